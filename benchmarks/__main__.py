@@ -10,30 +10,30 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from . import page
-from .machine import description, load
-from .measurements import NAMES
+from .machine import load_average, machine_description
+from .measurements import MEASUREMENT_NAMES
 from .report import targets_table
 
-RESULTS = Path(__file__).parent / "results"
+RESULT_FOLDER = Path(__file__).parent / "results"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the measurements that are named, print their tables, and keep each as JSON."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=main.__doc__)
-    parser.add_argument("names", nargs="*", metavar="name", help=f"all by default: {', '.join(NAMES)}")
+    parser.add_argument("names", nargs="*", metavar="name", help=f"all by default: {', '.join(MEASUREMENT_NAMES)}")
     parser.add_argument("--quick", action="store_true", help="see that everything runs; the figures mean nothing")
-    parser.add_argument("--out", type=Path, default=RESULTS, help="folder for the results")
+    parser.add_argument("--out", type=Path, default=RESULT_FOLDER, help="folder for the results")
     parser.add_argument("--kept", action="store_true", help="measure nothing: write the page from what is kept")
     parser.add_argument("--page", type=Path, help="write this page, and that of every run, from what is kept")
     options = parser.parse_args(arguments)
-    unknown = set(options.names) - set(NAMES)
+    unknown = set(options.names) - set(MEASUREMENT_NAMES)
     if unknown:
-        parser.error(f"no measurement {', '.join(sorted(unknown))}; there are {', '.join(NAMES)}")
+        parser.error(f"no measurement {', '.join(sorted(unknown))}; there are {', '.join(MEASUREMENT_NAMES)}")
     if options.quick and options.page:
         parser.error("quick results mean nothing on a page")
-    for name in [] if options.kept else options.names or NAMES:
+    for name in [] if options.kept else options.names or MEASUREMENT_NAMES:
         print(f"-- {name}", flush=True)
-        about = {"date": datetime.date.today().isoformat(), "load": load(), "machine": description()}
+        about = {"date": datetime.date.today().isoformat(), "load": load_average(), "machine": machine_description()}
         start = time.perf_counter()
         report = importlib.import_module(f"{__package__}.measurements.{name}").run(options.quick)
         report.save(options.out / f"{name}.json", name=name, quick=options.quick, **about)
@@ -43,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         warning = "; quick: the figures mean nothing" if options.quick else ""
         print(f"\n({time.perf_counter() - start:.0f} s{warning})\n", flush=True)
     if options.page:
-        page.write(options.out, options.page)
+        page.write_pages(options.out, options.page)
 
 
 if __name__ == "__main__":

@@ -10,16 +10,18 @@ import sys
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).parent.parent
+REPOSITORY_ROOT = Path(__file__).parent.parent
 
 
-def call(measurement: str, *arguments: str, cache: str | None = None, one_core: bool = False) -> Any:
+def run_child(measurement: str, *arguments: str, cache: str | None = None, one_core: bool = False) -> Any:
     """What ``child(*arguments)`` of a measurement returns in a new process, ``cache`` being its LIETHERMO_CACHE."""
     options = ["--one-core"] if one_core else []
-    return json.loads(python("-m", "benchmarks.child", *options, measurement, *arguments, cache=cache).splitlines()[-1])
+    return json.loads(
+        run_python("-m", "benchmarks.child", *options, measurement, *arguments, cache=cache).splitlines()[-1]
+    )
 
 
-def python(*arguments: str, cache: str | None = None) -> str:
+def run_python(*arguments: str, cache: str | None = None) -> str:
     """The standard output of a Python process in the repository's root.
 
     Raises
@@ -29,7 +31,7 @@ def python(*arguments: str, cache: str | None = None) -> str:
     """
     environment = dict(os.environ) if cache is None else os.environ | {"LIETHERMO_CACHE": cache}
     done = subprocess.run(
-        [sys.executable, *arguments], cwd=ROOT, env=environment, capture_output=True, text=True, check=False
+        [sys.executable, *arguments], cwd=REPOSITORY_ROOT, env=environment, capture_output=True, text=True, check=False
     )
     if done.returncode != 0:
         raise RuntimeError(f"python {' '.join(arguments[:3])} failed:\n{done.stderr[-2000:]}")

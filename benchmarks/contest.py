@@ -11,33 +11,35 @@ import numpy as np
 import liethermo as lt
 
 from . import laws
-from .native import Body
+from .native import BodyProgram
 from .problems import X0
 from .report import Table, ratio
 from .timing import race
 
 Engine = Literal["array", "compiled"]
 
-STEP = 0.1
+STEP_SIZE = 0.1
 
-RELAXATION = 10.0
+RATE_TIMES_DURATION = 10.0
 """Rate times duration: the body relaxes all the way, and its last step still needs most of the first one's work."""
 
 COMPARED_STEPS = 300
 
 
-def by_library(system: lt.System, steps: int, engine: Engine, every: int | None = None) -> Callable[[], lt.Solution]:
+def library_run(system: lt.System, steps: int, engine: Engine, every: int | None = None) -> Callable[[], lt.Solution]:
     """A run of the library from :data:`.problems.X0`; by default only the last state is kept."""
-    span, midpoint = (0.0, STEP * steps), lt.MetriplecticMidpoint()
-    return functools.partial(lt.integrate, system, X0, span, STEP, midpoint, save_every=every or steps, engine=engine)
+    span, midpoint = (0.0, STEP_SIZE * steps), lt.MetriplecticMidpoint()
+    return functools.partial(
+        lt.integrate, system, X0, span, STEP_SIZE, midpoint, save_every=every or steps, engine=engine
+    )
 
 
-def by_c(program: Body, steps: int, every: int | None = None) -> Callable[[], tuple[np.ndarray, np.ndarray]]:
+def c_run(program: BodyProgram, steps: int, every: int | None = None) -> Callable[[], tuple[np.ndarray, np.ndarray]]:
     """The same run by a program in C."""
-    return functools.partial(program.integrate, X0, STEP, steps, every)
+    return functools.partial(program.integrate, X0, STEP_SIZE, steps, every)
 
 
-def contest(caption: str, works: Mapping[str, Callable], steps: int, rounds: int, baseline: str):
+def race_one_trajectory(caption: str, works: Mapping[str, Callable], steps: int, rounds: int, baseline: str):
     """Race the works, each of so many steps in one thread; a table, and the seconds of the processor of each.
 
     Returns
@@ -45,35 +47,35 @@ def contest(caption: str, works: Mapping[str, Callable], steps: int, rounds: int
     Table, dict of float
     """
     outcomes = race(works, rounds=rounds)
-    times = {name: outcome.processor for name, outcome in outcomes.items()}
+    times = {name: outcome.cpu_seconds for name, outcome in outcomes.items()}
     rows = []
     for name, outcome in outcomes.items():
         solution = outcome.result
         if isinstance(solution, lt.Solution):
-            iterations, kept = solution.stats.iterations_per_step, laws.of_solution(solution)
+            iterations, kept = solution.stats.iterations_per_step, laws.solution_laws(solution)
         else:
             run = solution[1]
-            iterations, kept = float((run["iterations"] / run["steps"])[0]), laws.of_runs(run)
+            iterations, kept = float((run["iterations"] / run["steps"])[0]), laws.c_run_laws(run)
         rows.append([name, times[name] / steps, ratio(times[name], times.get(baseline)), iterations])
-        rows[-1] += kept.cells()
+        rows[-1] += kept.table_cells()
     columns = {"": "text", "Time a step": "seconds", f"Relative to {baseline}": "ratio", "Iterations a step": "number"}
     return Table(caption, columns | laws.COLUMNS, rows), times
 
 
-def difference(program: Body, system: lt.System) -> float:
+def max_difference_from_c(program: BodyProgram, system: lt.System) -> float:
     """Largest difference between the C program's trajectory and the compiled engine's, relative to the state.
 
     Raises
     ------
     RuntimeError
-        As :func:`of_one_scheme`.
+        As :func:`require_same_scheme`.
     """
-    ours = by_library(system, COMPARED_STEPS, "compiled", 1)().x[1:]
-    theirs, _ = program.integrate(X0, STEP, COMPARED_STEPS, 1)
-    return of_one_scheme(float(np.abs(ours - theirs).max() / np.abs(ours).max()), COMPARED_STEPS)
+    ours = library_run(system, COMPARED_STEPS, "compiled", 1)().x[1:]
+    theirs, _ = program.integrate(X0, STEP_SIZE, COMPARED_STEPS, 1)
+    return require_same_scheme(float(np.abs(ours - theirs).max() / np.abs(ours).max()), COMPARED_STEPS)
 
 
-def of_one_scheme(difference: float, steps: int) -> float:
+def require_same_scheme(difference: float, steps: int) -> float:
     """The difference of two trajectories after so many steps.
 
     Raises

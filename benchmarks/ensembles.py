@@ -14,7 +14,7 @@ from .contest import Engine
 from .laws import Laws
 
 
-def by_library(
+def library_ensemble(
     system: lt.System,
     x0s: np.ndarray,
     t_end: float,
@@ -32,7 +32,9 @@ def by_library(
 TOLERANCES = tuple(10.0 ** (-n / 4) for n in range(4, 60))
 
 
-def loosest(build: Callable, x0s: np.ndarray, exact: np.ndarray, wanted: float) -> tuple[Callable, float, float]:
+def loosest_tolerance_work(
+    build: Callable, x0s: np.ndarray, exact: np.ndarray, wanted: float
+) -> tuple[Callable, float, float]:
     """A peer's work with the loosest tolerance that reaches an error; that tolerance, and its error.
 
     Parameters
@@ -42,19 +44,19 @@ def loosest(build: Callable, x0s: np.ndarray, exact: np.ndarray, wanted: float) 
         The ends of the first states.
     """
     for tolerance in TOLERANCES:
-        reached = error(build(tolerance, x0s[: len(exact)])(), exact)
+        reached = max_relative_error(build(tolerance, x0s[: len(exact)])(), exact)
         if reached <= wanted:
             return build(tolerance, x0s), tolerance, reached
     raise RuntimeError(f"no tolerance reaches an error of {wanted:.1e}")
 
 
-def error(ends, exact: np.ndarray) -> float:
+def max_relative_error(ends, exact: np.ndarray) -> float:
     """Largest error of the first ends, relative to their states."""
     errors = np.abs(np.asarray(ends)[: len(exact)] - exact).max(axis=1) / np.abs(exact).max(axis=1)
     return float(errors.max())
 
 
-def laws(result: lt.Ensemble) -> Laws:
+def ensemble_laws(result: lt.Ensemble) -> Laws:
     """The worst of all bodies, over every step.
 
     Raises

@@ -7,16 +7,16 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 
-from .front import Comparison
+from .first_page import PeerComparison
 from .report import Table
 
-WIN, LOSS = "#0072b2", "#d55e00"
+FASTER_COLOUR, SLOWER_COLOUR = "#0072b2", "#d55e00"
 
-STYLES = {", compiled engine": "-", ", array engine": "--", ", C": ":"}
+LINE_STYLES = {", compiled engine": "-", ", array engine": "--", ", C": ":"}
 """Lines by what runs a method, whose colour is the same for all."""
 
 
-def work_precision(series: dict[str, list[list[float]]], path: Path) -> None:
+def draw_work_precision(series: dict[str, list[list[float]]], path: Path) -> None:
     """Time against error, a curve for each method; the format is that of the file name."""
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
@@ -27,9 +27,9 @@ def work_precision(series: dict[str, list[list[float]]], path: Path) -> None:
         for name, points in series.items():
             errors, seconds = zip(*points, strict=True)
             width = 2.0 if name.endswith("engine") else 1.0  # the library's own stand out
-            by = next((end for end in STYLES if name.endswith(end)), "")
+            by = next((end for end in LINE_STYLES if name.endswith(end)), "")
             colour = colours.setdefault(name.removesuffix(by), f"C{len(colours)}")
-            line = {"linestyle": STYLES.get(by, "-"), "linewidth": width, "color": colour}
+            line = {"linestyle": LINE_STYLES.get(by, "-"), "linewidth": width, "color": colour}
             axes.loglog(errors, seconds, marker="o", markersize=2 + width, label=name, **line)
         axes.invert_xaxis()
         axes.set_xlabel("relative error at the end")
@@ -42,7 +42,7 @@ def work_precision(series: dict[str, list[list[float]]], path: Path) -> None:
         plt.close(figure)
 
 
-def beside(themes: dict[str, list[Comparison]], path: Path) -> None:
+def draw_time_ratios(themes: dict[str, list[PeerComparison]], path: Path) -> None:
     """The ratio of times, a bar for each work, by theme: to the left of one this library is the faster."""
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
@@ -51,7 +51,7 @@ def beside(themes: dict[str, list[Comparison]], path: Path) -> None:
     with matplotlib.rc_context({"svg.hashsalt": "liethermo", "svg.fonttype": "none", "font.size": 8}):
         figure, axes = plt.subplots(figsize=(8.0, 0.6 + 0.19 * len(rows)), layout="constrained")
         for i, (_, c) in enumerate(rows):
-            axes.barh(i, c.ratio - 1.0, left=1.0, height=0.7, color=WIN if c.ratio < 1.0 else LOSS)
+            axes.barh(i, c.ratio - 1.0, left=1.0, height=0.7, color=FASTER_COLOUR if c.ratio < 1.0 else SLOWER_COLOUR)
         axes.set_yticks(range(len(rows)), [f"{c.work} · {c.peer.split(',')[0]}" for _, c in rows])
         axes.set_xscale("log")
         axes.axvline(1.0, color="black", linewidth=0.8)
@@ -70,30 +70,30 @@ def beside(themes: dict[str, list[Comparison]], path: Path) -> None:
         plt.close(figure)
 
 
-def magnet(table: Table, path: Path) -> None:
+def draw_magnet(table: Table, path: Path) -> None:
     """Magnetisation, specific heat and Binder's cumulant against the temperature: lattices, the smaller the paler."""
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    from .measurements.magnet import CRITICAL, MONTE_CARLO, NOISE, UNIVERSAL
+    from .measurements.magnet import CRITICAL_CUMULANT, CRITICAL_TEMPERATURE, MONTE_CARLO_ROW, NOISE_ROW
 
     lengths = sorted({row[1] for row in table.rows})
     with matplotlib.rc_context({"svg.hashsalt": "liethermo", "svg.fonttype": "none", "font.size": 9}):
         figure, axes = plt.subplots(1, 3, figsize=(9.0, 3.2), layout="constrained")
         colours = plt.get_cmap("viridis_r")(np.linspace(0.1, 1.0, len(lengths)))
         for colour, length in zip(colours, lengths, strict=True):
-            for by, style in ((NOISE, {"fmt": "o", "ms": 3.5}), (MONTE_CARLO, {"fmt": "-", "lw": 0.8})):
+            for by, style in ((NOISE_ROW, {"fmt": "o", "ms": 3.5}), (MONTE_CARLO_ROW, {"fmt": "-", "lw": 0.8})):
                 rows = [row for row in table.rows if row[0] == by and row[1] == length]
                 for ax, column in zip(axes, (5, 7, 9), strict=True):
                     values, errors = ([row[i] for row in rows] for i in (column, column + 1))
-                    label = f"{length}³ spins" if by == NOISE and ax is axes[0] else None
+                    label = f"{length}³ spins" if by == NOISE_ROW and ax is axes[0] else None
                     temperatures = [float(row[2]) for row in rows]
                     ax.errorbar(temperatures, values, errors, color=colour, label=label, **style)
         for ax, name in zip(axes, ("magnetisation", "specific heat", "Binder's cumulant"), strict=True):
-            ax.axvline(CRITICAL, color="0.6", linewidth=0.8, zorder=0)
+            ax.axvline(CRITICAL_TEMPERATURE, color="0.6", linewidth=0.8, zorder=0)
             ax.set(xlabel="kT / J", ylabel=name)
             ax.spines[["top", "right"]].set_visible(False)
-        axes[2].axhline(UNIVERSAL, color="0.6", linewidth=0.8, zorder=0)
+        axes[2].axhline(CRITICAL_CUMULANT, color="0.6", linewidth=0.8, zorder=0)
         figure.legend(frameon=False, loc="outside right center")
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, metadata={"Date": None})

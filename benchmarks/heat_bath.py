@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-OVER = 2
+OVERRELAXATION_PASSES = 2
 """Reflections of every spin at its field between two passes of the heat bath: they decorrelate, at constant energy."""
 
 
-def heat_bath(length: int, temperatures, sweeps: int, seed: int = 0) -> np.ndarray:
+def sample_heat_bath(length: int, temperatures, sweeps: int, seed: int = 0) -> np.ndarray:
     """Energy a spin and magnetisation vector after each sweep, shape (temperatures, sweeps, 4).
 
     ``E = -sum s_i . s_j`` on ``length**3`` sites, ``length`` even, periodic. A tenth as many sweeps come first and are
@@ -24,12 +24,12 @@ def heat_bath(length: int, temperatures, sweeps: int, seed: int = 0) -> np.ndarr
     s /= np.linalg.norm(s, axis=0)
     kept = np.empty((len(T), sweeps, 4))
     for sweep in range(-(sweeps // 10), sweeps):
-        for passing in range(OVER + 1):
+        for passing in range(OVERRELAXATION_PASSES + 1):
             for here in halves:
                 h = s[:, :, neighbours[:, here]].sum(axis=2)
                 size = np.linalg.norm(h, axis=0)
                 axis = h / size
-                if passing < OVER:
+                if passing < OVERRELAXATION_PASSES:
                     old = s[:, :, here]
                     s[:, :, here] = 2.0 * (axis * old).sum(axis=0) * axis - old
                 else:

@@ -20,18 +20,18 @@ class IsospectralMidpoint:
 
     def __init__(self, N: int):
         s = (N - 1) / 2
-        self.z = s - np.arange(N)
-        self.step = np.sqrt(np.arange(1.0, N + 1) * (N - np.arange(1.0, N + 1)))
-        self.main = 2.0 * s * (s + 1.0)
+        self.spin_z = s - np.arange(N)
+        self.raising = np.sqrt(np.arange(1.0, N + 1) * (N - np.arange(1.0, N + 1)))
+        self.diagonal = 2.0 * s * (s + 1.0)
 
-    def stream(self, W: np.ndarray) -> np.ndarray:
+    def stream_matrix(self, W: np.ndarray) -> np.ndarray:
         """P, anti-Hermitian and without trace, with ``Delta P = W``."""
         P = np.zeros_like(W)
-        _eliminate(W, self.z, self.step, self.main, P)
+        _solve_laplacian(W, self.spin_z, self.raising, self.diagonal, P)
         return P
 
     def energy(self, W: np.ndarray) -> float:
-        return -0.5 * float(np.vdot(self.stream(W), W).real)
+        return -0.5 * float(np.vdot(self.stream_matrix(W), W).real)
 
     def integrate(self, W: np.ndarray, h: float, steps: int) -> tuple[np.ndarray, float]:
         """The matrix after so many steps, and the mean number of iterations of one."""
@@ -40,7 +40,7 @@ class IsospectralMidpoint:
             for _ in range(60):
                 made += 1
                 V = W + change
-                P = (0.5 * h) * self.stream(V)
+                P = (0.5 * h) * self.stream_matrix(V)
                 PV = P @ V
                 commutator = PV - PV.conj().T
                 new = commutator + PV @ P
@@ -55,7 +55,7 @@ class IsospectralMidpoint:
 
 
 @numba.njit
-def _eliminate(W, z, step, main, P):
+def _solve_laplacian(W, z, step, main, P):
     N = W.shape[0]
     ratio, y = np.empty(N), np.empty(N, dtype=np.complex128)
     for m in range(N):

@@ -29,11 +29,11 @@ class Laws:
     least_entropy_increment: float | None
 
     @property
-    def hold(self) -> bool:
+    def are_kept(self) -> bool:
         increment = self.least_entropy_increment
         return self.energy_drift <= tolerance("energy") and (increment is None or increment >= -tolerance("entropy"))
 
-    def cells(self) -> list:
+    def table_cells(self) -> list:
         increment = self.least_entropy_increment
         broken = []
         if not self.energy_drift <= tolerance("energy"):
@@ -43,21 +43,21 @@ class Laws:
         return [self.energy_drift, increment, "hold" if not broken else f"broken: {', '.join(broken)}"]
 
 
-def of_solution(solution: lt.Solution) -> Laws:
+def solution_laws(solution: lt.Solution) -> Laws:
     """Of a run of the library, every step of it."""
     audit, entropy = solution.audit(), solution.entropy
     assert entropy is not None
     return Laws(audit.energy_drift, audit.entropy_min_increment / float(np.abs(entropy).max()))
 
 
-def of_runs(runs: np.ndarray) -> Laws:
+def c_run_laws(runs: np.ndarray) -> Laws:
     """The worst of one or more records of a C program, every step of them."""
     first = runs["first_energy"]
     drift = np.maximum(runs["largest_energy"] - first, first - runs["smallest_energy"]) / np.abs(first)
     return Laws(float(drift.max()), float((runs["least_entropy_increment"] / np.abs(runs["entropy"])).min()))
 
 
-def of_path(states: np.ndarray, system: lt.System) -> Laws:
+def path_laws(states: np.ndarray, system: lt.System) -> Laws:
     """Of a trajectory, shape (times, n)."""
     assert system.entropy is not None
     H, S = np.asarray(system.energy(states)), np.asarray(system.entropy(states))
@@ -65,7 +65,7 @@ def of_path(states: np.ndarray, system: lt.System) -> Laws:
     return Laws(float(np.abs(H - H[0]).max() / abs(H[0])), increment)
 
 
-def of_ends(before: np.ndarray, after: np.ndarray, system: lt.System) -> Laws:
+def end_state_laws(before: np.ndarray, after: np.ndarray, system: lt.System) -> Laws:
     """The worst of many runs of which only the ends are known, shape (runs, n)."""
     H0, H1 = np.asarray(system.energy(before)), np.asarray(system.energy(after))
     return Laws(float((np.abs(H1 - H0) / np.abs(H0)).max()), None)

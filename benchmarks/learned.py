@@ -12,21 +12,21 @@ import scipy.integrate
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.learn.data import Trajectory, scales
+from liethermo.learn.data import Trajectory, data_scales
 
 from . import learned_peers
 from .report import Report, Table
 
-RATE = 3e-3
+LEARNING_RATE = 3e-3
 """Of the descent, for all."""
 
-LONG = 100
+LONG_RUN_FACTOR = 100
 """How many times as long as the data the laws are followed."""
 
 
-TEXT = (
+REPORT_TEXT = (
     "Errors of forecasts from the first states of trajectories that were not learned from, means over all "
-    f"components and times. The laws are those of one forecast over {LONG} times the time of the data, of the "
+    f"components and times. The laws are those of one forecast over {LONG_RUN_FACTOR} times the time of the data, of the "
     "energy and entropy that were learned. GFINN and NMS are written here from their papers. All have the same data, "
     "loss, descent, rate, batches and networks. Their forecasts run by RK4, ours by a method of the same order with "
     "discrete laws. What rate and loss `lt.learn` has was chosen on other trajectories than these. Figures that the "
@@ -38,26 +38,26 @@ class Problem(NamedTuple):
     """Data of a motion, made by SciPy at a tolerance of 1e-10, and what a user may know of it."""
 
     title: str
-    about: str
-    rates: Callable
-    start: Callable[[np.random.Generator], np.ndarray]
+    text: str
+    vector_field: Callable
+    random_state: Callable[[np.random.Generator], np.ndarray]
     step: float
     steps: int
     poisson: mf.PoissonStructure
     entropy: Callable
-    end: float = 8.0
-    number: int = 100
-    seeds: int = 3
+    t_end: float = 8.0
+    n_trajectories: int = 100
+    n_seeds: int = 3
 
 
-def _gas(t, x):
+def _gas_field(t, x):
     q, p, *s = x
     E1, E2 = (np.exp(s[0]) / q) ** (2 / 3), (np.exp(s[1]) / (2 - q)) ** (2 / 3)
     heat = 22.5 * (1 / E1 - 1 / E2)
     return [p, 2 / 3 * (E1 / q - E2 / (2 - q)), heat / E1, -heat / E2]
 
 
-def _pendulum(t, x):
+def _pendulum_field(t, x):
     """Two springs with the energy ``(ln l)^2 / 2 + ln l + exp(S - ln l) - 1`` of their length l and entropy S.
 
     Unit masses; heat goes from one spring to the other with a conductance of 1/2.
@@ -73,10 +73,10 @@ def _pendulum(t, x):
 PROBLEMS = {
     "gas": Problem(
         "two gas containers",
-        f"{TEXT} The set-up is that of the code of the authors of GFINN. A few starts near the walls, which are rare "
+        f"{REPORT_TEXT} The set-up is that of the code of the authors of GFINN. A few starts near the walls, which are rare "
         "in the data, make up a large part of all means. Models of which more is known lose to NMS after T: their "
         "descents end at losses about ten times larger, and more neurons do not help.",
-        _gas,
+        _gas_field,
         lambda r: np.array([1.0, 0.0, 2.0, 2.0]) + r.uniform(-1.0, 1.0, 4) * [0.8, 1.0, 1.0, 1.0],
         0.02,
         8000,
@@ -88,7 +88,7 @@ PROBLEMS = {
         "As above. The pendulum has parameters of our own. To T the errors of GFINN are about those of `lt.learn`. "
         "Models of which more is known lose to both peers after T: their descents end at losses about twenty times "
         "larger.",
-        _pendulum,
+        _pendulum_field,
         lambda r: np.array([1.0, 0.0, 2.1, 0.0, 0.0, 0.5, 0.0, 1.0, 0.2, 0.4]) + r.uniform(-0.2, 0.2, 10),
         0.05,
         4000,
@@ -98,38 +98,40 @@ PROBLEMS = {
 }
 
 
-def data_of(problem: Problem, quick: bool, seed: int = 0) -> np.ndarray:
+def simulate_data(problem: Problem, quick: bool, seed: int = 0) -> np.ndarray:
     """States to twice the time of training, shape (trajectories, times, n)."""
     random, runs = np.random.default_rng(seed), []
-    times = np.arange(round(2 * problem.end / problem.step) + 1) * problem.step
-    for _ in range(5 if quick else problem.number):
-        x0 = problem.start(random)
-        found = scipy.integrate.solve_ivp(problem.rates, (0, times[-1]), x0, "LSODA", times, rtol=1e-10, atol=1e-10)
+    times = np.arange(round(2 * problem.t_end / problem.step) + 1) * problem.step
+    for _ in range(5 if quick else problem.n_trajectories):
+        x0 = problem.random_state(random)
+        found = scipy.integrate.solve_ivp(
+            problem.vector_field, (0, times[-1]), x0, "LSODA", times, rtol=1e-10, atol=1e-10
+        )
         runs.append(found.y.T)
     return np.stack(runs)
 
 
-def _errors(found: np.ndarray, true: np.ndarray) -> list[float]:
+def _forecast_errors(found: np.ndarray, true: np.ndarray) -> list[float]:
     """Mean squares and mean sizes of the errors of states, to the end of the training time and after it."""
     half = (true.shape[1] + 1) // 2
     parts = [found[:, :half] - true[:, :half], found[:, half:] - true[:, half:]]
     return [float(f(part)) for f in (lambda e: np.mean(e**2), lambda e: np.mean(np.abs(e))) for part in parts]
 
 
-def _laws(energy: np.ndarray, entropy: np.ndarray, spread: float) -> list[float]:
+def _law_errors(energy: np.ndarray, entropy: np.ndarray, spread: float) -> list[float]:
     """The drift of a learned energy, which is known up to a constant, relative to its spread over the test states."""
     return [float(np.max(np.abs(energy - energy[0])) / spread), float(np.diff(entropy).min())]
 
 
-def compared(problem: Problem, quick: bool) -> list[list]:
+def compare_models(problem: Problem, quick: bool) -> list[list]:
     """A row for each contestant, means over the seeds of first weights and batches; of the laws the worst."""
-    x = data_of(problem, quick)
+    x = simulate_data(problem, quick)
     count = max(1, len(x) // 5)
-    half = round(problem.end / problem.step) + 1
+    half = round(problem.t_end / problem.step) + 1
     test, train = x[:count], [Trajectory(np.arange(half) * problem.step, own[:half]) for own in x[count:]]
-    found_scales = scales(train)
-    steps, width, seeds = (50, 8, 1) if quick else (problem.steps, 32, problem.seeds)
-    long = round((2 if quick else LONG) * problem.end / problem.step)
+    found_scales = data_scales(train)
+    steps, width, seeds = (50, 8, 1) if quick else (problem.steps, 32, problem.n_seeds)
+    long = round((2 if quick else LONG_RUN_FACTOR) * problem.t_end / problem.step)
     rows = []
 
     def ours(build: Callable[[int], Any], name: str) -> None:
@@ -137,7 +139,14 @@ def compared(problem: Problem, quick: bool) -> list[list]:
             start = time.process_time()
             pairs = [tuple(own) for own in train]
             fitted = lt.learn.fit(
-                build(seed), pairs, matching=steps, shooting=0, rate=RATE, validation=0.0, seed=seed, progress=False
+                build(seed),
+                pairs,
+                matching=steps,
+                shooting=0,
+                rate=LEARNING_RATE,
+                validation=0.0,
+                seed=seed,
+                progress=False,
             )
             spent = time.process_time() - start
             method = lt.MetriplecticRungeKutta(4)
@@ -146,22 +155,22 @@ def compared(problem: Problem, quick: bool) -> list[list]:
             assert states is not None
             run = lt.integrate(fitted, test[0, 0], (0.0, long * problem.step), problem.step, method)
             assert run.entropy is not None
-            laws = _laws(run.energy, run.entropy, float(np.std(fitted.energy(test))))
-            return [fitted.training.parameters, *_errors(states, test), *laws, spent]
+            laws = _law_errors(run.energy, run.entropy, float(np.std(fitted.energy(test))))
+            return [fitted.training.parameters, *_forecast_errors(states, test), *laws, spent]
 
         add(name, [one(seed) for seed in range(seeds)])
 
-    def theirs(build: Callable[[int], learned_peers.Peer], name: str) -> None:
+    def theirs(build: Callable[[int], learned_peers.PeerModel], name: str) -> None:
         def one(seed: int) -> list[float]:
             start = time.process_time()
-            peer = learned_peers.trained(build(seed), train, found_scales, steps, RATE, seed)
+            peer = learned_peers.train(build(seed), train, found_scales, steps, LEARNING_RATE, seed)
             spent = time.process_time() - start
             states, laws = learned_peers.forecast(peer, test[:, 0], found_scales, problem.step, x.shape[1] - 1)
             run, _ = learned_peers.forecast(peer, test[:1, 0], found_scales, problem.step, long)
             spread = float(np.std(laws(test.reshape(-1, x.shape[2]))[0]))
             parameters = sum(leaf.size for leaf in jax.tree_util.tree_leaves(peer))
             energy, entropy = laws(run[0])
-            return [parameters, *_errors(states, test), *_laws(energy, entropy, spread), spent]
+            return [parameters, *_forecast_errors(states, test), *_law_errors(energy, entropy, spread), spent]
 
         add(name, [one(seed) for seed in range(seeds)])
 
@@ -186,14 +195,14 @@ def compared(problem: Problem, quick: bool) -> list[list]:
     return rows
 
 
-def report(name: str, quick: bool) -> Report:
+def problem_report(name: str, quick: bool) -> Report:
     """The measurement of one of the problems."""
     p = PROBLEMS[name]
     columns = {"Model": "text", "Parameters": "count", "MSE to T": "error", "T to 2 T": "error", "MAE to T": "error"}
     columns |= {"MAE, T to 2 T": "error", "Energy drift": "error", "Least entropy increment": "error"}
     columns |= {"Training": "seconds"}
     caption = (
-        f"{p.number} trajectories to T = {p.end:g}, a fifth of them for the test, {p.steps} steps of 256 points. Means "
-        f"over {p.seeds} seed{'s' if p.seeds > 1 else ''}."
+        f"{p.n_trajectories} trajectories to T = {p.t_end:g}, a fifth of them for the test, {p.steps} steps of 256 points. Means "
+        f"over {p.n_seeds} seed{'s' if p.n_seeds > 1 else ''}."
     )
-    return Report(f"Learned: {p.title}", p.about, [Table(caption, columns, compared(p, quick))])
+    return Report(f"Learned: {p.title}", p.text, [Table(caption, columns, compare_models(p, quick))])

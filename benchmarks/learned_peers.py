@@ -16,9 +16,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from liethermo.learn import losses
-from liethermo.learn.data import Scales, Trajectory
-from liethermo.learn.fitting import BATCH
-from liethermo.learn.training import Course, Phase
+from liethermo.learn.data import DataScales, Trajectory
+from liethermo.learn.fitting import BATCH_SIZES
+from liethermo.learn.training import Phase, TrainingRun
 
 
 class Perceptron(eqx.Module):
@@ -39,7 +39,7 @@ class Perceptron(eqx.Module):
         return W @ x + b
 
 
-class Peer(eqx.Module):
+class PeerModel(eqx.Module):
     """``x' = L(x) grad E + M(x) grad S`` with ``L grad S = 0`` and ``M grad E = 0``, in scaled variables."""
 
     energy: Perceptron
@@ -54,7 +54,7 @@ class Peer(eqx.Module):
         return L @ dE + M @ dS
 
 
-class GFINN(Peer):
+class GFINN(PeerModel):
     """``L = B^T (s - s^T) B``, rows ``xi_j grad S``, ``M = C^T t t^T C``, rows ``xi_j grad E`` [Zhang et al. 2022].
 
     The xi_j are constant skew matrices, s and t networks: the code of the authors for gas containers, without what it
@@ -62,26 +62,26 @@ class GFINN(Peer):
     """
 
     skew: jax.Array  # (2, K, n, n): of L, and of M
-    of_motion: Perceptron
-    of_friction: Perceptron
+    poisson_network: Perceptron
+    friction_network: Perceptron
     rank: int = eqx.field(static=True)
 
     def __init__(self, n: int, width: int, depth: int, seed: int):
         random = np.random.default_rng(seed)
         sizes = [n, *[width] * depth]
         self.energy, self.entropy = Perceptron([*sizes, 1], random), Perceptron([n, width, 1], random)
-        self.of_motion, self.of_friction = (Perceptron([*sizes, n * n], random) for _ in range(2))
+        self.poisson_network, self.friction_network = (Perceptron([*sizes, n * n], random) for _ in range(2))
         self.skew, self.rank = jnp.asarray(random.standard_normal((2, n, n, n)) / np.sqrt(n)), n
 
     def brackets(self, x, dE, dS):
         xi = jnp.triu(self.skew, 1)
         xi = xi - jnp.swapaxes(xi, -1, -2)
         B, C = jnp.einsum("kij,j->ki", xi[0], dS), jnp.einsum("kij,j->ki", xi[1], dE)
-        s, t = (f(x).reshape(self.rank, self.rank) for f in (self.of_motion, self.of_friction))
+        s, t = (f(x).reshape(self.rank, self.rank) for f in (self.poisson_network, self.friction_network))
         return B.T @ (s - s.T) @ B, C.T @ (t @ t.T) @ C
 
 
-class NMS(Peer):
+class NMS(PeerModel):
     """``L = P_S A P_S`` and ``M = P_E B D D^T B^T P_E`` [Gruber et al. 2025].
 
     P are the orthogonal projectors off the gradients. A skew, B and D are networks of the state.
@@ -109,31 +109,35 @@ class NMS(Peer):
         return off_S @ (A - A.T) @ off_S, C @ C.T
 
 
-class InUnits(eqx.Module):
+class UnscaledPeer(eqx.Module):
     """A peer in the units of the data."""
 
-    peer: Peer
-    scales: Scales
+    peer: PeerModel
+    scales: DataScales
 
     def _vector_field(self, x):
         centre, size, time = self.scales
         return size / time * self.peer.rates((x - centre) / size)
 
 
-def trained(peer: Peer, data: list[Trajectory], scales: Scales, steps: int, rate: float, seed: int) -> Peer:
+def train(peer: PeerModel, data: list[Trajectory], scales: DataScales, steps: int, rate: float, seed: int) -> PeerModel:
     """The peer after the matching of ``lt.learn.fit``."""
     start, back = ravel_pytree(peer)
     shapes = tuple(leaf.shape for leaf in jax.tree_util.tree_leaves(peer))
-    own = losses.Weights(np.asarray(start), shapes, lambda vector: InUnits(back(vector), scales))
-    task = losses.matching_of(own, data, None, scales)
-    course = Course([Phase("matching", task, None, steps, rate, BATCH["matching"], shapes)], own.start, "")
+    own = losses.ParameterVector(np.asarray(start), shapes, lambda vector: UnscaledPeer(back(vector), scales))
+    task = losses.trajectory_matching(own, data, None, scales)
+    course = TrainingRun(
+        [Phase("matching", task, None, steps, rate, BATCH_SIZES["matching"], shapes)], own.initial_values, ""
+    )
     course.run(seed, None, None, False)
     return back(jnp.asarray(course.weights))
 
 
-def forecast(peer: Peer, x0: np.ndarray, scales: Scales, step: float, steps: int) -> tuple[np.ndarray, Callable]:
+def forecast(
+    peer: PeerModel, x0: np.ndarray, scales: DataScales, step: float, steps: int
+) -> tuple[np.ndarray, Callable]:
     """States by RK4, shape (trajectories, steps + 1, n), and what gives energy and entropy of such states."""
-    h = step / scales.time
+    h = step / scales.time_scale
 
     def rk4(y, _):
         a = peer.rates(y)
@@ -145,10 +149,10 @@ def forecast(peer: Peer, x0: np.ndarray, scales: Scales, step: float, steps: int
     def whole(y):
         return jnp.concatenate([y[None], jax.lax.scan(rk4, y, length=steps)[1]])
 
-    y = jax.jit(jax.vmap(whole))(jnp.asarray((x0 - scales.centre) / scales.size))
+    y = jax.jit(jax.vmap(whole))(jnp.asarray((x0 - scales.centre) / scales.scale))
 
     def laws(found):
-        z = (found - scales.centre) / scales.size
+        z = (found - scales.centre) / scales.scale
         return tuple(np.asarray(jax.vmap(f)(jnp.asarray(z)))[..., 0] for f in (peer.energy, peer.entropy))
 
-    return np.asarray(y) * scales.size + scales.centre, laws
+    return np.asarray(y) * scales.scale + scales.centre, laws

@@ -8,30 +8,30 @@ import subprocess
 from importlib import metadata
 from pathlib import Path
 
-from .native import compiler
+from .native import find_c_compiler
 
 PACKAGES = "liethermo numpy scipy jax numba llvmlite diffrax heyoka mujoco pymanopt bsk".split()
 
 
-def description() -> dict[str, str]:
+def machine_description() -> dict[str, str]:
     """What is worth knowing, by name."""
     return {
         "Processor": _processor(),
-        "Cores": str(cores()),
+        "Cores": str(available_cores()),
         "Memory": f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.0f} GiB",
-        "System": f"{_system()}, {platform.machine()}",
-        "C compiler": _compiler(),
+        "System": f"{_operating_system()}, {platform.machine()}",
+        "C compiler": _compiler_version(),
         "Python": platform.python_version(),
-        "Packages": ", ".join(f"{name} {_version(name)}" for name in PACKAGES),
+        "Packages": ", ".join(f"{name} {_package_version(name)}" for name in PACKAGES),
     }
 
 
-def cores() -> int:
+def available_cores() -> int:
     """Processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def load() -> str:
+def load_average() -> str:
     """How busy the machine is: the load average of the last minute."""
     return f"{os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else "unknown"
 
@@ -47,21 +47,21 @@ def _processor() -> str:
     return " with ".join([fields.get("model name", platform.machine()), *map(str.upper, vectors[:1])])
 
 
-def _system() -> str:
+def _operating_system() -> str:
     try:
         return platform.freedesktop_os_release()["PRETTY_NAME"]
     except (OSError, KeyError, AttributeError):
         return platform.system()
 
 
-def _compiler() -> str:
-    command = compiler()
+def _compiler_version() -> str:
+    command = find_c_compiler()
     if command is None:
         return "none"
     return subprocess.run([command, "--version"], capture_output=True, text=True, check=True).stdout.splitlines()[0]
 
 
-def _version(name: str) -> str:
+def _package_version(name: str) -> str:
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:

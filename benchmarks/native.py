@@ -14,18 +14,18 @@ from pathlib import Path
 
 import numpy as np
 
-from liethermo.engines.rules import RULES
+from liethermo.engines.rules import DEFAULT_OPTIONS
 
 from .report import UnavailableError
 
-SOURCES = Path(__file__).parent / "c"
-OPTIONS = ["-std=gnu11", "-O3", "-march=native", "-fPIC", "-shared"]
+SOURCE_FOLDER = Path(__file__).parent / "c"
+COMPILER_OPTIONS = ["-std=gnu11", "-O3", "-march=native", "-fPIC", "-shared"]
 
 STATUSES = ("completed", "not_converged", "non_finite")
 
 
-def run_type(components: int) -> np.dtype:
-    """``Run`` of c/midpoint.h."""
+def run_dtype(components: int) -> np.dtype:
+    """``PeerRun`` of c/midpoint.h."""
     vectors = [(name, "f8", components) for name in ("x", "low", "k", "before")]
     energies = ["energy", "entropy", "first_energy", "largest_energy", "smallest_energy"]
     increments = ["least_entropy_increment", "largest_energy_increment"]
@@ -33,15 +33,15 @@ def run_type(components: int) -> np.dtype:
     return np.dtype(vectors + numbers + [(name, "i8") for name in ("status", "steps", "iterations", "most_iterations")])
 
 
-SUMMARY = np.dtype(
+SUMMARY_DTYPE = np.dtype(
     [("x", "f8", 3)]
     + [(name, "f8") for name in ("first_energy", "largest_energy", "smallest_energy", "entropy")]
     + [(name, "f8") for name in ("least_entropy_increment", "steps", "iterations", "integral")]
     + [("status", "i8")]
 )
-"""``Summary`` of c/ensemble.c."""
+"""``LawSummary`` of c/ensemble.c."""
 
-RING = np.dtype(
+RING_DTYPE = np.dtype(
     [(name, "f8") for name in ("energy", "entropy", "first_energy", "largest_energy", "smallest_energy")]
     + [("least_entropy_increment", "f8")]
     + [(name, "i8") for name in ("status", "steps", "iterations")]
@@ -49,19 +49,19 @@ RING = np.dtype(
 """``Record`` of c/spins.c."""
 
 
-def compiler() -> str | None:
+def find_c_compiler() -> str | None:
     """The C compiler: ``$CC``, or ``cc``; None where there is none."""
     return shutil.which(os.environ.get("CC", "cc"))
 
 
-def rules() -> list[str]:
+def solver_definitions() -> list[str]:
     """The library's rules, as definitions for the compiler."""
     names = ("fixed_point", "slow", "shrinking", "floor", "plateau", "steered")
-    return [f"-D{name.upper()}={getattr(RULES, name)!r}" for name in names]
+    return [f"-D{name.upper()}={getattr(DEFAULT_OPTIONS, name)!r}" for name in names]
 
 
 @functools.cache
-def program(source: str, *options: str) -> ctypes.CDLL:
+def compile_library(source: str, *options: str) -> ctypes.CDLL:
     """The library built from a file in ``c/``.
 
     Raises
@@ -69,18 +69,28 @@ def program(source: str, *options: str) -> ctypes.CDLL:
     UnavailableError
         If there is no compiler, or it fails.
     """
-    command = compiler()
+    command = find_c_compiler()
     if command is None:
         raise UnavailableError("no C compiler was found; install one, or name it with CC=...")
-    target = _folder() / f"{Path(source).stem}{len(os.listdir(_folder()))}.so"
-    arguments = [command, *OPTIONS, *rules(), *options, str(SOURCES / source), "-o", str(target), "-lm", "-lpthread"]
+    target = _build_folder() / f"{Path(source).stem}{len(os.listdir(_build_folder()))}.so"
+    arguments = [
+        command,
+        *COMPILER_OPTIONS,
+        *solver_definitions(),
+        *options,
+        str(SOURCE_FOLDER / source),
+        "-o",
+        str(target),
+        "-lm",
+        "-lpthread",
+    ]
     built = subprocess.run(arguments, capture_output=True, text=True, check=False)
     if built.returncode != 0:
         raise UnavailableError(f"{source} could not be compiled: {built.stderr.strip().splitlines()[-1]}")
     return ctypes.CDLL(str(target))
 
 
-class Body:
+class BodyProgram:
     """The step loop of one body, or of another system with a file of its own.
 
     Parameters
@@ -94,13 +104,13 @@ class Body:
     """
 
     def __init__(self, source: str, parameters: Sequence[float], *options: str):
-        self._library, self._parameters = program(source, *options), np.array(parameters, dtype=float)
+        self._library, self._parameters = compile_library(source, *options), np.array(parameters, dtype=float)
 
     def integrate(self, x0, step: float, steps: int, every: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """``steps`` steps from x0; every n-th state, by default the last, and a record of :func:`run_type`."""
+        """``steps`` steps from x0; every n-th state, by default the last, and a record of :func:`run_dtype`."""
         every = steps if every is None else every
         x0 = np.ascontiguousarray(x0, dtype=float)
-        saves, run = steps // every, np.zeros(1, run_type(len(x0)))
+        saves, run = steps // every, np.zeros(1, run_dtype(len(x0)))
         out = np.empty((saves, len(x0)))
         self._library.integrate(
             _pointer(self._parameters),
@@ -115,16 +125,16 @@ class Body:
         return out, run
 
 
-class Bodies:
+class EnsembleProgram:
     """The step loop of many rigid bodies, in SIMD lanes and threads; parameters as of rigid_body.c."""
 
     def __init__(self, parameters: Sequence[float]):
-        self._library, self._parameters = program("ensemble.c", "-Wno-psabi"), np.array(parameters, dtype=float)
+        self._library, self._parameters = compile_library("ensemble.c", "-Wno-psabi"), np.array(parameters, dtype=float)
 
     def integrate(self, x0s, step: float, steps: int, threads: int) -> np.ndarray:
         """``steps`` steps from each of the x0s, shape (bodies, 3); records of type :data:`SUMMARY`."""
         x0s = np.ascontiguousarray(x0s, dtype=float)
-        out = np.zeros(len(x0s), SUMMARY)
+        out = np.zeros(len(x0s), SUMMARY_DTYPE)
         self._library.integrate_ensemble(
             _pointer(self._parameters),
             _pointer(x0s),
@@ -138,15 +148,15 @@ class Bodies:
         return out
 
 
-class Ring:
+class SpinRingProgram:
     """The step loop of a ring of spins with a bath, in threads of OpenMP; parameters as of spins.c."""
 
     def __init__(self, parameters: Sequence[float]):
-        self._library, self._parameters = program("spins.c", "-fopenmp"), np.array(parameters, dtype=float)
+        self._library, self._parameters = compile_library("spins.c", "-fopenmp"), np.array(parameters, dtype=float)
 
     def integrate(self, x0, step: float, steps: int, threads: int) -> tuple[np.ndarray, np.ndarray]:
-        """The state after so many steps from x0, shape (3 count + 1,), and a record of :data:`RING`."""
-        x, record = np.array(x0, dtype=float), np.zeros(1, RING)
+        """The state after so many steps from x0, shape (3 count + 1,), and a record of :data:`RING_DTYPE`."""
+        x, record = np.array(x0, dtype=float), np.zeros(1, RING_DTYPE)
         self._library.omp_set_num_threads(ctypes.c_int(threads))
         self._library.integrate_ring(
             _pointer(self._parameters),
@@ -161,7 +171,7 @@ class Ring:
 
 
 @functools.cache
-def _folder() -> Path:
+def _build_folder() -> Path:
     folder = tempfile.TemporaryDirectory(prefix="liethermo-benchmarks-")
     atexit.register(folder.cleanup)
     return Path(folder.name)

@@ -6,14 +6,14 @@ import json
 from collections import Counter
 from pathlib import Path
 
-from . import front
-from .measurements import NAMES
+from . import first_page
+from .measurements import MEASUREMENT_NAMES
 from .report import Report, Table, Target, targets_table
 
-RUNS = "benchmarks_runs"
+RUNS_PAGE = "benchmarks_runs"
 """The name of the second page."""
 
-FIRST = """\
+INTRODUCTION = """\
 # Benchmarks
 
 How fast this library is beside other programs, and where it loses. Bars to the left of the line are wins.
@@ -21,17 +21,17 @@ How fast this library is beside other programs, and where it loses. Bars to the 
 ![Time of this library over the time of another program, work by work, on a logarithmic axis](benchmarks.svg)
 """
 
-HOW = f"""\
+METHODOLOGY = f"""\
 ## How it was measured
 
 Contestants take turns, and the best time of each counts. Both times of a row come from one run on one machine. Work in
 one thread is timed by the clock of the processor; where threads or processes are compared, the clock on the wall is
 used. *Equal accuracy* means that the other program has the loosest tolerance with which it is at least as accurate.
 *Laws* compares the drift of the energy and the least increment of the entropy in a step with the tolerances of the
-tests. {{missed}}. {{{{doc}}}}`{RUNS}` has the machine, the targets and the figures of every run. `make bench` measures
+tests. {{missed}}. {{{{doc}}}}`{RUNS_PAGE}` has the machine, the targets and the figures of every run. `make bench` measures
 everything anew and writes both pages; the programs are in `benchmarks/`."""
 
-SECOND = """\
+RUNS_INTRODUCTION = """\
 # Benchmarks: every run
 
 The figures behind {doc}`benchmarks`: the machine, the targets, and each measurement with all of its rows. Contestants
@@ -40,7 +40,7 @@ trust times by the clock on the wall. *Laws* compares the relative drift of the 
 entropy in a step, relative to its maximum, with the tolerances of the tests."""
 
 
-def write(results: Path, page: Path) -> None:
+def write_pages(results: Path, page: Path) -> None:
     """Write both pages and their figures from every result in the folder; the second lies beside the first.
 
     Raises
@@ -48,39 +48,41 @@ def write(results: Path, page: Path) -> None:
     ValueError
         If there is no result.
     """
-    files = [file for name in NAMES if (file := results / f"{name}.json").is_file()]
+    files = [file for name in MEASUREMENT_NAMES if (file := results / f"{name}.json").is_file()]
     found = [result for file in files if not (result := json.loads(file.read_text()))["quick"]]
     if not found:
         raise ValueError(f"{results} holds no results; run the measurements first")
     reports = {result["name"]: Report.from_dict(result["report"]) for result in found}
     targets = [target for report in reports.values() for target in report.targets]
-    from .figures import beside, magnet, work_precision
+    from .figures import draw_magnet, draw_time_ratios, draw_work_precision
 
-    beside(front.compare(reports), page.parent / "benchmarks.svg")
-    first, *themes = front.sections(reports)
-    _save(page, [FIRST + "\n" + first, *themes, HOW.format(missed=front.missed(targets))])
+    draw_time_ratios(first_page.compare_themes(reports), page.parent / "benchmarks.svg")
+    first, *themes = first_page.page_sections(reports)
+    _write_page(
+        page, [INTRODUCTION + "\n" + first, *themes, METHODOLOGY.format(missed=first_page.missed_targets_text(targets))]
+    )
 
-    machines, differing = _machines(found)
-    parts = [SECOND, machines, _targets(targets)]
-    whole = [name for names in front.WHOLE.values() for name in names]
+    machines, differing = _machine_section(found)
+    parts = [RUNS_INTRODUCTION, machines, _target_section(targets)]
+    whole = [name for names in first_page.FULL_REPORT_THEMES.values() for name in names]
     for name, report in reports.items():
         parts.append(f"## {report.title}\n\nOn the page {{doc}}`benchmarks`." if name in whole else report.markdown())
         if name in differing:
             parts.append(f"Measured elsewhere: {differing[name]}.")
         if report.series:
-            work_precision(report.series, figure := page.parent / f"{name}.svg")
+            draw_work_precision(report.series, figure := page.parent / f"{name}.svg")
             parts.append(f"![Time against error]({figure.name})")
         if name == "magnet":
-            magnet(report.tables[0], page.parent / "magnet.svg")
+            draw_magnet(report.tables[0], page.parent / "magnet.svg")
             parts.append("![Magnetisation, specific heat and Binder's cumulant against the temperature](magnet.svg)")
-    _save(page.parent / f"{RUNS}.md", parts)
+    _write_page(page.parent / f"{RUNS_PAGE}.md", parts)
 
 
-def _save(page: Path, parts: list[str]) -> None:
+def _write_page(page: Path, parts: list[str]) -> None:
     page.write_text("\n\n".join(part.strip("\n") for part in parts) + "\n")
 
 
-def _machines(found: list[dict]) -> tuple[str, dict[str, str]]:
+def _machine_section(found: list[dict]) -> tuple[str, dict[str, str]]:
     """The machine of most measurements, and by name how that of another measurement differs."""
     counted = Counter(json.dumps(result["machine"]) for result in found)
     usual = json.loads(counted.most_common(1)[0][0])
@@ -91,19 +93,19 @@ def _machines(found: list[dict]) -> tuple[str, dict[str, str]]:
     others = {result["name"]: result["machine"] for result in found if result["machine"] != usual}
     differing = {
         name: "; ".join(
-            f"{part} {_new(text, usual.get(part))}" for part, text in machine.items() if usual.get(part) != text
+            f"{part} {_additions(text, usual.get(part))}" for part, text in machine.items() if usual.get(part) != text
         )
         for name, machine in others.items()
     }
     return "## Machine" + table.markdown(), differing
 
 
-def _new(text: str, usual: str | None) -> str:
+def _additions(text: str, usual: str | None) -> str:
     """What of an enumeration is not in the usual one."""
     return ", ".join(part for part in text.split(", ") if part not in (usual or "").split(", "))
 
 
-def _targets(targets: list[Target]) -> str:
+def _target_section(targets: list[Target]) -> str:
     """Those that are missed come first."""
     order = sorted(targets, key=lambda target: target.verdict != "missed")
     return "## Targets" + targets_table(order).markdown()

@@ -22,28 +22,28 @@ from scipy.integrate import solve_ivp
 
 from liethermo.tracing.scalarize import scalarize
 
-from .machine import cores
+from .machine import available_cores
 from .problems import body_field
 from .report import UnavailableError
 
 
 @dataclass(frozen=True)
-class Run:
+class PeerRun:
     """One trajectory under one tolerance.
 
     Attributes
     ----------
-    end : function without arguments
+    solve_end : function without arguments
         Integrates and returns the state at the end, shape (3,): what is timed.
-    path : function without arguments
+    solve_path : function without arguments
         The states at the solver's own steps, shape (steps + 1, 3).
     """
 
-    end: Callable[[], np.ndarray]
-    path: Callable[[], np.ndarray]
+    solve_end: Callable[[], np.ndarray]
+    solve_path: Callable[[], np.ndarray]
 
 
-def module(name: str):
+def import_peer(name: str):
     """A peer, imported when it is wanted."""
     try:
         return importlib.import_module(name)
@@ -54,7 +54,7 @@ def module(name: str):
 # -- SciPy ------------------------------------------------------------------------------------------------------------
 
 
-def scipy(tolerance: float, x0, t_end: float, rate: float) -> Run:
+def scipy_run(tolerance: float, x0, t_end: float, rate: float) -> PeerRun:
     """DOP853, eighth order."""
     field = _scipy_field(rate)
 
@@ -64,13 +64,13 @@ def scipy(tolerance: float, x0, t_end: float, rate: float) -> Run:
             raise RuntimeError(solution.message)
         return solution.y.T
 
-    return Run(lambda: solve()[-1], solve)
+    return PeerRun(lambda: solve()[-1], solve)
 
 
-def scipy_loop(tolerance: float, x0s: np.ndarray, t_end: float, rate: float) -> Callable:
+def scipy_ensemble(tolerance: float, x0s: np.ndarray, t_end: float, rate: float) -> Callable:
     """The states at the end from all of the x0s, one after another."""
-    runs = [scipy(tolerance, x0, t_end, rate) for x0 in x0s]
-    return lambda: np.array([run.end() for run in runs])
+    runs = [scipy_run(tolerance, x0, t_end, rate) for x0 in x0s]
+    return lambda: np.array([run.solve_end() for run in runs])
 
 
 @functools.cache
@@ -87,9 +87,9 @@ def _scipy_field(rate: float) -> Callable:
 # -- diffrax ----------------------------------------------------------------------------------------------------------
 
 
-def diffrax(solver: str, tolerance: float, x0, t_end: float, rate: float) -> Run:
+def diffrax_run(solver: str, tolerance: float, x0, t_end: float, rate: float) -> PeerRun:
     """A Runge-Kutta method of diffrax, by name, with its PID controller."""
-    dfx, x0 = module("diffrax"), np.asarray(x0, dtype=float)
+    dfx, x0 = import_peer("diffrax"), np.asarray(x0, dtype=float)
     end = _diffrax_end(solver, t_end, rate)
 
     def path():
@@ -97,7 +97,7 @@ def diffrax(solver: str, tolerance: float, x0, t_end: float, rate: float) -> Run
         times, states = _diffrax_solve(solver, t_end, rate, saved, 100_000)(x0, tolerance)
         return np.asarray(states)[np.isfinite(np.asarray(times))]
 
-    return Run(lambda: np.asarray(end(x0, tolerance)), path)
+    return PeerRun(lambda: np.asarray(end(x0, tolerance)), path)
 
 
 def diffrax_ensemble(solver: str, tolerance: float, x0s: np.ndarray, t_end: float, rate: float) -> Callable:
@@ -108,19 +108,19 @@ def diffrax_ensemble(solver: str, tolerance: float, x0s: np.ndarray, t_end: floa
 
 @functools.cache
 def _diffrax_ends(solver: str, t_end: float, rate: float) -> Callable:
-    jax = module("jax")
+    jax = import_peer("jax")
     return jax.jit(jax.vmap(_diffrax_end(solver, t_end, rate), in_axes=(0, None)))
 
 
 @functools.cache
 def _diffrax_end(solver: str, t_end: float, rate: float) -> Callable:
-    solve = _diffrax_solve(solver, t_end, rate, module("diffrax").SaveAt(t1=True), None)
-    return module("jax").jit(lambda x0, tolerance: solve(x0, tolerance)[1][0])
+    solve = _diffrax_solve(solver, t_end, rate, import_peer("diffrax").SaveAt(t1=True), None)
+    return import_peer("jax").jit(lambda x0, tolerance: solve(x0, tolerance)[1][0])
 
 
 def _diffrax_solve(solver, t_end, rate, saveat, max_steps) -> Callable:
     """Times and states as diffrax returns them, compiled; NaN where it gave up."""
-    dfx, jax = module("diffrax"), module("jax")
+    dfx, jax = import_peer("diffrax"), import_peer("jax")
     jnp = jax.numpy
 
     def field(t, x, args):
@@ -148,14 +148,14 @@ def _diffrax_solve(solver, t_end, rate, saveat, max_steps) -> Callable:
 # -- heyoka -----------------------------------------------------------------------------------------------------------
 
 
-def heyoka(tolerance: float, x0, t_end: float, rate: float) -> Run:
+def heyoka_run(tolerance: float, x0, t_end: float, rate: float) -> PeerRun:
     """Taylor series of the order that the tolerance asks for."""
-    return heyoka_of(_heyoka_system(rate), tolerance, x0, t_end)
+    return heyoka_equations_run(_heyoka_system(rate), tolerance, x0, t_end)
 
 
-def heyoka_of(equations: list, tolerance: float, x0, t_end: float) -> Run:
+def heyoka_equations_run(equations: list, tolerance: float, x0, t_end: float) -> PeerRun:
     """The same for other equations: pairs of a variable and its derivative."""
-    hy, x0 = module("heyoka"), np.asarray(x0, dtype=float)
+    hy, x0 = import_peer("heyoka"), np.asarray(x0, dtype=float)
     integrator = hy.taylor_adaptive(equations, x0, tol=tolerance)
 
     def reset():
@@ -164,7 +164,7 @@ def heyoka_of(equations: list, tolerance: float, x0, t_end: float) -> Run:
 
     def end():
         reset()
-        _check_heyoka(hy, integrator.propagate_until(t_end)[0])
+        _require_time_limit(hy, integrator.propagate_until(t_end)[0])
         return integrator.state.copy()
 
     def path():
@@ -175,19 +175,19 @@ def heyoka_of(equations: list, tolerance: float, x0, t_end: float) -> Run:
             states.append(integrator.state.copy())
         return np.array(states)
 
-    return Run(end, path)
+    return PeerRun(end, path)
 
 
-def heyoka_batches(tolerance: float, x0s: np.ndarray, t_end: float, rate: float) -> Callable:
+def heyoka_threads(tolerance: float, x0s: np.ndarray, t_end: float, rate: float) -> Callable:
     """The states at the end from all of the x0s: a SIMD integrator for each core, and the batches dealt out to them."""
-    return heyoka_batches_of(_heyoka_system(rate), tolerance, x0s, t_end)
+    return heyoka_equations_threads(_heyoka_system(rate), tolerance, x0s, t_end)
 
 
-def heyoka_batches_of(equations: list, tolerance: float, x0s: np.ndarray, t_end: float) -> Callable:
+def heyoka_equations_threads(equations: list, tolerance: float, x0s: np.ndarray, t_end: float) -> Callable:
     """The same for other equations: pairs of a variable and its derivative."""
-    hy, (batches, states) = module("heyoka"), _batches(x0s)
+    hy, (batches, states) = import_peer("heyoka"), _simd_batches(x0s)
     first = hy.taylor_adaptive_batch(equations, states[0].copy(), tol=tolerance)
-    integrators = [copy.deepcopy(first) for _ in range(cores())]
+    integrators = [copy.deepcopy(first) for _ in range(available_cores())]
 
     def work(which: int) -> np.ndarray:
         integrator, mine = integrators[which], states[which :: len(integrators)]
@@ -211,7 +211,7 @@ def heyoka_batches_of(equations: list, tolerance: float, x0s: np.ndarray, t_end:
 
 def heyoka_ensemble(tolerance: float, x0s: np.ndarray, t_end: float, rate: float) -> Callable:
     """The states at the end from all of the x0s: heyoka's own ensemble mode, with a copy of an integrator a batch."""
-    hy, (batches, states) = module("heyoka"), _batches(x0s)
+    hy, (batches, states) = import_peer("heyoka"), _simd_batches(x0s)
     integrator = hy.taylor_adaptive_batch(_heyoka_system(rate), states[0].copy(), tol=tolerance)
 
     def start(copied, i):
@@ -226,21 +226,21 @@ def heyoka_ensemble(tolerance: float, x0s: np.ndarray, t_end: float, rate: float
     return ends
 
 
-def _batches(x0s: np.ndarray) -> tuple[int, np.ndarray]:
+def _simd_batches(x0s: np.ndarray) -> tuple[int, np.ndarray]:
     """States as batches for heyoka, shape (batches, n, lanes); the last is filled up with states from the front."""
-    lanes = module("heyoka").recommended_simd_size()
+    lanes = import_peer("heyoka").recommended_simd_size()
     batches = -(-len(x0s) // lanes)
     return batches, np.resize(x0s, (batches, lanes, x0s.shape[1])).swapaxes(1, 2).copy()
 
 
 def _heyoka_system(rate: float) -> list:
-    x, y, z = module("heyoka").make_vars("x", "y", "z")
+    x, y, z = import_peer("heyoka").make_vars("x", "y", "z")
     return list(zip((x, y, z), body_field(x, y, z, rate), strict=True))
 
 
-def heyoka_equations(field: Callable, dim: int) -> list:
+def equations_for_heyoka(field: Callable, dim: int) -> list:
     """The equations of motion of a vector field, from its scalar program: nothing is typed twice."""
-    hy = module("heyoka")
+    hy = import_peer("heyoka")
     program = scalarize(jax.make_jaxpr(field)(jnp.zeros(dim)))
     variables = [hy.make_vars(f"x{i}") for i in range(dim)]
     values = dict(zip(program.inputs[0], variables, strict=True))
@@ -252,6 +252,6 @@ def heyoka_equations(field: Callable, dim: int) -> list:
     return list(zip(variables, found, strict=True))
 
 
-def _check_heyoka(hy, outcome) -> None:
+def _require_time_limit(hy, outcome) -> None:
     if outcome != hy.taylor_outcome.time_limit:
         raise RuntimeError(f"heyoka stopped early: {outcome}")

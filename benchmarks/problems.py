@@ -25,12 +25,12 @@ def body_field(x, y, z, rate):
     return v * c - w * b, w * a - u * c, u * b - v * a
 
 
-def body(rate: float) -> lt.LiePoissonSystem:
+def quadratic_body(rate: float) -> lt.LiePoissonSystem:
     """The relaxed rigid body, H and S given as ``lt.Quadratic``."""
     return lt.models.rigid_body(INERTIA, rate)
 
 
-def plain_body(rate: float) -> lt.LiePoissonSystem:
+def function_body(rate: float) -> lt.LiePoissonSystem:
     """The same body, H and S given as plain functions: nothing tells the library that they are quadratic."""
     inertia = jnp.array(INERTIA)
     return lt.LiePoissonSystem(

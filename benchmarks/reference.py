@@ -8,40 +8,40 @@ import numpy as np
 
 from .problems import INERTIA
 
-DIGITS = 40
-ORDER = 30
-STEP = Decimal("0.25")
+DECIMAL_DIGITS = 40
+TAYLOR_ORDER = 30
+TAYLOR_STEP = Decimal("0.25")
 """The series' terms fall by a factor of ten or more at this step for states of norm one: what is left out is 1e-30."""
 
 
-def states(x0, rate: float, t_end: float) -> np.ndarray:
+def exact_state(x0, rate: float, t_end: float) -> np.ndarray:
     """The state at ``t_end``, a multiple of 1/4, from x0; correct to double precision."""
-    with localcontext(prec=DIGITS):
+    with localcontext(prec=DECIMAL_DIGITS):
         x = [Decimal(float(a)) for a in x0]
-        for _ in range(int(Decimal(t_end) / STEP)):
-            series = _series(x, Decimal(rate))
-            x = [sum((c * STEP**n for n, c in enumerate(component)), Decimal(0)) for component in series]
+        for _ in range(int(Decimal(t_end) / TAYLOR_STEP)):
+            series = _taylor_coefficients(x, Decimal(rate))
+            x = [sum((c * TAYLOR_STEP**n for n, c in enumerate(component)), Decimal(0)) for component in series]
         return np.array([float(a) for a in x])
 
 
-def _series(x0: list[Decimal], rate: Decimal) -> list[list[Decimal]]:
+def _taylor_coefficients(x0: list[Decimal], rate: Decimal) -> list[list[Decimal]]:
     """Taylor coefficients of the three components, from those before by the field of :func:`.problems.body_field`."""
     inverse = [1 / Decimal(moment) for moment in INERTIA]
     x: list[list[Decimal]] = [[a] for a in x0]
     w: list[list[Decimal]] = [[], [], []]
     u: list[list[Decimal]] = [[], [], []]
-    for n in range(ORDER):
+    for n in range(TAYLOR_ORDER):
         for i in range(3):
             w[i].append(inverse[i] * x[i][n])
         for i in range(3):
-            u[i].append(x[i][n] + rate * _cross(w, x, i, n))
-        new = [_cross(u, w, i, n) / (n + 1) for i in range(3)]
+            u[i].append(x[i][n] + rate * _cross_coefficient(w, x, i, n))
+        new = [_cross_coefficient(u, w, i, n) / (n + 1) for i in range(3)]
         for i in range(3):
             x[i].append(new[i])
     return x
 
 
-def _cross(a, b, i: int, n: int) -> Decimal:
+def _cross_coefficient(a, b, i: int, n: int) -> Decimal:
     """Coefficient n of component i of the cross product of two series."""
     j, k = (i + 1) % 3, (i + 2) % 3
     return sum((a[j][m] * b[k][n - m] - a[k][m] * b[j][n - m] for m in range(n + 1)), Decimal(0))

@@ -24,13 +24,16 @@ class Table:
 
     def markdown(self) -> str:
         kinds = list(self.columns.values())
-        cells = [[_text(a, kind) for a, kind in zip(row, kinds, strict=True)] for row in self.rows]
+        cells = [[_format_cell(a, kind) for a, kind in zip(row, kinds, strict=True)] for row in self.rows]
         rule = ["---" if kind == "text" else "---:" for kind in kinds]
         for row in cells:  # a number and its unit are not torn apart
             row[:] = [
                 text if kind == "text" else text.replace(" ", "\u00a0") for text, kind in zip(row, kinds, strict=True)
             ]
-        lines = [" | ".join(row) for row in (map(_in_cell, self.columns), rule, *(map(_in_cell, row) for row in cells))]
+        lines = [
+            " | ".join(row)
+            for row in (map(_escape_bars, self.columns), rule, *(map(_escape_bars, row) for row in cells))
+        ]
         return "\n".join([self.caption, "", *(f"| {line} |" for line in lines)])
 
 
@@ -51,8 +54,8 @@ class Target:
         return "met" if (self.measured >= self.bound if self.at_least else self.measured <= self.bound) else "missed"
 
     def row(self) -> list[str]:
-        wanted = f"{'≥' if self.at_least else '≤'} {_text(self.bound, self.kind)}"
-        return [self.work, wanted, _text(self.measured, self.kind), self.verdict]
+        wanted = f"{'≥' if self.at_least else '≤'} {_format_cell(self.bound, self.kind)}"
+        return [self.work, wanted, _format_cell(self.measured, self.kind), self.verdict]
 
 
 @dataclass(frozen=True)
@@ -100,7 +103,7 @@ def targets_table(targets: Sequence[Target]) -> Table:
     return Table("", columns, [target.row() for target in targets])
 
 
-def take_part(builders: Mapping[Any, Callable[[], Any]]) -> tuple[dict[Any, Any], dict[Any, str]]:
+def build_available(builders: Mapping[Any, Callable[[], Any]]) -> tuple[dict[Any, Any], dict[Any, str]]:
     """What each builder returns, and the reasons of those that raise :class:`UnavailableError`."""
     works, skipped = {}, {}
     for name, build in builders.items():
@@ -115,12 +118,12 @@ def ratio(a: float | None, b: float | None) -> float | None:
     return None if a is None or b is None else a / b
 
 
-def _in_cell(text: str) -> str:
+def _escape_bars(text: str) -> str:
     """Bars that belong to the text, not to the table."""
     return text.replace("|", r"\|")
 
 
-def _seconds(s: float) -> str:
+def _format_seconds(s: float) -> str:
     for unit, size in ("s", 1.0), ("ms", 1e-3), ("µs", 1e-6):
         if s >= size:
             return f"{s / size:.3g} {unit}"
@@ -129,7 +132,7 @@ def _seconds(s: float) -> str:
 
 FORMATS: dict[str, Callable[[Any], str]] = {
     "text": str,
-    "seconds": _seconds,
+    "seconds": _format_seconds,
     "ratio": lambda a: f"{a:.3g} ×",
     "about": lambda a: f"{a:.2g} ×",
     "number": lambda a: f"{a:.3g}",
@@ -140,5 +143,5 @@ FORMATS: dict[str, Callable[[Any], str]] = {
 }
 
 
-def _text(a: Any, kind: str) -> str:
+def _format_cell(a: Any, kind: str) -> str:
     return "–" if a is None else FORMATS[kind](a)

@@ -19,18 +19,18 @@ from scipy.integrate import solve_ivp
 import liethermo as lt
 import manifolds as mf
 
-from .peers import module
+from .peers import import_peer
 from .report import UnavailableError
 
-START = (0.1, 1.0, 0.1)
+INITIAL_ANGULAR_VELOCITY = (0.1, 1.0, 0.1)
 """The angular velocity, nearly about the middle axis; the wheel is at rest in the body."""
 
-HEAT = 2.0
+BATH_HEAT_CAPACITY = 2.0
 """The capacity of the bath that the wheel heats; its temperature is 1 at the start."""
 
 
 @dataclass(frozen=True)
-class Body:
+class TumblingBody:
     """Moments of inertia of the body without the turning of its wheel, and the wheel's; without one it is zero."""
 
     inertia: np.ndarray
@@ -50,10 +50,10 @@ class Body:
         """In the body, shape (..., 3), from the angular velocity and the wheel's, relative to the body."""
         return self.inertia * omega + self.wheel * np.multiply.outer(omega[..., 1] + spin, [0.0, 1.0, 0.0])
 
-    def kinetic(self, omega, spin) -> np.ndarray:
+    def kinetic_energy(self, omega, spin) -> np.ndarray:
         return 0.5 * np.sum(self.inertia * omega**2, axis=-1) + 0.5 * self.wheel * (omega[..., 1] + spin) ** 2
 
-    def velocities(self, momentum, wheel) -> tuple[np.ndarray, np.ndarray]:
+    def angular_velocities(self, momentum, wheel) -> tuple[np.ndarray, np.ndarray]:
         """The inverse of :meth:`momentum`, given the wheel's momentum too."""
         rest = momentum - np.multiply.outer(wheel, [0.0, 1.0, 0.0])
         omega = rest / self.inertia
@@ -61,14 +61,14 @@ class Body:
 
 
 @dataclass(frozen=True)
-class Record:
+class MotionRecord:
     """A run at times of equal distance.
 
     Attributes
     ----------
-    momentum, in_space : array, shape (times, 3)
-    kinetic : array, shape (times,)
-    total : array, shape (times,), or None
+    momentum, spatial_momentum : array, shape (times, 3)
+    kinetic_energy : array, shape (times,)
+    total_energy : array, shape (times,), or None
         With the heat, where the program follows it.
     steps : int or None
         How many it took, where it chose.
@@ -77,19 +77,19 @@ class Record:
     """
 
     momentum: np.ndarray
-    in_space: np.ndarray
-    kinetic: np.ndarray
-    total: np.ndarray | None = None
+    spatial_momentum: np.ndarray
+    kinetic_energy: np.ndarray
+    total_energy: np.ndarray | None = None
     steps: int | None = None
     seconds: float | None = None
 
 
-def _record(body: Body, omega, spin, attitude, total=None) -> Record:
+def _motion_record(body: TumblingBody, omega, spin, attitude, total=None) -> MotionRecord:
     momentum = body.momentum(omega, spin)
-    return Record(momentum, np.einsum("tij,tj->ti", attitude, momentum), body.kinetic(omega, spin), total)
+    return MotionRecord(momentum, np.einsum("tij,tj->ti", attitude, momentum), body.kinetic_energy(omega, spin), total)
 
 
-def _of_quaternions(q) -> np.ndarray:
+def _rotation_matrices(q) -> np.ndarray:
     """Rotations, shape (..., 3, 3), of quaternions with the scalar first."""
     w, v = q[..., 0, None, None], q[..., 1:]
     hat = np.cross(v[..., None, :], np.eye(3)).swapaxes(-1, -2)
@@ -99,26 +99,28 @@ def _of_quaternions(q) -> np.ndarray:
 # -- this library -----------------------------------------------------------------------------------------------------
 
 
-def system(body: Body) -> lt.LiePoissonSystem:
+def library_system(body: TumblingBody) -> lt.LiePoissonSystem:
     """The body, with its attitude: mu and, with a wheel, its momentum and the heat of its bearing."""
     if not body.wheel:
         return lt.LiePoissonSystem(mf.so(3), lt.Quadratic(1.0 / body.inertia), group=mf.SO(3))
     whole = body.inertia + np.array([0.0, body.wheel, 0.0])
-    return lt.models.damper_wheel(whole, (0.0, 1.0, 0.0), body.wheel, body.damping, HEAT, 1.0)
+    return lt.models.damper_wheel(whole, (0.0, 1.0, 0.0), body.wheel, body.damping, BATH_HEAT_CAPACITY, 1.0)
 
 
-def library(body: Body, method: lt.OneStepMethod, step: float, t_end: float, times: int) -> Callable[[], Record]:
+def library_run(
+    body: TumblingBody, method: lt.OneStepMethod, step: float, t_end: float, times: int
+) -> Callable[[], MotionRecord]:
     """Steps of one size."""
-    made, omega = system(body), np.array(START)
+    made, omega = library_system(body), np.array(INITIAL_ANGULAR_VELOCITY)
     start = body.momentum(omega, 0.0)
     x0 = [*start, body.wheel * omega[1], 0.0] if body.wheel else start
     every = round(t_end / step / times)
 
-    def work() -> Record:
+    def work() -> MotionRecord:
         solution = lt.integrate(made, x0, (0.0, t_end), step, method, save_every=every)
         x, g = np.asarray(solution.x), np.asarray(solution.attitude)[:, :3, :3]
-        omega, spin = body.velocities(x[:, :3], x[:, 3] if body.wheel else np.zeros(len(x)))
-        return _record(body, omega, spin, g, np.asarray(solution.energy))
+        omega, spin = body.angular_velocities(x[:, :3], x[:, 3] if body.wheel else np.zeros(len(x)))
+        return _motion_record(body, omega, spin, g, np.asarray(solution.energy))
 
     return work
 
@@ -126,26 +128,28 @@ def library(body: Body, method: lt.OneStepMethod, step: float, t_end: float, tim
 # -- SciPy ------------------------------------------------------------------------------------------------------------
 
 
-def scipy(body: Body, tolerance: float, t_end: float, times: int) -> Callable[[], Record]:
+def scipy_run(body: TumblingBody, tolerance: float, t_end: float, times: int) -> Callable[[], MotionRecord]:
     """DOP853 on momentum, wheel, quaternion and heat."""
-    omega, field = np.array(START), _field(body)
+    omega, field = np.array(INITIAL_ANGULAR_VELOCITY), _scipy_field(body)
     x0 = np.array([*body.momentum(omega, 0.0), body.wheel * omega[1], 1.0, 0.0, 0.0, 0.0, 0.0])
     when = np.linspace(0.0, t_end, times + 1)
 
-    def work() -> Record:
+    def work() -> MotionRecord:
         done = solve_ivp(field, (0.0, t_end), x0, method="DOP853", rtol=tolerance, atol=tolerance, t_eval=when)
         if not done.success:
             raise RuntimeError(done.message)
         x = done.y.T
-        omega, spin = body.velocities(x[:, :3], x[:, 3])
+        omega, spin = body.angular_velocities(x[:, :3], x[:, 3])
         heat = x[:, 8]
-        record = _record(body, omega, spin, _of_quaternions(x[:, 4:8]), body.kinetic(omega, spin) + heat)
+        record = _motion_record(
+            body, omega, spin, _rotation_matrices(x[:, 4:8]), body.kinetic_energy(omega, spin) + heat
+        )
         return dataclasses.replace(record, steps=done.nfev // 12)
 
     return work
 
 
-def _field(body: Body) -> Callable:
+def _scipy_field(body: TumblingBody) -> Callable:
     (I1, I2, I3), J, damping, turns = body.inertia, body.wheel or 1.0, body.damping, bool(body.wheel)
 
     @numba.njit
@@ -173,36 +177,38 @@ def _field(body: Body) -> Callable:
 
 # -- MuJoCo -----------------------------------------------------------------------------------------------------------
 
-XML = """
+MUJOCO_MODEL = """
 <mujoco>
   <option gravity="0 0 0" timestep="{step}" integrator="{integrator}"><flag contact="disable"/></option>
   <worldbody><body><freejoint/><inertial pos="0 0 0" mass="1" diaginertia="{hub}"/>{wheel}</body></worldbody>
 </mujoco>
 """
-WHEEL = """
+MUJOCO_WHEEL = """
 <body><inertial pos="0 0 0" mass="1e-6" diaginertia="{disc}"/>
   <joint type="hinge" axis="0 1 0" damping="{damping}"/></body>
 """
 
 
-def mujoco(body: Body, integrator: str, step: float, t_end: float, times: int) -> Callable[[], Record]:
+def mujoco_run(
+    body: TumblingBody, integrator: str, step: float, t_end: float, times: int
+) -> Callable[[], MotionRecord]:
     """A free body, and a wheel on a hinge; the loop of steps is MuJoCo's own."""
-    mj = module("mujoco")
+    mj = import_peer("mujoco")
     numbers = {name: " ".join(map(str, getattr(body, name))) for name in ("hub", "disc")}
-    wheel = WHEEL.format(damping=body.damping, **numbers) if body.wheel else ""
-    model = mj.MjModel.from_xml_string(XML.format(step=step, integrator=integrator, wheel=wheel, **numbers))
+    wheel = MUJOCO_WHEEL.format(damping=body.damping, **numbers) if body.wheel else ""
+    model = mj.MjModel.from_xml_string(MUJOCO_MODEL.format(step=step, integrator=integrator, wheel=wheel, **numbers))
     every = round(t_end / step / times)
 
-    def work() -> Record:
+    def work() -> MotionRecord:
         data = mj.MjData(model)
-        data.qvel[3:6] = START
+        data.qvel[3:6] = INITIAL_ANGULAR_VELOCITY
         states = [np.concatenate([data.qvel, data.qpos[3:7]])]
         for _ in range(times):
             mj.mj_step(model, data, nstep=every)
             states.append(np.concatenate([data.qvel, data.qpos[3:7]]))
         x = np.array(states)
         spin = x[:, 6] if body.wheel else np.zeros(len(x))
-        return _record(body, x[:, 3:6], spin, _of_quaternions(x[:, -4:]))
+        return _motion_record(body, x[:, 3:6], spin, _rotation_matrices(x[:, -4:]))
 
     return work
 
@@ -210,7 +216,7 @@ def mujoco(body: Body, integrator: str, step: float, t_end: float, times: int) -
 # -- Basilisk ---------------------------------------------------------------------------------------------------------
 
 
-BASILISK = (
+BASILISK_MODULES = (
     "Basilisk.simulation.spacecraft",
     "Basilisk.simulation.spinningBodyOneDOFStateEffector",
     "Basilisk.utilities.RigidBodyKinematics",
@@ -219,23 +225,23 @@ BASILISK = (
 )
 
 
-def basilisk(body: Body, step: float, t_end: float, times: int) -> Callable[[], Record]:
+def basilisk_run(body: TumblingBody, step: float, t_end: float, times: int) -> Callable[[], MotionRecord]:
     """A spacecraft under its default integrator, RK4, and a wheel as a spinning body.
 
     What its messages and modules are set up with is not counted: a simulation runs once.
     """
     try:
-        simulated, spinning, tools, macros, simulations = map(importlib.import_module, BASILISK)
+        simulated, spinning, tools, macros, simulations = map(importlib.import_module, BASILISK_MODULES)
     except ImportError:
         why = "Basilisk is not installed; `pip install bsk` in an environment of its own, since it holds pandas back"
         raise UnavailableError(why) from None
 
-    def work() -> Record:
+    def work() -> MotionRecord:
         simulation = simulations.SimBaseClass()
         simulation.CreateNewProcess("process").addTask(simulation.CreateNewTask("task", macros.sec2nano(step)))
         craft = simulated.Spacecraft()
         craft.hub.mHub, craft.hub.IHubPntBc_B = 1.0, np.diag(body.hub).tolist()
-        craft.hub.omega_BN_BInit = [[w] for w in START]
+        craft.hub.omega_BN_BInit = [[w] for w in INITIAL_ANGULAR_VELOCITY]
         simulation.AddModelToTask("task", craft)
         every = macros.sec2nano(t_end / times)
         spins = None
@@ -258,6 +264,6 @@ def basilisk(body: Body, step: float, t_end: float, times: int) -> Callable[[], 
         omega = np.array(states.omega_BN_B)
         attitude = np.array([tools.MRP2C(sigma).T for sigma in states.sigma_BN])
         spin = np.zeros(len(omega)) if spins is None else np.array(spins.thetaDot)
-        return dataclasses.replace(_record(body, omega, spin, attitude), seconds=seconds)
+        return dataclasses.replace(_motion_record(body, omega, spin, attitude), seconds=seconds)
 
     return work

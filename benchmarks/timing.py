@@ -11,31 +11,31 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-SLICE = 0.1
+MIN_TURN_SECONDS = 0.1
 """Seconds that a turn lasts at least: short work, which a disturbance spoils most, is repeated and timed each time."""
 
 
 @dataclass(frozen=True)
-class Outcome:
+class TimedResult:
     """The best times, and what the work returned.
 
     Attributes
     ----------
-    seconds : float
+    wall_seconds : float
         By the clock on the wall.
-    processor : float
+    cpu_seconds : float
         Of the processor: what other processes do is not counted, so that for work in one thread it is what the wall
         would show on an idle machine. Not to be used for work in several: Linux books the time of other threads at its
         next tick, so that the least of many short times is too small.
     result : object
     """
 
-    seconds: float
-    processor: float
+    wall_seconds: float
+    cpu_seconds: float
     result: Any
 
 
-def race(works: Mapping[Any, Callable[[], Any]], *, rounds: int, patience: float = 20.0) -> dict[Any, Outcome]:
+def race(works: Mapping[Any, Callable[[], Any]], *, rounds: int, max_seconds: float = 20.0) -> dict[Any, TimedResult]:
     """Time each work by turns.
 
     Parameters
@@ -43,7 +43,7 @@ def race(works: Mapping[Any, Callable[[], Any]], *, rounds: int, patience: float
     works : dict of functions without arguments
         Each is called once before the first round, which compiles it and fills the caches.
     rounds : int
-    patience : float
+    max_seconds : float
         Seconds after which a contestant sits out the remaining rounds, at least two taken.
 
     Returns
@@ -55,25 +55,25 @@ def race(works: Mapping[Any, Callable[[], Any]], *, rounds: int, patience: float
     spent = dict.fromkeys(works, 0.0)
     for turn in range(rounds):
         for name, work in works.items():
-            if turn < 2 or spent[name] < patience:
-                fastest, total = _turn(work)
+            if turn < 2 or spent[name] < max_seconds:
+                fastest, total = _time_turn(work)
                 best[name] = (min(best[name][0], fastest[0]), min(best[name][1], fastest[1]))
                 spent[name] += total
-    return {name: Outcome(*best[name], results[name]) for name in works}
+    return {name: TimedResult(*best[name], results[name]) for name in works}
 
 
-def once(work: Callable[[], Any]) -> Outcome:
+def time_once(work: Callable[[], Any]) -> TimedResult:
     """Time a work that can only be done once, such as compiling."""
     start, start_processor = time.perf_counter(), time.process_time()
     result = work()
-    return Outcome(time.perf_counter() - start, time.process_time() - start_processor, result)
+    return TimedResult(time.perf_counter() - start, time.process_time() - start_processor, result)
 
 
-def _turn(work) -> tuple[tuple[float, float], float]:
+def _time_turn(work) -> tuple[tuple[float, float], float]:
     seconds = processor = float("inf")
     total = 0.0
-    while total < SLICE:
-        one = once(work)
-        seconds, processor = min(seconds, one.seconds), min(processor, one.processor)
-        total += one.seconds
+    while total < MIN_TURN_SECONDS:
+        one = time_once(work)
+        seconds, processor = min(seconds, one.wall_seconds), min(processor, one.cpu_seconds)
+        total += one.wall_seconds
     return (seconds, processor), total

@@ -19,8 +19,8 @@ import numpy as np
 import liethermo as lt
 import manifolds as mf
 
-FIGURE = Path(__file__).resolve().parent.parent / "docs" / "howto" / "which_method.svg"
-STEPS, MANY = tuple(0.8 / 2**k for k in range(7)), 100
+FIGURE_PATH = Path(__file__).resolve().parent.parent / "docs" / "howto" / "which_method.svg"
+STEP_SIZES, N_RUNS = tuple(0.8 / 2**k for k in range(7)), 100
 
 
 @dataclass(frozen=True)
@@ -28,17 +28,17 @@ class Problem:
     """A system, where it starts, and how long it runs."""
 
     title: str
-    system: Callable[[], lt.System]
-    start: tuple[float, ...]
-    end: float
-    step: float  # of the reference
+    build_system: Callable[[], lt.System]
+    initial_state: tuple[float, ...]
+    t_end: float
+    reference_step: float  # of the reference
 
 
-def _body() -> lt.System:
+def _rigid_body() -> lt.System:
     return lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
 
 
-def _body_in_four() -> lt.System:
+def _so4_body() -> lt.System:
     g = mf.so(4)
     inertia = jnp.array([1.0, 1.5, 2.0, 2.5, 3.0, 3.5])
     return lt.LiePoissonSystem(
@@ -55,7 +55,7 @@ def _oscillator() -> lt.System:
     )
 
 
-def _stiff() -> lt.System:
+def _stiff_exchange() -> lt.System:
     def moving(x):
         return 0.5 * x[1] ** 2 + jnp.exp(x[2])
 
@@ -70,10 +70,10 @@ def _stiff() -> lt.System:
 
 
 PROBLEMS = (
-    Problem("relaxing body, so(3)", _body, (0.06, 0.1, 1.0), 40.0, 0.05),
-    Problem("body in four dimensions, so(4)", _body_in_four, (0.9, 0.3, -0.5, 0.2, 0.6, -0.4), 20.0, 0.05),
+    Problem("relaxing body, so(3)", _rigid_body, (0.06, 0.1, 1.0), 40.0, 0.05),
+    Problem("body in four dimensions, so(4)", _so4_body, (0.9, 0.3, -0.5, 0.2, 0.6, -0.4), 20.0, 0.05),
     Problem("oscillator and its heat", _oscillator, (1.0, 0.0, -2.0), 20.0, 0.05),
-    Problem("stiff exchange of heat", _stiff, (2.0, 0.0, 0.4, 0.0), 10.0, 0.002),
+    Problem("stiff exchange of heat", _stiff_exchange, (2.0, 0.0, 0.4, 0.0), 10.0, 0.002),
 )
 
 METHODS = (
@@ -86,23 +86,27 @@ METHODS = (
 )
 
 
-def measured(problem: Problem) -> dict[str, list[tuple[float, float]]]:
+def measure_methods(problem: Problem) -> dict[str, list[tuple[float, float]]]:
     """For each method points (error, evaluations); a step that a method cannot take from every state has none."""
-    system, span = problem.system(), (0.0, problem.end)
-    states = np.array(problem.start) * (1.0 + 0.1 * np.random.default_rng(0).standard_normal((MANY, system.dim)))
-    exact = lt.ensemble(system, states, span, problem.step, lt.MetriplecticGauss(6), progress=False).x
+    system, span = problem.build_system(), (0.0, problem.t_end)
+    states = np.array(problem.initial_state) * (
+        1.0 + 0.1 * np.random.default_rng(0).standard_normal((N_RUNS, system.dim))
+    )
+    exact = lt.ensemble(system, states, span, problem.reference_step, lt.MetriplecticGauss(6), progress=False).x
     assert exact is not None  # final states are kept
     found: dict[str, list[tuple[float, float]]] = {str(method): [] for method in METHODS}
     for method in METHODS:
-        for step in STEPS:
+        for step in STEP_SIZES:
             many = lt.ensemble(system, states, span, step, method, progress=False)
             if many.ok.all():
                 error = float(np.abs(np.asarray(many.x) - exact).max() / np.abs(exact).max())
-                found[str(method)].append((max(error, 1e-15), float(many.iterations.mean()) * method.evaluations))
+                found[str(method)].append(
+                    (max(error, 1e-15), float(many.iterations.mean()) * method.evaluations_per_iteration)
+                )
     return found
 
 
-def draw(results: dict[str, dict[str, list[tuple[float, float]]]], path: Path) -> None:
+def draw_figure(results: dict[str, dict[str, list[tuple[float, float]]]], path: Path) -> None:
     """One frame for each problem."""
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
@@ -128,15 +132,15 @@ def draw(results: dict[str, dict[str, list[tuple[float, float]]]], path: Path) -
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--figure", type=Path, default=FIGURE)
+    parser.add_argument("--figure", type=Path, default=FIGURE_PATH)
     arguments = parser.parse_args()
     results = {}
     for problem in PROBLEMS:
-        results[problem.title] = measured(problem)
+        results[problem.title] = measure_methods(problem)
         print(problem.title)
         for name, points in results[problem.title].items():
             print(f"  {name:<36}", "  ".join(f"{error:.0e}: {work:.3g}" for error, work in points))
-    draw(results, arguments.figure)
+    draw_figure(results, arguments.figure)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from liethermo.spec.schema import SECTIONS, keys
+from liethermo.spec.schema import SECTIONS, list_spec_keys
 
 FURTHER = {
     "run.step": "`run.step` as a table",
@@ -16,7 +16,7 @@ FURTHER = {
 
 def write_table(path: Path) -> None:
     """One table a section."""
-    listed = keys()
+    listed = list_spec_keys()
     lines: list[str] = []
     for section in dict.fromkeys(section for section, *_ in listed):
         kind = SECTIONS.get(section)

@@ -9,7 +9,7 @@ import importlib
 import importlib.metadata
 
 import manifolds  # noqa: F401  (switches 64-bit mode on before anything is traced)
-from manifolds._names import listing
+from manifolds._names import public_dir
 
 from . import bodies, models, testing
 from .dissipation.base import Dissipation
@@ -77,7 +77,7 @@ from .runs.suggest import MethodSuggestion, suggest_method, suggest_step
 from .studies.axes import Zipped, latin_hypercube, replicas, sobol, zipped
 from .studies.measures import At
 from .studies.progress import StudyStatus
-from .studies.stored import load_study
+from .studies.store_results import load_study
 from .studies.study import Study
 from .systems import (
     AttitudeSystem,
@@ -223,7 +223,7 @@ __all__ = [
 _INTEROP = ("diffrax", "scipy", "sympy")
 
 
-__dir__ = listing(__all__, "__version__")
+__dir__ = public_dir(__all__, "__version__")
 
 
 def __getattr__(name: str):

@@ -5,7 +5,7 @@ Units are SI or any others that are consistent; angles are in radians.
 
 from __future__ import annotations
 
-from manifolds._names import listing
+from manifolds._names import public_dir
 
 from .models.free_motion import Periods, damping_time, periods, rate_of
 from .models.inertia import PrincipalAxes, principal_axes
@@ -23,4 +23,4 @@ __all__ = [
     "rate_of",
     "spin",
 ]
-__dir__ = listing(__all__)
+__dir__ = public_dir(__all__)

@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from .systems import System
     from .systems.check import CheckReport
 
-FAILED = 1
+EXIT_LAWS_FAILED = 1
 """Exit status where a law or an axiom fails, or the run stopped early."""
 
-UNUSABLE = 2
+EXIT_BAD_INPUT = 2
 """Exit status for a spec or a file that cannot be used."""
 
 app = typer.Typer(
@@ -37,7 +37,7 @@ app = typer.Typer(
 )
 
 
-def _tell_version(wanted: bool) -> None:
+def _print_version(wanted: bool) -> None:
     if wanted:
         from importlib.metadata import version
 
@@ -48,16 +48,16 @@ def _tell_version(wanted: bool) -> None:
 @app.callback()
 def _options(
     version: Annotated[
-        bool, typer.Option("--version", callback=_tell_version, is_eager=True, help="Say the version and exit.")
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Say the version and exit.")
     ] = False,
 ) -> None: ...
 
 
-Changes = Annotated[
+SetOptions = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="In place of what the spec says, for example run.step=0.01."),
 ]
-Allowed = Annotated[
+AllowedModules = Annotated[
     list[str] | None,
     typer.Option("--allow", metavar="MODULE", help="A module that the spec may name though it is not beside it."),
 ]
@@ -66,7 +66,7 @@ SpecFile = Annotated[Path, typer.Argument(metavar="SPEC.toml", help="The run, de
 
 
 @contextlib.contextmanager
-def _told() -> Iterator[None]:
+def _report_errors() -> Iterator[None]:
     """Tell the library's errors in a message and an exit status, without a traceback."""
     from manifolds import ManifoldsError
 
@@ -76,26 +76,26 @@ def _told() -> Iterator[None]:
         yield
     except (LiethermoError, ManifoldsError) as error:
         typer.echo(f"liethermo: {error}", err=True)
-        raise typer.Exit(FAILED if isinstance(error, AxiomError) else UNUSABLE) from error
+        raise typer.Exit(EXIT_LAWS_FAILED if isinstance(error, AxiomError) else EXIT_BAD_INPUT) from error
 
 
 @app.command()
-@_told()
+@_report_errors()
 def run(
     spec: SpecFile,
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder for the results; by default named after the spec, here.")
     ] = None,
-    change: Changes = None,
-    allow: Allowed = None,
+    change: SetOptions = None,
+    allow: AllowedModules = None,
 ) -> None:
     """Run a spec file: integrate, audit the laws, and write result, figures and a copy of the spec into a folder."""
     from .runs.integrate import integrate
     from .spec import read
 
     plan = read(spec, change or (), allow or ())
-    system = plan.system()
-    folder = _folder(spec, Path(spec.stem) if out is None else out)
+    system = plan.build_system()
+    folder = _prepare_result_folder(spec, Path(spec.stem) if out is None else out)
     start, end = plan.run.t_span
     typer.echo(plan.summary)
     file = folder / plan.outputs.netcdf
@@ -115,13 +115,13 @@ def run(
     passed = _print_audit(solution)
     if not solution.status.ok:
         typer.echo(f"The run stopped early. The trajectory up to t = {solution.t[-1]:g} is kept.")
-    figures = _draw(plan, system, solution, folder)
+    figures = _draw_figures(plan, system, solution, folder)
     typer.echo(f"In {folder}{os.sep}: {', '.join([file.name, *figures, spec.name])}")
-    raise typer.Exit(0 if passed and solution.status.ok else FAILED)
+    raise typer.Exit(0 if passed and solution.status.ok else EXIT_LAWS_FAILED)
 
 
 @app.command()
-@_told()
+@_report_errors()
 def study(
     spec: SpecFile,
     out: Annotated[
@@ -130,37 +130,37 @@ def study(
     cluster: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler, such as tcp://10.0.0.1:8786.")
     ] = None,
-    change: Changes = None,
-    allow: Allowed = None,
+    change: SetOptions = None,
+    allow: AllowedModules = None,
 ) -> None:
     """Run the study of a spec file, or what of it is not done yet; audit the laws, and draw a measure."""
     from .spec import read
-    from .spec.study import study_of
+    from .spec.study import build_study
 
     plan = read(spec, change or (), allow or ())
     store = Path(f"{spec.stem}.zarr") if out is None else out
-    found = study_of(plan, store)
+    found = build_study(plan, store)
     typer.echo(plan.summary)
-    with _client(cluster, spec.resolve().parent) as client:
+    with _dask_client(cluster, spec.resolve().parent) as client:
         reached = found.run(client)
     typer.echo(str(reached))
     passed = _print_table(found.audit())
     if plan.study is not None and reached.done:
         _draw_study(store, plan.study.figure, store.with_suffix(f".{plan.outputs.figure_format}"))
-    raise typer.Exit(0 if passed and reached.ok else FAILED)
+    raise typer.Exit(0 if passed and reached.ok else EXIT_LAWS_FAILED)
 
 
 @app.command()
-@_told()
+@_report_errors()
 def status(store: StoreFolder) -> None:
     """Tell how far the study in a store is, also while it runs."""
-    from .studies.stored import status as told_of
+    from .studies.store_results import load_status as told_of
 
     typer.echo(str(told_of(store)))
 
 
 @app.command()
-@_told()
+@_report_errors()
 def plot(
     store: StoreFolder,
     measure: Annotated[str | None, typer.Option(metavar="NAME", help="By default the first that can be drawn.")] = None,
@@ -171,20 +171,20 @@ def plot(
 
 
 @app.command()
-@_told()
-def check(spec: SpecFile, change: Changes = None, allow: Allowed = None) -> None:
+@_report_errors()
+def check(spec: SpecFile, change: SetOptions = None, allow: AllowedModules = None) -> None:
     """Validate a spec file and test the axioms of its system at random points, without running it."""
     from .spec import read
 
     plan = read(spec, change or (), allow or (), lambda what: typer.echo(f"{spec}: {what}"))
     if plan.study is not None:
-        from .spec.study import study_of
+        from .spec.study import build_study
 
-        study_of(plan, "unused.zarr")
-    report = plan.system().check()
+        build_study(plan, "unused.zarr")
+    report = plan.build_system().check()
     typer.echo(f"{spec}: the spec is valid")
     _print_table(report)
-    raise typer.Exit(0 if report.passed else FAILED)
+    raise typer.Exit(0 if report.passed else EXIT_LAWS_FAILED)
 
 
 @app.command()
@@ -219,7 +219,7 @@ def methods() -> None:
 
 
 @app.command()
-@_told()
+@_report_errors()
 def audit(file: Annotated[Path, typer.Argument(metavar="FILE.nc", help="A result of `liethermo run`.")]) -> None:
     """Audit the laws of a saved run."""
     from .results.load import load
@@ -228,7 +228,7 @@ def audit(file: Annotated[Path, typer.Argument(metavar="FILE.nc", help="A result
     typer.echo(
         f"{file}: {solution.provenance.get('system', 'a system')}, {solution.provenance.get('method', 'a method')}"
     )
-    raise typer.Exit(0 if _print_audit(solution) else FAILED)
+    raise typer.Exit(0 if _print_audit(solution) else EXIT_LAWS_FAILED)
 
 
 def main() -> None:
@@ -239,7 +239,7 @@ def main() -> None:
 # -- helpers --------------------------------------------------------------------------------------------------------
 
 
-def _folder(spec: Path, folder: Path) -> Path:
+def _prepare_result_folder(spec: Path, folder: Path) -> Path:
     """The folder of the results, made ready, with a copy of the spec: a place that cannot be written shows at once."""
     from .errors import FileError
 
@@ -252,7 +252,7 @@ def _folder(spec: Path, folder: Path) -> Path:
     return folder
 
 
-def _draw(plan: Spec, system: System, solution: Solution, folder: Path) -> list[str]:
+def _draw_figures(plan: Spec, system: System, solution: Solution, folder: Path) -> list[str]:
     """Draw the figures of a spec; returns the names of their files."""
     os.environ.setdefault("MPLBACKEND", "agg")  # files only: no window, and no screen needed
     from .results import plot
@@ -286,7 +286,7 @@ def _print_table(table: Audit | CheckReport) -> bool:
 
 
 @contextlib.contextmanager
-def _client(address: str | None, folder: Path) -> Iterator[Any]:
+def _dask_client(address: str | None, folder: Path) -> Iterator[Any]:
     """A client of a Dask cluster, which is sent what is defined in a folder; None where no address was given."""
     if address is None:
         yield None
@@ -294,13 +294,13 @@ def _client(address: str | None, folder: Path) -> Iterator[Any]:
     from distributed import Client
 
     from .errors import FileError
-    from .spec.trust import sent
+    from .spec.trust import pickle_by_value
 
     try:
         client = Client(address, timeout=20)
     except (OSError, ValueError) as error:
         raise FileError(f"there is no Dask scheduler at {address}: {error}") from error
-    with client, sent(folder):
+    with client, pickle_by_value(folder):
         yield client
 
 
@@ -309,7 +309,7 @@ def _draw_study(store: Path, measure: str | None, file: Path) -> None:
     os.environ.setdefault("MPLBACKEND", "agg")
     from .errors import InputError
     from .results.plot import study as draw
-    from .studies.stored import load_study
+    from .studies.store_results import load_study
 
     try:
         draw(load_study(store), measure, file)

@@ -12,19 +12,21 @@ import socket
 import time
 from pathlib import Path
 
-PART = ".part"
+PART_SUFFIX = ".part"
 """How the name of a file ends that is being written."""
 
-OLD = 86_400.0
+STALE_PART_SECONDS = 86_400.0
 """Seconds after which a part that another machine has left is taken for that of a dead process."""
 
-NAMED = re.compile(r"\.[0-9a-f]{12}\.([0-9a-f]{8})\.(\d+)\.[0-9a-f]{16}\.part")
+PART_NAME_PATTERN = re.compile(r"\.[0-9a-f]{12}\.([0-9a-f]{8})\.(\d+)\.[0-9a-f]{16}\.part")
 """Names of parts: what they are to become, the machine and the process that write them, and a random number."""
 
-WRITING = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)
+EXCLUSIVE_WRITE_FLAGS = (
+    os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)
+)
 
 
-def write(path: Path, data: bytes | memoryview, mode: int = 0o666) -> None:
+def write_atomically(path: Path, data: bytes | memoryview, mode: int = 0o666) -> None:
     """Write a file whole: under a random name of its own, then renamed. The last of several writers wins.
 
     Parts that dead processes have left of the same file are removed.
@@ -39,10 +41,10 @@ def write(path: Path, data: bytes | memoryview, mode: int = 0o666) -> None:
         raise OSError(errno.EEXIST, "what is there is no plain file")
     try:
         try:
-            handle = os.open(part, WRITING, mode)
+            handle = os.open(part, EXCLUSIVE_WRITE_FLAGS, mode)
         except FileNotFoundError:
             path.parent.mkdir(parents=True, exist_ok=True)
-            handle = os.open(part, WRITING, mode)
+            handle = os.open(part, EXCLUSIVE_WRITE_FLAGS, mode)
         with os.fdopen(handle, "wb") as file:
             file.write(data)
         os.replace(part, path)
@@ -54,13 +56,13 @@ def write(path: Path, data: bytes | memoryview, mode: int = 0o666) -> None:
 
 def part_name(name: str) -> str:
     """A name for a part of a file or folder of this name."""
-    return f".{_short(name, 12)}.{_short(socket.gethostname(), 8)}.{os.getpid()}.{secrets.token_hex(8)}{PART}"
+    return f".{_name_digest(name, 12)}.{_name_digest(socket.gethostname(), 8)}.{os.getpid()}.{secrets.token_hex(8)}{PART_SUFFIX}"
 
 
-def sweep(folder: Path, name: str) -> None:
+def remove_dead_parts(folder: Path, name: str) -> None:
     """Remove the parts of a file or folder of this name that dead processes have left."""
     with contextlib.suppress(OSError):
-        for entry in folder.glob(f".{_short(name, 12)}.*{PART}"):
+        for entry in folder.glob(f".{_name_digest(name, 12)}.*{PART_SUFFIX}"):
             if is_dead(entry):
                 with contextlib.suppress(OSError):
                     entry.unlink()
@@ -68,11 +70,11 @@ def sweep(folder: Path, name: str) -> None:
 
 def is_dead(part: Path) -> bool:
     """Whether no process writes this part any more."""
-    named = NAMED.fullmatch(part.name)
+    named = PART_NAME_PATTERN.fullmatch(part.name)
     if named is None:
         return False
-    if named[1] != _short(socket.gethostname(), 8):
-        return time.time() - part.lstat().st_mtime > OLD
+    if named[1] != _name_digest(socket.gethostname(), 8):
+        return time.time() - part.lstat().st_mtime > STALE_PART_SECONDS
     try:
         os.kill(int(named[2]), 0)
     except ProcessLookupError:
@@ -82,7 +84,7 @@ def is_dead(part: Path) -> bool:
     return False
 
 
-def why(error: OSError | ValueError) -> str:
+def why_os_failed(error: OSError | ValueError) -> str:
     """What went wrong, in words; a ValueError means that it is not a path."""
     if not isinstance(error, OSError):
         return str(error)
@@ -91,5 +93,5 @@ def why(error: OSError | ValueError) -> str:
     return str(error.strerror or error)
 
 
-def _short(name: str, digits: int) -> str:
+def _name_digest(name: str, digits: int) -> str:
     return hashlib.sha256(name.encode("utf-8", "surrogateescape")).hexdigest()[:digits]

@@ -35,7 +35,7 @@ class IndexOutOfRangeError(FunctionError, IndexError):
             f'x.at[{index}].get(mode="clip")'
         )
 
-    def of(self, function: str) -> IndexOutOfRangeError:
+    def with_function(self, function: str) -> IndexOutOfRangeError:
         """Return the same error, saying which function has the index."""
         return type(self)(self.index, self.size, self.where, function)
 

@@ -6,8 +6,8 @@ round them away.
 
 import importlib
 
-from . import _fork, _precision, testing  # noqa: F401
-from ._names import listing
+from . import _fork_guard, _precision, testing  # noqa: F401
+from ._names import public_dir
 from .algebras.blocks import DirectSum, power
 from .algebras.casimirs import NoPolynomialCasimirWarning
 from .algebras.catalogue import abelian, aff, bianchi, g2, galilei, gl, heisenberg, registered, se, sl, so, sp, su, u
@@ -37,7 +37,7 @@ from .errors import (
 )
 from .groups.catalogue import GL, SE, SL, SO, SU, Heisenberg, Sp
 from .groups.matrix_group import MatrixGroup, registered_groups
-from .matrices.divided import ScalarFunction
+from .matrices.divided_differences import ScalarFunction
 from .matrices.spectral import spectral, spectral_difference, spectral_trace
 from .retractions.charts import (
     CayleyRetraction,
@@ -196,7 +196,7 @@ __all__ = [
     "trilinear_form",
     "u",
 ]
-__dir__ = listing(__all__)
+__dir__ = public_dir(__all__)
 
 
 def __getattr__(name: str):

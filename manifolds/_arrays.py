@@ -18,7 +18,7 @@ def is_traced(*values) -> bool:
 
 def real_components(x, dim: int, what: str) -> jax.Array:
     """``x`` as a real array of doubles with last axis ``dim``."""
-    array = jnp.asarray(as_numeric(x, what))
+    array = jnp.asarray(numeric_array(x, what))
     if jnp.issubdtype(array.dtype, jnp.complexfloating):
         raise ComponentError(f"{what} must be real, not {array.dtype}: take its real part if that is meant")
     if array.ndim == 0 or array.shape[-1] != dim:
@@ -28,35 +28,35 @@ def real_components(x, dim: int, what: str) -> jax.Array:
 
 def square_matrices(x, size: int, what: str) -> jax.Array:
     """``x`` as an array of doubles (or complex doubles) with last axes ``(size, size)``."""
-    array = jnp.asarray(as_numeric(x, what))
+    array = jnp.asarray(numeric_array(x, what))
     if array.shape[-2:] != (size, size):
         raise ShapeError(f"{what} must have last axes ({size}, {size}), but its shape is {array.shape}")
     complex_input = jnp.issubdtype(array.dtype, jnp.complexfloating)
     return array.astype(jnp.complex128 if complex_input else jnp.float64)
 
 
-def first(failed: np.ndarray) -> tuple[int, ...] | None:
+def first_true_index(failed: np.ndarray) -> tuple[int, ...] | None:
     """Index of the first true entry, or None."""
     return tuple(int(i) for i in np.argwhere(failed)[0]) if failed.any() else None
 
 
-def at(index: tuple[int, ...]) -> str:
+def format_index(index: tuple[int, ...]) -> str:
     """An index as a message shows it after the name of an array: nothing where there is one entry alone."""
     return f"[{', '.join(map(str, index))}]" if index else ""
 
 
-def as_numeric(x, what: str):
+def numeric_array(x, what: str):
     """``x`` as an array of numbers, of NumPy or JAX."""
     if isinstance(x, jax.Array):
         return x
     try:
         array = np.asarray(x)
-        return array.astype(np.float64) if array.dtype == object else _numeric(array)
+        return array.astype(np.float64) if array.dtype == object else _require_numeric_dtype(array)
     except (TypeError, ValueError) as error:
         raise ComponentError(f"{what} is not a rectangular array of numbers: {error}") from None
 
 
-def _numeric(array: np.ndarray) -> np.ndarray:
+def _require_numeric_dtype(array: np.ndarray) -> np.ndarray:
     if not np.issubdtype(array.dtype, np.number) and array.dtype != bool:
         raise TypeError(f"dtype {array.dtype}")
     return array
@@ -71,16 +71,16 @@ def real_array(value) -> jax.Array:
     return jnp.asarray(np.asarray(value, dtype=np.float64))
 
 
-SELECTED = 4
+MAX_SELECT_COLUMNS = 4
 """Arrays up to which the entries of one are selected among them."""
 
 
-def interleaved(columns: Sequence[jax.Array]) -> jax.Array:
+def stack_columns(columns: Sequence[jax.Array]) -> jax.Array:
     """Arrays of one shape as the columns of one, shape (..., columns).
 
     A few by selection: the loop of a concatenation has a branch for every entry.
     """
-    if len(columns) > SELECTED:
+    if len(columns) > MAX_SELECT_COLUMNS:
         return jnp.stack(columns, axis=-1)
     *others, found = (column[..., None] for column in columns)
     for i, column in enumerate(others):

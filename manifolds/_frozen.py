@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
-from ._keys import key
+from ._content_keys import content_key
 
 
 class FrozenFunction:
@@ -24,19 +24,19 @@ class FrozenFunction:
 
     Attributes
     ----------
-    closed : ClosedJaxpr
+    closed_jaxpr : ClosedJaxpr
     """
 
     def __init__(self, function: Callable, shape: tuple[int, ...]):
         self.function, self.shape = function, shape
         x = jax.ShapeDtypeStruct(shape, jnp.float64)
-        self.closed: ClosedJaxpr = jax.make_jaxpr(lambda x: jnp.asarray(function(x)))(
+        self.closed_jaxpr: ClosedJaxpr = jax.make_jaxpr(lambda x: jnp.asarray(function(x)))(
             x
         )  # JAX keeps the trace of a function
-        self._key = key(self.closed)
+        self._key = content_key(self.closed_jaxpr)
 
     def __call__(self, x):
-        return jaxpr_as_fun(self.closed)(jnp.asarray(x, dtype=jnp.float64))[0]
+        return jaxpr_as_fun(self.closed_jaxpr)(jnp.asarray(x, dtype=jnp.float64))[0]
 
     def __eq__(self, other) -> bool:
         return isinstance(other, FrozenFunction) and self._key == other._key

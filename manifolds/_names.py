@@ -21,6 +21,6 @@ def component_names(names: tuple[str, ...] | None, dim: int) -> tuple[str, ...]:
     return tuple(f"mu{i + 1}" for i in range(dim)) if names is None else names
 
 
-def listing(names, *more: str) -> Callable[[], list[str]]:
+def public_dir(names, *more: str) -> Callable[[], list[str]]:
     """``__dir__`` of a module: what is public, not the modules that are imported there."""
     return lambda: sorted({*names, *more, "__doc__", "__name__"})

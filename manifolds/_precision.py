@@ -16,15 +16,15 @@ jax.config.update("jax_enable_x64", True)  # before anything is traced
 
 F = TypeVar("F", bound=Callable)
 
-OWN = ("allow", "standard", False)
+LIBRARY_SETTINGS = ("allow", "standard", False)
 """Rank promotion, dtype promotion and the search for infinities, as the code of this library has them."""
 
-_asked: ContextVar[tuple[Any, ...] | None] = ContextVar("asked", default=None)
+_saved_user_settings: ContextVar[tuple[Any, ...] | None] = ContextVar("asked", default=None)
 """What the user has them at, while code of this library runs."""
 
 
 @contextlib.contextmanager
-def own_settings() -> Iterator[None]:
+def library_settings() -> Iterator[None]:
     """Run code of this library: its ranks are promoted, and infinities in its searches are no faults.
 
     Raises
@@ -39,45 +39,45 @@ def own_settings() -> Iterator[None]:
             'rounding then. Switch it on again with jax.config.update("jax_enable_x64", True)'
         )
     asked = (config.jax_numpy_rank_promotion, config.jax_numpy_dtype_promotion, config.jax_debug_infs)
-    if asked == OWN:
+    if asked == LIBRARY_SETTINGS:
         yield
         return
-    token = _asked.set(asked)
+    token = _saved_user_settings.set(asked)
     try:
-        with _set(OWN):
+        with _apply_settings(LIBRARY_SETTINGS):
             yield
     finally:
-        _asked.reset(token)
+        _saved_user_settings.reset(token)
 
 
 @contextlib.contextmanager
-def users_settings() -> Iterator[None]:
+def user_settings() -> Iterator[None]:
     """Run a function of the user's as the user has JAX set."""
-    asked = _asked.get()
+    asked = _saved_user_settings.get()
     if asked is None:
         yield
         return
-    token = _asked.set(None)
+    token = _saved_user_settings.set(None)
     try:
-        with _set(asked):
+        with _apply_settings(asked):
             yield
     finally:
-        _asked.reset(token)
+        _saved_user_settings.reset(token)
 
 
-def by_own_settings(function: F) -> F:
-    """A function that users call, run under :func:`own_settings`."""
+def with_library_settings(function: F) -> F:
+    """A function that users call, run under :func:`library_settings`."""
 
     @functools.wraps(function)
     def called(*arguments, **named):
-        with own_settings():
+        with library_settings():
             return function(*arguments, **named)
 
     return cast("F", called)
 
 
 @contextlib.contextmanager
-def _set(values: tuple[Any, ...]) -> Iterator[None]:
+def _apply_settings(values: tuple[Any, ...]) -> Iterator[None]:
     ranks, kinds, infinities = values
     with jax.numpy_rank_promotion(ranks), jax.numpy_dtype_promotion(kinds), jax.debug_infs(infinities):
         yield

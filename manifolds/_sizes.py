@@ -19,14 +19,14 @@ def checked_size(value: int, least: int, name: str, what: str = "n") -> int:
 
 def check_memory(numbers: float, what: str, instead: str, number_size: int = 8) -> None:
     """Raise SizeError where an array of so many numbers would not fit into half of this machine's memory."""
-    needed, there = float(numbers) * number_size, memory()
+    needed, there = float(numbers) * number_size, memory_bytes()
     if needed > there / 2:
         raise SizeError(
             f"{what} would take {needed / 1e9:.3g} GB, and this machine has {there / 1e9:.3g} GB of memory; {instead}"
         )
 
 
-def memory() -> float:
+def memory_bytes() -> float:
     """The bytes of memory of this machine; 16 GB where it does not say."""
     try:
         return float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")

@@ -8,11 +8,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from html import escape
 
-VERDICT = {True: "ok", False: "FAILS", None: "-"}
+VERDICT_TEXTS = {True: "ok", False: "FAILS", None: "-"}
 
 
 @dataclass(frozen=True)
-class Row:
+class TableRow:
     """What was measured, what is allowed, and the verdict (None where nothing is asked)."""
 
     name: str
@@ -26,43 +26,43 @@ class Tabular(ABC):
     """What prints as a table, and shows as one in a notebook."""
 
     @abstractmethod
-    def _table(self) -> tuple[Iterable[Row], tuple[str, str, str], str]:
+    def _table_content(self) -> tuple[Iterable[TableRow], tuple[str, str, str], str]:
         """The rows, their headings, and a last line."""
 
     def __str__(self) -> str:
-        return table(*self._table())
+        return text_table(*self._table_content())
 
     def _repr_html_(self) -> str:
-        return html_table(*self._table())
+        return html_table(*self._table_content())
 
 
-WIDTH = 80
+PAGE_WIDTH = 80
 """Columns of a terminal, and of a page."""
 
-NUMBERS = 30
+NUMBER_COLUMNS_WIDTH = 30
 """Columns of what stands behind the name of a row."""
 
 
-def table(rows: Iterable[Row], headings: tuple[str, str, str], last: str) -> str:
+def text_table(rows: Iterable[TableRow], headings: tuple[str, str, str], last: str) -> str:
     """The rows under their headings, and a last line; names and notes that are too long go on in lines of their own."""
     rows = list(rows)
-    width = min(max([len(headings[0]), *(len(row.name) for row in rows)]), WIDTH - NUMBERS)
+    width = min(max([len(headings[0]), *(len(row.name) for row in rows)]), PAGE_WIDTH - NUMBER_COLUMNS_WIDTH)
     lines = [f"{headings[0]:<{width}}  {headings[1]:>10}  {headings[2]:>9}"]
     for row in rows:
-        *above, name = wrapped(row.name, width, "  ")
+        *above, name = wrap_lines(row.name, width, "  ")
         allowed = " " * 9 if row.allowed is None or row.passed is None else f"{row.allowed:9.1e}"
-        line = f"{name:<{width}}  {row.value:10.2e}  {allowed}  {VERDICT[row.passed]:<5}"
+        line = f"{name:<{width}}  {row.value:10.2e}  {allowed}  {VERDICT_TEXTS[row.passed]:<5}"
         short = f"{line} {row.note}".rstrip()
-        fits = len(short) <= WIDTH
+        fits = len(short) <= PAGE_WIDTH
         lines += [
             *above,
             short if fits else line.rstrip(),
-            *([] if fits else wrapped(f"    {row.note}", WIDTH, "    ")),
+            *([] if fits else wrap_lines(f"    {row.note}", PAGE_WIDTH, "    ")),
         ]
-    return "\n".join([*lines, *wrapped(last, WIDTH)])
+    return "\n".join([*lines, *wrap_lines(last, PAGE_WIDTH)])
 
 
-def wrapped(text: str, width: int = WIDTH, hang: str = "") -> list[str]:
+def wrap_lines(text: str, width: int = PAGE_WIDTH, hang: str = "") -> list[str]:
     """Lines of at most so many columns, broken between words; a word that is longer stays whole."""
     found = [
         textwrap.wrap(line, width, subsequent_indent=hang, break_long_words=False, break_on_hyphens=False) or [""]
@@ -71,14 +71,14 @@ def wrapped(text: str, width: int = WIDTH, hang: str = "") -> list[str]:
     return [line for lines in found for line in lines]
 
 
-def html_table(rows: Iterable[Row], headings: tuple[str, str, str], last: str) -> str:
+def html_table(rows: Iterable[TableRow], headings: tuple[str, str, str], last: str) -> str:
     """The same table for a notebook."""
     cells = [
         (
             row.name,
             f"{row.value:.2e}",
             "" if row.allowed is None or row.passed is None else f"{row.allowed:.1e}",
-            VERDICT[row.passed],
+            VERDICT_TEXTS[row.passed],
             row.note,
         )
         for row in rows

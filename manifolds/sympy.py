@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import sympy
 
-from ._names import component_names, listing
+from ._names import component_names, public_dir
 from .algebras.lie_algebra import LieAlgebra
 from .algebras.polynomial import Polynomial
 from .errors import ComponentError, ShapeError
 
 __all__ = ["algebra", "expression", "polynomial", "structure_constants", "symbols"]
-__dir__ = listing(__all__)
+__dir__ = public_dir(__all__)
 
 
 def symbols(dim: int, names: Sequence[str] | None = None) -> tuple[sympy.Symbol, ...]:

@@ -15,7 +15,7 @@ import numpy as np
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.functions.energy import as_energy
+from liethermo.functions.energy import make_energy
 
 EPS = float(np.finfo(float).eps)
 
@@ -101,7 +101,7 @@ def entropy_of(g: mf.LieAlgebra):
             found = g.casimirs(degree)
         if found:
             # of several quadratic ones the sum: se(3) has |p|^2 and l.p
-            return as_energy(found[0], "S")
+            return make_energy(found[0], "S")
     raise AssertionError(f"no Casimir known for {g.name}: add one to TRANSCENDENTAL")
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from llvmlite import ir
 
 from liethermo.engines.compiled.machine_code import MachineCode
-from liethermo.engines.compiled.writer import NUMBER, WHOLE, Writer
+from liethermo.engines.compiled.writer import FLOAT64, INT64, ProgramWriter
 from liethermo.tracing.scalarize import Program
 
 CALL = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
@@ -19,20 +19,22 @@ def compiled(program: Program, lanes: int = 1):
     starts = np.concatenate([[0], np.cumsum(sizes)])
     outputs = [len(entries) for entries in program.outputs]
     module = ir.Module()
-    pointer = NUMBER.as_pointer()
+    pointer = FLOAT64.as_pointer()
     function = ir.Function(module, ir.FunctionType(ir.VoidType(), [pointer, pointer]), "run")
     build = ir.IRBuilder(function.append_basic_block())
-    writer = Writer(build, lanes)
+    writer = ProgramWriter(build, lanes)
 
     def place(base, row: int):
-        return build.bitcast(build.gep(base, [ir.Constant(WHOLE, row * lanes)]), writer.number.as_pointer())
+        return build.bitcast(build.gep(base, [ir.Constant(INT64, row * lanes)]), writer.double_type.as_pointer())
 
-    found = writer.write(program, lambda i, j: build.load(place(function.args[0], int(starts[i]) + j), align=8))
+    found = writer.write_as_doubles(
+        program, lambda i, j: build.load(place(function.args[0], int(starts[i]) + j), align=8)
+    )
     for row, value in enumerate(itertools.chain.from_iterable(found)):
         build.store(value, place(function.args[1], row), align=8)
     build.ret_void()
     code = MachineCode(module)
-    run = CALL(code.address("run"))
+    run = CALL(code.function_address("run"))
 
     def call(*arrays):
         columns = [np.asarray(a, dtype=np.float64).reshape(lanes, -1) for a in arrays]

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from liethermo.tracing.builder import meaning
+from liethermo.tracing.builder import implementation
 from liethermo.tracing.program import Program
 from liethermo.tracing.scalarize import scalarize
 from tests.cases import EPS
@@ -49,7 +49,7 @@ def nudged(program: Program, args, seed: int, composed: bool = False) -> list[np
     values = dict(zip(names, given, strict=True))
     with np.errstate(all="ignore"):
         for target, op, operands in program.instructions:
-            result = meaning(op)(*(values[a] if isinstance(a, str) else a for a in operands))
+            result = implementation(op)(*(values[a] if isinstance(a, str) else a for a in operands))
             values[target] = moved(result, EPS_SINGLE if composed and op == "single" else EPS)
     return [np.array([values[a] if isinstance(a, str) else a for a in row], float) for row in program.outputs]
 

@@ -12,24 +12,24 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from benchmarks import child, front, laws, native, page, reference, simulators
-from benchmarks.__main__ import RESULTS, main
-from benchmarks.contest import difference
-from benchmarks.heat_bath import heat_bath
+from benchmarks import child, first_page, laws, native, page, reference, simulators
+from benchmarks.__main__ import RESULT_FOLDER, main
+from benchmarks.contest import max_difference_from_c
+from benchmarks.heat_bath import sample_heat_bath
 from benchmarks.laws import Laws
 from benchmarks.measurements import magnet, manifolds, memory, spin, tumbling, variational
-from benchmarks.native import Bodies, Body
-from benchmarks.peers import scipy
-from benchmarks.problems import X0, body, body_parameters, general_body, general_parameters, random_states
+from benchmarks.native import BodyProgram, EnsembleProgram
+from benchmarks.peers import scipy_run
+from benchmarks.problems import X0, body_parameters, general_body, general_parameters, quadratic_body, random_states
 from benchmarks.report import Report, Table, Target, UnavailableError
 from benchmarks.timing import race
 from liethermo import MetriplecticGauss
-from liethermo.engines.codes import Code
-from liethermo.engines.rules import RULES
+from liethermo.engines.codes import StatusCode
+from liethermo.engines.rules import DEFAULT_OPTIONS
 
 ROOT = Path(__file__).resolve().parent.parent
 
-needs_compiler = pytest.mark.skipif(native.compiler() is None, reason="no C compiler")
+needs_compiler = pytest.mark.skipif(native.find_c_compiler() is None, reason="no C compiler")
 
 
 @pytest.fixture
@@ -38,9 +38,9 @@ def bare(monkeypatch):
     monkeypatch.setenv("CC", "no-such-compiler")
     for name in ("diffrax", "heyoka"):
         monkeypatch.setitem(sys.modules, name, None)
-    native.program.cache_clear()
+    native.compile_library.cache_clear()
     yield
-    native.program.cache_clear()
+    native.compile_library.cache_clear()
 
 
 @pytest.mark.slow
@@ -60,10 +60,10 @@ def test_the_driver_on_a_bare_machine(bare, tmp_path, capsys):
     assert rows["SciPy DOP853"][-1] == "broken: energy"
 
     with pytest.raises(ValueError, match="holds no results"):  # quick ones do not count
-        page.write(tmp_path, tmp_path / "page.md")
+        page.write_pages(tmp_path, tmp_path / "page.md")
     result["quick"] = False
     (tmp_path / "work_precision.json").write_text(json.dumps(result))
-    page.write(tmp_path, tmp_path / "page.md")
+    page.write_pages(tmp_path, tmp_path / "page.md")
     assert "| midpoint, array engine | 500 steps |" in (tmp_path / "benchmarks_runs.md").read_text()
     assert (tmp_path / "work_precision.svg").read_text().count("SciPy DOP853") == 1
 
@@ -72,7 +72,7 @@ PAGES = ROOT / "docs" / "reference"
 
 
 def test_both_pages_are_those_of_the_kept_results(tmp_path):
-    page.write(RESULTS, tmp_path / "benchmarks.md")
+    page.write_pages(RESULT_FOLDER, tmp_path / "benchmarks.md")
     for name in ("benchmarks.md", "benchmarks_runs.md"):
         assert (tmp_path / name).read_text() == (PAGES / name).read_text(), (
             f"{name}: python -m benchmarks --kept --page"
@@ -88,13 +88,15 @@ def test_a_page_has_one_row_a_comparison_and_escapes_bars():
     assert [len(re.findall(r"(?<!\\)\|", line)) for line in lines] == [4, 4, 4]
     rows = [["ours", 2.0, "hold"], ["peer, slow", 9.0, "hold"], ["peer, quick", 1.0, "broken: energy"]]
     report = Report("", "", [Table("", {"": "text", "Time": "seconds", "Laws": "text"}, rows)])
-    pair = front.Pair("some", 0, "work", "ours", "peer")
-    found = front._compared(report, pair)
-    assert found == front.Comparison("work", "peer, quick", 2.0, 1.0, "hold", "broken: energy")  # the fastest counts
-    (sentence, laws) = front.sentences([dataclasses.replace(found, peer="heyoka")])
+    pair = first_page.RowPair("some", 0, "work", "ours", "peer")
+    found = first_page._compare_rows(report, pair)
+    assert found == first_page.PeerComparison(
+        "work", "peer, quick", 2.0, 1.0, "hold", "broken: energy"
+    )  # the fastest counts
+    (sentence, laws) = first_page.summary_sentences([dataclasses.replace(found, peer="heyoka")])
     assert "faster in 0 of 1 tasks" in sentence
     assert "1 of 1 runs of this library and in 0 of theirs" in laws
-    assert front._compared(report, dataclasses.replace(pair, theirs="nobody")) is None
+    assert first_page._compare_rows(report, dataclasses.replace(pair, theirs="nobody")) is None
 
 
 def test_the_statistics_of_the_magnet():
@@ -103,7 +105,7 @@ def test_the_statistics_of_the_magnet():
     x = random.standard_normal(n)
     for i in range(1, n):
         x[i] = rho * x[i - 1] + np.sqrt(1 - rho**2) * x[i]
-    time = magnet.autocorrelation(x)
+    time = magnet.integrated_autocorrelation(x)
     assert abs(time / ((1 + rho) / (2 * (1 - rho))) - 1.0) < 0.2  # 0.06 is its standard error
     rows = np.column_stack([x, x, np.zeros((n, 2))])
     mean, error = magnet.with_error(lambda s, chosen: s.energy[chosen].mean(), _series(rows))
@@ -133,23 +135,23 @@ def test_where_the_cumulants_of_two_lattices_are_equal():
     b = _series(np.column_stack([square**2, np.sqrt(square), np.zeros((n, 2))]), T)
     slopes = (cumulant(T + 1e-3) - cumulant(T - 1e-3)) / 2e-3, 0.0
     for series, slope, value in zip((a, b), slopes, (cumulant(T), 1.0 - np.pi / 6.0), strict=True):
-        for quantity, exact in (magnet.slope, slope), (magnet.cumulant, value):
+        for quantity, exact in (magnet.cumulant_slope, slope), (magnet.binder_cumulant, value):
             found, error = magnet.with_error(quantity, series)
             assert abs(found - exact) < 4 * error < 0.05
-    found, error = magnet.crossing(a, b)
+    found, error = magnet.cumulant_crossing(a, b)
     assert abs(found - equal) < 4 * error < 0.4 * equal
-    assert np.abs(np.array(magnet.crossing(b, a)) - (found, error)).max() < 1e-12
-    assert magnet.crossings([a, b])[0][1:3] == [found, error]
-    both = magnet.joined([a, b])
+    assert np.abs(np.array(magnet.cumulant_crossing(b, a)) - (found, error)).max() < 1e-12
+    assert magnet.crossing_rows([a, b])[0][1:3] == [found, error]
+    both = magnet.join_runs([a, b])
     assert both.steps == 2 * n
-    assert len(both.rows) == len(a.settled().rows) + len(b.settled().rows)
+    assert len(both.samples) == len(a.equilibrated().rows) + len(b.equilibrated().rows)
 
 
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("T", [10.0, 20.0])
 def test_monte_carlo_of_the_magnet_at_high_temperatures(T):
     """The energy of a bond is Langevin's function of J / kT there, but for loops of four bonds."""
-    (rows,) = heat_bath(6, [T], 400)
+    (rows,) = sample_heat_bath(6, [T], 400)
     energies = rows[:, 0].reshape(20, -1).mean(axis=1)
     exact = -3.0 * (1.0 / np.tanh(1.0 / T) - T)
     assert abs(energies.mean() - exact) < 4 * energies.std() / np.sqrt(19) + 4.0 / (3 * T) ** 3
@@ -164,28 +166,28 @@ def test_the_driver_refuses_unknown_names(capsys):
 
 
 def test_c_is_handed_the_library_s_rules():
-    header = (native.SOURCES / "rules.h").read_text()
-    used = set(re.findall(r"\b[A-Z_]{4,}\b", "".join(p.read_text() for p in native.SOURCES.glob("*.[ch]"))))
-    for flag in native.rules():
+    header = (native.SOURCE_FOLDER / "rules.h").read_text()
+    used = set(re.findall(r"\b[A-Z_]{4,}\b", "".join(p.read_text() for p in native.SOURCE_FOLDER.glob("*.[ch]"))))
+    for flag in native.solver_definitions():
         name, value = flag.removeprefix("-D").split("=")
         assert name in used
-        assert float(value) == getattr(RULES, name.lower())
+        assert float(value) == getattr(DEFAULT_OPTIONS, name.lower())
         assert f"define {name}" not in header
     statuses = re.search(r"enum \{ (.*) \};", header)
     assert statuses is not None
-    assert statuses[1].split(", ") == ["RUNNING", *(code.name for code in (Code(1), Code(2)))]
+    assert statuses[1].split(", ") == ["RUNNING", *(code.name for code in (StatusCode(1), StatusCode(2)))]
 
 
 @pytest.mark.sampled(1)
 @needs_compiler
 @pytest.mark.parametrize(
     ("source", "parameters", "system"),
-    [("rigid_body.c", body_parameters, body), ("general.c", general_parameters, general_body)],
+    [("rigid_body.c", body_parameters, quadratic_body), ("general.c", general_parameters, general_body)],
 )
 def test_c_runs_the_same_scheme(source, parameters, system):
-    assert difference(Body(source, parameters(1.0)), system(1.0)) <= 1e-12
+    assert max_difference_from_c(BodyProgram(source, parameters(1.0)), system(1.0)) <= 1e-12
     with pytest.raises(RuntimeError, match="differ by"):  # another rate is another trajectory
-        difference(Body(source, parameters(1.001)), system(1.0))
+        max_difference_from_c(BodyProgram(source, parameters(1.001)), system(1.0))
 
 
 @needs_compiler
@@ -193,20 +195,20 @@ def test_c_runs_the_same_scheme(source, parameters, system):
     "number", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)]
 )
 def test_c_runs_the_same_variational_scheme(number):
-    assert variational.difference(number) <= 1e-12
+    assert variational.max_difference_from_c(number) <= 1e-12
 
 
 @needs_compiler
 @pytest.mark.parametrize("way", ["without charts", pytest.param("in charts", marks=pytest.mark.slow)])
 def test_c_moves_the_same_spin(way):
-    assert spin.difference(way) <= 1e-12
+    assert spin.max_difference_from_c(way) <= 1e-12
     with pytest.raises(RuntimeError, match="differ by"):
-        spin.difference(way, 0.0301)
+        spin.max_difference_from_c(way, 0.0301)
 
 
 @needs_compiler
 def test_lanes_do_as_one_body_does():
-    bodies, alone = Bodies(body_parameters(1.0)), Body("rigid_body.c", body_parameters(1.0))
+    bodies, alone = EnsembleProgram(body_parameters(1.0)), BodyProgram("rigid_body.c", body_parameters(1.0))
     x0s = random_states(19)  # no multiple of the lanes
     summaries = bodies.integrate(x0s, 0.05, 200, threads=3)
     for x0, summary in zip(x0s, summaries, strict=True):
@@ -219,39 +221,41 @@ def test_lanes_do_as_one_body_does():
 @needs_compiler
 def test_a_c_program_that_fails_says_so():
     with pytest.raises(RuntimeError, match="stopped early: not_converged"):
-        Body("rigid_body.c", body_parameters(1.0)).integrate([0.1, 1.0, 0.1], 3.0, 5)
+        BodyProgram("rigid_body.c", body_parameters(1.0)).integrate([0.1, 1.0, 0.1], 3.0, 5)
     with pytest.raises(RuntimeError, match="stopped early: not_converged"):
-        Bodies(body_parameters(1.0)).integrate([[0.0, 1.0, 0.0], [0.1, 1.0, 0.1]], 3.0, 5, threads=1)
+        EnsembleProgram(body_parameters(1.0)).integrate([[0.0, 1.0, 0.0], [0.1, 1.0, 0.1]], 3.0, 5, threads=1)
     with pytest.raises(RuntimeError, match="stopped early: non_finite"):
-        Bodies(body_parameters(1.0)).integrate([[0.1, 1.0, 0.1], [np.nan, 0.0, 1.0]], 0.1, 5, threads=1)
+        EnsembleProgram(body_parameters(1.0)).integrate([[0.1, 1.0, 0.1], [np.nan, 0.0, 1.0]], 0.1, 5, threads=1)
 
 
 def test_the_reference_is_the_trajectory(monkeypatch):
     """Against SciPy, which knows nothing of series, and against itself with another step."""
     x0 = [0.3, -0.8, 0.5]
-    exact = reference.states(x0, 0.7, 5.0)
-    assert np.abs(scipy(1e-13, x0, 5.0, 0.7).end() - exact).max() < 1e-11
-    assert np.abs(reference.states(x0, 0.71, 5.0) - exact).max() > 1e-3
-    monkeypatch.setattr(reference, "STEP", reference.STEP / 2)
-    assert np.array_equal(reference.states(x0, 0.7, 5.0), exact)
+    exact = reference.exact_state(x0, 0.7, 5.0)
+    assert np.abs(scipy_run(1e-13, x0, 5.0, 0.7).solve_end() - exact).max() < 1e-11
+    assert np.abs(reference.exact_state(x0, 0.71, 5.0) - exact).max() > 1e-3
+    monkeypatch.setattr(reference, "STEP", reference.TAYLOR_STEP / 2)
+    assert np.array_equal(reference.exact_state(x0, 0.7, 5.0), exact)
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not memory.STATUS.is_file(), reason="this system does not tell a process its largest size")
+@pytest.mark.skipif(
+    not memory.PROCESS_STATUS_FILE.is_file(), reason="this system does not tell a process its largest size"
+)
 def test_a_process_is_not_charged_its_parent_s_memory():
     """getrusage would: its figure survives the start of another program."""
     large = np.ones(100_000_000)
-    small = child.python("-c", "from benchmarks.measurements.memory import resident; print(resident())")
-    assert 1e7 < float(small) < large.nbytes < memory.resident()
+    small = child.run_python("-c", "from benchmarks.measurements.memory import resident; print(resident())")
+    assert 1e7 < float(small) < large.nbytes < memory.peak_resident_bytes()
 
 
 @needs_compiler
 def test_c_steers_the_energy():
     """A general energy keeps its value over a long run, as the library's does; without steering it is off by 5e-13."""
-    _, run = Body("general.c", general_parameters(1e-3)).integrate(X0, 0.1, 300_000)
-    assert laws.of_runs(run).energy_drift < 2e-14
-    _, run = Body("general.c", general_parameters(1e-3), "-DSTEERED=INFINITY").integrate(X0, 0.1, 300_000)
-    assert laws.of_runs(run).energy_drift > 2e-14
+    _, run = BodyProgram("general.c", general_parameters(1e-3)).integrate(X0, 0.1, 300_000)
+    assert laws.c_run_laws(run).energy_drift < 2e-14
+    _, run = BodyProgram("general.c", general_parameters(1e-3), "-DSTEERED=INFINITY").integrate(X0, 0.1, 300_000)
+    assert laws.c_run_laws(run).energy_drift > 2e-14
 
 
 @pytest.mark.parametrize(
@@ -270,10 +274,10 @@ def test_verdicts(bound, measured, at_least, verdict):
 
 
 def test_broken_laws_are_named():
-    assert Laws(1e-15, 0.0).cells()[-1] == "hold"
-    assert Laws(1e-15, None).cells()[-1] == "hold"
-    assert Laws(1e-12, -1e-12).cells()[-1] == "broken: energy, entropy"
-    assert Laws(float("nan"), 0.0).cells()[-1] == "broken: energy"
+    assert Laws(1e-15, 0.0).table_cells()[-1] == "hold"
+    assert Laws(1e-15, None).table_cells()[-1] == "hold"
+    assert Laws(1e-12, -1e-12).table_cells()[-1] == "broken: energy, entropy"
+    assert Laws(float("nan"), 0.0).table_cells()[-1] == "broken: energy"
 
 
 def test_a_race_takes_turns():
@@ -282,27 +286,27 @@ def test_a_race_takes_turns():
     turns = re.sub(r"(.)\1+", r"\1", "".join(taken))
     assert turns == "ab" * 4  # one before the first round
     assert outcomes["b"].result == 7
-    assert 0.0 < outcomes["a"].seconds < 0.02
+    assert 0.0 < outcomes["a"].wall_seconds < 0.02
 
 
-@pytest.mark.parametrize("body", [tumbling.FREE, tumbling.DAMPED], ids=["free", "damped"])
+@pytest.mark.parametrize("body", [tumbling.FREE_BODY, tumbling.DAMPED_BODY], ids=["free", "damped"])
 def test_the_tumbling_body_is_one_in_the_library_and_in_scipy(body):
-    ours = simulators.library(body, MetriplecticGauss(3), 0.05, 5.0, 10)()
-    exact = simulators.scipy(body, 1e-12, 5.0, 10)()
-    other = simulators.scipy(dataclasses.replace(body, inertia=1.001 * body.inertia), 1e-12, 5.0, 10)()
+    ours = simulators.library_run(body, MetriplecticGauss(3), 0.05, 5.0, 10)()
+    exact = simulators.scipy_run(body, 1e-12, 5.0, 10)()
+    other = simulators.scipy_run(dataclasses.replace(body, inertia=1.001 * body.inertia), 1e-12, 5.0, 10)()
     assert np.abs(ours.momentum - exact.momentum).max() <= 1e-9  # measured: 6e-11
-    assert np.abs(ours.in_space - exact.in_space).max() <= 1e-9
-    assert ours.total is not None
-    assert np.ptp(ours.total) <= 1e-14
+    assert np.abs(ours.spatial_momentum - exact.spatial_momentum).max() <= 1e-9
+    assert ours.total_energy is not None
+    assert np.ptp(ours.total_energy) <= 1e-14
     assert np.abs(ours.momentum - other.momentum).max() > 1e-4
 
 
-@pytest.mark.parametrize("body", [tumbling.FREE, tumbling.DAMPED], ids=["free", "damped"])
+@pytest.mark.parametrize("body", [tumbling.FREE_BODY, tumbling.DAMPED_BODY], ids=["free", "damped"])
 def test_the_tumbling_body_is_one_in_mujoco(body):
     pytest.importorskip("mujoco")
-    theirs = simulators.mujoco(body, "RK4", 0.01, 5.0, 10)()
-    exact = simulators.scipy(body, 1e-12, 5.0, 10)()
-    assert np.abs(theirs.in_space - exact.in_space).max() <= 1e-9
+    theirs = simulators.mujoco_run(body, "RK4", 0.01, 5.0, 10)()
+    exact = simulators.scipy_run(body, 1e-12, 5.0, 10)()
+    assert np.abs(theirs.spatial_momentum - exact.spatial_momentum).max() <= 1e-9
     assert np.abs(theirs.momentum - exact.momentum).max() <= 1e-9
 
 
@@ -310,14 +314,14 @@ def test_simulators_that_are_missing_are_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
     monkeypatch.setitem(sys.modules, "Basilisk.simulation.spacecraft", None)
     with pytest.raises(UnavailableError, match="mujoco is not installed"):
-        simulators.mujoco(tumbling.FREE, "RK4", 0.01, 1.0, 1)
+        simulators.mujoco_run(tumbling.FREE_BODY, "RK4", 0.01, 1.0, 1)
     with pytest.raises(UnavailableError, match="Basilisk is not installed"):
-        simulators.basilisk(tumbling.FREE, 0.01, 1.0, 1)
+        simulators.basilisk_run(tumbling.FREE_BODY, 0.01, 1.0, 1)
 
 
 def test_gradient_flows_beside_steepest_descent_of_pymanopt():
     """The difference is that of their steps, of first order: it halves with them, and is gone where they vanish."""
     pytest.importorskip("pymanopt")
-    for _, _, whole, half, extrapolated in manifolds.beside_pymanopt():
+    for _, _, whole, half, extrapolated in manifolds.pymanopt_rows():
         assert 1.9 < half / whole < 2.1
         assert extrapolated < 0.02 * whole

@@ -12,8 +12,8 @@ import pytest
 
 import liethermo as lt
 from liethermo.spec import read
-from liethermo.spec.study import study_of
-from liethermo.studies.stored import audit, load_study, status
+from liethermo.spec.study import build_study
+from liethermo.studies.store_results import audit_store, load_status, load_study
 from tests.liethermo.results.test_files import rewritten
 
 REFUSED = (lt.LiethermoError, lt.FileError)
@@ -107,7 +107,7 @@ def test_stores(tmp_path, count):
         chunk=2,
     )
     study.run()
-    points, judged, whole = status(store).points, audit(store).passed, load_study(store).load()
+    points, judged, whole = load_status(store).points, audit_store(store).passed, load_study(store).load()
     files = sorted(path for path in store.rglob("*") if path.is_file() and path.name != ".lock")
     random, told = np.random.default_rng(3), []
     for _ in range(count // 4):
@@ -116,15 +116,15 @@ def test_stores(tmp_path, count):
         path.write_bytes(damaged(content, random))
         start = time.perf_counter()
         try:
-            found = status(store)
+            found = load_status(store)
             assert found.points == points
-            assert audit(store).passed == judged or found.done < points
+            assert audit_store(store).passed == judged or found.done < points
             assert load_study(store).load().identical(whole) or found.done < points
         except lt.FileError as error:
             told.append(str(error))
         assert time.perf_counter() - start < SOON
         path.write_bytes(content)
-    assert status(store).complete
+    assert load_status(store).complete
     assert told
     assert not any("\n" in text for text in told)
 
@@ -161,7 +161,7 @@ def test_specs(tmp_path, count, monkeypatch):
     random, path, told = np.random.default_rng(4), tmp_path / "spec.toml", []
     monkeypatch.setattr(os, "system", lambda command: pytest.fail(f"it ran {command}"))
     path.write_text(text)
-    study_of(read(path), tmp_path / "unused.zarr")
+    build_study(read(path), tmp_path / "unused.zarr")
     for _ in range(count // 2):
         where, length = int(random.integers(len(text))), int(random.integers(0, 12))
         token = TOKENS[random.integers(len(TOKENS))]
@@ -171,9 +171,9 @@ def test_specs(tmp_path, count, monkeypatch):
             warnings.simplefilter("ignore")
             try:
                 plan = read(path)
-                plan.system()
+                plan.build_system()
                 if plan.study is not None:
-                    study_of(plan, tmp_path / "unused.zarr")
+                    build_study(plan, tmp_path / "unused.zarr")
             except REFUSED as error:
                 told.append(str(error))
         assert time.perf_counter() - start < SOON

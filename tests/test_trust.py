@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 import liethermo as lt
 from liethermo.cli import app
 from liethermo.spec import read
-from liethermo.spec.trust import sent
+from liethermo.spec.trust import pickle_by_value
 
 RUN = "[run]\ninitial = [0.1, 1.0, 0.1]\nt_span = [0.0, 1.0]\nstep = 0.1\n"
 MINE = """
@@ -137,7 +137,7 @@ def test_what_is_beside_the_spec_is_sent_to_workers(folder):
     assert (
         "No module named 'mine_of_trust'" in subprocess.run(command, capture_output=True, text=True, check=False).stderr
     )
-    with sent(folder):
+    with pickle_by_value(folder):
         packed.write_bytes(cloudpickle.dumps(build))
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.stdout.strip() == "LiePoissonSystem", done.stderr

@@ -1,6 +1,6 @@
 """The measurements, by name, in the order of the page."""
 
-NAMES = (
+MEASUREMENT_NAMES = (
     "single_body",
     "isolated_body",
     "general",

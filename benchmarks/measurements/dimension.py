@@ -15,7 +15,7 @@ def run(quick: bool) -> Report:
         f"Runs of {steps:,} steps of size {growth.STEP}, each algebra in a new process on one core with an empty "
         "cache. *Compiling* is what the first call takes longer than later ones: tracing and compiling."
     )
-    table = growth.table(caption, names, steps, rounds)
+    table = growth.growth_table(caption, names, steps, rounds)
     ratios = {row[0]: row[6] for row in table.rows}
     text = (
         "A body on each algebra, with a quadratic energy, `KillingDissipation` and the Casimir of the Killing form as "
@@ -30,4 +30,4 @@ def run(quick: bool) -> Report:
 
 def child(name: str, steps: str, rounds: str) -> dict:
     """The part that runs in a process of its own."""
-    return growth.measure(name, int(steps), int(rounds))
+    return growth.measure_engines(name, int(steps), int(rounds))

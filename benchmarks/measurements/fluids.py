@@ -14,10 +14,10 @@ from ..isospectral import IsospectralMidpoint
 from ..report import Report, Table, Target
 from ..timing import race
 
-DEGREES, TURN, RATE = (2, 12), 0.05, 1e-3
+VORTICITY_DEGREES, TURN_PER_STEP, DECAY_RATE = (2, 12), 0.05, 1e-3
 """Degrees of the first vorticity; how far the fastest part of the fluid turns in a step, in radians; of the decay."""
 
-LONG, MAGNETIC_RATE = 10_000, 1e-4
+LONG_RUN_STEPS, MAGNETIC_RATE = 10_000, 1e-4
 """Steps in which the invariants of the magnetic fluid are followed, and of its friction."""
 
 METHOD = lt.MetriplecticRungeKutta(4)
@@ -29,7 +29,7 @@ def run(quick: bool) -> Report:
     rows, targets = [], []
     for N in sizes:
         steps, rounds = (2, 1) if quick else (max(4, 10_240 // N), 1 if N > 256 else 3)
-        found, ratio = process.call("fluids", "plain", str(N), str(steps), str(rounds), one_core=True)
+        found, ratio = process.run_child("fluids", "plain", str(N), str(steps), str(rounds), one_core=True)
         rows += found
         if not quick and N in (128, 256):
             targets.append(
@@ -45,7 +45,7 @@ def run(quick: bool) -> Report:
         "Iterations": "number",
     }
     caption = (
-        f"Steps in which the fluid turns by {TURN} radians; relative changes of the energy and of the Casimirs in all "
+        f"Steps in which the fluid turns by {TURN_PER_STEP} radians; relative changes of the energy and of the Casimirs in all "
         "of them. Both run in a process of one core, and the time is that of the processor. Without decay the Casimirs "
         "are to stay; with it the enstrophy, tr W^2, falls and never rises."
     )
@@ -54,29 +54,29 @@ def run(quick: bool) -> Report:
         "NumPy and machine code, without dissipation. The library takes steps of `MetriplecticRungeKutta(4)` with "
         "selective decay, the energy exact and the entropy never falling."
     )
-    magnetic, more = with_field(quick)
+    magnetic, more = magnetic_tables(quick)
     tables = [Table(caption, columns, rows), *magnetic]
     return Report("Large matrix algebras: a fluid on the sphere", text, tables, targets + more, {})
 
 
-def with_field(quick: bool) -> tuple[list[Table], list[Target]]:
+def magnetic_tables(quick: bool) -> tuple[list[Table], list[Target]]:
     """A step with a magnetic field beside one without, and the invariants in many steps."""
     sizes = (12,) if quick else (64, 128, 256)
-    steps, rounds, long = (4, 1, 20) if quick else (40, 3, LONG)
+    steps, rounds, long = (4, 1, 20) if quick else (40, 3, LONG_RUN_STEPS)
     rows, targets = [], []
     for N in sizes:
-        found = process.call("fluids", "beside", str(N), str(steps), str(rounds), one_core=True)
+        found = process.run_child("fluids", "beside", str(N), str(steps), str(rounds), one_core=True)
         rows.append([N, *found, found[1] / found[0]])
         targets.append(Target(f"a step with a magnetic field beside one without, su({N})", 2.5, rows[-1][-1]))
     beside = Table(
         "A step without decay of `zeitlin` and of `magnetic_fluid` at the same N, by the same method, each so long "
-        f"that its fastest part turns by {TURN} radians.",
+        f"that its fastest part turns by {TURN_PER_STEP} radians.",
         {"N": "count", "Without": "seconds", "With": "seconds", "Ratio": "ratio"},
         rows,
     )
     kept, runs = [], [(12, 0.0)] if quick else [(64, 0.0), (64, MAGNETIC_RATE), (128, 0.0), (256, 0.0)]
     for N, rate in runs:
-        found = process.call("fluids", "kept", str(N), str(long), str(rate))
+        found = process.run_child("fluids", "kept", str(N), str(long), str(rate))
         kept.append([N, "ideal" if rate == 0.0 else "with friction", *found])
         if rate == 0.0:
             work = f"{long:,} steps of a magnetic fluid, su({N}): energy, cross helicity and tr B^3"
@@ -84,7 +84,7 @@ def with_field(quick: bool) -> tuple[list[Table], list[Target]]:
     names = ("Energy, largest change", "Energy, last by first", "tr W B", "tr B^2", "tr B^3", "tr B^4", "tr W B^2")
     columns = {"N": "count", "": "text", "Time of the run": "seconds"}
     caption = (
-        f"{long:,} steps, each so long that the fastest wave turns by {TURN} radians; the largest relative changes "
+        f"{long:,} steps, each so long that the fastest wave turns by {TURN_PER_STEP} radians; the largest relative changes "
         "along the run. Cross helicity and traces are computed from the matrices of the states, apart from the "
         "library's own. Friction is to lower the energy alone. The trace of the fourth power is not followed by the "
         "steps, so it is kept to their order."
@@ -95,27 +95,31 @@ def with_field(quick: bool) -> tuple[list[Table], list[Target]]:
 
 def child(what: str, *given: str):
     """The part that runs in a process of its own."""
-    parts: dict[str, Callable] = {"plain": plain, "beside": beside_plain, "kept": kept_in}
+    parts: dict[str, Callable] = {
+        "plain": race_isospectral,
+        "beside": time_with_and_without_field,
+        "kept": invariant_changes,
+    }
     return parts[what](*given)
 
 
-def spread(q: lt.models.QuantisedSphere, mu) -> float:
+def max_turning_rate(q: lt.models.QuantisedSphere, mu) -> float:
     """How fast what the state is the stream function of turns at most."""
     return float(q.gamma * np.ptp(np.linalg.eigvalsh(1j * np.asarray(q.matrix(mu)))))
 
 
-def magnetic_start(N: int) -> tuple:
+def magnetic_initial_state(N: int) -> tuple:
     """A flow and a field, as states of their own and as one, and the steps of the flow alone and of both."""
-    q, degrees = lt.models.QuantisedSphere(N), (min(DEGREES[0], N - 1), min(DEGREES[1], N - 1))
+    q, degrees = lt.models.QuantisedSphere(N), (min(VORTICITY_DEGREES[0], N - 1), min(VORTICITY_DEGREES[1], N - 1))
     W, B = q.random(0, degrees, 4.0), q.random(1, degrees, 1.0)
-    turn = spread(q, q.inverse_laplacian(W))
-    return q, W, q.magnetic_state(W, B), TURN / turn, TURN / max(turn, spread(q, B))
+    turn = max_turning_rate(q, q.inverse_laplacian(W))
+    return q, W, q.magnetic_state(W, B), TURN_PER_STEP / turn, TURN_PER_STEP / max(turn, max_turning_rate(q, B))
 
 
-def beside_plain(*numbers: str) -> list[float]:
+def time_with_and_without_field(*numbers: str) -> list[float]:
     """Times of a step without a magnetic field and with one, without the call."""
     N, steps, rounds = map(int, numbers)
-    _, W, x, alone, both = magnetic_start(N)
+    _, W, x, alone, both = magnetic_initial_state(N)
     works = {
         (name, count): functools.partial(
             lt.integrate, system, start, (0.0, count * h), h, METHOD, save_every=count, engine="array"
@@ -127,12 +131,12 @@ def beside_plain(*numbers: str) -> list[float]:
         for count in (2, 2 + steps)
     }
     found = race(works, rounds=rounds)
-    return [(found[n, 2 + steps].processor - found[n, 2].processor) / steps for n in ("without", "with")]
+    return [(found[n, 2 + steps].cpu_seconds - found[n, 2].cpu_seconds) / steps for n in ("without", "with")]
 
 
-def kept_in(N: str, steps: str, rate: str) -> list[float]:
+def invariant_changes(N: str, steps: str, rate: str) -> list[float]:
     """The time of a run, and the largest relative changes of what the magnetic fluid is to keep."""
-    q, _, x, _, h = magnetic_start(int(N))
+    q, _, x, _, h = magnetic_initial_state(int(N))
     system, count = lt.models.magnetic_fluid(int(N), float(rate)), int(steps)
     run = lt.integrate(system, x, (0.0, count * h), h, METHOD, save_every=max(1, count // 20), engine="array")
     energy = run.stats.energy_range or (run.energy.min(), run.energy.max())
@@ -153,14 +157,14 @@ def kept_in(N: str, steps: str, rate: str) -> list[float]:
 norm = np.linalg.norm
 
 
-def plain(*numbers: str):
+def race_isospectral(*numbers: str):
     """Both in one process; the rows of the table and the ratio of the times."""
     N, steps, rounds = map(int, numbers)
     q = lt.models.QuantisedSphere(N)
-    x = q.random(0, (min(DEGREES[0], N - 1), min(DEGREES[1], N - 1)), 4.0)
+    x = q.random(0, (min(VORTICITY_DEGREES[0], N - 1), min(VORTICITY_DEGREES[1], N - 1)), 4.0)
     W, scheme = np.asarray(q.matrix(x)), IsospectralMidpoint(N)
-    h = TURN / (q.gamma * np.abs(np.linalg.eigvalsh(1j * scheme.stream(W))).max() * 2.0)
-    system = lt.models.zeitlin(N, "enstrophy", RATE)
+    h = TURN_PER_STEP / (q.gamma * np.abs(np.linalg.eigvalsh(1j * scheme.stream_matrix(W))).max() * 2.0)
+    system = lt.models.zeitlin(N, "enstrophy", DECAY_RATE)
     span, method = (0.0, h * steps), METHOD
     ours = functools.partial(lt.integrate, system, x, span, h, method, save_every=steps, engine="array", progress=False)
     peer = functools.partial(scheme.integrate, W, h * q.gamma, steps)
@@ -173,16 +177,16 @@ def plain(*numbers: str):
     energy = solution.stats.energy_range
     low, high = energy if energy is not None else (solution.energy.min(), solution.energy.max())
     drift, kept = abs(scheme.energy(after) / scheme.energy(W) - 1.0), (high - low) / abs(solution.energy[0])
-    changed = _casimirs(W, np.asarray(q.matrix(solution.x[-1])))
-    ratio = float(mine.processor / theirs.processor)
+    changed = _casimir_changes(W, np.asarray(q.matrix(solution.x[-1])))
+    ratio = float(mine.cpu_seconds / theirs.cpu_seconds)
     rows = [
-        [N, name, theirs.processor / steps, 1.0, drift, *_casimirs(W, after), iterations],
-        [N, own_name, mine.processor / steps, ratio, float(kept), *changed, None],
+        [N, name, theirs.cpu_seconds / steps, 1.0, drift, *_casimir_changes(W, after), iterations],
+        [N, own_name, mine.cpu_seconds / steps, ratio, float(kept), *changed, None],
     ]
     return rows, ratio
 
 
-def _casimirs(before: np.ndarray, after: np.ndarray) -> list[float]:
+def _casimir_changes(before: np.ndarray, after: np.ndarray) -> list[float]:
     """Relative changes of the traces of powers 2 to 4, the odd one relative to that of its absolute values."""
     a, b = (np.linalg.eigvalsh(1j * W) for W in (before, after))
     return [float(abs((b**k).sum() - (a**k).sum()) / (np.abs(a) ** k).sum()) for k in (2, 3, 4)]

@@ -14,20 +14,20 @@ import liethermo as lt
 import manifolds as mf
 
 from .. import laws
-from ..contest import STEP
+from ..contest import STEP_SIZE
 from ..report import Report, Table, Target, ratio
 from ..timing import race
 
-INERTIA, START = jnp.array([1.0, 2.0, 3.0]), (0.3, 1.0, -0.5)
+INERTIA, INITIAL_STATE = jnp.array([1.0, 2.0, 3.0]), (0.3, 1.0, -0.5)
 KNOTS = jnp.linspace(-3.0, 3.0, 400)
 
 
-def matrix(m):
+def definite_matrix(m):
     """Positive definite, its eigenvalues apart."""
     return jnp.diag(jnp.array([2.0, 4.0, 7.0])) + 0.3 * jnp.outer(m, m)
 
 
-def root(s):
+def newton_root(s):
     """By Newton's method, in as many passes as it takes."""
 
     def off(carried):
@@ -37,23 +37,23 @@ def root(s):
 
 
 FUNCTIONS = {
-    "`while_loop`, a square root": lambda m: root(1.0 + m @ m),
+    "`while_loop`, a square root": lambda m: newton_root(1.0 + m @ m),
     "`scan`, 400 passes": lambda m: lax.scan(lambda c, t: (c + 0.01 * jnp.cos(t * m[0] + c), None), m[2], KNOTS)[0],
     "`cond`": lambda m: lax.cond(m[1] > 9.0, lambda a: jnp.sin(a[0]), lambda a: a[0] ** 4, m),
     "`interp`": lambda m: jnp.interp(m[0] ** 3 + m[1], KNOTS, 0.5 * KNOTS),
     "complex numbers": lambda m: jnp.abs((m[0] + 1j * m[1] + 2.0) ** 3 * jnp.exp(0.1j * m[2])),
-    "`eigvalsh`, 3 × 3": lambda m: jnp.sum(jnp.exp(0.2 * jnp.linalg.eigvalsh(matrix(m)))),
-    "`solve`, 3 × 3": lambda m: m @ jnp.linalg.solve(matrix(m), m),
-    "`slogdet`, 3 × 3": lambda m: jnp.linalg.slogdet(matrix(m))[1],
-    "`svd`, 3 × 3": lambda m: jnp.sum(jnp.linalg.svd(matrix(m), compute_uv=False)),
-    "`cholesky`, 3 × 3": lambda m: jnp.sum(jnp.log(jnp.diag(jnp.linalg.cholesky(matrix(m))))),
-    "`expm`, 3 × 3": lambda m: 0.1 * jnp.trace(jax.scipy.linalg.expm(0.3 * matrix(m))),
+    "`eigvalsh`, 3 × 3": lambda m: jnp.sum(jnp.exp(0.2 * jnp.linalg.eigvalsh(definite_matrix(m)))),
+    "`solve`, 3 × 3": lambda m: m @ jnp.linalg.solve(definite_matrix(m), m),
+    "`slogdet`, 3 × 3": lambda m: jnp.linalg.slogdet(definite_matrix(m))[1],
+    "`svd`, 3 × 3": lambda m: jnp.sum(jnp.linalg.svd(definite_matrix(m), compute_uv=False)),
+    "`cholesky`, 3 × 3": lambda m: jnp.sum(jnp.log(jnp.diag(jnp.linalg.cholesky(definite_matrix(m))))),
+    "`expm`, 3 × 3": lambda m: 0.1 * jnp.trace(jax.scipy.linalg.expm(0.3 * definite_matrix(m))),
     "`lgamma`": lambda m: special.gammaln(4.0 + m[0]),
     "Bessel functions": lambda m: special.i0(m[0]) + special.i1e(m[1]),
 }
 
 
-def body(function) -> lt.LiePoissonSystem:
+def function_body(function) -> lt.LiePoissonSystem:
     return lt.LiePoissonSystem(
         mf.so(3),
         lambda m: 0.5 * jnp.sum(m * m / INERTIA) + 0.1 * function(m),
@@ -67,22 +67,22 @@ def run(quick: bool) -> Report:
     steps, rounds = (200, 1) if quick else (2000, 3)
     rows, targets, method = [], [], lt.MetriplecticMidpoint()
     for name, function in list(FUNCTIONS.items())[: 2 if quick else None]:
-        system = body(function)
+        system = function_body(function)
         start = time.monotonic()
-        lt.integrate(system, START, (0.0, STEP), STEP, method, engine="compiled")
+        lt.integrate(system, INITIAL_STATE, (0.0, STEP_SIZE), STEP_SIZE, method, engine="compiled")
         first = time.monotonic() - start
         works = {
             engine: lambda engine=engine, system=system: lt.integrate(
-                system, START, (0.0, STEP * steps), STEP, method, save_every=steps, engine=engine
+                system, INITIAL_STATE, (0.0, STEP_SIZE * steps), STEP_SIZE, method, save_every=steps, engine=engine
             )
             for engine in ("compiled", "array")
         }
         outcomes = race(works, rounds=rounds)
-        ours, other = (outcomes[engine].processor / steps for engine in works)
-        cells = laws.of_solution(outcomes["compiled"].result).cells()
+        ours, other = (outcomes[engine].cpu_seconds / steps for engine in works)
+        cells = laws.solution_laws(outcomes["compiled"].result).table_cells()
         rows.append([name, first, ours, ratio(other, ours), *cells])
         targets.append(Target(f"first answer of an energy with {name}", 3.0, first, "seconds"))
     columns = {"": "text", "First answer": "seconds", "Time a step": "seconds", "Array engine, relative": "ratio"}
-    table = Table(f"Midpoint steps of size {STEP} on so(3)*.", columns | laws.COLUMNS, rows)
+    table = Table(f"Midpoint steps of size {STEP_SIZE} on so(3)*.", columns | laws.COLUMNS, rows)
     text = "An energy of a body and a tenth of a function that does not unroll. Processor times of a step."
     return Report("Functions of every kind", text, [table], targets)

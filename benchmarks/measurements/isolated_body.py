@@ -9,15 +9,15 @@ import time
 import liethermo as lt
 
 from .. import child, laws
-from ..contest import RELAXATION, STEP
+from ..contest import RATE_TIMES_DURATION, STEP_SIZE
 from ..report import Report, Table, Target, ratio
 from ..timing import race
 
-INERTIA, START = (3.0, 2.0, 1.5), (0.06, 0.1, 1.0)
+INERTIA, INITIAL_STATE = (3.0, 2.0, 1.5), (0.06, 0.1, 1.0)
 
 METHODS = (lt.MetriplecticMidpoint(), lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(6))
 
-SCRIPT = """
+RUN_SCRIPT = """
 import json, time
 
 import liethermo as lt
@@ -31,7 +31,7 @@ print(json.dumps([time.monotonic(), solution.audit().passed]))
 def run(quick: bool) -> Report:
     """Race both bodies, the isolated one with its attitude too; start its first trajectory with a cache and without."""
     steps, rounds = (2000, 1) if quick else (300_000, 7)
-    rate = RELAXATION / (STEP * steps)
+    rate = RATE_TIMES_DURATION / (STEP_SIZE * steps)
     bodies = {
         "relaxed body": lt.models.rigid_body(INERTIA, rate),
         "isolated body": lt.models.tumbling_body(INERTIA, rate=rate, attitude=False),
@@ -41,26 +41,26 @@ def run(quick: bool) -> Report:
     for method in METHODS[: 1 if quick else None]:
         works = {
             name: lambda body=body, method=method: lt.integrate(
-                body, START, (0.0, STEP * steps), STEP, method, save_every=steps, engine="compiled"
+                body, INITIAL_STATE, (0.0, STEP_SIZE * steps), STEP_SIZE, method, save_every=steps, engine="compiled"
             )
             for name, body in bodies.items()
         }
         outcomes = race(works, rounds=rounds)
-        first = outcomes["relaxed body"].processor
+        first = outcomes["relaxed body"].cpu_seconds
         for name, outcome in outcomes.items():
-            beside = ratio(outcome.processor, first)
-            cells = laws.of_solution(outcome.result).cells()
-            rows.append([f"{name}, {method}", outcome.processor / steps, beside, *cells])
+            beside = ratio(outcome.cpu_seconds, first)
+            cells = laws.solution_laws(outcome.result).table_cells()
+            rows.append([f"{name}, {method}", outcome.cpu_seconds / steps, beside, *cells])
             if name == "isolated body":
                 targets.append(Target(f"a step of the isolated body beside the relaxed one, {method}", 1.5, beside))
     columns = {"": "text", "Time a step": "seconds", "Relative to the relaxed body": "ratio"} | laws.COLUMNS
-    table = Table(f"A run of {steps:,} steps of size {STEP}; one state kept.", columns, rows)
+    table = Table(f"A run of {steps:,} steps of size {STEP_SIZE}; one state kept.", columns, rows)
 
     again, calls = [], ("MetriplecticMidpoint()",) if quick else ("MetriplecticMidpoint()", "MetriplecticRungeKutta(8)")
     for call in calls:
-        script = SCRIPT.format(inertia=INERTIA, start=START, method=call)
+        script = RUN_SCRIPT.format(inertia=INERTIA, start=INITIAL_STATE, method=call)
         with tempfile.TemporaryDirectory() as cache:
-            cold, *cached = [_seconds(script, cache) for _ in range(2 if quick else 4)]
+            cold, *cached = [_script_seconds(script, cache) for _ in range(2 if quick else 4)]
         again.append([call, cold, min(cached)])
         targets.append(Target(f"first trajectory with attitude, cached, {call}", 1.5, min(cached), "seconds"))
     calls_table = Table(
@@ -72,9 +72,9 @@ def run(quick: bool) -> Report:
     return Report("The isolated body", text, [table, calls_table], targets)
 
 
-def _seconds(script: str, cache: str) -> float:
+def _script_seconds(script: str, cache: str) -> float:
     start = time.monotonic()  # one clock for all processes
-    done, passed = json.loads(child.python("-c", script, cache=cache))
+    done, passed = json.loads(child.run_python("-c", script, cache=cache))
     if not passed:
         raise RuntimeError("the audit of the isolated body failed")
     return done - start

@@ -14,18 +14,18 @@ import liethermo as lt
 import manifolds as mf
 
 from .. import child as process
-from ..native import Ring
+from ..native import SpinRingProgram
 from ..report import Report, Table, Target, UnavailableError, ratio
-from .lattice import AXIS, EXCHANGE, STEP, start
-from .magnet import CRITICAL, RATE
+from .lattice import AXIS, EXCHANGE, STEP, random_spins
+from .magnet import CRITICAL_TEMPERATURE, RATE
 from .magnet import STEP as NOISY_STEP
 
 SIZES = (1_000, 10_000, 100_000, 1_000_000)
-FEW, MANY, LEAST_WORK, ROUNDS = 2, 12, 200_000, 3
+SHORT_STEPS, LONG_STEPS, MIN_SITE_STEPS, ROUNDS = 2, 12, 200_000, 3
 
-EDGES, SETTLING, TIMED = (4, 8, 16, 32), 100, 40
+EDGES, SETTLING_STEPS, TIMED_STEPS = (4, 8, 16, 32), 100, 40
 
-PLAIN, BY_HAND, BY_PLANES, NAMED, C = (
+PLAIN_ROW, HAND_WRITTEN_ROW, COLUMN_MAJOR_ROW, MODEL_ROW, C_ROW = (
     "plain function",
     "by hand in JAX, (n, 3)",
     "by hand in JAX, (3, n)",
@@ -37,8 +37,8 @@ PLAIN, BY_HAND, BY_PLANES, NAMED, C = (
 def run(quick: bool) -> Report:
     """Two tables, each row in a process of its own."""
     sizes, edges = ((1_000,), (4,)) if quick else (SIZES, EDGES)
-    found = {n: process.call("large", "functions", str(n)) for n in sizes}
-    ways = (PLAIN, BY_HAND, BY_PLANES, NAMED, C)
+    found = {n: process.run_child("large", "functions", str(n)) for n in sizes}
+    ways = (PLAIN_ROW, HAND_WRITTEN_ROW, COLUMN_MAJOR_ROW, MODEL_ROW, C_ROW)
     rows = [[n, *(found[n].get(way) for way in ways)] for n in sizes]
     columns = {"Sites": "count"} | {way[0].upper() + way[1:]: "seconds" for way in ways}
     functions = Table(
@@ -47,20 +47,20 @@ def run(quick: bool) -> Report:
         columns,
         rows,
     )
-    noise = {n: process.call("large", "noise", str(n)) for n in edges}
+    noise = {n: process.run_child("large", "noise", str(n)) for n in edges}
     names = ("first", "with", "without", "ratio", "iterations", "iterations without")
     kinds = ("seconds", "seconds", "seconds", "ratio", "number", "number")
     headings = ("First answer", "A spin and step", "Without noise", "Ratio", "Iterations a step", "Without noise ")
     lattices = Table(
-        f"Noise on cubes of spins in a bath of kT = {CRITICAL} J, in steps of {NOISY_STEP} with the rate {RATE:g}, "
-        f"after {SETTLING} steps from disorder; the same steps without noise. Times of the processor.",
+        f"Noise on cubes of spins in a bath of kT = {CRITICAL_TEMPERATURE} J, in steps of {NOISY_STEP} with the rate {RATE:g}, "
+        f"after {SETTLING_STEPS} steps from disorder; the same steps without noise. Times of the processor.",
         {"Edge": "count"} | dict(zip(headings, kinds, strict=True)),
         [[n, *(noise[n][name] for name in names)] for n in edges],
     )
     at = 100_000 if 100_000 in found else sizes[0]
     targets = [
         Target("a plain function on 10⁵ sites, a step against the scheme by hand in JAX, (n, 3)", 1.0,
-               None if quick else ratio(found[at][PLAIN], found[at][BY_HAND])),
+               None if quick else ratio(found[at][PLAIN_ROW], found[at][HAND_WRITTEN_ROW])),
         *(Target(f"noise on {n}³ spins, first answer", 5.0, noise[n]["first"], "seconds") for n in edges),
         *(Target(f"noise on {n}³ spins, a step against one without", 4.0, noise[n]["ratio"]) for n in edges),
     ]  # fmt: skip
@@ -73,18 +73,18 @@ def run(quick: bool) -> Report:
 
 def child(what: str, size: str) -> dict:
     """The part that runs in a process of its own."""
-    return functions_of(int(size)) if what == "functions" else noise_on(int(size))
+    return time_functions(int(size)) if what == "functions" else time_noise(int(size))
 
 
-def energy(s) -> jax.Array:
+def spin_energy(s) -> jax.Array:
     """Of spins in an array, shape (n, 3)."""
     return -EXCHANGE * jnp.sum(s * jnp.roll(s, 1, axis=0)) - AXIS * jnp.sum(s[:, 2] ** 2)
 
 
-def functions_of(n: int) -> dict[str, float]:
+def time_functions(n: int) -> dict[str, float]:
     """The time of a step by each way."""
-    spins = start(n)[:-1].reshape(n, 3)
-    plain = lt.LiePoissonSystem(mf.power(mf.so(3), n), energy, None, None)
+    spins = random_spins(n)[:-1].reshape(n, 3)
+    plain = lt.LiePoissonSystem(mf.power(mf.so(3), n), spin_energy, None, None)
     named = lt.models.spin_lattice(n, EXCHANGE, AXIS, rate=0.0, baths=False)
 
     def by_library(system: lt.System, steps: int) -> None:
@@ -92,37 +92,37 @@ def functions_of(n: int) -> dict[str, float]:
         lt.integrate(system, x0, (0.0, steps * STEP), STEP, lt.MetriplecticMidpoint(), save_every=steps, engine="array")
 
     works: dict[str, Callable[[int], object]] = {
-        PLAIN: functools.partial(by_library, plain),
-        BY_HAND: functools.partial(by_hand, jnp.asarray(spins), 0),
-        BY_PLANES: functools.partial(by_hand, jnp.asarray(spins.T), 1),
-        NAMED: functools.partial(by_library, named),
+        PLAIN_ROW: functools.partial(by_library, plain),
+        HAND_WRITTEN_ROW: functools.partial(hand_written_steps, jnp.asarray(spins), 0),
+        COLUMN_MAJOR_ROW: functools.partial(hand_written_steps, jnp.asarray(spins.T), 1),
+        MODEL_ROW: functools.partial(by_library, named),
     }
     try:
-        ring = Ring([EXCHANGE, AXIS, 0.0, n])
-        works[C] = lambda steps: ring.integrate(np.append(spins.ravel(), 0.0), STEP, steps, 1)
+        ring = SpinRingProgram([EXCHANGE, AXIS, 0.0, n])
+        works[C_ROW] = lambda steps: ring.integrate(np.append(spins.ravel(), 0.0), STEP, steps, 1)
     except UnavailableError:
         pass
-    many = max(MANY, LEAST_WORK // n)
+    many = max(LONG_STEPS, MIN_SITE_STEPS // n)
     best: dict[str, list[float]] = {name: [np.inf, np.inf] for name in works}
     for turn in range(ROUNDS + 1):  # the first one compiles
         for name, work in works.items():
-            for i, steps in enumerate((FEW, many)):
+            for i, steps in enumerate((SHORT_STEPS, many)):
                 begun = time.process_time()
                 work(steps)
                 if turn:
                     best[name][i] = min(best[name][i], time.process_time() - begun)
-    return {name: (long - short) / (many - FEW) for name, (short, long) in best.items()}
+    return {name: (long - short) / (many - SHORT_STEPS) for name, (short, long) in best.items()}
 
 
-def by_hand(s, axis: int, steps: int) -> jax.Array:
+def hand_written_steps(s, axis: int, steps: int) -> jax.Array:
     """Midpoint steps, their equation solved to the last digit; the vectors along the other axis."""
-    return _steps(s, steps, axis).block_until_ready()
+    return _midpoint_steps(s, steps, axis).block_until_ready()
 
 
 @functools.partial(jax.jit, static_argnames="axis")
-def _steps(s, steps, axis: int) -> jax.Array:
+def _midpoint_steps(s, steps, axis: int) -> jax.Array:
     def own(s):
-        return energy(s) if axis == 0 else energy(s.T)
+        return spin_energy(s) if axis == 0 else spin_energy(s.T)
 
     def step(_, s):
         def slopes(k):
@@ -145,12 +145,12 @@ def _steps(s, steps, axis: int) -> jax.Array:
     return jax.lax.fori_loop(0, steps, step, s)
 
 
-def noise_on(edge: int) -> dict[str, float]:
+def time_noise(edge: int) -> dict[str, float]:
     """First answer, and the time of a spin and step with noise and without, from one state."""
     sites, noise = (edge,) * 3, lt.Fluctuations(1.0, seed=1)
     begun = time.process_time()
-    system = lt.models.spin_lattice(sites, rate=RATE, baths=lt.HeatBaths(np.inf, CRITICAL))
-    spins = start(edge**3)[:-1].reshape(*sites, 3)
+    system = lt.models.spin_lattice(sites, rate=RATE, baths=lt.HeatBaths(np.inf, CRITICAL_TEMPERATURE))
+    spins = random_spins(edge**3)[:-1].reshape(*sites, 3)
 
     def steps(x, count: int, noise=noise) -> lt.Solution:
         method, end = lt.MetriplecticMidpoint(), count * NOISY_STEP
@@ -158,16 +158,16 @@ def noise_on(edge: int) -> dict[str, float]:
 
     settled = steps(system.state(spins), 1)
     first = time.process_time() - begun
-    settled = steps(settled.x[-1], SETTLING).x[-1]
-    many, found = max(TIMED, LEAST_WORK // edge**3 // 10), {}
+    settled = steps(settled.x[-1], SETTLING_STEPS).x[-1]
+    many, found = max(TIMED_STEPS, MIN_SITE_STEPS // edge**3 // 10), {}
     for name, own in (("with", noise), ("without", None)):
         times = []
         for _ in range(ROUNDS + 1):
-            for count in (FEW, many):
+            for count in (SHORT_STEPS, many):
                 begun = time.process_time()
                 done = steps(settled, count, own)
                 times.append(time.process_time() - begun)
         short, long = min(times[2::2]), min(times[3::2])
-        found[name] = (long - short) / (many - FEW) / edge**3
+        found[name] = (long - short) / (many - SHORT_STEPS) / edge**3
         found["iterations" if own else "iterations without"] = done.stats.iterations_per_step
     return found | {"first": first, "ratio": found["with"] / found["without"]}

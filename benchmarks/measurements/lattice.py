@@ -11,15 +11,15 @@ import liethermo as lt
 
 from .. import child as process
 from .. import laws
-from ..contest import of_one_scheme
-from ..native import Ring
-from ..report import Report, Table, Target, ratio, take_part
+from ..contest import require_same_scheme
+from ..native import SpinRingProgram
+from ..report import Report, Table, Target, build_available, ratio
 from ..timing import race
-from .memory import STATUS, resident
+from .memory import PROCESS_STATUS_FILE, peak_resident_bytes
 
 EXCHANGE, AXIS, RATE, STEP = 1.0, 0.1, 0.1, 0.02
-COUNT, FEW, STEPS = 100_000, 2, 12
-LEAST_WORK = 1_000_000  # steps times spins, for the time of a step to stand out
+N_SPINS, SHORT_STEPS, LONG_STEPS = 100_000, 2, 12
+MIN_SPIN_STEPS = 1_000_000  # steps times spins, for the time of a step to stand out
 SIZES = (1_000, 10_000, 100_000, 1_000_000)
 METHODS = {
     "midpoint": lt.MetriplecticMidpoint(),
@@ -31,30 +31,34 @@ THREADS = (1, 2)
 
 def run(quick: bool) -> Report:
     """Two tables: against C, and by size."""
-    count, rounds = (1_000, 1) if quick else (COUNT, 5)
-    system, x0 = ring(count), start(count)
+    count, rounds = (1_000, 1) if quick else (N_SPINS, 5)
+    system, x0 = spin_ring(count), random_spins(count)
 
     def theirs(threads: int, steps: int):
-        return Ring([EXCHANGE, AXIS, RATE, count]).integrate(x0, STEP, steps, threads)
+        return SpinRingProgram([EXCHANGE, AXIS, RATE, count]).integrate(x0, STEP, steps, threads)
 
     candidates = {
         f"C, {threads} threads": lambda threads=threads: functools.partial(theirs, threads) for threads in THREADS
     }
-    found, skipped = take_part(candidates)
-    works = {name: functools.partial(work, STEPS) for name, work in found.items()}
-    few = {(name, FEW): functools.partial(work, FEW) for name, work in found.items()}
-    works["array engine"] = functools.partial(of_library, system, x0, STEPS)
-    few["array engine", FEW] = functools.partial(of_library, system, x0, FEW)
+    found, skipped = build_available(candidates)
+    works = {name: functools.partial(work, LONG_STEPS) for name, work in found.items()}
+    few = {(name, SHORT_STEPS): functools.partial(work, SHORT_STEPS) for name, work in found.items()}
+    works["array engine"] = functools.partial(library_run, system, x0, LONG_STEPS)
+    few["array engine", SHORT_STEPS] = functools.partial(library_run, system, x0, SHORT_STEPS)
     outcomes = race(works | few, rounds=rounds)
     seconds, rows = {}, []
     for name in works:
         result = outcomes[name].result
-        seconds[name] = (outcomes[name].seconds - outcomes[name, FEW].seconds) / (STEPS - FEW)
+        seconds[name] = (outcomes[name].wall_seconds - outcomes[name, SHORT_STEPS].wall_seconds) / (
+            LONG_STEPS - SHORT_STEPS
+        )
         if isinstance(result, lt.Solution):
-            iterations, kept = result.stats.iterations_per_step, of_stats(result)
+            iterations, kept = result.stats.iterations_per_step, stats_laws(result)
         else:
-            iterations, kept = float((result[1]["iterations"] / result[1]["steps"])[0]), laws.of_runs(result[1])
-        rows.append([name, seconds[name], ratio(seconds[name], seconds.get("C, 1 threads")), iterations, *kept.cells()])
+            iterations, kept = float((result[1]["iterations"] / result[1]["steps"])[0]), laws.c_run_laws(result[1])
+        rows.append(
+            [name, seconds[name], ratio(seconds[name], seconds.get("C, 1 threads")), iterations, *kept.table_cells()]
+        )
     columns = {"": "text", "Time a step": "seconds", "Relative to C": "ratio", "Iterations a step": "number"}
     caption = f"A ring of {count:,} spins with exchange and an easy axis; steps of {STEP} by the midpoint scheme."
     text = (
@@ -64,22 +68,22 @@ def run(quick: bool) -> Report:
     if found:
         ours = outcomes["array engine"].result.x[-1]
         apart = np.abs(outcomes["C, 1 threads"].result[0] - ours).max() / np.abs(ours).max()
-        text += f" After {STEPS} steps the states differ by {of_one_scheme(float(apart), STEPS):.0e}."
-    tables = [Table(caption, columns | laws.COLUMNS, rows), growth((1_000,) if quick else SIZES)]
+        text += f" After {LONG_STEPS} steps the states differ by {require_same_scheme(float(apart), LONG_STEPS):.0e}."
+    tables = [Table(caption, columns | laws.COLUMNS, rows), growth_table((1_000,) if quick else SIZES)]
     most = f"C, {THREADS[-1]} threads"  # as many as the array engine may use
     against = ratio(seconds["array engine"], seconds.get(most))
     target = Target("10⁵ coupled spins on two cores, a step against C on both", 3.0, against)
     return Report("Many spins", text, tables, [target], skipped)
 
 
-def growth(sizes) -> Table:
+def growth_table(sizes) -> Table:
     """Time and memory of a step by the number of spins, each row in a process of its own."""
     rows = []
     for method in METHODS:
         for count in sizes:
-            found = process.call("lattice", method, str(count))
+            found = process.run_child("lattice", method, str(count))
             row = [method, count, found["first"], found["step"], found["step"] / count, found["iterations"]]
-            rows.append([*row, found["peak"], found["lengths"], *laws.Laws(*found["laws"]).cells()])
+            rows.append([*row, found["peak"], found["lengths"], *laws.Laws(*found["laws"]).table_cells()])
     columns = {"Method": "text", "Spins": "count", "The first call": "seconds", "A step": "seconds"}
     columns |= {"A step, for each spin": "seconds", "Iterations a step": "number"}
     columns |= {"Peak memory": "gigabytes", "| |s| - 1 |": "error"}
@@ -92,43 +96,43 @@ def growth(sizes) -> Table:
 
 def child(method: str, count: str) -> dict:
     """The part that runs in a process of its own."""
-    system, x0 = ring(int(count)), start(int(count))
-    work = functools.partial(of_library, system, x0, method=METHODS[method])
-    steps = max(STEPS, LEAST_WORK // int(count))
+    system, x0 = spin_ring(int(count)), random_spins(int(count))
+    work = functools.partial(library_run, system, x0, method=METHODS[method])
+    steps = max(LONG_STEPS, MIN_SPIN_STEPS // int(count))
     times = [time.process_time()]  # of all threads: runs are long enough, and other work on the machine does not count
-    for number in (FEW, FEW, steps):
+    for number in (SHORT_STEPS, SHORT_STEPS, steps):
         solution = work(number)
         times.append(time.process_time())
     first, few, many = np.diff(times)
-    kept = of_stats(solution)
+    kept = stats_laws(solution)
     lengths = np.linalg.norm(system.spins(solution.x[-1]), axis=-1)
     return {
         "first": first,
-        "step": (many - few) / (steps - FEW),
+        "step": (many - few) / (steps - SHORT_STEPS),
         "iterations": solution.stats.iterations_per_step,
-        "peak": resident() if STATUS.is_file() else None,
+        "peak": peak_resident_bytes() if PROCESS_STATUS_FILE.is_file() else None,
         "lengths": float(np.abs(lengths - 1.0).max()),
         "laws": [kept.energy_drift, kept.least_entropy_increment],
     }
 
 
-def ring(count: int) -> lt.SpinSystem:
+def spin_ring(count: int) -> lt.SpinSystem:
     """A ring with a bath of its own size."""
     return lt.models.spin_lattice(count, EXCHANGE, AXIS, rate=RATE)
 
 
-def start(count: int) -> np.ndarray:
+def random_spins(count: int) -> np.ndarray:
     """Spins in disorder, and the bath at entropy zero."""
     s = np.random.default_rng(0).standard_normal((count, 3))
     return np.append((s / np.linalg.norm(s, axis=1)[:, None]).ravel(), 0.0)
 
 
-def of_library(system: lt.SpinSystem, x0, steps: int, method: lt.OneStepMethod = METHODS["midpoint"]) -> lt.Solution:
+def library_run(system: lt.SpinSystem, x0, steps: int, method: lt.OneStepMethod = METHODS["midpoint"]) -> lt.Solution:
     """So many steps, the last state kept."""
     return lt.integrate(system, x0, (0.0, steps * STEP), STEP, method, save_every=steps, engine="array")
 
 
-def of_stats(solution: lt.Solution) -> laws.Laws:
+def stats_laws(solution: lt.Solution) -> laws.Laws:
     """The laws as they were followed at every step: an audit would take some of these again."""
     stats, entropy, first = solution.stats, solution.entropy, float(solution.energy[0])
     assert stats.energy_range is not None

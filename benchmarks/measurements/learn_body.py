@@ -12,31 +12,31 @@ import manifolds as mf
 from ..report import Report, Table
 
 INERTIA, RATE = (3.0, 2.0, 1.0), 0.08
-GUESS = lt.models.tumbling_body((2.4, 2.0, 1.4), rate=0.2)
-END, STEP, NUMBER = 20.0, 0.1, 8
+INITIAL_GUESS = lt.models.tumbling_body((2.4, 2.0, 1.4), rate=0.2)
+T_END, STEP, N_RECORDS = 20.0, 0.1, 8
 METHOD = lt.MetriplecticRungeKutta(4)
 
 
-def _records(noise: float) -> list[tuple[np.ndarray, np.ndarray]]:
+def _noisy_records(noise: float) -> list[tuple[np.ndarray, np.ndarray]]:
     """Times and attitudes, of a step a quarter as long and of order 6, each turned by a small random angle."""
     body, random, found = lt.models.tumbling_body(INERTIA, rate=RATE), np.random.default_rng(0), []
-    for start in _starts(random):
-        run = lt.integrate(body, start, (0.0, END), STEP / 4, lt.MetriplecticRungeKutta(6), save_every=4)
+    for start in _initial_momenta(random):
+        run = lt.integrate(body, start, (0.0, T_END), STEP / 4, lt.MetriplecticRungeKutta(6), save_every=4)
         turned = np.asarray(mf.SO(3).exp(noise * random.standard_normal((len(run.t), 3))))
         found.append((run.t, np.asarray(run.attitude) @ turned))
     return found
 
 
-def _starts(random: np.random.Generator) -> np.ndarray:
-    mu = random.standard_normal((NUMBER, 3))
-    return mu / np.linalg.norm(mu, axis=1, keepdims=True) * random.uniform(0.7, 1.5, (NUMBER, 1))
+def _initial_momenta(random: np.random.Generator) -> np.ndarray:
+    mu = random.standard_normal((N_RECORDS, 3))
+    return mu / np.linalg.norm(mu, axis=1, keepdims=True) * random.uniform(0.7, 1.5, (N_RECORDS, 1))
 
 
-def _row(noise: float, window: int, steps: int) -> list:
+def _fit_row(noise: float, window: int, steps: int) -> list:
     start = time.process_time()
     fitted = lt.learn.fit(
-        GUESS,
-        _records(noise),
+        INITIAL_GUESS,
+        _noisy_records(noise),
         observe=lambda x, R: R,
         noise=noise,
         shooting=steps,
@@ -50,13 +50,13 @@ def _row(noise: float, window: int, steps: int) -> list:
     shape, friction = inertia / inertia[2], float(fitted.dissipation.part.rate) * inertia[2]
     unit = inertia[2] / INERTIA[2]  # of momenta, which no attitude tells
     start_, true = np.array([0.3, 0.9, 0.4]), lt.models.tumbling_body(INERTIA, rate=RATE)
-    own = lt.integrate(fitted, unit * start_, (0.0, 100.0 * END), STEP, METHOD)
-    other = lt.integrate(true, start_, (0.0, 2.0 * END), STEP / 4, lt.MetriplecticRungeKutta(6), save_every=4)
+    own = lt.integrate(fitted, unit * start_, (0.0, 100.0 * T_END), STEP, METHOD)
+    other = lt.integrate(true, start_, (0.0, 2.0 * T_END), STEP / 4, lt.MetriplecticRungeKutta(6), save_every=4)
     missed = np.einsum("tij,tij->t", np.asarray(own.attitude)[: len(other.t)], np.asarray(other.attitude))
     angle = float(np.arccos(np.clip((missed.min() - 1.0) / 2.0, -1.0, 1.0)))
     errors = [float(e) for e in np.abs(shape[:2] / np.array(INERTIA[:2]) - 1.0)]
     laws = [own.audit().energy_drift, float(np.diff(np.asarray(own.entropy)).min())]
-    kind = "whole records" if window * STEP >= END else f"pieces of {window} intervals"
+    kind = "whole records" if window * STEP >= T_END else f"pieces of {window} intervals"
     return [f"noise {noise:g} rad, {kind}", *errors, float(abs(friction / RATE - 1.0)), angle, *laws, spent]
 
 
@@ -64,12 +64,12 @@ def run(quick: bool) -> Report:
     kinds = [(1e-3, 20, 1500), (1e-3, 200, 1500), (1e-2, 20, 1500)]
     rows = []
     for noise, window, steps in kinds[:1] if quick else kinds:
-        rows.append(_row(noise, window, 50 if quick else steps))
+        rows.append(_fit_row(noise, window, 50 if quick else steps))
         print(rows[-1], flush=True)
     errors = dict.fromkeys(["Error of I₁/I₃", "I₂/I₃", "Friction × I₃", "Angle to 2 T", "Energy drift"], "error")
     columns = {"Records": "text", **errors, "Least entropy increment": "error", "Training": "seconds"}
     text = (
-        f"{NUMBER} records of the attitude of a body with the inertia (3, 2, 1) and friction inside, to T = {END:g}, "
+        f"{N_RECORDS} records of the attitude of a body with the inertia (3, 2, 1) and friction inside, to T = {T_END:g}, "
         "201 attitudes each, with errors. The fit starts from the inertia (2.4, 2, 1.4) and 2.5 times the friction. No "
         "momentum, temperature or entropy is in the data. Attitudes tell the inertia up to a factor, so the table has "
         "relative errors of what does not depend on it. *Angle* is the largest error of a forecast to 2 T, in radians; "

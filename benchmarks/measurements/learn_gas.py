@@ -7,4 +7,4 @@ from ..report import Report
 
 
 def run(quick: bool) -> Report:
-    return learned.report("gas", quick)
+    return learned.problem_report("gas", quick)

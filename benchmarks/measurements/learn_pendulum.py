@@ -7,4 +7,4 @@ from ..report import Report
 
 
 def run(quick: bool) -> Report:
-    return learned.report("pendulum", quick)
+    return learned.problem_report("pendulum", quick)

@@ -15,7 +15,7 @@ import manifolds as mf
 
 from .. import child as processes
 from .. import peers
-from ..report import Report, Table, Target, ratio, take_part
+from ..report import Report, Table, Target, build_available, ratio
 
 METHODS = {
     "RK4": lt.MetriplecticRungeKutta(4),
@@ -23,10 +23,10 @@ METHODS = {
     "Gauss(2)": lt.MetriplecticGauss(2),
 }
 
-HALVED, ROUNDING = (1, 2, 4, 8, 16), 2e-13
+ORDER_STEP_COUNTS, MIN_ORDER_ERROR = (1, 2, 4, 8, 16), 2e-13
 """Steps to t = 1, and the error below which an order is not seen."""
 
-CHARTED = {"S^2": "exp", "H^2": "exp", "SO(3)": "exp", "S^2 x R^3": "exp"}
+RETRACTION_BY_SPACE = {"S^2": "exp", "H^2": "exp", "SO(3)": "exp", "S^2 x R^3": "exp"}
 """Spaces that are run in charts too, and by which retraction."""
 
 COLUMNS = {
@@ -42,7 +42,7 @@ COLUMNS = {
     "Order": "text",
 }
 
-SMALL = 6
+MAX_SMALL_DIM = 6
 """Dimension from which a first answer may take twice as long."""
 
 
@@ -50,11 +50,15 @@ def run(quick: bool) -> Report:
     """One process for each space, with an empty cache, and another with the one that it left."""
     steps = 1_000 if quick else 100_000
     flat = mf.Euclidean
-    spaces = [space for space in mf.registered_spaces() if space.surrounded and not isinstance(space, flat)]
+    spaces = [space for space in mf.registered_spaces() if space.can_be_embedded and not isinstance(space, flat)]
     spaces = spaces[:2] if quick else spaces
-    found = {space.name: _rows(space, "around", steps) for space in spaces}
-    charted = [space for space in spaces if space.name in CHARTED]
-    beside = [row for space in charted for row in (found[space.name][0], *_rows(space, CHARTED[space.name], steps))]
+    found = {space.name: _space_rows(space, "around", steps) for space in spaces}
+    charted = [space for space in spaces if space.name in RETRACTION_BY_SPACE]
+    beside = [
+        row
+        for space in charted
+        for row in (found[space.name][0], *_space_rows(space, RETRACTION_BY_SPACE[space.name], steps))
+    ]
     rows = [row for own in found.values() for row in own]
     text = (
         "A system with an energy and an entropy that are not quadratic, and the metric of the space projected off the "
@@ -66,13 +70,19 @@ def run(quick: bool) -> Report:
     caption = f"{steps:,} steps for the drift, in one thread; a point's residual at the end of them."
     first = [row for row in rows if row[2] == "RK4"]
     targets = []
-    for title, chosen in (("below", [r for r in first if r[1] < SMALL]), ("of", [r for r in first if r[1] >= SMALL])):
+    for title, chosen in (
+        ("below", [r for r in first if r[1] < MAX_SMALL_DIM]),
+        ("of", [r for r in first if r[1] >= MAX_SMALL_DIM]),
+    ):
         bound = 2.0 if title == "below" else 4.0
         more = "" if title == "below" else " or more"
         worst = max((row[3] for row in chosen), default=None)
         targets.append(
             Target(
-                f"first answer on a manifold, {title} {SMALL} dimensions{more}, the slowest", bound, worst, "seconds"
+                f"first answer on a manifold, {title} {MAX_SMALL_DIM} dimensions{more}, the slowest",
+                bound,
+                worst,
+                "seconds",
             )
         )
     for name, bound in (("S^2", 6.0), ("SPD(3)", 6.0), ("St(4, 2)", 12.0)):
@@ -82,7 +92,7 @@ def run(quick: bool) -> Report:
         Table(caption, COLUMNS, rows),
         Table("Steps of order 4 without charts, and in those of `retraction=`.", COLUMNS, beside),
     ]
-    found, skipped = take_part({"pymanopt": beside_pymanopt})
+    found, skipped = build_available({"pymanopt": pymanopt_rows})
     if found:
         columns = {
             "": "text",
@@ -99,11 +109,11 @@ def run(quick: bool) -> Report:
     return Report("Systems on manifolds", text, tables, targets, skipped)
 
 
-def _rows(space: mf.Space, way: str, steps: int) -> list[list]:
+def _space_rows(space: mf.Space, way: str, steps: int) -> list[list]:
     number = [other.name for other in mf.registered_spaces()].index(space.name)
     with tempfile.TemporaryDirectory() as cache:
-        cold = processes.call("manifolds", str(number), way, str(steps), cache=cache)
-        warm = processes.call("manifolds", str(number), way, "0", cache=cache)
+        cold = processes.run_child("manifolds", str(number), way, str(steps), cache=cache)
+        warm = processes.run_child("manifolds", str(number), way, "0", cache=cache)
     title = "" if way == "around" else f', retraction="{way}"'
     return [
         [
@@ -135,13 +145,13 @@ def child(number: str, way: str, steps: str) -> dict[str, list]:
         return found
     flat = mf.Euclidean(space.dim)
     plain, start = relaxing(flat), np.asarray(flat.random(3))
-    exact = _exact(system, x0)
+    exact = _exact_end(system, x0)
     for name, method in methods.items():
-        beside = _step(plain, start, METHODS[name]) if name == "RK4" else None
-        found[name] += [_step(system, x0, method), beside]
+        beside = _step_seconds(plain, start, METHODS[name]) if name == "RK4" else None
+        found[name] += [_step_seconds(system, x0, method), beside]
         long = lt.integrate(system, x0, (0.0, 0.01 * count), 0.01, method, save_every=count)
         residual = float(space.residual(system.points(long.x[-1])))
-        found[name] += [long.audit().energy_drift, residual, _order(system, x0, method, exact)]
+        found[name] += [long.audit().energy_drift, residual, _observed_order(system, x0, method, exact)]
     return found
 
 
@@ -162,7 +172,7 @@ def relaxing(space: mf.Space) -> lt.MetriplecticSystem:
     return lt.MetriplecticSystem(None, energy, entropy, dissipation, space=space, validate=False)
 
 
-def _step(system: lt.MetriplecticSystem, x0, method, steps: int = 20_000) -> float:
+def _step_seconds(system: lt.MetriplecticSystem, x0, method, steps: int = 20_000) -> float:
     """Seconds that a step takes, the best of several runs."""
     best = np.inf
     for _ in range(3):
@@ -172,31 +182,31 @@ def _step(system: lt.MetriplecticSystem, x0, method, steps: int = 20_000) -> flo
     return best / steps
 
 
-def _exact(system: lt.MetriplecticSystem, x0) -> np.ndarray:
+def _exact_end(system: lt.MetriplecticSystem, x0) -> np.ndarray:
     field = jax.jit(lambda x: system.vector_field(x))
     exact = solve_ivp(lambda t, x: np.asarray(field(x)), (0.0, 1.0), x0, method="DOP853", rtol=1e-13, atol=1e-14)
     return exact.y[:, -1]
 
 
-def _order(system: lt.MetriplecticSystem, x0, method, exact) -> str:
+def _observed_order(system: lt.MetriplecticSystem, x0, method, exact) -> str:
     """Of the finest two of some step sizes whose errors are no rounding."""
     errors = []
-    for steps in HALVED:
+    for steps in ORDER_STEP_COUNTS:
         end = lt.integrate(system, x0, (0.0, 1.0), 1.0 / steps, method).x[-1]
         errors.append(np.abs(end - exact).max())
-        if errors[-1] < ROUNDING:
+        if errors[-1] < MIN_ORDER_ERROR:
             break
-    above = [error for error in errors if error >= ROUNDING]
+    above = [error for error in errors if error >= MIN_ORDER_ERROR]
     return f"{np.log2(above[-2] / above[-1]):.2f}" if len(above) > 1 else "–"
 
 
 # -- pymanopt ---------------------------------------------------------------------------------------------------------
 
-DESCENTS = 200
+DESCENT_STEPS = 200
 """Steps of steepest descent to t = 1."""
 
 
-class _Equal:
+class _FixedStepSearch:
     """A search along a line that takes steps of one size."""
 
     def __init__(self, h: float):
@@ -207,7 +217,7 @@ class _Equal:
         return self.h, manifold.retraction(x, self.h * d)
 
 
-def beside_pymanopt() -> list[list]:
+def pymanopt_rows() -> list[list]:
     """For each space how far pymanopt's steepest descent ends from the gradient flow of the same function.
 
     Raises
@@ -215,7 +225,7 @@ def beside_pymanopt() -> list[list]:
     UnavailableError
         If pymanopt is not installed.
     """
-    theirs, A = peers.module("pymanopt"), np.diag([1.0, 2.0, 4.0]) + 0.3
+    theirs, A = peers.import_peer("pymanopt"), np.diag([1.0, 2.0, 4.0]) + 0.3
     sphere, definite, lines = mf.Sphere(2), mf.SPD(2), mf.Grassmann(3, 1)
     of_quadratic = (lambda x: 0.5 * np.sum(x * (A @ x))), lambda x: A @ x
     of_volume = (
@@ -253,12 +263,16 @@ def beside_pymanopt() -> list[list]:
 
         def end(steps, problem=problem, start=column if space is lines else x0):
             optimizer = theirs.optimizers.SteepestDescent(
-                _Equal(1.0 / steps), max_iterations=steps, min_gradient_norm=0.0, min_step_size=0.0, verbosity=0
+                _FixedStepSearch(1.0 / steps),
+                max_iterations=steps,
+                min_gradient_norm=0.0,
+                min_step_size=0.0,
+                verbosity=0,
             )
             x = optimizer.run(problem, initial_point=start).point
             return x @ x.T if x.shape == column.shape else x
 
-        half, whole = end(DESCENTS // 2), end(DESCENTS)
+        half, whole = end(DESCENT_STEPS // 2), end(DESCENT_STEPS)
         ends = whole, half, 2.0 * whole - half
-        rows.append([space.name, DESCENTS, *(float(np.abs(x - exact).max()) for x in ends)])
+        rows.append([space.name, DESCENT_STEPS, *(float(np.abs(x - exact).max()) for x in ends)])
     return rows

@@ -8,14 +8,14 @@ import numpy as np
 
 from .. import child as process
 from .. import laws
-from ..ensembles import by_library
-from ..ensembles import laws as ensemble_laws
-from ..problems import body, random_states
+from ..ensembles import ensemble_laws as ensemble_laws
+from ..ensembles import library_ensemble
+from ..problems import quadratic_body, random_states
 from ..report import Report, Table, Target
 
 RATE, T_END, STEPS = 1.0, 10.0, 200
 
-STATUS = Path("/proc/self/status")
+PROCESS_STATUS_FILE = Path("/proc/self/status")
 
 
 def run(quick: bool) -> Report:
@@ -24,13 +24,13 @@ def run(quick: bool) -> Report:
     rows: list[list] = []
     skipped: dict[str, str] = {}
     peak = None
-    if not STATUS.is_file():
+    if not PROCESS_STATUS_FILE.is_file():
         sizes, skipped = (), {"all": "this system does not tell a process its largest size"}
     for bodies in sizes:
-        found = process.call("memory", str(bodies))
+        found = process.run_child("memory", str(bodies))
         peak = found["peak"]
         kept = laws.Laws(*found["laws"])
-        rows.append([bodies, found["before"], peak, found["seconds"], *kept.cells()])
+        rows.append([bodies, found["before"], peak, found["seconds"], *kept.table_cells()])
     columns = {"Bodies": "count", "Memory before": "gigabytes", "Peak": "gigabytes", "Time": "seconds"}
     table = Table(f'`outputs="summary"`, {STEPS} steps each, compiled engine.', columns | laws.COLUMNS, rows)
     text = (
@@ -43,22 +43,24 @@ def run(quick: bool) -> Report:
 
 def child(bodies: str) -> dict:
     """The part that runs in a process of its own."""
-    work = by_library(body(RATE), random_states(int(bodies)), T_END, STEPS, "compiled", outputs="summary")
-    before, result = resident(), work()
+    work = library_ensemble(
+        quadratic_body(RATE), random_states(int(bodies)), T_END, STEPS, "compiled", outputs="summary"
+    )
+    before, result = peak_resident_bytes(), work()
     kept = ensemble_laws(result)
     assert np.all(np.isfinite(result.energy))
     return {
         "before": before,
-        "peak": resident(),
+        "peak": peak_resident_bytes(),
         "seconds": result.wall_time,
         "laws": [kept.energy_drift, kept.least_entropy_increment],
     }
 
 
-def resident() -> float:
+def peak_resident_bytes() -> float:
     """Largest resident size of this program so far, in bytes.
 
     Not ``getrusage``: a process inherits its figure from the one that started it, which may have been larger.
     """
-    fields = dict(line.split(":", 1) for line in STATUS.read_text().splitlines())
+    fields = dict(line.split(":", 1) for line in PROCESS_STATUS_FILE.read_text().splitlines())
     return 1024.0 * int(fields["VmHWM"].split()[0])

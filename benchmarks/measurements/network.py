@@ -14,10 +14,10 @@ from liethermo.models.heat_grid import grid_graph
 from .. import child as process
 from .. import laws
 from ..report import Report, Table, Target, ratio
-from .memory import STATUS, resident
+from .memory import PROCESS_STATUS_FILE, peak_resident_bytes
 
 SIZES = (1_000, 10_000, 100_000)
-MILD, STIFF = 0.02, 100.0
+MILD_STEP, STIFF_STEP = 0.02, 100.0
 """Steps in units of the time in which two neighbours exchange their heat: for fixed-point and for Newton iteration."""
 
 STEPS = 5
@@ -31,11 +31,11 @@ def run(quick: bool) -> Report:
     seconds: dict[tuple[str, int, float], float] = {}
     for graph in graphs:
         for nodes in sizes:
-            for h in (MILD, STIFF):
-                found = process.call("network", graph, str(nodes), str(h), one_core=True)
+            for h in (MILD_STEP, STIFF_STEP):
+                found = process.run_child("network", graph, str(nodes), str(h), one_core=True)
                 seconds[graph, nodes, h] = found["step"]
                 row = [graph, found["nodes"], h, found["first"], found["step"], found["iterations"], found["peak"]]
-                rows.append([*row, *laws.Laws(*found["laws"]).cells()])
+                rows.append([*row, *laws.Laws(*found["laws"]).table_cells()])
     columns = {
         "Graph": "text",
         "Bodies": "count",
@@ -54,7 +54,7 @@ def run(quick: bool) -> Report:
         "gradient. The short steps are solved by fixed-point iteration, the long ones by Newton's method with a sparse "
         "Jacobian matrix, factorised for plane grids and used by Krylov iteration for the others."
     )
-    few, many = (seconds.get((GRAPHS[0], nodes, STIFF)) for nodes in SIZES[1:])
+    few, many = (seconds.get((GRAPHS[0], nodes, STIFF_STEP)) for nodes in SIZES[1:])
     targets = [
         Target("stiff step of a plane grid of 10⁵ bodies", 10.0, many, "seconds"),
         Target("growth of its time from 10⁴ to 10⁵ bodies", 20.0, ratio(many, few)),
@@ -64,7 +64,7 @@ def run(quick: bool) -> Report:
 
 def child(graph: str, nodes: str, h: str) -> dict:
     """The part that runs in a process of its own."""
-    matrix = _graph(graph, int(nodes))
+    matrix = _make_graph(graph, int(nodes))
     count = matrix.shape[0]
     system = lt.models.thermo_particles([1.0] * count, matrix)
     x0 = np.log(np.random.default_rng(0).uniform(250.0, 350.0, count))
@@ -76,18 +76,18 @@ def child(graph: str, nodes: str, h: str) -> dict:
         times.append(time.perf_counter())
         solution = work()
     times.append(time.perf_counter())
-    kept = laws.of_solution(solution)
+    kept = laws.solution_laws(solution)
     return {
         "nodes": count,
         "first": times[1] - times[0],
         "step": (times[3] - times[2]) / STEPS,
         "iterations": solution.stats.iterations_per_step,
-        "peak": resident() if STATUS.is_file() else None,
+        "peak": peak_resident_bytes() if PROCESS_STATUS_FILE.is_file() else None,
         "laws": [kept.energy_drift, kept.least_entropy_increment],
     }
 
 
-def _graph(kind: str, nodes: int) -> scipy.sparse.csr_array:
+def _make_graph(kind: str, nodes: int) -> scipy.sparse.csr_array:
     if kind == "random, 4 neighbours":
         rng = np.random.default_rng(1)
         ends = np.concatenate([np.arange(nodes), rng.permutation(nodes)])  # a ring, so that it is connected, and more

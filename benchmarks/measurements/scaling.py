@@ -14,25 +14,25 @@ import numpy as np
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engines.choice import Chosen
-from liethermo.runs.preparation import as_run
+from liethermo.engines.choice import EngineWithFallback
+from liethermo.runs.preparation import prepare_run
 
 from .. import child as process
 from ..report import Report, Table, Target
-from .lattice import start
-from .memory import STATUS, resident
+from .lattice import random_spins
+from .memory import PROCESS_STATUS_FILE, peak_resident_bytes
 
 SIZES = tuple(10**i for i in range(1, 8))
-FEW, LEAST_TIME, MOST = 2, 1.0, 200_000
+SHORT_STEPS, MIN_TIMED_SECONDS, MAX_STEPS = 2, 1.0, 200_000
 """Steps of a short run; seconds, and steps at most, that the long one takes longer."""
 
-PATIENCE, SHARE = 20.0, 0.7
+MAX_STEP_SECONDS, MAX_MEMORY_FRACTION = 20.0, 0.7
 """Seconds that a step may take, and the share of the memory that a process may: else a size is left out."""
 
 MIDPOINT, EXPLICIT = lt.MetriplecticMidpoint(), lt.MetriplecticRungeKutta(4)
 
 
-def field(n: int) -> tuple[lt.System, Any]:
+def wave_field(n: int) -> tuple[lt.System, Any]:
     """A wave equation with a cubic force: a plain function of all positions and momenta."""
 
     def energy(x):
@@ -43,30 +43,30 @@ def field(n: int) -> tuple[lt.System, Any]:
     return lt.MetriplecticSystem(mf.Canonical(n), energy, validate=False), random
 
 
-def spins(n: int) -> tuple[lt.System, Any]:
+def spin_ring(n: int) -> tuple[lt.System, Any]:
     """A ring of spins that heat a bath."""
-    return lt.models.spin_lattice(n, 1.0, 0.1, rate=0.1), start(n)
+    return lt.models.spin_lattice(n, 1.0, 0.1, rate=0.1), random_spins(n)
 
 
-def graph(n: int) -> tuple[lt.System, Any]:
+def heat_graph(n: int) -> tuple[lt.System, Any]:
     """Heat on a square grid of bodies, nearly n of them."""
     edge = round(math.sqrt(n))
     temperatures = np.random.default_rng(0).uniform(0.8, 1.2, edge**2)
     return lt.models.heat_grid((edge, edge)), np.log(temperatures)
 
 
-def matrices(n: int) -> tuple[lt.System, Any]:
+def sphere_fluid(n: int) -> tuple[lt.System, Any]:
     """A fluid on the sphere, its matrix of nearly n entries."""
     N = round(math.sqrt(n))
     sphere = lt.models.QuantisedSphere(N)
     return lt.models.zeitlin(N, "enstrophy", 1e-3), sphere.random(0, (1, min(N - 1, 12)), 1.0)
 
 
-KINDS: dict[str, tuple[Callable, lt.OneStepMethod, float]] = {
-    "a field": (field, MIDPOINT, 0.05),
-    "spins": (spins, MIDPOINT, 0.02),
-    "a graph": (graph, MIDPOINT, 0.1),
-    "su(N)": (matrices, EXPLICIT, 1e-3),
+SYSTEM_KINDS: dict[str, tuple[Callable, lt.OneStepMethod, float]] = {
+    "a field": (wave_field, MIDPOINT, 0.05),
+    "spins": (spin_ring, MIDPOINT, 0.02),
+    "a graph": (heat_graph, MIDPOINT, 0.1),
+    "su(N)": (sphere_fluid, EXPLICIT, 1e-3),
 }
 """What makes a system and a state of so many sites, the method and the step."""
 
@@ -75,12 +75,12 @@ def run(quick: bool) -> Report:
     """One table, each row in a process of its own."""
     rows: list[list] = []
     skipped: dict[str, str] = {}
-    for kind in KINDS:
+    for kind in SYSTEM_KINDS:
         for n in SIZES[:2] if quick else SIZES:
-            if reason := too_large(rows[-1] if rows and rows[-1][0] == kind else None):
+            if reason := why_too_large(rows[-1] if rows and rows[-1][0] == kind else None):
                 skipped[f"{kind}, {n:,} sites"] = reason
                 break
-            found = process.call("scaling", kind, str(n))
+            found = process.run_child("scaling", kind, str(n))
             row = [kind, found["sites"], found["engine"], found["first"], found["step"] / found["sites"]]
             rows.append([*row, found["step"], found["peak"]])
     columns = {"System": "text", "Sites": "count", "Engine": "text", "First answer": "seconds"}
@@ -97,31 +97,31 @@ def run(quick: bool) -> Report:
     )
     targets = [
         Target(f"first answer with 10⁵ sites, {kind}", 5.0, next((r[3] for r in rows if r[0] == kind and
-               0.9e5 < r[1] < 1.1e5), None), "seconds") for kind in KINDS
+               0.9e5 < r[1] < 1.1e5), None), "seconds") for kind in SYSTEM_KINDS
     ]  # fmt: skip
     return Report("Time and memory by size", text, [Table(caption, columns, rows)], targets, skipped)
 
 
-def too_large(last: list | None) -> str:
+def why_too_large(last: list | None) -> str:
     """Why a system of ten times the size of the last row is not tried; empty where it is."""
     if last is None:
         return ""
     seconds, peak = last[-2:]
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    if 10.0 * seconds > PATIENCE:
-        return f"a step would take more than {PATIENCE:g} s"
-    if peak is not None and 10.0 * (peak - PACKAGES) > SHARE * memory:
-        return f"more than {SHARE * memory / 1e9:.0f} GB would be needed"
+    if 10.0 * seconds > MAX_STEP_SECONDS:
+        return f"a step would take more than {MAX_STEP_SECONDS:g} s"
+    if peak is not None and 10.0 * (peak - PACKAGES_BYTES) > MAX_MEMORY_FRACTION * memory:
+        return f"more than {MAX_MEMORY_FRACTION * memory / 1e9:.0f} GB would be needed"
     return ""
 
 
-PACKAGES = 0.5e9
+PACKAGES_BYTES = 0.5e9
 """Memory of a process that has compiled something small."""
 
 
 def child(kind: str, n: str) -> dict:
     """The part that runs in a process of its own."""
-    make, method, h = KINDS[kind]
+    make, method, h = SYSTEM_KINDS[kind]
     times = [time.process_time()]
     system, x0 = make(int(n))
 
@@ -129,25 +129,29 @@ def child(kind: str, n: str) -> dict:
         return lt.integrate(system, x0, (0.0, count * h), h, method, save_every=count)
 
     for _ in range(2):
-        steps(FEW)
+        steps(SHORT_STEPS)
         times.append(time.process_time())
     first, short = np.diff(times)
-    many = FEW + 1
-    while (seconds := _timed(functools.partial(steps, many)) - short) < LEAST_TIME and many < MOST:
-        many = min(MOST, 2 * many)
-    seconds = min(seconds, _timed(functools.partial(steps, many)) - short)  # Newton's method is compiled where needed
-    chosen = Chosen(*as_run(system, method), "auto", many)
-    chosen.begin(jnp.asarray(x0))
+    many = SHORT_STEPS + 1
+    while (
+        seconds := _processor_seconds(functools.partial(steps, many)) - short
+    ) < MIN_TIMED_SECONDS and many < MAX_STEPS:
+        many = min(MAX_STEPS, 2 * many)
+    seconds = min(
+        seconds, _processor_seconds(functools.partial(steps, many)) - short
+    )  # Newton's method is compiled where needed
+    chosen = EngineWithFallback(*prepare_run(system, method), "auto", many)
+    chosen.initial_run_state(jnp.asarray(x0))
     return {
         "sites": len(np.ravel(x0)) // {"a field": 2, "spins": 3}.get(kind, 1) + (kind == "su(N)"),
         "engine": chosen.name,
         "first": first,
-        "step": seconds / (many - FEW),
-        "peak": resident() if STATUS.is_file() else None,
+        "step": seconds / (many - SHORT_STEPS),
+        "peak": peak_resident_bytes() if PROCESS_STATUS_FILE.is_file() else None,
     }
 
 
-def _timed(work: Callable) -> float:
+def _processor_seconds(work: Callable) -> float:
     begun = time.process_time()
     work()
     return time.process_time() - begun

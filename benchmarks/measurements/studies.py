@@ -12,19 +12,19 @@ import numpy as np
 import liethermo as lt
 
 from .. import child as process
-from ..machine import cores
+from ..machine import available_cores
 from ..report import Report, Table, Target
-from .memory import resident
+from .memory import peak_resident_bytes
 
-X0, STEP, END, TOL = (1.0, 0.2, 0.3), 0.1, 40.0, 1e-8
+X0, STEP, T_END, RELAXED_TOLERANCE = (1.0, 0.2, 0.3), 0.1, 40.0, 1e-8
 METHOD = lt.MetriplecticRungeKutta(4)
-BODIES, CHUNKS, SHARED = 1_000_000, 100_000, 200_000
+N_BODIES, N_CHUNKS, N_CLUSTER_BODIES = 1_000_000, 100_000, 200_000
 
 
 def run(quick: bool) -> Report:
     """Three tables."""
-    bodies, chunks, shared = (2_000, 100, 500) if quick else (BODIES, CHUNKS, SHARED)
-    alone = [process.call("studies", what, str(bodies)) for what in ("bare", "kept")]
+    bodies, chunks, shared = (2_000, 100, 500) if quick else (N_BODIES, N_CHUNKS, N_CLUSTER_BODIES)
+    alone = [process.run_child("studies", what, str(bodies)) for what in ("bare", "kept")]
     share = alone[1]["seconds"] / alone[0]["seconds"] - 1.0
     columns = {"": "text", "Time": "seconds", "Peak memory": "gigabytes"}
     rows = [
@@ -32,7 +32,7 @@ def run(quick: bool) -> Report:
         for name, a in zip(("`ensemble(until=lt.Relaxed(...))`", "`Study`, kept"), alone, strict=True)
     ]
     first = Table(f"The relaxation times of {bodies:,} bodies, each in a process of its own.", columns, rows)
-    trivial = process.call("studies", "chunks", str(chunks))
+    trivial = process.run_child("studies", "chunks", str(chunks))
     columns = {"Chunks": "count", "Time": "seconds", "A chunk": "seconds"}
     second = Table(
         "Chunks of one point with one step: what a chunk costs.",
@@ -41,12 +41,12 @@ def run(quick: bool) -> Report:
     )
     rows, one = [], None
     for workers in (1, 2, 4):
-        found = process.call("studies", "workers", str(shared), str(workers))
+        found = process.run_child("studies", "workers", str(shared), str(workers))
         one = one or found["seconds"]
         rows.append([workers, found["seconds"], one / found["seconds"]])
     columns = {"Workers": "count", "Time": "seconds", "Speed-up": "ratio"}
     caption = (
-        f"The relaxation times of {shared:,} bodies by workers of one thread on {cores()} cores, once they are there "
+        f"The relaxation times of {shared:,} bodies by workers of one thread on {available_cores()} cores, once they are there "
         "and have compiled."
     )
     third = Table(caption, columns, rows)
@@ -62,9 +62,14 @@ def run(quick: bool) -> Report:
 def child(what: str, number: str, workers: str = "1") -> dict:
     """The part that runs in a process of its own."""
     count = int(number)
-    works = {"bare": _bare, "kept": _kept, "chunks": _chunks, "workers": lambda n: _on_workers(n, int(workers))}
+    works = {
+        "bare": _time_ensemble,
+        "kept": _time_stored_study,
+        "chunks": _time_small_chunks,
+        "workers": lambda n: _time_cluster_study(n, int(workers)),
+    }
     seconds = works[what](count)
-    return {"seconds": seconds, "peak": resident()}
+    return {"seconds": seconds, "peak": peak_resident_bytes()}
 
 
 def _body(point):
@@ -76,23 +81,27 @@ def _rates(count: int) -> np.ndarray:
 
 
 def _study(count: int, folder: str, **changes) -> lt.Study:
-    arguments: dict[str, Any] = {"t_span": (0.0, END), "step": STEP, "measure": {"time": lt.Relaxed(TOL)}} | changes
+    arguments: dict[str, Any] = {
+        "t_span": (0.0, T_END),
+        "step": STEP,
+        "measure": {"time": lt.Relaxed(RELAXED_TOLERANCE)},
+    } | changes
     return lt.Study(_body, {"rate": _rates(count)}, x0=X0, method=METHOD, store=Path(folder) / "s.zarr", **arguments)
 
 
-def _bare(count: int) -> float:
+def _time_ensemble(count: int) -> float:
     def timed(n: int) -> float:
         start = time.perf_counter()
         system = lt.models.rigid_body(rate=1.0)
         found = lt.ensemble(
             system,
             np.broadcast_to(X0, (n, 3)),
-            (0.0, END),
+            (0.0, T_END),
             STEP,
             METHOD,
             parameters={"dissipation.rate": _rates(n)},
             outputs="summary",
-            until=lt.Relaxed(TOL),
+            until=lt.Relaxed(RELAXED_TOLERANCE),
         )
         assert found.ok.all()
         return time.perf_counter() - start
@@ -101,28 +110,28 @@ def _bare(count: int) -> float:
     return timed(count)
 
 
-def _timed(study: lt.Study, client=None) -> float:
+def _time_study(study: lt.Study, client=None) -> float:
     start = time.perf_counter()
     study.run(client, progress=False)
     assert study.status().complete
     return time.perf_counter() - start
 
 
-def _kept(count: int, **changes) -> float:
+def _time_stored_study(count: int, **changes) -> float:
     with tempfile.TemporaryDirectory() as first, tempfile.TemporaryDirectory() as folder:
-        _timed(_study(100, first, **changes))
-        return _timed(_study(count, folder, **changes))
+        _time_study(_study(100, first, **changes))
+        return _time_study(_study(count, folder, **changes))
 
 
-def _chunks(count: int) -> float:
-    return _kept(count, t_span=(0.0, STEP), measure={"final": "final"}, chunk=1)
+def _time_small_chunks(count: int) -> float:
+    return _time_stored_study(count, t_span=(0.0, STEP), measure={"final": "final"}, chunk=1)
 
 
-def _on_workers(count: int, workers: int) -> float:
+def _time_cluster_study(count: int, workers: int) -> float:
     from distributed import Client, LocalCluster
 
     cluster = LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None)
     folders = tempfile.TemporaryDirectory(), tempfile.TemporaryDirectory()
     with cluster, Client(cluster) as client, folders[0] as first, folders[1] as folder:
-        _timed(_study(64 * workers, first, chunk=8), client)
-        return _timed(_study(count, folder, chunk=4096), client)
+        _time_study(_study(64 * workers, first, chunk=8), client)
+        return _time_study(_study(count, folder, chunk=4096), client)

@@ -9,13 +9,13 @@ import numpy as np
 
 import liethermo as lt
 
-from ..report import Report, Table, Target, take_part
-from ..simulators import Body, Record, basilisk, library, mujoco, scipy
+from ..report import Report, Table, Target, build_available
+from ..simulators import MotionRecord, TumblingBody, basilisk_run, library_run, mujoco_run, scipy_run
 from ..timing import race
 
-FREE = Body(np.array([3.0, 2.0, 1.0]))
-DAMPED = Body(np.array([3.3, 2.0, 1.3]), wheel=0.3, damping=0.2)
-TIMES, EXACT = 100, 1e-13
+FREE_BODY = TumblingBody(np.array([3.0, 2.0, 1.0]))
+DAMPED_BODY = TumblingBody(np.array([3.3, 2.0, 1.3]), wheel=0.3, damping=0.2)
+N_TIMES, EXACT_TOLERANCE = 100, 1e-13
 
 COLUMNS = {
     "": "text",
@@ -30,17 +30,17 @@ COLUMNS = {
 }
 
 
-def contestants(body: Body, t_end: float) -> dict[str, tuple[str, float | None, Callable[[], Callable]]]:
+def contestants(body: TumblingBody, t_end: float) -> dict[str, tuple[str, float | None, Callable[[], Callable]]]:
     """For each the setting, its step (None where it chooses), and what builds its work."""
     gauss, midpoint = lt.MetriplecticGauss(3), lt.MetriplecticMidpoint()
     return {
-        "this library, midpoint": ("step 0.01", 0.01, lambda: library(body, midpoint, 0.01, t_end, TIMES)),
-        "this library, Gauss, order 6": ("step 0.1", 0.1, lambda: library(body, gauss, 0.1, t_end, TIMES)),
-        "SciPy DOP853": ("tolerance 1e-10", None, lambda: scipy(body, 1e-10, t_end, TIMES)),
-        "MuJoCo, RK4": ("step 0.01", 0.01, lambda: mujoco(body, "RK4", 0.01, t_end, TIMES)),
-        "MuJoCo, implicit": ("step 0.01", 0.01, lambda: mujoco(body, "implicit", 0.01, t_end, TIMES)),
-        "MuJoCo, Euler (its default)": ("step 0.01", 0.01, lambda: mujoco(body, "Euler", 0.01, t_end, TIMES)),
-        "Basilisk, RK4 (its default)": ("step 0.01", 0.01, lambda: basilisk(body, 0.01, t_end, TIMES)),
+        "this library, midpoint": ("step 0.01", 0.01, lambda: library_run(body, midpoint, 0.01, t_end, N_TIMES)),
+        "this library, Gauss, order 6": ("step 0.1", 0.1, lambda: library_run(body, gauss, 0.1, t_end, N_TIMES)),
+        "SciPy DOP853": ("tolerance 1e-10", None, lambda: scipy_run(body, 1e-10, t_end, N_TIMES)),
+        "MuJoCo, RK4": ("step 0.01", 0.01, lambda: mujoco_run(body, "RK4", 0.01, t_end, N_TIMES)),
+        "MuJoCo, implicit": ("step 0.01", 0.01, lambda: mujoco_run(body, "implicit", 0.01, t_end, N_TIMES)),
+        "MuJoCo, Euler (its default)": ("step 0.01", 0.01, lambda: mujoco_run(body, "Euler", 0.01, t_end, N_TIMES)),
+        "Basilisk, RK4 (its default)": ("step 0.01", 0.01, lambda: basilisk_run(body, 0.01, t_end, N_TIMES)),
     }
 
 
@@ -51,20 +51,20 @@ def run(quick: bool) -> Report:
     skipped: dict[str, str] = {}
     worst = 0.0
     captions = {
-        f"The free body, I = (3, 2, 1), to t = {t_end:g} s.": FREE,
-        f"With a wheel about the middle axis that rubs in its bearing, to t = {t_end:g} s.": DAMPED,
+        f"The free body, I = (3, 2, 1), to t = {t_end:g} s.": FREE_BODY,
+        f"With a wheel about the middle axis that rubs in its bearing, to t = {t_end:g} s.": DAMPED_BODY,
     }
     for caption, body in captions.items():
         settings = contestants(body, t_end)
-        works, missing = take_part({name: build for name, (_, _, build) in settings.items()})
+        works, missing = build_available({name: build for name, (_, _, build) in settings.items()})
         skipped |= missing
-        exact = scipy(body, EXACT, t_end, TIMES)()
+        exact = scipy_run(body, EXACT_TOLERANCE, t_end, N_TIMES)()
         rows: list[list[Any]] = []
-        for name, outcome in race(works, rounds=rounds, patience=8.0).items():
+        for name, outcome in race(works, rounds=rounds, max_seconds=8.0).items():
             (setting, step, _), record = settings[name], outcome.result
             steps = record.steps or round(t_end / (step or t_end))
-            seconds = outcome.processor if record.seconds is None else record.seconds
-            found = _drifts(record, exact, exact.kinetic if body.wheel else exact.kinetic[:1])
+            seconds = outcome.cpu_seconds if record.seconds is None else record.seconds
+            found = _record_errors(record, exact, exact.kinetic_energy if body.wheel else exact.kinetic_energy[:1])
             rows.append([name, setting, seconds / steps, seconds, *found])
             if name.startswith("this library"):
                 worst = max(worst, *(drift for drift in found[1:4] if drift is not None))
@@ -74,7 +74,7 @@ def run(quick: bool) -> Report:
         "spin about the axis of greatest inertia. Nothing acts from outside: the angular momentum L in space is "
         "constant, in size and in direction, and so is the energy with the heat of the bearing. The table has the "
         "largest changes of these at 100 times, relative to their sizes. The columns of the kinetic energy and of the "
-        f"momentum in the body are errors, against DOP853 at a tolerance of {EXACT:g}; the smallest of the momentum's "
+        f"momentum in the body are errors, against DOP853 at a tolerance of {EXACT_TOLERANCE:g}; the smallest of the momentum's "
         "are its own. MuJoCo and Basilisk do not follow the heat. Times are of the processor; every row has the "
         "attitude too."
     )
@@ -82,14 +82,14 @@ def run(quick: bool) -> Report:
     return Report("A tumbling body, beside MuJoCo and Basilisk", text, tables, targets, skipped)
 
 
-def _drifts(record: Record, exact: Record, kinetic: np.ndarray) -> list[float | None]:
+def _record_errors(record: MotionRecord, exact: MotionRecord, kinetic: np.ndarray) -> list[float | None]:
     """Error of the kinetic energy, drift of the total one, of the size of L and of its direction, error of mu."""
-    size = np.linalg.norm(record.in_space, axis=1)
-    direction = record.in_space / size[:, None]
-    total = record.total
+    size = np.linalg.norm(record.spatial_momentum, axis=1)
+    direction = record.spatial_momentum / size[:, None]
+    total = record.total_energy
     return [
-        float(np.abs(record.kinetic - kinetic).max() / kinetic[0]),
-        None if total is None else float(np.abs(total - total[0]).max() / abs(exact.kinetic[0])),
+        float(np.abs(record.kinetic_energy - kinetic).max() / kinetic[0]),
+        None if total is None else float(np.abs(total - total[0]).max() / abs(exact.kinetic_energy[0])),
         float(np.abs(size - size[0]).max() / size[0]),
         float(np.linalg.norm(direction - direction[0], axis=1).max()),
         float(np.abs(record.momentum - exact.momentum).max() / size[0]),

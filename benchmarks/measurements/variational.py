@@ -10,9 +10,9 @@ import numpy as np
 import liethermo as lt
 from liethermo.models.mass_spring_gas import CASES
 
-from ..contest import contest, of_one_scheme
-from ..native import Body
-from ..report import Report, Target, ratio, take_part
+from ..contest import race_one_trajectory, require_same_scheme
+from ..native import BodyProgram
+from ..report import Report, Target, build_available, ratio
 
 SCHEMES = {
     1: lt.VariationalIntegrator.verlet(),
@@ -22,7 +22,7 @@ SCHEMES = {
 X0, STEP, FRICTION = (0.3, 0.0, 0.0), 1e-3, 0.2
 STEPS = 100_000
 
-C, COMPILED = "C", "compiled engine"
+C_ROW, COMPILED_ROW = "C", "compiled engine"
 
 
 def run(quick: bool) -> Report:
@@ -31,24 +31,24 @@ def run(quick: bool) -> Report:
     tables, targets, furthest = [], [], 0.0
     skipped: dict[str, str] = {}
     for number in SCHEMES:
-        works, left_out = take_part(
+        works, left_out = build_available(
             {
-                C: functools.partial(by_c, number, steps),
-                COMPILED: functools.partial(by_library, number, steps, steps),
+                C_ROW: functools.partial(c_run, number, steps),
+                COMPILED_ROW: functools.partial(library_run, number, steps, steps),
             }
         )
-        table, times = contest(f"Scheme {number}.", works, steps, rounds, C)
+        table, times = race_one_trajectory(f"Scheme {number}.", works, steps, rounds, C_ROW)
         tables.append(table)
         targets.append(
             Target(
                 f"variational scheme {number}, mass and spring in a gas, against C",
                 3.0,
-                ratio(times[COMPILED], times.get(C)),
+                ratio(times[COMPILED_ROW], times.get(C_ROW)),
             )
         )
         skipped |= left_out
-        if C in works:
-            furthest = max(furthest, difference(number))
+        if C_ROW in works:
+            furthest = max(furthest, max_difference_from_c(number))
     text = (
         f"The three schemes of Gay-Balmaz and Yoshimura on their Case 1 with friction {FRICTION}: {steps:,} steps of "
         f"{STEP} s, one state kept. The programs in C are written for this system, the library has its Lagrangian and "
@@ -60,23 +60,23 @@ def run(quick: bool) -> Report:
     return Report("Variational schemes", text, tables, targets, skipped)
 
 
-def program(number: int) -> Body:
+def c_program(number: int) -> BodyProgram:
     system = CASES[1]
     parameters = [system["mass"], system["stiffness"], FRICTION, 1.5 * system["moles"] * 8.31446261815324, 300.0]
-    return Body("variational.c", parameters, f"-DSCHEME={number}")
+    return BodyProgram("variational.c", parameters, f"-DSCHEME={number}")
 
 
-def by_c(number: int, steps: int) -> Callable:
-    return functools.partial(program(number).integrate, X0, STEP, steps)
+def c_run(number: int, steps: int) -> Callable:
+    return functools.partial(c_program(number).integrate, X0, STEP, steps)
 
 
-def by_library(number: int, steps: int, every: int) -> Callable[[], lt.Solution]:
+def library_run(number: int, steps: int, every: int) -> Callable[[], lt.Solution]:
     system = lt.models.mass_spring_gas(**CASES[1], friction=FRICTION)
     span = (0.0, STEP * steps)
     return functools.partial(lt.integrate, system, X0, span, STEP, SCHEMES[number], save_every=every, engine="compiled")
 
 
-def difference(number: int) -> float:
+def max_difference_from_c(number: int) -> float:
     """Largest difference between the trajectories of C and of the library, over 1000 steps.
 
     Raises
@@ -84,5 +84,5 @@ def difference(number: int) -> float:
     RuntimeError
         As :func:`..contest.of_one_scheme`.
     """
-    ours, (theirs, _) = by_library(number, 1000, 1)().x[1:], program(number).integrate(X0, STEP, 1000, 1)
-    return of_one_scheme(float(np.abs(ours - theirs).max()), 1000)
+    ours, (theirs, _) = library_run(number, 1000, 1)().x[1:], c_program(number).integrate(X0, STEP, 1000, 1)
+    return require_same_scheme(float(np.abs(ours - theirs).max()), 1000)

@@ -10,38 +10,38 @@ import numpy as np
 import liethermo as lt
 
 from .. import laws, peers, reference
-from ..native import Body
-from ..problems import X0, body, body_parameters
-from ..report import Report, Table, Target, take_part
+from ..native import BodyProgram
+from ..problems import X0, body_parameters, quadratic_body
+from ..report import Report, Table, Target, build_available
 from ..timing import race
 
 RATE, T_END = 0.1, 100.0
 """The body is half way to its rest at the end, where errors are taken."""
 
-STEPS = (500, 1000, 2000, 5000, 10_000, 20_000, 50_000, 100_000)
-LARGE_STEPS = (100, 200, 500, 1000, 2000)
+MIDPOINT_STEPS = (500, 1000, 2000, 5000, 10_000, 20_000, 50_000, 100_000)
+GAUSS_STEPS = (100, 200, 500, 1000, 2000)
 EXPLICIT_STEPS, TAYLOR_STEPS = (100, 150, 200, 250, 300, 400, 500, 700), (40, 50, 60, 70, 80, 100)
 
 TOLERANCES = tuple(10.0**-n for n in range(3, 14))
 
 METHODS: dict[str, tuple[lt.OneStepMethod, tuple[int, ...]]] = {
-    "midpoint": (lt.MetriplecticMidpoint(), STEPS),
-    **{f"Gauss, order {2 * s}": (lt.MetriplecticGauss(stages=s), LARGE_STEPS) for s in (2, 3, 4)},
+    "midpoint": (lt.MetriplecticMidpoint(), MIDPOINT_STEPS),
+    **{f"Gauss, order {2 * s}": (lt.MetriplecticGauss(stages=s), GAUSS_STEPS) for s in (2, 3, 4)},
     "explicit, order 8": (lt.MetriplecticRungeKutta(8), EXPLICIT_STEPS),
     "Taylor, order 16": (lt.MetriplecticTaylor(16), TAYLOR_STEPS),
 }
 """The library's methods and the numbers of steps to run each with. Another method is one more line."""
 
-PEERS: dict[str, tuple[Callable[..., peers.Run], tuple[float, ...]]] = {
-    "SciPy DOP853": (peers.scipy, TOLERANCES),
-    "diffrax Tsit5": (lambda *arguments: peers.diffrax("Tsit5", *arguments), TOLERANCES),
-    "diffrax Dopri8": (lambda *arguments: peers.diffrax("Dopri8", *arguments), TOLERANCES),
-    "heyoka Taylor": (peers.heyoka, (*TOLERANCES, 1e-15, 1e-18)),
+PEERS: dict[str, tuple[Callable[..., peers.PeerRun], tuple[float, ...]]] = {
+    "SciPy DOP853": (peers.scipy_run, TOLERANCES),
+    "diffrax Tsit5": (lambda *arguments: peers.diffrax_run("Tsit5", *arguments), TOLERANCES),
+    "diffrax Dopri8": (lambda *arguments: peers.diffrax_run("Dopri8", *arguments), TOLERANCES),
+    "heyoka Taylor": (peers.heyoka_run, (*TOLERANCES, 1e-15, 1e-18)),
 }
 
-WANTED = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
+TABLE_ERRORS = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
 
-TARGETS, CALL = (1e-10, 1e-12), "a call of one step"
+TARGET_ERRORS, CALL_ROW = (1e-10, 1e-12), "a call of one step"
 """Errors at which explicit methods are compared with heyoka, and what their calls take beside the steps."""
 
 
@@ -53,55 +53,55 @@ def run(quick: bool) -> Report:
             continue
         for steps in counts[:1] if quick else counts:
             builders |= {
-                (f"{name}, {engine} engine", f"{steps} steps"): _library(method, steps, engine)
+                (f"{name}, {engine} engine", f"{steps} steps"): _library_builder(method, steps, engine)
                 for engine in ("compiled", "array")
             }
             if name == "midpoint":
-                builders["midpoint, C", f"{steps} steps"] = _c(steps)
+                builders["midpoint, C", f"{steps} steps"] = _c_builder(steps)
         if method.explicit:
-            builders[name, CALL] = _library(method, 1, "compiled", T_END / counts[-1])
+            builders[name, CALL_ROW] = _library_builder(method, 1, "compiled", T_END / counts[-1])
     for name, (solver, tolerances) in PEERS.items():
         for tolerance in tolerances[:1] if quick else tolerances:
-            builders[name, f"tolerance {tolerance:.0e}"] = _peer(solver, tolerance)
-    contestants, skipped = take_part(builders)
-    outcomes = race({key: end for key, (end, _) in contestants.items()}, rounds=1 if quick else 5, patience=2.0)
+            builders[name, f"tolerance {tolerance:.0e}"] = _peer_builder(solver, tolerance)
+    contestants, skipped = build_available(builders)
+    outcomes = race({key: end for key, (end, _) in contestants.items()}, rounds=1 if quick else 5, max_seconds=2.0)
 
-    exact = reference.states(X0, RATE, T_END)
+    exact = reference.exact_state(X0, RATE, T_END)
     rows: list[list] = []
     series: dict[str, list[list[float]]] = {}
-    calls = {name: outcome.processor for (name, setting), outcome in outcomes.items() if setting == CALL}
+    calls = {name: outcome.cpu_seconds for (name, setting), outcome in outcomes.items() if setting == CALL_ROW}
     for (name, setting), outcome in outcomes.items():
-        if setting == CALL:
+        if setting == CALL_ROW:
             continue
         state, kept = contestants[name, setting][1](outcome.result)
         error = float(np.abs(state - exact).max() / np.abs(exact).max())
-        rows.append([name, setting, error, outcome.processor, *kept.cells()])
-        series.setdefault(name, []).append([error, outcome.processor])
+        rows.append([name, setting, error, outcome.cpu_seconds, *kept.table_cells()])
+        series.setdefault(name, []).append([error, outcome.cpu_seconds])
     rows.sort(key=lambda row: list(series).index(row[0]))
     columns = {"": "text", "Setting": "text", "Error": "error", "Time": "seconds"} | laws.COLUMNS
     text = (
         f"The relaxed rigid body (rate {RATE}) from {X0} to t = {T_END:g}: the error of the last state against Taylor "
-        f"series of {reference.DIGITS} digits. The times are the processor's, of whole calls from Python. For the "
+        f"series of {reference.DECIMAL_DIGITS} digits. The times are the processor's, of whole calls from Python. For the "
         "peers the laws are taken over their own steps; nothing but accuracy keeps the laws there."
     )
     return Report(
         "Work and precision",
         text,
-        [_fastest(series), Table("Every run.", columns, rows)],
-        [] if quick else _targets(series, calls),
+        [_fastest_table(series), Table("Every run.", columns, rows)],
+        [] if quick else _explicit_targets(series, calls),
         skipped={name: reason for (name, _), reason in skipped.items()},
         series=series,
     )
 
 
-def _targets(series: dict[str, list[list[float]]], calls: dict[str, float]) -> list[Target]:
+def _explicit_targets(series: dict[str, list[list[float]]], calls: dict[str, float]) -> list[Target]:
     """The best explicit method for each error: its steps against heyoka, and its whole call."""
 
     def fastest(name: str, wanted: float) -> float:
         return min((seconds for error, seconds in series.get(name, []) if error <= wanted), default=math.inf)
 
     found = []
-    for wanted in TARGETS:
+    for wanted in TARGET_ERRORS:
         whole, call = min((fastest(f"{name}, compiled engine", wanted), call) for name, call in calls.items())
         work, heyoka = f"one body to t = {T_END:g} at {wanted:.0e}, explicit", fastest("heyoka Taylor", wanted)
         steps = (whole - call) / heyoka if math.isfinite(heyoka) else None
@@ -110,40 +110,43 @@ def _targets(series: dict[str, list[list[float]]], calls: dict[str, float]) -> l
     return found
 
 
-def _fastest(series: dict[str, list[list[float]]]) -> Table:
+def _fastest_table(series: dict[str, list[list[float]]]) -> Table:
     """The least time in which each method reaches an error."""
     rows = [
-        [name, *(min((seconds for error, seconds in points if error <= wanted), default=None) for wanted in WANTED)]
+        [
+            name,
+            *(min((seconds for error, seconds in points if error <= wanted), default=None) for wanted in TABLE_ERRORS),
+        ]
         for name, points in series.items()
     ]
-    columns = {"": "text"} | {f"≤ {wanted:.0e}": "seconds" for wanted in WANTED}
+    columns = {"": "text"} | {f"≤ {wanted:.0e}": "seconds" for wanted in TABLE_ERRORS}
     return Table("The least time in which an error was reached, over the settings tried.", columns, rows)
 
 
 # Each builder returns what to time, and what makes of its result the last state and the laws.
 
 
-def _library(method, steps, engine, end_time=T_END):
+def _library_builder(method, steps, engine, end_time=T_END):
     def build():
-        system, span = body(RATE), (0.0, end_time)
+        system, span = quadratic_body(RATE), (0.0, end_time)
         end = lambda: lt.integrate(system, X0, span, end_time / steps, method, save_every=steps, engine=engine)  # noqa: E731
-        return end, lambda solution: (solution.x[-1], laws.of_solution(solution))
+        return end, lambda solution: (solution.x[-1], laws.solution_laws(solution))
 
     return build
 
 
-def _c(steps):
+def _c_builder(steps):
     def build():
-        program = Body("rigid_body.c", body_parameters(RATE))
+        program = BodyProgram("rigid_body.c", body_parameters(RATE))
         end = lambda: program.integrate(X0, T_END / steps, steps)  # noqa: E731
-        return end, lambda found: (found[0][-1], laws.of_runs(found[1]))
+        return end, lambda found: (found[0][-1], laws.c_run_laws(found[1]))
 
     return build
 
 
-def _peer(solver, tolerance):
+def _peer_builder(solver, tolerance):
     def build():
-        run, system = solver(tolerance, X0, T_END, RATE), body(RATE)
-        return run.end, lambda state: (state, laws.of_path(run.path(), system))
+        run, system = solver(tolerance, X0, T_END, RATE), quadratic_body(RATE)
+        return run.end, lambda state: (state, laws.path_laws(run.path(), system))
 
     return build

@@ -18,15 +18,15 @@ import jax
 import jax.numpy as jnp
 import scipy
 
-from manifolds._module import Module, forwarded
+from manifolds._pytree_module import Module, forward_to
 
 from ..errors import InputError
 from ..functions.energy import Energy
-from ..functions.indices import Indices, union
-from .factor import Factor, beside
+from ..functions.indices import Indices, union_pattern
+from .factor import Factor, concatenate_factors
 from .geometry import Geometry
 
-Law = Literal["conserved", "nondecreasing", "nonincreasing"]
+LawName = Literal["conserved", "nondecreasing", "nonincreasing"]
 T = TypeVar("T")
 
 
@@ -40,22 +40,22 @@ class Dissipation(Module):
     """
 
     @property
-    def energy_law(self) -> Law | None:
+    def energy_law(self) -> LawName | None:
         """What the construction guarantees of the energy; None where it guarantees nothing."""
         return "conserved"
 
     @property
-    def entropy_law(self) -> Law | None:
+    def entropy_law(self) -> LawName | None:
         """What the construction guarantees of the entropy; None where it guarantees nothing."""
         return "nondecreasing"
 
     @property
-    def symmetric(self) -> bool:
+    def is_symmetric(self) -> bool:
         """Whether the force is ``K(x) grad S``, K symmetric, and not a skew bracket with the energy alone [SML 6]."""
         return True
 
     @property
-    def noiseless(self) -> bool:
+    def is_noiseless(self) -> bool:
         """Whether it is what acts from outside and no friction at all, so that no noise belongs to it."""
         return False
 
@@ -67,7 +67,7 @@ class Dissipation(Module):
         return None
 
     @property
-    def keeps_casimirs(self) -> bool:
+    def preserves_casimirs(self) -> bool:
         """Whether the force keeps every Casimir, whatever gradients it is handed: it lies in the range of Pi(x)."""
         return False
 
@@ -89,11 +89,11 @@ class Dissipation(Module):
         """Whether it acts on states with the entropies of baths behind them, where a body has no entropy of its own."""
         return False
 
-    def prepared(self, system: Geometry) -> Dissipation:
+    def bind_to(self, system: Geometry) -> Dissipation:
         """This dissipation, checked against the system it is used in and completed with what that determines."""
         return self
 
-    def own_residuals(self, system: Geometry, x) -> dict[str, jax.Array]:
+    def input_residuals(self, system: Geometry, x) -> dict[str, jax.Array]:
         """Residuals at x of what it was given and would have to mend, relative to what cancels, by their names."""
         return {}
 
@@ -112,7 +112,7 @@ class Dissipation(Module):
         """
 
     @property
-    def heated_bath(self) -> Indices | None:
+    def heated_bath_index(self) -> Indices | None:
         """The number of the bath that takes its heat, or of that of each site; None for the first one."""
         return None
 
@@ -121,7 +121,7 @@ class Dissipation(Module):
         """Whether :meth:`generated` gives the force in a form that the gradient of the entropy is not in."""
         return False
 
-    def generated(self, system: Geometry, x, dH) -> jax.Array:
+    def generator_field(self, system: Geometry, x, dH) -> jax.Array:
         """The force at the gradients that energy and entropy have at x, shape (n,); see :attr:`has_generator`.
 
         Such a form needs no entropy, as Lindblad's equation needs no logarithm of the density matrix.
@@ -150,19 +150,19 @@ class Dissipation(Module):
 
         By differentiation, except where the construction makes it vanish.
         """
-        B = self.factor_at(system, x)
+        B = self.continuous_factor(system, x)
         assert B is not None
-        return jnp.zeros(B.size) if B.solenoidal else jnp.sum(self.changes(system, x), axis=0)
+        return jnp.zeros(B.size) if B.solenoidal else jnp.sum(self.divergence_terms(system, x), axis=0)
 
-    def changes(self, system: Geometry, x) -> jax.Array:
+    def divergence_terms(self, system: Geometry, x) -> jax.Array:
         """What the divergence of each column is the sum of, shape (n, columns)."""
-        return system.changes(x, lambda y, alpha: self.factor_at(system, y).transposed(alpha))  # type: ignore[union-attr]
+        return system.divergence_terms(x, lambda y, alpha: self.continuous_factor(system, y).transpose_times(alpha))  # type: ignore[union-attr]
 
-    def factor_at(self, system: Geometry, x) -> Factor | None:
+    def continuous_factor(self, system: Geometry, x) -> Factor | None:
         """The factor at the gradients of the functions."""
         return self.factor(system, x, system.energy.gradient(x), tuple(L.gradient(x) for L in self.preserve))
 
-    def momentum(self, dH, turned) -> jax.Array | None:
+    def added_momentum(self, dH, turned) -> jax.Array | None:
         """F with force ``ad*_dH F``, for dissipations of the form of forced Euler-Poincaré equations [BFM 3.2].
 
         ``turned`` is ``[dH, dS]``. Such an F joins the momentum of the motion, ``x' = ad*_dH (x + F)``: one coadjoint
@@ -170,72 +170,72 @@ class Dissipation(Module):
         """
         return None
 
-    def change(self, system: Geometry, x, dH, dS, dL, gradient) -> jax.Array:
+    def rate_of_change(self, system: Geometry, x, dH, dS, dL, gradient) -> jax.Array:
         """``gradient . force``: the rate at which a function with this gradient changes by the dissipation."""
         return gradient @ self.force(system, x, dH, dS, dL)
 
     def __add__(self, other: Dissipation) -> Dissipation:
-        return Several((*self.terms, *other.terms))
+        return DissipationSum((*self.terms, *other.terms))
 
 
-class Several(Dissipation):
+class DissipationSum(Dissipation):
     """A sum of dissipations acting together; a law holds if every part obeys it."""
 
-    parts: tuple[Dissipation, ...]
+    summands: tuple[Dissipation, ...]
 
     @property
     def terms(self) -> tuple[Dissipation, ...]:
-        return self.parts
+        return self.summands
 
     @property
-    def energy_law(self) -> Law | None:
-        laws = {part.energy_law for part in self.parts}
+    def energy_law(self) -> LawName | None:
+        laws = {part.energy_law for part in self.summands}
         return None if None in laws else "nonincreasing" if "nonincreasing" in laws else "conserved"
 
     @property
-    def entropy_law(self) -> Law | None:
-        laws = {part.entropy_law for part in self.parts} - {"conserved"}
+    def entropy_law(self) -> LawName | None:
+        laws = {part.entropy_law for part in self.summands} - {"conserved"}
         return "conserved" if not laws else ("nondecreasing" if laws == {"nondecreasing"} else None)
 
     @property
-    def symmetric(self) -> bool:
-        return all(part.symmetric for part in self.parts)
+    def is_symmetric(self) -> bool:
+        return all(part.is_symmetric for part in self.summands)
 
     def couplings(self, system):
-        return union(part.couplings(system) for part in self.parts)
+        return union_pattern(part.couplings(system) for part in self.summands)
 
     @property
-    def keeps_casimirs(self) -> bool:
-        return all(part.keeps_casimirs for part in self.parts)
+    def preserves_casimirs(self) -> bool:
+        return all(part.preserves_casimirs for part in self.summands)
 
     @property
     def preserve(self) -> tuple[Energy, ...]:
-        return tuple(L for part in self.parts for L in part.preserve)
+        return tuple(L for part in self.summands for L in part.preserve)
 
     @property
     def needs_entropy(self) -> bool:
-        return any(part.needs_entropy for part in self.parts)
+        return any(part.needs_entropy for part in self.summands)
 
-    def prepared(self, system: Geometry) -> Dissipation:
-        return Several(tuple(part.prepared(system) for part in self.parts))
+    def bind_to(self, system: Geometry) -> Dissipation:
+        return DissipationSum(tuple(part.bind_to(system) for part in self.summands))
 
     def force(self, system, x, dH, dS, dL):
-        return sum(part.force(system, x, dH, dS, own) for part, own in portions(self, dL))
+        return sum(part.force(system, x, dH, dS, own) for part, own in terms_with_preserved(self, dL))
 
     @property
     def has_generator(self) -> bool:
-        return all(part.has_generator for part in self.parts)
+        return all(part.has_generator for part in self.summands)
 
-    def generated(self, system, x, dH):
-        return sum(part.generated(system, x, dH) for part in self.parts)
+    def generator_field(self, system, x, dH):
+        return sum(part.generator_field(system, x, dH) for part in self.summands)
 
     def factor(self, system, x, dH, dL):
-        found = [part.factor(system, x, dH, own) for part, own in portions(self, dL)]
+        found = [part.factor(system, x, dH, own) for part, own in terms_with_preserved(self, dL)]
         given = [B for B in found if B is not None]
-        return beside(given) if len(given) == len(found) else None
+        return concatenate_factors(given) if len(given) == len(found) else None
 
 
-def total(given: Dissipation | Sequence[Dissipation] | None) -> Dissipation | None:
+def sum_dissipations(given: Dissipation | Sequence[Dissipation] | None) -> Dissipation | None:
     """What a system is given as its dissipation: one, none, or a list or tuple of those that act together.
 
     Raises
@@ -257,7 +257,9 @@ def total(given: Dissipation | Sequence[Dissipation] | None) -> Dissipation | No
     return functools.reduce(operator.add, given)
 
 
-def portions(dissipation: Dissipation, preserved: Sequence[T]) -> Iterator[tuple[Dissipation, tuple[T, ...]]]:
+def terms_with_preserved(
+    dissipation: Dissipation, preserved: Sequence[T]
+) -> Iterator[tuple[Dissipation, tuple[T, ...]]]:
     """Each summand with its portion of what belongs to the functions in ``dissipation.preserve``, in their order."""
     start = 0
     for part in dissipation.terms:
@@ -266,7 +268,7 @@ def portions(dissipation: Dissipation, preserved: Sequence[T]) -> Iterator[tuple
         start = end
 
 
-class There(NamedTuple):
+class LiftedGeometry(NamedTuple):
     """Where a dissipation acts that is carried to other states: the system and the state there, and the way to and fro.
 
     Attributes
@@ -277,7 +279,7 @@ class There(NamedTuple):
         From a gradient here, shape (n,), to that there, shape (m,).
     lower : function
         From a velocity there to that here.
-    volume : bool
+    preserves_solenoidal : bool
         Whether a field of divergence zero there has none here.
     """
 
@@ -285,72 +287,74 @@ class There(NamedTuple):
     x: jax.Array
     lift: Callable
     lower: Callable
-    volume: bool = False
+    preserves_solenoidal: bool = False
 
-    def lifted(self, dH, dS, dL) -> tuple:
+    def lift_gradients(self, dH, dS, dL) -> tuple:
         """The gradients there; dS may be None."""
         return self.lift(dH), None if dS is None else self.lift(dS), tuple(map(self.lift, dL))
 
 
-class Carried(Dissipation):
+class LiftedDissipation(Dissipation):
     """A dissipation in other coordinates or on a larger state: it obeys the laws of the one that it is made from.
 
     Attributes
     ----------
-    part : Dissipation
-    functions : tuple of Energy
+    inner : Dissipation
+    preserved_functions : tuple of Energy
         What that one preserves, as functions of the new state.
     """
 
-    part: Dissipation
-    functions: tuple[Energy, ...]
+    inner: Dissipation
+    preserved_functions: tuple[Energy, ...]
 
     @abstractmethod
-    def there(self, system: Geometry, x) -> There:
+    def lifted_geometry(self, system: Geometry, x) -> LiftedGeometry:
         """Where it acts when it is asked for at x."""
 
     def force(self, system, x, dH, dS, dL):
-        at = self.there(system, x)
-        return at.lower(self.part.force(at.system, at.x, *at.lifted(dH, dS, dL)))
+        at = self.lifted_geometry(system, x)
+        return at.lower(self.inner.force(at.system, at.x, *at.lift_gradients(dH, dS, dL)))
 
-    has_generator = forwarded("part")
+    has_generator = forward_to("inner")
 
-    def generated(self, system, x, dH):
-        at = self.there(system, x)
-        return at.lower(self.part.generated(at.system, at.x, at.lift(dH)))
+    def generator_field(self, system, x, dH):
+        at = self.lifted_geometry(system, x)
+        return at.lower(self.inner.generator_field(at.system, at.x, at.lift(dH)))
 
     def factor(self, system, x, dH, dL):
-        at = self.there(system, x)
-        B = self.part.factor(at.system, at.x, at.lift(dH), tuple(map(at.lift, dL)))
+        at = self.lifted_geometry(system, x)
+        B = self.inner.factor(at.system, at.x, at.lift(dH), tuple(map(at.lift, dL)))
         if B is None:
             return None
-        return B._replace(times=lambda w: at.lower(B.times(w)), solenoidal=at.volume and B.solenoidal)
+        return B._replace(times=lambda w: at.lower(B.times(w)), solenoidal=at.preserves_solenoidal and B.solenoidal)
 
-    def own_residuals(self, system, x):
-        at = self.there(system, x)
-        return self.part.own_residuals(at.system, at.x)
+    def input_residuals(self, system, x):
+        at = self.lifted_geometry(system, x)
+        return self.inner.input_residuals(at.system, at.x)
 
     @classmethod
-    def of(cls, dissipation: Dissipation | None, pulled: Callable[[Energy], Energy], *more) -> Dissipation | None:
+    def lift_terms(
+        cls, dissipation: Dissipation | None, pulled: Callable[[Energy], Energy], *more
+    ) -> Dissipation | None:
         """That of each summand, what it preserves pulled back; ``more`` is what a subclass has besides."""
         if dissipation is None:
             return None
         parts = tuple(cls(part, tuple(map(pulled, part.preserve)), *more) for part in dissipation.terms)
-        return parts[0] if len(parts) == 1 else Several(parts)
+        return parts[0] if len(parts) == 1 else DissipationSum(parts)
 
-    energy_law = forwarded("part")
-    entropy_law = forwarded("part")
-    keeps_casimirs = forwarded("part")
-    symmetric = forwarded("part")
-    needs_entropy = forwarded("part")
+    energy_law = forward_to("inner")
+    entropy_law = forward_to("inner")
+    preserves_casimirs = forward_to("inner")
+    is_symmetric = forward_to("inner")
+    needs_entropy = forward_to("inner")
 
     @property
     def preserve(self):
-        return self.functions
+        return self.preserved_functions
 
 
 class SkewFriction(Dissipation):
     """A skew bracket with the energy alone, so that the energy is conserved: friction that heats [SML 6]."""
 
     needs_entropy = False
-    symmetric = False
+    is_symmetric = False

@@ -16,11 +16,11 @@ import numpy as np
 import scipy
 
 from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
-from manifolds.structures.extended import Places
+from manifolds.structures.extended import StateIndices
 
 from ..functions.edges import Edges
-from ..functions.indices import Indices, as_pattern, cliques
-from .base import Dissipation, Law, SkewFriction
+from ..functions.indices import Indices, clique_pattern, pattern_of_matrix
+from .base import Dissipation, LawName, SkewFriction
 from .factor import Factor
 
 
@@ -42,22 +42,22 @@ class HeatConduction(Dissipation):
         Of bodies, with their conductances (power / temperature).
     laws : tuple of functions of (T_i, T_j, x), optional
         In place of the weights: the conductance of each edge, >= 0.
-    factors : {"discrete", "midpoint"}
+    fourier_factors : {"discrete", "midpoint"}
     """
 
-    first: Indices = eqx.field(static=True)
-    second: Indices = eqx.field(static=True)
+    first_bodies: Indices = eqx.field(static=True)
+    second_bodies: Indices = eqx.field(static=True)
     conductance: jax.Array
     laws: tuple[Callable, ...]
-    factors: str = eqx.field(static=True)
+    fourier_factors: str = eqx.field(static=True)
 
     def __init__(self, graph: Edges, laws: tuple[Callable, ...] = (), factors: str = "discrete"):
-        self.first, self.second = Indices(graph.first), Indices(graph.second)
-        self.conductance, self.laws, self.factors = graph.weight, laws, factors
+        self.first_bodies, self.second_bodies = Indices(graph.first), Indices(graph.second)
+        self.conductance, self.laws, self.fourier_factors = graph.weight, laws, factors
 
     @property
-    def entropy_law(self) -> Law | None:
-        return "nondecreasing" if self.factors == "discrete" else None
+    def entropy_law(self) -> LawName | None:
+        return "nondecreasing" if self.fourier_factors == "discrete" else None
 
     def conductances(self, x, T_i, T_j) -> jax.Array:
         """Those of the edges between bodies of these temperatures, shape (edges,); NaN where one is negative."""
@@ -67,16 +67,16 @@ class HeatConduction(Dissipation):
         return jnp.where(found >= 0.0, found, jnp.nan)
 
     def force(self, system, x, dH, dS, dL):
-        S, i, j = _places(system).S, np.asarray(self.first), np.asarray(self.second)
-        T, along = _positive(dH[S]), dS[S]
-        at = T if self.factors == "discrete" else _positive(system.energy.gradient(x)[S])
+        S, i, j = _state_indices(system).S, np.asarray(self.first_bodies), np.asarray(self.second_bodies)
+        T, along = _nan_unless_positive(dH[S]), dS[S]
+        at = T if self.fourier_factors == "discrete" else _nan_unless_positive(system.energy.gradient(x)[S])
         heat = self.conductances(x, at[i], at[j]) * (along[i] * at[j] - along[j] * at[i])
         share = heat / (at[i] * at[j])
         return jnp.zeros_like(x).at[S[i]].add(share * T[j]).at[S[j]].add(-share * T[i])
 
     def factor(self, system, x, dH, dL):
-        S, i, j = _places(system).S, np.asarray(self.first), np.asarray(self.second)
-        T = _positive(dH[S])
+        S, i, j = _state_indices(system).S, np.asarray(self.first_bodies), np.asarray(self.second_bodies)
+        T = _nan_unless_positive(dH[S])
         root = jnp.sqrt(self.conductances(x, T[i], T[j]) * T[i] * T[j])
 
         def times(w):
@@ -87,8 +87,10 @@ class HeatConduction(Dissipation):
     def couplings(self, system):
         if self.laws:
             return None  # they may depend on everything
-        S = _places(system).S
-        return cliques(np.stack([S[np.asarray(self.first)], S[np.asarray(self.second)]], axis=1), system.dim)
+        S = _state_indices(system).S
+        return clique_pattern(
+            np.stack([S[np.asarray(self.first_bodies)], S[np.asarray(self.second_bodies)]], axis=1), system.dim
+        )
 
 
 class LinearFriction(Dissipation):
@@ -100,37 +102,37 @@ class LinearFriction(Dissipation):
     ----------
     R : array, shape (m,) for a diagonal matrix, or (m, m); or function from the state of the body to one
         Positive semidefinite (mass / time).
-    body : int, optional
+    body_index : int, optional
         Whose m momenta these are; by default R is diagonal and has an entry for every momentum of the whole system.
     """
 
     R: jax.Array | Callable
-    body: int | None = eqx.field(static=True, default=None)
+    body_index: int | None = eqx.field(static=True, default=None)
 
     def force(self, system, x, dH, dS, dL):
-        p, S, R, v, T = self._here(system, x, dH)
-        return self._spread(x, p, S, v, T, _apply(R, (v * dS[S] - T * dS[p]) / T))
+        p, S, R, v, T = self._friction_data(system, x, dH)
+        return self._apply_directions(x, p, S, v, T, _apply_form(R, (v * dS[S] - T * dS[p]) / T))
 
     def factor(self, system, x, dH, dL):
-        p, S, R, v, T = self._here(system, x, dH)
+        p, S, R, v, T = self._friction_data(system, x, dH)
         full = semidefinite_root if callable(self.R) else semidefinite_factor
         root = jnp.sqrt(R) if jnp.ndim(R) < 2 else full(R)
-        return Factor(len(p), lambda w: self._spread(x, p, S, v, T, _apply(root, w) / jnp.sqrt(T)))
+        return Factor(len(p), lambda w: self._apply_directions(x, p, S, v, T, _apply_form(root, w) / jnp.sqrt(T)))
 
     @staticmethod
-    def _spread(x, p, S, v, T, flux) -> jax.Array:
+    def _apply_directions(x, p, S, v, T, flux) -> jax.Array:
         return jnp.zeros_like(x).at[p].add(-T * flux).at[S].add(v * flux)
 
-    def _here(self, system, x, dH):
+    def _friction_data(self, system, x, dH):
         """Where the momenta and the entropies are, R, the velocities and the temperatures."""
-        places = _places(system)
-        mine = np.arange(len(places.p)) if self.body is None else np.flatnonzero(places.owner == self.body)
-        R = self.R(x[_of_body(places, mine)]) if callable(self.R) else self.R
+        places = _state_indices(system)
+        mine = np.arange(len(places.p)) if self.body_index is None else np.flatnonzero(places.owner == self.body_index)
+        R = self.R(x[_body_components(places, mine)]) if callable(self.R) else self.R
         p, S = places.p[mine], places.S[places.owner[mine]]
-        return p, S, R, dH[p], _positive(dH[S])
+        return p, S, R, dH[p], _nan_unless_positive(dH[S])
 
     def couplings(self, system):
-        return _within(_places(system), system.dim)
+        return _block_pattern(_state_indices(system), system.dim)
 
 
 class Drag(Dissipation):
@@ -146,42 +148,42 @@ class Drag(Dissipation):
         Of bodies with the same number of degrees of freedom, with coefficients c (mass / time).
     """
 
-    first: Indices = eqx.field(static=True)
-    second: Indices = eqx.field(static=True)
+    first_bodies: Indices = eqx.field(static=True)
+    second_bodies: Indices = eqx.field(static=True)
     coefficient: jax.Array
 
     def __init__(self, graph: Edges):
-        self.first, self.second = Indices(graph.first), Indices(graph.second)
+        self.first_bodies, self.second_bodies = Indices(graph.first), Indices(graph.second)
         self.coefficient = graph.weight
 
     def force(self, system, x, dH, dS, dL):
-        (p_i, p_j, S_i, S_j), (T_i, T_j, w), weight, spread = self._edges(system, x, dH)
+        (p_i, p_j, S_i, S_j), (T_i, T_j, w), weight, spread = self._edge_data(system, x, dH)
         along = dS[p_j] - dS[p_i] + 0.5 * w * (dS[S_i] / T_i + dS[S_j] / T_j)
         return spread(weight * along)
 
     def factor(self, system, x, dH, dL):
-        _, _, weight, spread = self._edges(system, x, dH)
+        _, _, weight, spread = self._edge_data(system, x, dH)
         return Factor(len(weight), lambda w: spread(jnp.sqrt(weight) * w))
 
-    def _edges(self, system, x, dH):
+    def _edge_data(self, system, x, dH):
         """Where momenta and entropies are, the temperatures and the velocity between, ``c / theta``, and ``flux z``."""
-        places = _places(system)
-        i, j, edge = _pairs(self.first, self.second, places)
+        places = _state_indices(system)
+        i, j, edge = _momentum_pairs(self.first_bodies, self.second_bodies, places)
         S_i, S_j, p_i, p_j = places.S[places.owner[i]], places.S[places.owner[j]], places.p[i], places.p[j]
-        T_i, T_j, w = _positive(dH[S_i]), _positive(dH[S_j]), dH[p_i] - dH[p_j]
+        T_i, T_j, w = _nan_unless_positive(dH[S_i]), _nan_unless_positive(dH[S_j]), dH[p_i] - dH[p_j]
 
-        def spread(flux):
+        def apply_directions(flux):
             made = jnp.zeros_like(x).at[S_i].add(0.5 * w * flux / T_i).at[S_j].add(0.5 * w * flux / T_j)
             return made.at[p_i].add(-flux).at[p_j].add(flux)
 
         weight = self.coefficient[edge] * (2.0 * T_i * T_j / (T_i + T_j))
-        return (p_i, p_j, S_i, S_j), (T_i, T_j, w), weight, spread
+        return (p_i, p_j, S_i, S_j), (T_i, T_j, w), weight, apply_directions
 
     def couplings(self, system):
-        places = _places(system)
-        i, j, _ = _pairs(self.first, self.second, places)
+        places = _state_indices(system)
+        i, j, _ = _momentum_pairs(self.first_bodies, self.second_bodies, places)
         S_i, S_j = places.S[places.owner[i]], places.S[places.owner[j]]
-        return cliques(np.stack([places.p[i], S_i, places.p[j], S_j], axis=1), system.dim)
+        return clique_pattern(np.stack([places.p[i], S_i, places.p[j], S_j], axis=1), system.dim)
 
 
 class ContactFriction(SkewFriction):
@@ -192,50 +194,50 @@ class ContactFriction(SkewFriction):
 
     Parameters
     ----------
-    bodies : tuple of int
-    nondecreasing : bool
+    body_indices : tuple of int
+    is_nondecreasing : bool
         Whether their energies are known to be of that form.
     """
 
-    bodies: tuple[int, ...] = eqx.field(static=True)
-    nondecreasing: bool = eqx.field(static=True, default=False)
+    body_indices: tuple[int, ...] = eqx.field(static=True)
+    is_nondecreasing: bool = eqx.field(static=True, default=False)
 
     @property
-    def entropy_law(self) -> Law | None:
-        return "nondecreasing" if self.nondecreasing else None
+    def entropy_law(self) -> LawName | None:
+        return "nondecreasing" if self.is_nondecreasing else None
 
     def force(self, system, x, dH, dS, dL):
-        places = _places(system)
-        mine = np.flatnonzero(np.isin(places.owner, self.bodies))
+        places = _state_indices(system)
+        mine = np.flatnonzero(np.isin(places.owner, self.body_indices))
         p, S = places.p[mine], places.S[places.owner[mine]]
         return jnp.zeros_like(x).at[p].add(-x[p] * dH[S]).at[S].add(x[p] * dH[p])
 
     def couplings(self, system):
-        return _within(_places(system), system.dim)
+        return _block_pattern(_state_indices(system), system.dim)
 
 
 # -- helpers ----------------------------------------------------------------------------------------------------------
 
 
-def _places(system) -> Places:
+def _state_indices(system) -> StateIndices:
     return system.poisson.places
 
 
-def _positive(T):
+def _nan_unless_positive(T):
     """Temperatures, NaN where they are not positive: the step is then refused."""
     return jnp.where(T > 0.0, T, jnp.nan)
 
 
-def _apply(R, v):
+def _apply_form(R, v):
     return R * v if jnp.ndim(R) < 2 else R @ v
 
 
-def _of_body(places: Places, mine: np.ndarray) -> np.ndarray:
+def _body_components(places: StateIndices, mine: np.ndarray) -> np.ndarray:
     """The components of the state of the body that some of the momenta belong to."""
     return np.concatenate([places.q[mine], places.p[mine], places.S[places.owner[mine[:1]]]])
 
 
-def _pairs(first: Indices, second: Indices, places: Places):
+def _momentum_pairs(first: Indices, second: Indices, places: StateIndices):
     """For each edge and component: the numbers of the two momenta, and of the edge."""
     i, j = np.asarray(first), np.asarray(second)
     starts = np.searchsorted(places.owner, np.arange(len(places.S)))
@@ -245,9 +247,11 @@ def _pairs(first: Indices, second: Indices, places: Places):
     return starts[i][edge] + within, starts[j][edge] + within, edge
 
 
-def _within(places: Places, dim: int) -> scipy.sparse.csr_array:
+def _block_pattern(places: StateIndices, dim: int) -> scipy.sparse.csr_array:
     """The pattern in which all components of a body depend on each other, and on none of another body."""
     starts = np.concatenate([[0], places.S[:-1] + 1])
     body = np.repeat(np.arange(len(starts)), places.S + 1 - starts)
-    member = as_pattern(scipy.sparse.coo_array((np.ones(dim, dtype=bool), (np.arange(dim), body)), (dim, len(starts))))
-    return as_pattern(member @ member.T)
+    member = pattern_of_matrix(
+        scipy.sparse.coo_array((np.ones(dim, dtype=bool), (np.arange(dim), body)), (dim, len(starts)))
+    )
+    return pattern_of_matrix(member @ member.T)

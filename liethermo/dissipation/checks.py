@@ -10,34 +10,36 @@ import manifolds as mf
 from manifolds.matrices.blocks import BlockDiagonal, Diagonal
 
 from ..errors import IndefiniteError, InputError
-from ..functions.checks import check_shape
-from ..functions.conditions import numbers, require
+from ..functions.checks import check_function_shape
+from ..functions.conditions import check_numbers, require_condition
 from ..functions.indices import Indices
 from .geometry import Geometry
 
-NEGATIVE = "has the negative eigenvalue {value:.3g}: it must be positive semidefinite, or entropy would fall"
+NEGATIVE_EIGENVALUE_MESSAGE = (
+    "has the negative eigenvalue {value:.3g}: it must be positive semidefinite, or entropy would fall"
+)
 
 
-def form_at(form, x):
+def evaluate_form(form, x):
     """A constant, or a function of the state evaluated at x."""
     return jnp.asarray(form(x)) if callable(form) else form
 
 
-def over_sites(form, system: Geometry):
+def repeat_over_sites(form, system: Geometry):
     """A form on the components of one site as that on those of all; another form as it is."""
     if callable(form) or form is None or not system.sites or np.shape(form) != system.shape[-1:] * 2:
         return form
     return BlockDiagonal((form,), system.shape[-1:], (system.dim // system.shape[-1],))
 
 
-def zero_state(dim: int):
+def state_shape_dtype(dim: int):
     return jax.ShapeDtypeStruct((dim,), jnp.float64)
 
 
 def checked_rate(rate) -> jax.Array:
     """A rate as one non-negative number (or a traced one)."""
-    array = numbers(rate, "a rate", ())
-    require(
+    array = check_numbers(rate, "a rate", ())
+    require_condition(
         array,
         lambda rate: rate >= 0.0,
         "a dissipation rate must be >= 0, not {value}: a negative one would lower the entropy",
@@ -47,7 +49,7 @@ def checked_rate(rate) -> jax.Array:
 
 def checked_rates(rates) -> jax.Array:
     """A rate, or one for each site, as an array of non-negative numbers (or traced ones)."""
-    array = numbers(rates, "a rate")
+    array = check_numbers(rates, "a rate")
     if not isinstance(array, jax.core.Tracer) and not np.all(np.asarray(array) >= 0.0):
         least = float(np.asarray(array).min())
         raise InputError(f"a dissipation rate must be >= 0, not {least}: a negative one would lower the entropy")
@@ -64,7 +66,7 @@ def checked_bath(bath) -> Indices | None:
     return Indices(numbers)
 
 
-def not_a_rate(form, dissipation: object, what: str) -> None:
+def reject_rate_as_form(form, dissipation: object, what: str) -> None:
     """Raise where a number stands for a form: that of a multiple of the identity is another thing than a rate."""
     if isinstance(form, int | float):
         raise InputError(
@@ -73,15 +75,15 @@ def not_a_rate(form, dissipation: object, what: str) -> None:
         )
 
 
-def semidefinite(form, what: str, symmetric: bool = True) -> jax.Array:
+def checked_semidefinite(form, what: str, symmetric: bool = True) -> jax.Array:
     """A form as a positive semidefinite matrix (or a traced one): symmetric, or with a symmetric part that is."""
-    matrix = numbers(form, what)
+    matrix = check_numbers(form, what)
     if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
         raise InputError(f"{what} must be a square matrix, not an array of shape {matrix.shape}")
     if isinstance(matrix, jax.core.Tracer):
         eigenvalues = jnp.linalg.eigvalsh((matrix + matrix.T) / 2)
         allowed = 1e-12 * matrix.shape[0] * jnp.abs(matrix).max()
-        require(eigenvalues[0], lambda low: low >= -allowed, f"{what} {NEGATIVE}")
+        require_condition(eigenvalues[0], lambda low: low >= -allowed, f"{what} {NEGATIVE_EIGENVALUE_MESSAGE}")
         return matrix
     entries = np.asarray(matrix)
     if not np.isfinite(entries).all():
@@ -93,7 +95,7 @@ def semidefinite(form, what: str, symmetric: bool = True) -> jax.Array:
     lowest = float(np.linalg.eigvalsh(0.5 * (entries + entries.T))[0])
     if lowest < -1e-12 * scale * matrix.shape[0]:
         raise IndefiniteError(
-            f"{what} {NEGATIVE}".format(value=lowest),
+            f"{what} {NEGATIVE_EIGENVALUE_MESSAGE}".format(value=lowest),
             residual=lowest,
             tolerance=1e-12 * scale * matrix.shape[0],
         )
@@ -109,14 +111,14 @@ def check_matrix(form, dim: int, what: str) -> None:
             raise InputError(f"{what} has {form.entries.size} entries, and a state has {dim} components")
         return
     if callable(form):
-        check_shape(form, [(dim,)], [(dim, dim)], what, f"a state of shape ({dim},)")
+        check_function_shape(form, [(dim,)], [(dim, dim)], what, f"a state of shape ({dim},)")
     elif form.shape != (dim, dim):
         raise InputError(
             f"{what} must be a ({dim}, {dim}) matrix for a state of {dim} components, not shape {form.shape}"
         )
 
 
-def needed_algebra(system: Geometry, name: str, form=None) -> mf.LieAlgebra:
+def require_algebra(system: Geometry, name: str, form=None) -> mf.LieAlgebra:
     """The algebra of a system; InputError where it has none, or where a form is not one of it."""
     algebra = system.lie_algebra
     if algebra is None:

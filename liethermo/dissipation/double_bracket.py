@@ -10,11 +10,11 @@ import numpy as np
 
 from manifolds.matrices.blocks import Diagonal
 
-from ..functions.conditions import numbers, require
+from ..functions.conditions import check_numbers, require_condition
 from ..functions.indices import Indices
 from .base import Dissipation
-from .checks import check_matrix, checked_bath, checked_rate, over_sites, semidefinite
-from .factor import Factor, root_of
+from .checks import check_matrix, checked_bath, checked_rate, checked_semidefinite, repeat_over_sites
+from .factor import Factor, form_root
 
 
 class DoubleBracket(Dissipation):
@@ -52,51 +52,51 @@ class DoubleBracket(Dissipation):
     def __init__(self, rate=1.0, metric=None, bath=None):
         self.rate = checked_rate(rate)
         self.bath = checked_bath(bath)
-        self.metric = None if metric is None else _form(metric)
+        self.metric = None if metric is None else _checked_metric(metric)
 
     energy_law = "nonincreasing"
     entropy_law = "conserved"
-    keeps_casimirs = True
+    preserves_casimirs = True
     needs_entropy = False
 
-    def prepared(self, system):
+    def bind_to(self, system):
         if self.metric is None:
             return self
-        metric = over_sites(self.metric, system)
+        metric = repeat_over_sites(self.metric, system)
         check_matrix(metric, system.dim, "the metric")
         return self if metric is self.metric else eqx.tree_at(lambda d: d.metric, self, metric)
 
     @property
-    def heated_bath(self):
+    def heated_bath_index(self):
         return self.bath
 
     def force(self, system, x, dH, dS, dL):
-        return self.rate * system.poisson.sharp(x, self._lowered(system, x, dH))
+        return self.rate * system.poisson.sharp(x, self._bracket_velocity(system, x, dH))
 
     def velocity(self, system, x, dH, dS, dL):
-        return self.rate * self._lowered(system, x, dH)
+        return self.rate * self._bracket_velocity(system, x, dH)
 
-    def _lowered(self, system, x, dH) -> jax.Array:
+    def _bracket_velocity(self, system, x, dH) -> jax.Array:
         """``(Pi dH)^♯``."""
         motion = system.poisson.sharp(x, dH)
-        return system.lowered(x, motion) if self.metric is None else self.metric @ motion
+        return system.lower_index(x, motion) if self.metric is None else self.metric @ motion
 
     def factor(self, system, x, dH, dL):
-        root = None if self.metric is None else root_of(self.metric)
+        root = None if self.metric is None else form_root(self.metric)
 
         def velocity(w):
-            return system.lowered(x, system.isotropic(x, w)) if root is None else root @ w
+            return system.lower_index(x, system.isotropic_vector(x, w)) if root is None else root @ w
 
         def times(w):
             return system.poisson.sharp(x, velocity(w))
 
         size = system.isotropic_size if root is None else system.dim
-        return Factor(size, times, velocity=velocity).scaled(self.rate)
+        return Factor(size, times, velocity=velocity).scale_by(self.rate)
 
 
-def _form(metric) -> Any:
+def _checked_metric(metric) -> Any:
     if np.ndim(metric) != 1:
-        return semidefinite(metric, "the metric")
-    entries = numbers(metric, "the metric")
-    require(entries, lambda entries: entries >= 0.0, "the diagonal of the metric must be >= 0, not {value}")
+        return checked_semidefinite(metric, "the metric")
+    entries = check_numbers(metric, "the metric")
+    require_condition(entries, lambda entries: entries >= 0.0, "the diagonal of the metric must be >= 0, not {value}")
     return Diagonal(entries)

@@ -14,7 +14,7 @@ import numpy as np
 from manifolds.matrices.blocks import BlockDiagonal, Diagonal
 from manifolds.matrices.symmetric import semidefinite_factor
 
-from ..functions.frames import root
+from ..functions.frames import sqrt_or_zero
 
 
 class Factor(NamedTuple):
@@ -30,7 +30,7 @@ class Factor(NamedTuple):
         Whether every column, at the gradients of the functions, is a field of divergence zero.
     velocity : function or None
         From w to sigma with ``B w = Pi(x) sigma``, where the construction is such: see :meth:`.Dissipation.velocity`.
-    turning : array or None
+    spin_coefficients : array or None
         The numbers r, of shape () or (sites,), with ``B w = r_i w_i x s_i`` at every spin, where it is such and w has
         three components for each: see :class:`.Fluctuating`.
     """
@@ -39,24 +39,24 @@ class Factor(NamedTuple):
     times: Callable[[jax.Array], jax.Array]
     solenoidal: bool = False
     velocity: Callable[[jax.Array], jax.Array] | None = None
-    turning: jax.Array | None = None
+    spin_coefficients: jax.Array | None = None
 
-    def transposed(self, alpha) -> jax.Array:
+    def transpose_times(self, alpha) -> jax.Array:
         """``B^T alpha``, shape (size,)."""
         return jax.linear_transpose(self.times, jax.ShapeDtypeStruct((self.size,), jnp.float64))(alpha)[0]
 
-    def scaled(self, rate) -> Factor:
+    def scale_by(self, rate) -> Factor:
         """The factor of ``rate * K``; the rate is a number, which may depend on the state."""
-        scale = root(rate)
+        scale = sqrt_or_zero(rate)
         velocity = None if (along := self.velocity) is None else lambda w: scale * along(w)
-        turning = None if self.turning is None else scale * self.turning
-        return self._replace(times=lambda w: scale * self.times(w), velocity=velocity, turning=turning)
+        turning = None if self.spin_coefficients is None else scale * self.spin_coefficients
+        return self._replace(times=lambda w: scale * self.times(w), velocity=velocity, spin_coefficients=turning)
 
 
-def root_of(form) -> Any:
+def form_root(form) -> Any:
     """R with ``R R^T = form``, for a semidefinite matrix or what acts like one; None where it has no root that acts."""
     if isinstance(form, BlockDiagonal):
-        roots = tuple(root_of(block) for block in form.blocks)
+        roots = tuple(form_root(block) for block in form.blocks)
         known = all(root is not None for root in roots)
         return eqx.tree_at(lambda f: f.blocks, form, roots) if known else None
     if isinstance(form, Diagonal):
@@ -64,7 +64,7 @@ def root_of(form) -> Any:
     return semidefinite_factor(form) if isinstance(form, jax.Array | np.ndarray) else None
 
 
-def beside(factors: Sequence[Factor]) -> Factor:
+def concatenate_factors(factors: Sequence[Factor]) -> Factor:
     """The factors side by side: that of the sum of the matrices."""
     ends = list(itertools.accumulate((B.size for B in factors), initial=0))
 

@@ -8,11 +8,11 @@ from collections.abc import Callable
 import equinox as eqx
 import jax.numpy as jnp
 
-from manifolds._module import Module
+from manifolds._pytree_module import Module
 
-from ..functions.checks import check_shape
+from ..functions.checks import check_function_shape
 from .base import Dissipation
-from .checks import needed_algebra
+from .checks import require_algebra
 
 
 class EulerPoincareForce(Dissipation):
@@ -31,19 +31,21 @@ class EulerPoincareForce(Dissipation):
     entropy_law = None
     needs_entropy = False
 
-    def prepared(self, system):
-        needed_algebra(system, "EulerPoincareForce")
-        check_shape(self.F, [system.shape], [system.shape], "the force F", f"a velocity of shape {system.shape}")
-        return dataclasses.replace(self, F=_OnSites(self.F, system.shape)) if system.sites else self
+    def bind_to(self, system):
+        require_algebra(system, "EulerPoincareForce")
+        check_function_shape(
+            self.F, [system.shape], [system.shape], "the force F", f"a velocity of shape {system.shape}"
+        )
+        return dataclasses.replace(self, F=_FlattenedMap(self.F, system.shape)) if system.sites else self
 
-    def momentum(self, dH, turned):
+    def added_momentum(self, dH, turned):
         return self.F(dH)
 
     def force(self, system, x, dH, dS, dL):
         return system.algebra.ad_star(dH, self.F(dH))
 
 
-class _OnSites(Module):
+class _FlattenedMap(Module):
     """A map of arrays of one shape, as one of flat arrays."""
 
     function: Callable

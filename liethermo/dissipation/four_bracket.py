@@ -8,14 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from manifolds.matrices.linear import skew
+from manifolds.matrices.linear import skew_matrix
 from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
 
 from ..errors import IndefiniteError, InputError
-from ..functions.checks import check_shape
-from ..functions.conditions import numbers
+from ..functions.checks import check_function_shape
+from ..functions.conditions import check_numbers
 from .base import Dissipation
-from .checks import check_matrix, form_at, semidefinite
+from .checks import check_matrix, checked_semidefinite, evaluate_form
 from .factor import Factor
 from .inner_product import InnerProductDissipation, KillingDissipation
 
@@ -43,7 +43,7 @@ class FourBracket(Dissipation):
 
     def __init__(self, tensor):
         if not callable(tensor):
-            tensor = numbers(tensor, "a 4-bracket")
+            tensor = check_numbers(tensor, "a 4-bracket")
             if tensor.ndim != 4 or len(set(tensor.shape)) != 1:
                 raise InputError(f"a 4-bracket has shape (n, n, n, n), not {tensor.shape}")
             _check_curvature_symmetries(tensor)
@@ -63,26 +63,26 @@ class FourBracket(Dissipation):
         """4-bracket ``𝒦([dF, dK], [dG, dN])`` of an inner product 𝒦 on g (by default that of KillingDissipation)."""
         return KillingDissipation() if form is None else InnerProductDissipation(form)
 
-    def prepared(self, system):
+    def bind_to(self, system):
         n = system.dim
         if callable(self.tensor):
-            check_shape(self.tensor, [(n,)], [(n,) * 4], "the 4-bracket", f"a state of shape ({n},)")
+            check_function_shape(self.tensor, [(n,)], [(n,) * 4], "the 4-bracket", f"a state of shape ({n},)")
         elif self.tensor.shape != (n,) * 4:
             raise InputError(f"the 4-bracket has shape {self.tensor.shape}, but the state has {n} components")
         return self
 
     def force(self, system, x, dH, dS, dL):
-        return jnp.einsum("ijkl,j,k,l->i", form_at(self.tensor, x), dH, dS, dH)
+        return jnp.einsum("ijkl,j,k,l->i", evaluate_form(self.tensor, x), dH, dS, dH)
 
     def factor(self, system, x, dH, dL):
         """Columns ``A dH``, where ``R = sum A (x) A``: as a form on pairs of covectors R has to be semidefinite."""
         i, j = np.triu_indices(system.dim, 1)
-        form = form_at(self.tensor, x)[i, j][:, i, j]
-        _check_on_pairs(form)
+        form = evaluate_form(self.tensor, x)[i, j][:, i, j]
+        _check_semidefinite_on_pairs(form)
         root = semidefinite_root(form) if callable(self.tensor) else semidefinite_factor(form)
 
         def times(w):
-            return skew(root @ w, system.dim) @ dH
+            return skew_matrix(root @ w, system.dim) @ dH
 
         return Factor(len(i), times, solenoidal=not callable(self.tensor))
 
@@ -94,16 +94,16 @@ class KulkarniNomizu(Dissipation):
     mu: Callable | jax.Array
 
     def __init__(self, sigma, mu):
-        self.sigma = sigma if callable(sigma) else semidefinite(sigma, "the form sigma")
-        self.mu = mu if callable(mu) else semidefinite(mu, "the form mu")
+        self.sigma = sigma if callable(sigma) else checked_semidefinite(sigma, "the form sigma")
+        self.mu = mu if callable(mu) else checked_semidefinite(mu, "the form mu")
 
-    def prepared(self, system):
+    def bind_to(self, system):
         check_matrix(self.sigma, system.dim, "the form sigma")
         check_matrix(self.mu, system.dim, "the form mu")
         return self
 
     def force(self, system, x, dH, dS, dL):
-        sigma, mu = form_at(self.sigma, x), form_at(self.mu, x)
+        sigma, mu = evaluate_form(self.sigma, x), evaluate_form(self.mu, x)
         sH, mH = sigma @ dH, mu @ dH
         from_sigma = jnp.dot(mH, dH) * (sigma @ dS) - jnp.dot(mH, dS) * sH
         from_mu = jnp.dot(sH, dH) * (mu @ dS) - jnp.dot(sH, dS) * mH
@@ -124,7 +124,7 @@ class KulkarniNomizu(Dissipation):
         return Factor(n * n, times, constant)
 
 
-def _check_on_pairs(form) -> None:
+def _check_semidefinite_on_pairs(form) -> None:
     if isinstance(form, jax.core.Tracer):
         return
     lowest, size = float(np.linalg.eigvalsh(np.asarray(form))[0]), float(np.abs(form).max())

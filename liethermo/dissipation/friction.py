@@ -12,7 +12,7 @@ from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
 
 from ..functions.indices import Indices
 from .base import Dissipation
-from .checks import check_matrix, checked_bath, checked_rate, form_at, not_a_rate, semidefinite
+from .checks import check_matrix, checked_bath, checked_rate, checked_semidefinite, evaluate_form, reject_rate_as_form
 from .factor import Factor
 
 
@@ -41,9 +41,9 @@ class Friction(Dissipation):
     bath: Indices | None = eqx.field(static=True)
 
     def __init__(self, D=None, rate=1.0, bath=None):
-        not_a_rate(D, self, "the friction D")
+        reject_rate_as_form(D, self, "the friction D")
         if D is not None and not callable(D):
-            D = semidefinite(np.diag(D) if np.ndim(D) == 1 else D, "the friction D")
+            D = checked_semidefinite(np.diag(D) if np.ndim(D) == 1 else D, "the friction D")
         self.D = D
         self.rate = checked_rate(rate)
         self.bath = checked_bath(bath)
@@ -52,25 +52,25 @@ class Friction(Dissipation):
     entropy_law = None
     needs_entropy = False
 
-    def prepared(self, system):
+    def bind_to(self, system):
         if self.D is not None:
             check_matrix(self.D, system.dim, "the friction D")
         return self
 
     @property
-    def heated_bath(self):
+    def heated_bath_index(self):
         return self.bath
 
     def force(self, system, x, dH, dS, dL):
         if self.D is None:
-            return -self.rate * system.raised(x, dH)
-        return -self.rate * system.tangent(x, form_at(self.D, x) @ system.tangent(x, dH))
+            return -self.rate * system.raise_index(x, dH)
+        return -self.rate * system.project_tangent(x, evaluate_form(self.D, x) @ system.project_tangent(x, dH))
 
     def factor(self, system, x, dH, dL):
         if self.D is None:
-            return Factor(system.isotropic_size, lambda w: system.isotropic(x, w), system.space is None).scaled(
-                self.rate
-            )
+            return Factor(
+                system.isotropic_size, lambda w: system.isotropic_vector(x, w), system.space is None
+            ).scale_by(self.rate)
         root = semidefinite_root(self.D(x)) if callable(self.D) else semidefinite_factor(self.D)
         constant = system.space is None and not callable(self.D)
-        return Factor(system.dim, lambda w: system.tangent(x, root @ w), constant).scaled(self.rate)
+        return Factor(system.dim, lambda w: system.project_tangent(x, root @ w), constant).scale_by(self.rate)

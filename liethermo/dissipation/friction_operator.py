@@ -13,10 +13,10 @@ from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
 
 from ..errors import InputError
 from .base import Dissipation
-from .checks import check_matrix, checked_rate, form_at, not_a_rate, semidefinite
+from .checks import check_matrix, checked_rate, checked_semidefinite, evaluate_form, reject_rate_as_form
 from .factor import Factor
 
-KERNEL = "K grad H = 0, as given"
+FRICTION_KERNEL_CHECK = "K grad H = 0, as given"
 """The row of a check on a friction operator before it is projected."""
 
 
@@ -58,8 +58,8 @@ class FrictionOperator(Dissipation):
     projection: str = eqx.field(static=True)
 
     def __init__(self, K, rate=1.0, project: bool = False, projection: Literal["oblique", "orthogonal"] = "oblique"):
-        not_a_rate(K, self, "the operator K")
-        self.K = K if callable(K) else semidefinite(K, "the friction operator K")
+        reject_rate_as_form(K, self, "the operator K")
+        self.K = K if callable(K) else checked_semidefinite(K, "the friction operator K")
         self.rate = checked_rate(rate)
         self.project = bool(project)
         if projection not in ("oblique", "orthogonal"):
@@ -68,39 +68,39 @@ class FrictionOperator(Dissipation):
 
     can_drive_baths = True
 
-    def prepared(self, system):
+    def bind_to(self, system):
         check_matrix(self.K, system.dim, "the friction operator K")
         return self
 
-    def own_residuals(self, system, x):
+    def input_residuals(self, system, x):
         if self.project:
             return {}
-        K, dH = form_at(self.K, x), system.energy.gradient(x)
-        dH = dH if system.space is None else system.lowered(x, system.raised(x, dH))
+        K, dH = evaluate_form(self.K, x), system.energy.gradient(x)
+        dH = dH if system.space is None else system.lower_index(x, system.raise_index(x, dH))
         size = jnp.max(jnp.abs(K)) * jnp.max(jnp.abs(dH))
         defect = jnp.max(jnp.abs(jnp.stack([K @ dH, dH @ K])))
-        return {KERNEL: defect / jnp.where(size > 0.0, size, 1.0)}
+        return {FRICTION_KERNEL_CHECK: defect / jnp.where(size > 0.0, size, 1.0)}
 
     def force(self, system, x, dH, dS, dL):
-        along = self._along(system, x, dH)
-        image = form_at(self.K, x) @ (dS - jnp.dot(along, dS) * dH)
+        along = self._projection_direction(system, x, dH)
+        image = evaluate_form(self.K, x) @ (dS - jnp.dot(along, dS) * dH)
         return self.rate * (image - jnp.dot(dH, image) * along)
 
     def factor(self, system, x, dH, dL):
         """The symmetric root of K(x), or a Cholesky factor of a constant K, likewise projected."""
         root = semidefinite_root(self.K(x)) if callable(self.K) else semidefinite_factor(self.K)
-        along = self._along(system, x, dH)
+        along = self._projection_direction(system, x, dH)
 
         def times(w):
             image = root @ w
             return image - jnp.dot(dH, image) * along
 
-        return Factor(system.dim, times).scaled(self.rate)
+        return Factor(system.dim, times).scale_by(self.rate)
 
-    def _along(self, system, x, dH):
+    def _projection_direction(self, system, x, dH):
         """The vector a with ``a . dH = 1`` that P projects along."""
-        raised = system.raised(x, dH)
-        gradient = raised if self.projection == "orthogonal" else system.raised(x, system.energy.gradient(x))
+        raised = system.raise_index(x, dH)
+        gradient = raised if self.projection == "orthogonal" else system.raise_index(x, system.energy.gradient(x))
         overlap, square = jnp.dot(gradient, dH), jnp.dot(raised, dH)
         # Where grad H is tiny or turned away from dH, project orthogonally off dH instead.
         safe = overlap > 1e-3 * square

@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 
 import manifolds as mf
-from manifolds._module import Module
+from manifolds._pytree_module import Module
 
 from ..functions.energy import Energy
-from ..tracing.programs import part
+from ..tracing.programs import subprogram
 
 
 class Geometry(Module):
@@ -68,7 +68,7 @@ class Geometry(Module):
         """Number of state components, those of baths left out."""
 
     @abstractmethod
-    def without_baths(self) -> Geometry:
+    def drop_baths(self) -> Geometry:
         """The body alone: the geometry that its dissipation acts in. Itself where there are no baths."""
 
     def points(self, x) -> jax.Array:
@@ -80,19 +80,19 @@ class Geometry(Module):
 
     # -- the metric of the space --------------------------------------------------------------------------------------
 
-    def raised(self, x, alpha) -> jax.Array:
+    def raise_index(self, x, alpha) -> jax.Array:
         """The tangent vector that the metric of the space makes of a covector, shape (n,); itself on R^n."""
         if self.space is None:
             return alpha
         return self.space.to_vector(_sharp(self.space, self.points(x), self.points(alpha).conj()))
 
-    def lowered(self, x, v) -> jax.Array:
+    def lower_index(self, x, v) -> jax.Array:
         """The covector that the metric of the space makes of a tangent vector: the inverse of :meth:`raised`."""
         if self.space is None:
             return v
         return self.space.to_vector(self.space._flat(self.points(x), self.points(v)).conj())
 
-    def tangent(self, x, w) -> jax.Array:
+    def project_tangent(self, x, w) -> jax.Array:
         """The tangent vector nearest to an array, shape (n,); itself on R^n."""
         if self.space is None:
             return w
@@ -103,21 +103,21 @@ class Geometry(Module):
         """How many numbers :meth:`isotropic` takes."""
         return self.dim if self.space is None else self.space.isotropic_size
 
-    def isotropic(self, x, w) -> jax.Array:
+    def isotropic_vector(self, x, w) -> jax.Array:
         """``R w`` with ``R R^T`` the inverse of the metric of the space, shape (n,); w itself on R^n."""
         return w if self.space is None else self.space.to_vector(self.space._isotropic(self.points(x), w))
 
-    def at_sites(self, values, v) -> jax.Array:
+    def scale_at_sites(self, values, v) -> jax.Array:
         """A vector, shape (n,), times a number for each site, shape (sites,); or times one number."""
         if jnp.ndim(values) == 0:
             return values * v
         return (values[:, None] * v.reshape(len(values), -1)).ravel()
 
-    def over_sites(self, alpha, v) -> jax.Array:
+    def dot_at_sites(self, alpha, v) -> jax.Array:
         """``alpha . v`` at each site, shape (sites,)."""
         return jnp.sum((alpha * v).reshape(math.prod(self.sites), -1), axis=1)
 
-    def changes(self, x, rows) -> jax.Array:
+    def divergence_terms(self, x, rows) -> jax.Array:
         """What the divergence of vector fields is the sum of, over the first axis.
 
         ``rows(y, alpha)`` is what a covector alpha at y makes of the field, or of each of several; vectors of shape
@@ -126,9 +126,9 @@ class Geometry(Module):
         if self.space is None:
             return jax.vmap(lambda e: jax.jvp(lambda y: rows(y, e), (x,), (e,))[1])(jnp.eye(x.shape[0]))
         vector = self.space.to_vector
-        return self.space._changes(self.points(x), lambda y, alpha: rows(vector(y), vector(alpha.conj())))
+        return self.space._divergence_terms(self.points(x), lambda y, alpha: rows(vector(y), vector(alpha.conj())))
 
 
-@part
+@subprogram
 def _sharp(space: mf.Space, x, alpha) -> jax.Array:
     return space._sharp(x, alpha)

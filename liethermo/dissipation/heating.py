@@ -11,14 +11,14 @@ import numpy as np
 
 from ..errors import InputError
 from ..functions.energy import Energy
-from ..functions.frames import root
+from ..functions.frames import sqrt_or_zero
 from ..functions.indices import Indices
 from ..functions.with_baths import temperature_slopes
-from .base import Carried, Dissipation, Several, There
+from .base import Dissipation, DissipationSum, LiftedDissipation, LiftedGeometry
 from .geometry import Geometry
 
 
-class Heating(Carried):
+class Heating(LiftedDissipation):
     """A dissipation ``-K0 dH`` of a body, with baths of entropies y and temperatures ``T = U'(y)`` that it heats.
 
     It is ``K dS`` on states (x, y) with ``K = B B^T`` and, for ``K0 = B0 B0^T`` and a single bath,
@@ -35,117 +35,121 @@ class Heating(Carried):
     ----------
     bath : Indices, of shape () or that of the sites
         The number of the bath that takes the heat, from 0; of all sites, or of each.
-    positive : bool
+    has_positive_temperatures : bool
         Whether the temperatures are positive in every state. Then the motion of the body does not wait for them.
     """
 
     bath: Indices = eqx.field(static=True)
-    positive: bool = eqx.field(static=True)
+    has_positive_temperatures: bool = eqx.field(static=True)
 
     energy_law = "conserved"
     entropy_law = "nondecreasing"
-    symmetric = True
+    is_symmetric = True
     needs_entropy = False
     has_generator = False
 
     def force(self, system, x, dH, dS, dL):
-        body, n = system.without_baths(), system.body_dim
-        force = self.part.force(body, x[:n], self._pull(body, dH, dS, n), None, tuple(L[:n] for L in dL))
-        return self._joined(body, force, dH, n)
+        body, n = system.drop_baths(), system.body_dim
+        force = self.inner.force(body, x[:n], self._force_gradient(body, dH, dS, n), None, tuple(L[:n] for L in dL))
+        return self._join_with_entropies(body, force, dH, n)
 
     def velocity(self, system, x, dH, dS, dL):
-        body, n = system.without_baths(), system.body_dim
-        return self.part.velocity(body, x[:n], self._pull(body, dH, dS, n), None, tuple(L[:n] for L in dL))
+        body, n = system.drop_baths(), system.body_dim
+        return self.inner.velocity(body, x[:n], self._force_gradient(body, dH, dS, n), None, tuple(L[:n] for L in dL))
 
     def factor(self, system, x, dH, dL):
-        body, n = system.without_baths(), system.body_dim
-        B = self.part.factor(body, x[:n], dH[:n], tuple(L[:n] for L in dL))
+        body, n = system.drop_baths(), system.body_dim
+        B = self.inner.factor(body, x[:n], dH[:n], tuple(L[:n] for L in dL))
         if B is None:
             return None
-        T = self._of(dH[n:])
-        scale = root(self.sign(dH[n:]) * T)
+        T = self._values_at_sites(dH[n:])
+        scale = sqrt_or_zero(self.temperature_signs(dH[n:]) * T)
 
         def times(w):
-            return self._joined(body, body.at_sites(scale, B.times(w)), dH, n)
+            return self._join_with_entropies(body, body.scale_at_sites(scale, B.times(w)), dH, n)
 
         along = B.velocity
-        velocity = None if along is None else lambda w: body.at_sites(scale, along(w))
-        turning = None if B.turning is None else scale * B.turning
-        return B._replace(times=times, velocity=velocity, turning=turning, solenoidal=False)
+        velocity = None if along is None else lambda w: body.scale_at_sites(scale, along(w))
+        turning = None if B.spin_coefficients is None else scale * B.spin_coefficients
+        return B._replace(times=times, velocity=velocity, spin_coefficients=turning, solenoidal=False)
 
     def divergence(self, system, x):
         """``sqrt(T) div B0 + T' B0^T dH / (2 T^3/2)``, T' the derivative of T by y: no matrix is formed."""
-        body, n = system.without_baths(), system.body_dim
+        body, n = system.drop_baths(), system.body_dim
         dH, dL = system.energy.gradient(x), tuple(L.gradient(x) for L in self.preserve)
-        B = self.part.factor(body, x[:n], dH[:n], tuple(L[:n] for L in dL))
+        B = self.inner.factor(body, x[:n], dH[:n], tuple(L[:n] for L in dL))
         assert B is not None
-        if self.by_site and not B.solenoidal:  # each site has a temperature of its own
+        if self.has_site_baths and not B.solenoidal:  # each site has a temperature of its own
             return super().divergence(system, x)
-        T = jnp.abs(self._of(dH[n:]))
-        own = jnp.zeros(B.size) if B.solenoidal else jnp.sqrt(T) * self.part.divergence(body, x[:n])
+        T = jnp.abs(self._values_at_sites(dH[n:]))
+        own = jnp.zeros(B.size) if B.solenoidal else jnp.sqrt(T) * self.inner.divergence(body, x[:n])
         warmer = temperature_slopes(system.energy, x, n)
         if warmer is None:
             return own
-        share = jnp.where(T > 0.0, 0.5 * self._of(warmer) / jnp.where(T > 0.0, T, 1.0) ** 1.5, 0.0)
-        return own + B.transposed(body.at_sites(share, dH[:n]))
+        share = jnp.where(T > 0.0, 0.5 * self._values_at_sites(warmer) / jnp.where(T > 0.0, T, 1.0) ** 1.5, 0.0)
+        return own + B.transpose_times(body.scale_at_sites(share, dH[:n]))
 
-    def there(self, system, x) -> There:
-        return _of_body(system, x)
+    def lifted_geometry(self, system, x) -> LiftedGeometry:
+        return _body_geometry(system, x)
 
     @property
-    def by_site(self) -> bool:
+    def has_site_baths(self) -> bool:
         """Whether each site has a bath of its own."""
         return bool(self.bath.shape)
 
-    def sign(self, T) -> jax.Array:
+    def temperature_signs(self, T) -> jax.Array:
         """That of the temperatures, at the sites that heat them.
 
         A temperature changes its sign at no state: so this is a constant, as ``sign`` would not be for Taylor series.
         """
-        if self.positive:
-            return jnp.ones(np.shape(self.bath)).ravel() if self.by_site else jnp.ones(())
-        return jnp.where(self._of(T) < 0.0, -1.0, 1.0)
+        if self.has_positive_temperatures:
+            return jnp.ones(np.shape(self.bath)).ravel() if self.has_site_baths else jnp.ones(())
+        return jnp.where(self._values_at_sites(T) < 0.0, -1.0, 1.0)
 
-    def warming(self, lost, T) -> jax.Array:
+    def entropy_rates(self, lost, T) -> jax.Array:
         """What the entropies grow by, shape (m,), where a body loses an energy, of shape () or at each site."""
-        if self.by_site:
+        if self.has_site_baths:
             return jax.ops.segment_sum(lost, np.asarray(self.bath).ravel(), len(T)) / T
         return jnp.where(np.arange(len(T)) == int(np.asarray(self.bath)), lost / T, 0.0)
 
-    def _pull(self, body: Geometry, dH, dS, n: int) -> jax.Array:
+    def _force_gradient(self, body: Geometry, dH, dS, n: int) -> jax.Array:
         """What takes the place of dH in the force on the body, shape (n,): dH, where the entropy is that of baths."""
-        T, e, sign = self._of(dH[n:]), self._of(dS[n:]), self.sign(dH[n:])
-        return body.at_sites(sign, body.at_sites(e, dH[:n]) - body.at_sites(T, dS[:n]))
+        T, e, sign = self._values_at_sites(dH[n:]), self._values_at_sites(dS[n:]), self.temperature_signs(dH[n:])
+        return body.scale_at_sites(sign, body.scale_at_sites(e, dH[:n]) - body.scale_at_sites(T, dS[:n]))
 
-    def _of(self, values) -> jax.Array:
+    def _values_at_sites(self, values) -> jax.Array:
         """Values of baths, shape (m,), at the sites that heat them, shape () or (sites,)."""
-        return values[np.asarray(self.bath).ravel()] if self.by_site else values[int(np.asarray(self.bath))]
+        return values[np.asarray(self.bath).ravel()] if self.has_site_baths else values[int(np.asarray(self.bath))]
 
-    def _joined(self, body: Geometry, v, dH, n: int) -> jax.Array:
+    def _join_with_entropies(self, body: Geometry, v, dH, n: int) -> jax.Array:
         """What moves the body, shape (n,), and the entropies that take the energy which it loses."""
-        gained = body.over_sites(dH[:n], v) if self.by_site else jnp.dot(dH[:n], v)
-        return jnp.concatenate([v, self.warming(-gained, dH[n:])])
+        gained = body.dot_at_sites(dH[:n], v) if self.has_site_baths else jnp.dot(dH[:n], v)
+        return jnp.concatenate([v, self.entropy_rates(-gained, dH[n:])])
 
 
-class BesideBaths(Carried):
+class HeatlessDissipation(LiftedDissipation):
     """A dissipation of a body that makes no heat, beside baths."""
 
-    def there(self, system, x) -> There:
-        return _of_body(system, x)
+    def lifted_geometry(self, system, x) -> LiftedGeometry:
+        return _body_geometry(system, x)
 
     def velocity(self, system, x, dH, dS, dL):
-        at = _of_body(system, x)
-        return self.part.velocity(at.system, at.x, *at.lifted(dH, dS, dL))
+        at = _body_geometry(system, x)
+        return self.inner.velocity(at.system, at.x, *at.lift_gradients(dH, dS, dL))
 
 
-def _of_body(system: Geometry, x) -> There:
+def _body_geometry(system: Geometry, x) -> LiftedGeometry:
     n = system.body_dim
-    return There(
-        system.without_baths(), x[:n], lambda alpha: alpha[:n], lambda v: jnp.pad(v, (0, len(x) - n)), volume=True
+    return LiftedGeometry(
+        system.drop_baths(),
+        x[:n],
+        lambda alpha: alpha[:n],
+        lambda v: jnp.pad(v, (0, len(x) - n)),
+        preserves_solenoidal=True,
     )
 
 
-def heated(
+def couple_to_baths(
     dissipation: Dissipation | None, body: Geometry, number: int, positive: bool, pulled: Callable[[Energy], Energy]
 ) -> Dissipation:
     """The dissipation of a body, beside baths that take its heat: so many, of positive temperatures or of any.
@@ -162,17 +166,17 @@ def heated(
             "baths take the heat of a dissipation that lowers the energy, such as lt.DoubleBracket or lt.Friction, and "
             f"{found}: leave out baths="
         )
-    carried = tuple(_carried(part, body, number, positive, pulled) for part in parts)
-    return carried[0] if len(carried) == 1 else Several(carried)
+    carried = tuple(_couple_term_to_baths(part, body, number, positive, pulled) for part in parts)
+    return carried[0] if len(carried) == 1 else DissipationSum(carried)
 
 
-def _carried(
+def _couple_term_to_baths(
     part: Dissipation, body: Geometry, number: int, positive: bool, pulled: Callable[[Energy], Energy]
 ) -> Dissipation:
     functions = tuple(map(pulled, part.preserve))
     if part.energy_law != "nonincreasing":
-        return BesideBaths(part, functions)
-    bath = Indices(0) if part.heated_bath is None else part.heated_bath
+        return HeatlessDissipation(part, functions)
+    bath = Indices(0) if part.heated_bath_index is None else part.heated_bath_index
     numbers = np.asarray(bath)
     if numbers.shape not in ((), body.heating_sites):
         there = f", or of the shape {body.heating_sites} of the sites" if body.heating_sites else ""

@@ -14,24 +14,24 @@ import manifolds as mf
 
 from ..errors import IndefiniteError, InputError
 from .base import Dissipation
-from .checks import checked_rate, needed_algebra, over_sites, semidefinite
-from .factor import Factor, root_of
+from .checks import checked_rate, checked_semidefinite, repeat_over_sites, require_algebra
+from .factor import Factor, form_root
 
 
-class OfBracket(Dissipation):
-    """``ad*_dH F`` with F linear in ``[dH, dS]``: its ``momentum``."""
+class BracketDissipation(Dissipation):
+    """``ad*_dH F`` with F linear in ``[dH, dS]``: its ``added_momentum``."""
 
     def force(self, system, x, dH, dS, dL):
         g = system.algebra
-        return g.ad_star(dH, self.momentum(dH, g.bracket(dH, dS)))
+        return g.ad_star(dH, self.added_momentum(dH, g.bracket(dH, dS)))
 
-    def change(self, system, x, dH, dS, dL, gradient):
+    def rate_of_change(self, system, x, dH, dS, dL, gradient):
         """``F . [dH, gradient]``: of the entropy, with the bracket that F is made of and no other."""
         action = system.algebra.action(dH)
-        return action.bracket(gradient) @ self.momentum(dH, action.bracket(dS))
+        return action.bracket(gradient) @ self.added_momentum(dH, action.bracket(dS))
 
 
-class InnerProductDissipation(OfBracket):
+class InnerProductDissipation(BracketDissipation):
     """Dissipation by an inner product on the Lie algebra: ``K(alpha, beta) = 𝒦([dH, alpha], [dH, beta])``.
 
     It is the forced Euler-Poincaré equation ``mu' = ad*_xi (mu + F)`` with ``<F, eta> = 𝒦(eta, [xi, grad S])``
@@ -65,21 +65,21 @@ class InnerProductDissipation(OfBracket):
                 "the inner product 𝒦 is a constant matrix, not a function: one that depends on the state is "
                 "lt.ProjectedMetric(cometric=...), or lt.FrictionOperator(K, project=True)"
             )
-        self.K = semidefinite(K, "the inner product 𝒦")
+        self.K = checked_semidefinite(K, "the inner product 𝒦")
 
-    def prepared(self, system):
-        K = over_sites(self.K, system)
-        needed_algebra(system, "InnerProductDissipation", K)
+    def bind_to(self, system):
+        K = repeat_over_sites(self.K, system)
+        require_algebra(system, "InnerProductDissipation", K)
         return self if K is self.K else eqx.tree_at(lambda d: d.K, self, K)
 
-    def momentum(self, dH, turned):
+    def added_momentum(self, dH, turned):
         return self.K @ turned
 
     def factor(self, system, x, dH, dL):
-        return _factor(system, dH, self.K)
+        return _bracket_factor(system, dH, self.K)
 
 
-class KillingDissipation(OfBracket):
+class KillingDissipation(BracketDissipation):
     """Dissipation by the Killing form kappa, made positive: :class:`InnerProductDissipation` with the algebra's own 𝒦.
 
     ``𝒦 = -rate * kappa`` on compact type, ``𝒦(x, y) = -rate * kappa(x, theta y)`` with a Cartan involution theta on
@@ -129,8 +129,8 @@ class KillingDissipation(OfBracket):
             )
         return g.killing_inner_product()
 
-    def prepared(self, system):
-        g = needed_algebra(system, "KillingDissipation")
+    def bind_to(self, system):
+        g = require_algebra(system, "KillingDissipation")
         form = self.inner_product(g)
         if g.is_solvable():  # Cartan's criterion: kappa(g, [g, g]) = 0
             raise InputError(
@@ -139,15 +139,15 @@ class KillingDissipation(OfBracket):
             )
         return dataclasses.replace(self, form=jnp.asarray(form) if isinstance(form, np.ndarray) else form)
 
-    def momentum(self, dH, turned):
+    def added_momentum(self, dH, turned):
         return self.rate * (self.form @ turned)
 
     def factor(self, system, x, dH, dL):
-        factor = _factor(system, dH, self.form)
-        return None if factor is None else factor.scaled(self.rate)
+        factor = _bracket_factor(system, dH, self.form)
+        return None if factor is None else factor.scale_by(self.rate)
 
 
-def _factor(system, dH, form) -> Factor | None:
+def _bracket_factor(system, dH, form) -> Factor | None:
     """The factor of ``ad*_dH 𝒦 ad_dH``. As C is skew in a, b, ``div ad*_dH F = C[a, b, c] H_ab F_c`` vanishes."""
-    root, g = root_of(form), system.algebra
+    root, g = form_root(form), system.algebra
     return None if root is None else Factor(g.dim, lambda w: g.ad_star(dH, root @ w), solenoidal=True)

@@ -6,11 +6,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from manifolds.structures.spins import Planes, Spins, cross_planes, dotted, planes, scaled, summed
+from manifolds.structures.spins import (
+    Spins,
+    VectorComponents,
+    cross_vectors,
+    dot_vectors,
+    scale_vectors,
+    split_vectors,
+    sum_of_dots,
+)
 
 from ..errors import InputError
-from ..functions.conditions import numbers
-from ..functions.frames import root
+from ..functions.conditions import check_numbers
+from ..functions.frames import sqrt_or_zero
 from ..functions.indices import Indices
 from .base import Dissipation
 from .checks import checked_bath, checked_rate, checked_rates
@@ -44,22 +52,22 @@ class LandauLifshitz(Dissipation):
     bath: Indices | None = eqx.field(static=True)
 
     def __init__(self, rate=1.0, bath=None):
-        array = numbers(rate, "a rate")
+        array = check_numbers(rate, "a rate")
         self.rate = checked_rate(array) if array.shape == () else checked_rates(array)
         self.bath = checked_bath(bath)
 
     @staticmethod
     def gilbert(alpha, ratio=1.0) -> tuple[jax.Array, jax.Array]:
         """Gyromagnetic ratio and rate of Landau and Lifshitz for the damping alpha and the ratio of Gilbert's form."""
-        alpha, ratio = numbers(alpha, "alpha"), numbers(ratio, "ratio")
+        alpha, ratio = check_numbers(alpha, "alpha"), check_numbers(ratio, "ratio")
         return ratio / (1.0 + alpha**2), alpha * ratio / (1.0 + alpha**2)
 
     energy_law = "nonincreasing"
     entropy_law = "conserved"
-    keeps_casimirs = True
+    preserves_casimirs = True
     needs_entropy = False
 
-    def prepared(self, system):
+    def bind_to(self, system):
         spins = system.poisson
         if not isinstance(spins, Spins):
             raise InputError(
@@ -72,34 +80,38 @@ class LandauLifshitz(Dissipation):
         return self
 
     @property
-    def heated_bath(self):
+    def heated_bath_index(self):
         return self.bath
 
     def force(self, system, x, dH, dS, dL):
-        force, _ = self.damped(system.poisson, x, dH)
-        return system.poisson.joined(force, jnp.zeros(0))
+        force, _ = self.damping_force(system.poisson, x, dH)
+        return system.poisson.join_state(force, jnp.zeros(0))
 
-    def damped(self, spins: Spins, x, dH, sign=1.0, by_site: bool = False) -> tuple[Planes, jax.Array]:
+    def damping_force(
+        self, spins: Spins, x, dH, sign=1.0, per_site: bool = False
+    ) -> tuple[VectorComponents, jax.Array]:
         """The components of the force on ``spins``, times a sign, and how fast the energy falls by it.
 
-        The energy of all sites together, or with ``by_site`` at each.
+        The energy of all sites together, or with ``per_site`` at each.
         """
         s, rate = spins.spins(x), sign * self.rate.reshape(-1)
-        torque = cross_planes(s, spins.covectors(dH))
-        if rate.size == 1 and not by_site:
-            lost = rate[0] * summed(torque, torque)
+        torque = cross_vectors(s, spins.split_covectors(dH))
+        if rate.size == 1 and not per_site:
+            lost = rate[0] * sum_of_dots(torque, torque)
         else:
-            lost = rate * dotted(torque, torque)
-            lost = lost if by_site else jnp.sum(lost)
-        return scaled(rate, cross_planes(s, torque)), lost
+            lost = rate * dot_vectors(torque, torque)
+            lost = lost if per_site else jnp.sum(lost)
+        return scale_vectors(rate, cross_vectors(s, torque)), lost
 
     def factor(self, system, x, dH, dL):
         spins = system.poisson
-        s, scale = spins.spins(x), root(self.rate.reshape(-1))
+        s, scale = spins.spins(x), sqrt_or_zero(self.rate.reshape(-1))
 
         def times(w):
-            pull = planes(w.reshape(spins.count, 3))
-            return spins.joined(scaled(scale, cross_planes(pull, s)), jnp.zeros(0))
+            pull = split_vectors(w.reshape(spins.count, 3))
+            return spins.join_state(scale_vectors(scale, cross_vectors(pull, s)), jnp.zeros(0))
 
         # solenoidal, as w x s is, of any w that does not depend on s
-        return Factor(3 * spins.count, times, solenoidal=True, turning=scale.reshape(self.rate.shape and (-1,)))
+        return Factor(
+            3 * spins.count, times, solenoidal=True, spin_coefficients=scale.reshape(self.rate.shape and (-1,))
+        )

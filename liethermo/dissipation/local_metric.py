@@ -7,13 +7,13 @@ import math
 import jax
 import jax.numpy as jnp
 
-from manifolds.matrices.linear import skew
+from manifolds.matrices.linear import skew_matrix
 from manifolds.matrices.symmetric import semidefinite_factor
 
 from ..errors import InputError
-from ..functions.frames import root
+from ..functions.frames import sqrt_or_zero
 from .base import Dissipation
-from .checks import checked_rates, semidefinite
+from .checks import checked_rates, checked_semidefinite
 from .factor import Factor
 
 
@@ -37,9 +37,9 @@ class LocalProjectedMetric(Dissipation):
 
     def __init__(self, rate=1.0, cometric=None):
         self.rate = checked_rates(rate)
-        self.cometric = None if cometric is None else semidefinite(cometric, "the cometric of a site")
+        self.cometric = None if cometric is None else checked_semidefinite(cometric, "the cometric of a site")
 
-    def prepared(self, system):
+    def bind_to(self, system):
         if system.space is not None:
             raise InputError("LocalProjectedMetric is for systems on copies of an algebra, not on a manifold")
         if self.rate.shape not in ((), system.sites):
@@ -64,8 +64,8 @@ class LocalProjectedMetric(Dissipation):
         rates = jnp.broadcast_to(self.rate, system.sites or ()).reshape(count, 1)
         gradients = dH.reshape(count, d) @ L
 
-        def turned(w):
-            turns = skew(w.reshape(count, -1), d)
-            return (root(rates) * (jnp.einsum("nij,nj->ni", turns, gradients) @ L.T)).ravel()
+        def times(w):
+            turns = skew_matrix(w.reshape(count, -1), d)
+            return (sqrt_or_zero(rates) * (jnp.einsum("nij,nj->ni", turns, gradients) @ L.T)).ravel()
 
-        return Factor(count * math.comb(d, 2), turned, solenoidal=True)
+        return Factor(count * math.comb(d, 2), times, solenoidal=True)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from manifolds._module import Module
+from manifolds._pytree_module import Module
 from manifolds.algebras._null_space import row_echelon
 
 from .base import Dissipation
@@ -23,20 +23,20 @@ class Process(Module):
     ----------
     stoichiometry : tuple of float
         nu, of all particle numbers of the system.
-    heated : tuple of float
+    heat_shares : tuple of float
         The shares of the released energy ``A = -nu . mu`` that heat each body, of sum 1.
-    carried : tuple of float
+    entropy_transport : tuple of float
         Which bodies entropy is carried to (1) and from (-1).
-    entropy : array, shape ()
+    entropy_per_particle : array, shape ()
         What is carried with a particle (entropy).
     coefficient : array, shape (), or function of the whole state
         L >= 0.
     """
 
     stoichiometry: tuple[float, ...] = eqx.field(static=True)
-    heated: tuple[float, ...] = eqx.field(static=True)
-    carried: tuple[float, ...] = eqx.field(static=True)
-    entropy: jax.Array
+    heat_shares: tuple[float, ...] = eqx.field(static=True)
+    entropy_transport: tuple[float, ...] = eqx.field(static=True)
+    entropy_per_particle: jax.Array
     coefficient: jax.Array | Callable
 
 
@@ -59,11 +59,11 @@ class MatterExchange(Dissipation):
         self.processes = tuple(processes)
 
     def force(self, system, x, dH, dS, dL):
-        along, spread = self._directions(system, x, dH)
+        along, spread = self._flux_directions(system, x, dH)
         return spread(self._coefficients(x) * along(dS))
 
     def factor(self, system, x, dH, dL):
-        _, spread = self._directions(system, x, dH)
+        _, spread = self._flux_directions(system, x, dH)
         root = jnp.sqrt(self._coefficients(x))
         return Factor(len(self.processes), lambda w: spread(root * w))
 
@@ -73,17 +73,17 @@ class MatterExchange(Dissipation):
         L = jnp.stack([jnp.asarray(value) for value in found])
         return jnp.where(L >= 0.0, L, jnp.nan)
 
-    def _directions(self, system, x, dH) -> tuple[Callable, Callable]:
+    def _flux_directions(self, system, x, dH) -> tuple[Callable, Callable]:
         """``z . dS`` of each process, and the sum of fluxes times z."""
         numbers, heated, carried = (
             np.array([getattr(e, name) for e in self.processes]) for name in ("stoichiometry", "heated", "carried")
         )
-        N, S = system.poisson.matter.N, system.poisson.places.S
+        N, S = system.poisson.particle_indices.N, system.poisson.places.S
         mu, T = dH[N], dH[S]
         T, touched = jnp.where(T > 0.0, T, jnp.nan), np.abs(carried)
         affinity = -(numbers @ mu)
         mean = touched @ T / np.maximum(touched.sum(axis=1), 1.0)
-        heat = jnp.stack([e.entropy for e in self.processes]) * mean
+        heat = jnp.stack([e.entropy_per_particle for e in self.processes]) * mean
         entropies = (heated * affinity[:, None] + carried * heat[:, None]) / T
         return (
             lambda dS: numbers @ dS[N] + entropies @ dS[S],

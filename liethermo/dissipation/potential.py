@@ -9,22 +9,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from manifolds._module import Module, forwarded
+from manifolds._pytree_module import Module, forward_to
 from manifolds.matrices.stumpff import hyperbolic_stumpff
 
 from ..errors import FunctionError, InputError
-from ..functions.arguments import needed_arguments
-from ..functions.conditions import numbers
+from ..functions.arguments import required_argument_count
+from ..functions.conditions import check_numbers
 from ..tracing.index_check import result_shape
 from .base import Dissipation
-from .checks import zero_state
+from .checks import state_shape_dtype
 from .factor import Factor
 from .projected_metric import ProjectedMetric
 
-CONVEX, LEAST = "psi convex", "psi least at 0"
+CONVEXITY_CHECK, MINIMUM_AT_ZERO_CHECK = "psi convex", "psi least at 0"
 """The rows of a check on a dissipation potential."""
 
-PAIRS, SCALES = 8, (1e-3, 1e-1, 1.0, 10.0)
+CONVEXITY_PAIRS, CONVEXITY_FORCE_SCALES = 8, (1e-3, 1e-1, 1.0, 10.0)
 """Random pairs of forces that the convexity of a potential is tried on, and their sizes."""
 
 
@@ -59,7 +59,7 @@ class DissipationPotential(Dissipation):
 
     psi: Callable
     of: Dissipation
-    of_state: bool = eqx.field(static=True)
+    depends_on_state: bool = eqx.field(static=True)
 
     def __init__(self, psi: Callable, of: Dissipation | None = None):
         if not callable(psi):
@@ -69,35 +69,36 @@ class DissipationPotential(Dissipation):
             raise InputError(f"of is a dissipation, not {type(of).__name__}")
         if of.energy_law != "conserved":
             raise InputError(f"a potential composed with {type(of).__name__} would not keep the energy")
-        self.psi, self.of, self.of_state = psi, of, needed_arguments(psi) == 2
+        self.psi, self.of, self.depends_on_state = psi, of, required_argument_count(psi) == 2
 
-    symmetric = False
+    is_symmetric = False
 
-    keeps_casimirs = forwarded("of")
-    preserve = forwarded("of")
-    couplings = forwarded("of")
+    preserves_casimirs = forward_to("of")
+    preserve = forward_to("of")
+    couplings = forward_to("of")
 
-    def prepared(self, system):
-        found = eqx.tree_at(lambda d: d.of, self, self.of.prepared(system))
+    def bind_to(self, system):
+        found = eqx.tree_at(lambda d: d.of, self, self.of.bind_to(system))
         shape = result_shape(
-            lambda x: found.psi_of(x)(jnp.zeros(found._factor_at(system, x).size)), zero_state(system.dim)
+            lambda x: found.psi_at_state(x)(jnp.zeros(found._continuous_factor(system, x).size)),
+            state_shape_dtype(system.dim),
         )
         if shape.shape != ():
             raise FunctionError(f"psi must return one number, but it returns shape {shape.shape}")
         return found
 
-    def psi_of(self, x) -> Callable:
+    def psi_at_state(self, x) -> Callable:
         """The potential as a function of the forces at a state."""
-        return lambda f: jnp.asarray(self.psi(x, f) if self.of_state else self.psi(f))
+        return lambda f: jnp.asarray(self.psi(x, f) if self.depends_on_state else self.psi(f))
 
-    def own_residuals(self, system, x):
+    def input_residuals(self, system, x):
         """By how much the slope falls between two forces, and by how much it pushes at none."""
-        slope = jax.grad(self.psi_of(x))
-        size = self._factor_at(system, x).size
-        pairs = np.random.default_rng(0).standard_normal((PAIRS, 2, size))
-        pairs = np.concatenate([scale * pairs for scale in SCALES])
+        slope = jax.grad(self.psi_at_state(x))
+        size = self._continuous_factor(system, x).size
+        pairs = np.random.default_rng(0).standard_normal((CONVEXITY_PAIRS, 2, size))
+        pairs = np.concatenate([scale * pairs for scale in CONVEXITY_FORCE_SCALES])
 
-        def falls(pair):
+        def monotonicity_residual(pair):
             a, b = pair
             slopes = jnp.stack([slope(a), slope(b)])
             length = jnp.linalg.norm(a - b) * jnp.max(jnp.linalg.norm(slopes, axis=1))
@@ -105,16 +106,19 @@ class DissipationPotential(Dissipation):
 
         largest = jnp.max(jnp.linalg.norm(jax.vmap(slope)(pairs[:, 0]), axis=1))
         at_rest = jnp.linalg.norm(slope(jnp.zeros(size))) / jnp.where(largest > 0.0, largest, 1.0)
-        return self.of.own_residuals(system, x) | {CONVEX: jnp.max(jax.vmap(falls)(pairs)), LEAST: at_rest}
+        return self.of.input_residuals(system, x) | {
+            CONVEXITY_CHECK: jnp.max(jax.vmap(monotonicity_residual)(pairs)),
+            MINIMUM_AT_ZERO_CHECK: at_rest,
+        }
 
     def force(self, system, x, dH, dS, dL):
-        B = self._needed(system, x, dH, dL)
-        return B.times(jax.grad(self.psi_of(x))(B.transposed(dS)))
+        B = self._require_factor(system, x, dH, dL)
+        return B.times(jax.grad(self.psi_at_state(x))(B.transpose_times(dS)))
 
-    def _factor_at(self, system, x) -> Factor:
-        return self._needed(system, x, system.energy.gradient(x), tuple(L.gradient(x) for L in self.preserve))
+    def _continuous_factor(self, system, x) -> Factor:
+        return self._require_factor(system, x, system.energy.gradient(x), tuple(L.gradient(x) for L in self.preserve))
 
-    def _needed(self, system, x, dH, dL) -> Factor:
+    def _require_factor(self, system, x, dH, dL) -> Factor:
         B = self.of.factor(system, x, dH, dL)
         if B is None:
             where = "" if system.space is None else f" on {system.space.name}"
@@ -131,9 +135,9 @@ class NamedPotential(Module):
     each: bool = eqx.field(static=True, default=False, kw_only=True)
 
     def __call__(self, f):
-        return jnp.sum(self.of_square(f * f)) if self.each else self.of_square(jnp.dot(f, f))
+        return jnp.sum(self.value_of_square(f * f)) if self.each else self.value_of_square(jnp.dot(f, f))
 
-    def of_square(self, q):
+    def value_of_square(self, q):
         """As a function of the square of a force."""
         raise NotImplementedError
 
@@ -155,10 +159,13 @@ class CoulombFriction(NamedPotential):
     width: jax.Array
 
     def __init__(self, strength=1.0, width=1e-2, *, each: bool = False):
-        self.strength, self.width = _number(strength, "the strength", True), _number(width, "the width", False)
+        self.strength, self.width = (
+            _checked_number(strength, "the strength", True),
+            _checked_number(width, "the width", False),
+        )
         self.each = bool(each)
 
-    def of_square(self, q):
+    def value_of_square(self, q):
         return self.strength * q / (jnp.sqrt(q + self.width**2) + self.width)
 
 
@@ -181,13 +188,16 @@ class PowerLawFriction(NamedPotential):
     width: jax.Array
 
     def __init__(self, exponent, strength=1.0, width=0.0, *, each: bool = False):
-        self.exponent = _number(exponent, "the exponent", False)
+        self.exponent = _checked_number(exponent, "the exponent", False)
         if not isinstance(self.exponent, jax.core.Tracer) and not float(self.exponent) > 1.0:
             raise InputError(f"the exponent of a power law is > 1, not {float(self.exponent):g}: it has to be convex")
-        self.strength, self.width = _number(strength, "the strength", True), _number(width, "the width", True)
+        self.strength, self.width = (
+            _checked_number(strength, "the strength", True),
+            _checked_number(width, "the width", True),
+        )
         self.each = bool(each)
 
-    def of_square(self, q):
+    def value_of_square(self, q):
         q = q + self.width**2
         power = jnp.where(q > 0.0, jnp.where(q > 0.0, q, 1.0) ** (0.5 * self.exponent), 0.0)
         return self.strength / self.exponent * (power - self.width**self.exponent)
@@ -211,15 +221,15 @@ class ActivatedFriction(NamedPotential):
     scale: jax.Array
 
     def __init__(self, rate=1.0, scale=1.0, *, each: bool = False):
-        self.rate, self.scale = _number(rate, "the rate", True), _number(scale, "the scale", False)
+        self.rate, self.scale = _checked_number(rate, "the rate", True), _checked_number(scale, "the scale", False)
         self.each = bool(each)
 
-    def of_square(self, q):
+    def value_of_square(self, q):
         return self.rate * q * hyperbolic_stumpff(2, q / self.scale**2)
 
 
-def _number(value, what: str, zero: bool) -> jax.Array:
-    number = numbers(value, what, ())
+def _checked_number(value, what: str, zero: bool) -> jax.Array:
+    number = check_numbers(value, what, ())
     if not isinstance(number, jax.core.Tracer) and not (float(number) >= 0.0 if zero else float(number) > 0.0):
         raise InputError(f"{what} must be {'>=' if zero else '>'} 0, not {float(number):g}")
     return number

@@ -10,14 +10,14 @@ import jax
 import jax.numpy as jnp
 
 from manifolds.errors import warn
-from manifolds.matrices.linear import skew
+from manifolds.matrices.linear import skew_matrix
 from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
 
-from ..functions.checks import recognised
-from ..functions.energy import Energy, as_energy
-from ..functions.frames import frame
+from ..functions.checks import mark_polynomial_degrees
+from ..functions.energy import Energy, make_energy
+from ..functions.frames import gram_schmidt
 from .base import Dissipation
-from .checks import checked_rate, form_at, not_a_rate, semidefinite
+from .checks import checked_rate, checked_semidefinite, evaluate_form, reject_rate_as_form
 from .factor import Factor
 
 
@@ -59,23 +59,25 @@ class ProjectedMetric(Dissipation):
     """
 
     cometric: jax.Array | Callable | None
-    functions: tuple[Energy, ...]
+    preserved_functions: tuple[Energy, ...]
     normalized: bool = eqx.field(static=True)
     rate: jax.Array
 
     def __init__(self, cometric=None, preserve=(), normalized=False, rate=1.0):
-        not_a_rate(cometric, self, "the cometric")
-        self.cometric = cometric if cometric is None or callable(cometric) else semidefinite(cometric, "the cometric")
+        reject_rate_as_form(cometric, self, "the cometric")
+        self.cometric = (
+            cometric if cometric is None or callable(cometric) else checked_semidefinite(cometric, "the cometric")
+        )
         functions = preserve if isinstance(preserve, list | tuple) else (preserve,)
-        self.functions = tuple(as_energy(L, "a preserved function") for L in functions)
+        self.preserved_functions = tuple(make_energy(L, "a preserved function") for L in functions)
         self.normalized = bool(normalized)
         self.rate = checked_rate(rate)
 
     @property
     def preserve(self):
-        return self.functions
+        return self.preserved_functions
 
-    def prepared(self, system):
+    def bind_to(self, system):
         if system.sites and not self.normalized:
             warn(
                 f"ProjectedMetric damps each of the {math.prod(system.sites)} sites at a rate that grows with their "
@@ -85,44 +87,54 @@ class ProjectedMetric(Dissipation):
             )
         if system.space is not None:
             return self
-        return eqx.tree_at(lambda d: d.functions, self, tuple(recognised(L, system.dim) for L in self.functions))
+        return eqx.tree_at(
+            lambda d: d.preserved_functions,
+            self,
+            tuple(mark_polynomial_degrees(L, system.dim) for L in self.preserved_functions),
+        )
 
     def force(self, system, x, dH, dS, dL):
-        raised = self._raised(system, x)
+        raised = self._cometric_map(system, x)
         if not dL and not self.normalized:
             GdH = raised(dH)
             square = jnp.dot(GdH, dH)
             share = jnp.dot(GdH, dS) / jnp.where(square > 0.0, square, 1.0)
             image = raised(dS - share * dH)  # the rest first: near an equilibrium its image has digits of its own
             return self.rate * (square * image - jnp.dot(image, dH) * GdH)
-        held = frame((dH, *dL), form=raised)
-        projected = held.off_images(raised(held.off(dS)))
-        return self.rate * (projected if self.normalized else math.prod(held.squares) * projected)
+        held = gram_schmidt((dH, *dL), metric_map=raised)
+        projected = held.project_off_images(raised(held.project_off(dS)))
+        return self.rate * (projected if self.normalized else math.prod(held.squared_norms) * projected)
 
     def factor(self, system, x, dH, dL):
         """``P^T L`` with ``L L^T = G``. For the energy alone all ``(l_j . dH) l_i - (l_i . dH) l_j``, i < j.
 
         Their divergence is zero where G is constant.
         """
-        G, n = form_at(self.cometric, x), system.dim
+        G, n = evaluate_form(self.cometric, x), system.dim
         if system.space is not None:
             if G is not None:
                 return None
-            return self._projected(system, x, dH, dL, system.isotropic_size, lambda w: system.isotropic(x, w))
+            return self._projected_factor(
+                system, x, dH, dL, system.isotropic_size, lambda w: system.isotropic_vector(x, w)
+            )
         root = jnp.eye(n) if G is None else semidefinite_root(G) if callable(self.cometric) else semidefinite_factor(G)
         if not dL and not self.normalized:
 
-            def turned(w):
-                return root @ (skew(w, n) @ (dH @ root))
+            def times(w):
+                return root @ (skew_matrix(w, n) @ (dH @ root))
 
-            return Factor(math.comb(n, 2), turned, solenoidal=not callable(self.cometric)).scaled(self.rate)
-        return self._projected(system, x, dH, dL, n, lambda w: root @ w)
+            return Factor(math.comb(n, 2), times, solenoidal=not callable(self.cometric)).scale_by(self.rate)
+        return self._projected_factor(system, x, dH, dL, n, lambda w: root @ w)
 
-    def _projected(self, system, x, dH, dL, size: int, root: Callable) -> Factor:
-        held = frame((dH, *dL), form=self._raised(system, x))
-        rate = self.rate if self.normalized else self.rate * math.prod(held.squares)
-        return Factor(size, lambda w: held.off_images(root(w))).scaled(rate)
+    def _projected_factor(self, system, x, dH, dL, size: int, root: Callable) -> Factor:
+        held = gram_schmidt((dH, *dL), metric_map=self._cometric_map(system, x))
+        rate = self.rate if self.normalized else self.rate * math.prod(held.squared_norms)
+        return Factor(size, lambda w: held.project_off_images(root(w))).scale_by(rate)
 
-    def _raised(self, system, x):
-        G = form_at(self.cometric, x)
-        return lambda alpha: system.raised(x, alpha) if G is None else system.tangent(x, G @ system.tangent(x, alpha))
+    def _cometric_map(self, system, x):
+        G = evaluate_form(self.cometric, x)
+        return lambda alpha: (
+            system.raise_index(x, alpha)
+            if G is None
+            else system.project_tangent(x, G @ system.project_tangent(x, alpha))
+        )

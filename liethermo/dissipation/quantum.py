@@ -19,16 +19,16 @@ from manifolds.matrices.linear import adjoint
 from manifolds.matrices.spectral import log_mean
 
 from ..errors import InputError
-from ..functions.density import OfMatrix, common_energy, logarithm, positive_part
+from ..functions.density import DensityMatrixFunction, choose_reference_level, matrix_logarithm, positive_part
 from ..functions.energy import Energy, Function
-from ..functions.frames import Frame, frame
+from ..functions.frames import OrthonormalFrame, gram_schmidt
 from ..functions.gradients import EPS
-from ..functions.indices import Fixed
-from ..functions.with_baths import WithBaths
+from ..functions.indices import StaticArray
+from ..functions.with_baths import BodyBathsEnergy
 from .base import Dissipation
 from .checks import checked_rate
 
-ROUNDINGS = 8.0 * EPS
+ENERGY_RTOL = 8.0 * EPS
 """Error of an energy, relative to the largest one; times the number of levels, where energies are eigenvalues."""
 
 
@@ -39,7 +39,7 @@ class HasMatrix(Protocol):
     def full(self) -> np.ndarray: ...
 
 
-class Operator(Fixed):
+class Operator(StaticArray):
     """A complex matrix as a static field of a module."""
 
     dtype = complex
@@ -52,14 +52,14 @@ class Jump(NamedTuple):
     ----------
     operator : Operator
         V in the frame of the jumps; together with its adjoint, which puts that energy in.
-    source : int
+    coupling_index : int
         The number of the coupling.
     weight : float
         One half where V is its own adjoint: the two are then one.
     """
 
     operator: Operator
-    source: int
+    coupling_index: int
     weight: float
 
 
@@ -106,11 +106,11 @@ class ThermalJumps(Dissipation):
     rates: tuple[Any, ...]
     bath: int = eqx.field(static=True)
     jumps: tuple[Jump, ...] = eqx.field(static=True)
-    frame: Operator | None = eqx.field(static=True)
-    order: tuple[int, ...] = eqx.field(static=True)
-    driven: bool = eqx.field(static=True)
-    isolated: bool = eqx.field(static=True)
-    keeps_energy: bool = eqx.field(static=True)
+    jump_frame: Operator | None = eqx.field(static=True)
+    level_order: tuple[int, ...] = eqx.field(static=True)
+    is_driven: bool = eqx.field(static=True)
+    is_isolated: bool = eqx.field(static=True)
+    conserves_energy: bool = eqx.field(static=True)
 
     def __init__(self, couplings: Sequence[tuple[Any, Any]], bath: int = 0):
         given = list(couplings)
@@ -123,17 +123,18 @@ class ThermalJumps(Dissipation):
             if not np.asarray(V).any():
                 raise InputError(f"the coupling V[{i}] is zero: leave it out")
         self.rates = tuple(
-            _checked_function(rate, i) if callable(rate) else checked_rate(rate) for i, (_, rate) in enumerate(given)
+            _checked_rate_function(rate, i) if callable(rate) else checked_rate(rate)
+            for i, (_, rate) in enumerate(given)
         )
-        self.bath, self.jumps, self.frame, self.order, self.driven = bath, (), None, (), False
-        self.isolated, self.keeps_energy = False, True
+        self.bath, self.jumps, self.jump_frame, self.level_order, self.is_driven = bath, (), None, (), False
+        self.is_isolated, self.conserves_energy = False, True
 
     @property
     def energy_law(self):
-        return "conserved" if self.keeps_energy else None
+        return "conserved" if self.conserves_energy else None
 
-    def prepared(self, system):
-        structure, baths = needed_density(system, "ThermalJumps"), system.baths
+    def bind_to(self, system):
+        structure, baths = require_density_structure(system, "ThermalJumps"), system.baths
         for i, V in enumerate(self.operators):
             if np.shape(V) != (structure.size,) * 2:
                 raise InputError(
@@ -142,36 +143,38 @@ class ThermalJumps(Dissipation):
                 )
         if baths is not None and self.bath >= baths.number:
             raise InputError(f"ThermalJumps exchange heat with bath {self.bath}, but there are {baths.number}, from 0")
-        if is_traced(system.energy.body if isinstance(system.energy, WithBaths) else system.energy):
+        if is_traced(system.energy.body if isinstance(system.energy, BodyBathsEnergy) else system.energy):
             raise InputError(
                 "ThermalJumps are split by the eigenvectors of the Hamiltonian, which has to be a known one: build a "
                 "system for each, as lt.Study does. Rates, temperatures and capacities may be parameters of a function"
             )
         hamiltonians = system.hamiltonians()
         if baths is None:
-            jumps = tuple(Jump(V, i, 0.5 if _hermitian(V) else 1.0) for i, V in enumerate(self.operators))
-            kept = all(_commute(H, V) for H in hamiltonians for V in map(np.asarray, self.operators))
-            return self._replaced(jumps=jumps, frame=None, isolated=True, keeps_energy=kept)
-        vectors = _eigenvectors(hamiltonians)
-        parts = [_split(V, i, hamiltonians, vectors) for i, V in enumerate(self.operators)]
+            jumps = tuple(Jump(V, i, 0.5 if _is_hermitian(V) else 1.0) for i, V in enumerate(self.operators))
+            kept = all(_is_commuting(H, V) for H in hamiltonians for V in map(np.asarray, self.operators))
+            return self._replace_fields(jumps=jumps, frame=None, isolated=True, keeps_energy=kept)
+        vectors = _common_eigenvectors(hamiltonians)
+        parts = [_split_coupling(V, i, hamiltonians, vectors) for i, V in enumerate(self.operators)]
         frame = None if np.array_equal(vectors, np.eye(structure.size)) else Operator(vectors)
         jumps = tuple(itertools.chain.from_iterable(parts))
-        levels = np.diag(adjoint(vectors) @ _without_common(hamiltonians[0]) @ vectors).real
+        levels = np.diag(adjoint(vectors) @ _subtract_common_energy(hamiltonians[0]) @ vectors).real
         order, driven = tuple(int(i) for i in np.argsort(levels)), system.is_driven
-        found = self._replaced(jumps=jumps, frame=frame, order=order, driven=driven, isolated=False, keeps_energy=True)
+        found = self._replace_fields(
+            jumps=jumps, frame=frame, order=order, driven=driven, isolated=False, keeps_energy=True
+        )
         if not is_traced((self.rates, baths)):
             found._check_rates(system.at_some_times()[0] if system.is_driven else system)
         return found
 
-    def _replaced(self, **fields) -> ThermalJumps:
+    def _replace_fields(self, **fields) -> ThermalJumps:
         found = object.__new__(ThermalJumps)
         for field in dataclasses.fields(self):
             object.__setattr__(found, field.name, fields.get(field.name, getattr(self, field.name)))
         return found
 
-    def with_operators(self, matrices: Sequence[Any], bath: int) -> ThermalJumps:
+    def replace_operators(self, matrices: Sequence[Any], bath: int) -> ThermalJumps:
         """The same rates with other matrices, such as those of a larger system, and another bath."""
-        return self._replaced(operators=tuple(map(Operator, matrices)), bath=bath, jumps=())
+        return self._replace_fields(operators=tuple(map(Operator, matrices)), bath=bath, jumps=())
 
     def force(self, system, x, dH, dS, dL):
         """The force, of which Lindblad's equation is the part that is exact: no logarithm of rho is in it.
@@ -180,80 +183,92 @@ class ThermalJumps(Dissipation):
         applied to what a discrete gradient differs by. So eigenvalues that are zero to rounding stay so.
         """
         structure, n = system.structure, system.body_dim
-        rho, H, A = (self._inside(structure.matrix(a[:n])) for a in (x, dH, dS))
-        fixed, logs = _stacked(self.jumps), logarithm(rho)
-        V, back, omega = jnp.asarray(fixed), jnp.asarray(adjoint(fixed)), self._frequencies(structure, dH[:n])
-        T = jnp.asarray(jnp.inf) if self.isolated else dH[n + self.bath]
+        rho, H, A = (self._to_jump_frame(structure.matrix(a[:n])) for a in (x, dH, dS))
+        fixed, logs = _stack_operators(self.jumps), matrix_logarithm(rho)
+        V, back, omega = jnp.asarray(fixed), jnp.asarray(adjoint(fixed)), self._jump_frequencies(structure, dH[:n])
+        T = jnp.asarray(jnp.inf) if self.is_isolated else dH[n + self.bath]
         shift, rest = omega / (2.0 * T), _commutator(V, A + logs)
-        if not self.isolated:
+        if not self.is_isolated:
             # [V, H] by differences of levels, which lose no digits, and by what H has beside them, which is mostly zero
-            levels, apart = self._levels(structure, dH[:n]), 1.0 - np.eye(structure.size)
+            levels, apart = self._energy_levels(structure, dH[:n]), 1.0 - np.eye(structure.size)
             taken = V * (levels[None, :] - levels[:, None]) + _commutator(V, H * apart)
             rest = rest - (dS[n + self.bath] * taken - omega[:, None, None] * V) / T
         grown = jnp.exp(shift)[:, None, None]
         image = rho @ V / grown - grown * (V @ rho) + log_mean(logs, shift, rest)
-        moved = jnp.sum(_commutator(back, image * self._strengths(omega, T)[:, None, None]), axis=0)
-        return self._with_heat(system, dH, T, moved)  # the adjoints add the adjoint
+        moved = jnp.sum(_commutator(back, image * self._jump_strengths(omega, T)[:, None, None]), axis=0)
+        return self._append_bath_entropy(system, dH, T, moved)  # the adjoints add the adjoint
 
     has_generator = True
 
-    def generated(self, system, x, dH):
+    def generator_field(self, system, x, dH):
         """Lindblad's equation, and the heat that the bath takes."""
         structure, n = system.structure, system.body_dim
-        rho, omega = self._inside(structure.matrix(x[:n])), self._frequencies(structure, dH[:n])
-        T = jnp.asarray(jnp.inf) if self.isolated else dH[n + self.bath]
-        strengths, grown = self._strengths(omega, T), jnp.exp(omega / (2.0 * T))
+        rho, omega = self._to_jump_frame(structure.matrix(x[:n])), self._jump_frequencies(structure, dH[:n])
+        T = jnp.asarray(jnp.inf) if self.is_isolated else dH[n + self.bath]
+        strengths, grown = self._jump_strengths(omega, T), jnp.exp(omega / (2.0 * T))
         rates = jnp.concatenate([strengths * grown, strengths / grown])
         # the Hermitian part has both terms of what is lost
-        moved = _jumped(self.jumps, rates, rho) - jnp.tensordot(rates, _left(self.jumps), 1) @ rho
-        return self._with_heat(system, dH, T, moved)
+        moved = _apply_jumps(self.jumps, rates, rho) - jnp.tensordot(rates, _adjoint_products(self.jumps), 1) @ rho
+        return self._append_bath_entropy(system, dH, T, moved)
 
     def _check_rates(self, system) -> None:
         """Raise InputError where rates at the first temperature of the bath cannot be computed with."""
         n, dH = system.body_dim, system.energy.gradient(jnp.zeros(system.dim))
-        omega, T = self._frequencies(system.structure, dH[:n]), dH[n + self.bath]
-        strengths, sizes = self._strengths(omega, T), np.abs(np.asarray(omega))
+        omega, T = self._jump_frequencies(system.structure, dH[:n]), dH[n + self.bath]
+        strengths, sizes = self._jump_strengths(omega, T), np.abs(np.asarray(omega))
         rates = np.asarray(strengths * jnp.exp(jnp.abs(omega) / (2.0 * T)))
         for jump, rate, w in zip(self.jumps, rates, sizes, strict=True):
             if w > -2.0 * np.log(EPS) * T and not rate * EPS <= w:  # not so by the rate that was given
                 raise InputError(
-                    f"jumps of V[{jump.source}] that take the energy {w:.3g} from the system have, at T = {T:.3g}, "
+                    f"jumps of V[{jump.coupling_index}] that take the energy {w:.3g} from the system have, at T = {T:.3g}, "
                     f"rate * exp(omega / 2T) = {rate:.3g}: no rate that doubles hold beside that energy. Give the rate "
                     "as a function, such as lambda omega, T: g * jnp.exp(-omega / (2 * T)), or a higher temperature"
                 )
 
-    def _inside(self, matrix):
+    def _to_jump_frame(self, matrix):
         """A matrix in the frame, in which most entries of the jumps are zero."""
-        return matrix if self.frame is None else adjoint(np.asarray(self.frame)) @ matrix @ np.asarray(self.frame)
+        return (
+            matrix
+            if self.jump_frame is None
+            else adjoint(np.asarray(self.jump_frame)) @ matrix @ np.asarray(self.jump_frame)
+        )
 
-    def _outside(self, matrix):
-        return matrix if self.frame is None else np.asarray(self.frame) @ matrix @ adjoint(np.asarray(self.frame))
+    def _from_jump_frame(self, matrix):
+        return (
+            matrix
+            if self.jump_frame is None
+            else np.asarray(self.jump_frame) @ matrix @ adjoint(np.asarray(self.jump_frame))
+        )
 
-    def _frequencies(self, structure: mf.DensityMatrices, dH) -> jax.Array:
+    def _jump_frequencies(self, structure: mf.DensityMatrices, dH) -> jax.Array:
         """The energies that the jumps take: linear in H, by tables that are known when programs are written.
 
         ``tr(H [V^H, V]) / tr(V^H V)``, the diagonal of H by differences of levels, which lose no digits.
         """
-        fixed, apart, levels = _stacked(self.jumps), 1.0 - np.eye(structure.size), self._levels(structure, dH)
+        fixed, apart, levels = (
+            _stack_operators(self.jumps),
+            1.0 - np.eye(structure.size),
+            self._energy_levels(structure, dH),
+        )
         weights = np.abs(fixed) ** 2
         squares = np.sum(weights, axis=(-2, -1))
         k, j = np.nonzero(np.sum(weights * apart, axis=0))
         omega = (weights[:, k, j] / squares[:, None]) @ (levels[j] - levels[k])
         rest = apart * _commutator(adjoint(fixed), fixed) / squares[:, None, None]
-        return omega + structure.vector(self._outside(rest)) @ dH if rest.any() else omega
+        return omega + structure.vector(self._from_jump_frame(rest)) @ dH if rest.any() else omega
 
-    def _levels(self, structure: mf.DensityMatrices, dH) -> jax.Array:
+    def _energy_levels(self, structure: mf.DensityMatrices, dH) -> jax.Array:
         """The diagonal of H in the frame, shape (N,)."""
-        if self.frame is None:
+        if self.jump_frame is None:
             return dH[: structure.size]
-        vectors = np.asarray(self.frame).T
+        vectors = np.asarray(self.jump_frame).T
         return structure.vector(vectors[:, :, None] * vectors[:, None, :].conj()) @ dH
 
-    def _with_heat(self, system, dH, T, moved) -> jax.Array:
+    def _append_bath_entropy(self, system, dH, T, moved) -> jax.Array:
         """The coordinates of what the jumps do to rho, in the frame, and the entropy that the bath takes."""
         structure, n = system.structure, system.body_dim
-        force = structure.vector(self._outside(moved))
-        if self.isolated:
+        force = structure.vector(self._from_jump_frame(moved))
+        if self.is_isolated:
             return force
         taken = -self._energy_rate(structure, dH[:n], moved, force) / T
         return jnp.concatenate([force, np.eye(system.dim - n)[self.bath] * taken])
@@ -264,19 +279,19 @@ class ThermalJumps(Dissipation):
         It is summed by parts, from differences of neighbouring levels and the populations that cross between them. So
         levels that no jump connects do not matter, however large their energies are.
         """
-        order, size = np.array(self.order), structure.size
-        levels = self._levels(structure, dH)[order]
-        populations = force[:size] if self.frame is None else jnp.diagonal(moved).real
+        order, size = np.array(self.level_order), structure.size
+        levels = self._energy_levels(structure, dH)[order]
+        populations = force[:size] if self.jump_frame is None else jnp.diagonal(moved).real
         rate = jnp.dot(levels[:-1] - levels[1:], np.tri(size - 1, size) @ populations[order])
-        if self.frame is None:
+        if self.jump_frame is None:
             return rate + jnp.dot(dH[size:], force[size:])
-        if not self.driven:  # H is diagonal in the frame
+        if not self.is_driven:  # H is diagonal in the frame
             return rate
-        H = self._inside(structure.matrix(dH))
+        H = self._to_jump_frame(structure.matrix(dH))
         return rate + jnp.sum(((1.0 - np.eye(size)) * H.conj() * moved).real)
 
-    def _strengths(self, omega, T) -> jax.Array:
-        rates = [self.rates[jump.source] for jump in self.jumps]
+    def _jump_strengths(self, omega, T) -> jax.Array:
+        rates = [self.rates[jump.coupling_index] for jump in self.jumps]
         return jnp.stack(
             [
                 jump.weight * jnp.asarray(rate(omega[i], T) if callable(rate) else rate)
@@ -304,26 +319,26 @@ class SteepestEntropyAscent(Dissipation):
     """
 
     rate: jax.Array
-    functions: tuple[Any, ...]
+    preserved_functions: tuple[Any, ...]
 
     def __init__(self, rate=1.0, preserve=()):
         self.rate = checked_rate(rate)
-        self.functions = tuple(
+        self.preserved_functions = tuple(
             f if callable(f) else Operator(checked_hermitian(f, f"preserve[{i}]")) for i, f in enumerate(preserve)
         )
 
     @property
     def preserve(self) -> tuple[Energy, ...]:
-        return tuple(f for f in self.functions if isinstance(f, Energy))
+        return tuple(f for f in self.preserved_functions if isinstance(f, Energy))
 
-    def prepared(self, system):
-        needed_density(system, "SteepestEntropyAscent")
+    def bind_to(self, system):
+        require_density_structure(system, "SteepestEntropyAscent")
         return self
 
-    def on_density(self, structure: mf.DensityMatrices) -> SteepestEntropyAscent:
+    def bind_to_structure(self, structure: mf.DensityMatrices) -> SteepestEntropyAscent:
         """What it preserves as functions of states, whose structure is given."""
         made = []
-        for i, f in enumerate(self.functions):
+        for i, f in enumerate(self.preserved_functions):
             if isinstance(f, Operator):
                 if np.shape(f) != (structure.size,) * 2:
                     raise InputError(
@@ -331,32 +346,32 @@ class SteepestEntropyAscent(Dissipation):
                     )
                 f = Function(_Observable(jnp.asarray(structure.vector(np.asarray(f)))))
             elif not isinstance(f, Energy):
-                f = Function(OfMatrix(f, structure))
+                f = Function(DensityMatrixFunction(f, structure))
             made.append(f)
         found = SteepestEntropyAscent(self.rate)
-        object.__setattr__(found, "functions", tuple(made))
+        object.__setattr__(found, "preserved_functions", tuple(made))
         return found
 
     def force(self, system, x, dH, dS, dL):
-        held, raised = self._frame(system, x, dH, dL)
-        force = held.off_images(raised(held.off(dS[: system.body_dim])))
+        held, raised = self._constraint_frame(system, x, dH, dL)
+        force = held.project_off_images(raised(held.project_off(dS[: system.body_dim])))
         return jnp.pad(self.rate * force, (0, system.dim - system.body_dim))
 
-    def direction(self, system, x, dH, dS, dL) -> jax.Array:
+    def ascent_direction(self, system, x, dH, dS, dL) -> jax.Array:
         """``P dS``, shape (N^2,): the gradient of the entropy, less the part along what is preserved."""
-        held, _ = self._frame(system, x, dH, dL)
-        return held.off(dS[: system.body_dim])
+        held, _ = self._constraint_frame(system, x, dH, dL)
+        return held.project_off(dS[: system.body_dim])
 
-    def _frame(self, system, x, dH, dL) -> tuple[Frame, Callable]:
+    def _constraint_frame(self, system, x, dH, dL) -> tuple[OrthonormalFrame, Callable]:
         """The gradients of what is preserved, orthogonal for L, and L."""
         structure, n = system.structure, system.body_dim
         rho = positive_part(structure.matrix(x[:n]))  # a negative eigenvalue would fall ever faster
 
-        def raised(alpha):  # the Hermitian part of rho A has both terms
+        def apply_metric(alpha):  # the Hermitian part of rho A has both terms
             return structure.vector(rho @ structure.matrix(alpha))
 
         one = jnp.asarray(np.where(np.arange(n) < structure.size, 1.0, 0.0))
-        return frame((one, dH[:n], *(L[:n] for L in dL)), form=raised), raised
+        return gram_schmidt((one, dH[:n], *(L[:n] for L in dL)), metric_map=apply_metric), apply_metric
 
 
 class _Observable(eqx.Module):
@@ -368,7 +383,7 @@ class _Observable(eqx.Module):
         return jnp.dot(self.coordinates, x[: self.coordinates.shape[0]])
 
 
-def needed_density(system, name: str) -> mf.DensityMatrices:
+def require_density_structure(system, name: str) -> mf.DensityMatrices:
     """The structure of a system of density matrices."""
     structure = getattr(system, "structure", None)
     if not isinstance(structure, mf.DensityMatrices):
@@ -402,14 +417,16 @@ def _commutator(a, b):
     return a @ b - b @ a
 
 
-GENERIC = (1.0, 0.7548776662466927, 0.5698402909980532)
+GENERIC_WEIGHTS = (1.0, 0.7548776662466927, 0.5698402909980532)
 """Weights of Hamiltonians in a sum whose eigenvectors are those of each, if they commute."""
 
 
-def _eigenvectors(hamiltonians: Sequence[np.ndarray]) -> np.ndarray:
+def _common_eigenvectors(hamiltonians: Sequence[np.ndarray]) -> np.ndarray:
     """The eigenvectors that Hamiltonians have in common, if they have any; those of diagonal matrices are the axes."""
     sizes = [np.abs(H).max() for H in hamiltonians]
-    parts = zip(GENERIC, map(_without_common, hamiltonians), sizes, strict=False)  # there may be fewer than weights
+    parts = zip(
+        GENERIC_WEIGHTS, map(_subtract_common_energy, hamiltonians), sizes, strict=False
+    )  # there may be fewer than weights
     H = sum((w * H / (size or 1.0) for w, H, size in parts), np.zeros_like(hamiltonians[0]))
     return np.eye(len(H)) if _is_diagonal(H) else np.linalg.eigh(H)[1]
 
@@ -418,42 +435,42 @@ def _is_diagonal(H: np.ndarray) -> bool:
     return not (H - np.diag(np.diag(H))).any()
 
 
-def _stacked(jumps: tuple[Jump, ...]) -> np.ndarray:
+def _stack_operators(jumps: tuple[Jump, ...]) -> np.ndarray:
     """The matrices of jumps, real ones where they are."""
     found = np.stack([np.asarray(jump.operator) for jump in jumps])
     return found if found.imag.any() else found.real
 
 
-def _both(jumps: tuple[Jump, ...]) -> np.ndarray:
+def _operators_and_adjoints(jumps: tuple[Jump, ...]) -> np.ndarray:
     """The matrices of jumps, and then their adjoints."""
-    fixed = _stacked(jumps)
+    fixed = _stack_operators(jumps)
     return np.concatenate([fixed, adjoint(fixed)])
 
 
 @functools.lru_cache(maxsize=64)
-def _left(jumps: tuple[Jump, ...]) -> np.ndarray:
+def _adjoint_products(jumps: tuple[Jump, ...]) -> np.ndarray:
     """``V^H V`` of each jump, and then of each adjoint."""
-    both = _both(jumps)
+    both = _operators_and_adjoints(jumps)
     return adjoint(both) @ both
 
 
-def _jumped(jumps: tuple[Jump, ...], rates, rho) -> jax.Array:
+def _apply_jumps(jumps: tuple[Jump, ...], rates, rho) -> jax.Array:
     """``sum rate V rho V^H`` over the jumps and then their adjoints."""
-    found = _table(jumps)
+    found = _jump_table(jumps)
     if found is None:
-        both = _both(jumps)
+        both = _operators_and_adjoints(jumps)
         return jnp.sum((rates[:, None, None] * both) @ rho @ adjoint(both), axis=0)
     which, source, factors = found
     return jnp.sum(rho.ravel()[source] * (rates[which] * factors), axis=-1).reshape(rho.shape)
 
 
 @functools.lru_cache(maxsize=64)
-def _table(jumps: tuple[Jump, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+def _jump_table(jumps: tuple[Jump, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """The numbers of the jumps, the entries of rho and the factors that make up each entry of ``sum V rho V^H``.
 
     None where products of matrices are shorter, as with a few full matrices.
     """
-    both = _both(jumps)
+    both = _operators_and_adjoints(jumps)
     size = both.shape[-1]
     jump, i, j = np.nonzero(both)
     if np.sum(np.bincount(jump) ** 2) > 2 * both.size * size:
@@ -471,7 +488,7 @@ def _table(jumps: tuple[Jump, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     return which, source, factors
 
 
-def _checked_function(rate: Callable, i: int) -> Callable:
+def _checked_rate_function(rate: Callable, i: int) -> Callable:
     """A rate as a function of omega and T, tried where both are one."""
     what = f"the rate of V[{i}] is a number, or a function of omega and T to a number >= 0"
     try:
@@ -485,41 +502,43 @@ def _checked_function(rate: Callable, i: int) -> Callable:
     return rate
 
 
-def _hermitian(V) -> bool:
+def _is_hermitian(V) -> bool:
     V = np.asarray(V)
     return bool(np.abs(V - adjoint(V)).max() <= 1e-12 * np.abs(V).max())
 
 
-def _without_common(H: np.ndarray) -> np.ndarray:
+def _subtract_common_energy(H: np.ndarray) -> np.ndarray:
     """A Hamiltonian less the energy that all levels have in common."""
-    return H - common_energy(np.diag(H).real) * np.eye(len(H))
+    return H - choose_reference_level(np.diag(H).real) * np.eye(len(H))
 
 
 def energy_rounding(H: np.ndarray) -> float:
     """Largest difference between two differences of levels that are equal but for rounding."""
-    return ROUNDINGS * (1 if _is_diagonal(H) else len(H)) * float(np.linalg.norm(H, 2))
+    return ENERGY_RTOL * (1 if _is_diagonal(H) else len(H)) * float(np.linalg.norm(H, 2))
 
 
-def _commute(H: np.ndarray, V: np.ndarray) -> bool:
+def _is_commuting(H: np.ndarray, V: np.ndarray) -> bool:
     """Whether two matrices commute but for rounding; a constant that is added to H makes no difference."""
-    H = _without_common(H)
+    H = _subtract_common_energy(H)
     products = np.abs(H) @ np.abs(V) + np.abs(V) @ np.abs(H)
-    return bool(np.abs(_commutator(H, V)).max() <= ROUNDINGS * len(H) * products.max())
+    return bool(np.abs(_commutator(H, V)).max() <= ENERGY_RTOL * len(H) * products.max())
 
 
-def _split(operator: Operator, source: int, hamiltonians: Sequence[np.ndarray], frame: np.ndarray) -> list[Jump]:
+def _split_coupling(
+    operator: Operator, source: int, hamiltonians: Sequence[np.ndarray], frame: np.ndarray
+) -> list[Jump]:
     """The eigenoperators of ``[H, .]`` at all times that a coupling is the sum of; of a Hermitian one up to adjoints.
 
     The entries of one have the same difference of levels, in the frame, under each of the Hamiltonians.
     """
     V = np.asarray(operator)
     inside = adjoint(frame) @ V @ frame
-    framed = [adjoint(frame) @ _without_common(H) @ frame for H in hamiltonians]
+    framed = [adjoint(frame) @ _subtract_common_energy(H) @ frame for H in hamiltonians]
     spreads = [energy_rounding(H) for H in hamiltonians]
-    places = np.nonzero(np.abs(inside) > _noise(inside, frame, framed, spreads))
+    places = np.nonzero(np.abs(inside) > _entry_rounding(inside, frame, framed, spreads))
     gaps = np.stack([np.diag(H).real[places[1]] - np.diag(H).real[places[0]] for H in framed])
-    labels = np.stack([_clusters(*one) for one in zip(gaps, spreads, strict=True)])
-    own_adjoint, parts = _hermitian(V), []
+    labels = np.stack([_cluster_labels(*one) for one in zip(gaps, spreads, strict=True)])
+    own_adjoint, parts = _is_hermitian(V), []
     for label in np.unique(labels, axis=1).T:
         chosen = (labels == label[:, None]).all(axis=0)
         omegas = gaps[:, chosen].mean(axis=1)
@@ -539,7 +558,7 @@ def _split(operator: Operator, source: int, hamiltonians: Sequence[np.ndarray], 
     return parts
 
 
-def _noise(
+def _entry_rounding(
     inside: np.ndarray, frame: np.ndarray, framed: Sequence[np.ndarray], spreads: Sequence[float]
 ) -> np.ndarray | float:
     """The size up to which entries of a matrix in the frame may be rounding, shape (N, N), or zero in that of the axes.
@@ -555,10 +574,10 @@ def _noise(
         apart = np.abs(levels[:, None] - levels)
         turned = np.minimum(turned, spread / np.maximum(apart, spread or 1.0))
     turned = np.where(turned < 1.0, turned, 0.0)  # those of one level may be any
-    return ROUNDINGS * len(sizes) * sizes.max() + turned @ sizes + sizes @ turned
+    return ENERGY_RTOL * len(sizes) * sizes.max() + turned @ sizes + sizes @ turned
 
 
-def _clusters(numbers: np.ndarray, spread: float) -> np.ndarray:
+def _cluster_labels(numbers: np.ndarray, spread: float) -> np.ndarray:
     """The number of the cluster that each of some numbers belongs to: one begins beyond ``spread`` from the last."""
     found, begin, label = np.empty(len(numbers), int), -np.inf, -1
     for i in np.argsort(numbers):

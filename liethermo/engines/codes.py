@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 
 
-class Code(enum.IntEnum):
+class StatusCode(enum.IntEnum):
     """Zero while all is well. Engines know the first three; users see the names in small letters."""
 
     COMPLETED = 0
@@ -19,12 +19,12 @@ class Code(enum.IntEnum):
     INADMISSIBLE = 8
 
     @property
-    def text(self) -> str:
+    def status_name(self) -> str:
         return self.name.lower()
 
 
-UNTAKEN = (Code.NOT_CONVERGED, Code.NON_FINITE)
+FAILED_STEP_CODES = (StatusCode.NOT_CONVERGED, StatusCode.NON_FINITE)
 """How a step ends that could not be taken."""
 
-TEXTS = tuple(code.text for code in Code)
+STATUS_NAMES = tuple(code.status_name for code in StatusCode)
 """The names, each at the place of its number."""

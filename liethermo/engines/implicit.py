@@ -17,7 +17,7 @@ from jax.interpreters import ad, batching, mlir
 from manifolds.matrices.linear import inverse
 
 
-def solution(solve: Callable, misfit: Callable, parameters: Any, guess: jax.Array) -> jax.Array:
+def implicit_solution(solve: Callable, misfit: Callable, parameters: Any, guess: jax.Array) -> jax.Array:
     """The k with ``misfit(parameters, k) = 0`` that ``solve(parameters, guess)`` finds.
 
     Its derivative is ``-(D_k misfit)^-1 D misfit``, whatever ``solve`` does. Neither function may close over tracers.
@@ -29,13 +29,13 @@ def solution(solve: Callable, misfit: Callable, parameters: Any, guess: jax.Arra
     guess : array, of the shape of k
     """
     leaves, structure = jax.tree_util.tree_flatten(parameters)
-    return _solution.bind(*leaves, guess, solve=solve, misfit=misfit, structure=structure, axes=())
+    return _implicit_solution.bind(*leaves, guess, solve=solve, misfit=misfit, structure=structure, axes=())
 
 
-_solution = Primitive("solution")
+_implicit_solution = Primitive("solution")
 
 
-def _found(*arguments, solve: Callable, misfit: Callable, structure, axes: tuple) -> jax.Array:
+def _evaluate(*arguments, solve: Callable, misfit: Callable, structure, axes: tuple) -> jax.Array:
     """``axes`` has those of the arguments for each ``vmap`` that the primitive is under, the innermost first."""
     del misfit
 
@@ -43,38 +43,38 @@ def _found(*arguments, solve: Callable, misfit: Callable, structure, axes: tuple
         *leaves, guess = arguments
         return solve(jax.tree_util.tree_unflatten(structure, leaves), guess)
 
-    return _mapped(one, axes)(*arguments)
+    return _nest_vmaps(one, axes)(*arguments)
 
 
-def _mapped(function: Callable, axes: Sequence[tuple]) -> Callable:
+def _nest_vmaps(function: Callable, axes: Sequence[tuple]) -> Callable:
     for level in axes:
         function = jax.vmap(function, in_axes=level)
     return function
 
 
-def _shape(*arguments, axes: tuple, **_):
+def _abstract_shape(*arguments, axes: tuple, **_):
     shape, guess = arguments[-1].shape, arguments[-1]
     sizes = []
     for level in reversed(axes):
         sizes.append(next(a.shape[axis] for a, axis in zip(arguments, level, strict=True) if axis is not None))
-        arguments = tuple(_without(a, axis) for a, axis in zip(arguments, level, strict=True))
+        arguments = tuple(_drop_axis(a, axis) for a, axis in zip(arguments, level, strict=True))
         shape = arguments[-1].shape
     return jax.core.ShapedArray((*sizes, *shape), guess.dtype)
 
 
-def _without(a, axis: int | None):
+def _drop_axis(a, axis: int | None):
     """The shape that a function under ``vmap`` sees."""
     if axis is None:
         return a
     return jax.ShapeDtypeStruct(a.shape[:axis] + a.shape[axis + 1 :], a.dtype)
 
 
-def _batched(arguments, dims, *, axes: tuple, **rest):
-    return _solution.bind(*arguments, axes=(*axes, tuple(dims)), **rest), 0
+def _batching_rule(arguments, dims, *, axes: tuple, **rest):
+    return _implicit_solution.bind(*arguments, axes=(*axes, tuple(dims)), **rest), 0
 
 
-def _tangent(primals, tangents, *, misfit: Callable, structure, axes: tuple, **rest):
-    k = _solution.bind(*primals, misfit=misfit, structure=structure, axes=axes, **rest)
+def _jvp_rule(primals, tangents, *, misfit: Callable, structure, axes: tuple, **rest):
+    k = _implicit_solution.bind(*primals, misfit=misfit, structure=structure, axes=axes, **rest)
     moving = [i for i, tangent in enumerate(tangents[:-1]) if type(tangent) is not ad.Zero]
     if not moving:
         return k, jnp.zeros_like(k)
@@ -83,13 +83,13 @@ def _tangent(primals, tangents, *, misfit: Callable, structure, axes: tuple, **r
     def one(k, *given):
         leaves, dots = list(given[: -len(moving)]), given[-len(moving) :]
 
-        def of_moving(k, *values):
+        def active_residual(k, *values):
             whole = list(leaves)
             for i, value in zip(moving, values, strict=True):
                 whole[i] = value
             return misfit(jax.tree_util.tree_unflatten(structure, whole), k)
 
-        _, change = jax.linearize(of_moving, k, *(leaves[i] for i in moving))
+        _, change = jax.linearize(active_residual, k, *(leaves[i] for i in moving))
         fixed, still = jax.lax.stop_gradient(change), [jnp.zeros_like(dot) for dot in dots]
         matrix = jax.vmap(lambda d: fixed(d.reshape(k.shape), *still).ravel(), out_axes=1)(jnp.eye(k.size))
         inverted = inverse(matrix)
@@ -101,11 +101,11 @@ def _tangent(primals, tangents, *, misfit: Callable, structure, axes: tuple, **r
         )
 
     levels = [(0, *level[:-1], *(level[i] for i in moving)) for level in axes]
-    return k, _mapped(one, levels)(k, *leaves, *dots)
+    return k, _nest_vmaps(one, levels)(k, *leaves, *dots)
 
 
-_solution.def_impl(lambda *arguments, **rest: jax.jit(lambda *a: _found(*a, **rest))(*arguments))
-_solution.def_abstract_eval(_shape)
-batching.primitive_batchers[_solution] = _batched
-ad.primitive_jvps[_solution] = _tangent
-mlir.register_lowering(_solution, mlir.lower_fun(_found, multiple_results=False))
+_implicit_solution.def_impl(lambda *arguments, **rest: jax.jit(lambda *a: _evaluate(*a, **rest))(*arguments))
+_implicit_solution.def_abstract_eval(_abstract_shape)
+batching.primitive_batchers[_implicit_solution] = _batching_rule
+ad.primitive_jvps[_implicit_solution] = _jvp_rule
+mlir.register_lowering(_implicit_solution, mlir.lower_fun(_evaluate, multiple_results=False))

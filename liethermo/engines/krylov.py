@@ -7,10 +7,10 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from .rules import Rules
+from .rules import SolverOptions
 
 
-def krylov(product: Callable, b: jax.Array, rules: Rules) -> jax.Array:
+def solve_krylov(product: Callable, b: jax.Array, rules: SolverOptions) -> jax.Array:
     """An x with ``|b - product(x)| <= rules.forcing |b|``, of the shape of b, or the best found.
 
     Conjugate residuals, each direction made orthogonal to the last few [Eisenstat, Elman & Schultz 1983, "Orthomin"]:
@@ -21,9 +21,11 @@ def krylov(product: Callable, b: jax.Array, rules: Rules) -> jax.Array:
 
     def goes_on(carry):
         _, r, _, _, number = carry
-        return (number < rules.products) & (jnp.linalg.norm(r) > rules.forcing * size) | (number == 0)
+        return (number < rules.max_krylov_products) & (jnp.linalg.norm(r) > rules.krylov_forcing_term * size) | (
+            number == 0
+        )
 
-    def extended(carry):
+    def orthomin_step(carry):
         x, r, directions, images, number = carry
         p, q = r, product(r)
         shares = jnp.tensordot(images, q, q.ndim)
@@ -32,10 +34,12 @@ def krylov(product: Callable, b: jax.Array, rules: Rules) -> jax.Array:
         over = jnp.where(length > 0.0, 1.0 / jnp.where(length > 0.0, length, 1.0), 0.0)
         p, q = over * p, over * q
         along = jnp.vdot(q, r)
-        place = number % rules.kept
+        place = number % rules.krylov_basis_size
         directions, images = directions.at[place].set(p), images.at[place].set(q)
         return x + along * p, r - along * q, directions, images, number + 1
 
     size = jnp.linalg.norm(b)
-    none = jnp.zeros((rules.kept, *b.shape))
-    return jax.lax.while_loop(goes_on, extended, (jnp.zeros_like(b), b, none, none, jnp.zeros((), dtype=jnp.int64)))[0]
+    none = jnp.zeros((rules.krylov_basis_size, *b.shape))
+    return jax.lax.while_loop(
+        goes_on, orthomin_step, (jnp.zeros_like(b), b, none, none, jnp.zeros((), dtype=jnp.int64))
+    )[0]

@@ -8,10 +8,10 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from manifolds._module import Module
+from manifolds._pytree_module import Module
 
 
-def needed_arguments(function: Callable) -> int | None:
+def required_argument_count(function: Callable) -> int | None:
     """How many arguments a function needs by position; None where it does not tell."""
     try:
         parameters = inspect.signature(function).parameters.values()
@@ -20,7 +20,7 @@ def needed_arguments(function: Callable) -> int | None:
     return sum(p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD) and p.default is p.empty for p in parameters)
 
 
-class AtTime(Module):
+class FixedTimeFunction(Module):
     """A function of both, at a time."""
 
     function: Callable
@@ -30,7 +30,7 @@ class AtTime(Module):
         return self.function(x, self.time)
 
 
-class Joined(Module):
+class StateTimeFunction(Module):
     """A function of both, of the state with the time behind it."""
 
     function: Callable
@@ -39,7 +39,7 @@ class Joined(Module):
         return self.function(z[:-1], z[-1])
 
 
-class Steady(Module):
+class LastArgumentIgnored(Module):
     """A function as one of an argument more, the last, which it does not depend on."""
 
     function: Callable
@@ -48,7 +48,7 @@ class Steady(Module):
         return self.function(*arguments[:-1])
 
 
-class Constant(Module):
+class ConstantFunction(Module):
     """A value as a function of anything."""
 
     value: jax.Array
@@ -57,7 +57,7 @@ class Constant(Module):
         return self.value
 
 
-class Minus(Module):
+class NegatedFunction(Module):
     """Minus a function of both."""
 
     function: Callable
@@ -66,7 +66,7 @@ class Minus(Module):
         return -jnp.asarray(self.function(x, t))
 
 
-class BesideTime(Module):
+class CoordinatesWithTime(Module):
     """Coordinates of a state, and the time behind it."""
 
     coordinates: Callable

@@ -16,7 +16,7 @@ from manifolds._arrays import is_traced, real_array
 from ..errors import InputError
 
 
-class Condition(NamedTuple):
+class TracedCondition(NamedTuple):
     """What has to hold of a value that is being traced.
 
     Attributes
@@ -32,21 +32,23 @@ class Condition(NamedTuple):
     message: str
 
 
-_noted: contextvars.ContextVar[list[Condition] | None] = contextvars.ContextVar("noted", default=None)
+_collected_conditions: contextvars.ContextVar[list[TracedCondition] | None] = contextvars.ContextVar(
+    "noted", default=None
+)
 
 
 @contextlib.contextmanager
-def noting() -> Iterator[list[Condition]]:
+def collect_conditions() -> Iterator[list[TracedCondition]]:
     """Note the conditions on traced values meanwhile: those who sweep parameters evaluate them at every point."""
-    found: list[Condition] = []
-    token = _noted.set(found)
+    found: list[TracedCondition] = []
+    token = _collected_conditions.set(found)
     try:
         yield found
     finally:
-        _noted.reset(token)
+        _collected_conditions.reset(token)
 
 
-def require(value, test: Callable, message: str) -> None:
+def require_condition(value, test: Callable, message: str) -> None:
     """Refuse a value of which the test is not true everywhere; note the test where the value is traced.
 
     Parameters
@@ -61,13 +63,13 @@ def require(value, test: Callable, message: str) -> None:
     InputError
     """
     if is_traced(value):
-        if (noted := _noted.get()) is not None:
-            noted.append(Condition(jnp.all(test(value)), value, message))
+        if (noted := _collected_conditions.get()) is not None:
+            noted.append(TracedCondition(jnp.all(test(value)), value, message))
     elif not bool(np.all(test(np.asarray(value)))):
-        raise InputError(refusal(message, value))
+        raise InputError(refusal_message(message, value))
 
 
-def numbers(value, what: str, *shapes: tuple[int, ...]) -> jax.Array:
+def check_numbers(value, what: str, *shapes: tuple[int, ...]) -> jax.Array:
     """What a user gives as numbers, as an array of doubles; of one of these shapes, where any are given.
 
     Raises
@@ -90,6 +92,6 @@ def numbers(value, what: str, *shapes: tuple[int, ...]) -> jax.Array:
     return array
 
 
-def refusal(message: str, value) -> str:
+def refusal_message(message: str, value) -> str:
     """The message of a condition with the value in its place."""
     return message.format(value=np.asarray(value).tolist())

@@ -11,28 +11,28 @@ import jax.numpy as jnp
 import numpy as np
 
 from manifolds._arrays import is_traced
-from manifolds._module import Module
+from manifolds._pytree_module import Module
 
 from ..errors import FunctionError, InputError
-from ..tracing.interpret import at_points
-from ..tracing.trace_errors import TRACE_ERRORS, explain
+from ..tracing.interpret import evaluate_at_points
+from ..tracing.trace_errors import TRACE_ERRORS, explain_trace_error
 from .indices import Indices
 
 COORDINATE_TOLERANCE = 1e-10
 """How far a map of coordinates may be from quadratic, relative to its values: a few roundings."""
 
 
-class Choice(Module):
+class ComponentMap(Module):
     """A linear map from a state to some of its components, in another order or in units that are powers of two."""
 
     @abstractmethod
     def __call__(self, x) -> jax.Array: ...
 
 
-class Components(Choice):
+class Components(ComponentMap):
     """Components by their numbers; a range of them is read without gathering."""
 
-    places: range | Indices = eqx.field(static=True)
+    indices: range | Indices = eqx.field(static=True)
 
     @classmethod
     def of(cls, numbers: Sequence[int] | np.ndarray) -> Components:
@@ -41,22 +41,26 @@ class Components(Choice):
         return cls(Indices(np.asarray(numbers, dtype=np.int64)))
 
     def __call__(self, x):
-        places = self.places
+        places = self.indices
         return x[places.start : places.stop] if isinstance(places, range) else x[np.asarray(places)]
 
 
 def check_coordinates(coordinates: Callable, dim: int, role: str) -> None:
     """Raise unless coordinates are components of the state, or a map at most quadratic in it."""
     if isinstance(coordinates, Components):
-        outside = [i for i in np.asarray(coordinates.places).tolist() if not -dim <= i < dim]
+        outside = [i for i in np.asarray(coordinates.indices).tolist() if not -dim <= i < dim]
         if outside:  # JAX would read the last component instead
             raise InputError(f"{role} has a term on component {outside[0]} of a state with {dim} components")
-    if isinstance(coordinates, Choice) or is_traced(coordinates):
+    if isinstance(coordinates, ComponentMap) or is_traced(coordinates):
         return
     try:
-        start, end, step = at_points(_chord, coordinates, np.random.default_rng(0).standard_normal((1, 2 * dim)))
+        start, end, step = evaluate_at_points(
+            _coordinate_increments, coordinates, np.random.default_rng(0).standard_normal((1, 2 * dim))
+        )
     except TRACE_ERRORS as error:
-        raise FunctionError(explain(f"the coordinates of a term of {role} could not be evaluated", error)) from error
+        raise FunctionError(
+            explain_trace_error(f"the coordinates of a term of {role} could not be evaluated", error)
+        ) from error
     if start.ndim != 2:
         raise FunctionError(
             f"the coordinates of a term of {role} are one array of numbers, not shape {start.shape[1:]}"
@@ -71,7 +75,7 @@ def check_coordinates(coordinates: Callable, dim: int, role: str) -> None:
         )
 
 
-def _chord(coordinates: Callable, ends):
+def _coordinate_increments(coordinates: Callable, ends):
     """The coordinates of two random states, and their difference as a quadratic map would have it."""
     x, d = jnp.split(ends, 2)
     return coordinates(x), coordinates(x + d), jax.jvp(coordinates, (x + 0.5 * d,), (d,))[1]

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
-from manifolds._module import Module
+from manifolds._pytree_module import Module
 
 from ..errors import InputError
 from .energy import Energy, Linear
@@ -40,7 +40,7 @@ class VonNeumann(Energy):
     """
 
     floor: float = eqx.field(static=True)
-    limit: ClassVar[float] = NEGATIVE_EIGENVALUE_LIMIT
+    negative_limit: ClassVar[float] = NEGATIVE_EIGENVALUE_LIMIT
 
     def __init__(self, floor: float = 0.0):
         self.floor = float(floor)
@@ -49,11 +49,11 @@ class VonNeumann(Energy):
 
     def value(self, x) -> jax.Array:
         matrix = mf.DensityMatrices(math.isqrt(x.shape[-1])).matrix(x)
-        return -mf.spectral_trace(Information(self.floor, self.limit), matrix)
+        return -mf.spectral_trace(EntropyIntegrand(self.floor, self.negative_limit), matrix)
 
     def gradient(self, x) -> jax.Array:
         structure = mf.DensityMatrices(math.isqrt(x.shape[-1]))
-        return -structure.vector(mf.spectral(LogPlusOne(self.floor, self.limit), structure.matrix(x)))
+        return -structure.vector(mf.spectral(LogPlusOne(self.floor, self.negative_limit), structure.matrix(x)))
 
     def __eq__(self, other) -> bool:
         return isinstance(other, VonNeumann) and self.floor == other.floor
@@ -61,14 +61,14 @@ class VonNeumann(Energy):
     def __hash__(self) -> int:
         return hash(self.floor)
 
-    def hidden(self, x) -> jax.Array:
+    def difference_rounding_scale(self, x) -> jax.Array:
         return jnp.zeros(())
 
     def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
         """By divided differences between the eigenvalues at both ends, in place of any other: its rounding vanishes."""
         structure = mf.DensityMatrices(math.isqrt(x.shape[-1]))
         ends = structure.matrix(x + compensation), structure.matrix(x + (compensation + d))
-        return -structure.vector(mf.spectral_difference(Information(self.floor, self.limit), *ends))
+        return -structure.vector(mf.spectral_difference(EntropyIntegrand(self.floor, self.negative_limit), *ends))
 
     def stage_gradients(self, scheme, path) -> jax.Array:
         """The gradients, corrected along the slopes by what is missed of the change in closed form."""
@@ -80,14 +80,14 @@ class VonNeumann(Energy):
         return gradients + jnp.where(still, 0.0, defect / jnp.where(still, 1.0, square)) * k
 
 
-class OfIsolated(VonNeumann):
+class IsolatedVonNeumann(VonNeumann):
     """The entropy of a system without dissipation, in whose motion it has no part; finite for every Hermitian matrix.
 
     Steps that conserve eigenvalues to their order alone, as those of the midpoint scheme do, leave the cone of positive
     matrices by their error where an eigenvalue is zero.
     """
 
-    limit = math.inf
+    negative_limit = math.inf
 
 
 @dataclass(frozen=True)
@@ -98,77 +98,81 @@ class LogPlusOne(mf.ScalarFunction):
     """
 
     floor: float = 0.0
-    limit: float = NEGATIVE_EIGENVALUE_LIMIT
+    negative_limit: float = NEGATIVE_EIGENVALUE_LIMIT
 
     def derivative(self, x, order):
         if order:
-            above = x > self._cut
+            above = x > self._tangent_threshold
             return jnp.where(above, -math.factorial(order - 1) * (-1.0 / jnp.where(above, x, 1.0)) ** order, 0.0)
-        value = jnp.log(jnp.maximum(x, self._cut)) + 1.0
-        return _in_cone(x, self, jnp.where(x > self.floor, value, 0.0) if self.floor else value)
+        value = jnp.log(jnp.maximum(x, self._tangent_threshold)) + 1.0
+        return _nan_outside_cone(x, self, jnp.where(x > self.floor, value, 0.0) if self.floor else value)
 
     def width(self, x):
-        return jnp.abs(x - self._cut)
+        return jnp.abs(x - self._tangent_threshold)
 
-    def quotient(self, x, y):
+    def difference_quotient(self, x, y):
         least, most = jnp.minimum(x, y), jnp.maximum(x, y)
-        gap, above = most - least, least > self._cut
+        gap, above = most - least, least > self._tangent_threshold
         safe_gap, safe = jnp.where(gap == 0.0, 1.0, gap), jnp.where(above, least, 1.0)
         logarithm = jnp.where(gap == 0.0, 1.0 / safe, jnp.log1p(gap / safe) / safe_gap)
         return jnp.where(above, logarithm, (self.derivative(most, 0) - self.derivative(least, 0)) / safe_gap)
 
     @property
-    def _cut(self) -> float:
+    def _tangent_threshold(self) -> float:
         return max(self.floor, SMALLEST_EIGENVALUE)
 
 
 @dataclass(frozen=True)
-class Information(mf.ScalarFunction):
+class EntropyIntegrand(mf.ScalarFunction):
     """``p ln p``, continued by its tangent below :data:`SMALLEST_EIGENVALUE`; zero up to a floor that is not zero.
 
     Its derivative is :class:`LogPlusOne`, and it is NaN where that is.
     """
 
     floor: float = 0.0
-    limit: float = NEGATIVE_EIGENVALUE_LIMIT
+    negative_limit: float = NEGATIVE_EIGENVALUE_LIMIT
 
     def derivative(self, x, order):
         if order:
-            return LogPlusOne(self.floor, self.limit).derivative(x, order - 1)
-        above = jnp.maximum(x, self._cut)
+            return LogPlusOne(self.floor, self.negative_limit).derivative(x, order - 1)
+        above = jnp.maximum(x, self._tangent_threshold)
         value = jnp.where(x > self.floor, x * jnp.log(above), 0.0) if self.floor else x * jnp.log(above) + (x - above)
-        return _in_cone(x, self, value)
+        return _nan_outside_cone(x, self, value)
 
     def width(self, x):
-        return jnp.abs(x - self._cut)
+        return jnp.abs(x - self._tangent_threshold)
 
-    def quotient(self, x, y):
+    def difference_quotient(self, x, y):
         """``ln u + l ln(u / l) / (u - l)``, of the larger one u and the smaller one l."""
         least, most = jnp.minimum(x, y), jnp.maximum(x, y)
         gap = most - least
-        safe_gap, safe = jnp.where(gap == 0.0, 1.0, gap), jnp.where(least > self._cut, least, 1.0)
+        safe_gap, safe = jnp.where(gap == 0.0, 1.0, gap), jnp.where(least > self._tangent_threshold, least, 1.0)
         share = jnp.where(gap == 0.0, 1.0, safe * jnp.log1p(gap / safe) / safe_gap)
-        above = jnp.log(jnp.maximum(most, self._cut)) + share
+        above = jnp.log(jnp.maximum(most, self._tangent_threshold)) + share
         across = (self.derivative(most, 0) - self.derivative(least, 0)) / safe_gap
-        below = _in_cone(least, self, self.differentiated.derivative(most, 0))  # constant, so the quotient is it
-        return jnp.where(least > self._cut, above, jnp.where(most > self._cut, across, below))
+        below = _nan_outside_cone(
+            least, self, self.derivative_function.derivative(most, 0)
+        )  # constant, so the quotient is it
+        return jnp.where(
+            least > self._tangent_threshold, above, jnp.where(most > self._tangent_threshold, across, below)
+        )
 
     @property
-    def _cut(self) -> float:
+    def _tangent_threshold(self) -> float:
         return max(self.floor, SMALLEST_EIGENVALUE)
 
     @property
-    def differentiated(self):
-        return LogPlusOne(self.floor, self.limit)
+    def derivative_function(self):
+        return LogPlusOne(self.floor, self.negative_limit)
 
 
-def _in_cone(p, function: LogPlusOne | Information, value) -> jax.Array:
+def _nan_outside_cone(p, function: LogPlusOne | EntropyIntegrand, value) -> jax.Array:
     """The value of a function of an eigenvalue p; NaN where p is negative beyond its limit, and beyond its floor."""
-    return jnp.where(p < -max(function.floor, function.limit), jnp.nan, value)
+    return jnp.where(p < -max(function.floor, function.negative_limit), jnp.nan, value)
 
 
 @dataclass(frozen=True)
-class Positive(mf.ScalarFunction):
+class PositivePart(mf.ScalarFunction):
     """``max(p, 0)``."""
 
     def derivative(self, x, order):
@@ -177,7 +181,7 @@ class Positive(mf.ScalarFunction):
     def width(self, x):
         return jnp.abs(x)
 
-    def quotient(self, x, y):
+    def difference_quotient(self, x, y):
         gap = x - y
         across = (jnp.maximum(x, 0.0) - jnp.maximum(y, 0.0)) / jnp.where(gap == 0.0, 1.0, gap)
         return jnp.where(gap == 0.0, self.derivative(x, 1), across)
@@ -185,15 +189,15 @@ class Positive(mf.ScalarFunction):
 
 def positive_part(rho) -> jax.Array:
     """Density matrices, shape (..., N, N), with zero instead of eigenvalues that are negative by rounding."""
-    return mf.spectral(Positive(), rho)
+    return mf.spectral(PositivePart(), rho)
 
 
-def logarithm(rho) -> jax.Array:
+def matrix_logarithm(rho) -> jax.Array:
     """``ln rho`` of density matrices, shape (..., N, N), finite where eigenvalues are zero to rounding."""
     return mf.spectral(LogPlusOne(), rho) - np.eye(rho.shape[-1])
 
 
-class OfMatrix(Module):
+class DensityMatrixFunction(Module):
     """A function of a density matrix, as one of its coordinates, without those of baths behind."""
 
     function: Callable
@@ -217,23 +221,23 @@ class MeanEnergy(Linear):
     ----------
     b : array, shape (N^2,)
         The coordinates of H.
-    common : array, shape ()
-        e: see :func:`common_energy`. It makes no difference but by rounding.
+    reference_level : array, shape ()
+        e: see :func:`choose_reference_level`. It makes no difference but by rounding.
     """
 
-    common: jax.Array
+    reference_level: jax.Array
 
     def value(self, x) -> jax.Array:
-        return jnp.dot(self.gradient(x), x) + self.common
+        return jnp.dot(self.gradient(x), x) + self.reference_level
 
     def gradient(self, x) -> jax.Array:
-        return without_energy(self.b, self.common)
+        return subtract_level(self.b, self.reference_level)
 
     def __neg__(self) -> Energy:
-        return MeanEnergy(-self.b, -self.common)
+        return MeanEnergy(-self.b, -self.reference_level)
 
 
-def common_energy(levels: np.ndarray) -> float:
+def choose_reference_level(levels: np.ndarray) -> float:
     """The lower one of the two levels that are nearest to each other: their differences then lose no digit.
 
     It grows by c where all levels, shape (N,), do.
@@ -242,13 +246,13 @@ def common_energy(levels: np.ndarray) -> float:
     return float(ordered[0 if len(ordered) == 1 else np.argmin(np.diff(ordered))])
 
 
-def without_energy(b, common) -> jax.Array:
+def subtract_level(b, common) -> jax.Array:
     """The coordinates of H - e, of those of H, shape (N^2,), and a number e."""
     return b - common * np.where(np.arange(b.shape[-1]) < math.isqrt(b.shape[-1]), 1.0, 0.0)
 
 
-class Expectation(Module):
-    """``tr(rho H(t))`` of the coordinates of rho, for a function of time; ``common`` is as in :class:`MeanEnergy`.
+class ExpectationValue(Module):
+    """``tr(rho H(t))`` of the coordinates of rho, for a function of time; ``reference_level`` is as in :class:`MeanEnergy`.
 
     It is the lowest level at the time zero, so that it grows by c where H does: a discrete gradient weights the state
     and the time by the gradients of the energy by both.
@@ -256,21 +260,21 @@ class Expectation(Module):
 
     hamiltonian: Callable
     structure: mf.DensityMatrices
-    common: jax.Array
+    reference_level: jax.Array
 
     def __call__(self, x, t):
         b = self.structure.vector(self.hamiltonian(t))
-        return jnp.dot(without_energy(b, self.common), x) + self.common
+        return jnp.dot(subtract_level(b, self.reference_level), x) + self.reference_level
 
 
-class Modulated(Module):
+class ModulatedExpectationValue(Module):
     """``tr(rho (H_0 + f_1(t) H_1 + ...))`` of the coordinates of rho, by those of the matrices; likewise."""
 
     constant: jax.Array
     terms: tuple[jax.Array, ...]
     functions: tuple[Callable, ...]
-    common: jax.Array
+    reference_level: jax.Array
 
     def __call__(self, x, t):
         moved = [f(t) * term for f, term in zip(self.functions, self.terms, strict=True)]
-        return jnp.dot(sum(moved, without_energy(self.constant, self.common)), x) + self.common
+        return jnp.dot(sum(moved, subtract_level(self.constant, self.reference_level)), x) + self.reference_level

@@ -13,12 +13,12 @@ import scipy
 
 from ..errors import FunctionError, InputError
 from ..tracing.interpret import polynomial_degree
-from ..tracing.traced import settled
-from .checks import check_scalar, recognised
-from .conditions import numbers
-from .energy import Energy, Function, real
-from .indices import Indices, cliques
-from .path import Path
+from ..tracing.traced import trace_callables
+from .checks import check_energy, mark_polynomial_degrees
+from .conditions import check_numbers
+from .energy import Energy, Function, float64_array
+from .indices import Indices, clique_pattern
+from .path import CollocationPath
 
 
 class Each(Energy):
@@ -50,8 +50,8 @@ class Each(Energy):
     degree: float = eqx.field(static=True, default=math.inf)
 
     def __init__(self, phi, places, *parameters):
-        self.places = places if isinstance(places, Indices) else _checked_places(places)
-        self.parameters = tuple(numbers(a, "a parameter") for a in parameters)
+        self.places = places if isinstance(places, Indices) else _check_places(places)
+        self.parameters = tuple(check_numbers(a, "a parameter") for a in parameters)
         m, r = self.places.shape
         for a in self.parameters:
             if a.shape[:1] != (m,):
@@ -59,15 +59,15 @@ class Each(Energy):
         if isinstance(phi, Energy):
             if parameters:
                 raise InputError("an Energy is the same at every place: parameters are for a function")
-            self.phi = recognised(check_scalar(phi, r, "the energy at a place"), r)
+            self.phi = mark_polynomial_degrees(check_energy(phi, r, "the energy at a place"), r)
             self.degree = self.phi.degree
             return
         if not callable(phi):
             raise FunctionError(f"phi is a function or an Energy, not {type(phi).__name__}")
         first = tuple(jnp.zeros(a.shape[1:]) for a in self.parameters)
-        check_scalar(Function(lambda y: phi(y, *first)), r, "the function at a place")
-        self.phi = settled(phi, lambda phi, *a: phi(*a), (r,), *(a.shape for a in first))
-        self.degree = polynomial_degree(_value_at, (self.phi, first), r)
+        check_energy(Function(lambda y: phi(y, *first)), r, "the function at a place")
+        self.phi = trace_callables(phi, lambda phi, *a: phi(*a), (r,), *(a.shape for a in first))
+        self.degree = polynomial_degree(_summand_value, (self.phi, first), r)
 
     @property
     def terms(self) -> tuple[Energy, ...]:
@@ -80,66 +80,68 @@ class Each(Energy):
         return self.degree <= 2
 
     def value(self, x) -> jax.Array:
-        return jnp.sum(jax.vmap(lambda y, *a: self._at(a).value(y))(self._gathered(x), *self.parameters))
+        return jnp.sum(jax.vmap(lambda y, *a: self._summand(a).value(y))(self._gather_components(x), *self.parameters))
 
     def gradient(self, x) -> jax.Array:
-        x = real(x)
-        found = jax.vmap(lambda y, *a: self._at(a).gradient(y))(self._gathered(x), *self.parameters)
-        return self._spread(found, x.shape[0])
+        x = float64_array(x)
+        found = jax.vmap(lambda y, *a: self._summand(a).gradient(y))(self._gather_components(x), *self.parameters)
+        return self._scatter_gradients(found, x.shape[0])
 
     def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
         def one(y, step, kept, *a):
-            return self._at(a).discrete_gradient(scheme, y, step, kept)
+            return self._summand(a).discrete_gradient(scheme, y, step, kept)
 
-        y, step, kept = map(self._gathered, (x, d, jnp.zeros_like(x) + compensation))
-        return self._spread(jax.vmap(one)(y, step, kept, *self.parameters), x.shape[0])
+        y, step, kept = map(self._gather_components, (x, d, jnp.zeros_like(x) + compensation))
+        return self._scatter_gradients(jax.vmap(one)(y, step, kept, *self.parameters), x.shape[0])
 
     def stage_gradients(self, scheme, path) -> jax.Array:
-        def one(own: Path, *a):
-            return self._at(a).stage_gradients(scheme, own)
+        def one(own: CollocationPath, *a):
+            return self._summand(a).stage_gradients(scheme, own)
 
         compensation = jnp.zeros_like(path.start) + path.compensation
-        gathered = Path(*jax.tree.map(self._gathered, path._replace(compensation=compensation)[:7]), *path[7:])
-        further, symmetries = None if path.further is None else 1, None if path.symmetries is None else 2
-        axes = Path(0, 0, 0, 1, 1, further, symmetries, None, None, None)  # type: ignore[arg-type]
+        gathered = CollocationPath(
+            *jax.tree.map(self._gather_components, path._replace(compensation=compensation)[:7]), *path[7:]
+        )
+        further, symmetries = None if path.kronrod_samples is None else 1, None if path.symmetries is None else 2
+        axes = CollocationPath(0, 0, 0, 1, 1, further, symmetries, None, None, None)  # type: ignore[arg-type]
         in_axes = axes, *(0 for _ in self.parameters)
         found = jax.vmap(one, in_axes=in_axes, out_axes=1)(gathered, *self.parameters)
-        return jax.vmap(lambda g: self._spread(g, path.start.shape[0]))(found)
+        return jax.vmap(lambda g: self._scatter_gradients(g, path.start.shape[0]))(found)
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array:
-        return cliques(self.places, dim)
+        return clique_pattern(self.places, dim)
 
-    def check_places(self, dim: int, role: str) -> None:
+    def check_components(self, dim: int, role: str) -> None:
         numbers = np.asarray(self.places)
         if numbers.size and not (numbers.min() >= 0 and numbers.max() < dim):
             outside = int(numbers[(numbers < 0) | (numbers >= dim)][0])
             raise InputError(f"{role} has a term at component {outside} of a state with {dim} components")
 
-    def _at(self, parameters) -> Energy:
+    def _summand(self, parameters) -> Energy:
         """The summand with these parameters."""
         if isinstance(self.phi, Energy):
             return self.phi
         return Function(lambda y: self.phi(y, *parameters), degree=self.degree)
 
-    def _gathered(self, x) -> jax.Array:
+    def _gather_components(self, x) -> jax.Array:
         """The components at each place, shape (..., n) to (..., m, r)."""
-        if (run := self.places.run) is not None:
+        if (run := self.places.contiguous_slice) is not None:
             return x[..., run].reshape(*x.shape[:-1], *self.places.shape)
         return x[..., np.asarray(self.places)]
 
-    def _spread(self, gradients, n: int) -> jax.Array:
+    def _scatter_gradients(self, gradients, n: int) -> jax.Array:
         """The sum of covectors at the places, shape (m, r) to (n,)."""
-        if (run := self.places.run) is not None:
+        if (run := self.places.contiguous_slice) is not None:
             return jnp.zeros(n).at[run].add(gradients.ravel())
         return jnp.zeros(n).at[np.asarray(self.places)].add(gradients)
 
 
-def _value_at(model, y):
+def _summand_value(model, y):
     phi, parameters = model
     return jnp.asarray(phi(y, *parameters))
 
 
-def _checked_places(places) -> Indices:
+def _check_places(places) -> Indices:
     numbers = np.asarray(places)
     if numbers.ndim != 2 or numbers.dtype.kind not in "iu" or 0 in numbers.shape:
         raise InputError(

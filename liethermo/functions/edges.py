@@ -12,7 +12,7 @@ import scipy
 
 from ..errors import InputError
 
-ASYMMETRY = 1e-12
+ASYMMETRY_RTOL = 1e-12
 """How far a symmetric matrix may be from its transpose, relative to its largest entry."""
 
 
@@ -31,7 +31,7 @@ class Edges(NamedTuple):
     weight: jax.Array
 
 
-def edges(graph, nodes: int, what: str, names: Sequence[str], signed: bool = False) -> Edges:
+def graph_edges(graph, nodes: int, what: str, names: Sequence[str], allow_negative: bool = False) -> Edges:
     """The edges of a symmetric graph; those of weight zero are left out.
 
     Parameters
@@ -43,7 +43,7 @@ def edges(graph, nodes: int, what: str, names: Sequence[str], signed: bool = Fal
         What the weights are, for messages.
     names : sequence of str
         Of the nodes, for messages.
-    signed : bool
+    allow_negative : bool
         Whether weights may be negative.
 
     Raises
@@ -53,27 +53,29 @@ def edges(graph, nodes: int, what: str, names: Sequence[str], signed: bool = Fal
     if isinstance(graph, jax.core.Tracer):  # a matrix that is being swept or differentiated: all of its edges
         first, second = np.triu_indices(nodes, 1)
         return Edges(first, second, graph if graph.ndim == 0 else graph[first, second])
-    first, second, weight = _listed(graph, nodes, what)
+    first, second, weight = _edge_arrays(graph, nodes, what)
     if isinstance(weight, jax.Array):  # some are tracers
         return Edges(first, second, weight)
     for e in np.flatnonzero((first == second) & (weight != 0.0))[:1]:
         raise InputError(f"{what} of {names[first[e]]} with itself is {weight[e]:g}: leave the diagonal zero")
-    for e in np.flatnonzero(~((signed | (weight >= 0.0)) & np.isfinite(weight)))[:1]:
+    for e in np.flatnonzero(~((allow_negative | (weight >= 0.0)) & np.isfinite(weight)))[:1]:
         ends = f"{names[first[e]]} and {names[second[e]]}"
-        raise InputError(f"{what} between {ends} is {weight[e]:g}: it must be finite{'' if signed else ' and >= 0'}")
+        raise InputError(
+            f"{what} between {ends} is {weight[e]:g}: it must be finite{'' if allow_negative else ' and >= 0'}"
+        )
     kept = weight != 0.0
     return Edges(first[kept], second[kept], jnp.asarray(weight[kept]))
 
 
-def parts(graph: Edges, nodes: int) -> np.ndarray:
+def connected_components(graph: Edges, nodes: int) -> np.ndarray:
     """The number of the connected part that each node belongs to, shape (nodes,)."""
     matrix = scipy.sparse.coo_array((np.ones(len(graph.first)), (graph.first, graph.second)), (nodes, nodes))
     return scipy.sparse.csgraph.connected_components(matrix, directed=False)[1]
 
 
-def _listed(graph, nodes: int, what: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | jax.Array]:
+def _edge_arrays(graph, nodes: int, what: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | jax.Array]:
     if scipy.sparse.issparse(graph) or _is_matrix(graph):
-        return _of_matrix(scipy.sparse.coo_array(graph), nodes, what)
+        return _matrix_edges(scipy.sparse.coo_array(graph), nodes, what)
     if not _is_edge_list(graph) and np.ndim(graph) == 0:
         if nodes != 2:
             raise InputError(f"{what} as one number is meant for two parts, not {nodes}: give a matrix or edges")
@@ -98,11 +100,11 @@ def _listed(graph, nodes: int, what: str) -> tuple[np.ndarray, np.ndarray, np.nd
     return ends[:, 0], ends[:, 1], jnp.stack([jnp.asarray(k) for k in weights]) if traced else np.array(weights)
 
 
-def _of_matrix(matrix, nodes: int, what: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _matrix_edges(matrix, nodes: int, what: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if matrix.shape != (nodes, nodes):
         raise InputError(f"{what} is a ({nodes}, {nodes}) matrix for {nodes} parts, not one of shape {matrix.shape}")
     asymmetry = abs(matrix - matrix.T).max()
-    if not asymmetry <= ASYMMETRY * abs(matrix).max():
+    if not asymmetry <= ASYMMETRY_RTOL * abs(matrix).max():
         raise InputError(f"{what} is not symmetric: it differs from its transpose by {asymmetry:.3g}")
     upper = scipy.sparse.triu(matrix).tocoo()
     return upper.row.astype(int), upper.col.astype(int), upper.data.astype(float)

@@ -19,30 +19,36 @@ import scipy
 
 import manifolds as mf
 from manifolds._arrays import is_traced, real_array
-from manifolds._module import Module, forwarded
-from manifolds._precision import by_own_settings
+from manifolds._precision import with_library_settings
+from manifolds._pytree_module import Module, forward_to
 
 from ..errors import FunctionError, InputError
-from ..tracing.programs import part
-from .arguments import AtTime, BesideTime, Joined, Minus, needed_arguments
-from .conditions import numbers
-from .coordinates import Choice, Components, check_coordinates
-from .indices import cliques, pattern, union
-from .path import Path, Scheme
-from .rounding import with_rounding
+from ..tracing.programs import subprogram
+from .arguments import (
+    CoordinatesWithTime,
+    FixedTimeFunction,
+    NegatedFunction,
+    StateTimeFunction,
+    required_argument_count,
+)
+from .conditions import check_numbers
+from .coordinates import ComponentMap, Components, check_coordinates
+from .indices import clique_pattern, sparsity_pattern, union_pattern
+from .path import CollocationPath, DiscreteGradientScheme
+from .rounding import value_and_rounding_scale
 from .time_span import TimeSpan
 
 
-@part
+@subprogram
 def _gradient(energy: Energy, x) -> jax.Array:
     return jax.grad(energy.value)(x)
 
 
-LARGE = 1_000
+MIN_BUFFERED_DIM = 1_000
 """Components from which a gradient is put into memory before anything is made of it."""
 
 
-def _in_memory(function: Callable, x) -> jax.Array:
+def _evaluate_buffered(function: Callable, x) -> jax.Array:
     """``function(x)`` of the shape of x, computed once: XLA computes elementwise results anew for each use of an entry.
 
     It keeps what a branch returns. NaN where the first entry of x is not finite.
@@ -50,7 +56,7 @@ def _in_memory(function: Callable, x) -> jax.Array:
     return jax.lax.cond(jnp.isfinite(x[0]), function, lambda x: jnp.full_like(x, jnp.nan), x)
 
 
-LARGEST_CLIQUE = 2_000
+MAX_CLIQUE_COMPONENTS = 2_000
 """Components that a term may depend on together, for the pattern of what depends on what to be worth having."""
 
 
@@ -66,8 +72,8 @@ class Energy(Module):
 
     def gradient(self, x) -> jax.Array:
         """The gradient at one state, shape (n,)."""
-        x = real(x)
-        return _gradient(self, x) if x.size < LARGE else _in_memory(lambda x: _gradient(self, x), x)
+        x = float64_array(x)
+        return _gradient(self, x) if x.size < MIN_BUFFERED_DIM else _evaluate_buffered(lambda x: _gradient(self, x), x)
 
     def sensitivity(self, x) -> jax.Array:
         """``|grad f(x)| |x|``, of a sum the sum over its terms: the size at which the function is rounded.
@@ -77,16 +83,16 @@ class Energy(Module):
         """
         return jax.lax.stop_gradient(jnp.linalg.norm(self.gradient(x)) * jnp.linalg.norm(x))
 
-    def rounded(self, x) -> jax.Array:
+    def rounding_scale(self, x) -> jax.Array:
         """The size at which the value at x is rounded: that of the largest terms inside, though they cancel in it.
 
         Near q = 0 the value of ``1 - cos q`` is rounding, of the size of 1.
         """
-        return jax.lax.stop_gradient(with_rounding(self.value, x)[1])
+        return jax.lax.stop_gradient(value_and_rounding_scale(self.value, x)[1])
 
-    def hidden(self, x) -> jax.Array:
+    def difference_rounding_scale(self, x) -> jax.Array:
         """The size at which a difference of values of one term is rounded; zero where that has a closed form."""
-        return jnp.zeros(()) if self.is_quadratic else self.rounded(x)
+        return jnp.zeros(()) if self.is_quadratic else self.rounding_scale(x)
 
     @property
     def terms(self) -> tuple[Energy, ...]:
@@ -103,7 +109,7 @@ class Energy(Module):
         """Its degree as a polynomial, at most; infinity where it is not known to be one. Quadratures may be exact."""
         return 2.0 if self.is_quadratic else math.inf
 
-    def discrete_gradient(self, scheme: Scheme, x, d, compensation) -> jax.Array:
+    def discrete_gradient(self, scheme: DiscreteGradientScheme, x, d, compensation) -> jax.Array:
         """The discrete gradient of one term by a scheme, shape (n,), from x + compensation to x + compensation + d."""
         return (
             scheme.quadratic(self, x, d, compensation)
@@ -111,16 +117,16 @@ class Energy(Module):
             else scheme.general(self, x, d, compensation)
         )
 
-    def stage_gradients(self, scheme: Callable, path: Path) -> jax.Array:
+    def stage_gradients(self, scheme: Callable, path: CollocationPath) -> jax.Array:
         """Those of one term at the stages of a collocation method, shape (s, n)."""
         return scheme(self, path)
 
-    def in_chart(self, coordinates: mf.Coordinates, space: mf.Space, start=None) -> Energy:
+    def pullback_to_chart(self, coordinates: mf.Coordinates, space: mf.Space, start=None) -> Energy:
         """A function of state vectors of a space, as one of coordinates.
 
         Where it is for one step, ``start`` is the state vector from which that leads.
         """
-        return InChart(self, coordinates, space, start)
+        return ChartEnergy(self, coordinates, space, start)
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
         """The pattern of the Hessian: which components of the gradient depend on which of the state; None if unknown.
@@ -129,7 +135,7 @@ class Energy(Module):
         """
         return None
 
-    def check_places(self, dim: int, role: str) -> None:
+    def check_components(self, dim: int, role: str) -> None:
         """Raise unless the components that it depends on are those of a state of this dimension."""
 
     def on(self, coordinates: Sequence[int] | np.ndarray | Callable) -> Energy:
@@ -143,9 +149,9 @@ class Energy(Module):
         coordinates : sequence of int, or function from x, shape (n,), to y, shape (m,)
             Indices into the state, or a map at most quadratic in x (checked where a system is built).
         """
-        return self.mapped(lambda term: Pullback(term, coordinates))
+        return self.map_terms(lambda term: Pullback(term, coordinates))
 
-    def mapped(self, change: Callable[[Energy], Energy]) -> Energy:
+    def map_terms(self, change: Callable[[Energy], Energy]) -> Energy:
         """The sum of what its terms become by ``change``, a function from a term to an energy."""
         return Sum.of([change(term) for term in self.terms])
 
@@ -162,7 +168,7 @@ class Energy(Module):
         """The same as a function of the state with the time behind it, shape (n + 1,): of one that depends on both."""
         raise NotImplementedError(f"{type(self).__name__} does not depend on time")
 
-    @by_own_settings
+    @with_library_settings
     def __call__(self, x, t=None) -> jax.Array:
         x = jnp.asarray(x, dtype=jnp.float64)
         if t is None:
@@ -171,7 +177,7 @@ class Energy(Module):
         return at(x, jnp.asarray(t, dtype=jnp.float64))
 
     def __add__(self, other) -> Energy:
-        return Sum((*self.terms, *as_energy(other, "a term of a sum").terms))
+        return Sum((*self.terms, *make_energy(other, "a term of a sum").terms))
 
     __radd__ = __add__
 
@@ -179,13 +185,13 @@ class Energy(Module):
         return Negative(self)
 
     def __sub__(self, other) -> Energy:
-        return self + -as_energy(other, "a term of a sum")
+        return self + -make_energy(other, "a term of a sum")
 
     def __rsub__(self, other) -> Energy:
         return -self + other
 
 
-def real(x) -> jax.Array:
+def float64_array(x) -> jax.Array:
     """A state that may be given as a list, or in integers."""
     return jnp.asarray(x, dtype=jnp.float64)
 
@@ -216,9 +222,9 @@ class Quadratic(Energy):
     c: jax.Array
 
     def __init__(self, A, b=None, c=0.0):
-        self.A = numbers(A, "A of a quadratic function")
-        self.b = None if b is None else numbers(b, "b of a quadratic function")
-        self.c = numbers(c, "c of a quadratic function", ())
+        self.A = check_numbers(A, "A of a quadratic function")
+        self.b = None if b is None else check_numbers(b, "b of a quadratic function")
+        self.c = check_numbers(c, "c of a quadratic function", ())
         if self.A.ndim not in (1, 2) or len(set(self.A.shape)) != 1:
             raise InputError(f"A has shape (n, n), or (n,) for a diagonal, not {self.A.shape}")
         if self.b is not None and self.b.shape != self.A.shape[:1]:
@@ -242,14 +248,14 @@ class Quadratic(Energy):
         return 0.5 * jnp.dot(x, self.linear_part(x)) + linear + self.c
 
     def gradient(self, x) -> jax.Array:
-        along = self.linear_part(real(x))
+        along = self.linear_part(float64_array(x))
         return along if self.b is None else along + self.b
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
         if is_traced(self.A):
             return None
         places = np.nonzero(np.asarray(self.A))
-        return pattern(places[0], places[-1], dim)
+        return sparsity_pattern(places[0], places[-1], dim)
 
     def __neg__(self) -> Energy:
         return Quadratic(-self.A, None if self.b is None else -self.b, -self.c)
@@ -274,7 +280,7 @@ class Linear(Energy):
         return self.b
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array:
-        return pattern([], [], dim)
+        return sparsity_pattern([], [], dim)
 
     def __neg__(self) -> Energy:
         return Linear(-self.b)
@@ -315,19 +321,19 @@ class TimeDependent(Energy):
     depends_on_time = True
 
     def at_time(self, t) -> Energy:
-        return Function(AtTime(self.function, jnp.asarray(t, dtype=jnp.float64)))
+        return Function(FixedTimeFunction(self.function, jnp.asarray(t, dtype=jnp.float64)))
 
     def with_time(self) -> Energy:
-        return WithTime(WithinSpan(Function(Joined(self.function)), TimeSpan()))
+        return StateTimeEnergy(SpanLimitedEnergy(Function(StateTimeFunction(self.function)), TimeSpan()))
 
     def value(self, x) -> jax.Array:
         raise InputError("this energy depends on time, so its value is known at a time only: energy(x, t)")
 
     def __neg__(self) -> Energy:
-        return TimeDependent(Minus(self.function))
+        return TimeDependent(NegatedFunction(self.function))
 
 
-class WithinSpan(Energy):
+class SpanLimitedEnergy(Energy):
     """A function of a state and the time behind it, shape (n + 1,), evaluated at times within a span only."""
 
     energy: Energy
@@ -345,11 +351,11 @@ class WithinSpan(Energy):
     def sensitivity(self, z) -> jax.Array:
         return self.energy.sensitivity(self._clip(z))
 
-    def rounded(self, z) -> jax.Array:
-        return self.energy.rounded(self._clip(z))
+    def rounding_scale(self, z) -> jax.Array:
+        return self.energy.rounding_scale(self._clip(z))
 
 
-class WithTime(Energy):
+class StateTimeEnergy(Energy):
     """A function of a state and the time behind it, with what it changes by divided between the two.
 
     A discrete gradient is, by the state, one of the mean over both ends in time, and by the time the difference
@@ -360,8 +366,8 @@ class WithTime(Energy):
 
     energy: Energy
 
-    is_quadratic = forwarded("energy")
-    value = forwarded("energy")
+    is_quadratic = forward_to("energy")
+    value = forward_to("energy")
 
     def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
         if self.is_quadratic:
@@ -373,20 +379,20 @@ class WithTime(Energy):
             values = jax.vmap(lambda y, t: self.value(jnp.append(y, t)))(states, times)
             return 0.5 * (values[0] + values[1])
 
-        def of_state(y):
+        def mean_by_state(y):
             return mean(jnp.stack([y, y]), ends[:, -1])
 
-        def of_time(t):
+        def mean_by_time(t):
             return mean(ends[:, :-1], jnp.concatenate([t, t]))
 
-        by_state = scheme.general(Function(of_state), x[:-1], d[:-1], compensation[:-1])
-        return jnp.concatenate([by_state, scheme.general(Function(of_time), x[-1:], d[-1:], compensation[-1:])])
+        by_state = scheme.general(Function(mean_by_state), x[:-1], d[:-1], compensation[:-1])
+        return jnp.concatenate([by_state, scheme.general(Function(mean_by_time), x[-1:], d[-1:], compensation[-1:])])
 
     def stage_gradients(self, scheme, path) -> jax.Array:
-        return scheme(self, path, along=_squares)
+        return scheme(self, path, along=_squared_gradient_weights)
 
 
-def _squares(gradients) -> jax.Array:
+def _squared_gradient_weights(gradients) -> jax.Array:
     """Squares of gradients, shape (s, m): that by the state, for each of its components, and that by the time."""
     size = jnp.max(jnp.abs(gradients))
     squares = jnp.sum((gradients / jnp.where(size > 0.0, size, 1.0)) ** 2, axis=0)
@@ -407,29 +413,33 @@ class Pullback(Energy):
         self.term, self.coordinates = term, coordinates if callable(coordinates) else Components.of(coordinates)
 
     @property
-    def _chooses(self) -> bool:
-        return isinstance(self.coordinates, Choice)
+    def _selects_components(self) -> bool:
+        return isinstance(self.coordinates, ComponentMap)
 
     @property
     def is_quadratic(self) -> bool:
-        return self._chooses and self.term.is_quadratic
+        return self._selects_components and self.term.is_quadratic
 
     def value(self, x) -> jax.Array:
         return self.term.value(self.coordinates(x))
 
     def gradient(self, x) -> jax.Array:
-        y, back = jax.vjp(self.coordinates, real(x))
+        y, back = jax.vjp(self.coordinates, float64_array(x))
         return back(self.term.gradient(y))[0]  # in its own way, where it has one
 
     def sensitivity(self, x) -> jax.Array:
-        own = self._chooses or isinstance(self.term, WithTime)
+        own = self._selects_components or isinstance(self.term, StateTimeEnergy)
         return self.term.sensitivity(self.coordinates(x)) if own else super().sensitivity(x)
 
-    def rounded(self, x) -> jax.Array:
-        return self.term.rounded(self.coordinates(x)) if self._chooses else super().rounded(x)
+    def rounding_scale(self, x) -> jax.Array:
+        return self.term.rounding_scale(self.coordinates(x)) if self._selects_components else super().rounding_scale(x)
 
-    def hidden(self, x) -> jax.Array:
-        return self.term.hidden(self.coordinates(x)) if self._chooses else super().hidden(x)
+    def difference_rounding_scale(self, x) -> jax.Array:
+        return (
+            self.term.difference_rounding_scale(self.coordinates(x))
+            if self._selects_components
+            else super().difference_rounding_scale(x)
+        )
 
     def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
         if self.is_quadratic:  # at points of whole states, which others look at too
@@ -441,24 +451,24 @@ class Pullback(Energy):
         return back
 
     def stage_gradients(self, scheme, path) -> jax.Array:
-        path, back = path.through(self.coordinates)
+        path, back = path.map_coordinates(self.coordinates)
         return back(self.term.stage_gradients(scheme, path))
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
-        if not isinstance(self.coordinates, Components) or len(self.coordinates.places) > LARGEST_CLIQUE:
+        if not isinstance(self.coordinates, Components) or len(self.coordinates.indices) > MAX_CLIQUE_COMPONENTS:
             return None
-        return cliques([np.asarray(self.coordinates.places) % dim], dim)
+        return clique_pattern([np.asarray(self.coordinates.indices) % dim], dim)
 
-    def check_places(self, dim: int, role: str) -> None:
+    def check_components(self, dim: int, role: str) -> None:
         check_coordinates(self.coordinates, dim, role)
 
-    depends_on_time = forwarded("term")
+    depends_on_time = forward_to("term")
 
     def at_time(self, t) -> Energy:
         return eqx.tree_at(lambda e: e.term, self, self.term.at_time(t)) if self.depends_on_time else self
 
     def with_time(self) -> Energy:
-        return Pullback(self.term.with_time(), BesideTime(self.coordinates))
+        return Pullback(self.term.with_time(), CoordinatesWithTime(self.coordinates))
 
     def __neg__(self) -> Energy:
         return Pullback(-self.term, self.coordinates)
@@ -469,7 +479,7 @@ class Negative(Energy):
 
     term: Energy
 
-    is_quadratic = forwarded("term")
+    is_quadratic = forward_to("term")
 
     def value(self, x) -> jax.Array:
         return -self.term.value(x)
@@ -477,7 +487,7 @@ class Negative(Energy):
     def gradient(self, x) -> jax.Array:
         return -self.term.gradient(x)
 
-    sensitivity = forwarded("term")
+    sensitivity = forward_to("term")
 
     def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
         return -self.term.discrete_gradient(scheme, x, d, compensation)
@@ -485,8 +495,8 @@ class Negative(Energy):
     def stage_gradients(self, scheme, path) -> jax.Array:
         return -self.term.stage_gradients(scheme, path)
 
-    couplings = forwarded("term")
-    check_places = forwarded("term")
+    couplings = forward_to("term")
+    check_components = forward_to("term")
 
     def __neg__(self) -> Energy:
         return self.term
@@ -518,7 +528,7 @@ class Sum(Energy):
         return Sum(tuple(term.at_time(t) for term in self.summands))
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
-        return union(term.couplings(dim) for term in self.summands)
+        return union_pattern(term.couplings(dim) for term in self.summands)
 
     def __neg__(self) -> Energy:
         return Sum(tuple(-term for term in self.summands))
@@ -538,7 +548,7 @@ def function_name(energy: Energy) -> str:
     return getattr(energy.function, "__name__", "") if isinstance(energy, Function | TimeDependent) else ""
 
 
-def as_energy(function, role: str) -> Energy:
+def make_energy(function, role: str) -> Energy:
     """An :class:`Energy` from one, from a Casimir polynomial (quadratic ones are recognised) or from a function.
 
     One that needs two arguments is a function of the state and the time.
@@ -546,9 +556,9 @@ def as_energy(function, role: str) -> Energy:
     if isinstance(function, Energy):
         return function
     if isinstance(function, mf.Polynomial) and function.degree <= 2:
-        return quadratic_of(function)
+        return quadratic_from_polynomial(function)
     if callable(function):
-        return TimeDependent(function) if needed_arguments(function) == 2 else Function(function)
+        return TimeDependent(function) if required_argument_count(function) == 2 else Function(function)
     raise FunctionError(f"{role} must be a function of the state or an lt.Quadratic, not {type(function).__name__}")
 
 
@@ -556,7 +566,7 @@ CHART_ROUNDINGS = 4.0
 """Roundings of each component of a point that a chart computes."""
 
 
-class InChart(Energy):
+class ChartEnergy(Energy):
     """A function of state vectors, as one of coordinates."""
 
     energy: Energy
@@ -567,14 +577,14 @@ class InChart(Energy):
     def value(self, x) -> jax.Array:
         return self.energy.value(self.space.to_vector(self.coordinates.point(x)))
 
-    def rounded(self, x) -> jax.Array:
+    def rounding_scale(self, x) -> jax.Array:
         """At the start of the step, where that is known: so it is found once, not at every iteration."""
         if self.start is None:
-            return super().rounded(x)
-        return self.energy.rounded(self.start) + CHART_ROUNDINGS * self.energy.sensitivity(self.start)
+            return super().rounding_scale(x)
+        return self.energy.rounding_scale(self.start) + CHART_ROUNDINGS * self.energy.sensitivity(self.start)
 
 
-def quadratic_of(polynomial: mf.Polynomial) -> Quadratic:
+def quadratic_from_polynomial(polynomial: mf.Polynomial) -> Quadratic:
     A, b, c = np.zeros((polynomial.dim, polynomial.dim)), np.zeros(polynomial.dim), 0.0
     for power, coefficient in polynomial.terms:
         factors = np.repeat(np.arange(polynomial.dim), power)

@@ -9,7 +9,7 @@ first *predicted* by Gauss quadrature of the gradient along the segment,
 whose rounding error is about ``eps |grad H| |d|``: it vanishes with d. Only what the quadrature misses, its
 *defect* (difference minus prediction), needs the difference itself. The defect is let through where it matters and
 shut out where it is rounding noise, by a gate that is continuous, scale free, and closed near d = 0
-(:func:`_gate`). Quadratic terms have closed forms with no quotient at all, and of polynomials whose gradients the
+(:func:`_gate_opening`). Quadratic terms have closed forms with no quotient at all, and of polynomials whose gradients the
 quadrature is exact for nothing is missed: no value is asked for.
 """
 
@@ -24,12 +24,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from manifolds._module import Module
+from manifolds._pytree_module import Module
 
 from ..errors import InputError
 from .energy import Energy
-from .frames import frame, root, total
-from .path import Finer, Path
+from .frames import gram_schmidt, sqrt_or_zero, sum_terms
+from .path import CollocationPath, KronrodRule
 
 EPS = float(np.finfo(np.float64).eps)
 
@@ -43,7 +43,7 @@ defect is always used. There |d|/L > 2.6e-3, so the quotient's noise is below 1e
 three-node quadrature is exact to (|d|/L)^7 / 2e6 < 1e-23, nothing to lose even in 1e7 steps. A constant in H, or large
 terms that cancel there, make the noise as many times larger: see :data:`NOISY`."""
 
-NOISY = 1e-11
+MAX_DIFFERENCE_NOISE = 1e-11
 """Largest noise of the difference, relative to the gradient times the step, at which a defect below the noise is used.
 The equations of an implicit step are then solved to their plateau all the same. Where the values of H are rounded more
 coarsely, as beside a large constant, a defect that is less than their rounding is left to the steering of the
@@ -54,7 +54,7 @@ class DiscreteGradient(Module):
     """A discrete gradient; ``gradient(energy, x, d)`` is that of the step from x to x + d, both of shape (n,).
 
     A sum of energies is treated term by term: discrete gradients add, and each term knows which of the methods below is
-    its own (:meth:`liethermo.Energy.discrete_gradient`). ``compensation`` is what rounding has kept from x
+    its own (:meth:`liethermo.Energy.get_discrete_gradient`). ``compensation`` is what rounding has kept from x
     (compensated summation): points along the step are ``x + (compensation + c d)``, so that a step far below the
     rounding of x is still seen. Without it the rounding of the midpoint lets the energy drift linearly.
     """
@@ -65,12 +65,12 @@ class DiscreteGradient(Module):
         return 2
 
     @property
-    def orderless(self) -> bool:
+    def is_order_independent(self) -> bool:
         """Whether it does not depend on the order of the coordinates."""
         return False
 
     def __call__(self, energy: Energy, x, d, compensation=0.0) -> jax.Array:
-        return total(term.discrete_gradient(self, x, d, compensation) for term in energy.terms)
+        return sum_terms(term.discrete_gradient(self, x, d, compensation) for term in energy.terms)
 
     def quadratic(self, term: Energy, x, d, compensation) -> jax.Array:
         """The midpoint gradient: exact for quadratic functions."""
@@ -93,22 +93,22 @@ class Gonzalez(DiscreteGradient):
     the energy is across each step, and the quadrature misses a few roundings of one sign.
     """
 
-    noisy: float = eqx.field(static=True, default=NOISY)
+    noisy: float = eqx.field(static=True, default=MAX_DIFFERENCE_NOISE)
     across: bool = eqx.field(static=True, default=False)
 
-    orderless = True
+    is_order_independent = True
 
     def general(self, term: Energy, x, d, compensation) -> jax.Array:
-        left, middle, right = jax.vmap(lambda c: term.gradient(x + (compensation + c * d)))(_NODES_3)
+        left, middle, right = jax.vmap(lambda c: term.gradient(x + (compensation + c * d)))(_GAUSS_NODES_3)
         second = left + right - 2.0 * middle  # the prediction minus grad H(z).d is 5/18 second.d, free of cancellation
-        if term.degree <= 2 * len(_NODES_3):
-            return middle + _divide((5 / 18) * jnp.dot(second, d), jnp.dot(d, d)) * d
+        if term.degree <= 2 * len(_GAUSS_NODES_3):
+            return middle + _safe_divide((5 / 18) * jnp.dot(second, d), jnp.dot(d, d)) * d
         predicted = jnp.dot(middle, d) + (5 / 18) * jnp.dot(second, d)
-        difference = _difference(term, x, d, compensation, middle)
+        difference = _value_difference(term, x, d, compensation, middle)
         slope, size, length = (jnp.linalg.norm(v) for v in (middle, x, d))
         along = jnp.linalg.norm(second) * length if self.across else jnp.dot(second, d)
         defect = _gated_defect(*difference, predicted, slope * size, along, slope * length, self.noisy)
-        return middle + _divide((5 / 18) * jnp.dot(second, d) + defect, jnp.dot(d, d)) * d
+        return middle + _safe_divide((5 / 18) * jnp.dot(second, d) + defect, jnp.dot(d, d)) * d
 
 
 class MeanValue(DiscreteGradient):
@@ -120,21 +120,21 @@ class MeanValue(DiscreteGradient):
 
     nodes: int = eqx.field(static=True, default=5)
 
-    orderless = True
+    is_order_independent = True
 
     def __check_init__(self):
         if not isinstance(self.nodes, int) or self.nodes < 1:
             raise InputError(f"the number of quadrature nodes is a positive integer, not {self.nodes!r}")
 
     def general(self, term: Energy, x, d, compensation) -> jax.Array:
-        points, weights = _gauss(self.nodes)
+        points, weights = _gauss_rule(self.nodes)
         mean = jnp.asarray(weights) @ jax.vmap(lambda c: term.gradient(x + (compensation + c * d)))(points)
         if term.degree <= 2 * self.nodes:
             return mean
-        difference = _difference(term, x, d, compensation, mean)
+        difference = _value_difference(term, x, d, compensation, mean)
         rounding = jnp.linalg.norm(mean) * jnp.linalg.norm(x)
         defect = _gated_defect(*difference, jnp.dot(mean, d), rounding, 0.0, 1.0)
-        return mean + _divide(defect, jnp.dot(d, d)) * d
+        return mean + _safe_divide(defect, jnp.dot(d, d)) * d
 
 
 class CoordinateIncrement(DiscreteGradient):
@@ -158,29 +158,29 @@ class CoordinateIncrement(DiscreteGradient):
 
     def general(self, term: Energy, x, d, compensation) -> jax.Array:
         x = x + compensation
-        forwards = self._quotients(term, x, d)
-        return 0.5 * (forwards + self._quotients(term, x + d, -d)) if self.symmetric else forwards
+        forwards = self._coordinate_quotients(term, x, d)
+        return 0.5 * (forwards + self._coordinate_quotients(term, x + d, -d)) if self.symmetric else forwards
 
     @staticmethod
-    def _quotients(term: Energy, x, d) -> jax.Array:
+    def _coordinate_quotients(term: Energy, x, d) -> jax.Array:
         n = x.shape[0]
         corners = x + jnp.tril(jnp.ones((n + 1, n)), -1) * d  # corner i has the first i coordinates moved
-        values = _values(term, corners)
+        values = _values_at_points(term, corners)
 
         def slopes(corner, direction, step):  # of H along the edge that leaves a corner, and |grad H|
-            gradients = jax.vmap(lambda c: term.gradient(corner + c * step * direction))(_NODES_3)
+            gradients = jax.vmap(lambda c: term.gradient(corner + c * step * direction))(_GAUSS_NODES_3)
             return gradients @ direction, jnp.linalg.norm(gradients[1])
 
         along, slope = jax.vmap(slopes)(corners[:-1], jnp.eye(n), d)
         second = along[:, 0] + along[:, 2] - 2.0 * along[:, 1]
         mean = along[:, 1] + (5 / 18) * second
-        sizes = _largest(values[1:], values[:-1], term.rounded(x))
+        sizes = _value_rounding_scale(values[1:], values[:-1], term.rounding_scale(x))
         found = values[1:] - values[:-1]
         defect = _gated_defect(found, sizes, mean * d, slope * jnp.linalg.norm(x), second * d, slope * jnp.abs(d))
-        return mean + _divide(defect, d)
+        return mean + _safe_divide(defect, d)
 
 
-GRADIENTS: dict[str, DiscreteGradient] = {
+DISCRETE_GRADIENTS: dict[str, DiscreteGradient] = {
     "gonzalez": Gonzalez(),
     "mean_value": MeanValue(),
     "coordinate_increment": CoordinateIncrement(),
@@ -188,26 +188,26 @@ GRADIENTS: dict[str, DiscreteGradient] = {
 }
 
 
-def discrete_gradient(choice: str | DiscreteGradient) -> DiscreteGradient:
+def get_discrete_gradient(choice: str | DiscreteGradient) -> DiscreteGradient:
     """The discrete gradient of that name, or the object itself."""
     if isinstance(choice, DiscreteGradient):
         return choice
-    if choice not in GRADIENTS:
-        raise InputError(f"no discrete gradient {choice!r}; the names are {', '.join(map(repr, GRADIENTS))}")
-    return GRADIENTS[choice]
+    if choice not in DISCRETE_GRADIENTS:
+        raise InputError(f"no discrete gradient {choice!r}; the names are {', '.join(map(repr, DISCRETE_GRADIENTS))}")
+    return DISCRETE_GRADIENTS[choice]
 
 
-SPREAD = 1e-3
+MIN_GRADIENT_VARIATION = 1e-3
 """Relative variation of the gradient over a step above which the defect of collocation is used. Below it the
 quadrature is exact to 1e-19 of what H varies by, on lengths ten times shorter too (with ``finer`` nodes for one and
 two stages); above it the noise of the defect is below 1e-11 of the gradient."""
 
-HARMLESS = 1e-10
+MAX_NOISE_CORRECTION = 1e-10
 """Largest share of the gradient that a correction made of rounding noise may have."""
 
 
 def stage_gradients(
-    energy: Energy, x, compensation, h, k, A, b, finer: Finer | None = None, symmetries: jax.Array | None = None
+    energy: Energy, x, compensation, h, k, A, b, kronrod: KronrodRule | None = None, symmetries: jax.Array | None = None
 ) -> jax.Array:
     """Discrete gradients at the stages of a collocation method, shape (s, n) [:doc:`/explanation/exact_laws`].
 
@@ -222,7 +222,7 @@ def stage_gradients(
         The state is x + compensation.
     k : array, shape (s, n)
     A, b : array, shapes (s, s) and (s,)
-    finer : Finer, optional
+    kronrod : Finer, optional
         A better quadrature along the collocation polynomial, for methods of few stages. An energy with a part that
         varies on lengths far below those seen in its gradient drifts without it, at steps where the defect is shut out:
         two nodes missed 5e-15 of H in each of a hundred steps.
@@ -230,36 +230,42 @@ def stage_gradients(
         Vectors at the stages along which H does not change.
     """
     u = x + (compensation + h * (A @ k))
-    further = None if finer is None else (x + (compensation + h * (finer.A @ k)), finer.slopes @ k)
-    path = Path(x, compensation, h * (b @ k), u, k, further, symmetries, h, b, finer)
-    return total(term.stage_gradients(_stage_gradients, path) for term in energy.terms)
+    further = None if kronrod is None else (x + (compensation + h * (kronrod.A @ k)), kronrod.slope_matrix @ k)
+    path = CollocationPath(x, compensation, h * (b @ k), u, k, further, symmetries, h, b, kronrod)
+    return sum_terms(term.stage_gradients(_corrected_stage_gradients, path) for term in energy.terms)
 
 
-def _stage_gradients(term: Energy, path: Path, along=None) -> jax.Array:
-    """Gradients of one term; ``along`` names the components of the slopes to correct along, all by default.
+def _corrected_stage_gradients(term: Energy, path: CollocationPath, correction_weights=None) -> jax.Array:
+    """Gradients of one term; ``correction_weights`` names the components of the slopes to correct along, all by default.
 
     It may give them weights, shape (m,), and may be a function of the gradients at the stages, shape (s, m).
     """
     if term.is_quadratic:
         return jax.vmap(term.gradient)(path.points)
     x, compensation, k, h, b = path.start, path.compensation, path.slopes, path.h, path.b
-    change = Change.of(
-        term, x, compensation, path.step, [path.points, *(() if path.further is None else path.further[:1])]
+    change = FunctionChange.of(
+        term,
+        x,
+        compensation,
+        path.step,
+        [path.points, *(() if path.kronrod_samples is None else path.kronrod_samples[:1])],
     )
     gradients, between = change.gradients[: len(k)], change.gradients[len(k) :]
     smooth, spread = jnp.zeros(()), jnp.zeros(())
-    if path.finer is not None and path.further is not None:
+    if path.kronrod is not None and path.kronrod_samples is not None:
         # Both rules are exact for a gradient that does not vary: less one of the gradients the two sums vanish with the
         # step, where rounding of the weights alone would be divided by it in a derivative.
-        rates = jnp.sum((between - gradients[0]) * path.further[1], axis=1)
+        rates = jnp.sum((between - gradients[0]) * path.kronrod_samples[1], axis=1)
         own = jnp.sum((gradients - gradients[0]) * k, axis=1)
-        smooth = h * (jnp.dot(path.finer.b, rates) + jnp.dot(path.finer.change, own))
+        smooth = h * (jnp.dot(path.kronrod.b, rates) + jnp.dot(path.kronrod.weight_change, own))
         spread = jnp.max(jnp.linalg.norm(between - b @ gradients, axis=1))
-    weights = along(gradients) if callable(along) else along
-    return corrected(change, gradients, k, Direction.of(k, b, weights, path.symmetries), h, b, smooth, spread)
+    weights = correction_weights(gradients) if callable(correction_weights) else correction_weights
+    return correct_gradients(
+        change, gradients, k, CorrectionDirection.of(k, b, weights, path.symmetries), h, b, smooth, spread
+    )
 
 
-class Direction(NamedTuple):
+class CorrectionDirection(NamedTuple):
     """What a correction goes along, one multiple of it at all stages.
 
     Attributes
@@ -267,27 +273,27 @@ class Direction(NamedTuple):
     vectors : array, shape (s, m)
     square : array, shape ()
         ``sum_i b_i d_i . k_i``, d the vectors; not negative.
-    share : array, shape ()
+    length_fraction : array, shape ()
         The length of what symmetries leave of them, relative to what they are without. Near a relative equilibrium that
         is little, and noise must not be divided by it.
     """
 
     vectors: jax.Array
     square: jax.Array
-    share: jax.Array
+    length_fraction: jax.Array
 
     @classmethod
-    def of(cls, k, b, weights=None, symmetries=None) -> Direction:
+    def of(cls, k, b, weights=None, symmetries=None) -> CorrectionDirection:
         """``d = W k``, W diagonal with the weights, but orthogonal to the symmetries, shape (s, r, m)."""
-        scale = jnp.ones(()) if weights is None else root(weights)
+        scale = jnp.ones(()) if weights is None else sqrt_or_zero(weights)
         whole = left = scale * k
         if symmetries is not None:
-            left = jax.vmap(lambda v, along: frame(list(along)).off(v))(whole, scale * symmetries)
+            left = jax.vmap(lambda v, along: gram_schmidt(list(along)).project_off(v))(whole, scale * symmetries)
         square, most = (jnp.dot(b, jnp.sum(v * v, axis=1)) for v in (left, whole))
-        return cls(scale * left, square, _divide(jnp.sqrt(square), jnp.sqrt(most)))
+        return cls(scale * left, square, _safe_divide(jnp.sqrt(square), jnp.sqrt(most)))
 
 
-class Change(NamedTuple):
+class FunctionChange(NamedTuple):
     """What a function changes by in a step, from its values; and its gradients at some points.
 
     Attributes
@@ -303,47 +309,62 @@ class Change(NamedTuple):
     gradients: jax.Array
 
     @classmethod
-    def of(cls, term: Energy, x, compensation, d, points: list[jax.Array]) -> Change:
+    def of(cls, term: Energy, x, compensation, d, points: list[jax.Array]) -> FunctionChange:
         """The change over the step from x + compensation to x + compensation + d."""
-        new, new_compensation = compensated(x, compensation + d)
+        new, new_compensation = two_sum(x, compensation + d)
         # one map for all points, as one is what a compiler has to work on
         found = jax.vmap(term.gradient)(jnp.concatenate([*points, jnp.stack([x, new])]))
         gradients, ends = found[:-2], found[-2:]
         # which count for rounding alone: at an end where one is infinite, as of a root that ends there, for none
         ends = jnp.where(jnp.isfinite(ends), ends, 0.0)
-        before, after = _values(term, jnp.stack([x, new]))
+        before, after = _values_at_points(term, jnp.stack([x, new]))
         # of the compensated states: else a step takes back what rounding, or a steering of the energy, has put there
         difference = (after - before) + (jnp.dot(ends[1], new_compensation) - jnp.dot(ends[0], compensation))
         slope = jnp.max(jnp.linalg.norm(ends, axis=1))
-        size = _largest(before, after, term.rounded(x))
+        size = _value_rounding_scale(before, after, term.rounding_scale(x))
         noise = DIFFERENCE_NOISE * size + 4 * EPS * slope * jnp.linalg.norm(x)
         return cls(difference, noise, gradients)
 
 
-def corrected(change: Change, gradients, k, direction: Direction, h, b, smooth=0.0, spread=0.0) -> jax.Array:
+def correct_gradients(
+    change: FunctionChange,
+    gradients,
+    k,
+    direction: CorrectionDirection,
+    h,
+    b,
+    quadrature_correction=0.0,
+    gradient_variation=0.0,
+) -> jax.Array:
     """``gradients + alpha d``, shape (s, n), with ``h sum_i b_i (.)_i . k_i`` the change of the function.
 
-    ``smooth`` is what a better quadrature adds to that of the gradients, ``spread`` how far the gradients between the
+    ``quadrature_correction`` is what a better quadrature adds to that of the gradients, ``gradient_variation`` how far the gradients between the
     stages are from their mean at the stages.
     """
     mean, d = b @ gradients, direction.vectors
-    slope, spread = jnp.linalg.norm(mean), jnp.maximum(spread, jnp.max(jnp.linalg.norm(gradients - mean, axis=1)))
-    defect = change.difference - (h * jnp.dot(b, jnp.sum(gradients * k, axis=1)) + smooth)
+    slope, gradient_variation = (
+        jnp.linalg.norm(mean),
+        jnp.maximum(gradient_variation, jnp.max(jnp.linalg.norm(gradients - mean, axis=1))),
+    )
+    defect = change.difference - (h * jnp.dot(b, jnp.sum(gradients * k, axis=1)) + quadrature_correction)
     length = jnp.sqrt(jnp.dot(b, jnp.sum(d * d, axis=1)))
-    harm = jnp.maximum(jnp.abs(defect) * (1.0 / HARMLESS), change.noise * (1.0 / NOISY))
-    harmless = 1.0 - _gate(_divide(harm, h * direction.square) * length, slope * direction.share)
-    opened = jnp.maximum(_gate(defect, change.noise), harmless * _gate(spread, SPREAD * slope))
-    return gradients + _divide(smooth + _let_through(defect, opened), h * direction.square) * d
+    harm = jnp.maximum(jnp.abs(defect) * (1.0 / MAX_NOISE_CORRECTION), change.noise * (1.0 / MAX_DIFFERENCE_NOISE))
+    harmless = 1.0 - _gate_opening(_safe_divide(harm, h * direction.square) * length, slope * direction.length_fraction)
+    opened = jnp.maximum(
+        _gate_opening(defect, change.noise),
+        harmless * _gate_opening(gradient_variation, MIN_GRADIENT_VARIATION * slope),
+    )
+    return gradients + _safe_divide(quadrature_correction + _apply_gate(defect, opened), h * direction.square) * d
 
 
-def compensated(x, d) -> tuple[jax.Array, jax.Array]:
+def two_sum(x, d) -> tuple[jax.Array, jax.Array]:
     """x + d as a double, and what rounding keeps from it (Neumaier's two-sum)."""
     new = x + d
     back = new - x
     return new, (x - (new - back)) + (d - back)
 
 
-def _values(term: Energy, points) -> jax.Array:
+def _values_at_points(term: Energy, points) -> jax.Array:
     """H at each of the points, by the same instructions.
 
     What ends one step begins the next, and the rounding of H has to cancel there. Compiled apart, two evaluations may
@@ -352,7 +373,7 @@ def _values(term: Energy, points) -> jax.Array:
     return jax.vmap(term.value)(points)
 
 
-def _difference(term: Energy, x, d, compensation, gradient) -> tuple[jax.Array, jax.Array]:
+def _value_difference(term: Energy, x, d, compensation, gradient) -> tuple[jax.Array, jax.Array]:
     """``H(y + d) - H(y)`` from y = x + compensation, and the size at which it is rounded.
 
     ``gradient`` is one in between.
@@ -360,18 +381,20 @@ def _difference(term: Energy, x, d, compensation, gradient) -> tuple[jax.Array, 
     From values where steps begin and end, so that their rounding cancels from step to step, and the gradient for what
     these points leave out: else a step would take back what rounding, or a steering of the energy, has put there.
     """
-    new, new_compensation = compensated(x, compensation + d)
-    before, after = _values(term, jnp.stack([x, new]))
+    new, new_compensation = two_sum(x, compensation + d)
+    before, after = _values_at_points(term, jnp.stack([x, new]))
     difference = (after - before) + jnp.dot(gradient, new_compensation - compensation)
-    return difference, _largest(before, after, term.rounded(x))
+    return difference, _value_rounding_scale(before, after, term.rounding_scale(x))
 
 
-def _largest(before, after, terms):
+def _value_rounding_scale(before, after, terms):
     """The size at which the values at both ends are rounded: theirs, or that of the terms inside."""
     return jnp.maximum(jnp.maximum(jnp.abs(before), jnp.abs(after)), terms)
 
 
-def _gated_defect(difference, size, predicted, argument_effect, second_difference, slope_scale, noisy=NOISY):
+def _gated_defect(
+    difference, size, predicted, argument_effect, second_difference, slope_scale, noisy=MAX_DIFFERENCE_NOISE
+):
     """Defect of a predicted difference of two values of H, shut out where it is no more than rounding noise.
 
     ``size`` is that at which the values are rounded, ``argument_effect`` is ``|grad H| |x|``: one rounding of the
@@ -381,36 +404,36 @@ def _gated_defect(difference, size, predicted, argument_effect, second_differenc
     noise = DIFFERENCE_NOISE * size + 4 * EPS * argument_effect
     curved = jnp.abs(second_difference) * (1.0 / CURVATURE_SWITCH) - slope_scale
     harmless = 2.0 * slope_scale - noise * (1.0 / noisy)
-    opened = jnp.maximum(_gate(defect, noise), _share(jnp.minimum(curved, harmless), slope_scale))
-    return _let_through(defect, opened)
+    opened = jnp.maximum(_gate_opening(defect, noise), _clipped_ratio(jnp.minimum(curved, harmless), slope_scale))
+    return _apply_gate(defect, opened)
 
 
-def _let_through(defect, opened):
+def _apply_gate(defect, opened):
     """The defect by the opening of its gate, 0 to 1; but a NaN must not be hidden by a closed gate."""
     opened = jax.lax.stop_gradient(opened)
     return jnp.where(opened > 0.0, opened * defect, jnp.where(jnp.isfinite(defect), 0.0, defect))
 
 
-def _gate(size, threshold):
+def _gate_opening(size, threshold):
     """0 where ``|size| <= threshold``, 1 from twice that on, linear (so continuous) between."""
-    return _share(jnp.abs(size) - threshold, threshold)
+    return _clipped_ratio(jnp.abs(size) - threshold, threshold)
 
 
-def _share(part, whole):
+def _clipped_ratio(part, whole):
     """The quotient of two numbers, the second positive or zero, between 0 and 1."""
     return jnp.clip(part / jnp.maximum(whole, _TINY), 0.0, 1.0)
 
 
-def _divide(numerator, denominator):
+def _safe_divide(numerator, denominator):
     """Quotient, 0 where the denominator is 0 or subnormal; safe to differentiate."""
     usable = jnp.abs(denominator) > _TINY
     return jnp.where(usable, numerator / jnp.where(usable, denominator, 1.0), 0.0)
 
 
-def _gauss(nodes: int) -> tuple[np.ndarray, np.ndarray]:
+def _gauss_rule(nodes: int) -> tuple[np.ndarray, np.ndarray]:
     points, weights = np.polynomial.legendre.leggauss(nodes)
     return (points + 1.0) / 2.0, weights / 2.0
 
 
-_NODES_3 = _gauss(3)[0]
+_GAUSS_NODES_3 = _gauss_rule(3)[0]
 _TINY = 1e-290

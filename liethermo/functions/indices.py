@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 
 
-class Fixed:
+class StaticArray:
     """An array that cannot change and is compared by value, to be a static field of a module.
 
     A tuple of 1e5 numbers would be hashed anew at every call of a compiled function; this is hashed once.
@@ -44,13 +44,13 @@ class Fixed:
         return f"{type(self).__name__}{self.shape}"
 
 
-class Indices(Fixed):
+class Indices(StaticArray):
     """Integers: places."""
 
     dtype = np.int64
 
     @property
-    def run(self) -> slice | None:
+    def contiguous_slice(self) -> slice | None:
         """The slice that the numbers are, in order, or None: a slice is read faster than it is gathered."""
         flat = self._array.ravel()
         if flat.size == 0 or not np.array_equal(flat, np.arange(flat[0], flat[0] + flat.size)):
@@ -58,20 +58,20 @@ class Indices(Fixed):
         return slice(int(flat[0]), int(flat[0]) + flat.size)
 
 
-def pattern(rows, columns, dim: int) -> scipy.sparse.csr_array:
+def sparsity_pattern(rows, columns, dim: int) -> scipy.sparse.csr_array:
     """The pattern of a square matrix with entries in these places; its data are ones."""
     rows, columns = np.asarray(rows).ravel(), np.asarray(columns).ravel()
-    return as_pattern(scipy.sparse.coo_array((np.ones(len(rows), dtype=bool), (rows, columns)), (dim, dim)))
+    return pattern_of_matrix(scipy.sparse.coo_array((np.ones(len(rows), dtype=bool), (rows, columns)), (dim, dim)))
 
 
-def cliques(members, dim: int) -> scipy.sparse.csr_array:
+def clique_pattern(members, dim: int) -> scipy.sparse.csr_array:
     """The pattern in which all components of each row of ``members``, shape (m, r), depend on each other."""
     members = np.asarray(members)
     full = (*members.shape, members.shape[1])
-    return pattern(np.broadcast_to(members[:, :, None], full), np.broadcast_to(members[:, None, :], full), dim)
+    return sparsity_pattern(np.broadcast_to(members[:, :, None], full), np.broadcast_to(members[:, None, :], full), dim)
 
 
-def as_pattern(matrix) -> scipy.sparse.csr_array:
+def pattern_of_matrix(matrix) -> scipy.sparse.csr_array:
     """A sparse matrix with every entry that is stored set to one."""
     found = scipy.sparse.csr_array(matrix)
     found.sum_duplicates()
@@ -79,9 +79,9 @@ def as_pattern(matrix) -> scipy.sparse.csr_array:
     return found
 
 
-def union(patterns) -> scipy.sparse.csr_array | None:
+def union_pattern(patterns) -> scipy.sparse.csr_array | None:
     """All entries of some patterns; None, for unknown, where one of them is."""
     found = list(patterns)
     if any(one is None for one in found):
         return None
-    return as_pattern(sum(found[1:], found[0]))
+    return pattern_of_matrix(sum(found[1:], found[0]))

@@ -17,31 +17,31 @@ import numpy as np
 import scipy
 
 from manifolds._arrays import is_traced, real_array
-from manifolds._names import listing
+from manifolds._names import public_dir
 from manifolds.structures.spins import (
     Lattice,
-    Planes,
-    added,
+    VectorComponents,
+    add_vectors,
     cross,
-    cross_planes,
-    dotted,
-    planes,
-    reshaped,
-    scaled,
-    spins_of,
-    state_of,
-    summed,
+    cross_vectors,
+    dot_vectors,
+    reshape_vectors,
+    scale_vectors,
+    spins_from_state,
+    split_vectors,
+    state_from_spins,
+    sum_of_dots,
 )
 
 from ..errors import InputError
-from .conditions import numbers
+from .conditions import check_numbers
 from .each import Each
-from .edges import edges
+from .edges import graph_edges
 from .energy import Energy, Sum
-from .indices import cliques
+from .indices import clique_pattern
 
 __all__ = ["anisotropy", "dzyaloshinskii_moriya", "exchange", "zeeman"]
-__dir__ = listing(__all__)
+__dir__ = public_dir(__all__)
 
 
 def exchange(sites, strength=1.0, neighbours=None, periodic=True) -> Energy:
@@ -64,10 +64,10 @@ def exchange(sites, strength=1.0, neighbours=None, periodic=True) -> Energy:
     ------
     InputError
     """
-    shape = checked_sites(sites)
+    shape = lattice_shape(sites)
     if neighbours is None and _is_graph(strength, shape):
-        return _on_graph(shape, strength)
-    return _lattice(shape, strength, None, neighbours, periodic, "an exchange constant")
+        return _graph_exchange(shape, strength)
+    return _lattice_energy(shape, strength, None, neighbours, periodic, "an exchange constant")
 
 
 def dzyaloshinskii_moriya(sites, vectors, neighbours=None, periodic=True) -> Energy:
@@ -86,11 +86,11 @@ def dzyaloshinskii_moriya(sites, vectors, neighbours=None, periodic=True) -> Ene
     ------
     InputError
     """
-    shape = checked_sites(sites)
+    shape = lattice_shape(sites)
     if neighbours is None and _is_edge_list(vectors) and all(np.ndim(edge[2]) == 1 for edge in vectors):
-        ends, D = _directed(vectors, math.prod(shape))
-        return Each(_turned, _places(ends[:, 0], ends[:, 1]), D)
-    return _lattice(shape, None, vectors, neighbours, periodic, "a Dzyaloshinskii-Moriya vector")
+        ends, D = _directed_edges(vectors, math.prod(shape))
+        return Each(_antisymmetric_bond, _bond_indices(ends[:, 0], ends[:, 1]), D)
+    return _lattice_energy(shape, None, vectors, neighbours, periodic, "a Dzyaloshinskii-Moriya vector")
 
 
 def anisotropy(sites, strength=1.0, axis=(0.0, 0.0, 1.0)) -> Energy:
@@ -107,12 +107,12 @@ def anisotropy(sites, strength=1.0, axis=(0.0, 0.0, 1.0)) -> Energy:
     ------
     InputError
     """
-    shape = checked_sites(sites)
-    K = _of_sites(strength, shape, (), "an anisotropy constant")
-    n = _of_sites(axis, shape, (3,), "an axis")
+    shape = lattice_shape(sites)
+    K = _site_values(strength, shape, (), "an anisotropy constant")
+    n = _site_values(axis, shape, (3,), "an axis")
     if not is_traced((K, n)) and not (np.count_nonzero(np.asarray(n), axis=-1) > 1).any():  # along axes of space
-        return OnSites(shape, -2.0 * K[..., None] * n**2, None, None)
-    return OnSites(shape, -2.0 * K, None, n)
+        return SiteEnergy(shape, -2.0 * K[..., None] * n**2, None, None)
+    return SiteEnergy(shape, -2.0 * K, None, n)
 
 
 def zeeman(sites, field, moment=1.0) -> Energy:
@@ -128,9 +128,9 @@ def zeeman(sites, field, moment=1.0) -> Energy:
     ------
     InputError
     """
-    shape = checked_sites(sites)
-    B, moment = _of_sites(field, shape, (3,), "a field"), _of_sites(moment, shape, (), "a moment")
-    return OnSites(shape, None, -moment[..., None] * B, None)
+    shape = lattice_shape(sites)
+    B, moment = _site_values(field, shape, (3,), "a field"), _site_values(moment, shape, (), "a moment")
+    return SiteEnergy(shape, None, -moment[..., None] * B, None)
 
 
 class SpinEnergy(Energy):
@@ -139,37 +139,37 @@ class SpinEnergy(Energy):
     Attributes
     ----------
     sites : tuple of int
-    reach : tuple of int
+    interaction_range : tuple of int
         How far, along each axis, the spins are that act on one.
     """
 
     sites: tuple[int, ...] = eqx.field(static=True)
 
     @property
-    def reach(self) -> tuple[int, ...]:
+    def interaction_range(self) -> tuple[int, ...]:
         return (0,) * len(self.sites)
 
     @abstractmethod
-    def of(self, spins: Lattice) -> jax.Array:
+    def lattice_value(self, spins: Lattice) -> jax.Array:
         """The value, shape ()."""
 
     @abstractmethod
-    def gradients(self, spins: Lattice) -> Planes:
+    def lattice_gradients(self, spins: Lattice) -> VectorComponents:
         """The gradients by the spins."""
 
     is_quadratic = True
 
     def value(self, x) -> jax.Array:
-        return self.of(Lattice(on_lattice(x, self.sites)))
+        return self.lattice_value(Lattice(lattice_spins(x, self.sites)))
 
     def gradient(self, x) -> jax.Array:
-        return off_lattice(self.gradients(Lattice(on_lattice(x, self.sites))), x)
+        return flatten_covectors(self.lattice_gradients(Lattice(lattice_spins(x, self.sites))), x)
 
-    def check_places(self, dim: int, role: str) -> None:
-        check_room(self.sites, dim, role)
+    def check_components(self, dim: int, role: str) -> None:
+        check_spin_count(self.sites, dim, role)
 
 
-class OnSites(SpinEnergy):
+class SiteEnergy(SpinEnergy):
     """``sum_i A_i (n_i . s_i)^2 / 2 + b_i . s_i``; without n ``sum_ic A_ic s_ic^2 / 2``, c a component.
 
     Attributes
@@ -182,32 +182,34 @@ class OnSites(SpinEnergy):
     b: jax.Array | None
     n: jax.Array | None
 
-    def of(self, spins: Lattice) -> jax.Array:
-        linear = jnp.zeros(()) if self.b is None else summed(planes(self.b), spins.here)
-        return linear + (0.0 if self.A is None else 0.5 * summed(self._drawn(spins.here), spins.here))
+    def lattice_value(self, spins: Lattice) -> jax.Array:
+        linear = jnp.zeros(()) if self.b is None else sum_of_dots(split_vectors(self.b), spins.site_spins)
+        return linear + (
+            0.0 if self.A is None else 0.5 * sum_of_dots(self._quadratic_gradient(spins.site_spins), spins.site_spins)
+        )
 
-    def gradients(self, spins: Lattice) -> Planes:
+    def lattice_gradients(self, spins: Lattice) -> VectorComponents:
         if self.A is None:
             assert self.b is not None
-            a, b, c = (jnp.broadcast_to(component, self.sites) for component in planes(self.b))
+            a, b, c = (jnp.broadcast_to(component, self.sites) for component in split_vectors(self.b))
             return a, b, c
-        drawn = self._drawn(spins.here)
-        return drawn if self.b is None else added(drawn, planes(self.b))
+        drawn = self._quadratic_gradient(spins.site_spins)
+        return drawn if self.b is None else add_vectors(drawn, split_vectors(self.b))
 
-    def _drawn(self, spins: Planes) -> Planes:
+    def _quadratic_gradient(self, spins: VectorComponents) -> VectorComponents:
         """``A_i (n_i . s_i) n_i``."""
         assert self.A is not None
         if self.n is None:
-            A = planes(self.A)
+            A = split_vectors(self.A)
             return A[0] * spins[0], A[1] * spins[1], A[2] * spins[2]
-        n = planes(self.n)
-        return scaled(self.A * dotted(n, spins), n)
+        n = split_vectors(self.n)
+        return scale_vectors(self.A * dot_vectors(n, spins), n)
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array:
-        return cliques(np.arange(3 * math.prod(self.sites)).reshape(-1, 3), dim)
+        return clique_pattern(np.arange(3 * math.prod(self.sites)).reshape(-1, 3), dim)
 
 
-class Bonds(SpinEnergy):
+class BondEnergy(SpinEnergy):
     """``sum_i -J_i s_i . s_{i+o} + D_i . (s_i x s_{i+o})`` on a lattice, o an offset.
 
     Attributes
@@ -222,48 +224,51 @@ class Bonds(SpinEnergy):
     D: jax.Array | None
 
     @property
-    def reach(self) -> tuple[int, ...]:
+    def interaction_range(self) -> tuple[int, ...]:
         return tuple(map(abs, self.offset))
 
-    def of(self, spins: Lattice) -> jax.Array:
-        return summed(self._given(spins.at(self.offset), self.J, self.D), spins.here)
+    def lattice_value(self, spins: Lattice) -> jax.Array:
+        return sum_of_dots(self._neighbour_gradient(spins.at(self.offset), self.J, self.D), spins.site_spins)
 
-    def gradients(self, spins: Lattice) -> Planes:
+    def lattice_gradients(self, spins: Lattice) -> VectorComponents:
         ahead, behind = spins.at(self.offset), spins.at([-o for o in self.offset])
         if self.D is None and self.J is not None and not self.J.ndim:
-            return scaled(-self.J, added(ahead, behind))
+            return scale_vectors(-self.J, add_vectors(ahead, behind))
         axes = range(len(self.sites))
         J = self.J if self.J is None or not self.J.ndim else jnp.roll(self.J, self.offset, axes)
         D = self.D if self.D is None or self.D.ndim == 1 else jnp.roll(self.D, self.offset, axes)
-        return added(self._given(ahead, self.J, self.D), self._given(behind, J, None if D is None else -D))
+        return add_vectors(
+            self._neighbour_gradient(ahead, self.J, self.D),
+            self._neighbour_gradient(behind, J, None if D is None else -D),
+        )
 
     @staticmethod
-    def _given(s: Planes, J: jax.Array | None, D: jax.Array | None) -> Planes:
+    def _neighbour_gradient(s: VectorComponents, J: jax.Array | None, D: jax.Array | None) -> VectorComponents:
         """What a neighbour s gives to a site: ``-J s + s x D``."""
-        aligned = None if J is None else scaled(-J, s)
+        aligned = None if J is None else scale_vectors(-J, s)
         if D is not None:
-            turned = cross_planes(s, planes(D))
-            return turned if aligned is None else added(aligned, turned)
+            turned = cross_vectors(s, split_vectors(D))
+            return turned if aligned is None else add_vectors(aligned, turned)
         assert aligned is not None
         return aligned
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array:
         here = np.arange(math.prod(self.sites)).reshape(self.sites)
         ahead = np.roll(here, [-by for by in self.offset], axis=range(here.ndim))
-        return cliques(_places(here.ravel(), ahead.ravel()), dim)
+        return clique_pattern(_bond_indices(here.ravel(), ahead.ravel()), dim)
 
 
-def on_lattice(x, sites: tuple[int, ...], planar: bool = False) -> Planes:
+def lattice_spins(x, sites: tuple[int, ...], planar: bool = False) -> VectorComponents:
     """The components of the spins of a state, each of the shape of the sites."""
-    return reshaped(spins_of(x, math.prod(sites), planar), sites)
+    return reshape_vectors(spins_from_state(x, math.prod(sites), planar), sites)
 
 
-def off_lattice(covectors: Planes, x, planar: bool = False) -> jax.Array:
+def flatten_covectors(covectors: VectorComponents, x, planar: bool = False) -> jax.Array:
     """Covectors of the spins as one of the state x."""
-    return state_of(reshaped(covectors, (-1,)), jnp.zeros(x.size - 3 * covectors[0].size), planar)
+    return state_from_spins(reshape_vectors(covectors, (-1,)), jnp.zeros(x.size - 3 * covectors[0].size), planar)
 
 
-def checked_sites(sites) -> tuple[int, ...]:
+def lattice_shape(sites) -> tuple[int, ...]:
     """The shape of a lattice, or (count,)."""
     shape = tuple(sites) if isinstance(sites, tuple | list) else (sites,)
     good = all(isinstance(n, int | np.integer) and not isinstance(n, bool) and n >= 1 for n in shape)
@@ -272,17 +277,17 @@ def checked_sites(sites) -> tuple[int, ...]:
     return tuple(int(n) for n in shape)
 
 
-def check_room(sites: tuple[int, ...], dim: int, role: str) -> None:
+def check_spin_count(sites: tuple[int, ...], dim: int, role: str) -> None:
     """InputError where a state has no room for the spins that a term is of."""
     count = math.prod(sites)
     if 3 * count > dim:
         raise InputError(f"{role} has a term of {count} spins, which a state with {dim} components has no room for")
 
 
-def _lattice(shape, strength, vectors, neighbours, periodic, what: str) -> Energy:
+def _lattice_energy(shape, strength, vectors, neighbours, periodic, what: str) -> Energy:
     axes = len(shape)
     offsets = np.eye(axes, dtype=int).tolist() if neighbours is None else neighbours
-    offsets = [_checked_offset(offset, axes) for offset in offsets]
+    offsets = [_check_offset(offset, axes) for offset in offsets]
     if any(opposite in offsets for opposite in ([-o for o in offset] for offset in offsets)):
         raise InputError(f"the neighbours {offsets} name a pair twice: give one of each two opposite offsets")
     closed = (periodic,) * axes if isinstance(periodic, bool) else tuple(periodic)
@@ -297,24 +302,26 @@ def _lattice(shape, strength, vectors, neighbours, periodic, what: str) -> Energ
     tail = () if vectors is None else (3,)
     terms = []
     for offset, one in zip(offsets, each, strict=True):
-        value = _of_sites(one, shape, tail, what)
-        inside = _inside(shape, offset, closed)
+        value = _site_values(one, shape, tail, what)
+        inside = _has_neighbour(shape, offset, closed)
         if not inside.all():  # pairs that a border cuts
             value = jnp.where(inside.reshape(*shape, *(1 for _ in tail)), value, 0.0)
         terms.append(
-            Bonds(shape, tuple(offset), value, None) if vectors is None else Bonds(shape, tuple(offset), None, value)
+            BondEnergy(shape, tuple(offset), value, None)
+            if vectors is None
+            else BondEnergy(shape, tuple(offset), None, value)
         )
     return Sum.of(terms)
 
 
-def _checked_offset(offset, axes: int) -> list[int]:
+def _check_offset(offset, axes: int) -> list[int]:
     found = [offset] if np.ndim(offset) == 0 else list(offset)
     if len(found) != axes or any(int(o) != o for o in found) or not any(found):
         raise InputError(f"a neighbour is an offset of {axes} integers, not all zero, not {offset!r}")
     return [int(o) for o in found]
 
 
-def _inside(shape, offset, closed) -> np.ndarray:
+def _has_neighbour(shape, offset, closed) -> np.ndarray:
     """Which sites have the one ahead, shape of the sites."""
     inside = np.ones(shape, dtype=bool)
     for axis, (n, by, around) in enumerate(zip(shape, offset, closed, strict=True)):
@@ -326,9 +333,9 @@ def _inside(shape, offset, closed) -> np.ndarray:
     return inside
 
 
-def _of_sites(value, shape, tail: tuple[int, ...], what: str) -> jax.Array:
+def _site_values(value, shape, tail: tuple[int, ...], what: str) -> jax.Array:
     """A value of all sites, or one for each."""
-    array = numbers(value, what)
+    array = check_numbers(value, what)
     if array.shape not in (tail, (*shape, *tail)):
         wanted = f"{tail} or {(*shape, *tail)}" if tail else f"of one number, or {shape}"
         raise InputError(f"{what} has the shape {wanted}, not {array.shape}")
@@ -360,15 +367,15 @@ def _is_graph(strength, shape: tuple[int, ...]) -> bool:
     return given[0] == given[1] and given != shape
 
 
-def _on_graph(shape, graph) -> Energy:
+def _graph_exchange(shape, graph) -> Energy:
     count = math.prod(shape)
-    found = edges(graph, count, "the exchange", _Sites(), signed=True)
+    found = graph_edges(graph, count, "the exchange", _SiteNames(), allow_negative=True)
     if len(found.first) == 0:
         raise InputError("the graph of an exchange has no edges")
-    return Each(_aligned, _places(found.first, found.second), found.weight)
+    return Each(_exchange_bond, _bond_indices(found.first, found.second), found.weight)
 
 
-class _Sites(Sequence):
+class _SiteNames(Sequence):
     """Names of any number of sites, made when one is asked for."""
 
     def __getitem__(self, i):
@@ -378,7 +385,7 @@ class _Sites(Sequence):
         return 0
 
 
-def _directed(listed, count: int) -> tuple[np.ndarray, jax.Array]:
+def _directed_edges(listed, count: int) -> tuple[np.ndarray, jax.Array]:
     for i, j, _ in listed:
         if not (0 <= i < count and 0 <= j < count):
             raise InputError(f"the edge ({i}, {j}) leaves the {count} sites, which count from 0")
@@ -393,15 +400,15 @@ def _directed(listed, count: int) -> tuple[np.ndarray, jax.Array]:
     return np.array([edge[:2] for edge in listed], dtype=int), D
 
 
-def _places(first, second) -> np.ndarray:
+def _bond_indices(first, second) -> np.ndarray:
     """The components of two spins, shape (edges, 6)."""
     ends = np.stack([first, second], axis=1)
     return (3 * ends[:, :, None] + np.arange(3)).reshape(len(ends), 6)
 
 
-def _aligned(y, J):
+def _exchange_bond(y, J):
     return -J * jnp.dot(y[:3], y[3:])
 
 
-def _turned(y, D):
+def _antisymmetric_bond(y, D):
     return jnp.dot(D, cross(y[:3], y[3:]))

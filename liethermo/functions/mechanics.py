@@ -10,9 +10,9 @@ import numpy as np
 
 import manifolds as mf
 from manifolds._arrays import is_traced
-from manifolds._module import Module
+from manifolds._pytree_module import Module
 
-from ..tracing.interpret import at_points
+from ..tracing.interpret import evaluate_at_points
 from .each import Each
 from .energy import Energy, Function, Pullback, Quadratic
 
@@ -44,21 +44,24 @@ class Kinetic(Energy):
         return jnp.asarray(self.G(q)) if callable(self.G) else self.G
 
     def value(self, x) -> jax.Array:
-        q, p = _halves(x)
-        return 0.5 * jnp.dot(p, _apply(self.at(q), p))
+        q, p = _split_state(x)
+        return 0.5 * jnp.dot(p, _apply_metric(self.at(q), p))
 
     def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
-        (q, p), (dq, dp), (compensation_q, compensation_p) = map(_halves, (x, d, jnp.zeros_like(x) + compensation))
+        (q, p), (dq, dp), (compensation_q, compensation_p) = map(_split_state, (x, d, jnp.zeros_like(x) + compensation))
         middle, nothing = p + (compensation_p + 0.5 * dp), jnp.zeros(len(x) - 2 * len(p))
         if not callable(self.G):
-            return jnp.concatenate([jnp.zeros_like(q), _apply(self.G, middle), nothing])
+            return jnp.concatenate([jnp.zeros_like(q), _apply_metric(self.G, middle), nothing])
         first, last = p + compensation_p, p + (compensation_p + dp)
 
         def mean(q):  # over both ends in p, of the kinetic energy at q
             G = self.at(q)
-            return 0.25 * (jnp.dot(first, _apply(G, first)) + jnp.dot(last, _apply(G, last)))
+            return 0.25 * (jnp.dot(first, _apply_metric(G, first)) + jnp.dot(last, _apply_metric(G, last)))
 
-        by_p = 0.5 * (_apply(self.at(q + compensation_q), middle) + _apply(self.at(q + (compensation_q + dq)), middle))
+        by_p = 0.5 * (
+            _apply_metric(self.at(q + compensation_q), middle)
+            + _apply_metric(self.at(q + (compensation_q + dq)), middle)
+        )
         return jnp.concatenate([scheme.general(Function(mean), q, dq, compensation_q), by_p, nothing])
 
     def stage_gradients(self, scheme, path) -> jax.Array:
@@ -75,10 +78,10 @@ class Potential(Pullback):
     """
 
     def __init__(self, V: Callable):
-        super().__init__(Function(_Apart(V)), _without_momenta)
+        super().__init__(Function(_PotentialOfVector(V)), _drop_momenta)
 
 
-class _Apart(Module):
+class _PotentialOfVector(Module):
     """V(q, S) as a function of one array."""
 
     V: Callable
@@ -99,31 +102,31 @@ def is_mechanical(energy: Energy, dim: int, space: mf.Space | None = None) -> bo
     if is_traced(energy):
         return False
     points = np.random.default_rng(0).standard_normal((4, dim))
-    along = None if space is None else at_points(_projector, space, points[:, : space.size])
-    return all(_is_kinetic(term, points, along) or is_free_of_momenta(term, points) for term in energy.terms)
+    along = None if space is None else evaluate_at_points(_projector, space, points[:, : space.size])
+    return all(_is_kinetic(term, points, along) or is_independent_of_momenta(term, points) for term in energy.terms)
 
 
-def is_free_of_momenta(term: Energy, points: np.ndarray) -> bool:
+def is_independent_of_momenta(term: Energy, points: np.ndarray) -> bool:
     """Whether a term is known not to depend on p (or v)."""
     n = points.shape[1] // 2
-    return is_free_of(term, points, np.arange(n, 2 * n))
+    return is_independent_of(term, points, np.arange(n, 2 * n))
 
 
-def is_free_of(term: Energy, points: np.ndarray, components: np.ndarray) -> bool:
+def is_independent_of(term: Energy, points: np.ndarray, components: np.ndarray) -> bool:
     """Whether a term is known not to depend on some components, from its coordinates' derivatives at some states."""
     if isinstance(term, Each):
         return not np.isin(components, term.places).any()
-    return isinstance(term, Pullback) and not at_points(_jacobian, term, points)[:, :, components].any()
+    return isinstance(term, Pullback) and not evaluate_at_points(_jacobian, term, points)[:, :, components].any()
 
 
 def _is_kinetic(term: Energy, points: np.ndarray, along: np.ndarray | None) -> bool:
     """Whether it is a semidefinite form in p, whatever else it is in q and S; without mixed terms."""
     n = points.shape[1] // 2
     if isinstance(term, Kinetic):
-        return _is_semidefinite(at_points(_metric, term, points), along)
+        return _is_semidefinite(evaluate_at_points(_metric, term, points), along)
     if not term.is_quadratic:
         return False
-    slope, hessian = at_points(_by_momenta, term, np.zeros_like(points[:1]))
+    slope, hessian = evaluate_at_points(_momentum_derivatives, term, np.zeros_like(points[:1]))
     mixed = np.delete(hessian, np.s_[n : 2 * n], axis=-1)
     return not slope.any() and not mixed.any() and _is_semidefinite(hessian[..., n : 2 * n], along)
 
@@ -137,16 +140,16 @@ def _is_semidefinite(G: np.ndarray, along: np.ndarray | None) -> bool:
 
 def _projector(space: mf.Space, q):
     point = space.from_vector(q)
-    along = lambda w: space.to_vector(space._along(point, space.from_vector(w)))  # noqa: E731
+    along = lambda w: space.to_vector(space._tangential_part(point, space.from_vector(w)))  # noqa: E731
     return jax.vmap(along, out_axes=1)(jnp.eye(space.size))
 
 
 def _metric(term: Kinetic, x):
-    G = term.at(_halves(x)[0])
+    G = term.at(_split_state(x)[0])
     return jnp.diag(G) if G.ndim == 1 else G
 
 
-def _by_momenta(term: Energy, x):
+def _momentum_derivatives(term: Energy, x):
     n = len(x) // 2
     return term.gradient(x)[n : 2 * n], jax.jacfwd(term.gradient)(x)[n : 2 * n]
 
@@ -155,15 +158,15 @@ def _jacobian(term: Pullback, x):
     return jax.jacfwd(term.coordinates)(x)
 
 
-def _halves(x):
+def _split_state(x):
     n = len(x) // 2
     return x[:n], x[n : 2 * n]
 
 
-def _apply(G, p):
+def _apply_metric(G, p):
     return G * p if G.ndim == 1 else G @ p
 
 
-def _without_momenta(x):
+def _drop_momenta(x):
     n = len(x) // 2
     return jnp.concatenate([x[:n], x[2 * n :]])

@@ -9,12 +9,12 @@ import equinox as eqx
 import jax
 
 import manifolds as mf
-from manifolds._module import Module
+from manifolds._pytree_module import Module
 
 from .energy import Energy, Function, Negative, Quadratic, Sum, TimeDependent
 
 
-class OfPoint(Energy):
+class PointEnergy(Energy):
     """A function of the points of a space, as a function of their vectors, shape (n,)."""
 
     energy: Energy
@@ -24,20 +24,20 @@ class OfPoint(Energy):
         return self.energy.value(self.space.from_vector(x))
 
 
-def on_points(energy: Energy, space: mf.Space | None) -> Energy:
+def energy_of_vectors(energy: Energy, space: mf.Space | None) -> Energy:
     """An energy of the points of a space as one of their vectors; an lt.Quadratic is one of vectors already."""
     if space is None or space.shape == (space.size,):
         return energy
-    return energy.mapped(lambda term: _on_points(term, space))
+    return energy.map_terms(lambda term: _term_of_vectors(term, space))
 
 
-def _on_points(term: Energy, space: mf.Space) -> Energy:
+def _term_of_vectors(term: Energy, space: mf.Space) -> Energy:
     if isinstance(term, TimeDependent):
-        return TimeDependent(_OfPointAndTime(term.function, space))
-    return term if isinstance(term, Quadratic) else OfPoint(term, space)
+        return TimeDependent(_PointTimeFunction(term.function, space))
+    return term if isinstance(term, Quadratic) else PointEnergy(term, space)
 
 
-class _OfPointAndTime(Module):
+class _PointTimeFunction(Module):
     function: Callable
     space: mf.Space = eqx.field(static=True)
 
@@ -45,7 +45,7 @@ class _OfPointAndTime(Module):
         return self.function(self.space.from_vector(x), t)
 
 
-def on_sites(tree, shape: tuple[int, ...]):
+def flatten_site_functions(tree, shape: tuple[int, ...]):
     """A pytree whose plain functions of states of this shape have become functions of flat ones, shape (n,).
 
     Energies that say themselves what they do with components, and Casimirs of algebras, are of flat states already.
@@ -53,24 +53,24 @@ def on_sites(tree, shape: tuple[int, ...]):
     if len(shape) == 1:
         return tree
     return jax.tree_util.tree_map(
-        lambda part: _on_sites(part, shape) if isinstance(part, Energy) else part,
+        lambda part: _flatten_site_energy(part, shape) if isinstance(part, Energy) else part,
         tree,
         is_leaf=lambda part: isinstance(part, Energy),
     )
 
 
-def _on_sites(energy: Energy, shape: tuple[int, ...]) -> Energy:
+def _flatten_site_energy(energy: Energy, shape: tuple[int, ...]) -> Energy:
     if isinstance(energy, Sum):
-        return Sum(tuple(_on_sites(term, shape) for term in energy.summands))
+        return Sum(tuple(_flatten_site_energy(term, shape) for term in energy.summands))
     if isinstance(energy, Negative):
-        return Negative(_on_sites(energy.term, shape))
+        return Negative(_flatten_site_energy(energy.term, shape))
     if isinstance(energy, Function | TimeDependent):
         flat = getattr(energy.function, "dim", None) == math.prod(shape)  # a Casimir of the whole algebra
-        return energy if flat else type(energy)(_OfSites(energy.function, shape))
+        return energy if flat else type(energy)(_FlattenedFunction(energy.function, shape))
     return energy
 
 
-class _OfSites(Module):
+class _FlattenedFunction(Module):
     function: Callable
     shape: tuple[int, ...] = eqx.field(static=True)
 

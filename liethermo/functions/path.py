@@ -10,24 +10,24 @@ import jax.numpy as jnp
 import numpy as np
 
 
-class Finer(NamedTuple):
+class KronrodRule(NamedTuple):
     """Further nodes between those of a Gauss rule, which make it a Kronrod rule.
 
     Attributes
     ----------
-    A, slopes : ndarray, shape (s + 1, s)
+    A, slope_matrix : ndarray, shape (s + 1, s)
         ``x + h A @ k`` and ``slopes @ k`` are the collocation polynomial and its slope at the further nodes.
-    b, change : ndarray, shapes (s + 1,) and (s,)
+    b, weight_change : ndarray, shapes (s + 1,) and (s,)
         Their weights, and what is added to those of the Gauss nodes.
     """
 
     A: np.ndarray
-    slopes: np.ndarray
+    slope_matrix: np.ndarray
     b: np.ndarray
-    change: np.ndarray
+    weight_change: np.ndarray
 
 
-class Path(NamedTuple):
+class CollocationPath(NamedTuple):
     """The collocation polynomial of a step, in the coordinates that a term depends on.
 
     Attributes
@@ -36,8 +36,8 @@ class Path(NamedTuple):
         It leads from start + compensation to start + compensation + step.
     points, slopes : array, shape (s, m)
         At the stages.
-    further : two arrays, shape (r, m), or None
-        Points and slopes at the nodes of ``finer``.
+    kronrod_samples : two arrays, shape (r, m), or None
+        Points and slopes at the nodes of ``kronrod``.
     symmetries : array, shape (s, r, m), or None
         Vectors at the stages that corrections are to be orthogonal to.
     """
@@ -47,39 +47,39 @@ class Path(NamedTuple):
     step: jax.Array
     points: jax.Array
     slopes: jax.Array
-    further: tuple[jax.Array, jax.Array] | None
+    kronrod_samples: tuple[jax.Array, jax.Array] | None
     symmetries: jax.Array | None
     h: jax.Array
     b: np.ndarray
-    finer: Finer | None
+    kronrod: KronrodRule | None
 
-    def through(self, coordinates: Callable) -> tuple[Path, Callable]:
+    def map_coordinates(self, coordinates: Callable) -> tuple[CollocationPath, Callable]:
         """The path seen in coordinates at most quadratic in these, and what takes covectors at its stages back."""
 
-        def seen(x, d):
+        def push_forward(x, d):
             return jax.jvp(coordinates, (x,), (d,))
 
-        def turned(x, directions):
-            return jax.vmap(lambda d: seen(x, d)[1])(directions)
+        def push_directions(x, directions):
+            return jax.vmap(lambda d: push_forward(x, d)[1])(directions)
 
-        def back(covectors):
+        def pull_back(covectors):
             return jax.vmap(lambda x, g: jax.vjp(coordinates, x)[1](g)[0])(self.points, covectors)
 
         compensation = jnp.zeros_like(self.start) + self.compensation
-        (points, slopes), step = jax.vmap(seen)(self.points, self.slopes), self.step
+        (points, slopes), step = jax.vmap(push_forward)(self.points, self.slopes), self.step
         path = self._replace(
             start=coordinates(self.start),
-            compensation=seen(self.start + 0.5 * compensation, compensation)[1],
-            step=seen(self.start + (compensation + 0.5 * step), step)[1],
+            compensation=push_forward(self.start + 0.5 * compensation, compensation)[1],
+            step=push_forward(self.start + (compensation + 0.5 * step), step)[1],
             points=points,
             slopes=slopes,
-            further=None if self.further is None else jax.vmap(seen)(*self.further),
-            symmetries=None if self.symmetries is None else jax.vmap(turned)(self.points, self.symmetries),
+            kronrod_samples=None if self.kronrod_samples is None else jax.vmap(push_forward)(*self.kronrod_samples),
+            symmetries=None if self.symmetries is None else jax.vmap(push_directions)(self.points, self.symmetries),
         )
-        return path, back
+        return path, pull_back
 
 
-class Scheme(Protocol):
+class DiscreteGradientScheme(Protocol):
     """What a term asks of a discrete gradient: see :class:`liethermo.functions.gradients.DiscreteGradient`."""
 
     def quadratic(self, term: Any, x, d, compensation) -> jax.Array: ...

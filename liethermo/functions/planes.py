@@ -11,32 +11,32 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from manifolds.structures.spins import Padded, added, reshaped, summed
+from manifolds.structures.spins import PaddedLattice, add_vectors, reshape_vectors, sum_of_dots
 
-from .coordinates import Choice
+from .coordinates import ComponentMap
 from .energy import Energy, Negative, Pullback, Sum
-from .magnetism import SpinEnergy, off_lattice, on_lattice
-from .with_baths import WithBaths
+from .magnetism import SpinEnergy, flatten_covectors, lattice_spins
+from .with_baths import BodyBathsEnergy
 
 
 def to_planes(x, count: int) -> jax.Array:
     """States that begin with ``count`` spins site by site, shape (..., n), with these component by component."""
-    return _exchanged(x, (count, 3))
+    return _transpose_spins(x, (count, 3))
 
 
 def to_sites(x, count: int) -> jax.Array:
     """The inverse of :func:`to_planes`."""
-    return _exchanged(x, (3, count))
+    return _transpose_spins(x, (3, count))
 
 
-def _exchanged(x, shape: tuple[int, int]) -> jax.Array:
+def _transpose_spins(x, shape: tuple[int, int]) -> jax.Array:
     front, size = x.shape[:-1], shape[0] * shape[1]
     spins = x if size == x.shape[-1] else x[..., :size]
     spins = jnp.swapaxes(spins.reshape(*front, *shape), -1, -2).reshape(*front, size)
     return spins if size == x.shape[-1] else jnp.concatenate([spins, x[..., size:]], axis=-1)
 
 
-def by_planes(energy: Energy, count: int) -> Energy:
+def planar_energy(energy: Energy, count: int) -> Energy:
     """A function of states that are site by site, as one of states that are component by component."""
     terms: list[Energy] = []
     lattice: list[SpinEnergy] = []
@@ -44,63 +44,68 @@ def by_planes(energy: Energy, count: int) -> Energy:
         if isinstance(term, SpinEnergy) and math.prod(term.sites) == count:
             lattice.append(term)
         else:
-            terms.append(_by_planes(term, count))
+            terms.append(_planar_term(term, count))
     if lattice:
-        terms.append(InPlanes(tuple(lattice)))
+        terms.append(PlanarSpinEnergy(tuple(lattice)))
     return Sum.of(terms)
 
 
-def _by_planes(term: Energy, count: int) -> Energy:
-    if isinstance(term, WithBaths):
-        return WithBaths(by_planes(term.body, count), term.baths, term.size, term.dim)
+def _planar_term(term: Energy, count: int) -> Energy:
+    if isinstance(term, BodyBathsEnergy):
+        return BodyBathsEnergy(planar_energy(term.body, count), term.baths, term.body_dim, term.dim)
     if isinstance(term, Negative):
-        return Negative(by_planes(term.term, count))
-    return Pullback(term, BySites(count))
+        return Negative(planar_energy(term.term, count))
+    return Pullback(term, SiteOrder(count))
 
 
-class InPlanes(Energy):
+class PlanarSpinEnergy(Energy):
     """Energies of all spins: their gradients are added by components, before these become a state's."""
 
-    parts: tuple[SpinEnergy, ...]
+    spin_energies: tuple[SpinEnergy, ...]
 
     is_quadratic = True
 
     def value(self, x) -> jax.Array:
-        spins = self._spins(x)
-        return sum((part.of(spins[part.sites]) for part in self.parts), jnp.zeros(()))
+        spins = self._padded_spins(x)
+        return sum((part.lattice_value(spins[part.sites]) for part in self.spin_energies), jnp.zeros(()))
 
     def gradient(self, x) -> jax.Array:
-        spins = self._spins(x)
-        found, *others = (part.gradients(spins[part.sites]) for part in self.parts)
+        spins = self._padded_spins(x)
+        found, *others = (part.lattice_gradients(spins[part.sites]) for part in self.spin_energies)
         for other in others:
-            found = added(found, reshaped(other, found[0].shape))
-        return off_lattice(found, x, planar=True)
+            found = add_vectors(found, reshape_vectors(other, found[0].shape))
+        return flatten_covectors(found, x, planar=True)
 
-    def _spins(self, x) -> dict[tuple[int, ...], Padded]:
+    def _padded_spins(self, x) -> dict[tuple[int, ...], PaddedLattice]:
         """On the lattice of each part."""
-        sites = {part.sites for part in self.parts}
-        return {shape: Padded(on_lattice(x, shape, planar=True), reach(Sum(self.parts), shape)) for shape in sites}
+        sites = {part.sites for part in self.spin_energies}
+        return {
+            shape: PaddedLattice(
+                lattice_spins(x, shape, planar=True), interaction_range(Sum(self.spin_energies), shape)
+            )
+            for shape in sites
+        }
 
     def sensitivity(self, x) -> jax.Array:
-        spins, found = self._spins(x), jnp.zeros(())
-        for part in self.parts:
-            here, gradients = spins[part.sites].here, part.gradients(spins[part.sites])
-            found = found + jnp.sqrt(summed(gradients, gradients) * summed(here, here))
+        spins, found = self._padded_spins(x), jnp.zeros(())
+        for part in self.spin_energies:
+            here, gradients = spins[part.sites].site_spins, part.lattice_gradients(spins[part.sites])
+            found = found + jnp.sqrt(sum_of_dots(gradients, gradients) * sum_of_dots(here, here))
         return jax.lax.stop_gradient(found)
 
 
-def reach(energy: Energy, sites: tuple[int, ...]) -> tuple[int, ...]:
+def interaction_range(energy: Energy, sites: tuple[int, ...]) -> tuple[int, ...]:
     """How far the spins are, along each axis of a lattice, that act on one by its energies."""
     found = [(0,) * len(sites)]
     for term in energy.terms:
-        if isinstance(term, WithBaths):
-            found.append(reach(term.body, sites))
+        if isinstance(term, BodyBathsEnergy):
+            found.append(interaction_range(term.body, sites))
         elif isinstance(term, SpinEnergy) and term.sites == sites:
-            found.append(term.reach)
+            found.append(term.interaction_range)
     return tuple(max(along) for along in zip(*found, strict=True))
 
 
-class BySites(Choice):
+class SiteOrder(ComponentMap):
     """A state that is component by component, site by site."""
 
     count: int = eqx.field(static=True)

@@ -13,7 +13,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from manifolds.structures.spins import Planes, added, dotted, scaled, spins_of, state_of
+from manifolds.structures.spins import (
+    VectorComponents,
+    add_vectors,
+    dot_vectors,
+    scale_vectors,
+    spins_from_state,
+    state_from_spins,
+)
 
 from .energy import Energy
 
@@ -34,40 +41,42 @@ class Spheres:
     count: int
     name: str
     planar: bool = False
-    collocated = True
+    is_kept_by_collocation = True
 
-    def along(self, x, v) -> jax.Array:
+    def project_direction(self, x, v) -> jax.Array:
         """v, shape (n,), less its radial components at x."""
         s, part = self._vectors(x), self._vectors(v)
-        return self._replaced(v, added(part, scaled(-_quotient(dotted(s, part), dotted(s, s)), s)))
+        return self._replace_vectors(
+            v, add_vectors(part, scale_vectors(-_safe_quotient(dot_vectors(s, part), dot_vectors(s, s)), s))
+        )
 
-    def reached(self, x, compensation, d) -> tuple[jax.Array, jax.Array]:
+    def project_displacement(self, x, compensation, d) -> tuple[jax.Array, jax.Array]:
         """The displacement that ends where d does, but at the lengths of the start; nothing is missed.
 
         From what the squares change by, not from their values: so it is as exact as d is small.
         """
         start, step = self._vectors(x + compensation), self._vectors(d)
-        end = added(start, step)
-        share = _quotient(dotted(step, added(start, end)), dotted(end, end))
+        end = add_vectors(start, step)
+        share = _safe_quotient(dot_vectors(step, add_vectors(start, end)), dot_vectors(end, end))
         root = jnp.sqrt(jnp.maximum(1.0 - share, 0.0))
-        return self._replaced(d, added(step, scaled(-share / (1.0 + root), end))), jnp.zeros(())
+        return self._replace_vectors(d, add_vectors(step, scale_vectors(-share / (1.0 + root), end))), jnp.zeros(())
 
-    def settled(self, x, compensation) -> tuple[jax.Array, jax.Array]:
+    def correct_rounding(self, x, compensation) -> tuple[jax.Array, jax.Array]:
         """The state as it is: the sum of the squares is steered with the other first integrals."""
         return x, compensation
 
-    def _vectors(self, v) -> Planes:
-        return spins_of(v, self.count, self.planar)
+    def _vectors(self, v) -> VectorComponents:
+        return spins_from_state(v, self.count, self.planar)
 
-    def _replaced(self, v, vectors: Planes) -> jax.Array:
-        return state_of(vectors, v[3 * self.count :], self.planar)
+    def _replace_vectors(self, v, vectors: VectorComponents) -> jax.Array:
+        return state_from_spins(vectors, v[3 * self.count :], self.planar)
 
 
-def _quotient(numerator, square) -> jax.Array:
+def _safe_quotient(numerator, square) -> jax.Array:
     return numerator / jnp.where(square > 0.0, square, 1.0)
 
 
-class Squares(Energy):
+class HalfSumOfSquares(Energy):
     """``sum |s_i|^2 / 2`` over the sites: the Casimir that is followed along a run."""
 
     count: int = eqx.field(static=True)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from manifolds._arrays import is_traced
-from manifolds._module import Module
+from manifolds._pytree_module import Module
 
 
 class TimeSpan(Module):
@@ -25,14 +25,14 @@ class TimeSpan(Module):
     end: jax.Array
 
     def __init__(self, start: float = -np.inf, end: float = np.inf):
-        self.start, self.end = _number(start), _number(end)
+        self.start, self.end = _time_scalar(start), _time_scalar(end)
 
     def clip(self, t) -> jax.Array:
         """Return the times t, shape (...), those outside replaced by the nearest bound."""
         return _clip(t, self.start, self.end)
 
 
-def _number(t) -> jax.Array:
+def _time_scalar(t) -> jax.Array:
     if is_traced(t):
         return t
     with jax.ensure_compile_time_eval():  # a number, even where something else is traced

@@ -8,14 +8,16 @@ import jax
 import jax.numpy as jnp
 
 from ..functions.energy import Energy
-from ..functions.frames import Frame, frame
-from ..functions.gradients import Change, Direction, corrected
+from ..functions.frames import OrthonormalFrame, gram_schmidt
+from ..functions.gradients import CorrectionDirection, FunctionChange, correct_gradients
 
-NEWTON = 3
+CASIMIR_NEWTON_STEPS = 3
 """Steps of Newton's method to a level of the Casimirs: the distance is O(h), so what is left is O(h^8)."""
 
 
-def composed_gradients(S: Energy, casimirs: Sequence[Energy], gradients, x, compensation, h, k, A, b) -> jax.Array:
+def composed_entropy_gradients(
+    S: Energy, casimirs: Sequence[Energy], gradients, x, compensation, h, k, A, b
+) -> jax.Array:
     """Discrete gradients of ``S = f(C_1, …, C_m)`` at the stages of a collocation method, shape (s, n).
 
     Each is ``sum_j (f_j(c_i) + alpha r_ij) gC_ij``: a combination of the discrete gradients of the Casimirs at the
@@ -34,16 +36,18 @@ def composed_gradients(S: Energy, casimirs: Sequence[Energy], gradients, x, comp
     """
     rates = jnp.einsum("jin,in->ij", gradients, k)
 
-    def at(y) -> Frame:
-        return frame([C.gradient(y) for C in casimirs])
+    def casimir_frame(y) -> OrthonormalFrame:
+        return gram_schmidt([C.gradient(y) for C in casimirs])
 
-    def derivatives(change):
+    def entropy_coefficients(change):
         y = x
-        for _ in range(NEWTON):
+        for _ in range(CASIMIR_NEWTON_STEPS):
             defect = change - jnp.stack([C.value(y) - C.value(x) for C in casimirs])
-            y = y + at(y).with_products(defect)
-        return at(y).coefficients(S.gradient(y))
+            y = y + casimir_frame(y).vector_with_products(defect)
+        return casimir_frame(y).coefficients(S.gradient(y))
 
-    weights = jax.vmap(derivatives)(h * (A @ rates))
-    change = Change.of(S, x, compensation, h * (b @ k), [])
-    return jnp.einsum("ij,jin->in", corrected(change, weights, rates, Direction.of(rates, b), h, b), gradients)
+    weights = jax.vmap(entropy_coefficients)(h * (A @ rates))
+    change = FunctionChange.of(S, x, compensation, h * (b @ k), [])
+    return jnp.einsum(
+        "ij,jin->in", correct_gradients(change, weights, rates, CorrectionDirection.of(rates, b), h, b), gradients
+    )

@@ -16,28 +16,28 @@ import numpy as np
 import manifolds as mf
 from manifolds._arrays import is_traced
 
-from ..dissipation.base import Dissipation, portions
+from ..dissipation.base import Dissipation, terms_with_preserved
 from ..errors import InputError
 from ..functions.energy import Energy
-from ..functions.frames import frame
+from ..functions.frames import gram_schmidt
 from ..functions.gradients import stage_gradients
 from ..systems import System
 from ..systems.base import gradients_of
-from ..tracing.interpret import at_points
+from ..tracing.interpret import evaluate_at_points
 from .base import (
     GaussMethod,
     OneStepMethod,
     TransportingMethod,
+    apply_increment,
     checked_stages,
     collocation_error,
-    generator_linearised,
-    moved,
+    generator_residual_jvp,
     register,
 )
-from .charts import in_charts
-from .composed_entropy import composed_gradients
-from .preserved import check_preserved, is_momentum_map, preserved_functions, seen_on, share_moved
-from .tableaus import finer, gauss
+from .charts import wrap_in_charts
+from .composed_entropy import composed_entropy_gradients
+from .preserved import casimir_residuals, check_preserved, function_on_states, is_momentum_map, preserved_functions
+from .tableaus import gauss_tableau, kronrod_rule
 
 
 class MetriplecticGauss(GaussMethod, TransportingMethod):
@@ -58,13 +58,13 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
     The motion ``Pi gH`` has to keep S and C too. There are five cases:
 
     - A quadratic Casimir: collocation keeps it, and so it keeps an entropy that is a function of quadratic Casimirs;
-      see :func:`composed_gradients`.
+      see :func:`composed_entropy_gradients`.
     - A quadratic momentum map J: d_i is k_i less its component along the symmetry ``Pi grad J``, so that gH_i is
       invariant as grad H is [Gonzalez 1996].
     - Any other Casimir, without dissipation, where the structure knows the leaf of a state, as of density matrices,
       u(n), su(n) and so(n): the motion is ``Pi(v_i) gH_i`` at points v_i for which x' is on the leaf of x. So all
       Casimirs are kept, also where their gradients depend on each other [Modin & Viviani 2020;
-      :meth:`manifolds.PoissonStructure.on_leaf`].
+      :meth:`manifolds.PoissonStructure.stages_on_leaf`].
     - Any other Casimir: the motion is ``P Pi P gH_i``, P the orthogonal projector off the gC_i of all functions.
     - Any other first integral: the motion is ``Q Pi gH_i``, Q the projector off gH_i, gS_i and the gC_i.
 
@@ -124,18 +124,18 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         self.moving = moving
 
     def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
-        held = tuple(sorted(name for name in system.first_integrals() if self._holds(system, name)))
-        method = self._with(lambda C: seen_on(system, C), held)
+        held = tuple(sorted(name for name in system.first_integrals() if self._is_held(system, name)))
+        method = self._map_functions(lambda C: function_on_states(system, C), held)
         if self.functions and not is_traced((system, method)):
-            shares = at_points(share_moved, (system, method.functions), system.samples(4))
+            shares = evaluate_at_points(casimir_residuals, (system, method.functions), system.samples(4))
             moving = tuple(int(i) for i in np.flatnonzero(is_momentum_map(shares)))
-            method = method._with(lambda C: C, held, moving)
-        return in_charts(method, system, self.retraction, "exp")
+            method = method._map_functions(lambda C: C, held, moving)
+        return wrap_in_charts(method, system, self.retraction, "exp")
 
-    def asked_to_preserve(self, system: System) -> tuple[Energy, ...]:
-        return tuple(seen_on(system, C) for C in self.functions)
+    def requested_invariants(self, system: System) -> tuple[Energy, ...]:
+        return tuple(function_on_states(system, C) for C in self.functions)
 
-    def _with(self, change: Callable, held: tuple[str, ...], moving: tuple[int, ...] | None = None):
+    def _map_functions(self, change: Callable, held: tuple[str, ...], moving: tuple[int, ...] | None = None):
         """The method with its preserved functions changed, holding these of the system."""
         return type(self)(self.number, tuple(map(change, self.functions)), self.retraction, held, moving)
 
@@ -147,7 +147,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         if not self.functions:
             return
         functions = [system.energy, *(() if system.entropy is None else (system.entropy,)), *self.functions]
-        gradients = np.nan_to_num(at_points(gradients_of, tuple(functions), system.samples(8)))
+        gradients = np.nan_to_num(evaluate_at_points(gradients_of, tuple(functions), system.samples(8)))
         if np.linalg.matrix_rank(gradients, tol=1e-9).max() >= system.dim:
             raise InputError(
                 f"energy, entropy and {len(self.functions)} preserved functions are independent and leave no room to "
@@ -157,83 +157,88 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
     # -- the stage equations ------------------------------------------------------------------------------------------
 
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
-        found = self._on_leaf(system, x, compensation, h, k)
+        found = self._leaf_slopes(system, x, compensation, h, k)
         if found is not None:
             return found
-        return jax.vmap(lambda *stage: self._slope(system, *stage))(*self._at_stages(system, x, compensation, h, k))
+        return jax.vmap(lambda *stage: self._stage_slope(system, *stage))(
+            *self._stage_gradients(system, x, compensation, h, k)
+        )
 
-    def _on_leaf(self, system: System, x, compensation, h, k) -> jax.Array | None:
+    def _leaf_slopes(self, system: System, x, compensation, h, k) -> jax.Array | None:
         """The slopes of a motion that Casimirs alone have a part in, where the structure knows the leaf through x."""
-        functions = self._kept(system) | _made_of(system)
-        casimirs = functions.keys() <= {ENTROPY, *self._casimirs(system)}
+        functions = self._held_functions(system) | _entropy_arguments(system)
+        casimirs = functions.keys() <= {ENTROPY_KEY, *self._held_casimir_names(system)}
         if system.dissipation is not None or not casimirs or all(C.is_quadratic for C in functions.values()):
             return None
-        dH = self._of_energy(system, self._stages(x, compensation, h, k), x, compensation, h, k)
-        points = system.poisson.on_leaf(x + compensation, dH, h * gauss(self.number).A)
+        dH = self._energy_gradients(system, self._stage_states(x, compensation, h, k), x, compensation, h, k)
+        points = system.poisson.stages_on_leaf(x + compensation, dH, h * gauss_tableau(self.number).A)
         return None if points is None else jax.vmap(system.poisson.sharp)(points, dH)
 
-    def velocities(self, system: System, x, compensation, h, k) -> jax.Array:
+    def stage_velocities(self, system: System, x, compensation, h, k) -> jax.Array:
         names = tuple(system.preserved_by_name())
 
         def velocity(u, dH, dS, known):
             return system.transport(u, dH, dS, tuple(known[name].discrete for name in names))
 
-        return jax.vmap(velocity)(*self._at_stages(system, x, compensation, h, k))
+        return jax.vmap(velocity)(*self._stage_gradients(system, x, compensation, h, k))
 
-    def _at_stages(self, system: System, x, compensation, h, k) -> tuple:
+    def _stage_gradients(self, system: System, x, compensation, h, k) -> tuple:
         """The stages, shape (s, n), and there what the step takes for dH, dS and the other gradients, by name."""
-        A, b, _ = gauss(self.number)
-        u = self._stages(x, compensation, h, k)
+        A, b, _ = gauss_tableau(self.number)
+        u = self._stage_states(x, compensation, h, k)
 
-        def at_stages(C: Energy) -> Gradients:
+        def gradients_of_function(C: Energy) -> StageGradients:
             plain = jax.vmap(C.gradient)(u)
             if C.is_quadratic:
-                return Gradients(plain, plain)
-            return Gradients(stage_gradients(C, x, compensation, h, k, A, b, finer(self.number)), plain)
+                return StageGradients(plain, plain)
+            return StageGradients(stage_gradients(C, x, compensation, h, k, A, b, kronrod_rule(self.number)), plain)
 
-        S, parts = system.entropy, _made_of(system)
-        dH = self._of_energy(system, u, x, compensation, h, k)
-        known = {name: at_stages(C) for name, C in (self._kept(system) | parts | system.preserved_by_name()).items()}
+        S, parts = system.entropy, _entropy_arguments(system)
+        dH = self._energy_gradients(system, u, x, compensation, h, k)
+        known = {
+            name: gradients_of_function(C)
+            for name, C in (self._held_functions(system) | parts | system.preserved_by_name()).items()
+        }
         if S is None:
             dS = jnp.zeros_like(k)
-        elif ENTROPY in parts:
-            dS = known[ENTROPY].discrete
+        elif ENTROPY_KEY in parts:
+            dS = known[ENTROPY_KEY].discrete
         else:
             discrete = jnp.stack([known[name].discrete for name in parts])
-            dS = composed_gradients(S, list(parts.values()), discrete, x, compensation, h, k, A, b)
+            dS = composed_entropy_gradients(S, list(parts.values()), discrete, x, compensation, h, k, A, b)
         return u, dH, dS, known
 
-    def _stages(self, x, compensation, h, k) -> jax.Array:
-        return x + (compensation + h * (gauss(self.number).A @ k))
+    def _stage_states(self, x, compensation, h, k) -> jax.Array:
+        return x + (compensation + h * (gauss_tableau(self.number).A @ k))
 
-    def _of_energy(self, system: System, u, x, compensation, h, k) -> jax.Array:
+    def _energy_gradients(self, system: System, u, x, compensation, h, k) -> jax.Array:
         """What the step takes for dH at the stages u, shape (s, n)."""
-        A, b, _ = gauss(self.number)
-        symmetries = self._symmetries(system, u)
-        return stage_gradients(system.energy, x, compensation, h, k, A, b, finer(self.number), symmetries)
+        A, b, _ = gauss_tableau(self.number)
+        symmetries = self._symmetry_directions(system, u)
+        return stage_gradients(system.energy, x, compensation, h, k, A, b, kronrod_rule(self.number), symmetries)
 
-    def _slope(self, system: System, u, dH, dS, known: dict[str, Gradients]) -> jax.Array:
+    def _stage_slope(self, system: System, u, dH, dS, known: dict[str, StageGradients]) -> jax.Array:
         """``Pi_d dH + K_d dS`` at one stage."""
         system = system.here(u)
-        motion = self._motion(system, u, dH, known)
+        motion = self._conservative_slope(system, u, dH, known)
         names = tuple(zip(system.preserved_by_name(), system.preserved_names, strict=True))
-        for part, own in () if system.dissipation is None else portions(system.dissipation, names):
-            motion = motion + self._force(part, own, system, u, dH, dS, known)
+        for part, own in () if system.dissipation is None else terms_with_preserved(system.dissipation, names):
+            motion = motion + self._dissipative_slope(part, own, system, u, dH, dS, known)
         return motion
 
-    def _motion(self, system: System, u, dH, known: dict[str, Gradients]) -> jax.Array:
+    def _conservative_slope(self, system: System, u, dH, known: dict[str, StageGradients]) -> jax.Array:
         """``Pi dH``, less what would change S and what is held."""
-        functions = self._kept(system) | _made_of(system)
+        functions = self._held_functions(system) | _entropy_arguments(system)
         if all(C.is_quadratic for C in functions.values()):
             return system.poisson.sharp(u, dH)
         gradients = [known[name] for name in functions]
-        if functions.keys() <= {ENTROPY, *self._casimirs(system)}:
-            off = _projector(system, u, gradients, within=system.body_dim)
+        if functions.keys() <= {ENTROPY_KEY, *self._held_casimir_names(system)}:
+            off = _gradient_projector(system, u, gradients, within=system.body_dim)
             return off(system.poisson.sharp(u, off(dH)))
-        energy = Gradients(dH, system.energy.gradient(u))
-        return _projector(system, u, [energy, *gradients], within=system.body_dim)(system.poisson.sharp(u, dH))
+        energy = StageGradients(dH, system.energy.gradient(u))
+        return _gradient_projector(system, u, [energy, *gradients], within=system.body_dim)(system.poisson.sharp(u, dH))
 
-    def _force(
+    def _dissipative_slope(
         self, part: Dissipation, own: tuple[tuple[str, str], ...], system: System, u, dH, dS, known
     ) -> jax.Array:
         """One dissipation, less what would change what it has to keep beside its ``own`` preserved functions.
@@ -242,80 +247,88 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         """
         dL, functions = (
             tuple(known[key].discrete for key, _ in own),
-            self._imposed(part, {name for _, name in own}, system),
+            self._functions_to_project(part, {name for _, name in own}, system),
         )
         if not functions:
             return part.force(system, u, dH, dS, dL)
         gradients = [known[name] for name in functions] + [known[key] for key, name in own if name not in functions]
         if part.energy_law == "nonincreasing":
-            off = _projector(system, u, gradients)
+            off = _gradient_projector(system, u, gradients)
             return off(part.force(system, u, off(dH), dS, dL))
         if part.energy_law == "conserved":
-            gradients = [Gradients(dH, system.energy.gradient(u)), *gradients]
-        off = _projector(system, u, gradients)
+            gradients = [StageGradients(dH, system.energy.gradient(u)), *gradients]
+        off = _gradient_projector(system, u, gradients)
         return off(part.force(system, u, dH, off(dS), dL))
 
-    def _imposed(self, part: Dissipation, own: set[str], system: System) -> dict[str, Energy]:
+    def _functions_to_project(self, part: Dissipation, own: set[str], system: System) -> dict[str, Energy]:
         """The functions that a dissipation has to keep, by name, where it does not keep them all by construction."""
-        functions = self._kept(system) | (_made_of(system) if part.energy_law == "nonincreasing" else {})
+        functions = self._held_functions(system) | (
+            _entropy_arguments(system) if part.energy_law == "nonincreasing" else {}
+        )
         exact = system.energy.is_quadratic and (system.entropy is None or system.entropy.is_quadratic)
-        casimirs = {ENTROPY, *self._casimirs(system)} if part.keeps_casimirs else set()
+        casimirs = {ENTROPY_KEY, *self._held_casimir_names(system)} if part.preserves_casimirs else set()
 
-        def safe(name: str, C: Energy) -> bool:  # kept by construction
+        def is_kept_by_construction(name: str, C: Energy) -> bool:  # kept by construction
             return name in own or (C.is_quadratic and (exact or name in casimirs))
 
-        return {} if not part.symmetric or all(safe(*function) for function in functions.items()) else functions
+        return (
+            {}
+            if not part.is_symmetric or all(is_kept_by_construction(*function) for function in functions.items())
+            else functions
+        )
 
-    def transports(self, system: System) -> bool:
+    def can_transport_attitude(self, system: System) -> bool:
         """Where nothing is projected off the slopes."""
         names = system.preserved_names
-        parts = () if system.dissipation is None else portions(system.dissipation, names)
-        plain = all(C.is_quadratic for C in (self._kept(system) | _made_of(system)).values())
-        return plain and not any(self._imposed(part, set(own), system) for part, own in parts)
+        parts = () if system.dissipation is None else terms_with_preserved(system.dissipation, names)
+        plain = all(C.is_quadratic for C in (self._held_functions(system) | _entropy_arguments(system)).values())
+        return plain and not any(self._functions_to_project(part, set(own), system) for part, own in parts)
 
-    def keeps(self, system: System, name: str) -> bool:
+    def preserves_function(self, system: System, name: str) -> bool:
         known = name in system.casimirs() or name in system.preserved_names
-        return self._holds(system, name) if known else super().keeps(system, name)
+        return self._is_held(system, name) if known else super().preserves_function(system, name)
 
-    def _holds(self, system: System, name: str) -> bool:
+    def _is_held(self, system: System, name: str) -> bool:
         """Whether it holds a constant of the system unasked: Casimirs, and what the dissipation has to preserve.
 
         A skew friction is not projected, and keeps by itself what is quadratic alone.
         """
         if name not in system.casimirs() and name not in system.preserved_names:
             return False
-        projected = system.dissipation is None or system.dissipation.symmetric
+        projected = system.dissipation is None or system.dissipation.is_symmetric
         return projected or system.functions()[name].is_quadratic
 
-    def _kept(self, system: System) -> dict[str, Energy]:
+    def _held_functions(self, system: System) -> dict[str, Energy]:
         """What is held, by name."""
         functions = system.functions()
         given = {f"given {i + 1}": C for i, C in enumerate(self.functions)}
         return {name: functions[name] for name in self.held} | given
 
     def move(self, system: System, x, compensation, h, k) -> tuple[jax.Array, jax.Array]:
-        return moved(self, system, x, compensation, self.increment(h, k), tuple(self._kept(system).values()))
+        return apply_increment(
+            self, system, x, compensation, self.increment(h, k), tuple(self._held_functions(system).values())
+        )
 
-    def _casimirs(self, system: System) -> set[str]:
+    def _held_casimir_names(self, system: System) -> set[str]:
         """Names of the Casimirs among what is held."""
         given = range(len(self.functions)) if self.moving is not None else ()
         return {*system.casimirs(), *(f"given {i + 1}" for i in given if i not in (self.moving or ()))}
 
-    def _symmetries(self, system: System, u) -> jax.Array | None:
+    def _symmetry_directions(self, system: System, u) -> jax.Array | None:
         """The directions ``Pi grad J`` at the stages for quadratic momentum maps J, shape (s, r, n)."""
         if system.energy.is_quadratic:
             return None
-        casimirs = self._casimirs(system)
-        maps = [J for name, J in self._kept(system).items() if J.is_quadratic and name not in casimirs]
+        casimirs = self._held_casimir_names(system)
+        maps = [J for name, J in self._held_functions(system).items() if J.is_quadratic and name not in casimirs]
         if not maps:
             return None
         sharp = system.poisson.sharp
         return jax.vmap(lambda point: jnp.stack([sharp(point, J.gradient(point)) for J in maps]))(u)
 
-    def linearised(self, system: System, x, compensation, h, k) -> Callable:
+    def residual_jvp(self, system: System, x, compensation, h, k) -> Callable:
         if not system.has_generator:
-            return super().linearised(system, x, compensation, h, k)
-        return generator_linearised(system, lambda k: self._stages(x, compensation, h, k), k)
+            return super().residual_jvp(system, x, compensation, h, k)
+        return generator_residual_jvp(system, lambda k: self._stage_states(x, compensation, h, k), k)
 
     def error(self, system: System, x, compensation, h, k) -> jax.Array:
         return collocation_error(system, x, compensation, h, k)
@@ -325,37 +338,37 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         return f"MetriplecticGauss(stages={self.number}{kept})"
 
 
-class Gradients(NamedTuple):
+class StageGradients(NamedTuple):
     """Gradients of a function at the stages, shape (s, n), or at one: discrete ones, and their limits."""
 
     discrete: jax.Array
-    plain: jax.Array
+    continuous: jax.Array
 
 
-ENTROPY = "the entropy"
+ENTROPY_KEY = "the entropy"
 
 
-def _made_of(system: System) -> dict[str, Energy]:
+def _entropy_arguments(system: System) -> dict[str, Energy]:
     """What the entropy is a function of, by name: Casimirs where all are known and that helps, itself otherwise."""
     if system.entropy is None:
         return {}
     if system.entropy.is_quadratic or not system.has_all_casimirs:
-        return {ENTROPY: system.entropy}
+        return {ENTROPY_KEY: system.entropy}
     return system.casimirs()
 
 
-def _projector(system: System, u, gradients: list[Gradients], within: int | None = None) -> Callable:
+def _gradient_projector(system: System, u, gradients: list[StageGradients], within: int | None = None) -> Callable:
     """The orthogonal projector off discrete gradients, raised: what is driven has a clock, which is not to be moved.
 
     ``within`` the first components alone: Pi moves no bath, and the rounding of what it moves is none of theirs.
     """
 
-    def raised(alpha):
-        found = system.raised(u, alpha)
+    def raise_index(alpha):
+        found = system.raise_index(u, alpha)
         return found if within in (None, system.dim) else found.at[within:].set(0.0)
 
-    pairs = [(raised(g.discrete), raised(g.plain)) for g in gradients]
-    return frame([d for d, _ in pairs], like=[p for _, p in pairs]).off
+    pairs = [(raise_index(g.discrete), raise_index(g.continuous)) for g in gradients]
+    return gram_schmidt([d for d, _ in pairs], reference_vectors=[p for _, p in pairs]).project_off
 
 
 register(MetriplecticGauss(1), MetriplecticGauss(2), MetriplecticGauss(3))

@@ -11,24 +11,33 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
-from manifolds._module import Module
+from manifolds._pytree_module import Module
 from manifolds.matrices.linear import solve
 
 from ..errors import InputError
-from ..functions.arguments import needed_arguments
-from ..functions.checks import check_shape
-from ..functions.conditions import numbers
-from ..functions.energy import Energy, as_energy
-from ..functions.surface import OnLevels
+from ..functions.arguments import required_argument_count
+from ..functions.checks import check_function_shape
+from ..functions.conditions import check_numbers
+from ..functions.energy import Energy, make_energy
+from ..functions.surface import ConstraintSurface
 from ..systems import EmbeddedSystem, EvolutionSystem, System
-from .base import ONE_SIZE, OneStepMethod, checked_step, moved
+from .base import WHY_FIXED_VARIATIONAL_STEP, OneStepMethod, apply_increment, checked_step_size
 
-_OUTER = 1.0 / (4.0 - 4.0 ** (1.0 / 3.0))
-_PROPORTIONS = {2: (1.0,), 4: (_OUTER, _OUTER, 1.0 - 4.0 * _OUTER, _OUTER, _OUTER)}
+_SUZUKI_OUTER_FRACTION = 1.0 / (4.0 - 4.0 ** (1.0 / 3.0))
+_SUZUKI_FRACTIONS = {
+    2: (1.0,),
+    4: (
+        _SUZUKI_OUTER_FRACTION,
+        _SUZUKI_OUTER_FRACTION,
+        1.0 - 4.0 * _SUZUKI_OUTER_FRACTION,
+        _SUZUKI_OUTER_FRACTION,
+        _SUZUKI_OUTER_FRACTION,
+    ),
+}
 
-PARTS: dict[int, tuple[tuple[float, bool], ...]] = {1: ((1.0, True),)} | {
+SUBSTEPS: dict[int, tuple[tuple[float, bool], ...]] = {1: ((1.0, True),)} | {
     order: tuple((0.5 * share, forward) for share in shares for forward in (True, False))
-    for order, shares in _PROPORTIONS.items()
+    for order, shares in _SUZUKI_FRACTIONS.items()
 }
 """What a step of an order consists of: the share of the step, and whether it is of the scheme or of its adjoint."""
 
@@ -66,13 +75,13 @@ class DiscreteHerglotz(OneStepMethod):
     """
 
     systems = "evolution systems"
-    fixed: ClassVar[str] = ONE_SIZE
+    why_fixed_step: ClassVar[str] = WHY_FIXED_VARIATIONAL_STEP
 
     discrete_lagrangian: Callable
     composed: int = eqx.field(static=True)
 
     def __init__(self, discrete_lagrangian: Callable, order: Literal[1, 2, 4] = 1):
-        if order not in tuple(PARTS):
+        if order not in tuple(SUBSTEPS):
             raise InputError(f"the order is 1, 2 or 4, not {order!r}")
         if not callable(discrete_lagrangian):
             raise InputError(f"a discrete Lagrangian is a function of (q_0, q_1, S_0, h), not {discrete_lagrangian!r}")
@@ -87,12 +96,12 @@ class DiscreteHerglotz(OneStepMethod):
         lagrangian : function of (q, v, S), or of all in one array, shape (2n + 1,), to a scalar; or an Energy
         order : {1, 2, 4}
         """
-        apart = callable(lagrangian) and not isinstance(lagrangian, Energy) and needed_arguments(lagrangian) == 3
-        return cls(_Midpoint(lagrangian if apart else _OfParts(as_energy(lagrangian, "the Lagrangian"))), order)
+        apart = callable(lagrangian) and not isinstance(lagrangian, Energy) and required_argument_count(lagrangian) == 3
+        return cls(_Midpoint(lagrangian if apart else _OfParts(make_energy(lagrangian, "the Lagrangian"))), order)
 
     @property
     def stages(self) -> int:
-        return len(PARTS[self.composed])
+        return len(SUBSTEPS[self.composed])
 
     @property
     def order(self) -> int:
@@ -105,15 +114,19 @@ class DiscreteHerglotz(OneStepMethod):
 
     def state(self, q0, q1, S0, h) -> jax.Array:
         """The state (q_1, p_1, S_1) after a first step that is known, shape (2n + 1,), to start a run from."""
-        q0 = jnp.atleast_1d(numbers(q0, "q0"))
-        q1, S0, h = jnp.atleast_1d(numbers(q1, "q1", q0.shape, ())), numbers(S0, "S0", ()), checked_step(h)
+        q0 = jnp.atleast_1d(check_numbers(q0, "q0"))
+        q1, S0, h = (
+            jnp.atleast_1d(check_numbers(q1, "q1", q0.shape, ())),
+            check_numbers(S0, "S0", ()),
+            checked_step_size(h),
+        )
         self._check_action(q0.shape)
         p1 = jax.grad(self.discrete_lagrangian, argnums=1)(q0, q1, S0, h)
         return jnp.concatenate([q1, p1, (S0 + jnp.dot(q1 - q0, p1))[None]])
 
     def check(self, system: System) -> None:
         """Raise InputError unless the state is a (q, p, S)."""
-        system = _on_manifold(system)
+        system = _manifold_system(system)
         if not isinstance(system, EvolutionSystem):
             raise InputError(f"DiscreteHerglotz runs an lt.EvolutionSystem, not a {system.kind}")
         space = system.configurations
@@ -122,82 +135,84 @@ class DiscreteHerglotz(OneStepMethod):
     def _check_action(self, at: tuple[int, ...]) -> None:
         """Raise FunctionError unless the action of a step is a number, of positions of this shape."""
         where = f"(q_0, q_1, S_0, h), q_0 and q_1 of shape {at}"
-        check_shape(self.discrete_lagrangian, [at, at, (), ()], [()], "the discrete Lagrangian", where)
+        check_function_shape(self.discrete_lagrangian, [at, at, (), ()], [()], "the discrete Lagrangian", where)
 
     def weights(self, theta) -> np.ndarray:
-        return np.asarray(theta)[..., None] * self._shares
+        return np.asarray(theta)[..., None] * self._substep_fractions
 
     @property
-    def _shares(self) -> np.ndarray:
-        return np.array([share for share, _ in PARTS[self.composed]])
+    def _substep_fractions(self) -> np.ndarray:
+        return np.array([share for share, _ in SUBSTEPS[self.composed]])
 
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
-        system = _on_manifold(system)
+        system = _manifold_system(system)
         assert isinstance(system, EvolutionSystem)
         space, y, found, n = system.configurations, x + compensation, [], len(x) // 2
-        action = self.discrete_lagrangian if space is None else _OfPoints(self.discrete_lagrangian, space)
-        for (share, forward), guess in zip(PARTS[self.composed], k, strict=True):
-            slope = (_forward if forward else _backward)(action, system.contact, y, share * h, guess[:n])
+        action = self.discrete_lagrangian if space is None else _ActionOfPoints(self.discrete_lagrangian, space)
+        for (share, forward), guess in zip(SUBSTEPS[self.composed], k, strict=True):
+            slope = (_scheme_slope if forward else _adjoint_slope)(action, system.contact, y, share * h, guess[:n])
             found.append(slope)
             y = y + (share * h) * slope
         return jnp.stack(found)
 
     def increment(self, h, k) -> jax.Array:
-        return h * (self._shares @ k)
+        return h * (self._substep_fractions @ k)
 
     def move(self, system: System, x, compensation, h, k) -> tuple[jax.Array, jax.Array]:
-        return moved(self, system, x, compensation, self.increment(h, k), settles=True)
+        return apply_increment(self, system, x, compensation, self.increment(h, k), ends_on_surface=True)
 
 
-def _forward(action: Callable, on: mf.SplitContact, y, h, guess) -> jax.Array:
+def _scheme_slope(action: Callable, on: mf.SplitContact, y, h, guess) -> jax.Array:
     """The slope of a step of (40) and (41), after one step of Newton's method for its velocity."""
     n = len(guess)
     q, p, S = y[:n], y[n : 2 * n], y[2 * n]
 
-    def misfit(q1):
+    def momentum_residual(q1):
         by_q, by_S = jax.grad(action, argnums=(0, 2))(q, q1, S, h)
         return by_q + (1.0 + by_S) * p
 
-    velocity = _improved(misfit, on, q, h, guess)
+    velocity = _newton_velocity(momentum_residual, on, q, h, guess)
     q1 = q + h * velocity
-    p1 = on.along(q1, jax.grad(action, argnums=1)(q, q1, S, h))
+    p1 = on.tangential_part(q1, jax.grad(action, argnums=1)(q, q1, S, h))
     return jnp.concatenate([velocity, (p1 - p) / h, jnp.dot(velocity, p1)[None]])
 
 
-def _backward(action: Callable, on: mf.SplitContact, y, h, guess) -> jax.Array:
+def _adjoint_slope(action: Callable, on: mf.SplitContact, y, h, guess) -> jax.Array:
     """The same of the adjoint."""
     n = len(guess)
     q, p, S = y[:n], y[n : 2 * n], y[2 * n]
 
-    def end(q1):
+    def adjoint_arguments(q1):
         return q1, q, S + jnp.dot(q1 - q, p), -h
 
-    velocity = _improved(lambda q1: jax.grad(action, argnums=1)(*end(q1)) - p, on, q, h, guess)
+    velocity = _newton_velocity(lambda q1: jax.grad(action, argnums=1)(*adjoint_arguments(q1)) - p, on, q, h, guess)
     q1 = q + h * velocity
-    by_q, by_S = jax.grad(action, argnums=(0, 2))(*end(q1))
-    p1 = on.along(q1, -by_q / (1.0 + by_S))
+    by_q, by_S = jax.grad(action, argnums=(0, 2))(*adjoint_arguments(q1))
+    p1 = on.tangential_part(q1, -by_q / (1.0 + by_S))
     return jnp.concatenate([velocity, (p1 - p) / h, jnp.dot(velocity, p)[None]])
 
 
-def _improved(misfit: Callable, on: mf.SplitContact, q, h, velocity) -> jax.Array:
+def _newton_velocity(misfit: Callable, on: mf.SplitContact, q, h, velocity) -> jax.Array:
     """A velocity after one step of Newton's method for ``misfit(q + h velocity) = 0``, on a manifold along it."""
     A, missed = h * jax.jacfwd(misfit)(q + h * velocity), misfit(q + h * velocity)
     if isinstance(on.bundle, mf.TangentBundle):
-        surface, mass = OnLevels(on.bundle.base, tangent=True), jnp.max(jnp.abs(A))
+        surface, mass = ConstraintSurface(on.bundle.base, tangent=True), jnp.max(jnp.abs(A))
 
-        def off(v):  # how far its end is off Q, as a momentum
-            return mass * surface._moved(q, surface._change(q, 0.0, h * v) / h)
+        def distance_from_manifold(v):  # how far its end is off Q, as a momentum
+            return mass * surface._correction_displacement(q, surface._constraint_change(q, 0.0, h * v) / h)
 
-        A = jax.vmap(lambda column: on.along(q, column), in_axes=1, out_axes=1)(A) + jax.jacfwd(off)(velocity)
-        missed = on.along(q, missed) + off(velocity)
+        A = jax.vmap(lambda column: on.tangential_part(q, column), in_axes=1, out_axes=1)(A) + jax.jacfwd(
+            distance_from_manifold
+        )(velocity)
+        missed = on.tangential_part(q, missed) + distance_from_manifold(velocity)
     return velocity - solve(A, missed[:, None])[:, 0]
 
 
-def _on_manifold(system: System) -> System:
+def _manifold_system(system: System) -> System:
     return system.manifold if isinstance(system, EmbeddedSystem) else system
 
 
-class _OfPoints(Module):
+class _ActionOfPoints(Module):
     """An action of two points of a space, as one of their numbers in a row."""
 
     action: Callable

@@ -14,22 +14,22 @@ class ExplicitTableau(NamedTuple):
     Attributes
     ----------
     A, b : ndarray, shapes (s, s) and (s,)
-    d : ndarray, shape (s,)
+    error_weights : ndarray, shape (s,)
         ``E = h sum_i d_i k_i`` is O(h^(q + 1)).
-    q : int
-    scale : float
+    error_order : int
+    error_scale : float
         The local error of a step of length l is ``scale l (|E| / l)^(p / q)``, p the order: right for a linear equation
         as h -> 0.
     """
 
     A: np.ndarray
     b: np.ndarray
-    d: np.ndarray
-    q: int
-    scale: float
+    error_weights: np.ndarray
+    error_order: int
+    error_scale: float
 
 
-ORDERS = (4, 6, 8)
+LOBATTO_ORDERS = (4, 6, 8)
 
 
 @functools.cache
@@ -38,23 +38,23 @@ def lobatto_rule(nodes: int) -> tuple[np.ndarray, np.ndarray]:
     m = nodes - 1  # the inner ones are the roots of P_m'
     x = np.polynomial.legendre.Legendre.basis(m).deriv().roots().astype(np.longdouble)
     for _ in range(3):  # Newton's method from double precision
-        values, before = _legendre(m, x), _legendre(m - 1, x)
+        values, before = _legendre_value(m, x), _legendre_value(m - 1, x)
         slope = m * (before - x * values) / (1 - x * x)
         x = x - slope * (1 - x * x) / (2 * x * slope - m * nodes * values)
     x = np.concatenate([[-1], np.sort(x), [1]])
-    b = 1 / (m * nodes * _legendre(m, x) ** 2)
+    b = 1 / (m * nodes * _legendre_value(m, x) ** 2)
     return ((1 + x) / 2).astype(np.float64), b.astype(np.float64)
 
 
-def _legendre(m: int, x) -> np.ndarray:
+def _legendre_value(m: int, x) -> np.ndarray:
     return np.polynomial.legendre.Legendre.basis(m)(x)
 
 
 @functools.cache
-def lobatto(order: int) -> ExplicitTableau:
+def lobatto_tableau(order: int) -> ExplicitTableau:
     """The tableau of order 4 [Kutta 1901], 6 [Butcher 1964] or 8 [Cooper & Verner 1972]."""
-    A, b = {4: _kutta, 6: _butcher, 8: _cooper_verner}[order]()
-    d, q = _estimate(A, order)
+    A, b = {4: _kutta_coefficients, 6: _butcher_coefficients, 8: _cooper_verner_coefficients}[order]()
+    d, q = _error_weights(A, order)
     tall = [np.ones(len(b))]
     for _ in range(order):
         tall.append(A @ tall[-1])  # A^n 1, what a linear equation asks of the weights at order n + 1
@@ -64,9 +64,9 @@ def lobatto(order: int) -> ExplicitTableau:
     return ExplicitTableau(A, b, d, q, defect / seen ** (order / q))
 
 
-def _estimate(A: np.ndarray, order: int) -> tuple[np.ndarray, int]:
+def _error_weights(A: np.ndarray, order: int) -> tuple[np.ndarray, int]:
     """Weights d that every rooted tree of at most q nodes is orthogonal to, q as large as there are any but zero."""
-    vectors, found = trees(A, order - 1), None
+    vectors, found = tree_vectors(A, order - 1), None
     for q in range(order - 1, 0, -1):
         conditions = np.array([v for n in range(1, q + 1) for v in vectors[n]])
         _, sizes, rows = np.linalg.svd(conditions)
@@ -80,7 +80,7 @@ def _estimate(A: np.ndarray, order: int) -> tuple[np.ndarray, int]:
     return found
 
 
-def trees(A: np.ndarray, order: int) -> dict[int, list[np.ndarray]]:
+def tree_vectors(A: np.ndarray, order: int) -> dict[int, list[np.ndarray]]:
     """For each number of nodes, up to ``order``, the vectors at the stages of the rooted trees with so many.
 
     That of a tree is the product of ``A v`` over its branches, v their vectors; a method has the order p if ``b . v``
@@ -88,28 +88,28 @@ def trees(A: np.ndarray, order: int) -> dict[int, list[np.ndarray]]:
     """
     found: dict[int, list[np.ndarray]] = {1: [np.ones(len(A))]}
     for n in range(2, order + 1):
-        found[n] = list(_forests(A, found, n - 1, n - 1))
+        found[n] = list(_forest_products(A, found, n - 1, n - 1))
     return found
 
 
-def _forests(A, found, nodes: int, largest: int):
+def _forest_products(A, found, nodes: int, largest: int):
     """Products of branches with so many nodes together, none of more than ``largest``."""
     if nodes == 0:
         yield np.ones(len(A))
         return
     for size in range(min(nodes, largest), 0, -1):
         for v in found[size]:
-            for rest in _forests(A, found, nodes - size, size):
+            for rest in _forest_products(A, found, nodes - size, size):
                 yield (A @ v) * rest
 
 
-def _kutta() -> tuple[np.ndarray, np.ndarray]:
+def _kutta_coefficients() -> tuple[np.ndarray, np.ndarray]:
     A = np.zeros((4, 4))
     A[1, 0], A[2, 1], A[3, 2] = 0.5, 0.5, 1.0
     return A, np.array([1, 2, 2, 1]) / 6
 
 
-def _butcher() -> tuple[np.ndarray, np.ndarray]:
+def _butcher_coefficients() -> tuple[np.ndarray, np.ndarray]:
     s, A = np.sqrt(5.0), np.zeros((7, 7))
     A[1, 0] = (5 - s) / 10
     A[2, :2] = -s / 10, (5 + 2 * s) / 10
@@ -120,7 +120,7 @@ def _butcher() -> tuple[np.ndarray, np.ndarray]:
     return A, np.array([1, 0, 0, 0, 5, 5, 1]) / 12
 
 
-def _cooper_verner() -> tuple[np.ndarray, np.ndarray]:
+def _cooper_verner_coefficients() -> tuple[np.ndarray, np.ndarray]:
     s, A, b = np.sqrt(21.0), np.zeros((11, 11)), np.zeros(11)
     A[1, 0] = 1 / 2
     A[2, :2] = 1 / 4, 1 / 4

@@ -8,12 +8,12 @@ import equinox as eqx
 import jax
 
 import manifolds as mf
-from manifolds._module import forwarded
+from manifolds._pytree_module import forward_to
 
-from ..functions.gradients import DiscreteGradient, discrete_gradient
+from ..functions.gradients import DiscreteGradient, get_discrete_gradient
 from ..systems import System
-from .base import OneStepMethod, TransportingMethod, collocation_error, generator_linearised, register
-from .charts import in_charts
+from .base import OneStepMethod, TransportingMethod, collocation_error, generator_residual_jvp, register
+from .charts import wrap_in_charts
 
 
 class MetriplecticMidpoint(TransportingMethod):
@@ -53,22 +53,22 @@ class MetriplecticMidpoint(TransportingMethod):
     retraction: str | mf.Retraction | None = eqx.field(static=True)
 
     def __init__(self, gradient: str | DiscreteGradient = "gonzalez", retraction: str | mf.Retraction | None = None):
-        self.gradient = discrete_gradient(gradient)
+        self.gradient = get_discrete_gradient(gradient)
         self.retraction = retraction
 
     def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
-        return in_charts(self, system, self.retraction, "midpoint")
+        return wrap_in_charts(self, system, self.retraction, "midpoint")
 
     stages = 1
 
-    order = forwarded("gradient")
+    order = forward_to("gradient")
 
     preserves = frozenset({"energy", "entropy_law_quadratic", "quadratic_casimirs"})
 
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
-        return system.field(*self.at_midpoint(system, x, compensation, h, k))[None]
+        return system.field(*self.midpoint_gradients(system, x, compensation, h, k))[None]
 
-    def at_midpoint(self, system: System, x, compensation, h, k) -> tuple:
+    def midpoint_gradients(self, system: System, x, compensation, h, k) -> tuple:
         """The midpoint z, and what the step takes for the gradients dH, dS and dL: the arguments of the field."""
         d = h * k[0]
         z = x + (compensation + 0.5 * d)
@@ -77,16 +77,16 @@ class MetriplecticMidpoint(TransportingMethod):
         dL = tuple(self.gradient(L, x, d, compensation) for L in system.preserved)
         return z, dH, dS, dL
 
-    def velocities(self, system: System, x, compensation, h, k) -> jax.Array:
-        return system.transport(*self.at_midpoint(system, x, compensation, h, k))[None]
+    def stage_velocities(self, system: System, x, compensation, h, k) -> jax.Array:
+        return system.transport(*self.midpoint_gradients(system, x, compensation, h, k))[None]
 
-    def transports(self, system: System) -> bool:
+    def can_transport_attitude(self, system: System) -> bool:
         return True
 
-    def linearised(self, system: System, x, compensation, h, k) -> Callable:
+    def residual_jvp(self, system: System, x, compensation, h, k) -> Callable:
         if not system.has_generator:
-            return super().linearised(system, x, compensation, h, k)
-        return generator_linearised(system, lambda k: x + (compensation + 0.5 * h * k), k)
+            return super().residual_jvp(system, x, compensation, h, k)
+        return generator_residual_jvp(system, lambda k: x + (compensation + 0.5 * h * k), k)
 
     def error(self, system: System, x, compensation, h, k) -> jax.Array:
         return collocation_error(system, x, compensation, h, k)

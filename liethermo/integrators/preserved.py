@@ -9,21 +9,21 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..errors import InputError
-from ..functions.checks import check_scalar, recognised
-from ..functions.energy import Energy, as_energy, function_name
+from ..functions.checks import check_energy, mark_polynomial_degrees
+from ..functions.energy import Energy, function_name, make_energy
 from ..systems import System
 
 
 def preserved_functions(preserve) -> tuple[Energy, ...]:
     """Those of ``preserve=``: one function, or a sequence of them."""
     functions = preserve if isinstance(preserve, list | tuple) else (preserve,)
-    return tuple(as_energy(C, "a preserved function") for C in functions)
+    return tuple(make_energy(C, "a preserved function") for C in functions)
 
 
-def seen_on(system: System, C: Energy) -> Energy:
+def function_on_states(system: System, C: Energy) -> Energy:
     """A preserved function as one of the state vectors of a system."""
-    C = check_scalar(system.on_states(C), system.dim, "a preserved function")
-    return recognised(C, system.dim) if system.space is None else C
+    C = check_energy(system.on_states(C), system.dim, "a preserved function")
+    return mark_polynomial_degrees(C, system.dim) if system.space is None else C
 
 
 def check_preserved(system: System, functions: Sequence[Energy]) -> None:
@@ -45,11 +45,11 @@ def why_not_preserved(C: Energy) -> str:
     )
 
 
-MAX_CASIMIR_SHARE = 1e-10
+CASIMIR_RTOL = 1e-10
 """Largest ``|Pi grad C|``, relative to what Pi does to other covectors, of a function that is a Casimir."""
 
 
-def share_moved(model: tuple[System, tuple[Energy, ...]], x) -> jax.Array:
+def casimir_residuals(model: tuple[System, tuple[Energy, ...]], x) -> jax.Array:
     """Return ``|Pi grad C|`` of each function at x, relative to ``|Pi v|`` of another covector v of that length."""
     system, functions = model
     system = system.here(x)
@@ -63,5 +63,5 @@ def share_moved(model: tuple[System, tuple[Energy, ...]], x) -> jax.Array:
 
 
 def is_momentum_map(shares: np.ndarray) -> np.ndarray:
-    """Return which functions are no Casimirs, from :func:`share_moved` at points: (..., points, functions)."""
-    return shares.max(axis=-2) > MAX_CASIMIR_SHARE
+    """Return which functions are no Casimirs, from :func:`casimir_residuals` at points: (..., points, functions)."""
+    return shares.max(axis=-2) > CASIMIR_RTOL

@@ -8,21 +8,21 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from manifolds.groups.maps import central, from_adjoint_cayley, inverse_dexp
+from manifolds.groups.maps import central_part, from_adjoint_cayley, inverse_dexp
 from manifolds.matrices.linear import solve_near_identity
 
 from ..errors import InputError
-from ..functions.frames import towards
-from ..functions.gradients import compensated
+from ..functions.frames import vector_with_products
+from ..functions.gradients import two_sum
 from ..systems import SPATIAL_MOMENTUM, WITHOUT_IMPULSE, AttitudeSystem, DrivenSystem, TurningSystem
-from .base import TransportingMethod, Wrapping, pulled
-from .explicit import LEVELS
-from .tableaus import gauss
+from .base import MethodWrapper, TransportingMethod, pullback_method
+from .explicit import INITIAL_LEVELS_ROW
+from .tableaus import gauss_tableau
 
 RECONSTRUCTIONS = ("coadjoint", "cayley", "exp")
 
 
-class WithAttitude(Wrapping):
+class WithAttitude(MethodWrapper):
     """A method for momenta, and after it ``g' = g hat(xi)``, xi_i the velocities that it moves with at its stages.
 
     The equations of a step are those of the momentum alone, and their tolerances are measured by it. The attitude is
@@ -72,7 +72,7 @@ class WithAttitude(Wrapping):
             raise InputError(f"the reconstruction is {', '.join(map(repr, RECONSTRUCTIONS))}, not {self.kind!r}")
 
     @property
-    def _moving(self) -> TransportingMethod:
+    def _transporting_method(self) -> TransportingMethod:
         """The method, which says how it moves the body."""
         if isinstance(self.method, TransportingMethod):
             return self.method
@@ -80,11 +80,11 @@ class WithAttitude(Wrapping):
             f"{self.method} does not say which velocities it moves with, so attitudes cannot be reconstructed"
         )
 
-    def keeps(self, system, name: str) -> bool:
+    def preserves_function(self, system, name: str) -> bool:
         if name not in (SPATIAL_MOMENTUM, WITHOUT_IMPULSE):
-            return self.method.keeps(system.body, name)
+            return self.method.preserves_function(system.body, name)
         follows = self.kind == "coadjoint" or (self.kind == "cayley" and system.group.cayley_is_adjoint())
-        return (self.explicit or follows) and self._moving.transports(system.body)
+        return (self.explicit or follows) and self._transporting_method.can_transport_attitude(system.body)
 
     def check(self, system) -> None:
         body = system.body
@@ -97,12 +97,12 @@ class WithAttitude(Wrapping):
         method, mu, mu_compensation = self.method, system.points(x), system.points(compensation)
         if self.explicit:
             local = TurningSystem(system, self.order, system.split(x)[1])
-            return pulled(method, local).slopes(local, local.around(x), local.around(compensation), h, k)
+            return pullback_method(method, local).slopes(local, local.around(x), local.around(compensation), h, k)
         body = system.body
         if not (isinstance(body, DrivenSystem) and body.needs_attitude):
             return method.slopes(body, mu, mu_compensation, h, k)
         pushed = jax.vmap(lambda torque: method.slopes(body.with_torque(torque), mu, mu_compensation, h, k))
-        found = pushed(self._torques(system, x, compensation, h, k))  # all stages with the torques of all
+        found = pushed(self._stage_torques(system, x, compensation, h, k))  # all stages with the torques of all
         return jnp.stack([found[i, i] for i in range(self.stages)])
 
     def start(self, system: AttitudeSystem, x) -> jax.Array:  # type: ignore[override]
@@ -111,16 +111,16 @@ class WithAttitude(Wrapping):
         mu, g = system.split(x)
         local, n = TurningSystem(system, self.order, g), system.group.dim
         k = self.method.start(local, local.around(x))  # behind the levels that it has begun on is room for more
-        return k.at[LEVELS, mu.shape[0] : mu.shape[0] + n].set(mu[:n] @ system.to_space(g))
+        return k.at[INITIAL_LEVELS_ROW, mu.shape[0] : mu.shape[0] + n].set(mu[:n] @ system.to_space(g))
 
     def error(self, system: AttitudeSystem, x, compensation, h, k) -> jax.Array:  # type: ignore[override]
         return self.method.error(system.body_at(x), system.points(x), system.points(compensation), h, system.points(k))
 
-    def resumed(self, system: AttitudeSystem, x) -> jax.Array:  # type: ignore[override]
+    def initial_compensation(self, system: AttitudeSystem, x) -> jax.Array:  # type: ignore[override]
         mu, g = system.split(x)
-        off = _missing(system.group, g) if self.kind == "cayley" else jnp.zeros_like(g)
+        off = _group_correction(system.group, g) if self.kind == "cayley" else jnp.zeros_like(g)
         momentum = jnp.zeros_like(system.in_space(x)) if system.pushed_by else None
-        return system.join(self.method.resumed(system.body, mu), off, momentum)
+        return system.join(self.method.initial_compensation(system.body, mu), off, momentum)
 
     # -- the attitude, which follows from it --------------------------------------------------------------------------
 
@@ -128,90 +128,105 @@ class WithAttitude(Wrapping):
         (mu, g), (mu_compensation, g_compensation) = system.split(x), system.split(compensation)
         new, new_compensation = self.method.move(system.body, mu, mu_compensation, h, system.points(k))
         if self.explicit:
-            return self._moved_explicitly(system, x, compensation, new, new_compensation, h, k)
-        xi = h * self._moving.velocities(system.body, mu, mu_compensation, h, k)[:, : system.group.dim]
-        p, p_compensation = self._in_space(system, x, compensation, h, k, xi) if system.has_impulse else (None, None)
+            return self._apply_explicit_step(system, x, compensation, new, new_compensation, h, k)
+        xi = (
+            h
+            * self._transporting_method.stage_velocities(system.body, mu, mu_compensation, h, k)[:, : system.group.dim]
+        )
+        p, p_compensation = (
+            self._update_spatial_momentum(system, x, compensation, h, k, xi) if system.has_impulse else (None, None)
+        )
         if self.kind == "cayley":
-            gained = (g + g_compensation) @ _collocated(system.group.algebra.hat(xi))
-            turned, turned_compensation = compensated(g, g_compensation + gained)
+            gained = (g + g_compensation) @ _collocation_increment(system.group.algebra.hat(xi))
+            turned, turned_compensation = two_sum(g, g_compensation + gained)
             return system.join(new, turned, p), system.join(
-                new_compensation, turned_compensation + _missing(system.group, turned), p_compensation
+                new_compensation, turned_compensation + _group_correction(system.group, turned), p_compensation
             )
-        turned = system.group.restore_map(g @ self._turn(system.group, xi))
+        turned = system.group.restore_map(g @ self._attitude_increment(system.group, xi))
         return system.join(new, turned, p), system.join(new_compensation, jnp.zeros_like(g), p_compensation)
 
-    def _moved_explicitly(
+    def _apply_explicit_step(
         self, system: AttitudeSystem, x, compensation, new, new_compensation, h, k
     ) -> tuple[jax.Array, jax.Array]:
         g, group, n = system.split(x)[1], system.group, system.group.dim
         local, step = TurningSystem(system, self.order, g), self.increment(h, k)
         turned = g @ group.exp_map(group.algebra, local.angles(step))
-        follows, p_compensation = system.body.torque_free and self._moving.transports(system.body), None
+        follows, p_compensation = (
+            system.body.torque_free and self._transporting_method.can_transport_attitude(system.body),
+            None,
+        )
         if system.has_impulse:
-            p, p_compensation = compensated(system.in_space(x), system.in_space(compensation) + local.in_space(step))
+            p, p_compensation = two_sum(system.in_space(x), system.in_space(compensation) + local.in_space(step))
             if follows:
-                p, p_compensation = _on_orbit(system.momenta, p, new), jnp.zeros_like(p)
+                p, p_compensation = _project_onto_orbit(system.momenta, p, new), jnp.zeros_like(p)
         else:  # that of the start of the run, since the roundings of steps would add up
-            p = k[LEVELS, system.body.dim : system.body.dim + n]
+            p = k[INITIAL_LEVELS_ROW, system.body.dim : system.body.dim + n]
         if follows:
-            turned = _carrying(group, turned, p, new[:n])
+            turned = _align_attitude(group, turned, p, new[:n])
         turned = group.restore_map(turned)
         return system.join(new, turned, p if system.has_impulse else None), system.join(
             new_compensation, jnp.zeros_like(g), p_compensation
         )
 
-    def plain(self, system: AttitudeSystem, x, h) -> jax.Array:
+    def step_without_compensation(self, system: AttitudeSystem, x, h) -> jax.Array:
         """A step without care for rounding, of a method that has such: see :meth:`.MetriplecticRungeKutta.plain`."""
         g, group = system.split(x)[1], system.group
         local = TurningSystem(system, self.order, g)
-        method: Any = pulled(self.method, local)
-        end = method.plain(local, local.around(x), h)
+        method: Any = pullback_method(self.method, local)
+        end = method.step_without_compensation(local, local.around(x), h)
         return system.join(system.points(end), g @ group.exp_map(group.algebra, local.angles(end)))
 
-    def _turn(self, group, xi) -> jax.Array:
+    def _attitude_increment(self, group, xi) -> jax.Array:
         """By what an attitude is turned in a step, of angles h xi at the stages, shape (stages, dim)."""
         if self.kind == "coadjoint":
-            return self._coadjoint(group, xi)
-        return group.exp_map(group.algebra, gauss(len(xi)).b @ self._rates(group.algebra, xi))
+            return self._coadjoint_increment(group, xi)
+        return group.exp_map(group.algebra, gauss_tableau(len(xi)).b @ self._algebra_slopes(group.algebra, xi))
 
-    def _attitudes(self, system: AttitudeSystem, x, compensation, h, k) -> jax.Array:
+    def _stage_attitudes(self, system: AttitudeSystem, x, compensation, h, k) -> jax.Array:
         """Those at the stages, at which torques are taken, shape (stages, m, m), in the group."""
         (mu, g), (mu_compensation, g_compensation), group = system.split(x), system.split(compensation), system.group
-        xi = h * self._moving.velocities(system.body, mu, mu_compensation, h, k)[:, : system.group.dim]
+        xi = (
+            h
+            * self._transporting_method.stage_velocities(system.body, mu, mu_compensation, h, k)[:, : system.group.dim]
+        )
         if self.kind == "exp" or (self.kind == "coadjoint" and len(xi) > 1):
-            return g @ group.exp_map(group.algebra, gauss(len(xi)).A @ self._rates(group.algebra, xi))
+            return g @ group.exp_map(group.algebra, gauss_tableau(len(xi)).A @ self._algebra_slopes(group.algebra, xi))
         if self.kind == "cayley":
-            found = (g + g_compensation) @ _stages(group.algebra.hat(xi))
+            found = (g + g_compensation) @ _collocation_stages(group.algebra.hat(xi))
         else:
-            found = 0.5 * (g + g @ self._turn(group, xi))[None]  # the same from either end
-        for _ in range(RESTORED):
+            found = 0.5 * (g + g @ self._attitude_increment(group, xi))[None]  # the same from either end
+        for _ in range(RESTORE_STEPS):
             found = group.restore_map(found)
         return found
 
-    def _torques(self, system: AttitudeSystem, x, compensation, h, k) -> jax.Array:
+    def _stage_torques(self, system: AttitudeSystem, x, compensation, h, k) -> jax.Array:
         """Those at the stages, shape (stages, size of a state of the body without its clock)."""
-        body, states = system.body, system.points(x) + (system.points(compensation) + h * (gauss(len(k)).A @ k))
+        body, states = system.body, system.points(x) + (system.points(compensation) + h * (gauss_tableau(len(k)).A @ k))
         assert isinstance(body, DrivenSystem)
         if not body.needs_attitude:
             return jax.vmap(body.push)(states)
-        attitudes = self._attitudes(system, x, compensation, h, k)
+        attitudes = self._stage_attitudes(system, x, compensation, h, k)
         return jax.vmap(lambda g, state: body.turned(g).push(state))(attitudes, states)
 
-    def _in_space(self, system: AttitudeSystem, x, compensation, h, k, xi) -> tuple[jax.Array, jax.Array]:
+    def _update_spatial_momentum(
+        self, system: AttitudeSystem, x, compensation, h, k, xi
+    ) -> tuple[jax.Array, jax.Array]:
         """The momentum in space as the impulse of the step makes it, and what rounding keeps from it."""
-        torques = self._torques(system, x, compensation, h, k)[:, : system.group.dim]
-        actions = _stages(-system.group.algebra.ad(xi).swapaxes(-1, -2)).swapaxes(-1, -2)  # Ad(inverse(g)), relative
-        impulse = h * jnp.einsum("i,ia,iab->b", gauss(len(xi)).b, torques, actions)
+        torques = self._stage_torques(system, x, compensation, h, k)[:, : system.group.dim]
+        actions = _collocation_stages(-system.group.algebra.ad(xi).swapaxes(-1, -2)).swapaxes(
+            -1, -2
+        )  # Ad(inverse(g)), relative
+        impulse = h * jnp.einsum("i,ia,iab->b", gauss_tableau(len(xi)).b, torques, actions)
         gained = impulse @ system.to_space(system.split(x)[1])
-        return compensated(system.in_space(x), system.in_space(compensation) + gained)
+        return two_sum(system.in_space(x), system.in_space(compensation) + gained)
 
-    def displaced(self, system: AttitudeSystem, x, v) -> jax.Array:  # type: ignore[override]
+    def displace(self, system: AttitudeSystem, x, v) -> jax.Array:  # type: ignore[override]
         """With the momentum displaced: what is looked at on the way of a step are functions of that."""
         mu, g = system.split(x)
         return system.join(mu + system.points(v), g, system.in_space(x))
 
     @staticmethod
-    def _coadjoint(group, xi) -> jax.Array:
+    def _coadjoint_increment(group, xi) -> jax.Array:
         """The element of the group whose adjoint action is that of the step; of angles h xi, shape (stages, dim).
 
         Where the end of collocation is no adjoint action it is that of the nearest, to the order of the method.
@@ -219,16 +234,16 @@ class WithAttitude(Wrapping):
         algebra = group.algebra
         if len(xi) == 1:
             return group.adjoint_cayley_map(algebra, xi[0])
-        R = jnp.eye(algebra.dim) + _collocated(algebra.ad(xi))
-        x = from_adjoint_cayley(algebra, R) + central(algebra, gauss(len(xi)).b @ xi)
+        R = jnp.eye(algebra.dim) + _collocation_increment(algebra.ad(xi))
+        x = from_adjoint_cayley(algebra, R) + central_part(algebra, gauss_tableau(len(xi)).b @ xi)
         return group.adjoint_cayley_map(algebra, x)
 
-    def _rates(self, algebra, xi) -> jax.Array:
+    def _algebra_slopes(self, algebra, xi) -> jax.Array:
         """h theta' at the stages of collocation in the algebra, shape (stages, dim).
 
         A sweep of iteration gains a power of the step; so many are one more than its order needs.
         """
-        tableau, k = gauss(len(xi)), xi
+        tableau, k = gauss_tableau(len(xi)), xi
         for _ in range(2 * len(xi) - 1 if len(xi) > 1 else 0):  # of one stage k is xi, which commutes with itself
             k = inverse_dexp(algebra, tableau.A @ k, xi, self.order)
         return k
@@ -237,22 +252,22 @@ class WithAttitude(Wrapping):
         return f"{self.method} with attitudes by {self.kind}"
 
 
-RESTORED = 3
+RESTORE_STEPS = 3
 """Newton steps to the group from the mean of two attitudes: where a step turns by 0.5, what is left is 1e-11, and
 below rounding where it turns by 0.2."""
 
 
-def _collocated(X) -> jax.Array:
+def _collocation_increment(X) -> jax.Array:
     """``G - I``, G the end of Gauss collocation of ``G' = G X`` on [0, 1] from I, for X at the stages, (s, m, m)."""
-    return jnp.einsum("j,jab,jbc->ac", gauss(len(X)).b, _stages(X), X)
+    return jnp.einsum("j,jab,jbc->ac", gauss_tableau(len(X)).b, _collocation_stages(X), X)
 
 
-def _stages(X) -> jax.Array:
+def _collocation_stages(X) -> jax.Array:
     """The stages G_i of that collocation, shape (s, m, m).
 
     Solved for their transposes, ``G_i^T = I + sum_j A_ij X_j^T G_j^T``.
     """
-    (stages, m), tableau = X.shape[:2], gauss(len(X))
+    (stages, m), tableau = X.shape[:2], gauss_tableau(len(X))
     turned = X.swapaxes(-1, -2)
     implicit = jnp.einsum("ij,jab->iajb", tableau.A, turned).reshape(stages * m, stages * m)
     start = jnp.tile(jnp.eye(m), (stages, 1))
@@ -260,11 +275,11 @@ def _stages(X) -> jax.Array:
     return G.swapaxes(-1, -2)
 
 
-GENTLE = 2.0**-6
+RESTORE_FRACTION = 2.0**-6
 """Share of what the entries of an attitude lack by being rounded that a step gives back."""
 
 
-def _missing(group, g) -> jax.Array:
+def _group_correction(group, g) -> jax.Array:
     """What to add to an attitude that steps have left outside of its group.
 
     What entries lack by being rounded is known beside them, and is not what steps have done. Given back in full at
@@ -272,28 +287,28 @@ def _missing(group, g) -> jax.Array:
     """
     missing = group.restore_map(g) - g
     rounding = jnp.max(jnp.abs(missing)) <= 4.0 * jnp.finfo(jnp.float64).eps * jnp.max(jnp.abs(g))
-    return jnp.where(rounding, GENTLE, 1.0) * missing
+    return jnp.where(rounding, RESTORE_FRACTION, 1.0) * missing
 
 
-TURNS, DAMPING = 3, 1e-8
-"""Newton steps of :func:`_carrying`, and what is added to the diagonal of a matrix that may be singular, relative to
+MAX_NEWTON_ITERATIONS, NEWTON_DAMPING = 3, 1e-8
+"""Newton steps of :func:`_align_attitude`, and what is added to the diagonal of a matrix that may be singular, relative to
 its largest entry. A step leaves the square of the misfit, or this share of it."""
 
 
-def _on_orbit(momenta, p, mu) -> jax.Array:
+def _project_onto_orbit(momenta, p, mu) -> jax.Array:
     """The dual vector next to p, of the group, that has the Casimirs of a state mu; other momenta of it stay."""
     n = len(p)
     size = jnp.max(jnp.abs(mu[:n]))
     size, casimirs = jnp.where(size > 0.0, size, 1.0), momenta.casimirs_of_momenta().values()
     p, mu = p / size, mu[: momenta.algebra.dim] / size
-    for _ in range(TURNS):
+    for _ in range(MAX_NEWTON_ITERATIONS):
         whole = jnp.concatenate([p, mu[n:]])
         defect = jnp.stack([C.value(mu) - C.value(whole) for C in casimirs])
-        p = p + towards([C.gradient(whole)[:n] for C in casimirs], defect)
+        p = p + vector_with_products([C.gradient(whole)[:n] for C in casimirs], defect)
     return size * p
 
 
-def _carrying(group, g, p, new) -> jax.Array:
+def _align_attitude(group, g, p, new) -> jax.Array:
     """The element next to g whose coadjoint action takes the momentum in space to the new one, on the same orbit.
 
     By Newton's method: ``ad*_eta m = new - m`` for the least eta, m being p as seen from g [Marquardt 1963].
@@ -301,16 +316,18 @@ def _carrying(group, g, p, new) -> jax.Array:
     algebra, size = group.algebra, jnp.max(jnp.abs(new))
     p, new = (v / jnp.where(size > 0.0, size, 1.0) for v in (p, new))
 
-    def nearer(made: int, g) -> jax.Array:
+    def newton_step(made: int, g) -> jax.Array:
         m = group.Ad_star(g, p)
         defect, moved = new - m, algebra.ad_star(jnp.eye(algebra.dim), m)
         square = moved @ moved.T
         most = jnp.max(jnp.diagonal(square))
-        damping = jnp.where(most > 0.0, DAMPING * most, 1.0)  # what moves m by rounding alone does not turn either
+        damping = jnp.where(
+            most > 0.0, NEWTON_DAMPING * most, 1.0
+        )  # what moves m by rounding alone does not turn either
         eta = solve_near_identity(square + damping * jnp.eye(algebra.dim), (moved @ defect)[:, None])[:, 0]
         g = g @ group.exp_map(algebra, eta)
-        if made == TURNS:
+        if made == MAX_NEWTON_ITERATIONS:
             return g
-        return jax.lax.cond(jnp.max(jnp.abs(defect)) > DAMPING, lambda: nearer(made + 1, g), lambda: g)
+        return jax.lax.cond(jnp.max(jnp.abs(defect)) > NEWTON_DAMPING, lambda: newton_step(made + 1, g), lambda: g)
 
-    return nearer(1, g)
+    return newton_step(1, g)

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..systems import System
-from ..tracing.programs import program
+from ..tracing.programs import jit_program
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,12 @@ class Reference:
         reached = 1
         try:
             run = solver(
-                lambda _, x: np.asarray(_field(system, x)), times[0], np.asarray(x0), times[-1], rtol=rtol, atol=atol
+                lambda _, x: np.asarray(_vector_field(system, x)),
+                times[0],
+                np.asarray(x0),
+                times[-1],
+                rtol=rtol,
+                atol=atol,
             )
             while run.status == "running" and reached < len(times):
                 message = run.step() or ""
@@ -80,6 +85,6 @@ class Reference:
         return f"Reference(rtol={self.rtol:g}, scheme={self.scheme})"
 
 
-@program
-def _field(system: System, x):
+@jit_program
+def _vector_field(system: System, x):
     return system.vector_field(x)

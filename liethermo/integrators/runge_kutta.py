@@ -11,13 +11,13 @@ import numpy as np
 import manifolds as mf
 
 from ..errors import InputError
-from ..functions.frames import towards
+from ..functions.frames import vector_with_products
 from ..systems import System
 from .base import register
-from .explicit import ERROR, OWN, SLOPE, ExplicitMethod, Unlawful
-from .lobatto import ORDERS, ExplicitTableau, lobatto
+from .explicit import ERROR_ROW, FIRST_METHOD_ROW, MEAN_SLOPE_ROW, ExplicitMethod, UncorrectedStep
+from .lobatto import LOBATTO_ORDERS, ExplicitTableau, lobatto_tableau
 
-FIRST, LAST = OWN, OWN + 1
+START_SLOPE_ROW, END_SLOPE_ROW = FIRST_METHOD_ROW, FIRST_METHOD_ROW + 1
 """The rows of the slopes at the ends of a step."""
 
 
@@ -68,27 +68,27 @@ class MetriplecticRungeKutta(ExplicitMethod):
         retraction: str | mf.Retraction | None = None,
         held: tuple[str, ...] = (),
     ):
-        if type(order) is not int or order not in ORDERS:
+        if type(order) is not int or order not in LOBATTO_ORDERS:
             raise InputError(f"the order is 4, 6 or 8, not {order!r}")
         super().__init__(order, preserve, retraction, held)
 
-    stages = LAST + 1
+    stages = END_SLOPE_ROW + 1
 
     @property
-    def evaluations(self) -> int:
+    def evaluations_per_iteration(self) -> int:
         return len(self.tableau.b)
 
     @property
     def tableau(self) -> ExplicitTableau:
-        return lobatto(self.order)
+        return lobatto_tableau(self.order)
 
-    def uncorrected(self, rates: Callable, spared: bool, x, compensation, h) -> Unlawful:
+    def base_step(self, rates: Callable, spared: bool, x, compensation, h) -> UncorrectedStep:
         t = self.tableau
-        slopes, changes = self._stages(rates, x, compensation, h)
+        slopes, changes = self._stage_slopes(rates, x, compensation, h)
         ends = jnp.stack([slopes[0], slopes[-1]])
-        return Unlawful(h * (t.b @ slopes), h * (t.b @ changes), jnp.asarray(t.d) @ slopes, ends)
+        return UncorrectedStep(h * (t.b @ slopes), h * (t.b @ changes), jnp.asarray(t.error_weights) @ slopes, ends)
 
-    def plain(self, system: System, x, h) -> jax.Array:
+    def step_without_compensation(self, system: System, x, h) -> jax.Array:
         """A step with one correction and without care for rounding, for derivatives by the parameters of a system.
 
         It misses the levels by the square of what the step does before its correction, O(h^{2p+2}): far below what a
@@ -97,7 +97,7 @@ class MetriplecticRungeKutta(ExplicitMethod):
         laws, t = self._laws(system), self.tableau
 
         @jax.checkpoint  # what is computed again is not carried from step to step: a shorter program, and faster
-        def rates(x) -> tuple[jax.Array, jax.Array]:
+        def field_and_law_rates(x) -> tuple[jax.Array, jax.Array]:
             """Those of the laws are by the whole field: along the motion they change by rounding alone."""
             dH = system.energy.gradient(x)
             dS = jnp.zeros_like(x) if system.entropy is None else system.entropy.gradient(x)
@@ -106,16 +106,16 @@ class MetriplecticRungeKutta(ExplicitMethod):
             changes = [jnp.zeros(())] * (len(laws) - len(given)) + [jnp.dot(g, field) for g in given]  # they come last
             return field, jnp.asarray(changes)
 
-        slopes, changes = self._stages(rates, x, 0.0, h)
+        slopes, changes = self._stage_slopes(field_and_law_rates, x, 0.0, h)
         end = x + h * (t.b @ slopes)
         if not laws:
             return end
         both, functions = jnp.stack([x, end]), [law.function for law in laws]
         values, gradients = zip(*(jax.vmap(jax.value_and_grad(f.value))(both) for f in functions), strict=True)
         missed = h * (t.b @ changes) - jnp.stack([after - before for before, after in values])
-        return end + towards([system.raised(end, gradient) for _, gradient in gradients], missed)
+        return end + vector_with_products([system.raise_index(end, gradient) for _, gradient in gradients], missed)
 
-    def _stages(self, rates: Callable, x, compensation, h) -> tuple[jax.Array, jax.Array]:
+    def _stage_slopes(self, rates: Callable, x, compensation, h) -> tuple[jax.Array, jax.Array]:
         """The field at the stages, shape (s, n), and the rates of the functions of the laws there, shape (s, laws)."""
         t = self.tableau
         s = len(t.b)
@@ -131,16 +131,16 @@ class MetriplecticRungeKutta(ExplicitMethod):
         """Weights of the cubic through both ends with the slopes there; its error between them is O(h^4)."""
         theta = np.asarray(theta, dtype=np.float64)
         found = np.zeros((*theta.shape, self.stages))
-        found[..., SLOPE] = theta**2 * (3.0 - 2.0 * theta)
-        found[..., FIRST] = theta * (1.0 - theta) ** 2
-        found[..., LAST] = theta**2 * (theta - 1.0)
+        found[..., MEAN_SLOPE_ROW] = theta**2 * (3.0 - 2.0 * theta)
+        found[..., START_SLOPE_ROW] = theta * (1.0 - theta) ** 2
+        found[..., END_SLOPE_ROW] = theta**2 * (theta - 1.0)
         return found
 
     def error(self, system: System, x, compensation, h, k) -> jax.Array:
         """From weights that lower orders leave undetermined: see :class:`.lobatto.ExplicitTableau`."""
         t = self.tableau
-        found, length = h * jnp.max(jnp.abs(k[ERROR])), h * jnp.max(jnp.abs(k[SLOPE]))
-        return t.scale * length * (found / jnp.where(length > 0.0, length, 1.0)) ** (self.order / t.q)
+        found, length = h * jnp.max(jnp.abs(k[ERROR_ROW])), h * jnp.max(jnp.abs(k[MEAN_SLOPE_ROW]))
+        return t.error_scale * length * (found / jnp.where(length > 0.0, length, 1.0)) ** (self.order / t.error_order)
 
 
-register(*map(MetriplecticRungeKutta, ORDERS))
+register(*map(MetriplecticRungeKutta, LOBATTO_ORDERS))

@@ -7,12 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..functions.path import Finer
+from ..functions.path import KronrodRule
 
-MOST_STAGES = 8
+MAX_STAGES = 8
 
 
-class Gauss(NamedTuple):
+class GaussTableau(NamedTuple):
     """The Gauss method of s stages on [0, 1], order 2s [Hairer, Lubich & Wanner 2006, II.1].
 
     Attributes
@@ -27,33 +27,33 @@ class Gauss(NamedTuple):
 
 
 @functools.cache
-def gauss(stages: int) -> Gauss:
+def gauss_tableau(stages: int) -> GaussTableau:
     """The tableau, each entry rounded once from extended precision."""
-    A, b, c = _extended(stages)
-    return Gauss(*(np.asarray(a, dtype=np.float64) for a in (A, b, c)))
+    A, b, c = _extended_tableau(stages)
+    return GaussTableau(*(np.asarray(a, dtype=np.float64) for a in (A, b, c)))
 
 
 @functools.cache
-def beyond(stages: int) -> np.ndarray:
+def extrapolation_matrix(stages: int) -> np.ndarray:
     """The matrix that takes the stage slopes of a step to those of the next, by the polynomial through them."""
-    return _lagrange(stages, 1 + _extended(stages)[2]).astype(np.float64)
+    return _lagrange_values(stages, 1 + _extended_tableau(stages)[2]).astype(np.float64)
 
 
 @functools.cache
-def at_start(stages: int) -> np.ndarray:
+def start_slope_weights(stages: int) -> np.ndarray:
     """Weights w with ``u'(0) = w @ k``, u the collocation polynomial."""
-    return _lagrange(stages, np.zeros((), dtype=np.longdouble)).astype(np.float64)
+    return _lagrange_values(stages, np.zeros((), dtype=np.longdouble)).astype(np.float64)
 
 
-def integrated(stages: int, theta) -> np.ndarray:
+def interpolation_weights(stages: int, theta) -> np.ndarray:
     """Weights w(theta), shape (..., s), with ``u(theta) = x + h w @ k`` the collocation polynomial at t + theta h."""
     nodes = 2 * np.asarray(theta, dtype=np.float64) - 1
-    values = _legendre(stages, nodes)
-    return _integrals(values) @ _coefficients(stages).astype(np.float64)
+    values = _legendre_values(stages, nodes)
+    return _legendre_integrals(values) @ _lagrange_coefficients(stages).astype(np.float64)
 
 
 @functools.cache
-def finer(stages: int) -> Finer | None:
+def kronrod_rule(stages: int) -> KronrodRule | None:
     """The Kronrod rules of 1 + 2 nodes, degree 5, and of 2 + 3, degree 7; more stages need none."""
     if stages > 2:
         return None
@@ -63,37 +63,37 @@ def finer(stages: int) -> Finer | None:
         offsets, b = [-((6 / 7) ** 0.5), 0.0, (6 / 7) ** 0.5], [49 / 495, 14 / 45, 49 / 495]
         change = [-14 / 55, -14 / 55]
     theta = (1 + np.array(offsets)) / 2
-    slopes = _lagrange(stages, theta).astype(np.float64)
-    return Finer(integrated(stages, theta), slopes, np.array(b), np.array(change))
+    slopes = _lagrange_values(stages, theta).astype(np.float64)
+    return KronrodRule(interpolation_weights(stages, theta), slopes, np.array(b), np.array(change))
 
 
-def _extended(stages: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    x, b = _rule(stages)
-    return _integrals(_legendre(stages, x)) @ _coefficients(stages), b, (1 + x) / 2
+def _extended_tableau(stages: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    x, b = _gauss_rule(stages)
+    return _legendre_integrals(_legendre_values(stages, x)) @ _lagrange_coefficients(stages), b, (1 + x) / 2
 
 
 @functools.cache
-def _rule(stages: int) -> tuple[np.ndarray, np.ndarray]:
+def _gauss_rule(stages: int) -> tuple[np.ndarray, np.ndarray]:
     """Gauss nodes on [-1, 1] and weights on [0, 1] in extended precision."""
     x = np.polynomial.legendre.leggauss(stages)[0].astype(np.longdouble)
     for _ in range(2):  # Newton's method from double precision; the second pass has the slope at the root
-        values = _legendre(stages, x)
+        values = _legendre_values(stages, x)
         slope = stages * (values[..., stages - 1] - x * values[..., stages]) / (1 - x * x)
         x = x - values[..., stages] / slope
     return x, 1 / ((1 - x * x) * slope**2)
 
 
-def _coefficients(stages: int) -> np.ndarray:
+def _lagrange_coefficients(stages: int) -> np.ndarray:
     """The Lagrange polynomials of the nodes in Legendre's: entry m, j is ``(2m + 1) b_j P_m(x_j)``."""
-    x, b = _rule(stages)
-    return ((2 * np.arange(stages) + 1) * b[:, None] * _legendre(stages, x)[:, :stages]).T
+    x, b = _gauss_rule(stages)
+    return ((2 * np.arange(stages) + 1) * b[:, None] * _legendre_values(stages, x)[:, :stages]).T
 
 
-def _lagrange(stages: int, theta) -> np.ndarray:
-    return _legendre(stages, 2 * theta - 1)[..., :stages] @ _coefficients(stages)
+def _lagrange_values(stages: int, theta) -> np.ndarray:
+    return _legendre_values(stages, 2 * theta - 1)[..., :stages] @ _lagrange_coefficients(stages)
 
 
-def _legendre(stages: int, x) -> np.ndarray:
+def _legendre_values(stages: int, x) -> np.ndarray:
     """``P_0 … P_s`` at x, along a new last axis."""
     values = [np.ones_like(x), x]
     for m in range(1, stages):
@@ -101,7 +101,7 @@ def _legendre(stages: int, x) -> np.ndarray:
     return np.stack(values, axis=-1)
 
 
-def _integrals(values: np.ndarray) -> np.ndarray:
+def _legendre_integrals(values: np.ndarray) -> np.ndarray:
     """Integrals over [0, theta] of the shifted ``P_0 … P_(s-1)``, from the values of ``P_0 … P_s`` there."""
     stages = values.shape[-1] - 1
     first = (1 + values[..., 1:2]) / 2

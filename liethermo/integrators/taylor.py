@@ -13,24 +13,24 @@ import manifolds as mf
 
 from ..errors import InputError
 from ..systems import System
-from ..tracing.taylor import NoSeriesError, check_series, solution
+from ..tracing.taylor import TaylorSeriesError, check_taylor_series, taylor_coefficients
 from .base import OneStepMethod, register
-from .charts import retraction_of
-from .explicit import ERROR, OWN, SLOPE, ExplicitMethod, Unlawful
+from .charts import resolve_retraction
+from .explicit import ERROR_ROW, FIRST_METHOD_ROW, MEAN_SLOPE_ROW, ExplicitMethod, UncorrectedStep
 from .lobatto import lobatto_rule
 
-LOWEST, HIGHEST = 2, 24
+MIN_ORDER, MAX_ORDER = 2, 24
 """Orders: beyond the highest, double precision has no use for more."""
 
 
-TOLERANCE = 1e-10
+DEFAULT_RTOL = 1e-10
 """What the order is chosen for where no tolerance is given."""
 
 
-def order_for(tolerance: float | None) -> int:
+def order_for_tolerance(tolerance: float | None) -> int:
     """The order that a relative tolerance asks for [Jorba & Zou 2005]."""
-    order = math.ceil(1.0 - 0.5 * math.log(TOLERANCE if tolerance is None else tolerance))
-    return min(max(LOWEST, order), HIGHEST)
+    order = math.ceil(1.0 - 0.5 * math.log(DEFAULT_RTOL if tolerance is None else tolerance))
+    return min(max(MIN_ORDER, order), MAX_ORDER)
 
 
 class MetriplecticTaylor(ExplicitMethod):
@@ -74,30 +74,30 @@ class MetriplecticTaylor(ExplicitMethod):
         retraction: str | mf.Retraction | None = None,
         held: tuple[str, ...] = (),
     ):
-        if order is not None and (type(order) is not int or not LOWEST <= order <= HIGHEST):
-            raise InputError(f"the order is an integer from {LOWEST} to {HIGHEST}, or None, not {order!r}")
+        if order is not None and (type(order) is not int or not MIN_ORDER <= order <= MAX_ORDER):
+            raise InputError(f"the order is an integer from {MIN_ORDER} to {MAX_ORDER}, or None, not {order!r}")
         super().__init__(order, preserve, retraction, held)
 
     def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
         if self.number is not None:
             return super().on(system)
-        return type(self)(order_for(tolerance), self.functions, self.retraction, self.held).on(system)
+        return type(self)(order_for_tolerance(tolerance), self.functions, self.retraction, self.held).on(system)
 
     @property
     def order(self) -> int:
-        return order_for(None) if self.number is None else self.number
+        return order_for_tolerance(None) if self.number is None else self.number
 
     @property
     def stages(self) -> int:
-        return OWN + self.order
+        return FIRST_METHOD_ROW + self.order
 
     @property
-    def evaluations(self) -> int:
+    def evaluations_per_iteration(self) -> int:
         """Products of two series take as many multiplications as there are pairs; and the production at the nodes."""
-        return self.order * (self.order + 1) // 2 + len(self._rule[0])
+        return self.order * (self.order + 1) // 2 + len(self._lobatto_rule[0])
 
     @property
-    def _rule(self) -> tuple[np.ndarray, np.ndarray]:
+    def _lobatto_rule(self) -> tuple[np.ndarray, np.ndarray]:
         return lobatto_rule((self.order + 1) // 2 + 1)
 
     def check(self, system: System) -> None:
@@ -109,47 +109,47 @@ class MetriplecticTaylor(ExplicitMethod):
             functions["the entropy"] = system.entropy.value
         for name, function in functions.items():
             try:
-                check_series(function, x)
-            except NoSeriesError as error:
-                raise error.about(
+                check_taylor_series(function, x)
+            except TaylorSeriesError as error:
+                raise error.add_context(
                     f"{self} needs Taylor series, and of {name} ", "take lt.MetriplecticRungeKutta"
                 ) from None
         if system.space is not None and self.retraction is not None:
-            self._check_chart(system.space)
+            self._check_chart_series(system.space)
 
-    def _check_chart(self, space: mf.Space) -> None:
+    def _check_chart_series(self, space: mf.Space) -> None:
         """Raise NoSeriesError unless the points of a chart have Taylor series."""
         assert self.retraction is not None
-        chart = retraction_of(space, self.retraction).chart
+        chart = resolve_retraction(space, self.retraction).chart
         z = space.random(0)
 
         def point(c):
             return space.to_vector(chart._point(z, space._from_coordinates(z, c)))
 
         try:
-            check_series(point, jnp.zeros(space.dim))
-        except NoSeriesError as error:
-            raise error.about(
+            check_taylor_series(point, jnp.zeros(space.dim))
+        except TaylorSeriesError as error:
+            raise error.add_context(
                 f"{self} needs Taylor series, and of {chart} ",
                 "leave out retraction=, or take lt.MetriplecticGauss or lt.MetriplecticRungeKutta",
             ) from None
 
-    def uncorrected(self, rates: Callable, spared: bool, x, compensation, h) -> Unlawful:
-        nodes, b = self._rule
+    def base_step(self, rates: Callable, spared: bool, x, compensation, h) -> UncorrectedStep:
+        nodes, b = self._lobatto_rule
         numbers = np.arange(1.0, self.order + 1.0)
-        c = solution(lambda y: rates(y)[0], x, h, self.order)  # from the centre of a chart, exactly
+        c = taylor_coefficients(lambda y: rates(y)[0], x, h, self.order)  # from the centre of a chart, exactly
         points = jnp.concatenate([x[None], x + (compensation + nodes[1:, None] ** numbers @ c)])
         fields, found = jax.vmap(rates)(points[-1:] if spared else points)
         defect, changes = fields[-1] - (numbers @ c) / h, found[-1] if spared else h * (b @ found)
-        return Unlawful(jnp.sum(c, axis=0), changes, defect / (self.order + 1), c / h)
+        return UncorrectedStep(jnp.sum(c, axis=0), changes, defect / (self.order + 1), c / h)
 
     def weights(self, theta) -> np.ndarray:
         """Weights of the polynomial and of its correction, which grows like the first term that is left out."""
         theta = np.asarray(theta, dtype=np.float64)[..., None]
         last = theta ** (self.order + 1)
         found = np.zeros((*theta.shape[:-1], self.stages))
-        found[..., OWN:] = theta ** np.arange(1, self.order + 1) - last
-        found[..., SLOPE] = last[..., 0]
+        found[..., FIRST_METHOD_ROW:] = theta ** np.arange(1, self.order + 1) - last
+        found[..., MEAN_SLOPE_ROW] = last[..., 0]
         return found
 
     def error(self, system: System, x, compensation, h, k) -> jax.Array:
@@ -158,7 +158,7 @@ class MetriplecticTaylor(ExplicitMethod):
         The first term left out of X' is p + 1 times that of X, so the estimate is right to a factor that tends to 1. It
         also sees where a test has been decided otherwise on the way.
         """
-        return h * jnp.max(jnp.abs(k[ERROR]))
+        return h * jnp.max(jnp.abs(k[ERROR_ROW]))
 
 
 register(*map(MetriplecticTaylor, (6, 12, 20)))

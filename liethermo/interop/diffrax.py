@@ -11,21 +11,21 @@ import diffrax
 import jax
 import jax.numpy as jnp
 
-from manifolds._names import listing
+from manifolds._names import public_dir
 
 from ..errors import InputError
-from ..functions.checks import traced_energies
+from ..functions.checks import trace_energies
 from ..integrators import DEFAULT_METHOD, OneStepMethod
-from ..integrators.base import estimates_error
-from ..runs.flow import first_carry, one_step
+from ..integrators.base import has_error_estimate
+from ..runs.flow import differentiable_step, initial_carry
 from ..systems import System
 
 __all__ = ["Solver", "Term"]
-__dir__ = listing(__all__)
+__dir__ = public_dir(__all__)
 
 
 class Term(diffrax.ODETerm):
-    """The vector field of a system as a term of diffrax, for its solvers and for :class:`Solver`.
+    """The vector field of a system as a term of diffrax, for its solvers and for :class:`PointSolver`.
 
     Parameters
     ----------
@@ -37,14 +37,14 @@ class Term(diffrax.ODETerm):
 
     def __init__(self, system: System):
         self.system = system
-        self.vector_field = _field
+        self.vector_field = _unbound_field
 
     def vf(self, t, y, args):
         """The vector field at a state, shape (n,)."""
         return self.system.vector_field(y, t if self.system.is_driven else None)
 
 
-def _field(t, y, args):
+def _unbound_field(t, y, args):
     raise NotImplementedError("Term.vf knows the system")
 
 
@@ -79,18 +79,20 @@ class Solver(diffrax.AbstractAdaptiveSolver):
     def init(self, terms, t0, t1, y0, args) -> Any:
         """What a run carries besides its state: the lost digits, and the slopes of the last two steps."""
         del t0, t1, args
-        system, method = self._on(terms)
-        return first_carry(system, method, y0)[1:]
+        system, method = self._system_and_method(terms)
+        return initial_carry(system, method, y0)[1:]
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         """One step; a step whose equations are not solved is rejected, or ends the run, by diffrax's own rules."""
-        system, method = self._on(terms)
+        system, method = self._system_and_method(terms)
         h = getattr(terms, "direction", 1) * (t1 - t0)  # diffrax wraps a term to turn time around
         compensation, k, before = solver_state
-        y1, *state = one_step(system, method, (y0, compensation, k, before), h)
+        y1, *state = differentiable_step(system, method, (y0, compensation, k, before), h)
         solved = jnp.isfinite(jnp.sum(y1))
         slopes = state[1]
-        error = method.error(system, y0, compensation, jnp.abs(h), slopes) if estimates_error(method) else jnp.zeros(())
+        error = (
+            method.error(system, y0, compensation, jnp.abs(h), slopes) if has_error_estimate(method) else jnp.zeros(())
+        )
         estimate = jax.lax.stop_gradient(jnp.full_like(y0, jnp.where(solved, error, jnp.inf)))
         field = system.vector_field
         dense = {"y0": y0, "y1": y1, "k": h * jnp.stack([field(y0), field(y1)])}
@@ -101,10 +103,10 @@ class Solver(diffrax.AbstractAdaptiveSolver):
         """The vector field."""
         return terms.vf(t0, y0, args)
 
-    def _on(self, terms) -> tuple[System, OneStepMethod]:
+    def _system_and_method(self, terms) -> tuple[System, OneStepMethod]:
         system = getattr(terms, "term", terms).system
         if system.is_driven:
             raise InputError(
                 "an energy that depends on time needs a clock and a ledger in the state: use lt.integrate or lt.flow"
             )
-        return system, traced_energies(self.method.on(system), system.dim)
+        return system, trace_energies(self.method.on(system), system.dim)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from manifolds._names import listing
+from manifolds._names import public_dir
 from manifolds.errors import warn
 
 from ..errors import InputError
@@ -17,17 +17,17 @@ from ..integrators import MetriplecticRungeKutta, OneStepMethod
 from ..results.solution import Solution
 from ..runs.adaptive import Adaptive
 from ..runs.integrate import integrate, solution_without_steps
-from ..runs.timetable import times_within
-from ..runs.watch import Watch
+from ..runs.timetable import clip_times_to_span
+from ..runs.watch import EventSet
 from ..systems import System
 
 __all__ = ["OdeResult", "solve_ivp"]
-__dir__ = listing(__all__)
+__dir__ = public_dir(__all__)
 
-STATUSES = {"completed": 0, "event": 1}
+SCIPY_STATUS = {"completed": 0, "event": 1}
 """SciPy's numbers for how a run ended; -1 for every failure."""
 
-UNUSED = {"jac", "jac_sparsity", "lband", "uband", "min_step"}
+UNSUPPORTED_OPTIONS = {"jac", "jac_sparsity", "lband", "uband", "min_step"}
 """Options of SciPy's solvers that have no place here: the methods take what they need from the system."""
 
 
@@ -132,26 +132,26 @@ def solve_ivp(
             "the laws are those of its energy and entropy"
         )
     for name in options:
-        why = "the methods take it from the system" if name in UNUSED else "solve_ivp has no such option"
+        why = "the methods take it from the system" if name in UNSUPPORTED_OPTIONS else "solve_ivp has no such option"
         raise InputError(f"leave out {name}: {why}")
     functions = [] if events is None else [events] if callable(events) else list(events)
     if args is not None and not functions:
         raise InputError("args are passed to the events, and there are none: the system has its parameters in itself")
-    start, end = _span(t_span)
-    wanted = None if t_eval is None else _times(t_eval, start, end)
+    start, end = _checked_span(t_span)
+    wanted = None if t_eval is None else _checked_times(t_eval, start, end)
     _check_first_step(first_step, end - start)
-    watch = Watch(functions, _tuple(args)) if functions else None
-    if math.isinf(end) and not (watch and watch.can_end):
+    watch = EventSet(functions, _checked_args(args)) if functions else None
+    if math.isinf(end) and not (watch and watch.has_terminal):
         raise InputError("an infinite end needs an event that ends the run: set event.terminal = True, or a finite end")
     method = MetriplecticRungeKutta(order=8) if method is None else method
     step = Adaptive(
-        _tolerance("rtol", rtol, y0),
-        _tolerance("atol", atol, y0),
+        _scalar_tolerance("rtol", rtol, y0),
+        _scalar_tolerance("atol", atol, y0),
         first_step,
         None if max_step == math.inf else max_step,
     )
     if end == start:
-        return _result_without_steps(fun, y0, start, method, wanted, dense_output, watch)
+        return _empty_span_result(fun, y0, start, method, wanted, dense_output, watch)
     solution = integrate(
         fun,
         y0,
@@ -165,14 +165,14 @@ def solve_ivp(
         progress=False,
     )
     keep = np.ones(len(solution.t), bool) if wanted is None else np.isin(solution.t, wanted)
-    return _result(solution, solution.t[keep], solution.x[keep], method, watch, dense_output)
+    return _ode_result(solution, solution.t[keep], solution.x[keep], method, watch, dense_output)
 
 
-def _result(
-    solution: Solution, t: np.ndarray, x: np.ndarray, method: OneStepMethod, watch: Watch | None, dense: bool
+def _ode_result(
+    solution: Solution, t: np.ndarray, x: np.ndarray, method: OneStepMethod, watch: EventSet | None, dense: bool
 ) -> OdeResult:
     """Return what SciPy would of a solution, with the states x, shape (times, n), that are asked for."""
-    stats, status = solution.stats, STATUSES.get(str(solution.status.code), -1)
+    stats, status = solution.stats, SCIPY_STATUS.get(str(solution.status.code), -1)
     iterations = stats.fixed_point_iterations + stats.newton_iterations
     shape = solution.x.shape[1:]
 
@@ -183,9 +183,9 @@ def _result(
         t=t,
         y=x.T,
         sol=sol if dense else None,
-        t_events=None if watch is None else [np.array(times) for times in watch.times],
-        y_events=None if watch is None else [np.array(y).reshape(len(y), *shape) for y in watch.states],
-        nfev=iterations * method.evaluations,
+        t_events=None if watch is None else [np.array(times) for times in watch.event_times],
+        y_events=None if watch is None else [np.array(y).reshape(len(y), *shape) for y in watch.event_states],
+        nfev=iterations * method.evaluations_per_iteration,
         njev=stats.newton_iterations,
         nlu=stats.newton_iterations,
         status=status,
@@ -195,20 +195,20 @@ def _result(
     )
 
 
-def _result_without_steps(
+def _empty_span_result(
     fun: System,
     y0,
     t: float,
     method: OneStepMethod,
     wanted: np.ndarray | None,
     dense: bool,
-    watch: Watch | None,
+    watch: EventSet | None,
 ) -> OdeResult:
     """Return the result over a span of length zero: as in SciPy, the initial state at its start and at its end."""
     solution = solution_without_steps(fun, y0, t, method)
-    ended = watch is not None and watch.of_state(t, solution.x[0])
+    ended = watch is not None and watch.find_events_at_state(t, solution.x[0])
     times = np.array([t, t]) if wanted is None else wanted
-    result = _result(solution, times, np.repeat(solution.x, len(times), axis=0), method, watch, dense)
+    result = _ode_result(solution, times, np.repeat(solution.x, len(times), axis=0), method, watch, dense)
     return replace(result, status=1, message="A termination event occurred.") if ended else result
 
 
@@ -220,24 +220,24 @@ def _check_first_step(first_step: float | None, length: float) -> None:
         )
 
 
-SMALLEST_RTOL = 100.0 * float(np.finfo(np.float64).eps)
+MIN_RTOL = 100.0 * float(np.finfo(np.float64).eps)
 """The least relative tolerance that an array may have, as in SciPy; smaller ones are raised to it."""
 
 
-def _tolerance(name: str, given, y0) -> float:
+def _scalar_tolerance(name: str, given, y0) -> float:
     """Return the tolerance of all components: the smallest, where there is one for each."""
     if np.ndim(given) == 0:
         return given.item() if isinstance(given, np.ndarray) else given
     values = np.asarray(given, dtype=np.float64)
     if values.shape != np.shape(y0):
         raise InputError(f"{name} must be a number or an array of shape {np.shape(y0)}, as y0, got {values.shape}")
-    if name == "rtol" and (values < SMALLEST_RTOL).any():
-        warn(f"At least one element of rtol is too small. Setting rtol = np.maximum(rtol, {SMALLEST_RTOL:.3g})")
-        values = np.maximum(values, SMALLEST_RTOL)
+    if name == "rtol" and (values < MIN_RTOL).any():
+        warn(f"At least one element of rtol is too small. Setting rtol = np.maximum(rtol, {MIN_RTOL:.3g})")
+        values = np.maximum(values, MIN_RTOL)
     return float(values.min())
 
 
-def _span(t_span) -> tuple[float, float]:
+def _checked_span(t_span) -> tuple[float, float]:
     try:
         start, end = map(float, t_span)
     except (TypeError, ValueError):
@@ -252,14 +252,14 @@ def _span(t_span) -> tuple[float, float]:
     return start, end
 
 
-def _times(t_eval, start: float, end: float) -> np.ndarray:
+def _checked_times(t_eval, start: float, end: float) -> np.ndarray:
     times = np.asarray(t_eval, dtype=np.float64)
     if times.ndim != 1 or np.any(np.diff(times) <= 0.0):
         raise InputError("t_eval must be a list of increasing times")
-    return times_within(times, start, end, "t_eval")
+    return clip_times_to_span(times, start, end, "t_eval")
 
 
-def _tuple(args) -> tuple:
+def _checked_args(args) -> tuple:
     if args is None:
         return ()
     try:

@@ -20,7 +20,7 @@ import numpy as np
 import sympy
 
 import manifolds as mf
-from manifolds._names import listing
+from manifolds._names import public_dir
 
 from .. import disk
 from ..errors import FileError, InputError
@@ -31,14 +31,14 @@ from ..tracing.program import Program
 from ..tracing.scalarize import scalarize
 
 __all__ = ["Expressions", "describe", "expressions", "function", "write"]
-__dir__ = listing(__all__)
+__dir__ = public_dir(__all__)
 
-FORMAT = "liethermo-problem-1"
+PROBLEM_FORMAT = "liethermo-problem-1"
 
-LARGEST_DENOMINATOR = 1000
+MAX_DENOMINATOR = 1000
 """A number that is the double nearest to a fraction of such a denominator is written as the fraction."""
 
-OPERATIONS: dict[str, Callable[..., Any]] = {
+SYMPY_OPERATIONS: dict[str, Callable[..., Any]] = {
     "add": lambda a, b: a + b,
     "sub": lambda a, b: a - b,
     "mul": lambda a, b: a * b,
@@ -68,7 +68,7 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
 """What the scalar operations of a traced program are in SymPy."""
 
 
-SPECIAL: dict[str, Callable[..., Any]] = {
+JAX_SPECIAL_FUNCTIONS: dict[str, Callable[..., Any]] = {
     **{name: getattr(jax.scipy.special, name) for name in "erf erfc gamma polygamma".split()},
     "loggamma": jax.scipy.special.gammaln,
 }
@@ -123,7 +123,7 @@ def expressions(system: System, names: Sequence[str] | None = None) -> Expressio
 
     def of(function: Callable) -> list[sympy.Expr]:
         closed = jax.make_jaxpr(function)(jax.ShapeDtypeStruct((system.dim,), jnp.float64))
-        return _interpreted(scalarize(closed), variables)
+        return _program_expressions(scalarize(closed), variables)
 
     return Expressions(
         variables=variables,
@@ -157,20 +157,20 @@ def function(expression: Any, variables: Sequence[sympy.Symbol]) -> Callable:
         raise InputError(f"{', '.join(sorted(map(str, others)))} in {expression} is no component of the state")
     if expression.is_polynomial(*variables):
         return mf.sympy.polynomial(expression, variables)
-    found = _in_jax(expression, variables)
+    found = _jax_function(expression, variables)
     if found is None:
         parts = sympy.postorder_traversal(expression)
-        unknown = next(part for part in parts if part.args and _in_jax(part, variables) is None)
+        unknown = next(part for part in parts if part.args and _jax_function(part, variables) is None)
         raise InputError(
             f"{unknown.func.__name__} in {unknown} has no counterpart in JAX: write the function with jax.numpy"
         )
     return found
 
 
-def _in_jax(expression: sympy.Basic, variables: tuple[sympy.Symbol, ...]) -> Callable | None:
+def _jax_function(expression: sympy.Basic, variables: tuple[sympy.Symbol, ...]) -> Callable | None:
     """A function of one JAX array; None where a name of the expression is none of JAX."""
     try:
-        compiled = sympy.lambdify(variables, expression, modules=[SPECIAL, "jax"])
+        compiled = sympy.lambdify(variables, expression, modules=[JAX_SPECIAL_FUNCTIONS, "jax"])
         jax.eval_shape(lambda x: compiled(*x), jax.ShapeDtypeStruct((len(variables),), jnp.float64))
     except (NameError, AttributeError, NotImplementedError, TypeError):
         return None
@@ -204,16 +204,16 @@ def describe(system: System, x0, t_span: tuple[float, float], name: str = "probl
     """
     found = expressions(system)
     problem = {
-        "format": FORMAT,
+        "format": PROBLEM_FORMAT,
         "name": name,
         "variables": [str(x) for x in found.variables],
-        "energy": _written(found.energy),
-        "entropy": None if found.entropy is None else _written(found.entropy),
-        "casimirs": {key: _written(value) for key, value in found.casimirs.items()},
-        "field": [_written(component) for component in found.field],
+        "energy": _as_source_text(found.energy),
+        "entropy": None if found.entropy is None else _as_source_text(found.entropy),
+        "casimirs": {key: _as_source_text(value) for key, value in found.casimirs.items()},
+        "field": [_as_source_text(component) for component in found.field],
         "initial_state": [float(value) for value in np.asarray(x0, dtype=np.float64)],
         "t_span": [float(t) for t in t_span],
-        "reference": _reference(system, x0, t_span),
+        "reference": _reference_solution(system, x0, t_span),
     }
     if isinstance(system, LiePoissonSystem):
         constants = mf.sympy.structure_constants(system.algebra)
@@ -239,60 +239,62 @@ def write(problem: dict[str, Any], path: str | os.PathLike) -> Path:
     path = Path(path)
     text = json.dumps(problem, indent=2, ensure_ascii=False) + "\n"
     try:
-        disk.write(path, text.encode())
+        disk.write_atomically(path, text.encode())
     except (OSError, ValueError) as error:
-        raise FileError(f"cannot write {path}: {disk.why(error)}") from error
+        raise FileError(f"cannot write {path}: {disk.why_os_failed(error)}") from error
     return path
 
 
-def _written(expression: sympy.Expr) -> dict[str, str]:
+def _as_source_text(expression: sympy.Expr) -> dict[str, str]:
     return {"sympy": str(expression), "julia": sympy.julia_code(expression)}
 
 
-def _reference(system: System, x0, t_span: tuple[float, float]) -> dict[str, Any]:
+def _reference_solution(system: System, x0, t_span: tuple[float, float]) -> dict[str, Any]:
     length = t_span[1] - t_span[0]
     by_scipy = integrate(system, x0, t_span, length, Reference(rtol=1e-13), progress=False).x[-1]
-    by_gauss = integrate(system, x0, t_span, _short(system, x0, length), MetriplecticGauss(6), progress=False).x[-1]
+    by_gauss = integrate(
+        system, x0, t_span, _accurate_step_size(system, x0, length), MetriplecticGauss(6), progress=False
+    ).x[-1]
     apart = float(np.abs(by_scipy - by_gauss).max())
     digits = int(np.clip(-np.log10(max(apart, 1e-16)), 1, 15))
     return {"time": float(t_span[1]), "state": [round(float(x), digits) for x in by_gauss], "apart": apart}
 
 
-def _short(system: System, x0, length: float) -> float:
+def _accurate_step_size(system: System, x0, length: float) -> float:
     """A step for collocation of order 12: a fifth of the time in which the state changes by its size."""
     x = np.asarray(x0, dtype=np.float64)
     speed = float(np.abs(system.vector_field(system.state(x))).max())
     return float(min(0.05 * length, 0.2 * max(np.abs(x).max(), 1e-3) / max(speed, 1e-300), 0.1))
 
 
-def _interpreted(program: Program, variables: Sequence[sympy.Symbol]) -> list[sympy.Expr]:
+def _program_expressions(program: Program, variables: Sequence[sympy.Symbol]) -> list[sympy.Expr]:
     """The outputs of a program, its single input standing for the variables."""
     values: dict[Any, Any] = dict(zip(program.inputs[0], variables, strict=True))
 
     def value(a: Any) -> Any:
-        return values[a] if isinstance(a, str) else _number(a)
+        return values[a] if isinstance(a, str) else _as_sympy_number(a)
 
     for target, op, args in program.instructions:
         if op == "float":
             values[target] = value(args[0])
-        elif isinstance(op, str) and op in OPERATIONS:
-            values[target] = OPERATIONS[op](*map(value, args))
+        elif isinstance(op, str) and op in SYMPY_OPERATIONS:
+            values[target] = SYMPY_OPERATIONS[op](*map(value, args))
         else:
             raise InputError(f"the operation {str(op)!r} has no SymPy expression")
-    return [sympy.expand(value(a)) if _small(value(a)) else value(a) for entries in program.outputs for a in entries]
+    return [sympy.expand(value(a)) if _is_short(value(a)) else value(a) for entries in program.outputs for a in entries]
 
 
-def _small(expression: Any) -> bool:
+def _is_short(expression: Any) -> bool:
     """Whether writing out the products of an expression keeps it short."""
     return sympy.count_ops(expression) < 400
 
 
-def _number(value: Any) -> Any:
+def _as_sympy_number(value: Any) -> Any:
     if isinstance(value, bool | np.bool_):
-        return sympy.true if value else sympy.false
+        return sympy.check_true if value else sympy.false
     number = float(value)
     if not np.isfinite(number):
         return sympy.nan if number != number else sympy.oo * int(np.sign(number))
-    fraction = Fraction(number).limit_denominator(LARGEST_DENOMINATOR)
+    fraction = Fraction(number).limit_denominator(MAX_DENOMINATOR)
     exact = float(fraction) == number
     return sympy.Rational(fraction.numerator, fraction.denominator) if exact else sympy.Float(number, 17)

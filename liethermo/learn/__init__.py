@@ -1,10 +1,10 @@
 """Systems with networks in them, fitted to data: both laws hold by construction, before, during and after training."""
 
-from manifolds._names import listing
+from manifolds._names import public_dir
 
 from .files import load, save
 from .fitting import fit
-from .known import Determined, Fits, determined, several
+from .identifiability import Determined, Fits, determined, several
 from .model import Metriplectic
 from .networks import Learned
 from .parts import Energy, Entropy, Friction, Poisson
@@ -27,4 +27,4 @@ __all__ = [
     "save",
     "several",
 ]
-__dir__ = listing(__all__)
+__dir__ = public_dir(__all__)

@@ -13,7 +13,7 @@ from ..results.solution import Solution
 from ..systems import System
 from .observation import Observation
 
-SMOOTHNESS = 5
+SPLINE_DEGREE = 5
 """Degree of the splines through the data: their derivatives are of order 5."""
 
 
@@ -24,12 +24,12 @@ class Trajectory(NamedTuple):
     x: np.ndarray
 
     @property
-    def flat(self) -> Trajectory:
+    def flat_trajectory(self) -> Trajectory:
         """The same with rows of numbers, shape (m, k)."""
         return Trajectory(self.t, self.x.reshape(len(self.t), -1))
 
 
-def trajectories(data: Any, system: System, own: Observation) -> list[Trajectory]:
+def parse_trajectories(data: Any, system: System, own: Observation) -> list[Trajectory]:
     """What a user gives as data: a pair of times and observations, several of them, or solutions.
 
     Raises
@@ -37,27 +37,27 @@ def trajectories(data: Any, system: System, own: Observation) -> list[Trajectory
     InputError
         If something is missing, is not finite, or does not fit.
     """
-    found = [_checked(i, t, x, system, own) for i, (t, x) in enumerate(_pairs(data, own))]
+    found = [_checked_trajectory(i, t, x, system, own) for i, (t, x) in enumerate(_time_state_pairs(data, own))]
     if not found:
         raise InputError("there are no trajectories in the data")
     return found
 
 
-def _pairs(data: Any, own: Observation) -> list[tuple[Any, Any]]:
+def _time_state_pairs(data: Any, own: Observation) -> list[tuple[Any, Any]]:
     if isinstance(data, Solution):
-        return [(data.t, own.of_solution(data))]
-    if isinstance(data, tuple) and len(data) == 2 and _ndim(data[0]) == 1:
+        return [(data.t, own.observe_solution(data))]
+    if isinstance(data, tuple) and len(data) == 2 and _ndim_or_none(data[0]) == 1:
         t, x = data
-        return [(t, x) for x in np.asarray(x)] if _ndim(x) == 2 + len(own.shape) else [(t, x)]
+        return [(t, x) for x in np.asarray(x)] if _ndim_or_none(x) == 2 + len(own.shape) else [(t, x)]
     if not isinstance(data, Sequence) or isinstance(data, str):
         raise InputError(
             f"data is a pair (t, x), t of shape (m,), x of shape (m, n) or (trajectories, m, n), a list of such pairs, "
             f"or solutions, not {type(data).__name__}"
         )
-    return [pair for part in data for pair in _pairs(part, own)]
+    return [pair for part in data for pair in _time_state_pairs(part, own)]
 
 
-def _ndim(values: Any) -> int | None:
+def _ndim_or_none(values: Any) -> int | None:
     """None of rows of different lengths."""
     try:
         return np.ndim(values)
@@ -65,7 +65,7 @@ def _ndim(values: Any) -> int | None:
         return None
 
 
-def _real(values: Any) -> np.ndarray:
+def _real_array(values: Any) -> np.ndarray:
     """Raises TypeError, or ValueError, where they are none."""
     found = np.asarray(values)
     if found.dtype.kind not in "biufO":
@@ -73,10 +73,10 @@ def _real(values: Any) -> np.ndarray:
     return found.astype(np.float64)
 
 
-def _checked(number: int, t, x, system: System, own: Observation) -> Trajectory:
+def _checked_trajectory(number: int, t, x, system: System, own: Observation) -> Trajectory:
     what = f"trajectory {number}"
     try:
-        t, x = _real(t), _real(x)
+        t, x = _real_array(t), _real_array(x)
     except (TypeError, ValueError) as error:
         raise InputError(f"{what} is not made of real numbers: {error}") from None
     if t.ndim != 1 or len(t) < 2:
@@ -93,41 +93,45 @@ def _checked(number: int, t, x, system: System, own: Observation) -> Trajectory:
     if len(falls):
         i = int(falls[0])
         raise InputError(f"{what}: times must grow, but time {i + 1} is {t[i + 1]:g} after {t[i]:g}")
-    if own.is_whole:
+    if own.is_full_state:
         try:
             x = np.asarray(system.numbers(x, batch=True))
         except InputError as error:
             raise type(error)(f"{what}: {error}") from None
     elif x.shape != (len(t), *own.shape):
-        seen = f"{len(own.places)} components are observed" if len(own.places) else f"observe returns shape {own.shape}"
+        seen = (
+            f"{len(own.component_indices)} components are observed"
+            if len(own.component_indices)
+            else f"observe returns shape {own.shape}"
+        )
         raise InputError(f"{what} has observations of shape {x.shape}, but {seen} at {len(t)} times")
     return Trajectory(t, x)
 
 
-class Scales(NamedTuple):
+class DataScales(NamedTuple):
     """What numbers are of the size of.
 
     Attributes
     ----------
-    centre, size : array, shape (n,)
+    centre, scale : array, shape (n,)
         Mean and spread of each.
-    time : float
+    time_scale : float
         In which they change by their spread.
     """
 
     centre: np.ndarray
-    size: np.ndarray
-    time: float
+    scale: np.ndarray
+    time_scale: float
 
-    def of_states(self, places: np.ndarray, states: np.ndarray) -> Scales:
+    def extend_to_states(self, places: np.ndarray, states: np.ndarray) -> DataScales:
         """Those of states, shape (m, n), of which some components are observed; 0 and 1 of one that does not vary."""
         centre, size = states.mean(axis=0), states.std(axis=0)
         centre, size = np.where(size > 0.0, centre, 0.0), np.where(size > 0.0, size, 1.0)
-        centre[places], size[places] = self.centre[: len(places)], self.size[: len(places)]
-        return Scales(centre, size, self.time)
+        centre[places], size[places] = self.centre[: len(places)], self.scale[: len(places)]
+        return DataScales(centre, size, self.time_scale)
 
 
-def scales(data: list[Trajectory]) -> Scales:
+def data_scales(data: list[Trajectory]) -> DataScales:
     """The mean and the spread of all trajectories together, and the time in which they change."""
     x = np.concatenate([trajectory.x for trajectory in data])
     rates = np.concatenate([np.diff(x, axis=0) / np.diff(t)[:, None] for t, x in data])
@@ -137,18 +141,18 @@ def scales(data: list[Trajectory]) -> Scales:
     moving = speed[speed > 0.0]
     if not len(moving):
         raise InputError("nothing moves in the data: all states of a trajectory are the same")
-    return Scales(middle, spread, 1.0 / float(np.median(moving)))
+    return DataScales(middle, spread, 1.0 / float(np.median(moving)))
 
 
-def smoothed(trajectory: Trajectory, noise: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+def spline_states_and_rates(trajectory: Trajectory, noise: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
     """States and their rates of change at the times of a trajectory, by a spline, shape (m, k) each.
 
     Through the points, or as near to them as the noise allows, standard deviations of shape (k,).
     """
     t, x = trajectory
     start, length = t[0], t[-1] - t[0]
-    u, degree = (t - start) / length, min(SMOOTHNESS, len(t) - 1)
-    if noise is None or degree < SMOOTHNESS:
+    u, degree = (t - start) / length, min(SPLINE_DEGREE, len(t) - 1)
+    if noise is None or degree < SPLINE_DEGREE:
         spline = scipy.interpolate.make_interp_spline(u, x, k=degree)
         return x, spline.derivative()(u) / length
     columns = [
@@ -161,7 +165,7 @@ def smoothed(trajectory: Trajectory, noise: np.ndarray | None) -> tuple[np.ndarr
 DIFFERENCE_ORDERS = (2, 3, 4, 5, 6)
 """Orders of divided differences that distinguish noise from motion."""
 
-NOISE_PLATEAU = 0.7
+NOISE_PLATEAU_RATIO = 0.7
 """Ratio of the estimates by the highest order and by the one two below it, above which they are of noise: those of a
 motion that is resolved fall from order to order."""
 
@@ -172,7 +176,7 @@ MIN_RELATIVE_NOISE = 1e-3
 """Noise below this part of the spread of the data is left out of account."""
 
 
-def estimated_noise(data: list[Trajectory], size: np.ndarray) -> np.ndarray | None:
+def estimate_noise(data: list[Trajectory], size: np.ndarray) -> np.ndarray | None:
     """Return standard deviations of the errors of data, shape (k,), from their differences; None where none are seen.
 
     A divided difference of order d of a smooth motion falls with d, and that of independent errors, with weights of
@@ -181,15 +185,15 @@ def estimated_noise(data: list[Trajectory], size: np.ndarray) -> np.ndarray | No
     order = DIFFERENCE_ORDERS[-1]
     if sum(max(len(t) - order, 0) for t, _ in data) < MIN_DIFFERENCES:
         return None
-    levels = np.stack([_difference_level(data, d) for d in DIFFERENCE_ORDERS])
-    is_noise = (levels[-1] > NOISE_PLATEAU * levels[-3]) & (levels[-1] > MIN_RELATIVE_NOISE * size)
+    levels = np.stack([_divided_difference_std(data, d) for d in DIFFERENCE_ORDERS])
+    is_noise = (levels[-1] > NOISE_PLATEAU_RATIO * levels[-3]) & (levels[-1] > MIN_RELATIVE_NOISE * size)
     if not is_noise.any():
         return None
     found = np.where(is_noise, levels[-3:].mean(axis=0), levels.min(axis=0))
     return np.maximum(found, MIN_RELATIVE_NOISE * size)
 
 
-def _difference_level(data: list[Trajectory], order: int) -> np.ndarray:
+def _divided_difference_std(data: list[Trajectory], order: int) -> np.ndarray:
     """Return the standard deviation of normalised divided differences, shape (k,), by their median."""
     found = []
     for t, x in data:
@@ -201,10 +205,10 @@ def _difference_level(data: list[Trajectory], order: int) -> np.ndarray:
         weights = 1.0 / np.prod(gaps, axis=2)
         weights /= np.linalg.norm(weights, axis=1, keepdims=True)
         found.append(np.einsum("wj,wkj->wk", weights, np.lib.stride_tricks.sliding_window_view(x, order + 1, axis=0)))
-    return np.median(np.abs(np.concatenate(found)), axis=0) / MEDIAN_OF_NORMAL
+    return np.median(np.abs(np.concatenate(found)), axis=0) / MEDIAN_ABS_NORMAL
 
 
-MEDIAN_OF_NORMAL = 0.6744897501960817
+MEDIAN_ABS_NORMAL = 0.6744897501960817
 """Median of the absolute value of a normal variable, in its standard deviations."""
 
 
@@ -213,26 +217,26 @@ class Windows(NamedTuple):
 
     Attributes
     ----------
-    starts : array, shape (windows, N)
+    initial_states : array, shape (windows, N)
         The states in which they begin.
-    sizes : array, shape (windows, m)
+    intervals : array, shape (windows, m)
         Of the intervals.
-    shown : array, shape (windows, m + 1, k)
+    observations : array, shape (windows, m + 1, k)
         What is observed at their ends, that of the start first.
-    following : array of int, shape (windows,)
+    next_window : array of int, shape (windows,)
         The window that begins where one ends; -1 where none does.
-    first : array of int, shape (trajectories,)
+    first_windows : array of int, shape (trajectories,)
         The window in which each trajectory begins.
     """
 
-    starts: np.ndarray
-    sizes: np.ndarray
-    shown: np.ndarray
-    following: np.ndarray
-    first: np.ndarray
+    initial_states: np.ndarray
+    intervals: np.ndarray
+    observations: np.ndarray
+    next_window: np.ndarray
+    first_windows: np.ndarray
 
 
-def windows(data: list[Trajectory], states: list[np.ndarray], length: int, apart: bool) -> Windows:
+def cut_windows(data: list[Trajectory], states: list[np.ndarray], length: int, apart: bool) -> Windows:
     """The pieces of trajectories; with ``apart`` one begins where another ends, else at every point."""
     length = min(length, *(len(t) - 1 for t, _ in data))
     starts, sizes, shown = [], [], []

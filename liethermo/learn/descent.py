@@ -11,23 +11,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-MEMORY = 0.95
+MEAN_DECAY = 0.95
 """The share of a mean of gradients, of their squares or of their products that is kept from step to step."""
 
-ADAM = 0.9, 0.99
+ADAM_DECAYS = 0.9, 0.99
 """The same of means of gradients and of their squares, of numbers outside matrices, for which Adam is run."""
 
-REFRESHED = 10
+STEPS_PER_EIGENBASIS = 10
 """Steps between two looks at the eigenvectors."""
 
-LARGEST = 256
+MAX_PRECONDITIONED_DIM = 256
 """Rows or columns of a matrix that is turned: of more, eigenvectors cost more than they bring."""
 
-TINY = 1e-8
+ADAM_EPSILON = 1e-8
 """What is added to the sizes of gradients, as in Adam."""
 
 
-def descent(shapes: Sequence[tuple[int, ...]], rate: Callable) -> Any:
+def soap_optimiser(shapes: Sequence[tuple[int, ...]], rate: Callable) -> Any:
     """An optimiser of optax for a vector: SOAP [Vyas et al. 2025].
 
     The gradient of a matrix W of weights is turned into the eigenvectors of the means of ``G G^T`` and ``G^T G``. Adam
@@ -45,13 +45,13 @@ def descent(shapes: Sequence[tuple[int, ...]], rate: Callable) -> Any:
     matrices = [
         (slice(end - math.prod(shape), end), shape)
         for end, shape in zip(ends, shapes, strict=True)
-        if len(shape) == 2 and min(shape) > 1 and max(shape) <= LARGEST
+        if len(shape) == 2 and min(shape) > 1 and max(shape) <= MAX_PRECONDITIONED_DIM
     ]
 
-    def memories(size: int) -> tuple[np.ndarray, np.ndarray]:
-        first, second = (np.full(size, memory) for memory in ADAM)
+    def moment_decays(size: int) -> tuple[np.ndarray, np.ndarray]:
+        first, second = (np.full(size, memory) for memory in ADAM_DECAYS)
         for at, _ in matrices:
-            first[at] = second[at] = MEMORY
+            first[at] = second[at] = MEAN_DECAY
         return first, second
 
     def init(vector):
@@ -61,40 +61,40 @@ def descent(shapes: Sequence[tuple[int, ...]], rate: Callable) -> Any:
 
     def update(slope, state, vector=None):
         count, mean, square, sides = state
-        means = [[MEMORY * S + (1.0 - MEMORY) * P for (_, S), P in zip(pair, _products(slope[at].reshape(shape)),
+        means = [[MEAN_DECAY * S + (1.0 - MEAN_DECAY) * P for (_, S), P in zip(pair, _gram_matrices(slope[at].reshape(shape)),
                   strict=True)] for (at, shape), pair in zip(matrices, sides, strict=True)]  # fmt: skip
-        first, second = memories(slope.size)
-        turned, mean = _turned(slope, matrices, sides), first * mean + (1.0 - first) * slope
+        first, second = moment_decays(slope.size)
+        turned, mean = _rotate_matrices(slope, matrices, sides), first * mean + (1.0 - first) * slope
         square = second * square + (1.0 - second) * turned**2
-        step = _turned(mean / (1.0 - first ** (count + 1.0)), matrices, sides)
-        step = step / (jnp.sqrt(square / (1.0 - second ** (count + 1.0))) + TINY)
-        step = _turned(step, matrices, [[(Q.T, S) for Q, S in pair] for pair in sides])
+        step = _rotate_matrices(mean / (1.0 - first ** (count + 1.0)), matrices, sides)
+        step = step / (jnp.sqrt(square / (1.0 - second ** (count + 1.0))) + ADAM_EPSILON)
+        step = _rotate_matrices(step, matrices, [[(Q.T, S) for Q, S in pair] for pair in sides])
 
-        def refreshed(_):
-            return [[_eigenvectors(count, Q, S) for (Q, _), S in zip(pair, own, strict=True)]
+        def update_bases(_):
+            return [[_update_eigenvectors(count, Q, S) for (Q, _), S in zip(pair, own, strict=True)]
                     for pair, own in zip(sides, means, strict=True)]  # fmt: skip
 
-        def kept(_):
+        def keep_bases(_):
             return [[Q for Q, _ in pair] for pair in sides]
 
-        turns = jax.lax.cond(count % REFRESHED == 0, refreshed, kept, None)
+        turns = jax.lax.cond(count % STEPS_PER_EIGENBASIS == 0, update_bases, keep_bases, None)
         sides = [list(zip(*both, strict=True)) for both in zip(turns, means, strict=True)]
         return -rate(count) * step, (count + 1, mean, square, sides)
 
     return optax.GradientTransformation(init, update)
 
 
-def _products(G: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _gram_matrices(G: jax.Array) -> tuple[jax.Array, jax.Array]:
     return G @ G.T, G.T @ G
 
 
-def _turned(vector: jax.Array, matrices: Sequence, sides: Sequence) -> jax.Array:
+def _rotate_matrices(vector: jax.Array, matrices: Sequence, sides: Sequence) -> jax.Array:
     """``Q^T G R`` in place of each matrix G."""
     for (at, shape), ((Q, _), (R, _)) in zip(matrices, sides, strict=True):
         vector = vector.at[at].set((Q.T @ vector[at].reshape(shape) @ R).ravel())
     return vector
 
 
-def _eigenvectors(count: jax.Array, Q: jax.Array, S: jax.Array) -> jax.Array:
+def _update_eigenvectors(count: jax.Array, Q: jax.Array, S: jax.Array) -> jax.Array:
     """Those of S: at first, and then one step of orthogonal iteration from those so far."""
     return jax.lax.cond(count == 0, lambda: jnp.linalg.eigh(S)[1][:, ::-1], lambda: jnp.linalg.qr(S @ Q)[0])

@@ -12,30 +12,30 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from manifolds._precision import by_own_settings
+from manifolds._precision import with_library_settings
 from manifolds.errors import warn
 
 from ..errors import InputError
 from ..integrators import MetriplecticRungeKutta, OneStepMethod
 from ..systems import System
 from . import losses
-from .data import Trajectory, estimated_noise, scales, smoothed, trajectories, windows
-from .losses import Task
-from .model import has_networks, in_units
-from .observation import coordinates, observation, plain_states, states_that_move
-from .refining import can_refine, joined_runs, refine
-from .training import Course, FitWarning, Phase, fingerprint
+from .data import Trajectory, cut_windows, data_scales, estimate_noise, parse_trajectories, spline_states_and_rates
+from .losses import Objective
+from .model import has_networks, scale_networks
+from .observation import default_states, make_observation, n_coordinates, states_matching_rates
+from .refining import can_refine, pad_runs, refine_by_least_squares
+from .training import FitWarning, Phase, TrainingRun, fingerprint
 
 T = TypeVar("T", bound=System)
 
-BATCH = {"matching": 256, "shooting": 32}
+BATCH_SIZES = {"matching": 256, "shooting": 32}
 """Points, and short runs, of one step."""
 
-SLOWER = 0.3
+SHOOTING_RATE_FACTOR = 0.3
 """The rate of the shooting, relative to that of the matching before it."""
 
 
-@by_own_settings
+@with_library_settings
 def fit(
     system: T,
     data: Any,
@@ -142,90 +142,94 @@ def fit(
         raise InputError(f"fit takes a system, such as lt.learn.Metriplectic(4), not {type(system).__name__}")
     if not isinstance(method, OneStepMethod | None):
         raise InputError(f"method is a OneStepMethod, such as lt.MetriplecticRungeKutta(4), not {method!r}")
-    if not (_is_real(rate) and 0.0 < rate < np.inf):
+    if not (_is_real_number(rate) and 0.0 < rate < np.inf):
         raise InputError(f"rate is a positive number, not {rate!r}")
     counts = {"matching": matching, "shooting": shooting, "batch": batch, "window": window, "substeps": substeps}
     for name, value in {**counts, "patience": patience, "seed": seed}.items():
-        _check_count(name, value, 0 if name in BATCH or name == "seed" else 1, name in ("batch", "patience"))
+        _check_count(name, value, 0 if name in BATCH_SIZES or name == "seed" else 1, name in ("batch", "patience"))
     if system.is_driven:
         raise InputError("a fit is for systems without an energy that depends on time, and without torques")
-    seen = observation(system, observed, observe)
+    seen = make_observation(system, observed, observe)
     method = MetriplecticRungeKutta(4) if method is None else method
-    run = losses.stepper(system, method, substeps, seen.group is not None)[0]
-    whole = [trajectory.flat for trajectory in trajectories(data, system, seen)]
-    shown = scales(whole)
-    sigma = checked_noise(noise, shown.size.size)
+    run = losses.differentiable_stepper(system, method, substeps, seen.group is not None)[0]
+    whole = [trajectory.flat_trajectory for trajectory in parse_trajectories(data, system, seen)]
+    shown = data_scales(whole)
+    sigma = checked_noise(noise, shown.scale.size)
     noise_is_estimated = noise is None
     if noise_is_estimated:
-        sigma = estimated_noise(whole, shown.size)
-    smooth = [smoothed(trajectory, sigma) for trajectory in whole]
-    if seen.is_whole or has_networks(system):
-        starts = [plain_states(seen, run, x) for x, _ in smooth]
+        sigma = estimate_noise(whole, shown.scale)
+    smooth = [spline_states_and_rates(trajectory, sigma) for trajectory in whole]
+    if seen.is_full_state or has_networks(system):
+        starts = [default_states(seen, run, x) for x, _ in smooth]
     else:
-        starts = states_that_move(seen, run, smooth, shown.size, shown.time)
+        starts = states_matching_rates(seen, run, smooth, shown.scale, shown.time_scale)
     states = np.concatenate(starts)
-    found = shown.of_states(seen.places, states[:, : system.dim])
-    system = in_units(system, found, states[:, : system.dim])
-    if not seen.is_whole and validation:
+    found = shown.extend_to_states(seen.component_indices, states[:, : system.dim])
+    system = scale_networks(system, found, states[:, : system.dim])
+    if not seen.is_full_state and validation:
         raise InputError("validation is for data of all components: what is not observed has no start that is known")
-    own = losses.weights(system, also, positive)
-    if not own.start.size:
+    own = losses.parameter_vector(system, also, positive)
+    if not own.initial_values.size:
         raise InputError(
             "nothing is learned of this system: give it parts of lt.learn, or name parameters with also= or positive="
         )
-    share = (0.2 if seen.is_whole else 0.0) if validation is None else validation
-    train, held = _split(list(zip(whole, starts, strict=True)), share, seed)
-    noisy = 1.0 if sigma is None else float(np.sqrt(np.mean((sigma / shown.size) ** 2)))
+    share = (0.2 if seen.is_full_state else 0.0) if validation is None else validation
+    train, held = _split_held_out(list(zip(whole, starts, strict=True)), share, seed)
+    noisy = 1.0 if sigma is None else float(np.sqrt(np.mean((sigma / shown.scale) ** 2)))
     behind = np.ones(run.dim - system.dim)  # the numbers of an attitude
-    searched = found.size.copy()
-    if sigma is not None and len(seen.places):
-        searched[seen.places] = sigma
-    searched = np.concatenate([searched, noisy * np.ones(coordinates(run) - system.dim)])
-    units = shown.size if sigma is None else sigma, searched, noisy * np.concatenate([found.size, behind])
+    searched = found.scale.copy()
+    if sigma is not None and len(seen.component_indices):
+        searched[seen.component_indices] = sigma
+    searched = np.concatenate([searched, noisy * np.ones(n_coordinates(run) - system.dim)])
+    units = shown.scale if sigma is None else sigma, searched, noisy * np.concatenate([found.scale, behind])
 
-    def matched(part: list) -> Task:
-        return losses.matching_of(own, [trajectory for trajectory, _ in part], sigma, found)
+    def make_matching_objective(part: list) -> Objective:
+        return losses.trajectory_matching(own, [trajectory for trajectory, _ in part], sigma, found)
 
-    def shot(part: list, free: bool) -> Task:
-        pieces = windows([trajectory for trajectory, _ in part], [own for _, own in part], window, free)
-        return losses.shooting(own, method, pieces, seen, units, substeps, free)
+    def make_shooting_objective(part: list, free: bool) -> Objective:
+        pieces = cut_windows([trajectory for trajectory, _ in part], [own for _, own in part], window, free)
+        return losses.shooting_objective(own, method, pieces, seen, units, substeps, free)
 
     phases = []
-    if matching and seen.is_whole:
-        task = matched(train)
+    if matching and seen.is_full_state:
+        task = make_matching_objective(train)
         phases.append(
             Phase(
                 "matching",
                 task,
-                matched(held) if held else None,
+                make_matching_objective(held) if held else None,
                 matching,
                 rate,
-                batch or BATCH["matching"],
-                own.shapes,
+                batch or BATCH_SIZES["matching"],
+                own.array_shapes,
             )
         )
-    free = sigma is not None or not seen.is_whole
+    free = sigma is not None or not seen.is_full_state
     if shooting:
-        slower = SLOWER if phases else 1.0
-        task = shot(train, free)
+        slower = SHOOTING_RATE_FACTOR if phases else 1.0
+        task = make_shooting_objective(train, free)
         phases.append(
             Phase(
                 "shooting",
                 task,
-                shot(held, False) if held else None,
+                make_shooting_objective(held, False) if held else None,
                 shooting,
                 slower * rate,
-                batch or BATCH["shooting"],
-                own.shapes,
+                batch or BATCH_SIZES["shooting"],
+                own.array_shapes,
             )
         )
     settings = (matching, shooting, rate, batch, window, substeps, method, share, patience, seed)
     if not phases:
-        way = "matching" if seen.is_whole else "shooting, as not all of the states is observed"
+        way = "matching" if seen.is_full_state else "shooting, as not all of the states is observed"
         raise InputError(f"there is nothing to do: give more than 0 iterations of the {way}")
     numbers = [values for trajectory in whole for values in trajectory]
-    course = Course(
-        phases, own.start, fingerprint(*numbers, own.start, sigma, seen.places, *seen.content(run), repr(settings))
+    course = TrainingRun(
+        phases,
+        own.initial_values,
+        fingerprint(
+            *numbers, own.initial_values, sigma, seen.component_indices, *seen.fingerprint_parts(run), repr(settings)
+        ),
     )
     path = None if checkpoint is None else Path(checkpoint)
     if path is not None and path.exists():
@@ -233,28 +237,32 @@ def fit(
     course.run(seed, patience, path, progress)
     weights, refined = course.weights, None
     if shooting and can_refine(own, system, whole, run, substeps) and "interrupted" not in course.ended.values():
-        firsts = _first_states(course.best, own, train, window, free, seen, run, searched)
+        firsts = _fitted_initial_states(course.best_vector, own, train, window, free, seen, run, searched)
         parts = [pair[0] for pair in (*train, *held)]
-        runs = joined_runs(parts, [*firsts, *(states[0] for _, states in held)])
+        runs = pad_runs(parts, [*firsts, *(states[0] for _, states in held)])
         is_held_out = np.arange(len(parts)) >= len(train)
-        refined = refine(own, weights, method, runs, is_held_out, seen, units[:2], substeps)
+        refined = refine_by_least_squares(own, weights, method, runs, is_held_out, seen, units[:2], substeps)
         weights = refined.weights
-    fitted = cast(T, own.system(jnp.asarray(weights)))
-    training = course.record(time.perf_counter() - began).with_findings(own, refined, sigma, noise_is_estimated)
+    fitted = cast(T, own.build_system(jnp.asarray(weights)))
+    training = course.training_record(time.perf_counter() - began).with_estimates(
+        own, refined, sigma, noise_is_estimated
+    )
     object.__setattr__(fitted, "training", training)
     for problem in training.problems:
         warn(problem, FitWarning)
     return fitted
 
 
-def _first_states(vector, own, train: list, window: int, free: bool, seen, run, searched) -> np.ndarray:
+def _fitted_initial_states(vector, own, train: list, window: int, free: bool, seen, run, searched) -> np.ndarray:
     """Return the states in which whole trajectories begin, as the shooting has found them, shape (B, N)."""
     starts = np.stack([states[0] for _, states in train])
     if not free:
         return starts
-    pieces = windows([trajectory for trajectory, _ in train], [states for _, states in train], window, free)
-    moves = np.asarray(vector)[own.start.size :].reshape(len(pieces.starts), -1)[pieces.first] * searched
-    return np.asarray(jax.vmap(lambda x, z: seen.moved(run, x, z))(jnp.asarray(starts), jnp.asarray(moves)))
+    pieces = cut_windows([trajectory for trajectory, _ in train], [states for _, states in train], window, free)
+    moves = (
+        np.asarray(vector)[own.start.size :].reshape(len(pieces.initial_states), -1)[pieces.first_windows] * searched
+    )
+    return np.asarray(jax.vmap(lambda x, z: seen.displace(run, x, z))(jnp.asarray(starts), jnp.asarray(moves)))
 
 
 def _check_count(name: str, value: Any, least: int, optional: bool) -> None:
@@ -264,7 +272,7 @@ def _check_count(name: str, value: Any, least: int, optional: bool) -> None:
         raise InputError(f"{name} is an integer >= {least}, not {value!r}")
 
 
-def _is_real(value: Any) -> bool:
+def _is_real_number(value: Any) -> bool:
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
 
 
@@ -285,9 +293,9 @@ def checked_noise(noise: float | Sequence[float] | None, count: int) -> np.ndarr
     return np.broadcast_to(sigma, (count,)).copy()
 
 
-def _split(data: list, share: float, seed: int) -> tuple[list, list]:
+def _split_held_out(data: list, share: float, seed: int) -> tuple[list, list]:
     """What is learned from, and what is held out: whole trajectories with their states, or the end of the only one."""
-    if not (_is_real(share) and 0.0 <= share < 1.0):
+    if not (_is_real_number(share) and 0.0 <= share < 1.0):
         raise InputError(f"validation is a share from 0 to below 1, not {share!r}")
     if share == 0.0:
         return data, []

@@ -12,45 +12,45 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from ..integrators import MetriplecticRungeKutta, OneStepMethod, WithAttitude
-from ..runs.flow import first_carry, one_step
-from ..runs.preparation import of_steps
+from ..runs.flow import differentiable_step, initial_carry
+from ..runs.preparation import prepare_for_method
 from ..systems import System
-from .data import Scales, Trajectory, Windows, smoothed
-from .model import tied
-from .networks import learned
+from .data import DataScales, Trajectory, Windows, spline_states_and_rates
+from .model import tie_entropy
+from .networks import learned_mask
 from .observation import Observation
 from .parts import Poisson
 
-SLOW = 0.1
+MEAN_SQUARE_RATE_FLOOR = 0.1
 """Mean square of the rates of change, in units of their usual size, below which they count as slow."""
 
 
-class Weights(NamedTuple):
+class ParameterVector(NamedTuple):
     """The numbers of a system that are learned, as one vector.
 
     Attributes
     ----------
-    start : array, shape (p,)
+    initial_values : array, shape (p,)
         As they are; the logarithms of those that have to be positive.
-    shapes : tuple of tuple of int
+    array_shapes : tuple of tuple of int
         Of the arrays that stand in it, one after another.
-    system : function from such a vector to the system
+    build_system : function from such a vector to the system
     names : tuple of str, of length p
         Where each number stands in the system: ``"dissipation.rate"``, ``"energy.A[0]"``.
     is_log : array of bool, shape (p,)
         Which of them are logarithms.
     """
 
-    start: np.ndarray
-    shapes: tuple[tuple[int, ...], ...]
-    system: Callable[[Any], Any]
+    initial_values: np.ndarray
+    array_shapes: tuple[tuple[int, ...], ...]
+    build_system: Callable[[Any], Any]
     names: tuple[str, ...] = ()
     is_log: np.ndarray = np.zeros(0, bool)
 
 
-def weights(system: System, also: Callable | None = None, positive: Callable | None = None) -> Weights:
+def parameter_vector(system: System, also: Callable | None = None, positive: Callable | None = None) -> ParameterVector:
     """What is learned of a system: the arrays inside of marks, and those that two functions choose."""
-    mask = learned(system)
+    mask = learned_mask(system)
     if isinstance(system.poisson, Poisson) and system.poisson.entropy is not None:
         mask = eqx.tree_at(lambda m: m.poisson.entropy, mask, False)  # the same weights as in the entropy
     for choose in (also, positive):
@@ -63,16 +63,16 @@ def weights(system: System, also: Callable | None = None, positive: Callable | N
     both = jax.tree_util.tree_map(jnp.log, logs), plain
     first, back = ravel_pytree(both)
 
-    def rebuilt(vector) -> System:
+    def build_system(vector) -> System:
         logs, plain = back(vector)
-        return tied(eqx.combine(jax.tree_util.tree_map(jnp.exp, logs), plain, fixed))
+        return tie_entropy(eqx.combine(jax.tree_util.tree_map(jnp.exp, logs), plain, fixed))
 
     shapes = tuple(np.shape(leaf) for leaf in jax.tree_util.tree_leaves(both))
     count = sum(np.size(leaf) for leaf in jax.tree_util.tree_leaves(logs))
-    return Weights(np.asarray(first), shapes, rebuilt, _names(both), np.arange(first.size) < count)
+    return ParameterVector(np.asarray(first), shapes, build_system, _entry_names(both), np.arange(first.size) < count)
 
 
-def _names(trees: tuple) -> tuple[str, ...]:
+def _entry_names(trees: tuple) -> tuple[str, ...]:
     """Where each number of some trees stands in its tree, in the order of the numbers."""
     found: list[str] = []
     for tree in trees:
@@ -83,7 +83,7 @@ def _names(trees: tuple) -> tuple[str, ...]:
     return tuple(found)
 
 
-class Task(NamedTuple):
+class Objective(NamedTuple):
     """What is to be made small.
 
     Attributes
@@ -91,18 +91,18 @@ class Task(NamedTuple):
     loss : function from a vector, the arrays and indices of items, to a number
         The vector is that of the weights, with the free numbers behind it.
     arrays : tuple of arrays
-    items : int
-    free : array, shape (f,)
+    n_items : int
+    initial_free : array, shape (f,)
         Numbers that are found beside the weights, as they are at first.
     """
 
     loss: Callable[[jax.Array, tuple, jax.Array], jax.Array]
     arrays: tuple
-    items: int
-    free: np.ndarray
+    n_items: int
+    initial_free: np.ndarray
 
 
-def matching(own: Weights, x: np.ndarray, rates: np.ndarray, size: np.ndarray) -> Task:
+def matching_objective(own: ParameterVector, x: np.ndarray, rates: np.ndarray, size: np.ndarray) -> Objective:
     """The mean square of what ``x'`` misses of rates of change, in units of ``size``, shape (n,).
 
     Relative to how fast the state changes: else a loss is all about the few fastest moments, and the phase of a slow
@@ -111,32 +111,34 @@ def matching(own: Weights, x: np.ndarray, rates: np.ndarray, size: np.ndarray) -
 
     def loss(vector, arrays, chosen):
         points, wanted = (values[chosen] for values in arrays)
-        found = jax.vmap(own.system(vector)._vector_field)(points)
+        found = jax.vmap(own.build_system(vector)._vector_field)(points)
         speed = jnp.mean((wanted / size) ** 2, axis=1, keepdims=True)
-        return jnp.mean(((found - wanted) / size) ** 2 / (SLOW + speed))
+        return jnp.mean(((found - wanted) / size) ** 2 / (MEAN_SQUARE_RATE_FLOOR + speed))
 
-    return Task(loss, (jnp.asarray(x), jnp.asarray(rates)), len(x), np.zeros(0))
+    return Objective(loss, (jnp.asarray(x), jnp.asarray(rates)), len(x), np.zeros(0))
 
 
-def matching_of(own: Weights, data: list[Trajectory], noise: np.ndarray | None, found: Scales) -> Task:
+def trajectory_matching(
+    own: ParameterVector, data: list[Trajectory], noise: np.ndarray | None, found: DataScales
+) -> Objective:
     """:func:`matching` at the points of trajectories, by splines through them or as near as the noise allows."""
-    smooth = [smoothed(trajectory, noise) for trajectory in data]
+    smooth = [spline_states_and_rates(trajectory, noise) for trajectory in data]
     inner = [slice(1, -1) if len(x) > 8 else slice(None) for x, _ in smooth]  # a spline is worst at its ends
     x, rates = (
         np.concatenate([values[i] for values, i in zip(each, inner, strict=True)]) for each in zip(*smooth, strict=True)
     )
-    return matching(own, x, rates, found.size / found.time)
+    return matching_objective(own, x, rates, found.scale / found.time_scale)
 
 
-def shooting(
-    own: Weights,
+def shooting_objective(
+    own: ParameterVector,
     method: OneStepMethod,
     pieces: Windows,
     seen: Observation,
     units: tuple[np.ndarray, np.ndarray, np.ndarray],
     substeps: int,
     free: bool,
-) -> Task:
+) -> Objective:
     """The mean square of what runs miss of the data at the ends of all intervals.
 
     With ``free`` the states where the runs begin are found too, and what they show of the data counts, and what a run
@@ -147,57 +149,57 @@ def shooting(
     units : three arrays, shapes (k,), (coordinates of a state,), (numbers of a state,)
         Of what is observed, of the search for the states where runs begin, and of what a run misses of the next one.
     """
-    p = len(own.start)
+    p = len(own.initial_values)
     of_data, of_search, of_gaps = map(jnp.asarray, units)
-    count, length = pieces.sizes.shape
+    count, length = pieces.intervals.shape
 
     def loss(vector, arrays, chosen):
         starts, sizes, shown, following = arrays
-        system = own.system(vector[:p])
-        run, begin, advance, state_of = stepper(system, method, substeps, seen.group is not None)
+        system = own.build_system(vector[:p])
+        run, begin, advance, state_of = differentiable_stepper(system, method, substeps, seen.group is not None)
 
-        def along(x, h):
+        def run_window(x, h):
             def interval(carry, h):
                 carry = advance(carry, h)
                 return carry, state_of(carry)
 
             return jax.lax.scan(interval, begin(x), h)[1]
 
-        def shows(states):
-            return jax.vmap(lambda x: seen.of(run, x))(states)
+        def observe_states(states):
+            return jax.vmap(lambda x: seen.observe(run, x))(states)
 
         moves = vector[p:].reshape(count, -1) * of_search if free else None
 
-        def begins(i):
-            return starts[i] if moves is None else jax.vmap(lambda x, z: seen.moved(run, x, z))(starts[i], moves[i])
+        def initial_states(i):
+            return starts[i] if moves is None else jax.vmap(lambda x, z: seen.displace(run, x, z))(starts[i], moves[i])
 
-        at = begins(chosen)
-        found = jax.vmap(along)(at, sizes[chosen])
-        missed = jnp.mean(((jax.vmap(shows)(found) - shown[chosen, 1:]) / of_data) ** 2)
+        at = initial_states(chosen)
+        found = jax.vmap(run_window)(at, sizes[chosen])
+        missed = jnp.mean(((jax.vmap(observe_states)(found) - shown[chosen, 1:]) / of_data) ** 2)
         if moves is None:
             return missed
-        begun = jnp.mean(((shows(at) - shown[chosen, 0]) / of_data) ** 2) / length
+        begun = jnp.mean(((observe_states(at) - shown[chosen, 0]) / of_data) ** 2) / length
         next_ = following[chosen]
-        gaps = jnp.where(next_[:, None] >= 0, (found[:, -1] - begins(next_)) / of_gaps, 0.0)
+        gaps = jnp.where(next_[:, None] >= 0, (found[:, -1] - initial_states(next_)) / of_gaps, 0.0)
         return missed + begun + jnp.mean(gaps**2)
 
-    arrays = tuple(map(jnp.asarray, (pieces.starts, pieces.sizes, pieces.shown, pieces.following)))
-    return Task(loss, arrays, count, np.zeros(count * of_search.size if free else 0))
+    arrays = tuple(map(jnp.asarray, (pieces.initial_states, pieces.intervals, pieces.observations, pieces.next_window)))
+    return Objective(loss, arrays, count, np.zeros(count * of_search.size if free else 0))
 
 
-def stepper(
+def differentiable_stepper(
     system: System, method: OneStepMethod, substeps: int, attitude: bool = False
 ) -> tuple[System, Callable, Callable, Callable]:
     """The system as it is run, what begins a run at a state, takes it over an interval, and what its state is then.
 
     For derivatives.
     """
-    run, method = of_steps(system, method, None, attitude)
+    run, method = prepare_for_method(system, method, None, attitude)
     inner = method.method if isinstance(method, WithAttitude) else method
     plain = isinstance(inner, MetriplecticRungeKutta) and run.surface is None
 
     def step(carry, h):
-        return method.plain(run, carry, h) if plain else one_step(run, method, carry, h)  # type: ignore[attr-defined]
+        return method.step_without_compensation(run, carry, h) if plain else differentiable_step(run, method, carry, h)  # type: ignore[attr-defined]
 
     def advance(carry, h):
         if substeps == 1:
@@ -206,4 +208,4 @@ def stepper(
 
     if plain:
         return run, lambda x: x, advance, lambda x: x
-    return run, lambda x: first_carry(run, method, x), advance, lambda carry: carry[0][: run.dim]
+    return run, lambda x: initial_carry(run, method, x), advance, lambda carry: carry[0][: run.dim]

@@ -15,11 +15,11 @@ import manifolds as mf
 from ..dissipation.base import Dissipation
 from ..errors import InputError
 from ..functions.energy import Energy as AnyEnergy
-from ..functions.energy import Pullback, as_energy
+from ..functions.energy import Pullback, make_energy
 from ..systems import MetriplecticSystem, System
-from .data import Scales
-from .networks import Network, learned
-from .parts import Energy, Entropy, Friction, Poisson, behind
+from .data import DataScales
+from .networks import Network, learned_mask
+from .parts import Energy, Entropy, Friction, Poisson, extend_poisson
 
 T = TypeVar("T", bound=System)
 
@@ -67,36 +67,36 @@ class Metriplectic(MetriplecticSystem):
         seed: int = 0,
         validate: bool = True,
     ):
-        energy = Energy(dim, width, depth, 4 * seed) if energy is None else as_energy(energy, "the energy")
-        entropy = Entropy(dim, width, depth, 4 * seed + 1) if entropy is None else as_energy(entropy, "the entropy")
+        energy = Energy(dim, width, depth, 4 * seed) if energy is None else make_energy(energy, "the energy")
+        entropy = Entropy(dim, width, depth, 4 * seed + 1) if entropy is None else make_energy(entropy, "the entropy")
         if poisson is None:
             poisson = Poisson(dim, width, depth, 4 * seed + 2)
         if isinstance(poisson, Poisson):
             poisson = eqx.tree_at(lambda p: p.entropy, poisson, entropy, is_leaf=lambda part: part is None)
         elif isinstance(poisson, mf.PoissonStructure) and poisson.dim is not None:
-            poisson = behind(poisson, dim)
+            poisson = extend_poisson(poisson, dim)
         if isinstance(friction, str):
             if friction != "learned":
                 raise InputError(f"friction is a Dissipation, a list of them, 'learned' or None, not {friction!r}")
             friction = Friction(dim, rank, width=width, depth=depth, seed=4 * seed + 3)
         by_form = isinstance(poisson, Poisson)  # but for the Jacobi identity
         super().__init__(poisson, energy, entropy, friction, dim=dim, validate=validate and not by_form)
-        self.poisson = tied_to(self.poisson, self.entropy)
+        self.poisson = poisson_with_entropy(self.poisson, self.entropy)
 
 
-def tied_to(poisson: mf.PoissonStructure, entropy: AnyEnergy | None) -> mf.PoissonStructure:
+def poisson_with_entropy(poisson: mf.PoissonStructure, entropy: AnyEnergy | None) -> mf.PoissonStructure:
     """The structure with the entropy of its system in it, where it is one that has to know it."""
     if not isinstance(poisson, Poisson) or poisson.entropy is None:
         return poisson
     return eqx.tree_at(lambda p: p.entropy, poisson, entropy)
 
 
-def tied(system: T) -> T:
+def tie_entropy(system: T) -> T:
     """The system with the weights of its entropy wherever that occurs."""
-    return eqx.tree_at(lambda s: s.poisson, system, tied_to(system.poisson, system.entropy))
+    return eqx.tree_at(lambda s: s.poisson, system, poisson_with_entropy(system.poisson, system.entropy))
 
 
-def in_units(system: T, found: Scales, points: np.ndarray) -> T:
+def scale_networks(system: T, found: DataScales, points: np.ndarray) -> T:
     """The system with networks that work on numbers of the size of one; those that do already are left alone.
 
     Parameters
@@ -106,68 +106,68 @@ def in_units(system: T, found: Scales, points: np.ndarray) -> T:
     points : array, shape (m, n)
         Some states.
     """
-    x, s, tau = jnp.asarray(points), jnp.asarray(found.size), found.time
+    x, s, tau = jnp.asarray(points), jnp.asarray(found.scale), found.time_scale
 
-    def varies(function: AnyEnergy) -> float:
+    def mean_variation(function: AnyEnergy) -> float:
         """What a known function varies by over the data."""
         return float(jnp.mean(jnp.abs(jax.vmap(function.gradient)(x) * s)))
 
     energy = entropy = 1.0
     poisson = system.poisson
     if not has_networks(system.energy):
-        energy = varies(system.energy)
+        energy = mean_variation(system.energy)
     elif not has_networks(poisson):
         tensor = jnp.mean(jnp.abs(jax.vmap(poisson.tensor)(x)), axis=0)
         largest = float(jnp.max(tensor / jnp.outer(s, s)))
         energy = 1.0 / (tau * largest) if largest > 0.0 else 1.0
     if system.entropy is not None and not has_networks(system.entropy):
-        entropy = varies(system.entropy)
+        entropy = mean_variation(system.entropy)
     entropy = entropy if entropy > 0.0 else 1.0
     energy = energy if energy > 0.0 else 1.0
     pairs = jnp.outer(s, s)[np.triu_indices(system.dim, 1)]
 
-    def part_in_units(part):
+    def scale_friction(part):
         if isinstance(part, Friction):
             root = jnp.sqrt(entropy * tau)
             unit = pairs / (energy * root) if part.construction == "skew" else s / root
-            inner = _filled(part.function, x, jnp.tile(unit, part.rank))
+            inner = _fill_network_scales(part.function, x, jnp.tile(unit, part.rank))
             return eqx.tree_at(lambda p: (p.function, p.metric), part, (inner, s**2))
         return part
 
-    def of_kind(kind, tree, change):
+    def map_instances(kind, tree, change):
         return jax.tree_util.tree_map(change, tree, is_leaf=lambda part: isinstance(part, kind))
 
     parts: dict[str, Any] = {
-        "energy": _filled(system.energy, x, energy),
-        "entropy": _filled(system.entropy, x, entropy),
-        "dissipation": of_kind(Friction, system.dissipation, part_in_units),
+        "energy": _fill_network_scales(system.energy, x, energy),
+        "entropy": _fill_network_scales(system.entropy, x, entropy),
+        "dissipation": map_instances(Friction, system.dissipation, scale_friction),
     }
     if isinstance(poisson, Poisson):
-        inner = _filled(poisson.function, x, pairs / (energy * tau))
+        inner = _fill_network_scales(poisson.function, x, pairs / (energy * tau))
         poisson = eqx.tree_at(lambda p: (p.function, p.metric), poisson, (inner, s**2))
     parts["poisson"] = poisson
     names = list(parts)
     there = [name for name in names if parts[name] is not None]
     changed = eqx.tree_at(lambda m: [getattr(m, name) for name in there], system, [parts[name] for name in there])
-    return tied(changed)
+    return tie_entropy(changed)
 
 
 def has_networks(tree: Any) -> bool:
     """Whether anything in a pytree is learned."""
-    return any(jax.tree_util.tree_leaves(learned(tree)))
+    return any(jax.tree_util.tree_leaves(learned_mask(tree)))
 
 
-def _filled(tree: Any, x: jax.Array, unit) -> Any:
+def _fill_network_scales(tree: Any, x: jax.Array, unit) -> Any:
     """The networks in a pytree with the scales of their inputs, and outputs in a unit, unless they have scales."""
 
     def change(part):
         if isinstance(part, Pullback):
-            inner = _filled(part.term, jax.vmap(part.coordinates)(x), unit)
+            inner = _fill_network_scales(part.term, jax.vmap(part.coordinates)(x), unit)
             return eqx.tree_at(lambda p: p.term, part, inner)
-        if not isinstance(part, Network) or not part.is_new:
+        if not isinstance(part, Network) or not part.has_default_scales:
             return part
         spread = jnp.std(x, axis=0)
         spread = jnp.where(spread > 0.0, spread, 1.0)
-        return Network(jnp.mean(x, axis=0), spread, unit * part.unit, part.function)
+        return Network(jnp.mean(x, axis=0), spread, unit * part.output_scale, part.function)
 
     return jax.tree_util.tree_map(change, tree, is_leaf=lambda part: isinstance(part, Pullback | Network))

@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from manifolds._module import Module
+from manifolds._pytree_module import Module
 
 from ..errors import InputError
-from ..tracing.traced import Traced
+from ..tracing.traced import TracedFunction
 
 
 class Learned(Module):
@@ -30,11 +30,11 @@ class Learned(Module):
     function: Callable
 
     def __call__(self, *arguments):
-        return _called(self.function, arguments)
+        return _call_jitted(self.function, arguments)
 
 
 @eqx.filter_jit
-def _called(function: Callable, arguments: tuple):
+def _call_jitted(function: Callable, arguments: tuple):
     """A call that is traced once: machine code has one routine for all of its places."""
     return function(*arguments)
 
@@ -50,18 +50,18 @@ class Perceptron(Module):
     """
 
     weights: tuple[jax.Array, ...]
-    offsets: tuple[jax.Array, ...]
+    biases: tuple[jax.Array, ...]
 
     def __init__(self, sizes, seed: int):
         random = np.random.default_rng(seed)
         pairs = list(itertools.pairwise(sizes))
         self.weights = tuple(jnp.asarray(random.standard_normal((m, n)) / np.sqrt(n)) for n, m in pairs)
-        self.offsets = tuple(jnp.asarray(0.1 * random.standard_normal(m)) for _, m in pairs)
+        self.biases = tuple(jnp.asarray(0.1 * random.standard_normal(m)) for _, m in pairs)
 
     def __call__(self, x):
-        for W, b in zip(self.weights[:-1], self.offsets[:-1], strict=True):
+        for W, b in zip(self.weights[:-1], self.biases[:-1], strict=True):
             x = jnp.tanh(W @ x + b)
-        return self.weights[-1] @ x + self.offsets[-1]
+        return self.weights[-1] @ x + self.biases[-1]
 
 
 class Network(Module):
@@ -69,20 +69,20 @@ class Network(Module):
 
     Attributes
     ----------
-    centre, size : array, shape (m,)
+    centre, scale : array, shape (m,)
         Of the inputs: mean and spread of the data, which :func:`liethermo.learn.fit` fills in.
-    unit : array, shape (outputs,)
+    output_scale : array, shape (outputs,)
         Of the outputs, likewise.
     function : Learned
     """
 
     centre: jax.Array
-    size: jax.Array
-    unit: jax.Array
+    scale: jax.Array
+    output_scale: jax.Array
     function: Learned
 
     @classmethod
-    def of_size(cls, dim: int, outputs: int, width: int, depth: int, seed: int) -> Network:
+    def from_sizes(cls, dim: int, outputs: int, width: int, depth: int, seed: int) -> Network:
         """A perceptron with ``depth`` hidden layers of ``width`` neurons."""
         for name, value in {"the number of components": dim, "width": width, "depth": depth}.items():
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
@@ -93,27 +93,27 @@ class Network(Module):
         return cls(jnp.zeros(dim), jnp.ones(dim), jnp.ones(outputs), Learned(layers))
 
     @property
-    def is_new(self) -> bool:
+    def has_default_scales(self) -> bool:
         """Whether nothing is known yet of its inputs."""
-        fields = ((self.centre, 0.0), (self.size, 1.0), (self.unit, 1.0))
+        fields = ((self.centre, 0.0), (self.scale, 1.0), (self.output_scale, 1.0))
         return all(bool(np.all(np.asarray(values) == first)) for values, first in fields)
 
     def __call__(self, x):
-        return self.unit * self.function((x - self.centre) / self.size)
+        return self.output_scale * self.function((x - self.centre) / self.scale)
 
 
-def learned(tree: Any) -> Any:
+def learned_mask(tree: Any) -> Any:
     """Which leaves of a pytree are learned: a tree of True and False, one False for a part without any.
 
     Numbers that a plain function inside of a mark is written with are none.
     """
 
-    def inside(part):
-        return False if isinstance(part, Traced) else eqx.is_inexact_array(part)
+    def is_parameter(part):
+        return False if isinstance(part, TracedFunction) else eqx.is_inexact_array(part)
 
-    def marked(part):
+    def mask_part(part):
         if not isinstance(part, Learned):
             return False
-        return jax.tree_util.tree_map(inside, part, is_leaf=lambda leaf: isinstance(leaf, Traced))
+        return jax.tree_util.tree_map(is_parameter, part, is_leaf=lambda leaf: isinstance(leaf, TracedFunction))
 
-    return jax.tree_util.tree_map(marked, tree, is_leaf=lambda part: isinstance(part, Learned))
+    return jax.tree_util.tree_map(mask_part, tree, is_leaf=lambda part: isinstance(part, Learned))

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 import manifolds as mf
-from manifolds.matrices.linear import skew
+from manifolds.matrices.linear import skew_matrix
 
 from ..dissipation.base import Dissipation
 from ..dissipation.factor import Factor
@@ -46,7 +46,7 @@ class Energy(Function):
 
     def __init__(self, function: int | Callable, width: int = 32, depth: int = 2, seed: int = 0):
         if isinstance(function, int):
-            self.function = _Scalar(Network.of_size(function, 1, width, depth, seed))
+            self.function = _ScalarOutput(Network.from_sizes(function, 1, width, depth, seed))
         elif callable(function) and not isinstance(function, AnyEnergy):
             self.function = Learned(function)
         else:
@@ -57,11 +57,11 @@ class Energy(Function):
         self.degree = math.inf
 
     def gradient(self, x) -> jax.Array:
-        return _gradient(self.function, x)
+        return _gradient_jitted(self.function, x)
 
 
 @eqx.filter_jit
-def _gradient(function: Callable, x) -> jax.Array:
+def _gradient_jitted(function: Callable, x) -> jax.Array:
     """A gradient that is traced once, as the calls of :class:`.networks.Learned` are."""
     return jax.grad(lambda y: jnp.asarray(function(y)))(x)
 
@@ -73,7 +73,7 @@ class Entropy(Energy):
         super().__init__(function, width, depth, seed)
 
 
-class _Scalar(eqx.Module):
+class _ScalarOutput(eqx.Module):
     """The only output of a network."""
 
     network: Network
@@ -82,8 +82,10 @@ class _Scalar(eqx.Module):
         return self.network(x)[0]
 
 
-def _given_or_network(function: Callable | None, dim: int, outputs: int, width: int, depth: int, seed: int) -> Callable:
-    return Network.of_size(dim, outputs, width, depth, seed) if function is None else Learned(function)
+def _function_or_network(
+    function: Callable | None, dim: int, outputs: int, width: int, depth: int, seed: int
+) -> Callable:
+    return Network.from_sizes(dim, outputs, width, depth, seed) if function is None else Learned(function)
 
 
 class Poisson(mf.PoissonStructure):
@@ -111,28 +113,28 @@ class Poisson(mf.PoissonStructure):
     function: Callable
     metric: jax.Array
     entropy: AnyEnergy | None
-    number: int = eqx.field(static=True)
+    n_components: int = eqx.field(static=True)
 
     def __init__(self, dim: int, width: int = 32, depth: int = 2, seed: int = 2, function: Callable | None = None):
-        self.function = _given_or_network(function, dim, dim * (dim - 1) // 2, width, depth, seed)
-        self.number, self.metric, self.entropy = dim, jnp.ones(dim), None
+        self.function = _function_or_network(function, dim, dim * (dim - 1) // 2, width, depth, seed)
+        self.n_components, self.metric, self.entropy = dim, jnp.ones(dim), None
 
     @staticmethod
     def canonical(degrees_of_freedom: int, dim: int | None = None) -> mf.PoissonStructure:
         """The known tensor of (q, p) in the first components of a state; the others are at rest without friction."""
-        return behind(mf.Canonical(degrees_of_freedom), dim)
+        return extend_poisson(mf.Canonical(degrees_of_freedom), dim)
 
     @staticmethod
     def lie_poisson(algebra: mf.LieAlgebra, dim: int | None = None) -> mf.PoissonStructure:
         """The known tensor of the dual of a Lie algebra in the first components of a state, likewise."""
-        return behind(mf.LiePoisson(algebra), dim)
+        return extend_poisson(mf.LiePoisson(algebra), dim)
 
     @property
     def dim(self) -> int:
-        return self.number
+        return self.n_components
 
     def tensor(self, x) -> jax.Array:
-        A = skew(self.function(x), self.number)
+        A = skew_matrix(self.function(x), self.n_components)
         if self.entropy is None:
             return A
         dS = self.entropy.gradient(x)
@@ -143,7 +145,7 @@ class Poisson(mf.PoissonStructure):
         return A + (turned - turned.T) / jnp.where(square > 0.0, square, 1.0)
 
 
-def behind(poisson: mf.PoissonStructure, dim: int | None) -> mf.PoissonStructure:
+def extend_poisson(poisson: mf.PoissonStructure, dim: int | None) -> mf.PoissonStructure:
     """A structure with components behind its own, up to ``dim``, that nothing is conjugate to."""
     assert poisson.dim is not None
     if dim is None or dim == poisson.dim:
@@ -178,7 +180,7 @@ class Friction(Dissipation):
 
     function: Callable
     metric: jax.Array
-    number: int = eqx.field(static=True)
+    n_components: int = eqx.field(static=True)
     rank: int = eqx.field(static=True)
     construction: str = eqx.field(static=True)
 
@@ -197,27 +199,27 @@ class Friction(Dissipation):
         if isinstance(rank, bool) or not isinstance(rank, int) or rank < 1:
             raise InputError(f"rank is a positive integer, not {rank!r}")
         numbers = rank * (dim * (dim - 1) // 2 if construction == "skew" else dim)
-        self.function = _given_or_network(function, dim, numbers, width, depth, seed)
-        self.number, self.rank, self.construction, self.metric = dim, rank, construction, jnp.ones(dim)
+        self.function = _function_or_network(function, dim, numbers, width, depth, seed)
+        self.n_components, self.rank, self.construction, self.metric = dim, rank, construction, jnp.ones(dim)
 
-    def prepared(self, system):
-        if system.dim != self.number:
-            raise InputError(f"the friction is of {self.number} components, but the state has {system.dim}")
+    def bind_to(self, system):
+        if system.dim != self.n_components:
+            raise InputError(f"the friction is of {self.n_components} components, but the state has {system.dim}")
         return self
 
-    def columns(self, x, dH) -> jax.Array:
+    def factor_columns(self, x, dH) -> jax.Array:
         """B, shape (dim, rank)."""
         found = self.function(x).reshape(self.rank, -1)
         if self.construction == "skew":
-            return (skew(found, self.number) @ dH).T
+            return (skew_matrix(found, self.n_components) @ dH).T
         raised = self.metric * dH
         overlap = jnp.dot(raised, dH)
         return (found - jnp.outer(found @ dH, raised) / jnp.where(overlap > 0.0, overlap, 1.0)).T
 
     def force(self, system, x, dH, dS, dL):
-        B = self.columns(x, dH)
+        B = self.factor_columns(x, dH)
         return B @ (dS @ B)
 
     def factor(self, system, x, dH, dL):
-        B = self.columns(x, dH)
+        B = self.factor_columns(x, dH)
         return Factor(self.rank, lambda w: B @ w)

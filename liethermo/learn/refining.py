@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..integrators import OneStepMethod
+from .compile_options import fast_compile_options
 from .data import Trajectory
-from .losses import Weights, stepper
+from .losses import ParameterVector, differentiable_stepper
 from .networks import Perceptron
-from .observation import Observation, coordinates
-from .quickly import quickly
+from .observation import Observation, n_coordinates
 
 MAX_PARAMETERS = 64
 """Learned numbers up to which a fit is refined: the cost grows with their number."""
@@ -25,13 +25,13 @@ MAX_COLUMN_STEPS = 2e7
 MAX_ITERATIONS = 60
 """Iterations of Levenberg and Marquardt."""
 
-STEP_LIMIT = 1e-2
+NEWTON_STEP_TOLERANCE = 1e-2
 """Newton step of the learned numbers, in standard errors, below which the iteration has converged."""
 
 SCHUR_RTOL = 1e-12
 """Eigenvalues of the normal matrix, scaled to a diagonal of ones, below which a combination is not determined."""
 
-FIRST_STATE_PRIOR = 1e-4
+INITIAL_STATE_PRIOR = 1e-4
 """Weight of a first state staying where it is, in units of the search and of the variance of the residuals: a move by
 a hundred units counts as one standard deviation. What the data hardly depend on, as an entropy that is not observed,
 would move without bounds. It acts on steps and errors, not on where the minimum is."""
@@ -39,31 +39,31 @@ would move without bounds. It acts on steps and errors, not on where the minimum
 MAX_LOG_STEP = 2.0
 """Largest change of the logarithm of a number in one iteration."""
 
-FIRST_DAMPING, DAMPING_DECREASE, DAMPING_INCREASE, MAX_DAMPING = 1e-3, 0.2, 10.0, 1e12
+INITIAL_DAMPING, DAMPING_DECREASE, DAMPING_INCREASE, MAX_DAMPING = 1e-3, 0.2, 10.0, 1e12
 """Damping at first, its factors after a step that is taken and one that is not, and where the iteration gives up."""
 
 
-class Runs(NamedTuple):
+class PaddedRuns(NamedTuple):
     """Whole trajectories of any lengths, as arrays of one shape.
 
     Attributes
     ----------
-    starts : array, shape (B, N)
+    initial_states : array, shape (B, N)
         First states of the runs.
-    sizes : array, shape (B, m)
+    intervals : array, shape (B, m)
         Intervals; behind the end of a trajectory the last one is repeated.
-    shown : array, shape (B, m + 1, k)
+    observations : array, shape (B, m + 1, k)
         What was observed, zeros behind the end.
     is_observed : array of bool, shape (B, m + 1)
     """
 
-    starts: jax.Array
-    sizes: jax.Array
-    shown: jax.Array
+    initial_states: jax.Array
+    intervals: jax.Array
+    observations: jax.Array
     is_observed: jax.Array
 
 
-class Refined(NamedTuple):
+class LeastSquaresResult(NamedTuple):
     """Learned numbers at a least-squares minimum, and what the data say of them.
 
     Attributes
@@ -76,10 +76,10 @@ class Refined(NamedTuple):
     condition : float
         Ratio of the largest to the smallest singular value of the Jacobian with columns of norm one, after the first
         states have been eliminated.
-    residual, held_out : float
+    residual, held_out_residual : float
         Root mean square of the residuals by their degrees of freedom, in the units of the fit; of the trajectories held
         out only the first states are found. NaN where there are none.
-    gradient : float
+    gradient_norm : float
         Norm of the derivative of ln(loss) by the weights.
     converged : bool
     iterations : int
@@ -90,29 +90,29 @@ class Refined(NamedTuple):
     rank: int
     condition: float
     residual: float
-    held_out: float
-    gradient: float
+    held_out_residual: float
+    gradient_norm: float
     converged: bool
     iterations: int
 
 
-def can_refine(own: Weights, system: Any, data: list[Trajectory], run, substeps: int) -> bool:
+def can_refine(own: ParameterVector, system: Any, data: list[Trajectory], run, substeps: int) -> bool:
     """Return whether least squares over whole trajectories are affordable, and make sense of the numbers learned.
 
     The weights of a perceptron are not determined by the function that it is.
     """
-    count = own.start.size
+    count = own.initial_values.size
     if any(map(_is_perceptron, jax.tree_util.tree_leaves(system, is_leaf=_is_perceptron))):
         return False
     steps = substeps * sum(len(t) - 1 for t, _ in data)
-    return count <= MAX_PARAMETERS and steps * (count + coordinates(run)) <= MAX_COLUMN_STEPS
+    return count <= MAX_PARAMETERS and steps * (count + n_coordinates(run)) <= MAX_COLUMN_STEPS
 
 
 def _is_perceptron(part: Any) -> bool:
     return isinstance(part, Perceptron)
 
 
-def joined_runs(data: list[Trajectory], starts: list[np.ndarray]) -> Runs:
+def pad_runs(data: list[Trajectory], starts: list[np.ndarray]) -> PaddedRuns:
     """Return trajectories and their first states as arrays of one shape."""
     length = max(len(t) for t, _ in data)
     sizes, shown, is_observed = [], [], []
@@ -122,19 +122,19 @@ def joined_runs(data: list[Trajectory], starts: list[np.ndarray]) -> Runs:
         shown.append(np.concatenate([x, np.zeros((missing, x.shape[1]))]))
         is_observed.append(np.arange(length) < len(t))
     arrays = np.stack(starts), np.stack(sizes), np.stack(shown), np.stack(is_observed)
-    return Runs(*map(jnp.asarray, arrays))
+    return PaddedRuns(*map(jnp.asarray, arrays))
 
 
-def refine(
-    own: Weights,
+def refine_by_least_squares(
+    own: ParameterVector,
     weights: np.ndarray,
     method: OneStepMethod,
-    runs: Runs,
+    runs: PaddedRuns,
     is_held_out: np.ndarray,
     seen: Observation,
     units: tuple[np.ndarray, np.ndarray],
     substeps: int,
-) -> Refined:
+) -> LeastSquaresResult:
     """Minimise the squares of what whole runs miss of the data, over the weights and the first states.
 
     Levenberg and Marquardt's method. Each first state moves one run alone, so the normal equations of the weights are
@@ -150,26 +150,28 @@ def refine(
         Of what is observed, and of the search for first states.
     """
     evaluate = _normal_equations(own, method, seen, units, substeps)
-    moved = jax.jit(jax.vmap(lambda x, z: seen.moved(_run(own, method, substeps, seen), x, z)))
+    moved = jax.jit(jax.vmap(lambda x, z: seen.displace(_run_system(own, method, substeps, seen), x, z)))
     of_search, taken = np.asarray(units[1]), ~np.asarray(is_held_out)
     p = len(weights)
-    point = np.asarray(weights, dtype=np.float64), runs.starts
+    point = np.asarray(weights, dtype=np.float64), runs.initial_states
     squares, slopes, costs = map(np.asarray, evaluate(jnp.asarray(point[0]), point[1], *runs[1:]))
     if not np.isfinite(costs[taken]).all():
-        return _failed(weights)
-    damping, converged, iterations = FIRST_DAMPING, False, 0
-    freedom = _freedom(np.asarray(runs.is_observed), runs.shown.shape[-1], squares[:, p:, p:], taken, p)
+        return _failed_result(weights)
+    damping, converged, iterations = INITIAL_DAMPING, False, 0
+    freedom = _degrees_of_freedom(
+        np.asarray(runs.is_observed), runs.observations.shape[-1], squares[:, p:, p:], taken, p
+    )
     variance = costs[taken].sum() / max(freedom, 1)
     while iterations < MAX_ITERATIONS and damping < MAX_DAMPING:
-        damped = _with_prior(squares, p, variance)
-        schur, _ = _schur(damped, slopes, p, taken)
-        newton, _ = _step(damped, slopes, p, taken, 0.0)
+        damped = _add_prior(squares, p, variance)
+        schur, _ = _schur_complement(damped, slopes, p, taken)
+        newton, _ = _gauss_newton_step(damped, slopes, p, taken, 0.0)
         size = np.sqrt(max(newton @ schur @ newton, 0.0) / variance) if variance > 0.0 else 0.0
-        converged = bool(size <= STEP_LIMIT)
+        converged = bool(size <= NEWTON_STEP_TOLERANCE)
         if converged and iterations > 0:
             break
         iterations += 1
-        step, moves = _step(damped, slopes, p, taken, damping)
+        step, moves = _gauss_newton_step(damped, slopes, p, taken, damping)
         longest = np.abs(step[own.is_log]).max(initial=0.0) / MAX_LOG_STEP
         step, moves = step / max(longest, 1.0), moves / max(longest, 1.0)
         new = point[0] + step, moved(point[1], jnp.asarray(moves * of_search))
@@ -184,74 +186,80 @@ def refine(
             break
         else:
             damping *= DAMPING_INCREASE
-    schur, slope = _schur(_with_prior(squares, p, variance), slopes, p, taken)
+    schur, slope = _schur_complement(_add_prior(squares, p, variance), slopes, p, taken)
     total = costs[taken].sum()
     variance = total / freedom if freedom > 0 else np.nan
-    inverse, _, condition = _inverse(schur)
+    inverse, _, condition = _inverse_rank_condition(schur)
     of_weights = np.diag(squares[taken].sum(axis=0))[:p]  # with the first states known
-    without_prior, rank, _ = _inverse(_schur(squares, slopes, p, taken)[0], of_weights)
+    without_prior, rank, _ = _inverse_rank_condition(_schur_complement(squares, slopes, p, taken)[0], of_weights)
     if rank < p:  # the prior alone determines the rest
         inverse, condition = np.where(np.isinf(without_prior), np.inf, inverse), np.inf
     held = np.nan
     if not taken.all() and np.isfinite(costs[~taken]).all():
-        behind = _freedom(np.asarray(runs.is_observed), runs.shown.shape[-1], squares[:, p:, p:], ~taken, 0)
+        behind = _degrees_of_freedom(
+            np.asarray(runs.is_observed), runs.observations.shape[-1], squares[:, p:, p:], ~taken, 0
+        )
         held = np.sqrt(costs[~taken].sum() / behind) if behind > 0 else np.nan
     gradient = 2.0 * float(np.linalg.norm(slope)) / total if total > 0.0 else 0.0
     with np.errstate(invalid="ignore"):
         covariance = inverse * variance
-    return Refined(
+    return LeastSquaresResult(
         point[0], covariance, rank, condition, float(np.sqrt(variance)), float(held), gradient, converged, iterations
     )
 
 
-def _failed(weights) -> Refined:
+def _failed_result(weights) -> LeastSquaresResult:
     nan = np.full((len(weights),) * 2, np.nan)
-    return Refined(np.asarray(weights), nan, 0, np.nan, np.nan, np.nan, np.nan, False, 0)
+    return LeastSquaresResult(np.asarray(weights), nan, 0, np.nan, np.nan, np.nan, np.nan, False, 0)
 
 
-def _run(own: Weights, method: OneStepMethod, substeps: int, seen: Observation):
-    return stepper(own.system(jnp.asarray(own.start)), method, substeps, seen.group is not None)[0]
+def _run_system(own: ParameterVector, method: OneStepMethod, substeps: int, seen: Observation):
+    return differentiable_stepper(
+        own.build_system(jnp.asarray(own.initial_values)), method, substeps, seen.group is not None
+    )[0]
 
 
-def _normal_equations(own: Weights, method: OneStepMethod, seen: Observation, units, substeps: int):
+def _normal_equations(own: ParameterVector, method: OneStepMethod, seen: Observation, units, substeps: int):
     """Return a function of weights and runs to ``J^T J``, ``J^T r`` and ``r . r`` of each run, weights first."""
     of_data, of_search = map(jnp.asarray, units)
-    p, c = own.start.size, len(of_search)
+    p, c = own.initial_values.size, len(of_search)
 
-    def missed(weights, z, start, sizes, shown, is_observed):
-        run, begin, advance, state_of = stepper(own.system(weights), method, substeps, seen.group is not None)
+    def residuals(weights, z, start, sizes, shown, is_observed):
+        run, begin, advance, state_of = differentiable_stepper(
+            own.build_system(weights), method, substeps, seen.group is not None
+        )
 
         def interval(carry, h):
             carry = advance(carry, h)
             return carry, state_of(carry)
 
-        first = seen.moved(run, start, z * of_search)
+        first = seen.displace(run, start, z * of_search)
         states = jnp.concatenate([first[None], jax.lax.scan(interval, begin(first), sizes)[1]])
-        found = jax.vmap(lambda x: seen.of(run, x))(states)
+        found = jax.vmap(lambda x: seen.observe(run, x))(states)
         return jnp.where(is_observed[:, None], (found - shown) / of_data, 0.0).ravel()
 
-    def of_one(weights, arrays):
-        def rows(v):
-            return missed(weights + v[:p], v[p:], *arrays)
+    def run_equations(weights, arrays):
+        def displaced_residuals(v):
+            return residuals(weights + v[:p], v[p:], *arrays)
 
-        r, J = rows(jnp.zeros(p + c)), jax.jacfwd(rows)(jnp.zeros(p + c))
+        r, J = displaced_residuals(jnp.zeros(p + c)), jax.jacfwd(displaced_residuals)(jnp.zeros(p + c))
         return J.T @ J, J.T @ r, r @ r
 
-    @functools.partial(jax.jit, compiler_options=quickly())
-    def of_all(weights, *arrays):
-        return jax.lax.map(functools.partial(of_one, weights), arrays, batch_size=min(len(arrays[0]), 16))
+    @functools.partial(jax.jit, compiler_options=fast_compile_options())
+    def all_equations(weights, *arrays):
+        return jax.lax.map(functools.partial(run_equations, weights), arrays, batch_size=min(len(arrays[0]), 16))
 
-    return of_all
+    return all_equations
 
 
-def _with_prior(squares: np.ndarray, p: int, variance: float) -> np.ndarray:
-    prior = np.where(np.arange(squares.shape[-1]) < p, 0.0, FIRST_STATE_PRIOR * variance)
+def _add_prior(squares: np.ndarray, p: int, variance: float) -> np.ndarray:
+    prior = np.where(np.arange(squares.shape[-1]) < p, 0.0, INITIAL_STATE_PRIOR * variance)
     return squares + np.diag(prior)
 
 
-def _freedom(is_observed, k: int, by_starts, chosen, p: int) -> int:
+def _degrees_of_freedom(is_observed, k: int, by_starts, chosen, p: int) -> int:
     """Return the numbers observed less those that are found: the weights, and what is seen of the first states."""
-    seen = sum(int((np.linalg.eigvalsh(square) > FIRST_STATE_PRIOR).sum()) for square in by_starts[chosen])
+    seen = sum(int((np.linalg.eigvalsh(square) > INITIAL_STATE_PRIOR).sum()) for square in by_starts[chosen])
     return int(is_observed[chosen].sum()) * k - p - seen
 
 
@@ -263,7 +271,7 @@ def _pseudo_inverse(square: np.ndarray, damping: float = 0.0) -> np.ndarray:
     return np.linalg.pinv(scaled, rcond=SCHUR_RTOL, hermitian=True) * np.outer(scale, scale)
 
 
-def _schur(squares, slopes, p: int, taken, damping: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def _schur_complement(squares, slopes, p: int, taken, damping: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Return the normal matrix and the slope of the weights, the first states of all runs eliminated."""
     matrix, slope = np.zeros((p, p)), np.zeros(p)
     for S, g in zip(squares[taken], slopes[taken], strict=True):
@@ -273,9 +281,9 @@ def _schur(squares, slopes, p: int, taken, damping: float = 0.0) -> tuple[np.nda
     return 0.5 * (matrix + matrix.T), slope
 
 
-def _step(squares, slopes, p: int, taken, damping: float) -> tuple[np.ndarray, np.ndarray]:
+def _gauss_newton_step(squares, slopes, p: int, taken, damping: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the damped Gauss-Newton step of the weights, shape (p,), and of the first states, shape (B, c)."""
-    matrix, slope = _schur(squares, slopes, p, taken, damping)
+    matrix, slope = _schur_complement(squares, slopes, p, taken, damping)
     step = -_pseudo_inverse(matrix, damping) @ slope
     moves = [
         -_pseudo_inverse(S[p:, p:], damping) @ (g[p:] + S[p:, :p] @ step) if np.isfinite(S).all() else 0.0 * g[p:]
@@ -284,7 +292,7 @@ def _step(squares, slopes, p: int, taken, damping: float) -> tuple[np.ndarray, n
     return step, np.stack(moves)
 
 
-def _inverse(schur: np.ndarray, diagonal: np.ndarray | None = None) -> tuple[np.ndarray, int, float]:
+def _inverse_rank_condition(schur: np.ndarray, diagonal: np.ndarray | None = None) -> tuple[np.ndarray, int, float]:
     """Return the inverse of a normal matrix, infinite where it has none, its rank, and the condition of its root.
 
     Parameters

@@ -17,21 +17,21 @@ import numpy as np
 from .. import disk
 from ..errors import FileError, InputError
 from ..runs.progress import Progress
-from .descent import descent
-from .losses import Task, Weights
-from .quickly import quickly
-from .refining import Refined
+from .compile_options import fast_compile_options
+from .descent import soap_optimiser
+from .losses import Objective, ParameterVector
+from .refining import LeastSquaresResult
 
-BLOCK = 50
+STEPS_PER_EVALUATION = 50
 """Steps between two looks at the course."""
 
-LOOKED_AT = 512
+MAX_VALIDATION_ITEMS = 512
 """Items at most that a validation loss is the mean over."""
 
-BETTER = 0.999
+IMPROVEMENT_FACTOR = 0.999
 """What the loss has to fall below, relative to the least so far, to count as better."""
 
-FORMAT = "liethermo-training-1"
+CHECKPOINT_FORMAT = "liethermo-training-1"
 
 
 @dataclass(frozen=True)
@@ -39,21 +39,21 @@ class Phase:
     """A part of a fit: a loss, and how long and how fast it is descended."""
 
     name: str
-    task: Task
-    held_out: Task | None
+    objective: Objective
+    held_out_objective: Objective | None
     steps: int
     rate: float
-    batch: int
-    shapes: tuple[tuple[int, ...], ...]
+    batch_size: int
+    array_shapes: tuple[tuple[int, ...], ...]
 
 
 LEAST_SQUARES = "least squares"
 """Name of the refinement in the record of a fit."""
 
-VAGUE = 0.5
+MAX_RELATIVE_STANDARD_ERROR = 0.5
 """Standard error of a number, relative to it, above which the data do not determine it."""
 
-MISFIT = 1.5
+MAX_RESIDUAL_TO_NOISE = 1.5
 """Residual, relative to the noise, above which the model does not describe the data."""
 
 
@@ -127,7 +127,9 @@ class Training:
     noise: np.ndarray = field(default_factory=lambda: np.zeros(0))
     noise_is_estimated: bool = False
 
-    def with_findings(self, own: Weights, refined: Refined | None, noise, noise_is_estimated: bool) -> Training:
+    def with_estimates(
+        self, own: ParameterVector, refined: LeastSquaresResult | None, noise, noise_is_estimated: bool
+    ) -> Training:
         """Return the record with what a refinement by least squares has found, and the noise."""
         sigma = np.zeros(0) if noise is None else np.asarray(noise)
         record = replace(self, noise=sigma, noise_is_estimated=noise_is_estimated)
@@ -147,8 +149,8 @@ class Training:
             rank=refined.rank,
             condition=refined.condition,
             residual=refined.residual,
-            held_out=refined.held_out,
-            gradient=refined.gradient,
+            held_out=refined.held_out_residual,
+            gradient=refined.gradient_norm,
             converged=refined.converged,
             ended=self.ended | {LEAST_SQUARES: f"after {refined.iterations} iterations"},
         )
@@ -165,13 +167,13 @@ class Training:
         vague = [
             f"{name} = {value:.3g} ± {error:.2g}"
             for name, value, error in zip(self.names, self.values, self.standard_errors, strict=True)
-            if np.isinf(error) or (value > 0.0 and error > VAGUE * value)
+            if np.isinf(error) or (value > 0.0 and error > MAX_RELATIVE_STANDARD_ERROR * value)
         ]
         if vague:
             found.append(
                 f"the data do not determine {', '.join(vague)}: give more data, or leave known numbers out of the fit"
             )
-        if self.noise.size and self.residual > MISFIT:
+        if self.noise.size and self.residual > MAX_RESIDUAL_TO_NOISE:
             found.append(
                 f"what the runs miss of the data is {self.residual:.2g} times the noise: the model cannot describe "
                 "them, its steps are too long (substeps=), or the noise is larger (noise=)"
@@ -185,7 +187,9 @@ class Training:
             if len(of):
                 last, held = self.loss[of[-1]], self.validation[of[-1]]
                 beside = "" if np.isnan(held) else f", held out {held:.2e}"
-                lines.append(f"{name}: loss {self.loss[of[0]]:.2e} to {last:.2e}{beside}; {how}{self._fall(of)}")
+                lines.append(
+                    f"{name}: loss {self.loss[of[0]]:.2e} to {last:.2e}{beside}; {how}{self._late_decrease(of)}"
+                )
         if self.noise.size:
             low, high = float(self.noise.min()), float(self.noise.max())
             size = f"{low:.2g}" if low == high else f"{low:.2g} to {high:.2g}"
@@ -212,7 +216,7 @@ class Training:
         ]
         return "\n".join([*lines, *(f"CAUTION: {problem}" for problem in self.problems)])
 
-    def _fall(self, of: np.ndarray) -> str:
+    def _late_decrease(self, of: np.ndarray) -> str:
         """By how much the loss fell in the last fifth of the looks at a phase, in words."""
         if len(of) < 10:
             return ""
@@ -222,26 +226,26 @@ class Training:
         )
 
 
-class Course:
+class TrainingRun:
     """A fit under way: all that its next step depends on, so that it can go on from a file."""
 
     def __init__(self, phases: list[Phase], start: np.ndarray, identity: str):
-        self.phases, self.identity = phases, identity
-        self.index = self.block = 0
-        self.looks: list[tuple[int, str, float, float]] = []
-        self.gradient = float("nan")
+        self.phases, self.fit_fingerprint = phases, identity
+        self.phase_index = self.block_index = 0
+        self.evaluations: list[tuple[int, str, float, float]] = []
+        self.gradient_norm = float("nan")
         self.ended: dict[str, str] = {}
         self.weights = np.asarray(start)
-        self._enter()
+        self._start_phase()
 
-    def _enter(self) -> None:
+    def _start_phase(self) -> None:
         """Begin the phase that is next, with the best weights so far."""
-        phase = self.phases[self.index]
-        self.block, self.since = 0, 0
-        self.vector = jnp.concatenate([jnp.asarray(self.weights), jnp.asarray(phase.task.free)])
-        self.optimiser = _optimiser(phase)
-        self.state = self.optimiser.init(self.vector)
-        self.best, self.least = np.asarray(self.vector), np.inf
+        phase = self.phases[self.phase_index]
+        self.block_index, self.evaluations_since_best = 0, 0
+        self.vector = jnp.concatenate([jnp.asarray(self.weights), jnp.asarray(phase.objective.initial_free)])
+        self.optimiser = _make_optimiser(phase)
+        self.optimiser_state = self.optimiser.init(self.vector)
+        self.best_vector, self.best_loss = np.asarray(self.vector), np.inf
 
     def run(self, seed: int, patience: int | None, checkpoint: Path | None, progress: bool | None) -> None:
         """Take all steps, or as many as it takes, or as time is given.
@@ -253,77 +257,81 @@ class Course:
         """
         total = sum(phase.steps for phase in self.phases)
         with Progress((0, total), progress, "step {:.0f}") as bar:
-            while self.index < len(self.phases):
-                phase = self.phases[self.index]
+            while self.phase_index < len(self.phases):
+                phase = self.phases[self.phase_index]
                 try:
-                    how = self._phase(phase, seed, patience, checkpoint, bar)
+                    how = self._run_phase(phase, seed, patience, checkpoint, bar)
                 except KeyboardInterrupt:
                     self.ended[phase.name] = "interrupted"
-                    self.weights = self.best[: len(self.weights)]
+                    self.weights = self.best_vector[: len(self.weights)]
                     return
                 self.ended[phase.name] = how
-                self.weights = self.best[: len(self.weights)]
-                self.index += 1
-                if self.index < len(self.phases):
-                    self._enter()
-                self._save(checkpoint)
+                self.weights = self.best_vector[: len(self.weights)]
+                self.phase_index += 1
+                if self.phase_index < len(self.phases):
+                    self._start_phase()
+                self._save_checkpoint(checkpoint)
 
-    def _phase(self, phase: Phase, seed: int, patience: int | None, checkpoint: Path | None, bar: Progress) -> str:
-        length = min(BLOCK, phase.steps)
+    def _run_phase(self, phase: Phase, seed: int, patience: int | None, checkpoint: Path | None, bar: Progress) -> str:
+        length = min(STEPS_PER_EVALUATION, phase.steps)
         blocks = -(-phase.steps // length)
-        descend, look = _programs(phase, self.optimiser)
-        before = sum(p.steps for p in self.phases[: self.index])
-        if self.block == 0 and phase.held_out is not None and np.isfinite(found := look(self.vector)):
-            self.least = found  # what does worse on what is held out than the weights before is not taken
-        while self.block < blocks:
-            random = np.random.default_rng([seed, self.index, self.block])
-            batch = min(phase.batch, phase.task.items)
-            chosen = np.stack([random.permutation(phase.task.items)[:batch] for _ in range(length)])
-            self.vector, self.state, losses, slopes = descend(self.vector, self.state, phase.task.arrays, chosen)
-            self.gradient = float(slopes[-1])
-            self.block += 1
-            step, loss, held = before + self.block * length, float(jnp.mean(losses)), look(self.vector)
-            self.looks.append((step, phase.name, loss, held))
-            judged = loss if np.isnan(held) and phase.held_out is None else held
+        descend, look = _compile_programs(phase, self.optimiser)
+        before = sum(p.steps for p in self.phases[: self.phase_index])
+        if self.block_index == 0 and phase.held_out_objective is not None and np.isfinite(found := look(self.vector)):
+            self.best_loss = found  # what does worse on what is held out than the weights before is not taken
+        while self.block_index < blocks:
+            random = np.random.default_rng([seed, self.phase_index, self.block_index])
+            batch = min(phase.batch_size, phase.objective.n_items)
+            chosen = np.stack([random.permutation(phase.objective.n_items)[:batch] for _ in range(length)])
+            self.vector, self.optimiser_state, losses, slopes = descend(
+                self.vector, self.optimiser_state, phase.objective.arrays, chosen
+            )
+            self.gradient_norm = float(slopes[-1])
+            self.block_index += 1
+            step, loss, held = before + self.block_index * length, float(jnp.mean(losses)), look(self.vector)
+            self.evaluations.append((step, phase.name, loss, held))
+            judged = loss if np.isnan(held) and phase.held_out_objective is None else held
             if not np.isfinite(loss):
                 raise InputError(
                     f"the loss is {loss} after {step} steps, in the {phase.name}: the runs leave the domain of the "
                     "functions or the steps are too long; try a smaller rate, or more substeps"
                 )
-            self.since = 0 if judged < BETTER * self.least else self.since + 1
-            if judged < self.least:
-                self.best, self.least = np.asarray(self.vector), judged
+            self.evaluations_since_best = (
+                0 if judged < IMPROVEMENT_FACTOR * self.best_loss else self.evaluations_since_best + 1
+            )
+            if judged < self.best_loss:
+                self.best_vector, self.best_loss = np.asarray(self.vector), judged
             bar.update(step)
-            self._save(checkpoint)
-            if patience is not None and self.since >= patience:
-                return f"no better for {patience} looks, after {self.block * length} steps"
-        return f"after {self.block * length} steps"
+            self._save_checkpoint(checkpoint)
+            if patience is not None and self.evaluations_since_best >= patience:
+                return f"no better for {patience} looks, after {self.block_index * length} steps"
+        return f"after {self.block_index * length} steps"
 
-    def record(self, seconds: float) -> Training:
-        steps, phases, values, held = zip(*self.looks, strict=True) if self.looks else ((), (), (), ())
+    def training_record(self, seconds: float) -> Training:
+        steps, phases, values, held = zip(*self.evaluations, strict=True) if self.evaluations else ((), (), (), ())
         count = self.weights.size
         arrays = np.array(steps, dtype=int), np.array(phases, dtype=str), np.array(values), np.array(held)
-        return Training(*arrays, count, seconds, self.ended, gradient=self.gradient)
+        return Training(*arrays, count, seconds, self.ended, gradient=self.gradient_norm)
 
     # -- files --------------------------------------------------------------------------------------------------------
 
-    def _save(self, path: Path | None) -> None:
+    def _save_checkpoint(self, path: Path | None) -> None:
         if path is None:
             return
         said = {
-            "format": FORMAT,
-            "identity": self.identity,
-            "index": self.index,
-            "block": self.block,
-            "since": self.since,
-            "least": self.least,
-            "looks": self.looks,
+            "format": CHECKPOINT_FORMAT,
+            "identity": self.fit_fingerprint,
+            "index": self.phase_index,
+            "block": self.block_index,
+            "since": self.evaluations_since_best,
+            "least": self.best_loss,
+            "looks": self.evaluations,
             "ended": self.ended,
-            "gradient": self.gradient,
+            "gradient": self.gradient_norm,
         }
-        leaves = jax.tree_util.tree_leaves(self.state)
-        arrays = {"weights": self.weights, "vector": self.vector, "best": self.best}
-        write(path, said, arrays | {f"state_{i}": leaf for i, leaf in enumerate(leaves)})
+        leaves = jax.tree_util.tree_leaves(self.optimiser_state)
+        arrays = {"weights": self.weights, "vector": self.vector, "best": self.best_vector}
+        write_archive(path, said, arrays | {f"state_{i}": leaf for i, leaf in enumerate(leaves)})
 
     def resume(self, path: Path) -> None:
         """Go on from a file.
@@ -333,63 +341,65 @@ class Course:
         FileError
             If it is of another fit, or none.
         """
-        said, arrays = read(path, FORMAT)
-        if said.get("identity") != self.identity:
+        said, arrays = read_archive(path, CHECKPOINT_FORMAT)
+        if said.get("identity") != self.fit_fingerprint:
             raise FileError(
                 f"{path} is the checkpoint of a fit of another model, of other data or with other settings: give "
                 "another path, or remove it"
             )
-        self.index, self.weights = said["index"], arrays["weights"]
-        self.looks, self.ended = [tuple(look) for look in said["looks"]], said["ended"]
-        self.gradient = said.get("gradient", float("nan"))
-        if self.index >= len(self.phases):
-            self.best = arrays["best"]
+        self.phase_index, self.weights = said["index"], arrays["weights"]
+        self.evaluations, self.ended = [tuple(look) for look in said["looks"]], said["ended"]
+        self.gradient_norm = said.get("gradient", float("nan"))
+        if self.phase_index >= len(self.phases):
+            self.best_vector = arrays["best"]
             return
-        self._enter()
-        self.block, self.since, self.least = said["block"], said["since"], said["least"]
+        self._start_phase()
+        self.block_index, self.evaluations_since_best, self.best_loss = said["block"], said["since"], said["least"]
         if not self.vector.shape == arrays["vector"].shape == arrays["best"].shape:
             raise FileError(f"{path} cannot be gone on from: its numbers are not as many as those of this fit")
-        self.vector, self.best = jnp.asarray(arrays["vector"]), arrays["best"]
-        first, structure = jax.tree_util.tree_flatten(self.state)
+        self.vector, self.best_vector = jnp.asarray(arrays["vector"]), arrays["best"]
+        first, structure = jax.tree_util.tree_flatten(self.optimiser_state)
         leaves = [jnp.asarray(arrays[f"state_{i}"]) for i in range(len(first))]
-        self.state = jax.tree_util.tree_unflatten(structure, leaves)
+        self.optimiser_state = jax.tree_util.tree_unflatten(structure, leaves)
 
 
-def _optimiser(phase: Phase) -> Any:
+def _make_optimiser(phase: Phase) -> Any:
     """With a rate that falls to a hundredth along a cosine; steps with a gradient that is not finite are left."""
     try:
         import optax
     except ImportError:
         raise InputError("lt.learn.fit needs optax: pip install 'liethermo[learn]'") from None
     schedule = optax.cosine_decay_schedule(phase.rate, phase.steps, alpha=0.01)
-    return optax.apply_if_finite(descent(phase.shapes, schedule), max_consecutive_errors=10 * BLOCK)
+    return optax.apply_if_finite(
+        soap_optimiser(phase.array_shapes, schedule), max_consecutive_errors=10 * STEPS_PER_EVALUATION
+    )
 
 
-def _programs(phase: Phase, optimiser: Any) -> tuple[Callable, Callable]:
+def _compile_programs(phase: Phase, optimiser: Any) -> tuple[Callable, Callable]:
     """A block of steps, and the loss of what is held out."""
 
-    def one(carry, chosen):
+    def train_step(carry, chosen):
         vector, state, arrays = carry
-        value, slope = jax.value_and_grad(phase.task.loss)(vector, arrays, chosen)
+        value, slope = jax.value_and_grad(phase.objective.loss)(vector, arrays, chosen)
         updates, state = optimiser.update(slope, state, vector)
-        count = slope.size - phase.task.free.size
+        count = slope.size - phase.objective.initial_free.size
         return (vector + updates, state, arrays), (value, jnp.linalg.norm(slope[:count]) / value)
 
-    def block(vector, state, arrays, chosen):
-        (vector, state, _), (values, slopes) = jax.lax.scan(one, (vector, state, arrays), chosen)
+    def train_block(vector, state, arrays, chosen):
+        (vector, state, _), (values, slopes) = jax.lax.scan(train_step, (vector, state, arrays), chosen)
         return vector, state, values, slopes
 
-    held = phase.held_out
-    descend = jax.jit(block, compiler_options=quickly())
+    held = phase.held_out_objective
+    descend = jax.jit(train_block, compiler_options=fast_compile_options())
     if held is None:
         return descend, lambda vector: float("nan")
-    some = np.linspace(0, held.items - 1, min(held.items, LOOKED_AT)).round().astype(int)
-    looking = jax.jit(held.loss, compiler_options=quickly())
-    weights = phase.task.free.size
+    some = np.linspace(0, held.n_items - 1, min(held.n_items, MAX_VALIDATION_ITEMS)).round().astype(int)
+    looking = jax.jit(held.loss, compiler_options=fast_compile_options())
+    weights = phase.objective.initial_free.size
     return descend, lambda vector: float(looking(vector[: vector.size - weights], held.arrays, some))
 
 
-def write(path: Path, said: dict[str, Any], arrays: dict[str, Any]) -> None:
+def write_archive(path: Path, said: dict[str, Any], arrays: dict[str, Any]) -> None:
     """A file of arrays and JSON; it appears whole or not at all.
 
     Raises
@@ -400,12 +410,12 @@ def write(path: Path, said: dict[str, Any], arrays: dict[str, Any]) -> None:
     text = json.dumps({**said, "checksum": _checksum(said, held)})
     np.savez(made, __json__=np.frombuffer(text.encode(), dtype=np.uint8), **held)  # type: ignore[arg-type]
     try:
-        disk.write(path, made.getvalue())
+        disk.write_atomically(path, made.getvalue())
     except (OSError, ValueError) as error:
-        raise FileError(f"cannot write {path!s:.200}: {disk.why(error)}") from error
+        raise FileError(f"cannot write {path!s:.200}: {disk.why_os_failed(error)}") from error
 
 
-def read(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def read_archive(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """What :func:`write` wrote.
 
     Raises

@@ -5,7 +5,7 @@ A function ``model_solution`` beside a model, in its module, is the exact soluti
 
 from __future__ import annotations
 
-from manifolds._names import listing
+from manifolds._names import public_dir
 
 from .body_with_wheels import body_with_wheels
 from .cylinder import cylinder
@@ -50,4 +50,4 @@ __all__ = [
     "tumbling_body",
     "zeitlin",
 ]
-__dir__ = listing(__all__)
+__dir__ = public_dir(__all__)

@@ -9,26 +9,26 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
-from manifolds._module import Module
+from manifolds._pytree_module import Module
 
 from ..errors import InputError
 from ..systems import EulerPoincareClosedSystem
-from .parameters import positive
+from .parameters import checked_positive
 
 
 class _Lagrangian(Module):
     inertia: jax.Array
     wheels: jax.Array
-    heat: jax.Array
+    heat_capacity: jax.Array
     temperature: jax.Array
 
     def __call__(self, xi, S):
         body, wheel = xi[:3], xi[3:]
         kinetic = 0.5 * jnp.dot(self.inertia * body, body) + 0.5 * jnp.dot(self.wheels * (body + wheel), body + wheel)
-        return kinetic - self.heat * self.temperature * jnp.exp(S / self.heat)
+        return kinetic - self.heat_capacity * self.temperature * jnp.exp(S / self.heat_capacity)
 
 
-class _InBearings(Module):
+class _BearingFriction(Module):
     friction: jax.Array
 
     def __call__(self, xi, S):
@@ -56,23 +56,23 @@ def body_with_wheels(
     friction, heat, temperature : float, > 0
         k (mass * length**2 / time), the heat capacity C, and T_0.
     """
-    body, wheel = _moments(inertia), positive(wheels, "wheels", 3)
-    lagrangian = _Lagrangian(body, wheel, positive(heat, "heat"), positive(temperature, "temperature"))
+    body, wheel = _principal_moments(inertia), checked_positive(wheels, "wheels", 3)
+    lagrangian = _Lagrangian(body, wheel, checked_positive(heat, "heat"), checked_positive(temperature, "temperature"))
     algebra = mf.direct_sum(mf.so(3), mf.abelian(3))
-    return EulerPoincareClosedSystem(algebra, lagrangian, _InBearings(positive(friction, "friction")))
+    return EulerPoincareClosedSystem(algebra, lagrangian, _BearingFriction(checked_positive(friction, "friction")))
 
 
 def body_with_wheels_rest(momentum, energy, inertia=(3.0, 2.0, 1.0), wheels=(0.3, 0.3, 0.3), heat=2.0) -> float:
     """The temperature at the end, from the angular momentum's size and the total energy."""
-    greatest = float(np.max(_moments(inertia) + positive(wheels, "wheels", 3)))
+    greatest = float(np.max(_principal_moments(inertia) + checked_positive(wheels, "wheels", 3)))
     return (float(energy) - float(momentum) ** 2 / (2 * greatest)) / heat
 
 
-def _moments(inertia) -> jax.Array:
+def _principal_moments(inertia) -> jax.Array:
     """Return the principal moments of the body; a tensor is refused, since the wheels stand along principal axes."""
     if np.shape(inertia) == (3, 3):
         raise InputError(
             "inertia must be three principal moments, since there is a wheel along each principal axis, got an array "
             "of shape (3, 3): give liethermo.bodies.principal_axes(inertia).moments"
         )
-    return positive(inertia, "inertia", 3)
+    return checked_positive(inertia, "inertia", 3)

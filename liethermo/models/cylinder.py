@@ -8,18 +8,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from manifolds._module import Module
+from manifolds._pytree_module import Module
 
-from ..functions.conditions import numbers
+from ..functions.conditions import check_numbers
 from ..functions.energy import Function
 from ..functions.mechanics import Kinetic
 from ..systems import SimpleClosedSystem
 from ..systems.ledger import timed
 from .gas_piston import GAS_CONSTANT, IdealGas
-from .parameters import positive
+from .parameters import checked_positive
 
 
-class _UnderPiston(Module):
+class _GasEnergy(Module):
     """Energy of the gas from (q, S)."""
 
     gas: IdealGas
@@ -56,13 +56,17 @@ def cylinder(
     heat_power : float, or function likewise; optional
         Heat given to the gas per time (W).
     """
-    n, m, A = positive(moles, "moles"), positive(mass, "mass"), positive(area, "area")
-    gas = IdealGas(n, A * positive(height, "height"))
+    n, m, A = checked_positive(moles, "moles"), checked_positive(mass, "mass"), checked_positive(area, "area")
+    gas = IdealGas(n, A * checked_positive(height, "height"))
     push = pressure
     if pressure is not None:
-        push = _Push(timed(pressure), A) if callable(pressure) else -A * numbers(pressure, "pressure", ())[None]
+        push = (
+            _PressureForce(timed(pressure), A)
+            if callable(pressure)
+            else -A * check_numbers(pressure, "pressure", ())[None]
+        )
     return SimpleClosedSystem(
-        Kinetic(m[None]) - Function(_UnderPiston(gas, A)).on([0, 2]),
+        Kinetic(m[None]) - Function(_GasEnergy(gas, A)).on([0, 2]),
         3,
         friction=friction,
         external=push,
@@ -78,7 +82,7 @@ def cylinder_rest(pressure, T, area: float = 0.01, moles: float = 1.0, height: f
     return np.array([volume / area, 0.0, gas.entropy(T, volume)], dtype=float)
 
 
-class _Push(Module):
+class _PressureForce(Module):
     """``-P A``."""
 
     pressure: Callable

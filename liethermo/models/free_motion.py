@@ -10,7 +10,7 @@ import numpy as np
 import scipy.special
 
 from ..errors import InputError
-from ..functions.conditions import numbers, require
+from ..functions.conditions import check_numbers, require_condition
 from .inertia import EQUAL_MOMENTS_RTOL, are_tensors, principal_axes, principal_moments
 
 
@@ -93,14 +93,14 @@ def periods(inertia, momentum, energy=None) -> Periods:
         K = scipy.special.ellipk(m)
         rotation = 4 * K * np.sqrt(a * I2 * c / pace)
         n = -c * (I2 - a) / (a * (c - I2))
-        mean = 1 / c + (1 / a - 1 / c) * _third(n, m) / K
+        mean = 1 / c + (1 / a - 1 / c) * _elliptic_pi(n, m) / K
     still = (pace <= 0.0) | np.isinf(K)  # a spin about an axis that is circled by none, or the way to one
     rotation, mean = np.where(still, np.inf, rotation), np.where(still, 1 / I2, mean)
     axis = np.where(short, order[..., 2], order[..., 0])
     return Periods(rotation, 2 * np.pi / (L * mean), axis)
 
 
-def _third(n, m) -> np.ndarray:
+def _elliptic_pi(n, m) -> np.ndarray:
     """The complete elliptic integral of the third kind, by Carlson's forms [DLMF 19.25.2]."""
     RF, RJ = scipy.special.elliprf, scipy.special.elliprj
     return RF(0.0, 1.0 - m, 1.0) + n / 3.0 * RJ(0.0, 1.0 - m, 1.0, 1.0 - n)
@@ -147,12 +147,12 @@ def rate_of(relaxation_time, inertia, momentum) -> jax.Array:
     InputError
     """
     moments = principal_moments(inertia)
-    tau, L = numbers(relaxation_time, "a relaxation time"), numbers(momentum, "the size of a momentum")
+    tau, L = check_numbers(relaxation_time, "a relaxation time"), check_numbers(momentum, "the size of a momentum")
     for value, what in ((tau, "a relaxation time"), (L, "the size of a momentum")):
-        require(value, lambda v: (v > 0.0) & (v < np.inf), what + " must be positive and finite, not {value}")
+        require_condition(value, lambda v: (v > 0.0) & (v < np.inf), what + " must be positive and finite, not {value}")
     least, middle, greatest = jnp.moveaxis(jnp.sort(moments, axis=-1), -1, 0)
     unequal = greatest - least > EQUAL_MOMENTS_RTOL * greatest
-    require(unequal, lambda v: v, "a body with three equal moments has no nutation to relax")
+    require_condition(unequal, lambda v: v, "a body with three equal moments has no nutation to relax")
     is_rod = greatest - middle <= EQUAL_MOMENTS_RTOL * greatest
     d1 = (greatest - least) / (greatest * least)
     ratio = jnp.where(is_rod, 0.0, (greatest - middle) * least / ((greatest - least) * middle))  # d_2 / d_1
@@ -208,5 +208,5 @@ def damping_time(rigidity, quality, density, radius, spin, shape_factor=100.0) -
     }
     mu, Q, rho, R, omega, A = (np.asarray(value, dtype=float) for value in given.values())
     for name, value in given.items():
-        require(value, lambda v: (v > 0.0) & (v < np.inf), name + " must be positive and finite, not {value}")
+        require_condition(value, lambda v: (v > 0.0) & (v < np.inf), name + " must be positive and finite, not {value}")
     return A * mu * Q / (rho * R**2 * omega**3)

@@ -9,14 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from manifolds._module import Module
+from manifolds._pytree_module import Module
 
-from ..functions.conditions import numbers
+from ..functions.conditions import check_numbers
 from ..functions.energy import Function
 from ..functions.mechanics import Kinetic
 from ..systems import ComposedSystem, Subsystem
-from .parameters import positive
-from .thermo_particles import Warmth
+from .parameters import checked_positive
+from .thermo_particles import ThermalEnergy
 
 GAS_CONSTANT = 8.31446261815324
 """J / (K mol)."""
@@ -50,16 +50,16 @@ class IdealGas(Module):
         return self.c * nR * jnp.log(T / self.temperature) + nR * jnp.log(V / self.volume)
 
 
-class _InCylinder(Module):
+class _CylinderGasEnergy(Module):
     """Energy of a gas left or right of the piston, from (q, S)."""
 
     gas: IdealGas
     area: jax.Array
     length: jax.Array
-    right: bool = eqx.field(static=True)
+    is_right: bool = eqx.field(static=True)
 
     def volume(self, q):
-        return self.area * (self.length - q if self.right else q)
+        return self.area * (self.length - q if self.is_right else q)
 
     def __call__(self, y):
         return self.gas.energy(y[1], self.volume(y[0]))
@@ -93,11 +93,13 @@ def gas_piston(
     friction : float, >= 0
         Of the piston on the cylinder, which heats the piston (kg / s).
     """
-    n = positive(moles, "moles", 2)
-    A, L, m = positive(area, "area"), positive(length, "length"), positive(mass, "mass")
-    gases = [_InCylinder(IdealGas(n_i, 0.5 * A * L), A, L, right) for n_i, right in zip(n, (False, True), strict=True)]
-    numbers(conductance, "conductance", (2,))
-    piston = Kinetic((1.0 / m)[None]) + Function(Warmth(positive(capacity, "capacity"))).on([2])
+    n = checked_positive(moles, "moles", 2)
+    A, L, m = checked_positive(area, "area"), checked_positive(length, "length"), checked_positive(mass, "mass")
+    gases = [
+        _CylinderGasEnergy(IdealGas(n_i, 0.5 * A * L), A, L, right) for n_i, right in zip(n, (False, True), strict=True)
+    ]
+    check_numbers(conductance, "conductance", (2,))
+    piston = Kinetic((1.0 / m)[None]) + Function(ThermalEnergy(checked_positive(capacity, "capacity"))).on([2])
     return ComposedSystem(
         {"left gas": Subsystem(None, 1), "piston": Subsystem(piston, 3, friction), "right gas": Subsystem(None, 1)},
         coupling=[Function(gas).on([1, place]) for gas, place in zip(gases, (0, 4), strict=True)],

@@ -13,8 +13,8 @@ from manifolds._arrays import is_traced
 
 from ..errors import InputError
 from ..systems import ComposedSystem, Copies
-from .parameters import positive, whole
-from .thermo_particles import warmth
+from .parameters import checked_integer, checked_positive
+from .thermo_particles import thermal_energy
 
 
 def heat_grid(shape: Sequence[int] = (32, 32), capacity: float = 1.0, conductance: float = 1.0) -> ComposedSystem:
@@ -33,13 +33,13 @@ def heat_grid(shape: Sequence[int] = (32, 32), capacity: float = 1.0, conductanc
     conductance : float, > 0
         k between neighbours (power / temperature).
     """
-    sizes = _sizes(shape)
-    c, k = positive(capacity, "capacity"), positive(conductance, "conductance")
+    sizes = _checked_shape(shape)
+    c, k = checked_positive(capacity, "capacity"), checked_positive(conductance, "conductance")
     nodes = math.prod(sizes)
     graph = grid_graph(sizes)
     pairs = zip(*scipy.sparse.triu(graph).nonzero(), strict=True)
     edges = [(i, j, k) for i, j in pairs] if is_traced(k) else float(k) * graph
-    return ComposedSystem(Copies(nodes, warmth, 1, jnp.broadcast_to(c, nodes), name="node"), conductance=edges)
+    return ComposedSystem(Copies(nodes, thermal_energy, 1, jnp.broadcast_to(c, nodes), name="node"), conductance=edges)
 
 
 def heat_grid_solution(t, temperatures, capacity: float = 1.0, conductance: float = 1.0) -> np.ndarray:
@@ -56,7 +56,7 @@ def heat_grid_solution(t, temperatures, capacity: float = 1.0, conductance: floa
 
 def grid_graph(shape: Sequence[int]) -> scipy.sparse.csr_array:
     """The graph in which each node of a grid, in C order, is joined to its neighbours along the axes with weight 1."""
-    sizes = _sizes(shape)
+    sizes = _checked_shape(shape)
     total = scipy.sparse.csr_array((math.prod(sizes), math.prod(sizes)))
     for axis, n in enumerate(sizes):
         line = scipy.sparse.diags_array([np.ones(n - 1)] * 2, offsets=[-1, 1], shape=(n, n))
@@ -66,7 +66,7 @@ def grid_graph(shape: Sequence[int]) -> scipy.sparse.csr_array:
     return scipy.sparse.csr_array(total)
 
 
-def _sizes(shape: Sequence[int]) -> tuple[int, ...]:
+def _checked_shape(shape: Sequence[int]) -> tuple[int, ...]:
     if not isinstance(shape, Sequence) or isinstance(shape, str) or len(shape) == 0:
         raise InputError(f"shape is the number of nodes along each axis, such as (32, 32), not {shape!r}")
-    return tuple(whole(n, "each entry of shape") for n in shape)
+    return tuple(checked_integer(n, "each entry of shape") for n in shape)

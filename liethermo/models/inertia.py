@@ -11,7 +11,7 @@ import numpy as np
 from manifolds._arrays import is_traced
 
 from ..errors import InputError
-from ..functions.conditions import numbers, require
+from ..functions.conditions import check_numbers, require_condition
 
 SYMMETRY_RTOL = 1e-9
 """Largest asymmetry of a tensor of inertia, relative to its largest entry."""
@@ -63,7 +63,7 @@ def principal_axes(inertia) -> PrincipalAxes:
     >>> np.allclose(moments, [2.0, 2.0, 3.0]), np.allclose(np.abs(axes[:, 2]), [0.0, 0.5**0.5, 0.5**0.5])
     (True, True)
     """
-    tensors = np.asarray(numbers(inertia, "inertia"), dtype=np.float64)
+    tensors = np.asarray(check_numbers(inertia, "inertia"), dtype=np.float64)
     if tensors.shape[-2:] != (3, 3):
         raise InputError(f"a tensor of inertia has shape (..., 3, 3), not {tensors.shape}")
     moments, axes = np.linalg.eigh(checked_tensors(tensors))
@@ -126,11 +126,13 @@ def checked_tensors(tensors) -> np.ndarray:
 
 def principal_moments(inertia) -> jax.Array:
     """Return principal moments, shape (..., 3), of moments in any order or of tensors (then in ascending order)."""
-    array = numbers(inertia, "inertia")
+    array = check_numbers(inertia, "inertia")
     if array.shape[-1:] != (3,):
         raise InputError(f"inertia has shape (..., 3), or (..., 3, 3) of tensors, not {array.shape}")
     moments = jnp.linalg.eigvalsh(checked_tensors(array)) if are_tensors(array) else array
-    require(moments, lambda m: (m > 0.0) & (m < np.inf), "moments of inertia must be positive and finite, not {value}")
+    require_condition(
+        moments, lambda m: (m > 0.0) & (m < np.inf), "moments of inertia must be positive and finite, not {value}"
+    )
     return moments
 
 

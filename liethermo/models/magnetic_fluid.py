@@ -26,9 +26,9 @@ class MagneticEnergy(Energy):
 
     def gradient(self, x) -> jax.Array:
         sphere, n = self.sphere, self.sphere.algebra.dim
-        tables = sphere.algebra.tables
-        velocity = tables.raised(sphere.inverse_laplacian(x[:n]))
-        current = sphere.laplacian(tables.lowered(x[n:]))
+        tables = sphere.algebra.matrix_basis
+        velocity = tables.raise_index(sphere.inverse_laplacian(x[:n]))
+        current = sphere.laplacian(tables.lower_index(x[n:]))
         return -sphere.gamma * jnp.concatenate([velocity, current])
 
     def value(self, x) -> jax.Array:

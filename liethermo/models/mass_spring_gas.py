@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from manifolds._module import Module
+from manifolds._pytree_module import Module
 
 from ..functions.energy import Function, Quadratic
 from ..systems import SimpleClosedSystem
 from .gas_piston import GAS_CONSTANT
-from .parameters import positive
+from .parameters import checked_positive
 
 CASES = {
     1: {"mass": 5.0, "stiffness": 5.0, "moles": 1.0},
@@ -23,20 +23,20 @@ STARTS = {1: 0.3, 2: 0.1}
 """Where the mass of either case starts, ``x_0 = x_1`` (m), at S_0 = 0; the step is 1e-3 s."""
 
 
-class RoomOfGas(Module):
+class FixedVolumeGas(Module):
     """``U(S) = c N R T_0 exp(S / (c N R))`` of an ideal gas in a fixed volume, S counted from T_0.
 
     Attributes
     ----------
-    heat : heat capacity c N R (J / K)
+    heat_capacity : heat capacity c N R (J / K)
     temperature : T_0 (K)
     """
 
-    heat: jax.Array
+    heat_capacity: jax.Array
     temperature: jax.Array
 
     def __call__(self, y):
-        return self.heat * self.temperature * jnp.exp(y[0] / self.heat)
+        return self.heat_capacity * self.temperature * jnp.exp(y[0] / self.heat_capacity)
 
 
 def mass_spring_gas(
@@ -65,8 +65,8 @@ def mass_spring_gas(
     external : optional
         As for :class:`liethermo.SimpleClosedSystem` (N).
     """
-    m, k, heat = positive(mass, "mass"), positive(stiffness, "stiffness"), _heat(moles, c)
-    gas = Function(RoomOfGas(heat, positive(temperature, "temperature")))
+    m, k, heat = checked_positive(mass, "mass"), checked_positive(stiffness, "stiffness"), _heat_capacity(moles, c)
+    gas = Function(FixedVolumeGas(heat, checked_positive(temperature, "temperature")))
     lagrangian = Quadratic(jnp.stack([-k, m, jnp.zeros(())])) - gas.on([2])
     return SimpleClosedSystem(lagrangian, 3, friction=friction, external=external)
 
@@ -94,7 +94,7 @@ def mass_spring_gas_solution(
     mass, stiffness, friction, moles, temperature, c
         As for :func:`mass_spring_gas`.
     """
-    t, (x0, v0, S0), heat = np.asarray(t, dtype=float), np.asarray(x0, dtype=float), float(_heat(moles, c))
+    t, (x0, v0, S0), heat = np.asarray(t, dtype=float), np.asarray(x0, dtype=float), float(_heat_capacity(moles, c))
     kappa = friction / (2 * mass)
     square = stiffness / mass - kappa**2
     omega = np.sqrt(abs(square))
@@ -112,5 +112,5 @@ def mass_spring_gas_solution(
     return np.stack([x, v, S], axis=-1)
 
 
-def _heat(moles, c) -> jax.Array:
-    return positive(c, "c") * positive(moles, "moles") * GAS_CONSTANT
+def _heat_capacity(moles, c) -> jax.Array:
+    return checked_positive(c, "c") * checked_positive(moles, "moles") * GAS_CONSTANT

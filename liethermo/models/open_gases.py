@@ -9,15 +9,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from manifolds._module import Module
+from manifolds._pytree_module import Module
 
 from ..errors import InputError
-from ..functions.conditions import numbers, require
+from ..functions.conditions import check_numbers, require_condition
 from ..functions.energy import Function
 from ..functions.mechanics import Kinetic
 from ..systems import ComposedSystem, Membrane, Reaction, Subsystem
-from .parameters import finite, positive
-from .thermo_particles import Warmth
+from .parameters import checked_finite, checked_positive
+from .thermo_particles import ThermalEnergy
 
 
 class IdealMixture(Module):
@@ -57,12 +57,12 @@ class IdealMixture(Module):
         return jnp.exp(-jnp.dot(jnp.asarray(stoichiometry), standard) / T)
 
 
-def _monatomic(heat_capacity) -> IdealMixture:
+def _single_species_gas(heat_capacity) -> IdealMixture:
     """One kind of particles, its energy and entropy counted from zero."""
-    return IdealMixture(positive(heat_capacity, "heat_capacity")[None], jnp.zeros(1), jnp.zeros(1))
+    return IdealMixture(checked_positive(heat_capacity, "heat_capacity")[None], jnp.zeros(1), jnp.zeros(1))
 
 
-class _BothSides(Module):
+class _TwoGasEnergy(Module):
     """The energies of the gases left and right of a piston at q, in the volumes ``A q`` and ``A (L - q)``."""
 
     gas: IdealMixture
@@ -104,12 +104,13 @@ def porous_piston(
     heat_capacity : float, > 0
         Of a particle, at constant volume.
     """
-    gas = _monatomic(heat_capacity)
-    numbers(conductance, "conductance", (2,))
+    gas = _single_species_gas(heat_capacity)
+    check_numbers(conductance, "conductance", (2,))
     bodies = {
         "left": Subsystem(None, 2, species=1),
         "piston": Subsystem(
-            Kinetic(1.0 / positive(mass, "mass")[None]) + Function(Warmth(positive(capacity, "capacity"))).on([2]),
+            Kinetic(1.0 / checked_positive(mass, "mass")[None])
+            + Function(ThermalEnergy(checked_positive(capacity, "capacity"))).on([2]),
             3,
             friction=friction,
         ),
@@ -117,7 +118,7 @@ def porous_piston(
     }
     return ComposedSystem(
         bodies,
-        _BothSides(gas, positive(area, "area"), positive(length, "length")),
+        _TwoGasEnergy(gas, checked_positive(area, "area"), checked_positive(length, "length")),
         [(0, 1, conductance[0]), (1, 2, conductance[1])],
         membranes=[Membrane("left", "right", permeability)],
         validate=False,
@@ -141,17 +142,21 @@ def porous_piston_state(
     known = {name: parameter.default for name, parameter in inspect.signature(porous_piston).parameters.items()}
     if unknown := [name for name in parameters if name not in known]:
         raise InputError(f"porous_piston has no parameter {unknown[0]!r}: it has {', '.join(known)}")
-    area, length, capacity = (positive((known | parameters)[name], name) for name in ("area", "length", "capacity"))
-    place = numbers(q, "q", ())
-    require(place, lambda q: (q > 0.0) & (q < length), f"the piston is between 0 and {length:g}, not at {{value:g}}")
-    gas, state = _monatomic((known | parameters)["heat_capacity"]), []
+    area, length, capacity = (
+        checked_positive((known | parameters)[name], name) for name in ("area", "length", "capacity")
+    )
+    place = check_numbers(q, "q", ())
+    require_condition(
+        place, lambda q: (q > 0.0) & (q < length), f"the piston is between 0 and {length:g}, not at {{value:g}}"
+    )
+    gas, state = _single_species_gas((known | parameters)["heat_capacity"]), []
     for name, side, width in (("left", left, place), ("right", right, length - place)):
-        n, t = positive(side, f"{name}, (particles, temperature),", 2)
+        n, t = checked_positive(side, f"{name}, (particles, temperature),", 2)
         state += [gas.entropy_at(t, n[None], area * width), n]
-    return np.array([*state[:2], place, 0.0, capacity * jnp.log(positive(T, "T")), *state[2:]])
+    return np.array([*state[:2], place, 0.0, capacity * jnp.log(checked_positive(T, "T")), *state[2:]])
 
 
-class _Vessel(Module):
+class _VesselEnergy(Module):
     """The energy of a mixture in a volume, from (S, N)."""
 
     gas: IdealMixture
@@ -192,12 +197,12 @@ def reaction_vessel(
     reaction = Reaction("vessel", stoichiometry, rate)
     count = len(reaction.stoichiometry)
     gas = IdealMixture(
-        positive(capacity, "capacity", count),
-        *(finite(value, name, count) for value, name in ((energy, "energy"), (entropy, "entropy"))),
+        checked_positive(capacity, "capacity", count),
+        *(checked_finite(value, name, count) for value, name in ((energy, "energy"), (entropy, "entropy"))),
     )
     bodies = {
-        "vessel": Subsystem(_Vessel(gas, positive(volume, "volume")), 1 + count, species=count),
-        "jacket": Subsystem(Warmth(positive(jacket, "jacket")), 1),
+        "vessel": Subsystem(_VesselEnergy(gas, checked_positive(volume, "volume")), 1 + count, species=count),
+        "jacket": Subsystem(ThermalEnergy(checked_positive(jacket, "jacket")), 1),
     }
     return ComposedSystem(
         bodies,

@@ -7,7 +7,7 @@ import scipy
 
 from ..functions.energy import Quadratic
 from ..systems import EvolutionSystem
-from .parameters import positive
+from .parameters import checked_positive
 
 
 def damped_oscillator(mass: float = 1.0, stiffness: float = 1.0, friction: float = 0.1) -> EvolutionSystem:
@@ -24,7 +24,11 @@ def damped_oscillator(mass: float = 1.0, stiffness: float = 1.0, friction: float
     friction : float, > 0
         gamma (1 / time).
     """
-    m, k, gamma = positive(mass, "mass"), positive(stiffness, "stiffness"), positive(friction, "friction")
+    m, k, gamma = (
+        checked_positive(mass, "mass"),
+        checked_positive(stiffness, "stiffness"),
+        checked_positive(friction, "friction"),
+    )
     return EvolutionSystem(Quadratic([k, 1.0 / m, 0.0], [0.0, 0.0, gamma]), 3)
 
 

@@ -25,9 +25,9 @@ import manifolds as mf
 from manifolds.matrices.linear import adjoint
 
 from ..errors import InputError
-from .parameters import whole
+from .parameters import checked_integer
 
-MOST_TRACE = 1e-12
+TRACE_RTOL = 1e-12
 """Trace of a vorticity, relative to its norm, that counts as rounding."""
 
 
@@ -50,7 +50,7 @@ class QuantisedSphere:
     """
 
     def __init__(self, N: int):
-        self.N = whole(N, "N", 2)
+        self.N = checked_integer(N, "N", 2)
         algebra = mf.su(self.N, by_matrices=True)
         assert isinstance(algebra, mf.MatrixAlgebra)
         self.algebra = algebra
@@ -66,55 +66,55 @@ class QuantisedSphere:
 
     def laplacian(self, mu) -> jax.Array:
         """The state of ``Delta W``, shape (..., N^2 - 1)."""
-        return self._on_diagonals(mu, self._applied)
+        return self._map_diagonals(mu, self._apply_tridiagonal)
 
     def inverse_laplacian(self, mu) -> jax.Array:
         """The state of P with ``Delta P = W`` and no trace, shape (..., N^2 - 1)."""
-        return self._on_diagonals(mu, self._solved)
+        return self._map_diagonals(mu, self._solve_tridiagonal)
 
-    def _on_diagonals(self, mu, function) -> jax.Array:
+    def _map_diagonals(self, mu, function) -> jax.Array:
         """A map of the diagonals above and with the main one, shape (N, 2, N): entry i of the m-th at [i, :, m]."""
-        reads, values, places, weights = self._entries
-        tables = self.algebra.tables
+        reads, values, places, weights = self._diagonal_entries
+        tables = self.algebra.matrix_basis
         diagonal = tables.diagonal
         assert diagonal is not None
         mu = jnp.asarray(mu)
-        main = (mu[..., diagonal.components] / tables.squares[diagonal.components]) @ diagonal.table.T
+        main = (mu[..., diagonal.components] / tables.squared_norms[diagonal.components]) @ diagonal.coefficients.T
         read = jnp.concatenate([mu, jnp.zeros((*mu.shape[:-1], 1)), main], axis=-1)
         rows = function(read[..., reads] * values)
-        found = [rows.reshape(*rows.shape[:-3], -1), rows[..., diagonal.part, 0] @ diagonal.table]
+        found = [rows.reshape(*rows.shape[:-3], -1), rows[..., diagonal.part, 0] @ diagonal.coefficients]
         return jnp.concatenate(found, axis=-1)[..., places] * weights
 
     @cached_property
-    def _entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def _diagonal_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """The component in each entry [i, :, m], and its factor; the entry of each component, and the factor back.
 
         The entries of the diagonals below are those above with the sign of an anti-Hermitian matrix, so that they have
         the same products with the basis. What stands on the main diagonal follows the components, or the entries.
         """
-        tables, N = self.algebra.tables, self.N
+        tables, N = self.algebra.matrix_basis, self.N
         i, part, m = np.indices((N, 2, N))
         above = (m > 0) & (i + m < N)
         place = i * N + np.minimum(i + m, N - 1)
-        reads = np.where(above, tables.reads[part, place], tables.dim).astype(np.int32)
+        reads = np.where(above, tables.entry_components[part, place], tables.dim).astype(np.int32)
         values = np.where(above, tables.values[part, place], 0.0)
         places, weights = np.zeros(tables.dim, dtype=np.int32), np.ones(tables.dim)
         places[reads[above]], weights[reads[above]] = np.flatnonzero(above), 2.0 * values[above]
-        values /= np.append(tables.squares, 1.0)[reads]
+        values /= np.append(tables.squared_norms, 1.0)[reads]
         assert tables.diagonal is not None
         places[tables.diagonal.components] = above.size + np.arange(len(tables.diagonal.components))
         reads[:, tables.diagonal.part, 0], values[:, tables.diagonal.part, 0] = tables.dim + 1 + np.arange(N), 1.0
         return reads, values, places, weights
 
-    def _applied(self, rows) -> jax.Array:
-        main, beside = self._tridiagonal
+    def _apply_tridiagonal(self, rows) -> jax.Array:
+        main, beside = self._tridiagonal_coefficients
         up = jnp.pad(rows[..., 1:, :, :], [(0, 0)] * (rows.ndim - 3) + [(0, 1), (0, 0), (0, 0)])
         down = jnp.pad(rows[..., :-1, :, :], [(0, 0)] * (rows.ndim - 3) + [(1, 0), (0, 0), (0, 0)])
         before = np.pad(beside[:-1], [(1, 0), (0, 0)])
         return -(main[:, None] * rows + beside[:, None] * up + before[:, None] * down)
 
-    def _solved(self, rows) -> jax.Array:
-        ratio, inverse = self._factors
+    def _solve_tridiagonal(self, rows) -> jax.Array:
+        ratio, inverse = self._ldl_factors
         rows = jnp.moveaxis(-rows, -3, 0)  # along each diagonal step by step, all of them together
 
         def eliminate(before, given):
@@ -136,31 +136,31 @@ class QuantisedSphere:
         return rows.at[..., 0].add(-mean)
 
     @cached_property
-    def _inside(self) -> np.ndarray:
+    def _entry_mask(self) -> np.ndarray:
         """Which entries [i, m] there are: ``i + m < N``."""
         i, m = np.indices((self.N, self.N))
         return (i + m < self.N).astype(np.float64)
 
     @cached_property
-    def _tridiagonal(self) -> tuple[np.ndarray, np.ndarray]:
+    def _tridiagonal_coefficients(self) -> tuple[np.ndarray, np.ndarray]:
         """Minus the Laplacian: the main diagonals, and what couples entry i to i + 1; shapes (N, N) as [i, m]."""
         N, s = self.N, (self.N - 1) / 2.0
         i, m = np.indices((N, N))
         z = s - np.arange(N)  # of S_z
         step = np.sqrt(np.arange(1.0, N + 1) * (N - np.arange(1.0, N + 1)))  # of S_+, the last one zero
         j = np.minimum(i + m, N - 1)
-        main = (2.0 * s * (s + 1.0) - 2.0 * z[i] * z[j]) * self._inside
+        main = (2.0 * s * (s + 1.0) - 2.0 * z[i] * z[j]) * self._entry_mask
         beside = -step[i] * step[j] * (i + m + 1 < N)
         return main, beside
 
     @cached_property
-    def _factors(self) -> tuple[np.ndarray, np.ndarray]:
+    def _ldl_factors(self) -> tuple[np.ndarray, np.ndarray]:
         """``L D L^T``: the entries below the diagonal of L, and those of 1 / D; zero outside."""
-        main, beside = self._tridiagonal
+        main, beside = self._tridiagonal_coefficients
         inverse, ratio = np.zeros(main.shape), np.zeros(main.shape)
         pivot = main[0].copy()
         for i in range(self.N):
-            there = self._inside[i] > 0.0
+            there = self._entry_mask[i] > 0.0
             if i == self.N - 1:
                 there = there & (np.arange(self.N) > 0)  # of the main diagonal, the last pivot is zero
             inverse[i, there] = 1.0 / pivot[there]
@@ -184,9 +184,9 @@ class QuantisedSphere:
             raise InputError(f"a vorticity matrix has shape ({self.N}, {self.N}), not {W.shape}")
         size = max(float(np.linalg.norm(W)), np.finfo(float).tiny)
         skew, trace = float(np.linalg.norm(W + adjoint(W))) / size, float(abs(np.trace(W))) / size
-        if not skew <= MOST_TRACE:
+        if not skew <= TRACE_RTOL:
             raise InputError(f"a vorticity matrix is anti-Hermitian, and this one is not, by {skew:.3g} of its norm")
-        if not trace <= MOST_TRACE:
+        if not trace <= TRACE_RTOL:
             raise InputError(
                 f"the vorticity has a trace of {trace:.3g} of its norm: its integral over the sphere has to vanish. "
                 "Subtract np.trace(W) / N from its diagonal"
@@ -199,13 +199,13 @@ class QuantisedSphere:
 
     def magnetic_state(self, vorticity, potential) -> jax.Array:
         """The state of a :func:`magnetic_fluid` from vorticity and magnetic potential, each a state of this sphere."""
-        raised = self.algebra.tables.raised(jnp.asarray(potential))
+        raised = self.algebra.matrix_basis.raise_index(jnp.asarray(potential))
         return jnp.concatenate([jnp.asarray(vorticity), raised], axis=-1)
 
     def magnetic_fields(self, x) -> tuple[jax.Array, jax.Array]:
         """Vorticity and magnetic potential of states of a magnetic fluid: the inverse of :meth:`magnetic_state`."""
         x, n = jnp.asarray(x), self.algebra.dim
-        return x[..., :n], self.algebra.tables.lowered(x[..., n:])
+        return x[..., :n], self.algebra.matrix_basis.lower_index(x[..., n:])
 
     def from_coefficients(self, a) -> jax.Array:
         """The state of ``omega = sum_l a_l0 Y_l0 + sum_{m > 0} 2 Re(a_lm Y_lm)``, shape (N^2 - 1,).
@@ -235,32 +235,34 @@ class QuantisedSphere:
             W[on, on + m] = 1j * (vectors @ a[m:, m])
         return self.algebra.from_dual_matrix(W - adjoint(np.triu(W, 1)))
 
-    def coefficients(self, mu, most: int | None = None) -> np.ndarray:
-        """The coefficients of a state up to degree ``most``, shape (most + 1, most + 1): see the inverse above."""
-        L = self.N - 1 if most is None else min(whole(most, "the largest degree"), self.N - 1)
+    def coefficients(self, mu, max_degree: int | None = None) -> np.ndarray:
+        """The coefficients of a state up to degree ``max_degree``, shape (most + 1, most + 1): see the inverse above."""
+        L = self.N - 1 if max_degree is None else min(checked_integer(max_degree, "the largest degree"), self.N - 1)
         W, a = np.asarray(self.matrix(mu)), np.zeros((L + 1, L + 1), dtype=np.complex128)
         for m in range(L + 1):
             a[m:, m] = self.harmonics(m, L).T @ (-1j * np.diagonal(W, m))
         return a
 
-    def harmonics(self, m: int, most: int) -> np.ndarray:
+    def harmonics(self, m: int, max_degree: int) -> np.ndarray:
         """The m-th diagonals of T_lm for l = m, …, most: orthonormal columns, shape (N - m, most - m + 1)."""
-        main, beside = self._tridiagonal
+        main, beside = self._tridiagonal_coefficients
         size = self.N - m
         _, vectors = scipy.linalg.eigh_tridiagonal(
-            main[:size, m], beside[: size - 1, m], select="i", select_range=(0, most - m)
+            main[:size, m], beside[: size - 1, m], select="i", select_range=(0, max_degree - m)
         )
         return (
-            (-1.0) ** m * vectors * np.sign(vectors[np.argmax(np.abs(vectors) > 1e-8, axis=0), np.arange(most - m + 1)])
+            (-1.0) ** m
+            * vectors
+            * np.sign(vectors[np.argmax(np.abs(vectors) > 1e-8, axis=0), np.arange(max_degree - m + 1)])
         )
 
-    def on_grid(self, mu, shape: tuple[int, int] = (128, 256), most: int | None = None) -> np.ndarray:
+    def on_grid(self, mu, shape: tuple[int, int] = (128, 256), max_degree: int | None = None) -> np.ndarray:
         """The function on a grid of colatitudes ``pi (i + 1/2) / shape[0]`` and longitudes ``2 pi j / shape[1]``."""
-        a = self.coefficients(mu, most)
+        a = self.coefficients(mu, max_degree)
         theta = math.pi * (np.arange(shape[0]) + 0.5) / shape[0]
         waves = np.zeros((shape[0], shape[1]), dtype=np.complex128)
         for m in range(len(a)):
-            along = legendre(m, len(a) - 1, theta) @ a[m:, m]
+            along = normalised_legendre(m, len(a) - 1, theta) @ a[m:, m]
             waves[:, m % shape[1]] += along * (1.0 if m == 0 else 2.0)
         return np.fft.ifft(waves, axis=1).real * shape[1]
 
@@ -278,14 +280,14 @@ class QuantisedSphere:
         return mu * math.sqrt(enstrophy / float(jnp.sum(mu * mu)))
 
 
-def legendre(m: int, most: int, theta: np.ndarray) -> np.ndarray:
+def normalised_legendre(m: int, max_degree: int, theta: np.ndarray) -> np.ndarray:
     """``Y_lm(theta, 0)`` for l = m, …, most, shape (thetas, most - m + 1), by the recurrence in l."""
     x, sine = np.cos(theta), np.sin(theta)
     k = np.arange(1, m + 1)
     size = 0.5 * np.log((2.0 * k + 1.0) / (2.0 * k)).sum() - 0.5 * math.log(4.0 * math.pi)
     found = [(-1.0) ** m * np.exp(size + m * np.log(sine))]
     before = np.zeros_like(x)
-    for l in range(m + 1, most + 1):
+    for l in range(m + 1, max_degree + 1):
         a = math.sqrt((4.0 * l * l - 1.0) / (l * l - m * m))
         b = math.sqrt(((l - 1.0) ** 2 - m * m) / (4.0 * (l - 1.0) ** 2 - 1.0)) if l > m + 1 else 0.0
         before, new = found[-1], a * (x * found[-1] - b * before)

@@ -14,16 +14,16 @@ from manifolds.errors import warn
 
 from ..dissipation.checks import checked_rate
 from ..dissipation.inner_product import KillingDissipation
-from ..functions.conditions import numbers, require
+from ..functions.conditions import check_numbers, require_condition
 from ..functions.energy import Quadratic
 from ..systems import LiePoissonSystem
 from .inertia import checked_tensors, inverse_inertia
 
-PUBLISHED = ((10.0, 5.0, 1.0), (2.0, 1.0, 2.0 / 3.0))
+PUBLISHED_INERTIAS = ((10.0, 5.0, 1.0), (2.0, 1.0, 2.0 / 3.0))
 """Inertias of published examples, the first of them the paper's, though no body has them."""
 
 
-POSITIVE = "moments of inertia are positive and finite, not {value}"
+POSITIVE_MOMENTS_TEXT = "moments of inertia are positive and finite, not {value}"
 """Message to those who give others."""
 
 
@@ -85,12 +85,14 @@ def checked_inertia(inertia) -> np.ndarray | jax.Array:
 
     A tensor that is diagonal is returned as its moments.
     """
-    checked = numbers(inertia, "inertia", (3,), (3, 3))
+    checked = check_numbers(inertia, "inertia", (3,), (3, 3))
     if is_traced(inertia):
         if checked.ndim == 2:
-            require(checked, _is_positive_definite, "a tensor of inertia must be positive definite, got {value}")
+            require_condition(
+                checked, _is_positive_definite, "a tensor of inertia must be positive definite, got {value}"
+            )
         else:
-            require(checked, _are_positive, POSITIVE)
+            require_condition(checked, _are_positive, POSITIVE_MOMENTS_TEXT)
         return checked
     array = np.asarray(inertia, dtype=np.float64)
     if array.ndim == 2:
@@ -98,9 +100,9 @@ def checked_inertia(inertia) -> np.ndarray | jax.Array:
         if not (array - np.diag(np.diag(array))).any():
             array = np.diag(array).copy()
     else:
-        require(array, _are_positive, POSITIVE)
+        require_condition(array, _are_positive, POSITIVE_MOMENTS_TEXT)
     moments = array if array.ndim == 1 else np.linalg.eigvalsh(array)
-    if tuple(moments.tolist()) not in PUBLISHED:
+    if tuple(moments.tolist()) not in PUBLISHED_INERTIAS:
         largest, others = float(moments.max()), float(moments.sum() - moments.max())
         if largest > others * (1 + 1e-12):
             warn(

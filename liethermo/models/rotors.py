@@ -15,16 +15,16 @@ from ..dissipation.base import Dissipation
 from ..dissipation.checks import checked_rate
 from ..dissipation.factor import Factor
 from ..errors import InputError
-from ..functions.conditions import numbers, require
+from ..functions.conditions import check_numbers, require_condition
 from ..functions.energy import Quadratic
 from ..functions.indices import Indices
 from ..systems import HeatBaths, LiePoissonSystem
 from .inertia import inverse_inertia, principal_moments
-from .parameters import positive
+from .parameters import checked_positive
 from .rigid_body import checked_inertia
 
 
-class InBearing(Dissipation):
+class BearingFriction(Dissipation):
     """``p' = -k dH/dp`` of the momentum p of a rotor: the bearing rubs, and the angular momentum of the whole stays.
 
     Parameters
@@ -43,7 +43,7 @@ class InBearing(Dissipation):
     needs_entropy = False
 
     @property
-    def heated_bath(self):
+    def heated_bath_index(self):
         return self.bath
 
     def force(self, system, x, dH, dS, dL):
@@ -54,10 +54,10 @@ class InBearing(Dissipation):
 
     def factor(self, system, x, dH, dL):
         times = lambda w: jnp.zeros_like(x).at[3].set(w[0])  # noqa: E731
-        return Factor(1, times, True, velocity=lambda w: jnp.zeros_like(x)).scaled(self.friction)
+        return Factor(1, times, True, velocity=lambda w: jnp.zeros_like(x)).scale_by(self.friction)
 
 
-class InRotor(Dissipation):
+class RotorFriction(Dissipation):
     """Friction inside the rotor: the double bracket in the axes of the rotor.
 
     ``L' = L × sigma, p' = a . (L × sigma)`` with ``sigma = rate L × (Omega + w a)``: what the rotor sees of the motion
@@ -80,22 +80,22 @@ class InRotor(Dissipation):
     needs_entropy = False
 
     @property
-    def heated_bath(self):
+    def heated_bath_index(self):
         return self.bath
 
-    def _moved(self, x, sigma) -> jax.Array:
+    def _momentum_rate(self, x, sigma) -> jax.Array:
         turned = jnp.cross(x[:3], sigma)
         return jnp.append(turned, jnp.dot(self.axis, turned))
 
     def force(self, system, x, dH, dS, dL):
-        return self._moved(x, self.velocity(system, x, dH, dS, dL)[:3])
+        return self._momentum_rate(x, self.velocity(system, x, dH, dS, dL)[:3])
 
     def velocity(self, system, x, dH, dS, dL):
         return jnp.append(self.rate * jnp.cross(x[:3], dH[:3] + dH[3] * self.axis), 0.0)
 
     def factor(self, system, x, dH, dL):
-        moved = lambda w: self._moved(x, w)  # noqa: E731
-        return Factor(3, moved, velocity=lambda w: jnp.append(w, 0.0)).scaled(self.rate)
+        moved = lambda w: self._momentum_rate(x, w)  # noqa: E731
+        return Factor(3, moved, velocity=lambda w: jnp.append(w, 0.0)).scale_by(self.rate)
 
 
 def damper_wheel(
@@ -138,7 +138,7 @@ def damper_wheel(
         If the body without the wheel had an inertia that is not positive, or another parameter cannot be used.
     """
     k, baths = checked_rate(friction), HeatBaths(capacity, temperature)
-    return _with_rotor(inertia, axis, wheel, lambda a: InBearing(k, Indices(0)), baths, attitude)
+    return _rotor_system(inertia, axis, wheel, lambda a: BearingFriction(k, Indices(0)), baths, attitude)
 
 
 def ring_damper(
@@ -173,11 +173,11 @@ def ring_damper(
     ------
     InputError
     """
-    R, a = positive(radius, "radius"), positive(tube, "tube")
-    J = 2.0 * np.pi**2 * positive(density, "density") * a**2 * R**3
-    k = 16.0 * np.pi**2 * positive(viscosity, "viscosity") * R**3
+    R, a = checked_positive(radius, "radius"), checked_positive(tube, "tube")
+    J = 2.0 * np.pi**2 * checked_positive(density, "density") * a**2 * R**3
+    k = 16.0 * np.pi**2 * checked_positive(viscosity, "viscosity") * R**3
     baths = HeatBaths(capacity, temperature)
-    return _with_rotor(inertia, axis, J, lambda a: InBearing(k, Indices(0)), baths, attitude)
+    return _rotor_system(inertia, axis, J, lambda a: BearingFriction(k, Indices(0)), baths, attitude)
 
 
 def dual_spin(
@@ -227,9 +227,13 @@ def dual_spin(
 
     def inside(a) -> list[Dissipation]:
         none = jnp.zeros(3)
-        return [InBearing(k, Indices(0)), InRotor(rates[0], none, Indices(0)), InRotor(rates[1], a, Indices(1))]
+        return [
+            BearingFriction(k, Indices(0)),
+            RotorFriction(rates[0], none, Indices(0)),
+            RotorFriction(rates[1], a, Indices(1)),
+        ]
 
-    return _with_rotor(inertia, axis, rotor, inside, HeatBaths(capacity, temperature, number=2), attitude)
+    return _rotor_system(inertia, axis, rotor, inside, HeatBaths(capacity, temperature, number=2), attitude)
 
 
 def spin_temperature(momentum, energy, inertia, capacity=1.0, temperature=1.0) -> float:
@@ -248,18 +252,18 @@ def spin_temperature(momentum, energy, inertia, capacity=1.0, temperature=1.0) -
     return temperature + (float(energy) - float(momentum) ** 2 / (2.0 * greatest)) / capacity
 
 
-def _with_rotor(inertia, axis, rotor, inside, baths, attitude) -> LiePoissonSystem:
+def _rotor_system(inertia, axis, rotor, inside, baths, attitude) -> LiePoissonSystem:
     """``H = (L - p a) . B (L - p a) / 2 + p**2 / (2 J)``, ``B = (I - J a a^T)^-1``, on so(3) + R."""
-    inverse, J = inverse_inertia(checked_inertia(inertia)), positive(rotor, "the moment of the rotor")
+    inverse, J = inverse_inertia(checked_inertia(inertia)), checked_positive(rotor, "the moment of the rotor")
     inverse = jnp.diag(inverse) if inverse.ndim == 1 else inverse
-    numbers(axis, "axis")
+    check_numbers(axis, "axis")
     direction = np.asarray(axis, dtype=float)
     if direction.shape != (3,) or not np.isfinite(direction).all() or not direction.any():
         raise InputError(f"axis is a direction in body axes, three numbers that are not all zero, not {axis!r}")
     a = jnp.asarray(direction / np.linalg.norm(direction))
     turned = inverse @ a
     left = 1.0 - J * jnp.dot(a, turned)
-    require(
+    require_condition(
         left, lambda v: v > 0.0, "a rotor has less than the inertia of the whole about its axis: 1 - J/I is {value}"
     )
     B = inverse + J / left * jnp.outer(turned, turned)

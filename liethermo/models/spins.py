@@ -7,9 +7,9 @@ import numpy as np
 
 from ..dissipation.landau_lifshitz import LandauLifshitz
 from ..errors import InputError
-from ..functions.conditions import numbers
+from ..functions.conditions import check_numbers
 from ..functions.energy import Energy, Sum
-from ..functions.magnetism import anisotropy, checked_sites, dzyaloshinskii_moriya, exchange, zeeman
+from ..functions.magnetism import anisotropy, dzyaloshinskii_moriya, exchange, lattice_shape, zeeman
 from ..systems import HeatBaths, SpinSystem
 
 
@@ -28,7 +28,7 @@ def single_spin(field=1.0, rate=0.1, baths: HeatBaths | None = None) -> SpinSyst
     baths : HeatBaths, optional
         What takes the heat; without, the energy falls.
     """
-    return SpinSystem(1, zeeman(1, _along_third(field)), LandauLifshitz(rate), baths)
+    return SpinSystem(1, zeeman(1, _third_axis_vector(field)), LandauLifshitz(rate), baths)
 
 
 def single_spin_solution(t, start, field: float = 1.0, rate: float = 0.1) -> np.ndarray:
@@ -83,7 +83,7 @@ def spin_lattice(
     axis : array, shape (3,) or ``(*sites, 3)``
         Of the anisotropy.
     """
-    shape = checked_sites(sites)
+    shape = lattice_shape(sites)
     terms: list[Energy] = [*exchange(shape, exchange_constant, periodic=periodic).terms]
     if np.any(anisotropy_constant):
         terms.append(anisotropy(shape, anisotropy_constant, axis))
@@ -105,5 +105,5 @@ def spin_wave_frequency(wave_number, exchange_constant: float = 1.0, anisotropy_
     return 2.0 * exchange_constant * (1.0 - np.cos(wave_number)) + 2.0 * anisotropy_constant + field
 
 
-def _along_third(field):
-    return jnp.stack([jnp.zeros(()), jnp.zeros(()), numbers(field, "the field", ())])
+def _third_axis_vector(field):
+    return jnp.stack([jnp.zeros(()), jnp.zeros(()), check_numbers(field, "the field", ())])

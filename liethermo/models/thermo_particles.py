@@ -8,27 +8,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from manifolds._module import Module
+from manifolds._pytree_module import Module
 
-from ..functions.edges import edges
+from ..functions.edges import graph_edges
 from ..functions.energy import Function, Quadratic
 from ..functions.mechanics import Kinetic
 from ..systems import ComposedSystem, Copies, Subsystem
-from .parameters import positive, several, whole
+from .parameters import checked_integer, checked_positive, checked_positive_vector
 
 
-def warmth(x, capacity):
+def thermal_energy(x, capacity):
     """Internal energy ``c exp(S / c)`` of the last component S of a state: c is the heat capacity."""
     return capacity * jnp.exp(x[-1] / capacity)
 
 
-class Warmth(Module):
+class ThermalEnergy(Module):
     """The same, of one body."""
 
     capacity: jax.Array
 
     def __call__(self, x):
-        return warmth(x, self.capacity)
+        return thermal_energy(x, self.capacity)
 
 
 def thermo_particles(capacities: Sequence[float] = (1.0, 1.0), conductance=1.0) -> ComposedSystem:
@@ -45,14 +45,14 @@ def thermo_particles(capacities: Sequence[float] = (1.0, 1.0), conductance=1.0) 
     conductance : float for two bodies, or a graph as in :class:`liethermo.ComposedSystem`
         k_ab (power / temperature).
     """
-    c = several(capacities, "capacities")
-    return ComposedSystem(Copies(len(c), warmth, 1, c), conductance=conductance)
+    c = checked_positive_vector(capacities, "capacities")
+    return ComposedSystem(Copies(len(c), thermal_energy, 1, c), conductance=conductance)
 
 
 def thermo_particles_solution(t, temperatures, capacities=(1.0, 1.0), conductance=1.0) -> np.ndarray:
     """The exact temperatures at times t, shape (..., N), from those at t = 0: a linear relaxation."""
     c, count = np.asarray(capacities, dtype=float), len(capacities)
-    graph = edges(conductance, count, "the conductance", tuple(map(str, range(count))))
+    graph = graph_edges(conductance, count, "the conductance", tuple(map(str, range(count))))
     laplacian = np.zeros((count, count))
     for i, j, k in zip(graph.first, graph.second, np.asarray(graph.weight), strict=True):
         laplacian[[i, j], [i, j]] += k
@@ -81,11 +81,11 @@ def moving_thermo_particles(
     dimension : int
         Of the space; the state is (q_1, p_1, S_1, q_2, …) with q_a and p_a of that many components.
     """
-    bodies = _bodies(masses, capacities, dimension, 0.0)
+    bodies = _moving_bodies(masses, capacities, dimension, 0.0)
     of_axis = np.eye(2 * dimension + 1)[dimension:-1]
     total = {"momentum" if dimension == 1 else f"momentum {i + 1}": p for i, p in enumerate(of_axis)}
     constants = {name: Quadratic(np.zeros(len(bodies) * len(p)), np.tile(p, len(bodies))) for name, p in total.items()}
-    inverse = 1.0 / positive(masses, "masses", len(bodies))
+    inverse = 1.0 / checked_positive(masses, "masses", len(bodies))
     constants["kinetic energy"] = Quadratic(jnp.outer(inverse, of_axis.sum(axis=0)).ravel())
     return ComposedSystem(bodies, conductance=conductance, momentum_maps=constants)
 
@@ -110,9 +110,9 @@ def thermo_springs(
     friction, drag : float, >= 0
         Coefficients of linear friction of either body on its surroundings, and between the two (mass / time).
     """
-    k, free = positive(stiffness, "stiffness"), isinstance(friction, float | int) and friction == 0.0
+    k, free = checked_positive(stiffness, "stiffness"), isinstance(friction, float | int) and friction == 0.0
     return ComposedSystem(
-        _bodies(masses, capacities, 1, friction),
+        _moving_bodies(masses, capacities, 1, friction),
         coupling=Quadratic(k * np.array([[1.0, -1.0], [-1.0, 1.0]])).on([0, 3]),
         conductance=conductance,
         drag=drag,
@@ -121,10 +121,10 @@ def thermo_springs(
     )
 
 
-def _bodies(masses, capacities, dimension, friction) -> list[Subsystem]:
-    c = several(capacities, "capacities")
-    m, n = positive(masses, "masses", len(c)), whole(dimension, "dimension")
+def _moving_bodies(masses, capacities, dimension, friction) -> list[Subsystem]:
+    c = checked_positive_vector(capacities, "capacities")
+    m, n = checked_positive(masses, "masses", len(c)), checked_integer(dimension, "dimension")
     return [
-        Subsystem(Kinetic(jnp.full(n, 1.0 / m_a)) + Function(Warmth(c_a)).on([2 * n]), 2 * n + 1, friction)
+        Subsystem(Kinetic(jnp.full(n, 1.0 / m_a)) + Function(ThermalEnergy(c_a)).on([2 * n]), 2 * n + 1, friction)
         for m_a, c_a in zip(m, c, strict=True)
     ]

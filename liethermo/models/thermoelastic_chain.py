@@ -6,15 +6,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from manifolds._module import Module
+from manifolds._pytree_module import Module
 
 from ..errors import InputError
-from ..functions.conditions import numbers
+from ..functions.conditions import check_numbers
 from ..functions.each import Each
 from ..functions.energy import Energy, Function, Quadratic
 from ..functions.mechanics import Kinetic
 from ..systems import ComposedSystem, Copies
-from .parameters import positive, whole
+from .parameters import checked_integer, checked_positive
 
 
 class Thermospring(Module):
@@ -44,12 +44,12 @@ class Thermospring(Module):
         return elastic + self.capacity * (T - self.temperature)
 
 
-def _hanging(y):
+def _first_spring_variables(y):
     """The squared length of the first spring and its entropy, from (q_1, S_1)."""
     return jnp.stack([jnp.sum(y[:-1] ** 2), y[-1]])
 
 
-def _between(y):
+def _spring_variables(y):
     """Those of a spring between two bodies, from (q, q', S')."""
     n = len(y) // 2
     return jnp.stack([jnp.sum((y[n : 2 * n] - y[:n]) ** 2), y[-1]])
@@ -87,27 +87,27 @@ def thermoelastic_chain(
     gravity : float
         Acceleration against the last axis; without it the angular momentum is constant, and audited.
     """
-    N, n = whole(bodies, "bodies"), whole(dimension, "dimension")
+    N, n = checked_integer(bodies, "bodies"), checked_integer(dimension, "dimension")
     if n > 3:
         raise InputError(f"dimension is 1, 2 or 3, not {n}")
     spring = Thermospring(
-        positive(stiffness, "stiffness"),
-        numbers(expansion, "expansion", ()),
-        positive(capacity, "capacity"),
-        positive(length, "length"),
-        positive(temperature, "temperature"),
+        checked_positive(stiffness, "stiffness"),
+        check_numbers(expansion, "expansion", ()),
+        checked_positive(capacity, "capacity"),
+        checked_positive(length, "length"),
+        checked_positive(temperature, "temperature"),
     )
-    m = positive(mass, "mass")
+    m = checked_positive(mass, "mass")
     body: Energy = Kinetic(jnp.full(n, 1.0 / m))
-    g, heavy = numbers(gravity, "gravity", ()), not (isinstance(gravity, float | int) and gravity == 0.0)
+    g, heavy = check_numbers(gravity, "gravity", ()), not (isinstance(gravity, float | int) and gravity == 0.0)
     if heavy:
         body = body + Quadratic(jnp.zeros(2 * n + 1), jnp.zeros(2 * n + 1).at[n - 1].set(m * g))
     size = 2 * n + 1
     q = size * np.arange(N)[:, None] + np.arange(n)
     S = size * np.arange(1, N + 1)[:, None] - 1
-    springs: list[Energy] = [Function(spring).on(_hanging).on([*q[0], *S[0]])]
+    springs: list[Energy] = [Function(spring).on(_first_spring_variables).on([*q[0], *S[0]])]
     if N > 1:
-        springs.append(Each(Function(spring).on(_between), np.hstack([q[:-1], q[1:], S[1:]])))
+        springs.append(Each(Function(spring).on(_spring_variables), np.hstack([q[:-1], q[1:], S[1:]])))
     return ComposedSystem(
         Copies(N, body, size, name="spring"),
         coupling=springs,

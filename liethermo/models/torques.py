@@ -14,18 +14,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from manifolds._arrays import is_traced
-from manifolds._module import Module
-from manifolds._names import listing
+from manifolds._names import public_dir
+from manifolds._pytree_module import Module
 
 from ..errors import InputError
-from ..functions.conditions import numbers, require
+from ..functions.conditions import check_numbers, require_condition
 from .inertia import checked_tensors
-from .parameters import finite, positive
+from .parameters import checked_finite, checked_positive
 
 __all__ = ["ConstantInBody", "ConstantInSpace", "GravityGradient", "Magnetic", "Motor", "Tabulated"]
-__dir__ = listing(__all__)
+__dir__ = public_dir(__all__)
 
-PERPENDICULAR = 1e-8
+MAX_PERPENDICULAR_COSINE = 1e-8
 """Largest cosine of two directions that count as perpendicular."""
 
 
@@ -41,7 +41,7 @@ class ConstantInBody(Module):
     moment: jax.Array
 
     def __init__(self, moment):
-        self.moment = finite(moment, "moment")
+        self.moment = checked_finite(moment, "moment")
 
     def __call__(self, t, mu):
         return self.moment
@@ -59,7 +59,7 @@ class ConstantInSpace(Module):
     moment: jax.Array
 
     def __init__(self, moment):
-        self.moment = finite(moment, "moment", 3)
+        self.moment = checked_finite(moment, "moment", 3)
 
     def __call__(self, t, mu, attitude):
         return attitude.T @ self.moment
@@ -88,14 +88,14 @@ class GravityGradient(Module):
     normal: jax.Array
 
     def __init__(self, inertia, mean_motion, towards=(1.0, 0.0, 0.0), normal=(0.0, 0.0, 1.0)):
-        self.inertia = numbers(inertia, "inertia", (3,), (3, 3))
+        self.inertia = check_numbers(inertia, "inertia", (3,), (3, 3))
         if self.inertia.ndim == 2 and not is_traced(inertia):
             self.inertia = jnp.asarray(checked_tensors(self.inertia))
-        self.mean_motion = positive(mean_motion, "mean_motion")
-        self.towards, self.normal = _direction(towards, "towards"), _direction(normal, "normal")
+        self.mean_motion = checked_positive(mean_motion, "mean_motion")
+        self.towards, self.normal = _unit_vector(towards, "towards"), _unit_vector(normal, "normal")
         if not is_traced((self.towards, self.normal)):
             cosine = float(np.dot(self.towards, self.normal))
-            if abs(cosine) > PERPENDICULAR:
+            if abs(cosine) > MAX_PERPENDICULAR_COSINE:
                 raise InputError(f"towards lies in the plane of the orbit, normal to it: their cosine is {cosine:.3g}")
 
     def __call__(self, t, mu, attitude):
@@ -124,8 +124,8 @@ class Magnetic(Module):
     field: jax.Array | Callable
 
     def __init__(self, dipole, field):
-        self.dipole = finite(dipole, "dipole", 3)
-        self.field = field if callable(field) else finite(field, "field", 3)
+        self.dipole = checked_finite(dipole, "dipole", 3)
+        self.field = field if callable(field) else checked_finite(field, "field", 3)
 
     def __call__(self, t, mu, attitude):
         field = self.field(t) if callable(self.field) else self.field
@@ -148,7 +148,7 @@ class Motor(Module):
     moment: jax.Array | Callable
 
     def __init__(self, moment):
-        self.moment = moment if callable(moment) else finite(np.atleast_1d(moment), "moment")
+        self.moment = moment if callable(moment) else checked_finite(np.atleast_1d(moment), "moment")
 
     def __call__(self, t, mu):
         moment = jnp.atleast_1d(self.moment(t) if callable(self.moment) else self.moment)
@@ -173,13 +173,15 @@ class Tabulated(Module):
     moments: jax.Array
 
     def __init__(self, times, moments):
-        self.times, self.moments = finite(times, "times"), finite(moments, "moments")
+        self.times, self.moments = checked_finite(times, "times"), checked_finite(moments, "moments")
         if self.times.ndim != 1 or self.times.size < 2 or self.moments.shape[:1] != self.times.shape:
             raise InputError(
                 f"times has shape (m,), m at least 2, and moments m rows: not {self.times.shape} and "
                 f"{self.moments.shape}"
             )
-        require(self.times, lambda t: t[1:] > t[:-1], "the times of a table increase, and these do not: {value}")
+        require_condition(
+            self.times, lambda t: t[1:] > t[:-1], "the times of a table increase, and these do not: {value}"
+        )
 
     def __call__(self, t, mu):
         begun = jnp.where(t >= self.times, 1.0, 0.0)
@@ -188,7 +190,7 @@ class Tabulated(Module):
         return jnp.tensordot(now * (1.0 - gone), self.moments[:-1], 1) + jnp.tensordot(now * gone, self.moments[1:], 1)
 
 
-def _direction(value, name: str) -> jax.Array:
-    array = finite(value, name, 3)
-    require(array, lambda v: (v**2).sum() > 0.0, name + " is a direction, not {value}")
+def _unit_vector(value, name: str) -> jax.Array:
+    array = checked_finite(value, name, 3)
+    require_condition(array, lambda v: (v**2).sum() > 0.0, name + " is a direction, not {value}")
     return array / jnp.sqrt(jnp.sum(array**2))

@@ -44,7 +44,7 @@ def tumbling_body(
     relaxation_time : float, > 0
         Time (s) in which small nutations fall by e, at the angular momentum given beside it. If the three moments
         differ, the nutation oscillates, and its amplitude falls by e. If the two greatest are equal, as those of a rod,
-        the tangent of the angle from the flat spin falls by e. :func:`liethermo.bodies.rate_of` says what holds for
+        the tangent of the angle from the flat spin falls by e. :func:`liethermo.bodies.growth_rate_at` says what holds for
         nearly equal moments.
     momentum : float, > 0, or three numbers
         The size of the angular momentum, or that vector in body axes (kg m**2 / s), to tell a rate from a relaxation
@@ -80,7 +80,7 @@ def tumbling_body(
         given = {"relaxation_time": relaxation_time, "momentum": momentum, "rate": rate}
         names = ", ".join(name for name, value in given.items() if value is not None) or "none of them"
         raise InputError(f"give relaxation_time= with the momentum= that it belongs to, or rate=, not {names}")
-    friction = rate if relaxation_time is None else rate_of(relaxation_time, moments, _size(momentum))
+    friction = rate if relaxation_time is None else rate_of(relaxation_time, moments, _momentum_norm(momentum))
     return LiePoissonSystem(
         mf.so(3),
         energy=Quadratic(inverse_inertia(moments)),
@@ -90,7 +90,7 @@ def tumbling_body(
     )
 
 
-def _size(momentum):
+def _momentum_norm(momentum):
     """The size of a momentum that is given as such, or as a vector."""
     if np.shape(momentum) not in ((), (3,)):
         raise InputError(f"momentum is one number, or three, not an array of shape {np.shape(momentum)}")

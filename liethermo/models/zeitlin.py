@@ -28,7 +28,7 @@ class KineticEnergy(Energy):
 
     def gradient(self, x) -> jax.Array:
         psi = self.sphere.inverse_laplacian(x)
-        return -self.sphere.gamma * self.sphere.algebra.tables.raised(psi)
+        return -self.sphere.gamma * self.sphere.algebra.matrix_basis.raise_index(psi)
 
     def value(self, x) -> jax.Array:
         return 0.5 * jnp.dot(x, self.gradient(x))

@@ -10,12 +10,12 @@ import numpy as np
 from ..errors import ConvergenceError, InputError
 
 
-def _as_it_is(x: np.ndarray) -> np.ndarray:
+def _identity(x: np.ndarray) -> np.ndarray:
     return x
 
 
 @dataclass(frozen=True)
-class Dense:
+class DenseOutput:
     """``x(t)`` anywhere: where a step of the method ends that begins at the last state before t.
 
     So states between have the order of the method and its laws: the energy and the invariants are those of the state
@@ -27,16 +27,16 @@ class Dense:
         When the steps of the run begin, and when the last one ends.
     x : ndarray, shape (steps + 1, n)
         The states then.
-    ends : function from states, shape (m, n), and sizes of steps, shape (m,), to states
+    step_ends : function from states, shape (m, n), and sizes of steps, shape (m,), to states
         NaN where a step cannot be taken.
-    seen : function from states, shape (m, n), to states
+    to_user_state : function from states, shape (m, n), to states
         What a user sees of them.
     """
 
     t: np.ndarray
     x: np.ndarray
-    ends: Callable[[np.ndarray, np.ndarray], np.ndarray]
-    seen: Callable[[np.ndarray], np.ndarray] = _as_it_is
+    step_ends: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    to_user_state: Callable[[np.ndarray], np.ndarray] = _identity
 
     def __call__(self, t) -> np.ndarray:
         t = np.asarray(t, dtype=np.float64)
@@ -49,12 +49,12 @@ class Dense:
         h, found = times - self.t[i], self.x[i]
         between = np.flatnonzero(h > 0.0)
         if between.size:
-            found[between] = self.ends(found[between], h[between])
-            self._check(times[between], found[between])
-        found = self.seen(found)
+            found[between] = self.step_ends(found[between], h[between])
+            self._check_solved(times[between], found[between])
+        found = self.to_user_state(found)
         return found.reshape(*t.shape, found.shape[-1])
 
-    def _check(self, t: np.ndarray, x: np.ndarray) -> None:
+    def _check_solved(self, t: np.ndarray, x: np.ndarray) -> None:
         """Raise where a part of a step cannot be taken, although the run has taken the whole."""
         unknown = np.isnan(x).any(axis=1)
         if unknown.any():
@@ -64,7 +64,7 @@ class Dense:
                 None,
             )
 
-    def through(self, change: Callable[[np.ndarray], np.ndarray]) -> Dense:
+    def with_output_map(self, change: Callable[[np.ndarray], np.ndarray]) -> DenseOutput:
         """The same, of which a user sees what a function makes of it."""
-        before = self.seen
-        return replace(self, seen=lambda x: np.asarray(change(before(x))))
+        before = self.to_user_state
+        return replace(self, to_user_state=lambda x: np.asarray(change(before(x))))

@@ -9,15 +9,23 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from manifolds._precision import by_own_settings
+from manifolds._precision import with_library_settings
 from manifolds._tables import html_grid
 
-from ..engines.codes import TEXTS, Code
+from ..engines.codes import STATUS_NAMES, StatusCode
 from ..errors import InputError
-from .audit import FAILED, Audit, AuditRow, Tolerances, accuracy_row, coverage_of
-from .evidence import Evidence, Recorded, worst_evidence
-from .files import ENSEMBLE_FORMAT, as_parts, checked, described, from_parts, places, series_of
-from .many import laws_of_many
+from .audit import FAILED_TRAJECTORIES_ROW, Audit, AuditRow, Tolerances, accuracy_row, coverage_text
+from .evidence import AuditableResult, Evidence, merge_evidence
+from .files import (
+    ENSEMBLE_FORMAT,
+    array_of_shape,
+    build_dataset,
+    dataclass_from_json,
+    join_complex,
+    split_complex,
+    state_axis_names,
+)
+from .many import evaluate_ensemble_laws
 from .solution import Solution
 from .status import Laws, Stats, Status
 
@@ -25,25 +33,25 @@ if TYPE_CHECKING:
     import xarray
 
 
-SENTENCES = {
-    Code.COMPLETED: "reached t = {t:.15g} in {n} steps",
-    Code.NOT_CONVERGED: "the equations of step {next}, from t = {t:.15g}, were not solved: the iteration stopped at "
+STATUS_MESSAGES = {
+    StatusCode.COMPLETED: "reached t = {t:.15g} in {n} steps",
+    StatusCode.NOT_CONVERGED: "the equations of step {next}, from t = {t:.15g}, were not solved: the iteration stopped at "
     "a residual of {r:.2g} relative to the state; try a smaller step",
-    Code.NON_FINITE: "NaN or infinity in step {next}, from t = {t:.15g}: the energy, the entropy, the vector field or "
+    StatusCode.NON_FINITE: "NaN or infinity in step {next}, from t = {t:.15g}: the energy, the entropy, the vector field or "
     "the event function is not finite there; check the domain of the functions, or try a smaller step",
-    Code.INTERRUPTED: "stopped by the user after step {n}, t = {t:.15g}",
-    Code.EVENT: "the event happened at t = {t:.15g} in {n} steps",
-    Code.STEP_UNDERFLOW: "no step from t = {t:.15g}, after step {n}, was short enough for the tolerance: it may be "
+    StatusCode.INTERRUPTED: "stopped by the user after step {n}, t = {t:.15g}",
+    StatusCode.EVENT: "the event happened at t = {t:.15g} in {n} steps",
+    StatusCode.STEP_UNDERFLOW: "no step from t = {t:.15g}, after step {n}, was short enough for the tolerance: it may be "
     "below what rounding allows, or the functions not smooth there",
-    Code.STEP_LIMIT: "as many steps were tried as are allowed, and t = {t:.15g} is reached: Adaptive(most_steps=...) "
+    StatusCode.STEP_LIMIT: "as many steps were tried as are allowed, and t = {t:.15g} is reached: Adaptive(most_steps=...) "
     "allows more, and a larger tolerance or a method of higher order takes fewer",
-    Code.INADMISSIBLE: "{reason}",
+    StatusCode.INADMISSIBLE: "{reason}",
 }
 """How a trajectory ended, by its time t, its steps n, its residual r."""
 
 
 @dataclass(frozen=True)
-class Ensemble(Recorded):
+class Ensemble(AuditableResult):
     """What :func:`ensemble` returns; trajectories come first in every array, and B is their number.
 
     ``e[i]`` is one trajectory as a :class:`Solution`, and a loop over an ensemble is one over these.
@@ -58,7 +66,7 @@ class Ensemble(Recorded):
     energy, entropy : ndarray, shape (B,) or (B, times), as x has
         Final ones for ``"summary"``. ``entropy`` is None for a system without one.
     status : ndarray of int8, shape (B,)
-        Places in ``TEXTS``: 0 completed, 1 not converged, 2 not finite, 3 interrupted, 4 ended by its event, 5 and 6
+        Places in ``STATUS_NAMES``: 0 completed, 1 not converged, 2 not finite, 3 interrupted, 4 ended by its event, 5 and 6
         adaptive steps that were too short or too many, 8 inadmissible: a trajectory that could not be started, with its
         parameters or from its state.
     steps : ndarray of int64, shape (B,)
@@ -138,8 +146,8 @@ class Ensemble(Recorded):
     work: np.ndarray | None = None
     reasons: Mapping[int, str] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
-    witness: Callable[[], Evidence] | None = field(default=None, repr=False, compare=False)
-    alone: Callable[[Ensemble, int], Solution] | None = field(default=None, repr=False, compare=False)
+    evidence_source: Callable[[], Evidence] | None = field(default=None, repr=False, compare=False)
+    solution_builder: Callable[[Ensemble, int], Solution] | None = field(default=None, repr=False, compare=False)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "alone": None}
@@ -150,12 +158,12 @@ class Ensemble(Recorded):
     @property
     def ok(self) -> np.ndarray:
         """Which trajectories came to their end, shape (B,)."""
-        return np.isin(self.status, (Code.COMPLETED, Code.EVENT))
+        return np.isin(self.status, (StatusCode.COMPLETED, StatusCode.EVENT))
 
     @property
     def event_time(self) -> np.ndarray:
         """When events happened, shape (B,); NaN where none did."""
-        return np.where(self.status == Code.EVENT, self.end_time, np.nan)
+        return np.where(self.status == StatusCode.EVENT, self.end_time, np.nan)
 
     # -- one trajectory -------------------------------------------------------------------------------------------
 
@@ -171,17 +179,17 @@ class Ensemble(Recorded):
         InputError
             If no states were kept, or the trajectory is inadmissible.
         """
-        i = self._place(i)
+        i = self._member_index(i)
         if self.x is None:
             raise InputError('no states were kept: outputs="final" or "trajectory" keeps some')
-        if self.status[i] == Code.INADMISSIBLE:
+        if self.status[i] == StatusCode.INADMISSIBLE:
             raise InputError(self.message(i))
-        return self.member(i) if self.alone is None else self.alone(self, i)
+        return self.member_solution(i) if self.solution_builder is None else self.solution_builder(self, i)
 
     def __iter__(self) -> Iterator[Solution]:
         return (self[i] for i in range(len(self)))
 
-    def _place(self, i) -> int:
+    def _member_index(self, i) -> int:
         if isinstance(i, bool) or not isinstance(i, int | np.integer):
             raise InputError(f"a trajectory is chosen by a number, not by {i!r}")
         if not -len(self) <= i < len(self):
@@ -190,21 +198,23 @@ class Ensemble(Recorded):
 
     def message(self, i: int) -> str:
         """How a trajectory ended, in words, its index first."""
-        i = self._place(i)
+        i = self._member_index(i)
         facts = {"t": self.end_time[i], "n": self.steps[i], "next": self.steps[i] + 1, "r": self.residual[i]}
-        code, reason = Code(self.status[i]), self.reasons.get(i, "")
-        text = SENTENCES[code].format(reason=reason, **facts)
-        if reason and code != Code.INADMISSIBLE:
+        code, reason = StatusCode(self.status[i]), self.reasons.get(i, "")
+        text = STATUS_MESSAGES[code].format(reason=reason, **facts)
+        if reason and code != StatusCode.INADMISSIBLE:
             text = f"step {facts['next']} could not be taken: {reason}"
         return f"trajectory {i}: {text}"
 
-    def status_of(self, i: int) -> Status:
+    def member_status(self, i: int) -> Status:
         """How a trajectory ended."""
-        i = self._place(i)
+        i = self._member_index(i)
         residual = float(np.nan_to_num(self.residual[i]))
-        return Status(Code(self.status[i]), self.message(i), int(self.steps[i]), float(self.end_time[i]), residual)
+        return Status(
+            StatusCode(self.status[i]), self.message(i), int(self.steps[i]), float(self.end_time[i]), residual
+        )
 
-    def stats_of(self, i: int) -> Stats:
+    def member_stats(self, i: int) -> Stats:
         """What was counted of a trajectory, and its extremes; the iterations of both kinds together."""
         moved = self.steps[i] > 0
         entropy = float(self.least_entropy_increment[i]) if moved else None
@@ -219,7 +229,7 @@ class Ensemble(Recorded):
             wall_time=self.wall_time,
         )
 
-    def member(self, i: int) -> Solution:
+    def member_solution(self, i: int) -> Solution:
         """One trajectory as it is kept here, without Casimirs."""
         path = self.energy.ndim == 2
         reached = np.isfinite(self.energy[i]) if path else np.array([True])
@@ -240,37 +250,39 @@ class Ensemble(Recorded):
             t=self.t[reached] if path else np.array([self.provenance["t_span"][0], self.end_time[i]]),
             x=series(self.x, self.x0[i]),
             energy=series(self.energy, first),
-            entropy=None if self.entropy is None else series(self.entropy, self._first_entropy(i)),
+            entropy=None if self.entropy is None else series(self.entropy, self._initial_entropy(i)),
             casimirs={} if work is None else {"work": work[reached] if path else np.stack([0.0 * work, work])},
-            status=self.status_of(i),
-            stats=self.stats_of(i),
+            status=self.member_status(i),
+            stats=self.member_stats(i),
             laws=self.laws,
             provenance={**self.provenance, "trajectory": i, "x0": self.x0[i].tolist()},
             attitude=attitude,
-            event_time=float(self.end_time[i]) if self.status[i] == Code.EVENT else None,
-            witness=lambda: evidence,
+            event_time=float(self.end_time[i]) if self.status[i] == StatusCode.EVENT else None,
+            evidence_source=lambda: evidence,
         )
 
-    def _first_entropy(self, i: int) -> float:
+    def _initial_entropy(self, i: int) -> float:
         assert self.entropy is not None
         return self.entropy[i, 0] if self.entropy.ndim == 2 else self.entropy[i] - self.entropy_change[i]
 
     # -- all of them ----------------------------------------------------------------------------------------------
 
     def __str__(self) -> str:
-        counts = [f"{(self.status == code).sum()} {name}" for code, name in enumerate(TEXTS) if code in self.status]
+        counts = [
+            f"{(self.status == code).sum()} {name}" for code, name in enumerate(STATUS_NAMES) if code in self.status
+        ]
         lines = [f"{len(self)} trajectories to t = {self.t[-1]:g}: {', '.join(counts)}"]
         failed = np.flatnonzero(~self.ok)
-        lines += [f"  {TEXTS[self.status[i]]}: {self.message(i)}" for i in failed[:5]]
+        lines += [f"  {STATUS_NAMES[self.status[i]]}: {self.message(i)}" for i in failed[:5]]
         lines += [f"  and {len(failed) - 5} more"] if len(failed) > 5 else []
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
-        counts = [(TEXTS[code], str(int((self.status == code).sum()))) for code in np.unique(self.status)]
+        counts = [(STATUS_NAMES[code], str(int((self.status == code).sum()))) for code in np.unique(self.status)]
         drift = f"largest relative energy drift {np.max(self.energy_drift, initial=0.0):.1e}"
         return html_grid((f"{len(self)} trajectories to t = {self.t[-1]:g}", ""), counts, drift)
 
-    @by_own_settings
+    @with_library_settings
     def audit(
         self, energy: float = Tolerances.energy, entropy: float = Tolerances.entropy, **tolerances: float
     ) -> Audit:
@@ -289,19 +301,21 @@ class Ensemble(Recorded):
         InputError
             If there is no tolerance of a name, or it is negative.
         """
-        accepted = Tolerances.of(energy=energy, entropy=entropy, **tolerances)
+        accepted = Tolerances.with_defaults(energy=energy, entropy=entropy, **tolerances)
         moved, terms = self.steps > 0, self.evidence.terms
         rows = []
-        for law in laws_of_many(self, self.laws, accepted, terms.get("energy", 0.0), terms.get("entropy", 0.0)):
-            i = law.worst
-            rows.append(law.as_row(i, f"worst is trajectory {i}"))
-        if self.witness is not None or self.evidence.local_error is not None:
+        for law in evaluate_ensemble_laws(
+            self, self.laws, accepted, terms.get("energy", 0.0), terms.get("entropy", 0.0)
+        ):
+            i = law.worst_member
+            rows.append(law.audit_row(i, f"worst is trajectory {i}"))
+        if self.evidence_source is not None or self.evidence.local_error is not None:
             rows.append(accuracy_row(self.evidence, accepted))
-        failed = int((~self.ok & (self.status != Code.INTERRUPTED)).sum())
-        rows.append(AuditRow(FAILED, float(failed), 0.0, failed == 0))
+        failed = int((~self.ok & (self.status != StatusCode.INTERRUPTED)).sum())
+        rows.append(AuditRow(FAILED_TRAJECTORIES_ROW, float(failed), 0.0, failed == 0))
         least = np.nan if self.entropy is None else float(self.least_entropy_increment.min(initial=0.0, where=moved))
         drift, residual = (float(a.max(initial=0.0, where=moved)) for a in (self.energy_drift, self.residual))
-        coverage = coverage_of(self.evidence, int(self.steps.sum()))
+        coverage = coverage_text(self.evidence, int(self.steps.sum()))
         return Audit(drift, least, np.nan, residual, tuple(rows), coverage)
 
     # -- files --------------------------------------------------------------------------------------------------------
@@ -325,17 +339,17 @@ class Ensemble(Recorded):
         path = self.energy.ndim == 2
         each = ("trajectory", "time") if path else ("trajectory",)
         variables: dict[str, Any] = {
-            name: (each if name in SERIES else ("trajectory",), value)
-            for name in (*SERIES, *NUMBERS)
+            name: (each if name in TIME_SERIES_FIELDS else ("trajectory",), value)
+            for name in (*TIME_SERIES_FIELDS, *PER_MEMBER_FIELDS)
             if (value := getattr(self, name)) is not None
         }
         for name, dims in (("x", each), ("x0", ("trajectory",))):
             if (value := getattr(self, name)) is not None:
-                variables[name] = ((*dims, *places(value.ndim - len(dims))), value)
+                variables[name] = ((*dims, *state_axis_names(value.ndim - len(dims))), value)
         for name, dims in (("attitude", each), ("attitude0", ("trajectory",))):
             if (value := getattr(self, name)) is not None:
-                variables[name] = ((*dims, "row", "column", "part"), as_parts(value))
-        variables["status_text"] = ("trajectory", np.array([TEXTS[code] for code in self.status], dtype=object))
+                variables[name] = ((*dims, "row", "column", "part"), split_complex(value))
+        variables["status_text"] = ("trajectory", np.array([STATUS_NAMES[code] for code in self.status], dtype=object))
         failed = ~self.ok
         messages = [self.message(i) if failed[i] else "" for i in range(len(self))]
         variables["message"] = ("trajectory", np.array(messages, dtype=object))
@@ -350,54 +364,58 @@ class Ensemble(Recorded):
             "reasons": json.dumps({str(i): text for i, text in self.reasons.items()}),
         }
         coordinates = {"time": self.t, "trajectory": np.arange(len(self))}
-        return described(variables, coordinates, attributes, self.laws, units)
+        return build_dataset(variables, coordinates, attributes, self.laws, units)
 
     @classmethod
-    def of_file(cls, series: dict[str, np.ndarray], attributes: dict[str, Any]) -> Ensemble:
+    def from_file(cls, series: dict[str, np.ndarray], attributes: dict[str, Any]) -> Ensemble:
         """From what :func:`.files.read` returns; KeyError, TypeError or ValueError where a part is missing."""
         if len(series["time"]) != int(attributes["times"]):
             raise ValueError(f"{len(series['time'])} times of {attributes['times']}")
-        number, times = len(series["x0"]), len(series_of(series, "time", (None,)))
-        each = {name: series_of(series, name, (number,)) for name in NUMBERS}
-        along = {name: series_of(series, name, (number,), (number, times)) for name in SERIES if name in series}
+        number, times = len(series["x0"]), len(array_of_shape(series, "time", (None,)))
+        each = {name: array_of_shape(series, name, (number,)) for name in PER_MEMBER_FIELDS}
+        along = {
+            name: array_of_shape(series, name, (number,), (number, times))
+            for name in TIME_SERIES_FIELDS
+            if name in series
+        }
         states = {name: series[name] for name in ("x0", "x", "attitude0", "attitude") if name in series}
         for name in states:
-            series_of(series, name, (number, *[None] * max(series[name].ndim - 1, 1)))
+            array_of_shape(series, name, (number, *[None] * max(series[name].ndim - 1, 1)))
         for name in ("attitude", "attitude0"):
             if name in states:
-                states[name] = from_parts(states[name])
+                states[name] = join_complex(states[name])
         reasons, provenance = (json.loads(attributes[name]) for name in ("reasons", "provenance"))
         if not isinstance(reasons, dict) or not isinstance(provenance, dict):
             raise ValueError("what is said of the ensemble is not what this version writes")
-        if not ((each["status"] >= 0) & (each["status"] < len(TEXTS))).all():
+        if not ((each["status"] >= 0) & (each["status"] < len(STATUS_NAMES))).all():
             raise ValueError(f"a trajectory ended in a way that there is not: {int(each['status'].max())}")
-        evidence = checked(Evidence, json.loads(attributes["evidence"]))
+        evidence = dataclass_from_json(Evidence, json.loads(attributes["evidence"]))
         return cls(
             t=series["time"],
             **dict.fromkeys(("x", "entropy", "work")) | each | along | states,  # type: ignore[arg-type]
-            laws=checked(Laws, json.loads(attributes["laws"])),
+            laws=dataclass_from_json(Laws, json.loads(attributes["laws"])),
             engine=str(attributes["engine"]),
             wall_time=float(attributes["wall_time"]),
             reasons={int(i): str(text) for i, text in reasons.items()},
             provenance=provenance,
-            witness=lambda: evidence,
+            evidence_source=lambda: evidence,
         )
 
 
-SERIES = ("energy", "entropy", "work")
+TIME_SERIES_FIELDS = ("energy", "entropy", "work")
 """What is known at each of the times kept."""
 
-NUMBERS = tuple(
+PER_MEMBER_FIELDS = tuple(
     "status steps residual energy_drift largest_energy_increment least_entropy_increment entropy_scale "
     "energy_sensitivity entropy_sensitivity first_energy entropy_change relaxation_time iterations smallest_energy "
     "largest_energy end_time rejected".split()
 )
 """One of each trajectory."""
 
-NEEDED = ("energy", "x0", *NUMBERS)
+REQUIRED_FIELDS = ("energy", "x0", *PER_MEMBER_FIELDS)
 """What every ensemble has."""
 
-STATES = ("x", "x0", "attitude", "attitude0")
+STATE_FIELDS = ("x", "x0", "attitude", "attitude0")
 """The arrays of states, trajectories first."""
 
 
@@ -406,12 +424,12 @@ class Subset(NamedTuple):
 
     Attributes
     ----------
-    run : array of int
+    trajectory_numbers : array of int
         Their numbers in the whole ensemble, increasing.
     ensemble : Ensemble
     """
 
-    run: np.ndarray
+    trajectory_numbers: np.ndarray
     ensemble: Ensemble
 
 
@@ -434,22 +452,22 @@ def join_subsets(parts: Sequence[Subset], size: int, **fields: Any) -> Ensemble:
     if len(ensembles) == 1 and len(first) == size:
         return replace(first, **fields)
 
-    def placed(name: str) -> np.ndarray | None:
+    def joined_field(name: str) -> np.ndarray | None:
         values = getattr(first, name)
         if values is None:
             return None
-        empty = {"status": Code.INADMISSIBLE}.get(name, 0 if values.dtype.kind == "i" else np.nan)
+        empty = {"status": StatusCode.INADMISSIBLE}.get(name, 0 if values.dtype.kind == "i" else np.nan)
         whole = np.full((size, *values.shape[1:]), empty, dtype=values.dtype)
         for part, ensemble in zip(parts, ensembles, strict=True):
-            whole[part.run] = getattr(ensemble, name)
+            whole[part.trajectory_numbers] = getattr(ensemble, name)
         return whole
 
-    def alone(many: Ensemble, i: int) -> Solution:
-        part = next(part for part in parts if i in part.run)
-        assert part.ensemble.alone is not None
-        return part.ensemble.alone(many, i)
+    def build_solution(many: Ensemble, i: int) -> Solution:
+        part = next(part for part in parts if i in part.trajectory_numbers)
+        assert part.ensemble.solution_builder is not None
+        return part.ensemble.solution_builder(many, i)
 
-    witnesses = [e.witness for e in ensembles]
+    witnesses = [e.evidence_source for e in ensembles]
     conserved = [set(e.laws.conserved) for e in ensembles]
     promised = set.intersection(*conserved)
     others = [name for e in ensembles for name in (*e.laws.conserved, *e.laws.unpromised) if name not in promised]
@@ -458,13 +476,17 @@ def join_subsets(parts: Sequence[Subset], size: int, **fields: Any) -> Ensemble:
         conserved=tuple(name for name in first.laws.conserved if name in promised),
         unpromised=tuple(dict.fromkeys(others)),
     )
-    whole: dict[str, Any] = {name: placed(name) for name in (*STATES, *SERIES, *NUMBERS)}
+    whole: dict[str, Any] = {
+        name: joined_field(name) for name in (*STATE_FIELDS, *TIME_SERIES_FIELDS, *PER_MEMBER_FIELDS)
+    }
     return replace(
         first,
         **whole,
         laws=laws,
         engine=engine,
-        witness=None if None in witnesses else lambda: worst_evidence([w() for w in witnesses if w is not None]),
-        alone=alone,
+        evidence_source=None
+        if None in witnesses
+        else lambda: merge_evidence([w() for w in witnesses if w is not None]),
+        solution_builder=build_solution,
         **fields,
     )

@@ -27,19 +27,19 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-FORMAT, WITHOUT_CHECKSUM = "liethermo-solution-2", ("liethermo-solution-1",)
+SOLUTION_FORMAT, FORMATS_WITHOUT_CHECKSUM = "liethermo-solution-2", ("liethermo-solution-1",)
 ENSEMBLE_FORMAT = "liethermo-ensemble-1"
 
-ATTRIBUTES = tuple(
+FILE_ATTRIBUTES = tuple(
     "format times status stats laws evidence provenance event_time engine wall_time reasons sha256".split()
 )
 """What a file may have."""
 
-SEAL = b"\nliethermo sha256 "
+CHECKSUM_TAG = b"\nliethermo sha256 "
 """What comes after the end of the NetCDF file, with the digest of all before it."""
 
 
-LARGEST = 2_000
+MAX_COMPRESSION_RATIO = 2_000
 """How many times as large as a file its content can be: numbers of one value alone take hardly any place."""
 
 LONG_NAMES = {
@@ -62,13 +62,13 @@ LONG_NAMES = {
 }
 
 
-def places(axes: int) -> list[str]:
+def state_axis_names(axes: int) -> list[str]:
     """The names of the axes of a state: those of its sites, if it has any, and its components."""
     sites = ["site"] if axes == 2 else [f"site_{i + 1}" for i in range(axes - 1)]
     return [*sites, "component"]
 
 
-def described(
+def build_dataset(
     variables: dict[str, Any],
     coordinates: dict[str, Any],
     attributes: dict[str, Any],
@@ -94,7 +94,7 @@ def described(
     return dataset.assign_attrs(sha256=checksum(content, attributes))
 
 
-class Saved(ABC):
+class SaveableResult(ABC):
     """What can be kept in a file, from which :func:`liethermo.load` brings it back."""
 
     @abstractmethod
@@ -117,10 +117,10 @@ class Saved(ABC):
         InputError
             If there is no variable of a name in ``units``.
         """
-        return write(self.to_xarray(units), path)
+        return write_dataset(self.to_xarray(units), path)
 
 
-def write(dataset: xarray.Dataset, path: str | os.PathLike) -> Path:
+def write_dataset(dataset: xarray.Dataset, path: str | os.PathLike) -> Path:
     """Write a NetCDF file; it appears whole or not at all.
 
     HDF5 makes it in memory, since it does not survive a disk that is full.
@@ -128,20 +128,22 @@ def write(dataset: xarray.Dataset, path: str | os.PathLike) -> Path:
     path = Path(path)
     numbers = [name for name, v in dataset.variables.items() if v.dtype.kind == "f" and v.size]
     made = io.BytesIO()
-    with _alone():
+    with _synchronous_dask():
         dataset.to_netcdf(made, engine="h5netcdf", encoding={name: {"fletcher32": True} for name in numbers})
     made.seek(0, io.SEEK_END)
-    made.write(SEAL + hashlib.sha256(made.getbuffer()).hexdigest().encode())
+    made.write(CHECKSUM_TAG + hashlib.sha256(made.getbuffer()).hexdigest().encode())
     try:
-        disk.write(path, made.getbuffer())
+        disk.write_atomically(path, made.getbuffer())
     except (OSError, ValueError) as error:  # the latter for what is no path
-        raise FileError(f"cannot write {path!s:.200}: {disk.why(error)}. The result itself is as it was") from error
-    disk.sweep(path.parent, path.name)
+        raise FileError(
+            f"cannot write {path!s:.200}: {disk.why_os_failed(error)}. The result itself is as it was"
+        ) from error
+    disk.remove_dead_parts(path.parent, path.name)
     return path
 
 
 @contextlib.contextmanager
-def _alone() -> Iterator[None]:
+def _synchronous_dask() -> Iterator[None]:
     """Let xarray ask no scheduler of Dask for a lock: where there is a client, it might be one that is gone."""
     if "dask" not in sys.modules:
         yield
@@ -152,7 +154,7 @@ def _alone() -> Iterator[None]:
         yield
 
 
-def read(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def read_dataset(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The variables and the attributes of a file that :func:`write` wrote, checked.
 
     Raises
@@ -169,45 +171,45 @@ def read(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[str, Any]
     try:
         if not path.is_file():
             raise FileError(f"there is no file {path!s:.200}")
-        _check_seal(path)
+        _check_file_digest(path)
     except OSError as error:
         if isinstance(error, FileError):
             raise
-        raise FileError(f"cannot read {path!s:.200}: {disk.why(error)}") from error
+        raise FileError(f"cannot read {path!s:.200}: {disk.why_os_failed(error)}") from error
     try:
-        series, attributes = _content(path)
+        series, attributes = _read_hdf5(path)
     except Exception as error:  # the readers beneath raise a dozen kinds for a broken file
         raise FileError(
             f"{path} cannot be read as NetCDF: it is cut short, damaged or of another kind ({error})"
         ) from error
-    if attributes.get("format") not in (FORMAT, ENSEMBLE_FORMAT, *WITHOUT_CHECKSUM):
+    if attributes.get("format") not in (SOLUTION_FORMAT, ENSEMBLE_FORMAT, *FORMATS_WITHOUT_CHECKSUM):
         raise FileError(
             f"{path} is a NetCDF file, but not a liethermo result (its format is {attributes.get('format')!r})"
         )
-    if attributes["format"] in WITHOUT_CHECKSUM:
+    if attributes["format"] in FORMATS_WITHOUT_CHECKSUM:
         warn(f"{path} has no checksum, as an earlier version wrote it: damage would not show")
     elif attributes.get("sha256") != checksum(series, attributes):
         raise FileError(f"{path} is damaged: its content does not have the checksum that it was written with")
     return series, attributes
 
 
-def _check_seal(path: Path) -> None:
+def _check_file_digest(path: Path) -> None:
     """Before HDF5 sees the file: a damaged one can keep its reader in an endless loop.
 
     A file without a seal is let through: programs that write to an HDF5 file may cut off what follows its end.
     """
-    length = len(SEAL) + 2 * hashlib.sha256().digest_size
+    length = len(CHECKSUM_TAG) + 2 * hashlib.sha256().digest_size
     whole = path.stat().st_size - length
     if whole < 0:
         return
     with open(path, "rb") as file:
         file.seek(whole)
         end = file.read()
-    if end.startswith(SEAL) and end != SEAL + _digest(path, whole):
+    if end.startswith(CHECKSUM_TAG) and end != CHECKSUM_TAG + _sha256_of_prefix(path, whole):
         raise FileError(f"{path} is damaged, or was changed: it does not have the checksum that it was written with")
 
 
-def _digest(path: Path, length: int) -> bytes:
+def _sha256_of_prefix(path: Path, length: int) -> bytes:
     """SHA-256 of the beginning of a file, in hexadecimal digits."""
     found = hashlib.sha256()
     with open(path, "rb") as file:
@@ -220,7 +222,7 @@ def _digest(path: Path, length: int) -> bytes:
     return found.hexdigest().encode()
 
 
-def _content(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def _read_hdf5(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The variables of a file by name, and its attributes."""
     import h5py  # not through h5netcdf, which prints a traceback of its own for a file that it cannot open
 
@@ -228,25 +230,25 @@ def _content(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         for name in file:  # before anything that they lead to is opened
             if not isinstance(file.get(name, getlink=True), h5py.HardLink):
                 raise ValueError(f"{name!r} is a link to another place")
-        found = {name: v for name, v in file.items() if not _is_scale(v)}
+        found = {name: v for name, v in file.items() if not _is_dimension_scale(v)}
         for name, v in found.items():
             if not isinstance(v, h5py.Dataset) or v.is_virtual or v.external:
                 raise ValueError(f"{name!r} is not an array of this file")
-            if v.size * max(v.dtype.itemsize, 1) > LARGEST * path.stat().st_size:
+            if v.size * max(v.dtype.itemsize, 1) > MAX_COMPRESSION_RATIO * path.stat().st_size:
                 raise ValueError(f"{name!r} says that it is larger than the file can hold")
         series = {
             name: np.array(v.asstr()[...] if h5py.check_string_dtype(v.dtype) else v[...]) for name, v in found.items()
         }
-        said = {name: np.asarray(file.attrs[name]).item() for name in ATTRIBUTES if name in file.attrs}
+        said = {name: np.asarray(file.attrs[name]).item() for name in FILE_ATTRIBUTES if name in file.attrs}
         return series, said
 
 
-def _is_scale(variable) -> bool:
+def _is_dimension_scale(variable) -> bool:
     """Whether a variable is but the length of a dimension."""
     return bytes(variable.attrs.get("NAME", b"")).startswith(b"This is a netCDF dimension but not a netCDF variable")
 
 
-def checked(kind: type[T], stored: Any) -> T:
+def dataclass_from_json(kind: type[T], stored: Any) -> T:
     """An object of a dataclass from the JSON data that it was written as; ValueError where that is something else."""
     import pydantic
 
@@ -261,7 +263,7 @@ def checked(kind: type[T], stored: Any) -> T:
         raise ValueError(f"its {kind.__name__.lower()} cannot be used: {at} {fault['msg']}") from None
 
 
-def series_of(series: Mapping[str, np.ndarray], name: str, *shapes: tuple[int | None, ...]) -> np.ndarray:
+def array_of_shape(series: Mapping[str, np.ndarray], name: str, *shapes: tuple[int | None, ...]) -> np.ndarray:
     """An array of a file; ValueError unless it has numbers, in one of these shapes, where None stands for any size."""
     found = series[name]
     fits = [len(s) == found.ndim and all(n in (None, m) for n, m in zip(s, found.shape, strict=True)) for s in shapes]
@@ -270,13 +272,13 @@ def series_of(series: Mapping[str, np.ndarray], name: str, *shapes: tuple[int | 
     return found
 
 
-def as_parts(values: np.ndarray) -> np.ndarray:
+def split_complex(values: np.ndarray) -> np.ndarray:
     """Matrices with real and imaginary parts along a last axis: NetCDF has no complex numbers."""
     return np.stack([values.real, values.imag][: 1 + np.iscomplexobj(values)], axis=-1)
 
 
-def from_parts(parts: np.ndarray) -> np.ndarray:
-    """The inverse of :func:`as_parts`."""
+def join_complex(parts: np.ndarray) -> np.ndarray:
+    """The inverse of :func:`split_complex`."""
     return parts[..., 0] if parts.shape[-1] == 1 else parts[..., 0] + 1j * parts[..., 1]
 
 
@@ -291,6 +293,6 @@ def checksum(series: Mapping[str, np.ndarray], attributes: Mapping[str, Any]) ->
         found.update(
             json.dumps(values.tolist()).encode() if kind == "text" else values.astype(kind, order="C").tobytes()
         )
-    said = [[name, str(attributes[name])] for name in ATTRIBUTES[:-1] if name in attributes]
+    said = [[name, str(attributes[name])] for name in FILE_ATTRIBUTES[:-1] if name in attributes]
     found.update(json.dumps(said).encode())
     return found.hexdigest()

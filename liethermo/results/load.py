@@ -6,7 +6,7 @@ import os
 
 from ..errors import FileError
 from .ensemble import Ensemble
-from .files import ENSEMBLE_FORMAT, read
+from .files import ENSEMBLE_FORMAT, read_dataset
 from .solution import Solution
 
 
@@ -36,10 +36,10 @@ def load(path: str | os.PathLike) -> Solution | Ensemble:
     >>> bool((lt.load("run.nc").x == solution.x).all())
     True
     """
-    series, attributes = read(path)
+    series, attributes = read_dataset(path)
     try:
         if attributes["format"] == ENSEMBLE_FORMAT:
-            return Ensemble.of_file(series, attributes)
-        return Solution.of_file(series, attributes)
+            return Ensemble.from_file(series, attributes)
+        return Solution.from_file(series, attributes)
     except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise FileError(f"{path} lacks a part of a liethermo result: {error}") from error

@@ -7,10 +7,10 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
 from ..models.inertia import EQUAL_MOMENTS_RTOL
-from .evidence import Recorded
+from .evidence import AuditableResult
 
 
-def quaternions(solution: Recorded) -> np.ndarray:
+def quaternions(solution: AuditableResult) -> np.ndarray:
     """The attitudes as unit quaternions (x, y, z, w), scalar last, that take body axes to those of space.
 
     The first one has ``w >= 0``, and each other one the sign that is nearer to the one before: so they are
@@ -31,7 +31,7 @@ def quaternions(solution: Recorded) -> np.ndarray:
         If it has no such attitudes.
     """
     g = _attitudes(solution)
-    along_time = _along_time(solution)
+    along_time = _is_time_series(solution)
     finite = np.isfinite(g).all(axis=(-2, -1), keepdims=True)
     found = Rotation.from_matrix(np.where(finite, g, np.eye(3)).reshape(-1, 3, 3)).as_quat().reshape(*g.shape[:-2], 4)
     found = np.where(found[..., 3:] < 0.0, -found, found)
@@ -42,7 +42,7 @@ def quaternions(solution: Recorded) -> np.ndarray:
     return np.where(finite[..., 0], found, np.nan)
 
 
-def nutation(solution: Recorded, axis=None) -> np.ndarray:
+def nutation(solution: AuditableResult, axis=None) -> np.ndarray:
     """The angle between an axis of the body and its angular momentum, ``arctan2(|e × mu|, e . mu)``, from 0 to pi.
 
     A body that is left to itself ends at 0, or at pi where it spins about the other end of the axis.
@@ -65,11 +65,11 @@ def nutation(solution: Recorded, axis=None) -> np.ndarray:
     InputError
         If an axis is needed, or there is no momentum.
     """
-    mu, (first, second, third) = _momenta(solution), _frame(solution, axis)
+    mu, (first, second, third) = _momenta(solution), _body_frame(solution, axis)
     return np.arctan2(np.hypot(mu @ first, mu @ second), mu @ third)
 
 
-def spin(solution: Recorded, axis=None) -> np.ndarray:
+def spin(solution: AuditableResult, axis=None) -> np.ndarray:
     """The angle by which the body has turned about its axis, the third of Euler's angles (z, x, z), continuous.
 
     With body axes (a, b, e), e the axis: ``arctan2(a . mu, b . mu)``. It is not defined while the nutation is 0 or
@@ -90,11 +90,11 @@ def spin(solution: Recorded, axis=None) -> np.ndarray:
     ------
     InputError
     """
-    mu, (first, second, _) = _momenta(solution), _frame(solution, axis)
-    return _continuous(solution, np.arctan2(mu @ first, mu @ second))
+    mu, (first, second, _) = _momenta(solution), _body_frame(solution, axis)
+    return _unwrap_in_time(solution, np.arctan2(mu @ first, mu @ second))
 
 
-def precession(solution: Recorded, axis=None) -> np.ndarray:
+def precession(solution: AuditableResult, axis=None) -> np.ndarray:
     """The angle by which the axis of the body has turned about the angular momentum in space, continuous.
 
     The first of Euler's angles (z, x, z) in axes of space whose third has the direction of the angular momentum at the
@@ -115,19 +115,19 @@ def precession(solution: Recorded, axis=None) -> np.ndarray:
     InputError
         Likewise, and where there are no attitudes.
     """
-    g, mu, e = _attitudes(solution), _momenta(solution), _frame(solution, axis)[2]
+    g, mu, e = _attitudes(solution), _momenta(solution), _body_frame(solution, axis)[2]
     L = np.einsum("...ij,...j->...i", g, mu)
-    if _along_time(solution):
+    if _is_time_series(solution):
         L = L[..., :1, :]
-    first, second = _across(L)
+    first, second = _orthogonal_pair(L)
     pointing = g @ e
     across = np.arctan2(np.sum(first * pointing, axis=-1), -np.sum(second * pointing, axis=-1))
-    return _continuous(solution, across)
+    return _unwrap_in_time(solution, across)
 
 
-def angles(solution: Recorded) -> dict[str, np.ndarray]:
+def orientation_series(solution: AuditableResult) -> dict[str, np.ndarray]:
     """All that is known of the orientation of a body, by name; empty where there is no body with attitudes."""
-    if not _turns(solution):
+    if not _has_rotations(solution):
         return {}
     found = {"quaternion": quaternions(solution)}
     if _inertia(solution) is not None:
@@ -135,20 +135,20 @@ def angles(solution: Recorded) -> dict[str, np.ndarray]:
     return found
 
 
-def _turns(solution: Recorded) -> bool:
+def _has_rotations(solution: AuditableResult) -> bool:
     """Whether there are attitudes in SO(3)."""
     return solution.attitude is not None and solution.provenance.get("group") == "SO(3)"
 
 
-def _attitudes(solution: Recorded) -> np.ndarray:
+def _attitudes(solution: AuditableResult) -> np.ndarray:
     if solution.attitude is None:
         raise InputError("there are no attitudes: give the system a group, such as group=mf.SO(3), and keep states")
-    if not _turns(solution):
+    if not _has_rotations(solution):
         raise InputError(f"the attitudes are in {solution.provenance.get('group')}, and rotations are in SO(3)")
     return solution.attitude
 
 
-def _momenta(solution: Recorded) -> np.ndarray:
+def _momenta(solution: AuditableResult) -> np.ndarray:
     if solution.x is None:
         raise InputError('no states were kept: outputs="final" or "trajectory" keeps some')
     if not str(solution.provenance.get("algebra", "")).startswith("so(3)"):
@@ -159,12 +159,12 @@ def _momenta(solution: Recorded) -> np.ndarray:
     return solution.x[..., :3]
 
 
-def _inertia(solution: Recorded) -> np.ndarray | None:
+def _inertia(solution: AuditableResult) -> np.ndarray | None:
     given = solution.provenance.get("inertia")
     return None if given is None else np.array(given, dtype=float)
 
 
-def _frame(solution: Recorded, axis) -> np.ndarray:
+def _body_frame(solution: AuditableResult, axis) -> np.ndarray:
     """Body axes, shape (3, 3), as rows, right-handed, of which the last is the one that angles are about."""
     if axis is None:
         inertia = _inertia(solution)
@@ -181,11 +181,11 @@ def _frame(solution: Recorded, axis) -> np.ndarray:
         if e.shape != (3,) or not np.isfinite(e).all() or not e.any():
             raise InputError(f"axis is a direction in body axes, three numbers that are not all zero, not {axis!r}")
         e = e / np.linalg.norm(e)
-    first, second = _across(e)
+    first, second = _orthogonal_pair(e)
     return np.stack([first, second, e])
 
 
-def _across(e) -> tuple[np.ndarray, np.ndarray]:
+def _orthogonal_pair(e) -> tuple[np.ndarray, np.ndarray]:
     """Two directions, shape (..., 3), that make a right-handed frame with vectors: cyclic ones of e_1, e_2 and e_3."""
     size = np.linalg.norm(e, axis=-1, keepdims=True)
     e = np.divide(e, size, where=size > 0.0, out=np.zeros_like(e))
@@ -195,11 +195,11 @@ def _across(e) -> tuple[np.ndarray, np.ndarray]:
     return first, np.cross(e, first)
 
 
-def _along_time(solution: Recorded) -> bool:
+def _is_time_series(solution: AuditableResult) -> bool:
     """Whether the last axis of its series is that of time, and not that of trajectories of which the end is kept."""
     return solution.energy.shape[-1:] == np.shape(solution.t)
 
 
-def _continuous(solution: Recorded, found) -> np.ndarray:
+def _unwrap_in_time(solution: AuditableResult, found) -> np.ndarray:
     """Angles with whole turns counted along time."""
-    return np.unwrap(found, axis=-1) if _along_time(solution) else found
+    return np.unwrap(found, axis=-1) if _is_time_series(solution) else found

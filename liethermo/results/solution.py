@@ -9,25 +9,33 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from manifolds._precision import by_own_settings
+from manifolds._precision import with_library_settings
 from manifolds._tables import html_grid
 
 from ..errors import InputError
-from .audit import Audit, Tolerances, audit
-from .evidence import Evidence, Recorded
+from .audit import Audit, Tolerances, audit_run
+from .evidence import AuditableResult, Evidence
 
 if TYPE_CHECKING:
     import xarray
 
-    from .dense import Dense
-from .files import FORMAT, as_parts, checked, described, from_parts, places, series_of
-from .orientation import angles
-from .sketch import sketch
+    from .dense import DenseOutput
+from .files import (
+    SOLUTION_FORMAT,
+    array_of_shape,
+    build_dataset,
+    dataclass_from_json,
+    join_complex,
+    split_complex,
+    state_axis_names,
+)
+from .orientation import orientation_series
+from .sketch import svg_sketch
 from .status import Laws, Stats, Status
 
 
 @dataclass(frozen=True)
-class Solution(Recorded):
+class Solution(AuditableResult):
     """A trajectory with its laws.
 
     Attributes
@@ -72,11 +80,11 @@ class Solution(Recorded):
     laws: Laws
     provenance: dict[str, Any] = field(default_factory=dict)
     event_time: float | None = None
-    dense: Dense | None = None
+    dense: DenseOutput | None = None
     attitude: np.ndarray | None = None
-    witness: Callable[[], Evidence] | None = field(default=None, repr=False, compare=False)
+    evidence_source: Callable[[], Evidence] | None = field(default=None, repr=False, compare=False)
 
-    @by_own_settings
+    @with_library_settings
     def __call__(self, t) -> np.ndarray:
         """States at any times, shape (..., n): each is where a step ends that begins at the last state before.
 
@@ -97,7 +105,7 @@ class Solution(Recorded):
         """The energy less the work done from outside, shape (times,): what the first law keeps of a driven system."""
         return self.energy - sum(self.casimirs[name] for name in self.laws.balance)
 
-    @by_own_settings
+    @with_library_settings
     def audit(self, **tolerances: float) -> Audit:
         """Whether the laws held and the steps resolve the motion, as a table.
 
@@ -114,7 +122,7 @@ class Solution(Recorded):
         InputError
             If there is no tolerance of a name, or it is negative.
         """
-        return audit(self, Tolerances.of(**tolerances))
+        return audit_run(self, Tolerances.with_defaults(**tolerances))
 
     def with_provenance(self, **entries) -> Solution:
         """The same solution with more said about where it comes from."""
@@ -139,10 +147,10 @@ class Solution(Recorded):
         series = {"energy": ("time", self.energy)}
         if self.entropy is not None:
             series["entropy"] = ("time", self.entropy)
-        variables: dict[str, Any] = {"x": (("time", *places(self.x.ndim - 1)), self.x), **series}
+        variables: dict[str, Any] = {"x": (("time", *state_axis_names(self.x.ndim - 1)), self.x), **series}
         if self.attitude is not None:
-            variables["attitude"] = (("time", "row", "column", "part"), as_parts(self.attitude))
-            for name, values in angles(self).items():
+            variables["attitude"] = (("time", "row", "column", "part"), split_complex(self.attitude))
+            for name, values in orientation_series(self).items():
                 variables[name] = (("time", "quaternion_component")[: values.ndim], values)
         variables["invariant"] = (
             ("invariant_name", "time"),
@@ -150,7 +158,7 @@ class Solution(Recorded):
         )
         coordinates = {"time": self.t, "invariant_name": np.array(list(self.casimirs), dtype=object)}
         attributes = {
-            "format": FORMAT,
+            "format": SOLUTION_FORMAT,
             "times": len(self.t),
             "status": json.dumps(asdict(self.status)),
             "stats": json.dumps(asdict(self.stats)),
@@ -159,7 +167,7 @@ class Solution(Recorded):
             "provenance": json.dumps(self.provenance),
             "event_time": json.dumps(self.event_time),
         }
-        return described(variables, coordinates, attributes, self.laws, units)
+        return build_dataset(variables, coordinates, attributes, self.laws, units)
 
     def __repr__(self) -> str:
         return f"Solution({len(self.t)} times to t = {self.status.time:g}, {self.status.code})"
@@ -173,40 +181,40 @@ class Solution(Recorded):
             ("kept", f"{len(self.t)} times of {self.stats.steps} steps, states of {self.x[0].size} components"),
             ("energy", f"{self.energy[0]:.10g} to {self.energy[-1]:.10g}"),
         ]
-        pictures = [sketch(self.t, self.x.reshape(len(self.t), -1), "the components of the state along time")]
+        pictures = [svg_sketch(self.t, self.x.reshape(len(self.t), -1), "the components of the state along time")]
         if self.entropy is not None:
             facts.append(("entropy", f"{self.entropy[0]:.10g} to {self.entropy[-1]:.10g}"))
-            pictures.append(sketch(self.t, self.entropy[:, None], "the entropy along time"))
+            pictures.append(svg_sketch(self.t, self.entropy[:, None], "the entropy along time"))
         return html_grid(("Solution", ""), facts) + "<div>" + " ".join(pictures) + "</div>"
 
     @classmethod
-    def of_file(cls, series: dict[str, np.ndarray], attributes: dict[str, Any]) -> Solution:
+    def from_file(cls, series: dict[str, np.ndarray], attributes: dict[str, Any]) -> Solution:
         """From what :func:`.files.read` returns; KeyError, TypeError or ValueError where a part is missing."""
         stored = {name: json.loads(attributes[name]) for name in ("status", "stats", "laws", "provenance")}
-        t, x = series_of(series, "time", (None,)), series["x"]
+        t, x = array_of_shape(series, "time", (None,)), series["x"]
         if len(t) != int(attributes["times"]):
             raise ValueError(f"{len(t)} times of {attributes['times']}")
         names = [str(name) for name in series["invariant_name"]]
-        entropy = series_of(series, "entropy", (len(t),)) if "entropy" in series else None
+        entropy = array_of_shape(series, "entropy", (len(t),)) if "entropy" in series else None
         attitude = None
         if "attitude" in series:
             m = series["attitude"].shape[1:2]
-            attitude = from_parts(series_of(series, "attitude", *((len(t), *m, *m, parts) for parts in (1, 2))))
+            attitude = join_complex(array_of_shape(series, "attitude", *((len(t), *m, *m, parts) for parts in (1, 2))))
         event_time = json.loads(attributes.get("event_time", "null"))
         if not isinstance(event_time, int | float | None) or not isinstance(stored["provenance"], dict):
             raise ValueError("what is said of the run is not what this version writes")
-        evidence = checked(Evidence, json.loads(attributes.get("evidence", "{}")))
+        evidence = dataclass_from_json(Evidence, json.loads(attributes.get("evidence", "{}")))
         return cls(
             t=t,
-            x=series_of(series, "x", (len(t), *[None] * max(x.ndim - 1, 1))),
-            energy=series_of(series, "energy", (len(t),)),
+            x=array_of_shape(series, "x", (len(t), *[None] * max(x.ndim - 1, 1))),
+            energy=array_of_shape(series, "energy", (len(t),)),
             entropy=entropy,
-            casimirs=dict(zip(names, series_of(series, "invariant", (len(names), len(t))), strict=True)),
-            status=checked(Status, stored["status"]),
-            stats=checked(Stats, stored["stats"]),
-            laws=checked(Laws, stored["laws"]),
+            casimirs=dict(zip(names, array_of_shape(series, "invariant", (len(names), len(t))), strict=True)),
+            status=dataclass_from_json(Status, stored["status"]),
+            stats=dataclass_from_json(Stats, stored["stats"]),
+            laws=dataclass_from_json(Laws, stored["laws"]),
             provenance=stored["provenance"],
             event_time=event_time,
             attitude=attitude,
-            witness=lambda: evidence,
+            evidence_source=lambda: evidence,
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..engines.codes import TEXTS, Code
+from ..engines.codes import STATUS_NAMES, StatusCode
 from ..errors import InputError
 
 
@@ -16,7 +16,7 @@ class Status:
     ----------
     code : {"completed", "event", "not_converged", "non_finite", "step_underflow", "step_limit", "interrupted", \
 "reference_failed", "inadmissible"}
-        Or its :class:`liethermo.engines.codes.Code`.
+        Or its :class:`liethermo.engines.codes.StatusCode`.
     message : str
         A full sentence: what happened, where, and what to try.
     step : int
@@ -27,20 +27,20 @@ class Status:
         ``h |k - slopes(k)| / |x|`` of the last step tried.
     """
 
-    code: str | Code
+    code: str | StatusCode
     message: str
     step: int
     time: float
     residual: float = 0.0
 
     def __post_init__(self):
-        object.__setattr__(self, "code", self.code.text if isinstance(self.code, Code) else self.code)
-        if self.code not in TEXTS:
-            raise InputError(f"no status {self.code!r}; there are {', '.join(TEXTS)}")
+        object.__setattr__(self, "code", self.code.status_name if isinstance(self.code, StatusCode) else self.code)
+        if self.code not in STATUS_NAMES:
+            raise InputError(f"no status {self.code!r}; there are {', '.join(STATUS_NAMES)}")
 
     @property
     def ok(self) -> bool:
-        return self.code in (Code.COMPLETED.text, Code.EVENT.text)
+        return self.code in (StatusCode.COMPLETED.status_name, StatusCode.EVENT.status_name)
 
     def __str__(self) -> str:
         return f"{self.code}: {self.message}"

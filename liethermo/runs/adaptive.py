@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..engines.pacing import Pacing
+from ..engines.pacing import StepControl
 from ..errors import InputError
 from ..integrators import OneStepMethod
-from ..integrators.base import estimates_error
+from ..integrators.base import has_error_estimate
 from .events import Event
 
-UNDERFLOW = 1e-14
+MIN_STEP_FRACTION = 1e-14
 """Smallest step, relative to the span."""
 
 
@@ -75,7 +75,7 @@ class Adaptive:
         return self.rtol or self.atol
 
 
-def pacing_of(step: float | Adaptive, method: OneStepMethod, length: float, event: Event | None) -> Pacing:
+def make_step_control(step: float | Adaptive, method: OneStepMethod, length: float, event: Event | None) -> StepControl:
     """How the steps of a run over a span of some length are chosen, and what is watched.
 
     Raises
@@ -84,14 +84,14 @@ def pacing_of(step: float | Adaptive, method: OneStepMethod, length: float, even
         If steps of this method cannot be adaptive.
     """
     adaptive = isinstance(step, Adaptive)
-    min_step = UNDERFLOW * length if math.isfinite(length) else 0.0
+    min_step = MIN_STEP_FRACTION * length if math.isfinite(length) else 0.0
     if isinstance(step, Adaptive):
-        if not estimates_error(method):
-            raise InputError(f"the steps of {method} cannot be adaptive: {method.fixed}")
+        if not has_error_estimate(method):
+            raise InputError(f"the steps of {method} cannot be adaptive: {method.why_fixed_step}")
         numbers = [step.rtol, step.atol, step.first or 0.0, step.largest or math.inf]
         numbers += [min_step, step.most_steps]
     else:
         numbers = [0.0, 0.0, step, math.inf, min_step, math.inf]
-    watched, falling = (None, False) if event is None else (event.function, event.falling)
+    watched, falling = (None, False) if event is None else (event.function, event.falling_only)
     rtol, atol, first, largest, shortest, most = (np.asarray(float(number)) for number in numbers)
-    return Pacing(rtol, atol, first, largest, shortest, most, watched, falling, adaptive)
+    return StepControl(rtol, atol, first, largest, shortest, most, watched, falling, adaptive)

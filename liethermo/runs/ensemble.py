@@ -9,50 +9,50 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from manifolds._precision import by_own_settings
+from manifolds._precision import with_library_settings
 
-from ..engines.choice import is_small, warn_of_fallback
-from ..engines.codes import Code
+from ..engines.choice import is_worth_compiling, warn_of_fallback
+from ..engines.codes import StatusCode
 from ..errors import InputError
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..integrators.fluctuating import noise_dimension
 from ..results.ensemble import Ensemble, Subset, join_subsets
 from ..systems import System
 from ..tracing.scalarize import UnsupportedPrimitive
-from .adaptive import Adaptive, pacing_of
-from .batches import THREADS, Tally, follow_array, follow_compiled, run_array, run_compiled
+from .adaptive import Adaptive, make_step_control
+from .batches import MAX_THREADS, ProgressCounter, replay_array, replay_compiled, run_fixed_array, run_fixed_compiled
 from .events import Event, Relaxed
-from .family import Family, common_size, why_not
-from .fluctuations import DEFAULT_WITH_NOISE, Fluctuations, Paths, check_noise
-from .member_groups import common_inertia, groups_of, outside_own_domain
-from .paced import Many
+from .family import Family, broadcast_size, error_message_of
+from .fluctuations import DEFAULT_NOISE_METHOD, Fluctuations, NoisePaths, check_noise
+from .member_groups import common_inertia, group_members, members_outside_domain
+from .paced import AdaptiveEnsembleRun
 from .preparation import (
-    as_family,
-    as_run,
-    begun,
     check_choice,
-    decided,
-    family_within_span,
-    laws_of,
-    no_start,
+    initial_state,
+    limit_family_to_span,
+    limit_to_span,
+    prepare_run,
+    promised_laws,
     refuse_tracers,
-    within_span,
+    resolve_invariants,
+    why_not_startable,
+    wrap_family,
 )
-from .presented import provenance_of
+from .presented import run_provenance
 from .progress import Progress
-from .record import Alone, Followed, Record
-from .timetable import Course, course_of
+from .record import EnsembleEvidenceCollector, EnsembleRecord, MemberSolutionBuilder
+from .timetable import StepSchedule, make_schedule
 
-__all__ = ["THREADS", "Ensemble", "ensemble"]
+__all__ = ["MAX_THREADS", "Ensemble", "ensemble"]
 
-LOOKED_AT = 8192
+DOMAIN_CHECK_BATCH_SIZE = 8192
 """States that are looked at together, at most: bounded memory."""
 
-FOLLOWED = 256
+MAX_REPLAYED_STEPS = 256
 """Steps that an audit takes again of a trajectory by the array engine, whose steps are slow."""
 
 
-@by_own_settings
+@with_library_settings
 @refuse_tracers
 def ensemble(
     system: System | Callable[[Any], System] | Family,
@@ -124,7 +124,7 @@ def ensemble(
     ((100,), True)
     """
     started = time.perf_counter()
-    method = (DEFAULT_METHOD if noise is None else DEFAULT_WITH_NOISE) if method is None else method
+    method = (DEFAULT_METHOD if noise is None else DEFAULT_NOISE_METHOD) if method is None else method
     if not isinstance(method, OneStepMethod):
         raise InputError(f"the method must be an integrator such as lt.MetriplecticGauss(), not {method!r}")
     outputs = outputs or ("final" if save_at is None else "trajectory")
@@ -139,36 +139,36 @@ def ensemble(
         )
     if own_ends and noise is not None:
         raise InputError("steps with noise are of one size, and nothing is known of a path between them: give a step")
-    course = course_of(t_span, step, save_every if outputs == "trajectory" and save_at is None else None, save_at)
+    course = make_schedule(t_span, step, save_every if outputs == "trajectory" and save_at is None else None, save_at)
 
-    family = Family.of(system, parameters)
-    states, reasons = _admitted(family, x0s, len(attitude) if np.ndim(attitude) == 3 else 1)
+    family = Family.from_arguments(system, parameters)
+    states, reasons = _checked_initial_states(family, x0s, len(attitude) if np.ndim(attitude) == 3 else 1)
     check_noise(noise, len(states))
     size = len(states)
     run = np.arange(size)
     if reasons:
         run = np.setdiff1d(run, list(reasons))
         family, states = family.select(run), states[run]
-    plan = _Plan(method, step, course, outputs, engine, until, noise)
-    described = provenance_of(
+    plan = _EnsembleOptions(method, step, course, outputs, engine, until, noise)
+    described = run_provenance(
         family.representative,
         method,
         step if isinstance(step, Adaptive) else course.h,
         (course.start, course.end),
-        course.every,
+        course.save_every,
     )
     inertia = common_inertia(family)
     described["inertia"] = None if inertia is None else inertia.tolist()
-    groups, refused = groups_of(family, method, states)
+    groups, refused = group_members(family, method, states)
     reasons = dict(reasons) | {int(run[i]): text for i, text in refused.items()}
     parts: list[Subset] = []
     with Progress((0, len(run)), progress, "{:.0f} trajectories") as bar:
         for places, group in groups:
             own = np.asarray(attitude)[run[places]] if np.ndim(attitude) == 3 and len(attitude) > 1 else attitude
-            done = sum(len(part.run) for part in parts)
-            stopped = any((part.ensemble.status == Code.INTERRUPTED).any() for part in parts)
-            tell = functools.partial(_advance, bar, done)
-            part, why = plan.run(group, states[places], run[places], own, tell, stopped)
+            done = sum(len(part.trajectory_numbers) for part in parts)
+            stopped = any((part.ensemble.status == StatusCode.INTERRUPTED).any() for part in parts)
+            tell = functools.partial(_update_progress, bar, done)
+            part, why = plan.run_group(group, states[places], run[places], own, tell, stopped)
             parts += [] if part is None else [part]
             reasons |= why
     if not parts:
@@ -178,26 +178,26 @@ def ensemble(
         size,
         reasons=reasons,
         wall_time=time.perf_counter() - started,
-        provenance={**described, "noise": None if noise is None else noise.listed()},
+        provenance={**described, "noise": None if noise is None else noise.as_provenance()},
     )
 
 
-def _advance(bar: Progress, done: int, more: float) -> None:
+def _update_progress(bar: Progress, done: int, more: float) -> None:
     bar.update(done + more)
 
 
-class _Plan(NamedTuple):
+class _EnsembleOptions(NamedTuple):
     """What is done with each trajectory: the arguments of :func:`ensemble`."""
 
     method: OneStepMethod
     step: float | Adaptive
-    course: Course
+    schedule: StepSchedule
     outputs: str
     engine: str
     until: Any
     noise: Fluctuations | None
 
-    def run(
+    def run_group(
         self,
         family: Family,
         states: np.ndarray,
@@ -221,65 +221,69 @@ class _Plan(NamedTuple):
         stopped : bool
             Whether the user has interrupted the ensemble before: no step is taken then.
         """
-        step, course, noise = self.step, self.course, self.noise
-        member = decided(family.member(0), states)
+        step, course, noise = self.step, self.schedule, self.noise
+        member = resolve_invariants(family.member(0), states)
         tolerance = step.tolerance if isinstance(step, Adaptive) else None
-        member, method = as_run(member, self.method, noise, tolerance)
-        family = as_family(family, member)
-        states = np.asarray(begun(member, states, course.start, attitude, batch=True))
+        member, method = prepare_run(member, self.method, noise, tolerance)
+        family = wrap_family(family, member)
+        states = np.asarray(initial_state(member, states, course.start, attitude, batch=True))
         method.check(member)
         span = course.start, course.end
-        family, member = family_within_span(family, member, *span), within_span(member, *span)
-        reasons = {int(run[i]): text for i, text in _off(family, member, method, states).items()}
+        family, member = limit_family_to_span(family, member, *span), limit_to_span(member, *span)
+        reasons = {int(run[i]): text for i, text in _unstartable_members(family, member, method, states).items()}
         if reasons:
             left = np.flatnonzero(~np.isin(run, list(reasons)))
             run, family, states = run[left], family.select(left), states[left]
             if not len(run):
                 return None, reasons
         paths = (
-            None if noise is None or not noise_dimension(method) else Paths(noise, noise_dimension(method), run, course)
+            None
+            if noise is None or not noise_dimension(method)
+            else NoisePaths(noise, noise_dimension(method), run, course)
         )
-        record = Record(family, member, states, course, self.outputs, np.nan if tolerance is not None else course.h)
+        record = EnsembleRecord(
+            family, member, states, course, self.outputs, np.nan if tolerance is not None else course.h
+        )
         event = None if self.until is None else Event(self.until, member)
         own_ends = tolerance is not None or event is not None
-        pacing = pacing_of(step, method, course.end - course.start, event) if own_ends else None
+        pacing = make_step_control(step, method, course.end - course.start, event) if own_ends else None
 
-        def take(engine: str, tally: Tally) -> None:
+        def run_with_engine(engine: str, tally: ProgressCounter) -> None:
             if stopped:
                 return
             if pacing is not None:
-                many = Many(family, method, pacing, record, tally)
+                many = AdaptiveEnsembleRun(family, method, pacing, record, tally)
                 (many.run_compiled if engine == "compiled" else many.run_array)()
             else:
-                (run_compiled if engine == "compiled" else run_array)(family, method, record, tally, paths)
+                (run_fixed_compiled if engine == "compiled" else run_fixed_array)(family, method, record, tally, paths)
 
-        small = self.engine == "auto" and is_small(member)
+        small = self.engine == "auto" and is_worth_compiling(member)
         chosen = "compiled" if self.engine == "compiled" or small else "array"
         if chosen == "compiled":
             try:
-                take(chosen, Tally(tell))
+                run_with_engine(chosen, ProgressCounter(tell))
             except UnsupportedPrimitive as error:
                 if self.engine == "compiled":
                     raise
                 warn_of_fallback(error)
                 chosen = "array"
         if chosen == "array":
-            take(chosen, Tally(tell))
-        record.close()
-        again, most = (follow_compiled, course.steps) if chosen == "compiled" else (follow_array, FOLLOWED)
-        equal = 1 if tolerance is not None else min(course.parts[0].full, most)
-        found = record.result(
+            run_with_engine(chosen, ProgressCounter(tell))
+        record.set_unfinished_to_nan()
+        again, most = (replay_compiled, course.n_steps) if chosen == "compiled" else (replay_array, MAX_REPLAYED_STEPS)
+        equal = 1 if tolerance is not None else min(course.segments[0].n_full_steps, most)
+        found = record.to_ensemble(
             reasons={},
-            laws=laws_of(member, method, {}),
+            laws=promised_laws(member, method, {}),
             engine=chosen,
             wall_time=0.0,
-            witness=None if noise_dimension(method) else Followed(record, method, again, equal),
-            alone=Alone(record, method, run),
+            evidence_source=None if noise_dimension(method) else EnsembleEvidenceCollector(record, method, again, equal),
+            solution_builder=MemberSolutionBuilder(record, method, run),
         )
-        return Subset(run, found), reasons | {int(run[j]): text for j, text in record.reasons.items()}
+        return Subset(run, found), reasons | {int(run[j]): text for j, text in record.failure_reasons.items()}
 
 
-def _admitted(family: Family, x0s, attitudes: int) -> tuple[np.ndarray, Mapping[int, str]]:
+def _checked_initial_states(family: Family, x0s, attitudes: int) -> tuple[np.ndarray, Mapping[int, str]]:
     """An initial state for each trajectory, and which of them cannot be started, and why.
 
     Raises
@@ -289,50 +293,50 @@ def _admitted(family: Family, x0s, attitudes: int) -> tuple[np.ndarray, Mapping[
     """
     member = family.example
     if member is None:
-        member = family.member(next(i for i in range(family.size) if i not in family.refused))
-    x0s, bad = _states(member, x0s)
+        member = family.member(next(i for i in range(family.size) if i not in family.refusal_reasons))
+    x0s, bad = _convert_initial_states(member, x0s)
     if x0s.ndim > 2:
         raise InputError(f"initial states have shape (n,) or (trajectories, n), not {x0s.shape}")
-    size = common_size(len(x0s), family.size, attitudes)
+    size = broadcast_size(len(x0s), family.size, attitudes)
     states = np.broadcast_to(x0s, (size, x0s.shape[1]))
     if bad and len(x0s) == 1:
         raise InputError(bad[0])
-    reasons = dict(family.refused) | bad
+    reasons = dict(family.refusal_reasons) | bad
     if family.size > 1 and family.example is None:
-        reasons = family.found_wanting(lambda i: family.complaint(i, states[i]), reasons)
+        reasons = family.rejected_members(lambda i: family.axiom_violation(i, states[i]), reasons)
     if len(reasons) == size:
         raise InputError(f"no trajectory can be started; trajectory 0: {reasons[0]}")
     return states, reasons
 
 
-def _off(family: Family, member: System, method: OneStepMethod, states: np.ndarray) -> dict[int, str]:
+def _unstartable_members(family: Family, member: System, method: OneStepMethod, states: np.ndarray) -> dict[int, str]:
     """The trajectories, as they are run, whose first states the method cannot start at, and why."""
-    reasons = _by_halves(lambda part: no_start(member, method, states[part]), len(states))
-    if not any(family.varying):
+    reasons = _bisect_invalid_rows(lambda part: why_not_startable(member, method, states[part]), len(states))
+    if not any(family.has_member_axis):
         return reasons
-    suspects = {*reasons, *family.extremes(), *outside_own_domain(family, states)}
-    own = {i: no_start(family.member(i), method, states[i]) for i in sorted(suspects)}
+    suspects = {*reasons, *family.extreme_members(), *members_outside_domain(family, states)}
+    own = {i: why_not_startable(family.member(i), method, states[i]) for i in sorted(suspects)}
     return {i: text for i, text in own.items() if text}
 
 
-def _by_halves(complaint: Callable[[slice], str], size: int) -> dict[int, str]:
+def _bisect_invalid_rows(complaint: Callable[[slice], str], size: int) -> dict[int, str]:
     """Which of so many rows there is a complaint of, and which one: halves, as far as there is something to find."""
     found: dict[int, str] = {}
 
-    def look(first: int, last: int) -> None:
+    def search_rows(first: int, last: int) -> None:
         text = complaint(slice(first, last))
         if text and last - first == 1:
             found[first] = text
         elif text:
-            look(first, (first + last) // 2)
-            look((first + last) // 2, last)
+            search_rows(first, (first + last) // 2)
+            search_rows((first + last) // 2, last)
 
-    for first in range(0, size, LOOKED_AT):
-        look(first, min(first + LOOKED_AT, size))
+    for first in range(0, size, DOMAIN_CHECK_BATCH_SIZE):
+        search_rows(first, min(first + DOMAIN_CHECK_BATCH_SIZE, size))
     return found
 
 
-def _states(member: System, x0s) -> tuple[np.ndarray, dict[int, str]]:
+def _convert_initial_states(member: System, x0s) -> tuple[np.ndarray, dict[int, str]]:
     """Initial states, shape (trajectories, n), and those among them that are none, and why."""
     try:
         return np.atleast_2d(np.asarray(member.numbers(x0s, batch=True))), {}
@@ -340,7 +344,7 @@ def _states(member: System, x0s) -> tuple[np.ndarray, dict[int, str]]:
         rows = np.asarray(x0s)
         if rows.ndim < 2 or rows.dtype.kind not in "fiubc" or not len(rows):
             raise
-    bad = _by_halves(lambda part: why_not(lambda: member.numbers(rows[part], batch=True)), len(rows))
+    bad = _bisect_invalid_rows(lambda part: error_message_of(lambda: member.numbers(rows[part], batch=True)), len(rows))
     good = [i for i in range(len(rows)) if i not in bad]
     if not good:
         raise InputError(f"no trajectory can be started; trajectory 0: {bad[0]}")

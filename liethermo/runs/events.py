@@ -11,12 +11,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from manifolds._module import Module
+from manifolds._pytree_module import Module
 
 from ..errors import FunctionError, IndexOutOfRangeError, InputError
 from ..systems import System
-from ..tracing.trace_errors import TRACE_ERRORS, explain
-from ..tracing.traced import settled
+from ..tracing.trace_errors import TRACE_ERRORS, explain_trace_error
+from ..tracing.traced import trace_callables
 
 
 @dataclass(frozen=True)
@@ -60,12 +60,12 @@ class Event:
     ----------
     function : pytree
         Of a system and a state, for engines.
-    falling : bool
+    falling_only : bool
         Whether it is watched for a fall alone.
     """
 
     def __init__(self, until: Relaxed | Callable, system: System):
-        self.falling = isinstance(until, Relaxed)
+        self.falling_only = isinstance(until, Relaxed)
         self.name = "the event function"
         if isinstance(until, Relaxed):
             if system.entropy_law == "nondecreasing":  # what vanishes as a system relaxes, by its laws
@@ -78,16 +78,16 @@ class Event:
                     "no entropy and keeps its energy, or promises nothing: give a function of the state as until"
                 )
             self.name = f"{name} below {until.tol:g}"
-            self.function: Any = Excess(jnp.asarray(until.tol), rate)
+            self.function: Any = RateAboveThreshold(jnp.asarray(until.tol), rate)
         elif callable(until):
             seen = jax.eval_shape(system.seen, jax.ShapeDtypeStruct((system.dim,), jnp.float64))
             try:
-                self.function = OfPoints(settled(until, lambda f, x: f(x), seen.shape))
+                self.function = UserStateFunction(trace_callables(until, lambda f, x: f(x), seen.shape))
             except IndexOutOfRangeError as error:
-                raise error.of(f"the event function, at a state of shape {seen.shape},") from None
+                raise error.with_function(f"the event function, at a state of shape {seen.shape},") from None
             except TRACE_ERRORS as error:
                 what = f"the event function could not be evaluated on a state of shape {seen.shape}"
-                raise FunctionError(explain(what, error)) from error
+                raise FunctionError(explain_trace_error(what, error)) from error
         else:
             raise InputError(f"until must be lt.Relaxed(tol) or a function of the state, not {until!r}")
         x = jax.ShapeDtypeStruct((system.dim,), jnp.float64)
@@ -100,17 +100,17 @@ class Event:
             )
 
 
-class Excess(Module):
+class RateAboveThreshold(Module):
     """A rate of a system above one."""
 
-    tol: jax.Array
-    rate: str = eqx.field(static=True)
+    threshold: jax.Array
+    rate_name: str = eqx.field(static=True)
 
     def __call__(self, system: System, x):
-        return getattr(system, self.rate)(x) - self.tol
+        return getattr(system, self.rate_name)(x) - self.threshold
 
 
-class OfPoints(Module):
+class UserStateFunction(Module):
     """A function of what the user sees of a state."""
 
     function: Callable

@@ -13,22 +13,28 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from manifolds._arrays import is_traced
-from manifolds._precision import by_own_settings
+from manifolds._precision import with_library_settings
 
 from ..engines import implicit
-from ..engines.stages import Equations, Solved, explicit, fixed_point, solve_stages
-from ..engines.stepping import equations, finish, holds_energy, shifted, steering
+from ..engines.stages import StageEquations, StageSolution, explicit_slopes, solve_fixed_point, solve_stages
+from ..engines.stepping import (
+    apply_drift_correction,
+    can_correct_energy_drift,
+    end_of_step,
+    energy_drift_correction,
+    stage_equations,
+)
 from ..errors import InputError
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..systems import System
-from ..tracing.programs import hasty_program, program
+from ..tracing.programs import jit_program, jit_unoptimised
 from .adaptive import Adaptive
-from .preparation import begun, of_steps, started, within_span
-from .sensitivities import derivatives
-from .timetable import Course
+from .preparation import checked_initial_state, initial_state, limit_to_span, prepare_for_method
+from .sensitivities import state_derivatives
+from .timetable import StepSchedule
 
 
-@by_own_settings
+@with_library_settings
 def flow(
     system: System,
     x0,
@@ -87,40 +93,42 @@ def flow(
     (3,)
     """
     method = DEFAULT_METHOD if method is None else method
-    _check(system, t_span, step, method)
-    x, table = system.state(x0), Course(t_span, step, save_every)
+    _check_arguments(system, t_span, step, method)
+    x, table = system.state(x0), StepSchedule(t_span, step, save_every)
     n, shown = system.dim, system
-    system, method = of_steps(system, method, None, attitude is not None)
-    system = within_span(system, table.start, table.end)
+    system, method = prepare_for_method(system, method, None, attitude is not None)
+    system = limit_to_span(system, table.start, table.end)
     begin = x, table.start, attitude
     # of what is traced nothing is known that a start could be refused for
-    x = jnp.asarray(begun(system, *begin) if is_traced(system, x) else started(system, method, *begin))
-    calls = tuple(table.calls(limit=table.steps, saves=table.steps))
+    x = jnp.asarray(
+        initial_state(system, *begin) if is_traced(system, x) else checked_initial_state(system, method, *begin)
+    )
+    calls = tuple(table.engine_calls(max_steps=table.n_steps, max_saves=table.n_steps))
     sizes, counts = np.array([h for h, *_ in calls]), tuple((saves, every) for _, saves, every, _ in calls)
     # A derivative is that of steps whose slopes are known: their iterations are left to a program without one.
     given, last = (system, method, x), save_every is None
     known = not method.explicit and is_traced(given)
-    values = _constant(given) if known else given
+    values = _stop_gradients(given) if known else given
     newton = method.explicit or is_traced(values)
-    compiled = hasty_program if table.steps * x.size <= HASTY else program
-    path, steps = compiled(_path)(values, sizes, counts, newton, known, last)
+    compiled = jit_unoptimised if table.n_steps * x.size <= MAX_UNOPTIMISED_WORK else jit_program
+    path, steps = compiled(_compute_path)(values, sizes, counts, newton, known, last)
     if not newton and not np.isfinite(np.asarray(path)[-1]).all():  # it is compiled where a step needs it
-        path, steps = compiled(_path)(values, sizes, counts, True, known, last)
+        path, steps = compiled(_compute_path)(values, sizes, counts, True, known, last)
     if known:
         leaves = jax.tree_util.tree_leaves(given)
         moves, moving = tuple(map(is_traced, leaves)), [leaf for leaf in leaves if is_traced(leaf)]
-        order = _order(moving)
+        order = _differentiation_order(moving)
         count = sum(leaf.size for leaf in moving)
-        if order and count <= DIRECTIONS and count**order <= DERIVATIVES:
-            found = _derivatives(values, moves, order, sizes, counts, steps, last)
-            path = program(_polynomial)(path, found, moving, _constant(moving))
+        if order and count <= MAX_FORWARD_DIRECTIONS and count**order <= MAX_FORWARD_DERIVATIVES:
+            found = _saved_path_derivatives(values, moves, order, sizes, counts, steps, last)
+            path = jit_program(_taylor_path)(path, found, moving, _stop_gradients(moving))
         else:
-            path = program(_known_path)(*given, sizes, steps, last)
+            path = jit_program(_path_of_solved_steps)(*given, sizes, steps, last)
     path = path if path.shape[-1] == n else path[..., :n]
     return shown.points(path) if shown.space is None else path
 
 
-def _check(system, t_span, step, method) -> None:
+def _check_arguments(system, t_span, step, method) -> None:
     """Raise InputError where what is given is for another kind of run."""
     if not isinstance(system, System):
         raise InputError(f"flow takes a system, such as lt.models.rigid_body(), not {type(system).__name__}")
@@ -135,20 +143,20 @@ def _check(system, t_span, step, method) -> None:
         )
 
 
-HASTY = 1_000
+MAX_UNOPTIMISED_WORK = 1_000
 """Steps times components up to which a program is not optimised: that would take longer than it saves in many calls."""
 
-DIRECTIONS, DERIVATIVES = 64, 256
+MAX_FORWARD_DIRECTIONS, MAX_FORWARD_DERIVATIVES = 64, 256
 """Numbers that are differentiated by, and entries of the derivative of one component, up to which a derivative is found
 at once, forwards, for all that is differentiated by."""
 
 
-def _constant(tree: Any) -> Any:
+def _stop_gradients(tree: Any) -> Any:
     """A pytree of which nothing is differentiated."""
     return jax.tree_util.tree_map(lambda a: jax.lax.stop_gradient(a) if isinstance(a, jax.Array) else a, tree)
 
 
-def _order(moving: Sequence) -> int:
+def _differentiation_order(moving: Sequence) -> int:
     """How many derivatives are taken by some tracers whose values are known; zero where one is not known."""
     most = 0
     for leaf in moving:
@@ -161,7 +169,7 @@ def _order(moving: Sequence) -> int:
     return most
 
 
-def _path(
+def _compute_path(
     given: tuple[System, OneStepMethod, jax.Array],
     sizes,
     counts: tuple[tuple[int, int], ...],
@@ -175,11 +183,11 @@ def _path(
     its equations.
     """
     system, method, x = given
-    carry, states, steps = first_carry(system, method, x), [x[None]], []
+    carry, states, steps = initial_carry(system, method, x), [x[None]], []
     for i, (saves, every) in enumerate(counts):
 
         def step(carry, _, h=sizes[i]):
-            after = one_step(system, method, carry, h, iterated if newton else without_newton)
+            after = differentiable_step(system, method, carry, h, solve_or_nan if newton else fixed_point_or_nan)
             return after, (*carry[:2], after[2]) if known else None
 
         def save(carry, _, step=step, every=every):
@@ -189,26 +197,26 @@ def _path(
         carry, (kept, solved) = jax.lax.scan(save, carry, length=saves)
         states.append(kept)
         steps.append(solved)
-    return _kept(states, last), steps
+    return _select_saved(states, last), steps
 
 
-def _kept(states: Sequence, last: bool) -> jax.Array:
+def _select_saved(states: Sequence, last: bool) -> jax.Array:
     return states[-1][-1] if last else jnp.concatenate(states)
 
 
-def _derivatives(
+def _saved_path_derivatives(
     given: tuple, moves: tuple[bool, ...], order: int, sizes, counts, steps: list, last: bool
 ) -> list[np.ndarray]:
     """The derivatives of the path up to an order, by all leaves that move in one row: shapes (..., n, p, ..., p)."""
     each = [np.repeat(h, saves * every) for h, (saves, every) in zip(sizes, counts, strict=True)]
     parts = [[np.asarray(part).reshape(-1, *part.shape[2:]) for part in call] for call in steps]
     x, compensation, k = (np.concatenate(part) for part in zip(*parts, strict=True))
-    found = derivatives(given, moves, order, np.concatenate(each), (x, compensation, k))
+    found = state_derivatives(given, moves, order, np.concatenate(each), (x, compensation, k))
     ends = np.cumsum([0, *(every for saves, every in counts for _ in range(saves))])
     return [derivative[-1] if last else derivative[ends] for derivative in found]
 
 
-def _polynomial(path, derivatives: Sequence, moving: Sequence, here: Sequence) -> jax.Array:
+def _taylor_path(path, derivatives: Sequence, moving: Sequence, here: Sequence) -> jax.Array:
     """Taylor's polynomial where it is differentiated: its derivatives there are those given."""
     d = ravel_pytree([a - b for a, b in zip(moving, here, strict=True)])[0]
     for order, term in enumerate(derivatives, start=1):
@@ -218,14 +226,14 @@ def _polynomial(path, derivatives: Sequence, moving: Sequence, here: Sequence) -
     return path
 
 
-def _known_path(system: System, method: OneStepMethod, x, sizes, steps: list, last: bool) -> jax.Array:
+def _path_of_solved_steps(system: System, method: OneStepMethod, x, sizes, steps: list, last: bool) -> jax.Array:
     """The states of a path whose steps are solved: as functions of the first and of the parameters."""
     states = [x[None]]
     for i, solved in enumerate(steps):
 
         def step(x, known, h=sizes[i]):
             _, compensation, k = known
-            k = _as_guessed(system, method, x, compensation, h, k)
+            k = _implicit_slopes(system, method, x, compensation, h, k)
             return method.move(system, x, compensation, h, k)[0], None
 
         def save(x, known, step=step):
@@ -234,55 +242,57 @@ def _known_path(system: System, method: OneStepMethod, x, sizes, steps: list, la
 
         x, kept = jax.lax.scan(save, x, solved)
         states.append(kept)
-    return _kept(states, last)
+    return _select_saved(states, last)
 
 
-def _as_guessed(system: System, method: OneStepMethod, x, compensation, h, k) -> jax.Array:
+def _implicit_slopes(system: System, method: OneStepMethod, x, compensation, h, k) -> jax.Array:
     """The slopes of a step that are known, differentiated as the implicit function that they are."""
-    return _stages(system, method, x, compensation, h, k, lambda own: own.guess)
+    return _solve_stages_implicitly(system, method, x, compensation, h, k, lambda own: own.guess)
 
 
-def first_carry(system: System, method: OneStepMethod, x) -> tuple[jax.Array, ...]:
+def initial_carry(system: System, method: OneStepMethod, x) -> tuple[jax.Array, ...]:
     """What steps hand on, at the start: the state, what rounding keeps from it, the slopes of the last two steps."""
     k = method.start(system, x)
     return x, jnp.zeros_like(x), k, k
 
 
-def iterated(own: Equations) -> jax.Array:
+def solve_or_nan(own: StageEquations) -> jax.Array:
     """The slopes that solve the equations of a step; NaN where they are not found."""
-    return _found(solve_stages(own))
+    return _slopes_or_nan(solve_stages(own))
 
 
-def without_newton(own: Equations) -> jax.Array:
+def fixed_point_or_nan(own: StageEquations) -> jax.Array:
     """The same by fixed-point iteration alone."""
-    return _found(fixed_point(own))
+    return _slopes_or_nan(solve_fixed_point(own))
 
 
-def _found(solved: Solved) -> jax.Array:
+def _slopes_or_nan(solved: StageSolution) -> jax.Array:
     return jnp.where(solved.converged, solved.k, jnp.nan)
 
 
-def one_step(
-    system: System, method: OneStepMethod, carry: tuple[jax.Array, ...], h, solve: Callable = iterated
+def differentiable_step(
+    system: System, method: OneStepMethod, carry: tuple[jax.Array, ...], h, solve: Callable = solve_or_nan
 ) -> tuple[jax.Array, ...]:
-    """A step that JAX differentiates, from what :func:`first_carry` says; NaN where it could not be solved."""
+    """A step that JAX differentiates, from what :func:`initial_carry` says; NaN where it could not be solved."""
     x, compensation, k, before = carry
     if method.explicit:
-        new = _found(explicit(system, method, x, compensation, h, k))
+        new = _slopes_or_nan(explicit_slopes(system, method, x, compensation, h, k))
     else:
-        new = _stages(system, method, x, compensation, h, method.predict(k, before), solve)
-    after, after_compensation, energy, *_ = finish(system, method, x, compensation, h, new)
-    if holds_energy(system, method):
-        after_compensation = shifted(
+        new = _solve_stages_implicitly(system, method, x, compensation, h, method.predict(k, before), solve)
+    after, after_compensation, energy, *_ = end_of_step(system, method, x, compensation, h, new)
+    if can_correct_energy_drift(system, method):
+        after_compensation = apply_drift_correction(
             system,
             after,
             after_compensation,
-            steering(system, after, after_compensation, energy, system.energy.value(x)),
+            energy_drift_correction(system, after, after_compensation, energy, system.energy.value(x)),
         )
     return after, after_compensation, new, k
 
 
-def _stages(system: System, method: OneStepMethod, x, compensation, h, guess, solve: Callable) -> jax.Array:
+def _solve_stages_implicitly(
+    system: System, method: OneStepMethod, x, compensation, h, guess, solve: Callable
+) -> jax.Array:
     """The solution of the stage equations by ``solve``, differentiated as the implicit function that it is."""
     dynamic, static = eqx.partition((system, method, x, compensation, h), eqx.is_array)
 
@@ -292,6 +302,6 @@ def _stages(system: System, method: OneStepMethod, x, compensation, h, guess, so
 
     def solution(dynamic, guess):
         system, method, x, compensation, h = eqx.combine(dynamic, static)
-        return solve(equations(system, method, x, compensation, h, guess, guess)._replace(guess=guess))
+        return solve(stage_equations(system, method, x, compensation, h, guess, guess)._replace(guess=guess))
 
-    return implicit.solution(solution, lambda dynamic, k: slopes(dynamic, k) - k, dynamic, guess)
+    return implicit.implicit_solution(solution, lambda dynamic, k: slopes(dynamic, k) - k, dynamic, guess)

@@ -11,18 +11,18 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ..dissipation.noise import residuals
+from ..dissipation.noise import factor_residuals
 from ..errors import InputError
-from ..functions.energy import Energy, as_energy
+from ..functions.energy import Energy, make_energy
 from ..integrators import MetriplecticMidpoint, OneStepMethod
-from ..integrators.fluctuating import with_noise
+from ..integrators.fluctuating import add_noise
 from ..systems import System
 from ..systems.check import AXIOM_TOLERANCE, CheckReport, CheckRow
-from ..tracing.interpret import at_points
-from .threefry import derived, folded, normal, split_words
-from .timetable import Course
+from ..tracing.interpret import evaluate_at_points
+from .threefry import derive_key, grid_seeds, normal_numbers, split_words
+from .timetable import StepSchedule
 
-BOUND = 6.0
+MAX_STANDARD_DEVIATIONS = 6.0
 """Standard deviations that no random number exceeds, so that the equation of a step keeps a solution: one in 5e8 would,
 and to cut it off changes their variance by 1e-8."""
 
@@ -70,9 +70,9 @@ class Fluctuations:
     first: int = 0
 
     def __post_init__(self):
-        _check("boltzmann", self.boltzmann)
+        _check_nonnegative("boltzmann", self.boltzmann)
         if self.temperature is not None:
-            _check("the temperature", self.temperature)
+            _check_nonnegative("the temperature", self.temperature)
         seeds = self.seeds
         for name, numbers, bits in (("seed", seeds, 63), ("first", [self.first], 31)):
             whole = all(isinstance(n, int | np.integer) and not isinstance(n, bool) for n in numbers)
@@ -91,9 +91,9 @@ class Fluctuations:
         """One, or one for each trajectory."""
         return list(self.seed) if isinstance(self.seed, list | tuple | np.ndarray) else [self.seed]  # type: ignore[list-item]
 
-    def at(self, places: Sequence[np.ndarray]) -> np.ndarray:
+    def grid_seeds(self, places: Sequence[np.ndarray]) -> np.ndarray:
         """A seed for each point of a grid with these places along its axes: see :class:`liethermo.Study`."""
-        return folded(self.seeds[0], places)
+        return grid_seeds(self.seeds[0], places)
 
     def of(self, i: int) -> Fluctuations:
         """The noise of one trajectory of an ensemble."""
@@ -106,34 +106,36 @@ class Fluctuations:
         none; and, without a verdict, how far the motion is from keeping volume, or the ``density``: where it does not,
         the measure of the class's description is not the one that the states tend to.
         """
-        self.on(system, DEFAULT_WITH_NOISE)
+        self.method_with_noise(system, DEFAULT_NOISE_METHOD)
         points = system.samples(samples, seed, scale)
-        density = None if self.density is None else as_energy(self.density, "the density")
-        measured = at_points(_residuals, (system, density), points)
-        inside = np.isfinite(measured[MEASURE])
+        density = None if self.density is None else make_energy(self.density, "the density")
+        measured = evaluate_at_points(_noise_residuals, (system, density), points)
+        inside = np.isfinite(measured[MEASURE_ROW])
         if not inside.any():
             raise InputError(f"energy or dissipation is not finite at any of the {len(points)} test points")
         rows = []
         for name, values in measured.items():
             worst = float(values[inside].max())
-            judged = name != MEASURE
+            judged = name != MEASURE_ROW
             note = "" if judged or worst <= AXIOM_TOLERANCE else "no: what the states tend to is not known"
             rows.append(CheckRow(name, worst, AXIOM_TOLERANCE, worst <= AXIOM_TOLERANCE if judged else None, note))
         return CheckReport(tuple(rows), int(inside.sum()))
 
-    def listed(self) -> dict[str, Any]:
+    def as_provenance(self) -> dict[str, Any]:
         """For the provenance of a run."""
         density = None if self.density is None else getattr(self.density, "__name__", str(self.density))
         return {**vars(self), "seed": self.seeds if len(self.seeds) > 1 else self.seeds[0], "density": density}
 
-    def on(self, system: System, method: OneStepMethod) -> OneStepMethod:
+    def method_with_noise(self, system: System, method: OneStepMethod) -> OneStepMethod:
         """The method for steps with this noise; itself where there is none."""
         if not self.boltzmann:
             return method
-        density = None if self.density is None else as_energy(self.density, "the density")
-        return with_noise(system, method, self.boltzmann, self.temperature, density)
+        density = None if self.density is None else make_energy(self.density, "the density")
+        return add_noise(system, method, self.boltzmann, self.temperature, density)
 
-    def rows(self, increments: int, members: np.ndarray, first: int, steps: int, h: float) -> np.ndarray:
+    def consecutive_increments(
+        self, increments: int, members: np.ndarray, first: int, steps: int, h: float
+    ) -> np.ndarray:
         """Return increments of consecutive steps of size h of a run that begins at time 0, from step ``first`` on.
 
         Shape (trajectories, steps, increments).
@@ -168,15 +170,15 @@ class Fluctuations:
         highs, lows = split_words(cells)
         values = np.empty((len(trajectories), len(cells), count))
         for high in np.unique(highs):
-            key = derived(_key_of_steps(step_code(step), halvings, int(high)), split_words(seeds), (numbers, 0))
-            values[:, highs == high] = normal(key, lows[highs == high], count)
-        return np.sqrt(length) * np.clip(values, -BOUND, BOUND)
+            key = derive_key(_step_key(step_code(step), halvings, int(high)), split_words(seeds), (numbers, 0))
+            values[:, highs == high] = normal_numbers(key, lows[highs == high], count)
+        return np.sqrt(length) * np.clip(values, -MAX_STANDARD_DEVIATIONS, MAX_STANDARD_DEVIATIONS)
 
 
-CELLS = 64
+CELLS_PER_STEP = 64
 """Cells of time in a step: steps that start in the same cell are the same step."""
 
-CELL_EDGE = 0.5 * (math.sqrt(5.0) - 1.0)
+CELL_EDGE_FRACTION = 0.5 * (math.sqrt(5.0) - 1.0)
 """Where in its cell a multiple of the cell's length lies, as a share of that: the golden section, which is as far as
 possible from all simple fractions. In a run that starts at a simple fraction of a step, no step starts near the edge of
 a cell, where rounding would decide between two cells."""
@@ -191,8 +193,8 @@ def step_cells(starts, length: float, step: float) -> tuple[int, np.ndarray]:
     the same cell, as long as the rounding of times is less than a two hundredth of a step. In shorter steps cells are
     shorter, by as many halvings as the first integer says: no two steps of a path have the same integers.
     """
-    halvings = 1 - math.frexp(2.0 * CELL_EDGE * length / step)[1]
-    cells = np.floor(np.asarray(starts) / step * (CELLS * 2.0**halvings) + CELL_EDGE)
+    halvings = 1 - math.frexp(2.0 * CELL_EDGE_FRACTION * length / step)[1]
+    cells = np.floor(np.asarray(starts) / step * (CELLS_PER_STEP * 2.0**halvings) + CELL_EDGE_FRACTION)
     return halvings, cells.astype(np.int64)
 
 
@@ -202,46 +204,48 @@ def step_code(step: float) -> int:
     Steps such as ``(t1 - t0) / 10``, which differ in their last bits, have the same one.
     """
     mantissa, exponent = math.frexp(step)
-    return (exponent << 31) + math.floor((mantissa - 0.5) * 2.0**32 + CELL_EDGE)
+    return (exponent << 31) + math.floor((mantissa - 0.5) * 2.0**32 + CELL_EDGE_FRACTION)
 
 
 @functools.lru_cache(256)
-def _key_of_steps(code: int, halvings: int, high: int) -> tuple[np.ndarray, np.ndarray]:
+def _step_key(code: int, halvings: int, high: int) -> tuple[np.ndarray, np.ndarray]:
     """The key of all steps whose cells have these high words, shape (1,): found once for many calls."""
-    return derived(split_words([0]), split_words([code]), ([halvings], [high]))
+    return derive_key(split_words([0]), split_words([code]), ([halvings], [high]))
 
 
-MEASURE = "the motion keeps the measure"
+MEASURE_ROW = "the motion keeps the measure"
 
 
-def _residuals(model: tuple[System, Energy | None], x):
+def _noise_residuals(model: tuple[System, Energy | None], x):
     system, density = model
     assert system.dissipation is not None
 
     def motion(y):
         return system.poisson.sharp(y, system.energy.gradient(y))
 
-    parts = system.changes(x, lambda y, alpha: jnp.dot(alpha, motion(y)))
+    parts = system.divergence_terms(x, lambda y, alpha: jnp.dot(alpha, motion(y)))
     if density is not None:
         parts = jnp.append(parts, jnp.dot(density.gradient(x), motion(x)))
     size = jnp.max(jnp.abs(parts)) + jnp.max(jnp.abs(motion(x))) / (1.0 + jnp.max(jnp.abs(x)))
-    own = {MEASURE: jnp.abs(jnp.sum(parts)) / jnp.where(size > 0.0, size, 1.0)}
-    return residuals(system.dissipation, system, x) | own
+    own = {MEASURE_ROW: jnp.abs(jnp.sum(parts)) / jnp.where(size > 0.0, size, 1.0)}
+    return factor_residuals(system.dissipation, system, x) | own
 
 
 @dataclass(frozen=True)
-class Paths:
+class NoisePaths:
     """The noise of trajectories with the given numbers, shape (B,), along the course of a run."""
 
     noise: Fluctuations
-    increments: int
-    numbers: np.ndarray
-    course: Course
+    n_increments: int
+    trajectory_numbers: np.ndarray
+    schedule: StepSchedule
 
-    def rows(self, chosen: slice | np.ndarray, first: int, steps: int, h) -> np.ndarray:
+    def step_increments(self, chosen: slice | np.ndarray, first: int, steps: int, h) -> np.ndarray:
         """Return the increments of steps of size h, from the one after ``first`` steps of the run on."""
-        starts = self.course.reached(first + np.arange(steps))
-        return self.noise.increments(self.increments, self.numbers[chosen], starts, float(h), self.course.h)
+        starts = self.schedule.times_after(first + np.arange(steps))
+        return self.noise.increments(
+            self.n_increments, self.trajectory_numbers[chosen], starts, float(h), self.schedule.h
+        )
 
 
 def check_noise(noise, members: int = 1) -> None:
@@ -252,11 +256,11 @@ def check_noise(noise, members: int = 1) -> None:
         raise InputError(f"{len(noise.seeds)} seeds for {members} trajectories: give one, or one for each")
 
 
-DEFAULT_WITH_NOISE = MetriplecticMidpoint()
+DEFAULT_NOISE_METHOD = MetriplecticMidpoint()
 """The method of runs with noise where none is named."""
 
 
-def _check(what: str, value) -> None:
+def _check_nonnegative(what: str, value) -> None:
     try:
         number = float(value)
     except (TypeError, ValueError):

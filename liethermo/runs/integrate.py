@@ -6,26 +6,35 @@ import os
 from collections.abc import Callable
 from typing import Literal
 
-from manifolds._precision import by_own_settings
+from manifolds._precision import with_library_settings
 
-from ..engines.codes import Code
+from ..engines.codes import StatusCode
 from ..errors import ConvergenceError, FileError, InputError, NonFiniteError
 from ..integrators import DEFAULT_METHOD, OneStepMethod, Reference
 from ..results.solution import Solution
 from ..systems import System
 from .adaptive import Adaptive
 from .events import Relaxed
-from .fluctuations import DEFAULT_WITH_NOISE, Fluctuations, check_noise
-from .preparation import as_run, check_choice, decided, prepared, refuse_tracers, started
+from .fluctuations import DEFAULT_NOISE_METHOD, Fluctuations, check_noise
+from .preparation import (
+    check_choice,
+    checked_initial_state,
+    invariants_and_laws,
+    prepare_run,
+    refuse_tracers,
+    resolve_invariants,
+)
 from .progress import Progress
 from .run import Run
-from .timetable import Course, course_of
-from .watch import Watch
+from .timetable import StepSchedule, make_schedule
+from .watch import EventSet
 
-UNSOLVED = tuple(code.text for code in (Code.NOT_CONVERGED, Code.STEP_UNDERFLOW, Code.STEP_LIMIT))
+CONVERGENCE_FAILURES = tuple(
+    code.status_name for code in (StatusCode.NOT_CONVERGED, StatusCode.STEP_UNDERFLOW, StatusCode.STEP_LIMIT)
+)
 
 
-@by_own_settings
+@with_library_settings
 @refuse_tracers
 def integrate(
     system: System,
@@ -36,7 +45,7 @@ def integrate(
     *,
     save_every: int = 1,
     save_at=None,
-    until: Relaxed | Callable | Watch | None = None,
+    until: Relaxed | Callable | EventSet | None = None,
     dense: bool = False,
     engine: Literal["auto", "array", "compiled", "sparse"] = "auto",
     on_failure: Literal["raise", "return"] = "raise",
@@ -126,7 +135,7 @@ def integrate(
     ('event', True)
     """
     check_noise(noise)
-    default = DEFAULT_METHOD if noise is None else DEFAULT_WITH_NOISE
+    default = DEFAULT_METHOD if noise is None else DEFAULT_NOISE_METHOD
     method = default if method is None else method
     if not isinstance(method, OneStepMethod | Reference):
         raise InputError(f"the method must be an integrator such as lt.MetriplecticGauss(), not {method!r}")
@@ -136,8 +145,10 @@ def integrate(
         )
     check_choice("engine", engine, ("auto", "array", "compiled", "sparse"))
     check_choice("on_failure", on_failure, ("raise", "return"))
-    system, method = as_run(decided(system, x0), method, noise, step.tolerance if isinstance(step, Adaptive) else None)
-    prepared(system, method)  # refuses what the method cannot run
+    system, method = prepare_run(
+        resolve_invariants(system, x0), method, noise, step.tolerance if isinstance(step, Adaptive) else None
+    )
+    invariants_and_laws(system, method)  # refuses what the method cannot run
     adaptive = isinstance(step, Adaptive)
     looks = adaptive or dense or save_at is not None or until is not None
     if looks and isinstance(method, Reference):
@@ -149,30 +160,30 @@ def integrate(
             "steps with noise are of one size, and nothing is known of a path between them: Adaptive, until and dense "
             "are for runs without"
         )
-    course = course_of(t_span, step, save_every, save_at, endless=adaptive and until is not None)
-    x = started(system, method, x0, course.start, attitude)
+    course = make_schedule(t_span, step, save_every, save_at, allow_infinite_end=adaptive and until is not None)
+    x = checked_initial_state(system, method, x0, course.start, attitude)
     run = Run(system, method, x, course, save_to, engine, noise, dense)
     with Progress((course.start, course.end), progress) as bar:
         if isinstance(method, Reference):
-            run.by_scipy(bar)
+            run.run_reference(bar)
         elif adaptive or until is not None:
-            run.by_paces(bar, step if adaptive else course.h, until)
+            run.run_with_step_control(bar, step if adaptive else course.h, until)
         else:
-            run.by_steps(bar)
+            run.run_fixed(bar)
     solution = run.solution()
     if save_to is not None:
         try:
             solution.save(save_to)
         except FileError as error:
             raise FileError(f"{error}. It is the exception's .solution", solution) from error
-    if on_failure == "raise" and solution.status.code in UNSOLVED:
+    if on_failure == "raise" and solution.status.code in CONVERGENCE_FAILURES:
         raise ConvergenceError(solution.status.message, solution)
-    if on_failure == "raise" and not solution.status.ok and solution.status.code != Code.INTERRUPTED.text:
+    if on_failure == "raise" and not solution.status.ok and solution.status.code != StatusCode.INTERRUPTED.status_name:
         raise NonFiniteError(solution.status.message, solution)
     return solution
 
 
-@by_own_settings
+@with_library_settings
 def solution_without_steps(system: System, x0, t: float, method: OneStepMethod) -> Solution:
     """Return the solution over a span of length zero: the initial state at a time.
 
@@ -181,8 +192,16 @@ def solution_without_steps(system: System, x0, t: float, method: OneStepMethod) 
     InputError
         If no run of the method can start there.
     """
-    system, method = as_run(decided(system, x0), method)
-    prepared(system, method)
-    run = Run(system, method, started(system, method, x0, t), Course.at(t), None, "auto", dense=True)
+    system, method = prepare_run(resolve_invariants(system, x0), method)
+    invariants_and_laws(system, method)
+    run = Run(
+        system,
+        method,
+        checked_initial_state(system, method, x0, t),
+        StepSchedule.of_zero_length(t),
+        None,
+        "auto",
+        dense=True,
+    )
     run.take_no_step()
     return run.solution()

@@ -7,100 +7,125 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..engines.codes import Code
-from ..engines.compiled.paced import LanePaces
-from ..engines.paced import Guide, Paces, many
-from ..engines.pacing import ARRIVED, FINISHED, LOOKING, Pacing
-from ..engines.stepping import TELLING
+from ..engines.codes import StatusCode
+from ..engines.compiled.paced import CompiledAdaptiveRuns
+from ..engines.paced import AdaptiveRuns, PauseHandler, start_batch
+from ..engines.pacing import PAUSED_AT_STOP, PAUSED_FOR_GROWTH_RATE, REACHED_END, StepControl
+from ..engines.stepping import REPORTED_FIELDS
 from ..integrators import OneStepMethod
-from .batches import ARRAY_BATCH, KEPT_BEFORE, Lanes, Tally, by_threads, in_whole_vectors
+from .batches import (
+    ARRAY_BATCH_SIZE,
+    RECORDED_INITIAL_FIELDS,
+    LaneParameters,
+    ProgressCounter,
+    padded_member_indices,
+    run_in_threads,
+)
 from .family import Family
-from .record import Record
+from .record import EnsembleRecord
 
-ATTEMPTS = (16, 2048)
+ATTEMPTS_PER_CALL_RANGE = (16, 2048)
 """Attempts in a call of an engine, at least and at most: those that pause wait for the others' to be made."""
 
-WORK = 2**15
+TARGET_ATTEMPTS_PER_CALL = 2**15
 """Attempts in a call, of all trajectories together, between these."""
 
 
-class Many:
+class AdaptiveEnsembleRun:
     """The paces of an ensemble.
 
     Parameters
     ----------
     family : Family
     method : OneStepMethod
-    pacing : Pacing
+    control : Pacing
     record : Record
-    tally : Tally
+    progress_counter : Tally
     """
 
-    def __init__(self, family: Family, method: OneStepMethod, pacing: Pacing, record: Record, tally: Tally):
-        self.family, self.method, self.pacing, self.record, self.tally = family, method, pacing, record, tally
+    def __init__(
+        self, family: Family, method: OneStepMethod, pacing: StepControl, record: EnsembleRecord, tally: ProgressCounter
+    ):
+        self.family, self.method, self.control, self.record, self.progress_counter = (
+            family,
+            method,
+            pacing,
+            record,
+            tally,
+        )
         self.interrupted = False
-        self.stops = record.course.stops
+        self.stop_times = record.schedule.stop_times
 
     @property
-    def _times(self) -> tuple[float, float, float]:
-        course = self.record.course
-        return course.start, float(self.stops[0]), course.end - course.start
+    def _start_stop_length(self) -> tuple[float, float, float]:
+        course = self.record.schedule
+        return course.start, float(self.stop_times[0]), course.end - course.start
 
     def run_compiled(self) -> None:
         """In lanes over threads; those that are at their end leave their lanes to others."""
-        lanes, size = Lanes(self.family, self.method, self.pacing), len(self.record.x0)
+        lanes, size = LaneParameters(self.family, self.method, self.control), len(self.record.x0)
 
         def work(chosen: slice, stop: threading.Event) -> None:
             own = lanes.parameters(chosen, chosen.stop - chosen.start)
-            paces = LanePaces(lanes.stepper, lanes.first, own, self.record.x0[chosen], *self._times)
-            self._follow(paces, np.arange(chosen.start, chosen.stop), paces.only, stop.is_set)
+            paces = CompiledAdaptiveRuns(
+                lanes.step_loop, lanes.first_lane_parameters, own, self.record.x0[chosen], *self._start_stop_length
+            )
+            self._advance_to_end(paces, np.arange(chosen.start, chosen.stop), paces.keep_only, stop.is_set)
 
-        by_threads(work, size)
+        run_in_threads(work, size)
 
     def run_array(self) -> None:
         """All of a batch in one program."""
         size = len(self.record.x0)
-        for start in range(0, size, ARRAY_BATCH):
-            places = in_whole_vectors(start, min(start + ARRAY_BATCH, size), self.record.x0.shape[1])
-            parameters, axes = self.family.batched(places)
-            given = self.family.form, parameters, axes, self.method, self.pacing
-            paces = many(*given, self.record.x0[places], *self._times)
-            self._follow(paces, places, None, lambda: self.interrupted)
+        for start in range(0, size, ARRAY_BATCH_SIZE):
+            places = padded_member_indices(start, min(start + ARRAY_BATCH_SIZE, size), self.record.x0.shape[1])
+            parameters, axes = self.family.vmap_arguments(places)
+            given = self.family.form, parameters, axes, self.method, self.control
+            paces = start_batch(*given, self.record.x0[places], *self._start_stop_length)
+            self._advance_to_end(paces, places, None, lambda: self.interrupted)
 
-    def _follow(self, paces: Paces, places: np.ndarray, only: Callable | None, stopped: Callable[[], bool]) -> None:
+    def _advance_to_end(
+        self, paces: AdaptiveRuns, places: np.ndarray, only: Callable | None, stopped: Callable[[], bool]
+    ) -> None:
         """Trajectories with these places, to the ends of all."""
         record = self.record
-        guide = Guide(paces, self.pacing, self.method, self.stops, lambda i: self.family.member(int(places[i])))
-        before = {name: paces.read(name).copy() for name in KEPT_BEFORE}
-        record.begin(places, before["x"], before["energy"], before["entropy"])
+        guide = PauseHandler(
+            paces, self.control, self.method, self.stop_times, lambda i: self.family.member(int(places[i]))
+        )
+        before = {name: paces.read(name).copy() for name in RECORDED_INITIAL_FIELDS}
+        record.record_initial(places, before["x"], before["energy"], before["entropy"])
         followed = np.ones(len(places), dtype=bool)
-        guide.resume()
-        record.rows["first_step"][places] = np.minimum(paces.read("proposed"), self._times[2])
+        guide.resume_paused()
+        record.quantities["first_step"][places] = np.minimum(paces.read("next_step_size"), self._start_stop_length[2])
 
-        def finish(ended: np.ndarray, status: np.ndarray, fields: dict[str, np.ndarray], end_time: np.ndarray) -> None:
+        def record_finished(
+            ended: np.ndarray, status: np.ndarray, fields: dict[str, np.ndarray], end_time: np.ndarray
+        ) -> None:
             at = {name: values[ended] for name, values in before.items()}
-            record.finish(places[ended], at, fields, status, end_time)
-            record.rejected[places[ended]] = paces.read("rejected", ended)
+            record.finish_members(places[ended], at, fields, status, end_time)
+            record.rejected[places[ended]] = paces.read("n_rejected", ended)
 
         def fields_of(chosen: np.ndarray) -> dict[str, np.ndarray]:
-            return {name: paces.read(name, chosen) for name in TELLING}
+            return {name: paces.read(name, chosen) for name in REPORTED_FIELDS}
 
         try:
             while followed.any() and not stopped():
-                paces.follow(int(np.clip(WORK // len(places), *ATTEMPTS)))
-                guide.verify()
-                there = guide.paused(ARRIVED)
+                paces.advance(int(np.clip(TARGET_ATTEMPTS_PER_CALL // len(places), *ATTEMPTS_PER_CALL_RANGE)))
+                guide.confirm_events()
+                there = guide.paused_indices(PAUSED_AT_STOP)
                 if there.size:
                     columns = [paces.read("x", there), *(paces.read(n, there)[:, None] for n in ("energy", "entropy"))]
-                    record.keep_at(places[there], paces.read("t", there), np.hstack(columns))
-                guide.resume()
+                    record.store_states_at(places[there], paces.read("t", there), np.hstack(columns))
+                guide.resume_paused()
                 status = paces.read("status")
-                ended = np.flatnonzero(followed & ~np.isin(status, (Code.COMPLETED, ARRIVED, LOOKING)))
+                ended = np.flatnonzero(
+                    followed & ~np.isin(status, (StatusCode.COMPLETED, PAUSED_AT_STOP, PAUSED_FOR_GROWTH_RATE))
+                )
                 if ended.size:
-                    codes = np.where(status[ended] == FINISHED, Code.COMPLETED, status[ended])
-                    finish(ended, codes, fields_of(ended), paces.read("t", ended))
+                    codes = np.where(status[ended] == REACHED_END, StatusCode.COMPLETED, status[ended])
+                    record_finished(ended, codes, fields_of(ended), paces.read("t", ended))
                 followed[ended] = False
-                self.tally.add(np.unique(places[ended]).size)
+                self.progress_counter.add(np.unique(places[ended]).size)
                 if only is not None and 2 * followed.sum() <= len(places) and followed.any():
                     left = np.flatnonzero(followed)
                     only(left)
@@ -110,4 +135,4 @@ class Many:
             self.interrupted = True
         left = np.flatnonzero(followed)
         if left.size:
-            finish(left, np.full(left.size, Code.INTERRUPTED), fields_of(left), paces.read("t", left))
+            record_finished(left, np.full(left.size, StatusCode.INTERRUPTED), fields_of(left), paces.read("t", left))

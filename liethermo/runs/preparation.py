@@ -12,20 +12,20 @@ import numpy as np
 from manifolds._arrays import is_traced
 
 from ..errors import InputError
-from ..functions.checks import traced_energies
+from ..functions.checks import trace_energies
 from ..functions.time_span import limit_times
 from ..integrators import OneStepMethod, WithAttitude
-from ..integrators.base import pulled
+from ..integrators.base import pullback_method
 from ..integrators.fluctuating import noise_dimension
 from ..results.status import Laws
 from ..systems import AttitudeSystem, DrivenSystem, EmbeddedSystem, LiePoissonSystem, System, driven, embedded
-from ..tracing.remembered import Latest, remembered
+from ..tracing.caching import LRUCache, memoize
 from .family import Family
 from .fluctuations import Fluctuations
 
 Result = TypeVar("Result")
 
-NO_GROUP = "an attitude is for a system with a group: give LiePoissonSystem one, such as group=mf.SO(3)"
+MISSING_GROUP_MESSAGE = "an attitude is for a system with a group: give LiePoissonSystem one, such as group=mf.SO(3)"
 
 
 def refuse_tracers(function: Callable[..., Result]) -> Callable[..., Result]:
@@ -52,18 +52,18 @@ def check_choice(what: str, given, choices: tuple[str, ...]) -> None:
         raise InputError(f"{what} must be {', '.join(others)} or {last}, not {given!r}")
 
 
-def decided(system: System, x0) -> System:
+def resolve_invariants(system: System, x0) -> System:
     """The system, with what it conserves found out near the states that a run starts from, where that is open."""
-    return system.decided_near(x0) if _open(system) else system
+    return system.decided_near(x0) if _has_undecided_invariants(system) else system
 
 
-@remembered
-def _open(system: System) -> bool:
+@memoize
+def _has_undecided_invariants(system: System) -> bool:
     return not is_traced(system) and bool(system.undecided())
 
 
-@remembered
-def as_run(
+@memoize
+def prepare_run(
     system: System, method, noise: Fluctuations | None = None, tolerance: float | None = None
 ) -> tuple[System, Any]:
     """The system and the method as they are run, with adaptive steps of a tolerance or with given ones.
@@ -77,17 +77,17 @@ def as_run(
         if system.needs_attitude:
             raise InputError(f"{method} follows no attitude, and the torque {system.pushed_by} depends on it")
         return driven(system, unit=1.0), method  # its errors are measured component by component
-    method = method if noise is None else noise.on(driven(system), method)
-    return of_steps(system, method, tolerance, True)
+    method = method if noise is None else noise.method_with_noise(driven(system), method)
+    return prepare_for_method(system, method, tolerance, True)
 
 
-@remembered
-def of_steps(
+@memoize
+def prepare_for_method(
     system: System, method: OneStepMethod, tolerance: float | None = None, attitude: bool = False
 ) -> tuple[System, OneStepMethod]:
     """The same for a method of the library; attitudes where a torque depends on them, or where they are asked for."""
-    found = driven(system if method.in_charts else embedded(system))
-    method = traced_energies(pulled(method, found).on(found, tolerance), found.dim)
+    found = driven(system if method.uses_charts else embedded(system))
+    method = trace_energies(pullback_method(method, found).on(found, tolerance), found.dim)
     wanted = system.reconstruction if isinstance(system, LiePoissonSystem) else None
     if wanted is None or not (attitude or system.needs_attitude):
         return found, method
@@ -96,7 +96,7 @@ def of_steps(
     return AttitudeSystem(found, kind), WithAttitude(method, kind)
 
 
-def begun(system: System, x0, t: float, attitude=None, batch: bool = False) -> jax.Array | np.ndarray:
+def initial_state(system: System, x0, t: float, attitude=None, batch: bool = False) -> jax.Array | np.ndarray:
     """The state of a run that starts from one of its user; or several, with ``batch``.
 
     Raises
@@ -107,11 +107,11 @@ def begun(system: System, x0, t: float, attitude=None, batch: bool = False) -> j
     if isinstance(system, AttitudeSystem):
         return system.begin(x0, attitude, batch, t)
     if attitude is not None:
-        raise InputError(NO_GROUP)
+        raise InputError(MISSING_GROUP_MESSAGE)
     return system.begin(x0, t, batch) if isinstance(system, DrivenSystem) else system.numbers(x0, batch)
 
 
-def started(system: System, method, x0, t: float, attitude=None) -> jax.Array | np.ndarray:
+def checked_initial_state(system: System, method, x0, t: float, attitude=None) -> jax.Array | np.ndarray:
     """The state of a run of a method that starts from one of its user.
 
     Raises
@@ -119,35 +119,35 @@ def started(system: System, method, x0, t: float, attitude=None) -> jax.Array | 
     InputError
         If there is an attitude and no group, or no run can start there.
     """
-    x = begun(system, x0, t, attitude)
-    if reason := no_start(system, method, x):
+    x = initial_state(system, x0, t, attitude)
+    if reason := why_not_startable(system, method, x):
         raise InputError(reason)
     return x
 
 
-def no_start(system: System, method, x) -> str:
+def why_not_startable(system: System, method, x) -> str:
     """Why no run can start at x, or at one of several states, in words; empty where one can."""
     spared = system.has_generator and (not isinstance(method, OneStepMethod) or method.explicit)
     reason = system.outside(x) or ("" if spared else system.singular(x))
     return reason and f"the run cannot start at this x0: {reason}"
 
 
-def as_family(family: Family, system: System) -> Family:
+def wrap_family(family: Family, system: System) -> Family:
     """The family of what the members are run as, where the system is what one of them is."""
     if isinstance(system, AttitudeSystem):
-        return as_family(family, system.body).through(AttitudeSystem, system.reconstruction)
+        return wrap_family(family, system.body).map_members(AttitudeSystem, system.reconstruction)
     if isinstance(system, EmbeddedSystem):
-        return family.through(EmbeddedSystem, *system.known)
-    return as_family(family, system.body).through(DrivenSystem) if isinstance(system, DrivenSystem) else family
+        return family.map_members(EmbeddedSystem, *system.known)
+    return wrap_family(family, system.body).map_members(DrivenSystem) if isinstance(system, DrivenSystem) else family
 
 
 MAX_LIMITED_SYSTEMS = 64
 """Systems with the spans of their runs that are held in memory, those last used."""
 
-_limited: Latest[tuple[System, System]] = Latest(MAX_LIMITED_SYSTEMS)
+_limited_systems: LRUCache[tuple[System, System]] = LRUCache(MAX_LIMITED_SYSTEMS)
 
 
-def within_span(system: System, start: float, end: float) -> System:
+def limit_to_span(system: System, start: float, end: float) -> System:
     """Return a system as it is run, its functions of time evaluated at times from ``start`` to ``end`` only.
 
     One object for equal arguments, so that what is found for it is found once.
@@ -157,12 +157,14 @@ def within_span(system: System, start: float, end: float) -> System:
     if is_traced(system):
         return limit_times(system, start, end)
     # held with what it is made of, whose identity no other object takes meanwhile
-    return _limited.find((id(system), start, end), lambda: (system, limit_times(system, start, end)))[1]
+    return _limited_systems.get_or_compute((id(system), start, end), lambda: (system, limit_times(system, start, end)))[
+        1
+    ]
 
 
-def family_within_span(family: Family, system: System, start: float, end: float) -> Family:
-    """Return the family of what :func:`within_span` makes of the members, where the system is one of them."""
-    return family.with_numbers(limit_times, start, end) if is_driven_run(system) else family
+def limit_family_to_span(family: Family, system: System, start: float, end: float) -> Family:
+    """Return the family of what :func:`limit_to_span` makes of the members, where the system is one of them."""
+    return family.map_members_with_numbers(limit_times, start, end) if is_driven_run(system) else family
 
 
 def is_driven_run(system: System) -> bool:
@@ -170,18 +172,18 @@ def is_driven_run(system: System) -> bool:
     return isinstance(system.body if isinstance(system, AttitudeSystem) else system, DrivenSystem)
 
 
-@remembered
-def prepared(system: System, method) -> tuple[dict, Laws]:
+@memoize
+def invariants_and_laws(system: System, method) -> tuple[dict, Laws]:
     """What is recorded along a run and what is promised of it; raises InputError where the method cannot be used."""
     if isinstance(method, OneStepMethod):
         method.check(system)
     invariants = system.invariants()
-    return invariants, laws_of(system, method, invariants)
+    return invariants, promised_laws(system, method, invariants)
 
 
-def laws_of(system: System, method, invariants) -> Laws:
+def promised_laws(system: System, method, invariants) -> Laws:
     """What the system promises and, of its invariants, what the method keeps."""
-    keeps = method.keeps if isinstance(method, OneStepMethod) else lambda system, name: False
+    keeps = method.preserves_function if isinstance(method, OneStepMethod) else lambda system, name: False
     constants = [*(name for name, (_, kept) in invariants.items() if kept), *system.constants]
     unknown = tuple(name for name, (_, kept) in invariants.items() if kept is None)
     conserved = tuple(name for name in constants if keeps(system, name))

@@ -12,81 +12,84 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..engines.choice import Chosen
-from ..engines.codes import Code
-from ..results.evidence import Replay, Witness
+from ..engines.choice import EngineWithFallback
+from ..engines.codes import StatusCode
+from ..results.evidence import EvidenceCollector, StepReplay
 from ..results.solution import Solution
 from ..systems import System
-from ..tracing.interpret import at_points
+from ..tracing.interpret import evaluate_at_points
 from .adaptive import Adaptive
-from .preparation import prepared
+from .preparation import invariants_and_laws
 
 
-def presented(
+def build_solution(
     system: System,
     method,
     x: np.ndarray,
     entropy: np.ndarray | None,
-    steps: np.ndarray,
-    again: Replay,
-    prepared_as: System | None = None,
+    step_sizes: np.ndarray,
+    replay: StepReplay,
+    system_without_span: System | None = None,
     **fields,
 ) -> Solution:
     """The solution that a user sees of the states x, shape (times, n), of a run.
 
     Parameters
     ----------
-    steps : array, shape (times - 1,)
+    step_sizes : array, shape (times - 1,)
         Sizes of steps that the run took from the states.
-    again : Replay
-    prepared_as : System, optional
+    replay : Replay
+    system_without_span : System, optional
         The system without the span of the run, for which the laws are known already; by default ``system``.
     **fields
         The others of :class:`Solution`.
     """
-    invariants, laws = prepared(system if prepared_as is None else prepared_as, method)
+    invariants, laws = invariants_and_laws(system if system_without_span is None else system_without_span, method)
     functions = {name: f for name, (f, _) in invariants.items()}
     found = Solution(
         x=x,
         entropy=None if system.entropy is None else entropy,
-        casimirs={name: at_points(_value, function, x) for name, function in {**functions, **system.ledger}.items()},
+        casimirs={
+            name: evaluate_at_points(_function_value, function, x)
+            for name, function in {**functions, **system.ledger}.items()
+        },
         laws=laws,
-        witness=Witness(system, method, functions, x, np.asarray(fields["t"]), steps, again),
+        evidence_source=EvidenceCollector(system, method, functions, x, np.asarray(fields["t"]), step_sizes, replay),
         **fields,
     )
     return system.presented(found)
 
 
-def _value(function, x):
+def _function_value(function, x):
     return function.value(x)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Again:
-    """Steps from any state, by the program that a run has compiled: a :class:`Replay`."""
+class EngineReplay:
+    """Steps from any state, by the program that a run has compiled: a :class:`StepReplay`."""
 
-    engine: Chosen
+    engine: EngineWithFallback
 
     def __call__(self, x: np.ndarray, h: float, steps: int = 1):
-        return self.engine.advance(self.engine.begin(jnp.asarray(x)), h, 1, steps)[0]
+        return self.engine.advance(self.engine.initial_run_state(jnp.asarray(x)), h, 1, steps)[0]
 
-    def path(self, x: np.ndarray, h: float, steps: int) -> np.ndarray:
-        state, found = self.engine.begin(jnp.asarray(x)), [np.empty((0, len(x)))]
-        while steps > 0 and int(state.status) == Code.COMPLETED:
-            saves = min(steps, self.engine.portion)
+    def states_after_steps(self, x: np.ndarray, h: float, steps: int) -> np.ndarray:
+        state, found = self.engine.initial_run_state(jnp.asarray(x)), [np.empty((0, len(x)))]
+        while steps > 0 and int(state.status) == StatusCode.COMPLETED:
+            saves = min(steps, self.engine.max_saves_per_call)
             state, (states, _, _, reached) = self.engine.advance(state, h, saves, 1)
             found.append(np.asarray(states)[:saves][np.asarray(reached)[:saves].astype(bool)])
             steps -= saves
         return np.concatenate(found)
 
 
-def provenance_of(
+def run_provenance(
     system: System, method: Any, step: float | Adaptive, span: tuple[float, float], every: int | None
 ) -> dict[str, Any]:
     """Where a run comes from: JSON data."""
     algebra, group, inertia = system.lie_algebra, system.matrix_group, system.inertia
     return {
-        "library": f"liethermo {_version()}",
+        "library": f"liethermo {_library_version()}",
         "jax": jax.__version__,
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "method": str(method),
@@ -103,7 +106,7 @@ def provenance_of(
 
 
 @functools.cache
-def _version() -> str:
+def _library_version() -> str:
     try:
         return metadata.version("liethermo")
     except metadata.PackageNotFoundError:

@@ -17,19 +17,19 @@ class Progress:
     ----------
     span : (float, float)
         What is shown at the start and at the end: a time, or how much is done.
-    wanted : bool or None
+    is_shown : bool or None
         None where the standard error tells.
-    text : str
+    text_format : str
         Of the place between these.
     """
 
     def __init__(self, span: tuple[float, float], wanted: bool | None, text: str = "t = {:.4g}"):
-        self.span, self.text = span, text
+        self.span, self.text_format = span, text
         self.bar: Bar | None = None
-        self.wanted = sys.stderr.isatty() if wanted is None else wanted
+        self.is_shown = sys.stderr.isatty() if wanted is None else wanted
 
     def __enter__(self):
-        if self.wanted:
+        if self.is_shown:
             from rich.console import Console
             from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
             from rich.progress import Progress as Bar
@@ -39,12 +39,12 @@ class Progress:
             bar.start()
             length = self.span[1] - self.span[0]
             total = length if math.isfinite(length) else None
-            self.task = bar.add_task(self.text.format(self.span[0]), total=total)
+            self.task = bar.add_task(self.text_format.format(self.span[0]), total=total)
         return self
 
     def update(self, t: float) -> None:
         if self.bar is not None:
-            self.bar.update(self.task, completed=t - self.span[0], description=self.text.format(t))
+            self.bar.update(self.task, completed=t - self.span[0], description=self.text_format.format(t))
 
     def __exit__(self, *_):
         if self.bar is not None:

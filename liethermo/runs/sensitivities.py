@@ -23,67 +23,67 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from ..tracing.interpret import at_points
+from ..tracing.interpret import evaluate_at_points
 
-ENTRIES = 1_000_000
+MAX_VALUES_PER_CALL = 1_000_000
 """Numbers in the points that a function is computed at in one go."""
 
 
-class _Step(eqx.Module):
+class _StepFunction(eqx.Module):
     """A step as a function of z and k in one row, and of what else it starts from.
 
     Attributes
     ----------
-    given : tuple
+    system_method_state : tuple
         The system, the method, and the first state.
-    moves : tuple of bool
+    is_differentiated : tuple of bool
         Which leaves of these are differentiated by: those of system and method are the parameters.
-    stages : tuple of int
+    slopes_shape : tuple of int
         The shape of k.
     order : int
         Of the derivative, that is how many directions it is taken along.
     """
 
-    given: tuple
-    moves: tuple[bool, ...] = eqx.field(static=True)
-    stages: tuple[int, int] = eqx.field(static=True)
+    system_method_state: tuple
+    is_differentiated: tuple[bool, ...] = eqx.field(static=True)
+    slopes_shape: tuple[int, int] = eqx.field(static=True)
     order: int = eqx.field(static=True)
 
-    def parts(self, z) -> tuple[Any, Any, jax.Array, jax.Array]:
+    def unpack(self, z) -> tuple[Any, Any, jax.Array, jax.Array]:
         """System, method, state and slopes that a row says."""
-        leaves, structure = jax.tree_util.tree_flatten(self.given)
+        leaves, structure = jax.tree_util.tree_flatten(self.system_method_state)
         *own, x = leaves
-        _, rest = ravel_pytree([leaf for leaf, moving in zip(own, self.moves[:-1], strict=True) if moving])
-        n, m = np.size(x), self.stages[0] * self.stages[1]
+        _, rest = ravel_pytree([leaf for leaf, moving in zip(own, self.is_differentiated[:-1], strict=True) if moving])
+        n, m = np.size(x), self.slopes_shape[0] * self.slopes_shape[1]
         moved = iter(rest(z[n : len(z) - m]))
-        own = [next(moved) if moving else leaf for leaf, moving in zip(own, self.moves[:-1], strict=True)]
+        own = [next(moved) if moving else leaf for leaf, moving in zip(own, self.is_differentiated[:-1], strict=True)]
         system, method, _ = jax.tree_util.tree_unflatten(structure, [*own, x])
-        return system, method, z[:n], z[len(z) - m :].reshape(self.stages)
+        return system, method, z[:n], z[len(z) - m :].reshape(self.slopes_shape)
 
     def __call__(self, h, compensation, z) -> jax.Array:
         """The misfit, then the next state."""
-        system, method, x, k = self.parts(z)
+        system, method, x, k = self.unpack(z)
         misfit = method.slopes(system, x, compensation, h, k) - k
         return jnp.concatenate([misfit.ravel(), method.move(system, x, compensation, h, k)[0]])
 
 
-def _along(step: _Step, point) -> jax.Array:
+def _directional_derivative(step: _StepFunction, point) -> jax.Array:
     """The derivative along as many directions as its order says; rows of the point are z and k, and their derivatives.
 
     The row of a set of directions has the bits of its number set at their places.
     """
-    n = np.size(step.given[-1])
+    n = np.size(step.system_method_state[-1])
     h, compensation, rows = point[0], point[1 : 1 + n], point[1 + n :].reshape(2**step.order, -1)
 
     def value(rows):
         return step(h, compensation, rows[0])[None]
 
     def tangent(function):
-        def both(rows):
+        def value_and_tangent(rows):
             lower, upper = jnp.split(rows, 2)
             return jnp.concatenate(jax.jvp(function, (lower,), (upper,)))
 
-        return both
+        return value_and_tangent
 
     function = value
     for _ in range(step.order):
@@ -91,7 +91,7 @@ def _along(step: _Step, point) -> jax.Array:
     return function(rows)[-1]
 
 
-def derivatives(
+def state_derivatives(
     given: tuple, moves: Sequence[bool], order: int, sizes: np.ndarray, path: tuple[np.ndarray, np.ndarray, np.ndarray]
 ) -> list[np.ndarray]:
     """Those of the states of a path, from the first on, up to an order.
@@ -117,40 +117,40 @@ def derivatives(
     """
     x, compensation, k = path
     count, n, m = len(x), x.shape[1], k[0].size
-    parameters, start = _moving(given, moves)
+    parameters, start = _differentiated_values(given, moves)
     q, p = len(parameters), len(parameters) + len(start)
     place = np.concatenate([x, np.broadcast_to(parameters, (count, q)), k.reshape(count, m)], axis=1)
 
-    def along(rows: Callable[[slice], np.ndarray], many: int, rank: int) -> tuple[np.ndarray, np.ndarray]:
+    def evaluate_along(rows: Callable[[slice], np.ndarray], many: int, rank: int) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives of misfit and move, shapes (steps, m, many) and (steps, n, many).
 
         ``rows`` gives the rows of some steps, shape (steps, many, 2**rank, n + q + m): those of all steps are large.
         """
-        step, found = _Step(given, tuple(moves), k.shape[1:], rank), np.empty((count, many, m + n))
-        portion = max(1, ENTRIES // (many * 2**rank * (n + q + m)))
+        step, found = _StepFunction(given, tuple(moves), k.shape[1:], rank), np.empty((count, many, m + n))
+        portion = max(1, MAX_VALUES_PER_CALL // (many * 2**rank * (n + q + m)))
         for some in (slice(i, i + portion) for i in range(0, count, portion)):
             begin = np.concatenate([sizes[some, None], compensation[some]], axis=1)[:, None].repeat(many, axis=1)
             points = np.concatenate([begin, rows(some).reshape(*begin.shape[:2], -1)], axis=2)
-            moved = at_points(_along, step, points.reshape(-1, points.shape[-1]))
+            moved = evaluate_at_points(_directional_derivative, step, points.reshape(-1, points.shape[-1]))
             found[some] = moved.reshape(*begin.shape[:2], m + n)
         return found[..., :m].swapaxes(1, 2), found[..., m:].swapaxes(1, 2)
 
-    def each(some: slice) -> np.ndarray:
+    def unit_directions(some: slice) -> np.ndarray:
         units = np.broadcast_to(np.eye(n + q + m), (len(place[some]), n + q + m, n + q + m))
         return np.stack([np.broadcast_to(place[some, None], units.shape), units], axis=2)
 
-    misfit, move = along(each, n + q + m, 1)
-    back = -_inverse(misfit[..., n + q :])  # from a residual to the k that makes up for it
+    misfit, move = evaluate_along(unit_directions, n + q + m, 1)
+    back = -_inverse_or_nan(misfit[..., n + q :])  # from a residual to the k that makes up for it
     onward = move[..., : n + q] + move[..., n + q :] @ back @ misfit[..., : n + q]
     states, known = [], [place]  # derivatives of each order: of the states, and of z and k, (steps, n + q + m, p, ...)
     for rank in range(1, order + 1):
-        chosen, where = _symmetric(p, rank)
+        chosen, where = _symmetric_indices(p, rank)
         if rank == 1:
             still = np.eye(q, p)  # parameters move in the directions of their own
             residual, forced = misfit[..., n : n + q] @ still, onward[..., n:] @ still
         else:
             still = np.zeros((q, len(chosen)))
-            residual, forced = along(functools.partial(_rows, known, chosen), len(chosen), rank)
+            residual, forced = evaluate_along(functools.partial(_lower_order_rows, known, chosen), len(chosen), rank)
             forced = forced + move[..., n + q :] @ back @ residual
         own = np.zeros((count + 1, n, len(chosen)))
         if rank == 1:
@@ -165,7 +165,7 @@ def derivatives(
     return states
 
 
-def _rows(known: Sequence[np.ndarray], chosen: Sequence[tuple[int, ...]], some: slice) -> np.ndarray:
+def _lower_order_rows(known: Sequence[np.ndarray], chosen: Sequence[tuple[int, ...]], some: slice) -> np.ndarray:
     """Derivatives along all sets of some directions but the whole: shape (steps, many, 2**rank, n + q + m)."""
     own, rank = [a[some] for a in known], len(chosen[0])
     rows = np.zeros((len(own[0]), len(chosen), 2**rank, own[0].shape[1]))
@@ -176,14 +176,14 @@ def _rows(known: Sequence[np.ndarray], chosen: Sequence[tuple[int, ...]], some: 
     return rows
 
 
-def _moving(given: tuple, moves: Sequence[bool]) -> tuple[np.ndarray, np.ndarray]:
+def _differentiated_values(given: tuple, moves: Sequence[bool]) -> tuple[np.ndarray, np.ndarray]:
     """The parameters that are differentiated by, and the first state where it is: each in one row."""
     leaves = jax.tree_util.tree_leaves(given)
     *own, start = (np.ravel(leaf) if moving else np.zeros(0) for leaf, moving in zip(leaves, moves, strict=True))
     return np.concatenate([np.zeros(0), *own]), start
 
 
-def _symmetric(p: int, rank: int) -> tuple[list[tuple[int, ...]], np.ndarray]:
+def _symmetric_indices(p: int, rank: int) -> tuple[list[tuple[int, ...]], np.ndarray]:
     """The derivatives of a rank by p variables that differ, and which of them an entry of the whole is."""
     chosen = list(itertools.combinations_with_replacement(range(p), rank))
     where = np.empty((p,) * rank, dtype=int)
@@ -193,7 +193,7 @@ def _symmetric(p: int, rank: int) -> tuple[list[tuple[int, ...]], np.ndarray]:
     return chosen, where
 
 
-def _inverse(matrices: np.ndarray) -> np.ndarray:
+def _inverse_or_nan(matrices: np.ndarray) -> np.ndarray:
     """NaN where there is none: the derivative does not exist there."""
     try:
         return np.linalg.inv(matrices)

@@ -13,38 +13,40 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..engines.choice import Chosen
-from ..engines.codes import Code
-from ..engines.paced import Guide, Paces
-from ..engines.pacing import FINISHED, TOLD, Pacing
+from ..engines.choice import EngineWithFallback
+from ..engines.codes import StatusCode
+from ..engines.paced import AdaptiveRuns, PauseHandler
+from ..engines.pacing import ATTEMPT_FIELDS, REACHED_END, StepControl
 from ..engines.stepping import State
 from ..tracing.scalarize import UnsupportedPrimitive
-from .ending import STOPPED, stopped_by
-from .watch import UnknownStateError, Watch
+from .ending import INTERRUPTING_ERRORS, interruption_reason
+from .watch import EventSet, UnknownStateError
 
-TOGETHER = 64
+ATTEMPTS_PER_CALL = 64
 """Attempts between looks at an adaptive run."""
 
-MOST_KEPT = 2**28
+MAX_STORED_VALUES = 2**28
 """Numbers that an adaptive run keeps at most (2 GiB)."""
 
 
 @dataclass
-class Outcome:
+class RunOutcome:
     """What a stepwise run leaves: states kept, with times, and how it ended."""
 
     state: Any
-    rejected: int = 0
+    n_rejected: int = 0
     event_time: float | None = None
-    underflow: float | None = None
-    stopped: str = ""
-    jumps: list[float] = field(default_factory=list)  # when the event function changed its sign without a zero
-    undefined: bool = False  # whether the event function is not a number at the end
-    unknown: UnknownStateError | None = None  # what is not known of an event
-    limit: str = ""  # what an adaptive run has used up, "steps" or "memory"; "sight" where the event is not a number
+    underflow_step_size: float | None = None
+    interruption: str = ""
+    sign_jumps: list[float] = field(default_factory=list)  # when the event function changed its sign without a zero
+    is_event_undefined: bool = False  # whether the event function is not a number at the end
+    unknown_state_error: UnknownStateError | None = None  # what is not known of an event
+    exhausted_limit: str = (
+        ""  # what an adaptive run has used up, "steps" or "memory"; "sight" where the event is not a number
+    )
 
 
-class Steps(NamedTuple):
+class AcceptedSteps(NamedTuple):
     """Steps one after another.
 
     Attributes
@@ -54,9 +56,9 @@ class Steps(NamedTuple):
     h : array, shape (m,)
     x : array, shape (m, n)
         The states after them, with ``energy`` and ``entropy``, shape (m,).
-    number : array, shape (m,)
+    step_counts : array, shape (m,)
         How many steps the run has with each.
-    before, after : State
+    state_before, state_after : State
         Of the engine, before the first and after the last.
     """
 
@@ -65,105 +67,117 @@ class Steps(NamedTuple):
     x: np.ndarray
     energy: np.ndarray
     entropy: np.ndarray
-    number: np.ndarray
-    before: State
-    after: State
+    step_counts: np.ndarray
+    state_before: State
+    state_after: State
 
 
-Keep = Callable[[Steps], None]
+StepCallback = Callable[[AcceptedSteps], None]
 
 
-def follow(
-    engine: Chosen,
-    paces: Paces,
-    pacing: Pacing,
+def advance_to_end(
+    engine: EngineWithFallback,
+    paces: AdaptiveRuns,
+    pacing: StepControl,
     stops: np.ndarray,
-    keep: Keep,
-    most_kept: float = MOST_KEPT,
-    watch: Watch | None = None,
-    together: int = TOGETHER,
-) -> Outcome:
+    on_steps: StepCallback,
+    max_steps: float = MAX_STORED_VALUES,
+    events: EventSet | None = None,
+    attempts_per_call: int = ATTEMPTS_PER_CALL,
+) -> RunOutcome:
     """Follow a run from its start to its end, an event, a failure or Ctrl-C.
 
     Parameters
     ----------
     stops : array
         Times at which steps have to end, increasing; the last is the end of the span.
-    keep : function of Steps
+    on_steps : function of Steps
         Told of every step taken, of many together.
-    most_kept : float
+    max_steps : float
         Steps after which there is no room for more.
-    watch : Watch, optional
+    events : Watch, optional
         Looks at each step, and may end the run in it.
-    together : int
+    attempts_per_call : int
         Attempts between looks, at most.
     """
-    outcome = Outcome(_running(paces.state()))
+    outcome = RunOutcome(_clear_pause_status(paces.state()))
     try:
-        _follow(engine, paces, pacing, outcome, stops, keep, most_kept, watch, 1 if watch else together)
-    except STOPPED as error:
-        outcome.stopped = stopped_by(error)
+        _advance_to_end(
+            engine, paces, pacing, outcome, stops, on_steps, max_steps, events, 1 if events else attempts_per_call
+        )
+    except INTERRUPTING_ERRORS as error:
+        outcome.interruption = interruption_reason(error)
     return outcome
 
 
-def _follow(
-    engine, paces: Paces, pacing, outcome: Outcome, stops, keep, most_kept, watch: Watch | None, together: int
+def _advance_to_end(
+    engine,
+    paces: AdaptiveRuns,
+    pacing,
+    outcome: RunOutcome,
+    stops,
+    keep,
+    most_kept,
+    watch: EventSet | None,
+    together: int,
 ) -> None:
-    guide = Guide(paces, pacing, engine.method, stops, lambda i: engine.system)
-    outcome.jumps = guide.jumps
+    guide = PauseHandler(paces, pacing, engine.method, stops, lambda i: engine.system)
+    outcome.sign_jumps = guide.sign_jumps
 
     def scalar(name: str) -> float:
         return float(paces.read(name)[0])
 
     while True:
-        guide.verify()
-        guide.resume()
+        guide.confirm_events()
+        guide.resume_paused()
         code, t = int(scalar("status")), scalar("t")
-        outcome.undefined = not math.isfinite(scalar("value"))
-        if code == Code.EVENT:
+        outcome.is_event_undefined = not math.isfinite(scalar("event_value"))
+        if code == StatusCode.EVENT:
             outcome.event_time = t
-        if code != Code.COMPLETED:
+        if code != StatusCode.COMPLETED:
             break
         if int(outcome.state.step) >= most_kept:
-            outcome.limit = "memory"
+            outcome.exhausted_limit = "memory"
             return
         before = outcome.state
         try:
-            rows = paces.attempts(int(min(together, max(1.0, most_kept - int(before.step)))))
+            rows = paces.attempt_records(int(min(together, max(1.0, most_kept - int(before.step)))))
         except UnsupportedPrimitive as error:
-            guide.paces = paces = engine.instead(error, pacing, paces)
+            guide.adaptive_runs = paces = engine.fall_back_adaptive(error, pacing, paces)
             continue
-        outcome.rejected = int(scalar("rejected"))
-        outcome.state = _running(paces.state())
+        outcome.n_rejected = int(scalar("n_rejected"))
+        outcome.state = _clear_pause_status(paces.state())
         if (taken := np.diff(rows["step"], prepend=int(before.step)) > 0).any():  # some attempts do not count
-            x, energy, entropy, number, ends, h = (rows[name][taken] for name in TOLD)
+            x, energy, entropy, number, ends, h = (rows[name][taken] for name in ATTEMPT_FIELDS)
             try:
-                caught = watch.of_step(engine, t, h[0], ends[0], before, outcome.state) if watch else None
+                caught = watch.find_events(engine, t, h[0], ends[0], before, outcome.state) if watch else None
             except UnknownStateError as error:
-                outcome.state, outcome.unknown = before, error
+                outcome.state, outcome.unknown_state_error = before, error
                 return
             if caught:
                 outcome.event_time, part, at = caught
                 outcome.state = before if at is None else at
                 if at is not None:
-                    keep(_single(t, outcome.event_time, part, before, at))
+                    keep(_single_step(t, outcome.event_time, part, before, at))
                 return
-            keep(Steps(np.append(t, ends), h, x, energy, entropy, number, before, outcome.state))
-    if code == Code.STEP_LIMIT:
-        outcome.limit = "steps"
-    elif code == Code.STEP_UNDERFLOW:
-        outcome.underflow = scalar("proposed")
-        outcome.state = outcome.state._replace(status=np.int64(scalar("cause")), residual=scalar("residual"))
-    elif code not in (Code.EVENT, FINISHED):
+            keep(AcceptedSteps(np.append(t, ends), h, x, energy, entropy, number, before, outcome.state))
+    if code == StatusCode.STEP_LIMIT:
+        outcome.exhausted_limit = "steps"
+    elif code == StatusCode.STEP_UNDERFLOW:
+        outcome.underflow_step_size = scalar("next_step_size")
+        outcome.state = outcome.state._replace(
+            status=np.int64(scalar("last_attempt_status")), residual=scalar("residual")
+        )
+    elif code not in (StatusCode.EVENT, REACHED_END):
         outcome.state = outcome.state._replace(status=np.int64(code), residual=scalar("residual"))
-        outcome.limit = "sight" if scalar("cause") == Code.COMPLETED else ""
+        outcome.exhausted_limit = "sight" if scalar("last_attempt_status") == StatusCode.COMPLETED else ""
 
 
-def _running(state: State) -> State:
+def _clear_pause_status(state: State) -> State:
     """Return a state of a run that goes on, in place of one with the reason of a pause."""
     return state._replace(status=np.int64(0))  # type: ignore[arg-type]
 
 
-def _single(t: float, end: float, h: float, before: State, after: State) -> Steps:
-    x, energy, entropy, number = (np.asarray(getattr(after, name))[None] for name in TOLD[:4])
-    return Steps(np.array([t, end]), np.array([h]), x, energy, entropy, number, before, after)
+def _single_step(t: float, end: float, h: float, before: State, after: State) -> AcceptedSteps:
+    x, energy, entropy, number = (np.asarray(getattr(after, name))[None] for name in ATTEMPT_FIELDS[:4])
+    return AcceptedSteps(np.array([t, end]), np.array([h]), x, energy, entropy, number, before, after)

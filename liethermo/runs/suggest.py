@@ -9,20 +9,20 @@ from itertools import pairwise
 
 import numpy as np
 
-from manifolds._precision import by_own_settings
+from manifolds._precision import with_library_settings
 
-from ..engines.choice import Chosen
-from ..engines.pacing import DEADBAND, rate_of
+from ..engines.choice import EngineWithFallback
+from ..engines.pacing import DEADBAND, growth_rate_at
 from ..errors import InputError, LiethermoError
 from ..integrators import DEFAULT_METHOD, MetriplecticGauss, MetriplecticRungeKutta, MetriplecticTaylor, OneStepMethod
-from ..integrators.taylor import order_for
+from ..integrators.taylor import order_for_tolerance
 from ..systems import System
-from .adaptive import Adaptive, pacing_of
-from .preparation import of_steps, started
-from .stepwise import Outcome, Steps, follow
+from .adaptive import Adaptive, make_step_control
+from .preparation import checked_initial_state, prepare_for_method
+from .stepwise import AcceptedSteps, RunOutcome, advance_to_end
 
 
-@by_own_settings
+@with_library_settings
 def suggest_step(system: System, x0, rtol: float = 1e-8, method: OneStepMethod | None = None, t0: float = 0.0) -> float:
     """A step size for fixed steps as accurate as those of ``lt.Adaptive(rtol)``, near x0.
 
@@ -55,7 +55,7 @@ def suggest_step(system: System, x0, rtol: float = 1e-8, method: OneStepMethod |
     >>> bool(0.01 < step < 2.0)
     True
     """
-    return _tried(system, x0, rtol, DEFAULT_METHOD if method is None else method, t0).step
+    return _try_method(system, x0, rtol, DEFAULT_METHOD if method is None else method, t0).step
 
 
 @dataclass(frozen=True)
@@ -106,10 +106,10 @@ class MethodSuggestion:
         return "\n".join([*lines, self.reason])
 
 
-CANDIDATES = (*map(MetriplecticRungeKutta, (4, 6, 8)), *map(MetriplecticGauss, (1, 2, 3, 4)))
+CANDIDATE_METHODS = (*map(MetriplecticRungeKutta, (4, 6, 8)), *map(MetriplecticGauss, (1, 2, 3, 4)))
 
 
-@by_own_settings
+@with_library_settings
 def suggest_method(system: System, x0, rtol: float = 1e-8, t0: float = 0.0) -> MethodSuggestion:
     """The method, of those that keep both laws, that reaches an accuracy with the least work near x0.
 
@@ -135,9 +135,9 @@ def suggest_method(system: System, x0, rtol: float = 1e-8, t0: float = 0.0) -> M
     True
     """
     trials, refusals = [], []
-    for method in (*CANDIDATES, MetriplecticTaylor(order_for(rtol))):
+    for method in (*CANDIDATE_METHODS, MetriplecticTaylor(order_for_tolerance(rtol))):
         try:
-            trials.append(_tried(system, x0, rtol, method, t0))
+            trials.append(_try_method(system, x0, rtol, method, t0))
         except LiethermoError as error:
             refusals.append(f"{method}: {error}")
     if not trials:
@@ -156,43 +156,45 @@ def suggest_method(system: System, x0, rtol: float = 1e-8, t0: float = 0.0) -> M
     return MethodSuggestion(reason, tuple(trials))
 
 
-def _tried(system: System, x0, rtol: float, method: OneStepMethod, t0: float) -> Trial:
-    system, used = of_steps(system, method, rtol)
+def _try_method(system: System, x0, rtol: float, method: OneStepMethod, t0: float) -> Trial:
+    system, used = prepare_for_method(system, method, rtol)
     used.check(system)
-    x = np.asarray(started(system, used, x0, t0))
+    x = np.asarray(checked_initial_state(system, used, x0, t0))
     speed, size = float(np.abs(np.asarray(system.vector_field(x))).max()), float(np.abs(x).max())
     if not speed > 0.0:
         raise InputError("nothing moves at this state, so there is no step to suggest: start elsewhere")
     taken: list[float] = []
     iterations = [0]
 
-    def keep(steps: Steps):
+    def record_first_step(steps: AcceptedSteps):
         taken.append(float(steps.h[0]))
-        iterations.append(int(steps.after.fixed_point) + int(steps.after.newton))
+        iterations.append(int(steps.state_after.fixed_point_iterations) + int(steps.state_after.newton_iterations))
         if len(taken) == 30:
-            raise _EnoughError
+            raise _TrialCompleteError
 
-    def tried(rate: float) -> Outcome:
+    def run_trial(rate: float) -> RunOutcome:
         """Over a span in which what goes at this rate goes far."""
         taken.clear()
         iterations[1:] = []
         length = 1e6 / rate
-        pacing = pacing_of(Adaptive(rtol), used, length, None)
-        paces = engine.paces(pacing, x, 0.0, length, length)
-        return follow(engine, paces, pacing, np.array([length]), keep, together=1)  # since iterations are counted
+        pacing = make_step_control(Adaptive(rtol), used, length, None)
+        paces = engine.start_adaptive(pacing, x, 0.0, length, length)
+        return advance_to_end(
+            engine, paces, pacing, np.array([length]), record_first_step, attempts_per_call=1
+        )  # since iterations are counted
 
-    with contextlib.suppress(_EnoughError):
-        engine, rate = Chosen(system, used, "auto", 1), speed / max(size, 1e-300)
-        if tried(rate).underflow is not None and (growth := rate_of(system, used, x)) > rate:
-            tried(growth)  # from near a rest, where steps are short beside the time that the state takes
+    with contextlib.suppress(_TrialCompleteError):
+        engine, rate = EngineWithFallback(system, used, "auto", 1), speed / max(size, 1e-300)
+        if run_trial(rate).underflow_step_size is not None and (growth := growth_rate_at(system, used, x)) > rate:
+            run_trial(growth)  # from near a rest, where steps are short beside the time that the state takes
     if len(taken) < 2:
         raise InputError(f"no step from this state is as accurate as {rtol:g}: {len(taken)} steps were taken")
     settled = next((i for i, (a, b) in enumerate(pairwise(taken)) if b < DEADBAND[1] * a), len(taken) - 1)
     h = min(taken[settled:])
     digits = 1 - math.floor(math.log10(h))
-    work = used.evaluations * (iterations[-1] - iterations[settled]) / sum(taken[settled:])
+    work = used.evaluations_per_iteration * (iterations[-1] - iterations[settled]) / sum(taken[settled:])
     return Trial(method, math.floor(h * 10.0**digits) / 10.0**digits, work)
 
 
-class _EnoughError(Exception):
+class _TrialCompleteError(Exception):
     """Ends a run that has served its purpose."""

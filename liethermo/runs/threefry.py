@@ -14,7 +14,7 @@ import scipy
 ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 PARITY = np.uint32(0x1BD11BDA)
 
-BLOCK = 1 << 15
+VALUES_PER_BLOCK = 1 << 15
 """Numbers that are made at once: they stay in the cache."""
 
 
@@ -30,7 +30,7 @@ def threefry(key, counter) -> tuple[np.ndarray, np.ndarray]:
     return x, y
 
 
-def folded(seed: int, places: Sequence[np.ndarray]) -> np.ndarray:
+def grid_seeds(seed: int, places: Sequence[np.ndarray]) -> np.ndarray:
     """A seed below 2^63 for each point of a grid, from one seed and its places along the axes, shape (points,) each."""
     count = len(places[0]) if places else 1
     key = np.full(count, seed >> 32, np.uint32), np.full(count, seed & 0xFFFFFFFF, np.uint32)
@@ -39,7 +39,7 @@ def folded(seed: int, places: Sequence[np.ndarray]) -> np.ndarray:
     return (key[0].astype(np.int64) & 0x7FFFFFFF) << 32 | key[1].astype(np.int64)
 
 
-def derived(key, *counters) -> tuple[np.ndarray, np.ndarray]:
+def derive_key(key, *counters) -> tuple[np.ndarray, np.ndarray]:
     """The key that a chain of counters leads to from a key: each is encrypted with the words that the last one gave."""
     for counter in counters:
         key = threefry(key, tuple(np.asarray(word).astype(np.uint32) for word in counter))
@@ -52,7 +52,7 @@ def split_words(numbers) -> tuple[np.ndarray, np.ndarray]:
     return (numbers >> np.uint64(32)).astype(np.uint32), numbers.astype(np.uint32)
 
 
-def normal(key, steps: np.ndarray, count: int) -> np.ndarray:
+def normal_numbers(key, steps: np.ndarray, count: int) -> np.ndarray:
     """Normal numbers with the counters (step, place) under each key, shape (keys, steps, count).
 
     Parameters
@@ -65,7 +65,7 @@ def normal(key, steps: np.ndarray, count: int) -> np.ndarray:
     """
     numbers = np.empty((len(key[0]), len(steps), count))
     places = np.arange(count, dtype=np.uint32)
-    portion = max(1, BLOCK // max(count, 1))
+    portion = max(1, VALUES_PER_BLOCK // max(count, 1))
     together = max(1, portion // max(len(steps), 1))
     for i in range(0, len(numbers), together):
         keys = key[0][i : i + together, None, None], key[1][i : i + together, None, None]

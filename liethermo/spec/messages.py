@@ -13,30 +13,32 @@ from typing import Any
 from pydantic_core import PydanticCustomError
 
 
-def refusal(message: str) -> PydanticCustomError:
+def validation_error(message: str) -> PydanticCustomError:
     return PydanticCustomError("refused", "{message}", {"message": message})
 
 
-def shown(value) -> str:
+def format_value(value) -> str:
     """A value nearly as the file has it."""
     text = json.dumps(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def given(key: str, table: Mapping[str, Any]) -> str:
+def format_table(key: str, table: Mapping[str, Any]) -> str:
     """All that a table says, with the full keys."""
     return ", ".join(
-        given(f"{key}.{name}", value) if isinstance(value, dict) and value else f"{key}.{name} = {shown(value)}"
+        format_table(f"{key}.{name}", value)
+        if isinstance(value, dict) and value
+        else f"{key}.{name} = {format_value(value)}"
         for name, value in table.items()
     )
 
 
-def suggestion(word: str, options: Iterable[str]) -> str:
+def suggest_match(word: str, options: Iterable[str]) -> str:
     close = difflib.get_close_matches(word, options, n=1)
     return f" (did you mean {close[0]}?)" if close else ""
 
 
-def raised(error: Exception, function: Callable) -> str:
+def describe_exception(error: Exception, function: Callable) -> str:
     """What a function raised and, unless it is the library's own message, in which of its lines."""
     if type(error).__module__.split(".")[0] in ("liethermo", "manifolds"):
         return str(error)

@@ -18,10 +18,10 @@ from ..integrators import DEFAULT_METHOD, METHODS
 from ..runs.adaptive import Adaptive
 from ..runs.events import Relaxed
 from ..systems import System
-from .checking import arguments, checked
-from .messages import given, raised, shown, suggestion
-from .schema import SECTIONS, AdaptiveStep, File, Method, Model, Outputs, Run, StudyOfFile
-from .trust import imported
+from .checking import validate_arguments, validate_table
+from .messages import describe_exception, format_table, format_value, suggest_match
+from .schema import SECTIONS, AdaptiveStep, Method, Model, Outputs, Run, SpecContents, StudySection
+from .trust import import_function
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Spec:
     method: Any
     run: Run
     outputs: Outputs
-    study: StudyOfFile | None = None
+    study: StudySection | None = None
 
     @property
     def step(self) -> float | Adaptive:
@@ -65,7 +65,7 @@ class Spec:
         return None if self.run.until is None else Relaxed(self.run.until.relaxed)
 
     @property
-    def allowed(self) -> dict[str, Any]:
+    def model_arguments(self) -> dict[str, Any]:
         """The arguments that the model takes, with their values in this file or their defaults."""
         taken = inspect.signature(self.build).parameters.values()
         defaults = {p.name: None if p.default is p.empty else p.default for p in taken if p.kind is not p.VAR_KEYWORD}
@@ -76,9 +76,9 @@ class Spec:
         """The run in a line."""
         start, end = self.run.t_span
         step = self.step if isinstance(self.step, Adaptive) else f"step {self.step:g}"
-        return f"{self.model}, {self.method}, {step}, t = {start:g} to {end:g}"
+        return f"{self.model_name}, {self.method}, {step}, t = {start:g} to {end:g}"
 
-    def system(self) -> System:
+    def build_system(self) -> System:
         """The system, which the initial state has been seen to fit.
 
         Raises
@@ -93,25 +93,25 @@ class Spec:
         except AxiomError:
             raise
         except Exception as error:  # the function may be anyone's
-            raise self._refused(raised(error, self.build)) from error
+            raise self._model_error(describe_exception(error, self.build)) from error
         if not isinstance(system, System):
-            raise self._refused(f"it returned {system!r:.60}, not a system such as lt.LiePoissonSystem")
+            raise self._model_error(f"it returned {system!r:.60}, not a system such as lt.LiePoissonSystem")
         try:
             system.state(self.run.initial)
         except InputError as error:
-            raise SpecError(self.path, [f"run.initial = {shown(self.run.initial)}: {error}"]) from error
+            raise SpecError(self.path, [f"run.initial = {format_value(self.run.initial)}: {error}"]) from error
         if "momentum_sphere" in self.outputs.figures and system.body_dim != 3:
             problem = f"momentum_sphere needs states of 3 components, and these have {system.body_dim}"
-            raise SpecError(self.path, [f"outputs.figures = {shown(self.outputs.figures)}: {problem}"])
+            raise SpecError(self.path, [f"outputs.figures = {format_value(self.outputs.figures)}: {problem}"])
         return system
 
     @property
-    def model(self) -> str:
+    def model_name(self) -> str:
         """The name of the model, or ``module:function``."""
         return self.table["model"].get("name") or self.table["model"]["function"]
 
-    def _refused(self, why: str) -> SpecError:
-        return SpecError(self.path, [f"{given('model', self.table['model'])}: {why}"])
+    def _model_error(self, why: str) -> SpecError:
+        return SpecError(self.path, [f"{format_table('model', self.table['model'])}: {why}"])
 
 
 def read(
@@ -140,36 +140,36 @@ def read(
         With all that is wrong in it.
     """
     path = Path(path)
-    table = _parse(path)
+    table = _parse_file(path)
     problems: list[str] = []
     for change in changes:
-        _change(table, change, problems)
-    checked("", File, table, problems, "a spec file")
+        _apply_change(table, change, problems)
+    validate_table("", SpecContents, table, problems, "a spec file")
     needed = [name for name in SECTIONS if name != "study" or "study" in table]
-    found = {name: checked(name, SECTIONS[name], table.get(name, {}), problems, f"[{name}]") for name in needed}
+    found = {name: validate_table(name, SECTIONS[name], table.get(name, {}), problems, f"[{name}]") for name in needed}
     model, run, method, outputs = (found[name] for name in ("model", "run", "method", "outputs"))
-    build: Any = model and _builder(model, path.resolve().parent, allow, tell, problems)
-    parameters: Any = build and arguments("model.parameters", build, model.parameters, problems)
-    integrator = method and _integrator(method, problems)
+    build: Any = model and _model_function(model, path.resolve().parent, allow, tell, problems)
+    parameters: Any = build and validate_arguments("model.parameters", build, model.parameters, problems)
+    integrator = method and _build_method(method, problems)
     if problems:
         raise SpecError(path, problems)
     return Spec(path, table, build, parameters, integrator, run, outputs, found.get("study"))
 
 
-LARGEST = 2**20
+MAX_SPEC_BYTES = 2**20
 """Bytes of a spec file."""
 
-DEEPEST = 100
+MAX_KEY_PARTS = 100
 """Parts of a key."""
 
 
-def _parse(path: Path) -> dict[str, Any]:
+def _parse_file(path: Path) -> dict[str, Any]:
     try:
         with open(path, "rb") as file:
-            content = file.read(LARGEST + 1)
-        if len(content) > LARGEST:
-            raise SpecError(path, [f"it is larger than the {LARGEST // 2**20} MB that a spec file has at most"])
-        return _table(content.decode("utf-8"))
+            content = file.read(MAX_SPEC_BYTES + 1)
+        if len(content) > MAX_SPEC_BYTES:
+            raise SpecError(path, [f"it is larger than the {MAX_SPEC_BYTES // 2**20} MB that a spec file has at most"])
+        return _parse_toml(content.decode("utf-8"))
     except OSError as error:
         if isinstance(error, FileError):
             raise
@@ -182,29 +182,29 @@ def _parse(path: Path) -> dict[str, Any]:
         raise SpecError(path, [f"it is not valid TOML: {error}"]) from error
 
 
-def _table(text: str) -> dict[str, Any]:
+def _parse_toml(text: str) -> dict[str, Any]:
     """TOML as JSON data; ValueError where it is not valid, or has parts inside parts without end."""
     for number, line in enumerate(text.splitlines(), start=1):
-        if line.partition("=")[0].count(".") > DEEPEST and not line.lstrip().startswith("#"):
-            raise ValueError(f"a key of more than {DEEPEST} parts (at line {number})")
+        if line.partition("=")[0].count(".") > MAX_KEY_PARTS and not line.lstrip().startswith("#"):
+            raise ValueError(f"a key of more than {MAX_KEY_PARTS} parts (at line {number})")
     try:
         return json.loads(json.dumps(tomllib.loads(text), default=str))  # dates and times, which no key takes: texts
     except RecursionError:
         raise ValueError("it has lists or tables inside each other, too many") from None
 
 
-def _change(table: dict[str, Any], change: str, problems: list[str]) -> None:
+def _apply_change(table: dict[str, Any], change: str, problems: list[str]) -> None:
     """Make one change to the content of a file."""
     key, equals, text = change.partition("=")
     parts = key.strip().split(".")
     if not equals or not all(parts):
         problems.append(f"--set {change}: must be section.key=value, such as run.step=0.01")
         return
-    if len(parts) > DEEPEST:
-        problems.append(f"--set {change:.60}...: a key of more than {DEEPEST} parts")
+    if len(parts) > MAX_KEY_PARTS:
+        problems.append(f"--set {change:.60}...: a key of more than {MAX_KEY_PARTS} parts")
         return
     try:
-        value = _table(f"value = {text}")["value"]
+        value = _parse_toml(f"value = {text}")["value"]
     except (ValueError, KeyError):
         value = text.strip()  # a text without quotes, which a shell takes away
     for part in parts[:-1]:
@@ -215,7 +215,7 @@ def _change(table: dict[str, Any], change: str, problems: list[str]) -> None:
     table[parts[-1]] = value
 
 
-def _builder(
+def _model_function(
     model: Model, folder: Path, allow: Sequence[str], tell: Callable[[str], object] | None, problems: list[str]
 ) -> Callable[..., System] | None:
     """The function that the section ``[model]`` names."""
@@ -223,26 +223,26 @@ def _builder(
         return getattr(models, model.name)
     if model.function is not None and model.name is None:
         try:
-            return imported(model.function, folder, allow, tell)
+            return import_function(model.function, folder, allow, tell)
         except InputError as error:
-            problems.append(f"model.function = {shown(model.function)}: {error}")
+            problems.append(f"model.function = {format_value(model.function)}: {error}")
             return None
-    names = ", ".join(map(shown, models.__all__))
+    names = ", ".join(map(format_value, models.__all__))
     problems.append(f'model: give either name (one of {names}) or function = "module:function", not both')
     return None
 
 
-def _integrator(method: Method, problems: list[str]):
+def _build_method(method: Method, problems: list[str]):
     if method.name is None and not method.model_extra:
         return DEFAULT_METHOD
     kind = METHODS[method.name or "MetriplecticMidpoint"]
-    options = arguments("method", kind, method.model_extra or {}, problems)
+    options = validate_arguments("method", kind, method.model_extra or {}, problems)
     if options is None:
         return None
     try:
         return kind(**options)
     except (TypeError, ValueError) as error:
         listed = set(re.findall(r"\w+", str(error))).difference(map(str, options.values()))  # what the message allows
-        hints = [suggestion(value, listed) for value in options.values() if isinstance(value, str)]
-        problems.append(f"{given('method', options)}: {error}{''.join(hints)}")
+        hints = [suggest_match(value, listed) for value in options.values() if isinstance(value, str)]
+        problems.append(f"{format_table('method', options)}: {error}{''.join(hints)}")
         return None

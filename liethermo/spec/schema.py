@@ -10,13 +10,13 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Dis
 
 from .. import models
 from ..integrators import METHODS
-from .messages import refusal, shown, suggestion
+from .messages import format_value, suggest_match, validation_error
 
 FIGURES = ("momentum_sphere", "laws")
 FORMATS = ("png", "pdf", "svg")
 
 
-LONGEST = 10**7
+MAX_AXIS_VALUES = 10**7
 """Values of an axis."""
 
 
@@ -25,21 +25,23 @@ def one_of(options: Iterable[str]) -> BeforeValidator:
 
     def check(value):
         if value not in allowed:
-            raise refusal(f"must be one of {', '.join(map(shown, allowed))}{suggestion(str(value), allowed)}")
+            raise validation_error(
+                f"must be one of {', '.join(map(format_value, allowed))}{suggest_match(str(value), allowed)}"
+            )
         return value
 
     return BeforeValidator(check)
 
 
-def _increasing(span: tuple[float, float]) -> tuple[float, float]:
+def _require_increasing(span: tuple[float, float]) -> tuple[float, float]:
     if span[1] <= span[0]:
-        raise refusal("must increase: time runs forwards, since entropy grows")
+        raise validation_error("must increase: time runs forwards, since entropy grows")
     return span
 
 
-def _netcdf_name(name: str) -> str:
+def _require_netcdf_name(name: str) -> str:
     if not re.fullmatch(r"[^/\\]+\.nc", name):
-        raise refusal('must be a file name that ends in .nc, without a folder, such as "solution.nc"')
+        raise validation_error('must be a file name that ends in .nc, without a folder, such as "solution.nc"')
     return name
 
 
@@ -47,7 +49,7 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
 
-class File(Section):
+class SpecContents(Section):
     """The whole file."""
 
     model: Any = None
@@ -79,18 +81,18 @@ class AdaptiveStep(Section):
     largest: FiniteFloat | None = Field(None, gt=0, description="no step is longer")
 
 
-class Until(Section):
+class StopCondition(Section):
     """Where a run ends before its time."""
 
     relaxed: FiniteFloat = Field(gt=0, description="the rate of relaxation below which the run ends: `lt.Relaxed(tol)`")
 
 
-def _kind(value: Any) -> str:
+def _step_tag(value: Any) -> str:
     return "table" if isinstance(value, dict) else "number"
 
 
 Step = Annotated[
-    Annotated[FiniteFloat, Field(gt=0), Tag("number")] | Annotated[AdaptiveStep, Tag("table")], Discriminator(_kind)
+    Annotated[FiniteFloat, Field(gt=0), Tag("number")] | Annotated[AdaptiveStep, Tag("table")], Discriminator(_step_tag)
 ]
 
 
@@ -98,12 +100,14 @@ class Run(Section):
     """The initial state, the span of time, and the steps."""
 
     initial: list[FiniteFloat] = Field(min_length=1, description="the state to start from, a list of numbers")
-    t_span: Annotated[tuple[FiniteFloat, FiniteFloat], AfterValidator(_increasing)] = Field(
+    t_span: Annotated[tuple[FiniteFloat, FiniteFloat], AfterValidator(_require_increasing)] = Field(
         description="start and end, for example [0.0, 100.0]"
     )
     step: Step = Field(description="the step size, a number greater than 0, or {adaptive = 1e-8}")
     save_every: int = Field(1, ge=1, description="every n-th state is kept, n this number")
-    until: Until | None = Field(None, description="where the run ends before its time, for example {relaxed = 1e-8}")
+    until: StopCondition | None = Field(
+        None, description="where the run ends before its time, for example {relaxed = 1e-8}"
+    )
     attitude: list[list[FiniteFloat]] | None = Field(
         None, description="the element of the group at the start, a matrix, where the system has a group"
     )
@@ -122,47 +126,49 @@ class Method(BaseModel):
 class Outputs(Section):
     """What `liethermo run` writes into its folder."""
 
-    netcdf: Annotated[str, AfterValidator(_netcdf_name)] = Field("solution.nc", description="the file of the solution")
+    netcdf: Annotated[str, AfterValidator(_require_netcdf_name)] = Field(
+        "solution.nc", description="the file of the solution"
+    )
     figures: list[Annotated[str, one_of(FIGURES)]] = Field(["laws"], description=f"some of {', '.join(FIGURES)}")
     figure_format: Annotated[str, one_of(FORMATS)] = Field("png", description=f"one of {', '.join(FORMATS)}")
 
 
-class Points(Section):
+class EvenlySpacedAxis(Section):
     """Values of an axis that lie evenly."""
 
     first: FiniteFloat = Field(description="the first value")
     last: FiniteFloat = Field(description="the last value")
-    points: int = Field(ge=1, le=LONGEST, description="how many")
+    points: int = Field(ge=1, le=MAX_AXIS_VALUES, description="how many")
     scale: Annotated[str, one_of(("linear", "log"))] = Field("linear", description="linear, or log")
 
 
-class Sample(Section):
+class SampledAxis(Section):
     """Several parameters that vary together along an axis."""
 
     zip: dict[str, list[FiniteFloat]] | None = Field(None, description="equally many values of each parameter")
     latin_hypercube: int | None = Field(
-        None, ge=1, le=LONGEST, description="points of a Latin hypercube, with `ranges`"
+        None, ge=1, le=MAX_AXIS_VALUES, description="points of a Latin hypercube, with `ranges`"
     )
-    sobol: int | None = Field(None, ge=1, le=LONGEST, description="points of a Sobol sequence, with `ranges`")
+    sobol: int | None = Field(None, ge=1, le=MAX_AXIS_VALUES, description="points of a Sobol sequence, with `ranges`")
     ranges: dict[str, list[FiniteFloat | str]] | None = Field(
         None, description='of each parameter [low, high], or [low, high, "log"]'
     )
     seed: int = Field(0, ge=0, description="of the sample")
 
 
-def _sort(value: Any) -> str:
+def _axis_tag(value: Any) -> str:
     return "list" if not isinstance(value, dict) else "points" if "points" in value else "sample"
 
 
-AxisOfFile = Annotated[
+AxisEntry = Annotated[
     Annotated[list[FiniteFloat | str], Field(min_length=1), Tag("list")]
-    | Annotated[Points, Tag("points")]
-    | Annotated[Sample, Tag("sample")],
-    Discriminator(_sort),
+    | Annotated[EvenlySpacedAxis, Tag("points")]
+    | Annotated[SampledAxis, Tag("sample")],
+    Discriminator(_axis_tag),
 ]
 
 
-class MeasureOfFile(Section):
+class MeasureTable(Section):
     """A measure with a parameter."""
 
     relaxed: FiniteFloat | None = Field(
@@ -172,22 +178,24 @@ class MeasureOfFile(Section):
     what: str = Field("x", description="of which series: x, energy, entropy or attitude")
 
 
-def _word(value: Any) -> str:
+def _measure_tag(value: Any) -> str:
     return "measure" if isinstance(value, dict) else "word"
 
 
-Measured = Annotated[Annotated[str, Tag("word")] | Annotated[MeasureOfFile, Tag("measure")], Discriminator(_word)]
+MeasureEntry = Annotated[
+    Annotated[str, Tag("word")] | Annotated[MeasureTable, Tag("measure")], Discriminator(_measure_tag)
+]
 
 
-class StudyOfFile(Section):
+class StudySection(Section):
     """What `liethermo study` runs: the axes, and what is kept of each point."""
 
-    axes: dict[str, AxisOfFile] = Field(
+    axes: dict[str, AxisEntry] = Field(
         min_length=1,
         description="by parameters of the model, entries of them or of the state (`rate`, `inertia[0]`, `initial[2]`): "
         "lists of values, {first, last, points, scale}, or {zip = ...}, {latin_hypercube, ranges, seed}, {sobol, ...}",
     )
-    measure: dict[str, Measured] = Field(
+    measure: dict[str, MeasureEntry] = Field(
         {"final": "final"},
         min_length=1,
         description='what is kept, by names of yours: `"final"`, `"relaxation_time"`, ..., {relaxed = 1e-8}, or '
@@ -199,17 +207,19 @@ class StudyOfFile(Section):
     figure: str | None = Field(None, description="the measure that is drawn; by default the first that can be")
 
 
-SECTIONS = {"model": Model, "run": Run, "method": Method, "outputs": Outputs, "study": StudyOfFile}
+SECTIONS = {"model": Model, "run": Run, "method": Method, "outputs": Outputs, "study": StudySection}
 
 
-def keys() -> list[tuple[str, str, str, str]]:
+def list_spec_keys() -> list[tuple[str, str, str, str]]:
     """Every key of a spec file with its section, its default and what it is, as the documentation lists them."""
-    tables = {"run.step": AdaptiveStep, "run.until": Until, "study.axes.NAME": (Points, Sample)}
-    parts = [*SECTIONS.items(), *tables.items(), ("study.measure.NAME", MeasureOfFile)]
+    tables = {"run.step": AdaptiveStep, "run.until": StopCondition, "study.axes.NAME": (EvenlySpacedAxis, SampledAxis)}
+    parts = [*SECTIONS.items(), *tables.items(), ("study.measure.NAME", MeasureTable)]
     found = []
     for section, schemas in parts:
         for schema in schemas if isinstance(schemas, tuple) else (schemas,):
             for name, field in schema.model_fields.items():
-                default = "needed" if field.is_required() else "" if field.default is None else shown(field.default)
+                default = (
+                    "needed" if field.is_required() else "" if field.default is None else format_value(field.default)
+                )
                 found.append((section, name, default, field.description or ""))
     return found

@@ -18,10 +18,10 @@ from types import ModuleType
 from typing import Any
 
 from ..errors import InputError
-from .messages import suggestion
+from .messages import suggest_match
 
 
-def imported(
+def import_function(
     target: str, folder: Path, allow: Sequence[str] = (), tell: Callable[[str], object] | None = None
 ) -> Callable[..., Any]:
     """The function that ``module:function`` names.
@@ -53,34 +53,34 @@ def imported(
     if tell is not None:
         tell(f"imports {name}{'' if file is None else f' from {file}'}")
     try:
-        module = _found(name, folder) if file is None else _loaded(name, file, folder)
+        module = _import_installed(name, folder) if file is None else _load_from_file(name, file, folder)
     except InputError:
         raise
     except Exception as error:
         raise InputError(f"importing {name!r} failed with {type(error).__name__}: {error}") from error
-    own = [key for key, value in vars(module).items() if _is_own(value, module)]
+    own = [key for key, value in vars(module).items() if _is_defined_in(value, module)]
     if function not in own:
         where = "is only imported there" if hasattr(module, function) else "is not there"
-        raise InputError(f"{name} defines no function {function!r}: it {where}{suggestion(function, own)}")
+        raise InputError(f"{name} defines no function {function!r}: it {where}{suggest_match(function, own)}")
     return getattr(module, function)
 
 
-def _is_own(value: Any, module: ModuleType) -> bool:
+def _is_defined_in(value: Any, module: ModuleType) -> bool:
     """Whether a module defines a function, and has it not from elsewhere."""
     return (inspect.isfunction(value) or inspect.isclass(value)) and value.__module__ == module.__name__
 
 
-def _found(name: str, folder: Path) -> ModuleType:
-    with _importable(Path.cwd(), folder):
+def _import_installed(name: str, folder: Path) -> ModuleType:
+    with _extended_import_path(Path.cwd(), folder):
         return importlib.import_module(name)
 
 
-def _loaded(name: str, file: Path, folder: Path) -> ModuleType:
+def _load_from_file(name: str, file: Path, folder: Path) -> ModuleType:
     """The module in a file; it is the one of this name."""
     known = sys.modules.get(name)
     if known is not None and getattr(known, "__file__", None) == str(file):
         return known
-    if name not in _ours and (known is not None or _is_installed(name.partition(".")[0], folder)):
+    if name not in _spec_module_names and (known is not None or _is_installed(name.partition(".")[0], folder)):
         raise InputError(f"there is another module {name!r}: call {file.name} something else")
     spec = importlib.util.spec_from_file_location(name, file)
     assert spec is not None
@@ -88,12 +88,12 @@ def _loaded(name: str, file: Path, folder: Path) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     try:
-        with _importable(folder):
+        with _extended_import_path(folder):
             spec.loader.exec_module(module)
     except BaseException:
         del sys.modules[name]
         raise
-    _ours.add(name)
+    _spec_module_names.add(name)
     return module
 
 
@@ -111,11 +111,11 @@ def _is_installed(name: str, folder: Path) -> bool:
 
 
 @contextlib.contextmanager
-def sent(folder: Path) -> Iterator[None]:
+def pickle_by_value(folder: Path) -> Iterator[None]:
     """What is defined beside a spec is sent to the workers of a cluster as it is: they cannot import it."""
     import cloudpickle
 
-    own = [m for name, m in list(sys.modules.items()) if name in _ours or _folder_of(m) == folder]
+    own = [m for name, m in list(sys.modules.items()) if name in _spec_module_names or _module_folder(m) == folder]
     for module in own:
         cloudpickle.register_pickle_by_value(module)
     try:
@@ -125,17 +125,17 @@ def sent(folder: Path) -> Iterator[None]:
             cloudpickle.unregister_pickle_by_value(module)
 
 
-def _folder_of(module: ModuleType) -> Path | None:
+def _module_folder(module: ModuleType) -> Path | None:
     file = getattr(module, "__file__", None)
     return Path(file).parent if file else None
 
 
-_ours: set[str] = set()
+_spec_module_names: set[str] = set()
 """Names of the modules that were beside spec files."""
 
 
 @contextlib.contextmanager
-def _importable(*folders: Path) -> Iterator[None]:
+def _extended_import_path(*folders: Path) -> Iterator[None]:
     """For the time of an import, and behind all that is installed: a file beside a spec shadows nothing."""
     before = list(sys.path)
     sys.path += [str(folder) for folder in folders if str(folder) not in sys.path]

@@ -11,20 +11,20 @@ import numpy as np
 
 from ..errors import InputError
 
-RESERVED = ("status", "message", "laws", "quantity", "zarr.json")
+RESERVED_NAMES = ("status", "message", "laws", "quantity", "zarr.json")
 """Names of what every store of a study has."""
 
-LONGEST = 100
+MAX_NAME_LENGTH = 100
 """Characters of a name, which is that of a folder."""
 
-MOST = 10**9
+MAX_POINTS = 10**9
 """Points of a study: each is a file's share, and a run."""
 
 
-def is_name(name: Any) -> bool:
+def is_valid_name(name: Any) -> bool:
     """Whether an axis, a parameter or a measure can be called so, and a folder of the store with it."""
-    plain = isinstance(name, str) and name.isprintable() and 0 < len(name) <= LONGEST
-    return plain and not name.startswith(("_", ".")) and not {"/", "\\"} & set(name) and name not in RESERVED
+    plain = isinstance(name, str) and name.isprintable() and 0 < len(name) <= MAX_NAME_LENGTH
+    return plain and not name.startswith(("_", ".")) and not {"/", "\\"} & set(name) and name not in RESERVED_NAMES
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def zipped(**columns) -> Zipped:
     InputError
         If their lengths differ.
     """
-    found = {name: _column(name, values) for name, values in columns.items()}
+    found = {name: _checked_column(name, values) for name, values in columns.items()}
     lengths = {name: len(values) for name, values in found.items()}
     if not found:
         raise InputError("zipped needs parameters: zipped(a=[1.0, 2.0], b=[3.0, 4.0])")
@@ -88,7 +88,7 @@ def replicas(states) -> Zipped:
         If the states are not such an array of finite numbers.
     """
     if np.ndim(states) == 0:
-        return Zipped({}, count=_count(states))
+        return Zipped({}, count=_checked_count(states))
     array = np.asarray(states, dtype=np.float64)
     if array.ndim != 2 or not array.size:
         raise InputError(f"replicas have initial states of shape (replicas, n), not {array.shape}")
@@ -115,7 +115,9 @@ def latin_hypercube(count: int, *, seed: int, **ranges) -> Zipped:
     """
     from scipy.stats import qmc
 
-    return _sample(lambda d: qmc.LatinHypercube(d, rng=np.random.default_rng(seed)).random(_count(count)), ranges)
+    return _scale_sample(
+        lambda d: qmc.LatinHypercube(d, rng=np.random.default_rng(seed)).random(_checked_count(count)), ranges
+    )
 
 
 def sobol(count: int, *, seed: int, **ranges) -> Zipped:
@@ -138,11 +140,11 @@ def sobol(count: int, *, seed: int, **ranges) -> Zipped:
     """
     from scipy.stats import qmc
 
-    whole = max(_count(count) - 1, 0).bit_length()
-    return _sample(lambda d: qmc.Sobol(d, rng=np.random.default_rng(seed)).random_base2(whole)[:count], ranges)
+    whole = max(_checked_count(count) - 1, 0).bit_length()
+    return _scale_sample(lambda d: qmc.Sobol(d, rng=np.random.default_rng(seed)).random_base2(whole)[:count], ranges)
 
 
-def _sample(draw, ranges: Mapping[str, Any]) -> Zipped:
+def _scale_sample(draw, ranges: Mapping[str, Any]) -> Zipped:
     if not ranges:
         raise InputError("a sample needs the ranges of parameters: rate=(0.1, 10.0, 'log')")
     for name, given in ranges.items():
@@ -160,13 +162,13 @@ def _sample(draw, ranges: Mapping[str, Any]) -> Zipped:
     return Zipped(columns)
 
 
-def _count(count) -> int:
+def _checked_count(count) -> int:
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
         raise InputError(f"a sample has a positive number of points, not {count!r}")
     return int(count)
 
 
-def _column(name: str, values) -> np.ndarray:
+def _checked_column(name: str, values) -> np.ndarray:
     """Numbers or texts, shape (m,), m > 0."""
     array = np.asarray(values)
     if array.dtype.kind == "U" and not all(isinstance(value, str) for value in np.asarray(values, dtype=object).flat):
@@ -202,10 +204,10 @@ class Axis:
     states: np.ndarray | None = None
 
     @classmethod
-    def of(cls, name: str, given) -> Axis:
+    def from_values(cls, name: str, given) -> Axis:
         if isinstance(given, Zipped):
             return cls(name, np.arange(len(given)), given.columns, given.states)
-        values = _column(name, given)
+        values = _checked_column(name, given)
         unique, first = np.unique(values, return_index=True)
         if len(unique) < len(values):
             i = int(np.setdiff1d(np.arange(len(values)), first)[0])
@@ -215,21 +217,21 @@ class Axis:
     def __len__(self) -> int:
         return len(self.labels)
 
-    def same(self, other: Axis) -> bool:
+    def has_same_values(self, other: Axis) -> bool:
         """Whether the places of another axis, of the same columns, have the same distinct numbers in its order."""
         pairs = [(self.labels, other.labels), *((column, other.columns[n]) for n, column in self.columns.items())]
         if self.states is not None or other.states is not None:
             pairs.append((np.asarray(self.states), np.asarray(other.states)))
         return all(np.array_equal(one, another) for one, another in pairs)
 
-    def rows(self) -> list[tuple]:
+    def value_keys(self) -> list[tuple]:
         """What tells the places along the axis apart; numbers that rounding alone tells apart are the same."""
-        states = [] if self.states is None else [[tuple(map(_key, row)) for row in self.states.tolist()]]
-        columns = [list(map(_key, column.tolist())) for column in self.columns.values()]
+        states = [] if self.states is None else [[tuple(map(_rounded_key, row)) for row in self.states.tolist()]]
+        columns = [list(map(_rounded_key, column.tolist())) for column in self.columns.values()]
         return list(zip(*(columns + states or [self.labels.tolist()]), strict=True))
 
 
-def _key(value: Any) -> Any:
+def _rounded_key(value: Any) -> Any:
     return float(f"{value:.12e}") if isinstance(value, float) else value
 
 
@@ -238,11 +240,11 @@ class Axes:
     """The axes of a study, in their order."""
 
     axes: tuple[Axis, ...]
-    parameters: tuple[str, ...] = field(init=False)
+    parameter_names: tuple[str, ...] = field(init=False)
 
     def __post_init__(self):
         names = [name for axis in self.axes for name in axis.columns]
-        object.__setattr__(self, "parameters", tuple(names))
+        object.__setattr__(self, "parameter_names", tuple(names))
         twice = [name for i, name in enumerate(names) if name in names[:i]]
         also = [a.name for a in self.axes if a.name in names and a.name not in a.columns]
         if twice or also:
@@ -251,18 +253,20 @@ class Axes:
             )
 
     @classmethod
-    def of(cls, given: Mapping[str, Any]) -> Axes:
+    def from_mapping(cls, given: Mapping[str, Any]) -> Axes:
         """From what :class:`Study` is given."""
         if not isinstance(given, Mapping) or not given:
             raise InputError(f'axes are a dict from names to values, such as {{"rate": [0.1, 1.0]}}, not {given!r:.60}')
         for name, values in given.items():
             for called in (name, *(values.columns if isinstance(values, Zipped) else ())):
-                if not is_name(called):
+                if not is_valid_name(called):
                     raise InputError(f"an axis cannot be called {called!r:.120}")
-        found = cls(tuple(Axis.of(name, values) for name, values in given.items()))
-        if found.size > MOST:
+        found = cls(tuple(Axis.from_values(name, values) for name, values in given.items()))
+        if found.size > MAX_POINTS:
             shape = " x ".join(map(str, found.shape))
-            raise InputError(f"a study has at most {MOST:.0e} points, and these axes have {shape}: sample them instead")
+            raise InputError(
+                f"a study has at most {MAX_POINTS:.0e} points, and these axes have {shape}: sample them instead"
+            )
         return found
 
     @property
@@ -277,19 +281,19 @@ class Axes:
     def size(self) -> int:
         return math.prod(self.shape)
 
-    def points(self, places: tuple[np.ndarray, ...]) -> dict[str, np.ndarray]:
+    def parameters_at(self, places: tuple[np.ndarray, ...]) -> dict[str, np.ndarray]:
         """The parameters at some points, whose places along each axis are given."""
         return {
             name: column[i] for axis, i in zip(self.axes, places, strict=True) for name, column in axis.columns.items()
         }
 
-    def states(self, places: tuple[np.ndarray, ...]) -> np.ndarray | None:
+    def states_at(self, places: tuple[np.ndarray, ...]) -> np.ndarray | None:
         """The initial states at some points, where an axis has some, shape (points, n)."""
         return next(
             (axis.states[i] for axis, i in zip(self.axes, places, strict=True) if axis.states is not None), None
         )
 
-    def describe(self, place: tuple[int, ...]) -> str:
+    def describe_point(self, place: tuple[int, ...]) -> str:
         """A point in words."""
         return ", ".join(
             f"{name} = {column[i]:g}" if column.dtype.kind in "fiu" else f"{name} = {column[i]}"

@@ -29,15 +29,15 @@ import numpy as np
 from .. import disk
 from ..errors import FileError
 
-DTYPES = ("int8", "int64", "float64", "complex128", "bool", "string")
+ZARR_DTYPES = ("int8", "int64", "float64", "complex128", "bool", "string")
 """Types of Zarr that a store has."""
 
-LARGEST = 2**27
+MAX_CHUNK_VALUES = 2**27
 """Numbers of a chunk."""
 
 
 @dataclass(frozen=True)
-class Array:
+class ZarrArray:
     """An array of a store.
 
     Attributes
@@ -58,14 +58,14 @@ class Array:
     attributes: dict[str, Any] = field(default_factory=dict)
 
     @property
-    def fill(self) -> Any:
+    def fill_value(self) -> Any:
         """What stands for a value that is missing, as JSON."""
         return {"float64": "NaN", "complex128": ["NaN", "NaN"], "int8": -1, "string": "", "bool": False}.get(
             self.dtype, 0
         )
 
     @property
-    def numpy(self) -> np.dtype:
+    def numpy_dtype(self) -> np.dtype:
         return np.dtype(object if self.dtype == "string" else self.dtype).newbyteorder("<")
 
     def metadata(self) -> dict[str, Any]:
@@ -78,7 +78,7 @@ class Array:
             "data_type": self.dtype,
             "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": list(self.chunks)}},
             "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
-            "fill_value": self.fill,
+            "fill_value": self.fill_value,
             "codecs": [{"name": "vlen-utf8"} if self.dtype == "string" else plain, {"name": "crc32c"}],
             "attributes": self.attributes,
             "dimension_names": list(self.dims),
@@ -86,38 +86,44 @@ class Array:
         }
 
     @classmethod
-    def of(cls, name: str, metadata: dict[str, Any]) -> Array:
+    def from_metadata(cls, name: str, metadata: dict[str, Any]) -> ZarrArray:
         """From its metadata; ValueError, KeyError or TypeError where these are of another thing."""
         chunks, attributes = metadata["chunk_grid"]["configuration"]["chunk_shape"], metadata["attributes"]
         dims, shape, dtype = metadata["dimension_names"], metadata["shape"], metadata["data_type"]
         sizes = [*shape, *chunks]
         whole = all(type(n) is int and 0 <= n < 2**48 for n in sizes) and all(n > 0 for n in chunks)
-        if not (whole and len(shape) == len(chunks) == len(dims) and math.prod(chunks) <= LARGEST):
+        if not (whole and len(shape) == len(chunks) == len(dims) and math.prod(chunks) <= MAX_CHUNK_VALUES):
             raise ValueError(f"the array {name!r} has shape {shape} in chunks {chunks}")
-        if dtype not in DTYPES or not isinstance(attributes, dict) or not all(isinstance(d, str) for d in dims):
+        if dtype not in ZARR_DTYPES or not isinstance(attributes, dict) or not all(isinstance(d, str) for d in dims):
             raise ValueError(f"the array {name!r} is none that a study writes")
         return cls(name, tuple(dims), tuple(shape), tuple(chunks), dtype, attributes)
 
-    def path(self, index: Sequence[int]) -> str:
+    def chunk_path(self, index: Sequence[int]) -> str:
         """The path of a chunk within the store."""
         return "/".join([self.name, "c", *map(str, index)])
 
     # -- chunks ---------------------------------------------------------------------------------------------------
 
-    def empty(self) -> np.ndarray:
+    def empty_chunk(self) -> np.ndarray:
         """A chunk of fill values."""
         if self.dtype == "string":
             return np.full(self.chunks, "", dtype=object)
-        return np.full(self.chunks, {"int8": -1, "bool": False, "int64": 0}.get(self.dtype, np.nan), dtype=self.numpy)
+        return np.full(
+            self.chunks, {"int8": -1, "bool": False, "int64": 0}.get(self.dtype, np.nan), dtype=self.numpy_dtype
+        )
 
-    def encoded(self, block: np.ndarray) -> bytes:
+    def encode_chunk(self, block: np.ndarray) -> bytes:
         """A chunk as it is in its file."""
         import google_crc32c
 
-        data = _texts(block.ravel()) if self.dtype == "string" else np.asarray(block, dtype=self.numpy).tobytes()
+        data = (
+            _encode_texts(block.ravel())
+            if self.dtype == "string"
+            else np.asarray(block, dtype=self.numpy_dtype).tobytes()
+        )
         return data + struct.pack("<I", google_crc32c.value(data))
 
-    def decoded(self, data: bytes) -> np.ndarray:
+    def decode_chunk(self, data: bytes) -> np.ndarray:
         """A chunk from its file; ValueError or ``struct.error`` where it is damaged."""
         import google_crc32c
 
@@ -125,21 +131,21 @@ class Array:
         if len(data) < 4 or struct.pack("<I", google_crc32c.value(content)) != data[-4:]:
             raise ValueError("it does not have its checksum")
         if self.dtype == "string":
-            values = np.array([*_from_texts(content), None], dtype=object)[:-1]
+            values = np.array([*_decode_texts(content), None], dtype=object)[:-1]
         else:
-            values = np.frombuffer(content, dtype=self.numpy).copy()
+            values = np.frombuffer(content, dtype=self.numpy_dtype).copy()
         if values.size != math.prod(self.chunks):
             raise ValueError(f"it has {values.size} values, and should have {math.prod(self.chunks)}")
         return values.reshape(self.chunks)
 
 
-def _texts(values: np.ndarray) -> bytes:
+def _encode_texts(values: np.ndarray) -> bytes:
     """As the codec "vlen-utf8" has them."""
     encoded = [str(value).encode() for value in values]
     return b"".join([struct.pack("<I", len(encoded)), *(struct.pack("<I", len(text)) + text for text in encoded)])
 
 
-def _from_texts(data: bytes) -> Iterator[str]:
+def _decode_texts(data: bytes) -> Iterator[str]:
     (count,), place = struct.unpack_from("<I", data), 4
     if count > len(data) // 4:
         raise ValueError(f"it says that it has {count} texts")
@@ -152,7 +158,7 @@ def _from_texts(data: bytes) -> Iterator[str]:
 # -- files ------------------------------------------------------------------------------------------------------------
 
 
-def write(path: Path, data: bytes) -> None:
+def write_file(path: Path, data: bytes) -> None:
     """Write a file; it appears whole or not at all.
 
     Raises
@@ -161,10 +167,10 @@ def write(path: Path, data: bytes) -> None:
         If it cannot be written.
     """
     try:
-        disk.write(path, data)
+        disk.write_atomically(path, data)
     except OSError as error:
         kept = "What is done is kept; run the study again to go on"
-        raise FileError(f"cannot write {path}: {disk.why(error)}. {kept}") from error
+        raise FileError(f"cannot write {path}: {disk.why_os_failed(error)}. {kept}") from error
 
 
 class TemporaryFolder:
@@ -175,7 +181,7 @@ class TemporaryFolder:
         weakref.finalize(self, shutil.rmtree, self.path, ignore_errors=True)
 
 
-def read(path: Path) -> bytes:
+def read_plain_file(path: Path) -> bytes:
     """The content of a plain file; a link is refused.
 
     Raises
@@ -184,22 +190,22 @@ def read(path: Path) -> bytes:
         If it cannot be read.
     """
     try:
-        with open(path, "rb", opener=_plainly) as file:
+        with open(path, "rb", opener=_open_no_follow) as file:
             if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
                 raise FileError(f"{path} is no file")
             return file.read()
     except FileError:
         raise
     except OSError as error:
-        raise FileError(f"cannot read {path}: {disk.why(error)}") from error
+        raise FileError(f"cannot read {path}: {disk.why_os_failed(error)}") from error
 
 
-def _plainly(path: str, flags: int) -> int:
+def _open_no_follow(path: str, flags: int) -> int:
     """Open no link, and do not wait for the other end of a pipe."""
     return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
 
 
-def check_plain(root: Path) -> None:
+def require_plain_files(root: Path) -> None:
     """Raise FileError unless all in a store are files and folders: a link leads anywhere, and a pipe keeps waiting."""
     folders = [os.fspath(root)]
     while folders:
@@ -214,29 +220,29 @@ def check_plain(root: Path) -> None:
         except FileError:
             raise
         except OSError as error:
-            raise FileError(f"cannot read {root}: {disk.why(error)}") from error
+            raise FileError(f"cannot read {root}: {disk.why_os_failed(error)}") from error
 
 
 def write_json(path: Path, content: Any) -> None:
-    write(path, json.dumps(content, indent=1, allow_nan=False).encode())
+    write_file(path, json.dumps(content, indent=1, allow_nan=False).encode())
 
 
-def sweep(root: Path) -> None:
+def remove_parts(root: Path) -> None:
     """Remove half-written files of killed runs: no other run works on the store."""
     for folder, _, files in os.walk(root):
         for name in files:
-            if name.endswith(disk.PART) and name.startswith("."):
+            if name.endswith(disk.PART_SUFFIX) and name.startswith("."):
                 with contextlib.suppress(OSError):
                     os.unlink(os.path.join(folder, name))
 
 
 # -- one run at a time ------------------------------------------------------------------------------------------------
 
-LOCK = ".lock"
+LOCK_FILE = ".lock"
 
 
 @contextlib.contextmanager
-def locked(root: Path) -> Iterator[Callable[[int], None]]:
+def lock_store(root: Path) -> Iterator[Callable[[int], None]]:
     """Be the only run that works on a store; the operating system releases it however a run ends.
 
     Yields a function that tells others how many points were done when the work began.
@@ -247,17 +253,19 @@ def locked(root: Path) -> Iterator[Callable[[int], None]]:
         If another run does.
     """
     try:
-        file = open(root / LOCK, "a+", opener=_plainly)  # noqa: SIM115  (what follows has errors of its own)
+        file = open(root / LOCK_FILE, "a+", opener=_open_no_follow)  # noqa: SIM115  (what follows has errors of its own)
     except OSError as error:
-        raise FileError(f"cannot write into {root}: {disk.why(error)}") from error
+        raise FileError(f"cannot write into {root}: {disk.why_os_failed(error)}") from error
     with file:
         try:
-            if not _held(file):
-                raise FileError(f"another run works on {root}: {holder(root)}. Wait for it, or take another store")
+            if not _try_lock(file):
+                raise FileError(
+                    f"another run works on {root}: {describe_lock_holder(root)}. Wait for it, or take another store"
+                )
         except OSError as error:
             if isinstance(error, FileError):
                 raise
-            reason = disk.why(error)
+            reason = disk.why_os_failed(error)
             raise FileError(f"{root} cannot be locked ({reason}): two runs at once could not be told") from error
 
         def tell(done: int) -> None:
@@ -270,7 +278,7 @@ def locked(root: Path) -> Iterator[Callable[[int], None]]:
         yield tell
 
 
-def _held(file, tries: int = 5) -> bool:
+def _try_lock(file, tries: int = 5) -> bool:
     """Whether the lock was free; somebody who looks whether it is holds it for a moment too."""
     for _ in range(tries):
         try:
@@ -281,16 +289,16 @@ def _held(file, tries: int = 5) -> bool:
     return False
 
 
-def holder(root: Path) -> str:
+def describe_lock_holder(root: Path) -> str:
     """Who works on a store, in words."""
-    run = running(root) or {}
+    run = active_run(root) or {}
     return f"process {run.get('pid', '?')} on {run.get('host', '?')}"
 
 
-def running(root: Path) -> dict[str, Any] | None:
+def active_run(root: Path) -> dict[str, Any] | None:
     """The run that works on a store now, as it has told; None where there is none."""
     try:
-        with open(root / LOCK, opener=_plainly) as file:
+        with open(root / LOCK_FILE, opener=_open_no_follow) as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
             except BlockingIOError:

@@ -13,16 +13,16 @@ from typing import Any
 import jax
 import numpy as np
 
-from .solve import Columns, Solver
+from .solve import PointResults, PointSolver
 
-CLOSE = 1e-10
+VALUE_RTOL = 1e-10
 """Relative difference of numbers that another version of JAX may compute."""
 
-PROBED = 3
+N_PROBE_STATES = 3
 """States at which the motion of the system is looked at."""
 
 
-def description(solver: Solver, columns: Columns, x0: np.ndarray) -> dict[str, Any]:
+def describe_study(solver: PointSolver, columns: PointResults, x0: np.ndarray) -> dict[str, Any]:
     """A study as JSON data.
 
     Parameters
@@ -33,25 +33,25 @@ def description(solver: Solver, columns: Columns, x0: np.ndarray) -> dict[str, A
     x0 : array, shape (n,)
         Its initial state.
     """
-    task, system = solver.task, solver.members.example
-    states = np.concatenate([x0[None], system.samples(PROBED, seed=1)])
+    task, system = solver.task, solver.systems.example_system
+    states = np.concatenate([x0[None], system.samples(N_PROBE_STATES, seed=1)])
     with np.errstate(all="ignore"):
-        probe = [_numbers(_at_start(system, task.t_span[0]).vector_field(x)) for x in states]
-        energies = [_numbers(system.energy.at_time(task.t_span[0]).value(x)) for x in states]
+        probe = [_as_json_numbers(_system_at(system, task.t_span[0]).vector_field(x)) for x in states]
+        energies = [_as_json_numbers(system.energy.at_time(task.t_span[0]).value(x)) for x in states]
     return {
         "versions": {name: metadata.version(name) for name in ("liethermo", "jax")},
         "system": f"{type(system).__name__}, {system.dim} components",
         "motion": probe,
         "energy": energies,
-        "operations": _operations(solver),
-        "x0": _numbers(x0),
+        "operations": _program_digest(solver),
+        "x0": _as_json_numbers(x0),
         "t_span": list(map(float, task.t_span)),
-        "step": _step(task.step),
+        "step": _step_as_json(task.step),
         "method": repr(task.method),
-        "until": _until(task.until),
-        "noise": None if task.noise is None else task.noise.listed(),
+        "until": _event_as_json(task.until),
+        "noise": None if task.noise is None else task.noise.as_provenance(),
         "measures": {name: measure.description() for name, measure in task.measures.items()},
-        "values": {name: _numbers(columns.measures[name][0]) for name in task.measures},
+        "values": {name: _as_json_numbers(columns.measures[name][0]) for name in task.measures},
     }
 
 
@@ -65,7 +65,7 @@ def provenance(described: Mapping[str, Any], engine: str) -> dict[str, Any]:
     }
 
 
-def differences(mine: Mapping[str, Any], theirs: Mapping[str, Any]) -> list[str]:
+def study_differences(mine: Mapping[str, Any], theirs: Mapping[str, Any]) -> list[str]:
     """In what two studies differ, a line each; empty for the same study."""
     same_versions = mine["versions"] == theirs["versions"]
     found = [
@@ -80,9 +80,9 @@ def differences(mine: Mapping[str, Any], theirs: Mapping[str, Any]) -> list[str]
         "energy": "the energy",
         "x0": "the initial state",
     }
-    found += [_differing(what, mine[key], theirs[key]) for key, what in numbers.items()]
+    found += [_value_difference(what, mine[key], theirs[key]) for key, what in numbers.items()]
     for name in set(mine["values"]) & set(theirs["values"]):
-        found.append(_differing(f"the measure {name!r}", mine["values"][name], theirs["values"][name]))
+        found.append(_value_difference(f"the measure {name!r}", mine["values"][name], theirs["values"][name]))
     found = [line for line in found if line]
     if not found and same_versions and mine["operations"] != theirs["operations"]:
         found.append(
@@ -92,24 +92,24 @@ def differences(mine: Mapping[str, Any], theirs: Mapping[str, Any]) -> list[str]
     return found
 
 
-def _at_start(system: Any, t: float) -> Any:
+def _system_at(system: Any, t: float) -> Any:
     """A system as it is when a study begins, where its energy depends on time or a torque acts."""
     return system.at_time(t, system.group.identity) if system.needs_attitude else system.at_time(t)
 
 
-def _differing(what: str, mine: list, theirs: list) -> str:
+def _value_difference(what: str, mine: list, theirs: list) -> str:
     a, b = (np.asarray(values, dtype=np.float64).ravel() for values in (mine, theirs))
     if a.shape != b.shape:
         return f"{what} has {a.size} numbers at the first point, and {b.size} in the store"
     size = max(float(np.nanmax(np.abs(b), initial=0.0)), 1e-300)
-    unequal = ~((np.abs(a - b) <= CLOSE * size) | (a == b) | (np.isnan(a) & np.isnan(b)))
+    unequal = ~((np.abs(a - b) <= VALUE_RTOL * size) | (a == b) | (np.isnan(a) & np.isnan(b)))
     if not unequal.any():
         return ""
     k = int(np.flatnonzero(unequal)[0])
     return f"{what} is {a[k]:.15g} where the store has {b[k]:.15g} (at the first point)"
 
 
-def _numbers(values) -> list:
+def _as_json_numbers(values) -> list:
     """As JSON, in which there is no NaN."""
     array = np.asarray(values)
     if array.dtype.kind == "c":
@@ -117,40 +117,40 @@ def _numbers(values) -> list:
     return [v if math.isfinite(v) else None for v in map(float, array.ravel())]
 
 
-def _step(step: Any) -> Any:
+def _step_as_json(step: Any) -> Any:
     return asdict(step) if is_dataclass(step) and not isinstance(step, type) else float(step)
 
 
-def _until(until: Any) -> Any:
+def _event_as_json(until: Any) -> Any:
     if until is None:
         return None
     return repr(until) if is_dataclass(until) else f"function {getattr(until, '__qualname__', type(until).__name__)}"
 
 
-ADDRESS = re.compile(r" at 0x[0-9a-f]+|\bid=\d+")
+ADDRESS_PATTERN = re.compile(r" at 0x[0-9a-f]+|\bid=\d+")
 
 
-def _operations(solver: Solver) -> str:
+def _program_digest(solver: PointSolver) -> str:
     """A digest of the programs of the system and of the event, its parameters among their arguments where they are."""
-    task, members = solver.task, solver.members
-    x = jax.ShapeDtypeStruct((members.example.dim,), np.float64)
+    task, members = solver.task, solver.systems
+    x = jax.ShapeDtypeStruct((members.example_system.dim,), np.float64)
 
     def laws(system, x):
-        return system.energy.at_time(task.t_span[0]).value(x), _at_start(system, task.t_span[0]).vector_field(x)
+        return system.energy.at_time(task.t_span[0]).value(x), _system_at(system, task.t_span[0]).vector_field(x)
 
     found, numbers = [], []
-    if members.family is None or not task.parameters:
-        found.append(jax.make_jaxpr(lambda x: laws(members.example, x))(x))
+    if members.family is None or not task.parameter_names:
+        found.append(jax.make_jaxpr(lambda x: laws(members.example_system, x))(x))
     else:
-        family = members.family.with_values([np.zeros(2) for _ in task.parameters])
-        shapes = [jax.ShapeDtypeStruct(np.shape(value)[1:], np.float64) for value in family.values]
+        family = members.family.with_builder_arrays([np.zeros(2) for _ in task.parameter_names])
+        shapes = [jax.ShapeDtypeStruct(np.shape(value)[1:], np.float64) for value in family.parameter_arrays]
         found.append(jax.make_jaxpr(lambda arrays, x: laws(family.form.rebuild(arrays), x))(shapes, x))
-        numbers = family.values[family.given :]
+        numbers = family.parameter_arrays[family.n_builder_arrays :]
     if callable(task.until):
         found.append(jax.make_jaxpr(task.until)(x))
     digest = hashlib.sha256()
     for closed in found:
-        digest.update(ADDRESS.sub("", str(closed.jaxpr)).encode())
+        digest.update(ADDRESS_PATTERN.sub("", str(closed.jaxpr)).encode())
         numbers += closed.consts
     for number in numbers:
         digest.update(np.asarray(number).tobytes())

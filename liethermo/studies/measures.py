@@ -12,9 +12,9 @@ import numpy as np
 from ..errors import InputError
 from ..results.ensemble import Ensemble
 from ..runs.events import Relaxed
-from .axes import is_name
+from .axes import is_valid_name
 
-FIELDS = {
+NAMED_MEASURES = {
     "final": "state at the end",
     "final_attitude": "attitude at the end",
     "final_energy": "energy at the end",
@@ -59,14 +59,14 @@ class Measure(ABC):
 
     Attributes
     ----------
-    path : bool
+    needs_path : bool
         Whether it needs the states along the run.
     """
 
-    path: ClassVar[bool] = False
+    needs_path: ClassVar[bool] = False
 
     @property
-    def final(self) -> bool:
+    def needs_final_state(self) -> bool:
         """Whether it needs the last state."""
         return False
 
@@ -80,13 +80,13 @@ class Measure(ABC):
 
 
 @dataclass(frozen=True)
-class Named(Measure):
+class EnsembleField(Measure):
     """A field of an ensemble."""
 
     name: str
 
     @property
-    def final(self) -> bool:
+    def needs_final_state(self) -> bool:
         return self.name in ("final", "final_attitude")
 
     def __call__(self, ensemble: Ensemble, count: int) -> tuple[np.ndarray, dict[int, str]]:
@@ -94,13 +94,13 @@ class Named(Measure):
         values = getattr(ensemble, field)
         if values is None:
             raise InputError(f"this system has no {field}, so that {self.name!r} is no measure of it")
-        return _last(values, ensemble) if self.name.startswith("final") or self.name == "work" else values, {}
+        return _final_values(values, ensemble) if self.name.startswith("final") or self.name == "work" else values, {}
 
     def description(self) -> str:
-        return FIELDS[self.name]
+        return NAMED_MEASURES[self.name]
 
 
-def _last(values: np.ndarray, ensemble: Ensemble) -> np.ndarray:
+def _final_values(values: np.ndarray, ensemble: Ensemble) -> np.ndarray:
     """The values where each trajectory ended."""
     if ensemble.energy.ndim == 1:
         return values
@@ -122,12 +122,12 @@ class EventTime(Measure):
 
 
 @dataclass(frozen=True)
-class AtTimes(Measure):
+class ValuesAtTimes(Measure):
     """Values at given times."""
 
     at: At
 
-    path = True
+    needs_path = True
 
     def __call__(self, ensemble: Ensemble, count: int) -> tuple[np.ndarray, dict[int, str]]:
         values = getattr(ensemble, self.at.what)
@@ -141,36 +141,38 @@ class AtTimes(Measure):
 
 
 @dataclass(frozen=True)
-class OfSolution(Measure):
+class SolutionMeasure(Measure):
     """A user's function of a solution, to a number or an array of a fixed shape.
 
     Attributes
     ----------
     function : function
-    like : ndarray, optional
+    example_value : ndarray, optional
         What it returned at the first point that was run: of this shape and kind it is at all others, or has failed.
     """
 
     function: Callable
-    like: np.ndarray | None = field(default=None, compare=False)
+    example_value: np.ndarray | None = field(default=None, compare=False)
 
-    path = True
+    needs_path = True
 
     def __call__(self, ensemble: Ensemble, count: int) -> tuple[np.ndarray, dict[int, str]]:
         found: dict[int, np.ndarray] = {}
         reasons: dict[int, str] = {}
-        like = self.like
+        like = self.example_value
         for i in range(count):
             try:
-                value = np.asarray(self.function(ensemble.member(i)))
+                value = np.asarray(self.function(ensemble.member_solution(i)))
                 if value.dtype.kind not in "fiubc":
                     raise TypeError(f"it returned {value.dtype}, not numbers")
                 like = value if like is None else like
                 if value.shape != like.shape or (value.dtype.kind == "c") > (like.dtype.kind == "c"):
-                    raise TypeError(f"it returned {_kind(value)}, and {_kind(like)} at the first point")
+                    raise TypeError(
+                        f"it returned {_describe_array(value)}, and {_describe_array(like)} at the first point"
+                    )
                 found[i] = value
             except Exception as error:  # the function may be anyone's, and this is the status of one point
-                reasons[i] = f"{self._name} raised {type(error).__name__}: {error}"
+                reasons[i] = f"{self._function_name} raised {type(error).__name__}: {error}"
         like = np.asarray(np.nan) if like is None else like
         values = np.full((len(ensemble), *like.shape), np.nan, dtype=np.result_type(np.float64, like))
         for i, value in found.items():
@@ -178,18 +180,18 @@ class OfSolution(Measure):
         return values, reasons
 
     @property
-    def _name(self) -> str:
+    def _function_name(self) -> str:
         return getattr(self.function, "__qualname__", type(self.function).__name__)
 
     def description(self) -> str:
-        return f"function {self._name}"
+        return f"function {self._function_name}"
 
 
-def _kind(value: np.ndarray) -> str:
+def _describe_array(value: np.ndarray) -> str:
     return f"{'complex' if value.dtype.kind == 'c' else 'real'} numbers of shape {value.shape}"
 
 
-def measures_of(given: Mapping[str, Any], until: Any) -> tuple[dict[str, Measure], Any]:
+def parse_measures(given: Mapping[str, Any], until: Any) -> tuple[dict[str, Measure], Any]:
     """The measures that :class:`Study` is given, by name, and the event at which its runs end.
 
     Raises
@@ -208,21 +210,23 @@ def measures_of(given: Mapping[str, Any], until: Any) -> tuple[dict[str, Measure
                 raise InputError(f"the measure {name!r} ends each run at {measure}, but {until!r} is to end it too")
             until = measure
     for name, measure in given.items():
-        if not is_name(name):
+        if not is_valid_name(name):
             raise InputError(f"a measure cannot be called {name!r:.120}")
         if isinstance(measure, Relaxed):
             found[name] = EventTime(f"relaxation, to a rate below {measure.tol:g}")
         elif isinstance(measure, At):
-            found[name] = AtTimes(measure)
-        elif isinstance(measure, str) and measure in FIELDS:
-            found[name] = Named(measure)
+            found[name] = ValuesAtTimes(measure)
+        elif isinstance(measure, str) and measure in NAMED_MEASURES:
+            found[name] = EnsembleField(measure)
         elif measure == "event_time" and until is not None:
             found[name] = EventTime("the event")
         elif callable(measure):
-            found[name] = OfSolution(measure)
+            found[name] = SolutionMeasure(measure)
         else:
             raise InputError(
                 f"the measure {name!r} is lt.Relaxed(tol), lt.At(times), a function of a solution, or one of "
-                f"{', '.join(FIELDS)}" + (", event_time" if until is not None else "") + f"; not {measure!r:.60}"
+                f"{', '.join(NAMED_MEASURES)}"
+                + (", event_time" if until is not None else "")
+                + f"; not {measure!r:.60}"
             )
     return found, until

@@ -14,34 +14,34 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..errors import InputError
-from ..functions.conditions import noting, refusal
+from ..functions.conditions import collect_conditions, refusal_message
 from ..runs.family import Family, named_parameters
 from ..systems import System
 
-LOT = 8192
+FIXED_BATCH_SIZE = 8192
 """Points that XLA's programs take at once, always as many: results must not depend on where in a batch a point is."""
 
-ASKED = "and no parameter of an axis is called so"
+UNKNOWN_PARAMETER_TEXT = "and no parameter of an axis is called so"
 
-Points = Mapping[str, np.ndarray]
+PointParameters = Mapping[str, np.ndarray]
 
 
-class Watched(dict):
+class AccessRecorder(dict):
     """A dict that knows which of its entries have been looked at, and says which there are."""
 
     def __init__(self, entries: Mapping[str, Any]):
         super().__init__(entries)
-        self.seen: set[str] = set()
+        self.accessed_names: set[str] = set()
 
     def __getitem__(self, name):
-        self.seen.add(name)
+        self.accessed_names.add(name)
         return super().__getitem__(name)
 
     def __missing__(self, name):
-        raise InputError(f"the builder asks for {name!r}, {ASKED}; the axes have {', '.join(self)}")
+        raise InputError(f"the builder asks for {name!r}, {UNKNOWN_PARAMETER_TEXT}; the axes have {', '.join(self)}")
 
     def get(self, name, default=None):
-        self.seen.add(name)
+        self.accessed_names.add(name)
         return super().get(name, default)
 
     def __iter__(self):  # so that ** does not go round __getitem__
@@ -51,15 +51,15 @@ class Watched(dict):
         return super().keys()
 
     def items(self):
-        self.seen.update(self)
+        self.accessed_names.update(self)
         return super().items()
 
     def values(self):
-        self.seen.update(self)
+        self.accessed_names.update(self)
         return super().values()
 
 
-def builder(build: System | Callable[[dict], System], parameters: tuple[str, ...]) -> Callable[[dict], System]:
+def system_builder(build: System | Callable[[dict], System], parameters: tuple[str, ...]) -> Callable[[dict], System]:
     """The function from a point to its system; of a system, one that changes its parameters.
 
     Raises
@@ -76,20 +76,22 @@ def builder(build: System | Callable[[dict], System], parameters: tuple[str, ...
     for name in parameters:
         # the name of a leaf may end with an index too, such as numbers[0]
         entries = (re.fullmatch(re.escape(leaf) + r"((?:\[\d+\])*)", name) for leaf in leaves)
-        matches = {entry.string[: entry.start(1)]: _index(entry[1]) for entry in entries if entry is not None}
+        matches = {entry.string[: entry.start(1)]: _parse_index(entry[1]) for entry in entries if entry is not None}
         whole, index = next(((w, i) for w, i in matches.items() if len(i) == len(leaves[w])), (name, ()))
         if whole not in leaves or len(index) != len(leaves[whole]) or any(map(int.__ge__, index, leaves[whole])):
             known = ", ".join(leaf + "".join(f"[0..{m - 1}]" for m in shape) for leaf, shape in leaves.items())
             raise InputError(f"the system has no parameter {name!r} that is one number; it has {known}")
         places[name] = whole, index
-    return functools.partial(_changed, build, places)
+    return functools.partial(_with_parameters, build, places)
 
 
-def _index(text: str) -> tuple[int, ...]:
+def _parse_index(text: str) -> tuple[int, ...]:
     return tuple(map(int, re.findall(r"\d+", text)))
 
 
-def _changed(system: System, places: Mapping[str, tuple[str, tuple[int, ...]]], point: Mapping[str, Any]) -> System:
+def _with_parameters(
+    system: System, places: Mapping[str, tuple[str, tuple[int, ...]]], point: Mapping[str, Any]
+) -> System:
     """The system with the parameters of a point."""
     dynamic, static = eqx.partition(system, eqx.is_inexact_array)
     paths, structure = jax.tree_util.tree_flatten_with_path(dynamic)
@@ -99,7 +101,7 @@ def _changed(system: System, places: Mapping[str, tuple[str, tuple[int, ...]]], 
     return eqx.combine(jax.tree_util.tree_unflatten(structure, list(leaves.values())), static)
 
 
-class Members:
+class StudySystems:
     """The systems of a study.
 
     Parameters
@@ -107,78 +109,82 @@ class Members:
     build : function from the dict of a point to a System
     parameters : tuple of str
         The entries of the dict.
-    example : dict
+    example_system : dict
         A point at which the system can be built. What a method looks at in a system it looks at in this one, for all.
 
     Attributes
     ----------
-    example : System
+    example_system : System
     family : Family or None
         Of all systems, where one traced program builds them. None where the builder has to see the values: a Python
         ``if``, an integer, a text. Each point is then built by itself.
-    reason : str
+    why_no_family : str
         Why there is no family.
     """
 
     def __init__(self, build: Callable[[dict], System], parameters: tuple[str, ...], example: Mapping[str, Any]):
         self._build, self._parameters = build, parameters
-        self.example = self.member(example)
+        self.example_system = self.system_at(example)
         self.family: Family | None = None
-        self.reason = ""
+        self.why_no_family = ""
         try:
             given = {name: np.full(2, example[name], dtype=np.float64) for name in parameters}
-            family = Family.of_function(self._of_dict, given) if given else Family.of(self.example, None)
+            family = (
+                Family.from_function(self._build_system, given)
+                if given
+                else Family.from_arguments(self.example_system, None)
+            )
             if given:
-                self._refusals = _Refusals(self._of_dict, parameters)
-                family = family.traced()
-            self.family = replace(family, example=self.example)
+                self._conditions = _ParameterConditions(self._build_system, parameters)
+                family = family.as_traced_program()
+            self.family = replace(family, example=self.example_system)
         except Exception as error:  # whatever a builder does with a tracer; with numbers it will say what is wrong
-            self.reason = f"{type(error).__name__}: {error}".partition("\n")[0]
+            self.why_no_family = f"{type(error).__name__}: {error}".partition("\n")[0]
 
-    def _of_dict(self, point: Mapping[str, Any]) -> System:
-        return self._build(Watched(point))
+    def _build_system(self, point: Mapping[str, Any]) -> System:
+        return self._build(AccessRecorder(point))
 
-    def member(self, point: Mapping[str, Any]) -> System:
+    def system_at(self, point: Mapping[str, Any]) -> System:
         """The system at a point, whose constructors check what they are given."""
-        system = self._of_dict(plain(point))
+        system = self._build_system(as_python_values(point))
         if not isinstance(system, System):
             raise InputError(f"the builder must return a system, not {type(system).__name__}")
         return system
 
-    def refused(self, points: Points, size: int) -> dict[int, str]:
+    def inadmissible_points(self, points: PointParameters, size: int) -> dict[int, str]:
         """The points whose parameters are not admissible, and why; known where there is a family."""
-        return self._refusals(points, size) if self._parameters else {}
+        return self._conditions(points, size) if self._parameters else {}
 
-    def at(self, points: Points, chosen: np.ndarray) -> Family:
+    def family_at(self, points: PointParameters, chosen: np.ndarray) -> Family:
         """The family of some points."""
         assert self.family is not None
         names = sorted(self._parameters)  # as JAX has dicts
-        return self.family.with_values([np.asarray(points[name][chosen], dtype=np.float64) for name in names])
+        return self.family.with_builder_arrays([np.asarray(points[name][chosen], dtype=np.float64) for name in names])
 
 
-def plain(point: Mapping[str, Any]) -> dict[str, Any]:
+def as_python_values(point: Mapping[str, Any]) -> dict[str, Any]:
     """A point with Python's own numbers and texts."""
     return {name: value.item() if isinstance(value, np.generic) else value for name, value in point.items()}
 
 
-def in_lots(function: Callable, points: Points, size: int) -> list[np.ndarray]:
+def evaluate_in_batches(function: Callable, points: PointParameters, size: int) -> list[np.ndarray]:
     """What a compiled function of points gives, lot by lot: its arrays one after another."""
     found = []
-    for start in range(0, size, LOT):
-        rows = np.minimum(np.arange(start, start + LOT), size - 1)
+    for start in range(0, size, FIXED_BATCH_SIZE):
+        rows = np.minimum(np.arange(start, start + FIXED_BATCH_SIZE), size - 1)
         lot = {name: np.asarray(values, dtype=np.float64)[rows] for name, values in points.items()}
         found.append([np.asarray(array)[: size - start] for array in jax.tree_util.tree_leaves(function(lot))])
     return [np.concatenate(parts) for parts in zip(*found, strict=True)]
 
 
-class _Refusals:
+class _ParameterConditions:
     """The conditions that a builder states about its parameters, at any points."""
 
     def __init__(self, build: Callable, parameters: tuple[str, ...]):
         self._messages: list[str] = []
 
         def conditions(point):
-            with noting() as noted:
+            with collect_conditions() as noted:
                 build(point)
             self._messages = [condition.message for condition in noted]
             return [(condition.holds, condition.value) for condition in noted]
@@ -186,23 +192,23 @@ class _Refusals:
         jax.eval_shape(conditions, {name: jax.ShapeDtypeStruct((), np.float64) for name in parameters})
         self._evaluate = jax.jit(jax.vmap(conditions))
 
-    def __call__(self, points: Points, size: int) -> dict[int, str]:
+    def __call__(self, points: PointParameters, size: int) -> dict[int, str]:
         if not self._messages:
             return {}
         found: dict[int, str] = {}
-        results = in_lots(self._evaluate, points, size)
+        results = evaluate_in_batches(self._evaluate, points, size)
         for k, message in enumerate(self._messages):
             for i in map(int, np.flatnonzero(~results[2 * k])):
-                found.setdefault(i, refusal(message, results[2 * k + 1][i]))
+                found.setdefault(i, refusal_message(message, results[2 * k + 1][i]))
         return found
 
 
-class Given:
+class PointwiseArrays:
     """Initial states, or attitudes, at the points of a study.
 
     Parameters
     ----------
-    given : array, or function from the dict of a point to one
+    source : array, or function from the dict of a point to one
     parameters : tuple of str
     what : str
         For messages.
@@ -211,37 +217,39 @@ class Given:
     """
 
     def __init__(self, given: Any, parameters: tuple[str, ...], what: str, example: Mapping[str, Any]):
-        self.given, self._parameters, self._what = given, parameters, what
-        self._evaluate = None
+        self.source, self._parameters, self._label = given, parameters, what
+        self._evaluate_batch = None
         if callable(given) and parameters and not any(isinstance(value, str) for value in example.values()):
             scalar = {name: jax.ShapeDtypeStruct((), np.float64) for name in parameters}
             try:
-                jax.eval_shape(self._at, scalar)
-                self._evaluate = jax.jit(jax.vmap(self._at))
+                jax.eval_shape(self._evaluate_point, scalar)
+                self._evaluate_batch = jax.jit(jax.vmap(self._evaluate_point))
             except Exception:  # NumPy, random numbers, texts: such a function is called with the numbers of each point
                 pass
 
-    def _at(self, point):
-        return jnp.asarray(self.given(Watched(point)))
+    def _evaluate_point(self, point):
+        return jnp.asarray(self.source(AccessRecorder(point)))
 
-    def __call__(self, points: Points, size: int) -> tuple[np.ndarray, dict[int, str]]:
+    def __call__(self, points: PointParameters, size: int) -> tuple[np.ndarray, dict[int, str]]:
         """At some points, one row for each; and where there is none that can be used, and why."""
-        if not callable(self.given):
-            return np.broadcast_to(np.asarray(self.given), (size, *np.shape(self.given))), {}
-        if self._evaluate is not None:
-            (rows,) = in_lots(self._evaluate, {name: points[name] for name in self._parameters}, size)
+        if not callable(self.source):
+            return np.broadcast_to(np.asarray(self.source), (size, *np.shape(self.source))), {}
+        if self._evaluate_batch is not None:
+            (rows,) = evaluate_in_batches(self._evaluate_batch, {name: points[name] for name in self._parameters}, size)
             return rows, {}
         found: list[Any] = []
         reasons: dict[int, str] = {}
         for i in range(size):
             try:
-                found.append(np.asarray(self.given(Watched(plain({n: v[i] for n, v in points.items()})))))
+                found.append(
+                    np.asarray(self.source(AccessRecorder(as_python_values({n: v[i] for n, v in points.items()}))))
+                )
             except Exception as error:  # the function may be anyone's, and this is the status of one point
-                reasons[i] = f"{self._what} raised {type(error).__name__}: {error}"
+                reasons[i] = f"{self._label} raised {type(error).__name__}: {error}"
                 found.append(None)
         good = next((row for row in found if row is not None), np.zeros(0))
         for i, row in enumerate(found):
             if row is not None and row.shape != good.shape:
-                reasons[i] = f"{self._what} has shape {row.shape}, and {good.shape} at other points"
+                reasons[i] = f"{self._label} has shape {row.shape}, and {good.shape} at other points"
         filled = [good if i in reasons else row for i, row in enumerate(found)]
         return np.array(filled, dtype=np.float64), reasons

@@ -55,7 +55,7 @@ class StudyStatus:
         lines = [f"{self.done} of {self.points} points are done ({share:.3g} %)"]
         lines += [f"  {count} {name}" for name, count in self.counts.items() if name != "missing"]
         if self.running is not None:
-            left = "" if self.seconds_left is None else f", {duration(self.seconds_left)} left"
+            left = "" if self.seconds_left is None else f", {format_duration(self.seconds_left)} left"
             lines.append(f"process {self.running.get('pid', '?')} on {self.running.get('host', '?')} works on it{left}")
         elif self.interrupted:
             lines.append("interrupted; run the study again to go on")
@@ -65,7 +65,7 @@ class StudyStatus:
         return "\n".join(lines)
 
 
-def duration(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """A time in words."""
     minutes = round(seconds) // 60
     return f"{minutes // 60} h {minutes % 60} min" if minutes >= 60 else f"{minutes} min {round(seconds) % 60} s"
@@ -77,20 +77,20 @@ def seconds_left(points: int, done: int, running: Mapping[str, Any]) -> float | 
     return (time.time() - running["started"]) * (points - done) / since if since > 0 else None
 
 
-class Bar(Progress):
+class StudyProgressBar(Progress):
     """A bar of the points that are done, with the time left, on a terminal or in a notebook."""
 
     def __init__(self, total: int, done: int, wanted: bool | None):
         from rich.console import Console
 
-        self.done = done
+        self.n_done = done
         super().__init__((0, total), Console().is_jupyter or None if wanted is None else wanted, f"{{}}/{total} points")
 
-    def __enter__(self) -> Bar:
+    def __enter__(self) -> StudyProgressBar:
         super().__enter__()
         self.advance(0)
         return self
 
     def advance(self, points: int) -> None:
-        self.done += points
-        self.update(self.done)
+        self.n_done += points
+        self.update(self.n_done)

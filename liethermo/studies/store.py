@@ -24,36 +24,36 @@ from .. import disk
 from ..errors import FileError, InputError
 from . import files
 from .axes import Axes, Axis
-from .checked import MOST_CHUNKS, arrays_of, sealed
-from .files import Array
-from .solve import GOOD, MISSING, STATUSES, SUMMARY
+from .files import ZarrArray
+from .solve import LAW_QUANTITIES, NOT_COMPUTED, STATUSES, SUCCESS_CODES
+from .store_metadata import MAX_CHUNKS, read_group, with_checksum
 
-FORMAT = "liethermo-study-1"
+STORE_FORMAT = "liethermo-study-1"
 
-AGAIN = "Run the study again: what is damaged is done again"
+RERUN_ADVICE = "Run the study again: what is damaged is done again"
 
 
 @dataclass(frozen=True)
-class Survey:
+class StoreSurvey:
     """What a store has.
 
     Attributes
     ----------
-    todo : list of (int, bool)
+    remaining_chunks : list of (int, bool)
         The chunks that are not done, and whether a part of them is.
-    done : int
+    n_done : int
         Points.
     damaged : tuple of str
         Files that are missing or damaged, and so done again.
     """
 
-    todo: list[tuple[int, bool]]
-    done: int
+    remaining_chunks: list[tuple[int, bool]]
+    n_done: int
     damaged: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
-class Store:
+class StudyStore:
     """A store.
 
     Attributes
@@ -65,7 +65,7 @@ class Store:
     """
 
     root: Path
-    arrays: Mapping[str, Array]
+    arrays: Mapping[str, ZarrArray]
     attributes: dict[str, Any] = field(default_factory=dict)
 
     # -- making and opening ---------------------------------------------------------------------------------------
@@ -79,7 +79,7 @@ class Store:
         measures: Mapping[str, tuple],
         about: Mapping[str, Mapping[str, Any]],
         attributes: dict[str, Any],
-    ) -> Store:
+    ) -> StudyStore:
         """Make a store; it appears whole or not at all.
 
         Parameters
@@ -94,27 +94,27 @@ class Store:
         attributes : dict
             Of the group.
         """
-        chunks = _block(axes.shape, chunk)
-        if (number := math.prod(-(-m // c) for m, c in zip(axes.shape, chunks, strict=True))) > MOST_CHUNKS:
+        chunks = _chunk_shape(axes.shape, chunk)
+        if (number := math.prod(-(-m // c) for m, c in zip(axes.shape, chunks, strict=True))) > MAX_CHUNKS:
             raise InputError(f"{axes.size} points in chunks of {chunk} are {number} files: give a larger chunk")
 
-        def array(name: str, more: Sequence[tuple[str, int]], dtype: str) -> Array:
+        def array(name: str, more: Sequence[tuple[str, int]], dtype: str) -> ZarrArray:
             dims, sizes = (tuple(part) for part in zip(*more, strict=True)) if more else ((), ())
             shape = axes.shape + sizes
-            return Array(name, axes.names + dims, shape, chunks + sizes, dtype, dict(about.get(name, {})))
+            return ZarrArray(name, axes.names + dims, shape, chunks + sizes, dtype, dict(about.get(name, {})))
 
         arrays = [array("status", [], "int8"), array("message", [], "string")]
-        arrays.append(array("laws", [("quantity", len(SUMMARY))], "float64"))
+        arrays.append(array("laws", [("quantity", len(LAW_QUANTITIES))], "float64"))
         for name, (shape, dtype) in measures.items():
-            arrays.append(array(name, [(_dim(name, k, shape), m) for k, m in enumerate(shape)], dtype))
-        arrays.append(Array("quantity", ("quantity",), (len(SUMMARY),), (len(SUMMARY),), "string"))
-        coordinates = [array for array, _ in _coordinates(axes, about)]
+            arrays.append(array(name, [(_component_dim_name(name, k, shape), m) for k, m in enumerate(shape)], dtype))
+        arrays.append(ZarrArray("quantity", ("quantity",), (len(LAW_QUANTITIES),), (len(LAW_QUANTITIES),), "string"))
+        coordinates = [array for array, _ in _coordinate_arrays(axes, about)]
         store = cls(root, {a.name: a for a in [*arrays, *coordinates]}, attributes)
         part = root.with_name(disk.part_name(root.name))
         try:
             part.mkdir(parents=True)
             made = replace(store, root=part)
-            made._describe(axes)
+            made._write_metadata(axes)
             os.rename(part, root)
         except OSError as error:
             shutil.rmtree(part, ignore_errors=True)
@@ -122,11 +122,11 @@ class Store:
                 error = error.__cause__
             if error.errno in (errno.ENOTEMPTY, errno.EEXIST):  # another run was faster
                 return cls.open(root)
-            raise FileError(f"cannot make the store {root}: {disk.why(error)}") from error
+            raise FileError(f"cannot make the store {root}: {disk.why_os_failed(error)}") from error
         return store
 
     @classmethod
-    def open(cls, root: Path) -> Store:
+    def open(cls, root: Path) -> StudyStore:
         """Open a store.
 
         Raises
@@ -138,41 +138,41 @@ class Store:
             raise FileError(f"there is no store {root!s:.200}")
         kind = "folder" if root.is_dir() else "file"
         try:
-            content = json.loads(files.read(root / "zarr.json"))
-            assert content["attributes"]["format"] == FORMAT
+            content = json.loads(files.read_plain_file(root / "zarr.json"))
+            assert content["attributes"]["format"] == STORE_FORMAT
         except (FileError, ValueError, KeyError, TypeError, AssertionError, RecursionError) as error:
             raise FileError(f"{root} is a {kind}, but not the store of a study; take another name") from error
         try:
-            store = cls(root, *arrays_of(root, content))
+            store = cls(root, *read_group(root, content))
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise FileError(f"{root} is the store of a study, but damaged or changed: {error}") from error
-        files.check_plain(root)
+        files.require_plain_files(root)
         return store
 
     @property
-    def study(self) -> dict[str, Any]:
+    def study_description(self) -> dict[str, Any]:
         """What describes the study."""
         return self.attributes["study"]
 
     @property
-    def measures(self) -> list[str]:
+    def measure_names(self) -> list[str]:
         return list(self.attributes["measures"])
 
-    def extended(self, axes: Axes) -> Store:
+    def extend(self, axes: Axes) -> StudyStore:
         """The store with longer axes, whose values begin with those that it has."""
         shape = axes.shape
         arrays = {
-            name: replace(array, shape=shape + array.shape[len(shape) :]) if name in self.chunked else array
+            name: replace(array, shape=shape + array.shape[len(shape) :]) if name in self.chunked_arrays else array
             for name, array in self.arrays.items()
         }
         about = {name: array.attributes for name, array in arrays.items()}
-        for array, _ in _coordinates(axes, about):
+        for array, _ in _coordinate_arrays(axes, about):
             arrays[array.name] = replace(array, chunks=self.arrays[array.name].chunks)
         store = replace(self, arrays=arrays)
-        store._describe(axes)
+        store._write_metadata(axes)
         return store
 
-    def mended(self, axes: Axes) -> Axes:
+    def repaired_axes(self, axes: Axes) -> Axes:
         """The axes of the store; where a file of its coordinates is lost or damaged, it is written again from these.
 
         Raises
@@ -181,189 +181,202 @@ class Store:
             If these are not in the order of the store: what was lost is not known then.
         """
         try:
-            self._whole("quantity")
-            return self.axes()
+            self._read_array("quantity")
+            return self.read_axes()
         except FileError as error:
-            if self.attributes.get("coordinates") != _digest(axes) or axes.shape != self.shape:
+            if self.attributes.get("coordinates") != _coordinates_checksum(axes) or axes.shape != self.shape:
                 raise FileError(
                     f"{error}. A study with the axes that the store was made with, in their order, writes it again"
                 ) from error
-        self._describe(axes)
-        return self.axes()
+        self._write_metadata(axes)
+        return self.read_axes()
 
-    def _describe(self, axes: Axes) -> None:
+    def _write_metadata(self, axes: Axes) -> None:
         """Write the coordinates, then the metadata; those of the group last, which readers look at first."""
-        self.attributes["coordinates"] = _digest(axes)
-        self._write_chunk("quantity", (0,), np.array(SUMMARY, dtype=object))
-        for array, values in _coordinates(axes, {}):
+        self.attributes["coordinates"] = _coordinates_checksum(axes)
+        self._write_chunk_file("quantity", (0,), np.array(LAW_QUANTITIES, dtype=object))
+        for array, values in _coordinate_arrays(axes, {}):
             whole = self.arrays[array.name]
-            for index in np.ndindex(*_grid(whole)):
+            for index in np.ndindex(*_chunk_grid(whole)):
                 part = values[tuple(slice(i * c, (i + 1) * c) for i, c in zip(index, whole.chunks, strict=True))]
-                block = whole.empty()
+                block = whole.empty_chunk()
                 block[tuple(map(slice, part.shape))] = part
-                self._write_chunk(array.name, index, block)
+                self._write_chunk_file(array.name, index, block)
         metadata = {name: array.metadata() for name, array in self.arrays.items()}
         for name, content in metadata.items():
             files.write_json(self.root / name / "zarr.json", content)
         every = {"kind": "inline", "must_understand": False, "metadata": metadata}
         group = {"zarr_format": 3, "node_type": "group", "attributes": self.attributes, "consolidated_metadata": every}
-        files.write_json(self.root / "zarr.json", sealed(group))
+        files.write_json(self.root / "zarr.json", with_checksum(group))
 
-    def axes(self) -> Axes:
+    def read_axes(self) -> Axes:
         """The axes, with the values that they have."""
         found = []
         for name, columns in self.attributes["axes"].items():
             states = f"{name}_state"
-            given = {column: self._whole(column) for column in columns}
-            found.append(Axis(name, self._whole(name), given, self._whole(states) if states in self.arrays else None))
+            given = {column: self._read_array(column) for column in columns}
+            found.append(
+                Axis(name, self._read_array(name), given, self._read_array(states) if states in self.arrays else None)
+            )
         return Axes(tuple(found))
 
-    def _whole(self, name: str) -> np.ndarray:
+    def _read_array(self, name: str) -> np.ndarray:
         array = self.arrays[name]
-        values = np.empty(array.shape, dtype=array.numpy)
-        for index in np.ndindex(*_grid(array)):
+        values = np.empty(array.shape, dtype=array.numpy_dtype)
+        for index in np.ndindex(*_chunk_grid(array)):
             here = tuple(
                 slice(i * c, min((i + 1) * c, m)) for i, c, m in zip(index, array.chunks, array.shape, strict=True)
             )
-            block = self._chunk(name, index)
+            block = self._read_chunk_file(name, index)
             values[here] = block[tuple(slice(0, s.stop - s.start) for s in here)]
         return values.astype(str) if array.dtype == "string" else values
 
     # -- chunks of points -------------------------------------------------------------------------------------------
 
     @property
-    def chunked(self) -> list[str]:
+    def chunked_arrays(self) -> list[str]:
         """The arrays with a chunk of each chunk of points, the mark last."""
-        return [*self.measures, "laws", "message", "status"]
+        return [*self.measure_names, "laws", "message", "status"]
 
     @property
     def shape(self) -> tuple[int, ...]:
         return self.arrays["status"].shape
 
     @property
-    def grid(self) -> tuple[int, ...]:
+    def chunk_grid(self) -> tuple[int, ...]:
         """How many chunks there are along each axis."""
-        return _grid(self.arrays["status"])
+        return _chunk_grid(self.arrays["status"])
 
     @property
-    def points(self) -> int:
+    def n_points(self) -> int:
         return math.prod(self.shape)
 
-    def index(self, number: int) -> tuple[int, ...]:
-        return tuple(map(int, np.unravel_index(number, self.grid)))
+    def chunk_index(self, number: int) -> tuple[int, ...]:
+        return tuple(map(int, np.unravel_index(number, self.chunk_grid)))
 
-    def block(self, index: Sequence[int]) -> tuple[tuple[int, int], ...]:
+    def chunk_bounds(self, index: Sequence[int]) -> tuple[tuple[int, int], ...]:
         """Where a chunk begins and ends along each axis."""
         status = self.arrays["status"]
         return tuple((i * c, min((i + 1) * c, m)) for i, c, m in zip(index, status.chunks, status.shape, strict=True))
 
-    def places(self, index: Sequence[int], wanted: np.ndarray | None = None) -> tuple[np.ndarray, ...]:
+    def point_indices(self, index: Sequence[int], wanted: np.ndarray | None = None) -> tuple[np.ndarray, ...]:
         """The places of the points of a chunk along the axes; of those wanted, where that is given."""
-        block = self.block(index)
+        block = self.chunk_bounds(index)
         inside = np.indices([stop - start for start, stop in block]).reshape(len(block), -1)
         if wanted is not None:
             inside = inside[:, wanted[tuple(slice(0, stop - start) for start, stop in block)].ravel()]
         return tuple(place + start for place, (start, _) in zip(inside, block, strict=True))
 
-    def put(self, index: Sequence[int], places: tuple[np.ndarray, ...], arrays: Mapping[str, Any], keep: bool) -> None:
+    def write_chunk(
+        self, index: Sequence[int], places: tuple[np.ndarray, ...], arrays: Mapping[str, Any], keep: bool
+    ) -> None:
         """Write a chunk: values at some of its points, the others as they were where they are to be kept."""
-        inside = tuple(place - start for place, (start, _) in zip(places, self.block(index), strict=True))
-        for name in self.chunked:
-            block = self._chunk(name, index) if keep and self._has(name, index) else self.arrays[name].empty()
+        inside = tuple(place - start for place, (start, _) in zip(places, self.chunk_bounds(index), strict=True))
+        for name in self.chunked_arrays:
+            block = (
+                self._read_chunk_file(name, index)
+                if keep and self._has_chunk(name, index)
+                else self.arrays[name].empty_chunk()
+            )
             if name in arrays:  # a measure has no values where no point could be run
                 block[inside] = arrays[name]
             if name != "message" or (block != "").any():
-                self._write_chunk(name, index, block)
-            elif self._has(name, index):  # a chunk without messages has no file of them
-                (self.root / self.arrays[name].path(index)).unlink()
+                self._write_chunk_file(name, index, block)
+            elif self._has_chunk(name, index):  # a chunk without messages has no file of them
+                (self.root / self.arrays[name].chunk_path(index)).unlink()
 
-    def chunk(self, name: str, index: Sequence[int]) -> np.ndarray:
+    def read_chunk(self, name: str, index: Sequence[int]) -> np.ndarray:
         """The values of an array at the points of a chunk, fill values where there are none."""
-        block = self._chunk(name, index) if self._has(name, index) else self.arrays[name].empty()
-        inside = tuple(slice(0, stop - start) for start, stop in self.block(index))
+        block = self._read_chunk_file(name, index) if self._has_chunk(name, index) else self.arrays[name].empty_chunk()
+        inside = tuple(slice(0, stop - start) for start, stop in self.chunk_bounds(index))
         return block[inside]
 
-    def _has(self, name: str, index: Sequence[int]) -> bool:
-        return os.path.lexists(self.root / self.arrays[name].path(self._index_of(name, index)))
+    def _has_chunk(self, name: str, index: Sequence[int]) -> bool:
+        return os.path.lexists(self.root / self.arrays[name].chunk_path(self._file_index(name, index)))
 
-    def _index_of(self, name: str, index: Sequence[int]) -> tuple[int, ...]:
+    def _file_index(self, name: str, index: Sequence[int]) -> tuple[int, ...]:
         """The index of the chunk of an array that has more dimensions than the axes."""
         return (*index, *(0 for _ in range(len(self.arrays[name].dims) - len(index))))
 
-    def _chunk(self, name: str, index: Sequence[int]) -> np.ndarray:
-        path = self.root / self.arrays[name].path(self._index_of(name, index))
+    def _read_chunk_file(self, name: str, index: Sequence[int]) -> np.ndarray:
+        path = self.root / self.arrays[name].chunk_path(self._file_index(name, index))
         try:
-            block = self.arrays[name].decoded(files.read(path))
-            if name == "status" and not np.isin(block, (*STATUSES.values(), MISSING)).all():
+            block = self.arrays[name].decode_chunk(files.read_plain_file(path))
+            if name == "status" and not np.isin(block, (*STATUSES.values(), NOT_COMPUTED)).all():
                 raise ValueError("it has a status that there is not")
             return block
         except FileError as error:
-            raise FileError(f"{error}. {AGAIN}") from error
+            raise FileError(f"{error}. {RERUN_ADVICE}") from error
         except (ValueError, struct.error) as error:
-            raise FileError(f"{path} is damaged: {error}. {AGAIN}") from error
+            raise FileError(f"{path} is damaged: {error}. {RERUN_ADVICE}") from error
 
-    def check_chunk(self, name: str, index: tuple[int, ...]) -> None:
+    def require_chunk(self, name: str, index: tuple[int, ...]) -> None:
         """Raise FileError where a chunk is damaged, or missing though the mark of its points is there."""
-        marked = name not in self.chunked or (name != "message" and self._has("status", index[: len(self.shape)]))
-        if (marked and name != "status") or self._has(name, index):
-            self._chunk(name, index)
+        marked = name not in self.chunked_arrays or (
+            name != "message" and self._has_chunk("status", index[: len(self.shape)])
+        )
+        if (marked and name != "status") or self._has_chunk(name, index):
+            self._read_chunk_file(name, index)
 
-    def _write_chunk(self, name: str, index: Sequence[int], block: np.ndarray) -> None:
-        files.write(self.root / self.arrays[name].path(self._index_of(name, index)), self.arrays[name].encoded(block))
+    def _write_chunk_file(self, name: str, index: Sequence[int], block: np.ndarray) -> None:
+        files.write_file(
+            self.root / self.arrays[name].chunk_path(self._file_index(name, index)),
+            self.arrays[name].encode_chunk(block),
+        )
 
     # -- what there is ------------------------------------------------------------------------------------------------
 
-    def marks(self) -> Iterator[tuple[int, np.ndarray | None]]:
+    def chunk_statuses(self) -> Iterator[tuple[int, np.ndarray | None]]:
         """The number of each chunk and the status of its points; None where its mark is missing or damaged."""
-        for number in range(math.prod(self.grid)):
-            index = self.index(number)
+        for number in range(math.prod(self.chunk_grid)):
+            index = self.chunk_index(number)
             try:
-                yield number, self.chunk("status", index) if self._has("status", index) else None
+                yield number, self.read_chunk("status", index) if self._has_chunk("status", index) else None
             except FileError:
                 yield number, None
 
-    def survey(self) -> Survey:
+    def survey(self) -> StoreSurvey:
         """Look at every file: what is done, what is not, what is damaged."""
         todo: list[tuple[int, bool]] = []
         damaged: list[str] = []
         done = 0
-        for number, status in self.marks():
-            index = self.index(number)
-            faults = [] if status is None else self._faults(index, status)
-            if status is None and self._has("status", index):
-                faults = [f"{self.arrays['status'].path(index)} is damaged"]
+        for number, status in self.chunk_statuses():
+            index = self.chunk_index(number)
+            faults = [] if status is None else self._damaged_files(index, status)
+            if status is None and self._has_chunk("status", index):
+                faults = [f"{self.arrays['status'].chunk_path(index)} is damaged"]
             damaged += faults
             if status is None or faults:
                 todo.append((number, False))
                 continue
-            missing = int((status == MISSING).sum())
+            missing = int((status == NOT_COMPUTED).sum())
             done += status.size - missing
             if missing:
                 todo.append((number, True))
-        return Survey(todo, done, tuple(damaged))
+        return StoreSurvey(todo, done, tuple(damaged))
 
-    def _faults(self, index: tuple[int, ...], status: np.ndarray) -> list[str]:
+    def _damaged_files(self, index: tuple[int, ...], status: np.ndarray) -> list[str]:
         """The files of a chunk that should be there and are not, or are damaged."""
-        silent = np.isin(status, (*GOOD, MISSING)).all()
+        silent = np.isin(status, (*SUCCESS_CODES, NOT_COMPUTED)).all()
         found = []
-        for name in self.chunked[:-1]:
-            path = self.arrays[name].path(self._index_of(name, index))
+        for name in self.chunked_arrays[:-1]:
+            path = self.arrays[name].chunk_path(self._file_index(name, index))
             if not (self.root / path).exists():
                 found += [] if name == "message" and silent else [f"{path} is missing"]
                 continue
             try:
-                self._chunk(name, index)
+                self._read_chunk_file(name, index)
             except FileError:
                 found.append(f"{path} is damaged")
         return found
 
-    def counts(self) -> dict[str, int]:
+    def status_counts(self) -> dict[str, int]:
         """How many points ended how; those that are not done are "missing"."""
         names = {number: name for name, number in STATUSES.items()}
         found: dict[str, int] = {}
-        for number, status in self.marks():
+        for number, status in self.chunk_statuses():
             if status is None:
-                size = math.prod(stop - start for start, stop in self.block(self.index(number)))
+                size = math.prod(stop - start for start, stop in self.chunk_bounds(self.chunk_index(number)))
                 found["missing"] = found.get("missing", 0) + size
                 continue
             for code, count in zip(*np.unique(status, return_counts=True), strict=True):
@@ -371,20 +384,20 @@ class Store:
         return found
 
 
-def _digest(axes: Axes) -> str:
+def _coordinates_checksum(axes: Axes) -> str:
     """A checksum of the coordinates, which their order belongs to."""
     found = hashlib.sha256()
-    for array, values in _coordinates(axes, {}):
+    for array, values in _coordinate_arrays(axes, {}):
         found.update(json.dumps([array.name, values.shape, values.tolist()]).encode())
     return found.hexdigest()
 
 
-def _dim(name: str, k: int, shape: tuple[int, ...]) -> str:
+def _component_dim_name(name: str, k: int, shape: tuple[int, ...]) -> str:
     """The name of a dimension of a measure that is not an axis."""
     return f"{name}_component" if len(shape) == 1 else f"{name}_component_{k}"
 
 
-def _block(shape: tuple[int, ...], points: int) -> tuple[int, ...]:
+def _chunk_shape(shape: tuple[int, ...], points: int) -> tuple[int, ...]:
     """The shape of a chunk of about so many points, whole along the last axes."""
     found: list[int] = []
     for length in reversed(shape):
@@ -393,11 +406,11 @@ def _block(shape: tuple[int, ...], points: int) -> tuple[int, ...]:
     return tuple(reversed(found))
 
 
-def _grid(array: Array) -> tuple[int, ...]:
+def _chunk_grid(array: ZarrArray) -> tuple[int, ...]:
     return tuple(-(-m // c) for m, c in zip(array.shape, array.chunks, strict=True))
 
 
-def _coordinates(axes: Axes, about: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[Array, np.ndarray]]:
+def _coordinate_arrays(axes: Axes, about: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[ZarrArray, np.ndarray]]:
     """The coordinates of axes, with their values."""
     for axis in axes.axes:
         named = {axis.name: axis.labels, **axis.columns}
@@ -407,10 +420,10 @@ def _coordinates(axes: Axes, about: Mapping[str, Mapping[str, Any]]) -> Iterator
             dims = (axis.name, "component")[: values.ndim]
             dtype = {"U": "string", "b": "bool", "i": "int64", "u": "int64"}.get(values.dtype.kind, "float64")
             chunks = (max(64, 1 << (len(values) - 1).bit_length()), *values.shape[1:])
-            yield Array(name, dims, values.shape, chunks, dtype, dict(about.get(name, {}))), values
+            yield ZarrArray(name, dims, values.shape, chunks, dtype, dict(about.get(name, {}))), values
 
 
-def matched(mine: Axes, theirs: Axes) -> Axes:
+def match_axes(mine: Axes, theirs: Axes) -> Axes:
     """My axes with their values in the order of a store: first those that it has, then the new ones.
 
     Raises
@@ -423,13 +436,13 @@ def matched(mine: Axes, theirs: Axes) -> Axes:
         raise InputError(f"the axes are {names[0]}, and those of the store {names[1]}")
     found = []
     for axis, other in zip(mine.axes, theirs.axes, strict=True):
-        if axis.same(other):  # what follows takes microseconds a value
+        if axis.has_same_values(other):  # what follows takes microseconds a value
             found.append(axis)
             continue
         free: dict[Any, list[int]] = {}
-        for i, row in enumerate(axis.rows()):
+        for i, row in enumerate(axis.value_keys()):
             free.setdefault(row, []).append(i)
-        for i, row in enumerate(other.rows()):
+        for i, row in enumerate(other.value_keys()):
             if not free.get(row):
                 raise InputError(
                     f"the axis {axis.name!r} lacks {row[0] if len(row) == 1 else row!r}, which is value {i} in the "

@@ -11,48 +11,48 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from manifolds._precision import by_own_settings
+from manifolds._precision import with_library_settings
 from manifolds.errors import warn
 
-from ..engines.codes import Code
+from ..engines.codes import StatusCode
 from ..errors import InputError
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..results.audit import Audit
 from ..runs.adaptive import Adaptive
 from ..runs.events import Relaxed
-from ..runs.fluctuations import DEFAULT_WITH_NOISE, Fluctuations, check_noise
+from ..runs.fluctuations import DEFAULT_NOISE_METHOD, Fluctuations, check_noise
 from ..runs.preparation import check_choice
-from ..runs.timetable import course_of
+from ..runs.timetable import make_schedule
 from ..systems import System
 from . import files, identity
 from .axes import Axes, Zipped
-from .measures import At, AtTimes, Measure, OfSolution, measures_of
-from .members import ASKED, Watched, builder, plain
-from .progress import Bar, StudyStatus
-from .running import here, spread
-from .solve import MEASURE_FAILED, STATUSES, Columns, Solver, Task, reason_of
-from .store import FORMAT, Store, Survey, matched
-from .stored import audit, held_results, status, status_of
+from .measures import At, Measure, SolutionMeasure, ValuesAtTimes, parse_measures
+from .members import UNKNOWN_PARAMETER_TEXT, AccessRecorder, as_python_values, system_builder
+from .progress import StudyProgressBar, StudyStatus
+from .running import run_locally, run_on_cluster
+from .solve import MEASURE_FAILED, STATUSES, PointResults, PointSolver, StudyTask, describe_error
+from .store import STORE_FORMAT, StoreSurvey, StudyStore, match_axes
+from .store_results import audit_store, load_status, open_results, store_status
 
 if TYPE_CHECKING:
     import xarray
 
-WORK = 20_000_000
+TARGET_STEPS_PER_CHUNK = 20_000_000
 """Steps of all points of a chunk, about: some seconds."""
 
-CHUNK = 16_384
+MAX_POINTS_PER_CHUNK = 16_384
 """Points of a chunk at most, unless asked for."""
 
-ALONE = 64
+MAX_UNVECTORISED_CHUNK_POINTS = 64
 """Points of a chunk at most where each is built by itself."""
 
-TRIED = 256
+MAX_CANDIDATE_POINTS = 256
 """Points that are tried until one can be run, spread over all."""
 
-HOPELESS = 2
+MAX_FAILED_EXAMPLES = 2
 """Systems that are built and cannot be run, after which no more are tried."""
 
-SLOW = 1_000
+WARN_UNVECTORISED_POINTS = 1_000
 """Points from which one is reason_of that each has to be built by itself."""
 
 
@@ -112,7 +112,7 @@ class Study:
     (True, {'ratio': 2, 'rate': 3})
     """
 
-    @by_own_settings
+    @with_library_settings
     def __init__(
         self,
         build: System | Callable[[dict], System],
@@ -133,13 +133,13 @@ class Study:
         names: Mapping[str, str] | None = None,
         spec: Mapping[str, object] | None = None,
     ):
-        self._axes = Axes.of(axes)
-        self._measures, until = measures_of(measure, until)
-        taken = {*self._axes.names, *self._axes.parameters}
+        self._axes = Axes.from_mapping(axes)
+        self._measures, until = parse_measures(measure, until)
+        taken = {*self._axes.names, *self._axes.parameter_names}
         if both := taken & {*self._measures}:
             raise InputError(f"{both.pop()!r} is a measure and an axis")
         check_noise(noise)
-        method = (DEFAULT_METHOD if noise is None else DEFAULT_WITH_NOISE) if method is None else method
+        method = (DEFAULT_METHOD if noise is None else DEFAULT_NOISE_METHOD) if method is None else method
         if not isinstance(method, OneStepMethod):
             raise InputError(f"the method must be an integrator such as lt.MetriplecticGauss(), not {method!r}")
         check_choice("engine", engine, ("auto", "array", "compiled"))
@@ -150,46 +150,46 @@ class Study:
             raise InputError("x0 is missing: a state, or a function from the dict of a point to one")
         if len(sources) > 1:
             raise InputError(f"initial states come from one place, not from {' and '.join(sources)}")
-        times = sorted({t for m in self._measures.values() if isinstance(m, AtTimes) for t in m.at.times})
-        path = any(measure.path for measure in self._measures.values())
-        table = course_of(t_span, step, 1)
+        times = sorted({t for m in self._measures.values() if isinstance(m, ValuesAtTimes) for t in m.at.times})
+        path = any(measure.needs_path for measure in self._measures.values())
+        table = make_schedule(t_span, step, 1)
         if times and not (table.start <= times[0] and times[-1] <= table.end):
             raise InputError(
                 f"the times of measures lie within t_span = {tuple(t_span)}, and {times[0]:g} to {times[-1]:g} do not"
             )
-        every = any(m.path and not isinstance(m, AtTimes) for m in self._measures.values())
-        off = [t for t in times if every and np.abs(table.times - t).min() > 1e-9 * table.h]
+        every = any(m.needs_path and not isinstance(m, ValuesAtTimes) for m in self._measures.values())
+        off = [t for t in times if every and np.abs(table.saved_times - t).min() > 1e-9 * table.h]
         if off:
             raise InputError(f"beside a function of a solution lt.At takes times at which steps end, not {off[0]:g}")
         save_at = tuple(times) if times and not every else None
-        saves = (len(times) if save_at else table.steps + 1) if path else 0
-        self._chunk, self._steps, self._saves = chunk, table.steps, saves
-        self._about = {
+        saves = (len(times) if save_at else table.n_steps + 1) if path else 0
+        self._chunk_points, self._n_steps, self._n_saved = chunk, table.n_steps, saves
+        self._array_attributes = {
             name: {k: v for k, v in (("units", (units or {}).get(name)), ("long_name", (names or {}).get(name))) if v}
             for name in (*taken, *self._measures)
         }
         for name, what in self._measures.items():
-            self._about[name].setdefault("long_name", what.description())
-        unknown = [name for name in (*(units or {}), *(names or {})) if name not in self._about]
+            self._array_attributes[name].setdefault("long_name", what.description())
+        unknown = [name for name in (*(units or {}), *(names or {})) if name not in self._array_attributes]
         if unknown:
             raise InputError(f"there is no axis, parameter or measure {unknown[0]!r} to name")
         self._spec = None if spec is None else dict(spec)
-        self._folder: files.TemporaryFolder | None = None
+        self._temporary_folder: files.TemporaryFolder | None = None
         if store is None:
-            self._folder = files.TemporaryFolder()
-            store = self._folder.path / "study.zarr"
+            self._temporary_folder = files.TemporaryFolder()
+            store = self._temporary_folder.path / "study.zarr"
         self.store = Path(store)
-        parameters = self._axes.parameters
-        self._task = Task(
-            builder(build, parameters), parameters, x0, attitude, (table.start, table.end), step, method, until, engine,
+        parameters = self._axes.parameter_names
+        self._task = StudyTask(
+            system_builder(build, parameters), parameters, x0, attitude, (table.start, table.end), step, method, until, engine,
             self._measures, {}, save_at, saves, noise,
         )  # fmt: skip
-        self._solved: tuple[Solver, Columns, np.ndarray] | None = None
-        self._place: tuple[int, ...] = ()
+        self._example: tuple[PointSolver, PointResults, np.ndarray] | None = None
+        self._example_index: tuple[int, ...] = ()
 
     # -- running --------------------------------------------------------------------------------------------------
 
-    @by_own_settings
+    @with_library_settings
     def run(self, client: object = None, *, progress: bool | None = None) -> StudyStatus:
         """Do what is not done, and keep it: nothing is done twice.
 
@@ -212,30 +212,32 @@ class Study:
         FileError
             If the store cannot be read or written, or another run works on it.
         """
-        store, axes = self._opened()
+        store, axes = self._open_store()
         interrupted = False
-        with files.locked(store.root) as tell:
-            store, axes = self._opened()  # as another run may have left it
-            files.sweep(store.root)
+        with files.lock_store(store.root) as tell:
+            store, axes = self._open_store()  # as another run may have left it
+            files.remove_parts(store.root)
             if store.shape != axes.shape:
-                store = store.extended(axes)
+                store = store.extend(axes)
             survey = store.survey()
-            tell(survey.done)
+            tell(survey.n_done)
             try:
-                with Bar(store.points, survey.done, progress) as bar:
-                    self._work(store, axes, survey, bar, client)
+                with StudyProgressBar(store.n_points, survey.n_done, progress) as bar:
+                    self._solve_remaining(store, axes, survey, bar, client)
             except KeyboardInterrupt:
                 interrupted = True
-        return dataclasses.replace(status_of(store), damaged=survey.damaged, interrupted=interrupted)
+        return dataclasses.replace(store_status(store), damaged=survey.damaged, interrupted=interrupted)
 
-    def _work(self, store: Store, axes: Axes, survey: Survey, bar: Bar, client: Any) -> None:
-        if not survey.todo:
+    def _solve_remaining(
+        self, store: StudyStore, axes: Axes, survey: StoreSurvey, bar: StudyProgressBar, client: Any
+    ) -> None:
+        if not survey.remaining_chunks:
             return
-        solver = self._prepared(axes, tuple(store.study["place"]))[0]
+        solver = self._solve_example(axes, tuple(store.study_description["place"]))[0]
         if client is None:
-            here(solver, store, axes, survey, bar)
+            run_locally(solver, store, axes, survey, bar)
         else:
-            spread(solver.task, store, axes, survey, bar, client)
+            run_on_cluster(solver.task, store, axes, survey, bar, client)
 
     def status(self) -> StudyStatus:
         """How far the study is, from its store: any process may ask, also while another runs it.
@@ -245,7 +247,7 @@ class Study:
         FileError
             If there is no store.
         """
-        return status(self.store)
+        return load_status(self.store)
 
     # -- results ----------------------------------------------------------------------------------------------------
 
@@ -260,14 +262,14 @@ class Study:
         FileError
             If there is no store.
         """
-        found = held_results(self.store, self._folder)
-        store = Store.open(self.store)
-        mine, theirs = self._axes, store.axes()
+        found = open_results(self.store, self._temporary_folder)
+        store = StudyStore.open(self.store)
+        mine, theirs = self._axes, store.read_axes()
         order = {}
         for axis, kept in zip(mine.axes, theirs.axes, strict=True):
             if axis.name in axis.columns and len(axis) == len(kept):  # in the order of this study, not of the store
-                place = {row: i for i, row in enumerate(kept.rows())}
-                order[axis.name] = [place[row] for row in axis.rows()]
+                place = {row: i for i, row in enumerate(kept.value_keys())}
+                order[axis.name] = [place[row] for row in axis.value_keys()]
         return found.isel(order) if order else found
 
     def audit(self, **tolerances: float) -> Audit:
@@ -285,17 +287,17 @@ class Study:
         InputError
             If there is no tolerance of a name, or it is negative.
         """
-        return audit(self.store, **tolerances)
+        return audit_store(self.store, **tolerances)
 
     # -- what it is -------------------------------------------------------------------------------------------------
 
-    def _opened(self) -> tuple[Store, Axes]:
+    def _open_store(self) -> tuple[StudyStore, Axes]:
         """The store, made where there is none, and the axes in its order; refused where it is of another study."""
         if not self.store.exists() or (self.store.is_dir() and not any(self.store.iterdir())):
-            solver, columns, x0 = self._prepared()
-            described = {**identity.description(solver, columns, x0), "place": list(self._place)}
+            solver, columns, x0 = self._solve_example()
+            described = {**identity.describe_study(solver, columns, x0), "place": list(self._example_index)}
             about: dict[str, dict[str, Any]] = {
-                **self._about,
+                **self._array_attributes,
                 "status": {
                     "long_name": "how the point ended",
                     "flag_values": list(STATUSES.values()),
@@ -307,8 +309,8 @@ class Study:
             laws = solver.laws
             assert laws is not None
             attributes = {
-                "format": FORMAT,
-                "title": f"study of {', '.join(self._axes.parameters)}: {described['system']}",
+                "format": STORE_FORMAT,
+                "title": f"study of {', '.join(self._axes.parameter_names)}: {described['system']}",
                 **identity.provenance(described, solver.engine),
                 "study": described,
                 "laws": dataclasses.asdict(laws),
@@ -320,13 +322,13 @@ class Study:
                 name: (values.shape[1:], "complex128" if values.dtype.kind == "c" else "float64")
                 for name, values in columns.measures.items()
             }
-            store = Store.create(self.store, self._axes, self._points(solver), shapes, about, attributes)
+            store = StudyStore.create(self.store, self._axes, self._points_per_chunk(solver), shapes, about, attributes)
         else:
-            store = Store.open(self.store)
+            store = StudyStore.open(self.store)
         try:
-            axes = matched(self._axes, store.mended(self._axes))
-            solver, columns, x0 = self._prepared(axes, tuple(store.study["place"]))
-            lines = identity.differences(identity.description(solver, columns, x0), store.study)
+            axes = match_axes(self._axes, store.repaired_axes(self._axes))
+            solver, columns, x0 = self._solve_example(axes, tuple(store.study_description["place"]))
+            lines = identity.study_differences(identity.describe_study(solver, columns, x0), store.study_description)
         except InputError as error:
             lines = [str(error)]
         if lines:
@@ -334,95 +336,105 @@ class Study:
             raise InputError("\n  ".join([head, *lines]))
         return store, axes
 
-    def _points(self, solver: Solver) -> int:
+    def _points_per_chunk(self, solver: PointSolver) -> int:
         """Points of a chunk."""
-        if self._chunk is not None:
-            return self._chunk
-        most = ALONE if solver.members.family is None else CHUNK
-        return max(1, min(most, max(64, WORK // max(self._steps, 100))))
+        if self._chunk_points is not None:
+            return self._chunk_points
+        most = MAX_UNVECTORISED_CHUNK_POINTS if solver.systems.family is None else MAX_POINTS_PER_CHUNK
+        return max(1, min(most, max(64, TARGET_STEPS_PER_CHUNK // max(self._n_steps, 100))))
 
-    def _prepared(self, axes: Axes | None = None, place: tuple[int, ...] = ()) -> tuple[Solver, Columns, np.ndarray]:
+    def _solve_example(
+        self, axes: Axes | None = None, place: tuple[int, ...] = ()
+    ) -> tuple[PointSolver, PointResults, np.ndarray]:
         """The solver, and its example solved: the point at a place of some axes, or the first that can be run."""
-        if self._solved is not None and (axes is None or self._solved[0].task.example == _at(axes, place)[0]):
-            return self._solved
-        axes, places = (self._axes, self._candidates()) if axes is None else (axes, [place])
+        if self._example is not None and (
+            axes is None or self._example[0].task.example_point == _point_at(axes, place)[0]
+        ):
+            return self._example
+        axes, places = (self._axes, self._candidate_indices()) if axes is None else (axes, [place])
         first, failed = "", 0
         for place in places:
-            seeds = None if self._task.noise is None else self._task.noise.at([np.array([i]) for i in place])
-            why, built = self._tried(*_at(axes, place), seeds)
-            if self._solved is not None and not why:
-                self._place = place
-                return self._solved
-            first = first or f"{axes.describe(place)}: {why}"
+            seeds = None if self._task.noise is None else self._task.noise.grid_seeds([np.array([i]) for i in place])
+            why, built = self._try_point(*_point_at(axes, place), seeds)
+            if self._example is not None and not why:
+                self._example_index = place
+                return self._example
+            first = first or f"{axes.describe_point(place)}: {why}"
             failed += built
-            if failed == HOPELESS:
+            if failed == MAX_FAILED_EXAMPLES:
                 break
         raise InputError(f"no point of the study can be run; the first: {first}")
 
-    def _candidates(self) -> list[tuple[int, ...]]:
+    def _candidate_indices(self) -> list[tuple[int, ...]]:
         """Places spread over the axes, the first point first."""
         size, shape = self._axes.size, self._axes.shape
-        numbers = dict.fromkeys(int(size * _spread(k)) for k in range(TRIED))
+        numbers = dict.fromkeys(int(size * _van_der_corput(k)) for k in range(MAX_CANDIDATE_POINTS))
         return [tuple(map(int, np.unravel_index(number, shape))) for number in numbers]
 
-    def _tried(self, point: dict[str, Any], states: np.ndarray | None, seeds: np.ndarray | None) -> tuple[str, bool]:
+    def _try_point(
+        self, point: dict[str, Any], states: np.ndarray | None, seeds: np.ndarray | None
+    ) -> tuple[str, bool]:
         """Solve a point by itself; why it cannot be, or nothing, and whether its system was built."""
-        self._solved = None
-        self._check_axes(point)
+        self._example = None
+        self._require_used_axes(point)
         try:
-            solver = Solver(dataclasses.replace(self._task, example=point))
+            solver = PointSolver(dataclasses.replace(self._task, example_point=point))
         except Exception as error:  # the builder may be anyone's, and may raise at some points
-            return reason_of(error), False
-        columns = solver.columns({name: np.array([value]) for name, value in point.items()}, states, 1, seeds)
-        if columns.status[0] in (Code.INADMISSIBLE, MEASURE_FAILED):
+            return describe_error(error), False
+        columns = solver.solve({name: np.array([value]) for name, value in point.items()}, states, 1, seeds)
+        if columns.status[0] in (StatusCode.INADMISSIBLE, MEASURE_FAILED):
             return columns.message[0], True
-        measures = {name: _shaped(measure, columns.measures[name][0]) for name, measure in self._measures.items()}
+        measures = {
+            name: _with_example_value(measure, columns.measures[name][0]) for name, measure in self._measures.items()
+        }
         solver.task = dataclasses.replace(solver.task, measures=measures)
-        if solver.members.family is not None:  # and not another engine for some of the chunks
+        if solver.systems.family is not None:  # and not another engine for some of the chunks
             solver.task = dataclasses.replace(solver.task, engine=solver.engine)
-        elif self._axes.size > SLOW:
+        elif self._axes.size > WARN_UNVECTORISED_POINTS:
             warn(
-                f"the builder cannot be traced ({solver.members.reason}), so that each of {self._axes.size} points is "
+                f"the builder cannot be traced ({solver.systems.why_no_family}), so that each of {self._axes.size} points is "
                 "built by itself; written with jax.numpy and without Python's if, one program builds all"
             )
-        self._solved = solver, columns, self._initial(solver, point, states)
+        self._example = solver, columns, self._initial_state(solver, point, states)
         return "", True
 
-    def _initial(self, solver: Solver, point: dict[str, Any], states: np.ndarray | None) -> np.ndarray:
+    def _initial_state(self, solver: PointSolver, point: dict[str, Any], states: np.ndarray | None) -> np.ndarray:
         given = self._task.x0
-        x0 = states[0] if states is not None else given(Watched(point)) if callable(given) else given
-        return np.asarray(solver.members.example.state(x0), dtype=np.float64)
+        x0 = states[0] if states is not None else given(AccessRecorder(point)) if callable(given) else given
+        return np.asarray(solver.systems.example_system.state(x0), dtype=np.float64)
 
-    def _check_axes(self, point: dict[str, Any]) -> None:
+    def _require_used_axes(self, point: dict[str, Any]) -> None:
         """Refuse axes that are not used."""
-        watched = Watched(plain(point))
+        watched = AccessRecorder(as_python_values(point))
         for function in filter(callable, (self._task.build, self._task.x0, self._task.attitude)):
             try:
                 function(watched)
             except InputError as error:
-                if ASKED in str(error):
+                if UNKNOWN_PARAMETER_TEXT in str(error):
                     raise
                 return
             except Exception:  # reason_of as the reason of this point
                 return
-        unread = [name for name in self._axes.parameters if name not in watched.seen]
+        unread = [name for name in self._axes.parameter_names if name not in watched.accessed_names]
         if unread:
             raise InputError(
                 f"{unread[0]!r} is looked at neither by the builder nor by x0; an axis of replicas is lt.replicas"
             )
 
 
-def _shaped(measure: Measure, value: np.ndarray) -> Measure:
+def _with_example_value(measure: Measure, value: np.ndarray) -> Measure:
     """A measure that knows what it is at the first point."""
-    return dataclasses.replace(measure, like=value) if isinstance(measure, OfSolution) else measure
+    return dataclasses.replace(measure, example_value=value) if isinstance(measure, SolutionMeasure) else measure
 
 
-def _at(axes: Axes, place: tuple[int, ...]) -> tuple[dict[str, Any], np.ndarray | None]:
+def _point_at(axes: Axes, place: tuple[int, ...]) -> tuple[dict[str, Any], np.ndarray | None]:
     """The point at a place, and its initial state, shape (1, n), where an axis brings one."""
     rows = tuple(np.array([i]) for i in place)
-    return plain({name: values[0] for name, values in axes.points(rows).items()}), axes.states(rows)
+    return as_python_values({name: values[0] for name, values in axes.parameters_at(rows).items()}), axes.states_at(
+        rows
+    )
 
 
-def _spread(k: int) -> float:
+def _van_der_corput(k: int) -> float:
     """The k-th number of van der Corput's sequence: 0, 1/2, 1/4, 3/4, ..."""
     return sum((k >> bit & 1) / 2 ** (bit + 1) for bit in range(k.bit_length()))

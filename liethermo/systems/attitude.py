@@ -12,13 +12,13 @@ import numpy as np
 
 import manifolds as mf
 from manifolds._arrays import is_traced
-from manifolds._module import forwarded
+from manifolds._pytree_module import forward_to
 from manifolds.groups import maps
 
-from ..dissipation.base import Carried, There
+from ..dissipation.base import LiftedDissipation, LiftedGeometry
 from ..errors import InputError
 from ..functions.energy import Energy, Linear
-from ..tracing.interpret import at_points
+from ..tracing.interpret import evaluate_at_points
 from .base import System
 from .driven import DrivenSystem
 from .lie_poisson import LiePoissonSystem
@@ -80,9 +80,9 @@ class AttitudeSystem(System):
         """The system of mu and of baths alone."""
         return momenta_of(self.body)
 
-    pushed_by = forwarded("body")
-    has_impulse = forwarded("body")
-    casimirs_of_torque = forwarded("body")
+    pushed_by = forward_to("body")
+    has_impulse = forward_to("body")
+    casimirs_of_torque = forward_to("body")
 
     def split(self, x) -> tuple[jax.Array, jax.Array]:
         """State of the body, shape (..., n), and group element, shape (..., m, m), of a state."""
@@ -163,13 +163,13 @@ class AttitudeSystem(System):
         parts = [self.body.sizes(k[..., :n]), super().sizes(k[..., n:m])]
         return jnp.concatenate([*parts, *([super().sizes(k[..., m:])] if m < self.dim else [])], axis=-1)
 
-    def raised(self, x, alpha):
+    def raise_index(self, x, alpha):
         n = self.body.dim
-        return jnp.concatenate([self.body.raised(x[:n], alpha[:n]), alpha[n:]])
+        return jnp.concatenate([self.body.raise_index(x[:n], alpha[:n]), alpha[n:]])
 
-    def lowered(self, x, v):
+    def lower_index(self, x, v):
         n = self.body.dim
-        return jnp.concatenate([self.body.lowered(x[:n], v[:n]), v[n:]])
+        return jnp.concatenate([self.body.lower_index(x[:n], v[:n]), v[n:]])
 
     def presented(self, solution):
         states, g = self.split(solution.x)
@@ -178,7 +178,7 @@ class AttitudeSystem(System):
             attitude_residual=self.distance(solution.x),
             spatial_momentum_change=self.change_in_space(solution.x),
         )
-        dense = None if solution.dense is None else solution.dense.through(self.points)
+        dense = None if solution.dense is None else solution.dense.with_output_map(self.points)
         series = {name: f - f[0] if name in self.impulses else f for name, f in solution.casimirs.items()}
         of_body = dataclasses.replace(solution, x=np.asarray(states), dense=dense, stats=stats, casimirs=series)
         found = self.body.presented(of_body)
@@ -203,7 +203,7 @@ class AttitudeSystem(System):
         size = float(np.max(sizes))
         return float(np.abs(found - found[0]).max()) / (size if size > 0.0 else 1.0)
 
-    inertia = forwarded("momenta")
+    inertia = forward_to("momenta")
 
     @property
     def constants(self):
@@ -221,7 +221,7 @@ class AttitudeSystem(System):
         found = {name: self._of_momentum(f) for name, f in self.body.ledger.items()}
         return found | {name: Linear(jnp.ones(1)).on([i - self.group.dim]) for i, name in enumerate(self.impulses)}
 
-    balance = forwarded("body")
+    balance = forward_to("body")
 
     @property
     def blocks(self):
@@ -254,7 +254,7 @@ def _bounded(body: System) -> list[slice]:
 def _at_states(function: Callable, system: AttitudeSystem, x):
     """The values of ``function(system, x)`` at states, shape (m, n)."""
     rows = np.minimum(np.arange(1 << (len(x) - 1).bit_length()), len(x) - 1)  # few lengths, so few compilations
-    return at_points(function, system, np.asarray(x)[rows])
+    return evaluate_at_points(function, system, np.asarray(x)[rows])
 
 
 def momenta_of(body: System) -> LiePoissonSystem:
@@ -308,7 +308,7 @@ class TurningSystem(System):
         self.poisson = mf.NoPoisson(self.dim)  # the motion is that of field()
         self.energy, self.entropy = whole.energy, whole.entropy
         self.momentum_maps = {name: self.pulled(J) for name, J in body.momentum_maps.items()}
-        self.dissipation = _OnMomentum.of(body.dissipation, self.pulled)
+        self.dissipation = _OnMomentum.lift_terms(body.dissipation, self.pulled)
         self.preserved_as, self.decided = body.preserved_as, body.decided
 
     @property
@@ -319,15 +319,15 @@ class TurningSystem(System):
     def pulled(self, energy: Energy) -> Energy:
         return self.whole._of_momentum(energy)
 
-    pushed_by = forwarded("whole")
-    has_impulse = forwarded("whole")
-    casimirs_of_torque = forwarded("whole")
+    pushed_by = forward_to("whole")
+    has_impulse = forward_to("whole")
+    casimirs_of_torque = forward_to("whole")
 
     def casimirs(self):
         return {name: self.pulled(C) for name, C in self.whole.body.casimirs().items()}
 
-    raised = forwarded("whole")
-    lowered = forwarded("whole")
+    raise_index = forward_to("whole")
+    lower_index = forward_to("whole")
 
     def field(self, x, dH, dS, dL=()):
         body, n = self.body_at(x), self.whole.body.dim
@@ -366,11 +366,11 @@ class TurningSystem(System):
         return v[..., self.whole.body.dim + self.whole.group.dim :] / UNIT
 
 
-class _OnMomentum(Carried):
+class _OnMomentum(LiftedDissipation):
     """A dissipation of the momentum."""
 
-    noiseless = forwarded("part")
+    is_noiseless = forward_to("inner")
 
-    def there(self, system, x) -> There:
+    def lifted_geometry(self, system, x) -> LiftedGeometry:
         n = system.whole.body.dim
-        return There(system.body_at(x), x[:n], lambda alpha: alpha[:n], lambda v: jnp.pad(v, (0, len(x) - n)))
+        return LiftedGeometry(system.body_at(x), x[:n], lambda alpha: alpha[:n], lambda v: jnp.pad(v, (0, len(x) - n)))

@@ -14,19 +14,19 @@ import numpy as np
 
 import manifolds as mf
 from manifolds._arrays import is_traced, real_array
-from manifolds._precision import by_own_settings
-from manifolds.structures.poisson import Beside
+from manifolds._precision import with_library_settings
+from manifolds.structures.poisson import ProductPoisson
 
-from ..dissipation.base import Dissipation, portions, total
-from ..dissipation.heating import heated
+from ..dissipation.base import Dissipation, sum_dissipations, terms_with_preserved
+from ..dissipation.heating import couple_to_baths
 from ..errors import AxiomError, CasimirError, InputError
-from ..functions.checks import check_scalar, recognised, traced_energies
-from ..functions.energy import Energy, as_energy, function_name
-from ..functions.on_spaces import on_points, on_sites
-from ..functions.with_baths import WithBaths
-from ..tracing.interpret import at_points
-from ..tracing.remembered import remembered
-from ..tracing.traced import settled
+from ..functions.checks import check_energy, mark_polynomial_degrees, trace_energies
+from ..functions.energy import Energy, function_name, make_energy
+from ..functions.on_spaces import energy_of_vectors, flatten_site_functions
+from ..functions.with_baths import BodyBathsEnergy
+from ..tracing.caching import memoize
+from ..tracing.interpret import evaluate_at_points
+from ..tracing.traced import trace_callables
 from .baths import EntropyOfBaths, HeatBaths, beside_baths
 from .check import AXIOM_TOLERANCE, CheckReport, check_system
 from .conservation import is_proportional, judge, rates_of_change
@@ -88,7 +88,7 @@ class System(Kind):
         The state space, where it is not R^n.
     """
 
-    @by_own_settings
+    @with_library_settings
     def _build(
         self, poisson, dim, energy, entropy, dissipation, momentum_maps, validate, space=None, baths=None
     ) -> None:
@@ -96,26 +96,28 @@ class System(Kind):
         if not isinstance(baths, HeatBaths | None):
             raise InputError(f"baths are lt.HeatBaths(...), not {type(baths).__name__}")
         self.dim, self.space = dim, space
-        self.poisson = settled(poisson, lambda poisson, x: poisson.sharp(x, x), (dim,))
-        self.energy = check_scalar(self.on_states(as_energy(energy, "the energy")), dim, "the energy", timed=True)
+        self.poisson = trace_callables(poisson, lambda poisson, x: poisson.sharp(x, x), (dim,))
+        self.energy = check_energy(
+            self.on_states(make_energy(energy, "the energy")), dim, "the energy", allow_time=True
+        )
         self.entropy = None
         if entropy is not None:
-            self.entropy = check_scalar(self.on_states(as_energy(entropy, "the entropy")), dim, "the entropy")
+            self.entropy = check_energy(self.on_states(make_energy(entropy, "the entropy")), dim, "the entropy")
         momentum_maps = named_maps(momentum_maps)
         roles = {name: f"momentum map {name!r}" for name in momentum_maps}
         self.momentum_maps = {
-            name: check_scalar(self.on_states(as_energy(J, roles[name])), dim, roles[name])
+            name: check_energy(self.on_states(make_energy(J, roles[name])), dim, roles[name])
             for name, J in momentum_maps.items()
         }
         if space is None:  # in a chart no function is quadratic
-            self.energy = recognised(self.energy, dim)
-            self.entropy = None if self.entropy is None else recognised(self.entropy, dim)
-            self.momentum_maps = {name: recognised(J, dim) for name, J in self.momentum_maps.items()}
-        dissipation = total(dissipation)
+            self.energy = mark_polynomial_degrees(self.energy, dim)
+            self.entropy = None if self.entropy is None else mark_polynomial_degrees(self.entropy, dim)
+            self.momentum_maps = {name: mark_polynomial_degrees(J, dim) for name, J in self.momentum_maps.items()}
+        dissipation = sum_dissipations(dissipation)
         of_baths: tuple[Dissipation, ...] = ()
         if dissipation is not None and self.entropy is None:
             of_baths = tuple(part for part in dissipation.terms if part.needs_entropy)
-            dissipation = total([part for part in dissipation.terms if not part.needs_entropy] or None)
+            dissipation = sum_dissipations([part for part in dissipation.terms if not part.needs_entropy] or None)
         for part in of_baths:
             if baths is None:
                 raise InputError(f"{type(part).__name__} drives the entropy up, so the system needs an entropy")
@@ -126,7 +128,7 @@ class System(Kind):
                 )
         self.dissipation = None
         if dissipation is not None:
-            dissipation = on_sites(dissipation, self.shape)
+            dissipation = flatten_site_functions(dissipation, self.shape)
             self.dissipation = self._prepared_dissipation(dissipation)
         if baths is not None:
             self._heat(baths, of_baths)
@@ -136,37 +138,37 @@ class System(Kind):
             self._validate()
 
     def _prepared_dissipation(self, dissipation: Dissipation) -> Dissipation:
-        dissipation = traced_energies(dissipation, self.dim, "a preserved function")
-        return self._traced_dissipation(dissipation.prepared(self))
+        dissipation = trace_energies(dissipation, self.dim, "a preserved function")
+        return self._traced_dissipation(dissipation.bind_to(self))
 
     def _heat(self, baths: HeatBaths, of_baths: tuple[Dissipation, ...] = ()) -> None:
         """Put baths beside the body that this system has been so far; ``of_baths`` act on the states with baths."""
         body, n, m = copy(self), self.dim, baths.number
         if self.dissipation is not None or not of_baths:
-            self.dissipation = heated(self.dissipation, body, m, baths.positive, self._of_body)
+            self.dissipation = couple_to_baths(self.dissipation, body, m, baths.positive, self._of_body)
         if body.space is not None and body.space.dtype.kind == "c":
             raise InputError(f"baths are for real spaces, and {body.space.name} is complex")
         self.baths, self.dim = baths, n + m
         self.space = None if body.space is None else mf.Product(body.space, mf.Euclidean(m))
         self.poisson = beside_baths(body.poisson, m)
-        self.energy = WithBaths(body.energy, baths.energy, n, self.dim)
+        self.energy = BodyBathsEnergy(body.energy, baths.energy, n, self.dim)
         heat = EntropyOfBaths(m)
         self.entropy = heat if body.entropy is None else self._of_body(body.entropy) + heat
         self.momentum_maps = {name: self._of_body(J) for name, J in body.momentum_maps.items()}
         if of_baths:
             parts = tuple(self._prepared_dissipation(part) for part in of_baths)
-            self.dissipation = total([part for part in (self.dissipation, *parts) if part is not None])
+            self.dissipation = sum_dissipations([part for part in (self.dissipation, *parts) if part is not None])
 
-    def without_baths(self) -> System:
+    def drop_baths(self) -> System:
         if self.baths is None:
             return self
-        assert isinstance(self.poisson, Beside)
+        assert isinstance(self.poisson, ProductPoisson)
         body = copy(self)
         parts = {
             "dim": self.body_dim,
             "space": None if self.space is None else _first_factors(self.space),
             "poisson": self.poisson.first,
-            "energy": self.energy.body if isinstance(self.energy, WithBaths) else self.energy,
+            "energy": self.energy.body if isinstance(self.energy, BodyBathsEnergy) else self.energy,
             "baths": None,
         }
         for name, part in parts.items():
@@ -177,7 +179,7 @@ class System(Kind):
         """A function of the state of the body, as one of that with baths."""
         return energy.on(range(self.body_dim))
 
-    @by_own_settings
+    @with_library_settings
     def temperatures(self, x) -> jax.Array:
         """The temperatures of the baths: states of shape (..., n) give (..., number of baths)."""
         if self.baths is None:
@@ -187,7 +189,7 @@ class System(Kind):
 
     def on_states(self, energy: Energy) -> Energy:
         """An energy of states as they are shown, as one of their vectors."""
-        return on_points(on_sites(energy, self.shape), self.space)
+        return energy_of_vectors(flatten_site_functions(energy, self.shape), self.space)
 
     def _traced_dissipation(self, dissipation: Dissipation) -> Dissipation:
         """The dissipation with its plain functions traced for the arguments that its force gives them."""
@@ -195,7 +197,7 @@ class System(Kind):
         def force(dissipation, x):
             return dissipation.force(self, x, x, x, (x,) * len(dissipation.preserve))
 
-        return settled(dissipation, force, (self.dim,), is_leaf=lambda part: isinstance(part, Energy))
+        return trace_callables(dissipation, force, (self.dim,), is_leaf=lambda part: isinstance(part, Energy))
 
     # -- dynamics -------------------------------------------------------------------------------------------------
 
@@ -216,11 +218,11 @@ class System(Kind):
                 return jnp.zeros(())
             dH = system.energy.gradient(y)
             dS = None if system.entropy is None else system.entropy.gradient(y)
-            return -system.dissipation.change(system, y, dH, dS, system._preserved_gradients(y), dH)
+            return -system.dissipation.rate_of_change(system, y, dH, dS, system._preserved_gradients(y), dH)
 
         return self.evaluated(fall, x, t, "()")
 
-    @by_own_settings
+    @with_library_settings
     def friction_matrix(self, x, t=None, dissipation: Dissipation | None = None) -> jax.Array:
         """The matrix K(x) of the symmetric bracket, shape (n, n), where the force is ``K(x) grad S``.
 
@@ -258,7 +260,7 @@ class System(Kind):
 
     def _velocities(self, x, dH, dS, dL) -> list[jax.Array | None]:
         """Those of the dissipations, None where one is a torque."""
-        parts = () if self.dissipation is None else portions(self.dissipation, dL)
+        parts = () if self.dissipation is None else terms_with_preserved(self.dissipation, dL)
         return [part.velocity(self, x, dH, dS, own) for part, own in parts]
 
     # -- time -------------------------------------------------------------------------------------------------------
@@ -276,7 +278,7 @@ class System(Kind):
         """This system at a few times, for what is found out of one that is driven."""
         return [self.at_time(t) for t in TIMES]
 
-    @by_own_settings
+    @with_library_settings
     def evaluated(self, function: Callable, x, t, result: str) -> jax.Array:
         """``function(system, x)`` for each state of a batch, the system as it is at the time t, or at each of several.
 
@@ -366,7 +368,7 @@ class System(Kind):
     def _preserved_names(self) -> tuple[str, ...]:
         """What is preserved, by the name of the momentum map or Casimir it is a multiple of, or by one of its own."""
         functions = self.nameable()
-        gradients = at_points(gradients_of, functions, self.test_states(2))  # shape (points, functions, n)
+        gradients = evaluate_at_points(gradients_of, functions, self.test_states(2))  # shape (points, functions, n)
         return self.names_of_preserved(first_multiples(gradients, len(self.preserved)).tolist())
 
     def nameable(self) -> tuple[Energy, ...]:
@@ -374,7 +376,7 @@ class System(Kind):
         return (*(self.momentum_maps | self.casimirs()).values(), *self.preserved)
 
     def test_states(self, count: int) -> np.ndarray:
-        """Random states at which functions are compared, shape (states, n), ``count`` of each of :data:`SCALES`."""
+        """Random states at which functions are compared, shape (states, n), ``count`` of each of :data:`CONVEXITY_FORCE_SCALES`."""
         return np.concatenate([self.samples(count, seed, scale) for seed, scale in enumerate(SCALES)])
 
     def names_of_preserved(self, multiples: Sequence[int]) -> tuple[str, ...]:
@@ -393,7 +395,7 @@ class System(Kind):
             names.append(names[multiple] if multiple >= 0 else name if usable else fallback)
         return tuple(names[number:])
 
-    @by_own_settings
+    @with_library_settings
     def first_integrals(self) -> frozenset[str]:
         """The names of those of :meth:`functions` that the system conserves.
 
@@ -404,7 +406,7 @@ class System(Kind):
         """
         return self._found().constant
 
-    @by_own_settings
+    @with_library_settings
     def undecided(self) -> frozenset[str]:
         """The names of those of :meth:`functions` of which it is not found out whether the system conserves them.
 
@@ -445,7 +447,7 @@ class System(Kind):
 
     def claimed(self) -> frozenset[str]:
         """The names of the functions that it conserves by construction: nothing has to be tried out."""
-        by_form = self.dissipation is None or self.dissipation.keeps_casimirs
+        by_form = self.dissipation is None or self.dissipation.preserves_casimirs
         return frozenset({*self.momentum_maps, *(self.casimirs_of_torque if by_form else ())})
 
     def invariants(self) -> dict[str, tuple[Energy, bool | None]]:
@@ -478,7 +480,9 @@ class System(Kind):
         points = self.test_states(self.tested)
         if near is not None:
             points = np.concatenate([points, self.states_near(near)])
-        defined, conserved = judge(at_points(rates_of_change, (self, functions), points))  # shapes (points, functions)
+        defined, conserved = judge(
+            evaluate_at_points(rates_of_change, (self, functions), points)
+        )  # shapes (points, functions)
         pairs = zip(defined.T, conserved.T, strict=True)
         return [bool(kept[inside].all()) if inside.any() else None for inside, kept in pairs]
 
@@ -546,7 +550,7 @@ class System(Kind):
 
     def _beside_baths(self, x) -> np.ndarray | jax.Array:
         """A state of the body alone, with every bath at entropy zero; another array as it is."""
-        body = self.without_baths()
+        body = self.drop_baths()
         shape = body.shape if body.space is None else body.space.shape
         if shape == (1, 3) and x.shape == (3,):
             x = x[None]
@@ -559,7 +563,7 @@ class System(Kind):
         zeros = np.zeros((*vectors.shape[:-1], self.dim - body.dim))
         return (jnp if isinstance(x, jax.Array) else np).concatenate([vectors, zeros], axis=-1)
 
-    @by_own_settings
+    @with_library_settings
     def check(self, points=None, samples: int = 16, seed: int = 0, scale: float = 1.0, times=None) -> CheckReport:
         """Test the axioms of a metriplectic system at given or random points; the report prints as a table.
 
@@ -597,7 +601,9 @@ class System(Kind):
             return self.generated(x)
         dS = jnp.zeros_like(x) if self.entropy is None else self.entropy.gradient(x)
         gradients = self.energy.gradient(x), dS, *self._preserved_gradients(x)
-        dH, dS, *dL = (alpha if self.space is None else self.lowered(x, self.raised(x, alpha)) for alpha in gradients)
+        dH, dS, *dL = (
+            alpha if self.space is None else self.lower_index(x, self.raise_index(x, alpha)) for alpha in gradients
+        )
         return self.field(x, dH, dS, tuple(dL))
 
     def _preserved_gradients(self, x) -> tuple[jax.Array, ...]:
@@ -616,7 +622,7 @@ def _first_factors(space: mf.Space) -> mf.Space:
     return mf.Product(first, *others) if others else first
 
 
-@remembered
+@memoize
 def _verdicts_anywhere(system: System) -> dict[str, bool | None]:
     return system._verdicts()
 

@@ -12,14 +12,14 @@ import numpy as np
 
 import manifolds as mf
 from manifolds._arrays import is_traced
-from manifolds._module import Module
-from manifolds.structures.poisson import Beside
+from manifolds._pytree_module import Module
+from manifolds.structures.poisson import ProductPoisson
 
 from ..errors import InputError
-from ..functions.conditions import numbers
+from ..functions.bath_energy import BathEnergy, ReservoirEnergy, make_bath_energy
+from ..functions.conditions import check_numbers
 from ..functions.each import Each
 from ..functions.energy import Energy
-from ..functions.warmth import Reservoir, Warmth, warmth
 
 
 class HeatBaths(Module):
@@ -69,14 +69,16 @@ class HeatBaths(Module):
         self.number = number
         if energy is None:
             given = {"capacity": capacity, "temperature": temperature}
-            self.energy = warmth(*(_positive(value, what, number, what == "capacity") for what, value in given.items()))
+            self.energy = make_bath_energy(
+                *(_positive(value, what, number, what == "capacity") for what, value in given.items())
+            )
         else:
             self.energy = Each(_OfEntropy(energy), np.arange(number)[:, None])
 
     @property
     def positive(self) -> bool:
         """Whether every state has positive temperatures, by form."""
-        return isinstance(self.energy, Warmth | Reservoir)
+        return isinstance(self.energy, BathEnergy | ReservoirEnergy)
 
     @property
     def scale(self) -> np.ndarray | float:
@@ -85,7 +87,7 @@ class HeatBaths(Module):
 
     def entropy_scales(self) -> jax.Array:
         """:attr:`scale` as an array that JAX can trace, shape (number,)."""
-        if not isinstance(self.energy, Warmth):  # of what keeps its temperature any will do
+        if not isinstance(self.energy, BathEnergy):  # of what keeps its temperature any will do
             return jnp.ones(self.number)
         return jnp.where(jnp.isfinite(self.energy.capacity), self.energy.capacity, 1.0)
 
@@ -93,7 +95,7 @@ class HeatBaths(Module):
 def _positive(value, what: str, number: int, infinite: bool) -> jax.Array:
     known = contextlib.nullcontext() if is_traced(value) else jax.ensure_compile_time_eval()
     with known:  # numbers, while a family of systems is traced
-        array = numbers(value, f"the {what} of baths")
+        array = check_numbers(value, f"the {what} of baths")
         array = jnp.broadcast_to(array, (number,)) if array.ndim == 0 else array
     if array.shape != (number,):
         raise InputError(f"the {what} of {number} baths is one number, or has shape ({number},), not {array.shape}")
@@ -110,9 +112,9 @@ class _OfEntropy(Module):
         return self.energy(y[0])
 
 
-def beside_baths(body: mf.PoissonStructure, number: int) -> Beside:
+def beside_baths(body: mf.PoissonStructure, number: int) -> ProductPoisson:
     """The Poisson structure of a body, with entropies behind its state that nothing is conjugate to."""
-    return Beside(body, mf.NoPoisson(number))
+    return ProductPoisson(body, mf.NoPoisson(number))
 
 
 class EntropyOfBaths(Energy):

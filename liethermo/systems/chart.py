@@ -10,10 +10,10 @@ from __future__ import annotations
 import jax
 
 import manifolds as mf
-from manifolds._module import forwarded
+from manifolds._pytree_module import forward_to
 from manifolds.structures.poisson import PoissonBySharp
 
-from ..dissipation.base import Carried, There
+from ..dissipation.base import LiftedDissipation, LiftedGeometry
 from ..functions.energy import Energy
 from .base import System
 
@@ -46,16 +46,16 @@ class ChartSystem(System):
         trivial = isinstance(system.poisson, mf.NoPoisson)
         self.poisson = mf.NoPoisson(self.dim) if trivial else _Poisson(system, coordinates, place)
         self.momentum_maps = {name: self.pulled(J) for name, J in system.momentum_maps.items()}
-        self.dissipation = _Force.of(system.dissipation, self.pulled, system, coordinates, place)
+        self.dissipation = _Force.lift_terms(system.dissipation, self.pulled, system, coordinates, place)
         self.preserved_as, self.decided = system.preserved_as, system.decided
 
     def pulled(self, energy: Energy) -> Energy:
         """A function of states as one of coordinates."""
         space = self.manifold.space
         assert space is not None
-        return energy.mapped(lambda term: term.in_chart(self.coordinates, space, self.start))
+        return energy.map_terms(lambda term: term.pullback_to_chart(self.coordinates, space, self.start))
 
-    smooth = forwarded("manifold")
+    smooth = forward_to("manifold")
 
     def here(self, x) -> System:
         return (
@@ -100,15 +100,15 @@ class _Poisson(PoissonBySharp):
         return place.lower(self.system.poisson.sharp(place.state, place.lift(alpha)))
 
 
-class _Force(Carried):
+class _Force(LiftedDissipation):
     system: System
     coordinates: mf.Coordinates
     place: mf.Place | None
 
-    def there(self, system, x) -> There:
+    def lifted_geometry(self, system, x) -> LiftedGeometry:
         place = _Place(self.system, self.coordinates, self.place, x)
-        return There(self.system, place.state, place.lift, place.lower)
+        return LiftedGeometry(self.system, place.state, place.lift, place.lower)
 
     def divergence(self, system, x):
         """That with the volume of the manifold."""
-        return self.part.divergence(self.system, _Place(self.system, self.coordinates, self.place, x).state)
+        return self.inner.divergence(self.system, _Place(self.system, self.coordinates, self.place, x).state)

@@ -10,12 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from manifolds._tables import Row, Tabular
+from manifolds._tables import TableRow, Tabular
 
-from ..dissipation.friction_operator import KERNEL
-from ..dissipation.potential import CONVEX, LEAST
+from ..dissipation.friction_operator import FRICTION_KERNEL_CHECK
+from ..dissipation.potential import CONVEXITY_CHECK, MINIMUM_AT_ZERO_CHECK
 from ..errors import InputError
-from ..tracing.interpret import at_points
+from ..tracing.interpret import evaluate_at_points
 
 AXIOM_TOLERANCE = 1e-10
 """Largest residual of an axiom, relative to the size of what should cancel: derivatives round at about 1e-13."""
@@ -31,7 +31,7 @@ JACOBI_DIM = 40
 systems for three functions."""
 
 
-class CheckRow(Row):
+class CheckRow(TableRow):
     """One axiom: its worst relative residual over the points. ``passed`` is None for a report without a verdict."""
 
     @property
@@ -62,7 +62,7 @@ class CheckReport(Tabular):
     def __repr__(self) -> str:
         return f"<CheckReport of {len(self.rows)} axioms: {self._total}>"
 
-    def _table(self) -> tuple[tuple[CheckRow, ...], tuple[str, str, str], str]:
+    def _table_content(self) -> tuple[tuple[CheckRow, ...], tuple[str, str, str], str]:
         return self.rows, ("axiom", "residual", "tolerance"), f"{self._total} (at {self.points} points)"
 
     @property
@@ -85,7 +85,7 @@ def check_system(
     if system.is_driven:
         times = scale * np.random.default_rng(seed).standard_normal(len(points)) if times is None else times
         points = np.column_stack([points, np.broadcast_to(np.asarray(times, dtype=np.float64), len(points))])
-    measured = at_points(_residuals if matrices else _residuals_of_field, system, points)
+    measured = evaluate_at_points(_residuals if matrices else _residuals_of_field, system, points)
     friction = measured.pop("friction", None)
     if friction is not None:
         measured["semidefinite"] = np.array([_indefiniteness(K) for K in friction])
@@ -123,13 +123,16 @@ _AXIOMS = {
         "Pi grad S = 0",
         "The entropy is not a Casimir function; on a Lie algebra g, g.casimirs(degree) lists polynomial ones",
     ),
-    KERNEL: (
-        KERNEL,
+    FRICTION_KERNEL_CHECK: (
+        FRICTION_KERNEL_CHECK,
         "the friction operator does not have grad H in its kernel, and only its projection off grad H would act: give "
         "project=True if that is meant",
     ),
-    CONVEX: (CONVEX, "a dissipation potential has to be convex in the forces, or entropy could fall"),
-    LEAST: (LEAST, "a dissipation potential drives nothing where there is no force: its slope at zero vanishes"),
+    CONVEXITY_CHECK: (CONVEXITY_CHECK, "a dissipation potential has to be convex in the forces, or entropy could fall"),
+    MINIMUM_AT_ZERO_CHECK: (
+        MINIMUM_AT_ZERO_CHECK,
+        "a dissipation potential drives nothing where there is no force: its slope at zero vanishes",
+    ),
     "symmetric": ("K symmetric", "the friction matrix must be symmetric"),
     "kernel": ("K grad H = 0", "the dissipation would change the energy"),
     "semidefinite": ("K >= 0", "the friction matrix has a negative eigenvalue, so entropy could fall"),
@@ -189,9 +192,9 @@ def _residuals(system: Any, x: jax.Array, matrices: bool = True) -> dict[str, ja
     if system.space is not None:
         if matrices:  # else it is tangent by form
             velocity = system.vector_field(x)
-            found["tangent"] = relative(size(velocity - system.tangent(x, velocity)), size(velocity))
+            found["tangent"] = relative(size(velocity - system.project_tangent(x, velocity)), size(velocity))
         around, _ = system.local(x)
-        if system.space.of_classes:
+        if system.space.is_quotient:
             found["classes"] = _along_stabilizer(system, around, x)
         system, x = system.local(x, centred=True)
     dH, rate = system.energy.gradient(x), system.vector_field(x)
@@ -229,8 +232,8 @@ def _along_stabilizer(system: Any, around: Any, x) -> jax.Array:
     functions = [f for f in (system.energy, system.entropy, *system.momentum_maps.values()) if f is not None]
     found = []
     for gradient in (f.gradient(x) for f in functions):
-        along, whole = around.raised(x, gradient), size(gradient)
-        found.append(size(along - system.tangent(x, along)) / jnp.where(whole > 0.0, whole, 1.0))
+        along, whole = around.raise_index(x, gradient), size(gradient)
+        found.append(size(along - system.project_tangent(x, along)) / jnp.where(whole > 0.0, whole, 1.0))
     return jnp.max(jnp.stack(found))
 
 
@@ -238,7 +241,7 @@ def _of_dissipations(system: Any, x) -> dict[str, jax.Array]:
     """Residuals of what the dissipations were given, the largest of each name."""
     found: dict[str, jax.Array] = {}
     for part in () if system.dissipation is None else system.dissipation.terms:
-        for name, residual in part.own_residuals(system, x).items():
+        for name, residual in part.input_residuals(system, x).items():
             found[name] = jnp.maximum(found.get(name, 0.0), residual)
     return found
 
@@ -264,7 +267,7 @@ def _matrix_residuals(system: Any, around: Any, x, dH, dS):
     if system.entropy is not None:
         found["casimir"] = relative(size(tensor @ dS), size(tensor) * size(dS))
     dissipation = system.dissipation
-    if dissipation is not None and dissipation.entropy_law == "nondecreasing" and dissipation.symmetric:
+    if dissipation is not None and dissipation.entropy_law == "nondecreasing" and dissipation.is_symmetric:
         K = system.friction_matrix(x)
         found["symmetric"] = relative(size(K - K.T), size(K))
         found["kernel"] = relative(size(K @ dH), size(K) * size(dH))

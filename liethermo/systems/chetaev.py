@@ -13,13 +13,13 @@ import numpy as np
 
 import manifolds as mf
 from manifolds._arrays import is_traced
-from manifolds._module import Module
+from manifolds._pytree_module import Module
 
-from ..dissipation.base import Law
+from ..dissipation.base import LawName
 from ..errors import InputError
-from ..functions.arguments import Steady, needed_arguments
-from ..functions.checks import check_shape
-from ..tracing.interpret import at_points
+from ..functions.arguments import LastArgumentIgnored, required_argument_count
+from ..functions.checks import check_function_shape
+from ..tracing.interpret import evaluate_at_points
 from .herglotz import random_states
 from .ledger import ForcesAndHeat
 from .simple_closed import InOneRow, SimpleClosedSystem, lagrangian_of
@@ -95,10 +95,10 @@ class ChetaevSystem(SimpleClosedSystem):
 class ChetaevForces(ForcesAndHeat):
     """The force of a one-form, with the law of the entropy that it has."""
 
-    law: Law | None = eqx.field(static=True)
+    law: LawName | None = eqx.field(static=True)
 
     @property
-    def entropy_law(self) -> Law | None:
+    def entropy_law(self) -> LawName | None:
         return self.law
 
 
@@ -113,10 +113,10 @@ class Form(Module):
         """From what a user gives, checked; q and v of shape ``at``."""
         if not callable(eta):
             raise InputError(f"eta is a function of (q, v, S) to the components of a one-form, not {eta!r}")
-        implicit, n, what = needed_arguments(eta) == 4, math.prod(at), f"(q, v, S), q and v of shape {at}"
-        given = eta if implicit else Steady(eta)
+        implicit, n, what = required_argument_count(eta) == 4, math.prod(at), f"(q, v, S), q and v of shape {at}"
+        given = eta if implicit else LastArgumentIgnored(eta)
         given = given if len(at) == 1 else InOneRow(given, at)
-        function, found = check_shape(given, ((n,), (n,), (), ()), ((n + 1,), (n,)), "eta", what)
+        function, found = check_function_shape(given, ((n,), (n,), (), ()), ((n + 1,), (n,)), "eta", what)
         return cls(function if found == (n + 1,) else _Unit(function), implicit)
 
     def rate(self, q, v, S) -> jax.Array:
@@ -151,11 +151,11 @@ class _Unit(Module):
         return jnp.append(jnp.asarray(self.function(*arguments)), 1.0)
 
 
-def _law_of(form: Form, contact: mf.SplitContact) -> Law | None:
+def _law_of(form: Form, contact: mf.SplitContact) -> LawName | None:
     """What a form says of the entropy, from its production at random points."""
     if is_traced(form):
         return None
-    rates, sizes = at_points(_production, form, random_states(contact, POINTS))
+    rates, sizes = evaluate_at_points(_production, form, random_states(contact, POINTS))
     if (np.abs(rates) <= ROUNDED * sizes).all():
         return "conserved"
     return "nondecreasing" if (rates >= -ROUNDED * sizes).all() else None

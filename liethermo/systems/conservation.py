@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..functions.energy import Energy
-from ..functions.frames import frame
+from ..functions.frames import gram_schmidt
 from .check import AXIOM_TOLERANCE
 from .kinds import Kind
 
@@ -71,12 +71,12 @@ def rates_of_change(model: tuple[Kind, tuple[Energy, ...]], x) -> Rates:
 
 def project_covector(system: Kind, x, alpha) -> jax.Array:
     """Return the part of a covector that acts on tangent vectors: alpha itself on R^n."""
-    return alpha if system.space is None else system.lowered(x, system.raised(x, alpha))
+    return alpha if system.space is None else system.lower_index(x, system.raise_index(x, alpha))
 
 
 def _is_spanned(gradients, vectors) -> jax.Array:
     """Return which of the gradients, shape (m, n), are linear combinations of vectors, shape (m,)."""
-    off = frame(vectors).off
+    off = gram_schmidt(vectors).project_off
     rest = jnp.stack([off(gradient) for gradient in gradients])
     return jnp.sum(rest**2, axis=1) <= (AXIOM_TOLERANCE**2) * jnp.sum(gradients**2, axis=1)
 

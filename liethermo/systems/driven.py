@@ -11,14 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
-from manifolds._module import forwarded
-from manifolds.structures.poisson import Beside, PoissonBySharp
+from manifolds._pytree_module import forward_to
+from manifolds.structures.poisson import PoissonBySharp, ProductPoisson
 
-from ..dissipation.base import Carried, Law, SkewFriction, There
+from ..dissipation.base import LawName, LiftedDissipation, LiftedGeometry, SkewFriction
 from ..errors import InputError
-from ..functions.checks import recognised
-from ..functions.coordinates import Choice
-from ..functions.energy import Energy, InChart, Linear, Pullback, Quadratic, Sum, WithTime
+from ..functions.checks import mark_polynomial_degrees
+from ..functions.coordinates import ComponentMap
+from ..functions.energy import ChartEnergy, Energy, Linear, Pullback, Quadratic, StateTimeEnergy, Sum
 from ..functions.time_span import TimeSpan
 from .base import System
 
@@ -34,7 +34,7 @@ class DrivenSystem(System):
     It is the system of the energy ``H(x, t) - W`` and of the Poisson tensor ``Pi + [[0, -1], [1, 0]]`` on (t, W), with
     the dissipation acting on x alone. So ``H - W`` is constant, which is the law ``dH = work``, and every method keeps
     it as it keeps the energy of any system; K is rebuilt with the discrete gradient by x in its kernel, so the entropy
-    law holds as ever. What corrects the discrete gradient of H goes along x and t alone (:class:`WithTime`), so ``t' =
+    law holds as ever. What corrects the discrete gradient of H goes along x and t alone (:class:`StateTimeEnergy`), so ``t' =
     1`` holds to rounding and W is what the power comes to.
 
     A torque tau works too, ``x' = ... + tau``, ``W' = dH/dt + dH . tau``. It is a skew bracket of x and W with the
@@ -67,12 +67,12 @@ class DrivenSystem(System):
         self.space = None if body.space is None else mf.Product(body.space, mf.Euclidean(2))
         if body.space is not None and body.space.dtype.kind == "c":
             raise InputError(f"an energy that depends on time is for real spaces, and {body.space.name} is complex")
-        self.poisson = Beside(body.poisson, _OfClock(unit))
+        self.poisson = ProductPoisson(body.poisson, _OfClock(unit))
         energy = Sum((*map(self._term, body.energy.terms), _MinusWork(unit)))
-        self.energy = energy if self.space is not None else recognised(energy, self.dim)
+        self.energy = energy if self.space is not None else mark_polynomial_degrees(energy, self.dim)
         self.entropy = None if body.entropy is None else self._of_body(body.entropy)
         self.momentum_maps = {name: self._of_body(J) for name, J in body.momentum_maps.items()}
-        self.dissipation = _OnBody.of(body.dissipation, self._of_body)
+        self.dissipation = _OnBody.lift_terms(body.dissipation, self._of_body)
         if body.pushed_by:
             push = _Push("conserved" if body.entropy_law is not None or body.entropy is None else None)
             self.dissipation = push if self.dissipation is None else self.dissipation + push
@@ -128,8 +128,8 @@ class DrivenSystem(System):
 
     # -- dynamics ---------------------------------------------------------------------------------------------------
 
-    unrollable = forwarded("body")
-    spectral = forwarded("body")
+    unrollable = forward_to("body")
+    spectral = forward_to("body")
 
     def field(self, x, dH, dS, dL=()):
         motion = self._now(x).left_alone().field(*_part_of_body(x, dH, dS, dL))
@@ -139,12 +139,12 @@ class DrivenSystem(System):
     def transport(self, x, dH, dS, dL=()):
         return self._now(x).transport(*_part_of_body(x, dH, dS, dL))
 
-    torque_free = forwarded("body")
-    body_dim = forwarded("body")
-    pushed_by = forwarded("body")
-    has_impulse = forwarded("body")
-    casimirs_of_torque = forwarded("body")
-    needs_attitude = forwarded("body")
+    torque_free = forward_to("body")
+    body_dim = forward_to("body")
+    pushed_by = forward_to("body")
+    has_impulse = forward_to("body")
+    casimirs_of_torque = forward_to("body")
+    needs_attitude = forward_to("body")
 
     def push(self, x):
         return self._now(x).push(x[:-2]) if self.torque is None else self.torque
@@ -168,14 +168,14 @@ class DrivenSystem(System):
         object.__setattr__(found, "torque", torque)
         return found
 
-    surface = forwarded("body")
+    surface = forward_to("body")
 
-    def raised(self, x, alpha):
+    def raise_index(self, x, alpha):
         """What is moved to correct something is moved in the body: never the clock, nor the work done."""
-        return jnp.concatenate([self.body.raised(x[:-2], alpha[:-2]), jnp.zeros(2)])
+        return jnp.concatenate([self.body.raise_index(x[:-2], alpha[:-2]), jnp.zeros(2)])
 
-    def lowered(self, x, v):
-        return jnp.concatenate([self.body.lowered(x[:-2], v[:-2]), v[-2:]])
+    def lower_index(self, x, v):
+        return jnp.concatenate([self.body.lower_index(x[:-2], v[:-2]), v[-2:]])
 
     def _now(self, x) -> System:
         return self._at(self.time(x))
@@ -199,8 +199,8 @@ class DrivenSystem(System):
     def casimirs(self):
         return {name: self._of_body(C) for name, C in self.body.casimirs().items()}
 
-    has_all_casimirs = forwarded("body")
-    orbit = forwarded("body")
+    has_all_casimirs = forward_to("body")
+    orbit = forward_to("body")
 
     def conserves(self, functions, near=None):
         """Whether the body does, asked near its part of each state: beside the clock, nothing else would count."""
@@ -215,7 +215,7 @@ class DrivenSystem(System):
 
     def presented(self, solution):
         dense, body = solution.dense, self.body
-        dense = None if dense is None else dense.through(lambda x: x[..., :-2])
+        dense = None if dense is None else dense.with_output_map(lambda x: x[..., :-2])
         x = np.ascontiguousarray(solution.x[:, :-2])
         entries = {"system": type(body).__name__, "x0": x[0].tolist() if solution.provenance.get("x0") else None}
         if body.lie_algebra is not None:
@@ -225,7 +225,7 @@ class DrivenSystem(System):
         found = dataclasses.replace(solution, x=x, energy=energy, dense=dense).with_provenance(**entries)
         return body.presented(found)
 
-    on_sites = forwarded("body")
+    on_sites = forward_to("body")
 
 
 class _WithoutClock(Energy):
@@ -247,11 +247,11 @@ class _OfClock(PoissonBySharp):
     def sharp(self, x, alpha) -> jax.Array:
         return _clock(alpha, self.unit)
 
-    def on_leaf(self, x, alpha, A) -> jax.Array:
+    def stages_on_leaf(self, x, alpha, A) -> jax.Array:
         """Any points: the tensor is constant."""
         return jnp.broadcast_to(x, alpha.shape)
 
-    def turning(self, covector, alpha) -> jax.Array:
+    def leaf_covector_rate(self, covector, alpha) -> jax.Array:
         return alpha
 
 
@@ -268,27 +268,29 @@ def _part_of_body(x, dH, dS, dL) -> tuple:
 class _Push(SkewFriction):
     """The torque on a body and the work that it does."""
 
-    law: Law | None = eqx.field(static=True)
+    law: LawName | None = eqx.field(static=True)
 
     @property
     def entropy_law(self):
         return self.law
 
-    noiseless = True
-    keeps_casimirs = True  # those of :attr:`System.casimirs_of_torque`; of others nobody claims it
+    is_noiseless = True
+    preserves_casimirs = True  # those of :attr:`System.casimirs_of_torque`; of others nobody claims it
 
     def force(self, system, x, dH, dS, dL):
         return system.pushed(x, dH)
 
 
-class _OnBody(Carried):
+class _OnBody(LiftedDissipation):
     """A dissipation of the body, as it is at the time of the state."""
 
-    def there(self, system, x) -> There:
-        return There(system._now(x), x[:-2], lambda alpha: alpha[:-2], lambda v: jnp.pad(v, (0, 2)), volume=True)
+    def lifted_geometry(self, system, x) -> LiftedGeometry:
+        return LiftedGeometry(
+            system._now(x), x[:-2], lambda alpha: alpha[:-2], lambda v: jnp.pad(v, (0, 2)), preserves_solenoidal=True
+        )
 
 
-class _Clock(Choice):
+class _Clock(ComponentMap):
     """From a state with clock and work to x and t."""
 
     dim: int = eqx.field(static=True)
@@ -304,7 +306,7 @@ class _MinusWork(Pullback):
     def __init__(self, unit: float):
         super().__init__(Linear(jnp.array([-1.0 / unit])), [-1])
 
-    def in_chart(self, coordinates, space, start=None):
+    def pullback_to_chart(self, coordinates, space, start=None):
         value = self.value(space.to_vector(coordinates.centre().point))
         return Quadratic(jnp.zeros(space.dim), self.gradient(jnp.zeros(space.dim)), value)
 
@@ -314,9 +316,11 @@ class _OfTime(Pullback):
 
     coordinates: _Clock
 
-    def in_chart(self, coordinates, space, start=None):
+    def pullback_to_chart(self, coordinates, space, start=None):
         clock = _Clock(space.dim - 2, self.coordinates.unit)
-        return Pullback(WithTime(_InChartAndTime(InChart(self, coordinates, space, start), clock.unit)), clock)
+        return Pullback(
+            StateTimeEnergy(_InChartAndTime(ChartEnergy(self, coordinates, space, start), clock.unit)), clock
+        )
 
 
 class _InChartAndTime(Energy):

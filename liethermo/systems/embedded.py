@@ -16,15 +16,15 @@ import numpy as np
 
 import manifolds as mf
 from manifolds._arrays import is_traced
-from manifolds._module import forwarded
+from manifolds._pytree_module import forward_to
 from manifolds.structures.poisson import PoissonBySharp
 
-from ..dissipation.base import Carried, There
-from ..functions.checks import recognised
+from ..dissipation.base import LiftedDissipation, LiftedGeometry
+from ..functions.checks import mark_polynomial_degrees
 from ..functions.energy import Energy
-from ..functions.surface import OnLevels
-from ..tracing.interpret import at_points
-from ..tracing.programs import part
+from ..functions.surface import ConstraintSurface
+from ..tracing.interpret import evaluate_at_points
+from ..tracing.programs import subprogram
 from .base import System
 
 TANGENT = 1e-12
@@ -53,24 +53,24 @@ class EmbeddedSystem(System):
     def __init__(self, manifold: System, conforming: bool = False, untouched: bool = False):
         self.manifold, self.conforming, self.untouched = manifold, conforming, untouched
         self.dim, self.space, self.baths = manifold.dim, None, manifold.baths
-        self.energy = recognised(manifold.energy, self.dim)
-        self.entropy = None if manifold.entropy is None else recognised(manifold.entropy, self.dim)
+        self.energy = mark_polynomial_degrees(manifold.energy, self.dim)
+        self.entropy = None if manifold.entropy is None else mark_polynomial_degrees(manifold.entropy, self.dim)
         as_they_are = conforming or isinstance(manifold.poisson, mf.NoPoisson)
         self.poisson = manifold.poisson if as_they_are else _Tangent(manifold)
-        self.dissipation = _Force.of(manifold.dissipation, self._recognised, manifold, untouched)
+        self.dissipation = _Force.lift_terms(manifold.dissipation, self._recognised, manifold, untouched)
         self.momentum_maps = {name: self._recognised(J) for name, J in manifold.momentum_maps.items()}
         self.preserved_as, self.decided = manifold.preserved_as, manifold.decided
 
     def _recognised(self, energy: Energy) -> Energy:
-        return recognised(energy, self.dim)
+        return mark_polynomial_degrees(energy, self.dim)
 
-    kind = forwarded("manifold")
+    kind = forward_to("manifold")
 
     @property
     def domain(self) -> str:  # type: ignore[override]
         return f"a point of {_space(self.manifold).name}"
 
-    ledger = forwarded("manifold")
+    ledger = forward_to("manifold")
 
     @property
     def known(self) -> tuple[bool, bool]:
@@ -78,27 +78,29 @@ class EmbeddedSystem(System):
         return self.conforming, self.untouched
 
     @property
-    def surface(self) -> OnLevels:
-        return OnLevels(_space(self.manifold), self.conforming)
+    def surface(self) -> ConstraintSurface:
+        return ConstraintSurface(_space(self.manifold), self.conforming)
 
     def outside(self, x) -> str:
         space, x = _space(self.manifold), np.atleast_2d(x)
         if not np.isfinite(x).all():
             return ""
-        inside = at_points(_inside, self.surface, x) > 0.0
+        inside = evaluate_at_points(_inside, self.surface, x) > 0.0
         if inside.all():
             return self.manifold.outside(x)
-        return f"the step leaves {space.name}: {space._why_off(np.asarray(self.points(x[inside.argmin()])), np.inf)}"
+        return (
+            f"the step leaves {space.name}: {space._why_off_space(np.asarray(self.points(x[inside.argmin()])), np.inf)}"
+        )
 
     # -- states -------------------------------------------------------------------------------------------------------
 
-    singular = forwarded("manifold")
-    points = forwarded("manifold")
-    numbers = forwarded("manifold")
-    on_states = forwarded("manifold")
-    samples = forwarded("manifold")
-    without_baths = forwarded("manifold")
-    _around = forwarded("manifold")
+    singular = forward_to("manifold")
+    points = forward_to("manifold")
+    numbers = forward_to("manifold")
+    on_states = forward_to("manifold")
+    samples = forward_to("manifold")
+    drop_baths = forward_to("manifold")
+    _around = forward_to("manifold")
 
     def presented(self, solution):
         given = self.manifold.dissipation
@@ -110,7 +112,7 @@ class EmbeddedSystem(System):
     def at_time(self, t) -> System:
         return EmbeddedSystem(self.manifold.at_time(t), *self.known) if self.is_driven else self
 
-    def raised(self, x, alpha):
+    def raise_index(self, x, alpha):
         """What of a gradient is along the level sets: the direction of corrections."""
         return _along(self.manifold, x, alpha)
 
@@ -118,7 +120,7 @@ class EmbeddedSystem(System):
     def unrollable(self) -> bool:
         return self.manifold.smooth
 
-    smooth = forwarded("manifold")
+    smooth = forward_to("manifold")
 
 
 class _Tangent(PoissonBySharp):
@@ -126,14 +128,14 @@ class _Tangent(PoissonBySharp):
 
     manifold: System
 
-    dim = forwarded("manifold")
+    dim = forward_to("manifold")
 
     def sharp(self, x, alpha):
         motion = self.manifold.poisson.sharp(x, _along(self.manifold, x, alpha))
         return _along(self.manifold, x, motion)
 
 
-class _Force(Carried):
+class _Force(LiftedDissipation):
     """A dissipation that is handed the metric of the space, ``P K P`` near it.
 
     There P is symmetric, and what it gives is along the level sets; it need not be a projector, so that K between two
@@ -143,53 +145,55 @@ class _Force(Carried):
     manifold: System
     untouched: bool = eqx.field(static=True)
 
-    def there(self, system, x) -> There:
+    def lifted_geometry(self, system, x) -> LiftedGeometry:
         """It is handed what is along the level sets: near an equilibrium that has digits of its own."""
         along = functools.partial(_along, self.manifold, x)
-        return There(self.manifold, x, along, along)
+        return LiftedGeometry(self.manifold, x, along, along)
 
     def force(self, system, x, dH, dS, dL):
         return _forced(self, x, dH, dS, dL)
 
     def divergence(self, system, x):
         """That with the volume of the manifold."""
-        return self.part.divergence(self.manifold, system.surface.returned(x))
+        return self.inner.divergence(self.manifold, system.surface.project_state(x))
 
 
-@part
+@subprogram
 def _forced(force: _Force, x, dH, dS, dL) -> jax.Array:
-    at = force.there(force.manifold, x)
-    found = force.part.force(at.system, at.x, *at.lifted(dH, dS, dL))
+    at = force.lifted_geometry(force.manifold, x)
+    found = force.inner.force(at.system, at.x, *at.lift_gradients(dH, dS, dL))
     return found if force.untouched else at.lower(found)
 
 
 def embedded(system: System) -> System:
     """The system in the space around its manifold; itself on R^n, and where it can be run in charts alone."""
-    if system.space is None or not system.space.surrounded:
+    if system.space is None or not system.space.can_be_embedded:
         return system
     if is_traced(system):
         return EmbeddedSystem(system)
     points = _some_points(system)
     points = points * (1.0 + AWAY * np.random.default_rng(0).uniform(-1.0, 1.0, points.shape))
-    conforming, untouched = (np.nan_to_num(at_points(_across, system, points), nan=np.inf) <= TANGENT).all(axis=0)
+    conforming, untouched = (np.nan_to_num(evaluate_at_points(_across, system, points), nan=np.inf) <= TANGENT).all(
+        axis=0
+    )
     return EmbeddedSystem(system, bool(conforming), bool(conforming and untouched))
 
 
 def _some_points(system: System) -> np.ndarray:
     """A few states: of a space whose random points are made of normal numbers, without a compiler."""
     space = _space(system)
-    if space._normals is None:
+    if space._n_normals is None:
         return system.samples(3)
-    return at_points(_from_normals, space, np.random.default_rng(2).standard_normal((3, space._normals)))
+    return evaluate_at_points(_from_normals, space, np.random.default_rng(2).standard_normal((3, space._n_normals)))
 
 
 def _from_normals(space: mf.Space, w):
-    return space.to_vector(space._from_normals(w))
+    return space.to_vector(space._point_from_normals(w))
 
 
-def _inside(surface: OnLevels, x):
+def _inside(surface: ConstraintSurface, x):
     """1 where the point of the surface next to a state is in the space, else 0."""
-    return jnp.where(surface.inside(surface.returned(x)), 1.0, 0.0)
+    return jnp.where(surface.is_in_space(surface.project_state(x)), 1.0, 0.0)
 
 
 def _across(system: System, x):
@@ -220,9 +224,9 @@ def _along(system: System, x, w):
     return _along_in(_space(system), x, w)
 
 
-@part
+@subprogram
 def _along_in(space: mf.Space, x, w):
-    return space.to_vector(space._along(space.from_vector(x), space.from_vector(w)))
+    return space.to_vector(space._tangential_part(space.from_vector(x), space.from_vector(w)))
 
 
 def _space(system: System) -> mf.Space:

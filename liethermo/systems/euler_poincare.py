@@ -11,14 +11,14 @@ import numpy as np
 
 import manifolds as mf
 from manifolds._arrays import is_traced
-from manifolds._module import Module
+from manifolds._pytree_module import Module
 from manifolds.matrices.linear import solve
 
-from ..dissipation.base import Dissipation, total
+from ..dissipation.base import Dissipation, sum_dissipations
 from ..dissipation.force import EulerPoincareForce
 from ..errors import InputError
-from ..functions.checks import check_scalar
-from ..functions.energy import Energy, Quadratic, TimeDependent, as_energy
+from ..functions.checks import check_energy
+from ..functions.energy import Energy, Quadratic, TimeDependent, make_energy
 from .lie_poisson import LiePoissonSystem
 
 NEWTON_STEPS = 50
@@ -86,11 +86,11 @@ class EulerPoincareSystem(LiePoissonSystem):
         group: mf.MatrixGroup | None = None,
         reconstruction: str | None = None,
     ):
-        energy = as_energy(lagrangian, "the Lagrangian")
-        self.lagrangian = check_scalar(energy, algebra.dim, "the Lagrangian", timed=True)
+        energy = make_energy(lagrangian, "the Lagrangian")
+        self.lagrangian = check_energy(energy, algebra.dim, "the Lagrangian", allow_time=True)
         if force is not None:
             forced = EulerPoincareForce(force)
-            given = total(dissipation)
+            given = sum_dissipations(dissipation)
             dissipation = forced if given is None else given + forced
         energy = _hamiltonian(self.lagrangian, algebra.dim)
         super().__init__(algebra, energy, entropy, dissipation, momentum_maps, validate, group, reconstruction)

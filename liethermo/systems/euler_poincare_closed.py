@@ -11,15 +11,15 @@ import numpy as np
 
 import manifolds as mf
 from manifolds._arrays import is_traced
-from manifolds._module import Module
+from manifolds._pytree_module import Module
 from manifolds.matrices.linear import solve
-from manifolds.structures.poisson import Beside, PoissonBySharp
+from manifolds.structures.poisson import PoissonBySharp, ProductPoisson
 
 from ..errors import InputError
-from ..functions.checks import check_scalar, recognised
-from ..functions.energy import Energy, Function, as_energy
-from ..tracing.interpret import at_points
-from ..tracing.traced import settled
+from ..functions.checks import check_energy, mark_polynomial_degrees
+from ..functions.energy import Energy, Function, make_energy
+from ..tracing.interpret import evaluate_at_points
+from ..tracing.traced import trace_callables
 from .euler_poincare import singular_everywhere
 from .evolution import entropy_component
 from .ledger import ForcesAndHeat, WithLedger, field, linear_friction
@@ -83,8 +83,8 @@ class EulerPoincareClosedSystem(WithLedger):
         if not isinstance(algebra, mf.LieAlgebra):
             raise InputError(f"the algebra is a manifolds.LieAlgebra, such as mf.so(3), not {type(algebra).__name__}")
         n, at = algebra.dim, "(xi, S)"
-        check_scalar(as_energy(lambda x: lagrangian(x[:n], x[n]), "the Lagrangian"), n + 1, "the Lagrangian")
-        lagrangian = settled(lagrangian, lambda lagrangian, *a: lagrangian(*a), (n,), ())
+        check_energy(make_energy(lambda x: lagrangian(x[:n], x[n]), "the Lagrangian"), n + 1, "the Lagrangian")
+        lagrangian = trace_callables(lagrangian, lambda lagrangian, *a: lagrangian(*a), (n,), ())
         self.algebra, self.lagrangian = algebra, lagrangian
         if friction is None or callable(friction):
             self.friction = None if friction is None else field(friction, ((n,), ()), (n,), "the friction", at)
@@ -93,18 +93,20 @@ class EulerPoincareClosedSystem(WithLedger):
         self.external = None if external is None else field(external, ((n,), ()), (n,), "the external force", at)
         self.heat_power = None if heat_power is None else field(heat_power, ((n,), ()), (), "the heat power", at)
         casimirs = {
-            name: recognised(Function(OfMomentum(as_energy(C, "a Casimir"), lagrangian)), n + 1)
+            name: mark_polynomial_degrees(Function(OfMomentum(make_energy(C, "a Casimir"), lagrangian)), n + 1)
             for name, C in algebra.leading_casimirs()
         }
         self.invariants_of_momentum = {name: C.on(range(n + 1)) if self.receives else C for name, C in casimirs.items()}
         structure = OnAlgebra(algebra, lagrangian)
         if not is_traced(lagrangian):
-            hessians = at_points(_hessian, structure, np.random.default_rng(0).standard_normal((4, n + 1)))
+            hessians = evaluate_at_points(_hessian, structure, np.random.default_rng(0).standard_normal((4, n + 1)))
             if singular_everywhere(hessians):
                 raise InputError("the Lagrangian is singular: its Hessian in xi has no inverse")
         given = (self.friction, self.external, self.heat_power)
         forces = None if given == (None, None, None) else ForcesAndHeat(*given)
-        whole, total, energy = self._beside_ledger(structure, n + 1, recognised(ReducedEnergy(lagrangian), n + 1))
+        whole, total, energy = self._beside_ledger(
+            structure, n + 1, mark_polynomial_degrees(ReducedEnergy(lagrangian), n + 1)
+        )
         self._build(whole, total, energy, entropy_component(total, n), forces, momentum_maps, validate)
 
     def parts(self, x) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -115,7 +117,7 @@ class EulerPoincareClosedSystem(WithLedger):
     @property
     def structure(self) -> OnAlgebra:
         """The Poisson structure of (xi, S)."""
-        return cast(OnAlgebra, self.poisson.first if isinstance(self.poisson, Beside) else self.poisson)
+        return cast(OnAlgebra, self.poisson.first if isinstance(self.poisson, ProductPoisson) else self.poisson)
 
     def momentum(self, xi, S) -> jax.Array:
         """``l_xi`` at one point, shape (dim,)."""
@@ -158,7 +160,7 @@ class EulerPoincareClosedSystem(WithLedger):
         return self.invariants_of_momentum
 
     def outside(self, x) -> str:
-        T = float(at_points(_temperature, self, np.atleast_2d(x)).min())
+        T = float(evaluate_at_points(_temperature, self, np.atleast_2d(x)).min())
         return "" if T > 0.0 else f"the temperature -dl/dS is {T:.4g}: it has to be positive"
 
     def domain_margin(self, x):

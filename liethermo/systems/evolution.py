@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 
 import manifolds as mf
-from manifolds._module import Module
+from manifolds._pytree_module import Module
 
-from ..dissipation.base import Law, SkewFriction
+from ..dissipation.base import LawName, SkewFriction
 from ..errors import InputError
-from ..functions.arguments import needed_arguments
-from ..functions.checks import check_scalar, recognised
-from ..functions.energy import Energy, Quadratic, as_energy
+from ..functions.arguments import required_argument_count
+from ..functions.checks import check_energy, mark_polynomial_degrees
+from ..functions.energy import Energy, Quadratic, make_energy
 from ..functions.mechanics import is_mechanical
 from .base import System
 from .embedded import EmbeddedSystem
@@ -33,7 +33,7 @@ class LiouvilleFriction(SkewFriction):
     nondecreasing: bool = eqx.field(static=True, default=False)
 
     @property
-    def entropy_law(self) -> Law | None:
+    def entropy_law(self) -> LawName | None:
         return "nondecreasing" if self.nondecreasing else None
 
     def force(self, system, x, dH, dS, dL):
@@ -130,9 +130,9 @@ class EvolutionSystem(OnContactManifold):
         space: mf.Space | None = None,
     ):
         dim = components(dim, space)
-        energy = as_energy(in_one_array(energy, space), "the energy")
-        energy = check_scalar(energy, dim, "the energy", timed=True)
-        friction = LiouvilleFriction(is_mechanical(recognised(energy, dim), dim, space))
+        energy = make_energy(in_one_array(energy, space), "the energy")
+        energy = check_energy(energy, dim, "the energy", allow_time=True)
+        friction = LiouvilleFriction(is_mechanical(mark_polynomial_degrees(energy, dim), dim, space))
         entropy, states = entropy_component(dim), states_on(space)
         self._build(canonical(dim, space), dim, energy, entropy, friction, momentum_maps, validate, states)
 
@@ -184,7 +184,7 @@ def bundle_of(space: mf.Space | None) -> mf.TangentBundle | None:
     if space is None:
         return None
     bundle = mf.TangentBundle(space)
-    if not bundle.surrounded:
+    if not bundle.can_be_embedded:
         raise InputError(f"{space.name} has no equations in the arrays around it, so no momenta are taken along it")
     return bundle
 
@@ -230,7 +230,7 @@ class Joined(Module):
 
 def in_one_array(function, space: mf.Space | None = None):
     """A function of (q, p, S) as one of one array, and other things as they are."""
-    if not callable(function) or isinstance(function, Energy) or needed_arguments(function) != 3:
+    if not callable(function) or isinstance(function, Energy) or required_argument_count(function) != 3:
         return function
     return Joined(function, None if space is None else checked_space(space).shape)
 

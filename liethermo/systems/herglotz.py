@@ -12,16 +12,16 @@ import numpy as np
 
 import manifolds as mf
 from manifolds._arrays import is_traced
-from manifolds._module import Module
+from manifolds._pytree_module import Module
 from manifolds.matrices.linear import inverse
 
 from ..dissipation.base import Dissipation
 from ..errors import InputError
-from ..functions.checks import check_scalar, recognised
-from ..functions.energy import Energy, Quadratic, as_energy
-from ..functions.mechanics import Kinetic, is_free_of_momenta, is_mechanical
-from ..tracing.interpret import at_points
-from ..tracing.programs import program
+from ..functions.checks import check_energy, mark_polynomial_degrees
+from ..functions.energy import Energy, Quadratic, make_energy
+from ..functions.mechanics import Kinetic, is_independent_of_momenta, is_mechanical
+from ..tracing.interpret import evaluate_at_points
+from ..tracing.programs import jit_program
 from .euler_poincare import inverse_gradient, singular_everywhere
 from .evolution import (
     ContactSystem,
@@ -54,14 +54,14 @@ class OnVelocities(OnContactManifold):
         self, lagrangian, dim: int | None, space: mf.Space | None = None
     ) -> tuple[mf.Cosymplectic, int, Energy]:
         """The Poisson structure, the dimension and the energy E_L of a Lagrangian that is checked here."""
-        L = as_energy(lagrangian, "the Lagrangian")
+        L = make_energy(lagrangian, "the Lagrangian")
         if dim is None and space is None and isinstance(L, Quadratic):
             dim = L.A.shape[0]
         if dim is None and space is None:
             raise InputError("the dimension of the state (q, v, S) is not known: give dim=2n+1 beside the Lagrangian")
         dim = components(dim, space)
         n = degrees_of_freedom(dim)
-        self.lagrangian = L = recognised(check_scalar(L, dim, "the Lagrangian"), dim)
+        self.lagrangian = L = mark_polynomial_degrees(check_energy(L, dim, "the Lagrangian"), dim)
         contact = mf.LagrangianContact(_Values(L), n, bundle_of(space))
         _need_regular(contact)
         return mf.Cosymplectic(contact), dim, _energy(L, dim)
@@ -179,7 +179,7 @@ def _energy_of_term(term: Energy, points: np.ndarray) -> Energy:
         return term
     if isinstance(term, Quadratic):
         return _energy_of_quadratic(term)
-    return -term if not is_traced(term) and is_free_of_momenta(term, points) else _LegendreEnergy(term)
+    return -term if not is_traced(term) and is_independent_of_momenta(term, points) else _LegendreEnergy(term)
 
 
 def _energy_of_quadratic(L: Quadratic) -> Quadratic:
@@ -217,13 +217,13 @@ def _hamiltonian(L: Energy, dim: int) -> Energy:
     if isinstance(L, Quadratic):
         return _hamiltonian_of_quadratic(L)
     points = np.random.default_rng(0).standard_normal((4, dim))
-    moving = [term for term in L.terms if is_traced(term) or not is_free_of_momenta(term, points)]
+    moving = [term for term in L.terms if is_traced(term) or not is_independent_of_momenta(term, points)]
     if len(moving) == 1 and isinstance(moving[0], Kinetic):
         return sum((-term for term in L.terms if term is not moving[0]), Kinetic(_inverse_metric(moving[0].G)))
     return LegendreTransform(L)
 
 
-@program
+@jit_program
 def _hamiltonian_of_quadratic(L: Quadratic) -> Quadratic:
     """``H = (p - B r - c) . W^-1 (p - B r - c) / 2 - L(r)``, r = (q, S), where ``L_v = W v + B r + c``."""
     dim = L.A.shape[0]
@@ -287,7 +287,7 @@ class _OfVelocity(Energy):
 def _need_regular(contact: mf.LagrangianContact) -> None:
     if is_traced(contact):
         return
-    if singular_everywhere(at_points(_hessian, contact, random_states(contact, 4))):
+    if singular_everywhere(evaluate_at_points(_hessian, contact, random_states(contact, 4))):
         raise InputError(
             "the Lagrangian is singular: its Hessian L_vv has no inverse, so eta_L is no contact form and the momentum "
             "does not determine the velocity"

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
-from ..dissipation.base import Dissipation, Law
+from ..dissipation.base import Dissipation, LawName
 from ..dissipation.geometry import Geometry
 from ..functions.energy import Energy
 from ..functions.surface import Surface
@@ -94,7 +94,7 @@ class Kind(Geometry):
         """:meth:`field` at the gradients of the functions, in the form that the entropy is not in."""
         assert self.dissipation is not None
         dH = self.energy.gradient(x)
-        return self.poisson.sharp(x, dH) + self.dissipation.generated(self, x, dH)
+        return self.poisson.sharp(x, dH) + self.dissipation.generator_field(self, x, dH)
 
     def samples(self, count: int, seed: int = 0, scale: float = 1.0) -> np.ndarray:
         """Random states, shape (count, n): normal with standard deviation ``scale``, or the space's own points."""
@@ -164,12 +164,12 @@ class Kind(Geometry):
     # -- laws ---------------------------------------------------------------------------------------------------------
 
     @property
-    def energy_law(self) -> Law | None:
+    def energy_law(self) -> LawName | None:
         """ "conserved", "nonincreasing" under double-bracket dissipation, or None where there is no guarantee."""
         return "conserved" if self.dissipation is None else self.dissipation.energy_law
 
     @property
-    def entropy_law(self) -> Law | None:
+    def entropy_law(self) -> LawName | None:
         """ "nondecreasing", "conserved", or None where there is no entropy or no guarantee."""
         if self.entropy is None:
             return None
@@ -230,7 +230,7 @@ class Kind(Geometry):
     @property
     def unrollable(self) -> bool:
         """Whether the compiled engine is worth trying: False where the system is known to need a loop."""
-        return self.space is None or (self.space.smooth and self.space.dtype.kind != "c")
+        return self.space is None or (self.space.is_smooth and self.space.dtype.kind != "c")
 
     @property
     def spectral(self) -> bool:
@@ -240,7 +240,7 @@ class Kind(Geometry):
     @property
     def smooth(self) -> bool:
         """Whether the vector field can be differentiated twice and more."""
-        return self.space is None or self.space.smooth
+        return self.space is None or self.space.is_smooth
 
     def sparsity(self) -> scipy.sparse.csr_array | None:
         """Which components of the field depend on which of the state, discrete gradients included; None if not known.

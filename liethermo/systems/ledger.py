@@ -10,16 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
-from manifolds._module import Module
+from manifolds._pytree_module import Module
 from manifolds.matrices.linear import solve
-from manifolds.structures.poisson import Beside
+from manifolds.structures.poisson import ProductPoisson
 
-from ..dissipation.base import Law, SkewFriction
-from ..dissipation.checks import semidefinite
+from ..dissipation.base import LawName, SkewFriction
+from ..dissipation.checks import checked_semidefinite
 from ..errors import InputError
-from ..functions.arguments import Constant, Steady, needed_arguments
-from ..functions.checks import check_shape
-from ..functions.conditions import numbers, require
+from ..functions.arguments import ConstantFunction, LastArgumentIgnored, required_argument_count
+from ..functions.checks import check_function_shape
+from ..functions.conditions import check_numbers, require_condition
 from ..functions.energy import Energy, Quadratic
 from .base import System
 
@@ -52,7 +52,7 @@ class WithLedger(System):
             return structure, size, energy
         total = size + LEDGER
         received = Quadratic(jnp.zeros(total), jnp.zeros(total).at[size : size + 2].set(-1.0))
-        return Beside(structure, mf.NoPoisson(LEDGER)), total, energy.on(range(size)) + received
+        return ProductPoisson(structure, mf.NoPoisson(LEDGER)), total, energy.on(range(size)) + received
 
     def numbers(self, x, batch: bool = False):
         if self.receives and np.ndim(x) > 0 and np.shape(x)[-1] == self.own_size:
@@ -107,7 +107,7 @@ class ForcesAndHeat(SkewFriction):
     heat_power: Callable | None
 
     @property
-    def entropy_law(self) -> Law | None:
+    def entropy_law(self) -> LawName | None:
         if self.heat_power is not None:
             return None
         return "conserved" if self.friction is None else "nondecreasing"
@@ -144,13 +144,13 @@ def linear_friction(coefficient, n: int, what: str) -> LinearFriction:
     InputError
         If R has another shape, or the force would inject energy.
     """
-    R = numbers(coefficient, what)
+    R = check_numbers(coefficient, what)
     R = jnp.full(n, R) if R.ndim == 0 else R
     if R.shape not in ((n,), (n, n)):
         raise InputError(f"{what} has shape (), ({n},) or ({n}, {n}), not {R.shape}")
     if R.ndim == 2:
-        return LinearFriction(semidefinite(R, what, symmetric=False))
-    require(R.min(), lambda r: r >= 0.0, f"{what} must be >= 0, not {{value:g}}: it would inject energy")
+        return LinearFriction(checked_semidefinite(R, what, symmetric=False))
+    require_condition(R.min(), lambda r: r >= 0.0, f"{what} must be >= 0, not {{value:g}}: it would inject energy")
     return LinearFriction(R)
 
 
@@ -159,7 +159,7 @@ def linear_friction(coefficient, n: int, what: str) -> LinearFriction:
 
 def timed(function: Callable, parts: int = 3) -> Callable:
     """A function of so many parts of a state, or of those and t, as one of those and t."""
-    return Steady(function) if needed_arguments(function) == parts else function
+    return LastArgumentIgnored(function) if required_argument_count(function) == parts else function
 
 
 def field(function, parts: tuple[tuple[int, ...], ...], shape: tuple[int, ...], what: str, at: str) -> Callable:
@@ -174,5 +174,5 @@ def field(function, parts: tuple[tuple[int, ...], ...], shape: tuple[int, ...], 
     what, at : str
         For messages: what it is, and of what.
     """
-    found = timed(function, len(parts)) if callable(function) else Constant(numbers(function, what))
-    return check_shape(found, (*parts, ()), [shape], what, at)[0]
+    found = timed(function, len(parts)) if callable(function) else ConstantFunction(check_numbers(function, what))
+    return check_function_shape(found, (*parts, ()), [shape], what, at)[0]

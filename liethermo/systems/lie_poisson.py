@@ -17,10 +17,10 @@ from manifolds._arrays import is_traced
 
 from ..dissipation.base import Dissipation
 from ..errors import InputError
-from ..functions.checks import check_scalar, recognised
-from ..functions.energy import Energy, as_energy
-from ..tracing.interpret import at_points
-from ..tracing.remembered import remembered
+from ..functions.checks import check_energy, mark_polynomial_degrees
+from ..functions.energy import Energy, make_energy
+from ..tracing.caching import memoize
+from ..tracing.interpret import evaluate_at_points
 from .base import TIMES, System
 from .baths import EntropyOfBaths, HeatBaths
 from .torque import checked_torque, name_of, torque_at, untouched_components
@@ -142,17 +142,17 @@ class LiePoissonSystem(System):
         push = self.push(x)
         if push is not None:
             return self.left_alone().field(x, dH, dS, dL) + push
-        if self.dissipation is None or self.dissipation.momentum(dH, jnp.zeros_like(dH)) is None:
+        if self.dissipation is None or self.dissipation.added_momentum(dH, jnp.zeros_like(dH)) is None:
             return super().field(x, dH, dS, dL)
         action = self.algebra.action(dH)
         turned = jnp.zeros_like(dH) if dS is None else action.bracket(dS)
-        return action.ad_star(x + self.dissipation.momentum(dH, turned))
+        return action.ad_star(x + self.dissipation.added_momentum(dH, turned))
 
     @property
     def inertia(self) -> np.ndarray | None:
         if not _of_a_body(self.algebra) or is_traced(self.energy) or self.energy.depends_on_time:
             return None
-        energy = self.without_baths().energy
+        energy = self.drop_baths().energy
         return _inertia(energy, self.algebra.dim) if energy.is_quadratic else None
 
     # -- the torque -----------------------------------------------------------------------------------------------
@@ -260,7 +260,7 @@ def _checked_reconstruction(algebra: mf.LieAlgebra, group, reconstruction: str |
         reconstruction = _best_reconstruction(group)
     if reconstruction not in _MAPS:
         raise InputError(f"the reconstruction is {', '.join(map(repr, _MAPS))}, not {reconstruction!r}")
-    group._need(_MAPS[reconstruction])
+    group._require_map(_MAPS[reconstruction])
     return reconstruction
 
 
@@ -284,13 +284,13 @@ def _best_reconstruction(group: mf.MatrixGroup) -> str:
     """The one that keeps spatial momenta; else the cheapest that stays in the group."""
     if group.cayley_is_adjoint():
         return "cayley"
-    return next(kind for kind, map_ in _MAPS.items() if kind == "exp" or group._stays(map_))
+    return next(kind for kind, map_ in _MAPS.items() if kind == "exp" or group._is_map_in_group(map_))
 
 
-@remembered
+@memoize
 def _inertia(energy: Energy, dim: int) -> np.ndarray | None:
     """The moments of inertia of a body with a quadratic energy of its momenta; None where it is no kinetic one."""
-    (gradient,), (squares,) = at_points(_gradient_and_squares, energy, np.zeros((1, dim)))
+    (gradient,), (squares,) = evaluate_at_points(_gradient_and_squares, energy, np.zeros((1, dim)))
     if np.linalg.eigvalsh(squares)[0] <= 0.0 or gradient.any():  # its inverse is that of the parts moving freely
         return None
     found = np.linalg.inv(squares)[:3, :3]
@@ -318,8 +318,8 @@ def _recorded_casimirs(algebra: mf.LieAlgebra, names: tuple[str, ...] | None) ->
     found: dict[str, Energy] = {}
     with jax.ensure_compile_time_eval():  # what is found while something is traced is kept for later
         for name, casimir in algebra.leading_casimirs():
-            function = check_scalar(as_energy(casimir, "a Casimir"), algebra.dim, "a Casimir")
-            found[name] = recognised(function, algebra.dim)
+            function = check_energy(make_energy(casimir, "a Casimir"), algebra.dim, "a Casimir")
+            found[name] = mark_polynomial_degrees(function, algebra.dim)
     return found
 
 

@@ -11,7 +11,7 @@ import manifolds as mf
 
 from ..dissipation.base import Dissipation
 from ..errors import InputError
-from ..functions.checks import check_shape
+from ..functions.checks import check_function_shape
 from .base import System
 from .baths import HeatBaths
 from .chart import ChartSystem
@@ -104,17 +104,19 @@ class MetriplecticSystem(System):
             raise InputError(f"dim is {dim}, but the Poisson structure has {poisson.dim} coordinates")
         dim = poisson.dim
         if dim <= MATRIX_DIM:
-            check_shape(poisson.tensor, [(dim,)], [(dim, dim)], "the Poisson tensor", f"a state of shape ({dim},)")
+            check_function_shape(
+                poisson.tensor, [(dim,)], [(dim, dim)], "the Poisson tensor", f"a state of shape ({dim},)"
+            )
         else:
             at = f"a state and a covector of shape ({dim},)"
-            check_shape(poisson.sharp, [(dim,), (dim,)], [(dim,)], "Pi(x) of a covector", at)
+            check_function_shape(poisson.sharp, [(dim,), (dim,)], [(dim,)], "Pi(x) of a covector", at)
         self._build(poisson, poisson.dim, energy, entropy, dissipation, momentum_maps, validate, space, baths)
 
     def local(self, x, centred: bool = False) -> tuple[System, jax.Array]:
         """In the space around a manifold; where it has no equations, in the coordinates of its exponential map."""
         if self.space is None:
             return self, x
-        if self.space.surrounded:
+        if self.space.can_be_embedded:
             return EmbeddedSystem(self), x
         around = mf.coordinates_around(mf.RiemannianRetraction(self.space), self.points(x))
         return ChartSystem(self, around, around.centre() if centred else None), jnp.zeros(self.space.dim)

@@ -15,7 +15,7 @@ import manifolds as mf
 from manifolds._arrays import is_traced
 from manifolds.matrices.linear import adjoint
 
-from ..dissipation.base import Dissipation, total
+from ..dissipation.base import Dissipation, sum_dissipations
 from ..dissipation.quantum import (
     HasMatrix,
     SteepestEntropyAscent,
@@ -25,19 +25,19 @@ from ..dissipation.quantum import (
     energy_rounding,
 )
 from ..errors import InputError
+from ..functions.bath_energy import BathEnergy, ReservoirEnergy
 from ..functions.density import (
     NEGATIVE_EIGENVALUE_LIMIT,
-    Expectation,
+    ExpectationValue,
+    IsolatedVonNeumann,
     MeanEnergy,
-    Modulated,
-    OfIsolated,
+    ModulatedExpectationValue,
     VonNeumann,
-    common_energy,
+    choose_reference_level,
 )
 from ..functions.energy import Energy, Quadratic, Sum, TimeDependent
 from ..functions.gradients import EPS
-from ..functions.warmth import Reservoir, Warmth
-from ..functions.with_baths import WithBaths
+from ..functions.with_baths import BodyBathsEnergy
 from .base import TIMES, System
 from .baths import EntropyOfBaths, HeatBaths, beside_baths
 from .kinds import Decided
@@ -119,7 +119,7 @@ class QuantumSystem(System):
         if not isinstance(entropy, VonNeumann):
             raise InputError(f"the entropy of a density matrix is lt.VonNeumann(...), not {type(entropy).__name__}")
         self.floor = entropy.floor
-        entropy = OfIsolated(self.floor) if total(dissipation) is None else entropy
+        entropy = IsolatedVonNeumann(self.floor) if sum_dissipations(dissipation) is None else entropy
         terms = [_on_density(part, structure) for part in _terms(dissipation)]
         if baths is not None and not any(isinstance(part, ThermalJumps) for part in terms):
             raise InputError("baths exchange heat by lt.ThermalJumps, and there are none: leave out baths=")
@@ -128,7 +128,7 @@ class QuantumSystem(System):
         whole: Energy = entropy
         if baths is not None:
             self.baths = baths
-            poisson, energy = beside_baths(structure, m), WithBaths(energy, baths.energy, n, n + m)
+            poisson, energy = beside_baths(structure, m), BodyBathsEnergy(energy, baths.energy, n, n + m)
             whole = Sum((entropy.on(range(n)), EntropyOfBaths(m)))
         self._build(poisson, n + m, energy, whole, terms or None, {}, validate)
         if not self.preserved:  # whether an observable is kept by the motion is found out
@@ -331,7 +331,7 @@ class QuantumSystem(System):
         assert self.dissipation is not None
         part = next(part for part in self.dissipation.terms if isinstance(part, SteepestEntropyAscent))
         dS, dL = VonNeumann(self._zero).gradient(x[: self.body_dim]), tuple(L.gradient(x) for L in part.preserve)
-        affinity = np.asarray(self.structure.matrix(part.direction(self, x, self.energy.gradient(x), dS, dL)))
+        affinity = np.asarray(self.structure.matrix(part.ascent_direction(self, x, self.energy.gradient(x), dS, dL)))
         return float(np.exp(np.linalg.eigvalsh(adjoint(kernel) @ affinity @ kernel)[-1] - 1.0))
 
     def singular(self, x) -> str:
@@ -360,7 +360,7 @@ class QuantumSystem(System):
 
         def moved(x, rho):  # at the temperatures of x
             y = jnp.concatenate([self.structure.vector(rho), x[self.body_dim :]])
-            return sum(part.generated(self, y, self.energy.gradient(x))[: self.body_dim] for part in parts)
+            return sum(part.generator_field(self, y, self.energy.gradient(x))[: self.body_dim] for part in parts)
 
         projectors = np.stack([kernel @ adjoint(kernel) for kernel in kernels])
         changes, of_kernels = (
@@ -394,7 +394,7 @@ class QuantumSystem(System):
     def hamiltonians(self) -> list[np.ndarray]:
         """The Hamiltonian, at a few times where it depends on one."""
         n, energies = self.body_dim, [s.energy for s in (self.at_some_times() if self.is_driven else [self])]
-        energies = [E.body if isinstance(E, WithBaths) else E for E in energies]  # temperatures may be traced
+        energies = [E.body if isinstance(E, BodyBathsEnergy) else E for E in energies]  # temperatures may be traced
         with jax.ensure_compile_time_eval():
             origin, one = jnp.zeros(n), np.eye(self.structure.size)
             return [np.asarray(self.structure.matrix(E.gradient(origin)) + E.value(origin) * one) for E in energies]
@@ -422,7 +422,7 @@ class QuantumSystem(System):
                         f"{type(part).__name__} of a part is none of a product: give it to the product as a whole"
                     )
                 local = [_beside(np.asarray(V), k, sizes) for V in part.operators]
-                terms.append(part.with_operators(local, part.bath + offset))
+                terms.append(part.replace_operators(local, part.bath + offset))
             offset += 0 if s.baths is None else s.baths.number
         if (self.baths is None) != (other.baths is None) and all(s.dissipation is not None for s in systems):
             raise InputError("jumps of one part have a bath and those of the other none: give both, or neither, baths")
@@ -463,13 +463,16 @@ def _energy(hamiltonian) -> tuple[int, Energy]:
         structure = mf.DensityMatrices(len(matrices[0]))
         with jax.ensure_compile_time_eval():  # a number, while a family of systems is traced
             lowest = jnp.asarray(np.diag(matrices[0]).real.min())
-        return structure.size, TimeDependent(Expectation(hamiltonian, structure, lowest))
+        return structure.size, TimeDependent(ExpectationValue(hamiltonian, structure, lowest))
     if isinstance(hamiltonian, jax.core.Tracer):
         structure = mf.DensityMatrices(hamiltonian.shape[-1])
         return structure.size, MeanEnergy(structure.vector(hamiltonian), jnp.min(jnp.diag(hamiltonian).real))
     H = checked_hermitian(checked_matrix(hamiltonian, "the Hamiltonian"), "the Hamiltonian")
     with jax.ensure_compile_time_eval():  # numbers, while a family of systems is traced
-        b, common = jnp.asarray(mf.DensityMatrices(len(H)).vector(H)), jnp.asarray(common_energy(np.diag(H).real))
+        b, common = (
+            jnp.asarray(mf.DensityMatrices(len(H)).vector(H)),
+            jnp.asarray(choose_reference_level(np.diag(H).real)),
+        )
     return len(H), MeanEnergy(b, common)
 
 
@@ -515,18 +518,18 @@ def _sum_of_terms(given: Sequence) -> tuple[int, Energy]:
     structure = mf.DensityMatrices(len(H))
     with jax.ensure_compile_time_eval():  # numbers, while a family of systems is traced
         still, *rows = (jnp.asarray(structure.vector(a)) for a in (sum(constant, np.zeros_like(H)), *moved))
-        common = jnp.asarray(common_energy(np.asarray(still)[: structure.size]))
+        common = jnp.asarray(choose_reference_level(np.asarray(still)[: structure.size]))
     if not moved:
         return structure.size, MeanEnergy(still, common)
     at_start = still
     for f, row in zip(functions, rows, strict=True):
         at_start = at_start + f(TIMES[0]) * row
     lowest = jnp.min(at_start[: structure.size])  # in the same way where a function is traced
-    return structure.size, TimeDependent(Modulated(still, tuple(rows), tuple(functions), lowest))
+    return structure.size, TimeDependent(ModulatedExpectationValue(still, tuple(rows), tuple(functions), lowest))
 
 
 def _terms(dissipation) -> tuple[Dissipation, ...]:
-    found = total(dissipation)
+    found = sum_dissipations(dissipation)
     terms = () if found is None else found.terms
     for part in terms:
         if not isinstance(part, ThermalJumps | SteepestEntropyAscent):
@@ -538,7 +541,7 @@ def _terms(dissipation) -> tuple[Dissipation, ...]:
 
 
 def _on_density(part: Dissipation, structure: mf.DensityMatrices) -> Dissipation:
-    return part.on_density(structure) if isinstance(part, SteepestEntropyAscent) else part
+    return part.bind_to_structure(structure) if isinstance(part, SteepestEntropyAscent) else part
 
 
 def _checked_parts(parts, names, size: int) -> tuple[tuple[int, ...], tuple[str, ...]]:
@@ -559,7 +562,7 @@ def _beside(matrix: np.ndarray, k: int, sizes: Sequence[int]) -> np.ndarray:
 def _joined(one: HeatBaths | None, other: HeatBaths | None) -> HeatBaths | None:
     if one is None or other is None:
         return one or other
-    kinds = Warmth | Reservoir
+    kinds = BathEnergy | ReservoirEnergy
     if not isinstance(one.energy, kinds) or not isinstance(other.energy, kinds):
         raise InputError("baths of a product have constant capacities: build the product with baths of its own")
     capacity, temperature = (

@@ -12,13 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
-from manifolds._module import Module
-from manifolds.structures.poisson import Beside
+from manifolds._pytree_module import Module
+from manifolds.structures.poisson import ProductPoisson
 
 from ..errors import InputError
-from ..functions.arguments import needed_arguments
+from ..functions.arguments import required_argument_count
 from ..functions.energy import Energy
-from ..tracing.interpret import at_points
+from ..tracing.interpret import evaluate_at_points
 from .evolution import configurations, entropy_component, in_one_array, states_on
 from .herglotz import OnVelocities
 from .ledger import ForcesAndHeat, WithLedger, field, linear_friction
@@ -116,7 +116,7 @@ class SimpleClosedSystem(WithLedger, OnVelocities):
 
     @property
     def contact(self) -> mf.LagrangianContact:
-        structure = self.poisson.first if isinstance(self.poisson, Beside) else self.poisson
+        structure = self.poisson.first if isinstance(self.poisson, ProductPoisson) else self.poisson
         return cast(mf.LagrangianContact, cast(mf.Cosymplectic, structure).contact)
 
     @property
@@ -125,7 +125,7 @@ class SimpleClosedSystem(WithLedger, OnVelocities):
 
     def along(self, q, v) -> jax.Array:
         """The part of a velocity or a force at q that is along Q, shape (n,); itself on R^n."""
-        return self.contact.along(q, v)
+        return self.contact.tangential_part(q, v)
 
     def parts(self, x) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         """q, v, S and t of one state; t = 0 where it has none."""
@@ -194,7 +194,7 @@ class SimpleClosedSystem(WithLedger, OnVelocities):
     # -- checks -----------------------------------------------------------------------------------------------------
 
     def outside(self, x) -> str:
-        T = float(at_points(_temperature, self, np.atleast_2d(x)).min())
+        T = float(evaluate_at_points(_temperature, self, np.atleast_2d(x)).min())
         return "" if T > 0.0 else f"the temperature -dL/dS is {T:.4g}: it has to be positive"
 
     def domain_margin(self, x):
@@ -217,7 +217,7 @@ def _temperature(system: SimpleClosedSystem, x):
 
 def lagrangian_of(lagrangian, space: mf.Space | None = None):
     """A Lagrangian as a function of one array."""
-    if callable(lagrangian) and not isinstance(lagrangian, Energy) and needed_arguments(lagrangian) == 4:
+    if callable(lagrangian) and not isinstance(lagrangian, Energy) and required_argument_count(lagrangian) == 4:
         raise InputError(
             "the Lagrangian of a simple closed system is one of (q, v, S); what depends on time is external"
         )

@@ -12,18 +12,18 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
-from manifolds.structures.poisson import Beside
-from manifolds.structures.spins import added, cross_planes, dotted, planes, scaled
+from manifolds.structures.poisson import ProductPoisson
+from manifolds.structures.spins import add_vectors, cross_vectors, dot_vectors, scale_vectors, split_vectors
 
 from ..dissipation.base import Dissipation
 from ..dissipation.heating import Heating
 from ..dissipation.landau_lifshitz import LandauLifshitz
 from ..errors import InputError
 from ..functions.energy import Energy
-from ..functions.magnetism import checked_sites
-from ..functions.on_spaces import on_sites
-from ..functions.planes import by_planes, reach, to_planes, to_sites
-from ..functions.spheres import Spheres, Squares
+from ..functions.magnetism import lattice_shape
+from ..functions.on_spaces import flatten_site_functions
+from ..functions.planes import interaction_range, planar_energy, to_planes, to_sites
+from ..functions.spheres import HalfSumOfSquares, Spheres
 from .base import Arranged, System
 from .baths import HeatBaths, beside_baths
 
@@ -68,12 +68,12 @@ class SpinSystem(System):
         momentum_maps=(),
         validate: bool = True,
     ):
-        self.lattice = checked_sites(sites)
+        self.lattice = lattice_shape(sites)
         poisson = mf.Spins(self.lattice, ratio=ratio)
         self._build(poisson, poisson.dim, energy, None, dissipation, momentum_maps, validate, baths=baths)
 
     def on_states(self, energy: Energy) -> Energy:
-        return on_sites(energy, (*self.lattice, 3))
+        return flatten_site_functions(energy, (*self.lattice, 3))
 
     @property
     def heating_sites(self) -> tuple[int, ...]:
@@ -86,23 +86,29 @@ class SpinSystem(System):
         if damping is None or spins is None:
             return super().field(x, dH, dS, dL)
         if heating is None:
-            damped, _ = damping.damped(spins, x, dH)
+            damped, _ = damping.damping_force(spins, x, dH)
             warmed = jnp.zeros(0)
         else:  # the entropy is that of the baths
-            damped, lost = damping.damped(spins, x, dH, heating.sign(dH[n:]), heating.by_site)
-            warmed = heating.warming(lost, dH[n:])
-        return spins.joined(added(spins.turned(x, dH), damped), warmed)
+            damped, lost = damping.damping_force(
+                spins, x, dH, heating.temperature_signs(dH[n:]), heating.has_site_baths
+            )
+            warmed = heating.entropy_rates(lost, dH[n:])
+        return spins.join_state(add_vectors(spins.precession_rates(x, dH), damped), warmed)
 
-    def at_sites(self, values, v) -> jax.Array:
+    def scale_at_sites(self, values, v) -> jax.Array:
         """A vector v times ``values``: a number for each site, or one."""
         spins = self._spins
         assert spins is not None
-        return spins.joined(scaled(values, spins.covectors(v)), jnp.zeros(0)) if jnp.ndim(values) else values * v
+        return (
+            spins.join_state(scale_vectors(values, spins.split_covectors(v)), jnp.zeros(0))
+            if jnp.ndim(values)
+            else values * v
+        )
 
-    def over_sites(self, alpha, v) -> jax.Array:
+    def dot_at_sites(self, alpha, v) -> jax.Array:
         spins = self._spins
         assert spins is not None
-        return dotted(spins.covectors(alpha), spins.covectors(v))
+        return dot_vectors(spins.split_covectors(alpha), spins.split_covectors(v))
 
     def turned_back(self, angles, v) -> jax.Array:
         """The u with ``u_i - angles_i x u_i = v_i`` at each spin, angles of shape (sites, 3); behind them it is v.
@@ -111,9 +117,9 @@ class SpinSystem(System):
         """
         spins = self._spins
         assert spins is not None
-        a, r = planes(angles), spins.covectors(v)
-        u = added(added(r, cross_planes(a, r)), scaled(dotted(a, r), a))
-        return spins.joined(scaled(1.0 / (1.0 + dotted(a, a)), u), v[self.body_dim :])
+        a, r = split_vectors(angles), spins.split_covectors(v)
+        u = add_vectors(add_vectors(r, cross_vectors(a, r)), scale_vectors(dot_vectors(a, r), a))
+        return spins.join_state(scale_vectors(1.0 / (1.0 + dot_vectors(a, a)), u), v[self.body_dim :])
 
     def numbers(self, x, batch: bool = False):
         """A state in one row; also the spins alone, shape ``(*sites, 3)``."""
@@ -132,23 +138,23 @@ class SpinSystem(System):
         return x[..., : self.body_dim].reshape(*x.shape[:-1], *self.lattice, 3)
 
     def casimirs(self) -> dict[str, Energy]:
-        return {LENGTHS: Squares(math.prod(self.lattice))}
+        return {LENGTHS: HalfSumOfSquares(math.prod(self.lattice))}
 
     @property
     def surface(self) -> Spheres:
         assert self._spins is not None
-        return Spheres(math.prod(self.lattice), LENGTHS, self._spins.planar)
+        return Spheres(math.prod(self.lattice), LENGTHS, self._spins.is_component_major)
 
     def arranged(self) -> Arranged | None:
         """With the spins component by component; what other dissipations do with components is not known."""
         spins = self._spins
         known = type(self) is SpinSystem and (self.dissipation is None or _damping(self.dissipation)[0] is not None)
-        if not known or spins is None or spins.planar or self.is_driven:
+        if not known or spins is None or spins.is_component_major or self.is_driven:
             return None
         count = spins.count
-        planar = mf.Spins(spins.sites, 0, spins.ratio, reach(self.energy, spins.sites))
+        planar = mf.Spins(spins.sites, 0, spins.ratio, interaction_range(self.energy, spins.sites))
         poisson = planar if self.baths is None else beside_baths(planar, self.baths.number)
-        there, back, pulled = (functools.partial(f, count=count) for f in (to_planes, to_sites, by_planes))
+        there, back, pulled = (functools.partial(f, count=count) for f in (to_planes, to_sites, planar_energy))
         functions = [pulled(f) for f in (self.energy, *self.momentum_maps.values())]
         system = eqx.tree_at(lambda s: [s.poisson, s.energy, *s.momentum_maps.values()], self, [poisson, *functions])
         return Arranged(system, there, back, pulled)
@@ -156,12 +162,12 @@ class SpinSystem(System):
     @property
     def _spins(self) -> mf.Spins | None:
         """The structure of the spins; None of a system that is run in other coordinates."""
-        poisson = self.poisson.first if isinstance(self.poisson, Beside) else self.poisson
+        poisson = self.poisson.first if isinstance(self.poisson, ProductPoisson) else self.poisson
         return poisson if isinstance(poisson, mf.Spins) else None
 
 
 def _damping(dissipation: Dissipation | None) -> tuple[LandauLifshitz | None, Heating | None]:
     """The damping of the spins and what heats by it; a class of its own may have a force of its own."""
     heating = dissipation if type(dissipation) is Heating else None
-    part = dissipation if heating is None else heating.part
+    part = dissipation if heating is None else heating.inner
     return (part if type(part) is LandauLifshitz else None), heating

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import manifolds as mf
 
 from ..errors import FunctionError, InputError
-from ..functions.arguments import needed_arguments
-from ..tracing.interpret import LARGE, vanishing_entries
-from ..tracing.trace_errors import TRACE_ERRORS, explain
-from ..tracing.traced import Traced, converted
+from ..functions.arguments import required_argument_count
+from ..tracing.interpret import MAX_UNROLLED_DIM, vanishing_entries
+from ..tracing.trace_errors import TRACE_ERRORS, explain_trace_error
+from ..tracing.traced import TracedFunction, trace_callables_with_result
 
 
 def checked_torque(given: Any, algebra: mf.LieAlgebra, group: mf.MatrixGroup | None) -> tuple[Any, tuple[bool, ...]]:
@@ -45,10 +45,10 @@ def checked_torque(given: Any, algebra: mf.LieAlgebra, group: mf.MatrixGroup | N
 
     given = parts if isinstance(given, list) else given
     try:
-        torque, found = converted(given, use, *shapes)
+        torque, found = trace_callables_with_result(given, use, *shapes)
     except TRACE_ERRORS as error:
         what = f"the torque could not be evaluated on a momentum of shape {algebra.shape}"
-        raise FunctionError(explain(what, error)) from error
+        raise FunctionError(explain_trace_error(what, error)) from error
     for part, result in zip(parts, found, strict=True):
         if result.shape != algebra.shape or not jnp.issubdtype(result.dtype, jnp.floating):
             raise FunctionError(
@@ -70,7 +70,7 @@ def untouched_components(
 
     A motor inside a body turns a wheel and changes no component of the angular momentum of the whole.
     """
-    if algebra.dim > LARGE:
+    if algebra.dim > MAX_UNROLLED_DIM:
         return ()
     shape = () if group is None else group.identity.shape
     complex_group = group is not None and jnp.iscomplexobj(group.identity)
@@ -106,7 +106,7 @@ def _needs_attitude(part: Any) -> bool:
             "a torque is a function of t and mu, or of t, mu and the attitude, such as "
             f"lt.torques.ConstantInBody([0.0, 0.0, 1.0]), not {type(part).__name__}"
         )
-    number = len(part.content.arguments) if isinstance(part, Traced) else needed_arguments(part)
+    number = len(part.program.argument_avals) if isinstance(part, TracedFunction) else required_argument_count(part)
     if number not in (2, 3):
         raise InputError(
             f"a torque is a function of t and mu, or of t, mu and the attitude, and {name_of(part)} needs "

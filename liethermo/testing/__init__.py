@@ -5,7 +5,7 @@ Each ``check_*`` puts an object through what every registered one goes through. 
 :mod:`manifolds.testing`.
 """
 
-from manifolds._names import listing
+from manifolds._names import public_dir
 from manifolds.testing import PropertyError, Report
 
 from .dissipations import check_dissipation
@@ -24,4 +24,4 @@ __all__ = [
     "check_relations",
     "check_system",
 ]
-__dir__ = listing(__all__)
+__dir__ = public_dir(__all__)

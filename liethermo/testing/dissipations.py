@@ -12,7 +12,7 @@ from manifolds.testing import Report, Suite
 from ..dissipation.base import Dissipation
 from ..functions.energy import Quadratic
 from ..systems import LiePoissonSystem, System
-from .runs import METHODS, follow_laws, start_of, step_of
+from .runs import SUITE_METHODS, check_laws_along_run, default_step, random_start
 
 
 def check_dissipation(dissipation: Dissipation | System, algebra: mf.LieAlgebra | None = None, seed: int = 0) -> Report:
@@ -30,7 +30,7 @@ def check_dissipation(dissipation: Dissipation | System, algebra: mf.LieAlgebra 
     PropertyError
         If it does not keep what it states: its laws, the functions that it has to preserve.
     """
-    system = dissipation if isinstance(dissipation, System) else _system(dissipation, algebra or mf.so(3))
+    system = dissipation if isinstance(dissipation, System) else _test_system(dissipation, algebra or mf.so(3))
     if system.dissipation is None:
         raise ValueError("the system has no dissipation")
     suite = Suite(f"{type(system.dissipation).__name__} in a {system.kind}")
@@ -49,19 +49,19 @@ def check_dissipation(dissipation: Dissipation | System, algebra: mf.LieAlgebra 
         made = min(made, float((force @ dS) / max(scale * np.linalg.norm(dS), 1e-300)))
         size = max(size, scale)
     if acting.energy_law == "conserved" and system.space is None:
-        suite.small("any vector instead of grad H is in the kernel", lost, 1.0, 1e-12)
+        suite.check_small("any vector instead of grad H is in the kernel", lost, 1.0, 1e-12)
     if acting.entropy_law == "nondecreasing" and acting.energy_law == "conserved" and system.space is None:
-        suite.small("the entropy cannot fall, whatever the vectors", min(made, 0.0), 1.0, 1e-12)
-    suite.true("it acts", size > 0.0)
+        suite.check_small("the entropy cannot fall, whatever the vectors", min(made, 0.0), 1.0, 1e-12)
+    suite.check_true("it acts", size > 0.0)
     suite.rows += system.check(seed=seed).rows
-    x0 = start_of(system, seed)
-    h = step_of(system, x0)
-    for method in METHODS:
-        follow_laws(suite, system, method, x0, h, f"{method}: ")
+    x0 = random_start(system, seed)
+    h = default_step(system, x0)
+    for method in SUITE_METHODS:
+        check_laws_along_run(suite, system, method, x0, h, f"{method}: ")
     return suite.report()
 
 
-def _system(dissipation: Dissipation, g: mf.LieAlgebra) -> LiePoissonSystem:
+def _test_system(dissipation: Dissipation, g: mf.LieAlgebra) -> LiePoissonSystem:
     quadratic = g.casimirs(2)
     if not quadratic:
         raise ValueError(f"{g.name} has no quadratic Casimir: give a system that has the dissipation")

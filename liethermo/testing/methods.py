@@ -11,10 +11,10 @@ from manifolds.testing import Report, Suite
 
 from ..integrators import OneStepMethod, Reference
 from ..runs.integrate import integrate
-from .problems import Problem, problems_of
-from .runs import follow_laws
+from .problems import Problem, problems_for
+from .runs import check_laws_along_run
 
-ROUNDING = 1e-12
+MIN_ORDER_ERROR = 1e-12
 """Errors below which an order is not measured."""
 
 
@@ -38,7 +38,7 @@ def check_method(method: OneStepMethod, systems: Mapping[str, Problem] | None = 
         If there is no system to try the method on.
     """
     suite = Suite(str(method))
-    for name, (system, x0, time) in (problems_of(method) if systems is None else systems).items():
+    for name, (system, x0, time) in (problems_for(method) if systems is None else systems).items():
         start = np.asarray(x0, dtype=np.float64)
         exact = integrate(system, start, (0.0, time), time, Reference(rtol=3e-14)).x[-1]
         few = 6 if method.order > 2 else 20
@@ -46,11 +46,13 @@ def check_method(method: OneStepMethod, systems: Mapping[str, Problem] | None = 
         for n in (few, 2 * few, 4 * few):
             run = integrate(system, start, (0.0, time), time / n, method, save_every=4 * few, engine="array")
             errors.append(float(np.abs(run.x[-1] - exact).max()))
-        measured = [a / b for a, b in pairwise(errors) if b > ROUNDING]
+        measured = [a / b for a, b in pairwise(errors) if b > MIN_ORDER_ERROR]
         if measured:
             observed = float(np.log2(max(measured)))
-            suite.true(f"{name}: order {method.order}", observed > method.order - slack, f"observed {observed:.2f}")
+            suite.check_true(
+                f"{name}: order {method.order}", observed > method.order - slack, f"observed {observed:.2f}"
+            )
         else:
-            suite.without(f"{name}: order {method.order}", f"errors are rounding: {errors[-1]:.1g}")
-        follow_laws(suite, system, method, start, time / (4 * few), f"{name}: ")
+            suite.skip_check(f"{name}: order {method.order}", f"errors are rounding: {errors[-1]:.1g}")
+        check_laws_along_run(suite, system, method, start, time / (4 * few), f"{name}: ")
     return suite.report()

@@ -20,17 +20,17 @@ Problem = tuple[System, object, float]
 """A system, the state that it starts from, and the time that it runs."""
 
 
-def problems_of(method: OneStepMethod) -> dict[str, Problem]:
+def problems_for(method: OneStepMethod) -> dict[str, Problem]:
     """What a method is tried on."""
     if method.systems == EVERY_SYSTEM:
         return reference_problems()
-    found = {name: problem for name, problem in special_problems().items() if _accepts(method, problem[0])}
+    found = {name: problem for name, problem in special_problems().items() if _accepts_system(method, problem[0])}
     if not found:
         raise InputError(f"{method} is for {method.systems}, and none of the suite's is one: give systems=...")
     return found
 
 
-def _accepts(method: OneStepMethod, system: System) -> bool:
+def _accepts_system(method: OneStepMethod, system: System) -> bool:
     try:
         method.check(system)
     except InputError:

@@ -9,16 +9,16 @@ import numpy as np
 from manifolds.testing import Report, Suite
 
 from ..integrators import OneStepMethod
-from ..results.looking import field_at
+from ..results.looking import vector_field_at
 from ..systems import System
-from .runs import METHODS, follow_laws, rebuilt, start_of, step_of
+from .runs import SUITE_METHODS, check_laws_along_run, default_step, random_start, rebuild_pytree
 
 
 def check_system(
     system: System,
     x0=None,
     step: float | None = None,
-    methods: Sequence[OneStepMethod] = METHODS,
+    methods: Sequence[OneStepMethod] = SUITE_METHODS,
     seed: int = 0,
 ) -> Report:
     """The axioms of a system at random points, and its laws along a run of each method.
@@ -40,10 +40,10 @@ def check_system(
     suite = Suite(system.kind)
     suite.rows += system.check(seed=seed).rows
     points = system.samples(3, seed)
-    field, again = (field_at(s, points) for s in (system, rebuilt(system)))
-    suite.true("field to the bit when taken apart and put together", np.array_equal(field, again, equal_nan=True))
-    start = start_of(system, seed) if x0 is None else np.asarray(x0, dtype=np.float64)
-    h = step_of(system, start) if step is None else step
+    field, again = (vector_field_at(s, points) for s in (system, rebuild_pytree(system)))
+    suite.check_true("field to the bit when taken apart and put together", np.array_equal(field, again, equal_nan=True))
+    start = random_start(system, seed) if x0 is None else np.asarray(x0, dtype=np.float64)
+    h = default_step(system, start) if step is None else step
     for method in methods:
-        follow_laws(suite, system, method, start, h, f"{method}: ")
+        check_laws_along_run(suite, system, method, start, h, f"{method}: ")
     return suite.report()

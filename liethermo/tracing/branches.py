@@ -13,10 +13,10 @@ from typing import NamedTuple, TypeAlias
 from .builder import Block, Instruction
 from .program import Program
 
-LONG = 32
+MIN_BRANCH_COST = 32
 """Instructions that are worth a jump."""
 
-CALLS = frozenset("exp exp2 expm1 log log1p pow cbrt sin cos tan asin acos atan atan2".split()) | frozenset(
+COSTLY_OPERATIONS = frozenset("exp exp2 expm1 log log1p pow cbrt sin cos tan asin acos atan atan2".split()) | frozenset(
     "sinh cosh tanh asinh acosh atanh erf erfc rem".split()
 )
 """Operations that cost as many as that."""
@@ -43,13 +43,13 @@ class Branch(NamedTuple):
     choices: list[Instruction]
 
 
-def branched(program: Program, least: int = LONG) -> list[Instruction | Branch]:
+def nest_branches(program: Program, min_instructions: int = MIN_BRANCH_COST) -> list[Instruction | Branch]:
     """The instructions of a program in an order of evaluation, those needed on one side of a branch inside it.
 
     Parameters
     ----------
     program : Program
-    least : int
+    min_instructions : int
         Instructions that a side has at least; a shorter one stands before the choice.
     """
     tests = {instruction.target for instruction in program.instructions if instruction.op == "branch"}
@@ -60,12 +60,14 @@ def branched(program: Program, least: int = LONG) -> list[Instruction | Branch]:
     for instruction in program.instructions:
         guard = guards[instruction.target]
         for depth in range(1, len(guard) + 1):
-            sizes[guard[:depth]] += LONG if instruction.op in CALLS or isinstance(instruction.op, Block) else 1
+            sizes[guard[:depth]] += (
+                MIN_BRANCH_COST if instruction.op in COSTLY_OPERATIONS or isinstance(instruction.op, Block) else 1
+            )
     for target, guard in guards.items():
-        while guard and sizes[guard] < least:
+        while guard and sizes[guard] < min_instructions:
             guard = guard[:-1]
         guards[target] = guard
-    return _ordered(program.instructions, guards, 0)
+    return _order_by_dependence(program.instructions, guards, 0)
 
 
 def _guards(program: Program, tests: set[str]) -> dict[str, Guard]:
@@ -82,18 +84,18 @@ def _guards(program: Program, tests: set[str]) -> dict[str, Guard]:
             guard = guards.setdefault(target, ())
             test = args[0] if op == "select" and args[0] in tests else None
             if isinstance(test, str):
-                found[test] = _shared(found.get(test, guard), guard)
-                guard = guards[target] = _shared(together.get(test, guard), guard)
+                found[test] = _common_prefix(found.get(test, guard), guard)
+                guard = guards[target] = _common_prefix(together.get(test, guard), guard)
             for place, a in enumerate(args):
                 if isinstance(a, str):
                     needed = (*guard, (test, place == 1)) if isinstance(test, str) and place else guard
-                    guards[a] = _shared(guards.get(a, needed), needed)
+                    guards[a] = _common_prefix(guards.get(a, needed), needed)
         if found == together:
             return {instruction.target: guards[instruction.target] for instruction in program.instructions}
         together = found
 
 
-def _shared(one: Guard, other: Guard) -> Guard:
+def _common_prefix(one: Guard, other: Guard) -> Guard:
     """The branches that both are in."""
     depth = 0
     while depth < min(len(one), len(other)) and one[depth] == other[depth]:
@@ -101,7 +103,9 @@ def _shared(one: Guard, other: Guard) -> Guard:
     return one[:depth]
 
 
-def _ordered(instructions: Sequence[Instruction], guards: dict[str, Guard], depth: int) -> list[Instruction | Branch]:
+def _order_by_dependence(
+    instructions: Sequence[Instruction], guards: dict[str, Guard], depth: int
+) -> list[Instruction | Branch]:
     """Instructions that are in the same ``depth`` branches, each after what it depends on."""
     inner = {guards[i.target][depth][0] for i in instructions if len(guards[i.target]) > depth}
     place: dict[str, str] = {}  # of each target: a branch by the name of its test, or itself
@@ -131,7 +135,7 @@ def _ordered(instructions: Sequence[Instruction], guards: dict[str, Guard], dept
             sides[guards[i.target][depth : depth + 1]].append(i)
         then, otherwise, outside = sides.values()
         test = next(i for i in outside if i.target == name)
-        both = _ordered(then, guards, depth + 1), _ordered(otherwise, guards, depth + 1)
+        both = _order_by_dependence(then, guards, depth + 1), _order_by_dependence(otherwise, guards, depth + 1)
         return Branch(test, both, [i for i in outside if i is not test])
 
     return [item(name) for name in order]

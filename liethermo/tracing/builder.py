@@ -30,7 +30,7 @@ class Block:
 
     name: str
     kinds: tuple[str, ...]
-    inner: tuple = ()
+    inner_programs: tuple = ()
     """The programs that it runs again and again."""
 
     def __call__(self, *args) -> list:
@@ -52,14 +52,14 @@ class Block:
 
 
 class Instruction(NamedTuple):
-    """``target = op(*args)``, op a key of :data:`OPERATIONS` or a block, whose target stands for all its results."""
+    """``target = op(*args)``, op a key of :data:`SYMPY_OPERATIONS` or a block, whose target stands for all its results."""
 
     target: str
     op: str | Block
     args: tuple[Scalar, ...]
 
 
-def _truncated(a) -> np.ndarray:
+def _truncate_to_int64(a) -> np.ndarray:
     """As XLA converts to integers: NaN to 0, and what is too large to the nearest one."""
     a = np.asarray(a, dtype=np.float64)
     inside = np.abs(a) < 2.0**63
@@ -67,7 +67,7 @@ def _truncated(a) -> np.ndarray:
     return np.where(inside, np.where(inside, a, 0.0).astype(np.int64), outside)
 
 
-def _quotient(a, n):
+def _integer_quotient(a, n):
     """The quotient of integers, towards zero; by zero it is -1, as XLA has it."""
     a, n = np.asarray(a, dtype=np.int64), np.asarray(n, dtype=np.int64)
     safe = np.where(n == 0, 1, n)
@@ -76,19 +76,19 @@ def _quotient(a, n):
     return np.where(n == 0, -1, towards_zero)[()]
 
 
-def _wrapped(a, bits: int, signed: bool):
+def _wrap_integer(a, bits: int, signed: bool):
     """An integer as so many bits hold it."""
     low = np.asarray(a, dtype=np.int64) & ((1 << bits) - 1)
     return np.where(signed & (low >> (bits - 1) == 1), low - (1 << bits), low)[()]
 
 
-def _picked(place, *entries):
+def _take_clipped(place, *entries):
     """The entry at a place from zero; the first, or the last, where it lies outside."""
     place, *found = np.broadcast_arrays(np.clip(np.asarray(place, dtype=np.int64), 0, len(entries) - 1), *entries)
     return np.take_along_axis(np.stack(found), place[None], 0)[0][()]
 
 
-SPECIAL: dict[str, Callable[..., Any]] = {
+SPECIAL_FUNCTIONS: dict[str, Callable[..., Any]] = {
     "lgamma": lambda x: scipy.special.gammaln(x),
     "digamma": lambda x: scipy.special.psi(x),
     "erf_inv": lambda x: scipy.special.erfinv(x),
@@ -100,7 +100,7 @@ SPECIAL: dict[str, Callable[..., Any]] = {
 }
 """Special functions, SciPy's. It is imported where one is needed."""
 
-ELEMENTARY: dict[str, Callable[..., Any]] = {
+ELEMENTARY_OPERATIONS: dict[str, Callable[..., Any]] = {
     **{name: getattr(np, name) for name in "abs sign sqrt cbrt exp exp2 expm1 log log1p sin cos tan".split()},
     **{name: getattr(np, name) for name in "sinh cosh tanh floor ceil".split()},
     **{f"a{name}": getattr(np, f"arc{name}") for name in "sin cos tan tan2 sinh cosh tanh".split()},
@@ -110,12 +110,12 @@ ELEMENTARY: dict[str, Callable[..., Any]] = {
     **{name: getattr(operator, name) for name in "eq ne lt le gt ge xor".split()},
     "and": operator.and_,
     "or": operator.or_,
-    **SPECIAL,
+    **SPECIAL_FUNCTIONS,
 }
 """Operations that are primitives of the same name, with nothing to simplify."""
 
 OPERATIONS: dict[str, Callable[..., Any]] = (
-    ELEMENTARY
+    ELEMENTARY_OPERATIONS
     | {
         **{name: getattr(operator, name) for name in "add sub mul neg".split()},
         "div": operator.truediv,
@@ -129,15 +129,15 @@ OPERATIONS: dict[str, Callable[..., Any]] = (
         "select": np.where,
         "float": lambda a: np.asarray(a, dtype=np.float64),
         "int": lambda a: np.asarray(a, dtype=np.int64),
-        "truncate": _truncated,
+        "truncate": _truncate_to_int64,
         "branch": lambda condition, number: condition,
-        "quotient": _quotient,
-        "wrap": _wrapped,
+        "quotient": _integer_quotient,
+        "wrap": _wrap_integer,
         "single": lambda a: (
             np.float64(np.float32(a)) if np.ndim(a) == 0 else np.asarray(a, np.float32).astype(np.float64)
         ),
-        "pick": _picked,
-        "lookup": lambda place, table: _picked(place, *table),
+        "pick": _take_clipped,
+        "lookup": lambda place, table: _take_clipped(place, *table),
         "item": lambda results, i: results[i],
         "column": lambda results, start, length: results[start : start + length],
         "table": lambda *entries: list(entries),
@@ -146,18 +146,18 @@ OPERATIONS: dict[str, Callable[..., Any]] = (
 """What each operation means, on numbers and on NumPy arrays of them."""
 
 
-def meaning(op: str | Block) -> Callable[..., Any]:
+def implementation(op: str | Block) -> Callable[..., Any]:
     """What an operation or a block means."""
     return op if isinstance(op, Block) else OPERATIONS[op]
 
 
-TESTS = {"eq", "ne", "lt", "le", "gt", "ge", "is_finite"}
+COMPARISONS = {"eq", "ne", "lt", "le", "gt", "ge", "is_finite"}
 """Operations on numbers that give a truth value."""
 
-OF_TESTS = {"and", "or", "xor", "not", "branch"}
+BOOLEAN_OPERATIONS = {"and", "or", "xor", "not", "branch"}
 """Those on truth values."""
 
-FEW = 16
+MAX_SELECT_ENTRIES = 16
 """Entries among which one is picked by choices; more are a table."""
 
 COMMUTATIVE = {"add", "mul", "and", "or", "xor", "eq", "ne"}
@@ -167,14 +167,14 @@ class LimitExceededError(Exception):
     """More instructions than allowed."""
 
 
-class Around:
+class EnclosingScope:
     """What is around a program that is one of its instructions.
 
     Attributes
     ----------
     builder : Builder
         Of that.
-    inside, outside : dict
+    inner_names, outer_scalars : dict
         The names that its variables have inside, and the inverse of that.
     tables : dict
         What is in its tables, by their names inside.
@@ -182,20 +182,20 @@ class Around:
 
     def __init__(self, builder: Builder):
         self.builder = builder
-        self.inside: dict[Scalar, str] = {}
-        self.outside: dict[Scalar, Scalar] = {}
+        self.inner_names: dict[Scalar, str] = {}
+        self.outer_scalars: dict[Scalar, Scalar] = {}
         self.tables: dict[str, tuple[Scalar, ...]] = {}
 
-    def enter(self, a: Scalar) -> str:
+    def import_scalar(self, a: Scalar) -> str:
         """The name of a variable inside."""
-        if a not in self.inside:
-            self.inside[a] = name = f"x0_{len(self.inside)}"
-            self.outside[name] = a
-        return self.inside[a]
+        if a not in self.inner_names:
+            self.inner_names[a] = name = f"x0_{len(self.inner_names)}"
+            self.outer_scalars[name] = a
+        return self.inner_names[a]
 
     def table(self, entries: Sequence[Scalar]) -> str:
         """The name inside of a table around, of what these are there."""
-        name = self.enter(self.builder.table([self.outside[a] if type(a) is str else a for a in entries]))
+        name = self.import_scalar(self.builder.table([self.outer_scalars[a] if type(a) is str else a for a in entries]))
         self.tables[name] = tuple(entries)
         return name
 
@@ -209,19 +209,19 @@ class Builder:
 
     Parameters
     ----------
-    limit : int
+    max_instructions : int
         Instructions that it may collect.
-    around : Around, optional
+    enclosing : Around, optional
         What is around a program inside a loop, or in a routine.
     """
 
-    def __init__(self, limit: int, around: Around | None = None):
-        self.limit, self.around = limit, around
+    def __init__(self, max_instructions: int, enclosing: EnclosingScope | None = None):
+        self.max_instructions, self.enclosing = max_instructions, enclosing
         self.instructions: list[Instruction] = []
         self._emitted: dict[tuple[str | Block, ...], str] = {}
-        self._opposite: dict[Scalar, str] = {}  # the b of each a = -b
+        self._negated_operand: dict[Scalar, str] = {}  # the b of each a = -b
         self._branches: dict[tuple[str, ...], int] = {}
-        self.calls: dict[tuple, tuple] = {}
+        self.call_results: dict[tuple, tuple] = {}
 
     @property
     def real(self) -> Builder:
@@ -231,22 +231,22 @@ class Builder:
     def op(self, op: str | Block, *args: Scalar) -> Any:
         """The result of an operation, with no simplification but constants folded and equal expressions merged."""
         if not any(type(a) is str for a in args):
-            return fold(op, *args)
+            return fold_constants(op, *args)
         if op in COMMUTATIVE:
             args = tuple(sorted(args, key=str))
-        return self._named(op, *args)
+        return self._emit(op, *args)
 
-    def _named(self, op: str | Block, *args: Scalar) -> str:
+    def _emit(self, op: str | Block, *args: Scalar) -> str:
         key = (op, *(a if type(a) is str else repr(a) for a in args))  # repr tells 0.0 from -0.0, 1 from True
         name = self._emitted.get(key)
         if name is None:
-            if len(self.instructions) >= self.limit:
+            if len(self.instructions) >= self.max_instructions:
                 raise LimitExceededError
             name = self._emitted[key] = f"t{len(self.instructions)}"
             self.instructions.append(Instruction(name, op, args))
         return name
 
-    def block(self, block: Block, *args: Scalar) -> list[Scalar]:
+    def emit_block(self, block: Block, *args: Scalar) -> list[Scalar]:
         """The results of a block."""
         whole = self.op(block, *args)
         if isinstance(whole, str):
@@ -258,27 +258,29 @@ class Builder:
 
         Inside a loop those of what is around it are a table there: it is made once.
         """
-        if self.around is not None and not any(type(a) is str and a not in self.around.outside for a in entries):
-            return self.around.table(entries)
-        first = self._made(entries[0]) if entries else None
+        if self.enclosing is not None and not any(
+            type(a) is str and a not in self.enclosing.outer_scalars for a in entries
+        ):
+            return self.enclosing.table(entries)
+        first = self._defining_instruction(entries[0]) if entries else None
         if first is not None and first.op == "item":
             whole, start = first.args[0], int(first.args[1])
-            if all(self._made(a) == (a, "item", (whole, start + i)) for i, a in enumerate(entries)):
-                return self._named("column", whole, start, len(entries))
-        return self._named("table", *entries)
+            if all(self._defining_instruction(a) == (a, "item", (whole, start + i)) for i, a in enumerate(entries)):
+                return self._emit("column", whole, start, len(entries))
+        return self._emit("table", *entries)
 
-    def given(self, entries: Sequence[Scalar]) -> list[tuple[int, int]] | None:
+    def input_indices(self, entries: Sequence[Scalar]) -> list[tuple[int, int]] | None:
         """The places, of an array and of an entry, that scalars have among the inputs of the outermost program.
 
         None where one is no input.
         """
-        if self.around is not None:
-            return self.around.builder.given([self.around.outside.get(a, 0.0) for a in entries])
+        if self.enclosing is not None:
+            return self.enclosing.builder.input_indices([self.enclosing.outer_scalars.get(a, 0.0) for a in entries])
         if not all(type(a) is str and a[0] == "x" for a in entries):
             return None
         return [(int(place), int(number)) for place, number in (str(a)[1:].split("_") for a in entries)]
 
-    def _made(self, a: Scalar) -> Instruction | None:
+    def _defining_instruction(self, a: Scalar) -> Instruction | None:
         return self.instructions[int(a[1:])] if type(a) is str and a[0] == "t" else None
 
     def add(self, a, b):
@@ -288,10 +290,10 @@ class Builder:
             return b
         if b == 0:
             return a
-        if b in self._opposite:
-            return self.sub(a, self._opposite[b])
-        if a in self._opposite:
-            return self.sub(b, self._opposite[a])
+        if b in self._negated_operand:
+            return self.sub(a, self._negated_operand[b])
+        if a in self._negated_operand:
+            return self.sub(b, self._negated_operand[a])
         return self.op("add", a, b)
 
     def sub(self, a, b):
@@ -301,17 +303,17 @@ class Builder:
             return a
         if a == 0:
             return self.neg(b)
-        if b in self._opposite:
-            return self.add(a, self._opposite[b])
+        if b in self._negated_operand:
+            return self.add(a, self._negated_operand[b])
         return self.op("sub", a, b)
 
     def neg(self, a):
         if type(a) is not str:
             return -a
-        if a in self._opposite:
-            return self._opposite[a]
+        if a in self._negated_operand:
+            return self._negated_operand[a]
         result = self.op("neg", a)
-        self._opposite[result] = a
+        self._negated_operand[result] = a
         return result
 
     def mul(self, a, b):
@@ -323,21 +325,21 @@ class Builder:
             return b
         if b == 1:
             return a
-        return self._signed(self.mul, "mul", a, b)
+        return self._extract_signs(self.mul, "mul", a, b)
 
     def div(self, a, b):
         if type(a) is not str and type(b) is not str:
-            return fold("div", a, b)
+            return fold_constants("div", a, b)
         if a == 0:
             return abs(a)
         if b == 1:
             return a
-        return self._signed(self.div, "div", a, b)
+        return self._extract_signs(self.div, "div", a, b)
 
-    def _signed(self, method, op, a, b):
+    def _extract_signs(self, method, op, a, b):
         """A product or quotient, minus signs taken out of it."""
         for x, result in (a, lambda y: method(y, b)), (b, lambda y: method(a, y)):
-            opposite = self._opposite.get(x) if type(x) is str else -x if x < 0 else None
+            opposite = self._negated_operand.get(x) if type(x) is str else -x if x < 0 else None
             if opposite is not None:
                 return self.neg(result(opposite))
         return self.op(op, a, b)
@@ -380,7 +382,9 @@ class Builder:
         if alike:
             return entries[0]
         return (
-            self.op("pick", place, *entries) if len(entries) <= FEW else self.op("lookup", place, self.table(entries))
+            self.op("pick", place, *entries)
+            if len(entries) <= MAX_SELECT_ENTRIES
+            else self.op("lookup", place, self.table(entries))
         )
 
     def conj(self, a):
@@ -408,17 +412,17 @@ class Builder:
         return result
 
 
-def fold(op: str | Block, *args: Scalar) -> Any:
+def fold_constants(op: str | Block, *args: Scalar) -> Any:
     """The value of an operation on numbers, by the rules of IEEE arithmetic: nothing raises."""
     with np.errstate(all="ignore"):
-        value = meaning(op)(*(np.float64(a) if type(a) is float else a for a in args))
+        value = implementation(op)(*(np.float64(a) if type(a) is float else a for a in args))
     return value.item() if isinstance(value, np.generic | np.ndarray) else value
 
 
 # -- arrays of scalars ----------------------------------------------------------------------------------------------
 
 
-class Pair:
+class ComplexPair:
     """A complex scalar. No sequence, so that NumPy's object arrays take it for one entry."""
 
     __slots__ = ("im", "re")
@@ -427,22 +431,22 @@ class Pair:
         self.re, self.im = re, im
 
 
-def pair(a) -> Pair:
+def as_complex_pair(a) -> ComplexPair:
     """A complex number, or a real scalar, as one."""
-    if isinstance(a, Pair):
+    if isinstance(a, ComplexPair):
         return a
-    return Pair(a.real, a.imag) if isinstance(a, complex) else Pair(a, 0.0)
+    return ComplexPair(a.real, a.imag) if isinstance(a, complex) else ComplexPair(a, 0.0)
 
 
-def constant(value, dtype=None) -> np.ndarray:
+def constant_array(value, dtype=None) -> np.ndarray:
     """An array of numbers as an array of scalars, complex ones as pairs."""
     found = np.asarray(value, dtype=dtype)
     if found.dtype.kind != "c":
         return found.astype(object)
-    return array([Pair(a.real, a.imag) for a in found.ravel().tolist()], found.shape)
+    return scalar_array([ComplexPair(a.real, a.imag) for a in found.ravel().tolist()], found.shape)
 
 
-def array(scalars: Sequence[Any], shape) -> np.ndarray:
+def scalar_array(scalars: Sequence[Any], shape) -> np.ndarray:
     result = np.empty(len(scalars), object)
     result[:] = scalars
     return result.reshape(shape)
@@ -452,7 +456,7 @@ def elementwise(function: Callable[..., Any], *arrays: np.ndarray) -> np.ndarray
     """Apply a function entry by entry."""
     if len({np.shape(x) for x in arrays}) > 1:
         arrays = np.broadcast_arrays(*arrays)
-    return array(list(map(function, *(x.ravel().tolist() for x in arrays))), arrays[0].shape)
+    return scalar_array(list(map(function, *(x.ravel().tolist() for x in arrays))), arrays[0].shape)
 
 
 def entries_along(x: np.ndarray, axes) -> tuple[list[list[Scalar]], tuple[int, ...]]:

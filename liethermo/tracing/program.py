@@ -10,8 +10,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from .builder import Block, Instruction, Scalar, meaning
-from .calls import Product
+from .builder import Block, Instruction, Scalar, implementation
+from .calls import MatrixProduct
 
 
 @dataclass(frozen=True)
@@ -35,16 +35,16 @@ class Program:
     shapes: tuple[tuple[int, ...], ...]
 
     @property
-    def operations(self) -> Counter[str]:
+    def operation_counts(self) -> Counter[str]:
         """How many instructions there are of each kind."""
         return Counter(str(instruction.op) for instruction in self.instructions)
 
     @functools.cached_property
-    def size(self) -> int:
+    def instruction_count(self) -> int:
         """How many instructions compute something, those inside loops among them: what is moved alone costs little."""
         own = sum(i.op not in ("item", "column", "table") for i in self.instructions)
         blocks = (i.op for i in self.instructions if isinstance(i.op, Block))
-        return own + sum(program.size for block in blocks for program in block.inner)
+        return own + sum(program.instruction_count for block in blocks for program in block.inner_programs)
 
     def evaluate(self, *arrays, batch: bool = False) -> list[np.ndarray]:
         """The outputs for given input arrays, interpreted with NumPy: nothing is compiled.
@@ -59,17 +59,17 @@ class Program:
                 x = x.reshape(*front, len(names)).T
             given.append(x if batch else x.ravel())
 
-        def gathered(entries, shape):
+        def assemble_output(entries, shape):
             found = np.empty((*front, len(entries)))
             for i, a in enumerate(entries):
                 found[..., i] = a
             return found.reshape((*front, *shape))
 
-        return [gathered(entries, shape) for entries, shape in zip(self.run(*given), self.shapes, strict=True)]
+        return [assemble_output(entries, shape) for entries, shape in zip(self.run(*given), self.shapes, strict=True)]
 
     def run(self, *given: Sequence) -> list[list]:
         """The entries of the outputs for those of the inputs: numbers, or arrays of them for many points at once."""
-        places, start, instructions, results = self._plan
+        places, start, instructions, results = self._interpretation_plan
         values = start.copy()
         for own, entries in zip(places, given, strict=True):
             for place, entry in zip(own, entries, strict=True):
@@ -80,7 +80,9 @@ class Program:
         return [[values[place] for place in own] for own in results]
 
     @functools.cached_property
-    def _plan(self) -> tuple[list[list[int]], list, list[tuple[Callable, int, list[int]]], list[list[int]]]:
+    def _interpretation_plan(
+        self,
+    ) -> tuple[list[list[int]], list, list[tuple[Callable, int, list[int]]], list[list[int]]]:
         """How it is interpreted: the places of inputs, what is at each place at the start, instructions, and results.
 
         A place is free again after its value is read for the last time. So arrays of many points stay in fast memory.
@@ -104,7 +106,7 @@ class Program:
             own = read(args)
             free += [places[a] for a in set(args) if type(a) is str and last[a] == i]
             places[target] = free.pop() if free else place()
-            instructions.append((meaning(op), places[target], own))
+            instructions.append((implementation(op), places[target], own))
             if target not in last:
                 free.append(places[target])
         return inputs, start, instructions, [read(entries) for entries in self.outputs]
@@ -117,25 +119,25 @@ class Program:
         place : int
             Of the input.
         """
-        return self._degree(dict.fromkeys(self.inputs[place], 1))
+        return self._propagate_degrees(dict.fromkeys(self.inputs[place], 1))
 
-    def _degree(self, degrees: dict[Scalar, float]) -> float:
+    def _propagate_degrees(self, degrees: dict[Scalar, float]) -> float:
         """Where those of some of the inputs are known, and the others count for nothing."""
         for target, op, args in self.instructions:
             found = [degrees.get(a, 0) for a in args]
             if op in ("add", "sub", "neg", "table", "item", "column"):
                 degrees[target] = max(found)
-            elif op == "mul" or isinstance(op, Product):
+            elif op == "mul" or isinstance(op, MatrixProduct):
                 degrees[target] = sum(found)
             elif isinstance(op, Routine):
-                degrees[target] = op.program._degree(dict(zip(op.program.inputs[0], found, strict=True)))
+                degrees[target] = op.program._propagate_degrees(dict(zip(op.program.inputs[0], found, strict=True)))
             elif op == "div" and not found[1]:
                 degrees[target] = found[0]
             else:
                 degrees[target] = math.inf if any(found) else 0
         return max((degrees.get(a, 0) for entries in self.outputs for a in entries), default=0)
 
-    def factored(self, varying: Sequence[int]) -> Program:
+    def factor_constants(self, varying: Sequence[int]) -> Program:
         """The same, with products ``(v a) b`` written ``v (a b)`` where a and b do not depend on some of the inputs.
 
         In a loop over those, ``a b`` is then computed once.
@@ -169,7 +171,7 @@ class Program:
 
 
 @dataclass(frozen=True, eq=False)
-class While(Block):
+class WhileLoop(Block):
     """``while test(constants, carried): carried = body(constants, carried)``.
 
     Its arguments are the constants, then what is carried at the start; its results what is carried at the end. Where
@@ -189,7 +191,7 @@ class While(Block):
     name: str = field(default="while", repr=False)
 
     @property
-    def inner(self) -> tuple[Program, ...]:  # type: ignore[override]
+    def inner_programs(self) -> tuple[Program, ...]:  # type: ignore[override]
         return self.test, self.body
 
     def __call__(self, *args) -> list:
@@ -204,7 +206,7 @@ class While(Block):
 
 
 @dataclass(frozen=True, eq=False)
-class Scan(Block):
+class ScanLoop(Block):
     """``carried, stacked[i] = body(constants, carried, [table[i] for table in tables])`` for every i.
 
     Its arguments are the constants, what is carried at the start, and the tables; its results what is carried at the
@@ -217,30 +219,30 @@ class Scan(Block):
         Whether the last i is the first.
     body : Program
         Of three arrays, with two as its results.
-    carried, stacked : tuple of str
+    carry_kinds, stacked_kinds : tuple of str
         The kinds of what is carried, and of what is in a row of each stacked table.
     """
 
     length: int
     reverse: bool
     body: Program
-    carried: tuple[str, ...]
-    stacked: tuple[str, ...]
+    carry_kinds: tuple[str, ...]
+    stacked_kinds: tuple[str, ...]
     name: str = field(default="scan", repr=False)
 
     @property
-    def inner(self) -> tuple[Program, ...]:  # type: ignore[override]
+    def inner_programs(self) -> tuple[Program, ...]:  # type: ignore[override]
         return (self.body,)
 
     @property
     def kinds(self) -> tuple[str, ...]:  # type: ignore[override]
-        return self.carried + tuple(kind for kind in self.stacked for _ in range(self.length))
+        return self.carry_kinds + tuple(kind for kind in self.stacked_kinds for _ in range(self.length))
 
     def __call__(self, *args) -> list:
         fixed = len(self.body.inputs[0])
-        start = fixed + len(self.carried)
+        start = fixed + len(self.carry_kinds)
         constants, carried, tables = args[:fixed], list(args[fixed:start]), args[start:]
-        stacked: list[list] = [[None] * self.length for _ in self.stacked]
+        stacked: list[list] = [[None] * self.length for _ in self.stacked_kinds]
         for i in range(self.length)[::-1] if self.reverse else range(self.length):
             carried, row = self.body.run(constants, carried, [table[i] for table in tables])
             for column, value in zip(stacked, row, strict=True):
@@ -272,7 +274,7 @@ class Routine(Block):
 # -- what follows from instructions -----------------------------------------------------------------------------------
 
 
-def live(
+def eliminate_dead_code(
     instructions: Sequence[Instruction], results: Sequence[Scalar]
 ) -> tuple[tuple[Instruction, ...], dict[Scalar, str]]:
     """The instructions that results depend on, each as late as its first use allows, and their new names.

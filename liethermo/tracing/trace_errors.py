@@ -12,12 +12,12 @@ from jax.extend.core import Jaxpr, jaxprs_in_params
 from jax.extend.core.primitives import convert_element_type_p
 
 from ..errors import FunctionError
-from .scalarize import is_foreign, origin
+from .scalarize import is_user_file, user_source_line
 
 TRACE_ERRORS = (TypeError, ValueError, IndexError, AttributeError)
 """What the call of a function with traced arrays may raise."""
 
-REFUSED_IN_JAX = {
+JAX_ERROR_REMEDIES = {
     jax.errors.TracerBoolConversionError: (
         "it uses a traced value in `if`, `while`, `and`, `or`, `min` or `max`",
         "Replace `if` by jnp.where or jax.lax.cond, and max(a, b) by jnp.maximum(a, b)",
@@ -42,7 +42,7 @@ REFUSED_IN_JAX = {
 """The errors that JAX raises if a traced value is used as a number: what the function does, and what to do instead."""
 
 
-def explain(what: str, error: BaseException, cure: str = "") -> str:
+def explain_trace_error(what: str, error: BaseException, cure: str = "") -> str:
     """Return a message that says why a function could not be evaluated, and what to do.
 
     Parameters
@@ -54,25 +54,25 @@ def explain(what: str, error: BaseException, cure: str = "") -> str:
     cure : str
         What to do if nothing is known of the error.
     """
-    for kind, (cause, known_cure) in REFUSED_IN_JAX.items():
+    for kind, (cause, known_cure) in JAX_ERROR_REMEDIES.items():
         if isinstance(error, kind):
             reported = str(error).splitlines()[0].rstrip(".")
-            return f"{what}: {cause}{_place(error)}. {known_cure}. JAX reports: {reported}"
+            return f"{what}: {cause}{_user_line(error)}. {known_cure}. JAX reports: {reported}"
     if isinstance(error, FunctionError):
         return f"{what}: {error}"
     message = f"{what}: {type(error).__name__}: {error}".rstrip(".")
     return f"{message}. {cure}" if cure else message
 
 
-def _place(error: BaseException) -> str:
+def _user_line(error: BaseException) -> str:
     """Where the user's function raised."""
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
-        if is_foreign(Path(frame.filename)):
+        if is_user_file(Path(frame.filename)):
             return f" ({Path(frame.filename).name}:{frame.lineno}, in {frame.name})"
     return ""
 
 
-def check_result(value, name: str) -> None:
+def check_not_none(value, name: str) -> None:
     """Raise FunctionError if a function returned nothing."""
     if value is None:
         raise FunctionError(f"{name} returns None. Add the missing `return`")
@@ -91,6 +91,6 @@ def check_precision(jaxpr: Jaxpr, name: str) -> None:
             dtype = np.dtype(eqn.params["new_dtype"])
             if operand.dtype == np.float64 and dtype.kind == "f" and dtype.itemsize < 8:
                 raise FunctionError(
-                    f"{name} rounds numbers to {dtype} ({origin(eqn)}), but the laws hold to the rounding of float64. "
+                    f"{name} rounds numbers to {dtype} ({user_source_line(eqn)}), but the laws hold to the rounding of float64. "
                     f"Leave out {dtype}, such as astype(jnp.{dtype})"
                 )

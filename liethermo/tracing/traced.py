@@ -20,44 +20,49 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
-from manifolds._keys import key
-from manifolds._module import Module
-from manifolds._precision import users_settings
+from manifolds._content_keys import content_key
+from manifolds._precision import user_settings
+from manifolds._pytree_module import Module
 
 from ..errors import FunctionError
 from .index_check import check_indices
-from .lifting import Lifting
-from .trace_errors import check_precision, check_result
+from .lifting import ConstantLifter
+from .trace_errors import check_not_none, check_precision
 
 
-class Content:
+class TracedProgram:
     """What a function does to arrays of given shapes, without the numbers in it; equal operations are one object.
 
     Attributes
     ----------
-    closed : ClosedJaxpr
+    closed_jaxpr : ClosedJaxpr
         Its first arguments are the numbers.
-    structure : PyTreeDef
+    result_structure : PyTreeDef
         Of the result.
-    arguments : tuple of avals
-    loops : bool
+    argument_avals : tuple of avals
+    has_while_loop : bool
         Whether it has a loop of unknown length, which JAX differentiates forwards alone.
     """
 
     def __init__(self, closed: ClosedJaxpr, structure, arguments: tuple, loops: bool):
-        self.closed, self.structure, self.arguments, self.loops = closed, structure, arguments, loops
+        self.closed_jaxpr, self.result_structure, self.argument_avals, self.has_while_loop = (
+            closed,
+            structure,
+            arguments,
+            loops,
+        )
 
     def __repr__(self) -> str:
-        return f"{len(self.closed.eqns)} operations"
+        return f"{len(self.closed_jaxpr.eqns)} operations"
 
-    def __copy__(self) -> Content:
+    def __copy__(self) -> TracedProgram:
         return self
 
-    def __deepcopy__(self, memo) -> Content:
+    def __deepcopy__(self, memo) -> TracedProgram:
         return self
 
 
-_contents: weakref.WeakValueDictionary[Hashable, Content] = weakref.WeakValueDictionary()
+_traced_programs: weakref.WeakValueDictionary[Hashable, TracedProgram] = weakref.WeakValueDictionary()
 _lock = threading.Lock()
 
 
@@ -77,18 +82,18 @@ class _Label:
         return 0
 
 
-class Traced(Module):
+class TracedFunction(Module):
     """A function of arrays, traced once, as a pytree of the numbers that it was written with.
 
     Attributes
     ----------
     numbers : tuple of arrays
         The plain numbers in one array, then the arrays that it closes over.
-    content : Content
+    program : Content
     """
 
     numbers: tuple[jax.Array, ...]
-    content: Content = eqx.field(static=True)
+    program: TracedProgram = eqx.field(static=True)
     label: _Label = eqx.field(static=True)
 
     @property
@@ -96,7 +101,7 @@ class Traced(Module):
         return self.label.name
 
     def __call__(self, *arguments):
-        wanted = self.content.arguments
+        wanted = self.program.argument_avals
         given = tuple(map(jnp.asarray, arguments))
         if tuple(np.shape(a) for a in given) != tuple(a.shape for a in wanted):
             raise FunctionError(
@@ -104,21 +109,21 @@ class Traced(Module):
                 f"system that it belongs to, not of {', '.join(str(np.shape(a)) for a in given)}"
             )
         values = [*self.numbers, *(a.astype(b.dtype) for a, b in zip(given, wanted, strict=True))]
-        run = _looping if self.content.loops else _plain
-        return jax.tree_util.tree_unflatten(self.content.structure, run(self.content, values))
+        run = _run_with_while_loop if self.program.has_while_loop else _run_program
+        return jax.tree_util.tree_unflatten(self.program.result_structure, run(self.program, values))
 
 
-def _plain(content: Content, values: Sequence) -> list:
+def _run_program(content: TracedProgram, values: Sequence) -> list:
     packed, *rest = values
     scalars = [jax.lax.squeeze(jax.lax.slice(packed, (i,), (i + 1,)), (0,)) for i in range(packed.shape[0])]
-    return jaxpr_as_fun(content.closed)(*scalars, *rest)
+    return jaxpr_as_fun(content.closed_jaxpr)(*scalars, *rest)
 
 
-def _looping(content: Content, values: Sequence) -> list:
-    return _forwards(lambda *values: _plain(content, values))(*values)
+def _run_with_while_loop(content: TracedProgram, values: Sequence) -> list:
+    return _forward_differentiable(lambda *values: _run_program(content, values))(*values)
 
 
-def _forwards(function: Callable) -> Callable:
+def _forward_differentiable(function: Callable) -> Callable:
     """A function to a list of arrays, each derivative of which is taken forwards, whichever way is asked for.
 
     A loop of unknown length has no derivative backwards. The tangent is the Jacobian, found forwards, times the
@@ -134,7 +139,7 @@ def _forwards(function: Callable) -> Callable:
         values, tangents = tuple(map(jnp.asarray, values)), tuple(map(jnp.asarray, tangents))
         real = [i for i, v in enumerate(values) if jnp.issubdtype(v.dtype, jnp.inexact)]
 
-        def of_real(*moving):
+        def evaluate_inexact(*moving):
             whole = list(values)
             for i, v in zip(real, moving, strict=True):
                 whole[i] = v
@@ -146,8 +151,8 @@ def _forwards(function: Callable) -> Callable:
             ]
             return sum(terms[1:], terms[0])
 
-        jacobians = _forwards(
-            lambda *moving: jax.tree_util.tree_leaves(jax.jacfwd(of_real, tuple(range(len(real))))(*moving))
+        jacobians = _forward_differentiable(
+            lambda *moving: jax.tree_util.tree_leaves(jax.jacfwd(evaluate_inexact, tuple(range(len(real))))(*moving))
         )(*(values[i] for i in real))
         found = called(*values)
         columns = [jacobians[k * len(real) : (k + 1) * len(real)] for k in range(len(found))]
@@ -159,41 +164,43 @@ def _forwards(function: Callable) -> Callable:
 # -- conversion -------------------------------------------------------------------------------------------------------
 
 
-def traced(function: Callable, *arguments) -> Traced:
+def trace_function(function: Callable, *arguments) -> TracedFunction:
     """A function of arrays of these shapes (``jax.ShapeDtypeStruct``) as a pytree of its numbers."""
-    ours = _is_ours(function)
+    ours = _is_library_object(function)
     name = getattr(function, "__name__", type(function).__name__)
 
-    def called(*values):  # anew: JAX keeps the trace of a function object, and what the function reads may change
+    def evaluate(*values):  # anew: JAX keeps the trace of a function object, and what the function reads may change
         result = function(*values)
-        check_result(result, name)
+        check_not_none(result, name)
         return result
 
-    with contextlib.nullcontext() if ours else users_settings():
-        closed, found = jax.make_jaxpr(called, return_shape=True)(*arguments)
+    with contextlib.nullcontext() if ours else user_settings():
+        closed, found = jax.make_jaxpr(evaluate, return_shape=True)(*arguments)
     if not ours:
         check_precision(closed.jaxpr, name)
     check_indices(closed)
-    lifting = Lifting()
-    jaxpr, constants, numbers = lifting.whole(closed)
+    lifting = ConstantLifter()
+    jaxpr, constants, numbers = lifting.lift_jaxpr(closed)
     structure = jax.tree_util.tree_structure(found)
     avals = tuple(jax.ShapeDtypeStruct(np.shape(a), a.dtype) for a in arguments)
-    found_by = (key(ClosedJaxpr(jaxpr, constants)), structure, tuple((a.shape, a.dtype) for a in avals))
+    found_by = (content_key(ClosedJaxpr(jaxpr, constants)), structure, tuple((a.shape, a.dtype) for a in avals))
     with _lock:
-        content = _contents.get(found_by)
+        content = _traced_programs.get(found_by)
         if content is None:
-            content = _contents[found_by] = Content(ClosedJaxpr(jaxpr, constants), structure, avals, lifting.loops)
-    return Traced(numbers, content, _Label(name))
+            content = _traced_programs[found_by] = TracedProgram(
+                ClosedJaxpr(jaxpr, constants), structure, avals, lifting.has_while_loop
+            )
+    return TracedFunction(numbers, content, _Label(name))
 
 
-def _module(function: Callable) -> str:
+def _defining_module(function: Callable) -> str:
     """Where a function, or the class of one, is defined."""
     return getattr(function, "__module__", None) or type(function).__module__
 
 
-def _is_ours(function: Any) -> bool:
+def _is_library_object(function: Any) -> bool:
     """Whether a function, or the class of an object, is defined in this library."""
-    return _module(function).split(".")[0] in ("liethermo", "manifolds")
+    return _defining_module(function).split(".")[0] in ("liethermo", "manifolds")
 
 
 def _check_indices_of(tree: Any, use: Callable, shapes: Sequence[tuple[int, ...]]) -> None:
@@ -205,12 +212,14 @@ def _check_indices_of(tree: Any, use: Callable, shapes: Sequence[tuple[int, ...]
     check_indices(closed)
 
 
-def is_plain(leaf) -> bool:
+def is_plain_function(leaf) -> bool:
     """Whether a leaf of a pytree is a function."""
     return callable(leaf) and not isinstance(leaf, type | eqx.Module | jax.Array | np.ndarray)
 
 
-def converted(tree: Any, use: Callable, *shapes: tuple[int, ...], is_leaf: Callable | None = None) -> tuple[Any, Any]:
+def trace_callables_with_result(
+    tree: Any, use: Callable, *shapes: tuple[int, ...], is_leaf: Callable | None = None
+) -> tuple[Any, Any]:
     """A pytree with its plain functions traced, and the shapes of what ``use`` returned.
 
     Plain numbers among its leaves, such as those of an ``equinox.Module`` that is used as a function, become arrays,
@@ -229,25 +238,25 @@ def converted(tree: Any, use: Callable, *shapes: tuple[int, ...], is_leaf: Calla
     leaves, structure = jax.tree_util.tree_flatten(tree, is_leaf=is_leaf)
     if any(type(leaf) is float for leaf in leaves):
         try:
-            return _watched(leaves, structure, use, shapes, float)
+            return _trace_with_recorders(leaves, structure, use, shapes, float)
         except (TypeError, ValueError, AttributeError):  # what is wrong without arrays too, shows below
             pass
-    return _watched(leaves, structure, use, shapes, None)
+    return _trace_with_recorders(leaves, structure, use, shapes, None)
 
 
-def _watched(leaves: list, structure, use: Callable, shapes, number: type | None) -> tuple[Any, Any]:
+def _trace_with_recorders(leaves: list, structure, use: Callable, shapes, number: type | None) -> tuple[Any, Any]:
     """What ``use`` makes of leaves, those of one type of number being arrays, and of functions that are watched."""
-    recorders = {id(leaf): _Recorder(leaf) for leaf in leaves if is_plain(leaf)}
+    recorders = {id(leaf): _CallRecorder(leaf) for leaf in leaves if is_plain_function(leaf)}
     moved = [i for i, leaf in enumerate(leaves) if type(leaf) is number]
 
-    def used(numbers, *arguments):
+    def use_leaves(numbers, *arguments):
         watched = [recorders.get(id(leaf), leaf) for leaf in leaves]
         for i, value in zip(moved, numbers, strict=True):
             watched[i] = value
         return use(jax.tree_util.tree_unflatten(structure, watched), *arguments)
 
     scalar, arguments = jax.ShapeDtypeStruct((), jnp.float64), [jax.ShapeDtypeStruct(s, jnp.float64) for s in shapes]
-    closed, found = jax.make_jaxpr(used, return_shape=True)([scalar for _ in moved], *arguments)
+    closed, found = jax.make_jaxpr(use_leaves, return_shape=True)([scalar for _ in moved], *arguments)
     check_indices(closed)
     results = [recorders[id(leaf)].result if id(leaf) in recorders else leaf for leaf in leaves]
     with jax.ensure_compile_time_eval():
@@ -256,34 +265,38 @@ def _watched(leaves: list, structure, use: Callable, shapes, number: type | None
     return jax.tree_util.tree_unflatten(structure, results), found
 
 
-def settled(tree: Any, use: Callable, *shapes: tuple[int, ...], is_leaf: Callable | None = None) -> Any:
+def trace_callables(tree: Any, use: Callable, *shapes: tuple[int, ...], is_leaf: Callable | None = None) -> Any:
     """As :func:`converted`, the pytree alone; nothing is traced where there is nothing to convert."""
     leaves = jax.tree_util.tree_leaves(tree, is_leaf=is_leaf)
-    if not any(is_plain(leaf) or type(leaf) is float for leaf in leaves):
-        if not _is_ours(tree):
+    if not any(is_plain_function(leaf) or type(leaf) is float for leaf in leaves):
+        if not _is_library_object(tree):
             _check_indices_of(tree, use, shapes)
         return tree
-    return converted(tree, use, *shapes, is_leaf=is_leaf)[0]
+    return trace_callables_with_result(tree, use, *shapes, is_leaf=is_leaf)[0]
 
 
-class _Recorder:
+class _CallRecorder:
     """A plain function in use, traced for the arguments that it is first called with."""
 
     def __init__(self, function: Callable):
         self.function, self.__name__ = function, getattr(function, "__name__", type(function).__name__)
-        self._found: dict[tuple, Traced] = {}
-        self._otherwise = False
+        self._traced_functions: dict[tuple, TracedFunction] = {}
+        self._is_called_otherwise = False
 
     @property
     def result(self) -> Callable:
         """The traced function, or the function itself where it is called in more than one way, or not at all."""
-        return next(iter(self._found.values())) if len(self._found) == 1 and not self._otherwise else self.function
+        return (
+            next(iter(self._traced_functions.values()))
+            if len(self._traced_functions) == 1 and not self._is_called_otherwise
+            else self.function
+        )
 
     def __call__(self, *arguments, **named):
         if named or not all(isinstance(a, jax.Array) for a in arguments):
-            self._otherwise = True
+            self._is_called_otherwise = True
             return self.function(*arguments, **named)
         key = tuple((a.shape, a.dtype) for a in arguments)
-        if key not in self._found:
-            self._found[key] = traced(self.function, *(jax.ShapeDtypeStruct(*k) for k in key))
-        return self._found[key](*arguments)
+        if key not in self._traced_functions:
+            self._traced_functions[key] = trace_function(self.function, *(jax.ShapeDtypeStruct(*k) for k in key))
+        return self._traced_functions[key](*arguments)

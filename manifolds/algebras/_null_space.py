@@ -24,7 +24,7 @@ def rational_null_space(matrix: np.ndarray) -> list[list[int]]:
     Found modulo a prime, then modulo the product of two, three, …, until the fractions with these residues satisfy
     ``matrix @ v == 0`` in integers. None can then be missing: the rank modulo a prime is at most the rank over Q.
     """
-    primes = map(prime, count())
+    primes = map(large_prime, count())
     residues, modulus, leading = np.zeros((0, 0), dtype=object), 1, None
     while True:
         p = next(primes)
@@ -109,7 +109,7 @@ def row_echelon(rows: np.ndarray, modulus: int = 0, tolerance: float = 0) -> tup
     The entries are integers modulo a prime below 2**31; or, without modulus, fractions or floats, and what is below
     ``tolerance`` is zero.
     """
-    rows = reduced(rows.copy(), modulus)
+    rows = reduce_modulo(rows.copy(), modulus)
     pivots: list[int] = []
     for column in range(rows.shape[1]):
         rank = len(pivots)
@@ -126,19 +126,19 @@ def row_echelon(rows: np.ndarray, modulus: int = 0, tolerance: float = 0) -> tup
         others = np.flatnonzero(rows[:, column])
         others = others[others != rank]
         updated = rows[others, column:] - np.multiply.outer(rows[others, column], rows[rank, column:])
-        rows[others, column:] = reduced(updated, modulus)
+        rows[others, column:] = reduce_modulo(updated, modulus)
         pivots.append(column)
     return rows[: len(pivots)], pivots
 
 
-def reduced(values: np.ndarray, modulus: int) -> np.ndarray:
+def reduce_modulo(values: np.ndarray, modulus: int) -> np.ndarray:
     return values % modulus if modulus else values
 
 
 @cache
-def prime(k: int) -> int:
+def large_prime(k: int) -> int:
     """The primes below 2**31 in descending order: a product of two residues fits in 64 bits."""
-    n = 2**31 - 1 if k == 0 else prime(k - 1) - 2
+    n = 2**31 - 1 if k == 0 else large_prime(k - 1) - 2
     while any(n % d == 0 for d in range(3, math.isqrt(n) + 1, 2)):
         n -= 2
     return n

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._arrays import interleaved
+from .._arrays import stack_columns
 
-UNROLLED = 64
+MAX_UNROLLED_TERMS = 64
 """Structure constants other than zero up to which the bracket of many copies is written out, term by term."""
 
 
@@ -31,7 +31,7 @@ class Operator(Protocol):
     def __matmul__(self, other) -> jax.Array: ...
 
 
-class ByMatrix:
+class AdMatrixAction:
     """The action of x by the matrix of ``ad_x``."""
 
     def __init__(self, ad):
@@ -44,20 +44,20 @@ class ByMatrix:
         return self.ad.T @ mu
 
 
-def written_terms(constants: np.ndarray) -> tuple[tuple[int, int, int, float], ...] | None:
+def nonzero_terms(constants: np.ndarray) -> tuple[tuple[int, int, int, float], ...] | None:
     """The structure constants that are not zero with their indices; None if there are many."""
     places = np.argwhere(constants)
-    if len(places) > UNROLLED:
+    if len(places) > MAX_UNROLLED_TERMS:
         return None
     return tuple((a, b, c, float(constants[a, b, c])) for a, b, c in places.tolist())
 
 
 @partial(jax.jit, static_argnames=("terms", "dim"))  # one program where it is called by itself
-def written_out(terms: tuple[tuple[int, int, int, float], ...], x, y, dim: int) -> jax.Array:
+def unrolled_bracket(terms: tuple[tuple[int, int, int, float], ...], x, y, dim: int) -> jax.Array:
     """``sum_ab value x_a y_b`` for each c, from (a, b, c, value): one pass over a batch, without matrices."""
     columns: list[list[jax.Array]] = [[] for _ in range(dim)]
     for a, b, c, value in terms:
         product = x[..., a] * y[..., b]
         columns[c].append(product if value == 1.0 else value * product)
     zero = jnp.zeros(jnp.broadcast_shapes(x.shape, y.shape)[:-1])
-    return interleaved([sum(column[1:], column[0]) if column else zero for column in columns])
+    return stack_columns([sum(column[1:], column[0]) if column else zero for column in columns])

@@ -11,7 +11,7 @@ from ..errors import (
     JacobiError,
     ShapeError,
 )
-from ._exact import RationalArray, worst_jacobi
+from ._rational import RationalArray, max_jacobi_residual
 
 AXIOM_TOLERANCE = 1e-12
 """Relative residual allowed in an axiom when the constants are not rational (rounding of a few products)."""
@@ -33,7 +33,7 @@ def checked_constants(values) -> np.ndarray:
     return array
 
 
-def constants_of_matrices(basis) -> tuple[np.ndarray, np.ndarray]:
+def constants_from_matrices(basis) -> tuple[np.ndarray, np.ndarray]:
     """The structure constants of the algebra that matrices span over the reals, and the matrices as an array.
 
     Raises what :meth:`manifolds.LieAlgebra.from_matrices` does.
@@ -79,7 +79,7 @@ def constants_of_matrices(basis) -> tuple[np.ndarray, np.ndarray]:
     constants = coordinates.T.reshape(dim, dim, dim)
     constants = (constants - constants.swapaxes(0, 1)) / 2
     scales = sizes[:, None, None] * sizes[:, None] / sizes
-    return without_rounding(constants, scales, columns, commutators), given
+    return snap_to_fractions(constants, scales, columns, commutators), given
 
 
 def check_axioms(constants: np.ndarray, name: str, exact: RationalArray | None) -> None:
@@ -98,7 +98,7 @@ def check_axioms(constants: np.ndarray, name: str, exact: RationalArray | None) 
             tolerance=tolerance,
             indices=(a, b),
         )
-    worst, triple = worst_jacobi(constants)
+    worst, triple = max_jacobi_residual(constants)
     tolerance = 0.0 if exact is not None else AXIOM_TOLERANCE * scale**2 * len(constants)
     if worst > tolerance:
         residual = worst * unit**2
@@ -113,7 +113,7 @@ def check_axioms(constants: np.ndarray, name: str, exact: RationalArray | None) 
         )
 
 
-def without_rounding(
+def snap_to_fractions(
     constants: np.ndarray, scales: np.ndarray, columns: np.ndarray, commutators: np.ndarray
 ) -> np.ndarray:
     """The constants, times their scales, snapped to nearby fractions, if the commutators then hold at least as well.

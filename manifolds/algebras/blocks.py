@@ -15,19 +15,19 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
-from .._arrays import as_numeric, real_components
-from .._module import forwarded
+from .._arrays import numeric_array, real_components
+from .._pytree_module import forward_to
 from .._sizes import check_memory, checked_size
 from ..errors import LieAlgebraError, ParameterError, ShapeError
 from ..matrices.blocks import BlockDiagonal
+from .bracket_algebra import BracketAlgebra
 from .lie_algebra import LieAlgebra
-from .on_demand import OnDemand
 from .polynomial import Polynomial
 
-FEW = 8
+MAX_COPIES_LISTED = 8
 """Copies up to which the Casimirs of each are followed along a motion; of more copies their sum is."""
 
-LONGEST_LIST = 1_000_000
+MAX_LISTED_EXPONENTS = 1_000_000
 """Exponents in the Casimirs of all sites up to which they are listed one by one."""
 
 
@@ -67,7 +67,7 @@ def power(g: LieAlgebra, sites) -> DirectSum:
     return DirectSum(((g, count),), shape)
 
 
-def sum_of(algebras: Sequence[LieAlgebra]) -> DirectSum:
+def merged_direct_sum(algebras: Sequence[LieAlgebra]) -> DirectSum:
     """The direct sum of algebras in a row, equal neighbours taken together."""
     blocks: list[tuple[LieAlgebra, int]] = []
     for g in algebras:
@@ -81,7 +81,7 @@ def sum_of(algebras: Sequence[LieAlgebra]) -> DirectSum:
 
 
 @jax.tree_util.register_static
-class DirectSum(OnDemand):
+class DirectSum(BracketAlgebra):
     """A direct sum by its blocks; see :func:`manifolds.power` and :func:`manifolds.direct_sum`.
 
     Attributes
@@ -123,13 +123,13 @@ class DirectSum(OnDemand):
 
     def ad(self, x) -> jax.Array:
         """Matrix of ``y -> [x, y]``, shape (..., dim, dim), mostly zeros: for small sums alone."""
-        self._check_square("the matrix of ad")
+        self._check_matrix_memory("the matrix of ad")
         ads = [g.ad(part) for (g, _), part in zip(self.blocks, self.split(x), strict=True)]
         return _block_diagonal(ads)
 
     def split(self, x, what: str = "x") -> list[jax.Array]:
         """The parts of an element in each kind of block, shape (..., count, d)."""
-        x, parts, start = self._flat(x, what)[0], [], 0
+        x, parts, start = self._flatten_element(x, what)[0], [], 0
         for g, count in self.blocks:
             stop = start + g.dim * count
             parts.append(x[..., start:stop].reshape(*x.shape[:-1], count, g.dim))
@@ -137,42 +137,44 @@ class DirectSum(OnDemand):
         return parts
 
     def _blockwise(self, kernel: str, *elements) -> jax.Array:
-        shaped = any(self._flat(x, what)[1] for x, what in elements)
+        shaped = any(self._flatten_element(x, what)[1] for x, what in elements)
         columns = zip(*(self.split(x, what) for x, what in elements), strict=True)
         found = [getattr(g, kernel)(*parts) for (g, _), parts in zip(self.blocks, columns, strict=True)]
         rows = [part.reshape(*part.shape[:-2], -1) for part in found]
         joined = rows[0] if len(rows) == 1 else jnp.concatenate(rows, axis=-1)
         return joined.reshape(*joined.shape[:-1], *self.shape) if shaped else joined
 
-    def _flat(self, x, what: str) -> tuple[jax.Array, bool]:
+    def _flatten_element(self, x, what: str) -> tuple[jax.Array, bool]:
         """An element with its components in one axis, and whether it came with axes for the sites."""
-        array = jnp.asarray(as_numeric(x, what))
+        array = jnp.asarray(numeric_array(x, what))
         if self.sites is not None and array.shape[-len(self.shape) :] == self.shape:
             array = array.reshape(*array.shape[: -len(self.shape)], self.dim)
             return real_components(array, self.dim, what), True
         if self.sites is not None and array.shape[-1:] != (self.dim,):
-            raise ShapeError(f"{what} has shape (..., {_axes(self.shape)}) or (..., {self.dim}), not {array.shape}")
+            raise ShapeError(
+                f"{what} has shape (..., {_axes_text(self.shape)}) or (..., {self.dim}), not {array.shape}"
+            )
         return real_components(array, self.dim, what), False
 
     def _element(self, x, what: str) -> jax.Array:
-        return self._flat(x, what)[0]
+        return self._flatten_element(x, what)[0]
 
-    def _copies_bracket(self, x, y) -> jax.Array:
+    def _batched_bracket(self, x, y) -> jax.Array:
         return self.bracket(x, y)
 
-    def _copies_ad_star(self, x, mu) -> jax.Array:
+    def _batched_ad_star(self, x, mu) -> jax.Array:
         return self.ad_star(x, mu)
 
     # -- structure: that of the blocks ------------------------------------------------------------------------------
 
     def killing_form(self) -> np.ndarray:
-        return self._square("the Killing form", lambda g: g.killing_form())
+        return self._block_diagonal_matrix("the Killing form", lambda g: g.killing_form())
 
     def cartan_involution(self) -> np.ndarray:
-        return self._square("the Cartan involution", lambda g: g.cartan_involution())
+        return self._block_diagonal_matrix("the Cartan involution", lambda g: g.cartan_involution())
 
     def killing_inner_product(self) -> BlockDiagonal:
-        forms = tuple(_as_operator(g.killing_inner_product()) for g, _ in self.blocks)
+        forms = tuple(_to_operator(g.killing_inner_product()) for g, _ in self.blocks)
         return BlockDiagonal(forms, tuple(g.dim for g, _ in self.blocks), tuple(count for _, count in self.blocks))
 
     def killing_signature(self) -> tuple[int, int, int]:
@@ -189,10 +191,10 @@ class DirectSum(OnDemand):
         return all(g.is_unimodular() for g, _ in self.blocks)
 
     def derived_series(self) -> list[int]:
-        return _added([(g.derived_series(), count) for g, count in self.blocks])
+        return _sum_series([(g.derived_series(), count) for g, count in self.blocks])
 
     def lower_central_series(self) -> list[int]:
-        return _added([(g.lower_central_series(), count) for g, count in self.blocks])
+        return _sum_series([(g.lower_central_series(), count) for g, count in self.blocks])
 
     # -- Casimirs -----------------------------------------------------------------------------------------------------
 
@@ -208,14 +210,14 @@ class DirectSum(OnDemand):
             If they are too many to be listed: :meth:`site_casimirs` evaluates those of all sites together.
         """
         number = sum(count * len(g.casimirs(degree)) for g, count in self.blocks)
-        if number * self.dim > LONGEST_LIST:
+        if number * self.dim > MAX_LISTED_EXPONENTS:
             raise LieAlgebraError(
                 f"{self.name} has {number} Casimirs of degree {degree}, too many to be listed as functions of all its "
                 f"{self.dim} components; site_casimirs({degree}) evaluates those of all sites together"
             )
         return [
-            _placed(F, start + i * g.dim, g.dim, self.dim)
-            for g, count, start in self._starts()
+            _casimir_of_block(F, start + i * g.dim, g.dim, self.dim)
+            for g, count, start in self._blocks_with_starts()
             for i in range(count)
             for F in g.casimirs(degree)
         ]
@@ -225,24 +227,30 @@ class DirectSum(OnDemand):
 
         Those of copies on sites have values of shape ``(..., *sites)``.
         """
-        return [self._on_copies(F, g, count, start) for g, count, start in self._starts() for F in g.casimirs(degree)]
+        return [
+            self._casimir_at_copies(F, g, count, start)
+            for g, count, start in self._blocks_with_starts()
+            for F in g.casimirs(degree)
+        ]
 
     def leading_casimirs(self) -> list[tuple[str, Callable]]:
         found: list[tuple[str, Callable]] = []
-        for i, (g, count, start) in enumerate(self._starts()):
+        for i, (g, count, start) in enumerate(self._blocks_with_starts()):
             place = "" if len(self.blocks) == 1 else f" in block {i + 1}"
             for name, F in g.leading_casimirs():
-                if count > FEW:
-                    found.append((f"sum of {name}{place}", Total(self._on_copies(F, g, count, start))))
+                if count > MAX_COPIES_LISTED:
+                    found.append((f"sum of {name}{place}", CasimirSum(self._casimir_at_copies(F, g, count, start))))
                     continue
                 for j in range(count):
-                    found.append((f"{name} at {j + 1}{place}", _placed(F, start + j * g.dim, g.dim, self.dim)))
+                    found.append(
+                        (f"{name} at {j + 1}{place}", _casimir_of_block(F, start + j * g.dim, g.dim, self.dim))
+                    )
         return found
 
-    def _on_copies(self, F: Callable, g: LieAlgebra, count: int, start: int) -> SiteCasimirs:
+    def _casimir_at_copies(self, F: Callable, g: LieAlgebra, count: int, start: int) -> SiteCasimirs:
         return SiteCasimirs(F, g.dim, count, start, self.dim, self.sites)
 
-    def _starts(self) -> Iterator[tuple[LieAlgebra, int, int]]:
+    def _blocks_with_starts(self) -> Iterator[tuple[LieAlgebra, int, int]]:
         start = 0
         for g, count in self.blocks:
             yield g, count, start
@@ -250,11 +258,11 @@ class DirectSum(OnDemand):
 
     # -- constants ----------------------------------------------------------------------------------------------------
 
-    def _made_by_constants(self) -> LieAlgebra:
+    def _build_by_constants(self) -> LieAlgebra:
         return direct_sum_by_constants([g for g, count in self.blocks for _ in range(count)])
 
-    def _square(self, what: str, of: Callable[[LieAlgebra], np.ndarray]) -> np.ndarray:
-        self._check_square(what)
+    def _block_diagonal_matrix(self, what: str, of: Callable[[LieAlgebra], np.ndarray]) -> np.ndarray:
+        self._check_matrix_memory(what)
         return scipy.linalg.block_diag(*(block for g, count in self.blocks for block in [of(g)] * count))
 
 
@@ -287,7 +295,7 @@ class SiteCasimirs:
     sites: tuple[int, ...] | None
 
     def __call__(self, mu) -> jax.Array:
-        mu = jnp.asarray(as_numeric(mu, "mu"))
+        mu = jnp.asarray(numeric_array(mu, "mu"))
         shape = (self.count,) if self.sites is None else self.sites
         axes = (*shape, self.size)
         if self.sites is None or mu.shape[-len(axes) :] != axes:
@@ -301,23 +309,25 @@ class SiteCasimirs:
 
 @jax.tree_util.register_static
 @dataclass(frozen=True)
-class Total:
+class CasimirSum:
     """The sum of a Casimir over the copies, shape (..., dim) to (...)."""
 
-    part: SiteCasimirs
+    site_casimirs: SiteCasimirs
 
-    dim = forwarded("part")
+    dim = forward_to("part")
 
     def __call__(self, mu) -> jax.Array:
-        return jnp.sum(self.part(real_components(mu, self.dim, "mu")).reshape(*jnp.shape(mu)[:-1], -1), axis=-1)
+        return jnp.sum(
+            self.site_casimirs(real_components(mu, self.dim, "mu")).reshape(*jnp.shape(mu)[:-1], -1), axis=-1
+        )
 
     def __str__(self) -> str:
-        return f"sum of {self.part.casimir}"
+        return f"sum of {self.site_casimirs.casimir}"
 
 
 @jax.tree_util.register_static
 @dataclass(frozen=True)
-class Placed:
+class BlockCasimir:
     """A Casimir of one block as a function of the whole mu, shape (..., dim) to (...)."""
 
     casimir: Callable
@@ -332,9 +342,9 @@ class Placed:
         return f"{self.casimir} of components {self.start + 1} to {self.start + self.size}"
 
 
-def _placed(F, start: int, size: int, dim: int) -> Polynomial | Placed:
+def _casimir_of_block(F, start: int, size: int, dim: int) -> Polynomial | BlockCasimir:
     if not isinstance(F, Polynomial):
-        return Placed(F, start, size, dim)
+        return BlockCasimir(F, start, size, dim)
     exponents = np.zeros((len(F.terms), dim), dtype=np.int64)
     exponents[:, start : start + size] = F.exponents
     return Polynomial(exponents, F.coefficients)
@@ -369,7 +379,7 @@ def joined_names(*algebras: LieAlgebra) -> tuple[str, ...] | None:
     return tuple(names) if len(set(names)) == sum(g.dim for g in algebras) else None
 
 
-def _added(series: list[tuple[list[int], int]]) -> list[int]:
+def _sum_series(series: list[tuple[list[int], int]]) -> list[int]:
     """Dimensions added up, each series so many times, and going on where it has ended."""
     longest = max(len(dims) for dims, _ in series)
     return [sum(count * dims[min(i, len(dims) - 1)] for dims, count in series) for i in range(longest)]
@@ -387,11 +397,11 @@ def _block_diagonal(parts: list[jax.Array]) -> jax.Array:
     return found
 
 
-def _as_operator(form):
+def _to_operator(form):
     return jnp.asarray(form) if isinstance(form, np.ndarray) else form
 
 
-def _axes(shape: tuple[int, ...]) -> str:
+def _axes_text(shape: tuple[int, ...]) -> str:
     return ", ".join(map(str, shape))
 
 

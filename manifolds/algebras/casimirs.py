@@ -18,9 +18,9 @@ from ..errors import ParameterError, warn
 from .invariants import TracePolynomial, fundamental_invariants
 from .polynomial import Polynomial
 from .polynomial_casimirs import TooLargeError, casimir_count, new_casimirs
-from .structure import Structure
+from .structure import AlgebraStructure
 
-LEADING_MONOMIALS = 400
+MAX_LEADING_MONOMIALS = 400
 """Casimirs are looked for up to the degree whose monomials number at most this many (a second's work)."""
 
 
@@ -28,7 +28,7 @@ class NoPolynomialCasimirWarning(UserWarning):
     """The algebra has Casimirs, but none found is a polynomial."""
 
 
-def casimirs(g: Structure, degree: int) -> list[Polynomial | TracePolynomial]:
+def casimirs(g: AlgebraStructure, degree: int) -> list[Polynomial | TracePolynomial]:
     """All homogeneous polynomial Casimirs of this degree, modulo the span of products of those of lower degree.
 
     The lists of degrees 1, 2, … together generate the ring of polynomial Casimirs. Each is a reduced row echelon
@@ -86,12 +86,12 @@ def casimirs(g: Structure, degree: int) -> list[Polynomial | TracePolynomial]:
     return found
 
 
-def leading_casimirs(g: Structure) -> list[tuple[str, Callable]]:
+def leading_casimirs(g: AlgebraStructure) -> list[tuple[str, Callable]]:
     """The polynomial Casimirs of low degree with names, as many as there are; see the method of the algebra."""
     found: list[tuple[str, Callable]] = []
     count = g.casimir_count()
     for degree in range(1, g.dim + 1):
-        if len(found) >= count or math.comb(g.dim + degree - 1, degree) > LEADING_MONOMIALS:
+        if len(found) >= count or math.comb(g.dim + degree - 1, degree) > MAX_LEADING_MONOMIALS:
             break
         with warnings.catch_warnings():  # an algebra without polynomial Casimirs has simply none to follow
             warnings.simplefilter("ignore", NoPolynomialCasimirWarning)

@@ -20,16 +20,16 @@ from ..errors import ParameterError
 from . import matrix_bases
 from ._null_space import rational_null_space
 from .lie_algebra import LieAlgebra
-from .matrix_algebra import Classical, MatrixAlgebra
+from .matrix_algebra import ClassicalData, MatrixAlgebra
 from .matrix_bases import MatrixBasis
 from .sums import direct_sum, semidirect_sum
 
 _registry: list[tuple[Callable[..., LieAlgebra], tuple, dict]] = []
 
-LARGEST_BY_CONSTANTS = 120
+MAX_DIM_BY_CONSTANTS = 120
 """Dimension up to which the classical algebras are arrays of structure constants: su(11), so(16), sp(7)."""
 
-WORKING_MATRICES = 20
+MIN_WORKING_MATRICES = 20
 """Matrices of doubles that a step of a method works with, at the least."""
 
 BIANCHI_KINDS = ("I", "II", "III", "IV", "V", "VI", "VII", "VIII", "IX")
@@ -58,7 +58,7 @@ def abelian(n: int) -> LieAlgebra:
     n = checked_size(n, 1, "abelian(n)")
     basis = np.zeros((n, n + 1, n + 1))
     basis[np.arange(n), np.arange(n), n] = 1.0
-    return _named(basis, f"abelian({n})")
+    return _algebra_from_basis(basis, f"abelian({n})")
 
 
 @register((2,), (3,), (4,), (5,), (2, 1), (3, 1))
@@ -87,11 +87,20 @@ def so(p: int, q: int = 0, *, by_matrices: bool | None = None) -> LieAlgebra:
     n = checked_size(p + q, 2, "so(p, q)", "p + q")
     if (p, q) == (3, 0):
         i, j, k = np.eye(3)
-        return _named([_e(k, j) - _e(j, k), _e(i, k) - _e(k, i), _e(j, i) - _e(i, j)], "so(3)")
+        return _algebra_from_basis(
+            [
+                _outer_product(k, j) - _outer_product(j, k),
+                _outer_product(i, k) - _outer_product(k, i),
+                _outer_product(j, i) - _outer_product(i, j),
+            ],
+            "so(3)",
+        )
     even = tuple(range(2, n, 2))
     pfaffian = n // 2 if n % 2 == 0 else None
-    known = Classical(n // 2, (p * q, n * (n - 1) // 2 - p * q, 0), (n - 2.0, 0.0), q == 0, even, pfaffian)
-    return _classical(f"so({p},{q})" if q else f"so({n})", n, known, by_matrices, lambda: matrix_bases.orthogonal(p, q))
+    known = ClassicalData(n // 2, (p * q, n * (n - 1) // 2 - p * q, 0), (n - 2.0, 0.0), q == 0, even, pfaffian)
+    return _classical_algebra(
+        f"so({p},{q})" if q else f"so({n})", n, known, by_matrices, lambda: matrix_bases.orthogonal_basis(p, q)
+    )
 
 
 @register((2,), (3,), (4,))
@@ -101,16 +110,16 @@ def su(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
     su(2) has the structure constants of so(3); su(3) the usual f_abc.
     """
     n = checked_size(n, 2, "su(n)")
-    known = Classical(n - 1, (0, n * n - 1, 0), (2.0 * n, 0.0), True, tuple(range(2, n + 1)))
-    return _classical(f"su({n})", n, known, by_matrices, lambda: matrix_bases.unitary(n, centre=False))
+    known = ClassicalData(n - 1, (0, n * n - 1, 0), (2.0 * n, 0.0), True, tuple(range(2, n + 1)))
+    return _classical_algebra(f"su({n})", n, known, by_matrices, lambda: matrix_bases.unitary_basis(n, centre=False))
 
 
 @register((2,))
 def u(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
     """Anti-Hermitian matrices: the basis of su(n), then the centre ``-i/2 sqrt(2/n) 1``."""
     n = checked_size(n, 1, "u(n)")
-    known = Classical(n, (0, n * n - 1, 1), (2.0 * n, 2.0), True, tuple(range(1, n + 1)))
-    return _classical(f"u({n})", n, known, by_matrices, lambda: matrix_bases.unitary(n, centre=True))
+    known = ClassicalData(n, (0, n * n - 1, 1), (2.0 * n, 2.0), True, tuple(range(1, n + 1)))
+    return _classical_algebra(f"u({n})", n, known, by_matrices, lambda: matrix_bases.unitary_basis(n, centre=True))
 
 
 @register((2,), (3,))
@@ -121,16 +130,16 @@ def sl(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
     """
     n = checked_size(n, 2, "sl(n)")
     rotations = n * (n - 1) // 2
-    known = Classical(n - 1, (n * n - 1 - rotations, rotations, 0), (2.0 * n, 0.0), False, tuple(range(2, n + 1)))
-    return _classical(f"sl({n})", n, known, by_matrices, lambda: matrix_bases.special_linear(n))
+    known = ClassicalData(n - 1, (n * n - 1 - rotations, rotations, 0), (2.0 * n, 0.0), False, tuple(range(2, n + 1)))
+    return _classical_algebra(f"sl({n})", n, known, by_matrices, lambda: matrix_bases.special_linear_basis(n))
 
 
 @register((1,), (2,))
 def sp(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
     """sp(2n, R): the matrices ``[[A, B], [C, -A^T]]`` with B and C symmetric; A row by row, then B, then C."""
     n = checked_size(n, 1, "sp(n)")
-    known = Classical(n, (n * (n + 1), n * n, 0), (2.0 * n + 2.0, 0.0), False, tuple(range(2, 2 * n + 1, 2)))
-    return _classical(f"sp({n})", 2 * n, known, by_matrices, lambda: matrix_bases.symplectic(n))
+    known = ClassicalData(n, (n * (n + 1), n * n, 0), (2.0 * n + 2.0, 0.0), False, tuple(range(2, 2 * n + 1, 2)))
+    return _classical_algebra(f"sp({n})", 2 * n, known, by_matrices, lambda: matrix_bases.symplectic_basis(n))
 
 
 @register(())
@@ -148,7 +157,7 @@ def g2() -> LieAlgebra:
     moved = np.einsum("api,ijk->apjk", rotations, form)
     moved = moved + moved.transpose(0, 2, 3, 1) + moved.transpose(0, 3, 1, 2)
     kept = np.array(rational_null_space(moved.reshape(len(rotations), -1).T))
-    return _named(np.einsum("na,aij->nij", kept, rotations), "g2")
+    return _algebra_from_basis(np.einsum("na,aij->nij", kept, rotations), "g2")
 
 
 _OCTONIONS = (
@@ -167,8 +176,8 @@ def gl(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
     """All real matrices, basis E_ij row by row."""
     n = checked_size(n, 1, "gl(n)")
     rotations = n * (n - 1) // 2
-    known = Classical(n, (n * n - 1 - rotations, rotations, 1), (2.0 * n, 2.0), False, tuple(range(1, n + 1)))
-    return _classical(f"gl({n})", n, known, by_matrices, lambda: matrix_bases.general_linear(n))
+    known = ClassicalData(n, (n * n - 1 - rotations, rotations, 1), (2.0 * n, 2.0), False, tuple(range(1, n + 1)))
+    return _classical_algebra(f"gl({n})", n, known, by_matrices, lambda: matrix_bases.general_linear_basis(n))
 
 
 @register((2,), (3,))
@@ -183,9 +192,9 @@ def se(n: int) -> LieAlgebra:
 def heisenberg(n: int = 1) -> LieAlgebra:
     """Heisenberg algebra (q_1 … q_n, p_1 … p_n, z) with ``[q_i, p_i] = z``, upper triangular matrices."""
     n = checked_size(n, 1, "heisenberg(n)")
-    q = [_unit(n + 2, 0, i + 1) for i in range(n)]
-    p = [_unit(n + 2, i + 1, n + 1) for i in range(n)]
-    return _named([*q, *p, _unit(n + 2, 0, n + 1)], f"heisenberg({n})")
+    q = [_matrix_unit(n + 2, 0, i + 1) for i in range(n)]
+    p = [_matrix_unit(n + 2, i + 1, n + 1) for i in range(n)]
+    return _algebra_from_basis([*q, *p, _matrix_unit(n + 2, 0, n + 1)], f"heisenberg({n})")
 
 
 @register((2,), (3,))
@@ -194,9 +203,9 @@ def galilei(n: int) -> LieAlgebra:
     n = checked_size(n, 2, "galilei(n)")
     rotations = np.zeros((n * (n - 1) // 2, n + 2, n + 2))
     rotations[:, :n, :n] = so(n).basis
-    boosts = [_unit(n + 2, i, n) for i in range(n)]
-    translations = [_unit(n + 2, i, n + 1) for i in range(n)]
-    return _named([*rotations, *boosts, *translations, _unit(n + 2, n, n + 1)], f"galilei({n})")
+    boosts = [_matrix_unit(n + 2, i, n) for i in range(n)]
+    translations = [_matrix_unit(n + 2, i, n + 1) for i in range(n)]
+    return _algebra_from_basis([*rotations, *boosts, *translations, _matrix_unit(n + 2, n, n + 1)], f"galilei({n})")
 
 
 @register((1,), (2,))
@@ -261,7 +270,7 @@ def bianchi(kind: str, h: float | None = None) -> LieAlgebra:
     if kind in ("VIII", "IX"):  # no centre, so the adjoint matrices are faithful
         return LieAlgebra(constants, name=name, basis=constants.swapaxes(1, 2))
     if kind == "II":  # [e2, e3] = e1
-        basis = np.array([_unit(3, 0, 2), _unit(3, 0, 1), _unit(3, 1, 2)])
+        basis = np.array([_matrix_unit(3, 0, 2), _matrix_unit(3, 0, 1), _matrix_unit(3, 1, 2)])
         return LieAlgebra(constants, name=name, basis=basis)
     if kind == "I":
         return LieAlgebra(constants, name=name, basis=abelian(3).basis)
@@ -278,25 +287,25 @@ _registry.append((lambda: direct_sum(so(3), heisenberg(1)), (), {}))
 _registry.append((lambda: semidirect_sum(sl(2), sl(2).basis, name="sl(2) x R^2"), (), {}))
 
 
-def _e(row: np.ndarray, column: np.ndarray) -> np.ndarray:
+def _outer_product(row: np.ndarray, column: np.ndarray) -> np.ndarray:
     return np.outer(row, column)
 
 
-def _unit(n: int, i: int, j: int) -> np.ndarray:
+def _matrix_unit(n: int, i: int, j: int) -> np.ndarray:
     matrix = np.zeros((n, n))
     matrix[i, j] = 1.0
     return matrix
 
 
-def _classical(
-    name: str, size: int, known: Classical, by_matrices: bool | None, tables: Callable[[], MatrixBasis]
+def _classical_algebra(
+    name: str, size: int, known: ClassicalData, by_matrices: bool | None, tables: Callable[[], MatrixBasis]
 ) -> LieAlgebra:
     """By constants up to LARGEST_BY_CONSTANTS, by products of matrices beyond, or as asked; the basis is the same."""
-    check_memory(WORKING_MATRICES * float(size) ** 2, f"one step with matrices of {name}", "take smaller ones")
-    if not (sum(known.signature) > LARGEST_BY_CONSTANTS if by_matrices is None else by_matrices):
-        return _named(tables().matrices(), name)
+    check_memory(MIN_WORKING_MATRICES * float(size) ** 2, f"one step with matrices of {name}", "take smaller ones")
+    if not (sum(known.signature) > MAX_DIM_BY_CONSTANTS if by_matrices is None else by_matrices):
+        return _algebra_from_basis(tables().basis_matrices(), name)
     return MatrixAlgebra(name, tables(), known)
 
 
-def _named(basis, name: str) -> LieAlgebra:
+def _algebra_from_basis(basis, name: str) -> LieAlgebra:
     return LieAlgebra.from_matrices(np.array(basis), name=name)

@@ -8,7 +8,7 @@ import numpy as np
 
 from .._tables import html_grid
 
-MOST_DIM, MOST_BRACKETS = 12, 12
+MAX_LISTED_DIM, MAX_LISTED_BRACKETS = 12, 12
 """More brackets than these are not listed."""
 
 
@@ -18,13 +18,15 @@ def algebra_html(
     """Name, dimension and, of a small algebra, the brackets of its basis elements that do not vanish."""
     names = basis_names or tuple(f"e{a + 1}" for a in range(dim))
     rows = [("dimension", str(dim))]
-    if dim <= MOST_DIM:
+    if dim <= MAX_LISTED_DIM:
         a, b = np.triu_indices(dim, 1)
         brackets = structure_constants()[a, b]
         found = np.flatnonzero(brackets.any(axis=-1))
-        rows += [(f"[{names[a[i]]}, {names[b[i]]}]", _combination(brackets[i], names)) for i in found[:MOST_BRACKETS]]
-        if len(found) > MOST_BRACKETS:
-            rows.append((f"and {len(found) - MOST_BRACKETS} more", ""))
+        rows += [
+            (f"[{names[a[i]]}, {names[b[i]]}]", _combination(brackets[i], names)) for i in found[:MAX_LISTED_BRACKETS]
+        ]
+        if len(found) > MAX_LISTED_BRACKETS:
+            rows.append((f"and {len(found) - MAX_LISTED_BRACKETS} more", ""))
     return html_grid((f"Lie algebra {name}", ""), rows)
 
 

@@ -30,18 +30,18 @@ from ..errors import LieAlgebraError, ShapeError
 from ._null_space import numerical_null_space
 from .polynomial import Polynomial
 from .polynomial_casimirs import casimir_count, new_casimirs
-from .structure import Structure
+from .structure import AlgebraStructure
 
-LARGEST_COMMUTANT = 40
+MAX_COMMUTANT_SIZE = 40
 """Matrices up to this size are searched for others that commute with them."""
 
-LARGEST_PFAFFIAN = 20000
+MAX_PFAFFIAN_PRODUCTS = 20000
 """Most products in a Pfaffian that is written out."""
 
-LARGEST_EXPANSION = 200_000
+MAX_EXPANSION_MONOMIALS = 200_000
 """Most monomials in a trace that is written out."""
 
-INDEPENDENT = 1e-6
+MIN_INDEPENDENCE_SINE = 1e-6
 """Sine of the angle from the span of other gradients above which a gradient is independent of them."""
 
 
@@ -104,7 +104,7 @@ class TracePolynomial:
     def __call__(self, mu) -> jax.Array:
         """The value at ``mu``, shape (..., dim) -> (...)."""
         X = jnp.einsum("...a,aij->...ij", real_components(mu, self.dim, "mu"), self.matrices)
-        half = _power(X, self.degree // 2)
+        half = _matrix_power(X, self.degree // 2)
         other = half @ X if self.degree % 2 else half
         return jnp.einsum("...ij,...ji->...", self.weight @ half, other)
 
@@ -117,9 +117,9 @@ class TracePolynomial:
             If there are more than 200,000 monomials of this degree.
         """
         size = math.comb(self.dim + self.degree - 1, self.degree)
-        if size > LARGEST_EXPANSION:
+        if size > MAX_EXPANSION_MONOMIALS:
             raise LieAlgebraError(
-                f"{self} has up to {size} monomials, more than the {LARGEST_EXPANSION} that are written out"
+                f"{self} has up to {size} monomials, more than the {MAX_EXPANSION_MONOMIALS} that are written out"
             )
         coefficients, m = self.weight[None], self.weight.shape[0]
         factors = np.zeros((1, 0), dtype=np.int64)
@@ -161,7 +161,7 @@ class TracePolynomial:
         return f"<TracePolynomial {self.label}, X of shape {self.matrices.shape[1:]}>"
 
 
-def _power(X, exponent: int):
+def _matrix_power(X, exponent: int):
     """``X**exponent``, exponent >= 0, by squaring."""
     result = None
     while exponent:
@@ -177,10 +177,10 @@ def _power(X, exponent: int):
 
 
 @lru_cache(maxsize=64)
-def fundamental_invariants(g: Structure) -> tuple[TracePolynomial | Polynomial, ...] | None:
+def fundamental_invariants(g: AlgebraStructure) -> tuple[TracePolynomial | Polynomial, ...] | None:
     """Casimirs that generate all polynomial ones, in the order of their degrees; None where no such set is found."""
-    sources: list[_Source] = []
-    for source in _sources(g):
+    sources: list[_EquivariantSource] = []
+    for source in _equivariant_sources(g):
         sources.append(source)
         found = _independent_invariants(g, sources)
         if found is not None:
@@ -188,7 +188,9 @@ def fundamental_invariants(g: Structure) -> tuple[TracePolynomial | Polynomial, 
     return None
 
 
-def _independent_invariants(g: Structure, sources: list[_Source]) -> tuple[TracePolynomial | Polynomial, ...] | None:
+def _independent_invariants(
+    g: AlgebraStructure, sources: list[_EquivariantSource]
+) -> tuple[TracePolynomial | Polynomial, ...] | None:
     count = casimir_count(g)
     total = (g.dim + count) // 2
     points = np.random.default_rng(0).standard_normal((3, g.dim))
@@ -199,7 +201,7 @@ def _independent_invariants(g: Structure, sources: list[_Source]) -> tuple[Trace
             gradients = [_gradient_at(F, mu) for mu in points]
             if not all(_is_invariant(g, row, mu) for row, mu in zip(gradients, points, strict=True)):
                 return None  # an algebra whose constants are too inaccurate
-            wider = [_wider(span, row) for span, row in zip(spans, gradients, strict=True)]
+            wider = [_extend_span(span, row) for span, row in zip(spans, gradients, strict=True)]
             if all(len(new) > len(old) for new, old in zip(wider, spans, strict=True)):
                 spans = wider
                 found.append(F)
@@ -213,21 +215,21 @@ def _gradient_at(F: TracePolynomial | Polynomial, mu: np.ndarray) -> np.ndarray:
     return F._gradient(mu) if isinstance(F, TracePolynomial) else np.asarray(jax.grad(F)(mu))
 
 
-def _is_invariant(g: Structure, gradient: np.ndarray, mu: np.ndarray) -> bool:
+def _is_invariant(g: AlgebraStructure, gradient: np.ndarray, mu: np.ndarray) -> bool:
     motion = np.einsum("abc,a,c->b", g.structure_constants, gradient, mu)
     size = np.abs(g.structure_constants).max() * np.linalg.norm(gradient) * np.linalg.norm(mu)
     return bool(np.linalg.norm(motion) <= 1e-10 * size)
 
 
-def _wider(span: np.ndarray, row: np.ndarray) -> np.ndarray:
+def _extend_span(span: np.ndarray, row: np.ndarray) -> np.ndarray:
     """The orthonormal rows, and the direction of the part of ``row`` orthogonal to them if it is a part that counts."""
     rest = row - span.T @ (span @ row)
     rest -= span.T @ (span @ rest)
     size = np.linalg.norm(rest)
-    return np.vstack([span, rest / size]) if size > INDEPENDENT * np.linalg.norm(row) else span
+    return np.vstack([span, rest / size]) if size > MIN_INDEPENDENCE_SINE * np.linalg.norm(row) else span
 
 
-class _Source(NamedTuple):
+class _EquivariantSource(NamedTuple):
     """Equivariant matrices X_a, those that commute with all of them, and the Pfaffian or None."""
 
     name: str
@@ -243,24 +245,24 @@ class _Source(NamedTuple):
             yield self.pfaffian
 
 
-def _sources(g: Structure) -> Iterator[_Source]:
+def _equivariant_sources(g: AlgebraStructure) -> Iterator[_EquivariantSource]:
     """The cheap ones first: the matrices of the algebra, the adjoint ones, the second derivatives of cubic Casimirs."""
     if g.basis is not None:
         basis = _real_matrices(g.basis)
-        X = _dual(basis)
+        X = _dual_matrices(basis)
         if X is not None:
-            yield _Source("X", X, _commutant(X, g.name), _pfaffian(basis, X, g.name))
+            yield _EquivariantSource("X", X, _commutant(X, g.name), _pfaffian(basis, X, g.name))
     if not g.is_semisimple():
         return
     ad = g.structure_constants.swapaxes(1, 2)
     X = np.einsum("ab,bij->aij", np.linalg.inv(g.killing_form()), ad)
-    yield _Source("ad(X)", X, _commutant(X, g.name))
-    for i, cubic in enumerate(_cubics(g)):
+    yield _EquivariantSource("ad(X)", X, _commutant(X, g.name))
+    for i, cubic in enumerate(_cubic_casimirs(g)):
         D = _third_derivatives(cubic) @ g.killing_form()  # from g to g* to g
-        yield _Source(f"D{i + 1}", D, [np.eye(g.dim)])
+        yield _EquivariantSource(f"D{i + 1}", D, [np.eye(g.dim)])
 
 
-def _cubics(g: Structure) -> list[Polynomial]:
+def _cubic_casimirs(g: AlgebraStructure) -> list[Polynomial]:
     try:
         return list(new_casimirs(g, 3))
     except LieAlgebraError:  # too many monomials, or no clear rank
@@ -283,7 +285,7 @@ def _real_matrices(basis: np.ndarray) -> np.ndarray:
     return np.block([[basis.real, -basis.imag], [basis.imag, basis.real]])
 
 
-def _dual(basis: np.ndarray) -> np.ndarray | None:
+def _dual_matrices(basis: np.ndarray) -> np.ndarray | None:
     """The matrices X_a of ``X(mu)``, dual by the form ``tr(xy)``; None where that is degenerate.
 
     Only a reductive algebra has a nondegenerate one.
@@ -299,7 +301,7 @@ def _commutant(X: np.ndarray, name: str) -> list[np.ndarray]:
     """A basis of the matrices that commute with all of X, the identity first."""
     m = X.shape[1]
     identity = np.eye(m)
-    if m > LARGEST_COMMUTANT:
+    if m > MAX_COMMUTANT_SIZE:
         return [identity]
     random = np.random.default_rng(1).standard_normal((2, len(X)))  # two elements generate a semisimple algebra
     generic = np.einsum("ra,aij->rij", random / np.abs(X).max(), X)
@@ -311,7 +313,7 @@ def _commutant(X: np.ndarray, name: str) -> list[np.ndarray]:
 def _pfaffian(basis: np.ndarray, X: np.ndarray, name: str) -> Polynomial | None:
     """The Pfaffian of ``J X(mu)``, where the matrices keep one form J alone, up to a factor, and J is symmetric."""
     m = X.shape[1]
-    if m % 2 or m > LARGEST_COMMUTANT:
+    if m % 2 or m > MAX_COMMUTANT_SIZE:
         return None
     random = np.random.default_rng(2).standard_normal((2, len(basis)))
     generic = np.einsum("ra,aij->rij", random / np.abs(basis).max(), basis)
@@ -326,22 +328,22 @@ def _pfaffian(basis: np.ndarray, X: np.ndarray, name: str) -> Polynomial | None:
     nearest = np.rint(skew)
     skew = nearest if np.abs(skew - nearest).max() < 1e-12 else skew
     terms = max(int((skew[i, :, j] != 0).sum()) for i in range(m) for j in range(i))
-    if terms ** (m // 2) * math.prod(range(m - 1, 0, -2)) > LARGEST_PFAFFIAN:
+    if terms ** (m // 2) * math.prod(range(m - 1, 0, -2)) > MAX_PFAFFIAN_PRODUCTS:
         return None
     number, units = int if skew is nearest else float, np.eye(len(X), dtype=np.int64)
     entries = {(i, j): Polynomial(units, [number(c) for c in skew[i, :, j]]) for i in range(m) for j in range(i + 1, m)}
-    pfaffian = _expanded_pfaffian(entries, tuple(range(m)))
+    pfaffian = _expand_pfaffian(entries, tuple(range(m)))
     return -pfaffian if pfaffian.coefficients[0] < 0 else pfaffian
 
 
-def _expanded_pfaffian(entries: dict, rows: tuple[int, ...]) -> Polynomial:
+def _expand_pfaffian(entries: dict, rows: tuple[int, ...]) -> Polynomial:
     """By its first row; ``entries`` are those above the diagonal."""
     first, *others = rows
     if len(rows) == 2:
         return entries[first, others[0]]
     total = None
     for k, j in enumerate(others):
-        minor = _expanded_pfaffian(entries, tuple(r for r in others if r != j))
+        minor = _expand_pfaffian(entries, tuple(r for r in others if r != j))
         term = entries[first, j] * minor * (-1) ** k
         total = term if total is None else total + term
     assert total is not None

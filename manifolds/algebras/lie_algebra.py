@@ -19,10 +19,10 @@ import numpy as np
 from .._arrays import is_traced, real_components, square_matrices
 from .._names import checked_names
 from ..errors import LieAlgebraError
-from ._balance import STRUCTURE_TOLERANCE, balanced
-from ._exact import RationalArray, rational_array
-from .actions import Action, ByMatrix, Operator, written_out, written_terms
-from .axioms import check_axioms, checked_constants, constants_of_matrices, real_columns
+from ._basis_scaling import STRUCTURE_TOLERANCE, balance_constants
+from ._rational import RationalArray, rational_array
+from .actions import Action, AdMatrixAction, Operator, nonzero_terms, unrolled_bracket
+from .axioms import check_axioms, checked_constants, constants_from_matrices, real_columns
 from .casimirs import casimirs, leading_casimirs
 from .display import algebra_html
 from .killing import cartan_involution_of, killing_form_of, row_space
@@ -76,10 +76,10 @@ class LieAlgebra:
         exact = rational_array(constants)
         machine_size = exact is not None and exact.numerator.dtype != object
         self._rational: RationalArray | None = exact if machine_size else None
-        self._constants = _frozen(np.asarray(constants if exact is None else exact, dtype=np.float64))
+        self._constants = _read_only_copy(np.asarray(constants if exact is None else exact, dtype=np.float64))
         self.dim: int = self._constants.shape[0]
         self.name = name
-        self._basis: np.ndarray | None = None if basis is None else _frozen(np.asarray(basis))
+        self._basis: np.ndarray | None = None if basis is None else _read_only_copy(np.asarray(basis))
         self.basis_names = None if basis_names is None else checked_names(basis_names, self.dim)
         check_axioms(self._constants if exact is None else exact.numerator, name, exact)
 
@@ -137,7 +137,7 @@ class LieAlgebra:
         ClosureError
             If the matrices are linearly dependent over the reals or a commutator leaves their span.
         """
-        constants, given = constants_of_matrices(basis)
+        constants, given = constants_from_matrices(basis)
         return cls(constants, name=name, basis=given, basis_names=basis_names)
 
     def with_basis_names(self, *names: str) -> LieAlgebra:
@@ -200,7 +200,7 @@ class LieAlgebra:
 
     def action(self, x) -> Action:
         """``y -> [x, y]`` and ``mu -> ad*_x mu`` for one x, shape (dim,)."""
-        return ByMatrix(self.ad(x))
+        return AdMatrixAction(self.ad(x))
 
     def killing_form(self) -> np.ndarray:
         """Killing form ``kappa[a, b] = tr(ad_a ad_b)``, shape (dim, dim)."""
@@ -208,13 +208,13 @@ class LieAlgebra:
 
     def killing_signature(self) -> tuple[int, int, int]:
         """Numbers of positive, negative and zero eigenvalues of the Killing form, the same in every basis."""
-        eigenvalues = np.linalg.eigvalsh(killing_form_of(self._balanced[0]))
+        eigenvalues = np.linalg.eigvalsh(killing_form_of(self._balanced_constants[0]))
         positive, negative = (int((sign * eigenvalues > STRUCTURE_TOLERANCE).sum()) for sign in (1, -1))
         return positive, negative, self.dim - positive - negative
 
     def hat(self, x) -> jax.Array:
         """The matrix ``sum_a x_a e_a``, shape (..., m, m)."""
-        return jnp.einsum("...a,aij->...ij", self._element(x, "x"), self._known_basis())
+        return jnp.einsum("...a,aij->...ij", self._element(x, "x"), self._require_basis())
 
     def vee(self, X) -> jax.Array:
         """Components of a matrix of the algebra, shape (..., dim): the inverse of :meth:`hat`.
@@ -224,7 +224,7 @@ class LieAlgebra:
         LieAlgebraError
             If ``X`` is not in the span of the basis (residual above 1e-8 relative; not checked under tracing).
         """
-        basis = self._known_basis()
+        basis = self._require_basis()
         matrix = square_matrices(X, basis.shape[-1], "X")
         flat = matrix.reshape(*matrix.shape[:-2], -1)
         flat = jnp.concatenate([flat.real, flat.imag], axis=-1)
@@ -265,16 +265,16 @@ class LieAlgebra:
 
     def is_unimodular(self) -> bool:
         """Whether ``tr ad_x = 0`` for every x."""
-        traces = np.einsum("abb->a", self._balanced[0])
+        traces = np.einsum("abb->a", self._balanced_constants[0])
         return bool(np.abs(traces).max() <= STRUCTURE_TOLERANCE)
 
     def derived_series(self) -> list[int]:
         """Dimensions of g, [g, g], [[g, g], [g, g]], … until they no longer fall."""
-        return self._series(lambda ideal: (ideal, ideal))
+        return self._ideal_series(lambda ideal: (ideal, ideal))
 
     def lower_central_series(self) -> list[int]:
         """Dimensions of g, [g, g], [g, [g, g]], … until they no longer fall."""
-        return self._series(lambda ideal: (np.eye(self.dim), ideal))
+        return self._ideal_series(lambda ideal: (np.eye(self.dim), ideal))
 
     def cartan_involution(self) -> np.ndarray:
         """A Cartan involution theta, shape (dim, dim), for which ``-kappa(x, theta y)`` is positive definite.
@@ -309,19 +309,21 @@ class LieAlgebra:
     _power: ClassVar[Callable[..., LieAlgebra]]
     """Copies are algebras of a class that is defined after this one, and that enters here."""
 
-    def _copies_bracket(self, x, y) -> jax.Array:
+    def _batched_bracket(self, x, y) -> jax.Array:
         """The bracket for large batches, shape (..., dim)."""
-        return self.bracket(x, y) if self._terms is None else written_out(self._terms, x, y, self.dim)
+        return (
+            self.bracket(x, y) if self._nonzero_terms is None else unrolled_bracket(self._nonzero_terms, x, y, self.dim)
+        )
 
-    def _copies_ad_star(self, x, mu) -> jax.Array:
+    def _batched_ad_star(self, x, mu) -> jax.Array:
         """The coadjoint operator for large batches, shape (..., dim)."""
-        if self._terms is None:
+        if self._nonzero_terms is None:
             return self.ad_star(x, mu)
-        return written_out(tuple((a, c, b, value) for a, b, c, value in self._terms), x, mu, self.dim)
+        return unrolled_bracket(tuple((a, c, b, value) for a, b, c, value in self._nonzero_terms), x, mu, self.dim)
 
     @cached_property
-    def _terms(self) -> tuple[tuple[int, int, int, float], ...] | None:
-        return written_terms(self._constants)
+    def _nonzero_terms(self) -> tuple[tuple[int, int, int, float], ...] | None:
+        return nonzero_terms(self._constants)
 
     # -- Casimirs -----------------------------------------------------------------------------------------------
 
@@ -373,7 +375,7 @@ class LieAlgebra:
     def _element(self, x, what: str) -> jax.Array:
         return real_components(x, self.dim, what)
 
-    def _known_basis(self) -> np.ndarray:
+    def _require_basis(self) -> np.ndarray:
         if self.basis is None:
             raise LieAlgebraError(
                 f"{self.name} was defined by structure constants, so its matrices are not known; build it with "
@@ -383,33 +385,33 @@ class LieAlgebra:
 
     @cached_property
     def _left_inverse(self) -> np.ndarray:
-        return np.linalg.pinv(real_columns(self._known_basis()))
+        return np.linalg.pinv(real_columns(self._require_basis()))
 
     @cached_property
     def _killing_form(self) -> np.ndarray:
-        return _frozen(killing_form_of(self.structure_constants))
+        return _read_only_copy(killing_form_of(self.structure_constants))
 
     @cached_property
-    def _balanced(self) -> tuple[np.ndarray, np.ndarray]:
+    def _balanced_constants(self) -> tuple[np.ndarray, np.ndarray]:
         """The constants in a basis scaled by factors, the largest of size 1, and the factors."""
-        return balanced(self.structure_constants)
+        return balance_constants(self.structure_constants)
 
     @cached_property
     def _cartan_involution(self) -> np.ndarray:
         if not self.is_semisimple():
             raise LieAlgebraError(f"{self.name} is not semisimple, so it has no Cartan involution")
         if self.is_compact_type():
-            return _frozen(np.eye(self.dim))
-        constants, factors = self._balanced
+            return _read_only_copy(np.eye(self.dim))
+        constants, factors = self._balanced_constants
         theta = cartan_involution_of(constants, self.name) * factors[:, None] / factors
         snapped = np.asarray(np.round(theta))
-        return _frozen(snapped if np.abs(snapped - theta).max() < 1e-10 else theta)
+        return _read_only_copy(snapped if np.abs(snapped - theta).max() < 1e-10 else theta)
 
-    def _series(self, factors: Callable) -> list[int]:
+    def _ideal_series(self, factors: Callable) -> list[int]:
         ideal, dims = np.eye(self.dim), [self.dim]
         while True:
             left, right = factors(ideal)
-            products = np.einsum("ia,jb,abc->ijc", left, right, self._balanced[0], optimize=True)
+            products = np.einsum("ia,jb,abc->ijc", left, right, self._balanced_constants[0], optimize=True)
             ideal = row_space(products.reshape(-1, self.dim))
             if len(ideal) == dims[-1]:
                 return dims
@@ -418,7 +420,7 @@ class LieAlgebra:
                 return dims
 
 
-def _frozen(array: np.ndarray) -> np.ndarray:
+def _read_only_copy(array: np.ndarray) -> np.ndarray:
     array = np.array(array)
     array.setflags(write=False)
     return array

@@ -14,12 +14,12 @@ from .._arrays import real_components
 from ..errors import ParameterError
 from ..matrices.blocks import BlockDiagonal, Diagonal
 from .blocks import DirectSum
+from .bracket_algebra import BracketAlgebra
 from .lie_algebra import LieAlgebra
 from .matrix_algebra import MatrixAlgebra
-from .on_demand import OnDemand
-from .sums import LARGEST_BY_CONSTANTS, semidirect_sum
+from .sums import MAX_DIM_BY_CONSTANTS, semidirect_sum
 
-FOLLOWED = 2
+MAX_FOLLOWED_CASIMIRS = 2
 """Casimirs of g that are followed along a motion of its extension, where each makes two."""
 
 
@@ -51,12 +51,12 @@ def magnetic_extension(g: LieAlgebra, by_brackets: bool | None = None) -> LieAlg
     if not isinstance(g, LieAlgebra):
         raise ParameterError(f"the magnetic extension is that of a LieAlgebra, not of {type(g).__name__}")
     extension = MagneticExtension(g)
-    few = extension.dim <= LARGEST_BY_CONSTANTS
-    return extension.by_constants if (few if by_brackets is None else not by_brackets) else extension
+    few = extension.dim <= MAX_DIM_BY_CONSTANTS
+    return extension.algebra_by_constants if (few if by_brackets is None else not by_brackets) else extension
 
 
 @jax.tree_util.register_static
-class MagneticExtension(OnDemand):
+class MagneticExtension(BracketAlgebra):
     """``g ⋉ g*`` by what g does; see :func:`manifolds.magnetic_extension`.
 
     Attributes
@@ -73,7 +73,7 @@ class MagneticExtension(OnDemand):
     def _key(self):
         return self.algebra
 
-    def _made_by_constants(self) -> LieAlgebra:
+    def _build_by_constants(self) -> LieAlgebra:
         # rho(x) a = -ad*_x a
         return semidirect_sum(self.algebra, -self.algebra.structure_constants, name=self.name)
 
@@ -102,7 +102,7 @@ class MagneticExtension(OnDemand):
         return positive, negative, zero + self.algebra.dim
 
     def killing_form(self) -> np.ndarray:
-        self._check_square("the Killing form")
+        self._check_matrix_memory("the Killing form")
         return np.pad(2.0 * self.algebra.killing_form(), (0, self.algebra.dim))
 
     def killing_inner_product(self):
@@ -110,7 +110,7 @@ class MagneticExtension(OnDemand):
         if not g.is_compact_type():
             return -self.killing_form()
         form = g.killing_inner_product()
-        blocks = (_Twice(jnp.asarray(form) if isinstance(form, np.ndarray) else form), Diagonal(jnp.zeros(())))
+        blocks = (_DoubledForm(jnp.asarray(form) if isinstance(form, np.ndarray) else form), Diagonal(jnp.zeros(())))
         return BlockDiagonal(blocks, (g.dim, g.dim), (1, 1))
 
     def is_abelian(self) -> bool:
@@ -120,16 +120,16 @@ class MagneticExtension(OnDemand):
         return True  # the traces of ad_x on g and on g* cancel
 
     def derived_series(self) -> list[int]:
-        return [self.dim] if self.algebra.is_semisimple() else self.by_constants.derived_series()
+        return [self.dim] if self.algebra.is_semisimple() else self.algebra_by_constants.derived_series()
 
     def lower_central_series(self) -> list[int]:
-        return [self.dim] if self.algebra.is_semisimple() else self.by_constants.lower_central_series()
+        return [self.dim] if self.algebra.is_semisimple() else self.algebra_by_constants.lower_central_series()
 
     # -- Casimirs -----------------------------------------------------------------------------------------------------
 
     def casimir_count(self) -> int:
         g = self.algebra
-        return self.by_constants.casimir_count() if invariant_form(g) is None else 2 * g.casimir_count()
+        return self.algebra_by_constants.casimir_count() if invariant_form(g) is None else 2 * g.casimir_count()
 
     def casimirs(self, degree: int) -> list:
         """``f(B)`` and ``<W, grad f(B)>`` of each Casimir f of g, moved to g by its invariant form.
@@ -137,16 +137,16 @@ class MagneticExtension(OnDemand):
         Where no such form is known, those that the structure constants have.
         """
         if invariant_form(self.algebra) is None:
-            return self.by_constants.casimirs(degree)
-        return [F for _, F in self._of_both([(str(f), f) for f in self.algebra.casimirs(degree)])]
+            return self.algebra_by_constants.casimirs(degree)
+        return [F for _, F in self._extended_casimirs([(str(f), f) for f in self.algebra.casimirs(degree)])]
 
     def leading_casimirs(self) -> list[tuple[str, Callable]]:
         if invariant_form(self.algebra) is None:
             return [("<W, B>", CrossHelicity(self))]
-        return self._of_both(self.algebra.leading_casimirs()[:FOLLOWED])
+        return self._extended_casimirs(self.algebra.leading_casimirs()[:MAX_FOLLOWED_CASIMIRS])
 
-    def _of_both(self, known: list[tuple[str, Callable]]) -> list[tuple[str, Callable]]:
-        kinds = (("of B", OfField), ("along W at B", AlongMomentum))
+    def _extended_casimirs(self, known: list[tuple[str, Callable]]) -> list[tuple[str, Callable]]:
+        kinds = (("of B", FieldCasimir), ("along W at B", MomentumFieldCasimir))
         return [(f"{name} {where}", kind(self, f)) for name, f in known for where, kind in kinds]
 
 
@@ -155,23 +155,23 @@ class ExtendedAction:
 
     def __init__(self, g: MagneticExtension, x):
         self.g, (x, self.a) = g, g.halves(x)
-        self.of_g = g.algebra.action(x)
+        self.base_action = g.algebra.action(x)
 
     def bracket(self, y) -> jax.Array:
         y, b = self.g.halves(y, "y")
         return jnp.concatenate(
-            [self.of_g.bracket(y), self.g.algebra.ad_star(y, self.a) - self.of_g.ad_star(b)], axis=-1
+            [self.base_action.bracket(y), self.g.algebra.ad_star(y, self.a) - self.base_action.ad_star(b)], axis=-1
         )
 
     def ad_star(self, mu) -> jax.Array:
         W, B = self.g.halves(mu, "mu")
-        pushed = self.of_g.ad_star(W) - self.g.algebra.ad_star(B, self.a)
-        return jnp.concatenate([pushed, -self.of_g.bracket(B)], axis=-1)
+        pushed = self.base_action.ad_star(W) - self.g.algebra.ad_star(B, self.a)
+        return jnp.concatenate([pushed, -self.base_action.bracket(B)], axis=-1)
 
 
 @jax.tree_util.register_static
 @dataclass(frozen=True)
-class _Twice:
+class _DoubledForm:
     """Twice a linear map."""
 
     form: Any
@@ -189,14 +189,14 @@ def invariant_form(g: LieAlgebra) -> Callable | None:
         return g.trace_covector
     if isinstance(g, DirectSum):
         forms = [invariant_form(part) for part, _ in g.blocks]
-        return None if None in forms else lambda x: _blockwise(g, forms, x)
+        return None if None in forms else lambda x: _apply_forms_blockwise(g, forms, x)
     if not g.is_semisimple():
         return None
     form = g.killing_form()
     return lambda x: x @ form
 
 
-def _blockwise(g: DirectSum, forms, x) -> jax.Array:
+def _apply_forms_blockwise(g: DirectSum, forms, x) -> jax.Array:
     parts = [form(part) for form, part in zip(forms, g.split(x), strict=True)]
     return jnp.concatenate([part.reshape(*part.shape[:-2], -1) for part in parts], axis=-1)
 
@@ -222,7 +222,7 @@ class CrossHelicity:
 
 @jax.tree_util.register_static
 @dataclass(frozen=True)
-class OfField:
+class FieldCasimir:
     """A Casimir f of g at the invariant form of B, shape (..., dim) to (...)."""
 
     algebra: MagneticExtension
@@ -233,7 +233,7 @@ class OfField:
         return self.algebra.dim
 
     def __call__(self, mu) -> jax.Array:
-        return self.casimir(_dual(self.algebra, self.algebra.halves(mu, "mu")[1]))
+        return self.casimir(_dual_of_field(self.algebra, self.algebra.halves(mu, "mu")[1]))
 
     def __str__(self) -> str:
         return f"{self.casimir} of B"
@@ -241,18 +241,18 @@ class OfField:
 
 @jax.tree_util.register_static
 @dataclass(frozen=True)
-class AlongMomentum(OfField):
+class MomentumFieldCasimir(FieldCasimir):
     """``<W, grad f>`` there: of the Casimir of degree two a multiple of the cross helicity."""
 
     def __call__(self, mu) -> jax.Array:
         W, B = self.algebra.halves(mu, "mu")
-        return jax.jvp(self.casimir, (_dual(self.algebra, B),), (W,))[1]
+        return jax.jvp(self.casimir, (_dual_of_field(self.algebra, B),), (W,))[1]
 
     def __str__(self) -> str:
         return f"{self.casimir} along W at B"
 
 
-def _dual(extension: MagneticExtension, B) -> jax.Array:
+def _dual_of_field(extension: MagneticExtension, B) -> jax.Array:
     form = invariant_form(extension.algebra)
     assert form is not None
     return form(B)

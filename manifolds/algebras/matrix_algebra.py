@@ -13,23 +13,23 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._arrays import is_traced, real_components, square_matrices
-from .._module import forwarded
+from .._pytree_module import forward_to
 from .._sizes import check_memory
 from ..errors import LieAlgebraError, ParameterError
 from ..matrices.blocks import Diagonal
+from .bracket_algebra import BracketAlgebra
 from .lie_algebra import LieAlgebra
 from .matrix_bases import MatrixBasis
-from .on_demand import OnDemand
 
-FOLLOWED_DEGREE = 4
+MAX_FOLLOWED_DEGREE = 4
 """Traces of powers up to this one are followed along a motion."""
 
-Parts = tuple[jax.Array, ...]
+MatrixParts = tuple[jax.Array, ...]
 """A matrix by its real part and, of complex ones, its imaginary part; none of the identity."""
 
 
 @dataclass(frozen=True)
-class Classical:
+class ClassicalData:
     """What is known of a classical algebra without a computation.
 
     Attributes
@@ -38,26 +38,26 @@ class Classical:
         The number of Casimirs.
     signature : tuple of int
         Positive, negative and zero eigenvalues of the Killing form.
-    killing : tuple of float
+    killing_coefficients : tuple of float
         (c, d) of the Killing form ``c tr(xy) - d tr(x) tr(y)``.
-    compact : bool
+    is_compact : bool
         Whether all matrices are anti-Hermitian.
-    degrees : tuple of int
+    trace_degrees : tuple of int
         Those of the traces of powers that generate the Casimirs.
-    pfaffian : int or None
+    pfaffian_degree : int or None
         The degree of the Pfaffian, where there is one besides.
     """
 
     rank: int
     signature: tuple[int, int, int]
-    killing: tuple[float, float]
-    compact: bool
-    degrees: tuple[int, ...]
-    pfaffian: int | None = None
+    killing_coefficients: tuple[float, float]
+    is_compact: bool
+    trace_degrees: tuple[int, ...]
+    pfaffian_degree: int | None = None
 
 
 @jax.tree_util.register_static
-class MatrixAlgebra(OnDemand):
+class MatrixAlgebra(BracketAlgebra):
     """A classical algebra of large matrices; ``manifolds.su(N)`` and its neighbours make one where N is large.
 
     ``[x, y]`` and ``ad*_x mu`` are found from the matrices of x, y and mu: mu is the matrix M of the algebra with
@@ -68,13 +68,13 @@ class MatrixAlgebra(OnDemand):
     ----------
     matrix_size : int
         N.
-    tables : MatrixBasis
-    known : Classical
+    matrix_basis : MatrixBasis
+    classical_data : Classical
     """
 
-    def __init__(self, name: str, tables: MatrixBasis, known: Classical):
+    def __init__(self, name: str, tables: MatrixBasis, known: ClassicalData):
         super().__init__(name, tables.dim)
-        self.tables, self.known, self.matrix_size = tables, known, tables.size
+        self.matrix_basis, self.classical_data, self.matrix_size = tables, known, tables.size
 
     @property
     def _key(self):
@@ -84,35 +84,39 @@ class MatrixAlgebra(OnDemand):
 
     def bracket(self, x, y) -> jax.Array:
         x, y = self._element(x, "x"), self._element(y, "y")
-        return self._bracket(self.tables.matrix(x), self.tables.matrix(y))
+        return self._bracket(self.matrix_basis.matrix(x), self.matrix_basis.matrix(y))
 
     def ad_star(self, x, mu) -> jax.Array:
         x, mu = self._element(x, "x"), self._element(mu, "mu")
-        return self._ad_star(self.tables.matrix(x), mu)
+        return self._ad_star(self.matrix_basis.matrix(x), mu)
 
     def action(self, x) -> MatrixAction:
-        return MatrixAction(self, self.tables.matrix(self._element(x, "x")))
+        return MatrixAction(self, self.matrix_basis.matrix(self._element(x, "x")))
 
-    def _bracket(self, X: Parts, Y: Parts) -> jax.Array:
-        return self.tables.raised(self._commutator(X, Y))
+    def _bracket(self, X: MatrixParts, Y: MatrixParts) -> jax.Array:
+        return self.matrix_basis.raise_index(self._commutator(X, Y))
 
-    def _ad_star(self, X: Parts, mu) -> jax.Array:
-        return self._commutator(_adjoint(X), self.tables.matrix(self.tables.raised(mu)))
+    def _ad_star(self, X: MatrixParts, mu) -> jax.Array:
+        return self._commutator(_adjoint(X), self.matrix_basis.matrix(self.matrix_basis.raise_index(mu)))
 
-    def _commutator(self, X: Parts, Y: Parts) -> jax.Array:
+    def _commutator(self, X: MatrixParts, Y: MatrixParts) -> jax.Array:
         """``<[X, Y], e_a>`` for each a, shape (..., dim).
 
         For anti-Hermitian matrices ``[X, Y] = X Y - (X Y)^H``, and the two terms have the same products with each e_a.
         """
-        products = self.tables.products(_product(X, Y))
-        return 2.0 * products if self.known.compact else products - self.tables.products(_product(Y, X))
+        products = self.matrix_basis.inner_products(_product(X, Y))
+        return (
+            2.0 * products
+            if self.classical_data.is_compact
+            else products - self.matrix_basis.inner_products(_product(Y, X))
+        )
 
-    def _components(self, X: Parts) -> jax.Array:
-        return self.tables.raised(self.tables.products(X))
+    def _components(self, X: MatrixParts) -> jax.Array:
+        return self.matrix_basis.raise_index(self.matrix_basis.inner_products(X))
 
     def hat(self, x) -> jax.Array:
         """The matrix ``sum_a x_a e_a``, shape (..., N, N)."""
-        return _joined(self.tables.matrix(self._element(x, "x")))
+        return _combine_parts(self.matrix_basis.matrix(self._element(x, "x")))
 
     def vee(self, X) -> jax.Array:
         """Components of a matrix of the algebra, shape (..., dim): the inverse of :meth:`hat`.
@@ -123,9 +127,11 @@ class MatrixAlgebra(OnDemand):
             If ``X`` is not in the algebra (residual above 1e-8 relative; not checked under tracing).
         """
         matrix = square_matrices(X, self.matrix_size, "X")
-        components = self._components(self._parts(matrix))
+        components = self._components(self._split_parts(matrix))
         if not is_traced(matrix):
-            residual = float(jnp.max(jnp.abs(_joined(self.tables.matrix(components)) - matrix), initial=0.0))
+            residual = float(
+                jnp.max(jnp.abs(_combine_parts(self.matrix_basis.matrix(components)) - matrix), initial=0.0)
+            )
             tolerance = 1e-8 * max(1.0, float(jnp.max(jnp.abs(matrix), initial=0.0)))
             if not residual <= tolerance:
                 trace = float(jnp.max(jnp.abs(jnp.trace(matrix, axis1=-2, axis2=-1))))
@@ -140,66 +146,66 @@ class MatrixAlgebra(OnDemand):
 
     def dual_matrix(self, mu) -> jax.Array:
         """The matrix M of the algebra with ``<mu, y> = Re tr(M^H hat(y))`` for every y, shape (..., N, N)."""
-        return _joined(self.tables.matrix(self.tables.raised(self._element(mu, "mu"))))
+        return _combine_parts(self.matrix_basis.matrix(self.matrix_basis.raise_index(self._element(mu, "mu"))))
 
     def from_dual_matrix(self, M) -> jax.Array:
         """The inverse of :meth:`dual_matrix`; of any matrix, that of its part in the algebra, shape (..., dim)."""
-        return self.tables.products(self._parts(square_matrices(M, self.matrix_size, "M")))
+        return self.matrix_basis.inner_products(self._split_parts(square_matrices(M, self.matrix_size, "M")))
 
     def trace_covector(self, x) -> jax.Array:
         """The covector ``Re tr(x .)`` of the trace form, which is invariant and has no kernel, shape (..., dim)."""
         x = self._element(x, "x")
-        if self.known.compact:
-            return -self.tables.lowered(x)
-        return self.tables.products(_adjoint(self.tables.matrix(x)))
+        if self.classical_data.is_compact:
+            return -self.matrix_basis.lower_index(x)
+        return self.matrix_basis.inner_products(_adjoint(self.matrix_basis.matrix(x)))
 
-    def _parts(self, matrix) -> Parts:
-        return (matrix.real, matrix.imag)[: self.tables.parts]
+    def _split_parts(self, matrix) -> MatrixParts:
+        return (matrix.real, matrix.imag)[: self.matrix_basis.parts]
 
     # -- structure ----------------------------------------------------------------------------------------------------
 
     @property
     def basis(self) -> np.ndarray:
-        numbers = float(self.dim) * self.matrix_size**2 * self.tables.parts
+        numbers = float(self.dim) * self.matrix_size**2 * self.matrix_basis.parts
         check_memory(numbers, f"the matrices of the basis of {self.name}", "hat and vee need no list of them")
-        return self._matrices
+        return self._basis_matrices
 
     @cached_property
-    def _matrices(self) -> np.ndarray:
-        return self.tables.matrices()
+    def _basis_matrices(self) -> np.ndarray:
+        return self.matrix_basis.basis_matrices()
 
-    def _made_by_constants(self) -> LieAlgebra:
+    def _build_by_constants(self) -> LieAlgebra:
         one = jnp.eye(self.dim)
         constants = np.stack([np.asarray(self.bracket(e, one)) for e in one])
         constants[np.abs(constants) < 1e-15 * np.abs(constants).max()] = 0.0
         return LieAlgebra((constants - constants.swapaxes(0, 1)) / 2, name=self.name, basis=self.basis)
 
     def killing_form(self) -> np.ndarray:
-        self._check_square("the Killing form")
-        return np.asarray(jax.vmap(self._killing)(jnp.eye(self.dim)))
+        self._check_matrix_memory("the Killing form")
+        return np.asarray(jax.vmap(self._killing_covector)(jnp.eye(self.dim)))
 
-    def _killing(self, x) -> jax.Array:
+    def _killing_covector(self, x) -> jax.Array:
         """The covector ``kappa(x, .)``."""
-        c, d = self.known.killing
-        X = self.tables.matrix(x)
+        c, d = self.classical_data.killing_coefficients
+        X = self.matrix_basis.matrix(x)
         traces = [jnp.trace(part, axis1=-2, axis2=-1)[..., None, None] * np.eye(self.matrix_size) for part in X]
-        return self.tables.products(
+        return self.matrix_basis.inner_products(
             tuple(c * a - d * sign * t for a, t, sign in zip(_adjoint(X), traces, (1.0, -1.0), strict=False))
         )
 
     def killing_inner_product(self) -> Any:
-        if self.is_semisimple() and self.tables.orthogonal:
-            return Diagonal(jnp.asarray(self.known.killing[0] * self.tables.squares))
+        if self.is_semisimple() and self.matrix_basis.is_orthogonal:
+            return Diagonal(jnp.asarray(self.classical_data.killing_coefficients[0] * self.matrix_basis.squared_norms))
         return TraceForm(self)
 
     def killing_signature(self) -> tuple[int, int, int]:
-        return self.known.signature
+        return self.classical_data.signature
 
     def cartan_involution(self) -> np.ndarray:
         if not self.is_semisimple():
             raise LieAlgebraError(f"{self.name} is not semisimple, so it has no Cartan involution")
-        self._check_square("the Cartan involution")
-        images = jax.vmap(lambda e: self._components(tuple(-a for a in _adjoint(self.tables.matrix(e)))))
+        self._check_matrix_memory("the Cartan involution")
+        images = jax.vmap(lambda e: self._components(tuple(-a for a in _adjoint(self.matrix_basis.matrix(e)))))
         return np.asarray(images(jnp.eye(self.dim)).T)
 
     def is_abelian(self) -> bool:
@@ -209,7 +215,7 @@ class MatrixAlgebra(OnDemand):
         return True
 
     def derived_series(self) -> list[int]:
-        centre = self.known.signature[2]
+        centre = self.classical_data.signature[2]
         return [self.dim, self.dim - centre] if centre else [self.dim]
 
     def lower_central_series(self) -> list[int]:
@@ -218,7 +224,7 @@ class MatrixAlgebra(OnDemand):
     # -- Casimirs -----------------------------------------------------------------------------------------------------
 
     def casimir_count(self) -> int:
-        return self.known.rank
+        return self.classical_data.rank
 
     def casimirs(self, degree: int) -> list:
         """The trace of a power of the matrix of mu, where it is no polynomial in those of lower degree.
@@ -230,25 +236,30 @@ class MatrixAlgebra(OnDemand):
         """
         if isinstance(degree, bool) or not isinstance(degree, int | np.integer) or degree < 1:
             raise ParameterError(f"the degree of a Casimir must be an integer >= 1, not {degree!r}")
-        if degree == self.known.pfaffian:
+        if degree == self.classical_data.pfaffian_degree:
             raise LieAlgebraError(
                 f"{self.name} has a Casimir of degree {degree}, its Pfaffian, that is not formed for large matrices; "
                 "its square is the determinant, a polynomial in the traces of the even powers"
             )
-        return [MatrixTrace(self, int(degree))] if degree in self.known.degrees else []
+        return [MatrixTrace(self, int(degree))] if degree in self.classical_data.trace_degrees else []
 
     def leading_casimirs(self) -> list[tuple[str, Callable]]:
-        return [(str(F), F) for d in self.known.degrees if d <= FOLLOWED_DEGREE for F in [MatrixTrace(self, d)]]
+        return [
+            (str(F), F)
+            for d in self.classical_data.trace_degrees
+            if d <= MAX_FOLLOWED_DEGREE
+            for F in [MatrixTrace(self, d)]
+        ]
 
 
 class MatrixAction:
     """The action of one x, by its matrix."""
 
-    def __init__(self, g: MatrixAlgebra, X: Parts):
+    def __init__(self, g: MatrixAlgebra, X: MatrixParts):
         self.g, self.X = g, X
 
     def bracket(self, y) -> jax.Array:
-        return self.g._bracket(self.X, self.g.tables.matrix(y))
+        return self.g._bracket(self.X, self.g.matrix_basis.matrix(y))
 
     def ad_star(self, mu) -> jax.Array:
         return self.g._ad_star(self.X, mu)
@@ -264,8 +275,8 @@ class TraceForm:
     def __matmul__(self, x) -> jax.Array:
         g = self.algebra
         if g.is_semisimple():
-            return g.known.killing[0] * g.tables.lowered(x)
-        return -g._killing(x)
+            return g.classical_data.killing_coefficients[0] * g.matrix_basis.lower_index(x)
+        return -g._killing_covector(x)
 
 
 @jax.tree_util.register_static
@@ -279,60 +290,60 @@ class MatrixTrace:
     algebra: MatrixAlgebra
     degree: int
 
-    dim = forwarded("algebra")
+    dim = forward_to("algebra")
 
     def __call__(self, mu) -> jax.Array:
         g = self.algebra
-        raised = g.tables.raised(real_components(mu, g.dim, "mu"))
-        if g.known.compact and self.degree == 2:
+        raised = g.matrix_basis.raise_index(real_components(mu, g.dim, "mu"))
+        if g.classical_data.is_compact and self.degree == 2:
             return jnp.sum(jnp.asarray(mu) * raised, axis=-1)
-        M = g.tables.matrix(raised)
-        if g.known.compact:  # i (a + i b) = -b + i a
+        M = g.matrix_basis.matrix(raised)
+        if g.classical_data.is_compact:  # i (a + i b) = -b + i a
             M = (-M[1], M[0]) if len(M) == 2 else (jnp.zeros_like(M[0]), M[0])
-        return _trace_of_power(self.degree, g.known.compact, M)
+        return _trace_of_power(self.degree, g.classical_data.is_compact, M)
 
     def __str__(self) -> str:
-        return f"tr({'(i M)' if self.algebra.known.compact else 'M'}**{self.degree})"
+        return f"tr({'(i M)' if self.algebra.classical_data.is_compact else 'M'}**{self.degree})"
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _trace_of_power(n: int, hermitian: bool, M: Parts) -> jax.Array:
+def _trace_of_power(n: int, hermitian: bool, M: MatrixParts) -> jax.Array:
     """``Re tr(M**n)``, shape (..., N, N) to (...); its derivatives take as few products as it takes itself."""
-    return _real_trace(_power(M, n - n // 2), _power(M, n // 2))
+    return _real_trace(_matrix_power(M, n - n // 2), _matrix_power(M, n // 2))
 
 
 @_trace_of_power.defjvp
-def _by_one(n: int, hermitian: bool, primals, tangents):
+def _trace_of_power_jvp(n: int, hermitian: bool, primals, tangents):
     (M,), (dM,) = primals, tangents
-    return _trace_of_power(n, hermitian, M), n * _trace_beside(n - 1, hermitian, M, dM)
+    return _trace_of_power(n, hermitian, M), n * _trace_of_power_times(n - 1, hermitian, M, dM)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _trace_beside(n: int, hermitian: bool, M: Parts, D: Parts) -> jax.Array:
+def _trace_of_power_times(n: int, hermitian: bool, M: MatrixParts, D: MatrixParts) -> jax.Array:
     """``Re tr(M**n D)``."""
-    return _real_trace(_power(M, n), D)
+    return _real_trace(_matrix_power(M, n), D)
 
 
-@_trace_beside.defjvp
-def _by_both(n: int, hermitian: bool, primals, tangents):
+@_trace_of_power_times.defjvp
+def _trace_of_power_times_jvp(n: int, hermitian: bool, primals, tangents):
     """The sum of ``Re tr(M**(n-1-i) D M**i dM)``; of Hermitian matrices those of i and n-1-i are equal."""
     (M, D), (dM, dD) = primals, tangents
-    found = _trace_beside(n, hermitian, M, dD)
+    found = _trace_of_power_times(n, hermitian, M, dD)
     for i in range(n if not hermitian else (n + 1) // 2):
         times = 2.0 if hermitian and 2 * i != n - 1 else 1.0
-        found = found + times * _real_trace(_product(_product(_power(M, n - 1 - i), D), _power(M, i)), dM)
-    return _trace_beside(n, hermitian, M, D), found
+        found = found + times * _real_trace(_product(_product(_matrix_power(M, n - 1 - i), D), _matrix_power(M, i)), dM)
+    return _trace_of_power_times(n, hermitian, M, D), found
 
 
-def _power(M: Parts, n: int) -> Parts:
+def _matrix_power(M: MatrixParts, n: int) -> MatrixParts:
     """``M**n``, an empty tuple being 1."""
     if n <= 1:
         return M if n else ()
-    half = _power(M, n // 2)
+    half = _matrix_power(M, n // 2)
     return _product(_product(half, half), M if n % 2 else ())
 
 
-def _real_trace(X: Parts, Y: Parts) -> jax.Array:
+def _real_trace(X: MatrixParts, Y: MatrixParts) -> jax.Array:
     """``Re tr(X Y)``."""
     if not (X and Y):
         return jnp.trace((X or Y)[0], axis1=-2, axis2=-1)
@@ -340,7 +351,7 @@ def _real_trace(X: Parts, Y: Parts) -> jax.Array:
     return terms[0] - sum(terms[1:])
 
 
-def _product(X: Parts, Y: Parts) -> Parts:
+def _product(X: MatrixParts, Y: MatrixParts) -> MatrixParts:
     if not (X and Y):
         return X or Y
     if len(X) == 1:
@@ -350,9 +361,9 @@ def _product(X: Parts, Y: Parts) -> Parts:
     return real - imaginary, both - real - imaginary
 
 
-def _adjoint(X: Parts) -> Parts:
+def _adjoint(X: MatrixParts) -> MatrixParts:
     return tuple(sign * jnp.swapaxes(part, -1, -2) for sign, part in zip((1.0, -1.0), X, strict=False))
 
 
-def _joined(X: Parts) -> jax.Array:
+def _combine_parts(X: MatrixParts) -> jax.Array:
     return X[0] if len(X) == 1 else jax.lax.complex(X[0], X[1])

@@ -17,7 +17,7 @@ import numpy as np
 REAL, IMAGINARY = 0, 1
 
 
-class Entries(NamedTuple):
+class EntryTable(NamedTuple):
     """Where components stand off the diagonal, or one to an entry: arrays of one length.
 
     Attributes
@@ -34,19 +34,19 @@ class Entries(NamedTuple):
     value: np.ndarray
 
     @classmethod
-    def joined(cls, *parts: tuple) -> Entries:
+    def concatenate(cls, *parts: tuple) -> EntryTable:
         """From tuples of arrays that are broadcast against each other."""
         rows = [[a.ravel() for a in np.broadcast_arrays(*part)] for part in parts]
         component, part, row, column, value = (np.concatenate(column) for column in zip(*rows, strict=True))
         return cls(component, part, row, column, value.astype(np.float64))
 
 
-class Diagonal(NamedTuple):
+class DiagonalEntries(NamedTuple):
     """Components that are spread over the diagonal: ``diag = table @ x[components]``, in one part of the matrix."""
 
     components: np.ndarray
     part: int
-    table: np.ndarray
+    coefficients: np.ndarray
 
 
 class MatrixBasis:
@@ -65,99 +65,103 @@ class MatrixBasis:
 
     Attributes
     ----------
-    reads, values : array, shape (parts, N * N)
+    entry_components, values : array, shape (parts, N * N)
         The component that stands in each entry of a matrix, ``dim`` where none does, and the number that it has there.
     """
 
-    def __init__(self, size: int, entries: Entries, diagonal: Diagonal | None = None):
+    def __init__(self, size: int, entries: EntryTable, diagonal: DiagonalEntries | None = None):
         self.size, self.diagonal = size, diagonal
         self.dim = len(np.unique(entries.component)) + (0 if diagonal is None else len(diagonal.components))
         used = [entries.part] if diagonal is None else [entries.part, np.array([diagonal.part])]
         self.parts = 2 if np.concatenate(used).any() else 1
         place = entries.row * size + entries.column
-        self.reads = np.full((self.parts, size * size), self.dim, dtype=np.int32)  # dim: a component that is zero
+        self.entry_components = np.full(
+            (self.parts, size * size), self.dim, dtype=np.int32
+        )  # dim: a component that is zero
         self.values = np.zeros((self.parts, size * size))
-        self.reads[entries.part, place], self.values[entries.part, place] = entries.component, entries.value
+        self.entry_components[entries.part, place], self.values[entries.part, place] = entries.component, entries.value
         order = np.argsort(entries.component, kind="stable")
         component, place = entries.component[order], (entries.part * size * size + place)[order]
         rank = np.arange(len(order)) - np.searchsorted(component, component)
-        self._from = np.zeros((int(rank.max()) + 1 if len(rank) else 1, self.dim), dtype=np.int32)
-        self._weights = np.zeros(self._from.shape)
-        self._from[rank, component], self._weights[rank, component] = place, entries.value[order]
+        self._component_entries = np.zeros((int(rank.max()) + 1 if len(rank) else 1, self.dim), dtype=np.int32)
+        self._weights = np.zeros(self._component_entries.shape)
+        self._component_entries[rank, component], self._weights[rank, component] = place, entries.value[order]
 
     def matrix(self, x) -> tuple[jax.Array, ...]:
         """``sum_a x_a e_a`` by its parts, for x of shape (..., dim)."""
         padded = jnp.concatenate([x, jnp.zeros((*x.shape[:-1], 1))], axis=-1)
         parts = []
         for part in range(self.parts):
-            found = padded[..., self.reads[part]] * self.values[part]
+            found = padded[..., self.entry_components[part]] * self.values[part]
             found = found.reshape(*x.shape[:-1], self.size, self.size)
             if self.diagonal is not None and self.diagonal.part == part:
-                diagonal = x[..., self.diagonal.components] @ self.diagonal.table.T
+                diagonal = x[..., self.diagonal.components] @ self.diagonal.coefficients.T
                 found = found + diagonal[..., None] * np.eye(self.size)
             parts.append(found)
         return tuple(parts)
 
-    def products(self, parts: tuple[jax.Array, ...]) -> jax.Array:
+    def inner_products(self, parts: tuple[jax.Array, ...]) -> jax.Array:
         """``<A, e_a>`` for each a, shape (..., dim), of a matrix by its parts: the transpose of :meth:`matrix`."""
         flat = jnp.concatenate([part.reshape(*part.shape[:-2], -1) for part in parts], axis=-1)
-        terms = [flat[..., places] * weights for places, weights in zip(self._from, self._weights, strict=True)]
+        terms = [
+            flat[..., places] * weights for places, weights in zip(self._component_entries, self._weights, strict=True)
+        ]
         found = sum(terms[1:], terms[0])
         if self.diagonal is not None:
-            diagonal = jnp.diagonal(parts[self.diagonal.part], axis1=-2, axis2=-1) @ self.diagonal.table
+            diagonal = jnp.diagonal(parts[self.diagonal.part], axis1=-2, axis2=-1) @ self.diagonal.coefficients
             found = found.at[..., self.diagonal.components].set(diagonal)
         return found
 
-    def raised(self, mu) -> jax.Array:
+    def raise_index(self, mu) -> jax.Array:
         """The components of the matrix M of the span with ``<M, e_a> = mu_a`` for each a, shape (..., dim)."""
-        found = jnp.asarray(mu) / self.squares
-        if self.diagonal is None or self.orthogonal:
+        found = jnp.asarray(mu) / self.squared_norms
+        if self.diagonal is None or self.is_orthogonal:
             return found
         own = jnp.asarray(mu)[..., self.diagonal.components] @ self._inverse_gram
         return found.at[..., self.diagonal.components].set(own)
 
-    def lowered(self, x) -> jax.Array:
+    def lower_index(self, x) -> jax.Array:
         """``<M, e_a>`` for each a, of the matrix M with the components x: the inverse of :meth:`raised`."""
-        return jnp.asarray(x) * self.squares if self.orthogonal else self.products(self.matrix(x))
+        return jnp.asarray(x) * self.squared_norms if self.is_orthogonal else self.inner_products(self.matrix(x))
 
     @cached_property
-    def squares(self) -> np.ndarray:
+    def squared_norms(self) -> np.ndarray:
         """``<e_a, e_a>``, shape (dim,)."""
         found = (self._weights**2).sum(axis=0)
         if self.diagonal is not None:
-            found[self.diagonal.components] = (self.diagonal.table**2).sum(axis=0)
+            found[self.diagonal.components] = (self.diagonal.coefficients**2).sum(axis=0)
         return found
 
     @cached_property
-    def orthogonal(self) -> bool:
+    def is_orthogonal(self) -> bool:
         """Whether ``<e_a, e_b> = 0`` for all a != b."""
         if self.diagonal is None:
             return True
-        gram = self.diagonal.table.T @ self.diagonal.table
+        gram = self.diagonal.coefficients.T @ self.diagonal.coefficients
         return bool(np.abs(gram - np.diag(np.diag(gram))).max() < 1e-12 * np.abs(gram).max())
 
     @cached_property
     def _inverse_gram(self) -> np.ndarray:
         assert self.diagonal is not None
-        gram = self.diagonal.table.T @ self.diagonal.table
+        gram = self.diagonal.coefficients.T @ self.diagonal.coefficients
         return np.linalg.inv(gram)
 
-    def matrices(self) -> np.ndarray:
+    def basis_matrices(self) -> np.ndarray:
         """The e_a, shape (dim, N, N)."""
         flat = np.zeros((self.parts, self.dim + 1, self.size * self.size))
         for part in range(self.parts):
-            flat[part, self.reads[part], np.arange(self.size * self.size)] = self.values[part]
+            flat[part, self.entry_components[part], np.arange(self.size * self.size)] = self.values[part]
         found = flat[:, :-1].reshape(self.parts, self.dim, self.size, self.size)
         if self.diagonal is not None:
             on = np.arange(self.size)
-            found[self.diagonal.part, self.diagonal.components[:, None], on, on] = self.diagonal.table.T
+            found[self.diagonal.part, self.diagonal.components[:, None], on, on] = self.diagonal.coefficients.T
         return found[0] if self.parts == 1 else found[0] + 1j * found[1]
 
 
 # -- the classical ones -----------------------------------------------------------------------------------------------
 
 
-def unitary(n: int, centre: bool) -> MatrixBasis:
+def unitary_basis(n: int, centre: bool) -> MatrixBasis:
     """``-i lambda_a / 2``, lambda the (generalised) Gell-Mann matrices; with the centre ``-i/2 sqrt(2/n) 1`` last."""
     k, j = np.tril_indices(n, -1)
     symmetric, k0 = k * k - 1 + 2 * j, np.arange(1, n)
@@ -169,47 +173,47 @@ def unitary(n: int, centre: bool) -> MatrixBasis:
     if centre:
         components = np.append(components, n * n - 1)
         table = np.column_stack([table, np.full(n, -0.5 * math.sqrt(2.0 / n))])
-    entries = Entries.joined(
+    entries = EntryTable.concatenate(
         (symmetric, IMAGINARY, j, k, -0.5),
         (symmetric, IMAGINARY, k, j, -0.5),
         (symmetric + 1, REAL, j, k, -0.5),
         (symmetric + 1, REAL, k, j, 0.5),
     )
-    return MatrixBasis(n, entries, Diagonal(components, IMAGINARY, table))
+    return MatrixBasis(n, entries, DiagonalEntries(components, IMAGINARY, table))
 
 
-def orthogonal(p: int, q: int) -> MatrixBasis:
+def orthogonal_basis(p: int, q: int) -> MatrixBasis:
     """``(E_ij - E_ji) g`` for i < j in lexicographic order, g = diag(1, …, 1, -1, …, -1)."""
     n = p + q
     form = np.where(np.arange(n) < p, 1.0, -1.0)
     i, j = np.triu_indices(n, 1)
     a = np.arange(len(i))
-    return MatrixBasis(n, Entries.joined((a, REAL, i, j, form[j]), (a, REAL, j, i, -form[i])))
+    return MatrixBasis(n, EntryTable.concatenate((a, REAL, i, j, form[j]), (a, REAL, j, i, -form[i])))
 
 
-def general_linear(n: int) -> MatrixBasis:
+def general_linear_basis(n: int) -> MatrixBasis:
     """E_ij row by row."""
     i, j = (index.ravel() for index in np.indices((n, n)))
-    return MatrixBasis(n, Entries.joined((np.arange(n * n), REAL, i, j, 1.0)))
+    return MatrixBasis(n, EntryTable.concatenate((np.arange(n * n), REAL, i, j, 1.0)))
 
 
-def special_linear(n: int) -> MatrixBasis:
+def special_linear_basis(n: int) -> MatrixBasis:
     """``E_ii - E_(i+1)(i+1)`` first, then the E_ij of the upper and, transposed, of the lower triangle."""
     i, j = np.triu_indices(n, 1)
     a = n - 1 + np.arange(len(i))
     table = (np.eye(n) - np.eye(n, k=-1))[:, : n - 1]
-    entries = Entries.joined((a, REAL, i, j, 1.0), (a + len(i), REAL, j, i, 1.0))
-    return MatrixBasis(n, entries, Diagonal(np.arange(n - 1), REAL, table))
+    entries = EntryTable.concatenate((a, REAL, i, j, 1.0), (a + len(i), REAL, j, i, 1.0))
+    return MatrixBasis(n, entries, DiagonalEntries(np.arange(n - 1), REAL, table))
 
 
-def symplectic(n: int) -> MatrixBasis:
+def symplectic_basis(n: int) -> MatrixBasis:
     """``[[A, B], [C, -A^T]]`` with B and C symmetric: A row by row, then B, then C."""
     i, j = (index.ravel() for index in np.indices((n, n)))
     a = np.arange(n * n)
     s, t = np.triu_indices(n)
     b, off = n * n + np.arange(len(s)), s != t
     c = b + len(s)
-    entries = Entries.joined(
+    entries = EntryTable.concatenate(
         (a, REAL, i, j, 1.0),
         (a, REAL, n + j, n + i, -1.0),
         (b, REAL, s, n + t, 1.0),

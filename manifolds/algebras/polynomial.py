@@ -95,12 +95,12 @@ class Polynomial:
         # Products of gathered components: mu**0 would have the derivative 0 * mu**-1, which is NaN at zero.
         padded = jnp.concatenate([mu, jnp.ones((*mu.shape[:-1], 1))], axis=-1)
         values = jnp.ones((*mu.shape[:-1], len(self.terms)))
-        for factor in self._factors:
+        for factor in self._factor_indices:
             values = values * padded[..., factor]
         return values @ np.array([float(c) for c in self.coefficients])
 
     @cached_property
-    def _factors(self) -> np.ndarray:
+    def _factor_indices(self) -> np.ndarray:
         """Shape (degree, terms): the components to multiply; the index ``dim`` stands for the number 1."""
         factors = np.full((self.degree, len(self.terms)), self.dim)
         for term, (power, _) in enumerate(self.terms):
@@ -113,19 +113,19 @@ class Polynomial:
 
     def _derivative(self, a: int) -> Polynomial:
         terms = [((*p[:a], p[a] - 1, *p[a + 1 :]), p[a] * c) for p, c in self.terms if p[a]]
-        return self._from(terms)
+        return self._with_terms(terms)
 
     # -- arithmetic -------------------------------------------------------------------------------------------------
 
     def __add__(self, other) -> Polynomial:
-        other = self._operand(other)
-        return NotImplemented if other is None else self._from(self.terms + other.terms, other.names)
+        other = self._to_operand(other)
+        return NotImplemented if other is None else self._with_terms(self.terms + other.terms, other.names)
 
     def __mul__(self, other) -> Polynomial:
-        other = self._operand(other)
+        other = self._to_operand(other)
         if other is None:
             return NotImplemented
-        return self._from(
+        return self._with_terms(
             [(tuple(i + j for i, j in zip(p, q, strict=True)), c * d) for p, c in self.terms for q, d in other.terms],
             other.names,
         )
@@ -137,20 +137,20 @@ class Polynomial:
         return self * -1
 
     def __sub__(self, other) -> Polynomial:
-        other = self._operand(other)
+        other = self._to_operand(other)
         return NotImplemented if other is None else self + -other
 
     def __rsub__(self, other) -> Polynomial:
         return -self + other
 
-    def _operand(self, other) -> Polynomial | None:
+    def _to_operand(self, other) -> Polynomial | None:
         if isinstance(other, Real):
-            return self._from([((0,) * self.dim, other)])
+            return self._with_terms([((0,) * self.dim, other)])
         if isinstance(other, Polynomial) and other.dim != self.dim:
             raise ShapeError(f"polynomials in {self.dim} and in {other.dim} variables do not combine")
         return other if isinstance(other, Polynomial) else None
 
-    def _from(self, terms, names=None) -> Polynomial:
+    def _with_terms(self, terms, names=None) -> Polynomial:
         """A polynomial in the same components, with the names of this one or those given."""
         powers = np.array([power for power, _ in terms], dtype=np.int64).reshape(len(terms), self.dim)
         made = Polynomial(powers, [coefficient for _, coefficient in terms])

@@ -12,12 +12,19 @@ import numpy as np
 import scipy
 
 from ..errors import JacobiError, LieAlgebraError
-from ._null_space import numerical_null_space, numerical_rank, prime, rational_null_space, reduced, row_echelon
+from ._null_space import (
+    large_prime,
+    numerical_null_space,
+    numerical_rank,
+    rational_null_space,
+    reduce_modulo,
+    row_echelon,
+)
 from .polynomial import Polynomial
-from .structure import Structure
+from .structure import AlgebraStructure
 
-LARGEST_MONOMIAL_COUNT = 20000
-LARGEST_BLOCK = 2000
+MAX_MONOMIAL_COUNT = 20000
+MAX_BLOCK_SIZE = 2000
 """Most monomials, and most of them that the conditions may couple: up to a minute of linear algebra.
 
 In the bases of the catalogue the blocks are small (su(4), degree 4: 3060 monomials in blocks of 252 at most); in a
@@ -26,7 +33,7 @@ random basis all monomials form one block.
 
 
 @lru_cache(maxsize=256)
-def casimir_count(g: Structure) -> int:
+def casimir_count(g: AlgebraStructure) -> int:
     """Number of independent Casimir functions near a generic point of g*; they need not be polynomials.
 
     It is dim minus the generic rank of the Lie-Poisson tensor ``Pi(mu)[b, a] = sum_c C[a, b, c] mu_c``, taken as the
@@ -43,27 +50,27 @@ def casimir_count(g: Structure) -> int:
     ranks = []
     for draw in range(3):
         if exact is None:
-            tensor = g._balanced[0] @ random.standard_normal(g.dim)
+            tensor = g._balanced_constants[0] @ random.standard_normal(g.dim)
             ranks.append(numerical_rank(np.linalg.svd(tensor, compute_uv=False), 1.0, g.name))
         else:
-            p = prime(draw)
+            p = large_prime(draw)
             tensor = (exact.numerator * random.integers(1, p, g.dim) % p).sum(axis=2)
             ranks.append(len(row_echelon(tensor, p)[1]))
     return g.dim - max(ranks)
 
 
 @lru_cache(maxsize=256)
-def new_casimirs(g: Structure, degree: int) -> tuple[Polynomial, ...]:
+def new_casimirs(g: AlgebraStructure, degree: int) -> tuple[Polynomial, ...]:
     if casimir_count(g) == 0:
         return ()
     scaled, squares = _rational_form(g)
     if g.rational_constants is None and scaled.rational_constants is not None:
-        return tuple(_rescaled(F, squares) for F in new_casimirs(scaled, degree))
+        return tuple(_from_root_scaled_basis(F, squares) for F in new_casimirs(scaled, degree))
     if g.rational_constants is None and (scaled := _balanced_form(g)) != g:
-        return tuple(_weighted(F, g._balanced[1]) for F in new_casimirs(scaled, degree))
-    invariants = _invariants(g, degree)
+        return tuple(_from_scaled_basis(F, g._balanced_constants[1]) for F in new_casimirs(scaled, degree))
+    invariants = _homogeneous_casimirs(g, degree)
     lower = [F for d in range(1, degree) for F in new_casimirs(g, d)]
-    products = [dict(F.terms) for F in _products(lower, degree)]
+    products = [dict(F.terms) for F in _products_of_degree(lower, degree)]
     # The invariants are in reduced echelon form, so the coordinates of a product are its coefficients at their
     # leading monomials, up to the scale of each; and an invariant vanishes at the leading monomials of the others.
     leading = [F.terms[0][0] for F in invariants]
@@ -73,32 +80,32 @@ def new_casimirs(g: Structure, degree: int) -> tuple[Polynomial, ...]:
     return tuple(F for i, F in enumerate(invariants) if i not in decomposable)
 
 
-def _products(factors: list[Polynomial], degree: int) -> Iterator[Polynomial]:
+def _products_of_degree(factors: list[Polynomial], degree: int) -> Iterator[Polynomial]:
     """All products of total degree ``degree`` of one or more of the factors."""
     for i, F in enumerate(factors):
         if F.degree == degree:
             yield F
         elif F.degree < degree:
-            yield from (F * rest for rest in _products(factors[i:], degree - F.degree))
+            yield from (F * rest for rest in _products_of_degree(factors[i:], degree - F.degree))
 
 
-def _invariants(g: Structure, degree: int) -> list[Polynomial]:
+def _homogeneous_casimirs(g: AlgebraStructure, degree: int) -> list[Polynomial]:
     """The reduced row echelon basis of all homogeneous polynomial Casimirs of this degree, leading monomials first."""
     size = math.comb(g.dim + degree - 1, degree)
-    _check_size(size, LARGEST_MONOMIAL_COUNT, f"{g.name} has {size} monomials of degree {degree}")
+    _check_size(size, MAX_MONOMIAL_COUNT, f"{g.name} has {size} monomials of degree {degree}")
     exact = g.rational_constants
     if exact is None:
         constants = g.structure_constants / np.abs(g.structure_constants).max()
         generating = _generating_set(constants, tolerance=1e-8)
     else:
         constants = exact.numerator
-        generating = _generating_set(constants, prime(0))
-    factors, conditions = _conditions(constants[:, generating], degree)
+        generating = _generating_set(constants, large_prime(0))
+    factors, conditions = _invariance_conditions(constants[:, generating], degree)
     exponents = (factors[:, :, None] == np.arange(g.dim)).sum(axis=1)
     invariants = []
-    for columns in _blocks(conditions):
+    for columns in _coupled_blocks(conditions):
         coupled = f"this basis of {g.name} couples {len(columns)} monomials of degree {degree}"
-        _check_size(len(columns), LARGEST_BLOCK, coupled)
+        _check_size(len(columns), MAX_BLOCK_SIZE, coupled)
         block = conditions[:, columns].tocsr()
         block = block[np.flatnonzero(np.diff(block.indptr))].toarray()
         vectors = numerical_null_space(block, g.name) if exact is None else rational_null_space(block)
@@ -118,7 +125,7 @@ class TooLargeError(LieAlgebraError):
     """More monomials than the linear algebra is asked to take."""
 
 
-def _conditions(constants: np.ndarray, degree: int) -> tuple[np.ndarray, scipy.sparse.csc_array]:
+def _invariance_conditions(constants: np.ndarray, degree: int) -> tuple[np.ndarray, scipy.sparse.csc_array]:
     """The maps ``F -> sum_{a,c} C[a, b, c] mu_c dF/dmu_a`` on polynomials of one degree, one below the other.
 
     Returns the monomials as their sorted factors, shape (n, degree), in lexicographic order, and a sparse
@@ -147,7 +154,7 @@ def _conditions(constants: np.ndarray, degree: int) -> tuple[np.ndarray, scipy.s
     return factors, conditions
 
 
-def _blocks(conditions: scipy.sparse.csc_array) -> list[np.ndarray]:
+def _coupled_blocks(conditions: scipy.sparse.csc_array) -> list[np.ndarray]:
     """The columns in groups that no condition couples to one another: weight spaces, parities and the like."""
     pattern = conditions.astype(bool).astype(np.int64)
     _, block_of = scipy.sparse.csgraph.connected_components(pattern.T @ pattern, directed=False)
@@ -160,7 +167,7 @@ def _generating_set(constants: np.ndarray, modulus: int = 0, tolerance: float = 
     What the brackets span is never overestimated: modulo a prime a rank is at most what it is over Q.
     """
     dim = len(constants)
-    ad, units = reduced(constants, modulus), np.eye(dim, dtype=constants.dtype)
+    ad, units = reduce_modulo(constants, modulus), np.eye(dim, dtype=constants.dtype)
     span, chosen = units[:0], []
     for e in range(dim):
         wider, _ = row_echelon(np.vstack([span, units[e]]), modulus, tolerance)
@@ -168,7 +175,7 @@ def _generating_set(constants: np.ndarray, modulus: int = 0, tolerance: float = 
             chosen.append(e)
         while len(wider) > len(span):
             span = wider
-            brackets = [reduced(span[:, :, None] * ad[x], modulus).sum(axis=1) for x in chosen]
+            brackets = [reduce_modulo(span[:, :, None] * ad[x], modulus).sum(axis=1) for x in chosen]
             wider, _ = row_echelon(np.vstack([span, *brackets]), modulus, tolerance)
     return chosen
 
@@ -177,7 +184,7 @@ def _generating_set(constants: np.ndarray, modulus: int = 0, tolerance: float = 
 
 
 @lru_cache(maxsize=256)
-def _rational_form(g: Structure) -> tuple[Structure, tuple[int, ...]]:
+def _rational_form(g: AlgebraStructure) -> tuple[AlgebraStructure, tuple[int, ...]]:
     """The algebra in a basis ``sqrt(r_a) e_a`` with rational constants, and the integers r_a; else g itself.
 
     The constants become ``C[a, b, c] sqrt(r_a r_b / r_c)``, hence ``C**2 r_a r_b r_c`` must be a square wherever C is
@@ -214,9 +221,9 @@ def _rational_form(g: Structure) -> tuple[Structure, tuple[int, ...]]:
 
 
 @lru_cache(maxsize=256)
-def _balanced_form(g: Structure) -> Structure:
+def _balanced_form(g: AlgebraStructure) -> AlgebraStructure:
     """The algebra in the basis ``factors[a] e_a`` with balanced constants; g itself where it has them already."""
-    constants, factors = g._balanced
+    constants, factors = g._balanced_constants
     if np.abs(np.log(factors)).max() < 1e-12:
         return g
     try:
@@ -238,7 +245,7 @@ def _odd_primes(n: int) -> set[int]:
     return odd
 
 
-def _rescaled(F: Polynomial, squares: tuple[int, ...]) -> Polynomial:
+def _from_root_scaled_basis(F: Polynomial, squares: tuple[int, ...]) -> Polynomial:
     """F, given in the basis ``sqrt(r_a) e_a``, in the basis e_a, with leading coefficient 1."""
     weights = []
     for power, c in F.terms:
@@ -248,7 +255,7 @@ def _rescaled(F: Polynomial, squares: tuple[int, ...]) -> Polynomial:
     return Polynomial(F.exponents, roots)
 
 
-def _weighted(F: Polynomial, factors: np.ndarray) -> Polynomial:
+def _from_scaled_basis(F: Polynomial, factors: np.ndarray) -> Polynomial:
     """F, given in the basis ``factors[a] e_a``, in the basis e_a, with leading coefficient 1."""
     logarithms = F.exponents @ np.log(factors)
     weights = np.exp(logarithms - logarithms[0]) / float(F.coefficients[0])

@@ -11,11 +11,11 @@ from ..errors import (
     ShapeError,
 )
 from .axioms import AXIOM_TOLERANCE
-from .blocks import direct_sum_by_constants, joined_names, sum_of
+from .blocks import direct_sum_by_constants, joined_names, merged_direct_sum
 from .killing import row_space
 from .lie_algebra import LieAlgebra
 
-LARGEST_BY_CONSTANTS = 40
+MAX_DIM_BY_CONSTANTS = 40
 """Dimension up to which a direct sum is an array of structure constants."""
 
 
@@ -38,9 +38,9 @@ def direct_sum(*algebras: LieAlgebra) -> LieAlgebra:
     """
     if not algebras:
         raise ShapeError("direct_sum needs at least one algebra")
-    if sum(g.dim for g in algebras) <= LARGEST_BY_CONSTANTS:
+    if sum(g.dim for g in algebras) <= MAX_DIM_BY_CONSTANTS:
         return direct_sum_by_constants(algebras)
-    return sum_of(algebras)
+    return merged_direct_sum(algebras)
 
 
 def semidirect_sum(g: LieAlgebra, representation, name: str | None = None, *, ideal=None) -> LieAlgebra:
@@ -88,7 +88,7 @@ def semidirect_sum(g: LieAlgebra, representation, name: str | None = None, *, id
     _check_derivations(g, rho, ideal)
     constants[g.dim :, g.dim :, g.dim :] = ideal.structure_constants
     total = LieAlgebra(constants, name=name or f"{g.name} x {ideal.name}", basis_names=joined_names(g, ideal))
-    adjoint = total._balanced[0].reshape(dim, -1)
+    adjoint = total._balanced_constants[0].reshape(dim, -1)
     faithful = adjoint.any() and len(row_space(adjoint)) == dim
     return LieAlgebra(
         constants,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from ..algebras import catalogue
-from ..matrices.linear import adjoint, orthonormalized
+from ..matrices.linear import adjoint, newton_schulz_step
 from . import closed_forms as closed
 from . import maps
 from .matrix_group import MatrixGroup, register
@@ -37,7 +37,7 @@ def SO(n: int) -> MatrixGroup:
         adjoint,
         log_map=rotation_log,
         adjoint_cayley_map=None,
-        restore_map=orthonormalized,
+        restore_map=newton_schulz_step,
         equations=closed.orthogonal_equations,
     )
     if n == 2:
@@ -59,7 +59,7 @@ def SE(n: int) -> MatrixGroup:
         closed.rigid_defect,
         closed.rigid_inverse,
         adjoint_cayley_map=maps.cayley if n == 2 else None,
-        restore_map=closed.rigid_restored,
+        restore_map=closed.restore_rigid,
         equations=closed.rigid_equations,
     )
     if n == 2:
@@ -80,7 +80,7 @@ def SU(n: int) -> MatrixGroup:
         catalogue.su(n),
         closed.unitary_defect,
         adjoint,
-        restore_map=closed.unitary_restored,
+        restore_map=closed.restore_unitary,
         equations=closed.unitary_equations,
     )
     if n == 2:
@@ -94,7 +94,7 @@ def SU(n: int) -> MatrixGroup:
 @register((2,), (3,))
 def SL(n: int) -> MatrixGroup:
     """Real matrices of determinant 1. The Cayley map exists for n = 2 only, where SL(2) = Sp(1)."""
-    group = MatrixGroup(f"SL({n})", catalogue.sl(n), closed.unimodular_defect, restore_map=closed.unimodular_restored)
+    group = MatrixGroup(f"SL({n})", catalogue.sl(n), closed.unimodular_defect, restore_map=closed.restore_unimodular)
     if n == 2:
         return replace(group, adjoint_cayley_map=closed.plane_adjoint_cayley, equations=closed.symplectic_equations)
     return replace(group, cayley_map=None, adjoint_cayley_map=None, equations=closed.unimodular_equations)
@@ -109,7 +109,7 @@ def Sp(n: int) -> MatrixGroup:
         closed.symplectic_defect,
         closed.symplectic_inverse,
         adjoint_cayley_map=closed.plane_adjoint_cayley if n == 1 else None,
-        restore_map=closed.symplectic_restored,
+        restore_map=closed.restore_symplectic,
         equations=closed.symplectic_equations,
     )
 
@@ -138,5 +138,5 @@ def Heisenberg(n: int = 1) -> MatrixGroup:
         closed.heisenberg_exp,
         closed.heisenberg_log,
         closed.heisenberg_exp,
-        closed.heisenberg_restored,
+        closed.restore_heisenberg,
     )

@@ -14,13 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..algebras.lie_algebra import LieAlgebra
-from ..matrices.linear import adjoint, determinant, inverse, largest, orthonormalized
-from ..matrices.stumpff import HALF_TURN_MARGIN, _root, _square, arc, leading_sign, stumpff
+from ..matrices.linear import adjoint, determinant, inverse, max_abs_entry, newton_schulz_step
+from ..matrices.stumpff import HALF_TURN_MARGIN, _root_or_nan, _squared_length, angle_over_sine, leading_sign, stumpff
 
 
 def so2_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """``cos(t) I + sin(t)/t X``."""
-    z = _square(x)[..., None]
+    z = _squared_length(x)[..., None]
     return stumpff(0, z) * np.eye(2) + stumpff(1, z) * algebra.hat(x)
 
 
@@ -29,40 +29,40 @@ def so2_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
     sine, cosine = ((g - g.swapaxes(-1, -2)) / 2)[..., 0, 1:2], (g[..., :1, 0] + g[..., 1:2, 1]) / 2
     angle = jnp.arctan2(sine, cosine)
     angle = jnp.where(angle < HALF_TURN_MARGIN - math.pi, angle + 2 * math.pi, angle)
-    return jnp.where(cosine < 0, angle, arc(sine**2, cosine) * sine)
+    return jnp.where(cosine < 0, angle, angle_over_sine(sine**2, cosine) * sine)
 
 
 def so3_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """Rodrigues' formula ``I + c1 X + c2 X^2``."""
-    z, X = _square(x)[..., None], algebra.hat(x)
+    z, X = _squared_length(x)[..., None], algebra.hat(x)
     return jnp.eye(3) + stumpff(1, z) * X + stumpff(2, z) * X @ X
 
 
 def so3_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
     """Rotation vector by way of the quaternion, accurate at every angle; at the half turn by :func:`leading_sign`."""
     w, v = _quaternion(g)
-    sign = jnp.where(_angle(w, v) > math.pi - HALF_TURN_MARGIN, leading_sign(v), 1.0)
-    return 2 * arc(_square(v), sign * w) * sign * v
+    sign = jnp.where(_rotation_angle(w, v) > math.pi - HALF_TURN_MARGIN, leading_sign(v), 1.0)
+    return 2 * angle_over_sine(_squared_length(v), sign * w) * sign * v
 
 
 def so3_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """``I + (X + X^2/2) / (1 + |x|^2/4)``."""
     X = algebra.hat(x)[..., :3, :3]
-    return jnp.eye(3) + (X + X @ X / 2) / (1.0 + _square(x[..., :3])[..., None] / 4)
+    return jnp.eye(3) + (X + X @ X / 2) / (1.0 + _squared_length(x[..., :3])[..., None] / 4)
 
 
 def so3_inverse_cayley(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
     """``2 tan(a/2)`` times the axis, for the angle a: ``2 v / w`` of the quaternion (w, v)."""
     w, v = _quaternion(g)
-    return jnp.where(_angle(w, v) <= math.pi - HALF_TURN_MARGIN, 2 * v / w, jnp.nan)
+    return jnp.where(_rotation_angle(w, v) <= math.pi - HALF_TURN_MARGIN, 2 * v / w, jnp.nan)
 
 
 def se3_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """Rotation by Rodrigues' formula, translation ``(I + c2 W + c3 W^2) u``."""
-    z, u = _square(x[..., :3])[..., None], x[..., 3:, None]
+    z, u = _squared_length(x[..., :3])[..., None], x[..., 3:, None]
     W = algebra.hat(x)[..., :3, :3]
     rotation = jnp.eye(3) + stumpff(1, z) * W + stumpff(2, z) * W @ W
-    return affine(rotation, u + W @ (stumpff(2, z) * u + stumpff(3, z) * W @ u))
+    return affine_matrix(rotation, u + W @ (stumpff(2, z) * u + stumpff(3, z) * W @ u))
 
 
 def rigid_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
@@ -74,7 +74,7 @@ def rigid_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
     rotation, t = g[..., :-1, :-1], g[..., :-1, -1:]
     w = (so2_log if t.shape[-2] == 2 else so3_log)(algebra, rotation)
     W = algebra.hat(jnp.concatenate([w, jnp.zeros_like(t[..., 0])], axis=-1))[..., :-1, :-1]
-    z = _square(w)[..., None] / 4
+    z = _squared_length(w)[..., None] / 4
     d = (stumpff(2, z) - stumpff(3, z)) / (4 * stumpff(1, z))
     u = t - W @ (t / 2 - d * (W @ t))
     return jnp.concatenate([w, u[..., 0]], axis=-1)
@@ -83,7 +83,7 @@ def rigid_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
 def se3_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """That of the rotation, R, and the translation ``(I - W/2)^-1 u = (R u + u) / 2``."""
     rotation, u = so3_cayley(algebra, x), x[..., 3:, None]
-    return affine(rotation, 0.5 * (rotation @ u + u))
+    return affine_matrix(rotation, 0.5 * (rotation @ u + u))
 
 
 def se3_inverse_cayley(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
@@ -94,22 +94,26 @@ def se3_inverse_cayley(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
 
 def su2_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """``cos(|x|/2) I + sin(|x|/2) X / (|x|/2)``."""
-    z = _square(x)[..., None] / 4
+    z = _squared_length(x)[..., None] / 4
     return stumpff(0, z) * np.eye(2) + stumpff(1, z) * algebra.hat(x)
 
 
 def su2_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
     """Rotation vector of length below 2 pi: g is the unit quaternion ``w - i v . sigma``."""
     w, v = _unit_quaternion(g)
-    return jnp.where(_angle(w, v) <= 2 * (math.pi - HALF_TURN_MARGIN), 2 * arc(_square(v), w) * v, jnp.nan)
+    return jnp.where(
+        _rotation_angle(w, v) <= 2 * (math.pi - HALF_TURN_MARGIN),
+        2 * angle_over_sine(_squared_length(v), w) * v,
+        jnp.nan,
+    )
 
 
 def su2_inverse_cayley(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
     """``4 tan(a/4)`` times the axis, for the angle a: ``4 v / (1 + w)`` of the unit quaternion (w, v)."""
     w, v = _unit_quaternion(g)
-    square = jnp.where(w > 0, 1.0, _square(v))
+    square = jnp.where(w > 0, 1.0, _squared_length(v))
     x = 4 * v * jnp.where(w > 0, 1 / jnp.where(w > 0, 1 + w, 1.0), (1 - w) / square)  # 1 + w may cancel
-    return jnp.where(_angle(w, v) <= 2 * (math.pi - HALF_TURN_MARGIN), x, jnp.nan)
+    return jnp.where(_rotation_angle(w, v) <= 2 * (math.pi - HALF_TURN_MARGIN), x, jnp.nan)
 
 
 def plane_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
@@ -122,7 +126,7 @@ def plane_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     half = jnp.trace(X, axis1=-2, axis2=-1)[..., None, None] / 2
     X = X - half * identity
     square = -jnp.trace(X @ X, axis1=-2, axis2=-1).real[..., None, None] / 2
-    return jnp.exp(half) * (identity + X) / _root(1.0 + square)
+    return jnp.exp(half) * (identity + X) / _root_or_nan(1.0 + square)
 
 
 def so4_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
@@ -140,8 +144,8 @@ def so4_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
 def se3_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """Cayley's rotation, and the translation ``(u + w × u / 2) / (1 + |w|^2/4)``: Cayley's of the dual rotation."""
     w, u = x[..., :3], x[..., 3:]
-    translation = (u + jnp.cross(w, u) / 2) / (1.0 + _square(w) / 4)
-    return affine(so3_cayley(algebra, x), translation[..., None])
+    translation = (u + jnp.cross(w, u) / 2) / (1.0 + _squared_length(w) / 4)
+    return affine_matrix(so3_cayley(algebra, x), translation[..., None])
 
 
 def heisenberg_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
@@ -161,7 +165,7 @@ def heisenberg_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
 
 def unitary_defect(g) -> jax.Array:
     """Distance of ``g^H g`` from I, or of ``det g`` from 1."""
-    return jnp.maximum(largest(adjoint(g) @ g - np.eye(g.shape[-1])), jnp.abs(determinant(g) - 1.0))
+    return jnp.maximum(max_abs_entry(adjoint(g) @ g - np.eye(g.shape[-1])), jnp.abs(determinant(g) - 1.0))
 
 
 def rigid_defect(g) -> jax.Array:
@@ -178,19 +182,19 @@ def unimodular_defect(g) -> jax.Array:
 
 def symplectic_defect(g) -> jax.Array:
     """Distance of ``-J g^T J g`` from I."""
-    size = jnp.maximum(largest(g) ** 2, 1.0)
-    return largest(symplectic_inverse(g) @ g - np.eye(g.shape[-1])) / size
+    size = jnp.maximum(max_abs_entry(g) ** 2, 1.0)
+    return max_abs_entry(symplectic_inverse(g) @ g - np.eye(g.shape[-1])) / size
 
 
 def invertible_defect(g) -> jax.Array:
     """0 on the group, which is open; infinite where the condition number shows g to be singular to rounding."""
-    condition = g.shape[-1] * largest(g) * largest(inverse(g))
+    condition = g.shape[-1] * max_abs_entry(g) * max_abs_entry(inverse(g))
     return jnp.where(condition * np.finfo(float).eps < 1.0, 0.0, jnp.inf)
 
 
 def heisenberg_defect(g) -> jax.Array:
     """Distance of the entries outside the first row and the last column from those of I."""
-    return largest(jnp.where(_free(g), 0.0, g - np.eye(g.shape[-1])))
+    return max_abs_entry(jnp.where(_coordinate_entries(g), 0.0, g - np.eye(g.shape[-1])))
 
 
 # -- equations: they vanish on the group, and products from the right with its elements do not change them ----------
@@ -236,7 +240,7 @@ def unitary_equations(g) -> jax.Array:
 def rigid_inverse(g) -> jax.Array:
     """``[[R^T, -R^T t], [0, 1]]``."""
     transposed = g[..., :-1, :-1].swapaxes(-1, -2)
-    return affine(transposed, -transposed @ g[..., :-1, -1:])
+    return affine_matrix(transposed, -transposed @ g[..., :-1, -1:])
 
 
 def symplectic_inverse(g) -> jax.Array:
@@ -255,37 +259,37 @@ def heisenberg_inverse(g) -> jax.Array:
 # -- one Newton step to the group ---------------------------------------------------------------------------------
 
 
-def unchanged(g) -> jax.Array:
+def return_unchanged(g) -> jax.Array:
     """g itself."""
     return g
 
 
-def unitary_restored(g) -> jax.Array:
+def restore_unitary(g) -> jax.Array:
     """Orthonormal rows, and determinant 1."""
-    return unimodular_restored(orthonormalized(g))
+    return restore_unimodular(newton_schulz_step(g))
 
 
-def rigid_restored(g) -> jax.Array:
+def restore_rigid(g) -> jax.Array:
     """An orthonormal linear part."""
-    return affine(orthonormalized(g[..., :-1, :-1]), g[..., :-1, -1:])
+    return affine_matrix(newton_schulz_step(g[..., :-1, :-1]), g[..., :-1, -1:])
 
 
-def unimodular_restored(g) -> jax.Array:
+def restore_unimodular(g) -> jax.Array:
     """Determinant 1."""
     return g * (1.0 - (determinant(g) - 1.0) / g.shape[-1])[..., None, None]
 
 
-def symplectic_restored(g) -> jax.Array:
+def restore_symplectic(g) -> jax.Array:
     """``g (3 I - g^* g) / 2`` with ``g^* = -J g^T J``, which squares the distance of ``g^* g`` from I."""
     return 1.5 * g - 0.5 * g @ (symplectic_inverse(g) @ g)
 
 
-def heisenberg_restored(g) -> jax.Array:
+def restore_heisenberg(g) -> jax.Array:
     """The entries outside the first row and the last column are those of I."""
-    return jnp.where(_free(g), g, np.eye(g.shape[-1]))
+    return jnp.where(_coordinate_entries(g), g, np.eye(g.shape[-1]))
 
 
-def affine(linear: jax.Array, translation: jax.Array) -> jax.Array:
+def affine_matrix(linear: jax.Array, translation: jax.Array) -> jax.Array:
     """Homogeneous matrix ``[[linear, translation], [0, 1]]``; ``translation`` has shape (..., n, 1)."""
     top = jnp.concatenate([linear, translation], axis=-1)
     last = jnp.broadcast_to(np.eye(top.shape[-1])[-1:], (*top.shape[:-2], 1, top.shape[-1]))
@@ -295,7 +299,7 @@ def affine(linear: jax.Array, translation: jax.Array) -> jax.Array:
 # -- helpers ------------------------------------------------------------------------------------------------------
 
 
-def _free(g) -> np.ndarray:
+def _coordinate_entries(g) -> np.ndarray:
     """Which entries of a matrix of the Heisenberg group are its coordinates."""
     free = np.zeros(g.shape[-2:], dtype=bool)
     free[0, 1:] = free[:-1, -1] = True
@@ -326,6 +330,6 @@ def _unit_quaternion(g: jax.Array) -> tuple[jax.Array, jax.Array]:
     return w[..., None], v
 
 
-def _angle(w: jax.Array, v: jax.Array) -> jax.Array:
+def _rotation_angle(w: jax.Array, v: jax.Array) -> jax.Array:
     """Twice the angle of the quaternion (w, v), of any norm, shape (..., 1)."""
-    return 2 * jnp.arctan2(jnp.sqrt(_square(v)), w)
+    return 2 * jnp.arctan2(jnp.sqrt(_squared_length(v)), w)

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..algebras.lie_algebra import LieAlgebra
 from ..matrices.exponential import CAYLEY_CONDITION_LIMIT, cayley_of, expm
-from ..matrices.linear import _norm, _square_root, determinant, largest, solve, solve_near_identity
+from ..matrices.linear import _one_norm, _square_root, determinant, max_abs_entry, solve, solve_near_identity
 
 _NODES, _WEIGHTS = (a[16:] for a in np.polynomial.legendre.leggauss(32))
 
@@ -65,7 +65,7 @@ def inverse_cayley(algebra: LieAlgebra, g) -> jax.Array:
     """``2 (g + I)^-1 (g - I)`` in components, NaN where g + I is singular."""
     identity = np.eye(g.shape[-1])
     x = algebra.vee(2 * solve(g + identity, g - identity))
-    condition = largest(g + identity) * largest(identity - algebra.hat(x) / 2) / 2  # 2 (g + I)^-1 = I - X/2
+    condition = max_abs_entry(g + identity) * max_abs_entry(identity - algebra.hat(x) / 2) / 2  # 2 (g + I)^-1 = I - X/2
     return jnp.where((condition < CAYLEY_CONDITION_LIMIT)[..., None], x, jnp.nan)
 
 
@@ -75,32 +75,32 @@ def adjoint_cayley(algebra: LieAlgebra, x) -> jax.Array:
     ``ad y = 2 artanh(A/2) = int_0^1 A (I - t^2 A^2/4)^-1 dt`` with A = ad(x), by Gauss quadrature: right to rounding
     where the eigenvalues of A are imaginary and below 3, or real and below 1.5; to 1e-13 at 4, and to 1e-11 at 1.8.
     """
-    adjoint, identity = _adjoint(algebra), np.eye(algebra.dim)
+    adjoint, identity = _adjoint_representation(algebra), np.eye(algebra.dim)
     A = adjoint.hat(x)[..., None, :, :]
     parts = solve_near_identity(identity - _NODES[:, None, None] ** 2 / 4 * (A @ A), A + jnp.zeros((len(_NODES), 1, 1)))
-    return exp(algebra, adjoint.vee((_WEIGHTS[:, None, None] * parts).sum(axis=-3)) + central(algebra, x))
+    return exp(algebra, adjoint.vee((_WEIGHTS[:, None, None] * parts).sum(axis=-3)) + central_part(algebra, x))
 
 
 def from_adjoint_cayley(algebra: LieAlgebra, g) -> jax.Array:
     """The components x, none in the centre, with ``cay(ad x) = g``, for g of the size of the algebra, near I."""
     identity = np.eye(algebra.dim)
-    return _adjoint(algebra).vee(2 * solve_near_identity(g + identity, g - identity))
+    return _adjoint_representation(algebra).vee(2 * solve_near_identity(g + identity, g - identity))
 
 
-def central(algebra: LieAlgebra, x) -> jax.Array:
+def central_part(algebra: LieAlgebra, x) -> jax.Array:
     """The part of x in the centre of the algebra, the one orthogonal to it left out."""
-    adjoint = _adjoint(algebra)
+    adjoint = _adjoint_representation(algebra)
     return x - adjoint.vee(adjoint.hat(x))
 
 
 @cache
-def _adjoint(algebra: LieAlgebra) -> LieAlgebra:
+def _adjoint_representation(algebra: LieAlgebra) -> LieAlgebra:
     """The algebra with the matrices ad(e_a); ``vee`` finds the components with none in the centre."""
     constants = algebra.structure_constants
     return LieAlgebra(constants, name=f"ad({algebra.name})", basis=constants.swapaxes(1, 2))
 
 
-_OUTSIDE = 1e-3
+_MAX_OUTSIDE_FRACTION = 1e-3
 """Part of a logarithm outside of the algebra, relative to its size: more than rounding makes, less than 2 pi / n."""
 
 
@@ -117,7 +117,7 @@ def log(algebra: LieAlgebra, g) -> jax.Array:
 
     def far(state):
         s, _, converged = state
-        return converged & (_norm(s - identity) > 0.25)
+        return converged & (_one_norm(s - identity) > 0.25)
 
     def halve(state):
         s, halvings, converged = state
@@ -134,7 +134,7 @@ def log(algebra: LieAlgebra, g) -> jax.Array:
         series = identity / (2 * k + 1) + Z2 @ series
     X = size * identity + 2.0 ** (halvings + 1.0)[..., None, None] * Z @ series
     x = algebra.vee(X)
-    converged &= largest(X - algebra.hat(x)) < _OUTSIDE * (1.0 + largest(X))
+    converged &= max_abs_entry(X - algebra.hat(x)) < _MAX_OUTSIDE_FRACTION * (1.0 + max_abs_entry(X))
     remainder = algebra.vee(expm(algebra.hat(-x)) @ g - identity)
     x = x + solve(dexp(algebra, x), remainder[..., None])[..., 0]
     return jnp.where(converged[..., None], x, jnp.nan)

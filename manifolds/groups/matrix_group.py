@@ -19,11 +19,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._arrays import at, first, is_traced, real_components, square_matrices
+from .._arrays import first_true_index, format_index, is_traced, real_components, square_matrices
 from ..algebras.lie_algebra import LieAlgebra
 from ..errors import ComponentError, DomainError, LieAlgebraError
 from ..matrices.exponential import CAYLEY_CONDITION_LIMIT, cayley_of
-from ..matrices.linear import inverse, largest, solve
+from ..matrices.linear import inverse, max_abs_entry, solve
 from ..matrices.stumpff import HALF_TURN_MARGIN
 from . import closed_forms as closed
 from . import maps
@@ -31,16 +31,16 @@ from . import maps
 MEMBERSHIP_TOLERANCE = 1e-8
 """How far from the group, relative to its size, a matrix may lie for its logarithm to be taken."""
 
-LEAVES_TOLERANCE = 1e-10
+MAP_DEFECT_TOLERANCE = 1e-10
 """How far from the group, relative to its size, a map may end that is said to stay in it."""
 
-_LOG_NEEDS = (
+_LOG_DOMAIN_TEXT = (
     f"principal logarithm needs angles below pi - {HALF_TURN_MARGIN:.0e}, since at pi there may be a continuum "
     "to choose from (not where one plane of SO(n), SE(2) or SE(3) is turned by pi)"
 )
 
 _registry: list[tuple[Callable[..., MatrixGroup], tuple]] = []
-_catalogued: set[MatrixGroup] = set()
+_catalogued_groups: set[MatrixGroup] = set()
 """Groups made by a registered constructor: the property suite has tested their maps, so that no user waits for it."""
 
 
@@ -50,7 +50,7 @@ def register(*arguments: tuple):
     def remember(constructor):
         @wraps(constructor)
         def build(*arguments, **keywords):
-            _catalogued.add(group := constructor(*arguments, **keywords))
+            _catalogued_groups.add(group := constructor(*arguments, **keywords))
             return group
 
         _registry.extend((build, a) for a in arguments)
@@ -102,12 +102,12 @@ class MatrixGroup:
     cayley_map: Callable | None = maps.cayley
     inverse_cayley_map: Callable = maps.inverse_cayley
     adjoint_cayley_map: Callable | None = maps.adjoint_cayley
-    restore_map: Callable = closed.unchanged
+    restore_map: Callable = closed.return_unchanged
     equations: Callable | None = None
 
     def __post_init__(self) -> None:
         if getattr(self.defect, "__module__", "") != closed.__name__:  # those are known to take batches
-            object.__setattr__(self, "defect", _of_batches(self.defect, self.name, self.algebra._known_basis()))
+            object.__setattr__(self, "defect", _batch_defect(self.defect, self.name, self.algebra._require_basis()))
 
     @property
     def dim(self) -> int:
@@ -117,17 +117,17 @@ class MatrixGroup:
     @property
     def matrix_size(self) -> int:
         """Number m of rows of its matrices."""
-        return self.algebra._known_basis().shape[-1]
+        return self.algebra._require_basis().shape[-1]
 
     @property
     def is_complex(self) -> bool:
         """Whether its matrices have complex entries."""
-        return jnp.iscomplexobj(self.algebra._known_basis())
+        return jnp.iscomplexobj(self.algebra._require_basis())
 
     @property
     def identity(self) -> jax.Array:
         """The identity matrix, shape (m, m)."""
-        return jnp.eye(self.matrix_size, dtype=self.algebra._known_basis().dtype)
+        return jnp.eye(self.matrix_size, dtype=self.algebra._require_basis().dtype)
 
     def compose(self, g, h) -> jax.Array:
         """Product ``g h`` of group elements, shape (..., m, m)."""
@@ -142,9 +142,9 @@ class MatrixGroup:
             If g is singular. That g is in the group is taken for granted: see :meth:`belongs`.
         """
         g = self._element(g, "g")
-        inverse = _compiled(self.inverse_map, g)
-        if (index := _first_failure(inverse, 2)) is not None:
-            raise DomainError(f"{self.name}: g{at(index)} has no inverse: it is singular or not finite")
+        inverse = _call_compiled(self.inverse_map, g)
+        if (index := _first_nonfinite_index(inverse, 2)) is not None:
+            raise DomainError(f"{self.name}: g{format_index(index)} has no inverse: it is singular or not finite")
         return inverse
 
     def belongs(self, g, tolerance: float = 1e-10) -> jax.Array:
@@ -156,7 +156,7 @@ class MatrixGroup:
         -------
         array of bool, shape (...)
         """
-        return _compiled(self.defect, self._element(g, "g")) <= tolerance
+        return _call_compiled(self.defect, self._element(g, "g")) <= tolerance
 
     def random(self, key_or_seed, size: tuple[int, ...] = (), scale: float = 0.5) -> jax.Array:
         """Random elements ``exp(x)``, the components of x normal with standard deviation ``scale``; not Haar measure.
@@ -177,7 +177,7 @@ class MatrixGroup:
 
     def exp(self, x) -> jax.Array:
         """Exponential map, from components of the algebra, shape (..., dim), to the group, shape (..., m, m)."""
-        return _compiled(self.exp_map, self.algebra, self._components(x, "x"))
+        return _call_compiled(self.exp_map, self.algebra, self._components(x, "x"))
 
     def log(self, g) -> jax.Array:
         """Principal logarithm: the x with ``exp(x) = g`` and eigenvalues of ``hat(x)`` at heights below pi.
@@ -205,8 +205,10 @@ class MatrixGroup:
         """
         g = self._element(g, "g")
         x = _log(self, g)
-        if (index := _first_failure(x, 1)) is not None:
-            raise DomainError(f"log on {self.name}: g{at(index)} {self._why_not_in_domain(np.asarray(g[index]))}")
+        if (index := _first_nonfinite_index(x, 1)) is not None:
+            raise DomainError(
+                f"log on {self.name}: g{format_index(index)} {self._why_not_in_domain(np.asarray(g[index]))}"
+            )
         return x
 
     def cayley(self, x) -> jax.Array:
@@ -227,13 +229,13 @@ class MatrixGroup:
         DomainError
             If X has an eigenvalue 2, or for GL(n) also -2. Under tracing the result is NaN instead.
         """
-        self._need("cayley")
+        self._require_map("cayley")
         x = self._components(x, "x")
         g = _cayley(self, x)
-        if (index := _first_failure(g, 2)) is not None:
+        if (index := _first_nonfinite_index(g, 2)) is not None:
             x = np.asarray(x[index])
             why = self._why_no_cayley(x, self.algebra.hat(x) if np.isfinite(x).all() else x)
-            raise DomainError(f"cayley on {self.name}: x{at(index)} {why}")
+            raise DomainError(f"cayley on {self.name}: x{format_index(index)} {why}")
         return g
 
     def inverse_cayley(self, g) -> jax.Array:
@@ -246,12 +248,12 @@ class MatrixGroup:
         DomainError
             If g is not in the group or has the eigenvalue -1. Under tracing the result is NaN instead.
         """
-        self._need("cayley")
+        self._require_map("cayley")
         g = self._element(g, "g")
         x = _inverse_cayley(self, g)
-        if (index := _first_failure(x, 1)) is not None:
+        if (index := _first_nonfinite_index(x, 1)) is not None:
             why = self._why_not_in_domain(np.asarray(g[index]), "inverse Cayley map needs no eigenvalue -1", "map")
-            raise DomainError(f"inverse_cayley on {self.name}: g{at(index)} {why}")
+            raise DomainError(f"inverse_cayley on {self.name}: g{format_index(index)} {why}")
         return x
 
     def adjoint_cayley(self, x) -> jax.Array:
@@ -276,17 +278,17 @@ class MatrixGroup:
         DomainError
             If ad(x) has a real eigenvalue of size 2 or more. Under tracing the result is NaN instead.
         """
-        self._need("adjoint_cayley")
+        self._require_map("adjoint_cayley")
         assert self.adjoint_cayley_map is not None
         x = self._components(x, "x")
-        g = _compiled(self.adjoint_cayley_map, self.algebra, x)
-        if (index := _first_failure(g, 2)) is not None:
+        g = _call_compiled(self.adjoint_cayley_map, self.algebra, x)
+        if (index := _first_nonfinite_index(g, 2)) is not None:
             x = np.asarray(x[index])
             why = self._why_no_cayley(x, self.algebra.ad(x))
-            raise DomainError(f"adjoint_cayley on {self.name}: for ad(x), x{at(index)} {why}")
+            raise DomainError(f"adjoint_cayley on {self.name}: for ad(x), x{format_index(index)} {why}")
         return g
 
-    def leaves(self, kind: str) -> float:
+    def map_defect(self, kind: str) -> float:
         """How far a map of this group leads away from it: the largest :attr:`defect` at random elements of the algebra.
 
         Parameters
@@ -299,7 +301,7 @@ class MatrixGroup:
         float
             Of the order of rounding for a map that stays in the group; infinite where it gives no finite result.
         """
-        return _leaves(self, kind)
+        return _map_defect(self, kind)
 
     def Ad(self, g) -> jax.Array:
         """Adjoint action, the matrix of ``x -> vee(g hat(x) g^-1)``, shape (..., dim, dim).
@@ -313,9 +315,9 @@ class MatrixGroup:
         if not is_traced(g):
             with jax.ensure_compile_time_eval():  # g may be a constant in a program being traced
                 outside = ~np.asarray(self.belongs(g, MEMBERSHIP_TOLERANCE))
-                if (index := first(outside)) is not None:
+                if (index := first_true_index(outside)) is not None:
                     raise DomainError(
-                        f"Ad on {self.name}: g{at(index)} {self._why_not_in_domain(np.asarray(g[index]))}"
+                        f"Ad on {self.name}: g{format_index(index)} {self._why_not_in_domain(np.asarray(g[index]))}"
                     )
         return _adjoint_action(self, g)
 
@@ -344,13 +346,13 @@ class MatrixGroup:
 
     def _element(self, g, what: str) -> jax.Array:
         matrix = square_matrices(g, self.matrix_size, what)
-        if jnp.iscomplexobj(matrix) and not np.iscomplexobj(self.algebra._known_basis()):
+        if jnp.iscomplexobj(matrix) and not np.iscomplexobj(self.algebra._require_basis()):
             raise ComponentError(
                 f"{what} must be real for {self.name}, not {matrix.dtype}: take its real part if that is meant"
             )
-        return matrix.astype(self.algebra._known_basis().dtype)
+        return matrix.astype(self.algebra._require_basis().dtype)
 
-    def _why_not_in_domain(self, g: np.ndarray, needs: str = _LOG_NEEDS, image: str = "logarithm") -> str:
+    def _why_not_in_domain(self, g: np.ndarray, needs: str = _LOG_DOMAIN_TEXT, image: str = "logarithm") -> str:
         if not np.isfinite(g).all():
             return "has entries that are not finite"
         defect = float(self.defect(g))
@@ -377,29 +379,29 @@ class MatrixGroup:
 
     def cayley_is_adjoint(self) -> bool:
         """Whether :meth:`cayley` is :meth:`adjoint_cayley`: ``Ad(cayley(x)) = cay(ad(x))``, as for SO(3) and SE(2)."""
-        if self.cayley_map is None or self.cayley_map is self.adjoint_cayley_map or self in _catalogued:
-            return self.cayley_map is self.adjoint_cayley_map and self._stays("cayley")
-        return replace(self, adjoint_cayley_map=self.cayley_map)._stays("adjoint_cayley")
+        if self.cayley_map is None or self.cayley_map is self.adjoint_cayley_map or self in _catalogued_groups:
+            return self.cayley_map is self.adjoint_cayley_map and self._is_map_in_group("cayley")
+        return replace(self, adjoint_cayley_map=self.cayley_map)._is_map_in_group("adjoint_cayley")
 
-    def _stays(self, kind: str) -> bool:
+    def _is_map_in_group(self, kind: str) -> bool:
         """Whether the group has a map, and the map stays in it."""
         if getattr(self, f"{kind}_map") is None:
             return False
-        return self in _catalogued or self.leaves(kind) <= LEAVES_TOLERANCE
+        return self in _catalogued_groups or self.map_defect(kind) <= MAP_DEFECT_TOLERANCE
 
-    def _need(self, kind: str) -> None:
+    def _require_map(self, kind: str) -> None:
         """Raise unless the group has a map, and the map stays in it."""
-        if self._stays(kind):
+        if self._is_map_in_group(kind):
             return
-        what, otherwise = _MAPS[kind]
-        residual = self.leaves(kind)
-        if residual <= LEAVES_TOLERANCE:
+        what, otherwise = _MAP_TEXTS[kind]
+        residual = self.map_defect(kind)
+        if residual <= MAP_DEFECT_TOLERANCE:
             raise LieAlgebraError(f"{self.name} has been given None for its {kind}_map; {otherwise}")
         raise LieAlgebraError(
             f"{what} does not take {self.algebra.name} into {self.name}: at random elements it misses by "
-            f"{residual:.3g} (tolerance {LEAVES_TOLERANCE:.0e}); {otherwise}",
+            f"{residual:.3g} (tolerance {MAP_DEFECT_TOLERANCE:.0e}); {otherwise}",
             residual=residual,
-            tolerance=LEAVES_TOLERANCE,
+            tolerance=MAP_DEFECT_TOLERANCE,
         )
 
     def _why_no_cayley(self, x: np.ndarray, matrix) -> str:
@@ -414,7 +416,7 @@ class MatrixGroup:
 
 
 @dataclass(frozen=True)
-class _OfEach:
+class _BatchedFunction:
     """A function of one matrix, shape (m, m), as one of batches."""
 
     function: Callable
@@ -423,7 +425,7 @@ class _OfEach:
         return jnp.vectorize(self.function, signature="(m,n)->()")(g)
 
 
-def _of_batches(defect: Callable, name: str, basis: np.ndarray) -> Callable:
+def _batch_defect(defect: Callable, name: str, basis: np.ndarray) -> Callable:
     """The defect of a group as a function of batches; LieAlgebraError where it is none of a matrix."""
 
     def shape(batch: tuple[int, ...]) -> tuple[int, ...] | None:
@@ -439,10 +441,10 @@ def _of_batches(defect: Callable, name: str, basis: np.ndarray) -> Callable:
             f"the defect of {name} must be a number for a matrix, a JAX array of shape {basis.shape[1:]}: it gives "
             f"{'an error' if shape(()) is None else f'an array of shape {shape(())}'}"
         )
-    return _OfEach(defect)
+    return _BatchedFunction(defect)
 
 
-_MAPS = {
+_MAP_TEXTS = {
     "exp": ("the exponential map", "its defect, its exp_map or the matrices of its algebra are wrong"),
     "cayley": ("the Cayley map", "use exp"),
     "adjoint_cayley": ("the map that makes Cayley's of ad x an adjoint action", "use exp"),
@@ -454,14 +456,14 @@ _MAPS = {
 
 
 @partial(jax.jit, static_argnums=0)
-def _compiled(function: Callable, *arguments):
+def _call_compiled(function: Callable, *arguments):
     return function(*arguments)
 
 
 @partial(jax.jit, static_argnums=0)
 def _adjoint_action(group: MatrixGroup, g):
     g = g[..., None, :, :]
-    images = g @ group.algebra._known_basis() @ group.inverse_map(g)
+    images = g @ group.algebra._require_basis() @ group.inverse_map(g)
     return group.algebra.vee(images).swapaxes(-1, -2)
 
 
@@ -479,11 +481,11 @@ def _inverse_cayley(group: MatrixGroup, g):
 
 
 @cache
-def _leaves(group: MatrixGroup, kind: str) -> float:
+def _map_defect(group: MatrixGroup, kind: str) -> float:
     """See :meth:`MatrixGroup.leaves`."""
     algebra, x = group.algebra, np.random.default_rng(0).standard_normal((4, group.dim))
-    x /= np.linalg.norm(np.einsum("...a,aij->...ij", x, algebra._known_basis()), axis=(-2, -1))[:, None]
-    if kind == "adjoint_cayley" and not (miss := _automorphism_residual(algebra, x)) <= LEAVES_TOLERANCE:
+    x /= np.linalg.norm(np.einsum("...a,aij->...ij", x, algebra._require_basis()), axis=(-2, -1))[:, None]
+    if kind == "adjoint_cayley" and not (miss := _automorphism_residual(algebra, x)) <= MAP_DEFECT_TOLERANCE:
         return miss
     move = getattr(group, f"{kind}_map") or getattr(maps, kind)
 
@@ -494,7 +496,7 @@ def _leaves(group: MatrixGroup, kind: str) -> float:
         if kind != "adjoint_cayley":
             return miss
         wanted = cayley_of(algebra.ad(x))
-        return jnp.maximum(miss, largest(_adjoint_action(group, g) - wanted) / largest(wanted))
+        return jnp.maximum(miss, max_abs_entry(_adjoint_action(group, g) - wanted) / max_abs_entry(wanted))
 
     with jax.ensure_compile_time_eval():  # it may be asked for while a program is being traced
         return float(np.nan_to_num(np.asarray(misses(x)), nan=np.inf).max())
@@ -527,8 +529,8 @@ def _log_derivative(group: MatrixGroup, primals, tangents):
 _log = jax.jit(_principal_log, static_argnums=0)
 
 
-def _first_failure(result, core: int) -> tuple[int, ...] | None:
+def _first_nonfinite_index(result, core: int) -> tuple[int, ...] | None:
     """Batch index of the first result that is not finite, its last ``core`` axes one element; None while tracing."""
     if is_traced(result):
         return None
-    return first(~np.isfinite(np.asarray(result)).all(axis=tuple(range(-core, 0))))
+    return first_true_index(~np.isfinite(np.asarray(result)).all(axis=tuple(range(-core, 0))))

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..algebras.lie_algebra import LieAlgebra
 from ..matrices.stumpff import HALF_TURN_MARGIN, leading_sign
-from ..matrices.symmetric import eigh, symmetrized
+from ..matrices.symmetric import eigh, symmetrize
 from .maps import log
 
 
@@ -19,23 +19,25 @@ def rotation_log(algebra: LieAlgebra, g) -> jax.Array:
     ``log g = log(g exp(-pi J)) + pi J``. Where more than one plane is turned by pi, J may be any element of a
     continuum, and the result is NaN.
     """
-    values, vectors = eigh(symmetrized(g))
-    first = _least(values)
-    second = _least(jnp.where(first, jnp.inf, values))
+    values, vectors = eigh(symmetrize(g))
+    first = _first_minimum_mask(values)
+    second = _first_minimum_mask(jnp.where(first, jnp.inf, values))
     third = jnp.where(first | second, jnp.inf, values).min(axis=-1, keepdims=True)
     u, v = ((vectors * column[..., None, :]).sum(axis=-1) for column in (first, second))
     J = v[..., :, None] * u[..., None, :] - u[..., :, None] * v[..., None, :]
     sine = (J * (g - g.swapaxes(-1, -2))).sum(axis=(-2, -1))[..., None] / 4
     sign = jnp.where(jnp.abs(sine) > HALF_TURN_MARGIN, jnp.sign(sine), leading_sign(algebra.vee(J)))
-    is_turned = (jnp.where(second, values, 0.0).min(axis=-1, keepdims=True) < _TURNED) & (third > _TURNED)
+    is_turned = (jnp.where(second, values, 0.0).min(axis=-1, keepdims=True) < _MAX_HALF_TURN_COSINE) & (
+        third > _MAX_HALF_TURN_COSINE
+    )
     J = jnp.where(is_turned[..., None], sign[..., None] * J, 0.0)
     return log(algebra, g @ (np.eye(g.shape[-1]) + 2 * J @ J)) + jnp.pi * algebra.vee(J)
 
 
-_TURNED = -1.0 + 2e-15
+_MAX_HALF_TURN_COSINE = -1.0 + 2e-15
 """Cosines below this are those of a half turn: angles that differ by less than 6e-8, and rounding."""
 
 
-def _least(values):
+def _first_minimum_mask(values):
     """Where the first of the smallest entries along the last axis is."""
     return jnp.arange(values.shape[-1]) == jnp.argmin(values, axis=-1)[..., None]  # no index that varies

@@ -8,16 +8,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._arrays import as_numeric
+from .._arrays import numeric_array
 from ..errors import ParameterError
 from ..matrices.linear import solve
 from .matrix_group import MatrixGroup
 
-CLOSED = 1e-10
+SUBALGEBRA_TOLERANCE = 1e-10
 """What of a bracket of unit vectors may be off the subalgebra."""
 
 
-def subalgebra(group: MatrixGroup, stabilizer) -> np.ndarray:
+def subalgebra_basis(group: MatrixGroup, stabilizer) -> np.ndarray:
     """Orthonormal components of what spans a subalgebra, shape (k, dim of the group).
 
     Parameters
@@ -31,7 +31,7 @@ def subalgebra(group: MatrixGroup, stabilizer) -> np.ndarray:
     ParameterError
         If the matrices are dependent, not in the algebra of the group, or do not span a subalgebra.
     """
-    basis, matrices = group.algebra._known_basis(), np.asarray(as_numeric(stabilizer, "stabilizer"))
+    basis, matrices = group.algebra._require_basis(), np.asarray(numeric_array(stabilizer, "stabilizer"))
     matrices = matrices.reshape(-1, *basis.shape[1:]) if matrices.size == 0 else matrices
     if matrices.shape[1:] != basis.shape[1:]:
         n = group.matrix_size
@@ -47,7 +47,7 @@ def subalgebra(group: MatrixGroup, stabilizer) -> np.ndarray:
 
     given = components(matrices)
     outside = np.abs(matrices - matrix(given)).max(axis=(1, 2), initial=0.0)
-    if (outside > CLOSED).any():
+    if (outside > SUBALGEBRA_TOLERANCE).any():
         raise ParameterError(
             f"matrix {int(np.argmax(outside))} of the stabilizer is not in the algebra of {group.name}: it is "
             f"{outside.max():.2g} off"
@@ -60,7 +60,7 @@ def subalgebra(group: MatrixGroup, stabilizer) -> np.ndarray:
     for j, i in itertools.combinations(range(len(rows)), 2):
         a, b = matrix(rows[i]), matrix(rows[j])
         bracket = components(a @ b - b @ a)
-        if (off := np.linalg.norm(bracket - rows.T @ (rows @ bracket))) > CLOSED:
+        if (off := np.linalg.norm(bracket - rows.T @ (rows @ bracket))) > SUBALGEBRA_TOLERANCE:
             raise ParameterError(
                 f"the stabilizer in {group.name} is no subalgebra: the bracket of its directions {j} and {i} is "
                 f"{off:.2g} off their span; add what is missing"
@@ -68,11 +68,11 @@ def subalgebra(group: MatrixGroup, stabilizer) -> np.ndarray:
     return rows
 
 
-_MOST_STEPS = 30
+_MAX_NEWTON_STEPS = 30
 """Iterations of Newton's method."""
 
 
-def factored(group: MatrixGroup, m: np.ndarray, h: np.ndarray, way, reach: float):
+def factor_element(group: MatrixGroup, m: np.ndarray, h: np.ndarray, way, reach: float):
     """The c, shape (dim of m,), with b, for which ``exp(c m) exp(b h)`` is an element of the group.
 
     Parameters
@@ -111,7 +111,7 @@ def factored(group: MatrixGroup, m: np.ndarray, h: np.ndarray, way, reach: float
         return z + move, jnp.abs(move).max(), steps + 1
 
     def newton(_, start):
-        unfinished = lambda state: (state[1] > 1e-8) & (state[2] < _MOST_STEPS)  # noqa: E731
+        unfinished = lambda state: (state[1] > 1e-8) & (state[2] < _MAX_NEWTON_STEPS)  # noqa: E731
         z, change, _ = jax.lax.while_loop(unfinished, step, (start, jnp.inf, 0))
         found = ((z[:d] ** 2).sum() < reach**2) & (change <= 1e-8) & (jnp.abs(gap(z, way)).max() <= 1e-10)
         return jnp.where(found, z, jnp.nan)

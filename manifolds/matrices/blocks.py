@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from .._module import Module
+from .._pytree_module import Module
 
 
 class BlockDiagonal(Module):

@@ -24,13 +24,13 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 
-class Chained(Protocol):
+class MatrixFunction(Protocol):
     """A function of matrices; equal ones are one function, and they can be hashed.
 
     ``unrolled`` says that every operation becomes scalar instructions.
     """
 
-    def prepared(self, a, unrolled: bool) -> tuple[jax.Array, ...]:
+    def decompose(self, a, unrolled: bool) -> tuple[jax.Array, ...]:
         """What all chains have in common that one of the matrices is in, such as its eigenvectors."""
         ...
 
@@ -47,47 +47,47 @@ are as many leading axes of all, and what has one of length 1 is the same along 
 """
 
 
-def chain(function: Chained, matrices, slots, shifts, directions=()) -> jax.Array:
+def chain(function: MatrixFunction, matrices, slots, shifts, directions=()) -> jax.Array:
     """The chain, for arrays whose types, and numbers of leading axes, are made alike."""
     arrays = [*matrices, *directions]
     dtype = jnp.result_type(*arrays)
     rank = max(*(np.ndim(a) - 2 for a in arrays), np.ndim(shifts) - 1)
-    alike = [_of_rank(a.astype(dtype), rank + 2) for a in arrays]
-    shifts = _of_rank(shifts, rank + 1)
+    alike = [_with_rank(a.astype(dtype), rank + 2) for a in arrays]
+    shifts = _with_rank(shifts, rank + 1)
     m = len(matrices)
     return chain_p.bind(*alike[:m], shifts, *alike[m:], function=function, slots=tuple(slots))
 
 
-def _of_rank(a, rank: int):
+def _with_rank(a, rank: int):
     return a if a.ndim == rank else a.reshape((1,) * (rank - a.ndim) + a.shape)
 
 
-def evaluated(*arrays, function: Chained, slots: tuple[int, ...]) -> jax.Array:
+def evaluate_chain(*arrays, function: MatrixFunction, slots: tuple[int, ...]) -> jax.Array:
     """What the primitive computes, in terms of others."""
-    matrices, shifts, directions = _parts(arrays, slots)
-    prepared = [function.prepared(a, unrolled=False) for a in matrices]
+    matrices, shifts, directions = _split_arguments(arrays, slots)
+    prepared = [function.decompose(a, unrolled=False) for a in matrices]
     return function.chain(prepared, slots, shifts, directions, unrolled=False)
 
 
-def _parts(arrays, slots) -> tuple[list, Any, list]:
+def _split_arguments(arrays, slots) -> tuple[list, Any, list]:
     m = len(arrays) - len(slots)
     return list(arrays[:m]), arrays[m], list(arrays[m + 1 :])
 
 
 @functools.partial(jax.jit, static_argnames=("function", "slots"))
-def _run(*arrays, function, slots):
-    return evaluated(*arrays, function=function, slots=slots)
+def _evaluate_compiled(*arrays, function, slots):
+    return evaluate_chain(*arrays, function=function, slots=slots)
 
 
-def _abstract(*avals, function, slots):
+def _abstract_eval(*avals, function, slots):
     rank = avals[0].ndim - 2
     front = jnp.broadcast_shapes(*(a.shape[:rank] for a in avals))
     return jax.core.ShapedArray((*front, avals[slots[0]].shape[-1], avals[slots[-1]].shape[-1]), avals[0].dtype)
 
 
 def _jvp(primals, tangents, *, function, slots):
-    matrices, shifts, directions = _parts(primals, slots)
-    by_matrices, by_shifts, by_directions = _parts(tangents, slots)
+    matrices, shifts, directions = _split_arguments(primals, slots)
+    by_matrices, by_shifts, by_directions = _split_arguments(tangents, slots)
     bind = functools.partial(chain_p.bind, *matrices, function=function)
     terms = []
     for j, dE in enumerate(by_directions):
@@ -107,7 +107,7 @@ def _jvp(primals, tangents, *, function, slots):
 
 
 def _transpose(ct, *arrays, function, slots):
-    matrices, shifts, directions = _parts(arrays, slots)
+    matrices, shifts, directions = _split_arguments(arrays, slots)
     (j,) = (i for i, E in enumerate(directions) if ad.is_undefined_primal(E))
     if type(ct) is ad.Zero:
         return [None] * len(arrays)
@@ -126,9 +126,9 @@ def _batch(arrays, axes, *, function, slots):
     return chain_p.bind(*alike, function=function, slots=slots), 0
 
 
-chain_p.def_impl(_run)
-chain_p.def_abstract_eval(_abstract)
+chain_p.def_impl(_evaluate_compiled)
+chain_p.def_abstract_eval(_abstract_eval)
 ad.primitive_jvps[chain_p] = _jvp
 ad.primitive_transposes[chain_p] = _transpose
 batching.primitive_batchers[chain_p] = _batch
-mlir.register_lowering(chain_p, mlir.lower_fun(evaluated, multiple_results=False))
+mlir.register_lowering(chain_p, mlir.lower_fun(evaluate_chain, multiple_results=False))

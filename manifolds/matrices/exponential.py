@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .chains import chain
-from .linear import _norm, largest, solve
+from .linear import _one_norm, max_abs_entry, solve
 
 CAYLEY_CONDITION_LIMIT = 1e12
 """Condition number of I - X/2 above which X counts as a pole of the Cayley map."""
@@ -30,7 +30,7 @@ def expm(X) -> jax.Array:
 class Exponential:
     """The exponential of any matrices: see :class:`.chains.Chained`."""
 
-    def prepared(self, a, unrolled: bool) -> tuple[jax.Array, ...]:
+    def decompose(self, a, unrolled: bool) -> tuple[jax.Array, ...]:
         return (a,)
 
     def chain(self, prepared, slots, shifts, directions, unrolled: bool) -> jax.Array:
@@ -45,8 +45,8 @@ class Exponential:
             for j, slot in enumerate(slots)
         ]
         if k == 0:
-            return _exponential(diagonal[0], unrolled)
-        sizes = [largest(E)[..., None, None] for E in directions]
+            return _pade_exponential(diagonal[0], unrolled)
+        sizes = [max_abs_entry(E)[..., None, None] for E in directions]
         sizes = [jnp.where(size > 0.0, size, 1.0) for size in sizes]
         front = jnp.broadcast_shapes(*(a.shape[:-2] for a in (*diagonal, *directions)))
         rows = []
@@ -57,17 +57,17 @@ class Exponential:
                 E = directions[i] / sizes[i]
                 blocks[i + 1] = jnp.broadcast_to(E, (*front, *E.shape[-2:]))
             rows.append(jnp.concatenate(blocks, axis=-1))
-        whole = _exponential(jnp.concatenate(rows, axis=-2), unrolled)
+        whole = _pade_exponential(jnp.concatenate(rows, axis=-2), unrolled)
         found = whole[..., : diagonal[0].shape[-1], -diagonal[-1].shape[-1] :]
         for size in sizes:
             found = found * size
         return found
 
 
-def _exponential(X, unrolled: bool) -> jax.Array:
+def _pade_exponential(X, unrolled: bool) -> jax.Array:
     identity = np.eye(X.shape[-1])
-    squarings = jnp.ceil(jnp.log2(jnp.maximum(_norm(X) / _PADE_RADIUS, 1.0)))[..., None, None]
-    Y, b = X / 2.0**squarings, _PADE
+    squarings = jnp.ceil(jnp.log2(jnp.maximum(_one_norm(X) / _PADE_RADIUS, 1.0)))[..., None, None]
+    Y, b = X / 2.0**squarings, _PADE_COEFFICIENTS
     Y2 = Y @ Y
     Y4 = Y2 @ Y2
     Y6 = Y4 @ Y2
@@ -80,14 +80,14 @@ def _exponential(X, unrolled: bool) -> jax.Array:
         k, g = state
         return k + 1.0, jnp.where(k < squarings, g @ g, g)
 
-    most = jnp.minimum(jnp.max(squarings), _MOST_SQUARINGS)
+    most = jnp.minimum(jnp.max(squarings), _MAX_SQUARINGS)
     g = jax.lax.while_loop(lambda state: state[0] < most, square, (jnp.zeros(()), g))[1]
-    return jnp.where(squarings <= _MOST_SQUARINGS, g, jnp.nan)
+    return jnp.where(squarings <= _MAX_SQUARINGS, g, jnp.nan)
 
 
 _PADE_RADIUS = 5.371920351148152
-_PADE = [math.comb(13, k) * math.factorial(26 - k) / math.factorial(26) for k in range(14)]
-_MOST_SQUARINGS = 16
+_PADE_COEFFICIENTS = [math.comb(13, k) * math.factorial(26 - k) / math.factorial(26) for k in range(14)]
+_MAX_SQUARINGS = 16
 
 
 def cayley_of(X) -> jax.Array:
@@ -95,5 +95,5 @@ def cayley_of(X) -> jax.Array:
     identity = jnp.eye(X.shape[-1])
     denominator = identity - X / 2
     g = identity + solve(denominator, X)
-    condition = largest(denominator) * largest(identity + g) / 2  # I + g = 2 (I - X/2)^-1
+    condition = max_abs_entry(denominator) * max_abs_entry(identity + g) / 2  # I + g = 2 (I - X/2)^-1
     return jnp.where((condition < CAYLEY_CONDITION_LIMIT)[..., None, None], g, jnp.nan)

@@ -12,7 +12,7 @@ def adjoint(a):
     return a.conj().swapaxes(-1, -2)
 
 
-def orthonormalized(u) -> jax.Array:
+def newton_schulz_step(u) -> jax.Array:
     """One step of Newton and Schulz towards the nearest matrix with orthonormal columns.
 
     It squares the distance of ``u^H u`` from I.
@@ -20,7 +20,7 @@ def orthonormalized(u) -> jax.Array:
     return 1.5 * u - 0.5 * u @ (adjoint(u) @ u)
 
 
-def complement(u) -> jax.Array:
+def orthonormal_complement(u) -> jax.Array:
     """Columns that complete the orthonormal ones of u, shape (..., n, p), to a basis, shape (..., n, n - p).
 
     By Householder reflections, which take u to the first axes; smooth where none of its pivots changes sign.
@@ -53,19 +53,19 @@ def _square_root(a):
 
     def unfinished(state):
         _, change, steps = state
-        return ((change > 1e-8) & (steps < _MOST_ROOT_STEPS)).any()
+        return ((change > 1e-8) & (steps < _MAX_ROOT_STEPS)).any()
 
     def newton(state):
         roots, _, steps = state
         new = (roots + inverse(roots[::-1])) / 2
-        return new, largest(new[0] - roots[0]) / largest(new[0]), steps + 1
+        return new, max_abs_entry(new[0] - roots[0]) / max_abs_entry(new[0]), steps + 1
 
     roots = jnp.stack([a, jnp.broadcast_to(np.eye(a.shape[-1], dtype=a.dtype), a.shape)])
     roots, change, _ = jax.lax.while_loop(unfinished, newton, (roots, jnp.full(a.shape[:-2], jnp.inf), 0))
     return *roots, change <= 1e-8  # quadratic convergence: a step of 1e-8 ends at rounding
 
 
-_MOST_ROOT_STEPS = 33
+_MAX_ROOT_STEPS = 33
 """Enough for every angle up to pi - HALF_TURN_MARGIN, and little more."""
 
 
@@ -102,7 +102,7 @@ def solve_near_identity(a, b) -> jax.Array:
     return jax.lax.fori_loop(0, a.shape[-1], step, jnp.concatenate([a, b], axis=-1))[..., : b.shape[-1]]
 
 
-def lyapunov(g, c) -> jax.Array:
+def solve_lyapunov(g, c) -> jax.Array:
     """Symmetric s with ``g s + s g = c``, symmetric, of one or two rows, by Cayley and Hamilton's theorem."""
     if g.shape[-1] == 1:
         return c / (2.0 * g)
@@ -116,7 +116,7 @@ def inverse(a) -> jax.Array:
     return solve(a, jnp.broadcast_to(np.eye(a.shape[-1], dtype=a.dtype), a.shape))
 
 
-def turned_by(B, w, A) -> jax.Array:
+def conjugate_by_stages(B, w, A) -> jax.Array:
     """``U_i w U_i^H``, shape (s, n, n), where the U_i are the stages of ``U' = B U`` from the identity.
 
     Multiples of the identity are left out of B: they move the phase of U alone, and may be large.
@@ -130,13 +130,13 @@ def turned_by(B, w, A) -> jax.Array:
         The matrix of a Runge-Kutta method, times the step.
     """
     s, n = B.shape[:2]
-    table = (A[:, None, :, None] * _traceless(B).swapaxes(0, 1)).reshape(s * n, s * n)
+    table = (A[:, None, :, None] * _remove_trace(B).swapaxes(0, 1)).reshape(s * n, s * n)
     solver = solve_near_identity if s == 1 else solve  # whose matrix is 1 less a skew-Hermitian one
     stages = solver(np.eye(s * n) - table, jnp.asarray(np.tile(np.eye(n, dtype=B.dtype), (s, 1)))).reshape(s, n, n)
     return stages @ w @ adjoint(stages)
 
 
-def _traceless(a):
+def _remove_trace(a):
     """Matrices, shape (..., n, n), less multiples of the identity."""
     n = a.shape[-1]
     return a - (jnp.trace(a, axis1=-2, axis2=-1) / n)[..., None, None] * np.eye(n)
@@ -148,8 +148,8 @@ def cayley_rate(k, b) -> jax.Array:
     Both are taken without their traces, and k' is without one: it moves U by B and a multiple of the identity, which
     changes the phase of U alone.
     """
-    half, one = 0.5 * _traceless(k), np.eye(k.shape[-1])
-    found, square = (one - half) @ _traceless(b) @ (one + half), one - half @ half
+    half, one = 0.5 * _remove_trace(k), np.eye(k.shape[-1])
+    found, square = (one - half) @ _remove_trace(b) @ (one + half), one - half @ half
     return found - (jnp.trace(found) / jnp.trace(square)) * square
 
 
@@ -168,13 +168,13 @@ def determinant(a) -> jax.Array:
     """Determinant: the sum of products of at most three rows, or the signed product of the pivots."""
     if a.shape[-1] <= 3:
         first, *rest = jnp.moveaxis(a, (-2, -1), (0, 1))
-        return _volume(first, *rest)
+        return _determinant_by_minors(first, *rest)
     det = _eliminate(a, a[..., :0])[1]
     # a matrix of numbers leads to NaN only by way of a pivot of zero
     return jnp.where(jnp.isnan(det) & jnp.isfinite(a).all(axis=(-2, -1)), 0.0, det)
 
 
-def _volume(first, *rest):
+def _determinant_by_minors(first, *rest):
     """The determinant of a few rows, by minors."""
     if not rest:
         return first[0]
@@ -184,25 +184,25 @@ def _volume(first, *rest):
     return first[0] * (b * f - c * e) + first[1] * (c * d - a * f) + first[2] * (a * e - b * d)
 
 
-def skew(w, n: int) -> jax.Array:
+def skew_matrix(w, n: int) -> jax.Array:
     """The skew matrices with the entries w above the diagonal, row by row, shape (..., n, n)."""
     upper = jnp.zeros((*w.shape[:-1], n, n)).at[..., *np.triu_indices(n, 1)].add(w)
     return upper - upper.swapaxes(-1, -2)
 
 
-def symmetric(w, n: int) -> jax.Array:
+def symmetric_matrix(w, n: int) -> jax.Array:
     """The symmetric matrices with the entries w on and above the diagonal, row by row, shape (..., n, n)."""
     places = np.zeros((n, n), int)
     places[np.triu_indices(n)] = np.arange(w.shape[-1])
     return w[..., np.maximum(places, places.T)]
 
 
-def largest(matrix) -> jax.Array:
+def max_abs_entry(matrix) -> jax.Array:
     """Largest absolute value of the entries."""
     return jnp.abs(matrix).max(axis=(-2, -1))
 
 
-def _norm(matrix) -> jax.Array:
+def _one_norm(matrix) -> jax.Array:
     return jnp.abs(matrix).sum(axis=-2).max(axis=-1)
 
 

@@ -14,11 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from .chains import chain
-from .divided import ScalarFunction, scalar_function
+from .divided_differences import ScalarFunction, scalar_function
 from .linear import adjoint
 from .symmetric import eigh
 
-SMALL = 3
+MAX_JACOBI_ROWS = 3
 """Rows up to which eigenvectors are found by rotations; beyond, LAPACK is called."""
 
 
@@ -41,7 +41,7 @@ def spectral(f: Callable | ScalarFunction, a) -> jax.Array:
     array, shape (..., n, n)
         NaN where f is not defined at an eigenvalue.
     """
-    return chain(Spectral(scalar_function(f)), [jnp.asarray(a)], (0,), np.zeros(1))
+    return chain(SpectralFunction(scalar_function(f)), [jnp.asarray(a)], (0,), np.zeros(1))
 
 
 def spectral_trace(f: Callable | ScalarFunction, a) -> jax.Array:
@@ -52,19 +52,19 @@ def spectral_trace(f: Callable | ScalarFunction, a) -> jax.Array:
     f, a
         As for :func:`spectral`.
     """
-    return _trace(scalar_function(f), jnp.asarray(a))
+    return _spectral_trace(scalar_function(f), jnp.asarray(a))
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _trace(f: ScalarFunction, a):
+def _spectral_trace(f: ScalarFunction, a):
     return jnp.trace(spectral(f, a), axis1=-2, axis2=-1).real
 
 
-@_trace.defjvp
+@_spectral_trace.defjvp
 def _trace_derivative(f, primals, tangents):
     (a,), (da,) = primals, tangents
-    slope = spectral(f.differentiated, a)
-    return _trace(f, a), jnp.sum(slope.swapaxes(-1, -2) * da, axis=(-2, -1)).real
+    slope = spectral(f.derivative_function, a)
+    return _spectral_trace(f, a), jnp.sum(slope.swapaxes(-1, -2) * da, axis=(-2, -1)).real
 
 
 def spectral_difference(f: Callable | ScalarFunction, a, b) -> jax.Array:
@@ -81,7 +81,9 @@ def spectral_difference(f: Callable | ScalarFunction, a, b) -> jax.Array:
         Hermitian.
     """
     a, b = jnp.asarray(a), jnp.asarray(b)
-    found = chain(Spectral(scalar_function(f)), [a, b], (0, 1), np.zeros(2), [np.eye(a.shape[-1], dtype=a.dtype)])
+    found = chain(
+        SpectralFunction(scalar_function(f)), [a, b], (0, 1), np.zeros(2), [np.eye(a.shape[-1], dtype=a.dtype)]
+    )
     return (found + adjoint(found)) / 2
 
 
@@ -100,16 +102,16 @@ def log_mean(logs, shift, x) -> jax.Array:
     x : array, shape (..., n, n)
     """
     shift = jnp.asarray(shift)
-    return chain(Spectral(scalar_function(jnp.exp)), [logs], (0, 0), jnp.stack([-shift, shift], axis=-1), [x])
+    return chain(SpectralFunction(scalar_function(jnp.exp)), [logs], (0, 0), jnp.stack([-shift, shift], axis=-1), [x])
 
 
 @dataclass(frozen=True)
-class Spectral:
+class SpectralFunction:
     """A function of the eigenvalues of Hermitian matrices: see :class:`.chains.Chained`."""
 
     function: ScalarFunction
 
-    def prepared(self, a, unrolled: bool) -> tuple[jax.Array, jax.Array]:
+    def decompose(self, a, unrolled: bool) -> tuple[jax.Array, jax.Array]:
         return _eigenvectors(a)
 
     def chain(self, prepared, slots, shifts, directions, unrolled: bool) -> jax.Array:
@@ -119,7 +121,7 @@ class Spectral:
             (found[slot][0] + shifts[..., j, None])[(..., *(slice(None) if i == j else None for i in range(k + 1)))]
             for j, slot in enumerate(slots)
         ]
-        weights, adjoints = self.function.divided(*points), [adjoint(u) for u in vectors]
+        weights, adjoints = self.function.divided_difference(*points), [adjoint(u) for u in vectors]
         inner = [adjoints[j] @ E @ vectors[j + 1] for j, E in enumerate(directions)]
         if k == 0:
             return (vectors[0] * weights[..., None, :]) @ adjoints[0]
@@ -134,7 +136,7 @@ class Spectral:
 
 def _eigenvectors(a) -> tuple[jax.Array, jax.Array]:
     a = (a + adjoint(a)) / 2
-    if a.shape[-1] > SMALL:
+    if a.shape[-1] > MAX_JACOBI_ROWS:
         vectors, values = jax.lax.linalg.eigh(a, symmetrize_input=False, sort_eigenvalues=False)
         return values, vectors
     return eigh(a)

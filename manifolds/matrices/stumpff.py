@@ -33,7 +33,7 @@ def hyperbolic_stumpff(order: int, z) -> jax.Array:
     return _piecewise(_stumpff_series(order, 1.0), far, z, 1.0)
 
 
-def arc(z, cosine) -> jax.Array:
+def angle_over_sine(z, cosine) -> jax.Array:
     """``atan2(s, c) / s`` with ``z = s**2``: the angle over the sine, for sine and cosine of any common scale.
 
     Smooth where z = 0 and c > 0; not finite where z = 0 and c < 0, at the angle pi.
@@ -41,11 +41,11 @@ def arc(z, cosine) -> jax.Array:
     small = (cosine > 0) & (z < 0.01 * cosine**2)
     s = jnp.sqrt(jnp.where(small, 1.0, z))
     c = jnp.where(small, cosine, 1.0)
-    near = _series([(-1.0) ** k / (2 * k + 1) for k in range(9)], jnp.where(small, z, 0.0) / c**2) / c
+    near = _power_series([(-1.0) ** k / (2 * k + 1) for k in range(9)], jnp.where(small, z, 0.0) / c**2) / c
     return jnp.where(small, near, jnp.arctan2(s, cosine) / s)
 
 
-def hyperbolic_arc(z) -> jax.Array:
+def arcsinh_over_sinh(z) -> jax.Array:
     """``arcsinh(s) / s`` with ``z = s**2``, smooth at 0."""
     terms = [(-0.25) ** k * math.comb(2 * k, k) / (2 * k + 1) for k in range(9)]
     return _piecewise(terms, lambda s: jnp.arcsinh(s) / s, z, 0.01)
@@ -57,14 +57,14 @@ def leading_sign(x) -> jax.Array:
     The axis of a half turn is taken to have the sign 1: of the two logarithms one is so chosen, and rounding chooses no
     other. Within HALF_TURN_MARGIN of the half turn its angle may then be larger than pi by as much.
     """
-    sign, least = jnp.ones((*x.shape[:-1], 1)), HALF_TURN_MARGIN * jnp.sqrt(_square(x))
+    sign, least = jnp.ones((*x.shape[:-1], 1)), HALF_TURN_MARGIN * jnp.sqrt(_squared_length(x))
     for i in reversed(range(x.shape[-1])):
         component = x[..., i : i + 1]
         sign = jnp.where(component > least, 1.0, jnp.where(component < -least, -1.0, sign))
     return sign
 
 
-def _root(z):
+def _root_or_nan(z):
     """``sqrt(z)``, NaN where z <= 0."""
     return jnp.sqrt(jnp.where(z > 0.0, z, jnp.nan))
 
@@ -77,7 +77,7 @@ def _sinhc(t: jax.Array) -> jax.Array:
     return jnp.sinh(t) / t
 
 
-def _series(coefficients: list[float], z) -> jax.Array:
+def _power_series(coefficients: list[float], z) -> jax.Array:
     """``sum_k coefficients[k] z^k``."""
     total = jnp.zeros_like(z)
     for coefficient in reversed(coefficients):
@@ -96,10 +96,10 @@ def _piecewise(coefficients: list[float], far: Callable, z, radius: float) -> ja
     Both sides see arguments where they are smooth, so no NaN gradient.
     """
     small = z < radius
-    near = _series(coefficients, jnp.where(small, z, 0.0))
+    near = _power_series(coefficients, jnp.where(small, z, 0.0))
     return jnp.where(small, near, far(jnp.sqrt(jnp.where(small, 1.0, z))))
 
 
-def _square(x: jax.Array) -> jax.Array:
+def _squared_length(x: jax.Array) -> jax.Array:
     """``|x|^2``, shape (..., 1)."""
     return jnp.sum(x**2, axis=-1, keepdims=True)

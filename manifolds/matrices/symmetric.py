@@ -13,17 +13,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from .exponential import expm
-from .linear import adjoint, largest, orthonormalized, solve
+from .linear import adjoint, max_abs_entry, newton_schulz_step, solve
 from .stumpff import hyperbolic_stumpff
 
-_NEARLY_ONE = 0.5
+_MAX_EXCESS_FOR_LOG1P = 0.5
 """Largest entry of w - I up to which the logarithm of w takes the eigenvalues of w - I, not those of w."""
 
-_RANK = 1e-13
+_RANK_TOLERANCE = 1e-13
 """Eigenvalues and pivots of semidefinite matrices, relative to the largest, that rounding alone may have made."""
 
 
-def symmetrized(a) -> jax.Array:
+def symmetrize(a) -> jax.Array:
     """``(a + a^T) / 2``."""
     return 0.5 * (a + a.swapaxes(-1, -2))
 
@@ -53,7 +53,7 @@ def orthonormal_columns(a) -> jax.Array:
     """The Q of ``a = Q R`` with R upper triangular and its diagonal positive, for a of full rank, shape (..., n, p)."""
     q = adjoint(solve_lower(cholesky(adjoint(a) @ a), adjoint(a)))
     for _ in range(3):  # the product squares the condition number of a
-        q = orthonormalized(q)
+        q = newton_schulz_step(q)
     return q
 
 
@@ -66,28 +66,28 @@ def eigh(a) -> tuple[jax.Array, jax.Array]:
     """
     n = a.shape[-1]
     # one or two sweeps more than random matrices of size 3, 10, 30, 50 need: 4, 7, 8, 9
-    axes = _axes_of_sweeps(n, 1 if n == 2 else 4 + n.bit_length())
+    axes = _sweep_plane_axes(n, 1 if n == 2 else 4 + n.bit_length())
 
     def rotate(state, axes):
         a, vectors = state
         e, f = axes
-        J = _rotation(axes, *(u @ a @ v for u, v in ((e, e), (f, f), (e, f))))
+        J = _jacobi_rotation(axes, *(u @ a @ v for u, v in ((e, e), (f, f), (e, f))))
         return (adjoint(J) @ a @ J, vectors @ J), None
 
     start = (a + adjoint(a)) / 2, jnp.broadcast_to(np.eye(n, dtype=a.dtype), a.shape)
     (d, vectors), _ = jax.lax.scan(rotate, start, axes)
     values = jnp.diagonal(d, axis1=-2, axis2=-1).real
-    converged = largest(d * (1.0 - np.eye(n))) <= 1e-14 * largest(a)
+    converged = max_abs_entry(d * (1.0 - np.eye(n))) <= 1e-14 * max_abs_entry(a)
     return jnp.where(converged[..., None], values, jnp.nan), vectors
 
 
-def _axes_of_sweeps(n: int, sweeps: int) -> np.ndarray:
+def _sweep_plane_axes(n: int, sweeps: int) -> np.ndarray:
     """The axes of the planes of cyclic rotations, as unit vectors, shape (rotations, 2, n)."""
     pairs = np.array([(p, q) for p in range(n) for q in range(p + 1, n)], dtype=int).reshape(-1, 2)
     return np.tile(np.eye(n)[pairs], (sweeps, 1, 1))
 
 
-def _rotation(axes, alpha, beta, entry):
+def _jacobi_rotation(axes, alpha, beta, entry):
     """The rotation in the plane of two axes that makes ``[[alpha, entry], [conj(entry), beta]]`` diagonal."""
     e, f = axes
     alpha, beta, entry = (a[..., None, None] for a in (alpha.real, beta.real, entry))
@@ -112,12 +112,12 @@ def orthogonal_images(a) -> tuple[jax.Array, jax.Array]:
     no product of a with itself is formed. By Jacobi rotations of the columns [Hestenes 1958].
     """
     n = a.shape[-1]
-    axes = _axes_of_sweeps(n, 5 + n.bit_length())
+    axes = _sweep_plane_axes(n, 5 + n.bit_length())
 
     def rotate(state, axes):
         images, vectors = state
         u, v = images @ axes[0], images @ axes[1]
-        J = _rotation(axes, *((p.conj() * q).sum(axis=-1) for p, q in ((u, u), (v, v), (u, v))))
+        J = _jacobi_rotation(axes, *((p.conj() * q).sum(axis=-1) for p, q in ((u, u), (v, v), (u, v))))
         return (images @ J, vectors @ J), None
 
     start = a, jnp.broadcast_to(np.eye(n, dtype=a.dtype), (*a.shape[:-2], n, n))
@@ -132,9 +132,9 @@ def polar(a) -> jax.Array:
     """
     images, vectors = orthogonal_images(a)
     sizes = jnp.sqrt((jnp.abs(images) ** 2).sum(axis=-2, keepdims=True))
-    full = sizes.min(axis=-1, keepdims=True) > _RANK * sizes.max(axis=-1, keepdims=True)
-    u = orthonormalized((images / jnp.where(full, sizes, 1.0)) @ adjoint(vectors))
-    full &= (largest(adjoint(u) @ u - np.eye(a.shape[-1])) < 1e-12)[..., None, None]
+    full = sizes.min(axis=-1, keepdims=True) > _RANK_TOLERANCE * sizes.max(axis=-1, keepdims=True)
+    u = newton_schulz_step((images / jnp.where(full, sizes, 1.0)) @ adjoint(vectors))
+    full &= (max_abs_entry(adjoint(u) @ u - np.eye(a.shape[-1])) < 1e-12)[..., None, None]
     return jnp.where(full, u, jnp.nan)
 
 
@@ -175,11 +175,11 @@ def spd_log(w, excess) -> jax.Array:
     With both at hand neither a w next to I nor one next to 0 loses digits. Derivatives of every order, in w, through
     ``exp(x) = w``.
     """
-    near = largest(excess) < _NEARLY_ONE
+    near = max_abs_entry(excess) < _MAX_EXCESS_FOR_LOG1P
     values, vectors = eigh(jnp.where(near[..., None, None], excess, w))
     near = near[..., None]
     logs = jnp.where(near, jnp.log1p(jnp.where(near, values, 0.0)), jnp.log(jnp.where(near, 1.0, values)))
-    return symmetrized((vectors * logs[..., None, :]) @ vectors.swapaxes(-1, -2))
+    return symmetrize((vectors * logs[..., None, :]) @ vectors.swapaxes(-1, -2))
 
 
 @spd_log.defjvp
@@ -196,7 +196,7 @@ def _log_derivative(primals, tangents):
         return vectors @ ((vectors.swapaxes(-1, -2) @ b @ vectors) / quotients) @ vectors.swapaxes(-1, -2)
 
     # The derivative of exp is self-adjoint, and a linear solve has derivatives of its own: hence those of higher order.
-    return x, jax.lax.custom_linear_solve(derivative_of_exp, symmetrized(dw), in_eigenvectors, symmetric=True)
+    return x, jax.lax.custom_linear_solve(derivative_of_exp, symmetrize(dw), in_eigenvectors, symmetric=True)
 
 
 def semidefinite_factor(a) -> jax.Array:
@@ -205,7 +205,7 @@ def semidefinite_factor(a) -> jax.Array:
     What is left when the pivots are rounding is dropped: columns of zeros. The factor is no continuous function of a.
     """
     n, columns = a.shape[-1], []
-    least = _RANK * jnp.max(jnp.diagonal(a), initial=0.0)
+    least = _RANK_TOLERANCE * jnp.max(jnp.diagonal(a), initial=0.0)
     for _ in range(n):
         diagonal = jnp.diagonal(a)
         pivot = jnp.argmax(diagonal)
@@ -226,14 +226,14 @@ def semidefinite_root(a) -> jax.Array:
     Eigenvalues that are rounding count as zero. As long as their number does not change X is a smooth function of a.
     The first derivative is right also where eigenvalues meet; further ones are where none is zero.
     """
-    values, vectors = _semidefinite(a)
-    return symmetrized((vectors * jnp.sqrt(values)[..., None, :]) @ vectors.swapaxes(-1, -2))
+    values, vectors = _semidefinite_eigh(a)
+    return symmetrize((vectors * jnp.sqrt(values)[..., None, :]) @ vectors.swapaxes(-1, -2))
 
 
-def _semidefinite(a) -> tuple[jax.Array, jax.Array]:
+def _semidefinite_eigh(a) -> tuple[jax.Array, jax.Array]:
     """Eigenvalues, zero where they are rounding, and eigenvectors."""
     values, vectors = eigh(a)
-    least = _RANK * jnp.max(jnp.abs(values), axis=-1, keepdims=True)
+    least = _RANK_TOLERANCE * jnp.max(jnp.abs(values), axis=-1, keepdims=True)
     return jnp.where(values > least, values, 0.0), vectors
 
 
@@ -241,7 +241,7 @@ def _semidefinite(a) -> tuple[jax.Array, jax.Array]:
 def _root_derivative(primals, tangents):
     (a,), (da,) = primals, tangents
     x = semidefinite_root(a)
-    values, vectors = _semidefinite(jax.lax.stop_gradient(a))
+    values, vectors = _semidefinite_eigh(jax.lax.stop_gradient(a))
     roots = jnp.sqrt(values)
     sums = roots[..., :, None] + roots[..., None, :]
     inverse = jnp.where(sums > 0.0, 1.0 / jnp.where(sums > 0.0, sums, 1.0), 0.0)
@@ -252,4 +252,4 @@ def _root_derivative(primals, tangents):
     def in_eigenvectors(_, b):
         return vectors @ ((vectors.swapaxes(-1, -2) @ b @ vectors) * inverse) @ vectors.swapaxes(-1, -2)
 
-    return x, jax.lax.custom_linear_solve(of_square, symmetrized(da), in_eigenvectors, symmetric=True)
+    return x, jax.lax.custom_linear_solve(of_square, symmetrize(da), in_eigenvectors, symmetric=True)

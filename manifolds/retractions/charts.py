@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
-from .._module import forwarded
+from .._pytree_module import forward_to
 from ..errors import ParameterError, SpaceError
 from ..groups.matrix_group import MEMBERSHIP_TOLERANCE, MatrixGroup
 from ..matrices.linear import solve
@@ -30,10 +30,10 @@ class RiemannianRetraction(Chart):
 
     order = math.inf
 
-    _point = forwarded("space", "_exp")
-    _vector = forwarded("space", "_log")
-    _middle = forwarded("space", "_midpoint")
-    _carry = forwarded("space", "_transport")
+    _point = forward_to("space", "_exp")
+    _vector = forward_to("space", "_log")
+    _middle = forward_to("space", "_midpoint")
+    _carry = forward_to("space", "_transport")
 
 
 @jax.tree_util.register_static
@@ -49,7 +49,7 @@ class EuclideanRetraction(Chart):
 
     @property
     def order(self):
-        return math.inf if self.space.exp_of_group else 1
+        return math.inf if self.space.exp_is_group_exp else 1
 
     def _point(self, z, v):
         return z + v
@@ -63,10 +63,10 @@ class EuclideanRetraction(Chart):
     def _carry(self, z, v, u):
         return u + jnp.zeros_like(v)
 
-    _reach = forwarded("space", "_straight_reach")
+    _reach = forward_to("space", "_euclidean_reach")
 
     def _midpoint_reach(self, z, v):
-        return 0.5 * self.space._straight_reach(z, v)
+        return 0.5 * self.space._euclidean_reach(z, v)
 
 
 @jax.tree_util.register_static
@@ -98,13 +98,13 @@ class ProjectionRetraction(Chart):
             columns = jax.vmap(lambda axis: space._coordinates(z, push(axis)), in_axes=-1, out_axes=-1)(axes)
             return c - solve(columns, space._coordinates(z, defect)[..., None])[..., 0]
 
-        c = jax.lax.fori_loop(0, _NEWTON_STEPS, newton, space._coordinates(z, space._project_tangent(z, x - z)))
+        c = jax.lax.fori_loop(0, _MAX_NEWTON_STEPS, newton, space._coordinates(z, space._project_tangent(z, x - z)))
         defect = jnp.abs(rest(c)).max(axis=space._axes, keepdims=True)
         size = jnp.maximum(jnp.abs(x).max(axis=space._axes, keepdims=True), 1.0)
         return jnp.where(defect <= MEMBERSHIP_TOLERANCE * size, space._from_coordinates(z, c), jnp.nan)
 
 
-_NEWTON_STEPS = 8
+_MAX_NEWTON_STEPS = 8
 
 
 class _GroupChart(Chart):
@@ -112,7 +112,7 @@ class _GroupChart(Chart):
         return self.space._group_exp(x, 0.5 * self.space._group_log(x, y))
 
     def _carry(self, z, v, u):
-        return self.space._left_carry(z, self._point(z, v), u)
+        return self.space._left_translate(z, self._point(z, v), u)
 
 
 @jax.tree_util.register_static
@@ -128,10 +128,10 @@ class GroupRetraction(_GroupChart):
 
     @property
     def order(self):
-        return math.inf if self.space.exp_of_group else 1
+        return math.inf if self.space.exp_is_group_exp else 1
 
-    _point = forwarded("space", "_group_exp")
-    _vector = forwarded("space", "_group_log")
+    _point = forward_to("space", "_group_exp")
+    _vector = forward_to("space", "_group_log")
 
 
 @jax.tree_util.register_static
@@ -148,10 +148,10 @@ class CayleyRetraction(_GroupChart):
 
     @property
     def order(self):
-        return 2 if self.space.exp_of_group else 1
+        return 2 if self.space.exp_is_group_exp else 1
 
-    _point = forwarded("space", "_cayley")
-    _vector = forwarded("space", "_inverse_cayley")
+    _point = forward_to("space", "_cayley")
+    _vector = forward_to("space", "_inverse_cayley")
 
     def _reach(self, z, v):
         return 0.0 * self.space._reach(z, v)
@@ -181,17 +181,17 @@ class MidpointRetraction(Retraction):
                 f"MidpointRetraction is made from a chart, such as RiemannianRetraction(space), not from {self.chart!r}"
             )
 
-    space = forwarded("chart")
-    order = forwarded("chart")
+    space = forward_to("chart")
+    order = forward_to("chart")
 
-    def _ends(self, z, v):
+    def _end_points(self, z, v):
         return self.chart._point(z, -0.5 * v), self.chart._point(z, 0.5 * v)
 
-    def _base(self, x, y):
+    def _base_and_vector(self, x, y):
         z = self.chart._middle(x, y)
         return z, self.chart._vector(z, y) - self.chart._vector(z, x)
 
-    _reach = forwarded("chart", "_midpoint_reach")
+    _reach = forward_to("chart", "_midpoint_reach")
 
     def __repr__(self) -> str:
         return f"MidpointRetraction({self.chart!r})"

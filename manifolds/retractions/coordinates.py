@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._module import Module
+from .._pytree_module import Module
 from ..matrices.linear import inverse
 from ..spaces import Power, Product
 from .retraction import Chart
@@ -70,18 +70,20 @@ def coordinates_around(chart: Chart, z) -> Coordinates:
     """Coordinates around a point, shape ``(*space.shape)``, or around each point of a batch."""
     if isinstance(chart.space, Product):
         parts = zip(chart.space.factors, chart.space.split(z), strict=True)
-        return _Joined(chart.space, tuple(coordinates_around(_on(chart, factor), part) for factor, part in parts))
+        return _ProductCoordinates(
+            chart.space, tuple(coordinates_around(_chart_on_factor(chart, factor), part) for factor, part in parts)
+        )
     if isinstance(chart.space, Power):
-        return _Repeated(chart.space, coordinates_around(_on(chart, chart.space.base), z))
-    return _Plain(chart, z)
+        return _PowerCoordinates(chart.space, coordinates_around(_chart_on_factor(chart, chart.space.base), z))
+    return _ChartCoordinates(chart, z)
 
 
-def _on(chart: Chart, space) -> Chart:
+def _chart_on_factor(chart: Chart, space) -> Chart:
     """The chart of the same kind on a factor."""
     return dataclasses.replace(chart, space=space)  # type: ignore[type-var]
 
 
-class _Plain(Coordinates):
+class _ChartCoordinates(Coordinates):
     chart: Chart
     z: jax.Array
 
@@ -111,68 +113,80 @@ class _Plain(Coordinates):
         return Place(self.z, lambda alpha: space._flat(self.z, self.vector(alpha)), self.components)
 
 
-class _Joined(Coordinates):
+class _ProductCoordinates(Coordinates):
     space: Product
     parts: tuple[Coordinates, ...]
 
     def point(self, c):
-        return self.space.join(*(part.point(own) for part, own in zip(self.parts, self._split(c), strict=True)))
+        return self.space.join(
+            *(part.point(own) for part, own in zip(self.parts, self._split_components(c), strict=True))
+        )
 
     def components(self, v):
-        return self._rows([part.components(own) for part, own in zip(self.parts, self.space.split(v), strict=True)])
+        return self._join_components(
+            [part.components(own) for part, own in zip(self.parts, self.space.split(v), strict=True)]
+        )
 
     def vector(self, c):
-        return self.space.join(*(part.vector(own) for part, own in zip(self.parts, self._split(c), strict=True)))
+        return self.space.join(
+            *(part.vector(own) for part, own in zip(self.parts, self._split_components(c), strict=True))
+        )
 
     def at(self, c):
-        return self._join([part.at(own) for part, own in zip(self.parts, self._split(c), strict=True)])
+        return self._join_places(
+            [part.at(own) for part, own in zip(self.parts, self._split_components(c), strict=True)]
+        )
 
     def centre(self):
-        return self._join([part.centre() for part in self.parts])
+        return self._join_places([part.centre() for part in self.parts])
 
-    def _join(self, places: list[Place]) -> Place:
+    def _join_places(self, places: list[Place]) -> Place:
         def lift(alpha):
-            return self.space.join(*(p.lift(own) for p, own in zip(places, self._split(alpha), strict=True)))
+            return self.space.join(*(p.lift(own) for p, own in zip(places, self._split_components(alpha), strict=True)))
 
         def lower(v):
-            return self._rows([p.lower(own) for p, own in zip(places, self.space.split(v), strict=True)])
+            return self._join_components([p.lower(own) for p, own in zip(places, self.space.split(v), strict=True)])
 
         return Place(self.space.join(*(p.point for p in places)), lift, lower)
 
-    def _split(self, c):
+    def _split_components(self, c):
         return jnp.split(c, np.cumsum([factor.dim for factor in self.space.factors])[:-1], axis=-1)
 
     @staticmethod
-    def _rows(parts):
+    def _join_components(parts):
         return jnp.concatenate(parts, axis=-1)
 
 
-class _Repeated(Coordinates):
+class _PowerCoordinates(Coordinates):
     """The copies are a batch of the base."""
 
     space: Power
     base: Coordinates
 
     def point(self, c):
-        return self.base.point(self._split(c))
+        return self.base.point(self._split_components(c))
 
     def components(self, v):
-        return self._row(self.base.components(v))
+        return self._join_components(self.base.components(v))
 
     def vector(self, c):
-        return self.base.vector(self._split(c))
+        return self.base.vector(self._split_components(c))
 
     def at(self, c):
-        return self._join(self.base.at(self._split(c)))
+        return self._join_places(self.base.at(self._split_components(c)))
 
     def centre(self):
-        return self._join(self.base.centre())
+        return self._join_places(self.base.centre())
 
-    def _join(self, place: Place) -> Place:
-        return Place(place.point, lambda alpha: place.lift(self._split(alpha)), lambda v: self._row(place.lower(v)))
+    def _join_places(self, place: Place) -> Place:
+        return Place(
+            place.point,
+            lambda alpha: place.lift(self._split_components(alpha)),
+            lambda v: self._join_components(place.lower(v)),
+        )
 
-    def _split(self, c):
+    def _split_components(self, c):
         return c.reshape(*c.shape[:-1], self.space.count, self.space.base.dim)
 
-    def _row(self, c):
+    def _join_components(self, c):
         return c.reshape(*c.shape[:-2], self.space.dim)

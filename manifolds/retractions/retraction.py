@@ -17,13 +17,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._arrays import at, first, is_traced
-from .._module import forwarded
+from .._arrays import first_true_index, format_index, is_traced
+from .._pytree_module import forward_to
 from ..errors import DomainError, SpaceError
 from ..spaces.base import Space
-from ..spaces.maps import run
+from ..spaces.maps import run_kernel
 
-_MIDDLE_STEPS = 32
+_MIDPOINT_ITERATIONS = 32
 """Each shortens the distance from the middle by the square of that between the points, relative to the curvature."""
 
 
@@ -71,15 +71,15 @@ class Retraction(ABC):
             If h v is so long that the inverse would not give it back. Not checked under tracing.
         OffManifoldError
         """
-        z, v = self._step(z, v, h)
-        reach = run(self, "_reach", (), z, v)
-        if not is_traced(reach) and (index := first(~np.asarray(reach < 1.0))) is not None:
+        z, v = self._checked_step(z, v, h)
+        reach = run_kernel(self, "_reach", (), z, v)
+        if not is_traced(reach) and (index := first_true_index(~np.asarray(reach < 1.0))) is not None:
             radius = self.space.injectivity_radius(jnp.broadcast_arrays(z, v)[0][index])
             raise DomainError(
-                f"{self}: the step h v{at(index)} is {float(reach[index]):.6g} times as long as its inverse reaches "
+                f"{self}: the step h v{format_index(index)} is {float(reach[index]):.6g} times as long as its inverse reaches "
                 f"(injectivity radius of the space {radius:.6g}): take a smaller step"
             )
-        return run(self, "_ends", (), z, v)
+        return run_kernel(self, "_ends", (), z, v)
 
     def inverse(self, x, y, h=1.0) -> tuple[jax.Array, jax.Array]:
         """``R_h^-1(x, y)``: the base point z and the tangent vector v there that the step from x to y comes from.
@@ -100,24 +100,24 @@ class Retraction(ABC):
         OffManifoldError
         """
         x, y = self.space._checked_point(x, "x"), self.space._checked_point(y, "y")
-        z, v = run(self, "_base", (), x, y)
-        self.space._refuse_nan(v, len(self.space.shape), x, y, f"the inverse of {type(self).__name__}")
+        z, v = run_kernel(self, "_base", (), x, y)
+        self.space._raise_if_nan(v, len(self.space.shape), x, y, f"the inverse of {type(self).__name__}")
         return z, v / h
 
     def reach(self, z, v, h=1.0) -> jax.Array:
         """Length of h v relative to the domain of the inverse, shape (...): a step is valid where it is below 1."""
-        return run(self, "_reach", (), *self._step(z, v, h))
+        return run_kernel(self, "_reach", (), *self._checked_step(z, v, h))
 
     @abstractmethod
-    def _ends(self, z, v): ...
+    def _end_points(self, z, v): ...
 
     @abstractmethod
-    def _base(self, x, y): ...
+    def _base_and_vector(self, x, y): ...
 
     @abstractmethod
     def _reach(self, z, v): ...
 
-    def _step(self, z, v, h):
+    def _checked_step(self, z, v, h):
         z, v = self.space._checked_vectors(z, "z", v=v)
         return z, h * v
 
@@ -145,7 +145,7 @@ class Chart(Retraction):
 
         Defined beyond the domain of :meth:`vector` too.
         """
-        return run(self, "_point", (), *self._step(z, v, 1.0))
+        return run_kernel(self, "_point", (), *self._checked_step(z, v, 1.0))
 
     def vector(self, z, x) -> jax.Array:
         """The tangent vector at z that the chart gives the point x: the inverse of :meth:`point`.
@@ -159,7 +159,7 @@ class Chart(Retraction):
 
     def differential(self, z, v, w) -> jax.Array:
         """Derivative of ``v -> point(z, v)`` along w: a tangent vector at ``point(z, v)``."""
-        return run(self, "_differential", (), *self.space._checked_vectors(z, "z", v=v, w=w))
+        return run_kernel(self, "_differential", (), *self.space._checked_vectors(z, "z", v=v, w=w))
 
     def carry(self, z, v, u) -> jax.Array:
         """The tangent vector u at z, taken along to ``x = point(z, v)``: such that ``point(x, -carry(z, v, v))`` is z.
@@ -167,7 +167,7 @@ class Chart(Retraction):
         Parallel transport with the Riemannian chart, the same left-trivialised velocity with those of groups. With
         ``w = carry(z, v, u)``, ``carry(x, -carry(z, v, v), w)`` is u again.
         """
-        return run(self, "_carry", (), *self.space._checked_vectors(z, "z", v=v, u=u))
+        return run_kernel(self, "_carry", (), *self.space._checked_vectors(z, "z", v=v, u=u))
 
     @abstractmethod
     def _point(self, z, v):
@@ -183,7 +183,7 @@ class Chart(Retraction):
         def nearer(_, z):
             return self._point(z, 0.5 * (self._vector(z, x) + self._vector(z, y)))
 
-        return jax.lax.fori_loop(0, _MIDDLE_STEPS, nearer, self._point(x, 0.5 * self._vector(x, y)))
+        return jax.lax.fori_loop(0, _MIDPOINT_ITERATIONS, nearer, self._point(x, 0.5 * self._vector(x, y)))
 
     def _carry(self, z, v, u):
         """See :meth:`carry`."""
@@ -192,7 +192,7 @@ class Chart(Retraction):
             "which has it at the start"
         )
 
-    _reach = forwarded("space")
+    _reach = forward_to("space")
 
     def _midpoint_reach(self, z, v):
         """Reach of the step v with z in its middle."""
@@ -202,11 +202,11 @@ class Chart(Retraction):
         v, w = jnp.broadcast_arrays(v, w)
         return jax.jvp(lambda v: self._point(z, v), (v,), (w,))[1]
 
-    def _ends(self, z, v):
+    def _end_points(self, z, v):
         y = self._point(z, v)
         return jnp.broadcast_to(z, y.shape), y
 
-    def _base(self, x, y):
+    def _base_and_vector(self, x, y):
         v = self._vector(x, y)
         return jnp.broadcast_to(x, v.shape), v
 

@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._arrays import as_numeric, at, first, is_traced
+from .._arrays import first_true_index, format_index, is_traced, numeric_array
 from ..errors import ComponentError, DomainError, OffManifoldError, ShapeError
 from ..groups.matrix_group import MEMBERSHIP_TOLERANCE
-from .maps import Maps
+from .maps import SpaceMaps
 
-__all__ = ["CUT_MARGIN", "MEMBERSHIP_TOLERANCE", "Space", "makes", "register", "registered_spaces"]
+__all__ = ["CUT_MARGIN", "MEMBERSHIP_TOLERANCE", "Space", "register", "register_operation", "registered_spaces"]
 
 CUT_MARGIN = 1e-8
 """A logarithm is taken up to this relative distance from the cut locus; beyond, its direction is decided by noise."""
@@ -38,7 +38,7 @@ def registered_spaces() -> Iterator[Space]:
         yield constructor(*arguments)
 
 
-class Space(Maps):
+class Space(SpaceMaps):
     """A Riemannian manifold in an ambient space of arrays; leading axes of all arguments are batches, and broadcast.
 
     A point is an array of the given shape, a tangent vector at it an array of the same shape, with the components of
@@ -86,11 +86,11 @@ class Space(Maps):
             If x is off the space; the message names the residual and the tolerance. Not checked under tracing.
         ShapeError, ComponentError
         """
-        return self._checked_point(self.project(x) if project else self._array(x, "x"), "x", tolerance)
+        return self._checked_point(self.project(x) if project else self._point_array(x, "x"), "x", tolerance)
 
     def residual(self, x) -> jax.Array:
         """Distance from the space relative to the size of x, to the order of magnitude, shape (...)."""
-        return self._compiled("_residual", self._array(x, "x"))
+        return self._call_compiled("_residual", self._point_array(x, "x"))
 
     def belongs(self, x, tolerance: float = 1e-10) -> jax.Array:
         """Whether each point lies on the space: ``residual(x) <= tolerance``, shape (...)."""
@@ -104,10 +104,10 @@ class Space(Maps):
         DomainError
             If there is none, as for the centre of a sphere.
         """
-        x = self._array(x, "x")
-        y = self._compiled("_project", x)
-        if (index := self._first_nan(y, len(self.shape))) is not None:
-            raise DomainError(f"{self.name}: no point of the space is nearest to x{at(index)}")
+        x = self._point_array(x, "x")
+        y = self._call_compiled("_project", x)
+        if (index := self._first_nan_index(y, len(self.shape))) is not None:
+            raise DomainError(f"{self.name}: no point of the space is nearest to x{format_index(index)}")
         return y
 
     def random(self, key_or_seed, size: tuple[int, ...] = ()) -> jax.Array:
@@ -118,17 +118,17 @@ class Space(Maps):
         key_or_seed : JAX random key, or int
         size : tuple of int
         """
-        return self._compiled("_random", random_key(key_or_seed), static=(tuple(size),))
+        return self._call_compiled("_random", random_key(key_or_seed), static=(tuple(size),))
 
     def to_vector(self, x) -> jax.Array:
         """Points or tangent vectors as flat real arrays, shape (..., size): real parts, then imaginary ones."""
-        x = self._array(x, "x")
+        x = self._point_array(x, "x")
         rows = x.reshape(*x.shape[: x.ndim - len(self.shape)], -1)
         return rows if self.dtype.kind != "c" else jnp.concatenate([rows.real, rows.imag], axis=-1)
 
     def from_vector(self, x) -> jax.Array:
         """The inverse of :meth:`to_vector`, shape ``(..., *shape)``."""
-        x = jnp.asarray(as_numeric(x, "x"))
+        x = jnp.asarray(numeric_array(x, "x"))
         if x.shape[-1:] != (self.size,):
             raise ShapeError(f"x must have last axis {self.size} for {self.name}, but its shape is {x.shape}")
         if self.dtype.kind == "c":
@@ -140,7 +140,7 @@ class Space(Maps):
 
     def project_tangent(self, x, w) -> jax.Array:
         """The tangent vector at x nearest to the ambient array w in the Euclidean sense, shape ``(..., *shape)``."""
-        return self._compiled("_project_tangent", self._checked_point(x, "x"), self._array(w, "w"))
+        return self._call_compiled("_project_tangent", self._checked_point(x, "x"), self._point_array(w, "w"))
 
     def random_tangent(self, key_or_seed, x, scale: float = 1.0) -> jax.Array:
         """Random tangent vectors at x, their components in a frame normal with standard deviation ``scale``."""
@@ -150,32 +150,32 @@ class Space(Maps):
 
     def frame(self, x) -> jax.Array:
         """An orthonormal basis of the tangent space at x, shape ``(..., dim, *shape)``."""
-        return self._compiled("_frame", self._checked_point(x, "x"))
+        return self._call_compiled("_frame", self._checked_point(x, "x"))
 
     def coordinates(self, x, v) -> jax.Array:
         """Components of a tangent vector in :meth:`frame`, shape (..., dim)."""
-        return self._compiled("_coordinates", *self._checked_vectors(x, v=v))
+        return self._call_compiled("_coordinates", *self._checked_vectors(x, v=v))
 
     def from_coordinates(self, x, c) -> jax.Array:
         """The tangent vector at x with the components c, shape (..., dim), in :meth:`frame`."""
-        c = jnp.asarray(as_numeric(c, "c"))
+        c = jnp.asarray(numeric_array(c, "c"))
         if c.shape[-1:] != (self.dim,):
             raise ShapeError(f"c must have last axis {self.dim} for {self.name}, but its shape is {c.shape}")
-        return self._compiled("_from_coordinates", self._checked_point(x, "x"), c.astype(jnp.float64))
+        return self._call_compiled("_from_coordinates", self._checked_point(x, "x"), c.astype(jnp.float64))
 
     # -- metric ---------------------------------------------------------------------------------------------------
 
     def inner(self, x, u, v) -> jax.Array:
         """Inner product of two tangent vectors at x, shape (...)."""
-        return self._compiled("_inner", *self._checked_vectors(x, u=u, v=v))
+        return self._call_compiled("_inner", *self._checked_vectors(x, u=u, v=v))
 
     def norm(self, x, v) -> jax.Array:
         """Length of a tangent vector, shape (...); its derivative at v = 0 is taken as 0."""
-        return self._compiled("_norm", *self._checked_vectors(x, v=v))
+        return self._call_compiled("_norm", *self._checked_vectors(x, v=v))
 
     def flat(self, x, v) -> jax.Array:
         """The covector ``w -> inner(x, v, w)``, as an ambient array, shape ``(..., *shape)``."""
-        return self._compiled("_flat", *self._checked_vectors(x, v=v))
+        return self._call_compiled("_flat", *self._checked_vectors(x, v=v))
 
     def sharp(self, x, alpha) -> jax.Array:
         """The tangent vector v with ``inner(x, v, w) = Re sum(alpha * w)`` for all w: of dH, the gradient of H.
@@ -186,7 +186,7 @@ class Space(Maps):
         alpha : array, shape ``(..., *shape)``
             An ambient covector; only its action on tangent vectors matters.
         """
-        return self._compiled("_sharp", self._checked_point(x, "x"), self._array(alpha, "alpha"))
+        return self._call_compiled("_sharp", self._checked_point(x, "x"), self._point_array(alpha, "alpha"))
 
     def isotropic(self, x, w) -> jax.Array:
         """``R w``, a tangent vector, with ``R R^T`` the inverse of the metric: of normal numbers, isotropic noise.
@@ -196,11 +196,11 @@ class Space(Maps):
         x : array, shape ``(..., *shape)``
         w : array, shape (..., isotropic_size)
         """
-        w = jnp.asarray(as_numeric(w, "w"))
+        w = jnp.asarray(numeric_array(w, "w"))
         if w.shape[-1:] != (self.isotropic_size,):
             size = self.isotropic_size
             raise ShapeError(f"w must have last axis {size} for {self.name}, but its shape is {w.shape}")
-        return self._compiled("_isotropic", self._checked_point(x, "x"), w.astype(jnp.float64))
+        return self._call_compiled("_isotropic", self._checked_point(x, "x"), w.astype(jnp.float64))
 
     def divergence(self, field, x) -> jax.Array:
         """The divergence of a vector field at one point, shape (): how fast its flow expands Riemannian volume.
@@ -217,13 +217,13 @@ class Space(Maps):
             On a space without geodesics whose metric is not that of the arrays around.
         """
         x = self._checked_point(x, "x")
-        return self._changes(x, lambda y, alpha: self._pair(alpha, field(y))).sum()
+        return self._divergence_terms(x, lambda y, alpha: self._pair(alpha, field(y))).sum()
 
     # -- geodesics ------------------------------------------------------------------------------------------------
 
     def exp(self, x, v) -> jax.Array:
         """Riemannian exponential map: the geodesic from x with velocity v, at time 1, shape ``(..., *shape)``."""
-        return self._compiled("_exp", *self._checked_vectors(x, v=v))
+        return self._call_compiled("_exp", *self._checked_vectors(x, v=v))
 
     def log(self, x, y) -> jax.Array:
         """Riemannian logarithm: the v of least length with ``exp(x, v) = y``, a tangent vector at x.
@@ -240,8 +240,8 @@ class Space(Maps):
             error: of its two logarithms the one of :meth:`manifolds.MatrixGroup.log` is returned.
         """
         x, y = self._checked_point(x, "x"), self._checked_point(y, "y")
-        v = self._compiled("_log", x, y)
-        self._refuse_nan(v, len(self.shape), x, y, "log")
+        v = self._call_compiled("_log", x, y)
+        self._raise_if_nan(v, len(self.shape), x, y, "log")
         return v
 
     def distance(self, x, y) -> jax.Array:
@@ -259,7 +259,7 @@ class Space(Maps):
         """
         x, y = self._checked_point(x, "x"), self._checked_point(y, "y")
         d = self._distance(x, y)
-        self._refuse_nan(d, 0, x, y, "distance")
+        self._raise_if_nan(d, 0, x, y, "distance")
         return d
 
     def squared_distance(self, x, y) -> jax.Array:
@@ -272,14 +272,14 @@ class Space(Maps):
         """
         x, y = self._checked_point(x, "x"), self._checked_point(y, "y")
         square = self._squared_distance(x, y)
-        self._refuse_nan(square, 0, x, y, "squared_distance")
+        self._raise_if_nan(square, 0, x, y, "squared_distance")
         return square
 
     def midpoint(self, x, y) -> jax.Array:
         """Half way along the shortest geodesic from x to y, shape ``(..., *shape)``; raises as :meth:`log`."""
         x, y = self._checked_point(x, "x"), self._checked_point(y, "y")
         z = self._midpoint(x, y)
-        self._refuse_nan(z, len(self.shape), x, y, "midpoint")
+        self._raise_if_nan(z, len(self.shape), x, y, "midpoint")
         return z
 
     def transport(self, x, v, u) -> jax.Array:
@@ -290,7 +290,7 @@ class Space(Maps):
         array, shape ``(..., *shape)``
             A tangent vector at ``exp(x, v)``. Inner products are kept.
         """
-        return self._compiled("_transport", *self._checked_vectors(x, v=v, u=u))
+        return self._call_compiled("_transport", *self._checked_vectors(x, v=v, u=u))
 
     def reach(self, x, v) -> jax.Array:
         """Length of v over the injectivity radius, shape (...): below 1, ``log`` recovers v from ``exp(x, v)``.
@@ -298,13 +298,13 @@ class Space(Maps):
         Defined under tracing too: it is how to ask whether a step stays in the domain. In a product, the largest over
         the factors.
         """
-        return self._compiled("_reach", *self._checked_vectors(x, v=v))
+        return self._call_compiled("_reach", *self._checked_vectors(x, v=v))
 
     # -- checks ---------------------------------------------------------------------------------------------------
 
-    def _array(self, x, what: str) -> jax.Array:
+    def _point_array(self, x, what: str) -> jax.Array:
         """``x`` as an array of the shape and kind of points."""
-        array = jnp.asarray(as_numeric(x, what))
+        array = jnp.asarray(numeric_array(x, what))
         if jnp.iscomplexobj(array) and self.dtype.kind != "c":
             raise ComponentError(
                 f"{what} must be real for {self.name}, not {array.dtype}: take its real part if that is meant"
@@ -315,29 +315,29 @@ class Space(Maps):
         return array.astype(self.dtype)
 
     def _checked_point(self, x, what: str, tolerance: float = MEMBERSHIP_TOLERANCE) -> jax.Array:
-        x = self._array(x, what)
+        x = self._point_array(x, what)
         if is_traced(x):
             return x
         with jax.ensure_compile_time_eval():  # x may be a constant in a program being traced
-            residual, values = np.asarray(self._compiled("_residual", x)), np.asarray(x)
-        if (index := first(~(residual <= tolerance))) is not None:
+            residual, values = np.asarray(self._call_compiled("_residual", x)), np.asarray(x)
+        if (index := first_true_index(~(residual <= tolerance))) is not None:
             worst = float(residual[index])
             raise OffManifoldError(
-                f"{self.name}: {what}{at(index)} is off the space: {self._why_off(values[index], worst)}, "
+                f"{self.name}: {what}{format_index(index)} is off the space: {self._why_off_space(values[index], worst)}, "
                 f"tolerance {tolerance:.0e}; point({what}, project=True) moves it there",
                 residual=worst,
                 tolerance=tolerance,
             )
         return x
 
-    def _why_off(self, x: np.ndarray, residual: float) -> str:
+    def _why_off_space(self, x: np.ndarray, residual: float) -> str:
         return f"residual {residual:.3g}" if np.isfinite(x).all() else "residual nan, as it is not finite"
 
     def _checked_vectors(self, x, name: str = "x", **vectors) -> list[jax.Array]:
         """The point, and each of the vectors as a tangent vector there."""
         x, checked = self._checked_point(x, name), []
         for what, v in vectors.items():
-            v = self._array(v, what)
+            v = self._point_array(v, what)
             if not is_traced(x, v):
                 self._check_tangent(x, name, v, what)
             checked.append(v)
@@ -345,11 +345,11 @@ class Space(Maps):
 
     def _check_tangent(self, x, name: str, v, what: str) -> None:
         with jax.ensure_compile_time_eval():
-            residual = np.asarray(self._compiled("_tangent_residual", x, v))
-        if (index := first(~(residual <= MEMBERSHIP_TOLERANCE))) is not None:
+            residual = np.asarray(self._call_compiled("_tangent_residual", x, v))
+        if (index := first_true_index(~(residual <= MEMBERSHIP_TOLERANCE))) is not None:
             worst = float(residual[index])
             raise OffManifoldError(
-                f"{self.name}: {what}{at(index)} is not tangent at {name}: residual {worst:.3g}, tolerance "
+                f"{self.name}: {what}{format_index(index)} is not tangent at {name}: residual {worst:.3g}, tolerance "
                 f"{MEMBERSHIP_TOLERANCE:.0e}; project_tangent({name}, {what}) makes it so",
                 residual=worst,
                 tolerance=MEMBERSHIP_TOLERANCE,
@@ -360,17 +360,19 @@ class Space(Maps):
         size = jnp.maximum(jnp.abs(v).max(axis=axes, initial=0.0), 1.0)
         return jnp.abs(v - self._project_tangent(x, v)).max(axis=axes, initial=0.0) / size
 
-    def _refuse_nan(self, value, core: int, x, y, what: str) -> None:
-        if (index := self._first_nan(value, core)) is not None:
+    def _raise_if_nan(self, value, core: int, x, y, what: str) -> None:
+        if (index := self._first_nan_index(value, core)) is not None:
             batch = value.shape[: value.ndim - core]
             x, y = (np.asarray(jnp.broadcast_to(a, (*batch, *self.shape))[index]) for a in (x, y))
-            raise DomainError(f"{self.name}: {what}(x, y){at(index)} is not defined: {self._why_no_log(x, y)}")
+            raise DomainError(
+                f"{self.name}: {what}(x, y){format_index(index)} is not defined: {self._why_no_log(x, y)}"
+            )
 
     @staticmethod
-    def _first_nan(value, core: int) -> tuple[int, ...] | None:
+    def _first_nan_index(value, core: int) -> tuple[int, ...] | None:
         if is_traced(value):
             return None
-        return first(~np.isfinite(np.asarray(value)).all(axis=tuple(range(-core, 0))))
+        return first_true_index(~np.isfinite(np.asarray(value)).all(axis=tuple(range(-core, 0))))
 
     # -- helpers --------------------------------------------------------------------------------------------------
 
@@ -388,7 +390,7 @@ class Space(Maps):
     """Products are spaces themselves, of classes that are defined after this one: they enter by :func:`makes`."""
 
 
-def makes(operation: str) -> Callable[[type[Space]], type[Space]]:
+def register_operation(operation: str) -> Callable[[type[Space]], type[Space]]:
     """Decorator: spaces of this class are what the operation of spaces makes, ``"_product"`` or ``"_power"``."""
 
     def entered(space: type[Space]) -> type[Space]:

@@ -9,17 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._sizes import checked_size
-from ..matrices.linear import largest
-from ..matrices.symmetric import cholesky, symmetrized
+from ..matrices.linear import max_abs_entry
+from ..matrices.symmetric import cholesky, symmetrize
 from .base import register
-from .maps import by_coordinates, by_projection
-from .spd import Definite
+from .maps import inner_by_coordinates, tangential_part_by_projection
+from .spd import PositiveDefinite
 
 
 @register((3,))
 @jax.tree_util.register_static
 @dataclass(frozen=True, repr=False)
-class Correlation(Definite):
+class Correlation(PositiveDefinite):
     """Symmetric positive definite n x n matrices with ones on the diagonal, and the Euclidean-Cholesky metric.
 
     The Cholesky factor L of x, with each row divided by its entry on the diagonal, is a triangular matrix with ones on
@@ -42,42 +42,42 @@ class Correlation(Definite):
         return self.n * (self.n - 1) // 2
 
     def _residual(self, x):
-        return jnp.where(self._inside(x), largest(self._rest(x)), jnp.inf)
+        return jnp.where(self._inside(x), max_abs_entry(self._constraint_residual(x)), jnp.inf)
 
     def _project(self, x):
         """The correlations of a covariance."""
         scale = 1.0 / jnp.sqrt(jnp.diagonal(x, axis1=-2, axis2=-1))
-        y = self._with_ones(symmetrized(x) * scale[..., :, None] * scale[..., None, :])
+        y = self._with_unit_diagonal(symmetrize(x) * scale[..., :, None] * scale[..., None, :])
         return jnp.where(self._inside(y)[..., None, None], y, jnp.nan)
 
-    def _with_ones(self, x):
+    def _with_unit_diagonal(self, x):
         return jnp.where(np.eye(self.n, dtype=bool), 1.0, x)
 
-    def _rest(self, x):
+    def _constraint_residual(self, x):
         """What of a matrix is skew, and its diagonal less one."""
         return jnp.where(np.eye(self.n, dtype=bool), x - 1.0, 0.5 * (x - x.swapaxes(-1, -2)))
 
     def _constraints(self, x):
-        return self.to_vector(self._rest(x))
+        return self.to_vector(self._constraint_residual(x))
 
-    def _normal(self, x, c):
+    def _minimal_correction(self, x, c):
         return self.from_vector(c)
 
-    _along = by_projection
+    _tangential_part = tangential_part_by_projection
 
-    def _rounded(self, x):
+    def _constraint_scales(self, x):
         return self.to_vector(jnp.abs(x))
 
     @property
-    def _normals(self):
+    def _n_normals(self):
         return 2 * self.n**2
 
-    def _from_normals(self, w):
+    def _point_from_normals(self, w):
         rows = w.reshape(*w.shape[:-1], self.n, 2 * self.n)
         return self._project(rows @ rows.swapaxes(-1, -2))
 
     def _project_tangent(self, x, w):
-        return jnp.where(np.eye(self.n, dtype=bool), 0.0, symmetrized(w))
+        return jnp.where(np.eye(self.n, dtype=bool), 0.0, symmetrize(w))
 
     # -- the coordinates, and back ------------------------------------------------------------------------------------
 
@@ -86,10 +86,10 @@ class Correlation(Definite):
         rows = factor / jnp.diagonal(factor, axis1=-2, axis2=-1)[..., None]
         return rows[..., *np.tril_indices(self.n, -1)]
 
-    def _placed(self, c):
+    def _inverse_chart(self, c):
         rows = jnp.zeros((*c.shape[:-1], self.n, self.n)).at[..., *np.tril_indices(self.n, -1)].set(c) + np.eye(self.n)
         rows = rows / jnp.sqrt((rows**2).sum(axis=-1, keepdims=True))
-        return self._with_ones(rows @ rows.swapaxes(-1, -2))
+        return self._with_unit_diagonal(rows @ rows.swapaxes(-1, -2))
 
     def _coordinates(self, x, v):
         x, v = jnp.broadcast_arrays(x, v)
@@ -98,24 +98,24 @@ class Correlation(Definite):
     def _from_coordinates(self, x, c):
         start = self._chart(x)
         start, c = jnp.broadcast_arrays(start, c)
-        return jax.jvp(self._placed, (start,), (c,))[1]
+        return jax.jvp(self._inverse_chart, (start,), (c,))[1]
 
     def _frame(self, x):
         return jax.vmap(lambda e: self._from_coordinates(x, e), out_axes=-3)(jnp.eye(self.dim))
 
-    _inner = by_coordinates
+    _inner = inner_by_coordinates
 
     def _flat(self, x, v):
         c = self._coordinates(x, v)
-        return symmetrized(jax.vjp(self._chart, jnp.broadcast_to(x, (*c.shape[:-1], *self.shape)))[1](c)[0])
+        return symmetrize(jax.vjp(self._chart, jnp.broadcast_to(x, (*c.shape[:-1], *self.shape)))[1](c)[0])
 
     def _sharp(self, x, alpha):
         x, alpha = jnp.broadcast_arrays(x, alpha)
         start = self._chart(x)
-        return self._from_coordinates(x, jax.vjp(self._placed, start)[1](alpha)[0])
+        return self._from_coordinates(x, jax.vjp(self._inverse_chart, start)[1](alpha)[0])
 
     def _exp(self, x, v):
-        return self._placed(self._chart(x) + self._coordinates(x, v))
+        return self._inverse_chart(self._chart(x) + self._coordinates(x, v))
 
     def _log(self, x, y):
         return self._from_coordinates(x, self._chart(y) - self._chart(x))

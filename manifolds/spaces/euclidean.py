@@ -22,7 +22,7 @@ class Euclidean(Space):
     sizes: tuple[int, ...]
     metric = "flat"
     bi_invariant = True
-    exp_of_group = True
+    exp_is_group_exp = True
 
     def __init__(self, *sizes: int):
         object.__setattr__(self, "sizes", tuple(checked_size(n, 1, "Euclidean(*sizes)", "a size") for n in sizes))
@@ -48,13 +48,13 @@ class Euclidean(Space):
     def _constraints(self, x):
         return jnp.zeros((*x.shape[: x.ndim - len(self.shape)], 0))
 
-    def _normal(self, x, c):
+    def _minimal_correction(self, x, c):
         return jnp.zeros_like(x)
 
-    def _along(self, x, w):
+    def _tangential_part(self, x, w):
         return w
 
-    def _rounded(self, x):
+    def _constraint_scales(self, x):
         return self._constraints(x)
 
     def _project_tangent(self, x, w):
@@ -100,7 +100,7 @@ class Euclidean(Space):
     def _group_log(self, x, y):
         return y - x
 
-    def _left_carry(self, x, y, u):
+    def _left_translate(self, x, y, u):
         return u + jnp.zeros_like(y)
 
     def _cayley(self, x, v):
@@ -110,5 +110,5 @@ class Euclidean(Space):
     def _inverse_cayley(self, x, y):
         return y - x
 
-    def _straight_reach(self, x, v):
+    def _euclidean_reach(self, x, v):
         return jnp.zeros(jnp.broadcast_shapes(x.shape, v.shape)[: -len(self.shape)])

@@ -52,5 +52,5 @@ class Flag(Homogeneous):
         ----------
         x : array, shape (..., n, n)
         """
-        parts = jnp.split(self._array(x, "x"), np.cumsum(self.steps)[:-1], axis=-1)
+        parts = jnp.split(self._point_array(x, "x"), np.cumsum(self.steps)[:-1], axis=-1)
         return jnp.stack([part @ part.swapaxes(-1, -2) for part in parts], axis=-3)

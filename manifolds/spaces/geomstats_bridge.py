@@ -29,7 +29,7 @@ from .base import CUT_MARGIN, MEMBERSHIP_TOLERANCE, Space, random_key
 _STENCIL = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
 """Weights of f(x + k h) - f(x - k h) in h f'(x), to order 8."""
 
-_STEP = 0.02
+_DIFFERENCE_STEP = 0.02
 """Step of the differences, a length in the metric: for smooth f their error h^8 f^(9)/630 is below rounding, eps/h."""
 
 
@@ -67,7 +67,7 @@ def from_geomstats(space, injectivity_radius: float | None = None) -> GeomstatsS
         raise ParameterError(f"an injectivity radius is positive, not {injectivity_radius!r}")
     found = GeomstatsSpace(space, _known_radius(space) if injectivity_radius is None else injectivity_radius)
     for kernel in ("exp", "log", "inner", "project_tangent"):
-        found._need(kernel)
+        found._require_kernel(kernel)
     return found
 
 
@@ -80,12 +80,12 @@ class GeomstatsSpace(Space):
     source : geomstats Manifold
     """
 
-    smooth = False
+    is_smooth = False
 
     def __init__(self, source, radius: float | None):
         self.source, self._radius = source, radius
         self.metric = type(source.metric).__name__
-        self._present: set[str] = set()
+        self._available_kernels: set[str] = set()
 
     @property
     def name(self):
@@ -114,56 +114,56 @@ class GeomstatsSpace(Space):
         if self._radius is not None:
             return self._radius
         x = self.source.random_point() if x is None else x
-        return float(self._on_host("radius", np.asarray(x, dtype=float)[None])[0])
+        return float(self._evaluate_on_host("radius", np.asarray(x, dtype=float)[None])[0])
 
     def _random(self, key, size):
         raise SpaceError(f"{self.name} draws its random points outside of compiled programs")
 
     def _residual(self, x):
-        return self._call("residual", x)
+        return self._call_kernel("residual", x)
 
     def _project(self, x):
-        return self._call("project", x)
+        return self._call_kernel("project", x)
 
     def _project_tangent(self, x, w):
-        return self._call("project_tangent", x, w)
+        return self._call_kernel("project_tangent", x, w)
 
     def _inner(self, x, u, v):
-        return self._call("inner", x, u, v)
+        return self._call_kernel("inner", x, u, v)
 
     def _exp(self, x, v):
-        return self._call("exp", x, v)
+        return self._call_kernel("exp", x, v)
 
     def _log(self, x, y):
         return _log(self, *jnp.broadcast_arrays(x, y))
 
     def _distance(self, x, y):
-        return self._call("distance", x, y)
+        return self._call_kernel("distance", x, y)
 
     def _transport(self, x, v, u):
-        return self._call("transport", x, v, u)
+        return self._call_kernel("transport", x, v, u)
 
     def _flat(self, x, v):
         """The inner products with the projected axes."""
-        x, v = self._over_frame(x), self._over_frame(v)
+        x, v = self._with_frame_axis(x), self._with_frame_axis(v)
         values = self._inner(x, v, self._project_tangent(x, self._axis_vectors))
         return values.reshape(*values.shape[:-1], *self.shape)
 
     def _frame(self, x):
         """Gram-Schmidt on the projections of axes, as many as the space has dimensions, chosen for independence."""
         chosen = jnp.asarray(self._axis_vectors)[_independent_axes(self, x)]
-        base = self._over_frame(x)
+        base = self._with_frame_axis(x)
         vectors = self._project_tangent(base, chosen)
-        left, right = jnp.expand_dims(vectors, -2 - len(self.shape)), self._over_frame(vectors)
-        gram = self._inner(self._over_frame(base), left, right)
+        left, right = jnp.expand_dims(vectors, -2 - len(self.shape)), self._with_frame_axis(vectors)
+        gram = self._inner(self._with_frame_axis(base), left, right)
         rows = solve_lower(cholesky(gram), vectors.reshape(*gram.shape[:-1], -1))
         return rows.reshape(vectors.shape)
 
     def _coordinates(self, x, v):
-        return self._inner(self._over_frame(x), self._frame(x), self._over_frame(v))
+        return self._inner(self._with_frame_axis(x), self._frame(x), self._with_frame_axis(v))
 
     def _reach(self, x, v):
-        radius = self._call("radius", x) if self._radius is None else self._radius
+        radius = self._call_kernel("radius", x) if self._radius is None else self._radius
         return self._norm(x, v) / radius
 
     def _why_no_log(self, x, y):
@@ -178,36 +178,40 @@ class GeomstatsSpace(Space):
     def _axis_vectors(self) -> np.ndarray:
         return np.eye(math.prod(self.shape)).reshape(-1, *self.shape)
 
-    def _call(self, kernel: str, *arrays):
-        self._need(kernel)
-        return _call(self, kernel, jnp.broadcast_arrays(*arrays))
+    def _call_kernel(self, kernel: str, *arrays):
+        self._require_kernel(kernel)
+        return _call_on_host(self, kernel, jnp.broadcast_arrays(*arrays))
 
-    def _need(self, kernel: str) -> None:
+    def _require_kernel(self, kernel: str) -> None:
         """Raise unless geomstats has what a kernel calls, found out at a random point."""
-        if kernel in self._present:
+        if kernel in self._available_kernels:
             return
         x = np.asarray(self.source.random_point(), dtype=float)[None]
         try:
-            _KERNELS[kernel](self, *({"v": 0.0 * x}.get(kind, x) for kind in _SIGNATURES[kernel][0]))
+            _KERNELS[kernel](self, *({"v": 0.0 * x}.get(kind, x) for kind in _KERNEL_SIGNATURES[kernel][0]))
         except (NotImplementedError, AttributeError, TypeError, ValueError) as error:
             raise SpaceError(f"{self.name} with {self.metric} has no {kernel.replace('_', ' ')}: {error}") from None
-        self._present.add(kernel)
+        self._available_kernels.add(kernel)
 
-    def _core(self, kernel: str) -> tuple[int, ...]:
+    def _result_shape(self, kernel: str) -> tuple[int, ...]:
         """Shape of the result for one point."""
-        return self.shape if _SIGNATURES[kernel][1] == "array" else ()
+        return self.shape if _KERNEL_SIGNATURES[kernel][1] == "array" else ()
 
-    def _on_host(self, kernel: str, *arrays: np.ndarray) -> np.ndarray:
+    def _evaluate_on_host(self, kernel: str, *arrays: np.ndarray) -> np.ndarray:
         """A kernel on arrays of shape ``(count, *shape)``: all at once, or one by one where some are refused."""
         count = len(arrays[0])
         try:
             with np.errstate(all="ignore"), warnings.catch_warnings():  # what comes of it is looked at
                 warnings.simplefilter("ignore")
-                return np.asarray(_KERNELS[kernel](self, *arrays), dtype=float).reshape(count, *self._core(kernel))
+                return np.asarray(_KERNELS[kernel](self, *arrays), dtype=float).reshape(
+                    count, *self._result_shape(kernel)
+                )
         except (ValueError, ArithmeticError, np.linalg.LinAlgError):
             if count == 1:
-                return np.full((1, *self._core(kernel)), np.nan)
-            return np.concatenate([self._on_host(kernel, *(a[i : i + 1] for a in arrays)) for i in range(count)])
+                return np.full((1, *self._result_shape(kernel)), np.nan)
+            return np.concatenate(
+                [self._evaluate_on_host(kernel, *(a[i : i + 1] for a in arrays)) for i in range(count)]
+            )
 
     def _jacobian_on_host(self, kernel: str, *arrays: np.ndarray) -> np.ndarray:
         """Derivatives by all entries of all arguments, shape (count, size of the result, number of entries)."""
@@ -220,31 +224,34 @@ class GeomstatsSpace(Space):
 
     def _derivative(self, kernel: str, arrays, k: int, direction: np.ndarray) -> np.ndarray:
         """Derivative along a direction of the k-th argument, shape (count, size of the result)."""
-        kind, length = _SIGNATURES[kernel][0][k], np.ones(len(direction))
+        kind, length = _KERNEL_SIGNATURES[kernel][0][k], np.ones(len(direction))
         if kind != "a":
             x = arrays[k if kind == "p" else 0]
-            direction = self._on_host("project_tangent", x, direction)
-            length = np.sqrt(np.maximum(self._on_host("inner", x, direction, direction), 0.0))
+            direction = self._evaluate_on_host("project_tangent", x, direction)
+            length = np.sqrt(np.maximum(self._evaluate_on_host("inner", x, direction, direction), 0.0))
         unit = direction / np.where(length > 0.0, length, 1.0).reshape(-1, *(1,) * len(self.shape))
-        total = np.zeros((len(direction), math.prod(self._core(kernel))))
+        total = np.zeros((len(direction), math.prod(self._result_shape(kernel))))
         for offset, weight in _STENCIL.items():
             after, before = (
-                self._on_host(kernel, *self._moved(kernel, arrays, k, sign * offset * _STEP * unit)) for sign in (1, -1)
+                self._evaluate_on_host(
+                    kernel, *self._displace_argument(kernel, arrays, k, sign * offset * _DIFFERENCE_STEP * unit)
+                )
+                for sign in (1, -1)
             )
             total += weight * (after - before).reshape(total.shape)
-        return total / _STEP * length[:, None]
+        return total / _DIFFERENCE_STEP * length[:, None]
 
-    def _moved(self, kernel: str, arrays, k: int, shift: np.ndarray) -> list[np.ndarray]:
+    def _displace_argument(self, kernel: str, arrays, k: int, shift: np.ndarray) -> list[np.ndarray]:
         """The arguments with the k-th moved: a point along a geodesic, taking the tangent vectors at it along."""
-        kinds, moved = _SIGNATURES[kernel][0], list(arrays)
+        kinds, moved = _KERNEL_SIGNATURES[kernel][0], list(arrays)
         if kinds[k] != "p":
             moved[k] = moved[k] + shift
             return moved
-        moved[k] = self._on_host("exp", moved[k], shift)
+        moved[k] = self._evaluate_on_host("exp", moved[k], shift)
         if k == 0:
             tangent = [i for i, kind in enumerate(kinds) if kind == "v"]
             for i in tangent:
-                moved[i] = self._on_host("project_tangent", moved[0], moved[i])
+                moved[i] = self._evaluate_on_host("project_tangent", moved[0], moved[i])
         return moved
 
 
@@ -283,7 +290,7 @@ def _residual(space: GeomstatsSpace, x):
     return np.where(np.isfinite(x).all(axis=axes), rest, np.nan)
 
 
-_SIGNATURES = {
+_KERNEL_SIGNATURES = {
     # kernel: its arguments (p a point, v a vector tangent at the first one, a any array) and its result
     "exp": ("pv", "array"),
     "log": ("pp", "array"),
@@ -327,14 +334,14 @@ def _callback(space: GeomstatsSpace, function: Callable, core: tuple[int, ...], 
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _call(space: GeomstatsSpace, kernel: str, arrays):
-    return _callback(space, partial(space._on_host, kernel), space._core(kernel), np.float64, arrays)
+def _call_on_host(space: GeomstatsSpace, kernel: str, arrays):
+    return _callback(space, partial(space._evaluate_on_host, kernel), space._result_shape(kernel), np.float64, arrays)
 
 
-@_call.defjvp
+@_call_on_host.defjvp
 def _call_derivative(space: GeomstatsSpace, kernel: str, primals, tangents):
     (arrays,), (moves,) = primals, tangents
-    value = _call(space, kernel, arrays)
+    value = _call_on_host(space, kernel, arrays)
     jacobian = _jacobian(space, kernel, arrays)
     entries = jnp.concatenate([move.reshape(*jacobian.shape[:-2], -1) for move in moves], axis=-1)
     return value, jnp.einsum("...ij,...j->...i", jacobian, entries).reshape(value.shape)
@@ -342,7 +349,7 @@ def _call_derivative(space: GeomstatsSpace, kernel: str, primals, tangents):
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _log(space: GeomstatsSpace, x, y):
-    return space._call("log", x, y)
+    return space._call_kernel("log", x, y)
 
 
 @_log.defjvp
@@ -364,7 +371,7 @@ def _log_derivative(space: GeomstatsSpace, primals, tangents):
     rest = rows(dy) - jnp.einsum(
         "...ij,...j->...i", of_exp[..., :size], dx
     )  # exp projects what it is handed, hence no D
-    dual = rows(space._flat(space._over_frame(y), space._frame(y)))
+    dual = rows(space._flat(space._with_frame_axis(y), space._frame(y)))
     matrix = jnp.einsum("...bi,...ai->...ba", dual, along)
     c = solve(matrix, jnp.einsum("...bi,...i->...b", dual, rest)[..., None])[..., 0]
     dv = jnp.einsum("...ij,...j->...i", of_projection[..., :size], dx).reshape(v.shape)
@@ -373,33 +380,33 @@ def _log_derivative(space: GeomstatsSpace, primals, tangents):
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _jacobian(space: GeomstatsSpace, kernel: str, arrays):
-    core = (math.prod(space._core(kernel)), len(arrays) * math.prod(space.shape))
+    core = (math.prod(space._result_shape(kernel)), len(arrays) * math.prod(space.shape))
     return _callback(space, partial(space._jacobian_on_host, kernel), core, np.float64, arrays)
 
 
 @_jacobian.defjvp
-def _no_second_derivative(space: GeomstatsSpace, kernel: str, primals, tangents):
+def _refuse_second_derivative(space: GeomstatsSpace, kernel: str, primals, tangents):
     raise SpaceError(f"{space.name}: {kernel} has first derivatives only, as they are differences taken on the host")
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _independent_axes(space: GeomstatsSpace, x):
     """The axes, shape (dim,), whose projections to the tangent space at x make the best basis: pivoted Gram-Schmidt."""
-    return _callback(space, partial(_pivots, space), (space.dim,), np.int64, [x])
+    return _callback(space, partial(_pivot_axes, space), (space.dim,), np.int64, [x])
 
 
 @_independent_axes.defjvp
-def _constant(space: GeomstatsSpace, primals, tangents):
+def _independent_axes_jvp(space: GeomstatsSpace, primals, tangents):
     chosen = _independent_axes(space, *primals)
     return chosen, np.zeros(chosen.shape, jax.dtypes.float0)
 
 
-def _pivots(space: GeomstatsSpace, x: np.ndarray) -> np.ndarray:
+def _pivot_axes(space: GeomstatsSpace, x: np.ndarray) -> np.ndarray:
     rows = []
     for point in x:
         axes = space._axis_vectors
         points = np.broadcast_to(point, axes.shape)
-        vectors = space._on_host("project_tangent", points, axes).reshape(len(axes), -1)
+        vectors = space._evaluate_on_host("project_tangent", points, axes).reshape(len(axes), -1)
         chosen: list[int] = []
         for _ in range(space.dim):
             chosen.append(int((vectors**2).sum(axis=1).argmax()))

@@ -12,22 +12,22 @@ import numpy as np
 from .._sizes import checked_size
 from ..errors import ParameterError
 from ..matrices.exponential import expm
-from ..matrices.linear import complement, largest, skew
+from ..matrices.linear import max_abs_entry, orthonormal_complement, skew_matrix
 from ..matrices.spectral import spectral
-from ..matrices.symmetric import eigh, orthonormal_columns, polar, symmetrized
+from ..matrices.symmetric import eigh, orthonormal_columns, polar, symmetrize
 from .base import CUT_MARGIN, Space, register
-from .maps import by_value
+from .maps import extended_squared_distance
 
-_GAP = 1e-8
+_MIN_EIGENVALUE_GAP = 1e-8
 """Least distance of the eigenvalues that are taken from those that are not, relative to the largest."""
 
-_SETTLED = 60
+_SIGN_NEWTON_STEPS = 60
 """Newton's steps for the sign of a matrix: enough for that gap."""
 
-_SMALL = 1 / 8
+_MAX_SERIES_SINE_SQUARED = 1 / 8
 """``sin^2`` of half an angle below which a series in it is summed, whose derivatives do not cancel."""
 
-_SERIES = [math.factorial(k) / math.prod(j + 1.5 for j in range(k)) for k in reversed(range(24))]
+_ANGLE_OVER_SINE_SERIES = [math.factorial(k) / math.prod(j + 1.5 for j in range(k)) for k in reversed(range(24))]
 """``t / sin(t) = 1 + 2/3 s + 8/15 s^2 + …`` in powers of ``s = sin(t/2)^2``, the highest first."""
 
 
@@ -73,28 +73,28 @@ class Grassmann(Space):
         return q @ q.swapaxes(-1, -2)
 
     def _residual(self, x):
-        square = largest(x @ x - x)
+        square = max_abs_entry(x @ x - x)
         rank = jnp.abs(jnp.trace(x, axis1=-2, axis2=-1) - self.p)
-        return jnp.maximum(jnp.maximum(square, largest(x - x.swapaxes(-1, -2))), rank)
+        return jnp.maximum(jnp.maximum(square, max_abs_entry(x - x.swapaxes(-1, -2))), rank)
 
     def _constraints(self, x):
         """``x^2 - x``, symmetric, and what of x is skew: of their n^2 derivatives those off the tangents are left."""
-        y = symmetrized(x)
+        y = symmetrize(x)
         return self.to_vector(y @ y - y + (x - y))
 
     def _correction(self, x, c):
         """A symmetric matrix that commutes with x changes ``x^2 - x`` by ``(2 x - 1)`` times itself."""
         c = self.from_vector(c)
-        own = symmetrized(c)
+        own = symmetrize(c)
         turned = x @ own
         return turned + turned.swapaxes(-1, -2) - own + (c - own)
 
-    _normal = _correction
+    _minimal_correction = _correction
 
-    def _along(self, x, w):
-        return self._project_tangent(symmetrized(x), w)
+    def _tangential_part(self, x, w):
+        return self._project_tangent(symmetrize(x), w)
 
-    def _rounded(self, x):
+    def _constraint_scales(self, x):
         return self.to_vector(jnp.abs(x) @ jnp.abs(x) + jnp.abs(x))
 
     def _inside(self, x):
@@ -102,25 +102,27 @@ class Grassmann(Space):
 
     def _project(self, x):
         """The projector to the eigenvectors with the largest eigenvalues."""
-        x = symmetrized(x)
+        x = symmetrize(x)
         values = jnp.sort(eigh(jax.lax.stop_gradient(x))[0], axis=-1)
         upper, under = values[..., self.n - self.p], values[..., self.n - self.p - 1]
         middle, size = 0.5 * (upper + under), jnp.maximum(values[..., -1] - under, upper - values[..., 0])
         sign = (x - middle[..., None, None] * np.eye(self.n)) / size[..., None, None]
-        sign = jax.lax.fori_loop(0, _SETTLED, lambda _, y: 1.5 * y - 0.5 * y @ y @ y, sign)
+        sign = jax.lax.fori_loop(0, _SIGN_NEWTON_STEPS, lambda _, y: 1.5 * y - 0.5 * y @ y @ y, sign)
         return jnp.where(
-            (upper - under > _GAP * size)[..., None, None], symmetrized(0.5 * (np.eye(self.n) + sign)), jnp.nan
+            (upper - under > _MIN_EIGENVALUE_GAP * size)[..., None, None],
+            symmetrize(0.5 * (np.eye(self.n) + sign)),
+            jnp.nan,
         )
 
     @property
-    def _normals(self):
+    def _n_normals(self):
         return self.n * self.p
 
-    def _from_normals(self, w):
+    def _point_from_normals(self, w):
         return self.subspace(w.reshape(*w.shape[:-1], self.n, self.p))
 
     def _project_tangent(self, x, w):
-        w = symmetrized(w)
+        w = symmetrize(w)
         along = x @ w @ (np.eye(self.n) - x)
         return along + along.swapaxes(-1, -2)
 
@@ -143,7 +145,7 @@ class Grassmann(Space):
             rest = rest - e[..., :, None] * (e[..., None, :] @ rest)
             columns.append(e)
         q = jnp.stack(columns, axis=-1)
-        return jnp.concatenate([q, complement(q)], axis=-1)
+        return jnp.concatenate([q, orthonormal_complement(q)], axis=-1)
 
     @property
     def isotropic_size(self):
@@ -151,7 +153,7 @@ class Grassmann(Space):
 
     def _isotropic(self, x, w):
         """By the rotations of every plane."""
-        return _bracket(skew(w, self.n), x) / math.sqrt(2.0)
+        return _commutator(skew_matrix(w, self.n), x) / math.sqrt(2.0)
 
     def _inner(self, x, u, v):
         return self._pair(u, v)
@@ -160,14 +162,14 @@ class Grassmann(Space):
         return v
 
     def _sharp(self, x, alpha):
-        x = symmetrized(x)
-        product = symmetrized(alpha) @ x
+        x = symmetrize(x)
+        product = symmetrize(alpha) @ x
         turned = (product - product.swapaxes(-1, -2)) @ x  # [[alpha, x], x], whose products are transposes of others
         return turned + turned.swapaxes(-1, -2)
 
     def _exp(self, x, v):
-        turn = expm(_bracket(v, x))
-        return symmetrized(turn @ x @ turn.swapaxes(-1, -2))
+        turn = expm(_commutator(v, x))
+        return symmetrize(turn @ x @ turn.swapaxes(-1, -2))
 
     def _log(self, x, y):
         """From bases of both subspaces that are turned to each other: the one of y as near to that of x as it can be.
@@ -175,20 +177,20 @@ class Grassmann(Space):
         With the principal angles t, their difference has the singular values ``2 sin(t/2)``: nothing cancels, for
         neighbours nor at a right angle [Zimmermann & Huper 2022].
         """
-        at, to = self._near_basis(x), self._near_basis(y)
+        at, to = self._smooth_basis(x), self._smooth_basis(y)
         step = to @ polar(to.swapaxes(-1, -2) @ at) - at
         square = 0.25 * step.swapaxes(-1, -2) @ step
         across = step - at @ (at.swapaxes(-1, -2) @ step)  # its singular values are sin(t)
-        half = across @ spectral(_stretch, symmetrized(square)) @ at.swapaxes(-1, -2)
+        half = across @ spectral(_angle_over_sine, symmetrize(square)) @ at.swapaxes(-1, -2)
         return half + half.swapaxes(-1, -2)
 
-    def _near_basis(self, x):
+    def _smooth_basis(self, x):
         """An orthonormal basis of the subspace, shape (..., n, p), that is a smooth function of x near this one."""
         basis = jax.lax.stop_gradient(self._basis(x)[..., : self.p])
         return polar(x @ basis)
 
     def _squared_distance(self, x, y):
-        return by_value(self, x, y)
+        return extended_squared_distance(self, x, y)
 
     def _squared_distance_value(self, x, y):
         """Also at a right angle: eigenvalues of ``x + y - 1`` are cosines of the angles, each of them twice, or 1."""
@@ -197,21 +199,21 @@ class Grassmann(Space):
         return (jnp.arctan2(sines, jnp.abs(cosines)) ** 2).sum(axis=-1)
 
     def _transport(self, x, v, u):
-        turn = expm(_bracket(v, x))
-        return symmetrized(turn @ u @ turn.swapaxes(-1, -2))
+        turn = expm(_commutator(v, x))
+        return symmetrize(turn @ u @ turn.swapaxes(-1, -2))
 
     def _why_no_log(self, x, y):
         return "the subspaces have a right angle between them, and more than one geodesic leads from x to y"
 
 
-def _stretch(square):
+def _angle_over_sine(square):
     """``t / sin(t)`` for a square of ``sin(t/2)``, by its series where it is small; NaN at a right angle."""
-    small = square < _SMALL
-    series = jnp.polyval(jnp.asarray(_SERIES), jnp.where(small, square, 0.0))
+    small = square < _MAX_SERIES_SINE_SQUARED
+    series = jnp.polyval(jnp.asarray(_ANGLE_OVER_SINE_SERIES), jnp.where(small, square, 0.0))
     sine = jnp.where(small, 0.25, jnp.where(square < 0.5 - 0.5 * (math.pi / 2 * CUT_MARGIN), square, jnp.nan))
     cosine = 1.0 - sine
     return jnp.where(small, series, jnp.arctan2(jnp.sqrt(sine), jnp.sqrt(cosine)) / jnp.sqrt(sine * cosine))
 
 
-def _bracket(a, b):
+def _commutator(a, b):
     return a @ b - b @ a

@@ -10,17 +10,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._arrays import as_numeric
-from .._module import forwarded
+from .._arrays import numeric_array
+from .._pytree_module import forward_to
 from .._sizes import checked_size
 from ..errors import ParameterError, SpaceError
 from ..groups.catalogue import SE, SL, SO, SU, Heisenberg
-from ..groups.closed_forms import affine, unchanged
+from ..groups.closed_forms import affine_matrix, return_unchanged
 from ..groups.matrix_group import MEMBERSHIP_TOLERANCE, MatrixGroup, _log
-from ..matrices.linear import determinant, skew, solve, spectral_radius, symmetric
+from ..matrices.linear import determinant, skew_matrix, solve, spectral_radius, symmetric_matrix
 from ..matrices.symmetric import orthogonal_images, orthonormal_columns, polar
 from .base import Space, register
-from .maps import by_coordinates, by_flat, by_projection, by_value
+from .maps import extended_squared_distance, inner_by_coordinates, inner_by_flat, tangential_part_by_projection
 
 _so, _su, _se = lru_cache(SO), lru_cache(SU), lru_cache(SE)
 
@@ -52,12 +52,12 @@ class GroupSpace(Space):
     """
 
     metric = "left-invariant"
-    exp_of_group = True
+    exp_is_group_exp = True
 
     def __init__(self, group: MatrixGroup, inner=None):
         if not isinstance(group, MatrixGroup):
             raise SpaceError(f"GroupSpace is made of a MatrixGroup such as SL(3), not of {type(group).__name__}")
-        inner = np.eye(group.dim) if inner is None else np.asarray(as_numeric(inner, "inner"), dtype=np.float64)
+        inner = np.eye(group.dim) if inner is None else np.asarray(numeric_array(inner, "inner"), dtype=np.float64)
         if inner.shape != (group.dim,) * 2 or not np.allclose(inner, inner.T, rtol=1e-12, atol=0.0):
             raise ParameterError(f"inner is a symmetric matrix of shape {(group.dim,) * 2} for {group.name}")
         try:
@@ -83,10 +83,10 @@ class GroupSpace(Space):
 
     @property
     def dtype(self):  # type: ignore[override]
-        return self.group.algebra._known_basis().dtype
+        return self.group.algebra._require_basis().dtype
 
-    name = forwarded("group")
-    dim = forwarded("group")
+    name = forward_to("group")
+    dim = forward_to("group")
 
     @property
     def shape(self):
@@ -94,12 +94,12 @@ class GroupSpace(Space):
 
     def velocity(self, x, v) -> jax.Array:
         """Left-trivialised velocity: the ``xi`` in ``v = x hat(xi)``, components in the algebra, shape (..., dim)."""
-        return self._compiled("_velocity", *self._checked_vectors(x, v=v))
+        return self._call_compiled("_velocity", *self._checked_vectors(x, v=v))
 
     def from_velocity(self, x, xi) -> jax.Array:
         """``x hat(xi)``, the inverse of :meth:`velocity`."""
         xi = self.group._components(xi, "xi")
-        return self._compiled("_from_velocity", self._checked_point(x, "x"), xi)
+        return self._call_compiled("_from_velocity", self._checked_point(x, "x"), xi)
 
     def _velocity(self, x, v):
         return self.group.algebra.vee(self.group.inverse_map(x) @ v)
@@ -110,35 +110,35 @@ class GroupSpace(Space):
     def _residual(self, x):
         return self.group.defect(x)
 
-    def _relative(self, x, y):
+    def _relative_element(self, x, y):
         return self.group.inverse_map(x) @ y
 
     def _group_exp(self, x, v):
-        return self._restored(x @ self.group.exp_map(self.group.algebra, self._velocity(x, v)))
+        return self._apply_restore_map(x @ self.group.exp_map(self.group.algebra, self._velocity(x, v)))
 
     def _group_log(self, x, y):
-        return self._from_velocity(x, _log(self.group, self._relative(x, y)))
+        return self._from_velocity(x, _log(self.group, self._relative_element(x, y)))
 
-    def _left_carry(self, x, y, u):
+    def _left_translate(self, x, y, u):
         return y @ (self.group.inverse_map(x) @ u)
 
     def _cayley(self, x, v):
-        self.group._need("cayley")
+        self.group._require_map("cayley")
         assert self.group.cayley_map is not None
-        return self._restored(x @ self.group.cayley_map(self.group.algebra, self._velocity(x, v)))
+        return self._apply_restore_map(x @ self.group.cayley_map(self.group.algebra, self._velocity(x, v)))
 
     def _inverse_cayley(self, x, y):
-        self.group._need("cayley")
-        return self._from_velocity(x, self.group.inverse_cayley_map(self.group.algebra, self._relative(x, y)))
+        self.group._require_map("cayley")
+        return self._from_velocity(x, self.group.inverse_cayley_map(self.group.algebra, self._relative_element(x, y)))
 
-    def _restored(self, x):
+    def _apply_restore_map(self, x):
         """One Newton step to the group, so that rounding does not add up."""
         return self.group.restore_map(x)
 
     @property
-    def surrounded(self):
+    def can_be_embedded(self):
         """Not where all that is known of the group is its algebra and a distance from it."""
-        return self._has_equations or self.group.restore_map is not unchanged or self.dim == self.size
+        return self._has_equations or self.group.restore_map is not return_unchanged or self.dim == self.size
 
     @property
     def _has_equations(self):
@@ -147,8 +147,8 @@ class GroupSpace(Space):
     def _constraints(self, x):
         return super()._constraints(x) if self.group.equations is None else self.group.equations(x)
 
-    def _returned(self, x):
-        return self._restored(x)
+    def _restore(self, x):
+        return self._apply_restore_map(x)
 
     def _inside(self, x):
         return self.group.defect(x) <= MEMBERSHIP_TOLERANCE
@@ -157,7 +157,7 @@ class GroupSpace(Space):
 
     def injectivity_radius(self, x=None):
         """One that is sure: there eigenvalues of the velocity are smaller than pi."""
-        basis = self._orthonormal
+        basis = self._orthonormal_basis
         mixed = np.einsum("a,aij->ij", np.random.default_rng(0).standard_normal(len(basis)), basis)
         if not np.abs(np.linalg.matrix_power(mixed, len(mixed))).max() > 1e-12 * np.abs(mixed).max() ** len(mixed):
             return math.inf  # nilpotent: no eigenvalue but zero
@@ -168,32 +168,32 @@ class GroupSpace(Space):
         return spectral_radius(self.group.algebra.hat(self._velocity(x, v))) / math.pi
 
     def _project(self, x):
-        for _ in range(_MOST_RESTORES):
-            x = self._restored(x)
+        for _ in range(_MAX_RESTORE_STEPS):
+            x = self._apply_restore_map(x)
         return jnp.where((self.group.defect(x) <= MEMBERSHIP_TOLERANCE)[..., None, None], x, jnp.nan)
 
     @property
-    def _normals(self):
+    def _n_normals(self):
         return self.dim
 
-    def _from_normals(self, w):
+    def _point_from_normals(self, w):
         return self.group.exp_map(self.group.algebra, 0.5 * w)
 
     def _project_tangent(self, x, w):
         xi = self._velocity(x, w)
-        basis = x[..., None, :, :] @ self.group.algebra._known_basis()
+        basis = x[..., None, :, :] @ self.group.algebra._require_basis()
         rows = basis.reshape(*basis.shape[:-2], -1)
         rest = (w - self._from_velocity(x, xi)).reshape(*xi.shape[:-1], -1, 1)
         gram = (rows.conj() @ rows.swapaxes(-1, -2)).real
         return self._from_velocity(x, xi + solve(gram, (rows.conj() @ rest).real)[..., 0])
 
     @cached_property
-    def _orthonormal(self) -> np.ndarray:
+    def _orthonormal_basis(self) -> np.ndarray:
         """An orthonormal basis of the algebra, shape (dim, m, m)."""
-        return np.einsum("ab,bij->aij", np.linalg.inv(self._root), self.group.algebra._known_basis())
+        return np.einsum("ab,bij->aij", np.linalg.inv(self._root), self.group.algebra._require_basis())
 
     def _frame(self, x):
-        return x[..., None, :, :] @ self._orthonormal
+        return x[..., None, :, :] @ self._orthonormal_basis
 
     def _coordinates(self, x, v):
         return self._velocity(x, v) @ self._root
@@ -201,22 +201,22 @@ class GroupSpace(Space):
     def _from_coordinates(self, x, c):
         return self._from_velocity(x, c @ np.linalg.inv(self._root))
 
-    _inner = by_coordinates
+    _inner = inner_by_coordinates
 
     @cached_property
-    def _traces(self) -> np.ndarray:
+    def _adjoint_traces(self) -> np.ndarray:
         """``tr ad`` of the orthonormal basis, shape (dim,): zero on a unimodular group."""
         with jax.ensure_compile_time_eval():
             axes = np.eye(self.dim)
             brackets = np.asarray(self.group.algebra.bracket(axes[:, None], axes[None]))
         return np.linalg.solve(self._root, np.einsum("kaa->k", brackets))
 
-    def _changes(self, x, rows):
+    def _divergence_terms(self, x, rows):
         """Those along left translations, and the divergences ``-tr ad_E`` of the left-invariant fields themselves."""
-        along = super()._changes(x, rows)
+        along = super()._divergence_terms(x, rows)
         if self.group.algebra.is_unimodular():
             return along
-        own = rows(x, self._flat(x, self._from_coordinates(x, -self._traces)))
+        own = rows(x, self._flat(x, self._from_coordinates(x, -self._adjoint_traces)))
         return jnp.concatenate([along, own[None]])
 
     def _exp(self, x, v):
@@ -226,16 +226,16 @@ class GroupSpace(Space):
         return self._group_log(x, y)
 
     def _transport(self, x, v, u):
-        return self._left_carry(x, self._group_exp(x, v), u)
+        return self._left_translate(x, self._group_exp(x, v), u)
 
     def _why_no_log(self, x, y):
-        return f"x^-1 y {self.group._why_not_in_domain(np.asarray(self._relative(x, y)))}"
+        return f"x^-1 y {self.group._why_not_in_domain(np.asarray(self._relative_element(x, y)))}"
 
 
-_MOST_RESTORES = 8
+_MAX_RESTORE_STEPS = 8
 """Each squares the distance, so that from 1/2 on these reach rounding."""
 
-_HEIGHT = 1e-9
+_REAL_EIGENVALUE_SINE = 1e-9
 """Sine of an angle up to which an eigenvalue is taken to be 1 or -1, so that its angle has no sign."""
 
 register(())(lambda: GroupSpace(Heisenberg(1)))
@@ -254,10 +254,10 @@ class BiInvariantSpace(GroupSpace):
     def _project_tangent(self, x, w):
         return self._from_velocity(x, self._velocity(x, w))  # vee is the orthogonal projection
 
-    _along = by_projection
+    _tangential_part = tangential_part_by_projection
 
     def _frame(self, x):
-        return x[..., None, :, :] @ self.group.algebra._known_basis()
+        return x[..., None, :, :] @ self.group.algebra._require_basis()
 
     def _coordinates(self, x, v):
         return self._velocity(x, v)
@@ -265,17 +265,17 @@ class BiInvariantSpace(GroupSpace):
     def _from_coordinates(self, x, c):
         return self._from_velocity(x, c)
 
-    _inner = by_flat
+    _inner = inner_by_flat
 
     def _flat(self, x, v):
-        basis = self.group.algebra._known_basis()
+        basis = self.group.algebra._require_basis()
         return v.conj() / (np.abs(basis[0]) ** 2).sum()  # orthogonal matrices, all of this norm
 
     def _reach(self, x, v):
         return Space._reach(self, x, v)
 
     def _squared_distance(self, x, y):
-        return by_value(self, x, y)
+        return extended_squared_distance(self, x, y)
 
     def _squared_distance_value(self, x, y):
         """The squares of the angles of the eigenvalues of ``x^-1 y``, defined at half turns too.
@@ -283,24 +283,26 @@ class BiInvariantSpace(GroupSpace):
         ``|g v + v| = 2 cos(t/2)`` and ``|g v - v| = 2 sin(t/2)`` for eigenvectors v; they are found from the former,
         to a rounding also where it is small. NaN where the angles are not those of one logarithm in the algebra.
         """
-        g, one = self._relative(x, y), np.eye(self.shape[0])
+        g, one = self._relative_element(x, y), np.eye(self.shape[0])
         cosines, vectors = orthogonal_images(g + one)
         sines = (g - one) @ vectors
         angles = 2.0 * jnp.arctan2(*(jnp.sqrt((jnp.abs(a) ** 2).sum(axis=-2)) for a in (sines, cosines)))
-        square = (angles**2).sum(axis=-1) / (jnp.abs(self.group.algebra._known_basis()[0]) ** 2).sum()
+        square = (angles**2).sum(axis=-1) / (jnp.abs(self.group.algebra._require_basis()[0]) ** 2).sum()
         if not self.group.is_complex:
             return square
         heights = (vectors.conj() * (g @ vectors)).sum(axis=-2).imag
         turned = jnp.sin(angles)
-        signs = jnp.where(turned > _HEIGHT, heights / jnp.where(turned > _HEIGHT, turned, 1.0), 0.0)
-        half_turns = (jnp.where(turned > _HEIGHT, 0.0, angles)).sum(axis=-1)
+        signs = jnp.where(
+            turned > _REAL_EIGENVALUE_SINE, heights / jnp.where(turned > _REAL_EIGENVALUE_SINE, turned, 1.0), 0.0
+        )
+        half_turns = (jnp.where(turned > _REAL_EIGENVALUE_SINE, 0.0, angles)).sum(axis=-1)
         total = jnp.abs((signs * angles).sum(axis=-1))
         return jnp.where(total <= half_turns + 1.0, square, jnp.nan)
 
     def _transport(self, x, v, u):
         """``x m eta m`` with ``m = exp(xi/2)``: the velocity eta turns by Ad(m^-1)."""
         half = self.group.exp_map(self.group.algebra, 0.5 * self._velocity(x, v))
-        return x @ half @ self._relative(x, u) @ half
+        return x @ half @ self._relative_element(x, u) @ half
 
 
 @register((3,), (4,))
@@ -325,7 +327,7 @@ class SpecialOrthogonal(BiInvariantSpace):
         return math.pi
 
     def _project(self, x):
-        return _rotation(x)
+        return _nearest_rotation(x)
 
     def _squared_distance(self, x, y):
         if self.n <= 3:  # where every rotation has a logarithm
@@ -333,16 +335,16 @@ class SpecialOrthogonal(BiInvariantSpace):
         return super()._squared_distance(x, y)
 
     @property
-    def _normals(self):
+    def _n_normals(self):
         return self.size
 
-    def _from_normals(self, w):
+    def _point_from_normals(self, w):
         return _random_rotation(self.from_vector(w))
 
     def _correction(self, x, c):
-        return 0.5 * symmetric(c, self.n) @ x
+        return 0.5 * symmetric_matrix(c, self.n) @ x
 
-    def _rounded(self, x):
+    def _constraint_scales(self, x):
         return 2.0 * (jnp.abs(x) @ jnp.abs(x).swapaxes(-1, -2))[..., *np.triu_indices(self.n)]
 
 
@@ -370,26 +372,26 @@ class SpecialUnitary(BiInvariantSpace):
         return math.pi * math.sqrt(2 * self.n / (self.n - 1))
 
     def _project(self, x):
-        return self._of_unit_determinant(polar(x))
+        return self._scale_to_unit_determinant(polar(x))
 
-    def _of_unit_determinant(self, x):
+    def _scale_to_unit_determinant(self, x):
         return x * jnp.exp(-1j * jnp.angle(determinant(x)) / self.n)[..., None, None]
 
     @property
-    def _normals(self):
+    def _n_normals(self):
         return self.size
 
-    def _from_normals(self, w):
-        return self._of_unit_determinant(orthonormal_columns(self.from_vector(w)))
+    def _point_from_normals(self, w):
+        return self._scale_to_unit_determinant(orthonormal_columns(self.from_vector(w)))
 
     def _correction(self, x, c):
         of_real, of_imaginary, of_phase = jnp.split(
             c, np.cumsum([self.n * (self.n + 1) // 2, math.comb(self.n, 2)]), -1
         )
-        hermitian = symmetric(of_real, self.n) + 1j * skew(of_imaginary, self.n)
+        hermitian = symmetric_matrix(of_real, self.n) + 1j * skew_matrix(of_imaginary, self.n)
         return 0.5 * hermitian @ x + (1j / self.n) * of_phase[..., None] * x
 
-    def _rounded(self, x):
+    def _constraint_scales(self, x):
         sizes = 2.0 * jnp.abs(x) @ jnp.abs(x).swapaxes(-1, -2)
         upper = [sizes[..., *np.triu_indices(self.n, k)] for k in (0, 1)]
         return jnp.concatenate([*upper, jnp.full((*x.shape[:-2], 1), float(self.n))], axis=-1)
@@ -414,7 +416,7 @@ class SpecialEuclidean(GroupSpace):
 
     n: int
     length: float = 1.0
-    exp_of_group = False
+    exp_is_group_exp = False
 
     def __post_init__(self):
         checked_size(self.n, 2, "SpecialEuclidean(n)")
@@ -434,33 +436,33 @@ class SpecialEuclidean(GroupSpace):
         return math.pi
 
     def _project(self, x):
-        return affine(_rotation(x[..., :-1, :-1]), x[..., :-1, -1:])
+        return affine_matrix(_nearest_rotation(x[..., :-1, :-1]), x[..., :-1, -1:])
 
     @property
-    def _normals(self):
+    def _n_normals(self):
         return self.n * (self.n + 1)
 
-    def _from_normals(self, w):
+    def _point_from_normals(self, w):
         of_rotation, of_translation = jnp.split(w, [self.n**2], axis=-1)
         rotation = _random_rotation(of_rotation.reshape(*w.shape[:-1], self.n, self.n))
-        return affine(rotation, self.length * of_translation[..., None])
+        return affine_matrix(rotation, self.length * of_translation[..., None])
 
     def _project_tangent(self, x, w):
-        return self._map(self.rotations._project_tangent, lambda x, w: w, x, w)
+        return self._map_blocks(self.rotations._project_tangent, lambda x, w: w, x, w)
 
-    _along = by_projection
+    _tangential_part = tangential_part_by_projection
 
     def _correction(self, x, c):
         of_rotation, of_last = jnp.split(c, [self.n * (self.n + 1) // 2], axis=-1)
         top = self.rotations._correction(x[..., :-1, :-1], of_rotation)
         return jnp.concatenate([jnp.pad(top, [(0, 0)] * (top.ndim - 1) + [(0, 1)]), of_last[..., None, :]], axis=-2)
 
-    def _rounded(self, x):
-        return jnp.concatenate([self.rotations._rounded(x[..., :-1, :-1]), jnp.abs(x[..., -1, :])], axis=-1)
+    def _constraint_scales(self, x):
+        return jnp.concatenate([self.rotations._constraint_scales(x[..., :-1, :-1]), jnp.abs(x[..., -1, :])], axis=-1)
 
     def _frame(self, x):
         scale = np.where(np.arange(self.dim) < self.rotations.dim, 1.0, self.length)
-        return x[..., None, :, :] @ (scale[:, None, None] * self.group.algebra._known_basis())
+        return x[..., None, :, :] @ (scale[:, None, None] * self.group.algebra._require_basis())
 
     def _coordinates(self, x, v):
         return Space._coordinates(self, x, v)
@@ -468,29 +470,29 @@ class SpecialEuclidean(GroupSpace):
     def _from_coordinates(self, x, c):
         return Space._from_coordinates(self, x, c)
 
-    _inner = by_flat
+    _inner = inner_by_flat
 
     def _flat(self, x, v):
-        return self._map(self.rotations._flat, lambda x, v: v / self.length**2, x, v)
+        return self._map_blocks(self.rotations._flat, lambda x, v: v / self.length**2, x, v)
 
     def _exp(self, x, v):
-        y = self._map(self.rotations._exp, lambda x, v: x + v, x, v)
-        return affine(y[..., :-1, :-1], y[..., :-1, -1:])
+        y = self._map_blocks(self.rotations._exp, lambda x, v: x + v, x, v)
+        return affine_matrix(y[..., :-1, :-1], y[..., :-1, -1:])
 
     def _log(self, x, y):
-        return self._map(self.rotations._log, lambda x, y: y - x, x, y)
+        return self._map_blocks(self.rotations._log, lambda x, y: y - x, x, y)
 
     def _squared_distance(self, x, y):
         moved = (y[..., :-1, -1] - x[..., :-1, -1]) / self.length
         return self.rotations._squared_distance(x[..., :-1, :-1], y[..., :-1, :-1]) + (moved**2).sum(axis=-1)
 
     def _transport(self, x, v, u):
-        return self._map(self.rotations._transport, lambda x, v, u: u + jnp.zeros_like(v), x, v, u)
+        return self._map_blocks(self.rotations._transport, lambda x, v, u: u + jnp.zeros_like(v), x, v, u)
 
     def _reach(self, x, v):
         return self.rotations._reach(x[..., :-1, :-1], v[..., :-1, :-1])
 
-    def _map(self, rotational, translational, *arrays):
+    def _map_blocks(self, rotational, translational, *arrays):
         """Blocks ``[[rotational, translational], [0, 0]]`` of functions of the same blocks."""
         rotation = rotational(*(a[..., :-1, :-1] for a in arrays))
         translation = translational(*(a[..., :-1, -1:] for a in arrays))
@@ -502,7 +504,7 @@ class SpecialEuclidean(GroupSpace):
         return self.rotations._why_no_log(x[:-1, :-1], y[:-1, :-1])
 
 
-def _rotation(x):
+def _nearest_rotation(x):
     """The nearest rotation, NaN where there is a reflection nearer than any."""
     x = polar(x)
     return jnp.where((determinant(x) > 0.0)[..., None, None], x, jnp.nan)

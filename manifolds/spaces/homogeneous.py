@@ -10,14 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._module import forwarded
+from .._pytree_module import forward_to
 from ..errors import ParameterError, SpaceError
 from ..groups.matrix_group import MatrixGroup
-from ..groups.subgroups import factored, subalgebra
+from ..groups.subgroups import factor_element, subalgebra_basis
 from ..matrices.exponential import expm
 from .base import CUT_MARGIN, Space
 from .groups import BiInvariantSpace, SpecialOrthogonal, SpecialUnitary
-from .maps import by_coordinates
+from .maps import inner_by_coordinates
 
 
 @jax.tree_util.register_static
@@ -48,16 +48,16 @@ class Homogeneous(Space):
         If the matrices are dependent, not in the algebra of the group, or do not span a subalgebra.
     """
 
-    upstairs: BiInvariantSpace
-    horizontal: tuple[tuple[float, ...], ...]
+    group_space: BiInvariantSpace
+    horizontal_basis: tuple[tuple[float, ...], ...]
     name: str = "G/H"
     metric = "normal"
-    searched = True
-    of_classes = True
+    has_iterative_log = True
+    is_quotient = True
 
     def __init__(self, group, stabilizer, name: str | None = None):
-        upstairs = _space_of(group)
-        rows = subalgebra(upstairs.group, stabilizer)
+        upstairs = _group_space_of(group)
+        rows = subalgebra_basis(upstairs.group, stabilizer)
         rest = np.linalg.svd(rows, full_matrices=True)[2][len(rows) :] if len(rows) else np.eye(upstairs.dim)
         if not len(rest):
             raise ParameterError(f"{upstairs.name}: the stabilizer is the whole group, and leaves a single point")
@@ -68,20 +68,20 @@ class Homogeneous(Space):
 
     @property
     def dim(self):
-        return len(self.horizontal)
+        return len(self.horizontal_basis)
 
-    shape = forwarded("upstairs")
-    dtype = forwarded("upstairs")
+    shape = forward_to("group_space")
+    dtype = forward_to("group_space")
 
     def injectivity_radius(self, x=None):
         """Curvatures are at most ``|[X, Y]|^2`` for unit X, Y [Bloch & Iserles 2005]: 2 in SO(n) with n > 3, else 1."""
-        steep = isinstance(self.upstairs, SpecialOrthogonal) and self.upstairs.n > 3
+        steep = isinstance(self.group_space, SpecialOrthogonal) and self.group_space.n > 3
         return math.pi / math.sqrt(2.0) if steep else math.pi
 
     @cached_property
     def _m(self) -> np.ndarray:
         """The horizontal part of the algebra: orthonormal components, shape (dim, dim of the group)."""
-        return np.array(self.horizontal)
+        return np.array(self.horizontal_basis)
 
     @cached_property
     def _h(self) -> np.ndarray:
@@ -90,15 +90,15 @@ class Homogeneous(Space):
 
     # -- points: those of the group -----------------------------------------------------------------------------------
 
-    _residual = forwarded("upstairs")
-    _project = forwarded("upstairs")
-    _constraints = forwarded("upstairs")
-    _correction = forwarded("upstairs")
-    _along = forwarded("upstairs")
-    _rounded = forwarded("upstairs")
-    _inside = forwarded("upstairs")
-    _normals = forwarded("upstairs")
-    _from_normals = forwarded("upstairs")
+    _residual = forward_to("group_space")
+    _project = forward_to("group_space")
+    _constraints = forward_to("group_space")
+    _correction = forward_to("group_space")
+    _tangential_part = forward_to("group_space")
+    _constraint_scales = forward_to("group_space")
+    _inside = forward_to("group_space")
+    _n_normals = forward_to("group_space")
+    _point_from_normals = forward_to("group_space")
 
     # -- horizontal vectors -------------------------------------------------------------------------------------------
 
@@ -106,37 +106,37 @@ class Homogeneous(Space):
         return self._from_coordinates(x, self._coordinates(x, w))
 
     def _coordinates(self, x, v):
-        return self.upstairs._velocity(x, v) @ self._m.T
+        return self.group_space._velocity(x, v) @ self._m.T
 
     def _from_coordinates(self, x, c):
-        return self.upstairs._from_velocity(x, c @ self._m)
+        return self.group_space._from_velocity(x, c @ self._m)
 
     def _frame(self, x):
-        return x[..., None, :, :] @ np.einsum("da,aij->dij", self._m, self.upstairs.group.algebra._known_basis())
+        return x[..., None, :, :] @ np.einsum("da,aij->dij", self._m, self.group_space.group.algebra._require_basis())
 
-    _inner = by_coordinates
+    _inner = inner_by_coordinates
 
     def _flat(self, x, v):
-        return self.upstairs._flat(x, self._project_tangent(x, v))
+        return self.group_space._flat(x, self._project_tangent(x, v))
 
-    _exp = forwarded("upstairs")
+    _exp = forward_to("group_space")
 
     def _transport(self, x, v, u):
-        brackets = self._m @ self.upstairs.group.algebra.ad(self.upstairs._velocity(x, v)) @ self._m.T
+        brackets = self._m @ self.group_space.group.algebra.ad(self.group_space._velocity(x, v)) @ self._m.T
         c = expm(-0.5 * brackets) @ self._coordinates(x, u)[..., None]
         return self._from_coordinates(self._exp(x, v), c[..., 0])
 
     def _log(self, x, y):
         pair = "(n,n),(n,n)->(d)"
-        return self._from_coordinates(x, jnp.vectorize(self._log_of_one, signature=pair)(x, y))
+        return self._from_coordinates(x, jnp.vectorize(self._single_log, signature=pair)(x, y))
 
-    def _log_of_one(self, x, y):
+    def _single_log(self, x, y):
         """The horizontal c, with b in H, for which ``exp(c) exp(b)`` is the way from x to y."""
         reach = self.injectivity_radius() * (1.0 - CUT_MARGIN)
-        return factored(self.upstairs.group, self._m, self._h, self.upstairs._relative(x, y), reach)
+        return factor_element(self.group_space.group, self._m, self._h, self.group_space._relative_element(x, y), reach)
 
 
-def _space_of(group) -> BiInvariantSpace:
+def _group_space_of(group) -> BiInvariantSpace:
     if isinstance(group, BiInvariantSpace):
         return group
     if isinstance(group, MatrixGroup):

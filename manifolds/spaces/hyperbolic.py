@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._sizes import checked_size
-from ..matrices.stumpff import hyperbolic_arc, hyperbolic_stumpff
+from ..matrices.stumpff import arcsinh_over_sinh, hyperbolic_stumpff
 from .base import Space, register
-from .maps import by_coordinates, by_projection
+from .maps import inner_by_coordinates, tangential_part_by_projection
 
 
 @register((2,))
@@ -45,7 +45,7 @@ class Hyperbolic(Space):
 
     def _residual(self, x):
         square = (x**2).sum(axis=-1)
-        off = jnp.abs(1.0 + _minkowski(x, x)[..., 0]) / (2.0 * square)
+        off = jnp.abs(1.0 + _minkowski_product(x, x)[..., 0]) / (2.0 * square)
         return jnp.where(x[..., 0] > 0, off, jnp.where(jnp.isfinite(square), jnp.inf, jnp.nan))
 
     def _project(self, x):
@@ -54,21 +54,21 @@ class Hyperbolic(Space):
         return jnp.concatenate([jnp.sqrt(1.0 + (space**2).sum(axis=-1, keepdims=True)), space], axis=-1)
 
     def _constraints(self, x):
-        return 0.5 * (_minkowski(x, x) + 1.0)
+        return 0.5 * (_minkowski_product(x, x) + 1.0)
 
     def _inside(self, x):
         return x[..., 0] > 0.0
 
-    def _normal(self, x, c):
-        return c * _lowered(x) / (x**2).sum(axis=-1, keepdims=True)
+    def _minimal_correction(self, x, c):
+        return c * _lower_index(x) / (x**2).sum(axis=-1, keepdims=True)
 
-    _along = by_projection
+    _tangential_part = tangential_part_by_projection
 
-    def _rounded(self, x):
+    def _constraint_scales(self, x):
         return (x**2).sum(axis=-1, keepdims=True)
 
     def _project_tangent(self, x, w):
-        normal = _lowered(x)
+        normal = _lower_index(x)
         return w - normal * ((normal * w).sum(axis=-1, keepdims=True) / (x**2).sum(axis=-1, keepdims=True))
 
     def _frame(self, x):
@@ -82,27 +82,27 @@ class Hyperbolic(Space):
         x0, space, part = x[..., :1], x[..., 1:], v[..., 1:]
         return part - space * (_dot(space, part) / (x0 * (1.0 + x0)))
 
-    _inner = by_coordinates
+    _inner = inner_by_coordinates
 
     def _flat(self, x, v):
-        return _lowered(v)
+        return _lower_index(v)
 
     def _sharp(self, x, alpha):
-        raised = _lowered(alpha)
-        return _minkowski(x, raised) * x - _minkowski(x, x) * raised  # along every hyperboloid
+        raised = _lower_index(alpha)
+        return _minkowski_product(x, raised) * x - _minkowski_product(x, x) * raised  # along every hyperboloid
 
     def _exp(self, x, v):
-        z = _minkowski(v, v)
+        z = _minkowski_product(v, v)
         return self._project(hyperbolic_stumpff(0, z) * x + hyperbolic_stumpff(1, z) * v)
 
     def _log(self, x, y):
         z = self._squared_chord(x, y)
         w = y - x - 0.5 * z * x  # of length sinh(distance)
-        return hyperbolic_arc(z * (1.0 + 0.25 * z)) * w
+        return arcsinh_over_sinh(z * (1.0 + 0.25 * z)) * w
 
     def _squared_distance(self, x, y):
         z = self._squared_chord(x, y)[..., 0]
-        return z * hyperbolic_arc(0.25 * z) ** 2
+        return z * arcsinh_over_sinh(0.25 * z) ** 2
 
     def _squared_chord(self, x, y):
         """``<y - x, y - x> = 4 sinh(d/2)^2``, shape (..., 1), without the cancellation of the two squares in it.
@@ -112,8 +112,8 @@ class Hyperbolic(Space):
         """
         x0, y0, p, q = x[..., :1], y[..., :1], x[..., 1:], y[..., 1:]
         step = y - x
-        near, apart = _minkowski(step, step), -2.0 * (1.0 + _minkowski(x, y))
-        far = jnp.minimum(x0, y0) > _FAR
+        near, apart = _minkowski_product(step, step), -2.0 * (1.0 + _minkowski_product(x, y))
+        far = jnp.minimum(x0, y0) > _MIN_FAR_COSH
         p, q = (jnp.where(far, a, 1.0) for a in (p, q))
         a, b = jnp.sqrt(_dot(p, p)), jnp.sqrt(_dot(q, q))
         difference = _dot(q - p, q + p)  # b^2 - a^2
@@ -129,11 +129,11 @@ class Hyperbolic(Space):
         return self._project((x + y) / jnp.sqrt(4.0 + self._squared_chord(x, y)))
 
     def _transport(self, x, v, u):
-        z = _minkowski(v, v)
-        return u + _minkowski(v, u) * (hyperbolic_stumpff(2, z) * v + hyperbolic_stumpff(1, z) * x)
+        z = _minkowski_product(v, v)
+        return u + _minkowski_product(v, u) * (hyperbolic_stumpff(2, z) * v + hyperbolic_stumpff(1, z) * x)
 
 
-_FAR = 2.0
+_MIN_FAR_COSH = 2.0
 """The cosh of a radius from which on directions are taken of points."""
 
 
@@ -141,9 +141,9 @@ def _dot(u, v):
     return (u * v).sum(axis=-1, keepdims=True)
 
 
-def _minkowski(u, v):
-    return (_lowered(u) * v).sum(axis=-1, keepdims=True)
+def _minkowski_product(u, v):
+    return (_lower_index(u) * v).sum(axis=-1, keepdims=True)
 
 
-def _lowered(v):
+def _lower_index(v):
     return v * np.array([-1.0] + [1.0] * (v.shape[-1] - 1))

@@ -15,18 +15,18 @@ from .._sizes import checked_size
 from ..errors import DomainError, ParameterError, SpaceError
 from ..matrices.linear import solve_near_identity
 from .base import MEMBERSHIP_TOLERANCE, Space, register
-from .maps import by_flat
+from .maps import inner_by_flat
 
-DEPENDENT = 1e-9
+MIN_GRADIENT_SINGULAR_VALUE = 1e-9
 """Least singular value of the gradients of the constraints, made unit vectors, that counts as independent."""
 
-TRIED = 16
+N_RANDOM_TRIALS = 16
 """Random arrays, of which at least one has to lead to a point."""
 
-VANISHING = 1e-5
+MIN_GRADIENT_RATIO = 1e-5
 """Length of a gradient on the manifold, relative to that at random arrays, that counts as none."""
 
-_NEWTON_STEPS = 24
+_MAX_NEWTON_STEPS = 24
 
 
 @jax.tree_util.register_static
@@ -82,37 +82,39 @@ class LevelSet(Space):
         object.__setattr__(self, "constraints", frozen)
         if callable(metric):
             metric = FrozenFunction(metric, sizes)
-        object.__setattr__(self, "form", metric if metric is None or callable(metric) else _Constant.of(metric, self))
-        self._check()
+        object.__setattr__(
+            self, "form", metric if metric is None or callable(metric) else _ConstantMetric.from_matrix(metric, self)
+        )
+        self._check_constraints()
 
-    def _check(self) -> None:
+    def _check_constraints(self) -> None:
         count = jax.eval_shape(self._constraints, jax.ShapeDtypeStruct(self.shape, jnp.float64)).shape[-1]
         if not 0 < count < self.size:
             raise SpaceError(f"{self.name}: {count} constraints on {self.size} numbers leave no manifold")
-        x = jax.random.normal(jax.random.key(0), (TRIED, *self.shape))
-        dependence = self._compiled("_dependence", x)
-        if not bool((dependence > DEPENDENT).any()):
+        x = jax.random.normal(jax.random.key(0), (N_RANDOM_TRIALS, *self.shape))
+        dependence = self._call_compiled("_dependence", x)
+        if not bool((dependence > MIN_GRADIENT_SINGULAR_VALUE).any()):
             worst = float(np.nanmax(np.asarray(dependence), initial=0.0))
             raise SpaceError(
                 f"{self.name}: its constraints depend on each other: of their gradients, made unit vectors, the least "
-                f"singular value is at most {worst:.1e} at {TRIED} random arrays; leave one out"
+                f"singular value is at most {worst:.1e} at {N_RANDOM_TRIALS} random arrays; leave one out"
             )
-        points = self._compiled("_project", x)
+        points = self._call_compiled("_project", x)
         found = np.asarray(jnp.isfinite(points).all(axis=self._axes))
         if not found.any():
             raise SpaceError(
-                f"{self.name}: Newton's method finds no point of it from {TRIED} random arrays: its constraints may "
+                f"{self.name}: Newton's method finds no point of it from {N_RANDOM_TRIALS} random arrays: its constraints may "
                 "contradict each other, or depend on each other at its points"
             )
-        sizes = [np.linalg.norm(np.asarray(self._compiled("_rows", y)), axis=-1) for y in (x, points)]
+        sizes = [np.linalg.norm(np.asarray(self._call_compiled("_rows", y)), axis=-1) for y in (x, points)]
         shrunk = (sizes[1][found] / np.median(sizes[0], axis=0)).max(axis=0)
-        if (shrunk < VANISHING).any():
+        if (shrunk < MIN_GRADIENT_RATIO).any():
             i = int(np.argmin(shrunk))
             raise SpaceError(
                 f"{self.name}: the gradient of constraint {i} vanishes on it, near {np.asarray(points)[found][0]}: "
                 "give a function that changes its sign there"
             )
-        if self.form is not None and self._compiled("_metric_at", x).shape[-2:] != (self.size, self.size):
+        if self.form is not None and self._call_compiled("_metric_at", x).shape[-2:] != (self.size, self.size):
             raise ParameterError(f"{self.name}: the metric is a matrix of shape {(self.size, self.size)} at each point")
 
     @property
@@ -140,7 +142,7 @@ class LevelSet(Space):
         steps : int
         """
         x, v = self._checked_vectors(x, v=v)
-        end = self._compiled("_geodesic", x, v, static=(checked_size(steps, 1, "geodesic", "steps"),))
+        end = self._call_compiled("_geodesic", x, v, static=(checked_size(steps, 1, "geodesic", "steps"),))
         if not bool(jnp.isfinite(end).all()):
             raise DomainError(f"{self.name}: the geodesic could not be followed with {steps} steps: take more")
         return end
@@ -156,24 +158,26 @@ class LevelSet(Space):
         return jax.vmap(of_one)(x.reshape(-1, *self.shape)).reshape(*batch, -1) if batch else of_one(x)
 
     def _project(self, x):
-        x = jax.lax.fori_loop(0, _NEWTON_STEPS, lambda _, y: y - self._normal(y, self._constraints(y)), x)
+        x = jax.lax.fori_loop(
+            0, _MAX_NEWTON_STEPS, lambda _, y: y - self._minimal_correction(y, self._constraints(y)), x
+        )
         return jnp.where(self._scale(self._residual(x) <= MEMBERSHIP_TOLERANCE, jnp.ones_like(x)) > 0, x, jnp.nan)
 
-    def _returned(self, x):
-        return x - self._normal(x, self._constraints(x))
+    def _restore(self, x):
+        return x - self._minimal_correction(x, self._constraints(x))
 
     def _residual(self, x):
-        away = jnp.abs(self._normal(x, self._constraints(x))).max(axis=self._axes)
+        away = jnp.abs(self._minimal_correction(x, self._constraints(x))).max(axis=self._axes)
         return away / jnp.maximum(jnp.abs(x).max(axis=self._axes), 1.0)
 
     def _random(self, key, size):
-        tries = self._project(jax.random.normal(key, (TRIED, *size, *self.shape)))
+        tries = self._project(jax.random.normal(key, (N_RANDOM_TRIALS, *size, *self.shape)))
         found = jnp.isfinite(tries).all(axis=self._axes, keepdims=True)
         chosen = jnp.argmax(found, axis=0, keepdims=True)
         return jnp.take_along_axis(tries, chosen, axis=0)[0]
 
     def _project_tangent(self, x, w):
-        return self._along(x, w)
+        return self._tangential_part(x, w)
 
     def _metric_at(self, x):
         assert self.form is not None
@@ -181,7 +185,7 @@ class LevelSet(Space):
         found = jax.vmap(lambda y: jnp.asarray(form(y)))(x.reshape(-1, *self.shape))
         return found.reshape(*batch, *found.shape[1:])
 
-    _inner = by_flat
+    _inner = inner_by_flat
 
     def _flat(self, x, v):
         if self.form is None:
@@ -190,20 +194,20 @@ class LevelSet(Space):
 
     def _sharp(self, x, alpha):
         if self.form is None:
-            return self._along(x, alpha)
+            return self._tangential_part(x, alpha)
         g, alpha = self._metric_at(x), self.to_vector(alpha + jnp.zeros_like(x))[..., None]
-        columns = self._rows(x).swapaxes(-1, -2)
+        columns = self._constraint_jacobian(x).swapaxes(-1, -2)
         raised = solve_near_identity(g, jnp.concatenate([columns, alpha], axis=-1))
         normal, v = raised[..., :-1], raised[..., -1:]
         weights = solve_near_identity(columns.swapaxes(-1, -2) @ normal, columns.swapaxes(-1, -2) @ v)
         return self.from_vector((v - normal @ weights)[..., 0])
 
     @property
-    def _induced(self):
+    def _has_induced_metric(self):
         return self.form is None
 
-    def _dependence(self, x):
-        rows = self._rows(x)
+    def _min_gradient_singular_value(self, x):
+        rows = self._constraint_jacobian(x)
         rows = rows / jnp.linalg.norm(rows, axis=-1, keepdims=True)
         return jnp.sqrt(jnp.linalg.eigvalsh(rows @ rows.swapaxes(-1, -2))[..., 0])
 
@@ -225,20 +229,23 @@ class LevelSet(Space):
 
         return self._project(jax.lax.fori_loop(0, steps, step, (x, self._flat(x, v)))[0])
 
-    def _why_off(self, x, residual):
-        if np.isfinite(x).all() and not float(self._compiled("_dependence", jnp.asarray(x))) > DEPENDENT:
+    def _why_off_space(self, x, residual):
+        if (
+            np.isfinite(x).all()
+            and not float(self._call_compiled("_dependence", jnp.asarray(x))) > MIN_GRADIENT_SINGULAR_VALUE
+        ):
             return "the gradients of its constraints depend on each other there"
-        return super()._why_off(x, residual)
+        return super()._why_off_space(x, residual)
 
 
 @dataclass(frozen=True)
-class _Constant:
+class _ConstantMetric:
     """A metric that is the same everywhere."""
 
     rows: tuple[tuple[float, ...], ...]
 
     @classmethod
-    def of(cls, metric, space: LevelSet) -> _Constant:
+    def from_matrix(cls, metric, space: LevelSet) -> _ConstantMetric:
         matrix = np.asarray(metric, dtype=np.float64)
         n = math.prod(space.sizes)
         if matrix.shape != (n, n) or not np.allclose(matrix, matrix.T, rtol=1e-12, atol=0.0):

@@ -16,7 +16,7 @@ from ..errors import SpaceError
 from ..matrices.linear import solve_near_identity
 
 
-class Maps(ABC):
+class SpaceMaps(ABC):
     """The maps of a state space as its author writes them: plain JAX functions of arrays already checked.
 
     Batches are in front. ``name``, ``dim``, ``shape`` and ``_project`` have to be given; all the others follow from
@@ -26,11 +26,11 @@ class Maps(ABC):
     metric: str = "induced"
     bi_invariant: bool = False
     """Whether the space is a group whose exponential is the Riemannian one."""
-    exp_of_group: bool = False
+    exp_is_group_exp: bool = False
     """Whether the space is a group and :meth:`exp` the exponential of it, as with a bi-invariant metric."""
-    smooth: bool = True
+    is_smooth: bool = True
     """Whether its maps have derivatives of every order, not of the first alone."""
-    searched: bool = False
+    has_iterative_log: bool = False
     """Whether ``log`` looks for the geodesic, up to the injectivity radius."""
     dtype: np.dtype = np.dtype(np.float64)
 
@@ -68,23 +68,23 @@ class Maps(ABC):
         return jnp.abs(x - y).max(axis=self._axes) / jnp.maximum(jnp.abs(y).max(axis=self._axes), 1.0)
 
     @property
-    def _normals(self) -> int | None:
+    def _n_normals(self) -> int | None:
         """How many normal numbers a random point is made of, None where it is drawn otherwise."""
-        return self.size if type(self)._random is Maps._random else None
+        return self.size if type(self)._random is SpaceMaps._random else None
 
-    def _from_normals(self, w):
+    def _point_from_normals(self, w):
         """A random point from normal numbers, shape (..., normals)."""
         return self._project(self.from_vector(w))
 
     def _random(self, key, size):
-        return self._from_normals(jax.random.normal(key, (*size, self._normals or 0)))
+        return self._point_from_normals(jax.random.normal(key, (*size, self._n_normals or 0)))
 
-    def _tangents(self, x):
+    def _tangent_basis(self, x):
         """A basis of the tangent space, orthonormal as flat arrays, shape (..., dim, size): of what _project lets by.
 
         By Gram and Schmidt's process, the longest rest first.
         """
-        push = (lambda w: self._along(x, w)) if self._has_equations else jax.linearize(self._project, x)[1]
+        push = (lambda w: self._tangential_part(x, w)) if self._has_equations else jax.linearize(self._project, x)[1]
         axes = self.from_vector(jnp.eye(self.size))
         rest = jax.vmap(lambda axis: self.to_vector(push(jnp.broadcast_to(axis, x.shape))), out_axes=-2)(axes)
         basis: list[jax.Array] = []
@@ -97,13 +97,13 @@ class Maps(ABC):
         return jnp.stack(basis, axis=-2)
 
     def _project_tangent(self, x, w):
-        basis, flat = self._tangents(x), self.to_vector(w)
+        basis, flat = self._tangent_basis(x), self.to_vector(w)
         weights = (basis * flat[..., None, :]).sum(axis=-1, keepdims=True)
         return self.from_vector((weights * basis).sum(axis=-2))
 
     def _frame(self, x):
         frame: list[jax.Array] = []
-        for v in jnp.moveaxis(self.from_vector(self._tangents(x)), -1 - len(self.shape), 0):
+        for v in jnp.moveaxis(self.from_vector(self._tangent_basis(x)), -1 - len(self.shape), 0):
             for e in frame:
                 v = v - self._scale(self._inner(x, e, v), e)
             frame.append(self._scale(1.0 / jnp.sqrt(self._inner(x, v, v)), v))
@@ -117,9 +117,9 @@ class Maps(ABC):
         return jax.grad(lambda w: self._inner(x, v, w).sum())(jnp.zeros_like(v))
 
     @property
-    def geodesics(self) -> bool:
+    def has_geodesics(self) -> bool:
         """Whether the space knows its geodesics: has :meth:`exp`, :meth:`log`, :meth:`transport` and what follows."""
-        return type(self)._exp is not Maps._exp
+        return type(self)._exp is not SpaceMaps._exp
 
     def _exp(self, x, v):
         raise SpaceError(
@@ -135,33 +135,35 @@ class Maps(ABC):
         return self._exp(x, v)  # raises
 
     def _coordinates(self, x, v):
-        return self._pair(self._frame(x), self._over_frame(self._flat(x, v)))
+        return self._pair(self._frame(x), self._with_frame_axis(self._flat(x, v)))
 
     def _from_coordinates(self, x, c):
         weights = c.reshape(*c.shape, *(1,) * len(self.shape))
         return (weights * self._frame(x)).sum(axis=-1 - len(self.shape))
 
     def _sharp(self, x, alpha):
-        return self._from_coordinates(x, self._pair(self._frame(x), self._over_frame(alpha)))
+        return self._from_coordinates(x, self._pair(self._frame(x), self._with_frame_axis(alpha)))
 
     @property
     def isotropic_size(self) -> int:
         """How many numbers :meth:`isotropic` takes."""
-        return self.size if self._induced else self.dim
+        return self.size if self._has_induced_metric else self.dim
 
     def _isotropic(self, x, w):
         """``R w`` with ``R R^T`` the inverse of the metric, and R differentiable in x.
 
         A smooth frame is such an R; so are the fields of a group of isometries, and the projection of arrays.
         """
-        return self._project_tangent(x, self.from_vector(w)) if self._induced else self._from_coordinates(x, w)
+        return (
+            self._project_tangent(x, self.from_vector(w)) if self._has_induced_metric else self._from_coordinates(x, w)
+        )
 
     @property
-    def _induced(self) -> bool:
+    def _has_induced_metric(self) -> bool:
         """Whether the metric is known to be that of the arrays around."""
-        return type(self)._inner is Maps._inner
+        return type(self)._inner is SpaceMaps._inner
 
-    def _changes(self, x, rows):
+    def _divergence_terms(self, x, rows):
         """``<E_i, nabla_{E_i} X>`` over a frame E, shape (dim, ...): the divergence of X is the sum over i.
 
         ``rows(y, alpha)`` is what a covector alpha at y makes of the field X, or of each of several.
@@ -174,9 +176,9 @@ class Maps(ABC):
         def straight(t, e):  # the metric being that of the arrays around
             return rows(self._project(x + t * e), e.conj())
 
-        if not (self.geodesics or self._induced):
+        if not (self.has_geodesics or self._has_induced_metric):
             raise SpaceError(f"divergences on {self.name} are found along geodesics: give _exp, _log and _transport")
-        along = geodesic if self.geodesics else straight
+        along = geodesic if self.has_geodesics else straight
         frame = jnp.moveaxis(self._frame(x), -1 - len(self.shape), 0)
         return jax.vmap(lambda e: jax.jvp(lambda t: along(t, e), (0.0,), (1.0,))[1])(frame)
 
@@ -190,13 +192,13 @@ class Maps(ABC):
 
     def _squared_distance(self, x, y):
         """The square of the distance, with its derivatives of every order also where both points are one."""
-        if type(self)._distance is not Maps._distance:
+        if type(self)._distance is not SpaceMaps._distance:
             return self._distance(x, y) ** 2
-        v = self._compiled("_log", x, y)
-        return self._compiled("_inner", x, v, v)
+        v = self._call_compiled("_log", x, y)
+        return self._call_compiled("_inner", x, v, v)
 
     def _midpoint(self, x, y):
-        return self._compiled("_exp", x, 0.5 * self._compiled("_log", x, y))
+        return self._call_compiled("_exp", x, 0.5 * self._call_compiled("_log", x, y))
 
     def _reach(self, x, v):
         return self._norm(x, v) / self.injectivity_radius()
@@ -205,11 +207,11 @@ class Maps(ABC):
     # Systems are run there where no retraction is asked for. These maps are asked for near the space too.
 
     @property
-    def surrounded(self) -> bool:
+    def can_be_embedded(self) -> bool:
         """Whether systems are run in the arrays around the space where no retraction is asked for."""
         return True
 
-    of_classes: ClassVar[bool] = False
+    is_quotient: ClassVar[bool] = False
     """Whether many points are one: functions have to be the same at all of these."""
 
     def _constraints(self, x):
@@ -217,9 +219,9 @@ class Maps(ABC):
 
         Quadratic ones are kept by collocation, and cost an implicit step nothing.
         """
-        return self.to_vector(x - self._returned(x))
+        return self.to_vector(x - self._restore(x))
 
-    def _returned(self, x):
+    def _restore(self, x):
         """A point near x that is nearer to the space, as Newton's method comes nearer; x itself where it is one."""
         return self._project(x)
 
@@ -229,42 +231,42 @@ class Maps(ABC):
 
     @property
     def _has_equations(self) -> bool:
-        return type(self)._constraints is not Maps._constraints
+        return type(self)._constraints is not SpaceMaps._constraints
 
-    def _rows(self, x):
+    def _constraint_jacobian(self, x):
         """The derivatives of the constraints, shape (..., m, size)."""
         found, pull = jax.vjp(lambda y: self._constraints(self.from_vector(y)), self.to_vector(x))
         axes = np.eye(found.shape[-1])
         return jax.vmap(lambda e: pull(jnp.broadcast_to(e, found.shape))[0], out_axes=-2)(axes)
 
-    def _normal(self, x, c):
+    def _minimal_correction(self, x, c):
         """The least displacement at x that changes the constraints by c, shape (..., m)."""
         if not self._has_equations:
             return self.from_vector(c)
-        rows = self._rows(x)
+        rows = self._constraint_jacobian(x)
         weights = solve_near_identity(rows @ rows.swapaxes(-1, -2), c[..., None])
         return self.from_vector((weights * rows).sum(axis=-2))
 
     def _correction(self, x, c):
         """A displacement that changes the constraints by c, shape (..., m), at a point x; near it, by about as much."""
-        return self._normal(x, c)
+        return self._minimal_correction(x, c)
 
-    def _along(self, x, w):
+    def _tangential_part(self, x, w):
         """The array w less what would change the constraints at x."""
         if not self._has_equations:
             return self._project_tangent(x, w)
         x, w = jnp.broadcast_arrays(x, w)
-        return w - self._normal(x, jax.jvp(self._constraints, (x,), (w,))[1])
+        return w - self._minimal_correction(x, jax.jvp(self._constraints, (x,), (w,))[1])
 
-    def _rounded(self, x):
+    def _constraint_scales(self, x):
         """The sizes at which the constraints are rounded at x, shape (..., m)."""
         if not self._has_equations:
             return jnp.abs(self.to_vector(x))
-        return (jnp.abs(self._rows(x)) * jnp.abs(self.to_vector(x))[..., None, :]).sum(axis=-1)
+        return (jnp.abs(self._constraint_jacobian(x)) * jnp.abs(self.to_vector(x))[..., None, :]).sum(axis=-1)
 
     # What retractions other than the Riemannian one are made of, where a space has it.
 
-    def _straight_reach(self, x, v):
+    def _euclidean_reach(self, x, v):
         """Length of v over that up to which ``x + v`` is sure to stay in a space that is an open set of arrays."""
         raise SpaceError(f"{self.name} is not an open set of arrays: x + v leaves it")
 
@@ -276,7 +278,7 @@ class Maps(ABC):
         """The inverse of :meth:`_group_exp`, NaN where it is not defined."""
         return self._group_exp(x, y)  # raises
 
-    def _left_carry(self, x, y, u):
+    def _left_translate(self, x, y, u):
         """``y x^-1 u``."""
         return self._group_exp(x, u)  # raises
 
@@ -289,9 +291,9 @@ class Maps(ABC):
 
     def _why_no_log(self, x, y) -> str:
         """Why ``log(x, y)`` is NaN, for one pair of NumPy arrays."""
-        if not self.geodesics:
+        if not self.has_geodesics:
             return "the chart around x does not reach y; go by a point between them"
-        if self.searched:
+        if self.has_iterative_log:
             return (
                 f"no geodesic shorter than {self.injectivity_radius():.6g} from x to y was found, and a longer one "
                 "might not be the shortest; go by a point between them"
@@ -323,29 +325,31 @@ class Maps(ABC):
         """Vectors times numbers, one for each point."""
         return factor.reshape(*factor.shape, *(1,) * len(self.shape)) * v
 
-    def _over_frame(self, v):
+    def _with_frame_axis(self, v):
         """``v`` with an axis of length 1 for the vectors of a frame."""
         return jnp.expand_dims(v, -1 - len(self.shape))
 
-    def _compiled(self, kernel: str, *arrays, static: tuple = ()):
-        few = sum(np.size(array) for array in arrays) + np.prod(static) * self.size <= FEW
+    def _call_compiled(self, kernel: str, *arrays, static: tuple = ()):
+        few = sum(np.size(array) for array in arrays) + np.prod(static) * self.size <= MAX_UNOPTIMIZED_SIZE
         hasty = few and not any(is_traced(array) for array in arrays)  # a part of another program has no options
-        return (run_hastily if hasty else run)(self, kernel, static, *arrays)
+        return (run_kernel_unoptimized if hasty else run_kernel)(self, kernel, static, *arrays)
 
 
-FEW = 10_000
+MAX_UNOPTIMIZED_SIZE = 10_000
 """Numbers up to which a compiler that does not optimise is the faster one, as long as a kernel is run a few times."""
 
 
-def _of_kernel(space: Maps, kernel: str, static: tuple, *arrays) -> Any:
+def _call_kernel(space: SpaceMaps, kernel: str, static: tuple, *arrays) -> Any:
     return getattr(space, kernel)(*arrays, *static)
 
 
-run = jax.jit(_of_kernel, static_argnums=(0, 1, 2))
-run_hastily = jax.jit(_of_kernel, static_argnums=(0, 1, 2), compiler_options={"xla_backend_optimization_level": 0})
+run_kernel = jax.jit(_call_kernel, static_argnums=(0, 1, 2))
+run_kernel_unoptimized = jax.jit(
+    _call_kernel, static_argnums=(0, 1, 2), compiler_options={"xla_backend_optimization_level": 0}
+)
 
 
-EQUAL = 2.0**-300
+ZERO_LENGTH_LIMIT = 2.0**-300
 """Lengths below this, of any unit, count as zero where a derivative divides by them; a power of two divides exactly."""
 
 
@@ -362,16 +366,16 @@ def safe_sqrt(z):
 
 
 @safe_sqrt.defjvp
-def _derivative_of_root(primals, tangents):
+def _safe_sqrt_jvp(primals, tangents):
     (z,), (dz,) = primals, tangents
-    small = z < EQUAL**2
+    small = z < ZERO_LENGTH_LIMIT**2
     far = jnp.sqrt(jnp.where(small, 1.0, z))
-    slope = jnp.where(small, 0.5 / EQUAL, 0.5 / far)  # of constants, which have no derivatives to overflow
-    return jnp.where(small, EQUAL, far), jnp.where(z < 0.0, 0.0, slope) * dz
+    slope = jnp.where(small, 0.5 / ZERO_LENGTH_LIMIT, 0.5 / far)  # of constants, which have no derivatives to overflow
+    return jnp.where(small, ZERO_LENGTH_LIMIT, far), jnp.where(z < 0.0, 0.0, slope) * dz
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def by_value(space: Any, x, y):
+def extended_squared_distance(space: Any, x, y):
     """The squared distance from ``_squared_distance_value``, defined at the cut locus too, with derivatives by the log.
 
     At the cut locus there are no derivatives: they are NaN.
@@ -379,24 +383,26 @@ def by_value(space: Any, x, y):
     return space._squared_distance_value(x, y)
 
 
-@by_value.defjvp
-def _derivative_by_log(space, primals, tangents):
-    return by_value(space, *primals), jax.jvp(partial(Maps._squared_distance, space), primals, tangents)[1]
+@extended_squared_distance.defjvp
+def _extended_squared_distance_jvp(space, primals, tangents):
+    return extended_squared_distance(space, *primals), jax.jvp(
+        partial(SpaceMaps._squared_distance, space), primals, tangents
+    )[1]
 
 
 # -- what several spaces have: ``_inner = by_flat`` in the body of a class ---------------------------------------------
 
 
-def by_flat(self: Maps, x, u, v):
-    """The inner product, by :meth:`Maps._flat`."""
+def inner_by_flat(self: SpaceMaps, x, u, v):
+    """The inner product, by :meth:`SpaceMaps._flat`."""
     return self._pair(self._flat(x, u), v)
 
 
-def by_coordinates(self: Maps, x, u, v):
+def inner_by_coordinates(self: SpaceMaps, x, u, v):
     """The inner product, in the orthonormal frame."""
     return (self._coordinates(x, u) * self._coordinates(x, v)).sum(axis=-1)
 
 
-def by_projection(self: Maps, x, w):
-    """What is along a space whose :meth:`Maps._project_tangent` is right near it too."""
+def tangential_part_by_projection(self: SpaceMaps, x, w):
+    """What is along a space whose :meth:`SpaceMaps._project_tangent` is right near it too."""
     return self._project_tangent(x, w)

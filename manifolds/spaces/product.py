@@ -9,16 +9,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._module import forwarded
+from .._pytree_module import forward_to
 from .._sizes import checked_size
 from ..errors import SpaceError
-from .base import Space, makes, random_key, register
+from .base import Space, random_key, register, register_operation
 from .euclidean import Euclidean
 from .groups import SpecialOrthogonal
 from .sphere import Sphere
 
 
-@makes("_product")
+@register_operation("_product")
 @jax.tree_util.register_static
 @dataclass(frozen=True, init=False, repr=False)
 class Product(Space):
@@ -58,7 +58,7 @@ class Product(Space):
 
     def split(self, x) -> list[jax.Array]:
         """The parts of a point or tangent vector, each an array of its factor's shape."""
-        x, parts, start = self._array(x, "x"), [], 0
+        x, parts, start = self._point_array(x, "x"), [], 0
         for factor in self.factors:
             size = math.prod(factor.shape)
             part = x[..., start : start + size].reshape(*x.shape[:-1], *factor.shape)
@@ -68,7 +68,7 @@ class Product(Space):
 
     def join(self, *parts) -> jax.Array:
         """The flat array of the parts: the inverse of :meth:`split`."""
-        arrays = [factor._array(part, "part") for factor, part in zip(self.factors, parts, strict=True)]
+        arrays = [factor._point_array(part, "part") for factor, part in zip(self.factors, parts, strict=True)]
         rows = [a.reshape(*a.shape[: a.ndim - len(f.shape)], -1) for f, a in zip(self.factors, arrays, strict=True)]
         batch = jnp.broadcast_shapes(*(row.shape[:-1] for row in rows))
         return jnp.concatenate([jnp.broadcast_to(row, (*batch, row.shape[-1])) for row in rows], axis=-1)
@@ -77,20 +77,20 @@ class Product(Space):
         parts = [None] * len(self.factors) if x is None else self.split(x)
         return min(factor.injectivity_radius(part) for factor, part in zip(self.factors, parts, strict=True))
 
-    def _each(self, kernel: str, *arrays) -> list:
+    def _apply_to_factors(self, kernel: str, *arrays) -> list:
         """A kernel of every factor on its parts of the arrays."""
         parts = zip(*(self.split(a) for a in arrays), strict=True)
         return [getattr(factor, kernel)(*part) for factor, part in zip(self.factors, parts, strict=True)]
 
-    def _joined(self, kernel: str, *arrays):
-        return self.join(*self._each(kernel, *arrays))
+    def _apply_and_join(self, kernel: str, *arrays):
+        return self.join(*self._apply_to_factors(kernel, *arrays))
 
     def _residual(self, x):
         imaginary = jnp.abs(x - self.join(*self.split(x))).max(axis=-1)  # where a factor is real
-        return jnp.maximum(jnp.stack(self._each("_residual", x)).max(axis=0), imaginary)
+        return jnp.maximum(jnp.stack(self._apply_to_factors("_residual", x)).max(axis=0), imaginary)
 
     def _project(self, x):
-        return self._joined("_project", x)
+        return self._apply_and_join("_project", x)
 
     def random(self, key_or_seed, size=()):
         keys = jax.random.split(random_key(key_or_seed), len(self.factors))
@@ -100,60 +100,60 @@ class Product(Space):
         return self.random(key, size)
 
     @property
-    def _normals(self):
-        numbers = [factor._normals for factor in self.factors]
+    def _n_normals(self):
+        numbers = [factor._n_normals for factor in self.factors]
         return None if None in numbers else sum(n for n in numbers if n is not None)
 
-    def _from_normals(self, w):
-        ends = np.cumsum([factor._normals or 0 for factor in self.factors])[:-1]
+    def _point_from_normals(self, w):
+        ends = np.cumsum([factor._n_normals or 0 for factor in self.factors])[:-1]
         pairs = zip(self.factors, jnp.split(w, ends, axis=-1), strict=True)
-        return self.join(*(factor._from_normals(own) for factor, own in pairs))
+        return self.join(*(factor._point_from_normals(own) for factor, own in pairs))
 
-    def _returned(self, x):
-        return self._joined("_returned", x)
+    def _restore(self, x):
+        return self._apply_and_join("_returned", x)
 
     def _project_tangent(self, x, w):
-        return self._joined("_project_tangent", x, w)
+        return self._apply_and_join("_project_tangent", x, w)
 
     @property
-    def surrounded(self):
-        return all(factor.surrounded for factor in self.factors)
+    def can_be_embedded(self):
+        return all(factor.can_be_embedded for factor in self.factors)
 
     _has_equations = True
 
     @property
-    def of_classes(self):  # type: ignore[override]
-        return any(factor.of_classes for factor in self.factors)
+    def is_quotient(self):  # type: ignore[override]
+        return any(factor.is_quotient for factor in self.factors)
 
     def _constraints(self, x):
-        return self._rows_of("_constraints", x)
+        return self._apply_and_concatenate("_constraints", x)
 
-    def _rounded(self, x):
-        return self._rows_of("_rounded", x)
+    def _constraint_scales(self, x):
+        return self._apply_and_concatenate("_rounded", x)
 
-    def _rows_of(self, kernel: str, *arrays):
+    def _apply_and_concatenate(self, kernel: str, *arrays):
         """What a kernel of every factor gives, shape (..., m), side by side."""
-        parts = self._each(kernel, *arrays)
+        parts = self._apply_to_factors(kernel, *arrays)
         batch = jnp.broadcast_shapes(*(c.shape[:-1] for c in parts))
         return jnp.concatenate([jnp.broadcast_to(c, (*batch, c.shape[-1])) for c in parts], axis=-1)
 
-    def _normal(self, x, c):
-        return self._of_constraints("_normal", x, c)
+    def _minimal_correction(self, x, c):
+        return self._apply_to_constraint_parts("_normal", x, c)
 
     def _correction(self, x, c):
-        return self._of_constraints("_correction", x, c)
+        return self._apply_to_constraint_parts("_correction", x, c)
 
-    def _of_constraints(self, kernel: str, x, c):
+    def _apply_to_constraint_parts(self, kernel: str, x, c):
         parts = self.split(x)
-        sizes = [c.shape[-1] for c in jax.eval_shape(lambda x: self._each("_constraints", x), x)]
+        sizes = [c.shape[-1] for c in jax.eval_shape(lambda x: self._apply_to_factors("_constraints", x), x)]
         triples = zip(self.factors, parts, jnp.split(c, np.cumsum(sizes)[:-1], axis=-1), strict=True)
         return self.join(*(getattr(factor, kernel)(part, own) for factor, part, own in triples))
 
-    def _along(self, x, w):
-        return self._joined("_along", x, w)
+    def _tangential_part(self, x, w):
+        return self._apply_and_join("_along", x, w)
 
     def _inside(self, x):
-        return jnp.stack(self._each("_inside", x)).all(axis=0)
+        return jnp.stack(self._apply_to_factors("_inside", x)).all(axis=0)
 
     def _frame(self, x):
         batch, columns = x.shape[:-1], []
@@ -163,7 +163,7 @@ class Product(Space):
         return jnp.concatenate(columns, axis=-2)
 
     def _coordinates(self, x, v):
-        return self._rows_of("_coordinates", x, v)
+        return self._apply_and_concatenate("_coordinates", x, v)
 
     def _from_coordinates(self, x, c):
         ends = np.cumsum([factor.dim for factor in self.factors])[:-1]
@@ -180,65 +180,65 @@ class Product(Space):
         return self.join(*(factor._isotropic(part, own) for factor, part, own in triples))
 
     def _inner(self, x, u, v):
-        return sum(self._each("_inner", x, u, v))
+        return sum(self._apply_to_factors("_inner", x, u, v))
 
     def _flat(self, x, v):
-        return self._joined("_flat", x, v)
+        return self._apply_and_join("_flat", x, v)
 
     def _sharp(self, x, alpha):
-        return self._joined("_sharp", x, alpha)
+        return self._apply_and_join("_sharp", x, alpha)
 
     def _exp(self, x, v):
-        return self._joined("_exp", x, v)
+        return self._apply_and_join("_exp", x, v)
 
     def _log(self, x, y):
-        return self._joined("_log", x, y)
+        return self._apply_and_join("_log", x, y)
 
     def _midpoint(self, x, y):
-        return self._joined("_midpoint", x, y)
+        return self._apply_and_join("_midpoint", x, y)
 
     def _squared_distance(self, x, y):
-        return sum(self._each("_squared_distance", x, y))
+        return sum(self._apply_to_factors("_squared_distance", x, y))
 
     def _transport(self, x, v, u):
-        return self._joined("_transport", x, v, u)
+        return self._apply_and_join("_transport", x, v, u)
 
     def _reach(self, x, v):
-        return jnp.stack(self._each("_reach", x, v)).max(axis=0)
+        return jnp.stack(self._apply_to_factors("_reach", x, v)).max(axis=0)
 
     @property
     def bi_invariant(self):  # type: ignore[override]
         return all(factor.bi_invariant for factor in self.factors)
 
     @property
-    def exp_of_group(self):  # type: ignore[override]
-        return all(factor.exp_of_group for factor in self.factors)
+    def exp_is_group_exp(self):  # type: ignore[override]
+        return all(factor.exp_is_group_exp for factor in self.factors)
 
     @property
-    def geodesics(self):
-        return all(factor.geodesics for factor in self.factors)
+    def has_geodesics(self):
+        return all(factor.has_geodesics for factor in self.factors)
 
     @property
-    def smooth(self):  # type: ignore[override]
-        return all(factor.smooth for factor in self.factors)
+    def is_smooth(self):  # type: ignore[override]
+        return all(factor.is_smooth for factor in self.factors)
 
-    def _straight_reach(self, x, v):
-        return jnp.stack(self._each("_straight_reach", x, v)).max(axis=0)
+    def _euclidean_reach(self, x, v):
+        return jnp.stack(self._apply_to_factors("_straight_reach", x, v)).max(axis=0)
 
     def _group_exp(self, x, v):
-        return self._joined("_group_exp", x, v)
+        return self._apply_and_join("_group_exp", x, v)
 
     def _group_log(self, x, y):
-        return self._joined("_group_log", x, y)
+        return self._apply_and_join("_group_log", x, y)
 
-    def _left_carry(self, x, y, u):
-        return self._joined("_left_carry", x, y, u)
+    def _left_translate(self, x, y, u):
+        return self._apply_and_join("_left_carry", x, y, u)
 
     def _cayley(self, x, v):
-        return self._joined("_cayley", x, v)
+        return self._apply_and_join("_cayley", x, v)
 
     def _inverse_cayley(self, x, y):
-        return self._joined("_inverse_cayley", x, y)
+        return self._apply_and_join("_inverse_cayley", x, y)
 
     def _why_no_log(self, x, y):
         for i, (factor, *pair) in enumerate(zip(self.factors, self.split(x), self.split(y), strict=True)):
@@ -247,7 +247,7 @@ class Product(Space):
         raise AssertionError("the logarithm is defined in every factor")
 
 
-@makes("_power")
+@register_operation("_power")
 @jax.tree_util.register_static
 @dataclass(frozen=True, repr=False)
 class Power(Space):
@@ -277,17 +277,17 @@ class Power(Space):
     def shape(self):
         return (self.count, *self.base.shape)
 
-    dtype = forwarded("base")
+    dtype = forward_to("base")
 
     def injectivity_radius(self, x=None):
         if x is None:
             return self.base.injectivity_radius()
-        return min(self.base.injectivity_radius(part) for part in self._array(x, "x"))
+        return min(self.base.injectivity_radius(part) for part in self._point_array(x, "x"))
 
     def _residual(self, x):
         return self.base._residual(x).max(axis=-1)
 
-    _project = forwarded("base")
+    _project = forward_to("base")
 
     def random(self, key_or_seed, size=()):
         return self.base.random(key_or_seed, (*size, self.count))
@@ -296,41 +296,41 @@ class Power(Space):
         return self.random(key, size)
 
     @property
-    def of_classes(self):  # type: ignore[override]
-        return self.base.of_classes
+    def is_quotient(self):  # type: ignore[override]
+        return self.base.is_quotient
 
     @property
-    def _normals(self):
-        return None if self.base._normals is None else self.count * self.base._normals
+    def _n_normals(self):
+        return None if self.base._n_normals is None else self.count * self.base._n_normals
 
-    def _from_normals(self, w):
-        return self.base._from_normals(w.reshape(*w.shape[:-1], self.count, -1))
+    def _point_from_normals(self, w):
+        return self.base._point_from_normals(w.reshape(*w.shape[:-1], self.count, -1))
 
-    _returned = forwarded("base")
-    _project_tangent = forwarded("base")
-    surrounded = forwarded("base")
-    _has_equations = forwarded("base")
+    _restore = forward_to("base")
+    _project_tangent = forward_to("base")
+    can_be_embedded = forward_to("base")
+    _has_equations = forward_to("base")
 
     def _constraints(self, x):
-        return self._joined(self.base._constraints(x))
+        return self._join_copies(self.base._constraints(x))
 
-    def _rounded(self, x):
-        return self._joined(self.base._rounded(x))
+    def _constraint_scales(self, x):
+        return self._join_copies(self.base._constraint_scales(x))
 
     @staticmethod
-    def _joined(c):
+    def _join_copies(c):
         return c.reshape(*c.shape[:-2], -1)
 
-    def _normal(self, x, c):
-        return self.base._normal(x, self._of_each(c))
+    def _minimal_correction(self, x, c):
+        return self.base._minimal_correction(x, self._split_copies(c))
 
     def _correction(self, x, c):
-        return self.base._correction(x, self._of_each(c))
+        return self.base._correction(x, self._split_copies(c))
 
-    def _of_each(self, c):
+    def _split_copies(self, c):
         return c.reshape(*c.shape[:-1], self.count, c.shape[-1] // self.count)
 
-    _along = forwarded("base")
+    _tangential_part = forward_to("base")
 
     def _inside(self, x):
         return self.base._inside(x).all(axis=-1)
@@ -357,33 +357,33 @@ class Power(Space):
     def _inner(self, x, u, v):
         return self.base._inner(x, u, v).sum(axis=-1)
 
-    _flat = forwarded("base")
-    _sharp = forwarded("base")
-    _exp = forwarded("base")
-    _log = forwarded("base")
-    _midpoint = forwarded("base")
+    _flat = forward_to("base")
+    _sharp = forward_to("base")
+    _exp = forward_to("base")
+    _log = forward_to("base")
+    _midpoint = forward_to("base")
 
     def _squared_distance(self, x, y):
         return self.base._squared_distance(x, y).sum(axis=-1)
 
-    _transport = forwarded("base")
+    _transport = forward_to("base")
 
     def _reach(self, x, v):
         return self.base._reach(x, v).max(axis=-1)
 
-    bi_invariant = forwarded("base")
-    exp_of_group = forwarded("base")
-    geodesics = forwarded("base")
-    smooth = forwarded("base")
+    bi_invariant = forward_to("base")
+    exp_is_group_exp = forward_to("base")
+    has_geodesics = forward_to("base")
+    is_smooth = forward_to("base")
 
-    def _straight_reach(self, x, v):
-        return self.base._straight_reach(x, v).max(axis=-1)
+    def _euclidean_reach(self, x, v):
+        return self.base._euclidean_reach(x, v).max(axis=-1)
 
-    _group_exp = forwarded("base")
-    _group_log = forwarded("base")
-    _left_carry = forwarded("base")
-    _cayley = forwarded("base")
-    _inverse_cayley = forwarded("base")
+    _group_exp = forward_to("base")
+    _group_log = forward_to("base")
+    _left_translate = forward_to("base")
+    _cayley = forward_to("base")
+    _inverse_cayley = forward_to("base")
 
     def _why_no_log(self, x, y):
         lost = ~np.isfinite(np.asarray(self.base._log(x, y))).reshape(self.count, -1).all(axis=1)

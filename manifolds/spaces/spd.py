@@ -10,12 +10,12 @@ import numpy as np
 
 from .._sizes import checked_size
 from ..matrices.exponential import expm
-from ..matrices.linear import largest
-from ..matrices.symmetric import cholesky, solve_lower, spd_log, symmetrized
+from ..matrices.linear import max_abs_entry
+from ..matrices.symmetric import cholesky, solve_lower, spd_log, symmetrize
 from .base import Space, register
 
 
-class Definite(Space):
+class PositiveDefinite(Space):
     """Symmetric positive definite n x n matrices of some kind."""
 
     n: int
@@ -27,16 +27,16 @@ class Definite(Space):
     def _inside(self, x):
         return jnp.isfinite(cholesky(x)).all(axis=(-2, -1))
 
-    def _why_off(self, x, residual):
+    def _why_off_space(self, x, residual):
         if np.isfinite(x).all() and not np.isfinite(residual):
             return f"not positive definite, with the least eigenvalue {np.linalg.eigvalsh((x + x.T) / 2)[0]:.3g}"
-        return super()._why_off(x, residual)
+        return super()._why_off_space(x, residual)
 
 
 @register((3,))
 @jax.tree_util.register_static
 @dataclass(frozen=True, repr=False)
-class SPD(Definite):
+class SPD(PositiveDefinite):
     """Symmetric positive definite n x n matrices with ``inner(x, u, v) = tr(x^-1 u x^-1 v)``.
 
     The metric is invariant under every ``x -> g x g^T``; it makes the space complete and of nonpositive curvature, so
@@ -60,25 +60,25 @@ class SPD(Definite):
         return self.n * (self.n + 1) // 2
 
     def _residual(self, x):
-        asymmetry = largest(x - x.swapaxes(-1, -2)) / largest(x)
+        asymmetry = max_abs_entry(x - x.swapaxes(-1, -2)) / max_abs_entry(x)
         return jnp.where(self._inside(x), asymmetry, jnp.inf)
 
     def _project(self, x):
-        x = symmetrized(x)
+        x = symmetrize(x)
         return jnp.where(self._inside(x)[..., None, None], x, jnp.nan)
 
-    def _returned(self, x):
-        return symmetrized(x)
+    def _restore(self, x):
+        return symmetrize(x)
 
     @property
-    def _normals(self):
+    def _n_normals(self):
         return self.dim
 
-    def _from_normals(self, w):
-        return symmetrized(expm(jnp.einsum("...a,aij->...ij", 0.5 * w, self._basis)))
+    def _point_from_normals(self, w):
+        return symmetrize(expm(jnp.einsum("...a,aij->...ij", 0.5 * w, self._basis)))
 
     def _project_tangent(self, x, w):
-        return symmetrized(w)
+        return symmetrize(w)
 
     def _frame(self, x):
         L = cholesky(x)[..., None, :, :]
@@ -86,26 +86,26 @@ class SPD(Definite):
 
     def _inner(self, x, u, v):
         inverse = self._inverse_factor(x)
-        return self._pair(_congruent(inverse, u), _congruent(inverse, v))
+        return self._pair(_congruence(inverse, u), _congruence(inverse, v))
 
     def _flat(self, x, v):
         inverse = self._inverse_factor(x)
-        return _congruent(inverse.swapaxes(-1, -2), _congruent(inverse, v))
+        return _congruence(inverse.swapaxes(-1, -2), _congruence(inverse, v))
 
     def _sharp(self, x, alpha):
-        return x @ symmetrized(alpha) @ x
+        return x @ symmetrize(alpha) @ x
 
     def _exp(self, x, v):
-        half = cholesky(x) @ expm(0.5 * _congruent(self._inverse_factor(x), v))
-        return symmetrized(half @ half.swapaxes(-1, -2))  # positive definite by its form
+        half = cholesky(x) @ expm(0.5 * _congruence(self._inverse_factor(x), v))
+        return symmetrize(half @ half.swapaxes(-1, -2))  # positive definite by its form
 
     def _log(self, x, y):
-        return _congruent(cholesky(x), self._log_at_identity(x, y))
+        return _congruence(cholesky(x), self._log_at_identity(x, y))
 
     def _log_at_identity(self, x, y):
         """The logarithm of y at x, as both are carried by the isometry that takes x to the identity."""
         inverse = self._inverse_factor(x)
-        return spd_log(_congruent(inverse, y), _congruent(inverse, y - x))
+        return spd_log(_congruence(inverse, y), _congruence(inverse, y - x))
 
     def _squared_distance(self, x, y):
         v = self._log_at_identity(x, y)
@@ -113,9 +113,9 @@ class SPD(Definite):
 
     def _transport(self, x, v, u):
         inverse = self._inverse_factor(x)
-        return _congruent(cholesky(x) @ expm(0.5 * _congruent(inverse, v)) @ inverse, u)
+        return _congruence(cholesky(x) @ expm(0.5 * _congruence(inverse, v)) @ inverse, u)
 
-    def _straight_reach(self, x, v):
+    def _euclidean_reach(self, x, v):
         return self._norm(x, v)  # x + v = L (I + a) L^T, with a of this norm
 
     def _inverse_factor(self, x):
@@ -134,6 +134,6 @@ class SPD(Definite):
         )
 
 
-def _congruent(g, a):
+def _congruence(g, a):
     """``g a g^T``, symmetric to the last bit."""
-    return symmetrized(g @ a @ g.swapaxes(-1, -2))
+    return symmetrize(g @ a @ g.swapaxes(-1, -2))

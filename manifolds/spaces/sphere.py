@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 
 from .._sizes import checked_size
-from ..matrices.linear import complement, skew
-from ..matrices.stumpff import arc, stumpff
+from ..matrices.linear import orthonormal_complement, skew_matrix
+from ..matrices.stumpff import angle_over_sine, stumpff
 from .base import CUT_MARGIN, Space, register
 from .maps import safe_sqrt
 
@@ -68,20 +68,20 @@ class Sphere(Space):
     def _constraints(self, x):
         return 0.5 * (_dot(x, x) - 1.0)
 
-    def _normal(self, x, c):
+    def _minimal_correction(self, x, c):
         return c * x / _dot(x, x)
 
-    def _along(self, x, w):
+    def _tangential_part(self, x, w):
         return w - _dot(x, w) / _dot(x, x) * x
 
-    def _rounded(self, x):
+    def _constraint_scales(self, x):
         return _dot(x, x)
 
     def _project_tangent(self, x, w):
         return w - _dot(x, w) * x
 
     def _frame(self, x):
-        return complement(x[..., None]).swapaxes(-1, -2)
+        return orthonormal_complement(x[..., None]).swapaxes(-1, -2)
 
     @property
     def isotropic_size(self):
@@ -89,7 +89,7 @@ class Sphere(Space):
 
     def _isotropic(self, x, w):
         """By the rotations of every plane."""
-        return (skew(w, self.n + 1) @ x[..., None])[..., 0]
+        return (skew_matrix(w, self.n + 1) @ x[..., None])[..., 0]
 
     def _inner(self, x, u, v):
         return (u * v).sum(axis=-1)
@@ -111,11 +111,11 @@ class Sphere(Space):
         w = w - _dot(x, w) * x  # near the antipode the first pass leaves rounding that is not tangent
         z, cosine = _dot(w, w), _dot(x, y)
         defined = (cosine > 0) | (z > (math.pi * CUT_MARGIN) ** 2)
-        return jnp.where(defined, arc(z, cosine) * w, jnp.nan)
+        return jnp.where(defined, angle_over_sine(z, cosine) * w, jnp.nan)
 
     def _squared_distance(self, x, y):
         chord, cochord = (((y + s * x) ** 2).sum(axis=-1) for s in (-1.0, 1.0))
-        return 4.0 * chord * arc(chord, safe_sqrt(cochord)) ** 2
+        return 4.0 * chord * angle_over_sine(chord, safe_sqrt(cochord)) ** 2
 
     def _midpoint(self, x, y):
         total = x + y

@@ -10,7 +10,7 @@ from .._arrays import is_traced
 from ..errors import DomainError, ParameterError
 from .base import Space
 
-LIMIT = 200
+MAX_ITERATIONS = 200
 """Iterations: each of them gains a digit or more within the ball in which the mean is known to be one point."""
 
 
@@ -38,7 +38,7 @@ def frechet_mean(space: Space, points, weights=None) -> jax.Array:
         If a point is at the cut locus of the mean as far as it is found, or the iteration does not come to rest.
     OffManifoldError, ParameterError
     """
-    x, w = _sample(space, points, weights)
+    x, w = _points_and_weights(space, points, weights)
     if is_traced(x, w):
         return _traced_mean(space, x, w)
     try:
@@ -46,7 +46,7 @@ def frechet_mean(space: Space, points, weights=None) -> jax.Array:
     except DomainError:  # as of antipodal points
         mean = x[0]
     size, best, stalled = np.inf, np.inf, 0
-    for _ in range(LIMIT):
+    for _ in range(MAX_ITERATIONS):
         step = jnp.tensordot(w, space.log(mean, x), axes=1)
         size = float(space.norm(mean, step))
         stalled = 0 if size < 0.5 * best else stalled + 1
@@ -55,7 +55,7 @@ def frechet_mean(space: Space, points, weights=None) -> jax.Array:
             return mean
         mean = space.exp(mean, step)
     raise DomainError(
-        f"the mean on {space.name} did not come to rest: the last of {LIMIT} steps had the length {size:.3g}. The "
+        f"the mean on {space.name} did not come to rest: the last of {MAX_ITERATIONS} steps had the length {size:.3g}. The "
         "points may be too far apart for one mean: take those of a smaller region"
     )
 
@@ -72,7 +72,7 @@ def dispersion(space: Space, points, weights=None, mean=None) -> jax.Array:
     mean : array, shape ``(*space.shape)``, optional
         Another point, from which distances are taken.
     """
-    x, w = _sample(space, points, weights)
+    x, w = _points_and_weights(space, points, weights)
     mean = frechet_mean(space, x, w) if mean is None else mean
     return jnp.dot(w, space.distance(mean, x) ** 2)
 
@@ -102,7 +102,7 @@ def _traced_mean(space: Space, x: jax.Array, w: jax.Array) -> jax.Array:
     first = space.project(jnp.tensordot(weights, points, axes=1))
     first = jnp.where(jnp.isfinite(first).all(), first, points[0])
     start = first, jnp.inf * jnp.ones(()), jnp.inf * jnp.ones(()), jnp.zeros((), int), jnp.zeros((), int)
-    end = jax.lax.while_loop(lambda state: ~is_at_rest(state) & (state[-1] < LIMIT), advance, start)
+    end = jax.lax.while_loop(lambda state: ~is_at_rest(state) & (state[-1] < MAX_ITERATIONS), advance, start)
     mean = jnp.where(is_at_rest(end), end[0], jnp.nan)
 
     def shift_at(c, x, w):
@@ -115,7 +115,7 @@ def _traced_mean(space: Space, x: jax.Array, w: jax.Array) -> jax.Array:
     return space.exp(mean, space.from_coordinates(mean, correction - jax.lax.stop_gradient(correction)))
 
 
-def _sample(space: Space, points, weights) -> tuple[jax.Array, jax.Array]:
+def _points_and_weights(space: Space, points, weights) -> tuple[jax.Array, jax.Array]:
     """The points in one row, and their weights with the sum 1."""
     x = space.point(points)
     batch = x.shape[: x.ndim - len(space.shape)]

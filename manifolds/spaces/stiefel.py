@@ -12,12 +12,20 @@ import numpy as np
 from .._sizes import checked_size
 from ..errors import ParameterError
 from ..matrices.exponential import expm
-from ..matrices.linear import complement, largest, lyapunov, orthonormalized, skew, solve, symmetric
+from ..matrices.linear import (
+    max_abs_entry,
+    newton_schulz_step,
+    orthonormal_complement,
+    skew_matrix,
+    solve,
+    solve_lyapunov,
+    symmetric_matrix,
+)
 from ..matrices.symmetric import orthonormal_columns, polar
 from .base import CUT_MARGIN, Space, register
-from .maps import by_flat
+from .maps import inner_by_flat
 
-_MOST_STEPS = 30
+_MAX_NEWTON_STEPS = 30
 """Iterations of Newton's method for the logarithm; at most 11 were needed inside the injectivity radius."""
 
 
@@ -38,7 +46,7 @@ class Stiefel(Space):
     n: int
     p: int
     metric = "canonical"
-    searched = True
+    has_iterative_log = True
 
     def __post_init__(self):
         checked_size(self.n, 2, "Stiefel(n, p)")
@@ -64,38 +72,38 @@ class Stiefel(Space):
         return math.pi if self.p in (1, self.n - 1) else 2.0 * math.pi / math.sqrt(5.0)
 
     def _residual(self, x):
-        return largest(_transposed(x) @ x - np.eye(self.p))
+        return max_abs_entry(_transpose_matrix(x) @ x - np.eye(self.p))
 
     def _project(self, x):
         return polar(x)
 
     def _constraints(self, x):
-        rest = _transposed(x) @ x - np.eye(self.p)
+        rest = _transpose_matrix(x) @ x - np.eye(self.p)
         return rest[..., *np.triu_indices(self.p)]
 
-    def _normal(self, x, c):
+    def _minimal_correction(self, x, c):
         if self.p > 2:
-            return super()._normal(x, c)
-        return x @ lyapunov(_transposed(x) @ x, symmetric(c, self.p))
+            return super()._minimal_correction(x, c)
+        return x @ solve_lyapunov(_transpose_matrix(x) @ x, symmetric_matrix(c, self.p))
 
     def _correction(self, x, c):
-        return 0.5 * x @ symmetric(c, self.p)
+        return 0.5 * x @ symmetric_matrix(c, self.p)
 
-    def _along(self, x, w):
+    def _tangential_part(self, x, w):
         if self.p > 2:
-            return super()._along(x, w)
-        product = _transposed(x) @ w
-        return w - x @ lyapunov(_transposed(x) @ x, product + _transposed(product))
+            return super()._tangential_part(x, w)
+        product = _transpose_matrix(x) @ w
+        return w - x @ solve_lyapunov(_transpose_matrix(x) @ x, product + _transpose_matrix(product))
 
-    def _rounded(self, x):
-        return 2.0 * (_transposed(jnp.abs(x)) @ jnp.abs(x))[..., *np.triu_indices(self.p)]
+    def _constraint_scales(self, x):
+        return 2.0 * (_transpose_matrix(jnp.abs(x)) @ jnp.abs(x))[..., *np.triu_indices(self.p)]
 
-    def _from_normals(self, w):
+    def _point_from_normals(self, w):
         return orthonormal_columns(self.from_vector(w))
 
     def _project_tangent(self, x, w):
-        product = _transposed(x) @ w
-        return w - x @ (product + _transposed(product)) / 2
+        product = _transpose_matrix(x) @ w
+        return w - x @ (product + _transpose_matrix(product)) / 2
 
     def _frame(self, x):
         """Rotations of the columns of x among themselves, then of each column into the rest of the space."""
@@ -103,7 +111,7 @@ class Stiefel(Space):
         pairs = [(i, j) for i in range(self.p) for j in range(i + 1, self.p)]
         skew = [np.outer(units[j], units[i]) - np.outer(units[i], units[j]) for i, j in pairs]
         within = x[..., None, :, :] @ np.array(skew).reshape(-1, self.p, self.p)
-        outwards = jnp.einsum("...ni,jp->...ijnp", complement(x), units)
+        outwards = jnp.einsum("...ni,jp->...ijnp", orthonormal_complement(x), units)
         return jnp.concatenate([within, outwards.reshape(*x.shape[:-2], -1, *self.shape)], axis=-3)
 
     @property
@@ -112,36 +120,40 @@ class Stiefel(Space):
 
     def _isotropic(self, x, w):
         """By the rotations of every plane."""
-        return skew(w, self.n) @ x
+        return skew_matrix(w, self.n) @ x
 
-    _inner = by_flat
+    _inner = inner_by_flat
 
     def _flat(self, x, v):
-        return v - 0.5 * x @ (_transposed(x) @ v)
+        return v - 0.5 * x @ (_transpose_matrix(x) @ v)
 
     def _sharp(self, x, alpha):
-        return alpha @ (_transposed(x) @ x) - x @ (_transposed(alpha) @ x)  # a rotation of x, whatever x^T x is
+        return alpha @ (_transpose_matrix(x) @ x) - x @ (
+            _transpose_matrix(alpha) @ x
+        )  # a rotation of x, whatever x^T x is
 
     def _exp(self, x, v):
-        return orthonormalized(expm(self._lift(x, v)) @ x)  # one Newton step back, so that rounding does not add up
+        return newton_schulz_step(
+            expm(self._least_skew_generator(x, v)) @ x
+        )  # one Newton step back, so that rounding does not add up
 
     def _log(self, x, y):
-        return jnp.vectorize(self._log_of_one, signature="(n,p),(n,p)->(n,p)")(x, y)
+        return jnp.vectorize(self._single_log, signature="(n,p),(n,p)->(n,p)")(x, y)
 
     def _transport(self, x, v, u):
-        W, base = self._lift(x, v), x[..., None, :, :]
-        frame = self._lift(base, self._frame(x))
+        W, base = self._least_skew_generator(x, v), x[..., None, :, :]
+        frame = self._least_skew_generator(base, self._frame(x))
         rates = -0.5 * (W[..., None, :, :] @ frame - frame @ W[..., None, :, :]) @ base
         flow = expm(self._coordinates(base, rates))  # rows are images: it acts from the right
         c = (self._coordinates(x, u)[..., None, :] @ flow)[..., 0, :]
         return expm(W) @ self._from_coordinates(x, c)
 
-    def _lift(self, x, v):
+    def _least_skew_generator(self, x, v):
         """The skew matrix W, n x n, of least norm with ``W x = v``."""
-        outer = v @ _transposed(x)
-        return outer - _transposed(outer) - x @ (_transposed(x) @ outer)
+        outer = v @ _transpose_matrix(x)
+        return outer - _transpose_matrix(outer) - x @ (_transpose_matrix(x) @ outer)
 
-    def _log_of_one(self, x, y):
+    def _single_log(self, x, y):
         def gap(c):
             return self._exp(x, self._from_coordinates(x, c)) - y
 
@@ -156,7 +168,7 @@ class Stiefel(Space):
             return c + move, jnp.abs(move).max(), steps + 1
 
         def newton(_, start):
-            unfinished = lambda state: (state[1] > 1e-8) & (state[2] < _MOST_STEPS)  # noqa: E731
+            unfinished = lambda state: (state[1] > 1e-8) & (state[2] < _MAX_NEWTON_STEPS)  # noqa: E731
             c, change, _ = jax.lax.while_loop(unfinished, step, (start, jnp.inf, 0))
             inside = (c**2).sum() < (self.injectivity_radius() * (1.0 - CUT_MARGIN)) ** 2
             found = (change <= 1e-8) & (jnp.abs(gap(c)).max() <= 1e-10)  # not just a point where Newton gets stuck
@@ -174,5 +186,5 @@ class Stiefel(Space):
         return self._from_coordinates(x, c)
 
 
-def _transposed(a):
+def _transpose_matrix(a):
     return a.swapaxes(-1, -2)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
-from .._module import forwarded
+from .._pytree_module import forward_to
 from ..errors import SpaceError
 from ..matrices.linear import solve_near_identity
 from .base import Space, random_key, register
@@ -50,62 +50,62 @@ class TangentBundle(Space):
     def shape(self):
         return (2, *self.base.shape)
 
-    surrounded = forwarded("base")
-    smooth = forwarded("base")
-    _has_equations = forwarded("base")
+    can_be_embedded = forward_to("base")
+    is_smooth = forward_to("base")
+    _has_equations = forward_to("base")
 
-    def along(self, q, w) -> jax.Array:
+    def tangential_part(self, q, w) -> jax.Array:
         """The part along Q of an array w at a point q of it, both in one row, shape (n,), with n their entries."""
         base = self.base
-        return base.to_vector(base._along(base.from_vector(q), base.from_vector(w)))
+        return base.to_vector(base._tangential_part(base.from_vector(q), base.from_vector(w)))
 
-    def moving(self, x) -> tuple[jax.Array, jax.Array]:
+    def tangent_matrices(self, x) -> tuple[jax.Array, jax.Array]:
         """How the point (q, v), in one row, can move: the matrices P and N, shape (n, n).
 
         P is the projector along Q. Moving q takes v out of the tangent space: ``N q'`` is the part of v' across Q that
         takes it along. So tangent vectors are the ``(P a, P b + N P a)``.
         """
-        base, (q, v) = self.base, self._parts(self.from_vector(x))
-        tilts = jax.jacfwd(lambda y: self._tilt(base.from_vector(y), v))(base.to_vector(q))
+        base, (q, v) = self.base, self._position_and_vector(self.from_vector(x))
+        tilts = jax.jacfwd(lambda y: self._constraint_rates(base.from_vector(y), v))(base.to_vector(q))
         if not self._has_equations:
-            P = jax.vmap(lambda w: self.along(x[: base.size], w), out_axes=1)(jnp.eye(base.size))
+            P = jax.vmap(lambda w: self.tangential_part(x[: base.size], w), out_axes=1)(jnp.eye(base.size))
             return P, -tilts
-        rows = base._rows(q)
+        rows = base._constraint_jacobian(q)
         raised = solve_near_identity(rows @ rows.T, rows).T
         return jnp.eye(base.size) - raised @ rows, -raised @ tilts
 
     # -- maps ---------------------------------------------------------------------------------------------------------
 
-    def _tilt(self, q, v):
+    def _constraint_rates(self, q, v):
         """What v has across the space, shape (..., m): the rates of the constraints of Q along it."""
         if self._has_equations:
             return jax.jvp(self.base._constraints, (q,), (v,))[1]
-        return self.base.to_vector(v - self.base._along(q, v))
+        return self.base.to_vector(v - self.base._tangential_part(q, v))
 
     def _constraints(self, x):
-        q, v = self._parts(x)
-        return jnp.concatenate([self.base._constraints(q), self._tilt(q, v)], axis=-1)
+        q, v = self._position_and_vector(x)
+        return jnp.concatenate([self.base._constraints(q), self._constraint_rates(q, v)], axis=-1)
 
-    def _normal(self, x, c):
+    def _minimal_correction(self, x, c):
         if self._has_equations:
-            return super()._normal(x, c)
+            return super()._minimal_correction(x, c)
         return self.from_vector(c)
 
     def _inside(self, x):
-        return self.base._inside(self._parts(x)[0])
+        return self.base._inside(self._position_and_vector(x)[0])
 
     def _project(self, x):
-        q, v = self._parts(x)
+        q, v = self._position_and_vector(x)
         q = self.base._project(q)
-        return self._pair_of(q, self.base._project_tangent(q, v))
+        return self._stack_pair(q, self.base._project_tangent(q, v))
 
     def _random(self, key, size):
         at, along = jax.random.split(random_key(key))
         q = self.base._random(at, size)
-        return self._pair_of(q, self.base._project_tangent(q, jax.random.normal(along, q.shape)))
+        return self._stack_pair(q, self.base._project_tangent(q, jax.random.normal(along, q.shape)))
 
     def _project_tangent(self, x, w):
-        return self._along(x, w) if self._has_equations else super()._project_tangent(x, w)
+        return self._tangential_part(x, w) if self._has_equations else super()._project_tangent(x, w)
 
     def _sharp(self, x, alpha):
         return self._project_tangent(x, alpha)
@@ -115,9 +115,9 @@ class TangentBundle(Space):
 
     # -- helpers ------------------------------------------------------------------------------------------------------
 
-    def _parts(self, x):
+    def _position_and_vector(self, x):
         axis = -1 - len(self.base.shape)
         return tuple(jnp.take(x, i, axis=axis) for i in (0, 1))
 
-    def _pair_of(self, q, v):
+    def _stack_pair(self, q, v):
         return jnp.stack(jnp.broadcast_arrays(q, v), axis=-1 - len(self.base.shape))

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from .._arrays import real_components
-from .._module import Module
+from .._pytree_module import Module
 from ..errors import ParameterError, ShapeError
 from ..matrices.linear import determinant, inverse, solve
 from .poisson import PoissonStructure
@@ -159,12 +159,12 @@ class Bundle(Protocol):
     @property
     def size(self) -> int: ...
 
-    def along(self, q, w) -> jax.Array: ...
+    def tangential_part(self, q, w) -> jax.Array: ...
 
-    def moving(self, x) -> tuple[jax.Array, jax.Array]: ...
+    def tangent_matrices(self, x) -> tuple[jax.Array, jax.Array]: ...
 
 
-class Tangents(NamedTuple):
+class TangentMap(NamedTuple):
     """The tangent vectors of a bundle at a point, and what covectors do along them.
 
     Attributes
@@ -242,7 +242,7 @@ class SplitContact(ContactStructure):
         """The function ``{f, g}_Delta = R(g) Delta(f) - R(f) Delta(g)`` [SML §2.1]."""
         return self._bracket(self.liouville_sharp, f, g)
 
-    def _split(self, x):
+    def _split_coordinates(self, x):
         """The parts (q, p, S) or (q, v, S) of a point, a vector or a covector; S has shape (1,)."""
         n = self.degrees_of_freedom
         return x[:n], x[n : 2 * n], x[2 * n :]
@@ -254,13 +254,15 @@ class SplitContact(ContactStructure):
 
     # -- on a manifold ------------------------------------------------------------------------------------------------
 
-    def along(self, q, v) -> jax.Array:
+    def tangential_part(self, q, v) -> jax.Array:
         """The part of a velocity, of a momentum or of a force at q that is along Q, shape (n,); itself on R^n."""
-        return v if self.bundle is None else self.bundle.along(q, v)
+        return v if self.bundle is None else self.bundle.tangential_part(q, v)
 
-    def tangents(self, x) -> Tangents | None:
+    def tangent_map(self, x) -> TangentMap | None:
         """What makes vectors tangent at x, on a manifold."""
-        return None if self.bundle is None else Tangents(*self.bundle.moving(x[: 2 * self.degrees_of_freedom]))
+        return (
+            None if self.bundle is None else TangentMap(*self.bundle.tangent_matrices(x[: 2 * self.degrees_of_freedom]))
+        )
 
 
 class CanonicalContact(SplitContact):
@@ -271,27 +273,27 @@ class CanonicalContact(SplitContact):
     """
 
     def form(self, x) -> jax.Array:
-        q, p, S = self._split(x)
+        q, p, S = self._split_coordinates(x)
         return jnp.concatenate([-p, jnp.zeros_like(q), jnp.ones_like(S)])
 
     def reeb(self, x) -> jax.Array:
         return jnp.zeros(self.dim).at[-1].set(1.0)
 
     def liouville(self, x) -> jax.Array:
-        q, p, S = self._split(x)
-        return jnp.concatenate([jnp.zeros_like(q), self.along(q, p), jnp.zeros_like(S)])
+        q, p, S = self._split_coordinates(x)
+        return jnp.concatenate([jnp.zeros_like(q), self.tangential_part(q, p), jnp.zeros_like(S)])
 
     def sharp(self, x, alpha) -> jax.Array:
         return self.bivector_sharp(x, alpha) + alpha[-1] * self.reeb(x)
 
     def cosymplectic_sharp(self, x, alpha) -> jax.Array:
-        tangents = self.tangents(x)
-        by_q, by_p, by_S = self._split(alpha if tangents is None else tangents.lower(alpha))
+        tangents = self.tangent_map(x)
+        by_q, by_p, by_S = self._split_coordinates(alpha if tangents is None else tangents.lower(alpha))
         motion = jnp.concatenate([by_p, -by_q, jnp.zeros_like(by_S)])
         return motion if tangents is None else tangents.lift(motion)
 
     def liouville_sharp(self, x, alpha) -> jax.Array:
-        p, (by_q, by_p, by_S) = self._split(self.liouville(x))[1], self._split(alpha)
+        p, (by_q, by_p, by_S) = self._split_coordinates(self.liouville(x))[1], self._split_coordinates(alpha)
         return jnp.concatenate([jnp.zeros_like(by_q), -p * by_S, jnp.dot(p, by_p)[None]])
 
 
@@ -315,14 +317,16 @@ class LagrangianContact(SplitContact):
 
     def momentum(self, x) -> jax.Array:
         """``p = L_v``, shape (n,), as a covector of Q."""
-        return self.along(self._split(x)[0], self._split(jax.grad(self.lagrangian)(x))[1])
+        return self.tangential_part(
+            self._split_coordinates(x)[0], self._split_coordinates(jax.grad(self.lagrangian)(x))[1]
+        )
 
     def rates(self, x) -> tuple[jax.Array, jax.Array, jax.Array]:
         """The derivatives of the momentum by q, v and S, shapes (n, n), (n, n) and (n, 1), along the manifold.
 
         The second is the Hessian W, which on a manifold is made invertible: across Q it is a multiple of 1.
         """
-        n, tangents = self.degrees_of_freedom, self.tangents(x)
+        n, tangents = self.degrees_of_freedom, self.tangent_map(x)
         rates = jax.jacfwd(self.momentum)(x)
         by_q, W, by_S = rates[:, :n], rates[:, n : 2 * n], rates[:, 2 * n :]
         if tangents is None:
@@ -333,7 +337,7 @@ class LagrangianContact(SplitContact):
 
     def legendre(self, x) -> jax.Array:
         """The Legendre transform ``FL(q, v, S) = (q, p, S)``, shape (dim,)."""
-        q, _, S = self._split(x)
+        q, _, S = self._split_coordinates(x)
         return jnp.concatenate([q, self.momentum(x), S])
 
     def hessian(self, x) -> jax.Array:
@@ -342,40 +346,40 @@ class LagrangianContact(SplitContact):
 
     def energy(self, x) -> jax.Array:
         """``E_L = v·L_v - L``, shape ()."""
-        return jnp.dot(self._split(x)[1], self.momentum(x)) - self.lagrangian(x)
+        return jnp.dot(self._split_coordinates(x)[1], self.momentum(x)) - self.lagrangian(x)
 
     def form(self, x) -> jax.Array:
         return self._canonical.form(self.legendre(x))
 
     def reeb(self, x) -> jax.Array:
-        return self._pulled_back(x, lambda y, _: self._canonical.reeb(y), jnp.zeros(self.dim))
+        return self._pullback(x, lambda y, _: self._canonical.reeb(y), jnp.zeros(self.dim))
 
     def liouville(self, x) -> jax.Array:
-        return self._pulled_back(x, lambda y, _: self._canonical.liouville(y), jnp.zeros(self.dim))
+        return self._pullback(x, lambda y, _: self._canonical.liouville(y), jnp.zeros(self.dim))
 
     def sharp(self, x, alpha) -> jax.Array:
-        return self._pulled_back(x, self._canonical.sharp, alpha)
+        return self._pullback(x, self._canonical.sharp, alpha)
 
     def bivector_sharp(self, x, alpha) -> jax.Array:
-        return self._pulled_back(x, self._canonical.bivector_sharp, alpha)
+        return self._pullback(x, self._canonical.bivector_sharp, alpha)
 
     def cosymplectic_sharp(self, x, alpha) -> jax.Array:
-        return self._pulled_back(x, self._canonical.cosymplectic_sharp, alpha)
+        return self._pullback(x, self._canonical.cosymplectic_sharp, alpha)
 
     def liouville_sharp(self, x, alpha) -> jax.Array:
-        return self._pulled_back(x, self._canonical.liouville_sharp, alpha)
+        return self._pullback(x, self._canonical.liouville_sharp, alpha)
 
     @property
     def _canonical(self) -> CanonicalContact:
         return CanonicalContact(self.degrees_of_freedom, bundle=self.bundle)
 
-    def _pulled_back(self, x, sharp: Callable, alpha) -> jax.Array:
+    def _pullback(self, x, sharp: Callable, alpha) -> jax.Array:
         """``TFL^-1 sharp(FL(x), TFL^-T alpha)``: with p = L_v, ``dp = L_vq dq + W dv + L_vS dS``."""
-        (by_q, W, by_S), tangents = self.rates(x), self.tangents(x)
-        alpha_q, alpha_v, alpha_S = self._split(alpha if tangents is None else tangents.lower(alpha))
+        (by_q, W, by_S), tangents = self.rates(x), self.tangent_map(x)
+        alpha_q, alpha_v, alpha_S = self._split_coordinates(alpha if tangents is None else tangents.lower(alpha))
         beta_p = solve(W, alpha_v[:, None])[:, 0]  # W is symmetric
         beta = jnp.concatenate([alpha_q - beta_p @ by_q, beta_p, alpha_S - beta_p @ by_S])
-        q_dot, p_dot, S_dot = self._split(sharp(self.legendre(x), beta))
+        q_dot, p_dot, S_dot = self._split_coordinates(sharp(self.legendre(x), beta))
         v_dot = solve(W, (p_dot - by_q @ q_dot - by_S @ S_dot)[:, None])[:, 0]
         motion = jnp.concatenate([q_dot, v_dot, S_dot])
         return motion if tangents is None else tangents.lift(motion)

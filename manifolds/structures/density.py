@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..matrices.linear import cayley_rate, turned_by
+from ..matrices.linear import cayley_rate, conjugate_by_stages
 from .poisson import PoissonBySharp
 
 
@@ -35,7 +35,7 @@ class DensityMatrices(PoissonBySharp):
 
     def matrix(self, x) -> jax.Array:
         """The Hermitian matrices with coordinates x, shape (..., N^2) to (..., N, N)."""
-        (re, im), (size, sign), _ = _places(self.size)
+        (re, im), (size, sign), _ = _coordinate_indices(self.size)
         real, imaginary = (part.reshape(*part.shape[:-1], self.size, self.size) for part in (x[..., re], x[..., im]))
         real, imaginary = real * size, imaginary * sign
         return real + 1j * imaginary if isinstance(x, np.ndarray) else jax.lax.complex(real, imaginary)
@@ -43,7 +43,7 @@ class DensityMatrices(PoissonBySharp):
     def vector(self, a) -> jax.Array:
         """The coordinates of the Hermitian parts of matrices a, shape (..., N, N): the inverse of :meth:`matrix`."""
         xp = np if isinstance(a, np.ndarray) else jnp
-        turned, (_, (size, _), chosen) = a.swapaxes(-1, -2), _places(self.size)
+        turned, (_, (size, _), chosen) = a.swapaxes(-1, -2), _coordinate_indices(self.size)
         parts = xp.stack([(a.real + turned.real) * (0.5 / size), (a.imag - turned.imag) * (0.5 / size)], axis=-3)
         return parts.reshape(*a.shape[:-2], -1)[..., chosen]
 
@@ -51,16 +51,16 @@ class DensityMatrices(PoissonBySharp):
         product = self.matrix(alpha) @ self.matrix(x)
         return self.vector(-2j * product)  # whose Hermitian part has both terms of the commutator
 
-    def on_leaf(self, x, alpha, A) -> jax.Array:
+    def stages_on_leaf(self, x, alpha, A) -> jax.Array:
         """``U_i rho U_i^H``, the U_i stages by A of ``U' = -i H U`` from the identity; the eigenvalues stay."""
-        return self.vector(turned_by(-1j * self.matrix(alpha), self.matrix(x), A))
+        return self.vector(conjugate_by_stages(-1j * self.matrix(alpha), self.matrix(x), A))
 
-    def turning(self, covector, alpha) -> jax.Array:
+    def leaf_covector_rate(self, covector, alpha) -> jax.Array:
         return self.vector(1j * cayley_rate(-1j * self.matrix(covector), -1j * self.matrix(alpha)))
 
 
 @functools.lru_cache(maxsize=64)
-def _places(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _coordinate_indices(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Where in the coordinates the parts of each entry stand, and their factors; where in the parts the coordinates."""
     (j, k), on, root = np.triu_indices(n, 1), np.arange(n), np.sqrt(0.5)
     pairs = n + np.arange(len(j))

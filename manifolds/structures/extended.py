@@ -14,7 +14,7 @@ from ..errors import ParameterError
 from .poisson import PoissonStructure
 
 
-class Places(NamedTuple):
+class StateIndices(NamedTuple):
     """Where things are in a state of several (q_a, p_a, S_a): indices of all q, p and S, and whose each q is."""
 
     q: np.ndarray
@@ -23,7 +23,7 @@ class Places(NamedTuple):
     owner: np.ndarray
 
 
-class Matter(NamedTuple):
+class ParticleIndices(NamedTuple):
     """Where particle numbers are in such a state, and whose each is."""
 
     N: np.ndarray
@@ -52,14 +52,14 @@ class ExtendedPhaseSpace(PoissonStructure):
         return 2 * sum(self.degrees_of_freedom) + len(self.degrees_of_freedom) + sum(self.species)
 
     @property
-    def places(self) -> Places:
+    def state_indices(self) -> StateIndices:
         """Indices into a state."""
-        return _places(self.degrees_of_freedom, self.species)[0]
+        return _build_indices(self.degrees_of_freedom, self.species)[0]
 
     @property
-    def matter(self) -> Matter:
+    def particle_indices(self) -> ParticleIndices:
         """Indices of the particle numbers."""
-        return _places(self.degrees_of_freedom, self.species)[1]
+        return _build_indices(self.degrees_of_freedom, self.species)[1]
 
     def tensor(self, x) -> jax.Array:
         del x  # constant
@@ -71,25 +71,27 @@ class ExtendedPhaseSpace(PoissonStructure):
 
     @property
     def _conjugate(self) -> np.ndarray:
-        q, p, _, _ = self.places
+        q, p, _, _ = self.state_indices
         partner = np.arange(self.dim)
         partner[q], partner[p] = p, q
         return partner
 
     @property
     def _sign(self) -> np.ndarray:
-        q, p, _, _ = self.places
+        q, p, _, _ = self.state_indices
         sign = np.zeros(self.dim)
         sign[q], sign[p] = 1.0, -1.0
         return sign
 
 
 @functools.lru_cache(maxsize=64)
-def _places(degrees_of_freedom: tuple[int, ...], species: tuple[int, ...]) -> tuple[Places, Matter]:
+def _build_indices(
+    degrees_of_freedom: tuple[int, ...], species: tuple[int, ...]
+) -> tuple[StateIndices, ParticleIndices]:
     n, m = np.array(degrees_of_freedom), np.array(species or (0,) * len(degrees_of_freedom))
     starts = np.cumsum(2 * n + 1 + m) - (2 * n + 1 + m)
     owner, holder = np.repeat(np.arange(len(n)), n), np.repeat(np.arange(len(n)), m)
     q = starts[owner] + np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n)
     S = starts + 2 * n
     N = S[holder] + 1 + np.arange(m.sum()) - np.repeat(np.cumsum(m) - m, m)
-    return Places(q, q + n[owner], S, owner), Matter(N, holder)
+    return StateIndices(q, q + n[owner], S, owner), ParticleIndices(N, holder)

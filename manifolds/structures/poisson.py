@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._arrays import real_components
-from .._module import Module, forwarded
+from .._pytree_module import Module, forward_to
+from ..algebras.bracket_algebra import BracketAlgebra
 from ..algebras.lie_algebra import LieAlgebra
-from ..algebras.on_demand import OnDemand
 from ..errors import ParameterError, ShapeError
-from ..matrices.linear import adjoint, cayley_rate, turned_by
+from ..matrices.linear import adjoint, cayley_rate, conjugate_by_stages
 
 
 class PoissonStructure(Module):
@@ -40,7 +40,7 @@ class PoissonStructure(Module):
         """``Pi(x) alpha``, shape (n,), for a covector alpha, shape (n,)."""
         return self.tensor(x) @ alpha
 
-    def on_leaf(self, x, alpha, A) -> jax.Array | None:
+    def stages_on_leaf(self, x, alpha, A) -> jax.Array | None:
         """Points of stages whose motions add up to one along the symplectic leaf of x, shape (s, n); None: not known.
 
         With the weights b of a symplectic Runge-Kutta method, ``x + sum_i b_i Pi(u_i) alpha_i`` is on the leaf, and has
@@ -56,7 +56,7 @@ class PoissonStructure(Module):
         """
         return None
 
-    def carried(self, x, covector) -> jax.Array:
+    def leaf_displacement(self, x, covector) -> jax.Array:
         """The displacement of x along its leaf, shape (n,): ``Pi(u) K``, u the middle of that step.
 
         Parameters
@@ -65,11 +65,11 @@ class PoissonStructure(Module):
         covector : array, shape (n,)
             K: a gradient times a time.
         """
-        points = self.on_leaf(x, covector[None], np.full((1, 1), 0.5))
+        points = self.stages_on_leaf(x, covector[None], np.full((1, 1), 0.5))
         assert points is not None
         return self.sharp(points[0], covector)
 
-    def turning(self, covector, alpha) -> jax.Array | None:
+    def leaf_covector_rate(self, covector, alpha) -> jax.Array | None:
         """``K'`` for which x, :meth:`carried` by K, moves by ``x' = Pi(x) alpha``, shape (n,); None: not known.
 
         It begins at K = 0, where it is alpha, and is smooth: so K is found by any method, at its order, and what it
@@ -121,7 +121,7 @@ class LiePoisson(PoissonStructure):
 
     algebra: LieAlgebra = eqx.field(static=True)
 
-    dim = forwarded("algebra")
+    dim = forward_to("algebra")
 
     def tensor(self, x) -> jax.Array:
         return self.algebra.poisson_tensor(x)
@@ -129,16 +129,16 @@ class LiePoisson(PoissonStructure):
     def sharp(self, x, alpha) -> jax.Array:
         return self.algebra.ad_star(alpha, x)
 
-    def on_leaf(self, x, alpha, A) -> jax.Array | None:
+    def stages_on_leaf(self, x, alpha, A) -> jax.Array | None:
         """By A as for every structure; known for the matrices of u(n), su(n) and so(n)."""
         found = _skew_matrices(self.algebra)
         if found is None:
             return None
         basis, dual = found
-        turned = turned_by(-jnp.tensordot(alpha, basis, 1), jnp.tensordot(x, dual, 1), A)
+        turned = conjugate_by_stages(-jnp.tensordot(alpha, basis, 1), jnp.tensordot(x, dual, 1), A)
         return jnp.einsum("sij,aji->sa", turned, basis).real
 
-    def turning(self, covector, alpha) -> jax.Array | None:
+    def leaf_covector_rate(self, covector, alpha) -> jax.Array | None:
         found = _skew_matrices(self.algebra)
         if found is None:
             return None
@@ -153,7 +153,7 @@ def _skew_matrices(algebra: LieAlgebra) -> tuple[np.ndarray, np.ndarray] | None:
 
     None of an algebra that is none of these: its group is not all that keeps a form.
     """
-    basis = None if isinstance(algebra, OnDemand) else algebra.basis  # which may be too large to be made
+    basis = None if isinstance(algebra, BracketAlgebra) else algebra.basis  # which may be too large to be made
     if basis is None or np.abs(basis + adjoint(basis)).max() > 1e-14 * np.abs(basis).max():
         return None
     n = basis.shape[-1]
@@ -239,7 +239,7 @@ class PoissonMap(PoissonBySharp):
         return jnp.asarray(self.function(x, alpha))
 
 
-class Beside(PoissonStructure):
+class ProductPoisson(PoissonStructure):
     """Two structures on states (x, y), neither of which has to do with the components of the other."""
 
     first: PoissonStructure
@@ -259,16 +259,16 @@ class Beside(PoissonStructure):
         n = self.first.dim
         return jnp.concatenate([self.first.sharp(x[:n], alpha[:n]), self.second.sharp(x[n:], alpha[n:])])
 
-    def on_leaf(self, x, alpha, A) -> jax.Array | None:
+    def stages_on_leaf(self, x, alpha, A) -> jax.Array | None:
         n = self.first.dim
-        first = self.first.on_leaf(x[:n], alpha[:, :n], A)
-        second = self.second.on_leaf(x[n:], alpha[:, n:], A)
+        first = self.first.stages_on_leaf(x[:n], alpha[:, :n], A)
+        second = self.second.stages_on_leaf(x[n:], alpha[:, n:], A)
         return None if first is None or second is None else jnp.concatenate([first, second], axis=-1)
 
-    def turning(self, covector, alpha) -> jax.Array | None:
+    def leaf_covector_rate(self, covector, alpha) -> jax.Array | None:
         n = self.first.dim
-        first = self.first.turning(covector[:n], alpha[:n])
-        second = self.second.turning(covector[n:], alpha[n:])
+        first = self.first.leaf_covector_rate(covector[:n], alpha[:n])
+        second = self.second.leaf_covector_rate(covector[n:], alpha[n:])
         return None if first is None or second is None else jnp.concatenate([first, second])
 
 
@@ -287,7 +287,7 @@ class NoPoisson(PoissonStructure):
     def sharp(self, x, alpha) -> jax.Array:
         return jnp.zeros_like(alpha)
 
-    def on_leaf(self, x, alpha, A) -> jax.Array:
+    def stages_on_leaf(self, x, alpha, A) -> jax.Array:
         return jnp.broadcast_to(x, alpha.shape)
 
     def jacobi_residual(self, x) -> jax.Array:

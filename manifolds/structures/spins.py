@@ -10,12 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._arrays import interleaved, real_array
+from .._arrays import real_array, stack_columns
 from .._sizes import checked_size
 from ..errors import ParameterError
 from .poisson import PoissonBySharp
 
-Planes = tuple[jax.Array, jax.Array, jax.Array]
+VectorComponents = tuple[jax.Array, jax.Array, jax.Array]
 """Vectors in space by components: three arrays of one shape. What is computed from these is put together once."""
 
 
@@ -35,7 +35,7 @@ class Spins(PoissonBySharp):
         gamma_i: with ``s' = s x grad H``, the physics of a moment ``-gamma s`` in the field ``-grad H``.
     margins : tuple of int, optional
         If given, states have the spins component by component, ``(s_1x, s_2x, …, s_1y, …)``, which large ones go
-        through the memory faster with. They are worked on with margins of so many sites, see :class:`Padded`.
+        through the memory faster with. They are worked on with margins of so many sites, see :class:`PaddedLattice`.
 
     Raises
     ------
@@ -69,45 +69,47 @@ class Spins(PoissonBySharp):
         return 3 * self.count + self.others
 
     @property
-    def planar(self) -> bool:
+    def is_component_major(self) -> bool:
         """Whether states have the spins component by component."""
         return self.margins is not None
 
-    def spins(self, x) -> Planes:
+    def spins(self, x) -> VectorComponents:
         """The components of the spins of a state, shape (n,): three arrays, shape (count,)."""
         if self.margins is None:
-            return self.covectors(x)
-        return reshaped(Padded(reshaped(self.covectors(x), self.sites), self.margins).here, (self.count,))
+            return self.split_covectors(x)
+        return reshape_vectors(
+            PaddedLattice(reshape_vectors(self.split_covectors(x), self.sites), self.margins).site_spins, (self.count,)
+        )
 
-    def covectors(self, alpha) -> Planes:
+    def split_covectors(self, alpha) -> VectorComponents:
         """The components of covectors of the spins, likewise."""
-        return spins_of(alpha, self.count, self.planar)
+        return spins_from_state(alpha, self.count, self.is_component_major)
 
-    def joined(self, spins: Planes, others) -> jax.Array:
+    def join_state(self, spins: VectorComponents, others) -> jax.Array:
         """A state, shape (n,), from the components of its spins and the other components, shape (others,)."""
-        return state_of(spins, others, self.planar)
+        return state_from_spins(spins, others, self.is_component_major)
 
-    def turned(self, x, alpha) -> Planes:
+    def precession_rates(self, x, alpha) -> VectorComponents:
         """The components of ``gamma_i s_i x alpha_i``."""
-        return scaled(self.ratio.reshape(-1), cross_planes(self.spins(x), self.covectors(alpha)))
+        return scale_vectors(self.ratio.reshape(-1), cross_vectors(self.spins(x), self.split_covectors(alpha)))
 
     def sharp(self, x, alpha) -> jax.Array:
-        return self.joined(self.turned(x, alpha), jnp.zeros(self.others))
+        return self.join_state(self.precession_rates(x, alpha), jnp.zeros(self.others))
 
 
 class Lattice:
     """Spins on a lattice, by their components."""
 
-    def __init__(self, here: Planes):
-        self.here = here
+    def __init__(self, here: VectorComponents):
+        self.site_spins = here
 
-    def at(self, offset: Sequence[int]) -> Planes:
+    def at(self, offset: Sequence[int]) -> VectorComponents:
         """For each site the spin so many sites ahead, beyond the end those at the start."""
-        a, b, c = (jnp.roll(component, [-o for o in offset], range(len(offset))) for component in self.here)
+        a, b, c = (jnp.roll(component, [-o for o in offset], range(len(offset))) for component in self.site_spins)
         return a, b, c
 
 
-class Padded(Lattice):
+class PaddedLattice(Lattice):
     """A large lattice, kept with a margin all around: it is put into the memory once, and neighbours are parts of it.
 
     Parameters
@@ -116,57 +118,59 @@ class Padded(Lattice):
         How far neighbours are at most, along each axis.
     """
 
-    def __init__(self, spins: Planes, reach: Sequence[int]):
+    def __init__(self, spins: VectorComponents, reach: Sequence[int]):
         self.reach, self.sites = reach, spins[0].shape
         margins = [(r, r) for r in reach]
-        self.whole = jax.lax.optimization_barrier([jnp.pad(component, margins, mode="wrap") for component in spins])
+        self.padded_spins = jax.lax.optimization_barrier(
+            [jnp.pad(component, margins, mode="wrap") for component in spins]
+        )
         super().__init__(self.at([0 for _ in reach]))
 
-    def at(self, offset: Sequence[int]) -> Planes:
+    def at(self, offset: Sequence[int]) -> VectorComponents:
         places = tuple(slice(r + o, r + o + n) for r, o, n in zip(self.reach, offset, self.sites, strict=True))
-        a, b, c = (component[places] for component in self.whole)
+        a, b, c = (component[places] for component in self.padded_spins)
         return a, b, c
 
 
-def spins_of(x, count: int, planar: bool = False) -> Planes:
+def spins_from_state(x, count: int, planar: bool = False) -> VectorComponents:
     """The components of the first vectors of a state, shape (n,): three arrays, shape (count,)."""
     if planar:
         return x[:count], x[count : 2 * count], x[2 * count : 3 * count]
-    return planes(x[: 3 * count].reshape(count, 3))
+    return split_vectors(x[: 3 * count].reshape(count, 3))
 
 
-def state_of(spins: Planes, others, planar: bool = False) -> jax.Array:
+def state_from_spins(spins: VectorComponents, others, planar: bool = False) -> jax.Array:
     """The state, shape (n,), that has these, and the other components behind."""
-    parts = spins if planar else (interleaved(spins).reshape(-1),)
+    parts = spins if planar else (stack_columns(spins).reshape(-1),)
     return jnp.concatenate([*parts, others]) if planar or others.size else parts[0]
 
 
-def planes(v) -> Planes:
+def split_vectors(v) -> VectorComponents:
     """The components of vectors in space, shape (..., 3)."""
     return v[..., 0], v[..., 1], v[..., 2]
 
 
-def cross_planes(u: Planes, v: Planes) -> Planes:
+def cross_vectors(u: VectorComponents, v: VectorComponents) -> VectorComponents:
     """``u x v``, by components."""
     return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
 
 
-def added(u: Planes, v: Planes) -> Planes:
+def add_vectors(u: VectorComponents, v: VectorComponents) -> VectorComponents:
     """``u + v``, by components."""
     return u[0] + v[0], u[1] + v[1], u[2] + v[2]
 
 
-def scaled(factor, vectors: Planes) -> Planes:
+def scale_vectors(factor, vectors: VectorComponents) -> VectorComponents:
     """Vectors times a factor, or one for each, by components."""
     return factor * vectors[0], factor * vectors[1], factor * vectors[2]
 
 
-def dotted(u: Planes, v: Planes) -> jax.Array:
+def dot_vectors(u: VectorComponents, v: VectorComponents) -> jax.Array:
     """``u . v`` of each, by components."""
     return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
 
 
-def summed(u: Planes, v: Planes) -> jax.Array:
+def sum_of_dots(u: VectorComponents, v: VectorComponents) -> jax.Array:
     """``sum u_i . v_i`` over all, as products of vectors, which is faster than a sum over what v is made of."""
     return sum(
         (jnp.dot(jnp.broadcast_to(a, b.shape).reshape(-1), b.reshape(-1)) for a, b in zip(u, v, strict=True)),
@@ -174,11 +178,11 @@ def summed(u: Planes, v: Planes) -> jax.Array:
     )
 
 
-def reshaped(vectors: Planes, shape: tuple[int, ...]) -> Planes:
+def reshape_vectors(vectors: VectorComponents, shape: tuple[int, ...]) -> VectorComponents:
     """Vectors on an array of sites of another shape, by components."""
     return vectors[0].reshape(shape), vectors[1].reshape(shape), vectors[2].reshape(shape)
 
 
 def cross(u, v) -> jax.Array:
     """``u x v`` of vectors in space, shape (..., 3)."""
-    return interleaved(cross_planes(planes(u), planes(v)))
+    return stack_columns(cross_vectors(split_vectors(u), split_vectors(v)))

@@ -13,9 +13,9 @@ from ..retractions.coordinates import coordinates_around
 from ..spaces.base import Space
 from .report import Report, Suite
 
-BATCH = 4
+BATCH_SIZE = 4
 
-DIFFERENCES = 1e-8
+DIVERGENCE_TOLERANCE = 1e-8
 """What a divergence by differences may miss."""
 
 
@@ -36,82 +36,88 @@ def check_space(M: Space, length: float = 0.5, seed: int = 0, allowed: float = 1
         If one of the properties does not hold.
     """
     suite, random = Suite(M.name), np.random.default_rng(seed)
-    x = np.asarray(M.random(seed, (BATCH,)))
-    c, d = random.standard_normal((2, BATCH, M.dim))
+    x = np.asarray(M.random(seed, (BATCH_SIZE,)))
+    c, d = random.standard_normal((2, BATCH_SIZE, M.dim))
     u, v = (np.asarray(M.from_coordinates(x, w)) for w in (c, d))
     noise = random.standard_normal(x.shape)
     size = max(1.0, float(np.abs(x).max())) ** 2 * max(1, M.dim)
-    suite.true("shape and kind of random points", x.shape == (BATCH, *M.shape) and x.dtype == M.dtype)
-    suite.true("random points are in the space", bool(np.all(M.belongs(x))))
-    suite.small("a point is its own projection", M.project(x) - x, size, allowed)
+    suite.check_true("shape and kind of random points", x.shape == (BATCH_SIZE, *M.shape) and x.dtype == M.dtype)
+    suite.check_true("random points are in the space", bool(np.all(M.belongs(x))))
+    suite.check_small("a point is its own projection", M.project(x) - x, size, allowed)
     moved = x + 0.01 * noise
-    suite.true("projections are in the space", bool(np.all(M.belongs(M.project(moved)))))
+    suite.check_true("projections are in the space", bool(np.all(M.belongs(M.project(moved)))))
     if bool(np.all(M.belongs(moved, 1e-4))):
-        suite.without("a point off the space is seen", "every array is a point")
-    suite.small("to_vector, from_vector", M.from_vector(M.to_vector(x)) - x, size, allowed)
-    suite.small("tangent vectors are their own projections", M.project_tangent(x, u) - u, size, allowed)
-    suite.small("coordinates of vectors", np.asarray(M.coordinates(x, u)) - c, size, allowed)
+        suite.skip_check("a point off the space is seen", "every array is a point")
+    suite.check_small("to_vector, from_vector", M.from_vector(M.to_vector(x)) - x, size, allowed)
+    suite.check_small("tangent vectors are their own projections", M.project_tangent(x, u) - u, size, allowed)
+    suite.check_small("coordinates of vectors", np.asarray(M.coordinates(x, u)) - c, size, allowed)
     frame = np.einsum("ba,ba...->b...", c, M.frame(x))
-    suite.small("the frame spans the coordinates", frame - u, size, allowed)
-    suite.small("the frame is orthonormal", np.asarray(M.inner(x, u, v)) - (c * d).sum(1), size, allowed)
-    suite.small("the metric is symmetric", np.asarray(M.inner(x, u, v)) - np.asarray(M.inner(x, v, u)), size, allowed)
-    suite.small("norms", np.asarray(M.norm(x, u)) ** 2 - np.asarray(M.inner(x, u, u)), size, allowed)
+    suite.check_small("the frame spans the coordinates", frame - u, size, allowed)
+    suite.check_small("the frame is orthonormal", np.asarray(M.inner(x, u, v)) - (c * d).sum(1), size, allowed)
+    suite.check_small(
+        "the metric is symmetric", np.asarray(M.inner(x, u, v)) - np.asarray(M.inner(x, v, u)), size, allowed
+    )
+    suite.check_small("norms", np.asarray(M.norm(x, u)) ** 2 - np.asarray(M.inner(x, u, u)), size, allowed)
     axes = tuple(range(-len(M.shape), 0))
     paired = np.sum(np.asarray(M.flat(x, u)) * v, axis=axes).real
-    suite.small("flat(u) v = <u, v>", paired - np.asarray(M.inner(x, u, v)), size, allowed)
-    suite.small("sharp inverts flat", np.asarray(M.sharp(x, M.flat(x, u))) - u, size, allowed)
-    R = np.asarray(M.isotropic(x[:, None], np.broadcast_to(np.eye(M.isotropic_size), (BATCH, *[M.isotropic_size] * 2))))
+    suite.check_small("flat(u) v = <u, v>", paired - np.asarray(M.inner(x, u, v)), size, allowed)
+    suite.check_small("sharp inverts flat", np.asarray(M.sharp(x, M.flat(x, u))) - u, size, allowed)
+    R = np.asarray(
+        M.isotropic(x[:, None], np.broadcast_to(np.eye(M.isotropic_size), (BATCH_SIZE, *[M.isotropic_size] * 2)))
+    )
     parts = [np.asarray(M.inner(np.broadcast_to(x[:, None], R.shape), R, w[:, None])) for w in (u, v)]
-    suite.small(
+    suite.check_small(
         "isotropic: R R^T inverts the metric", (parts[0] * parts[1]).sum(1) - (c * d).sum(1), size, 10 * allowed
     )
-    if M.geodesics or M._induced:
+    if M.has_geodesics or M._has_induced_metric:
         turn = jnp.asarray(random.standard_normal((M.size, M.size))) / M.size
 
         def field(y):
             return M._project_tangent(y, M.from_vector(turn @ jnp.tanh(M.to_vector(y))))
 
         defect = np.asarray(jax.jit(partial(M.divergence, field))(x[0])) - divergence_by_volume(M, field, x[0])
-        suite.small("divergences are those of the volume", defect, size, DIFFERENCES)
-    if M.surrounded:
-        change, corrected, tangent = _in_the_arrays_around(M, x, noise)
-        suite.small("corrections change the equations by what is asked", corrected - change, size, allowed)
-        suite.small("what is along the space changes no equation", tangent, size, allowed)
-    if not M.geodesics:
-        suite.without("geodesics", "the space has none of its own: its charts project")
+        suite.check_small("divergences are those of the volume", defect, size, DIVERGENCE_TOLERANCE)
+    if M.can_be_embedded:
+        change, corrected, tangent = _constraint_changes(M, x, noise)
+        suite.check_small("corrections change the equations by what is asked", corrected - change, size, allowed)
+        suite.check_small("what is along the space changes no equation", tangent, size, allowed)
+    if not M.has_geodesics:
+        suite.skip_check("geodesics", "the space has none of its own: its charts project")
         return suite.report()
     reach = min(length, 0.45 * M.injectivity_radius(x[0]))
     across = (reach / np.linalg.norm(c, axis=1)).reshape(-1, *(1,) * len(M.shape)) * u
     y = np.asarray(M.exp(x, across))
     size = max(1.0, float(np.abs(x).max()), float(np.abs(y).max())) ** 2 * max(1, M.dim)
-    suite.true("exp is in the space", bool(np.all(M.belongs(y))))
-    suite.small("exp 0", M.exp(x, np.zeros_like(x)) - x, size, allowed)
-    suite.small("log inverts exp", np.asarray(M.log(x, y)) - across, size, 10 * allowed)
+    suite.check_true("exp is in the space", bool(np.all(M.belongs(y))))
+    suite.check_small("exp 0", M.exp(x, np.zeros_like(x)) - x, size, allowed)
+    suite.check_small("log inverts exp", np.asarray(M.log(x, y)) - across, size, 10 * allowed)
     if M.metric == "left-invariant":
-        suite.without("distance and transport", "one-parameter subgroups are not the geodesics of this metric")
+        suite.skip_check("distance and transport", "one-parameter subgroups are not the geodesics of this metric")
         return suite.report()
-    suite.small("distance is the length of the geodesic", np.asarray(M.distance(x, y)) - reach, size, 10 * allowed)
-    suite.small(
+    suite.check_small(
+        "distance is the length of the geodesic", np.asarray(M.distance(x, y)) - reach, size, 10 * allowed
+    )
+    suite.check_small(
         "distance is symmetric", np.asarray(M.distance(y, x)) - np.asarray(M.distance(x, y)), size, 10 * allowed
     )
     carried, other = (np.asarray(M.transport(x, across, w)) for w in (u, v))
-    suite.small(
+    suite.check_small(
         "transported vectors are tangent", np.asarray(M.project_tangent(y, carried)) - carried, size, 10 * allowed
     )
     kept = np.asarray(M.inner(y, carried, other)) - np.asarray(M.inner(x, u, v))
-    suite.small("transport keeps inner products", kept, size, 10 * allowed)
+    suite.check_small("transport keeps inner products", kept, size, 10 * allowed)
     half = np.asarray(M.exp(x, 0.5 * across))
-    suite.small("midpoints", np.asarray(M.midpoint(x, y)) - half, size, 10 * allowed)
+    suite.check_small("midpoints", np.asarray(M.midpoint(x, y)) - half, size, 10 * allowed)
     return suite.report()
 
 
-def _in_the_arrays_around(M: Space, x, w) -> list[np.ndarray]:
+def _constraint_changes(M: Space, x, w) -> list[np.ndarray]:
     """What equations change by along w, along the correction that is to make up for it, and along w made tangent."""
 
     @jax.jit
     def changes(x, w):
         along = lambda v: jax.jvp(M._constraints, (x,), (v + jnp.zeros_like(x),))[1]  # noqa: E731
-        return along(w), along(M._correction(x, along(w))), along(M._along(x, w))
+        return along(w), along(M._correction(x, along(w))), along(M._tangential_part(x, w))
 
     return [np.asarray(c) for c in changes(x, np.asarray(w, dtype=M.dtype))]
 

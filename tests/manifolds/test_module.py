@@ -5,7 +5,7 @@ import types
 import jax
 import jax.numpy as jnp
 
-from manifolds._module import Module
+from manifolds._pytree_module import Module
 
 
 class Scaled(Module):

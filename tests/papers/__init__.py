@@ -17,7 +17,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 import liethermo as lt
-from liethermo.tracing.interpret import at_points
+from liethermo.tracing.interpret import evaluate_at_points
 
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "verification.md"
 
@@ -114,7 +114,7 @@ class Tests:
 
 def fields(system, points) -> np.ndarray:
     """The vector field of a system at points, shape (m, n)."""
-    return at_points(_field, system, np.atleast_2d(np.asarray(points, dtype=float)))
+    return evaluate_at_points(_field, system, np.atleast_2d(np.asarray(points, dtype=float)))
 
 
 def _field(system, x):

@@ -11,7 +11,7 @@ import scipy.optimize
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.tracing.interpret import at_points
+from liethermo.tracing.interpret import evaluate_at_points
 
 from . import Difference, Order, apart, fields, order, row, solved, worst
 
@@ -35,7 +35,7 @@ def energy(m):
 
 
 def friction(system) -> np.ndarray:
-    return at_points(_friction, system, POINTS)
+    return evaluate_at_points(_friction, system, POINTS)
 
 
 def _friction(system, x):

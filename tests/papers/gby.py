@@ -9,7 +9,7 @@ import numpy as np
 
 import liethermo as lt
 from liethermo.models.mass_spring_gas import CASES, STARTS, mass_spring_gas_solution
-from liethermo.tracing.interpret import at_points
+from liethermo.tracing.interpret import evaluate_at_points
 
 from . import Difference, Order, Tests, Value, apart, fields, order, row, solved
 
@@ -134,8 +134,8 @@ def regularity():
         [-m / h - h * k / 4 - friction / 2, 0.0],
         [2 * friction * speed / h, -T / h * (h * s / (2 * heat) + 1)],
     ]
-    discrete = V.midpoint().discrete(lt.models.mass_spring_gas(m, k, friction), h)
-    found, _ = at_points(variational._matrices, discrete, np.array([[x0, x1, S0, S1]]))
+    discrete = V.midpoint().discrete_system(lt.models.mass_spring_gas(m, k, friction), h)
+    found, _ = evaluate_at_points(variational._matrices, discrete, np.array([[x0, x1, S0, S1]]))
     return apart(found[0], expected)
 
 

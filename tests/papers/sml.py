@@ -11,7 +11,7 @@ import liethermo as lt
 import manifolds as mf
 from liethermo.models.oscillator import damped_oscillator_solution
 from liethermo.models.thermo_particles import thermo_particles_solution
-from liethermo.tracing.interpret import at_points
+from liethermo.tracing.interpret import evaluate_at_points
 
 from . import Difference, Order, Tests, Value, apart, fields, order, row, solved, worst
 
@@ -51,7 +51,7 @@ def bivector():
         L = np.zeros((5, 5))
         L[2:4, :2], L[2:4, 4] = np.eye(2), x[2:4]
         expected.append(L - L.T)
-    return apart(at_points(_bivector, alone, POINTS), expected)
+    return apart(evaluate_at_points(_bivector, alone, POINTS), expected)
 
 
 def _bivector(structure, x):

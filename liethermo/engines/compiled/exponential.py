@@ -7,7 +7,7 @@ from typing import Any
 
 from llvmlite import ir
 
-INSIDE = 700.0
+MAX_NORMAL_ARGUMENT = 700.0
 """Arguments below this size have a result that is not subnormal; the C library computes the others."""
 
 LOG2_HIGH = float.fromhex("0x1.62e42fee00000p-1")
@@ -16,14 +16,14 @@ LOG2_HIGH = float.fromhex("0x1.62e42fee00000p-1")
 LOG2_LOW = float.fromhex("0x1.a39ef35793c76p-33")
 """The rest."""
 
-WHOLE = 1.5 * 2.0**52
+ROUND_TO_INT_SHIFT = 1.5 * 2.0**52
 """A number to which another is added as its nearest whole number, in the last bits."""
 
-TERMS = 13
+SERIES_DEGREE = 13
 """Power up to which the series of a remainder below log(2) / 2 is summed: what is left out is 4e-18."""
 
 
-def exponential(writer: Any, x: ir.Value) -> ir.Value:
+def write_exponential(writer: Any, x: ir.Value) -> ir.Value:
     """``exp(x)``, to one unit in the last place: ``2^k exp(r)`` with ``x = k log 2 + r`` and ``|r| <= log(2) / 2``.
 
     Parameters
@@ -31,36 +31,36 @@ def exponential(writer: Any, x: ir.Value) -> ir.Value:
     writer : Writer
     """
     build = writer.builder
-    usual = build.fcmp_ordered("<", writer.operation("abs", [x]), writer.constant(INSIDE))
-    found = _inside(writer, x)
+    usual = build.fcmp_ordered("<", writer.write_operation("abs", [x]), writer.constant(MAX_NORMAL_ARGUMENT))
+    found = _write_fast_exponential(writer, x)
     before = build.block
-    with build.if_then(writer.any(build.not_(usual)), likely=False):
-        chosen = build.select(usual, found, writer.of_each_lane("exp", [x]))
+    with build.if_then(writer.has_true_lane(build.not_(usual)), likely=False):
+        chosen = build.select(usual, found, writer.call_per_lane("exp", [x]))
         after = build.block
-    result = build.phi(writer.number)
+    result = build.phi(writer.double_type)
     result.add_incoming(found, before)
     result.add_incoming(chosen, after)
     return result
 
 
-def _inside(writer: Any, x: ir.Value) -> ir.Value:
+def _write_fast_exponential(writer: Any, x: ir.Value) -> ir.Value:
     build = writer.builder
 
-    def fused(a: ir.Value, b: ir.Value, c: ir.Value) -> ir.Value:
-        return writer.intrinsic("llvm.fmuladd", (a, b, c), writer.number)
+    def multiply_add(a: ir.Value, b: ir.Value, c: ir.Value) -> ir.Value:
+        return writer.call_intrinsic("llvm.fmuladd", (a, b, c), writer.double_type)
 
-    whole = writer.constant(WHOLE)
-    shifted = fused(x, writer.constant(1.0 / math.log(2.0)), whole)
+    whole = writer.constant(ROUND_TO_INT_SHIFT)
+    shifted = multiply_add(x, writer.constant(1.0 / math.log(2.0)), whole)
     k = build.fsub(shifted, whole)
-    r = fused(k, writer.constant(-LOG2_LOW), fused(k, writer.constant(-LOG2_HIGH), x))
+    r = multiply_add(k, writer.constant(-LOG2_LOW), multiply_add(k, writer.constant(-LOG2_HIGH), x))
     # exp(r) = 1 + (r + r^2 q(r)), q by pairs, which do not wait for each other
-    terms = [writer.constant(1.0 / math.factorial(n)) for n in range(2, TERMS + 1)]
+    terms = [writer.constant(1.0 / math.factorial(n)) for n in range(2, SERIES_DEGREE + 1)]
     power = r
     square = build.fmul(r, r)
     while len(terms) > 1:
-        pairs = [fused(power, other, one) for one, other in zip(terms[::2], terms[1::2], strict=False)]
+        pairs = [multiply_add(power, other, one) for one, other in zip(terms[::2], terms[1::2], strict=False)]
         terms = pairs + terms[2 * len(pairs) :]
         power = square if power is r else build.fmul(power, power)
-    bits = build.shl(build.bitcast(shifted, writer.whole), writer.constant(52))  # those of k alone are left
-    scale = build.bitcast(build.add(bits, writer.constant(1023 << 52)), writer.number)
-    return build.fmul(scale, build.fadd(writer.constant(1.0), fused(square, terms[0], r)))
+    bits = build.shl(build.bitcast(shifted, writer.int_type), writer.constant(52))  # those of k alone are left
+    scale = build.bitcast(build.add(bits, writer.constant(1023 << 52)), writer.double_type)
+    return build.fmul(scale, build.fadd(writer.constant(1.0), multiply_add(square, terms[0], r)))

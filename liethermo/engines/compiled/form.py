@@ -12,11 +12,11 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from ...tracing.remembered import remembered
+from ...tracing.caching import memoize
 
 
 @dataclass(frozen=True)
-class Form:
+class ProgramStructure:
     """What systems, or methods, have in common that differ in their parameters.
 
     Attributes
@@ -33,20 +33,20 @@ class Form:
     rebuild: Callable[[list], Any] = field(compare=False)
 
     @staticmethod
-    @remembered
-    def of(system: eqx.Module) -> Form:
+    @memoize
+    def from_module(system: eqx.Module) -> ProgramStructure:
         """The form of a system, a method or a pacing, its parameters being the arrays among its leaves."""
         dynamic, static = eqx.partition(system, eqx.is_inexact_array)
         leaves, structure = jax.tree_util.tree_flatten(dynamic)
         functions, outline = jax.tree_util.tree_flatten(static)
-        return Form(
+        return ProgramStructure(
             (outline, tuple(functions)),
             tuple(np.shape(leaf) for leaf in leaves),
             lambda arrays: eqx.combine(jax.tree_util.tree_unflatten(structure, arrays), static),
         )
 
     @property
-    def size(self) -> int:
+    def n_parameters(self) -> int:
         """How many numbers the parameters are."""
         return sum(map(math.prod, self.shapes))
 
@@ -57,13 +57,13 @@ class Form:
         return self.rebuild(arrays)
 
 
-@remembered
-def arrays_of(tree: eqx.Module) -> tuple[np.ndarray, ...]:
+@memoize
+def parameter_arrays(tree: eqx.Module) -> tuple[np.ndarray, ...]:
     """The parameters of a system, a method or a pacing."""
     leaves = jax.tree_util.tree_leaves(eqx.filter(tree, eqx.is_inexact_array))
     return tuple(np.asarray(leaf, dtype=np.float64) for leaf in leaves)
 
 
-def numbers_of(*trees: eqx.Module) -> np.ndarray:
+def flat_parameters(*trees: eqx.Module) -> np.ndarray:
     """The parameters of systems, methods or pacings, one after another, shape (p,)."""
-    return np.concatenate([np.zeros(0), *(array.ravel() for tree in trees for array in arrays_of(tree))])
+    return np.concatenate([np.zeros(0), *(array.ravel() for tree in trees for array in parameter_arrays(tree))])

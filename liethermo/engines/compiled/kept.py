@@ -18,13 +18,13 @@ class CacheWarning(UserWarning):
     """Machine code is compiled anew in every process, since it cannot be kept safely."""
 
 
-SEAL = 32
+CHECKSUM_BYTES = 32
 """Bytes of a file before the code: its checksum, for a file that was cut short."""
 
-LARGEST = 2**28
+MAX_FILE_BYTES = 2**28
 """Bytes of a file."""
 
-PLAINLY = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
+SAFE_OPEN_FLAGS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
 """Flags that open no link, and do not wait for the other end of a pipe."""
 
 
@@ -38,36 +38,38 @@ def cache_folder() -> Path | None:
         return None
 
 
-def read(name: str) -> bytes | None:
+def read_code(name: str) -> bytes | None:
     """What was written under a name; None where there is nothing, it is damaged, or it may be somebody else's."""
-    folder = _trusted()
+    folder = _trusted_folder()
     if folder is None:
         return None
     try:
-        with open(folder / f"{name}.o", "rb", opener=lambda path, flags: os.open(path, flags | PLAINLY)) as file:
+        with open(
+            folder / f"{name}.o", "rb", opener=lambda path, flags: os.open(path, flags | SAFE_OPEN_FLAGS)
+        ) as file:
             said = os.fstat(file.fileno())
-            if not stat.S_ISREG(said.st_mode) or said.st_size > LARGEST:
+            if not stat.S_ISREG(said.st_mode) or said.st_size > MAX_FILE_BYTES:
                 return None
-            if fault := _fault(said):
-                _distrusted(str(folder / f"{name}.o"), fault)
+            if fault := _why_untrusted(said):
+                _warn_untrusted(str(folder / f"{name}.o"), fault)
                 return None
             whole = file.read()
     except (OSError, ValueError):
         return None
-    seal, found = whole[:SEAL], whole[SEAL:]
+    seal, found = whole[:CHECKSUM_BYTES], whole[CHECKSUM_BYTES:]
     return found if found and seal == hashlib.sha256(found).digest() else None
 
 
-def write(name: str, code: bytes) -> None:
+def write_code(name: str, code: bytes) -> None:
     """Keep machine code under a name; nothing where there is no folder for it."""
-    folder = _trusted()
+    folder = _trusted_folder()
     if folder is not None:
         with contextlib.suppress(OSError):
-            disk.write(folder / f"{name}.o", hashlib.sha256(code).digest() + code, mode=0o600)
-            disk.sweep(folder, f"{name}.o")
+            disk.write_atomically(folder / f"{name}.o", hashlib.sha256(code).digest() + code, mode=0o600)
+            disk.remove_dead_parts(folder, f"{name}.o")
 
 
-def _trusted() -> Path | None:
+def _trusted_folder() -> Path | None:
     """The folder, made where there is none; None where it cannot be used, or others might write to it."""
     folder = cache_folder()
     if folder is None:
@@ -80,17 +82,17 @@ def _trusted() -> Path | None:
     except (OSError, ValueError):
         return None
     if stat.S_ISLNK(said.st_mode):
-        _distrusted(str(folder), "it is a link")
+        _warn_untrusted(str(folder), "it is a link")
     elif not stat.S_ISDIR(said.st_mode):
-        _distrusted(str(folder), "it is no folder")
-    elif fault := _fault(said):
-        _distrusted(str(folder), fault)
+        _warn_untrusted(str(folder), "it is no folder")
+    elif fault := _why_untrusted(said):
+        _warn_untrusted(str(folder), fault)
     else:
         return folder
     return None
 
 
-def _fault(said: os.stat_result) -> str:
+def _why_untrusted(said: os.stat_result) -> str:
     """Why what is found on disk may be somebody else's, in words; empty where it is this user's alone."""
     if not hasattr(os, "geteuid"):
         return ""
@@ -100,7 +102,7 @@ def _fault(said: os.stat_result) -> str:
 
 
 @functools.cache
-def _distrusted(path: str, fault: str) -> None:
+def _warn_untrusted(path: str, fault: str) -> None:
     """Say so once."""
     warn(
         f"machine code is not kept in {path}: {fault}, and it could run anything as you. It is compiled in memory; "

@@ -15,17 +15,17 @@ from typing import Any
 import llvmlite.binding as llvm
 from llvmlite import ir
 
-from ...tracing.calls import Call
+from ...tracing.calls import LapackCall
 
-NUMBER, WHOLE, INTEGER, LETTER = ir.DoubleType(), ir.IntType(64), ir.IntType(32), ir.IntType(8)
-NUMBERS = NUMBER.as_pointer()
+FLOAT64, INT64, INT32, INT8 = ir.DoubleType(), ir.IntType(64), ir.IntType(32), ir.IntType(8)
+FLOAT64_POINTER = FLOAT64.as_pointer()
 
-PREFIX = "liethermo_"
+SYMBOL_PREFIX = "liethermo_"
 """How the names of functions begin that are bound here."""
 
-ROUTINES = "dsyev zheev dgetrf zgetrf dgetri zgetri dgeqrf zgeqrf dorgqr zungqr dgesdd zgesdd".split()
+LAPACK_ROUTINES = "dsyev zheev dgetrf zgetrf dgetri zgetri dgeqrf zgeqrf dorgqr zungqr dgesdd zgesdd".split()
 
-SPECIAL = {
+SPECIAL_FUNCTIONS = {
     "lgamma": ("gammaln", 1),
     "digamma": ("__pyx_fuse_1psi", 1),
     "erf_inv": ("__pyx_fuse_0erfinv", 1),
@@ -39,7 +39,7 @@ SPECIAL = {
 
 
 @functools.cache
-def bind() -> None:
+def bind_symbols() -> None:
     """Make known to LLVM what SciPy exports."""
     import scipy.linalg.cython_lapack
     import scipy.special.cython_special
@@ -48,14 +48,14 @@ def bind() -> None:
     name.restype, name.argtypes = ctypes.c_char_p, [ctypes.py_object]
     pointer = ctypes.pythonapi.PyCapsule_GetPointer
     pointer.restype, pointer.argtypes = ctypes.c_void_p, [ctypes.py_object, ctypes.c_char_p]
-    found = {routine: scipy.linalg.cython_lapack.__pyx_capi__[routine] for routine in ROUTINES}
-    for op, (exported, _) in SPECIAL.items():
+    found = {routine: scipy.linalg.cython_lapack.__pyx_capi__[routine] for routine in LAPACK_ROUTINES}
+    for op, (exported, _) in SPECIAL_FUNCTIONS.items():
         found[op] = scipy.special.cython_special.__pyx_capi__[exported]
     for own, capsule in found.items():
-        llvm.add_symbol(PREFIX + own, pointer(capsule, name(capsule)))
+        llvm.add_symbol(SYMBOL_PREFIX + own, pointer(capsule, name(capsule)))
 
 
-def kernel(writer: Any, call: Call) -> ir.Function:
+def lapack_kernel(writer: Any, call: LapackCall) -> ir.Function:
     """The function ``f(given, found)`` of a call for one lane, of arrays with a number for each.
 
     Parameters
@@ -65,201 +65,262 @@ def kernel(writer: Any, call: Call) -> ir.Function:
     name = "_".join(["call", call.name, "z" if call.is_complex else "d", *map(str, call.sizes)])
     if name in writer.builder.module.globals:
         return writer.builder.module.globals[name]
-    function, inside = writer.function(name, [NUMBERS, NUMBERS])
-    _Kernel(inside, function.args, call).write()
+    function, inside = writer.new_function(name, [FLOAT64_POINTER, FLOAT64_POINTER])
+    _KernelWriter(inside, function.args, call).write()
     return function
 
 
-class _Kernel:
+class _KernelWriter:
     """Writes a kernel. Matrices lie column by column inside, complex numbers as their two parts."""
 
-    def __init__(self, writer: Any, arguments: Sequence[ir.Value], call: Call):
-        self.writer, self.call, self.build = writer, call, writer.builder
-        self.parts = 2 if call.is_complex else 1
-        self.given, self.found = arguments
+    def __init__(self, writer: Any, arguments: Sequence[ir.Value], call: LapackCall):
+        self.writer, self.call, self.builder = writer, call, writer.builder
+        self.parts_per_entry = 2 if call.is_complex else 1
+        self.input_pointer, self.output_pointer = arguments
 
     def write(self) -> None:
-        build, shapes = self.build, self.call.arguments
-        total = sum(map(math.prod, shapes)) * self.parts
+        build, shapes = self.builder, self.call.argument_shapes
+        total = sum(map(math.prod, shapes)) * self.parts_per_entry
         finite = build.alloca(ir.IntType(1))
         build.store(ir.Constant(ir.IntType(1), 1), finite)
-        for i in self._range(total):
-            value = build.load(self._at(self.given, i))
-            sound = build.fcmp_ordered("==", build.fsub(value, value), ir.Constant(NUMBER, 0.0))  # not of infinity
+        for i in self._loop(total):
+            value = build.load(self._lane_entry(self.input_pointer, i))
+            sound = build.fcmp_ordered("==", build.fsub(value, value), ir.Constant(FLOAT64, 0.0))  # not of infinity
             build.store(build.and_(build.load(finite), sound), finite)
         with build.if_else(build.load(finite)) as (sound, not_sound):
             with sound:
                 getattr(self, f"_{self.call.name}")(*self.call.sizes)
             with not_sound:
-                self._fail()
+                self._write_nan()
         build.ret_void()
 
     # -- the calls ----------------------------------------------------------------------------------------------------
 
     def _eigh(self, n: int) -> None:
-        a, w = self._entered(0, n, n), self._numbers(n)
+        a, w = self._copy_input(0, n, n), self._allocate_doubles(n)
         z, work = self.call.is_complex, 34 * n  # as much as a blocked reduction to tridiagonal form wants
-        arguments = [self._letter("V"), self._letter("L"), self._integer(n), a, self._integer(n), w]
-        arguments += [self._numbers(work * self.parts), self._integer(work)]
-        arguments += [self._numbers(3 * n)] if z else []
+        arguments = [
+            self._char_argument("V"),
+            self._char_argument("L"),
+            self._integer_argument(n),
+            a,
+            self._integer_argument(n),
+            w,
+        ]
+        arguments += [self._allocate_doubles(work * self.parts_per_entry), self._integer_argument(work)]
+        arguments += [self._allocate_doubles(3 * n)] if z else []
 
         def leave() -> None:
-            self._leave(0, a, n, n)
-            self._leave_row(1, w, n)
+            self._copy_output(0, a, n, n)
+            self._copy_output_vector(1, w, n)
 
-        self._checked("zheev" if z else "dsyev", arguments, leave)
+        self._call_with_info("zheev" if z else "dsyev", arguments, leave)
 
     def _lu(self, m: int, n: int) -> None:
-        a, least = self._entered(0, m, n), min(m, n)
-        pivots = self._integers(least)
+        a, least = self._copy_input(0, m, n), min(m, n)
+        pivots = self._allocate_integers(least)
         routine = "zgetrf" if self.call.is_complex else "dgetrf"
-        self._routine(routine, [self._integer(m), self._integer(n), a, self._integer(m), pivots, self._integers(1)])
-        self._leave(0, a, m, n)
-        for i in self._range(least):  # LAPACK counts from one
-            place = self.build.sub(self.build.load(self.build.gep(pivots, [i])), ir.Constant(INTEGER, 1))
-            self.build.store(self.build.sitofp(place, NUMBER), self._out(1, i))
+        self._call_routine(
+            routine,
+            [
+                self._integer_argument(m),
+                self._integer_argument(n),
+                a,
+                self._integer_argument(m),
+                pivots,
+                self._allocate_integers(1),
+            ],
+        )
+        self._copy_output(0, a, m, n)
+        for i in self._loop(least):  # LAPACK counts from one
+            place = self.builder.sub(self.builder.load(self.builder.gep(pivots, [i])), ir.Constant(INT32, 1))
+            self.builder.store(self.builder.sitofp(place, FLOAT64), self._output_entry(1, i))
 
     def _inverse(self, n: int) -> None:
-        z, a, rows, pivots = self.call.is_complex, self._entered(0, n, n), self._integer(n), self._integers(n)
+        z, a, rows, pivots = (
+            self.call.is_complex,
+            self._copy_input(0, n, n),
+            self._integer_argument(n),
+            self._allocate_integers(n),
+        )
         size = 64 * n
         first = [rows, rows, a, rows, pivots]
 
         def invert() -> None:
-            rest = [rows, a, rows, pivots, self._numbers(size * self.parts), self._integer(size)]
-            self._checked("zgetri" if z else "dgetri", rest, lambda: self._leave(0, a, n, n))
+            rest = [
+                rows,
+                a,
+                rows,
+                pivots,
+                self._allocate_doubles(size * self.parts_per_entry),
+                self._integer_argument(size),
+            ]
+            self._call_with_info("zgetri" if z else "dgetri", rest, lambda: self._copy_output(0, a, n, n))
 
-        self._checked("zgetrf" if z else "dgetrf", first, invert)
+        self._call_with_info("zgetrf" if z else "dgetrf", first, invert)
 
     def _qr(self, m: int, n: int, columns: int) -> None:
         least, width, z = min(m, n), max(n, columns), self.call.is_complex
-        a, tau, size = self._entered(0, m, n, width), self._numbers(least * self.parts), 64 * width
-        work, rows, info = self._numbers(size * self.parts), self._integer(m), self._integers(1)
-        first = [rows, self._integer(n), a, rows, tau, work, self._integer(size), info]
-        self._routine("zgeqrf" if z else "dgeqrf", first)
-        r = self._numbers(columns * n * self.parts)
-        build = self.build
-        for j in self._range(n):
-            for i in self._range(columns):
-                source = self._entry(a, i, j, m)
-                for part in range(self.parts):
-                    value = build.load(build.gep(source, [ir.Constant(WHOLE, part)]))
+        a, tau, size = (
+            self._copy_input(0, m, n, width),
+            self._allocate_doubles(least * self.parts_per_entry),
+            64 * width,
+        )
+        work, rows, info = (
+            self._allocate_doubles(size * self.parts_per_entry),
+            self._integer_argument(m),
+            self._allocate_integers(1),
+        )
+        first = [rows, self._integer_argument(n), a, rows, tau, work, self._integer_argument(size), info]
+        self._call_routine("zgeqrf" if z else "dgeqrf", first)
+        r = self._allocate_doubles(columns * n * self.parts_per_entry)
+        build = self.builder
+        for j in self._loop(n):
+            for i in self._loop(columns):
+                source = self._matrix_entry(a, i, j, m)
+                for part in range(self.parts_per_entry):
+                    value = build.load(build.gep(source, [ir.Constant(INT64, part)]))
                     upper = build.icmp_signed("<=", i, j)
-                    target = build.gep(self._entry(r, i, j, columns), [ir.Constant(WHOLE, part)])
-                    build.store(build.select(upper, value, ir.Constant(NUMBER, 0.0)), target)
-        rest = [rows, self._integer(columns), self._integer(least), a, rows, tau, work, self._integer(size), info]
-        self._routine("zungqr" if z else "dorgqr", rest)
-        self._leave(0, a, m, columns)
-        self._leave(1, r, columns, n)
+                    target = build.gep(self._matrix_entry(r, i, j, columns), [ir.Constant(INT64, part)])
+                    build.store(build.select(upper, value, ir.Constant(FLOAT64, 0.0)), target)
+        rest = [
+            rows,
+            self._integer_argument(columns),
+            self._integer_argument(least),
+            a,
+            rows,
+            tau,
+            work,
+            self._integer_argument(size),
+            info,
+        ]
+        self._call_routine("zungqr" if z else "dorgqr", rest)
+        self._copy_output(0, a, m, columns)
+        self._copy_output(1, r, columns, n)
 
     def _svd(self, m: int, n: int, full: int) -> None:
         least, most, z = min(m, n), max(m, n), self.call.is_complex
         left, right = (m, n) if full else (least, least)
-        a, s = self._entered(0, m, n), self._numbers(least)
-        u, v = self._numbers(m * left * self.parts), self._numbers(right * n * self.parts)
+        a, s = self._copy_input(0, m, n), self._allocate_doubles(least)
+        u, v = (
+            self._allocate_doubles(m * left * self.parts_per_entry),
+            self._allocate_doubles(right * n * self.parts_per_entry),
+        )
         size = 8 * most * most + 64 * most
-        arguments = [self._letter("A" if full else "S"), self._integer(m), self._integer(n), a, self._integer(m), s]
-        arguments += [u, self._integer(m), v, self._integer(right)]
-        arguments += [self._numbers(size * self.parts), self._integer(size)]
+        arguments = [
+            self._char_argument("A" if full else "S"),
+            self._integer_argument(m),
+            self._integer_argument(n),
+            a,
+            self._integer_argument(m),
+            s,
+        ]
+        arguments += [u, self._integer_argument(m), v, self._integer_argument(right)]
+        arguments += [self._allocate_doubles(size * self.parts_per_entry), self._integer_argument(size)]
         if z:
-            arguments.append(self._numbers(8 * most * most + 8 * most))
-        arguments.append(self._integers(8 * least))
+            arguments.append(self._allocate_doubles(8 * most * most + 8 * most))
+        arguments.append(self._allocate_integers(8 * least))
 
         def leave() -> None:
-            self._leave_row(0, s, least)
-            self._leave(1, u, m, left)
-            self._leave(2, v, right, n)
+            self._copy_output_vector(0, s, least)
+            self._copy_output(1, u, m, left)
+            self._copy_output(2, v, right, n)
 
-        self._checked("zgesdd" if z else "dgesdd", arguments, leave)
+        self._call_with_info("zgesdd" if z else "dgesdd", arguments, leave)
 
     # -- arrays -------------------------------------------------------------------------------------------------------
 
-    def _at(self, base: ir.Value, i: ir.Value) -> ir.Value:
-        return self.build.gep(base, [self.build.mul(i, ir.Constant(WHOLE, self.writer.lanes))])
+    def _lane_entry(self, base: ir.Value, i: ir.Value) -> ir.Value:
+        return self.builder.gep(base, [self.builder.mul(i, ir.Constant(INT64, self.writer.lanes))])
 
-    def _out(self, which: int, i: ir.Value) -> ir.Value:
+    def _output_entry(self, which: int, i: ir.Value) -> ir.Value:
         """Entry i of a result."""
-        start = sum(self.call.lengths(self.call.results)[:which])
-        return self._at(self.found, self.build.add(i, ir.Constant(WHOLE, start)))
+        start = sum(self.call.entry_counts(self.call.result_specs)[:which])
+        return self._lane_entry(self.output_pointer, self.builder.add(i, ir.Constant(INT64, start)))
 
-    def _entry(self, a: ir.Value, i: ir.Value, j: ir.Value, rows: int) -> ir.Value:
-        build = self.build
-        place = build.add(build.mul(j, ir.Constant(WHOLE, rows)), i)
-        return build.gep(a, [build.mul(place, ir.Constant(WHOLE, self.parts))])
+    def _matrix_entry(self, a: ir.Value, i: ir.Value, j: ir.Value, rows: int) -> ir.Value:
+        build = self.builder
+        place = build.add(build.mul(j, ir.Constant(INT64, rows)), i)
+        return build.gep(a, [build.mul(place, ir.Constant(INT64, self.parts_per_entry))])
 
-    def _entered(self, start: int, m: int, n: int, width: int | None = None) -> ir.Value:
+    def _copy_input(self, start: int, m: int, n: int, width: int | None = None) -> ir.Value:
         """An argument as LAPACK has it, with room for ``width`` columns."""
-        build, a = self.build, self._numbers(m * (width or n) * self.parts)
-        for i in self._range(m):
-            for j in self._range(n):
-                place = build.add(build.mul(i, ir.Constant(WHOLE, n)), j)
-                for part in range(self.parts):
-                    source = self._at(self.given, build.add(place, ir.Constant(WHOLE, start + part * m * n)))
-                    target = build.gep(self._entry(a, i, j, m), [ir.Constant(WHOLE, part)])
+        build, a = self.builder, self._allocate_doubles(m * (width or n) * self.parts_per_entry)
+        for i in self._loop(m):
+            for j in self._loop(n):
+                place = build.add(build.mul(i, ir.Constant(INT64, n)), j)
+                for part in range(self.parts_per_entry):
+                    source = self._lane_entry(
+                        self.input_pointer, build.add(place, ir.Constant(INT64, start + part * m * n))
+                    )
+                    target = build.gep(self._matrix_entry(a, i, j, m), [ir.Constant(INT64, part)])
                     build.store(build.load(source), target)
         return a
 
-    def _leave(self, which: int, a: ir.Value, m: int, n: int) -> None:
-        build = self.build
-        for i in self._range(m):
-            for j in self._range(n):
-                place = build.add(build.mul(i, ir.Constant(WHOLE, n)), j)
-                for part in range(self.parts):
-                    value = build.load(build.gep(self._entry(a, i, j, m), [ir.Constant(WHOLE, part)]))
-                    build.store(value, self._out(which, build.add(place, ir.Constant(WHOLE, part * m * n))))
+    def _copy_output(self, which: int, a: ir.Value, m: int, n: int) -> None:
+        build = self.builder
+        for i in self._loop(m):
+            for j in self._loop(n):
+                place = build.add(build.mul(i, ir.Constant(INT64, n)), j)
+                for part in range(self.parts_per_entry):
+                    value = build.load(build.gep(self._matrix_entry(a, i, j, m), [ir.Constant(INT64, part)]))
+                    build.store(value, self._output_entry(which, build.add(place, ir.Constant(INT64, part * m * n))))
 
-    def _leave_row(self, which: int, w: ir.Value, n: int) -> None:
-        for i in self._range(n):
-            self.build.store(self.build.load(self.build.gep(w, [i])), self._out(which, i))
+    def _copy_output_vector(self, which: int, w: ir.Value, n: int) -> None:
+        for i in self._loop(n):
+            self.builder.store(self.builder.load(self.builder.gep(w, [i])), self._output_entry(which, i))
 
-    def _fail(self) -> None:
-        for i in self._range(len(self.call.kinds)):
-            self.build.store(ir.Constant(NUMBER, math.nan), self._at(self.found, i))
+    def _write_nan(self) -> None:
+        for i in self._loop(len(self.call.kinds)):
+            self.builder.store(ir.Constant(FLOAT64, math.nan), self._lane_entry(self.output_pointer, i))
 
     # -- what LAPACK is told ------------------------------------------------------------------------------------------
 
-    def _alloca(self, kind: ir.Type, count: int) -> ir.Value:
-        with self.build.goto_entry_block():
-            return self.build.alloca(kind, max(count, 1))
+    def _allocate(self, kind: ir.Type, count: int) -> ir.Value:
+        with self.builder.goto_entry_block():
+            return self.builder.alloca(kind, max(count, 1))
 
-    def _numbers(self, count: int) -> ir.Value:
-        return self._alloca(NUMBER, count)
+    def _allocate_doubles(self, count: int) -> ir.Value:
+        return self._allocate(FLOAT64, count)
 
-    def _integers(self, count: int) -> ir.Value:
-        return self._alloca(INTEGER, count)
+    def _allocate_integers(self, count: int) -> ir.Value:
+        return self._allocate(INT32, count)
 
-    def _integer(self, value: int) -> ir.Value:
-        place = self._integers(1)
-        self.build.store(ir.Constant(INTEGER, value), place)
+    def _integer_argument(self, value: int) -> ir.Value:
+        place = self._allocate_integers(1)
+        self.builder.store(ir.Constant(INT32, value), place)
         return place
 
-    def _letter(self, letter: str) -> ir.Value:
-        place = self._alloca(LETTER, 1)
-        self.build.store(ir.Constant(LETTER, ord(letter)), place)
+    def _char_argument(self, letter: str) -> ir.Value:
+        place = self._allocate(INT8, 1)
+        self.builder.store(ir.Constant(INT8, ord(letter)), place)
         return place
 
-    def _routine(self, name: str, arguments: Sequence[ir.Value]) -> None:
-        self.build.call(declared(self.build.module, name, ir.VoidType(), [a.type for a in arguments]), arguments)
+    def _call_routine(self, name: str, arguments: Sequence[ir.Value]) -> None:
+        self.builder.call(
+            declare_symbol(self.builder.module, name, ir.VoidType(), [a.type for a in arguments]), arguments
+        )
 
-    def _checked(self, name: str, arguments: Sequence[ir.Value], leave) -> None:
+    def _call_with_info(self, name: str, arguments: Sequence[ir.Value], leave) -> None:
         """A routine that may fail, its last argument saying so."""
-        info = self._integers(1)
-        self._routine(name, [*arguments, info])
-        fine = self.build.icmp_signed("==", self.build.load(info), ir.Constant(INTEGER, 0))
-        with self.build.if_else(fine) as (done, failed):
+        info = self._allocate_integers(1)
+        self._call_routine(name, [*arguments, info])
+        fine = self.builder.icmp_signed("==", self.builder.load(info), ir.Constant(INT32, 0))
+        with self.builder.if_else(fine) as (done, failed):
             with done:
                 leave()
             with failed:
-                self._fail()
+                self._write_nan()
 
-    def _range(self, count: int):
+    def _loop(self, count: int):
         """A loop: the body of the ``for`` is written once, with its counter."""
-        with self.writer.counted(ir.Constant(WHOLE, count)) as i:
+        with self.writer.loop_range(ir.Constant(INT64, count)) as i:
             yield i
 
 
-def declared(module: ir.Module, name: str, result: ir.Type, kinds: Sequence[ir.Type]) -> ir.Function:
+def declare_symbol(module: ir.Module, name: str, result: ir.Type, kinds: Sequence[ir.Type]) -> ir.Function:
     """A function that is bound when the code is loaded."""
-    name = PREFIX + name
+    name = SYMBOL_PREFIX + name
     if name in module.globals:
         return module.globals[name]
     return ir.Function(module, ir.FunctionType(result, list(kinds)), name)

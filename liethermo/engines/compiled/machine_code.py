@@ -21,35 +21,37 @@ class MachineCode:
     Parameters
     ----------
     module : ir.Module, or its text
-    hasty : bool
+    skip_optimisation : bool
         Do not optimise it, which takes longer than a short run. Its numbers are the same.
 
     Attributes
     ----------
-    hasty : bool
+    skip_optimisation : bool
         Whether it is not optimised: what is found on disk may be.
-    text : str
+    ir_text : str
     """
 
-    def __init__(self, module: ir.Module | str, hasty: bool = False):
-        text = self.text = str(module)
-        if lapack.PREFIX in text:
-            lapack.bind()
+    def __init__(self, module: ir.Module | str, skip_optimisation: bool = False):
+        text = self.ir_text = str(module)
+        if lapack.SYMBOL_PREFIX in text:
+            lapack.bind_symbols()
         with _lock:
-            for self.hasty in (False, True) if hasty else (False,):
-                name = hashlib.sha256(f"{_this_machine()[-1]} {self.hasty}\n{text}".encode()).hexdigest()[:32]
-                found = _object(kept.read(name))
+            for self.skip_optimisation in (False, True) if skip_optimisation else (False,):
+                name = hashlib.sha256(f"{_host_target()[-1]} {self.skip_optimisation}\n{text}".encode()).hexdigest()[
+                    :32
+                ]
+                found = _object_file(kept.read_code(name))
                 if found is not None:
                     break
             else:
-                code = _compile(text, hasty)
-                kept.write(name, code)
-                found = _object(code)
-            self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
+                code = _compile_module(text, skip_optimisation)
+                kept.write_code(name, code)
+                found = _object_file(code)
+            self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _target_machine())
             self._engine.add_object_file(found)
             self._engine.finalize_object()
 
-    def address(self, name: str) -> int:
+    def function_address(self, name: str) -> int:
         """The address of a function."""
         return self._engine.get_function_address(name)
 
@@ -58,7 +60,7 @@ _lock = threading.Lock()
 
 
 @functools.cache
-def _this_machine() -> tuple[llvm.Target, str, str, str]:
+def _host_target() -> tuple[llvm.Target, str, str, str]:
     """This machine, and what tells its machine code, and the compiler's version, from others.
 
     ``$LIETHERMO_CPU`` names another processor whose instructions to use, one that this machine can stand in for: as
@@ -76,15 +78,15 @@ def _this_machine() -> tuple[llvm.Target, str, str, str]:
     return llvm.Target.from_triple(triple), cpu, features, f"{triple} {cpu} {features} {version}"
 
 
-def _machine(hasty: bool = False) -> llvm.TargetMachine:
+def _target_machine(hasty: bool = False) -> llvm.TargetMachine:
     """A compiler for this machine; an engine that is made with one owns it."""
-    target, cpu, features, _ = _this_machine()
+    target, cpu, features, _ = _host_target()
     return target.create_target_machine(cpu, features, opt=0 if hasty else 3, jit=True, reloc="pic")
 
 
-def _object(code: bytes | None) -> llvm.ObjectFileRef | None:
+def _object_file(code: bytes | None) -> llvm.ObjectFileRef | None:
     """Code for the linker; None where there is none, or it is something else, which LLVM does not survive."""
-    if code is None or not (code.startswith(OTHERS) or _is_elf(code)):
+    if code is None or not (code.startswith(OBJECT_FILE_MAGICS) or _is_valid_elf(code)):
         return None
     try:
         return llvm.ObjectFileRef.from_data(code)
@@ -92,11 +94,11 @@ def _object(code: bytes | None) -> llvm.ObjectFileRef | None:
         return None
 
 
-OTHERS = (b"\xcf\xfa\xed\xfe", b"\x64\x86", b"\x64\xaa")
+OBJECT_FILE_MAGICS = (b"\xcf\xfa\xed\xfe", b"\x64\x86", b"\x64\xaa")
 """How objects of macOS and of Windows begin."""
 
 
-def _is_elf(code: bytes) -> bool:
+def _is_valid_elf(code: bytes) -> bool:
     """Whether these bytes are a relocatable object of Linux whose parts all lie within them."""
     if len(code) < 64 or code[:5] != b"\x7fELF\x02" or struct.unpack_from("<H", code, 16) != (1,):
         return False
@@ -106,17 +108,17 @@ def _is_elf(code: bytes) -> bool:
         return False
     for i in range(count):
         kind, _, _, place, length = struct.unpack_from("<4xIQQQQ", code, start + size * i)
-        if kind != NO_BITS and place + length > len(code):
+        if kind != SHT_NOBITS and place + length > len(code):
             return False
     return True
 
 
-NO_BITS = 8
+SHT_NOBITS = 8
 """The kind of a section that takes no place in its file."""
 
 
-def _compile(text: str, hasty: bool) -> bytes:
-    module, target = llvm.parse_assembly(text), _machine(hasty)
+def _compile_module(text: str, hasty: bool) -> bytes:
+    module, target = llvm.parse_assembly(text), _target_machine(hasty)
     module.verify()
     if hasty:
         return target.emit_object(module)

@@ -9,12 +9,12 @@ from llvmlite import ir
 
 from ...tracing.program import Program
 from .blocks import Table
-from .loop import DEFERRED, NUMBERS, Layout
+from .loop import FLOAT64_POINTER, NEWTON_BUFFER, BlockLayout
 from .machine_code import MachineCode
-from .writer import NUMBER, WHOLE, Writer
+from .writer import FLOAT64, INT64, ProgramWriter
 
 
-def solver(program: Program, block: Layout, varies: np.ndarray, lanes: int) -> MachineCode:
+def compile_newton_solver(program: Program, block: BlockLayout, varies: np.ndarray, lanes: int) -> MachineCode:
     """The function ``solve(p, block, lane)``: a program on the arrays of one lane, as machine code.
 
     Parameters
@@ -27,25 +27,25 @@ def solver(program: Program, block: Layout, varies: np.ndarray, lanes: int) -> M
         Which parameters lie in the block; the others are the same for all.
     """
     module = ir.Module("newton")
-    function = ir.Function(module, ir.FunctionType(ir.VoidType(), [NUMBERS, NUMBERS, WHOLE]), "solve")
+    function = ir.Function(module, ir.FunctionType(ir.VoidType(), [FLOAT64_POINTER, FLOAT64_POINTER, INT64]), "solve")
     build, (p, w, lane), own = ir.IRBuilder(function.append_basic_block()), function.args, np.cumsum(varies) - 1
-    writer, first = Writer(build, 1), block.rows[DEFERRED]
+    writer, first = ProgramWriter(build, 1), block.first_rows[NEWTON_BUFFER]
 
     def place(row: int) -> ir.Value:
-        return build.gep(w, [build.add(writer.whole_number(row * lanes), lane)])
+        return build.gep(w, [build.add(writer.int64(row * lanes), lane)])
 
     def read(i: int, j: int) -> ir.Value:
         if i:
             return build.load(place(first + j))
-        return build.load(place(block.rows["p"] + int(own[j])) if varies[j] else build.gep(p, [writer.whole_number(j)]))
+        return build.load(place(block.first_rows["p"] + int(own[j])) if varies[j] else build.gep(p, [writer.int64(j)]))
 
     def memory(i: int, places: range) -> Table | None:
         if i or varies[places].any():
             return None
-        start = build.gep(p, [writer.whole_number(places[0])])
-        return Table(writer, NUMBER, start=start, length=len(places), step=places.step)
+        start = build.gep(p, [writer.int64(places[0])])
+        return Table(writer, FLOAT64, start=start, length=len(places), stride=places.step)
 
-    for i, value in enumerate(itertools.chain.from_iterable(writer.write(program, read, memory))):
+    for i, value in enumerate(itertools.chain.from_iterable(writer.write_as_doubles(program, read, memory))):
         build.store(value, place(first + i))
     build.ret_void()
     return MachineCode(module)

@@ -6,16 +6,16 @@ import numpy as np
 
 from ...tracing.scalarize import UnsupportedPrimitive
 from ..stepping import State
-from .stepper import Stepper
+from .stepper import CompiledStepLoop
 
 
-class LanePaces:
+class CompiledAdaptiveRuns:
     """Trajectories in lanes, each with a pace of its own, in place of :class:`..paced.ArrayPaces`.
 
     Parameters
     ----------
-    stepper : Stepper
-    first : array, shape (p,)
+    step_loop : Stepper
+    first_parameters : array, shape (p,)
         The parameters of one of them, those of the method and the pacing among them.
     parameters : array, shape (p,) or (trajectories, p)
     x : array, shape (trajectories, n)
@@ -23,42 +23,44 @@ class LanePaces:
         See :func:`..pacing.begun`.
     """
 
-    def __init__(self, stepper: Stepper, first, parameters, x: np.ndarray, t, stop, length):
-        self.stepper, self.first, self.number = stepper, first, len(x)
-        each = {name: np.full((len(x), 1), value) for name, value in (("t", t), ("stop", stop), ("length", length))}
-        self.blocks = stepper.begin(parameters, x, 0, **each)
+    def __init__(self, stepper: CompiledStepLoop, first, parameters, x: np.ndarray, t, stop, length):
+        self.step_loop, self.first_parameters, self.n_trajectories = stepper, first, len(x)
+        each = {
+            name: np.full((len(x), 1), value) for name, value in (("t", t), ("stop_time", stop), ("length", length))
+        }
+        self.blocks = stepper.start_blocks(parameters, x, 0, **each)
 
-    def follow(self, most: int) -> None:
-        self.stepper.run(self.first, self.blocks, 0.0, 1, most)
+    def advance(self, most: int) -> None:
+        self.step_loop.run(self.first_parameters, self.blocks, 0.0, 1, most)
 
     def state(self) -> State:
-        return self.stepper.state_in(self.blocks.copy())
+        return self.step_loop.state_from_block(self.blocks.copy())
 
-    def attempts(self, most: int) -> dict[str, np.ndarray]:
+    def attempt_records(self, most: int) -> dict[str, np.ndarray]:
         """Make so many attempts of the only trajectory, or fewer: see :meth:`..paced.ArrayPaces.attempts`."""
-        before, out = self.read("tried")[0], np.empty((1, most, self.stepper.width))
+        before, out = self.read("n_attempts")[0], np.empty((1, most, self.step_loop.n_saved_values))
         try:
-            self.stepper.run(self.first, self.blocks, 0.0, most, 1, out=out)
+            self.step_loop.run(self.first_parameters, self.blocks, 0.0, most, 1, out=out)
         except UnsupportedPrimitive:
-            if self.read("tried")[0] == before:
+            if self.read("n_attempts")[0] == before:
                 raise
-        return self.stepper.kept_of_one(out[0, : int(self.read("tried")[0] - before)])
+        return self.step_loop.saved_fields_of_one(out[0, : int(self.read("n_attempts")[0] - before)])
 
     def read(self, name: str, chosen: np.ndarray | slice = slice(None)) -> np.ndarray:
         if isinstance(chosen, slice):
-            return self.stepper.fields(self.blocks, (name,))[name][: self.number][chosen].copy()
-        values = self._rows(chosen, name)
-        return values if name == "p" else values.reshape(len(chosen), *self.stepper.shape(name))
+            return self.step_loop.read_fields(self.blocks, (name,))[name][: self.n_trajectories][chosen].copy()
+        values = self._lane_values(chosen, name)
+        return values if name == "p" else values.reshape(len(chosen), *self.step_loop.field_shape(name))
 
     def write(self, name: str, chosen: np.ndarray, values) -> None:
-        block, lane = np.divmod(chosen, self.stepper.lanes)
-        self.stepper.part(self.blocks, name)[block, :, lane] = np.broadcast_to(values, chosen.shape)[:, None]
+        block, lane = np.divmod(chosen, self.step_loop.lanes)
+        self.step_loop.block_rows(self.blocks, name)[block, :, lane] = np.broadcast_to(values, chosen.shape)[:, None]
 
-    def _rows(self, chosen: np.ndarray, name: str | None = None) -> np.ndarray:
+    def _lane_values(self, chosen: np.ndarray, name: str | None = None) -> np.ndarray:
         """A field of some of them, or all that is known of them, shape (trajectories, rows)."""
-        block, lane = np.divmod(chosen, self.stepper.lanes)
-        return self.stepper.part(self.blocks, name)[block, :, lane]
+        block, lane = np.divmod(chosen, self.step_loop.lanes)
+        return self.step_loop.block_rows(self.blocks, name)[block, :, lane]
 
-    def only(self, chosen: np.ndarray) -> None:
+    def keep_only(self, chosen: np.ndarray) -> None:
         """Go on with some of them."""
-        self.blocks, self.number = self.stepper.of_rows(self._rows(chosen)), len(chosen)
+        self.blocks, self.n_trajectories = self.step_loop.blocks_from_rows(self._lane_values(chosen)), len(chosen)

@@ -20,28 +20,35 @@ import jax.numpy as jnp
 import numpy as np
 
 from ...integrators import OneStepMethod
-from ...integrators.fluctuating import driven_by, noise_dimension
+from ...integrators.fluctuating import noise_dimension, set_noise_increments
 from ...systems import System
-from ...tracing.calls import deferred
-from ...tracing.remembered import Latest
-from ...tracing.scalarize import faults_reported, scalarize
-from ..array import portion_of
-from ..pacing import TOLD, Pace, Pacing, attempted, begun, shape_seen
-from ..rules import RULES, Rules
-from ..searching import NONE
-from ..stages import Solved, by_newton
-from ..stepping import State, equations, first_state, take_step
-from .form import Form, numbers_of
-from .loop import DEFERRED, HASTY_SIZE, Layout, Loops, Piece, step_loop
+from ...tracing.caching import LRUCache
+from ...tracing.calls import deferred_p
+from ...tracing.scalarize import report_compiler_faults, scalarize
+from ..array import max_saves_per_call
+from ..pacing import (
+    ATTEMPT_FIELDS,
+    AdaptiveState,
+    StepControl,
+    attempt_step,
+    initial_adaptive_state,
+    jacobian_probe_shape,
+)
+from ..rules import DEFAULT_OPTIONS, SolverOptions
+from ..searching import EMPTY_BRACKET
+from ..stages import StageSolution, solve_newton
+from ..stepping import State, initial_run_state, stage_equations, take_step
+from .form import ProgramStructure, flat_parameters
+from .loop import MAX_UNOPTIMISED_OPERATIONS, NEWTON_BUFFER, BlockLayout, CompiledLoops, NamedProgram, compile_step_loop
 from .machine_code import MachineCode
-from .newton import solver
+from .newton import compile_newton_solver
 
-FIELDS = State._fields
-OWN = tuple(name for name in Pace._fields if name != "state")
+STATE_FIELDS = State._fields
+ADAPTIVE_FIELDS = tuple(name for name in AdaptiveState._fields if name != "state")
 """Those of a pace beside them."""
-GIVEN = ("dW", "x", "compensation", "h", "k", "before")
+NEWTON_INPUTS = ("dW", "x", "compensation", "h", "k", "previous_slopes")
 """What it is given."""
-SOLVED = ("converged", "defined", "residual", "newton", "noise", "k")
+NEWTON_OUTPUTS = ("converged", "is_finite", "residual", "newton_iterations", "slope_rounding", "k")
 """What Newton's method may make better of :class:`..stages.Solved`."""
 
 
@@ -56,27 +63,35 @@ class CompiledEngine:
 
     name = "compiled"
 
-    def __init__(self, system: System, method: OneStepMethod, rules: Rules = RULES, planned: int = 0):
-        self._parameters, self.portion, self._planned = numbers_of(system, method), portion_of(system), planned
-        self._form, self._method, self._rules = Form.of(system), method, rules
+    def __init__(
+        self, system: System, method: OneStepMethod, rules: SolverOptions = DEFAULT_OPTIONS, planned_steps: int = 0
+    ):
+        self._parameters, self.max_saves_per_call, self._planned_steps = (
+            flat_parameters(system, method),
+            max_saves_per_call(system),
+            planned_steps,
+        )
+        self._structure, self._method, self._options = ProgramStructure.from_module(system), method, rules
 
     @functools.cached_property
-    def _stepper(self) -> Stepper:
+    def _step_loop(self) -> CompiledStepLoop:
         """Its loop of steps, made when it is first needed: a run with a pace has one of its own."""
-        return stepper_of(self._form, self._parameters, self._method, rules=self._rules)
+        return cached_step_loop(self._structure, self._parameters, self._method, options=self._options)
 
-    def paced(self, pacing: Pacing) -> tuple[Stepper, np.ndarray]:
+    def adaptive_step_loop(self, pacing: StepControl) -> tuple[CompiledStepLoop, np.ndarray]:
         """The stepper of a run with a pace, and its parameters."""
-        whole = np.append(self._parameters, numbers_of(pacing))
-        return stepper_of(self._form, whole, self._method, pacing, rules=self._rules), whole
+        whole = np.append(self._parameters, flat_parameters(pacing))
+        return cached_step_loop(self._structure, whole, self._method, pacing, options=self._options), whole
 
     @property
-    def operations(self) -> int:
+    def n_operations(self) -> int:
         """How many scalar operations a step takes."""
-        return self._stepper.operations
+        return self._step_loop.n_operations
 
-    def begin(self, x) -> State:
-        return self._state(self._stepper.begin(self._parameters, np.asarray(x, dtype=np.float64)[None], self._planned))
+    def initial_run_state(self, x) -> State:
+        return self._state_from_block(
+            self._step_loop.start_blocks(self._parameters, np.asarray(x, dtype=np.float64)[None], self._planned_steps)
+        )
 
     def advance(self, state: State, h, saves: int, every: int, noise=None):
         new, out = self._run(state, h, saves, every, noise)
@@ -86,22 +101,22 @@ class CompiledEngine:
     def step(self, state: State, h, noise=None) -> State:
         return self._run(state, h, 1, 1, noise)[0]
 
-    def ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
-        blocks = self._stepper.begin(self._parameters, x)
-        self._stepper.run(self._parameters, blocks, h, 1, 1)
-        found = self._stepper.fields(blocks, ("x", "status"))
+    def step_ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
+        blocks = self._step_loop.start_blocks(self._parameters, x)
+        self._step_loop.run(self._parameters, blocks, h, 1, 1)
+        found = self._step_loop.read_fields(blocks, ("x", "status"))
         return np.where(found["status"].reshape(-1, 1) == 0.0, found["x"], np.nan)
 
     def _run(self, state: State, h, saves: int, every: int, noise) -> tuple[State, np.ndarray]:
-        blocks = self._stepper.block_of(state)
-        out = self._stepper.run(self._parameters, blocks, h, saves, every, None if noise is None else noise[None])[0]
-        return self._state(blocks), out
+        blocks = self._step_loop.block_from_state(state)
+        out = self._step_loop.run(self._parameters, blocks, h, saves, every, None if noise is None else noise[None])[0]
+        return self._state_from_block(blocks), out
 
-    def _state(self, blocks: np.ndarray) -> State:
-        return self._stepper.state_in(blocks)
+    def _state_from_block(self, blocks: np.ndarray) -> State:
+        return self._step_loop.state_from_block(blocks)
 
 
-class Stepper:
+class CompiledStepLoop:
     """The step loop of one method on systems of one form, compiled; parameters are arguments.
 
     With a pacing a step is an attempt, whose size the loop chooses.
@@ -121,199 +136,217 @@ class Stepper:
 
     Attributes
     ----------
-    names : tuple of str
+    field_names : tuple of str
         The fields of a trajectory.
-    begins, given : tuple of str
+    initial_inputs, step_inputs : tuple of str
         The input of a run besides its x, and what a step is given besides the fields.
-    kept : tuple of str
+    saved_fields : tuple of str
         The fields that are written down at each save.
     """
 
     def __init__(
         self,
-        forms: Sequence[Form],
+        forms: Sequence[ProgramStructure],
         parameters: np.ndarray,
         method: OneStepMethod,
-        pacing: Pacing | None,
+        pacing: StepControl | None,
         lanes: int,
         varies: np.ndarray,
-        rules: Rules,
+        rules: SolverOptions,
     ):
-        self.lanes, self._rules, self._varies = lanes, rules, varies
-        self._known = np.where((parameters == 0.0) & ~varies, 0.0, np.nan)
+        self.lanes, self._options, self._is_per_trajectory = lanes, rules, varies
+        self._constant_parameters = np.where((parameters == 0.0) & ~varies, 0.0, np.nan)
         self._lock = threading.Lock()
-        self._newton: MachineCode | None = None
-        self._forms = forms
-        system = forms[0].build(parameters[: forms[0].size])
+        self._newton_code: MachineCode | None = None
+        self._structures = forms
+        system = forms[0].build(parameters[: forms[0].n_parameters])
         n, slopes = system.dim, jax.eval_shape(lambda x: method.start(system, x), jnp.zeros(system.dim)).shape
         self._shapes: dict[str, tuple[int, ...]] = {"x": (n,), "compensation": (n,), "k": slopes, "p": parameters.shape}
         self._shapes |= {
-            "before": (0 if method.explicit else method.stages, slopes[1]),
+            "previous_slopes": (0 if method.explicit else method.stages, slopes[1]),
             "dW": (noise_dimension(method),),
         }
-        self.names: tuple[str, ...] = FIELDS if pacing is None else (*FIELDS, *OWN)
-        self.kept = ("x", "energy", "entropy") if pacing is None else TOLD
-        self.begins = () if pacing is None else ("t", "stop", "length")
-        self.given = ("p", "dW", "h") if pacing is None else ("p", "dW")
+        self.field_names: tuple[str, ...] = STATE_FIELDS if pacing is None else (*STATE_FIELDS, *ADAPTIVE_FIELDS)
+        self.saved_fields = ("x", "energy", "entropy") if pacing is None else ATTEMPT_FIELDS
+        self.initial_inputs = () if pacing is None else ("t", "stop_time", "length")
+        self.step_inputs = ("p", "dW", "h") if pacing is None else ("p", "dW")
         if pacing is not None:
-            self._shapes |= {"seen": shape_seen(system, method, pacing), "search": NONE.shape}
-        step = self._piece(self.step, (*self.given, *self.names), self.names)
+            self._shapes |= {
+                "jacobian_probe": jacobian_probe_shape(system, method, pacing),
+                "root_bracket": EMPTY_BRACKET.shape,
+            }
+        step = self._trace_program(self.fields_after_step, (*self.step_inputs, *self.field_names), self.field_names)
         if method.explicit:
             changing = [i for i, a in enumerate(step.arguments) if a not in ("p", "h")]
-            step = step._replace(program=step.program.factored(changing))
-        begin = self._piece(self.begun, ("p", "x", *self.begins), self.names)
-        self._pieces = {"step": step, "begin": begin}
-        handed = 0 if method.explicit else sum(math.prod(self.shape(name)) for name in (*SOLVED, *GIVEN))
-        names = (*self.names, *self.begins, *self.given[1:])
-        shapes = {name: self.shape(name) for name in names} | {"p": (int(varies.sum()),), DEFERRED: (handed,)}
-        self._layout = Layout(shapes)
-        rows, sizes = self._layout.rows, self._layout.sizes
-        self._places = [(rows[name], rows[name] + sizes[name], self.shape(name)) for name in FIELDS]
-        state = [name for name in (*self.names, "h") if name in rows]
-        make = functools.partial(step_loop, self._pieces, self._layout, state, varies, lanes, self.kept)
-        self._code = Loops(make, lanes == 1 and self.operations <= HASTY_SIZE)
+            step = step._replace(program=step.program.factor_constants(changing))
+        begin = self._trace_program(self.initial_fields, ("p", "x", *self.initial_inputs), self.field_names)
+        self._programs = {"step": step, "begin": begin}
+        handed = (
+            0
+            if method.explicit
+            else sum(math.prod(self.field_shape(name)) for name in (*NEWTON_OUTPUTS, *NEWTON_INPUTS))
+        )
+        names = (*self.field_names, *self.initial_inputs, *self.step_inputs[1:])
+        shapes = {name: self.field_shape(name) for name in names} | {
+            "p": (int(varies.sum()),),
+            NEWTON_BUFFER: (handed,),
+        }
+        self._layout = BlockLayout(shapes)
+        rows, sizes = self._layout.first_rows, self._layout.row_counts
+        self._state_rows = [(rows[name], rows[name] + sizes[name], self.field_shape(name)) for name in STATE_FIELDS]
+        state = [name for name in (*self.field_names, "h") if name in rows]
+        make = functools.partial(
+            compile_step_loop, self._programs, self._layout, state, varies, lanes, self.saved_fields
+        )
+        self._loops = CompiledLoops(make, lanes == 1 and self.n_operations <= MAX_UNOPTIMISED_OPERATIONS)
 
     # -- what is compiled -----------------------------------------------------------------------------------------
 
-    def built(self, p) -> list[Any]:
+    def build_modules(self, p) -> list[Any]:
         """System and method, and pacing, with the parameters p."""
-        ends = itertools.accumulate(form.size for form in self._forms)
-        return [form.build(p[end - form.size : end]) for form, end in zip(self._forms, ends, strict=True)]
+        ends = itertools.accumulate(form.n_parameters for form in self._structures)
+        return [form.build(p[end - form.n_parameters : end]) for form, end in zip(self._structures, ends, strict=True)]
 
-    def begun(self, p, x, *times) -> tuple:
+    def initial_fields(self, p, x, *times) -> tuple:
         """The fields of a run about to start at x."""
-        system, method, *way = self.built(p)
+        system, method, *way = self.build_modules(p)
         if not way:
-            return first_state(system, method, x)
-        pace = begun(system, method, way[0], x, *times)
+            return initial_run_state(system, method, x)
+        pace = initial_adaptive_state(system, method, way[0], x, *times)
         return *pace.state, *pace[1:]
 
-    def step(self, p, dW, *given) -> tuple:
+    def fields_after_step(self, p, dW, *given) -> tuple:
         """The fields after a step, or an attempt, from its size and those before, or these alone."""
-        system, method, *way = self.built(p)
+        system, method, *way = self.build_modules(p)
         if not way:
             h, *fields = given
-            return take_step(system, driven_by(method, dW), State(*fields), h, self._rules, self._second(dW))
-        before = Pace(State(*given[: len(FIELDS)]), *given[len(FIELDS) :])
-        pace = attempted(system, method, way[0], before, self._rules, self._second(dW))
+            return take_step(
+                system, set_noise_increments(method, dW), State(*fields), h, self._options, self._newton_fallback(dW)
+            )
+        before = AdaptiveState(State(*given[: len(STATE_FIELDS)]), *given[len(STATE_FIELDS) :])
+        pace = attempt_step(system, method, way[0], before, self._options, self._newton_fallback(dW))
         return *pace.state, *pace[1:]
 
-    def _second(self, dW) -> Callable:
+    def _newton_fallback(self, dW) -> Callable:
         """Newton's method, for :func:`..stepping.take_step`: a program of its own, compiled when a step needs it."""
 
-        def second(first: Solved, *given) -> Solved:
-            handed = [1.0 * getattr(first, name) for name in SOLVED]
-            found = deferred.bind(*handed, dW, *(jnp.asarray(a) for a in given), results=len(SOLVED))
-            solved = first._replace(**dict(zip(SOLVED, found, strict=True)))
-            return solved._replace(converged=solved.converged > 0.0, defined=solved.defined > 0.0)
+        def second(first: StageSolution, *given) -> StageSolution:
+            handed = [1.0 * getattr(first, name) for name in NEWTON_OUTPUTS]
+            found = deferred_p.bind(*handed, dW, *(jnp.asarray(a) for a in given), results=len(NEWTON_OUTPUTS))
+            solved = first._replace(**dict(zip(NEWTON_OUTPUTS, found, strict=True)))
+            return solved._replace(converged=solved.converged > 0.0, is_finite=solved.is_finite > 0.0)
 
         return second
 
-    def _by_newton(self, p, handed) -> tuple:
+    def _solve_packed_newton(self, p, handed) -> tuple:
         """What takes the place of what is handed over."""
-        system, method, *_ = self.built(p)
-        shapes = [self.shape(name) for name in (*SOLVED, *GIVEN)]
+        system, method, *_ = self.build_modules(p)
+        shapes = [self.field_shape(name) for name in (*NEWTON_OUTPUTS, *NEWTON_INPUTS)]
         ends = itertools.accumulate(map(math.prod, shapes))
         parts = [handed[end - math.prod(shape) : end].reshape(shape) for end, shape in zip(ends, shapes, strict=True)]
-        dW, x, compensation, h, k, before = parts[len(SOLVED) :]
-        own = equations(system, driven_by(method, dW), x, compensation, h, k, before, self._rules, jax.lax.map)
-        found = by_newton(own, self._rules)
-        return tuple(1.0 * getattr(found, name) for name in SOLVED)
+        dW, x, compensation, h, k, before = parts[len(NEWTON_OUTPUTS) :]
+        own = stage_equations(
+            system, set_noise_increments(method, dW), x, compensation, h, k, before, self._options, jax.lax.map
+        )
+        found = solve_newton(own, self._options)
+        return tuple(1.0 * getattr(found, name) for name in NEWTON_OUTPUTS)
 
     @property
-    def operations(self) -> int:
+    def n_operations(self) -> int:
         """Scalar operations of a step with one iteration."""
-        return self._pieces["step"].program.size
+        return self._programs["step"].program.instruction_count
 
-    def _piece(self, function: Callable, names: Sequence[str], results: Sequence[str] = ()) -> Piece:
-        shapes = [jax.ShapeDtypeStruct(self.shape(a), jnp.float64) for a in names]
-        known = [self._known if a == "p" else None for a in names]
-        return Piece(scalarize(jax.make_jaxpr(function)(*shapes), known), tuple(names), tuple(results))
+    def _trace_program(self, function: Callable, names: Sequence[str], results: Sequence[str] = ()) -> NamedProgram:
+        shapes = [jax.ShapeDtypeStruct(self.field_shape(a), jnp.float64) for a in names]
+        known = [self._constant_parameters if a == "p" else None for a in names]
+        return NamedProgram(scalarize(jax.make_jaxpr(function)(*shapes), known), tuple(names), tuple(results))
 
     # -- trajectories in blocks -----------------------------------------------------------------------------------
 
-    def begin(self, parameters, x: np.ndarray, planned: int = 0, **fields: np.ndarray) -> np.ndarray:
+    def start_blocks(self, parameters, x: np.ndarray, planned: int = 0, **fields: np.ndarray) -> np.ndarray:
         """Blocks, shape (blocks, rows * lanes), of trajectories about to start at x, shape (trajectories, n).
 
         ``parameters`` has shape (p,), or (trajectories, p) where some vary; so many steps are ``planned``.
         """
-        blocks = self.blocks({"x": x, **fields}, parameters)
+        blocks = self.make_blocks({"x": x, **fields}, parameters)
         first = np.ascontiguousarray(parameters if np.ndim(parameters) == 1 else parameters[0], dtype=np.float64)
-        status = self.part(blocks, "status")
-        empty = status == EMPTY
-        self._code.functions(0, planned)[0](first.ctypes.data, blocks.ctypes.data, len(blocks))
-        status[empty] = EMPTY
+        status = self.block_rows(blocks, "status")
+        empty = status == EMPTY_LANE_STATUS
+        self._loops.loop_functions(0, planned)[0](first.ctypes.data, blocks.ctypes.data, len(blocks))
+        status[empty] = EMPTY_LANE_STATUS
         return blocks
 
-    def part(self, blocks: np.ndarray, name: str | None = None) -> np.ndarray:
+    def block_rows(self, blocks: np.ndarray, name: str | None = None) -> np.ndarray:
         """A field of blocks, or all rows of them, shape (blocks, entries, lanes)."""
-        whole = blocks.reshape(len(blocks), self.height, self.lanes)
-        return whole if name is None else whole[:, self.rows(name)]
+        whole = blocks.reshape(len(blocks), self.n_rows, self.lanes)
+        return whole if name is None else whole[:, self.row_slice(name)]
 
     @property
-    def height(self) -> int:
+    def n_rows(self) -> int:
         """How many rows a trajectory has."""
-        return self._layout.height
+        return self._layout.n_rows
 
-    def rows(self, name: str) -> slice:
+    def row_slice(self, name: str) -> slice:
         """Those of a field."""
-        first = self._layout.rows[name]
-        return slice(first, first + self._layout.sizes[name])
+        first = self._layout.first_rows[name]
+        return slice(first, first + self._layout.row_counts[name])
 
-    def shape(self, name: str) -> tuple[int, ...]:
+    def field_shape(self, name: str) -> tuple[int, ...]:
         """The shape of a field of one trajectory."""
         return self._shapes.get(name, ())
 
-    def blocks(self, fields: dict[str, Any], parameters=None) -> np.ndarray:
+    def make_blocks(self, fields: dict[str, Any], parameters=None) -> np.ndarray:
         """Blocks of trajectories with the given fields, trajectories first; nothing else is set but their status."""
-        if self._varies.any() and "p" not in fields:
-            fields = fields | {"p": parameters[:, self._varies]}
+        if self._is_per_trajectory.any() and "p" not in fields:
+            fields = fields | {"p": parameters[:, self._is_per_trajectory]}
         number = len(fields["x"])
-        whole = np.empty((-(-number // self.lanes), self.height, self.lanes))
-        whole[:, self.rows("status")] = 0.0
+        whole = np.empty((-(-number // self.lanes), self.n_rows, self.lanes))
+        whole[:, self.row_slice("status")] = 0.0
         for name, values in fields.items():
-            whole[:, self.rows(name)] = self._in_lanes(np.reshape(values, (number, -1)))
-        return self._marked(whole, number)
+            whole[:, self.row_slice(name)] = self._rows_to_lanes(np.reshape(values, (number, -1)))
+        return self._mark_empty_lanes(whole, number)
 
-    def block_of(self, state: State) -> np.ndarray:
+    def block_from_state(self, state: State) -> np.ndarray:
         """The only block of a trajectory by itself."""
-        whole = np.zeros((1, self.height))
+        whole = np.zeros((1, self.n_rows))
         row = whole[0]
-        for (first, end, shape), value in zip(self._places, state, strict=True):
+        for (first, end, shape), value in zip(self._state_rows, state, strict=True):
             if shape:
                 row[first:end].reshape(shape)[...] = value
             else:
                 row[first] = value
         return whole
 
-    def state_in(self, blocks: np.ndarray) -> State:
+    def state_from_block(self, blocks: np.ndarray) -> State:
         """The state in the only block of a trajectory by itself."""
         row = blocks[0]
-        return State(*(row[first:end].reshape(shape) if shape else row[first] for first, end, shape in self._places))
+        return State(
+            *(row[first:end].reshape(shape) if shape else row[first] for first, end, shape in self._state_rows)
+        )
 
-    def of_rows(self, whole: np.ndarray) -> np.ndarray:
+    def blocks_from_rows(self, whole: np.ndarray) -> np.ndarray:
         """Blocks of trajectories from all their rows, shape (trajectories, rows)."""
-        return self._marked(np.ascontiguousarray(self._in_lanes(whole)), len(whole))
+        return self._mark_empty_lanes(np.ascontiguousarray(self._rows_to_lanes(whole)), len(whole))
 
-    def _in_lanes(self, rows: np.ndarray) -> np.ndarray:
+    def _rows_to_lanes(self, rows: np.ndarray) -> np.ndarray:
         """Rows of trajectories, shape (trajectories, m), as (blocks, m, lanes); the last one fills empty lanes."""
         count = -(-len(rows) // self.lanes)
         if empty := count * self.lanes - len(rows):
             rows = np.concatenate([rows, np.repeat(rows[-1:], empty, axis=0)])
         return rows.reshape(count, self.lanes, -1).swapaxes(1, 2)
 
-    def _marked(self, whole: np.ndarray, number: int) -> np.ndarray:
+    def _mark_empty_lanes(self, whole: np.ndarray, number: int) -> np.ndarray:
         """Blocks, shape (blocks, rows, lanes), of so many trajectories, their empty lanes marked; each in one row."""
         used = number - (len(whole) - 1) * self.lanes
-        whole[-1, self._layout.rows["status"], used:] = EMPTY
+        whole[-1, self._layout.first_rows["status"], used:] = EMPTY_LANE_STATUS
         return whole.reshape(len(whole), -1)
 
-    def fields(self, blocks: np.ndarray, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+    def read_fields(self, blocks: np.ndarray, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
         """Fields of trajectories, trajectories first, those of empty lanes among them."""
         found, number = {}, len(blocks) * self.lanes
-        for name in self.names if names is None else names:
-            values = self.part(blocks, name).swapaxes(0, 1)
-            found[name] = values.reshape(-1, number).T.reshape(number, *self.shape(name))
+        for name in self.field_names if names is None else names:
+            values = self.block_rows(blocks, name).swapaxes(0, 1)
+            found[name] = values.reshape(-1, number).T.reshape(number, *self.field_shape(name))
         return found
 
     def run(
@@ -327,34 +360,37 @@ class Stepper:
         Returns, at each save, what is :attr:`kept` of every trajectory: shape (trajectories, saves, width), with those
         of empty lanes, and undefined after a failure. It is written to ``out``, if there is one.
         """
-        lanes, count, width = self.lanes, len(blocks), self.width
-        if "h" in self._layout.rows:
-            self.part(blocks, "h")[:, 0] = np.reshape(h, (-1, lanes)) if np.ndim(h) else h
+        lanes, count, width = self.lanes, len(blocks), self.n_saved_values
+        if "h" in self._layout.first_rows:
+            self.block_rows(blocks, "h")[:, 0] = np.reshape(h, (-1, lanes)) if np.ndim(h) else h
         parameters = np.ascontiguousarray(parameters, dtype=np.float64)
         out = np.empty((count, saves, width * lanes)) if out is None else out
         done = np.zeros(count, dtype=np.int64)
         saves, every = int(saves), int(every)
         arguments = [parameters.ctypes.data, blocks.ctypes.data, done.ctypes.data, count, saves, every]
-        increments = self._in_blocks(noise, count, saves * every)
+        increments = self._noise_by_block(noise, count, saves * every)
         arguments += [out.ctypes.data, saves * every, increments.ctypes.data]
-        solve = 0 if self._newton is None else self._solver()
-        _, advance = self._code.functions(count * saves * every)
+        solve = 0 if self._newton_code is None else self._newton_address()
+        _, advance = self._loops.loop_functions(count * saves * every)
         while advance(*arguments, solve) < count:
-            solve = self._solver()
+            solve = self._newton_address()
         return out.reshape(count, saves, width, lanes).transpose(0, 3, 1, 2).reshape(count * lanes, saves, width)
 
-    def kept_of_one(self, out: np.ndarray) -> dict[str, np.ndarray]:
+    def saved_fields_of_one(self, out: np.ndarray) -> dict[str, np.ndarray]:
         """By name what is kept of a trajectory that is a block by itself, from rows of ``out``."""
-        ends = np.cumsum([self._layout.sizes[name] for name in self.kept])
+        ends = np.cumsum([self._layout.row_counts[name] for name in self.saved_fields])
         parts = np.split(out, ends[:-1], axis=-1)
-        return {name: part.reshape(len(out), *self.shape(name)) for name, part in zip(self.kept, parts, strict=True)}
+        return {
+            name: part.reshape(len(out), *self.field_shape(name))
+            for name, part in zip(self.saved_fields, parts, strict=True)
+        }
 
     @property
-    def width(self) -> int:
+    def n_saved_values(self) -> int:
         """Numbers that are kept of a trajectory at each save."""
-        return sum(self._layout.sizes[name] for name in self.kept)
+        return sum(self._layout.row_counts[name] for name in self.saved_fields)
 
-    def _in_blocks(self, noise: np.ndarray | None, count: int, steps: int) -> np.ndarray:
+    def _noise_by_block(self, noise: np.ndarray | None, count: int, steps: int) -> np.ndarray:
         """Increments as the loop reads them, shape (blocks, steps, increments, lanes)."""
         if noise is None or not self._shapes["dW"][0]:
             return np.zeros((count, steps, self._shapes["dW"][0], self.lanes))
@@ -364,34 +400,34 @@ class Stepper:
 
     # -- machine code -------------------------------------------------------------------------------------------------
 
-    def _solver(self) -> int:
+    def _newton_address(self) -> int:
         """The address of Newton's method, which is compiled when a step first needs it."""
-        with self._lock, faults_reported():
-            if self._newton is None:
-                self._shapes[DEFERRED] = (self._layout.sizes[DEFERRED],)
-                program = self._piece(self._by_newton, ("p", DEFERRED)).program
-                self._newton = solver(program, self._layout, self._varies, self.lanes)
-            return self._newton.address("solve")
+        with self._lock, report_compiler_faults():
+            if self._newton_code is None:
+                self._shapes[NEWTON_BUFFER] = (self._layout.row_counts[NEWTON_BUFFER],)
+                program = self._trace_program(self._solve_packed_newton, ("p", NEWTON_BUFFER)).program
+                self._newton_code = compile_newton_solver(program, self._layout, self._is_per_trajectory, self.lanes)
+            return self._newton_code.function_address("solve")
 
 
-EMPTY = 9.0
+EMPTY_LANE_STATUS = 9.0
 """Status of a lane without a trajectory."""
 
-STEPPERS = 128
+MAX_CACHED_STEP_LOOPS = 128
 """Forms whose loops are held in memory."""
 
-_steppers: Latest[Any] = Latest(STEPPERS)
+_step_loop_cache: LRUCache[Any] = LRUCache(MAX_CACHED_STEP_LOOPS)
 
 
-def stepper_of(
-    form: Form,
+def cached_step_loop(
+    form: ProgramStructure,
     parameters: np.ndarray,
     method: OneStepMethod,
-    pacing: Pacing | None = None,
+    pacing: StepControl | None = None,
     lanes: int = 1,
     varies: np.ndarray | None = None,
-    rules: Rules = RULES,
-) -> Stepper:
+    options: SolverOptions = DEFAULT_OPTIONS,
+) -> CompiledStepLoop:
     """The stepper for systems of a form, a method, and a pacing.
 
     Which of their parameters are zero belongs to it: a diagonal matrix makes a shorter program.
@@ -399,10 +435,16 @@ def stepper_of(
     Parameters
     ----------
     parameters : array, shape (p,)
-        Of a system of that form, of the method, and of the pacing: see :func:`numbers_of`.
+        Of a system of that form, of the method, and of the pacing: see :func:`flat_parameters`.
     """
-    forms = [form, Form.of(method), *([] if pacing is None else [Form.of(pacing)])]
+    forms = [
+        form,
+        ProgramStructure.from_module(method),
+        *([] if pacing is None else [ProgramStructure.from_module(pacing)]),
+    ]
     varies = np.zeros(len(parameters), dtype=bool) if varies is None else varies
     known = ((parameters == 0.0) & ~varies).tobytes(), varies.tobytes()
-    key = *((form.key, form.shapes) for form in forms), *known, lanes, rules
-    return _steppers.find(key, lambda: Stepper(forms, parameters, method, pacing, lanes, varies, rules))
+    key = *((form.key, form.shapes) for form in forms), *known, lanes, options
+    return _step_loop_cache.get_or_compute(
+        key, lambda: CompiledStepLoop(forms, parameters, method, pacing, lanes, varies, options)
+    )

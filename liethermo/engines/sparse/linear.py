@@ -8,21 +8,21 @@ from collections.abc import Callable
 import numpy as np
 import scipy
 
-WIDEST = 1_000
+MAX_FRONT_WIDTH = 1_000
 """Widest level of a breadth-first search up to which a matrix is factorised.
 
 Such a level cuts the graph in two, and elimination ends with about its square filled: a plane grid of 1e6 nodes is at
 the limit, taking seconds. What is wider (grids in space, networks without a long way in them) is well connected, and
 Krylov iteration is quick there: tens to hundreds of products."""
 
-KRYLOV = 1e-6
+KRYLOV_RTOL = 1e-6
 """Relative residual of a Krylov solution; Newton's iteration makes up for the rest. (1e-12 gave the same laws, at 1.7
 times the products.)"""
 
-KRYLOV_LIMIT = 2_000
+MAX_KRYLOV_ITERATIONS = 2_000
 
 
-class Compression:
+class JacobianCompression:
     """How to find all entries of a sparse Jacobian matrix from few derivatives.
 
     Columns that have no row in common have one colour and are found together, by a derivative along their sum [Curtis,
@@ -39,25 +39,27 @@ class Compression:
 
     def __init__(self, pattern: scipy.sparse.csr_array, stages: int = 1):
         self.dim, self.stages = pattern.shape[0], stages
-        self.width = _widest_level(pattern)
+        self.front_width = _max_level_width(pattern)
         sizes = np.diff(pattern.indptr)
-        self.hubs = np.flatnonzero(sizes > _hub_size(sizes))
-        self._neighbours = [pattern.indices[pattern.indptr[i] : pattern.indptr[i + 1]] for i in self.hubs]
+        self.dense_rows = np.flatnonzero(sizes > _max_coloured_row_size(sizes))
+        self._dense_row_columns = [pattern.indices[pattern.indptr[i] : pattern.indptr[i + 1]] for i in self.dense_rows]
         rows, columns = np.repeat(np.arange(self.dim), sizes), pattern.indices
-        plain = ~np.isin(rows, self.hubs)
+        plain = ~np.isin(rows, self.dense_rows)
         rows, columns = rows[plain], columns[plain]
         rest = scipy.sparse.csr_array((np.ones(len(rows), dtype=bool), (rows, columns)), pattern.shape)
-        self.colours = _coloured(rest)
+        self.colours = _colour_columns(rest)
         order = np.argsort(self.colours[columns], kind="stable")
         ends = np.cumsum(np.bincount(self.colours[columns], minlength=self.colours.max(initial=-1) + 1))
-        self._groups = list(zip(np.split(rows[order], ends[:-1]), np.split(columns[order], ends[:-1]), strict=True))
+        self._colour_entries = list(
+            zip(np.split(rows[order], ends[:-1]), np.split(columns[order], ends[:-1]), strict=True)
+        )
 
     @property
-    def derivatives(self) -> int:
+    def n_derivatives(self) -> int:
         """How many are taken."""
-        return self.stages * (len(self._groups) + len(self.hubs))
+        return self.stages * (len(self._colour_entries) + len(self.dense_rows))
 
-    def matrix(self, push: Callable, pull: Callable) -> scipy.sparse.csc_array:
+    def assemble_jacobian(self, push: Callable, pull: Callable) -> scipy.sparse.csc_array:
         """The Jacobian matrix, shape (stages n, stages n).
 
         Parameters
@@ -68,7 +70,7 @@ class Compression:
         n, stages = self.dim, range(self.stages)
         rows, columns, entries = [], [], []
         seed = np.zeros((self.stages, n))
-        for colour, (r, c) in enumerate(self._groups):
+        for colour, (r, c) in enumerate(self._colour_entries):
             members = self.colours == colour
             for j in stages:
                 seed[j] = members
@@ -78,7 +80,7 @@ class Compression:
                     rows.append(i * n + r)
                     columns.append(j * n + c)
                     entries.append(found[i, r])
-        for hub, c in zip(self.hubs, self._neighbours, strict=True):
+        for hub, c in zip(self.dense_rows, self._dense_row_columns, strict=True):
             for i in stages:
                 seed[i, hub] = 1.0
                 found = np.asarray(pull(seed))
@@ -91,14 +93,14 @@ class Compression:
         return scipy.sparse.csc_array((np.concatenate(entries), places), (self.stages * n, self.stages * n))
 
 
-class Inverse:
+class SparseInverse:
     """Solutions of ``matrix @ x = b``: by factorisation where elimination fills little, or by Krylov iteration.
 
     Parameters
     ----------
     matrix : scipy.sparse.csc_array, shape (n, n)
     width : int
-        Of the widest level of its graph: see :data:`WIDEST`.
+        Of the widest level of its graph: see :data:`MAX_FRONT_WIDTH`.
 
     Raises
     ------
@@ -109,7 +111,7 @@ class Inverse:
     def __init__(self, matrix: scipy.sparse.csc_array, width: int):
         if not np.isfinite(matrix.data).all():
             raise np.linalg.LinAlgError("the matrix is not finite")
-        if width <= WIDEST:
+        if width <= MAX_FRONT_WIDTH:
             options = {"SymmetricMode": True}  # elimination on the diagonal, as far as that is stable
             try:
                 factors = scipy.sparse.linalg.splu(matrix, "MMD_AT_PLUS_A", diag_pivot_thresh=0.01, options=options)
@@ -123,7 +125,9 @@ class Inverse:
 
         def iterate(b):
             size = float(np.linalg.norm(scaling @ b)) or 1.0  # SciPy gives up on small residuals of an absolute size
-            x, _ = scipy.sparse.linalg.bicgstab(rowwise, scaling @ b / size, rtol=KRYLOV, maxiter=KRYLOV_LIMIT)
+            x, _ = scipy.sparse.linalg.bicgstab(
+                rowwise, scaling @ b / size, rtol=KRYLOV_RTOL, maxiter=MAX_KRYLOV_ITERATIONS
+            )
             return size * x
 
         self._solve = iterate
@@ -132,14 +136,14 @@ class Inverse:
         return self._solve(b)
 
 
-def _hub_size(sizes: np.ndarray) -> int:
+def _max_coloured_row_size(sizes: np.ndarray) -> int:
     """The largest row that is coloured: about as many colours are needed, and a derivative for each larger row."""
     candidates = np.unique(sizes)
     larger = len(sizes) - np.searchsorted(np.sort(sizes), candidates, side="right")
     return int(candidates[np.argmin(candidates + larger)])
 
 
-def _widest_level(pattern: scipy.sparse.csr_array) -> int:
+def _max_level_width(pattern: scipy.sparse.csr_array) -> int:
     """Nodes in the widest level of a breadth-first search through the largest part, from an end of it."""
     graph = scipy.sparse.csr_array(pattern + pattern.T, dtype=float)
     label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
@@ -151,7 +155,7 @@ def _widest_level(pattern: scipy.sparse.csr_array) -> int:
     return int(np.bincount(distance[reached].astype(int)).max())
 
 
-def _coloured(pattern: scipy.sparse.csr_array) -> np.ndarray:
+def _colour_columns(pattern: scipy.sparse.csr_array) -> np.ndarray:
     """A colour for each column, so that no row has two columns of one colour; greedily, in order."""
     columnwise = scipy.sparse.csc_array(pattern)
     rows = columnwise.indices.tolist()

@@ -16,17 +16,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ...functions.rounding import with_rounding
+from ...functions.rounding import value_and_rounding_scale
 from ...integrators import OneStepMethod
 from ...systems import System
-from ...tracing.programs import program
-from ..codes import Code
-from ..rules import RULES
-from ..stages import Equations, Iteration, Solved, better_start, fixed_point
-from ..stepping import State, begin, conclude, equations
-from .linear import Compression, Inverse
+from ...tracing.programs import jit_program
+from ..codes import StatusCode
+from ..rules import DEFAULT_OPTIONS
+from ..stages import IterationState, StageEquations, StageSolution, best_initial_guess, solve_fixed_point
+from ..stepping import State, finish_step, initial_run_state_program, stage_equations
+from .linear import JacobianCompression, SparseInverse
 
-PATIENT = replace(RULES, newton=80, halvings=12, stale=0.1, large=sys.maxsize)
+SPARSE_SOLVER_OPTIONS = replace(
+    DEFAULT_OPTIONS,
+    max_newton_iterations=80,
+    max_newton_halvings=12,
+    jacobian_contraction_limit=0.1,
+    matrix_free_dim=sys.maxsize,
+)
 """Newton iterations are cheap here: most use factors that are there already, kept from step to step. Their matrix is
 formed whatever its size, and a few stiff components of many are not to be lost in a mean."""
 
@@ -41,7 +47,7 @@ class SparseEngine:
     """
 
     name = "sparse"
-    portion = 1  # its steps may take seconds: show each, and keep each on Ctrl-C
+    max_saves_per_call = 1  # its steps may take seconds: show each, and keep each on Ctrl-C
 
     def __init__(self, system: System, method: OneStepMethod):
         self.system, self.method = system, method
@@ -49,12 +55,12 @@ class SparseEngine:
         if pattern is None:
             raise ValueError(f"{type(system).__name__} does not know its sparsity")
         self._pattern = pattern
-        self._compression: Compression | None = None
-        self._inverse: Inverse | None = None
-        self._h = np.nan
+        self._compression: JacobianCompression | None = None
+        self._inverse: SparseInverse | None = None
+        self._factored_step_size = np.nan
 
-    def begin(self, x) -> State:
-        return begin(self.system, self.method, x)
+    def initial_run_state(self, x) -> State:
+        return initial_run_state_program(self.system, self.method, x)
 
     def advance(self, state, h, saves, every, noise=None):
         """Keeps no more than it reaches."""
@@ -63,66 +69,73 @@ class SparseEngine:
         for _ in range(int(saves)):
             for _ in range(int(every)):
                 state = self.step(state, h)
-                if int(state.status) != Code.COMPLETED:
+                if int(state.status) != StatusCode.COMPLETED:
                     break
-            if int(state.status) != Code.COMPLETED:
+            if int(state.status) != StatusCode.COMPLETED:
                 break
             kept.append(state)
         x = np.array([np.asarray(s.x) for s in kept]).reshape(len(kept), self.system.dim)
         energy, entropy = (np.array([float(getattr(s, name)) for s in kept]) for name in ("energy", "entropy"))
         return state, (x, energy, entropy, np.ones(len(kept), dtype=bool))
 
-    def ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
-        states = [self.step(self.begin(jnp.asarray(start)), size) for start, size in zip(x, h, strict=True)]
-        solved = np.array([int(s.status) == Code.COMPLETED for s in states])
+    def step_ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
+        states = [self.step(self.initial_run_state(jnp.asarray(start)), size) for start, size in zip(x, h, strict=True)]
+        solved = np.array([int(s.status) == StatusCode.COMPLETED for s in states])
         return np.where(solved[:, None], np.array([np.asarray(s.x) for s in states]), np.nan)
 
     def step(self, state: State, h, noise=None) -> State:
         del noise
         h = jnp.asarray(h, dtype=jnp.float64)
-        solved = _fixed_point(self.system, self.method, state, h)
+        solved = _solve_fixed_point_program(self.system, self.method, state, h)
         if not bool(solved.converged):
-            solved = self._newton(state, h, int(solved.fixed_point))
-        return _conclude(self.system, self.method, state, h, solved)
+            solved = self._solve_newton(state, h, int(solved.fixed_point_iterations))
+        return _finish_step_program(self.system, self.method, state, h, solved)
 
     # -- Newton's method ------------------------------------------------------------------------------------------
 
-    def _newton(self, state: State, h, before: int) -> Solved:
-        k, misfit, scale = _better_start(self.system, self.method, state, h)
-        s, renew = Iteration.begin(k), float(h) != self._h
+    def _solve_newton(self, state: State, h, before: int) -> StageSolution:
+        k, misfit, scale = _best_guess_program(self.system, self.method, state, h)
+        s, renew = IterationState.initial(k), float(h) != self._factored_step_size
         noise = jnp.zeros(())
-        while not self._settled(s, scale, misfit, noise) and int(s.iterations) < PATIENT.newton:
+        while (
+            not self._is_at_plateau(s, scale, misfit, noise)
+            and int(s.n_iterations) < SPARSE_SOLVER_OPTIONS.max_newton_iterations
+        ):
             if renew or self._inverse is None:
-                self._inverse, self._h = self._inverted(state, h, s.k), float(h)
+                self._inverse, self._factored_step_size = self._jacobian_inverse(state, h, s.k), float(h)
                 if self._inverse is None:
                     break
-            found = self._improved(state, h, s, misfit, scale, self._inverse, PATIENT.halvings if renew else 1)
+            found = self._damped_newton_step(
+                state, h, s, misfit, scale, self._inverse, SPARSE_SOLVER_OPTIONS.max_newton_halvings if renew else 1
+            )
             if found is None and renew:
-                s = s._replace(stalled=jnp.asarray(2))  # no step, however short, solves the equations better
-                noise = _noise(self.system, self.method, state.x)
+                s = s._replace(n_stalled=jnp.asarray(2))  # no step, however short, solves the equations better
+                noise = _residual_rounding(self.system, self.method, state.x)
                 break
             renew = found is None
             if found is not None:
                 s, misfit, scale = found
-                renew = bool(s.update > PATIENT.stale * s.previous) and float(s.update) > PATIENT.plateau * float(scale)
-            if int(s.stalled) >= 2 and not noise and not bool(s.settled(scale, PATIENT)):
-                noise = _noise(self.system, self.method, state.x)
+                renew = bool(s.update > SPARSE_SOLVER_OPTIONS.jacobian_contraction_limit * s.previous_update) and float(
+                    s.update
+                ) > SPARSE_SOLVER_OPTIONS.plateau_rtol * float(scale)
+            if int(s.n_stalled) >= 2 and not noise and not bool(s.is_at_plateau(scale, SPARSE_SOLVER_OPTIONS)):
+                noise = _residual_rounding(self.system, self.method, state.x)
         defined = bool(jnp.isfinite(misfit).all())
-        return Solved(
+        return StageSolution(
             k=s.k,
-            converged=jnp.asarray(self._settled(s, scale, misfit, noise) and defined),
-            defined=jnp.asarray(defined),
+            converged=jnp.asarray(self._is_at_plateau(s, scale, misfit, noise) and defined),
+            is_finite=jnp.asarray(defined),
             residual=s.update,
-            fixed_point=jnp.asarray(before),
-            newton=s.iterations,
-            noise=jnp.where(s.settled(scale, PATIENT), 0.0, noise),
+            fixed_point_iterations=jnp.asarray(before),
+            newton_iterations=s.n_iterations,
+            slope_rounding=jnp.where(s.is_at_plateau(scale, SPARSE_SOLVER_OPTIONS), 0.0, noise),
         )
 
     @staticmethod
-    def _settled(s: Iteration, scale, misfit, noise) -> bool:
-        return bool(s.settled(scale, PATIENT, jnp.max(jnp.abs(misfit)), noise))
+    def _is_at_plateau(s: IterationState, scale, misfit, noise) -> bool:
+        return bool(s.is_at_plateau(scale, SPARSE_SOLVER_OPTIONS, jnp.max(jnp.abs(misfit)), noise))
 
-    def _improved(self, state, h, s: Iteration, misfit, scale, inverse: Inverse, attempts: int):
+    def _damped_newton_step(self, state, h, s: IterationState, misfit, scale, inverse: SparseInverse, attempts: int):
         """After a Newton step, halved until the equations are solved better than before; None if that fails.
 
         At the rounding plateau they are not, and a whole step is taken.
@@ -133,27 +146,27 @@ class SparseEngine:
         size = float(jnp.linalg.norm(misfit))
         for _ in range(attempts):
             k = s.k - step
-            found, new_scale = _misfit(self.system, self.method, state, h, k)
+            found, new_scale = _weighted_residual(self.system, self.method, state, h, k)
             new_size = float(jnp.linalg.norm(found))
-            rounding = float(np.abs(step).max()) <= PATIENT.plateau * float(scale)
+            rounding = float(np.abs(step).max()) <= SPARSE_SOLVER_OPTIONS.plateau_rtol * float(scale)
             if new_size < size or (rounding and np.isfinite(new_size)):
-                return s.after(k, PATIENT), found, new_scale
+                return s.next_state(k, SPARSE_SOLVER_OPTIONS), found, new_scale
             step = 0.5 * step
         return None
 
-    def _inverted(self, state, h, k) -> Inverse | None:
+    def _jacobian_inverse(self, state, h, k) -> SparseInverse | None:
         """The inverse of the Jacobian matrix of the misfit; None where there is none."""
         if self._compression is None:
-            self._compression = Compression(self._pattern, self.method.stages)
+            self._compression = JacobianCompression(self._pattern, self.method.stages)
 
         def push(seed):
-            return _pushed(self.system, self.method, state, h, k, seed)
+            return _residual_jvp(self.system, self.method, state, h, k, seed)
 
         def pull(seed):
-            return _pulled(self.system, self.method, state, h, k, seed)
+            return _residual_vjp(self.system, self.method, state, h, k, seed)
 
         try:
-            return Inverse(self._compression.matrix(push, pull), self._compression.width)
+            return SparseInverse(self._compression.assemble_jacobian(push, pull), self._compression.front_width)
         except np.linalg.LinAlgError:
             return None
 
@@ -161,26 +174,28 @@ class SparseEngine:
 # -- on the device ----------------------------------------------------------------------------------------------------
 
 
-@program
-def _fixed_point(system: System, method: OneStepMethod, state: State, h) -> Solved:
-    return fixed_point(_given(system, method, state, h), PATIENT)
+@jit_program
+def _solve_fixed_point_program(system: System, method: OneStepMethod, state: State, h) -> StageSolution:
+    return solve_fixed_point(_stage_equations(system, method, state, h), SPARSE_SOLVER_OPTIONS)
 
 
-def _given(system: System, method: OneStepMethod, state: State, h) -> Equations:
-    return equations(system, method, state.x, state.compensation, h, state.k, state.before, PATIENT)
+def _stage_equations(system: System, method: OneStepMethod, state: State, h) -> StageEquations:
+    return stage_equations(
+        system, method, state.x, state.compensation, h, state.k, state.previous_slopes, SPARSE_SOLVER_OPTIONS
+    )
 
 
-@program
-def _conclude(system: System, method: OneStepMethod, state: State, h, solved: Solved) -> State:
-    return conclude(system, method, state, h, solved, PATIENT)
+@jit_program
+def _finish_step_program(system: System, method: OneStepMethod, state: State, h, solved: StageSolution) -> State:
+    return finish_step(system, method, state, h, solved, SPARSE_SOLVER_OPTIONS)
 
 
-def _equations(system: System, method: OneStepMethod, state: State, h):
+def _weighted_equations(system: System, method: OneStepMethod, state: State, h):
     """The misfit ``w (slopes(k) - k)``, a guess of k, and the size that the plateau is measured against.
 
     With the weights w of :meth:`liethermo.System.weights` a stiff step is nearest to linear.
     """
-    slopes, guess, scale, *_ = _given(system, method, state, h)
+    slopes, guess, scale, *_ = _stage_equations(system, method, state, h)
 
     def misfit(k):
         middle = state.x + (state.compensation + 0.5 * method.increment(h, k))
@@ -189,33 +204,33 @@ def _equations(system: System, method: OneStepMethod, state: State, h):
     return misfit, guess, scale
 
 
-@program
-def _misfit(system: System, method: OneStepMethod, state: State, h, k) -> tuple[Any, Any]:
-    misfit, _, scale = _equations(system, method, state, h)
+@jit_program
+def _weighted_residual(system: System, method: OneStepMethod, state: State, h, k) -> tuple[Any, Any]:
+    misfit, _, scale = _weighted_equations(system, method, state, h)
     return misfit(k), scale(k)
 
 
-@program
-def _noise(system: System, method: OneStepMethod, x) -> Any:
+@jit_program
+def _residual_rounding(system: System, method: OneStepMethod, x) -> Any:
     """The size at which the misfit is rounded."""
-    return jnp.max(with_rounding(lambda x: system.weights(x) * system.vector_field(x), x)[1])
+    return jnp.max(value_and_rounding_scale(lambda x: system.weights(x) * system.vector_field(x), x)[1])
 
 
-@program
-def _better_start(system: System, method: OneStepMethod, state: State, h):
+@jit_program
+def _best_guess_program(system: System, method: OneStepMethod, state: State, h):
     """The predicted slopes, or a step of size zero where that solves the equations better; with misfit and scale."""
-    misfit, guess, scale = _equations(system, method, state, h)
-    k, found = better_start(misfit, guess)
+    misfit, guess, scale = _weighted_equations(system, method, state, h)
+    k, found = best_initial_guess(misfit, guess)
     return k, found, scale(k)
 
 
-@program
-def _pushed(system: System, method: OneStepMethod, state: State, h, k, seed):
-    misfit = _equations(system, method, state, h)[0]
+@jit_program
+def _residual_jvp(system: System, method: OneStepMethod, state: State, h, k, seed):
+    misfit = _weighted_equations(system, method, state, h)[0]
     return jax.jvp(misfit, (k,), (jnp.asarray(seed),))[1]
 
 
-@program
-def _pulled(system: System, method: OneStepMethod, state: State, h, k, seed):
-    misfit = _equations(system, method, state, h)[0]
+@jit_program
+def _residual_vjp(system: System, method: OneStepMethod, state: State, h, k, seed):
+    misfit = _weighted_equations(system, method, state, h)[0]
     return jax.vjp(misfit, k)[1](jnp.asarray(seed))[0]

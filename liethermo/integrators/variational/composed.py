@@ -9,11 +9,11 @@ import numpy as np
 from manifolds.matrices.linear import inverse
 
 from ...systems import ComposedSystem, System
-from ..base import Wrapping
+from ..base import MethodWrapper
 from .discrete import FiniteDifference
 
 
-class OnBodies(Wrapping):
+class ComposedVariational(MethodWrapper):
     """A variational integrator as it runs on a composed system; see there for its equations.
 
     With one map the slopes are the field at the point where the map looks. With several, a row for each follows, with
@@ -32,7 +32,7 @@ class OnBodies(Wrapping):
         return 1 if number == 1 else 1 + number
 
     @property
-    def evaluations(self) -> int:
+    def evaluations_per_iteration(self) -> int:
         return len(self.maps)
 
     def __str__(self) -> str:
@@ -42,15 +42,17 @@ class OnBodies(Wrapping):
         assert isinstance(system, ComposedSystem)
         maps = self.maps
         if len(maps) == 1:
-            return system.vector_field(x + (compensation + h * share(system, maps[0]) * k[0]))[None]
-        (q, p, S, _), total = system.poisson.places, sum(map.weight for map in maps)
+            return system.vector_field(x + (compensation + h * map_fractions(system, maps[0]) * k[0]))[None]
+        (q, p, S, _), total = system.poisson.state_indices, sum(map.weight for map in maps)
         parts, far = [map.weight / total for map in maps], [1.0 - map.alpha for map in maps]
 
         def mean(values) -> jax.Array:
             return sum(part * value for part, value in zip(parts[1:], values[1:], strict=True)) + parts[0] * values[0]
 
         # the points of the maps, with a momentum of its own each
-        moved = [(h * share(system, map) * k[0]).at[p].set(h * row[p]) for map, row in zip(maps, k[1:], strict=True)]
+        moved = [
+            (h * map_fractions(system, map) * k[0]).at[p].set(h * row[p]) for map, row in zip(maps, k[1:], strict=True)
+        ]
         points = [x + (compensation + d) for d in moved]
         gradients = [system.energy.gradient(point) for point in points]
         warm = mean([dH[S] for dH in gradients])
@@ -64,7 +66,7 @@ class OnBodies(Wrapping):
         step = mean(rates)
         if not len(p):
             return jnp.concatenate([step[None], jnp.zeros_like(k[1:])])
-        masses = [inverse(_by_momenta(system, point, p)) for point in points]
+        masses = [inverse(_momentum_hessian(system, point, p)) for point in points]
         needed = mean([share * rate[p] - row[p] for share, rate, row in zip(far, rates, k[1:], strict=True)])
         carried = mean([M @ dH[p] for M, dH in zip(masses, gradients, strict=True)])
         V = inverse(mean(masses)) @ (h * needed + carried)
@@ -85,14 +87,14 @@ class OnBodies(Wrapping):
         return np.multiply.outer(np.asarray(theta, dtype=float), np.eye(self.stages)[0])
 
 
-def share(system: ComposedSystem, map: FiniteDifference) -> np.ndarray:
+def map_fractions(system: ComposedSystem, map: FiniteDifference) -> np.ndarray:
     """How far on its way each component of a composed system is looked at."""
-    q, p, _, _ = system.poisson.places
+    q, p, _, _ = system.poisson.state_indices
     found = np.full(system.dim, map.beta)
     found[q], found[p] = map.alpha, 1.0 - map.alpha
     return found
 
 
-def _by_momenta(system: ComposedSystem, x, p) -> jax.Array:
+def _momentum_hessian(system: ComposedSystem, x, p) -> jax.Array:
     """``H_pp``, the inverse of the mass matrix of all bodies."""
     return jax.jacfwd(lambda y: system.energy.gradient(x.at[p].set(y))[p])(x[p])

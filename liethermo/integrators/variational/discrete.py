@@ -18,11 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
-from manifolds._module import Module
+from manifolds._pytree_module import Module
 from manifolds.matrices.linear import solve
 
 from ...errors import InputError
-from ...functions.surface import OnLevels
+from ...functions.surface import ConstraintSurface
 from ...systems import SimpleClosedSystem
 
 
@@ -71,7 +71,7 @@ class FiniteDifference(Module):
         """The entropy between two; a time between two is found in the same way."""
         return S0 + (self.beta * h) * s
 
-    def mirrored(self) -> FiniteDifference | None:
+    def reversed_map(self) -> FiniteDifference | None:
         """The map that represents (q_1, q_0, S_1, S_0) backward in time as this one does (q_0, …); None if unknown."""
         if type(self) is not FiniteDifference:
             return self if self.is_symmetric else None
@@ -94,32 +94,32 @@ class Curve(Module):
     space: mf.Space = eqx.field(static=True)
     chart: mf.Chart | None = eqx.field(static=True, default=None)
 
-    def represented(self, alpha: float, q0, V, h) -> tuple[jax.Array, jax.Array]:
+    def position_and_velocity(self, alpha: float, q0, V, h) -> tuple[jax.Array, jax.Array]:
         """The point of the curve and its velocity there, from ``V = (q_1 - q_0) / h``; shape (n,) each."""
         vector, point = self.space.to_vector, self.space.from_vector
         if self.chart is None:
-            return jax.jvp(self._returned, (q0 + (alpha * h) * V,), (V,))
+            return jax.jvp(self._project_to_space, (q0 + (alpha * h) * V,), (V,))
         start, chart = point(q0), self.chart
         w = chart._vector(start, point(q0 + h * V))
         q, v = jax.jvp(lambda a: chart._point(start, a * w), (jnp.asarray(alpha),), (1.0 / h,))
         return vector(q), vector(v)
 
-    def _returned(self, q) -> jax.Array:
+    def _project_to_space(self, q) -> jax.Array:
         point = self.space.from_vector(q)
-        for _ in range(RETURNS):
-            point = self.space._returned(point)
+        for _ in range(PROJECTION_NEWTON_STEPS):
+            point = self.space._restore(point)
         return self.space.to_vector(point)
 
 
-RETURNS = 3
+PROJECTION_NEWTON_STEPS = 3
 """Steps of Newton's method from a chord to the space: each squares the distance, relative to the curvature."""
 
 
-class Point(NamedTuple):
+class MapPoint(NamedTuple):
     """What a map makes of a pair: its part in the mean, and the arguments of the functions."""
 
     map: FiniteDifference
-    part: float
+    weight: float
     q: jax.Array
     v: jax.Array
     S: jax.Array
@@ -158,85 +158,87 @@ class DiscreteSystem(Module):
 
     # -- in difference quotients, per unit of time ------------------------------------------------------------------
 
-    def _points(self, maps, pair: Pair) -> Iterator[Point]:
+    def _map_points(self, maps, pair: Pair) -> Iterator[MapPoint]:
         total = sum(map.weight for map in maps)
         for map in maps:
-            q, v = self._represented(map, pair.q0, pair.V)
+            q, v = self._position_and_velocity(map, pair.q0, pair.V)
             S, t = map.entropy(pair.S0, pair.s, self.h), map.entropy(self.t, 1.0, self.h)
-            yield Point(map, map.weight / total, q, v, S, t)
+            yield MapPoint(map, map.weight / total, q, v, S, t)
 
-    def _represented(self, map: FiniteDifference, q0, V) -> tuple[jax.Array, jax.Array]:
+    def _position_and_velocity(self, map: FiniteDifference, q0, V) -> tuple[jax.Array, jax.Array]:
         if self.curve is None:
             return map.position(q0, V, self.h), map.velocity(q0, V, self.h)
-        return self.curve.represented(map.alpha, q0, V, self.h)
+        return self.curve.position_and_velocity(map.alpha, q0, V, self.h)
 
-    def _ends(self, map: FiniteDifference, pair: Pair, F) -> tuple[jax.Array, jax.Array]:
+    def _split_force(self, map: FiniteDifference, pair: Pair, F) -> tuple[jax.Array, jax.Array]:
         """A force at the representative, as one on q_0 and one on q_1: ``D_1 q·F``, ``D_2 q·F``."""
         if self.curve is None and type(map).position is FiniteDifference.position:
             return (1.0 - map.alpha) * F, map.alpha * F
-        _, back = jax.vjp(lambda q0, V: self._represented(map, q0, V)[0], pair.q0, pair.V)
+        _, back = jax.vjp(lambda q0, V: self._position_and_velocity(map, q0, V)[0], pair.q0, pair.V)
         both, second = back(F)  # V grows with q_1 at fixed q_0, at the rate 1/h
         return both - second / self.h, second / self.h
 
     def action(self, q0, V, S0, s) -> jax.Array:
         """``L_d / h``."""
-        points = self._points(self.lagrangian_maps, Pair(q0, V, S0, s))
-        return _total([p.part * self.system.action(p.q, p.v, p.S) for p in points])
+        points = self._map_points(self.lagrangian_maps, Pair(q0, V, S0, s))
+        return _sum_arrays([p.weight * self.system.action(p.q, p.v, p.S) for p in points])
 
     def impulses(self, pair: Pair, friction: bool = True, external: bool = True) -> tuple[jax.Array, jax.Array]:
         """``F^-_d / h`` and ``F^+_d / h``."""
         first = second = jnp.zeros_like(pair.V)
-        for p in self._points(self.force_maps, pair):
+        for p in self._map_points(self.force_maps, pair):
             F = jnp.zeros_like(p.v)
             F = F + self.system.friction_force(*p[2:]) if friction else F
             F = F + self.system.external_force(*p[2:]) if external else F
-            at_first, at_second = self._ends(p.map, pair, p.part * F)
+            at_first, at_second = self._split_force(p.map, pair, p.weight * F)
             first, second = first + at_first, second + at_second
         return first, second
 
-    def misfit(self, p0, pair: Pair) -> jax.Array:
+    def momentum_residual(self, p0, pair: Pair) -> jax.Array:
         """That of ``p_0 = -D_1 L_d - F^-_d``, (3.12) with the momentum of the step before, shape (n,)."""
         by_q, by_V = jax.grad(self.action, argnums=(0, 1))(*pair)
         return p0 - by_V + self.h * (by_q + self.impulses(pair)[0])
 
-    def motion(self, p0, pair: Pair, mass: float | jax.Array = 1.0) -> jax.Array:
+    def motion_residual(self, p0, pair: Pair, mass: float | jax.Array = 1.0) -> jax.Array:
         """What has to vanish, shape (n,): the misfit; on a manifold its part along Q, and how far q_1 is off Q.
 
         The latter is multiplied by a ``mass`` of the size of L_vv, so that all of it is momentum.
         """
-        missed = self.misfit(p0, pair)
+        missed = self.momentum_residual(p0, pair)
         if self.curve is None:
             return missed
-        surface = OnLevels(self.curve.space, tangent=True)
-        off = surface._change(pair.q0, 0.0, self.h * pair.V) / self.h
-        return self.system.along(pair.q0, missed) + mass * surface._moved(pair.q0, off)
+        surface = ConstraintSurface(self.curve.space, tangent=True)
+        off = surface._constraint_change(pair.q0, 0.0, self.h * pair.V) / self.h
+        return self.system.along(pair.q0, missed) + mass * surface._correction_displacement(pair.q0, off)
 
     def force(self, p0, pair: Pair) -> jax.Array:
         """``(p_1 - p_0) / h = (D_1 L_d + D_2 L_d + F^-_d + F^+_d) / h``, shape (n,), on a manifold along it."""
         first, second = self.impulses(pair)
         force = jax.grad(self.action)(*pair) + (first + second)
-        return force if self.curve is None else force - self.misfit(p0, pair) / self.h
+        return force if self.curve is None else force - self.momentum_residual(p0, pair) / self.h
 
-    def production(self, pair: Pair) -> jax.Array:
+    def constraint_residual(self, pair: Pair) -> jax.Array:
         """``-P_d``, the mean of ``T s + F_fr . v - P_H``; NaN where a temperature is not positive [GBY 3.9]."""
         total = jnp.zeros(())
-        for p in self._points(self.constraint_maps, pair):
+        for p in self._map_points(self.constraint_maps, pair):
             T = -jax.grad(self.system.action, argnums=2)(p.q, p.v, p.S)
             gained = jnp.dot(self.system.friction_force(*p[2:]), p.v) - self.system.heating(*p[2:])
-            total = total + p.part * (jnp.where(T > 0.0, T, jnp.nan) * pair.s + gained)
+            total = total + p.weight * (jnp.where(T > 0.0, T, jnp.nan) * pair.s + gained)
         return total
 
-    def received(self, pair: Pair) -> tuple[jax.Array, jax.Array]:
+    def work_and_heat_rates(self, pair: Pair) -> tuple[jax.Array, jax.Array]:
         """Work and heat from outside, per unit of time."""
         first, second = self.impulses(pair, friction=False)
-        heat = _total([p.part * self.system.heating(*p[2:]) for p in self._points(self.constraint_maps, pair)])
+        heat = _sum_arrays(
+            [p.weight * self.system.heating(*p[2:]) for p in self._map_points(self.constraint_maps, pair)]
+        )
         return jnp.dot(first + second, pair.V), heat
 
     def energy(self, pair: Pair) -> jax.Array:
         """``E = v . L_v - L`` at the points of the discrete Lagrangian, the mean."""
         energy = self.system.contact.energy
-        points = self._points(self.lagrangian_maps, pair)
-        return _total([p.part * energy(jnp.concatenate([p.q, p.v, p.S[None]])) for p in points])
+        points = self._map_points(self.lagrangian_maps, pair)
+        return _sum_arrays([p.weight * energy(jnp.concatenate([p.q, p.v, p.S[None]])) for p in points])
 
     # -- as in the paper ----------------------------------------------------------------------------------------------
 
@@ -254,7 +256,7 @@ class DiscreteSystem(Module):
 
     def constraint(self, q0, q1, S0, S1) -> jax.Array:
         """``P_d``: a pair is on ``C_K^d`` where it vanishes [GBY 3.8]."""
-        return -self.production(self.pair(q0, q1, S0, S1))
+        return -self.constraint_residual(self.pair(q0, q1, S0, S1))
 
     def momenta(self, q0, q1, S0, S1) -> tuple[jax.Array, jax.Array]:
         """p_0 and p_1 of the discrete Legendre transforms ``FL^-`` and ``FL^+`` with forces [GBY §4.2]."""
@@ -277,12 +279,12 @@ class DiscreteSystem(Module):
         matrix = self.regularity_matrix(q0, q1, S0, S1)
         return matrix[:-1, :-1] - jnp.outer(matrix[:-1, -1], matrix[-1, :-1]) / matrix[-1, -1]
 
-    def onto_constraint(self, q0, q1, S0, steps: int = 12) -> jax.Array:
+    def solve_constraint(self, q0, q1, S0, steps: int = 12) -> jax.Array:
         """S_1 with ``P_d(q_0, q_1, S_0, S_1) = 0``, by so many Newton steps; differentiable."""
         V = (q1 - q0) / self.h
 
         def newton(_, s):
-            misfit, slope = jax.jvp(lambda s: self.production(Pair(q0, V, S0, s)), (s,), (jnp.ones(()),))
+            misfit, slope = jax.jvp(lambda s: self.constraint_residual(Pair(q0, V, S0, s)), (s,), (jnp.ones(()),))
             return s - misfit / slope
 
         return S0 + self.h * jax.lax.fori_loop(0, steps, newton, jnp.zeros(()))
@@ -293,7 +295,7 @@ class DiscreteSystem(Module):
 
         def misfit(y):
             pair = Pair(q1, y[:-1], S1, y[-1])
-            return jnp.append(self.motion(p1, pair), self.production(pair))
+            return jnp.append(self.motion_residual(p1, pair), self.constraint_residual(pair))
 
         def newton(_, y):
             return y - solve(jax.jacfwd(misfit)(y), misfit(y)[:, None])[:, 0]
@@ -302,5 +304,5 @@ class DiscreteSystem(Module):
         return q1, q1 + self.h * y[:-1], S1, S1 + self.h * y[-1]
 
 
-def _total(parts: list[jax.Array]) -> jax.Array:
+def _sum_arrays(parts: list[jax.Array]) -> jax.Array:
     return functools.reduce(operator.add, parts)

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 from manifolds.matrices.linear import solve
 
 from ...systems import SimpleClosedSystem, System
-from ..base import ONE_SIZE, GaussMethod, checked_stages, register
-from ..tableaus import gauss
+from ..base import WHY_FIXED_VARIATIONAL_STEP, GaussMethod, checked_stages, register
+from ..tableaus import gauss_tableau
 from .equations import velocity_slope
-from .schemes import need_simple_closed
+from .schemes import require_simple_closed
 
 
 class VariationalGauss(GaussMethod):
@@ -39,7 +39,7 @@ class VariationalGauss(GaussMethod):
     """
 
     systems = "simple closed systems"
-    fixed: ClassVar[str] = ONE_SIZE
+    why_fixed_step: ClassVar[str] = WHY_FIXED_VARIATIONAL_STEP
 
     def __init__(self, stages: int = 2):
         self.number = checked_stages(stages)
@@ -48,11 +48,11 @@ class VariationalGauss(GaussMethod):
 
     def check(self, system: System) -> None:
         """Raise InputError unless the system has a variational principle of this kind."""
-        need_simple_closed(system, "VariationalGauss")
+        require_simple_closed(system, "VariationalGauss")
 
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
         assert isinstance(system, SimpleClosedSystem)
-        (A, b, c), n, start = gauss(self.number), system.degrees_of_freedom, x + compensation
+        (A, b, c), n, start = gauss_tableau(self.number), system.degrees_of_freedom, x + compensation
         (q0, v0, S0, t0), V, s = system.parts(start), k[:, :n], k[:, 2 * n]
         q, S, t, p0 = q0 + h * (A @ V), S0 + h * (A @ s), t0 + h * c, system.momentum(q0, v0, S0)
 

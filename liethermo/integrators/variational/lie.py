@@ -16,10 +16,10 @@ from manifolds.groups.maps import cayley, dexp, exp
 from manifolds.matrices.linear import solve
 
 from ...errors import InputError
-from ...functions.conditions import require
+from ...functions.conditions import require_condition
 from ...systems import EulerPoincareClosedSystem, System
-from ...tracing.programs import program
-from ..base import ONE_SIZE, OneStepMethod, checked_step, kind_of, register, states_of_run
+from ...tracing.programs import jit_program
+from ..base import WHY_FIXED_VARIATIONAL_STEP, OneStepMethod, checked_run_states, checked_step_size, kind_name, register
 
 NEWTON_STEPS = 20
 """For the velocities between the states of a finished run."""
@@ -48,7 +48,7 @@ class LieVariational(OneStepMethod):
     """
 
     systems = "Euler-Poincaré systems with entropy"
-    fixed: ClassVar[str] = ONE_SIZE
+    why_fixed_step: ClassVar[str] = WHY_FIXED_VARIATIONAL_STEP
 
     tau: str = eqx.field(static=True)
 
@@ -71,7 +71,7 @@ class LieVariational(OneStepMethod):
     def check(self, system: System) -> None:
         """Raise InputError where the Cayley map is to take an algebra to a group, and does not."""
         if not isinstance(system, EulerPoincareClosedSystem):
-            raise InputError(f"LieVariational runs an lt.EulerPoincareClosedSystem, not a {kind_of(system)}")
+            raise InputError(f"LieVariational runs an lt.EulerPoincareClosedSystem, not a {kind_name(system)}")
         algebra = system.algebra
         if self.tau == "exp":
             return
@@ -98,11 +98,11 @@ class LieVariational(OneStepMethod):
         assert isinstance(system, EulerPoincareClosedSystem)
         n = system.algebra.dim
         xi0, S0, t = system.parts(x + compensation)
-        step = _Step(system, self.tau, S0, h, t)
+        step = _LieStep(system, self.tau, S0, h, t)
         mu0 = system.momentum(xi0, S0)
 
         def misfit(y):
-            return jnp.append(mu0 - step.momenta(y)[0], step.production(y))
+            return jnp.append(mu0 - step.momenta(y)[0], step.constraint_residual(y))
 
         y = jnp.append(k[1, :n], k[0, n])
         y = y - solve(jax.jacfwd(misfit)(y), misfit(y)[:, None])[:, 0]
@@ -110,10 +110,10 @@ class LieVariational(OneStepMethod):
         guess = xi0 + h * k[0, :n]
         W = jax.jacfwd(system.momentum)(guess, S1)
         xi_dot = k[0, :n] - solve(W, ((system.momentum(guess, S1) - mu1) / h)[:, None])[:, 0]
-        rest = system.entries(*step.received(y))
+        rest = system.entries(*step.work_and_heat_rates(y))
         return jnp.stack([jnp.concatenate([xi_dot, y[n:], rest]), jnp.zeros_like(x).at[:n].set(y[:n])])
 
-    def linearised(self, system: System, x, compensation, h, k) -> Callable:
+    def residual_jvp(self, system: System, x, compensation, h, k) -> Callable:
         return jnp.negative  # the slopes are Newton's method already: their derivative vanishes at the solution
 
     def increment(self, h, k) -> jax.Array:
@@ -131,17 +131,19 @@ class LieVariational(OneStepMethod):
             g_0; the identity by default.
         """
         self.check(system)
-        steps = np.asarray(_turns(self, system, states_of_run(system, x), checked_step(h)))
+        steps = np.asarray(_group_increments(self, system, checked_run_states(system, x), checked_step_size(h)))
         size = steps.shape[-1]
         g0 = np.eye(size) if start is None else square_matrices(start, size, "start")
-        require(g0, np.isfinite, "start is an element of the group, and has entries that are not finite: {value}")
+        require_condition(
+            g0, np.isfinite, "start is an element of the group, and has entries that are not finite: {value}"
+        )
         path = [np.asarray(g0)]
         for turn in steps:
             path.append(path[-1] @ turn)
         return np.array(path)
 
 
-class _Step(NamedTuple):
+class _LieStep(NamedTuple):
     """The discrete equations of a step, of y = (xi, s): the velocity in it and the slope of the entropy."""
 
     system: EulerPoincareClosedSystem
@@ -150,18 +152,18 @@ class _Step(NamedTuple):
     h: jax.Array
     t: jax.Array  # when it begins
 
-    def _middle(self, y) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def _midpoint(self, y) -> tuple[jax.Array, jax.Array, jax.Array]:
         return y[:-1], self.S0 + 0.5 * self.h * y[-1], self.t + 0.5 * self.h
 
     def momenta(self, y) -> tuple[jax.Array, jax.Array]:
         """mu at its two ends."""
-        xi, S, t = self._middle(y)
+        xi, S, t = self._midpoint(y)
         force = self.system.friction_force(xi, S, t) + self.system.external_force(xi, S, t)
         mu, push = self.system.momentum(xi, S), 0.5 * self.h * force
-        first, second = (self._turned(sign * self.h * xi, mu) for sign in (1.0, -1.0))
+        first, second = (self._apply_dtau_inverse(sign * self.h * xi, mu) for sign in (1.0, -1.0))
         return first - push, second + push
 
-    def _turned(self, xi, mu) -> jax.Array:
+    def _apply_dtau_inverse(self, xi, mu) -> jax.Array:
         """``(dtau^-1_xi)* mu``, the derivative trivialised on the right; of -xi on the left."""
         algebra = self.system.algebra
         if self.tau == "exp":
@@ -171,27 +173,27 @@ class _Step(NamedTuple):
         basis = jnp.asarray(algebra.basis)
         return jax.vmap(lambda eta: algebra.vee((one - half) @ eta @ (one + half)))(basis) @ mu
 
-    def production(self, y) -> jax.Array:
+    def constraint_residual(self, y) -> jax.Array:
         """``T s + f . xi - P_H``, which vanishes; NaN where the temperature is not positive."""
-        xi, S, t = self._middle(y)
+        xi, S, t = self._midpoint(y)
         T = -jax.grad(self.system.lagrangian, argnums=1)(xi, S)
         gained = jnp.dot(self.system.friction_force(xi, S, t), xi) - self.system.heating(xi, S, t)
         return jnp.where(T > 0.0, T, jnp.nan) * y[-1] + gained
 
-    def received(self, y) -> tuple[jax.Array, jax.Array]:
+    def work_and_heat_rates(self, y) -> tuple[jax.Array, jax.Array]:
         """Work and heat from outside, per unit of time."""
-        middle = self._middle(y)
+        middle = self._midpoint(y)
         return jnp.dot(self.system.external_force(*middle), y[:-1]), self.system.heating(*middle)
 
 
-@program
-def _turns(method: LieVariational, system: EulerPoincareClosedSystem, x, h):
+@jit_program
+def _group_increments(method: LieVariational, system: EulerPoincareClosedSystem, x, h):
     """``tau(h xi_k)`` of every step, xi_k from the momentum before it."""
     turn = cayley if method.tau == "cayley" else exp
 
-    def one(before, after):
+    def group_increment(before, after):
         (xi0, S0, t), (xi1, S1, _) = system.parts(before), system.parts(after)
-        step, s, mu0 = _Step(system, method.tau, S0, h, t), (S1 - S0) / h, system.momentum(xi0, S0)
+        step, s, mu0 = _LieStep(system, method.tau, S0, h, t), (S1 - S0) / h, system.momentum(xi0, S0)
 
         def newton(_, xi):
             misfit = lambda xi: mu0 - step.momenta(jnp.append(xi, s))[0]  # noqa: E731
@@ -200,7 +202,7 @@ def _turns(method: LieVariational, system: EulerPoincareClosedSystem, x, h):
         xi = jax.lax.fori_loop(0, NEWTON_STEPS, newton, 0.5 * (xi0 + xi1))
         return turn(system.algebra, h * xi)
 
-    return jax.vmap(one)(x[:-1], x[1:])
+    return jax.vmap(group_increment)(x[:-1], x[1:])
 
 
 register(LieVariational(), LieVariational("exp"))

@@ -14,19 +14,27 @@ import numpy as np
 import manifolds as mf
 
 from ...errors import InputError
-from ...functions.conditions import numbers
+from ...functions.conditions import check_numbers
 from ...systems import ComposedSystem, EmbeddedSystem, SimpleClosedSystem, System
-from ...tracing.programs import program
-from ..base import ONE_SIZE, OneStepMethod, checked_step, kind_of, moved, register, states_of_run
-from ..charts import retraction_of
-from .composed import OnBodies
+from ...tracing.programs import jit_program
+from ..base import (
+    WHY_FIXED_VARIATIONAL_STEP,
+    OneStepMethod,
+    apply_increment,
+    checked_run_states,
+    checked_step_size,
+    kind_name,
+    register,
+)
+from ..charts import resolve_retraction
+from .composed import ComposedVariational
 from .discrete import Curve, DiscreteSystem, FiniteDifference, Pair
-from .equations import solved, velocity_of, velocity_slope
+from .equations import newton_step, velocity_from_momentum, velocity_slope
 
 CONSTRAINT_TOLERANCE = 1e-10
 """Largest misfit of a given first step, relative to the heat ``T |S_1 - S_0|`` and the work that make it up."""
 
-SINGULAR = 1e13
+SINGULAR_CONDITION_NUMBER = 1e13
 """Condition number, of rows scaled alike, from which a matrix counts as singular."""
 
 Maps = FiniteDifference | Sequence[FiniteDifference] | str
@@ -77,7 +85,7 @@ class VariationalIntegrator(OneStepMethod):
     """
 
     systems = "simple closed and composed systems"
-    fixed: ClassVar[str] = ONE_SIZE
+    why_fixed_step: ClassVar[str] = WHY_FIXED_VARIATIONAL_STEP
 
     phi: tuple[FiniteDifference, ...]
     forces: tuple[FiniteDifference, ...]
@@ -91,9 +99,9 @@ class VariationalIntegrator(OneStepMethod):
         constraint: Maps | None = None,
         retraction: str | mf.Retraction | None = None,
     ):
-        self.phi = _maps(phi, "phi")
-        self.forces = self.phi if forces is None else _maps(forces, "the maps of the forces")
-        self.constraint = self.phi if constraint is None else _maps(constraint, "the maps of the constraint")
+        self.phi = _checked_maps(phi, "phi")
+        self.forces = self.phi if forces is None else _checked_maps(forces, "the maps of the forces")
+        self.constraint = self.phi if constraint is None else _checked_maps(constraint, "the maps of the constraint")
         self.retraction = retraction
 
     @classmethod
@@ -124,14 +132,18 @@ class VariationalIntegrator(OneStepMethod):
 
     @property
     def order(self) -> int:
-        return 2 if all(map(_is_symmetric, (self.phi, self.forces, self.constraint))) and self._is_symmetric else 1
+        return (
+            2
+            if all(map(_is_symmetric_set, (self.phi, self.forces, self.constraint))) and self._has_symmetric_curves
+            else 1
+        )
 
     @property
-    def _is_symmetric(self) -> bool:
+    def _has_symmetric_curves(self) -> bool:
         """Whether curves on a manifold are the same seen from both ends."""
-        return self.retraction in SYMMETRIC or isinstance(self.retraction, LINES)
+        return self.retraction in SYMMETRIC_RETRACTION_NAMES or isinstance(self.retraction, SYMMETRIC_RETRACTION_TYPES)
 
-    in_charts = False
+    uses_charts = False
 
     preserves = frozenset({"entropy_law"})
 
@@ -155,7 +167,7 @@ class VariationalIntegrator(OneStepMethod):
         elif isinstance(system, ComposedSystem):
             self._check_bodies(system)
         else:
-            need_simple_closed(system, "VariationalIntegrator")
+            require_simple_closed(system, "VariationalIntegrator")
 
     def _check_bodies(self, system: ComposedSystem) -> None:
         if not (self.phi == self.forces == self.constraint):
@@ -169,9 +181,13 @@ class VariationalIntegrator(OneStepMethod):
             )
 
     def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
-        return OnBodies(self, self.phi) if isinstance(system, ComposedSystem) and self.retraction is None else self
+        return (
+            ComposedVariational(self, self.phi)
+            if isinstance(system, ComposedSystem) and self.retraction is None
+            else self
+        )
 
-    def discrete(self, system: SimpleClosedSystem, h, t=0.0) -> DiscreteSystem:
+    def discrete_system(self, system: SimpleClosedSystem, h, t=0.0) -> DiscreteSystem:
         """L_d, F_d and P_d of a step of size h from the time t on."""
         curve = self.curve(system)
         return DiscreteSystem(system, self.phi, self.forces, self.constraint, jnp.asarray(h), jnp.asarray(t), curve)
@@ -181,7 +197,7 @@ class VariationalIntegrator(OneStepMethod):
         space, kind = system.configurations, self.retraction
         if space is None or kind is None:
             return None if space is None else Curve(space)
-        return Curve(space, retraction_of(space, kind).chart)
+        return Curve(space, resolve_retraction(space, kind).chart)
 
     # -- the step ---------------------------------------------------------------------------------------------------
 
@@ -190,23 +206,23 @@ class VariationalIntegrator(OneStepMethod):
         assert isinstance(system, SimpleClosedSystem)
         n = system.degrees_of_freedom
         q0, v0, S0, t = system.parts(x + compensation)
-        discrete, p0 = self.discrete(system, h, t), system.momentum(q0, v0, S0)
-        V, s = solved(discrete, v0, p0, Pair(q0, k[0, :n], S0, k[0, 2 * n]))
+        discrete, p0 = self.discrete_system(system, h, t), system.momentum(q0, v0, S0)
+        V, s = newton_step(discrete, v0, p0, Pair(q0, k[0, :n], S0, k[0, 2 * n]))
         pair = Pair(q0, V, S0, s)
         v_dot = velocity_slope(
             system, (q0, v0, S0, p0), (q0 + h * V, k[0, n : 2 * n], S0 + h * s), discrete.force(p0, pair), h
         )
-        ledger = jnp.stack([*discrete.received(pair), jnp.ones(())])[: system.dim - (2 * n + 1)]
+        ledger = jnp.stack([*discrete.work_and_heat_rates(pair), jnp.ones(())])[: system.dim - (2 * n + 1)]
         return jnp.concatenate([V, v_dot, s[None], ledger])[None]
 
-    def linearised(self, system: System, x, compensation, h, k) -> Callable:
+    def residual_jvp(self, system: System, x, compensation, h, k) -> Callable:
         return jnp.negative  # the slopes are Newton's method already: their derivative vanishes at the solution
 
     def increment(self, h, k) -> jax.Array:
         return h * k[0]
 
     def move(self, system: System, x, compensation, h, k) -> tuple[jax.Array, jax.Array]:
-        return moved(self, system, x, compensation, self.increment(h, k), settles=True)
+        return apply_increment(self, system, x, compensation, self.increment(h, k), ends_on_surface=True)
 
     # -- starts and records -------------------------------------------------------------------------------------------
 
@@ -229,16 +245,19 @@ class VariationalIntegrator(OneStepMethod):
             If there is no S_1 that goes with q_0, q_1 and S_0, or the one given does not, or no velocity goes with the
             momentum.
         """
-        need_simple_closed(system, "VariationalIntegrator")
+        require_simple_closed(system, "VariationalIntegrator")
         space = system.configurations
         if space is not None:
             q0, q1 = (space.to_vector(space.point(q)) for q in (q0, q1))
-        q0, q1 = jnp.atleast_1d(numbers(q0, "q0")), jnp.atleast_1d(numbers(q1, "q1"))
+        q0, q1 = jnp.atleast_1d(check_numbers(q0, "q0")), jnp.atleast_1d(check_numbers(q1, "q1"))
         if not q0.shape == q1.shape == (system.degrees_of_freedom,):
             raise InputError(f"q0 and q1 have shape ({system.degrees_of_freedom},), not {q0.shape} and {q1.shape}")
-        discrete, S0 = self.discrete(system, checked_step(h), numbers(t, "t", ())), numbers(S0, "S0", ())
-        found = discrete.onto_constraint(q0, q1, S0) if S1 is None else numbers(S1, "S1", ())
-        misfit, size = (float(a) for a in _misfit(discrete, q0, q1, S0, found))
+        discrete, S0 = (
+            self.discrete_system(system, checked_step_size(h), check_numbers(t, "t", ())),
+            check_numbers(S0, "S0", ()),
+        )
+        found = discrete.solve_constraint(q0, q1, S0) if S1 is None else check_numbers(S1, "S1", ())
+        misfit, size = (float(a) for a in _constraint_residual(discrete, q0, q1, S0, found))
         if not misfit <= CONSTRAINT_TOLERANCE * size:
             raise InputError(
                 f"this first step is not on the discrete constraint: |P_d| = {misfit:.3g} between a heat and a work of "
@@ -250,7 +269,7 @@ class VariationalIntegrator(OneStepMethod):
                 )
             )
         p0 = discrete.momenta(q0, q1, S0, found)[0]
-        v0 = velocity_of(system, q0, S0, p0, (q1 - q0) / h)
+        v0 = velocity_from_momentum(system, q0, S0, p0, (q1 - q0) / h)
         if not bool(jnp.isfinite(v0).all()):
             raise InputError(f"no velocity was found that has the momentum {np.asarray(p0)} of this first step")
         rest = jnp.array([0.0, 0.0, t]) if system.receives else jnp.zeros(0)
@@ -269,22 +288,24 @@ class VariationalIntegrator(OneStepMethod):
         -------
         ndarray, shape (times - 1,)
         """
-        need_simple_closed(system, "VariationalIntegrator")
-        x = states_of_run(system, x)
-        return np.asarray(_energies(self, system, checked_step(h), x[:-1], x[1:]))
+        require_simple_closed(system, "VariationalIntegrator")
+        x = checked_run_states(system, x)
+        return np.asarray(_step_energies(self, system, checked_step_size(h), x[:-1], x[1:]))
 
-    def explain(self, system: System, x, k, h) -> str:
+    def why_step_failed(self, system: System, x, k, h) -> str:
         if not isinstance(system, SimpleClosedSystem) or system.configurations is not None:
             return ""
         n = system.degrees_of_freedom
         q0, _, S0, t = system.parts(jnp.asarray(x))
         slope = jnp.nan_to_num(jnp.asarray(k)[0])
-        matrix = np.asarray(_regularity(self.discrete(system, h, t), q0, q0 + h * slope[:n], S0, S0 + h * slope[2 * n]))
+        matrix = np.asarray(
+            _regularity_matrix(self.discrete_system(system, h, t), q0, q0 + h * slope[:n], S0, S0 + h * slope[2 * n])
+        )
         if not np.isfinite(matrix).all():
             return ""
         size = np.abs(matrix).max(axis=1, keepdims=True)
         singular = np.linalg.svd(matrix / np.where(size > 0.0, size, 1.0), compute_uv=False)
-        if singular[0] < SINGULAR * singular[-1]:
+        if singular[0] < SINGULAR_CONDITION_NUMBER * singular[-1]:
             return ""
         return (
             f"the regularity matrix (3.13) is singular: of its singular values, rows scaled to 1, the least is "
@@ -295,16 +316,29 @@ class VariationalIntegrator(OneStepMethod):
 # -- helpers ----------------------------------------------------------------------------------------------------------
 
 
-SYMMETRIC = (None, "exp", "midpoint", "euclidean", "midpoint_euclidean", "group_exp", "midpoint_group_exp")
-LINES = (mf.RiemannianRetraction, mf.EuclideanRetraction, mf.GroupRetraction, mf.MidpointRetraction)
+SYMMETRIC_RETRACTION_NAMES = (
+    None,
+    "exp",
+    "midpoint",
+    "euclidean",
+    "midpoint_euclidean",
+    "group_exp",
+    "midpoint_group_exp",
+)
+SYMMETRIC_RETRACTION_TYPES = (
+    mf.RiemannianRetraction,
+    mf.EuclideanRetraction,
+    mf.GroupRetraction,
+    mf.MidpointRetraction,
+)
 """Retractions of which a line through two points is the same in the charts around both."""
 
 
-def need_simple_closed(system: System, name: str) -> None:
+def require_simple_closed(system: System, name: str) -> None:
     if isinstance(system, EmbeddedSystem):
         raise InputError(f"{name} runs on R^n: on a manifold take lt.VariationalIntegrator or a metriplectic method")
     if not isinstance(system, SimpleClosedSystem):
-        raise InputError(f"{name} runs an lt.SimpleClosedSystem, not a {kind_of(system)}")
+        raise InputError(f"{name} runs an lt.SimpleClosedSystem, not a {kind_name(system)}")
 
 
 SCHEMES: dict[str, tuple[FiniteDifference, ...]] = {
@@ -315,7 +349,7 @@ SCHEMES: dict[str, tuple[FiniteDifference, ...]] = {
 """The schemes of GBY §3.3 by name."""
 
 
-def _maps(maps: Maps, what: str) -> tuple[FiniteDifference, ...]:
+def _checked_maps(maps: Maps, what: str) -> tuple[FiniteDifference, ...]:
     named = SCHEMES.get(maps, ()) if isinstance(maps, str) else maps
     found: tuple[Any, ...] = tuple(named) if isinstance(named, Sequence) else (named,)
     if not found or not all(isinstance(map, FiniteDifference) for map in found):
@@ -326,31 +360,31 @@ def _maps(maps: Maps, what: str) -> tuple[FiniteDifference, ...]:
     return found
 
 
-def _is_symmetric(maps: tuple[FiniteDifference, ...]) -> bool:
-    return Counter(maps) == Counter(map.mirrored() for map in maps)
+def _is_symmetric_set(maps: tuple[FiniteDifference, ...]) -> bool:
+    return Counter(maps) == Counter(map.reversed_map() for map in maps)
 
 
-@program
-def _misfit(discrete: DiscreteSystem, q0, q1, S0, S1):
+@jit_program
+def _constraint_residual(discrete: DiscreteSystem, q0, q1, S0, S1):
     """``h |P_d|``, and the heat and work between which it is one."""
     pair = discrete.pair(q0, q1, S0, S1)
-    misfit, slope = jax.jvp(lambda s: discrete.production(pair._replace(s=s)), (pair.s,), (jnp.ones(()),))
+    misfit, slope = jax.jvp(lambda s: discrete.constraint_residual(pair._replace(s=s)), (pair.s,), (jnp.ones(()),))
     heat = jnp.abs(slope * pair.s)
     return discrete.h * jnp.abs(misfit), discrete.h * (heat + jnp.abs(misfit - slope * pair.s)) + 1e-300
 
 
-@program
-def _energies(method: VariationalIntegrator, system: SimpleClosedSystem, h, before, after):
-    def one(x, y):
+@jit_program
+def _step_energies(method: VariationalIntegrator, system: SimpleClosedSystem, h, before, after):
+    def step_energy(x, y):
         (q0, _, S0, t), (q1, _, S1, _) = system.parts(x), system.parts(y)
-        discrete = method.discrete(system, h, t)
+        discrete = method.discrete_system(system, h, t)
         return discrete.energy(discrete.pair(q0, q1, S0, S1))
 
-    return jax.vmap(one)(before, after)
+    return jax.vmap(step_energy)(before, after)
 
 
-@program
-def _regularity(discrete: DiscreteSystem, q0, q1, S0, S1):
+@jit_program
+def _regularity_matrix(discrete: DiscreteSystem, q0, q1, S0, S1):
     return discrete.regularity_matrix(q0, q1, S0, S1)
 
 

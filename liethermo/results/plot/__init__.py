@@ -1,6 +1,6 @@
 """Pictures of runs and of studies: ``lt.plot``."""
 
-from manifolds._names import listing
+from manifolds._names import public_dir
 
 from .along_time import laws
 from .fields import sphere_field
@@ -8,4 +8,4 @@ from .studies import study
 from .surfaces import momentum_sphere
 
 __all__ = ["laws", "momentum_sphere", "sphere_field", "study"]
-__dir__ = listing(__all__)
+__dir__ = public_dir(__all__)

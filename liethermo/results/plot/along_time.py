@@ -11,9 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ...functions.gradients import EPS
-from ..audit import LAW_FAILS, Audit
+from ..audit import LAW_FAILURE_VERDICT, Audit
 from ..solution import Solution
-from .figures import BLUE, DPI, GREEN, GREY, RED, finished, writable
+from .figures import BLUE, DPI, GREEN, GREY, RED, checked_figure_path, save_figure
 
 
 def laws(solution: Solution, path: str | os.PathLike | None = None) -> Figure:
@@ -36,7 +36,7 @@ def laws(solution: Solution, path: str | os.PathLike | None = None) -> Figure:
     FileError
         If the file cannot be written.
     """
-    path = writable(path)
+    path = checked_figure_path(path)
     panels, audit = 1 if solution.entropy is None else 3, solution.audit()
     figure, axes = plt.subplots(
         panels, sharex=True, squeeze=False, figsize=(6.4, 1.1 + 1.7 * panels), dpi=DPI, layout="constrained"
@@ -44,14 +44,14 @@ def laws(solution: Solution, path: str | os.PathLike | None = None) -> Figure:
     _draw_energy(axes[0, 0], solution.t, solution.energy_balance, " - W" if solution.laws.balance else "")
     if solution.entropy is not None:
         _draw_entropy(axes[1, 0], solution.t, solution.entropy)
-        _draw_production(axes[2, 0], solution.t, solution.entropy, _rounding(audit))
+        _draw_production(axes[2, 0], solution.t, solution.entropy, _allowed_entropy_fall(audit))
     for ax in axes[:, 0]:
         ax.spines[["top", "right"]].set_visible(False)
         ax.margins(x=0.0)
     axes[-1, 0].set_xlabel("time")
     figure.align_ylabels()
-    figure.suptitle(_verdict(audit), color="black" if audit.passed else RED, fontsize="medium")
-    return finished(figure, path)
+    figure.suptitle(_verdict_title(audit), color="black" if audit.passed else RED, fontsize="medium")
+    return save_figure(figure, path)
 
 
 def _draw_energy(ax: Axes, t: np.ndarray, H: np.ndarray, less: str) -> None:
@@ -82,7 +82,7 @@ def _draw_entropy(ax: Axes, t: np.ndarray, S: np.ndarray) -> None:
         ax.annotate(f"{S[-1]:.6g}", (1.0, S[-1]), (0, -4), across, "offset points", **style)
 
 
-def _rounding(audit: Audit) -> float:
+def _allowed_entropy_fall(audit: Audit) -> float:
     """Fall of the entropy in one step that the audit allows."""
     return next((-row.tolerance for row in audit.rows if row.law == "least entropy increment" and row.tolerance), 0.0)
 
@@ -106,10 +106,10 @@ def _draw_production(ax: Axes, t: np.ndarray, S: np.ndarray, rounding: float) ->
     ax.set_ylabel("production $dS/dt$")
 
 
-def _verdict(audit: Audit) -> str:
+def _verdict_title(audit: Audit) -> str:
     failing = [row for row in audit.rows if row.passed is False]
     if failing:
-        law = audit.verdict == LAW_FAILS
+        law = audit.verdict == LAW_FAILURE_VERDICT
         return ("A law fails: " if law else f"{audit.verdict.capitalize()}: ") + "; ".join(
             f"{row.law} {row.value:.2g}" + (f" ({row.note})" if row.note else "") for row in failing
         )

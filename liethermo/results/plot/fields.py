@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ...errors import InputError
-from .figures import DPI, finished, writable
+from .figures import DPI, checked_figure_path, save_figure
 
 
 def sphere_field(
@@ -42,7 +42,7 @@ def sphere_field(
     FileError
         If the file cannot be written.
     """
-    path = writable(path)
+    path = checked_figure_path(path)
     field = np.asarray(values)
     if field.ndim != 2 or min(field.shape) < 2 or field.dtype.kind not in "fiu":
         raise InputError(f"values on the sphere have shape (latitudes, longitudes), not {np.shape(values)}")
@@ -61,4 +61,4 @@ def sphere_field(
     figure = ax.get_figure(root=True)
     assert figure is not None
     figure.colorbar(picture, ax=ax, shrink=0.8)
-    return finished(figure, path)
+    return save_figure(figure, path)

@@ -19,14 +19,14 @@ DPI = 150
 BLUE, ORANGE, GREEN, RED, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "0.55"
 
 
-def writable(path: str | os.PathLike | None) -> Path | None:
+def checked_figure_path(path: str | os.PathLike | None) -> Path | None:
     """The path of a figure, whose suffix is one of those that can be written."""
     if path is not None and Path(path).suffix.lower() not in SUFFIXES:
         raise InputError(f"a figure is written as {', '.join(SUFFIXES)}, and {Path(path).name!r} ends in none of them")
     return None if path is None else Path(path)
 
 
-def finished(figure: Figure, path: Path | None) -> Figure:
+def save_figure(figure: Figure, path: Path | None) -> Figure:
     """The figure, written to the path and closed if there is one."""
     if path is not None:
         drawn = io.BytesIO()
@@ -35,7 +35,7 @@ def finished(figure: Figure, path: Path | None) -> Figure:
         finally:
             plt.close(figure)
         try:
-            disk.write(path, drawn.getbuffer())
+            disk.write_atomically(path, drawn.getbuffer())
         except (OSError, ValueError) as error:  # the latter for what is no path
-            raise FileError(f"cannot write {path}: {disk.why(error)}") from error
+            raise FileError(f"cannot write {path}: {disk.why_os_failed(error)}") from error
     return figure

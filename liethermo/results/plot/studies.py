@@ -14,18 +14,18 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
 from ...errors import InputError
-from .figures import BLUE, DPI, GREEN, GREY, ORANGE, RED, finished, writable
+from .figures import BLUE, DPI, GREEN, GREY, ORANGE, RED, checked_figure_path, save_figure
 
 if TYPE_CHECKING:
     import xarray
 
-OF_THE_STORE = ("status", "message", "laws")
+NON_MEASURE_VARIABLES = ("status", "message", "laws")
 """Variables that are no measures."""
 
-FEW = 10
+MAX_CLASSES = 10
 """Different whole numbers up to which values are classes, each with a colour of its own."""
 
-HATCH: dict[str, Any] = {"hatch": "////", "facecolor": "0.93", "edgecolor": GREY, "linewidth": 0.0}
+HATCH_STYLE: dict[str, Any] = {"hatch": "////", "facecolor": "0.93", "edgecolor": GREY, "linewidth": 0.0}
 
 
 def study(
@@ -62,11 +62,11 @@ def study(
     FileError
         If the file cannot be written.
     """
-    path = writable(path)
+    path = checked_figure_path(path)
     if "status" not in dataset:
         raise InputError("this dataset is not one of a study: it has no variable status")
     axes = [str(dim) for dim in dataset["status"].dims]
-    values = dataset[_chosen(dataset, axes, variable)]
+    values = dataset[_measure_name(dataset, axes, variable)]
     more = [str(dim) for dim in values.dims if dim not in axes]
     own = {name: c for name, c in dataset.coords.items() if c.dims == tuple(axes) and name not in axes}
     columns = [str(name) for name, c in own.items() if c.dtype.kind in "fiu"]
@@ -76,18 +76,18 @@ def study(
         raise InputError(f"a picture has one or two axes, and {values.name} has {dims}: choose with results.isel(...)")
     if ax is None:
         _, ax = plt.subplots(figsize=(6.4, 4.4), dpi=DPI, layout="constrained")
-    failed = _failed(dataset)
+    failed = _has_failed(dataset)
     if sample:
         _draw_points(ax, values, failed, *(dataset[name] for name in columns[:2]))
     elif len(axes) == 1:
         _draw_lines(ax, values.transpose(axes[0], *more), failed, dataset[axes[0]])
     else:
         _draw_map(ax, values.transpose(*axes), failed.transpose(*axes), contours)
-    return finished(ax.figure, path)  # type: ignore[arg-type]
+    return save_figure(ax.figure, path)  # type: ignore[arg-type]
 
 
-def _chosen(dataset: xarray.Dataset, axes: list[str], variable: str | None) -> str:
-    measures = [str(name) for name in dataset.data_vars if name not in OF_THE_STORE]
+def _measure_name(dataset: xarray.Dataset, axes: list[str], variable: str | None) -> str:
+    measures = [str(name) for name in dataset.data_vars if name not in NON_MEASURE_VARIABLES]
     if variable is not None:
         if variable not in measures:
             raise InputError(f"there is no measure {variable!r}; there are {', '.join(measures)}")
@@ -98,7 +98,7 @@ def _chosen(dataset: xarray.Dataset, axes: list[str], variable: str | None) -> s
     return (plain or measures)[0]
 
 
-def _failed(dataset: xarray.Dataset) -> xarray.DataArray:
+def _has_failed(dataset: xarray.Dataset) -> xarray.DataArray:
     """Where a point came to another end than the one it should."""
     codes = dict(zip(dataset["status"].flag_meanings.split(), dataset["status"].flag_values, strict=True))
     return ~dataset["status"].isin([codes[name] for name in ("completed", "event", "missing") if name in codes])
@@ -116,7 +116,7 @@ def _is_geometric(places: np.ndarray) -> bool:
     return bool(spread[1] < 0.1 < spread[0])
 
 
-def _edges(places: np.ndarray) -> np.ndarray:
+def _cell_edges(places: np.ndarray) -> np.ndarray:
     """The edges of cells around places: the middles between them, as the axis is scaled."""
     if len(places) == 1:
         return places[0] + np.array([-0.5, 0.5]) * (abs(places[0]) or 1.0)
@@ -126,7 +126,7 @@ def _edges(places: np.ndarray) -> np.ndarray:
     return np.exp(edges) if _is_geometric(places) else edges
 
 
-def _places(coordinate: xarray.DataArray) -> np.ndarray:
+def _axis_values(coordinate: xarray.DataArray) -> np.ndarray:
     """Numbers along an axis; texts have the numbers from 0 on."""
     return coordinate.to_numpy().astype(float) if coordinate.dtype.kind in "fiub" else np.arange(coordinate.size) * 1.0
 
@@ -140,10 +140,10 @@ def _set_axis(ax: Axes, which: str, coordinate: xarray.DataArray, places: np.nda
     axis.set_label_text(_label(coordinate))
 
 
-def _colours(values: np.ndarray) -> dict[str, Any]:
+def _colour_map(values: np.ndarray) -> dict[str, Any]:
     """A map that is even in lightness; for classes a colour each."""
     known = np.unique(values[np.isfinite(values)])
-    if 0 < len(known) <= FEW and (known == np.round(known)).all():
+    if 0 < len(known) <= MAX_CLASSES and (known == np.round(known)).all():
         classes = np.arange(known.min(), known.max() + 2) - 0.5
         return {"cmap": plt.get_cmap("viridis", len(classes) - 1), "norm": BoundaryNorm(classes, len(classes) - 1)}
     return {"cmap": "viridis"}
@@ -151,24 +151,24 @@ def _colours(values: np.ndarray) -> dict[str, Any]:
 
 def _draw_map(ax: Axes, values: xarray.DataArray, failed: xarray.DataArray, contours: int) -> None:
     down, across = (values[dim] for dim in values.dims)
-    y, x = _places(down), _places(across)
+    y, x = _axis_values(down), _axis_values(across)
     rows, columns = np.argsort(y), np.argsort(x)
     y, x, z = y[rows], x[columns], values.to_numpy()[np.ix_(rows, columns)]
     bad = failed.to_numpy()[np.ix_(rows, columns)]
-    colours, seen = _colours(z), np.ma.masked_invalid(np.where(bad, np.nan, z))
-    mesh = ax.pcolormesh(_edges(x), _edges(y), seen, rasterized=True, **colours)
+    colours, seen = _colour_map(z), np.ma.masked_invalid(np.where(bad, np.nan, z))
+    mesh = ax.pcolormesh(_cell_edges(x), _cell_edges(y), seen, rasterized=True, **colours)
     bar = ax.figure.colorbar(mesh, ax=ax, label=_label(values))
     if "norm" in colours:
         bar.set_ticks(np.unique(z[np.isfinite(z)]).tolist())
     elif contours and min(z.shape) > 2 and seen.count() > 3 and np.ptp(seen.compressed()) > 0.0:
         lines = ax.contour(x, y, seen, contours, colors="white", linewidths=0.6, alpha=0.8)
         ax.clabel(lines, fontsize="xx-small", fmt="%.3g")
-    _hatch(ax, _edges(x), _edges(y), bad)
-    for which, coordinate, places in (("x", across, _places(across)), ("y", down, _places(down))):
+    _hatch_cells(ax, _cell_edges(x), _cell_edges(y), bad)
+    for which, coordinate, places in (("x", across, _axis_values(across)), ("y", down, _axis_values(down))):
         _set_axis(ax, which, coordinate, places)
 
 
-def _hatch(ax: Axes, x: np.ndarray, y: np.ndarray, bad: np.ndarray) -> None:
+def _hatch_cells(ax: Axes, x: np.ndarray, y: np.ndarray, bad: np.ndarray) -> None:
     """Hatch cells, neighbours in a row together."""
     patches = []
     for i, row in enumerate(bad):
@@ -176,18 +176,18 @@ def _hatch(ax: Axes, x: np.ndarray, y: np.ndarray, bad: np.ndarray) -> None:
         for first, last in zip(turns[::2], turns[1::2], strict=True):
             patches.append(Rectangle((x[first], y[i]), x[last] - x[first], y[i + 1] - y[i]))
     if patches:
-        ax.add_collection(PatchCollection(patches, **HATCH), autolim=False)
-        _tell_of_failures(ax)
+        ax.add_collection(PatchCollection(patches, **HATCH_STYLE), autolim=False)
+        _add_failure_legend(ax)
 
 
-def _tell_of_failures(ax: Axes) -> None:
+def _add_failure_legend(ax: Axes) -> None:
     handles, labels = ax.get_legend_handles_labels()
-    handles, labels = [*handles, Patch(**HATCH)], [*labels, "failed"]
+    handles, labels = [*handles, Patch(**HATCH_STYLE)], [*labels, "failed"]
     ax.legend(handles, labels, loc="upper left", fontsize="small", framealpha=0.9)
 
 
 def _draw_lines(ax: Axes, values: xarray.DataArray, failed: xarray.DataArray, coordinate: xarray.DataArray) -> None:
-    places = _places(coordinate)
+    places = _axis_values(coordinate)
     order = np.argsort(places)
     z, bad = values.to_numpy().reshape(len(places), -1)[order], failed.to_numpy()[order]
     names = values[values.dims[1]].to_numpy() if values.ndim == 2 else [""]
@@ -197,14 +197,14 @@ def _draw_lines(ax: Axes, values: xarray.DataArray, failed: xarray.DataArray, co
             {"color": colours[k], "label": str(name)} if len(names) <= len(colours) and values.ndim == 2 else {}
         )
         ax.plot(places[order], np.where(bad, np.nan, z[:, k]), marker="." if len(places) < 60 else "", **style)
-    edges = _edges(places[order])
+    edges = _cell_edges(places[order])
     for i in np.flatnonzero(bad):
-        ax.axvspan(edges[i], edges[i + 1], zorder=0, **HATCH)
+        ax.axvspan(edges[i], edges[i + 1], zorder=0, **HATCH_STYLE)
     _set_axis(ax, "x", coordinate, places)
     ax.set_ylabel(_label(values))
     ax.spines[["top", "right"]].set_visible(False)
     if bad.any():
-        _tell_of_failures(ax)
+        _add_failure_legend(ax)
     elif values.ndim == 2 and len(names) <= len(colours):
         ax.legend(frameon=False, fontsize="small")
 
@@ -213,7 +213,7 @@ def _draw_points(
     ax: Axes, values: xarray.DataArray, failed: xarray.DataArray, x: xarray.DataArray, y: xarray.DataArray
 ) -> None:
     z, bad = values.to_numpy(), failed.to_numpy()
-    colours = _colours(z[~bad])
+    colours = _colour_map(z[~bad])
     good = ~bad & np.isfinite(z)
     points = ax.scatter(x.to_numpy()[good], y.to_numpy()[good], c=z[good], s=14, linewidth=0, **colours)
     ax.figure.colorbar(points, ax=ax, label=_label(values))

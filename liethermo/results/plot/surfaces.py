@@ -23,14 +23,14 @@ from scipy.ndimage import map_coordinates
 from ...errors import InputError
 from ...systems import System
 from ..solution import Solution
-from .figures import BLUE, DPI, GREY, ORANGE, finished, writable
+from .figures import BLUE, DPI, GREY, ORANGE, checked_figure_path, save_figure
 
-MOST_SEGMENTS = 20_000
+MAX_SEGMENTS = 20_000
 """A longer trajectory is thinned for the 3D picture, in which each segment is drawn by itself."""
 
-TIME_MAP = plt.get_cmap("viridis")
+TIME_COLORMAP = plt.get_cmap("viridis")
 
-Function = Callable[[np.ndarray], np.ndarray]  # points, shape (..., 3), to values, shape (...)
+PointFunction = Callable[[np.ndarray], np.ndarray]  # points, shape (..., 3), to values, shape (...)
 
 
 def momentum_sphere(
@@ -71,9 +71,9 @@ def momentum_sphere(
     FileError
         If the file cannot be written.
     """
-    path = writable(path)
+    path = checked_figure_path(path)
     if system is not None and system.body_dim < system.dim == solution.x.shape[1]:
-        solution = _without_baths(solution, system)
+        solution = _body_solution(solution, system)
     if solution.x.shape[1] != 3:
         raise InputError(
             f"momentum_sphere draws states of 3 components, not {solution.x.shape[1]}; lt.plot.laws draws any, and "
@@ -85,12 +85,12 @@ def momentum_sphere(
         raise InputError("ax must be three-dimensional: make it with subplot_kw={'projection': '3d'}")
     if ax is None:
         ax = plt.figure(figsize=(6.4, 5.2), dpi=DPI, layout="constrained").add_subplot(projection="3d")
-        _look_at(solution.x[-1], ax)
+        _turn_axes_towards(solution.x[-1], ax)
     ax.set_proj_type("ortho")
     ax.computed_zorder = False  # what is behind what is settled here, by the zorder of each piece
 
     scene = _Scene(ax, solution.x)
-    kept, changing = _quantities(solution, system)
+    kept, changing = _conserved_and_changing(solution, system)
     if kept is not None:
         scene.draw_solid(kept.function, kept.label(0))
     if changing is not None:
@@ -98,7 +98,7 @@ def momentum_sphere(
         scene.draw_sections(changing.function, 0, ORANGE, changing.label(0))
         if not changing.is_constant:
             scene.draw_sections(changing.function, -1, BLUE, changing.label(-1))
-    _draw_path(solution, scene)
+    _draw_trajectory(solution, scene)
 
     name = "x" if solution.provenance.get("algebra") is None else r"\mu"
     algebra = None if system is None else system.lie_algebra
@@ -112,18 +112,18 @@ def momentum_sphere(
     ax.set_box_aspect((1, 1, 1), zoom=0.95)
     ax.set_aspect("equal", adjustable="datalim")
     ax.legend(loc="upper left", frameon=False, fontsize="small", handlelength=1.2)
-    return finished(ax.figure, path)
+    return save_figure(ax.figure, path)
 
 
-def _without_baths(solution: Solution, system: System) -> Solution:
+def _body_solution(solution: Solution, system: System) -> Solution:
     """The body alone: its states, and the energy that it has left."""
     x = solution.x[:, : system.body_dim]
-    energy = np.asarray(_of_body(system.energy, system)(x))
+    energy = np.asarray(_restrict_to_body(system.energy, system)(x))
     laws = dataclasses.replace(solution.laws, energy="nonincreasing")
     return dataclasses.replace(solution, x=x, energy=energy, entropy=None, laws=laws)
 
 
-def _of_body(function: Callable, system: System) -> Callable:
+def _restrict_to_body(function: Callable, system: System) -> Callable:
     """A function of the states of a system as one of its body, the entropies of baths being zero."""
     number = system.dim - system.body_dim
     return lambda x: function(jnp.concatenate([x, jnp.zeros((*x.shape[:-1], number))], axis=-1))
@@ -134,7 +134,7 @@ class _Quantity:
     """A function of the state and its values along a run."""
 
     name: str
-    function: Function
+    function: PointFunction
     values: np.ndarray
 
     @property
@@ -146,17 +146,17 @@ class _Quantity:
         return f"{self.name}{when} ${self.values[index]:.4g}$"
 
 
-def _quantities(solution: Solution, system: System | None) -> tuple[_Quantity | None, _Quantity | None]:
+def _conserved_and_changing(solution: Solution, system: System | None) -> tuple[_Quantity | None, _Quantity | None]:
     """Energy and entropy, or whatever stands for them, as far as they are known; the conserved one first."""
-    energy: Function | None
-    entropy: Function | None
+    energy: PointFunction | None
+    entropy: PointFunction | None
     if system is not None:
-        energy = _vectorized(_of_body(system.energy, system))
+        energy = _vectorize_in_blocks(_restrict_to_body(system.energy, system))
         own = system.entropy if system.body_dim == system.dim else None  # that of baths is no function of the body
         second = own or next((J for J, kept in system.invariants().values() if kept), None)
-        entropy = None if second is None else _vectorized(_of_body(second, system))
+        entropy = None if second is None else _vectorize_in_blocks(_restrict_to_body(second, system))
     else:
-        energy = _quadric_through(solution.x) if solution.laws.energy == "conserved" else None
+        energy = _fit_quadric(solution.x) if solution.laws.energy == "conserved" else None
         spheres = solution.provenance.get("algebra") in ("so(3)", "su(2)", "bianchi('IX')")
         entropy = (lambda x: (x * x).sum(axis=-1)) if spheres else None
     found = [None if energy is None else _Quantity("energy", energy, solution.energy), None]
@@ -167,7 +167,7 @@ def _quantities(solution: Solution, system: System | None) -> tuple[_Quantity | 
     return (found[0], found[1]) if solution.laws.energy == "conserved" else (found[1], found[0])
 
 
-def _vectorized(function: Callable, block: int = 8192) -> Function:
+def _vectorize_in_blocks(function: Callable, block: int = 8192) -> PointFunction:
     """The function on arrays of points of any shape, in blocks of one size so that it is compiled once."""
     compiled = jax.jit(lambda x: function(x))
 
@@ -179,7 +179,7 @@ def _vectorized(function: Callable, block: int = 8192) -> Function:
     return values
 
 
-def _quadric_through(states: np.ndarray) -> Function | None:
+def _fit_quadric(states: np.ndarray) -> PointFunction | None:
     """The polynomial of degree two that vanishes at all states, where there is one and only one up to a factor."""
     scale = float(np.abs(states).max()) or 1.0
     i, j = np.triu_indices(3)
@@ -204,37 +204,37 @@ class _LevelSurface:
         Whether some ray meets it and none meets it twice; whether every ray meets it.
     """
 
-    def __init__(self, function: Function, point: np.ndarray, size: float):
-        self.function, self.level, self.size = function, float(function(point)), size
+    def __init__(self, function: PointFunction, point: np.ndarray, size: float):
+        self.function, self.level, self.extent = function, float(function(point)), size
         self.radii = np.append(0.0, np.geomspace(0.01 * size, 10.0 * size, 60))
-        meetings = self._crossed(_sphere(16, 32)).sum(axis=0)
+        meetings = self._ray_crossings(_sphere_grid(16, 32)).sum(axis=0)
         self.is_simple, self.is_closed = bool(meetings.max() == 1), bool((meetings == 1).all())
 
-    def along(self, directions: np.ndarray) -> np.ndarray:
+    def intersect_rays(self, directions: np.ndarray) -> np.ndarray:
         """Where rays from the origin along unit vectors (..., 3) meet it, NaN where they do not, shape (..., 3)."""
-        crossed = self._crossed(directions)
+        crossed = self._ray_crossings(directions)
         first = crossed.argmax(axis=0)
         low, high = self.radii[first], self.radii[first + 1]
-        above = self._above(low[..., None] * directions)
+        above = self._is_above_level(low[..., None] * directions)
         for _ in range(40):
             middle = (low + high) / 2
-            before = self._above(middle[..., None] * directions) == above
+            before = self._is_above_level(middle[..., None] * directions) == above
             low, high = np.where(before, middle, low), np.where(before, high, middle)
-        met = crossed.any(axis=0) & (self.is_closed | (high <= 1.5 * self.size))
+        met = crossed.any(axis=0) & (self.is_closed | (high <= 1.5 * self.extent))
         return np.where(met[..., None], high[..., None] * directions, np.nan)
 
     def hides(self, points: np.ndarray, view: np.ndarray) -> np.ndarray:
         """Whether it stands between points (..., 3) and an eye far away in the direction ``view``, shape (...)."""
-        depths = np.geomspace(0.01, 20.0, 80) * self.size
-        above = self._above(points + depths.reshape(-1, *[1] * points.ndim) * view)
+        depths = np.geomspace(0.01, 20.0, 80) * self.extent
+        above = self._is_above_level(points + depths.reshape(-1, *[1] * points.ndim) * view)
         return (above[1:] != above[:-1]).any(axis=0)
 
-    def _above(self, points: np.ndarray) -> np.ndarray:
+    def _is_above_level(self, points: np.ndarray) -> np.ndarray:
         return self.function(points) > self.level
 
-    def _crossed(self, directions: np.ndarray) -> np.ndarray:
+    def _ray_crossings(self, directions: np.ndarray) -> np.ndarray:
         """In which intervals of ``radii`` rays meet it, shape (intervals, ...)."""
-        above = self._above(self.radii.reshape(-1, *[1] * directions.ndim) * directions)
+        above = self._is_above_level(self.radii.reshape(-1, *[1] * directions.ndim) * directions)
         return above[1:] != above[:-1]
 
 
@@ -242,62 +242,64 @@ class _Scene:
     """One solid and curves around it, those parts left out that the solid hides."""
 
     def __init__(self, ax: Axes3D, states: np.ndarray):
-        self.ax, self.states, self.view = ax, states, _viewpoint(ax)
-        self.size = float(np.linalg.norm(states, axis=1).max()) or 1.0
+        self.ax, self.states, self.view_direction = ax, states, _view_direction(ax)
+        self.extent = float(np.linalg.norm(states, axis=1).max()) or 1.0
         self.solid: _LevelSurface | None = None
 
-    def draw_solid(self, function: Function, label: str) -> None:
+    def draw_solid(self, function: PointFunction, label: str) -> None:
         """The level surface of the function through the first state, with its outline; sections if it is open."""
-        surface = _LevelSurface(function, self.states[0], self.size)
+        surface = _LevelSurface(function, self.states[0], self.extent)
         if not surface.is_closed:
             self.draw_sections(function, 0, GREY, label)
             return
-        self.solid, self.mesh = surface, surface.along(_sphere(96, 192))
+        self.solid, self.mesh = surface, surface.intersect_rays(_sphere_grid(96, 192))
         normals = np.cross(np.gradient(self.mesh, axis=0), np.gradient(self.mesh, axis=1))
         normals[[0, -1]] = normals[[1, -2]]  # at the poles of the mesh all longitudes meet
         normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-        grey = 0.80 + 0.18 * normals @ (0.6 * self.view + [0.0, 0.0, 0.8])  # lit from in front and above
+        grey = 0.80 + 0.18 * normals @ (0.6 * self.view_direction + [0.0, 0.0, 0.8])  # lit from in front and above
         shades = np.repeat(np.clip(grey, 0.0, 1.0)[..., None], 3, axis=-1)
         style = {"rstride": 1, "cstride": 1, "shade": False, "antialiased": False, "linewidth": 0, "zorder": 1}
         self.ax.plot_surface(*np.moveaxis(self.mesh, -1, 0), facecolors=shades, **style)
         self.ax.plot([], [], [], "s", color="0.85", label=label)
-        for line in _contours(self.mesh, normals @ self.view, 0.0):
+        for line in _level_curves(self.mesh, normals @ self.view_direction, 0.0):
             self._draw_line(line, color=GREY, linewidth=0.8)
 
-    def draw_contours(self, function: Function, count: int) -> None:
+    def draw_contours(self, function: PointFunction, count: int) -> None:
         """Curves on the solid along which the function is constant."""
         if self.solid is not None:
             values = function(self.mesh)
             for level in np.linspace(values.min(), values.max(), count + 2)[1:-1]:
                 self._draw_contour(values, level, color=GREY, linewidth=0.4)
 
-    def draw_sections(self, function: Function, index: int, color: str, label: str) -> None:
+    def draw_sections(self, function: PointFunction, index: int, color: str, label: str) -> None:
         """The level surface of the function through a state: plane sections, and where it cuts the solid."""
-        surface = _LevelSurface(function, self.states[index], self.size)
+        surface = _LevelSurface(function, self.states[index], self.extent)
         if not surface.is_simple:
             return
-        for normal in (*np.eye(3), self.view):
-            section = surface.along(_circle(normal))
-            seen, far = ~self.hidden(section), surface.hides(section, self.view)
+        for normal in (*np.eye(3), self.view_direction):
+            section = surface.intersect_rays(_great_circle(normal))
+            seen, far = ~self.is_hidden(section), surface.hides(section, self.view_direction)
             self._draw_line(section, seen & ~far, color=color, linewidth=0.7)
             self._draw_line(section, seen & far, color=color, linewidth=0.7, alpha=0.3)
         if self.solid is not None:
             self._draw_contour(function(self.mesh), surface.level, color=color, linewidth=1.2)
         self.ax.plot([], [], [], color=color, label=label)
 
-    def hidden(self, points: np.ndarray) -> np.ndarray:
+    def is_hidden(self, points: np.ndarray) -> np.ndarray:
         """Whether the solid hides the points, shape (m, 3)."""
-        return np.zeros(len(points), dtype=bool) if self.solid is None else self.solid.hides(points, self.view)
+        return (
+            np.zeros(len(points), dtype=bool) if self.solid is None else self.solid.hides(points, self.view_direction)
+        )
 
     def _draw_line(self, points: np.ndarray, seen: np.ndarray | bool = True, **style) -> None:
         self.ax.plot(*np.where(np.reshape(seen, (-1, 1)), points, np.nan).T, zorder=2, **style)
 
     def _draw_contour(self, values: np.ndarray, level: float, **style) -> None:
-        for line in _contours(self.mesh, values, level):
-            self._draw_line(line, ~self.hidden(line), **style)
+        for line in _level_curves(self.mesh, values, level):
+            self._draw_line(line, ~self.is_hidden(line), **style)
 
 
-def _contours(mesh: np.ndarray, values: np.ndarray, level: float) -> Iterator[np.ndarray]:
+def _level_curves(mesh: np.ndarray, values: np.ndarray, level: float) -> Iterator[np.ndarray]:
     """The curves, shape (m, 3), in a mesh (rows, columns, 3) along which values (rows, columns) equal the level."""
     contours: Any = contour_generator(z=values)
     for line in contours.lines(level):
@@ -305,14 +307,14 @@ def _contours(mesh: np.ndarray, values: np.ndarray, level: float) -> Iterator[np
         yield np.stack([map_coordinates(mesh[..., k], [row, column], order=1) for k in range(3)], axis=-1)
 
 
-def _draw_path(solution: Solution, scene: _Scene) -> None:
+def _draw_trajectory(solution: Solution, scene: _Scene) -> None:
     """The trajectory, coloured by time and pale where it is hidden; its start and its end."""
     last = len(solution.t) - 1
-    kept = np.linspace(0, last, min(last, MOST_SEGMENTS) + 1).round().astype(int)
+    kept = np.linspace(0, last, min(last, MAX_SEGMENTS) + 1).round().astype(int)
     t, x = solution.t[kept], solution.x[kept]
-    hidden = scene.hidden(x)
+    hidden = scene.is_hidden(x)
     scale = Normalize(solution.t[0], solution.t[-1])
-    segments, colors = np.stack([x[:-1], x[1:]], axis=1), TIME_MAP(scale((t[:-1] + t[1:]) / 2))
+    segments, colors = np.stack([x[:-1], x[1:]], axis=1), TIME_COLORMAP(scale((t[:-1] + t[1:]) / 2))
     behind = hidden[:-1] & hidden[1:]
     for part, alpha, zorder in ((behind, 0.25, 3), (~behind, 1.0, 4)):
         if part.any():
@@ -324,31 +326,31 @@ def _draw_path(solution: Solution, scene: _Scene) -> None:
         scene.ax.plot(*x[[i]].T, "o", alpha=0.25 if hidden[i] else 1.0, **style)
         scene.ax.plot([], [], [], "o", label=label, **style)
     bar = {"label": "time", "shrink": 0.6, "pad": 0.05, "aspect": 30}
-    scene.ax.figure.colorbar(ScalarMappable(scale, TIME_MAP), ax=scene.ax, **bar)
+    scene.ax.figure.colorbar(ScalarMappable(scale, TIME_COLORMAP), ax=scene.ax, **bar)
 
 
-def _sphere(rows: int, columns: int) -> np.ndarray:
+def _sphere_grid(rows: int, columns: int) -> np.ndarray:
     """Unit vectors by latitude and longitude, shape (rows + 1, columns + 1, 3)."""
     theta, phi = np.meshgrid(np.linspace(0, np.pi, rows + 1), np.linspace(0, 2 * np.pi, columns + 1), indexing="ij")
     return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
 
 
-def _circle(normal: np.ndarray, points: int = 360) -> np.ndarray:
+def _great_circle(normal: np.ndarray, points: int = 360) -> np.ndarray:
     """Unit vectors orthogonal to ``normal``, shape (points + 1, 3)."""
     phi = np.linspace(0, 2 * np.pi, points + 1)[:, None]
     _, _, (_, first, second) = np.linalg.svd(normal[None])
     return np.cos(phi) * first + np.sin(phi) * second
 
 
-def _viewpoint(ax: Axes3D) -> np.ndarray:
+def _view_direction(ax: Axes3D) -> np.ndarray:
     """The unit vector towards the eye."""
     elevation, azimuth = np.radians([ax.elev, ax.azim])
     return np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
 
 
-def _look_at(state: np.ndarray, ax: Axes3D) -> None:
+def _turn_axes_towards(state: np.ndarray, ax: Axes3D) -> None:
     """Turn the axes so that the state is on the near side, from above if that is possible."""
     azimuth = float(np.degrees(np.arctan2(state[1], state[0]))) + 40.0
     ax.view_init(elev=22.0, azim=azimuth)
-    if _viewpoint(ax) @ state < 0.0:
+    if _view_direction(ax) @ state < 0.0:
         ax.view_init(elev=-22.0, azim=azimuth)

@@ -9,14 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from manifolds._module import Module
+from manifolds._pytree_module import Module
 
-from ...dissipation.checks import semidefinite
+from ...dissipation.checks import checked_semidefinite
 from ...errors import InputError
-from ...functions.checks import check_scalar, check_shape, recognised
-from ...functions.conditions import numbers, require
+from ...functions.checks import check_energy, check_function_shape, mark_polynomial_degrees
+from ...functions.conditions import check_numbers, require_condition
 from ...functions.each import Each
-from ...functions.energy import Energy, Quadratic, as_energy
+from ...functions.energy import Energy, Quadratic, make_energy
 
 
 class Subsystem(Module):
@@ -55,8 +55,8 @@ class Subsystem(Module):
                 f"species, not {dim!r}; a wall that moves is a body of its own"
             )
         self.dim, self.name = dim, name
-        energy = Quadratic(jnp.zeros(dim)) if energy is None else as_energy(energy, "the energy of a subsystem")
-        self.energy = recognised(check_scalar(energy, dim, f"the energy of {name or 'a subsystem'}"), dim)
+        energy = Quadratic(jnp.zeros(dim)) if energy is None else make_energy(energy, "the energy of a subsystem")
+        self.energy = mark_polynomial_degrees(check_energy(energy, dim, f"the energy of {name or 'a subsystem'}"), dim)
         self.friction = _checked_friction(friction, dim - species, name or "a subsystem")
 
     @property
@@ -109,7 +109,7 @@ class Copies(Module):
         self.count, self.dim, self.name = count, dim, name
         self.energy = Quadratic(jnp.zeros(dim)) if energy is None else energy
         given = parameters if isinstance(parameters, tuple) else (parameters,)
-        self.parameters = tuple(numbers(a, f"the parameters of {name or 'the bodies'}") for a in given)
+        self.parameters = tuple(check_numbers(a, f"the parameters of {name or 'the bodies'}") for a in given)
         self.energy_from(0)  # checked there
         self.friction = _friction_of_many(friction, count, dim, name or "the bodies")
 
@@ -168,18 +168,18 @@ def _checked_friction(friction, dim: int, name: str):
         return friction
     if callable(friction):
         shapes, at = ((), (n,), (n, n)), f"a state of shape ({dim},)"
-        return check_shape(friction, [(dim,)], shapes, f"friction of {name}", at)[0]
-    R = numbers(friction, f"friction of {name}", (), (n,), (n, n))
+        return check_function_shape(friction, [(dim,)], shapes, f"friction of {name}", at)[0]
+    R = check_numbers(friction, f"friction of {name}", (), (n,), (n, n))
     R = jnp.full(n, R) if R.ndim == 0 else R
     if R.ndim == 2:
-        return semidefinite(R, f"the friction of {name}")
+        return checked_semidefinite(R, f"the friction of {name}")
     return _not_negative(R, name)
 
 
 def _friction_of_many(friction, count: int, dim: int, name: str):
     if friction is None or isinstance(friction, str):
         return _checked_friction(friction, dim, name)
-    n, R = dim // 2, numbers(friction, f"friction of {name}")
+    n, R = dim // 2, check_numbers(friction, f"friction of {name}")
     if n == 0 or R.shape not in ((), (n,), (count, n)):
         raise InputError(
             f"friction of {name}, {count} with {n} momenta each, has shape (), ({n},) or ({count}, {n}), not {R.shape}"
@@ -188,5 +188,7 @@ def _friction_of_many(friction, count: int, dim: int, name: str):
 
 
 def _not_negative(R: jax.Array, name: str) -> jax.Array:
-    require(R.min(), lambda r: r >= 0.0, f"friction of {name} must be >= 0, not {{value:g}}: it would cool the body")
+    require_condition(
+        R.min(), lambda r: r >= 0.0, f"friction of {name} must be >= 0, not {{value:g}}: it would cool the body"
+    )
     return R

@@ -13,7 +13,7 @@ import numpy as np
 import scipy
 
 from ...errors import FileError, InputError
-from ...functions.edges import edges
+from ...functions.edges import graph_edges
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def read_graph(path: str | os.PathLike, weight: str = "conductance", nodes: Sequ
                 raise InputError(f"{path}, {where}: there is no node {end!r} among the {len(names)} of the graph")
         numbered.append((number[source], number[target], k))
     try:
-        graph = edges(numbered, len(names), f"the {weight}", names)
+        graph = graph_edges(numbered, len(names), f"the {weight}", names)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     size = len(names)

@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
-from manifolds._module import Module
-from manifolds.structures.extended import Matter
+from manifolds._pytree_module import Module
+from manifolds.structures.extended import ParticleIndices
 
 from ...dissipation.matter import Process
 from ...errors import InputError
-from ...functions.checks import check_shape
-from ...functions.conditions import numbers, require
+from ...functions.checks import check_function_shape
+from ...functions.conditions import check_numbers, require_condition
 
 
 class Membrane(Module):
@@ -51,17 +51,19 @@ class Membrane(Module):
         if not (isinstance(pair, tuple) and len(pair) == 2 and all(type(kind) is int for kind in pair)):
             raise InputError(f"the species of a membrane are a whole number, or a pair of them, not {species!r}")
         self.species = pair
-        self.carries = numbers(carries, "the entropy that a particle carries", ())
-        require(self.carries, lambda s: abs(s) < np.inf, "the entropy that a particle carries is finite, not {value}")
+        self.carries = check_numbers(carries, "the entropy that a particle carries", ())
+        require_condition(
+            self.carries, lambda s: abs(s) < np.inf, "the entropy that a particle carries is finite, not {value}"
+        )
 
     def process(self, names: Sequence[str], structure: mf.ExtendedPhaseSpace) -> Process:
         """Which numbers change together, among the bodies of these ``names``, in states of a ``structure``."""
         a, b = (_body(given, names) for given in (self.first, self.second))
         if a == b:
             raise InputError(f"a membrane joins two bodies, not {names[a]} with itself")
-        stoichiometry, sides = np.zeros(len(structure.matter.N)), np.zeros((2, len(names)))
+        stoichiometry, sides = np.zeros(len(structure.particle_indices.N)), np.zeros((2, len(names)))
         for body, kind, sign in ((a, self.species[0], 1.0), (b, self.species[1], -1.0)):
-            stoichiometry[_number(body, kind, names, structure.matter)] = sign
+            stoichiometry[_number(body, kind, names, structure.particle_indices)] = sign
             sides[:, body] = 0.5, sign
         numbers, heated, carried = (tuple(row.tolist()) for row in (stoichiometry, *sides))
         L = _on_states(self.permeability, structure.dim, "the permeability of a membrane")
@@ -89,7 +91,7 @@ class Reaction(Module):
 
     def __init__(self, body, stoichiometry: Sequence[float], rate):
         self.body, self.rate = body, _coefficient(rate, "the rate of a reaction")
-        found = numbers(stoichiometry, "the stoichiometry of a reaction")
+        found = check_numbers(stoichiometry, "the stoichiometry of a reaction")
         if found.ndim != 1 or not (np.isfinite(found).all() and np.any(found)):
             raise InputError(f"the stoichiometry of a reaction is a row of finite numbers, not {found.tolist()}")
         self.stoichiometry = tuple(found.tolist())
@@ -97,7 +99,7 @@ class Reaction(Module):
     def process(self, names: Sequence[str], structure: mf.ExtendedPhaseSpace) -> Process:
         """Which numbers change together, among the bodies of these ``names``, in states of a ``structure``."""
         body = _body(self.body, names)
-        matter = structure.matter
+        matter = structure.particle_indices
         own = np.flatnonzero(matter.owner == body)
         if len(own) != len(self.stoichiometry):
             raise InputError(
@@ -112,8 +114,8 @@ class Reaction(Module):
 def _coefficient(given, what: str) -> jax.Array | Callable:
     if callable(given):
         return given
-    value = numbers(given, what, ())
-    require(value, lambda L: (L >= 0.0) & (np.inf > L), what + " must be >= 0 and finite, not {value}")
+    value = check_numbers(given, what, ())
+    require_condition(value, lambda L: (L >= 0.0) & (np.inf > L), what + " must be >= 0 and finite, not {value}")
     return value
 
 
@@ -121,7 +123,7 @@ def _on_states(coefficient, dim: int, what: str) -> jax.Array | Callable:
     """A coefficient, as a function checked on states of so many components."""
     if not callable(coefficient):
         return coefficient
-    return check_shape(coefficient, [(dim,)], [()], what, f"a state of shape ({dim},)")[0]
+    return check_function_shape(coefficient, [(dim,)], [()], what, f"a state of shape ({dim},)")[0]
 
 
 def _body(given, names: Sequence[str]) -> int:
@@ -134,7 +136,7 @@ def _body(given, names: Sequence[str]) -> int:
     raise InputError(f"there is no body {given!r}: the bodies are {', '.join(names)}, counted from 0")
 
 
-def _number(body: int, kind: int, names: Sequence[str], matter: Matter) -> int:
+def _number(body: int, kind: int, names: Sequence[str], matter: ParticleIndices) -> int:
     own = np.flatnonzero(matter.owner == body)
     if not 0 <= kind < len(own):
         raise InputError(f"{names[body]} has {len(own)} kinds of particles, so no number {kind}")

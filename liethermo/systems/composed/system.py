@@ -13,19 +13,19 @@ import scipy
 
 import manifolds as mf
 from manifolds._arrays import is_traced
-from manifolds._module import Module
-from manifolds.structures.extended import Places
+from manifolds._pytree_module import Module
+from manifolds.structures.extended import StateIndices
 
 from ...dissipation.base import Dissipation
 from ...dissipation.bodies import ContactFriction, Drag, HeatConduction, LinearFriction
 from ...dissipation.matter import MatterExchange, Process, conserved_numbers
 from ...errors import InputError
-from ...functions.arguments import Constant, Steady, needed_arguments
-from ...functions.checks import check_scalar, check_shape
-from ...functions.edges import Edges, edges, parts
+from ...functions.arguments import ConstantFunction, LastArgumentIgnored, required_argument_count
+from ...functions.checks import check_energy, check_function_shape
+from ...functions.edges import Edges, connected_components, graph_edges
 from ...functions.energy import Energy, Function, Quadratic, TimeDependent
-from ...functions.indices import as_pattern, pattern, union
-from ...functions.mechanics import is_free_of, is_mechanical
+from ...functions.indices import pattern_of_matrix, sparsity_pattern, union_pattern
+from ...functions.mechanics import is_independent_of, is_mechanical
 from ..base import System, named_maps
 from ..evolution import entropy_component
 from .bodies import Copies, Subsystem, named
@@ -116,8 +116,8 @@ class ComposedSystem(System):
             for name in ("degrees_of_freedom", "species")
         )
         structure = mf.ExtendedPhaseSpace(dofs, kinds if any(kinds) else ())
-        energy = check_scalar(self._energy(structure, coupling), structure.dim, "the energy", timed=True)
-        entropy = entropy_component(structure.dim, structure.places.S)
+        energy = check_energy(self._energy(structure, coupling), structure.dim, "the energy", allow_time=True)
+        entropy = entropy_component(structure.dim, structure.state_indices.S)
         dissipation = self._dissipation(structure, energy, conductance, drag, connected, conduction)
         given = [*(membranes if isinstance(membranes, list | tuple) else [membranes])]
         given += [*(reactions if isinstance(reactions, list | tuple) else [reactions])]
@@ -162,11 +162,13 @@ class ComposedSystem(System):
 
     def numbers_of_particles(self, x) -> jax.Array:
         """Those of all bodies, shape (..., K)."""
-        return self.state(x, batch=True)[..., self.poisson.matter.N]
+        return self.state(x, batch=True)[..., self.poisson.particle_indices.N]
 
     def chemical_potentials(self, x, t=None) -> jax.Array:
         """The ``mu = H_N`` of all particle numbers, shape (..., K); at a time, where the energy depends on one."""
-        return self.evaluated(lambda system, y: system.energy.gradient(y), x, t, "(n)")[..., self.poisson.matter.N]
+        return self.evaluated(lambda system, y: system.energy.gradient(y), x, t, "(n)")[
+            ..., self.poisson.particle_indices.N
+        ]
 
     def fourier_factors(self, x, t=None) -> jax.Array:
         """The skew matrix ``K_ab = k_ab (1/T_a - 1/T_b)``, shape (..., N, N), for which ``S_a' = sum_b K_ab T_b``.
@@ -177,7 +179,7 @@ class ComposedSystem(System):
         factors = jnp.zeros((*cold.shape, cold.shape[-1]))
         for part in () if self.dissipation is None else self.dissipation.terms:
             if isinstance(part, HeatConduction):
-                i, j = np.array(part.first, dtype=int), np.array(part.second, dtype=int)
+                i, j = np.array(part.first_bodies, dtype=int), np.array(part.second_bodies, dtype=int)
                 k = jnp.vectorize(part.conductances, signature="(n),(e),(e)->(e)")(
                     x, 1.0 / cold[..., i], 1.0 / cold[..., j]
                 )
@@ -203,11 +205,11 @@ class ComposedSystem(System):
         if self.poisson.species:
             return None
         parts = [_motion(self.poisson), *([] if self.dissipation is None else [self.dissipation.couplings(self)])]
-        through, hessian = union(parts), self.energy.couplings(self.dim)
+        through, hessian = union_pattern(parts), self.energy.couplings(self.dim)
         if through is None or hessian is None:
             return None
         itself = scipy.sparse.eye_array(self.dim, dtype=bool, format="csr")
-        return as_pattern((through + itself) @ (hessian + itself))
+        return pattern_of_matrix((through + itself) @ (hessian + itself))
 
     def weights(self, x) -> jax.Array:
         """The temperatures at the entropies: ``T S'`` is a flow of energy, linear in temperatures where S' is not."""
@@ -217,8 +219,8 @@ class ComposedSystem(System):
     # -- how it is put together -----------------------------------------------------------------------------------
 
     @property
-    def _places(self) -> Places:
-        return self.poisson.places
+    def _places(self) -> StateIndices:
+        return self.poisson.state_indices
 
     @property
     def _starts(self) -> np.ndarray:
@@ -252,16 +254,16 @@ class ComposedSystem(System):
             found.append(LinearFriction(jnp.concatenate(all_rates)))
         for body, R, a in zip(self.subsystems, rates, first[:-1].tolist(), strict=True):
             if R is None and not (body.friction is None or isinstance(body.friction, str)):
-                found.append(LinearFriction(body.friction, body=a))
+                found.append(LinearFriction(body.friction, body_index=a))
         if conductance is not None:
             given, functions = _by_law(conductance, len(dofs))
-            graph = edges(given, len(dofs), "the conductance", self.names)
+            graph = graph_edges(given, len(dofs), "the conductance", self.names)
             laws = _laws(graph, functions, structure.dim, self.names) if functions else ()
             if connected:
                 _need_connected(graph, self.names)
             found.append(HeatConduction(graph._replace(weight=jnp.zeros(0)) if laws else graph, laws, conduction))
         if drag is not None:
-            graph = edges(drag, len(dofs), "the drag", self.names)
+            graph = graph_edges(drag, len(dofs), "the drag", self.names)
             _need_velocities(graph, dofs, self.names)
             found.append(Drag(graph))
         return sum(found[1:], found[0]) if found else None
@@ -271,13 +273,13 @@ class ComposedSystem(System):
         if is_traced(energy):
             return False
         own = sum(len(body.energy_from(0).terms) for body in self.subsystems)
-        momenta = structure.places.p[np.isin(structure.places.owner, bodies)]
+        momenta = structure.state_indices.p[np.isin(structure.state_indices.owner, bodies)]
         points = np.random.default_rng(0).standard_normal((2, structure.dim))
         return all(
             isinstance(body.energy, Energy) and is_mechanical(body.energy, body.dim)
             for body in self.subsystems
             if isinstance(body.friction, str)
-        ) and all(is_free_of(term, points, momenta) for term in energy.terms[own:])
+        ) and all(is_independent_of(term, points, momenta) for term in energy.terms[own:])
 
 
 MOST_NAMED = 3
@@ -286,8 +288,8 @@ MOST_NAMED = 3
 
 def _motion(structure: mf.ExtendedPhaseSpace) -> scipy.sparse.csr_array:
     """The pattern of the Poisson tensor."""
-    q, p, _, _ = structure.places
-    return pattern(np.concatenate([q, p]), np.concatenate([p, q]), structure.dim)
+    q, p, _, _ = structure.state_indices
+    return sparsity_pattern(np.concatenate([q, p]), np.concatenate([p, q]), structure.dim)
 
 
 # -- arguments --------------------------------------------------------------------------------------------------------
@@ -305,8 +307,8 @@ def _potential(V, structure: mf.ExtendedPhaseSpace) -> Energy:
         return V
     if not callable(V):
         raise InputError(f"a coupling is a function of q, or of (q, S), or an Energy, not {type(V).__name__}")
-    q, _, S, _ = structure.places
-    needed, N = needed_arguments(V), structure.matter.N
+    q, _, S, _ = structure.state_indices
+    needed, N = required_argument_count(V), structure.particle_indices.N
     if needed == 1:
         return Function(V).on(q)
     parts = (q, S, N) if structure.species and needed is not None and needed > 2 else (q, S)
@@ -326,7 +328,7 @@ class _Apart(Module):
 
 def _conserved_numbers(structure: mf.ExtendedPhaseSpace, processes: Sequence[Process]) -> dict[str, Energy]:
     """The sums of particle numbers that no process changes."""
-    N = structure.matter.N
+    N = structure.particle_indices.N
     found: dict[str, Energy] = {}
     for i, weights in enumerate(conserved_numbers(processes, len(N)) if len(N) else ()):
         b = np.zeros(structure.dim)
@@ -354,12 +356,12 @@ def _laws(graph: Edges, functions, dim: int, names: tuple[str, ...]) -> tuple[Ca
     """A function of (T_i, T_j, x) for each edge of a graph, checked: where none is given, its weight."""
     found = {}
     for i, j, k in functions:
-        law = k if needed_arguments(k) == 3 else Steady(k)
+        law = k if required_argument_count(k) == 3 else LastArgumentIgnored(k)
         what = f"the conductance between {names[int(i)]} and {names[int(j)]}"
-        law, _ = check_shape(law, ((), (), (dim,)), [()], what, "(T_i, T_j), or (T_i, T_j, x)")
+        law, _ = check_function_shape(law, ((), (), (dim,)), [()], what, "(T_i, T_j), or (T_i, T_j, x)")
         found[min(i, j), max(i, j)] = law if i < j else _Exchanged(law)
     pairs = zip(graph.first.tolist(), graph.second.tolist(), graph.weight, strict=True)
-    return tuple(found.get((i, j), Constant(weight)) for i, j, weight in pairs)
+    return tuple(found.get((i, j), ConstantFunction(weight)) for i, j, weight in pairs)
 
 
 class _Exchanged(Module):
@@ -372,7 +374,7 @@ class _Exchanged(Module):
 
 
 def _need_connected(graph: Edges, names: tuple[str, ...]) -> None:
-    part = parts(graph, len(names))
+    part = connected_components(graph, len(names))
     if part.max() > 0:
         examples = [" and ".join(np.array(names)[part == i][:2]) for i in (0, 1)]
         raise InputError(

@@ -416,8 +416,8 @@ def test_a_dissipation_that_extends_another_stays_what_it_is():
     """What a system fills in is no reason to forget the class: a force of its own would be lost without a word."""
 
     class Twice(lt.KillingDissipation):
-        def momentum(self, dH, turned):
-            return 2.0 * super().momentum(dH, turned)
+        def added_momentum(self, dH, turned):
+            return 2.0 * super().added_momentum(dH, turned)
 
     def friction(dissipation):
         system = lt.LiePoissonSystem(

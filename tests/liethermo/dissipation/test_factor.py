@@ -7,7 +7,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.dissipation.noise import divergence, factors
+from liethermo.dissipation.noise import factor_divergence, terms_with_factors
 from liethermo.models.gas_piston import gas_piston_state
 from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
 from tests.cases import DISSIPATIONS, build, state_of
@@ -24,14 +24,19 @@ WITH = [
 @jax.jit
 def measured(system, x, dH, dS, dL):
     """``B B^T a - K a`` relative to it, ``B^T dH``, and the divergences as stated and by differentiation."""
-    parts, away = factors(system.dissipation, system, x, dH, dL), system.dissipation.energy_law == "conserved"
+    parts, away = (
+        terms_with_factors(system.dissipation, system, x, dH, dL),
+        system.dissipation.energy_law == "conserved",
+    )
     along = dS if away else -dH
-    product = sum(B.times(B.transposed(along)) for _, B in parts)
+    product = sum(B.times(B.transpose_times(along)) for _, B in parts)
     force = system.dissipation.force(system, x, dH, dS, dL)
-    kernel = jnp.concatenate([B.transposed(v) for _, B in parts for v in ((dH, *dL) if away else dL)] or [jnp.zeros(1)])
+    kernel = jnp.concatenate(
+        [B.transpose_times(v) for _, B in parts for v in ((dH, *dL) if away else dL)] or [jnp.zeros(1)]
+    )
 
     def matrix(y):
-        at = factors(
+        at = terms_with_factors(
             system.dissipation, system, y, system.energy.gradient(y), [L.gradient(y) for L in system.preserved]
         )
         return jnp.concatenate([jax.vmap(B.times)(jnp.eye(B.size)) for _, B in at])
@@ -41,7 +46,7 @@ def measured(system, x, dH, dS, dL):
     return (
         jnp.linalg.norm(product - force) / size,
         jnp.max(jnp.abs(kernel)),
-        divergence(system.dissipation, system, x) - traces,
+        factor_divergence(system.dissipation, system, x) - traces,
     )
 
 
@@ -67,19 +72,19 @@ def test_factors_between_bodies():
     x = jnp.asarray(gas_piston_state(0.4, (310.0, 290.0, 300.0), p=0.3))
     rng = np.random.default_rng(0)
     dH = system.energy.gradient(x) * (1.0 + 0.01 * rng.standard_normal(5))
-    parts = factors(system.dissipation, system, x, dH, ())
+    parts = terms_with_factors(system.dissipation, system, x, dH, ())
     assert sum(B.size for _, B in parts) == 3
     dS = rng.standard_normal(5)
-    product = sum(B.times(B.transposed(dS)) for _, B in parts)
+    product = sum(B.times(B.transpose_times(dS)) for _, B in parts)
     assert np.allclose(product, system.dissipation.force(system, x, dH, dS, ()), rtol=1e-13)
-    assert max(float(jnp.abs(B.transposed(dH)).max()) for _, B in parts) < 1e-12 * float(jnp.abs(dH).max())
+    assert max(float(jnp.abs(B.transpose_times(dH)).max()) for _, B in parts) < 1e-12 * float(jnp.abs(dH).max())
 
 
 def test_a_dissipation_without_a_factor():
     system = build(mf.so(3), next(case for case in DISSIPATIONS if case.name == "force"))
     x = jnp.ones(3)
     with pytest.raises(lt.InputError, match=r"EulerPoincareForce gives no factor"):
-        factors(system.dissipation, system, x, x, ())
+        terms_with_factors(system.dissipation, system, x, x, ())
     pairs = np.zeros((3, 3, 3, 3))
     for i, j, sign in ((0, 1, 1.0), (0, 2, -0.5)):
         for a, b in ((i, j), (j, i)):
@@ -143,4 +148,4 @@ def test_divergences_of_what_heats(make):
         assert product < 1e-13
     assert np.abs(defect).max() < 1e-12
     if system.baths is not None:
-        assert np.abs(divergence(system.dissipation, system, x)).max() > 1e-3
+        assert np.abs(factor_divergence(system.dissipation, system, x)).max() > 1e-3

@@ -78,14 +78,14 @@ def test_forces_between_bodies():
     dH, dS = bodies.energy.gradient(x), bodies.entropy.gradient(x)
     force = potential.force(bodies, x, dH, dS, ())
     assert abs(force @ dH) < 1e-12 * float(np.linalg.norm(force) * np.linalg.norm(dH))
-    T, k = np.asarray(dH[bodies.poisson.places.S]), 5.0
+    T, k = np.asarray(dH[bodies.poisson.state_indices.S]), 5.0
     first, second = (np.sqrt(k * a * b) for a, b in itertools.pairwise(T))
     f = np.array([first * (1 / T[0] - 1 / T[1]), second * (1 / T[1] - 1 / T[2])])
     flow = 0.5 * np.sinh(f / 0.5)
     made = np.array(
         [first * flow[0] / T[0], -first * flow[0] / T[1] + second * flow[1] / T[1], -second * flow[1] / T[2]]
     )
-    assert np.allclose(force[bodies.poisson.places.S], made, rtol=1e-12)
+    assert np.allclose(force[bodies.poisson.state_indices.S], made, rtol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -15,10 +15,10 @@ import liethermo as lt
 import manifolds as mf
 from liethermo.engines import array
 from liethermo.engines.choice import CompiledEngineWarning
-from liethermo.engines.codes import Code
+from liethermo.engines.codes import StatusCode
 from liethermo.engines.compiled import machine_code
 from liethermo.engines.compiled.stepper import CompiledEngine
-from liethermo.engines.rules import Rules
+from liethermo.engines.rules import SolverOptions
 from tests.cases import DISSIPATIONS, build, state_of
 
 BODY = lt.models.rigid_body()
@@ -114,11 +114,14 @@ def test_every_engine_goes_by_the_rules_it_is_given():
     system = lt.LiePoissonSystem(mf.so(3), lambda p: jnp.sum(p**4), lt.Quadratic(np.ones(3)), lt.KillingDissipation())
     x0, method = np.array([0.8, 0.5, 0.9]), lt.MetriplecticGauss(1)
     for engine in (CompiledEngine, array.ArrayEngine):
-        hasty = engine(system, method, Rules(fixed_point=1, newton=1))
-        state = hasty.step(hasty.begin(x0), 0.1)
-        assert int(state.status) == Code.NOT_CONVERGED
+        hasty = engine(system, method, SolverOptions(max_fixed_point_iterations=1, max_newton_iterations=1))
+        state = hasty.step(hasty.initial_run_state(x0), 0.1)
+        assert int(state.status) == StatusCode.NOT_CONVERGED
         assert np.array_equal(state.x, x0)
-        assert int(engine(system, method).step(state_of_engine := hasty.begin(x0), 0.1).status) == Code.COMPLETED
+        assert (
+            int(engine(system, method).step(state_of_engine := hasty.initial_run_state(x0), 0.1).status)
+            == StatusCode.COMPLETED
+        )
         assert np.array_equal(state_of_engine.x, x0)
 
 
@@ -126,13 +129,17 @@ def test_rules_of_large_systems_in_machine_code():
     """A choice of all of a state at once, where a system is large, is one of numbers of the kinds that it has there."""
     for method in (lt.MetriplecticGauss(1), lt.MetriplecticRungeKutta(4)):
         usual = CompiledEngine(BODY, method)
-        large = CompiledEngine(BODY, method, Rules(large=2))
-        state = large.advance(large.begin(X0), 0.1, 1, 20)[0]
-        assert int(state.status) == Code.COMPLETED
-        assert np.abs(state.x - usual.advance(usual.begin(X0), 0.1, 1, 20)[0].x).max() < 1e-14
-    hasty = CompiledEngine(BODY, lt.MetriplecticGauss(1), Rules(large=2, fixed_point=1, newton=1))
-    failed = hasty.step(hasty.begin(X0), 0.1)
-    assert int(failed.status) == Code.NOT_CONVERGED
+        large = CompiledEngine(BODY, method, SolverOptions(matrix_free_dim=2))
+        state = large.advance(large.initial_run_state(X0), 0.1, 1, 20)[0]
+        assert int(state.status) == StatusCode.COMPLETED
+        assert np.abs(state.x - usual.advance(usual.initial_run_state(X0), 0.1, 1, 20)[0].x).max() < 1e-14
+    hasty = CompiledEngine(
+        BODY,
+        lt.MetriplecticGauss(1),
+        SolverOptions(matrix_free_dim=2, max_fixed_point_iterations=1, max_newton_iterations=1),
+    )
+    failed = hasty.step(hasty.initial_run_state(X0), 0.1)
+    assert int(failed.status) == StatusCode.NOT_CONVERGED
     assert np.array_equal(failed.x, X0)
 
 
@@ -149,7 +156,7 @@ def test_code_is_optimised_once_many_steps_are_taken(tmp_path, monkeypatch):
     """Not for a few, nor for those that are found on disk; and the numbers are the same to the bit."""
     made = []
     monkeypatch.setenv("LIETHERMO_CACHE", str(tmp_path))
-    compile_it = machine_code._compile
+    compile_it = machine_code._compile_module
     monkeypatch.setattr(machine_code, "_compile", lambda text, hasty: made.append(hasty) or compile_it(text, hasty))
     system = lt.LiePoissonSystem(
         mf.so(3),
@@ -173,7 +180,7 @@ def test_code_is_optimised_once_many_steps_are_taken(tmp_path, monkeypatch):
 def test_parameters_are_arguments(monkeypatch):
     """A sweep over inertias and rates compiles once; another pattern of zeros is another program."""
     loaded = []
-    compile_it = machine_code._compile
+    compile_it = machine_code._compile_module
     monkeypatch.setattr(machine_code, "_compile", lambda *a: loaded.append(a[0]) or compile_it(*a))
     for inertia, rate in [((9.0, 4.0, 2.0), 0.3), ((7.0, 3.0, 1.0), 0.4), ((5.0, 4.0, 3.0), 0.5)]:
         system = lt.models.rigid_body(inertia, rate)

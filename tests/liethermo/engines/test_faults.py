@@ -8,10 +8,10 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.engines.choice import CompiledEngineWarning
-from liethermo.engines.compiled.writer import Writer
+from liethermo.engines.compiled.writer import ProgramWriter
 from liethermo.tracing import scalarize
 from liethermo.tracing.builder import Builder
-from liethermo.tracing.primitives import RULES
+from liethermo.tracing.primitives import UNROLLING_RULES
 
 X0 = np.array([0.4, 0.5, -0.3])
 ENERGIES = {
@@ -60,8 +60,8 @@ def sine(m):
 @pytest.fixture
 def fresh_programs(monkeypatch):
     """No program that was made before is found again."""
-    monkeypatch.setattr("liethermo.engines.compiled.stepper._steppers", lt.tracing.remembered.Latest(4))
-    monkeypatch.setattr("liethermo.tracing.interpret._unrolled", lt.tracing.remembered.Latest(4))
+    monkeypatch.setattr("liethermo.engines.compiled.stepper._steppers", lt.tracing.remembered.LRUCache(4))
+    monkeypatch.setattr("liethermo.tracing.interpret._unrolled", lt.tracing.remembered.LRUCache(4))
 
 
 def raising(*arguments, **named):
@@ -69,10 +69,10 @@ def raising(*arguments, **named):
 
 
 FAULTS = {
-    "rule of a primitive": lambda patch: patch.setitem(RULES, "sin", raising),
+    "rule of a primitive": lambda patch: patch.setitem(UNROLLING_RULES, "sin", raising),
     "scalar compiler": lambda patch: patch.setattr(scalarize, "_program", raising),
     "builder": lambda patch: patch.setattr(Builder, "mul", raising),
-    "writer": lambda patch: patch.setattr(Writer, "operation", raising),
+    "writer": lambda patch: patch.setattr(ProgramWriter, "operation", raising),
     "LLVM": lambda patch: patch.setattr("liethermo.engines.compiled.loop.MachineCode", raising),
 }
 
@@ -96,7 +96,7 @@ def test_a_fault_of_the_compiler_is_no_fault_of_the_run(fault, monkeypatch, fres
 @pytest.mark.parametrize("options", [{"until": lambda m: m[0] + 9.0}, {}], ids=["event", "adaptive"])
 def test_a_fault_where_a_run_has_a_pace(options, monkeypatch, fresh_programs):
     system = lt.LiePoissonSystem(mf.so(3), sine)
-    monkeypatch.setattr(Writer, "operation", raising)
+    monkeypatch.setattr(ProgramWriter, "operation", raising)
     with pytest.warns(CompiledEngineWarning, match="nobody has seen this yet"):
         found = lt.integrate(system, X0, (0.0, 0.5), lt.Adaptive(1e-8), **options)
     assert found.provenance["engine"] == "array"
@@ -112,7 +112,7 @@ def test_a_fault_in_newtons_method(monkeypatch, fresh_programs):
 
 
 def test_the_primitive_and_the_line_of_a_fault_are_named(monkeypatch):
-    monkeypatch.setitem(RULES, "sin", raising)
+    monkeypatch.setitem(UNROLLING_RULES, "sin", raising)
     with pytest.raises(scalarize.CompilerFault, match=r"on the JAX primitive 'sin' \(test_faults.py:\d+") as caught:
         scalarize.scalarize(jax.make_jaxpr(sine)(X0))
     assert isinstance(caught.value.__cause__, ZeroDivisionError)

@@ -19,14 +19,16 @@ from tests.machine_code import compiled
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     monkeypatch.setenv("LIETHERMO_CACHE", str(tmp_path / "cache"))
-    kept._distrusted.cache_clear()
+    kept._warn_untrusted.cache_clear()
     return tmp_path / "cache"
 
 
 @pytest.fixture
 def made(monkeypatch):
     found = []
-    monkeypatch.setattr(machine_code, "_compile", lambda *a, make=machine_code._compile: found.append(1) or make(*a))
+    monkeypatch.setattr(
+        machine_code, "_compile", lambda *a, make=machine_code._compile_module: found.append(1) or make(*a)
+    )
     return found
 
 

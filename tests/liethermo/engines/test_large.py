@@ -11,11 +11,11 @@ import liethermo as lt
 import manifolds as mf
 from liethermo.dissipation.base import Dissipation
 from liethermo.engines import array
-from liethermo.engines.krylov import krylov
-from liethermo.engines.rules import RULES
-from liethermo.engines.stages import Equations, Iteration, solve_stages
-from liethermo.engines.stepping import begin
-from liethermo.runs.preparation import as_run, started
+from liethermo.engines.krylov import solve_krylov
+from liethermo.engines.rules import DEFAULT_OPTIONS
+from liethermo.engines.stages import IterationState, StageEquations, solve_stages
+from liethermo.engines.stepping import initial_run_state_program
+from liethermo.runs.preparation import checked_initial_state, prepare_run
 
 COUNT = 5_000
 
@@ -71,11 +71,11 @@ def test_many_damped_spins_take_long_steps():
 def slow_after(updates, rate):
     """Whether an iteration with these updates is slower than a rate, after each of them."""
     k = jnp.zeros((1, 1))
-    iteration, found = Iteration.begin(k), []
+    iteration, found = IterationState.initial(k), []
     for update in updates:
         k = k + update
-        iteration = iteration.after(k, RULES)
-        found.append(bool(iteration.slower(rate)))
+        iteration = iteration.next_state(k, DEFAULT_OPTIONS)
+        found.append(bool(iteration.is_slower_than(rate)))
     return found
 
 
@@ -103,10 +103,12 @@ def test_newtons_method_is_compiled_when_a_step_needs_it():
     system = lt.models.rigid_body(inertia=(10, 5, 1), rate=200.0)
     for h, needed in ((1e-3, False), (0.5, True)):
         engine = array.ArrayEngine(system, lt.MetriplecticMidpoint())
-        start = engine.begin(jnp.array([0.1, 1.0, 0.1]))
+        start = engine.initial_run_state(jnp.array([0.1, 1.0, 0.1]))
         after, kept = engine.advance(start, h, 4, 2)
-        assert engine._on_demand.newton is needed
-        whole, of_whole = array.advance(system, engine.method, start, *map(jnp.asarray, (h, 4, 2)), engine.portion)
+        assert engine._lazy_newton.has_newton is needed
+        whole, of_whole = array.advance(
+            system, engine.method, start, *map(jnp.asarray, (h, 4, 2)), engine.max_saves_per_call
+        )
         assert int(after.step) == int(whole.step) == 8
         assert np.abs(np.asarray(kept[0]) - np.asarray(of_whole[0])).max() <= 1e-15
 
@@ -123,17 +125,17 @@ def test_steps_before_newtons_method_is_needed_are_not_taken_again(monkeypatch):
         return advance(system, method, state, *rest)
 
     monkeypatch.setattr(array, "advance", watched)
-    system, method = as_run(body, lt.MetriplecticMidpoint())
+    system, method = prepare_run(body, lt.MetriplecticMidpoint())
     engine = array.ArrayEngine(system, method)
-    start = engine.begin(started(system, method, [0.1, 0.1, 0.1], 0.0))
+    start = engine.initial_run_state(checked_initial_state(system, method, [0.1, 0.1, 0.1], 0.0))
     after, kept = engine.advance(start, 0.5, 10, 4)
     assert begun[0] == (0, False)
     assert begun[1] == (begun[1][0], True)
     assert 1 < begun[1][0] < 40
     assert begun[1][0] % 4  # in the middle between two states that are kept
-    whole, of_whole = advance(system, method, start, *map(jnp.asarray, (0.5, 10, 4)), engine.portion)
-    assert int(after.newton) == int(whole.newton) > 0
-    assert int(after.fixed_point) == int(whole.fixed_point)
+    whole, of_whole = advance(system, method, start, *map(jnp.asarray, (0.5, 10, 4)), engine.max_saves_per_call)
+    assert int(after.newton_iterations) == int(whole.newton_iterations) > 0
+    assert int(after.fixed_point_iterations) == int(whole.fixed_point_iterations)
     for a, b in zip(kept, of_whole, strict=True):
         np.testing.assert_allclose(a[:10], b[:10], rtol=1e-13, atol=1e-13)
 
@@ -151,14 +153,14 @@ def stiff(n, rate):
     return slopes, source
 
 
-def solved(slopes, guess, rules=RULES):
+def solved(slopes, guess, rules=DEFAULT_OPTIONS):
     def inverted(k):
         product = jax.linearize(lambda k: slopes(k) - k, k)[1]
-        return lambda found: krylov(product, found, rules)
+        return lambda found: solve_krylov(product, found, rules)
 
     n = guess.shape[1]
     measure = rules.size(n)
-    return solve_stages(Equations(slopes, guess, lambda k: 1.0 + measure(k), inverted), rules)
+    return solve_stages(StageEquations(slopes, guess, lambda k: 1.0 + measure(k), inverted), rules)
 
 
 @pytest.mark.slow
@@ -170,12 +172,12 @@ def test_stiff_equations_are_solved_to_rounding_without_their_matrix(rate):
     exact = np.linalg.solve(matrix, np.asarray(slopes(jnp.zeros_like(guess)))[0])
     assert bool(found.converged)
     assert np.abs(np.asarray(found.k)[0] - exact).max() < 1e-12
-    assert (int(found.newton) > 0) == (rate > 1.0)
+    assert (int(found.newton_iterations) > 0) == (rate > 1.0)
 
 
 def test_it_is_said_where_the_equations_are_not_solved():
     slopes, guess = stiff(1_500, 1000.0)
-    few = replace(RULES, products=2, newton=2, halvings=0)
+    few = replace(DEFAULT_OPTIONS, max_krylov_products=2, max_newton_iterations=2, max_newton_halvings=0)
     assert not bool(solved(slopes, guess, few).converged)
     assert not bool(solved(lambda k: 2.0 * k * k + 1.0, guess).converged)  # there is no such k
 
@@ -188,10 +190,10 @@ def test_the_work_does_not_depend_on_how_many_copies_there_are():
     for copies in (1, 8):
         system, x = ring(400 * copies, 3.0), np.append(np.tile(one, copies), 0.0)
         method = lt.MetriplecticGauss(1).on(system)
-        state = begin(system, method, x)
+        state = initial_run_state_program(system, method, x)
         after = array.ArrayEngine(system, method).step(state, 0.2)
         assert int(after.status) == 0
-        counts.append((int(after.fixed_point), int(after.newton)))
+        counts.append((int(after.fixed_point_iterations), int(after.newton_iterations)))
     assert counts[0][1] > 0
     assert abs(counts[0][0] - counts[1][0]) <= 1
     assert abs(counts[0][1] - counts[1][1]) <= 1
@@ -202,11 +204,13 @@ def test_krylov_solves_what_dense_elimination_solves():
     skew = rng.standard_normal((60, 60))
     matrix = jnp.asarray(np.eye(60) + 0.3 * (skew - skew.T))
     b = jnp.asarray(rng.standard_normal(60))
-    x = krylov(lambda v: matrix @ v, b, replace(RULES, forcing=1e-12, kept=60))
+    x = solve_krylov(lambda v: matrix @ v, b, replace(DEFAULT_OPTIONS, krylov_forcing_term=1e-12, krylov_basis_size=60))
     np.testing.assert_allclose(x, np.linalg.solve(matrix, b), atol=1e-11)
-    short = krylov(lambda v: matrix @ v, b, replace(RULES, forcing=1e-3, kept=2))
+    short = solve_krylov(
+        lambda v: matrix @ v, b, replace(DEFAULT_OPTIONS, krylov_forcing_term=1e-3, krylov_basis_size=2)
+    )
     assert np.linalg.norm(matrix @ short - b) <= 1.01e-3 * np.linalg.norm(b)
-    assert not np.asarray(krylov(lambda v: matrix @ v, jnp.zeros(60), RULES)).any()
+    assert not np.asarray(solve_krylov(lambda v: matrix @ v, jnp.zeros(60), DEFAULT_OPTIONS)).any()
 
 
 @pytest.mark.parametrize(("strength", "length"), [(12.0, 1.0), (0.1, 1e6)], ids=["slow", "large"])
@@ -217,10 +221,10 @@ def test_one_of_many_components_is_solved_like_the_others(strength, length):
     spins = np.random.default_rng(0).standard_normal((n, 3))
     spins[0] = 0.6 * length, 0.0, 0.8 * length
     given = lt.LiePoissonSystem(mf.power(mf.so(3), n), energy), lt.MetriplecticMidpoint()
-    system, method = as_run(*given)
-    assert system.dim > RULES.many
+    system, method = prepare_run(*given)
+    assert system.dim > DEFAULT_OPTIONS.rms_norm_dim
     engine = array.ArrayEngine(system, method)
-    state = engine.begin(jnp.asarray(spins.ravel()))
+    state = engine.initial_run_state(jnp.asarray(spins.ravel()))
     for _ in range(10):
         before, state = state, engine.step(state, h)
         left = np.abs(method.slopes(system, before.x, before.compensation, h, state.k) - state.k)[0]
@@ -230,6 +234,6 @@ def test_one_of_many_components_is_solved_like_the_others(strength, length):
         assert (left.reshape(n, 3) / own).max() < 1e-14, np.unravel_index(np.argmax(left.reshape(n, 3) / own), (n, 3))
     lengths = [np.linalg.norm(np.asarray(x).reshape(n, 3), axis=1) for x in (spins, state.x)]
     np.testing.assert_allclose(lengths[1], lengths[0], rtol=1e-14)
-    assert abs(float(state.energy) - float(engine.begin(jnp.asarray(spins.ravel())).energy)) <= 1e-14 * float(
-        state.energy_sensitivity
-    )
+    assert abs(
+        float(state.energy) - float(engine.initial_run_state(jnp.asarray(spins.ravel())).energy)
+    ) <= 1e-14 * float(state.energy_sensitivity)

@@ -16,14 +16,14 @@ from llvmlite import ir
 
 from liethermo.engines.compiled import machine_code
 from liethermo.engines.compiled.machine_code import MachineCode
-from liethermo.engines.compiled.writer import NUMBER, Writer
-from liethermo.tracing.builder import OF_TESTS, OPERATIONS, TESTS, Instruction
+from liethermo.engines.compiled.writer import FLOAT64, ProgramWriter
+from liethermo.tracing.builder import BOOLEAN_OPERATIONS, COMPARISONS, OPERATIONS, Instruction
 from liethermo.tracing.program import Program
 from liethermo.tracing.scalarize import UnsupportedPrimitive, scalarize
 from tests.liethermo.tracing.test_scalarize import CASES, STEPS, check, program_of, shapes, steps
 from tests.machine_code import compiled, memory_maps
 
-PAIRS = {*"add sub mul div pow rem max min atan2 igamma igammac".split(), *TESTS - {"is_finite"}}
+PAIRS = {*"add sub mul div pow rem max min atan2 igamma igammac".split(), *COMPARISONS - {"is_finite"}}
 SPECIAL = np.array([0.0, -0.0, 1.0, -1.5, 2.5, 0.3, -3.7, np.inf, -np.inf, np.nan, 1e300, 1e-300])
 GRID = np.array(list(itertools.product(SPECIAL, SPECIAL)))
 
@@ -31,7 +31,7 @@ GRID = np.array(list(itertools.product(SPECIAL, SPECIAL)))
 def of_one_operation(op: str) -> Program:
     """A program of two numbers."""
     first = [Instruction("p", "lt", ("a", "b")), Instruction("q", "gt", ("a", 0.5))]
-    if op in OF_TESTS:
+    if op in BOOLEAN_OPERATIONS:
         second = {"not": (), "branch": (0,)}.get(op, ("q",))
         chosen = [Instruction("t", op, ("p", *second))]
     elif op == "select":
@@ -69,7 +69,7 @@ def test_every_operation_at_every_kind_of_number(op, lanes):
 @pytest.mark.parametrize("lanes", [1, 4])
 def test_comparisons_of_truth_values_and_of_integers(lanes):
     """True, which is one bit, is more than false."""
-    tests = sorted(TESTS - {"is_finite"})
+    tests = sorted(COMPARISONS - {"is_finite"})
     first = [Instruction("p", "lt", ("a", "b")), Instruction("q", "gt", ("a", 0.5))]
     first += [Instruction("i", "truncate", ("a",)), Instruction("j", "truncate", ("b",))]
     compared = [Instruction(x + op, op, (x, y)) for op in tests for x, y in ("pq", "ij")]
@@ -146,11 +146,11 @@ def test_random_programs_agree(chosen, shape_x, shape_y, seed, lanes):
 
 
 def test_an_operation_without_an_instruction_is_refused():
-    writer = Writer(
-        ir.IRBuilder(ir.Function(ir.Module(), ir.FunctionType(NUMBER, [NUMBER]), "f").append_basic_block()), 1
+    writer = ProgramWriter(
+        ir.IRBuilder(ir.Function(ir.Module(), ir.FunctionType(FLOAT64, [FLOAT64]), "f").append_basic_block()), 1
     )
     with pytest.raises(UnsupportedPrimitive, match="gamma"):
-        writer.operation("gamma", [writer.constant(1.0)])
+        writer.write_operation("gamma", [writer.constant(1.0)])
 
 
 def test_code_is_unloaded():
@@ -169,7 +169,9 @@ def test_code_is_unloaded():
 def test_code_is_found_on_disk_and_damage_is_seen(tmp_path, monkeypatch):
     monkeypatch.setenv("LIETHERMO_CACHE", str(tmp_path / "cache"))
     made = []
-    monkeypatch.setattr(machine_code, "_compile", lambda *a, make=machine_code._compile: made.append(1) or make(*a))
+    monkeypatch.setattr(
+        machine_code, "_compile", lambda *a, make=machine_code._compile_module: made.append(1) or make(*a)
+    )
     program = program_of(lambda a: a * 3.25, np.ones(2))
     for _ in range(2):
         assert compiled(program)(np.ones(2))[0][0] == 3.25
@@ -188,17 +190,19 @@ def test_code_is_made_for_the_processor_that_is_named(tmp_path, monkeypatch):
     """Its instructions alone, and in files of its own."""
     monkeypatch.setenv("LIETHERMO_CACHE", str(tmp_path))
     program, made = program_of(lambda a: a * 3.75 + 1.0, np.ones(2)), []
-    monkeypatch.setattr(machine_code, "_compile", lambda *a, make=machine_code._compile: made.append(1) or make(*a))
+    monkeypatch.setattr(
+        machine_code, "_compile", lambda *a, make=machine_code._compile_module: made.append(1) or make(*a)
+    )
     try:
         for cpu in ("x86-64", "x86-64-v2"):
             monkeypatch.setenv("LIETHERMO_CPU", cpu)
-            machine_code._this_machine.cache_clear()
+            machine_code._host_target.cache_clear()
             for _ in range(2):
                 assert compiled(program, 8)(np.ones((8, 2)))[0].tolist() == [[4.75, 4.75]] * 8
-            assert "ymm" not in machine_code._machine().emit_assembly(llvm.parse_assembly(WIDE))
+            assert "ymm" not in machine_code._target_machine().emit_assembly(llvm.parse_assembly(WIDE))
     finally:
         monkeypatch.delenv("LIETHERMO_CPU")
-        machine_code._this_machine.cache_clear()
+        machine_code._host_target.cache_clear()
     assert len(made) == len(list(tmp_path.glob("*.o"))) == 2
 
 
@@ -214,7 +218,7 @@ define void @add(<8 x double>* %p) {
 
 def test_a_module_that_llvm_refuses_is_an_error():
     module = ir.Module()
-    function = ir.Function(module, ir.FunctionType(NUMBER, []), "f")
+    function = ir.Function(module, ir.FunctionType(FLOAT64, []), "f")
     ir.IRBuilder(function.append_basic_block())  # without an end
     with pytest.raises(RuntimeError):
         MachineCode(module)

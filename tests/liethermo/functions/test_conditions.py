@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import liethermo as lt
-from liethermo.functions.conditions import noting, refusal, require
+from liethermo.functions.conditions import collect_conditions, refusal_message, require_condition
 
 
 def found(build, *arguments):
@@ -14,13 +14,15 @@ def found(build, *arguments):
     messages = []
 
     def conditions(*arguments):
-        with noting() as noted:
+        with collect_conditions() as noted:
             build(*arguments)
         messages[:] = [condition.message for condition in noted]
         return [(condition.holds, condition.value) for condition in noted]
 
     results = jax.jit(conditions)(*map(jnp.asarray, arguments))
-    return [refusal(message, value) for message, (holds, value) in zip(messages, results, strict=True) if not holds]
+    return [
+        refusal_message(message, value) for message, (holds, value) in zip(messages, results, strict=True) if not holds
+    ]
 
 
 BUILDERS = {
@@ -41,6 +43,6 @@ def test_what_is_refused_as_a_number_is_noted_in_the_same_words_where_it_is_trac
 
 
 def test_nothing_is_noted_where_nobody_listens():
-    assert jax.jit(lambda x: require(x, lambda x: x > 0.0, "{value}") or x)(-1.0) == -1.0
+    assert jax.jit(lambda x: require_condition(x, lambda x: x > 0.0, "{value}") or x)(-1.0) == -1.0
     with pytest.raises(lt.InputError, match="not -1"):
-        require(np.float64(-1.0), lambda x: x > 0.0, "not {value:g}")
+        require_condition(np.float64(-1.0), lambda x: x > 0.0, "not {value:g}")

@@ -4,13 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from liethermo.functions.energy import LARGE, as_energy
+from liethermo.functions.energy import MIN_BUFFERED_DIM, make_energy
 
 
 def test_a_large_gradient_is_kept_in_memory_and_has_derivatives():
     """By a branch, of which batches and derivatives know nothing."""
-    energy = as_energy(lambda x: jnp.sum(x * jnp.roll(x, 1) ** 2), "the energy")
-    x, v = np.random.default_rng(3).standard_normal((2, LARGE))
+    energy = make_energy(lambda x: jnp.sum(x * jnp.roll(x, 1) ** 2), "the energy")
+    x, v = np.random.default_rng(3).standard_normal((2, MIN_BUFFERED_DIM))
     plain = jax.grad(energy.value)
     assert " cond[" in str(jax.make_jaxpr(energy.gradient)(x))
     assert " cond[" not in str(jax.make_jaxpr(energy.gradient)(x[1:])), "a control: small ones are not"

@@ -8,17 +8,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import liethermo as lt
-from liethermo.functions.checks import recognised
-from liethermo.functions.energy import as_energy
-from liethermo.functions.gradients import GRADIENTS, stage_gradients
-from liethermo.integrators.tableaus import finer, gauss
+from liethermo.functions.checks import mark_polynomial_degrees
+from liethermo.functions.energy import make_energy
+from liethermo.functions.gradients import DISCRETE_GRADIENTS, stage_gradients
+from liethermo.integrators.tableaus import gauss_tableau, kronrod_rule
 from tests.cases import EPS, energy_of
 
-NAMES = list(GRADIENTS)
+NAMES = list(DISCRETE_GRADIENTS)
 seeds = st.integers(0, 10**6)
 
 
-each_gradient = pytest.mark.parametrize("gradient", GRADIENTS.values(), ids=NAMES)
+each_gradient = pytest.mark.parametrize("gradient", DISCRETE_GRADIENTS.values(), ids=NAMES)
 
 
 @pytest.mark.sampled(1)
@@ -76,7 +76,7 @@ def test_continuous_across_the_gate(name):
     energy, rng = energy_of(4, 3), np.random.default_rng(3)
     x, direction = rng.standard_normal(4), rng.standard_normal(4)
     distances = np.geomspace(1e-8, 1.0, 4001)
-    found = np.asarray(jax.vmap(lambda r: GRADIENTS[name](energy, x, r * direction))(distances))
+    found = np.asarray(jax.vmap(lambda r: DISCRETE_GRADIENTS[name](energy, x, r * direction))(distances))
     jumps = np.abs(np.diff(found, axis=0)).max(axis=1)
     assert (jumps <= 20 * np.diff(distances) + 1e-12).all()
 
@@ -87,15 +87,15 @@ def test_continuous_across_the_gate(name):
 def test_symmetric_in_its_end_points(name, seed):
     rng = np.random.default_rng(seed)
     energy, x, d = energy_of(3, seed), rng.standard_normal(3), 0.5 * rng.standard_normal(3)
-    there = np.asarray(GRADIENTS[name](energy, x, d))
-    back = np.asarray(GRADIENTS[name](energy, x + d, -d))
+    there = np.asarray(DISCRETE_GRADIENTS[name](energy, x, d))
+    back = np.asarray(DISCRETE_GRADIENTS[name](energy, x + d, -d))
     assert np.abs(there - back).max() <= 1e-12 * np.abs(there).max()
 
 
 def test_the_printed_coordinate_increment_is_not_symmetric():
     """Control for the test above, and the reason why its scheme has order 1."""
     energy, x, d = energy_of(3, 1), np.ones(3), np.array([0.3, -0.2, 0.5])
-    gradient = GRADIENTS["coordinate_increment"]
+    gradient = DISCRETE_GRADIENTS["coordinate_increment"]
     assert np.abs(np.asarray(gradient(energy, x, d) - gradient(energy, x + d, -d))).max() > 1e-3
 
 
@@ -117,7 +117,7 @@ AT_REST = {
 def test_where_one_coordinate_rests(name):
     """The quotient of that coordinate is 0/0, and each formula has a value of its own in its place."""
     energy, x, d = energy_of(3, 1), np.array([0.4, -0.3, 1.0]), np.array([0.3, -0.2, 0.0])
-    found = GRADIENTS[name](energy, x, d)
+    found = DISCRETE_GRADIENTS[name](energy, x, d)
     assert float(found[2]) == pytest.approx(AT_REST[name](lambda t: float(energy.gradient(x + t * d)[2])), abs=1e-7)
     others = [float(energy.gradient(x + t * d)[2]) for t in (0.0, 0.5, 1.0)]
     assert min(np.abs(np.diff(others))) > 1e-4
@@ -167,10 +167,10 @@ def test_the_change_of_a_polynomial_is_found_without_its_values(degree):
     x, d = np.array([0.7, -0.4]), np.array([0.9, 1.3])
 
     def change(claimed=None, constant=0.0):
-        energy = as_energy(lambda x: x[0] ** degree + x[0] * x[1] ** (degree - 1) + constant, "H")
-        energy = recognised(energy, 2) if claimed is None else lt.Function(energy.function, claimed)
+        energy = make_energy(lambda x: x[0] ** degree + x[0] * x[1] ** (degree - 1) + constant, "H")
+        energy = mark_polynomial_degrees(energy, 2) if claimed is None else lt.Function(energy.function, claimed)
         assert energy.degree == (claimed or degree)
-        return float(GRADIENTS["gonzalez"](energy, x, d) @ d)
+        return float(DISCRETE_GRADIENTS["gonzalez"](energy, x, d) @ d)
 
     exact = float(np.diff([y[0] ** degree + y[0] * y[1] ** (degree - 1) for y in (x, x + d)])[0])
     assert change() == pytest.approx(exact, rel=1e-14)
@@ -187,8 +187,10 @@ def test_nan_is_not_hidden(gradient):
 
 def test_each_has_a_name_of_its_own():
     """It stands in the provenance of a run."""
-    names = {str(lt.MetriplecticMidpoint(name)) for name in GRADIENTS} | {str(lt.MetriplecticMidpoint(lt.MeanValue(3)))}
-    assert len(names) == len(GRADIENTS) + 1
+    names = {str(lt.MetriplecticMidpoint(name)) for name in DISCRETE_GRADIENTS} | {
+        str(lt.MetriplecticMidpoint(lt.MeanValue(3)))
+    }
+    assert len(names) == len(DISCRETE_GRADIENTS) + 1
     assert "MetriplecticMidpoint(gradient=CoordinateIncrement(symmetric=True))" in names
 
 
@@ -203,13 +205,13 @@ def test_unknown_names_and_bad_nodes_are_refused():
 @pytest.mark.parametrize("stages", [1, 2])
 def test_derivatives_at_stages_of_a_step_that_vanishes(stages, length):
     """Compiled too, where products and sums are fused: by k they are ``h A (x) Hess``, whatever is left of k."""
-    A, b, _ = gauss(stages)
-    x, h, energy = jnp.array([1.0, 2.0]), 0.1, as_energy(lambda u: jnp.log(u[0]) + 2.0 * jnp.log(u[1]), "S")
+    A, b, _ = gauss_tableau(stages)
+    x, h, energy = jnp.array([1.0, 2.0]), 0.1, make_energy(lambda u: jnp.log(u[0]) + 2.0 * jnp.log(u[1]), "S")
 
     @jax.jit
     @jax.jacfwd
     def found(k):
-        return stage_gradients(energy, x, jnp.zeros(2), h, k, A, b, finer(stages))
+        return stage_gradients(energy, x, jnp.zeros(2), h, k, A, b, kronrod_rule(stages))
 
     expected = np.einsum("ij,ab->iajb", h * A, np.diag([-1.0, -0.5]))
     np.testing.assert_allclose(found(jnp.full((stages, 2), length)), expected, atol=1e-15)

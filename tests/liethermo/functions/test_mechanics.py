@@ -9,12 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import liethermo as lt
-from liethermo.functions.gradients import GRADIENTS
+from liethermo.functions.gradients import DISCRETE_GRADIENTS
 from liethermo.functions.mechanics import is_mechanical
 from tests.cases import EPS
 
 seeds = st.integers(0, 10**6)
-each_gradient = pytest.mark.parametrize("gradient", GRADIENTS.values(), ids=list(GRADIENTS))
+each_gradient = pytest.mark.parametrize("gradient", DISCRETE_GRADIENTS.values(), ids=list(DISCRETE_GRADIENTS))
 DIM, N = 5, 2
 
 
@@ -50,7 +50,10 @@ def discrete(gradient, term, x, d, compensation=0.0):
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("name", "gradient"),
-    [*((name, "gonzalez") for name in TERMS), *(("sum", gradient) for gradient in GRADIENTS if gradient != "gonzalez")],
+    [
+        *((name, "gonzalez") for name in TERMS),
+        *(("sum", gradient) for gradient in DISCRETE_GRADIENTS if gradient != "gonzalez"),
+    ],
 )
 @given(seed=seeds)
 def test_discrete_gradients(name, gradient, seed):
@@ -58,7 +61,9 @@ def test_discrete_gradients(name, gradient, seed):
     term, (x, d) = TERMS[name], np.random.default_rng(seed).standard_normal((2, DIM))
     for size in (1.0, 1e-3, 1e-7):
         step, compensation = size * d, 0.4 * EPS * x
-        found, difference, slope = (np.asarray(a) for a in discrete(GRADIENTS[gradient], term, x, step, compensation))
+        found, difference, slope = (
+            np.asarray(a) for a in discrete(DISCRETE_GRADIENTS[gradient], term, x, step, compensation)
+        )
         values = sum(abs(float(t(x))) + abs(float(t(x + step))) for t in term.terms)
         allowed = 40 * EPS * (values + np.linalg.norm(slope) * np.linalg.norm(x))
         assert abs(found @ step - difference) <= allowed

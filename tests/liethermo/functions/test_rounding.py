@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from liethermo.functions.rounding import rounding
+from liethermo.functions.rounding import propagated_rounding_scale
 
 X = np.array([0.5, 2.0])
 CASES = {
@@ -21,4 +21,4 @@ CASES = {
 def test_the_size_at_which_a_function_is_rounded(name):
     """To a factor: errors are drawn from one half to one."""
     function, size = CASES[name]
-    assert 0.3 * size <= float(rounding(function, X, np.abs(X))) <= 3.0 * size
+    assert 0.3 * size <= float(propagated_rounding_scale(function, X, np.abs(X))) <= 3.0 * size

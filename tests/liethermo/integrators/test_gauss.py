@@ -7,7 +7,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.integrators.tableaus import gauss
+from liethermo.integrators.tableaus import gauss_tableau
 from tests.cases import EPS, TRANSCENDENTAL, slow
 from tests.liethermo import random_systems
 from tests.liethermo.integrators.test_orders import NONLINEAR
@@ -336,13 +336,13 @@ class Collocation(lt.MetriplecticGauss):
     """Control: without the correction alpha."""
 
     def slopes(self, system, x, compensation, h, k):
-        return jax.vmap(system.vector_field)(x + (compensation + h * (gauss(self.number).A @ k)))
+        return jax.vmap(system.vector_field)(x + (compensation + h * (gauss_tableau(self.number).A @ k)))
 
 
 class WithoutProjector(lt.MetriplecticGauss):
     """Control: without the projector, so that the motion changes the entropy."""
 
-    def _motion(self, system, u, dH, known):
+    def _conservative_slope(self, system, u, dH, known):
         return system.poisson.sharp(u, dH)
 
 

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.runs.preparation import as_run
+from liethermo.runs.preparation import prepare_run
 from tests.manifolds.spaces.test_own_spaces import Ellipsoid
 
 RK4, RK8, GAUSS, MIDPOINT = (
@@ -120,11 +120,11 @@ def test_with_charts_and_without(name):
 def test_what_is_run_is_a_system_on_arrays():
     """No chart: a spin moves along every sphere, so nothing is projected; with a retraction it is in charts."""
     spin = lt.MetriplecticSystem(mf.LiePoisson(mf.so(3)), lambda s: s[0] ** 4 + s[1] ** 2, space=mf.Sphere(2))
-    system, method = as_run(spin, GAUSS)
+    system, method = prepare_run(spin, GAUSS)
     assert type(system).__name__ == "EmbeddedSystem"
     assert system.conforming
     assert method == GAUSS
-    in_charts = as_run(spin, lt.MetriplecticGauss(2, retraction="exp"))
+    in_charts = prepare_run(spin, lt.MetriplecticGauss(2, retraction="exp"))
     assert in_charts[0] is spin
     assert isinstance(in_charts[1], lt.InCharts)
 
@@ -134,7 +134,7 @@ def test_what_is_run_is_a_system_on_arrays():
         return jnp.array([[0, -c, b], [c, 0, -a], [-b, a, 0]])
 
     other = lt.MetriplecticSystem(tensor, lambda s: s[0] ** 4 + s[1] ** 2, space=mf.Sphere(2))
-    assert not as_run(other, GAUSS)[0].conforming
+    assert not prepare_run(other, GAUSS)[0].conforming
     x0 = np.array([0.6, 0.64, 0.48])
     ends = [lt.integrate(s, x0, (0.0, 1.0), 0.01, GAUSS).x[-1] for s in (spin, other)]
     assert np.abs(ends[0] - ends[1]).max() < 1e-6

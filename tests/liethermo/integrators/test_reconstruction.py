@@ -44,7 +44,7 @@ def quartic(mu):
 
 def reference(system, T):
     """Momentum and attitude by SciPy, from START and TURNED."""
-    asked, hat = jax.jit(lambda mu: (system.vector_field(mu), system.energy.gradient(mu))), SO3.algebra._known_basis()
+    asked, hat = jax.jit(lambda mu: (system.vector_field(mu), system.energy.gradient(mu))), SO3.algebra._require_basis()
 
     def rate(t, y):
         field, gradient = map(np.asarray, asked(y[:3]))

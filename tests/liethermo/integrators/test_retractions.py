@@ -23,7 +23,7 @@ QUICK = {("SO(3)", "projection", "midpoint"), ("S^2", "projection", "midpoint")}
 def kinds(space) -> list[str]:
     """The retractions that a space has, by the table of its page."""
     factors = space.factors if isinstance(space, mf.Product) else (space,)
-    found = ["exp", "midpoint", "projection"] if space.geodesics else ["projection"]
+    found = ["exp", "midpoint", "projection"] if space.has_geodesics else ["projection"]
     if all(isinstance(factor, mf.Euclidean | mf.SPD) for factor in factors):
         found += ["euclidean", "midpoint_euclidean"]
     if all(isinstance(factor, mf.Euclidean | mf.GroupSpace) for factor in factors):
@@ -80,7 +80,7 @@ def test_a_run_in_charts_ends_where_one_without_does(space, kind, method):
     build, arguments, allowed = METHODS[method]
     system, start = falling(space), np.asarray(space.to_vector(space.random(5)))
     run = lt.integrate(system, start, (0.0, 0.04), 0.02, build(*arguments, retraction=kind))
-    around = lt.MetriplecticRungeKutta(6) if space.surrounded else lt.MetriplecticRungeKutta(6, retraction="exp")
+    around = lt.MetriplecticRungeKutta(6) if space.can_be_embedded else lt.MetriplecticRungeKutta(6, retraction="exp")
     reference = lt.integrate(system, start, (0.0, 0.04), 0.002, around)
     assert float(space.residual(system.points(run.x[-1]))) < 1e-14
     ends = [system.points(found.x[-1]) for found in (run, reference)]

@@ -8,8 +8,8 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engines.stepping import first_state, take_step
-from liethermo.integrators.lobatto import ExplicitTableau, lobatto, trees
+from liethermo.engines.stepping import initial_run_state, take_step
+from liethermo.integrators.lobatto import ExplicitTableau, lobatto_tableau, tree_vectors
 from tests.liethermo.integrators.test_orders import NONLINEAR
 
 RK = lt.MetriplecticRungeKutta
@@ -58,7 +58,7 @@ def of_tree(A, tree):
 @pytest.mark.parametrize(("order", "stages"), [(4, 4), (6, 7), (8, 11)])
 def test_order_conditions(order, stages):
     """Of all rooted trees [Hairer, Nørsett & Wanner 1993, II.2]; and what the weights of the estimate see."""
-    A, b, d, q, _ = lobatto(order)
+    A, b, d, q, _ = lobatto_tableau(order)
     counts = [1, 1, 2, 4, 9, 20, 48, 115, 286]
     found = rooted_trees(order)
     assert [len(found[n]) for n in found] == counts[:order]
@@ -72,7 +72,7 @@ def test_order_conditions(order, stages):
             assert b @ vector == pytest.approx(1.0 / gamma, rel=1e-12)
             if n <= q:
                 assert abs(d @ vector) < 1e-14
-    assert max(abs(d @ v) for v in trees(A, q + 1)[q + 1]) > 1e-3
+    assert max(abs(d @ v) for v in tree_vectors(A, q + 1)[q + 1]) > 1e-3
 
 
 @pytest.mark.parametrize("order", ORDERS)
@@ -80,7 +80,7 @@ def test_the_estimate_is_right_for_a_linear_oscillation(order):
     """The error of a step of a rotation is along the circle, where no correction takes it away."""
     system = lt.MetriplecticSystem(mf.Canonical(1), lt.Quadratic(np.eye(2)))
     method = RK(order).on(system)
-    state = first_state(system, method, jnp.array([1.0, 0.0]))
+    state = initial_run_state(system, method, jnp.array([1.0, 0.0]))
     off = []
     for h in {4: (0.2, 0.1, 0.05), 6: (0.2, 0.1, 0.05), 8: (0.4, 0.2, 0.1)}[order]:
         new = take_step(system, method, state, h)
@@ -116,7 +116,7 @@ def test_observed_order(name, order):
 class NegativeWeight(RK):
     """Of order two, with the weights -3 and 4, whose step is far off: it takes more corrections."""
 
-    corrections: ClassVar[int] = 20
+    max_corrections: ClassVar[int] = 20
 
     @property
     def tableau(self):

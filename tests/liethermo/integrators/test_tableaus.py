@@ -8,9 +8,15 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from liethermo.integrators.tableaus import MOST_STAGES, beyond, finer, gauss, integrated
+from liethermo.integrators.tableaus import (
+    MAX_STAGES,
+    extrapolation_matrix,
+    gauss_tableau,
+    interpolation_weights,
+    kronrod_rule,
+)
 
-STAGES = range(1, MOST_STAGES + 1)
+STAGES = range(1, MAX_STAGES + 1)
 EPS = float(np.finfo(float).eps)
 DIGITS = 60
 
@@ -95,7 +101,7 @@ def roundings(found, exact):
 @pytest.mark.parametrize("stages", STAGES)
 def test_every_entry_is_the_nearest_double(stages):
     """Half a rounding, and what extended precision adds to it; where there is none, a few roundings."""
-    tableau, exact = gauss(stages), exact_tableau(stages)
+    tableau, exact = gauss_tableau(stages), exact_tableau(stages)
     extended = np.finfo(np.longdouble).eps < 1e-18
     for found, expected in zip(tableau, exact, strict=True):
         assert roundings(found, expected) <= (0.51 if extended else 40.0)
@@ -118,14 +124,14 @@ def test_the_tableaus_of_the_textbook():
         ),
     }
     for stages, tableau in printed.items():
-        for found, expected in zip(gauss(stages), tableau, strict=True):
+        for found, expected in zip(gauss_tableau(stages), tableau, strict=True):
             assert np.allclose(found, expected, rtol=0, atol=2 * EPS)
 
 
 @pytest.mark.parametrize("stages", STAGES)
 def test_order_conditions(stages):
     """B(2s): sum b c^(q-1) = 1/q. C(s): sum_j a_ij c_j^(q-1) = c_i^q/q. Both fail one degree further."""
-    A, b, c = gauss(stages)
+    A, b, c = gauss_tableau(stages)
 
     def B(q):
         return abs(b @ c ** (q - 1) - 1 / q)
@@ -143,7 +149,7 @@ def test_order_conditions(stages):
 @pytest.mark.parametrize("stages", STAGES)
 def test_symplectic_and_symmetric(stages):
     """b_i a_ij + b_j a_ji = b_i b_j, which keeps quadratic invariants; reversed in time the method is the same."""
-    A, b, c = gauss(stages)
+    A, b, c = gauss_tableau(stages)
     assert np.abs(b[:, None] * A + (b[:, None] * A).T - np.outer(b, b)).max() <= EPS
     assert np.abs(A + A[::-1, ::-1] - b).max() <= 2 * EPS
     assert np.abs(c + c[::-1] - 1.0).max() <= EPS
@@ -162,46 +168,48 @@ def test_controls():
 @pytest.mark.parametrize("stages", STAGES)
 def test_beyond_continues_a_polynomial(stages):
     """Slopes of degree s - 1 at the nodes of one step become those of the next; a degree more is one too many."""
-    c, rng = gauss(stages).c, np.random.default_rng(stages)
-    size = np.abs(beyond(stages)).sum(axis=1).max()  # what rounding of the slopes is multiplied by
+    c, rng = gauss_tableau(stages).c, np.random.default_rng(stages)
+    size = np.abs(extrapolation_matrix(stages)).sum(axis=1).max()  # what rounding of the slopes is multiplied by
     polynomial = np.polynomial.Polynomial(rng.standard_normal(stages))
-    error = np.abs(beyond(stages) @ polynomial(c) - polynomial(1 + c)).max()
+    error = np.abs(extrapolation_matrix(stages) @ polynomial(c) - polynomial(1 + c)).max()
     assert error <= 20 * EPS * size
-    assert np.abs(beyond(stages) @ c**stages - (1 + c) ** stages).max() > 0.1
+    assert np.abs(extrapolation_matrix(stages) @ c**stages - (1 + c) ** stages).max() > 0.1
 
 
 @pytest.mark.parametrize("stages", STAGES)
 def test_integrated_integrates_a_polynomial(stages):
     """The integrals of the Lagrange polynomials, between and beyond the nodes; 0, A and b at 0, the nodes and 1."""
-    A, b, c = gauss(stages)
+    A, b, c = gauss_tableau(stages)
     theta = np.linspace(-0.5, 1.5, 41).reshape(1, 41)
-    weights = integrated(stages, theta)
+    weights = interpolation_weights(stages, theta)
     assert weights.shape == (1, 41, stages)
     with localcontext(prec=DIGITS):
         integrals = [integral(p) for p in oracle(stages)[1]]
         exact = [[float(value(p, Decimal(float(t)))) for p in integrals] for t in theta[0]]
     size = np.maximum(1.0, np.abs(exact).sum(axis=1, keepdims=True))
     assert (np.abs(weights[0] - exact) / size).max() <= 10 * EPS
-    assert np.abs(integrated(stages, c) - A).max() <= 4 * EPS
-    assert np.abs(integrated(stages, 1.0) - b).max() <= 4 * EPS
-    assert np.abs(integrated(stages, 0.0)).max() <= 4 * EPS
+    assert np.abs(interpolation_weights(stages, c) - A).max() <= 4 * EPS
+    assert np.abs(interpolation_weights(stages, 1.0) - b).max() <= 4 * EPS
+    assert np.abs(interpolation_weights(stages, 0.0)).max() <= 4 * EPS
 
 
 def test_tableaus_are_computed_once():
-    assert gauss(3) is gauss(3)
-    assert all(a.dtype == np.float64 for a in (*gauss(3), beyond(3), integrated(3, 0.3)))
+    assert gauss_tableau(3) is gauss_tableau(3)
+    assert all(
+        a.dtype == np.float64 for a in (*gauss_tableau(3), extrapolation_matrix(3), interpolation_weights(3, 0.3))
+    )
 
 
 @pytest.mark.parametrize(("stages", "degree"), [(1, 5), (2, 7)])
 def test_finer_quadrature(stages, degree):
     """The Kronrod rule, through the collocation polynomial: exact to its degree, and not beyond."""
-    c, rule = gauss(stages).c, finer(stages)
+    c, rule = gauss_tableau(stages).c, kronrod_rule(stages)
     theta = rule.A @ np.ones(stages)  # slopes of 1 take the polynomial to the node itself
     for power in range(degree + 2):
-        error = abs(rule.b @ theta**power + (gauss(stages).b + rule.change) @ c**power - 1 / (power + 1))
+        error = abs(rule.b @ theta**power + (gauss_tableau(stages).b + rule.weight_change) @ c**power - 1 / (power + 1))
         assert (error <= 2 * EPS) if power <= degree else (error > 1e-6)
     slopes = np.random.default_rng(0).standard_normal(stages)
     line = np.polynomial.Polynomial.fit(c, slopes, stages - 1)
-    assert np.abs(rule.slopes @ slopes - line(theta)).max() <= 20 * EPS
+    assert np.abs(rule.slope_matrix @ slopes - line(theta)).max() <= 20 * EPS
     assert np.abs(rule.A @ slopes - line.integ()(theta) + line.integ()(0.0)).max() <= 20 * EPS
-    assert finer(3) is None
+    assert kronrod_rule(3) is None

@@ -9,7 +9,7 @@ import pytest
 
 import liethermo as lt
 from liethermo.models.mass_spring_gas import CASES, STARTS, mass_spring_gas_solution
-from liethermo.tracing.interpret import at_points
+from liethermo.tracing.interpret import evaluate_at_points
 from tests.liethermo.closed_systems import ISOLATED, OPEN, SCHEMES, X0
 
 H = 1e-3
@@ -103,7 +103,7 @@ def test_a_run_solves_3_12(kind, name):
     @jax.vmap
     def misfits(before, at, after):
         (a, _, Sa, ta), (b, _, Sb, tb), (c, _, Sc, _) = (system.parts(y) for y in (before, at, after))
-        first, second = method.discrete(system, h, ta), method.discrete(system, h, tb)
+        first, second = method.discrete_system(system, h, ta), method.discrete_system(system, h, tb)
         return (
             first.momenta(a, b, Sa, Sb)[1] - second.momenta(b, c, Sb, Sc)[0],  # (3.12)
             second.constraint(b, c, Sb, Sc),
@@ -127,8 +127,8 @@ def test_the_matrix_of_regularity():
         "scheme 3": [[-m / h - lam / 2, 0.0], [2 * lam * V / h, -(T[2] * s / heat + (T[0] + T[2]) / h) / 2]],
     }
     for name, matrix in expected.items():
-        discrete = SCHEMES[name].discrete(system, h)
-        found, reduced = at_points(_matrices, discrete, np.array([[x0, x1, S0, S1]]))
+        discrete = SCHEMES[name].discrete_system(system, h)
+        found, reduced = evaluate_at_points(_matrices, discrete, np.array([[x0, x1, S0, S1]]))
         assert np.abs(found[0] - np.array(matrix)).max() < 1e-10 * np.abs(matrix).max(), name
         assert np.allclose(reduced[0], np.array(matrix)[:1, :1], rtol=1e-13)
 
@@ -152,9 +152,17 @@ def test_a_map_of_one_s_own():
     own = lt.VariationalIntegrator(Midpoint(0.5))
     assert own.order == 2
     points = np.array([[0.1, 0.2, 0.15, 0.1, 0.2, 0.3]])
-    a, b = (at_points(_momenta, scheme.discrete(OPEN["tangled"], 0.1), points) for scheme in (own, SCHEMES["scheme 2"]))
+    a, b = (
+        evaluate_at_points(_momenta, scheme.discrete_system(OPEN["tangled"], 0.1), points)
+        for scheme in (own, SCHEMES["scheme 2"])
+    )
     assert np.abs(a - b).max() < 1e-14
-    assert np.abs(a - at_points(_momenta, SCHEMES["scheme 3"].discrete(OPEN["tangled"], 0.1), points)).max() > 1e-3
+    assert (
+        np.abs(
+            a - evaluate_at_points(_momenta, SCHEMES["scheme 3"].discrete_system(OPEN["tangled"], 0.1), points)
+        ).max()
+        > 1e-3
+    )
 
 
 def _momenta(discrete, x):

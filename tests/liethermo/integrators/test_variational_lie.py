@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 import liethermo as lt
 import manifolds as mf
 from liethermo.models.body_with_wheels import body_with_wheels_rest
-from liethermo.tracing.interpret import at_points
+from liethermo.tracing.interpret import evaluate_at_points
 
 body = functools.cache(lt.models.body_with_wheels)
 X0 = [0.1, 1.0, 0.2, 0.5, -0.3, 0.4, 0.0]
@@ -52,7 +52,7 @@ def residuals(system, x):
 def test_the_equations(make):
     system = make()
     points = np.random.default_rng(0).standard_normal((8, system.dim))
-    found, production = at_points(residuals, system, points)
+    found, production = evaluate_at_points(residuals, system, points)
     for name, residual in found.items():
         assert np.abs(residual).max() < 1e-12, name
     assert production.min() > 0.0

@@ -36,7 +36,7 @@ def root(misfit, y):
 @eqx.filter_jit
 def values(discrete, z):
     """Of s at the first pair, and of the difference quotients of the second: by Newton's method, no derivatives."""
-    r = z[:2], z[2:4], z[4], discrete.onto_constraint(z[:2], z[2:4], z[4])
+    r = z[:2], z[2:4], z[4], discrete.solve_constraint(z[:2], z[2:4], z[4])
     _, q2, S1, S2 = discrete.flow(*r)
     return (r[3] - r[2])[None] / H, jnp.append(q2 - r[1], S2 - S1) / H
 
@@ -47,13 +47,13 @@ def two_forms(discrete, flow, z, first, second):
 
     def pairs(z):
         q0, q1, S0 = z[:2], z[2:4], z[4]
-        (s,) = root(lambda s: discrete.production(Pair(q0, (q1 - q0) / H, S0, s[0]))[None], first)
+        (s,) = root(lambda s: discrete.constraint_residual(Pair(q0, (q1 - q0) / H, S0, s[0]))[None], first)
         S1 = S0 + H * s
         p1 = flow.momenta(q0, q1, S0, S1)[1]
 
         def misfit(y):
             pair = Pair(q1, y[:2], S1, y[2])
-            return jnp.append(flow.motion(p1, pair), flow.production(pair))
+            return jnp.append(flow.motion_residual(p1, pair), flow.constraint_residual(pair))
 
         y = root(misfit, second)
         return jnp.stack([_flat(q0, q1, S0, S1), _flat(q1, q1 + flow.h * y[:2], S1, S1 + flow.h * y[2])])
@@ -76,7 +76,7 @@ def _flat(q0, q1, S0, S1):
 
 def forms_of_two_steps(kind, name) -> np.ndarray:
     """Minus the two-forms of a pair and of the next: shape (pair, form, component, component)."""
-    z, discrete = jnp.array([0.4, -0.3, 0.45, -0.24, 0.2]), SCHEMES[name].discrete(OPEN[kind], H)
+    z, discrete = jnp.array([0.4, -0.3, 0.45, -0.24, 0.2]), SCHEMES[name].discrete_system(OPEN[kind], H)
     return np.asarray(two_forms(discrete, discrete, z, *values(discrete, z)))
 
 
@@ -104,7 +104,7 @@ def test_the_structure_identity(kind, name):
 def test_another_flow_does_not_have_the_structure():
     """That of the same scheme with a step that is a tenth longer."""
     z, scheme, system = jnp.array([0.4, -0.3, 0.45, -0.24, 0.2]), SCHEMES["scheme 3"], OPEN["mechanical"]
-    discrete, other = scheme.discrete(system, H), scheme.discrete(system, 1.1 * H)
+    discrete, other = scheme.discrete_system(system, H), scheme.discrete_system(system, 1.1 * H)
     first, _ = values(discrete, z)
     S1 = z[4] + H * first[0]
     _, q2, _, S2 = other.flow(z[:2], z[2:4], z[4], S1)
@@ -121,12 +121,12 @@ def test_symplecticity_without_heat(name):
 
     @eqx.filter_jit
     def defect(system, x):
-        discrete = SCHEMES[name].discrete(system, 0.2)
+        discrete = SCHEMES[name].discrete_system(system, 0.2)
 
         def step(q0, p0, S0):
             def misfit(y):
                 pair = Pair(q0, y[:2], S0, y[2])
-                return jnp.append(discrete.motion(p0, pair), discrete.production(pair))
+                return jnp.append(discrete.motion_residual(p0, pair), discrete.constraint_residual(pair))
 
             def newton(_, y):
                 return y - solve(jax.jacfwd(misfit)(y), misfit(y)[:, None])[:, 0]

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engines.choice import Chosen
+from liethermo.engines.choice import EngineWithFallback
 
 BODY = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.3)
 X0, SPAN = [0.1, 0.2, 1.0], (0.0, 8.0)
@@ -191,11 +191,11 @@ def test_every_change_of_sign_between_states_is_an_event():
 def test_a_state_that_cannot_be_found_is_a_failure_with_a_reason(monkeypatch):
     """Where no part of a long step can be taken; the message's advice helps."""
 
-    def part_of_step(self, state, h, found=Chosen.part_of_step):
+    def part_of_step(self, state, h, found=EngineWithFallback.partial_step):
         after = found(self, state, h)
         return after if h < 0.05 else after._replace(status=np.int64(1))
 
-    monkeypatch.setattr(Chosen, "part_of_step", part_of_step)
+    monkeypatch.setattr(EngineWithFallback, "part_of_step", part_of_step)
     settings = {"events": lambda t, y: t - 3.0, "rtol": 1e-6}
     ours = lt.scipy.solve_ivp(BODY, SPAN, X0, **settings)
     assert (ours.success, ours.status, ours.t_events[0].size) == (False, -1, 0)
@@ -214,7 +214,7 @@ def test_a_state_that_cannot_be_found_is_a_failure_with_a_reason(monkeypatch):
 
 
 def test_a_state_between_steps_that_cannot_be_found_is_an_error(monkeypatch):
-    monkeypatch.setattr(Chosen, "ends", lambda self, x, h: np.full_like(x, np.nan))
+    monkeypatch.setattr(EngineWithFallback, "ends", lambda self, x, h: np.full_like(x, np.nan))
     run = lt.integrate(BODY, X0, SPAN, 0.5, dense=True)
     assert np.array_equal(run(SPAN[1]), run.x[-1])
     with pytest.raises(lt.ConvergenceError, match=r"the state at t = 0\.75, between two steps, cannot be found"):

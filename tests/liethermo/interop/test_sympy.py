@@ -80,7 +80,7 @@ def test_special_functions_are_those_of_jax():
 
 def test_a_problem_written_down_is_the_problem(tmp_path):
     system, x0 = lt.models.rigid_body((3, 2, 1), rate=0.5), [0.1, 0.2, 1.0]
-    file = lt.sympy.write(lt.sympy.describe(system, x0, (0.0, 5.0), "relaxed body"), tmp_path / "body.json")
+    file = lt.sympy.write(lt.sympy.describe_point(system, x0, (0.0, 5.0), "relaxed body"), tmp_path / "body.json")
     problem = json.loads(file.read_text())
     assert problem["format"] == "liethermo-problem-1"
     assert [1, 2, 3, "1"] in problem["lie_algebra"]["structure_constants"]

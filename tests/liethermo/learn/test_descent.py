@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from liethermo.learn.descent import ADAM, descent
+from liethermo.learn.descent import ADAM_DECAYS, soap_optimiser
 
 optax = pytest.importorskip("optax")
 
@@ -37,7 +37,7 @@ def test_a_matrix_with_steep_and_flat_directions_is_found_sooner_than_by_adam():
 
     schedule = optax.cosine_decay_schedule(0.1, STEPS, alpha=0.01)
     start = np.r_[np.zeros(36), np.ones(3)]
-    x, own = _descended(descent([(6, 6)], schedule), loss, start)
+    x, own = _descended(soap_optimiser([(6, 6)], schedule), loss, start)
     _, others = _descended(optax.adam(schedule), loss, start)
     assert own[-1] < 0.2 * others[-1]  # 0.11
     assert np.abs(x[36:]).max() < 1e-2
@@ -50,7 +50,7 @@ def test_without_matrices_it_is_adam():
     def loss(x):
         return jnp.sum(jnp.array([1.0, 10.0, 100.0]) * x**2)
 
-    x, own = _descended(descent([(2,)], schedule), loss, start)
-    other, values = _descended(optax.adam(schedule, *ADAM), loss, start)
+    x, own = _descended(soap_optimiser([(2,)], schedule), loss, start)
+    other, values = _descended(optax.adam(schedule, *ADAM_DECAYS), loss, start)
     np.testing.assert_allclose(own, values, rtol=1e-9)
     np.testing.assert_allclose(x, other, atol=1e-12)

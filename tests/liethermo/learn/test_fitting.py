@@ -10,9 +10,9 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.learn import training
-from liethermo.learn.data import Trajectory, smoothed
-from liethermo.learn.losses import stepper
-from liethermo.learn.observation import observation, states_that_move
+from liethermo.learn.data import Trajectory, spline_states_and_rates
+from liethermo.learn.losses import differentiable_stepper
+from liethermo.learn.observation import make_observation, states_matching_rates
 
 from . import cases
 
@@ -231,10 +231,10 @@ def test_the_first_states_show_the_attitudes_and_move_as_they_do():
     """Of the body that made them, from any attitude: a spline is off by the noise over the distance of the times."""
     body = lt.models.tumbling_body((3.0, 2.0, 1.0), rate=0.08)
     (t, R), *_ = _attitudes(0.0)
-    seen = observation(body, None, lambda x, R: R)
-    run = stepper(body, lt.MetriplecticRungeKutta(4), 1, True)[0]
-    shown = smoothed(Trajectory(t, R.reshape(-1, 9)), None)
-    states = states_that_move(seen, run, [shown], np.ones(9), 1.0)[0]
+    seen = make_observation(body, None, lambda x, R: R)
+    run = differentiable_stepper(body, lt.MetriplecticRungeKutta(4), 1, True)[0]
+    shown = spline_states_and_rates(Trajectory(t, R.reshape(-1, 9)), None)
+    states = states_matching_rates(seen, run, [shown], np.ones(9), 1.0)[0]
     true = lt.integrate(body, np.random.default_rng(0).standard_normal(3), (0.0, 8.0), 0.05, save_every=4)
     np.testing.assert_allclose(states[:, 4:], R.reshape(-1, 9), atol=2e-3)  # splines are worst at their ends: 4e-4
     np.testing.assert_allclose(states[5:-5, :3], true.x[5:-5, :3], atol=2e-2)

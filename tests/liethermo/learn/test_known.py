@@ -98,12 +98,12 @@ def test_a_fitted_system_comes_back_from_its_file(tmp_path):
         ({"leaf_0": np.nan * honest["leaf_0"]}, "not finite"),
         ({"leaf_0": "text"}, "built otherwise"),
     ):
-        said, arrays = training.read(path, files.FORMAT)
-        training.write(tmp_path / "other.npz", said, arrays | changed)  # by someone who knows the format
+        said, arrays = training.read_archive(path, files.MODEL_FORMAT)
+        training.write_archive(tmp_path / "other.npz", said, arrays | changed)  # by someone who knows the format
         with pytest.raises(lt.FileError, match=words):
             lt.learn.load(tmp_path / "other.npz", system)
     said["training"].pop("seconds")
-    training.write(tmp_path / "other.npz", said, arrays)
+    training.write_archive(tmp_path / "other.npz", said, arrays)
     with pytest.raises(lt.FileError, match="record of its fit"):
         lt.learn.load(tmp_path / "other.npz", system)
     path.write_bytes(path.read_bytes()[:-200])

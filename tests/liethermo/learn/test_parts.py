@@ -9,8 +9,8 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.learn.networks import learned
-from liethermo.runs.preparation import of_steps
+from liethermo.learn.networks import learned_mask
+from liethermo.runs.preparation import prepare_for_method
 
 from . import cases
 
@@ -70,16 +70,16 @@ def test_the_factor_is_that_of_the_friction():
     x = jnp.array([0.3, -0.2, 0.5])
     columns = system.dissipation.columns(x, system.energy.gradient(x))
     np.testing.assert_allclose(columns @ columns.T, system.friction_matrix(x), atol=1e-14)
-    factor = system.dissipation.factor_at(system, x)
+    factor = system.dissipation.continuous_factor(system, x)
     np.testing.assert_allclose(factor.times(jnp.array([1.0, -2.0])), columns @ np.array([1.0, -2.0]), atol=1e-15)
 
 
 def test_known_terms_stay_and_marked_ones_are_learned():
     energy = lt.Quadratic(np.ones(2)).on([0, 1]) + lt.learn.Energy(2, width=5, depth=1).on([0, 2])
     system = lt.learn.Metriplectic(3, energy=energy, entropy=cases.entropy, poisson=mf.Canonical(1), friction=None)
-    leaves = jax.tree_util.tree_leaves(jax.tree_util.tree_map(lambda m: m, learned(system)))
+    leaves = jax.tree_util.tree_leaves(jax.tree_util.tree_map(lambda m: m, learned_mask(system)))
     assert sum(leaves) == 4  # two layers, each a matrix and a vector
-    assert not any(jax.tree_util.tree_leaves(learned(lt.models.rigid_body())))
+    assert not any(jax.tree_util.tree_leaves(learned_mask(lt.models.rigid_body())))
 
 
 @pytest.mark.parametrize("order", [4, pytest.param(8, marks=pytest.mark.slow)])
@@ -87,8 +87,8 @@ def test_a_plain_step_is_the_step_but_for_rounding(order):
     """Its end misses the levels by the square of what the first correction does."""
     system = cases.oscillator(2.0, 0.3)
     x = jnp.array([0.7, -0.4, 0.1])
-    run, method = of_steps(system, lt.MetriplecticRungeKutta(order))
-    plain = jax.jit(lambda h: method.plain(run, x, h))
+    run, method = prepare_for_method(system, lt.MetriplecticRungeKutta(order))
+    plain = jax.jit(lambda h: method.step_without_compensation(run, x, h))
     for h in (0.2, 0.1):
         whole = lt.flow(system, x, (0.0, h), h, method=lt.MetriplecticRungeKutta(order))
         assert np.abs(plain(h) - whole).max() < 10.0 * h ** (2 * order + 2) + 1e-15

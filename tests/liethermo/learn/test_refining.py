@@ -15,7 +15,7 @@ import scipy.optimize
 import liethermo as lt
 import manifolds as mf
 from liethermo.learn import files, training
-from liethermo.learn.data import Trajectory, estimated_noise
+from liethermo.learn.data import Trajectory, estimate_noise
 
 pytest.importorskip("optax")
 
@@ -163,13 +163,13 @@ def test_noise_is_told_from_motion():
     for noise in (0.005, 0.05):
         random = np.random.default_rng(1)
         data = [Trajectory(t, run(start, RATE, t) + noise * random.standard_normal((90, 3))) for start in STARTS]
-        np.testing.assert_allclose(estimated_noise(data, np.ones(3)), noise, rtol=0.25)
+        np.testing.assert_allclose(estimate_noise(data, np.ones(3)), noise, rtol=0.25)
     for times in (t, np.linspace(0.0, 8.0, 17)):  # 17 rows are 9 in a period
         data = [Trajectory(times, run(start, RATE, times)) for start in STARTS]
-        assert estimated_noise(data, np.ones(3)) is None
-    assert estimated_noise([Trajectory(t[:3], np.zeros((3, 1)))], np.ones(1)) is None
+        assert estimate_noise(data, np.ones(3)) is None
+    assert estimate_noise([Trajectory(t[:3], np.zeros((3, 1)))], np.ones(1)) is None
     rounded = [Trajectory(TIMES, run(STARTS[0], RATE) + 1e-9 * np.random.default_rng(0).standard_normal((81, 3)))]
-    assert estimated_noise(rounded, np.ones(3)) is None
+    assert estimate_noise(rounded, np.ones(3)) is None
 
 
 def test_data_without_noise_can_be_said_to_be_exact():
@@ -215,11 +215,11 @@ def test_the_findings_come_back_from_a_file(tmp_path):
     back = lt.learn.load(path, spring(1.0))
     assert str(back.training) == str(found.training)
     np.testing.assert_array_equal(back.training.covariance, found.training.covariance)
-    said, arrays = training.read(path, files.FORMAT)  # a file of before
-    for name in files.FINDINGS:
+    said, arrays = training.read_archive(path, files.MODEL_FORMAT)  # a file of before
+    for name in files.ESTIMATE_FIELDS:
         arrays.pop(name)
     said["training"] = {name: said["training"][name] for name in ("parameters", "seconds", "ended")}
-    training.write(path, said, arrays)
+    training.write_archive(path, said, arrays)
     old = lt.learn.load(path, spring(1.0)).training
     assert old.converged is None
     assert old.names == ()

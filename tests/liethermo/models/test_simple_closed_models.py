@@ -8,7 +8,7 @@ import pytest
 import liethermo as lt
 from liethermo.models.cylinder import cylinder_rest
 from liethermo.models.mass_spring_gas import CASES, mass_spring_gas_solution
-from liethermo.tracing.interpret import at_points
+from liethermo.tracing.interpret import evaluate_at_points
 
 START = [0.3, -0.2, 0.1]
 FRICTIONS = {"undamped": 0.0, "underdamped": 2.0, "critical": 10.0, "overdamped": 25.0}
@@ -31,7 +31,7 @@ def test_the_exact_solution_solves_the_equations(case, friction):
 
     weights = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
     slopes = sum(w * (path(t + i * d) - path(t - i * d)) / d for i, w in weights.items())
-    assert np.abs(slopes - at_points(_rate, system, path(t))).max() < 1e-10
+    assert np.abs(slopes - evaluate_at_points(_rate, system, path(t))).max() < 1e-10
     assert np.array_equal(path(0.0), START)
     energy = np.asarray(system.energy(path(t)))
     assert np.ptp(energy) < 1e-12 * energy[0]
@@ -71,7 +71,7 @@ def test_the_heat_is_the_printed_one():
 def test_a_gas_under_a_piston():
     """It rests where its pressure is the one outside; pushed away it comes back, warmer."""
     gas, rest = lt.models.cylinder(mass=20.0, friction=150.0, pressure=1e5), cylinder_rest(1e5, T=300.0)
-    rate = at_points(_rate, gas, np.asarray(gas.state(rest))[None])[0]
+    rate = evaluate_at_points(_rate, gas, np.asarray(gas.state(rest))[None])[0]
     assert np.abs(rate[:5]).max() < 1e-9  # the clock runs on
     assert float(gas.temperature(rest)) == pytest.approx(300.0, rel=1e-13)
     assert "temperature" not in gas.outside(gas.state(rest))
@@ -85,7 +85,7 @@ def test_a_gas_under_a_piston():
 def test_pressure_and_heat_may_depend_on_time():
     gas = lt.models.cylinder(pressure=lambda q, v, S, t: 1e5 * (1 + t), heat_power=lambda q, v, S: 10.0)
     rest = cylinder_rest(1e5, T=300.0)
-    early, late = (at_points(_rate, gas, np.array([[*rest, 0.0, 0.0, t]]))[0] for t in (0.0, 1.0))
+    early, late = (evaluate_at_points(_rate, gas, np.array([[*rest, 0.0, 0.0, t]]))[0] for t in (0.0, 1.0))
     assert early[1] - late[1] == pytest.approx(1e5 * 0.01 / 1.0, rel=1e-9)
     assert early[4] == 10.0
 

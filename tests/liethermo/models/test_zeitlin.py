@@ -44,7 +44,7 @@ def test_laplacian_is_the_double_commutator_with_spins_and_its_inverse_inverts_i
 @pytest.mark.parametrize("N", [2, 5, 64])
 def test_harmonics_are_orthonormal_eigenvectors_with_the_eigenvalues_of_the_sphere(N):
     q = QuantisedSphere(N)
-    main, beside = q._tridiagonal
+    main, beside = q._tridiagonal_coefficients
     for m in {0, 1, N // 2, N - 1}:
         v, l = q.harmonics(m, N - 1), np.arange(m, N)
         off = beside[: N - m - 1, m]

@@ -109,4 +109,4 @@ def test_states_between_adaptive_steps(engine):
     with pytest.raises(lt.InputError, match=r"known from t = 0 to 4, not at 4\.1"):
         run(4.1)
     assert run.dense is not None
-    assert np.isnan(run.dense.ends(run.x[:1], np.array([1e6]))).all()
+    assert np.isnan(run.dense.step_ends(run.x[:1], np.array([1e6]))).all()

@@ -26,10 +26,10 @@ def solution():
 
 def rewritten(path: Path, change) -> Path:
     """A file that somebody has changed who knows how it is sealed."""
-    path.write_bytes(path.read_bytes()[: -len(files.SEAL) - 64])
+    path.write_bytes(path.read_bytes()[: -len(files.CHECKSUM_TAG) - 64])
     with h5py.File(path, "r+") as file:
         change(file)
-    series, said = files._content(path)
+    series, said = files._read_hdf5(path)
     with h5py.File(path, "r+") as file:
         file.attrs["sha256"] = files.checksum(series, said)
     return path
@@ -177,7 +177,7 @@ def test_what_is_no_result_is_refused(what, solution, tmp_path):
 @pytest.mark.parametrize("link", [h5py.ExternalLink("other.nc", "/x"), h5py.SoftLink("/x")])
 def test_links_are_not_followed(link, solution, tmp_path):
     path = solution.save(tmp_path / "run.nc")
-    path.write_bytes(path.read_bytes()[: -len(files.SEAL) - 64])
+    path.write_bytes(path.read_bytes()[: -len(files.CHECKSUM_TAG) - 64])
     with h5py.File(path, "r+") as file:
         file["more"] = link
     with pytest.raises(lt.FileError, match="is a link to another place"):
@@ -186,7 +186,7 @@ def test_links_are_not_followed(link, solution, tmp_path):
 
 def test_an_array_that_the_file_cannot_hold_is_not_made(solution, tmp_path):
     path = solution.save(tmp_path / "run.nc")
-    path.write_bytes(path.read_bytes()[: -len(files.SEAL) - 64])
+    path.write_bytes(path.read_bytes()[: -len(files.CHECKSUM_TAG) - 64])
     with h5py.File(path, "r+") as file:
         file.create_dataset("more", shape=(10**6, 10**6), chunks=(1000, 1000), dtype="f8")
     limits = resource.getrlimit(resource.RLIMIT_AS)

@@ -50,13 +50,13 @@ def test_the_picture_of_a_solution_holds_its_curves(solution):
 
 
 def test_a_picture_of_what_is_not_finite_or_long_is_still_one():
-    from liethermo.results.sketch import MOST_POINTS, sketch
+    from liethermo.results.sketch import MAX_POINTS, svg_sketch
 
     t = np.arange(5000.0)
     series = np.stack([np.sin(t), np.full_like(t, np.nan)], axis=-1)
-    tree = ElementTree.fromstring(sketch(t, series, "a test"))
+    tree = ElementTree.fromstring(svg_sketch(t, series, "a test"))
     first, second = (node.get("points").split() for node in tree.iter() if node.tag.endswith("polyline"))
-    assert len(first) == MOST_POINTS
+    assert len(first) == MAX_POINTS
     assert second == []
 
 

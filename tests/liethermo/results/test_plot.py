@@ -17,7 +17,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 import liethermo as lt
 import manifolds as mf
 from liethermo.results.plot.figures import BLUE, GREEN, GREY, RED
-from liethermo.results.plot.surfaces import _LevelSurface, _quadric_through, _sphere
+from liethermo.results.plot.surfaces import _fit_quadric, _LevelSurface, _sphere_grid
 
 SIZE_OF_A_PICTURE = 5_000  # bytes; an empty one is smaller
 
@@ -174,7 +174,7 @@ def test_momentum_sphere_of_a_loaded_solution(body, relaxed, tmp_path):
 
 
 def test_the_energy_surface_is_found_from_the_states(body, relaxed):
-    found = _LevelSurface(_quadric_through(relaxed.x), relaxed.x[0], 1.0).along(_sphere(8, 16))
+    found = _LevelSurface(_fit_quadric(relaxed.x), relaxed.x[0], 1.0).intersect_rays(_sphere_grid(8, 16))
     np.testing.assert_allclose(body.energy(found), relaxed.energy[0], rtol=1e-9)
 
 

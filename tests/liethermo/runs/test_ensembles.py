@@ -8,7 +8,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engines.codes import TEXTS
+from liethermo.engines.codes import STATUS_NAMES
 from liethermo.runs import batches
 
 BODY = lt.models.rigid_body()
@@ -120,7 +120,7 @@ def test_a_failure_stays_where_it_is(engine):
     many = lt.ensemble(leaves_its_domain(), x0s, (0.0, 60.0), 0.1, **options)
     one = lt.integrate(leaves_its_domain(), x0s[7], (0.0, 60.0), 0.1, save_every=7, on_failure="return")
     assert one.status.code == "non_finite"
-    assert [TEXTS[code] for code in many.status] == [*["completed"] * 7, "non_finite", *["completed"] * 12]
+    assert [STATUS_NAMES[code] for code in many.status] == [*["completed"] * 7, "non_finite", *["completed"] * 12]
     assert many.steps[7] == one.status.step
     kept = one.status.step // 7 + 1
     assert np.isfinite(many.x[7, :kept]).all()
@@ -181,7 +181,7 @@ def test_interrupted(monkeypatch):
 
     monkeypatch.setattr(batches, "advance_all", interrupt)
     many = lt.ensemble(BODY, states(3), (0.0, 1.0), 0.1, engine="array")
-    assert [TEXTS[code] for code in many.status] == ["interrupted"] * 3
+    assert [STATUS_NAMES[code] for code in many.status] == ["interrupted"] * 3
     assert not many.steps.any()
 
 

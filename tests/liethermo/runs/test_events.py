@@ -85,7 +85,7 @@ def watched(until, step, engine="compiled", order=8, rounded=1e-13):
     given = (0.0, 3.0), step, lt.MetriplecticRungeKutta(order)
     found = lt.integrate(OSCILLATOR, [1.0, 0.0], *given, until=until, engine=engine, on_failure="return")
     many = lt.ensemble(OSCILLATOR, [[1.0, 0.0], [1.0, 0.0]], *given, until=until, engine=engine)
-    assert [found.status.code] * 2 == [status.code for status in map(many.status_of, range(2))]
+    assert [found.status.code] * 2 == [status.code for status in map(many.member_status, range(2))]
     times = np.nan if found.event_time is None else found.event_time
     assert many.event_time == pytest.approx([times] * 2, abs=rounded, nan_ok=True)
     return found

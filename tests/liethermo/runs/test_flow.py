@@ -225,7 +225,9 @@ def root(p, x):
         p, x = parameters
         return y + 0.5 * p * jnp.sin(y) - x
 
-    return jax.lax.scan(lambda x, _: (implicit.solution(solve, misfit, (p, x), x), None), x[None], length=3)[0][0]
+    return jax.lax.scan(lambda x, _: (implicit.implicit_solution(solve, misfit, (p, x), x), None), x[None], length=3)[
+        0
+    ][0]
 
 
 @pytest.mark.slow
@@ -243,7 +245,7 @@ def test_implicit_functions_have_derivatives_of_derivatives():
         found = [jax.jit(jax.vmap(f, (None, 0)))(p, x) for f in (slopes, outer(slopes, 1))]
         assert np.abs(found[0] - first).max() < 1e-12
         assert np.abs(found[1] - second).max() < 1e-12
-    by_guess = jax.grad(lambda guess: implicit.solution(lambda p, guess: p, lambda p, y: y - p, p, guess))(0.0)
+    by_guess = jax.grad(lambda guess: implicit.implicit_solution(lambda p, guess: p, lambda p, y: y - p, p, guess))(0.0)
     assert by_guess == 0.0
     both = jax.jit(jax.jacrev(jax.jacrev(root, 0), 0))(p, x[0]), jax.jit(jax.jacfwd(jax.jacfwd(root, 0), 0))(p, x[0])
     assert np.abs(both[0] - both[1]) < 1e-12

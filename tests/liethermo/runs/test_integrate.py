@@ -12,8 +12,8 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.engines import array
-from liethermo.engines.codes import Code
-from liethermo.engines.rules import RULES, Rules
+from liethermo.engines.codes import StatusCode
+from liethermo.engines.rules import DEFAULT_OPTIONS, SolverOptions
 from liethermo.runs.progress import Progress
 from tests.cases import EPS
 
@@ -123,7 +123,7 @@ def test_a_step_too_large_names_step_time_residual_and_advice():
         lt.integrate(stiff, [0.3, 1.0, -0.2], (0.0, 500.0), 50.0)
     solution = caught.value.solution
     assert (solution.status.code, solution.status.step, solution.status.time) == ("not_converged", 0, 0.0)
-    assert solution.status.residual > RULES.plateau
+    assert solution.status.residual > DEFAULT_OPTIONS.plateau_rtol
     assert np.array_equal(solution.x, [[0.3, 1.0, -0.2]])
     assert not solution.audit().passed
     assert isinstance(caught.value, ArithmeticError)
@@ -134,7 +134,9 @@ def test_a_step_too_large_names_step_time_residual_and_advice():
 @pytest.mark.slow
 def test_no_smaller_step_is_advised_where_none_helps(monkeypatch):
     """The message says what was tried: with too few iterations shorter steps cannot be solved either."""
-    hasty = functools.partial(array.ArrayEngine, rules=Rules(fixed_point=1, newton=1))
+    hasty = functools.partial(
+        array.ArrayEngine, options=SolverOptions(max_fixed_point_iterations=1, max_newton_iterations=1)
+    )
     monkeypatch.setattr("liethermo.engines.choice.ArrayEngine", hasty)
     system = lt.LiePoissonSystem(mf.so(3), lambda p: jnp.sum(p**4), lt.Quadratic(np.ones(3)), lt.KillingDissipation())
     solution = lt.integrate(system, [0.8, 0.5, 0.9], (0.0, 1.0), 0.25, on_failure="return", engine="array")
@@ -166,9 +168,11 @@ def test_huge_steps_solve_their_equation(h, x0):
 def test_one_iteration_is_not_enough_and_says_so(method):
     """Control for dropped statuses: with a single iteration allowed every implicit method must report failure."""
     system = lt.LiePoissonSystem(mf.so(3), lambda p: jnp.sum(p**4), lt.Quadratic(np.ones(3)), lt.KillingDissipation())
-    engine = array.ArrayEngine(system, method.on(system), Rules(fixed_point=1, newton=1))
-    state, _ = engine.advance(engine.begin(jnp.array([0.8, 0.5, 0.9])), 0.01, 10, 1)
-    assert int(state.status) == (Code.COMPLETED if method.explicit else Code.NOT_CONVERGED)
+    engine = array.ArrayEngine(
+        system, method.on(system), SolverOptions(max_fixed_point_iterations=1, max_newton_iterations=1)
+    )
+    state, _ = engine.advance(engine.initial_run_state(jnp.array([0.8, 0.5, 0.9])), 0.01, 10, 1)
+    assert int(state.status) == (StatusCode.COMPLETED if method.explicit else StatusCode.NOT_CONVERGED)
     assert int(state.step) == (10 if method.explicit else 0)
 
 

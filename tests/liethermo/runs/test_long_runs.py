@@ -8,7 +8,7 @@ import liethermo as lt
 import manifolds as mf
 from benchmarks.measurements import spin
 from benchmarks.problems import general_body
-from liethermo.functions.gradients import GRADIENTS
+from liethermo.functions.gradients import DISCRETE_GRADIENTS
 
 MILLION = 1_000_000
 
@@ -23,7 +23,7 @@ def test_free_body_energy_after_a_million_steps(h):
 
 
 @pytest.mark.sampled(1)
-@pytest.mark.parametrize("name", GRADIENTS)
+@pytest.mark.parametrize("name", DISCRETE_GRADIENTS)
 def test_relaxing_to_rounding_and_staying_there(name):
     """A body with a non-quadratic energy relaxes until |x' - x| is at rounding, and stays for a million steps."""
     system = lt.LiePoissonSystem(
@@ -65,5 +65,5 @@ def test_the_energy_in_long_steps(gradient):
 @pytest.mark.slow
 def test_the_energy_on_a_sphere():
     """A spin and its bath, on its way for 1e5 steps in which the points are rounded anew (it came to 6e-13)."""
-    solution = lt.integrate(spin.system(2e-4), spin.X0, (0.0, 1e4), 0.1, save_every=1000, engine="compiled")
+    solution = lt.integrate(spin.spin_system(2e-4), spin.X0, (0.0, 1e4), 0.1, save_every=1000, engine="compiled")
     assert solution.audit(energy=2e-14).passed, str(solution.audit())

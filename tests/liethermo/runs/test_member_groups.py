@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engines.codes import Code
+from liethermo.engines.codes import StatusCode
 from liethermo.runs import member_groups
 from liethermo.runs.family import Family
 
@@ -112,8 +112,12 @@ def test_a_control_one_verdict_for_all_is_found(monkeypatch):
 
     def of_first(family, method, states):
         decided = family.member(0)._found()
-        facts = member_groups.Facts(None, decided)
-        return [member_groups.Group(np.arange(len(states)), family.known(member_groups.with_facts, facts))], {}
+        facts = member_groups.InvariantFacts(None, decided)
+        return [
+            member_groups.MemberGroup(
+                np.arange(len(states)), family.annotate_members(member_groups.with_invariant_facts, facts)
+            )
+        ], {}
 
     system = lt.LiePoissonSystem(
         mf.so(3), lt.Quadratic([1.0, 2.0, 3.0]), lambda m: jnp.log(1 + m @ m), lt.KillingDissipation(0.3)
@@ -136,11 +140,11 @@ def lopsided(p):
 def test_what_a_member_does_not_conserve_is_not_held(method):
     holding = method(4, preserve=[lambda m: m[2]])
     many = lt.ensemble(lopsided, START, SPAN, STEP, holding, parameters={"b": np.array([1.0, 2.0, 1.0])})
-    assert many.status.tolist() == [Code.COMPLETED, Code.INADMISSIBLE, Code.COMPLETED]
+    assert many.status.tolist() == [StatusCode.COMPLETED, StatusCode.INADMISSIBLE, StatusCode.COMPLETED]
     assert "does not conserve the preserved function" in many.reasons[1]
     assert np.abs(many.x[[0, 2], 2] - START[2]).max() < 1e-15
     many = lt.ensemble(lopsided, START, SPAN, STEP, holding, parameters={"b": np.array([2.0, 1.0])})
-    assert many.status.tolist() == [Code.INADMISSIBLE, Code.COMPLETED]
+    assert many.status.tolist() == [StatusCode.INADMISSIBLE, StatusCode.COMPLETED]
 
 
 def test_a_preserved_function_that_is_a_casimir_of_one_member():
@@ -176,7 +180,7 @@ def test_a_member_outside_its_own_domain_is_not_started():
 
     a = np.array([0.0, 1.0, 3.0])  # temperatures 0.5, -0.5, 3.5
     many = lt.ensemble(gas, [0.3, 0.1, 1.0], (0.0, 1.0), 0.1, parameters={"a": a})
-    assert many.status.tolist() == [Code.COMPLETED, Code.INADMISSIBLE, Code.COMPLETED], str(many)
+    assert many.status.tolist() == [StatusCode.COMPLETED, StatusCode.INADMISSIBLE, StatusCode.COMPLETED], str(many)
     assert "temperature" in many.reasons[1]
 
 
@@ -192,10 +196,10 @@ def test_one_inertia_only_if_all_have_it():
 
     rows = np.random.default_rng(0).standard_normal((12, 10))
     rows[:, 9] = 0.0
-    family = Family.of(build, {"all": rows})
+    family = Family.from_arguments(build, {"all": rows})
     np.testing.assert_allclose(member_groups.common_inertia(family), np.diag([1.0, 1 / 2, 1 / 3]))
     rows[5, 9] = 1e-3
-    assert member_groups.common_inertia(Family.of(build, {"all": rows})) is None
+    assert member_groups.common_inertia(Family.from_arguments(build, {"all": rows})) is None
 
 
 # -- the rest of an ensemble ------------------------------------------------------------------------------------------
@@ -203,9 +207,9 @@ def test_one_inertia_only_if_all_have_it():
 
 def test_groups_are_few_and_in_order():
     many = np.array([2.0, 1.0, 0.5, 1.0, 3.0])
-    family = Family.of(body, {"a": many})
-    groups, refused = member_groups.groups_of(family, lt.MetriplecticMidpoint(), np.tile(START, (5, 1)))
-    assert [group.places.tolist() for group in groups] == [[0, 2, 4], [1, 3]]
+    family = Family.from_arguments(body, {"a": many})
+    groups, refused = member_groups.group_members(family, lt.MetriplecticMidpoint(), np.tile(START, (5, 1)))
+    assert [group.indices.tolist() for group in groups] == [[0, 2, 4], [1, 3]]
     assert refused == {}
     names = [group.family.member(0).decided.constant for group in groups]
     assert names[0] == frozenset()
@@ -222,7 +226,7 @@ def test_an_interruption_stops_all_groups(monkeypatch):
     monkeypatch.setattr(module, "run_compiled", interrupted)
     many = lt.ensemble(body, START, SPAN, STEP, parameters={"a": A}, engine="compiled")
     assert calls == [1]
-    assert many.status.tolist() == [Code.INTERRUPTED] * 3
+    assert many.status.tolist() == [StatusCode.INTERRUPTED] * 3
 
 
 @pytest.mark.parametrize("outputs", ["final", "trajectory", "summary"])

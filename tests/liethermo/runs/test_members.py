@@ -9,7 +9,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engines.codes import Code
+from liethermo.engines.codes import StatusCode
 
 BODY = lt.models.rigid_body()
 SPAN, STEP = (0.0, 6.0), 0.1
@@ -143,7 +143,7 @@ def test_inadmissible_parameters_are_a_status_of_their_member(named):
         return lt.ensemble(lambda rate: lt.models.rigid_body(rate=rate), x0s, SPAN, STEP, parameters=rates, **options)
 
     many, good = run(rates, states(1000)), np.delete(np.arange(1000), [17, 400, 999])
-    assert np.flatnonzero(many.status == Code.INADMISSIBLE).tolist() == [17, 400, 999]
+    assert np.flatnonzero(many.status == StatusCode.INADMISSIBLE).tolist() == [17, 400, 999]
     assert not many.ok[17]
     assert sorted(many.reasons) == [17, 400, 999]
     assert np.array_equal(many.x[good], run(rates[good], states(1000)[good]).x)

@@ -8,8 +8,8 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engines.stages import noise_of
-from liethermo.functions.rounding import with_rounding
+from liethermo.engines.stages import slope_rounding_scale
+from liethermo.functions.rounding import value_and_rounding_scale
 from liethermo.models.thermo_particles import thermo_particles_solution
 from tests.cases import slow
 
@@ -28,11 +28,11 @@ def test_the_size_at_which_a_function_is_rounded():
         (lambda x: x + x, 0.0, 0.0),
     ]
     for function, x, expected in cases:
-        value, size = with_rounding(function, np.array(x))
+        value, size = value_and_rounding_scale(function, np.array(x))
         assert value == function(x)
         assert 0.2 * expected <= size <= 5 * expected
-    assert 0.2 < noise_of(two(), np.zeros(2)) < 10.0
-    assert noise_of(lt.models.rigid_body(), np.array([1e-9, 0.0, 0.0])) < 1e-17
+    assert 0.2 < slope_rounding_scale(two(), np.zeros(2)) < 10.0
+    assert slope_rounding_scale(lt.models.rigid_body(), np.array([1e-9, 0.0, 0.0])) < 1e-17
 
 
 @pytest.mark.sampled(1)

@@ -9,8 +9,8 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engines.choice import Chosen
-from liethermo.integrators.fluctuating import driven_by, noise_dimension
+from liethermo.engines.choice import EngineWithFallback
+from liethermo.integrators.fluctuating import noise_dimension, set_noise_increments
 from liethermo.models.gas_piston import gas_piston_state
 from liethermo.runs.threefry import threefry
 from liethermo.tracing import programs
@@ -98,9 +98,11 @@ def test_random_numbers_are_those_of_the_paper():
 
 def test_random_numbers_in_portions():
     """Normal, independent, bounded; the same however they are asked for."""
-    whole = NOISE.rows(3, np.arange(40), 0, 1000, 1.0)
-    assert np.array_equal(NOISE.rows(3, np.arange(10, 20), 100, 57, 1.0), whole[10:20, 100:157])
-    assert abs((2.0 * NOISE.rows(3, np.arange(40), 0, 1000, 0.25) * whole).mean()) < 4 / np.sqrt(whole.size)
+    whole = NOISE.consecutive_increments(3, np.arange(40), 0, 1000, 1.0)
+    assert np.array_equal(NOISE.consecutive_increments(3, np.arange(10, 20), 100, 57, 1.0), whole[10:20, 100:157])
+    assert abs((2.0 * NOISE.consecutive_increments(3, np.arange(40), 0, 1000, 0.25) * whole).mean()) < 4 / np.sqrt(
+        whole.size
+    )
     sample = whole.ravel()
     count = len(sample)
     assert abs(sample.mean()) < 4 / np.sqrt(count)
@@ -129,7 +131,7 @@ def test_little_noise_is_nearly_the_run_without():
 def test_a_lattice_needs_few_programs(monkeypatch):
     """One takes the steps, one begins a run, and the axioms have one: no size adds any, nor does another run."""
     traced = []
-    monkeypatch.setattr(programs._Whole, "__call__", _counted(programs._Whole.__call__, traced))
+    monkeypatch.setattr(programs._ArrayFunction, "__call__", _counted(programs._ArrayFunction.__call__, traced))
     sites = (3, 5, 4)
     magnet = lt.models.spin_lattice(sites, rate=1.0, baths=lt.HeatBaths(np.inf, 1.0))
     up = magnet.state(np.tile([0.0, 0.0, 1.0], (*sites, 1)))
@@ -209,10 +211,10 @@ class Crooked(lt.KillingDissipation):
     """Control: a factor that is 10 % too large."""
 
     def factor(self, system, x, dH, dL):
-        return super().factor(system, x, dH, dL).scaled(jnp.asarray(1.21))
+        return super().factor(system, x, dH, dL).scale_by(jnp.asarray(1.21))
 
-    def prepared(self, system):
-        found = super().prepared(system)
+    def bind_to(self, system):
+        found = super().bind_to(system)
         return Crooked(found.rate, found.form)
 
 
@@ -274,8 +276,8 @@ def test_paths_converge_in_the_mean_square(system, noise):
     increments = np.sqrt(T / fine) * np.random.default_rng(0).standard_normal((paths, fine, noise_dimension(method)))
 
     def end(W, steps):
-        engine = Chosen(system, method, "compiled", steps, Summed(W, fine // steps))
-        return np.asarray(engine.advance(engine.begin(START), T / steps, 1, steps)[0].x)
+        engine = EngineWithFallback(system, method, "compiled", steps, Summed(W, fine // steps))
+        return np.asarray(engine.advance(engine.initial_run_state(START), T / steps, 1, steps)[0].x)
 
     exact = np.array([end(W, fine) for W in increments])
     for steps in levels:
@@ -361,8 +363,8 @@ def test_heat_of_a_bath_is_what_the_energy_changes_by():
     system = rotor()
     solution = run(system, BATH, "array")
     method, gradient = lt.MetriplecticMidpoint(), lt.Gonzalez()
-    rows = BATH.rows(3, np.zeros(1, int), 0, 100, 0.05)[0]
-    noisy = BATH.on(system, method)
+    rows = BATH.consecutive_increments(3, np.zeros(1, int), 0, 100, 0.05)[0]
+    noisy = BATH.method_with_noise(system, method)
 
     @jax.jit
     @jax.vmap
@@ -371,7 +373,8 @@ def test_heat_of_a_bath_is_what_the_energy_changes_by():
         dH = gradient(system.energy, x, d, compensation)
         moved = system.poisson.sharp(x + 0.5 * d, dH)
         heat = jnp.dot(
-            dH, 0.05 * (driven_by(noisy, dW).slopes(system, x, compensation, 0.05, d[None] / 0.05)[0] - moved)
+            dH,
+            0.05 * (set_noise_increments(noisy, dW).slopes(system, x, compensation, 0.05, d[None] / 0.05)[0] - moved),
         )
         return heat - (system.energy.value(new) - system.energy.value(x)), jnp.dot(dH, moved)
 

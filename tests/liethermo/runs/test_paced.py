@@ -6,7 +6,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engines.codes import Code
+from liethermo.engines.codes import StatusCode
 from liethermo.runs import batches, paced
 
 BODY = lt.models.rigid_body()
@@ -113,7 +113,7 @@ def test_stiff_failing_and_early_ones_together(engine):
     parameters = {"rate": np.array([50.0, 0.5, 0.5, 0.5, -1.0, 0.5]), "edge": np.array([9, 1.1, 9, 9, 9, 9])}
     step, method = lt.Adaptive(1e-6), lt.MetriplecticGauss(2)
     many = lt.ensemble(build, x0s, (0.0, 120.0), step, method, parameters=parameters, engine=engine)
-    assert many.status[[0, 2, 3, 4, 5]].tolist() == [0, 0, 0, Code.INADMISSIBLE, 0]
+    assert many.status[[0, 2, 3, 4, 5]].tolist() == [0, 0, 0, StatusCode.INADMISSIBLE, 0]
     for i in (0, 1, 2, 3, 5):
         system = build({name: value[i] for name, value in parameters.items()})
         one = lt.integrate(system, x0s[i], (0.0, 120.0), step, method, engine=engine, on_failure="return")
@@ -132,7 +132,7 @@ def test_stiff_failing_and_early_ones_together(engine):
 def test_limits():
     x0s = np.array([[0.1, 1.0, 0.1], [1.0, 0.0, 0.0]])
     many = lt.ensemble(BODY, x0s, (0.0, 50.0), lt.Adaptive(1e-8, most_steps=20), METHOD)
-    assert many.status.tolist() == [Code.STEP_LIMIT, Code.COMPLETED]
+    assert many.status.tolist() == [StatusCode.STEP_LIMIT, StatusCode.COMPLETED]
     one = lt.integrate(BODY, x0s[0], (0.0, 50.0), lt.Adaptive(1e-8, most_steps=20), METHOD, on_failure="return")
     assert many.end_time[0] == one.status.time
     assert "most_steps" in many.message(0)
@@ -163,7 +163,7 @@ def test_events_happen_when_they_do_alone(engine, step):
     x0s = np.concatenate([states(9), [[1.0, 0.0, 0.0]]])
     options = {"until": lt.Relaxed(1e-4), "engine": engine}
     many = lt.ensemble(BODY, x0s, (0.0, 40.05), step, METHOD, **options)
-    assert set(many.status.tolist()) == {Code.COMPLETED, Code.EVENT}
+    assert set(many.status.tolist()) == {StatusCode.COMPLETED, StatusCode.EVENT}
     assert many.end_time[9] == 40.05
     assert np.isnan(many.event_time[9])
     for i in (0, 4, 8, 9):
@@ -172,7 +172,7 @@ def test_events_happen_when_they_do_alone(engine, step):
         assert one.t[-1] == pytest.approx(many.end_time[i], rel=1e-13)
         assert one.event_time == (None if i == 9 else pytest.approx(many.event_time[i], rel=1e-13))
         assert np.abs(one.x[-1] - many.x[i]).max() < 1e-12
-    produced = [float(BODY.entropy_production(x)) for x in many.x[many.status == Code.EVENT]]
+    produced = [float(BODY.entropy_production(x)) for x in many.x[many.status == StatusCode.EVENT]]
     assert produced == pytest.approx([1e-4] * len(produced), rel=1e-9)
     assert many.audit().passed
 
@@ -184,7 +184,7 @@ def test_an_event_of_ones_own_in_a_family():
     options = {"until": lambda x: x[0] - level}
     given = {"parameters": {"dissipation.rate": rates}}
     many = lt.ensemble(BODY, x0s, (0.0, 30.0), lt.Adaptive(1e-9), METHOD, **given, **options)
-    happened = many.status == Code.EVENT
+    happened = many.status == StatusCode.EVENT
     assert happened.sum() >= 2
     i = int(np.flatnonzero(happened)[-1])
     assert np.abs(many.x[happened, 0] - level).max() < 1e-13
@@ -236,7 +236,7 @@ def test_interrupted(monkeypatch):
 
     monkeypatch.setattr("liethermo.engines.paced._follow_all", interrupt)
     many = lt.ensemble(BODY, states(3), SPAN, lt.Adaptive(1e-6), METHOD, engine="array")
-    assert many.status.tolist() == [Code.INTERRUPTED] * 3
+    assert many.status.tolist() == [StatusCode.INTERRUPTED] * 3
     assert not many.steps.any()
 
 

@@ -9,7 +9,7 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.runs.fluctuations import step_cells, step_code
-from liethermo.runs.timetable import Part
+from liethermo.runs.timetable import ScheduleSegment
 from tests.cases import BuiltOnUse
 
 ENTROPY = lt.Quadratic(4.0 * np.ones(3))
@@ -188,11 +188,11 @@ def test_steps_at_times_that_are_rounded_otherwise_have_the_same_names(step, off
 def test_parts_have_the_steps_of_the_run_however_late_they_are(step, steps):
     """1024.9 - 1024.8 is more than 0.1 by rounding, which is no time for a step."""
     for first in [*range(0, 200_000, 17), 10**6, 10**7 + 3, 10**8 + 1]:
-        part = Part.of(first * steps * step, (first + 1) * steps * step, step)
-        assert (part.full, part.last) == (steps, 0.0)
-        part = Part.of(first * steps * step, (first + 1) * steps * step + 0.25 * step, step)
-        assert part.full == steps
-        assert np.isclose(part.last, 0.25 * step, rtol=1e-4)
+        part = ScheduleSegment.from_span(first * steps * step, (first + 1) * steps * step, step)
+        assert (part.n_full_steps, part.last_step_size) == (steps, 0.0)
+        part = ScheduleSegment.from_span(first * steps * step, (first + 1) * steps * step + 0.25 * step, step)
+        assert part.n_full_steps == steps
+        assert np.isclose(part.last_step_size, 0.25 * step, rtol=1e-4)
 
 
 def test_a_noisy_loop_of_single_steps_at_late_times():

@@ -12,8 +12,8 @@ import liethermo as lt
 import manifolds as mf
 from liethermo.engines import array
 from liethermo.engines.compiled import stepper as compiled
-from liethermo.engines.growth import growing
-from liethermo.engines.pacing import after_bad, after_good
+from liethermo.engines.growth import arnoldi_hessenberg
+from liethermo.engines.pacing import step_size_after_acceptance, step_size_after_rejection
 from liethermo.runs import stepwise
 from liethermo.tracing.scalarize import UnsupportedPrimitive
 
@@ -76,7 +76,7 @@ def test_the_estimate_of_the_local_error(stages, h):
     engines = [array.ArrayEngine(SYSTEM, m) for m in (method, exact)]
     ratios = []
     for x in lt.integrate(SYSTEM, START, (0.0, 20.0), 0.5, engine="array").x:
-        new, right = (f.step(f.begin(x), h) for f in engines)
+        new, right = (f.step(f.initial_run_state(x), h) for f in engines)
         estimate = method.error(SYSTEM, x, np.zeros(3), h, new.k)
         ratios.append(float(estimate / np.abs(new.x - right.x).max()))
     mean = np.exp(np.mean(np.log(ratios)))
@@ -93,7 +93,7 @@ def test_the_estimate_scales_with_the_motion():
     ratios = []
     for amplitude in (1e-1, 1e-3, 1e-5):
         x = np.array([amplitude, 0.0, 1.0])
-        new, right = (e.step(e.begin(x), h) for e in (compiled.CompiledEngine(free, m) for m in methods))
+        new, right = (e.step(e.initial_run_state(x), h) for e in (compiled.CompiledEngine(free, m) for m in methods))
         estimate = method.error(free, x, np.zeros(3), h, new.k)
         ratios.append(float(estimate) / np.abs(new.x - right.x).max())
     assert max(ratios) < 1.5 * min(ratios), ratios
@@ -128,15 +128,17 @@ def test_control(explicit):
         before, optimal = optimal, h * error**-power
         good = error <= 1.0
         proposed = float(
-            after_good(optimal, before, h, h, power, np.inf, explicit) if good else after_bad(error, h, power)
+            step_size_after_acceptance(optimal, before, h, h, power, np.inf, explicit)
+            if good
+            else step_size_after_rejection(error, h, power)
         )
         sizes.append(proposed)
     assert 0.05 < proposed <= 0.1
     assert proposed == pytest.approx(h, rel=1e-14 if explicit else 0.0)
     assert sizes[0] == pytest.approx(1e-4 if explicit else 3e-5)
     cut_short = 0.01 * proposed  # which says nothing
-    assert float(after_good(10.0, 0.0, cut_short, proposed, power, np.inf, explicit)) == proposed
-    assert float(after_bad(np.inf, proposed, power)) == 0.25 * proposed
+    assert float(step_size_after_acceptance(10.0, 0.0, cut_short, proposed, power, np.inf, explicit)) == proposed
+    assert float(step_size_after_rejection(np.inf, proposed, power)) == 0.25 * proposed
 
 
 def test_attempts_together_are_attempts_one_by_one(monkeypatch):
@@ -171,7 +173,7 @@ def test_the_array_engine_takes_over_amid_attempts_made_together(monkeypatch):
         raise UnsupportedPrimitive("newton", "in this test")
 
     whole = followed("array")
-    monkeypatch.setattr(compiled.Stepper, "_solver", solver)
+    monkeypatch.setattr(compiled.CompiledStepLoop, "_solver", solver)
     with pytest.warns(UserWarning, match="newton"):
         parts = followed("auto")
     assert asked
@@ -292,7 +294,7 @@ def test_what_grows_in_a_larger_system():
     system = wells(6)
     x = np.concatenate([[0.0, 0.1, 0.0, 0.7, 0.0, 0.2], np.zeros(6)])
     matrix = np.asarray(jax.jacfwd(system.vector_field)(jnp.asarray(x)))
-    found = np.linalg.eigvals(np.asarray(growing(system, lt.MetriplecticMidpoint(), jnp.asarray(x))))
+    found = np.linalg.eigvals(np.asarray(arnoldi_hessenberg(system, lt.MetriplecticMidpoint(), jnp.asarray(x))))
     assert np.sort(found.real) == pytest.approx(np.sort(np.linalg.eigvals(matrix).real), abs=1e-9)
 
 

@@ -11,7 +11,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engines.choice import Chosen
+from liethermo.engines.choice import EngineWithFallback
 from liethermo.integrators import reference
 
 BODY, X0 = lt.models.rigid_body(), np.array([0.1, 1.0, 0.1])
@@ -26,7 +26,7 @@ BODY, X0 = lt.models.rigid_body(), np.array([0.1, 1.0, 0.1])
     ],
 )
 def test_fixed_steps(monkeypatch, error, why):
-    advance, calls = Chosen.advance, []
+    advance, calls = EngineWithFallback.advance, []
 
     def stopped(self, *arguments):
         calls.append(1)
@@ -34,8 +34,8 @@ def test_fixed_steps(monkeypatch, error, why):
             raise error
         return advance(self, *arguments)
 
-    monkeypatch.setattr(Chosen, "advance", stopped)
-    monkeypatch.setattr(Chosen, "portion", property(lambda self: 10))
+    monkeypatch.setattr(EngineWithFallback, "advance", stopped)
+    monkeypatch.setattr(EngineWithFallback, "portion", property(lambda self: 10))
     whole = lt.integrate(BODY, X0, (0.0, 5.0), 0.1, engine="array")
     assert whole.status.code == "interrupted"
     assert why in whole.status.message
@@ -47,7 +47,7 @@ def test_fixed_steps(monkeypatch, error, why):
 def test_adaptive_steps(monkeypatch):
     from liethermo.runs.run import Run
 
-    append, calls = Run._append, []
+    append, calls = Run._save_steps, []
 
     def stopped(self, *arguments):
         calls.append(1)
@@ -65,13 +65,13 @@ def test_another_error_is_not_hidden(monkeypatch):
     def broken(self, *arguments):
         raise jax.errors.JaxRuntimeError("INTERNAL: something else")
 
-    monkeypatch.setattr(Chosen, "advance", broken)
+    monkeypatch.setattr(EngineWithFallback, "advance", broken)
     with pytest.raises(jax.errors.JaxRuntimeError, match="something else"):
         lt.integrate(BODY, X0, (0.0, 5.0), 0.1)
 
 
 def test_the_reference_solver(monkeypatch):
-    field, calls = reference._field, []
+    field, calls = reference._vector_field, []
 
     def stopped(*arguments):
         calls.append(1)

@@ -6,18 +6,18 @@ from scipy.stats import qmc
 
 import liethermo as lt
 from liethermo.studies.axes import Axes
-from liethermo.studies.store import matched
+from liethermo.studies.store import match_axes
 
 
 def test_a_grid_has_every_combination_and_zipped_parameters_vary_together():
-    axes = Axes.of({"a": [1.0, 2.0], "pair": lt.zipped(b=[3, 4, 5], c=["x", "y", "z"])})
+    axes = Axes.from_mapping({"a": [1.0, 2.0], "pair": lt.zipped(b=[3, 4, 5], c=["x", "y", "z"])})
     assert axes.shape == (2, 3)
-    assert axes.parameters == ("a", "b", "c")
-    points = axes.points(tuple(np.indices(axes.shape).reshape(2, -1)))
+    assert axes.parameter_names == ("a", "b", "c")
+    points = axes.parameters_at(tuple(np.indices(axes.shape).reshape(2, -1)))
     assert points["a"].tolist() == [1, 1, 1, 2, 2, 2]
     assert points["b"].tolist() == [3, 4, 5] * 2
     assert points["c"].tolist() == ["x", "y", "z"] * 2
-    assert axes.describe((1, 2)) == "a = 2, b = 5, c = z"
+    assert axes.describe_point((1, 2)) == "a = 2, b = 5, c = z"
 
 
 def test_samples_lie_in_their_ranges_as_their_construction_says():
@@ -48,7 +48,7 @@ def test_samples_lie_in_their_ranges_as_their_construction_says():
 )
 def test_what_is_no_axis_is_refused(given, message):
     with pytest.raises(lt.InputError, match=message):
-        Axes.of(given)
+        Axes.from_mapping(given)
 
 
 @pytest.mark.parametrize(
@@ -71,19 +71,24 @@ def test_what_is_no_sample_is_refused(make, message):
 
 
 def test_longer_axes_match_the_order_of_a_store_and_its_rounding():
-    kept, longer = Axes.of({"a": np.linspace(0.1, 0.7, 7)}), Axes.of({"a": np.linspace(0.1, 0.8, 8)[::-1]})
+    kept, longer = (
+        Axes.from_mapping({"a": np.linspace(0.1, 0.7, 7)}),
+        Axes.from_mapping({"a": np.linspace(0.1, 0.8, 8)[::-1]}),
+    )
     assert kept.axes[0].labels[2] != longer.axes[0].labels[5]  # 0.3 and its neighbour
-    found = matched(longer, kept).axes[0]
+    found = match_axes(longer, kept).axes[0]
     assert found.labels.tolist() == [*kept.axes[0].labels, 0.8]
     with pytest.raises(lt.InputError, match=r"the axis 'a' lacks 0\.1, which is value 0"):
-        matched(Axes.of({"a": [0.2, 0.3]}), kept)
+        match_axes(Axes.from_mapping({"a": [0.2, 0.3]}), kept)
     with pytest.raises(lt.InputError, match=r"the axes are b \(b\)"):
-        matched(Axes.of({"b": [0.2]}), kept)
+        match_axes(Axes.from_mapping({"b": [0.2]}), kept)
 
 
 def test_replicas_are_told_apart_by_their_states_and_may_be_alike():
     states = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    found = matched(Axes.of({"r": lt.replicas(states)}), Axes.of({"r": lt.replicas(states[1:])})).axes[0]
+    found = match_axes(
+        Axes.from_mapping({"r": lt.replicas(states)}), Axes.from_mapping({"r": lt.replicas(states[1:])})
+    ).axes[0]
     assert np.array_equal(found.states, states[[1, 2, 0]])
     with pytest.raises(lt.InputError, match="lacks"):
-        matched(Axes.of({"r": lt.replicas(states[1:])}), Axes.of({"r": lt.replicas(states[:2])}))
+        match_axes(Axes.from_mapping({"r": lt.replicas(states[1:])}), Axes.from_mapping({"r": lt.replicas(states[:2])}))

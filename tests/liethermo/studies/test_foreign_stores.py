@@ -15,8 +15,8 @@ import liethermo as lt
 from liethermo.cli import app
 from liethermo.studies import files
 from liethermo.studies import store as stores
-from liethermo.studies.checked import SEAL, sealed
-from liethermo.studies.stored import audit, load_study, status
+from liethermo.studies.store_metadata import CHECKSUM_ATTRIBUTE, with_checksum
+from liethermo.studies.store_results import audit_store, load_status, load_study
 
 
 def study(store, rates=(0.5, 1.0, 2.0, 4.0)):
@@ -47,8 +47,8 @@ def store(made, tmp_path):
 def everything(store):
     """All that can be asked of a store; the errors that it was answered with."""
     asked = [
-        lambda: status(store),
-        lambda: audit(store),
+        lambda: load_status(store),
+        lambda: audit_store(store),
         lambda: load_study(store).load(),
         lambda: study(store).run(),
         lambda: study(store).results.load(),
@@ -66,7 +66,7 @@ def changed(store, change, seal=True):
     """A store whose metadata somebody has changed who knows how they are sealed."""
     group = json.loads((store / "zarr.json").read_text())
     change(group)
-    (store / "zarr.json").write_text(json.dumps(sealed(group) if seal else group))
+    (store / "zarr.json").write_text(json.dumps(with_checksum(group) if seal else group))
     return store
 
 
@@ -179,7 +179,7 @@ def test_metadata_have_a_checksum(store):
     assert everything(changed(store, retitled)) == []
     assert len(everything(changed(store, retitled, seal=False))) == 5
     with pytest.warns(UserWarning, match="an earlier version"):
-        assert status(changed(store, of_group("attributes", SEAL), seal=False)).complete
+        assert load_status(changed(store, of_group("attributes", CHECKSUM_ATTRIBUTE), seal=False)).complete
 
 
 def link(path, target):
@@ -209,8 +209,8 @@ def test_nothing_leads_out_of_a_store(store, tmp_path, where, planted):
 def test_a_status_that_there_is_not(store):
     mark = np.array([77, 0], dtype=np.int8).tobytes()
     (store / "status/c/0").write_bytes(mark + struct.pack("<I", google_crc32c.value(mark)))
-    assert status(store).done == 2
-    assert audit(store).passed
+    assert load_status(store).done == 2
+    assert audit_store(store).passed
     with pytest.raises(lt.FileError, match="a status that there is not"):
         load_study(store).load()
     assert study(store).run().damaged == ("status/c/0 is damaged",)
@@ -255,7 +255,7 @@ def test_the_loser_of_a_race_for_a_store_is_told(tmp_path, monkeypatch):
     def late(source, target):
         monkeypatch.undo()
         study(path).run()
-        held.enter_context(files.locked(path))(4)
+        held.enter_context(files.lock_store(path))(4)
         rename(source, target)
 
     monkeypatch.setattr(stores.os, "rename", late)

@@ -17,7 +17,7 @@ import liethermo as lt
 import manifolds as mf
 from liethermo import disk
 from liethermo.studies import files
-from liethermo.studies.running import here
+from liethermo.studies.running import run_locally
 
 from .cases import RATES, RATIOS, X0, body, content, study
 
@@ -41,7 +41,7 @@ def test_every_point_is_what_a_run_of_its_own_gives(done):
     assert np.array_equal(found.rate, RATES)
     for i, j in ((0, 0), (3, 4), (5, 2)):
         solution = lt.integrate(body({"rate": RATES[i], "ratio": RATIOS[j]}), X0, (0.0, 4.0), 0.1)
-        np.testing.assert_allclose(found.final[i, j], solution.x[-1], rtol=0, atol=1e-14)
+        np.testing.assert_allclose(found.needs_final_state[i, j], solution.x[-1], rtol=0, atol=1e-14)
         kept = found.laws[i, j]
         assert kept.sel(quantity="steps") == 40
         assert kept.sel(quantity="entropy_change") == pytest.approx(
@@ -62,7 +62,7 @@ def test_a_parameter_that_is_refused_is_the_status_of_its_points(done):
         "a dissipation rate must be >= 0, not -1.0: a negative one would lower the entropy"
     }
     assert np.isnan(bad.tau).all()
-    assert np.isnan(bad.final).all()
+    assert np.isnan(bad.needs_final_state).all()
     assert (found.status.sel(rate=RATES[0]) == 0).all()
 
 
@@ -89,8 +89,8 @@ def test_chunks_and_their_order_make_no_difference_to_the_last_bit(done, tmp_pat
         assert found.results.drop_attrs().identical(whole.drop_attrs()), chunk
 
     def backwards(solver, store, axes, survey, bar):
-        survey.todo.reverse()
-        here(solver, store, axes, survey, bar)
+        survey.remaining_chunks.reverse()
+        run_locally(solver, store, axes, survey, bar)
 
     monkeypatch.setattr("liethermo.studies.study.here", backwards)
     assert study(tmp_path / "backwards.zarr").run().complete
@@ -114,7 +114,7 @@ def test_longer_axes_run_the_new_points_alone(done, tmp_path):
     def watched(solver, store, axes, survey, bar):
         columns = solver.columns
         solver.columns = lambda points, states, size, *rest: asked.append(size) or columns(points, states, size, *rest)
-        here(solver, store, axes, survey, bar)
+        run_locally(solver, store, axes, survey, bar)
         del solver.columns
 
     with pytest.MonkeyPatch.context() as patch:
@@ -140,7 +140,7 @@ def test_damaged_and_missing_files_are_noticed_and_made_again(done, tmp_path):
     flipped = store / "status/c/3/0"
     flipped.write_bytes(bytes([flipped.read_bytes()[0] ^ 1]) + flipped.read_bytes()[1:])
     (store / "message/c/6/0").unlink()
-    half_written = store / "tau/c" / f".0.abc{disk.PART}"
+    half_written = store / "tau/c" / f".0.abc{disk.PART_SUFFIX}"
     half_written.write_bytes(b"half")
     status = study(store).run()
     assert set(status.damaged) == {
@@ -191,7 +191,7 @@ def test_a_builder_that_looks_at_values_is_called_for_each_point(tmp_path):
     results = found.results
     assert results.message.sel(kind="plate", rate=2.0).item() == "ValueError: too fast"
     direct = lt.integrate(lt.models.rigid_body((2.0, 2.0, 1.0), 0.5), X0, (0.0, 4.0), 0.1)
-    np.testing.assert_allclose(results.final.sel(kind="plate", rate=0.5), direct.x[-1], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(results.needs_final_state.sel(kind="plate", rate=0.5), direct.x[-1], rtol=0, atol=1e-14)
 
 
 @pytest.mark.slow
@@ -226,7 +226,7 @@ def test_a_system_can_be_swept_by_the_names_of_its_parameters(tmp_path):
     assert found.run().ok
     direct = lt.ensemble(system, X0, (0.0, 4.0), 0.1, parameters={"dissipation.rate": np.array([0.2, 0.4])})
     wanted = lt.integrate(lt.models.rigid_body((2.5, 2.0, 1.5), 0.8), X0, (0.0, 4.0), 0.1).x[-1]
-    np.testing.assert_allclose(found.results.final[1, 1], wanted, atol=1e-14)
+    np.testing.assert_allclose(found.results.needs_final_state[1, 1], wanted, atol=1e-14)
     assert direct.x.shape == (2, 3)
     with pytest.raises(lt.InputError, match=r"no parameter 'rate' that is one number; it has"):
         study(axes={"rate": [0.1]}, build=system)
@@ -244,7 +244,7 @@ def test_replicas_and_initial_states_of_their_own(tmp_path):
         build=lambda p: body({"ratio": 0.2, "rate": p["rate"]}),
     )
     seeded.run()
-    assert np.array_equal(found.results.final.values, seeded.results.final.values)
+    assert np.array_equal(found.results.needs_final_state.values, seeded.results.needs_final_state.values)
     assert np.array_equal(found.results.replica_state, states)
     named = study(
         tmp_path / "c.zarr",
@@ -253,8 +253,8 @@ def test_replicas_and_initial_states_of_their_own(tmp_path):
         build=lambda p: body({"ratio": 0.2, "rate": 0.3}),
     )
     named.run()
-    assert np.array_equal(named.results.final.sel(place="pole"), [0.0, 0.0, 1.0])  # both are equilibria
-    assert np.array_equal(named.results.final.sel(place="equator"), [1.0, 0.0, 0.0])
+    assert np.array_equal(named.results.needs_final_state.sel(place="pole"), [0.0, 0.0, 1.0])  # both are equilibria
+    assert np.array_equal(named.results.needs_final_state.sel(place="equator"), [1.0, 0.0, 0.0])
     with pytest.raises(lt.InputError, match="x0 and replica"):
         study(axes=axes, build=body)
 
@@ -319,7 +319,7 @@ def test_folders_that_are_no_stores_and_folders_that_cannot_be_written(tmp_path,
 
 
 def test_a_full_disk_is_said_and_loses_nothing(done, tmp_path, monkeypatch):
-    store, write, left = tmp_path / "s.zarr", disk.write, [40]
+    store, write, left = tmp_path / "s.zarr", disk.write_atomically, [40]
 
     def short(path, data):
         left[0] -= 1
@@ -340,7 +340,7 @@ def test_a_full_disk_is_said_and_loses_nothing(done, tmp_path, monkeypatch):
 
 def test_two_runs_at_once_and_a_status_from_outside(done, tmp_path):
     store = done[0]
-    with files.locked(store) as tell:
+    with files.lock_store(store) as tell:
         tell(0)
         with pytest.raises(lt.FileError, match=f"another run works on .*process {os.getpid()} on"):
             study(store).run()
@@ -355,8 +355,8 @@ def test_ctrl_c_leaves_a_store_to_go_on_from(done, tmp_path, monkeypatch):
     store = tmp_path / "s.zarr"
 
     def interrupted(solver, store, axes, survey, bar):
-        del survey.todo[3:]
-        here(solver, store, axes, survey, bar)
+        del survey.remaining_chunks[3:]
+        run_locally(solver, store, axes, survey, bar)
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
@@ -498,7 +498,7 @@ def test_noise_at_a_place_is_that_of_its_seed(tmp_path):
         measure={"final": "final"}, noise=noise, store=tmp_path / "one.zarr",
     )  # fmt: skip
     study.run()
-    seed = int(noise.at([np.array([1])])[0])
+    seed = int(noise.grid_seeds([np.array([1])])[0])
     alone = lt.integrate(
         spin_in_a_bath({"rate": 1.0}), [0.6, 0.0, 0.8], (0.0, 1.0), 0.1,
         noise=lt.Fluctuations(0.2, seed, temperature=1.0),

@@ -11,7 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import liethermo as lt
-from liethermo.tracing.interpret import at_points
+from liethermo.tracing.interpret import evaluate_at_points
 
 X0 = np.array([0.3, -0.2, 0.5, 0.4, 0.1])
 
@@ -46,7 +46,7 @@ def by_hand(t, y):
 
 def test_the_equations_and_their_laws():
     points = np.random.default_rng(1).standard_normal((8, 5))
-    field = at_points(lambda system, x: system.vector_field(x), tangled(), points)
+    field = evaluate_at_points(lambda system, x: system.vector_field(x), tangled(), points)
     expected = np.array([by_hand(0.0, x) for x in points])
     assert np.abs(field - expected).max() < 1e-12 * np.abs(expected).max()
     assert (tangled().energy_law, tangled().entropy_law) == ("conserved", "nondecreasing")
@@ -56,7 +56,7 @@ def test_the_equations_and_their_laws():
 def test_it_is_the_thermodynamic_herglotz_system_for_eta_L():
     """SML Prop. 3.3; and for ``T dS + F dq`` a simple closed system with that friction."""
     points = np.random.default_rng(2).standard_normal((8, 5))
-    field = lambda system: at_points(lambda system, x: system.vector_field(x), system, points)  # noqa: E731
+    field = lambda system: evaluate_at_points(lambda system, x: system.vector_field(x), system, points)  # noqa: E731
     by_L = lt.ChetaevSystem(L, lambda q, v, S: jnp.append(-jax.grad(L, argnums=1)(q, v, S), 1.0), 5, validate=False)
     herglotz = lt.ThermodynamicHerglotz(lambda x: L(x[:2], x[2:4], x[4]), 5, validate=False)
     assert np.abs(field(by_L) - field(herglotz)).max() < 1e-12 * np.abs(field(herglotz)).max()

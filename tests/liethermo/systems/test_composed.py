@@ -221,7 +221,7 @@ class ConstantFactor(HeatConduction):
 
     def force(self, system, x, dH, dS, dL):
         T = dH[S := system.poisson.places.S]
-        i, j = np.array(self.first), np.array(self.second)
+        i, j = np.array(self.first_bodies), np.array(self.second_bodies)
         return jnp.zeros_like(x).at[S[i]].add(self.conductance * T[j]).at[S[j]].add(-self.conductance * T[i])
 
 
@@ -471,7 +471,7 @@ def test_temperatures_that_are_not_positive():
 
 
 def test_places():
-    places = mf.ExtendedPhaseSpace((2, 0, 1)).places
+    places = mf.ExtendedPhaseSpace((2, 0, 1)).state_indices
     assert places.q.tolist() == [0, 1, 6]
     assert places.p.tolist() == [2, 3, 7]
     assert places.S.tolist() == [4, 5, 8]

@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.tracing.interpret import at_points
+from liethermo.tracing.interpret import evaluate_at_points
 
 GRAVITY, MASS, RATE, CAPACITY = 9.81, 1.3, 0.4, 5.0
 V = lt.VariationalIntegrator
@@ -321,7 +321,7 @@ def by_herglotz() -> Case:
 
 
 def fields(system, points) -> np.ndarray:
-    return at_points(lambda system, x: system.vector_field(x), system, np.asarray(points))
+    return evaluate_at_points(lambda system, x: system.vector_field(x), system, np.asarray(points))
 
 
 def discrete_errors(order: int, counts=(20, 40, 80)) -> np.ndarray:

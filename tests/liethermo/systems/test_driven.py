@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 import liethermo as lt
 import manifolds as mf
 from liethermo.systems.driven import UNIT
-from liethermo.tracing.interpret import at_points
+from liethermo.tracing.interpret import evaluate_at_points
 
 RATE = 1.3
 SPAN = (0.5, 3.5)
@@ -160,7 +160,9 @@ def slopes(system, method, states, rates):
         system = lt.DrivenSystem(system)
         states = system.begin(states, 0.5, batch=True)
         rates = np.concatenate([rates, np.full((*rates.shape[:-1], 2), system.unit)], axis=-1)
-    return at_points(_slopes, (system, method), np.concatenate([states, rates.reshape(len(rates), -1)], axis=1))
+    return evaluate_at_points(
+        _slopes, (system, method), np.concatenate([states, rates.reshape(len(rates), -1)], axis=1)
+    )
 
 
 METHODS = [

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.functions.gradients import GRADIENTS
+from liethermo.functions.gradients import DISCRETE_GRADIENTS
 from tests.cases import tolerance
 
 seeds = st.integers(0, 10**6)
@@ -129,7 +129,7 @@ def test_both_laws_for_random_potentials_and_steps(bent, seed, h):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", GRADIENTS)
+@pytest.mark.parametrize("name", DISCRETE_GRADIENTS)
 def test_both_laws_with_every_discrete_gradient(name):
     """Diagonal G, for which the coordinate increment as printed is a midpoint gradient too."""
     energy = lt.Kinetic([1.0, 0.5]) + lt.Potential(Bumpy(jnp.array([2.0, -1.0, 1.5]), jnp.ones(2)))

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 import liethermo as lt
 from liethermo.engines.sparse import linear
-from liethermo.functions.gradients import GRADIENTS, stage_gradients
-from liethermo.integrators.tableaus import gauss
+from liethermo.functions.gradients import DISCRETE_GRADIENTS, stage_gradients
+from liethermo.integrators.tableaus import gauss_tableau
 from liethermo.models.heat_grid import grid_graph, heat_grid_solution
 from tests.cases import tolerance
 
@@ -67,9 +67,9 @@ def assert_both_laws(solution, content=0.0):
 @eqx.filter_jit
 def all_of(energy, x, d, k):
     """Value, gradient and all discrete gradients."""
-    A, b, _ = gauss(2)
+    A, b, _ = gauss_tableau(2)
     stages = stage_gradients(energy, x, 0.0 * x, 0.1, k, A, b)
-    return [energy.value(x), energy.gradient(x), *(g(energy, x, d) for g in GRADIENTS.values()), stages]
+    return [energy.value(x), energy.gradient(x), *(g(energy, x, d) for g in DISCRETE_GRADIENTS.values()), stages]
 
 
 @pytest.mark.slow
@@ -157,12 +157,12 @@ def test_the_compressed_jacobian_is_the_jacobian(method):
     pattern, x = system.sparsity(), jnp.asarray(random_state(n))
     slopes = eqx.filter_jit(lambda k: method.slopes(system, x, 0.0 * x, h, k))
     k = jnp.asarray(np.random.default_rng(1).standard_normal((method.stages, 3 * n)))
-    compression = linear.Compression(pattern, method.stages)
-    assert 0 < len(compression.hubs) < 6
-    assert compression.derivatives < 0.8 * k.size
+    compression = linear.JacobianCompression(pattern, method.stages)
+    assert 0 < len(compression.dense_rows) < 6
+    assert compression.n_derivatives < 0.8 * k.size
     push = jax.jit(lambda seed: jax.jvp(slopes, (k,), (seed,))[1])
     pull = jax.jit(lambda seed: jax.vjp(slopes, k)[1](seed)[0])
-    found = compression.matrix(push, pull)
+    found = compression.assemble_jacobian(push, pull)
     exact = np.asarray(jax.jacfwd(slopes)(k)).reshape(k.size, k.size)
     # rounding in derivatives of the quotient (H(x') - H(x)) / |d|^2: 6e-14 seen
     assert np.abs(found.toarray() - exact).max() <= 3e-13 * np.abs(exact).max()
@@ -176,13 +176,13 @@ def test_colours(seed):
     """No row has two columns of one colour, and a plane grid needs few."""
     rng = np.random.default_rng(seed)
     pattern = scipy.sparse.random_array((40, 40), density=0.1, rng=rng, format="csr") + scipy.sparse.eye_array(40)
-    compression = linear.Compression(scipy.sparse.csr_array(pattern))
-    for i in set(range(40)) - set(compression.hubs.tolist()):
+    compression = linear.JacobianCompression(scipy.sparse.csr_array(pattern))
+    for i in set(range(40)) - set(compression.dense_rows.tolist()):
         colours = compression.colours[pattern.indices[pattern.indptr[i] : pattern.indptr[i + 1]]]
         assert len(set(colours)) == len(colours)
-    grid = linear.Compression(scipy.sparse.csr_array(grid_graph((9, 9)) + scipy.sparse.eye_array(81)))
-    assert grid.derivatives <= 9
-    assert grid.width == 9
+    grid = linear.JacobianCompression(scipy.sparse.csr_array(grid_graph((9, 9)) + scipy.sparse.eye_array(81)))
+    assert grid.n_derivatives <= 9
+    assert grid.front_width == 9
 
 
 @pytest.mark.parametrize("widest", [1000, 0], ids=["factorised", "Krylov"])
@@ -191,16 +191,16 @@ def test_inverses(widest, monkeypatch):
     rng = np.random.default_rng(0)
     A = scipy.sparse.csc_array(scipy.sparse.eye_array(50) + 3.0 * grid_laplacian((5, 10)))
     x = rng.standard_normal(50)
-    assert np.abs(linear.Inverse(A, 5)(A @ x) - x).max() < (1e-13 if widest else 1e-4)
+    assert np.abs(linear.SparseInverse(A, 5)(A @ x) - x).max() < (1e-13 if widest else 1e-4)
     bad = A.copy()
     bad.data[3] = np.nan
     with pytest.raises(np.linalg.LinAlgError, match="not finite"):
-        linear.Inverse(bad, 5)
+        linear.SparseInverse(bad, 5)
 
 
 def test_a_singular_matrix():
     with pytest.raises(np.linalg.LinAlgError, match="singular"):
-        linear.Inverse(scipy.sparse.csc_array(np.diag([1.0, 0.0])), 1)
+        linear.SparseInverse(scipy.sparse.csc_array(np.diag([1.0, 0.0])), 1)
 
 
 def grid_laplacian(shape):

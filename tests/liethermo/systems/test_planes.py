@@ -10,12 +10,12 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.engines import array
-from liethermo.engines.rules import RULES
-from liethermo.engines.stepping import begin, in_order, take_step
-from liethermo.functions.gradients import GRADIENTS, stage_gradients
+from liethermo.engines.rules import DEFAULT_OPTIONS
+from liethermo.engines.stepping import initial_run_state_program, reorder_components, take_step
+from liethermo.functions.gradients import DISCRETE_GRADIENTS, stage_gradients
 from liethermo.functions.planes import to_planes, to_sites
-from liethermo.integrators.base import pulled
-from liethermo.integrators.tableaus import finer, gauss
+from liethermo.integrators.base import pullback_method
+from liethermo.integrators.tableaus import gauss_tableau, kronrod_rule
 from tests.cases import BuiltOnUse
 
 from .test_spins import ENERGIES, SITES, unit
@@ -84,12 +84,14 @@ def state(system, seed=0):
 @jax.jit
 def looked_at(system, x, d, compensation, k):
     """What a step asks of a system: numbers, and vectors."""
-    A, b, _ = gauss(2)
+    A, b, _ = gauss_tableau(2)
     energy = system.energy
-    gradients = [scheme(energy, x, d, compensation) for scheme in GRADIENTS.values() if scheme.orderless]
-    stages = stage_gradients(energy, x, compensation, 0.1, k, A, b, finer(2))
+    gradients = [
+        scheme(energy, x, d, compensation) for scheme in DISCRETE_GRADIENTS.values() if scheme.is_order_independent
+    ]
+    stages = stage_gradients(energy, x, compensation, 0.1, k, A, b, kronrod_rule(2))
     vectors = jnp.stack([energy.gradient(x), system.vector_field(x), *gradients, *stages])
-    return jnp.stack([energy.value(x), energy.sensitivity(x)]), energy.rounded(x), vectors
+    return jnp.stack([energy.value(x), energy.sensitivity(x)]), energy.rounding_scale(x), vectors
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
@@ -117,11 +119,11 @@ def test_steps_are_the_same(name, method):
     system, h = SYSTEMS[name], jnp.asarray(0.02)
     method = method.on(system)
     found = system.arranged()
-    one = begin(system, method, state(system))
-    other = begin(found.system, pulled(method, found), found.there(state(system)))
+    one = initial_run_state_program(system, method, state(system))
+    other = initial_run_state_program(found.system, pullback_method(method, found), found.there(state(system)))
     step = jax.jit(take_step)
     for _ in range(3):
-        one, other = step(system, method, one, h), step(found.system, pulled(method, found), other, h)
+        one, other = step(system, method, one, h), step(found.system, pullback_method(method, found), other, h)
     assert int(one.status) == int(other.status) == 0
     for name in ("x", "energy", "entropy", "largest_energy_increment", "energy_sensitivity"):
         ours = getattr(other, name)
@@ -142,7 +144,7 @@ def ring(**changes):
 def test_a_run_of_a_large_system_is_in_that_order_and_no_user_sees_it(method, monkeypatch):
     system = ring()
     x0 = system.state(unit(LARGE))
-    assert x0.size > RULES.many
+    assert x0.size > DEFAULT_OPTIONS.rms_norm_dim
     run = (system, x0, (0.0, 0.2), 0.05, method)
     found = lt.integrate(*run)
     assert found.audit().passed
@@ -157,8 +159,8 @@ def test_levels_keep_their_places():
     """Levels of an explicit method are no components of a state."""
     system, method = ring(), lt.MetriplecticRungeKutta(4)
     own = method.on(system)
-    first = begin(system, own, jnp.asarray(system.state(unit(LARGE))))
-    _, _, inside, back = in_order(system, own, first)
+    first = initial_run_state_program(system, own, jnp.asarray(system.state(unit(LARGE))))
+    _, _, inside, back = reorder_components(system, own, first)
     np.testing.assert_array_equal(inside.k[3], first.k[3])
     for name, value in first._asdict().items():
         np.testing.assert_array_equal(getattr(back(inside), name), value)
@@ -193,9 +195,12 @@ def test_noise_is_that_of_sites_whatever_the_order(monkeypatch):
 
 def test_a_scheme_that_takes_coordinates_in_their_order_keeps_it():
     system, method = SYSTEMS["one bath"], lt.MetriplecticMidpoint("coordinate_increment")
-    first = begin(system, method, state(system))
-    assert in_order(system, method, first, replace(RULES, many=1))[0] is system
-    assert in_order(system, lt.MetriplecticMidpoint(), first, replace(RULES, many=1))[0] is not system
+    first = initial_run_state_program(system, method, state(system))
+    assert reorder_components(system, method, first, replace(DEFAULT_OPTIONS, rms_norm_dim=1))[0] is system
+    assert (
+        reorder_components(system, lt.MetriplecticMidpoint(), first, replace(DEFAULT_OPTIONS, rms_norm_dim=1))[0]
+        is not system
+    )
 
 
 @pytest.mark.slow
@@ -212,7 +217,7 @@ def test_derivatives_go_through():
 
 
 def test_what_has_no_other_order():
-    assert mf.Spins(3).planar is False
+    assert mf.Spins(3).is_component_major is False
     assert ring(baths=False).arranged() is not None
     other = lt.SpinSystem(3, lt.magnetism.zeeman(3, (0.0, 0.0, 1.0)), lt.DoubleBracket())
     assert other.arranged() is None  # what that does with components is not known
@@ -243,7 +248,7 @@ def test_control_a_wrong_order_is_seen():
     """Steps from a state in the other order, taken for one that is not."""
     system = ring()
     found = system.arranged()
-    first = begin(system, lt.MetriplecticMidpoint(), jnp.asarray(system.state(unit(LARGE))))
+    first = initial_run_state_program(system, lt.MetriplecticMidpoint(), jnp.asarray(system.state(unit(LARGE))))
     right = array.advance(system, lt.MetriplecticMidpoint(), first, *map(jnp.asarray, (0.05, 1, 1)), 1)[0]
     wrong = first._replace(x=found.there(first.x))
     other = array.advance(system, lt.MetriplecticMidpoint(), wrong, *map(jnp.asarray, (0.05, 1, 1)), 1)[0]

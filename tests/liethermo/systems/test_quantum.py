@@ -377,10 +377,10 @@ def test_newtons_method_takes_the_derivative_of_the_generator(method):
     x, h, off = q.state(RHO), 0.05, jnp.zeros(q.dim)
     k = jnp.tile(q.vector_field(x), (method.stages, 1))
     d = jnp.cos(jnp.arange(float(k.size))).reshape(k.shape)
-    by_slopes = functools.partial(lt.integrators.base.OneStepMethod.linearised, method)
+    by_slopes = functools.partial(lt.integrators.base.OneStepMethod.residual_jvp, method)
     found, wanted = (
         np.asarray(jax.jit(lambda k, d, made=made: made(q, x, off, h, k)(d))(k, d))
-        for made in (method.linearised, by_slopes)
+        for made in (method.residual_jvp, by_slopes)
     )
     assert np.abs(found - wanted).max() <= 0.1 * np.abs(wanted + d).max()
 

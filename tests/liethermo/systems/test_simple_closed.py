@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import liethermo as lt
-from liethermo.tracing.interpret import at_points
+from liethermo.tracing.interpret import evaluate_at_points
 from tests.cases import tolerance
 from tests.liethermo.closed_systems import ISOLATED, MECHANICAL, OPEN, X0, friction, swirl
 
@@ -45,7 +45,7 @@ def residuals(system, x):
 def test_the_equations_and_both_balances(kind, name):
     system = KINDS[kind][name]
     points = np.random.default_rng(0).standard_normal((8, system.dim))
-    found, energy_rate, production = at_points(residuals, system, points)
+    found, energy_rate, production = evaluate_at_points(residuals, system, points)
     for name, residual in found.items():
         assert np.abs(residual).max() < 2e-12, name
     assert production.min() > 1e-4
@@ -123,7 +123,7 @@ def test_the_same_lagrangian_in_its_different_forms():
             lt.Kinetic(np.ones(2)) - lt.Potential(lambda q, S: 0.5 * q @ q + jnp.exp(S)), 5, friction=R
         ),
     ]
-    fields = [at_points(_rate, system, np.array([X0])) for system in forms]
+    fields = [evaluate_at_points(_rate, system, np.array([X0])) for system in forms]
     for field in fields[1:]:
         assert np.abs(field - fields[0]).max() < 1e-14
 

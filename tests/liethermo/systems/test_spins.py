@@ -217,8 +217,8 @@ def test_the_force_is_that_of_its_factor_for_any_gradients(baths):
     dH[system.body_dim :] = np.abs(dH[system.body_dim :])  # temperatures, which constant capacities have above zero
     B = system.dissipation.factor(system, x, jnp.asarray(dH), ())
     force = system.dissipation.force(system, x, jnp.asarray(dH), jnp.asarray(dS), ())
-    np.testing.assert_allclose(force, B.times(B.transposed(jnp.asarray(dS))), atol=1e-13)
-    np.testing.assert_allclose(B.transposed(jnp.asarray(dH)), 0.0, atol=1e-13)
+    np.testing.assert_allclose(force, B.times(B.transpose_times(jnp.asarray(dS))), atol=1e-13)
+    np.testing.assert_allclose(B.transpose_times(jnp.asarray(dH)), 0.0, atol=1e-13)
 
 
 @pytest.mark.slow
@@ -424,7 +424,7 @@ class Unsaid(lt.LandauLifshitz):
     """Control: noise that does not say how it turns the spins."""
 
     def factor(self, system, x, dH, dL):
-        return super().factor(system, x, dH, dL)._replace(turning=None)
+        return super().factor(system, x, dH, dL)._replace(spin_coefficients=None)
 
 
 def test_what_noise_turns_a_step_solves_for_at_once():

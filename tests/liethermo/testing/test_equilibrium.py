@@ -9,7 +9,7 @@ import manifolds as mf
 from liethermo.integrators import fluctuating
 from liethermo.models.gas_piston import GAS_CONSTANT, gas_piston_state
 from liethermo.testing import PropertyError, check_equilibrium
-from liethermo.testing.equilibrium import exact_samples
+from liethermo.testing.equilibrium import sample_exact_measure
 from tests.additions.group import LINE
 
 INERTIA = np.array([3.0, 2.0, 1.0])
@@ -29,7 +29,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 def drawn(system, noise, number):
     """Independent states in equilibrium."""
-    exact, rng = exact_samples(system, noise, UP, np.zeros((2, 3))), np.random.default_rng(1)
+    exact, rng = sample_exact_measure(system, noise, UP, np.zeros((2, 3))), np.random.default_rng(1)
     return exact.points[rng.choice(len(exact.points), number, p=exact.weights / exact.weights.sum())]
 
 
@@ -93,7 +93,7 @@ class Crooked(lt.DoubleBracket):
     """Control: noise by a factor that is a tenth too large."""
 
     def factor(self, system, x, dH, dL):
-        return super().factor(system, x, dH, dL).scaled(jnp.asarray(1.21))
+        return super().factor(system, x, dH, dL).scale_by(jnp.asarray(1.21))
 
 
 CROOKED = lt.LiePoissonSystem(mf.so(3), SPIN.energy, None, Crooked(0.5))
@@ -193,7 +193,7 @@ def test_what_is_not_known_is_not_compared():
         mf.direct_sum(mf.so(3), mf.so(3)), lt.Quadratic(np.arange(1.0, 7.0)), None, lt.DoubleBracket(0.1)
     )
     with pytest.raises(ValueError, match="give samples"):
-        exact_samples(spins, BATH, np.ones(6), np.zeros((2, 6)))
+        sample_exact_measure(spins, BATH, np.ones(6), np.zeros((2, 6)))
     few = np.tile(UP, (10, 1)), np.ones(10)
     with pytest.raises(ValueError, match="count as 10 alone"):
         check_equilibrium(SPIN, BATH, UP, 1.0, 0.1, paths=8, samples=few)

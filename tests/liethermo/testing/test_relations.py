@@ -12,9 +12,9 @@ import liethermo as lt
 import manifolds as mf
 from liethermo import testing
 from liethermo.integrators import fluctuating
-from liethermo.integrators.base import estimates_error
-from liethermo.runs.timetable import Course
-from liethermo.testing.changed import Change, changed, in_basis
+from liethermo.integrators.base import has_error_estimate
+from liethermo.runs.timetable import StepSchedule
+from liethermo.testing.transformations import CoordinateChange, transform_structure_constants, transform_system
 from tests.cases import DISSIPATIONS, REPRESENTATIVE, build, state_of
 
 METHODS = {
@@ -112,7 +112,7 @@ def runs(draw, methods, relations):
     else:
         names = [case.name for case in DISSIPATIONS if case.exempt(g) is None]
         system, x0 = system_of(g, draw(st.sampled_from(names)), seed), 0.5 * state_of(g, seed)
-    step = draw(st.sampled_from([None, lt.Adaptive(1e-8)])) if estimates_error(METHODS[method]) else None
+    step = draw(st.sampled_from([None, lt.Adaptive(1e-8)])) if has_error_estimate(METHODS[method]) else None
     return system, method, x0, step, relation, seed
 
 
@@ -143,10 +143,10 @@ def test_another_basis_is_another_algebra():
     inertia = np.array([3.0, 2.0, 1.0])
     body = lt.LiePoissonSystem(mf.so(3), lt.Quadratic(1 / inertia))
     matrix = np.array([[2.0, 1.0, 0.0], [0.0, 1.0, -1.0], [0.5, 0.0, 1.0]])
-    new = changed(body, Change(matrix, 1.0, 1.0))
+    new = transform_system(body, CoordinateChange(matrix, 1.0, 1.0))
     mu = np.array([0.3, -0.7, 0.5])
     np.testing.assert_allclose(new.vector_field(matrix @ mu), matrix @ np.cross(mu, mu / inertia), atol=1e-14)
-    C = in_basis(mf.so(3).structure_constants, matrix)
+    C = transform_structure_constants(mf.so(3).structure_constants, matrix)
     basis = [np.tensordot(row, np.asarray(mf.so(3).structure_constants), 1) for row in matrix]
     for a in range(3):  # [e_a, e_b] in the old coordinates
         for b in range(3):
@@ -183,10 +183,10 @@ def test_a_fault_is_found(relation):
         testing.check_relations(body, method, [0.5, 0.8, 0.3], 0.02, relations=[relation])
 
 
-class Remembering(fluctuating.Fluctuating):
+class Remembering(fluctuating.StochasticMidpoint):
     """Control: steps with noise that hand on what rounding has kept from the state."""
 
-    carries_rounding = True
+    carries_compensation = True
 
 
 def test_noise_that_repeats_is_found(monkeypatch):
@@ -201,7 +201,7 @@ def test_noise_that_repeats_is_found(monkeypatch):
 
     check(0)
     with monkeypatch.context() as patched:
-        patched.setattr(Course, "reached", lambda self, steps: np.asarray(steps) * self.h)
+        patched.setattr(StepSchedule, "reached", lambda self, steps: np.asarray(steps) * self.h)
         with pytest.raises(testing.PropertyError, match=r"noise: .*FAILS"):
             check(1)
     with monkeypatch.context() as patched:

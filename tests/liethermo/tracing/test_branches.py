@@ -7,11 +7,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax import lax
 
-from liethermo.tracing.branches import LONG, Branch, branched
+from liethermo.tracing.branches import MIN_BRANCH_COST, Branch, nest_branches
 from tests.liethermo.tracing.test_scalarize import program_of
 from tests.machine_code import compiled
 
-TURNS = LONG  # of two instructions each
+TURNS = MIN_BRANCH_COST  # of two instructions each
 
 
 def long(x, factor: float):
@@ -35,7 +35,7 @@ def inside(items, depth: int = 0):
 
 def ordered(program, **options):
     """The branches of a program; checks that every instruction is there once and after what it depends on."""
-    items = branched(program, **options)
+    items = nest_branches(program, **options)
     order = [instruction for instruction, _ in inside(items)]
     assert sorted(order) == sorted(program.instructions)
     known = {name for names in program.inputs for name in names}

@@ -9,7 +9,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.tracing.degrees import degree_by_arrays
+from liethermo.tracing.degrees import array_degree_bound
 from liethermo.tracing.scalarize import scalarize
 
 A = np.random.default_rng(0).standard_normal((4, 3, 3))
@@ -45,13 +45,13 @@ def traced(function):
 def test_degrees_are_those_of_the_unrolled_program(name):
     function, expected = POLYNOMIALS[name]
     closed = traced(function)
-    assert degree_by_arrays(closed, 0) == expected
+    assert array_degree_bound(closed, 0) == expected
     assert scalarize(closed).degree(0) == expected
 
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_what_is_no_polynomial_is_none(name):
-    assert degree_by_arrays(traced(OTHERS[name]), 0) == math.inf
+    assert array_degree_bound(traced(OTHERS[name]), 0) == math.inf
 
 
 def test_a_plain_function_on_many_sites_is_known_as_quadratic():

@@ -7,7 +7,7 @@ import pytest
 
 import liethermo.tracing.primitives as primitives
 from liethermo.tracing.builder import elementwise
-from liethermo.tracing.scalarize import CONTROL
+from liethermo.tracing.scalarize import CONTROL_FLOW_RULES
 from tests import fuzz
 from tests.fuzz_operations import OPERATIONS
 
@@ -63,18 +63,18 @@ def test_every_operation_by_itself(name):
 
 
 def test_every_primitive_that_is_claimed_is_drawn():
-    claimed = set(primitives.RULES) | set(CONTROL)
+    claimed = set(primitives.UNROLLING_RULES) | set(CONTROL_FLOW_RULES)
     assert claimed - fuzz.primitives_drawn() == set(NOT_DRAWN)
 
 
 @pytest.mark.parametrize("name", ["sin", "max"])
 def test_a_wrong_rule_is_found(name, monkeypatch):
     """A control."""
-    right = primitives.RULES[name]
+    right = primitives.UNROLLING_RULES[name]
 
     def wrong(b, eqn, *arrays):
         return elementwise(lambda a: b.mul(a, 1.0 + 1e-9), right(b, eqn, *arrays))
 
-    monkeypatch.setitem(primitives.RULES, name, wrong)
+    monkeypatch.setitem(primitives.UNROLLING_RULES, name, wrong)
     function = fuzz.function_of(1, [name], steps=1)
     assert fuzz.compared(function, "value", 1, machine_code=False).kind == "differs"

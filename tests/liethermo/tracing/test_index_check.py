@@ -10,7 +10,7 @@ from jax import lax
 import liethermo as lt
 import manifolds as mf
 from liethermo.errors import IndexOutOfRangeError
-from liethermo.learn.observation import observation
+from liethermo.learn.observation import make_observation
 from liethermo.tracing.index_check import check_indices
 
 X = jnp.array([0.4, 0.5, -0.3])
@@ -128,7 +128,7 @@ ROLES = {
         "has the index 9",
     ),
     "observation": (
-        lambda: observation(body(), None, lambda x: x[:1] + x[5]),
+        lambda: make_observation(body(), None, lambda x: x[:1] + x[5]),
         "observe, at a state of shape",
     ),
     "event": (lambda: lt.integrate(body(), X, (0.0, 1.0), 0.1, until=lambda m: m[3]), "the event function"),

@@ -13,7 +13,7 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.tracing import programs, traced
-from liethermo.tracing.remembered import Latest
+from liethermo.tracing.caching import LRUCache
 from tests.machine_code import memory_maps
 
 COMMON = """
@@ -116,8 +116,10 @@ def function(a, weights, count=3, shift=0.0):
 
 
 def test_other_numbers_are_other_arguments():
-    one, two = (traced.traced(function(a, w), STATE) for a, w in ((0.3, [1.0, 2.0, 3.0]), (0.4, [0.5, 2.5, 1.5])))
-    assert one.content is two.content
+    one, two = (
+        traced.trace_function(function(a, w), STATE) for a, w in ((0.3, [1.0, 2.0, 3.0]), (0.4, [0.5, 2.5, 1.5]))
+    )
+    assert one.program is two.program
     assert jax.tree_util.tree_structure(one) == jax.tree_util.tree_structure(two)
     for f, g in ((function(0.3, [1.0, 2.0, 3.0]), one), (function(0.4, [0.5, 2.5, 1.5]), two)):
         both = jax.jit(jax.value_and_grad(f))(X), jax.jit(jax.value_and_grad(g))(X)
@@ -135,7 +137,10 @@ def test_other_numbers_are_other_arguments():
     ids=["another count", "another operation", "another order"],
 )
 def test_other_operations_are_other_programs(other):
-    assert traced.traced(function(0.3, [1.0, 2.0, 3.0]), STATE).content is not traced.traced(other, STATE).content
+    assert (
+        traced.trace_function(function(0.3, [1.0, 2.0, 3.0]), STATE).program
+        is not traced.trace_function(other, STATE).program
+    )
 
 
 def test_integers_and_truths_belong_to_the_operations():
@@ -144,23 +149,23 @@ def test_integers_and_truths_belong_to_the_operations():
     def of(a):
         return lambda x: jnp.where(jnp.asarray(a) > 0.5, x[jnp.asarray(a).astype(int)], jnp.sin(x[0]))
 
-    contents = [traced.traced(of(a), STATE) for a in (0.2, 0.3, 0.7, 1.2)]
-    assert contents[0].content is contents[1].content
-    assert len({id(f.content) for f in contents}) == 3
+    contents = [traced.trace_function(of(a), STATE) for a in (0.2, 0.3, 0.7, 1.2)]
+    assert contents[0].program is contents[1].program
+    assert len({id(f.program) for f in contents}) == 3
     for a, f in zip((0.2, 0.3, 0.7, 1.2), contents, strict=True):
         assert f(X) == of(a)(X)
 
 
 def test_a_traced_function_says_what_it_takes():
     with pytest.raises(lt.LiethermoError, match="shapes"):
-        traced.traced(function(0.3, [1.0, 2.0, 3.0]), STATE)(jnp.ones(4))
+        traced.trace_function(function(0.3, [1.0, 2.0, 3.0]), STATE)(jnp.ones(4))
 
 
 def test_what_was_compiled_is_unloaded(monkeypatch):
     """Programs that do differ: a bounded number is kept."""
-    monkeypatch.setattr(programs, "_programs", Latest(2))
+    monkeypatch.setattr(programs, "_programs", LRUCache(2))
 
-    @programs.program
+    @programs.jit_program
     def power(x, n: int):
         return x**n
 
@@ -172,7 +177,7 @@ def test_what_was_compiled_is_unloaded(monkeypatch):
     before = maps()
     assert [float(power(jnp.asarray(2.0), n)) for n in range(6, 26)] == [2.0**n for n in range(6, 26)]
     assert maps() - before < 20
-    assert len(programs._programs) == 2
+    assert len(programs._program_cache) == 2
 
 
 @pytest.mark.slow
@@ -192,9 +197,9 @@ def test_a_family_built_by_a_new_function_each_time():
     from liethermo.engines.compiled import stepper as compiled
 
     run(0.5)
-    before = len(compiled._steppers)
+    before = len(compiled._step_loop_cache)
     run(0.6)
-    assert len(compiled._steppers) == before
+    assert len(compiled._step_loop_cache) == before
 
 
 @pytest.mark.slow
@@ -202,7 +207,7 @@ def test_a_thousand_programs_that_differ(monkeypatch):
     """Machine code is unloaded with the steppers that are dropped."""
     from liethermo.engines.compiled import stepper as compiled
 
-    monkeypatch.setattr(compiled, "_steppers", Latest(4))
+    monkeypatch.setattr(compiled, "_steppers", LRUCache(4))
 
     def run(i):
         system = lt.MetriplecticSystem(None, lambda x: jnp.sin(x[0]) ** (i + 3), dim=1, validate=False)

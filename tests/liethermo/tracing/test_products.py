@@ -9,7 +9,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.tracing.calls import Product
+from liethermo.tracing.calls import MatrixProduct
 from liethermo.tracing.program import Routine
 from liethermo.tracing.scalarize import scalarize
 
@@ -22,7 +22,7 @@ def _program(f, *arrays):
 
 
 def _products(program):
-    own = [i.op for i in program.instructions if isinstance(i.op, Product)]
+    own = [i.op for i in program.instructions if isinstance(i.op, MatrixProduct)]
     inner = [getattr(i.op, name, None) for i in program.instructions for name in ("test", "body")]
     return own + [found for p in inner if p is not None for found in _products(p)]
 

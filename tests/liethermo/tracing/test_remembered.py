@@ -11,13 +11,13 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.tracing import programs
-from liethermo.tracing.remembered import KEPT, Latest, fingerprint, remembered
+from liethermo.tracing.caching import MAX_CACHED_RESULTS, LRUCache, fingerprint, memoize
 
 
 def counted():
     calls = []
 
-    @remembered
+    @memoize
     def function(*arguments):
         calls.append(arguments)
         return len(calls)
@@ -44,7 +44,7 @@ def test_others_of_the_same_content_are_found_too():
 def test_no_object_takes_the_place_of_another():
     """Objects are kept alive as long as what was found for them, and both for so long only."""
     function, _ = counted()
-    assert [function((float(i),)) for i in range(2 * KEPT)] == list(range(1, 2 * KEPT + 1))
+    assert [function((float(i),)) for i in range(2 * MAX_CACHED_RESULTS)] == list(range(1, 2 * MAX_CACHED_RESULTS + 1))
 
 
 def test_what_can_change_is_not_remembered():
@@ -96,14 +96,14 @@ def test_a_method_with_arrays_of_its_own_can_be_compiled():
 )
 def test_one_program_serves_all_calls(method, monkeypatch):
     """Whatever the span, the outputs and the tolerance: numbers of Python are no types of their own."""
-    traces, trace = Counter(), programs._Whole.__call__
+    traces, trace = Counter(), programs._ArrayFunction.__call__
 
     def counted(whole, dynamic):
         traces[whole] += 1
         return trace(whole, dynamic)
 
-    monkeypatch.setattr(programs._Whole, "__call__", counted)
-    monkeypatch.setattr(programs, "_programs", Latest(programs.KEPT))
+    monkeypatch.setattr(programs._ArrayFunction, "__call__", counted)
+    monkeypatch.setattr(programs, "_programs", LRUCache(programs.MAX_CACHED_PROGRAMS))
     body, x0, h = lt.models.rigid_body(rate=0.2), np.array([0.1, 0.2, 1.0]), 0.05
     for span in (1.0, 1.02):
         given = body, x0, (0.0, span)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.special
 
-from liethermo.tracing.taylor import NoSeriesError, check_series, solution
+from liethermo.tracing.taylor import TaylorSeriesError, check_taylor_series, taylor_coefficients
 
 ORDER = 20
 
@@ -167,7 +167,9 @@ def test_every_recurrence():
         values = [function(state[i]) for i, (function, *_) in enumerate(FUNCTIONS.values())]
         return jnp.concatenate([jnp.ones(len(points)), jnp.stack(values)])
 
-    found = jax.jit(lambda x: solution(field, x, 1.0, ORDER))(jnp.concatenate([points, jnp.zeros(len(points))]))
+    found = jax.jit(lambda x: taylor_coefficients(field, x, 1.0, ORDER))(
+        jnp.concatenate([points, jnp.zeros(len(points))])
+    )
     found = np.asarray(found)[:, len(points) :] * np.arange(1, ORDER + 1)[:, None]
     for own, (name, (_, other, point, radius)) in zip(found.T, FUNCTIONS.items(), strict=True):
         expected = by_cauchy(other, point, radius)
@@ -178,9 +180,9 @@ def test_every_recurrence():
 def test_a_solution_that_is_known():
     """``x' = x^2``: all coefficients are powers of h x; in units of h they neither grow nor vanish."""
     for h, x in ((0.5, 0.8), (1e-100, 1e100)):
-        found = np.asarray(solution(lambda x: x * x, jnp.array([x]), h, 24))[:, 0]
+        found = np.asarray(taylor_coefficients(lambda x: x * x, jnp.array([x]), h, 24))[:, 0]
         assert np.allclose(found, x * (h * x) ** np.arange(1, 25), rtol=1e-14, atol=0.0)
-    constant = np.asarray(solution(lambda x: jnp.array([2.0, 3.0]), jnp.zeros(2), 0.5, 6))
+    constant = np.asarray(taylor_coefficients(lambda x: jnp.array([2.0, 3.0]), jnp.zeros(2), 0.5, 6))
     assert np.array_equal(constant, [[1.0, 1.5], *np.zeros((5, 2))])
 
 
@@ -201,10 +203,10 @@ def test_a_solution_that_is_known():
     ],
 )
 def test_refusals(function, primitive):
-    with pytest.raises(NoSeriesError, match=f"'{primitive}'") as caught:
-        check_series(function, 0.5)
+    with pytest.raises(TaylorSeriesError, match=f"'{primitive}'") as caught:
+        check_taylor_series(function, 0.5)
     assert caught.value.primitive == primitive
-    check_series(lambda x: jnp.where(function(x) > 0.0, x, x * x), 0.5)  # a test needs no series
+    check_taylor_series(lambda x: jnp.where(function(x) > 0.0, x, x * x), 0.5)  # a test needs no series
 
 
 def bent(x):
@@ -212,5 +214,5 @@ def bent(x):
 
 
 def test_a_refusal_names_the_line():
-    with pytest.raises(NoSeriesError, match=r"'abs' is not smooth \(test_taylor.py:\d+, in bent\)"):
-        check_series(bent, 0.5)
+    with pytest.raises(TaylorSeriesError, match=r"'abs' is not smooth \(test_taylor.py:\d+, in bent\)"):
+        check_taylor_series(bent, 0.5)

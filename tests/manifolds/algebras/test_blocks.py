@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import manifolds as mf
-from manifolds.algebras.blocks import direct_sum_by_constants, sum_of
-from manifolds.algebras.sums import LARGEST_BY_CONSTANTS
+from manifolds.algebras.blocks import direct_sum_by_constants, merged_direct_sum
+from manifolds.algebras.sums import MAX_DIM_BY_CONSTANTS
 
 MIXED = [mf.so(3), mf.so(3), mf.heisenberg(1), mf.sl(2), mf.so(3)]
 
@@ -15,7 +15,7 @@ MIXED = [mf.so(3), mf.so(3), mf.heisenberg(1), mf.sl(2), mf.so(3)]
 def pair(request):
     if request.param == "power":
         return mf.so(3) ** 4, direct_sum_by_constants([mf.so(3)] * 4)
-    return sum_of(MIXED), direct_sum_by_constants(MIXED)
+    return merged_direct_sum(MIXED), direct_sum_by_constants(MIXED)
 
 
 def test_operations_are_those_of_the_constants(pair):
@@ -79,14 +79,14 @@ def test_copies_of_copies_have_the_sites_of_both():
     assert (mf.so(3) ** 2) ** 3 == mf.power(mf.so(3), (3, 2))
     assert mf.so(3) ** 2 != mf.so(3) ** 3
     assert hash(mf.so(3) ** 2) == hash(mf.power(mf.so(3), 2))
-    mixed = sum_of(MIXED) ** 2
+    mixed = merged_direct_sum(MIXED) ** 2
     x, y = np.random.default_rng(4).standard_normal((2, *mixed.shape))
-    np.testing.assert_allclose(mixed.bracket(x, y), sum_of(MIXED).bracket(x, y), atol=1e-14)
+    np.testing.assert_allclose(mixed.bracket(x, y), merged_direct_sum(MIXED).bracket(x, y), atol=1e-14)
 
 
 def test_direct_sums_change_their_form_with_their_size_and_not_what_they_do():
     small, large = (mf.direct_sum(*[mf.so(3)] * n) for n in (13, 14))
-    assert small.dim <= LARGEST_BY_CONSTANTS < large.dim
+    assert small.dim <= MAX_DIM_BY_CONSTANTS < large.dim
     assert not isinstance(small, mf.DirectSum)
     assert isinstance(large, mf.DirectSum)
     assert large.blocks == ((mf.so(3), 14),)

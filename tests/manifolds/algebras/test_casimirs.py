@@ -312,7 +312,7 @@ def test_too_many_monomials_are_refused_with_their_number(monkeypatch):
 @given(st.data())
 def test_rational_null_space(data):
     rows, columns = data.draw(st.integers(0, 5)), data.draw(st.integers(1, 6))
-    p = linear.prime(0)
+    p = linear.large_prime(0)
     entry = st.one_of(st.integers(-3, 3), st.integers(-(2**40), 2**40), st.sampled_from([p, -2 * p]))
     matrix = np.array([[data.draw(entry) for _ in range(columns)] for _ in range(rows)], dtype=np.int64)
     matrix = matrix.reshape(rows, columns)
@@ -328,7 +328,7 @@ def test_rational_null_space(data):
 
 
 def test_primes():
-    assert [linear.prime(k) for k in range(3)] == [2**31 - 1, 2147483629, 2147483587]
+    assert [linear.large_prime(k) for k in range(3)] == [2**31 - 1, 2147483629, 2147483587]
 
 
 # -- polynomials --------------------------------------------------------------------------------------------------

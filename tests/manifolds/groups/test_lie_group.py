@@ -209,9 +209,9 @@ def test_adjoint_cayley(G):
 def test_maps_stay_in_the_group(G):
     """What the constructor of a group says of its maps, measured."""
     tolerance = TOLERANCES["member"][0]
-    assert G.leaves("exp") <= tolerance
-    assert (G.leaves("cayley") <= tolerance) is (G.cayley_map is not None)
-    assert (G.leaves("adjoint_cayley") <= tolerance) is (G.adjoint_cayley_map is not None)
+    assert G.map_defect("exp") <= tolerance
+    assert (G.map_defect("cayley") <= tolerance) is (G.cayley_map is not None)
+    assert (G.map_defect("adjoint_cayley") <= tolerance) is (G.adjoint_cayley_map is not None)
 
 
 @pytest.mark.sampled(5)
@@ -375,7 +375,7 @@ def test_a_group_whose_cayley_map_leaves_it():
         with pytest.raises(mf.LieAlgebraError, match=r"sl\(3\) into mine: .* misses by 0\.0\d+ .*use exp") as info:
             call()
         assert info.value.tolerance < 1e-3 < info.value.residual
-    assert group.leaves("exp") < 1e-14
+    assert group.map_defect("exp") < 1e-14
     assert not group.cayley_is_adjoint()
     with pytest.raises(mf.LieAlgebraError, match="None for its cayley_map"):
         replace(mf.SO(3), cayley_map=None).cayley(np.zeros(3))
@@ -600,7 +600,7 @@ def test_solve_and_determinant():
 )
 def test_a_defect_of_one_matrix_is_applied_to_each(defect):
     group = mf.MatrixGroup("mine", mf.sl(2), defect)
-    assert group.leaves("exp") < 1e-14
+    assert group.map_defect("exp") < 1e-14
     g = np.stack([np.eye(2), 2.0 * np.eye(2), np.diag([2.0, 0.5])])
     assert group.belongs(g).tolist() == [True, False, True]
     assert group == mf.MatrixGroup("mine", mf.sl(2), defect)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import manifolds as mf
-from manifolds.matrices.divided import Plain, scalar_function
+from manifolds.matrices.divided_differences import GenericFunction, scalar_function
 from manifolds.matrices.exponential import expm
 from manifolds.matrices.spectral import log_mean
 from manifolds.matrices.symmetric import eigh
@@ -35,7 +35,7 @@ def test_divided_differences(name, points):
         for k in range(1, len(found)):
             table = [(b - a) / (found[i + k] - found[i]) for i, (a, b) in enumerate(itertools.pairwise(table))]
         wanted = float(table[0])
-    got = float(scalar_function(getattr(jnp, name)).divided(*map(jnp.asarray, points)))
+    got = float(scalar_function(getattr(jnp, name)).divided_difference(*map(jnp.asarray, points)))
     assert got == pytest.approx(wanted, rel=3e-14)  # at most 5e-15
 
 
@@ -59,10 +59,10 @@ def test_what_a_trace_changes_by():
 
 
 def test_divided_differences_of_a_function_of_ones_own():
-    f = Plain(jnp.tanh)
+    f = GenericFunction(jnp.tanh)
     for x, y in ((0.3, 0.3), (0.3, 0.3 + 1e-8), (0.0, 1e-9), (0.3, 2.5)):
         wanted = float(mpmath.tanh(x) - mpmath.tanh(y)) / (x - y) if abs(x - y) > 1 else 1 - np.tanh((x + y) / 2) ** 2
-        assert float(f.divided(jnp.asarray(x), jnp.asarray(y))) == pytest.approx(wanted, rel=1e-14)
+        assert float(f.divided_difference(jnp.asarray(x), jnp.asarray(y))) == pytest.approx(wanted, rel=1e-14)
 
 
 @pytest.mark.parametrize("is_complex", [pytest.param(False, marks=pytest.mark.slow), True])

@@ -45,7 +45,7 @@ QUICK = ("R^3", "S^2", "(S^2)^4", "Oblique(3, 2)")
 SPACES = [
     pytest.param(space, id=space.name, marks=[] if space.name in QUICK else [pytest.mark.slow])
     for space in (*mf.registered_spaces(), *COMPOSED)
-    if space.geodesics
+    if space.has_geodesics
 ]
 
 

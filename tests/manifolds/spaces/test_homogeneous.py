@@ -47,7 +47,7 @@ def test_other_names_of_the_same(case):
     assert close(space.log(x, y), v)
     h = mf.SO(n).exp(np.asarray(mf.so(n).vee(0.7 * np.array(stabilizer[0]))))
     assert close(space.distance(x @ h, y), other.distance(down(x), down(y)))
-    assert not close(space.upstairs.distance(x @ h, y), other.distance(down(x), down(y)))  # control
+    assert not close(space.group_space.distance(x @ h, y), other.distance(down(x), down(y)))  # control
 
 
 def test_flags_of_two_pieces_are_subspaces():

@@ -83,11 +83,11 @@ def test_stages_on_a_leaf(P):
     def spectrum(x):
         return np.sort(np.linalg.eigvals(matrices(x)).imag + np.linalg.eigvals(matrices(x)).real)
 
-    points = P.on_leaf(x, alpha, 0.7 * A)
+    points = P.stages_on_leaf(x, alpha, 0.7 * A)
     assert np.abs(spectrum(moved(points)) - spectrum(x)).max() <= 2e-14
     assert np.abs(spectrum(moved([x, x])) - spectrum(x)).max() >= 1e-3
-    slopes = np.stack([P.sharp(u, a) for u, a in zip(P.on_leaf(x, alpha, 1e-6 * A), alpha, strict=True)])
-    assert np.abs(P.on_leaf(x, alpha, 1e-6 * A) - (x + 1e-6 * A @ slopes)).max() <= 1e-10
+    slopes = np.stack([P.sharp(u, a) for u, a in zip(P.stages_on_leaf(x, alpha, 1e-6 * A), alpha, strict=True)])
+    assert np.abs(P.stages_on_leaf(x, alpha, 1e-6 * A) - (x + 1e-6 * A @ slopes)).max() <= 1e-10
 
 
 @pytest.mark.parametrize("P", LEAVES, ids=lambda P: f"{type(P).__name__}-{P.dim}")
@@ -95,13 +95,16 @@ def test_a_covector_that_carries_a_state(P):
     """Its rate is that of the motion, at a covector that is not small; the control: the covector as it is."""
     rng = np.random.default_rng(4)
     x, covector, alpha = rng.standard_normal((3, P.dim))
-    end = x + P.carried(x, covector)
-    moved = jax.jvp(lambda K: P.carried(x, K), (covector,), (P.turning(covector, alpha),))[1]
+    end = x + P.leaf_displacement(x, covector)
+    moved = jax.jvp(lambda K: P.leaf_displacement(x, K), (covector,), (P.leaf_covector_rate(covector, alpha),))[1]
     assert np.abs(moved - P.sharp(end, alpha)).max() <= 1e-13 * np.abs(x).max() * np.abs(covector).max() ** 2
     if isinstance(P, mf.DensityMatrices):  # a constant that is added to the energy moves nothing
         constant = np.append(np.ones(P.size), np.zeros(P.dim - P.size))
-        assert np.abs(P.turning(covector, alpha + 1e6 * constant) - P.turning(covector, alpha)).max() <= 1e-8
-    assert np.abs(jax.jvp(lambda K: P.carried(x, K), (covector,), (alpha,))[1] - moved).max() >= 1e-2
+        assert (
+            np.abs(P.leaf_covector_rate(covector, alpha + 1e6 * constant) - P.leaf_covector_rate(covector, alpha)).max()
+            <= 1e-8
+        )
+    assert np.abs(jax.jvp(lambda K: P.leaf_displacement(x, K), (covector,), (alpha,))[1] - moved).max() >= 1e-2
 
 
 def gauss_of_two():
@@ -116,5 +119,5 @@ def dual(g):
 
 def test_other_leaves_are_not_known():
     for P in (mf.LiePoisson(mf.se(3)), mf.LiePoisson(mf.g2()), mf.LiePoisson(mf.sl(3)), mf.LiePoisson(mf.su(20))):
-        assert P.on_leaf(np.ones(P.dim), np.ones((1, P.dim)), np.eye(1)) is None
-        assert P.turning(np.ones(P.dim), np.ones(P.dim)) is None
+        assert P.stages_on_leaf(np.ones(P.dim), np.ones((1, P.dim)), np.eye(1)) is None
+        assert P.leaf_covector_rate(np.ones(P.dim), np.ones(P.dim)) is None

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from manifolds._precision import by_own_settings
+from manifolds._precision import with_library_settings
 from manifolds.errors import warn
 
 from ..errors import InputError
@@ -18,21 +18,21 @@ from ..integrators import OneStepMethod
 from ..runs.integrate import integrate
 from ..systems import System
 from . import losses
-from .data import Trajectory, estimated_noise, scales, trajectories
+from .data import Trajectory, data_scales, estimate_noise, parse_trajectories
 from .fitting import checked_noise, fit
-from .observation import observation
+from .observation import make_observation
 from .training import FitWarning
 
 T = TypeVar("T", bound=System)
 
-DEPENDENT = 1e-8
+RANK_RTOL = 1e-8
 """Singular values, relative to the largest, below which a combination of parameters changes nothing."""
 
 
-MIN_RESAMPLED = 8
+MIN_BOOTSTRAP_TRAJECTORIES = 8
 """Trajectories from which they are drawn again: of fewer the draws are often the same."""
 
-MAX_DRAWS = 100
+MAX_BOOTSTRAP_DRAWS = 100
 """Draws of trajectories in the search for one that has not been drawn before."""
 
 
@@ -54,9 +54,9 @@ class Determined:
     values: np.ndarray
     rank: int
     directions: np.ndarray
-    own: losses.Weights
+    parameters: losses.ParameterVector
 
-    @by_own_settings
+    @with_library_settings
     def share(self, quantity: Callable[[Any], Any]) -> np.ndarray:
         """How far quantities are determined: 1 where fully, 0 where not at all.
 
@@ -67,21 +67,21 @@ class Determined:
         quantity : function from a system to an array
             Such as an energy at some state, or the difference of two.
         """
-        rows = _jacobian(self.own, quantity)
+        rows = _parameter_jacobian(self.parameters, quantity)
         along = rows @ self.directions[: self.rank].T
         sizes = np.linalg.norm(rows, axis=1)
         found = np.linalg.norm(along, axis=1) / np.where(sizes > 0.0, sizes, 1.0)
         return np.where(sizes > 0.0, found, 1.0)
 
 
-@by_own_settings
+@with_library_settings
 def determined(
     system: T,
     observed: Callable[[T], Any],
     *,
     also: Callable[[T], Any] | None = None,
     positive: Callable[[T], Any] | None = None,
-    tolerance: float = DEPENDENT,
+    tolerance: float = RANK_RTOL,
 ) -> Determined:
     """Which combinations of the learned parameters are determined by what is observed.
 
@@ -105,23 +105,23 @@ def determined(
     InputError
         If nothing is learned.
     """
-    own = losses.weights(system, also, positive)
-    if not own.start.size:
+    own = losses.parameter_vector(system, also, positive)
+    if not own.initial_values.size:
         raise InputError("nothing is learned of this system, so there is nothing to determine")
-    jacobian = _jacobian(own, observed)
+    jacobian = _parameter_jacobian(own, observed)
     _, values, directions = np.linalg.svd(jacobian, full_matrices=jacobian.shape[0] < jacobian.shape[1])
-    relative = np.zeros(own.start.size)
+    relative = np.zeros(own.initial_values.size)
     relative[: len(values)] = values / (values[0] if values[0] > 0.0 else 1.0)
     return Determined(relative, int(np.sum(relative > tolerance)), directions, own)
 
 
-def _jacobian(own: losses.Weights, quantity: Callable) -> np.ndarray:
+def _parameter_jacobian(own: losses.ParameterVector, quantity: Callable) -> np.ndarray:
     def values(vector):
-        return jnp.ravel(jnp.asarray(quantity(own.system(vector))))
+        return jnp.ravel(jnp.asarray(quantity(own.build_system(vector))))
 
-    start = jnp.asarray(own.start)
+    start = jnp.asarray(own.initial_values)
     size = jax.eval_shape(values, start).shape[0]
-    by = jax.jacfwd if own.start.size <= size else jax.jacrev
+    by = jax.jacfwd if own.initial_values.size <= size else jax.jacrev
     found = np.asarray(jax.jit(by(values))(start))
     if not np.isfinite(found).all():
         raise InputError("the derivative of what is observed by the parameters is not finite")
@@ -203,28 +203,28 @@ def several(
     drawn: set[tuple[int, ...]] = set()
     for own in range(seed, seed + number):
         system, random = build(own), np.random.default_rng(own)
-        whole = trajectories(data, system, observation(system, how.get("observed"), how.get("observe")))
-        sigma = _noise_of(whole, how.get("noise")) if resample and len(whole) < MIN_RESAMPLED else None
+        whole = parse_trajectories(data, system, make_observation(system, how.get("observed"), how.get("observe")))
+        sigma = _noise_std(whole, how.get("noise")) if resample and len(whole) < MIN_BOOTSTRAP_TRAJECTORIES else None
         if sigma is not None:
             noisy = [(t, x + (sigma * random.standard_normal((len(t), sigma.size))).reshape(x.shape)) for t, x in whole]
             more = {} if how.get("noise") is None else {"noise": np.sqrt(2.0) * sigma}
             systems.append(fit(system, noisy, seed=own, **{**how, **more}))
             continue
-        chosen = _new_draw(len(whole), random, drawn) if resample else range(len(whole))
+        chosen = _draw_bootstrap_indices(len(whole), random, drawn) if resample else range(len(whole))
         systems.append(fit(system, [whole[i] for i in chosen], seed=own, **how))
     return Fits(tuple(systems))
 
 
-def _noise_of(whole: list[Trajectory], noise) -> np.ndarray | None:
+def _noise_std(whole: list[Trajectory], noise) -> np.ndarray | None:
     """Return the standard deviations of the errors of data, given or estimated; None where there are none."""
-    flat = [trajectory.flat for trajectory in whole]
-    size = scales(flat).size
-    return estimated_noise(flat, size) if noise is None else checked_noise(noise, size.size)
+    flat = [trajectory.flat_trajectory for trajectory in whole]
+    size = data_scales(flat).scale
+    return estimate_noise(flat, size) if noise is None else checked_noise(noise, size.size)
 
 
-def _new_draw(count: int, random: np.random.Generator, drawn: set[tuple[int, ...]]) -> np.ndarray:
+def _draw_bootstrap_indices(count: int, random: np.random.Generator, drawn: set[tuple[int, ...]]) -> np.ndarray:
     """Draw so many out of as many, with replacement, and remember it; another draw than before, where there is one."""
-    for _ in range(MAX_DRAWS):
+    for _ in range(MAX_BOOTSTRAP_DRAWS):
         chosen = random.integers(count, size=count)
         if tuple(sorted(chosen.tolist())) not in drawn:
             break

@@ -10,9 +10,9 @@ from numbers import Rational
 import numpy as np
 import scipy
 
-LARGEST_DENOMINATOR = 1000
+MAX_DENOMINATOR = 1000
 
-MACHINE_INTEGERS = 2**28
+MAX_INT64_NUMERATOR = 2**28
 """Numerators below this are int64: sums of a hundred products of two are then exact. Larger ones are Python's."""
 
 
@@ -38,19 +38,19 @@ def rational_array(values) -> RationalArray | None:
     distinct, inverse = np.unique(array, return_inverse=True) if array.dtype != object else (array.ravel(), None)
     fractions = []
     for value in distinct:
-        fraction = _fraction(value)
+        fraction = _recognize_fraction(value)
         if fraction is None:
             return None
         fractions.append(fraction)
     denominator = math.lcm(*(f.denominator for f in fractions)) if fractions else 1
     integers = [int(f * denominator) for f in fractions]
-    small = max(map(abs, integers), default=0) < MACHINE_INTEGERS
+    small = max(map(abs, integers), default=0) < MAX_INT64_NUMERATOR
     numerators = np.array(integers, dtype=np.int64 if small else object)
     numerators = numerators if inverse is None else numerators[inverse]
     return RationalArray(numerators.reshape(array.shape), denominator)
 
 
-def _fraction(value) -> Fraction | None:
+def _recognize_fraction(value) -> Fraction | None:
     if isinstance(value, Rational):
         return Fraction(value)
     if isinstance(value, np.integer):
@@ -58,21 +58,21 @@ def _fraction(value) -> Fraction | None:
     number = float(value)
     if not math.isfinite(number):
         return None
-    fraction = Fraction(number).limit_denominator(LARGEST_DENOMINATOR)
+    fraction = Fraction(number).limit_denominator(MAX_DENOMINATOR)
     return fraction if float(fraction) == number else None
 
 
-DENSE = 12
+MAX_DENSE_JACOBI_DIM = 12
 """Dimension up to which all triples of elements are looked at in one array."""
 
 
-def worst_jacobi(constants: np.ndarray) -> tuple[float, tuple[int, int, int]]:
+def max_jacobi_residual(constants: np.ndarray) -> tuple[float, tuple[int, int, int]]:
     """The largest component of ``[[a,b],c] + [[b,c],a] + [[c,a],b]`` and its triple; exact for integers.
 
     The constants are antisymmetric. In dimensions above DENSE one a is looked at after another, in memory for one.
     """
     dim = constants.shape[0]
-    if constants.dtype == object or dim <= DENSE:
+    if constants.dtype == object or dim <= MAX_DENSE_JACOBI_DIM:
         nested = np.tensordot(constants, constants, axes=(2, 0))
         total = np.abs(nested + nested.transpose(2, 0, 1, 3) + nested.transpose(1, 2, 0, 3)).max(axis=3)
         a, b, c = (int(i) for i in np.unravel_index(total.argmax(), total.shape))

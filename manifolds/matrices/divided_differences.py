@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.special
 
-from .._module import forwarded
+from .._pytree_module import forward_to
 
-CLOSE = 1 / 16
+MAX_SPREAD_FOR_MEAN = 1 / 16
 """Spread of points, relative to the width of a function, up to which divided differences are means of derivatives.
 
 Beyond, a quotient of differences loses four bits. Up to it, what four nodes leave out of the mean is rounding.
@@ -32,39 +32,39 @@ class ScalarFunction:
     def width(self, x) -> jax.Array:
         """The distance to the next place where the function has no Taylor series, or over which it changes much."""
 
-    def quotient(self, x, y) -> jax.Array:
+    def difference_quotient(self, x, y) -> jax.Array:
         """``f[x, y]``."""
-        return self._of_close_or_far(x, y)
+        return self._mean_or_quotient(x, y)
 
     @property
-    def differentiated(self) -> ScalarFunction:
+    def derivative_function(self) -> ScalarFunction:
         """The derivative as such a function."""
         return Derivative(self)
 
-    def divided(self, *points) -> jax.Array:
+    def divided_difference(self, *points) -> jax.Array:
         """``f[x0, …, xk]``, which no order of the points changes; arrays that are broadcast."""
         if len(points) == 1:
             return self.derivative(points[0], 0)
         alike = jnp.broadcast_arrays(*points)
-        return self.quotient(*alike) if len(alike) == 2 else self._of_close_or_far(*alike)
+        return self.difference_quotient(*alike) if len(alike) == 2 else self._mean_or_quotient(*alike)
 
-    def _of_close_or_far(self, *points) -> jax.Array:
-        ordered = _in_order(points)
+    def _mean_or_quotient(self, *points) -> jax.Array:
+        ordered = _sort_entrywise(points)
         width = jnp.stack([self.width(x) for x in ordered]).min(axis=0)
         gap = ordered[-1] - ordered[0]
-        close = gap <= CLOSE * width
-        further = self.divided(*ordered[1:]) - self.divided(*ordered[:-1])
-        return jnp.where(close, self._mean(ordered, 4), further / jnp.where(close, 1.0, gap))
+        close = gap <= MAX_SPREAD_FOR_MEAN * width
+        further = self.divided_difference(*ordered[1:]) - self.divided_difference(*ordered[:-1])
+        return jnp.where(close, self._simplex_mean(ordered, 4), further / jnp.where(close, 1.0, gap))
 
-    def _mean(self, points, nodes: int) -> jax.Array:
+    def _simplex_mean(self, points, nodes: int) -> jax.Array:
         """The mean of a derivative over the simplex of the points [Genocchi & Hermite], by Gauss's quadrature."""
         k = len(points) - 1
-        places, weights = _simplex(k, nodes)
+        places, weights = _simplex_quadrature(k, nodes)
         at = jnp.tensordot(places, jnp.stack(points), 1)
         return jnp.tensordot(weights, self.derivative(at, k), 1)
 
 
-def _in_order(points) -> list[jax.Array]:
+def _sort_entrywise(points) -> list[jax.Array]:
     """Points in ascending order, entry by entry; NaN stays."""
     points = list(points)
     for end in range(len(points) - 1, 0, -1):
@@ -73,7 +73,7 @@ def _in_order(points) -> list[jax.Array]:
     return points
 
 
-def _simplex(k: int, nodes: int) -> tuple[np.ndarray, np.ndarray]:
+def _simplex_quadrature(k: int, nodes: int) -> tuple[np.ndarray, np.ndarray]:
     """Barycentric coordinates and weights, which sum to 1 / k!, of Gauss's quadrature in collapsed coordinates."""
     places, weights = np.ones((1, 1)), np.ones(1)
     for i in range(k):
@@ -94,13 +94,13 @@ class Exp(ScalarFunction):
     def width(self, x):
         return jnp.ones_like(x)
 
-    def quotient(self, x, y):
+    def difference_quotient(self, x, y):
         gap = jnp.abs(x - y)
         same = gap == 0.0
         return jnp.exp(jnp.maximum(x, y)) * jnp.where(same, 1.0, -jnp.expm1(-gap) / jnp.where(same, 1.0, gap))
 
     @property
-    def differentiated(self):
+    def derivative_function(self):
         return self
 
 
@@ -108,39 +108,39 @@ class Exp(ScalarFunction):
 class Log(ScalarFunction):
     """``log(start + x)``."""
 
-    start: float = 0.0
+    offset: float = 0.0
 
     def derivative(self, x, order):
         if order == 0:
-            return jnp.log1p(x) if self.start == 1.0 else jnp.log(self.start + x)
-        return -math.factorial(order - 1) * (-1.0 / (self.start + x)) ** order
+            return jnp.log1p(x) if self.offset == 1.0 else jnp.log(self.offset + x)
+        return -math.factorial(order - 1) * (-1.0 / (self.offset + x)) ** order
 
     def width(self, x):
-        return self.start + x
+        return self.offset + x
 
-    def quotient(self, x, y):
-        least, gap = self.start + jnp.minimum(x, y), jnp.abs(x - y)
+    def difference_quotient(self, x, y):
+        least, gap = self.offset + jnp.minimum(x, y), jnp.abs(x - y)
         same = gap == 0.0
         return jnp.where(same, 1.0 / least, jnp.log1p(gap / least) / jnp.where(same, 1.0, gap))
 
     @property
-    def differentiated(self):
-        return Reciprocal(self.start)
+    def derivative_function(self):
+        return Reciprocal(self.offset)
 
 
 @dataclass(frozen=True)
 class Reciprocal(ScalarFunction):
     """``1 / (start + x)``."""
 
-    start: float = 0.0
+    offset: float = 0.0
 
     def derivative(self, x, order):
-        return (-1.0) ** order * math.factorial(order) / (self.start + x) ** (order + 1)
+        return (-1.0) ** order * math.factorial(order) / (self.offset + x) ** (order + 1)
 
     def width(self, x):
-        return jnp.abs(self.start + x)
+        return jnp.abs(self.offset + x)
 
-    def divided(self, *points):
+    def divided_difference(self, *points):
         found = self.derivative(points[0], 0)
         for x in points[1:]:
             found = -found * self.derivative(x, 0)
@@ -156,22 +156,22 @@ class Sqrt(ScalarFunction):
     def width(self, x):
         return x
 
-    def quotient(self, x, y):
+    def difference_quotient(self, x, y):
         return 1.0 / (jnp.sqrt(x) + jnp.sqrt(y))
 
 
 @dataclass(frozen=True)
 class Derivative(ScalarFunction):
-    of: ScalarFunction
+    function: ScalarFunction
 
     def derivative(self, x, order):
-        return self.of.derivative(x, order + 1)
+        return self.function.derivative(x, order + 1)
 
-    width = forwarded("of")
+    width = forward_to("function")
 
 
 @dataclass(frozen=True)
-class Plain(ScalarFunction):
+class GenericFunction(ScalarFunction):
     """A function that nothing is known of, with as many derivatives as JAX takes."""
 
     function: Callable
@@ -184,20 +184,20 @@ class Plain(ScalarFunction):
     def width(self, x):
         raise NotImplementedError
 
-    def _of_close_or_far(self, *points):
+    def _mean_or_quotient(self, *points):
         """The more accurate one, by what rounding makes of a quotient, and by what more nodes make of a mean."""
-        ordered = _in_order(points)
+        ordered = _sort_entrywise(points)
         gap = ordered[-1] - ordered[0]
-        one, other = self.divided(*ordered[1:]), self.divided(*ordered[:-1])
+        one, other = self.divided_difference(*ordered[1:]), self.divided_difference(*ordered[:-1])
         same = gap == 0.0
         quotient = (one - other) / jnp.where(same, 1.0, gap)
         rounding = jnp.finfo(jnp.float64).eps * (jnp.abs(one) + jnp.abs(other)) / jnp.where(same, 1.0, gap)
-        mean = self._mean(ordered, 8)
-        by_mean = same | (jnp.abs(mean - self._mean(ordered, 6)) <= rounding)
+        mean = self._simplex_mean(ordered, 8)
+        by_mean = same | (jnp.abs(mean - self._simplex_mean(ordered, 6)) <= rounding)
         return jnp.where(by_mean, mean, quotient)
 
 
-KNOWN: dict[Callable, ScalarFunction] = {
+KNOWN_FUNCTIONS: dict[Callable, ScalarFunction] = {
     jnp.exp: Exp(),
     jnp.log: Log(),
     jnp.log1p: Log(1.0),
@@ -208,4 +208,4 @@ KNOWN: dict[Callable, ScalarFunction] = {
 
 def scalar_function(f: Callable | ScalarFunction) -> ScalarFunction:
     """A function of a number as one with divided differences."""
-    return f if isinstance(f, ScalarFunction) else KNOWN.get(f) or Plain(f)
+    return f if isinstance(f, ScalarFunction) else KNOWN_FUNCTIONS.get(f) or GenericFunction(f)

@@ -12,76 +12,78 @@ import equinox as eqx
 import jax
 import numpy as np
 
-Found = TypeVar("Found")
+Result = TypeVar("Result")
 
-KEPT = 64
+MAX_CACHED_RESULTS = 64
 """Results of one function that are held in memory, those last used."""
 
-BYTES = 2**28
+MAX_CACHED_BYTES = 2**28
 """Largest size of the arrays that they were found for, together."""
 
-COMPARED = 2**20
+MAX_COMPARED_BYTES = 2**20
 """Largest size of arrays that are compared by content: comparing larger ones takes longer than a call should."""
 
 
-class Latest(Generic[Found]):
+class LRUCache(Generic[Result]):
     """Results by their keys, those last used.
 
     Parameters
     ----------
-    kept : int
+    max_entries : int
         How many.
-    size : int, optional
+    max_size : int, optional
         Of all together.
     """
 
-    def __init__(self, kept: int, size: float = float("inf")):
-        self.kept, self.size = kept, size
-        self._found: OrderedDict[Hashable, tuple[Found, int]] = OrderedDict()
-        self._total, self._lock = 0, threading.Lock()
+    def __init__(self, max_entries: int, max_size: float = float("inf")):
+        self.max_entries, self.max_size = max_entries, max_size
+        self._entries: OrderedDict[Hashable, tuple[Result, int]] = OrderedDict()
+        self._total_size, self._lock = 0, threading.Lock()
 
     def __len__(self) -> int:
-        return len(self._found)
+        return len(self._entries)
 
-    def get(self, key: Hashable) -> Found | None:
+    def get(self, key: Hashable) -> Result | None:
         """What is known by a key, or None."""
         with self._lock:
-            if key not in self._found:
+            if key not in self._entries:
                 return None
-            self._found.move_to_end(key)
-            return self._found[key][0]
+            self._entries.move_to_end(key)
+            return self._entries[key][0]
 
-    def find(self, key: Hashable, make: Callable[[], Found], size: int = 0) -> Found:
+    def get_or_compute(self, key: Hashable, make: Callable[[], Result], size: int = 0) -> Result:
         """What is known by a key; made, and kept, where nothing is."""
         with self._lock:
-            if key in self._found:
-                self._found.move_to_end(key)
-                return self._found[key][0]
+            if key in self._entries:
+                self._entries.move_to_end(key)
+                return self._entries[key][0]
         found = make()
         with self._lock:
-            if key not in self._found:
-                self._total += size
-            self._found[key] = found, size
-            while len(self._found) > self.kept or (self._total > self.size and len(self._found) > 1):
-                self._total -= self._found.popitem(last=False)[1][1]
+            if key not in self._entries:
+                self._total_size += size
+            self._entries[key] = found, size
+            while len(self._entries) > self.max_entries or (
+                self._total_size > self.max_size and len(self._entries) > 1
+            ):
+                self._total_size -= self._entries.popitem(last=False)[1][1]
         return found
 
 
-def remembered(function: Callable[..., Found]) -> Callable[..., Found]:
+def memoize(function: Callable[..., Result]) -> Callable[..., Result]:
     """Decorator: call a function of pytrees once for the same objects, or for others of the same content.
 
     Objects with leaves that could change in place, as NumPy arrays can, or that are being traced, are not remembered.
     """
-    known: Latest[tuple[tuple, Found]] = Latest(KEPT, BYTES)
-    alike: Latest[Found] = Latest(KEPT, BYTES)
+    known: LRUCache[tuple[tuple, Result]] = LRUCache(MAX_CACHED_RESULTS, MAX_CACHED_BYTES)
+    alike: LRUCache[Result] = LRUCache(MAX_CACHED_RESULTS, MAX_CACHED_BYTES)
 
-    def by_content(arguments: tuple, size: int) -> Found:
-        content = fingerprint(arguments) if size <= COMPARED else None
+    def find_by_content(arguments: tuple, size: int) -> Result:
+        content = fingerprint(arguments) if size <= MAX_COMPARED_BYTES else None
         make = functools.partial(function, *arguments)
-        return make() if content is None else alike.find(content, make, size)
+        return make() if content is None else alike.get_or_compute(content, make, size)
 
     @functools.wraps(function)
-    def call(*arguments) -> Found:
+    def call(*arguments) -> Result:
         found = known.get(identities := tuple(map(id, arguments)))
         if found is not None:
             return found[1]
@@ -90,7 +92,7 @@ def remembered(function: Callable[..., Found]) -> Callable[..., Found]:
             return function(*arguments)
         size = sum(leaf.nbytes for leaf in leaves if eqx.is_array(leaf))
         # the arguments are held on to, so that no other object takes their identity
-        return known.find(identities, lambda: (arguments, by_content(arguments, size)), size)[1]
+        return known.get_or_compute(identities, lambda: (arguments, find_by_content(arguments, size)), size)[1]
 
     return call
 

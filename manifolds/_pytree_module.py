@@ -22,36 +22,36 @@ class Module(eqx.Module):
 
     def __check_init__(self) -> None:
         leaves, structure = jax.tree_util.tree_flatten(self)
-        if any(map(_is_of_module, leaves)):
-            whole = jax.tree_util.tree_unflatten(structure, [_as_pytree(leaf) for leaf in leaves])
+        if any(map(_is_module_method, leaves)):
+            whole = jax.tree_util.tree_unflatten(structure, [_method_to_partial(leaf) for leaf in leaves])
             for name, value in vars(whole).items():
                 object.__setattr__(self, name, value)
 
 
-def _is_of_module(leaf: Any) -> bool:
+def _is_module_method(leaf: Any) -> bool:
     return isinstance(leaf, MethodType) and isinstance(leaf.__self__, eqx.Module)
 
 
-def _as_pytree(leaf: Any) -> Any:
-    return eqx.Partial(leaf.__func__, leaf.__self__) if _is_of_module(leaf) else leaf
+def _method_to_partial(leaf: Any) -> Any:
+    return eqx.Partial(leaf.__func__, leaf.__self__) if _is_module_method(leaf) else leaf
 
 
-class _Forwarded:
+class _ForwardedMember:
     """See :func:`forwarded`."""
 
     def __init__(self, inside: str, name: str | None):
-        self.inside, self.name = inside, name
+        self.attribute, self.name = inside, name
 
     def __set_name__(self, owner: type, name: str) -> None:
         self.name = self.name or name
 
     def __get__(self, instance: Any, owner: type | None = None) -> Any:
-        return self if instance is None else getattr(getattr(instance, self.inside), str(self.name))
+        return self if instance is None else getattr(getattr(instance, self.attribute), str(self.name))
 
 
-def forwarded(inside: str, name: str | None = None) -> Any:
+def forward_to(inside: str, name: str | None = None) -> Any:
     """In the body of a class that wraps an object: a member of that object, which the attribute ``inside`` holds.
 
     The member of the same name, or of another one.
     """
-    return _Forwarded(inside, name)
+    return _ForwardedMember(inside, name)

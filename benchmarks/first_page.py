@@ -1,6 +1,6 @@
 """The first page of the benchmarks: which rows of the measurements stand beside each other on it, theme by theme.
 
-A measurement that is to be on the page has a line in :data:`THEMES` or :data:`COSTS`; nothing else has to change.
+A measurement that is to be on the page has a line in :data:`PAIRS_BY_THEME` or :data:`COST_MEASUREMENTS`; nothing else has to change.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ from dataclasses import dataclass
 
 from .report import Report, Table, Target
 
-COMPILED, EXPLICIT = "compiled engine", "explicit, order 8, compiled engine"
-GAUSS = "this library, Gauss, order 6"
+COMPILED_ROW, EXPLICIT_ROW = "compiled engine", "explicit, order 8, compiled engine"
+GAUSS_ROW = "this library, Gauss, order 6"
 
 
 @dataclass(frozen=True)
-class Pair:
+class RowPair:
     """Two rows of one table of a measurement.
 
     Attributes
@@ -25,10 +25,10 @@ class Pair:
     work : str
         What both did.
     ours, theirs : str
-        What the rows begin with. Of several rows of another program the fastest counts, unless ``which`` is given.
+        What the rows begin with. Of several rows of another program the fastest counts, unless ``row_number`` is given.
     column : str, optional
         The heading of the times; by default the first that begins with "Time".
-    which : int, optional
+    row_number : int, optional
         Which of several rows that begin alike, where they are of different settings.
     """
 
@@ -38,11 +38,11 @@ class Pair:
     ours: str
     theirs: str
     column: str = "Time"
-    which: int | None = None
+    row_number: int | None = None
 
 
 @dataclass(frozen=True)
-class Comparison:
+class PeerComparison:
     """What a pair was measured to be; a verdict on the laws is None where the table has none."""
 
     work: str
@@ -57,40 +57,40 @@ class Comparison:
         return self.ours / self.theirs
 
 
-def _at_accuracy(table: int, what: str) -> list[Pair]:
-    return [Pair("ensemble", table, what, COMPILED, peer) for peer in ("heyoka", "diffrax")]
+def _ensemble_pairs(table: int, what: str) -> list[RowPair]:
+    return [RowPair("ensemble", table, what, COMPILED_ROW, peer) for peer in ("heyoka", "diffrax")]
 
 
-THEMES: dict[str, list[Pair]] = {
+PAIRS_BY_THEME: dict[str, list[RowPair]] = {
     "The same scheme in C": [
-        Pair("single_body", 0, "midpoint, quadratic H and S", "compiled engine, plain functions", "C"),
-        Pair("single_body", 1, "a call of 1000 midpoint steps, every state kept", COMPILED, "C"),
-        Pair("general", 0, "midpoint, quartic H and logarithmic S", COMPILED, "C"),
-        *(Pair("variational", i, f"variational scheme {i + 1}", COMPILED, "C") for i in range(3)),
-        Pair("spin", 0, "midpoint, a spin on its sphere", COMPILED, "C"),
-        Pair("spin", 1, "the same in charts", COMPILED, "C"),
-        Pair("ensemble", 0, "10,000 bodies, 200 midpoint steps", COMPILED, "C with SIMD"),
+        RowPair("single_body", 0, "midpoint, quadratic H and S", "compiled engine, plain functions", "C"),
+        RowPair("single_body", 1, "a call of 1000 midpoint steps, every state kept", COMPILED_ROW, "C"),
+        RowPair("general", 0, "midpoint, quartic H and logarithmic S", COMPILED_ROW, "C"),
+        *(RowPair("variational", i, f"variational scheme {i + 1}", COMPILED_ROW, "C") for i in range(3)),
+        RowPair("spin", 0, "midpoint, a spin on its sphere", COMPILED_ROW, "C"),
+        RowPair("spin", 1, "the same in charts", COMPILED_ROW, "C"),
+        RowPair("ensemble", 0, "10,000 bodies, 200 midpoint steps", COMPILED_ROW, "C with SIMD"),
     ],
     "One trajectory at equal accuracy": [
-        Pair("work_precision", 0, f"one body to an error of {error}", EXPLICIT, peer, f"≤ {error}")
+        RowPair("work_precision", 0, f"one body to an error of {error}", EXPLICIT_ROW, peer, f"≤ {error}")
         for error in ("1e-05", "1e-09")
         for peer in ("heyoka", "diffrax", "SciPy")
     ],
     "Many trajectories at equal accuracy": [
-        *_at_accuracy(3, "10,000 bodies to 1e-3"),
-        *_at_accuracy(4, "10,000 bodies to 1e-5"),
-        *_at_accuracy(5, "10,000 bodies to 1e-8"),
-        *_at_accuracy(6, "10,000 bodies to 1e-12"),
+        *_ensemble_pairs(3, "10,000 bodies to 1e-3"),
+        *_ensemble_pairs(4, "10,000 bodies to 1e-5"),
+        *_ensemble_pairs(5, "10,000 bodies to 1e-8"),
+        *_ensemble_pairs(6, "10,000 bodies to 1e-12"),
         *(
-            Pair("ensemble", 2, "10,000 bodies, Gauss of order 6, to 3e-8", COMPILED, peer)
+            RowPair("ensemble", 2, "10,000 bodies, Gauss of order 6, to 3e-8", COMPILED_ROW, peer)
             for peer in ("heyoka", "diffrax")
         ),
-        Pair("others", 0, "10,000 states, quartic H, to 7e-14", COMPILED, "heyoka", which=2),
-        Pair("others", 1, "10,000 states of su(3) to 3e-13", COMPILED, "heyoka", which=2),
-        Pair("others", 2, "10,000 spins, each with a bath, to 7e-11", COMPILED, "heyoka", which=2),
+        RowPair("others", 0, "10,000 states, quartic H, to 7e-14", COMPILED_ROW, "heyoka", row_number=2),
+        RowPair("others", 1, "10,000 states of su(3) to 3e-13", COMPILED_ROW, "heyoka", row_number=2),
+        RowPair("others", 2, "10,000 spins, each with a bath, to 7e-11", COMPILED_ROW, "heyoka", row_number=2),
     ],
     "Satellites": [
-        Pair(
+        RowPair(
             "tumbling", table, f"{body}, 1000 s with attitude", "this library, Gauss, order 6", peer, "Time of the run"
         )
         for table, body in enumerate(("a free body", "a body with a damped wheel"))
@@ -98,30 +98,34 @@ THEMES: dict[str, list[Pair]] = {
     ],
     "Large algebras and lattices": [
         *(
-            Pair("fluids", 0, f"a fluid on the sphere, su({N})", "this library", "isospectral midpoint", which=i)
+            RowPair(
+                "fluids", 0, f"a fluid on the sphere, su({N})", "this library", "isospectral midpoint", row_number=i
+            )
             for i, N in enumerate((32, 64, 128, 256, 512))
             if N in (32, 128, 512)
         ),
-        Pair("lattice", 0, "10⁵ coupled spins, two cores", "array engine", "C, 2 threads"),
+        RowPair("lattice", 0, "10⁵ coupled spins, two cores", "array engine", "C, 2 threads"),
     ],
-    "Manifolds": [Pair("spin", 2, "a spin with a bath to an error of 1e-8", "Taylor(12)", "heyoka")],
+    "Manifolds": [RowPair("spin", 2, "a spin with a bath to an error of 1e-8", "Taylor(12)", "heyoka")],
     "Quantum systems": [],
 }
 """Where each theme's rows come from; a theme of which nothing was measured is left out of the page."""
 
-COSTS = (
+COST_MEASUREMENTS = (
     *("first_run", "network", "memory", "scaling", "studies", "manifolds", "functions", "isolated_body", "large"),
     *("magnet", "fluids"),
 )
 """Measurements without another program: their targets that are no ratios are a table of their own."""
 
-WHOLE = {"Learning": ("learn_gas", "learn_pendulum", "learn_body")}
+FULL_REPORT_THEMES = {"Learning": ("learn_gas", "learn_pendulum", "learn_body")}
 """Themes whose measurements are about errors: their tables are shown as they are."""
 
-NOTES = {"The same scheme in C": "Two of the variational schemes let the energy drift by their nature, here and in C."}
+THEME_NOTES = {
+    "The same scheme in C": "Two of the variational schemes let the energy drift by their nature, here and in C."
+}
 """What a reader has to know before a table."""
 
-GROUPS = {
+PEER_GROUPS = {
     "C by hand, the same scheme": ("C",),
     "heyoka": ("heyoka",),
     "diffrax and SciPy": ("diffrax", "SciPy"),
@@ -130,57 +134,57 @@ GROUPS = {
 """Whom a sentence is about, and how the names of the rows begin."""
 
 
-def compare(reports: Mapping[str, Report]) -> dict[str, list[Comparison]]:
+def compare_themes(reports: Mapping[str, Report]) -> dict[str, list[PeerComparison]]:
     """By theme, the pairs of which both rows were measured."""
-    found = {theme: [_compared(reports[p.measurement], p) for p in pairs if p.measurement in reports]
-             for theme, pairs in THEMES.items()}  # fmt: skip
+    found = {theme: [_compare_rows(reports[p.measurement], p) for p in pairs if p.measurement in reports]
+             for theme, pairs in PAIRS_BY_THEME.items()}  # fmt: skip
     return {theme: kept for theme, pairs in found.items() if (kept := [pair for pair in pairs if pair is not None])}
 
 
-def _compared(report: Report, pair: Pair) -> Comparison | None:
+def _compare_rows(report: Report, pair: RowPair) -> PeerComparison | None:
     if pair.table >= len(report.tables):
         return None
     table = report.tables[pair.table]
     column = next(i for i, name in enumerate(table.columns) if name.startswith(pair.column))
     laws = list(table.columns).index("Laws") if "Laws" in table.columns else None
-    rows = [_row(table, column, start, pair.which) for start in (pair.ours, pair.theirs)]
+    rows = [_find_row(table, column, start, pair.row_number) for start in (pair.ours, pair.theirs)]
     if None in rows or None in (times := [row[column] for row in rows if row]):
         return None
     said = [None if laws is None else row[laws] for row in rows if row]
-    return Comparison(pair.work, _name(rows[1] or []), *times, *said)
+    return PeerComparison(pair.work, _row_name(rows[1] or []), *times, *said)
 
 
-def _row(table: Table, column: int, start: str, which: int | None) -> list | None:
+def _find_row(table: Table, column: int, start: str, which: int | None) -> list | None:
     """The row of this name, or else of those that begin so; the fastest of them or the one asked for."""
-    named = [row for row in table.rows if _name(row) == start]
-    named = named or [row for row in table.rows if _name(row).startswith(start)]
+    named = [row for row in table.rows if _row_name(row) == start]
+    named = named or [row for row in table.rows if _row_name(row).startswith(start)]
     if which is not None:
         return named[which] if which < len(named) else None
     return min((row for row in named if row[column] is not None), key=lambda row: row[column], default=None)
 
 
-def _name(row: list) -> str:
+def _row_name(row: list) -> str:
     return next((cell for cell in row if isinstance(cell, str)), "")
 
 
-def sections(reports: Mapping[str, Report]) -> Iterator[str]:
+def page_sections(reports: Mapping[str, Report]) -> Iterator[str]:
     """The sentences, and a table for each theme."""
-    themes = compare(reports)
-    yield "\n".join(f"- {sentence}" for sentence in sentences([c for found in themes.values() for c in found]))
+    themes = compare_themes(reports)
+    yield "\n".join(f"- {sentence}" for sentence in summary_sentences([c for found in themes.values() for c in found]))
     for theme, found in themes.items():
-        note = f"\n\n{NOTES[theme]}" if theme in NOTES else ""
-        yield f"## {theme}{note}" + _table(found).markdown()
-    for theme, names in WHOLE.items():
+        note = f"\n\n{THEME_NOTES[theme]}" if theme in THEME_NOTES else ""
+        yield f"## {theme}{note}" + _comparison_table(found).markdown()
+    for theme, names in FULL_REPORT_THEMES.items():
         shown = [reports[name] for name in names if name in reports]
         if shown:
             yield "\n\n".join([f"## {theme}", *(r.markdown().replace("## ", "### ", 1) for r in shown)])
-    targets = [t for name in COSTS if name in reports for t in reports[name].targets if t.kind != "ratio"]
+    targets = [t for name in COST_MEASUREMENTS if name in reports for t in reports[name].targets if t.kind != "ratio"]
     if targets:
         table = Table("", {"Work": "text", "Measured": "text"}, [target.row()[::2] for target in targets])
         yield "## Other costs" + table.markdown()
 
 
-def _table(found: list[Comparison]) -> Table:
+def _comparison_table(found: list[PeerComparison]) -> Table:
     columns = {"Work": "text", "Beside": "text", "Here": "seconds", "There": "seconds", "Here / there": "about"}
     rows = [[c.work, c.peer, c.ours, c.theirs, c.ratio] for c in found]
     if any(c.our_laws for c in found):
@@ -189,9 +193,9 @@ def _table(found: list[Comparison]) -> Table:
     return Table("", columns, rows)
 
 
-def sentences(found: list[Comparison]) -> Iterator[str]:
+def summary_sentences(found: list[PeerComparison]) -> Iterator[str]:
     """Wins and losses, a sentence for each group of peers and one for the laws."""
-    for name, starts in GROUPS.items():
+    for name, starts in PEER_GROUPS.items():
         ours = sorted((c for c in found if c.peer.startswith(starts)), key=lambda c: c.ratio)
         if ours:
             best, worst, won = ours[0], ours[-1], sum(c.ratio < 1.0 for c in ours)
@@ -209,7 +213,7 @@ def sentences(found: list[Comparison]) -> Iterator[str]:
         )
 
 
-def missed(targets: list[Target]) -> str:
+def missed_targets_text(targets: list[Target]) -> str:
     """How many targets there are, and how many are missed."""
     count = sum(target.verdict == "missed" for target in targets)
     return f"{count} of {len(targets)} targets are missed"

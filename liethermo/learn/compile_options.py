@@ -6,7 +6,7 @@ import os
 from typing import Any
 
 
-def quickly() -> dict[str, Any]:
+def fast_compile_options() -> dict[str, Any]:
     """Options for programs that derivatives make long: they compile sooner, and run about as fast.
 
     Where the user has chosen a level of optimisation, that is taken.

@@ -8,17 +8,17 @@ from functools import cached_property
 import jax
 import jax.numpy as jnp
 
-from .._module import forwarded
 from .._names import checked_names
+from .._pytree_module import forward_to
 from .._sizes import check_memory
 from .lie_algebra import LieAlgebra
 
 
-class OnDemand(LieAlgebra):
-    """An algebra given by its bracket. What its constants alone tell is asked of :attr:`by_constants`.
+class BracketAlgebra(LieAlgebra):
+    """An algebra given by its bracket. What its constants alone tell is asked of :attr:`algebra_by_constants`.
 
-    A subclass sets ``name`` and ``dim``, gives :meth:`bracket`, :meth:`ad_star`, ``_key`` and
-    :meth:`_made_by_constants`, and whatever else it knows without constants.
+    A subclass sets ``name`` and ``dim``, gives :meth:`bracket`, :meth:`ad_star`, ``_rounded_key`` and
+    :meth:`_build_by_constants`, and whatever else it knows without constants.
     """
 
     name: str
@@ -29,7 +29,7 @@ class OnDemand(LieAlgebra):
         self.basis_names = None if basis_names is None else checked_names(basis_names, dim)
 
     @cached_property
-    def by_constants(self) -> LieAlgebra:
+    def algebra_by_constants(self) -> LieAlgebra:
         """The same algebra, given by its structure constants.
 
         Raises
@@ -42,31 +42,31 @@ class OnDemand(LieAlgebra):
             f"the {self.dim}**3 structure constants of {self.name}",
             "bracket, ad_star, killing_inner_product and leading_casimirs need none",
         )
-        return self._made_by_constants()
+        return self._build_by_constants()
 
     @abstractmethod
-    def _made_by_constants(self) -> LieAlgebra: ...
+    def _build_by_constants(self) -> LieAlgebra: ...
 
     @property
     @abstractmethod
     def _key(self): ...
 
-    structure_constants = forwarded("by_constants")
-    rational_constants = forwarded("by_constants")
-    basis = forwarded("by_constants")
-    _balanced = forwarded("by_constants")
+    structure_constants = forward_to("algebra_by_constants")
+    rational_constants = forward_to("algebra_by_constants")
+    basis = forward_to("algebra_by_constants")
+    _balanced_constants = forward_to("algebra_by_constants")
 
-    def _check_square(self, what: str) -> None:
+    def _check_matrix_memory(self, what: str) -> None:
         """Raise SizeError where a dim by dim matrix would not fit."""
         check_memory(float(self.dim) ** 2, f"{what} of {self.name}", "bracket, ad_star and action make no matrices")
 
     def ad(self, x):
-        self._check_square("the matrix of ad")
+        self._check_matrix_memory("the matrix of ad")
         columns = self.bracket(jnp.asarray(x)[..., None, :], jnp.eye(self.dim))
         return jnp.swapaxes(columns, -1, -2)
 
     def poisson_tensor(self, mu):
-        self._check_square("the Poisson tensor")
+        self._check_matrix_memory("the Poisson tensor")
         return jax.vmap(lambda e: self.ad_star(e, mu), out_axes=1)(jnp.eye(self.dim))
 
     def __eq__(self, other) -> bool:

@@ -12,13 +12,13 @@ import scipy
 from manifolds._arrays import is_traced
 
 from .energy import Energy, Linear
-from .indices import pattern
+from .indices import sparsity_pattern
 
-NEAR = 1 / 32
+MAX_SERIES_ARGUMENT = 1 / 32
 """Largest argument of the series of ``(exp(z) - 1) / z``: what its eight terms leave out is below their rounding."""
 
 
-class Warmth(Energy):
+class BathEnergy(Energy):
     """``sum_b C_b T_b (exp(y_b / C_b) - 1)`` of the entropies y, so that ``T_b exp(y_b / C_b)`` is the temperature.
 
     Measured from y = 0: else the heat of a small body would be lost in the rounding of what a large bath holds. Over a
@@ -35,22 +35,22 @@ class Warmth(Energy):
     temperature: jax.Array
 
     def value(self, x) -> jax.Array:
-        return jnp.sum(self.temperature * _grown(x * self.rate)[1] * x)
+        return jnp.sum(self.temperature * _exponential_and_quotient(x * self.rate)[1] * x)
 
     def gradient(self, x) -> jax.Array:
         return self.temperature * jnp.exp(x * self.rate)
 
-    def hidden(self, x) -> jax.Array:
+    def difference_rounding_scale(self, x) -> jax.Array:
         return jnp.zeros(())
 
     def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
         """The one that there is, of functions of one number each."""
-        return self.gradient(x + compensation) * _grown(d * self.rate)[1]
+        return self.gradient(x + compensation) * _exponential_and_quotient(d * self.rate)[1]
 
     def stage_gradients(self, scheme, path) -> jax.Array:
         start, k, h, b = path.start + path.compensation, path.slopes, path.h, path.b
         ahead = jnp.concatenate([path.points - start, path.step[None]])
-        powers, grown = _grown(ahead * self.rate)
+        powers, grown = _exponential_and_quotient(ahead * self.rate)
         first = self.gradient(start)
         gradients, change = first * powers[:-1], first * grown[-1] * path.step
         defect, square = change - h * (b @ (gradients * k)), h * (b @ (k * k))
@@ -63,10 +63,10 @@ class Warmth(Energy):
         return 1.0 / self.capacity
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array:
-        return pattern(range(dim), range(dim), dim)
+        return sparsity_pattern(range(dim), range(dim), dim)
 
 
-class Reservoir(Linear):
+class ReservoirEnergy(Linear):
     """``sum_b T_b y_b`` of the entropies y: the energy of baths of infinite capacity, which keep their temperatures."""
 
     @property
@@ -78,14 +78,14 @@ class Reservoir(Linear):
         return jnp.full_like(self.b, jnp.inf)
 
 
-def warmth(capacity: jax.Array, temperature: jax.Array) -> Warmth | Reservoir:
+def make_bath_energy(capacity: jax.Array, temperature: jax.Array) -> BathEnergy | ReservoirEnergy:
     """The energy of baths of constant capacities, finite or infinite, shape (m,) each."""
     if is_traced(capacity) or not np.isinf(np.asarray(capacity)).all():
-        return Warmth(capacity, temperature)
-    return Reservoir(temperature)
+        return BathEnergy(capacity, temperature)
+    return ReservoirEnergy(temperature)
 
 
-def _grown(z) -> tuple[jax.Array, jax.Array]:
+def _exponential_and_quotient(z) -> tuple[jax.Array, jax.Array]:
     """``exp(z)`` and ``(exp(z) - 1) / z``, elementwise: by their series where all z are near zero, as within a step."""
 
     def series() -> tuple[jax.Array, jax.Array]:
@@ -100,4 +100,4 @@ def _grown(z) -> tuple[jax.Array, jax.Array]:
         zero = z == 0.0
         return jnp.exp(z), jnp.where(zero, 1.0, jnp.expm1(z) / jnp.where(zero, 1.0, z))
 
-    return jax.lax.cond(jnp.max(jnp.abs(z)) <= NEAR, series, quotient)
+    return jax.lax.cond(jnp.max(jnp.abs(z)) <= MAX_SERIES_ARGUMENT, series, quotient)

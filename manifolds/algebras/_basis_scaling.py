@@ -11,13 +11,13 @@ In random bases of condition number 1e2, scaled by 1e-6 … 1e6, zeros come out 
 1e-5 (Killing forms) and 1e-4 (brackets).
 """
 
-_INVISIBLE = 1e-12
+_MIN_RELATIVE_CONSTANT = 1e-12
 """Constants below this, relative to the largest, take no part in the balance: rounding is not to be made large."""
 
-_MOST_ROUNDS = 20
+_MAX_ROUNDS = 20
 
 
-def balanced(constants: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def balance_constants(constants: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The constants in the basis ``factors[a] e_a``, the largest of size 1, and the factors.
 
     The logarithms of the constants that are not zero, ``log |C[a, b, c]| + x_a + x_b - x_c``, have the least sum of
@@ -27,8 +27,8 @@ def balanced(constants: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if not size.any():
         return constants, np.ones(len(constants))
     kept, scaled = np.zeros(constants.shape, dtype=bool), constants
-    for _ in range(_MOST_ROUNDS):
-        seen = kept | (np.abs(scaled) > _INVISIBLE * np.abs(scaled).max())
+    for _ in range(_MAX_ROUNDS):
+        seen = kept | (np.abs(scaled) > _MIN_RELATIVE_CONSTANT * np.abs(scaled).max())
         if (seen == kept).all():
             break
         kept = seen  # what comes to light when the scales of the others are known takes part from then on
