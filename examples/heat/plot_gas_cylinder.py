@@ -48,7 +48,7 @@ left.plot(solution.t, solution.x[:, 0], color="#0072B2")
 left.set(xlabel="time (s)", title="height of the piston (m)")
 middle.plot(solution.t, temperature, color="#D55E00")
 middle.set(xlabel="time (s)", title="temperature (K)")
-own = np.asarray(gas.own_energy(solution.x))
+own = np.asarray(gas.mechanical_energy(solution.x))
 for label, series, color in (
     ("energy of the gas", own - own[0], "0.2"),
     ("heat received", heat, "#D55E00"),

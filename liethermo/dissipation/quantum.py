@@ -163,7 +163,7 @@ class ThermalJumps(Dissipation):
             jumps=jumps, frame=frame, order=order, driven=driven, isolated=False, keeps_energy=True
         )
         if not is_traced((self.rates, baths)):
-            found._check_rates(system.at_some_times()[0] if system.is_driven else system)
+            found._check_rates(system.systems_at_test_times()[0] if system.is_driven else system)
         return found
 
     def _replace_fields(self, **fields) -> ThermalJumps:

@@ -173,14 +173,14 @@ class EngineWithFallback:
         if self.requested_engine == "sparse" or (
             auto and system.dim >= MIN_SPARSE_DIM and not method.explicit and self.noise is None
         ):
-            if system.sparsity() is not None:
+            if system.sparsity_pattern() is not None:
                 return SparseEngine(system, method)
             if not auto:
                 raise InputError(
                     f"the sparse engine cannot run a {system.kind} that does not know its sparsity: a "
                     "ComposedSystem of lt.Copies joined by lt.Each does"
                 )
-        long = self.planned_steps >= MIN_STEPS_TO_COMPILE or system.spectral
+        long = self.planned_steps >= MIN_STEPS_TO_COMPILE or system.has_matrix_functions
         if self.requested_engine == "compiled" or (auto and is_worth_compiling(system)):
             compiled = CompiledEngine(system, method, planned_steps=self.planned_steps)
             try:
@@ -218,7 +218,7 @@ class EngineWithFallback:
 
 def is_worth_compiling(system: System) -> bool:
     """Whether a system is worth trying to compile: unrolled code, on the CPU, for few components."""
-    return system.unrollable and system.dim <= MAX_COMPILED_DIM and jax.default_backend() == "cpu"
+    return system.can_unroll and system.dim <= MAX_COMPILED_DIM and jax.default_backend() == "cpu"
 
 
 def warn_of_fallback(error: UnsupportedPrimitive) -> None:

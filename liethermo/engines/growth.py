@@ -40,7 +40,7 @@ def jacobian_probe(system: System, x) -> jax.Array:
 @jit_program
 def arnoldi_hessenberg(system, method, x):
     """The matrix of the Jacobian in a Krylov space, shape (m, m): its eigenvalues lie near the outer ones [Arnoldi]."""
-    system, x = system.solved_for(x)
+    system, x = system.solved_part(x)
     stretched, n = _jacobian_product(system, x), x.shape[0]
     m = min(n, KRYLOV_DIM)
 

@@ -158,7 +158,9 @@ EVENT_ZERO_ULPS = 2.0**10
 def _event_rounding(model: tuple[System, Any], x) -> jax.Array:
     """The size at which what is watched is rounded at a state, which is rounded itself."""
     system, watched = model
-    return propagated_rounding_scale(lambda y: watched(system, y), x, jnp.maximum(jnp.abs(x), system.sizes(x)))
+    return propagated_rounding_scale(
+        lambda y: watched(system, y), x, jnp.maximum(jnp.abs(x), system.component_scales(x))
+    )
 
 
 # -- from pause to pause ----------------------------------------------------------------------------------------------

@@ -132,7 +132,7 @@ def initial_adaptive_state(
 ) -> AdaptiveState:
     """The pace of a run about to start at x; ``length`` is that of its whole span."""
     state, zero = initial_run_state(system, method, x), jnp.zeros(())
-    own, at = system.solved_for(x)
+    own, at = system.solved_part(x)
     size = jnp.max(jnp.abs(at))
     unit = jnp.where(size > 0.0, size, 1.0)
     speed = jnp.max(jnp.abs(own.vector_field(at))) / unit
@@ -168,7 +168,7 @@ def jacobian_probe_shape(system: System, method: OneStepMethod, pacing: StepCont
     if not pacing.adaptive:
         return 1, 1
     x = jax.ShapeDtypeStruct((system.dim,), jnp.float64)
-    return jax.eval_shape(lambda x: jacobian_probe(*system.solved_for(x)), x).shape
+    return jax.eval_shape(lambda x: jacobian_probe(*system.solved_part(x)), x).shape
 
 
 def next_step(pacing: StepControl, pace: AdaptiveState) -> tuple[jax.Array, jax.Array]:
@@ -225,7 +225,7 @@ def accept_or_reject(
     good, proposed, code = solved, pace.next_step_size, new.status
     speed, optimal = pace.max_relative_rate, pace.optimal_step_size
     if pacing.adaptive:
-        here, there = (system.solved_for(x)[1] for x in (old.x, new.x))
+        here, there = (system.solved_part(x)[1] for x in (old.x, new.x))
         size = jnp.maximum(jnp.max(jnp.abs(here)), jnp.max(jnp.abs(there)))
         gone = jnp.max(jnp.abs(there - here)) / jnp.where(size > 0.0, size, 1.0)
         speed = jnp.maximum(speed, jnp.where(solved, gone / h, 0.0))
@@ -287,7 +287,7 @@ def accept_or_reject(
     )
     if not pacing.adaptive:
         return after
-    looked = limit_by_growth_rate(method, after, jacobian_probe(*system.solved_for(new.x)))
+    looked = limit_by_growth_rate(method, after, jacobian_probe(*system.solved_part(new.x)))
     after = jax.tree_util.tree_map(select_if_running, looked, after)
     spent = (tried >= pacing.max_attempts) & (after.state.status == StatusCode.COMPLETED)
     status = jnp.where(spent, StatusCode.STEP_LIMIT, after.state.status).astype(old.status.dtype)

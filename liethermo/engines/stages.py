@@ -123,7 +123,7 @@ def solve_fixed_point(equations: StageEquations, rules: SolverOptions = DEFAULT_
 
 def slope_rounding_scale(system: System, x, rules: SolverOptions = DEFAULT_OPTIONS) -> jax.Array:
     """The size at which the motion from a state is rounded, as a whole."""
-    system, x = system.solved_for(x)
+    system, x = system.solved_part(x)
     return rules.norm_for_dim(x.size)(value_and_rounding_scale(system.vector_field, x)[1])
 
 
@@ -255,7 +255,7 @@ def explicit_slopes(
 ) -> StageSolution:
     """The slopes of an explicit method, which there is nothing to solve for."""
     k = method.slopes(system, x, compensation, h, k)
-    x, none = system.solved_for(x)[1], jnp.zeros((), dtype=jnp.int64)
+    x, none = system.solved_part(x)[1], jnp.zeros((), dtype=jnp.int64)
     size = rules.norm_for_dim(x.size)
     missed = size(jnp.zeros_like(x).at[0].set(constraint_residual(k)))  # it is the length of a vector
     converged = missed <= rules.projection_rtol * size(k[0]) + rules.projection_state_rtol * update_scale(

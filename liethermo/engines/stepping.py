@@ -107,7 +107,11 @@ def reorder_components(
     system: System, method: OneStepMethod, state: State, rules: SolverOptions = DEFAULT_OPTIONS
 ) -> tuple[System, OneStepMethod, State, Callable[[State], State]]:
     """The three with many components in the order in which steps are fastest, and what takes states back."""
-    found = system.arranged() if is_permutation_equivariant(method) and state.x.size > rules.rms_norm_dim else None
+    found = (
+        system.reorder_components()
+        if is_permutation_equivariant(method) and state.x.size > rules.rms_norm_dim
+        else None
+    )
     if found is None:
         return system, method, state, lambda state: state
 
@@ -123,8 +127,8 @@ def reorder_components(
     return (
         found.system,
         pullback_method(method, found),
-        permute_state(state, found.there),
-        lambda s: permute_state(s, found.back),
+        permute_state(state, found.reorder_state),
+        lambda s: permute_state(s, found.restore_state),
     )
 
 
@@ -166,7 +170,7 @@ def stage_equations(
     columns: Callable | None = None,
 ) -> StageEquations:
     """What a step from a state has to solve, with a guess from the slopes of the steps before."""
-    own = system.solved_for(x)[1]
+    own = system.solved_part(x)[1]
     measure = rules.norm_for_dim(own.size)
     whole = measure(own) / jnp.abs(h)  # once a step
     return StageEquations(
@@ -191,13 +195,13 @@ def finish_step(
     new, new_compensation, energy, entropy, check, *sizes = end_of_step(system, method, x, compensation, h, solved.k)
     pending = state.energy_drift_correction
     if not method.carries_compensation:  # the next step makes its own, as it would if it were the first of a run
-        new_compensation = system.of_clock(new_compensation)
+        new_compensation = system.clock_components(new_compensation)
     elif can_correct_energy_drift(system, method):  # by what the last step left: so no step waits for its own
         new_compensation = apply_drift_correction(system, new, new_compensation, pending)
         pending = energy_drift_correction(system, new, new_compensation, energy, state.first_energy)
     good = solved.converged & jnp.isfinite(check)
     failure = jnp.where(solved.converged | ~solved.is_finite, int(StatusCode.NON_FINITE), int(StatusCode.NOT_CONVERGED))
-    own = system.solved_for(x)[1]
+    own = system.solved_part(x)[1]
     size = jnp.maximum(rules.norm_for_dim(own.size)(own), h * solved.slope_rounding)
     residual = h * solved.residual / jnp.where(size > rules.tiny, size, 1.0)
     iterations = solved.fixed_point_iterations + solved.newton_iterations

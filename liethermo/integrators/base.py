@@ -296,7 +296,7 @@ def pullback_method(method: OneStepMethod, local) -> OneStepMethod:
     """The method with its own functions in the coordinates of ``local``: a system in a chart, or in another order."""
 
     def pullback_part(part):
-        return local.pulled(part) if isinstance(part, Energy) else part
+        return local.pullback(part) if isinstance(part, Energy) else part
 
     return jax.tree_util.tree_map(pullback_part, method, is_leaf=lambda part: isinstance(part, Energy))
 
@@ -338,7 +338,7 @@ def generator_residual_jvp(system: System, stages: Callable, k) -> Callable:
     The slopes differ from it by the corrections of their gradients alone, which are of the order of the method, and its
     derivative has no eigenvectors in it.
     """
-    return jax.linearize(lambda k: jax.vmap(system.generated)(stages(k)) - k, k)[1]
+    return jax.linearize(lambda k: jax.vmap(system.generator_field)(stages(k)) - k, k)[1]
 
 
 def collocation_error(system: System, x, compensation, h, k) -> jax.Array:

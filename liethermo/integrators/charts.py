@@ -68,7 +68,7 @@ class InCharts(MethodWrapper):
         The second derivatives of a chart may not exist, and where they do the compiler would spend most of its time on
         what is hardly ever needed.
         """
-        sizes, misfit = system.sizes(k), self.slopes(system, x, compensation, h, k) - k
+        sizes, misfit = system.component_scales(k), self.slopes(system, x, compensation, h, k) - k
 
         def difference_quotient(d):
             step = EPS**0.5 / jnp.max(jnp.abs(d) / sizes)

@@ -148,7 +148,7 @@ class ExplicitMethod(TransportingMethod):
         but does not move. Near these the turn that makes up for an error is much larger than the error. Momenta of
         parts that turn inside, such as a wheel that rubs, are no matter of the attitude's.
         """
-        size, casimirs = system.orbit
+        size, casimirs = system.orbit_levels
         held = system.has_impulse or casimirs <= set(self.held)  # of a torque, the impulse is made to fit
         return system.has_all_casimirs and held and size - len(casimirs) <= 2
 
@@ -253,7 +253,8 @@ class ExplicitMethod(TransportingMethod):
         def is_small_displacement(v) -> jax.Array:
             move = correction_displacement(system, x, v, leaf)
             near = [
-                jnp.linalg.norm(move[b]) <= MAX_CORRECTION_DISPLACEMENT * jnp.linalg.norm(x[b]) for b in system.blocks
+                jnp.linalg.norm(move[b]) <= MAX_CORRECTION_DISPLACEMENT * jnp.linalg.norm(x[b])
+                for b in system.state_blocks
             ]
             return jnp.stack(near).all()
 
@@ -287,9 +288,9 @@ class ExplicitMethod(TransportingMethod):
 
         Where the field has a form without the entropy, the rates are not needed, and zero.
         """
-        system = system.here(x)
+        system = system.freeze_at(x)
         if system.has_generator:
-            return system.generated(x), jnp.zeros(len(laws))
+            return system.generator_field(x), jnp.zeros(len(laws))
         dH = system.energy.gradient(x)
         if system.dissipation is None:
             return system.field(x, dH, jnp.zeros_like(x)), jnp.zeros(len(laws))
@@ -364,4 +365,4 @@ def constraint_residual(k) -> jax.Array:
 
 def _max_stored_levels(system: System) -> int:
     """How many levels a run remembers: no more than the components that functions depend on, as angles are none."""
-    return system.whole.body.dim if isinstance(system, TurningSystem) else system.dim
+    return system.attitude_system.body.dim if isinstance(system, TurningSystem) else system.dim

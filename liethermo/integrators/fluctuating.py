@@ -97,7 +97,7 @@ class StochasticMidpoint(MethodWrapper, TransportingMethod):
         if not turns or not isinstance(system, SpinSystem):
             return found[None]
         # The same solution, in a fraction of the iterations: of many spins some are turned far in every step.
-        return (k[0] + system.turned_back(0.5 * h * sum(turns), found - k[0]))[None]
+        return (k[0] + system.solve_rotation(0.5 * h * sum(turns), found - k[0]))[None]
 
     def stage_velocities(self, system: System, x, compensation, h, k) -> jax.Array:
         z, dH, dS, dL = self.method.midpoint_gradients(system, x, compensation, h, k)

@@ -22,7 +22,7 @@ from ..functions.energy import Energy
 from ..functions.frames import gram_schmidt
 from ..functions.gradients import stage_gradients
 from ..systems import System
-from ..systems.base import gradients_of
+from ..systems.base import stack_gradients
 from ..tracing.interpret import evaluate_at_points
 from .base import (
     GaussMethod,
@@ -147,7 +147,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         if not self.functions:
             return
         functions = [system.energy, *(() if system.entropy is None else (system.entropy,)), *self.functions]
-        gradients = np.nan_to_num(evaluate_at_points(gradients_of, tuple(functions), system.samples(8)))
+        gradients = np.nan_to_num(evaluate_at_points(stack_gradients, tuple(functions), system.samples(8)))
         if np.linalg.matrix_rank(gradients, tol=1e-9).max() >= system.dim:
             raise InputError(
                 f"energy, entropy and {len(self.functions)} preserved functions are independent and leave no room to "
@@ -219,7 +219,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
 
     def _stage_slope(self, system: System, u, dH, dS, known: dict[str, StageGradients]) -> jax.Array:
         """``Pi_d dH + K_d dS`` at one stage."""
-        system = system.here(u)
+        system = system.freeze_at(u)
         motion = self._conservative_slope(system, u, dH, known)
         names = tuple(zip(system.preserved_by_name(), system.preserved_names, strict=True))
         for part, own in () if system.dissipation is None else terms_with_preserved(system.dissipation, names):

@@ -95,7 +95,7 @@ def project_onto_levels(
     """
     change, surface = CHANGE_GRADIENT, system.surface
     signs = jnp.asarray([law.sign for law in laws])
-    functions, blocks = [law.function for law in laws], system.blocks
+    functions, blocks = [law.function for law in laws], system.state_blocks
 
     def corrected_displacement(s: ProjectionState) -> tuple[jax.Array, jax.Array]:
         d = s.d + correction_displacement(system, x + (compensation + s.d), s.correction, leaf)
@@ -250,7 +250,7 @@ def level_correction(
     is_usable: Callable[[jax.Array], jax.Array] | None = None,
 ) -> jax.Array:
     """The vector in the span of these directions that changes their functions by so much, as far as it is usable."""
-    return vector_with_products(along, changes, min(len(system.blocks), 2), is_usable)
+    return vector_with_products(along, changes, min(len(system.state_blocks), 2), is_usable)
 
 
 def correction_displacement(system: System, x, correction, leaf: bool = False) -> jax.Array:

@@ -22,7 +22,7 @@ def preserved_functions(preserve) -> tuple[Energy, ...]:
 
 def function_on_states(system: System, C: Energy) -> Energy:
     """A preserved function as one of the state vectors of a system."""
-    C = check_energy(system.on_states(C), system.dim, "a preserved function")
+    C = check_energy(system.energy_of_vectors(C), system.dim, "a preserved function")
     return mark_polynomial_degrees(C, system.dim) if system.space is None else C
 
 
@@ -52,7 +52,7 @@ CASIMIR_RTOL = 1e-10
 def casimir_residuals(model: tuple[System, tuple[Energy, ...]], x) -> jax.Array:
     """Return ``|Pi grad C|`` of each function at x, relative to ``|Pi v|`` of another covector v of that length."""
     system, functions = model
-    system = system.here(x)
+    system = system.freeze_at(x)
     shares = []
     for C in functions:
         gradient, random = C.gradient(x), jnp.cos(jnp.arange(1.0, x.shape[0] + 1.0))

@@ -14,7 +14,7 @@ from manifolds.matrices.linear import solve_near_identity
 from ..errors import InputError
 from ..functions.frames import vector_with_products
 from ..functions.gradients import two_sum
-from ..systems import SPATIAL_MOMENTUM, WITHOUT_IMPULSE, AttitudeSystem, DrivenSystem, TurningSystem
+from ..systems import MOMENTUM_LESS_IMPULSE, SPATIAL_MOMENTUM, AttitudeSystem, DrivenSystem, TurningSystem
 from .base import MethodWrapper, TransportingMethod, pullback_method
 from .explicit import INITIAL_LEVELS_ROW
 from .tableaus import gauss_tableau
@@ -81,14 +81,14 @@ class WithAttitude(MethodWrapper):
         )
 
     def preserves_function(self, system, name: str) -> bool:
-        if name not in (SPATIAL_MOMENTUM, WITHOUT_IMPULSE):
+        if name not in (SPATIAL_MOMENTUM, MOMENTUM_LESS_IMPULSE):
             return self.method.preserves_function(system.body, name)
         follows = self.kind == "coadjoint" or (self.kind == "cayley" and system.group.cayley_is_adjoint())
         return (self.explicit or follows) and self._transporting_method.can_transport_attitude(system.body)
 
     def check(self, system) -> None:
         body = system.body
-        self.method.check(body.turned(system.group.identity) if isinstance(body, DrivenSystem) else body)
+        self.method.check(body.bind_attitude(system.group.identity) if isinstance(body, DrivenSystem) else body)
 
     # -- the momentum, which the equations of a step are about --------------------------------------------------------
 
@@ -96,8 +96,10 @@ class WithAttitude(MethodWrapper):
         """Those of the momentum; of an explicit method those of the angles beside it."""
         method, mu, mu_compensation = self.method, system.points(x), system.points(compensation)
         if self.explicit:
-            local = TurningSystem(system, self.order, system.split(x)[1])
-            return pullback_method(method, local).slopes(local, local.around(x), local.around(compensation), h, k)
+            local = TurningSystem(system, self.order, system.split_state(x)[1])
+            return pullback_method(method, local).slopes(
+                local, local.local_coordinates(x), local.local_coordinates(compensation), h, k
+            )
         body = system.body
         if not (isinstance(body, DrivenSystem) and body.needs_attitude):
             return method.slopes(body, mu, mu_compensation, h, k)
@@ -107,25 +109,29 @@ class WithAttitude(MethodWrapper):
 
     def start(self, system: AttitudeSystem, x) -> jax.Array:  # type: ignore[override]
         if not self.explicit:
-            return self.method.start(system.body_at(x), system.points(x))
-        mu, g = system.split(x)
+            return self.method.start(system.body_at_attitude(x), system.points(x))
+        mu, g = system.split_state(x)
         local, n = TurningSystem(system, self.order, g), system.group.dim
-        k = self.method.start(local, local.around(x))  # behind the levels that it has begun on is room for more
-        return k.at[INITIAL_LEVELS_ROW, mu.shape[0] : mu.shape[0] + n].set(mu[:n] @ system.to_space(g))
+        k = self.method.start(
+            local, local.local_coordinates(x)
+        )  # behind the levels that it has begun on is room for more
+        return k.at[INITIAL_LEVELS_ROW, mu.shape[0] : mu.shape[0] + n].set(mu[:n] @ system.spatial_action(g))
 
     def error(self, system: AttitudeSystem, x, compensation, h, k) -> jax.Array:  # type: ignore[override]
-        return self.method.error(system.body_at(x), system.points(x), system.points(compensation), h, system.points(k))
+        return self.method.error(
+            system.body_at_attitude(x), system.points(x), system.points(compensation), h, system.points(k)
+        )
 
     def initial_compensation(self, system: AttitudeSystem, x) -> jax.Array:  # type: ignore[override]
-        mu, g = system.split(x)
+        mu, g = system.split_state(x)
         off = _group_correction(system.group, g) if self.kind == "cayley" else jnp.zeros_like(g)
-        momentum = jnp.zeros_like(system.in_space(x)) if system.pushed_by else None
-        return system.join(self.method.initial_compensation(system.body, mu), off, momentum)
+        momentum = jnp.zeros_like(system.spatial_impulse(x)) if system.torque_name else None
+        return system.join_state(self.method.initial_compensation(system.body, mu), off, momentum)
 
     # -- the attitude, which follows from it --------------------------------------------------------------------------
 
     def move(self, system: AttitudeSystem, x, compensation, h, k) -> tuple[jax.Array, jax.Array]:  # type: ignore[override]
-        (mu, g), (mu_compensation, g_compensation) = system.split(x), system.split(compensation)
+        (mu, g), (mu_compensation, g_compensation) = system.split_state(x), system.split_state(compensation)
         new, new_compensation = self.method.move(system.body, mu, mu_compensation, h, system.points(k))
         if self.explicit:
             return self._apply_explicit_step(system, x, compensation, new, new_compensation, h, k)
@@ -139,42 +145,44 @@ class WithAttitude(MethodWrapper):
         if self.kind == "cayley":
             gained = (g + g_compensation) @ _collocation_increment(system.group.algebra.hat(xi))
             turned, turned_compensation = two_sum(g, g_compensation + gained)
-            return system.join(new, turned, p), system.join(
+            return system.join_state(new, turned, p), system.join_state(
                 new_compensation, turned_compensation + _group_correction(system.group, turned), p_compensation
             )
         turned = system.group.restore_map(g @ self._attitude_increment(system.group, xi))
-        return system.join(new, turned, p), system.join(new_compensation, jnp.zeros_like(g), p_compensation)
+        return system.join_state(new, turned, p), system.join_state(new_compensation, jnp.zeros_like(g), p_compensation)
 
     def _apply_explicit_step(
         self, system: AttitudeSystem, x, compensation, new, new_compensation, h, k
     ) -> tuple[jax.Array, jax.Array]:
-        g, group, n = system.split(x)[1], system.group, system.group.dim
+        g, group, n = system.split_state(x)[1], system.group, system.group.dim
         local, step = TurningSystem(system, self.order, g), self.increment(h, k)
         turned = g @ group.exp_map(group.algebra, local.angles(step))
         follows, p_compensation = (
-            system.body.torque_free and self._transporting_method.can_transport_attitude(system.body),
+            system.body.is_torque_free and self._transporting_method.can_transport_attitude(system.body),
             None,
         )
         if system.has_impulse:
-            p, p_compensation = two_sum(system.in_space(x), system.in_space(compensation) + local.in_space(step))
+            p, p_compensation = two_sum(
+                system.spatial_impulse(x), system.spatial_impulse(compensation) + local.spatial_impulse(step)
+            )
             if follows:
-                p, p_compensation = _project_onto_orbit(system.momenta, p, new), jnp.zeros_like(p)
+                p, p_compensation = _project_onto_orbit(system.momentum_system, p, new), jnp.zeros_like(p)
         else:  # that of the start of the run, since the roundings of steps would add up
             p = k[INITIAL_LEVELS_ROW, system.body.dim : system.body.dim + n]
         if follows:
             turned = _align_attitude(group, turned, p, new[:n])
         turned = group.restore_map(turned)
-        return system.join(new, turned, p if system.has_impulse else None), system.join(
+        return system.join_state(new, turned, p if system.has_impulse else None), system.join_state(
             new_compensation, jnp.zeros_like(g), p_compensation
         )
 
     def step_without_compensation(self, system: AttitudeSystem, x, h) -> jax.Array:
         """A step without care for rounding, of a method that has such: see :meth:`.MetriplecticRungeKutta.plain`."""
-        g, group = system.split(x)[1], system.group
+        g, group = system.split_state(x)[1], system.group
         local = TurningSystem(system, self.order, g)
         method: Any = pullback_method(self.method, local)
-        end = method.step_without_compensation(local, local.around(x), h)
-        return system.join(system.points(end), g @ group.exp_map(group.algebra, local.angles(end)))
+        end = method.step_without_compensation(local, local.local_coordinates(x), h)
+        return system.join_state(system.points(end), g @ group.exp_map(group.algebra, local.angles(end)))
 
     def _attitude_increment(self, group, xi) -> jax.Array:
         """By what an attitude is turned in a step, of angles h xi at the stages, shape (stages, dim)."""
@@ -184,7 +192,11 @@ class WithAttitude(MethodWrapper):
 
     def _stage_attitudes(self, system: AttitudeSystem, x, compensation, h, k) -> jax.Array:
         """Those at the stages, at which torques are taken, shape (stages, m, m), in the group."""
-        (mu, g), (mu_compensation, g_compensation), group = system.split(x), system.split(compensation), system.group
+        (mu, g), (mu_compensation, g_compensation), group = (
+            system.split_state(x),
+            system.split_state(compensation),
+            system.group,
+        )
         xi = (
             h
             * self._transporting_method.stage_velocities(system.body, mu, mu_compensation, h, k)[:, : system.group.dim]
@@ -204,9 +216,9 @@ class WithAttitude(MethodWrapper):
         body, states = system.body, system.points(x) + (system.points(compensation) + h * (gauss_tableau(len(k)).A @ k))
         assert isinstance(body, DrivenSystem)
         if not body.needs_attitude:
-            return jax.vmap(body.push)(states)
+            return jax.vmap(body.external_torque)(states)
         attitudes = self._stage_attitudes(system, x, compensation, h, k)
-        return jax.vmap(lambda g, state: body.turned(g).push(state))(attitudes, states)
+        return jax.vmap(lambda g, state: body.bind_attitude(g).external_torque(state))(attitudes, states)
 
     def _update_spatial_momentum(
         self, system: AttitudeSystem, x, compensation, h, k, xi
@@ -217,13 +229,13 @@ class WithAttitude(MethodWrapper):
             -1, -2
         )  # Ad(inverse(g)), relative
         impulse = h * jnp.einsum("i,ia,iab->b", gauss_tableau(len(xi)).b, torques, actions)
-        gained = impulse @ system.to_space(system.split(x)[1])
-        return two_sum(system.in_space(x), system.in_space(compensation) + gained)
+        gained = impulse @ system.spatial_action(system.split_state(x)[1])
+        return two_sum(system.spatial_impulse(x), system.spatial_impulse(compensation) + gained)
 
     def displace(self, system: AttitudeSystem, x, v) -> jax.Array:  # type: ignore[override]
         """With the momentum displaced: what is looked at on the way of a step are functions of that."""
-        mu, g = system.split(x)
-        return system.join(mu + system.points(v), g, system.in_space(x))
+        mu, g = system.split_state(x)
+        return system.join_state(mu + system.points(v), g, system.spatial_impulse(x))
 
     @staticmethod
     def _coadjoint_increment(group, xi) -> jax.Array:
@@ -299,7 +311,7 @@ def _project_onto_orbit(momenta, p, mu) -> jax.Array:
     """The dual vector next to p, of the group, that has the Casimirs of a state mu; other momenta of it stay."""
     n = len(p)
     size = jnp.max(jnp.abs(mu[:n]))
-    size, casimirs = jnp.where(size > 0.0, size, 1.0), momenta.casimirs_of_momenta().values()
+    size, casimirs = jnp.where(size > 0.0, size, 1.0), momenta.momentum_casimirs().values()
     p, mu = p / size, mu[: momenta.algebra.dim] / size
     for _ in range(MAX_NEWTON_ITERATIONS):
         whole = jnp.concatenate([p, mu[n:]])

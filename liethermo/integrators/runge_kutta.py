@@ -101,7 +101,7 @@ class MetriplecticRungeKutta(ExplicitMethod):
             """Those of the laws are by the whole field: along the motion they change by rounding alone."""
             dH = system.energy.gradient(x)
             dS = jnp.zeros_like(x) if system.entropy is None else system.entropy.gradient(x)
-            field = system.here(x).field(x, dH, dS, tuple(L.gradient(x) for L in system.preserved))
+            field = system.freeze_at(x).field(x, dH, dS, tuple(L.gradient(x) for L in system.preserved))
             given = [dS if law.function is system.entropy else law.function.gradient(x) for law in laws if law.sign]
             changes = [jnp.zeros(())] * (len(laws) - len(given)) + [jnp.dot(g, field) for g in given]  # they come last
             return field, jnp.asarray(changes)

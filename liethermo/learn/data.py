@@ -95,7 +95,7 @@ def _checked_trajectory(number: int, t, x, system: System, own: Observation) -> 
         raise InputError(f"{what}: times must grow, but time {i + 1} is {t[i + 1]:g} after {t[i]:g}")
     if own.is_full_state:
         try:
-            x = np.asarray(system.numbers(x, batch=True))
+            x = np.asarray(system.state_array(x, batch=True))
         except InputError as error:
             raise type(error)(f"{what}: {error}") from None
     elif x.shape != (len(t), *own.shape):

@@ -54,7 +54,7 @@ class Observation(NamedTuple):
 
     def observe(self, run: System, state) -> jax.Array:
         """The numbers that a state of a run shows, in a row."""
-        parts = run.split(state) if isinstance(run, AttitudeSystem) else (state,)
+        parts = run.split_state(state) if isinstance(run, AttitudeSystem) else (state,)
         return jnp.ravel(jnp.asarray(self.function(*parts)))
 
     def fingerprint_parts(self, run: System) -> list:
@@ -86,8 +86,8 @@ class Observation(NamedTuple):
         """A state at coordinates z around another: ``x + z``, and ``g exp(hat(z))`` of the numbers behind that."""
         if not isinstance(run, AttitudeSystem):
             return state + z
-        (x, g), n, group = run.split(state), dim_without_attitude(run), run.group
-        return run.join(x + z[:n], g @ group.exp_map(group.algebra, z[n:]))
+        (x, g), n, group = run.split_state(state), dim_without_attitude(run), run.group
+        return run.join_state(x + z[:n], g @ group.exp_map(group.algebra, z[n:]))
 
 
 def make_observation(system: System, observed: Sequence[int] | None, observe: Callable | None) -> Observation:
@@ -141,7 +141,7 @@ def default_states(own: Observation, run: System, shown: np.ndarray) -> np.ndarr
     x = np.zeros((len(shown), dim_without_attitude(run)))
     if len(own.component_indices):
         x[:, own.component_indices] = shown
-    return np.asarray(run.begin(x, batch=True)) if isinstance(run, AttitudeSystem) else x
+    return np.asarray(run.initial_state(x, batch=True)) if isinstance(run, AttitudeSystem) else x
 
 
 def states_matching_rates(

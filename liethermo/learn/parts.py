@@ -18,7 +18,7 @@ from ..dissipation.factor import Factor
 from ..errors import InputError
 from ..functions.energy import Energy as AnyEnergy
 from ..functions.energy import Function
-from ..systems.baths import beside_baths
+from ..systems.baths import poisson_with_baths
 from .networks import Learned, Network
 
 
@@ -152,7 +152,7 @@ def extend_poisson(poisson: mf.PoissonStructure, dim: int | None) -> mf.PoissonS
         return poisson
     if dim < poisson.dim:
         raise InputError(f"the Poisson structure has {poisson.dim} coordinates, more than the {dim} of a state")
-    return beside_baths(poisson, dim - poisson.dim)
+    return poisson_with_baths(poisson, dim - poisson.dim)
 
 
 class Friction(Dissipation):

@@ -14,7 +14,7 @@ from ..functions.conditions import check_numbers
 from ..functions.energy import Function
 from ..functions.mechanics import Kinetic
 from ..systems import SimpleClosedSystem
-from ..systems.ledger import timed
+from ..systems.ledger import add_time_argument
 from .gas_piston import GAS_CONSTANT, IdealGas
 from .parameters import checked_positive
 
@@ -61,7 +61,7 @@ def cylinder(
     push = pressure
     if pressure is not None:
         push = (
-            _PressureForce(timed(pressure), A)
+            _PressureForce(add_time_argument(pressure), A)
             if callable(pressure)
             else -A * check_numbers(pressure, "pressure", ())[None]
         )

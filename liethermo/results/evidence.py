@@ -204,7 +204,7 @@ class EvidenceCollector:
             if not steps:  # nothing moves
                 return found
             missed = self._inconsistency(steps)
-            if len(self.system.blocks) == 1 or missed is None or missed <= CONSISTENCY_SKIP_LEVEL:
+            if len(self.system.state_blocks) == 1 or missed is None or missed <= CONSISTENCY_SKIP_LEVEL:
                 break
         found = dataclasses.replace(found, inconsistency=missed)
         moving = [step is None or step.user_distance > MIN_RELATIVE_MOTION * step.user_state_norm for step in tried]
@@ -221,7 +221,7 @@ class EvidenceCollector:
         """The least field at states, shape (m, n), that is more than rounding, of each block, shape (m, blocks)."""
         moved = x.copy()
         signs = np.random.default_rng(0).choice([-1.0, 1.0], x.shape[1])  # in no axes of the system
-        for block in self.system.blocks:
+        for block in self.system.state_blocks:
             moved[:, block] += (
                 ROUNDING_SLOPE_RTOL * np.abs(x[:, block]).max(axis=1, initial=0.0, keepdims=True) * signs[block]
             )
@@ -235,7 +235,7 @@ class EvidenceCollector:
             return self._max_by_block(ROUNDING_SLOPE_RTOL * evaluate_at_points(_field_rounding_scale, self.system, x))
 
     def _max_by_block(self, fields: np.ndarray) -> np.ndarray:
-        return np.stack([fields[:, block].max(axis=1, initial=0.0) for block in self.system.blocks], axis=1)
+        return np.stack([fields[:, block].max(axis=1, initial=0.0) for block in self.system.state_blocks], axis=1)
 
     def _select_worst_steps(self, steps: StepSample, whole: float) -> tuple[np.ndarray, np.ndarray]:
 
@@ -291,7 +291,7 @@ class EvidenceCollector:
         if not starts:
             return np.full(len(x), np.nan)
         found = iter(vector_field_at(self.system, np.array(starts + ends)).reshape(2, len(starts), -1).swapaxes(0, 1))
-        defects = [[_slope_defect(step, self.system.blocks, *next(found)) for step in steps] for steps in short]
+        defects = [[_slope_defect(step, self.system.state_blocks, *next(found)) for step in steps] for steps in short]
         return np.array([min((d for d in values if np.isfinite(d)), default=np.nan) for values in defects])
 
     def _replay_step(
@@ -310,7 +310,7 @@ class EvidenceCollector:
         moved = float(np.abs(np.asarray(points(x + d)) - start).max())
         lengths = (
             _relative_norm(d[block], np.append(x[block], d[block]))  # what starts at zero has the size that it gets
-            for block, f in zip(self.system.blocks, least, strict=True)
+            for block, f in zip(self.system.state_blocks, least, strict=True)
             if np.abs(d[block]).max(initial=0.0) > MIN_RELATIVE_MOTION / ROUNDING_SLOPE_RTOL * steps * h * f
         )
         return _ReplayedStep(

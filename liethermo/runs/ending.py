@@ -237,6 +237,6 @@ def _why_non_finite(engine: EngineWithFallback, state, h: float) -> str:
         suspects |= {"entropy": system.entropy.value, "gradient of the entropy": system.entropy.gradient}
     for name, function in suspects.items():
         if not bool(jnp.isfinite(jnp.asarray(function(ahead))).all()):
-            near = np.array2string(np.asarray(system.seen(ahead)), precision=4, threshold=8)
+            near = np.array2string(np.asarray(system.user_state(ahead)), precision=4, threshold=8)
             return f"the {name} first, near x = {near}"
     return f"the iteration overflowed{system.domain and f', or did not find {system.domain}'}"

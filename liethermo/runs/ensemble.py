@@ -277,7 +277,9 @@ class _EnsembleOptions(NamedTuple):
             laws=promised_laws(member, method, {}),
             engine=chosen,
             wall_time=0.0,
-            evidence_source=None if noise_dimension(method) else EnsembleEvidenceCollector(record, method, again, equal),
+            evidence_source=None
+            if noise_dimension(method)
+            else EnsembleEvidenceCollector(record, method, again, equal),
             solution_builder=MemberSolutionBuilder(record, method, run),
         )
         return Subset(run, found), reasons | {int(run[j]): text for j, text in record.failure_reasons.items()}
@@ -339,15 +341,17 @@ def _bisect_invalid_rows(complaint: Callable[[slice], str], size: int) -> dict[i
 def _convert_initial_states(member: System, x0s) -> tuple[np.ndarray, dict[int, str]]:
     """Initial states, shape (trajectories, n), and those among them that are none, and why."""
     try:
-        return np.atleast_2d(np.asarray(member.numbers(x0s, batch=True))), {}
+        return np.atleast_2d(np.asarray(member.state_array(x0s, batch=True))), {}
     except (InputError, ValueError):
         rows = np.asarray(x0s)
         if rows.ndim < 2 or rows.dtype.kind not in "fiubc" or not len(rows):
             raise
-    bad = _bisect_invalid_rows(lambda part: error_message_of(lambda: member.numbers(rows[part], batch=True)), len(rows))
+    bad = _bisect_invalid_rows(
+        lambda part: error_message_of(lambda: member.state_array(rows[part], batch=True)), len(rows)
+    )
     good = [i for i in range(len(rows)) if i not in bad]
     if not good:
         raise InputError(f"no trajectory can be started; trajectory 0: {bad[0]}")
     filled = rows.copy()
     filled[list(bad)] = rows[good[0]]
-    return np.asarray(member.numbers(filled, batch=True)), bad
+    return np.asarray(member.state_array(filled, batch=True)), bad

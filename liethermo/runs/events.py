@@ -80,7 +80,7 @@ class Event:
             self.name = f"{name} below {until.tol:g}"
             self.function: Any = RateAboveThreshold(jnp.asarray(until.tol), rate)
         elif callable(until):
-            seen = jax.eval_shape(system.seen, jax.ShapeDtypeStruct((system.dim,), jnp.float64))
+            seen = jax.eval_shape(system.user_state, jax.ShapeDtypeStruct((system.dim,), jnp.float64))
             try:
                 self.function = UserStateFunction(trace_callables(until, lambda f, x: f(x), seen.shape))
             except IndexOutOfRangeError as error:
@@ -116,4 +116,4 @@ class UserStateFunction(Module):
     function: Callable
 
     def __call__(self, system: System, x):
-        return self.function(system.seen(x))
+        return self.function(system.user_state(x))

@@ -20,10 +20,10 @@ import numpy as np
 from ..integrators import OneStepMethod
 from ..integrators.preserved import casimir_residuals, is_momentum_map, why_not_preserved
 from ..systems import System
-from ..systems.base import first_multiples, gradients_of
+from ..systems.base import first_multiple_indices, stack_gradients
 from ..systems.baths import HeatBaths
-from ..systems.conservation import judge, rates_of_change
-from ..systems.kinds import Decided
+from ..systems.conservation import judge_conservation, rates_of_change
+from ..systems.interface import InvariantVerdicts
 from ..tracing.interpret import evaluate_at_points
 from .family import Family
 
@@ -39,14 +39,14 @@ class InvariantFacts(NamedTuple):
 
     Attributes
     ----------
-    preserved_as : tuple of str or None
+    preserved_labels : tuple of str or None
         The names of the functions that its dissipation has to preserve.
-    decided : Decided
+    invariant_verdicts : Decided
         Which functions it conserves.
     """
 
-    preserved_as: tuple[str, ...] | None
-    decided: Decided
+    preserved_labels: tuple[str, ...] | None
+    invariant_verdicts: InvariantVerdicts
 
 
 def with_invariant_facts(system: System, facts: InvariantFacts) -> System:
@@ -85,9 +85,9 @@ def group_members(
         The initial state of each trajectory. A function that cannot be evaluated at random states is judged near it.
     """
     everyone, member = np.arange(len(states)), family.representative
-    if member.decided is not None:
+    if member.invariant_verdicts is not None:
         return [MemberGroup(everyone, family)], {}
-    if not any(family.has_member_axis) and not member.undecided():
+    if not any(family.has_member_axis) and not member.undecided_functions():
         return [MemberGroup(everyone, family)], {}
     members = _MemberFunctions(family, member, method, states)
     if not (members.casimirs or member.preserved or members.requested_functions):
@@ -146,7 +146,7 @@ class _MemberFunctions:
     def __init__(self, family: Family, member: System, method: OneStepMethod, states: np.ndarray):
         self.family, self.member, self.states = family, member, states
         self.requested_functions = method.requested_invariants(member)
-        self.casimirs = tuple(name for name in member.casimirs() if name not in member.claimed())
+        self.casimirs = tuple(name for name in member.casimirs() if name not in member.invariants_by_construction())
 
     # -- facts --------------------------------------------------------------------------------------------------------
 
@@ -156,9 +156,9 @@ class _MemberFunctions:
         if not count:
             return np.zeros((len(self.states), 0), dtype=int)
         points = self.member.test_states(2)
-        each = len(points) * len(self.member.nameable()) * self.member.dim
+        each = len(points) * len(self.member.functions_for_naming()) * self.member.dim
         return self._evaluate_in_batches(
-            lambda rows: first_multiples(
+            lambda rows: first_multiple_indices(
                 self._evaluate_at(_nameable_gradients, rows, self._points_per_member(points, rows)), count
             ),
             each,
@@ -169,8 +169,8 @@ class _MemberFunctions:
         count, member = len(self.casimirs) + len(self.member.preserved), self.member
         verdicts = self._judge_functions(_named_rates, count, self.casimirs, near=True)
         # a torque that is zero at some times tells nothing of others
-        acted_on = [member.pushed_by and name not in member.casimirs_of_torque for name in self.casimirs]
-        acted_on += [bool(member.pushed_by)] * len(member.preserved)
+        acted_on = [member.torque_name and name not in member.torque_invariant_casimirs for name in self.casimirs]
+        acted_on += [bool(member.torque_name)] * len(member.preserved)
         return np.where(np.array(acted_on, dtype=bool), VERDICT_NOT_CONSERVED, verdicts)
 
     def verdicts_of_requested(self) -> np.ndarray:
@@ -197,13 +197,15 @@ class _MemberFunctions:
     def invariant_facts(self, multiples: np.ndarray, named: np.ndarray) -> InvariantFacts:
         """From what was found of one member."""
         member = self.member
-        names = member.names_of_preserved(multiples.tolist())
+        names = member.names_from_multiples(multiples.tolist())
         known = {VERDICT_UNKNOWN: None, VERDICT_NOT_CONSERVED: False, VERDICT_CONSERVED: True}
         verdicts: dict[str, bool | None] = {}
         for name, verdict in zip((*names, *self.casimirs), np.roll(named, len(names)).tolist(), strict=True):
             verdicts[name] = known[verdict]  # a Casimir after what is preserved, which may have its name
-        verdicts |= dict.fromkeys(member.claimed(), True)
-        return InvariantFacts(names if names else member.preserved_as, Decided.of(verdicts, names))
+        verdicts |= dict.fromkeys(member.invariants_by_construction(), True)
+        return InvariantFacts(
+            names if names else member.preserved_labels, InvariantVerdicts.from_verdicts(verdicts, names)
+        )
 
     # -- verdicts -----------------------------------------------------------------------------------------------------
 
@@ -212,7 +214,7 @@ class _MemberFunctions:
 
         With ``near``, states near the first of a trajectory are tried where random states have left a function open.
         """
-        times = range(len(self.member.at_some_times())) if self.member.is_driven else (None,)
+        times = range(len(self.member.systems_at_test_times())) if self.member.is_driven else (None,)
         each = np.stack([self._judge_functions_at_time(rates, count, functions, time, near) for time in times])
         unknown = np.where((each == VERDICT_UNKNOWN).any(axis=0), VERDICT_UNKNOWN, VERDICT_CONSERVED)
         return np.where((each == VERDICT_NOT_CONSERVED).any(axis=0), VERDICT_NOT_CONSERVED, unknown)
@@ -227,15 +229,17 @@ class _MemberFunctions:
 
         def try_states(rows: np.ndarray, states_of: Callable[[np.ndarray], np.ndarray], number: int) -> None:
             def judge_rows(rows: np.ndarray) -> np.ndarray:
-                found = judge(self._evaluate_at(rates, rows, states_of(rows), functions, time))
-                return np.stack([found.defined.any(axis=1), (found.defined & ~found.conserved).any(axis=1)], axis=1)
+                found = judge_conservation(self._evaluate_at(rates, rows, states_of(rows), functions, time))
+                return np.stack(
+                    [found.is_defined.any(axis=1), (found.is_defined & ~found.is_conserved).any(axis=1)], axis=1
+                )
 
             if rows.size:
                 result = self._evaluate_in_batches(judge_rows, number * member.dim, rows)
                 defined[rows] |= result[:, 0]
                 broken[rows] |= result[:, 1]
 
-        random = member.test_states(member.tested)
+        random = member.test_states(member.test_states_per_scale)
         for some in (random[:1], random[1:]):  # one state is enough to see that a function is not conserved
             left = np.flatnonzero(~broken.all(axis=1))
             try_states(left, functools.partial(self._points_per_member, some), len(some))
@@ -284,13 +288,13 @@ class _MemberFunctions:
 def _member_and_state(form, p: int, at, time: int | None = None) -> tuple[System, jnp.ndarray]:
     """The member with the parameters that a row begins with, as it is at one of some times; and the state behind."""
     system = form.build(at[:p])
-    return (system if time is None else system.at_some_times()[time]), at[p:]
+    return (system if time is None else system.systems_at_test_times()[time]), at[p:]
 
 
 def _nameable_gradients(model, at):
     form, p = model
     system, x = _member_and_state(form, p, at)
-    return gradients_of(system.nameable(), x)
+    return stack_gradients(system.functions_for_naming(), x)
 
 
 def _named_rates(model, at):

@@ -18,7 +18,15 @@ from ..integrators import OneStepMethod, WithAttitude
 from ..integrators.base import pullback_method
 from ..integrators.fluctuating import noise_dimension
 from ..results.status import Laws
-from ..systems import AttitudeSystem, DrivenSystem, EmbeddedSystem, LiePoissonSystem, System, driven, embedded
+from ..systems import (
+    AttitudeSystem,
+    DrivenSystem,
+    EmbeddedSystem,
+    LiePoissonSystem,
+    System,
+    embed_in_arrays,
+    make_autonomous,
+)
 from ..tracing.caching import LRUCache, memoize
 from .family import Family
 from .fluctuations import Fluctuations
@@ -54,12 +62,12 @@ def check_choice(what: str, given, choices: tuple[str, ...]) -> None:
 
 def resolve_invariants(system: System, x0) -> System:
     """The system, with what it conserves found out near the states that a run starts from, where that is open."""
-    return system.decided_near(x0) if _has_undecided_invariants(system) else system
+    return system.resolve_invariants_near(x0) if _has_undecided_invariants(system) else system
 
 
 @memoize
 def _has_undecided_invariants(system: System) -> bool:
-    return not is_traced(system) and bool(system.undecided())
+    return not is_traced(system) and bool(system.undecided_functions())
 
 
 @memoize
@@ -75,9 +83,9 @@ def prepare_run(
         if noise is not None:
             raise InputError(f"steps with noise are those of lt.MetriplecticMidpoint, and {method} has none")
         if system.needs_attitude:
-            raise InputError(f"{method} follows no attitude, and the torque {system.pushed_by} depends on it")
-        return driven(system, unit=1.0), method  # its errors are measured component by component
-    method = method if noise is None else noise.method_with_noise(driven(system), method)
+            raise InputError(f"{method} follows no attitude, and the torque {system.torque_name} depends on it")
+        return make_autonomous(system, unit=1.0), method  # its errors are measured component by component
+    method = method if noise is None else noise.method_with_noise(make_autonomous(system), method)
     return prepare_for_method(system, method, tolerance, True)
 
 
@@ -86,7 +94,7 @@ def prepare_for_method(
     system: System, method: OneStepMethod, tolerance: float | None = None, attitude: bool = False
 ) -> tuple[System, OneStepMethod]:
     """The same for a method of the library; attitudes where a torque depends on them, or where they are asked for."""
-    found = driven(system if method.uses_charts else embedded(system))
+    found = make_autonomous(system if method.uses_charts else embed_in_arrays(system))
     method = trace_energies(pullback_method(method, found).on(found, tolerance), found.dim)
     wanted = system.reconstruction if isinstance(system, LiePoissonSystem) else None
     if wanted is None or not (attitude or system.needs_attitude):
@@ -105,10 +113,10 @@ def initial_state(system: System, x0, t: float, attitude=None, batch: bool = Fal
         If there is an attitude and no group.
     """
     if isinstance(system, AttitudeSystem):
-        return system.begin(x0, attitude, batch, t)
+        return system.initial_state(x0, attitude, batch, t)
     if attitude is not None:
         raise InputError(MISSING_GROUP_MESSAGE)
-    return system.begin(x0, t, batch) if isinstance(system, DrivenSystem) else system.numbers(x0, batch)
+    return system.initial_state(x0, t, batch) if isinstance(system, DrivenSystem) else system.state_array(x0, batch)
 
 
 def checked_initial_state(system: System, method, x0, t: float, attitude=None) -> jax.Array | np.ndarray:
@@ -128,7 +136,7 @@ def checked_initial_state(system: System, method, x0, t: float, attitude=None) -
 def why_not_startable(system: System, method, x) -> str:
     """Why no run can start at x, or at one of several states, in words; empty where one can."""
     spared = system.has_generator and (not isinstance(method, OneStepMethod) or method.explicit)
-    reason = system.outside(x) or ("" if spared else system.singular(x))
+    reason = system.outside(x) or ("" if spared else system.why_singular(x))
     return reason and f"the run cannot start at this x0: {reason}"
 
 
@@ -137,7 +145,7 @@ def wrap_family(family: Family, system: System) -> Family:
     if isinstance(system, AttitudeSystem):
         return wrap_family(family, system.body).map_members(AttitudeSystem, system.reconstruction)
     if isinstance(system, EmbeddedSystem):
-        return family.map_members(EmbeddedSystem, *system.known)
+        return family.map_members(EmbeddedSystem, *system.projection_flags)
     return wrap_family(family, system.body).map_members(DrivenSystem) if isinstance(system, DrivenSystem) else family
 
 
@@ -184,17 +192,19 @@ def invariants_and_laws(system: System, method) -> tuple[dict, Laws]:
 def promised_laws(system: System, method, invariants) -> Laws:
     """What the system promises and, of its invariants, what the method keeps."""
     keeps = method.preserves_function if isinstance(method, OneStepMethod) else lambda system, name: False
-    constants = [*(name for name, (_, kept) in invariants.items() if kept), *system.constants]
+    constants = [*(name for name, (_, kept) in invariants.items() if kept), *system.constant_names]
     unknown = tuple(name for name, (_, kept) in invariants.items() if kept is None)
     conserved = tuple(name for name in constants if keeps(system, name))
     unpromised = tuple(name for name in constants if name not in conserved)
     if isinstance(method, OneStepMethod) and noise_dimension(method):  # what holds on paths, and what in the mean
         energy = "conserved" if system.energy_law == "conserved" else None
         mean = ("energy", "entropy") if energy is None else ("entropy",)
-        return Laws(energy, None, conserved, tuple(system.ledger), (), system.balance, unpromised, mean, unknown)
+        return Laws(
+            energy, None, conserved, tuple(system.ledger), (), system.balance_entries, unpromised, mean, unknown
+        )
     quadratic = system.entropy is not None and system.entropy.is_quadratic
     exact = {"energy": {"energy"}, "entropy": {"entropy_law", *(["entropy_law_quadratic"] if quadratic else [])}}
     inexact = tuple(law for law, claims in exact.items() if not claims & method.preserves)
     ledger = tuple(system.ledger)
     of_both = system.energy_law, system.entropy_law
-    return Laws(*of_both, conserved, ledger, inexact, system.balance, unpromised, unknown=unknown)
+    return Laws(*of_both, conserved, ledger, inexact, system.balance_entries, unpromised, unknown=unknown)

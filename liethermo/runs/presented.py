@@ -57,7 +57,7 @@ def build_solution(
         evidence_source=EvidenceCollector(system, method, functions, x, np.asarray(fields["t"]), step_sizes, replay),
         **fields,
     )
-    return system.presented(found)
+    return system.to_user_solution(found)
 
 
 def _function_value(function, x):
@@ -101,7 +101,7 @@ def run_provenance(
         "group": None if group is None else group.name,
         "inertia": None if inertia is None else inertia.tolist(),
         "dissipation": None if system.dissipation is None else type(system.dissipation).__name__,
-        **({"torque": system.pushed_by} if system.pushed_by else {}),
+        **({"torque": system.torque_name} if system.torque_name else {}),
     }
 
 

@@ -194,9 +194,9 @@ class EnsembleRecord:
             )
         x0, attitude, attitude0, work = self.x0, None, None, None
         if isinstance(self.member, AttitudeSystem):
-            x0, attitude0 = map(np.asarray, self.member.split(x0))
+            x0, attitude0 = map(np.asarray, self.member.split_state(x0))
             if x is not None:
-                x, attitude = map(np.asarray, self.member.split(x))
+                x, attitude = map(np.asarray, self.member.split_state(x))
         if (driven := driven_system(self.member)) is not None:
             work = self.work if self.trajectories is None else np.asarray(driven.work(x))
             x, x0, energy = None if x is None else x[..., :-2], x0[..., :-2], energy + work
@@ -216,7 +216,7 @@ class EnsembleRecord:
             **rows,
             **fields,
         )
-        return self.member.on_sites(found)
+        return self.member.reshape_to_sites(found)
 
 
 class MemberSolutionBuilder:

@@ -232,7 +232,7 @@ class _SubdividedStep:
     def user_state_at(self, share: float) -> np.ndarray:
         """The state as the user sees it."""
         if share not in self._user_states:
-            self._user_states[share] = np.asarray(self.engine.system.seen(np.asarray(self.state_at(share).x)))
+            self._user_states[share] = np.asarray(self.engine.system.user_state(np.asarray(self.state_at(share).x)))
         return self._user_states[share]
 
     @property
@@ -242,7 +242,7 @@ class _SubdividedStep:
             method, after = self.engine.method, self._engine_states[1.0]
             v = self.h * (np.asarray(method.weights(np.array(self.fractions))) @ np.asarray(after.k))
             x = _displaced_states(self.engine.system, method, np.asarray(self._engine_states[0.0].x), v)
-            self._states_between = np.asarray(self.engine.system.seen(np.asarray(x)))
+            self._states_between = np.asarray(self.engine.system.user_state(np.asarray(x)))
         return self._states_between
 
 

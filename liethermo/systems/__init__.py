@@ -1,6 +1,6 @@
 """Systems: an energy, an entropy, a Poisson structure and a dissipation, with their laws and their axioms checked."""
 
-from .attitude import SPATIAL_MOMENTUM, WITHOUT_IMPULSE, AttitudeSystem, TurningSystem, momenta_of
+from .attitude import MOMENTUM_LESS_IMPULSE, SPATIAL_MOMENTUM, AttitudeSystem, TurningSystem, momentum_system_of
 from .base import System
 from .baths import HeatBaths
 from .chart import ChartSystem
@@ -8,8 +8,8 @@ from .chetaev import ChetaevSystem
 from .composed.bodies import Copies, Subsystem
 from .composed.matter import Membrane, Reaction
 from .composed.system import ComposedSystem
-from .driven import DrivenSystem, driven
-from .embedded import EmbeddedSystem, embedded
+from .driven import DrivenSystem, make_autonomous
+from .embedded import EmbeddedSystem, embed_in_arrays
 from .euler_poincare import EulerPoincareSystem, Legendre
 from .euler_poincare_closed import EulerPoincareClosedSystem
 from .evolution import ContactSystem, EvolutionSystem
@@ -21,8 +21,8 @@ from .simple_closed import SimpleClosedSystem
 from .spins import SpinSystem
 
 __all__ = [
+    "MOMENTUM_LESS_IMPULSE",
     "SPATIAL_MOMENTUM",
-    "WITHOUT_IMPULSE",
     "AttitudeSystem",
     "ChartSystem",
     "ChetaevSystem",
@@ -48,7 +48,7 @@ __all__ = [
     "System",
     "ThermodynamicHerglotz",
     "TurningSystem",
-    "driven",
-    "embedded",
-    "momenta_of",
+    "embed_in_arrays",
+    "make_autonomous",
+    "momentum_system_of",
 ]

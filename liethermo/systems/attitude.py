@@ -26,10 +26,10 @@ from .lie_poisson import LiePoissonSystem
 SPATIAL_MOMENTUM = "momentum in space"
 """The name of ``Ad_star(inverse(g), mu)`` among what is constant along a run."""
 
-WITHOUT_IMPULSE = "momentum in space less the impulse"
+MOMENTUM_LESS_IMPULSE = "momentum in space less the impulse"
 """The name of what is constant in its place where a torque acts."""
 
-IMPULSE = "impulse"
+IMPULSE_NAME = "impulse"
 """The name of what a torque has given to the momentum in space, before the number of a component."""
 
 
@@ -58,64 +58,68 @@ class AttitudeSystem(System):
         return self.group
 
     def __init__(self, body: LiePoissonSystem | DrivenSystem, reconstruction: str):
-        group = momenta_of(body).group
+        group = momentum_system_of(body).group
         assert group is not None
         self.body, self.reconstruction, self.group, self.space = body, reconstruction, group, None
-        self.dim = body.dim + self._parts * group.matrix_size**2 + (group.dim if body.has_impulse else 0)
+        self.dim = body.dim + self._n_real_parts * group.matrix_size**2 + (group.dim if body.has_impulse else 0)
         self.poisson, self.dissipation, self.momentum_maps = body.poisson, body.dissipation, {}
-        self.energy = self._of_momentum(body.energy)
-        self.entropy = None if body.entropy is None else self._of_momentum(body.entropy)
-        self.preserved_as, self.decided = body.preserved_as, body.decided
+        self.energy = self._extend_from_momentum(body.energy)
+        self.entropy = None if body.entropy is None else self._extend_from_momentum(body.entropy)
+        self.preserved_labels, self.invariant_verdicts = body.preserved_labels, body.invariant_verdicts
 
     @property
-    def unrollable(self) -> bool:
+    def can_unroll(self) -> bool:
         general = {"exp": maps.exp, "coadjoint": maps.adjoint_cayley}
         own = {"exp": self.group.exp_map, "coadjoint": self.group.adjoint_cayley_map}
         kind = self.reconstruction
         unrolls = kind not in own or own[kind] is not general[kind]  # a power series of matrices, squared up again
-        return self.body.unrollable and self._parts == 1 and unrolls
+        return self.body.can_unroll and self._n_real_parts == 1 and unrolls
 
     @property
-    def momenta(self) -> LiePoissonSystem:
+    def momentum_system(self) -> LiePoissonSystem:
         """The system of mu and of baths alone."""
-        return momenta_of(self.body)
+        return momentum_system_of(self.body)
 
-    pushed_by = forward_to("body")
+    torque_name = forward_to("body")
     has_impulse = forward_to("body")
-    casimirs_of_torque = forward_to("body")
+    torque_invariant_casimirs = forward_to("body")
 
-    def split(self, x) -> tuple[jax.Array, jax.Array]:
+    def split_state(self, x) -> tuple[jax.Array, jax.Array]:
         """State of the body, shape (..., n), and group element, shape (..., m, m), of a state."""
         n, m = self.body.dim, self.group.matrix_size
-        parts = x[..., n : n + self._parts * m**2].reshape(*x.shape[:-1], self._parts, m, m)
-        return x[..., :n], parts[..., 0, :, :] if self._parts == 1 else parts[..., 0, :, :] + 1j * parts[..., 1, :, :]
+        parts = x[..., n : n + self._n_real_parts * m**2].reshape(*x.shape[:-1], self._n_real_parts, m, m)
+        return x[..., :n], parts[..., 0, :, :] if self._n_real_parts == 1 else parts[..., 0, :, :] + 1j * parts[
+            ..., 1, :, :
+        ]
 
-    def in_space(self, x) -> jax.Array:
+    def spatial_impulse(self, x) -> jax.Array:
         """The momentum in space as the impulse of the torque makes it, shape (..., dim of the algebra); or (..., 0)."""
-        return x[..., self.body.dim + self._parts * self.group.matrix_size**2 :]
+        return x[..., self.body.dim + self._n_real_parts * self.group.matrix_size**2 :]
 
-    def join(self, mu, g, p=None) -> jax.Array:
-        """The inverse of :meth:`split` and :meth:`in_space`."""
-        parts = g[..., None, :, :] if self._parts == 1 else jnp.stack([g.real, g.imag], axis=-3)
+    def join_state(self, mu, g, p=None) -> jax.Array:
+        """The inverse of :meth:`split` and :meth:`spatial_impulse`."""
+        parts = g[..., None, :, :] if self._n_real_parts == 1 else jnp.stack([g.real, g.imag], axis=-3)
         rest = [] if p is None else [p]
         return jnp.concatenate([mu, parts.reshape(*mu.shape[:-1], -1), *rest], axis=-1)
 
-    def of_clock(self, v):
-        mu, g = self.split(v)
-        return self.join(self.body.of_clock(mu), jnp.zeros_like(g), self.in_space(v) if self.pushed_by else None)
+    def clock_components(self, v):
+        mu, g = self.split_state(v)
+        return self.join_state(
+            self.body.clock_components(mu), jnp.zeros_like(g), self.spatial_impulse(v) if self.torque_name else None
+        )
 
-    def body_at(self, x) -> LiePoissonSystem | DrivenSystem:
+    def body_at_attitude(self, x) -> LiePoissonSystem | DrivenSystem:
         """The body, for use at the attitude of a state."""
-        return self.body.turned(self.split(x)[1]) if isinstance(self.body, DrivenSystem) else self.body
+        return self.body.bind_attitude(self.split_state(x)[1]) if isinstance(self.body, DrivenSystem) else self.body
 
-    def solved_for(self, x) -> tuple[System, jax.Array]:
-        return self.body_at(x), self.points(x)
+    def solved_part(self, x) -> tuple[System, jax.Array]:
+        return self.body_at_attitude(x), self.points(x)
 
-    def to_space(self, g) -> jax.Array:
+    def spatial_action(self, g) -> jax.Array:
         """The matrix, shape (..., n, n), that a dual vector is multiplied by from the left to become one in space."""
         return self.group.Ad(self.group.inverse_map(g))
 
-    def begin(self, mu, attitude=None, batch: bool = False, t: float = 0.0) -> jax.Array:
+    def initial_state(self, mu, attitude=None, batch: bool = False, t: float = 0.0) -> jax.Array:
         """The state with a momentum and an attitude, the identity by default, at a time; or several, with ``batch``.
 
         Raises
@@ -132,21 +136,21 @@ class AttitudeSystem(System):
                         f"the attitude is not in {self.group.name}: relative distance {residual:.3g}, tolerance 1e-10"
                     )
         body = self.body
-        mu = body.begin(mu, t, batch) if isinstance(body, DrivenSystem) else body.state(mu, batch)
+        mu = body.initial_state(mu, t, batch) if isinstance(body, DrivenSystem) else body.state(mu, batch)
         size = jnp.broadcast_shapes(mu.shape[:-1], g.shape[:-2])
         if size and not batch:
             raise InputError(f"a run has one attitude, of shape {self.group.identity.shape}, not {g.shape}")
         mu, g = jnp.broadcast_to(mu, (*size, mu.shape[-1])), jnp.broadcast_to(g, (*size, *g.shape[-2:]))
         if not self.has_impulse:
-            return self.join(mu, g)
-        return self.join(mu, g, jnp.einsum("...a,...ab->...b", mu[..., : self.group.dim], self.to_space(g)))
+            return self.join_state(mu, g)
+        return self.join_state(mu, g, jnp.einsum("...a,...ab->...b", mu[..., : self.group.dim], self.spatial_action(g)))
 
     def points(self, x):
         """The states of the body: what functions of the state are functions of."""
         return x[..., : self.body.dim]
 
-    def seen(self, x):
-        return self.body.seen(self.points(x))
+    def user_state(self, x):
+        return self.body.user_state(self.points(x))
 
     def outside(self, x) -> str:
         return self.body.outside(self.points(x))
@@ -154,14 +158,14 @@ class AttitudeSystem(System):
     def domain_margin(self, x):
         return self.body.domain_margin(self.points(x))
 
-    def singular(self, x) -> str:
-        return self.body.singular(self.points(x))
+    def why_singular(self, x) -> str:
+        return self.body.why_singular(self.points(x))
 
-    def sizes(self, k):
+    def component_scales(self, k):
         """Those of momenta, which have a unit, and of attitudes, which have none."""
-        n, m = self.body.dim, self.dim - self.in_space(k).shape[-1]
-        parts = [self.body.sizes(k[..., :n]), super().sizes(k[..., n:m])]
-        return jnp.concatenate([*parts, *([super().sizes(k[..., m:])] if m < self.dim else [])], axis=-1)
+        n, m = self.body.dim, self.dim - self.spatial_impulse(k).shape[-1]
+        parts = [self.body.component_scales(k[..., :n]), super().component_scales(k[..., n:m])]
+        return jnp.concatenate([*parts, *([super().component_scales(k[..., m:])] if m < self.dim else [])], axis=-1)
 
     def raise_index(self, x, alpha):
         n = self.body.dim
@@ -171,112 +175,112 @@ class AttitudeSystem(System):
         n = self.body.dim
         return jnp.concatenate([self.body.lower_index(x[:n], v[:n]), v[n:]])
 
-    def presented(self, solution):
-        states, g = self.split(solution.x)
+    def to_user_solution(self, solution):
+        states, g = self.split_state(solution.x)
         stats = dataclasses.replace(
             solution.stats,
-            attitude_residual=self.distance(solution.x),
-            spatial_momentum_change=self.change_in_space(solution.x),
+            attitude_residual=self.max_attitude_residual(solution.x),
+            spatial_momentum_change=self.max_spatial_momentum_change(solution.x),
         )
         dense = None if solution.dense is None else solution.dense.with_output_map(self.points)
-        series = {name: f - f[0] if name in self.impulses else f for name, f in solution.casimirs.items()}
+        series = {name: f - f[0] if name in self.impulse_names else f for name, f in solution.casimirs.items()}
         of_body = dataclasses.replace(solution, x=np.asarray(states), dense=dense, stats=stats, casimirs=series)
-        found = self.body.presented(of_body)
+        found = self.body.to_user_solution(of_body)
         return dataclasses.replace(found, attitude=np.ascontiguousarray(g)).with_provenance(
-            system=type(self.momenta).__name__,
-            algebra=self.momenta.algebra.name,
+            system=type(self.momentum_system).__name__,
+            algebra=self.momentum_system.algebra.name,
             x0=found.x[0].tolist(),
         )
 
-    def distance(self, x) -> float:
+    def max_attitude_residual(self, x) -> float:
         """The largest distance of the attitudes of states, shape (m, n), from the group, relative to their size."""
-        return float(np.max(_at_states(_distance, self, x)))
+        return float(np.max(_evaluate_at_states(_attitude_residual, self, x)))
 
-    def change_in_space(self, x) -> float:
+    def max_spatial_momentum_change(self, x) -> float:
         """The largest change of the momentum in space along states, shape (m, n), the first being that at the start.
 
         Less the impulse, where a torque acts.
 
         Relative to the largest of the terms that it is the sum of.
         """
-        found, sizes = _at_states(_in_space, self, x)
+        found, sizes = _evaluate_at_states(_spatial_momentum_and_scale, self, x)
         size = float(np.max(sizes))
         return float(np.abs(found - found[0]).max()) / (size if size > 0.0 else 1.0)
 
-    inertia = forward_to("momenta")
+    inertia = forward_to("momentum_system")
 
     @property
-    def constants(self):
-        if not self.body.torque_free:
+    def constant_names(self):
+        if not self.body.is_torque_free:
             return ()
-        return (WITHOUT_IMPULSE,) if self.has_impulse else (SPATIAL_MOMENTUM,)
+        return (MOMENTUM_LESS_IMPULSE,) if self.has_impulse else (SPATIAL_MOMENTUM,)
 
     @property
-    def impulses(self) -> tuple[str, ...]:
+    def impulse_names(self) -> tuple[str, ...]:
         """The names of the components of the impulse; none where no torque acts."""
-        return tuple(f"{IMPULSE} {i + 1}" for i in range(self.group.dim)) if self.has_impulse else ()
+        return tuple(f"{IMPULSE_NAME} {i + 1}" for i in range(self.group.dim)) if self.has_impulse else ()
 
     @property
     def ledger(self):
-        found = {name: self._of_momentum(f) for name, f in self.body.ledger.items()}
-        return found | {name: Linear(jnp.ones(1)).on([i - self.group.dim]) for i, name in enumerate(self.impulses)}
+        found = {name: self._extend_from_momentum(f) for name, f in self.body.ledger.items()}
+        return found | {name: Linear(jnp.ones(1)).on([i - self.group.dim]) for i, name in enumerate(self.impulse_names)}
 
-    balance = forward_to("body")
+    balance_entries = forward_to("body")
 
     @property
-    def blocks(self):
+    def state_blocks(self):
         n, m = self.body.dim, self.dim - (self.group.dim if self.has_impulse else 0)
-        return *_bounded(self.body), slice(n, m), *([slice(m, None)] if m < self.dim else [])
+        return *_body_blocks(self.body), slice(n, m), *([slice(m, None)] if m < self.dim else [])
 
     def invariants(self):
-        return {name: (self._of_momentum(J), kept) for name, (J, kept) in self.body.invariants().items()}
+        return {name: (self._extend_from_momentum(J), kept) for name, (J, kept) in self.body.invariants().items()}
 
     def _vector_field(self, x):
-        (mu, g), body = self.split(x), self.body_at(x)
+        (mu, g), body = self.split_state(x), self.body_at_attitude(x)
         dS = None if body.entropy is None else body.entropy.gradient(mu)
         xi = body.transport(mu, body.energy.gradient(mu), dS, body._preserved_gradients(mu))
-        p = body.push(mu)[: self.group.dim] @ self.to_space(g) if self.has_impulse else None
-        return self.join(body._vector_field(mu), g @ self.group.algebra.hat(xi[: self.group.dim]), p)
+        p = body.external_torque(mu)[: self.group.dim] @ self.spatial_action(g) if self.has_impulse else None
+        return self.join_state(body._vector_field(mu), g @ self.group.algebra.hat(xi[: self.group.dim]), p)
 
-    def _of_momentum(self, energy: Energy) -> Energy:
+    def _extend_from_momentum(self, energy: Energy) -> Energy:
         return energy.on(range(self.body.dim))
 
     @property
-    def _parts(self) -> int:
+    def _n_real_parts(self) -> int:
         return 2 if self.group.is_complex else 1
 
 
-def _bounded(body: System) -> list[slice]:
+def _body_blocks(body: System) -> list[slice]:
     """The blocks of the states of a body, as those of the first part of longer states."""
-    return [slice(*block.indices(body.dim)) for block in body.blocks]
+    return [slice(*block.indices(body.dim)) for block in body.state_blocks]
 
 
-def _at_states(function: Callable, system: AttitudeSystem, x):
+def _evaluate_at_states(function: Callable, system: AttitudeSystem, x):
     """The values of ``function(system, x)`` at states, shape (m, n)."""
     rows = np.minimum(np.arange(1 << (len(x) - 1).bit_length()), len(x) - 1)  # few lengths, so few compilations
     return evaluate_at_points(function, system, np.asarray(x)[rows])
 
 
-def momenta_of(body: System) -> LiePoissonSystem:
+def momentum_system_of(body: System) -> LiePoissonSystem:
     """The system of momenta in one that may be driven."""
     found = body.body if isinstance(body, DrivenSystem) else body
     assert isinstance(found, LiePoissonSystem)
     return found
 
 
-def _distance(system: AttitudeSystem, x) -> jax.Array:
-    return system.group.defect(system.split(x)[1])
+def _attitude_residual(system: AttitudeSystem, x) -> jax.Array:
+    return system.group.defect(system.split_state(x)[1])
 
 
-def _in_space(system: AttitudeSystem, x) -> tuple[jax.Array, jax.Array]:
+def _spatial_momentum_and_scale(system: AttitudeSystem, x) -> tuple[jax.Array, jax.Array]:
     """The momentum in space, less what the impulse makes of it, and the size of the largest terms in it."""
-    (state, g), p = system.split(x), system.in_space(x)
-    mu, action = state[: system.group.dim], system.to_space(g)
+    (state, g), p = system.split_state(x), system.spatial_impulse(x)
+    mu, action = state[: system.group.dim], system.spatial_action(g)
     found = mu @ action
     return found - p if system.has_impulse else found, jnp.max(jnp.abs(mu) @ jnp.abs(action))
 
 
-UNIT = 2.0**-300
+ANGLE_UNIT = 2.0**-300
 """Angles beside a momentum are kept in a unit this small, so that they count for nothing in the length of a step that
 is measured by the momentum, be that of 1e20 or of 1e-20. A power of two, so that nothing is rounded."""
 
@@ -290,87 +294,97 @@ class TurningSystem(System):
 
     Attributes
     ----------
-    whole : AttitudeSystem
+    attitude_system : AttitudeSystem
     order : int
         The power of theta to which its velocity is computed.
     attitude : array, shape (m, m)
         g.
     """
 
-    whole: AttitudeSystem
+    attitude_system: AttitudeSystem
     order: int = eqx.field(static=True)
     attitude: jax.Array
 
-    def __init__(self, whole: AttitudeSystem, order: int, attitude: jax.Array):
-        body = whole.body
-        self.whole, self.order, self.attitude = whole, order, attitude
-        self.dim, self.space = body.dim + whole.group.dim * (2 if whole.has_impulse else 1), None
+    def __init__(self, attitude_system: AttitudeSystem, order: int, attitude: jax.Array):
+        body = attitude_system.body
+        self.attitude_system, self.order, self.attitude = attitude_system, order, attitude
+        self.dim, self.space = body.dim + attitude_system.group.dim * (2 if attitude_system.has_impulse else 1), None
         self.poisson = mf.NoPoisson(self.dim)  # the motion is that of field()
-        self.energy, self.entropy = whole.energy, whole.entropy
-        self.momentum_maps = {name: self.pulled(J) for name, J in body.momentum_maps.items()}
-        self.dissipation = _OnMomentum.lift_terms(body.dissipation, self.pulled)
-        self.preserved_as, self.decided = body.preserved_as, body.decided
+        self.energy, self.entropy = attitude_system.energy, attitude_system.entropy
+        self.momentum_maps = {name: self.pullback(J) for name, J in body.momentum_maps.items()}
+        self.dissipation = _MomentumDissipation.lift_terms(body.dissipation, self.pullback)
+        self.preserved_labels, self.invariant_verdicts = body.preserved_labels, body.invariant_verdicts
 
     @property
-    def blocks(self):
-        n, m = self.whole.body.dim, self.whole.body.dim + self.whole.group.dim
-        return *_bounded(self.whole.body), slice(n, m), *([slice(m, None)] if self.has_impulse else [])
+    def state_blocks(self):
+        n, m = self.attitude_system.body.dim, self.attitude_system.body.dim + self.attitude_system.group.dim
+        return *_body_blocks(self.attitude_system.body), slice(n, m), *([slice(m, None)] if self.has_impulse else [])
 
-    def pulled(self, energy: Energy) -> Energy:
-        return self.whole._of_momentum(energy)
+    def pullback(self, energy: Energy) -> Energy:
+        return self.attitude_system._extend_from_momentum(energy)
 
-    pushed_by = forward_to("whole")
-    has_impulse = forward_to("whole")
-    casimirs_of_torque = forward_to("whole")
+    torque_name = forward_to("attitude_system")
+    has_impulse = forward_to("attitude_system")
+    torque_invariant_casimirs = forward_to("attitude_system")
 
     def casimirs(self):
-        return {name: self.pulled(C) for name, C in self.whole.body.casimirs().items()}
+        return {name: self.pullback(C) for name, C in self.attitude_system.body.casimirs().items()}
 
-    raise_index = forward_to("whole")
-    lower_index = forward_to("whole")
+    raise_index = forward_to("attitude_system")
+    lower_index = forward_to("attitude_system")
 
     def field(self, x, dH, dS, dL=()):
-        body, n = self.body_at(x), self.whole.body.dim
+        body, n = self.body_at_attitude(x), self.attitude_system.body.dim
         given = x[:n], dH[:n], None if dS is None else dS[:n], tuple(L[:n] for L in dL)
-        algebra = self.whole.group.algebra
+        algebra = self.attitude_system.group.algebra
         turning = maps.inverse_dexp(algebra, self.angles(x), body.transport(*given)[: algebra.dim], self.order)
-        rates = [body.field(*given), UNIT * turning]
+        rates = [body.field(*given), ANGLE_UNIT * turning]
         if self.has_impulse:
-            push = body.push(x[:n])
+            push = body.external_torque(x[:n])
             assert push is not None
-            rates.append(UNIT * (push[: algebra.dim] @ self.whole.to_space(self._turned(x))))
+            rates.append(ANGLE_UNIT * (push[: algebra.dim] @ self.attitude_system.spatial_action(self._attitude_at(x))))
         return jnp.concatenate(rates)
 
-    def body_at(self, x) -> System:
+    def body_at_attitude(self, x) -> System:
         """The body, for use at the attitude of the coordinates."""
-        body = self.whole.body
-        return body.turned(self._turned(x)) if isinstance(body, DrivenSystem) and body.needs_attitude else body
+        body = self.attitude_system.body
+        return (
+            body.bind_attitude(self._attitude_at(x)) if isinstance(body, DrivenSystem) and body.needs_attitude else body
+        )
 
-    def _turned(self, x) -> jax.Array:
-        group = self.whole.group
+    def _attitude_at(self, x) -> jax.Array:
+        group = self.attitude_system.group
         return self.attitude @ group.exp_map(group.algebra, self.angles(x))
 
     # -- coordinates --------------------------------------------------------------------------------------------------
 
-    def around(self, x) -> jax.Array:
+    def local_coordinates(self, x) -> jax.Array:
         """The coordinates of a state around its own attitude."""
-        return jnp.concatenate([self.whole.points(x), jnp.zeros(self.whole.group.dim), UNIT * self.whole.in_space(x)])
+        return jnp.concatenate(
+            [
+                self.attitude_system.points(x),
+                jnp.zeros(self.attitude_system.group.dim),
+                ANGLE_UNIT * self.attitude_system.spatial_impulse(x),
+            ]
+        )
 
     def angles(self, v) -> jax.Array:
         """Theta of a vector of coordinates, shape (..., dim of the algebra)."""
-        n = self.whole.body.dim
-        return v[..., n : n + self.whole.group.dim] / UNIT
+        n = self.attitude_system.body.dim
+        return v[..., n : n + self.attitude_system.group.dim] / ANGLE_UNIT
 
-    def in_space(self, v) -> jax.Array:
+    def spatial_impulse(self, v) -> jax.Array:
         """The momentum in space of a vector of coordinates, shape (..., dim of the algebra)."""
-        return v[..., self.whole.body.dim + self.whole.group.dim :] / UNIT
+        return v[..., self.attitude_system.body.dim + self.attitude_system.group.dim :] / ANGLE_UNIT
 
 
-class _OnMomentum(LiftedDissipation):
+class _MomentumDissipation(LiftedDissipation):
     """A dissipation of the momentum."""
 
     is_noiseless = forward_to("inner")
 
     def lifted_geometry(self, system, x) -> LiftedGeometry:
-        n = system.whole.body.dim
-        return LiftedGeometry(system.body_at(x), x[:n], lambda alpha: alpha[:n], lambda v: jnp.pad(v, (0, len(x) - n)))
+        n = system.attitude_system.body.dim
+        return LiftedGeometry(
+            system.body_at_attitude(x), x[:n], lambda alpha: alpha[:n], lambda v: jnp.pad(v, (0, len(x) - n))
+        )

@@ -27,44 +27,44 @@ from ..functions.with_baths import BodyBathsEnergy
 from ..tracing.caching import memoize
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.traced import trace_callables
-from .baths import EntropyOfBaths, HeatBaths, beside_baths
+from .baths import BathEntropy, HeatBaths, poisson_with_baths
 from .check import AXIOM_TOLERANCE, CheckReport, check_system
-from .conservation import is_proportional, judge, rates_of_change
-from .kinds import Decided, Kind
+from .conservation import is_proportional, judge_conservation, rates_of_change
+from .interface import InvariantVerdicts, SystemInterface
 
-SCALES = (1.0, 1e-4, 1e4)
+TEST_STATE_SCALES = (1.0, 1e-4, 1e4)
 """Scales of the random points at which the system is asked which functions it conserves."""
 
-MANY = 2_000
+LARGE_STATE_DIM = 2_000
 """Components of a state above which one point of each scale is enough."""
 
-AROUND, NEARER = 4, (0.3, 0.1, 0.03, 0.01, 1e-3, 1e-4)
+N_NEARBY_STATES, NEARBY_RADII = 4, (0.3, 0.1, 0.03, 0.01, 1e-3, 1e-4)
 """States near which it is asked too, and how near, relative to the size of a state."""
 
 
-TIMES = (0.0, 0.7310585786300049, -1.618033988749895)
+TEST_TIMES = (0.0, 0.7310585786300049, -1.618033988749895)
 """Times at which it is asked that of a system whose energy depends on time."""
 
 
-class Arranged(NamedTuple):
+class ReorderedSystem(NamedTuple):
     """A system with the components of its states in another order.
 
     Attributes
     ----------
     system : System
-    there, back : functions of states, shape (..., n)
+    reorder_state, restore_state : functions of states, shape (..., n)
         Into that order, and out of it.
-    pulled : function from an Energy to an Energy
+    pullback : function from an Energy to an Energy
         A function of states, as one of states in that order.
     """
 
     system: System
-    there: Callable
-    back: Callable
-    pulled: Callable
+    reorder_state: Callable
+    restore_state: Callable
+    pullback: Callable
 
 
-class System(Kind):
+class System(SystemInterface):
     """A metriplectic system on R^n or on a manifold [BFM §2.3]; see the subclasses for how to build one.
 
     On a manifold states, covectors and velocities are the arrays of the space, flat and real
@@ -98,15 +98,15 @@ class System(Kind):
         self.dim, self.space = dim, space
         self.poisson = trace_callables(poisson, lambda poisson, x: poisson.sharp(x, x), (dim,))
         self.energy = check_energy(
-            self.on_states(make_energy(energy, "the energy")), dim, "the energy", allow_time=True
+            self.energy_of_vectors(make_energy(energy, "the energy")), dim, "the energy", allow_time=True
         )
         self.entropy = None
         if entropy is not None:
-            self.entropy = check_energy(self.on_states(make_energy(entropy, "the entropy")), dim, "the entropy")
-        momentum_maps = named_maps(momentum_maps)
+            self.entropy = check_energy(self.energy_of_vectors(make_energy(entropy, "the entropy")), dim, "the entropy")
+        momentum_maps = name_momentum_maps(momentum_maps)
         roles = {name: f"momentum map {name!r}" for name in momentum_maps}
         self.momentum_maps = {
-            name: check_energy(self.on_states(make_energy(J, roles[name])), dim, roles[name])
+            name: check_energy(self.energy_of_vectors(make_energy(J, roles[name])), dim, roles[name])
             for name, J in momentum_maps.items()
         }
         if space is None:  # in a chart no function is quadratic
@@ -129,34 +129,36 @@ class System(Kind):
         self.dissipation = None
         if dissipation is not None:
             dissipation = flatten_site_functions(dissipation, self.shape)
-            self.dissipation = self._prepared_dissipation(dissipation)
+            self.dissipation = self._bind_dissipation(dissipation)
         if baths is not None:
-            self._heat(baths, of_baths)
+            self._attach_baths(baths, of_baths)
         if self.preserved and not is_traced(self):
-            self.preserved_as = self._preserved_names()
+            self.preserved_labels = self._find_preserved_names()
         if validate and not is_traced(self):
             self._validate()
 
-    def _prepared_dissipation(self, dissipation: Dissipation) -> Dissipation:
+    def _bind_dissipation(self, dissipation: Dissipation) -> Dissipation:
         dissipation = trace_energies(dissipation, self.dim, "a preserved function")
-        return self._traced_dissipation(dissipation.bind_to(self))
+        return self._trace_dissipation(dissipation.bind_to(self))
 
-    def _heat(self, baths: HeatBaths, of_baths: tuple[Dissipation, ...] = ()) -> None:
+    def _attach_baths(self, baths: HeatBaths, of_baths: tuple[Dissipation, ...] = ()) -> None:
         """Put baths beside the body that this system has been so far; ``of_baths`` act on the states with baths."""
         body, n, m = copy(self), self.dim, baths.number
         if self.dissipation is not None or not of_baths:
-            self.dissipation = couple_to_baths(self.dissipation, body, m, baths.positive, self._of_body)
+            self.dissipation = couple_to_baths(
+                self.dissipation, body, m, baths.has_positive_temperatures, self._extend_from_body
+            )
         if body.space is not None and body.space.dtype.kind == "c":
             raise InputError(f"baths are for real spaces, and {body.space.name} is complex")
         self.baths, self.dim = baths, n + m
         self.space = None if body.space is None else mf.Product(body.space, mf.Euclidean(m))
-        self.poisson = beside_baths(body.poisson, m)
+        self.poisson = poisson_with_baths(body.poisson, m)
         self.energy = BodyBathsEnergy(body.energy, baths.energy, n, self.dim)
-        heat = EntropyOfBaths(m)
-        self.entropy = heat if body.entropy is None else self._of_body(body.entropy) + heat
-        self.momentum_maps = {name: self._of_body(J) for name, J in body.momentum_maps.items()}
+        heat = BathEntropy(m)
+        self.entropy = heat if body.entropy is None else self._extend_from_body(body.entropy) + heat
+        self.momentum_maps = {name: self._extend_from_body(J) for name, J in body.momentum_maps.items()}
         if of_baths:
-            parts = tuple(self._prepared_dissipation(part) for part in of_baths)
+            parts = tuple(self._bind_dissipation(part) for part in of_baths)
             self.dissipation = sum_dissipations([part for part in (self.dissipation, *parts) if part is not None])
 
     def drop_baths(self) -> System:
@@ -166,7 +168,7 @@ class System(Kind):
         body = copy(self)
         parts = {
             "dim": self.body_dim,
-            "space": None if self.space is None else _first_factors(self.space),
+            "space": None if self.space is None else _drop_last_factor(self.space),
             "poisson": self.poisson.first,
             "energy": self.energy.body if isinstance(self.energy, BodyBathsEnergy) else self.energy,
             "baths": None,
@@ -175,7 +177,7 @@ class System(Kind):
             object.__setattr__(body, name, part)
         return body
 
-    def _of_body(self, energy: Energy) -> Energy:
+    def _extend_from_body(self, energy: Energy) -> Energy:
         """A function of the state of the body, as one of that with baths."""
         return energy.on(range(self.body_dim))
 
@@ -187,11 +189,11 @@ class System(Kind):
         entropies = jnp.asarray(x)[..., self.body_dim :]
         return jnp.vectorize(self.baths.energy.gradient, signature="(m)->(m)")(entropies)
 
-    def on_states(self, energy: Energy) -> Energy:
+    def energy_of_vectors(self, energy: Energy) -> Energy:
         """An energy of states as they are shown, as one of their vectors."""
         return energy_of_vectors(flatten_site_functions(energy, self.shape), self.space)
 
-    def _traced_dissipation(self, dissipation: Dissipation) -> Dissipation:
+    def _trace_dissipation(self, dissipation: Dissipation) -> Dissipation:
         """The dissipation with its plain functions traced for the arguments that its force gives them."""
 
         def force(dissipation, x):
@@ -203,24 +205,24 @@ class System(Kind):
 
     def vector_field(self, x, t=None) -> jax.Array:
         """``x'`` at a state or a batch of states, shape (..., n); at a time, where the energy depends on one."""
-        return self.evaluated(lambda system, y: system._vector_field(y), x, t, "(n)")
+        return self.evaluate_batch(lambda system, y: system._vector_field(y), x, t, "(n)")
 
     def entropy_production(self, x, t=None) -> jax.Array:
         """The rate of growth of the entropy, ``grad S @ x'``, shape (...); at a time, likewise."""
-        entropy = self._needed_entropy()
-        return self.evaluated(lambda system, y: jnp.dot(entropy.gradient(y), system._vector_field(y)), x, t, "()")
+        entropy = self._require_entropy()
+        return self.evaluate_batch(lambda system, y: jnp.dot(entropy.gradient(y), system._vector_field(y)), x, t, "()")
 
     def energy_fall(self, x, t=None) -> jax.Array:
         """The rate at which the dissipation lowers the energy, ``-grad H . force``, shape (...); likewise."""
 
-        def fall(system: System, y):
+        def fall_rate(system: System, y):
             if system.dissipation is None:
                 return jnp.zeros(())
             dH = system.energy.gradient(y)
             dS = None if system.entropy is None else system.entropy.gradient(y)
             return -system.dissipation.rate_of_change(system, y, dH, dS, system._preserved_gradients(y), dH)
 
-        return self.evaluated(fall, x, t, "()")
+        return self.evaluate_batch(fall_rate, x, t, "()")
 
     @with_library_settings
     def friction_matrix(self, x, t=None, dissipation: Dissipation | None = None) -> jax.Array:
@@ -242,23 +244,23 @@ class System(Kind):
         baths. On a Lie algebra an attitude follows it, ``g' = g hat(transport)``.
         """
         total = dH[: self.body_dim]
-        for sigma in self._velocities(x, dH, dS, dL):
+        for sigma in self._dissipation_velocities(x, dH, dS, dL):
             total = total if sigma is None else total + sigma
         return total
 
     @property
-    def torque_free(self) -> bool:
+    def is_torque_free(self) -> bool:
         """Whether the motion is all ``Pi(x) transport``: on a Lie algebra the momentum in space is then constant."""
         found: list[bool] = []
 
-        def ask(x):
-            velocities = self._velocities(x, x, x, (x,) * len(self.preserved))
+        def record_answer(x):
+            velocities = self._dissipation_velocities(x, x, x, (x,) * len(self.preserved))
             found.append(all(sigma is not None for sigma in velocities))
 
-        jax.eval_shape(ask, jax.ShapeDtypeStruct((self.dim,), jnp.float64))
+        jax.eval_shape(record_answer, jax.ShapeDtypeStruct((self.dim,), jnp.float64))
         return found[0]
 
-    def _velocities(self, x, dH, dS, dL) -> list[jax.Array | None]:
+    def _dissipation_velocities(self, x, dH, dS, dL) -> list[jax.Array | None]:
         """Those of the dissipations, None where one is a torque."""
         parts = () if self.dissipation is None else terms_with_preserved(self.dissipation, dL)
         return [part.velocity(self, x, dH, dS, own) for part, own in parts]
@@ -274,17 +276,17 @@ class System(Kind):
         """The system whose energy is for ever what it is at a time; itself where that does not depend on time."""
         return eqx.tree_at(lambda system: system.energy, self, self.energy.at_time(t)) if self.is_driven else self
 
-    def at_some_times(self) -> list[System]:
+    def systems_at_test_times(self) -> list[System]:
         """This system at a few times, for what is found out of one that is driven."""
-        return [self.at_time(t) for t in TIMES]
+        return [self.at_time(t) for t in TEST_TIMES]
 
     @with_library_settings
-    def evaluated(self, function: Callable, x, t, result: str) -> jax.Array:
+    def evaluate_batch(self, function: Callable, x, t, result_signature: str) -> jax.Array:
         """``function(system, x)`` for each state of a batch, the system as it is at the time t, or at each of several.
 
         Parameters
         ----------
-        result : str
+        result_signature : str
             The shape of one result, as in ``"(n)"``.
 
         Raises
@@ -294,42 +296,42 @@ class System(Kind):
         """
         x = self.state(x, batch=True)
         if not self.is_driven:
-            return jnp.vectorize(lambda y: function(self, y), signature=f"(n)->{result}")(x)
+            return jnp.vectorize(lambda y: function(self, y), signature=f"(n)->{result_signature}")(x)
         if t is None:
             what = "energy of this system depends on" if self.energy.depends_on_time else "torque is known at a"
             raise InputError(f"the {what} time: give the time beside the state")
-        at = jnp.vectorize(lambda y, t: function(self.at_time(t), y), signature=f"(n),()->{result}")
+        at = jnp.vectorize(lambda y, t: function(self.at_time(t), y), signature=f"(n),()->{result_signature}")
         return at(x, jnp.asarray(t, dtype=jnp.float64))
 
     # -- other forms of the same system -------------------------------------------------------------------------------
 
-    def local(self, x, centred: bool = False) -> tuple[System, jax.Array]:
+    def local_system(self, x, is_centred: bool = False) -> tuple[System, jax.Array]:
         """This system near a state in as many coordinates as it has dimensions, and those of the state.
 
-        With ``centred``, for use at that state alone.
+        With ``is_centred``, for use at that state alone.
         """
         return self, x
 
-    def solved_for(self, x) -> tuple[System, jax.Array]:
+    def solved_part(self, x) -> tuple[System, jax.Array]:
         """The part of the system, and of a state, that a step is solved for; slopes and errors are of its size.
 
         The rest of the state follows from it, and no tolerance of the one is measured by the other.
         """
         return self, x
 
-    def arranged(self) -> Arranged | None:
+    def reorder_components(self) -> ReorderedSystem | None:
         """This system with its components in another order, in which programs for large states are faster, if any."""
         return None
 
-    def of_clock(self, v) -> jax.Array:
+    def clock_components(self, v) -> jax.Array:
         """Return v, shape (n,), with zeros in all components but those that only count: a clock, and the work done."""
         return jnp.zeros_like(v)
 
-    def presented(self, solution: Any) -> Any:
+    def to_user_solution(self, solution: Any) -> Any:
         """A solution of this system, as its user is to see it."""
-        return self.on_sites(solution)
+        return self.reshape_to_sites(solution)
 
-    def on_sites(self, found: Any) -> Any:
+    def reshape_to_sites(self, found: Any) -> Any:
         """A solution, or an ensemble, with its states, shape (..., n), as they are shown on sites."""
         if not self.sites:
             return found
@@ -337,7 +339,7 @@ class System(Kind):
         shown = {name: value.reshape(*value.shape[:-1], *self.shape) for name, value in states.items()}
         return dataclasses.replace(found, **shown)
 
-    def here(self, x) -> System:
+    def freeze_at(self, x) -> System:
         """The same system, for use at one state: what its Pi and K have in common there is computed once."""
         return self
 
@@ -359,27 +361,27 @@ class System(Kind):
     @property
     def preserved_names(self) -> tuple[str, ...]:
         """What each of :attr:`preserved` is called among :meth:`functions`."""
-        return tuple(self.preserved_by_name()) if self.preserved_as is None else self.preserved_as
+        return tuple(self.preserved_by_name()) if self.preserved_labels is None else self.preserved_labels
 
     def preserved_by_name(self) -> dict[str, Energy]:
         """:attr:`preserved`, each with a key of its own."""
         return {f"preserved {i + 1}": L for i, L in enumerate(self.preserved)}
 
-    def _preserved_names(self) -> tuple[str, ...]:
+    def _find_preserved_names(self) -> tuple[str, ...]:
         """What is preserved, by the name of the momentum map or Casimir it is a multiple of, or by one of its own."""
-        functions = self.nameable()
-        gradients = evaluate_at_points(gradients_of, functions, self.test_states(2))  # shape (points, functions, n)
-        return self.names_of_preserved(first_multiples(gradients, len(self.preserved)).tolist())
+        functions = self.functions_for_naming()
+        gradients = evaluate_at_points(stack_gradients, functions, self.test_states(2))  # shape (points, functions, n)
+        return self.names_from_multiples(first_multiple_indices(gradients, len(self.preserved)).tolist())
 
-    def nameable(self) -> tuple[Energy, ...]:
+    def functions_for_naming(self) -> tuple[Energy, ...]:
         """Momentum maps and Casimirs, then what is preserved, which has the name of one of them if it is a multiple."""
         return (*(self.momentum_maps | self.casimirs()).values(), *self.preserved)
 
     def test_states(self, count: int) -> np.ndarray:
         """Random states at which functions are compared, shape (states, n), ``count`` of each of :data:`CONVEXITY_FORCE_SCALES`."""
-        return np.concatenate([self.samples(count, seed, scale) for seed, scale in enumerate(SCALES)])
+        return np.concatenate([self.samples(count, seed, scale) for seed, scale in enumerate(TEST_STATE_SCALES)])
 
-    def names_of_preserved(self, multiples: Sequence[int]) -> tuple[str, ...]:
+    def names_from_multiples(self, multiples: Sequence[int]) -> tuple[str, ...]:
         """The name of each of :attr:`preserved`: that of the function of which it is a multiple, or one of its own.
 
         Parameters
@@ -404,56 +406,60 @@ class System(Kind):
         says so, random points decide; while the system is being traced the function is left out. If random points
         cannot decide, a function that the dissipation has to preserve counts as conserved.
         """
-        return self._found().constant
+        return self._find_invariants().conserved_names
 
     @with_library_settings
-    def undecided(self) -> frozenset[str]:
+    def undecided_functions(self) -> frozenset[str]:
         """The names of those of :meth:`functions` of which it is not found out whether the system conserves them.
 
         At none of the points that were tried all of the motion could be evaluated, as where an entropy is defined for
         few states.
         """
-        return self._found(declared=False).unknown
+        return self._find_invariants(include_declared=False).undecided_names
 
-    def decided_near(self, x) -> System:
+    def resolve_invariants_near(self, x) -> System:
         """This system, with what random points leave open found out near states that are in its domain.
 
         Parameters
         ----------
         x : array, shape (n,) or (m, n)
         """
-        if self.decided is not None or is_traced(self) or not self.undecided():
+        if self.invariant_verdicts is not None or is_traced(self) or not self.undecided_functions():
             return self
         found = copy(self)
-        object.__setattr__(found, "decided", self._found(near=np.asarray(self.state(x, batch=True))))
+        object.__setattr__(
+            found, "invariant_verdicts", self._find_invariants(near=np.asarray(self.state(x, batch=True)))
+        )
         return found
 
-    def _found(self, near=None, declared: bool = True) -> Decided:
-        """What it conserves; with ``declared``, what its dissipation has to preserve unless it is seen not to."""
-        if self.decided is not None:
-            return self.decided
-        verdicts = _verdicts_anywhere(self) if near is None else self._verdicts(near)
-        return Decided.of(verdicts, self.preserved_names if declared else ())
+    def _find_invariants(self, near=None, include_declared: bool = True) -> InvariantVerdicts:
+        """What it conserves; with ``include_declared``, what its dissipation has to preserve unless it is seen not to."""
+        if self.invariant_verdicts is not None:
+            return self.invariant_verdicts
+        verdicts = _memoized_verdicts(self) if near is None else self._conservation_verdicts(near)
+        return InvariantVerdicts.from_verdicts(verdicts, self.preserved_names if include_declared else ())
 
-    def _verdicts(self, near=None) -> dict[str, bool | None]:
+    def _conservation_verdicts(self, near=None) -> dict[str, bool | None]:
         """Whether it conserves each of its functions: by construction, or at random points."""
-        claimed, untouched = self.claimed(), self.casimirs_of_torque
+        claimed, untouched = self.invariants_by_construction(), self.torque_invariant_casimirs
         others = {name: f for name, f in self.functions().items() if name not in claimed}
         # points decide, but not of what a torque acts on: one that is zero at some times tells nothing of others
-        open_ = {name: f for name, f in others.items() if not self.pushed_by or name in untouched}
+        open_ = {name: f for name, f in others.items() if not self.torque_name or name in untouched}
         with jax.ensure_compile_time_eval():  # this may be asked while something else is traced
             kept = [False] * len(open_) if is_traced(self) else self.conserves(tuple(open_.values()), near)
         return dict.fromkeys(others, False) | dict(zip(open_, kept, strict=True)) | dict.fromkeys(claimed, True)
 
-    def claimed(self) -> frozenset[str]:
+    def invariants_by_construction(self) -> frozenset[str]:
         """The names of the functions that it conserves by construction: nothing has to be tried out."""
         by_form = self.dissipation is None or self.dissipation.preserves_casimirs
-        return frozenset({*self.momentum_maps, *(self.casimirs_of_torque if by_form else ())})
+        return frozenset({*self.momentum_maps, *(self.torque_invariant_casimirs if by_form else ())})
 
     def invariants(self) -> dict[str, tuple[Energy, bool | None]]:
         """Functions worth recording along a run, by name, each with whether it is conserved; None where not known."""
-        found = self._found()
-        verdicts = {name: None if name in found.unknown else name in found.constant for name in self.functions()}
+        found = self._find_invariants()
+        verdicts = {
+            name: None if name in found.undecided_names else name in found.conserved_names for name in self.functions()
+        }
         return {name: (function, verdicts[name]) for name, function in self.functions().items()}
 
     def conserves(self, functions: tuple[Energy, ...], near: np.ndarray | None = None) -> list[bool | None]:
@@ -475,30 +481,30 @@ class System(Kind):
         if not functions:
             return []
         if self.is_driven:
-            found = [system.conserves(functions, near) for system in self.at_some_times()]
+            found = [system.conserves(functions, near) for system in self.systems_at_test_times()]
             return [False if False in kept else None if None in kept else True for kept in zip(*found, strict=True)]
-        points = self.test_states(self.tested)
+        points = self.test_states(self.test_states_per_scale)
         if near is not None:
             points = np.concatenate([points, self.states_near(near)])
-        defined, conserved = judge(
+        defined, conserved = judge_conservation(
             evaluate_at_points(rates_of_change, (self, functions), points)
         )  # shapes (points, functions)
         pairs = zip(defined.T, conserved.T, strict=True)
         return [bool(kept[inside].all()) if inside.any() else None for inside, kept in pairs]
 
     @property
-    def tested(self) -> int:
+    def test_states_per_scale(self) -> int:
         """At how many random states of each scale it is judged whether a function is conserved."""
-        return 4 if self.dim <= MANY else 1
+        return 4 if self.dim <= LARGE_STATE_DIM else 1
 
     def states_near(self, x) -> np.ndarray:
         """Some of the states x, shape (m, n), and on R^n points around them, ever nearer: they lie in most domains."""
-        x = np.reshape(np.asarray(x), (-1, self.dim))[:AROUND]
+        x = np.reshape(np.asarray(x), (-1, self.dim))[:N_NEARBY_STATES]
         if self.space is not None:
             return x
-        random = np.random.default_rng(0).standard_normal((len(NEARER), *x.shape))
+        random = np.random.default_rng(0).standard_normal((len(NEARBY_RADII), *x.shape))
         lengths = np.linalg.norm(x, axis=1, keepdims=True) / np.sqrt(self.dim)
-        return np.concatenate([x, *(x + nearer * lengths * w for nearer, w in zip(NEARER, random, strict=True))])
+        return np.concatenate([x, *(x + nearer * lengths * w for nearer, w in zip(NEARBY_RADII, random, strict=True))])
 
     # -- checks ---------------------------------------------------------------------------------------------------
 
@@ -512,10 +518,10 @@ class System(Kind):
         ------
         InputError, manifolds.OffManifoldError
         """
-        numbers = self.numbers(x, batch)
+        numbers = self.state_array(x, batch)
         return numbers.astype(jnp.float64) if isinstance(numbers, jax.core.Tracer) else real_array(numbers)
 
-    def numbers(self, x, batch: bool = False) -> np.ndarray | jax.Array:
+    def state_array(self, x, batch: bool = False) -> np.ndarray | jax.Array:
         """What :meth:`state` makes of x, as an array of NumPy where its values are known."""
         if not isinstance(x, jax.Array):
             try:
@@ -529,7 +535,7 @@ class System(Kind):
         if self.sites and x.shape[-len(self.shape) :] == self.shape:
             x = x.reshape(*x.shape[: -len(self.shape)], self.dim)
         if self.baths is not None and x.shape[-1:] != (self.dim,):
-            x = self._beside_baths(x)
+            x = self._append_bath_entropies(x)
         if jnp.iscomplexobj(x):
             raise InputError(f"a state is real, not {x.dtype}; take the real part if that is meant")
         if x.shape[-1:] != (self.dim,) or (x.ndim > 1 and not batch):
@@ -548,7 +554,7 @@ class System(Kind):
             self.space.point(self.points(numbers))
         return numbers
 
-    def _beside_baths(self, x) -> np.ndarray | jax.Array:
+    def _append_bath_entropies(self, x) -> np.ndarray | jax.Array:
         """A state of the body alone, with every bath at entropy zero; another array as it is."""
         body = self.drop_baths()
         shape = body.shape if body.space is None else body.space.shape
@@ -585,7 +591,7 @@ class System(Kind):
 
     def _validate(self) -> None:
         """Raise where an axiom fails at random points: called by the constructors, so that no bad system exists."""
-        for row in check_system(self, None, 4, 0, 1.0, matrices=not self.tensor_by_form).rows:
+        for row in check_system(self, None, 4, 0, 1.0, matrices=not self.has_poisson_by_construction).rows:
             if row.passed is not False:
                 continue
             kind = CasimirError if row.axiom == "Pi grad S = 0" else AxiomError
@@ -598,7 +604,7 @@ class System(Kind):
 
     def _vector_field(self, x) -> jax.Array:
         if self.has_generator:
-            return self.generated(x)
+            return self.generator_field(x)
         dS = jnp.zeros_like(x) if self.entropy is None else self.entropy.gradient(x)
         gradients = self.energy.gradient(x), dS, *self._preserved_gradients(x)
         dH, dS, *dL = (
@@ -609,13 +615,13 @@ class System(Kind):
     def _preserved_gradients(self, x) -> tuple[jax.Array, ...]:
         return tuple(L.gradient(x) for L in self.preserved)
 
-    def _needed_entropy(self) -> Energy:
+    def _require_entropy(self) -> Energy:
         if self.entropy is None:
             raise InputError("this system has no entropy")
         return self.entropy
 
 
-def _first_factors(space: mf.Space) -> mf.Space:
+def _drop_last_factor(space: mf.Space) -> mf.Space:
     """A product without its last factor."""
     assert isinstance(space, mf.Product)
     first, *others = space.factors[:-1]
@@ -623,16 +629,16 @@ def _first_factors(space: mf.Space) -> mf.Space:
 
 
 @memoize
-def _verdicts_anywhere(system: System) -> dict[str, bool | None]:
-    return system._verdicts()
+def _memoized_verdicts(system: System) -> dict[str, bool | None]:
+    return system._conservation_verdicts()
 
 
-def gradients_of(functions: tuple[Energy, ...], x) -> jax.Array:
+def stack_gradients(functions: tuple[Energy, ...], x) -> jax.Array:
     """The gradients of several functions at a state, shape (functions, n)."""
     return jnp.stack([f.gradient(x) for f in functions])
 
 
-def first_multiples(gradients: np.ndarray, count: int) -> np.ndarray:
+def first_multiple_indices(gradients: np.ndarray, count: int) -> np.ndarray:
     """Return for each of the last ``count`` functions the first one before it of which it is a multiple, or -1.
 
     Parameters
@@ -652,7 +658,7 @@ def first_multiples(gradients: np.ndarray, count: int) -> np.ndarray:
     return multiples
 
 
-def named_maps(given) -> dict[str, Any]:
+def name_momentum_maps(given) -> dict[str, Any]:
     """Momentum maps by name."""
     if isinstance(given, Mapping):
         return dict(given)
@@ -661,4 +667,4 @@ def named_maps(given) -> dict[str, Any]:
     return {getattr(J, "__name__", f"J{i + 1}"): J for i, J in enumerate(given)}
 
 
-__all__ = ["AXIOM_TOLERANCE", "System", "named_maps"]
+__all__ = ["AXIOM_TOLERANCE", "System", "name_momentum_maps"]

@@ -70,13 +70,13 @@ class HeatBaths(Module):
         if energy is None:
             given = {"capacity": capacity, "temperature": temperature}
             self.energy = make_bath_energy(
-                *(_positive(value, what, number, what == "capacity") for what, value in given.items())
+                *(_check_positive(value, what, number, what == "capacity") for what, value in given.items())
             )
         else:
-            self.energy = Each(_OfEntropy(energy), np.arange(number)[:, None])
+            self.energy = Each(_BathEnergyFunction(energy), np.arange(number)[:, None])
 
     @property
-    def positive(self) -> bool:
+    def has_positive_temperatures(self) -> bool:
         """Whether every state has positive temperatures, by form."""
         return isinstance(self.energy, BathEnergy | ReservoirEnergy)
 
@@ -92,7 +92,7 @@ class HeatBaths(Module):
         return jnp.where(jnp.isfinite(self.energy.capacity), self.energy.capacity, 1.0)
 
 
-def _positive(value, what: str, number: int, infinite: bool) -> jax.Array:
+def _check_positive(value, what: str, number: int, infinite: bool) -> jax.Array:
     known = contextlib.nullcontext() if is_traced(value) else jax.ensure_compile_time_eval()
     with known:  # numbers, while a family of systems is traced
         array = check_numbers(value, f"the {what} of baths")
@@ -105,19 +105,19 @@ def _positive(value, what: str, number: int, infinite: bool) -> jax.Array:
     return array
 
 
-class _OfEntropy(Module):
+class _BathEnergyFunction(Module):
     energy: Callable
 
     def __call__(self, y):
         return self.energy(y[0])
 
 
-def beside_baths(body: mf.PoissonStructure, number: int) -> ProductPoisson:
+def poisson_with_baths(body: mf.PoissonStructure, number: int) -> ProductPoisson:
     """The Poisson structure of a body, with entropies behind its state that nothing is conjugate to."""
     return ProductPoisson(body, mf.NoPoisson(number))
 
 
-class EntropyOfBaths(Energy):
+class BathEntropy(Energy):
     """The sum of the last components."""
 
     number: int = eqx.field(static=True)

@@ -41,23 +41,23 @@ class ChartSystem(System):
         assert system.space is not None
         self.manifold, self.coordinates, self.place, self.start = system, coordinates, place, start
         self.dim, self.space, self.momentum_maps = system.space.dim, None, {}
-        self.energy = self.pulled(system.energy)
-        self.entropy = None if system.entropy is None else self.pulled(system.entropy)
+        self.energy = self.pullback(system.energy)
+        self.entropy = None if system.entropy is None else self.pullback(system.entropy)
         trivial = isinstance(system.poisson, mf.NoPoisson)
-        self.poisson = mf.NoPoisson(self.dim) if trivial else _Poisson(system, coordinates, place)
-        self.momentum_maps = {name: self.pulled(J) for name, J in system.momentum_maps.items()}
-        self.dissipation = _Force.lift_terms(system.dissipation, self.pulled, system, coordinates, place)
-        self.preserved_as, self.decided = system.preserved_as, system.decided
+        self.poisson = mf.NoPoisson(self.dim) if trivial else _ChartPoisson(system, coordinates, place)
+        self.momentum_maps = {name: self.pullback(J) for name, J in system.momentum_maps.items()}
+        self.dissipation = _ChartDissipation.lift_terms(system.dissipation, self.pullback, system, coordinates, place)
+        self.preserved_labels, self.invariant_verdicts = system.preserved_labels, system.invariant_verdicts
 
-    def pulled(self, energy: Energy) -> Energy:
+    def pullback(self, energy: Energy) -> Energy:
         """A function of states as one of coordinates."""
         space = self.manifold.space
         assert space is not None
         return energy.map_terms(lambda term: term.pullback_to_chart(self.coordinates, space, self.start))
 
-    smooth = forward_to("manifold")
+    is_smooth = forward_to("manifold")
 
-    def here(self, x) -> System:
+    def freeze_at(self, x) -> System:
         return (
             self
             if self.place is not None
@@ -65,12 +65,12 @@ class ChartSystem(System):
         )
 
     def field(self, x, dH, dS, dL=()):
-        place = _Place(self.manifold, self.coordinates, self.place, x)
+        place = _ChartPoint(self.manifold, self.coordinates, self.place, x)
         dS, dL = None if dS is None else place.lift(dS), tuple(map(place.lift, dL))
         return place.lower(self.manifold.field(place.state, place.lift(dH), dS, dL))
 
 
-class _Place:
+class _ChartPoint:
     """A point given or by its coordinates, and the maps there between arrays of coordinates and of states."""
 
     def __init__(self, system: System, coordinates: mf.Coordinates, place: mf.Place | None, c):
@@ -85,7 +85,7 @@ class _Place:
         return self._place.lower(self._space.from_vector(v))
 
 
-class _Poisson(PoissonBySharp):
+class _ChartPoisson(PoissonBySharp):
     system: System
     coordinates: mf.Coordinates
     place: mf.Place | None
@@ -96,19 +96,19 @@ class _Poisson(PoissonBySharp):
         return self.system.space.dim
 
     def sharp(self, x, alpha):
-        place = _Place(self.system, self.coordinates, self.place, x)
+        place = _ChartPoint(self.system, self.coordinates, self.place, x)
         return place.lower(self.system.poisson.sharp(place.state, place.lift(alpha)))
 
 
-class _Force(LiftedDissipation):
+class _ChartDissipation(LiftedDissipation):
     system: System
     coordinates: mf.Coordinates
     place: mf.Place | None
 
     def lifted_geometry(self, system, x) -> LiftedGeometry:
-        place = _Place(self.system, self.coordinates, self.place, x)
+        place = _ChartPoint(self.system, self.coordinates, self.place, x)
         return LiftedGeometry(self.system, place.state, place.lift, place.lower)
 
     def divergence(self, system, x):
         """That with the volume of the manifold."""
-        return self.inner.divergence(self.system, _Place(self.system, self.coordinates, self.place, x).state)
+        return self.inner.divergence(self.system, _ChartPoint(self.system, self.coordinates, self.place, x).state)

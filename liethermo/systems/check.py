@@ -21,12 +21,12 @@ AXIOM_TOLERANCE = 1e-10
 """Largest residual of an axiom, relative to the size of what should cancel: derivatives round at about 1e-13."""
 
 
-MATRIX_DIM = 200
+MAX_MATRIX_DIM = 200
 """Components up to which the matrices Pi and K are formed; of larger systems only what they do to dH and dS is looked \
 at."""
 
 
-JACOBI_DIM = 40
+MAX_FULL_JACOBI_DIM = 40
 """Components up to which Jacobi's identity is tested for all coordinates at once, in arrays of n^3 numbers; of larger
 systems for three functions."""
 
@@ -60,13 +60,13 @@ class CheckReport(Tabular):
         return all(row.passed is not False for row in self.rows)
 
     def __repr__(self) -> str:
-        return f"<CheckReport of {len(self.rows)} axioms: {self._total}>"
+        return f"<CheckReport of {len(self.rows)} axioms: {self._summary}>"
 
     def _table_content(self) -> tuple[tuple[CheckRow, ...], tuple[str, str, str], str]:
-        return self.rows, ("axiom", "residual", "tolerance"), f"{self._total} (at {self.points} points)"
+        return self.rows, ("axiom", "residual", "tolerance"), f"{self._summary} (at {self.points} points)"
 
     @property
-    def _total(self) -> str:
+    def _summary(self) -> str:
         return "all axioms hold" if self.passed else "NOT metriplectic"
 
 
@@ -74,7 +74,7 @@ def check_system(
     system: Any, points, samples: int, seed: int, scale: float, times=None, matrices: bool = True
 ) -> CheckReport:
     """See :meth:`liethermo.systems.base.System.check`; without ``matrices``, for what is not true of them by form."""
-    system = system.left_alone()
+    system = system.drop_torque()
     if points is None:
         if samples < 1:
             raise InputError(f"samples must be a positive integer, not {samples}")
@@ -85,7 +85,7 @@ def check_system(
     if system.is_driven:
         times = scale * np.random.default_rng(seed).standard_normal(len(points)) if times is None else times
         points = np.column_stack([points, np.broadcast_to(np.asarray(times, dtype=np.float64), len(points))])
-    measured = evaluate_at_points(_residuals if matrices else _residuals_of_field, system, points)
+    measured = evaluate_at_points(_axiom_residuals if matrices else _field_residuals, system, points)
     friction = measured.pop("friction", None)
     if friction is not None:
         measured["semidefinite"] = np.array([_indefiniteness(K) for K in friction])
@@ -96,7 +96,7 @@ def check_system(
             "their domain to system.check(points=...), and validate=False to the constructor"
         )
     rows = [
-        _row(system, name, measured[name][inside], axiom, note)
+        _axiom_row(system, name, measured[name][inside], axiom, note)
         for name, (axiom, note) in _AXIOMS.items()
         if name in measured
     ]
@@ -104,7 +104,7 @@ def check_system(
         if name.startswith("momentum map"):
             rows.append(_momentum_map_row(system, name, values[inside]))
         elif name not in _AXIOMS and name != "domain":
-            rows.append(_row(system, name, values[inside], name, _OWN))
+            rows.append(_axiom_row(system, name, values[inside], name, _SPECIFIC_AXIOM_NOTE))
     if not inside.all():
         rows.append(CheckRow("domain", float((~inside).sum()), 0.0, None, "points outside the domain, left out"))
     return CheckReport(tuple(rows), int(inside.sum()))
@@ -141,11 +141,11 @@ _AXIOMS = {
     "second law": ("entropy law", "dS/dt along the vector field has the wrong sign"),
     "production": ("min", "smallest entropy production found (no guarantee asked)"),
 }
-_MOMENTUM_MAP = "a momentum map has to commute with H and lie in the kernel of K"
-_OWN = "what sets this kind of system apart does not hold"
+_MOMENTUM_MAP_NOTE = "a momentum map has to commute with H and lie in the kernel of K"
+_SPECIFIC_AXIOM_NOTE = "what sets this kind of system apart does not hold"
 
 
-def _row(system: Any, name: str, values: np.ndarray, axiom: str, note: str) -> CheckRow:
+def _axiom_row(system: Any, name: str, values: np.ndarray, axiom: str, note: str) -> CheckRow:
     worst = float(values.max())
     if name == "production":
         least = float(values.min())
@@ -160,7 +160,7 @@ def _momentum_map_row(system: Any, name: str, values: np.ndarray) -> CheckRow:
     is_defined = np.isfinite(values)
     if not is_defined.any():
         return CheckRow(name, float("nan"), AXIOM_TOLERANCE, False, "it is not finite at any of the points")
-    row = _row(system, name, values[is_defined], name, _MOMENTUM_MAP)
+    row = _axiom_row(system, name, values[is_defined], name, _MOMENTUM_MAP_NOTE)
     if is_defined.all() or not row.passed:
         return row
     return CheckRow(name, row.value, AXIOM_TOLERANCE, True, f"{int((~is_defined).sum())} points outside its domain")
@@ -174,34 +174,34 @@ def _indefiniteness(K: np.ndarray) -> float:
     return max(0.0, -float(np.linalg.eigvalsh((K + K.T) / 2)[0])) / scale
 
 
-def _residuals_of_field(system: Any, x: jax.Array) -> dict[str, jax.Array]:
-    return _residuals(system, x, matrices=False)
+def _field_residuals(system: Any, x: jax.Array) -> dict[str, jax.Array]:
+    return _axiom_residuals(system, x, matrices=False)
 
 
-def _residuals(system: Any, x: jax.Array, matrices: bool = True) -> dict[str, jax.Array]:
+def _axiom_residuals(system: Any, x: jax.Array, matrices: bool = True) -> dict[str, jax.Array]:
     """Residual of each axiom at a point, relative to the size of the terms that cancel; and the friction matrix.
 
     Where the energy depends on time, the point has the time behind it.
     """
     if system.is_driven:
-        return _residuals(system.at_time(x[-1]), x[:-1], matrices)
+        return _axiom_residuals(system.at_time(x[-1]), x[:-1], matrices)
     size: Callable = lambda a: jnp.max(jnp.abs(a), initial=0.0)  # noqa: E731
     relative: Callable = lambda a, b: a / jnp.where(b > 0.0, b, 1.0)  # noqa: E731
-    found = _of_dissipations(system, x)
+    found = _dissipation_residuals(system, x)
     given = around = system
     if system.space is not None:
         if matrices:  # else it is tangent by form
             velocity = system.vector_field(x)
             found["tangent"] = relative(size(velocity - system.project_tangent(x, velocity)), size(velocity))
-        around, _ = system.local(x)
+        around, _ = system.local_system(x)
         if system.space.is_quotient:
-            found["classes"] = _along_stabilizer(system, around, x)
-        system, x = system.local(x, centred=True)
+            found["classes"] = _stabilizer_residual(system, around, x)
+        system, x = system.local_system(x, is_centred=True)
     dH, rate = system.energy.gradient(x), system.vector_field(x)
     dS = jnp.zeros_like(x) if system.entropy is None else system.entropy.gradient(x)
     values = system.energy.value(x) + (0.0 if system.entropy is None else system.entropy.value(x))
     found["domain"] = values + jnp.sum(dH) + jnp.sum(dS) + jnp.sum(rate)
-    if system.dim > MATRIX_DIM or not matrices:
+    if system.dim > MAX_MATRIX_DIM or not matrices:
         speed = size(system.poisson.sharp(x, dH)) + size(rate)
         if system.entropy is not None:
             found["casimir"] = relative(size(system.poisson.sharp(x, dS)), size(dS))
@@ -223,10 +223,10 @@ def _residuals(system: Any, x: jax.Array, matrices: bool = True) -> dict[str, ja
         dJ = J.gradient(x)
         drift = relative(jnp.abs(jnp.dot(dJ, rate)), size(dJ) * speed)
         found[f"momentum map {name}"] = jnp.where(jnp.isfinite(J.value(x)), drift, jnp.nan)
-    return found | system.own_residuals(x)
+    return found | system.specific_residuals(x)
 
 
-def _along_stabilizer(system: Any, around: Any, x) -> jax.Array:
+def _stabilizer_residual(system: Any, around: Any, x) -> jax.Array:
     """What of the gradients is along the constraints but not the space: the largest, relative to its gradient."""
     size: Callable = lambda a: jnp.max(jnp.abs(a), initial=0.0)  # noqa: E731
     functions = [f for f in (system.energy, system.entropy, *system.momentum_maps.values()) if f is not None]
@@ -237,7 +237,7 @@ def _along_stabilizer(system: Any, around: Any, x) -> jax.Array:
     return jnp.max(jnp.stack(found))
 
 
-def _of_dissipations(system: Any, x) -> dict[str, jax.Array]:
+def _dissipation_residuals(system: Any, x) -> dict[str, jax.Array]:
     """Residuals of what the dissipations were given, the largest of each name."""
     found: dict[str, jax.Array] = {}
     for part in () if system.dissipation is None else system.dissipation.terms:
@@ -257,9 +257,9 @@ def _matrix_residuals(system: Any, around: Any, x, dH, dS):
     found = {
         "skew": relative(size(tensor + tensor.T), size(tensor)),
     }
-    if system.smooth and around is None and x.size > JACOBI_DIM:
-        found["jacobi"] = _jacobi_of_three(system.poisson, x)
-    elif system.smooth:
+    if system.is_smooth and around is None and x.size > MAX_FULL_JACOBI_DIM:
+        found["jacobi"] = _sampled_jacobi_residual(system.poisson, x)
+    elif system.is_smooth:
         variation = size(jax.jacfwd((around or system).poisson.tensor)(x))
         if around is not None:  # in normal coordinates it may be rounding alone: as seen over a unit of length, then
             variation = variation + size(tensor)
@@ -281,7 +281,7 @@ def _matrix_residuals(system: Any, around: Any, x, dH, dS):
     return found, size(tensor) * size(dH)
 
 
-def _jacobi_of_three(poisson: Any, x) -> jax.Array:
+def _sampled_jacobi_residual(poisson: Any, x) -> jax.Array:
     """``{f, {g, h}}`` and its cyclic permutations for three random linear functions: their sum, beside the largest."""
     of_three = np.random.default_rng(0).standard_normal((3, x.size))
 

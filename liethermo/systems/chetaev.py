@@ -22,12 +22,12 @@ from ..functions.checks import check_function_shape
 from ..tracing.interpret import evaluate_at_points
 from .herglotz import random_states
 from .ledger import ForcesAndHeat
-from .simple_closed import InOneRow, SimpleClosedSystem, lagrangian_of
+from .simple_closed import FlattenedFunction, SimpleClosedSystem, join_lagrangian_arguments
 
-NEWTON_STEPS, SOLVED = 12, 1e-12
+N_NEWTON_ITERATIONS, CONSTRAINT_RTOL = 12, 1e-12
 """For S' where the form depends on it; and the share of its terms that the constraint may miss then."""
 
-POINTS, ROUNDED = 16, 1e-12
+N_TEST_STATES, PRODUCTION_ROUNDING_RTOL = 16, 1e-12
 """Random points at which the production is looked at, and the share of its terms that is rounding."""
 
 
@@ -61,7 +61,7 @@ class ChetaevSystem(SimpleClosedSystem):
     AxiomError, FunctionError, InputError
     """
 
-    form: Form
+    form: SemibasicForm
 
     production_name: ClassVar[str] = "S'"
 
@@ -74,25 +74,27 @@ class ChetaevSystem(SimpleClosedSystem):
         validate: bool = True,
         space: mf.Space | None = None,
     ):
-        structure, size, energy = self._prepare(lagrangian_of(lagrangian, space), dim, space)
+        structure, size, energy = self._build_contact_structure(
+            join_lagrangian_arguments(lagrangian, space), dim, space
+        )
         self.friction = self.external = self.heat_power = None
-        self.form = Form.of(eta, (size // 2,) if space is None else space.shape)
-        forces = ChetaevForces(None, None, None, _law_of(self.form, structure.contact))
+        self.form = SemibasicForm.from_function(eta, (size // 2,) if space is None else space.shape)
+        forces = OneFormForce(None, None, None, _find_entropy_law(self.form, structure.contact))
         self._assemble(structure, size, energy, forces, momentum_maps, validate)
 
     def friction_at(self, q, v, S, t, T) -> jax.Array:
         del t
-        return T * self.along(q, self.form.covector(q, v, S))
+        return T * self.tangential_part(q, self.form.force_covector(q, v, S))
 
     def friction_force(self, q, v, S, t) -> jax.Array:
         """The force ``T eta_q / eta_S``, shape (n,)."""
-        return self.friction_at(q, v, S, t, -jax.grad(self.action, argnums=2)(q, v, S))
+        return self.friction_at(q, v, S, t, -jax.grad(self.lagrangian_value, argnums=2)(q, v, S))
 
-    def own_residuals(self, x) -> dict[str, jax.Array]:
-        return super().own_residuals(x) if self.entropy_law == "nondecreasing" else {}
+    def specific_residuals(self, x) -> dict[str, jax.Array]:
+        return super().specific_residuals(x) if self.entropy_law == "nondecreasing" else {}
 
 
-class ChetaevForces(ForcesAndHeat):
+class OneFormForce(ForcesAndHeat):
     """The force of a one-form, with the law of the entropy that it has."""
 
     law: LawName | None = eqx.field(static=True)
@@ -102,47 +104,47 @@ class ChetaevForces(ForcesAndHeat):
         return self.law
 
 
-class Form(Module):
+class SemibasicForm(Module):
     """A semibasic one-form on Q x R: its components as a function of (q, v, S, S'), shape (n + 1,)."""
 
     function: Callable
-    implicit: bool = eqx.field(static=True)
+    is_implicit: bool = eqx.field(static=True)
 
     @classmethod
-    def of(cls, eta, at: tuple[int, ...]) -> Form:
+    def from_function(cls, eta, at: tuple[int, ...]) -> SemibasicForm:
         """From what a user gives, checked; q and v of shape ``at``."""
         if not callable(eta):
             raise InputError(f"eta is a function of (q, v, S) to the components of a one-form, not {eta!r}")
         implicit, n, what = required_argument_count(eta) == 4, math.prod(at), f"(q, v, S), q and v of shape {at}"
         given = eta if implicit else LastArgumentIgnored(eta)
-        given = given if len(at) == 1 else InOneRow(given, at)
+        given = given if len(at) == 1 else FlattenedFunction(given, at)
         function, found = check_function_shape(given, ((n,), (n,), (), ()), ((n + 1,), (n,)), "eta", what)
-        return cls(function if found == (n + 1,) else _Unit(function), implicit)
+        return cls(function if found == (n + 1,) else _UnitEntropyForm(function), implicit)
 
-    def rate(self, q, v, S) -> jax.Array:
+    def entropy_rate(self, q, v, S) -> jax.Array:
         """S' with ``eta_q . v + eta_S S' = 0``; NaN where none is found."""
 
-        def misfit(s):
+        def residual(s):
             found = self.function(q, v, S, s)
             return jnp.dot(found[:-1], v) + found[-1] * s, jnp.abs(found[:-1]) @ jnp.abs(v) + jnp.abs(found[-1] * s)
 
         def newton(_, s):
-            (defect, _), (slope, _) = jax.jvp(misfit, (s,), (jnp.ones(()),))
+            (defect, _), (slope, _) = jax.jvp(residual, (s,), (jnp.ones(()),))
             return s - defect / slope
 
-        s = jax.lax.fori_loop(0, NEWTON_STEPS if self.implicit else 1, newton, jnp.zeros(()))
-        if not self.implicit:  # linear in S'
+        s = jax.lax.fori_loop(0, N_NEWTON_ITERATIONS if self.is_implicit else 1, newton, jnp.zeros(()))
+        if not self.is_implicit:  # linear in S'
             return s
-        defect, size = misfit(s)
-        return jnp.where(jnp.abs(defect) <= SOLVED * size, s, jnp.nan)
+        defect, size = residual(s)
+        return jnp.where(jnp.abs(defect) <= CONSTRAINT_RTOL * size, s, jnp.nan)
 
-    def covector(self, q, v, S) -> jax.Array:
+    def force_covector(self, q, v, S) -> jax.Array:
         """``eta_q / eta_S``, shape (n,), at the S' that goes with (q, v, S)."""
-        found = self.function(q, v, S, self.rate(q, v, S) if self.implicit else jnp.zeros(()))
+        found = self.function(q, v, S, self.entropy_rate(q, v, S) if self.is_implicit else jnp.zeros(()))
         return found[:-1] / found[-1]
 
 
-class _Unit(Module):
+class _UnitEntropyForm(Module):
     """``eta_q`` with ``eta_S = 1`` behind it."""
 
     function: Callable
@@ -151,18 +153,18 @@ class _Unit(Module):
         return jnp.append(jnp.asarray(self.function(*arguments)), 1.0)
 
 
-def _law_of(form: Form, contact: mf.SplitContact) -> LawName | None:
+def _find_entropy_law(form: SemibasicForm, contact: mf.SplitContact) -> LawName | None:
     """What a form says of the entropy, from its production at random points."""
     if is_traced(form):
         return None
-    rates, sizes = evaluate_at_points(_production, form, random_states(contact, POINTS))
-    if (np.abs(rates) <= ROUNDED * sizes).all():
+    rates, sizes = evaluate_at_points(_entropy_production, form, random_states(contact, N_TEST_STATES))
+    if (np.abs(rates) <= PRODUCTION_ROUNDING_RTOL * sizes).all():
         return "conserved"
-    return "nondecreasing" if (rates >= -ROUNDED * sizes).all() else None
+    return "nondecreasing" if (rates >= -PRODUCTION_ROUNDING_RTOL * sizes).all() else None
 
 
-def _production(form: Form, x):
+def _entropy_production(form: SemibasicForm, x):
     """S', and the size of the terms that it is the sum of."""
     n = len(x) // 2
-    covector = form.covector(x[:n], x[n : 2 * n], x[2 * n])
+    covector = form.force_covector(x[:n], x[n : 2 * n], x[2 * n])
     return -jnp.dot(covector, x[n : 2 * n]), jnp.abs(covector) @ jnp.abs(x[n : 2 * n])

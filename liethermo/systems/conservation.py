@@ -11,10 +11,10 @@ import numpy as np
 from ..functions.energy import Energy
 from ..functions.frames import gram_schmidt
 from .check import AXIOM_TOLERANCE
-from .kinds import Kind
+from .interface import SystemInterface
 
 
-class Rates(NamedTuple):
+class InvariantRates(NamedTuple):
     """Rates of change of functions along the parts of a vector field: the motion, each dissipation, a torque.
 
     Attributes
@@ -28,7 +28,7 @@ class Rates(NamedTuple):
     scales: jax.Array
 
 
-def rates_of_change(model: tuple[Kind, tuple[Energy, ...]], x) -> Rates:
+def rates_of_change(model: tuple[SystemInterface, tuple[Energy, ...]], x) -> InvariantRates:
     """Return the rates of change of functions at x along the motion, along each dissipation and along a torque.
 
     The speed of a dissipation is the norm of its force, or of its force for other gradients of equal length if that is
@@ -53,7 +53,7 @@ def rates_of_change(model: tuple[Kind, tuple[Energy, ...]], x) -> Rates:
         a, b = (project_covector(system, x, v * jnp.linalg.norm(d)) for v, d in zip(random, (dH, dS), strict=True))
         parts.append(part.force(system, x, dH, dS, dL))
         speeds.append(jnp.fmax(jnp.linalg.norm(parts[-1]), jnp.linalg.norm(part.force(system, x, a, b, dL))))
-    if (push := system.push(x)) is not None:
+    if (push := system.external_torque(x)) is not None:
         parts.append(push)
         speeds.append(jnp.linalg.norm(push))
     rates = jnp.stack(parts) @ gradients.T
@@ -66,10 +66,10 @@ def rates_of_change(model: tuple[Kind, tuple[Energy, ...]], x) -> Rates:
             kept = _is_spanned(gradients, [L.gradient(x) for L in part.preserve])
             rates = rates.at[i].set(jnp.where(kept, 0.0, rates[i]))
     scales = jnp.stack(speeds)[:, None] * jnp.linalg.norm(gradients, axis=1)
-    return Rates(rates, jnp.where(rates == 0.0, 1.0, scales))
+    return InvariantRates(rates, jnp.where(rates == 0.0, 1.0, scales))
 
 
-def project_covector(system: Kind, x, alpha) -> jax.Array:
+def project_covector(system: SystemInterface, x, alpha) -> jax.Array:
     """Return the part of a covector that acts on tangent vectors: alpha itself on R^n."""
     return alpha if system.space is None else system.lower_index(x, system.raise_index(x, alpha))
 
@@ -81,29 +81,29 @@ def _is_spanned(gradients, vectors) -> jax.Array:
     return jnp.sum(rest**2, axis=1) <= (AXIOM_TOLERANCE**2) * jnp.sum(gradients**2, axis=1)
 
 
-class Verdicts(NamedTuple):
+class PointwiseVerdicts(NamedTuple):
     """What rates of change say of functions at points.
 
     Attributes
     ----------
-    defined : array of bool, shape (..., functions)
+    is_defined : array of bool, shape (..., functions)
         Where all rates are finite; elsewhere nothing is known.
-    conserved : array of bool, shape (..., functions)
+    is_conserved : array of bool, shape (..., functions)
         Where the motion and each dissipation conserve the function, relative to their own sizes. Dissipations much
         slower than the motion are judged too, since their effect adds up.
     """
 
-    defined: np.ndarray
-    conserved: np.ndarray
+    is_defined: np.ndarray
+    is_conserved: np.ndarray
 
 
-def judge(rates: Rates) -> Verdicts:
+def judge_conservation(rates: InvariantRates) -> PointwiseVerdicts:
     """Return at which points each function is conserved."""
     values, scales = rates
     with np.errstate(invalid="ignore"):
         each = (np.abs(values) <= AXIOM_TOLERANCE * scales).all(axis=-2)
         together = np.abs(values.sum(axis=-2)) <= AXIOM_TOLERANCE * np.abs(values).max(axis=-2)
-    return Verdicts(np.asarray(np.isfinite(values).all(axis=-2)), each | together)
+    return PointwiseVerdicts(np.asarray(np.isfinite(values).all(axis=-2)), each | together)
 
 
 def is_proportional(one: np.ndarray, other: np.ndarray) -> np.ndarray:

@@ -22,7 +22,7 @@ from ..functions.energy import ChartEnergy, Energy, Linear, Pullback, Quadratic,
 from ..functions.time_span import TimeSpan
 from .base import System
 
-UNIT = 2.0**-100
+CLOCK_UNIT = 2.0**-100
 """Time and work are kept in a unit this small: beside the user's components they count for nothing in the size of a
 state or of its velocity, which convergence and errors are measured against. A power of two, so that nothing is rounded.
 """
@@ -61,39 +61,39 @@ class DrivenSystem(System):
     torque: jax.Array | None
     span: TimeSpan
 
-    def __init__(self, body: System, unit: float = UNIT):
+    def __init__(self, body: System, unit: float = CLOCK_UNIT):
         self.span = TimeSpan()
         self.body, self.unit, self.dim, self.attitude, self.torque = body, unit, body.dim + 2, None, None
         self.space = None if body.space is None else mf.Product(body.space, mf.Euclidean(2))
         if body.space is not None and body.space.dtype.kind == "c":
             raise InputError(f"an energy that depends on time is for real spaces, and {body.space.name} is complex")
-        self.poisson = ProductPoisson(body.poisson, _OfClock(unit))
-        energy = Sum((*map(self._term, body.energy.terms), _MinusWork(unit)))
+        self.poisson = ProductPoisson(body.poisson, _ClockPoisson(unit))
+        energy = Sum((*map(self._extend_term, body.energy.terms), _NegativeWork(unit)))
         self.energy = energy if self.space is not None else mark_polynomial_degrees(energy, self.dim)
-        self.entropy = None if body.entropy is None else self._of_body(body.entropy)
-        self.momentum_maps = {name: self._of_body(J) for name, J in body.momentum_maps.items()}
-        self.dissipation = _OnBody.lift_terms(body.dissipation, self._of_body)
-        if body.pushed_by:
-            push = _Push("conserved" if body.entropy_law is not None or body.entropy is None else None)
+        self.entropy = None if body.entropy is None else self._extend_from_body(body.entropy)
+        self.momentum_maps = {name: self._extend_from_body(J) for name, J in body.momentum_maps.items()}
+        self.dissipation = _BodyDissipation.lift_terms(body.dissipation, self._extend_from_body)
+        if body.torque_name:
+            push = _TorqueForce("conserved" if body.entropy_law is not None or body.entropy is None else None)
             self.dissipation = push if self.dissipation is None else self.dissipation + push
-        self.preserved_as, self.decided = body.preserved_as, body.decided
+        self.preserved_labels, self.invariant_verdicts = body.preserved_labels, body.invariant_verdicts
 
     @property
     def kind(self) -> str:
-        return f"{self.body.kind} {'with a torque' if self.body.pushed_by else 'whose energy depends on time'}"
+        return f"{self.body.kind} {'with a torque' if self.body.torque_name else 'whose energy depends on time'}"
 
     # -- the state --------------------------------------------------------------------------------------------------
 
-    def begin(self, x, t: float, batch: bool = False) -> jax.Array:
+    def initial_state(self, x, t: float, batch: bool = False) -> jax.Array:
         """The state at a time, or several with ``batch``, no work having been done."""
         x = self.body.state(x, batch)
         clock = jnp.broadcast_to(jnp.array([t * self.unit, 0.0]), (*x.shape[:-1], 2))
         return jnp.concatenate([x, clock], axis=-1)
 
-    def of_clock(self, v):
+    def clock_components(self, v):
         return jnp.concatenate([jnp.zeros_like(v[:-2]), v[-2:]])
 
-    def seen(self, x):
+    def user_state(self, x):
         return self.body.points(x[..., :-2])
 
     def time(self, x) -> jax.Array:
@@ -109,52 +109,52 @@ class DrivenSystem(System):
         return np.column_stack([self.body.samples(count, seed, scale), self.unit * times, np.zeros(count)])
 
     def outside(self, x) -> str:
-        return self._now_of_all(x).outside(x[..., :-2])
+        return self._body_at_first_time(x).outside(x[..., :-2])
 
     def domain_margin(self, x):
-        return self._now(x).domain_margin(x[..., :-2])
+        return self._body_at_state(x).domain_margin(x[..., :-2])
 
-    def singular(self, x) -> str:
-        return self._now_of_all(x).singular(x[..., :-2])
+    def why_singular(self, x) -> str:
+        return self._body_at_first_time(x).why_singular(x[..., :-2])
 
-    def _now_of_all(self, x) -> System:
+    def _body_at_first_time(self, x) -> System:
         """The body at the time of the first of several states, which are numbers."""
         t = float(np.reshape(x, (-1, self.dim))[0, -2]) / self.unit
-        return self._at(min(max(t, float(self.span.start)), float(self.span.end)))
+        return self._body_at_time(min(max(t, float(self.span.start)), float(self.span.end)))
 
-    def sizes(self, k):
+    def component_scales(self, k):
         clock = jnp.full((*k.shape[:-1], 2), self.unit)
-        return jnp.concatenate([self.body.sizes(k[..., :-2]), clock], axis=-1)
+        return jnp.concatenate([self.body.component_scales(k[..., :-2]), clock], axis=-1)
 
     # -- dynamics ---------------------------------------------------------------------------------------------------
 
-    unrollable = forward_to("body")
-    spectral = forward_to("body")
+    can_unroll = forward_to("body")
+    has_matrix_functions = forward_to("body")
 
     def field(self, x, dH, dS, dL=()):
-        motion = self._now(x).left_alone().field(*_part_of_body(x, dH, dS, dL))
-        motion = jnp.concatenate([motion, _clock(dH, self.unit)])
-        return motion + self.pushed(x, dH) if self.pushed_by else motion
+        motion = self._body_at_state(x).drop_torque().field(*_restrict_to_body(x, dH, dS, dL))
+        motion = jnp.concatenate([motion, _clock_velocity(dH, self.unit)])
+        return motion + self.torque_velocity(x, dH) if self.torque_name else motion
 
     def transport(self, x, dH, dS, dL=()):
-        return self._now(x).transport(*_part_of_body(x, dH, dS, dL))
+        return self._body_at_state(x).transport(*_restrict_to_body(x, dH, dS, dL))
 
-    torque_free = forward_to("body")
+    is_torque_free = forward_to("body")
     body_dim = forward_to("body")
-    pushed_by = forward_to("body")
+    torque_name = forward_to("body")
     has_impulse = forward_to("body")
-    casimirs_of_torque = forward_to("body")
+    torque_invariant_casimirs = forward_to("body")
     needs_attitude = forward_to("body")
 
-    def push(self, x):
-        return self._now(x).push(x[:-2]) if self.torque is None else self.torque
+    def external_torque(self, x):
+        return self._body_at_state(x).external_torque(x[:-2]) if self.torque is None else self.torque
 
-    def pushed(self, x, dH) -> jax.Array:
+    def torque_velocity(self, x, dH) -> jax.Array:
         """What a torque does to the state, and the work that it does, for a gradient of either kind."""
-        push = self.push(x)
+        push = self.external_torque(x)
         return jnp.concatenate([push, jnp.stack([jnp.zeros(()), self.unit * jnp.dot(dH[:-2], push)])])
 
-    def turned(self, attitude) -> DrivenSystem:
+    def bind_attitude(self, attitude) -> DrivenSystem:
         """The same system, for use at an attitude, shape (m, m); itself where nothing depends on it."""
         if not self.needs_attitude:
             return self
@@ -177,43 +177,43 @@ class DrivenSystem(System):
     def lower_index(self, x, v):
         return jnp.concatenate([self.body.lower_index(x[:-2], v[:-2]), v[-2:]])
 
-    def _now(self, x) -> System:
-        return self._at(self.time(x))
+    def _body_at_state(self, x) -> System:
+        return self._body_at_time(self.time(x))
 
-    def _at(self, t) -> System:
+    def _body_at_time(self, t) -> System:
         where = () if self.attitude is None else (self.attitude,)
         return self.body.at_time(t, *where)
 
     # -- functions ----------------------------------------------------------------------------------------------------
 
-    def pulled(self, energy: Energy) -> Energy:
-        return self._of_body(self.body.on_states(energy))
+    def pullback(self, energy: Energy) -> Energy:
+        return self._extend_from_body(self.body.energy_of_vectors(energy))
 
-    def _of_body(self, energy: Energy) -> Energy:
+    def _extend_from_body(self, energy: Energy) -> Energy:
         return energy.on(range(self.body.dim))
 
-    def _term(self, term: Energy) -> Energy:
-        clock = _Clock(self.body.dim, self.unit)
-        return _OfTime(term.with_time(), clock) if term.depends_on_time else self._of_body(term)
+    def _extend_term(self, term: Energy) -> Energy:
+        clock = _ClockMap(self.body.dim, self.unit)
+        return _TimedEnergy(term.with_time(), clock) if term.depends_on_time else self._extend_from_body(term)
 
     def casimirs(self):
-        return {name: self._of_body(C) for name, C in self.body.casimirs().items()}
+        return {name: self._extend_from_body(C) for name, C in self.body.casimirs().items()}
 
     has_all_casimirs = forward_to("body")
-    orbit = forward_to("body")
+    orbit_levels = forward_to("body")
 
     def conserves(self, functions, near=None):
         """Whether the body does, asked near its part of each state: beside the clock, nothing else would count."""
         near = None if near is None else near[..., : self.body.dim]
-        return self.body.conserves(tuple(_WithoutClock(f) for f in functions), near)
+        return self.body.conserves(tuple(_ClockFreeEnergy(f) for f in functions), near)
 
     @property
     def ledger(self):
         return {"work": Quadratic(jnp.zeros(self.dim), jnp.zeros(self.dim).at[-1].set(1.0 / self.unit))}
 
-    balance = ("work",)
+    balance_entries = ("work",)
 
-    def presented(self, solution):
+    def to_user_solution(self, solution):
         dense, body = solution.dense, self.body
         dense = None if dense is None else dense.with_output_map(lambda x: x[..., :-2])
         x = np.ascontiguousarray(solution.x[:, :-2])
@@ -223,12 +223,12 @@ class DrivenSystem(System):
         entries["dissipation"] = None if body.dissipation is None else type(body.dissipation).__name__
         energy = solution.energy + solution.casimirs["work"]
         found = dataclasses.replace(solution, x=x, energy=energy, dense=dense).with_provenance(**entries)
-        return body.presented(found)
+        return body.to_user_solution(found)
 
-    on_sites = forward_to("body")
+    reshape_to_sites = forward_to("body")
 
 
-class _WithoutClock(Energy):
+class _ClockFreeEnergy(Energy):
     """A function of a state with clock and work that depends on neither, as one of the body's state."""
 
     energy: Energy
@@ -237,7 +237,7 @@ class _WithoutClock(Energy):
         return self.energy.value(jnp.concatenate([x, jnp.zeros(2)]))
 
 
-class _OfClock(PoissonBySharp):
+class _ClockPoisson(PoissonBySharp):
     """``[[0, -1], [1, 0]]`` on (t, W), in units of ``unit``."""
 
     unit: float = eqx.field(static=True)
@@ -245,7 +245,7 @@ class _OfClock(PoissonBySharp):
     dim = 2
 
     def sharp(self, x, alpha) -> jax.Array:
-        return _clock(alpha, self.unit)
+        return _clock_velocity(alpha, self.unit)
 
     def stages_on_leaf(self, x, alpha, A) -> jax.Array:
         """Any points: the tensor is constant."""
@@ -255,17 +255,17 @@ class _OfClock(PoissonBySharp):
         return alpha
 
 
-def _clock(dH, unit: float) -> jax.Array:
+def _clock_velocity(dH, unit: float) -> jax.Array:
     """The velocities of t and W, shape (2,), from a gradient of the energy."""
     return unit**2 * jnp.stack([-dH[-1], dH[-2]])
 
 
-def _part_of_body(x, dH, dS, dL) -> tuple:
+def _restrict_to_body(x, dH, dS, dL) -> tuple:
     """A state with clock and work and the gradients there, as those of the body."""
     return x[:-2], dH[:-2], None if dS is None else dS[:-2], tuple(L[:-2] for L in dL)
 
 
-class _Push(SkewFriction):
+class _TorqueForce(SkewFriction):
     """The torque on a body and the work that it does."""
 
     law: LawName | None = eqx.field(static=True)
@@ -275,22 +275,26 @@ class _Push(SkewFriction):
         return self.law
 
     is_noiseless = True
-    preserves_casimirs = True  # those of :attr:`System.casimirs_of_torque`; of others nobody claims it
+    preserves_casimirs = True  # those of :attr:`System.torque_invariant_casimirs`; of others nobody claims it
 
     def force(self, system, x, dH, dS, dL):
-        return system.pushed(x, dH)
+        return system.torque_velocity(x, dH)
 
 
-class _OnBody(LiftedDissipation):
+class _BodyDissipation(LiftedDissipation):
     """A dissipation of the body, as it is at the time of the state."""
 
     def lifted_geometry(self, system, x) -> LiftedGeometry:
         return LiftedGeometry(
-            system._now(x), x[:-2], lambda alpha: alpha[:-2], lambda v: jnp.pad(v, (0, 2)), preserves_solenoidal=True
+            system._body_at_state(x),
+            x[:-2],
+            lambda alpha: alpha[:-2],
+            lambda v: jnp.pad(v, (0, 2)),
+            preserves_solenoidal=True,
         )
 
 
-class _Clock(ComponentMap):
+class _ClockMap(ComponentMap):
     """From a state with clock and work to x and t."""
 
     dim: int = eqx.field(static=True)
@@ -300,7 +304,7 @@ class _Clock(ComponentMap):
         return jnp.append(x[: self.dim], x[self.dim] / self.unit)
 
 
-class _MinusWork(Pullback):
+class _NegativeWork(Pullback):
     """``-W``, the last component of a state."""
 
     def __init__(self, unit: float):
@@ -311,19 +315,19 @@ class _MinusWork(Pullback):
         return Quadratic(jnp.zeros(space.dim), self.gradient(jnp.zeros(space.dim)), value)
 
 
-class _OfTime(Pullback):
+class _TimedEnergy(Pullback):
     """A function of (x, t), shape (n + 1,), as one of a state with clock and work."""
 
-    coordinates: _Clock
+    coordinates: _ClockMap
 
     def pullback_to_chart(self, coordinates, space, start=None):
-        clock = _Clock(space.dim - 2, self.coordinates.unit)
+        clock = _ClockMap(space.dim - 2, self.coordinates.unit)
         return Pullback(
-            StateTimeEnergy(_InChartAndTime(ChartEnergy(self, coordinates, space, start), clock.unit)), clock
+            StateTimeEnergy(_TimedChartEnergy(ChartEnergy(self, coordinates, space, start), clock.unit)), clock
         )
 
 
-class _InChartAndTime(Energy):
+class _TimedChartEnergy(Energy):
     """A function of coordinates on a product with clock and work that does not depend on the work, as one of (c, t)."""
 
     energy: Energy
@@ -333,6 +337,6 @@ class _InChartAndTime(Energy):
         return self.energy.value(jnp.concatenate([x[:-1], jnp.stack([x[-1] * self.unit, jnp.zeros(())])]))
 
 
-def driven(system: System, unit: float = UNIT) -> System:
+def make_autonomous(system: System, unit: float = CLOCK_UNIT) -> System:
     """The system as it is run: with clock and work where work is done from outside."""
     return DrivenSystem(system, unit) if system.is_driven else system

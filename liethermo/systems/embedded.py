@@ -27,10 +27,10 @@ from ..tracing.interpret import evaluate_at_points
 from ..tracing.programs import subprogram
 from .base import System
 
-TANGENT = 1e-12
+TANGENCY_RTOL = 1e-12
 """Largest component across the level sets, relative to the velocity, of a field that is along them by form."""
 
-AWAY = 0.05
+MANIFOLD_OFFSET = 0.05
 """How far off the manifold that is asked for, relative to the components of a point."""
 
 
@@ -40,52 +40,54 @@ class EmbeddedSystem(System):
     Attributes
     ----------
     manifold : System
-    conforming : bool
+    is_tangent : bool
         Whether the motion is along the level sets of the constraints as it is: then it is not projected.
-    untouched : bool
+    is_projection_trivial : bool
         Whether projecting it would leave it as it is, so that the force is not projected either.
     """
 
     manifold: System
-    conforming: bool = eqx.field(static=True)
-    untouched: bool = eqx.field(static=True)
+    is_tangent: bool = eqx.field(static=True)
+    is_projection_trivial: bool = eqx.field(static=True)
 
-    def __init__(self, manifold: System, conforming: bool = False, untouched: bool = False):
-        self.manifold, self.conforming, self.untouched = manifold, conforming, untouched
+    def __init__(self, manifold: System, is_tangent: bool = False, is_projection_trivial: bool = False):
+        self.manifold, self.is_tangent, self.is_projection_trivial = manifold, is_tangent, is_projection_trivial
         self.dim, self.space, self.baths = manifold.dim, None, manifold.baths
         self.energy = mark_polynomial_degrees(manifold.energy, self.dim)
         self.entropy = None if manifold.entropy is None else mark_polynomial_degrees(manifold.entropy, self.dim)
-        as_they_are = conforming or isinstance(manifold.poisson, mf.NoPoisson)
-        self.poisson = manifold.poisson if as_they_are else _Tangent(manifold)
-        self.dissipation = _Force.lift_terms(manifold.dissipation, self._recognised, manifold, untouched)
-        self.momentum_maps = {name: self._recognised(J) for name, J in manifold.momentum_maps.items()}
-        self.preserved_as, self.decided = manifold.preserved_as, manifold.decided
+        as_they_are = is_tangent or isinstance(manifold.poisson, mf.NoPoisson)
+        self.poisson = manifold.poisson if as_they_are else _TangentPoisson(manifold)
+        self.dissipation = _TangentDissipation.lift_terms(
+            manifold.dissipation, self._mark_polynomial_degrees, manifold, is_projection_trivial
+        )
+        self.momentum_maps = {name: self._mark_polynomial_degrees(J) for name, J in manifold.momentum_maps.items()}
+        self.preserved_labels, self.invariant_verdicts = manifold.preserved_labels, manifold.invariant_verdicts
 
-    def _recognised(self, energy: Energy) -> Energy:
+    def _mark_polynomial_degrees(self, energy: Energy) -> Energy:
         return mark_polynomial_degrees(energy, self.dim)
 
     kind = forward_to("manifold")
 
     @property
     def domain(self) -> str:  # type: ignore[override]
-        return f"a point of {_space(self.manifold).name}"
+        return f"a point of {_require_space(self.manifold).name}"
 
     ledger = forward_to("manifold")
 
     @property
-    def known(self) -> tuple[bool, bool]:
+    def projection_flags(self) -> tuple[bool, bool]:
         """What is known of the motion, as the constructor is given it."""
-        return self.conforming, self.untouched
+        return self.is_tangent, self.is_projection_trivial
 
     @property
     def surface(self) -> ConstraintSurface:
-        return ConstraintSurface(_space(self.manifold), self.conforming)
+        return ConstraintSurface(_require_space(self.manifold), self.is_tangent)
 
     def outside(self, x) -> str:
-        space, x = _space(self.manifold), np.atleast_2d(x)
+        space, x = _require_space(self.manifold), np.atleast_2d(x)
         if not np.isfinite(x).all():
             return ""
-        inside = evaluate_at_points(_inside, self.surface, x) > 0.0
+        inside = evaluate_at_points(_inside_indicator, self.surface, x) > 0.0
         if inside.all():
             return self.manifold.outside(x)
         return (
@@ -94,36 +96,38 @@ class EmbeddedSystem(System):
 
     # -- states -------------------------------------------------------------------------------------------------------
 
-    singular = forward_to("manifold")
+    why_singular = forward_to("manifold")
     points = forward_to("manifold")
-    numbers = forward_to("manifold")
-    on_states = forward_to("manifold")
+    state_array = forward_to("manifold")
+    energy_of_vectors = forward_to("manifold")
     samples = forward_to("manifold")
     drop_baths = forward_to("manifold")
     _around = forward_to("manifold")
 
-    def presented(self, solution):
+    def to_user_solution(self, solution):
         given = self.manifold.dissipation
         kind = None if given is None else type(given).__name__
-        return self.manifold.presented(solution.with_provenance(system=type(self.manifold).__name__, dissipation=kind))
+        return self.manifold.to_user_solution(
+            solution.with_provenance(system=type(self.manifold).__name__, dissipation=kind)
+        )
 
     # -- dynamics -----------------------------------------------------------------------------------------------------
 
     def at_time(self, t) -> System:
-        return EmbeddedSystem(self.manifold.at_time(t), *self.known) if self.is_driven else self
+        return EmbeddedSystem(self.manifold.at_time(t), *self.projection_flags) if self.is_driven else self
 
     def raise_index(self, x, alpha):
         """What of a gradient is along the level sets: the direction of corrections."""
-        return _along(self.manifold, x, alpha)
+        return _tangential_part(self.manifold, x, alpha)
 
     @property
-    def unrollable(self) -> bool:
-        return self.manifold.smooth
+    def can_unroll(self) -> bool:
+        return self.manifold.is_smooth
 
-    smooth = forward_to("manifold")
+    is_smooth = forward_to("manifold")
 
 
-class _Tangent(PoissonBySharp):
+class _TangentPoisson(PoissonBySharp):
     """``P Pi P``, P the projector to the level sets."""
 
     manifold: System
@@ -131,11 +135,11 @@ class _Tangent(PoissonBySharp):
     dim = forward_to("manifold")
 
     def sharp(self, x, alpha):
-        motion = self.manifold.poisson.sharp(x, _along(self.manifold, x, alpha))
-        return _along(self.manifold, x, motion)
+        motion = self.manifold.poisson.sharp(x, _tangential_part(self.manifold, x, alpha))
+        return _tangential_part(self.manifold, x, motion)
 
 
-class _Force(LiftedDissipation):
+class _TangentDissipation(LiftedDissipation):
     """A dissipation that is handed the metric of the space, ``P K P`` near it.
 
     There P is symmetric, and what it gives is along the level sets; it need not be a projector, so that K between two
@@ -143,15 +147,15 @@ class _Force(LiftedDissipation):
     """
 
     manifold: System
-    untouched: bool = eqx.field(static=True)
+    is_projection_trivial: bool = eqx.field(static=True)
 
     def lifted_geometry(self, system, x) -> LiftedGeometry:
         """It is handed what is along the level sets: near an equilibrium that has digits of its own."""
-        along = functools.partial(_along, self.manifold, x)
+        along = functools.partial(_tangential_part, self.manifold, x)
         return LiftedGeometry(self.manifold, x, along, along)
 
     def force(self, system, x, dH, dS, dL):
-        return _forced(self, x, dH, dS, dL)
+        return _tangent_force(self, x, dH, dS, dL)
 
     def divergence(self, system, x):
         """That with the volume of the manifold."""
@@ -159,49 +163,51 @@ class _Force(LiftedDissipation):
 
 
 @subprogram
-def _forced(force: _Force, x, dH, dS, dL) -> jax.Array:
+def _tangent_force(force: _TangentDissipation, x, dH, dS, dL) -> jax.Array:
     at = force.lifted_geometry(force.manifold, x)
     found = force.inner.force(at.system, at.x, *at.lift_gradients(dH, dS, dL))
-    return found if force.untouched else at.lower(found)
+    return found if force.is_projection_trivial else at.lower(found)
 
 
-def embedded(system: System) -> System:
+def embed_in_arrays(system: System) -> System:
     """The system in the space around its manifold; itself on R^n, and where it can be run in charts alone."""
     if system.space is None or not system.space.can_be_embedded:
         return system
     if is_traced(system):
         return EmbeddedSystem(system)
-    points = _some_points(system)
-    points = points * (1.0 + AWAY * np.random.default_rng(0).uniform(-1.0, 1.0, points.shape))
-    conforming, untouched = (np.nan_to_num(evaluate_at_points(_across, system, points), nan=np.inf) <= TANGENT).all(
-        axis=0
-    )
+    points = _sample_states(system)
+    points = points * (1.0 + MANIFOLD_OFFSET * np.random.default_rng(0).uniform(-1.0, 1.0, points.shape))
+    conforming, untouched = (
+        np.nan_to_num(evaluate_at_points(_tangency_residuals, system, points), nan=np.inf) <= TANGENCY_RTOL
+    ).all(axis=0)
     return EmbeddedSystem(system, bool(conforming), bool(conforming and untouched))
 
 
-def _some_points(system: System) -> np.ndarray:
+def _sample_states(system: System) -> np.ndarray:
     """A few states: of a space whose random points are made of normal numbers, without a compiler."""
-    space = _space(system)
+    space = _require_space(system)
     if space._n_normals is None:
         return system.samples(3)
-    return evaluate_at_points(_from_normals, space, np.random.default_rng(2).standard_normal((3, space._n_normals)))
+    return evaluate_at_points(
+        _state_from_normals, space, np.random.default_rng(2).standard_normal((3, space._n_normals))
+    )
 
 
-def _from_normals(space: mf.Space, w):
+def _state_from_normals(space: mf.Space, w):
     return space.to_vector(space._point_from_normals(w))
 
 
-def _inside(surface: ConstraintSurface, x):
+def _inside_indicator(surface: ConstraintSurface, x):
     """1 where the point of the surface next to a state is in the space, else 0."""
     return jnp.where(surface.is_in_space(surface.project_state(x)), 1.0, 0.0)
 
 
-def _across(system: System, x):
+def _tangency_residuals(system: System, x):
     """What of a field is across the level sets, and what covectors across them do, relative to the field.
 
     Behind it what projecting the field would change: the projection need not be a projector off the manifold.
     """
-    constraints, pull = jax.vjp(functools.partial(_constraints, _space(system)), x)
+    constraints, pull = jax.vjp(functools.partial(_constraint_values, _require_space(system)), x)
     random, number = np.random.default_rng(1), 3 + len(system.preserved)
     covectors = random.standard_normal((number, x.shape[0]))
     off = [pull(jnp.asarray(w))[0] for w in random.standard_normal((number, *constraints.shape))]
@@ -209,26 +215,26 @@ def _across(system: System, x):
     for dH, dS, _, *dL in (covectors, [a + b for a, b in zip(covectors, off, strict=True)]):
         fields.append(system.field(x, dH, None if system.entropy is None else dS, tuple(dL)))
     size = jnp.max(jnp.abs(fields[0]))
-    change = jax.jvp(functools.partial(_constraints, _space(system)), (x,), (fields[0],))[1]
+    change = jax.jvp(functools.partial(_constraint_values, _require_space(system)), (x,), (fields[0],))[1]
     defect = jnp.maximum(jnp.max(jnp.abs(fields[1] - fields[0])), jnp.max(jnp.abs(change), initial=0.0))
-    changed = jnp.max(jnp.abs(_along(system, x, fields[0]) - fields[0]))
+    changed = jnp.max(jnp.abs(_tangential_part(system, x, fields[0]) - fields[0]))
     return jnp.stack([defect, changed]) / jnp.where(size > 0.0, size, 1.0)
 
 
-def _constraints(space: mf.Space, x):
+def _constraint_values(space: mf.Space, x):
     return space._constraints(space.from_vector(x))
 
 
-def _along(system: System, x, w):
+def _tangential_part(system: System, x, w):
     """An array less what would change the constraints of the space."""
-    return _along_in(_space(system), x, w)
+    return _tangential_part_in_space(_require_space(system), x, w)
 
 
 @subprogram
-def _along_in(space: mf.Space, x, w):
+def _tangential_part_in_space(space: mf.Space, x, w):
     return space.to_vector(space._tangential_part(space.from_vector(x), space.from_vector(w)))
 
 
-def _space(system: System) -> mf.Space:
+def _require_space(system: System) -> mf.Space:
     assert system.space is not None
     return system.space

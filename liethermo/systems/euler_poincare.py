@@ -21,8 +21,8 @@ from ..functions.checks import check_energy
 from ..functions.energy import Energy, Quadratic, TimeDependent, make_energy
 from .lie_poisson import LiePoissonSystem
 
-NEWTON_STEPS = 50
-_SINGULAR = (
+MAX_NEWTON_ITERATIONS = 50
+_SINGULAR_MESSAGE = (
     "the Lagrangian is singular: its Hessian has no inverse, so the momentum mu does not determine the velocity xi"
 )
 
@@ -92,11 +92,11 @@ class EulerPoincareSystem(LiePoissonSystem):
             forced = EulerPoincareForce(force)
             given = sum_dissipations(dissipation)
             dissipation = forced if given is None else given + forced
-        energy = _hamiltonian(self.lagrangian, algebra.dim)
+        energy = _legendre_hamiltonian(self.lagrangian, algebra.dim)
         super().__init__(algebra, energy, entropy, dissipation, momentum_maps, validate, group, reconstruction)
 
     @property
-    def unrollable(self) -> bool:
+    def can_unroll(self) -> bool:
         return isinstance(self.energy, Quadratic)  # the others iterate
 
     def at_time(self, t, attitude=None) -> EulerPoincareSystem:
@@ -108,14 +108,14 @@ class EulerPoincareSystem(LiePoissonSystem):
 
     def velocity(self, mu, t=None) -> jax.Array:
         """xi = dH/dmu at a state or batch of states, shape (..., dim); at a time, where the Lagrangian needs one."""
-        return self.evaluated(lambda system, mu: system.energy.gradient(mu), mu, t, "(n)")
+        return self.evaluate_batch(lambda system, mu: system.energy.gradient(mu), mu, t, "(n)")
 
     def momentum(self, xi, t=None) -> jax.Array:
         """mu = dl/dxi, shape (..., dim); likewise."""
-        return self.evaluated(lambda system, xi: system.lagrangian.gradient(xi), xi, t, "(n)")
+        return self.evaluate_batch(lambda system, xi: system.lagrangian.gradient(xi), xi, t, "(n)")
 
 
-class _LegendreAtTime(Module):
+class _TimedLegendre(Module):
     """The Hamiltonian of a Lagrangian ``l(xi, t)``, a function of mu and t."""
 
     lagrangian: Energy
@@ -124,19 +124,19 @@ class _LegendreAtTime(Module):
         return Legendre(self.lagrangian.at_time(t)).value(mu)
 
 
-def _hamiltonian(lagrangian: Energy, dim: int) -> Energy:
+def _legendre_hamiltonian(lagrangian: Energy, dim: int) -> Energy:
     if lagrangian.depends_on_time:
-        _need_regular(lagrangian.at_time(0.0), dim)
-        return TimeDependent(_LegendreAtTime(lagrangian))
+        _require_regular(lagrangian.at_time(0.0), dim)
+        return TimeDependent(_TimedLegendre(lagrangian))
     if not isinstance(lagrangian, Quadratic):
-        _need_regular(lagrangian, dim)
+        _require_regular(lagrangian, dim)
         return Legendre(lagrangian)
     A, b = lagrangian.A, lagrangian.b
     b = jnp.zeros(dim) if b is None else b
     if not isinstance(A, jax.core.Tracer):
         singular = np.abs(A) if A.ndim == 1 else np.linalg.svd(np.asarray(A), compute_uv=False)
         if not singular.min() > 1e-14 * singular.max():
-            raise InputError(_SINGULAR)
+            raise InputError(_SINGULAR_MESSAGE)
     inverse = 1.0 / A if A.ndim == 1 else jnp.linalg.inv(A)
     if inverse.ndim == 2:
         inverse = 0.5 * (inverse + inverse.T)
@@ -144,15 +144,15 @@ def _hamiltonian(lagrangian: Energy, dim: int) -> Energy:
     return Quadratic(inverse, None if lagrangian.b is None else shift, -0.5 * jnp.dot(b, shift) - lagrangian.c)
 
 
-def _need_regular(lagrangian: Energy, dim: int) -> None:
+def _require_regular(lagrangian: Energy, dim: int) -> None:
     if is_traced(lagrangian):
         return
     points = np.random.default_rng(0).standard_normal((4, dim))
-    if singular_everywhere(jax.vmap(jax.hessian(lagrangian.value))(points)):
-        raise InputError(_SINGULAR)
+    if are_all_singular(jax.vmap(jax.hessian(lagrangian.value))(points)):
+        raise InputError(_SINGULAR_MESSAGE)
 
 
-def singular_everywhere(matrices) -> bool:
+def are_all_singular(matrices) -> bool:
     """Whether matrices at some points, shape (points, n, n), are all singular; not where they are not all finite."""
     if not np.isfinite(matrices).all():
         return False
@@ -175,20 +175,20 @@ def inverse_gradient(lagrangian: Energy, mu: jax.Array) -> jax.Array:
             t, _ = state
             return 0.5 * t, residual(xi - 0.5 * t * step)
 
-        def too_long(state):
+        def is_too_long(state):
             t, trial = state
             return (t > 1e-4) & ~(jnp.linalg.norm(trial) <= (1.0 - 0.25 * t) * jnp.linalg.norm(r) + 1e-300)
 
-        t, trial = jax.lax.while_loop(too_long, shorten, (1.0, residual(xi - step)))
+        t, trial = jax.lax.while_loop(is_too_long, shorten, (1.0, residual(xi - step)))
         shrinking = jnp.linalg.norm(trial) < jnp.linalg.norm(r)
         return jnp.where(shrinking, xi - t * step, xi), jnp.where(shrinking, trial, r), shrinking, k + 1
 
-    def unfinished(carry):
+    def should_continue(carry):
         _, _, shrinking, k = carry
-        return shrinking & (k < NEWTON_STEPS)
+        return shrinking & (k < MAX_NEWTON_ITERATIONS)
 
     start = jnp.zeros_like(mu)
-    xi, r, _, _ = jax.lax.while_loop(unfinished, refine, (start, residual(start), True, 0))
+    xi, r, _, _ = jax.lax.while_loop(should_continue, refine, (start, residual(start), True, 0))
     return jnp.where(jnp.linalg.norm(r) <= 1e-10 * (1.0 + jnp.linalg.norm(mu)), xi, jnp.nan)
 
 

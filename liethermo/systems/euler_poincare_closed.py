@@ -20,12 +20,12 @@ from ..functions.checks import check_energy, mark_polynomial_degrees
 from ..functions.energy import Energy, Function, make_energy
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.traced import trace_callables
-from .euler_poincare import singular_everywhere
+from .euler_poincare import are_all_singular
 from .evolution import entropy_component
-from .ledger import ForcesAndHeat, WithLedger, field, linear_friction
+from .ledger import ForcesAndHeat, LedgerSystem, check_state_function, linear_friction
 
 
-class EulerPoincareClosedSystem(WithLedger):
+class EulerPoincareClosedSystem(LedgerSystem):
     """``d/dt l_xi = ad*_xi l_xi + f + F``, ``T S' = P_H - f·xi``, ``T = -l_S > 0``: a body that its friction heats.
 
     These are the equations (2.4) of a Lagrangian ``L(g, g', S) = l(g^-1 g', S)`` on TG x R: the variations of GBY §2.2
@@ -66,7 +66,7 @@ class EulerPoincareClosedSystem(WithLedger):
     algebra: mf.LieAlgebra
     lagrangian: Callable
     friction: Callable | None
-    invariants_of_momentum: dict[str, Energy]
+    momentum_casimirs: dict[str, Energy]
 
     domain: ClassVar[str] = "a positive temperature"
 
@@ -87,37 +87,45 @@ class EulerPoincareClosedSystem(WithLedger):
         lagrangian = trace_callables(lagrangian, lambda lagrangian, *a: lagrangian(*a), (n,), ())
         self.algebra, self.lagrangian = algebra, lagrangian
         if friction is None or callable(friction):
-            self.friction = None if friction is None else field(friction, ((n,), ()), (n,), "the friction", at)
+            self.friction = (
+                None if friction is None else check_state_function(friction, ((n,), ()), (n,), "the friction", at)
+            )
         else:
             self.friction = linear_friction(friction, n, "a coefficient of friction")
-        self.external = None if external is None else field(external, ((n,), ()), (n,), "the external force", at)
-        self.heat_power = None if heat_power is None else field(heat_power, ((n,), ()), (), "the heat power", at)
+        self.external = (
+            None if external is None else check_state_function(external, ((n,), ()), (n,), "the external force", at)
+        )
+        self.heat_power = (
+            None if heat_power is None else check_state_function(heat_power, ((n,), ()), (), "the heat power", at)
+        )
         casimirs = {
-            name: mark_polynomial_degrees(Function(OfMomentum(make_energy(C, "a Casimir"), lagrangian)), n + 1)
+            name: mark_polynomial_degrees(Function(MomentumFunction(make_energy(C, "a Casimir"), lagrangian)), n + 1)
             for name, C in algebra.leading_casimirs()
         }
-        self.invariants_of_momentum = {name: C.on(range(n + 1)) if self.receives else C for name, C in casimirs.items()}
-        structure = OnAlgebra(algebra, lagrangian)
+        self.momentum_casimirs = {name: C.on(range(n + 1)) if self.has_ledger else C for name, C in casimirs.items()}
+        structure = VelocityLiePoisson(algebra, lagrangian)
         if not is_traced(lagrangian):
             hessians = evaluate_at_points(_hessian, structure, np.random.default_rng(0).standard_normal((4, n + 1)))
-            if singular_everywhere(hessians):
+            if are_all_singular(hessians):
                 raise InputError("the Lagrangian is singular: its Hessian in xi has no inverse")
         given = (self.friction, self.external, self.heat_power)
         forces = None if given == (None, None, None) else ForcesAndHeat(*given)
-        whole, total, energy = self._beside_ledger(
+        whole, total, energy = self._append_ledger(
             structure, n + 1, mark_polynomial_degrees(ReducedEnergy(lagrangian), n + 1)
         )
         self._build(whole, total, energy, entropy_component(total, n), forces, momentum_maps, validate)
 
-    def parts(self, x) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def split_state(self, x) -> tuple[jax.Array, jax.Array, jax.Array]:
         """xi, S and t of one state; t = 0 where it has none."""
         n = self.algebra.dim
-        return x[:n], x[n], self.time_of(x)
+        return x[:n], x[n], self.state_time(x)
 
     @property
-    def structure(self) -> OnAlgebra:
+    def structure(self) -> VelocityLiePoisson:
         """The Poisson structure of (xi, S)."""
-        return cast(OnAlgebra, self.poisson.first if isinstance(self.poisson, ProductPoisson) else self.poisson)
+        return cast(
+            VelocityLiePoisson, self.poisson.first if isinstance(self.poisson, ProductPoisson) else self.poisson
+        )
 
     def momentum(self, xi, S) -> jax.Array:
         """``l_xi`` at one point, shape (dim,)."""
@@ -135,29 +143,29 @@ class EulerPoincareClosedSystem(WithLedger):
         """P_H."""
         return jnp.zeros(()) if self.heat_power is None else jnp.asarray(self.heat_power(xi, S, t))
 
-    first_velocity: ClassVar[int] = 0
+    first_velocity_index: ClassVar[int] = 0
 
-    def inertia_at(self, x) -> tuple[jax.Array, jax.Array]:
-        return self.structure.rates(x[: self.own_size])[1:]
+    def momentum_jacobians(self, x) -> tuple[jax.Array, jax.Array]:
+        return self.structure.momentum_derivatives(x[: self.dim_without_ledger])[1:]
 
-    def acted_on(self, x, v, T) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def forces_and_power(self, x, v, T) -> tuple[jax.Array, jax.Array, jax.Array]:
         del T
-        _, S, t = self.parts(x)
+        _, S, t = self.split_state(x)
         return self.friction_force(v, S, t), self.external_force(v, S, t), self.heating(v, S, t)
 
     def temperature(self, x) -> jax.Array:
         """``T = -l_S`` at a state or a batch of states, shape (...)."""
         by_S = jax.grad(self.lagrangian, argnums=1)
-        return jnp.vectorize(lambda y: -by_S(*self.parts(y)[:2]), signature="(n)->()")(self.state(x, batch=True))
+        return jnp.vectorize(lambda y: -by_S(*self.split_state(y)[:2]), signature="(n)->()")(self.state(x, batch=True))
 
     def momenta(self, x) -> jax.Array:
         """``l_xi``, shape (..., dim), at a state or a batch of states."""
-        return jnp.vectorize(lambda y: self.momentum(*self.parts(y)[:2]), signature="(n)->(m)")(
+        return jnp.vectorize(lambda y: self.momentum(*self.split_state(y)[:2]), signature="(n)->(m)")(
             self.state(x, batch=True)
         )
 
     def casimirs(self) -> dict[str, Energy]:
-        return self.invariants_of_momentum
+        return self.momentum_casimirs
 
     def outside(self, x) -> str:
         T = float(evaluate_at_points(_temperature, self, np.atleast_2d(x)).min())
@@ -166,14 +174,14 @@ class EulerPoincareClosedSystem(WithLedger):
     def domain_margin(self, x):
         return self.temperature(x)
 
-    def own_residuals(self, x) -> dict[str, jax.Array]:
-        xi, S, t = self.parts(x)
+    def specific_residuals(self, x) -> dict[str, jax.Array]:
+        xi, S, t = self.split_state(x)
         force = self.friction_force(xi, S, t)
         size = jnp.linalg.norm(force) * jnp.linalg.norm(xi)
         return {"f . xi <= 0": jnp.maximum(jnp.dot(force, xi), 0.0) / jnp.where(size > 0.0, size, 1.0)}
 
 
-class OfMomentum(Module):
+class MomentumFunction(Module):
     """A function of the momentum ``l_xi``, as one of the state."""
 
     energy: Energy
@@ -193,7 +201,7 @@ class ReducedEnergy(Energy):
         return jnp.dot(x[:-1], momentum) - value
 
 
-class OnAlgebra(PoissonBySharp):
+class VelocityLiePoisson(PoissonBySharp):
     """The Lie-Poisson structure on g* x R in the chart ``(xi, S) -> (l_xi, S)``; S is a Casimir function."""
 
     algebra: mf.LieAlgebra
@@ -203,14 +211,14 @@ class OnAlgebra(PoissonBySharp):
     def dim(self) -> int:
         return self.algebra.dim + 1
 
-    def rates(self, x) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def momentum_derivatives(self, x) -> tuple[jax.Array, jax.Array, jax.Array]:
         """``mu = l_xi`` and its derivatives by xi and S."""
         momentum = jax.grad(self.lagrangian)
         by_xi, by_S = jax.jacfwd(momentum, argnums=(0, 1))(x[:-1], x[-1])
         return momentum(x[:-1], x[-1]), by_xi, by_S
 
     def sharp(self, x, alpha) -> jax.Array:
-        mu, W, _ = self.rates(x)
+        mu, W, _ = self.momentum_derivatives(x)
         xi = solve(W, alpha[:-1, None])[:, 0]
         return jnp.append(solve(W, self.algebra.ad_star(xi, mu)[:, None])[:, 0], 0.0)
 
@@ -219,5 +227,5 @@ def _temperature(system: EulerPoincareClosedSystem, x):
     return system.temperature(x)
 
 
-def _hessian(structure: OnAlgebra, x):
-    return structure.rates(x)[1]
+def _hessian(structure: VelocityLiePoisson, x):
+    return structure.momentum_derivatives(x)[1]

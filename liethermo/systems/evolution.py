@@ -30,11 +30,11 @@ class LiouvilleFriction(SkewFriction):
     is known of ``H = p . G(q) p / 2 + V(q, S)`` given in terms of that form, and then holds in a discretisation too.
     """
 
-    nondecreasing: bool = eqx.field(static=True, default=False)
+    is_nondecreasing: bool = eqx.field(static=True, default=False)
 
     @property
     def entropy_law(self) -> LawName | None:
-        return "nondecreasing" if self.nondecreasing else None
+        return "nondecreasing" if self.is_nondecreasing else None
 
     def force(self, system, x, dH, dS, dL):
         return system.contact.liouville_sharp(x, dH)
@@ -49,7 +49,7 @@ class ReebDrift(LiouvilleFriction):
         return system.contact.liouville_sharp(x, dH) - system.energy.value(x) * system.contact.reeb(x)
 
 
-class OnContactManifold(System):
+class ContactManifoldSystem(System):
     """What evolution and contact systems share, on T*Q x R and on TQ x R."""
 
     poisson: mf.Cosymplectic
@@ -62,14 +62,14 @@ class OnContactManifold(System):
     @property
     def configurations(self) -> mf.Space | None:
         """The space of positions Q; None for R^n."""
-        return configurations(self.contact)
+        return configuration_space(self.contact)
 
-    def local(self, x, centred: bool = False) -> tuple[System, jax.Array]:
+    def local_system(self, x, is_centred: bool = False) -> tuple[System, jax.Array]:
         """In the space around: its fields are tangent to the level sets of the constraints by form."""
-        return (self if self.space is None else EmbeddedSystem(self, conforming=True)), x
+        return (self if self.space is None else EmbeddedSystem(self, is_tangent=True)), x
 
     @property
-    def tensor_by_form(self) -> bool:
+    def has_poisson_by_construction(self) -> bool:
         return self.space is not None
 
     def _vector_field(self, x) -> jax.Array:
@@ -77,7 +77,7 @@ class OnContactManifold(System):
         return self.field(x, self.energy.gradient(x), None if self.entropy is None else self.entropy.gradient(x))
 
 
-class EvolutionSystem(OnContactManifold):
+class EvolutionSystem(ContactManifoldSystem):
     """The evolution field of an energy on T*Q x R: an isolated system with friction [SML 7, §4].
 
     ``q' = H_p, p' = -H_q - p H_S, S' = p . H_p``, with the temperature ``T = H_S``. The energy is constant and the path
@@ -129,22 +129,22 @@ class EvolutionSystem(OnContactManifold):
         validate: bool = True,
         space: mf.Space | None = None,
     ):
-        dim = components(dim, space)
-        energy = make_energy(in_one_array(energy, space), "the energy")
+        dim = state_dim(dim, space)
+        energy = make_energy(join_arguments(energy, space), "the energy")
         energy = check_energy(energy, dim, "the energy", allow_time=True)
         friction = LiouvilleFriction(is_mechanical(mark_polynomial_degrees(energy, dim), dim, space))
-        entropy, states = entropy_component(dim), states_on(space)
-        self._build(canonical(dim, space), dim, energy, entropy, friction, momentum_maps, validate, states)
+        entropy, states = entropy_component(dim), state_space(space)
+        self._build(canonical_structure(dim, space), dim, energy, entropy, friction, momentum_maps, validate, states)
 
     def temperature(self, x, t=None) -> jax.Array:
         """``T = H_S`` at a state or a batch of states, shape (...); at a time, where the energy depends on one."""
-        return self.evaluated(lambda system, y: system.energy.gradient(y)[-1], x, t, "()")
+        return self.evaluate_batch(lambda system, y: system.energy.gradient(y)[-1], x, t, "()")
 
-    def own_residuals(self, x) -> dict[str, jax.Array]:
-        return tangency(self, x)
+    def specific_residuals(self, x) -> dict[str, jax.Array]:
+        return tangency_residual(self, x)
 
 
-class ContactSystem(OnContactManifold):
+class ContactSystem(ContactManifoldSystem):
     """The plain contact field X_H of an energy on T*Q x R, for comparison [SML §2.2].
 
     ``q' = H_p, p' = -H_q - p H_S, S' = p . H_p - H``. It describes no isolated system: ``H' = -H_S H``, and S is the
@@ -164,22 +164,24 @@ class ContactSystem(OnContactManifold):
         validate: bool = True,
         space: mf.Space | None = None,
     ):
-        dim, energy = components(dim, space), in_one_array(energy, space)
-        self._build(canonical(dim, space), dim, energy, None, ReebDrift(), momentum_maps, validate, states_on(space))
+        dim, energy = state_dim(dim, space), join_arguments(energy, space)
+        self._build(
+            canonical_structure(dim, space), dim, energy, None, ReebDrift(), momentum_maps, validate, state_space(space)
+        )
 
-    def own_residuals(self, x) -> dict[str, jax.Array]:
-        return decay(self, x)
+    def specific_residuals(self, x) -> dict[str, jax.Array]:
+        return energy_decay_residual(self, x)
 
 
 # -- shared with the Lagrangian side ----------------------------------------------------------------------------------
 
 
-def canonical(dim: int, space: mf.Space | None = None) -> mf.Cosymplectic:
+def canonical_structure(dim: int, space: mf.Space | None = None) -> mf.Cosymplectic:
     """The structure of T*Q x R, on dim = 2n + 1 coordinates."""
-    return mf.Cosymplectic(mf.CanonicalContact(degrees_of_freedom(dim), bundle=bundle_of(space)))
+    return mf.Cosymplectic(mf.CanonicalContact(n_degrees_of_freedom(dim), bundle=tangent_bundle_of(space)))
 
 
-def bundle_of(space: mf.Space | None) -> mf.TangentBundle | None:
+def tangent_bundle_of(space: mf.Space | None) -> mf.TangentBundle | None:
     """The tangent bundle of a space of positions, which stands for the cotangent bundle too; None for R^n."""
     if space is None:
         return None
@@ -189,34 +191,34 @@ def bundle_of(space: mf.Space | None) -> mf.TangentBundle | None:
     return bundle
 
 
-def states_on(space: mf.Space | None, more: int = 0) -> mf.Space | None:
+def state_space(space: mf.Space | None, more: int = 0) -> mf.Space | None:
     """The space of states (q, p, S), with so many components behind them; None for R^n."""
-    bundle = bundle_of(space)
+    bundle = tangent_bundle_of(space)
     return None if bundle is None else mf.Product(bundle, mf.Euclidean(1 + more))
 
 
-def configurations(contact: mf.SplitContact) -> mf.Space | None:
+def configuration_space(contact: mf.SplitContact) -> mf.Space | None:
     """Q, of a contact structure on T*Q x R or TQ x R; None for R^n."""
     return contact.bundle.base if isinstance(contact.bundle, mf.TangentBundle) else None
 
 
-def checked_space(space) -> mf.Space:
+def check_space(space) -> mf.Space:
     """A space of positions; InputError where it is none."""
     if not isinstance(space, mf.Space):
         raise InputError(f"space is a manifolds.Space, such as mf.Sphere(2), not {type(space).__name__}")
     return space
 
 
-def components(dim: int | None, space: mf.Space | None) -> int:
+def state_dim(dim: int | None, space: mf.Space | None) -> int:
     """The number of components of (q, p, S)."""
     if space is None:
-        return 2 * degrees_of_freedom(dim) + 1
-    if dim not in (None, found := 2 * checked_space(space).size + 1):
+        return 2 * n_degrees_of_freedom(dim) + 1
+    if dim not in (None, found := 2 * check_space(space).size + 1):
         raise InputError(f"on {space.name} a state (q, p, S) has {found} components, not {dim}: leave dim out")
     return found
 
 
-class Joined(Module):
+class JoinedArguments(Module):
     """A function of (q, p, S), or (q, v, S) and more, as one of one array and more; q has a shape."""
 
     function: Callable
@@ -228,14 +230,14 @@ class Joined(Module):
         return self.function(q, v, x[2 * n], *more)
 
 
-def in_one_array(function, space: mf.Space | None = None):
+def join_arguments(function, space: mf.Space | None = None):
     """A function of (q, p, S) as one of one array, and other things as they are."""
     if not callable(function) or isinstance(function, Energy) or required_argument_count(function) != 3:
         return function
-    return Joined(function, None if space is None else checked_space(space).shape)
+    return JoinedArguments(function, None if space is None else check_space(space).shape)
 
 
-def degrees_of_freedom(dim: int | None) -> int:
+def n_degrees_of_freedom(dim: int | None) -> int:
     """n of a state with 2n + 1 components (q, p, S)."""
     if isinstance(dim, bool) or not isinstance(dim, int) or dim < 3 or dim % 2 == 0:
         raise InputError(
@@ -249,18 +251,20 @@ def entropy_component(dim: int, at=-1) -> Energy:
     return Quadratic(jnp.zeros(dim), jnp.zeros(dim).at[at].set(1.0))
 
 
-def tangency(system: OnContactManifold, x) -> dict[str, jax.Array]:
+def tangency_residual(system: ContactManifoldSystem, x) -> dict[str, jax.Array]:
     """The first law: the field lies in the kernel of the contact form [SML Remark 4.2]."""
     form, rate = system.contact.form(x), system.vector_field(x)
-    return {"eta(x') = 0": _relative(jnp.dot(form, rate), jnp.abs(form) @ jnp.abs(rate))}
+    return {"eta(x') = 0": _relative_residual(jnp.dot(form, rate), jnp.abs(form) @ jnp.abs(rate))}
 
 
-def decay(system: OnContactManifold, x) -> dict[str, jax.Array]:
+def energy_decay_residual(system: ContactManifoldSystem, x) -> dict[str, jax.Array]:
     """``H' = -R(H) H`` along a contact field [SML Prop. 2.1]."""
     dH, rate = system.energy.gradient(x), system.vector_field(x)
     loss = jnp.dot(dH, system.contact.reeb(x)) * system.energy.value(x)
-    return {"dH/dt = -R(H) H": _relative(jnp.dot(dH, rate) + loss, jnp.abs(dH) @ jnp.abs(rate) + jnp.abs(loss))}
+    return {
+        "dH/dt = -R(H) H": _relative_residual(jnp.dot(dH, rate) + loss, jnp.abs(dH) @ jnp.abs(rate) + jnp.abs(loss))
+    }
 
 
-def _relative(residual, size):
+def _relative_residual(residual, size):
     return jnp.abs(residual) / jnp.where(size > 0.0, size, 1.0)

@@ -22,25 +22,25 @@ from ..functions.energy import Energy, Quadratic, make_energy
 from ..functions.mechanics import Kinetic, is_independent_of_momenta, is_mechanical
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.programs import jit_program
-from .euler_poincare import inverse_gradient, singular_everywhere
+from .euler_poincare import are_all_singular, inverse_gradient
 from .evolution import (
+    ContactManifoldSystem,
     ContactSystem,
     EvolutionSystem,
     LiouvilleFriction,
-    OnContactManifold,
     ReebDrift,
-    bundle_of,
-    components,
-    decay,
-    degrees_of_freedom,
+    energy_decay_residual,
     entropy_component,
-    in_one_array,
-    states_on,
-    tangency,
+    join_arguments,
+    n_degrees_of_freedom,
+    state_dim,
+    state_space,
+    tangency_residual,
+    tangent_bundle_of,
 )
 
 
-class OnVelocities(OnContactManifold):
+class VelocityContactSystem(ContactManifoldSystem):
     """What the two systems of a Lagrangian share; the state is (q, v, S)."""
 
     lagrangian: Energy
@@ -50,7 +50,7 @@ class OnVelocities(OnContactManifold):
         """The contact structure ``eta_L = dS - L_v dq`` [SML §3.1]."""
         return cast(mf.LagrangianContact, self.poisson.contact)
 
-    def _prepare(
+    def _build_contact_structure(
         self, lagrangian, dim: int | None, space: mf.Space | None = None
     ) -> tuple[mf.Cosymplectic, int, Energy]:
         """The Poisson structure, the dimension and the energy E_L of a Lagrangian that is checked here."""
@@ -59,12 +59,12 @@ class OnVelocities(OnContactManifold):
             dim = L.A.shape[0]
         if dim is None and space is None:
             raise InputError("the dimension of the state (q, v, S) is not known: give dim=2n+1 beside the Lagrangian")
-        dim = components(dim, space)
-        n = degrees_of_freedom(dim)
+        dim = state_dim(dim, space)
+        n = n_degrees_of_freedom(dim)
         self.lagrangian = L = mark_polynomial_degrees(check_energy(L, dim, "the Lagrangian"), dim)
-        contact = mf.LagrangianContact(_Values(L), n, bundle_of(space))
-        _need_regular(contact)
-        return mf.Cosymplectic(contact), dim, _energy(L, dim)
+        contact = mf.LagrangianContact(_EnergyValue(L), n, tangent_bundle_of(space))
+        _require_regular(contact)
+        return mf.Cosymplectic(contact), dim, _lagrangian_energy(L, dim)
 
     def _hamiltonian(self) -> Energy:
         if self.configurations is not None:
@@ -72,14 +72,14 @@ class OnVelocities(OnContactManifold):
                 f"the Legendre transform is inverted on R^n alone, and positions are in {self.configurations.name}: "
                 "give lt.EvolutionSystem or lt.ContactSystem the Hamiltonian, with space="
             )
-        return _hamiltonian(self.lagrangian, self.dim)
+        return _legendre_hamiltonian(self.lagrangian, self.dim)
 
     def legendre(self, x) -> jax.Array:
         """``FL(q, v, S) = (q, L_v, S)``, a state of :meth:`hamiltonian_system`, or a batch, shape (..., dim)."""
         return jnp.vectorize(self.contact.legendre, signature="(n)->(n)")(self.state(x, batch=True))
 
 
-class OfLagrangian(OnVelocities):
+class LagrangianSystem(VelocityContactSystem):
     """A system that a Lagrangian makes alone, without forces beside it."""
 
     def __init__(
@@ -90,15 +90,23 @@ class OfLagrangian(OnVelocities):
         validate: bool = True,
         space: mf.Space | None = None,
     ):
-        structure, dim, energy = self._prepare(in_one_array(lagrangian, space), dim, space)
-        self._build(structure, dim, energy, *self._terms(dim, space), momentum_maps, validate, states_on(space))
+        structure, dim, energy = self._build_contact_structure(join_arguments(lagrangian, space), dim, space)
+        self._build(
+            structure,
+            dim,
+            energy,
+            *self._entropy_and_dissipation(dim, space),
+            momentum_maps,
+            validate,
+            state_space(space),
+        )
 
     @abstractmethod
-    def _terms(self, dim: int, space: mf.Space | None) -> tuple[Energy | None, Dissipation]:
+    def _entropy_and_dissipation(self, dim: int, space: mf.Space | None) -> tuple[Energy | None, Dissipation]:
         """The entropy and the dissipation."""
 
 
-class ThermodynamicHerglotz(OfLagrangian):
+class ThermodynamicHerglotz(LagrangianSystem):
     """Thermodynamic Herglotz equations: the evolution field of a Lagrangian L(q, v, S) [SML 12].
 
     ``d/dt L_v - L_q = L_v L_S`` and ``S' = v . L_v``, in the state (q, v, S). It is the field ``Gamma_L`` of
@@ -131,18 +139,18 @@ class ThermodynamicHerglotz(OfLagrangian):
 
     production_name: ClassVar[str] = "Delta(L)"
 
-    def _terms(self, dim, space):
+    def _entropy_and_dissipation(self, dim, space):
         return entropy_component(dim), LiouvilleFriction(is_mechanical(self.lagrangian, dim, space))
 
     def hamiltonian_system(self) -> EvolutionSystem:
         """The same dynamics on T*Q x R, in the state (q, p, S); on R^n alone."""
         return EvolutionSystem(self._hamiltonian(), self.dim, validate=False)
 
-    def own_residuals(self, x) -> dict[str, jax.Array]:
-        return tangency(self, x)
+    def specific_residuals(self, x) -> dict[str, jax.Array]:
+        return tangency_residual(self, x)
 
 
-class Herglotz(OfLagrangian):
+class Herglotz(LagrangianSystem):
     """Herglotz' equations of 1930, the contact field of a Lagrangian, for comparison [SML 10].
 
     ``d/dt L_v - L_q = L_v L_S`` and ``S' = L``, in the state (q, v, S): S is the action, and ``E_L' = L_S E_L``.
@@ -153,21 +161,21 @@ class Herglotz(OfLagrangian):
         As for :class:`ThermodynamicHerglotz`.
     """
 
-    def _terms(self, dim, space):
+    def _entropy_and_dissipation(self, dim, space):
         return None, ReebDrift()
 
     def hamiltonian_system(self) -> ContactSystem:
         """The same dynamics on T*Q x R, in the state (q, p, S); on R^n alone."""
         return ContactSystem(self._hamiltonian(), self.dim, validate=False)
 
-    def own_residuals(self, x) -> dict[str, jax.Array]:
-        return decay(self, x)
+    def specific_residuals(self, x) -> dict[str, jax.Array]:
+        return energy_decay_residual(self, x)
 
 
 # -- the energy E_L ---------------------------------------------------------------------------------------------------
 
 
-def _energy(L: Energy, dim: int) -> Energy:
+def _lagrangian_energy(L: Energy, dim: int) -> Energy:
     """``E_L = v . L_v - L``, term by term, so that a discretisation sees of each what it is."""
     points = np.random.default_rng(0).standard_normal((4, dim))
     first, *others = (_energy_of_term(term, points) for term in L.terms)
@@ -200,7 +208,7 @@ class _LegendreEnergy(Energy):
         return jnp.dot(x[n : 2 * n], self.lagrangian.gradient(x)[n : 2 * n]) - self.lagrangian.value(x)
 
 
-class _Values(Module):
+class _EnergyValue(Module):
     """An energy as a function of one state."""
 
     energy: Energy
@@ -212,7 +220,7 @@ class _Values(Module):
 # -- the Hamiltonian --------------------------------------------------------------------------------------------------
 
 
-def _hamiltonian(L: Energy, dim: int) -> Energy:
+def _legendre_hamiltonian(L: Energy, dim: int) -> Energy:
     """``H = E_L o FL^-1``, in closed form for a quadratic Lagrangian and for kinetic minus potential energy."""
     if isinstance(L, Quadratic):
         return _hamiltonian_of_quadratic(L)
@@ -262,7 +270,7 @@ class LegendreTransform(Energy):
     def velocity(self, x) -> jax.Array:
         """v at (q, p, S), shape (n,)."""
         n = len(x) // 2
-        return inverse_gradient(_OfVelocity(self.lagrangian, x[:n], x[2 * n :]), x[n : 2 * n])
+        return inverse_gradient(_VelocityLagrangian(self.lagrangian, x[:n], x[2 * n :]), x[n : 2 * n])
 
     def value(self, x) -> jax.Array:
         v, n = self.velocity(x), len(x) // 2
@@ -273,7 +281,7 @@ class LegendreTransform(Energy):
         return (-self.lagrangian.gradient(x.at[n : 2 * n].set(v))).at[n : 2 * n].set(v)
 
 
-class _OfVelocity(Energy):
+class _VelocityLagrangian(Energy):
     """A Lagrangian at fixed q and S."""
 
     lagrangian: Energy
@@ -284,10 +292,10 @@ class _OfVelocity(Energy):
         return self.lagrangian.value(jnp.concatenate([self.q, x, self.S]))
 
 
-def _need_regular(contact: mf.LagrangianContact) -> None:
+def _require_regular(contact: mf.LagrangianContact) -> None:
     if is_traced(contact):
         return
-    if singular_everywhere(evaluate_at_points(_hessian, contact, random_states(contact, 4))):
+    if are_all_singular(evaluate_at_points(_hessian, contact, random_states(contact, 4))):
         raise InputError(
             "the Lagrangian is singular: its Hessian L_vv has no inverse, so eta_L is no contact form and the momentum "
             "does not determine the velocity"

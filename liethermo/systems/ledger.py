@@ -23,11 +23,11 @@ from ..functions.conditions import check_numbers, require_condition
 from ..functions.energy import Energy, Quadratic
 from .base import System
 
-LEDGER = 3
+LEDGER_DIM = 3
 """Components of the ledger of a system that is not isolated: work and heat received, and the time."""
 
 
-class WithLedger(System):
+class LedgerSystem(System):
     """A system whose state has the work W and the heat Q received so far, and the time t, behind its own components.
 
     Its energy is ``E - W - Q``, that of system and surroundings. The state of an isolated system has no ledger.
@@ -37,61 +37,61 @@ class WithLedger(System):
     heat_power: Callable | None
 
     @property
-    def receives(self) -> bool:
+    def has_ledger(self) -> bool:
         """Whether work or heat comes from outside, so that the state has a ledger."""
         return self.external is not None or self.heat_power is not None
 
     @property
-    def own_size(self) -> int:
+    def dim_without_ledger(self) -> int:
         """Components of the state without the ledger."""
-        return self.dim - LEDGER if self.receives else self.dim
+        return self.dim - LEDGER_DIM if self.has_ledger else self.dim
 
-    def _beside_ledger(self, structure, size: int, energy: Energy) -> tuple[mf.PoissonStructure, int, Energy]:
+    def _append_ledger(self, structure, size: int, energy: Energy) -> tuple[mf.PoissonStructure, int, Energy]:
         """The structure, the size and the energy of system and surroundings, from those of the system."""
-        if not self.receives:
+        if not self.has_ledger:
             return structure, size, energy
-        total = size + LEDGER
+        total = size + LEDGER_DIM
         received = Quadratic(jnp.zeros(total), jnp.zeros(total).at[size : size + 2].set(-1.0))
-        return ProductPoisson(structure, mf.NoPoisson(LEDGER)), total, energy.on(range(size)) + received
+        return ProductPoisson(structure, mf.NoPoisson(LEDGER_DIM)), total, energy.on(range(size)) + received
 
-    def numbers(self, x, batch: bool = False):
-        if self.receives and np.ndim(x) > 0 and np.shape(x)[-1] == self.own_size:
-            x = jnp.concatenate([jnp.asarray(x), jnp.zeros((*np.shape(x)[:-1], LEDGER))], axis=-1)
-        return super().numbers(x, batch)
+    def state_array(self, x, batch: bool = False):
+        if self.has_ledger and np.ndim(x) > 0 and np.shape(x)[-1] == self.dim_without_ledger:
+            x = jnp.concatenate([jnp.asarray(x), jnp.zeros((*np.shape(x)[:-1], LEDGER_DIM))], axis=-1)
+        return super().state_array(x, batch)
 
-    def time_of(self, x) -> jax.Array:
+    def state_time(self, x) -> jax.Array:
         """The time in one state; 0 where it has none."""
-        return x[-1] if len(x) > self.own_size else jnp.zeros(())
+        return x[-1] if len(x) > self.dim_without_ledger else jnp.zeros(())
 
     # what ForcesAndHeat asks for
 
     @property
     @abstractmethod
-    def first_velocity(self) -> int:
+    def first_velocity_index(self) -> int:
         """The component of the state where velocities begin."""
 
     @abstractmethod
-    def inertia_at(self, x) -> tuple[jax.Array, jax.Array]:
+    def momentum_jacobians(self, x) -> tuple[jax.Array, jax.Array]:
         """The derivatives of the momentum by v and S at a state, shapes (n, n) and (n,)."""
 
     @abstractmethod
-    def acted_on(self, x, v, T) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def forces_and_power(self, x, v, T) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Friction and external force, shape (n,), and heat power at a state x, with a velocity v and T."""
 
-    def along_at(self, x, covector) -> jax.Array:
+    def tangential_covector(self, x, covector) -> jax.Array:
         """What of a covector acts on velocities at a state x, shape (n,)."""
         del x
         return covector
 
-    def entries(self, work, heat) -> jax.Array:
+    def ledger_rates(self, work, heat) -> jax.Array:
         """The rates of the ledger, shape (3,), or none of an isolated system."""
-        return jnp.stack([work, heat, jnp.ones(())])[: self.dim - self.own_size]
+        return jnp.stack([work, heat, jnp.ones(())])[: self.dim - self.dim_without_ledger]
 
     @property
     def ledger(self) -> dict[str, Energy]:
-        names = ("work received", "heat received") if self.receives else ()
+        names = ("work received", "heat received") if self.has_ledger else ()
         rows = jnp.eye(self.dim)
-        return {name: Quadratic(jnp.zeros(self.dim), rows[self.own_size + i]) for i, name in enumerate(names)}
+        return {name: Quadratic(jnp.zeros(self.dim), rows[self.dim_without_ledger + i]) for i, name in enumerate(names)}
 
 
 class ForcesAndHeat(SkewFriction):
@@ -99,7 +99,7 @@ class ForcesAndHeat(SkewFriction):
 
     ``d/dt l_v = … + F_fr + F_ext`` and ``T S' = P_H - F_fr . v``. With the ledger W' = F_ext . v, Q' = P_H the energy
     ``v . l_v - l - W - Q`` of system and surroundings is constant, for discrete gradients too. The system says where v
-    begins (``first_velocity``), how its momentum changes with v and S (``inertia_at``), and how it is ``acted_on``.
+    begins (``first_velocity_index``), how its momentum changes with v and S (``momentum_jacobians``), and how it is ``forces_and_power``.
     """
 
     friction: Callable | None
@@ -113,14 +113,16 @@ class ForcesAndHeat(SkewFriction):
         return "conserved" if self.friction is None else "nondecreasing"
 
     def force(self, system, x, dH, dS, dL):
-        first, S = system.first_velocity, system.own_size - 1
-        W, by_S = system.inertia_at(x)
-        v = solve(W, system.along_at(x, dH[first:S])[:, None])[:, 0]  # the velocity and temperature of the gradient
+        first, S = system.first_velocity_index, system.dim_without_ledger - 1
+        W, by_S = system.momentum_jacobians(x)
+        v = solve(W, system.tangential_covector(x, dH[first:S])[:, None])[
+            :, 0
+        ]  # the velocity and temperature of the gradient
         T = dH[S] - jnp.dot(by_S, v)
-        friction, push, power = system.acted_on(x, v, T)
+        friction, push, power = system.forces_and_power(x, v, T)
         S_dot = (power - jnp.dot(friction, v)) / jnp.where(T > 0.0, T, jnp.nan)
         v_dot = solve(W, (friction + push - by_S * S_dot)[:, None])[:, 0]
-        return jnp.concatenate([jnp.zeros(first), v_dot, S_dot[None], system.entries(jnp.dot(push, v), power)])
+        return jnp.concatenate([jnp.zeros(first), v_dot, S_dot[None], system.ledger_rates(jnp.dot(push, v), power)])
 
 
 # -- friction by a coefficient -----------------------------------------------------------------------------------------
@@ -157,12 +159,14 @@ def linear_friction(coefficient, n: int, what: str) -> LinearFriction:
 # -- functions of a state and the time --------------------------------------------------------------------------------
 
 
-def timed(function: Callable, parts: int = 3) -> Callable:
+def add_time_argument(function: Callable, parts: int = 3) -> Callable:
     """A function of so many parts of a state, or of those and t, as one of those and t."""
     return LastArgumentIgnored(function) if required_argument_count(function) == parts else function
 
 
-def field(function, parts: tuple[tuple[int, ...], ...], shape: tuple[int, ...], what: str, at: str) -> Callable:
+def check_state_function(
+    function, parts: tuple[tuple[int, ...], ...], shape: tuple[int, ...], what: str, at: str
+) -> Callable:
     """A function of parts of a state, or of those and t, or a constant, as one of those and t, checked.
 
     Parameters
@@ -174,5 +178,9 @@ def field(function, parts: tuple[tuple[int, ...], ...], shape: tuple[int, ...], 
     what, at : str
         For messages: what it is, and of what.
     """
-    found = timed(function, len(parts)) if callable(function) else ConstantFunction(check_numbers(function, what))
+    found = (
+        add_time_argument(function, len(parts))
+        if callable(function)
+        else ConstantFunction(check_numbers(function, what))
+    )
     return check_function_shape(found, (*parts, ()), [shape], what, at)[0]

@@ -21,9 +21,9 @@ from ..functions.checks import check_energy, mark_polynomial_degrees
 from ..functions.energy import Energy, make_energy
 from ..tracing.caching import memoize
 from ..tracing.interpret import evaluate_at_points
-from .base import TIMES, System
-from .baths import EntropyOfBaths, HeatBaths
-from .torque import checked_torque, name_of, torque_at, untouched_components
+from .base import TEST_TIMES, System
+from .baths import BathEntropy, HeatBaths
+from .torque import check_torque, evaluate_torque, torque_free_components, torque_name
 
 
 class LiePoissonSystem(System):
@@ -69,7 +69,7 @@ class LiePoissonSystem(System):
 
     Attributes
     ----------
-    place : (t, attitude) or None
+    torque_arguments : (t, attitude) or None
         Where a torque is taken: see :meth:`at_time`.
 
     Raises
@@ -98,9 +98,9 @@ class LiePoissonSystem(System):
     group: mf.MatrixGroup | None = eqx.field(static=True)
     reconstruction: str | None = eqx.field(static=True)
     torque: Any
-    place: tuple[jax.Array, jax.Array | None] | None
-    turned_parts: tuple[bool, ...] = eqx.field(static=True)
-    untouched: tuple[int, ...] = eqx.field(static=True)
+    torque_arguments: tuple[jax.Array, jax.Array | None] | None
+    torques_need_attitude: tuple[bool, ...] = eqx.field(static=True)
+    torque_free_components: tuple[int, ...] = eqx.field(static=True)
 
     @property
     def lie_algebra(self) -> mf.LieAlgebra:
@@ -126,10 +126,12 @@ class LiePoissonSystem(System):
         if not isinstance(algebra, mf.LieAlgebra):
             raise InputError(f"the algebra must be a manifolds.LieAlgebra, not {type(algebra).__name__}")
         self.algebra = algebra
-        self.group, self.reconstruction = group, _checked_reconstruction(algebra, group, reconstruction)
-        self.torque, self.turned_parts = checked_torque(torque, algebra, group)
-        self.untouched = () if torque is None else untouched_components(self.torque, self.turned_parts, algebra, group)
-        self.place = None
+        self.group, self.reconstruction = group, _resolve_reconstruction(algebra, group, reconstruction)
+        self.torque, self.torques_need_attitude = check_torque(torque, algebra, group)
+        self.torque_free_components = (
+            () if torque is None else torque_free_components(self.torque, self.torques_need_attitude, algebra, group)
+        )
+        self.torque_arguments = None
         poisson = mf.LiePoisson(algebra)
         self._build(poisson, algebra.dim, energy, entropy, dissipation, momentum_maps, validate, baths=baths)
 
@@ -139,9 +141,9 @@ class LiePoissonSystem(System):
 
     def field(self, x, dH, dS, dL=()):
         """``ad*_dH (x + F) + force``: as for every system, with the forces that are coadjoint actions joined to one."""
-        push = self.push(x)
+        push = self.external_torque(x)
         if push is not None:
-            return self.left_alone().field(x, dH, dS, dL) + push
+            return self.drop_torque().field(x, dH, dS, dL) + push
         if self.dissipation is None or self.dissipation.added_momentum(dH, jnp.zeros_like(dH)) is None:
             return super().field(x, dH, dS, dL)
         action = self.algebra.action(dH)
@@ -150,35 +152,35 @@ class LiePoissonSystem(System):
 
     @property
     def inertia(self) -> np.ndarray | None:
-        if not _of_a_body(self.algebra) or is_traced(self.energy) or self.energy.depends_on_time:
+        if not _is_body_algebra(self.algebra) or is_traced(self.energy) or self.energy.depends_on_time:
             return None
         energy = self.drop_baths().energy
-        return _inertia(energy, self.algebra.dim) if energy.is_quadratic else None
+        return _inertia_tensor(energy, self.algebra.dim) if energy.is_quadratic else None
 
     # -- the torque -----------------------------------------------------------------------------------------------
 
     @property
-    def pushed_by(self) -> str:
-        return "" if self.torque is None else name_of(self.torque)
+    def torque_name(self) -> str:
+        return "" if self.torque is None else torque_name(self.torque)
 
     @property
     def has_impulse(self) -> bool:
         turned = self.algebra.dim if self.group is None else self.group.dim
-        return self.torque is not None and not set(range(turned)) <= set(self.untouched)
+        return self.torque is not None and not set(range(turned)) <= set(self.torque_free_components)
 
     @property
-    def casimirs_of_torque(self) -> frozenset[str]:
+    def torque_invariant_casimirs(self) -> frozenset[str]:
         if self.torque is None:
-            return super().casimirs_of_torque
-        return _on_components(self.algebra, self.algebra.basis_names, self.untouched)
+            return super().torque_invariant_casimirs
+        return _casimirs_of_components(self.algebra, self.algebra.basis_names, self.torque_free_components)
 
     @property
     def needs_attitude(self) -> bool:
-        return any(self.turned_parts)
+        return any(self.torques_need_attitude)
 
     @property
     def is_driven(self) -> bool:
-        return super().is_driven or (self.torque is not None and self.place is None)
+        return super().is_driven or (self.torque is not None and self.torque_arguments is None)
 
     def at_time(self, t, attitude=None):
         """The system at a time: its energy, and its torque, which may need the attitude, shape (m, m), too."""
@@ -187,37 +189,42 @@ class LiePoissonSystem(System):
             return found
         found = copy(found)
         place = jnp.asarray(t, dtype=jnp.float64), None if attitude is None else jnp.asarray(attitude)
-        object.__setattr__(found, "place", place)
+        object.__setattr__(found, "torque_arguments", place)
         return found
 
-    def at_some_times(self):
+    def systems_at_test_times(self):
         if not self.needs_attitude:
-            return super().at_some_times()
+            return super().systems_at_test_times()
         assert self.group is not None
-        attitudes = self.group.random(0, (len(TIMES),), scale=1.0)
-        return [self.at_time(t, attitude) for t, attitude in zip(TIMES, attitudes, strict=True)]
+        attitudes = self.group.random(0, (len(TEST_TIMES),), scale=1.0)
+        return [self.at_time(t, attitude) for t, attitude in zip(TEST_TIMES, attitudes, strict=True)]
 
-    def push(self, x):
+    def external_torque(self, x):
         if self.torque is None:
             return None
-        t, attitude = (None, None) if self.place is None else self.place
+        t, attitude = (None, None) if self.torque_arguments is None else self.torque_arguments
         if t is None or (attitude is None and self.needs_attitude):
             what = "time" if not self.needs_attitude else "time and the attitude"
             raise InputError(
-                f"the torque {self.pushed_by} is known at a {what}: take system.at_time(t"
+                f"the torque {self.torque_name} is known at a {what}: take system.at_time(t"
                 f"{', attitude' if self.needs_attitude else ''})"
             )
         if attitude is not None:  # XLA stops the process where it lays out many such matrices for products with vectors
             attitude = jax.lax.optimization_barrier(attitude)
         n = self.algebra.dim
-        found = torque_at(self.torque, self.turned_parts, t, x[:n].reshape(self.algebra.shape), attitude)
+        found = evaluate_torque(self.torque, self.torques_need_attitude, t, x[:n].reshape(self.algebra.shape), attitude)
         return jnp.pad(found.ravel(), (0, self.dim - n))
 
-    def left_alone(self):
+    def drop_torque(self):
         if self.torque is None:
             return self
         found = copy(self)
-        for name, value in {"torque": None, "turned_parts": (), "untouched": (), "place": None}.items():
+        for name, value in {
+            "torque": None,
+            "torques_need_attitude": (),
+            "torque_free_components": (),
+            "torque_arguments": None,
+        }.items():
             object.__setattr__(found, name, value)
         return found
 
@@ -225,28 +232,28 @@ class LiePoissonSystem(System):
     def entropy_law(self):
         """That of a torque beside an entropy of momenta is none; those of baths it does not touch."""
         law = super().entropy_law
-        return law if self.torque is None or isinstance(self.entropy, EntropyOfBaths) else None
+        return law if self.torque is None or isinstance(self.entropy, BathEntropy) else None
 
     def casimirs(self) -> dict[str, Energy]:
-        found = self.casimirs_of_momenta()
-        return found if self.baths is None else {name: self._of_body(C) for name, C in found.items()}
+        found = self.momentum_casimirs()
+        return found if self.baths is None else {name: self._extend_from_body(C) for name, C in found.items()}
 
-    def casimirs_of_momenta(self) -> dict[str, Energy]:
+    def momentum_casimirs(self) -> dict[str, Energy]:
         """:meth:`casimirs`, as functions of mu alone."""
-        return _recorded_casimirs(self.algebra, self.algebra.basis_names)
+        return _leading_casimirs(self.algebra, self.algebra.basis_names)
 
     @property
     def has_all_casimirs(self) -> bool:
         return _spans_all_casimirs(self.algebra)
 
     @property
-    def orbit(self) -> tuple[int, frozenset[str]]:
+    def orbit_levels(self) -> tuple[int, frozenset[str]]:
         if self.group is None:
-            return super().orbit
-        return self.group.dim, _on_the_first(self.algebra, self.algebra.basis_names, self.group.dim)
+            return super().orbit_levels
+        return self.group.dim, _casimirs_of_first(self.algebra, self.algebra.basis_names, self.group.dim)
 
 
-def _checked_reconstruction(algebra: mf.LieAlgebra, group, reconstruction: str | None) -> str | None:
+def _resolve_reconstruction(algebra: mf.LieAlgebra, group, reconstruction: str | None) -> str | None:
     """The way to reconstruct attitudes in a group of the algebra; None without a group."""
     if group is None:
         if reconstruction is not None:
@@ -254,20 +261,20 @@ def _checked_reconstruction(algebra: mf.LieAlgebra, group, reconstruction: str |
         return None
     if not isinstance(group, mf.MatrixGroup):
         raise InputError(f"the group must be a manifolds.MatrixGroup such as SO(3), not {type(group).__name__}")
-    if not _acts(group.algebra, algebra):
+    if not _extends_algebra(group.algebra, algebra):
         raise InputError(f"{group.name} is not a group of {algebra.name}: the structure constants differ")
     if reconstruction is None:
-        reconstruction = _best_reconstruction(group)
-    if reconstruction not in _MAPS:
-        raise InputError(f"the reconstruction is {', '.join(map(repr, _MAPS))}, not {reconstruction!r}")
-    group._require_map(_MAPS[reconstruction])
+        reconstruction = _default_reconstruction(group)
+    if reconstruction not in _RECONSTRUCTION_MAPS:
+        raise InputError(f"the reconstruction is {', '.join(map(repr, _RECONSTRUCTION_MAPS))}, not {reconstruction!r}")
+    group._require_map(_RECONSTRUCTION_MAPS[reconstruction])
     return reconstruction
 
 
-def _acts(own: mf.LieAlgebra, algebra: mf.LieAlgebra) -> bool:
+def _extends_algebra(own: mf.LieAlgebra, algebra: mf.LieAlgebra) -> bool:
     """Whether an algebra is a group's own, or the sum of that and an abelian one: of parts that turn inside a body."""
     n, more = own.dim, algebra.dim - own.dim
-    if more < 0 or (more > 0 and (len(algebra.shape) != 1 or algebra.dim > LARGEST_BODY)):
+    if more < 0 or (more > 0 and (len(algebra.shape) != 1 or algebra.dim > MAX_BODY_DIM)):
         return False
     if more == 0 and algebra.shape != own.shape:
         return False
@@ -276,21 +283,21 @@ def _acts(own: mf.LieAlgebra, algebra: mf.LieAlgebra) -> bool:
     return np.allclose(algebra.structure_constants, C, rtol=0.0, atol=1e-12)
 
 
-_MAPS = {"coadjoint": "adjoint_cayley", "cayley": "cayley", "exp": "exp"}
+_RECONSTRUCTION_MAPS = {"coadjoint": "adjoint_cayley", "cayley": "cayley", "exp": "exp"}
 """The map from the algebra to the group that a reconstruction takes its steps by."""
 
 
-def _best_reconstruction(group: mf.MatrixGroup) -> str:
+def _default_reconstruction(group: mf.MatrixGroup) -> str:
     """The one that keeps spatial momenta; else the cheapest that stays in the group."""
     if group.cayley_is_adjoint():
         return "cayley"
-    return next(kind for kind, map_ in _MAPS.items() if kind == "exp" or group._is_map_in_group(map_))
+    return next(kind for kind, map_ in _RECONSTRUCTION_MAPS.items() if kind == "exp" or group._is_map_in_group(map_))
 
 
 @memoize
-def _inertia(energy: Energy, dim: int) -> np.ndarray | None:
+def _inertia_tensor(energy: Energy, dim: int) -> np.ndarray | None:
     """The moments of inertia of a body with a quadratic energy of its momenta; None where it is no kinetic one."""
-    (gradient,), (squares,) = evaluate_at_points(_gradient_and_squares, energy, np.zeros((1, dim)))
+    (gradient,), (squares,) = evaluate_at_points(_gradient_and_hessian, energy, np.zeros((1, dim)))
     if np.linalg.eigvalsh(squares)[0] <= 0.0 or gradient.any():  # its inverse is that of the parts moving freely
         return None
     found = np.linalg.inv(squares)[:3, :3]
@@ -298,22 +305,22 @@ def _inertia(energy: Energy, dim: int) -> np.ndarray | None:
     return found
 
 
-def _gradient_and_squares(energy: Energy, x) -> tuple[jax.Array, jax.Array]:
+def _gradient_and_hessian(energy: Energy, x) -> tuple[jax.Array, jax.Array]:
     return energy.gradient(x), jax.jacfwd(energy.gradient)(x)
 
 
 @functools.lru_cache(maxsize=64)
-def _of_a_body(algebra: mf.LieAlgebra) -> bool:
+def _is_body_algebra(algebra: mf.LieAlgebra) -> bool:
     """Whether the algebra is so(3), or its sum with an abelian one: that of parts that turn inside a body."""
-    return algebra.dim >= 3 and _acts(mf.so(3), algebra)
+    return algebra.dim >= 3 and _extends_algebra(mf.so(3), algebra)
 
 
-LARGEST_BODY = 64
+MAX_BODY_DIM = 64
 """Components of the momentum of a body with parts inside, at most."""
 
 
 @functools.lru_cache(maxsize=64)
-def _recorded_casimirs(algebra: mf.LieAlgebra, names: tuple[str, ...] | None) -> dict[str, Energy]:
+def _leading_casimirs(algebra: mf.LieAlgebra, names: tuple[str, ...] | None) -> dict[str, Energy]:
     del names  # equal algebras may differ in the names of their basis elements, and their Casimirs print with those
     found: dict[str, Energy] = {}
     with jax.ensure_compile_time_eval():  # what is found while something is traced is kept for later
@@ -324,20 +331,22 @@ def _recorded_casimirs(algebra: mf.LieAlgebra, names: tuple[str, ...] | None) ->
 
 
 @functools.lru_cache(maxsize=64)
-def _on_the_first(algebra: mf.LieAlgebra, names: tuple[str, ...] | None, n: int) -> frozenset[str]:
+def _casimirs_of_first(algebra: mf.LieAlgebra, names: tuple[str, ...] | None, n: int) -> frozenset[str]:
     """Which of the recorded Casimirs depend on the first n components."""
     x = np.random.default_rng(0).standard_normal(algebra.dim)
     with jax.ensure_compile_time_eval():
-        found = _recorded_casimirs(algebra, names).items()
+        found = _leading_casimirs(algebra, names).items()
         return frozenset(name for name, C in found if bool(C.gradient(jnp.asarray(x))[:n].any()))
 
 
 @functools.lru_cache(maxsize=64)
-def _on_components(algebra: mf.LieAlgebra, names: tuple[str, ...] | None, places: tuple[int, ...]) -> frozenset[str]:
+def _casimirs_of_components(
+    algebra: mf.LieAlgebra, names: tuple[str, ...] | None, places: tuple[int, ...]
+) -> frozenset[str]:
     """Which of the recorded Casimirs depend on some components alone."""
     x, others = np.random.default_rng(0).standard_normal(algebra.dim), np.delete(np.arange(algebra.dim), places)
     with jax.ensure_compile_time_eval():
-        found = _recorded_casimirs(algebra, names).items()
+        found = _leading_casimirs(algebra, names).items()
         return frozenset(name for name, C in found if not bool(C.gradient(jnp.asarray(x))[others].any()))
 
 
@@ -345,7 +354,7 @@ def _on_components(algebra: mf.LieAlgebra, names: tuple[str, ...] | None, places
 def _spans_all_casimirs(algebra: mf.LieAlgebra) -> bool:
     """Whether the gradients of the recorded Casimirs span the kernel of the Poisson tensor at a random point."""
     found, x = (
-        _recorded_casimirs(algebra, algebra.basis_names).values(),
+        _leading_casimirs(algebra, algebra.basis_names).values(),
         np.random.default_rng(0).standard_normal(algebra.dim),
     )
     if not found or len(found) < algebra.casimir_count():

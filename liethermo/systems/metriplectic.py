@@ -15,7 +15,7 @@ from ..functions.checks import check_function_shape
 from .base import System
 from .baths import HeatBaths
 from .chart import ChartSystem
-from .check import MATRIX_DIM
+from .check import MAX_MATRIX_DIM
 from .embedded import EmbeddedSystem
 
 
@@ -103,7 +103,7 @@ class MetriplecticSystem(System):
         if dim is not None and dim != poisson.dim:
             raise InputError(f"dim is {dim}, but the Poisson structure has {poisson.dim} coordinates")
         dim = poisson.dim
-        if dim <= MATRIX_DIM:
+        if dim <= MAX_MATRIX_DIM:
             check_function_shape(
                 poisson.tensor, [(dim,)], [(dim, dim)], "the Poisson tensor", f"a state of shape ({dim},)"
             )
@@ -112,11 +112,11 @@ class MetriplecticSystem(System):
             check_function_shape(poisson.sharp, [(dim,), (dim,)], [(dim,)], "Pi(x) of a covector", at)
         self._build(poisson, poisson.dim, energy, entropy, dissipation, momentum_maps, validate, space, baths)
 
-    def local(self, x, centred: bool = False) -> tuple[System, jax.Array]:
+    def local_system(self, x, is_centred: bool = False) -> tuple[System, jax.Array]:
         """In the space around a manifold; where it has no equations, in the coordinates of its exponential map."""
         if self.space is None:
             return self, x
         if self.space.can_be_embedded:
             return EmbeddedSystem(self), x
         around = mf.coordinates_around(mf.RiemannianRetraction(self.space), self.points(x))
-        return ChartSystem(self, around, around.centre() if centred else None), jnp.zeros(self.space.dim)
+        return ChartSystem(self, around, around.centre() if is_centred else None), jnp.zeros(self.space.dim)

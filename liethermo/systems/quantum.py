@@ -38,14 +38,14 @@ from ..functions.density import (
 from ..functions.energy import Energy, Quadratic, Sum, TimeDependent
 from ..functions.gradients import EPS
 from ..functions.with_baths import BodyBathsEnergy
-from .base import TIMES, System
-from .baths import EntropyOfBaths, HeatBaths, beside_baths
-from .kinds import Decided
+from .base import TEST_TIMES, System
+from .baths import BathEntropy, HeatBaths, poisson_with_baths
+from .interface import InvariantVerdicts
 
-WITHIN = 1e-12
+DENSITY_MATRIX_TOLERANCE = 1e-12
 """How far a trace may be from one, and a density matrix from its adjoint, where it is given."""
 
-ZERO_ROUNDINGS = 8.0 * EPS
+ZERO_EIGENVALUE_PER_LEVEL = 8.0 * EPS
 """Size of an eigenvalue of a density matrix that is zero to rounding, times the number of levels."""
 
 
@@ -112,15 +112,15 @@ class QuantumSystem(System):
     ):
         if not isinstance(baths, HeatBaths | None):
             raise InputError(f"baths are lt.HeatBaths(...), not {type(baths).__name__}")
-        size, energy = _energy(hamiltonian)
+        size, energy = _hamiltonian_energy(hamiltonian)
         self.structure = structure = mf.DensityMatrices(size)
-        self.parts, self.names = _checked_parts(parts, names, size)
+        self.parts, self.names = _check_parts(parts, names, size)
         entropy = VonNeumann() if entropy is None else entropy
         if not isinstance(entropy, VonNeumann):
             raise InputError(f"the entropy of a density matrix is lt.VonNeumann(...), not {type(entropy).__name__}")
         self.floor = entropy.floor
         entropy = IsolatedVonNeumann(self.floor) if sum_dissipations(dissipation) is None else entropy
-        terms = [_on_density(part, structure) for part in _terms(dissipation)]
+        terms = [_bind_to_density(part, structure) for part in _dissipation_terms(dissipation)]
         if baths is not None and not any(isinstance(part, ThermalJumps) for part in terms):
             raise InputError("baths exchange heat by lt.ThermalJumps, and there are none: leave out baths=")
         n, m = structure.dim, 0 if baths is None else baths.number
@@ -128,11 +128,11 @@ class QuantumSystem(System):
         whole: Energy = entropy
         if baths is not None:
             self.baths = baths
-            poisson, energy = beside_baths(structure, m), BodyBathsEnergy(energy, baths.energy, n, n + m)
-            whole = Sum((entropy.on(range(n)), EntropyOfBaths(m)))
+            poisson, energy = poisson_with_baths(structure, m), BodyBathsEnergy(energy, baths.energy, n, n + m)
+            whole = Sum((entropy.on(range(n)), BathEntropy(m)))
         self._build(poisson, n + m, energy, whole, terms or None, {}, validate)
         if not self.preserved:  # whether an observable is kept by the motion is found out
-            self.decided = Decided(frozenset(self.casimirs()), frozenset())
+            self.invariant_verdicts = InvariantVerdicts(frozenset(self.casimirs()), frozenset())
 
     # -- states -------------------------------------------------------------------------------------------------------
 
@@ -157,7 +157,7 @@ class QuantumSystem(System):
         rho = rho.full() if isinstance(rho, HasMatrix) else rho
         if isinstance(rho, jax.core.Tracer) or (np.shape(rho)[-1:] == (self.dim,) and not self._is_matrix(rho, batch)):
             return super().state(rho, batch)
-        matrices = self._checked(np.asarray(rho), mixed)
+        matrices = self._check_density(np.asarray(rho), mixed)
         front, m = matrices.shape[:-2], self.dim - self.body_dim
         y = np.zeros((*front, m)) if entropies is None else np.asarray(entropies, dtype=np.float64)
         if y.shape[-1:] != (m,):
@@ -165,12 +165,12 @@ class QuantumSystem(System):
         x = np.asarray(self.structure.vector(matrices))
         return jnp.asarray(np.concatenate([x, np.broadcast_to(y, (*front, m))], axis=-1))
 
-    def numbers(self, x, batch: bool = False):
+    def state_array(self, x, batch: bool = False):
         """What :meth:`state` makes of x; a matrix or a ket stands for the state with every bath at entropy zero."""
         x = x.full() if isinstance(x, HasMatrix) else x
         if not isinstance(x, jax.core.Tracer) and (self._is_matrix(x, batch) or self._is_ket(x)):
             x = np.asarray(self.state(x))
-        return super().numbers(x, batch)
+        return super().state_array(x, batch)
 
     def _is_ket(self, x) -> bool:
         """Whether it is the amplitudes of one pure state; of one level they look like a state."""
@@ -233,25 +233,25 @@ class QuantumSystem(System):
         off = rho[..., 0, 1]
         return jnp.stack([2.0 * off.real, -2.0 * off.imag, (rho[..., 0, 0] - rho[..., 1, 1]).real], axis=-1)
 
-    def _checked(self, rho: np.ndarray, mixed: float) -> np.ndarray:
+    def _check_density(self, rho: np.ndarray, mixed: float) -> np.ndarray:
         size = self.structure.size
         if rho.dtype.kind not in "fiuc":
             raise InputError(f"a density matrix is an array of numbers, not of {rho.dtype}")
         if not np.isfinite(rho).all():
             raise InputError("the density matrix is not finite")
         if rho.shape == (size,) or (size > 1 and rho.shape[-2:] == (size, 1)):
-            rho = self._of_ket(rho[:, None] if rho.ndim == 1 else rho)
+            rho = self._density_of_kets(rho[:, None] if rho.ndim == 1 else rho)
         if rho.shape[-2:] != (size, size):
             raise InputError(
                 f"a density matrix of this system has shape ({size}, {size}), not {rho.shape}; a ket has the shape "
                 f"({size},) or ({size}, 1)"
             )
         asymmetry = float(np.abs(rho - adjoint(rho)).max())
-        if asymmetry > WITHIN:
+        if asymmetry > DENSITY_MATRIX_TOLERANCE:
             raise InputError(f"the density matrix is not Hermitian: it differs from its adjoint by {asymmetry:.3g}")
         trace = np.trace(rho, axis1=-2, axis2=-1).real
         worst = float(trace.ravel()[np.argmax(np.abs(trace - 1.0))])
-        if abs(worst - 1.0) > WITHIN:
+        if abs(worst - 1.0) > DENSITY_MATRIX_TOLERANCE:
             raise InputError(f"the density matrix has the trace {worst:.15g}, not 1: divide it by that")
         least = float(np.linalg.eigvalsh(rho)[..., 0].min())
         if least < -NEGATIVE_EIGENVALUE_LIMIT:
@@ -260,11 +260,11 @@ class QuantumSystem(System):
             raise InputError(f"mixed is a share of the identity, from 0 to 1, not {mixed!r}")
         return (1.0 - mixed) * rho + mixed * np.eye(size) / size
 
-    def _of_ket(self, ket: np.ndarray) -> np.ndarray:
+    def _density_of_kets(self, ket: np.ndarray) -> np.ndarray:
         """The density matrices of pure states, shape (..., N, 1) to (..., N, N)."""
         norms = np.linalg.norm(ket, axis=-2)
         worst = float(norms.ravel()[np.argmax(np.abs(norms - 1.0))])
-        if abs(worst - 1.0) > WITHIN:
+        if abs(worst - 1.0) > DENSITY_MATRIX_TOLERANCE:
             raise InputError(f"the ket has the norm {worst:.15g}, not 1: divide it by that")
         ket = ket / norms[..., None]
         return ket @ adjoint(ket)
@@ -283,7 +283,7 @@ class QuantumSystem(System):
     def outside(self, x) -> str:
         if is_traced(self):
             return ""
-        rho = self._matrices(x)
+        rho = self._density_matrices(x)
         traces = np.trace(rho, axis1=-2, axis2=-1).real
         trace = traces[np.abs(traces - 1.0).argmax()]
         if not abs(trace - 1.0) <= 1e-9:
@@ -294,19 +294,19 @@ class QuantumSystem(System):
                 f"its density matrix has the eigenvalue {least:.3g}, outside the cone of positive matrices: a shorter "
                 "step stays inside"
             )
-        return self._why_rank_grows(np.atleast_2d(x), rho) if self._has(SteepestEntropyAscent) else ""
+        return self._why_rank_grows(np.atleast_2d(x), rho) if self._has_dissipation(SteepestEntropyAscent) else ""
 
     def _why_rank_grows(self, x: np.ndarray, rho: np.ndarray) -> str:
         """Why eigenvalues that are zero would not stay zero under steepest ascent, in words; empty where they do."""
         kernels = self._kernels(rho)
         use = [i for i, kernel in enumerate(kernels) if kernel.size]
-        turned = [self._is_turned(rho[i], kernels[i]) for i in use]
+        turned = [self._is_kernel_rotated(rho[i], kernels[i]) for i in use]
         mix = "mix it, as in q.state(rho, mixed=1e-6)"
         if self.floor > 0.0:
             text = "eigenvalues of its density matrix are zero, and the Hamiltonian turns their eigenvectors: the ends "
             text += f"of steps have others, by the error of a step, which steepest ascent lets grow: {mix}"
             return text if any(turned) else ""
-        grows = [self._population_at_rest(x[i], kernels[i]) > self._zero for i in use]
+        grows = [self._equilibrium_population(x[i], kernels[i]) > self._zero_eigenvalue_limit for i in use]
         if not any(grows):
             return ""
         first = grows.index(True)
@@ -316,34 +316,39 @@ class QuantumSystem(System):
             f"of the entropy is infinite: {mix}{'' if turned[first] else floor}"
         )
 
-    def _is_turned(self, rho: np.ndarray, kernel: np.ndarray) -> bool:
+    def _is_kernel_rotated(self, rho: np.ndarray, kernel: np.ndarray) -> bool:
         """Whether the Hamiltonian turns a kernel, shape (N, r), which is as exact as the least eigenvalue outside."""
         outside = np.eye(len(rho)) - kernel @ adjoint(kernel)
         p = np.linalg.eigvalsh(rho)
-        blurred = p[p > self._zero].min()
+        blurred = p[p > self._zero_eigenvalue_limit].min()
         return any(np.abs(outside @ H @ kernel).max() > energy_rounding(H) / blurred for H in self.hamiltonians())
 
-    def _population_at_rest(self, x: np.ndarray, kernel: np.ndarray) -> float:
+    def _equilibrium_population(self, x: np.ndarray, kernel: np.ndarray) -> float:
         """About the largest population that a state in the kernel, shape (N, r), has where steepest ascent ends.
 
         There ``-ln rho - 1`` is a combination of the gradients of what is preserved: the one that fits best outside.
         """
         assert self.dissipation is not None
         part = next(part for part in self.dissipation.terms if isinstance(part, SteepestEntropyAscent))
-        dS, dL = VonNeumann(self._zero).gradient(x[: self.body_dim]), tuple(L.gradient(x) for L in part.preserve)
+        dS, dL = (
+            VonNeumann(self._zero_eigenvalue_limit).gradient(x[: self.body_dim]),
+            tuple(L.gradient(x) for L in part.preserve),
+        )
         affinity = np.asarray(self.structure.matrix(part.ascent_direction(self, x, self.energy.gradient(x), dS, dL)))
         return float(np.exp(np.linalg.eigvalsh(adjoint(kernel) @ affinity @ kernel)[-1] - 1.0))
 
-    def singular(self, x) -> str:
-        if is_traced(self) or not self._has(ThermalJumps):
+    def why_singular(self, x) -> str:
+        if is_traced(self) or not self._has_dissipation(ThermalJumps):
             return ""
-        x, rho = np.atleast_2d(x), self._matrices(x)
+        x, rho = np.atleast_2d(x), self._density_matrices(x)
         kernels = self._kernels(rho)
         use = [i for i, kernel in enumerate(kernels) if kernel.size]
         if not use:
             return ""
-        filled, emptied = self._rates_of_jumps(x[use], [kernels[i] for i in use])
-        grows = np.flatnonzero(filled > self._zero * emptied)  # beyond rounding of the population that is at rest
+        filled, emptied = self._jump_rates(x[use], [kernels[i] for i in use])
+        grows = np.flatnonzero(
+            filled > self._zero_eigenvalue_limit * emptied
+        )  # beyond rounding of the population that is at rest
         if not grows.size:
             return ""
         least = np.linalg.eigvalsh(rho[use[grows[0]]])[0]
@@ -353,47 +358,47 @@ class QuantumSystem(System):
             f"entropy is infinite: mix it, as in q.state(rho, mixed=1e-6){otherwise}"
         )
 
-    def _rates_of_jumps(self, x: np.ndarray, kernels: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    def _jump_rates(self, x: np.ndarray, kernels: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """How fast jumps fill kernels of states, and how fast they move all states and empty these; shapes (m,)."""
         assert self.dissipation is not None
         parts = [part for part in self.dissipation.terms if isinstance(part, ThermalJumps)]
 
-        def moved(x, rho):  # at the temperatures of x
+        def jump_rate(x, rho):  # at the temperatures of x
             y = jnp.concatenate([self.structure.vector(rho), x[self.body_dim :]])
             return sum(part.generator_field(self, y, self.energy.gradient(x))[: self.body_dim] for part in parts)
 
         projectors = np.stack([kernel @ adjoint(kernel) for kernel in kernels])
         changes, of_kernels = (
-            np.asarray(self.structure.matrix(jax.vmap(moved)(jnp.asarray(x), jnp.asarray(matrices))))
-            for matrices in (self._matrices(x), projectors)
+            np.asarray(self.structure.matrix(jax.vmap(jump_rate)(jnp.asarray(x), jnp.asarray(matrices))))
+            for matrices in (self._density_matrices(x), projectors)
         )
         pairs = zip(changes, kernels, strict=True)
         filled = np.array([np.linalg.eigvalsh(adjoint(kernel) @ change @ kernel)[-1] for change, kernel in pairs])
         return filled, sum(np.linalg.norm(a, 2, axis=(-2, -1)) for a in (changes, of_kernels))
 
-    def _matrices(self, x) -> np.ndarray:
+    def _density_matrices(self, x) -> np.ndarray:
         """The density matrices of a state or of several, shape (m, N, N)."""
         return np.asarray(self.structure.matrix(np.atleast_2d(x)[:, : self.body_dim]))
 
     @property
-    def _zero(self) -> float:
+    def _zero_eigenvalue_limit(self) -> float:
         """The largest eigenvalue of a density matrix that is zero: up to rounding, or to the floor of the entropy."""
-        return max(self.floor, ZERO_ROUNDINGS * self.structure.size)
+        return max(self.floor, ZERO_EIGENVALUE_PER_LEVEL * self.structure.size)
 
     def _kernels(self, rho: np.ndarray) -> list[np.ndarray]:
         """The eigenvectors whose eigenvalue is zero of matrices, shape (m, N, N), each of a shape (N, r)."""
-        return [vectors[:, p <= self._zero] for p, vectors in zip(*np.linalg.eigh(rho), strict=True)]
+        return [vectors[:, p <= self._zero_eigenvalue_limit] for p, vectors in zip(*np.linalg.eigh(rho), strict=True)]
 
-    def _has(self, kind: type[Dissipation]) -> bool:
+    def _has_dissipation(self, kind: type[Dissipation]) -> bool:
         return self.dissipation is not None and any(isinstance(part, kind) for part in self.dissipation.terms)
 
-    spectral = True
+    has_matrix_functions = True
 
     # -- laws ---------------------------------------------------------------------------------------------------------
 
     def hamiltonians(self) -> list[np.ndarray]:
         """The Hamiltonian, at a few times where it depends on one."""
-        n, energies = self.body_dim, [s.energy for s in (self.at_some_times() if self.is_driven else [self])]
+        n, energies = self.body_dim, [s.energy for s in (self.systems_at_test_times() if self.is_driven else [self])]
         energies = [E.body if isinstance(E, BodyBathsEnergy) else E for E in energies]  # temperatures may be traced
         with jax.ensure_compile_time_eval():
             origin, one = jnp.zeros(n), np.eye(self.structure.size)
@@ -421,17 +426,17 @@ class QuantumSystem(System):
                     raise InputError(
                         f"{type(part).__name__} of a part is none of a product: give it to the product as a whole"
                     )
-                local = [_beside(np.asarray(V), k, sizes) for V in part.operators]
+                local = [_tensor_with_identity(np.asarray(V), k, sizes) for V in part.operators]
                 terms.append(part.replace_operators(local, part.bath + offset))
             offset += 0 if s.baths is None else s.baths.number
         if (self.baths is None) != (other.baths is None) and all(s.dissipation is not None for s in systems):
             raise InputError("jumps of one part have a bath and those of the other none: give both, or neither, baths")
         H = [s._constant_hamiltonian() for s in systems]
-        whole = _beside(H[0], 0, sizes) + _beside(H[1], 1, sizes)
+        whole = _tensor_with_identity(H[0], 0, sizes) + _tensor_with_identity(H[1], 1, sizes)
         parts = self.parts + other.parts
         names = self.names + other.names if len(self.names + other.names) == len(parts) else ()
         names = names if len(set(names)) == len(names) else ()
-        baths, floor = _joined(self.baths, other.baths), max(self.floor, other.floor)
+        baths, floor = _join_baths(self.baths, other.baths), max(self.floor, other.floor)
         return QuantumSystem(whole, terms or None, baths, VonNeumann(floor), parts, names)
 
     def coupled(self, interaction) -> QuantumSystem:
@@ -452,13 +457,14 @@ class QuantumSystem(System):
         return self.hamiltonians()[0]
 
 
-def _energy(hamiltonian) -> tuple[int, Energy]:
+def _hamiltonian_energy(hamiltonian) -> tuple[int, Energy]:
     """The size of a Hamiltonian, and ``tr(rho H)`` of coordinates."""
-    if isinstance(hamiltonian, list | tuple) and any(map(_is_term, hamiltonian)):
-        return _sum_of_terms(hamiltonian)
+    if isinstance(hamiltonian, list | tuple) and any(map(_is_hamiltonian_term, hamiltonian)):
+        return _energy_of_terms(hamiltonian)
     if callable(hamiltonian) and not isinstance(hamiltonian, HasMatrix):
         matrices = [
-            checked_hermitian(_at(hamiltonian, t, "the Hamiltonian"), f"the Hamiltonian at t = {t:.3g}") for t in TIMES
+            checked_hermitian(_value_at_time(hamiltonian, t, "the Hamiltonian"), f"the Hamiltonian at t = {t:.3g}")
+            for t in TEST_TIMES
         ]
         structure = mf.DensityMatrices(len(matrices[0]))
         with jax.ensure_compile_time_eval():  # a number, while a family of systems is traced
@@ -476,7 +482,7 @@ def _energy(hamiltonian) -> tuple[int, Energy]:
     return len(H), MeanEnergy(b, common)
 
 
-def _at(function, t: float, what: str):
+def _value_at_time(function, t: float, what: str):
     """What a function gives at a time; refused where it is none of one argument."""
     try:
         inspect.signature(function).bind(t)
@@ -487,14 +493,14 @@ def _at(function, t: float, what: str):
     return function(t)
 
 
-def _is_term(part) -> bool:
+def _is_hamiltonian_term(part) -> bool:
     """Whether it is a matrix, or begins with one, and not a row of numbers."""
     if isinstance(part, list | tuple):
-        return bool(part) and (isinstance(part[0], list | tuple) or _is_term(part[0]))
+        return bool(part) and (isinstance(part[0], list | tuple) or _is_hamiltonian_term(part[0]))
     return isinstance(part, HasMatrix) or np.ndim(part) == 2
 
 
-def _sum_of_terms(given: Sequence) -> tuple[int, Energy]:
+def _energy_of_terms(given: Sequence) -> tuple[int, Energy]:
     """The same for ``[H0, (H1, f), ...]``."""
     constant: list[np.ndarray] = []
     moved: list[np.ndarray] = []
@@ -502,7 +508,7 @@ def _sum_of_terms(given: Sequence) -> tuple[int, Energy]:
     for i, part in enumerate(given):
         pair = isinstance(part, list | tuple) and len(part) == 2 and callable(part[1])
         H, f = part if pair else (part, None)
-        if isinstance(H, list | tuple) and H and _is_term(H[0]):
+        if isinstance(H, list | tuple) and H and _is_hamiltonian_term(H[0]):
             raise InputError(f"term {i} of the Hamiltonian is a matrix, or a pair of a matrix and a function of t")
         H = checked_hermitian(H, f"term {i} of the Hamiltonian")
         if H.shape != (first := (constant + moved + [H])[0]).shape:
@@ -510,7 +516,7 @@ def _sum_of_terms(given: Sequence) -> tuple[int, Energy]:
         if f is None:
             constant.append(H)
             continue
-        value = _at(f, TIMES[0], f"the second of term {i} of the Hamiltonian")
+        value = _value_at_time(f, TEST_TIMES[0], f"the second of term {i} of the Hamiltonian")
         if np.shape(value) or jnp.result_type(value).kind not in "fiu":
             raise InputError(f"the function of term {i} of the Hamiltonian gives a real number, not {value!r}")
         moved.append(H)
@@ -523,12 +529,12 @@ def _sum_of_terms(given: Sequence) -> tuple[int, Energy]:
         return structure.size, MeanEnergy(still, common)
     at_start = still
     for f, row in zip(functions, rows, strict=True):
-        at_start = at_start + f(TIMES[0]) * row
+        at_start = at_start + f(TEST_TIMES[0]) * row
     lowest = jnp.min(at_start[: structure.size])  # in the same way where a function is traced
     return structure.size, TimeDependent(ModulatedExpectationValue(still, tuple(rows), tuple(functions), lowest))
 
 
-def _terms(dissipation) -> tuple[Dissipation, ...]:
+def _dissipation_terms(dissipation) -> tuple[Dissipation, ...]:
     found = sum_dissipations(dissipation)
     terms = () if found is None else found.terms
     for part in terms:
@@ -540,11 +546,11 @@ def _terms(dissipation) -> tuple[Dissipation, ...]:
     return terms
 
 
-def _on_density(part: Dissipation, structure: mf.DensityMatrices) -> Dissipation:
+def _bind_to_density(part: Dissipation, structure: mf.DensityMatrices) -> Dissipation:
     return part.bind_to_structure(structure) if isinstance(part, SteepestEntropyAscent) else part
 
 
-def _checked_parts(parts, names, size: int) -> tuple[tuple[int, ...], tuple[str, ...]]:
+def _check_parts(parts, names, size: int) -> tuple[tuple[int, ...], tuple[str, ...]]:
     parts = (size,) if parts is None else tuple(int(n) for n in parts)
     if math.prod(parts) != size or min(parts) < 1:
         raise InputError(f"the parts have the sizes {parts}, whose product is not {size}")
@@ -554,12 +560,12 @@ def _checked_parts(parts, names, size: int) -> tuple[tuple[int, ...], tuple[str,
     return parts, names
 
 
-def _beside(matrix: np.ndarray, k: int, sizes: Sequence[int]) -> np.ndarray:
+def _tensor_with_identity(matrix: np.ndarray, k: int, sizes: Sequence[int]) -> np.ndarray:
     """An operator of one of two systems as one of both."""
     return np.kron(matrix, np.eye(sizes[1])) if k == 0 else np.kron(np.eye(sizes[0]), matrix)
 
 
-def _joined(one: HeatBaths | None, other: HeatBaths | None) -> HeatBaths | None:
+def _join_baths(one: HeatBaths | None, other: HeatBaths | None) -> HeatBaths | None:
     if one is None or other is None:
         return one or other
     kinds = BathEnergy | ReservoirEnergy

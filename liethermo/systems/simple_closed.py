@@ -19,12 +19,12 @@ from ..errors import InputError
 from ..functions.arguments import required_argument_count
 from ..functions.energy import Energy
 from ..tracing.interpret import evaluate_at_points
-from .evolution import configurations, entropy_component, in_one_array, states_on
-from .herglotz import OnVelocities
-from .ledger import ForcesAndHeat, WithLedger, field, linear_friction
+from .evolution import configuration_space, entropy_component, join_arguments, state_space
+from .herglotz import VelocityContactSystem
+from .ledger import ForcesAndHeat, LedgerSystem, check_state_function, linear_friction
 
 
-class SimpleClosedSystem(WithLedger, OnVelocities):
+class SimpleClosedSystem(LedgerSystem, VelocityContactSystem):
     """A simple closed system: a Lagrangian L(q, v, S), friction, an external force and heat from outside [GBY 2.4].
 
     ``d/dt L_v - L_q = F_ext + F_fr`` and ``T S' = P_H - F_fr . v``, ``T = -L_S > 0``, on R^n or a manifold. The energy
@@ -95,11 +95,13 @@ class SimpleClosedSystem(WithLedger, OnVelocities):
         validate: bool = True,
         space: mf.Space | None = None,
     ):
-        structure, size, energy = self._prepare(lagrangian_of(lagrangian, space), dim, space)
+        structure, size, energy = self._build_contact_structure(
+            join_lagrangian_arguments(lagrangian, space), dim, space
+        )
         at = (size // 2,) if space is None else space.shape
-        self.friction = _force(friction, at, "friction")
-        self.external = None if external is None else _field(external, at, at, "the external force")
-        self.heat_power = None if heat_power is None else _field(heat_power, at, (), "the heat power")
+        self.friction = _make_friction(friction, at, "friction")
+        self.external = None if external is None else _check_flat_function(external, at, at, "the external force")
+        self.heat_power = None if heat_power is None else _check_flat_function(heat_power, at, (), "the heat power")
         given = (self.friction, self.external, self.heat_power)
         forces = None if given == (None, None, None) else ForcesAndHeat(*given)
         self._assemble(structure, size, energy, forces, momentum_maps, validate)
@@ -107,9 +109,9 @@ class SimpleClosedSystem(WithLedger, OnVelocities):
     def _assemble(
         self, structure, size: int, energy: Energy, forces: ForcesAndHeat | None, momentum_maps, validate
     ) -> None:
-        whole, total, energy = self._beside_ledger(structure, size, energy)
+        whole, total, energy = self._append_ledger(structure, size, energy)
         entropy = entropy_component(total, size - 1)
-        states = states_on(configurations(structure.contact), total - size)
+        states = state_space(configuration_space(structure.contact), total - size)
         self._build(whole, total, energy, entropy, forces, momentum_maps, validate, states)
 
     # -- the state --------------------------------------------------------------------------------------------------
@@ -121,45 +123,49 @@ class SimpleClosedSystem(WithLedger, OnVelocities):
 
     @property
     def degrees_of_freedom(self) -> int:
-        return self.own_size // 2
+        return self.dim_without_ledger // 2
 
-    def along(self, q, v) -> jax.Array:
+    def tangential_part(self, q, v) -> jax.Array:
         """The part of a velocity or a force at q that is along Q, shape (n,); itself on R^n."""
         return self.contact.tangential_part(q, v)
 
-    def parts(self, x) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    def split_state(self, x) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         """q, v, S and t of one state; t = 0 where it has none."""
         n = self.degrees_of_freedom
-        return x[:n], x[n : 2 * n], x[2 * n], self.time_of(x)
+        return x[:n], x[n : 2 * n], x[2 * n], self.state_time(x)
 
     def legendre(self, x) -> jax.Array:
         """``FL(q, v, S) = (q, L_v, S)`` at a state or a batch of states, shape (..., 2n + 1)."""
-        return jnp.vectorize(self.contact.legendre, signature="(n)->(n)")(self._mechanical(x))
+        return jnp.vectorize(self.contact.legendre, signature="(n)->(n)")(self._drop_ledger(x))
 
     def temperature(self, x) -> jax.Array:
         """``T = -L_S``, shape (...)."""
-        return jnp.vectorize(lambda y: -self.lagrangian.gradient(y)[-1], signature="(n)->()")(self._mechanical(x))
+        return jnp.vectorize(lambda y: -self.lagrangian.gradient(y)[-1], signature="(n)->()")(self._drop_ledger(x))
 
-    def own_energy(self, x) -> jax.Array:
+    def mechanical_energy(self, x) -> jax.Array:
         """``E = v·L_v - L``, without the ledger, shape (...)."""
-        return jnp.vectorize(self.contact.energy, signature="(n)->()")(self._mechanical(x))
+        return jnp.vectorize(self.contact.energy, signature="(n)->()")(self._drop_ledger(x))
 
-    def _mechanical(self, x) -> jax.Array:
-        return self.state(x, batch=True)[..., : self.own_size]
+    def _drop_ledger(self, x) -> jax.Array:
+        return self.state(x, batch=True)[..., : self.dim_without_ledger]
 
     # -- the functions, at one point ----------------------------------------------------------------------------------
 
-    def action(self, q, v, S) -> jax.Array:
+    def lagrangian_value(self, q, v, S) -> jax.Array:
         """``L(q, v, S)``."""
         return self.lagrangian.value(jnp.concatenate([q, v, jnp.reshape(S, 1)]))
 
     def momentum(self, q, v, S) -> jax.Array:
         """``L_v``, shape (n,)."""
-        return jax.grad(self.action, argnums=1)(q, v, S)
+        return jax.grad(self.lagrangian_value, argnums=1)(q, v, S)
 
     def friction_force(self, q, v, S, t) -> jax.Array:
         """F_fr, shape (n,)."""
-        return jnp.zeros_like(v) if self.friction is None else self.along(q, jnp.asarray(self.friction(q, v, S, t)))
+        return (
+            jnp.zeros_like(v)
+            if self.friction is None
+            else self.tangential_part(q, jnp.asarray(self.friction(q, v, S, t)))
+        )
 
     def friction_at(self, q, v, S, t, T) -> jax.Array:
         """F_fr where a discretisation has the temperature T, shape (n,)."""
@@ -167,7 +173,11 @@ class SimpleClosedSystem(WithLedger, OnVelocities):
 
     def external_force(self, q, v, S, t) -> jax.Array:
         """F_ext, shape (n,)."""
-        return jnp.zeros_like(v) if self.external is None else self.along(q, jnp.asarray(self.external(q, v, S, t)))
+        return (
+            jnp.zeros_like(v)
+            if self.external is None
+            else self.tangential_part(q, jnp.asarray(self.external(q, v, S, t)))
+        )
 
     def heating(self, q, v, S, t) -> jax.Array:
         """P_H."""
@@ -176,18 +186,18 @@ class SimpleClosedSystem(WithLedger, OnVelocities):
     # -- what ForcesAndHeat asks for ----------------------------------------------------------------------------------
 
     @property
-    def first_velocity(self) -> int:
+    def first_velocity_index(self) -> int:
         return self.degrees_of_freedom
 
-    def along_at(self, x, covector) -> jax.Array:
-        return self.along(x[: self.degrees_of_freedom], covector)
+    def tangential_covector(self, x, covector) -> jax.Array:
+        return self.tangential_part(x[: self.degrees_of_freedom], covector)
 
-    def inertia_at(self, x) -> tuple[jax.Array, jax.Array]:
-        _, W, by_S = self.contact.rates(x[: self.own_size])
+    def momentum_jacobians(self, x) -> tuple[jax.Array, jax.Array]:
+        _, W, by_S = self.contact.rates(x[: self.dim_without_ledger])
         return W, by_S[:, 0]
 
-    def acted_on(self, x, v, T) -> tuple[jax.Array, jax.Array, jax.Array]:
-        q, _, S, t = self.parts(x)
+    def forces_and_power(self, x, v, T) -> tuple[jax.Array, jax.Array, jax.Array]:
+        q, _, S, t = self.split_state(x)
         at = q, v, S, t
         return self.friction_at(*at, T), self.external_force(*at), self.heating(*at)
 
@@ -200,8 +210,8 @@ class SimpleClosedSystem(WithLedger, OnVelocities):
     def domain_margin(self, x):
         return self.temperature(x)
 
-    def own_residuals(self, x) -> dict[str, jax.Array]:
-        q, v, S, t = self.parts(x)
+    def specific_residuals(self, x) -> dict[str, jax.Array]:
+        q, v, S, t = self.split_state(x)
         force = self.friction_force(q, v, S, t)
         size = jnp.linalg.norm(force) * jnp.linalg.norm(v)
         injected = jnp.maximum(jnp.dot(force, v), 0.0)
@@ -215,22 +225,22 @@ def _temperature(system: SimpleClosedSystem, x):
 # -- arguments --------------------------------------------------------------------------------------------------------
 
 
-def lagrangian_of(lagrangian, space: mf.Space | None = None):
+def join_lagrangian_arguments(lagrangian, space: mf.Space | None = None):
     """A Lagrangian as a function of one array."""
     if callable(lagrangian) and not isinstance(lagrangian, Energy) and required_argument_count(lagrangian) == 4:
         raise InputError(
             "the Lagrangian of a simple closed system is one of (q, v, S); what depends on time is external"
         )
-    return in_one_array(lagrangian, space)
+    return join_arguments(lagrangian, space)
 
 
-def _force(friction, at: tuple[int, ...], what: str) -> Callable | None:
+def _make_friction(friction, at: tuple[int, ...], what: str) -> Callable | None:
     if friction is None or callable(friction):
-        return None if friction is None else _field(friction, at, at, what)
+        return None if friction is None else _check_flat_function(friction, at, at, what)
     return linear_friction(friction, math.prod(at), f"a coefficient of {what}")
 
 
-class InOneRow(Module):
+class FlattenedFunction(Module):
     """A function of arrays q and v as one of their entries in a row; and so are its values."""
 
     function: Callable
@@ -241,7 +251,7 @@ class InOneRow(Module):
         return found.ravel() if found.ndim else found
 
 
-def _field(function, at: tuple[int, ...], shape: tuple[int, ...], what: str) -> Callable:
+def _check_flat_function(function, at: tuple[int, ...], shape: tuple[int, ...], what: str) -> Callable:
     """As a function of (q, v, S, t), whose shape has been checked; q and v of shape ``at``, and flat in the result."""
-    checked = field(function, (at, at, ()), shape, what, f"(q, v, S), q and v of shape {at}")
-    return checked if len(at) == 1 else InOneRow(checked, at)
+    checked = check_state_function(function, (at, at, ()), shape, what, f"(q, v, S), q and v of shape {at}")
+    return checked if len(at) == 1 else FlattenedFunction(checked, at)

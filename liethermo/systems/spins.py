@@ -24,10 +24,10 @@ from ..functions.magnetism import lattice_shape
 from ..functions.on_spaces import flatten_site_functions
 from ..functions.planes import interaction_range, planar_energy, to_planes, to_sites
 from ..functions.spheres import HalfSumOfSquares, Spheres
-from .base import Arranged, System
-from .baths import HeatBaths, beside_baths
+from .base import ReorderedSystem, System
+from .baths import HeatBaths, poisson_with_baths
 
-LENGTHS = "sum |s|^2 / 2"
+SPIN_LENGTHS_NAME = "sum |s|^2 / 2"
 
 
 class SpinSystem(System):
@@ -72,7 +72,7 @@ class SpinSystem(System):
         poisson = mf.Spins(self.lattice, ratio=ratio)
         self._build(poisson, poisson.dim, energy, None, dissipation, momentum_maps, validate, baths=baths)
 
-    def on_states(self, energy: Energy) -> Energy:
+    def energy_of_vectors(self, energy: Energy) -> Energy:
         return flatten_site_functions(energy, (*self.lattice, 3))
 
     @property
@@ -81,8 +81,8 @@ class SpinSystem(System):
 
     def field(self, x, dH, dS, dL=()):
         """As for every system, the motion and the damping of the spins joined before they become a state's."""
-        damping, heating = _damping(self.dissipation)
-        spins, n = self._spins, self.body_dim
+        damping, heating = _split_damping(self.dissipation)
+        spins, n = self._spin_structure, self.body_dim
         if damping is None or spins is None:
             return super().field(x, dH, dS, dL)
         if heating is None:
@@ -97,7 +97,7 @@ class SpinSystem(System):
 
     def scale_at_sites(self, values, v) -> jax.Array:
         """A vector v times ``values``: a number for each site, or one."""
-        spins = self._spins
+        spins = self._spin_structure
         assert spins is not None
         return (
             spins.join_state(scale_vectors(values, spins.split_covectors(v)), jnp.zeros(0))
@@ -106,22 +106,22 @@ class SpinSystem(System):
         )
 
     def dot_at_sites(self, alpha, v) -> jax.Array:
-        spins = self._spins
+        spins = self._spin_structure
         assert spins is not None
         return dot_vectors(spins.split_covectors(alpha), spins.split_covectors(v))
 
-    def turned_back(self, angles, v) -> jax.Array:
+    def solve_rotation(self, angles, v) -> jax.Array:
         """The u with ``u_i - angles_i x u_i = v_i`` at each spin, angles of shape (sites, 3); behind them it is v.
 
         ``u = (v + a x v + (a . v) a) / (1 + |a|^2)``, as ``a . u = a . v``.
         """
-        spins = self._spins
+        spins = self._spin_structure
         assert spins is not None
         a, r = split_vectors(angles), spins.split_covectors(v)
         u = add_vectors(add_vectors(r, cross_vectors(a, r)), scale_vectors(dot_vectors(a, r), a))
         return spins.join_state(scale_vectors(1.0 / (1.0 + dot_vectors(a, a)), u), v[self.body_dim :])
 
-    def numbers(self, x, batch: bool = False):
+    def state_array(self, x, batch: bool = False):
         """A state in one row; also the spins alone, shape ``(*sites, 3)``."""
         shape, given = (*self.lattice, 3), np.shape(x)
         if given != (self.dim,) and given[-len(shape) :] == shape and (batch or len(given) == len(shape)):
@@ -130,7 +130,7 @@ class SpinSystem(System):
             raise InputError(
                 f"a state has its spins in shape {shape}, or all {self.dim} components in one row, not shape {given}"
             )
-        return super().numbers(x, batch)
+        return super().state_array(x, batch)
 
     def spins(self, x) -> jax.Array:
         """The spins of states, shape (..., n) to ``(..., *sites, 3)``."""
@@ -138,35 +138,37 @@ class SpinSystem(System):
         return x[..., : self.body_dim].reshape(*x.shape[:-1], *self.lattice, 3)
 
     def casimirs(self) -> dict[str, Energy]:
-        return {LENGTHS: HalfSumOfSquares(math.prod(self.lattice))}
+        return {SPIN_LENGTHS_NAME: HalfSumOfSquares(math.prod(self.lattice))}
 
     @property
     def surface(self) -> Spheres:
-        assert self._spins is not None
-        return Spheres(math.prod(self.lattice), LENGTHS, self._spins.is_component_major)
+        assert self._spin_structure is not None
+        return Spheres(math.prod(self.lattice), SPIN_LENGTHS_NAME, self._spin_structure.is_component_major)
 
-    def arranged(self) -> Arranged | None:
+    def reorder_components(self) -> ReorderedSystem | None:
         """With the spins component by component; what other dissipations do with components is not known."""
-        spins = self._spins
-        known = type(self) is SpinSystem and (self.dissipation is None or _damping(self.dissipation)[0] is not None)
+        spins = self._spin_structure
+        known = type(self) is SpinSystem and (
+            self.dissipation is None or _split_damping(self.dissipation)[0] is not None
+        )
         if not known or spins is None or spins.is_component_major or self.is_driven:
             return None
         count = spins.count
         planar = mf.Spins(spins.sites, 0, spins.ratio, interaction_range(self.energy, spins.sites))
-        poisson = planar if self.baths is None else beside_baths(planar, self.baths.number)
+        poisson = planar if self.baths is None else poisson_with_baths(planar, self.baths.number)
         there, back, pulled = (functools.partial(f, count=count) for f in (to_planes, to_sites, planar_energy))
         functions = [pulled(f) for f in (self.energy, *self.momentum_maps.values())]
         system = eqx.tree_at(lambda s: [s.poisson, s.energy, *s.momentum_maps.values()], self, [poisson, *functions])
-        return Arranged(system, there, back, pulled)
+        return ReorderedSystem(system, there, back, pulled)
 
     @property
-    def _spins(self) -> mf.Spins | None:
+    def _spin_structure(self) -> mf.Spins | None:
         """The structure of the spins; None of a system that is run in other coordinates."""
         poisson = self.poisson.first if isinstance(self.poisson, ProductPoisson) else self.poisson
         return poisson if isinstance(poisson, mf.Spins) else None
 
 
-def _damping(dissipation: Dissipation | None) -> tuple[LandauLifshitz | None, Heating | None]:
+def _split_damping(dissipation: Dissipation | None) -> tuple[LandauLifshitz | None, Heating | None]:
     """The damping of the spins and what heats by it; a class of its own may have a force of its own."""
     heating = dissipation if type(dissipation) is Heating else None
     part = dissipation if heating is None else heating.inner

@@ -17,7 +17,7 @@ from ..tracing.trace_errors import TRACE_ERRORS, explain_trace_error
 from ..tracing.traced import TracedFunction, trace_callables_with_result
 
 
-def checked_torque(given: Any, algebra: mf.LieAlgebra, group: mf.MatrixGroup | None) -> tuple[Any, tuple[bool, ...]]:
+def check_torque(given: Any, algebra: mf.LieAlgebra, group: mf.MatrixGroup | None) -> tuple[Any, tuple[bool, ...]]:
     """What a system is given as its torque, its plain functions traced; and which of its parts need the attitude.
 
     Raises
@@ -27,43 +27,43 @@ def checked_torque(given: Any, algebra: mf.LieAlgebra, group: mf.MatrixGroup | N
     """
     if given is None:
         return None, ()
-    parts = _parts(given)
+    parts = _torque_terms(given)
     if not parts:
         raise InputError("torque is an empty list: a system without a torque is given None")
     needs = tuple(map(_needs_attitude, parts))
     if any(needs) and group is None:
-        name = name_of(parts[needs.index(True)])
+        name = torque_name(parts[needs.index(True)])
         raise InputError(f"the torque {name} depends on the attitude: give the system a group, such as group=mf.SO(3)")
     shape = () if group is None else group.identity.shape
     # of complex groups both parts, since what is traced here is traced for real arrays
     complex_group = group is not None and jnp.iscomplexobj(group.identity)
     shapes = ((), algebra.shape, *((shape,) * (2 if complex_group else 1)))
 
-    def use(torque, t, mu, *g):
+    def evaluate_terms(torque, t, mu, *g):
         attitude = g[0] if len(g) == 1 else g[0] + 1j * g[1]
-        return [jnp.asarray(part) for part in _evaluated(torque, needs, t, mu, attitude)]
+        return [jnp.asarray(part) for part in _evaluate_terms(torque, needs, t, mu, attitude)]
 
     given = parts if isinstance(given, list) else given
     try:
-        torque, found = trace_callables_with_result(given, use, *shapes)
+        torque, found = trace_callables_with_result(given, evaluate_terms, *shapes)
     except TRACE_ERRORS as error:
         what = f"the torque could not be evaluated on a momentum of shape {algebra.shape}"
         raise FunctionError(explain_trace_error(what, error)) from error
     for part, result in zip(parts, found, strict=True):
         if result.shape != algebra.shape or not jnp.issubdtype(result.dtype, jnp.floating):
             raise FunctionError(
-                f"the torque {name_of(part)} must return real numbers of shape {algebra.shape}, as the momentum has, "
+                f"the torque {torque_name(part)} must return real numbers of shape {algebra.shape}, as the momentum has, "
                 f"not {result.dtype} of shape {result.shape}"
             )
     return torque, needs
 
 
-def torque_at(torque: Any, needs: tuple[bool, ...], t, mu, attitude) -> jax.Array:
+def evaluate_torque(torque: Any, needs: tuple[bool, ...], t, mu, attitude) -> jax.Array:
     """The sum of the parts, of the shape of mu."""
-    return sum(_evaluated(torque, needs, t, mu, attitude), jnp.zeros_like(mu))
+    return sum(_evaluate_terms(torque, needs, t, mu, attitude), jnp.zeros_like(mu))
 
 
-def untouched_components(
+def torque_free_components(
     torque: Any, needs: tuple[bool, ...], algebra: mf.LieAlgebra, group: mf.MatrixGroup | None
 ) -> tuple[int, ...]:
     """Return the components of the momentum on which a torque does not act, whatever its parameters.
@@ -75,28 +75,28 @@ def untouched_components(
     shape = () if group is None else group.identity.shape
     complex_group = group is not None and jnp.iscomplexobj(group.identity)
     shapes = ((), algebra.shape, *((shape,) * (2 if complex_group else 1)))
-    return tuple(sorted(vanishing_entries(_torque, (torque, needs), *shapes)))
+    return tuple(sorted(vanishing_entries(_torque_of_model, (torque, needs), *shapes)))
 
 
-def _torque(model: tuple, t, mu, *attitude) -> jax.Array:
+def _torque_of_model(model: tuple, t, mu, *attitude) -> jax.Array:
     torque, needs = model
     g = attitude[0] if len(attitude) == 1 else attitude[0] + 1j * attitude[1]
-    return torque_at(torque, needs, t, mu, g)
+    return evaluate_torque(torque, needs, t, mu, g)
 
 
-def name_of(torque: Any) -> str:
+def torque_name(torque: Any) -> str:
     """What a torque is called, in messages and in provenances."""
     if isinstance(torque, list | tuple):
-        return " + ".join(map(name_of, torque))
+        return " + ".join(map(torque_name, torque))
     return getattr(torque, "__name__", type(torque).__name__)
 
 
-def _parts(torque: Any) -> tuple[Callable, ...]:
+def _torque_terms(torque: Any) -> tuple[Callable, ...]:
     return tuple(torque) if isinstance(torque, list | tuple) else (torque,)
 
 
-def _evaluated(torque: Any, needs: tuple[bool, ...], t, mu, attitude) -> list:
-    parts = zip(_parts(torque), needs, strict=True)
+def _evaluate_terms(torque: Any, needs: tuple[bool, ...], t, mu, attitude) -> list:
+    parts = zip(_torque_terms(torque), needs, strict=True)
     return [part(t, mu, attitude) if turned else part(t, mu) for part, turned in parts]
 
 
@@ -109,7 +109,7 @@ def _needs_attitude(part: Any) -> bool:
     number = len(part.program.argument_avals) if isinstance(part, TracedFunction) else required_argument_count(part)
     if number not in (2, 3):
         raise InputError(
-            f"a torque is a function of t and mu, or of t, mu and the attitude, and {name_of(part)} needs "
+            f"a torque is a function of t and mu, or of t, mu and the attitude, and {torque_name(part)} needs "
             f"{'an unknown number of' if number is None else number} arguments"
         )
     return number == 3

@@ -39,7 +39,7 @@ def check_dissipation(dissipation: Dissipation | System, algebra: mf.LieAlgebra 
     acting, lost, made, size = system.dissipation, 0.0, 0.0, 0.0
     for x in points:
         dH, dS, *dL = random.standard_normal((2 + len(acting.preserve), system.dim))
-        if system.baths is not None and system.baths.positive:
+        if system.baths is not None and system.baths.has_positive_temperatures:
             dH[system.body_dim :] = np.abs(dH[system.body_dim :])  # no gradient has temperatures below zero
         force = np.asarray(
             acting.force(system, jnp.asarray(x), jnp.asarray(dH), jnp.asarray(dS), tuple(map(jnp.asarray, dL)))

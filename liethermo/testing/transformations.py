@@ -195,7 +195,7 @@ def replace_parts(system: System, **parts: Any) -> System:
         lambda s: [getattr(s, name) for name in names], system, list(parts.values()), is_leaf=lambda part: part is None
     )
     if "dissipation" in parts:  # the constructor of a system finds names for what its dissipation preserves
-        object.__setattr__(found, "preserved_as", found._preserved_names() if found.preserved else None)
+        object.__setattr__(found, "preserved_labels", found._find_preserved_names() if found.preserved else None)
     return found
 
 

@@ -135,7 +135,7 @@ def regularity():
         [2 * friction * speed / h, -T / h * (h * s / (2 * heat) + 1)],
     ]
     discrete = V.midpoint().discrete_system(lt.models.mass_spring_gas(m, k, friction), h)
-    found, _ = evaluate_at_points(variational._matrices, discrete, np.array([[x0, x1, S0, S1]]))
+    found, _ = evaluate_at_points(variational._density_matrices, discrete, np.array([[x0, x1, S0, S1]]))
     return apart(found[0], expected)
 
 

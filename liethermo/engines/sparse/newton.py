@@ -51,7 +51,7 @@ class SparseEngine:
 
     def __init__(self, system: System, method: OneStepMethod):
         self.system, self.method = system, method
-        pattern = system.sparsity()
+        pattern = system.sparsity_pattern()
         if pattern is None:
             raise ValueError(f"{type(system).__name__} does not know its sparsity")
         self._pattern = pattern
@@ -199,7 +199,7 @@ def _weighted_equations(system: System, method: OneStepMethod, state: State, h):
 
     def misfit(k):
         middle = state.x + (state.compensation + 0.5 * method.increment(h, k))
-        return system.weights(middle) * (slopes(k) - k)
+        return system.residual_weights(middle) * (slopes(k) - k)
 
     return misfit, guess, scale
 
@@ -213,7 +213,7 @@ def _weighted_residual(system: System, method: OneStepMethod, state: State, h, k
 @jit_program
 def _residual_rounding(system: System, method: OneStepMethod, x) -> Any:
     """The size at which the misfit is rounded."""
-    return jnp.max(value_and_rounding_scale(lambda x: system.weights(x) * system.vector_field(x), x)[1])
+    return jnp.max(value_and_rounding_scale(lambda x: system.residual_weights(x) * system.vector_field(x), x)[1])
 
 
 @jit_program

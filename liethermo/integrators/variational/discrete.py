@@ -181,7 +181,7 @@ class DiscreteSystem(Module):
     def action(self, q0, V, S0, s) -> jax.Array:
         """``L_d / h``."""
         points = self._map_points(self.lagrangian_maps, Pair(q0, V, S0, s))
-        return _sum_arrays([p.weight * self.system.action(p.q, p.v, p.S) for p in points])
+        return _sum_arrays([p.weight * self.system.lagrangian_value(p.q, p.v, p.S) for p in points])
 
     def impulses(self, pair: Pair, friction: bool = True, external: bool = True) -> tuple[jax.Array, jax.Array]:
         """``F^-_d / h`` and ``F^+_d / h``."""
@@ -209,7 +209,7 @@ class DiscreteSystem(Module):
             return missed
         surface = ConstraintSurface(self.curve.space, tangent=True)
         off = surface._constraint_change(pair.q0, 0.0, self.h * pair.V) / self.h
-        return self.system.along(pair.q0, missed) + mass * surface._correction_displacement(pair.q0, off)
+        return self.system.tangential_part(pair.q0, missed) + mass * surface._correction_displacement(pair.q0, off)
 
     def force(self, p0, pair: Pair) -> jax.Array:
         """``(p_1 - p_0) / h = (D_1 L_d + D_2 L_d + F^-_d + F^+_d) / h``, shape (n,), on a manifold along it."""
@@ -221,7 +221,7 @@ class DiscreteSystem(Module):
         """``-P_d``, the mean of ``T s + F_fr . v - P_H``; NaN where a temperature is not positive [GBY 3.9]."""
         total = jnp.zeros(())
         for p in self._map_points(self.constraint_maps, pair):
-            T = -jax.grad(self.system.action, argnums=2)(p.q, p.v, p.S)
+            T = -jax.grad(self.system.lagrangian_value, argnums=2)(p.q, p.v, p.S)
             gained = jnp.dot(self.system.friction_force(*p[2:]), p.v) - self.system.heating(*p[2:])
             total = total + p.weight * (jnp.where(T > 0.0, T, jnp.nan) * pair.s + gained)
         return total
@@ -262,7 +262,7 @@ class DiscreteSystem(Module):
         """p_0 and p_1 of the discrete Legendre transforms ``FL^-`` and ``FL^+`` with forces [GBY §4.2]."""
         by_first, by_second = jax.grad(self.lagrangian, argnums=(0, 1))(q0, q1, S0, S1)
         first, second = self.forces(q0, q1, S0, S1)
-        along = self.system.along
+        along = self.system.tangential_part
         return along(q0, -by_first - first), along(q1, by_second + second)
 
     def regularity_matrix(self, q0, q1, S0, S1) -> jax.Array:

@@ -93,9 +93,9 @@ def _restrict_to_tangents(system: SimpleClosedSystem, q, v, W, missed, h=1.0) ->
             q, jax.jvp(space._constraints, (space.from_vector(q),), (space.from_vector(w),))[1]
         )
 
-    along = jax.vmap(lambda w: system.along(q, w), in_axes=1, out_axes=1)
+    along = jax.vmap(lambda w: system.tangential_part(q, w), in_axes=1, out_axes=1)
     W = along(W) + mass * jax.vmap(normal_residual, out_axes=1)(jnp.eye(len(v)))
-    return W, system.along(q, missed) + mass / h * normal_residual(v)
+    return W, system.tangential_part(q, missed) + mass / h * normal_residual(v)
 
 
 def mass_scale(system: SimpleClosedSystem, q, v, S) -> jax.Array:
@@ -118,5 +118,5 @@ def velocity_from_momentum(system: SimpleClosedSystem, q, S, p, v):
         return v - solve(W, missed[:, None])[:, 0]
 
     v = jax.lax.fori_loop(0, 20, newton, v)
-    defect = jnp.max(jnp.abs(system.along(q, system.momentum(q, v, S) - p)))
+    defect = jnp.max(jnp.abs(system.tangential_part(q, system.momentum(q, v, S) - p)))
     return jnp.where(defect <= 1e-12 * (1.0 + jnp.max(jnp.abs(p))), v, jnp.nan)

@@ -53,11 +53,11 @@ class VariationalGauss(GaussMethod):
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
         assert isinstance(system, SimpleClosedSystem)
         (A, b, c), n, start = gauss_tableau(self.number), system.degrees_of_freedom, x + compensation
-        (q0, v0, S0, t0), V, s = system.parts(start), k[:, :n], k[:, 2 * n]
+        (q0, v0, S0, t0), V, s = system.split_state(start), k[:, :n], k[:, 2 * n]
         q, S, t, p0 = q0 + h * (A @ V), S0 + h * (A @ s), t0 + h * c, system.momentum(q0, v0, S0)
 
         def forces(q, V, S, t):
-            by_q, p, minus_T = jax.grad(system.action, argnums=(0, 1, 2))(q, V, S)
+            by_q, p, minus_T = jax.grad(system.lagrangian_value, argnums=(0, 1, 2))(q, V, S)
             friction, push = system.friction_force(q, V, S, t), system.external_force(q, V, S, t)
             power, T = system.heating(q, V, S, t), jnp.where(minus_T < 0.0, -minus_T, jnp.nan)
             received = jnp.stack([jnp.dot(push, V), power])
@@ -70,7 +70,7 @@ class VariationalGauss(GaussMethod):
         end = q0 + h * (b @ V), k[0, n : 2 * n], S0 + h * (b @ s)
         v_dot = velocity_slope(system, (q0, v0, S0, p0), end, b @ force, h)
         columns = [V, jnp.tile(v_dot, (self.number, 1)), s[:, None]]
-        if system.receives:
+        if system.has_ledger:
             columns += [received, jnp.ones((self.number, 1))]
         return jnp.concatenate(columns, axis=1)
 

@@ -97,7 +97,7 @@ class LieVariational(OneStepMethod):
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
         assert isinstance(system, EulerPoincareClosedSystem)
         n = system.algebra.dim
-        xi0, S0, t = system.parts(x + compensation)
+        xi0, S0, t = system.split_state(x + compensation)
         step = _LieStep(system, self.tau, S0, h, t)
         mu0 = system.momentum(xi0, S0)
 
@@ -110,7 +110,7 @@ class LieVariational(OneStepMethod):
         guess = xi0 + h * k[0, :n]
         W = jax.jacfwd(system.momentum)(guess, S1)
         xi_dot = k[0, :n] - solve(W, ((system.momentum(guess, S1) - mu1) / h)[:, None])[:, 0]
-        rest = system.entries(*step.work_and_heat_rates(y))
+        rest = system.ledger_rates(*step.work_and_heat_rates(y))
         return jnp.stack([jnp.concatenate([xi_dot, y[n:], rest]), jnp.zeros_like(x).at[:n].set(y[:n])])
 
     def residual_jvp(self, system: System, x, compensation, h, k) -> Callable:
@@ -192,7 +192,7 @@ def _group_increments(method: LieVariational, system: EulerPoincareClosedSystem,
     turn = cayley if method.tau == "cayley" else exp
 
     def group_increment(before, after):
-        (xi0, S0, t), (xi1, S1, _) = system.parts(before), system.parts(after)
+        (xi0, S0, t), (xi1, S1, _) = system.split_state(before), system.split_state(after)
         step, s, mu0 = _LieStep(system, method.tau, S0, h, t), (S1 - S0) / h, system.momentum(xi0, S0)
 
         def newton(_, xi):

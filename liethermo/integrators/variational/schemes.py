@@ -205,7 +205,7 @@ class VariationalIntegrator(OneStepMethod):
         system = system.manifold if isinstance(system, EmbeddedSystem) else system
         assert isinstance(system, SimpleClosedSystem)
         n = system.degrees_of_freedom
-        q0, v0, S0, t = system.parts(x + compensation)
+        q0, v0, S0, t = system.split_state(x + compensation)
         discrete, p0 = self.discrete_system(system, h, t), system.momentum(q0, v0, S0)
         V, s = newton_step(discrete, v0, p0, Pair(q0, k[0, :n], S0, k[0, 2 * n]))
         pair = Pair(q0, V, S0, s)
@@ -272,7 +272,7 @@ class VariationalIntegrator(OneStepMethod):
         v0 = velocity_from_momentum(system, q0, S0, p0, (q1 - q0) / h)
         if not bool(jnp.isfinite(v0).all()):
             raise InputError(f"no velocity was found that has the momentum {np.asarray(p0)} of this first step")
-        rest = jnp.array([0.0, 0.0, t]) if system.receives else jnp.zeros(0)
+        rest = jnp.array([0.0, 0.0, t]) if system.has_ledger else jnp.zeros(0)
         return np.concatenate([q0, v0, S0[None], rest])
 
     def energies(self, system: SimpleClosedSystem, x, h: float) -> np.ndarray:
@@ -296,7 +296,7 @@ class VariationalIntegrator(OneStepMethod):
         if not isinstance(system, SimpleClosedSystem) or system.configurations is not None:
             return ""
         n = system.degrees_of_freedom
-        q0, _, S0, t = system.parts(jnp.asarray(x))
+        q0, _, S0, t = system.split_state(jnp.asarray(x))
         slope = jnp.nan_to_num(jnp.asarray(k)[0])
         matrix = np.asarray(
             _regularity_matrix(self.discrete_system(system, h, t), q0, q0 + h * slope[:n], S0, S0 + h * slope[2 * n])
@@ -376,7 +376,7 @@ def _constraint_residual(discrete: DiscreteSystem, q0, q1, S0, S1):
 @jit_program
 def _step_energies(method: VariationalIntegrator, system: SimpleClosedSystem, h, before, after):
     def step_energy(x, y):
-        (q0, _, S0, t), (q1, _, S1, _) = system.parts(x), system.parts(y)
+        (q0, _, S0, t), (q1, _, S1, _) = system.split_state(x), system.split_state(y)
         discrete = method.discrete_system(system, h, t)
         return discrete.energy(discrete.pair(q0, q1, S0, S1))
 

@@ -57,7 +57,7 @@ class Subsystem(Module):
         self.dim, self.name = dim, name
         energy = Quadratic(jnp.zeros(dim)) if energy is None else make_energy(energy, "the energy of a subsystem")
         self.energy = mark_polynomial_degrees(check_energy(energy, dim, f"the energy of {name or 'a subsystem'}"), dim)
-        self.friction = _checked_friction(friction, dim - species, name or "a subsystem")
+        self.friction = _check_friction(friction, dim - species, name or "a subsystem")
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -68,7 +68,7 @@ class Subsystem(Module):
         """How many bodies it is."""
         return 1
 
-    def energy_from(self, start: int) -> Energy:
+    def energy_in_state(self, start: int) -> Energy:
         """The energy as a function of a whole state in which the body begins at a component."""
         return self.energy.on(np.arange(start, start + self.dim))
 
@@ -110,8 +110,8 @@ class Copies(Module):
         self.energy = Quadratic(jnp.zeros(dim)) if energy is None else energy
         given = parameters if isinstance(parameters, tuple) else (parameters,)
         self.parameters = tuple(check_numbers(a, f"the parameters of {name or 'the bodies'}") for a in given)
-        self.energy_from(0)  # checked there
-        self.friction = _friction_of_many(friction, count, dim, name or "the bodies")
+        self.energy_in_state(0)  # checked there
+        self.friction = _check_copies_friction(friction, count, dim, name or "the bodies")
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -122,7 +122,7 @@ class Copies(Module):
         """Kinds of particles: copies hold none."""
         return 0
 
-    def energy_from(self, start: int) -> Energy:
+    def energy_in_state(self, start: int) -> Energy:
         """The energy as a function of a whole state in which the first of the bodies begins at a component."""
         places = np.arange(start, start + self.count * self.dim).reshape(self.count, self.dim)
         return Each(self.energy, places, *self.parameters)
@@ -131,7 +131,7 @@ class Copies(Module):
 # -- arguments --------------------------------------------------------------------------------------------------------
 
 
-def named(subsystems) -> tuple[tuple[str, ...], tuple[Subsystem | Copies, ...]]:
+def name_subsystems(subsystems) -> tuple[tuple[str, ...], tuple[Subsystem | Copies, ...]]:
     """A name for each entry, and the entries."""
     if isinstance(subsystems, Mapping):
         names, bodies = tuple(map(str, subsystems)), tuple(subsystems.values())
@@ -156,7 +156,7 @@ def _check_dim(dim) -> None:
         raise InputError(f"dim counts the components of a state (q, p, S): 2n + 1, and 1 for S alone, not {dim!r}")
 
 
-def _checked_friction(friction, dim: int, name: str):
+def _check_friction(friction, dim: int, name: str):
     n = dim // 2
     if friction is None:
         return None
@@ -173,21 +173,21 @@ def _checked_friction(friction, dim: int, name: str):
     R = jnp.full(n, R) if R.ndim == 0 else R
     if R.ndim == 2:
         return checked_semidefinite(R, f"the friction of {name}")
-    return _not_negative(R, name)
+    return _require_nonnegative(R, name)
 
 
-def _friction_of_many(friction, count: int, dim: int, name: str):
+def _check_copies_friction(friction, count: int, dim: int, name: str):
     if friction is None or isinstance(friction, str):
-        return _checked_friction(friction, dim, name)
+        return _check_friction(friction, dim, name)
     n, R = dim // 2, check_numbers(friction, f"friction of {name}")
     if n == 0 or R.shape not in ((), (n,), (count, n)):
         raise InputError(
             f"friction of {name}, {count} with {n} momenta each, has shape (), ({n},) or ({count}, {n}), not {R.shape}"
         )
-    return _not_negative(jnp.broadcast_to(R, (count, n)), name)
+    return _require_nonnegative(jnp.broadcast_to(R, (count, n)), name)
 
 
-def _not_negative(R: jax.Array, name: str) -> jax.Array:
+def _require_nonnegative(R: jax.Array, name: str) -> jax.Array:
     require_condition(
         R.min(), lambda r: r >= 0.0, f"friction of {name} must be >= 0, not {{value:g}}: it would cool the body"
     )

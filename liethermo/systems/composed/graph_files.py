@@ -66,11 +66,11 @@ def read_graph(path: str | os.PathLike, weight: str = "conductance", nodes: Sequ
     path = Path(path)
     if not path.is_file():
         raise FileError(f"there is no file {path}")
-    readers = {".csv": _csv, ".graphml": _graphml}
+    readers = {".csv": _read_csv, ".graphml": _read_graphml}
     if path.suffix.lower() not in readers:
         raise FileError(f"{path} is neither .csv nor .graphml, the kinds of graph that can be read")
     found, listed = readers[path.suffix.lower()](path, weight)
-    names = _names(found, nodes, path)
+    names = _node_names(found, nodes, path)
     number = {name: i for i, name in enumerate(names)}
     numbered = []
     for where, source, target, k in listed:
@@ -87,12 +87,12 @@ def read_graph(path: str | os.PathLike, weight: str = "conductance", nodes: Sequ
     return Graph(names, scipy.sparse.csr_array(upper + upper.T))
 
 
-_Listed = list[tuple[str, str, str, float]]
+_EdgeList = list[tuple[str, str, str, float]]
 
 
-def _csv(path: Path, weight: str) -> tuple[tuple[str, ...] | None, _Listed]:
+def _read_csv(path: Path, weight: str) -> tuple[tuple[str, ...] | None, _EdgeList]:
     """The nodes in the order of their first edges, and the edges with where they stand."""
-    listed: _Listed = []
+    listed: _EdgeList = []
     try:
         with path.open(newline="", encoding="utf-8") as file:
             reader = csv.DictReader(file, skipinitialspace=True)
@@ -105,37 +105,37 @@ def _csv(path: Path, weight: str) -> tuple[tuple[str, ...] | None, _Listed]:
                 source, target = ((row[title] or "").strip() for title in ("source", "target"))
                 if not (source and target):
                     raise InputError(f"{path}, {where}: an edge has two nodes, but one of them is missing")
-                listed.append((where, source, target, _number(row[weight], weight, f"{path}, {where}")))
+                listed.append((where, source, target, _parse_weight(row[weight], weight, f"{path}, {where}")))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise FileError(f"{path} cannot be read as CSV: {error}") from error
     names = tuple(dict.fromkeys(end for _, source, target, _ in listed for end in (source, target)))
     return (tuple(sorted(names, key=int)) if all(name.isdecimal() for name in names) else names), listed
 
 
-def _graphml(path: Path, weight: str) -> tuple[tuple[str, ...] | None, _Listed]:
+def _read_graphml(path: Path, weight: str) -> tuple[tuple[str, ...] | None, _EdgeList]:
     try:
         import networkx
     except ImportError as error:
         raise FileError(f"networkx, which reads {path}, is not installed: pip install networkx") from error
     try:
         graph = networkx.read_graphml(path)
-        declared = _declared(path)
+        declared = _declared_nodes(path)
     except (networkx.NetworkXError, ElementTree.ParseError, OSError, KeyError, ValueError) as error:
         raise FileError(f"{path} cannot be read as GraphML: {error}") from error
-    listed: _Listed = []
+    listed: _EdgeList = []
     for source, target, data in graph.edges(data=True):
         where = f"the edge from {source} to {target}"
-        listed.append((where, source, target, _number(data.get(weight), weight, f"{path}, {where}")))
+        listed.append((where, source, target, _parse_weight(data.get(weight), weight, f"{path}, {where}")))
     return declared, listed
 
 
-def _declared(path: Path) -> tuple[str, ...]:
+def _declared_nodes(path: Path) -> tuple[str, ...]:
     """The nodes that a GraphML file declares: networkx makes up those that only an edge names."""
     elements = ElementTree.parse(path).iter()
     return tuple(element.attrib["id"] for element in elements if element.tag.rsplit("}")[-1] == "node")
 
 
-def _names(found: Iterable[str] | None, nodes, path: Path) -> tuple[str, ...]:
+def _node_names(found: Iterable[str] | None, nodes, path: Path) -> tuple[str, ...]:
     names = tuple(found or ()) if nodes is None else tuple(map(str, range(nodes) if isinstance(nodes, int) else nodes))
     if not names:
         raise InputError(f"{path} has no nodes")
@@ -144,7 +144,7 @@ def _names(found: Iterable[str] | None, nodes, path: Path) -> tuple[str, ...]:
     return names
 
 
-def _number(text, weight: str, where: str) -> float:
+def _parse_weight(text, weight: str, where: str) -> float:
     try:
         return float(text)
     except (TypeError, ValueError):

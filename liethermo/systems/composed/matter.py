@@ -46,7 +46,7 @@ class Membrane(Module):
 
     def __init__(self, first, second, permeability, species: int | tuple[int, int] = 0, carries: float = 0.0):
         self.first, self.second = first, second
-        self.permeability = _coefficient(permeability, "the permeability of a membrane")
+        self.permeability = _check_coefficient(permeability, "the permeability of a membrane")
         pair = (species, species) if isinstance(species, int) else species
         if not (isinstance(pair, tuple) and len(pair) == 2 and all(type(kind) is int for kind in pair)):
             raise InputError(f"the species of a membrane are a whole number, or a pair of them, not {species!r}")
@@ -58,15 +58,15 @@ class Membrane(Module):
 
     def process(self, names: Sequence[str], structure: mf.ExtendedPhaseSpace) -> Process:
         """Which numbers change together, among the bodies of these ``names``, in states of a ``structure``."""
-        a, b = (_body(given, names) for given in (self.first, self.second))
+        a, b = (_body_index(given, names) for given in (self.first, self.second))
         if a == b:
             raise InputError(f"a membrane joins two bodies, not {names[a]} with itself")
         stoichiometry, sides = np.zeros(len(structure.particle_indices.N)), np.zeros((2, len(names)))
         for body, kind, sign in ((a, self.species[0], 1.0), (b, self.species[1], -1.0)):
-            stoichiometry[_number(body, kind, names, structure.particle_indices)] = sign
+            stoichiometry[_particle_index(body, kind, names, structure.particle_indices)] = sign
             sides[:, body] = 0.5, sign
         numbers, heated, carried = (tuple(row.tolist()) for row in (stoichiometry, *sides))
-        L = _on_states(self.permeability, structure.dim, "the permeability of a membrane")
+        L = _check_state_function(self.permeability, structure.dim, "the permeability of a membrane")
         return Process(numbers, heated, carried, self.carries, L)
 
 
@@ -90,7 +90,7 @@ class Reaction(Module):
     rate: jax.Array | Callable
 
     def __init__(self, body, stoichiometry: Sequence[float], rate):
-        self.body, self.rate = body, _coefficient(rate, "the rate of a reaction")
+        self.body, self.rate = body, _check_coefficient(rate, "the rate of a reaction")
         found = check_numbers(stoichiometry, "the stoichiometry of a reaction")
         if found.ndim != 1 or not (np.isfinite(found).all() and np.any(found)):
             raise InputError(f"the stoichiometry of a reaction is a row of finite numbers, not {found.tolist()}")
@@ -98,7 +98,7 @@ class Reaction(Module):
 
     def process(self, names: Sequence[str], structure: mf.ExtendedPhaseSpace) -> Process:
         """Which numbers change together, among the bodies of these ``names``, in states of a ``structure``."""
-        body = _body(self.body, names)
+        body = _body_index(self.body, names)
         matter = structure.particle_indices
         own = np.flatnonzero(matter.owner == body)
         if len(own) != len(self.stoichiometry):
@@ -107,11 +107,11 @@ class Reaction(Module):
             )
         stoichiometry, heated = np.zeros(len(matter.N)), np.zeros(len(names))
         stoichiometry[own], heated[body] = self.stoichiometry, 1.0
-        none, L = (0.0,) * len(names), _on_states(self.rate, structure.dim, "the rate of a reaction")
+        none, L = (0.0,) * len(names), _check_state_function(self.rate, structure.dim, "the rate of a reaction")
         return Process(tuple(stoichiometry.tolist()), tuple(heated.tolist()), none, jnp.zeros(()), L)
 
 
-def _coefficient(given, what: str) -> jax.Array | Callable:
+def _check_coefficient(given, what: str) -> jax.Array | Callable:
     if callable(given):
         return given
     value = check_numbers(given, what, ())
@@ -119,14 +119,14 @@ def _coefficient(given, what: str) -> jax.Array | Callable:
     return value
 
 
-def _on_states(coefficient, dim: int, what: str) -> jax.Array | Callable:
+def _check_state_function(coefficient, dim: int, what: str) -> jax.Array | Callable:
     """A coefficient, as a function checked on states of so many components."""
     if not callable(coefficient):
         return coefficient
     return check_function_shape(coefficient, [(dim,)], [()], what, f"a state of shape ({dim},)")[0]
 
 
-def _body(given, names: Sequence[str]) -> int:
+def _body_index(given, names: Sequence[str]) -> int:
     if isinstance(given, str) and given in names:
         if list(names).count(given) > 1:
             raise InputError(f"{given!r} is the name of several bodies: give the number of the one that is meant")
@@ -136,7 +136,7 @@ def _body(given, names: Sequence[str]) -> int:
     raise InputError(f"there is no body {given!r}: the bodies are {', '.join(names)}, counted from 0")
 
 
-def _number(body: int, kind: int, names: Sequence[str], matter: ParticleIndices) -> int:
+def _particle_index(body: int, kind: int, names: Sequence[str], matter: ParticleIndices) -> int:
     own = np.flatnonzero(matter.owner == body)
     if not 0 <= kind < len(own):
         raise InputError(f"{names[body]} has {len(own)} kinds of particles, so no number {kind}")

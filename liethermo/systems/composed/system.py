@@ -26,9 +26,9 @@ from ...functions.edges import Edges, connected_components, graph_edges
 from ...functions.energy import Energy, Function, Quadratic, TimeDependent
 from ...functions.indices import pattern_of_matrix, sparsity_pattern, union_pattern
 from ...functions.mechanics import is_independent_of, is_mechanical
-from ..base import System, named_maps
+from ..base import System, name_momentum_maps
 from ..evolution import entropy_component
-from .bodies import Copies, Subsystem, named
+from .bodies import Copies, Subsystem, name_subsystems
 from .matter import Membrane, Reaction
 
 
@@ -110,15 +110,15 @@ class ComposedSystem(System):
     ):
         if conduction not in ("discrete", "midpoint"):
             raise InputError(f"conduction is 'discrete' or 'midpoint', not {conduction!r}")
-        self.labels, self.subsystems = named(subsystems)
+        self.labels, self.subsystems = name_subsystems(subsystems)
         dofs, kinds = (
             tuple(n for body in self.subsystems for n in (getattr(body, name),) * body.count)
             for name in ("degrees_of_freedom", "species")
         )
         structure = mf.ExtendedPhaseSpace(dofs, kinds if any(kinds) else ())
-        energy = check_energy(self._energy(structure, coupling), structure.dim, "the energy", allow_time=True)
+        energy = check_energy(self._total_energy(structure, coupling), structure.dim, "the energy", allow_time=True)
         entropy = entropy_component(structure.dim, structure.state_indices.S)
-        dissipation = self._dissipation(structure, energy, conductance, drag, connected, conduction)
+        dissipation = self._make_dissipation(structure, energy, conductance, drag, connected, conduction)
         given = [*(membranes if isinstance(membranes, list | tuple) else [membranes])]
         given += [*(reactions if isinstance(reactions, list | tuple) else [reactions])]
         for one in given:
@@ -128,7 +128,7 @@ class ComposedSystem(System):
         if processes:
             exchange = MatterExchange(processes)
             dissipation = exchange if dissipation is None else dissipation + exchange
-        momentum_maps = {**_conserved_numbers(structure, processes), **named_maps(momentum_maps)}
+        momentum_maps = {**_particle_invariants(structure, processes), **name_momentum_maps(momentum_maps)}
         self._build(structure, structure.dim, energy, entropy, dissipation, momentum_maps, validate)
 
     # -- in parts -------------------------------------------------------------------------------------------------
@@ -146,7 +146,7 @@ class ComposedSystem(System):
 
         Those of :class:`Copies` are in one array, shape (..., count, dim_a).
         """
-        found = jnp.split(self.state(x, batch=True), self._starts[1:-1], axis=-1)
+        found = jnp.split(self.state(x, batch=True), self._subsystem_offsets[1:-1], axis=-1)
         return tuple(
             part if isinstance(body, Subsystem) else part.reshape(*part.shape[:-1], body.count, body.dim)
             for part, body in zip(found, self.subsystems, strict=True)
@@ -154,11 +154,11 @@ class ComposedSystem(System):
 
     def entropies(self, x) -> jax.Array:
         """The S_a, shape (..., N)."""
-        return self.state(x, batch=True)[..., self._places.S]
+        return self.state(x, batch=True)[..., self._state_indices.S]
 
     def temperatures(self, x, t=None) -> jax.Array:
         """The ``T_a = H_{S_a}``, shape (..., N); at a time, where the energy depends on one."""
-        return self.evaluated(lambda system, y: system.energy.gradient(y), x, t, "(n)")[..., self._places.S]
+        return self.evaluate_batch(lambda system, y: system.energy.gradient(y), x, t, "(n)")[..., self._state_indices.S]
 
     def numbers_of_particles(self, x) -> jax.Array:
         """Those of all bodies, shape (..., K)."""
@@ -166,7 +166,7 @@ class ComposedSystem(System):
 
     def chemical_potentials(self, x, t=None) -> jax.Array:
         """The ``mu = H_N`` of all particle numbers, shape (..., K); at a time, where the energy depends on one."""
-        return self.evaluated(lambda system, y: system.energy.gradient(y), x, t, "(n)")[
+        return self.evaluate_batch(lambda system, y: system.energy.gradient(y), x, t, "(n)")[
             ..., self.poisson.particle_indices.N
         ]
 
@@ -193,49 +193,55 @@ class ComposedSystem(System):
         if not cold.size:
             return ""
         names = self.names
-        found = [f"the temperature of {names[a]} is {T[a]:.4g}" for a in cold[:MOST_NAMED]]
-        if cold.size > MOST_NAMED:
-            found.append(f"of {cold.size - MOST_NAMED} more likewise")
+        found = [f"the temperature of {names[a]} is {T[a]:.4g}" for a in cold[:MAX_NAMED_BODIES]]
+        if cold.size > MAX_NAMED_BODIES:
+            found.append(f"of {cold.size - MAX_NAMED_BODIES} more likewise")
         return f"{' and '.join(found)}: it has to be positive"
 
     def domain_margin(self, x):
-        return jnp.min(self.energy.gradient(x)[..., self._places.S])
+        return jnp.min(self.energy.gradient(x)[..., self._state_indices.S])
 
-    def sparsity(self) -> scipy.sparse.csr_array | None:
+    def sparsity_pattern(self) -> scipy.sparse.csr_array | None:
         if self.poisson.species:
             return None
-        parts = [_motion(self.poisson), *([] if self.dissipation is None else [self.dissipation.couplings(self)])]
+        parts = [
+            _poisson_pattern(self.poisson),
+            *([] if self.dissipation is None else [self.dissipation.couplings(self)]),
+        ]
         through, hessian = union_pattern(parts), self.energy.couplings(self.dim)
         if through is None or hessian is None:
             return None
         itself = scipy.sparse.eye_array(self.dim, dtype=bool, format="csr")
         return pattern_of_matrix((through + itself) @ (hessian + itself))
 
-    def weights(self, x) -> jax.Array:
+    def residual_weights(self, x) -> jax.Array:
         """The temperatures at the entropies: ``T S'`` is a flow of energy, linear in temperatures where S' is not."""
-        S = self._places.S
+        S = self._state_indices.S
         return jnp.ones_like(x).at[S].set(self.energy.gradient(x)[S])
 
     # -- how it is put together -----------------------------------------------------------------------------------
 
     @property
-    def _places(self) -> StateIndices:
+    def _state_indices(self) -> StateIndices:
         return self.poisson.state_indices
 
     @property
-    def _starts(self) -> np.ndarray:
+    def _subsystem_offsets(self) -> np.ndarray:
         """Where each of the subsystems begins in a state, and the end."""
         return np.cumsum([0, *(body.count * body.dim for body in self.subsystems)])
 
-    def _energy(self, structure: mf.ExtendedPhaseSpace, coupling) -> Energy:
-        terms = [body.energy_from(int(at)) for body, at in zip(self.subsystems, self._starts[:-1], strict=True)]
+    def _total_energy(self, structure: mf.ExtendedPhaseSpace, coupling) -> Energy:
+        terms = [
+            body.energy_in_state(int(at))
+            for body, at in zip(self.subsystems, self._subsystem_offsets[:-1], strict=True)
+        ]
         if coupling is not None:
             terms += [
-                _potential(V, structure) for V in (coupling if isinstance(coupling, list | tuple) else [coupling])
+                _coupling_energy(V, structure) for V in (coupling if isinstance(coupling, list | tuple) else [coupling])
             ]
         return sum(terms[1:], terms[0])
 
-    def _dissipation(self, structure, energy, conductance, drag, connected, conduction) -> Dissipation | None:
+    def _make_dissipation(self, structure, energy, conductance, drag, connected, conduction) -> Dissipation | None:
         found: list[Dissipation] = []
         dofs = structure.degrees_of_freedom
         first = np.cumsum([0, *(body.count for body in self.subsystems)])
@@ -246,8 +252,8 @@ class ComposedSystem(System):
             if isinstance(body.friction, str)
         )
         if bodies:
-            found.append(ContactFriction(bodies, self._pays(energy, structure, bodies)))
-        rates = [_rates(body) for body in self.subsystems]
+            found.append(ContactFriction(bodies, self._is_entropy_producing(energy, structure, bodies)))
+        rates = [_diagonal_friction(body) for body in self.subsystems]
         if any(R is not None for R in rates):  # all that are diagonal in one
             none = [jnp.zeros(body.count * body.degrees_of_freedom) for body in self.subsystems]
             all_rates = [z if R is None else R for R, z in zip(rates, none, strict=True)]
@@ -256,23 +262,23 @@ class ComposedSystem(System):
             if R is None and not (body.friction is None or isinstance(body.friction, str)):
                 found.append(LinearFriction(body.friction, body_index=a))
         if conductance is not None:
-            given, functions = _by_law(conductance, len(dofs))
+            given, functions = _split_conductances(conductance, len(dofs))
             graph = graph_edges(given, len(dofs), "the conductance", self.names)
-            laws = _laws(graph, functions, structure.dim, self.names) if functions else ()
+            laws = _conduction_laws(graph, functions, structure.dim, self.names) if functions else ()
             if connected:
-                _need_connected(graph, self.names)
+                _require_connected(graph, self.names)
             found.append(HeatConduction(graph._replace(weight=jnp.zeros(0)) if laws else graph, laws, conduction))
         if drag is not None:
             graph = graph_edges(drag, len(dofs), "the drag", self.names)
-            _need_velocities(graph, dofs, self.names)
+            _require_velocities(graph, dofs, self.names)
             found.append(Drag(graph))
         return sum(found[1:], found[0]) if found else None
 
-    def _pays(self, energy: Energy, structure: mf.ExtendedPhaseSpace, bodies: tuple[int, ...]) -> bool:
+    def _is_entropy_producing(self, energy: Energy, structure: mf.ExtendedPhaseSpace, bodies: tuple[int, ...]) -> bool:
         """Whether contact friction in some bodies is known to produce entropy: see :func:`is_mechanical`."""
         if is_traced(energy):
             return False
-        own = sum(len(body.energy_from(0).terms) for body in self.subsystems)
+        own = sum(len(body.energy_in_state(0).terms) for body in self.subsystems)
         momenta = structure.state_indices.p[np.isin(structure.state_indices.owner, bodies)]
         points = np.random.default_rng(0).standard_normal((2, structure.dim))
         return all(
@@ -282,11 +288,11 @@ class ComposedSystem(System):
         ) and all(is_independent_of(term, points, momenta) for term in energy.terms[own:])
 
 
-MOST_NAMED = 3
+MAX_NAMED_BODIES = 3
 """Bodies that a message names."""
 
 
-def _motion(structure: mf.ExtendedPhaseSpace) -> scipy.sparse.csr_array:
+def _poisson_pattern(structure: mf.ExtendedPhaseSpace) -> scipy.sparse.csr_array:
     """The pattern of the Poisson tensor."""
     q, p, _, _ = structure.state_indices
     return sparsity_pattern(np.concatenate([q, p]), np.concatenate([p, q]), structure.dim)
@@ -295,13 +301,13 @@ def _motion(structure: mf.ExtendedPhaseSpace) -> scipy.sparse.csr_array:
 # -- arguments --------------------------------------------------------------------------------------------------------
 
 
-def _rates(body: Subsystem | Copies) -> jax.Array | None:
+def _diagonal_friction(body: Subsystem | Copies) -> jax.Array | None:
     """The diagonal friction of a subsystem, an entry for each momentum."""
     R = body.friction
     return R.ravel() if isinstance(R, jax.Array) and (R.ndim == 1 or isinstance(body, Copies)) else None
 
 
-def _potential(V, structure: mf.ExtendedPhaseSpace) -> Energy:
+def _coupling_energy(V, structure: mf.ExtendedPhaseSpace) -> Energy:
     """A coupling as an Energy of the whole state."""
     if isinstance(V, Energy):
         return V
@@ -312,21 +318,21 @@ def _potential(V, structure: mf.ExtendedPhaseSpace) -> Energy:
     if needed == 1:
         return Function(V).on(q)
     parts = (q, S, N) if structure.species and needed is not None and needed > 2 else (q, S)
-    joined = _Apart(V, tuple(np.cumsum([len(part) for part in parts[:-1]]).tolist()))
+    joined = _SplitArguments(V, tuple(np.cumsum([len(part) for part in parts[:-1]]).tolist()))
     return (TimeDependent(joined) if needed == len(parts) + 1 else Function(joined)).on(np.concatenate(parts))
 
 
-class _Apart(Module):
+class _SplitArguments(Module):
     """V(q, S), or V(q, S, N), and of t, as a function of one array, and of t."""
 
     V: Callable
-    ends: tuple[int, ...] = eqx.field(static=True)
+    split_indices: tuple[int, ...] = eqx.field(static=True)
 
     def __call__(self, y, *t):
-        return self.V(*jnp.split(y, self.ends), *t)
+        return self.V(*jnp.split(y, self.split_indices), *t)
 
 
-def _conserved_numbers(structure: mf.ExtendedPhaseSpace, processes: Sequence[Process]) -> dict[str, Energy]:
+def _particle_invariants(structure: mf.ExtendedPhaseSpace, processes: Sequence[Process]) -> dict[str, Energy]:
     """The sums of particle numbers that no process changes."""
     N = structure.particle_indices.N
     found: dict[str, Energy] = {}
@@ -337,7 +343,7 @@ def _conserved_numbers(structure: mf.ExtendedPhaseSpace, processes: Sequence[Pro
     return found
 
 
-def _by_law(conductance, bodies: int) -> tuple[Any, list[tuple[int, int, Callable]]]:
+def _split_conductances(conductance, bodies: int) -> tuple[Any, list[tuple[int, int, Callable]]]:
     """A graph of conductances, with 1 for functions, and the edges that have one."""
     if callable(conductance):
         conductance = [(0, 1, conductance)]
@@ -352,19 +358,19 @@ def _by_law(conductance, bodies: int) -> tuple[Any, list[tuple[int, int, Callabl
     return [tuple(1.0 if callable(part) else part for part in edge) for edge in conductance], functions
 
 
-def _laws(graph: Edges, functions, dim: int, names: tuple[str, ...]) -> tuple[Callable, ...]:
+def _conduction_laws(graph: Edges, functions, dim: int, names: tuple[str, ...]) -> tuple[Callable, ...]:
     """A function of (T_i, T_j, x) for each edge of a graph, checked: where none is given, its weight."""
     found = {}
     for i, j, k in functions:
         law = k if required_argument_count(k) == 3 else LastArgumentIgnored(k)
         what = f"the conductance between {names[int(i)]} and {names[int(j)]}"
         law, _ = check_function_shape(law, ((), (), (dim,)), [()], what, "(T_i, T_j), or (T_i, T_j, x)")
-        found[min(i, j), max(i, j)] = law if i < j else _Exchanged(law)
+        found[min(i, j), max(i, j)] = law if i < j else _SwappedLaw(law)
     pairs = zip(graph.first.tolist(), graph.second.tolist(), graph.weight, strict=True)
     return tuple(found.get((i, j), ConstantFunction(weight)) for i, j, weight in pairs)
 
 
-class _Exchanged(Module):
+class _SwappedLaw(Module):
     """A law of two bodies, with the bodies in the other order."""
 
     law: Callable
@@ -373,7 +379,7 @@ class _Exchanged(Module):
         return self.law(T_j, T_i, x)
 
 
-def _need_connected(graph: Edges, names: tuple[str, ...]) -> None:
+def _require_connected(graph: Edges, names: tuple[str, ...]) -> None:
     part = connected_components(graph, len(names))
     if part.max() > 0:
         examples = [" and ".join(np.array(names)[part == i][:2]) for i in (0, 1)]
@@ -383,7 +389,7 @@ def _need_connected(graph: Edges, names: tuple[str, ...]) -> None:
         )
 
 
-def _need_velocities(graph: Edges, dofs: tuple[int, ...], names: tuple[str, ...]) -> None:
+def _require_velocities(graph: Edges, dofs: tuple[int, ...], names: tuple[str, ...]) -> None:
     n = np.array(dofs)
     bad = np.flatnonzero((n[graph.first] != n[graph.second]) | (n[graph.first] == 0))
     if bad.size:

@@ -122,7 +122,7 @@ def test_what_is_run_is_a_system_on_arrays():
     spin = lt.MetriplecticSystem(mf.LiePoisson(mf.so(3)), lambda s: s[0] ** 4 + s[1] ** 2, space=mf.Sphere(2))
     system, method = prepare_run(spin, GAUSS)
     assert type(system).__name__ == "EmbeddedSystem"
-    assert system.conforming
+    assert system.is_tangent
     assert method == GAUSS
     in_charts = prepare_run(spin, lt.MetriplecticGauss(2, retraction="exp"))
     assert in_charts[0] is spin
@@ -134,7 +134,7 @@ def test_what_is_run_is_a_system_on_arrays():
         return jnp.array([[0, -c, b], [c, 0, -a], [-b, a, 0]])
 
     other = lt.MetriplecticSystem(tensor, lambda s: s[0] ** 4 + s[1] ** 2, space=mf.Sphere(2))
-    assert not prepare_run(other, GAUSS)[0].conforming
+    assert not prepare_run(other, GAUSS)[0].is_tangent
     x0 = np.array([0.6, 0.64, 0.48])
     ends = [lt.integrate(s, x0, (0.0, 1.0), 0.01, GAUSS).x[-1] for s in (spin, other)]
     assert np.abs(ends[0] - ends[1]).max() < 1e-6

@@ -415,8 +415,8 @@ def test_a_torque_moves_the_momentum_in_space(tmp_path):
     assert again.stats.spatial_momentum_change == torque.stats.spatial_momentum_change
     both = lt.DoubleBracket(0.1) + lt.KillingDissipation(0.1)
     mixed = lt.LiePoissonSystem(mf.so(3), lt.Quadratic(1 / INERTIA), lt.Quadratic(np.ones(3)), both, group=SO3)
-    assert not mixed.torque_free
-    assert rubbing_body().torque_free
+    assert not mixed.is_torque_free
+    assert rubbing_body().is_torque_free
     unpromised = lt.integrate(rubbing_body(kind="exp"), START, (0.0, 5.0), 0.1)
     (row,) = [row for row in unpromised.audit().rows if "in space" in row.law]
     assert (row.law, row.passed) == ("drift of momentum in space", None)

@@ -111,7 +111,7 @@ def test_a_control_one_verdict_for_all_is_found(monkeypatch):
     """Control: with what the first member conserves held for all, the relation of company fails."""
 
     def of_first(family, method, states):
-        decided = family.member(0)._found()
+        decided = family.member(0)._find_invariants()
         facts = member_groups.InvariantFacts(None, decided)
         return [
             member_groups.MemberGroup(
@@ -211,7 +211,7 @@ def test_groups_are_few_and_in_order():
     groups, refused = member_groups.group_members(family, lt.MetriplecticMidpoint(), np.tile(START, (5, 1)))
     assert [group.indices.tolist() for group in groups] == [[0, 2, 4], [1, 3]]
     assert refused == {}
-    names = [group.family.member(0).decided.constant for group in groups]
+    names = [group.family.member(0).invariant_verdicts.conserved_names for group in groups]
     assert names[0] == frozenset()
     assert len(names[1]) == 1
 

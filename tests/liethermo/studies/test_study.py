@@ -408,7 +408,7 @@ def test_events_adaptive_steps_given_times_and_functions_of_a_solution(tmp_path)
     shaped = study(tmp_path / "f.zarr", {"rate": [0.5, 2.0], "ratio": [0.3]}, measure={"turned": turned})
     assert shaped.run().ok
     wanted = turned(lt.integrate(body({"rate": 2.0, "ratio": 0.3}), X0, (0.0, 4.0), 0.1))
-    np.testing.assert_allclose(shaped.results.turned[1, 0], wanted, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(shaped.results.bind_attitude[1, 0], wanted, rtol=0, atol=1e-14)
 
 
 @pytest.mark.slow

@@ -58,9 +58,9 @@ def test_unknown_is_a_row_of_its_own():
     """It is neither conserved nor not: the start is on the edge, where no derivative of the entropy exists."""
     system = lt.LiePoissonSystem(mf.so(3), lambda m: 0.5 * m[2], lambda m: jnp.log(m[0] - 1e6), Half(), validate=False)
     (name,) = system.casimirs()
-    assert system.undecided() == {name}
+    assert system.undecided_functions() == {name}
     assert system.invariants()[name][1] is None
-    assert system.decided_near(np.array([2e6, 1.0, 1.0])).first_integrals() == {name}
+    assert system.resolve_invariants_near(np.array([2e6, 1.0, 1.0])).first_integrals() == {name}
 
 
 def test_it_is_known_without_random_points_after_a_pytree_is_taken_apart():

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.systems.driven import UNIT
+from liethermo.systems.driven import CLOCK_UNIT
 from liethermo.tracing.interpret import evaluate_at_points
 
 RATE = 1.3
@@ -188,7 +188,7 @@ def test_time_is_exact(method):
     """Whatever the slopes handed to the method, t' = 1, where the entropy law and the energy are corrected too."""
     rng = np.random.default_rng(1)
     states, rates = rng.standard_normal((4, 3)), rng.standard_normal((4, method.stages, 3))
-    clock, work = np.moveaxis(slopes(SPIN, method, states, rates)[..., -2:] / UNIT, -1, 0)
+    clock, work = np.moveaxis(slopes(SPIN, method, states, rates)[..., -2:] / CLOCK_UNIT, -1, 0)
     assert np.abs(clock - 1.0).max() < 1e-15
     assert np.abs(work).max() > 1e-3
 
@@ -329,7 +329,7 @@ def test_a_driven_system_is_the_same_when_taken_apart():
     driven = lt.DrivenSystem(SPIN)
     leaves, structure = jax.tree_util.tree_flatten(driven)
     again = jax.tree_util.tree_unflatten(structure, leaves)
-    y = driven.begin(SPIN_START, 0.9)
+    y = driven.initial_state(SPIN_START, 0.9)
     assert np.array_equal(driven.vector_field(y), again.vector_field(y))
     assert np.array_equal(driven.vector_field(y)[:3], SPIN.vector_field(SPIN_START, 0.9))
 
@@ -385,9 +385,9 @@ def test_an_euler_poincare_system_with_changing_inertia():
     assert np.allclose(by_velocity.velocity(mu, t), mu / grown(t), rtol=1e-14)
     assert np.allclose(by_velocity.momentum(mu / grown(t), t), mu, rtol=1e-14)
     fields = [lt.DrivenSystem(s, unit=1.0) for s in (by_velocity, by_momentum)]
-    found = [s.vector_field(s.begin(mu, t)) for s in fields]
+    found = [s.vector_field(s.initial_state(mu, t)) for s in fields]
     assert np.allclose(*found, rtol=1e-12, atol=1e-14)
-    assert not by_velocity.unrollable
+    assert not by_velocity.can_unroll
 
 
 @pytest.mark.slow

@@ -98,13 +98,13 @@ def looked_at(system, x, d, compensation, k):
 @pytest.mark.sampled(5)
 def test_functions_are_the_same(name):
     system = SYSTEMS[name]
-    found, x = system.arranged(), state(system)
+    found, x = system.reorder_components(), state(system)
     d, compensation, k = (scale * jnp.asarray(RANDOM.standard_normal(shape)) for scale, shape in shapes(x.size))
     one = looked_at(system, x, d, compensation, k)
-    other = looked_at(found.system, *map(found.there, (x, d, compensation, k)))
+    other = looked_at(found.system, *map(found.reorder_state, (x, d, compensation, k)))
     assert found.system.energy.is_quadratic == system.energy.is_quadratic
     np.testing.assert_allclose(other[0], one[0], rtol=1e-13, atol=1e-13)
-    np.testing.assert_allclose(found.back(other[2]), one[2], rtol=1e-12, atol=1e-13)
+    np.testing.assert_allclose(found.restore_state(other[2]), one[2], rtol=1e-12, atol=1e-13)
     assert 0.3 < float(other[1] / one[1]) < 3.0  # the size of a rounding, which sums have in another order
 
 
@@ -118,9 +118,9 @@ def shapes(n):
 def test_steps_are_the_same(name, method):
     system, h = SYSTEMS[name], jnp.asarray(0.02)
     method = method.on(system)
-    found = system.arranged()
+    found = system.reorder_components()
     one = initial_run_state_program(system, method, state(system))
-    other = initial_run_state_program(found.system, pullback_method(method, found), found.there(state(system)))
+    other = initial_run_state_program(found.system, pullback_method(method, found), found.reorder_state(state(system)))
     step = jax.jit(take_step)
     for _ in range(3):
         one, other = step(system, method, one, h), step(found.system, pullback_method(method, found), other, h)
@@ -128,7 +128,7 @@ def test_steps_are_the_same(name, method):
     for name in ("x", "energy", "entropy", "largest_energy_increment", "energy_sensitivity"):
         ours = getattr(other, name)
         np.testing.assert_allclose(
-            found.back(ours) if name == "x" else ours, getattr(one, name), rtol=1e-11, atol=1e-13
+            found.restore_state(ours) if name == "x" else ours, getattr(one, name), rtol=1e-11, atol=1e-13
         )
 
 
@@ -149,7 +149,7 @@ def test_a_run_of_a_large_system_is_in_that_order_and_no_user_sees_it(method, mo
     found = lt.integrate(*run)
     assert found.audit().passed
     np.testing.assert_allclose(np.linalg.norm(system.spins(found.x), axis=-1), 1.0, atol=1e-14)
-    monkeypatch.setattr(lt.SpinSystem, "arranged", lambda self: None)
+    monkeypatch.setattr(lt.SpinSystem, "reorder_components", lambda self: None)
     jax.clear_caches()
     np.testing.assert_allclose(found.x, lt.integrate(*run).x, rtol=1e-11, atol=1e-13)
     jax.clear_caches()
@@ -173,7 +173,7 @@ def test_adaptive_steps_are_the_same(monkeypatch):
         return lt.integrate(system, system.state(unit(LARGE)), (0.0, 0.2), lt.Adaptive(1e-6), METHODS[-1]).x[-1]
 
     found = path()
-    monkeypatch.setattr(lt.SpinSystem, "arranged", lambda self: None)
+    monkeypatch.setattr(lt.SpinSystem, "reorder_components", lambda self: None)
     jax.clear_caches()
     np.testing.assert_allclose(found, path(), rtol=1e-10, atol=1e-12)
     jax.clear_caches()
@@ -187,7 +187,7 @@ def test_noise_is_that_of_sites_whatever_the_order(monkeypatch):
         return lt.integrate(system, system.state(unit(LARGE)), (0.0, 0.2), 0.05, noise=noise).x[-1]
 
     found = path()
-    monkeypatch.setattr(lt.SpinSystem, "arranged", lambda self: None)
+    monkeypatch.setattr(lt.SpinSystem, "reorder_components", lambda self: None)
     jax.clear_caches()
     np.testing.assert_allclose(found, path(), rtol=1e-11, atol=1e-13)
     jax.clear_caches()
@@ -218,13 +218,13 @@ def test_derivatives_go_through():
 
 def test_what_has_no_other_order():
     assert mf.Spins(3).is_component_major is False
-    assert ring(baths=False).arranged() is not None
+    assert ring(baths=False).reorder_components() is not None
     other = lt.SpinSystem(3, lt.magnetism.zeeman(3, (0.0, 0.0, 1.0)), lt.DoubleBracket())
-    assert other.arranged() is None  # what that does with components is not known
-    assert ring().arranged().system.arranged() is None
+    assert other.reorder_components() is None  # what that does with components is not known
+    assert ring().reorder_components().system.reorder_components() is None
     driven = lt.SpinSystem(3, lambda s, t: t * jnp.sum(s))
-    assert driven.arranged() is None
-    assert lt.models.rigid_body().arranged() is None
+    assert driven.reorder_components() is None
+    assert lt.models.rigid_body().reorder_components() is None
 
     class Own(lt.LandauLifshitz):
         def force(self, system, x, dH, dS, dL):
@@ -232,7 +232,7 @@ def test_what_has_no_other_order():
 
     mine = lt.SpinSystem(3, lt.magnetism.zeeman(3, (0.0, 0.0, 1.0)), Own(0.1))
     assert type(mine.dissipation) is Own  # which may say something else of components
-    assert mine.arranged() is None
+    assert mine.reorder_components() is None
     once = lt.SpinSystem(3, lt.magnetism.zeeman(3, (0.0, 0.0, 1.0)), lt.LandauLifshitz(0.1))
     x, motion = state(mine), mine.poisson.sharp(state(mine), mine.energy.gradient(state(mine)))
     np.testing.assert_allclose(mine.vector_field(x) - motion, 2.0 * (once.vector_field(x) - motion), atol=1e-15)
@@ -247,9 +247,9 @@ def test_the_two_orders():
 def test_control_a_wrong_order_is_seen():
     """Steps from a state in the other order, taken for one that is not."""
     system = ring()
-    found = system.arranged()
+    found = system.reorder_components()
     first = initial_run_state_program(system, lt.MetriplecticMidpoint(), jnp.asarray(system.state(unit(LARGE))))
     right = array.advance(system, lt.MetriplecticMidpoint(), first, *map(jnp.asarray, (0.05, 1, 1)), 1)[0]
-    wrong = first._replace(x=found.there(first.x))
+    wrong = first._replace(x=found.reorder_state(first.x))
     other = array.advance(system, lt.MetriplecticMidpoint(), wrong, *map(jnp.asarray, (0.05, 1, 1)), 1)[0]
-    assert np.abs(right.x - found.back(other.x)).max() > 1e-3
+    assert np.abs(right.x - found.restore_state(other.x)).max() > 1e-3

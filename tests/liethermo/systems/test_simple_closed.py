@@ -26,16 +26,16 @@ def residuals(system, x):
     by_q, by_v, by_S = jax.grad(system.action, argnums=(0, 1, 2))(q, v, S)
     change = jax.jvp(system.momentum, (q, v, S), (rate[:n], rate[n : 2 * n], rate[2 * n]))[1]
     F, push, heat = (f(q, v, S, t) for f in (system.friction_force, system.external_force, system.heating))
-    energy_rate = jax.jvp(system.own_energy, (x,), (rate,))[1]
+    energy_rate = jax.jvp(system.mechanical_energy, (x,), (rate,))[1]
     found = {
         "q' = v": rate[:n] - v,
         "momentum": change - by_q - F - push,
         "heat": -by_S * rate[2 * n] - heat + F @ v,
         "energy balance": energy_rate - push @ v - heat,
-        "E": system.own_energy(x) - (v @ by_v - system.action(q, v, S)),
+        "E": system.mechanical_energy(x) - (v @ by_v - system.action(q, v, S)),
         "energy law": jnp.dot(system.energy.gradient(x), rate),
     }
-    if system.receives:
+    if system.has_ledger:
         found["ledger"] = rate[2 * n + 1 :] - jnp.stack([push @ v, heat, 1.0])
     return found, energy_rate, -F @ v / -by_S
 
@@ -49,7 +49,7 @@ def test_the_equations_and_both_balances(kind, name):
     for name, residual in found.items():
         assert np.abs(residual).max() < 2e-12, name
     assert production.min() > 1e-4
-    assert (np.abs(energy_rate).max() > 0.1) == system.receives  # so the balance is one of something
+    assert (np.abs(energy_rate).max() > 0.1) == system.has_ledger  # so the balance is one of something
     assert system.check(points).passed
 
 
@@ -79,7 +79,7 @@ def _run_and_judge(system, x0):
     """The energy with the ledger is that of an isolated system."""
     solution = lt.integrate(system, x0, (0.0, 2.0), 0.05, engine="array")
     assert solution.audit().energy_drift <= tolerance("energy")
-    if not system.receives:
+    if not system.has_ledger:
         assert solution.stats.least_entropy_increment > 0.0
         assert solution.audit().passed
 
@@ -89,7 +89,7 @@ def test_the_ledger_in_the_audit():
     solution = lt.integrate(system, [0.4, 0.5, 0.2], (0.0, 2.0), 0.05)
     work, heat = solution.casimirs["work received"], solution.casimirs["heat received"]
     assert min(abs(work[-1]), abs(heat[-1])) > 0.01
-    gained = np.asarray(system.own_energy(solution.x)) - work - heat
+    gained = np.asarray(system.mechanical_energy(solution.x)) - work - heat
     assert np.ptp(gained) < 1e-13
     printed = {row.law: row.value for row in solution.audit().rows}
     assert printed["work received"] == work[-1]

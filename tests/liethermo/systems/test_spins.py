@@ -416,7 +416,7 @@ def test_ratios_and_sites_of_the_structure_are_checked():
 class Iterated(lt.SpinSystem):
     """Control: what noise turns is left to the iteration."""
 
-    def turned_back(self, angles, v):
+    def solve_rotation(self, angles, v):
         return v
 
 
@@ -441,7 +441,7 @@ def test_what_noise_turns_a_step_solves_for_at_once():
     assert at_once.stats.newton_iterations == 0
     assert 2 * at_once.stats.fixed_point_iterations < control.stats.fixed_point_iterations
     angles, v = RANDOM.standard_normal((64, 3)), RANDOM.standard_normal(system.dim)
-    u = np.asarray(lt.SpinSystem.turned_back(system, angles, v))
+    u = np.asarray(lt.SpinSystem.solve_rotation(system, angles, v))
     left = u[:-1] - np.cross(angles, u[:-1].reshape(-1, 3)).ravel()
     assert np.abs(left - v[:-1]).max() < 1e-14
     assert u[-1] == v[-1]

@@ -15,7 +15,7 @@ from scipy.integrate import solve_ivp
 import liethermo as lt
 import manifolds as mf
 from liethermo.integrators import registered_methods
-from liethermo.systems.check import JACOBI_DIM
+from liethermo.systems.check import MAX_FULL_JACOBI_DIM
 from tests.cases import energy_of, state_of
 
 SPHERE = lt.Quadratic(np.ones(3))
@@ -239,7 +239,7 @@ def test_a_poisson_tensor_that_is_none():
 @pytest.mark.parametrize("fits", [True, False], ids=["Poisson", "not"])
 def test_jacobi_of_many_components(fits):
     """Of three functions: arrays of n^3 numbers are not formed."""
-    n = JACOBI_DIM + 5
+    n = MAX_FULL_JACOBI_DIM + 5
 
     def tensor(x):
         a, b, c = x[:3] if fits else (x[1], 0.0, 1.0)
@@ -326,12 +326,12 @@ def test_the_report_counts_points_outside_the_domain():
 
 
 class Unstartable(lt.LiePoissonSystem):
-    def singular(self, x):
+    def why_singular(self, x):
         return "its gradient is infinite"
 
 
 class UnstartableOnASpace(lt.MetriplecticSystem):
-    singular = Unstartable.singular
+    why_singular = Unstartable.why_singular
 
 
 def test_what_a_system_says_of_first_states_is_heard_through_what_it_is_run_as():

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.systems.driven import _Push
+from liethermo.systems.driven import _TorqueForce
 
 INERTIA = np.array([3.2, 3.0, 1.0])
 START = np.array([0.8, 0.5, 1.3])
@@ -128,7 +128,9 @@ def test_work_by_another_gradient_breaks_the_ledger(monkeypatch):
     system = lt.LiePoissonSystem(mf.so(3), energy, torque=TORQUES["body"])
     good = lt.integrate(system, START, SPAN, 0.1, lt.MetriplecticMidpoint(), engine="array")
     assert good.audit().energy_drift <= LAW
-    monkeypatch.setattr(_Push, "force", lambda self, system, x, dH, dS, dL: system.pushed(x, system.energy.gradient(x)))
+    monkeypatch.setattr(
+        _TorqueForce, "force", lambda self, system, x, dH, dS, dL: system.torque_velocity(x, system.energy.gradient(x))
+    )
     monkeypatch.setattr(
         lt.DrivenSystem,
         "field",
@@ -353,12 +355,12 @@ def test_what_a_torque_acts_on_does_not_depend_on_its_numbers():
     for torque in (idle, busy, [lt.torques.Motor([0.1]), idle], lambda t, mu: 0.1 * mu):
         system = with_a_wheel(torque, group=SO3)
         assert system.has_impulse
-        assert not system.casimirs_of_torque
+        assert not system.torque_invariant_casimirs
     for torque in INTERNAL.values():
         system = with_a_wheel(torque, group=SO3)
         assert not system.has_impulse
-        assert system.casimirs_of_torque == {"mu1**2 + mu2**2 + mu3**2"}
-    assert with_a_wheel(INTERNAL["motor"]).casimirs_of_torque == {"mu1**2 + mu2**2 + mu3**2"}
+        assert system.torque_invariant_casimirs == {"mu1**2 + mu2**2 + mu3**2"}
+    assert with_a_wheel(INTERNAL["motor"]).torque_invariant_casimirs == {"mu1**2 + mu2**2 + mu3**2"}
 
 
 def test_an_ensemble_over_the_moment_of_a_motor_is_single_runs():
@@ -448,16 +450,16 @@ def test_files_provenance_and_dense_output(tmp_path):
     assert loaded.laws == run.laws
     assert str(loaded.audit()) == str(run.audit())
     assert np.array_equal(loaded.casimirs["impulse 2"], run.casimirs["impulse 2"])
-    assert "torque" not in lt.integrate(system.left_alone(), START, (0.0, 0.1), 0.1).provenance
+    assert "torque" not in lt.integrate(system.drop_torque(), START, (0.0, 0.1), 0.1).provenance
 
 
 def test_what_the_user_asks_of_a_system():
     system, attitude = rubbing(TORQUES["space"], warm=False), np.asarray(SO3.exp(np.array([0.4, -0.2, 0.7])))
     here = system.at_time(0.5, attitude)
-    expected = np.asarray(system.left_alone().vector_field(START)) + attitude.T @ [0.1, 0.2, -0.1]
+    expected = np.asarray(system.drop_torque().vector_field(START)) + attitude.T @ [0.1, 0.2, -0.1]
     assert np.allclose(here.vector_field(START), expected, rtol=1e-14)
     timed = rubbing(lambda t, mu: t * mu, warm=False)
-    assert np.allclose(timed.vector_field(START, 2.0), timed.left_alone().vector_field(START) + 2.0 * START)
+    assert np.allclose(timed.vector_field(START, 2.0), timed.drop_torque().vector_field(START) + 2.0 * START)
     assert system.check().passed
     assert rubbing(TORQUES["space"]).entropy_law == "nondecreasing"
     own = lt.LiePoissonSystem(

@@ -18,21 +18,21 @@ from ..functions.surface import Surface
 from .baths import HeatBaths
 
 
-class Decided(NamedTuple):
+class InvariantVerdicts(NamedTuple):
     """Names of functions of a system: of those that it conserves, and of those that this is not known of."""
 
-    constant: frozenset[str]
-    unknown: frozenset[str]
+    conserved_names: frozenset[str]
+    undecided_names: frozenset[str]
 
     @classmethod
-    def of(cls, verdicts: Mapping[str, bool | None], declared: Iterable[str]) -> Decided:
+    def from_verdicts(cls, verdicts: Mapping[str, bool | None], declared: Iterable[str]) -> InvariantVerdicts:
         """From a verdict on each function; one that is declared counts as conserved unless it is seen not to be."""
         verdicts = {**verdicts, **{name: True for name in declared if verdicts.get(name, True) is None}}
         constant = {name for name, verdict in verdicts.items() if verdict}
         return cls(frozenset(constant), frozenset(name for name, verdict in verdicts.items() if verdict is None))
 
 
-class Kind(Geometry):
+class SystemInterface(Geometry):
     """A kind of system: its data, and answers that a subclass may replace; :class:`System` has what follows from them.
 
     The attributes are those of :class:`System`.
@@ -41,9 +41,9 @@ class Kind(Geometry):
     entropy: Energy | None
     dissipation: Dissipation | None
     momentum_maps: dict[str, Energy]
-    preserved_as: tuple[str, ...] | None = eqx.field(static=True, kw_only=True, default=None)
+    preserved_labels: tuple[str, ...] | None = eqx.field(static=True, kw_only=True, default=None)
     """What the functions are called that the dissipation has to preserve, one after another."""
-    decided: Decided | None = eqx.field(static=True, kw_only=True, default=None)
+    invariant_verdicts: InvariantVerdicts | None = eqx.field(static=True, kw_only=True, default=None)
     """What it conserves, where that has been found out near the states of a run."""
     baths: HeatBaths | None = eqx.field(kw_only=True, default=None)
     """What takes the heat of the dissipation; the entropies are the last components of a state."""
@@ -81,7 +81,7 @@ class Kind(Geometry):
         return motion if self.dissipation is None else motion + self.dissipation.force(self, x, dH, dS, dL)
 
     @property
-    def tensor_by_form(self) -> bool:
+    def has_poisson_by_construction(self) -> bool:
         """Whether Pi is a Poisson tensor whatever the user gives, and dear to check when a system is built."""
         return False
 
@@ -90,7 +90,7 @@ class Kind(Geometry):
         """Whether the motion has a form without the gradient of the entropy: see :meth:`generated`."""
         return self.dissipation is not None and self.dissipation.has_generator
 
-    def generated(self, x) -> jax.Array:
+    def generator_field(self, x) -> jax.Array:
         """:meth:`field` at the gradients of the functions, in the form that the entropy is not in."""
         assert self.dissipation is not None
         dH = self.energy.gradient(x)
@@ -120,44 +120,44 @@ class Kind(Geometry):
         """
         return None
 
-    def singular(self, x) -> str:
+    def why_singular(self, x) -> str:
         """Why no run can start at x whose steps take the gradient of the entropy, in words; empty where one can.
 
         For several states it is as in :meth:`outside`.
         """
         return ""
 
-    def own_residuals(self, x) -> dict[str, jax.Array]:
+    def specific_residuals(self, x) -> dict[str, jax.Array]:
         """Residuals at x of axioms that only this kind of system has, relative to what cancels, by their names."""
         return {}
 
     # -- what acts from outside ---------------------------------------------------------------------------------------
 
     @property
-    def pushed_by(self) -> str:
+    def torque_name(self) -> str:
         """What a torque from outside is called; empty where none acts."""
         return ""
 
     @property
     def has_impulse(self) -> bool:
         """Whether a torque may change the momenta that a group turns, and not those of parts inside alone."""
-        return bool(self.pushed_by)
+        return bool(self.torque_name)
 
     @property
-    def casimirs_of_torque(self) -> frozenset[str]:
+    def torque_invariant_casimirs(self) -> frozenset[str]:
         """The names of the Casimirs that no torque on the system changes."""
-        return frozenset() if self.pushed_by else frozenset(self.casimirs())
+        return frozenset() if self.torque_name else frozenset(self.casimirs())
 
     @property
     def needs_attitude(self) -> bool:
         """Whether the torque depends on the attitude."""
         return False
 
-    def push(self, x) -> jax.Array | None:
+    def external_torque(self, x) -> jax.Array | None:
         """The torque at a state, shape (n,), of a system at a time and an attitude; None where none acts."""
         return None
 
-    def left_alone(self) -> Self:
+    def drop_torque(self) -> Self:
         """The system without a torque."""
         return self
 
@@ -185,7 +185,7 @@ class Kind(Geometry):
         return False
 
     @property
-    def orbit(self) -> tuple[int, frozenset[str]]:
+    def orbit_levels(self) -> tuple[int, frozenset[str]]:
         """How many momenta a group turns, and the names of the Casimirs on them: an orbit is a level of these."""
         return self.body_dim, frozenset(self.casimirs())
 
@@ -200,27 +200,27 @@ class Kind(Geometry):
         return {}
 
     @property
-    def constants(self) -> tuple[str, ...]:
+    def constant_names(self) -> tuple[str, ...]:
         """Names of what is constant along a run and is no function with one value, such as a momentum in space."""
         return ()
 
     @property
-    def balance(self) -> tuple[str, ...]:
+    def balance_entries(self) -> tuple[str, ...]:
         """Entries of the ledger that the energy of a solution contains; its laws are stated without them."""
         return ()
 
     # -- states as users see them -------------------------------------------------------------------------------------
 
-    def seen(self, x) -> jax.Array:
+    def user_state(self, x) -> jax.Array:
         """The part of a state that is the user's, as points: what the functions of an event are functions of."""
         return self.points(x)
 
-    def pulled(self, energy: Energy) -> Energy:
+    def pullback(self, energy: Energy) -> Energy:
         """A function of the states that the user sees, as one of the states here."""
         return energy
 
     @property
-    def blocks(self) -> tuple[slice, ...]:
+    def state_blocks(self) -> tuple[slice, ...]:
         """The parts of a state that have sizes of their own, such as a momentum and the attitude beside it."""
         n = self.body_dim
         return (slice(None),) if self.baths is None else (slice(0, n), slice(n, self.dim))
@@ -228,35 +228,35 @@ class Kind(Geometry):
     # -- for the engines ----------------------------------------------------------------------------------------------
 
     @property
-    def unrollable(self) -> bool:
+    def can_unroll(self) -> bool:
         """Whether the compiled engine is worth trying: False where the system is known to need a loop."""
         return self.space is None or (self.space.is_smooth and self.space.dtype.kind != "c")
 
     @property
-    def spectral(self) -> bool:
+    def has_matrix_functions(self) -> bool:
         """Whether it is made of functions of matrices, which XLA compiles more slowly than the compiled engine."""
         return False
 
     @property
-    def smooth(self) -> bool:
+    def is_smooth(self) -> bool:
         """Whether the vector field can be differentiated twice and more."""
         return self.space is None or self.space.is_smooth
 
-    def sparsity(self) -> scipy.sparse.csr_array | None:
+    def sparsity_pattern(self) -> scipy.sparse.csr_array | None:
         """Which components of the field depend on which of the state, discrete gradients included; None if not known.
 
         A pattern, shape (n, n). Large systems that know it are solved by sparse Newton iteration.
         """
         return None
 
-    def weights(self, x) -> jax.Array:
+    def residual_weights(self, x) -> jax.Array:
         """Factors of the components of the field, at a state, in which it depends on the state most nearly linearly.
 
         Newton's method is applied to the equations of a stiff step multiplied by these, shape (n,).
         """
         return jnp.ones_like(x)
 
-    def sizes(self, k) -> jax.Array:
+    def component_scales(self, k) -> jax.Array:
         """The size that components of slopes, shape (..., n), are measured by, for differences: the largest for all."""
         size = jnp.max(jnp.abs(k))
         return jnp.full_like(k, jnp.where(size > 0.0, size, 1.0))
