@@ -128,15 +128,30 @@ html_context = {"default_mode": "auto"}  # else the theme complains to a first v
 
 INTERNALS = frozenset(
     """
-    acted_on across along_at arranged at_midpoint at_sites at_some_times balance begin blocks body_at body_dim
-    by_constants casimirs_of_torque check_places constants couplings decided decided_near displaced entries evaluated
-    explain first_velocity general has_impulse heating_sites here hidden impulses in_chart inertia_at isotropic
-    isotropic_size kind leaves ledger left_alone
-    linearised local lowered needs_attitude noiseless noisy numbers on on_density on_sites on_states orderless outside
-    over_sites own_energy own_residuals own_size place predict prepared presented preserved_as preserved_by_name
-    preserved_names production_name pulled push pushed pushed_by quotient raised receives rounded samples seen
-    sizes smooth solved_for sparsity spectral surface surrounded tangent time_of torque_free transport transports
-    turned turned_parts uncorrected undecided unrollable untouched
+    accessed_names across added_momentum algebra_by_constants as_provenance balance_entries base_step
+    bind_attitude bind_to bind_to_structure block_results body_at_attitude body_dim can_be_embedded
+    can_transport_attitude can_unroll carries_compensation check_components clock_components component_scales
+    consecutive_increments constant_names continuous_factor couplings decompose difference_quotient
+    difference_rounding_scale dim_without_ledger displace divergence_terms dot_at_sites drop_baths drop_torque
+    energy_of_vectors evaluate_batch evaluations_per_iteration external_torque field_and_law_rates
+    first_velocity_index forces_and_power freeze_at functions_for_naming general generator_field grid_seeds
+    has_impulse has_ledger has_matrix_functions has_poisson_by_construction heating_sites impulse_names initial
+    initial_compensation initial_run_state initial_state input_residuals intervals invariant_names
+    invariant_verdicts invariants_by_construction is_hidden is_noiseless is_order_independent
+    is_projection_trivial is_smooth is_torque_free isotropic_size isotropic_vector jackknife_blocks
+    jacobian_probe join_state ledger ledger_rates local_system lower_index make_blocks map_defect
+    mechanical_energy member_stats member_status method_with_noise midpoint_gradients momentum_jacobians
+    momentum_system names_from_multiples needs_attitude noisy nonnegative orbit_levels outer_scalars
+    precession_rates predict preserved_by_name preserved_labels preserved_names preserves_function
+    production_name project_tangent pullback pullback_to_chart raise_index rate_of_change record_initial
+    reorder_components requested_invariants reshape_to_sites residual_jvp residual_weights
+    resolve_invariants_near rounding_scale row_counts row_pointer samples scale_at_sites site_spins
+    solution_builder solved_part sparsity_pattern specific_residuals split_state stage_velocities start_blocks
+    state_array state_blocks state_time step_without_compensation surface system_without_span
+    systems_at_test_times tangential_covector term_index test_states_per_scale to_user_solution to_user_state
+    torque_arguments torque_free_components torque_invariant_casimirs torque_name torque_velocity
+    torques_need_attitude trajectory_numbers transport undecided_functions user_state user_state_at uses_charts
+    value_type why_singular why_step_failed
     """.split()
 )
 """Members that the rooms of the library ask of each other: no user calls them, so the reference leaves them out."""
