@@ -810,7 +810,7 @@ text = repr(scalarize(jax.make_jaxpr(f)(spec, spec)))
         (lambda a: jnp.float16(a) * 2.0, "convert_element_type", "on float16[3]"),
         (lambda a: jnp.arcsin(a + 1j).real, "asin", "on complex numbers"),
         (lambda a: jax.pure_callback(np.sin, a, a), "pure_callback", ""),
-        (lambda a: lax.reduce_max(a[:0], (0,)), "reduce_max", "of no entries"),
+        (lambda a: lax.reduce_max(a[:0], (0,)), "reduce_max", "over an empty axis"),
     ],
     ids=["eig", "float16", "complex", "callback", "empty"],
 )
