@@ -147,15 +147,15 @@ def test_which_energies_are_known_to_produce_entropy(energy, expected):
 @pytest.mark.parametrize(
     ("energy", "error", "words"),
     [
-        (lt.Function(bumpy).on([0, 3]), lt.InputError, "component 3 of a state with 3"),
+        (lt.Function(bumpy).on([0, 3]), lt.InputError, "component 3, but the state has 3"),
         (lt.Function(bumpy).on([-4]), lt.InputError, "component -4"),
-        (lt.Function(bumpy).on(jnp.sin), lt.InputError, r"not a quadratic function.*miss.*tolerance.*square"),
-        (lt.Function(bumpy).on(lambda x: jnp.linalg.norm(x)[None]), lt.InputError, "not a quadratic function"),
+        (lt.Function(bumpy).on(jnp.sin), lt.InputError, r"must be a quadratic function.*miss.*tolerance.*square"),
+        (lt.Function(bumpy).on(lambda x: jnp.linalg.norm(x)[None]), lt.InputError, "must be a quadratic function"),
         (lt.Function(bumpy).on(lambda x: x @ jnp.ones(4)), lt.FunctionError, "coordinates of a term"),
     ],
 )
 def test_coordinates_that_cannot_be_used(energy, error, words):
     with pytest.raises(error, match=words):
         lt.EvolutionSystem(energy, 3)
-    with pytest.raises(lt.InputError, match="not symmetric"):
+    with pytest.raises(lt.InputError, match="must be symmetric"):
         lt.Kinetic([[1.0, 1.0], [0.0, 1.0]])

@@ -112,9 +112,9 @@ def test_one_branch_after_another():
 def test_short_work_is_not_worth_a_jump_and_a_choice_is_no_branch():
     short = program_of(lambda x: lax.cond(x > 0.0, lambda x: x * 2.0, lambda x: x / 3.0, x), np.array(1.0))
     assert not branches(ordered(short))
-    assert branches(ordered(short, least=1))
+    assert branches(ordered(short, min_instructions=1))
     choice = program_of(lambda x: jnp.where(x > 0.0, long(x, 0.9), x), np.array(1.0))
-    assert not branches(ordered(choice, least=1))
+    assert not branches(ordered(choice, min_instructions=1))
 
 
 def test_equal_branches_are_one():
