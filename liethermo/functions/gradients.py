@@ -486,4 +486,7 @@ def _gauss_rule(nodes: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 _GAUSS_NODES_3 = _gauss_rule(3)[0]
+"""Nodes of the Gauss rule with three nodes on [0, 1]."""
+
 _TINY = 1e-290
+"""Smallest modulus of a divisor."""

@@ -13,7 +13,7 @@ import pytest
 from liethermo.engines.compiled import kept, machine_code
 from liethermo.engines.compiled.kept import CacheWarning
 from tests.liethermo.tracing.test_scalarize import program_of
-from tests.machine_code import compiled
+from tests.machine_code import compile_program as compiled
 
 
 @pytest.fixture
