@@ -19,12 +19,12 @@ MAX_SERIES_ARGUMENT = 1 / 32
 
 
 class BathEnergy(Energy):
-    """The energy ``sum_b C_b T_b (exp(y_b / C_b) - 1)`` of baths with entropies y and temperatures ``T_b exp(y_b /
-    C_b)``.
+    """The energy of heat baths, ``sum_b C_b T_b (exp(y_b / C_b) - 1)``, as a function of their entropies y.
 
-    The energy vanishes at y = 0; otherwise the heat of a small body would be lost in the rounding of the content of a
-    large bath. Over a step that changes y_b by d_b the energy changes by ``T_b exp(y_b / C_b) C_b (exp(d_b / C_b) -
-    1)``. This is not a difference of two values, so it has none of their rounding.
+    The temperatures are ``T_b exp(y_b / C_b)``. The energy vanishes at y = 0; otherwise the heat of a small body would
+    be lost in the rounding of the content of a large bath. Over a step that changes y_b by d_b the energy changes by
+    ``T_b exp(y_b / C_b) C_b (exp(d_b / C_b) - 1)``. This is not a difference of two values, so it has none of their
+    rounding.
 
     Parameters
     ----------
@@ -45,8 +45,7 @@ class BathEnergy(Energy):
         return jnp.zeros(())
 
     def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
-        """Return the difference quotient of each bath; a sum of functions of one number has no other discrete
-        gradient."""
+        """Return the difference quotient of each bath, the only discrete gradient of a function of one number."""
         return self.gradient(x + compensation) * _exponential_and_quotient(d * self.rate)[1]
 
     def stage_gradients(self, scheme, path) -> jax.Array:

@@ -39,8 +39,7 @@ _collected_conditions: contextvars.ContextVar[list[TracedCondition] | None] = co
 
 @contextlib.contextmanager
 def collect_conditions() -> Iterator[list[TracedCondition]]:
-    """Collect the conditions on traced values inside a ``with`` block, for a sweep that evaluates them at every
-    point."""
+    """Collect the conditions on traced values inside a ``with`` block; a sweep evaluates them at every point."""
     conditions: list[TracedCondition] = []
     token = _collected_conditions.set(conditions)
     try:

@@ -401,8 +401,7 @@ class StateTimeEnergy(Energy):
 
 
 def _squared_gradient_weights(gradients) -> jax.Array:
-    """Return squared gradients, shape (s, m), summed: that by the state for each of its components, then that by
-    time."""
+    """Return sums of squared gradients, shape (s, m): that by the state for each component, then that by time."""
     scale = jnp.max(jnp.abs(gradients))
     squares = jnp.sum((gradients / jnp.where(scale > 0.0, scale, 1.0)) ** 2, axis=0)
     return jnp.append(jnp.full(gradients.shape[1] - 1, jnp.sum(squares[:-1])), squares[-1])
@@ -590,8 +589,7 @@ class ChartEnergy(Energy):
         return self.energy.value(self.space.to_vector(self.coordinates.point(x)))
 
     def rounding_scale(self, x) -> jax.Array:
-        """Return the rounding scale at the start of the step if it is known; it is then computed once for all
-        iterations."""
+        """Return the rounding scale at the start of the step, if it is known, so that iterations share one value."""
         if self.start is None:
             return super().rounding_scale(x)
         return self.energy.rounding_scale(self.start) + CHART_ROUNDINGS * self.energy.sensitivity(self.start)

@@ -289,7 +289,7 @@ def flatten_covectors(covectors: VectorComponents, x, planar: bool = False) -> j
 
 
 def lattice_shape(sites) -> tuple[int, ...]:
-    """Return the shape of a lattice as a tuple; ``(count,)`` for a number of sites."""
+    """Return the shape of a lattice as a tuple; an integer becomes a tuple of one entry."""
     shape = tuple(sites) if isinstance(sites, tuple | list) else (sites,)
     is_valid = all(isinstance(n, int | np.integer) and not isinstance(n, bool) and n >= 1 for n in shape)
     if not shape or not is_valid:

@@ -116,8 +116,7 @@ def is_independent_of_momenta(term: Energy, points: np.ndarray) -> bool:
 
 
 def is_independent_of(term: Energy, points: np.ndarray, components: np.ndarray) -> bool:
-    """Return whether a term is known not to depend on some components, from its coordinates' Jacobian at some
-    states."""
+    """Return whether a term is known not to depend on some components, by the Jacobian of its coordinates."""
     if isinstance(term, Each):
         return not np.isin(components, term.places).any()
     return isinstance(term, Pullback) and not evaluate_at_points(_jacobian, term, points)[:, :, components].any()

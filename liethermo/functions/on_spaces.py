@@ -25,8 +25,7 @@ class PointEnergy(Energy):
 
 
 def energy_of_vectors(energy: Energy, space: mf.Space | None) -> Energy:
-    """Return an energy of the points of a space as an energy of their vectors; an lt.Quadratic is returned
-    unchanged."""
+    """Return an energy of the points of a space as one of their vectors; an lt.Quadratic is returned unchanged."""
     if space is None or space.shape == (space.size,):
         return energy
     return energy.map_terms(lambda term: _term_of_vectors(term, space))

@@ -1,5 +1,4 @@
-"""Find the instructions of a scalar program that only one side of a branch needs, so that the other side can jump over
-them.
+"""Move the instructions that only one side of a branch needs into that side, so that they can be jumped over.
 
 A scalar program computes both sides of every ``lax.cond`` and then selects one, which is right wherever it runs. The
 writer of machine code calls :func:`nest_branches` to move the instructions of one side behind a jump.

@@ -174,8 +174,7 @@ class LimitExceededError(Exception):
 
 
 class EnclosingScope:
-    """The builder around a program that becomes one of its instructions, and the scalars that the program reads from
-    it.
+    """The builder around an inner program, such as a loop body, and the scalars that the inner program reads.
 
     Attributes
     ----------

@@ -21,8 +21,7 @@ MAX_CACHED_BYTES = 2**28
 """Largest total size, in bytes, of the arrays among the arguments that one function keeps."""
 
 MAX_COMPARED_BYTES = 2**20
-"""Largest size, in bytes, of arguments that are compared by content: comparing takes longer than most calls beyond
-it."""
+"""Largest size, in bytes, of arguments compared by content; comparing larger ones takes longer than most calls."""
 
 
 class LRUCache(Generic[Result]):

@@ -16,8 +16,7 @@ from .builder import Block
 
 @dataclass(frozen=True, eq=False)
 class LapackCall(Block):
-    """A function of matrices, whose entries are passed row by row; complex matrices pass all real parts, then all
-    imaginary parts.
+    """A function of matrices, passed row by row; complex ones pass all real parts, then all imaginary parts.
 
     The results are NaN if an argument is not finite or the function does not converge.
 

@@ -34,13 +34,11 @@ MAX_UNROLLED_DIM = 2_000
 """Largest dimension of points at which a function is unrolled; for more it is compiled and mapped over the points."""
 
 MAX_DEGREE_INSTRUCTIONS = 8_000
-"""Largest number of instructions unrolled to find a degree; beyond it :func:`array_degree_bound` gives a looser
-bound."""
+"""Largest number of instructions unrolled to find a degree; then :func:`array_degree_bound` gives a looser bound."""
 
 
 def evaluate_at_points(function: Callable, model: Any, points: np.ndarray) -> Any:
-    """Evaluate ``function(model, x)`` for each x of ``points``, shape (m, n); the results have the points as first
-    axis.
+    """Return ``function(model, x)`` for each x of ``points``, shape (m, n), as arrays whose first axis is the points.
 
     Parameters
     ----------
@@ -95,8 +93,7 @@ def point_evaluator(function: Callable, model: Any, dim: int) -> Callable[[np.nd
 
 
 def polynomial_degree(function: Callable, model: Any, dim: int) -> float:
-    """Return an upper bound of the degree of ``function(model, x)`` as a polynomial in x, shape (dim,), for any
-    parameters.
+    """Return an upper bound of the degree of ``function(model, x)`` in x, shape (dim,), for any parameters.
 
     The bound is infinite if the function is not written as a polynomial. The arrays of the model are the parameters.
     """
@@ -139,8 +136,7 @@ def vanishing_entries(function: Callable, model: Any, *shapes: tuple[int, ...]) 
 
 
 def _split_parameters(model: Any) -> tuple[list, Any, Callable]:
-    """Return the parameters of a model (its float64 arrays), a key of its other leaves, and a function that rebuilds
-    it."""
+    """Return the parameters of a model (its float64 arrays), a key of all else, and a function that rebuilds it."""
     dynamic, static = eqx.partition(model, _is_parameter)
     leaves, structure = jax.tree_util.tree_flatten(dynamic)
     model_key = fingerprint(static), structure, tuple(np.shape(leaf) for leaf in leaves)

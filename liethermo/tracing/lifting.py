@@ -23,8 +23,7 @@ CALL_PRIMITIVES = ("jit", "pjit", "closed_call", "core_call")
 
 
 class ConstantLifter:
-    """Turns the numbers of a jaxpr into its first arguments: all constants, and all literals of double precision except
-    zeros.
+    """Turns constants and nonzero float64 literals of a jaxpr, here called its numbers, into its first arguments.
 
     Zeros stay, because vanishing terms belong to the operations. Exponents with instructions of their own stay too, and
     so do numbers from which truth values or integers are computed.
@@ -276,8 +275,7 @@ def _is_liftable_literal(atom) -> bool:
 
 
 FORMULA_INPUTS = {"pow": (1, 2.0), "polygamma": (0, 1.0)}
-"""Input that selects the formula of a primitive, and a factor: the input is a constant if their product is an
-integer."""
+"""Input that selects the formula of a primitive, and a factor; it stays a constant if their product is an integer."""
 
 
 def _formula_input_index(name: str, inputs: list) -> int | None:

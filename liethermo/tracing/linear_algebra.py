@@ -67,8 +67,7 @@ def matrix_product(b, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def input_table(b, x: np.ndarray) -> tuple[str, tuple[int, int]] | None:
-    """Return the table of a matrix that is an input of the program, such as parameters, or its transpose, without a
-    copy.
+    """Return the table of a matrix, or of its transpose, that is an input of the program, without a copy.
 
     The result is the name of the table and the distances in it between neighbouring rows and between neighbouring
     columns. It is None if the matrix is not an input.

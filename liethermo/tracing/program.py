@@ -160,8 +160,8 @@ class Program:
         return max((degrees.get(a, 0) for entries in self.outputs for a in entries), default=0)
 
     def factor_constants(self, varying: Sequence[int]) -> Program:
-        """Return an equivalent program with products ``(v a) b`` written ``v (a b)``, where a and b do not depend on
-        some inputs.
+        """Return an equivalent program that multiplies ``(v a) b`` as ``v (a b)`` if a and b do not depend on some
+        inputs.
 
         A loop that changes only these inputs then computes ``a b`` once.
 

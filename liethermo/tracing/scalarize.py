@@ -297,8 +297,7 @@ def _prepare_chain_matrix(function: chains.MatrixFunction, a):
 
 
 def _apply_chain(chain: tuple[chains.MatrixFunction, tuple[int, ...], int], *arguments):
-    """Evaluate a chain of a function at some slots, from decompositions of its matrices with ``n_arrays`` arrays
-    each."""
+    """Evaluate a chain of a function at some slots, from decomposed matrices of ``n_arrays`` arrays each."""
     function, slots, n_arrays = chain
     end = len(arguments) - len(slots)
     decompositions = [arguments[i : i + n_arrays] for i in range(0, end, n_arrays)]

@@ -136,8 +136,7 @@ class _Recurrences:
         self.evaluation_order = [] if self.result is None else self._topological_order(self.result)
 
     def next_coefficient(self, n, n_float, argument_coefficient, histories: dict) -> tuple[jax.Array, dict]:
-        """Return coefficient n of the result from that of the argument, and the histories extended by coefficients
-        n."""
+        """Return coefficient n of the result from that of the argument, and the histories with coefficients n added."""
         coefficients: dict[int, Any] = {}
         histories = dict(histories)
         for term_index in (0, *self.evaluation_order):
@@ -163,8 +162,7 @@ class _Recurrences:
         return [(i, self.terms[i].start) for i in indices]
 
     def _topological_order(self, result: int) -> list[int]:
-        """Return the terms that a result needs, each after its ``current_terms``; its ``history_terms`` have no
-        order."""
+        """Return the terms that a result needs, each after its ``current_terms``; ``history_terms`` may come later."""
         order, pending, visited_terms = [], [result], {0}
         while pending:
             stack = [(pending.pop(), False)]
@@ -398,8 +396,7 @@ def _derivative_rule(recurrences: _Recurrences, eqn, values) -> list:
 
 
 def _power_rule(recurrences: _Recurrences, eqn, values) -> list:
-    """Compute ``a ** p``, by products for an integer p, because ``p D a / a`` is inaccurate near a = 0 and NaN
-    there."""
+    """Compute ``a ** p``, by products for an integer p: ``p D a / a`` is inaccurate near a = 0, and NaN there."""
     a, p = values
     if not isinstance(a, _SeriesIndex) or isinstance(p, _SeriesIndex):
         return _derivative_rule(recurrences, eqn, values)

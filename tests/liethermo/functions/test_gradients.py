@@ -110,8 +110,7 @@ RESTING_COMPONENTS = {
     "coordinate_increment": lambda slope: slope(1.0),
     "symmetric_coordinate_increment": lambda slope: 0.5 * (slope(0.0) + slope(1.0)),
 }
-"""Component of the discrete gradient for a coordinate that does not move, from the slope of the energy along it at ``x
-+ t d``."""
+"""Component of a coordinate that does not move, from the slope of the energy along it at ``x + t d``."""
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -145,8 +144,7 @@ def test_quadratic_terms_agree_with_the_general_formula(gradient, seed):
     "function", [lambda x: jnp.cos(1000.0 * x[0]) + x[1] ** 2, lambda x: jnp.exp(3.0 * x[0] * x[1])]
 )
 def test_short_length_scales(gradient, function):
-    """A function that varies on lengths of 1e-3 satisfies the identity at every distance, because the gate is scale
-    free."""
+    """The gate is scale free: a function that varies on lengths of 1e-3 satisfies the identity at every distance."""
     energy, x, direction = lt.Function(function), np.array([0.7, 0.4]), np.array([1.0, 0.5])
     for distance in np.geomspace(1e-9, 1.0, 19):
         d = distance * direction

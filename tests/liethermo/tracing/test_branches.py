@@ -194,6 +194,4 @@ def test_lanes_of_random_branches_equal_single_runs(specs, seed):
     )
     for i, (lane_output, expected) in enumerate(zip(lane_outputs, program.evaluate(x, batch=True), strict=True)):
         np.testing.assert_allclose(lane_output, expected, rtol=1e-12, atol=1e-13)
-        assert np.array_equal(lane_output, [single[i] for single in single_outputs]), (
-            "no lane depends on the others"
-        )
+        assert np.array_equal(lane_output, [single[i] for single in single_outputs]), "no lane depends on the others"

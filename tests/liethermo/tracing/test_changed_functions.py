@@ -1,5 +1,4 @@
-"""A function that was traced before is traced again for a new system, because the globals that it reads may have
-changed."""
+"""A function that was traced before is traced again for a new system, since globals that it reads may change."""
 
 import pickle
 import types

@@ -915,8 +915,7 @@ def test_a_corrupted_instruction_is_caught():
 
 
 def slopes(system, method):
-    """Return the right-hand side of the stage equations and its arguments: state, compensation, step, slopes,
-    parameters."""
+    """Return the right-hand side of the stage equations, and its arguments from the state to the parameters."""
     parameters, structure = eqx.partition(system, eqx.is_inexact_array)
 
     def f(x, compensation, h, k, parameters):

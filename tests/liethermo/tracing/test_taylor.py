@@ -156,8 +156,7 @@ def one_and_x(x):
 
 
 def cauchy_coefficients(function, point, radius, count=1024):
-    """Return coefficients times powers of the radius, from values on a circle [NumPy's and SciPy's complex
-    functions]."""
+    """Return coefficients times powers of the radius, from values on a circle by the discrete Fourier transform."""
     circle = point + radius * np.exp(2j * np.pi * np.arange(count) / count)
     return (np.fft.fft(function(circle)) / count).real[:ORDER]
 
