@@ -33,7 +33,7 @@ class TracedCondition(NamedTuple):
 
 
 _collected_conditions: contextvars.ContextVar[list[TracedCondition] | None] = contextvars.ContextVar(
-    "noted", default=None
+    "collected_conditions", default=None
 )
 
 

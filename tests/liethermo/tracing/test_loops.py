@@ -159,7 +159,7 @@ def test_integers_and_truths_belong_to_the_operations():
 
 
 def test_traced_function_refuses_other_shapes():
-    with pytest.raises(lt.LiethermoError, match="shapes"):
+    with pytest.raises(lt.LiethermoError, match="must be called with arrays of shape"):
         traced.trace_function(function(0.3, [1.0, 2.0, 3.0]), STATE)(jnp.ones(4))
 
 

@@ -216,5 +216,5 @@ def shifted_abs(x):
 
 
 def test_a_refusal_names_the_line():
-    with pytest.raises(TaylorSeriesError, match=r"'abs' is not smooth \(test_taylor.py:\d+, in bent\)"):
+    with pytest.raises(TaylorSeriesError, match=r"'abs' is not smooth \(test_taylor.py:\d+, in shifted_abs\)"):
         check_taylor_series(shifted_abs, 0.5)
