@@ -220,7 +220,7 @@ class ConstantFactor(HeatConduction):
     """Control: the skew tensor with a constant in place of the Fourier factor, the Poisson tensor of SML §5."""
 
     def force(self, system, x, dH, dS, dL):
-        T = dH[S := system.poisson.places.S]
+        T = dH[S := system.poisson.state_indices.S]
         i, j = np.array(self.first_bodies), np.array(self.second_bodies)
         return jnp.zeros_like(x).at[S[i]].add(self.conductance * T[j]).at[S[j]].add(-self.conductance * T[i])
 
@@ -229,7 +229,7 @@ class AtTheMidpoint(HeatConduction):
     """Control: the heat of the discrete temperatures, divided by those at the midpoint."""
 
     def force(self, system, x, dH, dS, dL):
-        S = system.poisson.places.S
+        S = system.poisson.state_indices.S
         T = system.energy.gradient(x)[S]
         return super().force(system, x, dH, dS, dL) * jnp.ones_like(x).at[S].set(dH[S] / T)
 
@@ -260,7 +260,7 @@ CART = lt.Subsystem(lt.Kinetic([1.0]) + lt.Function(Warm(jnp.asarray(1.0))).on([
     ("arguments", "words"),
     [
         ({"conductance": [[0.0, 1.0, 0.0], [2.0, 0.0, 1.0], [0.0, 1.0, 0.0]]}, "must be symmetric.*transpose by 1"),
-        ({"conductance": np.ones((2, 2))}, r"\(3, 3\) matrix for 3 parts, not one of shape \(2, 2\)"),
+        ({"conductance": np.ones((2, 2))}, r"of 3 parts must be a \(3, 3\) matrix, got shape \(2, 2\)"),
         ({"conductance": [(0, 1, -1.0), (1, 2, 1.0)]}, "between stone and cart must be finite and >= 0, got -1"),
         ({"conductance": [(0, 1, np.nan), (1, 2, 1.0)]}, "finite"),
         ({"conductance": [(0, 1, 1.0)]}, "2 parts that.*of stone and cart and that of body 2.*connected=False"),
