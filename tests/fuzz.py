@@ -1,8 +1,8 @@
-"""Random functions of every primitive that the scalar compiler claims, composed, beside JAX.
+"""Comparison of the scalar compiler with JAX, on random compositions of every primitive that it supports.
 
 ``python -m tests.fuzz --seconds 60`` (``make fuzz SECONDS=60``) draws functions until the time is over. It compares
 values, gradients, second derivatives and lanes, at random points and at special ones: zeros of both signs, infinity,
-subnormal numbers, equal entries. What differs is printed with the seed that makes the same function again.
+subnormal numbers, equal entries. A difference is printed with the seed of its function.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ import numpy as np
 from jax.extend.core import jaxprs_in_params
 
 from liethermo.tracing.scalarize import CompilerFault, UnsupportedPrimitive, scalarize
-from tests.fuzz_operations import DTYPES, INTEGERS, OPERATIONS, cut
-from tests.machine_code import compiled
-from tests.scalar_programs import check
+from tests.fuzz_operations import DTYPES, INTEGER_DTYPES, OPERATIONS, limit_size
+from tests.machine_code import compile_program
+from tests.scalar_programs import check_outputs
 
 SUMMARIES: dict[str, Callable] = {
     "value": lambda f: f,
@@ -35,10 +35,10 @@ SUMMARIES: dict[str, Callable] = {
     "batch": lambda f: lambda x, y: jax.vmap(lambda s: f(s * x, y))(jnp.array([1.0, 0.5])),
 }
 
-SIZES = 3, 2
-"""Entries of the two arguments of a function."""
+ARGUMENT_SIZES = 3, 2
+"""Number of entries of the two arguments of a function."""
 
-# XLA's complex abs is 0 where squares underflow, so nothing normal is smaller than 1e-140
+# no normal number below 1e-140, because XLA's complex abs is 0 where squares underflow
 SPECIAL_NUMBERS = np.array(
     [
         0.0,
@@ -64,87 +64,82 @@ SPECIAL_NUMBERS = np.array(
 
 
 class Function(NamedTuple):
-    """A random function of two vectors.
-
-    ``text`` says what it is made of, a step a line.
-    """
+    """A random function of two vectors; ``text`` describes it, one step a line."""
 
     call: Callable
     text: str
 
 
-def function_of(seed: int, names: Sequence[str] | None = None, steps: int = 5) -> Function:
-    """A random function of the operations of these names, each step of which uses what the steps before it made."""
-    random = np.random.default_rng(seed)
+def random_function(seed: int, names: Sequence[str] | None = None, steps: int = 5) -> Function:
+    """Compose random operations of these names; each step uses the arguments and the results of previous steps."""
+    rng = np.random.default_rng(seed)
     names = list(OPERATIONS) if names is None else list(names)
-    x = [jax.ShapeDtypeStruct((n,), jnp.float64) for n in SIZES]
     program: list[tuple[Callable, tuple[int, ...], int]] = []
-    known, text = list(x), []
+    values = [jax.ShapeDtypeStruct((n,), jnp.float64) for n in ARGUMENT_SIZES]
+    lines: list[str] = []
 
-    def applied(values):
-        values = list(values)
-        for function, places, k in program:
-            values.append(function(*(values[i] for i in places), k))
-        return values
+    def evaluate(arrays):
+        results = list(arrays)
+        for function, indices, k in program:
+            results.append(function(*(results[i] for i in indices), k))
+        return results
 
-    def of_kind(kind: str) -> int:
-        """The place of a value of a kind; one that is converted where there is none."""
+    def value_of_kind(kind: str) -> int:
+        """Return the index of a value of a kind, converting one if there is none."""
         if kind == "i":
-            fitting = [i for i, a in enumerate(known) if jnp.issubdtype(a.dtype, jnp.integer)]
+            candidates = [i for i, a in enumerate(values) if jnp.issubdtype(a.dtype, jnp.integer)]
         else:
-            fitting = [i for i, a in enumerate(known) if a.dtype == DTYPES[kind]]
-        if fitting and (kind == "f" or random.random() < 0.7):
-            newest = [i for i in fitting if i >= len(SIZES)]
-            return int(random.choice(newest if newest and random.random() < 0.8 else fitting))
-        source = of_kind("f")
-        number = float(np.round(random.uniform(-1.0, 1.0), 1))
+            candidates = [i for i, a in enumerate(values) if a.dtype == DTYPES[kind]]
+        if candidates and (kind == "f" or rng.random() < 0.7):
+            results_of_kind = [i for i in candidates if i >= len(ARGUMENT_SIZES)]
+            return int(rng.choice(results_of_kind if results_of_kind and rng.random() < 0.8 else candidates))
+        source = value_of_kind("f")
+        number = float(np.round(rng.uniform(-1.0, 1.0), 1))
         if kind == "b":
-            convert, said = (lambda a, k: a > number), f"> {number}"
+            convert, description = (lambda a, k: a > number), f"> {number}"
         elif kind == "i":
-            t = random.choice(list(INTEGERS))
-            convert, said = (lambda a, k: (3.0 * a).astype(INTEGERS[t])), f"3 * . as {t}"
+            dtype_name = rng.choice(list(INTEGER_DTYPES))
+            convert, description = (lambda a, k: (3.0 * a).astype(INTEGER_DTYPES[dtype_name])), f"3 * . as {dtype_name}"
         else:
-            convert, said = (lambda a, k: a.astype(DTYPES[kind])), str(np.dtype(DTYPES[kind]))
-        return added(convert, (source,), 0, said)
+            convert, description = (lambda a, k: a.astype(DTYPES[kind])), str(np.dtype(DTYPES[kind]))
+        return add_step(convert, (source,), 0, description)
 
-    def added(function, places: tuple[int, ...], k: int, name: str) -> int:
-        result = jax.eval_shape(lambda *values: function(*values, k), *(known[i] for i in places))
-        program.append((function, places, k))
-        known.append(result)
-        arguments = ", ".join(f"v{i}" for i in places)
-        text.append(f"v{len(known) - 1} = {name}({arguments}; {k})  # {result.dtype}{list(result.shape)}")
-        return len(known) - 1
+    def add_step(function, indices: tuple[int, ...], k: int, name: str) -> int:
+        result = jax.eval_shape(lambda *arrays: function(*arrays, k), *(values[i] for i in indices))
+        program.append((function, indices, k))
+        values.append(result)
+        arguments = ", ".join(f"v{i}" for i in indices)
+        lines.append(f"v{len(values) - 1} = {name}({arguments}; {k})  # {result.dtype}{list(result.shape)}")
+        return len(values) - 1
 
     for _ in range(steps):
-        name = str(random.choice(names))
+        name = str(rng.choice(names))
         kinds, function = OPERATIONS[name]
-        places = tuple(of_kind(kind) for kind in kinds)
-        added(lambda *a, f=function: cut(f(*a)), places, int(random.integers(6)), name)
-    if known[-1].dtype != jnp.float64:
-        convert = jnp.abs if known[-1].dtype == jnp.complex128 else lambda a: a.astype(jnp.float64)
-        added(lambda a, k: convert(a), (len(known) - 1,), 0, "as a number")
-    results = [i for i, a in enumerate(known) if i >= len(SIZES)]
+        indices = tuple(value_of_kind(kind) for kind in kinds)
+        add_step(lambda *a, f=function: limit_size(f(*a)), indices, int(rng.integers(6)), name)
+    if values[-1].dtype != jnp.float64:
+        convert = jnp.abs if values[-1].dtype == jnp.complex128 else lambda a: a.astype(jnp.float64)
+        add_step(lambda a, k: convert(a), (len(values) - 1,), 0, "as a number")
+    outputs = [i for i, a in enumerate(values) if i >= len(ARGUMENT_SIZES)]
 
     def call(x, y):
-        values = applied((x, y))
-        outputs = []
-        for i in results:
-            a = values[i]
-            outputs += [jnp.real(a), jnp.imag(a)] if a.dtype == jnp.complex128 else [a.astype(jnp.float64)]
-        return outputs
+        results = evaluate((x, y))
+        arrays = []
+        for i in outputs:
+            a = results[i]
+            arrays += [jnp.real(a), jnp.imag(a)] if a.dtype == jnp.complex128 else [a.astype(jnp.float64)]
+        return arrays
 
-    return Function(call, "\n".join(text))
+    return Function(call, "\n".join(lines))
 
 
-def points_of(random, count: int) -> list[list[np.ndarray]]:
-    """Arguments: ordinary ones, then with special numbers among them, and equal entries."""
+def random_points(rng, count: int) -> list[list[np.ndarray]]:
+    """Draw arguments: in turn ordinary ones, ones with special numbers, and ones with equal entries too."""
     points = []
     for i in range(count):
-        arrays = [random.normal(0.0, 1.5, n) for n in SIZES]
+        arrays = [rng.normal(0.0, 1.5, n) for n in ARGUMENT_SIZES]
         if i % 3:
-            arrays = [
-                np.where(random.random(a.shape) < 0.5, random.choice(SPECIAL_NUMBERS, a.shape), a) for a in arrays
-            ]
+            arrays = [np.where(rng.random(a.shape) < 0.5, rng.choice(SPECIAL_NUMBERS, a.shape), a) for a in arrays]
         if i % 3 == 2:
             for a in arrays:
                 a[-1] = a[0]
@@ -152,13 +147,13 @@ def points_of(random, count: int) -> list[list[np.ndarray]]:
     return points
 
 
-def primitives_drawn() -> set[str]:
-    """Return the names of the primitives that the operations are made of, and their derivatives."""
-    found: set[str] = set()
+def drawn_primitives() -> set[str]:
+    """Return the names of the primitives in all operations and in some of their derivatives."""
+    names: set[str] = set()
 
     def collect(jaxpr) -> None:
         for eqn in jaxpr.eqns:
-            found.add(eqn.primitive.name)
+            names.add(eqn.primitive.name)
             for inner in jaxprs_in_params(eqn.params):
                 collect(inner)
 
@@ -167,87 +162,93 @@ def primitives_drawn() -> set[str]:
         for k in range(6):
             collect(jax.make_jaxpr(lambda *a, f=function, k=k: f(*a, k))(*arrays).jaxpr)
     for name, summary in (("solve", "gradient"), ("where", "gradient"), ("scatter set", "gradient")):
-        closed = jax.make_jaxpr(SUMMARIES[summary](function_of(0, [name], steps=1).call))
-        collect(closed(*[jax.ShapeDtypeStruct((n,), jnp.float64) for n in SIZES]).jaxpr)
-    return found
+        trace = jax.make_jaxpr(SUMMARIES[summary](random_function(0, [name], steps=1).call))
+        collect(trace(*[jax.ShapeDtypeStruct((n,), jnp.float64) for n in ARGUMENT_SIZES]).jaxpr)
+    return names
 
 
 class Outcome(NamedTuple):
-    """What came of a comparison: ``kind`` is "agrees", "refused" or "differs"; ``text`` says what differs, or why."""
+    """The result of a comparison: ``kind`` is "agrees", "refused" or "differs"; ``text`` gives the reason."""
 
     kind: str
     text: str
 
 
 LANES = 4
+"""Number of lanes of the programs that are compared with single runs."""
 
-TOLERANT: dict[str, Any] = {"hidden_nan": True, "composed": True, "slack": 64.0}
+CHECK_OPTIONS: dict[str, Any] = {"hidden_nan": True, "perturb_zeros": True, "slack": 64.0}
+"""Options of :func:`check_outputs` for random functions, whose rounding errors accumulate."""
 
 
-def _agrees_one_by_one(f: Callable, program, point, found) -> bool:
-    """Whether values are JAX's where each operation is compiled by itself: XLA simplifies NaN times a zero away."""
+def _agrees_without_jit(f: Callable, program, point, outputs) -> bool:
+    """Return whether outputs agree with JAX operation by operation; jitted, XLA may simplify NaN times zero to zero."""
     with jax.disable_jit():
-        right = [np.asarray(leaf) for leaf in jax.tree_util.tree_leaves(f(*map(jnp.asarray, point)))]
+        expected = [np.asarray(leaf) for leaf in jax.tree_util.tree_leaves(f(*map(jnp.asarray, point)))]
     try:
-        check(program, point, right, found, **TOLERANT)
+        check_outputs(program, point, expected, outputs, **CHECK_OPTIONS)
     except AssertionError:
         return False
     return True
 
 
-def compared(function: Function, summary: str, seed: int, count: int = 6, machine_code: bool = True) -> Outcome:
-    """Compare a function with JAX's at random points."""
-    f, points = SUMMARIES[summary](function.call), points_of(np.random.default_rng(seed), count)
-    structs = [jax.ShapeDtypeStruct((n,), jnp.float64) for n in SIZES]
+def compare_with_jax(function: Function, summary: str, seed: int, count: int = 6, machine_code: bool = True) -> Outcome:
+    """Compare a function, compiled to a scalar program, with JAX at random points."""
+    f, points = SUMMARIES[summary](function.call), random_points(np.random.default_rng(seed), count)
+    structs = [jax.ShapeDtypeStruct((n,), jnp.float64) for n in ARGUMENT_SIZES]
     try:
-        closed = jax.make_jaxpr(f)(*structs)
+        closed_jaxpr = jax.make_jaxpr(f)(*structs)
     except (NotImplementedError, ValueError, TypeError) as error:  # JAX cannot differentiate it
         return Outcome("refused", f"by JAX: {type(error).__name__} {str(error)[:60]}")
     try:
-        program = scalarize(closed)
+        program = scalarize(closed_jaxpr)
     except UnsupportedPrimitive as error:
         if isinstance(error, CompilerFault):
             return Outcome("differs", f"the compiler fails: {error}")
         return Outcome("refused", f"{error.primitive} {error.reason}")
     except Exception:
         return Outcome("differs", f"the compiler fails:\n{traceback.format_exc(limit=-3)}")
-    right = jax.jit(f)
-    expected = [[np.asarray(leaf) for leaf in jax.tree_util.tree_leaves(right(*point))] for point in points]
+    jax_function = jax.jit(f)
+    expected = [[np.asarray(leaf) for leaf in jax.tree_util.tree_leaves(jax_function(*point))] for point in points]
     try:
-        interpreted = [program.evaluate(*point) for point in points]
-        ways = {"interpreted": interpreted}
+        outputs_by_engine = {"interpreted": [program.evaluate(*point) for point in points]}
         if machine_code:
-            alone = compiled(program)
-            ways["machine code"] = [alone(*point) for point in points]
-            lanes = compiled(program, LANES)
+            run_single = compile_program(program)
+            single_outputs = [run_single(*point) for point in points]
+            outputs_by_engine["machine code"] = single_outputs
+            run_lanes = compile_program(program, LANES)
             for i in range(0, count, LANES):
-                some = [points[(i + j) % count] for j in range(LANES)]
-                found = lanes(*(np.stack(column) for column in zip(*some, strict=True)))
+                lane_points = [points[(i + j) % count] for j in range(LANES)]
+                lane_outputs = run_lanes(*(np.stack(column) for column in zip(*lane_points, strict=True)))
                 for j in range(LANES):
-                    for own, one in zip(found, ways["machine code"][(i + j) % count], strict=True):
-                        if not np.array_equal(own[j], one, equal_nan=True):
-                            return Outcome("differs", f"lane {j} has {own[j]}, a single run {one} at {some[j]}")
+                    for lane_output, single in zip(lane_outputs, single_outputs[(i + j) % count], strict=True):
+                        if not np.array_equal(lane_output[j], single, equal_nan=True):
+                            return Outcome(
+                                "differs", f"lane {j} has {lane_output[j]}, a single run {single} at {lane_points[j]}"
+                            )
     except Exception:
         return Outcome("differs", f"fails at run time:\n{traceback.format_exc(limit=-3)}")
-    for way, values in ways.items():
-        for point, right, found in zip(points, expected, values, strict=True):
+    for engine, point_outputs in outputs_by_engine.items():
+        for point, reference, outputs in zip(points, expected, point_outputs, strict=True):
             try:
-                check(program, point, right, found, **TOLERANT)
+                check_outputs(program, point, reference, outputs, **CHECK_OPTIONS)
             except AssertionError as error:
-                if not _agrees_one_by_one(f, program, point, found):
-                    return Outcome("differs", f"{way}, at {[a.tolist() for a in point]}: {error}")
+                if not _agrees_without_jit(f, program, point, outputs):
+                    return Outcome("differs", f"{engine}, at {[a.tolist() for a in point]}: {error}")
     return Outcome("agrees", "")
 
 
-def searched(seconds: float, seed: int, names: Sequence[str] | None = None, machine_code: bool = True) -> Counter:
-    """Draw functions and compare them until the time is over; print what differs, and count the outcomes."""
+def search_differences(
+    seconds: float, seed: int, names: Sequence[str] | None = None, machine_code: bool = True
+) -> Counter:
+    """Draw functions and compare them until the time is over; print differences, and count the outcomes."""
     counts: Counter = Counter()
     end = time.monotonic() + seconds
     while time.monotonic() < end:
-        random = np.random.default_rng(seed)
-        summary = str(random.choice(list(SUMMARIES)))
-        function = function_of(seed, names, steps=int(random.integers(1, 6)))
-        outcome = compared(function, summary, seed, machine_code=machine_code)
+        rng = np.random.default_rng(seed)
+        summary = str(rng.choice(list(SUMMARIES)))
+        function = random_function(seed, names, steps=int(rng.integers(1, 6)))
+        outcome = compare_with_jax(function, summary, seed, machine_code=machine_code)
         counts[outcome.kind] += 1
         if outcome.kind == "differs":
             print(f"--- seed {seed}, {summary}\n{function.text}\n{outcome.text}\n", flush=True)
@@ -260,16 +261,16 @@ def searched(seconds: float, seed: int, names: Sequence[str] | None = None, mach
 
 
 def main() -> int:
-    """Return 1 where something differs."""
+    """Run the search from the command line; return 1 if it found a difference."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--seed", type=int, default=None, help="of the first function; by default one of the clock")
+    parser.add_argument("--seed", type=int, default=None, help="seed of the first function; by default the time")
     parser.add_argument("--only", nargs="*", help="names of operations")
     parser.add_argument("--no-machine-code", action="store_true")
-    given = parser.parse_args()
+    args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    seed = int(time.time()) if given.seed is None else given.seed
-    counts = searched(given.seconds, seed, given.only, not given.no_machine_code)
+    seed = int(time.time()) if args.seed is None else args.seed
+    counts = search_differences(args.seconds, seed, args.only, not args.no_machine_code)
     for name, count in counts.most_common():
         print(f"{count:6}  {name}")
     return int(counts["differs"] > 0)

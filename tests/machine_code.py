@@ -1,4 +1,4 @@
-"""A scalar program as a function that LLVM compiles, for the tests."""
+"""Compilation of a scalar program by LLVM, for the tests."""
 
 import ctypes
 import itertools
@@ -10,11 +10,12 @@ from liethermo.engines.compiled.machine_code import MachineCode
 from liethermo.engines.compiled.writer import FLOAT64, INT64, ProgramWriter
 from liethermo.tracing.scalarize import Program
 
-CALL = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
+RUN_SIGNATURE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
+"""Signature ``run(inputs, outputs)`` of the compiled function."""
 
 
-def compiled(program: Program, lanes: int = 1):
-    """``f(*arrays)``, the outputs of a program; with the lanes as the first axis of each array where there are some."""
+def compile_program(program: Program, lanes: int = 1):
+    """Return ``f(*arrays)``, the outputs of a program; with several lanes, each array has them as its first axis."""
     sizes = [len(names) for names in program.inputs]
     starts = np.concatenate([[0], np.cumsum(sizes)])
     outputs = [len(entries) for entries in program.outputs]
@@ -24,32 +25,32 @@ def compiled(program: Program, lanes: int = 1):
     build = ir.IRBuilder(function.append_basic_block())
     writer = ProgramWriter(build, lanes)
 
-    def place(base, row: int):
+    def row_pointer(base, row: int):
         return build.bitcast(build.gep(base, [ir.Constant(INT64, row * lanes)]), writer.double_type.as_pointer())
 
-    found = writer.write_as_doubles(
-        program, lambda i, j: build.load(place(function.args[0], int(starts[i]) + j), align=8)
+    values = writer.write_as_doubles(
+        program, lambda i, j: build.load(row_pointer(function.args[0], int(starts[i]) + j), align=8)
     )
-    for row, value in enumerate(itertools.chain.from_iterable(found)):
-        build.store(value, place(function.args[1], row), align=8)
+    for row, value in enumerate(itertools.chain.from_iterable(values)):
+        build.store(value, row_pointer(function.args[1], row), align=8)
     build.ret_void()
     code = MachineCode(module)
-    run = CALL(code.function_address("run"))
+    run = RUN_SIGNATURE(code.function_address("run"))
 
     def call(*arrays):
         columns = [np.asarray(a, dtype=np.float64).reshape(lanes, -1) for a in arrays]
-        given = np.ascontiguousarray(np.concatenate(columns, axis=1).T)
-        out = np.zeros((sum(outputs), lanes))
-        run(given.ctypes.data, out.ctypes.data)
-        results = np.split(out.T, np.cumsum(outputs)[:-1], axis=1)
-        front = () if lanes == 1 else (lanes,)
-        return [r.reshape((*front, *shape)) for r, shape in zip(results, program.shapes, strict=True)]
+        inputs = np.ascontiguousarray(np.concatenate(columns, axis=1).T)
+        output = np.zeros((sum(outputs), lanes))
+        run(inputs.ctypes.data, output.ctypes.data)
+        results = np.split(output.T, np.cumsum(outputs)[:-1], axis=1)
+        lane_shape = () if lanes == 1 else (lanes,)
+        return [r.reshape((*lane_shape, *shape)) for r, shape in zip(results, program.shapes, strict=True)]
 
-    call.code = code  # which is unloaded with the function
+    call.code = code  # keeps the machine code loaded as long as the function
     return call
 
 
-def memory_maps() -> int:
-    """Of this process."""
+def count_memory_maps() -> int:
+    """Return the number of memory maps of this process."""
     with open("/proc/self/maps") as file:
         return len(file.readlines())

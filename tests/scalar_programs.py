@@ -1,7 +1,7 @@
-"""Scalar programs beside JAX, for the tests: equal to rounding, which is measured.
+"""Comparison of scalar programs with JAX, to their rounding error, which is measured.
 
-A program is run again with every result moved by a few units in its last place, and the spread is what rounding can do
-to it. A branch that rounding can turn (``floor`` of an integer) shows as a wide one.
+A program is evaluated repeatedly with every result perturbed by a few units in its last place; the spread of the
+outputs is the effect of rounding. A decision that rounding can change (``floor`` of an integer) shows as a wide spread.
 """
 
 import jax
@@ -14,8 +14,10 @@ from liethermo.tracing.scalarize import scalarize
 from tests.cases import EPS
 
 EPS_SINGLE = float(np.finfo(np.float32).eps)
+"""Spacing of float32 numbers at 1."""
 
 SMALLEST_NORMAL = np.finfo(np.float64).tiny
+"""Smallest normal float64 number."""
 
 
 def program_of(f, *args, **options) -> Program:
@@ -26,67 +28,75 @@ def jax_values(f, *args) -> list[np.ndarray]:
     return [np.asarray(leaf) for leaf in jax.tree_util.tree_leaves(jax.jit(f)(*args))]
 
 
-def nudged(program: Program, args, seed: int, composed: bool = False) -> list[np.ndarray]:
-    """The outputs when every instruction's result is off by up to four units in its last place.
+def evaluate_perturbed(program: Program, args, seed: int, perturb_zeros: bool = False) -> list[np.ndarray]:
+    """Evaluate a program with every instruction's result perturbed by up to four units in its last place.
 
-    ``composed``: zeros get any sign, as a structural zero has none, and subnormal numbers become zero in some runs, as
-    XLA rounds them to zero on some processors; and numbers of single precision move by units in their last place.
+    With ``perturb_zeros``, zeros get a random sign, as a structural zero has none; subnormal numbers become zero for
+    even seeds, as XLA rounds them to zero on some processors; and float32 numbers are perturbed by units in their last
+    place.
     """
-    noise = np.random.default_rng(seed)
+    rng = np.random.default_rng(seed)
 
-    def moved(value, eps=EPS):
+    def perturb(value, eps=EPS):
         if not isinstance(value, tuple | list) and np.asarray(value).dtype == np.float64:
-            value = value * (1.0 + eps * noise.uniform(-4, 4, np.shape(value)))
-            if composed:
+            value = value * (1.0 + eps * rng.uniform(-4, 4, np.shape(value)))
+            if perturb_zeros:
                 subnormal = np.abs(value) < SMALLEST_NORMAL
                 value = np.where(subnormal & (seed % 2 == 0), 0.0, value)
-                value = np.where(value == 0.0, noise.choice([0.0, -0.0], np.shape(value)), value)[()]
+                value = np.where(value == 0.0, rng.choice([0.0, -0.0], np.shape(value)), value)[()]
         return value
 
     entries = np.concatenate([np.ravel(x) for x in args]).astype(np.float64)
     names = sum(program.inputs, ())
-    given = [moved(a) if composed and abs(a) < SMALLEST_NORMAL else a for a in entries]
-    values = dict(zip(names, given, strict=True))
+    inputs = [perturb(a) if perturb_zeros and abs(a) < SMALLEST_NORMAL else a for a in entries]
+    values = dict(zip(names, inputs, strict=True))
     with np.errstate(all="ignore"):
         for target, op, operands in program.instructions:
             result = implementation(op)(*(values[a] if isinstance(a, str) else a for a in operands))
-            values[target] = moved(result, EPS_SINGLE if composed and op == "single" else EPS)
+            values[target] = perturb(result, EPS_SINGLE if perturb_zeros and op == "single" else EPS)
     return [np.array([values[a] if isinstance(a, str) else a for a in row], float) for row in program.outputs]
 
 
-def check(
+def check_outputs(
     program: Program,
     args,
     expected: list[np.ndarray],
-    found=None,
+    outputs=None,
     hidden_nan: bool = False,
-    composed: bool = False,
+    perturb_zeros: bool = False,
     slack: float = 8.0,
 ) -> None:
-    """Raise unless a program gives the expected outputs: numbers to rounding, NaN and infinity where they belong.
+    """Assert that a program gives the expected outputs: numbers to rounding, NaN and infinity at the same entries.
 
-    ``hidden_nan``: where JAX has NaN a number may stand, as a structural zero times NaN is zero.
+    With ``hidden_nan``, a number is accepted where JAX has NaN, because a structural zero times NaN is zero.
     """
-    found = program.evaluate(*args) if found is None else found
-    assert [a.shape for a in found] == [a.shape for a in expected]
-    runs = [nudged(program, args, seed, composed) for seed in range(6)]
-    for i, (right, got) in enumerate(zip(expected, found, strict=True)):
-        right, got = right.astype(float).ravel(), got.astype(float).ravel()
-        moved = np.array([run[i] for run in runs])
-        steady = (kind(moved) == kind(got)).all(axis=0)
+    outputs = program.evaluate(*args) if outputs is None else outputs
+    assert [a.shape for a in outputs] == [a.shape for a in expected]
+    runs = [evaluate_perturbed(program, args, seed, perturb_zeros) for seed in range(6)]
+    for i, (reference, output) in enumerate(zip(expected, outputs, strict=True)):
+        reference, output = reference.astype(float).ravel(), output.astype(float).ravel()
+        perturbations = np.array([run[i] for run in runs])
+        is_stable = (number_class(perturbations) == number_class(output)).all(axis=0)
         with np.errstate(all="ignore"):
-            spread = np.abs(moved - got).max(axis=0)
-            close = np.abs(got - right) <= slack * spread + 2 * slack * EPS * np.abs(right) + 1e-300
-        bad = ~np.where(np.isfinite(right), close, hidden_nan & np.isnan(right) | (kind(right) == kind(got))) & steady
-        assert not bad.any(), f"output {i}: {got[bad]} is not {right[bad]}, spread {spread[bad]}"
+            spread = np.abs(perturbations - output).max(axis=0)
+            is_close = np.abs(output - reference) <= slack * spread + 2 * slack * EPS * np.abs(reference) + 1e-300
+        agrees = np.where(
+            np.isfinite(reference),
+            is_close,
+            hidden_nan & np.isnan(reference) | (number_class(reference) == number_class(output)),
+        )
+        is_wrong = ~agrees & is_stable
+        assert not is_wrong.any(), (
+            f"output {i}: {output[is_wrong]} is not {reference[is_wrong]}, spread {spread[is_wrong]}"
+        )
 
 
-def kind(a):
-    """0 for a number, 1 for infinity, -1 for minus infinity, 2 for NaN."""
+def number_class(a):
+    """Return 0 for a finite number, 1 for infinity, -1 for minus infinity, 2 for NaN."""
     return np.where(np.isinf(a), np.sign(a), 0.0) + 2 * np.isnan(a)
 
 
-def agrees(f, *args, **options) -> Program:
+def check_agrees_with_jax(f, *args, **options) -> Program:
     program = program_of(f, *args)
-    check(program, args, jax_values(f, *args), **options)
+    check_outputs(program, args, jax_values(f, *args), **options)
     return program

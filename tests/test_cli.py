@@ -334,7 +334,7 @@ REFUSALS = {
     ),
     "value of a parameter": (
         [MODEL, "parameters = {inertia = [1, 2]}", RUN],
-        ['model.name = "rigid_body", model.parameters.inertia = [1, 2]: inertia has shape (3,) or (3, 3), not (2,)'],
+        ['model.name = "rigid_body", model.parameters.inertia = [1, 2]: inertia must have shape (3,) or (3, 3), got (2,)'],
     ),
     "method": (
         [MODEL, RUN, '[method]\nname = "Referense"'],

@@ -1,1 +1,1 @@
-"""Energies and entropies as sums of terms: their gradients, discrete gradients, and how rounding sees them."""
+"""Energies and entropies as sums of terms, with their gradients, discrete gradients and rounding errors."""

@@ -1,4 +1,4 @@
-"""Functions of a state and a time: how many arguments they need, and as functions of fewer."""
+"""Functions of a state and a time: the number of their arguments, and wrappers with fewer or more arguments."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from manifolds._pytree_module import Module
 
 
 def required_argument_count(function: Callable) -> int | None:
-    """How many arguments a function needs by position; None where it does not tell."""
+    """Return the number of positional arguments without a default; None if a function has no signature."""
     try:
         parameters = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):
@@ -21,7 +21,7 @@ def required_argument_count(function: Callable) -> int | None:
 
 
 class FixedTimeFunction(Module):
-    """A function of both, at a time."""
+    """A function of the state and the time, at a fixed time."""
 
     function: Callable
     time: jax.Array
@@ -31,7 +31,7 @@ class FixedTimeFunction(Module):
 
 
 class StateTimeFunction(Module):
-    """A function of both, of the state with the time behind it."""
+    """A function of the state and the time, as a function of the state with the time appended."""
 
     function: Callable
 
@@ -40,7 +40,7 @@ class StateTimeFunction(Module):
 
 
 class LastArgumentIgnored(Module):
-    """A function as one of an argument more, the last, which it does not depend on."""
+    """A function that accepts one more argument, the last, and ignores it."""
 
     function: Callable
 
@@ -49,7 +49,7 @@ class LastArgumentIgnored(Module):
 
 
 class ConstantFunction(Module):
-    """A value as a function of anything."""
+    """A function that returns a constant for any arguments."""
 
     value: jax.Array
 
@@ -58,7 +58,7 @@ class ConstantFunction(Module):
 
 
 class NegatedFunction(Module):
-    """Minus a function of both."""
+    """The negative of a function of the state and the time."""
 
     function: Callable
 
@@ -67,7 +67,7 @@ class NegatedFunction(Module):
 
 
 class CoordinatesWithTime(Module):
-    """Coordinates of a state, and the time behind it."""
+    """Coordinates of a state, with the time appended to the state and to the coordinates."""
 
     coordinates: Callable
 

@@ -1,4 +1,4 @@
-"""The energy of baths of constant heat capacity, with what it changes by in closed form."""
+"""The energy of heat baths of constant heat capacity, with its change over a step in closed form."""
 
 from __future__ import annotations
 
@@ -15,15 +15,16 @@ from .energy import Energy, Linear
 from .indices import sparsity_pattern
 
 MAX_SERIES_ARGUMENT = 1 / 32
-"""Largest argument of the series of ``(exp(z) - 1) / z``: what its eight terms leave out is below their rounding."""
+"""Largest argument of the series of ``(exp(z) - 1) / z``: its truncation after eight terms is then below rounding."""
 
 
 class BathEnergy(Energy):
-    """``sum_b C_b T_b (exp(y_b / C_b) - 1)`` of the entropies y, so that ``T_b exp(y_b / C_b)`` is the temperature.
+    """The energy of heat baths, ``sum_b C_b T_b (exp(y_b / C_b) - 1)``, as a function of their entropies y.
 
-    Measured from y = 0: else the heat of a small body would be lost in the rounding of what a large bath holds. Over a
-    step that changes y_b by d_b the energy changes by ``T_b exp(y_b / C_b) C_b (exp(d_b / C_b) - 1)``, which is not the
-    difference of two values and has none of their rounding.
+    The temperatures are ``T_b exp(y_b / C_b)``. The energy vanishes at y = 0; otherwise the heat of a small body would
+    be lost in the rounding of the content of a large bath. Over a step that changes y_b by d_b the energy changes by
+    ``T_b exp(y_b / C_b) C_b (exp(d_b / C_b) - 1)``. This is not a difference of two values, so it has none of their
+    rounding.
 
     Parameters
     ----------
@@ -44,22 +45,22 @@ class BathEnergy(Energy):
         return jnp.zeros(())
 
     def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
-        """The one that there is, of functions of one number each."""
+        """Return the difference quotient of each bath, the only discrete gradient of a function of one number."""
         return self.gradient(x + compensation) * _exponential_and_quotient(d * self.rate)[1]
 
     def stage_gradients(self, scheme, path) -> jax.Array:
         start, k, h, b = path.start + path.compensation, path.slopes, path.h, path.b
-        ahead = jnp.concatenate([path.points - start, path.step[None]])
-        powers, grown = _exponential_and_quotient(ahead * self.rate)
-        first = self.gradient(start)
-        gradients, change = first * powers[:-1], first * grown[-1] * path.step
-        defect, square = change - h * (b @ (gradients * k)), h * (b @ (k * k))
-        still = square < jnp.finfo(jnp.float64).tiny
-        return gradients + jnp.where(still, 0.0, defect / jnp.where(still, 1.0, square)) * k
+        displacements = jnp.concatenate([path.points - start, path.step[None]])
+        exponentials, quotients = _exponential_and_quotient(displacements * self.rate)
+        start_gradient = self.gradient(start)
+        gradients, change = start_gradient * exponentials[:-1], start_gradient * quotients[-1] * path.step
+        defect, squared_norm = change - h * (b @ (gradients * k)), h * (b @ (k * k))
+        is_zero = squared_norm < jnp.finfo(jnp.float64).tiny
+        return gradients + jnp.where(is_zero, 0.0, defect / jnp.where(is_zero, 1.0, squared_norm)) * k
 
     @property
     def rate(self) -> jax.Array:
-        """By which a temperature grows with the entropy, shape (m,)."""
+        """Relative change of a temperature per entropy, 1 / C, shape (m,)."""
         return 1.0 / self.capacity
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array:
@@ -67,7 +68,7 @@ class BathEnergy(Energy):
 
 
 class ReservoirEnergy(Linear):
-    """``sum_b T_b y_b`` of the entropies y: the energy of baths of infinite capacity, which keep their temperatures."""
+    """The energy ``sum_b T_b y_b`` of baths of infinite capacity, with entropies y and constant temperatures."""
 
     @property
     def temperature(self) -> jax.Array:
@@ -79,25 +80,25 @@ class ReservoirEnergy(Linear):
 
 
 def make_bath_energy(capacity: jax.Array, temperature: jax.Array) -> BathEnergy | ReservoirEnergy:
-    """The energy of baths of constant capacities, finite or infinite, shape (m,) each."""
+    """Return the energy of baths of constant capacities, finite or infinite, shape (m,) each."""
     if is_traced(capacity) or not np.isinf(np.asarray(capacity)).all():
         return BathEnergy(capacity, temperature)
     return ReservoirEnergy(temperature)
 
 
 def _exponential_and_quotient(z) -> tuple[jax.Array, jax.Array]:
-    """``exp(z)`` and ``(exp(z) - 1) / z``, elementwise: by their series where all z are near zero, as within a step."""
+    """Return ``exp(z)`` and ``(exp(z) - 1) / z``, elementwise; by their series if all z are small, as within a step."""
 
     def series() -> tuple[jax.Array, jax.Array]:
-        """By pairs, which do not wait for each other."""
+        """Sum the series by pairs of terms, which the processor can compute in parallel."""
         terms, power = [jnp.full_like(z, 1.0 / math.factorial(n)) for n in range(1, 9)], z
         while len(terms) > 1:
-            terms = [one + power * other for one, other in zip(terms[::2], terms[1::2], strict=True)]
+            terms = [a + power * b for a, b in zip(terms[::2], terms[1::2], strict=True)]
             power = power * power
         return 1.0 + z * terms[0], terms[0]
 
     def quotient() -> tuple[jax.Array, jax.Array]:
-        zero = z == 0.0
-        return jnp.exp(z), jnp.where(zero, 1.0, jnp.expm1(z) / jnp.where(zero, 1.0, z))
+        is_zero = z == 0.0
+        return jnp.exp(z), jnp.where(is_zero, 1.0, jnp.expm1(z) / jnp.where(is_zero, 1.0, z))
 
     return jax.lax.cond(jnp.max(jnp.abs(z)) <= MAX_SERIES_ARGUMENT, series, quotient)

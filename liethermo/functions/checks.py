@@ -1,4 +1,4 @@
-"""Functions that users give: evaluated once, traced, and refused with reasons where they are none."""
+"""Checks of the functions that users pass, which are evaluated once, traced, and refused with the reason."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .energy import Energy, Function, Negative, Pullback, SpanLimitedEnergy, Sta
 
 
 def mark_polynomial_degrees(energy: Energy, dim: int) -> Energy:
-    """The same energy, the degrees of its plain functions marked that are written as polynomials."""
+    """Return an energy with the degrees of its plain functions set if they are written as polynomials."""
     if isinstance(energy, Sum):
         return Sum(tuple(mark_polynomial_degrees(term, dim) for term in energy.summands))
     if isinstance(energy, Negative):
@@ -25,13 +25,12 @@ def mark_polynomial_degrees(energy: Energy, dim: int) -> Energy:
     if isinstance(energy, StateTimeEnergy):
         return StateTimeEnergy(mark_polynomial_degrees(energy.energy, dim))
     if isinstance(energy, SpanLimitedEnergy):
-        inner = mark_polynomial_degrees(energy.energy, dim)
-        return (
-            inner if inner.is_quadratic else SpanLimitedEnergy(inner, energy.span)
-        )  # a polynomial is known at every time
+        inner_energy = mark_polynomial_degrees(energy.energy, dim)
+        # a polynomial is defined at every time
+        return inner_energy if inner_energy.is_quadratic else SpanLimitedEnergy(inner_energy, energy.span)
     if isinstance(energy, Pullback):
-        (inner,) = jax.eval_shape(energy.coordinates, jax.ShapeDtypeStruct((dim,), jnp.float64)).shape
-        return eqx.tree_at(lambda e: e.term, energy, mark_polynomial_degrees(energy.term, inner))
+        (inner_dim,) = jax.eval_shape(energy.coordinates, jax.ShapeDtypeStruct((dim,), jnp.float64)).shape
+        return eqx.tree_at(lambda e: e.term, energy, mark_polynomial_degrees(energy.term, inner_dim))
     if isinstance(energy, Function) and energy.degree == math.inf:
         degree = polynomial_degree(energy_value, energy, dim)
         return energy if degree == math.inf else Function(energy.function, degree)
@@ -39,24 +38,28 @@ def mark_polynomial_degrees(energy: Energy, dim: int) -> Energy:
 
 
 def energy_value(energy: Energy, x) -> jax.Array:
-    """Its value at a state: of any energy one function, as what is compiled is kept by."""
+    """Return the value of an energy at a state.
+
+    One function serves all energies, because compiled programs are cached by the identity of their function.
+    """
     return energy.value(x)
 
 
 def check_energy(energy: Energy, dim: int, role: str, allow_time: bool = False) -> Energy:
-    """The energy with its plain functions traced, so that closures with other numbers are alike.
+    """Return the energy with its plain functions traced, so that closures that differ only in numbers are equal.
 
-    With ``allow_time`` it may depend on the time too.
+    With ``allow_time`` the energy may depend on time.
 
     Raises
     ------
     FunctionError, InputError
-        Unless it maps a state of this dimension to one real number, each term in coordinates that it has.
+        Unless the energy maps a state of this dimension to one real number, and the coordinates of each term exist.
     """
     if energy.depends_on_time and not allow_time:
         raise InputError(
-            f"{role} depends on time, or is a function of two arguments, which only the energy of a system may be "
-            "(and the Lagrangian of an EulerPoincareSystem, and couplings of a ComposedSystem)"
+            f"{role} must be a function of the state alone, got a function of two arguments or of time. Only the "
+            "energy of a system, the Lagrangian of an EulerPoincareSystem and couplings of a ComposedSystem may depend "
+            "on time"
         )
     try:
         energy, result = trace_callables_with_result(
@@ -64,7 +67,7 @@ def check_energy(energy: Energy, dim: int, role: str, allow_time: bool = False) 
         )
     except TRACE_ERRORS as error:
         for term in energy.terms:
-            term.check_components(dim, role)  # says which term, where the fault is in its coordinates
+            term.check_components(dim, role)  # names the term if its coordinates are at fault
         if isinstance(error, IndexOutOfRangeError):
             raise error.with_function(f"{role}, a function of a state of shape ({dim},),") from None
         cure = "It must be written with jax.numpy and accept one array"
@@ -82,48 +85,48 @@ def check_energy(energy: Energy, dim: int, role: str, allow_time: bool = False) 
 
 
 def trace_energies(tree, dim: int, role: str | None = None):
-    """A pytree with the energies in it checked as :func:`check_energy` does; one that occurs twice stays one object.
+    """Return a pytree with its energies checked by :func:`check_energy`; an energy that occurs twice stays one object.
 
-    Without a role, those that are no functions of a state are left as they are.
+    Without a role, an energy that fails the check is left unchanged.
     """
-    found: dict[int, Energy] = {}
+    checked_energies: dict[int, Energy] = {}
 
-    def check_once(part):
-        if not isinstance(part, Energy):
-            return part
-        if id(part) not in found:
+    def check_once(node):
+        if not isinstance(node, Energy):
+            return node
+        if id(node) not in checked_energies:
             try:
-                found[id(part)] = check_energy(part, dim, role or "a function")
+                checked_energies[id(node)] = check_energy(node, dim, role or "a function")
             except (FunctionError, InputError):
                 if role is not None:
                     raise
-                found[id(part)] = part
-        return found[id(part)]
+                checked_energies[id(node)] = node
+        return checked_energies[id(node)]
 
-    return jax.tree_util.tree_map(check_once, tree, is_leaf=lambda part: isinstance(part, Energy))
+    return jax.tree_util.tree_map(check_once, tree, is_leaf=lambda node: isinstance(node, Energy))
 
 
 def check_function_shape(
     function: Callable, arguments: Sequence[tuple[int, ...]], shapes: Sequence[tuple[int, ...]], what: str, at: str
 ) -> tuple[Callable, tuple[int, ...]]:
-    """A function of arrays of these shapes, traced, and the shape of its values; ``at`` names its arguments.
+    """Return a traced function of arrays of given shapes, and the shape of its result; ``at`` names its arguments.
 
     Raises
     ------
     FunctionError
-        Unless it gives real numbers of one of ``shapes``.
+        Unless the result is real and has one of ``shapes``.
     """
     try:
-        function, found = trace_callables_with_result(
+        function, result = trace_callables_with_result(
             function, lambda function, *a: jnp.asarray(function(*a)), *arguments
         )
     except IndexOutOfRangeError as error:
         raise error.with_function(f"{what}, at {at},") from None
     except TRACE_ERRORS as error:
         raise FunctionError(explain_trace_error(f"{what} could not be evaluated at {at}", error)) from error
-    if found.shape not in shapes:
-        wanted = " or ".join(map(str, shapes))
-        raise FunctionError(f"{what} has shape {wanted}, not {found.shape}")
-    if jnp.iscomplexobj(found):
-        raise FunctionError(f"{what} is real, not {found.dtype}; take the real part if that is meant")
-    return function, found.shape
+    if result.shape not in shapes:
+        expected_shapes = " or ".join(map(str, shapes))
+        raise FunctionError(f"{what} must have shape {expected_shapes}, got {result.shape}")
+    if jnp.iscomplexobj(result):
+        raise FunctionError(f"{what} must be real, got {result.dtype}. Take the real part if that is meant")
+    return function, result.shape

@@ -1,4 +1,4 @@
-"""Conditions on parameters: refused where their values are known, noted for later where they are being traced."""
+"""Conditions on parameters: checked at once for known values, recorded for a later check of traced values."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from ..errors import InputError
 
 
 class TracedCondition(NamedTuple):
-    """What has to hold of a value that is being traced.
+    """A condition on a value that is being traced.
 
     Attributes
     ----------
     holds : traced truth value
     value : traced array
     message : str
-        Why a value is refused, with a place for it: ``"a rate must be >= 0, not {value}"``.
+        The message of the error, with a placeholder: ``"a rate must be >= 0, not {value}"``.
     """
 
     holds: Any
@@ -33,65 +33,65 @@ class TracedCondition(NamedTuple):
 
 
 _collected_conditions: contextvars.ContextVar[list[TracedCondition] | None] = contextvars.ContextVar(
-    "noted", default=None
+    "collected_conditions", default=None
 )
 
 
 @contextlib.contextmanager
 def collect_conditions() -> Iterator[list[TracedCondition]]:
-    """Note the conditions on traced values meanwhile: those who sweep parameters evaluate them at every point."""
-    found: list[TracedCondition] = []
-    token = _collected_conditions.set(found)
+    """Collect the conditions on traced values inside a ``with`` block; a sweep evaluates them at every point."""
+    conditions: list[TracedCondition] = []
+    token = _collected_conditions.set(conditions)
     try:
-        yield found
+        yield conditions
     finally:
         _collected_conditions.reset(token)
 
 
 def require_condition(value, test: Callable, message: str) -> None:
-    """Refuse a value of which the test is not true everywhere; note the test where the value is traced.
+    """Raise InputError unless a test is true for all entries of a value; record the test of a traced value.
 
     Parameters
     ----------
     value : array
     test : function from an array to an array of truth values
     message : str
-        With a place for the value, or for its numbers as a list.
+        The message, with a placeholder ``{value}`` for the value as a list.
 
     Raises
     ------
     InputError
     """
     if is_traced(value):
-        if (noted := _collected_conditions.get()) is not None:
-            noted.append(TracedCondition(jnp.all(test(value)), value, message))
+        if (conditions := _collected_conditions.get()) is not None:
+            conditions.append(TracedCondition(jnp.all(test(value)), value, message))
     elif not bool(np.all(test(np.asarray(value)))):
         raise InputError(refusal_message(message, value))
 
 
 def check_numbers(value, what: str, *shapes: tuple[int, ...]) -> jax.Array:
-    """What a user gives as numbers, as an array of doubles; of one of these shapes, where any are given.
+    """Return a user's numbers as an array of float64; check its shape if shapes are given.
 
     Raises
     ------
     InputError
-        If it is none.
+        If the value is not made of real numbers, or has another shape.
     """
     try:
         kind = "f" if is_traced(value) else (value if isinstance(value, jax.Array) else np.asarray(value)).dtype.kind
-        if kind not in "biufO" or value is None:  # NumPy would make numbers of texts, and NaN of None
+        if kind not in "biufO" or value is None:  # NumPy would convert strings to numbers, and None to NaN
             raise TypeError(f"not {kind}")
         array = real_array(value)
     except (TypeError, ValueError) as error:
-        shown = repr(value) if isinstance(value, str | complex | None) else type(value).__name__
-        raise InputError(f"{what} is made of real numbers, not {shown}") from error
+        description = repr(value) if isinstance(value, str | complex | None) else type(value).__name__
+        raise InputError(f"{what} must be made of real numbers, got {description}") from error
     if shapes == ((),) and array.shape:
-        raise InputError(f"{what} is one number, not an array of shape {array.shape}")
+        raise InputError(f"{what} must be one number, got an array of shape {array.shape}")
     if shapes and array.shape not in shapes:
-        raise InputError(f"{what} has shape {' or '.join(map(str, shapes))}, not {array.shape}")
+        raise InputError(f"{what} must have shape {' or '.join(map(str, shapes))}, got {array.shape}")
     return array
 
 
 def refusal_message(message: str, value) -> str:
-    """The message of a condition with the value in its place."""
+    """Return the message of a condition with the value inserted."""
     return message.format(value=np.asarray(value).tolist())

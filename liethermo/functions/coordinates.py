@@ -1,4 +1,4 @@
-"""What a term may take for its coordinates: components of the state, or a map at most quadratic in it."""
+"""Coordinates of a term of an energy: components of the state, or a map at most quadratic in the state."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from ..tracing.trace_errors import TRACE_ERRORS, explain_trace_error
 from .indices import Indices
 
 COORDINATE_TOLERANCE = 1e-10
-"""How far a map of coordinates may be from quadratic, relative to its values: a few roundings."""
+"""Largest deviation of a map of coordinates from a quadratic one, relative to its values: a few roundings."""
 
 
 class ComponentMap(Module):
-    """A linear map from a state to some of its components, in another order or in units that are powers of two."""
+    """A linear map from a state to some of its components, reordered or scaled by powers of two."""
 
     @abstractmethod
     def __call__(self, x) -> jax.Array: ...
 
 
 class Components(ComponentMap):
-    """Components by their numbers; a range of them is read without gathering."""
+    """Components of a state by their indices; a range is read as a slice."""
 
     indices: range | Indices = eqx.field(static=True)
 
@@ -41,16 +41,16 @@ class Components(ComponentMap):
         return cls(Indices(np.asarray(numbers, dtype=np.int64)))
 
     def __call__(self, x):
-        places = self.indices
-        return x[places.start : places.stop] if isinstance(places, range) else x[np.asarray(places)]
+        indices = self.indices
+        return x[indices.start : indices.stop] if isinstance(indices, range) else x[np.asarray(indices)]
 
 
 def check_coordinates(coordinates: Callable, dim: int, role: str) -> None:
-    """Raise unless coordinates are components of the state, or a map at most quadratic in it."""
+    """Raise an error unless coordinates are components of the state or a map at most quadratic in the state."""
     if isinstance(coordinates, Components):
-        outside = [i for i in np.asarray(coordinates.indices).tolist() if not -dim <= i < dim]
-        if outside:  # JAX would read the last component instead
-            raise InputError(f"{role} has a term on component {outside[0]} of a state with {dim} components")
+        invalid_indices = [i for i in np.asarray(coordinates.indices).tolist() if not -dim <= i < dim]
+        if invalid_indices:  # JAX would read the last component instead
+            raise InputError(f"{role} has a term on component {invalid_indices[0]}, but the state has {dim} components")
     if isinstance(coordinates, ComponentMap) or is_traced(coordinates):
         return
     try:
@@ -62,20 +62,18 @@ def check_coordinates(coordinates: Callable, dim: int, role: str) -> None:
             explain_trace_error(f"the coordinates of a term of {role} could not be evaluated", error)
         ) from error
     if start.ndim != 2:
-        raise FunctionError(
-            f"the coordinates of a term of {role} are one array of numbers, not shape {start.shape[1:]}"
-        )
-    size = max(1.0, float(np.abs(start).max() + np.abs(end).max()))
+        raise FunctionError(f"the coordinates of a term of {role} must be a vector, got shape {start.shape[1:]}")
+    scale = max(1.0, float(np.abs(start).max() + np.abs(end).max()))
     defect = float(np.abs(end - start - step).max())
-    if not defect <= COORDINATE_TOLERANCE * size:
+    if not defect <= COORDINATE_TOLERANCE * scale:
         raise InputError(
-            f"the coordinates of a term of {role} are not a quadratic function of the state: they miss "
-            f"y' - y = Dpi(z)(x' - x) by {defect:.3g} (tolerance {COORDINATE_TOLERANCE * size:.1g}), which would "
-            "cost the exactness of the energy. Let the term take, say, the square of a distance and root it itself"
+            f"the coordinates of a term of {role} must be a quadratic function of the state, but they miss "
+            f"y' - y = Dpi(z)(x' - x) by {defect:.3g} (tolerance {COORDINATE_TOLERANCE * scale:.1g}), so the energy "
+            "would not be exact. Use, for example, the square of a distance, and take its root inside the term"
         )
 
 
 def _coordinate_increments(coordinates: Callable, ends):
-    """The coordinates of two random states, and their difference as a quadratic map would have it."""
+    """Return the coordinates of two states, and the difference that a quadratic map would give."""
     x, d = jnp.split(ends, 2)
     return coordinates(x), coordinates(x + d), jax.jvp(coordinates, (x + 0.5 * d,), (d,))[1]

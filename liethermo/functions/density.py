@@ -1,4 +1,4 @@
-"""Functions of density matrices: von Neumann's entropy, expectation values, and others in terms of the matrix."""
+"""Functions of density matrices: von Neumann's entropy, expectation values, and other functions of the matrix."""
 
 from __future__ import annotations
 
@@ -19,24 +19,25 @@ from ..errors import InputError
 from .energy import Energy, Linear
 
 NEGATIVE_EIGENVALUE_LIMIT = 1e-12
-"""Largest size of a negative eigenvalue of a density matrix that is rounding: up to it the matrix is positive."""
+"""Largest modulus of a negative eigenvalue of a density matrix that counts as rounding of a zero."""
 
 SMALLEST_EIGENVALUE = 1e-40
-"""Eigenvalue below which the entropy is continued by its tangent, so that its gradient is finite (at most 92)."""
+"""Eigenvalue below which the entropy is continued by its tangent, which bounds its gradient by 92."""
 
 
 class VonNeumann(Energy):
     """The entropy ``-tr(rho ln rho)`` of a density matrix; its gradient is ``-ln rho - 1`` (k_B = 1).
 
-    The derivatives of it are by divided differences, so that they are finite where eigenvalues meet
-    (``manifolds.spectral``). Where an eigenvalue vanishes, as in a pure state, the gradient is infinite: the entropy is
-    continued by its tangent there, from eigenvalues of 1e-40 down to -1e-12, which are zero to rounding.
+    Its derivatives use divided differences, so they are finite where eigenvalues cross (``manifolds.spectral``). The
+    gradient is infinite where an eigenvalue vanishes, as in a pure state. There the entropy is continued by its
+    tangent, for eigenvalues from 1e-40 down to -1e-12, which are zero to rounding.
 
     Parameters
     ----------
     floor : float, >= 0
-        Eigenvalues up to this count as zero, and have no part in the entropy: for a dissipation that keeps the rank of
-        the state, as steepest ascent does. By default zero: then the state has to be positive definite.
+        Eigenvalues up to this value count as zero and do not contribute to the entropy. Use it with a dissipation that
+        preserves the rank of the state, such as steepest ascent. With the default, zero, the state must be positive
+        definite.
     """
 
     floor: float = eqx.field(static=True)
@@ -45,7 +46,7 @@ class VonNeumann(Energy):
     def __init__(self, floor: float = 0.0):
         self.floor = float(floor)
         if not 0.0 <= self.floor < 1.0:
-            raise InputError(f"the floor of eigenvalues that count is a small number >= 0, not {floor!r}")
+            raise InputError(f"floor must be a number from 0 to 1, got {floor!r}")
 
     def value(self, x) -> jax.Array:
         matrix = mf.DensityMatrices(math.isqrt(x.shape[-1])).matrix(x)
@@ -65,26 +66,29 @@ class VonNeumann(Energy):
         return jnp.zeros(())
 
     def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
-        """By divided differences between the eigenvalues at both ends, in place of any other: its rounding vanishes."""
+        """Return the divided difference between the eigenvalues at both ends; its rounding error vanishes with d.
+
+        It replaces the discrete gradient of every scheme.
+        """
         structure = mf.DensityMatrices(math.isqrt(x.shape[-1]))
         ends = structure.matrix(x + compensation), structure.matrix(x + (compensation + d))
         return -structure.vector(mf.spectral_difference(EntropyIntegrand(self.floor, self.negative_limit), *ends))
 
     def stage_gradients(self, scheme, path) -> jax.Array:
-        """The gradients, corrected along the slopes by what is missed of the change in closed form."""
+        """Return the gradients at the stages, corrected along the slopes to give the exact change over the step."""
         h, b, k = path.h, path.b, path.slopes
         gradients = jax.vmap(self.gradient)(path.points)
         change = jnp.dot(self.discrete_gradient(scheme, path.start, path.step, path.compensation), path.step)
-        defect, square = change - h * (b @ jnp.sum(gradients * k, axis=1)), h * (b @ jnp.sum(k * k, axis=1))
-        still = square < jnp.finfo(jnp.float64).tiny
-        return gradients + jnp.where(still, 0.0, defect / jnp.where(still, 1.0, square)) * k
+        defect, squared_norm = change - h * (b @ jnp.sum(gradients * k, axis=1)), h * (b @ jnp.sum(k * k, axis=1))
+        is_zero = squared_norm < jnp.finfo(jnp.float64).tiny
+        return gradients + jnp.where(is_zero, 0.0, defect / jnp.where(is_zero, 1.0, squared_norm)) * k
 
 
 class IsolatedVonNeumann(VonNeumann):
-    """The entropy of a system without dissipation, in whose motion it has no part; finite for every Hermitian matrix.
+    """The entropy of a system without dissipation, which does not affect its motion; finite for every Hermitian matrix.
 
-    Steps that conserve eigenvalues to their order alone, as those of the midpoint scheme do, leave the cone of positive
-    matrices by their error where an eigenvalue is zero.
+    Steps that conserve eigenvalues only to their order, such as those of the midpoint scheme, leave the cone of
+    positive matrices by their error if an eigenvalue is zero.
     """
 
     negative_limit = math.inf
@@ -92,9 +96,9 @@ class IsolatedVonNeumann(VonNeumann):
 
 @dataclass(frozen=True)
 class LogPlusOne(mf.ScalarFunction):
-    """``ln p + 1``, constant below :data:`SMALLEST_EIGENVALUE`; zero up to the floor, where that is not zero.
+    """The function ``ln p + 1``, constant below :data:`SMALLEST_EIGENVALUE`; zero up to a positive floor.
 
-    It is NaN where p is negative beyond a limit, outside the cone of positive matrices.
+    It is NaN if p is negative beyond the limit, outside the cone of positive matrices.
     """
 
     floor: float = 0.0
@@ -102,8 +106,8 @@ class LogPlusOne(mf.ScalarFunction):
 
     def derivative(self, x, order):
         if order:
-            above = x > self._tangent_threshold
-            return jnp.where(above, -math.factorial(order - 1) * (-1.0 / jnp.where(above, x, 1.0)) ** order, 0.0)
+            is_above = x > self._tangent_threshold
+            return jnp.where(is_above, -math.factorial(order - 1) * (-1.0 / jnp.where(is_above, x, 1.0)) ** order, 0.0)
         value = jnp.log(jnp.maximum(x, self._tangent_threshold)) + 1.0
         return _nan_outside_cone(x, self, jnp.where(x > self.floor, value, 0.0) if self.floor else value)
 
@@ -111,11 +115,11 @@ class LogPlusOne(mf.ScalarFunction):
         return jnp.abs(x - self._tangent_threshold)
 
     def difference_quotient(self, x, y):
-        least, most = jnp.minimum(x, y), jnp.maximum(x, y)
-        gap, above = most - least, least > self._tangent_threshold
-        safe_gap, safe = jnp.where(gap == 0.0, 1.0, gap), jnp.where(above, least, 1.0)
-        logarithm = jnp.where(gap == 0.0, 1.0 / safe, jnp.log1p(gap / safe) / safe_gap)
-        return jnp.where(above, logarithm, (self.derivative(most, 0) - self.derivative(least, 0)) / safe_gap)
+        lower, upper = jnp.minimum(x, y), jnp.maximum(x, y)
+        gap, is_above = upper - lower, lower > self._tangent_threshold
+        safe_gap, safe_lower = jnp.where(gap == 0.0, 1.0, gap), jnp.where(is_above, lower, 1.0)
+        logarithm = jnp.where(gap == 0.0, 1.0 / safe_lower, jnp.log1p(gap / safe_lower) / safe_gap)
+        return jnp.where(is_above, logarithm, (self.derivative(upper, 0) - self.derivative(lower, 0)) / safe_gap)
 
     @property
     def _tangent_threshold(self) -> float:
@@ -124,9 +128,9 @@ class LogPlusOne(mf.ScalarFunction):
 
 @dataclass(frozen=True)
 class EntropyIntegrand(mf.ScalarFunction):
-    """``p ln p``, continued by its tangent below :data:`SMALLEST_EIGENVALUE`; zero up to a floor that is not zero.
+    """The function ``p ln p``, continued by its tangent below :data:`SMALLEST_EIGENVALUE`; zero up to a positive floor.
 
-    Its derivative is :class:`LogPlusOne`, and it is NaN where that is.
+    Its derivative is :class:`LogPlusOne`; both are NaN for the same p.
     """
 
     floor: float = 0.0
@@ -135,26 +139,31 @@ class EntropyIntegrand(mf.ScalarFunction):
     def derivative(self, x, order):
         if order:
             return LogPlusOne(self.floor, self.negative_limit).derivative(x, order - 1)
-        above = jnp.maximum(x, self._tangent_threshold)
-        value = jnp.where(x > self.floor, x * jnp.log(above), 0.0) if self.floor else x * jnp.log(above) + (x - above)
+        clipped_x = jnp.maximum(x, self._tangent_threshold)
+        value = (
+            jnp.where(x > self.floor, x * jnp.log(clipped_x), 0.0)
+            if self.floor
+            else x * jnp.log(clipped_x) + (x - clipped_x)
+        )
         return _nan_outside_cone(x, self, value)
 
     def width(self, x):
         return jnp.abs(x - self._tangent_threshold)
 
     def difference_quotient(self, x, y):
-        """``ln u + l ln(u / l) / (u - l)``, of the larger one u and the smaller one l."""
-        least, most = jnp.minimum(x, y), jnp.maximum(x, y)
-        gap = most - least
-        safe_gap, safe = jnp.where(gap == 0.0, 1.0, gap), jnp.where(least > self._tangent_threshold, least, 1.0)
-        share = jnp.where(gap == 0.0, 1.0, safe * jnp.log1p(gap / safe) / safe_gap)
-        above = jnp.log(jnp.maximum(most, self._tangent_threshold)) + share
-        across = (self.derivative(most, 0) - self.derivative(least, 0)) / safe_gap
-        below = _nan_outside_cone(
-            least, self, self.derivative_function.derivative(most, 0)
-        )  # constant, so the quotient is it
+        """Return ``ln u + l ln(u / l) / (u - l)`` of the larger argument u and the smaller argument l."""
+        lower, upper = jnp.minimum(x, y), jnp.maximum(x, y)
+        gap = upper - lower
+        safe_gap, safe_lower = jnp.where(gap == 0.0, 1.0, gap), jnp.where(lower > self._tangent_threshold, lower, 1.0)
+        log_quotient = jnp.where(gap == 0.0, 1.0, safe_lower * jnp.log1p(gap / safe_lower) / safe_gap)
+        quotient_above = jnp.log(jnp.maximum(upper, self._tangent_threshold)) + log_quotient
+        quotient_across = (self.derivative(upper, 0) - self.derivative(lower, 0)) / safe_gap
+        # the derivative is constant below the threshold, so it is the quotient
+        quotient_below = _nan_outside_cone(lower, self, self.derivative_function.derivative(upper, 0))
         return jnp.where(
-            least > self._tangent_threshold, above, jnp.where(most > self._tangent_threshold, across, below)
+            lower > self._tangent_threshold,
+            quotient_above,
+            jnp.where(upper > self._tangent_threshold, quotient_across, quotient_below),
         )
 
     @property
@@ -167,13 +176,13 @@ class EntropyIntegrand(mf.ScalarFunction):
 
 
 def _nan_outside_cone(p, function: LogPlusOne | EntropyIntegrand, value) -> jax.Array:
-    """The value of a function of an eigenvalue p; NaN where p is negative beyond its limit, and beyond its floor."""
+    """Return the value of a function of an eigenvalue p, or NaN if p is negative beyond its limit and floor."""
     return jnp.where(p < -max(function.floor, function.negative_limit), jnp.nan, value)
 
 
 @dataclass(frozen=True)
 class PositivePart(mf.ScalarFunction):
-    """``max(p, 0)``."""
+    """The function ``max(p, 0)``."""
 
     def derivative(self, x, order):
         return jnp.maximum(x, 0.0) if order == 0 else jnp.where((x > 0.0) & (order == 1), 1.0, 0.0)
@@ -183,22 +192,22 @@ class PositivePart(mf.ScalarFunction):
 
     def difference_quotient(self, x, y):
         gap = x - y
-        across = (jnp.maximum(x, 0.0) - jnp.maximum(y, 0.0)) / jnp.where(gap == 0.0, 1.0, gap)
-        return jnp.where(gap == 0.0, self.derivative(x, 1), across)
+        quotient = (jnp.maximum(x, 0.0) - jnp.maximum(y, 0.0)) / jnp.where(gap == 0.0, 1.0, gap)
+        return jnp.where(gap == 0.0, self.derivative(x, 1), quotient)
 
 
 def positive_part(rho) -> jax.Array:
-    """Density matrices, shape (..., N, N), with zero instead of eigenvalues that are negative by rounding."""
+    """Return density matrices, shape (..., N, N), with eigenvalues that are negative by rounding set to zero."""
     return mf.spectral(PositivePart(), rho)
 
 
 def matrix_logarithm(rho) -> jax.Array:
-    """``ln rho`` of density matrices, shape (..., N, N), finite where eigenvalues are zero to rounding."""
+    """Return ``ln rho`` of density matrices, shape (..., N, N), finite if eigenvalues are zero to rounding."""
     return mf.spectral(LogPlusOne(), rho) - np.eye(rho.shape[-1])
 
 
 class DensityMatrixFunction(Module):
-    """A function of a density matrix, as one of its coordinates, without those of baths behind."""
+    """A function of a density matrix, as a function of the state: coordinates of the matrix, then those of baths."""
 
     function: Callable
     structure: mf.DensityMatrices
@@ -212,17 +221,17 @@ class DensityMatrixFunction(Module):
 
 
 class MeanEnergy(Linear):
-    """``tr(rho H)`` of the coordinates of rho, shape (N^2,), which has trace one, by those of H.
+    """The mean energy ``tr(rho H)``, by the coordinates of rho, shape (N^2,), which has trace one, and those of H.
 
-    An energy e that the levels have in common is added as a constant, ``tr(rho (H - e)) + e``. The gradient is then
-    that of differences of levels: a constant that is added to H changes neither the motion nor its rounding.
+    An energy e that the levels have in common is added as a constant: ``tr(rho (H - e)) + e``. The gradient then
+    depends on differences of levels only, so a constant added to H changes neither the motion nor its rounding.
 
     Parameters
     ----------
     b : array, shape (N^2,)
         The coordinates of H.
     reference_level : array, shape ()
-        e: see :func:`choose_reference_level`. It makes no difference but by rounding.
+        The energy e: see :func:`choose_reference_level`. It affects rounding only.
     """
 
     reference_level: jax.Array
@@ -238,24 +247,24 @@ class MeanEnergy(Linear):
 
 
 def choose_reference_level(levels: np.ndarray) -> float:
-    """The lower one of the two levels that are nearest to each other: their differences then lose no digit.
+    """Return the lower one of the two levels nearest to each other, so that their difference loses no digit.
 
-    It grows by c where all levels, shape (N,), do.
+    It grows by c if all levels, shape (N,), do.
     """
-    ordered = np.sort(levels)
-    return float(ordered[0 if len(ordered) == 1 else np.argmin(np.diff(ordered))])
+    sorted_levels = np.sort(levels)
+    return float(sorted_levels[0 if len(sorted_levels) == 1 else np.argmin(np.diff(sorted_levels))])
 
 
-def subtract_level(b, common) -> jax.Array:
-    """The coordinates of H - e, of those of H, shape (N^2,), and a number e."""
-    return b - common * np.where(np.arange(b.shape[-1]) < math.isqrt(b.shape[-1]), 1.0, 0.0)
+def subtract_level(b, level) -> jax.Array:
+    """Return the coordinates of H - level, from those of H, shape (N^2,), and a number."""
+    return b - level * np.where(np.arange(b.shape[-1]) < math.isqrt(b.shape[-1]), 1.0, 0.0)
 
 
 class ExpectationValue(Module):
-    """``tr(rho H(t))`` of the coordinates of rho, for a function of time; ``reference_level`` is as in :class:`MeanEnergy`.
+    """The mean energy ``tr(rho H(t))``, by the coordinates of rho, for a Hamiltonian that is a function of time.
 
-    It is the lowest level at the time zero, so that it grows by c where H does: a discrete gradient weights the state
-    and the time by the gradients of the energy by both.
+    The ``reference_level``, as in :class:`MeanEnergy`, is the lowest level at time zero, so it grows by c if H does: a
+    discrete gradient weights the state and the time by the two gradients of the energy.
     """
 
     hamiltonian: Callable
@@ -268,7 +277,10 @@ class ExpectationValue(Module):
 
 
 class ModulatedExpectationValue(Module):
-    """``tr(rho (H_0 + f_1(t) H_1 + ...))`` of the coordinates of rho, by those of the matrices; likewise."""
+    """The mean energy ``tr(rho (H_0 + f_1(t) H_1 + ...))``, by the coordinates of rho and of the matrices H_i.
+
+    The ``reference_level`` is chosen as in :class:`ExpectationValue`.
+    """
 
     constant: jax.Array
     terms: tuple[jax.Array, ...]
@@ -276,5 +288,5 @@ class ModulatedExpectationValue(Module):
     reference_level: jax.Array
 
     def __call__(self, x, t):
-        moved = [f(t) * term for f, term in zip(self.functions, self.terms, strict=True)]
-        return jnp.dot(sum(moved, subtract_level(self.constant, self.reference_level)), x) + self.reference_level
+        time_terms = [f(t) * term for f, term in zip(self.functions, self.terms, strict=True)]
+        return jnp.dot(sum(time_terms, subtract_level(self.constant, self.reference_level)), x) + self.reference_level

@@ -1,4 +1,4 @@
-"""Energies of many bodies: one function at many places of a large state."""
+"""Energies of many bodies: one function evaluated at many places of a large state."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from .path import CollocationPath
 
 
 class Each(Energy):
-    """``sum_e phi(x[places_e], a_e)``: one function at many places of the state, with parameters of its own at each.
+    """A sum of one function over many places of the state, ``sum_e phi(x[places_e], a_e)``, a_e parameters.
 
-    Springs between bodies, the bodies themselves: written once, evaluated at all places together, at a cost that grows
-    with their number and not with the square of the state. Every summand has a discrete gradient of its own, corrected
-    along its own components only; so a component feels no more of the others than in the exact gradient, and stiff
-    systems of any size can be solved by sparse Newton iteration.
+    It describes springs between bodies, or the bodies themselves. The function is written once and evaluated at all
+    places together, at a cost proportional to their number, not to the square of the dimension of the state. Every
+    summand has its own discrete gradient, corrected along its own components. The Jacobian is therefore as sparse as
+    that of the exact gradient, so stiff systems of any size can be solved by sparse Newton iteration.
 
     Parameters
     ----------
     phi : function or Energy
-        From the components at one place, shape (r,), and the parameters there, to a scalar; or an Energy of those
-        components, the same at every place.
+        From the components at one place, shape (r,), and the parameters there, to a scalar; or an Energy of these
+        components, equal at every place.
     places : array of int, shape (m, r)
         Indices into the state.
     *parameters : arrays, shape (m, ...)
@@ -55,19 +55,23 @@ class Each(Energy):
         m, r = self.places.shape
         for a in self.parameters:
             if a.shape[:1] != (m,):
-                raise InputError(f"parameters have an entry for each of the {m} places, but these have shape {a.shape}")
+                raise InputError(
+                    f"parameters must have shape ({m}, ...), an entry for each of the {m} places, got {a.shape}"
+                )
         if isinstance(phi, Energy):
             if parameters:
-                raise InputError("an Energy is the same at every place: parameters are for a function")
+                raise InputError(
+                    "parameters need a function phi(y, *parameters), got an Energy, which is equal at every place"
+                )
             self.phi = mark_polynomial_degrees(check_energy(phi, r, "the energy at a place"), r)
             self.degree = self.phi.degree
             return
         if not callable(phi):
-            raise FunctionError(f"phi is a function or an Energy, not {type(phi).__name__}")
-        first = tuple(jnp.zeros(a.shape[1:]) for a in self.parameters)
-        check_energy(Function(lambda y: phi(y, *first)), r, "the function at a place")
-        self.phi = trace_callables(phi, lambda phi, *a: phi(*a), (r,), *(a.shape for a in first))
-        self.degree = polynomial_degree(_summand_value, (self.phi, first), r)
+            raise FunctionError(f"phi must be a function or an Energy, got {type(phi).__name__}")
+        zero_parameters = tuple(jnp.zeros(a.shape[1:]) for a in self.parameters)
+        check_energy(Function(lambda y: phi(y, *zero_parameters)), r, "the function at a place")
+        self.phi = trace_callables(phi, lambda phi, *a: phi(*a), (r,), *(a.shape for a in zero_parameters))
+        self.degree = polynomial_degree(_summand_value, (self.phi, zero_parameters), r)
 
     @property
     def terms(self) -> tuple[Energy, ...]:
@@ -84,55 +88,56 @@ class Each(Energy):
 
     def gradient(self, x) -> jax.Array:
         x = float64_array(x)
-        found = jax.vmap(lambda y, *a: self._summand(a).gradient(y))(self._gather_components(x), *self.parameters)
-        return self._scatter_gradients(found, x.shape[0])
+        gradients = jax.vmap(lambda y, *a: self._summand(a).gradient(y))(self._gather_components(x), *self.parameters)
+        return self._scatter_gradients(gradients, x.shape[0])
 
     def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
-        def one(y, step, kept, *a):
-            return self._summand(a).discrete_gradient(scheme, y, step, kept)
+        def summand_gradient(y, step, offset, *a):
+            return self._summand(a).discrete_gradient(scheme, y, step, offset)
 
-        y, step, kept = map(self._gather_components, (x, d, jnp.zeros_like(x) + compensation))
-        return self._scatter_gradients(jax.vmap(one)(y, step, kept, *self.parameters), x.shape[0])
+        y, step, offset = map(self._gather_components, (x, d, jnp.zeros_like(x) + compensation))
+        return self._scatter_gradients(jax.vmap(summand_gradient)(y, step, offset, *self.parameters), x.shape[0])
 
     def stage_gradients(self, scheme, path) -> jax.Array:
-        def one(own: CollocationPath, *a):
-            return self._summand(a).stage_gradients(scheme, own)
+        def summand_gradients(summand_path: CollocationPath, *a):
+            return self._summand(a).stage_gradients(scheme, summand_path)
 
         compensation = jnp.zeros_like(path.start) + path.compensation
-        gathered = CollocationPath(
+        summand_paths = CollocationPath(
             *jax.tree.map(self._gather_components, path._replace(compensation=compensation)[:7]), *path[7:]
         )
-        further, symmetries = None if path.kronrod_samples is None else 1, None if path.symmetries is None else 2
-        axes = CollocationPath(0, 0, 0, 1, 1, further, symmetries, None, None, None)  # type: ignore[arg-type]
-        in_axes = axes, *(0 for _ in self.parameters)
-        found = jax.vmap(one, in_axes=in_axes, out_axes=1)(gathered, *self.parameters)
-        return jax.vmap(lambda g: self._scatter_gradients(g, path.start.shape[0]))(found)
+        kronrod_axis = None if path.kronrod_samples is None else 1
+        symmetry_axis = None if path.symmetries is None else 2
+        axes = CollocationPath(0, 0, 0, 1, 1, kronrod_axis, symmetry_axis, None, None, None)  # type: ignore[arg-type]
+        mapped_axes = axes, *(0 for _ in self.parameters)
+        gradients = jax.vmap(summand_gradients, in_axes=mapped_axes, out_axes=1)(summand_paths, *self.parameters)
+        return jax.vmap(lambda g: self._scatter_gradients(g, path.start.shape[0]))(gradients)
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array:
         return clique_pattern(self.places, dim)
 
     def check_components(self, dim: int, role: str) -> None:
-        numbers = np.asarray(self.places)
-        if numbers.size and not (numbers.min() >= 0 and numbers.max() < dim):
-            outside = int(numbers[(numbers < 0) | (numbers >= dim)][0])
-            raise InputError(f"{role} has a term at component {outside} of a state with {dim} components")
+        indices = np.asarray(self.places)
+        if indices.size and not (indices.min() >= 0 and indices.max() < dim):
+            invalid_index = int(indices[(indices < 0) | (indices >= dim)][0])
+            raise InputError(f"{role} has a term at component {invalid_index}, but the state has {dim} components")
 
     def _summand(self, parameters) -> Energy:
-        """The summand with these parameters."""
+        """Return the summand with these parameters."""
         if isinstance(self.phi, Energy):
             return self.phi
         return Function(lambda y: self.phi(y, *parameters), degree=self.degree)
 
     def _gather_components(self, x) -> jax.Array:
-        """The components at each place, shape (..., n) to (..., m, r)."""
-        if (run := self.places.contiguous_slice) is not None:
-            return x[..., run].reshape(*x.shape[:-1], *self.places.shape)
+        """Return the components at each place, from shape (..., n) to (..., m, r)."""
+        if (contiguous_slice := self.places.contiguous_slice) is not None:
+            return x[..., contiguous_slice].reshape(*x.shape[:-1], *self.places.shape)
         return x[..., np.asarray(self.places)]
 
     def _scatter_gradients(self, gradients, n: int) -> jax.Array:
-        """The sum of covectors at the places, shape (m, r) to (n,)."""
-        if (run := self.places.contiguous_slice) is not None:
-            return jnp.zeros(n).at[run].add(gradients.ravel())
+        """Return the sum of the gradients at the places, from shape (m, r) to (n,)."""
+        if (contiguous_slice := self.places.contiguous_slice) is not None:
+            return jnp.zeros(n).at[contiguous_slice].add(gradients.ravel())
         return jnp.zeros(n).at[np.asarray(self.places)].add(gradients)
 
 
@@ -142,9 +147,9 @@ def _summand_value(model, y):
 
 
 def _check_places(places) -> Indices:
-    numbers = np.asarray(places)
-    if numbers.ndim != 2 or numbers.dtype.kind not in "iu" or 0 in numbers.shape:
+    indices = np.asarray(places)
+    if indices.ndim != 2 or indices.dtype.kind not in "iu" or 0 in indices.shape:
         raise InputError(
-            f"places are integers of shape (m, r), the r components that each of m summands depends on, not {places!r}"
+            f"places must be integers of shape (m, r), the r components of each of m summands, got {places!r}"
         )
-    return Indices(numbers)
+    return Indices(indices)

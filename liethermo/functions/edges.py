@@ -1,4 +1,4 @@
-"""Weighted graphs between the parts of a system, from matrices or lists of edges, checked."""
+"""Weighted graphs between the parts of a system, checked, from matrices or lists of edges."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ import scipy
 from ..errors import InputError
 
 ASYMMETRY_RTOL = 1e-12
-"""How far a symmetric matrix may be from its transpose, relative to its largest entry."""
+"""Largest difference of a symmetric matrix from its transpose, relative to its largest entry: a few roundings."""
 
 
 class Edges(NamedTuple):
-    """Each edge once: its two ends and its weight.
+    """The edges of a graph, each once, as two arrays of nodes and an array of weights.
 
     Attributes
     ----------
     first, second : ndarray of int, shape (edges,)
-        With first < second.
+        The nodes of each edge, with first < second.
     weight : array, shape (edges,)
     """
 
@@ -32,7 +32,7 @@ class Edges(NamedTuple):
 
 
 def graph_edges(graph, nodes: int, what: str, names: Sequence[str], allow_negative: bool = False) -> Edges:
-    """The edges of a symmetric graph; those of weight zero are left out.
+    """Return the edges of a symmetric graph, without those of weight zero.
 
     Parameters
     ----------
@@ -40,9 +40,9 @@ def graph_edges(graph, nodes: int, what: str, names: Sequence[str], allow_negati
         number for the one edge of two nodes
     nodes : int
     what : str
-        What the weights are, for messages.
+        Name of the weights, for messages.
     names : sequence of str
-        Of the nodes, for messages.
+        Names of the nodes, for messages.
     allow_negative : bool
         Whether weights may be negative.
 
@@ -50,25 +50,27 @@ def graph_edges(graph, nodes: int, what: str, names: Sequence[str], allow_negati
     ------
     InputError
     """
-    if isinstance(graph, jax.core.Tracer):  # a matrix that is being swept or differentiated: all of its edges
+    if isinstance(graph, jax.core.Tracer):  # a matrix that is swept or differentiated keeps all its edges
         first, second = np.triu_indices(nodes, 1)
         return Edges(first, second, graph if graph.ndim == 0 else graph[first, second])
     first, second, weight = _edge_arrays(graph, nodes, what)
-    if isinstance(weight, jax.Array):  # some are tracers
+    if isinstance(weight, jax.Array):  # some weights are tracers
         return Edges(first, second, weight)
     for e in np.flatnonzero((first == second) & (weight != 0.0))[:1]:
-        raise InputError(f"{what} of {names[first[e]]} with itself is {weight[e]:g}: leave the diagonal zero")
+        raise InputError(
+            f"{what} of {names[first[e]]} with itself must be 0, got {weight[e]:g}. Leave the diagonal zero"
+        )
     for e in np.flatnonzero(~((allow_negative | (weight >= 0.0)) & np.isfinite(weight)))[:1]:
         ends = f"{names[first[e]]} and {names[second[e]]}"
         raise InputError(
-            f"{what} between {ends} is {weight[e]:g}: it must be finite{'' if allow_negative else ' and >= 0'}"
+            f"{what} between {ends} must be finite{'' if allow_negative else ' and >= 0'}, got {weight[e]:g}"
         )
-    kept = weight != 0.0
-    return Edges(first[kept], second[kept], jnp.asarray(weight[kept]))
+    is_nonzero = weight != 0.0
+    return Edges(first[is_nonzero], second[is_nonzero], jnp.asarray(weight[is_nonzero]))
 
 
 def connected_components(graph: Edges, nodes: int) -> np.ndarray:
-    """The number of the connected part that each node belongs to, shape (nodes,)."""
+    """Return the number of the connected component of each node, shape (nodes,)."""
     matrix = scipy.sparse.coo_array((np.ones(len(graph.first)), (graph.first, graph.second)), (nodes, nodes))
     return scipy.sparse.csgraph.connected_components(matrix, directed=False)[1]
 
@@ -78,9 +80,9 @@ def _edge_arrays(graph, nodes: int, what: str) -> tuple[np.ndarray, np.ndarray, 
         return _matrix_edges(scipy.sparse.coo_array(graph), nodes, what)
     if not _is_edge_list(graph) and np.ndim(graph) == 0:
         if nodes != 2:
-            raise InputError(f"{what} as one number is meant for two parts, not {nodes}: give a matrix or edges")
+            raise InputError(f"{what} may be one number only for two parts, got {nodes} parts. Give a matrix or edges")
         graph = [(0, 1, graph)]
-    found: dict[tuple[int, int], Any] = {}
+    weight_by_pair: dict[tuple[int, int], Any] = {}
     for edge in graph:
         try:
             first, second, k = edge
@@ -88,24 +90,26 @@ def _edge_arrays(graph, nodes: int, what: str) -> tuple[np.ndarray, np.ndarray, 
             if (i, j) != (first, second):
                 raise TypeError("not whole numbers")
         except (TypeError, ValueError):
-            raise InputError(f"{what}: an edge is (i, j, weight), not {edge!r}") from None
+            raise InputError(f"{what}: an edge must be (i, j, weight), got {edge!r}") from None
         if not (0 <= i < nodes and 0 <= j < nodes):
-            raise InputError(f"{what}: the edge ({i}, {j}) leaves the {nodes} parts, which count from 0")
-        if (min(i, j), max(i, j)) in found:
+            raise InputError(
+                f"{what}: the edge ({i}, {j}) must join two of the {nodes} parts, which are numbered from 0"
+            )
+        if (min(i, j), max(i, j)) in weight_by_pair:
             raise InputError(f"{what}: the edge between {i} and {j} is given twice")
-        found[min(i, j), max(i, j)] = k
-    ends = np.array(list(found), dtype=int).reshape(-1, 2)
-    weights = list(found.values())
-    traced = any(isinstance(k, jax.core.Tracer) for k in weights)
-    return ends[:, 0], ends[:, 1], jnp.stack([jnp.asarray(k) for k in weights]) if traced else np.array(weights)
+        weight_by_pair[min(i, j), max(i, j)] = k
+    ends = np.array(list(weight_by_pair), dtype=int).reshape(-1, 2)
+    weights = list(weight_by_pair.values())
+    has_tracers = any(isinstance(k, jax.core.Tracer) for k in weights)
+    return ends[:, 0], ends[:, 1], jnp.stack([jnp.asarray(k) for k in weights]) if has_tracers else np.array(weights)
 
 
 def _matrix_edges(matrix, nodes: int, what: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if matrix.shape != (nodes, nodes):
-        raise InputError(f"{what} is a ({nodes}, {nodes}) matrix for {nodes} parts, not one of shape {matrix.shape}")
+        raise InputError(f"{what} of {nodes} parts must be a ({nodes}, {nodes}) matrix, got shape {matrix.shape}")
     asymmetry = abs(matrix - matrix.T).max()
     if not asymmetry <= ASYMMETRY_RTOL * abs(matrix).max():
-        raise InputError(f"{what} is not symmetric: it differs from its transpose by {asymmetry:.3g}")
+        raise InputError(f"{what} must be symmetric, but it differs from its transpose by {asymmetry:.3g}")
     upper = scipy.sparse.triu(matrix).tocoo()
     return upper.row.astype(int), upper.col.astype(int), upper.data.astype(float)
 

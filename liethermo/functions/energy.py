@@ -1,7 +1,7 @@
 """Energies and entropies: functions of the state as sums of terms, quadratic or general.
 
-The distinction matters to a discretisation. A quadratic term needs no discrete gradient, since its gradient at the
-midpoint is one already; a general term gets a correction of its own, along its own coordinates where these are given
+A discretisation treats the two kinds differently. The gradient of a quadratic term at the midpoint is a discrete
+gradient already. A general term gets a correction of its own, along its own coordinates if these are given
 (:meth:`Energy.on`) [:doc:`/explanation/exact_laws`].
 """
 
@@ -45,72 +45,74 @@ def _gradient(energy: Energy, x) -> jax.Array:
 
 
 MIN_BUFFERED_DIM = 1_000
-"""Components from which a gradient is put into memory before anything is made of it."""
+"""Number of components from which a gradient is stored in memory before it is used."""
 
 
 def _evaluate_buffered(function: Callable, x) -> jax.Array:
-    """``function(x)`` of the shape of x, computed once: XLA computes elementwise results anew for each use of an entry.
+    """Return ``function(x)``, of the shape of x, computed once and stored; NaN if the first entry of x is not finite.
 
-    It keeps what a branch returns. NaN where the first entry of x is not finite.
+    XLA would compute elementwise results anew for each use of an entry, but it stores the result of a branch.
     """
     return jax.lax.cond(jnp.isfinite(x[0]), function, lambda x: jnp.full_like(x, jnp.nan), x)
 
 
 MAX_CLIQUE_COMPONENTS = 2_000
-"""Components that a term may depend on together, for the pattern of what depends on what to be worth having."""
+"""Largest number of components of a term for which :meth:`Energy.couplings` makes a dense block of its pattern."""
 
 
 class Energy(Module):
     """A real function of the state with a gradient; energies add with ``+`` and subtract with ``-``.
 
-    Calling one evaluates it: shape (..., n) to shape (...); with a time, shape (...), where it depends on one.
+    Calling an energy evaluates it, from shape (..., n) to shape (...); an energy that depends on time also takes a
+    time, shape (...).
     """
 
     @abstractmethod
     def value(self, x) -> jax.Array:
-        """The value at one state, shape (n,) to shape ()."""
+        """Return the value at one state, shape (n,), as an array of shape ()."""
 
     def gradient(self, x) -> jax.Array:
-        """The gradient at one state, shape (n,)."""
+        """Return the gradient at one state, shape (n,)."""
         x = float64_array(x)
         return _gradient(self, x) if x.size < MIN_BUFFERED_DIM else _evaluate_buffered(lambda x: _gradient(self, x), x)
 
     def sensitivity(self, x) -> jax.Array:
-        """``|grad f(x)| |x|``, of a sum the sum over its terms: the size at which the function is rounded.
+        """Return ``|grad f(x)| |x|``, the scale of rounding errors that come from x; of a sum, the sum over its terms.
 
-        One rounding of the state changes f by eps times this, whatever the value of f is: ``log |x|^2`` has the
-        sensitivity 2 where it vanishes, and a constant that is added to f has none. Every drift is judged against it.
+        One rounding of the state changes f by eps times this scale, whatever the value of f is: ``log |x|^2`` has the
+        sensitivity 2 where it vanishes, and a constant that is added to f has none. Every drift is judged relative to
+        it.
         """
         return jax.lax.stop_gradient(jnp.linalg.norm(self.gradient(x)) * jnp.linalg.norm(x))
 
     def rounding_scale(self, x) -> jax.Array:
-        """The size at which the value at x is rounded: that of the largest terms inside, though they cancel in it.
+        """Return the scale at which the value at x is rounded: that of the largest terms inside, even if they cancel.
 
-        Near q = 0 the value of ``1 - cos q`` is rounding, of the size of 1.
+        Near q = 0 the value of ``1 - cos q`` consists of rounding at the scale 1.
         """
         return jax.lax.stop_gradient(value_and_rounding_scale(self.value, x)[1])
 
     def difference_rounding_scale(self, x) -> jax.Array:
-        """The size at which a difference of values of one term is rounded; zero where that has a closed form."""
+        """Return the scale at which a difference of values of one term is rounded; zero if it has a closed form."""
         return jnp.zeros(()) if self.is_quadratic else self.rounding_scale(x)
 
     @property
     def terms(self) -> tuple[Energy, ...]:
-        """The summands, none of them a sum itself."""
+        """The summands, none of which is a sum."""
         return (self,)
 
     @property
     def is_quadratic(self) -> bool:
-        """Whether it is known to be a polynomial of degree two at most: its gradient at a midpoint is then exact."""
+        """True if the energy is known to be a polynomial of degree at most two, whose midpoint gradient is exact."""
         return False
 
     @property
     def degree(self) -> float:
-        """Its degree as a polynomial, at most; infinity where it is not known to be one. Quadratures may be exact."""
+        """Upper bound of the degree as a polynomial; infinity if none is known. Quadratures of low degree are exact."""
         return 2.0 if self.is_quadratic else math.inf
 
     def discrete_gradient(self, scheme: DiscreteGradientScheme, x, d, compensation) -> jax.Array:
-        """The discrete gradient of one term by a scheme, shape (n,), from x + compensation to x + compensation + d."""
+        """Return the discrete gradient of one term, shape (n,), from x + compensation to x + compensation + d."""
         return (
             scheme.quadratic(self, x, d, compensation)
             if self.is_quadratic
@@ -118,54 +120,55 @@ class Energy(Module):
         )
 
     def stage_gradients(self, scheme: Callable, path: CollocationPath) -> jax.Array:
-        """Those of one term at the stages of a collocation method, shape (s, n)."""
+        """Return the discrete gradients of one term at the stages of a collocation method, shape (s, n)."""
         return scheme(self, path)
 
     def pullback_to_chart(self, coordinates: mf.Coordinates, space: mf.Space, start=None) -> Energy:
-        """A function of state vectors of a space, as one of coordinates.
+        """Return a function of state vectors of a space as a function of coordinates.
 
-        Where it is for one step, ``start`` is the state vector from which that leads.
+        For a single step, ``start`` is the state vector at which the step begins.
         """
         return ChartEnergy(self, coordinates, space, start)
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
-        """The pattern of the Hessian: which components of the gradient depend on which of the state; None if unknown.
+        """Return the sparsity pattern of the Hessian, or None if it is unknown.
 
-        The discrete gradients have it too.
+        The discrete gradients have the same pattern.
         """
         return None
 
     def check_components(self, dim: int, role: str) -> None:
-        """Raise unless the components that it depends on are those of a state of this dimension."""
+        """Raise an error unless a state of this dimension has the components that the energy depends on."""
 
     def on(self, coordinates: Sequence[int] | np.ndarray | Callable) -> Energy:
-        """This energy as a function of some coordinates y of a larger state, ``x -> self(coordinates(x))``.
+        """Return this energy as a function of some coordinates y of a larger state, ``x -> self(coordinates(x))``.
 
-        Its discrete gradients are then corrected along y only and lie in the span of dy: a potential of positions
-        puts no correction into momenta, one of distances keeps the momentum maps that distances are invariant under.
+        Its discrete gradients are then corrected along y only and lie in the span of dy: a potential of positions puts
+        no correction into momenta, and a potential of distances conserves the momentum maps under which distances are
+        invariant.
 
         Parameters
         ----------
         coordinates : sequence of int, or function from x, shape (n,), to y, shape (m,)
-            Indices into the state, or a map at most quadratic in x (checked where a system is built).
+            Indices into the state, or a map at most quadratic in x (checked when a system is built).
         """
         return self.map_terms(lambda term: Pullback(term, coordinates))
 
     def map_terms(self, change: Callable[[Energy], Energy]) -> Energy:
-        """The sum of what its terms become by ``change``, a function from a term to an energy."""
+        """Return the sum of ``change(term)`` over the terms, where ``change`` maps a term to an energy."""
         return Sum.of([change(term) for term in self.terms])
 
     @property
     def depends_on_time(self) -> bool:
-        """Whether it is a function of the state and the time; see :class:`TimeDependent`."""
+        """True for a function of the state and the time; see :class:`TimeDependent`."""
         return False
 
     def at_time(self, t) -> Energy:
-        """The function of the state alone that it is at a time."""
+        """Return the energy at a fixed time, as a function of the state."""
         return self
 
     def with_time(self) -> Energy:
-        """The same as a function of the state with the time behind it, shape (n + 1,): of one that depends on both."""
+        """Return an energy that depends on time as a function of the state with the time appended, shape (n + 1,)."""
         raise NotImplementedError(f"{type(self).__name__} does not depend on time")
 
     @with_library_settings
@@ -173,8 +176,8 @@ class Energy(Module):
         x = jnp.asarray(x, dtype=jnp.float64)
         if t is None:
             return jnp.vectorize(self.value, signature="(n)->()")(x)
-        at = jnp.vectorize(lambda x, t: self.at_time(t).value(x), signature="(n),()->()")
-        return at(x, jnp.asarray(t, dtype=jnp.float64))
+        evaluate = jnp.vectorize(lambda x, t: self.at_time(t).value(x), signature="(n),()->()")
+        return evaluate(x, jnp.asarray(t, dtype=jnp.float64))
 
     def __add__(self, other) -> Energy:
         return Sum((*self.terms, *make_energy(other, "a term of a sum").terms))
@@ -192,12 +195,12 @@ class Energy(Module):
 
 
 def float64_array(x) -> jax.Array:
-    """A state that may be given as a list, or in integers."""
+    """Return a state, which may be a list or integers, as an array of float64."""
     return jnp.asarray(x, dtype=jnp.float64)
 
 
 class Quadratic(Energy):
-    """``x @ A @ x / 2 + b @ x + c``.
+    """A quadratic energy or entropy, ``x @ A @ x / 2 + b @ x + c``.
 
     Parameters
     ----------
@@ -226,21 +229,23 @@ class Quadratic(Energy):
         self.b = None if b is None else check_numbers(b, "b of a quadratic function")
         self.c = check_numbers(c, "c of a quadratic function", ())
         if self.A.ndim not in (1, 2) or len(set(self.A.shape)) != 1:
-            raise InputError(f"A has shape (n, n), or (n,) for a diagonal, not {self.A.shape}")
+            raise InputError(f"A must have shape (n, n), or (n,) for a diagonal matrix, got {self.A.shape}")
         if self.b is not None and self.b.shape != self.A.shape[:1]:
-            raise InputError(f"b has shape {self.A.shape[:1]} beside this A, not {self.b.shape}")
+            raise InputError(f"b must have shape {self.A.shape[:1]} to match A, got {self.b.shape}")
         if self.A.ndim == 2 and not isinstance(self.A, jax.core.Tracer):
             matrix = np.asarray(self.A)
             asymmetry = float(np.abs(matrix - matrix.T).max())
             if asymmetry > 1e-12 * float(np.abs(matrix).max()):
-                raise InputError(f"A is not symmetric (by {asymmetry:.3g}); only its symmetric part (A + A.T)/2 acts")
-            if asymmetry > 0.0:  # the gradient A x of the value x A x / 2 has to be exact
+                raise InputError(
+                    f"A must be symmetric, but it differs from its transpose by {asymmetry:.3g}. Use (A + A.T) / 2"
+                )
+            if asymmetry > 0.0:  # A x must be the exact gradient of x A x / 2
                 self.A = real_array((matrix + matrix.T) / 2)
 
     is_quadratic = True
 
     def linear_part(self, x) -> jax.Array:
-        """``A x``."""
+        """Return ``A x``."""
         return self.A * x if self.A.ndim == 1 else self.A @ x
 
     def value(self, x) -> jax.Array:
@@ -248,21 +253,21 @@ class Quadratic(Energy):
         return 0.5 * jnp.dot(x, self.linear_part(x)) + linear + self.c
 
     def gradient(self, x) -> jax.Array:
-        along = self.linear_part(float64_array(x))
-        return along if self.b is None else along + self.b
+        linear_part = self.linear_part(float64_array(x))
+        return linear_part if self.b is None else linear_part + self.b
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
         if is_traced(self.A):
             return None
-        places = np.nonzero(np.asarray(self.A))
-        return sparsity_pattern(places[0], places[-1], dim)
+        indices = np.nonzero(np.asarray(self.A))
+        return sparsity_pattern(indices[0], indices[-1], dim)
 
     def __neg__(self) -> Energy:
         return Quadratic(-self.A, None if self.b is None else -self.b, -self.c)
 
 
 class Linear(Energy):
-    """``b @ x``, whose gradient does not depend on the state.
+    """A linear energy, ``b @ x``, whose gradient does not depend on the state.
 
     Parameters
     ----------
@@ -287,9 +292,9 @@ class Linear(Energy):
 
 
 class Function(Energy):
-    """An energy given by a plain function from a JAX array, shape (n,), to a scalar; differentiated by JAX.
+    """An energy given by a plain function from a JAX array, shape (n,), to a scalar; JAX differentiates it.
 
-    The function may be an ``equinox.Module``: its arrays are then parameters of the system.
+    The function may be an ``equinox.Module``, whose arrays are then parameters of the system.
     """
 
     function: Callable
@@ -304,16 +309,16 @@ class Function(Energy):
 
 
 class TimeDependent(Energy):
-    """An energy ``H(x, t)`` that is changed from outside: a field that is turned, a piston that is moved.
+    """An energy ``H(x, t)`` that depends on time, such as that of a rotating field or a moving piston.
 
-    A plain function of two arguments is taken for one wherever the energy of a system is asked for; this class says so
-    of any function, and makes terms of sums. ``lt.Quadratic(A) + lt.TimeDependent(V)`` needs a correction for V only,
-    and ``lt.TimeDependent(V).on(range(n))`` is a function of the first n components and the time.
+    A plain function of two arguments is taken as such an energy wherever a system expects one. This class declares any
+    function as time-dependent, and makes it a term of a sum. In ``lt.Quadratic(A) + lt.TimeDependent(V)`` only V needs
+    a correction, and ``lt.TimeDependent(V).on(range(n))`` is a function of the first n components and the time.
 
     Parameters
     ----------
     function : function from x, shape (n,), and t, shape (), to a scalar
-        An ``equinox.Module`` too: its arrays are then parameters of the system.
+        The function may be an ``equinox.Module``, whose arrays are then parameters of the system.
     """
 
     function: Callable
@@ -327,14 +332,14 @@ class TimeDependent(Energy):
         return StateTimeEnergy(SpanLimitedEnergy(Function(StateTimeFunction(self.function)), TimeSpan()))
 
     def value(self, x) -> jax.Array:
-        raise InputError("this energy depends on time, so its value is known at a time only: energy(x, t)")
+        raise InputError("this energy depends on time, so its value needs a time. Call energy(x, t)")
 
     def __neg__(self) -> Energy:
         return TimeDependent(NegatedFunction(self.function))
 
 
 class SpanLimitedEnergy(Energy):
-    """A function of a state and the time behind it, shape (n + 1,), evaluated at times within a span only."""
+    """A function of a state with the time appended, shape (n + 1,), whose time is clipped to a span."""
 
     energy: Energy
     span: TimeSpan
@@ -356,12 +361,13 @@ class SpanLimitedEnergy(Energy):
 
 
 class StateTimeEnergy(Energy):
-    """A function of a state and the time behind it, with what it changes by divided between the two.
+    """A function of a state with the time appended, whose change is divided between the state and the time.
 
-    A discrete gradient is, by the state, one of the mean over both ends in time, and by the time the difference
-    quotient of the mean over both states. At the stages of a collocation method the corrections along the state and
-    along the time are weighted by the squares of the gradient by the one and by the other. So it does not matter in
-    which units time is measured, and a function that does not depend on it has the gradients of one of the state.
+    The components of a discrete gradient by the state are those of the mean over both end times; the component by the
+    time is the difference quotient of the mean over both end states. At the stages of a collocation method the
+    corrections along the state and along the time are weighted by the squares of the two gradients. The result does not
+    depend on the unit of time, and a function that does not depend on time has the gradients of a function of the
+    state.
     """
 
     energy: Energy
@@ -385,25 +391,27 @@ class StateTimeEnergy(Energy):
         def mean_by_time(t):
             return mean(ends[:, :-1], jnp.concatenate([t, t]))
 
-        by_state = scheme.general(Function(mean_by_state), x[:-1], d[:-1], compensation[:-1])
-        return jnp.concatenate([by_state, scheme.general(Function(mean_by_time), x[-1:], d[-1:], compensation[-1:])])
+        state_gradient = scheme.general(Function(mean_by_state), x[:-1], d[:-1], compensation[:-1])
+        return jnp.concatenate(
+            [state_gradient, scheme.general(Function(mean_by_time), x[-1:], d[-1:], compensation[-1:])]
+        )
 
     def stage_gradients(self, scheme, path) -> jax.Array:
         return scheme(self, path, correction_weights=_squared_gradient_weights)
 
 
 def _squared_gradient_weights(gradients) -> jax.Array:
-    """Squares of gradients, shape (s, m): that by the state, for each of its components, and that by the time."""
-    size = jnp.max(jnp.abs(gradients))
-    squares = jnp.sum((gradients / jnp.where(size > 0.0, size, 1.0)) ** 2, axis=0)
+    """Return sums of squared gradients, shape (s, m): that by the state for each component, then that by time."""
+    scale = jnp.max(jnp.abs(gradients))
+    squares = jnp.sum((gradients / jnp.where(scale > 0.0, scale, 1.0)) ** 2, axis=0)
     return jnp.append(jnp.full(gradients.shape[1] - 1, jnp.sum(squares[:-1])), squares[-1])
 
 
 class Pullback(Energy):
-    """A term that depends on the state through coordinates ``y = pi(x)`` at most quadratic in it; see Energy.on.
+    """A term that depends on the state through coordinates ``y = pi(x)`` at most quadratic in x; see :meth:`Energy.on`.
 
-    For such a map ``y' - y = Dpi(z) d`` with z the midpoint, exactly, so ``Dpi(z)^T`` takes discrete gradients in y to
-    discrete gradients in x [Gonzalez 1996]. A choice of components leaves what is known of the term as it is.
+    For such a map ``y' - y = Dpi(z) d`` exactly, with z the midpoint, so ``Dpi(z)^T`` maps discrete gradients in y to
+    discrete gradients in x [Gonzalez 1996]. If the map selects components, a quadratic term stays quadratic.
     """
 
     term: Energy
@@ -424,12 +432,12 @@ class Pullback(Energy):
         return self.term.value(self.coordinates(x))
 
     def gradient(self, x) -> jax.Array:
-        y, back = jax.vjp(self.coordinates, float64_array(x))
-        return back(self.term.gradient(y))[0]  # in its own way, where it has one
+        y, pull_back = jax.vjp(self.coordinates, float64_array(x))
+        return pull_back(self.term.gradient(y))[0]  # a term may override its gradient
 
     def sensitivity(self, x) -> jax.Array:
-        own = self._selects_components or isinstance(self.term, StateTimeEnergy)
-        return self.term.sensitivity(self.coordinates(x)) if own else super().sensitivity(x)
+        uses_term = self._selects_components or isinstance(self.term, StateTimeEnergy)
+        return self.term.sensitivity(self.coordinates(x)) if uses_term else super().sensitivity(x)
 
     def rounding_scale(self, x) -> jax.Array:
         return self.term.rounding_scale(self.coordinates(x)) if self._selects_components else super().rounding_scale(x)
@@ -442,17 +450,20 @@ class Pullback(Energy):
         )
 
     def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
-        if self.is_quadratic:  # at points of whole states, which others look at too
+        if self.is_quadratic:  # at the midpoint of the whole state, which other terms use too
             return scheme.quadratic(self, x, d, compensation)
-        of, compensation = self.coordinates, jnp.zeros_like(x) + compensation
-        middle, kept = x + (compensation + 0.5 * d), jax.jvp(of, (x + 0.5 * compensation,), (compensation,))[1]
-        step = jax.jvp(of, (middle,), (d,))[1]
-        (back,) = jax.vjp(of, middle)[1](self.term.discrete_gradient(scheme, of(x), step, kept))
-        return back
+        coordinates, compensation = self.coordinates, jnp.zeros_like(x) + compensation
+        midpoint = x + (compensation + 0.5 * d)
+        term_compensation = jax.jvp(coordinates, (x + 0.5 * compensation,), (compensation,))[1]
+        step = jax.jvp(coordinates, (midpoint,), (d,))[1]
+        (gradient,) = jax.vjp(coordinates, midpoint)[1](
+            self.term.discrete_gradient(scheme, coordinates(x), step, term_compensation)
+        )
+        return gradient
 
     def stage_gradients(self, scheme, path) -> jax.Array:
-        path, back = path.map_coordinates(self.coordinates)
-        return back(self.term.stage_gradients(scheme, path))
+        path, pull_back = path.map_coordinates(self.coordinates)
+        return pull_back(self.term.stage_gradients(scheme, path))
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
         if not isinstance(self.coordinates, Components) or len(self.coordinates.indices) > MAX_CLIQUE_COMPONENTS:
@@ -475,7 +486,7 @@ class Pullback(Energy):
 
 
 class Negative(Energy):
-    """Minus a term."""
+    """The negative of a term."""
 
     term: Energy
 
@@ -509,7 +520,7 @@ class Sum(Energy):
 
     @classmethod
     def of(cls, terms: Sequence[Energy]) -> Energy:
-        """A sum of some, which is the one where there is no other."""
+        """Return the sum of some terms; a single term is returned as it is."""
         return terms[0] if len(terms) == 1 else cls(tuple(terms))
 
     @property
@@ -544,14 +555,14 @@ class Sum(Energy):
 
 
 def function_name(energy: Energy) -> str:
-    """The name of the plain function that an energy is given by; empty where there is none."""
+    """Return the name of the plain function of an energy; "" if there is none."""
     return getattr(energy.function, "__name__", "") if isinstance(energy, Function | TimeDependent) else ""
 
 
 def make_energy(function, role: str) -> Energy:
-    """An :class:`Energy` from one, from a Casimir polynomial (quadratic ones are recognised) or from a function.
+    """Return an :class:`Energy` from an energy, a Casimir polynomial (quadratic if possible) or a function.
 
-    One that needs two arguments is a function of the state and the time.
+    A function that needs two arguments is a function of the state and the time.
     """
     if isinstance(function, Energy):
         return function
@@ -559,15 +570,15 @@ def make_energy(function, role: str) -> Energy:
         return quadratic_from_polynomial(function)
     if callable(function):
         return TimeDependent(function) if required_argument_count(function) == 2 else Function(function)
-    raise FunctionError(f"{role} must be a function of the state or an lt.Quadratic, not {type(function).__name__}")
+    raise FunctionError(f"{role} must be a function of the state or an lt.Quadratic, got {type(function).__name__}")
 
 
 CHART_ROUNDINGS = 4.0
-"""Roundings of each component of a point that a chart computes."""
+"""Number of roundings in each component of a point that a chart computes."""
 
 
 class ChartEnergy(Energy):
-    """A function of state vectors, as one of coordinates."""
+    """A function of state vectors, as a function of the coordinates of a chart."""
 
     energy: Energy
     coordinates: mf.Coordinates
@@ -578,13 +589,14 @@ class ChartEnergy(Energy):
         return self.energy.value(self.space.to_vector(self.coordinates.point(x)))
 
     def rounding_scale(self, x) -> jax.Array:
-        """At the start of the step, where that is known: so it is found once, not at every iteration."""
+        """Return the rounding scale at the start of the step, if it is known, so that iterations share one value."""
         if self.start is None:
             return super().rounding_scale(x)
         return self.energy.rounding_scale(self.start) + CHART_ROUNDINGS * self.energy.sensitivity(self.start)
 
 
 def quadratic_from_polynomial(polynomial: mf.Polynomial) -> Quadratic:
+    """Return a polynomial of degree at most two as a :class:`Quadratic`."""
     A, b, c = np.zeros((polynomial.dim, polynomial.dim)), np.zeros(polynomial.dim), 0.0
     for power, coefficient in polynomial.terms:
         factors = np.repeat(np.arange(polynomial.dim), power)

@@ -1,4 +1,4 @@
-"""Orthonormal frames of a few gradients, some of which may vanish or depend on the others."""
+"""Orthonormal frames of a few gradients, which may vanish or be linearly dependent."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ import jax.numpy as jnp
 import numpy as np
 
 DEPENDENCE_RTOL_SQUARED = 1e-24
-"""Square of what is left of a vector, relative to its own, below which it depends on those before it."""
+"""Squared norm of a residual, relative to that of its vector, below which the vector depends on the previous ones."""
 
 MIN_SQUARED_NORM = 1e-280
-"""Square of a vector below which it is none: products of its components have lost their digits."""
+"""Squared norm below which a vector counts as zero, because products of its components have lost their digits."""
 
 
 class OrthonormalFrame(NamedTuple):
-    """Orthonormal vectors that span what given ones span; zero instead of one that depends on those before it.
+    """Orthonormal vectors with the span of given vectors; a vector that depends on previous ones has a zero instead.
 
     Attributes
     ----------
     unit_vectors : list of array, shape (n,)
     combinations : list of array, shape (m,)
-        Unit j is ``sum_l combinations[j][l] vectors[l]``.
+        Unit vector j is ``sum_l combinations[j][l] vectors[l]``.
     images : list of array, shape (n,)
-        Those of the units by the form in which they are orthonormal; they themselves by default.
+        Images of the unit vectors under the form in which they are orthonormal; the unit vectors by default.
     squared_norms : list of array, shape ()
-        Of what was left of each vector, zero instead of one that was left out; their product is Gram's determinant.
+        Squared norm of the residual of each vector, zero for a dependent one; their product is Gram's determinant.
     """
 
     unit_vectors: list[jax.Array]
@@ -36,30 +36,31 @@ class OrthonormalFrame(NamedTuple):
     squared_norms: list[jax.Array]
 
     def project_off(self, v) -> jax.Array:
-        """v less its components in the span."""
+        """Return v without its component in the span."""
         return self._orthogonalize(v)[0]
 
     def project_off_images(self, v) -> jax.Array:
-        """An image less its components in the span of the images: ``P^T v``, where :meth:`off` is P."""
+        """Return an image without its component in the span of the images, ``P^T v`` if :meth:`project_off` is P."""
         for e, image in zip(self.unit_vectors, self.images, strict=True):
             v = v - jnp.dot(e, v) * image
         return v
 
     def coefficients(self, v) -> jax.Array:
-        """Those w for which ``sum_l w_l vectors[l]`` is the component of v in the span, shape (m,)."""
+        """Return w, shape (m,), for which ``sum_l w_l vectors[l]`` is the component of v in the span."""
         return sum_terms(jnp.dot(e, v) * c for e, c in zip(self.unit_vectors, self.combinations, strict=True))
 
     def vector_with_products(self, products) -> jax.Array:
-        """The vector in the span whose inner products with the given ones are these, shape (n,)."""
+        """Return the vector in the span, shape (n,), that has given inner products with the given vectors."""
         return sum_terms(jnp.dot(c, products) * e for e, c in zip(self.unit_vectors, self.combinations, strict=True))
 
     def _orthogonalize(self, v) -> tuple[jax.Array, list[jax.Array]]:
-        taken: list[jax.Array] = [jnp.zeros(())] * len(self.unit_vectors)
+        """Return v without its component in the span, and its coefficients in the unit vectors."""
+        coefficients: list[jax.Array] = [jnp.zeros(())] * len(self.unit_vectors)
         for _ in range(2):  # the second pass removes what rounding left of the first
             for j, (e, image) in enumerate(zip(self.unit_vectors, self.images, strict=True)):
-                along = jnp.dot(image, v)
-                v, taken[j] = v - along * e, taken[j] + along
-        return v, taken
+                coefficient = jnp.dot(image, v)
+                v, coefficients[j] = v - coefficient * e, coefficients[j] + coefficient
+        return v, coefficients
 
 
 def gram_schmidt(
@@ -67,37 +68,40 @@ def gram_schmidt(
     reference_vectors: Sequence[jax.Array] | None = None,
     metric_map: Callable | None = None,
 ) -> OrthonormalFrame:
-    """The frame of some vectors by Gram and Schmidt, orthonormal in a form given as a map: from v to ``G v``.
+    """Return the frame of some vectors by Gram-Schmidt, orthonormal in the form given by ``metric_map``, v -> G v.
 
-    ``reference_vectors`` are vectors whose dependence decides instead of the given ones. Discrete gradients of C and exp(C)
-    differ by a multiple of the slope alone, and to project off both would stop the motion: the gradients tell.
+    If ``reference_vectors`` are given, their linear dependence decides instead. The discrete gradients of C and exp(C)
+    may differ by a multiple of the increment, and projecting off both would then stop the motion; the gradients show
+    the dependence.
     """
     image_of = metric_map or (lambda v: v)
-    found, plain = OrthonormalFrame([], [], [], []), OrthonormalFrame([], [], [], [])
+    frame, reference_frame = OrthonormalFrame([], [], [], []), OrthonormalFrame([], [], [], [])
     for j, vector in enumerate(vectors):
-        rest, taken = found._orthogonalize(vector)
-        image = image_of(rest)
-        square = jnp.dot(image, rest)
+        residual, coefficients = frame._orthogonalize(vector)
+        image = image_of(residual)
+        squared_norm = jnp.dot(image, residual)
         if reference_vectors is None:
-            whole = square if rest is vector else jnp.dot(image_of(vector), vector)
-            independent = square > DEPENDENCE_RTOL_SQUARED * whole
+            full_squared_norm = squared_norm if residual is vector else jnp.dot(image_of(vector), vector)
+            is_independent = squared_norm > DEPENDENCE_RTOL_SQUARED * full_squared_norm
         else:
-            plain_rest = plain.project_off(reference_vectors[j])
-            plain_square = jnp.dot(plain_rest, plain_rest)
-            independent = (square > 0.0) & (
-                plain_square > DEPENDENCE_RTOL_SQUARED * jnp.dot(reference_vectors[j], reference_vectors[j])
+            reference_residual = reference_frame.project_off(reference_vectors[j])
+            reference_squared_norm = jnp.dot(reference_residual, reference_residual)
+            is_independent = (squared_norm > 0.0) & (
+                reference_squared_norm > DEPENDENCE_RTOL_SQUARED * jnp.dot(reference_vectors[j], reference_vectors[j])
             )
-            plain.unit_vectors.append(plain_rest * _safe_inverse_sqrt(plain_square, independent))
-            plain.images.append(plain.unit_vectors[-1])
-        scale = _safe_inverse_sqrt(square, independent)
+            reference_frame.unit_vectors.append(
+                reference_residual * _safe_inverse_sqrt(reference_squared_norm, is_independent)
+            )
+            reference_frame.images.append(reference_frame.unit_vectors[-1])
+        scale = _safe_inverse_sqrt(squared_norm, is_independent)
         combination = jnp.asarray(np.eye(len(vectors))[j])
-        for along, earlier in zip(taken, found.combinations, strict=True):
-            combination = combination - along * earlier
-        found.unit_vectors.append(rest * scale)
-        found.combinations.append(combination * scale)
-        found.images.append(image * scale)
-        found.squared_norms.append(jnp.where(independent, square, 0.0))
-    return found
+        for coefficient, previous_combination in zip(coefficients, frame.combinations, strict=True):
+            combination = combination - coefficient * previous_combination
+        frame.unit_vectors.append(residual * scale)
+        frame.combinations.append(combination * scale)
+        frame.images.append(image * scale)
+        frame.squared_norms.append(jnp.where(is_independent, squared_norm, 0.0))
+    return frame
 
 
 def vector_with_products(
@@ -106,44 +110,45 @@ def vector_with_products(
     passes: int = 1,
     is_usable: Callable[[jax.Array], jax.Array] | None = None,
 ) -> jax.Array:
-    """The vector in the span of some whose inner products with them are these, shape (n,).
+    """Return the vector in the span of some directions, shape (n,), that has given inner products with them.
 
-    As ``frame(directions).with_products(products)``, in one pass and without roots: for an iteration that corrects what
-    rounding leaves. One that depends on those before it, as at an equilibrium, is left out. A second pass is for
-    directions that are nearly parallel, as in units of which one is much larger than another.
+    The result is ``gram_schmidt(directions).vector_with_products(products)``, but computed in one pass and without
+    square roots, for an iteration that corrects rounding errors. A direction that depends on previous ones, as at an
+    equilibrium, is skipped. A second pass is for directions that are nearly parallel, as in units in which one
+    component is much larger than another.
 
-    What each direction adds is left out where it is not usable: the product with that direction is then as the others
-    make it.
+    An increment along a direction for which ``is_usable`` is false is skipped; the product with this direction is then
+    not enforced.
     """
-    found = jnp.zeros_like(directions[0])
+    result = jnp.zeros_like(directions[0])
     units: list[tuple[jax.Array, jax.Array]] = []
     for v, product in zip(directions, products, strict=True):
-        own = v
-        for made in range(passes):
-            for unit, square in units:
-                own = own - (jnp.dot(own if made else v, unit) / square) * unit
-        square = jnp.dot(own, own)
-        use = square > jnp.maximum(DEPENDENCE_RTOL_SQUARED * jnp.dot(v, v), MIN_SQUARED_NORM)
-        square = jnp.where(use, square, 1.0)
-        own = jnp.where(use, own, 0.0)
-        added = ((product - jnp.dot(v, found)) / square) * own
-        found = found + (added if is_usable is None else jnp.where(is_usable(added), added, 0.0))
-        units.append((own, square))
-    return found
+        residual = v
+        for pass_index in range(passes):
+            for unit, squared_norm in units:
+                residual = residual - (jnp.dot(residual if pass_index else v, unit) / squared_norm) * unit
+        squared_norm = jnp.dot(residual, residual)
+        is_independent = squared_norm > jnp.maximum(DEPENDENCE_RTOL_SQUARED * jnp.dot(v, v), MIN_SQUARED_NORM)
+        squared_norm = jnp.where(is_independent, squared_norm, 1.0)
+        residual = jnp.where(is_independent, residual, 0.0)
+        increment = ((product - jnp.dot(v, result)) / squared_norm) * residual
+        result = result + (increment if is_usable is None else jnp.where(is_usable(increment), increment, 0.0))
+        units.append((residual, squared_norm))
+    return result
 
 
 def sqrt_or_zero(square) -> jax.Array:
-    """The square root, zero where there is none; that has a derivative at zero too."""
+    """Return the square root, or zero where the argument is not positive, with a finite derivative at zero."""
     positive = square > 0.0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
 
 
-def _safe_inverse_sqrt(square, usable):
-    """``1 / |v|`` from ``|v|^2``, or 0 where that cannot be used; safe to differentiate."""
-    return jnp.where(usable, 1.0 / jnp.sqrt(jnp.where(usable, square, 1.0)), 0.0)
+def _safe_inverse_sqrt(square, is_usable):
+    """Return ``1 / |v|`` from ``|v|^2``, or 0 where it is not usable, with finite derivatives."""
+    return jnp.where(is_usable, 1.0 / jnp.sqrt(jnp.where(is_usable, square, 1.0)), 0.0)
 
 
-def sum_terms(parts: Iterable[jax.Array]) -> jax.Array:
-    """The sum, without a zero to begin with."""
-    first, *others = parts
-    return sum(others, first)
+def sum_terms(terms: Iterable[jax.Array]) -> jax.Array:
+    """Return the sum of arrays, without a zero at the start."""
+    first_term, *other_terms = terms
+    return sum(other_terms, first_term)

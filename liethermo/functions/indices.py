@@ -1,4 +1,4 @@
-"""Where things are in a large state: arrays of integers that are fixed, and patterns of what depends on what."""
+"""Fixed arrays of integers, such as indices into a large state, and sparsity patterns."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import scipy
 
 
 class StaticArray:
-    """An array that cannot change and is compared by value, to be a static field of a module.
+    """An array that cannot change and is compared by value, so that it can be a static field of a module.
 
-    A tuple of 1e5 numbers would be hashed anew at every call of a compiled function; this is hashed once.
+    It is hashed once; a tuple of 1e5 numbers would be hashed at every call of a compiled function.
     """
 
     dtype: ClassVar[type]
@@ -37,51 +37,51 @@ class StaticArray:
     def __eq__(self, other) -> bool:
         if self is other:
             return True
-        same = type(self) is type(other) and self._hash == other._hash
-        return same and np.array_equal(self._array, np.asarray(other))
+        is_same_kind = type(self) is type(other) and self._hash == other._hash
+        return is_same_kind and np.array_equal(self._array, np.asarray(other))
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}{self.shape}"
 
 
 class Indices(StaticArray):
-    """Integers: places."""
+    """An immutable array of integers that index a state."""
 
     dtype = np.int64
 
     @property
     def contiguous_slice(self) -> slice | None:
-        """The slice that the numbers are, in order, or None: a slice is read faster than it is gathered."""
-        flat = self._array.ravel()
-        if flat.size == 0 or not np.array_equal(flat, np.arange(flat[0], flat[0] + flat.size)):
+        """The slice that equals the indices in order, or None; a slice is read faster than it is gathered."""
+        entries = self._array.ravel()
+        if entries.size == 0 or not np.array_equal(entries, np.arange(entries[0], entries[0] + entries.size)):
             return None
-        return slice(int(flat[0]), int(flat[0]) + flat.size)
+        return slice(int(entries[0]), int(entries[0]) + entries.size)
 
 
 def sparsity_pattern(rows, columns, dim: int) -> scipy.sparse.csr_array:
-    """The pattern of a square matrix with entries in these places; its data are ones."""
+    """Return the pattern of a square matrix with entries at these rows and columns; its data are ones."""
     rows, columns = np.asarray(rows).ravel(), np.asarray(columns).ravel()
     return pattern_of_matrix(scipy.sparse.coo_array((np.ones(len(rows), dtype=bool), (rows, columns)), (dim, dim)))
 
 
 def clique_pattern(members, dim: int) -> scipy.sparse.csr_array:
-    """The pattern in which all components of each row of ``members``, shape (m, r), depend on each other."""
+    """Return the pattern in which all components of each row of ``members``, shape (m, r), depend on each other."""
     members = np.asarray(members)
     full = (*members.shape, members.shape[1])
     return sparsity_pattern(np.broadcast_to(members[:, :, None], full), np.broadcast_to(members[:, None, :], full), dim)
 
 
 def pattern_of_matrix(matrix) -> scipy.sparse.csr_array:
-    """A sparse matrix with every entry that is stored set to one."""
-    found = scipy.sparse.csr_array(matrix)
-    found.sum_duplicates()
-    found.data = np.ones(found.nnz, dtype=bool)
-    return found
+    """Return a sparse matrix with every stored entry set to one."""
+    pattern = scipy.sparse.csr_array(matrix)
+    pattern.sum_duplicates()
+    pattern.data = np.ones(pattern.nnz, dtype=bool)
+    return pattern
 
 
 def union_pattern(patterns) -> scipy.sparse.csr_array | None:
-    """All entries of some patterns; None, for unknown, where one of them is."""
-    found = list(patterns)
-    if any(one is None for one in found):
+    """Return the union of some patterns; None, for unknown, if one of them is None."""
+    known_patterns = list(patterns)
+    if any(pattern is None for pattern in known_patterns):
         return None
-    return pattern_of_matrix(sum(found[1:], found[0]))
+    return pattern_of_matrix(sum(known_patterns[1:], known_patterns[0]))

@@ -1,7 +1,8 @@
-"""Energies of spins on sites: exchange, Dzyaloshinskii-Moriya, anisotropy, Zeeman, on lattices and on any graph.
+"""Energies of spins on lattices and graphs: exchange, Dzyaloshinskii-Moriya interaction, anisotropy and Zeeman energy.
 
-Every term is quadratic, so its gradient at a midpoint is a discrete gradient, and costs what there are sites and edges.
-States hold the spins first, site by site in C order, ``(s_1x, s_1y, s_1z, s_2x, …)``; what comes behind is left alone.
+Every term is quadratic, so its gradient at a midpoint is a discrete gradient, at a cost proportional to the number of
+sites and edges. States begin with the spins, site by site in C order, ``(s_1x, s_1y, s_1z, s_2x, …)``; the other
+components do not affect these energies.
 """
 
 from __future__ import annotations
@@ -45,20 +46,24 @@ __dir__ = public_dir(__all__)
 
 
 def exchange(sites, strength=1.0, neighbours=None, periodic=True) -> Energy:
-    """Heisenberg exchange, ``-sum J_ij s_i . s_j`` over pairs: J > 0 aligns neighbours.
+    """Return the Heisenberg exchange, ``-sum J_ij s_i . s_j`` over pairs of sites: J > 0 aligns neighbours.
 
     Parameters
     ----------
     sites : int or tuple of int
         A tuple, such as ``(64, 64)``, for a lattice.
     strength : float, or array; or graph
-        J: one number for all pairs; an array of the shape of the sites, that of the pair of each site with the one
-        ahead (or a list of such, one for each neighbour). Or, with ``neighbours=None``, the graph itself: a symmetric
+        J: one number for all pairs; an array of the shape of the sites, for the pair of each site and its neighbour
+        ahead (or a list of such arrays, one for each neighbour). Or, with ``neighbours=None``, the graph: a symmetric
         matrix of all sites, dense or sparse, or a list of edges ``(i, j, J)``, each pair once, sites in C order.
     neighbours : sequence of tuples of int, optional
-        Offsets to the sites ahead on a lattice, each pair of opposite ones once: by default one along every axis.
+        Offsets to the neighbours ahead on a lattice, one of each two opposite offsets; by default one along every axis.
     periodic : bool or tuple of bool
-        Whether the lattice closes on itself, along each axis.
+        Whether the lattice is periodic, along each axis.
+
+    Returns
+    -------
+    Energy
 
     Raises
     ------
@@ -71,16 +76,20 @@ def exchange(sites, strength=1.0, neighbours=None, periodic=True) -> Energy:
 
 
 def dzyaloshinskii_moriya(sites, vectors, neighbours=None, periodic=True) -> Energy:
-    """Antisymmetric exchange, ``sum D_ij . (s_i x s_j)`` over pairs: it turns neighbours against each other.
+    """Return the antisymmetric exchange, ``sum D_ij . (s_i x s_j)`` over pairs of sites, which cants neighbours.
 
     Parameters
     ----------
     sites : int or tuple of int
     vectors : array, shape (3,), or ``(*sites, 3)``; or a list of them, one for each neighbour; or list of edges
-        D of each pair of a site with the one ahead, such as ``[(0, D, 0), (-D, 0, 0)]`` on a square lattice; or edges
-        ``(i, j, D)``, D being that from i to j.
+        D of the pair of each site and its neighbour ahead, such as ``[(0, D, 0), (-D, 0, 0)]`` on a square lattice; or
+        edges ``(i, j, D)``, with D from i to j.
     neighbours, periodic
-        As of :func:`exchange`.
+        See :func:`exchange`.
+
+    Returns
+    -------
+    Energy
 
     Raises
     ------
@@ -94,14 +103,19 @@ def dzyaloshinskii_moriya(sites, vectors, neighbours=None, periodic=True) -> Ene
 
 
 def anisotropy(sites, strength=1.0, axis=(0.0, 0.0, 1.0)) -> Energy:
-    """Uniaxial anisotropy, ``-sum K_i (n_i . s_i)^2``: an easy axis for K > 0, a hard one for K < 0.
+    """Return the uniaxial anisotropy, ``-sum K_i (n_i . s_i)^2``: an easy axis for K > 0, a hard axis for K < 0.
 
     Parameters
     ----------
     sites : int or tuple of int
     strength : float, or array of the shape of the sites
+        K_i.
     axis : array, shape (3,) or ``(*sites, 3)``
-        n_i; its length counts.
+        n_i, which is not normalised.
+
+    Returns
+    -------
+    Energy
 
     Raises
     ------
@@ -110,19 +124,25 @@ def anisotropy(sites, strength=1.0, axis=(0.0, 0.0, 1.0)) -> Energy:
     shape = lattice_shape(sites)
     K = _site_values(strength, shape, (), "an anisotropy constant")
     n = _site_values(axis, shape, (3,), "an axis")
-    if not is_traced((K, n)) and not (np.count_nonzero(np.asarray(n), axis=-1) > 1).any():  # along axes of space
+    if not is_traced((K, n)) and not (np.count_nonzero(np.asarray(n), axis=-1) > 1).any():  # every axis is x, y or z
         return SiteEnergy(shape, -2.0 * K[..., None] * n**2, None, None)
     return SiteEnergy(shape, -2.0 * K, None, n)
 
 
 def zeeman(sites, field, moment=1.0) -> Energy:
-    """The energy in a field, ``-sum mu_i B_i . s_i``.
+    """Return the energy in a magnetic field, ``-sum mu_i B_i . s_i``.
 
     Parameters
     ----------
     sites : int or tuple of int
     field : array, shape (3,) or ``(*sites, 3)``
+        B_i.
     moment : float, or array of the shape of the sites
+        mu_i.
+
+    Returns
+    -------
+    Energy
 
     Raises
     ------
@@ -134,13 +154,13 @@ def zeeman(sites, field, moment=1.0) -> Energy:
 
 
 class SpinEnergy(Energy):
-    """A quadratic energy of spins on a lattice, written down by their components: arrays of the shape of the sites.
+    """A quadratic energy of spins on a lattice, computed component by component on arrays of the shape of the sites.
 
     Attributes
     ----------
     sites : tuple of int
     interaction_range : tuple of int
-        How far, along each axis, the spins are that act on one.
+        Largest distance, along each axis, of two spins that interact.
     """
 
     sites: tuple[int, ...] = eqx.field(static=True)
@@ -151,11 +171,11 @@ class SpinEnergy(Energy):
 
     @abstractmethod
     def lattice_value(self, spins: Lattice) -> jax.Array:
-        """The value, shape ()."""
+        """Return the energy of the spins, shape ()."""
 
     @abstractmethod
     def lattice_gradients(self, spins: Lattice) -> VectorComponents:
-        """The gradients by the spins."""
+        """Return the gradients by the spins."""
 
     is_quadratic = True
 
@@ -170,11 +190,11 @@ class SpinEnergy(Energy):
 
 
 class SiteEnergy(SpinEnergy):
-    """``sum_i A_i (n_i . s_i)^2 / 2 + b_i . s_i``; without n ``sum_ic A_ic s_ic^2 / 2``, c a component.
+    """The energy ``sum_i A_i (n_i . s_i)^2 / 2 + b_i . s_i``; without n, the first term is ``sum_ic A_ic s_ic^2 / 2``.
 
     Attributes
     ----------
-    A : array, shape () or that of the sites, (3,) or ``(*sites, 3)`` without n, or None
+    A : array, shape () or that of the sites; (3,) or ``(*sites, 3)`` without n; or None
     b, n : array, shape (3,) or ``(*sites, 3)``, or None
     """
 
@@ -193,11 +213,11 @@ class SiteEnergy(SpinEnergy):
             assert self.b is not None
             a, b, c = (jnp.broadcast_to(component, self.sites) for component in split_vectors(self.b))
             return a, b, c
-        drawn = self._quadratic_gradient(spins.site_spins)
-        return drawn if self.b is None else add_vectors(drawn, split_vectors(self.b))
+        quadratic_gradient = self._quadratic_gradient(spins.site_spins)
+        return quadratic_gradient if self.b is None else add_vectors(quadratic_gradient, split_vectors(self.b))
 
     def _quadratic_gradient(self, spins: VectorComponents) -> VectorComponents:
-        """``A_i (n_i . s_i) n_i``."""
+        """Return ``A_i (n_i . s_i) n_i``."""
         assert self.A is not None
         if self.n is None:
             A = split_vectors(self.A)
@@ -210,7 +230,7 @@ class SiteEnergy(SpinEnergy):
 
 
 class BondEnergy(SpinEnergy):
-    """``sum_i -J_i s_i . s_{i+o} + D_i . (s_i x s_{i+o})`` on a lattice, o an offset.
+    """The energy ``sum_i -J_i s_i . s_{i+o} + D_i . (s_i x s_{i+o})`` on a lattice, o an offset.
 
     Attributes
     ----------
@@ -231,57 +251,57 @@ class BondEnergy(SpinEnergy):
         return sum_of_dots(self._neighbour_gradient(spins.at(self.offset), self.J, self.D), spins.site_spins)
 
     def lattice_gradients(self, spins: Lattice) -> VectorComponents:
-        ahead, behind = spins.at(self.offset), spins.at([-o for o in self.offset])
+        spins_ahead, spins_behind = spins.at(self.offset), spins.at([-o for o in self.offset])
         if self.D is None and self.J is not None and not self.J.ndim:
-            return scale_vectors(-self.J, add_vectors(ahead, behind))
+            return scale_vectors(-self.J, add_vectors(spins_ahead, spins_behind))
         axes = range(len(self.sites))
         J = self.J if self.J is None or not self.J.ndim else jnp.roll(self.J, self.offset, axes)
         D = self.D if self.D is None or self.D.ndim == 1 else jnp.roll(self.D, self.offset, axes)
         return add_vectors(
-            self._neighbour_gradient(ahead, self.J, self.D),
-            self._neighbour_gradient(behind, J, None if D is None else -D),
+            self._neighbour_gradient(spins_ahead, self.J, self.D),
+            self._neighbour_gradient(spins_behind, J, None if D is None else -D),
         )
 
     @staticmethod
     def _neighbour_gradient(s: VectorComponents, J: jax.Array | None, D: jax.Array | None) -> VectorComponents:
-        """What a neighbour s gives to a site: ``-J s + s x D``."""
-        aligned = None if J is None else scale_vectors(-J, s)
+        """Return ``-J s + s x D``, the gradient by a spin that is due to its neighbour s."""
+        exchange_gradient = None if J is None else scale_vectors(-J, s)
         if D is not None:
-            turned = cross_vectors(s, split_vectors(D))
-            return turned if aligned is None else add_vectors(aligned, turned)
-        assert aligned is not None
-        return aligned
+            dmi_gradient = cross_vectors(s, split_vectors(D))
+            return dmi_gradient if exchange_gradient is None else add_vectors(exchange_gradient, dmi_gradient)
+        assert exchange_gradient is not None
+        return exchange_gradient
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array:
-        here = np.arange(math.prod(self.sites)).reshape(self.sites)
-        ahead = np.roll(here, [-by for by in self.offset], axis=range(here.ndim))
-        return clique_pattern(_bond_indices(here.ravel(), ahead.ravel()), dim)
+        site_numbers = np.arange(math.prod(self.sites)).reshape(self.sites)
+        neighbour_numbers = np.roll(site_numbers, [-shift for shift in self.offset], axis=range(site_numbers.ndim))
+        return clique_pattern(_bond_indices(site_numbers.ravel(), neighbour_numbers.ravel()), dim)
 
 
 def lattice_spins(x, sites: tuple[int, ...], planar: bool = False) -> VectorComponents:
-    """The components of the spins of a state, each of the shape of the sites."""
+    """Return the components of the spins of a state, each of the shape of the sites."""
     return reshape_vectors(spins_from_state(x, math.prod(sites), planar), sites)
 
 
 def flatten_covectors(covectors: VectorComponents, x, planar: bool = False) -> jax.Array:
-    """Covectors of the spins as one of the state x."""
+    """Return covectors of the spins as one covector of the state x."""
     return state_from_spins(reshape_vectors(covectors, (-1,)), jnp.zeros(x.size - 3 * covectors[0].size), planar)
 
 
 def lattice_shape(sites) -> tuple[int, ...]:
-    """The shape of a lattice, or (count,)."""
+    """Return the shape of a lattice as a tuple; an integer becomes a tuple of one entry."""
     shape = tuple(sites) if isinstance(sites, tuple | list) else (sites,)
-    good = all(isinstance(n, int | np.integer) and not isinstance(n, bool) and n >= 1 for n in shape)
-    if not shape or not good:
-        raise InputError(f"sites are a positive integer, or some for a lattice such as (64, 64), not {sites!r}")
+    is_valid = all(isinstance(n, int | np.integer) and not isinstance(n, bool) and n >= 1 for n in shape)
+    if not shape or not is_valid:
+        raise InputError(f"sites must be a positive integer, or a tuple for a lattice such as (64, 64), got {sites!r}")
     return tuple(int(n) for n in shape)
 
 
 def check_spin_count(sites: tuple[int, ...], dim: int, role: str) -> None:
-    """InputError where a state has no room for the spins that a term is of."""
+    """Raise InputError if a state has fewer components than the spins of a term."""
     count = math.prod(sites)
     if 3 * count > dim:
-        raise InputError(f"{role} has a term of {count} spins, which a state with {dim} components has no room for")
+        raise InputError(f"{role} has a term of {count} spins, so the state needs {3 * count} components, got {dim}")
 
 
 def _lattice_energy(shape, strength, vectors, neighbours, periodic, what: str) -> Energy:
@@ -289,23 +309,23 @@ def _lattice_energy(shape, strength, vectors, neighbours, periodic, what: str) -
     offsets = np.eye(axes, dtype=int).tolist() if neighbours is None else neighbours
     offsets = [_check_offset(offset, axes) for offset in offsets]
     if any(opposite in offsets for opposite in ([-o for o in offset] for offset in offsets)):
-        raise InputError(f"the neighbours {offsets} name a pair twice: give one of each two opposite offsets")
-    closed = (periodic,) * axes if isinstance(periodic, bool) else tuple(periodic)
-    if len(closed) != axes:
-        raise InputError(f"periodic is true or false, or such for each of the {axes} axes, not {periodic!r}")
-    given = strength if vectors is None else vectors
-    each = (
-        given
-        if isinstance(given, list | tuple) and len(given) == len(offsets) and np.ndim(given[0])
-        else [given] * len(offsets)
+        raise InputError(f"the neighbours {offsets} name a pair twice. Give one of each two opposite offsets")
+    periodic_axes = (periodic,) * axes if isinstance(periodic, bool) else tuple(periodic)
+    if len(periodic_axes) != axes:
+        raise InputError(f"periodic must be True or False, or one for each of the {axes} axes, got {periodic!r}")
+    coupling = strength if vectors is None else vectors
+    couplings = (
+        coupling
+        if isinstance(coupling, list | tuple) and len(coupling) == len(offsets) and np.ndim(coupling[0])
+        else [coupling] * len(offsets)
     )
     tail = () if vectors is None else (3,)
     terms = []
-    for offset, one in zip(offsets, each, strict=True):
-        value = _site_values(one, shape, tail, what)
-        inside = _has_neighbour(shape, offset, closed)
-        if not inside.all():  # pairs that a border cuts
-            value = jnp.where(inside.reshape(*shape, *(1 for _ in tail)), value, 0.0)
+    for offset, offset_coupling in zip(offsets, couplings, strict=True):
+        value = _site_values(offset_coupling, shape, tail, what)
+        has_neighbour = _has_neighbour(shape, offset, periodic_axes)
+        if not has_neighbour.all():  # no pairs across the border
+            value = jnp.where(has_neighbour.reshape(*shape, *(1 for _ in tail)), value, 0.0)
         terms.append(
             BondEnergy(shape, tuple(offset), value, None)
             if vectors is None
@@ -315,37 +335,37 @@ def _lattice_energy(shape, strength, vectors, neighbours, periodic, what: str) -
 
 
 def _check_offset(offset, axes: int) -> list[int]:
-    found = [offset] if np.ndim(offset) == 0 else list(offset)
-    if len(found) != axes or any(int(o) != o for o in found) or not any(found):
-        raise InputError(f"a neighbour is an offset of {axes} integers, not all zero, not {offset!r}")
-    return [int(o) for o in found]
+    components = [offset] if np.ndim(offset) == 0 else list(offset)
+    if len(components) != axes or any(int(o) != o for o in components) or not any(components):
+        raise InputError(f"a neighbour must be an offset of {axes} integers, not all zero, got {offset!r}")
+    return [int(o) for o in components]
 
 
-def _has_neighbour(shape, offset, closed) -> np.ndarray:
-    """Which sites have the one ahead, shape of the sites."""
-    inside = np.ones(shape, dtype=bool)
-    for axis, (n, by, around) in enumerate(zip(shape, offset, closed, strict=True)):
-        place = np.arange(n) + by
-        here = (np.ones(n, dtype=bool) if around else (place >= 0) & (place < n)).reshape(
+def _has_neighbour(shape, offset, periodic_axes) -> np.ndarray:
+    """Return which sites have a neighbour at an offset, as an array of the shape of the sites."""
+    has_neighbour = np.ones(shape, dtype=bool)
+    for axis, (n, shift, is_periodic) in enumerate(zip(shape, offset, periodic_axes, strict=True)):
+        indices = np.arange(n) + shift
+        is_inside_axis = (np.ones(n, dtype=bool) if is_periodic else (indices >= 0) & (indices < n)).reshape(
             [-1 if a == axis else 1 for a in range(len(shape))]
         )
-        inside = inside & here
-    return inside
+        has_neighbour = has_neighbour & is_inside_axis
+    return has_neighbour
 
 
 def _site_values(value, shape, tail: tuple[int, ...], what: str) -> jax.Array:
-    """A value of all sites, or one for each."""
+    """Check a value that is given once for all sites, or for each site, and return it as an array."""
     array = check_numbers(value, what)
     if array.shape not in (tail, (*shape, *tail)):
-        wanted = f"{tail} or {(*shape, *tail)}" if tail else f"of one number, or {shape}"
-        raise InputError(f"{what} has the shape {wanted}, not {array.shape}")
+        expected_shapes = f"{tail} or {(*shape, *tail)}" if tail else f"() or {shape}"
+        raise InputError(f"{what} must have shape {expected_shapes}, got {array.shape}")
     if not is_traced(array) and not np.isfinite(np.asarray(array)).all():
-        raise InputError(f"{what} is not finite")
+        raise InputError(f"{what} must be finite, got {np.asarray(array).tolist()}")
     return array
 
 
 def _is_edge_list(graph) -> bool:
-    """Return whether these are edges ``(i, j, weight)``, two integers first, and not a list of values."""
+    """Return whether a value is a list of edges ``(i, j, weight)``, and not a list of values."""
     return (
         isinstance(graph, list | tuple)
         and len(graph) > 0
@@ -358,25 +378,25 @@ def _is_integer(value) -> bool:
 
 
 def _is_graph(strength, shape: tuple[int, ...]) -> bool:
-    """Return whether an exchange is given on a graph: a square matrix, unless it has the shape of a lattice."""
+    """Return whether an exchange is given as a graph: as edges, or as a square matrix not shaped like the lattice."""
     if scipy.sparse.issparse(strength) or _is_edge_list(strength):
         return True
     if isinstance(strength, list) or np.ndim(strength) != 2:
         return False
-    given = np.shape(strength)
-    return given[0] == given[1] and given != shape
+    matrix_shape = np.shape(strength)
+    return matrix_shape[0] == matrix_shape[1] and matrix_shape != shape
 
 
 def _graph_exchange(shape, graph) -> Energy:
     count = math.prod(shape)
-    found = graph_edges(graph, count, "the exchange", _SiteNames(), allow_negative=True)
-    if len(found.first) == 0:
+    edges = graph_edges(graph, count, "the exchange", _SiteNames(), allow_negative=True)
+    if len(edges.first) == 0:
         raise InputError("the graph of an exchange has no edges")
-    return Each(_exchange_bond, _bond_indices(found.first, found.second), found.weight)
+    return Each(_exchange_bond, _bond_indices(edges.first, edges.second), edges.weight)
 
 
 class _SiteNames(Sequence):
-    """Names of any number of sites, made when one is asked for."""
+    """Names of any number of sites, formatted on demand."""
 
     def __getitem__(self, i):
         return f"site {i}"
@@ -385,23 +405,23 @@ class _SiteNames(Sequence):
         return 0
 
 
-def _directed_edges(listed, count: int) -> tuple[np.ndarray, jax.Array]:
-    for i, j, _ in listed:
+def _directed_edges(edges, count: int) -> tuple[np.ndarray, jax.Array]:
+    for i, j, _ in edges:
         if not (0 <= i < count and 0 <= j < count):
-            raise InputError(f"the edge ({i}, {j}) leaves the {count} sites, which count from 0")
+            raise InputError(f"the edge ({i}, {j}) must join two of the {count} sites, which are numbered from 0")
         if i == j:
             raise InputError(f"the edge ({i}, {j}) joins a site with itself")
-    pairs = [frozenset(edge[:2]) for edge in listed]
+    pairs = [frozenset(edge[:2]) for edge in edges]
     if len(set(pairs)) < len(pairs):
-        raise InputError("an edge is given twice: a pair of sites has one Dzyaloshinskii-Moriya vector")
-    D = real_array(np.array([edge[2] for edge in listed], dtype=float))
+        raise InputError("an edge is given twice, but a pair of sites has one Dzyaloshinskii-Moriya vector")
+    D = real_array(np.array([edge[2] for edge in edges], dtype=float))
     if D.shape != (len(pairs), 3):
-        raise InputError(f"an edge (i, j, D) has a vector D, shape (3,), but together they have shape {D.shape}")
-    return np.array([edge[:2] for edge in listed], dtype=int), D
+        raise InputError(f"the vectors D of edges (i, j, D) must have shape ({len(pairs)}, 3) together, got {D.shape}")
+    return np.array([edge[:2] for edge in edges], dtype=int), D
 
 
 def _bond_indices(first, second) -> np.ndarray:
-    """The components of two spins, shape (edges, 6)."""
+    """Return the indices of the components of two spins, shape (edges, 6)."""
     ends = np.stack([first, second], axis=1)
     return (3 * ends[:, :, None] + np.arange(3)).reshape(len(ends), 6)
 

@@ -1,4 +1,4 @@
-"""Energies of mechanical systems in states (q, p, S): kinetic and potential energy, discretised term by term."""
+"""Energies of mechanical systems with states (q, p, S): kinetic and potential energy, discretised term by term."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from .energy import Energy, Function, Pullback, Quadratic
 
 
 class Kinetic(Energy):
-    """``p·G(q) p / 2`` of a state (q, p) or (q, p, S), or ``v·G(q) v / 2`` of (q, v, S) [SML 28].
+    """The kinetic energy ``p·G(q) p / 2`` of a state (q, p) or (q, p, S), or ``v·G(q) v / 2`` of (q, v, S) [SML 28].
 
-    G is the inverse of the metric (of the mass matrix) in a Hamiltonian, the metric itself in a Lagrangian. In every
+    G is the inverse of the metric (of the mass matrix) in a Hamiltonian, and the metric in a Lagrangian. In every
     scheme its discrete gradient by p is a mean of G times a mean of p: ``(G(q) + G(q')) (p + p') / 4`` for discrete
-    gradients, ``G(q_i) p_i`` at the stages of a collocation method; what corrects it goes along q alone. For a
-    semidefinite G this keeps the entropy of an evolution field from falling at any step.
+    gradients, ``G(q_i) p_i`` at the stages of a collocation method; the correction changes only the components of q.
+    For a semidefinite G this ensures that the entropy of an evolution field does not fall at any step.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ class Kinetic(Energy):
         return not callable(self.G)
 
     def at(self, q) -> jax.Array:
-        """``G(q)``, shape (n, n) or (n,)."""
+        """Return ``G(q)``, shape (n, n) or (n,)."""
         return jnp.asarray(self.G(q)) if callable(self.G) else self.G
 
     def value(self, x) -> jax.Array:
@@ -49,28 +49,28 @@ class Kinetic(Energy):
 
     def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
         (q, p), (dq, dp), (compensation_q, compensation_p) = map(_split_state, (x, d, jnp.zeros_like(x) + compensation))
-        middle, nothing = p + (compensation_p + 0.5 * dp), jnp.zeros(len(x) - 2 * len(p))
+        p_middle, zeros = p + (compensation_p + 0.5 * dp), jnp.zeros(len(x) - 2 * len(p))
         if not callable(self.G):
-            return jnp.concatenate([jnp.zeros_like(q), _apply_metric(self.G, middle), nothing])
-        first, last = p + compensation_p, p + (compensation_p + dp)
+            return jnp.concatenate([jnp.zeros_like(q), _apply_metric(self.G, p_middle), zeros])
+        p_start, p_end = p + compensation_p, p + (compensation_p + dp)
 
-        def mean(q):  # over both ends in p, of the kinetic energy at q
+        def mean(q):  # of the kinetic energy at q, over both ends in p
             G = self.at(q)
-            return 0.25 * (jnp.dot(first, _apply_metric(G, first)) + jnp.dot(last, _apply_metric(G, last)))
+            return 0.25 * (jnp.dot(p_start, _apply_metric(G, p_start)) + jnp.dot(p_end, _apply_metric(G, p_end)))
 
-        by_p = 0.5 * (
-            _apply_metric(self.at(q + compensation_q), middle)
-            + _apply_metric(self.at(q + (compensation_q + dq)), middle)
+        p_gradient = 0.5 * (
+            _apply_metric(self.at(q + compensation_q), p_middle)
+            + _apply_metric(self.at(q + (compensation_q + dq)), p_middle)
         )
-        return jnp.concatenate([scheme.general(Function(mean), q, dq, compensation_q), by_p, nothing])
+        return jnp.concatenate([scheme.general(Function(mean), q, dq, compensation_q), p_gradient, zeros])
 
     def stage_gradients(self, scheme, path) -> jax.Array:
-        size = len(path.start)
-        return scheme(self, path, correction_weights=np.arange(size) < size // 2)
+        dim = len(path.start)
+        return scheme(self, path, correction_weights=np.arange(dim) < dim // 2)
 
 
 class Potential(Pullback):
-    """A potential ``V(q, S)`` of a state (q, p, S), entropy included: internal energy, springs that heat [SML 28].
+    """A potential ``V(q, S)`` of a state (q, p, S): internal energy, or springs that heat up [SML 28].
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ class Potential(Pullback):
 
 
 class _PotentialOfVector(Module):
-    """V(q, S) as a function of one array."""
+    """A potential V(q, S), as a function of the array (q, S)."""
 
     V: Callable
 
@@ -91,57 +91,60 @@ class _PotentialOfVector(Module):
 
 
 def is_mechanical(energy: Energy, dim: int, space: mf.Space | None = None) -> bool:
-    """Whether H is ``p . G(q) p / 2 + V(q, S)`` with G semidefinite [SML 28], and each term known to be of that kind.
+    """Return whether the terms of H are known to be ``p . G(q) p / 2``, with G semidefinite, or ``V(q, S)`` [SML 28].
 
-    On a space of positions ``P(q) G(q)`` has to be semidefinite near it, P the projector along it: its symmetric part.
+    On a space of positions, the symmetric part of ``P(q) G(q)`` must be semidefinite near the space, P the projector
+    onto its tangent space.
 
-    Then ``p . (dgrad H)_p >= 0`` with p the midpoint, for the discrete gradients of every scheme that takes that of a
-    quadratic term at the midpoint. A plain function of the whole state is not known to be of any kind, unless it is
-    quadratic.
+    Then ``p . (dgrad H)_p >= 0`` with p the midpoint, for the discrete gradients of every scheme that takes the
+    midpoint gradient of a quadratic term. A plain function of the whole state is not known to be of any kind, unless it
+    is quadratic.
     """
     if is_traced(energy):
         return False
     points = np.random.default_rng(0).standard_normal((4, dim))
-    along = None if space is None else evaluate_at_points(_projector, space, points[:, : space.size])
-    return all(_is_kinetic(term, points, along) or is_independent_of_momenta(term, points) for term in energy.terms)
+    projectors = None if space is None else evaluate_at_points(_projector, space, points[:, : space.size])
+    return all(
+        _is_kinetic(term, points, projectors) or is_independent_of_momenta(term, points) for term in energy.terms
+    )
 
 
 def is_independent_of_momenta(term: Energy, points: np.ndarray) -> bool:
-    """Whether a term is known not to depend on p (or v)."""
+    """Return whether a term is known not to depend on p (or v)."""
     n = points.shape[1] // 2
     return is_independent_of(term, points, np.arange(n, 2 * n))
 
 
 def is_independent_of(term: Energy, points: np.ndarray, components: np.ndarray) -> bool:
-    """Whether a term is known not to depend on some components, from its coordinates' derivatives at some states."""
+    """Return whether a term is known not to depend on some components, by the Jacobian of its coordinates."""
     if isinstance(term, Each):
         return not np.isin(components, term.places).any()
     return isinstance(term, Pullback) and not evaluate_at_points(_jacobian, term, points)[:, :, components].any()
 
 
-def _is_kinetic(term: Energy, points: np.ndarray, along: np.ndarray | None) -> bool:
-    """Whether it is a semidefinite form in p, whatever else it is in q and S; without mixed terms."""
+def _is_kinetic(term: Energy, points: np.ndarray, projectors: np.ndarray | None) -> bool:
+    """Return whether a term is a semidefinite form in p plus a function of q and S."""
     n = points.shape[1] // 2
     if isinstance(term, Kinetic):
-        return _is_semidefinite(evaluate_at_points(_metric, term, points), along)
+        return _is_semidefinite(evaluate_at_points(_metric, term, points), projectors)
     if not term.is_quadratic:
         return False
     slope, hessian = evaluate_at_points(_momentum_derivatives, term, np.zeros_like(points[:1]))
-    mixed = np.delete(hessian, np.s_[n : 2 * n], axis=-1)
-    return not slope.any() and not mixed.any() and _is_semidefinite(hessian[..., n : 2 * n], along)
+    mixed_block = np.delete(hessian, np.s_[n : 2 * n], axis=-1)
+    return not slope.any() and not mixed_block.any() and _is_semidefinite(hessian[..., n : 2 * n], projectors)
 
 
-def _is_semidefinite(G: np.ndarray, along: np.ndarray | None) -> bool:
-    """Whether all of these matrices, shape (..., n, n), are positive semidefinite; behind projectors, if there are."""
-    G = G if along is None else along @ G
+def _is_semidefinite(G: np.ndarray, projectors: np.ndarray | None) -> bool:
+    """Return whether all matrices, shape (..., n, n), are positive semidefinite, multiplied by projectors if given."""
+    G = G if projectors is None else projectors @ G
     eigenvalues = np.linalg.eigvalsh(0.5 * (G + G.swapaxes(-1, -2)))
     return bool(eigenvalues.min() >= -1e-14 * np.abs(eigenvalues).max())
 
 
 def _projector(space: mf.Space, q):
     point = space.from_vector(q)
-    along = lambda w: space.to_vector(space._tangential_part(point, space.from_vector(w)))  # noqa: E731
-    return jax.vmap(along, out_axes=1)(jnp.eye(space.size))
+    project = lambda w: space.to_vector(space._tangential_part(point, space.from_vector(w)))  # noqa: E731
+    return jax.vmap(project, out_axes=1)(jnp.eye(space.size))
 
 
 def _metric(term: Kinetic, x):

@@ -25,7 +25,7 @@ class PointEnergy(Energy):
 
 
 def energy_of_vectors(energy: Energy, space: mf.Space | None) -> Energy:
-    """An energy of the points of a space as one of their vectors; an lt.Quadratic is one of vectors already."""
+    """Return an energy of the points of a space as one of their vectors; an lt.Quadratic is returned unchanged."""
     if space is None or space.shape == (space.size,):
         return energy
     return energy.map_terms(lambda term: _term_of_vectors(term, space))
@@ -38,6 +38,8 @@ def _term_of_vectors(term: Energy, space: mf.Space) -> Energy:
 
 
 class _PointTimeFunction(Module):
+    """A function of a point and the time, as a function of the vector of the point and the time."""
+
     function: Callable
     space: mf.Space = eqx.field(static=True)
 
@@ -46,16 +48,16 @@ class _PointTimeFunction(Module):
 
 
 def flatten_site_functions(tree, shape: tuple[int, ...]):
-    """A pytree whose plain functions of states of this shape have become functions of flat ones, shape (n,).
+    """Replace the plain functions of states of this shape in a pytree by functions of flat states, shape (n,).
 
-    Energies that say themselves what they do with components, and Casimirs of algebras, are of flat states already.
+    Energies of other classes and Casimirs of algebras are functions of flat states already.
     """
     if len(shape) == 1:
         return tree
     return jax.tree_util.tree_map(
-        lambda part: _flatten_site_energy(part, shape) if isinstance(part, Energy) else part,
+        lambda node: _flatten_site_energy(node, shape) if isinstance(node, Energy) else node,
         tree,
-        is_leaf=lambda part: isinstance(part, Energy),
+        is_leaf=lambda node: isinstance(node, Energy),
     )
 
 
@@ -65,12 +67,14 @@ def _flatten_site_energy(energy: Energy, shape: tuple[int, ...]) -> Energy:
     if isinstance(energy, Negative):
         return Negative(_flatten_site_energy(energy.term, shape))
     if isinstance(energy, Function | TimeDependent):
-        flat = getattr(energy.function, "dim", None) == math.prod(shape)  # a Casimir of the whole algebra
-        return energy if flat else type(energy)(_FlattenedFunction(energy.function, shape))
+        is_flat = getattr(energy.function, "dim", None) == math.prod(shape)  # a Casimir of the whole algebra
+        return energy if is_flat else type(energy)(_FlattenedFunction(energy.function, shape))
     return energy
 
 
 class _FlattenedFunction(Module):
+    """A function of states of some shape, as a function of flat states."""
+
     function: Callable
     shape: tuple[int, ...] = eqx.field(static=True)
 

@@ -1,4 +1,4 @@
-"""The collocation polynomial of a step, as the terms of an energy see it."""
+"""The collocation polynomial of a step, in the coordinates of a term of an energy."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import numpy as np
 
 
 class KronrodRule(NamedTuple):
-    """Further nodes between those of a Gauss rule, which make it a Kronrod rule.
+    """Additional nodes between those of a Gauss rule, which extend it to a Kronrod rule.
 
     Attributes
     ----------
     A, slope_matrix : ndarray, shape (s + 1, s)
-        ``x + h A @ k`` and ``slopes @ k`` are the collocation polynomial and its slope at the further nodes.
+        ``x + h A @ k`` and ``slope_matrix @ k`` are the collocation polynomial and its slope at the additional nodes.
     b, weight_change : ndarray, shapes (s + 1,) and (s,)
-        Their weights, and what is added to those of the Gauss nodes.
+        Weights of the additional nodes, and the change of the weights of the Gauss nodes.
     """
 
     A: np.ndarray
@@ -33,13 +33,16 @@ class CollocationPath(NamedTuple):
     Attributes
     ----------
     start, compensation, step : array, shape (m,)
-        It leads from start + compensation to start + compensation + step.
+        The path leads from start + compensation to start + compensation + step.
     points, slopes : array, shape (s, m)
-        At the stages.
+        The polynomial and its slope at the stages.
     kronrod_samples : two arrays, shape (r, m), or None
         Points and slopes at the nodes of ``kronrod``.
     symmetries : array, shape (s, r, m), or None
-        Vectors at the stages that corrections are to be orthogonal to.
+        Vectors at the stages to which corrections must be orthogonal.
+    h, b
+        Step size and weights of the method.
+    kronrod : KronrodRule or None
     """
 
     start: jax.Array
@@ -54,7 +57,7 @@ class CollocationPath(NamedTuple):
     kronrod: KronrodRule | None
 
     def map_coordinates(self, coordinates: Callable) -> tuple[CollocationPath, Callable]:
-        """The path seen in coordinates at most quadratic in these, and what takes covectors at its stages back."""
+        """Return the path in coordinates at most quadratic in these, and the pullback of covectors at the stages."""
 
         def push_forward(x, d):
             return jax.jvp(coordinates, (x,), (d,))
@@ -66,12 +69,12 @@ class CollocationPath(NamedTuple):
             return jax.vmap(lambda x, g: jax.vjp(coordinates, x)[1](g)[0])(self.points, covectors)
 
         compensation = jnp.zeros_like(self.start) + self.compensation
-        (points, slopes), step = jax.vmap(push_forward)(self.points, self.slopes), self.step
+        (mapped_points, slopes), step = jax.vmap(push_forward)(self.points, self.slopes), self.step
         path = self._replace(
             start=coordinates(self.start),
             compensation=push_forward(self.start + 0.5 * compensation, compensation)[1],
             step=push_forward(self.start + (compensation + 0.5 * step), step)[1],
-            points=points,
+            points=mapped_points,
             slopes=slopes,
             kronrod_samples=None if self.kronrod_samples is None else jax.vmap(push_forward)(*self.kronrod_samples),
             symmetries=None if self.symmetries is None else jax.vmap(push_directions)(self.points, self.symmetries),
@@ -80,7 +83,7 @@ class CollocationPath(NamedTuple):
 
 
 class DiscreteGradientScheme(Protocol):
-    """What a term asks of a discrete gradient: see :class:`liethermo.functions.gradients.DiscreteGradient`."""
+    """The methods of :class:`liethermo.functions.gradients.DiscreteGradient` that a term calls."""
 
     def quadratic(self, term: Any, x, d, compensation) -> jax.Array: ...
     def general(self, term: Any, x, d, compensation) -> jax.Array: ...

@@ -1,6 +1,6 @@
-"""Functions of many spins, for states that have these component by component, ``(s_1x, s_2x, …, s_1y, …)``.
+"""Energies of many spins for states that store them component by component, ``(s_1x, s_2x, …, s_1y, …)``.
 
-What is computed of all components x then goes through the memory without gaps, as vector instructions want it.
+The components x of all spins are then contiguous in memory, so that they can be computed by vector instructions.
 """
 
 from __future__ import annotations
@@ -20,33 +20,33 @@ from .with_baths import BodyBathsEnergy
 
 
 def to_planes(x, count: int) -> jax.Array:
-    """States that begin with ``count`` spins site by site, shape (..., n), with these component by component."""
+    """Reorder states that begin with ``count`` spins site by site, shape (..., n), component by component."""
     return _transpose_spins(x, (count, 3))
 
 
 def to_sites(x, count: int) -> jax.Array:
-    """The inverse of :func:`to_planes`."""
+    """Reorder states that begin with ``count`` spins component by component, shape (..., n), site by site."""
     return _transpose_spins(x, (3, count))
 
 
 def _transpose_spins(x, shape: tuple[int, int]) -> jax.Array:
-    front, size = x.shape[:-1], shape[0] * shape[1]
-    spins = x if size == x.shape[-1] else x[..., :size]
-    spins = jnp.swapaxes(spins.reshape(*front, *shape), -1, -2).reshape(*front, size)
-    return spins if size == x.shape[-1] else jnp.concatenate([spins, x[..., size:]], axis=-1)
+    batch_shape, n_spin_components = x.shape[:-1], shape[0] * shape[1]
+    spins = x if n_spin_components == x.shape[-1] else x[..., :n_spin_components]
+    spins = jnp.swapaxes(spins.reshape(*batch_shape, *shape), -1, -2).reshape(*batch_shape, n_spin_components)
+    return spins if n_spin_components == x.shape[-1] else jnp.concatenate([spins, x[..., n_spin_components:]], axis=-1)
 
 
 def planar_energy(energy: Energy, count: int) -> Energy:
-    """A function of states that are site by site, as one of states that are component by component."""
+    """Return a function of states ordered site by site as a function of states ordered component by component."""
     terms: list[Energy] = []
-    lattice: list[SpinEnergy] = []
+    spin_energies: list[SpinEnergy] = []
     for term in energy.terms:
         if isinstance(term, SpinEnergy) and math.prod(term.sites) == count:
-            lattice.append(term)
+            spin_energies.append(term)
         else:
             terms.append(_planar_term(term, count))
-    if lattice:
-        terms.append(PlanarSpinEnergy(tuple(lattice)))
+    if spin_energies:
+        terms.append(PlanarSpinEnergy(tuple(spin_energies)))
     return Sum.of(terms)
 
 
@@ -59,7 +59,7 @@ def _planar_term(term: Energy, count: int) -> Energy:
 
 
 class PlanarSpinEnergy(Energy):
-    """Energies of all spins: their gradients are added by components, before these become a state's."""
+    """A sum of energies of all spins; their gradients are added on the lattice, then copied to the state once."""
 
     spin_energies: tuple[SpinEnergy, ...]
 
@@ -67,18 +67,18 @@ class PlanarSpinEnergy(Energy):
 
     def value(self, x) -> jax.Array:
         spins = self._padded_spins(x)
-        return sum((part.lattice_value(spins[part.sites]) for part in self.spin_energies), jnp.zeros(()))
+        return sum((energy.lattice_value(spins[energy.sites]) for energy in self.spin_energies), jnp.zeros(()))
 
     def gradient(self, x) -> jax.Array:
         spins = self._padded_spins(x)
-        found, *others = (part.lattice_gradients(spins[part.sites]) for part in self.spin_energies)
-        for other in others:
-            found = add_vectors(found, reshape_vectors(other, found[0].shape))
-        return flatten_covectors(found, x, planar=True)
+        total, *other_gradients = (energy.lattice_gradients(spins[energy.sites]) for energy in self.spin_energies)
+        for gradient in other_gradients:
+            total = add_vectors(total, reshape_vectors(gradient, total[0].shape))
+        return flatten_covectors(total, x, planar=True)
 
     def _padded_spins(self, x) -> dict[tuple[int, ...], PaddedLattice]:
-        """On the lattice of each part."""
-        sites = {part.sites for part in self.spin_energies}
+        """Return the spins on the lattice of each energy, by the shape of the lattice."""
+        sites = {energy.sites for energy in self.spin_energies}
         return {
             shape: PaddedLattice(
                 lattice_spins(x, shape, planar=True), interaction_range(Sum(self.spin_energies), shape)
@@ -87,26 +87,26 @@ class PlanarSpinEnergy(Energy):
         }
 
     def sensitivity(self, x) -> jax.Array:
-        spins, found = self._padded_spins(x), jnp.zeros(())
-        for part in self.spin_energies:
-            here, gradients = spins[part.sites].site_spins, part.lattice_gradients(spins[part.sites])
-            found = found + jnp.sqrt(sum_of_dots(gradients, gradients) * sum_of_dots(here, here))
-        return jax.lax.stop_gradient(found)
+        spins, total = self._padded_spins(x), jnp.zeros(())
+        for energy in self.spin_energies:
+            site_spins, gradients = spins[energy.sites].site_spins, energy.lattice_gradients(spins[energy.sites])
+            total = total + jnp.sqrt(sum_of_dots(gradients, gradients) * sum_of_dots(site_spins, site_spins))
+        return jax.lax.stop_gradient(total)
 
 
 def interaction_range(energy: Energy, sites: tuple[int, ...]) -> tuple[int, ...]:
-    """How far the spins are, along each axis of a lattice, that act on one by its energies."""
-    found = [(0,) * len(sites)]
+    """Return the largest distance, along each axis of a lattice, of two spins that interact through an energy."""
+    ranges = [(0,) * len(sites)]
     for term in energy.terms:
         if isinstance(term, BodyBathsEnergy):
-            found.append(interaction_range(term.body, sites))
+            ranges.append(interaction_range(term.body, sites))
         elif isinstance(term, SpinEnergy) and term.sites == sites:
-            found.append(term.interaction_range)
-    return tuple(max(along) for along in zip(*found, strict=True))
+            ranges.append(term.interaction_range)
+    return tuple(max(axis_ranges) for axis_ranges in zip(*ranges, strict=True))
 
 
 class SiteOrder(ComponentMap):
-    """A state that is component by component, site by site."""
+    """A map from states ordered component by component to states ordered site by site."""
 
     count: int = eqx.field(static=True)
 

@@ -1,9 +1,9 @@
-"""What rounding does to a function, found where it arises.
+"""Rounding errors of a function, estimated where they arise.
 
-A bound relative to the result, or to the state, is wrong where large terms cancel: the heat between two bodies of
-temperature 1 is rounded like 1 however little it is, and their entropies, the logarithms of 1, vanish. Here each result
-of the arithmetic inside the function is given an error of its own, and what they come to is seen in the result
-[stochastic arithmetic: Vignes 1993].
+A bound relative to the result, or to the state, is wrong if large terms cancel: the heat between two bodies of
+temperature 1 is rounded like 1 however small it is, and their entropies, the logarithms of 1, vanish. Here each result
+of the arithmetic inside the function is perturbed, and the perturbation of the final result is measured [stochastic
+arithmetic: Vignes 1993].
 """
 
 from __future__ import annotations
@@ -25,27 +25,28 @@ EXACT_PRIMITIVES = frozenset(
     dynamic_update_slice expand_dims floor gather imag iota max min neg pad real reduce_max reduce_min reshape rev round
     select_n sign slice sort split squeeze stop_gradient transpose""".split()
 )
-"""Primitives that round nothing."""
+"""Primitives without rounding error."""
 
 JAXPR_PARAMETERS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
+"""Parameters of equations that hold a jaxpr."""
 CONTROL_PRIMITIVES = frozenset({"cond", "scan", "while"})
-"""Primitives with programs inside that are left as they are: their results alone are given errors."""
+"""Primitives whose inner programs are not perturbed; only their results are."""
 
 MAX_RELATIVE_PERTURBATION = 2.0**-36
-"""Largest error, relative to what a result is: far above rounding, and small enough for errors to add."""
+"""Largest perturbation relative to a result: far above rounding, and small enough for perturbations to add up."""
 
 PERTURBATION_SAMPLES = 3
-"""Times that errors are drawn: those of two instructions may cancel in one."""
+"""Number of perturbed evaluations; in one of them, the errors of two instructions may cancel."""
 
 PATTERNS_PER_SHAPE = 8
-"""Arrays of errors for each size: few, since a program holds them."""
+"""Number of perturbation patterns for each shape; a program stores them, so they are few."""
 
 MAX_STORED_PATTERN_LENGTH = 10_000
-"""Numbers in an array up to which it does; longer ones it makes."""
+"""Largest length of a pattern that is stored as a constant; longer ones are generated at run time."""
 
 
 def value_and_rounding_scale(function: Callable, x) -> tuple[jax.Array, jax.Array]:
-    """``function(x)`` and the size at which it is rounded: its error is about eps times that, entry by entry.
+    """Return ``function(x)`` and its rounding scale: the error of each entry is about eps times its scale.
 
     Parameters
     ----------
@@ -54,98 +55,104 @@ def value_and_rounding_scale(function: Callable, x) -> tuple[jax.Array, jax.Arra
     Returns
     -------
     two arrays, shape (...)
-        The size is zero where the function is not finite with errors.
+        The scale is zero if a perturbed result is not finite.
     """
-    closed = jax.make_jaxpr(function)(x)
+    closed_jaxpr = jax.make_jaxpr(function)(x)
 
-    def evaluate_perturbed(shares):
-        return _evaluate_perturbed(closed.jaxpr, closed.consts, [x], itertools.count(), shares)[0]
+    def evaluate_perturbed(amplitudes):
+        return _evaluate_perturbed(closed_jaxpr.jaxpr, closed_jaxpr.consts, [x], itertools.count(), amplitudes)[0]
 
-    # one program, as one is quicker to compile; of large arrays one sample after another, for they need memory, and of
-    # functions within that are called by several samples, such as networks
-    together = np.size(x) <= MAX_STORED_PATTERN_LENGTH and not any(map(_is_routine_call, closed.jaxpr.eqns))
-    each = jax.vmap(evaluate_perturbed) if together else functools.partial(jax.lax.map, evaluate_perturbed)
-    found = each(np.eye(PERTURBATION_SAMPLES + 1, PERTURBATION_SAMPLES, -1) * MAX_RELATIVE_PERTURBATION)
-    right, wrong = found[0], found[1:]
-    size = jnp.max(jnp.abs(wrong - right), axis=0) / MAX_RELATIVE_PERTURBATION
-    return right, jnp.where(jnp.isfinite(size), size, 0.0)
+    # vectorised samples compile faster; large arrays are mapped one by one to save memory, and so are functions that
+    # contain routines, such as networks, which all samples then share
+    can_vectorise = np.size(x) <= MAX_STORED_PATTERN_LENGTH and not any(map(_is_routine_call, closed_jaxpr.jaxpr.eqns))
+    map_samples = jax.vmap(evaluate_perturbed) if can_vectorise else functools.partial(jax.lax.map, evaluate_perturbed)
+    results = map_samples(np.eye(PERTURBATION_SAMPLES + 1, PERTURBATION_SAMPLES, -1) * MAX_RELATIVE_PERTURBATION)
+    exact_result, perturbed_results = results[0], results[1:]
+    rounding_scale = jnp.max(jnp.abs(perturbed_results - exact_result), axis=0) / MAX_RELATIVE_PERTURBATION
+    return exact_result, jnp.where(jnp.isfinite(rounding_scale), rounding_scale, 0.0)
 
 
-def propagated_rounding_scale(function: Callable, x, sizes) -> jax.Array:
-    """The size at which ``function(x)`` is rounded, to first order, where x itself is.
+def propagated_rounding_scale(function: Callable, x, scales) -> jax.Array:
+    """Return the scale at which ``function(x)`` is rounded, to first order, if x is rounded too.
 
-    Errors so small change nothing that the function decides: one that jumps is not rounded by the size of its jump.
+    Infinitesimal perturbations do not change any decision of the function: a jump does not count as rounding.
 
     Parameters
     ----------
     function : function from an array, shape (n,), to a number
-    sizes : array, shape (n,)
-        The components of x are known to about eps times these.
+    scales : array, shape (n,)
+        The components of x are known to about eps times these scales.
     """
-    closed = jax.make_jaxpr(function)(x)
+    closed_jaxpr = jax.make_jaxpr(function)(x)
 
-    def evaluate_perturbed(shares):
+    def evaluate_perturbed(amplitudes):
         numbers = itertools.count()
-        given = x + (_perturb(sizes, next(numbers), shares) - sizes)
-        return _evaluate_perturbed(closed.jaxpr, closed.consts, [given], numbers, shares)[0]
+        perturbed_x = x + (_perturb(scales, next(numbers), amplitudes) - scales)
+        return _evaluate_perturbed(closed_jaxpr.jaxpr, closed_jaxpr.consts, [perturbed_x], numbers, amplitudes)[0]
 
-    none = jnp.zeros(PERTURBATION_SAMPLES)
-    found = [jax.jvp(evaluate_perturbed, (none,), (direction,))[1] for direction in jnp.eye(PERTURBATION_SAMPLES)]
-    return jnp.max(jnp.abs(jnp.stack(found)))
+    zero_amplitudes = jnp.zeros(PERTURBATION_SAMPLES)
+    derivatives = [
+        jax.jvp(evaluate_perturbed, (zero_amplitudes,), (direction,))[1] for direction in jnp.eye(PERTURBATION_SAMPLES)
+    ]
+    return jnp.max(jnp.abs(jnp.stack(derivatives)))
 
 
-def _evaluate_perturbed(jaxpr: Jaxpr, constants, arguments, numbers: Iterator[int], shares) -> list:
-    """The results of a program each of whose instructions errs, by shares of what it gives."""
+def _evaluate_perturbed(jaxpr: Jaxpr, constants, arguments, numbers: Iterator[int], amplitudes) -> list:
+    """Evaluate a jaxpr with the result of each equation perturbed, by the given relative amplitudes."""
     values = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *arguments], strict=True))
     for equation in jaxpr.eqns:
-        given = [v.val if isinstance(v, Literal) else values[v] for v in equation.invars]
+        inputs = [v.val if isinstance(v, Literal) else values[v] for v in equation.invars]
         name, parameters = equation.primitive.name, equation.params
         inner = next((parameters[key] for key in JAXPR_PARAMETERS if key in parameters), None)
         if inner is not None and name not in CONTROL_PRIMITIVES and isinstance(inner, ClosedJaxpr):
             if _is_routine_call(equation):
-                whole = jax.jit(
-                    lambda given, shares, i=inner: _evaluate_perturbed(i.jaxpr, i.consts, given, numbers, shares)
+                routine = jax.jit(
+                    lambda inputs, amplitudes, i=inner: _evaluate_perturbed(
+                        i.jaxpr, i.consts, inputs, numbers, amplitudes
+                    )
                 )
-                found = whole(given, shares)
+                results = routine(inputs, amplitudes)
             else:
-                found = _evaluate_perturbed(inner.jaxpr, inner.consts, given, numbers, shares)
+                results = _evaluate_perturbed(inner.jaxpr, inner.consts, inputs, numbers, amplitudes)
         else:
-            bound = equation.primitive.get_bind_params(parameters)
-            functions, parameters = bound if isinstance(bound, tuple) else ((), bound)  # as older versions of JAX have
-            found = equation.primitive.bind(*functions, *given, **parameters)
-            found = found if equation.primitive.multiple_results else [found]
+            bind_params = equation.primitive.get_bind_params(parameters)
+            # older versions of JAX return (functions, parameters)
+            functions, parameters = bind_params if isinstance(bind_params, tuple) else ((), bind_params)
+            results = equation.primitive.bind(*functions, *inputs, **parameters)
+            results = results if equation.primitive.multiple_results else [results]
             if name not in EXACT_PRIMITIVES:
-                found = [_perturb(value, next(numbers), shares) for value in found]
-        values.update(zip(equation.outvars, found, strict=True))
+                results = [_perturb(value, next(numbers), amplitudes) for value in results]
+        values.update(zip(equation.outvars, results, strict=True))
     return [v.val if isinstance(v, Literal) else values[v] for v in jaxpr.outvars]
 
 
 def _is_routine_call(equation) -> bool:
-    """Whether it calls a function with products of matrices: in machine code that is a routine, written once."""
+    """Return whether an equation calls a function with products of matrices, which is a routine in machine code."""
     return equation.primitive.name in ("jit", "pjit") and has_matrix_products(equation.params["jaxpr"].jaxpr)
 
 
-def _perturb(value, number: int, shares):
+def _perturb(value, number: int, amplitudes):
+    """Return a value with pattern ``number`` of each amplitude added to it, relative to its entries."""
     if not jnp.issubdtype(jnp.result_type(value), jnp.inexact):
         return value
     shape = np.shape(value)[-1:]
     pattern = _stored_pattern if math.prod(shape) <= MAX_STORED_PATTERN_LENGTH else _generated_pattern
     errors = [
-        share * pattern(shape, (number + PERTURBATION_SAMPLES * i) % PATTERNS_PER_SHAPE)
-        for i, share in enumerate(shares)
+        amplitude * pattern(shape, (number + PERTURBATION_SAMPLES * i) % PATTERNS_PER_SHAPE)
+        for i, amplitude in enumerate(amplitudes)
     ]
-    return value + (value * sum(errors[1:], errors[0])).astype(jnp.result_type(value))  # single precision stays so
+    return value + (value * sum(errors[1:], errors[0])).astype(jnp.result_type(value))  # single precision is preserved
 
 
 @functools.cache
 def _stored_pattern(shape: tuple[int, ...], number: int) -> np.ndarray:
-    """Numbers of size one half to one and either sign."""
-    random = np.random.default_rng(number)
-    return random.uniform(0.5, 1.0, shape) * random.choice([-1.0, 1.0], shape)
+    """Return random numbers of modulus 0.5 to 1 and random sign."""
+    rng = np.random.default_rng(number)
+    return rng.uniform(0.5, 1.0, shape) * rng.choice([-1.0, 1.0], shape)
 
 
 def _generated_pattern(shape: tuple[int, ...], number: int) -> jax.Array:
-    """The like from a product that overflows the digits of a sine, entry by entry."""
+    """Return pseudorandom numbers of modulus 0.5 to 1, from the fractional part of a large multiple of a sine."""
     v = 43758.5453 * jnp.sin(12.9898 * jnp.arange(1.0, shape[0] + 1.0) + 78.233 * number)
     v = 2.0 * (v - jnp.floor(v)) - 1.0
     return jnp.where(v < 0.0, -0.5, 0.5) + 0.5 * v

@@ -1,8 +1,8 @@
-"""Vectors of constant length in a large state: as many first integrals, each of few components, held one by one.
+"""Vectors of constant length in a large state: many first integrals of a few components, conserved one by one.
 
-Held with the others by a system of equations they would need a matrix with a row for each. But the gradient of
-``|s_i|^2`` at s_i is s_i, and those of different sites have no component in common: each sphere is returned to along
-its own radius, and what else a correction does is done along the spheres.
+Conserving them together with other first integrals would need a matrix with a row for each. But the gradient of
+``|s_i|^2`` by s_i is along s_i, and the gradients of different sites share no component. Each vector is therefore
+rescaled by itself, and other corrections are made tangent to the spheres.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from .energy import Energy
 
 @dataclass(frozen=True)
 class Spheres:
-    """A :class:`.surface.Surface`: the first ``count`` vectors of three components of a state have constant lengths.
+    """A :class:`.surface.Surface` of states whose first ``count`` vectors of three components have constant lengths.
 
     Attributes
     ----------
     count : int
     name : str
-        Of the first integral that is the sum of their squares.
+        Name of the first integral that is the sum of their squares.
     planar : bool
-        Whether the state has them component by component, and not one after another.
+        Whether the state stores the vectors component by component, and not one after another.
     """
 
     count: int
@@ -44,25 +44,25 @@ class Spheres:
     is_kept_by_collocation = True
 
     def project_direction(self, x, v) -> jax.Array:
-        """v, shape (n,), less its radial components at x."""
-        s, part = self._vectors(x), self._vectors(v)
+        """Return v, shape (n,), without its radial components at x."""
+        s, vectors = self._vectors(x), self._vectors(v)
         return self._replace_vectors(
-            v, add_vectors(part, scale_vectors(-_safe_quotient(dot_vectors(s, part), dot_vectors(s, s)), s))
+            v, add_vectors(vectors, scale_vectors(-_safe_quotient(dot_vectors(s, vectors), dot_vectors(s, s)), s))
         )
 
     def project_displacement(self, x, compensation, d) -> tuple[jax.Array, jax.Array]:
-        """The displacement that ends where d does, but at the lengths of the start; nothing is missed.
+        """Return the displacement rescaled so that its end has the lengths of the start, and an error of zero.
 
-        From what the squares change by, not from their values: so it is as exact as d is small.
+        The correction is computed from the changes of the squares, not from their values, so its error shrinks with d.
         """
         start, step = self._vectors(x + compensation), self._vectors(d)
         end = add_vectors(start, step)
-        share = _safe_quotient(dot_vectors(step, add_vectors(start, end)), dot_vectors(end, end))
-        root = jnp.sqrt(jnp.maximum(1.0 - share, 0.0))
-        return self._replace_vectors(d, add_vectors(step, scale_vectors(-share / (1.0 + root), end))), jnp.zeros(())
+        shrinkage = _safe_quotient(dot_vectors(step, add_vectors(start, end)), dot_vectors(end, end))
+        root = jnp.sqrt(jnp.maximum(1.0 - shrinkage, 0.0))
+        return self._replace_vectors(d, add_vectors(step, scale_vectors(-shrinkage / (1.0 + root), end))), jnp.zeros(())
 
     def correct_rounding(self, x, compensation) -> tuple[jax.Array, jax.Array]:
-        """The state as it is: the sum of the squares is steered with the other first integrals."""
+        """Return the state unchanged: the sum of the squares is corrected with the other first integrals."""
         return x, compensation
 
     def _vectors(self, v) -> VectorComponents:
@@ -77,7 +77,7 @@ def _safe_quotient(numerator, square) -> jax.Array:
 
 
 class HalfSumOfSquares(Energy):
-    """``sum |s_i|^2 / 2`` over the sites: the Casimir that is followed along a run."""
+    """The Casimir ``sum |s_i|^2 / 2`` over the sites, which is recorded along a run."""
 
     count: int = eqx.field(static=True)
 

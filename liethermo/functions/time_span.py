@@ -1,4 +1,4 @@
-"""The span of time of a run: functions of time are evaluated at times in it, and at no others."""
+"""The time span of a run: functions of time are evaluated only at times within it."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from manifolds._pytree_module import Module
 
 
 class TimeSpan(Module):
-    """From when to when a run lasts; without bounds until a run gives them: see :func:`limit_times`.
+    """The start and end time of a run, infinite until a run sets them: see :func:`limit_times`.
 
-    A run adds up its steps, whose sum may end a rounding beyond the end of the span: 0.1 + 0.1 + 0.1 > 0.3. A table or
-    a root that ends with the span is not defined there.
+    The sum of the steps of a run may exceed the end of the span by a rounding: 0.1 + 0.1 + 0.1 > 0.3. A table or a root
+    that ends with the span is not defined there.
 
     Attributes
     ----------
@@ -28,7 +28,7 @@ class TimeSpan(Module):
         self.start, self.end = _time_scalar(start), _time_scalar(end)
 
     def clip(self, t) -> jax.Array:
-        """Return the times t, shape (...), those outside replaced by the nearest bound."""
+        """Return the times t, shape (...), clipped to the span."""
         return _clip(t, self.start, self.end)
 
 
@@ -46,7 +46,7 @@ def _clip(t, start, end) -> jax.Array:
 
 @_clip.defjvp
 def _derivative_of_clip(primals, tangents):
-    """The derivative by t is 1 beyond the bounds too: what lies there is there by rounding."""
+    """Return the clipped time and its tangent: the derivative by t is 1 outside too, where t lies by rounding."""
     return _clip(*primals), tangents[0]
 
 
@@ -54,7 +54,7 @@ def limit_times(tree, start: float, end: float):
     """Return a pytree, such as a system, whose functions of time are evaluated within a span only."""
     span = TimeSpan(start, end)
 
-    def limit(part):
-        return span if isinstance(part, TimeSpan) else part
+    def limit(node):
+        return span if isinstance(node, TimeSpan) else node
 
-    return jax.tree_util.tree_map(limit, tree, is_leaf=lambda part: isinstance(part, TimeSpan))
+    return jax.tree_util.tree_map(limit, tree, is_leaf=lambda node: isinstance(node, TimeSpan))

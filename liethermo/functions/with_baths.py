@@ -1,4 +1,4 @@
-"""The energy of a body and of the baths that it heats, as one function: its gradient is made in one piece."""
+"""The energy of a body and of the baths that it heats, as one function with one gradient."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from .path import CollocationPath
 
 
 class BodyBathsEnergy(Energy):
-    """``H(x) + U(y)`` of a state (x, y): two functions of components that they do not share.
+    """The energy ``H(x) + U(y)`` of a state (x, y): two functions that share no component.
 
-    As a sum of two functions of the whole state each would make a vector as long as that, mostly zeros.
+    In a sum of two functions of the whole state, each gradient would be a vector of full length, mostly zeros.
 
     Attributes
     ----------
     body : Energy
-        Of the first ``body_dim`` components. It may depend on the time.
+        Energy of the first ``body_dim`` components. It may depend on time.
     baths : Energy
-        Of the components behind.
+        Energy of the other components.
     body_dim, dim : int
-        The number of components of the body, and of all.
+        Number of components of the body, and of the state.
     """
 
     body: Energy
@@ -41,8 +41,8 @@ class BodyBathsEnergy(Energy):
     def terms(self) -> tuple[Energy, ...]:
         if not self.depends_on_time:
             return (self,)
-        of_body = self.body.on(range(self.body_dim)).terms
-        return (*of_body, *self.baths.on(range(self.body_dim, self.dim)).terms)
+        body_terms = self.body.on(range(self.body_dim)).terms
+        return (*body_terms, *self.baths.on(range(self.body_dim, self.dim)).terms)
 
     @property
     def is_quadratic(self) -> bool:
@@ -58,40 +58,42 @@ class BodyBathsEnergy(Energy):
         return (self.body, Components(range(self.body_dim))), (self.baths, Components(range(self.body_dim, self.dim)))
 
     def value(self, x) -> jax.Array:
-        return sum_terms(energy.value(of(x)) for energy, of in self._energies_and_components)
+        return sum_terms(energy.value(components(x)) for energy, components in self._energies_and_components)
 
     def gradient(self, x) -> jax.Array:
-        return jnp.concatenate([energy.gradient(of(x)) for energy, of in self._energies_and_components])
+        return jnp.concatenate([energy.gradient(components(x)) for energy, components in self._energies_and_components])
 
     def sensitivity(self, x) -> jax.Array:
-        return sum_terms(energy.sensitivity(of(x)) for energy, of in self._energies_and_components)
+        return sum_terms(energy.sensitivity(components(x)) for energy, components in self._energies_and_components)
 
     def rounding_scale(self, x) -> jax.Array:
-        return sum_terms(energy.rounding_scale(of(x)) for energy, of in self._energies_and_components)
+        return sum_terms(energy.rounding_scale(components(x)) for energy, components in self._energies_and_components)
 
     def difference_rounding_scale(self, x) -> jax.Array:
         return sum_terms(
-            term.difference_rounding_scale(of(x))
-            for energy, of in self._energies_and_components
+            term.difference_rounding_scale(components(x))
+            for energy, components in self._energies_and_components
             for term in energy.terms
         )
 
     def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
-        ends = x, d, jnp.zeros_like(x) + compensation
+        arrays = x, d, jnp.zeros_like(x) + compensation
 
-        def component_gradient(energy: Energy, of: Components) -> jax.Array:
-            if energy is self.body and energy.is_quadratic:  # at points of whole states, which others look at too
-                return of(scheme.quadratic(Pullback(energy, of), *ends))
-            return sum_terms(term.discrete_gradient(scheme, *map(of, ends)) for term in energy.terms)
+        def component_gradient(energy: Energy, components: Components) -> jax.Array:
+            if (
+                energy is self.body and energy.is_quadratic
+            ):  # at the midpoint of the whole state, which other terms use too
+                return components(scheme.quadratic(Pullback(energy, components), *arrays))
+            return sum_terms(term.discrete_gradient(scheme, *map(components, arrays)) for term in energy.terms)
 
-        return jnp.concatenate([component_gradient(*one) for one in self._energies_and_components])
+        return jnp.concatenate([component_gradient(*pair) for pair in self._energies_and_components])
 
     def stage_gradients(self, scheme, path: CollocationPath) -> jax.Array:
-        def component_gradients(energy: Energy, of: Components) -> jax.Array:
-            seen, _ = path.map_coordinates(of)
-            return sum_terms(term.stage_gradients(scheme, seen) for term in energy.terms)
+        def component_gradients(energy: Energy, components: Components) -> jax.Array:
+            component_path, _ = path.map_coordinates(components)
+            return sum_terms(term.stage_gradients(scheme, component_path) for term in energy.terms)
 
-        return jnp.concatenate([component_gradients(*one) for one in self._energies_and_components], axis=1)
+        return jnp.concatenate([component_gradients(*pair) for pair in self._energies_and_components], axis=1)
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
         body, baths = self.body.couplings(self.body_dim), self.baths.couplings(dim - self.body_dim)
@@ -100,22 +102,22 @@ class BodyBathsEnergy(Energy):
         return pattern_of_matrix(scipy.sparse.block_diag([body, baths]))
 
     def check_components(self, dim: int, role: str) -> None:
-        for energy, size in ((self.body, self.body_dim), (self.baths, dim - self.body_dim)):
+        for energy, dim_of_energy in ((self.body, self.body_dim), (self.baths, dim - self.body_dim)):
             for term in energy.terms:
-                term.check_components(size, role)
+                term.check_components(dim_of_energy, role)
 
     def __neg__(self) -> Energy:
         return BodyBathsEnergy(-self.body, -self.baths, self.body_dim, self.dim)
 
 
-def temperature_slopes(energy: Energy, x, size: int) -> jax.Array | None:
-    """The derivative of each bath's temperature by its own entropy, shape (m,); None where temperatures are constant.
+def temperature_slopes(energy: Energy, x, body_dim: int) -> jax.Array | None:
+    """Return the derivative of each bath's temperature by its entropy, shape (m,); None for constant temperatures.
 
-    The baths are the components behind the first ``size``.
+    The first ``body_dim`` components belong to the body, the others to the baths.
     """
     if not isinstance(energy, BodyBathsEnergy):
-        return jax.jvp(energy.gradient, (x,), (jnp.zeros_like(x).at[size:].set(1.0),))[1][size:]
+        return jax.jvp(energy.gradient, (x,), (jnp.zeros_like(x).at[body_dim:].set(1.0),))[1][body_dim:]
     if isinstance(energy.baths, ReservoirEnergy):
         return None
-    y = x[size:]
+    y = x[body_dim:]
     return jax.jvp(energy.baths.gradient, (y,), (jnp.ones_like(y),))[1]

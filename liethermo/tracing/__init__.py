@@ -1,4 +1,4 @@
-"""JAX functions as programs: traced by content, made scalar instructions, loops and calls, interpreted at a few points.
+"""Trace JAX functions by content, unroll them into scalar programs, and interpret these programs at a few points.
 
-Knows nothing of dynamics.
+This package knows nothing of dynamics.
 """

@@ -1,7 +1,7 @@
 """Scalar arithmetic that simplifies itself.
 
-A scalar is a Python number, known at compile time, or a ``str``, the name of a variable. An array is a NumPy array of
-such objects, so NumPy itself moves data: reshaping, slicing or transposing costs the program nothing.
+A scalar is a Python number, which is known at compile time, or a ``str``, the name of a variable. An array is a NumPy
+array of such objects. NumPy moves the data, so reshaping, slicing or transposing adds no instruction.
 """
 
 from __future__ import annotations
@@ -19,22 +19,24 @@ Scalar = str | float | int | bool
 
 
 class Block:
-    """An operation with several results, which ``item`` picks out: a loop, or a call. Those that do the same are equal.
+    """An operation with several results, such as a loop or a call; equal blocks do the same work.
+
+    The instruction of a block has one target, from which ``item`` instructions pick the results.
 
     Attributes
     ----------
     name : str
     kinds : tuple of str
-        Of its results: ``"f"`` for a number, ``"i"`` for an integer, ``"b"`` for a truth value.
+        Kinds of the results: ``"f"`` for a real number, ``"i"`` for an integer, ``"b"`` for a truth value.
     """
 
     name: str
     kinds: tuple[str, ...]
     inner_programs: tuple = ()
-    """The programs that it runs again and again."""
+    """Programs that the block runs repeatedly."""
 
     def __call__(self, *args) -> list:
-        """Its results, for numbers or for NumPy arrays of them."""
+        """Evaluate the block for numbers, or for NumPy arrays of them; return its results."""
         raise NotImplementedError
 
     @functools.cached_property
@@ -52,7 +54,10 @@ class Block:
 
 
 class Instruction(NamedTuple):
-    """``target = op(*args)``, op a key of :data:`SYMPY_OPERATIONS` or a block, whose target stands for all its results."""
+    """One operation, ``target = op(*args)``.
+
+    ``op`` is a key of :data:`OPERATIONS` or a block. The target of a block stands for all its results.
+    """
 
     target: str
     op: str | Block
@@ -60,32 +65,32 @@ class Instruction(NamedTuple):
 
 
 def _truncate_to_int64(a) -> np.ndarray:
-    """As XLA converts to integers: NaN to 0, and what is too large to the nearest one."""
+    """Convert numbers to integers as XLA does: NaN becomes 0, and a number out of range the nearest integer."""
     a = np.asarray(a, dtype=np.float64)
-    inside = np.abs(a) < 2.0**63
-    outside = np.where(a != a, 0, np.where(a < 0.0, -(2**63), 2**63 - 1))
-    return np.where(inside, np.where(inside, a, 0.0).astype(np.int64), outside)
+    is_in_range = np.abs(a) < 2.0**63
+    limit = np.where(a != a, 0, np.where(a < 0.0, -(2**63), 2**63 - 1))
+    return np.where(is_in_range, np.where(is_in_range, a, 0.0).astype(np.int64), limit)
 
 
 def _integer_quotient(a, n):
-    """The quotient of integers, towards zero; by zero it is -1, as XLA has it."""
+    """Return the quotient of integers, rounded towards zero; division by zero gives -1, as in XLA."""
     a, n = np.asarray(a, dtype=np.int64), np.asarray(n, dtype=np.int64)
-    safe = np.where(n == 0, 1, n)
-    below = a // safe
-    towards_zero = below + ((below * safe != a) & ((a < 0) != (safe < 0)))
-    return np.where(n == 0, -1, towards_zero)[()]
+    divisor = np.where(n == 0, 1, n)
+    floor_quotient = a // divisor
+    quotient = floor_quotient + ((floor_quotient * divisor != a) & ((a < 0) != (divisor < 0)))
+    return np.where(n == 0, -1, quotient)[()]
 
 
-def _wrap_integer(a, bits: int, signed: bool):
-    """An integer as so many bits hold it."""
-    low = np.asarray(a, dtype=np.int64) & ((1 << bits) - 1)
-    return np.where(signed & (low >> (bits - 1) == 1), low - (1 << bits), low)[()]
+def _wrap_integer(a, bits: int, is_signed: bool):
+    """Return an integer modulo ``2**bits``, in the range of a signed or unsigned type."""
+    low_bits = np.asarray(a, dtype=np.int64) & ((1 << bits) - 1)
+    return np.where(is_signed & (low_bits >> (bits - 1) == 1), low_bits - (1 << bits), low_bits)[()]
 
 
-def _take_clipped(place, *entries):
-    """The entry at a place from zero; the first, or the last, where it lies outside."""
-    place, *found = np.broadcast_arrays(np.clip(np.asarray(place, dtype=np.int64), 0, len(entries) - 1), *entries)
-    return np.take_along_axis(np.stack(found), place[None], 0)[0][()]
+def _take_clipped(index, *entries):
+    """Return the entry at an index, which counts from zero; an index out of range is clipped."""
+    index, *values = np.broadcast_arrays(np.clip(np.asarray(index, dtype=np.int64), 0, len(entries) - 1), *entries)
+    return np.take_along_axis(np.stack(values), index[None], 0)[0][()]
 
 
 SPECIAL_FUNCTIONS: dict[str, Callable[..., Any]] = {
@@ -98,7 +103,7 @@ SPECIAL_FUNCTIONS: dict[str, Callable[..., Any]] = {
     "igammac": lambda a, x: scipy.special.gammaincc(a, x),
     "regularized_incomplete_beta": lambda a, b, x: scipy.special.betainc(a, b, x),
 }
-"""Special functions, SciPy's. It is imported where one is needed."""
+"""SciPy's special functions. The lambdas delay the import of SciPy until one of them is called."""
 
 ELEMENTARY_OPERATIONS: dict[str, Callable[..., Any]] = {
     **{name: getattr(np, name) for name in "abs sign sqrt cbrt exp exp2 expm1 log log1p sin cos tan".split()},
@@ -112,7 +117,7 @@ ELEMENTARY_OPERATIONS: dict[str, Callable[..., Any]] = {
     "or": operator.or_,
     **SPECIAL_FUNCTIONS,
 }
-"""Operations that are primitives of the same name, with nothing to simplify."""
+"""Operations that are named like their JAX primitive and that the builder does not simplify."""
 
 OPERATIONS: dict[str, Callable[..., Any]] = (
     ELEMENTARY_OPERATIONS
@@ -137,47 +142,48 @@ OPERATIONS: dict[str, Callable[..., Any]] = (
             np.float64(np.float32(a)) if np.ndim(a) == 0 else np.asarray(a, np.float32).astype(np.float64)
         ),
         "pick": _take_clipped,
-        "lookup": lambda place, table: _take_clipped(place, *table),
+        "lookup": lambda index, table: _take_clipped(index, *table),
         "item": lambda results, i: results[i],
         "column": lambda results, start, length: results[start : start + length],
         "table": lambda *entries: list(entries),
     }
 )
-"""What each operation means, on numbers and on NumPy arrays of them."""
+"""Meaning of each operation, on numbers and on NumPy arrays of them."""
 
 
 def implementation(op: str | Block) -> Callable[..., Any]:
-    """What an operation or a block means."""
+    """Return the function that evaluates an operation or a block."""
     return op if isinstance(op, Block) else OPERATIONS[op]
 
 
 COMPARISONS = {"eq", "ne", "lt", "le", "gt", "ge", "is_finite"}
-"""Operations on numbers that give a truth value."""
+"""Operations on numbers that return a truth value."""
 
 BOOLEAN_OPERATIONS = {"and", "or", "xor", "not", "branch"}
-"""Those on truth values."""
+"""Operations on truth values."""
 
 MAX_SELECT_ENTRIES = 16
-"""Entries among which one is picked by choices; more are a table."""
+"""Largest number of entries among which ``pick`` selects directly; more entries become a table."""
 
 COMMUTATIVE = {"add", "mul", "and", "or", "xor", "eq", "ne"}
+"""Operations whose arguments are sorted, so that equal expressions merge."""
 
 
 class LimitExceededError(Exception):
-    """More instructions than allowed."""
+    """A program has more instructions than its builder allows."""
 
 
 class EnclosingScope:
-    """What is around a program that is one of its instructions.
+    """The builder around an inner program, such as a loop body, and the scalars that the inner program reads.
 
     Attributes
     ----------
     builder : Builder
-        Of that.
+        The builder of the outer program.
     inner_names, outer_scalars : dict
-        The names that its variables have inside, and the inverse of that.
+        The name that each outer scalar has inside, and the inverse of this map.
     tables : dict
-        What is in its tables, by their names inside.
+        The entries of each outer table, by its name inside.
     """
 
     def __init__(self, builder: Builder):
@@ -187,14 +193,14 @@ class EnclosingScope:
         self.tables: dict[str, tuple[Scalar, ...]] = {}
 
     def import_scalar(self, a: Scalar) -> str:
-        """The name of a variable inside."""
+        """Return the name that an outer scalar has inside."""
         if a not in self.inner_names:
             self.inner_names[a] = name = f"x0_{len(self.inner_names)}"
             self.outer_scalars[name] = a
         return self.inner_names[a]
 
     def table(self, entries: Sequence[Scalar]) -> str:
-        """The name inside of a table around, of what these are there."""
+        """Make a table of these entries in the outer program; return its name inside."""
         name = self.import_scalar(self.builder.table([self.outer_scalars[a] if type(a) is str else a for a in entries]))
         self.tables[name] = tuple(entries)
         return name
@@ -203,33 +209,33 @@ class EnclosingScope:
 class Builder:
     """Collects instructions; each method returns the scalar that holds its result.
 
-    Nothing is emitted for a result that is known, equals an earlier one, or is one but for a sign that can be moved on.
-    All this is exact, save for the sign of a zero and one licence: a structural zero times anything, or divided by
-    anything, is zero. Sums are never reassociated.
+    No instruction is emitted for a result that is known at compile time, that equals an earlier one, or that differs
+    from one by a sign which a later instruction can absorb. These simplifications are exact, except for the sign of a
+    zero and one rule: a structural zero times anything, or divided by anything, is zero. Sums are never reassociated.
 
     Parameters
     ----------
     max_instructions : int
-        Instructions that it may collect.
-    enclosing : Around, optional
-        What is around a program inside a loop, or in a routine.
+        Largest number of instructions that the builder may collect.
+    enclosing : EnclosingScope, optional
+        Scope around a program inside a loop or a routine.
     """
 
     def __init__(self, max_instructions: int, enclosing: EnclosingScope | None = None):
         self.max_instructions, self.enclosing = max_instructions, enclosing
         self.instructions: list[Instruction] = []
         self._emitted: dict[tuple[str | Block, ...], str] = {}
-        self._negated_operand: dict[Scalar, str] = {}  # the b of each a = -b
+        self._negated_operand: dict[Scalar, str] = {}  # b, by the name of a = -b
         self._branches: dict[tuple[str, ...], int] = {}
         self.call_results: dict[tuple, tuple] = {}
 
     @property
     def real(self) -> Builder:
-        """The builder of real scalars: itself."""
+        """The builder of real scalars, which is this object."""
         return self
 
     def op(self, op: str | Block, *args: Scalar) -> Any:
-        """The result of an operation, with no simplification but constants folded and equal expressions merged."""
+        """Return the result of an operation; only fold constants and merge equal expressions."""
         if not any(type(a) is str for a in args):
             return fold_constants(op, *args)
         if op in COMMUTATIVE:
@@ -247,38 +253,44 @@ class Builder:
         return name
 
     def emit_block(self, block: Block, *args: Scalar) -> list[Scalar]:
-        """The results of a block."""
-        whole = self.op(block, *args)
-        if isinstance(whole, str):
-            return [self.op("item", whole, i) for i in range(len(block.kinds))]
-        return [a.item() if isinstance(a, np.generic | np.ndarray) else a for a in whole]
+        """Return the results of a block."""
+        result = self.op(block, *args)
+        if isinstance(result, str):
+            return [self.op("item", result, i) for i in range(len(block.kinds))]
+        return [a.item() if isinstance(a, np.generic | np.ndarray) else a for a in result]
 
     def table(self, entries: Sequence[Scalar]) -> str:
-        """Entries as one variable, which a loop reads by their numbers: what another loop has made is left as it is.
+        """Return one variable that holds the entries, from which a loop reads by index.
 
-        Inside a loop those of what is around it are a table there: it is made once.
+        Consecutive results of one block are taken from it without a copy. Inside a loop, a table of outer scalars is
+        made once, outside of the loop.
         """
         if self.enclosing is not None and not any(
             type(a) is str and a not in self.enclosing.outer_scalars for a in entries
         ):
             return self.enclosing.table(entries)
-        first = self._defining_instruction(entries[0]) if entries else None
-        if first is not None and first.op == "item":
-            whole, start = first.args[0], int(first.args[1])
-            if all(self._defining_instruction(a) == (a, "item", (whole, start + i)) for i, a in enumerate(entries)):
-                return self._emit("column", whole, start, len(entries))
+        first_instruction = self._defining_instruction(entries[0]) if entries else None
+        if first_instruction is not None and first_instruction.op == "item":
+            block_result, start = first_instruction.args[0], int(first_instruction.args[1])
+            if all(
+                self._defining_instruction(a) == (a, "item", (block_result, start + i)) for i, a in enumerate(entries)
+            ):
+                return self._emit("column", block_result, start, len(entries))
         return self._emit("table", *entries)
 
     def input_indices(self, entries: Sequence[Scalar]) -> list[tuple[int, int]] | None:
-        """The places, of an array and of an entry, that scalars have among the inputs of the outermost program.
+        """Return the (array, entry) indices of scalars among the inputs of the outermost program.
 
-        None where one is no input.
+        The result is None if a scalar is not an input.
         """
         if self.enclosing is not None:
             return self.enclosing.builder.input_indices([self.enclosing.outer_scalars.get(a, 0.0) for a in entries])
         if not all(type(a) is str and a[0] == "x" for a in entries):
             return None
-        return [(int(place), int(number)) for place, number in (str(a)[1:].split("_") for a in entries)]
+        return [
+            (int(array_index), int(entry_index))
+            for array_index, entry_index in (str(a)[1:].split("_") for a in entries)
+        ]
 
     def _defining_instruction(self, a: Scalar) -> Instruction | None:
         return self.instructions[int(a[1:])] if type(a) is str and a[0] == "t" else None
@@ -337,7 +349,7 @@ class Builder:
         return self._extract_signs(self.div, "div", a, b)
 
     def _extract_signs(self, method, op, a, b):
-        """A product or quotient, minus signs taken out of it."""
+        """Return a product or quotient, with minus signs moved outside."""
         for x, result in (a, lambda y: method(y, b)), (b, lambda y: method(a, y)):
             opposite = self._negated_operand.get(x) if type(x) is str else -x if x < 0 else None
             if opposite is not None:
@@ -345,7 +357,7 @@ class Builder:
         return self.op(op, a, b)
 
     def integer_pow(self, a, n: int, one: Scalar = 1.0):
-        """``a**n`` by repeated squaring."""
+        """Return ``a**n`` by repeated squaring."""
         if n < 0:
             return self.div(one, self.integer_pow(a, -n))
         result = one
@@ -363,32 +375,35 @@ class Builder:
         return self.op("pow", a, b)
 
     def select(self, condition, a, b):
-        """``a if condition else b``."""
+        """Return ``a if condition else b``."""
         if type(condition) is not str:
             return a if condition else b
         return a if type(a) is type(b) and repr(a) == repr(b) else self.op("select", condition, a, b)
 
-    def branch(self, condition, then: Sequence[Scalar], otherwise: Sequence[Scalar]) -> list[Scalar]:
-        """The scalars of one side, by a test that is theirs alone: see :mod:`.branches`."""
-        key = tuple(a if type(a) is str else repr(a) for a in (condition, *then, *otherwise))
-        own = self.op("branch", condition, self._branches.setdefault(key, len(self._branches)))
-        return [self.select(own, a, b) for a, b in zip(then, otherwise, strict=True)]
+    def branch(self, condition, true_values: Sequence[Scalar], false_values: Sequence[Scalar]) -> list[Scalar]:
+        """Select the scalars of one side of a ``lax.cond``.
 
-    def pick(self, place, entries: Sequence[Scalar]) -> Scalar:
-        """The entry at a place, an integer from zero: of one that lies outside the nearest."""
-        if type(place) is not str:
-            return entries[min(max(place, 0), len(entries) - 1)]
-        alike = all(type(a) is type(entries[0]) and repr(a) == repr(entries[0]) for a in entries)
-        if alike:
+        A ``branch`` instruction marks the condition, so that :mod:`.branches` finds the choices that belong together.
+        """
+        key = tuple(a if type(a) is str else repr(a) for a in (condition, *true_values, *false_values))
+        test = self.op("branch", condition, self._branches.setdefault(key, len(self._branches)))
+        return [self.select(test, a, b) for a, b in zip(true_values, false_values, strict=True)]
+
+    def pick(self, index, entries: Sequence[Scalar]) -> Scalar:
+        """Return the entry at an index, which counts from zero; an index out of range is clipped."""
+        if type(index) is not str:
+            return entries[min(max(index, 0), len(entries) - 1)]
+        are_equal = all(type(a) is type(entries[0]) and repr(a) == repr(entries[0]) for a in entries)
+        if are_equal:
             return entries[0]
         return (
-            self.op("pick", place, *entries)
+            self.op("pick", index, *entries)
             if len(entries) <= MAX_SELECT_ENTRIES
-            else self.op("lookup", place, self.table(entries))
+            else self.op("lookup", index, self.table(entries))
         )
 
     def conj(self, a):
-        """Its complex conjugate: itself."""
+        """Return the complex conjugate of a real scalar, which is the scalar."""
         return a
 
     def max(self, a, b):
@@ -401,9 +416,9 @@ class Builder:
         return self.div(1.0, self.add(1.0, self.op("exp", self.neg(a))))
 
     def round_half_away(self, a):
-        whole = self.op("trunc", a)
-        beyond = self.op("ge", self.op("abs", self.sub(a, whole)), 0.5)  # false at infinity
-        return self.select(beyond, self.add(whole, self.op("sign", a)), whole)
+        truncation = self.op("trunc", a)
+        rounds_away = self.op("ge", self.op("abs", self.sub(a, truncation)), 0.5)  # false at infinity
+        return self.select(rounds_away, self.add(truncation, self.op("sign", a)), truncation)
 
     def all(self, conditions):
         result: Scalar = True
@@ -413,7 +428,7 @@ class Builder:
 
 
 def fold_constants(op: str | Block, *args: Scalar) -> Any:
-    """The value of an operation on numbers, by the rules of IEEE arithmetic: nothing raises."""
+    """Evaluate an operation on numbers by IEEE arithmetic, without exceptions."""
     with np.errstate(all="ignore"):
         value = implementation(op)(*(np.float64(a) if type(a) is float else a for a in args))
     return value.item() if isinstance(value, np.generic | np.ndarray) else value
@@ -423,7 +438,10 @@ def fold_constants(op: str | Block, *args: Scalar) -> Any:
 
 
 class ComplexPair:
-    """A complex scalar. No sequence, so that NumPy's object arrays take it for one entry."""
+    """A complex scalar, stored as two real scalars.
+
+    The class is not a sequence, so NumPy's object arrays treat an instance as one entry.
+    """
 
     __slots__ = ("im", "re")
 
@@ -432,18 +450,18 @@ class ComplexPair:
 
 
 def as_complex_pair(a) -> ComplexPair:
-    """A complex number, or a real scalar, as one."""
+    """Convert a complex number or a real scalar to a :class:`ComplexPair`."""
     if isinstance(a, ComplexPair):
         return a
     return ComplexPair(a.real, a.imag) if isinstance(a, complex) else ComplexPair(a, 0.0)
 
 
 def constant_array(value, dtype=None) -> np.ndarray:
-    """An array of numbers as an array of scalars, complex ones as pairs."""
-    found = np.asarray(value, dtype=dtype)
-    if found.dtype.kind != "c":
-        return found.astype(object)
-    return scalar_array([ComplexPair(a.real, a.imag) for a in found.ravel().tolist()], found.shape)
+    """Return an array of numbers as an object array of scalars; complex numbers become pairs."""
+    array = np.asarray(value, dtype=dtype)
+    if array.dtype.kind != "c":
+        return array.astype(object)
+    return scalar_array([ComplexPair(a.real, a.imag) for a in array.ravel().tolist()], array.shape)
 
 
 def scalar_array(scalars: Sequence[Any], shape) -> np.ndarray:
@@ -453,15 +471,15 @@ def scalar_array(scalars: Sequence[Any], shape) -> np.ndarray:
 
 
 def elementwise(function: Callable[..., Any], *arrays: np.ndarray) -> np.ndarray:
-    """Apply a function entry by entry."""
+    """Apply a function entry by entry, with broadcasting."""
     if len({np.shape(x) for x in arrays}) > 1:
         arrays = np.broadcast_arrays(*arrays)
     return scalar_array(list(map(function, *(x.ravel().tolist() for x in arrays))), arrays[0].shape)
 
 
 def entries_along(x: np.ndarray, axes) -> tuple[list[list[Scalar]], tuple[int, ...]]:
-    """The entries along some axes, for each place on the others; and the shape of those others."""
-    kept = [i for i in range(x.ndim) if i not in axes]
-    shape = tuple(x.shape[i] for i in kept)
-    size = math.prod(x.shape[i] for i in axes)
-    return x.transpose(*kept, *axes).reshape(math.prod(shape), size).tolist(), shape
+    """Return the entries along some axes, one row for each index of the other axes, and the shape of the other axes."""
+    remaining_axes = [i for i in range(x.ndim) if i not in axes]
+    shape = tuple(x.shape[i] for i in remaining_axes)
+    n_entries = math.prod(x.shape[i] for i in axes)
+    return x.transpose(*remaining_axes, *axes).reshape(math.prod(shape), n_entries).tolist(), shape

@@ -1,4 +1,4 @@
-"""Results kept for what they were found for: systems and methods never change."""
+"""Caches of results of functions of systems and methods, which never change."""
 
 from __future__ import annotations
 
@@ -15,99 +15,104 @@ import numpy as np
 Result = TypeVar("Result")
 
 MAX_CACHED_RESULTS = 64
-"""Results of one function that are held in memory, those last used."""
+"""Largest number of results that one function keeps; the least recently used are dropped."""
 
 MAX_CACHED_BYTES = 2**28
-"""Largest size of the arrays that they were found for, together."""
+"""Largest total size, in bytes, of the arrays among the arguments that one function keeps."""
 
 MAX_COMPARED_BYTES = 2**20
-"""Largest size of arrays that are compared by content: comparing larger ones takes longer than a call should."""
+"""Largest size, in bytes, of arguments compared by content; comparing larger ones takes longer than most calls."""
 
 
 class LRUCache(Generic[Result]):
-    """Results by their keys, those last used.
+    """A cache of the results that were used last.
 
     Parameters
     ----------
     max_entries : int
-        How many.
-    max_size : int, optional
-        Of all together.
+        Largest number of results.
+    max_bytes : float, optional
+        Largest total size of the entries. One entry is always kept.
     """
 
-    def __init__(self, max_entries: int, max_size: float = float("inf")):
-        self.max_entries, self.max_size = max_entries, max_size
+    def __init__(self, max_entries: int, max_bytes: float = float("inf")):
+        self.max_entries, self.max_bytes = max_entries, max_bytes
         self._entries: OrderedDict[Hashable, tuple[Result, int]] = OrderedDict()
-        self._total_size, self._lock = 0, threading.Lock()
+        self._total_bytes, self._lock = 0, threading.Lock()
 
     def __len__(self) -> int:
         return len(self._entries)
 
     def get(self, key: Hashable) -> Result | None:
-        """What is known by a key, or None."""
+        """Return the result for a key, or None."""
         with self._lock:
             if key not in self._entries:
                 return None
             self._entries.move_to_end(key)
             return self._entries[key][0]
 
-    def get_or_compute(self, key: Hashable, make: Callable[[], Result], size: int = 0) -> Result:
-        """What is known by a key; made, and kept, where nothing is."""
+    def get_or_compute(self, key: Hashable, compute: Callable[[], Result], n_bytes: int = 0) -> Result:
+        """Return the result for a key; compute and store it if it is missing."""
         with self._lock:
             if key in self._entries:
                 self._entries.move_to_end(key)
                 return self._entries[key][0]
-        found = make()
+        result = compute()
         with self._lock:
             if key not in self._entries:
-                self._total_size += size
-            self._entries[key] = found, size
+                self._total_bytes += n_bytes
+            self._entries[key] = result, n_bytes
             while len(self._entries) > self.max_entries or (
-                self._total_size > self.max_size and len(self._entries) > 1
+                self._total_bytes > self.max_bytes and len(self._entries) > 1
             ):
-                self._total_size -= self._entries.popitem(last=False)[1][1]
-        return found
+                self._total_bytes -= self._entries.popitem(last=False)[1][1]
+        return result
 
 
 def memoize(function: Callable[..., Result]) -> Callable[..., Result]:
-    """Decorator: call a function of pytrees once for the same objects, or for others of the same content.
+    """Decorator: cache the results of a function of pytrees, by the identity of its arguments and by their content.
 
-    Objects with leaves that could change in place, as NumPy arrays can, or that are being traced, are not remembered.
+    A call whose arguments have NumPy arrays, which can change in place, or tracers among their leaves is not cached.
     """
-    known: LRUCache[tuple[tuple, Result]] = LRUCache(MAX_CACHED_RESULTS, MAX_CACHED_BYTES)
-    alike: LRUCache[Result] = LRUCache(MAX_CACHED_RESULTS, MAX_CACHED_BYTES)
+    identity_cache: LRUCache[tuple[tuple, Result]] = LRUCache(MAX_CACHED_RESULTS, MAX_CACHED_BYTES)
+    content_cache: LRUCache[Result] = LRUCache(MAX_CACHED_RESULTS, MAX_CACHED_BYTES)
 
-    def find_by_content(arguments: tuple, size: int) -> Result:
-        content = fingerprint(arguments) if size <= MAX_COMPARED_BYTES else None
-        make = functools.partial(function, *arguments)
-        return make() if content is None else alike.get_or_compute(content, make, size)
+    def find_by_content(arguments: tuple, n_bytes: int) -> Result:
+        content = fingerprint(arguments) if n_bytes <= MAX_COMPARED_BYTES else None
+        compute = functools.partial(function, *arguments)
+        return compute() if content is None else content_cache.get_or_compute(content, compute, n_bytes)
 
     @functools.wraps(function)
     def call(*arguments) -> Result:
-        found = known.get(identities := tuple(map(id, arguments)))
-        if found is not None:
-            return found[1]
+        entry = identity_cache.get(identities := tuple(map(id, arguments)))
+        if entry is not None:
+            return entry[1]
         leaves = jax.tree_util.tree_leaves(arguments)
         if any(isinstance(leaf, np.ndarray | jax.core.Tracer) for leaf in leaves):
             return function(*arguments)
-        size = sum(leaf.nbytes for leaf in leaves if eqx.is_array(leaf))
-        # the arguments are held on to, so that no other object takes their identity
-        return known.get_or_compute(identities, lambda: (arguments, find_by_content(arguments, size)), size)[1]
+        n_bytes = sum(leaf.nbytes for leaf in leaves if eqx.is_array(leaf))
+        # the entry holds the arguments, so that no other object takes their id
+        return identity_cache.get_or_compute(
+            identities, lambda: (arguments, find_by_content(arguments, n_bytes)), n_bytes
+        )[1]
 
     return call
 
 
 def fingerprint(tree: Any) -> Any:
-    """A key that tells pytrees apart by the values of arrays and the identity of the rest; None where there is none."""
+    """Return a key that distinguishes pytrees by the values of their arrays and by their other leaves.
+
+    The result is None if a leaf cannot be hashed or is a tracer.
+    """
     leaves, structure = jax.tree_util.tree_flatten(tree)
     try:
-        parts = tuple(
+        leaf_keys = tuple(
             (leaf.shape, leaf.dtype, np.asarray(leaf).tobytes())
             if isinstance(leaf, jax.Array | np.ndarray | np.generic)
             else (type(leaf), leaf)
             for leaf in leaves
         )
-        hash(key := (structure, parts))
-    except (TypeError, jax.errors.JAXTypeError):  # something unhashable, or traced
+        hash(key := (structure, leaf_keys))
+    except (TypeError, jax.errors.JAXTypeError):  # an unhashable leaf, or a tracer
         return None
     return key

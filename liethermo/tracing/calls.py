@@ -1,4 +1,4 @@
-"""Linear algebra that does not unroll: calls of LAPACK, and products of matrices as loops."""
+"""Linear algebra that is not unrolled: calls of LAPACK, and products of matrices as loops."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from .builder import Block
 
 @dataclass(frozen=True, eq=False)
 class LapackCall(Block):
-    """A function of matrices, on their entries row by row; of complex ones all real parts, then all imaginary ones.
+    """A function of matrices, passed row by row; complex ones pass all real parts, then all imaginary parts.
 
-    NaN where an argument is not finite, or the function does not end.
+    The results are NaN if an argument is not finite or the function does not converge.
 
     Attributes
     ----------
     name : str
-        A key of :data:`FUNCTIONS`.
+        A key of :data:`LAPACK_FUNCTIONS`.
     sizes : tuple of int
-        What its function learns about the matrices.
+        Sizes of the matrices and flags, as the entry of :data:`LAPACK_FUNCTIONS` expects them.
     is_complex : bool
     """
 
@@ -39,43 +39,45 @@ class LapackCall(Block):
 
     @property
     def argument_shapes(self) -> list[tuple[int, ...]]:
-        """Shapes of the matrices that it is given."""
+        """Shapes of the argument matrices."""
         return LAPACK_FUNCTIONS[self.name].argument_shapes(*self.sizes)
 
     @property
     def result_specs(self) -> list[tuple[tuple[int, ...], bool]]:
-        """Shapes of the arrays that it makes, and whether they are real even where its arguments are not."""
+        """Shape of each result, and whether it is real even for complex arguments."""
         return LAPACK_FUNCTIONS[self.name].result_specs(*self.sizes)
 
-    def entry_counts(self, results) -> list[int]:
-        return [math.prod(shape) * (2 if self.is_complex and not real else 1) for shape, real in results]
+    def entry_counts(self, specs) -> list[int]:
+        """Return the number of real entries of each result."""
+        return [math.prod(shape) * (2 if self.is_complex and not is_real else 1) for shape, is_real in specs]
 
     def __call__(self, *args) -> list:
         arrays = np.broadcast_arrays(*(np.asarray(a, dtype=np.float64) for a in args))
-        front = arrays[0].shape
+        batch_shape = arrays[0].shape
         rows = np.stack(arrays, axis=-1).reshape(-1, len(args))
-        found = np.stack([self._evaluate_one(row) for row in rows]).reshape(*front, -1)
-        return [found[..., i][()] for i in range(found.shape[-1])]
+        results = np.stack([self._evaluate_one(row) for row in rows]).reshape(*batch_shape, -1)
+        return [results[..., i][()] for i in range(results.shape[-1])]
 
     def _evaluate_one(self, row: np.ndarray) -> np.ndarray:
+        """Evaluate the function for one set of matrices, given as a row of real entries."""
         if not np.isfinite(row).all():
             return np.full(len(self.kinds), np.nan)
         matrices, start = [], 0
         for shape in self.argument_shapes:
-            size = math.prod(shape)
-            matrix = row[start : start + size].reshape(shape)
+            n_entries = math.prod(shape)
+            matrix = row[start : start + n_entries].reshape(shape)
             if self.is_complex:
-                matrix = matrix + 1j * row[start + size : start + 2 * size].reshape(shape)
+                matrix = matrix + 1j * row[start + n_entries : start + 2 * n_entries].reshape(shape)
             matrices.append(matrix)
-            start += size * (2 if self.is_complex else 1)
+            start += n_entries * (2 if self.is_complex else 1)
         try:
-            found = LAPACK_FUNCTIONS[self.name].evaluate(self.sizes, *matrices)
+            results = LAPACK_FUNCTIONS[self.name].evaluate(self.sizes, *matrices)
         except np.linalg.LinAlgError:
             return np.full(len(self.kinds), np.nan)
-        parts = []
-        for x, (_, real) in zip(found, self.result_specs, strict=True):
-            parts += [x.real.ravel(), x.imag.ravel()] if self.is_complex and not real else [np.real(x).ravel()]
-        return np.concatenate(parts).astype(np.float64)
+        components = []
+        for x, (_, is_real) in zip(results, self.result_specs, strict=True):
+            components += [x.real.ravel(), x.imag.ravel()] if self.is_complex and not is_real else [np.real(x).ravel()]
+        return np.concatenate(components).astype(np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +89,7 @@ class MatrixProduct(Block):
     sizes : (int, int, int)
         m, k, n of an (m, k) and a (k, n) matrix.
     strides : ((int, int), (int, int))
-        For both how far apart in their tables entries are of neighbouring rows, and of neighbouring columns.
+        For both matrices the distance, in their tables, of neighbouring rows and of neighbouring columns.
     """
 
     sizes: tuple[int, int, int]
@@ -106,18 +108,18 @@ class MatrixProduct(Block):
             ]
             for table, (rows, columns), (height, width) in zip(args, self.strides, ((m, k), (k, n)), strict=True)
         )
-        found = np.einsum("mk...,kn...->mn...", x, y)
-        return [found[place][()] for place in np.ndindex(m, n)]
+        products = np.einsum("mk...,kn...->mn...", x, y)
+        return [products[index][()] for index in np.ndindex(m, n)]
 
 
 @dataclass(frozen=True, eq=False)
 class DeferredBlock(Block):
-    """What the writer of the code has to fill in, from all arguments: by itself the first of them, as they are.
+    """A block that the writer of the code fills in; evaluated as it stands, it returns its first arguments.
 
     Attributes
     ----------
     kinds : tuple of str
-        Of its results, and of as many arguments.
+        Kinds of the results, and of the first arguments.
     """
 
     kinds: tuple[str, ...]
@@ -128,14 +130,14 @@ class DeferredBlock(Block):
 
 
 deferred_p = Primitive("deferred")
-"""Makes one: ``deferred.bind(*arrays, results=n)`` gives the first n of the arrays, or what takes their place."""
+"""Primitive of a :class:`DeferredBlock`: ``deferred_p.bind(*arrays, results=n)`` returns n arrays."""
 deferred_p.multiple_results = True
 deferred_p.def_abstract_eval(lambda *avals, results: list(avals[:results]))
 
 
 @dataclass(frozen=True)
 class LapackFunction:
-    """What a call is of.
+    """Shapes and implementation of a function that :class:`LapackCall` calls.
 
     Attributes
     ----------
@@ -167,8 +169,8 @@ def _svd(sizes, a) -> tuple[np.ndarray, ...]:
 
 
 def _svd_result_specs(m: int, n: int, full: int) -> list[tuple[tuple[int, ...], bool]]:
-    least = min(m, n)
-    return [((least,), True), ((m, m if full else least), False), ((n if full else least, n), False)]
+    k = min(m, n)
+    return [((k,), True), ((m, m if full else k), False), ((n if full else k, n), False)]
 
 
 LAPACK_FUNCTIONS = {
@@ -186,7 +188,11 @@ LAPACK_FUNCTIONS = {
     ),
     "svd": LapackFunction(lambda m, n, full: [(m, n)], _svd_result_specs, _svd),
 }
-"""``eigh``: eigenvectors and eigenvalues, from the lower triangle; ``inverse``, NaN of a singular
-matrix; ``lu``: factors in one matrix, and the row that each
-row is exchanged with; ``qr``: with as many columns as are asked for; ``svd``: singular values, left vectors, and right
-ones as rows."""
+"""Functions of matrices, by name.
+
+- ``eigh``: eigenvectors and eigenvalues, from the lower triangle.
+- ``inverse``: the inverse; NaN if the matrix is singular.
+- ``lu``: both factors in one matrix, and the row with which each row is exchanged.
+- ``qr``: factors with the requested number of columns.
+- ``svd``: singular values, left singular vectors, and right ones as rows.
+"""

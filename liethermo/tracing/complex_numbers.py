@@ -1,4 +1,4 @@
-"""Complex numbers as pairs of real scalars, while a jaxpr is unrolled: a program itself has real ones alone."""
+"""Complex numbers as pairs of real scalars while a jaxpr is unrolled; the program itself has real scalars only."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from .builder import Builder, ComplexPair, Scalar, as_complex_pair, scalar_array
 
 
 def flatten_scalars(arrays: Sequence[np.ndarray]) -> list[Scalar]:
-    """The real scalars in arrays, one after another."""
-    found: list[Scalar] = []
+    """Return the real scalars of arrays as one list; a complex entry contributes two."""
+    scalars: list[Scalar] = []
     for x in arrays:
         for a in x.ravel().tolist():
-            found += [a.re, a.im] if isinstance(a, ComplexPair) else [a]
-    return found
+            scalars += [a.re, a.im] if isinstance(a, ComplexPair) else [a]
+    return scalars
 
 
 def unflatten_scalars(scalars: Iterator[Scalar], avals: Sequence) -> list[np.ndarray]:
-    """Arrays of these shapes and types from real scalars one after another: the inverse of :func:`flat`."""
+    """Return arrays of these types from a sequence of real scalars; the inverse of :func:`flatten_scalars`."""
     arrays = []
     for aval in avals:
-        size, is_complex = math.prod(aval.shape), aval.dtype.kind == "c"
-        entries = [ComplexPair(next(scalars), next(scalars)) if is_complex else next(scalars) for _ in range(size)]
+        n_entries, is_complex = math.prod(aval.shape), aval.dtype.kind == "c"
+        entries = [ComplexPair(next(scalars), next(scalars)) if is_complex else next(scalars) for _ in range(n_entries)]
         arrays.append(scalar_array(entries, aval.shape))
     return arrays
 
 
 def scalar_kinds(avals: Sequence) -> tuple[str, ...]:
-    """The kinds of those scalars: see :attr:`.builder.Block.kinds`."""
+    """Return the kinds of the real scalars of arrays with these types: see :attr:`.builder.Block.kinds`."""
     return tuple(
         kind
         for aval in avals
@@ -41,7 +41,7 @@ def scalar_kinds(avals: Sequence) -> tuple[str, ...]:
 
 
 class ComplexBuilder:
-    """A builder's methods on pairs, by those on their parts."""
+    """A builder of complex arithmetic, which calls a real builder for the real and imaginary parts."""
 
     def __init__(self, real: Builder):
         self.real, self.max_instructions = real, real.max_instructions
@@ -67,17 +67,19 @@ class ComplexBuilder:
         return ComplexPair(a.re, self.real.neg(a.im))
 
     def div(self, a, b):
-        """With the divisor scaled, so that its square neither overflows nor vanishes; by infinity it is zero."""
+        """Return a / b, with b scaled so that ``|b|^2`` neither overflows nor underflows; a / infinity is zero."""
         a, b, r = as_complex_pair(a), as_complex_pair(b), self.real
         if type(b.im) is not str and b.im == 0:
             return ComplexPair(r.div(a.re, b.re), r.div(a.im, b.re))
-        size = r.max(r.op("abs", b.re), r.op("abs", b.im))
-        c, d = r.div(b.re, size), r.div(b.im, size)
-        square = r.mul(r.add(r.mul(c, c), r.mul(d, d)), size)
-        over = self.mul(a, ComplexPair(c, r.neg(d)))
-        infinite = r.op("eq", size, math.inf)
+        scale = r.max(r.op("abs", b.re), r.op("abs", b.im))
+        c, d = r.div(b.re, scale), r.div(b.im, scale)
+        square = r.mul(r.add(r.mul(c, c), r.mul(d, d)), scale)
+        numerator = self.mul(a, ComplexPair(c, r.neg(d)))
+        is_infinite = r.op("eq", scale, math.inf)
         zero = r.add(r.sub(a.re, a.re), r.sub(a.im, a.im))  # or NaN
-        return ComplexPair(*(r.select(infinite, zero, r.div(part, square)) for part in (over.re, over.im)))
+        return ComplexPair(
+            *(r.select(is_infinite, zero, r.div(component, square)) for component in (numerator.re, numerator.im))
+        )
 
     def integer_pow(self, a, n: int, one=1.0):
         if n < 0:
@@ -91,24 +93,24 @@ class ComplexBuilder:
         a, b, r = as_complex_pair(a), as_complex_pair(b), self.real
         return ComplexPair(r.select(condition, a.re, b.re), r.select(condition, a.im, b.im))
 
-    def pick(self, place, entries):
-        parts, r = [as_complex_pair(a) for a in entries], self.real
-        return ComplexPair(r.pick(place, [a.re for a in parts]), r.pick(place, [a.im for a in parts]))
+    def pick(self, index, entries):
+        pairs, r = [as_complex_pair(a) for a in entries], self.real
+        return ComplexPair(r.pick(index, [a.re for a in pairs]), r.pick(index, [a.im for a in pairs]))
 
     def logistic(self, a):
         return self.div(1.0, self.add(1.0, self.op("exp", self.neg(a))))
 
     def modulus(self, a) -> Scalar:
-        """``|a|``, without overflow."""
+        """Return ``|a|``, without overflow."""
         a, r = as_complex_pair(a), self.real
         x, y = r.op("abs", a.re), r.op("abs", a.im)
-        large, small = r.max(x, y), r.min(x, y)
-        ratio = r.div(small, r.select(r.op("gt", large, 0.0), large, 1.0))
-        return r.mul(large, r.op("sqrt", r.add(1.0, r.mul(ratio, ratio))))
+        maximum, minimum = r.max(x, y), r.min(x, y)
+        ratio = r.div(minimum, r.select(r.op("gt", maximum, 0.0), maximum, 1.0))
+        return r.mul(maximum, r.op("sqrt", r.add(1.0, r.mul(ratio, ratio))))
 
     def op(self, op: str, *args):
         r = self.real
-        if op in ("le", "lt", "ge", "gt") or op not in COMPLEX_OPERATIONS:  # of what is no complex number
+        if op in ("le", "lt", "ge", "gt") or op not in COMPLEX_OPERATIONS:  # operations on real numbers
             if any(isinstance(a, ComplexPair) for a in args):
                 raise NotImplementedError("on complex numbers")
             return r.op(op, *args)
@@ -124,12 +126,12 @@ class ComplexBuilder:
         return self.real.op("or", self.real.op("ne", a.re, b.re), self.real.op("ne", a.im, b.im))
 
     def _sign(self, a):
-        r, size = self.real, self.modulus(a)
-        return self.div(a, r.select(r.op("eq", size, 0.0), 1.0, size))
+        r, modulus = self.real, self.modulus(a)
+        return self.div(a, r.select(r.op("eq", modulus, 0.0), 1.0, modulus))
 
-    def _polar(self, size, angle):
+    def _polar(self, modulus, angle):
         r = self.real
-        return ComplexPair(r.mul(size, r.op("cos", angle)), r.mul(size, r.op("sin", angle)))
+        return ComplexPair(r.mul(modulus, r.op("cos", angle)), r.mul(modulus, r.op("sin", angle)))
 
     def _exp(self, a):
         return self._polar(self.real.op("exp", a.re), a.im)
@@ -140,27 +142,29 @@ class ComplexBuilder:
     def _log1p(self, a):
         r = self.real
         square = r.add(r.mul(a.re, r.add(2.0, a.re)), r.mul(a.im, a.im))  # |1 + a|^2 - 1, which may overflow
-        size = self.modulus(ComplexPair(r.add(1.0, a.re), a.im))
-        near = r.mul(0.5, r.op("log1p", square))
-        real = r.select(r.op("gt", size, 4.0), r.op("log", size), near)
+        modulus = self.modulus(ComplexPair(r.add(1.0, a.re), a.im))
+        log_near_one = r.mul(0.5, r.op("log1p", square))
+        real = r.select(r.op("gt", modulus, 4.0), r.op("log", modulus), log_near_one)
         return ComplexPair(real, r.op("atan2", a.im, r.add(1.0, a.re)))
 
     def _expm1(self, a):
         r = self.real
-        grown, half = r.op("expm1", a.re), r.op("sin", r.mul(0.5, a.im))
-        less = r.mul(-2.0, r.mul(half, half))  # cos - 1
-        real = r.add(r.add(grown, less), r.mul(grown, less))
+        real_expm1, sin_half = r.op("expm1", a.re), r.op("sin", r.mul(0.5, a.im))
+        cos_minus_one = r.mul(-2.0, r.mul(sin_half, sin_half))
+        real = r.add(r.add(real_expm1, cos_minus_one), r.mul(real_expm1, cos_minus_one))
         return ComplexPair(real, r.mul(r.op("exp", a.re), r.op("sin", a.im)))
 
     def _sqrt(self, a):
         r = self.real
         root = r.op("sqrt", r.mul(0.5, r.add(r.op("abs", a.re), self.modulus(a))))
         zero = r.op("eq", root, 0.0)
-        other = r.div(r.op("abs", a.im), r.select(zero, 1.0, r.mul(2.0, root)))
-        right = r.op("ge", a.re, 0.0)
-        below = r.op("lt", a.im, 0.0)
-        imaginary = r.select(right, other, root)
-        return ComplexPair(r.select(right, root, other), r.select(below, r.neg(imaginary), imaginary))
+        quotient = r.div(r.op("abs", a.im), r.select(zero, 1.0, r.mul(2.0, root)))
+        is_right_half = r.op("ge", a.re, 0.0)
+        is_lower_half = r.op("lt", a.im, 0.0)
+        imaginary = r.select(is_right_half, quotient, root)
+        return ComplexPair(
+            r.select(is_right_half, root, quotient), r.select(is_lower_half, r.neg(imaginary), imaginary)
+        )
 
     def _sin(self, a):
         r = self.real
@@ -177,9 +181,9 @@ class ComplexBuilder:
         )
 
     def _apply_rotated(self, function, a):
-        """``-i f(i a)``."""
-        found = function(ComplexPair(self.real.neg(a.im), a.re))
-        return ComplexPair(found.im, self.real.neg(found.re))
+        """Return ``-i f(i a)``."""
+        result = function(ComplexPair(self.real.neg(a.im), a.re))
+        return ComplexPair(result.im, self.real.neg(result.re))
 
     def _sinh(self, a):
         return self._apply_rotated(self._sin, a)
@@ -191,10 +195,10 @@ class ComplexBuilder:
         r = self.real
         s, t = r.op("tanh", a.re), r.op("tan", a.im)
         ss, tt = r.mul(s, s), r.mul(t, t)
-        below = r.add(1.0, r.mul(ss, tt))
+        denominator = r.add(1.0, r.mul(ss, tt))
         return ComplexPair(
-            r.div(r.mul(s, r.add(1.0, tt)), below),
-            r.div(r.mul(t, r.sub(1.0, ss)), below),
+            r.div(r.mul(s, r.add(1.0, tt)), denominator),
+            r.div(r.mul(t, r.sub(1.0, ss)), denominator),
         )
 
     def _tan(self, a):
@@ -202,4 +206,4 @@ class ComplexBuilder:
 
 
 COMPLEX_OPERATIONS = frozenset("abs eq ne sign exp log log1p expm1 sqrt sin cos sinh cosh tanh tan".split())
-"""Operations that are known of complex numbers."""
+"""Operations that are implemented for complex numbers."""

@@ -1,4 +1,4 @@
-"""Numbers taken out of a jaxpr: programs that differ in them alone become one, with parameters."""
+"""Numbers taken out of a jaxpr: programs that differ only in their numbers become one program with parameters."""
 
 from __future__ import annotations
 
@@ -16,89 +16,90 @@ from manifolds._content_keys import content_key
 from manifolds.matrices.exponential import expm
 
 MAX_INLINE_NUMBERS = 64
-"""Numbers that are no table yet: what they are made from may be shorter."""
+"""Largest number of entries of an array that is recomputed from its origin; a larger one is stored as a table."""
 
 CALL_PRIMITIVES = ("jit", "pjit", "closed_call", "core_call")
-"""Primitives that call a jaxpr, which takes their place here."""
+"""Primitives that call a jaxpr, which is inlined."""
 
 
 class ConstantLifter:
-    """The numbers of a jaxpr made its first arguments: all literals of double precision but zeros, and all constants.
+    """Turns constants and nonzero float64 literals of a jaxpr, here called its numbers, into its first arguments.
 
-    Zeros stay, since what vanishes belongs to the operations; so do the exponents that have instructions of their own,
-    and numbers that truth values or integers come from.
+    Zeros stay, because vanishing terms belong to the operations. Exponents with instructions of their own stay too, and
+    so do numbers from which truth values or integers are computed.
     """
 
     def __init__(self):
         self.has_while_loop = False
 
-    def lift_jaxpr(self, closed: ClosedJaxpr) -> tuple[Jaxpr, list, tuple]:
-        """The jaxpr, its remaining constants, and the numbers: scalars in one array, then arrays."""
+    def lift_jaxpr(self, closed_jaxpr: ClosedJaxpr) -> tuple[Jaxpr, list, tuple]:
+        """Return the jaxpr, its remaining constants, and its numbers: all scalars in one array, then the arrays."""
         body = _LiftedBody(self)
-        body.append_jaxpr(closed.jaxpr, closed.consts, closed.jaxpr.invars)
-        used = {a for eqn in body.equations for a in eqn.invars if type(a) is Var} | {
+        body.append_jaxpr(closed_jaxpr.jaxpr, closed_jaxpr.consts, closed_jaxpr.jaxpr.invars)
+        used_vars = {a for eqn in body.equations for a in eqn.invars if type(a) is Var} | {
             a for a in body.outputs if type(a) is Var
         }
-        body.numbers = [(v, x) for v, x in body.numbers if v in used]
+        body.numbers = [(v, x) for v, x in body.numbers if v in used_vars]
         scalars = [(v, x) for v, x in body.numbers if isinstance(x, float)]
         arrays = [(v, x) for v, x in body.numbers if not isinstance(x, float)]
-        invars = [v for v, _ in (*scalars, *arrays)] + list(closed.jaxpr.invars)
+        invars = [v for v, _ in (*scalars, *arrays)] + list(closed_jaxpr.jaxpr.invars)
         jaxpr = Jaxpr(
             list(body.constants),
             invars,
             body.outputs,
             body.equations,
-            closed.jaxpr.effects,
-            _debug_info_without_names(closed.jaxpr),
+            closed_jaxpr.jaxpr.effects,
+            _debug_info_without_names(closed_jaxpr.jaxpr),
         )
-        with jax.ensure_compile_time_eval():  # numbers, whatever is being traced around
-            packed = jnp.asarray(np.array([x for _, x in scalars], dtype=np.float64))
+        with jax.ensure_compile_time_eval():  # concrete values, even inside another trace
+            number_array = jnp.asarray(np.array([x for _, x in scalars], dtype=np.float64))
             values = [x if isinstance(x, jax.Array) else jnp.asarray(np.asarray(x)) for _, x in arrays]
-        return jaxpr, list(body.constants.values()), (packed, *values)
+        return jaxpr, list(body.constants.values()), (number_array, *values)
 
-    def lift_inner_jaxpr(self, closed: ClosedJaxpr) -> tuple[ClosedJaxpr, list[tuple[Var, Any]]]:
-        """The jaxpr of a loop or a branch, its numbers in front of its arguments, and those numbers."""
+    def lift_inner_jaxpr(self, closed_jaxpr: ClosedJaxpr) -> tuple[ClosedJaxpr, list[tuple[Var, Any]]]:
+        """Return the jaxpr of a loop or branch with its numbers as first arguments, and these numbers."""
         body = _LiftedBody(self)
-        fresh = [Var(v.aval) for v in closed.jaxpr.invars]
-        body.append_jaxpr(closed.jaxpr, closed.consts, fresh)
-        invars = [v for v, _ in body.numbers] + fresh
+        argument_vars = [Var(v.aval) for v in closed_jaxpr.jaxpr.invars]
+        body.append_jaxpr(closed_jaxpr.jaxpr, closed_jaxpr.consts, argument_vars)
+        invars = [v for v, _ in body.numbers] + argument_vars
         jaxpr = Jaxpr(
             list(body.constants),
             invars,
             body.outputs,
             body.equations,
-            closed.jaxpr.effects,
-            _debug_info_without_names(closed.jaxpr),
+            closed_jaxpr.jaxpr.effects,
+            _debug_info_without_names(closed_jaxpr.jaxpr),
         )
         return ClosedJaxpr(jaxpr, list(body.constants.values())), body.numbers
 
 
 class _LiftedBody:
-    """Equations under construction."""
+    """Equations, numbers and constants of a jaxpr under construction."""
 
-    def __init__(self, lifting: ConstantLifter):
-        self.lifter = lifting
+    def __init__(self, lifter: ConstantLifter):
+        self.lifter = lifter
         self.equations: list[JaxprEqn] = []
         self.numbers: list[tuple[Var, Any]] = []
         self.constants: dict[Var, Any] = {}
         self.outputs: list = []
-        self._argument_free: dict[
-            Var, Any
-        ] = {}  # what does not depend on the arguments: a number, or the equation that makes it
+        # variables that do not depend on the arguments: a number, or (equation, index of its output)
+        self._argument_free: dict[Var, Any] = {}
 
     def append_jaxpr(self, jaxpr: Jaxpr, consts: Sequence, arguments: Sequence) -> None:
         env: dict[Var, Any] = dict(zip(jaxpr.invars, arguments, strict=True))
         self.outputs = self._append_equations(jaxpr, consts, env)
 
     def _append_equations(self, jaxpr: Jaxpr, consts: Sequence, env: dict[Var, Any]) -> list:
-        named = [
+        formula_uses = [
             (eqn.invars, FORMULA_INPUTS[eqn.primitive.name])
             for eqn in jaxpr.eqns
             if eqn.primitive.name in FORMULA_INPUTS
         ]
-        formulas = {inputs[place] for inputs, (place, _) in named if type(inputs[place]) is Var}
+        formula_vars = {
+            inputs[input_index] for inputs, (input_index, _) in formula_uses if type(inputs[input_index]) is Var
+        }
         for var, value in zip(jaxpr.constvars, consts, strict=True):
-            env[var] = self._lift_or_keep(var, value, var in formulas)
+            env[var] = self._lift_or_keep(var, value, var in formula_vars)
 
         def read(atom):
             return atom if isinstance(atom, Literal) else env[atom]
@@ -107,14 +108,14 @@ class _LiftedBody:
             inputs = [read(a) for a in eqn.invars]
             if eqn.primitive.name in CALL_PRIMITIVES and isinstance(eqn.params.get("jaxpr"), ClosedJaxpr):
                 inner = _expm_substitute(eqn) or eqn.params["jaxpr"]
-                found = self._append_equations(
+                results = self._append_equations(
                     inner.jaxpr, inner.consts, dict(zip(inner.jaxpr.invars, inputs, strict=True))
                 )
-                env.update(zip(eqn.outvars, found, strict=True))
+                env.update(zip(eqn.outvars, results, strict=True))
                 continue
-            fixed = self._constant_outputs(eqn, inputs)
-            if fixed is not None:
-                for var, value in zip(eqn.outvars, fixed, strict=True):
+            constant_values = self._constant_outputs(eqn, inputs)
+            if constant_values is not None:
+                for var, value in zip(eqn.outvars, constant_values, strict=True):
                     inexact = _is_inexact(var.aval)
                     env[var] = (
                         self._lift_number(value, var.aval) if inexact else self._keep_constant(Var(var.aval), value)
@@ -132,8 +133,8 @@ class _LiftedBody:
 
     def _lift_number(self, value, aval) -> Var:
         var = Var(aval)
-        concrete = np.shape(value) == () and not isinstance(value, jax.Array)
-        self.numbers.append((var, float(value) if concrete else value))
+        is_concrete = np.shape(value) == () and not isinstance(value, jax.Array)
+        self.numbers.append((var, float(value) if is_concrete else value))
         self._argument_free[var] = value
         return var
 
@@ -141,22 +142,22 @@ class _LiftedBody:
         self.constants[var] = self._argument_free[var] = value
         return var
 
-    def _lift_or_keep(self, var: Var, value, formula: bool):
+    def _lift_or_keep(self, var: Var, value, is_formula_input: bool):
         if isinstance(value, jax.core.Tracer):
             return self._lift_number(value, var.aval)
-        if getattr(var.aval, "dtype", None) == np.float64 and not formula:
+        if getattr(var.aval, "dtype", None) == np.float64 and not is_formula_input:
             return self._lift_number(value if isinstance(value, jax.Array) else np.asarray(value), var.aval)
         return self._keep_constant(Var(var.aval), value)
 
     def _lift_equation(self, eqn: JaxprEqn, inputs: list) -> tuple[list, dict]:
-        """The inputs and parameters of an equation, its numbers taken out."""
+        """Return the inputs and parameters of an equation, with its numbers as variables."""
         name, params = eqn.primitive.name, dict(eqn.params)
-        more: list = []
+        number_vars: list = []
         if name == "scan":
             params["jaxpr"], numbers = self.lifter.lift_inner_jaxpr(params["jaxpr"])
-            more = self._lift_inner_numbers(numbers)
-            params["num_consts"] += len(more)
-            inputs = more + self._lift_literals(inputs)
+            number_vars = self._lift_inner_numbers(numbers)
+            params["num_consts"] += len(number_vars)
+            inputs = number_vars + self._lift_literals(inputs)
         elif name == "cond":
             params["branches"], inputs = self._lift_branches(params["branches"], inputs)
         elif name == "while":
@@ -165,8 +166,8 @@ class _LiftedBody:
         else:
             if not self.lifter.has_while_loop:
                 self.lifter.has_while_loop = any(_has_while_loop(p) for p in params.values())
-            place = _formula_input_index(name, inputs)
-            inputs = [a if i == place else self._lift_literals([a])[0] for i, a in enumerate(inputs)]
+            formula_index = _formula_input_index(name, inputs)
+            inputs = [a if i == formula_index else self._lift_literals([a])[0] for i, a in enumerate(inputs)]
         return inputs, params
 
     def _lift_literals(self, inputs: list) -> list:
@@ -176,30 +177,34 @@ class _LiftedBody:
         return [self._lift_number(value, var.aval) for var, value in numbers]
 
     def _lift_branches(self, branches, inputs: list) -> tuple[tuple, list]:
-        """Branches of a choice, which all take the numbers of all of them."""
-        found = [self.lifter.lift_inner_jaxpr(branch) for branch in branches]
-        every = [var for _, numbers in found for var, _ in numbers]
-        taken = [atom for _, numbers in found for atom in self._lift_inner_numbers(numbers)]
-        new = []
-        for closed, numbers in found:
-            own = closed.jaxpr.invars[len(numbers) :]
-            mine = {var for var, _ in numbers}
-            front = [var if var in mine else Var(var.aval) for var in every]
-            new.append(ClosedJaxpr(closed.jaxpr.replace(invars=[*front, *own]), closed.consts))
+        """Return the branches of a ``cond``, each of which takes the numbers of all branches, and the inputs."""
+        lifted_branches = [self.lifter.lift_inner_jaxpr(branch) for branch in branches]
+        number_vars = [var for _, numbers in lifted_branches for var, _ in numbers]
+        outer_vars = [atom for _, numbers in lifted_branches for atom in self._lift_inner_numbers(numbers)]
+        extended_branches = []
+        for closed_jaxpr, numbers in lifted_branches:
+            argument_vars = closed_jaxpr.jaxpr.invars[len(numbers) :]
+            branch_vars = {var for var, _ in numbers}
+            leading_vars = [var if var in branch_vars else Var(var.aval) for var in number_vars]
+            extended_branches.append(
+                ClosedJaxpr(closed_jaxpr.jaxpr.replace(invars=[*leading_vars, *argument_vars]), closed_jaxpr.consts)
+            )
         index, *operands = inputs
-        return tuple(new), [index, *taken, *self._lift_literals(operands)]
+        return tuple(extended_branches), [index, *outer_vars, *self._lift_literals(operands)]
 
-    # -- what follows from numbers alone ----------------------------------------------------------------------------
+    # -- constant folding -----------------------------------------------------------------------------------------
 
     def _constant_outputs(self, eqn: JaxprEqn, inputs: list) -> list | None:
-        """The values of truths or integers that follow from numbers alone: they belong to the operations.
+        """Return the outputs of an equation that depend on numbers only and belong to the operations, or None.
 
-        Or those of large arrays of numbers: a table is kept as it is, not what it is made from.
+        These are truth values and integers, and tables that are made from large arrays: a table is stored as a whole.
         """
-        table = all(map(_is_table, eqn.outvars)) and any(math.prod(a.aval.shape) > MAX_INLINE_NUMBERS for a in inputs)
-        if eqn.effects or (all(_is_inexact(v.aval) for v in eqn.outvars) and not table):
+        makes_table = all(map(_is_table, eqn.outvars)) and any(
+            math.prod(a.aval.shape) > MAX_INLINE_NUMBERS for a in inputs
+        )
+        if eqn.effects or (all(_is_inexact(v.aval) for v in eqn.outvars) and not makes_table):
             return None
-        if not any(_is_inexact(a.aval) for a in inputs) and not table:
+        if not any(_is_inexact(a.aval) for a in inputs) and not makes_table:
             return None
         if not all(isinstance(a, Literal) or a in self._argument_free for a in inputs):
             return None
@@ -209,11 +214,11 @@ class _LiftedBody:
             if isinstance(atom, Literal):
                 return atom.val
             if atom not in memo:
-                found = self._argument_free[atom]
-                if isinstance(found, tuple):
-                    equation, i = found
-                    found = _evaluate_equation(equation, [value(a) for a in equation.invars])[i]
-                memo[atom] = found
+                definition = self._argument_free[atom]
+                if isinstance(definition, tuple):
+                    equation, i = definition
+                    definition = _evaluate_equation(equation, [value(a) for a in equation.invars])[i]
+                memo[atom] = definition
             return memo[atom]
 
         values = [value(a) for a in inputs]
@@ -223,22 +228,22 @@ class _LiftedBody:
 
 
 def _expm_substitute(eqn: JaxprEqn) -> ClosedJaxpr | None:
-    """What takes the place of a function of JAX that unrolls badly, above all its derivatives: the exponential."""
+    """Return the library's matrix exponential for a call of JAX's, whose derivatives unroll badly; otherwise None."""
     if eqn.params.get("name") != "expm" or len(eqn.invars) != 1:
         return None
     aval: Any = eqn.invars[0].aval
-    known, own = _expm_jaxprs(jax.ShapeDtypeStruct(aval.shape, aval.dtype))
-    return own if known is not None and content_key(eqn.params["jaxpr"]) == known else None
+    jax_key, substitute = _expm_jaxprs(jax.ShapeDtypeStruct(aval.shape, aval.dtype))
+    return substitute if jax_key is not None and content_key(eqn.params["jaxpr"]) == jax_key else None
 
 
 @functools.lru_cache(maxsize=64)
 def _expm_jaxprs(shape) -> tuple[Hashable, ClosedJaxpr | None]:
-    """A key of what JAX's does to an array, where that can be traced, and the operations of ours."""
+    """Return a key of JAX's matrix exponential of an array and the jaxpr of the library's; None if no key is found."""
     outer = jax.make_jaxpr(jax.scipy.linalg.expm)(shape)
-    found = [eqn for eqn in outer.eqns if eqn.params.get("name") == "expm"]
-    if len(found) != 1:
+    expm_equations = [eqn for eqn in outer.eqns if eqn.params.get("name") == "expm"]
+    if len(expm_equations) != 1:
         return None, None
-    return content_key(found[0].params["jaxpr"]), jax.make_jaxpr(expm)(shape)
+    return content_key(expm_equations[0].params["jaxpr"]), jax.make_jaxpr(expm)(shape)
 
 
 def _evaluate_equation(eqn: JaxprEqn, values: Sequence) -> list:
@@ -249,7 +254,7 @@ def _evaluate_equation(eqn: JaxprEqn, values: Sequence) -> list:
 
 
 def _debug_info_without_names(jaxpr: Jaxpr) -> DebugInfo:
-    return jaxpr.debug_info._replace(arg_names=None, result_paths=None)  # there are more arguments now
+    return jaxpr.debug_info._replace(arg_names=None, result_paths=None)  # the arguments have changed
 
 
 def _is_inexact(aval) -> bool:
@@ -263,25 +268,25 @@ def _is_table(var: Var) -> bool:
 
 
 def _is_liftable_literal(atom) -> bool:
-    """Whether it is a literal to be lifted."""
+    """Return whether an atom is a literal that is lifted: a nonzero scalar of double precision."""
     if not isinstance(atom, Literal) or getattr(atom.aval, "dtype", None) != np.float64:
         return False
     return bool(atom.val != 0.0) and np.shape(atom.val) == ()
 
 
 FORMULA_INPUTS = {"pow": (1, 2.0), "polygamma": (0, 1.0)}
-"""Which input says by what formula a primitive is computed: where so many times the number is an integer."""
+"""Input that selects the formula of a primitive, and a factor; it stays a constant if their product is an integer."""
 
 
 def _formula_input_index(name: str, inputs: list) -> int | None:
-    """The place of an input that is to stay a number, if there is one."""
-    place, times = FORMULA_INPUTS.get(name, (0, 0.0))
-    known = times and isinstance(inputs[place], Literal)
-    return place if known and float(times * np.real(inputs[place].val)).is_integer() else None
+    """Return the index of the input that must stay a literal, or None."""
+    index, factor = FORMULA_INPUTS.get(name, (0, 0.0))
+    is_literal = factor and isinstance(inputs[index], Literal)
+    return index if is_literal and float(factor * np.real(inputs[index].val)).is_integer() else None
 
 
 def _has_while_loop(parameter) -> bool:
-    """Whether a parameter of an equation has a jaxpr with a loop of unknown length."""
+    """Return whether a parameter of an equation contains a ``while`` loop."""
     if isinstance(parameter, ClosedJaxpr):
         parameter = parameter.jaxpr
     if isinstance(parameter, Jaxpr):

@@ -1,4 +1,4 @@
-"""How the primitives of linear algebra, of sorting, convolution and of special functions become instructions."""
+"""Unrolling rules for linear algebra, sorting, convolution and special functions."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from .calls import LapackCall, MatrixProduct
 from .complex_numbers import ComplexBuilder
 
 MAX_UNROLLED_LU_ROWS = 4
-"""Rows of a matrix whose elimination is unrolled; a larger one is LAPACK's."""
+"""Largest number of rows of a matrix whose LU factorisation is unrolled; LAPACK factorises larger ones."""
 
 MAX_BUBBLE_SORT_ENTRIES = 16
-"""Entries that are sorted by exchanging neighbours; more take a network whose size grows as n log(n)^2."""
+"""Largest number of entries that are sorted by exchanging neighbours; more use a network of size O(n log(n)^2)."""
 
 
 def _matrix_stack(x: np.ndarray) -> np.ndarray:
@@ -25,58 +25,65 @@ def _matrix_stack(x: np.ndarray) -> np.ndarray:
 
 
 def call_lapack(b, name: str, sizes: tuple[int, ...], *matrices: np.ndarray) -> list[np.ndarray]:
-    """The results of a call, as arrays of scalars."""
+    """Call a LAPACK function; return its results as arrays of scalars."""
     is_complex = isinstance(b, ComplexBuilder)
     call = _cached_call(name, sizes, is_complex)
-    given: list[Scalar] = []
+    arguments: list[Scalar] = []
     for x in matrices:
         entries = x.ravel().tolist()
-        given += [a.re for a in entries] + [a.im for a in entries] if is_complex else entries
-    found, arrays = iter(b.real.emit_block(call, *given)), []
-    for shape, real in call.result_specs:
-        size = math.prod(shape)
-        parts = list(itertools.islice(found, size))
-        if is_complex and not real:
-            parts = [ComplexPair(re, im) for re, im in zip(parts, list(itertools.islice(found, size)), strict=True)]
-        arrays.append(scalar_array(parts, shape))
+        arguments += [a.re for a in entries] + [a.im for a in entries] if is_complex else entries
+    results, arrays = iter(b.real.emit_block(call, *arguments)), []
+    for shape, is_real in call.result_specs:
+        n_entries = math.prod(shape)
+        result_entries = list(itertools.islice(results, n_entries))
+        if is_complex and not is_real:
+            result_entries = [
+                ComplexPair(re, im)
+                for re, im in zip(result_entries, list(itertools.islice(results, n_entries)), strict=True)
+            ]
+        arrays.append(scalar_array(result_entries, shape))
     return arrays
 
 
 @functools.lru_cache(maxsize=256)
-def _cached_call(*what) -> LapackCall:
-    """One object for equal calls, so that those of the same matrices merge."""
-    return LapackCall(*what)
+def _cached_call(*spec) -> LapackCall:
+    """Return one object for equal calls, so that calls with equal arguments merge."""
+    return LapackCall(*spec)
 
 
 def matrix_product(b, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """The product of two matrices, as a loop; of complex ones those of their parts."""
+    """Return the product of two matrices, computed in a loop; a complex product is four real ones."""
     if not isinstance(b, ComplexBuilder):
-        (table_x, steps_x), (table_y, steps_y) = _matrix_table(b, x), _matrix_table(b, y)
+        (table_x, strides_x), (table_y, strides_y) = _matrix_table(b, x), _matrix_table(b, y)
         sizes = (*x.shape, y.shape[1])
         return scalar_array(
-            b.emit_block(MatrixProduct(sizes, (steps_x, steps_y)), table_x, table_y), (x.shape[0], y.shape[1])
+            b.emit_block(MatrixProduct(sizes, (strides_x, strides_y)), table_x, table_y), (x.shape[0], y.shape[1])
         )
     (a, c), (d, e) = (
         [elementwise(lambda v, k=k: getattr(as_complex_pair(v), k), m) for k in ("re", "im")] for m in (x, y)
     )
-    ad, ce, ae, cd = (matrix_product(b.real, *both) for both in ((a, d), (c, e), (a, e), (c, d)))
+    ad, ce, ae, cd = (matrix_product(b.real, *factors) for factors in ((a, d), (c, e), (a, e), (c, d)))
     return elementwise(ComplexPair, elementwise(b.real.sub, ad, ce), elementwise(b.real.add, ae, cd))
 
 
 def input_table(b, x: np.ndarray) -> tuple[str, tuple[int, int]] | None:
-    """A matrix that lies in memory as it is given, such as parameters, or its transpose: nothing is copied.
+    """Return the table of a matrix, or of its transpose, that is an input of the program, without a copy.
 
-    Its table, and how far apart entries are there of neighbouring rows, and of neighbouring columns.
+    The result is the name of the table and the distances in it between neighbouring rows and between neighbouring
+    columns. It is None if the matrix is not an input.
     """
     names = x.ravel().tolist()
-    outer = b.input_indices(names)
-    if outer is None or len({place for place, _ in outer}) > 1:
+    positions = b.input_indices(names)
+    if positions is None or len({array_index for array_index, _ in positions}) > 1:
         return None
-    numbers = np.array([number for _, number in outer]).reshape(x.shape)
+    entry_indices = np.array([entry_index for _, entry_index in positions]).reshape(x.shape)
     rows, columns = x.shape
-    for steps in ((columns, 1), (1, rows)):
-        if (numbers - numbers[0, 0] == np.add.outer(steps[0] * np.arange(rows), steps[1] * np.arange(columns))).all():
-            return b.table([names[i] for i in np.argsort(numbers, axis=None)]), steps
+    for strides in ((columns, 1), (1, rows)):
+        if (
+            entry_indices - entry_indices[0, 0]
+            == np.add.outer(strides[0] * np.arange(rows), strides[1] * np.arange(columns))
+        ).all():
+            return b.table([names[i] for i in np.argsort(entry_indices, axis=None)]), strides
     return None
 
 
@@ -85,17 +92,17 @@ def _matrix_table(b, x: np.ndarray) -> tuple[str, tuple[int, int]]:
 
 
 def _map_matrices(b, eqn, x: np.ndarray, function) -> list[np.ndarray]:
-    """``function`` of each matrix in x, shape (..., m, n): arrays with the same axes in front."""
-    found = [function(a) for a in _matrix_stack(x)]
+    """Apply ``function`` to each matrix of x, shape (..., m, n); return arrays with the same leading axes."""
+    results = [function(a) for a in _matrix_stack(x)]
     outputs = []
-    for var, parts in zip(eqn.outvars, zip(*found, strict=True), strict=True):
-        outputs.append(scalar_array([a for part in parts for a in part.ravel().tolist()], var.aval.shape))
+    for var, matrices in zip(eqn.outvars, zip(*results, strict=True), strict=True):
+        outputs.append(scalar_array([a for matrix in matrices for a in matrix.ravel().tolist()], var.aval.shape))
     return outputs
 
 
 def eigh(b, eqn, a):
     if eqn.params["subset_by_index"] not in (None, (0, a.shape[-1])):
-        raise NotImplementedError("of some eigenvalues alone")
+        raise NotImplementedError("for a subset of the eigenvalues")
     lower = eqn.params["lower"]
 
     def eigh_of_matrix(m):
@@ -105,35 +112,35 @@ def eigh(b, eqn, a):
     return _map_matrices(b, eqn, a, eigh_of_matrix)
 
 
-def _swap_rows(b, x: np.ndarray, k: int, place: Scalar) -> np.ndarray:
-    """A matrix with row k and the row at a place, which is not before k, in each other's place."""
-    x, first, rest = x.copy(), x[k].copy(), x[k:].copy()
+def _swap_rows(b, x: np.ndarray, k: int, pivot: Scalar) -> np.ndarray:
+    """Return a matrix with row k and row ``pivot`` exchanged, where ``pivot >= k``."""
+    x, row_k, candidate_rows = x.copy(), x[k].copy(), x[k:].copy()
     for j in range(x.shape[1]):
-        x[k, j] = b.pick(b.real.sub(place, k), list(rest[:, j]))
+        x[k, j] = b.pick(b.real.sub(pivot, k), list(candidate_rows[:, j]))
     for i in range(k + 1, len(x)):
-        hit = b.real.op("eq", place, i)
+        is_hit = b.real.op("eq", pivot, i)
         for j in range(x.shape[1]):
-            x[i, j] = b.select(hit, first[j], x[i, j])
+            x[i, j] = b.select(is_hit, row_k[j], x[i, j])
     return x
 
 
 def _unrolled_lu(b, a: np.ndarray) -> tuple[np.ndarray, list[Scalar]]:
-    """LU factors with the largest pivots, and the row that each is exchanged with."""
+    """Return the LU factors with partial pivoting, and the row with which each row is exchanged."""
     a, r = a.copy(), b.real
     pivots: list[Scalar] = []
     for k in range(min(a.shape)):
-        sizes = [r.op("abs", v) if not isinstance(b, ComplexBuilder) else b.modulus(v) for v in a[k:, k]]
-        best, at = sizes[0], k
-        for i, size in enumerate(sizes[1:], k + 1):
-            larger = r.op("gt", size, best)
-            best, at = r.select(larger, size, best), r.select(larger, i, at)
-        a = _swap_rows(b, a, k, at)
-        pivots.append(at)
+        moduli = [r.op("abs", v) if not isinstance(b, ComplexBuilder) else b.modulus(v) for v in a[k:, k]]
+        max_modulus, pivot_index = moduli[0], k
+        for i, modulus in enumerate(moduli[1:], k + 1):
+            is_larger = r.op("gt", modulus, max_modulus)
+            max_modulus, pivot_index = r.select(is_larger, modulus, max_modulus), r.select(is_larger, i, pivot_index)
+        a = _swap_rows(b, a, k, pivot_index)
+        pivots.append(pivot_index)
         for i in range(k + 1, len(a)):
             factor = b.div(a[i, k], a[k, k])
-            # a column of zeros stays one, as LAPACK has it
-            zero = b.op("eq", a[k, k], 0.0)
-            a[i, k] = b.select(zero, a[i, k], factor)
+            # a column of zeros stays zero, as in LAPACK
+            is_zero = b.op("eq", a[k, k], 0.0)
+            a[i, k] = b.select(is_zero, a[i, k], factor)
             for j in range(k + 1, a.shape[1]):
                 a[i, j] = b.sub(a[i, j], b.mul(a[i, k], a[k, j]))
     return a, pivots
@@ -147,18 +154,18 @@ def lu(b, eqn, a):
         if m <= MAX_UNROLLED_LU_ROWS and n <= MAX_UNROLLED_LU_ROWS:
             factors, pivots = _unrolled_lu(b, x)
         else:
-            factors, found = call_lapack(b, "lu", (m, n), x)
-            pivots = [r.op("truncate", p) for p in found.tolist()]
+            factors, pivot_values = call_lapack(b, "lu", (m, n), x)
+            pivots = [r.op("truncate", p) for p in pivot_values.tolist()]
         order = constant_array(np.arange(m)[:, None])
-        for k, place in enumerate(pivots):
-            order = _swap_rows(r, order, k, place)
+        for k, pivot in enumerate(pivots):
+            order = _swap_rows(r, order, k, pivot)
         return factors, scalar_array(pivots, (len(pivots),)), order[:, 0]
 
     return _map_matrices(b, eqn, a, lu_of_matrix)
 
 
 def inverse(b, eqn, a):
-    """The primitive is the library's own: see :func:`..engines.stages.newton_steps`."""
+    """Unroll the primitive ``inverse`` of :mod:`liethermo.engines.stages`, which Newton's method calls."""
     return _map_matrices(b, eqn, a, lambda x: call_lapack(b, "inverse", (len(x),), x))
 
 
@@ -172,13 +179,13 @@ def qr(b, eqn, a):
 
 def svd(b, eqn, a):
     if eqn.params["subset_by_index"] not in (None, (0, min(a.shape[-2:]))):
-        raise NotImplementedError("of some singular values alone")
+        raise NotImplementedError("for a subset of the singular values")
     m, n = a.shape[-2:]
     full = int(eqn.params["full_matrices"]) if eqn.params["compute_uv"] else 0
 
     def svd_of_matrix(x):
-        found = call_lapack(b, "svd", (m, n, full), x)
-        return found if eqn.params["compute_uv"] else found[:1]
+        results = call_lapack(b, "svd", (m, n, full), x)
+        return results if eqn.params["compute_uv"] else results[:1]
 
     return _map_matrices(b, eqn, a, svd_of_matrix)
 
@@ -187,22 +194,22 @@ def cholesky(b, eqn, a):
     n, r = a.shape[-1], b.real
     lower = constant_array(np.zeros(a.shape))
     for A, L in zip(_matrix_stack(a), _matrix_stack(lower), strict=True):
-        positive: Scalar = True
+        is_positive: Scalar = True
         for j in range(n):
             pivot = reduce(b.sub, (b.mul(v, b.conj(v)) for v in L[j, :j]), A[j, j])
-            size = pivot.re if isinstance(pivot, ComplexPair) else pivot
-            positive = r.op("and", positive, r.op("gt", size, 0.0))
-            root = r.op("sqrt", size)
+            real_pivot = pivot.re if isinstance(pivot, ComplexPair) else pivot
+            is_positive = r.op("and", is_positive, r.op("gt", real_pivot, 0.0))
+            root = r.op("sqrt", real_pivot)
             L[j, j] = ComplexPair(root, 0.0) if isinstance(pivot, ComplexPair) else root
             for i in range(j + 1, n):
                 products = (b.mul(u, b.conj(v)) for u, v in zip(L[i, :j], L[j, :j], strict=True))
                 L[i, j] = b.div(reduce(b.sub, products, A[i, j]), L[j, j])
-        L[...] = elementwise(lambda v, ok=positive: b.select(ok, v, math.nan), L)
+        L[...] = elementwise(lambda v, ok=is_positive: b.select(ok, v, math.nan), L)
     return elementwise(lambda v: b.add(v, 0.0), lower) if isinstance(b, ComplexBuilder) else lower
 
 
 def triangular_solve(b, eqn, a, rhs):
-    """``x`` with ``a x = rhs``, or ``x a = rhs``, by substitution."""
+    """Solve ``a x = rhs``, or ``x a = rhs``, by substitution."""
     params = eqn.params
     if params["transpose_a"] and params["conjugate_a"]:
         a = elementwise(b.conj, a)
@@ -214,10 +221,10 @@ def triangular_solve(b, eqn, a, rhs):
     n, x = a.shape[-1], rhs.copy()
     order = range(n) if lower else range(n)[::-1]
     for A, X in zip(_matrix_stack(a), _matrix_stack(x), strict=True):
-        for done, i in enumerate(order):
+        for n_solved, i in enumerate(order):
             for k in range(X.shape[1]):
-                rest = reduce(b.sub, (b.mul(A[i, j], X[j, k]) for j in order[:done]), X[i, k])
-                X[i, k] = rest if params["unit_diagonal"] else b.div(rest, A[i, i])
+                residual = reduce(b.sub, (b.mul(A[i, j], X[j, k]) for j in order[:n_solved]), X[i, k])
+                X[i, k] = residual if params["unit_diagonal"] else b.div(residual, A[i, i])
     return x if params["left_side"] else x.swapaxes(-1, -2)
 
 
@@ -225,25 +232,25 @@ def triangular_solve(b, eqn, a, rhs):
 
 
 def is_sorted_before(b, kind: str, x: Scalar, y: Scalar) -> Scalar:
-    """Whether x stands before y where numbers are in order: NaN is the last."""
-    less = b.op("lt", x, y)
-    return less if kind != "f" else b.op("or", less, b.op("and", b.op("ne", y, y), b.op("eq", x, x)))
+    """Return the truth value that x is sorted before y; NaN is sorted last."""
+    is_less = b.op("lt", x, y)
+    return is_less if kind != "f" else b.op("or", is_less, b.op("and", b.op("ne", y, y), b.op("eq", x, x)))
 
 
 def _sorting_network(n: int):
-    """Pairs of places to be compared: neighbours, which keeps the order of what is alike; or Batcher's [Knuth]."""
+    """Yield pairs of indices to be compared: neighbours, which sort stably, or Batcher's network [Knuth]."""
     if n <= MAX_BUBBLE_SORT_ENTRIES:
         yield from ((j, j + 1) for i in range(n) for j in range(n - 1 - i))
         return
     t = (n - 1).bit_length()
     p = 1 << (t - 1)
     while p:
-        q, rest, d = 1 << (t - 1), 0, p
+        q, r, d = 1 << (t - 1), 0, p
         while True:
-            yield from ((i, i + d) for i in range(n - d) if i & p == rest)
+            yield from ((i, i + d) for i in range(n - d) if i & p == r)
             if q == p:
                 break
-            d, q, rest = q - p, q >> 1, p
+            d, q, r = q - p, q >> 1, p
         p >>= 1
 
 
@@ -251,28 +258,28 @@ def sort(b, eqn, *operands):
     axis, keys = eqn.params["dimension"], eqn.params["num_keys"]
     n = operands[0].shape[axis]
     kinds = ["f" if var.aval.dtype.kind == "f" else "i" for var in eqn.invars[:keys]]
-    moved = [np.moveaxis(x, axis, -1).copy() for x in operands]
-    for place in np.ndindex(*moved[0].shape[:-1]):
-        rows = [x[place].tolist() for x in moved]
-        key_rows, more = list(rows[:keys]), []
-        own = list(kinds)
-        if n > MAX_BUBBLE_SORT_ENTRIES:  # the network does not keep the order of what is alike
-            more, own = [list(range(n))], [*kinds, "i"]
+    arrays = [np.moveaxis(x, axis, -1).copy() for x in operands]
+    for index in np.ndindex(*arrays[0].shape[:-1]):
+        rows = [x[index].tolist() for x in arrays]
+        key_rows, tie_breakers = list(rows[:keys]), []
+        key_kinds = list(kinds)
+        if n > MAX_BUBBLE_SORT_ENTRIES:  # the network is not stable
+            tie_breakers, key_kinds = [list(range(n))], [*kinds, "i"]
         for i, j in _sorting_network(n):
-            swaps: Scalar = False
-            for key, kind in reversed(list(zip([*key_rows, *more], own, strict=True))):
-                other = is_sorted_before(b, kind, key[j], key[i])
-                alike = b.op("not", b.op("or", other, is_sorted_before(b, kind, key[i], key[j])))
-                swaps = b.op("or", other, b.op("and", alike, swaps))
-            for row in (*rows, *more):
-                row[i], row[j] = b.select(swaps, row[j], row[i]), b.select(swaps, row[i], row[j])
-        for x, row in zip(moved, rows, strict=True):
-            x[place] = scalar_array(row, (n,))
-    return [np.moveaxis(x, -1, axis) for x in moved]
+            must_swap: Scalar = False
+            for key, kind in reversed(list(zip([*key_rows, *tie_breakers], key_kinds, strict=True))):
+                is_less = is_sorted_before(b, kind, key[j], key[i])
+                is_equal = b.op("not", b.op("or", is_less, is_sorted_before(b, kind, key[i], key[j])))
+                must_swap = b.op("or", is_less, b.op("and", is_equal, must_swap))
+            for row in (*rows, *tie_breakers):
+                row[i], row[j] = b.select(must_swap, row[j], row[i]), b.select(must_swap, row[i], row[j])
+        for x, row in zip(arrays, rows, strict=True):
+            x[index] = scalar_array(row, (n,))
+    return [np.moveaxis(x, -1, axis) for x in arrays]
 
 
 def total_order_rule(op: str):
-    """``lt_to`` and ``le_to``: NaN is the last of all numbers, and -0 stands before 0."""
+    """Return the rule of ``lt_to`` or ``le_to``, in whose order NaN is last and -0 is before 0."""
 
     def rule(b, eqn, x, y):
         kind = eqn.invars[0].aval.dtype.kind
@@ -293,22 +300,22 @@ def total_order_rule(op: str):
 
 
 def convolution(b, eqn, x, kernel):
-    """``conv_general_dilated``: the sum of the products that fall together."""
+    """Unroll ``conv_general_dilated`` into sums of products."""
     params, dims = eqn.params, eqn.params["dimension_numbers"]
     if params["batch_group_count"] != 1:
-        raise NotImplementedError("with groups of batches")
+        raise NotImplementedError("with batch_group_count > 1")
     x, kernel = x.transpose(dims.lhs_spec), kernel.transpose(dims.rhs_spec)
     shape = tuple(eqn.outvars[0].aval.shape[i] for i in dims.out_spec)
     groups, inputs = params["feature_group_count"], kernel.shape[1]
     result = np.empty(shape, object)
-    for place in np.ndindex(*shape):
-        n, channel, at = place[0], place[1], place[2:]
-        first = channel // (shape[1] // groups) * inputs
+    for index in np.ndindex(*shape):
+        n, channel, position = index[0], index[1], index[2:]
+        first_input = channel // (shape[1] // groups) * inputs
         products = []
         for offset in np.ndindex(*kernel.shape[2:]):
             source = []
-            for i, j, stride, (low, _), dilation, spread, size in zip(
-                at,
+            for i, j, stride, (low, _), input_dilation, kernel_dilation, axis_length in zip(
+                position,
                 offset,
                 params["window_strides"],
                 params["padding"],
@@ -317,13 +324,15 @@ def convolution(b, eqn, x, kernel):
                 x.shape[2:],
                 strict=True,
             ):
-                where, rest = divmod(i * stride + j * spread - low, dilation)
-                if rest or not 0 <= where < size:
+                source_index, remainder = divmod(i * stride + j * kernel_dilation - low, input_dilation)
+                if remainder or not 0 <= source_index < axis_length:
                     break
-                source.append(where)
+                source.append(source_index)
             else:
-                products += [b.mul(x[(n, first + c, *source)], kernel[(channel, c, *offset)]) for c in range(inputs)]
-        result[place] = reduce(b.add, products, 0.0)
+                products += [
+                    b.mul(x[(n, first_input + c, *source)], kernel[(channel, c, *offset)]) for c in range(inputs)
+                ]
+        result[index] = reduce(b.add, products, 0.0)
     return result.transpose(np.argsort(dims.out_spec))
 
 
@@ -335,70 +344,70 @@ EULER_MACLAURIN_DIVISORS += [1.8152105401943546773e17, -7.1661652561756670113e18
 """Divisors ``(2 j)! / B_2j`` of the terms j = 1, 2, ... of the asymptotic series of ``zeta``."""
 
 ZETA_DIRECT_TERMS = 10
-"""Terms that are summed before the asymptotic series of ``zeta`` begins."""
+"""Number of terms of ``zeta`` that are summed before its asymptotic series begins."""
 
 
 def zeta(b, s: Scalar, q: Scalar) -> Scalar:
     """Return Hurwitz's ``sum_k (q + k)^-s`` by the formula of Euler and Maclaurin, term by term as XLA computes it.
 
-    For q < 0 and an integer s too, but the series is of little use where ``q + 10`` is not well above zero.
+    The formula holds for q < 0 and an integer s too, but the series is inaccurate unless ``q + 10`` is well above zero.
     """
-    minus = b.neg(s)
-    total = reduce(b.add, (b.pow(b.add(q, float(k)), minus) for k in range(ZETA_DIRECT_TERMS)))
-    at = b.add(q, float(ZETA_DIRECT_TERMS))
-    power = b.pow(at, minus)
-    total = b.add(total, b.div(b.mul(power, at), b.sub(s, 1.0)))
-    inverse_square, series = b.div(1.0, b.mul(at, at)), 0.0
+    minus_s = b.neg(s)
+    total = reduce(b.add, (b.pow(b.add(q, float(k)), minus_s) for k in range(ZETA_DIRECT_TERMS)))
+    q_end = b.add(q, float(ZETA_DIRECT_TERMS))
+    power = b.pow(q_end, minus_s)
+    total = b.add(total, b.div(b.mul(power, q_end), b.sub(s, 1.0)))
+    inverse_square, series = b.div(1.0, b.mul(q_end, q_end)), 0.0
     for j in reversed(range(1, len(EULER_MACLAURIN_DIVISORS))):
-        rising = b.mul(b.add(s, 2.0 * j), b.add(s, 2.0 * j - 1.0))
-        series = b.mul(rising, b.mul(inverse_square, b.add(series, 1.0 / EULER_MACLAURIN_DIVISORS[j])))
+        rising_factorial = b.mul(b.add(s, 2.0 * j), b.add(s, 2.0 * j - 1.0))
+        series = b.mul(rising_factorial, b.mul(inverse_square, b.add(series, 1.0 / EULER_MACLAURIN_DIVISORS[j])))
     series = b.add(series, 1.0 / EULER_MACLAURIN_DIVISORS[0])
-    total = b.add(total, b.mul(power, b.add(b.mul(b.div(s, at), series), 0.5)))
+    total = b.add(total, b.mul(power, b.add(b.mul(b.div(s, q_end), series), 0.5)))
 
     def is_integer(a: Scalar) -> Scalar:
         return b.op("eq", a, b.op("floor", a))
 
-    below = b.op("le", q, 0.0)
+    is_nonpositive = b.op("le", q, 0.0)
     is_even = b.op("and", is_integer(s), b.op("eq", b.op("rem", s, 2.0), 0.0))
-    undefined = b.op("or", b.op("lt", s, 1.0), b.op("and", below, b.op("not", is_integer(s))))
-    at_pole = b.op("and", below, is_integer(q))
-    total = b.select(at_pole, b.select(is_even, math.inf, math.nan), b.select(undefined, math.nan, total))
+    is_undefined = b.op("or", b.op("lt", s, 1.0), b.op("and", is_nonpositive, b.op("not", is_integer(s))))
+    is_pole = b.op("and", is_nonpositive, is_integer(q))
+    total = b.select(is_pole, b.select(is_even, math.inf, math.nan), b.select(is_undefined, math.nan, total))
     return b.select(b.op("eq", s, 1.0), math.inf, total)
 
 
 def digamma(b, x: Scalar) -> Scalar:
-    """Return the logarithmic derivative of the gamma function: NaN at zero, as XLA has it."""
+    """Return the logarithmic derivative of the gamma function; NaN at zero, as in XLA."""
     return b.select(b.op("eq", x, 0.0), math.nan, b.op("digamma", x))
 
 
 def lgamma(b, x: Scalar) -> Scalar:
-    """Return ``log(abs(gamma(x)))``: infinity at minus infinity, as XLA has it."""
+    """Return ``log(abs(gamma(x)))``; infinity at minus infinity, as in XLA."""
     return b.select(b.op("eq", x, -math.inf), math.inf, b.op("lgamma", x))
 
 
 def incomplete_gamma_rule(op: str):
-    """Return the rule of ``igamma`` or ``igammac``, which JAX leaves undefined at some limits.
+    """Return the rule of ``igamma`` or ``igammac``, with NaN at the limits where JAX returns NaN.
 
-    So it is for a = 0 and x < 1 (``igamma`` alone), and for an infinite a and a finite x >= 1.
+    These are a = 0 with x < 1 (``igamma`` only), and an infinite a with a finite x >= 1.
     """
     limit = 1.0 if op == "igamma" else 0.0
 
     def incomplete_gamma_of(b, a: Scalar, x: Scalar) -> Scalar:
-        found = b.op(op, a, x)
+        result = b.op(op, a, x)
         if op == "igamma":
-            found = b.select(b.op("and", b.op("eq", a, 0.0), b.op("lt", x, 1.0)), math.nan, found)
-        infinite = b.op("and", b.op("eq", a, math.inf), b.op("ge", x, 1.0))
-        return b.select(infinite, b.select(b.op("eq", x, math.inf), limit, math.nan), found)
+            result = b.select(b.op("and", b.op("eq", a, 0.0), b.op("lt", x, 1.0)), math.nan, result)
+        is_infinite = b.op("and", b.op("eq", a, math.inf), b.op("ge", x, 1.0))
+        return b.select(is_infinite, b.select(b.op("eq", x, math.inf), limit, math.nan), result)
 
     return lambda b, eqn, a, x: elementwise(lambda u, v: incomplete_gamma_of(b, u, v), a, x)
 
 
 def polygamma(b, eqn, order, x):
-    """The derivatives of digamma."""
+    """Return the derivative of ``digamma`` of a constant order."""
 
     def polygamma_of(m, v):
         if type(m) is str:
-            raise NotImplementedError("of an order that is not known at compile time")
+            raise NotImplementedError("with an order that is unknown at compile time")
         if not math.isfinite(m) or m != int(m) or m < 0:
             return math.nan
         if m == 0:

@@ -1,4 +1,4 @@
-"""The rules by which each JAX primitive becomes scalar arithmetic: ``rule(builder, equation, *arrays)``."""
+"""Rules that unroll each JAX primitive into scalar arithmetic: ``rule(builder, equation, *arrays)``."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _dtype(eqn, argument: int = 0) -> np.dtype:
 
 
 def _numeric_rule(method: str) -> Rule:
-    """A method of the builder, on numbers."""
+    """Return the rule that applies a method of the builder to numbers."""
 
     def rule(b, eqn, *arrays):
         if _dtype(eqn).kind == "b":
@@ -44,12 +44,12 @@ def _numeric_rule(method: str) -> Rule:
     return rule
 
 
-def _extremum_rule(method: str, of_truths: str) -> Rule:
-    """The larger, or the smaller, of two numbers, or of two truth values."""
+def _extremum_rule(method: str, boolean_op: str) -> Rule:
+    """Return the rule of ``max`` or ``min``, for numbers and for truth values."""
 
     def rule(b, eqn, x, y):
         if _dtype(eqn).kind == "b":
-            return elementwise(lambda u, v: b.op(of_truths, u, v), x, y)
+            return elementwise(lambda u, v: b.op(boolean_op, u, v), x, y)
         return elementwise(getattr(b, method), x, y)
 
     return rule
@@ -60,12 +60,12 @@ def _power(b, eqn, x, y):
 
 
 def _operation_rule(op: str) -> Rule:
-    """An operation that has nothing to simplify."""
+    """Return the rule of an operation that the builder does not simplify."""
     return lambda b, eqn, *arrays: elementwise(lambda *args: b.op(op, *args), *arrays)
 
 
 def _rearrangement_rule(function: Callable[..., Any]) -> Rule:
-    """A rearrangement of entries: ``function(array, parameters)``."""
+    """Return the rule that rearranges entries by ``function(array, parameters)``."""
     return lambda b, eqn, x: function(x, eqn.params)
 
 
@@ -75,8 +75,8 @@ def _identity(b, eqn, *arrays):
 
 def _deferred_rule(b, eqn, *arrays):
     avals = [var.aval for var in eqn.outvars]
-    found = b.emit_block(DeferredBlock(scalar_kinds(avals)), *flatten_scalars(arrays))
-    return unflatten_scalars(iter(found), avals)
+    results = b.emit_block(DeferredBlock(scalar_kinds(avals)), *flatten_scalars(arrays))
+    return unflatten_scalars(iter(results), avals)
 
 
 def _divide(b, eqn, x, y):
@@ -92,8 +92,8 @@ def _remainder(b, eqn, x, y):
 
 
 def _integer_pow(b, eqn, x):
-    one = _dtype(eqn).type(1).item()
-    return elementwise(lambda a: b.integer_pow(a, eqn.params["y"], one), x)
+    unit = _dtype(eqn).type(1).item()
+    return elementwise(lambda a: b.integer_pow(a, eqn.params["y"], unit), x)
 
 
 def _not(b, eqn, x):
@@ -111,13 +111,13 @@ def _round(b, eqn, x):
     return elementwise((lambda a: b.op("rint", a)) if to_even else b.round_half_away, x)
 
 
-def _select(b, eqn, which, *cases):
+def _select(b, eqn, selector, *cases):
     if _dtype(eqn).kind == "b":
-        return elementwise(b.select, which, cases[1], cases[0])
-    chosen = cases[-1]
+        return elementwise(b.select, selector, cases[1], cases[0])
+    result = cases[-1]
     for i in reversed(range(len(cases) - 1)):
-        chosen = elementwise(lambda w, a, rest, i=i: b.select(b.op("le", w, i), a, rest), which, cases[i], chosen)
-    return chosen
+        result = elementwise(lambda s, a, c, i=i: b.select(b.op("le", s, i), a, c), selector, cases[i], result)
+    return result
 
 
 def _convert(b, eqn, x):
@@ -125,9 +125,9 @@ def _convert(b, eqn, x):
 
 
 def convert_dtype(b, x: np.ndarray, source: np.dtype, target: np.dtype) -> np.ndarray:
-    """Return an array of scalars of one type as those of another, integers not yet wrapped around.
+    """Return an array of scalars converted from one dtype to another; integers are not yet wrapped around.
 
-    A number becomes the nearest integer of the type that lies towards zero, and NaN becomes 0, as XLA has it.
+    A real number is rounded towards zero and clipped to the range of the integer type; NaN becomes 0, as in XLA.
     """
     conversion = (source.kind + target.kind).replace("u", "i")
     if conversion in ("ff", "ii", "bb", "cc"):
@@ -142,10 +142,10 @@ def convert_dtype(b, x: np.ndarray, source: np.dtype, target: np.dtype) -> np.nd
     if target.kind == "b":
         return elementwise(lambda a: b.op("ne", a, 0), x)
     if conversion == "fi":
-        limits, whole = np.iinfo(target), elementwise(lambda a: b.op("truncate", a), x)
+        limits, integers = np.iinfo(target), elementwise(lambda a: b.op("truncate", a), x)
         if target == np.int64:
-            return whole
-        return elementwise(lambda a: b.min(b.max(a, int(limits.min)), int(limits.max)), whole)
+            return integers
+        return elementwise(lambda a: b.min(b.max(a, int(limits.min)), int(limits.max)), integers)
     return elementwise(lambda a: b.op("float" if target.kind == "f" else "int", a), x)
 
 
@@ -153,7 +153,7 @@ def _reduction_rule(combine: Callable[..., Scalar], start: Scalar | None = None)
     def rule(b, eqn, x):
         rows, shape = entries_along(x, eqn.params["axes"])
         if start is None and not all(rows):
-            raise NotImplementedError("of no entries")
+            raise NotImplementedError("over an empty axis")
         empty: Any = 0.0 if start is None else constant_array(start, _dtype(eqn)).item()
         return scalar_array([reduce(lambda u, v: combine(b, u, v), row) if row else empty for row in rows], shape)
 
@@ -168,16 +168,16 @@ def _builder_operation(op: str) -> Callable[..., Scalar]:
     return lambda b, u, v: b.op(op, u, v)
 
 
-def _arg_extremum_rule(better: str) -> Rule:
-    """The first place of the extreme entry; NaN counts as one."""
+def _arg_extremum_rule(comparison: str) -> Rule:
+    """Return the rule for the first index of the extreme entry; NaN counts as extreme."""
 
     def first_extremum_index(b, row):
-        best, at = row[0], 0
+        extremum, index = row[0], 0
         for i, v in enumerate(row[1:], 1):
-            nan_first = b.op("and", b.op("ne", v, v), b.op("eq", best, best))
-            wins = b.op("or", b.op(better, v, best), nan_first)
-            best, at = b.select(wins, v, best), b.select(wins, i, at)
-        return at
+            nan_first = b.op("and", b.op("ne", v, v), b.op("eq", extremum, extremum))
+            is_better = b.op("or", b.op(comparison, v, extremum), nan_first)
+            extremum, index = b.select(is_better, v, extremum), b.select(is_better, i, index)
+        return index
 
     def rule(b, eqn, x):
         rows, shape = entries_along(x, eqn.params["axes"])
@@ -196,58 +196,65 @@ def _cumulative_rule(combine: Callable[..., Scalar]) -> Rule:
     return rule
 
 
-MAX_UNROLLED_PRODUCTS, MAX_UNROLLED_INPUT_PRODUCTS, MAX_UNROLLED_OUTER_PRODUCTS = 900, 100, 9_000
-"""Products of real numbers in a product of matrices that is unrolled, at most: more are a loop. Where one of them lies
-in memory as it is given, such as the weights of a network, a loop copies nothing, and is worth it earlier. A product
-of a column and a row sums nothing: unrolled, it costs only those of its entries that are used."""
+MAX_UNROLLED_PRODUCTS = 900
+"""Largest number of scalar products in a product of matrices that is unrolled; a larger one becomes a loop."""
+
+MAX_UNROLLED_INPUT_PRODUCTS = 100
+"""Limit that replaces :data:`MAX_UNROLLED_PRODUCTS` if a matrix is an input, such as the weights of a network.
+
+A loop reads the input in place and copies nothing, so it pays off earlier.
+"""
+
+MAX_UNROLLED_OUTER_PRODUCTS = 9_000
+"""Limit that replaces :data:`MAX_UNROLLED_PRODUCTS` for an outer product, whose unused entries cost nothing."""
 
 
 def _count_products(rows: np.ndarray, columns: np.ndarray) -> int:
-    """How many products of entries a product of two matrices takes, those with a zero left out."""
+    """Return the number of scalar products in a product of two matrices, without those that have a zero factor."""
     counts = [np.reshape([not _is_zero(a) for a in x.ravel().tolist()], x.shape).sum(axis=0) for x in (rows, columns)]
     return int(np.sum(counts[0] * counts[1]))
 
 
 def _is_zero(a: Scalar) -> bool:
-    parts = (a.re, a.im) if isinstance(a, ComplexPair) else (a,)
-    return all(type(part) is not str and part == 0 for part in parts)
+    components = (a.re, a.im) if isinstance(a, ComplexPair) else (a,)
+    return all(type(component) is not str and component == 0 for component in components)
 
 
 def _needs_loop(b, rows: np.ndarray, columns: np.ndarray) -> bool:
-    """Whether the product of two matrices, the second by its columns, is better a loop."""
-    count = _count_products(rows, columns)
-    if b.real is not b:  # of complex numbers
-        return 4 * count > MAX_UNROLLED_PRODUCTS
+    """Return whether the product of two matrices, the second given by its columns, should be a loop."""
+    n_products = _count_products(rows, columns)
+    if b.real is not b:  # complex numbers
+        return 4 * n_products > MAX_UNROLLED_PRODUCTS
     if rows.shape[-1] == 1:
-        return count > MAX_UNROLLED_OUTER_PRODUCTS
-    if count > MAX_UNROLLED_PRODUCTS or count <= MAX_UNROLLED_INPUT_PRODUCTS:
-        return count > MAX_UNROLLED_PRODUCTS
+        return n_products > MAX_UNROLLED_OUTER_PRODUCTS
+    if n_products > MAX_UNROLLED_PRODUCTS or n_products <= MAX_UNROLLED_INPUT_PRODUCTS:
+        return n_products > MAX_UNROLLED_PRODUCTS
     return any(min(x.shape) > 1 and algebra.input_table(b, x) is not None for x in (rows, columns))
 
 
 def _dot_general(b, eqn, x, y):
     (sum_x, sum_y), (batch_x, batch_y) = eqn.params["dimension_numbers"]
-    rest_x = [i for i in range(x.ndim) if i not in (*sum_x, *batch_x)]
-    rest_y = [i for i in range(y.ndim) if i not in (*sum_y, *batch_y)]
-    shape = [x.shape[i] for i in (*batch_x, *rest_x)] + [y.shape[i] for i in rest_y]
-    batch, size = math.prod(x.shape[i] for i in batch_x), math.prod(x.shape[i] for i in sum_x)
-    left = x.transpose(*batch_x, *rest_x, *sum_x).reshape(batch, math.prod(x.shape[i] for i in rest_x), size)
-    right = y.transpose(*batch_y, *rest_y, *sum_y).reshape(batch, math.prod(y.shape[i] for i in rest_y), size)
+    free_x = [i for i in range(x.ndim) if i not in (*sum_x, *batch_x)]
+    free_y = [i for i in range(y.ndim) if i not in (*sum_y, *batch_y)]
+    shape = [x.shape[i] for i in (*batch_x, *free_x)] + [y.shape[i] for i in free_y]
+    n_batches, n_summed = math.prod(x.shape[i] for i in batch_x), math.prod(x.shape[i] for i in sum_x)
+    lhs = x.transpose(*batch_x, *free_x, *sum_x).reshape(n_batches, math.prod(x.shape[i] for i in free_x), n_summed)
+    rhs = y.transpose(*batch_y, *free_y, *sum_y).reshape(n_batches, math.prod(y.shape[i] for i in free_y), n_summed)
     dtype = eqn.outvars[0].aval.dtype
-    left, right = (convert_dtype(b, side, _dtype(eqn, i), dtype) for i, side in enumerate((left, right)))
+    lhs, rhs = (convert_dtype(b, operand, _dtype(eqn, i), dtype) for i, operand in enumerate((lhs, rhs)))
     if dtype.kind == "b":
-        both = _builder_operation("and")
+        logical_and = _builder_operation("and")
         return scalar_array(
             [
-                reduce(lambda u, v: b.op("or", u, v), map(lambda u, v: both(b, u, v), row, column), False)
-                for rows, columns in zip(left.tolist(), right.tolist(), strict=True)
+                reduce(lambda u, v: b.op("or", u, v), map(lambda u, v: logical_and(b, u, v), row, column), False)
+                for rows, columns in zip(lhs.tolist(), rhs.tolist(), strict=True)
                 for row, column in itertools.product(rows, columns)
             ],
             shape,
         )
     zero, result = constant_array(0, dtype).item(), []
-    for rows, columns in zip(left, right, strict=True):
-        # as structure constants are
+    for rows, columns in zip(lhs, rhs, strict=True):
+        # skip zeros, such as those of structure constants
         sparse = [[(k, a) for k, a in enumerate(row) if not _is_zero(a)] for row in rows.tolist()]
         if dtype.kind in "fc" and _needs_loop(b, rows, columns):
             result += algebra.matrix_product(b, rows, columns.T).ravel().tolist()
@@ -258,9 +265,9 @@ def _dot_general(b, eqn, x, y):
 
 
 def broadcast(x, params):
-    inner = np.ones(len(params["shape"]), int)
-    inner[list(params["broadcast_dimensions"])] = x.shape
-    return np.broadcast_to(x.reshape(inner), params["shape"])
+    expanded_shape = np.ones(len(params["shape"]), int)
+    expanded_shape[list(params["broadcast_dimensions"])] = x.shape
+    return np.broadcast_to(x.reshape(expanded_shape), params["shape"])
 
 
 def reshape(x, params):
@@ -274,7 +281,7 @@ def _iota(b, eqn):
 
 
 def _platform_index(b, eqn):
-    """Which of several implementations is the CPU's, or that for any platform."""
+    """Return the index of the first of several implementations that is for the CPU or for any platform."""
     return constant_array(next(i for i, names in enumerate(eqn.params["platforms"]) if names is None or "cpu" in names))
 
 
@@ -293,21 +300,21 @@ def _dynamic_update_slice(b, eqn, x, update, *starts):
     return result
 
 
-def _pad(b, eqn, x, filling):
+def _pad(b, eqn, x, fill_value):
     shape = eqn.outvars[0].aval.shape
-    result = np.full(shape, filling.item(), object)
+    result = np.full(shape, fill_value.item(), object)
     sources, targets = [], []
-    for n, size, (low, _, between) in zip(x.shape, shape, eqn.params["padding_config"], strict=True):
-        place = int(low) + np.arange(n) * (int(between) + 1)
-        sources.append(np.flatnonzero((place >= 0) & (place < size)))
-        targets.append(place[sources[-1]])
+    for n, padded_length, (low, _, interior) in zip(x.shape, shape, eqn.params["padding_config"], strict=True):
+        positions = int(low) + np.arange(n) * (int(interior) + 1)
+        sources.append(np.flatnonzero((positions >= 0) & (positions < padded_length)))
+        targets.append(positions[sources[-1]])
     result[np.ix_(*targets)] = x[np.ix_(*sources)]
     return result
 
 
 def _unstack(x, params):
     axis = params["axis"]
-    return [part.squeeze(axis) for part in np.split(x, x.shape[axis], axis)]  # arrays, of no dimension even
+    return [section.squeeze(axis) for section in np.split(x, x.shape[axis], axis)]  # arrays, even 0-d ones
 
 
 def _split_sections(x, params):
@@ -315,12 +322,12 @@ def _split_sections(x, params):
 
 
 def _gather(b, eqn, x, indices):
-    dtype, filling = _dtype(eqn), eqn.params["fill_value"]
-    if filling is None:
-        filling = {"f": math.nan, "b": True, "c": math.nan}.get(dtype.kind)
-    if filling is None:
-        filling = np.iinfo(dtype).min if dtype.kind == "i" else np.iinfo(dtype).max
-    return indexing.gather(b, eqn, x, indices, constant_array(filling, dtype).item())
+    dtype, fill_value = _dtype(eqn), eqn.params["fill_value"]
+    if fill_value is None:
+        fill_value = {"f": math.nan, "b": True, "c": math.nan}.get(dtype.kind)
+    if fill_value is None:
+        fill_value = np.iinfo(dtype).min if dtype.kind == "i" else np.iinfo(dtype).max
+    return indexing.gather(b, eqn, x, indices, constant_array(fill_value, dtype).item())
 
 
 def _scatter_rule(combine: Callable[..., Scalar]) -> Rule:
@@ -407,7 +414,7 @@ UNROLLING_RULES: dict[str, Rule] = {
     "igamma": algebra.incomplete_gamma_rule("igamma"),
     "igammac": algebra.incomplete_gamma_rule("igammac"),
 }
-"""How each primitive is unrolled; calls of other functions are followed in :mod:`liethermo.tracing.scalarize`."""
+"""Rule of each primitive; :mod:`liethermo.tracing.scalarize` has the rules of calls, loops and branches."""
 
 SUPPORTED_PARAMETERS = """
 accuracy algorithm axes axis batch_group_count broadcast_dimensions compute_uv conjugate_a dimension dimension_numbers
@@ -417,5 +424,7 @@ padding_config permutation pivoting platforms precision preferred_element_type r
 rounding_method shape sharding sizes slice_sizes sort_eigenvalues start_indices strides subset_by_index transpose_a
 unique_indices unit_diagonal update_consts update_jaxpr use_magma weak_type window_strides y
 """
-"""Parameters of primitives that the rules heed, or that do not matter here. Another one, if it is set, may mean
-anything: the primitive is refused."""
+"""Parameters of primitives that the rules handle or that do not affect results here.
+
+A primitive is refused if any other parameter is set.
+"""

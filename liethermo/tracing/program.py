@@ -1,4 +1,4 @@
-"""Scalar programs: instructions in order, among them calls and loops, which have several results."""
+"""Scalar programs: instructions in order, some of which are calls and loops with several results."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,9 +15,28 @@ from .builder import Block, Instruction, Scalar, implementation
 from .calls import MatrixProduct
 
 
+class _InterpretationPlan(NamedTuple):
+    """Instructions on a list of values, whose indices are called slots.
+
+    Attributes
+    ----------
+    input_slots, output_slots : list of list of int
+        Slots of the entries of each input, and of each output.
+    initial_values : list
+        Value of each slot at the start; None except for constants.
+    instructions : list of (function, int, list of int)
+        The function, the slot of its result, and the slots of its arguments.
+    """
+
+    input_slots: list[list[int]]
+    initial_values: list
+    instructions: list[tuple[Callable, int, list[int]]]
+    output_slots: list[list[int]]
+
+
 @dataclass(frozen=True)
 class Program:
-    """Scalar instructions in order, each variable assigned once.
+    """Scalar instructions in order; each variable is assigned once.
 
     Attributes
     ----------
@@ -24,7 +44,7 @@ class Program:
         Names of the entries of each input array, in row-major order.
     instructions : tuple of Instruction
     outputs : tuple of tuple of scalars
-        For each output array its entries: names, or numbers where they are constant.
+        Entries of each output array: names, or numbers if they are constant.
     shapes : tuple of tuple of int
         Shapes of the output arrays.
     """
@@ -36,128 +56,131 @@ class Program:
 
     @property
     def operation_counts(self) -> Counter[str]:
-        """How many instructions there are of each kind."""
+        """Number of instructions of each kind."""
         return Counter(str(instruction.op) for instruction in self.instructions)
 
     @functools.cached_property
     def instruction_count(self) -> int:
-        """How many instructions compute something, those inside loops among them: what is moved alone costs little."""
-        own = sum(i.op not in ("item", "column", "table") for i in self.instructions)
+        """Number of instructions that compute something, those inside loops included; moving data costs little."""
+        count = sum(i.op not in ("item", "column", "table") for i in self.instructions)
         blocks = (i.op for i in self.instructions if isinstance(i.op, Block))
-        return own + sum(program.instruction_count for block in blocks for program in block.inner_programs)
+        return count + sum(program.instruction_count for block in blocks for program in block.inner_programs)
 
     def evaluate(self, *arrays, batch: bool = False) -> list[np.ndarray]:
-        """The outputs for given input arrays, interpreted with NumPy: nothing is compiled.
+        """Evaluate the outputs for input arrays with NumPy, without compiling.
 
-        With ``batch`` inputs and outputs have one axis more in front, the same for all.
+        With ``batch``, inputs and outputs have one more leading axis, of equal length for all.
         """
-        given, front = [], ()
+        values, batch_shape = [], ()
         for names, x in zip(self.inputs, arrays, strict=True):
             x = np.asarray(x, dtype=np.float64)
             if batch:
-                front = x.shape[:1]
-                x = x.reshape(*front, len(names)).T
-            given.append(x if batch else x.ravel())
+                batch_shape = x.shape[:1]
+                x = x.reshape(*batch_shape, len(names)).T
+            values.append(x if batch else x.ravel())
 
         def assemble_output(entries, shape):
-            found = np.empty((*front, len(entries)))
+            array = np.empty((*batch_shape, len(entries)))
             for i, a in enumerate(entries):
-                found[..., i] = a
-            return found.reshape((*front, *shape))
+                array[..., i] = a
+            return array.reshape((*batch_shape, *shape))
 
-        return [assemble_output(entries, shape) for entries, shape in zip(self.run(*given), self.shapes, strict=True)]
+        return [assemble_output(entries, shape) for entries, shape in zip(self.run(*values), self.shapes, strict=True)]
 
-    def run(self, *given: Sequence) -> list[list]:
-        """The entries of the outputs for those of the inputs: numbers, or arrays of them for many points at once."""
-        places, start, instructions, results = self._interpretation_plan
-        values = start.copy()
-        for own, entries in zip(places, given, strict=True):
-            for place, entry in zip(own, entries, strict=True):
-                values[place] = entry
+    def run(self, *arrays: Sequence) -> list[list]:
+        """Return the entries of the outputs for the entries of the inputs: numbers, or arrays over many points."""
+        plan = self._interpretation_plan
+        values = plan.initial_values.copy()
+        for slots, entries in zip(plan.input_slots, arrays, strict=True):
+            for slot, entry in zip(slots, entries, strict=True):
+                values[slot] = entry
         with np.errstate(all="ignore"):
-            for function, target, args in instructions:
+            for function, target, args in plan.instructions:
                 values[target] = function(*[values[a] for a in args])
-        return [[values[place] for place in own] for own in results]
+        return [[values[slot] for slot in slots] for slots in plan.output_slots]
 
     @functools.cached_property
-    def _interpretation_plan(
-        self,
-    ) -> tuple[list[list[int]], list, list[tuple[Callable, int, list[int]]], list[list[int]]]:
-        """How it is interpreted: the places of inputs, what is at each place at the start, instructions, and results.
+    def _interpretation_plan(self) -> _InterpretationPlan:
+        """The steps by which the program is interpreted.
 
-        A place is free again after its value is read for the last time. So arrays of many points stay in fast memory.
+        A slot is reused after its value is read for the last time, so arrays of many points stay in the processor's
+        cache.
         """
-        last = {a: i for i, instruction in enumerate(self.instructions) for a in instruction.args if type(a) is str}
-        last.update((a, len(self.instructions)) for entries in self.outputs for a in entries if type(a) is str)
-        places: dict[str, int] = {}
-        start: list = []
-        free: list[int] = []
+        last_use = {a: i for i, instruction in enumerate(self.instructions) for a in instruction.args if type(a) is str}
+        last_use.update((a, len(self.instructions)) for entries in self.outputs for a in entries if type(a) is str)
+        slots: dict[str, int] = {}
+        initial_values: list = []
+        free_slots: list[int] = []
 
-        def place(value=None) -> int:
-            start.append(value)
-            return len(start) - 1
+        def new_slot(value=None) -> int:
+            initial_values.append(value)
+            return len(initial_values) - 1
 
         def read(args) -> list[int]:
-            return [places[a] if type(a) is str else place(a) for a in args]
+            return [slots[a] if type(a) is str else new_slot(a) for a in args]
 
-        places.update((name, place()) for names in self.inputs for name in names)
-        inputs, instructions = [read(names) for names in self.inputs], []
+        slots.update((name, new_slot()) for names in self.inputs for name in names)
+        input_slots, instructions = [read(names) for names in self.inputs], []
         for i, (target, op, args) in enumerate(self.instructions):
-            own = read(args)
-            free += [places[a] for a in set(args) if type(a) is str and last[a] == i]
-            places[target] = free.pop() if free else place()
-            instructions.append((implementation(op), places[target], own))
-            if target not in last:
-                free.append(places[target])
-        return inputs, start, instructions, [read(entries) for entries in self.outputs]
+            argument_slots = read(args)
+            free_slots += [slots[a] for a in set(args) if type(a) is str and last_use[a] == i]
+            slots[target] = free_slots.pop() if free_slots else new_slot()
+            instructions.append((implementation(op), slots[target], argument_slots))
+            if target not in last_use:
+                free_slots.append(slots[target])
+        output_slots = [read(entries) for entries in self.outputs]
+        return _InterpretationPlan(input_slots, initial_values, instructions, output_slots)
 
-    def degree(self, place: int) -> float:
-        """Degree of the outputs as polynomials in an input array; infinity where they are not written as such.
+    def degree(self, input_index: int) -> float:
+        """Return an upper bound of the degree of the outputs as polynomials in one input array, or infinity.
 
         Parameters
         ----------
-        place : int
-            Of the input.
+        input_index : int
+            Index of the input array.
         """
-        return self._propagate_degrees(dict.fromkeys(self.inputs[place], 1))
+        return self._propagate_degrees(dict.fromkeys(self.inputs[input_index], 1))
 
     def _propagate_degrees(self, degrees: dict[Scalar, float]) -> float:
-        """Where those of some of the inputs are known, and the others count for nothing."""
+        """Return the largest degree of an output, from the degrees of some inputs; the other inputs have degree 0."""
         for target, op, args in self.instructions:
-            found = [degrees.get(a, 0) for a in args]
+            argument_degrees = [degrees.get(a, 0) for a in args]
             if op in ("add", "sub", "neg", "table", "item", "column"):
-                degrees[target] = max(found)
+                degrees[target] = max(argument_degrees)
             elif op == "mul" or isinstance(op, MatrixProduct):
-                degrees[target] = sum(found)
+                degrees[target] = sum(argument_degrees)
             elif isinstance(op, Routine):
-                degrees[target] = op.program._propagate_degrees(dict(zip(op.program.inputs[0], found, strict=True)))
-            elif op == "div" and not found[1]:
-                degrees[target] = found[0]
+                degrees[target] = op.program._propagate_degrees(
+                    dict(zip(op.program.inputs[0], argument_degrees, strict=True))
+                )
+            elif op == "div" and not argument_degrees[1]:
+                degrees[target] = argument_degrees[0]
             else:
-                degrees[target] = math.inf if any(found) else 0
+                degrees[target] = math.inf if any(argument_degrees) else 0
         return max((degrees.get(a, 0) for entries in self.outputs for a in entries), default=0)
 
     def factor_constants(self, varying: Sequence[int]) -> Program:
-        """The same, with products ``(v a) b`` written ``v (a b)`` where a and b do not depend on some of the inputs.
+        """Return an equivalent program that multiplies ``(v a) b`` as ``v (a b)`` if a and b do not depend on some
+        inputs.
 
-        In a loop over those, ``a b`` is then computed once.
+        A loop that changes only these inputs then computes ``a b`` once.
 
         Parameters
         ----------
         varying : sequence of int
-            Places of those inputs.
+            Indices of these inputs.
         """
-        depends: set[Scalar] = {name for i in varying for name in self.inputs[i]}
+        dependent: set[Scalar] = {name for i in varying for name in self.inputs[i]}
         products: dict[Scalar, tuple[Scalar, Scalar]] = {}
         factors: dict[tuple[Scalar, Scalar], str] = {}
         instructions: list[Instruction] = []
         for instruction in self.instructions:
-            changing = [a for a in instruction.args if a in depends]
-            if changing:
-                depends.add(instruction.target)
-            if instruction.op == "mul" and len(changing) == 1:
-                first, second = instruction.args
-                v, b = (first, second) if first in depends else (second, first)
+            varying_args = [a for a in instruction.args if a in dependent]
+            if varying_args:
+                dependent.add(instruction.target)
+            if instruction.op == "mul" and len(varying_args) == 1:
+                lhs, rhs = instruction.args
+                v, b = (lhs, rhs) if lhs in dependent else (rhs, lhs)
                 if v in products:
                     v, a = products[v]
                     if (a, b) not in factors:
@@ -172,17 +195,17 @@ class Program:
 
 @dataclass(frozen=True, eq=False)
 class WhileLoop(Block):
-    """``while test(constants, carried): carried = body(constants, carried)``.
+    """The loop ``while test(constants, carry): carry = body(constants, carry)``.
 
-    Its arguments are the constants, then what is carried at the start; its results what is carried at the end. Where
-    there are several lanes, those whose test has failed wait, unchanged, for the others.
+    Its arguments are the constants, then the initial carry; its results are the final carry. In a batch of lanes, a
+    lane whose test has failed keeps its values until all lanes have ended.
 
     Attributes
     ----------
     test, body : Program
-        Of the two arrays; the first has one truth value as its result.
+        Programs of the two arrays; the result of ``test`` is one truth value.
     kinds : tuple of str
-        Of what is carried.
+        Kinds of the carry.
     """
 
     test: Program
@@ -195,32 +218,35 @@ class WhileLoop(Block):
         return self.test, self.body
 
     def __call__(self, *args) -> list:
-        fixed = len(self.test.inputs[0])
-        constants, carried = args[:fixed], list(args[fixed:])
+        n_constants = len(self.test.inputs[0])
+        constants, carry = args[:n_constants], list(args[n_constants:])
         while True:
-            ((going,),) = self.test.run(constants, carried)
-            if not np.any(going):
-                return carried
-            (new,) = self.body.run(constants, carried)
-            carried = [np.where(going, after, before)[()] for after, before in zip(new, carried, strict=True)]
+            ((is_running,),) = self.test.run(constants, carry)
+            if not np.any(is_running):
+                return carry
+            (next_carry,) = self.body.run(constants, carry)
+            carry = [
+                np.where(is_running, new_value, old_value)[()]
+                for new_value, old_value in zip(next_carry, carry, strict=True)
+            ]
 
 
 @dataclass(frozen=True, eq=False)
 class ScanLoop(Block):
-    """``carried, stacked[i] = body(constants, carried, [table[i] for table in tables])`` for every i.
+    """The loop ``carry, stacked[i] = body(constants, carry, [table[i] for table in tables])`` for every i.
 
-    Its arguments are the constants, what is carried at the start, and the tables; its results what is carried at the
-    end, and the stacked tables, one after another.
+    Its arguments are the constants, the initial carry and the tables. Its results are the final carry, then the stacked
+    tables one after another.
 
     Attributes
     ----------
     length : int
     reverse : bool
-        Whether the last i is the first.
+        Whether the loop runs from the last i to the first.
     body : Program
-        Of three arrays, with two as its results.
+        Program of three arrays with two results.
     carry_kinds, stacked_kinds : tuple of str
-        The kinds of what is carried, and of what is in a row of each stacked table.
+        Kinds of the carry, and of the entries in a row of the stacked tables.
     """
 
     length: int
@@ -239,25 +265,25 @@ class ScanLoop(Block):
         return self.carry_kinds + tuple(kind for kind in self.stacked_kinds for _ in range(self.length))
 
     def __call__(self, *args) -> list:
-        fixed = len(self.body.inputs[0])
-        start = fixed + len(self.carry_kinds)
-        constants, carried, tables = args[:fixed], list(args[fixed:start]), args[start:]
-        stacked: list[list] = [[None] * self.length for _ in self.stacked_kinds]
+        n_constants = len(self.body.inputs[0])
+        table_start = n_constants + len(self.carry_kinds)
+        constants, carry, tables = args[:n_constants], list(args[n_constants:table_start]), args[table_start:]
+        columns: list[list] = [[None] * self.length for _ in self.stacked_kinds]
         for i in range(self.length)[::-1] if self.reverse else range(self.length):
-            carried, row = self.body.run(constants, carried, [table[i] for table in tables])
-            for column, value in zip(stacked, row, strict=True):
+            carry, row = self.body.run(constants, carry, [table[i] for table in tables])
+            for column, value in zip(columns, row, strict=True):
                 column[i] = value
-        return carried + [a for column in stacked for a in column]
+        return carry + [a for column in columns for a in column]
 
 
 @dataclass(frozen=True, eq=False)
 class Routine(Block):
-    """A program that is written once and called wherever it is needed.
+    """A program that is written once and called from several places.
 
     Attributes
     ----------
     program : Program
-        Of one array of numbers, with another as its result.
+        Program of one array of real numbers, with one array as its result.
     """
 
     program: Program
@@ -271,29 +297,29 @@ class Routine(Block):
         return self.program.run(args)[0]
 
 
-# -- what follows from instructions -----------------------------------------------------------------------------------
+# -- dead code --------------------------------------------------------------------------------------------------------
 
 
 def eliminate_dead_code(
     instructions: Sequence[Instruction], results: Sequence[Scalar]
 ) -> tuple[tuple[Instruction, ...], dict[Scalar, str]]:
-    """The instructions that results depend on, each as late as its first use allows, and their new names.
+    """Return the instructions that the results depend on, each as late as its first use allows, and their new names.
 
-    Computing a value just before it is used keeps few alive at a time: registers are scarce.
+    A value that is computed just before its use occupies a register for a short time.
     """
-    defined: dict[Scalar, Instruction] = {instruction.target: instruction for instruction in instructions}
+    definitions: dict[Scalar, Instruction] = {instruction.target: instruction for instruction in instructions}
     order: list[Instruction] = []
-    renamed: dict[Scalar, str] = {}
+    new_names: dict[Scalar, str] = {}
     for result in results:
         stack = [result]
         while stack:
-            instruction = defined.get(stack[-1])
-            if instruction is None or instruction.target in renamed:
+            instruction = definitions.get(stack[-1])
+            if instruction is None or instruction.target in new_names:
                 stack.pop()
-            elif missing := [a for a in instruction.args if a in defined and a not in renamed]:
-                stack.extend(reversed(missing))
+            elif pending := [a for a in instruction.args if a in definitions and a not in new_names]:
+                stack.extend(reversed(pending))
             else:
-                args = tuple(renamed.get(a, a) if type(a) is str else a for a in instruction.args)
-                renamed[stack.pop()] = f"t{len(order)}"
+                args = tuple(new_names.get(a, a) if type(a) is str else a for a in instruction.args)
+                new_names[stack.pop()] = f"t{len(order)}"
                 order.append(Instruction(f"t{len(order)}", instruction.op, args))
-    return tuple(order), renamed
+    return tuple(order), new_names

@@ -1,6 +1,7 @@
-"""Programs that XLA compiles, found again by what they do, and unloaded when too many others have been used since.
+"""A cache of programs compiled by XLA, found by their content; the least recently used are unloaded.
 
-One takes some hundred memory maps of the 65,530 that Linux grants a process, and ``jax.jit`` keeps thousands.
+A compiled program takes several hundred memory maps of the 65,530 that Linux grants a process, and ``jax.jit`` keeps
+thousands of programs.
 """
 
 from __future__ import annotations
@@ -19,48 +20,48 @@ from manifolds._arrays import is_traced
 from .caching import LRUCache
 
 MAX_CACHED_PROGRAMS = 48
-"""Programs held in memory, those last used: of 500 maps each at most."""
+"""Largest number of compiled programs in memory; each takes at most 500 memory maps."""
 
 FunctionT = TypeVar("FunctionT", bound=Callable)
 
 _program_cache: LRUCache[Callable] = LRUCache(MAX_CACHED_PROGRAMS)
 
 MAX_CACHED_SUBPROGRAMS = 512
-"""Parts of programs held in memory, those last used: traced, and not compiled."""
+"""Largest number of traced, uncompiled subprograms in memory."""
 
 _subprogram_cache: LRUCache[Callable] = LRUCache(MAX_CACHED_SUBPROGRAMS)
 
 
 UNOPTIMISED_XLA_OPTIONS = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
-"""How a program is compiled that is run once: to optimise it, or to join its loops, takes longer than it would save."""
+"""Options for a program that runs once or twice: optimising it, or fusing its loops, takes longer than it saves."""
 
 
 def jit_program(function: FunctionT) -> FunctionT:
-    """Decorator: compile a function of pytrees, arrays being its arguments and all else a part of the program."""
+    """Decorator: compile a function of pytrees; arrays are its arguments, and other leaves are part of the program."""
     return _jit_with_options(function, None)
 
 
 def jit_unoptimised(function: FunctionT) -> FunctionT:
-    """The same, for a function that a run calls once or twice."""
+    """Decorator: compile a function of pytrees without optimisation, for a function that a run calls once or twice."""
     return _jit_with_options(function, UNOPTIMISED_XLA_OPTIONS)
 
 
 def subprogram(function: FunctionT) -> FunctionT:
-    """Decorator: trace a function of pytrees once for all places of a program that it is a part of.
+    """Decorator: trace a function of pytrees once for all places where a program calls it.
 
-    Called outside of one, and with what cannot be told from others, it is as it was.
+    The function is called directly if no argument is traced, or if an argument cannot be hashed.
     """
 
     @functools.wraps(function)
     def call(*arguments):
         if not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(arguments)):
             return function(*arguments)
-        whole, dynamic, key = _split_arguments(function, arguments)
+        array_function, dynamic, key = _split_arguments(function, arguments)
         try:
             hash(key)
         except TypeError:
-            return whole(dynamic)
-        return _subprogram_cache.get_or_compute(key, lambda: jax.jit(whole))(dynamic)
+            return array_function(dynamic)
+        return _subprogram_cache.get_or_compute(key, lambda: jax.jit(array_function))(dynamic)
 
     return call  # type: ignore[return-value]
 
@@ -68,26 +69,28 @@ def subprogram(function: FunctionT) -> FunctionT:
 def _jit_with_options(function: FunctionT, options: dict | None) -> FunctionT:
     @functools.wraps(function)
     def call(*arguments):
-        whole, dynamic, key = _split_arguments(function, arguments)
-        own = None if options is None or _is_being_traced(dynamic) else options
-        return _program_cache.get_or_compute((key, own is None), lambda: jax.jit(whole, compiler_options=own))(dynamic)
+        array_function, dynamic, key = _split_arguments(function, arguments)
+        compiler_options = None if options is None or _is_being_traced(dynamic) else options
+        return _program_cache.get_or_compute(
+            (key, compiler_options is None), lambda: jax.jit(array_function, compiler_options=compiler_options)
+        )(dynamic)
 
     return call  # type: ignore[return-value]
 
 
 def _is_being_traced(dynamic: tuple) -> bool:
-    """Whether a call is a part of another program, which is compiled in its own way; or may become one."""
+    """Return whether a call belongs to a program that is being traced, whose own options apply."""
     return is_traced(dynamic, jnp.zeros(()))
 
 
 def _strip_weak_type(array):
-    """An array of a type of its own: for one made from a Python number, JAX would compile another program."""
-    weak = getattr(array, "weak_type", False) and not isinstance(array, jax.core.Tracer)
-    return np.asarray(array) if weak else array
+    """Return an array without JAX's weak type, which a Python number has and which would need another program."""
+    is_weak = getattr(array, "weak_type", False) and not isinstance(array, jax.core.Tracer)
+    return np.asarray(array) if is_weak else array
 
 
 def _split_arguments(function: Callable, arguments: tuple) -> tuple[_ArrayFunction, tuple, tuple]:
-    """A function of the arrays among its arguments, these, and a key that tells it from others."""
+    """Return a function of the arrays among the arguments, these arrays, and a key of all the rest."""
     leaves, structure = jax.tree_util.tree_flatten(arguments)
     dynamic = tuple(_strip_weak_type(leaf) if eqx.is_array(leaf) else None for leaf in leaves)
     static = tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)
@@ -97,7 +100,7 @@ def _split_arguments(function: Callable, arguments: tuple) -> tuple[_ArrayFuncti
 
 
 class _ArrayFunction:
-    """A function of the arrays among its arguments alone."""
+    """A function of the arrays among its arguments; the other arguments are fixed."""
 
     def __init__(self, function: Callable, structure, static: tuple):
         self.function, self.structure, self.static = function, structure, static

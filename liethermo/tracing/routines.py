@@ -1,4 +1,4 @@
-"""Functions that are written once, as routines: those with products of matrices, such as networks, and long ones."""
+"""Functions that become routines, written once and called: long ones, and those with products of matrices."""
 
 from __future__ import annotations
 
@@ -16,14 +16,17 @@ from .complex_numbers import flatten_scalars, scalar_kinds, unflatten_scalars
 from .primitives import MAX_UNROLLED_INPUT_PRODUCTS
 from .program import Program, Routine, eliminate_dead_code
 
-MIN_ROUTINE_PRODUCTS, MIN_ROUTINE_INSTRUCTIONS = 2, 500
-"""Products of matrices as loops, or instructions, from which a function is worth a routine."""
+MIN_ROUTINE_PRODUCTS = 2
+"""Smallest number of products of matrices, as loops, for which a function becomes a routine."""
+
+MIN_ROUTINE_INSTRUCTIONS = 500
+"""Number of instructions above which a function becomes a routine."""
 
 _routine_cache: LRUCache[tuple] = LRUCache(256)
 
 
 def has_matrix_products(jaxpr) -> bool:
-    """Whether a product of matrices stands in it that may become a loop."""
+    """Return whether a jaxpr contains a product of matrices that may become a loop."""
     for eqn in jaxpr.eqns:
         inner = eqn.params.get("jaxpr")
         if (
@@ -37,42 +40,50 @@ def has_matrix_products(jaxpr) -> bool:
 
 
 def call_as_routine(
-    b: Builder, unroll: Callable, closed: ClosedJaxpr, arguments: Sequence[np.ndarray]
+    b: Builder, unroll: Callable, closed_jaxpr: ClosedJaxpr, arguments: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
-    """The results of a function, by a routine where that is worth it.
+    """Return the results of a function, computed by a routine if it is long enough, and unrolled otherwise.
 
-    Calls of one function, jitted, have one routine, whatever is known of the numbers that they hand over. Matrices
-    that lie in memory as they are given, such as weights, stay there.
+    Calls of one jitted function share one routine, whatever constants they pass. Matrices that are inputs of the
+    program, such as weights, are read in place.
 
     Parameters
     ----------
     unroll : function
-        What unrolls a jaxpr: that of :mod:`.scalarize`.
+        Unrolls a jaxpr: :func:`.scalarize._unroll_jaxpr`.
     """
     scalars = flatten_scalars(arguments)
-    held = [b.input_indices(x.ravel().tolist()) if x.ndim > 1 else None for x in arguments]
-    known = [a if type(a) in (int, bool) else None for a in scalars]
-    key = id(closed), tuple(None if place is None else tuple(place) for place in held), tuple(map(repr, known))
-    # with the jaxpr, so that no other takes its place
-    once = _routine_cache.get_or_compute(key, lambda: (closed, _RoutineCall.build(b, unroll, closed, arguments, held)))[
-        1
-    ]
-    return unroll(b, closed.jaxpr, closed.consts, arguments) if once is None else once.emit_call(b, scalars, closed)
+    input_positions = [b.input_indices(x.ravel().tolist()) if x.ndim > 1 else None for x in arguments]
+    integer_values = [a if type(a) in (int, bool) else None for a in scalars]
+    key = (
+        id(closed_jaxpr),
+        tuple(None if positions is None else tuple(positions) for positions in input_positions),
+        tuple(map(repr, integer_values)),
+    )
+    # the entry holds the jaxpr, so that no other object takes its id
+    routine_call = _routine_cache.get_or_compute(
+        key, lambda: (closed_jaxpr, _RoutineCall.build(b, unroll, closed_jaxpr, arguments, input_positions))
+    )[1]
+    return (
+        unroll(b, closed_jaxpr.jaxpr, closed_jaxpr.consts, arguments)
+        if routine_call is None
+        else routine_call.emit_call(b, scalars, closed_jaxpr)
+    )
 
 
 @dataclass(frozen=True)
 class _RoutineCall:
-    """A function as a routine.
+    """A function as a routine, with the origin of its arguments and results.
 
     Attributes
     ----------
     routine : Routine
     argument_sources : tuple of (int or tuple)
-        What the routine is given: the place, among all entries of the arguments, of a number; or those of what is in a
-        table, a number that is known standing for itself, in a tuple.
+        For each argument of the routine the index of a scalar among the entries of all arguments; for a table, a tuple
+        of such indices, in which ``(number,)`` is a constant.
     result_sources : tuple of (scalar, (int) or None)
-        For each entry of the results what it is, where that is known, or in a tuple its place among all entries of the
-        arguments; others are those of the routine, in order.
+        For each entry of the results its constant, or its index among the entries of all arguments in a tuple; None for
+        a result of the routine.
     """
 
     routine: Routine
@@ -80,21 +91,28 @@ class _RoutineCall:
     result_sources: tuple[Scalar | tuple[int] | None, ...]
 
     @classmethod
-    def build(cls, b: Builder, unroll: Callable, closed: ClosedJaxpr, arguments, held: Sequence) -> _RoutineCall | None:
-        around, names = EnclosingScope(b), dict[Scalar, int]()  # inside, and where they are among the arguments
-        own, entries = Builder(b.max_instructions, around), list[Scalar]()
-        for x, aval, place in zip(arguments, closed.in_avals, held, strict=True):
+    def build(
+        cls, b: Builder, unroll: Callable, closed_jaxpr: ClosedJaxpr, arguments, input_positions: Sequence
+    ) -> _RoutineCall | None:
+        scope, argument_indices = EnclosingScope(b), dict[Scalar, int]()  # index of each inner name
+        inner_builder, entries = Builder(b.max_instructions, scope), list[Scalar]()
+        for x, aval, positions in zip(arguments, closed_jaxpr.in_avals, input_positions, strict=True):
             for kind, a in zip(scalar_kinds([aval]), flatten_scalars([x]), strict=True):
                 if type(a) in (str, float):
-                    name = f"x1_{len(entries)}" if place is None else around.import_scalar(a)
-                    names.setdefault(name, len(entries))
-                    a = _convert_to_kind(own, kind, name)
+                    name = f"x1_{len(entries)}" if positions is None else scope.import_scalar(a)
+                    argument_indices.setdefault(name, len(entries))
+                    a = _convert_to_kind(inner_builder, kind, name)
                 entries.append(a)
         results = flatten_scalars(
-            unroll(own, closed.jaxpr, closed.consts, unflatten_scalars(iter(entries), closed.in_avals))
+            unroll(
+                inner_builder,
+                closed_jaxpr.jaxpr,
+                closed_jaxpr.consts,
+                unflatten_scalars(iter(entries), closed_jaxpr.in_avals),
+            )
         )
-        made = [a for a in results if type(a) is str and a not in names]
-        instructions, renamed = eliminate_dead_code(own.instructions, made)
+        computed_results = [a for a in results if type(a) is str and a not in argument_indices]
+        instructions, new_names = eliminate_dead_code(inner_builder.instructions, computed_results)
         blocks = [i.op for i in instructions if isinstance(i.op, MatrixProduct | Routine)]
         if (
             len(instructions) <= MIN_ROUTINE_INSTRUCTIONS
@@ -102,25 +120,38 @@ class _RoutineCall:
             and not any(isinstance(op, Routine) for op in blocks)
         ):
             return None
-        used = list(dict.fromkeys(a for i in instructions for a in i.args if type(a) is str and a[0] == "x"))
-        given = tuple(names[a] if a in names else tuple(names.get(e, (e,)) for e in around.tables[a]) for a in used)
-        program = Program((tuple(used),), instructions, (tuple(renamed[a] for a in made),), ((len(made),),))
-        said = tuple((names[a],) if a in names else None if type(a) is str else a for a in results)
-        return cls(Routine(program), given, said)
+        used_names = list(dict.fromkeys(a for i in instructions for a in i.args if type(a) is str and a[0] == "x"))
+        argument_sources = tuple(
+            argument_indices[a]
+            if a in argument_indices
+            else tuple(argument_indices.get(e, (e,)) for e in scope.tables[a])
+            for a in used_names
+        )
+        program = Program(
+            (tuple(used_names),),
+            instructions,
+            (tuple(new_names[a] for a in computed_results),),
+            ((len(computed_results),),),
+        )
+        result_sources = tuple(
+            (argument_indices[a],) if a in argument_indices else None if type(a) is str else a for a in results
+        )
+        return cls(Routine(program), argument_sources, result_sources)
 
-    def emit_call(self, b: Builder, scalars: Sequence[Scalar], closed: ClosedJaxpr) -> list[np.ndarray]:
-        def argument(i) -> Scalar:
-            if isinstance(i, int):
-                return scalars[i]
-            return b.table([scalars[j] if isinstance(j, int) else j[0] for j in i])
+    def emit_call(self, b: Builder, scalars: Sequence[Scalar], closed_jaxpr: ClosedJaxpr) -> list[np.ndarray]:
+        def argument_scalar(source) -> Scalar:
+            if isinstance(source, int):
+                return scalars[source]
+            return b.table([scalars[entry] if isinstance(entry, int) else entry[0] for entry in source])
 
-        found, entries = iter(b.emit_block(self.routine, *map(argument, self.argument_sources))), list[Scalar]()
-        for kind, a in zip(scalar_kinds(closed.out_avals), self.result_sources, strict=True):
-            known = scalars[a[0]] if isinstance(a, tuple) else a
-            entries.append(_convert_to_kind(b, kind, next(found)) if known is None else known)
-        return unflatten_scalars(iter(entries), closed.out_avals)
+        results = iter(b.emit_block(self.routine, *map(argument_scalar, self.argument_sources)))
+        entries = list[Scalar]()
+        for kind, result_source in zip(scalar_kinds(closed_jaxpr.out_avals), self.result_sources, strict=True):
+            value = scalars[result_source[0]] if isinstance(result_source, tuple) else result_source
+            entries.append(_convert_to_kind(b, kind, next(results)) if value is None else value)
+        return unflatten_scalars(iter(entries), closed_jaxpr.out_avals)
 
 
 def _convert_to_kind(b: Builder, kind: str, a: Scalar) -> Scalar:
-    """A number as what it was before it was handed over."""
+    """Convert a real number, as a routine passes it, back to its kind."""
     return a if kind == "f" else b.op("ne", a, 0.0) if kind == "b" else b.op("truncate", a)

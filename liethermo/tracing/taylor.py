@@ -1,12 +1,12 @@
 """Taylor series of the solutions of ``x' = f(x)``, by the recurrences of Taylor arithmetic on the jaxpr of f.
 
-Coefficient n of every intermediate value follows from coefficients up to n of the values it is made of [Hairer, Nørsett
-& Wanner 1993, I.8]. A product is a convolution, a quotient is one solved for its last term. For every other function
-there is one rule, since JAX knows the derivative: of ``y = F(a)`` the Euler operator ``D = t d/dt``, which multiplies
-coefficient n by n, makes ``D y = F'(a) D a``; so coefficient n of y follows from those of F'(a) up to n - 1, which
-are made of a, y and their like.
+Coefficient n of every intermediate value follows from coefficients up to n of its arguments [Hairer, Nørsett & Wanner
+1993, I.8]. A product is a convolution; a quotient is a convolution solved for its last term. JAX knows the derivative
+of every other function ``y = F(a)``, so one rule serves all: the Euler operator ``D = t d/dt``, which multiplies
+coefficient n by n, gives ``D y = F'(a) D a``. Coefficient n of y thus follows from the coefficients of F'(a) up to n -
+1.
 
-What depends on a test, ``jnp.where`` and ``lax.cond``, is decided where the series begins. What has no derivatives of
+The tests of ``jnp.where`` and ``lax.cond`` are evaluated at the start of the series. A function without derivatives of
 every order is refused by name.
 """
 
@@ -25,41 +25,41 @@ from .scalarize import user_source_line
 
 
 class TaylorSeriesError(InputError):
-    """A function that has no Taylor series, or whose series there is no rule for.
+    """A function has no Taylor series, or no rule for its series is known.
 
     Attributes
     ----------
     primitive : str
-        The JAX primitive in the way.
+        The JAX primitive without a rule.
     source_line : str
-        The line of the user's code that called for it, as far as JAX knows.
+        The line of the user's code that led to it, if JAX knows it.
     """
 
-    def __init__(self, primitive: str, source_line: str, before: str = "", after: str = ""):
+    def __init__(self, primitive: str, source_line: str, prefix: str = "", suffix: str = ""):
         self.primitive, self.source_line = primitive, source_line
         reason = "is not smooth" if primitive in NONSMOOTH_PRIMITIVES else "has no rule for its Taylor series"
-        super().__init__(f"{before}the JAX primitive {primitive!r} {reason} ({source_line}){after}")
+        super().__init__(f"{prefix}the JAX primitive {primitive!r} {reason} ({source_line}){suffix}")
 
-    def add_context(self, what: str, advice: str) -> TaylorSeriesError:
-        """The same, saying what the function is of and what to do."""
-        return type(self)(self.primitive, self.source_line, what, f": {advice}")
+    def add_context(self, subject: str, advice: str) -> TaylorSeriesError:
+        """Return the error with the name of the function in front and an advice behind."""
+        return type(self)(self.primitive, self.source_line, subject, f": {advice}")
 
 
 def check_taylor_series(function: Callable, x) -> None:
-    """Raise NoSeriesError unless a function of an array like x has Taylor series, of which nothing is computed."""
+    """Raise TaylorSeriesError unless a function of an array like x has a Taylor series; compute no coefficients."""
     jax.eval_shape(lambda x: _Recurrences(function, x).evaluation_order and (), jnp.zeros_like(x))
 
 
 def taylor_coefficients(field: Callable, x, h, order: int) -> jax.Array:
-    """The coefficients ``c_1 ... c_order``, shape (order, n), of ``x(h s) = x + c_1 s + c_2 s^2 + ...``.
+    """Return the coefficients ``c_1 ... c_order``, shape (order, n), of ``x(h s) = x + c_1 s + c_2 s^2 + ...``.
 
-    This x(h s) is the solution of ``x' = field(x)`` that begins at x, shape (n,). A loop finds one coefficient after
-    another, with the same body for all.
+    This x(h s) is the solution of ``x' = field(x)`` that begins at x, shape (n,). The coefficients are computed one
+    after another, in a loop.
 
     Raises
     ------
-    NoSeriesError
-        Where the field has none.
+    TaylorSeriesError
+        If the field has no Taylor series.
     """
     recurrences = _Recurrences(field, x)
     if recurrences.result is None:
@@ -71,13 +71,15 @@ def taylor_coefficients(field: Callable, x, h, order: int) -> jax.Array:
 
     def coefficient(carry, numbers):
         histories, rate = carry
-        n, number = numbers
-        rate, histories = recurrences.next_coefficient(n, number, rate / number, histories)
-        return (histories, h * rate), carry[1] / number
+        n, n_float = numbers
+        rate, histories = recurrences.next_coefficient(n, n_float, rate / n_float, histories)
+        return (histories, h * rate), carry[1] / n_float
 
     numbers = np.arange(1, order), np.arange(1.0, order)
-    (_, rate), found = jax.lax.scan(coefficient, (histories, h * recurrences.terms[recurrences.result].start), numbers)
-    return jnp.concatenate([found, rate[None] / order])
+    (_, rate), coefficients = jax.lax.scan(
+        coefficient, (histories, h * recurrences.terms[recurrences.result].start), numbers
+    )
+    return jnp.concatenate([coefficients, rate[None] / order])
 
 
 class _SeriesTerm(NamedTuple):
@@ -86,15 +88,16 @@ class _SeriesTerm(NamedTuple):
     Attributes
     ----------
     start : array
-        Its coefficient 0.
-    rule : function of n, the coefficients n of ``current_terms``, and the coefficients so far of ``history_terms``, to coefficient n
-        What is not known yet is zero in the latter. None for a value that is known at the start alone.
+        Coefficient 0.
+    rule : function, or None
+        Computes coefficient n from n, n as a float, the coefficients n of ``current_terms``, and all coefficients so
+        far of ``history_terms``, in which the unknown ones are zero. None for a value whose start alone is known.
     current_terms, history_terms : tuple of int
-        Places of terms.
+        Indices of terms.
     starts_at_zero : bool
-        Whether its coefficient 0 vanishes, as that of ``D a`` does.
+        Whether coefficient 0 is known to vanish, as for ``D a``.
     refusal : tuple of str
-        A primitive and its origin, where there is no rule.
+        The primitive without a rule and its source line.
     """
 
     start: Any
@@ -106,78 +109,81 @@ class _SeriesTerm(NamedTuple):
 
 
 class _SeriesIndex(NamedTuple):
-    """The place of a term."""
+    """The index of a term, as a type that differs from a constant."""
 
     term_index: int
 
 
 class _Recurrences:
-    """The series of the values that a function is computed with, and the rules that they follow.
+    """The series of all intermediate values of a function, with the rules that compute their coefficients.
 
     Attributes
     ----------
-    terms : list of _Term
-        The argument is the first.
+    terms : list of _SeriesTerm
+        The first term is the argument.
     result : int or None
-        The place of the result; None where it is ``constant``.
+        Index of the result; None if the result is ``constant``.
     evaluation_order : list of int
-        What the result depends on, the argument left out, each behind those of the same order that it needs.
+        Indices of the terms that the result depends on, without the argument, each after its ``current_terms``.
     """
 
     def __init__(self, function: Callable, x):
         self.terms: list[_SeriesTerm] = [_SeriesTerm(x, None)]
         self._cached_series: dict[tuple, _SeriesIndex] = {}
-        (found,) = self.inline(lambda x: [function(x)], [_SeriesIndex(0)])
-        self.result = found.term_index if isinstance(found, _SeriesIndex) else None
-        self.constant = found
+        (result,) = self.inline(lambda x: [function(x)], [_SeriesIndex(0)])
+        self.result = result.term_index if isinstance(result, _SeriesIndex) else None
+        self.constant = result
         self.evaluation_order = [] if self.result is None else self._topological_order(self.result)
 
-    def next_coefficient(self, n, number, first, histories: dict) -> tuple[jax.Array, dict]:
-        """Coefficient n of the result from that of the argument, and the histories with coefficients n entered."""
-        now: dict[int, Any] = {}
+    def next_coefficient(self, n, n_float, argument_coefficient, histories: dict) -> tuple[jax.Array, dict]:
+        """Return coefficient n of the result from that of the argument, and the histories with coefficients n added."""
+        coefficients: dict[int, Any] = {}
         histories = dict(histories)
-        for place in (0, *self.evaluation_order):
-            term = self.terms[place]
-            if place:
+        for term_index in (0, *self.evaluation_order):
+            term = self.terms[term_index]
+            if term_index:
                 assert term.rule is not None
-                now[place] = term.rule(
-                    n, number, [now[i] for i in term.current_terms], [histories[i] for i in term.history_terms]
+                coefficients[term_index] = term.rule(
+                    n,
+                    n_float,
+                    [coefficients[i] for i in term.current_terms],
+                    [histories[i] for i in term.history_terms],
                 )
             else:
-                now[place] = first
-            if place in histories:
-                histories[place] = _store_coefficient(histories[place], now[place], n)
+                coefficients[term_index] = argument_coefficient
+            if term_index in histories:
+                histories[term_index] = _store_coefficient(histories[term_index], coefficients[term_index], n)
         assert self.result is not None
-        return now[self.result], histories
+        return coefficients[self.result], histories
 
     def history_starts(self):
-        """The places of the terms whose past is needed, and their first coefficients."""
-        places = sorted({i for place in self.evaluation_order for i in self.terms[place].history_terms})
-        return [(i, self.terms[i].start) for i in places]
+        """Return the index and coefficient 0 of each term whose history is needed."""
+        indices = sorted({i for term_index in self.evaluation_order for i in self.terms[term_index].history_terms})
+        return [(i, self.terms[i].start) for i in indices]
 
     def _topological_order(self, result: int) -> list[int]:
-        """Depth first; by way of ``past`` further terms are needed, in no order."""
-        order, wanted, entered = [], [result], {0}
-        while wanted:
-            stack = [(wanted.pop(), False)]
+        """Return the terms that a result needs, each after its ``current_terms``; ``history_terms`` may come later."""
+        order, pending, visited_terms = [], [result], {0}
+        while pending:
+            stack = [(pending.pop(), False)]
             while stack:
-                place, done = stack.pop()
-                if done:
-                    order.append(place)
-                elif place not in entered:
-                    entered.add(place)
-                    term = self.terms[place]
+                term_index, is_expanded = stack.pop()
+                if is_expanded:
+                    order.append(term_index)
+                elif term_index not in visited_terms:
+                    visited_terms.add(term_index)
+                    term = self.terms[term_index]
                     if term.rule is None:
                         raise TaylorSeriesError(*term.refusal)
-                    stack.append((place, True))
+                    stack.append((term_index, True))
                     stack.extend((i, False) for i in term.current_terms)
-                    wanted.extend(term.history_terms)
+                    pending.extend(term.history_terms)
         return order
 
     # -- building -----------------------------------------------------------------------------------------------------
 
-    def add_term(self, start, rule: Callable | None, now=(), past=(), **more) -> _SeriesIndex:
-        self.terms.append(_SeriesTerm(start, rule, tuple(now), tuple(past), **more))
+    def add_term(self, start, rule: Callable | None, current_terms=(), history_terms=(), **fields) -> _SeriesIndex:
+        self.terms.append(_SeriesTerm(start, rule, tuple(current_terms), tuple(history_terms), **fields))
         return _SeriesIndex(len(self.terms) - 1)
 
     def initial_value(self, value):
@@ -187,13 +193,13 @@ class _Recurrences:
         return isinstance(value, _SeriesIndex) and self.terms[value.term_index].starts_at_zero
 
     def inline(self, function: Callable, values: Sequence) -> list:
-        """What a function from arrays to a list of arrays makes of values."""
+        """Apply a function from arrays to a list of arrays to values that are constants or series."""
         avals = [jax.ShapeDtypeStruct(np.shape(a), jnp.result_type(a)) for a in map(self.initial_value, values)]
-        closed = jax.make_jaxpr(function)(*avals)
-        return self.evaluate_jaxpr(closed.jaxpr, closed.consts, values)
+        closed_jaxpr = jax.make_jaxpr(function)(*avals)
+        return self.evaluate_jaxpr(closed_jaxpr.jaxpr, closed_jaxpr.consts, values)
 
     def evaluate_jaxpr(self, jaxpr, consts: Sequence, values: Sequence) -> list:
-        """The results of a jaxpr: arrays where they do not depend on the argument, and series."""
+        """Return the results of a jaxpr: series, or arrays if they do not depend on the argument."""
         env = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *values), strict=True))
 
         def read(v):
@@ -201,17 +207,19 @@ class _Recurrences:
 
         has_powers = any(eqn.primitive.name == "pow" for eqn in jaxpr.eqns)
         for eqn in jaxpr.eqns:
-            given, name = [read(v) for v in eqn.invars], eqn.primitive.name
+            arguments, name = [read(v) for v in eqn.invars], eqn.primitive.name
             if name in CALL_PRIMITIVES:
-                found = _call_rule(self, eqn, given)
-            elif has_powers and all(map(_is_small_constant, given)):
-                with jax.ensure_compile_time_eval():  # it may become an exponent, whose value says what is done
-                    found = _evaluate_equation(eqn, given)
-            elif not any(isinstance(value, _SeriesIndex) for value in given) or not any(map(_is_inexact, eqn.outvars)):
-                found = _evaluate_equation(eqn, map(self.initial_value, given))  # tests are decided at the start
+                results = _call_rule(self, eqn, arguments)
+            elif has_powers and all(map(_is_small_constant, arguments)):
+                with jax.ensure_compile_time_eval():  # it may become an exponent, whose value selects the rule
+                    results = _evaluate_equation(eqn, arguments)
+            elif not any(isinstance(value, _SeriesIndex) for value in arguments) or not any(
+                map(_is_inexact, eqn.outvars)
+            ):
+                results = _evaluate_equation(eqn, map(self.initial_value, arguments))  # tests use the initial values
             else:
-                found = SERIES_RULES.get(name, _refuse_series)(self, eqn, given)
-            env.update(zip(eqn.outvars, found, strict=True))
+                results = SERIES_RULES.get(name, _refuse_series)(self, eqn, arguments)
+            env.update(zip(eqn.outvars, results, strict=True))
         return [read(v) for v in jaxpr.outvars]
 
 
@@ -219,7 +227,7 @@ class _Recurrences:
 
 
 def _refuse_series(recurrences: _Recurrences, eqn, values) -> list:
-    """Only the value at the start is known, which is all that a test needs."""
+    """Return terms with only a start, which suffices for tests; any other use raises TaylorSeriesError."""
     return [
         recurrences.add_term(start, None, refusal=(eqn.primitive.name, user_source_line(eqn)))
         for start in _evaluate_equation(eqn, map(recurrences.initial_value, values))
@@ -227,99 +235,109 @@ def _refuse_series(recurrences: _Recurrences, eqn, values) -> list:
 
 
 def _linear_rule(recurrences: _Recurrences, eqn, values) -> list:
-    """Linear in all real arguments together: those that are constant have no further coefficients."""
-    moving = [value.term_index for value in values if isinstance(value, _SeriesIndex)]
+    """Apply a primitive that is linear in all real arguments together; constants have no higher coefficients."""
+    series_indices = [value.term_index for value in values if isinstance(value, _SeriesIndex)]
 
-    def rule(n, number, now, past, which):
-        rest = iter(now)
-        given = [_higher_coefficient(value, rest) for value in values]
-        return _evaluate_equation(eqn, given)[which]
+    def rule(n, n_float, current, history, output_number):
+        coefficients = iter(current)
+        arguments = [_higher_coefficient(value, coefficients) for value in values]
+        return _evaluate_equation(eqn, arguments)[output_number]
 
-    rising = all(recurrences.terms[place].starts_at_zero for place in moving)
+    starts_at_zero = all(recurrences.terms[i].starts_at_zero for i in series_indices)
     return [
-        recurrences.add_term(start, _select_output(rule, which), moving, rising=rising)
-        for which, start in enumerate(_evaluate_equation(eqn, map(recurrences.initial_value, values)))
+        recurrences.add_term(start, _select_output(rule, output_number), series_indices, starts_at_zero=starts_at_zero)
+        for output_number, start in enumerate(_evaluate_equation(eqn, map(recurrences.initial_value, values)))
     ]
 
 
-def _higher_coefficient(value, rest):
-    """A coefficient beyond the first: the next of the rest for a series, zero for a constant."""
+def _higher_coefficient(value, coefficients):
+    """Return a coefficient above the first: the next one of ``coefficients`` for a series, zero for a constant."""
     if isinstance(value, _SeriesIndex):
-        return next(rest)
+        return next(coefficients)
     return jnp.zeros_like(value) if jnp.issubdtype(jnp.result_type(value), jnp.inexact) else value
 
 
-def _select_output(rule: Callable, which: int) -> Callable:
-    return lambda *arguments: rule(*arguments, which)
+def _select_output(rule: Callable, output_index: int) -> Callable:
+    return lambda *arguments: rule(*arguments, output_index)
 
 
 def _bilinear_rule(recurrences: _Recurrences, eqn, values) -> list:
     (start,) = _evaluate_equation(eqn, map(recurrences.initial_value, values))
     a, b = values
     if isinstance(a, _SeriesIndex) and isinstance(b, _SeriesIndex):
-        now = [
-            x.term_index for x, y in ((a, b), (b, a)) if not recurrences.starts_at_zero(y)
-        ]  # beside coefficient 0 of the other
+        # coefficient n of a factor is multiplied by coefficient 0 of the other one
+        current_terms = [x.term_index for x, y in ((a, b), (b, a)) if not recurrences.starts_at_zero(y)]
 
-        def rule(n, number, now, past):
-            return cauchy_product(lambda *pair: _evaluate_equation(eqn, pair)[0], past[0], past[1], n)
+        def rule(n, n_float, current, history):
+            return cauchy_product(lambda *pair: _evaluate_equation(eqn, pair)[0], history[0], history[1], n)
 
         return [
             recurrences.add_term(
                 start,
                 rule,
-                now,
+                current_terms,
                 (a.term_index, b.term_index),
-                rising=recurrences.starts_at_zero(a) or recurrences.starts_at_zero(b),
+                starts_at_zero=recurrences.starts_at_zero(a) or recurrences.starts_at_zero(b),
             )
         ]
-    moving = a if isinstance(a, _SeriesIndex) else b
+    series = a if isinstance(a, _SeriesIndex) else b
 
-    def single(n, number, now, past):
-        return _evaluate_equation(eqn, [now[0] if value is moving else value for value in values])[0]
+    def linear_rule(n, n_float, current, history):
+        return _evaluate_equation(eqn, [current[0] if value is series else value for value in values])[0]
 
-    return [recurrences.add_term(start, single, (moving.term_index,), rising=recurrences.starts_at_zero(moving))]
+    return [
+        recurrences.add_term(
+            start, linear_rule, (series.term_index,), starts_at_zero=recurrences.starts_at_zero(series)
+        )
+    ]
 
 
 def _solve_bilinear(recurrences: _Recurrences, start, product: Callable, solve: Callable, a: _SeriesIndex, b) -> list:
-    """``c`` with ``product(a, c) = b``, a bilinear product, where ``solve(rhs)`` is it at the start."""
-    moving, rising = isinstance(b, _SeriesIndex), recurrences.starts_at_zero(b)
-    now = [*([b.term_index] if moving else ()), *(() if rising else (a.term_index,))]
+    """Solve ``product(a, c) = b`` for c, with a bilinear product; ``solve(rhs)`` solves it with coefficient 0 of a."""
+    is_series, starts_at_zero = isinstance(b, _SeriesIndex), recurrences.starts_at_zero(b)
+    current_terms = [*([b.term_index] if is_series else ()), *(() if starts_at_zero else (a.term_index,))]
 
-    def rule(n, number, now, past):
-        rest = cauchy_product(product, past[0], past[1], n)  # without coefficient n of c, which is zero yet
-        return solve(now[0] - rest if moving else -rest)
+    def rule(n, n_float, current, history):
+        # coefficient n of c is still zero here
+        lower_terms = cauchy_product(product, history[0], history[1], n)
+        return solve(current[0] - lower_terms if is_series else -lower_terms)
 
-    return [recurrences.add_term(start, rule, now, (a.term_index, len(recurrences.terms)), rising=rising)]
+    return [
+        recurrences.add_term(
+            start, rule, current_terms, (a.term_index, len(recurrences.terms)), starts_at_zero=starts_at_zero
+        )
+    ]
 
 
 def _division_rule(recurrences: _Recurrences, eqn, values) -> list:
     a, b = values
     if not isinstance(b, _SeriesIndex):
         return _bilinear_rule(recurrences, eqn, values)
-    first = recurrences.initial_value(b)
+    divisor_start = recurrences.initial_value(b)
     return _solve_bilinear(
-        recurrences, recurrences.initial_value(a) / first, jnp.multiply, lambda rhs: rhs / first, b, a
+        recurrences, recurrences.initial_value(a) / divisor_start, jnp.multiply, lambda rhs: rhs / divisor_start, b, a
     )
 
 
 def _linear_solve_rule(recurrences: _Recurrences, eqn, values) -> list:
-    """``custom_linear_solve``: its matrix from its products, its inverse from the user's way of solving."""
-    sizes, jaxprs = eqn.params["const_lengths"], eqn.params["jaxprs"]
-    constants, right = list(values[: sum(sizes)]), values[sum(sizes) :]
-    if len(right) > 1:
+    """Apply ``custom_linear_solve``: its matrix is assembled from its products, its inverse is the user's ``solve``."""
+    lengths, jaxprs = eqn.params["const_lengths"], eqn.params["jaxprs"]
+    constants, right_sides = list(values[: sum(lengths)]), values[sum(lengths) :]
+    if len(right_sides) > 1:
         return _refuse_series(recurrences, eqn, values)
-    (b,), starts = right, [recurrences.initial_value(value) for value in constants]
+    (b,), starts = right_sides, [recurrences.initial_value(value) for value in constants]
     shape = np.shape(recurrences.initial_value(b))
-    axes = np.eye(int(np.prod(shape)))
+    basis = np.eye(int(np.prod(shape)))
 
-    def columns(*own):
+    def columns(*matvec_constants):
         product = jaxpr_as_fun(jaxprs.matvec)
-        return [jax.vmap(lambda axis: product(*own, axis.reshape(shape))[0].ravel())(axes)]
+        return [
+            jax.vmap(lambda basis_vector: product(*matvec_constants, basis_vector.reshape(shape))[0].ravel())(basis)
+        ]
 
-    (matrix,) = recurrences.inline(columns, values[: sizes.matvec])
+    (matrix,) = recurrences.inline(columns, values[: lengths.matvec])
     if not isinstance(matrix, _SeriesIndex):
-        return _linear_rule(recurrences, eqn, values)  # in b alone: what else is there are the constants of other ways
+        return _linear_rule(recurrences, eqn, values)  # linear in b; the other values are constants of the other jaxprs
 
     def solve(rhs):
         return eqn.primitive.bind(*starts, rhs, **eqn.params)[0]
@@ -331,67 +349,67 @@ def _linear_solve_rule(recurrences: _Recurrences, eqn, values) -> list:
 
 
 def _triangular_solve_rule(recurrences: _Recurrences, eqn, values) -> list:
-    """``triangular_solve``: of the matrix one triangle counts."""
+    """Apply ``triangular_solve``, which reads one triangle of the matrix."""
     a, b = values
     if not isinstance(a, _SeriesIndex):
         return _bilinear_rule(recurrences, eqn, values)
-    params, first = eqn.params, recurrences.initial_value(a)
+    params, matrix_start = eqn.params, recurrences.initial_value(a)
 
     def product(a, c):
         a = jnp.tril(a) if params["lower"] else jnp.triu(a)
         if params["unit_diagonal"]:
-            a = a - a * jnp.eye(a.shape[-1])  # the ones belong to coefficient 0, which is solved for
+            a = a - a * jnp.eye(a.shape[-1])  # the unit diagonal belongs to coefficient 0
         a = a.swapaxes(-1, -2) if params["transpose_a"] else a
         return a @ c if params["left_side"] else c @ a
 
     def solve(rhs):
-        return eqn.primitive.bind(first, rhs, **params)
+        return eqn.primitive.bind(matrix_start, rhs, **params)
 
     return _solve_bilinear(recurrences, solve(recurrences.initial_value(b)), product, solve, a, b)
 
 
 def _derivative_rule(recurrences: _Recurrences, eqn, values) -> list:
-    """``y = F(a, b, ...)`` from ``D y = dF(D a, D b, ...)``, by JAX's own rule for dF."""
+    """Compute ``y = F(a, b, ...)`` from ``D y = dF(D a, D b, ...)``, with JAX's rule for dF."""
     (start,) = _evaluate_equation(eqn, map(recurrences.initial_value, values))
     key = (eqn.primitive.name, repr(eqn.params), tuple(value for value in values if isinstance(value, _SeriesIndex)))
-    whole = len(key[2]) == len(values)
-    if whole and key in recurrences._cached_series:
-        return [recurrences._cached_series[key]]  # which it may be itself: of y = exp(a) the derivative is y
+    is_all_series = len(key[2]) == len(values)
+    if is_all_series and key in recurrences._cached_series:
+        return [recurrences._cached_series[key]]  # also inside its own rule: the derivative of exp(a) is exp(a)
     y = recurrences.add_term(start, None)
-    if whole:
+    if is_all_series:
         recurrences._cached_series[key] = y
     rates = [_euler_derivative(recurrences, value) for value in values if isinstance(value, _SeriesIndex)]
     if eqn.primitive.name == "pow":
-        (change,) = _power_derivative(recurrences, y, *values)
+        (euler_derivative,) = _power_derivative(recurrences, y, *values)
     else:
 
         def tangent(*arguments):
-            rest = iter(arguments[len(values) :])
-            tangents = tuple(next(rest) if isinstance(v, _SeriesIndex) else jnp.zeros_like(v) for v in values)
+            rate_values = iter(arguments[len(values) :])
+            tangents = tuple(next(rate_values) if isinstance(v, _SeriesIndex) else jnp.zeros_like(v) for v in values)
             return [jax.jvp(lambda *a: _evaluate_equation(eqn, a)[0], arguments[: len(values)], tangents)[1]]
 
-        (change,) = recurrences.inline(tangent, [*values, *rates])
+        (euler_derivative,) = recurrences.inline(tangent, [*values, *rates])
     recurrences.terms[y.term_index] = _SeriesTerm(
-        start, lambda n, number, now, past: now[0] / number, (change.term_index,)
+        start, lambda n, n_float, current, history: current[0] / n_float, (euler_derivative.term_index,)
     )
     return [y]
 
 
 def _power_rule(recurrences: _Recurrences, eqn, values) -> list:
-    """``a ** p``: products where p is whole, for ``p D a / a`` loses all digits where a is small, and is NaN at 0."""
+    """Compute ``a ** p``, by products for an integer p: ``p D a / a`` is inaccurate near a = 0, and NaN there."""
     a, p = values
     if not isinstance(a, _SeriesIndex) or isinstance(p, _SeriesIndex):
         return _derivative_rule(recurrences, eqn, values)
     if _is_small_constant(p):
         exponents: Any = np.asarray(p)
-        whole = [int(n) for n in np.unique(exponents) if float(n).is_integer() and abs(n) <= MAX_INTEGER_EXPONENT]
-        if len(whole) == 1 and (exponents == whole[0]).all():
-            return recurrences.inline(lambda x: [_power_by_squaring(x, whole[0])], [a])
-    else:  # a parameter
-        exponents, whole = p, list(range(MAX_INTEGER_PARAMETER + 1))
+        integers = [int(n) for n in np.unique(exponents) if float(n).is_integer() and abs(n) <= MAX_INTEGER_EXPONENT]
+        if len(integers) == 1 and (exponents == integers[0]).all():
+            return recurrences.inline(lambda x: [_power_by_squaring(x, integers[0])], [a])
+    else:  # the exponent is a parameter
+        exponents, integers = p, list(range(MAX_INTEGER_PARAMETER + 1))
 
     def select_power(x, result):
-        for n in whole:
+        for n in integers:
             result = jnp.where(exponents == n, _power_by_squaring(x, n), result)
         return [result]
 
@@ -399,27 +417,29 @@ def _power_rule(recurrences: _Recurrences, eqn, values) -> list:
 
 
 def _is_small_constant(value) -> bool:
-    """Whether it is a number, or a few of them, known when the function is traced."""
+    """Return whether a value is a number, or a few numbers, known at trace time."""
     return not isinstance(value, _SeriesIndex | jax.core.Tracer) and np.size(value) <= MAX_CONSTANT_EXPONENTS
 
 
 MAX_CONSTANT_EXPONENTS = 64
-"""Entries of a constant that may be an array of exponents."""
+"""Largest number of entries of a constant that is treated as an array of exponents."""
 
 MAX_INTEGER_EXPONENT = 256
-"""Largest size of a whole exponent, known when the function is traced, for which a power is written as products."""
+"""Largest modulus of a constant integer exponent for which a power is written as products."""
 
 MAX_INTEGER_PARAMETER = 6
-"""Largest whole exponent for which a power is, where the exponent is a parameter."""
+"""Largest integer exponent, given by a parameter, for which a power is written as products."""
 
 
 def _euler_derivative(recurrences: _Recurrences, a: _SeriesIndex) -> _SeriesIndex:
     zero = jnp.zeros_like(recurrences.initial_value(a))
-    return recurrences.add_term(zero, lambda n, number, now, past: number * now[0], (a.term_index,), rising=True)
+    return recurrences.add_term(
+        zero, lambda n, n_float, current, history: n_float * current[0], (a.term_index,), starts_at_zero=True
+    )
 
 
 def _power_derivative(recurrences: _Recurrences, y: _SeriesIndex, a, p) -> list:
-    """``D y = y (p D a / a + log(a) D p)``: JAX's rule has another power in it, whose rule has another."""
+    """Return ``D y = y (p D a / a + log(a) D p)``; JAX's rule contains another power, and so on without end."""
     if not isinstance(p, _SeriesIndex):
         return recurrences.inline(
             lambda y, a, p, da: [y * (p * (da / a))], [y, a, p, _euler_derivative(recurrences, a)]
@@ -433,7 +453,7 @@ def _power_derivative(recurrences: _Recurrences, y: _SeriesIndex, a, p) -> list:
 
 
 def _rewriting_rule(function: Callable) -> Callable:
-    """A primitive in terms of others: ``function(parameters, arguments)``."""
+    """Return the rule that writes a primitive in terms of others: ``function(parameters, *arguments)``."""
     return lambda recurrences, eqn, values: recurrences.inline(lambda *a: [function(eqn.params, *a)], values)
 
 
@@ -460,42 +480,43 @@ def _call_rule(recurrences: _Recurrences, eqn, values) -> list:
 
 
 def _cond_rule(recurrences: _Recurrences, eqn, values) -> list:
-    """``cond``: every branch, then the one that is taken at the start."""
-    which, *values = values
+    """Evaluate every branch of ``cond``, then select the branch that is chosen at the start."""
+    branch_index, *values = values
     results = [recurrences.evaluate_jaxpr(branch.jaxpr, branch.consts, values) for branch in eqn.params["branches"]]
 
-    def choice(which, *cases):
-        which = jnp.clip(jnp.asarray(which, dtype=jnp.int32), 0, len(cases) - 1)
-        return [jax.lax.select_n(which, *cases)]
+    def choice(index, *cases):
+        index = jnp.clip(jnp.asarray(index, dtype=jnp.int32), 0, len(cases) - 1)
+        return [jax.lax.select_n(index, *cases)]
 
     return [
-        recurrences.inline(choice, [recurrences.initial_value(which), *cases])[0]
+        recurrences.inline(choice, [recurrences.initial_value(branch_index), *cases])[0]
         for cases in zip(*results, strict=True)
     ]
 
 
 def _scan_rule(recurrences: _Recurrences, eqn, values) -> list:
-    """``scan``, unrolled."""
+    """Unroll ``scan``."""
     params = eqn.params
-    inner, first = params["jaxpr"], params["num_consts"]
-    last = first + params["num_carry"]
-    consts, carry, slices = values[:first], list(values[first:last]), values[last:]
-    rows, gathered = range(params["length"]), []
+    body, n_consts = params["jaxpr"], params["num_consts"]
+    carry_end = n_consts + params["num_carry"]
+    consts, carry, tables = values[:n_consts], list(values[n_consts:carry_end]), values[carry_end:]
+    rows, row_outputs = range(params["length"]), []
     for i in reversed(rows) if params["reverse"] else rows:
-        own = [recurrences.inline(lambda x, i=i: [x[i]], [x])[0] for x in slices]
-        found = recurrences.evaluate_jaxpr(inner.jaxpr, inner.consts, [*consts, *carry, *own])
-        carry = found[: len(carry)]
-        gathered.append(found[len(carry) :])
+        row_slices = [recurrences.inline(lambda x, i=i: [x[i]], [x])[0] for x in tables]
+        results = recurrences.evaluate_jaxpr(body.jaxpr, body.consts, [*consts, *carry, *row_slices])
+        carry = results[: len(carry)]
+        row_outputs.append(results[len(carry) :])
     if params["reverse"]:
-        gathered.reverse()
+        row_outputs.reverse()
     return carry + [
-        recurrences.inline(lambda *rows: [jnp.stack(rows)], column)[0] for column in zip(*gathered, strict=True)
+        recurrences.inline(lambda *rows: [jnp.stack(rows)], column)[0] for column in zip(*row_outputs, strict=True)
     ]
 
 
 CALL_PRIMITIVES = set(
     "jit pjit call closed_call core_call custom_jvp_call custom_vjp_call checkpoint remat remat2".split()
 )
+"""Primitives that call a jaxpr."""
 
 NONSMOOTH_PRIMITIVES = set(
     "abs sign floor ceil round max min clamp rem reduce_max reduce_min cummax cummin argmax argmin sort".split()
@@ -507,11 +528,13 @@ add sub add_any neg convert_element_type copy copy_p name optimization_barrier s
 reduce_sum cumsum broadcast_in_dim reshape squeeze expand_dims transpose rev slice split concatenate stack unstack tile
 pad dynamic_slice dynamic_update_slice gather scatter scatter-add scatter-sub select_n
 """
+"""Primitives that are linear in all real arguments together."""
 
 DERIVATIVE_PRIMITIVES = """
 exp exp2 expm1 log log1p pow sqrt rsqrt cbrt logistic sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh
 erf erfc erf_inv reduce_prod cumprod cholesky
 """
+"""Primitives whose series follow from their derivative."""
 
 SERIES_RULES: dict[str, Callable] = {
     **dict.fromkeys(LINEAR_PRIMITIVES.split(), _linear_rule),
@@ -526,14 +549,15 @@ SERIES_RULES: dict[str, Callable] = {
     "cond": _cond_rule,
     "scan": _scan_rule,
 }
+"""Rules ``rule(recurrences, equation, values)`` by primitive; each returns the list of results."""
 
 # -- helpers ----------------------------------------------------------------------------------------------------------
 
 
 def cauchy_product(product: Callable, a, b, n) -> jax.Array:
-    """``sum_k product(a[k], b[n - k])`` for k from 0 to n, of coefficients that are zero beyond n."""
-    size = a.shape[0]
-    window = jax.lax.dynamic_slice_in_dim(jnp.concatenate([jnp.zeros_like(b), b]), n + 1, size)
+    """Return ``sum_k product(a[k], b[n - k])`` for k from 0 to n; coefficients beyond n are zero."""
+    n_coefficients = a.shape[0]
+    window = jax.lax.dynamic_slice_in_dim(jnp.concatenate([jnp.zeros_like(b), b]), n + 1, n_coefficients)
     return jax.vmap(product)(a, window[::-1]).sum(axis=0)
 
 
@@ -542,11 +566,11 @@ def _store_coefficient(history, coefficient, n):
 
 
 def _evaluate_equation(eqn, values) -> list:
-    """The results of an equation for arrays."""
-    found = eqn.primitive.bind(*values, **eqn.primitive.get_bind_params(eqn.params))
-    return list(found) if eqn.primitive.multiple_results else [found]
+    """Return the results of an equation for arrays."""
+    results = eqn.primitive.bind(*values, **eqn.primitive.get_bind_params(eqn.params))
+    return list(results) if eqn.primitive.multiple_results else [results]
 
 
 def _is_inexact(v) -> bool:
-    """Whether a variable is one of real or complex numbers."""
+    """Return whether a variable holds real or complex numbers."""
     return jnp.issubdtype(v.aval.dtype, jnp.inexact)

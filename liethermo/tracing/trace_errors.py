@@ -1,4 +1,4 @@
-"""Why a function of a user could not be traced: the cause and the cure first, JAX's own words last."""
+"""Messages for a user's function that cannot be traced: the cause and the cure first, JAX's message last."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..errors import FunctionError
 from .scalarize import is_user_file, user_source_line
 
 TRACE_ERRORS = (TypeError, ValueError, IndexError, AttributeError)
-"""What the call of a function with traced arrays may raise."""
+"""Exceptions that a call with traced arrays may raise."""
 
 JAX_ERROR_REMEDIES = {
     jax.errors.TracerBoolConversionError: (
@@ -39,33 +39,33 @@ JAX_ERROR_REMEDIES = {
         "Leave out float, and replace math by jax.numpy, such as math.sin by jnp.sin",
     ),
 }
-"""The errors that JAX raises if a traced value is used as a number: what the function does, and what to do instead."""
+"""Cause and remedy for each error that JAX raises if a traced value is used as a number."""
 
 
-def explain_trace_error(what: str, error: BaseException, cure: str = "") -> str:
+def explain_trace_error(subject: str, error: BaseException, cure: str = "") -> str:
     """Return a message that says why a function could not be evaluated, and what to do.
 
     Parameters
     ----------
-    what : str
+    subject : str
         Names the function and its arguments, such as "the energy could not be evaluated on a state of shape (3,)".
     error : exception
-        What its call with traced arrays has raised.
+        The exception that a call with traced arrays has raised.
     cure : str
-        What to do if nothing is known of the error.
+        Advice for an unknown error.
     """
-    for kind, (cause, known_cure) in JAX_ERROR_REMEDIES.items():
+    for kind, (cause, remedy) in JAX_ERROR_REMEDIES.items():
         if isinstance(error, kind):
-            reported = str(error).splitlines()[0].rstrip(".")
-            return f"{what}: {cause}{_user_line(error)}. {known_cure}. JAX reports: {reported}"
+            jax_message = str(error).splitlines()[0].rstrip(".")
+            return f"{subject}: {cause}{_user_line(error)}. {remedy}. JAX reports: {jax_message}"
     if isinstance(error, FunctionError):
-        return f"{what}: {error}"
-    message = f"{what}: {type(error).__name__}: {error}".rstrip(".")
+        return f"{subject}: {error}"
+    message = f"{subject}: {type(error).__name__}: {error}".rstrip(".")
     return f"{message}. {cure}" if cure else message
 
 
 def _user_line(error: BaseException) -> str:
-    """Where the user's function raised."""
+    """Return the line of the user's code that raised an error, in parentheses, or ""."""
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
         if is_user_file(Path(frame.filename)):
             return f" ({Path(frame.filename).name}:{frame.lineno}, in {frame.name})"
@@ -73,7 +73,7 @@ def _user_line(error: BaseException) -> str:
 
 
 def check_not_none(value, name: str) -> None:
-    """Raise FunctionError if a function returned nothing."""
+    """Raise FunctionError if a function returned None."""
     if value is None:
         raise FunctionError(f"{name} returns None. Add the missing `return`")
 
@@ -81,7 +81,7 @@ def check_not_none(value, name: str) -> None:
 def check_precision(jaxpr: Jaxpr, name: str) -> None:
     """Raise FunctionError if a function rounds a traced number to single precision.
 
-    Steps hold the laws to the rounding of double precision, so no step of such a function could be solved.
+    Steps conserve the laws to the rounding of double precision, so no step with such a function could be solved.
     """
     for eqn in jaxpr.eqns:
         for inner in jaxprs_in_params(eqn.params):
@@ -91,6 +91,7 @@ def check_precision(jaxpr: Jaxpr, name: str) -> None:
             dtype = np.dtype(eqn.params["new_dtype"])
             if operand.dtype == np.float64 and dtype.kind == "f" and dtype.itemsize < 8:
                 raise FunctionError(
-                    f"{name} rounds numbers to {dtype} ({user_source_line(eqn)}), but the laws hold to the rounding of float64. "
+                    f"{name} rounds numbers to {dtype} ({user_source_line(eqn)}), "
+                    "but the laws hold to the rounding of float64. "
                     f"Leave out {dtype}, such as astype(jnp.{dtype})"
                 )

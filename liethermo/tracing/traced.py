@@ -1,9 +1,9 @@
-"""Plain functions as programs with parameters: closures that differ in their numbers alone become one program.
+"""Plain functions as programs with parameters: closures that differ only in their numbers become one program.
 
-A function made anew in every pass of a loop has a new identity, and whatever was compiled for the last one would not be
-found again. What it does is the same: the jaxpr that JAX traces, in which its numbers stand as literals and constants.
-Here they are taken out and become the leaves of a pytree; what is left is an object that is one and the same for equal
-operations. Tracers that a function closes over are leaves too, where they can be seen and differentiated.
+A function that is made anew in every pass of a loop has a new identity, so its compiled program would not be found
+again. But it has the same jaxpr, except for the numbers that are its literals and constants. These are taken out and
+become the leaves of a pytree; the rest is one object for equal operations. Tracers that a function closes over are
+leaves too, so they can be differentiated.
 """
 
 from __future__ import annotations
@@ -31,25 +31,25 @@ from .trace_errors import check_not_none, check_precision
 
 
 class TracedProgram:
-    """What a function does to arrays of given shapes, without the numbers in it; equal operations are one object.
+    """The operations of a function of arrays of given shapes, without its numbers; equal operations are one object.
 
     Attributes
     ----------
     closed_jaxpr : ClosedJaxpr
-        Its first arguments are the numbers.
+        The numbers are its first arguments.
     result_structure : PyTreeDef
-        Of the result.
+        Structure of the result.
     argument_avals : tuple of avals
     has_while_loop : bool
-        Whether it has a loop of unknown length, which JAX differentiates forwards alone.
+        Whether there is a loop of unknown length, which JAX can differentiate in forward mode only.
     """
 
-    def __init__(self, closed: ClosedJaxpr, structure, arguments: tuple, loops: bool):
+    def __init__(self, closed_jaxpr: ClosedJaxpr, structure, avals: tuple, has_while_loop: bool):
         self.closed_jaxpr, self.result_structure, self.argument_avals, self.has_while_loop = (
-            closed,
+            closed_jaxpr,
             structure,
-            arguments,
-            loops,
+            avals,
+            has_while_loop,
         )
 
     def __repr__(self) -> str:
@@ -67,7 +67,7 @@ _lock = threading.Lock()
 
 
 class _Label:
-    """A name, which makes no difference: all labels are equal."""
+    """A name that does not affect comparisons: all labels are equal."""
 
     def __init__(self, name: str):
         self.name = name
@@ -83,13 +83,15 @@ class _Label:
 
 
 class TracedFunction(Module):
-    """A function of arrays, traced once, as a pytree of the numbers that it was written with.
+    """A function of arrays, traced once, as a pytree of its numbers.
 
     Attributes
     ----------
     numbers : tuple of arrays
-        The plain numbers in one array, then the arrays that it closes over.
-    program : Content
+        The Python numbers in one array, then the arrays that the function closes over.
+    program : TracedProgram
+    label : _Label
+        Name of the function, for messages.
     """
 
     numbers: tuple[jax.Array, ...]
@@ -101,33 +103,35 @@ class TracedFunction(Module):
         return self.label.name
 
     def __call__(self, *arguments):
-        wanted = self.program.argument_avals
-        given = tuple(map(jnp.asarray, arguments))
-        if tuple(np.shape(a) for a in given) != tuple(a.shape for a in wanted):
+        expected_avals = self.program.argument_avals
+        arrays = tuple(map(jnp.asarray, arguments))
+        if tuple(np.shape(a) for a in arrays) != tuple(a.shape for a in expected_avals):
+            expected_shapes = ", ".join(str(a.shape) for a in expected_avals)
             raise FunctionError(
-                f"{self.label.name} is a function of arrays of shapes {', '.join(str(a.shape) for a in wanted)} in the "
-                f"system that it belongs to, not of {', '.join(str(np.shape(a)) for a in given)}"
+                f"{self.label.name} must be called with arrays of shape {expected_shapes}, as in its system, "
+                f"got {', '.join(str(np.shape(a)) for a in arrays)}"
             )
-        values = [*self.numbers, *(a.astype(b.dtype) for a, b in zip(given, wanted, strict=True))]
+        values = [*self.numbers, *(a.astype(b.dtype) for a, b in zip(arrays, expected_avals, strict=True))]
         run = _run_with_while_loop if self.program.has_while_loop else _run_program
         return jax.tree_util.tree_unflatten(self.program.result_structure, run(self.program, values))
 
 
-def _run_program(content: TracedProgram, values: Sequence) -> list:
-    packed, *rest = values
-    scalars = [jax.lax.squeeze(jax.lax.slice(packed, (i,), (i + 1,)), (0,)) for i in range(packed.shape[0])]
-    return jaxpr_as_fun(content.closed_jaxpr)(*scalars, *rest)
+def _run_program(program: TracedProgram, values: Sequence) -> list:
+    number_array, *arrays = values
+    scalars = [jax.lax.squeeze(jax.lax.slice(number_array, (i,), (i + 1,)), (0,)) for i in range(number_array.shape[0])]
+    return jaxpr_as_fun(program.closed_jaxpr)(*scalars, *arrays)
 
 
-def _run_with_while_loop(content: TracedProgram, values: Sequence) -> list:
-    return _forward_differentiable(lambda *values: _run_program(content, values))(*values)
+def _run_with_while_loop(program: TracedProgram, values: Sequence) -> list:
+    return _forward_differentiable(lambda *values: _run_program(program, values))(*values)
 
 
 def _forward_differentiable(function: Callable) -> Callable:
-    """A function to a list of arrays, each derivative of which is taken forwards, whichever way is asked for.
+    """Return a function whose derivatives are computed in forward mode, also where JAX asks for reverse mode.
 
-    A loop of unknown length has no derivative backwards. The tangent is the Jacobian, found forwards, times the
-    direction, and that product is linear: it can be transposed. Likewise for the derivatives of the Jacobian.
+    A loop of unknown length cannot be differentiated in reverse mode. The tangent is the Jacobian, computed in forward
+    mode, times the direction; this product is linear, so JAX can transpose it. The Jacobian is wrapped in the same way,
+    for higher derivatives.
     """
 
     @jax.custom_jvp
@@ -137,26 +141,29 @@ def _forward_differentiable(function: Callable) -> Callable:
     @called.defjvp
     def rule(values, tangents):
         values, tangents = tuple(map(jnp.asarray, values)), tuple(map(jnp.asarray, tangents))
-        real = [i for i, v in enumerate(values) if jnp.issubdtype(v.dtype, jnp.inexact)]
+        inexact_indices = [i for i, v in enumerate(values) if jnp.issubdtype(v.dtype, jnp.inexact)]
 
-        def evaluate_inexact(*moving):
-            whole = list(values)
-            for i, v in zip(real, moving, strict=True):
-                whole[i] = v
-            return function(*whole)
+        def evaluate_inexact(*inexact_values):
+            full_values = list(values)
+            for i, v in zip(inexact_indices, inexact_values, strict=True):
+                full_values[i] = v
+            return function(*full_values)
 
-        def tangent(found, columns):
+        def tangent(output, columns):
             terms = [
-                jnp.tensordot(column, tangents[i], tangents[i].ndim) for i, column in zip(real, columns, strict=True)
+                jnp.tensordot(column, tangents[i], tangents[i].ndim)
+                for i, column in zip(inexact_indices, columns, strict=True)
             ]
             return sum(terms[1:], terms[0])
 
         jacobians = _forward_differentiable(
-            lambda *moving: jax.tree_util.tree_leaves(jax.jacfwd(evaluate_inexact, tuple(range(len(real))))(*moving))
-        )(*(values[i] for i in real))
-        found = called(*values)
-        columns = [jacobians[k * len(real) : (k + 1) * len(real)] for k in range(len(found))]
-        return found, [tangent(f, c) for f, c in zip(found, columns, strict=True)]
+            lambda *inexact_arrays: jax.tree_util.tree_leaves(
+                jax.jacfwd(evaluate_inexact, tuple(range(len(inexact_indices))))(*inexact_arrays)
+            )
+        )(*(values[i] for i in inexact_indices))
+        outputs = called(*values)
+        columns = [jacobians[k * len(inexact_indices) : (k + 1) * len(inexact_indices)] for k in range(len(outputs))]
+        return outputs, [tangent(f, c) for f, c in zip(outputs, columns, strict=True)]
 
     return called
 
@@ -165,108 +172,114 @@ def _forward_differentiable(function: Callable) -> Callable:
 
 
 def trace_function(function: Callable, *arguments) -> TracedFunction:
-    """A function of arrays of these shapes (``jax.ShapeDtypeStruct``) as a pytree of its numbers."""
-    ours = _is_library_object(function)
+    """Trace a function of arrays of given shapes (``jax.ShapeDtypeStruct``); return it as a pytree of its numbers."""
+    is_library_code = _is_library_object(function)
     name = getattr(function, "__name__", type(function).__name__)
 
-    def evaluate(*values):  # anew: JAX keeps the trace of a function object, and what the function reads may change
+    def evaluate(*values):  # a new function object: JAX caches traces by it, and globals that it reads may change
         result = function(*values)
         check_not_none(result, name)
         return result
 
-    with contextlib.nullcontext() if ours else user_settings():
-        closed, found = jax.make_jaxpr(evaluate, return_shape=True)(*arguments)
-    if not ours:
-        check_precision(closed.jaxpr, name)
-    check_indices(closed)
-    lifting = ConstantLifter()
-    jaxpr, constants, numbers = lifting.lift_jaxpr(closed)
-    structure = jax.tree_util.tree_structure(found)
+    with contextlib.nullcontext() if is_library_code else user_settings():
+        closed_jaxpr, result_shapes = jax.make_jaxpr(evaluate, return_shape=True)(*arguments)
+    if not is_library_code:
+        check_precision(closed_jaxpr.jaxpr, name)
+    check_indices(closed_jaxpr)
+    lifter = ConstantLifter()
+    jaxpr, constants, numbers = lifter.lift_jaxpr(closed_jaxpr)
+    structure = jax.tree_util.tree_structure(result_shapes)
     avals = tuple(jax.ShapeDtypeStruct(np.shape(a), a.dtype) for a in arguments)
-    found_by = (content_key(ClosedJaxpr(jaxpr, constants)), structure, tuple((a.shape, a.dtype) for a in avals))
+    key = (content_key(ClosedJaxpr(jaxpr, constants)), structure, tuple((a.shape, a.dtype) for a in avals))
     with _lock:
-        content = _traced_programs.get(found_by)
-        if content is None:
-            content = _traced_programs[found_by] = TracedProgram(
-                ClosedJaxpr(jaxpr, constants), structure, avals, lifting.has_while_loop
+        program = _traced_programs.get(key)
+        if program is None:
+            program = _traced_programs[key] = TracedProgram(
+                ClosedJaxpr(jaxpr, constants), structure, avals, lifter.has_while_loop
             )
-    return TracedFunction(numbers, content, _Label(name))
+    return TracedFunction(numbers, program, _Label(name))
 
 
 def _defining_module(function: Callable) -> str:
-    """Where a function, or the class of one, is defined."""
+    """Return the name of the module that defines a function or the class of an object."""
     return getattr(function, "__module__", None) or type(function).__module__
 
 
 def _is_library_object(function: Any) -> bool:
-    """Whether a function, or the class of an object, is defined in this library."""
+    """Return whether a function, or the class of an object, is defined in this library."""
     return _defining_module(function).split(".")[0] in ("liethermo", "manifolds")
 
 
 def _check_indices_of(tree: Any, use: Callable, shapes: Sequence[tuple[int, ...]]) -> None:
-    """Check the indices in a class of the user's, where it can be traced; where not, its use will say so."""
+    """Check the constant indices in a user's object, if it can be traced; otherwise its later use reports the error."""
     try:
-        closed = jax.make_jaxpr(lambda *a: use(tree, *a))(*(jax.ShapeDtypeStruct(s, jnp.float64) for s in shapes))
+        closed_jaxpr = jax.make_jaxpr(lambda *a: use(tree, *a))(*(jax.ShapeDtypeStruct(s, jnp.float64) for s in shapes))
     except Exception:
         return
-    check_indices(closed)
+    check_indices(closed_jaxpr)
 
 
 def is_plain_function(leaf) -> bool:
-    """Whether a leaf of a pytree is a function."""
+    """Return whether a leaf of a pytree is a plain function: callable, but not a class, module or array."""
     return callable(leaf) and not isinstance(leaf, type | eqx.Module | jax.Array | np.ndarray)
 
 
 def trace_callables_with_result(
     tree: Any, use: Callable, *shapes: tuple[int, ...], is_leaf: Callable | None = None
 ) -> tuple[Any, Any]:
-    """A pytree with its plain functions traced, and the shapes of what ``use`` returned.
+    """Return a pytree with its plain functions traced, and the shapes of the result of ``use``.
 
-    Plain numbers among its leaves, such as those of an ``equinox.Module`` that is used as a function, become arrays,
-    unless Python has to see their values.
+    Python floats among its leaves, such as fields of an ``equinox.Module`` that is used as a function, become arrays
+    unless Python needs their values.
 
     Parameters
     ----------
     tree : pytree
     use : function from such a pytree and arrays
-        Calls the functions, as they will be called later: it is traced, to see the shapes of their arguments.
+        Calls the functions as they will be called later; it is traced to find the shapes of their arguments.
     *shapes : tuple of int
-        Of the arrays.
+        Shapes of the arrays.
     is_leaf : function, optional
-        Of parts to be left alone.
+        Identifies parts of the tree that are left unchanged.
     """
     leaves, structure = jax.tree_util.tree_flatten(tree, is_leaf=is_leaf)
     if any(type(leaf) is float for leaf in leaves):
         try:
             return _trace_with_recorders(leaves, structure, use, shapes, float)
-        except (TypeError, ValueError, AttributeError):  # what is wrong without arrays too, shows below
+        except (TypeError, ValueError, AttributeError):  # an error that does not come from the arrays is raised below
             pass
     return _trace_with_recorders(leaves, structure, use, shapes, None)
 
 
-def _trace_with_recorders(leaves: list, structure, use: Callable, shapes, number: type | None) -> tuple[Any, Any]:
-    """What ``use`` makes of leaves, those of one type of number being arrays, and of functions that are watched."""
+def _trace_with_recorders(leaves: list, structure, use: Callable, shapes, number_type: type | None) -> tuple[Any, Any]:
+    """Trace ``use`` with recorders in place of plain functions, and arrays in place of leaves of ``number_type``."""
     recorders = {id(leaf): _CallRecorder(leaf) for leaf in leaves if is_plain_function(leaf)}
-    moved = [i for i, leaf in enumerate(leaves) if type(leaf) is number]
+    number_indices = [i for i, leaf in enumerate(leaves) if type(leaf) is number_type]
 
     def use_leaves(numbers, *arguments):
-        watched = [recorders.get(id(leaf), leaf) for leaf in leaves]
-        for i, value in zip(moved, numbers, strict=True):
-            watched[i] = value
-        return use(jax.tree_util.tree_unflatten(structure, watched), *arguments)
+        recorded_leaves = [recorders.get(id(leaf), leaf) for leaf in leaves]
+        for i, value in zip(number_indices, numbers, strict=True):
+            recorded_leaves[i] = value
+        return use(jax.tree_util.tree_unflatten(structure, recorded_leaves), *arguments)
 
     scalar, arguments = jax.ShapeDtypeStruct((), jnp.float64), [jax.ShapeDtypeStruct(s, jnp.float64) for s in shapes]
-    closed, found = jax.make_jaxpr(use_leaves, return_shape=True)([scalar for _ in moved], *arguments)
-    check_indices(closed)
-    results = [recorders[id(leaf)].result if id(leaf) in recorders else leaf for leaf in leaves]
+    closed_jaxpr, result_shapes = jax.make_jaxpr(use_leaves, return_shape=True)(
+        [scalar for _ in number_indices], *arguments
+    )
+    check_indices(closed_jaxpr)
+    traced_leaves = [recorders[id(leaf)].result if id(leaf) in recorders else leaf for leaf in leaves]
     with jax.ensure_compile_time_eval():
-        for i in moved:
-            results[i] = jnp.asarray(np.float64(leaves[i]))
-    return jax.tree_util.tree_unflatten(structure, results), found
+        for i in number_indices:
+            traced_leaves[i] = jnp.asarray(np.float64(leaves[i]))
+    return jax.tree_util.tree_unflatten(structure, traced_leaves), result_shapes
 
 
 def trace_callables(tree: Any, use: Callable, *shapes: tuple[int, ...], is_leaf: Callable | None = None) -> Any:
-    """As :func:`converted`, the pytree alone; nothing is traced where there is nothing to convert."""
+    """Return a pytree with its plain functions traced, as :func:`trace_callables_with_result` does.
+
+    A tree without plain functions and floats is returned unchanged; an object of the user's is checked for constant
+    indices out of range.
+    """
     leaves = jax.tree_util.tree_leaves(tree, is_leaf=is_leaf)
     if not any(is_plain_function(leaf) or type(leaf) is float for leaf in leaves):
         if not _is_library_object(tree):
@@ -276,7 +289,7 @@ def trace_callables(tree: Any, use: Callable, *shapes: tuple[int, ...], is_leaf:
 
 
 class _CallRecorder:
-    """A plain function in use, traced for the arguments that it is first called with."""
+    """A plain function that traces itself for the shapes of the arguments with which it is called."""
 
     def __init__(self, function: Callable):
         self.function, self.__name__ = function, getattr(function, "__name__", type(function).__name__)
@@ -285,17 +298,17 @@ class _CallRecorder:
 
     @property
     def result(self) -> Callable:
-        """The traced function, or the function itself where it is called in more than one way, or not at all."""
+        """The traced function; the function itself if it was never called, or was called in more than one way."""
         return (
             next(iter(self._traced_functions.values()))
             if len(self._traced_functions) == 1 and not self._is_called_otherwise
             else self.function
         )
 
-    def __call__(self, *arguments, **named):
-        if named or not all(isinstance(a, jax.Array) for a in arguments):
+    def __call__(self, *arguments, **keywords):
+        if keywords or not all(isinstance(a, jax.Array) for a in arguments):
             self._is_called_otherwise = True
-            return self.function(*arguments, **named)
+            return self.function(*arguments, **keywords)
         key = tuple((a.shape, a.dtype) for a in arguments)
         if key not in self._traced_functions:
             self._traced_functions[key] = trace_function(self.function, *(jax.ShapeDtypeStruct(*k) for k in key))

@@ -112,11 +112,11 @@ class DirectSum(BracketAlgebra):
 
     def bracket(self, x, y) -> jax.Array:
         """Lie bracket ``[x, y]``; elements have shape (..., dim) or ``(..., *sites, d)``, and so has the result."""
-        return self._blockwise("_copies_bracket", (x, "x"), (y, "y"))
+        return self._blockwise("_batched_bracket", (x, "x"), (y, "y"))
 
     def ad_star(self, x, mu) -> jax.Array:
         """Coadjoint operator ``ad*_x mu``, for elements of shape (..., dim) or ``(..., *sites, d)``."""
-        return self._blockwise("_copies_ad_star", (x, "x"), (mu, "mu"))
+        return self._blockwise("_batched_ad_star", (x, "x"), (mu, "mu"))
 
     def action(self, x) -> BlockAction:
         return BlockAction(self, x)

@@ -13,7 +13,7 @@ import pytest
 from liethermo.engines.compiled import kept, machine_code
 from liethermo.engines.compiled.kept import CacheWarning
 from tests.liethermo.tracing.test_scalarize import program_of
-from tests.machine_code import compiled
+from tests.machine_code import compile_program as compiled
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def folder(tmp_path, monkeypatch):
 def made(monkeypatch):
     found = []
     monkeypatch.setattr(
-        machine_code, "_compile", lambda *a, make=machine_code._compile_module: found.append(1) or make(*a)
+        machine_code, "_compile_module", lambda *a, make=machine_code._compile_module: found.append(1) or make(*a)
     )
     return found
 

@@ -20,8 +20,10 @@ from liethermo.engines.compiled.writer import FLOAT64, ProgramWriter
 from liethermo.tracing.builder import BOOLEAN_OPERATIONS, COMPARISONS, OPERATIONS, Instruction
 from liethermo.tracing.program import Program
 from liethermo.tracing.scalarize import UnsupportedPrimitive, scalarize
-from tests.liethermo.tracing.test_scalarize import CASES, STEPS, check, program_of, shapes, steps
-from tests.machine_code import compiled, memory_maps
+from tests.liethermo.tracing.test_scalarize import CASES, STEPS, program_of, shapes, steps
+from tests.machine_code import compile_program as compiled
+from tests.machine_code import count_memory_maps as memory_maps
+from tests.scalar_programs import check_outputs as check
 
 PAIRS = {*"add sub mul div pow rem max min atan2 igamma igammac".split(), *COMPARISONS - {"is_finite"}}
 SPECIAL = np.array([0.0, -0.0, 1.0, -1.5, 2.5, 0.3, -3.7, np.inf, -np.inf, np.nan, 1e300, 1e-300])
@@ -170,7 +172,7 @@ def test_code_is_found_on_disk_and_damage_is_seen(tmp_path, monkeypatch):
     monkeypatch.setenv("LIETHERMO_CACHE", str(tmp_path / "cache"))
     made = []
     monkeypatch.setattr(
-        machine_code, "_compile", lambda *a, make=machine_code._compile_module: made.append(1) or make(*a)
+        machine_code, "_compile_module", lambda *a, make=machine_code._compile_module: made.append(1) or make(*a)
     )
     program = program_of(lambda a: a * 3.25, np.ones(2))
     for _ in range(2):
@@ -191,7 +193,7 @@ def test_code_is_made_for_the_processor_that_is_named(tmp_path, monkeypatch):
     monkeypatch.setenv("LIETHERMO_CACHE", str(tmp_path))
     program, made = program_of(lambda a: a * 3.75 + 1.0, np.ones(2)), []
     monkeypatch.setattr(
-        machine_code, "_compile", lambda *a, make=machine_code._compile_module: made.append(1) or make(*a)
+        machine_code, "_compile_module", lambda *a, make=machine_code._compile_module: made.append(1) or make(*a)
     )
     try:
         for cpu in ("x86-64", "x86-64-v2"):

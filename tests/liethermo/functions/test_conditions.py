@@ -1,4 +1,4 @@
-"""Conditions on parameters: refused where they are numbers, found again at every point where they are swept."""
+"""Conditions on parameters: checked for concrete values, and re-evaluated at every point of a sweep."""
 
 import jax
 import jax.numpy as jnp
@@ -9,15 +9,15 @@ import liethermo as lt
 from liethermo.functions.conditions import collect_conditions, refusal_message, require_condition
 
 
-def found(build, *arguments):
-    """The conditions that a builder notes while it is traced, evaluated, and the messages of those that fail."""
+def failed_messages(build, *arguments):
+    """Trace a builder, evaluate the conditions that it records, and return the messages of those that fail."""
     messages = []
 
     def conditions(*arguments):
-        with collect_conditions() as noted:
+        with collect_conditions() as records:
             build(*arguments)
-        messages[:] = [condition.message for condition in noted]
-        return [(condition.holds, condition.value) for condition in noted]
+        messages[:] = [condition.message for condition in records]
+        return [(condition.holds, condition.value) for condition in records]
 
     results = jax.jit(conditions)(*map(jnp.asarray, arguments))
     return [
@@ -34,15 +34,15 @@ BUILDERS = {
 
 
 @pytest.mark.parametrize("name", BUILDERS)
-def test_what_is_refused_as_a_number_is_noted_in_the_same_words_where_it_is_traced(name):
+def test_traced_values_fail_with_the_messages_of_concrete_values(name):
     build, bad = BUILDERS[name]
-    with pytest.raises(lt.LiethermoError) as refused:
+    with pytest.raises(lt.LiethermoError) as error:
         build(jnp.asarray(bad))
-    assert str(refused.value) in found(build, bad)
-    assert found(build, 1.0) == []
+    assert str(error.value) in failed_messages(build, bad)
+    assert failed_messages(build, 1.0) == []
 
 
-def test_nothing_is_noted_where_nobody_listens():
+def test_traced_conditions_are_ignored_outside_of_collect_conditions():
     assert jax.jit(lambda x: require_condition(x, lambda x: x > 0.0, "{value}") or x)(-1.0) == -1.0
     with pytest.raises(lt.InputError, match="not -1"):
         require_condition(np.float64(-1.0), lambda x: x > 0.0, "not {value:g}")

@@ -18,43 +18,43 @@ NAMES = list(DISCRETE_GRADIENTS)
 seeds = st.integers(0, 10**6)
 
 
-each_gradient = pytest.mark.parametrize("gradient", DISCRETE_GRADIENTS.values(), ids=NAMES)
+for_each_gradient = pytest.mark.parametrize("gradient", DISCRETE_GRADIENTS.values(), ids=NAMES)
 
 
 @pytest.mark.sampled(1)
-@each_gradient
+@for_each_gradient
 @pytest.mark.parametrize("distance", [3.0, 1.0, 0.3, 0.03, 1e-3, 1e-6, 1e-9, 1e-13])
 @given(seed=seeds)
 def test_identity_at_every_distance(gradient, distance, seed):
-    """dgrad . d = H(x + d) - H(x), to the rounding error of the right-hand side."""
+    """The identity dgrad . d = H(x + d) - H(x) holds to the rounding error of its right-hand side."""
     rng = np.random.default_rng(seed)
     energy, x = energy_of(4, seed), rng.standard_normal(4)
     d = distance * rng.standard_normal(4) / 2
-    before, after = float(energy.value(x)), float(energy.value(x + d))
-    found = float(jnp.dot(gradient(energy, x, d), d))
-    # x + d is rounded, which moves H by |grad H| eps |x|
-    allowed = 40 * EPS * (abs(before) + abs(after) + float(jnp.linalg.norm(energy.gradient(x + d))))
-    assert abs(found - (after - before)) <= allowed
+    start_value, end_value = float(energy.value(x)), float(energy.value(x + d))
+    product = float(jnp.dot(gradient(energy, x, d), d))
+    # the rounding of x + d changes H by |grad H| eps |x|
+    tolerance = 40 * EPS * (abs(start_value) + abs(end_value) + float(jnp.linalg.norm(energy.gradient(x + d))))
+    assert abs(product - (end_value - start_value)) <= tolerance
 
 
 @pytest.mark.sampled("gonzalez")
-@each_gradient
+@for_each_gradient
 @given(seed=seeds)
-def test_tends_to_the_gradient(gradient, seed):
-    """dgrad -> grad H: to rounding once d is tiny, with no noise of size eps / |d|."""
+def test_discrete_gradient_tends_to_the_gradient(gradient, seed):
+    """For tiny d, dgrad equals grad H to rounding, without noise of size eps / |d|."""
     rng = np.random.default_rng(seed)
     energy, x = energy_of(4, seed), rng.standard_normal(4)
     direction = rng.standard_normal(4)
     exact = np.asarray(energy.gradient(x))
     curvature = float(np.abs(jax.hessian(energy.value)(x)).sum(axis=1).max())
     for distance in (1e-9, 1e-12, 1e-15, 1e-18, 1e-100, 1e-160, 0.0):
-        found = np.asarray(gradient(energy, x, distance * direction))
-        moved = 1.01 * curvature * distance * np.abs(direction).max()
-        assert np.abs(found - exact).max() <= moved + 40 * EPS * np.abs(exact).max()
+        discrete = np.asarray(gradient(energy, x, distance * direction))
+        variation = 1.01 * curvature * distance * np.abs(direction).max()
+        assert np.abs(discrete - exact).max() <= variation + 40 * EPS * np.abs(exact).max()
 
 
 def test_the_printed_quotient_is_noise_near_zero():
-    """Control: BFM (4.3) as printed loses the gradient where the library's version keeps it."""
+    """Control: the formula BFM (4.3) as printed loses the gradient, but the library's version does not."""
     energy, rng = energy_of(4, 0), np.random.default_rng(0)
     x, direction = rng.standard_normal(4), rng.standard_normal(4)
     errors = {"printed": 0.0, "ours": 0.0}
@@ -72,12 +72,12 @@ def test_the_printed_quotient_is_noise_near_zero():
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", NAMES)
 def test_continuous_across_the_gate(name):
-    """Along a ray in d the gradient moves by no more than its own variation: no jump where the defect is let in."""
+    """Along a ray in d the gradient changes continuously, also where the gate opens for the defect."""
     energy, rng = energy_of(4, 3), np.random.default_rng(3)
     x, direction = rng.standard_normal(4), rng.standard_normal(4)
     distances = np.geomspace(1e-8, 1.0, 4001)
-    found = np.asarray(jax.vmap(lambda r: DISCRETE_GRADIENTS[name](energy, x, r * direction))(distances))
-    jumps = np.abs(np.diff(found, axis=0)).max(axis=1)
+    gradients = np.asarray(jax.vmap(lambda r: DISCRETE_GRADIENTS[name](energy, x, r * direction))(distances))
+    jumps = np.abs(np.diff(gradients, axis=0)).max(axis=1)
     assert (jumps <= 20 * np.diff(distances) + 1e-12).all()
 
 
@@ -87,47 +87,49 @@ def test_continuous_across_the_gate(name):
 def test_symmetric_in_its_end_points(name, seed):
     rng = np.random.default_rng(seed)
     energy, x, d = energy_of(3, seed), rng.standard_normal(3), 0.5 * rng.standard_normal(3)
-    there = np.asarray(DISCRETE_GRADIENTS[name](energy, x, d))
-    back = np.asarray(DISCRETE_GRADIENTS[name](energy, x + d, -d))
-    assert np.abs(there - back).max() <= 1e-12 * np.abs(there).max()
+    forward = np.asarray(DISCRETE_GRADIENTS[name](energy, x, d))
+    backward = np.asarray(DISCRETE_GRADIENTS[name](energy, x + d, -d))
+    assert np.abs(forward - backward).max() <= 1e-12 * np.abs(forward).max()
 
 
 def test_the_printed_coordinate_increment_is_not_symmetric():
-    """Control for the test above, and the reason why its scheme has order 1."""
+    """Control for the test above; the asymmetry is why the scheme has order 1."""
     energy, x, d = energy_of(3, 1), np.ones(3), np.array([0.3, -0.2, 0.5])
     gradient = DISCRETE_GRADIENTS["coordinate_increment"]
     assert np.abs(np.asarray(gradient(energy, x, d) - gradient(energy, x + d, -d))).max() > 1e-3
 
 
-def _averaged(slope):
+def _mean_over_step(slope):
     points, weights = np.polynomial.legendre.leggauss(20)
     return 0.5 * sum(w * slope(0.5 * (1.0 + c)) for c, w in zip(points, weights, strict=True))
 
 
-AT_REST = {
+RESTING_COMPONENTS = {
     "gonzalez": lambda slope: slope(0.5),
-    "mean_value": _averaged,
+    "mean_value": _mean_over_step,
     "coordinate_increment": lambda slope: slope(1.0),
     "symmetric_coordinate_increment": lambda slope: 0.5 * (slope(0.0) + slope(1.0)),
 }
-"""What stands in a coordinate that does not move, given the energy's slope along it at ``x + t d``."""
+"""Component of a coordinate that does not move, from the slope of the energy along it at ``x + t d``."""
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_where_one_coordinate_rests(name):
-    """The quotient of that coordinate is 0/0, and each formula has a value of its own in its place."""
+def test_component_of_a_coordinate_that_does_not_move(name):
+    """The difference quotient of that coordinate is 0/0, which each formula replaces by a limit of its own."""
     energy, x, d = energy_of(3, 1), np.array([0.4, -0.3, 1.0]), np.array([0.3, -0.2, 0.0])
-    found = DISCRETE_GRADIENTS[name](energy, x, d)
-    assert float(found[2]) == pytest.approx(AT_REST[name](lambda t: float(energy.gradient(x + t * d)[2])), abs=1e-7)
-    others = [float(energy.gradient(x + t * d)[2]) for t in (0.0, 0.5, 1.0)]
-    assert min(np.abs(np.diff(others))) > 1e-4
+    discrete = DISCRETE_GRADIENTS[name](energy, x, d)
+    assert float(discrete[2]) == pytest.approx(
+        RESTING_COMPONENTS[name](lambda t: float(energy.gradient(x + t * d)[2])), abs=1e-7
+    )
+    slopes = [float(energy.gradient(x + t * d)[2]) for t in (0.0, 0.5, 1.0)]
+    assert min(np.abs(np.diff(slopes))) > 1e-4
 
 
 @pytest.mark.sampled(1)
-@each_gradient
+@for_each_gradient
 @given(seed=seeds)
 def test_quadratic_terms_agree_with_the_general_formula(gradient, seed):
-    """The closed form for a Quadratic equals what the general formula makes of the same function."""
+    """The closed form for a Quadratic equals the general formula for an equal function."""
     rng = np.random.default_rng(seed)
     A = rng.standard_normal((4, 4))
     term = lt.Quadratic(A + A.T, rng.standard_normal(4), 0.7)
@@ -137,12 +139,12 @@ def test_quadratic_terms_agree_with_the_general_formula(gradient, seed):
 
 
 @pytest.mark.sampled(1)
-@each_gradient
+@for_each_gradient
 @pytest.mark.parametrize(
     "function", [lambda x: jnp.cos(1000.0 * x[0]) + x[1] ** 2, lambda x: jnp.exp(3.0 * x[0] * x[1])]
 )
 def test_short_length_scales(gradient, function):
-    """The gate is scale free: a function that varies on lengths of 1e-3 keeps the identity at every distance."""
+    """The gate is scale free: a function that varies on lengths of 1e-3 satisfies the identity at every distance."""
     energy, x, direction = lt.Function(function), np.array([0.7, 0.4]), np.array([1.0, 0.5])
     for distance in np.geomspace(1e-9, 1.0, 19):
         d = distance * direction
@@ -152,7 +154,7 @@ def test_short_length_scales(gradient, function):
 
 
 def test_mean_value_is_exact_on_polynomials_of_its_degree():
-    """Quadrature with m nodes integrates the gradient of a polynomial of degree 2m exactly: no defect is left."""
+    """Quadrature with m nodes integrates the gradient of a polynomial of degree 2m exactly, so there is no defect."""
     for nodes in (1, 2, 3):
         energy = lt.Function(lambda x, degree=2 * nodes: x[0] ** degree + x[0] * x[1] ** (degree - 1))
         x, d = np.array([0.7, -0.4]), np.array([0.9, 1.3])
@@ -162,31 +164,33 @@ def test_mean_value_is_exact_on_polynomials_of_its_degree():
 
 
 @pytest.mark.parametrize("degree", [3, 6, 7])
-def test_the_change_of_a_polynomial_is_found_without_its_values(degree):
-    """Up to degree six three nodes are exact, so a constant beside it, which coarsens its values, does no harm."""
+def test_change_of_a_polynomial_is_computed_without_its_values(degree):
+    """Up to degree six three nodes are exact, so a large added constant, which coarsens the values, has no effect."""
     x, d = np.array([0.7, -0.4]), np.array([0.9, 1.3])
 
-    def change(claimed=None, constant=0.0):
+    def change(degree_claim=None, constant=0.0):
         energy = make_energy(lambda x: x[0] ** degree + x[0] * x[1] ** (degree - 1) + constant, "H")
-        energy = mark_polynomial_degrees(energy, 2) if claimed is None else lt.Function(energy.function, claimed)
-        assert energy.degree == (claimed or degree)
+        energy = (
+            mark_polynomial_degrees(energy, 2) if degree_claim is None else lt.Function(energy.function, degree_claim)
+        )
+        assert energy.degree == (degree_claim or degree)
         return float(DISCRETE_GRADIENTS["gonzalez"](energy, x, d) @ d)
 
     exact = float(np.diff([y[0] ** degree + y[0] * y[1] ** (degree - 1) for y in (x, x + d)])[0])
     assert change() == pytest.approx(exact, rel=1e-14)
     assert (change(constant=1e9) == pytest.approx(exact, rel=1e-14)) == (degree <= 6)
-    assert (change(claimed=6) == pytest.approx(exact, rel=1e-9)) == (degree <= 6)  # a control
+    assert (change(degree_claim=6) == pytest.approx(exact, rel=1e-9)) == (degree <= 6)  # a control
 
 
-@each_gradient
+@for_each_gradient
 def test_nan_is_not_hidden(gradient):
-    """A function outside its domain must show: a closed gate does not swallow NaN."""
+    """NaN of a function outside its domain passes a closed gate."""
     energy = lt.Function(lambda x: jnp.sqrt(x[0]))
     assert not np.isfinite(np.asarray(gradient(energy, np.array([0.5]), np.array([-0.6])))).all()
 
 
-def test_each_has_a_name_of_its_own():
-    """It stands in the provenance of a run."""
+def test_discrete_gradients_have_distinct_names():
+    """The provenance of a run contains the name."""
     names = {str(lt.MetriplecticMidpoint(name)) for name in DISCRETE_GRADIENTS} | {
         str(lt.MetriplecticMidpoint(lt.MeanValue(3)))
     }
@@ -204,14 +208,14 @@ def test_unknown_names_and_bad_nodes_are_refused():
 @pytest.mark.parametrize("length", [0.0, 1e-45, 1e-30, 1e-17])
 @pytest.mark.parametrize("stages", [1, 2])
 def test_derivatives_at_stages_of_a_step_that_vanishes(stages, length):
-    """Compiled too, where products and sums are fused: by k they are ``h A (x) Hess``, whatever is left of k."""
+    """Compiled derivatives by k, with fused products and sums, are ``h A (x) Hess`` for vanishing k."""
     A, b, _ = gauss_tableau(stages)
     x, h, energy = jnp.array([1.0, 2.0]), 0.1, make_energy(lambda u: jnp.log(u[0]) + 2.0 * jnp.log(u[1]), "S")
 
     @jax.jit
     @jax.jacfwd
-    def found(k):
+    def stage_jacobian(k):
         return stage_gradients(energy, x, jnp.zeros(2), h, k, A, b, kronrod_rule(stages))
 
     expected = np.einsum("ij,ab->iajb", h * A, np.diag([-1.0, -0.5]))
-    np.testing.assert_allclose(found(jnp.full((stages, 2), length)), expected, atol=1e-15)
+    np.testing.assert_allclose(stage_jacobian(jnp.full((stages, 2), length)), expected, atol=1e-15)

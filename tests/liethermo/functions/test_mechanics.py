@@ -1,4 +1,4 @@
-"""Terms that know their coordinates: discrete gradients of pulled-back, kinetic and potential energies."""
+"""Discrete gradients of terms with coordinates: pulled-back, kinetic and potential energies."""
 
 import equinox as eqx
 import jax
@@ -14,12 +14,12 @@ from liethermo.functions.mechanics import is_mechanical
 from tests.cases import EPS
 
 seeds = st.integers(0, 10**6)
-each_gradient = pytest.mark.parametrize("gradient", DISCRETE_GRADIENTS.values(), ids=list(DISCRETE_GRADIENTS))
+for_each_gradient = pytest.mark.parametrize("gradient", DISCRETE_GRADIENTS.values(), ids=list(DISCRETE_GRADIENTS))
 DIM, N = 5, 2
 
 
 def distances(x):
-    """Squared distance of two points on a line, and their mean: quadratic and linear in the state."""
+    """Return the squared distance of two points on a line, and their mean: quadratic and linear in the state."""
     return jnp.array([(x[1] - x[0]) ** 2, 0.5 * (x[0] + x[1])])
 
 
@@ -43,7 +43,7 @@ TERMS = {
 
 
 @eqx.filter_jit
-def discrete(gradient, term, x, d, compensation=0.0):
+def discrete_and_exact(gradient, term, x, d, compensation=0.0):
     return gradient(term, x, d, compensation), term.value(x + (compensation + d)) - term.value(x), term.gradient(x)
 
 
@@ -57,56 +57,58 @@ def discrete(gradient, term, x, d, compensation=0.0):
 )
 @given(seed=seeds)
 def test_discrete_gradients(name, gradient, seed):
-    """Both defining properties (34), at steps of every size, from a state of which rounding has kept a part."""
+    """Both defining properties (34) hold for steps of every size, from a state with a compensation."""
     term, (x, d) = TERMS[name], np.random.default_rng(seed).standard_normal((2, DIM))
-    for size in (1.0, 1e-3, 1e-7):
-        step, compensation = size * d, 0.4 * EPS * x
-        found, difference, slope = (
-            np.asarray(a) for a in discrete(DISCRETE_GRADIENTS[gradient], term, x, step, compensation)
+    for scale in (1.0, 1e-3, 1e-7):
+        step, compensation = scale * d, 0.4 * EPS * x
+        discrete_gradient, difference, slope = (
+            np.asarray(a) for a in discrete_and_exact(DISCRETE_GRADIENTS[gradient], term, x, step, compensation)
         )
         values = sum(abs(float(t(x))) + abs(float(t(x + step))) for t in term.terms)
-        allowed = 40 * EPS * (values + np.linalg.norm(slope) * np.linalg.norm(x))
-        assert abs(found @ step - difference) <= allowed
-        if size < 1.0:  # functions of the eighth degree are not near their derivatives a unit away
+        tolerance = 40 * EPS * (values + np.linalg.norm(slope) * np.linalg.norm(x))
+        assert abs(discrete_gradient @ step - difference) <= tolerance
+        if scale < 1.0:  # functions of degree eight are not near their linearisation at distance one
             steepness = 1.0 + np.abs(slope).max()
-            assert np.abs(found - slope).max() <= 50 * size * np.linalg.norm(d) * steepness
+            assert np.abs(discrete_gradient - slope).max() <= 50 * scale * np.linalg.norm(d) * steepness
 
 
 @pytest.mark.sampled(3)
-@each_gradient
+@for_each_gradient
 def test_a_term_is_corrected_along_its_own_coordinates_alone(gradient):
     x, d = np.random.default_rng(0).standard_normal((2, DIM))
-    found, _, _ = discrete(gradient, TERMS["potential"], x, d)
-    assert np.array_equal(found[2:4], [0.0, 0.0])
-    if isinstance(gradient, lt.Gonzalez):  # control: the same function, not told
-        whole, _, _ = discrete(gradient, lt.Function(TERMS["potential"].value), x, d)
-        assert np.abs(np.asarray(whole[2:4])).min() > 1e-3
+    discrete_gradient, _, _ = discrete_and_exact(gradient, TERMS["potential"], x, d)
+    assert np.array_equal(discrete_gradient[2:4], [0.0, 0.0])
+    if isinstance(gradient, lt.Gonzalez):  # control: an equal function without coordinates
+        control_gradient, _, _ = discrete_and_exact(gradient, lt.Function(TERMS["potential"].value), x, d)
+        assert np.abs(np.asarray(control_gradient[2:4])).min() > 1e-3
 
 
-def test_invariances_of_coordinates_are_kept():
-    """Distances: the discrete forces of a pair add up to nothing and turn nothing, also in a step of size one."""
+def test_invariances_of_coordinates_are_conserved():
+    """Discrete forces of a pair that depend on distances have no sum and no torque, even in a step of size one."""
 
-    def squared(x):  # distance of two points in the plane
+    def squared_distance(x):  # distance of two points in the plane
         return jnp.sum((x[2:4] - x[:2]) ** 2)[None]
 
     def sum_and_torque(energy):
-        force = np.asarray(discrete(lt.Gonzalez(), energy, x, d)[0]).reshape(2, 2)
+        force = np.asarray(discrete_and_exact(lt.Gonzalez(), energy, x, d)[0]).reshape(2, 2)
         torques = [np.linalg.det(pair) for pair in zip((x + d / 2).reshape(2, 2), force, strict=True)]
         return np.abs(force.sum(axis=0)).max(), abs(sum(torques))
 
     root, (x, d) = lt.Function(lambda y: jnp.sqrt(y[0])), np.random.default_rng(1).standard_normal((2, 4))
-    assert max(sum_and_torque(root.on(squared))) < 1e-14
-    assert min(sum_and_torque(lt.Function(root.on(squared).value))) > 1e-3  # control: the same function, not told
+    assert max(sum_and_torque(root.on(squared_distance))) < 1e-14
+    assert (
+        min(sum_and_torque(lt.Function(root.on(squared_distance).value))) > 1e-3
+    )  # control: an equal function without coordinates
 
 
 @pytest.mark.sampled(2)
-@each_gradient
+@for_each_gradient
 def test_a_kinetic_energy_by_momenta_is_a_metric_times_their_mean(gradient):
     x, d = np.random.default_rng(2).standard_normal((2, DIM))
     q, p, end = x[:N], x[N : 2 * N] + d[N : 2 * N] / 2, x[:N] + d[:N]
-    found = np.asarray(discrete(gradient, lt.Kinetic(metric), x, d)[0])
-    assert np.allclose(found[N : 2 * N], 0.5 * (metric(q) + metric(end)) @ p, rtol=0, atol=1e-14)
-    assert found[-1] == 0.0
+    discrete_gradient = np.asarray(discrete_and_exact(gradient, lt.Kinetic(metric), x, d)[0])
+    assert np.allclose(discrete_gradient[N : 2 * N], 0.5 * (metric(q) + metric(end)) @ p, rtol=0, atol=1e-14)
+    assert discrete_gradient[-1] == 0.0
 
 
 def test_arithmetic():
@@ -132,7 +134,7 @@ V = lt.Potential(lambda q, S: S * q[0])
         (lt.Quadratic(np.diag([-1.0, 1.0, 2.0, 0.0, 1.0])) - V + lt.Function(bumpy).on([4]), True),
         (lt.Kinetic([1.0, -1.0]) + V, False),  # Lorentzian
         (lt.Kinetic(lambda q: jnp.array([1.0, -1.0])), False),
-        (lt.Quadratic(np.ones(DIM), [0, 0, 1.0, 0, 0]), False),  # p . H_p has a sign of its own
+        (lt.Quadratic(np.ones(DIM), [0, 0, 1.0, 0, 0]), False),  # p . H_p may be negative
         (lt.Quadratic(np.ones((DIM, DIM))), False),
         (lt.Kinetic([1.0, 2.0]) + lt.Function(bumpy).on([0, 2]), False),
         (lt.Kinetic([1.0, 2.0]) + lt.Function(lambda x: x[0] * x[4]), False),  # not known to be free of p
@@ -147,15 +149,15 @@ def test_which_energies_are_known_to_produce_entropy(energy, expected):
 @pytest.mark.parametrize(
     ("energy", "error", "words"),
     [
-        (lt.Function(bumpy).on([0, 3]), lt.InputError, "component 3 of a state with 3"),
+        (lt.Function(bumpy).on([0, 3]), lt.InputError, "component 3, but the state has 3"),
         (lt.Function(bumpy).on([-4]), lt.InputError, "component -4"),
-        (lt.Function(bumpy).on(jnp.sin), lt.InputError, r"not a quadratic function.*miss.*tolerance.*square"),
-        (lt.Function(bumpy).on(lambda x: jnp.linalg.norm(x)[None]), lt.InputError, "not a quadratic function"),
+        (lt.Function(bumpy).on(jnp.sin), lt.InputError, r"must be a quadratic function.*miss.*tolerance.*square"),
+        (lt.Function(bumpy).on(lambda x: jnp.linalg.norm(x)[None]), lt.InputError, "must be a quadratic function"),
         (lt.Function(bumpy).on(lambda x: x @ jnp.ones(4)), lt.FunctionError, "coordinates of a term"),
     ],
 )
-def test_coordinates_that_cannot_be_used(energy, error, words):
+def test_invalid_coordinates_are_refused(energy, error, words):
     with pytest.raises(error, match=words):
         lt.EvolutionSystem(energy, 3)
-    with pytest.raises(lt.InputError, match="not symmetric"):
+    with pytest.raises(lt.InputError, match="must be symmetric"):
         lt.Kinetic([[1.0, 1.0], [0.0, 1.0]])

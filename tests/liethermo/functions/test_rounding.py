@@ -1,4 +1,4 @@
-"""How rounding sees a function, to first order: its terms and its state are rounded, its jumps are not."""
+"""Rounding scale of a function to first order: terms and the state are rounded, jumps are not."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +18,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_the_size_at_which_a_function_is_rounded(name):
-    """To a factor: errors are drawn from one half to one."""
-    function, size = CASES[name]
-    assert 0.3 * size <= float(propagated_rounding_scale(function, X, np.abs(X))) <= 3.0 * size
+def test_rounding_scale_of_a_function(name):
+    """The scale is right up to a factor, as random errors are between 0.5 and 1."""
+    function, scale = CASES[name]
+    assert 0.3 * scale <= float(propagated_rounding_scale(function, X, np.abs(X))) <= 3.0 * scale

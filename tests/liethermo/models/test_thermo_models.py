@@ -198,9 +198,9 @@ def test_a_thermospring():
     [
         (lambda: lt.models.damped_oscillator(friction=0.0), "friction must be positive"),
         (lambda: lt.models.thermo_particles((1.0, -1.0)), "capacities must be positive"),
-        (lambda: lt.models.thermo_particles((1.0, 1.0, 1.0)), "meant for two parts, not 3"),
+        (lambda: lt.models.thermo_particles((1.0, 1.0, 1.0)), "only for two parts, got 3"),
         (lambda: lt.models.moving_thermo_particles(dimension=0), "dimension must be an integer >= 1"),
-        (lambda: lt.models.moving_thermo_particles(masses=(1.0,)), r"masses has shape \(2,\), not \(1,\)"),
+        (lambda: lt.models.moving_thermo_particles(masses=(1.0,)), r"masses must have shape \(2,\), got \(1,\)"),
         (lambda: lt.models.thermo_springs(conductance=-1.0), ">= 0"),
         (lambda: lt.models.gas_piston(moles=(1.0, 0.0)), "moles must be positive"),
         (lambda: lt.models.thermoelastic_chain(dimension=4), "1, 2 or 3, not 4"),

@@ -220,7 +220,7 @@ class ConstantFactor(HeatConduction):
     """Control: the skew tensor with a constant in place of the Fourier factor, the Poisson tensor of SML §5."""
 
     def force(self, system, x, dH, dS, dL):
-        T = dH[S := system.poisson.places.S]
+        T = dH[S := system.poisson.state_indices.S]
         i, j = np.array(self.first_bodies), np.array(self.second_bodies)
         return jnp.zeros_like(x).at[S[i]].add(self.conductance * T[j]).at[S[j]].add(-self.conductance * T[i])
 
@@ -229,7 +229,7 @@ class AtTheMidpoint(HeatConduction):
     """Control: the heat of the discrete temperatures, divided by those at the midpoint."""
 
     def force(self, system, x, dH, dS, dL):
-        S = system.poisson.places.S
+        S = system.poisson.state_indices.S
         T = system.energy.gradient(x)[S]
         return super().force(system, x, dH, dS, dL) * jnp.ones_like(x).at[S].set(dH[S] / T)
 
@@ -259,16 +259,16 @@ CART = lt.Subsystem(lt.Kinetic([1.0]) + lt.Function(Warm(jnp.asarray(1.0))).on([
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"conductance": [[0.0, 1.0, 0.0], [2.0, 0.0, 1.0], [0.0, 1.0, 0.0]]}, "not symmetric.*transpose by 1"),
-        ({"conductance": np.ones((2, 2))}, r"\(3, 3\) matrix for 3 parts, not one of shape \(2, 2\)"),
-        ({"conductance": [(0, 1, -1.0), (1, 2, 1.0)]}, "between stone and cart is -1.*>= 0"),
+        ({"conductance": [[0.0, 1.0, 0.0], [2.0, 0.0, 1.0], [0.0, 1.0, 0.0]]}, "must be symmetric.*transpose by 1"),
+        ({"conductance": np.ones((2, 2))}, r"of 3 parts must be a \(3, 3\) matrix, got shape \(2, 2\)"),
+        ({"conductance": [(0, 1, -1.0), (1, 2, 1.0)]}, "between stone and cart must be finite and >= 0, got -1"),
         ({"conductance": [(0, 1, np.nan), (1, 2, 1.0)]}, "finite"),
         ({"conductance": [(0, 1, 1.0)]}, "2 parts that.*of stone and cart and that of body 2.*connected=False"),
         ({"conductance": np.eye(3)}, "with itself"),
-        ({"conductance": [(0, 3, 1.0)]}, "leaves the 3 parts"),
+        ({"conductance": [(0, 3, 1.0)]}, "must join two of the 3 parts"),
         ({"conductance": [(0, 1, 1.0), (1, 0, 1.0)]}, "given twice"),
         ({"conductance": [(0, 1)]}, r"\(i, j, weight\)"),
-        ({"conductance": 1.0}, "meant for two parts, not 3"),
+        ({"conductance": 1.0}, "only for two parts, got 3"),
         ({"drag": [(0, 1, 1.0)]}, "drag between stone and cart needs velocities.*0 and 1"),
         ({"drag": [(1, 2, -1.0)]}, "the drag between cart and body 2"),
         ({"coupling": 3.0}, "function of q"),
@@ -290,7 +290,7 @@ def test_unusable_couplings(arguments, words):
         (lambda: lt.Subsystem(CART.energy, 3, friction="dry"), "'contact', not 'dry'"),
         (
             lambda: lt.Subsystem(CART.energy, 3, friction=lambda x: x),
-            r"has shape \(\) or \(1,\) or \(1, 1\), not \(3,\)",
+            r"must have shape \(\) or \(1,\) or \(1, 1\), got \(3,\)",
         ),
         (lambda: lt.ComposedSystem([CART, CART.energy]), "must be an lt.Subsystem"),
         (lambda: lt.ComposedSystem([]), "at least one"),

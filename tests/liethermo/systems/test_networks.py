@@ -103,8 +103,8 @@ def test_each_of_an_energy():
         (lambda: lt.Each(spring, [0, 1, 2], [1.0]), r"shape \(m, r\)"),
         (lambda: lt.Each(spring, [[0.5, 1.0, 2.0]], [1.0]), "integers"),
         (lambda: lt.Each(spring, [[0, 1, 2]], [1.0, 2.0]), "entry for each of the 1 places"),
-        (lambda: lt.Each(lt.Quadratic(np.ones(3)), [[0, 1, 2]], [1.0]), "same at every place"),
-        (lambda: lt.ComposedSystem(lt.Copies(2, None, 3), lt.Each(spring, [[0, 3, 9]], [1.0])), "at component 9 of"),
+        (lambda: lt.Each(lt.Quadratic(np.ones(3)), [[0, 1, 2]], [1.0]), "equal at every place"),
+        (lambda: lt.ComposedSystem(lt.Copies(2, None, 3), lt.Each(spring, [[0, 3, 9]], [1.0])), "at component 9, but"),
         (lambda: lt.Copies(0, None, 3), "integer >= 1"),
         (lambda: lt.Copies(2, None, 2), r"2n \+ 1"),
         (lambda: lt.Copies(2, None, 1, friction=1.0), "with 0 momenta"),
@@ -387,7 +387,7 @@ def test_a_csv_file(tmp_path):
         (CSV + "1,,2\n", {}, "line 4.*one of them is missing"),
         (CSV + "1,2\n", {}, "line 4: the conductance is None"),
         (CSV + "1,2,fast\n", {}, "'fast', not a number"),
-        (CSV + "1,2,-2\n", {}, "between 1 and 2 is -2.*>= 0"),
+        (CSV + "1,2,-2\n", {}, "between 1 and 2 must be finite and >= 0, got -2"),
         (CSV + "1,2,nan\n", {}, "finite"),
         (CSV + "1,10,3\n", {}, "given twice"),
         (CSV + "1,1,3\n", {}, "with itself"),
@@ -450,7 +450,7 @@ def test_a_network_that_falls_apart():
         particles([(0, 1, 1.0), (2, 3, 1.0), (4, 5, 1.0)])
     lopsided = grid_graph((6,)).tolil()
     lopsided[0, 1] = 2.0
-    with pytest.raises(lt.InputError, match=r"not symmetric.*by 1"):
+    with pytest.raises(lt.InputError, match=r"must be symmetric.*by 1"):
         particles(lopsided.tocsr())
-    with pytest.raises(lt.InputError, match="between node 0 and node 1 is -1"):
+    with pytest.raises(lt.InputError, match="between node 0 and node 1 must be finite and >= 0, got -1"):
         particles(-1.0 * grid_graph((6,)))

@@ -138,7 +138,7 @@ def test_laws_hold_on_many_sites(method):
         (lambda: lt.LocalProjectedMetric([1.0, -1.0]), "must be >= 0, not -1"),
         (lambda: system(lt.LocalProjectedMetric(1.0, np.eye(4))), r"shape \(3, 3\), not \(4, 4\)"),
         (lambda: system(lt.InnerProductDissipation(np.eye(4))), r"\(4, 4\), but \(so\(3\)\)\^3x2 has dimension 18"),
-        (lambda: system(lt.EulerPoincareForce(lambda xi: xi[0])), r"force F has shape \(3, 2, 3\), not \(2, 3\)"),
+        (lambda: system(lt.EulerPoincareForce(lambda xi: xi[0])), r"force F must have shape \(3, 2, 3\), got \(2, 3\)"),
         (lambda: system(group=mf.SO(3)), "is not a group of"),
     ],
 )

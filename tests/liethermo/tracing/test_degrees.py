@@ -1,4 +1,4 @@
-"""Degrees of polynomials by whole arrays, beside those of the unrolled program."""
+"""Degrees of polynomials computed on whole arrays, compared with those of the unrolled program."""
 
 import math
 
@@ -27,7 +27,7 @@ POLYNOMIALS = {
     "where": (lambda s: jnp.sum(jnp.where(np.eye(4, 3) > 0, s**2, s)), 2),
     "a constant": (lambda s: jnp.zeros(()), 0),
 }
-OTHERS = {
+OTHER_FUNCTIONS = {
     "a sine": lambda s: jnp.sum(jnp.sin(s)),
     "a quotient": lambda s: jnp.sum(s[0] / s[1]),
     "a modulus": lambda s: jnp.sum(jnp.abs(s)),
@@ -37,25 +37,25 @@ OTHERS = {
 }
 
 
-def traced(function):
+def trace(function):
     return jax.make_jaxpr(function)(jax.ShapeDtypeStruct((4, 3), np.float64))
 
 
 @pytest.mark.parametrize("name", POLYNOMIALS)
-def test_degrees_are_those_of_the_unrolled_program(name):
+def test_array_degrees_equal_those_of_the_unrolled_program(name):
     function, expected = POLYNOMIALS[name]
-    closed = traced(function)
-    assert array_degree_bound(closed, 0) == expected
-    assert scalarize(closed).degree(0) == expected
+    closed_jaxpr = trace(function)
+    assert array_degree_bound(closed_jaxpr, 0) == expected
+    assert scalarize(closed_jaxpr).degree(0) == expected
 
 
-@pytest.mark.parametrize("name", OTHERS)
-def test_what_is_no_polynomial_is_none(name):
-    assert array_degree_bound(traced(OTHERS[name]), 0) == math.inf
+@pytest.mark.parametrize("name", OTHER_FUNCTIONS)
+def test_other_functions_have_infinite_degree(name):
+    assert array_degree_bound(trace(OTHER_FUNCTIONS[name]), 0) == math.inf
 
 
 def test_a_plain_function_on_many_sites_is_known_as_quadratic():
-    """Too large to be unrolled. Its steps then take one gradient each iteration, and no difference of values."""
+    """The function is too large to be unrolled, but its degree is found by whole arrays."""
     g = mf.so(3) ** 5_000
     quadratic, quartic = (
         lt.LiePoissonSystem(

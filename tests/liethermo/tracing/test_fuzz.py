@@ -1,4 +1,4 @@
-"""Random functions by the scalar compiler and by JAX: a few by default, more in the slow tier and by `make fuzz`."""
+"""Random functions through the scalar compiler and JAX: a few by default, more in the slow tier and by `make fuzz`."""
 
 import time
 
@@ -11,7 +11,7 @@ from liethermo.tracing.scalarize import CONTROL_FLOW_RULES
 from tests import fuzz
 from tests.fuzz_operations import OPERATIONS
 
-NOT_DRAWN = {
+UNDRAWN_PRIMITIVES = {
     "inverse": "the library's own, in Newton's method",
     "deferred": "the library's own, in Newton's method",
     "matrix_chain": "the library's own, of functions of matrices",
@@ -23,32 +23,33 @@ NOT_DRAWN = {
         "copy_p pjit call closed_call core_call checkpoint remat".split(), "names of other versions of JAX"
     ),
 }
+"""Supported primitives that no random function uses, with the reason."""
 
 
-def drawn(seed: int, **options) -> fuzz.Outcome:
-    random = np.random.default_rng(seed)
-    summary = str(random.choice(list(fuzz.SUMMARIES)))
-    function = fuzz.function_of(seed, steps=int(random.integers(1, 6)))
-    outcome = fuzz.compared(function, summary, seed, **options)
+def check_random_function(seed: int, **options) -> fuzz.Outcome:
+    rng = np.random.default_rng(seed)
+    summary = str(rng.choice(list(fuzz.SUMMARIES)))
+    function = fuzz.random_function(seed, steps=int(rng.integers(1, 6)))
+    outcome = fuzz.compare_with_jax(function, summary, seed, **options)
     assert outcome.kind != "differs", f"{summary} of\n{function.text}\n{outcome.text}"
     return outcome
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_random_functions(seed):
-    drawn(seed, count=3)
+    check_random_function(seed, count=3)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("first", range(100, 400, 25))
-def test_many_random_functions(first):
-    kinds = [drawn(seed).kind for seed in range(first, first + 25)]
+@pytest.mark.parametrize("first_seed", range(100, 400, 25))
+def test_many_random_functions(first_seed):
+    kinds = [check_random_function(seed).kind for seed in range(first_seed, first_seed + 25)]
     assert kinds.count("agrees") > 18
 
 
 @pytest.mark.slow
-def test_functions_that_nobody_has_drawn_yet():
-    counts = fuzz.searched(60.0, int(time.time()))
+def test_random_functions_from_a_new_seed():
+    counts = fuzz.search_differences(60.0, int(time.time()))
     assert not counts["differs"], "what differs is printed above, with its seed"
 
 
@@ -57,24 +58,24 @@ def test_functions_that_nobody_has_drawn_yet():
 def test_every_operation_by_itself(name):
     for seed in range(4):
         summary = list(fuzz.SUMMARIES)[seed]
-        function = fuzz.function_of(seed, [name], steps=1)
-        outcome = fuzz.compared(function, summary, seed)
+        function = fuzz.random_function(seed, [name], steps=1)
+        outcome = fuzz.compare_with_jax(function, summary, seed)
         assert outcome.kind != "differs", f"{summary} of\n{function.text}\n{outcome.text}"
 
 
-def test_every_primitive_that_is_claimed_is_drawn():
-    claimed = set(primitives.UNROLLING_RULES) | set(CONTROL_FLOW_RULES)
-    assert claimed - fuzz.primitives_drawn() == set(NOT_DRAWN)
+def test_every_supported_primitive_is_drawn():
+    supported_primitives = set(primitives.UNROLLING_RULES) | set(CONTROL_FLOW_RULES)
+    assert supported_primitives - fuzz.drawn_primitives() == set(UNDRAWN_PRIMITIVES)
 
 
 @pytest.mark.parametrize("name", ["sin", "max"])
-def test_a_wrong_rule_is_found(name, monkeypatch):
-    """A control."""
-    right = primitives.UNROLLING_RULES[name]
+def test_comparison_detects_a_wrong_rule(name, monkeypatch):
+    """Control: a rule with a relative error of 1e-9 is detected."""
+    rule = primitives.UNROLLING_RULES[name]
 
-    def wrong(b, eqn, *arrays):
-        return elementwise(lambda a: b.mul(a, 1.0 + 1e-9), right(b, eqn, *arrays))
+    def wrong_rule(b, eqn, *arrays):
+        return elementwise(lambda a: b.mul(a, 1.0 + 1e-9), rule(b, eqn, *arrays))
 
-    monkeypatch.setitem(primitives.UNROLLING_RULES, name, wrong)
-    function = fuzz.function_of(1, [name], steps=1)
-    assert fuzz.compared(function, "value", 1, machine_code=False).kind == "differs"
+    monkeypatch.setitem(primitives.UNROLLING_RULES, name, wrong_rule)
+    function = fuzz.random_function(1, [name], steps=1)
+    assert fuzz.compare_with_jax(function, "value", 1, machine_code=False).kind == "differs"

@@ -1,4 +1,4 @@
-"""Constant indices out of range are refused by name where a function is traced; what is meant so is not."""
+"""Constant indices out of range are refused by name when a function is traced; intended ones are accepted."""
 
 import equinox as eqx
 import jax
@@ -17,8 +17,8 @@ X = jnp.array([0.4, 0.5, -0.3])
 TABLE = np.array([0, 3])
 NEIGHBOURS = np.array([[1, 3], [0, 2], [1, 3]])
 
-OUTSIDE = {
-    # name: (function of three components, the index as it is written, entries of the axis)
+INVALID_ACCESSES = {
+    # name: (function of three components, the index as written, length of the axis)
     "one beyond": (lambda m: m[3], 3, 3),
     "from the end": (lambda m: m[-4], -4, 3),
     "of a matrix": (lambda m: jnp.outer(m, m)[1, 5], 5, 3),
@@ -41,7 +41,7 @@ OUTSIDE = {
     "promised to be inside": (lambda m: m.at[3].get(mode="promise_in_bounds"), 3, 3),
 }
 
-MEANT = {
+INTENDED_ACCESSES = {
     "inside": lambda m: m[2] + m[-3],
     "clip": lambda m: m.at[3].get(mode="clip"),
     "fill": lambda m: m.at[3].get(mode="fill", fill_value=0.0),
@@ -62,33 +62,33 @@ MEANT = {
 }
 
 
-@pytest.mark.parametrize("name", OUTSIDE)
+@pytest.mark.parametrize("name", INVALID_ACCESSES)
 def test_an_index_out_of_range_is_found(name):
-    function, index, size = OUTSIDE[name]
-    with pytest.raises(IndexOutOfRangeError, match=f"the index {index} of an axis with {size} entries") as caught:
+    function, index, axis_length = INVALID_ACCESSES[name]
+    with pytest.raises(IndexOutOfRangeError, match=f"the index {index} of an axis with {axis_length} entries") as error:
         check_indices(jax.make_jaxpr(function)(X))
-    assert (caught.value.index, caught.value.size) == (index, size)
-    assert caught.value.where.startswith("test_index_check.py:")
+    assert (error.value.index, error.value.size) == (index, axis_length)
+    assert error.value.where.startswith("test_index_check.py:")
 
 
-@pytest.mark.parametrize("name", MEANT)
-def test_what_is_meant_is_left_alone(name):
-    check_indices(jax.make_jaxpr(MEANT[name])(X))
+@pytest.mark.parametrize("name", INTENDED_ACCESSES)
+def test_intended_accesses_pass(name):
+    check_indices(jax.make_jaxpr(INTENDED_ACCESSES[name])(X))
 
 
 def energy(m):
     return 0.5 * (m[0] ** 2 + 2.0 * m[1] ** 2 + 3.0 * m[2] ** 2)
 
 
-class Parametrised(eqx.Module):
+class ScaledComponent(eqx.Module):
     scale: float
 
     def __call__(self, m):
         return self.scale * m[3] ** 2
 
 
-class Mine(lt.KillingDissipation):
-    """A dissipation of somebody else's."""
+class UserDissipation(lt.KillingDissipation):
+    """A user's dissipation with an index out of range."""
 
     def force(self, system, x, *arguments):
         return x[3] * super().force(system, x, *arguments)
@@ -98,14 +98,14 @@ def body(H=energy, **options):
     return lt.LiePoissonSystem(mf.so(3), H, **options)
 
 
-def with_bath(**options):
+def body_with_bath(**options):
     return body(dissipation=lt.DoubleBracket(0.1), baths=lt.HeatBaths(1.0, 1.0), **options)
 
 
 ROLES = {
     "energy": (lambda: body(lambda m: m[3] ** 2), "the energy, a function of a state of shape"),
     "energy of time": (lambda: body(lambda m, t: m[3] * t), "the energy"),
-    "energy, a module": (lambda: body(Parametrised(2.0)), "the energy"),
+    "energy, a module": (lambda: body(ScaledComponent(2.0)), "the energy"),
     "energy beside a bath": (
         lambda: body(lambda x: energy(x) + x[3], dissipation=lt.DoubleBracket(0.1), baths=lt.HeatBaths(1.0, 1.0)),
         "the energy",
@@ -115,7 +115,10 @@ ROLES = {
         lambda: body(entropy=lambda m: m @ m, dissipation=lt.FrictionOperator(lambda m: jnp.eye(3) * m[3])),
         "the friction operator K, at a state of shape",
     ),
-    "dissipation of the user's": (lambda: body(entropy=lambda m: m @ m, dissipation=Mine(0.1)), "has the index 3"),
+    "dissipation of the user's": (
+        lambda: body(entropy=lambda m: m @ m, dissipation=UserDissipation(0.1)),
+        "has the index 3",
+    ),
     "Poisson tensor": (
         lambda: lt.MetriplecticSystem(poisson=lambda x: jnp.zeros((3, 3)) * x[3], energy=energy, dim=3),
         "the Poisson tensor",
@@ -137,7 +140,10 @@ ROLES = {
         "the event function",
     ),
     "event, ensemble": (lambda: lt.ensemble(body(), [X, X], (0.0, 1.0), 0.1, until=lambda m: m[3]), "the event"),
-    "event beyond the bath": (lambda: lt.integrate(with_bath(), X, (0.0, 1.0), 0.1, until=lambda x: x[4]), "index 4"),
+    "event beyond the bath": (
+        lambda: lt.integrate(body_with_bath(), X, (0.0, 1.0), 0.1, until=lambda x: x[4]),
+        "index 4",
+    ),
 }
 
 
@@ -150,12 +156,12 @@ def test_every_function_of_a_user_is_checked(role):
     assert "Python counts from 0, so the last index is " in str(caught.value)
 
 
-def test_the_advice_works():
-    """What is meant is written as the message says, and is what JAX makes of it."""
+def test_advised_mode_works():
+    """The index mode that the message suggests is accepted, and gives the entry that JAX would take."""
     system = body(lambda m: energy(m) + m.at[3].get(mode="clip"))
     assert float(system.energy.value(X)) == float(energy(X) + X[2])
 
 
 def test_an_event_sees_the_entropy_of_a_bath():
-    found = lt.integrate(with_bath(), X, (0.0, 10.0), 0.1, until=lambda x: x[3] - 0.001)
-    assert found.status.code == "event"
+    solution = lt.integrate(body_with_bath(), X, (0.0, 10.0), 0.1, until=lambda x: x[3] - 0.001)
+    assert solution.status.code == "event"

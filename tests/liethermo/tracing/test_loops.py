@@ -1,4 +1,4 @@
-"""A study in an ordinary loop: closures made anew find what was compiled for those before, and nothing piles up."""
+"""Studies in an ordinary loop: new closures reuse compiled programs, and memory does not grow."""
 
 import gc
 import subprocess
@@ -14,9 +14,9 @@ import liethermo as lt
 import manifolds as mf
 from liethermo.tracing import programs, traced
 from liethermo.tracing.caching import LRUCache
-from tests.machine_code import memory_maps
+from tests.machine_code import count_memory_maps
 
-COMMON = """
+SCRIPT_SETUP = """
 import resource, sys, time
 import jax.numpy as jnp, numpy as np
 import liethermo as lt, manifolds as mf
@@ -59,7 +59,7 @@ one_pass(0, everything)
 one_pass(1, everything)
 """
 
-LOOP = """
+SCRIPT_LOOP = """
 before = maps(), memory()
 started = time.process_time()
 for i in range(2, passes):
@@ -68,28 +68,30 @@ print(maps() - before[0], memory() - before[1], (time.process_time() - started) 
 """
 
 
-def looped(passes: int, what: str) -> tuple[float, ...]:
-    done = subprocess.run([sys.executable, "-c", COMMON + LOOP, str(passes), what], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-2000:]
-    return tuple(map(float, done.stdout.split()))
+def run_loop(passes: int, mode: str) -> tuple[float, ...]:
+    process = subprocess.run(
+        [sys.executable, "-c", SCRIPT_SETUP + SCRIPT_LOOP, str(passes), mode], capture_output=True, text=True
+    )
+    assert process.returncode == 0, process.stderr[-2000:]
+    return tuple(map(float, process.stdout.split()))
 
 
 @pytest.mark.slow
-def test_a_loop_compiles_once_and_keeps_nothing():
-    """It was some 400 memory maps a pass, of the 65,530 that a process can have, and five seconds."""
-    maps, megabytes, each = looped(60, "some")
+def test_a_loop_compiles_once_and_does_not_grow():
+    """Without the cache, a pass took some 400 of the 65,530 memory maps of a process, and five seconds."""
+    maps, megabytes, seconds_per_pass = run_loop(60, "some")
     assert maps < 100
     assert megabytes < 40
-    assert each < 0.2
+    assert seconds_per_pass < 0.2
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("passes", "what"), [(300, "all"), (10_000, "some")])
 def test_long_loops(passes, what):
-    maps, megabytes, each = looped(passes, what)
+    maps, megabytes, seconds_per_pass = run_loop(passes, what)
     assert maps < 300
     assert megabytes < 200
-    assert each < 0.6
+    assert seconds_per_pass < 0.6
 
 
 # -- programs by content ----------------------------------------------------------------------------------------------
@@ -99,32 +101,32 @@ X = jnp.array([0.3, 1.0, 0.2])
 
 
 def function(a, weights, count=3, shift=0.0):
-    """With everything that a number can hide in."""
+    """Return a function that contains its numbers in every possible place."""
     weights = np.asarray(weights)
 
     def inner(c, w):
         return a * c + w, c
 
     def f(x):
-        looped = jax.lax.scan(inner, x[0], weights * x)[0] + jax.lax.fori_loop(0, count, lambda i, y: y * a, x[1])
-        chosen = jax.lax.cond(x[0] > a, lambda y: y * a, lambda y: y / (a + 2.0), x[2])
-        jitted = jax.jit(lambda y: jnp.sum(weights * y**2) / a)(x) + jax.nn.softplus(a * x[0]) + jnp.sinc(x[1])
-        places = x[jnp.asarray([0, 2])].sum() + x[(jnp.asarray(weights) * 0 + 1.0).astype(int)].sum()
-        return looped + chosen + jitted + places + jnp.where(x[0] > shift, x[0] ** 1.3, 0.0)
+        loop_results = jax.lax.scan(inner, x[0], weights * x)[0] + jax.lax.fori_loop(0, count, lambda i, y: y * a, x[1])
+        branch_result = jax.lax.cond(x[0] > a, lambda y: y * a, lambda y: y / (a + 2.0), x[2])
+        jit_result = jax.jit(lambda y: jnp.sum(weights * y**2) / a)(x) + jax.nn.softplus(a * x[0]) + jnp.sinc(x[1])
+        indexed_sum = x[jnp.asarray([0, 2])].sum() + x[(jnp.asarray(weights) * 0 + 1.0).astype(int)].sum()
+        return loop_results + branch_result + jit_result + indexed_sum + jnp.where(x[0] > shift, x[0] ** 1.3, 0.0)
 
     return f
 
 
-def test_other_numbers_are_other_arguments():
-    one, two = (
+def test_functions_with_other_numbers_share_a_program():
+    function_a, function_b = (
         traced.trace_function(function(a, w), STATE) for a, w in ((0.3, [1.0, 2.0, 3.0]), (0.4, [0.5, 2.5, 1.5]))
     )
-    assert one.program is two.program
-    assert jax.tree_util.tree_structure(one) == jax.tree_util.tree_structure(two)
-    for f, g in ((function(0.3, [1.0, 2.0, 3.0]), one), (function(0.4, [0.5, 2.5, 1.5]), two)):
-        both = jax.jit(jax.value_and_grad(f))(X), jax.jit(jax.value_and_grad(g))(X)
-        assert np.abs(both[0][0] - both[1][0]) < 1e-13
-        assert np.abs(both[0][1] - both[1][1]).max() < 1e-13
+    assert function_a.program is function_b.program
+    assert jax.tree_util.tree_structure(function_a) == jax.tree_util.tree_structure(function_b)
+    for f, g in ((function(0.3, [1.0, 2.0, 3.0]), function_a), (function(0.4, [0.5, 2.5, 1.5]), function_b)):
+        results = jax.jit(jax.value_and_grad(f))(X), jax.jit(jax.value_and_grad(g))(X)
+        assert np.abs(results[0][0] - results[1][0]) < 1e-13
+        assert np.abs(results[0][1] - results[1][1]).max() < 1e-13
 
 
 @pytest.mark.parametrize(
@@ -144,7 +146,7 @@ def test_other_operations_are_other_programs(other):
 
 
 def test_integers_and_truths_belong_to_the_operations():
-    """They decide on indices and branches, so a program for others would be wrong."""
+    """They decide on indices and branches, so other values need another program."""
 
     def of(a):
         return lambda x: jnp.where(jnp.asarray(a) > 0.5, x[jnp.asarray(a).astype(int)], jnp.sin(x[0]))
@@ -156,14 +158,14 @@ def test_integers_and_truths_belong_to_the_operations():
         assert f(X) == of(a)(X)
 
 
-def test_a_traced_function_says_what_it_takes():
-    with pytest.raises(lt.LiethermoError, match="shapes"):
+def test_traced_function_refuses_other_shapes():
+    with pytest.raises(lt.LiethermoError, match="must be called with arrays of shape"):
         traced.trace_function(function(0.3, [1.0, 2.0, 3.0]), STATE)(jnp.ones(4))
 
 
-def test_what_was_compiled_is_unloaded(monkeypatch):
-    """Programs that do differ: a bounded number is kept."""
-    monkeypatch.setattr(programs, "_programs", LRUCache(2))
+def test_programs_are_unloaded_beyond_the_cache_size(monkeypatch):
+    """Different programs are kept up to a bounded number."""
+    monkeypatch.setattr(programs, "_program_cache", LRUCache(2))
 
     @programs.jit_program
     def power(x, n: int):
@@ -174,9 +176,9 @@ def test_what_was_compiled_is_unloaded(monkeypatch):
             return sum(1 for _ in file)
 
     assert [float(power(jnp.asarray(2.0), n)) for n in range(3, 6)] == [8.0, 16.0, 32.0]
-    before = maps()
+    maps_before = maps()
     assert [float(power(jnp.asarray(2.0), n)) for n in range(6, 26)] == [2.0**n for n in range(6, 26)]
-    assert maps() - before < 20
+    assert maps() - maps_before < 20
     assert len(programs._program_cache) == 2
 
 
@@ -190,24 +192,24 @@ def test_a_family_built_by_a_new_function_each_time():
             )  # fmt: skip
 
         rates = np.array([0.5, 1.0])
-        together = lt.ensemble(family, X, (0.0, 1.0), 0.1, parameters=rates, engine="compiled").x
-        alone = [lt.integrate(family(r), X, (0.0, 1.0), 0.1, engine="compiled").x[-1] for r in rates]
-        assert np.abs(together - alone).max() < 1e-14
+        ensemble_states = lt.ensemble(family, X, (0.0, 1.0), 0.1, parameters=rates, engine="compiled").x
+        single_states = [lt.integrate(family(r), X, (0.0, 1.0), 0.1, engine="compiled").x[-1] for r in rates]
+        assert np.abs(ensemble_states - single_states).max() < 1e-14
 
     from liethermo.engines.compiled import stepper as compiled
 
     run(0.5)
-    before = len(compiled._step_loop_cache)
+    n_cached = len(compiled._step_loop_cache)
     run(0.6)
-    assert len(compiled._step_loop_cache) == before
+    assert len(compiled._step_loop_cache) == n_cached
 
 
 @pytest.mark.slow
 def test_a_thousand_programs_that_differ(monkeypatch):
-    """Machine code is unloaded with the steppers that are dropped."""
+    """Dropping a stepper unloads its machine code."""
     from liethermo.engines.compiled import stepper as compiled
 
-    monkeypatch.setattr(compiled, "_steppers", LRUCache(4))
+    monkeypatch.setattr(compiled, "_step_loop_cache", LRUCache(4))
 
     def run(i):
         system = lt.MetriplecticSystem(None, lambda x: jnp.sin(x[0]) ** (i + 3), dim=1, validate=False)
@@ -215,10 +217,10 @@ def test_a_thousand_programs_that_differ(monkeypatch):
 
     assert all(map(run, range(20)))
     gc.collect()
-    before = memory_maps()
+    maps_before = count_memory_maps()
     assert all(map(run, range(20, 60)))
     gc.collect()
-    assert memory_maps() <= before + 400
+    assert count_memory_maps() <= maps_before + 400
 
 
 class Spring(eqx.Module):
@@ -226,12 +228,12 @@ class Spring(eqx.Module):
     exponent: float
 
     def __call__(self, x):
-        power = 2 if self.exponent > 1.0 else 1  # Python has to see it
+        power = 2 if self.exponent > 1.0 else 1  # needs the value in Python
         return self.stiffness * x[0] ** power
 
 
 def test_plain_numbers_of_modules_are_parameters():
-    class Plain(eqx.Module):
+    class LinearSpring(eqx.Module):
         stiffness: float
 
         def __call__(self, x):
@@ -240,8 +242,8 @@ def test_plain_numbers_of_modules_are_parameters():
     def structure(function):
         return jax.tree_util.tree_structure(eqx.filter(lt.MetriplecticSystem(None, function, dim=1), eqx.is_array))
 
-    assert structure(Plain(1.0)) == structure(Plain(2.0))
-    system = lt.MetriplecticSystem(None, Plain(1.5), dim=1)
+    assert structure(LinearSpring(1.0)) == structure(LinearSpring(2.0))
+    system = lt.MetriplecticSystem(None, LinearSpring(1.5), dim=1)
     assert float(system.energy.function.stiffness) == 1.5
-    seen = lt.MetriplecticSystem(None, Spring(1.5, 2.0), dim=1)
-    assert float(seen.energy(jnp.array([2.0]))) == 6.0
+    branching_system = lt.MetriplecticSystem(None, Spring(1.5, 2.0), dim=1)
+    assert float(branching_system.energy(jnp.array([2.0]))) == 6.0

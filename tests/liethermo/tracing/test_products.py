@@ -1,4 +1,4 @@
-"""Products with matrices that lie in memory as they are given, such as weights of networks: loops, without copies."""
+"""Products with matrices that are inputs, such as weights of networks: loops that read them in place."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from liethermo.tracing.program import Routine
 from liethermo.tracing.scalarize import scalarize
 
 RANDOM = np.random.default_rng(0)
-W, X, POINTS = RANDOM.standard_normal((12, 15)), RANDOM.standard_normal(15), RANDOM.standard_normal((3, 15))
+W = RANDOM.standard_normal((12, 15))
+X = RANDOM.standard_normal(15)
+POINTS = RANDOM.standard_normal((3, 15))
 
 
 def _program(f, *arrays):
@@ -22,9 +24,9 @@ def _program(f, *arrays):
 
 
 def _products(program):
-    own = [i.op for i in program.instructions if isinstance(i.op, MatrixProduct)]
-    inner = [getattr(i.op, name, None) for i in program.instructions for name in ("test", "body")]
-    return own + [found for p in inner if p is not None for found in _products(p)]
+    products = [i.op for i in program.instructions if isinstance(i.op, MatrixProduct)]
+    inner_programs = [getattr(i.op, name, None) for i in program.instructions for name in ("test", "body")]
+    return products + [product for p in inner_programs if p is not None for product in _products(p)]
 
 
 @pytest.mark.parametrize(
@@ -35,7 +37,7 @@ def _products(program):
         (lambda W, x: jax.grad(lambda x: jnp.sum(jnp.tanh(W @ x)))(x), (W, X), 2),
         (lambda W, points: jax.vmap(lambda x: W @ x)(points), (W, POINTS), 1),
         (lambda W, x: W[:, :5] @ x[:5], (W, X), 0),  # 60 products are unrolled
-        (lambda W, x: (2.0 * W) @ x, (W, X), 0),  # what is computed has to be copied: 180 are unrolled
+        (lambda W, x: (2.0 * W) @ x, (W, X), 0),  # a computed matrix is copied: 180 products are unrolled
     ],
 )
 def test_products_are_loops(f, arrays, count):
@@ -46,26 +48,26 @@ def test_products_are_loops(f, arrays, count):
         assert "mul" not in {str(i.op) for i in program.instructions} or count == 2
 
 
-def test_inside_of_loops_too():
-    """The matrix is the parameter of a program around two loops: it is handed on as a table, not entry by entry."""
+def test_products_in_loops_read_the_matrix_in_place():
+    """The matrix is a parameter of the program around two loops, which pass it on as a table, not entry by entry."""
 
     def f(W, x):
         def step(x, _):
             return jnp.tanh(W.T @ (W @ x) / 20.0 + x), None
 
-        def whole(carry):
+        def body(carry):
             return jax.lax.scan(step, carry[0], None, length=200)[0], carry[1] + 1
 
-        return jax.lax.while_loop(lambda carry: carry[1] < 2, whole, (x, 0))[0]
+        return jax.lax.while_loop(lambda carry: carry[1] < 2, body, (x, 0))[0]
 
     program = _program(f, W, X)
-    found = _products(program)
-    assert len(found) == 2
-    assert {p.steps[0] for p in found} == {(15, 1), (1, 15)}
+    products = _products(program)
+    assert len(products) == 2
+    assert {p.strides[0] for p in products} == {(15, 1), (1, 15)}
     np.testing.assert_allclose(program.evaluate(W, X)[0], f(W, X), rtol=1e-12)
 
 
-def test_a_quadratic_function_of_a_large_matrix_is_one():
+def test_large_quadratic_form_has_degree_two():
     A = W.T @ W
     assert _program(lambda A, x: x @ A @ x, A, X).degree(1) == 2
     system = lt.MetriplecticSystem(None, lambda x: 0.5 * x @ jnp.asarray(A) @ x, dim=15)
@@ -77,8 +79,8 @@ def _network(W, x):
     return jnp.sum(jnp.tanh(W.T @ jnp.tanh(W @ x)))
 
 
-def test_a_function_that_is_called_again_is_written_once():
-    """The gradient of a network at three places: two routines, of the way there and back, and the weights stay."""
+def test_repeated_calls_share_a_routine():
+    """The gradient of a network at three points needs two routines, forward and backward, and copies no weights."""
 
     def f(W, x):
         gradient = jax.grad(lambda y: _network(W, y))
@@ -93,22 +95,22 @@ def test_a_function_that_is_called_again_is_written_once():
     np.testing.assert_allclose(program.evaluate(W, X)[0], f(W, X), rtol=1e-12, atol=1e-13)
 
 
-def test_a_routine_is_handed_what_loops_around_it_know():
+def test_routine_inside_a_loop():
     def f(W, x):
         return jax.lax.fori_loop(0, 300, lambda i, x: x + 0.01 * jax.grad(lambda y: _network(W, y))(x), x)
 
     np.testing.assert_allclose(_program(f, W, X).evaluate(W, X)[0], f(W, X), rtol=1e-12)
 
 
-def test_truth_values_and_whole_numbers_are_handed_over():
+def test_routine_passes_truth_values_and_integers():
     @jax.jit
-    def kinked(W, x, n, on):
+    def relu_network(W, x, n, on):
         return jnp.where(on, jnp.sum(jax.nn.relu(W.T @ jax.nn.relu(W @ x))), 0.0) * n, n + 1, ~on
 
     def f(W, x):
-        value = jax.grad(lambda y: kinked(W, y, 2, x[0] > 0.0)[0])(x)
-        _, n, off = kinked(W, x, jnp.asarray(x[1] > 0.0, int), x[2] > 5.0)
-        return jnp.where(off, value * n, 0.0)
+        value = jax.grad(lambda y: relu_network(W, y, 2, x[0] > 0.0)[0])(x)
+        _, n, is_off = relu_network(W, x, jnp.asarray(x[1] > 0.0, int), x[2] > 5.0)
+        return jnp.where(is_off, value * n, 0.0)
 
     program = _program(f, W, X)
     assert any(isinstance(i.op, Routine) for i in program.instructions)
@@ -125,17 +127,17 @@ def test_a_routine_has_the_degree_of_what_it_computes():
     assert program.degree(1) == 2
 
 
-SLOW = pytest.param(lt.MetriplecticRungeKutta(4), marks=pytest.mark.slow)
+SLOW_METHOD = pytest.param(lt.MetriplecticRungeKutta(4), marks=pytest.mark.slow)
 
 
-@pytest.mark.parametrize("method", [lt.MetriplecticMidpoint(), SLOW], ids=str)
+@pytest.mark.parametrize("method", [lt.MetriplecticMidpoint(), SLOW_METHOD], ids=str)
 def test_machine_code_agrees_with_xla(method):
-    """A network of 12 neurons in a layer; single runs and lanes, which are the same to the bit."""
+    """A network with 12 neurons in a layer; single runs and lanes agree to the bit."""
     system = lt.learn.Metriplectic(3, entropy=lambda x: x[2], poisson=mf.Canonical(1), width=12)
     starts = RANDOM.standard_normal((5, 3))
-    own, other = (
+    compiled_run, array_run = (
         lt.integrate(system, starts[0], (0.0, 1.0), 0.1, method=method, engine=e) for e in ("compiled", "array")
     )
-    np.testing.assert_allclose(own.x, other.x, atol=1e-13)
-    many = lt.ensemble(system, starts, (0.0, 1.0), 0.1, method, outputs="final", engine="compiled")
-    np.testing.assert_array_equal(many.x[0], own.x[-1])
+    np.testing.assert_allclose(compiled_run.x, array_run.x, atol=1e-13)
+    ensemble = lt.ensemble(system, starts, (0.0, 1.0), 0.1, method, outputs="final", engine="compiled")
+    np.testing.assert_array_equal(ensemble.x[0], compiled_run.x[-1])

@@ -1,4 +1,4 @@
-"""What is kept between calls for systems and methods: found again for the same objects, and for no others."""
+"""Caches of results for systems and methods: hits for the same or equal objects, and for no others."""
 
 from collections import Counter
 
@@ -14,7 +14,7 @@ from liethermo.tracing import programs
 from liethermo.tracing.caching import MAX_CACHED_RESULTS, LRUCache, fingerprint, memoize
 
 
-def counted():
+def counting_function():
     calls = []
 
     @memoize
@@ -25,38 +25,38 @@ def counted():
     return function, calls
 
 
-def test_the_same_objects_are_found_again():
-    function, calls = counted()
-    first, second = lt.models.rigid_body(), lt.models.rigid_body(rate=2.0)
-    assert [function(first), function(second), function(first), function(first, second)] == [1, 2, 1, 3]
+def test_results_are_cached_by_identity():
+    function, calls = counting_function()
+    body, other_body = lt.models.rigid_body(), lt.models.rigid_body(rate=2.0)
+    assert [function(body), function(other_body), function(body), function(body, other_body)] == [1, 2, 1, 3]
     assert len(calls) == 3
 
 
-def test_others_of_the_same_content_are_found_too():
-    """A method that is written out in each call costs what one that is kept does."""
-    function, calls = counted()
+def test_results_are_cached_by_content():
+    """A method written out in each call is as fast as one object that is reused."""
+    function, calls = counting_function()
     assert [function(lt.models.rigid_body(), lt.MetriplecticTaylor(n)) for n in (6, 6, 8, 6)] == [1, 1, 2, 1]
-    one = (jnp.zeros(2), jnp.zeros(2, dtype=int), jnp.zeros((1, 2)), 1, 1.0, True)
-    assert [function(a) for a in one] == [3, 4, 5, 6, 7, 8], "types and shapes are content"
+    distinct_arguments = (jnp.zeros(2), jnp.zeros(2, dtype=int), jnp.zeros((1, 2)), 1, 1.0, True)
+    assert [function(a) for a in distinct_arguments] == [3, 4, 5, 6, 7, 8], "types and shapes are content"
     assert len(calls) == 8
 
 
-def test_no_object_takes_the_place_of_another():
-    """Objects are kept alive as long as what was found for them, and both for so long only."""
-    function, _ = counted()
+def test_a_new_object_does_not_match_a_cached_id():
+    """The cache keeps arguments alive as long as their results, so that no new object has their id."""
+    function, _ = counting_function()
     assert [function((float(i),)) for i in range(2 * MAX_CACHED_RESULTS)] == list(range(1, 2 * MAX_CACHED_RESULTS + 1))
 
 
-def test_what_can_change_is_not_remembered():
-    """An array of NumPy, which may be written to between two runs, and what is being traced."""
-    function, calls = counted()
+def test_mutable_and_traced_arguments_are_not_cached():
+    """A NumPy array may be modified between two runs; a tracer has no value."""
+    function, calls = counting_function()
     weights = np.ones(3)
     assert [function(weights), function(weights)] == [1, 2]
     jax.jit(lambda x: (function(x), function(x), x)[2])(1.0)
     assert len(calls) == 4
 
 
-class Weighted(eqx.Module):
+class WeightedEnergy(eqx.Module):
     weights: np.ndarray
 
     def __call__(self, mu):
@@ -65,21 +65,25 @@ class Weighted(eqx.Module):
 
 @pytest.mark.slow
 def test_a_run_sees_parameters_that_were_changed_in_place():
-    energy = Weighted(np.array([1.0, 2.0, 3.0]))
+    energy = WeightedEnergy(np.array([1.0, 2.0, 3.0]))
     system = lt.LiePoissonSystem(mf.so(3), energy)
-    before = [lt.integrate(system, [0.1, 1.0, 0.2], (0.0, 1.0), 0.1, engine=e).x[-1] for e in ("array", "compiled")]
+    states_before = [
+        lt.integrate(system, [0.1, 1.0, 0.2], (0.0, 1.0), 0.1, engine=e).x[-1] for e in ("array", "compiled")
+    ]
     energy.weights[:] = [3.0, 1.0, 2.0]
-    after = [lt.integrate(system, [0.1, 1.0, 0.2], (0.0, 1.0), 0.1, engine=e).x[-1] for e in ("array", "compiled")]
-    assert np.abs(before[0] - before[1]).max() < 1e-14
-    assert np.abs(after[0] - after[1]).max() < 1e-14
-    assert np.abs(after[0] - before[0]).max() > 0.1
+    states_after = [
+        lt.integrate(system, [0.1, 1.0, 0.2], (0.0, 1.0), 0.1, engine=e).x[-1] for e in ("array", "compiled")
+    ]
+    assert np.abs(states_before[0] - states_before[1]).max() < 1e-14
+    assert np.abs(states_after[0] - states_after[1]).max() < 1e-14
+    assert np.abs(states_after[0] - states_before[0]).max() > 0.1
 
 
 def test_fingerprints():
-    """By the values of arrays; None for what has no identity that lasts."""
-    same = [fingerprint(lt.MetriplecticGauss(2, preserve=lt.Quadratic(np.ones(3)))) for _ in range(2)]
-    assert same[0] == same[1]
-    assert same[0] != fingerprint(lt.MetriplecticGauss(2, preserve=lt.Quadratic(2 * np.ones(3))))
+    """Fingerprints compare arrays by value; an unhashable object has none."""
+    keys = [fingerprint(lt.MetriplecticGauss(2, preserve=lt.Quadratic(np.ones(3)))) for _ in range(2)]
+    assert keys[0] == keys[1]
+    assert keys[0] != fingerprint(lt.MetriplecticGauss(2, preserve=lt.Quadratic(2 * np.ones(3))))
     assert fingerprint({1}) is None
 
 
@@ -95,27 +99,27 @@ def test_a_method_with_arrays_of_its_own_can_be_compiled():
     "method", [lt.MetriplecticRungeKutta(4), pytest.param(lt.MetriplecticGauss(2), marks=pytest.mark.slow)], ids=str
 )
 def test_one_program_serves_all_calls(method, monkeypatch):
-    """Whatever the span, the outputs and the tolerance: numbers of Python are no types of their own."""
+    """The span, the outputs and the tolerance are arguments of the program, whether Python or NumPy numbers."""
     traces, trace = Counter(), programs._ArrayFunction.__call__
 
-    def counted(whole, dynamic):
-        traces[whole] += 1
-        return trace(whole, dynamic)
+    def count_trace(array_function, dynamic):
+        traces[array_function] += 1
+        return trace(array_function, dynamic)
 
-    monkeypatch.setattr(programs._ArrayFunction, "__call__", counted)
-    monkeypatch.setattr(programs, "_programs", LRUCache(programs.MAX_CACHED_PROGRAMS))
+    monkeypatch.setattr(programs._ArrayFunction, "__call__", count_trace)
+    monkeypatch.setattr(programs, "_program_cache", LRUCache(programs.MAX_CACHED_PROGRAMS))
     body, x0, h = lt.models.rigid_body(rate=0.2), np.array([0.1, 0.2, 1.0]), 0.05
     for span in (1.0, 1.02):
-        given = body, x0, (0.0, span)
+        arguments = body, x0, (0.0, span)
         for step, options in (
             (h, {}),
             (np.float64(h), {"save_at": [0.33, 0.5]}),
             (h, {"until": lt.Relaxed(1e-9)}),
             (lt.Adaptive(1e-5 * span), {}),
         ):
-            lt.integrate(*given, step, method, engine="array", **options)
+            lt.integrate(*arguments, step, method, engine="array", **options)
         for step, options in ((h, {}), (h, {"save_at": [0.33, 0.5]}), (lt.Adaptive(1e-5 * span), {})):
             lt.ensemble(body, np.tile(x0, (8, 1)), (0.0, span), step, method, engine="array", **options)
-    names = {whole.__name__ for whole in traces}
-    assert {"advance", "follow", "advance_all", "_follow_all"} <= names
-    assert not [whole.__name__ for whole, number in traces.items() if number > 1]
+    names = {array_function.__name__ for array_function in traces}
+    assert {"advance", "advance_adaptive", "advance_vmapped", "_advance_batch_program"} <= names
+    assert not [array_function.__name__ for array_function, count in traces.items() if count > 1]

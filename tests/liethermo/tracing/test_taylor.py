@@ -1,4 +1,4 @@
-"""Taylor arithmetic: every recurrence against Cauchy's integral, what contains others, and refusals by name."""
+"""Taylor arithmetic: recurrences against Cauchy's integral, nested functions, and refusals by name."""
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from liethermo.tracing.taylor import TaylorSeriesError, check_taylor_series, tay
 ORDER = 20
 
 FUNCTIONS = {
-    # name: (in JAX, the same of complex numbers by others, point, radius of a circle on which it is analytic)
+    # name: (JAX function, complex function of NumPy or SciPy, point, radius of a circle on which it is analytic)
     "quotient": (lambda x: (1.0 + x) / (2.0 - x * x), lambda z: (1 + z) / (2 - z * z), 0.3, 0.8),
     "constant over": (lambda x: 3.0 / x, lambda z: 3 / z, 1.3, 0.9),
     "integer powers": (lambda x: x**5 + x**-3 + jnp.square(x), lambda z: z**5 + z**-3 + z**2, 1.3, 0.9),
@@ -57,7 +57,7 @@ FUNCTIONS = {
     "acosh": (jnp.arccosh, np.arccosh, 2.5, 1.3),
     "atanh": (jnp.arctanh, np.arctanh, 0.1, 0.7),
     "erf and erfc": (
-        lambda x: scipy_of(x, "erf") + 2.0 * scipy_of(x, "erfc"),
+        lambda x: jax_special_function(x, "erf") + 2.0 * jax_special_function(x, "erfc"),
         lambda z: scipy.special.erf(z) + 2 * scipy.special.erfc(z),
         0.3,
         2.0,
@@ -69,20 +69,22 @@ FUNCTIONS = {
         2.0,
     ),
     "matrices": (
-        lambda x: jnp.einsum("ij,jk,k->i", turned(x), turned(2.0 * x), jnp.array([1.0, 2.0]))[1],
+        lambda x: jnp.einsum("ij,jk,k->i", rotation(x), rotation(2.0 * x), jnp.array([1.0, 2.0]))[1],
         lambda z: np.sin(3 * z) + 2 * np.cos(3 * z),
         0.3,
         1.5,
     ),
     "elimination": (
-        lambda x: jnp.linalg.solve(jnp.array([[2.0, 1.0], [0.0, 1.0]]) + x * jnp.array([[0.0, 1], [1, 3]]), ramp(x))[0],
+        lambda x: jnp.linalg.solve(
+            jnp.array([[2.0, 1.0], [0.0, 1.0]]) + x * jnp.array([[0.0, 1], [1, 3]]), one_and_x(x)
+        )[0],
         lambda z: ((1 + 3 * z) - (1 + z) * z) / (2 * (1 + 3 * z) - z * (1 + z)),
         0.3,
         0.5,
     ),
     "substitution": (
         lambda x: jax.scipy.linalg.solve_triangular(
-            jnp.array([[1.0, 9.0], [0.0, 2.0]]).T + x * jnp.eye(2), ramp(x), lower=True
+            jnp.array([[1.0, 9.0], [0.0, 2.0]]).T + x * jnp.eye(2), one_and_x(x), lower=True
         )[1],
         lambda z: (z - 9 / (1 + z)) / (2 + z),
         0.3,
@@ -141,47 +143,47 @@ FUNCTIONS = {
 }
 
 
-def scipy_of(x, name):
+def jax_special_function(x, name):
     return getattr(jax.scipy.special, name)(x)
 
 
-def turned(angle):
+def rotation(angle):
     return jnp.array([[jnp.cos(angle), -jnp.sin(angle)], [jnp.sin(angle), jnp.cos(angle)]])
 
 
-def ramp(x):
+def one_and_x(x):
     return jnp.stack([jnp.ones(()), x])
 
 
-def by_cauchy(function, point, radius, count=1024):
-    """Coefficients times powers of the radius, from values on a circle [NumPy's and SciPy's complex functions]."""
+def cauchy_coefficients(function, point, radius, count=1024):
+    """Return coefficients times powers of the radius, from values on a circle by the discrete Fourier transform."""
     circle = point + radius * np.exp(2j * np.pi * np.arange(count) / count)
     return (np.fft.fft(function(circle)) / count).real[:ORDER]
 
 
-def test_every_recurrence():
-    """Of ``x' = 1, y' = F(x)``; relative to the largest term on the circle."""
+def test_recurrences_agree_with_cauchy_integrals():
+    """Solve ``x' = 1, y' = F(x)``; errors are relative to the largest term on the circle."""
     points = np.array([point for _, _, point, _ in FUNCTIONS.values()])
 
     def field(state):
         values = [function(state[i]) for i, (function, *_) in enumerate(FUNCTIONS.values())]
         return jnp.concatenate([jnp.ones(len(points)), jnp.stack(values)])
 
-    found = jax.jit(lambda x: taylor_coefficients(field, x, 1.0, ORDER))(
+    coefficients = jax.jit(lambda x: taylor_coefficients(field, x, 1.0, ORDER))(
         jnp.concatenate([points, jnp.zeros(len(points))])
     )
-    found = np.asarray(found)[:, len(points) :] * np.arange(1, ORDER + 1)[:, None]
-    for own, (name, (_, other, point, radius)) in zip(found.T, FUNCTIONS.items(), strict=True):
-        expected = by_cauchy(other, point, radius)
-        error = np.abs(own * radius ** np.arange(ORDER) - expected).max() / np.abs(expected).max()
+    coefficients = np.asarray(coefficients)[:, len(points) :] * np.arange(1, ORDER + 1)[:, None]
+    for series, (name, (_, complex_function, point, radius)) in zip(coefficients.T, FUNCTIONS.items(), strict=True):
+        expected = cauchy_coefficients(complex_function, point, radius)
+        error = np.abs(series * radius ** np.arange(ORDER) - expected).max() / np.abs(expected).max()
         assert error < 2e-14, (name, error)
 
 
-def test_a_solution_that_is_known():
-    """``x' = x^2``: all coefficients are powers of h x; in units of h they neither grow nor vanish."""
+def test_coefficients_of_a_known_solution():
+    """The coefficients of ``x' = x^2`` are powers of h x; in units of h they neither overflow nor underflow."""
     for h, x in ((0.5, 0.8), (1e-100, 1e100)):
-        found = np.asarray(taylor_coefficients(lambda x: x * x, jnp.array([x]), h, 24))[:, 0]
-        assert np.allclose(found, x * (h * x) ** np.arange(1, 25), rtol=1e-14, atol=0.0)
+        coefficients = np.asarray(taylor_coefficients(lambda x: x * x, jnp.array([x]), h, 24))[:, 0]
+        assert np.allclose(coefficients, x * (h * x) ** np.arange(1, 25), rtol=1e-14, atol=0.0)
     constant = np.asarray(taylor_coefficients(lambda x: jnp.array([2.0, 3.0]), jnp.zeros(2), 0.5, 6))
     assert np.array_equal(constant, [[1.0, 1.5], *np.zeros((5, 2))])
 
@@ -203,16 +205,16 @@ def test_a_solution_that_is_known():
     ],
 )
 def test_refusals(function, primitive):
-    with pytest.raises(TaylorSeriesError, match=f"'{primitive}'") as caught:
+    with pytest.raises(TaylorSeriesError, match=f"'{primitive}'") as error:
         check_taylor_series(function, 0.5)
-    assert caught.value.primitive == primitive
+    assert error.value.primitive == primitive
     check_taylor_series(lambda x: jnp.where(function(x) > 0.0, x, x * x), 0.5)  # a test needs no series
 
 
-def bent(x):
+def shifted_abs(x):
     return jnp.abs(x) + 1.0
 
 
 def test_a_refusal_names_the_line():
-    with pytest.raises(TaylorSeriesError, match=r"'abs' is not smooth \(test_taylor.py:\d+, in bent\)"):
-        check_taylor_series(bent, 0.5)
+    with pytest.raises(TaylorSeriesError, match=r"'abs' is not smooth \(test_taylor.py:\d+, in shifted_abs\)"):
+        check_taylor_series(shifted_abs, 0.5)
