@@ -244,7 +244,8 @@ class System(SystemInterface):
         """Return the covector that transports the state, ``x' = Pi(x) transport`` without torques.
 
         It is dH plus the velocities of the dissipations [:meth:`liethermo.Dissipation.velocity`], for the body without
-        baths; the gradients are continuous or discrete. On a Lie algebra an attitude follows it, ``g' = g hat(transport)``.
+        baths; the gradients are continuous or discrete. On a Lie algebra an attitude follows it:
+        ``g' = g hat(transport)``.
         """
         total = dH[: self.body_dim]
         for sigma in self._dissipation_velocities(x, dH, dS, dL):
@@ -276,7 +277,7 @@ class System(SystemInterface):
         return self.energy.depends_on_time
 
     def at_time(self, t) -> System:
-        """Return the system with its energy frozen at the time t; the system itself if its energy is constant in time."""
+        """Return the system with its energy frozen at the time t; itself if it does not depend on time."""
         return eqx.tree_at(lambda system: system.energy, self, self.energy.at_time(t)) if self.is_driven else self
 
     def systems_at_test_times(self) -> list[System]:
@@ -371,7 +372,7 @@ class System(SystemInterface):
         return {f"preserved {i + 1}": L for i, L in enumerate(self.preserved)}
 
     def _find_preserved_names(self) -> tuple[str, ...]:
-        """Return names of the preserved functions: each that of a momentum map or Casimir it is a multiple of, or its own."""
+        """Return names of the preserved functions: of the map or Casimir that each is a multiple of, or new ones."""
         functions = self.functions_for_naming()
         gradients = evaluate_at_points(stack_gradients, functions, self.test_states(2))  # shape (points, functions, n)
         return self.names_from_multiples(first_multiple_indices(gradients, len(self.preserved)).tolist())
@@ -436,14 +437,14 @@ class System(SystemInterface):
         return resolved
 
     def _find_invariants(self, near=None, include_declared: bool = True) -> InvariantVerdicts:
-        """Return which functions are conserved; with ``include_declared``, preserved ones unless a test refutes them."""
+        """Return which functions are conserved; ``include_declared`` adds preserved ones unless a test refutes them."""
         if self.invariant_verdicts is not None:
             return self.invariant_verdicts
         verdicts = _memoized_verdicts(self) if near is None else self._conservation_verdicts(near)
         return InvariantVerdicts.from_verdicts(verdicts, self.preserved_names if include_declared else ())
 
     def _conservation_verdicts(self, near=None) -> dict[str, bool | None]:
-        """Return whether each function is conserved: by construction, or by a test at random states; None if undecided."""
+        """Return whether each function is conserved, by construction or by a test; None if undecided."""
         claimed, torque_free = self.invariants_by_construction(), self.torque_invariant_casimirs
         unclaimed = {name: f for name, f in self.functions().items() if name not in claimed}
         # a test says nothing of functions that a torque changes: the torque may be zero at the tested times only
@@ -514,8 +515,8 @@ class System(SystemInterface):
     def state(self, x, batch: bool = False) -> jax.Array:
         """Return ``x`` as a state of this system: real doubles, finite, shape (n,), or (..., n) with ``batch``.
 
-        For a system on sites x may have the shape ``(*sites, d)``. On a manifold x may have the shape of points, and must
-        be a point of it.
+        For a system on sites x may have the shape ``(*sites, d)``. On a manifold x may have the shape of points,
+        and must be a point of it.
 
         Raises
         ------

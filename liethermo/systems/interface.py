@@ -26,7 +26,7 @@ class InvariantVerdicts(NamedTuple):
 
     @classmethod
     def from_verdicts(cls, verdicts: Mapping[str, bool | None], declared: Iterable[str]) -> InvariantVerdicts:
-        """Build from a verdict on each function; a declared function counts as conserved unless its verdict is False."""
+        """Build from a verdict on each function; declared functions count as conserved unless False."""
         verdicts = {**verdicts, **{name: True for name in declared if verdicts.get(name, True) is None}}
         constant = {name for name, verdict in verdicts.items() if verdict}
         return cls(frozenset(constant), frozenset(name for name, verdict in verdicts.items() if verdict is None))
@@ -129,7 +129,7 @@ class SystemInterface(Geometry):
         return ""
 
     def specific_residuals(self, x) -> dict[str, jax.Array]:
-        """Return residuals at x of axioms that only this kind of system has, by name, relative to the terms that cancel."""
+        """Return residuals at x, by name, of axioms of this kind of system alone, relative to the terms that cancel."""
         return {}
 
     # -- what acts from outside ---------------------------------------------------------------------------------------
@@ -155,7 +155,7 @@ class SystemInterface(Geometry):
         return False
 
     def external_torque(self, x) -> jax.Array | None:
-        """Return the external torque at a state, shape (n,), for the system at one time and attitude; None if none acts."""
+        """Return the external torque at a state, shape (n,), at a fixed time and attitude; None if none acts."""
         return None
 
     def drop_torque(self) -> Self:
@@ -192,7 +192,7 @@ class SystemInterface(Geometry):
 
     @property
     def surface(self) -> Surface | None:
-        """Surface on which every step has to end, for constraints that are no functions of the system; None without any."""
+        """Surface on which every step has to end, for constraints beside conserved functions; None without any."""
         return None
 
     @property
@@ -207,7 +207,7 @@ class SystemInterface(Geometry):
 
     @property
     def balance_entries(self) -> tuple[str, ...]:
-        """Entries of the ledger that are contained in the energy of a solution, and subtracted where laws are stated."""
+        """Entries of the ledger that the energy of a solution contains; laws are stated after subtracting them."""
         return ()
 
     # -- states as users see them -------------------------------------------------------------------------------------
@@ -258,6 +258,6 @@ class SystemInterface(Geometry):
         return jnp.ones_like(x)
 
     def component_scales(self, k) -> jax.Array:
-        """Return the scale of each component of slopes, shape (..., n), for finite differences: the largest, for all."""
+        """Return the scale of each component of slopes, shape (..., n), for finite differences: the largest of all."""
         scale = jnp.max(jnp.abs(k))
         return jnp.full_like(k, jnp.where(scale > 0.0, scale, 1.0))

@@ -76,7 +76,7 @@ class LedgerSystem(System):
 
     @abstractmethod
     def forces_and_power(self, x, v, T) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return friction and external force, shape (n,) each, and heat power at a state x, velocity v, temperature T."""
+        """Return friction, external force, shape (n,) each, and heat power at a state x, velocity v, temperature T."""
 
     def tangential_covector(self, x, covector) -> jax.Array:
         """Return the part of a covector that acts on admissible velocities at a state x, shape (n,)."""
