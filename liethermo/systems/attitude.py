@@ -118,7 +118,7 @@ class AttitudeSystem(System):
         return self.group.Ad(self.group.inverse_map(g))
 
     def initial_state(self, mu, attitude=None, batch: bool = False, t: float = 0.0) -> jax.Array:
-        """Return the state with a momentum and an attitude, by default the identity, at the time t; several with ``batch``.
+        """Return the state with a momentum and an attitude (default: identity) at the time t; several with ``batch``.
 
         Raises
         ------
