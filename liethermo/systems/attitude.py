@@ -233,7 +233,10 @@ class AttitudeSystem(System):
         return *_body_blocks(self.body), slice(n, m), *([slice(m, None)] if m < self.dim else [])
 
     def invariants(self):
-        return {name: (self._extend_from_momentum(J), kept) for name, (J, kept) in self.body.invariants().items()}
+        return {
+            name: (self._extend_from_momentum(J), is_conserved)
+            for name, (J, is_conserved) in self.body.invariants().items()
+        }
 
     def _vector_field(self, x):
         (mu, g), body = self.split_state(x), self.body_at_attitude(x)
@@ -300,7 +303,7 @@ class TurningSystem(System):
     order : int
         Highest power of theta in the series for its velocity.
     attitude : array, shape (m, m)
-        g.
+        The element g of the group.
     """
 
     attitude_system: AttitudeSystem
@@ -311,7 +314,7 @@ class TurningSystem(System):
         body = attitude_system.body
         self.attitude_system, self.order, self.attitude = attitude_system, order, attitude
         self.dim, self.space = body.dim + attitude_system.group.dim * (2 if attitude_system.has_impulse else 1), None
-        self.poisson = mf.NoPoisson(self.dim)  # the motion is that of field()
+        self.poisson = mf.NoPoisson(self.dim)  # field() computes the motion
         self.energy, self.entropy = attitude_system.energy, attitude_system.entropy
         self.momentum_maps = {name: self.pullback(J) for name, J in body.momentum_maps.items()}
         self.dissipation = _MomentumDissipation.lift_terms(body.dissipation, self.pullback)
@@ -337,22 +340,25 @@ class TurningSystem(System):
 
     def field(self, x, dH, dS, dL=()):
         body, n = self.body_at_attitude(x), self.attitude_system.body.dim
-        given = x[:n], dH[:n], None if dS is None else dS[:n], tuple(L[:n] for L in dL)
+        body_arguments = x[:n], dH[:n], None if dS is None else dS[:n], tuple(L[:n] for L in dL)
         algebra = self.attitude_system.group.algebra
-        turning = maps.inverse_dexp(algebra, self.angles(x), body.transport(*given)[: algebra.dim], self.order)
-        rates = [body.field(*given), ANGLE_UNIT * turning]
+        velocity = body.transport(*body_arguments)[: algebra.dim]
+        angle_rates = maps.inverse_dexp(algebra, self.angles(x), velocity, self.order)
+        rates = [body.field(*body_arguments), ANGLE_UNIT * angle_rates]
         if self.has_impulse:
-            push = body.external_torque(x[:n])
-            assert push is not None
-            rates.append(ANGLE_UNIT * (push[: algebra.dim] @ self.attitude_system.spatial_action(self._attitude_at(x))))
+            torque = body.external_torque(x[:n])
+            assert torque is not None
+            rates.append(
+                ANGLE_UNIT * (torque[: algebra.dim] @ self.attitude_system.spatial_action(self._attitude_at(x)))
+            )
         return jnp.concatenate(rates)
 
     def body_at_attitude(self, x) -> System:
-        """The body, for use at the attitude of the coordinates."""
+        """Return the body with its torque bound to the attitude of the coordinates."""
         body = self.attitude_system.body
-        return (
-            body.bind_attitude(self._attitude_at(x)) if isinstance(body, DrivenSystem) and body.needs_attitude else body
-        )
+        if isinstance(body, DrivenSystem) and body.needs_attitude:
+            return body.bind_attitude(self._attitude_at(x))
+        return body
 
     def _attitude_at(self, x) -> jax.Array:
         group = self.attitude_system.group
@@ -361,7 +367,7 @@ class TurningSystem(System):
     # -- coordinates --------------------------------------------------------------------------------------------------
 
     def local_coordinates(self, x) -> jax.Array:
-        """The coordinates of a state around its own attitude."""
+        """Return the coordinates of a state of the attitude system around its attitude."""
         return jnp.concatenate(
             [
                 self.attitude_system.points(x),
@@ -371,12 +377,12 @@ class TurningSystem(System):
         )
 
     def angles(self, v) -> jax.Array:
-        """Theta of a vector of coordinates, shape (..., dim of the algebra)."""
+        """Return theta of coordinates, shape (..., algebra.dim)."""
         n = self.attitude_system.body.dim
         return v[..., n : n + self.attitude_system.group.dim] / ANGLE_UNIT
 
     def spatial_impulse(self, v) -> jax.Array:
-        """The momentum in space of a vector of coordinates, shape (..., dim of the algebra)."""
+        """Return the spatial impulse of coordinates, shape (..., algebra.dim)."""
         return v[..., self.attitude_system.body.dim + self.attitude_system.group.dim :] / ANGLE_UNIT
 
 

@@ -254,7 +254,7 @@ class System(SystemInterface):
 
     @property
     def is_torque_free(self) -> bool:
-        """Whether ``x' = Pi(x) transport``, so that on a Lie algebra the momentum in space is constant."""
+        """True if ``x' = Pi(x) transport``, so that on a Lie algebra the momentum in space is constant."""
         answers: list[bool] = []
 
         def record_answer(x):
@@ -273,7 +273,7 @@ class System(SystemInterface):
 
     @property
     def is_driven(self) -> bool:
-        """Whether the energy depends on time, or a torque acts, so that work is done from outside."""
+        """True if the energy depends on time, or a torque acts, so that work is done from outside."""
         return self.energy.depends_on_time
 
     def at_time(self, t) -> System:

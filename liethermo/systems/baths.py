@@ -77,7 +77,7 @@ class HeatBaths(Module):
 
     @property
     def has_positive_temperatures(self) -> bool:
-        """Whether the temperatures are positive in every state by construction."""
+        """True if the temperatures are positive in every state by construction."""
         return isinstance(self.energy, BathEnergy | ReservoirEnergy)
 
     @property

@@ -82,12 +82,12 @@ class SystemInterface(Geometry):
 
     @property
     def has_poisson_by_construction(self) -> bool:
-        """Whether Pi is a Poisson tensor by construction, so that an expensive check can be skipped."""
+        """True if Pi is a Poisson tensor by construction, so that an expensive check can be skipped."""
         return False
 
     @property
     def has_generator(self) -> bool:
-        """Whether :meth:`generator_field` computes the motion without the gradient of the entropy."""
+        """True if :meth:`generator_field` computes the motion without the gradient of the entropy."""
         return self.dissipation is not None and self.dissipation.has_generator
 
     def generator_field(self, x) -> jax.Array:
@@ -141,7 +141,7 @@ class SystemInterface(Geometry):
 
     @property
     def has_impulse(self) -> bool:
-        """Whether a torque may change momenta that the group acts on, and not only those of internal parts."""
+        """True if a torque may change momenta that the group acts on, and not only those of internal parts."""
         return bool(self.torque_name)
 
     @property
@@ -151,7 +151,7 @@ class SystemInterface(Geometry):
 
     @property
     def needs_attitude(self) -> bool:
-        """Whether the torque depends on the attitude."""
+        """True if the torque depends on the attitude."""
         return False
 
     def external_torque(self, x) -> jax.Array | None:
@@ -182,7 +182,7 @@ class SystemInterface(Geometry):
 
     @property
     def has_all_casimirs(self) -> bool:
-        """Whether every Casimir is known to be a function of :meth:`casimirs`."""
+        """True if every Casimir is known to be a function of :meth:`casimirs`."""
         return False
 
     @property
@@ -230,17 +230,17 @@ class SystemInterface(Geometry):
 
     @property
     def can_unroll(self) -> bool:
-        """Whether the compiled engine is worth trying; False if the system needs a loop."""
+        """True if the compiled engine is worth trying; False if the system needs a loop."""
         return self.space is None or (self.space.is_smooth and self.space.dtype.kind != "c")
 
     @property
     def has_matrix_functions(self) -> bool:
-        """Whether the system consists of matrix functions, which XLA compiles more slowly than the compiled engine."""
+        """True if the system consists of matrix functions, which XLA compiles more slowly than the compiled engine."""
         return False
 
     @property
     def is_smooth(self) -> bool:
-        """Whether the vector field is at least twice differentiable."""
+        """True if the vector field is at least twice differentiable."""
         return self.space is None or self.space.is_smooth
 
     def sparsity_pattern(self) -> scipy.sparse.csr_array | None:

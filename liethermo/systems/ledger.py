@@ -38,7 +38,7 @@ class LedgerSystem(System):
 
     @property
     def has_ledger(self) -> bool:
-        """Whether work or heat comes from outside, so that the state has a ledger."""
+        """True if work or heat comes from outside, so that the state has a ledger."""
         return self.external is not None or self.heat_power is not None
 
     @property
@@ -114,13 +114,13 @@ class ForcesAndHeat(SkewFriction):
 
     def force(self, system, x, dH, dS, dL):
         first, S = system.first_velocity_index, system.dim_without_ledger - 1
-        W, by_S = system.momentum_jacobians(x)
+        W, S_derivative = system.momentum_jacobians(x)
         # velocity and temperature that belong to the gradient
         v = solve(W, system.tangential_covector(x, dH[first:S])[:, None])[:, 0]
-        T = dH[S] - jnp.dot(by_S, v)
+        T = dH[S] - jnp.dot(S_derivative, v)
         friction, external, power = system.forces_and_power(x, v, T)
         S_dot = (power - jnp.dot(friction, v)) / jnp.where(T > 0.0, T, jnp.nan)
-        v_dot = solve(W, (friction + external - by_S * S_dot)[:, None])[:, 0]
+        v_dot = solve(W, (friction + external - S_derivative * S_dot)[:, None])[:, 0]
         return jnp.concatenate([jnp.zeros(first), v_dot, S_dot[None], system.ledger_rates(jnp.dot(external, v), power)])
 
 
