@@ -41,7 +41,7 @@ class LiouvilleFriction(SkewFriction):
 
 
 class ReebDrift(LiouvilleFriction):
-    """The drift that turns an evolution field into the contact field ``X_H = E_H - H R``, ``H' = -R(H) H`` [SML §2.2]."""
+    """Drift that turns an evolution field into the contact field ``X_H = E_H - H R``, ``H' = -R(H) H`` [SML §2.2]."""
 
     energy_law = None
 

@@ -263,7 +263,7 @@ def _inverse_metric(G):
 
 
 class LegendreTransform(Energy):
-    """The Hamiltonian ``H(q, p, S) = p . v - L(q, v, S)`` with ``L_v = p``, by damped Newton; NaN without a solution."""
+    """The Hamiltonian ``H(q, p, S) = p . v - L(q, v, S)`` with ``L_v = p``, by damped Newton; else NaN."""
 
     lagrangian: Energy
 

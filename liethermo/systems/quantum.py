@@ -291,8 +291,8 @@ class QuantumSystem(System):
         min_eigenvalue = np.linalg.eigvalsh(rho)[:, 0].min()
         if self.dissipation is not None and min_eigenvalue < -max(self.floor, NEGATIVE_EIGENVALUE_LIMIT):
             return (
-                f"its density matrix has the eigenvalue {min_eigenvalue:.3g}, outside the cone of positive matrices: a shorter "
-                "step stays inside"
+                f"its density matrix has the eigenvalue {min_eigenvalue:.3g}, outside the cone of positive matrices: "
+                "a shorter step stays inside"
             )
         return self._why_rank_grows(np.atleast_2d(x), rho) if self._has_dissipation(SteepestEntropyAscent) else ""
 
@@ -351,8 +351,8 @@ class QuantumSystem(System):
         eigenvalue = np.linalg.eigvalsh(rho[use[grows[0]]])[0]
         otherwise = ", or take lt.MetriplecticRungeKutta, whose stages are without it" if self.has_generator else ""
         return (
-            f"its density matrix has the eigenvalue {eigenvalue:.3g}, which jumps make larger, where the gradient of the "
-            f"entropy is infinite: mix it, as in q.state(rho, mixed=1e-6){otherwise}"
+            f"its density matrix has the eigenvalue {eigenvalue:.3g}, which jumps make larger, where the gradient of "
+            f"the entropy is infinite: mix it, as in q.state(rho, mixed=1e-6){otherwise}"
         )
 
     def _jump_rates(self, x: np.ndarray, kernels: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

@@ -69,7 +69,7 @@ class Subsystem(Module):
         return 1
 
     def energy_in_state(self, start: int) -> Energy:
-        """Return the energy as a function of a whole state, in which the state of the body begins at index ``start``."""
+        """Return the energy as a function of a whole state, in which the body begins at index ``start``."""
         return self.energy.on(np.arange(start, start + self.dim))
 
 

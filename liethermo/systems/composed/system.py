@@ -171,7 +171,7 @@ class ComposedSystem(System):
         ]
 
     def fourier_factors(self, x, t=None) -> jax.Array:
-        """Return the skew matrix ``K_ab = k_ab (1/T_a - 1/T_b)``, shape (..., N, N), for which ``S_a' = sum_b K_ab T_b``.
+        """Return the skew matrix ``K_ab = k_ab (1/T_a - 1/T_b)``, shape (..., N, N), with ``S_a' = sum_b K_ab T_b``.
 
         The matrix is dense, for systems of few bodies; the dynamics uses the edges alone.
         """
