@@ -1,4 +1,4 @@
-"""A body with its attitude: the momentum of a Lie-Poisson system, and the element of the group that it moves."""
+"""``AttitudeSystem``: the momentum of a Lie-Poisson system together with its attitude, an element of the group."""
 
 from __future__ import annotations
 
@@ -24,28 +24,27 @@ from .driven import DrivenSystem
 from .lie_poisson import LiePoissonSystem
 
 SPATIAL_MOMENTUM = "momentum in space"
-"""The name of ``Ad_star(inverse(g), mu)`` among what is constant along a run."""
+"""Name of the constant of the motion ``Ad_star(inverse(g), mu)``."""
 
 MOMENTUM_LESS_IMPULSE = "momentum in space less the impulse"
-"""The name of what is constant in its place where a torque acts."""
+"""Name of the constant of the motion if a torque acts: the spatial momentum minus the impulse of the torque."""
 
 IMPULSE_NAME = "impulse"
-"""The name of what a torque has given to the momentum in space, before the number of a component."""
+"""Name of the impulse of a torque on the spatial momentum; the number of the component follows."""
 
 
 class AttitudeSystem(System):
-    """A Lie-Poisson system for mu, and ``g' = g hat(transport(mu))`` beside it [:doc:`/explanation/exact_laws`].
+    """A Lie-Poisson system for mu together with ``g' = g hat(transport(mu))`` [:doc:`/explanation/exact_laws`].
 
-    A state is that of the body, mu first, followed by the entries of g, row by row, their imaginary parts last where
-    there are any. Where a torque tau acts, the momentum in space as its impulse makes it comes last, ``p' =
-    Ad_star(inverse(g), tau)``. Energy, entropy and Casimirs are those of mu. Made by :func:`liethermo.integrate` from a
-    system with a group.
+    A state consists of the state of the body, mu first, and the entries of g row by row; imaginary parts follow for
+    complex groups. If a torque tau acts, the accumulated impulse comes last, ``p' = Ad_star(inverse(g), tau)``. Energy,
+    entropy and Casimirs are functions of mu. :func:`liethermo.integrate` builds it from a system with a group.
 
     Attributes
     ----------
     body : LiePoissonSystem, or DrivenSystem of one
     reconstruction : {"coadjoint", "cayley", "exp"}
-        How the attitude is found: see :class:`liethermo.WithAttitude`.
+        Method that computes the attitude: see :class:`liethermo.WithAttitude`.
     group : manifolds.MatrixGroup
     """
 
@@ -69,15 +68,15 @@ class AttitudeSystem(System):
 
     @property
     def can_unroll(self) -> bool:
-        general = {"exp": maps.exp, "coadjoint": maps.adjoint_cayley}
-        own = {"exp": self.group.exp_map, "coadjoint": self.group.adjoint_cayley_map}
+        series_maps = {"exp": maps.exp, "coadjoint": maps.adjoint_cayley}
+        group_maps = {"exp": self.group.exp_map, "coadjoint": self.group.adjoint_cayley_map}
         kind = self.reconstruction
-        unrolls = kind not in own or own[kind] is not general[kind]  # a power series of matrices, squared up again
-        return self.body.can_unroll and self._n_real_parts == 1 and unrolls
+        has_closed_form = kind not in group_maps or group_maps[kind] is not series_maps[kind]
+        return self.body.can_unroll and self._n_real_parts == 1 and has_closed_form
 
     @property
     def momentum_system(self) -> LiePoissonSystem:
-        """The system of mu and of baths alone."""
+        """System of mu and the baths, without attitude and clock."""
         return momentum_system_of(self.body)
 
     torque_name = forward_to("body")
@@ -85,22 +84,21 @@ class AttitudeSystem(System):
     torque_invariant_casimirs = forward_to("body")
 
     def split_state(self, x) -> tuple[jax.Array, jax.Array]:
-        """State of the body, shape (..., n), and group element, shape (..., m, m), of a state."""
+        """Return the state of the body, shape (..., n), and the group element, shape (..., m, m), of a state."""
         n, m = self.body.dim, self.group.matrix_size
-        parts = x[..., n : n + self._n_real_parts * m**2].reshape(*x.shape[:-1], self._n_real_parts, m, m)
-        return x[..., :n], parts[..., 0, :, :] if self._n_real_parts == 1 else parts[..., 0, :, :] + 1j * parts[
-            ..., 1, :, :
-        ]
+        entries = x[..., n : n + self._n_real_parts * m**2].reshape(*x.shape[:-1], self._n_real_parts, m, m)
+        g = entries[..., 0, :, :]
+        return x[..., :n], g if self._n_real_parts == 1 else g + 1j * entries[..., 1, :, :]
 
     def spatial_impulse(self, x) -> jax.Array:
-        """The momentum in space as the impulse of the torque makes it, shape (..., dim of the algebra); or (..., 0)."""
+        """Return the initial spatial momentum plus the impulse of the torque, shape (..., algebra.dim); or (..., 0)."""
         return x[..., self.body.dim + self._n_real_parts * self.group.matrix_size**2 :]
 
     def join_state(self, mu, g, p=None) -> jax.Array:
-        """The inverse of :meth:`split` and :meth:`spatial_impulse`."""
-        parts = g[..., None, :, :] if self._n_real_parts == 1 else jnp.stack([g.real, g.imag], axis=-3)
-        rest = [] if p is None else [p]
-        return jnp.concatenate([mu, parts.reshape(*mu.shape[:-1], -1), *rest], axis=-1)
+        """Return the state with a state of the body, a group element and a spatial impulse: see :meth:`split_state`."""
+        entries = g[..., None, :, :] if self._n_real_parts == 1 else jnp.stack([g.real, g.imag], axis=-3)
+        impulse = [] if p is None else [p]
+        return jnp.concatenate([mu, entries.reshape(*mu.shape[:-1], -1), *impulse], axis=-1)
 
     def clock_components(self, v):
         mu, g = self.split_state(v)
@@ -109,18 +107,18 @@ class AttitudeSystem(System):
         )
 
     def body_at_attitude(self, x) -> LiePoissonSystem | DrivenSystem:
-        """The body, for use at the attitude of a state."""
+        """Return the body with its torque bound to the attitude of a state."""
         return self.body.bind_attitude(self.split_state(x)[1]) if isinstance(self.body, DrivenSystem) else self.body
 
     def solved_part(self, x) -> tuple[System, jax.Array]:
         return self.body_at_attitude(x), self.points(x)
 
     def spatial_action(self, g) -> jax.Array:
-        """The matrix, shape (..., n, n), that a dual vector is multiplied by from the left to become one in space."""
+        """Return the matrix A, shape (..., n, n), for which ``mu @ A`` is the momentum in space."""
         return self.group.Ad(self.group.inverse_map(g))
 
     def initial_state(self, mu, attitude=None, batch: bool = False, t: float = 0.0) -> jax.Array:
-        """The state with a momentum and an attitude, the identity by default, at a time; or several, with ``batch``.
+        """Return the state with a momentum and an attitude (default: identity) at the time t; several with ``batch``.
 
         Raises
         ------
@@ -129,7 +127,7 @@ class AttitudeSystem(System):
         """
         g = self.group.identity if attitude is None else self.group._element(attitude, "attitude")
         if not is_traced(g):
-            with jax.ensure_compile_time_eval():  # something else may be traced meanwhile
+            with jax.ensure_compile_time_eval():  # JAX may be tracing something else
                 if not bool(self.group.belongs(g).all()):
                     residual = float(self.group.defect(g).max())
                     raise InputError(
@@ -137,16 +135,16 @@ class AttitudeSystem(System):
                     )
         body = self.body
         mu = body.initial_state(mu, t, batch) if isinstance(body, DrivenSystem) else body.state(mu, batch)
-        size = jnp.broadcast_shapes(mu.shape[:-1], g.shape[:-2])
-        if size and not batch:
+        batch_shape = jnp.broadcast_shapes(mu.shape[:-1], g.shape[:-2])
+        if batch_shape and not batch:
             raise InputError(f"a run has one attitude, of shape {self.group.identity.shape}, not {g.shape}")
-        mu, g = jnp.broadcast_to(mu, (*size, mu.shape[-1])), jnp.broadcast_to(g, (*size, *g.shape[-2:]))
+        mu, g = jnp.broadcast_to(mu, (*batch_shape, mu.shape[-1])), jnp.broadcast_to(g, (*batch_shape, *g.shape[-2:]))
         if not self.has_impulse:
             return self.join_state(mu, g)
         return self.join_state(mu, g, jnp.einsum("...a,...ab->...b", mu[..., : self.group.dim], self.spatial_action(g)))
 
     def points(self, x):
-        """The states of the body: what functions of the state are functions of."""
+        """Return the state of the body, on which energy, entropy and Casimirs depend."""
         return x[..., : self.body.dim]
 
     def user_state(self, x):
@@ -162,10 +160,12 @@ class AttitudeSystem(System):
         return self.body.why_singular(self.points(x))
 
     def component_scales(self, k):
-        """Those of momenta, which have a unit, and of attitudes, which have none."""
+        """Return scales of momenta, which have a unit, and of attitudes, which have none."""
         n, m = self.body.dim, self.dim - self.spatial_impulse(k).shape[-1]
-        parts = [self.body.component_scales(k[..., :n]), super().component_scales(k[..., n:m])]
-        return jnp.concatenate([*parts, *([super().component_scales(k[..., m:])] if m < self.dim else [])], axis=-1)
+        scales = [self.body.component_scales(k[..., :n]), super().component_scales(k[..., n:m])]
+        if m < self.dim:
+            scales.append(super().component_scales(k[..., m:]))
+        return jnp.concatenate(scales, axis=-1)
 
     def raise_index(self, x, alpha):
         n = self.body.dim
@@ -184,28 +184,26 @@ class AttitudeSystem(System):
         )
         dense = None if solution.dense is None else solution.dense.with_output_map(self.points)
         series = {name: f - f[0] if name in self.impulse_names else f for name, f in solution.casimirs.items()}
-        of_body = dataclasses.replace(solution, x=np.asarray(states), dense=dense, stats=stats, casimirs=series)
-        found = self.body.to_user_solution(of_body)
-        return dataclasses.replace(found, attitude=np.ascontiguousarray(g)).with_provenance(
+        body_solution = dataclasses.replace(solution, x=np.asarray(states), dense=dense, stats=stats, casimirs=series)
+        body_solution = self.body.to_user_solution(body_solution)
+        return dataclasses.replace(body_solution, attitude=np.ascontiguousarray(g)).with_provenance(
             system=type(self.momentum_system).__name__,
             algebra=self.momentum_system.algebra.name,
-            x0=found.x[0].tolist(),
+            x0=body_solution.x[0].tolist(),
         )
 
     def max_attitude_residual(self, x) -> float:
-        """The largest distance of the attitudes of states, shape (m, n), from the group, relative to their size."""
+        """Return the largest relative distance from the group of the attitudes of states, shape (m, n)."""
         return float(np.max(_evaluate_at_states(_attitude_residual, self, x)))
 
     def max_spatial_momentum_change(self, x) -> float:
-        """The largest change of the momentum in space along states, shape (m, n), the first being that at the start.
+        """Return the largest change of the spatial momentum minus impulse, from the first of the states, shape (m, n).
 
-        Less the impulse, where a torque acts.
-
-        Relative to the largest of the terms that it is the sum of.
+        The change is relative to the largest term that is added up in a component.
         """
-        found, sizes = _evaluate_at_states(_spatial_momentum_and_scale, self, x)
-        size = float(np.max(sizes))
-        return float(np.abs(found - found[0]).max()) / (size if size > 0.0 else 1.0)
+        momenta, scales = _evaluate_at_states(_spatial_momentum_and_scale, self, x)
+        scale = float(np.max(scales))
+        return float(np.abs(momenta - momenta[0]).max()) / (scale if scale > 0.0 else 1.0)
 
     inertia = forward_to("momentum_system")
 
@@ -217,13 +215,15 @@ class AttitudeSystem(System):
 
     @property
     def impulse_names(self) -> tuple[str, ...]:
-        """The names of the components of the impulse; none where no torque acts."""
+        """Names of the components of the impulse; empty if no torque acts."""
         return tuple(f"{IMPULSE_NAME} {i + 1}" for i in range(self.group.dim)) if self.has_impulse else ()
 
     @property
     def ledger(self):
-        found = {name: self._extend_from_momentum(f) for name, f in self.body.ledger.items()}
-        return found | {name: Linear(jnp.ones(1)).on([i - self.group.dim]) for i, name in enumerate(self.impulse_names)}
+        body_ledger = {name: self._extend_from_momentum(f) for name, f in self.body.ledger.items()}
+        return body_ledger | {
+            name: Linear(jnp.ones(1)).on([i - self.group.dim]) for i, name in enumerate(self.impulse_names)
+        }
 
     balance_entries = forward_to("body")
 
@@ -233,7 +233,10 @@ class AttitudeSystem(System):
         return *_body_blocks(self.body), slice(n, m), *([slice(m, None)] if m < self.dim else [])
 
     def invariants(self):
-        return {name: (self._extend_from_momentum(J), kept) for name, (J, kept) in self.body.invariants().items()}
+        return {
+            name: (self._extend_from_momentum(J), is_conserved)
+            for name, (J, is_conserved) in self.body.invariants().items()
+        }
 
     def _vector_field(self, x):
         (mu, g), body = self.split_state(x), self.body_at_attitude(x)
@@ -251,21 +254,23 @@ class AttitudeSystem(System):
 
 
 def _body_blocks(body: System) -> list[slice]:
-    """The blocks of the states of a body, as those of the first part of longer states."""
+    """Return the blocks of the state of a body as slices of a longer state that begins with it."""
     return [slice(*block.indices(body.dim)) for block in body.state_blocks]
 
 
 def _evaluate_at_states(function: Callable, system: AttitudeSystem, x):
-    """The values of ``function(system, x)`` at states, shape (m, n)."""
-    rows = np.minimum(np.arange(1 << (len(x) - 1).bit_length()), len(x) - 1)  # few lengths, so few compilations
+    """Return ``function(system, x)`` at states, shape (m, n)."""
+    rows = np.minimum(
+        np.arange(1 << (len(x) - 1).bit_length()), len(x) - 1
+    )  # padded to a power of two, so that few programs are compiled
     return evaluate_at_points(function, system, np.asarray(x)[rows])
 
 
 def momentum_system_of(body: System) -> LiePoissonSystem:
-    """The system of momenta in one that may be driven."""
-    found = body.body if isinstance(body, DrivenSystem) else body
-    assert isinstance(found, LiePoissonSystem)
-    return found
+    """Return the Lie-Poisson system that a driven system contains, or the system itself."""
+    momentum_system = body.body if isinstance(body, DrivenSystem) else body
+    assert isinstance(momentum_system, LiePoissonSystem)
+    return momentum_system
 
 
 def _attitude_residual(system: AttitudeSystem, x) -> jax.Array:
@@ -273,32 +278,32 @@ def _attitude_residual(system: AttitudeSystem, x) -> jax.Array:
 
 
 def _spatial_momentum_and_scale(system: AttitudeSystem, x) -> tuple[jax.Array, jax.Array]:
-    """The momentum in space, less what the impulse makes of it, and the size of the largest terms in it."""
+    """Return the spatial momentum minus the impulse, and the largest term that is added up in a component of it."""
     (state, g), p = system.split_state(x), system.spatial_impulse(x)
     mu, action = state[: system.group.dim], system.spatial_action(g)
-    found = mu @ action
-    return found - p if system.has_impulse else found, jnp.max(jnp.abs(mu) @ jnp.abs(action))
+    momentum = mu @ action
+    return momentum - p if system.has_impulse else momentum, jnp.max(jnp.abs(mu) @ jnp.abs(action))
 
 
 ANGLE_UNIT = 2.0**-300
-"""Angles beside a momentum are kept in a unit this small, so that they count for nothing in the length of a step that
-is measured by the momentum, be that of 1e20 or of 1e-20. A power of two, so that nothing is rounded."""
+"""Unit of the angles that are stored beside a momentum. It is so small that angles do not count in a norm of the state,
+which the momentum alone determines, be it 1e20 or 1e-20. It is a power of two, so that scaling rounds nothing."""
 
 
 class TurningSystem(System):
-    """A body in coordinates (mu, theta) around an attitude g, which it turns to ``g exp(hat(theta))``.
+    """A body in coordinates (mu, theta) around an attitude g, for the attitude ``g exp(hat(theta))``.
 
     ``theta' = dexp(theta)^-1 transport(mu)`` [Munthe-Kaas 1999]: a system on a vector space, for one step of a method
-    that needs no more. The laws are those of mu. Theta is in units of :data:`UNIT`, and so is the momentum in space
-    that is behind it where a torque acts.
+    that needs no more. The laws are those of mu. Theta is in units of
+    :data:`ANGLE_UNIT`, and so is the spatial impulse that follows it if a torque acts.
 
     Attributes
     ----------
     attitude_system : AttitudeSystem
     order : int
-        The power of theta to which its velocity is computed.
+        Highest power of theta in the series for its velocity.
     attitude : array, shape (m, m)
-        g.
+        The element g of the group.
     """
 
     attitude_system: AttitudeSystem
@@ -309,7 +314,7 @@ class TurningSystem(System):
         body = attitude_system.body
         self.attitude_system, self.order, self.attitude = attitude_system, order, attitude
         self.dim, self.space = body.dim + attitude_system.group.dim * (2 if attitude_system.has_impulse else 1), None
-        self.poisson = mf.NoPoisson(self.dim)  # the motion is that of field()
+        self.poisson = mf.NoPoisson(self.dim)  # field() computes the motion
         self.energy, self.entropy = attitude_system.energy, attitude_system.entropy
         self.momentum_maps = {name: self.pullback(J) for name, J in body.momentum_maps.items()}
         self.dissipation = _MomentumDissipation.lift_terms(body.dissipation, self.pullback)
@@ -335,22 +340,25 @@ class TurningSystem(System):
 
     def field(self, x, dH, dS, dL=()):
         body, n = self.body_at_attitude(x), self.attitude_system.body.dim
-        given = x[:n], dH[:n], None if dS is None else dS[:n], tuple(L[:n] for L in dL)
+        body_arguments = x[:n], dH[:n], None if dS is None else dS[:n], tuple(L[:n] for L in dL)
         algebra = self.attitude_system.group.algebra
-        turning = maps.inverse_dexp(algebra, self.angles(x), body.transport(*given)[: algebra.dim], self.order)
-        rates = [body.field(*given), ANGLE_UNIT * turning]
+        velocity = body.transport(*body_arguments)[: algebra.dim]
+        angle_rates = maps.inverse_dexp(algebra, self.angles(x), velocity, self.order)
+        rates = [body.field(*body_arguments), ANGLE_UNIT * angle_rates]
         if self.has_impulse:
-            push = body.external_torque(x[:n])
-            assert push is not None
-            rates.append(ANGLE_UNIT * (push[: algebra.dim] @ self.attitude_system.spatial_action(self._attitude_at(x))))
+            torque = body.external_torque(x[:n])
+            assert torque is not None
+            rates.append(
+                ANGLE_UNIT * (torque[: algebra.dim] @ self.attitude_system.spatial_action(self._attitude_at(x)))
+            )
         return jnp.concatenate(rates)
 
     def body_at_attitude(self, x) -> System:
-        """The body, for use at the attitude of the coordinates."""
+        """Return the body with its torque bound to the attitude of the coordinates."""
         body = self.attitude_system.body
-        return (
-            body.bind_attitude(self._attitude_at(x)) if isinstance(body, DrivenSystem) and body.needs_attitude else body
-        )
+        if isinstance(body, DrivenSystem) and body.needs_attitude:
+            return body.bind_attitude(self._attitude_at(x))
+        return body
 
     def _attitude_at(self, x) -> jax.Array:
         group = self.attitude_system.group
@@ -359,7 +367,7 @@ class TurningSystem(System):
     # -- coordinates --------------------------------------------------------------------------------------------------
 
     def local_coordinates(self, x) -> jax.Array:
-        """The coordinates of a state around its own attitude."""
+        """Return the coordinates of a state of the attitude system around its attitude."""
         return jnp.concatenate(
             [
                 self.attitude_system.points(x),
@@ -369,12 +377,12 @@ class TurningSystem(System):
         )
 
     def angles(self, v) -> jax.Array:
-        """Theta of a vector of coordinates, shape (..., dim of the algebra)."""
+        """Return theta of coordinates, shape (..., algebra.dim)."""
         n = self.attitude_system.body.dim
         return v[..., n : n + self.attitude_system.group.dim] / ANGLE_UNIT
 
     def spatial_impulse(self, v) -> jax.Array:
-        """The momentum in space of a vector of coordinates, shape (..., dim of the algebra)."""
+        """Return the spatial impulse of coordinates, shape (..., algebra.dim)."""
         return v[..., self.attitude_system.body.dim + self.attitude_system.group.dim :] / ANGLE_UNIT
 
 

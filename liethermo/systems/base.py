@@ -1,4 +1,4 @@
-"""What every system has in common: ``x' = Pi(x) dH + force(x; dH, dS)`` and the laws that follow from it."""
+"""``System``, the base class of all systems: ``x' = Pi(x) dH + force(x; dH, dS)`` and the laws that follow from it."""
 
 from __future__ import annotations
 
@@ -33,17 +33,20 @@ from .conservation import is_proportional, judge_conservation, rates_of_change
 from .interface import InvariantVerdicts, SystemInterface
 
 TEST_STATE_SCALES = (1.0, 1e-4, 1e4)
-"""Scales of the random points at which the system is asked which functions it conserves."""
+"""Scales of the random states at which it is tested which functions a system conserves."""
 
 LARGE_STATE_DIM = 2_000
-"""Components of a state above which one point of each scale is enough."""
+"""Number of state components above which one random state of each scale is tested."""
 
-N_NEARBY_STATES, NEARBY_RADII = 4, (0.3, 0.1, 0.03, 0.01, 1e-3, 1e-4)
-"""States near which it is asked too, and how near, relative to the size of a state."""
+N_NEARBY_STATES = 4
+"""Number of initial states near which conservation is tested too."""
+
+NEARBY_RADII = (0.3, 0.1, 0.03, 0.01, 1e-3, 1e-4)
+"""Distances of the tested states from an initial state, relative to its norm."""
 
 
 TEST_TIMES = (0.0, 0.7310585786300049, -1.618033988749895)
-"""Times at which it is asked that of a system whose energy depends on time."""
+"""Times at which conservation is tested if the energy depends on time."""
 
 
 class ReorderedSystem(NamedTuple):
@@ -53,9 +56,9 @@ class ReorderedSystem(NamedTuple):
     ----------
     system : System
     reorder_state, restore_state : functions of states, shape (..., n)
-        Into that order, and out of it.
+        Reorder the components, and restore their order.
     pullback : function from an Energy to an Energy
-        A function of states, as one of states in that order.
+        Turns a function of states into a function of reordered states.
     """
 
     system: System
@@ -92,7 +95,7 @@ class System(SystemInterface):
     def _build(
         self, poisson, dim, energy, entropy, dissipation, momentum_maps, validate, space=None, baths=None
     ) -> None:
-        """Shared by the constructors of the subclasses, after they have set what is their own."""
+        """Check and set the common attributes; constructors of subclasses call it after they have set their own."""
         if not isinstance(baths, HeatBaths | None):
             raise InputError(f"baths are lt.HeatBaths(...), not {type(baths).__name__}")
         self.dim, self.space = dim, space
@@ -114,16 +117,16 @@ class System(SystemInterface):
             self.entropy = None if self.entropy is None else mark_polynomial_degrees(self.entropy, dim)
             self.momentum_maps = {name: mark_polynomial_degrees(J, dim) for name, J in self.momentum_maps.items()}
         dissipation = sum_dissipations(dissipation)
-        of_baths: tuple[Dissipation, ...] = ()
+        bath_terms: tuple[Dissipation, ...] = ()
         if dissipation is not None and self.entropy is None:
-            of_baths = tuple(part for part in dissipation.terms if part.needs_entropy)
-            dissipation = sum_dissipations([part for part in dissipation.terms if not part.needs_entropy] or None)
-        for part in of_baths:
+            bath_terms = tuple(term for term in dissipation.terms if term.needs_entropy)
+            dissipation = sum_dissipations([term for term in dissipation.terms if not term.needs_entropy] or None)
+        for term in bath_terms:
             if baths is None:
-                raise InputError(f"{type(part).__name__} drives the entropy up, so the system needs an entropy")
-            if not part.can_drive_baths:
+                raise InputError(f"{type(term).__name__} drives the entropy up, so the system needs an entropy")
+            if not term.can_drive_baths:
                 raise InputError(
-                    f"{type(part).__name__} drives the entropy of the body up, which it needs beside the entropies of "
+                    f"{type(term).__name__} drives the entropy of the body up, which it needs beside the entropies of "
                     "its baths: give entropy="
                 )
         self.dissipation = None
@@ -131,7 +134,7 @@ class System(SystemInterface):
             dissipation = flatten_site_functions(dissipation, self.shape)
             self.dissipation = self._bind_dissipation(dissipation)
         if baths is not None:
-            self._attach_baths(baths, of_baths)
+            self._attach_baths(baths, bath_terms)
         if self.preserved and not is_traced(self):
             self.preserved_labels = self._find_preserved_names()
         if validate and not is_traced(self):
@@ -141,10 +144,10 @@ class System(SystemInterface):
         dissipation = trace_energies(dissipation, self.dim, "a preserved function")
         return self._trace_dissipation(dissipation.bind_to(self))
 
-    def _attach_baths(self, baths: HeatBaths, of_baths: tuple[Dissipation, ...] = ()) -> None:
-        """Put baths beside the body that this system has been so far; ``of_baths`` act on the states with baths."""
+    def _attach_baths(self, baths: HeatBaths, bath_terms: tuple[Dissipation, ...] = ()) -> None:
+        """Append baths to this system, in place; the dissipations ``bath_terms`` act on the extended states."""
         body, n, m = copy(self), self.dim, baths.number
-        if self.dissipation is not None or not of_baths:
+        if self.dissipation is not None or not bath_terms:
             self.dissipation = couple_to_baths(
                 self.dissipation, body, m, baths.has_positive_temperatures, self._extend_from_body
             )
@@ -157,44 +160,44 @@ class System(SystemInterface):
         heat = BathEntropy(m)
         self.entropy = heat if body.entropy is None else self._extend_from_body(body.entropy) + heat
         self.momentum_maps = {name: self._extend_from_body(J) for name, J in body.momentum_maps.items()}
-        if of_baths:
-            parts = tuple(self._bind_dissipation(part) for part in of_baths)
-            self.dissipation = sum_dissipations([part for part in (self.dissipation, *parts) if part is not None])
+        if bath_terms:
+            bound_terms = tuple(self._bind_dissipation(term) for term in bath_terms)
+            self.dissipation = sum_dissipations([d for d in (self.dissipation, *bound_terms) if d is not None])
 
     def drop_baths(self) -> System:
         if self.baths is None:
             return self
         assert isinstance(self.poisson, ProductPoisson)
         body = copy(self)
-        parts = {
+        attributes = {
             "dim": self.body_dim,
             "space": None if self.space is None else _drop_last_factor(self.space),
             "poisson": self.poisson.first,
             "energy": self.energy.body if isinstance(self.energy, BodyBathsEnergy) else self.energy,
             "baths": None,
         }
-        for name, part in parts.items():
-            object.__setattr__(body, name, part)
+        for name, value in attributes.items():
+            object.__setattr__(body, name, value)
         return body
 
     def _extend_from_body(self, energy: Energy) -> Energy:
-        """A function of the state of the body, as one of that with baths."""
+        """Return a function of states with baths from a function of states of the body."""
         return energy.on(range(self.body_dim))
 
     @with_library_settings
     def temperatures(self, x) -> jax.Array:
-        """The temperatures of the baths: states of shape (..., n) give (..., number of baths)."""
+        """Return the temperatures of the baths, shape (..., number of baths), for states of shape (..., n)."""
         if self.baths is None:
             raise InputError("this system has no baths: give it baths=lt.HeatBaths(...)")
         entropies = jnp.asarray(x)[..., self.body_dim :]
         return jnp.vectorize(self.baths.energy.gradient, signature="(m)->(m)")(entropies)
 
     def energy_of_vectors(self, energy: Energy) -> Energy:
-        """An energy of states as they are shown, as one of their vectors."""
+        """Return a function of flat states from a function of states in the shape that users see."""
         return energy_of_vectors(flatten_site_functions(energy, self.shape), self.space)
 
     def _trace_dissipation(self, dissipation: Dissipation) -> Dissipation:
-        """The dissipation with its plain functions traced for the arguments that its force gives them."""
+        """Return the dissipation with its plain functions traced for the arguments that its force passes to them."""
 
         def force(dissipation, x):
             return dissipation.force(self, x, x, x, (x,) * len(dissipation.preserve))
@@ -204,16 +207,16 @@ class System(SystemInterface):
     # -- dynamics -------------------------------------------------------------------------------------------------
 
     def vector_field(self, x, t=None) -> jax.Array:
-        """``x'`` at a state or a batch of states, shape (..., n); at a time, where the energy depends on one."""
+        """Return ``x'`` at states x, shape (..., n), and at the time t if the energy depends on it."""
         return self.evaluate_batch(lambda system, y: system._vector_field(y), x, t, "(n)")
 
     def entropy_production(self, x, t=None) -> jax.Array:
-        """The rate of growth of the entropy, ``grad S @ x'``, shape (...); at a time, likewise."""
+        """Return the rate of growth of the entropy, ``grad S . x'``, shape (...), at states x and the time t."""
         entropy = self._require_entropy()
         return self.evaluate_batch(lambda system, y: jnp.dot(entropy.gradient(y), system._vector_field(y)), x, t, "()")
 
     def energy_fall(self, x, t=None) -> jax.Array:
-        """The rate at which the dissipation lowers the energy, ``-grad H . force``, shape (...); likewise."""
+        """Return the rate at which the dissipation lowers the energy, ``-grad H . force``, shape (...), at x and t."""
 
         def fall_rate(system: System, y):
             if system.dissipation is None:
@@ -226,22 +229,23 @@ class System(SystemInterface):
 
     @with_library_settings
     def friction_matrix(self, x, t=None, dissipation: Dissipation | None = None) -> jax.Array:
-        """The matrix K(x) of the symmetric bracket, shape (n, n), where the force is ``K(x) grad S``.
+        """Return the matrix K(x) of the symmetric bracket, shape (n, n), for which the force is ``K(x) grad S``.
 
-        The dissipation is that of the system, or another, such as one of its summands.
+        By default the dissipation is that of the system; it may be another, such as one of its summands.
         """
         x, system = self.state(x), self if t is None else self.at_time(t)
-        part = self.dissipation if dissipation is None else dissipation
-        if part is None:
+        dissipation = self.dissipation if dissipation is None else dissipation
+        if dissipation is None:
             return jnp.zeros((self.dim, self.dim))
-        dH, dL = system.energy.gradient(x), tuple(L.gradient(x) for L in part.preserve)
-        return jax.jacfwd(lambda dS: part.force(system, x, dH, dS, dL))(jnp.zeros(self.dim))
+        dH, dL = system.energy.gradient(x), tuple(L.gradient(x) for L in dissipation.preserve)
+        return jax.jacfwd(lambda dS: dissipation.force(system, x, dH, dS, dL))(jnp.zeros(self.dim))
 
     def transport(self, x, dH, dS, dL=()) -> jax.Array:
-        """The velocity that moves the state, ``x' = Pi(x) transport`` but for torques, for gradients of either kind.
+        """Return the covector that transports the state, ``x' = Pi(x) transport`` without torques.
 
-        It is dH and what the dissipations add to it [:meth:`liethermo.Dissipation.velocity`], of the body without its
-        baths. On a Lie algebra an attitude follows it, ``g' = g hat(transport)``.
+        It is dH plus the velocities of the dissipations [:meth:`liethermo.Dissipation.velocity`], for the body without
+        baths; the gradients are continuous or discrete. On a Lie algebra an attitude follows it:
+        ``g' = g hat(transport)``.
         """
         total = dH[: self.body_dim]
         for sigma in self._dissipation_velocities(x, dH, dS, dL):
@@ -250,39 +254,39 @@ class System(SystemInterface):
 
     @property
     def is_torque_free(self) -> bool:
-        """Whether the motion is all ``Pi(x) transport``: on a Lie algebra the momentum in space is then constant."""
-        found: list[bool] = []
+        """True if ``x' = Pi(x) transport``, so that on a Lie algebra the momentum in space is constant."""
+        answers: list[bool] = []
 
         def record_answer(x):
             velocities = self._dissipation_velocities(x, x, x, (x,) * len(self.preserved))
-            found.append(all(sigma is not None for sigma in velocities))
+            answers.append(all(sigma is not None for sigma in velocities))
 
         jax.eval_shape(record_answer, jax.ShapeDtypeStruct((self.dim,), jnp.float64))
-        return found[0]
+        return answers[0]
 
     def _dissipation_velocities(self, x, dH, dS, dL) -> list[jax.Array | None]:
-        """Those of the dissipations, None where one is a torque."""
-        parts = () if self.dissipation is None else terms_with_preserved(self.dissipation, dL)
-        return [part.velocity(self, x, dH, dS, own) for part, own in parts]
+        """Return the velocity of each dissipation; None for a dissipation that acts as a torque."""
+        terms = () if self.dissipation is None else terms_with_preserved(self.dissipation, dL)
+        return [term.velocity(self, x, dH, dS, term_dL) for term, term_dL in terms]
 
     # -- time -------------------------------------------------------------------------------------------------------
 
     @property
     def is_driven(self) -> bool:
-        """Whether the energy depends on time, or a torque acts, so that work is done from outside."""
+        """True if the energy depends on time, or a torque acts, so that work is done from outside."""
         return self.energy.depends_on_time
 
     def at_time(self, t) -> System:
-        """The system whose energy is for ever what it is at a time; itself where that does not depend on time."""
+        """Return the system with its energy frozen at the time t; itself if it does not depend on time."""
         return eqx.tree_at(lambda system: system.energy, self, self.energy.at_time(t)) if self.is_driven else self
 
     def systems_at_test_times(self) -> list[System]:
-        """This system at a few times, for what is found out of one that is driven."""
+        """Return the system frozen at each of :data:`TEST_TIMES`."""
         return [self.at_time(t) for t in TEST_TIMES]
 
     @with_library_settings
     def evaluate_batch(self, function: Callable, x, t, result_signature: str) -> jax.Array:
-        """``function(system, x)`` for each state of a batch, the system as it is at the time t, or at each of several.
+        """Return ``function(system, x)`` for each state of a batch, with the system frozen at the time t of that state.
 
         Parameters
         ----------
@@ -300,27 +304,27 @@ class System(SystemInterface):
         if t is None:
             what = "energy of this system depends on" if self.energy.depends_on_time else "torque is known at a"
             raise InputError(f"the {what} time: give the time beside the state")
-        at = jnp.vectorize(lambda y, t: function(self.at_time(t), y), signature=f"(n),()->{result_signature}")
-        return at(x, jnp.asarray(t, dtype=jnp.float64))
+        evaluate = jnp.vectorize(lambda y, t: function(self.at_time(t), y), signature=f"(n),()->{result_signature}")
+        return evaluate(x, jnp.asarray(t, dtype=jnp.float64))
 
     # -- other forms of the same system -------------------------------------------------------------------------------
 
     def local_system(self, x, is_centred: bool = False) -> tuple[System, jax.Array]:
-        """This system near a state in as many coordinates as it has dimensions, and those of the state.
+        """Return this system in local coordinates near a state, and the coordinates of that state.
 
-        With ``is_centred``, for use at that state alone.
+        With ``is_centred`` the local system is for use at that state alone.
         """
         return self, x
 
     def solved_part(self, x) -> tuple[System, jax.Array]:
-        """The part of the system, and of a state, that a step is solved for; slopes and errors are of its size.
+        """Return the sub-system and the part of a state that the equations of a step are solved for.
 
-        The rest of the state follows from it, and no tolerance of the one is measured by the other.
+        Slopes and errors have its dimension. The other components follow from it, and have tolerances of their own.
         """
         return self, x
 
     def reorder_components(self) -> ReorderedSystem | None:
-        """This system with its components in another order, in which programs for large states are faster, if any."""
+        """Return this system with its components in the order that is fastest for large states; None if it has none."""
         return None
 
     def clock_components(self, v) -> jax.Array:
@@ -328,97 +332,98 @@ class System(SystemInterface):
         return jnp.zeros_like(v)
 
     def to_user_solution(self, solution: Any) -> Any:
-        """A solution of this system, as its user is to see it."""
+        """Return a solution in the form that the user sees."""
         return self.reshape_to_sites(solution)
 
-    def reshape_to_sites(self, found: Any) -> Any:
-        """A solution, or an ensemble, with its states, shape (..., n), as they are shown on sites."""
+    def reshape_to_sites(self, result: Any) -> Any:
+        """Return a solution or an ensemble with its states, shape (..., n), reshaped to (..., *sites, d)."""
         if not self.sites:
-            return found
-        states = {name: value for name in found.state_fields if (value := getattr(found, name)) is not None}
-        shown = {name: value.reshape(*value.shape[:-1], *self.shape) for name, value in states.items()}
-        return dataclasses.replace(found, **shown)
+            return result
+        states = {name: value for name in result.state_fields if (value := getattr(result, name)) is not None}
+        reshaped = {name: value.reshape(*value.shape[:-1], *self.shape) for name, value in states.items()}
+        return dataclasses.replace(result, **reshaped)
 
     def freeze_at(self, x) -> System:
-        """The same system, for use at one state: what its Pi and K have in common there is computed once."""
+        """Return the system for use at one state, with the common parts of Pi and K computed once."""
         return self
 
     # -- functions and laws -------------------------------------------------------------------------------------------
 
     @property
     def preserved(self) -> tuple[Energy, ...]:
-        """The functions that the dissipation, or one of its summands, has to preserve besides the energy."""
+        """Functions that the dissipation, or one of its summands, has to preserve beside the energy."""
         return () if self.dissipation is None else self.dissipation.preserve
 
     def functions(self) -> dict[str, Energy]:
-        """Momentum maps, what the dissipation has to preserve, and Casimirs, by name; one name for one quantity."""
-        casimirs, own = self.casimirs(), dict[str, Energy]()
+        """Return momentum maps, functions that the dissipation preserves, and Casimirs, by name, each quantity once."""
+        casimirs, preserved = self.casimirs(), dict[str, Energy]()
         for name, L in zip(self.preserved_names, self.preserved, strict=True):
-            if name not in self.momentum_maps and name not in own:
-                own[name] = L
-        return self.momentum_maps | own | casimirs
+            if name not in self.momentum_maps and name not in preserved:
+                preserved[name] = L
+        return self.momentum_maps | preserved | casimirs
 
     @property
     def preserved_names(self) -> tuple[str, ...]:
-        """What each of :attr:`preserved` is called among :meth:`functions`."""
+        """Names of the functions :attr:`preserved` among :meth:`functions`."""
         return tuple(self.preserved_by_name()) if self.preserved_labels is None else self.preserved_labels
 
     def preserved_by_name(self) -> dict[str, Energy]:
-        """:attr:`preserved`, each with a key of its own."""
+        """Return the functions :attr:`preserved` by numbered names."""
         return {f"preserved {i + 1}": L for i, L in enumerate(self.preserved)}
 
     def _find_preserved_names(self) -> tuple[str, ...]:
-        """What is preserved, by the name of the momentum map or Casimir it is a multiple of, or by one of its own."""
+        """Return names of the preserved functions: of the map or Casimir that each is a multiple of, or new ones."""
         functions = self.functions_for_naming()
         gradients = evaluate_at_points(stack_gradients, functions, self.test_states(2))  # shape (points, functions, n)
         return self.names_from_multiples(first_multiple_indices(gradients, len(self.preserved)).tolist())
 
     def functions_for_naming(self) -> tuple[Energy, ...]:
-        """Momentum maps and Casimirs, then what is preserved, which has the name of one of them if it is a multiple."""
+        """Return momentum maps and Casimirs, followed by the preserved functions, which may be multiples of them."""
         return (*(self.momentum_maps | self.casimirs()).values(), *self.preserved)
 
     def test_states(self, count: int) -> np.ndarray:
-        """Random states at which functions are compared, shape (states, n), ``count`` of each of :data:`CONVEXITY_FORCE_SCALES`."""
+        """Return random states at which functions are compared, ``count`` of each of :data:`TEST_STATE_SCALES`."""
         return np.concatenate([self.samples(count, seed, scale) for seed, scale in enumerate(TEST_STATE_SCALES)])
 
     def names_from_multiples(self, multiples: Sequence[int]) -> tuple[str, ...]:
-        """The name of each of :attr:`preserved`: that of the function of which it is a multiple, or one of its own.
+        """Return the name of each preserved function: that of the function it is a multiple of, or its own.
 
         Parameters
         ----------
         multiples : sequence of int
-            For each, the place among :meth:`nameable` of a function before it of which it is a multiple; or -1.
+            For each preserved function, the index in :meth:`functions_for_naming` of an earlier function of which it is
+            a multiple; -1 if there is none.
         """
-        names, taken = list(self.momentum_maps | self.casimirs()), {"energy", "entropy"}
-        number = len(names)
+        names, reserved = list(self.momentum_maps | self.casimirs()), {"energy", "entropy"}
+        n_named = len(names)
         for multiple, (fallback, L) in zip(multiples, self.preserved_by_name().items(), strict=True):
             name = function_name(L)
-            usable = name.isidentifier() and name not in {*names, *taken}
+            usable = name.isidentifier() and name not in {*names, *reserved}
             names.append(names[multiple] if multiple >= 0 else name if usable else fallback)
-        return tuple(names[number:])
+        return tuple(names[n_named:])
 
     @with_library_settings
     def first_integrals(self) -> frozenset[str]:
-        """The names of those of :meth:`functions` that the system conserves.
+        """Return the names of the functions that the system conserves.
 
-        Momentum maps are claimed to be conserved. A Casimir is conserved if the dissipation keeps it. A function that
-        one dissipation has to preserve is conserved if the motion and the other summands keep it. If no construction
-        says so, random points decide; while the system is being traced the function is left out. If random points
-        cannot decide, a function that the dissipation has to preserve counts as conserved.
+        Momentum maps are claimed to be conserved. A Casimir is conserved if the dissipation conserves it. A function
+        that one dissipation has to preserve is conserved if the motion and the other summands conserve it. If no
+        construction implies conservation, the function is tested at random states; it is left out while JAX traces the
+        system. If the test cannot decide, a function that the dissipation has to preserve counts as conserved.
         """
         return self._find_invariants().conserved_names
 
     @with_library_settings
     def undecided_functions(self) -> frozenset[str]:
-        """The names of those of :meth:`functions` of which it is not found out whether the system conserves them.
+        """Return the names of the functions for which the test of conservation could not decide.
 
-        At none of the points that were tried all of the motion could be evaluated, as where an entropy is defined for
+        The vector field could be evaluated at none of the test states, for example because the entropy is defined for
         few states.
         """
         return self._find_invariants(include_declared=False).undecided_names
 
     def resolve_invariants_near(self, x) -> System:
-        """This system, with what random points leave open found out near states that are in its domain.
+        """Return this system with the undecided functions tested near states in its domain.
 
         Parameters
         ----------
@@ -426,93 +431,92 @@ class System(SystemInterface):
         """
         if self.invariant_verdicts is not None or is_traced(self) or not self.undecided_functions():
             return self
-        found = copy(self)
-        object.__setattr__(
-            found, "invariant_verdicts", self._find_invariants(near=np.asarray(self.state(x, batch=True)))
-        )
-        return found
+        resolved = copy(self)
+        verdicts = self._find_invariants(near=np.asarray(self.state(x, batch=True)))
+        object.__setattr__(resolved, "invariant_verdicts", verdicts)
+        return resolved
 
     def _find_invariants(self, near=None, include_declared: bool = True) -> InvariantVerdicts:
-        """What it conserves; with ``include_declared``, what its dissipation has to preserve unless it is seen not to."""
+        """Return which functions are conserved; ``include_declared`` adds preserved ones unless a test refutes them."""
         if self.invariant_verdicts is not None:
             return self.invariant_verdicts
         verdicts = _memoized_verdicts(self) if near is None else self._conservation_verdicts(near)
         return InvariantVerdicts.from_verdicts(verdicts, self.preserved_names if include_declared else ())
 
     def _conservation_verdicts(self, near=None) -> dict[str, bool | None]:
-        """Whether it conserves each of its functions: by construction, or at random points."""
-        claimed, untouched = self.invariants_by_construction(), self.torque_invariant_casimirs
-        others = {name: f for name, f in self.functions().items() if name not in claimed}
-        # points decide, but not of what a torque acts on: one that is zero at some times tells nothing of others
-        open_ = {name: f for name, f in others.items() if not self.torque_name or name in untouched}
-        with jax.ensure_compile_time_eval():  # this may be asked while something else is traced
-            kept = [False] * len(open_) if is_traced(self) else self.conserves(tuple(open_.values()), near)
-        return dict.fromkeys(others, False) | dict(zip(open_, kept, strict=True)) | dict.fromkeys(claimed, True)
+        """Return whether each function is conserved, by construction or by a test; None if undecided."""
+        claimed, torque_free = self.invariants_by_construction(), self.torque_invariant_casimirs
+        unclaimed = {name: f for name, f in self.functions().items() if name not in claimed}
+        # a test says nothing of functions that a torque changes: the torque may be zero at the tested times only
+        testable = {name: f for name, f in unclaimed.items() if not self.torque_name or name in torque_free}
+        with jax.ensure_compile_time_eval():  # JAX may be tracing something else
+            verdicts = [False] * len(testable) if is_traced(self) else self.conserves(tuple(testable.values()), near)
+        tested = dict(zip(testable, verdicts, strict=True))
+        return dict.fromkeys(unclaimed, False) | tested | dict.fromkeys(claimed, True)
 
     def invariants_by_construction(self) -> frozenset[str]:
-        """The names of the functions that it conserves by construction: nothing has to be tried out."""
+        """Return the names of the functions that are conserved by construction and need no test."""
         by_form = self.dissipation is None or self.dissipation.preserves_casimirs
         return frozenset({*self.momentum_maps, *(self.torque_invariant_casimirs if by_form else ())})
 
     def invariants(self) -> dict[str, tuple[Energy, bool | None]]:
-        """Functions worth recording along a run, by name, each with whether it is conserved; None where not known."""
-        found = self._find_invariants()
-        verdicts = {
-            name: None if name in found.undecided_names else name in found.conserved_names for name in self.functions()
+        """Return functions to record along a run, by name, each with whether it is conserved; None if not known."""
+        verdicts = self._find_invariants()
+        return {
+            name: (function, None if name in verdicts.undecided_names else name in verdicts.conserved_names)
+            for name, function in self.functions().items()
         }
-        return {name: (function, verdicts[name]) for name, function in self.functions().items()}
 
     def conserves(self, functions: tuple[Energy, ...], near: np.ndarray | None = None) -> list[bool | None]:
-        """Whether each function is constant along the vector field, at random points inside its domain.
+        """Return whether each function is constant along the vector field, at random states of several scales.
 
-        The motion and each dissipation have to keep it, each judged by its own size: a friction 1e12 times as slow as
-        the motion is a friction still. Or else what one makes of it, another takes back. Points are of several scales.
+        The motion and every dissipation must each conserve the function, relative to their own size, however slow a
+        dissipation is; otherwise their changes must cancel.
 
         Parameters
         ----------
         near : array, shape (n,) or (m, n), optional
-            States that are inside the domain: points near them are tried too.
+            States inside the domain: states near them are tested too.
 
         Returns
         -------
         list of bool or None
-            None where it could be evaluated at no point: then it is not known.
+            None if the rate of change could be evaluated at no state.
         """
         if not functions:
             return []
         if self.is_driven:
-            found = [system.conserves(functions, near) for system in self.systems_at_test_times()]
-            return [False if False in kept else None if None in kept else True for kept in zip(*found, strict=True)]
+            by_time = [system.conserves(functions, near) for system in self.systems_at_test_times()]
+            return [False if False in v else None if None in v else True for v in zip(*by_time, strict=True)]
         points = self.test_states(self.test_states_per_scale)
         if near is not None:
             points = np.concatenate([points, self.states_near(near)])
-        defined, conserved = judge_conservation(
-            evaluate_at_points(rates_of_change, (self, functions), points)
-        )  # shapes (points, functions)
-        pairs = zip(defined.T, conserved.T, strict=True)
-        return [bool(kept[inside].all()) if inside.any() else None for inside, kept in pairs]
+        rates = evaluate_at_points(rates_of_change, (self, functions), points)
+        is_defined, is_conserved = judge_conservation(rates)  # shapes (points, functions)
+        by_function = zip(is_defined.T, is_conserved.T, strict=True)
+        return [bool(conserved[defined].all()) if defined.any() else None for defined, conserved in by_function]
 
     @property
     def test_states_per_scale(self) -> int:
-        """At how many random states of each scale it is judged whether a function is conserved."""
+        """Number of random states of each scale at which conservation is tested."""
         return 4 if self.dim <= LARGE_STATE_DIM else 1
 
     def states_near(self, x) -> np.ndarray:
-        """Some of the states x, shape (m, n), and on R^n points around them, ever nearer: they lie in most domains."""
+        """Return a few of the states x, shape (m, n), and on R^n states around them at decreasing distances."""
         x = np.reshape(np.asarray(x), (-1, self.dim))[:N_NEARBY_STATES]
         if self.space is not None:
             return x
         random = np.random.default_rng(0).standard_normal((len(NEARBY_RADII), *x.shape))
         lengths = np.linalg.norm(x, axis=1, keepdims=True) / np.sqrt(self.dim)
-        return np.concatenate([x, *(x + nearer * lengths * w for nearer, w in zip(NEARBY_RADII, random, strict=True))])
+        return np.concatenate([x, *(x + radius * lengths * w for radius, w in zip(NEARBY_RADII, random, strict=True))])
 
     # -- checks ---------------------------------------------------------------------------------------------------
 
     def state(self, x, batch: bool = False) -> jax.Array:
-        """``x`` as a state of this system: real doubles, finite, shape (n,), or (..., n) with ``batch``.
+        """Return ``x`` as a state of this system: real doubles, finite, shape (n,), or (..., n) with ``batch``.
 
-        On sites it may have the shape ``(*sites, d)`` too. On a manifold it may have the shape of points, and has to be
-        one.
+        For a system on sites x may have the shape ``(*sites, d)``. On a manifold x may have the shape of points,
+        and must be a point of it.
 
         Raises
         ------
@@ -522,7 +526,7 @@ class System(SystemInterface):
         return numbers.astype(jnp.float64) if isinstance(numbers, jax.core.Tracer) else real_array(numbers)
 
     def state_array(self, x, batch: bool = False) -> np.ndarray | jax.Array:
-        """What :meth:`state` makes of x, as an array of NumPy where its values are known."""
+        """Return the state x as :meth:`state` does, as an array of NumPy unless JAX traces it."""
         if not isinstance(x, jax.Array):
             try:
                 x = np.asarray(x)
@@ -555,7 +559,7 @@ class System(SystemInterface):
         return numbers
 
     def _append_bath_entropies(self, x) -> np.ndarray | jax.Array:
-        """A state of the body alone, with every bath at entropy zero; another array as it is."""
+        """Append zero entropies of the baths to a state of the body; return any other array unchanged."""
         body = self.drop_baths()
         shape = body.shape if body.space is None else body.space.shape
         if shape == (1, 3) and x.shape == (3,):
@@ -590,7 +594,7 @@ class System(SystemInterface):
         return check_system(self, points, samples, seed, scale, times)
 
     def _validate(self) -> None:
-        """Raise where an axiom fails at random points: called by the constructors, so that no bad system exists."""
+        """Raise an error if an axiom fails at random states; the constructors call it."""
         for row in check_system(self, None, 4, 0, 1.0, matrices=not self.has_poisson_by_construction).rows:
             if row.passed is not False:
                 continue
@@ -634,7 +638,7 @@ def _memoized_verdicts(system: System) -> dict[str, bool | None]:
 
 
 def stack_gradients(functions: tuple[Energy, ...], x) -> jax.Array:
-    """The gradients of several functions at a state, shape (functions, n)."""
+    """Return the gradients of several functions at a state, shape (functions, n)."""
     return jnp.stack([f.gradient(x) for f in functions])
 
 
@@ -659,7 +663,7 @@ def first_multiple_indices(gradients: np.ndarray, count: int) -> np.ndarray:
 
 
 def name_momentum_maps(given) -> dict[str, Any]:
-    """Momentum maps by name."""
+    """Return momentum maps by name, from a mapping or a sequence of functions."""
     if isinstance(given, Mapping):
         return dict(given)
     if not isinstance(given, Sequence) or isinstance(given, str):

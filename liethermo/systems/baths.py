@@ -1,4 +1,4 @@
-"""Heat baths: what takes the heat of a dissipation, and the states that have their entropies behind those of a body."""
+"""``HeatBaths``, which take the heat of a dissipation; their entropies are appended to the state of a body."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class HeatBaths(Module):
     Attributes
     ----------
     energy : Energy
-        Their energy, of their entropies, shape (number,).
+        Total energy of the baths as a function of their entropies, shape (number,).
 
     Raises
     ------
@@ -68,33 +68,34 @@ class HeatBaths(Module):
             raise InputError(f"the number of baths is a positive integer, not {number!r}")
         self.number = number
         if energy is None:
-            given = {"capacity": capacity, "temperature": temperature}
+            parameters = {"capacity": capacity, "temperature": temperature}
             self.energy = make_bath_energy(
-                *(_check_positive(value, what, number, what == "capacity") for what, value in given.items())
+                *(_check_positive(value, what, number, what == "capacity") for what, value in parameters.items())
             )
         else:
             self.energy = Each(_BathEnergyFunction(energy), np.arange(number)[:, None])
 
     @property
     def has_positive_temperatures(self) -> bool:
-        """Whether every state has positive temperatures, by form."""
+        """True if the temperatures are positive in every state by construction."""
         return isinstance(self.energy, BathEnergy | ReservoirEnergy)
 
     @property
     def scale(self) -> np.ndarray | float:
-        """The entropies over which temperatures change, shape (number,): the capacities, where they are constant."""
+        """Entropies over which the temperatures change, shape (number,): the capacities if they are constant."""
         return 1.0 if is_traced(self.energy) else np.asarray(self.entropy_scales())
 
     def entropy_scales(self) -> jax.Array:
-        """:attr:`scale` as an array that JAX can trace, shape (number,)."""
-        if not isinstance(self.energy, BathEnergy):  # of what keeps its temperature any will do
+        """Return :attr:`scale` as an array that JAX can trace, shape (number,)."""
+        if not isinstance(self.energy, BathEnergy):  # any scale suits a bath of constant temperature
             return jnp.ones(self.number)
         return jnp.where(jnp.isfinite(self.energy.capacity), self.energy.capacity, 1.0)
 
 
 def _check_positive(value, what: str, number: int, infinite: bool) -> jax.Array:
-    known = contextlib.nullcontext() if is_traced(value) else jax.ensure_compile_time_eval()
-    with known:  # numbers, while a family of systems is traced
+    # numbers stay numbers while JAX traces a family of systems
+    evaluation = contextlib.nullcontext() if is_traced(value) else jax.ensure_compile_time_eval()
+    with evaluation:
         array = check_numbers(value, f"the {what} of baths")
         array = jnp.broadcast_to(array, (number,)) if array.ndim == 0 else array
     if array.shape != (number,):
@@ -113,12 +114,12 @@ class _BathEnergyFunction(Module):
 
 
 def poisson_with_baths(body: mf.PoissonStructure, number: int) -> ProductPoisson:
-    """The Poisson structure of a body, with entropies behind its state that nothing is conjugate to."""
+    """Return the Poisson structure of a body with baths, whose entropies have no conjugate variables."""
     return ProductPoisson(body, mf.NoPoisson(number))
 
 
 class BathEntropy(Energy):
-    """The sum of the last components."""
+    """The entropy of baths: the sum of the last components of a state."""
 
     number: int = eqx.field(static=True)
 

@@ -1,8 +1,9 @@
-"""A system on a manifold in the coordinates of a chart: a system on R^dim, for the methods of vector spaces.
+"""``ChartSystem``: a system on a manifold in the coordinates of a chart, for the methods of vector spaces.
 
-Functions pull back by ``c -> point(c)``, the Poisson tensor and the dissipation by the inverse of its derivative
-[:doc:`/explanation/exact_laws`]: Pi is still a Poisson tensor, K symmetric and semidefinite, with the same relations to
-the gradients of the functions. So a method keeps on the manifold every law that it keeps in R^dim.
+Functions are pulled back by ``c -> point(c)``, the Poisson tensor and the dissipation by the inverse of its derivative
+[:doc:`/explanation/exact_laws`]. Pi remains a Poisson tensor, K remains symmetric and semidefinite, and their kernels
+contain the gradients of the pulled-back functions. A method therefore obeys on the manifold every law that it obeys in
+R^dim.
 """
 
 from __future__ import annotations
@@ -19,17 +20,17 @@ from .base import System
 
 
 class ChartSystem(System):
-    """The system in coordinates c, shape (dim,).
+    """A system on a manifold in coordinates c of a chart, shape (dim,).
 
     Parameters
     ----------
     system : System
-        On a manifold.
+        A system on a manifold.
     coordinates : manifolds.Coordinates
     place : manifolds.Place, optional
-        Where Pi and K are taken, in place of the point that they are asked for at.
+        Fixed point at which Pi and K are evaluated, instead of the point with the coordinates c.
     start : array, optional
-        Of a system for one step, the state vector from which that leads.
+        State vector at the start of the step, for a system that serves one step.
     """
 
     manifold: System
@@ -50,7 +51,7 @@ class ChartSystem(System):
         self.preserved_labels, self.invariant_verdicts = system.preserved_labels, system.invariant_verdicts
 
     def pullback(self, energy: Energy) -> Energy:
-        """A function of states as one of coordinates."""
+        """Return a function of coordinates from a function of states."""
         space = self.manifold.space
         assert space is not None
         return energy.map_terms(lambda term: term.pullback_to_chart(self.coordinates, space, self.start))
@@ -58,20 +59,18 @@ class ChartSystem(System):
     is_smooth = forward_to("manifold")
 
     def freeze_at(self, x) -> System:
-        return (
-            self
-            if self.place is not None
-            else ChartSystem(self.manifold, self.coordinates, self.coordinates.at(x), self.start)
-        )
+        if self.place is not None:
+            return self
+        return ChartSystem(self.manifold, self.coordinates, self.coordinates.at(x), self.start)
 
     def field(self, x, dH, dS, dL=()):
-        place = _ChartPoint(self.manifold, self.coordinates, self.place, x)
-        dS, dL = None if dS is None else place.lift(dS), tuple(map(place.lift, dL))
-        return place.lower(self.manifold.field(place.state, place.lift(dH), dS, dL))
+        point = _ChartPoint(self.manifold, self.coordinates, self.place, x)
+        dS, dL = None if dS is None else point.lift(dS), tuple(map(point.lift, dL))
+        return point.lower(self.manifold.field(point.state, point.lift(dH), dS, dL))
 
 
 class _ChartPoint:
-    """A point given or by its coordinates, and the maps there between arrays of coordinates and of states."""
+    """A point of the manifold with the maps between covectors and velocities of coordinates and of states."""
 
     def __init__(self, system: System, coordinates: mf.Coordinates, place: mf.Place | None, c):
         assert system.space is not None
@@ -96,8 +95,8 @@ class _ChartPoisson(PoissonBySharp):
         return self.system.space.dim
 
     def sharp(self, x, alpha):
-        place = _ChartPoint(self.system, self.coordinates, self.place, x)
-        return place.lower(self.system.poisson.sharp(place.state, place.lift(alpha)))
+        point = _ChartPoint(self.system, self.coordinates, self.place, x)
+        return point.lower(self.system.poisson.sharp(point.state, point.lift(alpha)))
 
 
 class _ChartDissipation(LiftedDissipation):
@@ -106,9 +105,9 @@ class _ChartDissipation(LiftedDissipation):
     place: mf.Place | None
 
     def lifted_geometry(self, system, x) -> LiftedGeometry:
-        place = _ChartPoint(self.system, self.coordinates, self.place, x)
-        return LiftedGeometry(self.system, place.state, place.lift, place.lower)
+        point = _ChartPoint(self.system, self.coordinates, self.place, x)
+        return LiftedGeometry(self.system, point.state, point.lift, point.lower)
 
     def divergence(self, system, x):
-        """That with the volume of the manifold."""
+        """Return the divergence with respect to the volume of the manifold."""
         return self.inner.divergence(self.system, _ChartPoint(self.system, self.coordinates, self.place, x).state)

@@ -1,4 +1,4 @@
-"""The axioms of a metriplectic system, tested at points [BFM §2.3]."""
+"""Test the axioms of a metriplectic system at given states [BFM §2.3]."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ AXIOM_TOLERANCE = 1e-10
 
 
 MAX_MATRIX_DIM = 200
-"""Components up to which the matrices Pi and K are formed; of larger systems only what they do to dH and dS is looked \
-at."""
+"""Number of components up to which the matrices Pi and K are formed; for larger systems only their products with dH
+and dS are tested."""
 
 
 MAX_FULL_JACOBI_DIM = 40
-"""Components up to which Jacobi's identity is tested for all coordinates at once, in arrays of n^3 numbers; of larger
-systems for three functions."""
+"""Number of components up to which Jacobi's identity is tested for all coordinates at once, in arrays of n^3 numbers;
+for larger systems it is tested for three functions."""
 
 
 class CheckRow(TableRow):
-    """One axiom: its worst relative residual over the points. ``passed`` is None for a report without a verdict."""
+    """One axiom with its largest relative residual over the points; ``passed`` is None for a row without a verdict."""
 
     @property
     def axiom(self) -> str:
@@ -50,7 +50,7 @@ class CheckRow(TableRow):
 
 @dataclass(frozen=True)
 class CheckReport(Tabular):
-    """The axioms of a system and how far each is from holding. Printing it gives a table."""
+    """Residuals of the axioms of a system, which print as a table."""
 
     rows: tuple[CheckRow, ...]
     points: int
@@ -73,7 +73,10 @@ class CheckReport(Tabular):
 def check_system(
     system: Any, points, samples: int, seed: int, scale: float, times=None, matrices: bool = True
 ) -> CheckReport:
-    """See :meth:`liethermo.systems.base.System.check`; without ``matrices``, for what is not true of them by form."""
+    """Test the axioms at states: see :meth:`liethermo.systems.base.System.check`.
+
+    Without ``matrices`` the tests of Pi and K are left out, for systems that satisfy them by construction.
+    """
     system = system.drop_torque()
     if points is None:
         if samples < 1:
@@ -85,29 +88,29 @@ def check_system(
     if system.is_driven:
         times = scale * np.random.default_rng(seed).standard_normal(len(points)) if times is None else times
         points = np.column_stack([points, np.broadcast_to(np.asarray(times, dtype=np.float64), len(points))])
-    measured = evaluate_at_points(_axiom_residuals if matrices else _field_residuals, system, points)
-    friction = measured.pop("friction", None)
+    residuals = evaluate_at_points(_axiom_residuals if matrices else _field_residuals, system, points)
+    friction = residuals.pop("friction", None)
     if friction is not None:
-        measured["semidefinite"] = np.array([_indefiniteness(K) for K in friction])
-    inside = np.isfinite(measured["domain"])
-    if not inside.any():
+        residuals["semidefinite"] = np.array([_indefiniteness(K) for K in friction])
+    is_inside = np.isfinite(residuals["domain"])
+    if not is_inside.any():
         raise InputError(
             f"energy, entropy or dissipation is not finite at any of the {len(points)} test points: give points inside "
             "their domain to system.check(points=...), and validate=False to the constructor"
         )
     rows = [
-        _axiom_row(system, name, measured[name][inside], axiom, note)
+        _axiom_row(system, name, residuals[name][is_inside], axiom, note)
         for name, (axiom, note) in _AXIOMS.items()
-        if name in measured
+        if name in residuals
     ]
-    for name, values in measured.items():
+    for name, values in residuals.items():
         if name.startswith("momentum map"):
-            rows.append(_momentum_map_row(system, name, values[inside]))
+            rows.append(_momentum_map_row(system, name, values[is_inside]))
         elif name not in _AXIOMS and name != "domain":
-            rows.append(_axiom_row(system, name, values[inside], name, _SPECIFIC_AXIOM_NOTE))
-    if not inside.all():
-        rows.append(CheckRow("domain", float((~inside).sum()), 0.0, None, "points outside the domain, left out"))
-    return CheckReport(tuple(rows), int(inside.sum()))
+            rows.append(_axiom_row(system, name, values[is_inside], name, _SPECIFIC_AXIOM_NOTE))
+    if not is_inside.all():
+        rows.append(CheckRow("domain", float((~is_inside).sum()), 0.0, None, "points outside the domain, left out"))
+    return CheckReport(tuple(rows), int(is_inside.sum()))
 
 
 _AXIOMS = {
@@ -146,13 +149,13 @@ _SPECIFIC_AXIOM_NOTE = "what sets this kind of system apart does not hold"
 
 
 def _axiom_row(system: Any, name: str, values: np.ndarray, axiom: str, note: str) -> CheckRow:
-    worst = float(values.max())
     if name == "production":
-        least = float(values.min())
-        note = f"{note}: the entropy falls there" if least < 0.0 else note
-        return CheckRow(f"{axiom} {system.production_name}", least, 0.0, None, note)
-    passed = worst <= AXIOM_TOLERANCE
-    return CheckRow(axiom, worst, AXIOM_TOLERANCE, passed, "" if passed else note)
+        smallest = float(values.min())
+        note = f"{note}: the entropy falls there" if smallest < 0.0 else note
+        return CheckRow(f"{axiom} {system.production_name}", smallest, 0.0, None, note)
+    max_residual = float(values.max())
+    holds = max_residual <= AXIOM_TOLERANCE
+    return CheckRow(axiom, max_residual, AXIOM_TOLERANCE, holds, "" if holds else note)
 
 
 def _momentum_map_row(system: Any, name: str, values: np.ndarray) -> CheckRow:
@@ -167,7 +170,7 @@ def _momentum_map_row(system: Any, name: str, values: np.ndarray) -> CheckRow:
 
 
 def _indefiniteness(K: np.ndarray) -> float:
-    """Minus the lowest eigenvalue where that is negative, relative to the size of K."""
+    """Return the absolute value of the lowest eigenvalue if it is negative, relative to the largest entry of K."""
     scale = np.abs(K).max()
     if not 0.0 < scale < np.inf:
         return 0.0 if scale == 0.0 else np.nan
@@ -179,115 +182,115 @@ def _field_residuals(system: Any, x: jax.Array) -> dict[str, jax.Array]:
 
 
 def _axiom_residuals(system: Any, x: jax.Array, matrices: bool = True) -> dict[str, jax.Array]:
-    """Residual of each axiom at a point, relative to the size of the terms that cancel; and the friction matrix.
+    """Return the residual of each axiom at a point, relative to the terms that cancel, and the friction matrix.
 
-    Where the energy depends on time, the point has the time behind it.
+    If the energy depends on time, the last component of the point is the time.
     """
     if system.is_driven:
         return _axiom_residuals(system.at_time(x[-1]), x[:-1], matrices)
     size: Callable = lambda a: jnp.max(jnp.abs(a), initial=0.0)  # noqa: E731
     relative: Callable = lambda a, b: a / jnp.where(b > 0.0, b, 1.0)  # noqa: E731
-    found = _dissipation_residuals(system, x)
-    given = around = system
+    residuals = _dissipation_residuals(system, x)
+    original = chart_system = system
     if system.space is not None:
-        if matrices:  # else it is tangent by form
+        if matrices:  # otherwise it is tangent by construction
             velocity = system.vector_field(x)
-            found["tangent"] = relative(size(velocity - system.project_tangent(x, velocity)), size(velocity))
-        around, _ = system.local_system(x)
+            residuals["tangent"] = relative(size(velocity - system.project_tangent(x, velocity)), size(velocity))
+        chart_system, _ = system.local_system(x)
         if system.space.is_quotient:
-            found["classes"] = _stabilizer_residual(system, around, x)
+            residuals["classes"] = _stabilizer_residual(system, chart_system, x)
         system, x = system.local_system(x, is_centred=True)
     dH, rate = system.energy.gradient(x), system.vector_field(x)
     dS = jnp.zeros_like(x) if system.entropy is None else system.entropy.gradient(x)
     values = system.energy.value(x) + (0.0 if system.entropy is None else system.entropy.value(x))
-    found["domain"] = values + jnp.sum(dH) + jnp.sum(dS) + jnp.sum(rate)
+    residuals["domain"] = values + jnp.sum(dH) + jnp.sum(dS) + jnp.sum(rate)
     if system.dim > MAX_MATRIX_DIM or not matrices:
         speed = size(system.poisson.sharp(x, dH)) + size(rate)
         if system.entropy is not None:
-            found["casimir"] = relative(size(system.poisson.sharp(x, dS)), size(dS))
+            residuals["casimir"] = relative(size(system.poisson.sharp(x, dS)), size(dS))
     else:
-        of_matrices, speed = _matrix_residuals(system, None if around is given else around, x, dH, dS)
-        found, speed = found | of_matrices, speed + size(rate)
+        noncentred = None if chart_system is original else chart_system
+        matrix_residuals, speed = _matrix_residuals(system, noncentred, x, dH, dS)
+        residuals, speed = residuals | matrix_residuals, speed + size(rate)
     if system.energy_law is not None:
         flow = jnp.dot(dH, rate)
         flow = jnp.abs(flow) if system.energy_law == "conserved" else jnp.maximum(flow, 0.0)
-        found["first law"] = relative(flow, size(dH) * speed)
+        residuals["first law"] = relative(flow, size(dH) * speed)
     if system.entropy is not None:
         production = jnp.dot(dS, rate)
         if system.entropy_law is None:
-            found["production"] = production
+            residuals["production"] = production
         else:
-            wrong = jnp.abs(production) if system.entropy_law == "conserved" else jnp.maximum(-production, 0.0)
-            found["second law"] = relative(wrong, size(dS) * speed)
+            violation = jnp.abs(production) if system.entropy_law == "conserved" else jnp.maximum(-production, 0.0)
+            residuals["second law"] = relative(violation, size(dS) * speed)
     for name, J in system.momentum_maps.items():
         dJ = J.gradient(x)
         drift = relative(jnp.abs(jnp.dot(dJ, rate)), size(dJ) * speed)
-        found[f"momentum map {name}"] = jnp.where(jnp.isfinite(J.value(x)), drift, jnp.nan)
-    return found | system.specific_residuals(x)
+        residuals[f"momentum map {name}"] = jnp.where(jnp.isfinite(J.value(x)), drift, jnp.nan)
+    return residuals | system.specific_residuals(x)
 
 
-def _stabilizer_residual(system: Any, around: Any, x) -> jax.Array:
-    """What of the gradients is along the constraints but not the space: the largest, relative to its gradient."""
+def _stabilizer_residual(system: Any, chart_system: Any, x) -> jax.Array:
+    """Return the largest relative component of a gradient that satisfies the constraints and is not tangent."""
     size: Callable = lambda a: jnp.max(jnp.abs(a), initial=0.0)  # noqa: E731
     functions = [f for f in (system.energy, system.entropy, *system.momentum_maps.values()) if f is not None]
-    found = []
+    residuals = []
     for gradient in (f.gradient(x) for f in functions):
-        along, whole = around.raise_index(x, gradient), size(gradient)
-        found.append(size(along - system.project_tangent(x, along)) / jnp.where(whole > 0.0, whole, 1.0))
-    return jnp.max(jnp.stack(found))
+        vector, norm = chart_system.raise_index(x, gradient), size(gradient)
+        residuals.append(size(vector - system.project_tangent(x, vector)) / jnp.where(norm > 0.0, norm, 1.0))
+    return jnp.max(jnp.stack(residuals))
 
 
 def _dissipation_residuals(system: Any, x) -> dict[str, jax.Array]:
-    """Residuals of what the dissipations were given, the largest of each name."""
-    found: dict[str, jax.Array] = {}
-    for part in () if system.dissipation is None else system.dissipation.terms:
-        for name, residual in part.input_residuals(system, x).items():
-            found[name] = jnp.maximum(found.get(name, 0.0), residual)
-    return found
+    """Return residuals of conditions on the arguments of dissipations, by name, the largest of equal names."""
+    residuals: dict[str, jax.Array] = {}
+    for term in () if system.dissipation is None else system.dissipation.terms:
+        for name, residual in term.input_residuals(system, x).items():
+            residuals[name] = jnp.maximum(residuals.get(name, 0.0), residual)
+    return residuals
 
 
-def _matrix_residuals(system: Any, around: Any, x, dH, dS):
-    """Residuals of the axioms on the matrices Pi and K; and the size of the motion, for what cancels in it.
+def _matrix_residuals(system: Any, chart_system: Any, x, dH, dS):
+    """Return residuals of the axioms on the matrices Pi and K, and a scale of the motion, which itself may vanish.
 
-    The motion itself may vanish at every point. On a manifold ``around`` is the system in a chart that is not centred.
+    On a manifold ``chart_system`` is the system in a chart that is not centred at the point; otherwise it is None.
     """
     size: Callable = lambda a: jnp.max(jnp.abs(a), initial=0.0)  # noqa: E731
     relative: Callable = lambda a, b: a / jnp.where(b > 0.0, b, 1.0)  # noqa: E731
     tensor = system.poisson.tensor(x)
-    found = {
-        "skew": relative(size(tensor + tensor.T), size(tensor)),
-    }
-    if system.is_smooth and around is None and x.size > MAX_FULL_JACOBI_DIM:
-        found["jacobi"] = _sampled_jacobi_residual(system.poisson, x)
+    residuals = {"skew": relative(size(tensor + tensor.T), size(tensor))}
+    if system.is_smooth and chart_system is None and x.size > MAX_FULL_JACOBI_DIM:
+        residuals["jacobi"] = _sampled_jacobi_residual(system.poisson, x)
     elif system.is_smooth:
-        variation = size(jax.jacfwd((around or system).poisson.tensor)(x))
-        if around is not None:  # in normal coordinates it may be rounding alone: as seen over a unit of length, then
+        poisson = (chart_system or system).poisson
+        variation = size(jax.jacfwd(poisson.tensor)(x))
+        if chart_system is not None:  # in normal coordinates the derivative may be rounding alone
             variation = variation + size(tensor)
-        found["jacobi"] = relative((around or system).poisson.jacobi_residual(x), size(tensor) * variation)
+        residuals["jacobi"] = relative(poisson.jacobi_residual(x), size(tensor) * variation)
     if system.entropy is not None:
-        found["casimir"] = relative(size(tensor @ dS), size(tensor) * size(dS))
+        residuals["casimir"] = relative(size(tensor @ dS), size(tensor) * size(dS))
     dissipation = system.dissipation
     if dissipation is not None and dissipation.entropy_law == "nondecreasing" and dissipation.is_symmetric:
         K = system.friction_matrix(x)
-        found["symmetric"] = relative(size(K - K.T), size(K))
-        found["kernel"] = relative(size(K @ dH), size(K) * size(dH))
-        found["friction"] = K
-        for part in dissipation.terms:  # each keeps its own
-            own = system.friction_matrix(x, dissipation=part) if part.preserve else K
-            for L in part.preserve:
+        residuals["symmetric"] = relative(size(K - K.T), size(K))
+        residuals["kernel"] = relative(size(K @ dH), size(K) * size(dH))
+        residuals["friction"] = K
+        for term in dissipation.terms:  # each preserves functions of its own
+            K_term = system.friction_matrix(x, dissipation=term) if term.preserve else K
+            for L in term.preserve:
                 dL = L.gradient(x)
-                residual = relative(size(own @ dL), size(own) * size(dL))
-                found["preserved"] = jnp.maximum(found.get("preserved", 0.0), residual)
-    return found, size(tensor) * size(dH)
+                residual = relative(size(K_term @ dL), size(K_term) * size(dL))
+                residuals["preserved"] = jnp.maximum(residuals.get("preserved", 0.0), residual)
+    return residuals, size(tensor) * size(dH)
 
 
 def _sampled_jacobi_residual(poisson: Any, x) -> jax.Array:
-    """``{f, {g, h}}`` and its cyclic permutations for three random linear functions: their sum, beside the largest."""
-    of_three = np.random.default_rng(0).standard_normal((3, x.size))
+    """Return the sum of ``{f, {g, h}}`` and its cyclic permutations for random linear functions, relative to a term."""
+    covectors = np.random.default_rng(0).standard_normal((3, x.size))
 
     def term(f, g, h):
         return jax.jvp(lambda y: jnp.dot(g, poisson.sharp(y, h)), (x,), (poisson.sharp(x, f),))[1]
 
-    terms = jnp.stack([term(*np.roll(of_three, i, axis=0)) for i in range(3)])
-    largest = jnp.max(jnp.abs(terms))
-    return jnp.abs(jnp.sum(terms)) / jnp.where(largest > 0.0, largest, 1.0)
+    terms = jnp.stack([term(*np.roll(covectors, i, axis=0)) for i in range(3)])
+    max_term = jnp.max(jnp.abs(terms))
+    return jnp.abs(jnp.sum(terms)) / jnp.where(max_term > 0.0, max_term, 1.0)

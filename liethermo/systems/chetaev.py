@@ -24,11 +24,17 @@ from .herglotz import random_states
 from .ledger import ForcesAndHeat
 from .simple_closed import FlattenedFunction, SimpleClosedSystem, join_lagrangian_arguments
 
-N_NEWTON_ITERATIONS, CONSTRAINT_RTOL = 12, 1e-12
-"""For S' where the form depends on it; and the share of its terms that the constraint may miss then."""
+N_NEWTON_ITERATIONS = 12
+"""Number of iterations of Newton's method for S' if the form depends on it."""
 
-N_TEST_STATES, PRODUCTION_ROUNDING_RTOL = 16, 1e-12
-"""Random points at which the production is looked at, and the share of its terms that is rounding."""
+CONSTRAINT_RTOL = 1e-12
+"""Largest residual of the constraint after these iterations, relative to its terms."""
+
+N_TEST_STATES = 16
+"""Number of random states at which the sign of the entropy production is tested."""
+
+PRODUCTION_ROUNDING_RTOL = 1e-12
+"""Largest production that counts as rounding, relative to its terms."""
 
 
 class ChetaevSystem(SimpleClosedSystem):
@@ -74,20 +80,19 @@ class ChetaevSystem(SimpleClosedSystem):
         validate: bool = True,
         space: mf.Space | None = None,
     ):
-        structure, size, energy = self._build_contact_structure(
-            join_lagrangian_arguments(lagrangian, space), dim, space
-        )
+        lagrangian = join_lagrangian_arguments(lagrangian, space)
+        structure, dim, energy = self._build_contact_structure(lagrangian, dim, space)
         self.friction = self.external = self.heat_power = None
-        self.form = SemibasicForm.from_function(eta, (size // 2,) if space is None else space.shape)
+        self.form = SemibasicForm.from_function(eta, (dim // 2,) if space is None else space.shape)
         forces = OneFormForce(None, None, None, _find_entropy_law(self.form, structure.contact))
-        self._assemble(structure, size, energy, forces, momentum_maps, validate)
+        self._assemble(structure, dim, energy, forces, momentum_maps, validate)
 
     def friction_at(self, q, v, S, t, T) -> jax.Array:
         del t
         return T * self.tangential_part(q, self.form.force_covector(q, v, S))
 
     def friction_force(self, q, v, S, t) -> jax.Array:
-        """The force ``T eta_q / eta_S``, shape (n,)."""
+        """Return the force ``T eta_q / eta_S``, shape (n,)."""
         return self.friction_at(q, v, S, t, -jax.grad(self.lagrangian_value, argnums=2)(q, v, S))
 
     def specific_residuals(self, x) -> dict[str, jax.Array]:
@@ -95,7 +100,7 @@ class ChetaevSystem(SimpleClosedSystem):
 
 
 class OneFormForce(ForcesAndHeat):
-    """The force of a one-form, with the law of the entropy that it has."""
+    """The force of a one-form with its entropy law."""
 
     law: LawName | None = eqx.field(static=True)
 
@@ -111,41 +116,44 @@ class SemibasicForm(Module):
     is_implicit: bool = eqx.field(static=True)
 
     @classmethod
-    def from_function(cls, eta, at: tuple[int, ...]) -> SemibasicForm:
-        """From what a user gives, checked; q and v of shape ``at``."""
+    def from_function(cls, eta, shape: tuple[int, ...]) -> SemibasicForm:
+        """Return the checked form of a user's function, for q and v of a shape."""
         if not callable(eta):
             raise InputError(f"eta is a function of (q, v, S) to the components of a one-form, not {eta!r}")
-        implicit, n, what = required_argument_count(eta) == 4, math.prod(at), f"(q, v, S), q and v of shape {at}"
-        given = eta if implicit else LastArgumentIgnored(eta)
-        given = given if len(at) == 1 else FlattenedFunction(given, at)
-        function, found = check_function_shape(given, ((n,), (n,), (), ()), ((n + 1,), (n,)), "eta", what)
-        return cls(function if found == (n + 1,) else _UnitEntropyForm(function), implicit)
+        is_implicit, n = required_argument_count(eta) == 4, math.prod(shape)
+        function = eta if is_implicit else LastArgumentIgnored(eta)
+        function = function if len(shape) == 1 else FlattenedFunction(function, shape)
+        arguments = f"(q, v, S), q and v of shape {shape}"
+        function, result_shape = check_function_shape(
+            function, ((n,), (n,), (), ()), ((n + 1,), (n,)), "eta", arguments
+        )
+        return cls(function if result_shape == (n + 1,) else _UnitEntropyForm(function), is_implicit)
 
     def entropy_rate(self, q, v, S) -> jax.Array:
-        """S' with ``eta_q . v + eta_S S' = 0``; NaN where none is found."""
+        """Return S' with ``eta_q . v + eta_S S' = 0``; NaN if Newton's method finds none."""
 
         def residual(s):
-            found = self.function(q, v, S, s)
-            return jnp.dot(found[:-1], v) + found[-1] * s, jnp.abs(found[:-1]) @ jnp.abs(v) + jnp.abs(found[-1] * s)
+            eta = self.function(q, v, S, s)
+            return jnp.dot(eta[:-1], v) + eta[-1] * s, jnp.abs(eta[:-1]) @ jnp.abs(v) + jnp.abs(eta[-1] * s)
 
         def newton(_, s):
-            (defect, _), (slope, _) = jax.jvp(residual, (s,), (jnp.ones(()),))
-            return s - defect / slope
+            (value, _), (slope, _) = jax.jvp(residual, (s,), (jnp.ones(()),))
+            return s - value / slope
 
         s = jax.lax.fori_loop(0, N_NEWTON_ITERATIONS if self.is_implicit else 1, newton, jnp.zeros(()))
         if not self.is_implicit:  # linear in S'
             return s
-        defect, size = residual(s)
-        return jnp.where(jnp.abs(defect) <= CONSTRAINT_RTOL * size, s, jnp.nan)
+        value, scale = residual(s)
+        return jnp.where(jnp.abs(value) <= CONSTRAINT_RTOL * scale, s, jnp.nan)
 
     def force_covector(self, q, v, S) -> jax.Array:
-        """``eta_q / eta_S``, shape (n,), at the S' that goes with (q, v, S)."""
-        found = self.function(q, v, S, self.entropy_rate(q, v, S) if self.is_implicit else jnp.zeros(()))
-        return found[:-1] / found[-1]
+        """Return ``eta_q / eta_S``, shape (n,), at (q, v, S) and the S' that belongs to them."""
+        eta = self.function(q, v, S, self.entropy_rate(q, v, S) if self.is_implicit else jnp.zeros(()))
+        return eta[:-1] / eta[-1]
 
 
 class _UnitEntropyForm(Module):
-    """``eta_q`` with ``eta_S = 1`` behind it."""
+    """The components of a form with ``eta_S = 1``, from a function that returns ``eta_q``."""
 
     function: Callable
 
@@ -154,17 +162,17 @@ class _UnitEntropyForm(Module):
 
 
 def _find_entropy_law(form: SemibasicForm, contact: mf.SplitContact) -> LawName | None:
-    """What a form says of the entropy, from its production at random points."""
+    """Return the entropy law of a form, from the sign of its production at random states."""
     if is_traced(form):
         return None
-    rates, sizes = evaluate_at_points(_entropy_production, form, random_states(contact, N_TEST_STATES))
-    if (np.abs(rates) <= PRODUCTION_ROUNDING_RTOL * sizes).all():
+    rates, scales = evaluate_at_points(_entropy_production, form, random_states(contact, N_TEST_STATES))
+    if (np.abs(rates) <= PRODUCTION_ROUNDING_RTOL * scales).all():
         return "conserved"
-    return "nondecreasing" if (rates >= -PRODUCTION_ROUNDING_RTOL * sizes).all() else None
+    return "nondecreasing" if (rates >= -PRODUCTION_ROUNDING_RTOL * scales).all() else None
 
 
 def _entropy_production(form: SemibasicForm, x):
-    """S', and the size of the terms that it is the sum of."""
+    """Return S', and a scale of the terms that are added up in it."""
     n = len(x) // 2
     covector = form.force_covector(x[:n], x[n : 2 * n], x[2 * n])
     return -jnp.dot(covector, x[n : 2 * n]), jnp.abs(covector) @ jnp.abs(x[n : 2 * n])

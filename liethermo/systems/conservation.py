@@ -1,4 +1,4 @@
-"""Which functions are constant along a system, judged at points by their rates of change."""
+"""Test which functions a system conserves, by their rates of change at given states."""
 
 from __future__ import annotations
 
@@ -45,26 +45,27 @@ def rates_of_change(model: tuple[SystemInterface, tuple[Energy, ...]], x) -> Inv
     dS = jnp.zeros_like(x) if system.entropy is None else project_covector(system, x, system.entropy.gradient(x))
     random = np.random.default_rng(0).standard_normal((2, system.dim)) / np.sqrt(system.dim)
     motion = system.poisson.sharp(x, dH)
-    parts = [motion]
+    velocities = [motion]
     speeds = [jnp.linalg.norm(motion) + jnp.linalg.norm(system.poisson.sharp(x, jnp.abs(dH)))]
     dissipations = () if system.dissipation is None else system.dissipation.terms
-    for part in dissipations:
-        dL = tuple(project_covector(system, x, L.gradient(x)) for L in part.preserve)
+    for dissipation in dissipations:
+        dL = tuple(project_covector(system, x, L.gradient(x)) for L in dissipation.preserve)
         a, b = (project_covector(system, x, v * jnp.linalg.norm(d)) for v, d in zip(random, (dH, dS), strict=True))
-        parts.append(part.force(system, x, dH, dS, dL))
-        speeds.append(jnp.fmax(jnp.linalg.norm(parts[-1]), jnp.linalg.norm(part.force(system, x, a, b, dL))))
-    if (push := system.external_torque(x)) is not None:
-        parts.append(push)
-        speeds.append(jnp.linalg.norm(push))
-    rates = jnp.stack(parts) @ gradients.T
+        velocities.append(dissipation.force(system, x, dH, dS, dL))
+        other_force = dissipation.force(system, x, a, b, dL)
+        speeds.append(jnp.fmax(jnp.linalg.norm(velocities[-1]), jnp.linalg.norm(other_force)))
+    if (torque := system.external_torque(x)) is not None:
+        velocities.append(torque)
+        speeds.append(jnp.linalg.norm(torque))
+    rates = jnp.stack(velocities) @ gradients.T
     energy = system.energy.value(x)  # a derivative may be finite where the function is not defined
-    laws = energy if system.entropy is None else energy + system.entropy.value(x)
-    defined = jnp.isfinite(jnp.stack([energy, *[laws] * (len(parts) - 1)]))
-    rates = jnp.where(defined[:, None], rates, jnp.nan)
-    for i, part in enumerate(dissipations, start=1):
-        if part.preserve:  # by construction, wherever it is defined
-            kept = _is_spanned(gradients, [L.gradient(x) for L in part.preserve])
-            rates = rates.at[i].set(jnp.where(kept, 0.0, rates[i]))
+    value = energy if system.entropy is None else energy + system.entropy.value(x)
+    is_defined = jnp.isfinite(jnp.stack([energy, *[value] * (len(velocities) - 1)]))
+    rates = jnp.where(is_defined[:, None], rates, jnp.nan)
+    for i, dissipation in enumerate(dissipations, start=1):
+        if dissipation.preserve:  # by construction, wherever it is defined
+            is_preserved = _is_spanned(gradients, [L.gradient(x) for L in dissipation.preserve])
+            rates = rates.at[i].set(jnp.where(is_preserved, 0.0, rates[i]))
     scales = jnp.stack(speeds)[:, None] * jnp.linalg.norm(gradients, axis=1)
     return InvariantRates(rates, jnp.where(rates == 0.0, 1.0, scales))
 
@@ -76,21 +77,21 @@ def project_covector(system: SystemInterface, x, alpha) -> jax.Array:
 
 def _is_spanned(gradients, vectors) -> jax.Array:
     """Return which of the gradients, shape (m, n), are linear combinations of vectors, shape (m,)."""
-    off = gram_schmidt(vectors).project_off
-    rest = jnp.stack([off(gradient) for gradient in gradients])
-    return jnp.sum(rest**2, axis=1) <= (AXIOM_TOLERANCE**2) * jnp.sum(gradients**2, axis=1)
+    project_off = gram_schmidt(vectors).project_off
+    remainders = jnp.stack([project_off(gradient) for gradient in gradients])
+    return jnp.sum(remainders**2, axis=1) <= (AXIOM_TOLERANCE**2) * jnp.sum(gradients**2, axis=1)
 
 
 class PointwiseVerdicts(NamedTuple):
-    """What rates of change say of functions at points.
+    """Verdicts on the conservation of functions at several states.
 
     Attributes
     ----------
     is_defined : array of bool, shape (..., functions)
-        Where all rates are finite; elsewhere nothing is known.
+        Whether all rates are finite; otherwise nothing is known.
     is_conserved : array of bool, shape (..., functions)
-        Where the motion and each dissipation conserve the function, relative to their own sizes. Dissipations much
-        slower than the motion are judged too, since their effect adds up.
+        Whether the motion and every dissipation conserve the function, each relative to its own size, so that a
+        dissipation much slower than the motion counts too.
     """
 
     is_defined: np.ndarray
@@ -101,28 +102,28 @@ def judge_conservation(rates: InvariantRates) -> PointwiseVerdicts:
     """Return at which points each function is conserved."""
     values, scales = rates
     with np.errstate(invalid="ignore"):
-        each = (np.abs(values) <= AXIOM_TOLERANCE * scales).all(axis=-2)
-        together = np.abs(values.sum(axis=-2)) <= AXIOM_TOLERANCE * np.abs(values).max(axis=-2)
-    return PointwiseVerdicts(np.asarray(np.isfinite(values).all(axis=-2)), each | together)
+        each_vanishes = (np.abs(values) <= AXIOM_TOLERANCE * scales).all(axis=-2)
+        sum_vanishes = np.abs(values.sum(axis=-2)) <= AXIOM_TOLERANCE * np.abs(values).max(axis=-2)
+    return PointwiseVerdicts(np.asarray(np.isfinite(values).all(axis=-2)), each_vanishes | sum_vanishes)
 
 
-def is_proportional(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return whether one field of gradients is a constant multiple of the other, shape (...).
+def is_proportional(f: np.ndarray, g: np.ndarray) -> np.ndarray:
+    """Return whether the vector field f is a constant multiple of the vector field g, shape (...).
 
     Parameters
     ----------
-    one, other : array, shape (..., points, n)
-        Points at which one of them is not finite are left out.
+    f, g : array, shape (..., points, n)
+        Points at which f or g is not finite are left out.
     """
-    inside = np.isfinite(one).all(axis=-1) & np.isfinite(other).all(axis=-1)
-    one, other = (np.where(inside[..., None], field, 0.0) for field in (one, other))
-    lengths, other_lengths = np.linalg.norm(one, axis=-1), np.linalg.norm(other, axis=-1)
-    alike = ((lengths > 0.0) == (other_lengths > 0.0)).all(axis=-1) & (lengths > 0.0).any(axis=-1)
-    at = np.argmax(other_lengths, axis=-1)[..., None, None]
-    a, b = (np.take_along_axis(field, at, axis=-2)[..., 0, :] for field in (one, other))
+    is_finite = np.isfinite(f).all(axis=-1) & np.isfinite(g).all(axis=-1)
+    f, g = (np.where(is_finite[..., None], field, 0.0) for field in (f, g))
+    f_norms, g_norms = np.linalg.norm(f, axis=-1), np.linalg.norm(g, axis=-1)
+    same_zeros = ((f_norms > 0.0) == (g_norms > 0.0)).all(axis=-1) & (f_norms > 0.0).any(axis=-1)
+    largest = np.argmax(g_norms, axis=-1)[..., None, None]
+    a, b = (np.take_along_axis(field, largest, axis=-2)[..., 0, :] for field in (f, g))
     i = np.argmax(np.abs(b), axis=-1)[..., None]
     with np.errstate(divide="ignore", invalid="ignore"):
         factor = np.take_along_axis(a, i, axis=-1) / np.take_along_axis(b, i, axis=-1)
-        residual = np.linalg.norm(one - factor[..., None] * other, axis=-1)
-        near = (residual <= AXIOM_TOLERANCE * lengths).all(axis=-1)  # at each point by itself: their scales differ
-    return alike & near
+        residual = np.linalg.norm(f - factor[..., None] * g, axis=-1)
+        is_multiple = (residual <= AXIOM_TOLERANCE * f_norms).all(axis=-1)  # each point relative to its own norm
+    return same_zeros & is_multiple

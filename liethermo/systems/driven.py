@@ -1,4 +1,4 @@
-"""Driven systems: energies that depend on time, and torques; clock and work are two more components of the state."""
+"""``DrivenSystem``: an energy that depends on time, or a torque, with clock and work as components of the state."""
 
 from __future__ import annotations
 
@@ -23,36 +23,35 @@ from ..functions.time_span import TimeSpan
 from .base import System
 
 CLOCK_UNIT = 2.0**-100
-"""Time and work are kept in a unit this small: beside the user's components they count for nothing in the size of a
-state or of its velocity, which convergence and errors are measured against. A power of two, so that nothing is rounded.
-"""
+"""Unit in which time and work are stored. It is so small that they do not count in norms of a state or of its velocity,
+which convergence and errors are measured against. It is a power of two, so that scaling rounds nothing."""
 
 
 class DrivenSystem(System):
     """A system with ``H(x, t)``, made autonomous: ``x' = Pi dH + force``, ``t' = 1``, ``W' = dH/dt`` at fixed x.
 
-    It is the system of the energy ``H(x, t) - W`` and of the Poisson tensor ``Pi + [[0, -1], [1, 0]]`` on (t, W), with
-    the dissipation acting on x alone. So ``H - W`` is constant, which is the law ``dH = work``, and every method keeps
-    it as it keeps the energy of any system; K is rebuilt with the discrete gradient by x in its kernel, so the entropy
-    law holds as ever. What corrects the discrete gradient of H goes along x and t alone (:class:`StateTimeEnergy`), so ``t' =
-    1`` holds to rounding and W is what the power comes to.
+    It has the energy ``H(x, t) - W`` and the Poisson tensor ``Pi + [[0, -1], [1, 0]]`` on (t, W); the dissipation acts
+    on x alone. Every method conserves ``H - W``, which is the law ``dH = work``, as it conserves the energy of any
+    system. K is rebuilt with the discrete gradient by x in its kernel, so the entropy law holds. The correction of the
+    discrete gradient of H has components along x and t only (:class:`StateTimeEnergy`), so ``t' = 1`` holds to rounding
+    and W is the integral of the power.
 
-    A torque tau works too, ``x' = ... + tau``, ``W' = dH/dt + dH . tau``. It is a skew bracket of x and W with the
-    energy alone: so it keeps ``H - W`` whatever gradient it is handed, a discrete one among them.
+    A torque tau does work, ``x' = ... + tau``, ``W' = dH/dt + dH . tau``. It acts by a skew bracket of x and W with the
+    energy, so it conserves ``H - W`` for every gradient, continuous or discrete.
 
-    A state is that of the body followed by t and W, in units of ``unit``. Made by :func:`liethermo.integrate` from a
-    system whose energy depends on time, or that a torque acts on.
+    A state consists of the state of the body, t and W, in units of ``unit``. :func:`liethermo.integrate` builds it from
+    a system whose energy depends on time, or on which a torque acts.
 
     Attributes
     ----------
     body : System
     unit : float
     attitude : array, shape (m, m), or None
-        That at which a torque is taken that needs one: see :meth:`turned`.
+        Attitude at which a torque is evaluated that depends on it: see :meth:`bind_attitude`.
     torque : array, shape (n,), or None
-        The torque itself, where it is known: see :meth:`with_torque`.
+        Fixed torque: see :meth:`with_torque`.
     span : TimeSpan
-        The functions of time are evaluated at times in it only; a run sets it.
+        Span of a run: functions of time are evaluated at times in it only.
     """
 
     body: System
@@ -74,8 +73,8 @@ class DrivenSystem(System):
         self.momentum_maps = {name: self._extend_from_body(J) for name, J in body.momentum_maps.items()}
         self.dissipation = _BodyDissipation.lift_terms(body.dissipation, self._extend_from_body)
         if body.torque_name:
-            push = _TorqueForce("conserved" if body.entropy_law is not None or body.entropy is None else None)
-            self.dissipation = push if self.dissipation is None else self.dissipation + push
+            torque = _TorqueForce("conserved" if body.entropy_law is not None or body.entropy is None else None)
+            self.dissipation = torque if self.dissipation is None else self.dissipation + torque
         self.preserved_labels, self.invariant_verdicts = body.preserved_labels, body.invariant_verdicts
 
     @property
@@ -85,7 +84,7 @@ class DrivenSystem(System):
     # -- the state --------------------------------------------------------------------------------------------------
 
     def initial_state(self, x, t: float, batch: bool = False) -> jax.Array:
-        """The state at a time, or several with ``batch``, no work having been done."""
+        """Return the state at a time with zero work; several states with ``batch``."""
         x = self.body.state(x, batch)
         clock = jnp.broadcast_to(jnp.array([t * self.unit, 0.0]), (*x.shape[:-1], 2))
         return jnp.concatenate([x, clock], axis=-1)
@@ -97,11 +96,11 @@ class DrivenSystem(System):
         return self.body.points(x[..., :-2])
 
     def time(self, x) -> jax.Array:
-        """t, shape (...), within the span."""
+        """Return the time t of states, shape (...), clipped to the span of the run."""
         return self.span.clip(x[..., -2] / self.unit)
 
     def work(self, x) -> jax.Array:
-        """W, shape (...)."""
+        """Return the work W of states, shape (...)."""
         return x[..., -1] / self.unit
 
     def samples(self, count, seed=0, scale=1.0):
@@ -118,7 +117,7 @@ class DrivenSystem(System):
         return self._body_at_first_time(x).why_singular(x[..., :-2])
 
     def _body_at_first_time(self, x) -> System:
-        """The body at the time of the first of several states, which are numbers."""
+        """Return the body at the time of the first of several states, given by numbers."""
         t = float(np.reshape(x, (-1, self.dim))[0, -2]) / self.unit
         return self._body_at_time(min(max(t, float(self.span.start)), float(self.span.end)))
 
@@ -150,28 +149,28 @@ class DrivenSystem(System):
         return self._body_at_state(x).external_torque(x[:-2]) if self.torque is None else self.torque
 
     def torque_velocity(self, x, dH) -> jax.Array:
-        """What a torque does to the state, and the work that it does, for a gradient of either kind."""
-        push = self.external_torque(x)
-        return jnp.concatenate([push, jnp.stack([jnp.zeros(()), self.unit * jnp.dot(dH[:-2], push)])])
+        """Return the velocity that a torque gives to a state, power included, for a continuous or discrete gradient."""
+        torque = self.external_torque(x)
+        return jnp.concatenate([torque, jnp.stack([jnp.zeros(()), self.unit * jnp.dot(dH[:-2], torque)])])
 
     def bind_attitude(self, attitude) -> DrivenSystem:
-        """The same system, for use at an attitude, shape (m, m); itself where nothing depends on it."""
+        """Return the system with its torque evaluated at an attitude, shape (m, m)."""
         if not self.needs_attitude:
             return self
-        found = copy(self)
-        object.__setattr__(found, "attitude", attitude)
-        return found
+        bound = copy(self)
+        object.__setattr__(bound, "attitude", attitude)
+        return bound
 
     def with_torque(self, torque) -> DrivenSystem:
-        """The same system, for use where the torque is this one, of the size of a state of the body."""
-        found = copy(self)
-        object.__setattr__(found, "torque", torque)
-        return found
+        """Return the system with a fixed torque, shape (body.dim,)."""
+        bound = copy(self)
+        object.__setattr__(bound, "torque", torque)
+        return bound
 
     surface = forward_to("body")
 
     def raise_index(self, x, alpha):
-        """What is moved to correct something is moved in the body: never the clock, nor the work done."""
+        """Return the direction of a correction along alpha, without components along the clock and the work."""
         return jnp.concatenate([self.body.raise_index(x[:-2], alpha[:-2]), jnp.zeros(2)])
 
     def lower_index(self, x, v):
@@ -181,8 +180,8 @@ class DrivenSystem(System):
         return self._body_at_time(self.time(x))
 
     def _body_at_time(self, t) -> System:
-        where = () if self.attitude is None else (self.attitude,)
-        return self.body.at_time(t, *where)
+        attitude = () if self.attitude is None else (self.attitude,)
+        return self.body.at_time(t, *attitude)
 
     # -- functions ----------------------------------------------------------------------------------------------------
 
@@ -203,7 +202,7 @@ class DrivenSystem(System):
     orbit_levels = forward_to("body")
 
     def conserves(self, functions, near=None):
-        """Whether the body does, asked near its part of each state: beside the clock, nothing else would count."""
+        """Return whether the body conserves each function; clock and work are left out, so that they set no scale."""
         near = None if near is None else near[..., : self.body.dim]
         return self.body.conserves(tuple(_ClockFreeEnergy(f) for f in functions), near)
 
@@ -222,14 +221,14 @@ class DrivenSystem(System):
             entries["algebra"] = body.lie_algebra.name
         entries["dissipation"] = None if body.dissipation is None else type(body.dissipation).__name__
         energy = solution.energy + solution.casimirs["work"]
-        found = dataclasses.replace(solution, x=x, energy=energy, dense=dense).with_provenance(**entries)
-        return body.to_user_solution(found)
+        body_solution = dataclasses.replace(solution, x=x, energy=energy, dense=dense).with_provenance(**entries)
+        return body.to_user_solution(body_solution)
 
     reshape_to_sites = forward_to("body")
 
 
 class _ClockFreeEnergy(Energy):
-    """A function of a state with clock and work that depends on neither, as one of the body's state."""
+    """A function of the state of the body, from a function of states with clock and work that depends on neither."""
 
     energy: Energy
 
@@ -238,7 +237,7 @@ class _ClockFreeEnergy(Energy):
 
 
 class _ClockPoisson(PoissonBySharp):
-    """``[[0, -1], [1, 0]]`` on (t, W), in units of ``unit``."""
+    """The Poisson tensor ``[[0, -1], [1, 0]]`` on (t, W), in units of ``unit``."""
 
     unit: float = eqx.field(static=True)
 
@@ -248,7 +247,7 @@ class _ClockPoisson(PoissonBySharp):
         return _clock_velocity(alpha, self.unit)
 
     def stages_on_leaf(self, x, alpha, A) -> jax.Array:
-        """Any points: the tensor is constant."""
+        """Return x for every stage, since the tensor is constant."""
         return jnp.broadcast_to(x, alpha.shape)
 
     def leaf_covector_rate(self, covector, alpha) -> jax.Array:
@@ -256,12 +255,12 @@ class _ClockPoisson(PoissonBySharp):
 
 
 def _clock_velocity(dH, unit: float) -> jax.Array:
-    """The velocities of t and W, shape (2,), from a gradient of the energy."""
+    """Return the velocities of t and W, shape (2,), for a gradient of the energy."""
     return unit**2 * jnp.stack([-dH[-1], dH[-2]])
 
 
 def _restrict_to_body(x, dH, dS, dL) -> tuple:
-    """A state with clock and work and the gradients there, as those of the body."""
+    """Return the state of the body and the gradients with respect to it."""
     return x[:-2], dH[:-2], None if dS is None else dS[:-2], tuple(L[:-2] for L in dL)
 
 
@@ -275,14 +274,14 @@ class _TorqueForce(SkewFriction):
         return self.law
 
     is_noiseless = True
-    preserves_casimirs = True  # those of :attr:`System.torque_invariant_casimirs`; of others nobody claims it
+    preserves_casimirs = True  # of :attr:`System.torque_invariant_casimirs`; no other Casimir is claimed
 
     def force(self, system, x, dH, dS, dL):
         return system.torque_velocity(x, dH)
 
 
 class _BodyDissipation(LiftedDissipation):
-    """A dissipation of the body, as it is at the time of the state."""
+    """A dissipation of the body, evaluated at the time that the state contains."""
 
     def lifted_geometry(self, system, x) -> LiftedGeometry:
         return LiftedGeometry(
@@ -295,7 +294,7 @@ class _BodyDissipation(LiftedDissipation):
 
 
 class _ClockMap(ComponentMap):
-    """From a state with clock and work to x and t."""
+    """The map from a state with clock and work to (x, t)."""
 
     dim: int = eqx.field(static=True)
     unit: float = eqx.field(static=True)
@@ -305,7 +304,7 @@ class _ClockMap(ComponentMap):
 
 
 class _NegativeWork(Pullback):
-    """``-W``, the last component of a state."""
+    """The energy ``-W``, minus the last component of a state."""
 
     def __init__(self, unit: float):
         super().__init__(Linear(jnp.array([-1.0 / unit])), [-1])
@@ -316,7 +315,7 @@ class _NegativeWork(Pullback):
 
 
 class _TimedEnergy(Pullback):
-    """A function of (x, t), shape (n + 1,), as one of a state with clock and work."""
+    """A function of states with clock and work, from a function of (x, t), shape (n + 1,)."""
 
     coordinates: _ClockMap
 
@@ -328,7 +327,7 @@ class _TimedEnergy(Pullback):
 
 
 class _TimedChartEnergy(Energy):
-    """A function of coordinates on a product with clock and work that does not depend on the work, as one of (c, t)."""
+    """A function of (c, t), from a function of coordinates, clock and work that does not depend on the work."""
 
     energy: Energy
     unit: float = eqx.field(static=True)
@@ -338,5 +337,5 @@ class _TimedChartEnergy(Energy):
 
 
 def make_autonomous(system: System, unit: float = CLOCK_UNIT) -> System:
-    """The system as it is run: with clock and work where work is done from outside."""
+    """Return the system with clock and work if work is done from outside; otherwise the system itself."""
     return DrivenSystem(system, unit) if system.is_driven else system

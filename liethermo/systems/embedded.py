@@ -1,8 +1,8 @@
-"""A system on a manifold in the space of arrays around it: a system on R^n that stays on a surface.
+"""``EmbeddedSystem``: a system on a manifold, extended to the arrays around it.
 
-The field is the same formula, asked for near the manifold too, where the covectors that it is handed and the velocities
-that it gives are made tangent to the level sets of the constraints. So these are first integrals of it, and a method
-has no more to do than to end each step on the level that it began on [:doc:`/explanation/exact_laws`].
+The formula of the vector field is used near the manifold too. Covectors and velocities are projected to the level sets
+of the constraints, so the constraints are first integrals. A method only has to end each step on the level on which
+the step began [:doc:`/explanation/exact_laws`].
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ from ..tracing.programs import subprogram
 from .base import System
 
 TANGENCY_RTOL = 1e-12
-"""Largest component across the level sets, relative to the velocity, of a field that is along them by form."""
+"""Largest component normal to the level sets, relative to the velocity, of a field that counts as tangent to them."""
 
 MANIFOLD_OFFSET = 0.05
-"""How far off the manifold that is asked for, relative to the components of a point."""
+"""Distance from the manifold at which tangency is tested, relative to the components of a point."""
 
 
 class EmbeddedSystem(System):
-    """The system on states x, shape (n,), the arrays of the space in one row. Made by :func:`embedded`.
+    """A system on states x, shape (n,), the flattened arrays of the space; :func:`embed_in_arrays` builds it.
 
     Attributes
     ----------
     manifold : System
     is_tangent : bool
-        Whether the motion is along the level sets of the constraints as it is: then it is not projected.
+        Whether the motion is tangent to the level sets of the constraints without a projection.
     is_projection_trivial : bool
-        Whether projecting it would leave it as it is, so that the force is not projected either.
+        Whether the projection leaves the motion unchanged, so that the force is not projected either.
     """
 
     manifold: System
@@ -55,8 +55,8 @@ class EmbeddedSystem(System):
         self.dim, self.space, self.baths = manifold.dim, None, manifold.baths
         self.energy = mark_polynomial_degrees(manifold.energy, self.dim)
         self.entropy = None if manifold.entropy is None else mark_polynomial_degrees(manifold.entropy, self.dim)
-        as_they_are = is_tangent or isinstance(manifold.poisson, mf.NoPoisson)
-        self.poisson = manifold.poisson if as_they_are else _TangentPoisson(manifold)
+        needs_no_projection = is_tangent or isinstance(manifold.poisson, mf.NoPoisson)
+        self.poisson = manifold.poisson if needs_no_projection else _TangentPoisson(manifold)
         self.dissipation = _TangentDissipation.lift_terms(
             manifold.dissipation, self._mark_polynomial_degrees, manifold, is_projection_trivial
         )
@@ -76,7 +76,7 @@ class EmbeddedSystem(System):
 
     @property
     def projection_flags(self) -> tuple[bool, bool]:
-        """What is known of the motion, as the constructor is given it."""
+        """Arguments ``is_tangent`` and ``is_projection_trivial`` of the constructor."""
         return self.is_tangent, self.is_projection_trivial
 
     @property
@@ -87,12 +87,11 @@ class EmbeddedSystem(System):
         space, x = _require_space(self.manifold), np.atleast_2d(x)
         if not np.isfinite(x).all():
             return ""
-        inside = evaluate_at_points(_inside_indicator, self.surface, x) > 0.0
-        if inside.all():
+        is_inside = evaluate_at_points(_inside_indicator, self.surface, x) > 0.0
+        if is_inside.all():
             return self.manifold.outside(x)
-        return (
-            f"the step leaves {space.name}: {space._why_off_space(np.asarray(self.points(x[inside.argmin()])), np.inf)}"
-        )
+        point = np.asarray(self.points(x[is_inside.argmin()]))
+        return f"the step leaves {space.name}: {space._why_off_space(point, np.inf)}"
 
     # -- states -------------------------------------------------------------------------------------------------------
 
@@ -105,8 +104,8 @@ class EmbeddedSystem(System):
     _around = forward_to("manifold")
 
     def to_user_solution(self, solution):
-        given = self.manifold.dissipation
-        kind = None if given is None else type(given).__name__
+        dissipation = self.manifold.dissipation
+        kind = None if dissipation is None else type(dissipation).__name__
         return self.manifold.to_user_solution(
             solution.with_provenance(system=type(self.manifold).__name__, dissipation=kind)
         )
@@ -117,7 +116,7 @@ class EmbeddedSystem(System):
         return EmbeddedSystem(self.manifold.at_time(t), *self.projection_flags) if self.is_driven else self
 
     def raise_index(self, x, alpha):
-        """What of a gradient is along the level sets: the direction of corrections."""
+        """Return the part of a gradient tangent to the level sets, the direction of corrections."""
         return _tangential_part(self.manifold, x, alpha)
 
     @property
@@ -128,7 +127,7 @@ class EmbeddedSystem(System):
 
 
 class _TangentPoisson(PoissonBySharp):
-    """``P Pi P``, P the projector to the level sets."""
+    """The Poisson tensor ``P Pi P``, with the projector P to the level sets of the constraints."""
 
     manifold: System
 
@@ -140,51 +139,50 @@ class _TangentPoisson(PoissonBySharp):
 
 
 class _TangentDissipation(LiftedDissipation):
-    """A dissipation that is handed the metric of the space, ``P K P`` near it.
+    """The dissipation ``P K P`` near a manifold, with the metric of the space.
 
-    There P is symmetric, and what it gives is along the level sets; it need not be a projector, so that K between two
-    of them does no work.
+    P is symmetric and maps to tangent vectors of the level sets, so K between two of them does no work. P need not be a
+    projector off the manifold.
     """
 
     manifold: System
     is_projection_trivial: bool = eqx.field(static=True)
 
     def lifted_geometry(self, system, x) -> LiftedGeometry:
-        """It is handed what is along the level sets: near an equilibrium that has digits of its own."""
-        along = functools.partial(_tangential_part, self.manifold, x)
-        return LiftedGeometry(self.manifold, x, along, along)
+        """Return the manifold with projected gradients, whose digits near an equilibrium are exact."""
+        project = functools.partial(_tangential_part, self.manifold, x)
+        return LiftedGeometry(self.manifold, x, project, project)
 
     def force(self, system, x, dH, dS, dL):
         return _tangent_force(self, x, dH, dS, dL)
 
     def divergence(self, system, x):
-        """That with the volume of the manifold."""
+        """Return the divergence with respect to the volume of the manifold."""
         return self.inner.divergence(self.manifold, system.surface.project_state(x))
 
 
 @subprogram
 def _tangent_force(force: _TangentDissipation, x, dH, dS, dL) -> jax.Array:
-    at = force.lifted_geometry(force.manifold, x)
-    found = force.inner.force(at.system, at.x, *at.lift_gradients(dH, dS, dL))
-    return found if force.is_projection_trivial else at.lower(found)
+    geometry = force.lifted_geometry(force.manifold, x)
+    velocity = force.inner.force(geometry.system, geometry.x, *geometry.lift_gradients(dH, dS, dL))
+    return velocity if force.is_projection_trivial else geometry.lower(velocity)
 
 
 def embed_in_arrays(system: System) -> System:
-    """The system in the space around its manifold; itself on R^n, and where it can be run in charts alone."""
+    """Return the system embedded in the arrays of its space; itself on R^n, or if it can run in charts only."""
     if system.space is None or not system.space.can_be_embedded:
         return system
     if is_traced(system):
         return EmbeddedSystem(system)
     points = _sample_states(system)
     points = points * (1.0 + MANIFOLD_OFFSET * np.random.default_rng(0).uniform(-1.0, 1.0, points.shape))
-    conforming, untouched = (
-        np.nan_to_num(evaluate_at_points(_tangency_residuals, system, points), nan=np.inf) <= TANGENCY_RTOL
-    ).all(axis=0)
-    return EmbeddedSystem(system, bool(conforming), bool(conforming and untouched))
+    residuals = np.nan_to_num(evaluate_at_points(_tangency_residuals, system, points), nan=np.inf)
+    is_tangent, is_unchanged = (residuals <= TANGENCY_RTOL).all(axis=0)
+    return EmbeddedSystem(system, bool(is_tangent), bool(is_tangent and is_unchanged))
 
 
 def _sample_states(system: System) -> np.ndarray:
-    """A few states: of a space whose random points are made of normal numbers, without a compiler."""
+    """Return a few random states, without compiling a program if the space maps normal numbers to points."""
     space = _require_space(system)
     if space._n_normals is None:
         return system.samples(3)
@@ -198,27 +196,28 @@ def _state_from_normals(space: mf.Space, w):
 
 
 def _inside_indicator(surface: ConstraintSurface, x):
-    """1 where the point of the surface next to a state is in the space, else 0."""
+    """Return 1.0 if the point of the surface nearest to a state is in the space, otherwise 0.0."""
     return jnp.where(surface.is_in_space(surface.project_state(x)), 1.0, 0.0)
 
 
 def _tangency_residuals(system: System, x):
-    """What of a field is across the level sets, and what covectors across them do, relative to the field.
+    """Return how far a field is from tangent, and how much projecting it would change it, relative to the field.
 
-    Behind it what projecting the field would change: the projection need not be a projector off the manifold.
+    A field is tangent if it conserves the constraints and does not depend on normal components of covectors. The
+    second value is separate, because off the manifold the projection need not be a projector.
     """
     constraints, pull = jax.vjp(functools.partial(_constraint_values, _require_space(system)), x)
-    random, number = np.random.default_rng(1), 3 + len(system.preserved)
-    covectors = random.standard_normal((number, x.shape[0]))
-    off = [pull(jnp.asarray(w))[0] for w in random.standard_normal((number, *constraints.shape))]
+    random, n_covectors = np.random.default_rng(1), 3 + len(system.preserved)
+    covectors = random.standard_normal((n_covectors, x.shape[0]))
+    normals = [pull(jnp.asarray(w))[0] for w in random.standard_normal((n_covectors, *constraints.shape))]
     fields = []
-    for dH, dS, _, *dL in (covectors, [a + b for a, b in zip(covectors, off, strict=True)]):
+    for dH, dS, _, *dL in (covectors, [a + b for a, b in zip(covectors, normals, strict=True)]):
         fields.append(system.field(x, dH, None if system.entropy is None else dS, tuple(dL)))
-    size = jnp.max(jnp.abs(fields[0]))
-    change = jax.jvp(functools.partial(_constraint_values, _require_space(system)), (x,), (fields[0],))[1]
-    defect = jnp.maximum(jnp.max(jnp.abs(fields[1] - fields[0])), jnp.max(jnp.abs(change), initial=0.0))
-    changed = jnp.max(jnp.abs(_tangential_part(system, x, fields[0]) - fields[0]))
-    return jnp.stack([defect, changed]) / jnp.where(size > 0.0, size, 1.0)
+    norm = jnp.max(jnp.abs(fields[0]))
+    constraint_rates = jax.jvp(functools.partial(_constraint_values, _require_space(system)), (x,), (fields[0],))[1]
+    residual = jnp.maximum(jnp.max(jnp.abs(fields[1] - fields[0])), jnp.max(jnp.abs(constraint_rates), initial=0.0))
+    change = jnp.max(jnp.abs(_tangential_part(system, x, fields[0]) - fields[0]))
+    return jnp.stack([residual, change]) / jnp.where(norm > 0.0, norm, 1.0)
 
 
 def _constraint_values(space: mf.Space, x):
@@ -226,7 +225,7 @@ def _constraint_values(space: mf.Space, x):
 
 
 def _tangential_part(system: System, x, w):
-    """An array less what would change the constraints of the space."""
+    """Return an array without the component that would change the constraints of the space."""
     return _tangential_part_in_space(_require_space(system), x, w)
 
 

@@ -89,9 +89,9 @@ class EulerPoincareSystem(LiePoissonSystem):
         energy = make_energy(lagrangian, "the Lagrangian")
         self.lagrangian = check_energy(energy, algebra.dim, "the Lagrangian", allow_time=True)
         if force is not None:
-            forced = EulerPoincareForce(force)
-            given = sum_dissipations(dissipation)
-            dissipation = forced if given is None else given + forced
+            force_term = EulerPoincareForce(force)
+            dissipation = sum_dissipations(dissipation)
+            dissipation = force_term if dissipation is None else dissipation + force_term
         energy = _legendre_hamiltonian(self.lagrangian, algebra.dim)
         super().__init__(algebra, energy, entropy, dissipation, momentum_maps, validate, group, reconstruction)
 
@@ -153,7 +153,7 @@ def _require_regular(lagrangian: Energy, dim: int) -> None:
 
 
 def are_all_singular(matrices) -> bool:
-    """Whether matrices at some points, shape (points, n, n), are all singular; not where they are not all finite."""
+    """Return whether matrices, shape (points, n, n), are all finite and all singular."""
     if not np.isfinite(matrices).all():
         return False
     singular = np.linalg.svd(matrices, compute_uv=False)
@@ -162,7 +162,7 @@ def are_all_singular(matrices) -> bool:
 
 @eqx.filter_custom_jvp
 def inverse_gradient(lagrangian: Energy, mu: jax.Array) -> jax.Array:
-    """xi with ``grad lagrangian (xi) = mu``, shape (n,), by damped Newton; NaN where it finds none."""
+    """Return xi with ``grad lagrangian (xi) = mu``, shape (n,), by damped Newton; NaN if it finds none."""
 
     def residual(xi):
         return lagrangian.gradient(xi) - mu
@@ -200,6 +200,6 @@ def _inverse_gradient_jvp(primals, tangents):
     # d(grad l)(xi) + l''(xi) dxi = dmu
     change = jnp.zeros_like(mu) if mu_dot is None else mu_dot
     if any(tangent is not None for tangent in jax.tree_util.tree_leaves(lagrangian_dot)):
-        _, moved = eqx.filter_jvp(lambda lagrangian: lagrangian.gradient(xi), (lagrangian,), (lagrangian_dot,))
-        change = change - moved
+        _, gradient_dot = eqx.filter_jvp(lambda lagrangian: lagrangian.gradient(xi), (lagrangian,), (lagrangian_dot,))
+        change = change - gradient_dot
     return xi, solve(jax.hessian(lagrangian.value)(xi), change[:, None])[:, 0]

@@ -108,39 +108,38 @@ class EulerPoincareClosedSystem(LedgerSystem):
             hessians = evaluate_at_points(_hessian, structure, np.random.default_rng(0).standard_normal((4, n + 1)))
             if are_all_singular(hessians):
                 raise InputError("the Lagrangian is singular: its Hessian in xi has no inverse")
-        given = (self.friction, self.external, self.heat_power)
-        forces = None if given == (None, None, None) else ForcesAndHeat(*given)
-        whole, total, energy = self._append_ledger(
-            structure, n + 1, mark_polynomial_degrees(ReducedEnergy(lagrangian), n + 1)
-        )
-        self._build(whole, total, energy, entropy_component(total, n), forces, momentum_maps, validate)
+        terms = (self.friction, self.external, self.heat_power)
+        forces = None if terms == (None, None, None) else ForcesAndHeat(*terms)
+        energy = mark_polynomial_degrees(ReducedEnergy(lagrangian), n + 1)
+        poisson, total_dim, energy = self._append_ledger(structure, n + 1, energy)
+        self._build(poisson, total_dim, energy, entropy_component(total_dim, n), forces, momentum_maps, validate)
 
     def split_state(self, x) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """xi, S and t of one state; t = 0 where it has none."""
+        """Return xi, S and t of one state; t = 0 if the state has no ledger."""
         n = self.algebra.dim
         return x[:n], x[n], self.state_time(x)
 
     @property
     def structure(self) -> VelocityLiePoisson:
-        """The Poisson structure of (xi, S)."""
+        """Poisson structure of (xi, S)."""
         return cast(
             VelocityLiePoisson, self.poisson.first if isinstance(self.poisson, ProductPoisson) else self.poisson
         )
 
     def momentum(self, xi, S) -> jax.Array:
-        """``l_xi`` at one point, shape (dim,)."""
+        """Return the momentum ``l_xi`` at one point, shape (dim,)."""
         return jax.grad(self.lagrangian)(xi, S)
 
     def friction_force(self, xi, S, t=0.0) -> jax.Array:
-        """f at one point, shape (dim,)."""
+        """Return the friction f at one point, shape (dim,)."""
         return jnp.zeros_like(xi) if self.friction is None else jnp.asarray(self.friction(xi, S, t))
 
     def external_force(self, xi, S, t=0.0) -> jax.Array:
-        """F at one point, shape (dim,)."""
+        """Return the external force F at one point, shape (dim,)."""
         return jnp.zeros_like(xi) if self.external is None else jnp.asarray(self.external(xi, S, t))
 
     def heating(self, xi, S, t=0.0) -> jax.Array:
-        """P_H."""
+        """Return the heat power P_H at one point."""
         return jnp.zeros(()) if self.heat_power is None else jnp.asarray(self.heat_power(xi, S, t))
 
     first_velocity_index: ClassVar[int] = 0
@@ -154,12 +153,14 @@ class EulerPoincareClosedSystem(LedgerSystem):
         return self.friction_force(v, S, t), self.external_force(v, S, t), self.heating(v, S, t)
 
     def temperature(self, x) -> jax.Array:
-        """``T = -l_S`` at a state or a batch of states, shape (...)."""
-        by_S = jax.grad(self.lagrangian, argnums=1)
-        return jnp.vectorize(lambda y: -by_S(*self.split_state(y)[:2]), signature="(n)->()")(self.state(x, batch=True))
+        """Return the temperature ``T = -l_S`` at states, shape (...)."""
+        S_derivative = jax.grad(self.lagrangian, argnums=1)
+        return jnp.vectorize(lambda y: -S_derivative(*self.split_state(y)[:2]), signature="(n)->()")(
+            self.state(x, batch=True)
+        )
 
     def momenta(self, x) -> jax.Array:
-        """``l_xi``, shape (..., dim), at a state or a batch of states."""
+        """Return the momenta ``l_xi``, shape (..., dim), at states, shape (..., n)."""
         return jnp.vectorize(lambda y: self.momentum(*self.split_state(y)[:2]), signature="(n)->(m)")(
             self.state(x, batch=True)
         )
@@ -177,12 +178,12 @@ class EulerPoincareClosedSystem(LedgerSystem):
     def specific_residuals(self, x) -> dict[str, jax.Array]:
         xi, S, t = self.split_state(x)
         force = self.friction_force(xi, S, t)
-        size = jnp.linalg.norm(force) * jnp.linalg.norm(xi)
-        return {"f . xi <= 0": jnp.maximum(jnp.dot(force, xi), 0.0) / jnp.where(size > 0.0, size, 1.0)}
+        scale = jnp.linalg.norm(force) * jnp.linalg.norm(xi)
+        return {"f . xi <= 0": jnp.maximum(jnp.dot(force, xi), 0.0) / jnp.where(scale > 0.0, scale, 1.0)}
 
 
 class MomentumFunction(Module):
-    """A function of the momentum ``l_xi``, as one of the state."""
+    """A function of the state, from a function of the momentum ``l_xi``."""
 
     energy: Energy
     lagrangian: Callable
@@ -192,7 +193,7 @@ class MomentumFunction(Module):
 
 
 class ReducedEnergy(Energy):
-    """``xi . l_xi - l``."""
+    """The energy ``xi . l_xi - l``."""
 
     lagrangian: Callable
 
@@ -212,10 +213,10 @@ class VelocityLiePoisson(PoissonBySharp):
         return self.algebra.dim + 1
 
     def momentum_derivatives(self, x) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """``mu = l_xi`` and its derivatives by xi and S."""
+        """Return ``mu = l_xi`` and its derivatives with respect to xi and S."""
         momentum = jax.grad(self.lagrangian)
-        by_xi, by_S = jax.jacfwd(momentum, argnums=(0, 1))(x[:-1], x[-1])
-        return momentum(x[:-1], x[-1]), by_xi, by_S
+        xi_derivative, S_derivative = jax.jacfwd(momentum, argnums=(0, 1))(x[:-1], x[-1])
+        return momentum(x[:-1], x[-1]), xi_derivative, S_derivative
 
     def sharp(self, x, alpha) -> jax.Array:
         mu, W, _ = self.momentum_derivatives(x)

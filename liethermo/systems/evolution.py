@@ -41,7 +41,7 @@ class LiouvilleFriction(SkewFriction):
 
 
 class ReebDrift(LiouvilleFriction):
-    """What makes an evolution field the contact field ``X_H = E_H - H R``: along it ``H' = -R(H) H`` [SML §2.2]."""
+    """Drift that turns an evolution field into the contact field ``X_H = E_H - H R``, ``H' = -R(H) H`` [SML §2.2]."""
 
     energy_law = None
 
@@ -50,7 +50,7 @@ class ReebDrift(LiouvilleFriction):
 
 
 class ContactManifoldSystem(System):
-    """What evolution and contact systems share, on T*Q x R and on TQ x R."""
+    """Base class of evolution and contact systems on T*Q x R and on TQ x R."""
 
     poisson: mf.Cosymplectic
 
@@ -65,7 +65,7 @@ class ContactManifoldSystem(System):
         return configuration_space(self.contact)
 
     def local_system(self, x, is_centred: bool = False) -> tuple[System, jax.Array]:
-        """In the space around: its fields are tangent to the level sets of the constraints by form."""
+        """Return the embedded system, whose field is tangent to the level sets of the constraints, and x."""
         return (self if self.space is None else EmbeddedSystem(self, is_tangent=True)), x
 
     @property
@@ -73,7 +73,7 @@ class ContactManifoldSystem(System):
         return self.space is not None
 
     def _vector_field(self, x) -> jax.Array:
-        """From the gradients as they are, since what they are across the manifold counts for nothing."""
+        """Return the field without projecting the gradients, whose normal components have no effect."""
         return self.field(x, self.energy.gradient(x), None if self.entropy is None else self.entropy.gradient(x))
 
 
@@ -182,7 +182,7 @@ def canonical_structure(dim: int, space: mf.Space | None = None) -> mf.Cosymplec
 
 
 def tangent_bundle_of(space: mf.Space | None) -> mf.TangentBundle | None:
-    """The tangent bundle of a space of positions, which stands for the cotangent bundle too; None for R^n."""
+    """Return the tangent bundle of a space of positions, identified with the cotangent bundle; None for R^n."""
     if space is None:
         return None
     bundle = mf.TangentBundle(space)
@@ -191,54 +191,54 @@ def tangent_bundle_of(space: mf.Space | None) -> mf.TangentBundle | None:
     return bundle
 
 
-def state_space(space: mf.Space | None, more: int = 0) -> mf.Space | None:
-    """The space of states (q, p, S), with so many components behind them; None for R^n."""
+def state_space(space: mf.Space | None, n_extra: int = 0) -> mf.Space | None:
+    """Return the space of states (q, p, S) followed by ``n_extra`` components; None for R^n."""
     bundle = tangent_bundle_of(space)
-    return None if bundle is None else mf.Product(bundle, mf.Euclidean(1 + more))
+    return None if bundle is None else mf.Product(bundle, mf.Euclidean(1 + n_extra))
 
 
 def configuration_space(contact: mf.SplitContact) -> mf.Space | None:
-    """Q, of a contact structure on T*Q x R or TQ x R; None for R^n."""
+    """Return the space Q of a contact structure on T*Q x R or TQ x R; None for R^n."""
     return contact.bundle.base if isinstance(contact.bundle, mf.TangentBundle) else None
 
 
 def check_space(space) -> mf.Space:
-    """A space of positions; InputError where it is none."""
+    """Return the space of positions, or raise an InputError if it is no space."""
     if not isinstance(space, mf.Space):
         raise InputError(f"space is a manifolds.Space, such as mf.Sphere(2), not {type(space).__name__}")
     return space
 
 
 def state_dim(dim: int | None, space: mf.Space | None) -> int:
-    """The number of components of (q, p, S)."""
+    """Return the number of components of (q, p, S)."""
     if space is None:
         return 2 * n_degrees_of_freedom(dim) + 1
-    if dim not in (None, found := 2 * check_space(space).size + 1):
-        raise InputError(f"on {space.name} a state (q, p, S) has {found} components, not {dim}: leave dim out")
-    return found
+    if dim not in (None, n := 2 * check_space(space).size + 1):
+        raise InputError(f"on {space.name} a state (q, p, S) has {n} components, not {dim}: leave dim out")
+    return n
 
 
 class JoinedArguments(Module):
-    """A function of (q, p, S), or (q, v, S) and more, as one of one array and more; q has a shape."""
+    """A function of one array (and more arguments), from a function of (q, p, S) or (q, v, S), q of a given shape."""
 
     function: Callable
     shape: tuple[int, ...] | None = eqx.field(static=True)
 
-    def __call__(self, x, *more):
+    def __call__(self, x, *arguments):
         n = len(x) // 2
-        q, v = (part if self.shape is None else part.reshape(self.shape) for part in (x[:n], x[n : 2 * n]))
-        return self.function(q, v, x[2 * n], *more)
+        q, v = (a if self.shape is None else a.reshape(self.shape) for a in (x[:n], x[n : 2 * n]))
+        return self.function(q, v, x[2 * n], *arguments)
 
 
 def join_arguments(function, space: mf.Space | None = None):
-    """A function of (q, p, S) as one of one array, and other things as they are."""
+    """Return a function of one array from a function of (q, p, S); anything else is returned unchanged."""
     if not callable(function) or isinstance(function, Energy) or required_argument_count(function) != 3:
         return function
     return JoinedArguments(function, None if space is None else check_space(space).shape)
 
 
 def n_degrees_of_freedom(dim: int | None) -> int:
-    """n of a state with 2n + 1 components (q, p, S)."""
+    """Return n for a state with dim = 2n + 1 components (q, p, S)."""
     if isinstance(dim, bool) or not isinstance(dim, int) or dim < 3 or dim % 2 == 0:
         raise InputError(
             f"dim counts the components of a state (q, p, S): 2n + 1 for n degrees of freedom, 3 at least, not {dim!r}"
@@ -246,19 +246,19 @@ def n_degrees_of_freedom(dim: int | None) -> int:
     return dim // 2
 
 
-def entropy_component(dim: int, at=-1) -> Energy:
-    """The last component of a state, or the sum of those ``at`` some places."""
-    return Quadratic(jnp.zeros(dim), jnp.zeros(dim).at[at].set(1.0))
+def entropy_component(dim: int, indices=-1) -> Energy:
+    """Return the entropy that is the last component of a state, or the sum of components with given indices."""
+    return Quadratic(jnp.zeros(dim), jnp.zeros(dim).at[indices].set(1.0))
 
 
 def tangency_residual(system: ContactManifoldSystem, x) -> dict[str, jax.Array]:
-    """The first law: the field lies in the kernel of the contact form [SML Remark 4.2]."""
+    """Return the residual of the first law: the field lies in the kernel of the contact form [SML Remark 4.2]."""
     form, rate = system.contact.form(x), system.vector_field(x)
     return {"eta(x') = 0": _relative_residual(jnp.dot(form, rate), jnp.abs(form) @ jnp.abs(rate))}
 
 
 def energy_decay_residual(system: ContactManifoldSystem, x) -> dict[str, jax.Array]:
-    """``H' = -R(H) H`` along a contact field [SML Prop. 2.1]."""
+    """Return the residual of ``H' = -R(H) H`` along a contact field [SML Prop. 2.1]."""
     dH, rate = system.energy.gradient(x), system.vector_field(x)
     loss = jnp.dot(dH, system.contact.reeb(x)) * system.energy.value(x)
     return {

@@ -41,7 +41,7 @@ from .evolution import (
 
 
 class VelocityContactSystem(ContactManifoldSystem):
-    """What the two systems of a Lagrangian share; the state is (q, v, S)."""
+    """Base class of contact systems of a Lagrangian, with states (q, v, S)."""
 
     lagrangian: Energy
 
@@ -53,7 +53,7 @@ class VelocityContactSystem(ContactManifoldSystem):
     def _build_contact_structure(
         self, lagrangian, dim: int | None, space: mf.Space | None = None
     ) -> tuple[mf.Cosymplectic, int, Energy]:
-        """The Poisson structure, the dimension and the energy E_L of a Lagrangian that is checked here."""
+        """Check a Lagrangian, and return its Poisson structure, the dimension and the energy E_L."""
         L = make_energy(lagrangian, "the Lagrangian")
         if dim is None and space is None and isinstance(L, Quadratic):
             dim = L.A.shape[0]
@@ -75,12 +75,12 @@ class VelocityContactSystem(ContactManifoldSystem):
         return _legendre_hamiltonian(self.lagrangian, self.dim)
 
     def legendre(self, x) -> jax.Array:
-        """``FL(q, v, S) = (q, L_v, S)``, a state of :meth:`hamiltonian_system`, or a batch, shape (..., dim)."""
+        """Return ``FL(q, v, S) = (q, L_v, S)``, states of :meth:`hamiltonian_system`, shape (..., dim)."""
         return jnp.vectorize(self.contact.legendre, signature="(n)->(n)")(self.state(x, batch=True))
 
 
 class LagrangianSystem(VelocityContactSystem):
-    """A system that a Lagrangian makes alone, without forces beside it."""
+    """A system that a Lagrangian determines, without other forces."""
 
     def __init__(
         self,
@@ -103,7 +103,7 @@ class LagrangianSystem(VelocityContactSystem):
 
     @abstractmethod
     def _entropy_and_dissipation(self, dim: int, space: mf.Space | None) -> tuple[Energy | None, Dissipation]:
-        """The entropy and the dissipation."""
+        """Return the entropy and the dissipation."""
 
 
 class ThermodynamicHerglotz(LagrangianSystem):
@@ -143,7 +143,7 @@ class ThermodynamicHerglotz(LagrangianSystem):
         return entropy_component(dim), LiouvilleFriction(is_mechanical(self.lagrangian, dim, space))
 
     def hamiltonian_system(self) -> EvolutionSystem:
-        """The same dynamics on T*Q x R, in the state (q, p, S); on R^n alone."""
+        """Return the system on T*Q x R with states (q, p, S); positions must be in R^n."""
         return EvolutionSystem(self._hamiltonian(), self.dim, validate=False)
 
     def specific_residuals(self, x) -> dict[str, jax.Array]:
@@ -165,7 +165,7 @@ class Herglotz(LagrangianSystem):
         return None, ReebDrift()
 
     def hamiltonian_system(self) -> ContactSystem:
-        """The same dynamics on T*Q x R, in the state (q, p, S); on R^n alone."""
+        """Return the system on T*Q x R with states (q, p, S); positions must be in R^n."""
         return ContactSystem(self._hamiltonian(), self.dim, validate=False)
 
     def specific_residuals(self, x) -> dict[str, jax.Array]:
@@ -176,10 +176,10 @@ class Herglotz(LagrangianSystem):
 
 
 def _lagrangian_energy(L: Energy, dim: int) -> Energy:
-    """``E_L = v . L_v - L``, term by term, so that a discretisation sees of each what it is."""
+    """Return ``E_L = v . L_v - L``, term by term, so that discretisations know the form of each term."""
     points = np.random.default_rng(0).standard_normal((4, dim))
-    first, *others = (_energy_of_term(term, points) for term in L.terms)
-    return sum(others, first)
+    terms = [_energy_of_term(term, points) for term in L.terms]
+    return sum(terms[1:], terms[0])
 
 
 def _energy_of_term(term: Energy, points: np.ndarray) -> Energy:
@@ -191,7 +191,7 @@ def _energy_of_term(term: Energy, points: np.ndarray) -> Energy:
 
 
 def _energy_of_quadratic(L: Quadratic) -> Quadratic:
-    """What is of degree k in v is multiplied by k - 1."""
+    """Return E_L of a quadratic Lagrangian: terms of degree k in v are multiplied by k - 1."""
     dim = L.A.shape[0]
     degree = (np.arange(dim) // (dim // 2) == 1).astype(float)
     factor = 2.0 * degree - 1.0 if L.A.ndim == 1 else np.add.outer(degree, degree) - 1.0
@@ -199,7 +199,7 @@ def _energy_of_quadratic(L: Quadratic) -> Quadratic:
 
 
 class _LegendreEnergy(Energy):
-    """``v . L_v - L`` of any term."""
+    """The energy ``v . L_v - L`` of any term of a Lagrangian."""
 
     lagrangian: Energy
 
@@ -209,7 +209,7 @@ class _LegendreEnergy(Energy):
 
 
 class _EnergyValue(Module):
-    """An energy as a function of one state."""
+    """The value of an energy, as a callable module."""
 
     energy: Energy
 
@@ -221,28 +221,28 @@ class _EnergyValue(Module):
 
 
 def _legendre_hamiltonian(L: Energy, dim: int) -> Energy:
-    """``H = E_L o FL^-1``, in closed form for a quadratic Lagrangian and for kinetic minus potential energy."""
+    """Return ``H = E_L o FL^-1``, in closed form for quadratic Lagrangians and for kinetic minus potential energy."""
     if isinstance(L, Quadratic):
         return _hamiltonian_of_quadratic(L)
     points = np.random.default_rng(0).standard_normal((4, dim))
-    moving = [term for term in L.terms if is_traced(term) or not is_independent_of_momenta(term, points)]
-    if len(moving) == 1 and isinstance(moving[0], Kinetic):
-        return sum((-term for term in L.terms if term is not moving[0]), Kinetic(_inverse_metric(moving[0].G)))
+    kinetic = [term for term in L.terms if is_traced(term) or not is_independent_of_momenta(term, points)]
+    if len(kinetic) == 1 and isinstance(kinetic[0], Kinetic):
+        return sum((-term for term in L.terms if term is not kinetic[0]), Kinetic(_inverse_metric(kinetic[0].G)))
     return LegendreTransform(L)
 
 
 @jit_program
 def _hamiltonian_of_quadratic(L: Quadratic) -> Quadratic:
-    """``H = (p - B r - c) . W^-1 (p - B r - c) / 2 - L(r)``, r = (q, S), where ``L_v = W v + B r + c``."""
+    """Return ``H = (p - B r - c) . W^-1 (p - B r - c) / 2 - L(r)``, r = (q, S), where ``L_v = W v + B r + c``."""
     dim = L.A.shape[0]
-    moving, still = np.split(np.roll(np.arange(dim), -(dim // 2)), [dim // 2])
+    v, r = np.split(np.roll(np.arange(dim), -(dim // 2)), [dim // 2])
     A, b = jnp.diag(L.A) if L.A.ndim == 1 else L.A, jnp.zeros(dim) if L.b is None else L.b
-    inverted = inverse(A[np.ix_(moving, moving)])
-    shift = jnp.zeros((dim // 2, dim)).at[:, moving].set(jnp.eye(dim // 2)).at[:, still].set(-A[np.ix_(moving, still)])
-    rest = jnp.zeros((dim, dim)).at[np.ix_(still, still)].set(A[np.ix_(still, still)])
-    raised = 0.5 * (inverted + inverted.T) @ shift
-    c = b[moving]
-    return Quadratic(shift.T @ raised - rest, -c @ raised - b.at[moving].set(0.0), 0.5 * c @ inverted @ c - L.c)
+    W_inverse = inverse(A[np.ix_(v, v)])
+    shift = jnp.zeros((dim // 2, dim)).at[:, v].set(jnp.eye(dim // 2)).at[:, r].set(-A[np.ix_(v, r)])
+    A_r = jnp.zeros((dim, dim)).at[np.ix_(r, r)].set(A[np.ix_(r, r)])
+    velocity = 0.5 * (W_inverse + W_inverse.T) @ shift
+    c = b[v]
+    return Quadratic(shift.T @ velocity - A_r, -c @ velocity - b.at[v].set(0.0), 0.5 * c @ W_inverse @ c - L.c)
 
 
 class _InverseMetric(Module):
@@ -258,17 +258,17 @@ def _inverse_metric(G):
         return _InverseMetric(G)
     if G.ndim == 1:
         return 1.0 / G
-    inverted = inverse(G)
-    return 0.5 * (inverted + inverted.T)
+    G_inverse = inverse(G)
+    return 0.5 * (G_inverse + G_inverse.T)
 
 
 class LegendreTransform(Energy):
-    """``H(q, p, S) = p . v - L(q, v, S)`` at the v with ``L_v = p``, by damped Newton; NaN where it finds none."""
+    """The Hamiltonian ``H(q, p, S) = p . v - L(q, v, S)`` with ``L_v = p``, by damped Newton; else NaN."""
 
     lagrangian: Energy
 
     def velocity(self, x) -> jax.Array:
-        """v at (q, p, S), shape (n,)."""
+        """Return the velocity v at (q, p, S), shape (n,)."""
         n = len(x) // 2
         return inverse_gradient(_VelocityLagrangian(self.lagrangian, x[:n], x[2 * n :]), x[n : 2 * n])
 
@@ -303,11 +303,11 @@ def _require_regular(contact: mf.LagrangianContact) -> None:
 
 
 def random_states(contact: mf.SplitContact, count: int) -> np.ndarray:
-    """Random states (q, v, S), shape (count, dim); those of a space of positions are points of it."""
+    """Return random states (q, v, S), shape (count, dim), with (q, v) in the tangent bundle if there is one."""
     points = np.random.default_rng(0).standard_normal((count, contact.dim))
     if isinstance(contact.bundle, mf.TangentBundle):
-        on = contact.bundle
-        points[:, :-1] = on.to_vector(on.random(0, (count,)))
+        bundle = contact.bundle
+        points[:, :-1] = bundle.to_vector(bundle.random(0, (count,)))
     return points
 
 

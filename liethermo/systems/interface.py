@@ -1,4 +1,4 @@
-"""What the author of a kind of system says of it: all that the library does not find out by itself."""
+"""``SystemInterface``: the data and the answers that the author of a kind of system provides."""
 
 from __future__ import annotations
 
@@ -19,41 +19,41 @@ from .baths import HeatBaths
 
 
 class InvariantVerdicts(NamedTuple):
-    """Names of functions of a system: of those that it conserves, and of those that this is not known of."""
+    """Names of the functions that a system conserves, and of those for which this is not known."""
 
     conserved_names: frozenset[str]
     undecided_names: frozenset[str]
 
     @classmethod
     def from_verdicts(cls, verdicts: Mapping[str, bool | None], declared: Iterable[str]) -> InvariantVerdicts:
-        """From a verdict on each function; one that is declared counts as conserved unless it is seen not to be."""
+        """Build from a verdict on each function; declared functions count as conserved unless False."""
         verdicts = {**verdicts, **{name: True for name in declared if verdicts.get(name, True) is None}}
         constant = {name for name, verdict in verdicts.items() if verdict}
         return cls(frozenset(constant), frozenset(name for name, verdict in verdicts.items() if verdict is None))
 
 
 class SystemInterface(Geometry):
-    """A kind of system: its data, and answers that a subclass may replace; :class:`System` has what follows from them.
+    """Data of a kind of system, and methods that a subclass may override.
 
-    The attributes are those of :class:`System`.
+    :class:`System` derives everything else from them, and documents the attributes.
     """
 
     entropy: Energy | None
     dissipation: Dissipation | None
     momentum_maps: dict[str, Energy]
     preserved_labels: tuple[str, ...] | None = eqx.field(static=True, kw_only=True, default=None)
-    """What the functions are called that the dissipation has to preserve, one after another."""
+    """Names of the functions that the dissipation has to preserve, in their order."""
     invariant_verdicts: InvariantVerdicts | None = eqx.field(static=True, kw_only=True, default=None)
-    """What it conserves, where that has been found out near the states of a run."""
+    """Functions that the system conserves, if they were determined near the states of a run."""
     baths: HeatBaths | None = eqx.field(kw_only=True, default=None)
-    """What takes the heat of the dissipation; the entropies are the last components of a state."""
+    """Baths that take the heat of the dissipation; their entropies are the last components of a state."""
     production_name: ClassVar[str] = "dS/dt"
     domain: ClassVar[str] = ""
-    """What a state of the system has to have beyond finite components, in words."""
+    """Condition, in words, that a state must satisfy beside finite components."""
 
     @property
     def kind(self) -> str:
-        """What it is, for messages."""
+        """Name of the kind of system, for messages."""
         return type(self).__name__
 
     @property
@@ -65,7 +65,7 @@ class SystemInterface(Geometry):
     def inertia(self) -> np.ndarray | None:
         """The tensor of inertia, shape (3, 3), of a rigid body whose state begins with its angular momentum.
 
-        That with all parts inside held fast; None where the system is no such body, or the tensor is not known.
+        All internal parts count as fixed. None if the system is no such body, or the tensor is not known.
         """
         return None
 
@@ -74,91 +74,92 @@ class SystemInterface(Geometry):
     def field(self, x, dH, dS, dL=()) -> jax.Array:
         """``Pi(x) dH + force(x; dH, dS, dL)``, shape (n,), for gradients continuous or discrete.
 
-        dS may be None of a system without an entropy. This is the one definition of the dynamics; integrators differ in
-        the gradients they hand it.
+        dS is None if the system has no entropy. This is the one definition of the dynamics; integrators differ in the
+        gradients that they pass.
         """
         motion = self.poisson.sharp(x, dH)
         return motion if self.dissipation is None else motion + self.dissipation.force(self, x, dH, dS, dL)
 
     @property
     def has_poisson_by_construction(self) -> bool:
-        """Whether Pi is a Poisson tensor whatever the user gives, and dear to check when a system is built."""
+        """True if Pi is a Poisson tensor by construction, so that an expensive check can be skipped."""
         return False
 
     @property
     def has_generator(self) -> bool:
-        """Whether the motion has a form without the gradient of the entropy: see :meth:`generated`."""
+        """True if :meth:`generator_field` computes the motion without the gradient of the entropy."""
         return self.dissipation is not None and self.dissipation.has_generator
 
     def generator_field(self, x) -> jax.Array:
-        """:meth:`field` at the gradients of the functions, in the form that the entropy is not in."""
+        """Return the vector field at x, shape (n,), in the form that does not contain the entropy."""
         assert self.dissipation is not None
         dH = self.energy.gradient(x)
         return self.poisson.sharp(x, dH) + self.dissipation.generator_field(self, x, dH)
 
     def samples(self, count: int, seed: int = 0, scale: float = 1.0) -> np.ndarray:
-        """Random states, shape (count, n): normal with standard deviation ``scale``, or the space's own points."""
+        """Return random states, shape (count, n): normal with standard deviation ``scale``, or points of the space."""
         if self.space is None:
-            found = scale * np.random.default_rng(seed).standard_normal((count, self.dim))
+            states = scale * np.random.default_rng(seed).standard_normal((count, self.dim))
         else:
-            found = np.asarray(self.space.to_vector(self.space.random(seed, (count,))))
+            states = np.asarray(self.space.to_vector(self.space.random(seed, (count,))))
         if self.baths is not None:
-            found[..., self.body_dim :] *= min(1.0, 1.0 / scale) * self.baths.scale  # of a temperature that is finite
-        return found
+            states[..., self.body_dim :] *= min(1.0, 1.0 / scale) * self.baths.scale  # keeps temperatures finite
+        return states
 
     def outside(self, x) -> str:
-        """Why a state lies outside the domain of the system, in words; empty where it does not.
+        """Explain why a state lies outside the domain of the system; "" if it lies inside.
 
-        For several states at one time, shape (..., n), the text is about one that does.
+        For several states, shape (..., n), the text is about one that lies outside.
         """
         return ""
 
     def domain_margin(self, x) -> jax.Array | None:
-        """A number that is positive where the parameters of the system allow a state x, shape (n,), and nowhere else.
+        """Return a number that is positive if and only if the parameters of the system allow the state x, shape (n,).
 
-        It is traced, for many systems at a time; :meth:`outside` has the words. None if any parameters allow any state.
+        JAX traces it, for many systems at once; :meth:`outside` explains it in words. None if all parameters allow
+        all states.
         """
         return None
 
     def why_singular(self, x) -> str:
-        """Why no run can start at x whose steps take the gradient of the entropy, in words; empty where one can.
+        """Explain why the gradient of the entropy is infinite at x, so that no run can start there; "" if it is finite.
 
-        For several states it is as in :meth:`outside`.
+        For several states, shape (..., n), the text is about one of them.
         """
         return ""
 
     def specific_residuals(self, x) -> dict[str, jax.Array]:
-        """Residuals at x of axioms that only this kind of system has, relative to what cancels, by their names."""
+        """Return residuals at x, by name, of axioms of this kind of system alone, relative to the terms that cancel."""
         return {}
 
     # -- what acts from outside ---------------------------------------------------------------------------------------
 
     @property
     def torque_name(self) -> str:
-        """What a torque from outside is called; empty where none acts."""
+        """Name of the external torque; "" if none acts."""
         return ""
 
     @property
     def has_impulse(self) -> bool:
-        """Whether a torque may change the momenta that a group turns, and not those of parts inside alone."""
+        """True if a torque may change momenta that the group acts on, and not only those of internal parts."""
         return bool(self.torque_name)
 
     @property
     def torque_invariant_casimirs(self) -> frozenset[str]:
-        """The names of the Casimirs that no torque on the system changes."""
+        """Names of the Casimirs that the torque leaves constant."""
         return frozenset() if self.torque_name else frozenset(self.casimirs())
 
     @property
     def needs_attitude(self) -> bool:
-        """Whether the torque depends on the attitude."""
+        """True if the torque depends on the attitude."""
         return False
 
     def external_torque(self, x) -> jax.Array | None:
-        """The torque at a state, shape (n,), of a system at a time and an attitude; None where none acts."""
+        """Return the external torque at a state, shape (n,), at a fixed time and attitude; None if none acts."""
         return None
 
     def drop_torque(self) -> Self:
-        """The system without a torque."""
+        """Return the system without its external torque."""
         return self
 
     # -- laws ---------------------------------------------------------------------------------------------------------
@@ -176,52 +177,52 @@ class SystemInterface(Geometry):
         return "conserved" if self.dissipation is None else self.dissipation.entropy_law
 
     def casimirs(self) -> dict[str, Energy]:
-        """Casimirs of the Poisson structure that are known, by name."""
+        """Return the known Casimirs of the Poisson structure, by name."""
         return {}
 
     @property
     def has_all_casimirs(self) -> bool:
-        """Whether every Casimir is known to be a function of :meth:`casimirs`."""
+        """True if every Casimir is known to be a function of :meth:`casimirs`."""
         return False
 
     @property
     def orbit_levels(self) -> tuple[int, frozenset[str]]:
-        """How many momenta a group turns, and the names of the Casimirs on them: an orbit is a level of these."""
+        """Number of momenta that the group acts on, and names of the Casimirs whose common levels are the orbits."""
         return self.body_dim, frozenset(self.casimirs())
 
     @property
     def surface(self) -> Surface | None:
-        """Where a step has to end, of constraints that are no functions of the system; None where there are none."""
+        """Surface on which every step has to end, for constraints beside conserved functions; None without any."""
         return None
 
     @property
     def ledger(self) -> dict[str, Energy]:
-        """What the system receives from outside, recorded along a run, by name."""
+        """Work and heat that the system receives from outside, recorded along a run, by name."""
         return {}
 
     @property
     def constant_names(self) -> tuple[str, ...]:
-        """Names of what is constant along a run and is no function with one value, such as a momentum in space."""
+        """Names of constants of the motion with several components, such as a momentum in space."""
         return ()
 
     @property
     def balance_entries(self) -> tuple[str, ...]:
-        """Entries of the ledger that the energy of a solution contains; its laws are stated without them."""
+        """Entries of the ledger that the energy of a solution contains; laws are stated after subtracting them."""
         return ()
 
     # -- states as users see them -------------------------------------------------------------------------------------
 
     def user_state(self, x) -> jax.Array:
-        """The part of a state that is the user's, as points: what the functions of an event are functions of."""
+        """Return the state as the user sees it, as a point; event functions receive it."""
         return self.points(x)
 
     def pullback(self, energy: Energy) -> Energy:
-        """A function of the states that the user sees, as one of the states here."""
+        """Return a function of the states of this system from a function of the states that the user sees."""
         return energy
 
     @property
     def state_blocks(self) -> tuple[slice, ...]:
-        """The parts of a state that have sizes of their own, such as a momentum and the attitude beside it."""
+        """Parts of a state that have scales of their own, such as a momentum and an attitude."""
         n = self.body_dim
         return (slice(None),) if self.baths is None else (slice(0, n), slice(n, self.dim))
 
@@ -229,34 +230,34 @@ class SystemInterface(Geometry):
 
     @property
     def can_unroll(self) -> bool:
-        """Whether the compiled engine is worth trying: False where the system is known to need a loop."""
+        """True if the compiled engine is worth trying; False if the system needs a loop."""
         return self.space is None or (self.space.is_smooth and self.space.dtype.kind != "c")
 
     @property
     def has_matrix_functions(self) -> bool:
-        """Whether it is made of functions of matrices, which XLA compiles more slowly than the compiled engine."""
+        """True if the system consists of matrix functions, which XLA compiles more slowly than the compiled engine."""
         return False
 
     @property
     def is_smooth(self) -> bool:
-        """Whether the vector field can be differentiated twice and more."""
+        """True if the vector field is at least twice differentiable."""
         return self.space is None or self.space.is_smooth
 
     def sparsity_pattern(self) -> scipy.sparse.csr_array | None:
-        """Which components of the field depend on which of the state, discrete gradients included; None if not known.
+        """Return the sparsity pattern of the Jacobian of the field, shape (n, n), discrete gradients included.
 
-        A pattern, shape (n, n). Large systems that know it are solved by sparse Newton iteration.
+        None if it is not known. Large systems with a pattern are solved by sparse Newton iteration.
         """
         return None
 
     def residual_weights(self, x) -> jax.Array:
-        """Factors of the components of the field, at a state, in which it depends on the state most nearly linearly.
+        """Return factors, shape (n,), that make the components of the field nearly linear in the state.
 
-        Newton's method is applied to the equations of a stiff step multiplied by these, shape (n,).
+        Newton's method solves the equations of a stiff step multiplied by these factors.
         """
         return jnp.ones_like(x)
 
     def component_scales(self, k) -> jax.Array:
-        """The size that components of slopes, shape (..., n), are measured by, for differences: the largest for all."""
-        size = jnp.max(jnp.abs(k))
-        return jnp.full_like(k, jnp.where(size > 0.0, size, 1.0))
+        """Return the scale of each component of slopes, shape (..., n), for finite differences: the largest of all."""
+        scale = jnp.max(jnp.abs(k))
+        return jnp.full_like(k, jnp.where(scale > 0.0, scale, 1.0))

@@ -1,4 +1,4 @@
-"""Systems that receive work and heat from outside: a ledger of both, and the time, behind their state."""
+"""Systems that receive work and heat from outside, with a ledger appended to their states: work, heat, time."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class LedgerSystem(System):
 
     @property
     def has_ledger(self) -> bool:
-        """Whether work or heat comes from outside, so that the state has a ledger."""
+        """True if work or heat comes from outside, so that the state has a ledger."""
         return self.external is not None or self.heat_power is not None
 
     @property
@@ -46,13 +46,13 @@ class LedgerSystem(System):
         """Components of the state without the ledger."""
         return self.dim - LEDGER_DIM if self.has_ledger else self.dim
 
-    def _append_ledger(self, structure, size: int, energy: Energy) -> tuple[mf.PoissonStructure, int, Energy]:
-        """The structure, the size and the energy of system and surroundings, from those of the system."""
+    def _append_ledger(self, poisson, dim: int, energy: Energy) -> tuple[mf.PoissonStructure, int, Energy]:
+        """Return the Poisson structure, dimension and energy of system and ledger, from those of the system."""
         if not self.has_ledger:
-            return structure, size, energy
-        total = size + LEDGER_DIM
-        received = Quadratic(jnp.zeros(total), jnp.zeros(total).at[size : size + 2].set(-1.0))
-        return ProductPoisson(structure, mf.NoPoisson(LEDGER_DIM)), total, energy.on(range(size)) + received
+            return poisson, dim, energy
+        total_dim = dim + LEDGER_DIM
+        received = Quadratic(jnp.zeros(total_dim), jnp.zeros(total_dim).at[dim : dim + 2].set(-1.0))
+        return ProductPoisson(poisson, mf.NoPoisson(LEDGER_DIM)), total_dim, energy.on(range(dim)) + received
 
     def state_array(self, x, batch: bool = False):
         if self.has_ledger and np.ndim(x) > 0 and np.shape(x)[-1] == self.dim_without_ledger:
@@ -60,31 +60,31 @@ class LedgerSystem(System):
         return super().state_array(x, batch)
 
     def state_time(self, x) -> jax.Array:
-        """The time in one state; 0 where it has none."""
+        """Return the time that is contained in a state; 0 if the state has no ledger."""
         return x[-1] if len(x) > self.dim_without_ledger else jnp.zeros(())
 
-    # what ForcesAndHeat asks for
+    # members that ForcesAndHeat needs
 
     @property
     @abstractmethod
     def first_velocity_index(self) -> int:
-        """The component of the state where velocities begin."""
+        """Index of the first velocity in the state."""
 
     @abstractmethod
     def momentum_jacobians(self, x) -> tuple[jax.Array, jax.Array]:
-        """The derivatives of the momentum by v and S at a state, shapes (n, n) and (n,)."""
+        """Return the derivatives of the momentum with respect to v and S at a state, shapes (n, n) and (n,)."""
 
     @abstractmethod
     def forces_and_power(self, x, v, T) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Friction and external force, shape (n,), and heat power at a state x, with a velocity v and T."""
+        """Return friction, external force, shape (n,) each, and heat power at a state x, velocity v, temperature T."""
 
     def tangential_covector(self, x, covector) -> jax.Array:
-        """What of a covector acts on velocities at a state x, shape (n,)."""
+        """Return the part of a covector that acts on admissible velocities at a state x, shape (n,)."""
         del x
         return covector
 
     def ledger_rates(self, work, heat) -> jax.Array:
-        """The rates of the ledger, shape (3,), or none of an isolated system."""
+        """Return the rates of the ledger, shape (3,), or an empty array for an isolated system."""
         return jnp.stack([work, heat, jnp.ones(())])[: self.dim - self.dim_without_ledger]
 
     @property
@@ -98,8 +98,8 @@ class ForcesAndHeat(SkewFriction):
     """Friction and the heat that it makes, an external force and a heat power, on states (…, v, S) [GBY 2.4].
 
     ``d/dt l_v = … + F_fr + F_ext`` and ``T S' = P_H - F_fr . v``. With the ledger W' = F_ext . v, Q' = P_H the energy
-    ``v . l_v - l - W - Q`` of system and surroundings is constant, for discrete gradients too. The system says where v
-    begins (``first_velocity_index``), how its momentum changes with v and S (``momentum_jacobians``), and how it is ``forces_and_power``.
+    ``v . l_v - l - W - Q`` of system and surroundings is constant, for discrete gradients too. The system
+    provides ``first_velocity_index``, ``momentum_jacobians`` and ``forces_and_power``.
     """
 
     friction: Callable | None
@@ -114,22 +114,21 @@ class ForcesAndHeat(SkewFriction):
 
     def force(self, system, x, dH, dS, dL):
         first, S = system.first_velocity_index, system.dim_without_ledger - 1
-        W, by_S = system.momentum_jacobians(x)
-        v = solve(W, system.tangential_covector(x, dH[first:S])[:, None])[
-            :, 0
-        ]  # the velocity and temperature of the gradient
-        T = dH[S] - jnp.dot(by_S, v)
-        friction, push, power = system.forces_and_power(x, v, T)
+        W, S_derivative = system.momentum_jacobians(x)
+        # velocity and temperature that belong to the gradient
+        v = solve(W, system.tangential_covector(x, dH[first:S])[:, None])[:, 0]
+        T = dH[S] - jnp.dot(S_derivative, v)
+        friction, external, power = system.forces_and_power(x, v, T)
         S_dot = (power - jnp.dot(friction, v)) / jnp.where(T > 0.0, T, jnp.nan)
-        v_dot = solve(W, (friction + push - by_S * S_dot)[:, None])[:, 0]
-        return jnp.concatenate([jnp.zeros(first), v_dot, S_dot[None], system.ledger_rates(jnp.dot(push, v), power)])
+        v_dot = solve(W, (friction + external - S_derivative * S_dot)[:, None])[:, 0]
+        return jnp.concatenate([jnp.zeros(first), v_dot, S_dot[None], system.ledger_rates(jnp.dot(external, v), power)])
 
 
 # -- friction by a coefficient -----------------------------------------------------------------------------------------
 
 
 class LinearFriction(Module):
-    """The force ``-R v`` as a function of parts of a state that end with (v, S, t)."""
+    """The force ``-R v`` as a function of arguments that end with (v, S, t)."""
 
     R: jax.Array
 
@@ -159,28 +158,27 @@ def linear_friction(coefficient, n: int, what: str) -> LinearFriction:
 # -- functions of a state and the time --------------------------------------------------------------------------------
 
 
-def add_time_argument(function: Callable, parts: int = 3) -> Callable:
-    """A function of so many parts of a state, or of those and t, as one of those and t."""
-    return LastArgumentIgnored(function) if required_argument_count(function) == parts else function
+def add_time_argument(function: Callable, n_arguments: int = 3) -> Callable:
+    """Return a function of (..., t) from a function with or without the argument t."""
+    return LastArgumentIgnored(function) if required_argument_count(function) == n_arguments else function
 
 
 def check_state_function(
     function, parts: tuple[tuple[int, ...], ...], shape: tuple[int, ...], what: str, at: str
 ) -> Callable:
-    """A function of parts of a state, or of those and t, or a constant, as one of those and t, checked.
+    """Return a checked function of (..., t) from a function with or without the argument t, or from a constant.
 
     Parameters
     ----------
     parts : tuple of shapes
-        Of the parts of a state.
+        Shapes of the arguments before t.
     shape : tuple of int
-        Of what it has to give.
+        Shape of the result.
     what, at : str
-        For messages: what it is, and of what.
+        Name of the function and of its arguments, for messages.
     """
-    found = (
-        add_time_argument(function, len(parts))
-        if callable(function)
-        else ConstantFunction(check_numbers(function, what))
-    )
-    return check_function_shape(found, (*parts, ()), [shape], what, at)[0]
+    if callable(function):
+        function = add_time_argument(function, len(parts))
+    else:
+        function = ConstantFunction(check_numbers(function, what))
+    return check_function_shape(function, (*parts, ()), [shape], what, at)[0]

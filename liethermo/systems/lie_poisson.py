@@ -140,15 +140,15 @@ class LiePoissonSystem(System):
         return () if self.baths is not None else self.algebra.shape[:-1]
 
     def field(self, x, dH, dS, dL=()):
-        """``ad*_dH (x + F) + force``: as for every system, with the forces that are coadjoint actions joined to one."""
-        push = self.external_torque(x)
-        if push is not None:
-            return self.drop_torque().field(x, dH, dS, dL) + push
+        """Return ``ad*_dH (x + F) + force``, with all forces that are coadjoint actions computed by one action."""
+        torque = self.external_torque(x)
+        if torque is not None:
+            return self.drop_torque().field(x, dH, dS, dL) + torque
         if self.dissipation is None or self.dissipation.added_momentum(dH, jnp.zeros_like(dH)) is None:
             return super().field(x, dH, dS, dL)
         action = self.algebra.action(dH)
-        turned = jnp.zeros_like(dH) if dS is None else action.bracket(dS)
-        return action.ad_star(x + self.dissipation.added_momentum(dH, turned))
+        bracket = jnp.zeros_like(dH) if dS is None else action.bracket(dS)
+        return action.ad_star(x + self.dissipation.added_momentum(dH, bracket))
 
     @property
     def inertia(self) -> np.ndarray | None:
@@ -165,8 +165,8 @@ class LiePoissonSystem(System):
 
     @property
     def has_impulse(self) -> bool:
-        turned = self.algebra.dim if self.group is None else self.group.dim
-        return self.torque is not None and not set(range(turned)) <= set(self.torque_free_components)
+        n_momenta = self.algebra.dim if self.group is None else self.group.dim
+        return self.torque is not None and not set(range(n_momenta)) <= set(self.torque_free_components)
 
     @property
     def torque_invariant_casimirs(self) -> frozenset[str]:
@@ -183,14 +183,14 @@ class LiePoissonSystem(System):
         return super().is_driven or (self.torque is not None and self.torque_arguments is None)
 
     def at_time(self, t, attitude=None):
-        """The system at a time: its energy, and its torque, which may need the attitude, shape (m, m), too."""
-        found = super().at_time(t)
+        """Return the system with energy and torque at a time; a torque may need the attitude too, shape (m, m)."""
+        system = super().at_time(t)
         if self.torque is None:
-            return found
-        found = copy(found)
-        place = jnp.asarray(t, dtype=jnp.float64), None if attitude is None else jnp.asarray(attitude)
-        object.__setattr__(found, "torque_arguments", place)
-        return found
+            return system
+        system = copy(system)
+        arguments = jnp.asarray(t, dtype=jnp.float64), None if attitude is None else jnp.asarray(attitude)
+        object.__setattr__(system, "torque_arguments", arguments)
+        return system
 
     def systems_at_test_times(self):
         if not self.needs_attitude:
@@ -209,37 +209,38 @@ class LiePoissonSystem(System):
                 f"the torque {self.torque_name} is known at a {what}: take system.at_time(t"
                 f"{', attitude' if self.needs_attitude else ''})"
             )
-        if attitude is not None:  # XLA stops the process where it lays out many such matrices for products with vectors
+        if attitude is not None:  # without it XLA crashes on products of many such matrices with vectors
             attitude = jax.lax.optimization_barrier(attitude)
         n = self.algebra.dim
-        found = evaluate_torque(self.torque, self.torques_need_attitude, t, x[:n].reshape(self.algebra.shape), attitude)
-        return jnp.pad(found.ravel(), (0, self.dim - n))
+        mu = x[:n].reshape(self.algebra.shape)
+        torque = evaluate_torque(self.torque, self.torques_need_attitude, t, mu, attitude)
+        return jnp.pad(torque.ravel(), (0, self.dim - n))
 
     def drop_torque(self):
         if self.torque is None:
             return self
-        found = copy(self)
+        system = copy(self)
         for name, value in {
             "torque": None,
             "torques_need_attitude": (),
             "torque_free_components": (),
             "torque_arguments": None,
         }.items():
-            object.__setattr__(found, name, value)
-        return found
+            object.__setattr__(system, name, value)
+        return system
 
     @property
     def entropy_law(self):
-        """That of a torque beside an entropy of momenta is none; those of baths it does not touch."""
+        """Law of the entropy; None if a torque acts on momenta that the entropy depends on."""
         law = super().entropy_law
         return law if self.torque is None or isinstance(self.entropy, BathEntropy) else None
 
     def casimirs(self) -> dict[str, Energy]:
-        found = self.momentum_casimirs()
-        return found if self.baths is None else {name: self._extend_from_body(C) for name, C in found.items()}
+        casimirs = self.momentum_casimirs()
+        return casimirs if self.baths is None else {name: self._extend_from_body(C) for name, C in casimirs.items()}
 
     def momentum_casimirs(self) -> dict[str, Energy]:
-        """:meth:`casimirs`, as functions of mu alone."""
+        """Return the known Casimirs as functions of mu alone, by name."""
         return _leading_casimirs(self.algebra, self.algebra.basis_names)
 
     @property
@@ -254,7 +255,7 @@ class LiePoissonSystem(System):
 
 
 def _resolve_reconstruction(algebra: mf.LieAlgebra, group, reconstruction: str | None) -> str | None:
-    """The way to reconstruct attitudes in a group of the algebra; None without a group."""
+    """Return the checked name of a reconstruction, by default the best one for the group; None without a group."""
     if group is None:
         if reconstruction is not None:
             raise InputError("a reconstruction needs a group to live in: give group=..., such as manifolds.SO(3)")
@@ -271,24 +272,24 @@ def _resolve_reconstruction(algebra: mf.LieAlgebra, group, reconstruction: str |
     return reconstruction
 
 
-def _extends_algebra(own: mf.LieAlgebra, algebra: mf.LieAlgebra) -> bool:
-    """Whether an algebra is a group's own, or the sum of that and an abelian one: of parts that turn inside a body."""
-    n, more = own.dim, algebra.dim - own.dim
-    if more < 0 or (more > 0 and (len(algebra.shape) != 1 or algebra.dim > MAX_BODY_DIM)):
+def _extends_algebra(group_algebra: mf.LieAlgebra, algebra: mf.LieAlgebra) -> bool:
+    """Return whether an algebra is that of a group, or its direct sum with an abelian algebra of internal parts."""
+    n, n_internal = group_algebra.dim, algebra.dim - group_algebra.dim
+    if n_internal < 0 or (n_internal > 0 and (len(algebra.shape) != 1 or algebra.dim > MAX_BODY_DIM)):
         return False
-    if more == 0 and algebra.shape != own.shape:
+    if n_internal == 0 and algebra.shape != group_algebra.shape:
         return False
     C = np.zeros((algebra.dim,) * 3)
-    C[:n, :n, :n] = own.structure_constants
+    C[:n, :n, :n] = group_algebra.structure_constants
     return np.allclose(algebra.structure_constants, C, rtol=0.0, atol=1e-12)
 
 
 _RECONSTRUCTION_MAPS = {"coadjoint": "adjoint_cayley", "cayley": "cayley", "exp": "exp"}
-"""The map from the algebra to the group that a reconstruction takes its steps by."""
+"""Map from the algebra to the group that each reconstruction uses."""
 
 
 def _default_reconstruction(group: mf.MatrixGroup) -> str:
-    """The one that keeps spatial momenta; else the cheapest that stays in the group."""
+    """Return the reconstruction that conserves spatial momenta, or else the cheapest that stays in the group."""
     if group.cayley_is_adjoint():
         return "cayley"
     return next(kind for kind, map_ in _RECONSTRUCTION_MAPS.items() if kind == "exp" or group._is_map_in_group(map_))
@@ -296,13 +297,13 @@ def _default_reconstruction(group: mf.MatrixGroup) -> str:
 
 @memoize
 def _inertia_tensor(energy: Energy, dim: int) -> np.ndarray | None:
-    """The moments of inertia of a body with a quadratic energy of its momenta; None where it is no kinetic one."""
-    (gradient,), (squares,) = evaluate_at_points(_gradient_and_hessian, energy, np.zeros((1, dim)))
-    if np.linalg.eigvalsh(squares)[0] <= 0.0 or gradient.any():  # its inverse is that of the parts moving freely
+    """Return the tensor of inertia, shape (3, 3), of a quadratic energy; None if it is not a kinetic energy."""
+    (gradient,), (hessian,) = evaluate_at_points(_gradient_and_hessian, energy, np.zeros((1, dim)))
+    if np.linalg.eigvalsh(hessian)[0] <= 0.0 or gradient.any():
         return None
-    found = np.linalg.inv(squares)[:3, :3]
-    found.flags.writeable = False  # it is remembered
-    return found
+    inertia = np.linalg.inv(hessian)[:3, :3]
+    inertia.flags.writeable = False  # the result is cached
+    return inertia
 
 
 def _gradient_and_hessian(energy: Energy, x) -> tuple[jax.Array, jax.Array]:
@@ -311,55 +312,53 @@ def _gradient_and_hessian(energy: Energy, x) -> tuple[jax.Array, jax.Array]:
 
 @functools.lru_cache(maxsize=64)
 def _is_body_algebra(algebra: mf.LieAlgebra) -> bool:
-    """Whether the algebra is so(3), or its sum with an abelian one: that of parts that turn inside a body."""
+    """Return whether the algebra is so(3), or its direct sum with an abelian algebra of internal parts."""
     return algebra.dim >= 3 and _extends_algebra(mf.so(3), algebra)
 
 
 MAX_BODY_DIM = 64
-"""Components of the momentum of a body with parts inside, at most."""
+"""Largest number of momenta of a body with internal parts."""
 
 
 @functools.lru_cache(maxsize=64)
 def _leading_casimirs(algebra: mf.LieAlgebra, names: tuple[str, ...] | None) -> dict[str, Energy]:
-    del names  # equal algebras may differ in the names of their basis elements, and their Casimirs print with those
-    found: dict[str, Energy] = {}
-    with jax.ensure_compile_time_eval():  # what is found while something is traced is kept for later
+    del names  # a key of the cache: equal algebras may differ in the names with which their Casimirs print
+    casimirs: dict[str, Energy] = {}
+    with jax.ensure_compile_time_eval():  # the cache outlives any trace
         for name, casimir in algebra.leading_casimirs():
             function = check_energy(make_energy(casimir, "a Casimir"), algebra.dim, "a Casimir")
-            found[name] = mark_polynomial_degrees(function, algebra.dim)
-    return found
+            casimirs[name] = mark_polynomial_degrees(function, algebra.dim)
+    return casimirs
 
 
 @functools.lru_cache(maxsize=64)
 def _casimirs_of_first(algebra: mf.LieAlgebra, names: tuple[str, ...] | None, n: int) -> frozenset[str]:
-    """Which of the recorded Casimirs depend on the first n components."""
+    """Return the names of the leading Casimirs that depend on the first n components."""
     x = np.random.default_rng(0).standard_normal(algebra.dim)
     with jax.ensure_compile_time_eval():
-        found = _leading_casimirs(algebra, names).items()
-        return frozenset(name for name, C in found if bool(C.gradient(jnp.asarray(x))[:n].any()))
+        casimirs = _leading_casimirs(algebra, names).items()
+        return frozenset(name for name, C in casimirs if bool(C.gradient(jnp.asarray(x))[:n].any()))
 
 
 @functools.lru_cache(maxsize=64)
 def _casimirs_of_components(
-    algebra: mf.LieAlgebra, names: tuple[str, ...] | None, places: tuple[int, ...]
+    algebra: mf.LieAlgebra, names: tuple[str, ...] | None, indices: tuple[int, ...]
 ) -> frozenset[str]:
-    """Which of the recorded Casimirs depend on some components alone."""
-    x, others = np.random.default_rng(0).standard_normal(algebra.dim), np.delete(np.arange(algebra.dim), places)
+    """Return the names of the leading Casimirs that depend on no components but those with the given indices."""
+    x, complement = np.random.default_rng(0).standard_normal(algebra.dim), np.delete(np.arange(algebra.dim), indices)
     with jax.ensure_compile_time_eval():
-        found = _leading_casimirs(algebra, names).items()
-        return frozenset(name for name, C in found if not bool(C.gradient(jnp.asarray(x))[others].any()))
+        casimirs = _leading_casimirs(algebra, names).items()
+        return frozenset(name for name, C in casimirs if not bool(C.gradient(jnp.asarray(x))[complement].any()))
 
 
 @functools.lru_cache(maxsize=64)
 def _spans_all_casimirs(algebra: mf.LieAlgebra) -> bool:
-    """Whether the gradients of the recorded Casimirs span the kernel of the Poisson tensor at a random point."""
-    found, x = (
-        _leading_casimirs(algebra, algebra.basis_names).values(),
-        np.random.default_rng(0).standard_normal(algebra.dim),
-    )
-    if not found or len(found) < algebra.casimir_count():
+    """Return whether the gradients of the leading Casimirs span the kernel of the Poisson tensor at a random point."""
+    casimirs = _leading_casimirs(algebra, algebra.basis_names).values()
+    x = np.random.default_rng(0).standard_normal(algebra.dim)
+    if not casimirs or len(casimirs) < algebra.casimir_count():
         return False
     with jax.ensure_compile_time_eval():
-        gradients = np.array([C.gradient(jnp.asarray(x)) for C in found])
+        gradients = np.array([C.gradient(jnp.asarray(x)) for C in casimirs])
     lengths = np.linalg.norm(gradients, axis=1, keepdims=True)
     return int(np.linalg.matrix_rank(gradients / lengths, tol=1e-9)) == algebra.casimir_count()

@@ -43,10 +43,10 @@ from .baths import BathEntropy, HeatBaths, poisson_with_baths
 from .interface import InvariantVerdicts
 
 DENSITY_MATRIX_TOLERANCE = 1e-12
-"""How far a trace may be from one, and a density matrix from its adjoint, where it is given."""
+"""Largest difference of a trace from one, and of a density matrix from its adjoint, that is accepted as input."""
 
 ZERO_EIGENVALUE_PER_LEVEL = 8.0 * EPS
-"""Size of an eigenvalue of a density matrix that is zero to rounding, times the number of levels."""
+"""Largest eigenvalue of a density matrix that is zero to rounding, divided by the number of levels."""
 
 
 class QuantumSystem(System):
@@ -120,18 +120,18 @@ class QuantumSystem(System):
             raise InputError(f"the entropy of a density matrix is lt.VonNeumann(...), not {type(entropy).__name__}")
         self.floor = entropy.floor
         entropy = IsolatedVonNeumann(self.floor) if sum_dissipations(dissipation) is None else entropy
-        terms = [_bind_to_density(part, structure) for part in _dissipation_terms(dissipation)]
-        if baths is not None and not any(isinstance(part, ThermalJumps) for part in terms):
+        terms = [_bind_to_density(term, structure) for term in _dissipation_terms(dissipation)]
+        if baths is not None and not any(isinstance(term, ThermalJumps) for term in terms):
             raise InputError("baths exchange heat by lt.ThermalJumps, and there are none: leave out baths=")
         n, m = structure.dim, 0 if baths is None else baths.number
         poisson: mf.PoissonStructure = structure
-        whole: Energy = entropy
+        total_entropy: Energy = entropy
         if baths is not None:
             self.baths = baths
             poisson, energy = poisson_with_baths(structure, m), BodyBathsEnergy(energy, baths.energy, n, n + m)
-            whole = Sum((entropy.on(range(n)), BathEntropy(m)))
-        self._build(poisson, n + m, energy, whole, terms or None, {}, validate)
-        if not self.preserved:  # whether an observable is kept by the motion is found out
+            total_entropy = Sum((entropy.on(range(n)), BathEntropy(m)))
+        self._build(poisson, n + m, energy, total_entropy, terms or None, {}, validate)
+        if not self.preserved:  # preserved observables are tested instead
             self.invariant_verdicts = InvariantVerdicts(frozenset(self.casimirs()), frozenset())
 
     # -- states -------------------------------------------------------------------------------------------------------
@@ -166,24 +166,24 @@ class QuantumSystem(System):
         return jnp.asarray(np.concatenate([x, np.broadcast_to(y, (*front, m))], axis=-1))
 
     def state_array(self, x, batch: bool = False):
-        """What :meth:`state` makes of x; a matrix or a ket stands for the state with every bath at entropy zero."""
+        """Return the state x; a matrix or a ket becomes the state with every bath at entropy zero."""
         x = x.full() if isinstance(x, HasMatrix) else x
         if not isinstance(x, jax.core.Tracer) and (self._is_matrix(x, batch) or self._is_ket(x)):
             x = np.asarray(self.state(x))
         return super().state_array(x, batch)
 
     def _is_ket(self, x) -> bool:
-        """Whether it is the amplitudes of one pure state; of one level they look like a state."""
+        """Return whether x has the shape of the amplitudes of one pure state, with more than one level."""
         size = self.structure.size
         return size > 1 and np.shape(x) in ((size,), (size, 1))
 
     def _is_matrix(self, x, batch: bool) -> bool:
-        """Whether it is one density matrix or, with ``batch``, several; of one level a row of states looks like one."""
+        """Return whether x has the shape of a density matrix; of several with ``batch`` and more than one level."""
         size = self.structure.size
         return np.shape(x)[-2:] == (size, size) and (size > 1 or not batch)
 
     def density(self, x) -> jax.Array:
-        """The density matrices of states, shape (..., n) to (..., N, N)."""
+        """Return the density matrices, shape (..., N, N), of states, shape (..., n)."""
         x = jnp.asarray(x)
         if x.shape[-1:] not in ((self.dim,), (self.body_dim,)):
             raise InputError(f"a state of this system has shape (..., {self.dim}), not {x.shape}")
@@ -203,11 +203,11 @@ class QuantumSystem(System):
             raise InputError(
                 f"the parts are 0 to {len(self.parts) - 1}, or {self.names or 'without names'}, not {part!r}"
             )
-        before, own = math.prod(self.parts[:k]), self.parts[k]
+        n_before, n_part = math.prod(self.parts[:k]), self.parts[k]
         rho = self.density(x)
-        after = self.structure.size // (before * own)
-        split = rho.reshape(*rho.shape[:-2], before, own, after, before, own, after)
-        return jnp.einsum("...iajibj->...ab", split)
+        n_after = self.structure.size // (n_before * n_part)
+        tensor = rho.reshape(*rho.shape[:-2], n_before, n_part, n_after, n_before, n_part, n_after)
+        return jnp.einsum("...iajibj->...ab", tensor)
 
     def expectation(self, x, observable) -> jax.Array:
         """``tr(rho A)`` of states, shape (..., n) to (...), for an observable A, Hermitian, shape (N, N)."""
@@ -230,8 +230,8 @@ class QuantumSystem(System):
         rho = self.reduced(x, part)
         if rho.shape[-1] != 2:
             raise InputError(f"a Bloch vector belongs to a qubit, and part {part!r} has {rho.shape[-1]} levels")
-        off = rho[..., 0, 1]
-        return jnp.stack([2.0 * off.real, -2.0 * off.imag, (rho[..., 0, 0] - rho[..., 1, 1]).real], axis=-1)
+        coherence = rho[..., 0, 1]
+        return jnp.stack([2.0 * coherence.real, -2.0 * coherence.imag, (rho[..., 0, 0] - rho[..., 1, 1]).real], axis=-1)
 
     def _check_density(self, rho: np.ndarray, mixed: float) -> np.ndarray:
         size = self.structure.size
@@ -250,27 +250,27 @@ class QuantumSystem(System):
         if asymmetry > DENSITY_MATRIX_TOLERANCE:
             raise InputError(f"the density matrix is not Hermitian: it differs from its adjoint by {asymmetry:.3g}")
         trace = np.trace(rho, axis1=-2, axis2=-1).real
-        worst = float(trace.ravel()[np.argmax(np.abs(trace - 1.0))])
-        if abs(worst - 1.0) > DENSITY_MATRIX_TOLERANCE:
-            raise InputError(f"the density matrix has the trace {worst:.15g}, not 1: divide it by that")
-        least = float(np.linalg.eigvalsh(rho)[..., 0].min())
-        if least < -NEGATIVE_EIGENVALUE_LIMIT:
-            raise InputError(f"the density matrix is not positive: its least eigenvalue is {least:.3g}")
+        wrong_trace = float(trace.ravel()[np.argmax(np.abs(trace - 1.0))])
+        if abs(wrong_trace - 1.0) > DENSITY_MATRIX_TOLERANCE:
+            raise InputError(f"the density matrix has the trace {wrong_trace:.15g}, not 1: divide it by that")
+        min_eigenvalue = float(np.linalg.eigvalsh(rho)[..., 0].min())
+        if min_eigenvalue < -NEGATIVE_EIGENVALUE_LIMIT:
+            raise InputError(f"the density matrix is not positive: its least eigenvalue is {min_eigenvalue:.3g}")
         if not isinstance(mixed, int | float | np.number) or not 0.0 <= mixed <= 1.0:
             raise InputError(f"mixed is a share of the identity, from 0 to 1, not {mixed!r}")
         return (1.0 - mixed) * rho + mixed * np.eye(size) / size
 
     def _density_of_kets(self, ket: np.ndarray) -> np.ndarray:
-        """The density matrices of pure states, shape (..., N, 1) to (..., N, N)."""
+        """Return the density matrices, shape (..., N, N), of pure states, shape (..., N, 1)."""
         norms = np.linalg.norm(ket, axis=-2)
-        worst = float(norms.ravel()[np.argmax(np.abs(norms - 1.0))])
-        if abs(worst - 1.0) > DENSITY_MATRIX_TOLERANCE:
-            raise InputError(f"the ket has the norm {worst:.15g}, not 1: divide it by that")
+        wrong_norm = float(norms.ravel()[np.argmax(np.abs(norms - 1.0))])
+        if abs(wrong_norm - 1.0) > DENSITY_MATRIX_TOLERANCE:
+            raise InputError(f"the ket has the norm {wrong_norm:.15g}, not 1: divide it by that")
         ket = ket / norms[..., None]
         return ket @ adjoint(ket)
 
     def samples(self, count: int, seed: int = 0, scale: float = 1.0) -> np.ndarray:
-        """Random states, ``count`` of them: density matrices by Ginibre's ensemble, and entropies of baths."""
+        """Return ``count`` random states: density matrices of Ginibre's ensemble, and entropies of baths."""
         rng, size = np.random.default_rng(seed), self.structure.size
         root = rng.standard_normal((count, size, size, 2)) @ np.array([1.0, 1.0j])
         rho = root @ adjoint(root)
@@ -288,16 +288,16 @@ class QuantumSystem(System):
         trace = traces[np.abs(traces - 1.0).argmax()]
         if not abs(trace - 1.0) <= 1e-9:
             return f"the trace of its density matrix is {trace:.12g}, not 1"
-        least = np.linalg.eigvalsh(rho)[:, 0].min()
-        if self.dissipation is not None and least < -max(self.floor, NEGATIVE_EIGENVALUE_LIMIT):
+        min_eigenvalue = np.linalg.eigvalsh(rho)[:, 0].min()
+        if self.dissipation is not None and min_eigenvalue < -max(self.floor, NEGATIVE_EIGENVALUE_LIMIT):
             return (
-                f"its density matrix has the eigenvalue {least:.3g}, outside the cone of positive matrices: a shorter "
-                "step stays inside"
+                f"its density matrix has the eigenvalue {min_eigenvalue:.3g}, outside the cone of positive matrices: "
+                "a shorter step stays inside"
             )
         return self._why_rank_grows(np.atleast_2d(x), rho) if self._has_dissipation(SteepestEntropyAscent) else ""
 
     def _why_rank_grows(self, x: np.ndarray, rho: np.ndarray) -> str:
-        """Why eigenvalues that are zero would not stay zero under steepest ascent, in words; empty where they do."""
+        """Explain why eigenvalues zero would not stay zero under steepest ascent; "" if they do."""
         kernels = self._kernels(rho)
         use = [i for i, kernel in enumerate(kernels) if kernel.size]
         turned = [self._is_kernel_rotated(rho[i], kernels[i]) for i in use]
@@ -317,24 +317,22 @@ class QuantumSystem(System):
         )
 
     def _is_kernel_rotated(self, rho: np.ndarray, kernel: np.ndarray) -> bool:
-        """Whether the Hamiltonian turns a kernel, shape (N, r), which is as exact as the least eigenvalue outside."""
-        outside = np.eye(len(rho)) - kernel @ adjoint(kernel)
+        """Return whether the Hamiltonian changes a kernel, shape (N, r), by more than the rounding of the kernel."""
+        complement = np.eye(len(rho)) - kernel @ adjoint(kernel)
         p = np.linalg.eigvalsh(rho)
-        blurred = p[p > self._zero_eigenvalue_limit].min()
-        return any(np.abs(outside @ H @ kernel).max() > energy_rounding(H) / blurred for H in self.hamiltonians())
+        smallest = p[p > self._zero_eigenvalue_limit].min()
+        return any(np.abs(complement @ H @ kernel).max() > energy_rounding(H) / smallest for H in self.hamiltonians())
 
     def _equilibrium_population(self, x: np.ndarray, kernel: np.ndarray) -> float:
-        """About the largest population that a state in the kernel, shape (N, r), has where steepest ascent ends.
+        """Estimate the largest population of a state in a kernel, shape (N, r), at the end of steepest ascent.
 
-        There ``-ln rho - 1`` is a combination of the gradients of what is preserved: the one that fits best outside.
+        At the end ``-ln rho - 1`` is a combination of the preserved gradients, which is fitted outside the kernel.
         """
         assert self.dissipation is not None
-        part = next(part for part in self.dissipation.terms if isinstance(part, SteepestEntropyAscent))
-        dS, dL = (
-            VonNeumann(self._zero_eigenvalue_limit).gradient(x[: self.body_dim]),
-            tuple(L.gradient(x) for L in part.preserve),
-        )
-        affinity = np.asarray(self.structure.matrix(part.ascent_direction(self, x, self.energy.gradient(x), dS, dL)))
+        ascent = next(term for term in self.dissipation.terms if isinstance(term, SteepestEntropyAscent))
+        dS = VonNeumann(self._zero_eigenvalue_limit).gradient(x[: self.body_dim])
+        dL = tuple(L.gradient(x) for L in ascent.preserve)
+        affinity = np.asarray(self.structure.matrix(ascent.ascent_direction(self, x, self.energy.gradient(x), dS, dL)))
         return float(np.exp(np.linalg.eigvalsh(adjoint(kernel) @ affinity @ kernel)[-1] - 1.0))
 
     def why_singular(self, x) -> str:
@@ -345,59 +343,58 @@ class QuantumSystem(System):
         use = [i for i, kernel in enumerate(kernels) if kernel.size]
         if not use:
             return ""
-        filled, emptied = self._jump_rates(x[use], [kernels[i] for i in use])
-        grows = np.flatnonzero(
-            filled > self._zero_eigenvalue_limit * emptied
-        )  # beyond rounding of the population that is at rest
+        fill_rates, rate_scales = self._jump_rates(x[use], [kernels[i] for i in use])
+        # larger than the rounding of a population at rest
+        grows = np.flatnonzero(fill_rates > self._zero_eigenvalue_limit * rate_scales)
         if not grows.size:
             return ""
-        least = np.linalg.eigvalsh(rho[use[grows[0]]])[0]
+        eigenvalue = np.linalg.eigvalsh(rho[use[grows[0]]])[0]
         otherwise = ", or take lt.MetriplecticRungeKutta, whose stages are without it" if self.has_generator else ""
         return (
-            f"its density matrix has the eigenvalue {least:.3g}, which jumps make larger, where the gradient of the "
-            f"entropy is infinite: mix it, as in q.state(rho, mixed=1e-6){otherwise}"
+            f"its density matrix has the eigenvalue {eigenvalue:.3g}, which jumps make larger, where the gradient of "
+            f"the entropy is infinite: mix it, as in q.state(rho, mixed=1e-6){otherwise}"
         )
 
     def _jump_rates(self, x: np.ndarray, kernels: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """How fast jumps fill kernels of states, and how fast they move all states and empty these; shapes (m,)."""
+        """Return rates at which jumps fill the kernels of states, and scales of their rates, shapes (m,)."""
         assert self.dissipation is not None
-        parts = [part for part in self.dissipation.terms if isinstance(part, ThermalJumps)]
+        jumps = [term for term in self.dissipation.terms if isinstance(term, ThermalJumps)]
 
         def jump_rate(x, rho):  # at the temperatures of x
             y = jnp.concatenate([self.structure.vector(rho), x[self.body_dim :]])
-            return sum(part.generator_field(self, y, self.energy.gradient(x))[: self.body_dim] for part in parts)
+            return sum(jump.generator_field(self, y, self.energy.gradient(x))[: self.body_dim] for jump in jumps)
 
         projectors = np.stack([kernel @ adjoint(kernel) for kernel in kernels])
-        changes, of_kernels = (
+        changes, kernel_changes = (
             np.asarray(self.structure.matrix(jax.vmap(jump_rate)(jnp.asarray(x), jnp.asarray(matrices))))
             for matrices in (self._density_matrices(x), projectors)
         )
         pairs = zip(changes, kernels, strict=True)
-        filled = np.array([np.linalg.eigvalsh(adjoint(kernel) @ change @ kernel)[-1] for change, kernel in pairs])
-        return filled, sum(np.linalg.norm(a, 2, axis=(-2, -1)) for a in (changes, of_kernels))
+        fill_rates = np.array([np.linalg.eigvalsh(adjoint(kernel) @ change @ kernel)[-1] for change, kernel in pairs])
+        return fill_rates, sum(np.linalg.norm(a, 2, axis=(-2, -1)) for a in (changes, kernel_changes))
 
     def _density_matrices(self, x) -> np.ndarray:
-        """The density matrices of a state or of several, shape (m, N, N)."""
+        """Return the density matrices of one or several states, shape (m, N, N)."""
         return np.asarray(self.structure.matrix(np.atleast_2d(x)[:, : self.body_dim]))
 
     @property
     def _zero_eigenvalue_limit(self) -> float:
-        """The largest eigenvalue of a density matrix that is zero: up to rounding, or to the floor of the entropy."""
+        """Largest eigenvalue of a density matrix that counts as zero, by rounding or by the floor of the entropy."""
         return max(self.floor, ZERO_EIGENVALUE_PER_LEVEL * self.structure.size)
 
     def _kernels(self, rho: np.ndarray) -> list[np.ndarray]:
-        """The eigenvectors whose eigenvalue is zero of matrices, shape (m, N, N), each of a shape (N, r)."""
+        """Return the kernels of matrices, shape (m, N, N), each as eigenvectors, shape (N, r)."""
         return [vectors[:, p <= self._zero_eigenvalue_limit] for p, vectors in zip(*np.linalg.eigh(rho), strict=True)]
 
     def _has_dissipation(self, kind: type[Dissipation]) -> bool:
-        return self.dissipation is not None and any(isinstance(part, kind) for part in self.dissipation.terms)
+        return self.dissipation is not None and any(isinstance(term, kind) for term in self.dissipation.terms)
 
     has_matrix_functions = True
 
     # -- laws ---------------------------------------------------------------------------------------------------------
 
     def hamiltonians(self) -> list[np.ndarray]:
-        """The Hamiltonian, at a few times where it depends on one."""
+        """Return the Hamiltonian, at each test time if it depends on time."""
         n, energies = self.body_dim, [s.energy for s in (self.systems_at_test_times() if self.is_driven else [self])]
         energies = [E.body if isinstance(E, BodyBathsEnergy) else E for E in energies]  # temperatures may be traced
         with jax.ensure_compile_time_eval():
@@ -405,7 +402,7 @@ class QuantumSystem(System):
             return [np.asarray(self.structure.matrix(E.gradient(origin)) + E.value(origin) * one) for E in energies]
 
     def casimirs(self) -> dict[str, Energy]:
-        """The trace, and of a system without dissipation the purity: what relaxes keeps none but the trace."""
+        """Return the trace, and without dissipation the purity too."""
         n = self.body_dim
         trace = Quadratic(np.zeros(n), np.where(np.arange(n) < self.structure.size, 1.0, 0.0))
         if self.dissipation is None:
@@ -415,32 +412,32 @@ class QuantumSystem(System):
     # -- products -----------------------------------------------------------------------------------------------------
 
     def __mul__(self, other: QuantumSystem) -> QuantumSystem:
-        """Two systems beside each other, each with its jumps and baths: see :meth:`coupled`."""
+        """Return the product of two systems, each with its jumps and baths; :meth:`coupled` adds an interaction."""
         if not isinstance(other, QuantumSystem):
             return NotImplemented
         systems, offset, terms = (self, other), 0, []
         sizes = [s.structure.size for s in systems]
         for k, s in enumerate(systems):
-            for part in () if s.dissipation is None else s.dissipation.terms:
-                if not isinstance(part, ThermalJumps):
+            for term in () if s.dissipation is None else s.dissipation.terms:
+                if not isinstance(term, ThermalJumps):
                     raise InputError(
-                        f"{type(part).__name__} of a part is none of a product: give it to the product as a whole"
+                        f"{type(term).__name__} of a part is none of a product: give it to the product as a whole"
                     )
-                local = [_tensor_with_identity(np.asarray(V), k, sizes) for V in part.operators]
-                terms.append(part.replace_operators(local, part.bath + offset))
+                operators = [_tensor_with_identity(np.asarray(V), k, sizes) for V in term.operators]
+                terms.append(term.replace_operators(operators, term.bath + offset))
             offset += 0 if s.baths is None else s.baths.number
         if (self.baths is None) != (other.baths is None) and all(s.dissipation is not None for s in systems):
             raise InputError("jumps of one part have a bath and those of the other none: give both, or neither, baths")
         H = [s._constant_hamiltonian() for s in systems]
-        whole = _tensor_with_identity(H[0], 0, sizes) + _tensor_with_identity(H[1], 1, sizes)
+        total_H = _tensor_with_identity(H[0], 0, sizes) + _tensor_with_identity(H[1], 1, sizes)
         parts = self.parts + other.parts
         names = self.names + other.names if len(self.names + other.names) == len(parts) else ()
         names = names if len(set(names)) == len(names) else ()
         baths, floor = _join_baths(self.baths, other.baths), max(self.floor, other.floor)
-        return QuantumSystem(whole, terms or None, baths, VonNeumann(floor), parts, names)
+        return QuantumSystem(total_H, terms or None, baths, VonNeumann(floor), parts, names)
 
     def coupled(self, interaction) -> QuantumSystem:
-        """The system with ``H + interaction``, a Hermitian matrix, shape (N, N); the couplings are split anew."""
+        """Return the system with the Hamiltonian ``H + interaction``, shape (N, N), and its jumps split anew."""
         interaction = checked_hermitian(interaction, "the interaction")
         if interaction.shape != (self.structure.size,) * 2:
             raise InputError(
@@ -458,7 +455,7 @@ class QuantumSystem(System):
 
 
 def _hamiltonian_energy(hamiltonian) -> tuple[int, Energy]:
-    """The size of a Hamiltonian, and ``tr(rho H)`` of coordinates."""
+    """Return the number of levels of a Hamiltonian, and the energy ``tr(rho H)`` as a function of coordinates."""
     if isinstance(hamiltonian, list | tuple) and any(map(_is_hamiltonian_term, hamiltonian)):
         return _energy_of_terms(hamiltonian)
     if callable(hamiltonian) and not isinstance(hamiltonian, HasMatrix):
@@ -475,79 +472,84 @@ def _hamiltonian_energy(hamiltonian) -> tuple[int, Energy]:
         return structure.size, MeanEnergy(structure.vector(hamiltonian), jnp.min(jnp.diag(hamiltonian).real))
     H = checked_hermitian(checked_matrix(hamiltonian, "the Hamiltonian"), "the Hamiltonian")
     with jax.ensure_compile_time_eval():  # numbers, while a family of systems is traced
-        b, common = (
-            jnp.asarray(mf.DensityMatrices(len(H)).vector(H)),
-            jnp.asarray(choose_reference_level(np.diag(H).real)),
-        )
-    return len(H), MeanEnergy(b, common)
+        b = jnp.asarray(mf.DensityMatrices(len(H)).vector(H))
+        reference = jnp.asarray(choose_reference_level(np.diag(H).real))
+    return len(H), MeanEnergy(b, reference)
 
 
 def _value_at_time(function, t: float, what: str):
-    """What a function gives at a time; refused where it is none of one argument."""
+    """Return the value of a function of time at t.
+
+    Raises
+    ------
+    InputError
+        If the function does not accept one argument.
+    """
     try:
         inspect.signature(function).bind(t)
     except TypeError as error:
         raise InputError(f"{what}, where it is a function, is one of the time t alone: {error}") from None
-    except ValueError:  # it does not tell
+    except ValueError:  # the signature is not known
         pass
     return function(t)
 
 
-def _is_hamiltonian_term(part) -> bool:
-    """Whether it is a matrix, or begins with one, and not a row of numbers."""
-    if isinstance(part, list | tuple):
-        return bool(part) and (isinstance(part[0], list | tuple) or _is_hamiltonian_term(part[0]))
-    return isinstance(part, HasMatrix) or np.ndim(part) == 2
+def _is_hamiltonian_term(term) -> bool:
+    """Return whether a term of a list is a matrix, or begins with one, and is not a row of numbers."""
+    if isinstance(term, list | tuple):
+        return bool(term) and (isinstance(term[0], list | tuple) or _is_hamiltonian_term(term[0]))
+    return isinstance(term, HasMatrix) or np.ndim(term) == 2
 
 
-def _energy_of_terms(given: Sequence) -> tuple[int, Energy]:
-    """The same for ``[H0, (H1, f), ...]``."""
+def _energy_of_terms(terms: Sequence) -> tuple[int, Energy]:
+    """Return the number of levels and the energy of a Hamiltonian ``[H0, (H1, f), ...]``, ``H0 + f(t) H1 + ...``."""
     constant: list[np.ndarray] = []
-    moved: list[np.ndarray] = []
+    modulated: list[np.ndarray] = []
     functions = []
-    for i, part in enumerate(given):
-        pair = isinstance(part, list | tuple) and len(part) == 2 and callable(part[1])
-        H, f = part if pair else (part, None)
+    for i, term in enumerate(terms):
+        is_pair = isinstance(term, list | tuple) and len(term) == 2 and callable(term[1])
+        H, f = term if is_pair else (term, None)
         if isinstance(H, list | tuple) and H and _is_hamiltonian_term(H[0]):
             raise InputError(f"term {i} of the Hamiltonian is a matrix, or a pair of a matrix and a function of t")
         H = checked_hermitian(H, f"term {i} of the Hamiltonian")
-        if H.shape != (first := (constant + moved + [H])[0]).shape:
-            raise InputError(f"term {i} of the Hamiltonian has shape {H.shape}, and another one {first.shape}")
+        if H.shape != (first_matrix := (constant + modulated + [H])[0]).shape:
+            raise InputError(f"term {i} of the Hamiltonian has shape {H.shape}, and another one {first_matrix.shape}")
         if f is None:
             constant.append(H)
             continue
         value = _value_at_time(f, TEST_TIMES[0], f"the second of term {i} of the Hamiltonian")
         if np.shape(value) or jnp.result_type(value).kind not in "fiu":
             raise InputError(f"the function of term {i} of the Hamiltonian gives a real number, not {value!r}")
-        moved.append(H)
+        modulated.append(H)
         functions.append(f)
     structure = mf.DensityMatrices(len(H))
     with jax.ensure_compile_time_eval():  # numbers, while a family of systems is traced
-        still, *rows = (jnp.asarray(structure.vector(a)) for a in (sum(constant, np.zeros_like(H)), *moved))
-        common = jnp.asarray(choose_reference_level(np.asarray(still)[: structure.size]))
-    if not moved:
-        return structure.size, MeanEnergy(still, common)
-    at_start = still
+        matrices = (sum(constant, np.zeros_like(H)), *modulated)
+        static, *rows = (jnp.asarray(structure.vector(a)) for a in matrices)
+        reference = jnp.asarray(choose_reference_level(np.asarray(static)[: structure.size]))
+    if not modulated:
+        return structure.size, MeanEnergy(static, reference)
+    initial = static
     for f, row in zip(functions, rows, strict=True):
-        at_start = at_start + f(TEST_TIMES[0]) * row
-    lowest = jnp.min(at_start[: structure.size])  # in the same way where a function is traced
-    return structure.size, TimeDependent(ModulatedExpectationValue(still, tuple(rows), tuple(functions), lowest))
+        initial = initial + f(TEST_TIMES[0]) * row
+    lowest = jnp.min(initial[: structure.size])  # works for traced functions too
+    return structure.size, TimeDependent(ModulatedExpectationValue(static, tuple(rows), tuple(functions), lowest))
 
 
 def _dissipation_terms(dissipation) -> tuple[Dissipation, ...]:
-    found = sum_dissipations(dissipation)
-    terms = () if found is None else found.terms
-    for part in terms:
-        if not isinstance(part, ThermalJumps | SteepestEntropyAscent):
+    total = sum_dissipations(dissipation)
+    terms = () if total is None else total.terms
+    for term in terms:
+        if not isinstance(term, ThermalJumps | SteepestEntropyAscent):
             raise InputError(
                 f"the dissipation of density matrices is lt.ThermalJumps or lt.SteepestEntropyAscent, not "
-                f"{type(part).__name__}"
+                f"{type(term).__name__}"
             )
     return terms
 
 
-def _bind_to_density(part: Dissipation, structure: mf.DensityMatrices) -> Dissipation:
-    return part.bind_to_structure(structure) if isinstance(part, SteepestEntropyAscent) else part
+def _bind_to_density(term: Dissipation, structure: mf.DensityMatrices) -> Dissipation:
+    return term.bind_to_structure(structure) if isinstance(term, SteepestEntropyAscent) else term
 
 
 def _check_parts(parts, names, size: int) -> tuple[tuple[int, ...], tuple[str, ...]]:
@@ -561,18 +563,17 @@ def _check_parts(parts, names, size: int) -> tuple[tuple[int, ...], tuple[str, .
 
 
 def _tensor_with_identity(matrix: np.ndarray, k: int, sizes: Sequence[int]) -> np.ndarray:
-    """An operator of one of two systems as one of both."""
+    """Return an operator of the k-th of two systems as an operator of their product."""
     return np.kron(matrix, np.eye(sizes[1])) if k == 0 else np.kron(np.eye(sizes[0]), matrix)
 
 
-def _join_baths(one: HeatBaths | None, other: HeatBaths | None) -> HeatBaths | None:
-    if one is None or other is None:
-        return one or other
+def _join_baths(a: HeatBaths | None, b: HeatBaths | None) -> HeatBaths | None:
+    if a is None or b is None:
+        return a or b
     kinds = BathEnergy | ReservoirEnergy
-    if not isinstance(one.energy, kinds) or not isinstance(other.energy, kinds):
+    if not isinstance(a.energy, kinds) or not isinstance(b.energy, kinds):
         raise InputError("baths of a product have constant capacities: build the product with baths of its own")
     capacity, temperature = (
-        jnp.concatenate([getattr(one.energy, name), getattr(other.energy, name)])
-        for name in ("capacity", "temperature")
+        jnp.concatenate([getattr(a.energy, name), getattr(b.energy, name)]) for name in ("capacity", "temperature")
     )
-    return HeatBaths(capacity, temperature, one.number + other.number)
+    return HeatBaths(capacity, temperature, a.number + b.number)

@@ -95,24 +95,23 @@ class SimpleClosedSystem(LedgerSystem, VelocityContactSystem):
         validate: bool = True,
         space: mf.Space | None = None,
     ):
-        structure, size, energy = self._build_contact_structure(
-            join_lagrangian_arguments(lagrangian, space), dim, space
-        )
-        at = (size // 2,) if space is None else space.shape
-        self.friction = _make_friction(friction, at, "friction")
-        self.external = None if external is None else _check_flat_function(external, at, at, "the external force")
-        self.heat_power = None if heat_power is None else _check_flat_function(heat_power, at, (), "the heat power")
-        given = (self.friction, self.external, self.heat_power)
-        forces = None if given == (None, None, None) else ForcesAndHeat(*given)
-        self._assemble(structure, size, energy, forces, momentum_maps, validate)
+        lagrangian = join_lagrangian_arguments(lagrangian, space)
+        structure, dim, energy = self._build_contact_structure(lagrangian, dim, space)
+        shape = (dim // 2,) if space is None else space.shape
+        self.friction = _make_friction(friction, shape, "friction")
+        self.external = None if external is None else _check_flat_function(external, shape, shape, "the external force")
+        self.heat_power = None if heat_power is None else _check_flat_function(heat_power, shape, (), "the heat power")
+        terms = (self.friction, self.external, self.heat_power)
+        forces = None if terms == (None, None, None) else ForcesAndHeat(*terms)
+        self._assemble(structure, dim, energy, forces, momentum_maps, validate)
 
     def _assemble(
-        self, structure, size: int, energy: Energy, forces: ForcesAndHeat | None, momentum_maps, validate
+        self, structure, dim: int, energy: Energy, forces: ForcesAndHeat | None, momentum_maps, validate
     ) -> None:
-        whole, total, energy = self._append_ledger(structure, size, energy)
-        entropy = entropy_component(total, size - 1)
-        states = state_space(configuration_space(structure.contact), total - size)
-        self._build(whole, total, energy, entropy, forces, momentum_maps, validate, states)
+        poisson, total_dim, energy = self._append_ledger(structure, dim, energy)
+        entropy = entropy_component(total_dim, dim - 1)
+        space = state_space(configuration_space(structure.contact), total_dim - dim)
+        self._build(poisson, total_dim, energy, entropy, forces, momentum_maps, validate, space)
 
     # -- the state --------------------------------------------------------------------------------------------------
 
@@ -193,13 +192,13 @@ class SimpleClosedSystem(LedgerSystem, VelocityContactSystem):
         return self.tangential_part(x[: self.degrees_of_freedom], covector)
 
     def momentum_jacobians(self, x) -> tuple[jax.Array, jax.Array]:
-        _, W, by_S = self.contact.rates(x[: self.dim_without_ledger])
-        return W, by_S[:, 0]
+        _, W, S_derivative = self.contact.rates(x[: self.dim_without_ledger])
+        return W, S_derivative[:, 0]
 
     def forces_and_power(self, x, v, T) -> tuple[jax.Array, jax.Array, jax.Array]:
         q, _, S, t = self.split_state(x)
-        at = q, v, S, t
-        return self.friction_at(*at, T), self.external_force(*at), self.heating(*at)
+        arguments = q, v, S, t
+        return self.friction_at(*arguments, T), self.external_force(*arguments), self.heating(*arguments)
 
     # -- checks -----------------------------------------------------------------------------------------------------
 
@@ -213,9 +212,9 @@ class SimpleClosedSystem(LedgerSystem, VelocityContactSystem):
     def specific_residuals(self, x) -> dict[str, jax.Array]:
         q, v, S, t = self.split_state(x)
         force = self.friction_force(q, v, S, t)
-        size = jnp.linalg.norm(force) * jnp.linalg.norm(v)
-        injected = jnp.maximum(jnp.dot(force, v), 0.0)
-        return {"F_fr . v <= 0": injected / jnp.where(size > 0.0, size, 1.0)}
+        scale = jnp.linalg.norm(force) * jnp.linalg.norm(v)
+        positive_power = jnp.maximum(jnp.dot(force, v), 0.0)
+        return {"F_fr . v <= 0": positive_power / jnp.where(scale > 0.0, scale, 1.0)}
 
 
 def _temperature(system: SimpleClosedSystem, x):
@@ -226,7 +225,7 @@ def _temperature(system: SimpleClosedSystem, x):
 
 
 def join_lagrangian_arguments(lagrangian, space: mf.Space | None = None):
-    """A Lagrangian as a function of one array."""
+    """Return a Lagrangian as a function of one array."""
     if callable(lagrangian) and not isinstance(lagrangian, Energy) and required_argument_count(lagrangian) == 4:
         raise InputError(
             "the Lagrangian of a simple closed system is one of (q, v, S); what depends on time is external"
@@ -234,14 +233,14 @@ def join_lagrangian_arguments(lagrangian, space: mf.Space | None = None):
     return join_arguments(lagrangian, space)
 
 
-def _make_friction(friction, at: tuple[int, ...], what: str) -> Callable | None:
+def _make_friction(friction, shape: tuple[int, ...], what: str) -> Callable | None:
     if friction is None or callable(friction):
-        return None if friction is None else _check_flat_function(friction, at, at, what)
-    return linear_friction(friction, math.prod(at), f"a coefficient of {what}")
+        return None if friction is None else _check_flat_function(friction, shape, shape, what)
+    return linear_friction(friction, math.prod(shape), f"a coefficient of {what}")
 
 
 class FlattenedFunction(Module):
-    """A function of arrays q and v as one of their entries in a row; and so are its values."""
+    """A function of flat q and v with flat values, from a function of arrays q and v."""
 
     function: Callable
     shape: tuple[int, ...] = eqx.field(static=True)

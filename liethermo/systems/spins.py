@@ -80,23 +80,23 @@ class SpinSystem(System):
         return self.lattice
 
     def field(self, x, dH, dS, dL=()):
-        """As for every system, the motion and the damping of the spins joined before they become a state's."""
+        """Return the vector field; precession and damping of the spins are added before they are stored in a state."""
         damping, heating = _split_damping(self.dissipation)
         spins, n = self._spin_structure, self.body_dim
         if damping is None or spins is None:
             return super().field(x, dH, dS, dL)
         if heating is None:
-            damped, _ = damping.damping_force(spins, x, dH)
-            warmed = jnp.zeros(0)
+            force, _ = damping.damping_force(spins, x, dH)
+            entropy_rates = jnp.zeros(0)
         else:  # the entropy is that of the baths
-            damped, lost = damping.damping_force(
+            force, lost_power = damping.damping_force(
                 spins, x, dH, heating.temperature_signs(dH[n:]), heating.has_site_baths
             )
-            warmed = heating.entropy_rates(lost, dH[n:])
-        return spins.join_state(add_vectors(spins.precession_rates(x, dH), damped), warmed)
+            entropy_rates = heating.entropy_rates(lost_power, dH[n:])
+        return spins.join_state(add_vectors(spins.precession_rates(x, dH), force), entropy_rates)
 
     def scale_at_sites(self, values, v) -> jax.Array:
-        """A vector v times ``values``: a number for each site, or one."""
+        """Return a vector v multiplied by ``values``, one for each site or one for all."""
         spins = self._spin_structure
         assert spins is not None
         return (
@@ -111,7 +111,7 @@ class SpinSystem(System):
         return dot_vectors(spins.split_covectors(alpha), spins.split_covectors(v))
 
     def solve_rotation(self, angles, v) -> jax.Array:
-        """The u with ``u_i - angles_i x u_i = v_i`` at each spin, angles of shape (sites, 3); behind them it is v.
+        """Return u with ``u_i - angles_i x u_i = v_i`` at each spin, angles of shape (sites, 3), and u = v elsewhere.
 
         ``u = (v + a x v + (a . v) a) / (1 + |a|^2)``, as ``a . u = a . v``.
         """
@@ -122,18 +122,18 @@ class SpinSystem(System):
         return spins.join_state(scale_vectors(1.0 / (1.0 + dot_vectors(a, a)), u), v[self.body_dim :])
 
     def state_array(self, x, batch: bool = False):
-        """A state in one row; also the spins alone, shape ``(*sites, 3)``."""
-        shape, given = (*self.lattice, 3), np.shape(x)
-        if given != (self.dim,) and given[-len(shape) :] == shape and (batch or len(given) == len(shape)):
-            x = (x if isinstance(x, jax.Array) else np.asarray(x)).reshape(*given[: -len(shape)], -1)
-        elif given[-1:] not in ((self.dim,), (self.body_dim,)):
+        """Return the flat state x; x may be the spins alone, shape ``(*sites, 3)``."""
+        shape, x_shape = (*self.lattice, 3), np.shape(x)
+        if x_shape != (self.dim,) and x_shape[-len(shape) :] == shape and (batch or len(x_shape) == len(shape)):
+            x = (x if isinstance(x, jax.Array) else np.asarray(x)).reshape(*x_shape[: -len(shape)], -1)
+        elif x_shape[-1:] not in ((self.dim,), (self.body_dim,)):
             raise InputError(
-                f"a state has its spins in shape {shape}, or all {self.dim} components in one row, not shape {given}"
+                f"a state has its spins in shape {shape}, or all {self.dim} components in one row, not shape {x_shape}"
             )
         return super().state_array(x, batch)
 
     def spins(self, x) -> jax.Array:
-        """The spins of states, shape (..., n) to ``(..., *sites, 3)``."""
+        """Return the spins, shape ``(..., *sites, 3)``, of states, shape (..., n)."""
         x = jnp.asarray(x)
         return x[..., : self.body_dim].reshape(*x.shape[:-1], *self.lattice, 3)
 
@@ -146,30 +146,31 @@ class SpinSystem(System):
         return Spheres(math.prod(self.lattice), SPIN_LENGTHS_NAME, self._spin_structure.is_component_major)
 
     def reorder_components(self) -> ReorderedSystem | None:
-        """With the spins component by component; what other dissipations do with components is not known."""
+        """Return the system with its spins component by component; None for dissipations that may use the order."""
         spins = self._spin_structure
-        known = type(self) is SpinSystem and (
+        is_reorderable = type(self) is SpinSystem and (
             self.dissipation is None or _split_damping(self.dissipation)[0] is not None
         )
-        if not known or spins is None or spins.is_component_major or self.is_driven:
+        if not is_reorderable or spins is None or spins.is_component_major or self.is_driven:
             return None
         count = spins.count
         planar = mf.Spins(spins.sites, 0, spins.ratio, interaction_range(self.energy, spins.sites))
         poisson = planar if self.baths is None else poisson_with_baths(planar, self.baths.number)
-        there, back, pulled = (functools.partial(f, count=count) for f in (to_planes, to_sites, planar_energy))
-        functions = [pulled(f) for f in (self.energy, *self.momentum_maps.values())]
+        maps = (functools.partial(f, count=count) for f in (to_planes, to_sites, planar_energy))
+        reorder, restore, pullback = maps
+        functions = [pullback(f) for f in (self.energy, *self.momentum_maps.values())]
         system = eqx.tree_at(lambda s: [s.poisson, s.energy, *s.momentum_maps.values()], self, [poisson, *functions])
-        return ReorderedSystem(system, there, back, pulled)
+        return ReorderedSystem(system, reorder, restore, pullback)
 
     @property
     def _spin_structure(self) -> mf.Spins | None:
-        """The structure of the spins; None of a system that is run in other coordinates."""
+        """Poisson structure of the spins; None if the system runs in other coordinates."""
         poisson = self.poisson.first if isinstance(self.poisson, ProductPoisson) else self.poisson
         return poisson if isinstance(poisson, mf.Spins) else None
 
 
 def _split_damping(dissipation: Dissipation | None) -> tuple[LandauLifshitz | None, Heating | None]:
-    """The damping of the spins and what heats by it; a class of its own may have a force of its own."""
+    """Return the damping of the spins and the heating of baths by it; None for subclasses, whose force may differ."""
     heating = dissipation if type(dissipation) is Heating else None
-    part = dissipation if heating is None else heating.inner
-    return (part if type(part) is LandauLifshitz else None), heating
+    damping = dissipation if heating is None else heating.inner
+    return (damping if type(damping) is LandauLifshitz else None), heating

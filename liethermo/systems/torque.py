@@ -1,4 +1,4 @@
-"""Torques: what acts on a body from outside, as functions of the time, the momentum and the attitude."""
+"""Torques on a body from outside: functions of the time, the momentum and the attitude."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ..tracing.traced import TracedFunction, trace_callables_with_result
 
 
 def check_torque(given: Any, algebra: mf.LieAlgebra, group: mf.MatrixGroup | None) -> tuple[Any, tuple[bool, ...]]:
-    """What a system is given as its torque, its plain functions traced; and which of its parts need the attitude.
+    """Return a checked torque with its plain functions traced, and which of its terms need the attitude.
 
     Raises
     ------
@@ -27,39 +27,39 @@ def check_torque(given: Any, algebra: mf.LieAlgebra, group: mf.MatrixGroup | Non
     """
     if given is None:
         return None, ()
-    parts = _torque_terms(given)
-    if not parts:
+    terms = _torque_terms(given)
+    if not terms:
         raise InputError("torque is an empty list: a system without a torque is given None")
-    needs = tuple(map(_needs_attitude, parts))
+    needs = tuple(map(_needs_attitude, terms))
     if any(needs) and group is None:
-        name = torque_name(parts[needs.index(True)])
+        name = torque_name(terms[needs.index(True)])
         raise InputError(f"the torque {name} depends on the attitude: give the system a group, such as group=mf.SO(3)")
     shape = () if group is None else group.identity.shape
-    # of complex groups both parts, since what is traced here is traced for real arrays
+    # real and imaginary parts of complex groups are separate arguments: functions are traced for real arrays
     complex_group = group is not None and jnp.iscomplexobj(group.identity)
     shapes = ((), algebra.shape, *((shape,) * (2 if complex_group else 1)))
 
     def evaluate_terms(torque, t, mu, *g):
         attitude = g[0] if len(g) == 1 else g[0] + 1j * g[1]
-        return [jnp.asarray(part) for part in _evaluate_terms(torque, needs, t, mu, attitude)]
+        return [jnp.asarray(value) for value in _evaluate_terms(torque, needs, t, mu, attitude)]
 
-    given = parts if isinstance(given, list) else given
+    given = terms if isinstance(given, list) else given
     try:
-        torque, found = trace_callables_with_result(given, evaluate_terms, *shapes)
+        torque, values = trace_callables_with_result(given, evaluate_terms, *shapes)
     except TRACE_ERRORS as error:
         what = f"the torque could not be evaluated on a momentum of shape {algebra.shape}"
         raise FunctionError(explain_trace_error(what, error)) from error
-    for part, result in zip(parts, found, strict=True):
-        if result.shape != algebra.shape or not jnp.issubdtype(result.dtype, jnp.floating):
+    for term, value in zip(terms, values, strict=True):
+        if value.shape != algebra.shape or not jnp.issubdtype(value.dtype, jnp.floating):
             raise FunctionError(
-                f"the torque {torque_name(part)} must return real numbers of shape {algebra.shape}, as the momentum has, "
-                f"not {result.dtype} of shape {result.shape}"
+                f"the torque {torque_name(term)} must return real numbers of shape {algebra.shape}, as the momentum "
+                f"has, not {value.dtype} of shape {value.shape}"
             )
     return torque, needs
 
 
 def evaluate_torque(torque: Any, needs: tuple[bool, ...], t, mu, attitude) -> jax.Array:
-    """The sum of the parts, of the shape of mu."""
+    """Return the sum of the terms of a torque, with the shape of mu."""
     return sum(_evaluate_terms(torque, needs, t, mu, attitude), jnp.zeros_like(mu))
 
 
@@ -85,7 +85,7 @@ def _torque_of_model(model: tuple, t, mu, *attitude) -> jax.Array:
 
 
 def torque_name(torque: Any) -> str:
-    """What a torque is called, in messages and in provenances."""
+    """Return the name of a torque, for messages and provenances."""
     if isinstance(torque, list | tuple):
         return " + ".join(map(torque_name, torque))
     return getattr(torque, "__name__", type(torque).__name__)
@@ -96,20 +96,20 @@ def _torque_terms(torque: Any) -> tuple[Callable, ...]:
 
 
 def _evaluate_terms(torque: Any, needs: tuple[bool, ...], t, mu, attitude) -> list:
-    parts = zip(_torque_terms(torque), needs, strict=True)
-    return [part(t, mu, attitude) if turned else part(t, mu) for part, turned in parts]
+    terms = zip(_torque_terms(torque), needs, strict=True)
+    return [term(t, mu, attitude) if needs_attitude else term(t, mu) for term, needs_attitude in terms]
 
 
-def _needs_attitude(part: Any) -> bool:
-    if not callable(part):
+def _needs_attitude(term: Any) -> bool:
+    if not callable(term):
         raise InputError(
             "a torque is a function of t and mu, or of t, mu and the attitude, such as "
-            f"lt.torques.ConstantInBody([0.0, 0.0, 1.0]), not {type(part).__name__}"
+            f"lt.torques.ConstantInBody([0.0, 0.0, 1.0]), not {type(term).__name__}"
         )
-    number = len(part.program.argument_avals) if isinstance(part, TracedFunction) else required_argument_count(part)
-    if number not in (2, 3):
+    count = len(term.program.argument_avals) if isinstance(term, TracedFunction) else required_argument_count(term)
+    if count not in (2, 3):
         raise InputError(
-            f"a torque is a function of t and mu, or of t, mu and the attitude, and {torque_name(part)} needs "
-            f"{'an unknown number of' if number is None else number} arguments"
+            f"a torque is a function of t and mu, or of t, mu and the attitude, and {torque_name(term)} needs "
+            f"{'an unknown number of' if count is None else count} arguments"
         )
-    return number == 3
+    return count == 3

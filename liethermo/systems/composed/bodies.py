@@ -65,11 +65,11 @@ class Subsystem(Module):
 
     @property
     def count(self) -> int:
-        """How many bodies it is."""
+        """Number of bodies."""
         return 1
 
     def energy_in_state(self, start: int) -> Energy:
-        """The energy as a function of a whole state in which the body begins at a component."""
+        """Return the energy as a function of a whole state, in which the body begins at index ``start``."""
         return self.energy.on(np.arange(start, start + self.dim))
 
 

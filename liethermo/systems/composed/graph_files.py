@@ -69,21 +69,21 @@ def read_graph(path: str | os.PathLike, weight: str = "conductance", nodes: Sequ
     readers = {".csv": _read_csv, ".graphml": _read_graphml}
     if path.suffix.lower() not in readers:
         raise FileError(f"{path} is neither .csv nor .graphml, the kinds of graph that can be read")
-    found, listed = readers[path.suffix.lower()](path, weight)
-    names = _node_names(found, nodes, path)
-    number = {name: i for i, name in enumerate(names)}
-    numbered = []
-    for where, source, target, k in listed:
+    file_names, edges = readers[path.suffix.lower()](path, weight)
+    names = _node_names(file_names, nodes, path)
+    index = {name: i for i, name in enumerate(names)}
+    indexed_edges = []
+    for location, source, target, k in edges:
         for end in (source, target):
-            if end not in number:
-                raise InputError(f"{path}, {where}: there is no node {end!r} among the {len(names)} of the graph")
-        numbered.append((number[source], number[target], k))
+            if end not in index:
+                raise InputError(f"{path}, {location}: there is no node {end!r} among the {len(names)} of the graph")
+        indexed_edges.append((index[source], index[target], k))
     try:
-        graph = graph_edges(numbered, len(names), f"the {weight}", names)
+        graph = graph_edges(indexed_edges, len(names), f"the {weight}", names)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    size = len(names)
-    upper = scipy.sparse.coo_array((np.asarray(graph.weight), (graph.first, graph.second)), (size, size))
+    shape = (len(names), len(names))
+    upper = scipy.sparse.coo_array((np.asarray(graph.weight), (graph.first, graph.second)), shape)
     return Graph(names, scipy.sparse.csr_array(upper + upper.T))
 
 
@@ -91,8 +91,8 @@ _EdgeList = list[tuple[str, str, str, float]]
 
 
 def _read_csv(path: Path, weight: str) -> tuple[tuple[str, ...] | None, _EdgeList]:
-    """The nodes in the order of their first edges, and the edges with where they stand."""
-    listed: _EdgeList = []
+    """Return the nodes in the order of their first edges, and the edges with their locations in the file."""
+    edges: _EdgeList = []
     try:
         with path.open(newline="", encoding="utf-8") as file:
             reader = csv.DictReader(file, skipinitialspace=True)
@@ -101,15 +101,15 @@ def _read_csv(path: Path, weight: str) -> tuple[tuple[str, ...] | None, _EdgeLis
             if lacking:
                 raise InputError(f"{path} has no column {lacking[0]!r} in its first line, but {', '.join(titles)}")
             for row in reader:
-                where = f"line {reader.line_num}"
+                location = f"line {reader.line_num}"
                 source, target = ((row[title] or "").strip() for title in ("source", "target"))
                 if not (source and target):
-                    raise InputError(f"{path}, {where}: an edge has two nodes, but one of them is missing")
-                listed.append((where, source, target, _parse_weight(row[weight], weight, f"{path}, {where}")))
+                    raise InputError(f"{path}, {location}: an edge has two nodes, but one of them is missing")
+                edges.append((location, source, target, _parse_weight(row[weight], weight, f"{path}, {location}")))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise FileError(f"{path} cannot be read as CSV: {error}") from error
-    names = tuple(dict.fromkeys(end for _, source, target, _ in listed for end in (source, target)))
-    return (tuple(sorted(names, key=int)) if all(name.isdecimal() for name in names) else names), listed
+    names = tuple(dict.fromkeys(end for _, source, target, _ in edges for end in (source, target)))
+    return (tuple(sorted(names, key=int)) if all(name.isdecimal() for name in names) else names), edges
 
 
 def _read_graphml(path: Path, weight: str) -> tuple[tuple[str, ...] | None, _EdgeList]:
@@ -119,24 +119,26 @@ def _read_graphml(path: Path, weight: str) -> tuple[tuple[str, ...] | None, _Edg
         raise FileError(f"networkx, which reads {path}, is not installed: pip install networkx") from error
     try:
         graph = networkx.read_graphml(path)
-        declared = _declared_nodes(path)
+        names = _declared_nodes(path)
     except (networkx.NetworkXError, ElementTree.ParseError, OSError, KeyError, ValueError) as error:
         raise FileError(f"{path} cannot be read as GraphML: {error}") from error
-    listed: _EdgeList = []
+    edges: _EdgeList = []
     for source, target, data in graph.edges(data=True):
-        where = f"the edge from {source} to {target}"
-        listed.append((where, source, target, _parse_weight(data.get(weight), weight, f"{path}, {where}")))
-    return declared, listed
+        location = f"the edge from {source} to {target}"
+        edges.append((location, source, target, _parse_weight(data.get(weight), weight, f"{path}, {location}")))
+    return names, edges
 
 
 def _declared_nodes(path: Path) -> tuple[str, ...]:
-    """The nodes that a GraphML file declares: networkx makes up those that only an edge names."""
+    """Return the nodes that a GraphML file declares; networkx adds those that only an edge names."""
     elements = ElementTree.parse(path).iter()
     return tuple(element.attrib["id"] for element in elements if element.tag.rsplit("}")[-1] == "node")
 
 
-def _node_names(found: Iterable[str] | None, nodes, path: Path) -> tuple[str, ...]:
-    names = tuple(found or ()) if nodes is None else tuple(map(str, range(nodes) if isinstance(nodes, int) else nodes))
+def _node_names(file_names: Iterable[str] | None, nodes, path: Path) -> tuple[str, ...]:
+    names = (
+        tuple(file_names or ()) if nodes is None else tuple(map(str, range(nodes) if isinstance(nodes, int) else nodes))
+    )
     if not names:
         raise InputError(f"{path} has no nodes")
     if len(set(names)) < len(names):
@@ -144,8 +146,8 @@ def _node_names(found: Iterable[str] | None, nodes, path: Path) -> tuple[str, ..
     return names
 
 
-def _parse_weight(text, weight: str, where: str) -> float:
+def _parse_weight(text, weight: str, location: str) -> float:
     try:
         return float(text)
     except (TypeError, ValueError):
-        raise InputError(f"{where}: the {weight} is {text!r}, not a number") from None
+        raise InputError(f"{location}: the {weight} is {text!r}, not a number") from None

@@ -20,7 +20,7 @@ from ...functions.conditions import check_numbers, require_condition
 
 
 class Membrane(Module):
-    """What lets particles of one kind pass between two bodies: ``N_1' = L (mu_2 / T_2 - mu_1 / T_1 + …) = -N_2'``.
+    """A membrane that lets particles pass between two bodies: ``N_1' = L (mu_2 / T_2 - mu_1 / T_1 + …) = -N_2'``.
 
     Between equal temperatures ``J = L (mu_2 - mu_1) / T``; what the particles lose heats either body by half. Between
     bodies of different temperature the flux is driven by ``e (1/T_1 - 1/T_2) - (mu_1/T_1 - mu_2/T_2)``, with the energy
@@ -57,17 +57,17 @@ class Membrane(Module):
         )
 
     def process(self, names: Sequence[str], structure: mf.ExtendedPhaseSpace) -> Process:
-        """Which numbers change together, among the bodies of these ``names``, in states of a ``structure``."""
-        a, b = (_body_index(given, names) for given in (self.first, self.second))
+        """Return the process of the membrane between bodies of the given names, in states of a structure."""
+        a, b = (_body_index(body, names) for body in (self.first, self.second))
         if a == b:
             raise InputError(f"a membrane joins two bodies, not {names[a]} with itself")
         stoichiometry, sides = np.zeros(len(structure.particle_indices.N)), np.zeros((2, len(names)))
         for body, kind, sign in ((a, self.species[0], 1.0), (b, self.species[1], -1.0)):
             stoichiometry[_particle_index(body, kind, names, structure.particle_indices)] = sign
             sides[:, body] = 0.5, sign
-        numbers, heated, carried = (tuple(row.tolist()) for row in (stoichiometry, *sides))
+        numbers, heat_shares, entropy_transport = (tuple(row.tolist()) for row in (stoichiometry, *sides))
         L = _check_state_function(self.permeability, structure.dim, "the permeability of a membrane")
-        return Process(numbers, heated, carried, self.carries, L)
+        return Process(numbers, heat_shares, entropy_transport, self.carries, L)
 
 
 class Reaction(Module):
@@ -91,53 +91,54 @@ class Reaction(Module):
 
     def __init__(self, body, stoichiometry: Sequence[float], rate):
         self.body, self.rate = body, _check_coefficient(rate, "the rate of a reaction")
-        found = check_numbers(stoichiometry, "the stoichiometry of a reaction")
-        if found.ndim != 1 or not (np.isfinite(found).all() and np.any(found)):
-            raise InputError(f"the stoichiometry of a reaction is a row of finite numbers, not {found.tolist()}")
-        self.stoichiometry = tuple(found.tolist())
+        numbers = check_numbers(stoichiometry, "the stoichiometry of a reaction")
+        if numbers.ndim != 1 or not (np.isfinite(numbers).all() and np.any(numbers)):
+            raise InputError(f"the stoichiometry of a reaction is a row of finite numbers, not {numbers.tolist()}")
+        self.stoichiometry = tuple(numbers.tolist())
 
     def process(self, names: Sequence[str], structure: mf.ExtendedPhaseSpace) -> Process:
-        """Which numbers change together, among the bodies of these ``names``, in states of a ``structure``."""
+        """Return the process of the reaction among bodies of the given names, in states of a structure."""
         body = _body_index(self.body, names)
         matter = structure.particle_indices
-        own = np.flatnonzero(matter.owner == body)
-        if len(own) != len(self.stoichiometry):
+        indices = np.flatnonzero(matter.owner == body)
+        if len(indices) != len(self.stoichiometry):
             raise InputError(
-                f"a reaction in {names[body]} has {len(own)} stoichiometric numbers, not {len(self.stoichiometry)}"
+                f"a reaction in {names[body]} has {len(indices)} stoichiometric numbers, not {len(self.stoichiometry)}"
             )
-        stoichiometry, heated = np.zeros(len(matter.N)), np.zeros(len(names))
-        stoichiometry[own], heated[body] = self.stoichiometry, 1.0
-        none, L = (0.0,) * len(names), _check_state_function(self.rate, structure.dim, "the rate of a reaction")
-        return Process(tuple(stoichiometry.tolist()), tuple(heated.tolist()), none, jnp.zeros(()), L)
+        stoichiometry, heat_shares = np.zeros(len(matter.N)), np.zeros(len(names))
+        stoichiometry[indices], heat_shares[body] = self.stoichiometry, 1.0
+        no_transport = (0.0,) * len(names)
+        L = _check_state_function(self.rate, structure.dim, "the rate of a reaction")
+        return Process(tuple(stoichiometry.tolist()), tuple(heat_shares.tolist()), no_transport, jnp.zeros(()), L)
 
 
-def _check_coefficient(given, what: str) -> jax.Array | Callable:
-    if callable(given):
-        return given
-    value = check_numbers(given, what, ())
+def _check_coefficient(coefficient, what: str) -> jax.Array | Callable:
+    if callable(coefficient):
+        return coefficient
+    value = check_numbers(coefficient, what, ())
     require_condition(value, lambda L: (L >= 0.0) & (np.inf > L), what + " must be >= 0 and finite, not {value}")
     return value
 
 
 def _check_state_function(coefficient, dim: int, what: str) -> jax.Array | Callable:
-    """A coefficient, as a function checked on states of so many components."""
+    """Return a coefficient; a function is checked on states of shape (dim,)."""
     if not callable(coefficient):
         return coefficient
     return check_function_shape(coefficient, [(dim,)], [()], what, f"a state of shape ({dim},)")[0]
 
 
-def _body_index(given, names: Sequence[str]) -> int:
-    if isinstance(given, str) and given in names:
-        if list(names).count(given) > 1:
-            raise InputError(f"{given!r} is the name of several bodies: give the number of the one that is meant")
-        return list(names).index(given)
-    if isinstance(given, int) and not isinstance(given, bool) and 0 <= given < len(names):
-        return given
-    raise InputError(f"there is no body {given!r}: the bodies are {', '.join(names)}, counted from 0")
+def _body_index(body, names: Sequence[str]) -> int:
+    if isinstance(body, str) and body in names:
+        if list(names).count(body) > 1:
+            raise InputError(f"{body!r} is the name of several bodies: give the number of the one that is meant")
+        return list(names).index(body)
+    if isinstance(body, int) and not isinstance(body, bool) and 0 <= body < len(names):
+        return body
+    raise InputError(f"there is no body {body!r}: the bodies are {', '.join(names)}, counted from 0")
 
 
 def _particle_index(body: int, kind: int, names: Sequence[str], matter: ParticleIndices) -> int:
-    own = np.flatnonzero(matter.owner == body)
-    if not 0 <= kind < len(own):
-        raise InputError(f"{names[body]} has {len(own)} kinds of particles, so no number {kind}")
-    return int(own[kind])
+    indices = np.flatnonzero(matter.owner == body)
+    if not 0 <= kind < len(indices):
+        raise InputError(f"{names[body]} has {len(indices)} kinds of particles, so no number {kind}")
+    return int(indices[kind])

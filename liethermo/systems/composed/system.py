@@ -1,4 +1,4 @@
-"""Composed systems: bodies with entropies of their own that push, rub and warm each other [SML §5]."""
+"""``ComposedSystem``: bodies with entropies of their own that exchange momentum, heat and matter [SML §5]."""
 
 from __future__ import annotations
 
@@ -119,15 +119,15 @@ class ComposedSystem(System):
         energy = check_energy(self._total_energy(structure, coupling), structure.dim, "the energy", allow_time=True)
         entropy = entropy_component(structure.dim, structure.state_indices.S)
         dissipation = self._make_dissipation(structure, energy, conductance, drag, connected, conduction)
-        given = [*(membranes if isinstance(membranes, list | tuple) else [membranes])]
-        given += [*(reactions if isinstance(reactions, list | tuple) else [reactions])]
-        for one in given:
-            if not isinstance(one, Membrane | Reaction):
-                raise InputError(f"membranes and reactions are lt.Membrane and lt.Reaction, not {type(one).__name__}")
-        processes = [one.process(self.names, structure) for one in given]
+        exchanges = [*(membranes if isinstance(membranes, list | tuple) else [membranes])]
+        exchanges += [*(reactions if isinstance(reactions, list | tuple) else [reactions])]
+        for item in exchanges:
+            if not isinstance(item, Membrane | Reaction):
+                raise InputError(f"membranes and reactions are lt.Membrane and lt.Reaction, not {type(item).__name__}")
+        processes = [item.process(self.names, structure) for item in exchanges]
         if processes:
-            exchange = MatterExchange(processes)
-            dissipation = exchange if dissipation is None else dissipation + exchange
+            matter = MatterExchange(processes)
+            dissipation = matter if dissipation is None else dissipation + matter
         momentum_maps = {**_particle_invariants(structure, processes), **name_momentum_maps(momentum_maps)}
         self._build(structure, structure.dim, energy, entropy, dissipation, momentum_maps, validate)
 
@@ -142,48 +142,48 @@ class ComposedSystem(System):
         )
 
     def split(self, x) -> tuple[jax.Array, ...]:
-        """The states of the subsystems, shapes (..., dim_a), in a state or a batch of states.
+        """Return the states of the subsystems, shapes (..., dim_a), from states of the whole, shape (..., n).
 
-        Those of :class:`Copies` are in one array, shape (..., count, dim_a).
+        States of :class:`Copies` form one array, shape (..., count, dim_a).
         """
-        found = jnp.split(self.state(x, batch=True), self._subsystem_offsets[1:-1], axis=-1)
+        states = jnp.split(self.state(x, batch=True), self._subsystem_offsets[1:-1], axis=-1)
         return tuple(
-            part if isinstance(body, Subsystem) else part.reshape(*part.shape[:-1], body.count, body.dim)
-            for part, body in zip(found, self.subsystems, strict=True)
+            y if isinstance(body, Subsystem) else y.reshape(*y.shape[:-1], body.count, body.dim)
+            for y, body in zip(states, self.subsystems, strict=True)
         )
 
     def entropies(self, x) -> jax.Array:
-        """The S_a, shape (..., N)."""
+        """Return the entropies S_a of the bodies, shape (..., N)."""
         return self.state(x, batch=True)[..., self._state_indices.S]
 
     def temperatures(self, x, t=None) -> jax.Array:
-        """The ``T_a = H_{S_a}``, shape (..., N); at a time, where the energy depends on one."""
+        """Return the temperatures ``T_a = H_{S_a}``, shape (..., N), at x and at t if the energy depends on it."""
         return self.evaluate_batch(lambda system, y: system.energy.gradient(y), x, t, "(n)")[..., self._state_indices.S]
 
     def numbers_of_particles(self, x) -> jax.Array:
-        """Those of all bodies, shape (..., K)."""
+        """Return the particle numbers of all bodies, shape (..., K)."""
         return self.state(x, batch=True)[..., self.poisson.particle_indices.N]
 
     def chemical_potentials(self, x, t=None) -> jax.Array:
-        """The ``mu = H_N`` of all particle numbers, shape (..., K); at a time, where the energy depends on one."""
+        """Return the chemical potentials ``mu = H_N``, shape (..., K), at x and at t if the energy depends on it."""
         return self.evaluate_batch(lambda system, y: system.energy.gradient(y), x, t, "(n)")[
             ..., self.poisson.particle_indices.N
         ]
 
     def fourier_factors(self, x, t=None) -> jax.Array:
-        """The skew matrix ``K_ab = k_ab (1/T_a - 1/T_b)``, shape (..., N, N), for which ``S_a' = sum_b K_ab T_b``.
+        """Return the skew matrix ``K_ab = k_ab (1/T_a - 1/T_b)``, shape (..., N, N), with ``S_a' = sum_b K_ab T_b``.
 
-        All of it, zeros too: for few bodies. The dynamics works with the edges alone.
+        The matrix is dense, for systems of few bodies; the dynamics uses the edges alone.
         """
-        cold = 1.0 / self.temperatures(x, t)
-        factors = jnp.zeros((*cold.shape, cold.shape[-1]))
-        for part in () if self.dissipation is None else self.dissipation.terms:
-            if isinstance(part, HeatConduction):
-                i, j = np.array(part.first_bodies, dtype=int), np.array(part.second_bodies, dtype=int)
-                k = jnp.vectorize(part.conductances, signature="(n),(e),(e)->(e)")(
-                    x, 1.0 / cold[..., i], 1.0 / cold[..., j]
+        beta = 1.0 / self.temperatures(x, t)
+        factors = jnp.zeros((*beta.shape, beta.shape[-1]))
+        for term in () if self.dissipation is None else self.dissipation.terms:
+            if isinstance(term, HeatConduction):
+                i, j = np.array(term.first_bodies, dtype=int), np.array(term.second_bodies, dtype=int)
+                k = jnp.vectorize(term.conductances, signature="(n),(e),(e)->(e)")(
+                    x, 1.0 / beta[..., i], 1.0 / beta[..., j]
                 )
-                factor = k * (cold[..., i] - cold[..., j])
+                factor = k * (beta[..., i] - beta[..., j])
                 factors = factors.at[..., i, j].set(factor).at[..., j, i].set(-factor)
         return factors
 
@@ -193,10 +193,10 @@ class ComposedSystem(System):
         if not cold.size:
             return ""
         names = self.names
-        found = [f"the temperature of {names[a]} is {T[a]:.4g}" for a in cold[:MAX_NAMED_BODIES]]
+        clauses = [f"the temperature of {names[a]} is {T[a]:.4g}" for a in cold[:MAX_NAMED_BODIES]]
         if cold.size > MAX_NAMED_BODIES:
-            found.append(f"of {cold.size - MAX_NAMED_BODIES} more likewise")
-        return f"{' and '.join(found)}: it has to be positive"
+            clauses.append(f"of {cold.size - MAX_NAMED_BODIES} more likewise")
+        return f"{' and '.join(clauses)}: it has to be positive"
 
     def domain_margin(self, x):
         return jnp.min(self.energy.gradient(x)[..., self._state_indices.S])
@@ -204,22 +204,21 @@ class ComposedSystem(System):
     def sparsity_pattern(self) -> scipy.sparse.csr_array | None:
         if self.poisson.species:
             return None
-        parts = [
-            _poisson_pattern(self.poisson),
-            *([] if self.dissipation is None else [self.dissipation.couplings(self)]),
-        ]
-        through, hessian = union_pattern(parts), self.energy.couplings(self.dim)
-        if through is None or hessian is None:
+        patterns = [_poisson_pattern(self.poisson)]
+        if self.dissipation is not None:
+            patterns.append(self.dissipation.couplings(self))
+        operator, hessian = union_pattern(patterns), self.energy.couplings(self.dim)
+        if operator is None or hessian is None:
             return None
-        itself = scipy.sparse.eye_array(self.dim, dtype=bool, format="csr")
-        return pattern_of_matrix((through + itself) @ (hessian + itself))
+        identity = scipy.sparse.eye_array(self.dim, dtype=bool, format="csr")
+        return pattern_of_matrix((operator + identity) @ (hessian + identity))
 
     def residual_weights(self, x) -> jax.Array:
-        """The temperatures at the entropies: ``T S'`` is a flow of energy, linear in temperatures where S' is not."""
+        """Return temperatures as weights of entropies: ``T S'`` is linear in the temperatures, unlike S'."""
         S = self._state_indices.S
         return jnp.ones_like(x).at[S].set(self.energy.gradient(x)[S])
 
-    # -- how it is put together -----------------------------------------------------------------------------------
+    # -- construction -----------------------------------------------------------------------------------
 
     @property
     def _state_indices(self) -> StateIndices:
@@ -227,13 +226,13 @@ class ComposedSystem(System):
 
     @property
     def _subsystem_offsets(self) -> np.ndarray:
-        """Where each of the subsystems begins in a state, and the end."""
+        """Index of the first component of each subsystem, followed by the dimension of the state."""
         return np.cumsum([0, *(body.count * body.dim for body in self.subsystems)])
 
     def _total_energy(self, structure: mf.ExtendedPhaseSpace, coupling) -> Energy:
         terms = [
-            body.energy_in_state(int(at))
-            for body, at in zip(self.subsystems, self._subsystem_offsets[:-1], strict=True)
+            body.energy_in_state(int(start))
+            for body, start in zip(self.subsystems, self._subsystem_offsets[:-1], strict=True)
         ]
         if coupling is not None:
             terms += [
@@ -242,58 +241,58 @@ class ComposedSystem(System):
         return sum(terms[1:], terms[0])
 
     def _make_dissipation(self, structure, energy, conductance, drag, connected, conduction) -> Dissipation | None:
-        found: list[Dissipation] = []
+        terms: list[Dissipation] = []
         dofs = structure.degrees_of_freedom
-        first = np.cumsum([0, *(body.count for body in self.subsystems)])
+        first_indices = np.cumsum([0, *(body.count for body in self.subsystems)])
         bodies = tuple(
             a
-            for body, i in zip(self.subsystems, first[:-1].tolist(), strict=True)
+            for body, i in zip(self.subsystems, first_indices[:-1].tolist(), strict=True)
             for a in range(i, i + body.count)
             if isinstance(body.friction, str)
         )
         if bodies:
-            found.append(ContactFriction(bodies, self._is_entropy_producing(energy, structure, bodies)))
+            terms.append(ContactFriction(bodies, self._is_entropy_producing(energy, structure, bodies)))
         rates = [_diagonal_friction(body) for body in self.subsystems]
-        if any(R is not None for R in rates):  # all that are diagonal in one
-            none = [jnp.zeros(body.count * body.degrees_of_freedom) for body in self.subsystems]
-            all_rates = [z if R is None else R for R, z in zip(rates, none, strict=True)]
-            found.append(LinearFriction(jnp.concatenate(all_rates)))
-        for body, R, a in zip(self.subsystems, rates, first[:-1].tolist(), strict=True):
+        if any(R is not None for R in rates):  # one dissipation for all diagonal frictions
+            zeros = [jnp.zeros(body.count * body.degrees_of_freedom) for body in self.subsystems]
+            diagonals = [z if R is None else R for R, z in zip(rates, zeros, strict=True)]
+            terms.append(LinearFriction(jnp.concatenate(diagonals)))
+        for body, R, a in zip(self.subsystems, rates, first_indices[:-1].tolist(), strict=True):
             if R is None and not (body.friction is None or isinstance(body.friction, str)):
-                found.append(LinearFriction(body.friction, body_index=a))
+                terms.append(LinearFriction(body.friction, body_index=a))
         if conductance is not None:
-            given, functions = _split_conductances(conductance, len(dofs))
-            graph = graph_edges(given, len(dofs), "the conductance", self.names)
+            constants, functions = _split_conductances(conductance, len(dofs))
+            graph = graph_edges(constants, len(dofs), "the conductance", self.names)
             laws = _conduction_laws(graph, functions, structure.dim, self.names) if functions else ()
             if connected:
                 _require_connected(graph, self.names)
-            found.append(HeatConduction(graph._replace(weight=jnp.zeros(0)) if laws else graph, laws, conduction))
+            terms.append(HeatConduction(graph._replace(weight=jnp.zeros(0)) if laws else graph, laws, conduction))
         if drag is not None:
             graph = graph_edges(drag, len(dofs), "the drag", self.names)
             _require_velocities(graph, dofs, self.names)
-            found.append(Drag(graph))
-        return sum(found[1:], found[0]) if found else None
+            terms.append(Drag(graph))
+        return sum(terms[1:], terms[0]) if terms else None
 
     def _is_entropy_producing(self, energy: Energy, structure: mf.ExtendedPhaseSpace, bodies: tuple[int, ...]) -> bool:
-        """Whether contact friction in some bodies is known to produce entropy: see :func:`is_mechanical`."""
+        """Return whether contact friction in some bodies is known to produce entropy: see :func:`is_mechanical`."""
         if is_traced(energy):
             return False
-        own = sum(len(body.energy_in_state(0).terms) for body in self.subsystems)
+        n_body_terms = sum(len(body.energy_in_state(0).terms) for body in self.subsystems)
         momenta = structure.state_indices.p[np.isin(structure.state_indices.owner, bodies)]
         points = np.random.default_rng(0).standard_normal((2, structure.dim))
         return all(
             isinstance(body.energy, Energy) and is_mechanical(body.energy, body.dim)
             for body in self.subsystems
             if isinstance(body.friction, str)
-        ) and all(is_independent_of(term, points, momenta) for term in energy.terms[own:])
+        ) and all(is_independent_of(term, points, momenta) for term in energy.terms[n_body_terms:])
 
 
 MAX_NAMED_BODIES = 3
-"""Bodies that a message names."""
+"""Largest number of bodies that a message names."""
 
 
 def _poisson_pattern(structure: mf.ExtendedPhaseSpace) -> scipy.sparse.csr_array:
-    """The pattern of the Poisson tensor."""
+    """Return the sparsity pattern of the Poisson tensor."""
     q, p, _, _ = structure.state_indices
     return sparsity_pattern(np.concatenate([q, p]), np.concatenate([p, q]), structure.dim)
 
@@ -302,28 +301,29 @@ def _poisson_pattern(structure: mf.ExtendedPhaseSpace) -> scipy.sparse.csr_array
 
 
 def _diagonal_friction(body: Subsystem | Copies) -> jax.Array | None:
-    """The diagonal friction of a subsystem, an entry for each momentum."""
+    """Return the diagonal friction of a subsystem, an entry for each momentum; None if it has another friction."""
     R = body.friction
     return R.ravel() if isinstance(R, jax.Array) and (R.ndim == 1 or isinstance(body, Copies)) else None
 
 
 def _coupling_energy(V, structure: mf.ExtendedPhaseSpace) -> Energy:
-    """A coupling as an Energy of the whole state."""
+    """Return a coupling as an Energy of the whole state."""
     if isinstance(V, Energy):
         return V
     if not callable(V):
         raise InputError(f"a coupling is a function of q, or of (q, S), or an Energy, not {type(V).__name__}")
     q, _, S, _ = structure.state_indices
-    needed, N = required_argument_count(V), structure.particle_indices.N
-    if needed == 1:
+    n_arguments, N = required_argument_count(V), structure.particle_indices.N
+    if n_arguments == 1:
         return Function(V).on(q)
-    parts = (q, S, N) if structure.species and needed is not None and needed > 2 else (q, S)
-    joined = _SplitArguments(V, tuple(np.cumsum([len(part) for part in parts[:-1]]).tolist()))
-    return (TimeDependent(joined) if needed == len(parts) + 1 else Function(joined)).on(np.concatenate(parts))
+    indices = (q, S, N) if structure.species and n_arguments is not None and n_arguments > 2 else (q, S)
+    function = _SplitArguments(V, tuple(np.cumsum([len(i) for i in indices[:-1]]).tolist()))
+    energy = TimeDependent(function) if n_arguments == len(indices) + 1 else Function(function)
+    return energy.on(np.concatenate(indices))
 
 
 class _SplitArguments(Module):
-    """V(q, S), or V(q, S, N), and of t, as a function of one array, and of t."""
+    """A function of one array (and t), from V(q, S) or V(q, S, N) (and t)."""
 
     V: Callable
     split_indices: tuple[int, ...] = eqx.field(static=True)
@@ -333,45 +333,45 @@ class _SplitArguments(Module):
 
 
 def _particle_invariants(structure: mf.ExtendedPhaseSpace, processes: Sequence[Process]) -> dict[str, Energy]:
-    """The sums of particle numbers that no process changes."""
+    """Return the sums of particle numbers that no process changes, by name."""
     N = structure.particle_indices.N
-    found: dict[str, Energy] = {}
+    invariants: dict[str, Energy] = {}
     for i, weights in enumerate(conserved_numbers(processes, len(N)) if len(N) else ()):
         b = np.zeros(structure.dim)
         b[N] = weights
-        found[f"particles {i + 1}"] = Quadratic(jnp.zeros(structure.dim), b)
-    return found
+        invariants[f"particles {i + 1}"] = Quadratic(jnp.zeros(structure.dim), b)
+    return invariants
 
 
 def _split_conductances(conductance, bodies: int) -> tuple[Any, list[tuple[int, int, Callable]]]:
-    """A graph of conductances, with 1 for functions, and the edges that have one."""
+    """Return conductances with functions replaced by 1, and the edges (i, j, function) with functions."""
     if callable(conductance):
         conductance = [(0, 1, conductance)]
         if bodies != 2:
             raise InputError(
                 f"the conductance as one function is meant for two bodies, not {bodies}: give edges (i, j, function)"
             )
-    listed = isinstance(conductance, list | tuple) and all(isinstance(edge, tuple) for edge in conductance)
-    functions = [edge for edge in conductance if any(map(callable, edge))] if listed else []
+    is_edge_list = isinstance(conductance, list | tuple) and all(isinstance(edge, tuple) for edge in conductance)
+    functions = [edge for edge in conductance if any(map(callable, edge))] if is_edge_list else []
     if not functions:
         return conductance, []
-    return [tuple(1.0 if callable(part) else part for part in edge) for edge in conductance], functions
+    return [tuple(1.0 if callable(entry) else entry for entry in edge) for edge in conductance], functions
 
 
 def _conduction_laws(graph: Edges, functions, dim: int, names: tuple[str, ...]) -> tuple[Callable, ...]:
-    """A function of (T_i, T_j, x) for each edge of a graph, checked: where none is given, its weight."""
-    found = {}
+    """Return a checked function of (T_i, T_j, x) for each edge of a graph: its weight if no function is given."""
+    laws = {}
     for i, j, k in functions:
         law = k if required_argument_count(k) == 3 else LastArgumentIgnored(k)
         what = f"the conductance between {names[int(i)]} and {names[int(j)]}"
         law, _ = check_function_shape(law, ((), (), (dim,)), [()], what, "(T_i, T_j), or (T_i, T_j, x)")
-        found[min(i, j), max(i, j)] = law if i < j else _SwappedLaw(law)
-    pairs = zip(graph.first.tolist(), graph.second.tolist(), graph.weight, strict=True)
-    return tuple(found.get((i, j), ConstantFunction(weight)) for i, j, weight in pairs)
+        laws[min(i, j), max(i, j)] = law if i < j else _SwappedLaw(law)
+    edges = zip(graph.first.tolist(), graph.second.tolist(), graph.weight, strict=True)
+    return tuple(laws.get((i, j), ConstantFunction(weight)) for i, j, weight in edges)
 
 
 class _SwappedLaw(Module):
-    """A law of two bodies, with the bodies in the other order."""
+    """A conduction law with its two bodies exchanged."""
 
     law: Callable
 
@@ -380,11 +380,11 @@ class _SwappedLaw(Module):
 
 
 def _require_connected(graph: Edges, names: tuple[str, ...]) -> None:
-    part = connected_components(graph, len(names))
-    if part.max() > 0:
-        examples = [" and ".join(np.array(names)[part == i][:2]) for i in (0, 1)]
+    labels = connected_components(graph, len(names))
+    if labels.max() > 0:
+        examples = [" and ".join(np.array(names)[labels == i][:2]) for i in (0, 1)]
         raise InputError(
-            f"the conductance falls into {part.max() + 1} parts that exchange no heat, such as that of {examples[0]} "
+            f"the conductance falls into {labels.max() + 1} parts that exchange no heat, such as that of {examples[0]} "
             f"and that of {examples[1]}. If that is meant, say connected=False"
         )
 
