@@ -22,10 +22,6 @@ from .compiled.paced import CompiledAdaptiveRuns
 from .growth import DENSE_JACOBIAN_DIM
 from .pacing import (
     ATTEMPT_FIELDS,
-    PAUSED_AT_EVENT,
-    PAUSED_AT_STOP,
-    PAUSED_FOR_GROWTH_RATE,
-    REACHED_END,
     AdaptiveState,
     StepControl,
     advance_adaptive,
@@ -207,7 +203,7 @@ class PauseHandler:
         between the two signs, since it is not a number, neither is whether the event happens: the run ends.
         What is watched for a fall alone may jump: it has fallen.
         """
-        paces, there = self.adaptive_runs, self.paused_indices(PAUSED_AT_EVENT)
+        paces, there = self.adaptive_runs, self.paused_indices(StatusCode.PAUSED_AT_EVENT)
         if not there.size:
             return
         value, before = (
@@ -226,7 +222,9 @@ class PauseHandler:
             paces.write("last_stop_time", there, t)
             paces.write("steps_at_last_stop", there, paces.read("step", there))
             paces.write(
-                "status", there, np.where(t >= paces.read("stop_time", there), PAUSED_AT_STOP, StatusCode.COMPLETED)
+                "status",
+                there,
+                np.where(t >= paces.read("stop_time", there), StatusCode.PAUSED_AT_STOP, StatusCode.COMPLETED),
             )
 
     def _is_zero_to_rounding(self, there: np.ndarray, value: np.ndarray, before: np.ndarray) -> np.ndarray:
@@ -254,17 +252,17 @@ class PauseHandler:
     def resume_paused(self) -> None:
         """Those at a stop are done or go on to the next, and what grows near a state is looked at."""
         paces, status = self.adaptive_runs, self.adaptive_runs.read("status")
-        there = np.flatnonzero(status == PAUSED_AT_STOP)
+        there = np.flatnonzero(status == StatusCode.PAUSED_AT_STOP)
         if there.size:
             t = paces.read("t", there)
             done = t >= self.stop_times[-1]
-            paces.write("status", there[done], REACHED_END)
+            paces.write("status", there[done], StatusCode.REACHED_END)
             there, t = there[~done], t[~done]
         if there.size:
             paces.write("last_stop_time", there, t)
             paces.write("steps_at_last_stop", there, paces.read("step", there))
             paces.write("stop_time", there, self.stop_times[np.searchsorted(self.stop_times, t, side="right")])
-        waiting = np.concatenate([there, np.flatnonzero(status == PAUSED_FOR_GROWTH_RATE)])
+        waiting = np.concatenate([there, np.flatnonzero(status == StatusCode.PAUSED_FOR_GROWTH_RATE)])
         if not waiting.size:
             return
         unknown = waiting[np.isnan(paces.read("growth_rate", waiting))]

@@ -62,11 +62,6 @@ goes on varies, and gives oscillations that nothing excites small rates of eithe
 JACOBIAN_CHANGE_RTOL = 0.05
 """Change of the derivative of the motion, relative to it, below which what grows is not looked for again."""
 
-PAUSED_AT_STOP, PAUSED_FOR_GROWTH_RATE, PAUSED_AT_EVENT, REACHED_END = 20, 21, 22, 23
-"""Why a run pauses, beside the :class:`StatusCode` of how it ended: it is where steps had to end; what grows near its state
-is to be looked at; it is where what is watched changes its sign; it is at its end."""
-
-
 ATTEMPT_FIELDS = ("x", "energy", "entropy", "step", "t", "last_step_size")
 """What is recorded of each attempt of a trajectory that is watched: fields of its state, its time and its step."""
 
@@ -265,7 +260,7 @@ def accept_or_reject(
         return jnp.where(goes_on, after, before)
 
     state = jax.tree_util.tree_map(lambda after, before: jnp.where(good, after, before), new, old)
-    code = jnp.where(goes_on & (reached >= pace.stop_time), PAUSED_AT_STOP, code)
+    code = jnp.where(goes_on & (reached >= pace.stop_time), StatusCode.PAUSED_AT_STOP, code)
     tried = pace.n_attempts + 1.0
     after = AdaptiveState(
         state=state._replace(status=code.astype(old.status.dtype), residual=new.residual),
@@ -342,7 +337,7 @@ def apply_event_detection(
     later = sight.time_after > pace.t
     lost, ends = looking & ~solved, at_root | at_start
     proposed = jnp.where(cut, first * h, jnp.where(looking | begins, pace.next_step_size, sight.next_step_size))
-    code = jnp.where(ends, PAUSED_AT_EVENT, jnp.where(looking, StatusCode.COMPLETED, sight.status))
+    code = jnp.where(ends, StatusCode.PAUSED_AT_EVENT, jnp.where(looking, StatusCode.COMPLETED, sight.status))
     if pacing.adaptive:
         proposed = jnp.where(lost, FACTOR_AFTER_NONCONVERGENCE * search.step_size, proposed)
         short = jnp.where(new.status == StatusCode.COMPLETED, StatusCode.NON_FINITE, StatusCode.STEP_UNDERFLOW)
@@ -450,7 +445,9 @@ def limit_by_growth_rate(method: OneStepMethod, pace: AdaptiveState, now) -> Ada
         jnp.inf,
     )
     unknown = ~short & ~same
-    paused = jnp.where(unknown & (pace.state.status == StatusCode.COMPLETED), PAUSED_FOR_GROWTH_RATE, pace.state.status)
+    paused = jnp.where(
+        unknown & (pace.state.status == StatusCode.COMPLETED), StatusCode.PAUSED_FOR_GROWTH_RATE, pace.state.status
+    )
     return pace._replace(
         state=pace.state._replace(status=paused.astype(pace.state.status.dtype)),
         next_step_size=jnp.where(short | unknown, pace.next_step_size, jnp.minimum(pace.next_step_size, limit)),

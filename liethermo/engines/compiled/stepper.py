@@ -26,6 +26,7 @@ from ...tracing.caching import LRUCache
 from ...tracing.calls import deferred_p
 from ...tracing.scalarize import report_compiler_faults, scalarize
 from ..array import max_saves_per_call
+from ..codes import StatusCode
 from ..pacing import (
     ATTEMPT_FIELDS,
     AdaptiveState,
@@ -271,9 +272,9 @@ class CompiledStepLoop:
         blocks = self.make_blocks({"x": x, **fields}, parameters)
         first = np.ascontiguousarray(parameters if np.ndim(parameters) == 1 else parameters[0], dtype=np.float64)
         status = self.block_rows(blocks, "status")
-        empty = status == EMPTY_LANE_STATUS
+        empty = status == StatusCode.EMPTY_LANE
         self._loops.loop_functions(0, planned)[0](first.ctypes.data, blocks.ctypes.data, len(blocks))
-        status[empty] = EMPTY_LANE_STATUS
+        status[empty] = StatusCode.EMPTY_LANE
         return blocks
 
     def block_rows(self, blocks: np.ndarray, name: str | None = None) -> np.ndarray:
@@ -338,7 +339,7 @@ class CompiledStepLoop:
     def _mark_empty_lanes(self, whole: np.ndarray, number: int) -> np.ndarray:
         """Blocks, shape (blocks, rows, lanes), of so many trajectories, their empty lanes marked; each in one row."""
         used = number - (len(whole) - 1) * self.lanes
-        whole[-1, self._layout.first_rows["status"], used:] = EMPTY_LANE_STATUS
+        whole[-1, self._layout.first_rows["status"], used:] = StatusCode.EMPTY_LANE
         return whole.reshape(len(whole), -1)
 
     def read_fields(self, blocks: np.ndarray, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
@@ -409,9 +410,6 @@ class CompiledStepLoop:
                 self._newton_code = compile_newton_solver(program, self._layout, self._is_per_trajectory, self.lanes)
             return self._newton_code.function_address("solve")
 
-
-EMPTY_LANE_STATUS = 9.0
-"""Status of a lane without a trajectory."""
 
 MAX_CACHED_STEP_LOOPS = 128
 """Forms whose loops are held in memory."""

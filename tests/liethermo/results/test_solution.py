@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import liethermo as lt
-from liethermo.engines.codes import StatusCode
+from liethermo.engines.codes import RESULT_CODES
 
 X0 = [0.001, 1.0, 0.001]
 
@@ -199,8 +199,8 @@ def test_double_precision_is_on():
 
 
 def test_statuses_have_one_vocabulary():
-    for code in StatusCode:
+    for code in RESULT_CODES:
         assert lt.Status(code, "a sentence", 1, 0.0) == lt.Status(code.status_name, "a sentence", 1, 0.0)
-    assert [code.status_name for code in StatusCode if lt.Status(code, "", 0, 0.0).ok] == ["completed", "event"]
+    assert [code.status_name for code in RESULT_CODES if lt.Status(code, "", 0, 0.0).ok] == ["completed", "event"]
     with pytest.raises(lt.InputError, match=r"no status 'finished'; there are completed, not_converged"):
         lt.Status("finished", "a sentence", 1, 0.0)
