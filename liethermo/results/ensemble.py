@@ -150,7 +150,7 @@ class Ensemble(AuditableResult):
     solution_builder: Callable[[Ensemble, int], Solution] | None = field(default=None, repr=False, compare=False)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "alone": None}
+        return {**super().__getstate__(), "solution_builder": None}
 
     def __len__(self) -> int:
         return len(self.status)

@@ -128,7 +128,7 @@ class AuditableResult(SaveableResult):
         return Evidence() if self.evidence_source is None else self.evidence_source()
 
     def __getstate__(self) -> dict[str, Any]:  # a copy in another process knows the evidence, not how to find it
-        return {**vars(self), "evidence": self.evidence, "witness": None}
+        return {**vars(self), "evidence": self.evidence, "evidence_source": None}
 
 
 class StepReplay(Protocol):
