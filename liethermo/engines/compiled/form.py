@@ -34,13 +34,13 @@ class ProgramStructure:
 
     @staticmethod
     @memoize
-    def from_module(system: eqx.Module) -> ProgramStructure:
+    def from_module(module: eqx.Module) -> ProgramStructure:
         """The form of a system, a method or a pacing, its parameters being the arrays among its leaves."""
-        dynamic, static = eqx.partition(system, eqx.is_inexact_array)
+        dynamic, static = eqx.partition(module, eqx.is_inexact_array)
         leaves, structure = jax.tree_util.tree_flatten(dynamic)
-        functions, outline = jax.tree_util.tree_flatten(static)
+        static_leaves, static_structure = jax.tree_util.tree_flatten(static)
         return ProgramStructure(
-            (outline, tuple(functions)),
+            (static_structure, tuple(static_leaves)),
             tuple(np.shape(leaf) for leaf in leaves),
             lambda arrays: eqx.combine(jax.tree_util.tree_unflatten(structure, arrays), static),
         )
@@ -58,12 +58,12 @@ class ProgramStructure:
 
 
 @memoize
-def parameter_arrays(tree: eqx.Module) -> tuple[np.ndarray, ...]:
+def parameter_arrays(module: eqx.Module) -> tuple[np.ndarray, ...]:
     """The parameters of a system, a method or a pacing."""
-    leaves = jax.tree_util.tree_leaves(eqx.filter(tree, eqx.is_inexact_array))
+    leaves = jax.tree_util.tree_leaves(eqx.filter(module, eqx.is_inexact_array))
     return tuple(np.asarray(leaf, dtype=np.float64) for leaf in leaves)
 
 
-def flat_parameters(*trees: eqx.Module) -> np.ndarray:
+def flat_parameters(*modules: eqx.Module) -> np.ndarray:
     """The parameters of systems, methods or pacings, one after another, shape (p,)."""
-    return np.concatenate([np.zeros(0), *(array.ravel() for tree in trees for array in parameter_arrays(tree))])
+    return np.concatenate([np.zeros(0), *(array.ravel() for module in modules for array in parameter_arrays(module))])

@@ -30,8 +30,8 @@ SAFE_OPEN_FLAGS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | 
 
 def cache_folder() -> Path | None:
     """Where machine code is kept: ``$LIETHERMO_CACHE``, or a folder in the user's cache directory; None without."""
-    if named := os.environ.get("LIETHERMO_CACHE"):
-        return Path(named)
+    if user_folder := os.environ.get("LIETHERMO_CACHE"):
+        return Path(user_folder)
     try:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "liethermo"
     except RuntimeError:  # there is no HOME, and nobody knows the user
@@ -47,17 +47,17 @@ def read_code(name: str) -> bytes | None:
         with open(
             folder / f"{name}.o", "rb", opener=lambda path, flags: os.open(path, flags | SAFE_OPEN_FLAGS)
         ) as file:
-            said = os.fstat(file.fileno())
-            if not stat.S_ISREG(said.st_mode) or said.st_size > MAX_FILE_BYTES:
+            file_status = os.fstat(file.fileno())
+            if not stat.S_ISREG(file_status.st_mode) or file_status.st_size > MAX_FILE_BYTES:
                 return None
-            if fault := _why_untrusted(said):
-                _warn_untrusted(str(folder / f"{name}.o"), fault)
+            if reason := _why_untrusted(file_status):
+                _warn_untrusted(str(folder / f"{name}.o"), reason)
                 return None
-            whole = file.read()
+            content = file.read()
     except (OSError, ValueError):
         return None
-    seal, found = whole[:CHECKSUM_BYTES], whole[CHECKSUM_BYTES:]
-    return found if found and seal == hashlib.sha256(found).digest() else None
+    checksum, code = content[:CHECKSUM_BYTES], content[CHECKSUM_BYTES:]
+    return code if code and checksum == hashlib.sha256(code).digest() else None
 
 
 def write_code(name: str, code: bytes) -> None:
@@ -78,34 +78,34 @@ def _trusted_folder() -> Path | None:
         folder.parent.mkdir(parents=True, exist_ok=True)
         with contextlib.suppress(FileExistsError):
             folder.mkdir(mode=0o700)
-        said = os.lstat(folder)
+        folder_status = os.lstat(folder)
     except (OSError, ValueError):
         return None
-    if stat.S_ISLNK(said.st_mode):
+    if stat.S_ISLNK(folder_status.st_mode):
         _warn_untrusted(str(folder), "it is a link")
-    elif not stat.S_ISDIR(said.st_mode):
+    elif not stat.S_ISDIR(folder_status.st_mode):
         _warn_untrusted(str(folder), "it is no folder")
-    elif fault := _why_untrusted(said):
-        _warn_untrusted(str(folder), fault)
+    elif reason := _why_untrusted(folder_status):
+        _warn_untrusted(str(folder), reason)
     else:
         return folder
     return None
 
 
-def _why_untrusted(said: os.stat_result) -> str:
+def _why_untrusted(status: os.stat_result) -> str:
     """Why what is found on disk may be somebody else's, in words; empty where it is this user's alone."""
     if not hasattr(os, "geteuid"):
         return ""
-    if said.st_uid != os.geteuid():
+    if status.st_uid != os.geteuid():
         return "it belongs to another user"
-    return "others may write to it" if said.st_mode & (stat.S_IWGRP | stat.S_IWOTH) else ""
+    return "others may write to it" if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH) else ""
 
 
 @functools.cache
-def _warn_untrusted(path: str, fault: str) -> None:
+def _warn_untrusted(path: str, reason: str) -> None:
     """Say so once."""
     warn(
-        f"machine code is not kept in {path}: {fault}, and it could run anything as you. It is compiled in memory; "
+        f"machine code is not kept in {path}: {reason}, and it could run anything as you. It is compiled in memory; "
         "give LIETHERMO_CACHE a folder of your own (chmod 700)",
         CacheWarning,
     )

@@ -40,14 +40,14 @@ class JacobianCompression:
     def __init__(self, pattern: scipy.sparse.csr_array, stages: int = 1):
         self.dim, self.stages = pattern.shape[0], stages
         self.front_width = _max_level_width(pattern)
-        sizes = np.diff(pattern.indptr)
-        self.dense_rows = np.flatnonzero(sizes > _max_coloured_row_size(sizes))
+        row_sizes = np.diff(pattern.indptr)
+        self.dense_rows = np.flatnonzero(row_sizes > _max_coloured_row_size(row_sizes))
         self._dense_row_columns = [pattern.indices[pattern.indptr[i] : pattern.indptr[i + 1]] for i in self.dense_rows]
-        rows, columns = np.repeat(np.arange(self.dim), sizes), pattern.indices
-        plain = ~np.isin(rows, self.dense_rows)
-        rows, columns = rows[plain], columns[plain]
-        rest = scipy.sparse.csr_array((np.ones(len(rows), dtype=bool), (rows, columns)), pattern.shape)
-        self.colours = _colour_columns(rest)
+        rows, columns = np.repeat(np.arange(self.dim), row_sizes), pattern.indices
+        is_coloured = ~np.isin(rows, self.dense_rows)
+        rows, columns = rows[is_coloured], columns[is_coloured]
+        coloured_pattern = scipy.sparse.csr_array((np.ones(len(rows), dtype=bool), (rows, columns)), pattern.shape)
+        self.colours = _colour_columns(coloured_pattern)
         order = np.argsort(self.colours[columns], kind="stable")
         ends = np.cumsum(np.bincount(self.colours[columns], minlength=self.colours.max(initial=-1) + 1))
         self._colour_entries = list(
@@ -59,38 +59,38 @@ class JacobianCompression:
         """How many are taken."""
         return self.stages * (len(self._colour_entries) + len(self.dense_rows))
 
-    def assemble_jacobian(self, push: Callable, pull: Callable) -> scipy.sparse.csc_array:
+    def assemble_jacobian(self, jvp: Callable, vjp: Callable) -> scipy.sparse.csc_array:
         """The Jacobian matrix, shape (stages n, stages n).
 
         Parameters
         ----------
-        push, pull : functions from an array, shape (stages, n), to one
+        jvp, vjp : functions from an array, shape (stages, n), to one
             The product of the matrix, and of its transpose, with a vector.
         """
         n, stages = self.dim, range(self.stages)
         rows, columns, entries = [], [], []
         seed = np.zeros((self.stages, n))
         for colour, (r, c) in enumerate(self._colour_entries):
-            members = self.colours == colour
+            has_colour = self.colours == colour
             for j in stages:
-                seed[j] = members
-                found = np.asarray(push(seed))
+                seed[j] = has_colour
+                product = np.asarray(jvp(seed))
                 seed[j] = 0.0
                 for i in stages:
                     rows.append(i * n + r)
                     columns.append(j * n + c)
-                    entries.append(found[i, r])
-        for hub, c in zip(self.dense_rows, self._dense_row_columns, strict=True):
+                    entries.append(product[i, r])
+        for dense_row, c in zip(self.dense_rows, self._dense_row_columns, strict=True):
             for i in stages:
-                seed[i, hub] = 1.0
-                found = np.asarray(pull(seed))
-                seed[i, hub] = 0.0
+                seed[i, dense_row] = 1.0
+                product = np.asarray(vjp(seed))
+                seed[i, dense_row] = 0.0
                 for j in stages:
-                    rows.append(np.full(len(c), i * n + hub))
+                    rows.append(np.full(len(c), i * n + dense_row))
                     columns.append(j * n + c)
-                    entries.append(found[j, c])
-        places = np.concatenate(rows), np.concatenate(columns)
-        return scipy.sparse.csc_array((np.concatenate(entries), places), (self.stages * n, self.stages * n))
+                    entries.append(product[j, c])
+        indices = np.concatenate(rows), np.concatenate(columns)
+        return scipy.sparse.csc_array((np.concatenate(entries), indices), (self.stages * n, self.stages * n))
 
 
 class SparseInverse:
@@ -108,10 +108,10 @@ class SparseInverse:
         If the matrix is singular or not finite.
     """
 
-    def __init__(self, matrix: scipy.sparse.csc_array, width: int):
+    def __init__(self, matrix: scipy.sparse.csc_array, front_width: int):
         if not np.isfinite(matrix.data).all():
             raise np.linalg.LinAlgError("the matrix is not finite")
-        if width <= MAX_FRONT_WIDTH:
+        if front_width <= MAX_FRONT_WIDTH:
             options = {"SymmetricMode": True}  # elimination on the diagonal, as far as that is stable
             try:
                 factors = scipy.sparse.linalg.splu(matrix, "MMD_AT_PLUS_A", diag_pivot_thresh=0.01, options=options)
@@ -121,26 +121,26 @@ class SparseInverse:
             return
         diagonal = matrix.diagonal()
         scaling = scipy.sparse.diags_array(1.0 / np.where(diagonal != 0.0, diagonal, 1.0))
-        rowwise = scipy.sparse.csr_array(scaling @ matrix)
+        scaled_matrix = scipy.sparse.csr_array(scaling @ matrix)
 
-        def iterate(b):
-            size = float(np.linalg.norm(scaling @ b)) or 1.0  # SciPy gives up on small residuals of an absolute size
+        def solve_bicgstab(b):
+            b_norm = float(np.linalg.norm(scaling @ b)) or 1.0  # SciPy gives up on small residuals of an absolute size
             x, _ = scipy.sparse.linalg.bicgstab(
-                rowwise, scaling @ b / size, rtol=KRYLOV_RTOL, maxiter=MAX_KRYLOV_ITERATIONS
+                scaled_matrix, scaling @ b / b_norm, rtol=KRYLOV_RTOL, maxiter=MAX_KRYLOV_ITERATIONS
             )
-            return size * x
+            return b_norm * x
 
-        self._solve = iterate
+        self._solve = solve_bicgstab
 
     def __call__(self, b: np.ndarray) -> np.ndarray:
         return self._solve(b)
 
 
-def _max_coloured_row_size(sizes: np.ndarray) -> int:
+def _max_coloured_row_size(row_sizes: np.ndarray) -> int:
     """The largest row that is coloured: about as many colours are needed, and a derivative for each larger row."""
-    candidates = np.unique(sizes)
-    larger = len(sizes) - np.searchsorted(np.sort(sizes), candidates, side="right")
-    return int(candidates[np.argmin(candidates + larger)])
+    candidates = np.unique(row_sizes)
+    n_larger = len(row_sizes) - np.searchsorted(np.sort(row_sizes), candidates, side="right")
+    return int(candidates[np.argmin(candidates + n_larger)])
 
 
 def _max_level_width(pattern: scipy.sparse.csr_array) -> int:
@@ -150,24 +150,24 @@ def _max_level_width(pattern: scipy.sparse.csr_array) -> int:
     start = int(np.argmax(label == np.bincount(label).argmax()))
     for _ in range(2):  # the second search starts where the first ended
         distance = scipy.sparse.csgraph.dijkstra(graph, directed=False, indices=start, unweighted=True)
-        reached = np.isfinite(distance)
-        start = int(np.argmax(np.where(reached, distance, -1.0)))
-    return int(np.bincount(distance[reached].astype(int)).max())
+        is_reached = np.isfinite(distance)
+        start = int(np.argmax(np.where(is_reached, distance, -1.0)))
+    return int(np.bincount(distance[is_reached].astype(int)).max())
 
 
 def _colour_columns(pattern: scipy.sparse.csr_array) -> np.ndarray:
     """A colour for each column, so that no row has two columns of one colour; greedily, in order."""
-    columnwise = scipy.sparse.csc_array(pattern)
-    rows = columnwise.indices.tolist()
-    taken = [0] * pattern.shape[0]  # by each row: a bit for every colour that one of its columns has
+    csc_pattern = scipy.sparse.csc_array(pattern)
+    rows = csc_pattern.indices.tolist()
+    row_colours = [0] * pattern.shape[0]  # by each row: a bit for every colour that one of its columns has
     colours = []
-    for start, end in itertools.pairwise(columnwise.indptr.tolist()):
-        of_column = rows[start:end]
-        used = 0
-        for row in of_column:
-            used |= taken[row]
-        free = ~used & (used + 1)  # the lowest bit that is not set
-        for row in of_column:
-            taken[row] |= free
-        colours.append(free.bit_length() - 1)
+    for start, end in itertools.pairwise(csc_pattern.indptr.tolist()):
+        column_rows = rows[start:end]
+        used_colours = 0
+        for row in column_rows:
+            used_colours |= row_colours[row]
+        free_colour = ~used_colours & (used_colours + 1)  # the lowest bit that is not set
+        for row in column_rows:
+            row_colours[row] |= free_colour
+        colours.append(free_colour.bit_length() - 1)
     return np.array(colours, dtype=int)

@@ -157,7 +157,7 @@ def test_code_is_optimised_once_many_steps_are_taken(tmp_path, monkeypatch):
     made = []
     monkeypatch.setenv("LIETHERMO_CACHE", str(tmp_path))
     compile_it = machine_code._compile_module
-    monkeypatch.setattr(machine_code, "_compile", lambda text, hasty: made.append(hasty) or compile_it(text, hasty))
+    monkeypatch.setattr(machine_code, "_compile_module", lambda text, hasty: made.append(hasty) or compile_it(text, hasty))
     system = lt.LiePoissonSystem(
         mf.so(3),
         lambda x: jnp.sum((1.3 + x**2) ** 1.37) + jnp.exp(0.3 * x[0]) * jnp.sin(x[1]) + (0.5 + x[2] ** 2) ** 0.5,
@@ -181,7 +181,7 @@ def test_parameters_are_arguments(monkeypatch):
     """A sweep over inertias and rates compiles once; another pattern of zeros is another program."""
     loaded = []
     compile_it = machine_code._compile_module
-    monkeypatch.setattr(machine_code, "_compile", lambda *a: loaded.append(a[0]) or compile_it(*a))
+    monkeypatch.setattr(machine_code, "_compile_module", lambda *a: loaded.append(a[0]) or compile_it(*a))
     for inertia, rate in [((9.0, 4.0, 2.0), 0.3), ((7.0, 3.0, 1.0), 0.4), ((5.0, 4.0, 3.0), 0.5)]:
         system = lt.models.rigid_body(inertia, rate)
         a, b = both(system, X0, (0.0, 5.0), 0.1)

@@ -60,8 +60,8 @@ def sine(m):
 @pytest.fixture
 def fresh_programs(monkeypatch):
     """No program that was made before is found again."""
-    monkeypatch.setattr("liethermo.engines.compiled.stepper._steppers", lt.tracing.remembered.LRUCache(4))
-    monkeypatch.setattr("liethermo.tracing.interpret._unrolled", lt.tracing.remembered.LRUCache(4))
+    monkeypatch.setattr("liethermo.engines.compiled.stepper._step_loop_cache", lt.tracing.caching.LRUCache(4))
+    monkeypatch.setattr("liethermo.tracing.interpret._unrolled_cache", lt.tracing.caching.LRUCache(4))
 
 
 def raising(*arguments, **named):
@@ -70,9 +70,9 @@ def raising(*arguments, **named):
 
 FAULTS = {
     "rule of a primitive": lambda patch: patch.setitem(UNROLLING_RULES, "sin", raising),
-    "scalar compiler": lambda patch: patch.setattr(scalarize, "_program", raising),
+    "scalar compiler": lambda patch: patch.setattr(scalarize, "_collect_program", raising),
     "builder": lambda patch: patch.setattr(Builder, "mul", raising),
-    "writer": lambda patch: patch.setattr(ProgramWriter, "operation", raising),
+    "writer": lambda patch: patch.setattr(ProgramWriter, "write_operation", raising),
     "LLVM": lambda patch: patch.setattr("liethermo.engines.compiled.loop.MachineCode", raising),
 }
 
@@ -96,7 +96,7 @@ def test_a_fault_of_the_compiler_is_no_fault_of_the_run(fault, monkeypatch, fres
 @pytest.mark.parametrize("options", [{"until": lambda m: m[0] + 9.0}, {}], ids=["event", "adaptive"])
 def test_a_fault_where_a_run_has_a_pace(options, monkeypatch, fresh_programs):
     system = lt.LiePoissonSystem(mf.so(3), sine)
-    monkeypatch.setattr(ProgramWriter, "operation", raising)
+    monkeypatch.setattr(ProgramWriter, "write_operation", raising)
     with pytest.warns(CompiledEngineWarning, match="nobody has seen this yet"):
         found = lt.integrate(system, X0, (0.0, 0.5), lt.Adaptive(1e-8), **options)
     assert found.provenance["engine"] == "array"
@@ -105,7 +105,7 @@ def test_a_fault_where_a_run_has_a_pace(options, monkeypatch, fresh_programs):
 def test_a_fault_in_newtons_method(monkeypatch, fresh_programs):
     """Which is compiled when a step first needs it: the run goes on from there."""
     system = lt.LiePoissonSystem(mf.so(3), sine)
-    monkeypatch.setattr("liethermo.engines.compiled.stepper.solver", raising)
+    monkeypatch.setattr("liethermo.engines.compiled.stepper.compile_newton_solver", raising)
     with pytest.warns(CompiledEngineWarning, match="nobody has seen this yet"):
         found = lt.integrate(system, 3.0 * X0, (0.0, 4.0), 0.4, lt.MetriplecticMidpoint())
     assert found.stats.newton_iterations > 0

@@ -27,7 +27,7 @@ def folder(tmp_path, monkeypatch):
 def made(monkeypatch):
     found = []
     monkeypatch.setattr(
-        machine_code, "_compile", lambda *a, make=machine_code._compile_module: found.append(1) or make(*a)
+        machine_code, "_compile_module", lambda *a, make=machine_code._compile_module: found.append(1) or make(*a)
     )
     return found
 

@@ -210,7 +210,7 @@ def test_the_audit_finds_a_step_through_a_barrier(every):
 @pytest.mark.parametrize("every", [1, 40])
 def test_the_verdict_says_how_many_steps_were_looked_at(monkeypatch, every):
     """They are those where the motion is fastest."""
-    monkeypatch.setattr(looking, "LOOKED_NUMBERS", 3_000)
+    monkeypatch.setattr(looking, "MAX_SAMPLED_VALUES", 3_000)
     system, orbit = lt.MetriplecticSystem(mf.Canonical(2), KEPLER), 2 * np.pi
     few = lt.integrate(
         system, from_afar(0.9), (0.0, 4 * orbit), orbit / 451, lt.MetriplecticMidpoint(), save_every=every
