@@ -45,10 +45,8 @@ def advance(
     the
     first step of that call: it takes the remaining steps and fills the remaining saves.
     """
-    first_step, newton_fallback = (
-        state.step if first_step is None else first_step,
-        None if newton else keep_fixed_point_result,
-    )
+    first_step = state.step if first_step is None else first_step
+    newton_fallback = None if newton else keep_fixed_point_result
     system, method, state, restore_order = reorder_components(system, method, state, options)
 
     def step(s: State) -> State:
@@ -68,9 +66,8 @@ def advance(
 
     initial_values = state.x, state.energy, state.entropy, jnp.zeros((), bool)
     saved_arrays = tuple(jnp.zeros((capacity, *a.shape), a.dtype) for a in initial_values)
-    state, saved_arrays = jax.lax.fori_loop(
-        0, saves, advance_to_save, (state, saved_arrays)
-    )  # as many passes as saves, not as the capacity
+    # saves passes, not capacity passes
+    state, saved_arrays = jax.lax.fori_loop(0, saves, advance_to_save, (state, saved_arrays))
     return restore_order(state), saved_arrays
 
 
@@ -95,7 +92,7 @@ class LazyNewton:
     """
 
     def __init__(self, method: OneStepMethod):
-        # Where there are no equations it makes no difference; a reference solver has none of its own.
+        # Explicit methods have no equations, and a reference solver does not use Newton's method of this package.
         self.has_newton = not isinstance(method, OneStepMethod) or method.explicit
 
     def advance(self, call: Callable, state: State, save_every) -> tuple[State, tuple]:
@@ -167,7 +164,9 @@ class ArrayEngine:
         """
         ends, block = np.empty_like(x), min(STEP_ENDS_PER_CALL, self.max_saves_per_call)
         for start in range(0, len(x), block):
-            indices = np.minimum(np.arange(start, start + block), len(x) - 1)  # of one length, for one program
+            indices = np.minimum(
+                np.arange(start, start + block), len(x) - 1
+            )  # always of the same length, for one program
             block_ends = _step_ends_program(
                 self.system, self.method, jnp.asarray(x[indices]), jnp.asarray(h[indices]), self.options
             )

@@ -81,13 +81,11 @@ class EngineWithFallback:
         planned_steps: int,
         noise: Callable | None = None,
     ):
-        self.system, self.method, self.requested_engine, self.planned_steps, self.noise = (
-            system,
-            method,
-            requested_engine,
-            planned_steps,
-            noise,
-        )
+        self.system = system
+        self.method = method
+        self.requested_engine = requested_engine
+        self.planned_steps = planned_steps
+        self.noise = noise
         self._engine: Engine = ArrayEngine(system, method)
         self._is_engine_chosen = False
 
@@ -204,7 +202,7 @@ class EngineWithFallback:
                 if n_operations <= MAX_AUTO_COMPILED_OPERATIONS or not is_auto or repays_compiling:
                     return compiled
             except UnsupportedPrimitive as error:
-                if not (is_auto and error.too_large):  # as little of a surprise as one that is too long to be worth it
+                if not (is_auto and error.too_large):  # no warning: a program that is too large is expected with auto
                     self._fall_back(error)
         return ArrayEngine(system, method)
 

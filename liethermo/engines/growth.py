@@ -53,20 +53,17 @@ def arnoldi_hessenberg(system, method, x):
         v = jacobian_product(basis[i])
         coefficients, remainder = orthogonalise(basis, v)
         remainder_norm = jnp.linalg.norm(remainder)
-        is_invariant = remainder_norm <= 1e-10 * jnp.linalg.norm(
-            v
-        )  # a space that the motion keeps: go on outside of it
-        remainder_norm, remainder = (
-            jnp.where(is_invariant, 0.0, remainder_norm),
-            jnp.where(is_invariant, jnp.roll(_generic_vector(n), i + 1), remainder),
-        )
+        # in an invariant subspace the remainder vanishes: continue outside of it
+        is_invariant = remainder_norm <= 1e-10 * jnp.linalg.norm(v)
+        remainder_norm = jnp.where(is_invariant, 0.0, remainder_norm)
+        remainder = jnp.where(is_invariant, jnp.roll(_generic_vector(n), i + 1), remainder)
         matrix = matrix.at[:m, i].set(coefficients[:m]).at[i + 1, i].set(remainder_norm)
         return (basis.at[i + 1].set(_unit_vector(orthogonalise(basis, _unit_vector(remainder))[1])), matrix), None
 
     def orthogonalise(basis, v):
         coefficients = basis @ v
         v = v - coefficients @ basis
-        correction = basis @ v  # the second pass removes what rounding left of the first
+        correction = basis @ v  # the second pass removes the rounding errors of the first
         return coefficients + correction, v - correction @ basis
 
     initial_basis = jnp.zeros((m + 1, n)).at[0].set(_unit_vector(_generic_vector(n)))

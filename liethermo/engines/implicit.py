@@ -31,7 +31,7 @@ def implicit_solution(solve: Callable, residual: Callable, parameters: Any, gues
     guess : array, of the shape of k
     """
     leaves, structure = jax.tree_util.tree_flatten(parameters)
-    return _implicit_solution.bind(*leaves, guess, solve=solve, misfit=residual, structure=structure, axes=())
+    return _implicit_solution.bind(*leaves, guess, solve=solve, residual=residual, structure=structure, axes=())
 
 
 _implicit_solution = Primitive("solution")
@@ -77,7 +77,7 @@ def _batching_rule(arguments, dims, *, axes: tuple, **rest):
 
 
 def _jvp_rule(primals, tangents, *, residual: Callable, structure, axes: tuple, **rest):
-    k = _implicit_solution.bind(*primals, misfit=residual, structure=structure, axes=axes, **rest)
+    k = _implicit_solution.bind(*primals, residual=residual, structure=structure, axes=axes, **rest)
     active = [i for i, tangent in enumerate(tangents[:-1]) if type(tangent) is not ad.Zero]
     if not active:
         return k, jnp.zeros_like(k)
@@ -93,10 +93,8 @@ def _jvp_rule(primals, tangents, *, residual: Callable, structure, axes: tuple, 
             return residual(jax.tree_util.tree_unflatten(structure, leaf_values), k)
 
         _, residual_jvp = jax.linearize(active_residual, k, *(leaves[i] for i in active))
-        constant_jvp, zero_tangents = (
-            jax.lax.stop_gradient(residual_jvp),
-            [jnp.zeros_like(dot) for dot in active_tangents],
-        )
+        constant_jvp = jax.lax.stop_gradient(residual_jvp)
+        zero_tangents = [jnp.zeros_like(dot) for dot in active_tangents]
         matrix = jax.vmap(lambda d: constant_jvp(d.reshape(k.shape), *zero_tangents).ravel(), out_axes=1)(
             jnp.eye(k.size)
         )

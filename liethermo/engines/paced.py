@@ -86,7 +86,7 @@ class ArrayAdaptiveRuns:
     def attempt_records(self, max_attempts: int) -> dict[str, np.ndarray]:
         """Make one attempt of the only trajectory and return its record: each field of ATTEMPT_FIELDS, attempts
         first."""
-        del max_attempts  # one, which nothing else follows
+        del max_attempts  # a single attempt: this engine does not record several at once
         self.advance(1)
         return {name: self.read(name) for name in ATTEMPT_FIELDS}
 
@@ -118,7 +118,7 @@ def start_one(
         )
 
     run = ArrayAdaptiveRuns(method, adaptive_state, advance_one, True)
-    run.lazy_newton.has_newton |= step is not None  # which has its own
+    run.lazy_newton.has_newton |= step is not None  # a host engine has its own Newton's method
     return run
 
 
@@ -189,7 +189,7 @@ def _event_rounding(model: tuple[System, Any], x) -> jax.Array:
     )
 
 
-# -- from pause to pause ----------------------------------------------------------------------------------------------
+# -- pauses -----------------------------------------------------------------------------------------------------------
 
 
 class PauseHandler:
@@ -218,13 +218,11 @@ class PauseHandler:
         stop_times: np.ndarray,
         system_of: Callable,
     ):
-        self.adaptive_runs, self.control, self.method, self.stop_times, self.system_of = (
-            adaptive_runs,
-            control,
-            method,
-            stop_times,
-            system_of,
-        )
+        self.adaptive_runs = adaptive_runs
+        self.control = control
+        self.method = method
+        self.stop_times = stop_times
+        self.system_of = system_of
         self.sign_jumps: list[float] = []
 
     def paused_indices(self, reason: int) -> np.ndarray:
@@ -241,10 +239,8 @@ class PauseHandler:
         runs, indices = self.adaptive_runs, self.paused_indices(StatusCode.PAUSED_AT_EVENT)
         if not indices.size:
             return
-        value, value_before = (
-            runs.read("root_bracket", indices)[:, searching.LAST_VALUE_INDEX],
-            runs.read("event_value", indices),
-        )
+        value = runs.read("root_bracket", indices)[:, searching.LAST_VALUE_INDEX]
+        value_before = runs.read("event_value", indices)
         is_zero = (
             np.isfinite(value) if self.control.falling_only else self._is_zero_to_rounding(indices, value, value_before)
         )
@@ -287,7 +283,7 @@ class PauseHandler:
     def _group_by_system(self, indices: np.ndarray) -> list[np.ndarray]:
         """Return the indices of trajectories, one array for each system."""
         groups: dict[int, list[int]] = {}
-        systems = [self.system_of(int(i)) for i in indices]  # held, so that no identity is used twice
+        systems = [self.system_of(int(i)) for i in indices]  # kept alive, so that no id is used twice
         for i, system in zip(indices, systems, strict=True):
             groups.setdefault(id(system), []).append(int(i))
         return [np.array(group) for group in groups.values()]

@@ -113,22 +113,20 @@ class AdaptiveState(NamedTuple):
 
     state: State
     t: jax.Array
-    stop_time: jax.Array  # when a step has to end next
-    last_stop_time: jax.Array  # when one had to last,
-    steps_at_last_stop: jax.Array  # and the steps taken until then
-    next_step_size: jax.Array  # size of the next step, unless it has to end somewhere
-    last_step_size: jax.Array  # size of the last one tried
-    optimal_step_size: (
-        jax.Array
-    )  # the size with which the last one that counts would have had the allowed error; 0 before
+    stop_time: jax.Array  # next time at which a step has to end
+    last_stop_time: jax.Array
+    steps_at_last_stop: jax.Array  # number of steps taken until the last stop time
+    next_step_size: jax.Array  # unless the step has to end at a stop time
+    last_step_size: jax.Array  # size of the last attempted step
+    optimal_step_size: jax.Array  # size with which the last accepted step would have had the allowed error; 0 at first
     n_attempts: jax.Array
     n_rejected: jax.Array
-    last_attempt_status: jax.Array  # status of the last one tried
-    event_value: jax.Array  # of what is watched; infinite, with the last sign that is known, where it is not a number
-    max_relative_rate: jax.Array  # the largest at which the state has changed, relative to its size
-    growth_rate: jax.Array  # rate of what grows fastest, when it was looked at last,
-    jacobian_probe: jax.Array  # and how the motion stretched what lay near
-    root_bracket: jax.Array  # for the event in a step: a searching.Search
+    last_attempt_status: jax.Array
+    event_value: jax.Array  # of the event function; where that is NaN, infinity with its last known sign
+    max_relative_rate: jax.Array  # largest rate of change of the state so far, relative to its norm
+    growth_rate: jax.Array  # largest growth rate when it was last computed; NaN if it must be computed
+    jacobian_probe: jax.Array  # probe of the Jacobian when the growth rate was last computed
+    root_bracket: jax.Array  # bracket of an event in a step: the fields of a searching.RootBracket
 
 
 def initial_adaptive_state(
@@ -142,7 +140,7 @@ def initial_adaptive_state(
     scale = jnp.where(norm > 0.0, norm, 1.0)
     relative_rate = jnp.max(jnp.abs(solved_system.vector_field(components))) / scale
     relative_tolerance = jnp.minimum(control.allowed_error(norm) / scale, 1.0)
-    # a step whose error is what is allowed, if each derivative of the motion is faster by the same rate; half of it
+    # half of the step with the allowed error, if each derivative of the motion is larger by the same rate
     estimated_step = (
         0.5 * relative_tolerance ** (1.0 / method.order) / jnp.where(relative_rate > 0.0, relative_rate, 1.0)
     )
@@ -203,13 +201,11 @@ def next_full_step(control: StepControl, adaptive_state: AdaptiveState) -> tuple
             jnp.where(remaining < 2.0 * adaptive_state.next_step_size, 0.5 * remaining, adaptive_state.next_step_size),
         )
         time_after = jnp.where(reaches_stop, adaptive_state.stop_time, adaptive_state.t + h)
-        # the step that the clock sees, so that rounding of the times does not add up
+        # the step as the difference of the rounded times, so that their rounding errors do not accumulate
         return jnp.where(reaches_stop | ~(time_after > adaptive_state.t), h, time_after - adaptive_state.t), time_after
-    # as a timetable has them
-    interval, n_done = (
-        adaptive_state.stop_time - adaptive_state.last_stop_time,
-        adaptive_state.state.step - adaptive_state.steps_at_last_stop,
-    )
+    # the same steps as runs.timetable
+    interval = adaptive_state.stop_time - adaptive_state.last_stop_time
+    n_done = adaptive_state.state.step - adaptive_state.steps_at_last_stop
     n_full = jnp.floor(interval / adaptive_state.next_step_size * (1 + 1e-12))
     remainder = adaptive_state.stop_time - (adaptive_state.last_stop_time + n_full * adaptive_state.next_step_size)
     has_remainder = remainder > 1e-12 * interval
@@ -252,11 +248,8 @@ def accept_or_reject(
     new_state: State,
 ) -> AdaptiveState:
     """Return the adaptive state after an attempted step to ``new_state``: accept the step, or choose another size."""
-    old_state, is_solved, attempt_status = (
-        adaptive_state.state,
-        new_state.status == StatusCode.COMPLETED,
-        1.0 * new_state.status,
-    )
+    old_state, is_solved = adaptive_state.state, new_state.status == StatusCode.COMPLETED
+    attempt_status = 1.0 * new_state.status
     is_accepted, next_step_size, code = is_solved, adaptive_state.next_step_size, new_state.status
     max_rate, optimal_step = adaptive_state.max_relative_rate, adaptive_state.optimal_step_size
     if control.adaptive:
@@ -264,7 +257,7 @@ def accept_or_reject(
         norm = jnp.maximum(jnp.max(jnp.abs(x_before)), jnp.max(jnp.abs(x_after)))
         relative_change = jnp.max(jnp.abs(x_after - x_before)) / jnp.where(norm > 0.0, norm, 1.0)
         max_rate = jnp.maximum(max_rate, jnp.where(is_solved, relative_change / h, 0.0))
-        time_fraction = h * max_rate  # of the time in which the state, at its fastest, changes by its size
+        time_fraction = h * max_rate  # of the time in which the state, at its fastest, changes by its norm
         allowed_error = jnp.maximum(
             control.allowed_error(norm) * jnp.minimum(time_fraction, 1.0),
             MIN_RELATIVE_ERROR * norm + DEFAULT_OPTIONS.tiny,
@@ -281,7 +274,7 @@ def accept_or_reject(
             h < TRUNCATED_STEP_RATIO * next_step_size, adaptive_state.optimal_step_size, optimal_step
         )
         next_step_size = jnp.where(is_accepted, accepted_step_size, step_size_after_rejection(error, h, power))
-        time_advances = time_after > adaptive_state.t  # or else the step is less than the last place of the time
+        time_advances = time_after > adaptive_state.t  # unless the step is below the rounding of the time
         is_accepted = is_accepted & time_advances
         code = jnp.where(
             is_accepted | (time_advances & (next_step_size >= control.min_step)),
@@ -344,13 +337,13 @@ def accept_or_reject(
 class AttemptOutcome(NamedTuple):
     """Outcome of an attempted step."""
 
-    is_accepted: jax.Array  # whether its state is the next one
-    is_at_event: jax.Array  # whether an event is there
-    event_value: jax.Array  # of what is watched
-    time_after: jax.Array  # when it ends
-    next_step_size: jax.Array  # size of the next
-    status: jax.Array  # whether the run goes on, pauses or fails
-    n_rejected: jax.Array  # 1 for an attempt in vain, or 0
+    is_accepted: jax.Array  # whether the new state is accepted
+    is_at_event: jax.Array  # whether a sign change of the event function is at the time after
+    event_value: jax.Array
+    time_after: jax.Array  # time at the end of the attempt
+    next_step_size: jax.Array
+    status: jax.Array  # the run continues (COMPLETED), pauses or fails
+    n_rejected: jax.Array  # 1 for a rejected attempt, or 0
     root_bracket: jax.Array
 
 
@@ -377,10 +370,8 @@ def apply_event_detection(
     signed_value = jnp.where(
         jnp.isnan(value) & jnp.isinf(adaptive_state.event_value), adaptive_state.event_value, value
     )
-    is_searching, is_solved = (
-        bracket.step_size > 0.0,
-        (new_state.status == StatusCode.COMPLETED) & ~jnp.isnan(signed_value),
-    )
+    is_searching = bracket.step_size > 0.0
+    is_solved = (new_state.status == StatusCode.COMPLETED) & ~jnp.isnan(signed_value)
     starts_search = outcome.is_accepted & is_event_crossing(control, adaptive_state.event_value, value) & ~is_searching
     is_shortened, first_fraction = jnp.zeros((), dtype=bool), jnp.ones(())
     if control.adaptive:
@@ -468,7 +459,7 @@ def first_sign_change_in_step(
     return fraction, is_undone | (has_changed & jnp.isnan(end_value))
 
 
-# -- the size of the next step ----------------------------------------------------------------------------------------
+# -- choice of the step size ------------------------------------------------------------------------------------------
 
 
 def step_size_after_acceptance(
@@ -505,7 +496,7 @@ def step_size_after_rejection(error, h, power) -> jax.Array:
     return h * jnp.minimum(jnp.where(is_solved, factor, FACTOR_AFTER_NONCONVERGENCE), 0.9)
 
 
-# -- what grows -------------------------------------------------------------------------------------------------------
+# -- growth rates -----------------------------------------------------------------------------------------------------
 
 
 def max_growth_per_step(method: OneStepMethod) -> float:
@@ -518,7 +509,7 @@ def max_growth_per_step(method: OneStepMethod) -> float:
     """
     s = max(1, method.order // 2)
     pade_constant = math.factorial(2 * s) * math.factorial(2 * s + 1) / math.factorial(s) ** 2
-    return (GROWTH_RATE_RTOL * pade_constant) ** (0.5 / s)  # ln R(z) / z = 1 +- z^2s / constant + ...
+    return (GROWTH_RATE_RTOL * pade_constant) ** (0.5 / s)  # ln R(z) / z = 1 +- z^2s / pade_constant + ...
 
 
 def limit_by_growth_rate(method: OneStepMethod, adaptive_state: AdaptiveState, probe) -> AdaptiveState:

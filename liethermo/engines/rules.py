@@ -66,7 +66,7 @@ class SolverOptions:
         Energy error, relative to the magnitude of H, above which it is corrected: a few roundings of H itself.
     large_offset_ratio : float
         Ratio of H to its variation above which the rounding of H far exceeds that of the state: see
-        :data:`..functions.gradients.NOISY_VALUE_RATIO`.
+        :data:`..functions.gradients.MAX_DIFFERENCE_NOISE`.
     """
 
     rms_norm_dim: int = 100

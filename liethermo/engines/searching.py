@@ -55,10 +55,8 @@ def narrow_bracket(bracket: RootBracket, value) -> tuple[RootBracket, jax.Array]
     t = bracket.trial_fraction
     has_sign_of_a = jnp.sign(value) == jnp.sign(bracket.fa)
     c, fc = jnp.where(has_sign_of_a, bracket.a, bracket.b), jnp.where(has_sign_of_a, bracket.fa, bracket.fb)
-    opposite, f_opposite = (
-        jnp.where(has_sign_of_a, bracket.b, bracket.a),
-        jnp.where(has_sign_of_a, bracket.fb, bracket.fa),
-    )
+    opposite = jnp.where(has_sign_of_a, bracket.b, bracket.a)
+    f_opposite = jnp.where(has_sign_of_a, bracket.fb, bracket.fa)
     best_fraction = jnp.where((jnp.abs(value) < jnp.abs(f_opposite)) | (value == 0.0), t, opposite)
     width, tolerance = jnp.abs(opposite - t), 4.0 * EPS * jnp.abs(best_fraction) + 1e-300
     is_converged = (width <= tolerance) | (value == 0.0)

@@ -31,11 +31,11 @@ class StageSolution(NamedTuple):
 
     k: jax.Array
     converged: jax.Array
-    is_finite: jax.Array
-    residual: jax.Array
+    is_finite: jax.Array  # whether the last update was finite
+    residual: jax.Array  # norm of the last update
     fixed_point_iterations: jax.Array
     newton_iterations: jax.Array
-    slope_rounding: jax.Array
+    slope_rounding: jax.Array  # rounding scale of the slopes if the iteration converged only relative to it, else 0
 
 
 class StageEquations(NamedTuple):
@@ -43,23 +43,21 @@ class StageEquations(NamedTuple):
 
     slopes: Callable
     guess: jax.Array
-    scale: Callable  # from k to the size that the plateau is measured against
-    newton_solve_at: Callable  # from k to a function from ``slopes - k`` to what Newton's method takes off k
-    slope_rounding: Callable = lambda: jnp.zeros(
-        ()
-    )  # the size at which the slopes are rounded, where it has to be known
+    scale: Callable  # of k; updates are measured relative to it
+    newton_solve_at: Callable  # of k; returns a function from ``slopes(k) - k`` to the step that is subtracted from k
+    slope_rounding: Callable = lambda: jnp.zeros(())  # rounding scale of the slopes
 
 
 class IterationState(NamedTuple):
     """State of an iteration on the stage equations."""
 
     k: jax.Array
-    update: jax.Array
+    update: jax.Array  # norm of the last update of k
     smallest_update: jax.Array
-    n_stalled: jax.Array  # iterations in a row that did not shrink the update
-    previous_update: jax.Array  # the update before the last
-    earlier_update: jax.Array  # the one before that; zero where there is none
-    n_iterations: jax.Array  # iterations so far
+    n_stalled: jax.Array  # consecutive iterations that did not shrink the update
+    previous_update: jax.Array
+    earlier_update: jax.Array  # the update before the previous one; 0 if there is none
+    n_iterations: jax.Array
 
     @classmethod
     def initial(cls, k) -> IterationState:
@@ -130,7 +128,7 @@ def slope_rounding_scale(system: System, x, options: SolverOptions = DEFAULT_OPT
 def solve_stages(equations: StageEquations, options: SolverOptions = DEFAULT_OPTIONS) -> StageSolution:
     """Solve the stage equations by fixed-point iteration, and by Newton's method if that fails."""
     fixed_point_result = solve_fixed_point(equations, options)
-    # a branch, since what is carried to a loop, and back, is copied
+    # a branch, because a loop would copy its carry
     return jax.lax.cond(
         fixed_point_result.converged,
         lambda: fixed_point_result,
@@ -152,11 +150,9 @@ def solve_newton(
     iteration restarts once from the guess with damped steps.
     """
     slopes, guess, scale, newton_solve_at, get_slope_rounding = equations
-    norm, slope_rounding, zero_count = (
-        options.norm_for_dim(guess.shape[-1]),
-        get_slope_rounding(),
-        jnp.zeros((), dtype=jnp.int64),
-    )
+    norm = options.norm_for_dim(guess.shape[-1])
+    slope_rounding = get_slope_rounding()
+    zero_count = jnp.zeros((), dtype=jnp.int64)
     is_solved, n_fixed_point = (
         (False, zero_count)
         if fixed_point_result is None
@@ -211,7 +207,7 @@ def solve_newton(
 
         def can_reuse_jacobian(carry):
             inner, residual, n_uses = carry
-            # by the last update alone: a matrix that is stale leads astray before two updates show it
+            # by the last update alone: a stale matrix misleads the iteration before two updates show it
             is_fresh = (n_uses == 0) | (
                 (n_uses < options.max_jacobian_reuse)
                 & ~(inner.update > options.jacobian_contraction_limit * inner.previous_update)
@@ -255,7 +251,7 @@ def best_initial_guess(residual_function: Callable, guess: jax.Array) -> tuple[j
             jnp.where(is_better, a, b) for a, b in ((trial_k, best_k), (residual, best_residual), (norm, best_norm))
         )
 
-    # a loop, so that programs hold the equations once
+    # a loop, so that the program contains the equations only once
     return jax.lax.while_loop(
         lambda carry: carry[0] < 2, try_guess, (zero_count, zero_slopes, zero_slopes, jnp.zeros(()))
     )[1:3]
@@ -271,7 +267,7 @@ def _same_shape(matrix):
 
 
 def _inverse_batching_rule(arguments, axes):
-    # not by LAPACK, whose batched calls can wait for each other forever: see manifolds.matrices.linear.solve
+    # without LAPACK, whose batched calls can deadlock: see manifolds.matrices.linear.solve
     (matrices,), (axis,) = arguments, axes
     return inverse(jnp.moveaxis(matrices, axis, 0)), 0
 
@@ -289,7 +285,7 @@ def explicit_slopes(
     k = method.slopes(system, x, compensation, h, k)
     x, zero_count = system.solved_part(x)[1], jnp.zeros((), dtype=jnp.int64)
     norm = options.norm_for_dim(x.size)
-    residual = norm(jnp.zeros_like(x).at[0].set(constraint_residual(k)))  # it is the length of a vector
+    residual = norm(jnp.zeros_like(x).at[0].set(constraint_residual(k)))  # the residual is the length of a vector
     converged = residual <= options.projection_rtol * norm(k[0]) + options.projection_state_rtol * update_scale(
         x, h, k[0], options
     )

@@ -31,11 +31,9 @@ class State(NamedTuple):
     """State of a run, carried from step to step."""
 
     x: jax.Array
-    compensation: jax.Array  # what rounding has kept from x so far (compensated summation)
-    k: jax.Array
-    previous_slopes: (
-        jax.Array
-    )  # the slopes of the step before the last; none of an explicit method, which guesses nothing
+    compensation: jax.Array  # rounding errors of x so far (compensated summation)
+    k: jax.Array  # slopes of the last step
+    previous_slopes: jax.Array  # slopes of the step before, to extrapolate from; empty for an explicit method
     energy: jax.Array
     entropy: jax.Array
     status: jax.Array
@@ -43,18 +41,16 @@ class State(NamedTuple):
     fixed_point_iterations: jax.Array
     newton_iterations: jax.Array
     most_iterations: jax.Array
-    residual: (
-        jax.Array
-    )  # of the last step tried, as h |k - slopes(k)| / |x|, or h times the noise of the slopes for |x|
-    worst_residual: jax.Array  # of the steps taken
-    largest_energy: jax.Array  # over all steps, relative to the first: for laws between the saved states
+    residual: jax.Array  # h |k - slopes(k)| / max(|x|, h slope_rounding) of the last attempted step
+    worst_residual: jax.Array  # largest residual of the accepted steps
+    largest_energy: jax.Array  # over all steps, so that the laws can be judged between the saved states
     smallest_energy: jax.Array
     least_entropy_increment: jax.Array
     largest_energy_increment: jax.Array
-    relaxation_integral: jax.Array  # over time, of what relaxes: see relaxing()
+    relaxation_integral: jax.Array  # time integral of relaxation_functional()
     first_energy: jax.Array
-    energy_drift_correction: jax.Array  # what the end of the next step is to be shifted by: see steering()
-    energy_sensitivity: jax.Array  # the largest over all steps: the size at which the function is rounded
+    energy_drift_correction: jax.Array  # shift of the next step's end along the energy gradient
+    energy_sensitivity: jax.Array  # rounding scale of the energy, the largest over all steps
     entropy_sensitivity: jax.Array
 
 
@@ -122,7 +118,7 @@ def reorder_components(
         k = permute(s.k)
         k = (
             k.at[INITIAL_LEVELS_ROW].set(s.k[INITIAL_LEVELS_ROW]) if method.explicit else k
-        )  # which are values of functions
+        )  # not slopes, but values of functions
         return s._replace(
             x=permute(s.x), compensation=permute(s.compensation), k=k, previous_slopes=permute(s.previous_slopes)
         )
@@ -177,7 +173,7 @@ def stage_equations(
     """Return the stage equations of a step from x, with a guess extrapolated from the slopes of previous steps."""
     components = system.solved_part(x)[1]
     norm = options.norm_for_dim(components.size)
-    state_rate = norm(components) / jnp.abs(h)  # once a step
+    state_rate = norm(components) / jnp.abs(h)  # computed once per step
     return StageEquations(
         slopes=lambda k: method.slopes(system, x, compensation, h, k),
         guess=method.predict(k, previous_slopes),
@@ -197,16 +193,15 @@ def finish_step(
 ) -> State:
     """Return the state after a step with solved stage equations, or the old state with a failure status."""
     x, compensation = state.x, state.compensation
-    new_x, new_compensation, energy, entropy, finite_check, *sensitivities = end_of_step(
-        system, method, x, compensation, h, solution.k
-    )
+    end = end_of_step(system, method, x, compensation, h, solution.k)
+    new_x, new_compensation, energy, entropy = end.x, end.compensation, end.energy, end.entropy
     correction = state.energy_drift_correction
-    if not method.carries_compensation:  # the next step makes its own, as it would if it were the first of a run
+    if not method.carries_compensation:  # the next step computes its own, as the first step of a run does
         new_compensation = system.clock_components(new_compensation)
-    elif can_correct_energy_drift(system, method):  # by what the last step left: so no step waits for its own
+    elif can_correct_energy_drift(system, method):  # by the error of the last step: no step waits for its own energy
         new_compensation = apply_drift_correction(system, new_x, new_compensation, correction)
         correction = energy_drift_correction(system, new_x, new_compensation, energy, state.first_energy)
-    is_taken = solution.converged & jnp.isfinite(finite_check)
+    is_taken = solution.converged & jnp.isfinite(end.finite_check)
     failure_code = jnp.where(
         solution.converged | ~solution.is_finite, int(StatusCode.NON_FINITE), int(StatusCode.NOT_CONVERGED)
     )
@@ -239,30 +234,33 @@ def finish_step(
         relaxation_integral=state.relaxation_integral + h * mean_functional,
         first_energy=state.first_energy,
         energy_drift_correction=correction,
-        energy_sensitivity=jnp.fmax(state.energy_sensitivity, sensitivities[0]),
-        entropy_sensitivity=jnp.fmax(state.entropy_sensitivity, sensitivities[1]),
+        energy_sensitivity=jnp.fmax(state.energy_sensitivity, end.energy_sensitivity),
+        entropy_sensitivity=jnp.fmax(state.entropy_sensitivity, end.entropy_sensitivity),
     )
     failed_state = state._replace(status=failure_code.astype(state.status.dtype), residual=residual)
-    if x.size > options.matrix_free_dim:  # a choice entry by entry would read both
+    if x.size > options.matrix_free_dim:  # an entrywise choice would read both states
         return jax.lax.cond(is_taken, lambda: new_state, lambda: failed_state)
     return jax.tree_util.tree_map(lambda a, b: jnp.where(is_taken, a, b), new_state, failed_state)
 
 
-def end_of_step(system: System, method: OneStepMethod, x, compensation, h, k):
-    """The end of a step: new state, what rounding keeps from it, energy, entropy, a sum that is finite if they are.
+class StepEnd(NamedTuple):
+    """State vector at the end of a step, with the values of the functions there."""
 
-    And the sizes at which energy and entropy are rounded there.
-    """
+    x: jax.Array
+    compensation: jax.Array
+    energy: jax.Array
+    entropy: jax.Array
+    finite_check: jax.Array  # a sum that is finite if the state, the energy and the entropy are
+    energy_sensitivity: jax.Array
+    entropy_sensitivity: jax.Array
+
+
+def end_of_step(system: System, method: OneStepMethod, x, compensation, h, k) -> StepEnd:
+    """Return the end of a step of size h with the slopes k."""
     new_x, new_compensation = method.move(system, x, compensation, h, k)
     energy, entropy = energy_and_entropy_at(system, new_x)
-    return (
-        new_x,
-        new_compensation,
-        energy,
-        entropy,
-        jnp.sum(new_x) + energy + entropy,
-        *rounding_sensitivities(system, new_x),
-    )
+    finite_check = jnp.sum(new_x) + energy + entropy
+    return StepEnd(new_x, new_compensation, energy, entropy, finite_check, *rounding_sensitivities(system, new_x))
 
 
 def can_correct_energy_drift(system: System, method: OneStepMethod) -> bool:

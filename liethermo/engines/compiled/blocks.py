@@ -1,4 +1,4 @@
-"""Loops and calls as LLVM instructions, for all lanes at once."""
+"""Loops, calls and tables of scalar programs as LLVM instructions, for all lanes at once."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ INT32 = ir.IntType(32)
 
 
 def write_block(writer: Any, block: Block, args: Sequence[Any]) -> BlockResults:
-    """Write a block, of values and tables.
+    """Write the instructions of a block (a loop, call or matrix product) on ``args``, values and tables.
 
     Parameters
     ----------
-    writer : Writer
+    writer : ProgramWriter
     """
     if isinstance(block, WhileLoop):
         return _write_while(writer, block, args)
@@ -38,14 +38,14 @@ def write_block(writer: Any, block: Block, args: Sequence[Any]) -> BlockResults:
 
 
 def clamp_index(writer: Any, index: ir.Value, length: int) -> ir.Value:
-    """A place, or the nearest one of a table of some length."""
+    """Clamp an index to the range of a table of ``length`` entries."""
     build, last = writer.builder, writer.constant(length - 1)
     index = build.select(build.icmp_signed("<", index, writer.constant(0)), writer.constant(0), index)
     return build.select(build.icmp_signed(">", index, last), last, index)
 
 
 def select_entry(writer: Any, index: ir.Value, entries: Sequence[ir.Value]) -> ir.Value:
-    """The entry at a place, by the bits of its number: of one that lies outside the nearest."""
+    """Select the entry at ``index``, clamped to the range, by the bits of the index."""
     build, index = writer.builder, clamp_index(writer, index, len(entries))
     entries, bit = list(entries), 0
     while len(entries) > 1:
@@ -56,10 +56,10 @@ def select_entry(writer: Any, index: ir.Value, entries: Sequence[ir.Value]) -> i
 
 
 def _allocate_slots(writer: Any, kinds: Sequence[str], values: Sequence[ir.Value]) -> list[ir.Value]:
-    """Memory for values of some kinds, that holds them."""
+    """Allocate a stack slot for each value and store the value there."""
     build, slots = writer.builder, []
     for kind, value in zip(kinds, values, strict=True):
-        with build.goto_entry_block():  # else each pass of a loop around would take more of the stack
+        with build.goto_entry_block():  # otherwise each pass of an outer loop would take more of the stack
             slot = build.alloca(writer.type_of_kind[kind])
         build.store(writer.cast(value, kind), slot)
         slots.append(slot)
@@ -71,10 +71,10 @@ def _array_reader(*arrays: Sequence[ir.Value]) -> Callable[[int, int], ir.Value]
 
 
 def _write_while(writer: Any, loop: WhileLoop, args: Sequence[ir.Value]) -> BlockResults:
-    """Until the test fails in every lane that is :attr:`.Writer.active`.
+    """Write a while loop, which runs until the test fails in every active lane.
 
-    A pass need not wait for the test of which lanes the one before has left: those go on too, and what they
-    come to is not kept. They wait where a loop inside might not end for them.
+    A pass does not wait for the test of which lanes have left the loop: these lanes run on, and their results are
+    discarded. They do wait if an inner loop might not end for them.
     """
     build, n_constants = writer.builder, len(loop.test.inputs[0])
     constants, slots = args[:n_constants], _allocate_slots(writer, loop.kinds, args[n_constants:])
@@ -106,11 +106,9 @@ def _write_while(writer: Any, loop: WhileLoop, args: Sequence[ir.Value]) -> Bloc
 def _write_scan(writer: Any, loop: ScanLoop, args: Sequence[Any]) -> BlockResults:
     build, n_constants = writer.builder, len(loop.body.inputs[0])
     start = n_constants + len(loop.carry_kinds)
-    constants, slots, tables = (
-        args[:n_constants],
-        _allocate_slots(writer, loop.carry_kinds, args[n_constants:start]),
-        args[start:],
-    )
+    constants = args[:n_constants]
+    slots = _allocate_slots(writer, loop.carry_kinds, args[n_constants:start])
+    tables = args[start:]
     stacked_tables = [Table(writer, writer.type_of_kind[kind], length=loop.length) for kind in loop.stacked_kinds]
     with writer.loop_range(writer.int64(loop.length)) as count:
         i = build.sub(writer.int64(loop.length - 1), count) if loop.reverse else count
@@ -124,16 +122,16 @@ def _write_scan(writer: Any, loop: ScanLoop, args: Sequence[Any]) -> BlockResult
 
 
 class Table:
-    """Values of one kind in memory, by their numbers.
+    """Values of one type in memory, read and written by their indices.
 
     Parameters
     ----------
     value_type : ir.Type
-        A number, where lanes have several, is the same for all.
+        Type of an entry; a scalar type while there are several lanes means that all lanes share the entry.
     values : sequence of values, optional
-        What it holds; written there, or a constant.
+        Entries, stored in memory of the table, or a global constant if all are constant.
     length, start, stride : int, value, int
-        How many there are, without values; where the first lies, and how far apart they are, if they lie somewhere.
+        Number of entries without ``values``; pointer to the first and distance of entries, for memory that exists.
     """
 
     def __init__(
@@ -147,20 +145,17 @@ class Table:
     ):
         self.builder, self.value_type, self.writer, self.stride = writer.builder, value_type, writer, stride
         self.length = max(len(values), length)
-        self.memory_type = (
-            writer.type_of_kind["i"] if value_type == writer.type_of_kind["b"] else None
-        )  # bits are awkward in memory
+        # truth values are stored as integers
+        self.memory_type = writer.type_of_kind["i"] if value_type == writer.type_of_kind["b"] else None
         if start is not None:
             self.start = start
             return
         if values and not self.memory_type and all(isinstance(value, ir.Constant) for value in values):
             array_type, module = ir.ArrayType(self.value_type, len(values)), self.builder.module
             global_table = ir.GlobalVariable(module, array_type, module.get_unique_name("table"))
-            global_table.initializer, global_table.global_constant, global_table.linkage = (
-                ir.Constant(array_type, list(values)),
-                True,
-                "internal",
-            )
+            global_table.initializer = ir.Constant(array_type, list(values))
+            global_table.global_constant = True
+            global_table.linkage = "internal"
             self.start = self.builder.bitcast(global_table, self.value_type.as_pointer())
             return
         with self.builder.goto_entry_block():
@@ -169,12 +164,12 @@ class Table:
             self.write(writer.int64(i), value)
 
     def view_at(self, writer: Any, start: ir.Value) -> Table:
-        """The same in another function, at an address of its own."""
+        """Return a view of this table in another function, with its own pointer ``start``."""
         return Table(writer, self.value_type, length=self.length, start=start, stride=self.stride)
 
     @property
     def signature(self) -> tuple:
-        """What a function that is given it has to know."""
+        """Type, length and stride: the part of the table that is compiled into a function that takes it."""
         return str(self.start.type), self.length, self.stride
 
     def _entry_pointer(self, i: ir.Value) -> ir.Value:
@@ -189,7 +184,7 @@ class Table:
         return self.builder.trunc(value, self.value_type) if self.memory_type else value
 
     def gather(self, indices: ir.Value) -> ir.Value:
-        """What each lane has at a place of its own, or at the nearest."""
+        """Return in each lane the entry at the index of that lane, clamped to the range."""
         build, lanes, indices = self.builder, self.writer.lanes, clamp_index(self.writer, indices, self.length)
         if lanes == 1:
             return self.read(indices)
@@ -211,7 +206,7 @@ class Table:
 
 
 class BlockResults:
-    """The results of a block: values, then tables of one length. What is in those is read where it is used."""
+    """Results of a block: values, then the columns of tables of one length, which are read when they are used."""
 
     def __init__(self, values: Sequence[ir.Value], tables: Sequence[Table] = (), length: int = 1):
         self.values, self.tables, self.length = values, tables, length
@@ -227,20 +222,18 @@ class BlockResults:
 
 
 def make_table(writer: Any, values: Sequence[ir.Value]) -> Table:
-    """Values as a table; they are numbers where one of them is."""
+    """Return a table of values, converted to doubles if one of them is a double."""
     value_type = writer.double_type if any(value.type == writer.double_type for value in values) else values[0].type
     return Table(writer, value_type, [writer.cast(v, "f") if value_type == writer.double_type else v for v in values])
 
 
 def _call_routine(writer: Any, routine: Routine, args: Sequence[Any]) -> BlockResults:
-    """By a function of its own, which all that need it call: numbers are handed over in memory, tables stay there."""
+    """Call a routine as a shared function: numbers are passed in memory, and tables by pointer."""
     build, n_results = writer.builder, len(routine.kinds)
     tables = {i: a for i, a in enumerate(args) if isinstance(a, Table)}
     numbers = [writer.cast(a, "f") for i, a in enumerate(args) if i not in tables]
-    inputs, results = (
-        Table(writer, writer.double_type, numbers, length=1),
-        Table(writer, writer.double_type, length=n_results),
-    )
+    inputs = Table(writer, writer.double_type, numbers, length=1)
+    results = Table(writer, writer.double_type, length=n_results)
     signature = repr((routine, *((i, a.signature) for i, a in tables.items())))
     name = "routine_" + hashlib.sha256(signature.encode()).hexdigest()[:16]
     function = build.module.globals.get(name) or _routine_function(writer, routine, name, tables)
@@ -269,11 +262,11 @@ def _routine_function(writer: Any, routine: Routine, name: str, tables: Mapping[
 
 
 PRODUCT_TILE_WIDTH = 8
-"""Sums of a product of matrices that are made at a time: each waits for its own last term alone."""
+"""Number of sums of a matrix product that are accumulated at once, so that none waits for the term of another."""
 
 
 def _write_product(writer: Any, block: MatrixProduct, args: Sequence[Table]) -> BlockResults:
-    """By a function of its own for these sizes; its sums are in the order of their terms."""
+    """Write a matrix product as a call of a function for these shapes, which adds the terms in order."""
     build, (m, _, n) = writer.builder, block.sizes
     product = Table(writer, writer.double_type, length=m * n)
     signature = repr((block.sizes, block.strides, *(a.signature for a in args)))
@@ -291,7 +284,7 @@ def _product_function(writer: Any, block: MatrixProduct, tables: Sequence[Table]
     build, int64 = function_writer.builder, function_writer.int64
     *starts, product_pointer = function.args
     factors = [a.view_at(function_writer, start) for a, start in zip(tables, starts, strict=True)]
-    sums_run_over_rows = m >= n  # which sums stand beside each other
+    sums_run_over_rows = m >= n  # whether the sums of a tile are in one column
 
     def entry(factor: int, i: ir.Value, j: ir.Value) -> ir.Value:
         row_stride, column_stride = block.strides[factor]
@@ -327,7 +320,7 @@ def _product_function(writer: Any, block: MatrixProduct, tables: Sequence[Table]
 
 
 def _call_kernel(writer: Any, call: LapackCall, args: Sequence[ir.Value]) -> BlockResults:
-    """By a function of its own, lane by lane: what it makes of one does not depend on the others."""
+    """Call a LAPACK kernel lane by lane, so that the result of one does not depend on the others."""
     build, n_results = writer.builder, len(call.kinds)
     inputs = Table(writer, writer.double_type, [writer.cast(a, "f") for a in args])
     results = Table(writer, writer.double_type, length=n_results)

@@ -1,4 +1,5 @@
-"""What systems and methods are to the compiled engine: a form, which is compiled, and parameters, its arguments."""
+"""Systems and methods as the compiled engine sees them: a structure, which is compiled, and parameters, its
+arguments."""
 
 from __future__ import annotations
 
@@ -17,15 +18,15 @@ from ...tracing.caching import memoize
 
 @dataclass(frozen=True)
 class ProgramStructure:
-    """What systems, or methods, have in common that differ in their parameters.
+    """Structure that systems, methods or step controls share if they differ only in their parameters.
 
     Attributes
     ----------
     key : hashable
-        The same for the same form.
+        Equal for equal structures.
     shapes : tuple of shapes
-        Of the parameters, which are arrays.
-    rebuild : function from a list of arrays to one of them
+        Shapes of the parameters, which are arrays.
+    rebuild : function from a list of arrays to a module with these parameters
     """
 
     key: Any
@@ -35,7 +36,8 @@ class ProgramStructure:
     @staticmethod
     @memoize
     def from_module(module: eqx.Module) -> ProgramStructure:
-        """The form of a system, a method or a pacing, its parameters being the arrays among its leaves."""
+        """Return the structure of a system, a method or a step control, whose parameters are the arrays among its
+        leaves."""
         dynamic, static = eqx.partition(module, eqx.is_inexact_array)
         leaves, structure = jax.tree_util.tree_flatten(dynamic)
         static_leaves, static_structure = jax.tree_util.tree_flatten(static)
@@ -47,11 +49,11 @@ class ProgramStructure:
 
     @property
     def n_parameters(self) -> int:
-        """How many numbers the parameters are."""
+        """Number of all entries of the parameter arrays."""
         return sum(map(math.prod, self.shapes))
 
     def build(self, p) -> Any:
-        """The one with the parameters p, shape (size,), all arrays one after another."""
+        """Return the module with the parameters p, shape (n_parameters,), all arrays flattened one after another."""
         ends = list(itertools.accumulate(map(math.prod, self.shapes)))
         arrays = [p[end - math.prod(shape) : end].reshape(shape) for end, shape in zip(ends, self.shapes, strict=True)]
         return self.rebuild(arrays)
@@ -59,11 +61,11 @@ class ProgramStructure:
 
 @memoize
 def parameter_arrays(module: eqx.Module) -> tuple[np.ndarray, ...]:
-    """The parameters of a system, a method or a pacing."""
+    """Return the parameter arrays of a system, a method or a step control."""
     leaves = jax.tree_util.tree_leaves(eqx.filter(module, eqx.is_inexact_array))
     return tuple(np.asarray(leaf, dtype=np.float64) for leaf in leaves)
 
 
 def flat_parameters(*modules: eqx.Module) -> np.ndarray:
-    """The parameters of systems, methods or pacings, one after another, shape (p,)."""
+    """Return the parameters of systems, methods or step controls, one after another, shape (p,)."""
     return np.concatenate([np.zeros(0), *(array.ravel() for module in modules for array in parameter_arrays(module))])

@@ -1,4 +1,5 @@
-"""Machine code on disk. It is run as it is found, so it is taken from folders and files of this user alone."""
+"""Cache of machine code on disk. Cached code is run unchecked, so only files and folders of this user alone are
+used."""
 
 from __future__ import annotations
 
@@ -15,31 +16,32 @@ from ... import disk
 
 
 class CacheWarning(UserWarning):
-    """Machine code is compiled anew in every process, since it cannot be kept safely."""
+    """Warning that machine code cannot be cached safely, so that every process compiles it again."""
 
 
 CHECKSUM_BYTES = 32
-"""Bytes of a file before the code: its checksum, for a file that was cut short."""
+"""Length in bytes of the checksum at the start of a file, which shows that a file was cut short."""
 
 MAX_FILE_BYTES = 2**28
-"""Bytes of a file."""
+"""Largest size in bytes of a file that is read."""
 
 SAFE_OPEN_FLAGS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
-"""Flags that open no link, and do not wait for the other end of a pipe."""
+"""Flags that refuse to open a link and do not wait for the other end of a pipe."""
 
 
 def cache_folder() -> Path | None:
-    """Where machine code is kept: ``$LIETHERMO_CACHE``, or a folder in the user's cache directory; None without."""
+    """Return the cache folder: ``$LIETHERMO_CACHE``, or a folder in the user's cache directory; None if there is
+    none."""
     if user_folder := os.environ.get("LIETHERMO_CACHE"):
         return Path(user_folder)
     try:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "liethermo"
-    except RuntimeError:  # there is no HOME, and nobody knows the user
+    except RuntimeError:  # no HOME, and no entry for the user
         return None
 
 
 def read_code(name: str) -> bytes | None:
-    """What was written under a name; None where there is nothing, it is damaged, or it may be somebody else's."""
+    """Return the machine code written under ``name``; None if it is missing, damaged, or may be another user's."""
     folder = _trusted_folder()
     if folder is None:
         return None
@@ -61,7 +63,7 @@ def read_code(name: str) -> bytes | None:
 
 
 def write_code(name: str, code: bytes) -> None:
-    """Keep machine code under a name; nothing where there is no folder for it."""
+    """Write machine code to the cache under ``name``, if there is a folder that can be used."""
     folder = _trusted_folder()
     if folder is not None:
         with contextlib.suppress(OSError):
@@ -70,7 +72,7 @@ def write_code(name: str, code: bytes) -> None:
 
 
 def _trusted_folder() -> Path | None:
-    """The folder, made where there is none; None where it cannot be used, or others might write to it."""
+    """Return the cache folder, created if necessary; None if it cannot be used or others might write to it."""
     folder = cache_folder()
     if folder is None:
         return None
@@ -93,7 +95,7 @@ def _trusted_folder() -> Path | None:
 
 
 def _why_untrusted(status: os.stat_result) -> str:
-    """Why what is found on disk may be somebody else's, in words; empty where it is this user's alone."""
+    """Return why a file or folder may be another user's; empty if it is this user's alone."""
     if not hasattr(os, "geteuid"):
         return ""
     if status.st_uid != os.geteuid():
@@ -103,7 +105,7 @@ def _why_untrusted(status: os.stat_result) -> str:
 
 @functools.cache
 def _warn_untrusted(path: str, reason: str) -> None:
-    """Say so once."""
+    """Warn, once for each path, that machine code is not cached there."""
     warn(
         f"machine code is not kept in {path}: {reason}, and it could run anything as you. It is compiled in memory; "
         "give LIETHERMO_CACHE a folder of your own (chmod 700)",

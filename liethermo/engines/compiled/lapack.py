@@ -1,7 +1,7 @@
-"""LAPACK in machine code, by the pointers that SciPy exports, and products of matrices as loops.
+"""LAPACK kernels and special functions in machine code, by the pointers that SciPy exports.
 
-Machine code holds the names of the functions, so it can be kept on disk; each process binds them when it loads code
-that calls one. A call takes small matrices of one lane, on the thread that makes it.
+Machine code contains the names of the functions, so it can be cached on disk; each process binds the names when it
+loads code that calls them. A call takes small matrices of one lane, on the calling thread.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ INT8 = ir.IntType(8)
 FLOAT64_POINTER = FLOAT64.as_pointer()
 
 SYMBOL_PREFIX = "liethermo_"
-"""How the names of functions begin that are bound here."""
+"""Prefix of the names of functions that are bound when code is loaded."""
 
 LAPACK_ROUTINES = "dsyev zheev dgetrf zgetrf dgetri zgetri dgeqrf zgeqrf dorgqr zungqr dgesdd zgesdd".split()
 
@@ -38,12 +38,12 @@ SPECIAL_FUNCTIONS = {
     "igammac": ("gammaincc", 2),
     "regularized_incomplete_beta": ("__pyx_fuse_0betainc", 3),
 }
-"""SciPy's names of special functions, and of how many numbers they are."""
+"""SciPy's name of each special function, and its number of arguments."""
 
 
 @functools.cache
 def bind_symbols() -> None:
-    """Make known to LLVM what SciPy exports."""
+    """Bind the names of SciPy's exported functions in LLVM."""
     import scipy.linalg.cython_lapack
     import scipy.special.cython_special
 
@@ -59,11 +59,13 @@ def bind_symbols() -> None:
 
 
 def lapack_kernel(writer: Any, call: LapackCall) -> ir.Function:
-    """The function ``f(given, found)`` of a call for one lane, of arrays with a number for each.
+    """Return the function ``kernel(inputs, outputs)`` that computes a LAPACK call for one lane.
+
+    The arrays interleave the lanes: consecutive entries are ``writer.lanes`` numbers apart.
 
     Parameters
     ----------
-    writer : Writer
+    writer : ProgramWriter
     """
     name = "_".join(["call", call.name, "z" if call.is_complex else "d", *map(str, call.sizes)])
     if name in writer.builder.module.globals:
@@ -74,7 +76,7 @@ def lapack_kernel(writer: Any, call: LapackCall) -> ir.Function:
 
 
 class _KernelWriter:
-    """Writes a kernel. Matrices lie column by column inside, complex numbers as their two parts."""
+    """Writer of a LAPACK kernel. Its matrices are stored by columns, complex numbers as real and imaginary part."""
 
     def __init__(self, writer: Any, arguments: Sequence[ir.Value], call: LapackCall):
         self.writer, self.call, self.builder = writer, call, writer.builder
@@ -88,14 +90,13 @@ class _KernelWriter:
         build.store(ir.Constant(ir.IntType(1), 1), all_finite)
         for i in self._loop(total):
             value = build.load(self._lane_entry(self.input_pointer, i))
-            is_value_finite = build.fcmp_ordered(
-                "==", build.fsub(value, value), ir.Constant(FLOAT64, 0.0)
-            )  # not of infinity
-            build.store(build.and_(build.load(all_finite), is_value_finite), all_finite)
-        with build.if_else(build.load(all_finite)) as (is_value_finite, if_not_finite):
-            with is_value_finite:
+            difference = build.fsub(value, value)  # NaN for infinity
+            is_finite = build.fcmp_ordered("==", difference, ir.Constant(FLOAT64, 0.0))
+            build.store(build.and_(build.load(all_finite), is_finite), all_finite)
+        with build.if_else(build.load(all_finite)) as (finite_branch, other_branch):
+            with finite_branch:
                 getattr(self, f"_{self.call.name}")(*self.call.sizes)
-            with if_not_finite:
+            with other_branch:
                 self._write_nan()
         build.ret_void()
 
@@ -103,7 +104,7 @@ class _KernelWriter:
 
     def _eigh(self, n: int) -> None:
         a, w = self._copy_input(0, n, n), self._allocate_doubles(n)
-        is_complex, work_size = self.call.is_complex, 34 * n  # as much as a blocked reduction to tridiagonal form wants
+        is_complex, work_size = self.call.is_complex, 34 * n  # workspace of a blocked reduction to tridiagonal form
         arguments = [
             self._char_argument("V"),
             self._char_argument("L"),
@@ -137,17 +138,15 @@ class _KernelWriter:
             ],
         )
         self._copy_output(0, a, m, n)
-        for i in self._loop(n_pivots):  # LAPACK counts from one
+        for i in self._loop(n_pivots):  # LAPACK counts from 1
             pivot_index = self.builder.sub(self.builder.load(self.builder.gep(pivots, [i])), ir.Constant(INT32, 1))
             self.builder.store(self.builder.sitofp(pivot_index, FLOAT64), self._output_entry(1, i))
 
     def _inverse(self, n: int) -> None:
-        is_complex, a, rows, pivots = (
-            self.call.is_complex,
-            self._copy_input(0, n, n),
-            self._integer_argument(n),
-            self._allocate_integers(n),
-        )
+        is_complex = self.call.is_complex
+        a = self._copy_input(0, n, n)
+        rows = self._integer_argument(n)
+        pivots = self._allocate_integers(n)
         work_size = 64 * n
         factorise_arguments = [rows, rows, a, rows, pivots]
 
@@ -168,16 +167,12 @@ class _KernelWriter:
 
     def _qr(self, m: int, n: int, columns: int) -> None:
         n_reflectors, width, is_complex = min(m, n), max(n, columns), self.call.is_complex
-        a, tau, work_size = (
-            self._copy_input(0, m, n, width),
-            self._allocate_doubles(n_reflectors * self.parts_per_entry),
-            64 * width,
-        )
-        work, rows, info = (
-            self._allocate_doubles(work_size * self.parts_per_entry),
-            self._integer_argument(m),
-            self._allocate_integers(1),
-        )
+        a = self._copy_input(0, m, n, width)
+        tau = self._allocate_doubles(n_reflectors * self.parts_per_entry)
+        work_size = 64 * width
+        work = self._allocate_doubles(work_size * self.parts_per_entry)
+        rows = self._integer_argument(m)
+        info = self._allocate_integers(1)
         factorise_arguments = [
             rows,
             self._integer_argument(n),
@@ -218,10 +213,8 @@ class _KernelWriter:
         n_singular, max_dim, is_complex = min(m, n), max(m, n), self.call.is_complex
         n_left, n_right = (m, n) if full else (n_singular, n_singular)
         a, s = self._copy_input(0, m, n), self._allocate_doubles(n_singular)
-        u, v = (
-            self._allocate_doubles(m * n_left * self.parts_per_entry),
-            self._allocate_doubles(n_right * n * self.parts_per_entry),
-        )
+        u = self._allocate_doubles(m * n_left * self.parts_per_entry)
+        v = self._allocate_doubles(n_right * n * self.parts_per_entry)
         work_size = 8 * max_dim * max_dim + 64 * max_dim
         arguments = [
             self._char_argument("A" if full else "S"),
@@ -250,7 +243,7 @@ class _KernelWriter:
         return self.builder.gep(base, [self.builder.mul(i, ir.Constant(INT64, self.writer.lanes))])
 
     def _output_entry(self, result_index: int, i: ir.Value) -> ir.Value:
-        """Entry i of a result."""
+        """Return the pointer to entry i of a result."""
         start = sum(self.call.entry_counts(self.call.result_specs)[:result_index])
         return self._lane_entry(self.output_pointer, self.builder.add(i, ir.Constant(INT64, start)))
 
@@ -260,7 +253,7 @@ class _KernelWriter:
         return build.gep(a, [build.mul(offset, ir.Constant(INT64, self.parts_per_entry))])
 
     def _copy_input(self, start: int, m: int, n: int, width: int | None = None) -> ir.Value:
-        """An argument as LAPACK has it, with room for ``width`` columns."""
+        """Copy an argument into LAPACK's storage, with room for ``width`` columns."""
         build, a = self.builder, self._allocate_doubles(m * (width or n) * self.parts_per_entry)
         for i in self._loop(m):
             for j in self._loop(n):
@@ -320,18 +313,18 @@ class _KernelWriter:
         )
 
     def _call_with_info(self, name: str, arguments: Sequence[ir.Value], write_results) -> None:
-        """A routine that may fail, its last argument saying so."""
+        """Call a routine whose last argument reports failure, then write its results, or NaN if it failed."""
         info = self._allocate_integers(1)
         self._call_routine(name, [*arguments, info])
         is_successful = self.builder.icmp_signed("==", self.builder.load(info), ir.Constant(INT32, 0))
-        with self.builder.if_else(is_successful) as (if_successful, if_failed):
-            with if_successful:
+        with self.builder.if_else(is_successful) as (success_branch, failure_branch):
+            with success_branch:
                 write_results()
-            with if_failed:
+            with failure_branch:
                 self._write_nan()
 
     def _loop(self, count: int):
-        """A loop: the body of the ``for`` is written once, with its counter."""
+        """Write a loop: the body of the Python ``for`` is written once, with the loop counter."""
         with self.writer.loop_range(ir.Constant(INT64, count)) as i:
             yield i
 
@@ -339,7 +332,7 @@ class _KernelWriter:
 def declare_symbol(
     module: ir.Module, name: str, return_type: ir.Type, argument_types: Sequence[ir.Type]
 ) -> ir.Function:
-    """A function that is bound when the code is loaded."""
+    """Declare a function that is bound when the code is loaded."""
     name = SYMBOL_PREFIX + name
     if name in module.globals:
         return module.globals[name]

@@ -1,8 +1,9 @@
-"""The step loop of the compiled engine: the array engine's own steps, as scalar programs, on lanes that go together.
+"""Step loop of the compiled engine: the array engine's own steps, as scalar programs, on lanes that advance together.
 
-A *block* of trajectories advances together, one SIMD lane each; a single one is a block of one lane. The programs are
-traced from the functions that the array engine runs (:mod:`..array`), so its rules are these; here are the loops around
-them. What a block knows stays in registers, as far as there are enough, and is written back when the loop is left.
+A *block* is a group of trajectories that advance together, one SIMD lane each; a single trajectory is a block of one
+lane. The programs are traced from the functions of the array engine (:mod:`..array`), so both engines take the same
+steps; this module writes the loops around them. The fields of a block are held in registers, as far as there are
+enough, and written back when the loop is left.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ INT64_POINTER = INT64.as_pointer()
 
 
 class NamedProgram(NamedTuple):
-    """A program, and the names of the arrays that it reads and writes."""
+    """A program with the names of the arrays that it reads and writes."""
 
     program: Program
     arguments: tuple[str, ...]
@@ -37,7 +38,7 @@ class NamedProgram(NamedTuple):
 
 
 class BlockLayout:
-    """Where arrays of some shapes lie one after another: their first rows by name, and how many rows there are."""
+    """Layout of a block: the first row and the number of rows of each array, by name."""
 
     def __init__(self, shapes: Mapping[str, tuple[int, ...]]):
         self.row_counts = {name: math.prod(shape) for name, shape in shapes.items()}
@@ -54,20 +55,20 @@ def compile_step_loop(
     saved_names: Sequence[str],
     skip_optimisation: bool,
 ) -> MachineCode:
-    """The functions ``advance`` and ``begin`` of :class:`_StepLoopWriter` as machine code.
+    """Compile the functions ``advance`` and ``begin`` of :class:`_StepLoopWriter` to machine code.
 
     Parameters
     ----------
     programs : mapping
-        ``begin``, the state of a run about to start, and ``step``, the state after a step.
-    layout : Layout
-        Of a block, each row with a number for each lane.
+        ``begin``, which computes the initial state of a run, and ``step``, the state after a step.
+    layout : BlockLayout
+        Layout of a block; each row has a number for each lane.
     state_names : sequence of str
-        The arrays that stay from step to step.
+        Arrays that are carried from step to step.
     is_per_trajectory : array of bool, shape (p,)
-        Which parameters lie in the block, under the name "p"; the others are the same for all.
+        Parameters that lie in the block, under the name "p"; the others are common to all trajectories.
     saved_names : sequence of str
-        The arrays that are written down at each save.
+        Arrays that are written out at each save.
     skip_optimisation : bool
         See :class:`.machine_code.MachineCode`.
     """
@@ -93,26 +94,26 @@ def compile_step_loop(
 
 
 class CompiledLoops:
-    """The functions of :func:`compile_step_loop`: optimised once many steps are taken.
+    """Compiled functions of :func:`compile_step_loop`, optimised only once many steps are taken.
 
     Parameters
     ----------
-    make : function from ``hasty`` to MachineCode
-    small : bool
-        Whether there is a choice: code that is not optimised takes a place on the stack for each of its operations.
+    compile_loops : function from ``skip_optimisation`` to MachineCode
+    can_skip_optimisation : bool
+        Whether code may stay unoptimised: such code takes a place on the stack for each of its operations.
     """
 
     def __init__(self, compile_loops: Callable[[bool], MachineCode], can_skip_optimisation: bool):
-        self._compile, self._can_skip_optimisation, self._steps_so_far, self._lock = (
-            compile_loops,
-            can_skip_optimisation,
-            0,
-            threading.Lock(),
-        )
-        self._loaded: list[tuple[MachineCode, Callable, Callable]] = []  # all of them: a thread may be in any
+        self._compile = compile_loops
+        self._can_skip_optimisation = can_skip_optimisation
+        self._steps_so_far = 0
+        self._lock = threading.Lock()
+        self._loaded: list[
+            tuple[MachineCode, Callable, Callable]
+        ] = []  # kept loaded, because a thread may be running any of them
 
     def loop_functions(self, n_steps: int, planned_steps: int = 0) -> Sequence[Callable]:
-        """``begin`` and ``advance`` for so many steps more, and others that are planned: compiled, or found so."""
+        """Return ``begin`` and ``advance``, compiled for ``n_steps`` more steps now and ``planned_steps`` later."""
         with self._lock, report_compiler_faults():
             self._steps_so_far += n_steps
             skip_optimisation = (
@@ -143,12 +144,13 @@ BEGIN_SIGNATURE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctype
 
 
 class _StepLoopWriter(ProgramWriter):
-    """Writes ``advance(p, blocks, done, count, saves, every, out, most, noise, newton)``.
+    """Writer of ``advance(p, blocks, done, count, saves, every, out, most, noise, newton)`` and of ``begin``.
 
-    It advances each block from its step ``done`` to step ``saves * every`` and keeps states in ``out``, one in
-    ``every``. It reads the increments that drive the steps from ``noise``, block by block. A call takes ``most`` steps
-    at most, and ends where a block needs Newton's method and ``newton`` is null. It then returns the number of that
-    block, and another call goes on there; otherwise it returns the number of blocks.
+    ``advance`` takes each block from its step ``done`` to step ``saves * every`` and writes every ``every``-th state to
+    ``out``. It reads the noise increments of the steps from ``noise``, block by block. A call takes at most ``most``
+    steps. If a block needs Newton's method and ``newton`` is null, the call returns the number of that block, and
+    another
+    call resumes there; otherwise it returns the number of blocks.
     """
 
     def __init__(
@@ -210,7 +212,8 @@ class _StepLoopWriter(ProgramWriter):
         build.ret(argument["count"])
 
     def write_begin(self) -> None:
-        """``begin(p, blocks, count)``: from the x of each trajectory the state of a run about to start there."""
+        """Write ``begin(p, blocks, count)``, which computes the initial state of a run from the x of each
+        trajectory."""
         with self.loop_range(self.arguments["count"]) as i:
             self.select_block(i)
             self.load_rows([name for name in self.programs["begin"].arguments if name != "p"])
@@ -219,13 +222,13 @@ class _StepLoopWriter(ProgramWriter):
         self.builder.ret_void()
 
     def select_block(self, i: ir.Value) -> None:
-        """Work on block i from here on."""
+        """Make block i the one that the following instructions work on."""
         offset = self.builder.mul(i, self.int64(self.layout.n_rows * self.lanes))
         self.builder.store(self.builder.gep(self.arguments["blocks"], [offset]), self.block)
         self.builder.store(i, self.block_index)
 
     def load_noise_increments(self, step_number: ir.Value) -> None:
-        """The increments of a step, from the row of ``noise`` with this number."""
+        """Load the increments of a step from row ``step_number`` of ``noise``."""
         build, slots = self.builder, self.slots["dW"]
         row = build.mul(step_number, self.int64(len(slots) * self.lanes))
         for j, slot in enumerate(slots):
@@ -233,9 +236,9 @@ class _StepLoopWriter(ProgramWriter):
             build.store(build.load(build.bitcast(start, self.double_type.as_pointer()), align=8), slot)
 
     def call_newton(self, args: Sequence[ir.Value], n_results: int) -> list[ir.Value]:
-        """Newton's method for the lanes that have not converged; the loop is left where there is none.
+        """Call Newton's method for the lanes that have not converged; leave the loop if it is not compiled yet.
 
-        It finds its arguments in the block, and leaves its results there.
+        Newton's method reads its arguments from the block and writes its results there.
         """
         build, argument = self.builder, self.arguments
         is_unsolved = build.fcmp_ordered("==", args[CONVERGED_INDEX], self.constant(0.0))
@@ -268,7 +271,7 @@ class _StepLoopWriter(ProgramWriter):
     # -- rows and slots -----------------------------------------------------------------------------------------------
 
     def run_program(self, name: str) -> None:
-        """Run a piece; its results take the place of what there was, in the lanes that are active."""
+        """Run a program; in the active lanes its results replace the old values."""
         named_program, build, active_lanes = self.programs[name], self.builder, self.active_lanes
 
         def read(i: int, j: int) -> ir.Value:
@@ -281,7 +284,7 @@ class _StepLoopWriter(ProgramWriter):
                 return None
             if rows[0] is None:
                 start, value_type = build.gep(self.arguments["p"], [self.int64(entries[0])]), FLOAT64
-            else:  # those of an array are all each lane's own, in the same order
+            else:  # per-trajectory entries of an array are consecutive rows of the block
                 start, value_type = self.row_pointer(self.layout.first_rows["p"] + rows[0]), self.double_type
             return Table(self, value_type, start=start, length=len(entries), stride=entries.step)
 
@@ -316,7 +319,7 @@ class _StepLoopWriter(ProgramWriter):
                 self.builder.store(self.builder.load(slot), self.row_pointer(self.layout.first_rows[name] + i), align=8)
 
     def store_output(self, i: ir.Value, save_number: ir.Value) -> None:
-        """Write down what is kept, as the row of block i in ``out`` with this number."""
+        """Write the saved fields of block i to ``out``, as save ``save_number``."""
         build, argument = self.builder, self.arguments
         saved_slots = [slot for name in self.saved_names for slot in self.slots[name]]
         row = build.add(build.mul(i, argument["saves"]), build.sub(save_number, self.int64(1)))
@@ -327,8 +330,7 @@ class _StepLoopWriter(ProgramWriter):
 
 
 NEWTON_BUFFER = "deferred"
-"""Rows of a block that hold what Newton's method is given, and what it leaves: the latter is what the former begins
-with."""
+"""Name of the rows of a block that hold the arguments of Newton's method; its results overwrite the first of them."""
 
 CONVERGED_INDEX = 0
-"""Which of them says whether the equations are solved."""
+"""Index among the arguments of Newton's method of the flag that the stage equations are solved."""

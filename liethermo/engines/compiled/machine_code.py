@@ -1,4 +1,4 @@
-"""Modules of LLVM instructions as machine code: kept on disk, unloaded when unused."""
+"""Compilation of LLVM modules to machine code, cached on disk and unloaded when unused."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from . import kept, lapack
 
 
 class MachineCode:
-    """A module as machine code: unloaded with this object.
+    """Machine code of a module, unloaded with this object.
 
     Parameters
     ----------
     module : ir.Module, or its text
     skip_optimisation : bool
-        Do not optimise it, which takes longer than a short run. Its numbers are the same.
+        Do not optimise the code, which takes longer than a short run. Its results are the same.
 
     Attributes
     ----------
     skip_optimisation : bool
-        Whether it is not optimised: what is found on disk may be.
+        Whether the code is not optimised; code from the cache may be, even if it was not asked for.
     ir_text : str
     """
 
@@ -52,7 +52,7 @@ class MachineCode:
             self._engine.finalize_object()
 
     def function_address(self, name: str) -> int:
-        """The address of a function."""
+        """Return the address of the function ``name``."""
         return self._engine.get_function_address(name)
 
 
@@ -61,10 +61,10 @@ _lock = threading.Lock()
 
 @functools.cache
 def _host_target() -> tuple[llvm.Target, str, str, str]:
-    """This machine, and what tells its machine code, and the compiler's version, from others.
+    """Return the LLVM target, CPU and features of this machine, and a text that identifies them and the LLVM version.
 
-    ``$LIETHERMO_CPU`` names another processor whose instructions to use, one that this machine can stand in for: as
-    LLVM names them, such as ``x86-64-v3``, which has AVX2 and no AVX-512.
+    ``$LIETHERMO_CPU`` selects another CPU whose instructions this machine supports, by its LLVM name, such as
+    ``x86-64-v3``, which has AVX2 and no AVX-512.
     """
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
@@ -79,13 +79,13 @@ def _host_target() -> tuple[llvm.Target, str, str, str]:
 
 
 def _target_machine(skip_optimisation: bool = False) -> llvm.TargetMachine:
-    """A compiler for this machine; an engine that is made with one owns it."""
+    """Return an LLVM compiler for this machine; an engine created with it owns it."""
     target, cpu, features, _ = _host_target()
     return target.create_target_machine(cpu, features, opt=0 if skip_optimisation else 3, jit=True, reloc="pic")
 
 
 def _object_file(code: bytes | None) -> llvm.ObjectFileRef | None:
-    """Code for the linker; None where there is none, or it is something else, which LLVM does not survive."""
+    """Return the code as an object file for the linker; None if it is no valid object file, which would crash LLVM."""
     if code is None or not (code.startswith(OBJECT_FILE_MAGICS) or _is_valid_elf(code)):
         return None
     try:
@@ -95,11 +95,11 @@ def _object_file(code: bytes | None) -> llvm.ObjectFileRef | None:
 
 
 OBJECT_FILE_MAGICS = (b"\xcf\xfa\xed\xfe", b"\x64\x86", b"\x64\xaa")
-"""How objects of macOS and of Windows begin."""
+"""First bytes of object files of macOS and Windows."""
 
 
 def _is_valid_elf(code: bytes) -> bool:
-    """Whether these bytes are a relocatable object of Linux whose parts all lie within them."""
+    """Return whether the bytes are a relocatable ELF object whose sections all lie within them."""
     if len(code) < 64 or code[:5] != b"\x7fELF\x02" or struct.unpack_from("<H", code, 16) != (1,):
         return False
     (table_offset,) = struct.unpack_from("<Q", code, 40)
@@ -116,7 +116,7 @@ def _is_valid_elf(code: bytes) -> bool:
 
 
 SHT_NOBITS = 8
-"""The kind of a section that takes no place in its file."""
+"""ELF section type of a section that occupies no space in its file."""
 
 
 def _compile_module(text: str, skip_optimisation: bool) -> bytes:

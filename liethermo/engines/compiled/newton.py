@@ -1,4 +1,4 @@
-"""Newton's method for one trajectory of a block, which the step loop calls where fixed-point iteration fails."""
+"""Newton's method for one trajectory of a block, which the step loop calls if fixed-point iteration fails."""
 
 from __future__ import annotations
 
@@ -17,24 +17,22 @@ from .writer import FLOAT64, INT64, ProgramWriter
 def compile_newton_solver(
     program: Program, layout: BlockLayout, is_per_trajectory: np.ndarray, lanes: int
 ) -> MachineCode:
-    """The function ``solve(p, block, lane)``: a program on the arrays of one lane, as machine code.
+    """Compile the function ``solve(p, block, lane)``, which runs ``program`` on the arrays of one lane.
 
     Parameters
     ----------
     program : Program
-        :func:`..stages.by_newton`, of the parameters p and of what is :data:`.loop.DEFERRED`, whose first rows it
-        replaces.
-    layout : Layout
+        :func:`..stages.solve_newton`, of the parameters p and the rows :data:`.loop.NEWTON_BUFFER`; the results
+        overwrite the first of these rows.
+    layout : BlockLayout
     is_per_trajectory : array of bool, shape (p,)
-        Which parameters lie in the block; the others are the same for all.
+        Parameters that lie in the block; the others are common to all trajectories.
     """
     module = ir.Module("newton")
     function = ir.Function(module, ir.FunctionType(ir.VoidType(), [FLOAT64_POINTER, FLOAT64_POINTER, INT64]), "solve")
-    build, (p, block, lane), parameter_row = (
-        ir.IRBuilder(function.append_basic_block()),
-        function.args,
-        np.cumsum(is_per_trajectory) - 1,
-    )
+    build = ir.IRBuilder(function.append_basic_block())
+    (p, block, lane) = function.args
+    parameter_row = np.cumsum(is_per_trajectory) - 1
     writer, first_row = ProgramWriter(build, 1), layout.first_rows[NEWTON_BUFFER]
 
     def row_pointer(row: int) -> ir.Value:

@@ -1,4 +1,4 @@
-"""Trajectories with steps of sizes of their own in the compiled engine."""
+"""Adaptive runs in the compiled engine."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from .stepper import CompiledStepLoop
 
 
 class CompiledAdaptiveRuns:
-    """Trajectories in lanes, each with a pace of its own, in place of :class:`..paced.ArrayPaces`.
+    """Adaptive runs of trajectories in lanes, the counterpart of :class:`..paced.ArrayAdaptiveRuns`.
 
     Parameters
     ----------
-    step_loop : Stepper
+    step_loop : CompiledStepLoop
     first_parameters : array, shape (p,)
-        The parameters of one of them, those of the method and the pacing among them.
+        Parameters of one trajectory: of its system, the method and the step control.
     parameters : array, shape (p,) or (trajectories, p)
     x : array, shape (trajectories, n)
-    t, stop, length : float
-        See :func:`..pacing.begun`.
+    t, stop_time, span_length : float
+        See :func:`..pacing.initial_adaptive_state`.
     """
 
     def __init__(
@@ -40,7 +40,7 @@ class CompiledAdaptiveRuns:
         return self.step_loop.state_from_block(self.blocks.copy())
 
     def attempt_records(self, max_attempts: int) -> dict[str, np.ndarray]:
-        """Make so many attempts of the only trajectory, or fewer: see :meth:`..paced.ArrayPaces.attempts`."""
+        """Make up to ``max_attempts`` attempts of the only trajectory and return their records: see ATTEMPT_FIELDS."""
         n_before, out = self.read("n_attempts")[0], np.empty((1, max_attempts, self.step_loop.n_saved_values))
         try:
             self.step_loop.run(self.first_parameters, self.blocks, 0.0, max_attempts, 1, out=out)
@@ -60,10 +60,10 @@ class CompiledAdaptiveRuns:
         self.step_loop.block_rows(self.blocks, name)[block, :, lane] = np.broadcast_to(values, indices.shape)[:, None]
 
     def _lane_values(self, indices: np.ndarray, name: str | None = None) -> np.ndarray:
-        """A field of some of them, or all that is known of them, shape (trajectories, rows)."""
+        """Return a field of the chosen trajectories, or all their rows, shape (trajectories, rows)."""
         block, lane = np.divmod(indices, self.step_loop.lanes)
         return self.step_loop.block_rows(self.blocks, name)[block, :, lane]
 
     def keep_only(self, indices: np.ndarray) -> None:
-        """Go on with some of them."""
+        """Drop all trajectories except the chosen ones."""
         self.blocks, self.n_trajectories = self.step_loop.blocks_from_rows(self._lane_values(indices)), len(indices)

@@ -1,9 +1,8 @@
-"""The compiled engine: a user's plain functions as machine code, for small systems on the CPU.
+"""Compiled engine: a user's plain functions as machine code, for small systems on the CPU.
 
 The steps of the array engine, for one system and method, are traced, unrolled to scalar programs (:mod:`liethermo.
 tracing.scalarize`) and placed in a loop over steps (:mod:`.loop`) that LLVM compiles. The system's parameters (the
-arrays among its leaves) stay arguments: a sweep compiles once. Machine code is kept on disk, so that another process
-finds it.
+arrays among its leaves) stay arguments: a sweep compiles once. Machine code is cached on disk for other processes.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ import itertools
 import math
 import threading
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -46,20 +45,35 @@ from .newton import compile_newton_solver
 
 STATE_FIELDS = State._fields
 ADAPTIVE_FIELDS = tuple(name for name in AdaptiveState._fields if name != "state")
-"""Those of a pace beside them."""
-NEWTON_INPUTS = ("dW", "x", "compensation", "h", "k", "previous_slopes")
-"""What it is given."""
+"""Fields of an adaptive state besides the state."""
+
+
+class NewtonInputs(NamedTuple):
+    """Inputs of the Newton fallback, as they are packed into the Newton buffer."""
+
+    dW: jax.Array
+    x: jax.Array
+    compensation: jax.Array
+    h: jax.Array
+    k: jax.Array
+    previous_slopes: jax.Array
+
+
+NEWTON_INPUTS = NewtonInputs._fields
+"""Names of the inputs of the Newton fallback."""
+
 NEWTON_OUTPUTS = ("converged", "is_finite", "residual", "newton_iterations", "slope_rounding", "k")
-"""What Newton's method may make better of :class:`..stages.Solved`."""
+"""Fields of :class:`..stages.StageSolution` that the Newton fallback replaces."""
 
 
 class CompiledEngine:
-    """The compiled engine for one system and method: its results are those of the array engine.
+    """Compiled engine for one system and method; its steps are those of the array engine.
 
     Raises
     ------
     UnsupportedPrimitive
-        If the system or the method uses what cannot be unrolled; of Newton's method, when a step first needs it.
+        If the system or the method uses a primitive that cannot be unrolled; if only Newton's method does, at the first
+        step that needs it.
     """
 
     name = "compiled"
@@ -67,26 +81,23 @@ class CompiledEngine:
     def __init__(
         self, system: System, method: OneStepMethod, options: SolverOptions = DEFAULT_OPTIONS, planned_steps: int = 0
     ):
-        self._parameters, self.max_saves_per_call, self._planned_steps = (
-            flat_parameters(system, method),
-            max_saves_per_call(system),
-            planned_steps,
-        )
+        self._parameters, self._planned_steps = flat_parameters(system, method), planned_steps
+        self.max_saves_per_call = max_saves_per_call(system)
         self._structure, self._method, self._options = ProgramStructure.from_module(system), method, options
 
     @functools.cached_property
     def _step_loop(self) -> CompiledStepLoop:
-        """Its loop of steps, made when it is first needed: a run with a pace has one of its own."""
+        """Loop of fixed steps, compiled at its first use: an adaptive run has a loop of its own."""
         return cached_step_loop(self._structure, self._parameters, self._method, options=self._options)
 
     def adaptive_step_loop(self, control: StepControl) -> tuple[CompiledStepLoop, np.ndarray]:
-        """The stepper of a run with a pace, and its parameters."""
+        """Return the step loop of an adaptive run, and its parameters."""
         parameters = np.append(self._parameters, flat_parameters(control))
         return cached_step_loop(self._structure, parameters, self._method, control, options=self._options), parameters
 
     @property
     def n_operations(self) -> int:
-        """How many scalar operations a step takes."""
+        """Number of scalar operations of a step."""
         return self._step_loop.n_operations
 
     def initial_run_state(self, x) -> State:
@@ -120,31 +131,31 @@ class CompiledEngine:
 
 
 class CompiledStepLoop:
-    """The step loop of one method on systems of one form, compiled; parameters are arguments.
+    """Compiled step loop of one method on systems of one structure; parameters are arguments.
 
-    With a pacing a step is an attempt, whose size the loop chooses.
+    With a ``control`` a step is an attempt of an adaptive run, whose size the loop chooses.
 
     Parameters
     ----------
-    forms : sequence of Form
-        Of the system and of the method, and of the pacing where there is one.
+    structures : sequence of ProgramStructure
+        Structures of the system, the method and, in an adaptive run, the step control.
     parameters : array, shape (p,)
-        Those of one of each, one after another. Zeros among them hold for all, unless they vary.
+        Example parameters of these, one after another. Zeros among them are compiled in, unless they vary.
     method : OneStepMethod
-    pacing : Pacing or None
+    control : StepControl or None
     lanes : int
-        Trajectories that advance together, a block.
-    varies : array of bool, shape (p,)
-        Which parameters are each trajectory's own.
+        Number of trajectories in a block, which advance together.
+    is_per_trajectory : array of bool, shape (p,)
+        Parameters that differ between trajectories.
 
     Attributes
     ----------
     field_names : tuple of str
-        The fields of a trajectory.
+        Fields of a trajectory.
     initial_inputs, step_inputs : tuple of str
-        The input of a run besides its x, and what a step is given besides the fields.
+        Inputs of the initial state besides p and x; inputs of a step besides the fields.
     saved_fields : tuple of str
-        The fields that are written down at each save.
+        Fields that are written out at each save.
     """
 
     def __init__(
@@ -215,7 +226,7 @@ class CompiledStepLoop:
     # -- what is compiled -----------------------------------------------------------------------------------------
 
     def build_modules(self, p) -> list[Any]:
-        """System and method, and pacing, with the parameters p."""
+        """Return system and method, and the step control of an adaptive run, with the parameters p."""
         ends = itertools.accumulate(structure.n_parameters for structure in self._structures)
         return [
             structure.build(p[end - structure.n_parameters : end])
@@ -223,7 +234,7 @@ class CompiledStepLoop:
         ]
 
     def initial_fields(self, p, x, *times) -> tuple:
-        """The fields of a run about to start at x."""
+        """Return the fields of a run that starts at x."""
         system, method, *control = self.build_modules(p)
         if not control:
             return initial_run_state(system, method, x)
@@ -231,7 +242,8 @@ class CompiledStepLoop:
         return *adaptive_state.state, *adaptive_state[1:]
 
     def fields_after_step(self, p, dW, *inputs) -> tuple:
-        """The fields after a step, or an attempt, from its size and those before, or these alone."""
+        """Return the fields after a step or an attempt; ``inputs`` are the step size (fixed steps only) and the old
+        fields."""
         system, method, *control = self.build_modules(p)
         if not control:
             h, *fields = inputs
@@ -245,7 +257,8 @@ class CompiledStepLoop:
         return *adaptive_state.state, *adaptive_state[1:]
 
     def _newton_fallback(self, dW) -> Callable:
-        """Newton's method, for :func:`..stepping.take_step`: a program of its own, compiled when a step needs it."""
+        """Return the fallback of :func:`..stepping.take_step`: a separate program, compiled when a step first needs
+        it."""
 
         def bind_deferred_newton(fixed_point_result: StageSolution, *stage_inputs) -> StageSolution:
             initial_outputs = [1.0 * getattr(fixed_point_result, name) for name in NEWTON_OUTPUTS]
@@ -258,21 +271,19 @@ class CompiledStepLoop:
         return bind_deferred_newton
 
     def _solve_packed_newton(self, p, packed) -> tuple:
-        """What takes the place of what is handed over."""
+        """Run Newton's method on the packed outputs and inputs; return the new outputs."""
         system, method, *_ = self.build_modules(p)
         shapes = [self.field_shape(name) for name in (*NEWTON_OUTPUTS, *NEWTON_INPUTS)]
         ends = itertools.accumulate(map(math.prod, shapes))
         arrays = [packed[end - math.prod(shape) : end].reshape(shape) for end, shape in zip(ends, shapes, strict=True)]
-        dW, x, compensation, h, k, previous_slopes = arrays[len(NEWTON_OUTPUTS) :]
-        equations = stage_equations(
-            system, set_noise_increments(method, dW), x, compensation, h, k, previous_slopes, self._options, jax.lax.map
-        )
+        dW, *stage_inputs = NewtonInputs(*arrays[len(NEWTON_OUTPUTS) :])
+        equations = stage_equations(system, set_noise_increments(method, dW), *stage_inputs, self._options, jax.lax.map)
         solution = solve_newton(equations, self._options)
         return tuple(1.0 * getattr(solution, name) for name in NEWTON_OUTPUTS)
 
     @property
     def n_operations(self) -> int:
-        """Scalar operations of a step with one iteration."""
+        """Number of scalar operations of a step with one iteration."""
         return self._programs["step"].program.instruction_count
 
     def _trace_program(self, function: Callable, names: Sequence[str], results: Sequence[str] = ()) -> NamedProgram:
@@ -283,9 +294,9 @@ class CompiledStepLoop:
     # -- trajectories in blocks -----------------------------------------------------------------------------------
 
     def start_blocks(self, parameters, x: np.ndarray, planned_steps: int = 0, **fields: np.ndarray) -> np.ndarray:
-        """Blocks, shape (blocks, rows * lanes), of trajectories about to start at x, shape (trajectories, n).
+        """Return blocks, shape (blocks, rows * lanes), of trajectories that start at x, shape (trajectories, n).
 
-        ``parameters`` has shape (p,), or (trajectories, p) where some vary; so many steps are ``planned_steps``.
+        ``parameters`` has shape (p,), or (trajectories, p) if some differ; ``planned_steps`` decides on optimisation.
         """
         blocks = self.make_blocks({"x": x, **fields}, parameters)
         first_parameters = np.ascontiguousarray(
@@ -298,26 +309,27 @@ class CompiledStepLoop:
         return blocks
 
     def block_rows(self, blocks: np.ndarray, name: str | None = None) -> np.ndarray:
-        """A field of blocks, or all rows of them, shape (blocks, entries, lanes)."""
+        """Return a field of blocks, or all their rows, as a view of shape (blocks, rows, lanes)."""
         rows = blocks.reshape(len(blocks), self.n_rows, self.lanes)
         return rows if name is None else rows[:, self.row_slice(name)]
 
     @property
     def n_rows(self) -> int:
-        """How many rows a trajectory has."""
+        """Number of rows of a block."""
         return self._layout.n_rows
 
     def row_slice(self, name: str) -> slice:
-        """Those of a field."""
+        """Return the rows of a field."""
         start = self._layout.first_rows[name]
         return slice(start, start + self._layout.row_counts[name])
 
     def field_shape(self, name: str) -> tuple[int, ...]:
-        """The shape of a field of one trajectory."""
+        """Return the shape of a field of one trajectory."""
         return self._shapes.get(name, ())
 
     def make_blocks(self, fields: dict[str, Any], parameters=None) -> np.ndarray:
-        """Blocks of trajectories with the given fields, trajectories first; nothing else is set but their status."""
+        """Return blocks of trajectories with the given fields, trajectories first, and status 0; other fields are
+        undefined."""
         if self._is_per_trajectory.any() and "p" not in fields:
             fields = fields | {"p": parameters[:, self._is_per_trajectory]}
         n_trajectories = len(fields["x"])
@@ -328,7 +340,7 @@ class CompiledStepLoop:
         return self._mark_empty_lanes(blocks, n_trajectories)
 
     def block_from_state(self, state: State) -> np.ndarray:
-        """The only block of a trajectory by itself."""
+        """Return the block of a single trajectory."""
         block = np.zeros((1, self.n_rows))
         row = block[0]
         for (start, end, shape), value in zip(self._state_rows, state, strict=True):
@@ -339,31 +351,31 @@ class CompiledStepLoop:
         return block
 
     def state_from_block(self, blocks: np.ndarray) -> State:
-        """The state in the only block of a trajectory by itself."""
+        """Return the state of a single trajectory from its block."""
         row = blocks[0]
         return State(
             *(row[start:end].reshape(shape) if shape else row[start] for start, end, shape in self._state_rows)
         )
 
     def blocks_from_rows(self, rows: np.ndarray) -> np.ndarray:
-        """Blocks of trajectories from all their rows, shape (trajectories, rows)."""
+        """Return blocks of trajectories from all their rows, shape (trajectories, rows)."""
         return self._mark_empty_lanes(np.ascontiguousarray(self._rows_to_lanes(rows)), len(rows))
 
     def _rows_to_lanes(self, rows: np.ndarray) -> np.ndarray:
-        """Rows of trajectories, shape (trajectories, m), as (blocks, m, lanes); the last one fills empty lanes."""
+        """Rearrange rows, shape (trajectories, m), to (blocks, m, lanes); the last trajectory fills the empty lanes."""
         n_blocks = -(-len(rows) // self.lanes)
         if n_empty := n_blocks * self.lanes - len(rows):
             rows = np.concatenate([rows, np.repeat(rows[-1:], n_empty, axis=0)])
         return rows.reshape(n_blocks, self.lanes, -1).swapaxes(1, 2)
 
     def _mark_empty_lanes(self, blocks: np.ndarray, n_trajectories: int) -> np.ndarray:
-        """Blocks, shape (blocks, rows, lanes), of so many trajectories, their empty lanes marked; each in one row."""
+        """Mark the empty lanes of blocks, shape (blocks, rows, lanes), and return the blocks with one row each."""
         n_used = n_trajectories - (len(blocks) - 1) * self.lanes
         blocks[-1, self._layout.first_rows["status"], n_used:] = StatusCode.EMPTY_LANE
         return blocks.reshape(len(blocks), -1)
 
     def read_fields(self, blocks: np.ndarray, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
-        """Fields of trajectories, trajectories first, those of empty lanes among them."""
+        """Return fields of all lanes by name, trajectories first, including empty lanes."""
         fields, n_lanes = {}, len(blocks) * self.lanes
         for name in self.field_names if names is None else names:
             values = self.block_rows(blocks, name).swapaxes(0, 1)
@@ -373,13 +385,16 @@ class CompiledStepLoop:
     def run(
         self, parameters, blocks: np.ndarray, h: float | np.ndarray, saves: int, save_every: int, noise=None, out=None
     ) -> np.ndarray:
-        """Advance blocks in place by ``saves * every`` steps of size h, or less where steps fail.
+        """Advance blocks in place by ``saves * save_every`` steps of size h, fewer if a step fails; return the saved
+        fields.
 
-        The size is one for all, or one for each lane, those of empty ones among them.
-        ``noise`` has the increments, shape (trajectories, steps, increments), of a method that is driven by any.
+        h is one step size, or one for each lane, empty lanes included. ``noise`` holds the increments of a stochastic
+        method,
+        shape (trajectories, steps, increments).
 
-        Returns, at each save, what is :attr:`kept` of every trajectory: shape (trajectories, saves, width), with those
-        of empty lanes, and undefined after a failure. It is written to ``out``, if there is one.
+        The result has shape (trajectories, saves, n_saved_values), including empty lanes, and is undefined after a
+        failed
+        step. It is written to ``out`` if that is given.
         """
         lanes, n_blocks, width = self.lanes, len(blocks), self.n_saved_values
         if "h" in self._layout.first_rows:
@@ -398,7 +413,7 @@ class CompiledStepLoop:
         return out.reshape(n_blocks, saves, width, lanes).transpose(0, 3, 1, 2).reshape(n_blocks * lanes, saves, width)
 
     def saved_fields_of_one(self, out: np.ndarray) -> dict[str, np.ndarray]:
-        """By name what is kept of a trajectory that is a block by itself, from rows of ``out``."""
+        """Return the saved fields of a single trajectory by name, from rows of ``out``."""
         ends = np.cumsum([self._layout.row_counts[name] for name in self.saved_fields])
         arrays = np.split(out, ends[:-1], axis=-1)
         return {
@@ -408,11 +423,11 @@ class CompiledStepLoop:
 
     @property
     def n_saved_values(self) -> int:
-        """Numbers that are kept of a trajectory at each save."""
+        """Number of values of a trajectory at each save."""
         return sum(self._layout.row_counts[name] for name in self.saved_fields)
 
     def _noise_by_block(self, noise: np.ndarray | None, n_blocks: int, n_steps: int) -> np.ndarray:
-        """Increments as the loop reads them, shape (blocks, steps, increments, lanes)."""
+        """Rearrange noise increments to the order of the loop, shape (blocks, steps, increments, lanes)."""
         if noise is None or not self._shapes["dW"][0]:
             return np.zeros((n_blocks, n_steps, self._shapes["dW"][0], self.lanes))
         padded = np.zeros((n_blocks * self.lanes, n_steps, self._shapes["dW"][0]))
@@ -422,7 +437,7 @@ class CompiledStepLoop:
     # -- machine code -------------------------------------------------------------------------------------------------
 
     def _newton_address(self) -> int:
-        """The address of Newton's method, which is compiled when a step first needs it."""
+        """Return the address of Newton's method, which is compiled at the first call."""
         with self._lock, report_compiler_faults():
             if self._newton_code is None:
                 self._shapes[NEWTON_BUFFER] = (self._layout.row_counts[NEWTON_BUFFER],)
@@ -432,7 +447,7 @@ class CompiledStepLoop:
 
 
 MAX_CACHED_STEP_LOOPS = 128
-"""Forms whose loops are held in memory."""
+"""Number of compiled step loops held in memory."""
 
 _step_loop_cache: LRUCache[Any] = LRUCache(MAX_CACHED_STEP_LOOPS)
 
@@ -446,14 +461,15 @@ def cached_step_loop(
     is_per_trajectory: np.ndarray | None = None,
     options: SolverOptions = DEFAULT_OPTIONS,
 ) -> CompiledStepLoop:
-    """The stepper for systems of a form, a method, and a pacing.
+    """Return the compiled step loop for a structure of systems, a method and a step control, from the cache if
+    possible.
 
-    Which of their parameters are zero belongs to it: a diagonal matrix makes a shorter program.
+    The cache key contains which parameters are zero: a diagonal matrix makes a shorter program.
 
     Parameters
     ----------
     parameters : array, shape (p,)
-        Of a system of that form, of the method, and of the pacing: see :func:`flat_parameters`.
+        Parameters of such a system, of the method, and of the step control: see :func:`flat_parameters`.
     """
     structures = [
         structure,

@@ -23,12 +23,12 @@ BOOL = ir.IntType(1)
 INT64 = ir.IntType(64)
 
 LLVM_INTRINSICS = {name: name for name in "sqrt exp2 log sin cos floor ceil rint trunc pow".split()} | {"abs": "fabs"}
-"""Operations that LLVM has functions for."""
+"""Operations that are LLVM intrinsics, with their LLVM names."""
 
 C_LIBRARY_FUNCTIONS = frozenset(
     "cbrt expm1 log1p tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh erf erfc".split()
 )
-"""Operations that are functions of the C library, by the same names."""
+"""Operations that are functions of the C library, with the same names."""
 
 COMPARISONS = {"eq": "==", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
 ARITHMETIC = {"add": ("fadd", "add"), "sub": ("fsub", "sub"), "mul": ("fmul", "mul"), "neg": ("fneg", "neg")}
@@ -41,17 +41,18 @@ TableFinder: TypeAlias = Callable[[int, range], Table | None]
 
 
 class ProgramWriter:
-    """Writes programs where a builder stands, on numbers, or on vectors with a number for each lane.
+    """Writer of scalar programs as LLVM instructions, on numbers or on vectors with a number for each lane.
 
-    Truth values are bits, integers have 64. Sums are never reassociated. A product that is only added to something is
-    fused with the sum, and rounded once, on processors that can. The choice of these products does not depend on the
-    number of lanes. Instructions for one side of a branch are skipped where no lane takes that side. Each lane chooses
-    for itself, so that its numbers do not depend on the others.
+    Truth values are bits, integers have 64. Sums are never reassociated. A product whose only use is a sum is fused
+    with
+    it, and rounded once, on processors that can. The choice of these products does not depend on the number of lanes.
+    Instructions for one side of a branch are skipped if no lane takes that side. Each lane chooses for itself, so its
+    numbers do not depend on the others.
 
     Attributes
     ----------
     active_lanes : value or None
-        The lanes that what is being written is for; None where it is for all.
+        Lanes for which instructions are being written; None for all.
     """
 
     def __init__(self, builder: ir.IRBuilder, lanes: int):
@@ -63,7 +64,7 @@ class ProgramWriter:
         self.active_lanes: ir.Value | None = None
 
     def new_function(self, name: str, argument_types: Sequence[ir.Type]) -> tuple[ir.Function, ProgramWriter]:
-        """A function of the module that returns nothing, and what writes it, for as many lanes."""
+        """Return a new function of the module without a result, and a writer of its body with as many lanes."""
         function = ir.Function(self.builder.module, ir.FunctionType(ir.VoidType(), list(argument_types)), name)
         function.linkage = "internal"
         function.attributes.add("noinline")
@@ -72,14 +73,15 @@ class ProgramWriter:
     def write_as_doubles(
         self, program: Program, read_input: InputReader, find_table: TableFinder | None = None
     ) -> list[list[ir.Value]]:
-        """The values of the outputs, array by array.
+        """Write a program and return its outputs as doubles, array by array.
 
         Parameters
         ----------
-        read_input : function from the places of an array among the inputs, and of an entry in it, to its value
-            Asked for what the program uses.
-        find_table : function from the place of an array among the inputs, and those of entries in it, to a table, optional
-            None where they do not lie in memory at equal distances.
+        read_input : function of (array, entry), the indices of an input array and of an entry in it, to a value
+            Called for the inputs that the program uses.
+        find_table : function of (array, entries), the index of an input array and a range of entries, to a table,
+        optional
+            Returns None if these entries are not equidistant in memory.
         """
         return [
             [self._to_double(value) for value in entries]
@@ -89,13 +91,13 @@ class ProgramWriter:
     def write_program(
         self, program: Program, read_input: InputReader, find_table: TableFinder | None = None
     ) -> list[list[ir.Value]]:
-        """The same, integers and truth values as they are."""
+        """Write a program and return its outputs, array by array, with integers and truth values unconverted."""
         emitter = _ProgramEmitter(self, program, read_input, find_table)
         emitter.write_items(nest_branches(program))
         return [[emitter.value(a) for a in entries] for entries in program.outputs]
 
     def cast(self, value: ir.Value, kind: str) -> ir.Value:
-        """A value as one of a kind, a key of ``kinds``."""
+        """Convert a value to a kind, "f", "b" or "i"."""
         if value.type == self.type_of_kind[kind]:
             return value
         if kind == "f":
@@ -110,7 +112,7 @@ class ProgramWriter:
         return ir.Constant(value_type, value if self.lanes == 1 else [value] * self.lanes)
 
     def write_operation(self, op: str, args: Sequence[ir.Value]) -> ir.Value:
-        """The result of one operation, a key of :data:`liethermo.tracing.builder.SYMPY_OPERATIONS`."""
+        """Write one operation, a key of :data:`liethermo.tracing.builder.SYMPY_OPERATIONS`, and return its result."""
         build, (x, *rest) = self.builder, args
         is_real = x.type == self.double_type
         if op in ARITHMETIC:
@@ -119,15 +121,14 @@ class ProgramWriter:
         if op in LOGICAL and not is_real:
             return getattr(build, LOGICAL[op])(*args)
         if op in COMPARISONS:
-            compare_integers = (
-                build.icmp_unsigned if x.type == self.bool_type else build.icmp_signed
-            )  # true, one bit, is no -1
+            # as a signed bit, true would be -1
+            compare_integers = build.icmp_unsigned if x.type == self.bool_type else build.icmp_signed
             return (build.fcmp_ordered if is_real else compare_integers)(COMPARISONS[op], *args)
         if op == "ne":
             return build.fcmp_unordered("!=", *args) if is_real else build.icmp_signed("!=", *args)
         if op == "select":
             return build.select(x, *rest)
-        if op in ("max", "min"):  # like XLA's, NaN if either is
+        if op in ("max", "min"):  # NaN if either is NaN, as in XLA
             takes_x = self.write_operation("gt" if op == "max" else "lt", args)
             if is_real:
                 takes_x = build.or_(takes_x, build.fcmp_unordered("uno", x, x))
@@ -153,11 +154,11 @@ class ProgramWriter:
             return self.call_intrinsic(f"llvm.{LLVM_INTRINSICS[op]}", args, self.double_type)
         if is_real and op in C_LIBRARY_FUNCTIONS:
             return self.call_per_lane(op, args)
-        if is_real and op == "truncate":  # NaN to 0, and what is too large to the nearest integer
+        if is_real and op == "truncate":  # NaN becomes 0, and too large numbers the nearest integer
             return self.call_intrinsic("llvm.fptosi.sat", args, self.int_type)
         if is_real and op == "is_finite":
             return build.fcmp_ordered("<", self.write_operation("abs", args), self.constant(np.inf))
-        if is_real and op == "sign":  # NaN of NaN, a zero of a zero
+        if is_real and op == "sign":  # NaN for NaN, a signed zero for a zero
             signed_one = self.call_intrinsic("llvm.copysign", [self.constant(1.0), x], self.double_type)
             return build.select(build.fcmp_ordered("one", x, self.constant(0.0)), signed_one, x)
         if op in ("abs", "sign") and x.type == self.int_type:
@@ -169,24 +170,25 @@ class ProgramWriter:
         raise UnsupportedPrimitive(op, "of unknown origin", f"on {x.type}")
 
     def _integer_quotient(self, x: ir.Value, n: ir.Value) -> ir.Value:
-        """The quotient of integers, towards zero; by zero -1, and by -1 without a trap."""
+        """Write the quotient of integers, rounded towards zero; it is -1 for a divisor 0, and a divisor -1 does not
+        trap."""
         build, one = self.builder, self.constant(1)
         is_zero, is_minus_one = (build.icmp_signed("==", n, self.constant(c)) for c in (0, -1))
         quotient = build.sdiv(x, build.select(build.or_(is_zero, is_minus_one), one, n))
         return build.select(is_zero, self.constant(-1), build.select(is_minus_one, build.neg(x), quotient))
 
     def call_newton(self, args: Sequence[ir.Value], n_results: int) -> list[ir.Value]:
-        """What takes the place of the first arguments: see :class:`...tracing.calls.Deferred`."""
+        """Write the deferred Newton iteration and return its results: see :class:`...tracing.calls.DeferredBlock`."""
         raise NotImplementedError(f"nothing fills in {n_results} of {len(args)} values here")
 
     def wrap_integer(self, x: ir.Value, bits: int, is_signed: bool) -> ir.Value:
-        """An integer as so many bits hold it."""
+        """Wrap an integer to the range of ``bits`` bits."""
         narrow_type = ir.IntType(bits) if self.lanes == 1 else ir.VectorType(ir.IntType(bits), self.lanes)
         widen = self.builder.sext if is_signed else self.builder.zext
         return widen(self.builder.trunc(x, narrow_type), self.int_type)
 
     def _call_special_function(self, op: str, args: Sequence[ir.Value]) -> ir.Value:
-        """SciPy's, one lane after another; its last argument is none of the mathematics."""
+        """Call a special function of SciPy lane by lane; its last argument is a flag of Cython's."""
         dispatch_flag = ir.Constant(ir.IntType(32), 0)
         argument_types = [FLOAT64] * SPECIAL_FUNCTIONS[op][1] + [dispatch_flag.type]
         function = declare_symbol(self.builder.module, op, FLOAT64, argument_types)
@@ -195,14 +197,15 @@ class ProgramWriter:
     def fused_multiply_add(
         self, op: str, product_index: int, factors: Sequence[ir.Value], terms: Sequence[ir.Value]
     ) -> ir.Value:
-        """A sum or difference whose term at a place is a product."""
+        """Write a sum or difference whose term ``product_index`` is the product of ``factors``, rounded once."""
         (x, y), addend = factors, terms[1 - product_index]
         if op == "sub":
             x, addend = (x, self.builder.fneg(addend)) if product_index == 0 else (self.builder.fneg(x), addend)
         return self.call_intrinsic("llvm.fmuladd", (x, y, addend), self.double_type)
 
     def nonnegative_max(self, x: ir.Value, y: ir.Value) -> ir.Value:
-        """The larger of two numbers without a sign, NaN if either is: their bits are in the order of the numbers."""
+        """Write the maximum of two nonnegative numbers, NaN if either is NaN: their bits are ordered like the
+        numbers."""
         build, width = self.builder, max(self.lanes, 2)
         double_vector, int_vector = ir.VectorType(FLOAT64, width), ir.VectorType(INT64, width)
         lane_zero = ir.Constant(ir.IntType(32), 0)
@@ -215,7 +218,7 @@ class ProgramWriter:
         return build.extract_element(maxima, lane_zero) if self.lanes == 1 else maxima
 
     def splat(self, number: ir.Value) -> ir.Value:
-        """A number in every lane."""
+        """Copy a number to every lane."""
         if self.lanes == 1:
             return number
         build, zero = self.builder, ir.Constant(ir.IntType(32), 0)
@@ -224,7 +227,7 @@ class ProgramWriter:
         return build.shuffle_vector(first_lane, ir.Constant(self.double_type, ir.Undefined), lane_indices)
 
     def has_true_lane(self, tests: ir.Value) -> ir.Value:
-        """Whether a truth value holds in any lane, as one bit."""
+        """Return whether a truth value holds in any lane, as one bit."""
         if self.lanes == 1:
             return tests
         bits = ir.IntType(self.lanes)
@@ -236,7 +239,7 @@ class ProgramWriter:
 
     @contextlib.contextmanager
     def loop_while(self, condition: Callable[[], ir.Value]) -> Iterator[None]:
-        """While a test holds."""
+        """Write a loop around the body of the ``with`` statement, which runs while a condition holds."""
         build = self.builder
         head, body, exit_block = (build.append_basic_block(name) for name in ("head", "body", "after"))
         build.branch(head)
@@ -249,9 +252,9 @@ class ProgramWriter:
 
     @contextlib.contextmanager
     def loop_range(self, count: ir.Value) -> Iterator[ir.Value]:
-        """For each number from zero to before ``count``."""
+        """Write a loop around the body of the ``with`` statement, with a counter from 0 to ``count - 1``."""
         build = self.builder
-        with build.goto_entry_block():  # else each pass would take more of the stack
+        with build.goto_entry_block():  # otherwise each pass would take more of the stack
             counter = build.alloca(INT64)
         build.store(self.int64(0), counter)
         with self.loop_while(lambda: build.icmp_signed("<", build.load(counter), count)):
@@ -259,7 +262,7 @@ class ProgramWriter:
             build.store(build.add(build.load(counter), self.int64(1)), counter)
 
     def match_constant_types(self, op: str | Block, values: list[ir.Value], args: Sequence[Scalar]) -> list[ir.Value]:
-        """Constants as numbers of the type of what stands beside them."""
+        """Convert constants among the operands to the type of the other operands."""
         operands = slice(1, None) if op in ("select", "pick") else slice(None)
         types = [v.type for v, a in zip(values[operands], args[operands], strict=True) if isinstance(a, str)]
         for i in range(len(values))[operands]:
@@ -285,7 +288,7 @@ class ProgramWriter:
         )
 
     def _apply_per_lane(self, call: Callable[[Sequence[ir.Value]], ir.Value], args: Sequence[ir.Value]) -> ir.Value:
-        """What a call for one number makes of each lane."""
+        """Apply a scalar call to each lane."""
         if self.lanes == 1:
             return call(args)
         result = ir.Constant(self.double_type, ir.Undefined)
@@ -307,7 +310,8 @@ class ProgramWriter:
 
 
 class _ProgramEmitter:
-    """The variables of a program so far, as it is written: those of one side of a branch are known there alone."""
+    """Emitter of one program: it holds the values written so far, those of one side of a branch in a scope of their
+    own."""
 
     def __init__(
         self, writer: ProgramWriter, program: Program, read_input: InputReader, find_table: TableFinder | None
@@ -317,8 +321,8 @@ class _ProgramEmitter:
         self.use_counts = Counter(a for _, _, args in program.instructions for a in args)
         self.use_counts.update(a for entries in program.outputs for a in entries)
         self.values: ChainMap[str, ir.Value] = ChainMap()
-        self.fusible_products: dict[Scalar, list[ir.Value]] = {}  # that nothing else needs
-        self.nonnegative: set[Scalar] = set()  # numbers without a sign
+        self.fusible_products: dict[Scalar, list[ir.Value]] = {}  # factors of products with a single use
+        self.nonnegative: set[Scalar] = set()  # variables that are known to be nonnegative
         self.block_results: dict[Scalar, BlockResults] = {}
         self.tables: dict[Scalar, Table] = {}
 
@@ -330,7 +334,7 @@ class _ProgramEmitter:
         return self.values[a]
 
     def operand(self, a: Scalar) -> Any:
-        """A value, or a table."""
+        """Return a value or a table."""
         return self.tables.get(a) or self.value(a)
 
     def write_items(self, items: Sequence[Instruction | Branch]) -> None:
@@ -381,7 +385,7 @@ class _ProgramEmitter:
             self.nonnegative.add(target)
 
     def table_of_inputs(self, names: Sequence[Scalar]) -> Table | None:
-        """A table of inputs that lie in memory at equal distances: nothing is copied."""
+        """Return a table of inputs that are equidistant in memory, without a copy; None if they are not."""
         positions = [self.input_positions[a] for a in names if a in self.input_positions]
         if self.find_table is None or len(positions) < max(len(names), 2):
             return None
@@ -395,7 +399,7 @@ class _ProgramEmitter:
         )
 
     def write_branch(self, branch: Branch) -> None:
-        """Each side where any lane takes it, then what each lane chooses."""
+        """Write each side of a branch, skipped if no lane takes it, then the choices of each lane."""
         writer, build = self.writer, self.writer.builder
         self.write_instruction(branch.test)
         test = self.values[branch.test.target]
@@ -406,10 +410,8 @@ class _ProgramEmitter:
                 continue
             block_before, outer_values = build.block, self.values
             side_values, outer_lanes = outer_values.new_child(), writer.active_lanes
-            self.values, writer.active_lanes = (
-                side_values,
-                is_taken if outer_lanes is None else build.and_(outer_lanes, is_taken),
-            )
+            self.values = side_values
+            writer.active_lanes = is_taken if outer_lanes is None else build.and_(outer_lanes, is_taken)
             with build.if_then(writer.has_true_lane(writer.active_lanes)):
                 self.write_items(side)
                 side_block = build.block
@@ -418,7 +420,6 @@ class _ProgramEmitter:
                 if isinstance(a, str) and a in side_values.maps[0] and a not in self.input_positions:
                     outer_values[a] = build.phi(side_values[a].type)
                     outer_values[a].add_incoming(side_values[a], side_block)
-                    outer_values[a].add_incoming(
-                        ir.Constant(side_values[a].type, None), block_before
-                    )  # which no lane chooses
+                    unused = ir.Constant(side_values[a].type, None)  # no lane chooses it
+                    outer_values[a].add_incoming(unused, block_before)
         self.write_items(branch.choices)

@@ -1,4 +1,4 @@
-"""Sparse matrices of derivatives, and linear equations with them, on the host."""
+"""Sparse Jacobian matrices and the solution of linear equations with them, on the host."""
 
 from __future__ import annotations
 
@@ -9,32 +9,37 @@ import numpy as np
 import scipy
 
 MAX_FRONT_WIDTH = 1_000
-"""Widest level of a breadth-first search up to which a matrix is factorised.
+"""Largest width of a level of a breadth-first search for which a matrix is factorised.
 
-Such a level cuts the graph in two, and elimination ends with about its square filled: a plane grid of 1e6 nodes is at
-the limit, taking seconds. What is wider (grids in space, networks without a long way in them) is well connected, and
-Krylov iteration is quick there: tens to hundreds of products."""
+Such a level cuts the graph in two, and elimination fills about the square of its width: a plane grid of 1e6 nodes is at
+the limit, taking seconds. Wider graphs (grids in space, networks of small diameter) are well connected, and Krylov
+iteration is quick for them: tens to hundreds of products.
+"""
 
 KRYLOV_RTOL = 1e-6
-"""Relative residual of a Krylov solution; Newton's iteration makes up for the rest. (1e-12 gave the same laws, at 1.7
-times the products.)"""
+"""Relative residual of a Krylov solution; Newton's iteration corrects the rest.
+
+(1e-12 gave the same laws, at 1.7 times the products.)
+"""
 
 MAX_KRYLOV_ITERATIONS = 2_000
+"""Largest number of Krylov iterations for one solution."""
 
 
 class JacobianCompression:
-    """How to find all entries of a sparse Jacobian matrix from few derivatives.
+    """Compression of a sparse Jacobian matrix: all its entries from few Jacobian-vector products.
 
-    Columns that have no row in common have one colour and are found together, by a derivative along their sum [Curtis,
-    Powell & Reid 1974]. Rows of many entries would need as many colours; these *hubs* are found one by one, by pulling
-    back. How many entries make a hub is chosen to need the fewest derivatives.
+    Columns without a common row get one colour and are computed together, by a derivative along their sum [Curtis,
+    Powell &
+    Reid 1974]. Dense rows (of *hubs*) would need as many colours as they have entries; they are computed one by one, by
+    vector-Jacobian products. The limit between both is chosen to need the fewest derivatives.
 
     Parameters
     ----------
     pattern : scipy.sparse.csr_array, shape (n, n)
-        Every entry that can be different from zero.
+        Entries that can be different from zero.
     stages : int
-        The function is from (stages, n) to (stages, n), and every stage depends on every other by the same pattern.
+        The function maps (stages, n) to (stages, n), and every stage depends on every other by the same pattern.
     """
 
     def __init__(self, pattern: scipy.sparse.csr_array, stages: int = 1):
@@ -56,11 +61,11 @@ class JacobianCompression:
 
     @property
     def n_derivatives(self) -> int:
-        """How many are taken."""
+        """Number of derivatives that one Jacobian matrix takes."""
         return self.stages * (len(self._colour_entries) + len(self.dense_rows))
 
     def assemble_jacobian(self, jvp: Callable, vjp: Callable) -> scipy.sparse.csc_array:
-        """The Jacobian matrix, shape (stages n, stages n).
+        """Return the Jacobian matrix, shape (stages n, stages n).
 
         Parameters
         ----------
@@ -94,13 +99,13 @@ class JacobianCompression:
 
 
 class SparseInverse:
-    """Solutions of ``matrix @ x = b``: by factorisation where elimination fills little, or by Krylov iteration.
+    """Solver of ``matrix @ x = b``, by factorisation if elimination fills little, else by Krylov iteration.
 
     Parameters
     ----------
     matrix : scipy.sparse.csc_array, shape (n, n)
-    width : int
-        Of the widest level of its graph: see :data:`MAX_FRONT_WIDTH`.
+    front_width : int
+        Width of the widest level of its graph: see :data:`MAX_FRONT_WIDTH`.
 
     Raises
     ------
@@ -112,7 +117,7 @@ class SparseInverse:
         if not np.isfinite(matrix.data).all():
             raise np.linalg.LinAlgError("the matrix is not finite")
         if front_width <= MAX_FRONT_WIDTH:
-            options = {"SymmetricMode": True}  # elimination on the diagonal, as far as that is stable
+            options = {"SymmetricMode": True}  # pivots on the diagonal, as far as that is stable
             try:
                 factors = scipy.sparse.linalg.splu(matrix, "MMD_AT_PLUS_A", diag_pivot_thresh=0.01, options=options)
             except RuntimeError as error:
@@ -124,7 +129,7 @@ class SparseInverse:
         scaled_matrix = scipy.sparse.csr_array(scaling @ matrix)
 
         def solve_bicgstab(b):
-            b_norm = float(np.linalg.norm(scaling @ b)) or 1.0  # SciPy gives up on small residuals of an absolute size
+            b_norm = float(np.linalg.norm(scaling @ b)) or 1.0  # SciPy stops at a small absolute residual
             x, _ = scipy.sparse.linalg.bicgstab(
                 scaled_matrix, scaling @ b / b_norm, rtol=KRYLOV_RTOL, maxiter=MAX_KRYLOV_ITERATIONS
             )
@@ -137,14 +142,20 @@ class SparseInverse:
 
 
 def _max_coloured_row_size(row_sizes: np.ndarray) -> int:
-    """The largest row that is coloured: about as many colours are needed, and a derivative for each larger row."""
+    """Return the largest number of entries of a row that is coloured.
+
+    About as many colours are needed, and a derivative for each larger row: their sum is minimised.
+    """
     candidates = np.unique(row_sizes)
     n_larger = len(row_sizes) - np.searchsorted(np.sort(row_sizes), candidates, side="right")
     return int(candidates[np.argmin(candidates + n_larger)])
 
 
 def _max_level_width(pattern: scipy.sparse.csr_array) -> int:
-    """Nodes in the widest level of a breadth-first search through the largest part, from an end of it."""
+    """Return the number of nodes in the widest level of a breadth-first search through the largest component.
+
+    The search starts at a peripheral node.
+    """
     graph = scipy.sparse.csr_array(pattern + pattern.T, dtype=float)
     label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
     start = int(np.argmax(label == np.bincount(label).argmax()))
@@ -156,10 +167,10 @@ def _max_level_width(pattern: scipy.sparse.csr_array) -> int:
 
 
 def _colour_columns(pattern: scipy.sparse.csr_array) -> np.ndarray:
-    """A colour for each column, so that no row has two columns of one colour; greedily, in order."""
+    """Return a colour for each column, greedily and in order, so that no row has two columns of one colour."""
     csc_pattern = scipy.sparse.csc_array(pattern)
     rows = csc_pattern.indices.tolist()
-    row_colours = [0] * pattern.shape[0]  # by each row: a bit for every colour that one of its columns has
+    row_colours = [0] * pattern.shape[0]  # for each row, a bit mask of the colours of its columns
     colours = []
     for start, end in itertools.pairwise(csc_pattern.indptr.tolist()):
         column_rows = rows[start:end]

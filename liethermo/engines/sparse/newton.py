@@ -1,9 +1,9 @@
-"""The sparse engine: systems of any size that know which of their components act on which.
+"""Sparse engine: systems of any size whose sparsity pattern is known.
 
-A step is tried by fixed-point iteration, as by the array engine; a stiff one is solved by Newton's method with a sparse
-Jacobian matrix. Its entries come from few derivatives: columns that no row has in common are taken in one, and the rows
-of hubs, which have many neighbours, are taken by themselves [Curtis, Powell & Reid 1974; Coleman & Verma 1998]. The
-Newton iteration runs on the host, where SciPy factorises; all else is the array engine's.
+A step is tried by fixed-point iteration, as in the array engine; a stiff one is solved by Newton's method with a sparse
+Jacobian matrix. Its entries come from few derivatives: columns without a common row are computed together, and the rows
+of hubs, which have many neighbours, by themselves [Curtis, Powell & Reid 1974; Coleman & Verma 1998]. The Newton
+iteration runs on the host, where SciPy factorises; all else is shared with the array engine.
 """
 
 from __future__ import annotations
@@ -33,21 +33,24 @@ SPARSE_SOLVER_OPTIONS = replace(
     jacobian_contraction_limit=0.1,
     matrix_free_dim=sys.maxsize,
 )
-"""Newton iterations are cheap here: most use factors that are there already, kept from step to step. Their matrix is
-formed whatever its size, and a few stiff components of many are not to be lost in a mean."""
+"""Solver options of the sparse engine.
+
+Newton iterations are cheap: most use factors that are kept from step to step. The matrix is formed for any dimension,
+and the norm is the maximum norm, because a root mean square could hide a few stiff components among many.
+"""
 
 
 class SparseEngine:
-    """The engine for one system and method; the factors of its Jacobian matrix are kept from step to step.
+    """Sparse engine for one system and method; the factors of its Jacobian matrix are kept from step to step.
 
     Raises
     ------
     ValueError
-        If the system does not know its sparsity.
+        If the system has no sparsity pattern.
     """
 
     name = "sparse"
-    max_saves_per_call = 1  # its steps may take seconds: show each, and keep each on Ctrl-C
+    max_saves_per_call = 1  # a step may take seconds: show each, and keep each on Ctrl-C
 
     def __init__(self, system: System, method: OneStepMethod):
         self.system, self.method = system, method
@@ -63,8 +66,8 @@ class SparseEngine:
         return initial_run_state_program(self.system, self.method, x)
 
     def advance(self, state, h, saves, save_every, noise=None):
-        """Keeps no more than it reaches."""
-        del noise  # steps with noise are not for this engine
+        """Take ``save_every`` steps up to ``saves`` times; the saved arrays have only the saves that were reached."""
+        del noise  # this engine takes no steps with noise
         saved_states: list[State] = []
         for _ in range(int(saves)):
             for _ in range(int(save_every)):
@@ -118,7 +121,7 @@ class SparseEngine:
                 SPARSE_SOLVER_OPTIONS.max_newton_halvings if needs_jacobian else 1,
             )
             if newton_step is None and needs_jacobian:
-                s = s._replace(n_stalled=jnp.asarray(2))  # no step, however short, solves the equations better
+                s = s._replace(n_stalled=jnp.asarray(2))  # no damped step decreases the residual
                 slope_rounding = _residual_rounding(self.system, self.method, state.x)
                 break
             needs_jacobian = newton_step is None
@@ -147,9 +150,10 @@ class SparseEngine:
     def _damped_newton_step(
         self, state, h, s: IterationState, residual, scale, inverse: SparseInverse, max_trials: int
     ):
-        """After a Newton step, halved until the equations are solved better than before; None if that fails.
+        """Return iteration state, residual and scale after a Newton step, halved until the residual decreases; None on
+        failure.
 
-        At the rounding plateau they are not, and a whole step is taken.
+        At the rounding plateau the residual does not decrease, and a full step is taken.
         """
         step = inverse(np.asarray(residual).ravel()).reshape(s.k.shape)
         if not np.isfinite(step).all():
@@ -166,7 +170,7 @@ class SparseEngine:
         return None
 
     def _jacobian_inverse(self, state, h, k) -> SparseInverse | None:
-        """The inverse of the Jacobian matrix of the misfit; None where there is none."""
+        """Return the inverse of the Jacobian matrix of the residual; None if it is singular or not finite."""
         if self._compression is None:
             self._compression = JacobianCompression(self._pattern, self.method.stages)
 
@@ -202,9 +206,9 @@ def _finish_step_program(system: System, method: OneStepMethod, state: State, h,
 
 
 def _weighted_equations(system: System, method: OneStepMethod, state: State, h):
-    """The misfit ``w (slopes(k) - k)``, a guess of k, and the size that the plateau is measured against.
+    """Return the residual ``w (slopes(k) - k)`` as a function of k, a guess of k, and the scale of updates.
 
-    With the weights w of :meth:`liethermo.System.weights` a stiff step is nearest to linear.
+    With the weights w of :meth:`liethermo.System.residual_weights` a stiff step is nearest to linear.
     """
     slopes, guess, scale, *_ = _stage_equations(system, method, state, h)
 
@@ -223,13 +227,13 @@ def _weighted_residual(system: System, method: OneStepMethod, state: State, h, k
 
 @jit_program
 def _residual_rounding(system: System, method: OneStepMethod, x) -> Any:
-    """The size at which the misfit is rounded."""
+    """Return the scale at which the weighted residual is rounded."""
     return jnp.max(value_and_rounding_scale(lambda x: system.residual_weights(x) * system.vector_field(x), x)[1])
 
 
 @jit_program
 def _best_guess_program(system: System, method: OneStepMethod, state: State, h):
-    """The predicted slopes, or a step of size zero where that solves the equations better; with misfit and scale."""
+    """Return the predicted slopes, or zero slopes if their residual is smaller, with residual and scale."""
     residual_function, guess, scale = _weighted_equations(system, method, state, h)
     k, residual = best_initial_guess(residual_function, guess)
     return k, residual, scale(k)
