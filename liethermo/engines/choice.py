@@ -173,11 +173,9 @@ class EngineWithFallback:
     def _preferred_engine(self, count_operations: Callable[[CompiledEngine], int]) -> Engine:
         system, method, is_auto = self.system, self.method, self.requested_engine == "auto"
         if self.requested_engine == "sparse" and self.noise is not None:
-            raise InputError("the sparse engine takes no steps with noise: leave out engine")
+            raise InputError("the sparse engine cannot take steps with noise. Leave out engine=")
         if self.requested_engine == "sparse" and method.explicit:
-            raise InputError(
-                f"{method} has no equations to solve, so the sparse engine is not for it: leave out engine"
-            )
+            raise InputError(f"the sparse engine needs an implicit method, got {method}. Leave out engine=")
         if self.requested_engine == "sparse" or (
             is_auto and system.dim >= MIN_SPARSE_DIM and not method.explicit and self.noise is None
         ):
@@ -185,8 +183,8 @@ class EngineWithFallback:
                 return SparseEngine(system, method)
             if not is_auto:
                 raise InputError(
-                    f"the sparse engine cannot run a {system.kind} that does not know its sparsity: a "
-                    "ComposedSystem of lt.Copies joined by lt.Each does"
+                    f"the sparse engine cannot run a {system.kind} that does not know its sparsity. Build the system as "
+                    "a ComposedSystem of lt.Copies joined by lt.Each"
                 )
         repays_compiling = self.planned_steps >= MIN_STEPS_TO_COMPILE or system.has_matrix_functions
         if self.requested_engine == "compiled" or (is_auto and is_worth_compiling(system)):
@@ -195,8 +193,8 @@ class EngineWithFallback:
                 n_operations = count_operations(compiled)
                 if not is_auto and n_operations > SLOW_COMPILE_OPERATIONS:
                     warn(
-                        f"a step of {n_operations:,} operations takes minutes to compile: leave out engine, or take "
-                        "engine='array', to start at once",
+                        f"a step of {n_operations:,} operations takes minutes to compile. Leave out engine=, or "
+                        "take engine='array', to start at once",
                         CompiledEngineWarning,
                     )
                 if n_operations <= MAX_AUTO_COMPILED_OPERATIONS or not is_auto or repays_compiling:

@@ -107,7 +107,7 @@ def _why_untrusted(status: os.stat_result) -> str:
 def _warn_untrusted(path: str, reason: str) -> None:
     """Warn, once for each path, that machine code is not cached there."""
     warn(
-        f"machine code is not kept in {path}: {reason}, and it could run anything as you. It is compiled in memory; "
-        "give LIETHERMO_CACHE a folder of your own (chmod 700)",
+        f"machine code is not kept in {path}: {reason}, and the code there could do anything in your name. It is compiled "
+        "in memory instead. Set LIETHERMO_CACHE to a folder of your own (chmod 700)",
         CacheWarning,
     )

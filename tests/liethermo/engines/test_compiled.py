@@ -145,7 +145,7 @@ def test_rules_of_large_systems_in_machine_code():
 
 def test_what_takes_minutes_to_compile_is_said(monkeypatch):
     monkeypatch.setattr("liethermo.engines.choice.LARGE_PROGRAM", 2)
-    with pytest.warns(CompiledEngineWarning, match="takes minutes to compile: leave out engine"):
+    with pytest.warns(CompiledEngineWarning, match="takes minutes to compile. Leave out engine"):
         lt.integrate(BODY, X0, (0.0, 1.0), 0.1, engine="compiled")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
