@@ -33,17 +33,13 @@ def advance(
     newton: bool = True,
     first_step=None,
 ):
-    """Take ``save_every`` steps of size h up to ``saves`` times, and save the state after each time; stop at a failed
-    step.
+    """Take ``save_every`` steps of size h, save, and repeat this ``saves`` times; stop at a failed step.
 
     ``h``, ``saves <= capacity`` and ``save_every`` are arrays, so one program serves all values. Returns the new state
-    and
-    four arrays with ``capacity`` rows: state vectors, energies, entropies, and whether the save was reached. ``noise``
-    has
-    the increments of each step, shape (steps, increments), or is None. Without ``newton`` a step fails if fixed-point
-    iteration does not solve its equations. A call that continues another one passes its ``first_step``, the number of
-    the
-    first step of that call: it takes the remaining steps and fills the remaining saves.
+    and four arrays with ``capacity`` rows: state vectors, energies, entropies, and whether the save was reached.
+    ``noise`` has the increments of each step, shape (steps, increments), or is None. Without ``newton`` a step fails if
+    fixed-point iteration does not solve its equations. A call that continues another one passes its ``first_step``, the
+    number of the first step of that call: it takes the remaining steps and fills the remaining saves.
     """
     first_step = state.step if first_step is None else first_step
     newton_fallback = None if newton else keep_fixed_point_result
@@ -79,16 +75,14 @@ MAX_SAVED_VALUES_PER_CALL = 2**16
 
 
 def max_saves_per_call(system: System) -> int:
-    """Return the largest number of saves per call, the same for all runs of a system so that one program serves
-    them."""
+    """Return the largest number of saves per call, one number for all runs so that they share a program."""
     return min(MAX_SAVES_PER_CALL, max(1, MAX_SAVED_VALUES_PER_CALL // system.dim))
 
 
 class LazyNewton:
-    """Compile the steps without Newton's method first, and with it once a step does not converge, resuming at that
-    step.
+    """Compile steps without Newton's method first, and with it once a step does not converge.
 
-    Newton's method is two thirds of what there is to compile.
+    The call resumes at the failed step. Newton's method is two thirds of what there is to compile.
     """
 
     def __init__(self, method: OneStepMethod):
@@ -96,8 +90,7 @@ class LazyNewton:
         self.has_newton = not isinstance(method, OneStepMethod) or method.explicit
 
     def advance(self, call: Callable, state: State, save_every) -> tuple[State, tuple]:
-        """Return the state after ``call(state, with_newton, first_step)``, of one trajectory or many, and the saved
-        arrays."""
+        """Return the state and the saved arrays after ``call(state, with_newton, first_step)``."""
         first_step = state.step
         state, saved = call(state, self.has_newton, first_step)
         needs_newton = np.isin(state.status, FAILED_STEP_CODES)
@@ -157,8 +150,7 @@ class ArrayEngine:
         return self.advance(state, h, 1, 1, noise)[0]
 
     def step_ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
-        """Return the end states, shape (m, n), of single steps of sizes h, shape (m,), from states x; NaN if a step
-        fails.
+        """Return the ends of single steps of sizes h from states x, shape (m, n); NaN if a step fails.
 
         Each is the first step of a run of its own.
         """
@@ -189,8 +181,7 @@ def _step_ends_program(system: System, method: OneStepMethod, x, h, options: Sol
 
 
 def padded_increments(noise) -> jax.Array | None:
-    """Return noise increments, shape (..., steps, increments), zero-padded to a power of two of steps: few shapes, few
-    programs.
+    """Return noise increments zero-padded to a power of two of steps: few shapes, few programs.
 
     Short calls share one program: padding up to :data:`MAX_SAVED_VALUES_PER_CALL` increments costs nothing.
     """

@@ -61,8 +61,7 @@ class EngineWithFallback:
     """The engine of a run, chosen when the run begins; it has the methods of an :class:`Engine`.
 
     With "auto", the array engine takes over if the compiled engine meets a primitive that it cannot unroll, or fails:
-    at
-    the start, or when a step first needs Newton's method. The run resumes from the last good state, with a warning.
+    at the start, or when a step first needs Newton's method. The run resumes from the last good state, with a warning.
 
     Parameters
     ----------
@@ -183,8 +182,8 @@ class EngineWithFallback:
                 return SparseEngine(system, method)
             if not is_auto:
                 raise InputError(
-                    f"the sparse engine cannot run a {system.kind} that does not know its sparsity. Build the system as "
-                    "a ComposedSystem of lt.Copies joined by lt.Each"
+                    f"the sparse engine cannot run a {system.kind} that does not know its sparsity. Build the system "
+                    "as a ComposedSystem of lt.Copies joined by lt.Each"
                 )
         repays_compiling = self.planned_steps >= MIN_STEPS_TO_COMPILE or system.has_matrix_functions
         if self.requested_engine == "compiled" or (is_auto and is_worth_compiling(system)):
@@ -205,8 +204,7 @@ class EngineWithFallback:
         return ArrayEngine(system, method)
 
     def _call_with_fallback(self, call: Callable[[Engine, Any], Any], state: State | None = None) -> Any:
-        """Return ``call(engine, state)``; if the compiled engine raises UnsupportedPrimitive, repeat it on the array
-        engine."""
+        """Return ``call(engine, state)``, on the array engine if the compiled one raises UnsupportedPrimitive."""
         try:
             return call(self._engine, state)
         except UnsupportedPrimitive as error:

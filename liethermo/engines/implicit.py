@@ -18,8 +18,7 @@ from manifolds.matrices.linear import inverse
 
 
 def implicit_solution(solve: Callable, residual: Callable, parameters: Any, guess: jax.Array) -> jax.Array:
-    """Return the k with ``residual(parameters, k) = 0`` that ``solve(parameters, guess)`` computes, as a differentiable
-    array.
+    """Return the k with ``residual(parameters, k) = 0`` that ``solve`` computes, as a differentiable array.
 
     Its derivative is ``-(D_k residual)^-1 D residual``, whatever ``solve`` does. Neither function may close over
     tracers.
@@ -38,8 +37,7 @@ _implicit_solution = Primitive("solution")
 
 
 def _evaluate(*arguments, solve: Callable, residual: Callable, structure, axes: tuple) -> jax.Array:
-    """Run the solver; ``axes`` holds the batch axes of the arguments for each enclosing ``vmap``, the innermost
-    first."""
+    """Run the solver; ``axes`` holds the argument axes of each enclosing ``vmap``, innermost first."""
     del residual
 
     def solve_one(*arguments):

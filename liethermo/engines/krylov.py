@@ -14,13 +14,10 @@ def solve_krylov(matvec: Callable, b: jax.Array, options: SolverOptions) -> jax.
     """Solve ``matvec(x) = b`` to the relative residual ``options.krylov_forcing_term``; return x, of the shape of b.
 
     Conjugate residuals, each direction made orthogonal to the last few [Eisenstat, Elman & Schultz 1983, "Orthomin"].
-    With
-    all directions kept, x would have the least residual in the Krylov space; the memory is ``2
-    options.krylov_basis_size``
-    vectors. It converges if the symmetric part of the matrix is definite, which holds for a step unless growth is
-    faster
-    than 1/h. After ``options.max_krylov_products`` products the last iterate is returned. Clustered eigenvalues are
-    resolved together, so a few stiff components of a large state cost a few products.
+    With all directions kept, x would have the least residual in the Krylov space; the memory is ``2
+    options.krylov_basis_size`` vectors. It converges if the symmetric part of the matrix is definite, which holds for a
+    step unless growth is faster than 1/h. After ``options.max_krylov_products`` products the last iterate is returned.
+    Clustered eigenvalues are resolved together, so a few stiff components of a large state cost a few products.
     """
 
     def goes_on(carry):

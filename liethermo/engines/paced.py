@@ -37,8 +37,7 @@ from .stepping import State
 
 
 class ArrayAdaptiveRuns:
-    """Adaptive runs of one or many trajectories in the array engine; fields are read and written with trajectories
-    first.
+    """Adaptive runs of one or many trajectories in the array engine.
 
     Parameters
     ----------
@@ -84,8 +83,7 @@ class ArrayAdaptiveRuns:
         return State(*(self.read(name)[0] for name in State._fields))
 
     def attempt_records(self, max_attempts: int) -> dict[str, np.ndarray]:
-        """Make one attempt of the only trajectory and return its record: each field of ATTEMPT_FIELDS, attempts
-        first."""
+        """Make one attempt of the only trajectory and return its record, the fields ATTEMPT_FIELDS."""
         del max_attempts  # a single attempt: this engine does not record several at once
         self.advance(1)
         return {name: self.read(name) for name in ATTEMPT_FIELDS}
@@ -233,8 +231,8 @@ class PauseHandler:
         """Decide for each trajectory paused at a sign change whether it is an event: a zero, to rounding.
 
         A trajectory at a jump or a pole resumes after it, as after a stop. If the function is NaN between the two
-        signs, it is
-        unknown whether the event happens, and the run ends. If only falls are events, a jump is an event too.
+        signs, it is unknown whether the event happens, and the run ends. If only falls are events, a jump is an event
+        too.
         """
         runs, indices = self.adaptive_runs, self.paused_indices(StatusCode.PAUSED_AT_EVENT)
         if not indices.size:
@@ -261,12 +259,10 @@ class PauseHandler:
             )
 
     def _is_zero_to_rounding(self, indices: np.ndarray, value: np.ndarray, value_before: np.ndarray) -> np.ndarray:
-        """Return whether event values are zero, to rounding, given the values at the start of their steps; shape of
-        ``value``.
+        """Return whether event values are zero, to rounding, given the values at the start of the steps.
 
         A value is zero if it is negligible relative to the value before. Otherwise it is compared with the rounding of
-        the
-        function, except near a pole, where the value has grown and its rounding is as large as the value.
+        the function, except near a pole, where the value has grown and its rounding is as large as the value.
         """
         magnitude, value_before = np.abs(value), np.abs(value_before)
         is_zero = (magnitude == 0.0) | ((magnitude <= EVENT_ZERO_ULPS * EPS * value_before) & np.isfinite(value_before))
@@ -289,8 +285,7 @@ class PauseHandler:
         return [np.array(group) for group in groups.values()]
 
     def resume_paused(self) -> None:
-        """Resume the trajectories at a stop, or finish those at their end, and compute the growth rates that are
-        unknown."""
+        """Resume the trajectories at a stop, finish those at their end, and compute missing growth rates."""
         runs, status = self.adaptive_runs, self.adaptive_runs.read("status")
         at_stop = np.flatnonzero(status == StatusCode.PAUSED_AT_STOP)
         if at_stop.size:

@@ -49,8 +49,7 @@ TRUNCATED_STEP_RATIO = 0.99
 """Ratio to the planned step size below which a step counts as truncated by a stop time."""
 
 DEADBAND = (0.9, 1.3)
-"""Range of factors for which the step size is kept: a small change is not worth a worse prediction, and would
-chatter."""
+"""Range of factors for which the step size is kept: small changes spoil the prediction, and chatter."""
 
 MIN_RELATIVE_ERROR = 4.0 * EPS
 """Smallest allowed error of a step, relative to the norm of the state."""
@@ -132,8 +131,7 @@ class AdaptiveState(NamedTuple):
 def initial_adaptive_state(
     system: System, method: OneStepMethod, control: StepControl, x, t, stop_time, span_length
 ) -> AdaptiveState:
-    """Return the state of an adaptive run that starts at x at time t; ``span_length`` is the duration of the whole
-    run."""
+    """Return the state of an adaptive run from x at time t to t + ``span_length``."""
     state, zero = initial_run_state(system, method, x), jnp.zeros(())
     solved_system, components = system.solved_part(x)
     norm = jnp.max(jnp.abs(components))
@@ -190,8 +188,7 @@ def next_step(control: StepControl, adaptive_state: AdaptiveState) -> tuple[jax.
 
 
 def next_full_step(control: StepControl, adaptive_state: AdaptiveState) -> tuple[jax.Array, jax.Array]:
-    """Return the size of the next step outside an event search, and the time after it; none ends just before a stop
-    time."""
+    """Return the size of the next full step and the time after it; none ends just before a stop time."""
     if control.adaptive:
         remaining = adaptive_state.stop_time - adaptive_state.t
         reaches_stop = remaining <= adaptive_state.next_step_size * (1 + 1e-12)
@@ -359,12 +356,10 @@ def apply_event_detection(
     """Return the outcome of an attempt, corrected for sign changes of the event function.
 
     A step in which the event happens starts a search among steps from the same state, so the event is as accurate as
-    the
-    method, and the laws hold there. If the dense output shows that the sign change is undone within the step, a shorter
-    step is tried first, and likewise if a trial step fails although the full step did not. A step may end where the
-    event
-    function is NaN. A search that starts there assumes the previous value, so it ends where the function is a number
-    again. The value at the end of a search is stored by :func:`.searching.closed_bracket`.
+    the method, and the laws hold there. If the dense output shows that the sign change is undone within the step, a
+    shorter step is tried first, and likewise if a trial step fails although the full step did not. A step may end where
+    the event function is NaN. A search that starts there assumes the previous value, so it ends where the function is a
+    number again. The value at the end of a search is stored by :func:`.searching.closed_bracket`.
     """
     value, bracket = control.event_value(system, new_state.x), searching.RootBracket(*adaptive_state.root_bracket)
     signed_value = jnp.where(
@@ -439,8 +434,7 @@ def is_event_crossing(control: StepControl, value_before, value_after) -> jax.Ar
 def first_sign_change_in_step(
     system: System, method: OneStepMethod, control: StepControl, adaptive_state: AdaptiveState, increments, end_value
 ):
-    """Return the first of the fractions ``event_check_fractions`` with a sign change, and whether a later one undoes
-    it.
+    """Return the fraction of the first sign change in a step, and whether a later one undoes it.
 
     A NaN at the end of the step also undoes a sign change.
     """
@@ -465,8 +459,7 @@ def first_sign_change_in_step(
 def step_size_after_acceptance(
     optimal, previous_optimal, h, planned_size, power, max_step, explicit: bool
 ) -> jax.Array:
-    """Return the next step size after an accepted step of size h; a size of ``optimal`` would have had the allowed
-    error.
+    """Return the step size after an accepted step of size h; ``optimal`` would have had the allowed error.
 
     If the optimal size shrinks, from ``previous_optimal``, the trend is extrapolated [Gustafsson; Hairer & Wanner 1996,
     IV.8]. The step size of an implicit method is kept if the change would be small. A truncated step tells little about
@@ -487,8 +480,7 @@ def step_size_after_acceptance(
 
 
 def step_size_after_rejection(error, h, power) -> jax.Array:
-    """Return the next step size after a step with too large an error; an infinite error means unsolved stage
-    equations."""
+    """Return the step size after a rejected step; an infinite error means unsolved stage equations."""
     is_solved = jnp.isfinite(error)
     factor = jnp.maximum(
         MIN_FACTOR, (ERROR_TARGET_FRACTION / jnp.where(is_solved, jnp.maximum(error, 1.0), 1.0)) ** power
@@ -504,8 +496,7 @@ def max_growth_per_step(method: OneStepMethod) -> float:
 
     A step of a one-step method multiplies the solution of a linear equation of rate r by R(h r), instead of exp(h r).
     Implicit methods damp or preserve what they do not resolve, so a long step can miss an instability. R is assumed to
-    be
-    the diagonal Padé approximation of the method's order.
+    be the diagonal Padé approximation of the method's order.
     """
     s = max(1, method.order // 2)
     pade_constant = math.factorial(2 * s) * math.factorial(2 * s + 1) / math.factorial(s) ** 2
@@ -546,8 +537,7 @@ def limit_by_growth_rate(method: OneStepMethod, adaptive_state: AdaptiveState, p
 
 
 def spectral_radius_bound(probe) -> jax.Array:
-    """Return an upper bound (from the matrix) or an estimate (from power iterates) of the spectral radius of the
-    Jacobian."""
+    """Return an upper bound (from the matrix) or an estimate (from power iterates) of the spectral radius."""
     if probe.shape[1] > DENSE_JACOBIAN_DIM:
         return jnp.sqrt(jnp.max(jnp.sum(probe * probe, axis=1)))
     matrix_squared = probe @ probe
@@ -566,8 +556,7 @@ def max_growth_rates(matrices: np.ndarray) -> np.ndarray:
 
 
 def growth_rate_at(system: System, method: OneStepMethod, x) -> float:
-    """Return the largest growth rate at x by Arnoldi's method, for systems of more than DENSE_JACOBIAN_DIM
-    components."""
+    """Return the largest growth rate at x by Arnoldi's method, for more than DENSE_JACOBIAN_DIM components."""
     return float(max_growth_rates(np.asarray(arnoldi_hessenberg(system, method, jnp.asarray(x)))))
 
 

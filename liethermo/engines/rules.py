@@ -1,5 +1,4 @@
-"""Options of the nonlinear solver: when an iteration on the stage equations continues, has converged, or is given
-up."""
+"""Options of the nonlinear solver: when an iteration continues, has converged, or is given up."""
 
 from __future__ import annotations
 

@@ -81,8 +81,7 @@ def _final_evaluation(step_size, fraction) -> RootBracket:
 
 
 def _next_trial_fraction(a, b, c, fa, fb, fc, margin) -> jax.Array:
-    """Return the next trial point between a and b, as a fraction: by inverse quadratic interpolation if safe, else
-    1/2."""
+    """Return the next trial fraction between a and b: by inverse quadratic interpolation, or halfway."""
     xi, phi = (a - b) / (c - b), (fa - fb) / (fc - fb)
     is_safe = (phi**2 < xi) & ((1.0 - phi) ** 2 < 1.0 - xi)
     t = fa / (fb - fa) * fc / (fb - fc) + (c - a) / (b - a) * fa / (fc - fa) * fb / (fc - fb)

@@ -75,14 +75,12 @@ class IterationState(NamedTuple):
         """Return whether updates shrink by less than ``rate``, in the last iteration and in the last two together.
 
         Two components that drive each other, such as spins and the bath that they heat, are each corrected in every
-        second
-        iteration. If their units differ, updates then grow and shrink in turn while both converge.
+        second iteration. If their units differ, updates then grow and shrink in turn while both converge.
         """
         return (self.update > rate * self.previous_update) & (self.update > rate * rate * self.earlier_update)
 
     def is_at_plateau(self, scale, options: SolverOptions, residual_norm=None, slope_rounding=None) -> jax.Array:
-        """Return whether the iteration is at its rounding plateau: the update is negligible, or small and stalled
-        twice.
+        """Return whether the update is negligible, or small and stalled twice (the rounding plateau).
 
         An update is small relative to ``scale``; the residual may be small relative to ``slope_rounding`` instead.
         """
@@ -171,8 +169,7 @@ def solve_newton(
         return jnp.logical_not(is_solved) & ~s.is_at_plateau(scale(s.k), options, norm(residual), slope_rounding)
 
     def damp_newton_step(k, step, residual_norm, plateau_update, is_damped):
-        """Return k minus the step, halved until the residual decreases, with its residual; at the plateau the full
-        step."""
+        """Return k minus the step, halved until the residual decreases (not at the plateau), and the residual."""
 
         def needs_halving(carry):
             factor, residual = carry
@@ -280,8 +277,7 @@ mlir.register_lowering(_inverse, mlir.lower_fun(jnp.linalg.inv, multiple_results
 def explicit_slopes(
     system: System, method: OneStepMethod, x, compensation, h, k, options: SolverOptions = DEFAULT_OPTIONS
 ) -> StageSolution:
-    """Return the slopes of an explicit step as a stage solution, converged if the step ends on its constraint
-    levels."""
+    """Return the slopes of an explicit step; it has converged if its end satisfies the constraints."""
     k = method.slopes(system, x, compensation, h, k)
     x, zero_count = system.solved_part(x)[1], jnp.zeros((), dtype=jnp.int64)
     norm = options.norm_for_dim(x.size)

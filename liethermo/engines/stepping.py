@@ -310,8 +310,7 @@ def nearest_level(value, sensitivity) -> jax.Array:
 
 
 def compensation_from_state(system: System, method: OneStepMethod, x, clock_compensation) -> jax.Array:
-    """Return the compensation, shape (n,), of a step from x when nothing is known but x and the compensation of its
-    clock.
+    """Return the compensation, shape (n,), of a step for which only x and its clock's part are known.
 
     It shifts the state by less than its rounding: onto its constraint surface, and to a level of each function that the
     method conserves. Without it the roundings of the states would add up, with a mean that is not zero.

@@ -37,8 +37,8 @@ STATUS_MESSAGES = {
     StatusCode.COMPLETED: "reached t = {t:.15g} in {n} steps",
     StatusCode.NOT_CONVERGED: "the equations of step {next}, from t = {t:.15g}, were not solved: the iteration "
     "stopped at a residual of {r:.2g} relative to the state. Try a smaller step",
-    StatusCode.NON_FINITE: "NaN or infinity in step {next}, from t = {t:.15g}: the energy, the entropy, the vector field "
-    "or the event function is not finite there. Check the domain of the functions, or try a smaller step",
+    StatusCode.NON_FINITE: "NaN or infinity in step {next}, from t = {t:.15g}: the energy, the entropy, the vector "
+    "field or the event function is not finite there. Check the domain of the functions, or try a smaller step",
     StatusCode.INTERRUPTED: "stopped by the user after step {n}, t = {t:.15g}",
     StatusCode.EVENT: "the event happened at t = {t:.15g} in {n} steps",
     StatusCode.STEP_UNDERFLOW: "no step from t = {t:.15g}, after step {n}, was short enough for the tolerance: the "
@@ -68,8 +68,7 @@ class Ensemble(AuditableResult):
     status : ndarray of int8, shape (B,)
         Indices in ``STATUS_NAMES``: 0 completed, 1 not converged, 2 not finite, 3 interrupted, 4 ended by its event, 5
         and 6 adaptive steps that were too short or too many, 8 inadmissible: a trajectory that could not be started,
-        with
-        its parameters or from its state.
+        with its parameters or from its state.
     steps : ndarray of int64, shape (B,)
         Number of steps taken; if the status is a failure, the next step failed.
     residual : ndarray, shape (B,)
@@ -327,8 +326,7 @@ class Ensemble(AuditableResult):
         """Return an ``xarray.Dataset`` with coordinates ``trajectory`` and ``time``; all else is in attributes (JSON).
 
         ``status_text`` and ``message`` tell how every trajectory ended. Each variable has a long name, energy and
-        entropy
-        also the law that the system promises of them.
+        entropy also the law that the system promises of them.
 
         Parameters
         ----------

@@ -1,5 +1,4 @@
-"""Evidence for the audit of a run besides its series: rounding scales of its functions, and steps repeated from its
-states.
+"""Evidence for the audit of a run: rounding scales of its functions, and steps repeated from its states.
 
 All of it is computed when it is first asked for, at a bounded number of states.
 """
@@ -236,8 +235,7 @@ class EvidenceCollector:
         )
 
     def _min_significant_field(self, x: np.ndarray) -> np.ndarray:
-        """Return the field magnitude above which it is more than rounding, at states x, shape (m, n), by block: (m,
-        blocks)."""
+        """Return the magnitude, shape (m, blocks), above which the field of a block is more than rounding."""
         perturbed_x = x.copy()
         signs = np.random.default_rng(0).choice([-1.0, 1.0], x.shape[1])  # in no axes of the system
         for block in self.system.state_blocks:
@@ -280,9 +278,8 @@ class EvidenceCollector:
         """Return the largest defect of short steps over a few states, where the smallest over the step sizes counts.
 
         At rest the field of a block may vanish, as the heat of friction does, and grow like a power of time: then a
-        step of any
-        size has the same relative defect. So if short steps from a state have a defect, others begin at the end of the
-        first.
+        step of any size has the same relative defect. So if short steps from a state have a defect, others begin at the
+        end of the first.
         """
         max_rate = max(step.relative_length / step.h for step in steps)
         moving_steps = [step for step in steps if step.relative_length > 1e-6 * max_rate * step.h]
@@ -366,8 +363,7 @@ class _ReplayedStep(NamedTuple):
 def _slope_defect(
     step: _ReplayedStep, blocks: tuple[slice, ...], field_before: np.ndarray, field_after: np.ndarray
 ) -> float:
-    """Return the distance of the slope of a step from the mean field at its ends, relative to that; the worst block
-    counts.
+    """Return the relative distance of the slope of a step from the mean field at its ends, in the worst block.
 
     A block that is almost at rest is measured relative to the rounding of its slope and its field.
     """

@@ -1,5 +1,4 @@
-"""Solutions and ensembles in NetCDF files: written atomically, with a checksum that is verified before they are
-read."""
+"""Solutions and ensembles in NetCDF files, written atomically and verified by a checksum."""
 
 from __future__ import annotations
 
@@ -276,8 +275,7 @@ def dataclass_from_json(cls: type[T], data: Any) -> T:
 
 
 def array_of_shape(series: Mapping[str, np.ndarray], name: str, *shapes: tuple[int | None, ...]) -> np.ndarray:
-    """Return an array of a file; ValueError unless it is numeric and has one of the shapes, where None is any
-    length."""
+    """Return a numeric array of a file; ValueError unless it has one of the shapes, where None is any length."""
     array = series[name]
     matches = [
         len(s) == array.ndim and all(n in (None, m) for n, m in zip(s, array.shape, strict=True)) for s in shapes

@@ -88,8 +88,7 @@ def sample_steps(system: System, x: np.ndarray, t: np.ndarray, h: np.ndarray, re
 
 
 def _order_by_field_change(system: System, x: np.ndarray, h: np.ndarray, max_states: int) -> np.ndarray:
-    """Return the indices of all steps, by decreasing change of the field over a step, as seen from ``max_states``
-    states."""
+    """Return the indices of all steps, by decreasing change of the field, evaluated at ``max_states`` states."""
     indices = np.unique(np.linspace(0, len(h) - 1, min(max_states, len(h))).astype(int))
     field = vector_field_at(system, x[indices])
     step = h[indices, None] * field

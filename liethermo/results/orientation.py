@@ -43,8 +43,7 @@ def quaternions(solution: AuditableResult) -> np.ndarray:
 
 
 def nutation(solution: AuditableResult, axis=None) -> np.ndarray:
-    """Return the angle between an axis of the body and its angular momentum, ``arctan2(|e × mu|, e . mu)``, from 0 to
-    pi.
+    """Return the angle between a body axis e and the angular momentum, ``arctan2(|e × mu|, e . mu)``, 0 to pi.
 
     A torque-free body with friction ends at 0, or at pi if it spins about the other end of the axis.
 
@@ -54,8 +53,7 @@ def nutation(solution: AuditableResult, axis=None) -> np.ndarray:
         A result of a body whose state begins with its angular momentum in body axes.
     axis : array, shape (3,), optional
         The axis in body axes, of any length. The default is the axis of greatest inertia, or of least inertia if the
-        two
-        greatest are equal, as for a rod; its first nonzero component is positive.
+        two greatest are equal, as for a rod; its first nonzero component is positive.
 
     Returns
     -------
@@ -86,8 +84,7 @@ def spin(solution: AuditableResult, axis=None) -> np.ndarray:
     -------
     ndarray, of the shape of :func:`nutation`
         Angles (rad), full turns included; the body must turn by less than half a turn between the saved times. Angles
-        of
-        final states are from -pi to pi.
+        of final states are from -pi to pi.
 
     Raises
     ------

@@ -86,8 +86,7 @@ class Solution(AuditableResult):
 
     @with_library_settings
     def __call__(self, t) -> np.ndarray:
-        """Return the states at any times, shape (..., n): each is the end of a step that begins at the last state
-        before.
+        """Return the states at times t, shape (..., n): ends of steps that begin at the last state before.
 
         Such a state has the order of the method and obeys its laws.
 
@@ -103,8 +102,7 @@ class Solution(AuditableResult):
 
     @property
     def energy_balance(self) -> np.ndarray:
-        """The energy less the work done from outside, shape (times,), which the first law conserves in a driven
-        system."""
+        """The energy less the work done from outside, shape (times,); driven systems conserve it."""
         return self.energy - sum(self.casimirs[name] for name in self.laws.balance)
 
     @with_library_settings

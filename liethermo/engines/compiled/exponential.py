@@ -24,8 +24,7 @@ SERIES_DEGREE = 13
 
 
 def write_exponential(writer: Any, x: ir.Value) -> ir.Value:
-    """Write ``exp(x)``, to one unit in the last place: ``2^k exp(r)`` with ``x = k log 2 + r`` and ``|r| <= log(2) /
-    2``.
+    """Write ``exp(x) = 2^k exp(r)`` with ``x = k log 2 + r``, to one unit in the last place.
 
     Parameters
     ----------

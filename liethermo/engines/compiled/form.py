@@ -1,5 +1,4 @@
-"""Systems and methods as the compiled engine sees them: a structure, which is compiled, and parameters, its
-arguments."""
+"""Split of systems and methods into a structure, which is compiled, and parameters, its arguments."""
 
 from __future__ import annotations
 
@@ -36,8 +35,7 @@ class ProgramStructure:
     @staticmethod
     @memoize
     def from_module(module: eqx.Module) -> ProgramStructure:
-        """Return the structure of a system, a method or a step control, whose parameters are the arrays among its
-        leaves."""
+        """Return the structure of a module; its parameters are the arrays among its leaves."""
         dynamic, static = eqx.partition(module, eqx.is_inexact_array)
         leaves, structure = jax.tree_util.tree_flatten(dynamic)
         static_leaves, static_structure = jax.tree_util.tree_flatten(static)

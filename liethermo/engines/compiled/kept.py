@@ -1,5 +1,4 @@
-"""Cache of machine code on disk. Cached code is run unchecked, so only files and folders of this user alone are
-used."""
+"""Cache of machine code on disk, in files and folders that only this user can have written."""
 
 from __future__ import annotations
 
@@ -30,8 +29,7 @@ SAFE_OPEN_FLAGS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | 
 
 
 def cache_folder() -> Path | None:
-    """Return the cache folder: ``$LIETHERMO_CACHE``, or a folder in the user's cache directory; None if there is
-    none."""
+    """Return the folder ``$LIETHERMO_CACHE`` or one in the user's cache directory; None if there is none."""
     if user_folder := os.environ.get("LIETHERMO_CACHE"):
         return Path(user_folder)
     try:
@@ -107,7 +105,7 @@ def _why_untrusted(status: os.stat_result) -> str:
 def _warn_untrusted(path: str, reason: str) -> None:
     """Warn, once for each path, that machine code is not cached there."""
     warn(
-        f"machine code is not kept in {path}: {reason}, and the code there could do anything in your name. It is compiled "
-        "in memory instead. Set LIETHERMO_CACHE to a folder of your own (chmod 700)",
+        f"machine code is not kept in {path}: {reason}, and the code there could do anything in your name. It is "
+        "compiled in memory instead. Set LIETHERMO_CACHE to a folder of your own (chmod 700)",
         CacheWarning,
     )

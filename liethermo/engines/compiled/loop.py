@@ -149,8 +149,7 @@ class _StepLoopWriter(ProgramWriter):
     ``advance`` takes each block from its step ``done`` to step ``saves * every`` and writes every ``every``-th state to
     ``out``. It reads the noise increments of the steps from ``noise``, block by block. A call takes at most ``most``
     steps. If a block needs Newton's method and ``newton`` is null, the call returns the number of that block, and
-    another
-    call resumes there; otherwise it returns the number of blocks.
+    another call resumes there; otherwise it returns the number of blocks.
     """
 
     def __init__(
@@ -212,8 +211,7 @@ class _StepLoopWriter(ProgramWriter):
         build.ret(argument["count"])
 
     def write_begin(self) -> None:
-        """Write ``begin(p, blocks, count)``, which computes the initial state of a run from the x of each
-        trajectory."""
+        """Write ``begin(p, blocks, count)``, which computes the initial state of a run from each x."""
         with self.loop_range(self.arguments["count"]) as i:
             self.select_block(i)
             self.load_rows([name for name in self.programs["begin"].arguments if name != "p"])

@@ -242,8 +242,7 @@ class CompiledStepLoop:
         return *adaptive_state.state, *adaptive_state[1:]
 
     def fields_after_step(self, p, dW, *inputs) -> tuple:
-        """Return the fields after a step or an attempt; ``inputs`` are the step size (fixed steps only) and the old
-        fields."""
+        """Return the fields after a step or an attempt; ``inputs`` are h (fixed steps only) and the old fields."""
         system, method, *control = self.build_modules(p)
         if not control:
             h, *fields = inputs
@@ -257,8 +256,7 @@ class CompiledStepLoop:
         return *adaptive_state.state, *adaptive_state[1:]
 
     def _newton_fallback(self, dW) -> Callable:
-        """Return the fallback of :func:`..stepping.take_step`: a separate program, compiled when a step first needs
-        it."""
+        """Return the fallback for :func:`..stepping.take_step`: a program compiled at its first use."""
 
         def bind_deferred_newton(fixed_point_result: StageSolution, *stage_inputs) -> StageSolution:
             initial_outputs = [1.0 * getattr(fixed_point_result, name) for name in NEWTON_OUTPUTS]
@@ -328,8 +326,7 @@ class CompiledStepLoop:
         return self._shapes.get(name, ())
 
     def make_blocks(self, fields: dict[str, Any], parameters=None) -> np.ndarray:
-        """Return blocks of trajectories with the given fields, trajectories first, and status 0; other fields are
-        undefined."""
+        """Return blocks of trajectories with these fields and status 0; other fields are undefined."""
         if self._is_per_trajectory.any() and "p" not in fields:
             fields = fields | {"p": parameters[:, self._is_per_trajectory]}
         n_trajectories = len(fields["x"])
@@ -385,16 +382,13 @@ class CompiledStepLoop:
     def run(
         self, parameters, blocks: np.ndarray, h: float | np.ndarray, saves: int, save_every: int, noise=None, out=None
     ) -> np.ndarray:
-        """Advance blocks in place by ``saves * save_every`` steps of size h, fewer if a step fails; return the saved
-        fields.
+        """Advance blocks in place by up to ``saves * save_every`` steps of size h; return the saved fields.
 
         h is one step size, or one for each lane, empty lanes included. ``noise`` holds the increments of a stochastic
-        method,
-        shape (trajectories, steps, increments).
+        method, shape (trajectories, steps, increments).
 
         The result has shape (trajectories, saves, n_saved_values), including empty lanes, and is undefined after a
-        failed
-        step. It is written to ``out`` if that is given.
+        failed step. It is written to ``out`` if that is given.
         """
         lanes, n_blocks, width = self.lanes, len(blocks), self.n_saved_values
         if "h" in self._layout.first_rows:
@@ -461,8 +455,7 @@ def cached_step_loop(
     is_per_trajectory: np.ndarray | None = None,
     options: SolverOptions = DEFAULT_OPTIONS,
 ) -> CompiledStepLoop:
-    """Return the compiled step loop for a structure of systems, a method and a step control, from the cache if
-    possible.
+    """Return the compiled step loop for a structure, a method and a step control, cached if possible.
 
     The cache key contains which parameters are zero: a diagonal matrix makes a shorter program.
 

@@ -44,10 +44,9 @@ class ProgramWriter:
     """Writer of scalar programs as LLVM instructions, on numbers or on vectors with a number for each lane.
 
     Truth values are bits, integers have 64. Sums are never reassociated. A product whose only use is a sum is fused
-    with
-    it, and rounded once, on processors that can. The choice of these products does not depend on the number of lanes.
-    Instructions for one side of a branch are skipped if no lane takes that side. Each lane chooses for itself, so its
-    numbers do not depend on the others.
+    with it, and rounded once, on processors that can. The choice of these products does not depend on the number of
+    lanes. Instructions for one side of a branch are skipped if no lane takes that side. Each lane chooses for itself,
+    so its numbers do not depend on the others.
 
     Attributes
     ----------
@@ -170,8 +169,7 @@ class ProgramWriter:
         raise UnsupportedPrimitive(op, "of unknown origin", f"on {x.type}")
 
     def _integer_quotient(self, x: ir.Value, n: ir.Value) -> ir.Value:
-        """Write the quotient of integers, rounded towards zero; it is -1 for a divisor 0, and a divisor -1 does not
-        trap."""
+        """Write the quotient of integers, towards zero; a divisor 0 gives -1, and -1 does not trap."""
         build, one = self.builder, self.constant(1)
         is_zero, is_minus_one = (build.icmp_signed("==", n, self.constant(c)) for c in (0, -1))
         quotient = build.sdiv(x, build.select(build.or_(is_zero, is_minus_one), one, n))
@@ -204,8 +202,7 @@ class ProgramWriter:
         return self.call_intrinsic("llvm.fmuladd", (x, y, addend), self.double_type)
 
     def nonnegative_max(self, x: ir.Value, y: ir.Value) -> ir.Value:
-        """Write the maximum of two nonnegative numbers, NaN if either is NaN: their bits are ordered like the
-        numbers."""
+        """Write the maximum of two nonnegative numbers, NaN if either is, by comparing their bits."""
         build, width = self.builder, max(self.lanes, 2)
         double_vector, int_vector = ir.VectorType(FLOAT64, width), ir.VectorType(INT64, width)
         lane_zero = ir.Constant(ir.IntType(32), 0)
@@ -310,8 +307,7 @@ class ProgramWriter:
 
 
 class _ProgramEmitter:
-    """Emitter of one program: it holds the values written so far, those of one side of a branch in a scope of their
-    own."""
+    """Emitter of one program; values written on one side of a branch have a scope of their own."""
 
     def __init__(
         self, writer: ProgramWriter, program: Program, read_input: InputReader, find_table: TableFinder | None

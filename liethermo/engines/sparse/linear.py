@@ -30,9 +30,8 @@ class JacobianCompression:
     """Compression of a sparse Jacobian matrix: all its entries from few Jacobian-vector products.
 
     Columns without a common row get one colour and are computed together, by a derivative along their sum [Curtis,
-    Powell &
-    Reid 1974]. Dense rows (of *hubs*) would need as many colours as they have entries; they are computed one by one, by
-    vector-Jacobian products. The limit between both is chosen to need the fewest derivatives.
+    Powell & Reid 1974]. Dense rows (of *hubs*) would need as many colours as they have entries; they are computed one
+    by one, by vector-Jacobian products. The limit between both is chosen to need the fewest derivatives.
 
     Parameters
     ----------

@@ -150,8 +150,7 @@ class SparseEngine:
     def _damped_newton_step(
         self, state, h, s: IterationState, residual, scale, inverse: SparseInverse, max_trials: int
     ):
-        """Return iteration state, residual and scale after a Newton step, halved until the residual decreases; None on
-        failure.
+        """Return state, residual and scale after a Newton step, halved until the residual decreases, or None.
 
         At the rounding plateau the residual does not decrease, and a full step is taken.
         """

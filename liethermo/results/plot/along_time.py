@@ -21,8 +21,7 @@ def laws(solution: Solution, path: str | os.PathLike | None = None) -> Figure:
 
     The production is the difference quotient of the saved entropies, on a logarithmic axis. Increments below the
     rounding of the entropy itself (the tolerance of the audit) are marked at that level in grey, larger decreases in
-    red
-    by their magnitude. A solution without entropy has the first panel only.
+    red by their magnitude. A solution without entropy has the first panel only.
 
     Parameters
     ----------

@@ -26,8 +26,7 @@ from ..solution import Solution
 from .figures import BLUE, DPI, GREY, ORANGE, checked_figure_path, save_figure
 
 MAX_SEGMENTS = 20_000
-"""Largest number of segments of a trajectory in a 3D figure, each of which is drawn by itself; longer ones are
-thinned."""
+"""Largest number of segments in a 3D figure, each drawn by itself; longer trajectories are thinned."""
 
 TIME_COLORMAP = plt.get_cmap("viridis")
 
@@ -44,10 +43,10 @@ def momentum_sphere(
 
     The energy surface is solid, with lines of constant entropy on it; the entropy surfaces are drawn by their sections
     with the coordinate planes and the plane of the paper. The trajectory is coloured by time. Parts that the solid
-    hides
-    from the viewpoint of ``ax`` are pale or left out, so turn the axes before drawing, not after. A system without
-    entropy shows its first Casimir or momentum map instead. If the energy decreases (double bracket), the two functions
-    change places. They also do for a system with baths, which are left out: the body loses the energy that they gain.
+    hides from the viewpoint of ``ax`` are pale or left out, so turn the axes before drawing, not after. A system
+    without entropy shows its first Casimir or momentum map instead. If the energy decreases (double bracket), the two
+    functions change places. They also do for a system with baths, which are left out: the body loses the energy that
+    they gain.
 
     Surfaces are found along rays from the origin. A surface that a ray meets twice is left out; one that does not close
     around the origin, such as a cylinder, is drawn by sections that end a little beyond the trajectory.
@@ -58,9 +57,8 @@ def momentum_sphere(
         A result of a system with three components, such as one on so(3)*, and baths besides.
     system : System, optional
         The system that was integrated, which a solution read from a file does not know. Without it the energy surface
-        is
-        the quadric through all states, if there is exactly one, and the entropy surfaces are spheres if the algebra is
-        so(3) or su(2), where every Casimir is a function of ``|mu|``; what remains unknown is left out. The axes are
+        is the quadric through all states, if there is exactly one, and the entropy surfaces are spheres if the algebra
+        is so(3) or su(2), where every Casimir is a function of ``|mu|``; what remains unknown is left out. The axes are
         labelled by the names of the basis elements of its algebra, if they have some.
     path : path, optional
         Write the figure to this .pdf, .png or .svg file, and close it.
@@ -79,8 +77,8 @@ def momentum_sphere(
         solution = _body_solution(solution, system)
     if solution.x.shape[1] != 3:
         raise InputError(
-            f"momentum_sphere draws states of 3 components, got {solution.x.shape[1]}. If the others are the entropies of "
-            "baths, pass the system too; lt.plot.laws draws any solution"
+            f"momentum_sphere draws states of 3 components, got {solution.x.shape[1]}. If the others are the entropies "
+            "of baths, pass the system too; lt.plot.laws draws any solution"
         )
     if system is not None and system.body_dim != 3:
         raise InputError(f"system must have 3 components like the solution, got {system.body_dim}")
@@ -216,8 +214,7 @@ class _LevelSurface:
         self.is_simple, self.is_closed = bool(meetings.max() == 1), bool((meetings == 1).all())
 
     def intersect_rays(self, directions: np.ndarray) -> np.ndarray:
-        """Return the points where rays from the origin along unit vectors (..., 3) meet the surface, NaN if they do
-        not."""
+        """Return the points where rays along unit vectors (..., 3) meet the surface, NaN if they do not."""
         has_crossing = self._ray_crossings(directions)
         first_interval = has_crossing.argmax(axis=0)
         inner, outer = self.radii[first_interval], self.radii[first_interval + 1]
@@ -230,8 +227,7 @@ class _LevelSurface:
         return np.where(is_hit[..., None], outer[..., None] * directions, np.nan)
 
     def hides(self, points: np.ndarray, view: np.ndarray) -> np.ndarray:
-        """Return whether the surface hides points (..., 3) from a distant eye in the direction ``view``, shape
-        (...)."""
+        """Return whether the surface hides points, shape (..., 3), from a distant eye in the direction ``view``."""
         depths = np.geomspace(0.01, 20.0, 80) * self.extent
         side = self._is_above_level(points + depths.reshape(-1, *[1] * points.ndim) * view)
         return (side[1:] != side[:-1]).any(axis=0)
@@ -279,8 +275,7 @@ class _Scene:
                 self._draw_contour(values, level, color=GREY, linewidth=0.4)
 
     def draw_sections(self, function: PointFunction, index: int, color: str, label: str) -> None:
-        """Draw plane sections of the level surface of the function through a state, and its intersection with the
-        solid."""
+        """Draw plane sections of the level surface through a state, and its intersection with the solid."""
         surface = _LevelSurface(function, self.states[index], self.extent)
         if not surface.is_simple:
             return
@@ -308,8 +303,7 @@ class _Scene:
 
 
 def _level_curves(mesh: np.ndarray, values: np.ndarray, level: float) -> Iterator[np.ndarray]:
-    """Yield the curves, shape (m, 3), in a mesh (rows, columns, 3) along which values (rows, columns) equal the
-    level."""
+    """Yield the curves, shape (m, 3), in a mesh (rows, columns, 3) on which ``values`` equal the level."""
     contours: Any = contour_generator(z=values)
     for line in contours.lines(level):
         column, row = line.T
