@@ -60,7 +60,7 @@ class DenseOutput:
         if is_unknown.any():
             raise ConvergenceError(
                 f"the state at t = {t[is_unknown][0]:g}, between two steps, cannot be found: the equations of a "
-                "partial step were not solved. Evaluate the solution at the ends of the steps, or run with smaller steps",
+                "partial step were not solved. Evaluate the solution at the ends of the steps, or take smaller steps",
                 None,
             )
 

@@ -144,8 +144,8 @@ def test_rules_of_large_systems_in_machine_code():
 
 
 def test_what_takes_minutes_to_compile_is_said(monkeypatch):
-    monkeypatch.setattr("liethermo.engines.choice.LARGE_PROGRAM", 2)
-    with pytest.warns(CompiledEngineWarning, match="takes minutes to compile. Leave out engine"):
+    monkeypatch.setattr("liethermo.engines.choice.SLOW_COMPILE_OPERATIONS", 2)
+    with pytest.warns(CompiledEngineWarning, match=r"takes minutes to compile\. Leave out engine"):
         lt.integrate(BODY, X0, (0.0, 1.0), 0.1, engine="compiled")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -263,11 +263,11 @@ def test_newtons_method_that_cannot_be_compiled(adaptive):
 def test_auto_compiles_small_systems_and_long_runs(monkeypatch):
     chosen = lambda: lt.integrate(BODY, X0, (0.0, 1.0), 0.1).provenance["engine"]  # noqa: E731
     assert chosen() == "compiled"
-    monkeypatch.setattr("liethermo.engines.choice.SMALL_PROGRAM", 2)
+    monkeypatch.setattr("liethermo.engines.choice.MAX_AUTO_COMPILED_OPERATIONS", 2)
     assert chosen() == "array"
-    monkeypatch.setattr("liethermo.engines.choice.COMPILED_STEPS", 5)
+    monkeypatch.setattr("liethermo.engines.choice.MIN_STEPS_TO_COMPILE", 5)
     assert chosen() == "compiled"
-    monkeypatch.setattr("liethermo.engines.choice.COMPILED_DIM", 2)
+    monkeypatch.setattr("liethermo.engines.choice.MAX_COMPILED_DIM", 2)
     assert chosen() == "array"
 
 

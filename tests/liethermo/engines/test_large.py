@@ -159,7 +159,7 @@ def solved(slopes, guess, rules=DEFAULT_OPTIONS):
         return lambda found: solve_krylov(product, found, rules)
 
     n = guess.shape[1]
-    measure = rules.size(n)
+    measure = rules.norm_for_dim(n)
     return solve_stages(StageEquations(slopes, guess, lambda k: 1.0 + measure(k), inverted), rules)
 
 

@@ -170,7 +170,7 @@ def test_code_is_found_on_disk_and_damage_is_seen(tmp_path, monkeypatch):
     monkeypatch.setenv("LIETHERMO_CACHE", str(tmp_path / "cache"))
     made = []
     monkeypatch.setattr(
-        machine_code, "_compile", lambda *a, make=machine_code._compile_module: made.append(1) or make(*a)
+        machine_code, "_compile_module", lambda *a, make=machine_code._compile_module: made.append(1) or make(*a)
     )
     program = program_of(lambda a: a * 3.25, np.ones(2))
     for _ in range(2):
@@ -191,7 +191,7 @@ def test_code_is_made_for_the_processor_that_is_named(tmp_path, monkeypatch):
     monkeypatch.setenv("LIETHERMO_CACHE", str(tmp_path))
     program, made = program_of(lambda a: a * 3.75 + 1.0, np.ones(2)), []
     monkeypatch.setattr(
-        machine_code, "_compile", lambda *a, make=machine_code._compile_module: made.append(1) or make(*a)
+        machine_code, "_compile_module", lambda *a, make=machine_code._compile_module: made.append(1) or make(*a)
     )
     try:
         for cpu in ("x86-64", "x86-64-v2"):

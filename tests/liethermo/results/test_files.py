@@ -83,7 +83,7 @@ def test_a_save_that_fails_leaves_the_old_file(solution, tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(disk.os, "replace", full)
-    with pytest.raises(lt.FileError, match=r"the disk is full .*The result itself is as it was"):
+    with pytest.raises(lt.FileError, match=r"the disk is full .*The result in memory is unchanged"):
         solution.save(path)
     assert path.read_bytes() == before
     assert os.listdir(tmp_path) == ["run.nc"]

@@ -233,7 +233,7 @@ def test_a_solid_hides_what_is_behind_it():
 
 
 def test_long_trajectories_are_thinned_but_keep_their_ends(body, relaxed, monkeypatch):
-    monkeypatch.setattr("liethermo.results.plot.surfaces.MOST_SEGMENTS", 50)
+    monkeypatch.setattr("liethermo.results.plot.surfaces.MAX_SEGMENTS", 50)
     segments = path_in_space(lt.plot.momentum_sphere(relaxed, body))
     assert len(segments) == 50
     assert any((segment[0] == relaxed.x[0]).all() for segment in segments)
@@ -287,10 +287,10 @@ def test_a_file_that_cannot_be_written(relaxed, tmp_path):
 
 def test_other_dimensions_and_flat_axes_are_refused(body, relaxed):
     wide = replace(relaxed, x=np.tile(relaxed.x, 2))
-    with pytest.raises(lt.InputError, match="3 components, not 6"):
+    with pytest.raises(lt.InputError, match="3 components, got 6"):
         lt.plot.momentum_sphere(wide)
     other = lt.LiePoissonSystem(mf.se(3), lt.Quadratic(np.ones(6)))
-    with pytest.raises(lt.InputError, match="this system have 6"):
+    with pytest.raises(lt.InputError, match="3 components like the solution, got 6"):
         lt.plot.momentum_sphere(relaxed, other)
     _, flat = plt.subplots()
     with pytest.raises(lt.InputError, match="three-dimensional"):
@@ -305,5 +305,5 @@ def test_momentum_sphere_of_a_body_with_a_bath():
     solution = lt.integrate(system, [0.1, 0.2, 1.0], (0.0, 20.0), 0.1)
     assert labels(lt.plot.momentum_sphere(solution, system))[:2] == ["invariant $1.05$", "energy at start $0.5117$"]
     assert np.ptp(solution.energy) < 1e-14
-    with pytest.raises(lt.InputError, match="where the others are the entropies of baths, give the system too"):
+    with pytest.raises(lt.InputError, match="If the others are the entropies of baths, pass the system too"):
         lt.plot.momentum_sphere(solution)
