@@ -31,11 +31,11 @@ def jacobian_probe(system: System, x) -> jax.Array:
     if n <= DENSE_JACOBIAN_DIM:
         return jax.vmap(jacobian_product)(jnp.eye(n)).T
 
-    def power(v, _):
+    def power_step(v, _):
         v = jacobian_product(v)
         return _unit_vector(v), v
 
-    return jax.lax.scan(power, _unit_vector(_generic_vector(n)), length=POWER_ITERATIONS)[1]
+    return jax.lax.scan(power_step, _unit_vector(_generic_vector(n)), length=POWER_ITERATIONS)[1]
 
 
 @jit_program

@@ -53,7 +53,7 @@ def _nest_vmaps(function: Callable, axes: Sequence[tuple]) -> Callable:
     return function
 
 
-def _abstract_shape(*arguments, axes: tuple, **_):
+def _abstract_eval(*arguments, axes: tuple, **_):
     shape, guess = arguments[-1].shape, arguments[-1]
     sizes = []
     for axes_of_level in reversed(axes):
@@ -109,7 +109,7 @@ def _jvp_rule(primals, tangents, *, residual: Callable, structure, axes: tuple, 
 
 
 _implicit_solution.def_impl(lambda *arguments, **rest: jax.jit(lambda *a: _evaluate(*a, **rest))(*arguments))
-_implicit_solution.def_abstract_eval(_abstract_shape)
+_implicit_solution.def_abstract_eval(_abstract_eval)
 batching.primitive_batchers[_implicit_solution] = _batching_rule
 ad.primitive_jvps[_implicit_solution] = _jvp_rule
 mlir.register_lowering(_implicit_solution, mlir.lower_fun(_evaluate, multiple_results=False))

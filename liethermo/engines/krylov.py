@@ -20,7 +20,7 @@ def solve_krylov(matvec: Callable, b: jax.Array, options: SolverOptions) -> jax.
     Clustered eigenvalues are resolved together, so a few stiff components of a large state cost a few products.
     """
 
-    def goes_on(carry):
+    def is_unfinished(carry):
         _, r, _, _, n_products = carry
         return (n_products < options.max_krylov_products) & (
             jnp.linalg.norm(r) > options.krylov_forcing_term * b_norm
@@ -42,5 +42,5 @@ def solve_krylov(matvec: Callable, b: jax.Array, options: SolverOptions) -> jax.
     b_norm = jnp.linalg.norm(b)
     empty_basis = jnp.zeros((options.krylov_basis_size, *b.shape))
     return jax.lax.while_loop(
-        goes_on, orthomin_step, (jnp.zeros_like(b), b, empty_basis, empty_basis, jnp.zeros((), dtype=jnp.int64))
+        is_unfinished, orthomin_step, (jnp.zeros_like(b), b, empty_basis, empty_basis, jnp.zeros((), dtype=jnp.int64))
     )[0]

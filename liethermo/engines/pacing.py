@@ -359,7 +359,7 @@ def apply_event_detection(
     the method, and the laws hold there. If the dense output shows that the sign change is undone within the step, a
     shorter step is tried first, and likewise if a trial step fails although the full step did not. A step may end where
     the event function is NaN. A search that starts there assumes the previous value, so it ends where the function is a
-    number again. The value at the end of a search is stored by :func:`.searching.closed_bracket`.
+    number again. The value at the end of a search is stored by :func:`.searching.empty_bracket_with_value`.
     """
     value, bracket = control.event_value(system, new_state.x), searching.RootBracket(*adaptive_state.root_bracket)
     signed_value = jnp.where(
@@ -401,7 +401,7 @@ def apply_event_detection(
             status,
         )
     initial_bracket = jnp.stack(searching.bracket_from_step(h, adaptive_state.event_value, value))
-    event_bracket = searching.closed_bracket(
+    event_bracket = searching.empty_bracket_with_value(
         jnp.where(ends_at_start, adaptive_state.event_value, jnp.where(time_advances, signed_value, 0.0))
     )
     updated_bracket = jnp.where(

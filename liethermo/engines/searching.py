@@ -47,7 +47,7 @@ def bracket_from_step(step_size, value_before, value_after) -> RootBracket:
     bracket = RootBracket(
         zero + step_size, 0.5 * one, zero, zero + value_before, one, zero + value_after, zero, zero + value_before
     )
-    return _select_bracket(value_after == 0.0, _final_evaluation(step_size, one), bracket)
+    return _select_bracket(value_after == 0.0, _last_trial_bracket(step_size, one), bracket)
 
 
 def narrow_bracket(bracket: RootBracket, value) -> tuple[RootBracket, jax.Array]:
@@ -65,16 +65,16 @@ def narrow_bracket(bracket: RootBracket, value) -> tuple[RootBracket, jax.Array]
     ) * (opposite - t)
     new_bracket = RootBracket(bracket.step_size, next_fraction, t, value, opposite, f_opposite, c, fc)
     return _select_bracket(
-        is_converged, _final_evaluation(bracket.step_size, best_fraction), new_bracket
+        is_converged, _last_trial_bracket(bracket.step_size, best_fraction), new_bracket
     ), is_converged & (best_fraction == t)
 
 
-def closed_bracket(value) -> RootBracket:
+def empty_bracket_with_value(value) -> RootBracket:
     """Return an empty bracket whose ``fa`` holds the event value where the search ended."""
     return RootBracket(*jnp.asarray(EMPTY_BRACKET))._replace(fa=jnp.zeros(()) + value)
 
 
-def _final_evaluation(step_size, fraction) -> RootBracket:
+def _last_trial_bracket(step_size, fraction) -> RootBracket:
     """Return a bracket that is evaluated once more, at ``fraction``, and then closed."""
     infinite, fraction = jnp.full((), jnp.inf), jnp.zeros(()) + fraction
     return RootBracket(jnp.zeros(()) + step_size, fraction, fraction, infinite, fraction, infinite, fraction, infinite)

@@ -259,7 +259,7 @@ _inverse = Primitive("inverse")
 
 
 @_inverse.def_abstract_eval
-def _same_shape(matrix):
+def _inverse_abstract_eval(matrix):
     return jax.core.ShapedArray(matrix.shape, matrix.dtype)
 
 
@@ -307,7 +307,7 @@ def make_newton_solve(
         jacobian_product = method.residual_jvp(system, x, compensation, h, k)
         if map_function is None and k.shape[-1] > options.matrix_free_dim:
             return lambda residual: solve_krylov(jacobian_product, residual, options)
-        matrix = (map_function or _apply_vmapped)(
+        matrix = (map_function or _map_with_vmap)(
             lambda d: jacobian_product(d.reshape(k.shape)).ravel(), jnp.eye(k.size)
         ).T
         jacobian_inverse = _inverse.bind(matrix)
@@ -316,7 +316,7 @@ def make_newton_solve(
     return linearise_at
 
 
-def _apply_vmapped(function: Callable, vectors) -> jax.Array:
+def _map_with_vmap(function: Callable, vectors) -> jax.Array:
     return jax.vmap(function)(vectors)
 
 

@@ -83,13 +83,13 @@ def _write_while(writer: Any, loop: WhileLoop, args: Sequence[ir.Value]) -> Bloc
     outer_lanes = writer.active_lanes
     (running_lanes,) = _allocate_slots(writer, "b", [writer.constant(True) if outer_lanes is None else outer_lanes])
 
-    def any_lane_continues() -> ir.Value:
+    def has_running_lane() -> ir.Value:
         carried = [build.load(slot) for slot in slots]
         ((test,),) = writer.write_program(loop.test, _array_reader(constants, carried))
         build.store(build.and_(build.load(running_lanes), writer.cast(test, "b")), running_lanes)
         return writer.has_true_lane(build.load(running_lanes))
 
-    with writer.loop_while(any_lane_continues):
+    with writer.loop_while(has_running_lane):
         previous_values = [build.load(slot) for slot in slots]
         writer.active_lanes = build.load(running_lanes)
         (new_values,) = writer.write_program(loop.body, _array_reader(constants, previous_values))
