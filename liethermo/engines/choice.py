@@ -25,6 +25,7 @@ from .sparse.newton import SparseEngine
 from .stepping import State
 
 ENGINES = ("auto", "array", "compiled", "sparse")
+"""Values of the option ``engine``."""
 
 MAX_COMPILED_DIM = 40
 """Largest dimension for which the compiled engine, with its unrolled scalar code, is considered."""

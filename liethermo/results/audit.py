@@ -109,10 +109,13 @@ class AuditRow(TableRow):
 
 ACCURACY_ROW = "accuracy"
 """Name of the row that judges the local errors."""
+
 CONSISTENCY_ROW = "consistency"
 """Name of the row that compares short steps with the vector field."""
+
 STEPS_TAKEN_ROW = "steps taken"
 """Name of the row that tells whether a run reached its end."""
+
 FAILED_TRAJECTORIES_ROW = "trajectories that failed"
 """Name of the row that counts the trajectories of an ensemble that did not reach their end."""
 

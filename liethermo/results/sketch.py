@@ -11,6 +11,7 @@ MAX_CURVES = 8
 """Largest number of curves, which is the number of colours."""
 
 CURVE_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9", "#999999", "#F0E442")
+"""Colours of the curves, which colour-blind readers can tell apart [Okabe & Ito 2008]."""
 
 
 def svg_sketch(t: np.ndarray, series: np.ndarray, label: str, width: int = 280, height: int = 110) -> str:

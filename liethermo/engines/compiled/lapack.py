@@ -27,6 +27,7 @@ SYMBOL_PREFIX = "liethermo_"
 """Prefix of the names of functions that are bound when code is loaded."""
 
 LAPACK_ROUTINES = "dsyev zheev dgetrf zgetrf dgetri zgetri dgeqrf zgeqrf dorgqr zungqr dgesdd zgesdd".split()
+"""LAPACK routines that kernels call."""
 
 SPECIAL_FUNCTIONS = {
     "lgamma": ("gammaln", 1),

@@ -139,8 +139,10 @@ MAX_UNOPTIMISED_OPERATIONS = 30_000
 
 ADVANCE_SIGNATURE = ctypes.CFUNCTYPE(ctypes.c_int64, *[ctypes.c_void_p] * 3, *[ctypes.c_int64] * 3, ctypes.c_void_p,
                            ctypes.c_int64, *[ctypes.c_void_p] * 2)  # fmt: skip
+"""C signature of ``advance``: see :class:`_StepLoopWriter`."""
 
 BEGIN_SIGNATURE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)
+"""C signature of ``begin(p, blocks, count)``."""
 
 
 class _StepLoopWriter(ProgramWriter):

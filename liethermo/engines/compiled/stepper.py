@@ -44,6 +44,8 @@ from .machine_code import MachineCode
 from .newton import compile_newton_solver
 
 STATE_FIELDS = State._fields
+"""Fields of a state."""
+
 ADAPTIVE_FIELDS = tuple(name for name in AdaptiveState._fields if name != "state")
 """Fields of an adaptive state besides the state."""
 

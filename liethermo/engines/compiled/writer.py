@@ -31,9 +31,14 @@ C_LIBRARY_FUNCTIONS = frozenset(
 """Operations that are functions of the C library, with the same names."""
 
 COMPARISONS = {"eq": "==", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
+"""Comparisons, with their LLVM predicates."""
+
 ARITHMETIC = {"add": ("fadd", "add"), "sub": ("fsub", "sub"), "mul": ("fmul", "mul"), "neg": ("fneg", "neg")}
 ARITHMETIC |= {"div": ("fdiv", ""), "rem": ("frem", "")}
+"""Arithmetic operations, with the builder's methods for doubles and for integers."""
+
 LOGICAL = {"and": "and_", "or": "or_", "xor": "xor", "not": "not_"}
+"""Operations on truth values and integers, with the builder's method for each."""
 
 
 InputReader: TypeAlias = Callable[[int, int], ir.Value]

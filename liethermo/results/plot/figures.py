@@ -13,7 +13,10 @@ from ... import disk
 from ...errors import FileError, InputError
 
 SUFFIXES = (".pdf", ".png", ".svg")
+"""Suffixes of the file formats of figures."""
+
 DPI = 150
+"""Resolution of figures, in dots per inch."""
 
 # These colours can be told apart by colour-blind readers [Okabe & Ito 2008].
 BLUE = "#0072B2"

@@ -29,6 +29,7 @@ MAX_SEGMENTS = 20_000
 """Largest number of segments in a 3D figure, each drawn by itself; longer trajectories are thinned."""
 
 TIME_COLORMAP = plt.get_cmap("viridis")
+"""Colour map of the time along a trajectory."""
 
 PointFunction = Callable[[np.ndarray], np.ndarray]  # points, shape (..., 3), to values, shape (...)
 

@@ -309,7 +309,7 @@ def test_a_plain_function_that_is_quadratic_is_treated_as_one():
 
 # -- the cache --------------------------------------------------------------------------------------------------------
 
-RUN = """
+RUN_SCRIPT = """
 import liethermo as lt
 print(lt.integrate(lt.models.rigid_body(), [0.001, 1.0, 0.001], (0.0, 5.0), 0.1, engine="compiled").x[-1].tolist())
 """
@@ -317,7 +317,10 @@ print(lt.integrate(lt.models.rigid_body(), [0.001, 1.0, 0.001], (0.0, 5.0), 0.1,
 
 def run_in_process(folder):
     result = subprocess.run(
-        [sys.executable, "-c", RUN], capture_output=True, text=True, env={**os.environ, "LIETHERMO_CACHE": str(folder)}
+        [sys.executable, "-c", RUN_SCRIPT],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "LIETHERMO_CACHE": str(folder)},
     )
     assert result.returncode == 0, result.stderr
     return result.stdout

@@ -25,6 +25,7 @@ ENERGIES = {
     "float to narrow integers": lambda m: m[0] ** 2 + m[1] ** 2 * (200.0 * m[2]).astype(jnp.uint8).astype(float),
     "larger truth value": lambda m: m[0] ** 2 + m[1] ** 2 * jnp.maximum(m[2] > 0, m[0] > 0),
 }
+"""Energies that once crashed the compiler."""
 
 
 def run(system, engine, **options):
@@ -76,6 +77,7 @@ FAULTS = {
     "writer": lambda patch: patch.setattr(ProgramWriter, "write_operation", raising),
     "LLVM": lambda patch: patch.setattr("liethermo.engines.compiled.loop.MachineCode", raising),
 }
+"""Patches that raise an error in a part of the compiler."""
 
 
 @pytest.mark.parametrize("fault", FAULTS)

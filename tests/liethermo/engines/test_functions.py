@@ -85,6 +85,7 @@ FUNCTIONS = {
     "bessel_jn": lambda m: special.bessel_jn(m[0] + 4.0, v=1)[1],
     "convolve": lambda m: jnp.sum(jnp.convolve(m, m)[1:3]),
 }
+"""Function of the momentum for each JAX feature, a part of the energy."""
 
 METHODS = lt.MetriplecticMidpoint(), lt.MetriplecticRungeKutta(4)
 CASIMIR = functools.partial(lt.Quadratic, np.ones(3))
@@ -166,6 +167,7 @@ FUNCTIONS_OF_MATRICES = {
         mf.spectral(jnp.sqrt, 2.0 * jnp.eye(4) + 0.3j * mf.so(4).hat(jnp.tile(m, 2)))[0, 0].real
     ),
 }
+"""Matrix functions of the momentum, a part of the energy."""
 
 
 @pytest.mark.sampled(1)

@@ -134,7 +134,7 @@ def test_a_pipe_is_passed_over(folder, compilations):
     assert len(compilations) == 2
 
 
-HOMELESS = """
+HOMELESS_SCRIPT = """
 import os, pathlib
 def nobody():
     raise RuntimeError("Could not determine home directory.")
@@ -151,7 +151,7 @@ def test_without_a_home(tmp_path, has_xdg_cache):
     if has_xdg_cache:
         environment["XDG_CACHE_HOME"] = str(tmp_path)
     process = subprocess.run(
-        [sys.executable, "-c", HOMELESS], capture_output=True, text=True, env=environment, check=False
+        [sys.executable, "-c", HOMELESS_SCRIPT], capture_output=True, text=True, env=environment, check=False
     )
     assert process.stdout.strip() == "True", process.stderr
     assert (tmp_path / "liethermo").exists() == has_xdg_cache

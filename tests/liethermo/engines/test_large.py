@@ -17,7 +17,8 @@ from liethermo.engines.stages import IterationState, StageEquations, solve_stage
 from liethermo.engines.stepping import initial_run_state_program
 from liethermo.runs.preparation import checked_initial_state, prepare_run
 
-COUNT = 5_000
+N_SPINS = 5_000
+"""Number of spins of the large ring."""
 
 
 class Damping(Dissipation):
@@ -61,7 +62,7 @@ def random_spins(count, seed=0):
 @pytest.mark.slow
 def test_many_damped_spins_take_long_steps():
     """Many damped spins need Newton's method only for long steps, although some spin always converges late."""
-    system, x = ring(COUNT), random_spins(COUNT)
+    system, x = ring(N_SPINS), random_spins(N_SPINS)
     for h, steps in ((0.1, 20), (1.0, 3)):
         solution = lt.integrate(system, x, (0.0, steps * h), h, save_every=steps, engine="array")
         energy, stats = solution.energy, solution.stats

@@ -23,9 +23,14 @@ from liethermo.tracing.scalarize import UnsupportedPrimitive, scalarize
 from tests.liethermo.tracing.test_scalarize import CASES, STEPS, check, program_of, shapes, steps
 from tests.machine_code import compiled, memory_maps
 
-PAIRS = {*"add sub mul div pow rem max min atan2 igamma igammac".split(), *COMPARISONS - {"is_finite"}}
-SPECIAL = np.array([0.0, -0.0, 1.0, -1.5, 2.5, 0.3, -3.7, np.inf, -np.inf, np.nan, 1e300, 1e-300])
-GRID = np.array(list(itertools.product(SPECIAL, SPECIAL)))
+BINARY_OPERATIONS = {*"add sub mul div pow rem max min atan2 igamma igammac".split(), *COMPARISONS - {"is_finite"}}
+"""Operations on two numbers."""
+
+SPECIAL_NUMBERS = np.array([0.0, -0.0, 1.0, -1.5, 2.5, 0.3, -3.7, np.inf, -np.inf, np.nan, 1e300, 1e-300])
+"""Ordinary and special numbers."""
+
+NUMBER_PAIRS = np.array(list(itertools.product(SPECIAL_NUMBERS, SPECIAL_NUMBERS)))
+"""All pairs of these numbers, shape (pairs, 2)."""
 
 
 def single_operation_program(op: str) -> Program:
@@ -47,7 +52,7 @@ def single_operation_program(op: str) -> Program:
     elif op == "regularized_incomplete_beta":
         tested_instruction = [Instruction("t", op, ("a", "b", 0.3))]
     else:
-        tested_instruction = [Instruction("t", op, ("a", "b") if op in PAIRS else ("a",))]
+        tested_instruction = [Instruction("t", op, ("a", "b") if op in BINARY_OPERATIONS else ("a",))]
     return Program((("a",), ("b",)), (*operand_instructions, *tested_instruction), (("t",),), ((1,),))
 
 
@@ -58,7 +63,7 @@ def single_operation_program(op: str) -> Program:
 def test_every_operation_at_every_kind_of_number(op, lanes):
     program = single_operation_program(op)
     function = compiled(program, lanes)
-    for a, b in GRID.reshape(-1, lanes, 2).swapaxes(1, 2):
+    for a, b in NUMBER_PAIRS.reshape(-1, lanes, 2).swapaxes(1, 2):
         (result,), (expected,) = function(a, b), program.evaluate(a, b, batch=True)
         np.testing.assert_allclose(np.ravel(result), np.ravel(expected).astype(float), rtol=4e-15, equal_nan=True)
         is_number = ~np.isnan(np.ravel(expected).astype(float))
@@ -75,7 +80,7 @@ def test_comparisons_of_truth_values_and_of_integers(lanes):
     comparisons = [Instruction(x + op, op, (x, y)) for op in tests for x, y in ("pq", "ij")]
     names = tuple(instruction.target for instruction in comparisons)
     program = Program((("a",), ("b",)), (*operand_instructions, *comparisons), (names,), ((len(names),),))
-    function, finite_pairs = compiled(program, lanes), GRID[np.abs(GRID).max(axis=1) < 1e6]
+    function, finite_pairs = compiled(program, lanes), NUMBER_PAIRS[np.abs(NUMBER_PAIRS).max(axis=1) < 1e6]
     for a, b in finite_pairs[: len(finite_pairs) // lanes * lanes].reshape(-1, lanes, 2).swapaxes(1, 2):
         (result,), (expected,) = function(a, b), program.evaluate(a, b, batch=True)
         np.testing.assert_array_equal(result.reshape(expected.shape), expected)
@@ -112,7 +117,7 @@ def test_products_in_sums_are_the_same_in_every_lane():
 def test_the_largest_component(lanes):
     """The maximum of absolute values, compared by their bits, propagates NaN."""
     program = program_of(lambda a: jnp.max(jnp.abs(a)), np.ones(3))
-    triples = np.array(list(itertools.product(SPECIAL, repeat=3))).reshape(-1, lanes, 3)
+    triples = np.array(list(itertools.product(SPECIAL_NUMBERS, repeat=3))).reshape(-1, lanes, 3)
     function = compiled(program, lanes)
     for a in triples:
         (result,) = function(a)

@@ -525,7 +525,7 @@ def body(dissipation, energy=(1.0, 1 / 2, 1 / 3), capacity=2.0):
     return system, system.state(np.append([0.4, 0.5, 0.8], [0.0] * (system.dim - 3)))
 
 
-IDLE = {
+IDLE_SYSTEMS = {
     "jumps at rate zero": lambda: quantum(LEVELS, LOWERING, 0.0, 0.8),
     "jumps without a Hamiltonian": lambda: quantum(0.0 * LEVELS, LOWERING, 0.5, np.inf),
     "jumps of equal levels": lambda: quantum(np.eye(3), LOWERING, 0.5, np.inf),
@@ -540,16 +540,17 @@ IDLE = {
         lt.FourBracket.kulkarni_nomizu(np.eye(3), np.eye(3)), np.zeros(3), None
     ),
 }
+"""Systems whose dissipation does nothing, with initial states."""
 
 
 @pytest.mark.sampled(
     "jumps without a Hamiltonian-Gauss", "jumps that exchange no heat-Gauss", "a bracket at rate zero-explicit"
 )
 @pytest.mark.parametrize("method_name", ["Gauss", "explicit"])
-@pytest.mark.parametrize("name", IDLE)
+@pytest.mark.parametrize("name", IDLE_SYSTEMS)
 def test_what_rounding_makes_of_nothing_is_no_motion(name, method_name):
     """Baths that receive no heat, and energies that are zero, change by rounding alone, and the audit passes."""
     methods = {"Gauss": lt.MetriplecticGauss(2), "explicit": lt.MetriplecticRungeKutta(4)}
-    system, x0 = IDLE[name]()
+    system, x0 = IDLE_SYSTEMS[name]()
     audit = lt.integrate(system, x0, (0.0, 2.0), 0.05, methods[method_name]).audit()
     assert audit.passed, str(audit)

@@ -37,7 +37,8 @@ def system_of(name):
     return SYSTEMS[name]()
 
 
-START, END = np.array([0.6, 0.64, 0.48]), 4.0
+START = np.array([0.6, 0.64, 0.48])
+END = 4.0
 TIMES = np.linspace(0.0, END, 64)[1:-1]  # at no step's end
 
 METHODS = {  # and a step whose error is far above rounding

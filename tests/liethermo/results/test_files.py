@@ -34,7 +34,7 @@ def rewrite(path: Path, change) -> Path:
     return path
 
 
-FULL = """
+FULL_DISK_SCRIPT = """
 import resource, signal, sys
 import liethermo as lt
 solution = lt.integrate(lt.models.rigid_body(), [0.1, 1.0, 0.1], (0.0, 200.0), 0.1)
@@ -53,7 +53,9 @@ assert solution.save(sys.argv[1]).exists() and (lt.load(sys.argv[1]).x == soluti
 
 def test_a_full_disk_is_an_error_and_no_crash(tmp_path):
     path = tmp_path / "run.nc"
-    process = subprocess.run([sys.executable, "-c", FULL, str(path)], capture_output=True, text=True, check=False)
+    process = subprocess.run(
+        [sys.executable, "-c", FULL_DISK_SCRIPT, str(path)], capture_output=True, text=True, check=False
+    )
     assert process.returncode == 0, process.stdout + process.stderr
     assert os.listdir(tmp_path) == ["run.nc"]
 
@@ -166,6 +168,7 @@ CHANGES = {
     "states in words": _replace_array("x", np.array([[b"a"] * 3] * 21)),
     "an energy of another number": _replace_array("energy", np.zeros(4)),
 }
+"""Changes of a file that make it no result."""
 
 
 @pytest.mark.parametrize("change_name", CHANGES)

@@ -19,7 +19,8 @@ import manifolds as mf
 from liethermo.results.plot.figures import BLUE, GREEN, GREY, RED
 from liethermo.results.plot.surfaces import _fit_quadric, _LevelSurface, _sphere_grid
 
-SIZE_OF_A_PICTURE = 5_000  # bytes; an empty one is smaller
+MIN_FIGURE_BYTES = 5_000
+"""Size in bytes that every figure exceeds; an empty one is smaller."""
 
 
 @pytest.fixture(autouse=True)
@@ -273,13 +274,13 @@ def test_drawing_into_axes_that_are_given(body, relaxed_solution):
 def test_figures_are_written_and_closed(relaxed_solution, tmp_path, suffix):
     path = tmp_path / "new folder" / f"laws{suffix}"
     lt.plot.laws(relaxed_solution, path=path)
-    assert path.stat().st_size > SIZE_OF_A_PICTURE
+    assert path.stat().st_size > MIN_FIGURE_BYTES
     assert not plt.get_fignums()
 
 
 def test_momentum_sphere_is_written(body, relaxed_solution, tmp_path):
     lt.plot.momentum_sphere(relaxed_solution, body, path=str(tmp_path / "body.PNG"))
-    assert (tmp_path / "body.PNG").stat().st_size > SIZE_OF_A_PICTURE
+    assert (tmp_path / "body.PNG").stat().st_size > MIN_FIGURE_BYTES
 
 
 @pytest.mark.parametrize("draw", [lt.plot.laws, lt.plot.momentum_sphere])
