@@ -226,7 +226,7 @@ class RoundingScale:
     def allowed_change(self, tolerance: float) -> Any:
         """Return the largest accepted change of the function, relative to ``scale``."""
         scales = self.sensitivity, np.maximum(np.abs(self.value), self.term_size)
-        with np.errstate(invalid="ignore"):  # of what has overflowed all is as large as the size
+        with np.errstate(invalid="ignore"):  # after an overflow the fraction is 1
             fractions = (np.where(np.isinf(self.scale), 1.0, part_scale / self.scale) for part_scale in scales)
             return sum(
                 fraction * allowed
@@ -349,7 +349,7 @@ def _entropy_row(solution: AuditedRun, tolerances: Tolerances) -> tuple[float, A
         float(rounding.allowed_change(t) * rounding.scale) for t in (tolerances.entropy, tolerances.casimirs)
     )
     fall = float((np.maximum.accumulate(S) - S).max())
-    if fall > total_tolerance >= 0.0 and min_increment >= -step_tolerance:  # step by step below what rounding hides
+    if fall > total_tolerance >= 0.0 and min_increment >= -step_tolerance:  # each step is within the rounding
         note = f"in all it falls by {fall:.2g}"
     return min_increment, AuditRow(
         "least entropy increment",

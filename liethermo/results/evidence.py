@@ -141,7 +141,7 @@ class AuditableResult(SaveableResult):
         """Data that an audit needs besides the series; computed at its first use."""
         return Evidence() if self.evidence_source is None else self.evidence_source()
 
-    def __getstate__(self) -> dict[str, Any]:  # a copy in another process knows the evidence, not how to find it
+    def __getstate__(self) -> dict[str, Any]:  # a pickled copy has the evidence itself, not the function
         return {**vars(self), "evidence": self.evidence, "evidence_source": None}
 
 
@@ -194,9 +194,8 @@ class EvidenceCollector:
         sensitivity_by_name = dict(zip(names, _column_maxima(sensitivities), strict=True))
         energy, entropy = sensitivity_by_name.pop("energy"), sensitivity_by_name.pop("entropy", None)
         evidence = Evidence(energy, entropy, sensitivity_by_name, dict(zip(names, _column_maxima(terms), strict=True)))
-        if not isinstance(self.method, OneStepMethod) or noise_dimension(
-            self.method
-        ):  # noise is what a short step shows
+        # a short step of a stochastic method shows only its noise
+        if not isinstance(self.method, OneStepMethod) or noise_dimension(self.method):
             return evidence
         n_steps = len(self.h)
         if not n_steps:
@@ -228,7 +227,9 @@ class EvidenceCollector:
         if not any(is_moving):
             return evidence
         errors = np.array([self._local_error(*step, min_motion) for step in zip(replayed, is_moving, strict=True)])
-        errors = np.where(np.isfinite(errors), errors, defects)  # nothing better is known
+        errors = np.where(
+            np.isfinite(errors), errors, defects
+        )  # a step that cannot be refined has the defect as its error
         worst = int(np.argmax(errors))
         return dataclasses.replace(
             evidence, local_error=float(errors[worst]), error_time=float(sample.t[indices[worst]]), looked=len(sample.h)
@@ -237,7 +238,7 @@ class EvidenceCollector:
     def _min_significant_field(self, x: np.ndarray) -> np.ndarray:
         """Return the magnitude, shape (m, blocks), above which the field of a block is more than rounding."""
         perturbed_x = x.copy()
-        signs = np.random.default_rng(0).choice([-1.0, 1.0], x.shape[1])  # in no axes of the system
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], x.shape[1])  # a direction along no axis of the system
         for block in self.system.state_blocks:
             perturbed_x[:, block] += (
                 ROUNDING_SLOPE_RTOL * np.abs(x[:, block]).max(axis=1, initial=0.0, keepdims=True) * signs[block]
@@ -330,7 +331,7 @@ class EvidenceCollector:
         points = self.system.points
         try:
             state = self.replay(x, float(h), steps)
-        except UnsupportedPrimitive:  # Newton's method, where the run went without it
+        except UnsupportedPrimitive:  # Newton's method, which the run did not need
             return None
         if int(state.status) != 0:
             return None
@@ -338,7 +339,9 @@ class EvidenceCollector:
         start = np.asarray(points(x))
         user_distance = float(np.abs(np.asarray(points(x + d)) - start).max())
         lengths = (
-            _relative_norm(d[block], np.append(x[block], d[block]))  # what starts at zero has the size that it gets
+            _relative_norm(
+                d[block], np.append(x[block], d[block])
+            )  # a block that starts at zero has the norm that it reaches
             for block, f in zip(self.system.state_blocks, min_field, strict=True)
             if np.abs(d[block]).max(initial=0.0) > MIN_RELATIVE_MOTION / ROUNDING_SLOPE_RTOL * steps * h * f
         )

@@ -143,7 +143,7 @@ def write_dataset(dataset: xarray.Dataset, path: str | os.PathLike) -> Path:
     buffer.write(CHECKSUM_TAG + hashlib.sha256(buffer.getbuffer()).hexdigest().encode())
     try:
         disk.write_atomically(path, buffer.getbuffer())
-    except (OSError, ValueError) as error:  # the latter for what is no path
+    except (OSError, ValueError) as error:  # ValueError for an invalid path
         raise FileError(
             f"cannot write {path!s:.200}: {disk.why_os_failed(error)}. The result in memory is unchanged"
         ) from error
@@ -187,7 +187,7 @@ def read_dataset(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[s
         raise FileError(f"cannot read {path!s:.200}: {disk.why_os_failed(error)}") from error
     try:
         series, attributes = _read_hdf5(path)
-    except Exception as error:  # the readers beneath raise a dozen kinds for a broken file
+    except Exception as error:  # HDF5's readers raise a dozen kinds of errors for a broken file
         raise FileError(
             f"{path} cannot be read as NetCDF: it is cut short, damaged or of another format. {error}"
         ) from error
@@ -234,10 +234,10 @@ def _sha256_of_prefix(path: Path, n_remaining: int) -> bytes:
 
 def _read_hdf5(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Return the variables of a file by name, and its attributes."""
-    import h5py  # not through h5netcdf, which prints a traceback of its own for a file that it cannot open
+    import h5py  # not through h5netcdf, which prints a traceback if it cannot open a file
 
     with h5py.File(path) as file:
-        for name in file:  # before anything that they lead to is opened
+        for name in file:  # before any link is followed
             if not isinstance(file.get(name, getlink=True), h5py.HardLink):
                 raise ValueError(f"{name!r} is a link to another place")
         variables = {name: v for name, v in file.items() if not _is_dimension_scale(v)}

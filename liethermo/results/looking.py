@@ -60,9 +60,8 @@ def sample_steps(system: System, x: np.ndarray, t: np.ndarray, h: np.ndarray, re
     """
     gaps = np.diff(t)
     counts = np.rint(gaps / h)
-    is_uniform = (counts > 0) & (
-        np.abs(gaps - counts * h) <= 1e-6 * h
-    )  # as many steps of that size lead to the next state
+    # whether ``counts`` steps of size h lead from a saved state to the next
+    is_uniform = (counts > 0) & (np.abs(gaps - counts * h) <= 1e-6 * h)
     counts = np.where(is_uniform, counts, 1).astype(int)
     has_both_ends = is_uniform & (counts == 1)
     costs = np.where(has_both_ends, 1, REPLAY_COST_RATIO * counts)
@@ -94,7 +93,7 @@ def _order_by_field_change(system: System, x: np.ndarray, h: np.ndarray, max_sta
     step = h[indices, None] * field
     change = np.abs(h[indices, None] * vector_field_at(system, x[indices] + 0.5 * step) - step).max(axis=1)
     change = np.nan_to_num(change, nan=np.inf)
-    interval_change = np.maximum(change, np.append(change[1:], 0.0))  # between two states that were seen
+    interval_change = np.maximum(change, np.append(change[1:], 0.0))  # for the interval between two sampled states
     interval = np.searchsorted(indices, np.arange(len(h)), side="right") - 1
     return np.lexsort([np.arange(len(h)), -interval_change[interval]])
 

@@ -81,9 +81,8 @@ def evaluate_ensemble_laws(
             -ensemble.entropy_change / rounding.scale,
             rounding.allowed_change(tolerances.casimirs),
         )
-        ensemble_laws += (
-            [total_fall_law] if total_fall_law.is_violated.any() else []
-        )  # each step below what rounding hides
+        if total_fall_law.is_violated.any():  # although each step is within the rounding
+            ensemble_laws.append(total_fall_law)
     ensemble_laws.append(
         ensemble_law("stage residual", np.where(ensemble.ok, ensemble.residual, 0.0), tolerances.residual)
     )

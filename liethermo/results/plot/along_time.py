@@ -63,7 +63,7 @@ def _draw_energy(ax: Axes, t: np.ndarray, H: np.ndarray, work_label: str) -> Non
     error = (H - initial_energy) / (abs(initial_energy) or 1.0)
     max_error = float(np.abs(error).max())
     ax.axhline(0.0, color=GREY, linewidth=0.8)
-    if max_error < 20 * EPS:  # beside one unit of rounding
+    if max_error < 20 * EPS:  # the scale is one unit of rounding
         ax.axhspan(-EPS, EPS, color="0.93", linewidth=0)
         ax.set_ylim(-1.4 * max(max_error, EPS), 1.4 * max(max_error, EPS))
     ax.plot(t, error, color=BLUE, linewidth=0.8)

@@ -55,7 +55,7 @@ def sphere_field(
     latitudes, longitudes = field.shape
     edges = np.linspace(-np.pi, np.pi, longitudes + 1), np.linspace(np.pi / 2, -np.pi / 2, latitudes + 1)
     colour_limit = float(np.abs(field).max()) if largest is None else largest
-    centred_field = np.roll(field, longitudes // 2, axis=1)  # the meridian of longitude zero is in the middle
+    centred_field = np.roll(field, longitudes // 2, axis=1)  # longitude zero is in the centre
     picture = ax.pcolormesh(
         *edges, centred_field, cmap="RdBu_r", vmin=-colour_limit, vmax=colour_limit, rasterized=True
     )

@@ -45,6 +45,6 @@ def save_figure(figure: Figure, path: Path | None) -> Figure:
             plt.close(figure)
         try:
             disk.write_atomically(path, buffer.getbuffer())
-        except (OSError, ValueError) as error:  # the latter for what is no path
+        except (OSError, ValueError) as error:  # ValueError for an invalid path
             raise FileError(f"cannot write {path}: {disk.why_os_failed(error)}") from error
     return figure

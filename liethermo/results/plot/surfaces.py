@@ -89,7 +89,7 @@ def momentum_sphere(
         ax = plt.figure(figsize=(6.4, 5.2), dpi=DPI, layout="constrained").add_subplot(projection="3d")
         _turn_axes_towards(solution.x[-1], ax)
     ax.set_proj_type("ortho")
-    ax.computed_zorder = False  # what is behind what is settled here, by the zorder of each piece
+    ax.computed_zorder = False  # the zorder of each piece is set here
 
     scene = _Scene(ax, solution.x)
     conserved_quantity, changing_quantity = _conserved_and_changing(solution, system)
@@ -154,9 +154,8 @@ def _conserved_and_changing(solution: Solution, system: System | None) -> tuple[
     entropy: PointFunction | None
     if system is not None:
         energy = _vectorize_in_blocks(_restrict_to_body(system.energy, system))
-        body_entropy = (
-            system.entropy if system.body_dim == system.dim else None
-        )  # that of baths is no function of the body
+        # the entropy of baths is no function of the body
+        body_entropy = system.entropy if system.body_dim == system.dim else None
         function = body_entropy or next((J for J, is_conserved in system.invariants().values() if is_conserved), None)
         entropy = None if function is None else _vectorize_in_blocks(_restrict_to_body(function, system))
     else:
@@ -258,7 +257,7 @@ class _Scene:
             return
         self.solid, self.mesh = surface, surface.intersect_rays(_sphere_grid(96, 192))
         normals = np.cross(np.gradient(self.mesh, axis=0), np.gradient(self.mesh, axis=1))
-        normals[[0, -1]] = normals[[1, -2]]  # at the poles of the mesh all longitudes meet
+        normals[[0, -1]] = normals[[1, -2]]  # the normals vanish at the poles of the mesh
         normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
         grey = 0.80 + 0.18 * normals @ (0.6 * self.view_direction + [0.0, 0.0, 0.8])  # lit from in front and above
         shades = np.repeat(np.clip(grey, 0.0, 1.0)[..., None], 3, axis=-1)
@@ -325,7 +324,7 @@ def _draw_trajectory(solution: Solution, scene: _Scene) -> None:
             lines = Line3DCollection(
                 segments[is_selected], colors=colors[is_selected], alpha=alpha, linewidths=1.7, zorder=zorder
             )
-            lines.set_capstyle("round")  # segments would show gaps at their joints
+            lines.set_capstyle("round")  # otherwise gaps show at the joints of segments
             scene.ax.add_collection3d(lines)
     for i, face, label in ((0, "white", "start"), (-1, "black", "end")):
         style = {"color": "black", "markerfacecolor": face, "markersize": 5, "zorder": 5}

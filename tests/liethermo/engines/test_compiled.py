@@ -36,7 +36,7 @@ def assert_equal_runs(a, b, tolerance=1e-13):
     assert (a.status.code, a.status.step, a.laws) == (b.status.code, b.status.step, b.laws)
     assert np.array_equal(a.t, b.t)
     assert np.abs(a.x - b.x).max() <= tolerance * np.abs(a.x).max()
-    # the plateau is met an iteration earlier or later as rounding has it
+    # rounding decides whether the plateau is met an iteration earlier or later
     assert b.stats.iterations_per_step == pytest.approx(a.stats.iterations_per_step, rel=0.05)
 
 

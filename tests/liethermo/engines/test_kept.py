@@ -54,7 +54,7 @@ def test_a_folder_that_others_may_write_to_is_not_used(folder, compilations, mod
         run()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        run()  # told once
+        run()  # the warning is not repeated
     assert len(compilations) == 3
 
 
@@ -65,7 +65,7 @@ def test_a_file_that_others_may_write_to_is_not_run(folder, compilations):
     with pytest.warns(CacheWarning, match="others may write to it"):
         run()
     assert len(compilations) == 2
-    run()  # it has been replaced
+    run()  # the file has been replaced
     assert len(compilations) == 2
 
 

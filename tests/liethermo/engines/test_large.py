@@ -86,11 +86,14 @@ def slowness_by_update(updates, rate):
 
 def test_an_iteration_is_slow_by_its_last_update_and_by_the_last_two():
     assert slowness_by_update([1.0, 0.5, 0.4, 0.3, 0.25], 0.6) == [False, False, True, True, True]
-    assert slowness_by_update([1.0, 0.5], 0.3) == [False, True]  # as Newton's method asks, of one step with a matrix
+    assert slowness_by_update([1.0, 0.5], 0.3) == [False, True]  # the rate that Newton's method requires
     assert (
         slowness_by_update([1.0, 100.0, 1e-2, 1.0, 1e-4, 1e-2], 0.6)[2:] == [False] * 4
-    )  # two parts that drive each other
-    assert slowness_by_update([1.0, 100.0, 0.9, 90.0, 0.8, 80.0], 0.6)[3::2] == [True, True]  # and do not converge
+    )  # two components that drive each other
+    assert slowness_by_update([1.0, 100.0, 0.9, 90.0, 0.8, 80.0], 0.6)[3::2] == [
+        True,
+        True,
+    ]  # two components that do not converge
     assert slowness_by_update([1.0, 2.0, 4.0, 8.0], 0.6)[1:] == [True] * 3
 
 
@@ -101,7 +104,7 @@ def test_spins_in_line_that_a_bath_shakes(h):
     system = lt.models.spin_lattice((3, 3, 3), baths=bath)
     initial_spins = np.tile([0.0, 0.0, 1.0], (3, 3, 3, 1))
     run = lt.integrate(system, initial_spins, (0.0, 3 * h), h, noise=lt.Fluctuations(1.0, 1), engine="array")
-    assert (run.stats.newton_iterations > 0) == (h == 0.6)  # steps so long do need it
+    assert (run.stats.newton_iterations > 0) == (h == 0.6)  # long steps do need it
     assert run.audit().energy_drift <= 1e-14
 
 
@@ -139,7 +142,7 @@ def test_steps_before_newtons_method_is_needed_are_not_taken_again(monkeypatch):
     assert calls[0] == (0, False)
     assert calls[1] == (calls[1][0], True)
     assert 1 < calls[1][0] < 40
-    assert calls[1][0] % 4  # in the middle between two states that are kept
+    assert calls[1][0] % 4  # between two saves
     eager_state, eager_saves = advance(
         system, method, start, *map(jnp.asarray, (0.5, 10, 4)), engine.max_saves_per_call
     )
@@ -189,7 +192,7 @@ def test_it_is_said_where_the_equations_are_not_solved():
     slopes, guess = stiff_heat_chain(1_500, 1000.0)
     few_iterations = replace(DEFAULT_OPTIONS, max_krylov_products=2, max_newton_iterations=2, max_newton_halvings=0)
     assert not bool(solve_matrix_free(slopes, guess, few_iterations).converged)
-    assert not bool(solve_matrix_free(lambda k: 2.0 * k * k + 1.0, guess).converged)  # there is no such k
+    assert not bool(solve_matrix_free(lambda k: 2.0 * k * k + 1.0, guess).converged)  # it has no solution
 
 
 @pytest.mark.slow

@@ -59,7 +59,7 @@ def single_operation_program(op: str) -> Program:
 @pytest.mark.parametrize("lanes", [1, 4])
 @pytest.mark.parametrize(
     "op", sorted(set(OPERATIONS) - {"item", "table", "column", "lookup"})
-)  # which belong to blocks
+)  # those belong to blocks
 def test_every_operation_at_every_kind_of_number(op, lanes):
     program = single_operation_program(op)
     function = compiled(program, lanes)
@@ -67,7 +67,7 @@ def test_every_operation_at_every_kind_of_number(op, lanes):
         (result,), (expected,) = function(a, b), program.evaluate(a, b, batch=True)
         np.testing.assert_allclose(np.ravel(result), np.ravel(expected).astype(float), rtol=4e-15, equal_nan=True)
         is_number = ~np.isnan(np.ravel(expected).astype(float))
-        if expected.dtype.kind == "f" and op not in ("max", "min", "sign"):  # whose zeros may have either sign
+        if expected.dtype.kind == "f" and op not in ("max", "min", "sign"):  # the zeros of those may have either sign
             assert np.array_equal(np.signbit(np.ravel(result))[is_number], np.signbit(np.ravel(expected))[is_number])
 
 
@@ -229,7 +229,7 @@ define void @add(<8 x double>* %p) {
 def test_a_module_that_llvm_refuses_is_an_error():
     module = ir.Module()
     function = ir.Function(module, ir.FunctionType(FLOAT64, []), "f")
-    ir.IRBuilder(function.append_basic_block())  # without an end
+    ir.IRBuilder(function.append_basic_block())  # a block without a terminator
     with pytest.raises(RuntimeError):
         MachineCode(module)
 

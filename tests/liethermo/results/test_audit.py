@@ -119,10 +119,10 @@ def test_a_constant_does_not_hide_a_drift():
     assert only_row(drifting_solution.audit(), "energy drift").passed is False
     assert drifting_solution.audit().energy_drift == pytest.approx(
         1e-14, rel=0.1
-    )  # relative to the value, as it is defined
+    )  # relative to the value by definition
     falling_entropy = dataclasses.replace(
         solution, entropy=1e12 - 4e-4 * np.arange(len(solution.t))
-    )  # each step as rounding might
+    )  # each decrease is as small as rounding
     row = only_row(falling_entropy.audit(), "least entropy increment")
     assert (row.passed, "in all it falls by 0.04" in row.note) == (False, True)
 
@@ -204,7 +204,7 @@ def test_the_audit_finds_a_step_through_a_barrier(save_every):
     """The barrier is a twentieth of a step wide, and twice as high as would stop the particle."""
     barrier = lt.MetriplecticSystem(mf.Canonical(1), lambda x: 0.5 * x[1] ** 2 + jnp.exp(-((x[0] / 0.01) ** 2)))
     solution = lt.integrate(barrier, [-1.05, 1.0], (0.0, 2.4), 0.4, lt.MetriplecticMidpoint(), save_every=save_every)
-    assert solution.x[-1] == pytest.approx([1.35, 1.0])  # where it would be without a barrier
+    assert solution.x[-1] == pytest.approx([1.35, 1.0])  # its position without a barrier
     assert solution.audit().resolved is False
     fine_solution = lt.integrate(
         barrier, [-1.05, 1.0], (0.0, 2.4), 1e-3, lt.MetriplecticGauss(3), save_every=save_every
@@ -254,7 +254,9 @@ def test_the_estimate_is_of_the_order_of_the_method():
     errors = [
         only_row(lt.integrate(BODY, [0.3, 1.0, -0.2], (0.0, 8.0), h).audit(), "accuracy").value for h in (0.8, 0.4, 0.2)
     ]
-    assert np.abs(np.log2(np.divide(errors[:-1], errors[1:])) - 2.0).max() < 0.2  # a step is of its length to h^2
+    assert (
+        np.abs(np.log2(np.divide(errors[:-1], errors[1:])) - 2.0).max() < 0.2
+    )  # relative to the length of a step the error is of order h^2
     assert only_row(lt.ensemble(BODY, [0.3, 1.0, -0.2], (0.0, 8.0), 0.2).audit(), "accuracy").passed
 
 

@@ -39,9 +39,9 @@ def system_of(name):
 
 START = np.array([0.6, 0.64, 0.48])
 END = 4.0
-TIMES = np.linspace(0.0, END, 64)[1:-1]  # at no step's end
+TIMES = np.linspace(0.0, END, 64)[1:-1]  # none at the end of a step
 
-METHODS = {  # and a step whose error is far above rounding
+METHODS = {  # each with a step whose error is far above rounding
     "RK4": (lt.MetriplecticRungeKutta(4), 0.4),
     "RK6": (lt.MetriplecticRungeKutta(6), 0.8),
     "RK8": (lt.MetriplecticRungeKutta(8), 1.0),

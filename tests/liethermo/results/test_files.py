@@ -97,7 +97,7 @@ def test_many_write_to_one_path(solution, tmp_path):
         try:
             for _ in range(5):
                 solution.save(path)
-        except Exception as error:  # told below
+        except Exception as error:  # asserted below
             errors.append(error)
 
     threads = [threading.Thread(target=save) for _ in range(4)]
@@ -260,7 +260,7 @@ def test_a_pipe_or_a_device_is_not_replaced(solution, tmp_path):
         with pytest.raises(lt.FileError, match="no plain file"):
             solution.save(path)
     assert (tmp_path / "pipe.nc").is_fifo()
-    with pytest.raises(lt.FileError, match="there is no file"):  # and is not waited for
+    with pytest.raises(lt.FileError, match="there is no file"):  # without waiting for the pipe
         lt.load(tmp_path / "pipe.nc")
 
 
