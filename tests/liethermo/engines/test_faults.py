@@ -42,8 +42,7 @@ def test_is_compiled(name):
 
 
 def test_entries_that_a_function_is_applied_to():
-    """``x.at[i].apply(f)``, which once gave zero, is compiled; JAX does not differentiate it, so it is in a
-    friction."""
+    """``x.at[i].apply(f)``, which JAX does not differentiate and which once gave zero, is compiled in a friction."""
 
     def friction(m):
         return jnp.diag(m.at[1].apply(jnp.cos).at[0].apply(lambda a: 1.0 + a * a) ** 2)

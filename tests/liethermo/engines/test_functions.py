@@ -176,8 +176,7 @@ FUNCTIONS_OF_MATRICES = {
 @pytest.mark.parametrize("method", METHODS, ids=["implicit", "explicit"])
 @pytest.mark.parametrize("name", FUNCTIONS_OF_MATRICES)
 def test_functions_of_matrices(name, method):
-    """Matrix functions are compiled; the second has LAPACK's eigenvectors, with equal pairs of eigenvalues for some
-    m."""
+    """Matrix functions are compiled, by LAPACK for the second, which has equal pairs of eigenvalues for some m."""
     system = body(FUNCTIONS_OF_MATRICES[name])
     compiled_run, array_run = (
         lt.integrate(system, X0, (0.0, 1.0), 0.1, method, engine=e) for e in ("compiled", "array")

@@ -22,8 +22,7 @@ N_SPINS = 5_000
 
 
 class Damping(Dissipation):
-    """Damping of the spins along ``s x (s x dH)``, which heats a bath with the entropy x[-1], as a user would write
-    it."""
+    """Damping of spins along ``s x (s x dH)`` that heats a bath of entropy x[-1], as a user would write it."""
 
     rate: jax.Array
 
@@ -37,8 +36,7 @@ class Damping(Dissipation):
 
 
 def ring(count, exchange=1.0):
-    """Return a ring of spins with exchange and an easy axis, written with plain functions of a state in R^(3 count +
-    1)."""
+    """Return a ring of ``count`` spins with exchange and an easy axis, and a bath, written with plain functions."""
 
     def energy(x):
         s = x[:-1].reshape(-1, 3)
@@ -153,8 +151,7 @@ def test_steps_before_newtons_method_is_needed_are_not_taken_again(monkeypatch):
 
 
 def stiff_heat_chain(n, rate):
-    """Return the slopes of a heat-conducting chain, of rates up to 4 ``rate``, and a guess; its residual is linear in
-    k."""
+    """Return slopes, linear in k, of a heat-conducting chain with rates up to 4 ``rate``, and a guess."""
     rng = np.random.default_rng(0)
     source = jnp.asarray(rng.standard_normal((1, n)))
 

@@ -95,8 +95,7 @@ def test_every_primitive(name):
 
 
 def test_products_in_sums_are_the_same_in_every_lane():
-    """Fused products are rounded equally in a single run and in lanes, so that no trajectory depends on its
-    neighbours."""
+    """Fused products are rounded equally in a single run and in every lane."""
 
     def run(a):
         x, y, z = a
