@@ -156,9 +156,8 @@ class ArrayEngine:
         """
         ends, block = np.empty_like(x), min(STEP_ENDS_PER_CALL, self.max_saves_per_call)
         for start in range(0, len(x), block):
-            indices = np.minimum(
-                np.arange(start, start + block), len(x) - 1
-            )  # always of the same length, for one program
+            # always of the same length, for one program
+            indices = np.minimum(np.arange(start, start + block), len(x) - 1)
             block_ends = _step_ends_program(
                 self.system, self.method, jnp.asarray(x[indices]), jnp.asarray(h[indices]), self.options
             )

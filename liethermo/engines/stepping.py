@@ -106,19 +106,15 @@ def reorder_components(
 
     Only systems of more than ``options.rms_norm_dim`` components are reordered.
     """
-    reordering = (
-        system.reorder_components()
-        if is_permutation_equivariant(method) and state.x.size > options.rms_norm_dim
-        else None
-    )
+    can_reorder = is_permutation_equivariant(method) and state.x.size > options.rms_norm_dim
+    reordering = system.reorder_components() if can_reorder else None
     if reordering is None:
         return system, method, state, lambda state: state
 
     def permute_state(s: State, permute: Callable) -> State:
         k = permute(s.k)
-        k = (
-            k.at[INITIAL_LEVELS_ROW].set(s.k[INITIAL_LEVELS_ROW]) if method.explicit else k
-        )  # not slopes, but values of functions
+        if method.explicit:  # this row holds values of functions, which have no components
+            k = k.at[INITIAL_LEVELS_ROW].set(s.k[INITIAL_LEVELS_ROW])
         return s._replace(
             x=permute(s.x), compensation=permute(s.compensation), k=k, previous_slopes=permute(s.previous_slopes)
         )
