@@ -114,7 +114,7 @@ CONSISTENCY_ROW = "consistency"
 """Name of the row that compares short steps with the vector field."""
 
 STEPS_TAKEN_ROW = "steps taken"
-"""Name of the row that tells whether a run reached its end."""
+"""Name of the row for whether a run reached its end."""
 
 FAILED_TRAJECTORIES_ROW = "trajectories that failed"
 """Name of the row that counts the trajectories of an ensemble that did not reach their end."""
@@ -371,7 +371,7 @@ def _step_rows(evidence: Evidence, tolerances: Tolerances) -> list[AuditRow]:
 
 
 def accuracy_row(evidence: Evidence, tolerances: Tolerances) -> AuditRow:
-    """Return the row that tells whether the steps resolve the motion."""
+    """Return the row that judges whether the steps resolve the motion."""
     if evidence.local_error is None:
         return AuditRow(ACCURACY_ROW, np.nan, None, None, "the local errors were not estimated")
     row = _judged_row(ACCURACY_ROW, evidence.local_error, tolerances.accuracy)

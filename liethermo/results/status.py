@@ -96,10 +96,10 @@ class Laws:
     ``conserved`` names the functions that the method conserves to rounding, ``unpromised`` those that it does not: an
     audit shows their drift without a verdict. ``ledger`` names the recorded functions that count what is received from
     outside. ``balance`` names the ledger functions that the energy of a solution contains; its law is stated without
-    them (``dH = work``). ``inexact`` tells which of the two laws ("energy", "entropy") the method does not claim to
-    keep: an audit judges them nevertheless, and says so. ``mean`` names those of the two laws that hold only in the
-    mean, because of fluctuations: on single paths both functions may rise and fall. ``unknown`` names the functions for
-    which it could not be determined whether the system conserves them.
+    them (``dH = work``). ``inexact`` names the laws ("energy", "entropy") that the method does not claim to keep: an
+    audit judges them nevertheless, and says so. ``mean`` names the laws that hold only in the mean, because of
+    fluctuations: on single paths both functions may rise and fall. ``unknown`` names the functions for which it could
+    not be determined whether the system conserves them.
     """
 
     energy: str | None = "conserved"
