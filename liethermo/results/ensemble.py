@@ -157,7 +157,7 @@ class Ensemble(AuditableResult):
 
     @property
     def ok(self) -> np.ndarray:
-        """Whether each trajectory reached its end, shape (B,)."""
+        """True for each trajectory that reached its end, shape (B,)."""
         return np.isin(self.status, (StatusCode.COMPLETED, StatusCode.EVENT))
 
     @property

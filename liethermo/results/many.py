@@ -28,7 +28,7 @@ class EnsembleLaw:
 
     @property
     def is_violated(self) -> np.ndarray:
-        """Whether each trajectory violates the law, shape (B,)."""
+        """True for each trajectory that violates the law, shape (B,)."""
         return ~(self.values <= self.limits)
 
     @property

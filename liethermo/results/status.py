@@ -10,7 +10,7 @@ from ..errors import InputError
 
 @dataclass(frozen=True)
 class Status:
-    r"""How a run ended: its status code, with a message.
+    r"""Status of a run at its end: a code and a message.
 
     Attributes
     ----------
