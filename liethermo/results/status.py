@@ -10,7 +10,7 @@ from ..errors import InputError
 
 @dataclass(frozen=True)
 class Status:
-    r"""Status of a run at its end: a code and a message.
+    """Status of a run at its end: a code and a message.
 
     Attributes
     ----------

@@ -276,8 +276,18 @@ class CompiledStepLoop:
         shapes = [self.field_shape(name) for name in (*NEWTON_OUTPUTS, *NEWTON_INPUTS)]
         ends = itertools.accumulate(map(math.prod, shapes))
         arrays = [packed[end - math.prod(shape) : end].reshape(shape) for end, shape in zip(ends, shapes, strict=True)]
-        dW, *stage_inputs = NewtonInputs(*arrays[len(NEWTON_OUTPUTS) :])
-        equations = stage_equations(system, set_noise_increments(method, dW), *stage_inputs, self._options, jax.lax.map)
+        inputs = NewtonInputs(*arrays[len(NEWTON_OUTPUTS) :])
+        equations = stage_equations(
+            system,
+            set_noise_increments(method, inputs.dW),
+            inputs.x,
+            inputs.compensation,
+            inputs.h,
+            inputs.k,
+            inputs.previous_slopes,
+            self._options,
+            jax.lax.map,
+        )
         solution = solve_newton(equations, self._options)
         return tuple(1.0 * getattr(solution, name) for name in NEWTON_OUTPUTS)
 
