@@ -15,7 +15,7 @@ class Status:
     Attributes
     ----------
     code : {"completed", "event", "not_converged", "non_finite", "step_underflow", "step_limit", "interrupted", \
-    "reference_failed", "inadmissible"}
+"reference_failed", "inadmissible"}
         Given by name or as a :class:`liethermo.engines.codes.StatusCode`.
     message : str
         A full sentence: what happened, where, and what to try.
