@@ -1,5 +1,5 @@
-"""How the definition of a step becomes fast code.
+"""Engines: they turn the definition of a step into fast code.
 
-An engine takes the steps of one method on one system: arrays in JAX, machine code for small systems,
-sparse matrices for large networks. :class:`.choice.Chosen` picks one.
+An engine takes the steps of one method on one system: the array engine in JAX, the compiled engine in machine code for
+small systems, the sparse engine with sparse matrices for large networks. :class:`.choice.EngineWithFallback` picks one.
 """

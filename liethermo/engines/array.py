@@ -1,4 +1,4 @@
-"""The array engine: any one-step method on any system, in JAX."""
+"""Array engine: any one-step method on any system, in JAX."""
 
 from __future__ import annotations
 
@@ -26,94 +26,98 @@ def advance(
     state: State,
     h,
     saves,
-    every,
+    save_every,
     capacity: int,
-    rules: SolverOptions = DEFAULT_OPTIONS,
+    options: SolverOptions = DEFAULT_OPTIONS,
     noise=None,
     newton: bool = True,
-    first=None,
+    first_step=None,
 ):
-    """Up to ``saves <= capacity`` times ``every`` steps of size h; stops where a step fails.
+    """Take ``save_every`` steps of size h, save, and repeat this ``saves`` times; stop at a failed step.
 
-    The three are arrays, so that one program serves all. Returns the new state and, for each of ``capacity`` saves, the
-    state vector, energy and entropy, and whether it was reached. ``noise`` has the increments of each step, shape
-    (steps, increments); steps without any where it is None. Without ``newton`` a step fails where fixed-point iteration
-    does not solve its equations. A call that goes on with another is given the number of the first step of that: it
-    takes the steps that are left, and keeps what is not kept.
+    ``h``, ``saves <= capacity`` and ``save_every`` are arrays, so one program serves all values. Returns the new state
+    and four arrays with ``capacity`` rows: state vectors, energies, entropies, and whether the save was reached.
+    ``noise`` has the increments of each step, shape (steps, increments), or is None. Without ``newton`` a step fails if
+    fixed-point iteration does not solve its equations. A call that continues another one passes its ``first_step``, the
+    number of the first step of that call: it takes the remaining steps and fills the remaining saves.
     """
-    first, second = state.step if first is None else first, None if newton else keep_fixed_point_result
-    system, method, state, back = reorder_components(system, method, state, rules)
+    first_step = state.step if first_step is None else first_step
+    newton_fallback = None if newton else keep_fixed_point_result
+    system, method, state, restore_order = reorder_components(system, method, state, options)
 
     def step(s: State) -> State:
-        own = method if noise is None else set_noise_increments(method, noise[s.step - first])
-        return take_step(system, own, s, h, rules, second)
+        driven_method = method if noise is None else set_noise_increments(method, noise[s.step - first_step])
+        return take_step(system, driven_method, s, h, options, newton_fallback)
 
-    def one_save(index, carry: tuple[State, tuple]):
-        state, kept = carry
-        target = first + (index + 1) * every
+    def advance_to_save(index, carry: tuple[State, tuple]):
+        state, saved_arrays = carry
+        target_step = first_step + (index + 1) * save_every
 
-        def goes_on(s: State):
-            return (s.status == StatusCode.COMPLETED) & (s.step < target)
+        def continues(s: State):
+            return (s.status == StatusCode.COMPLETED) & (s.step < target_step)
 
-        state = jax.lax.while_loop(goes_on, step, state)
-        saved = back(state).x, state.energy, state.entropy, state.status == StatusCode.COMPLETED
-        return state, jax.tree_util.tree_map(lambda all_of, one: all_of.at[index].set(one), kept, saved)
+        state = jax.lax.while_loop(continues, step, state)
+        values = restore_order(state).x, state.energy, state.entropy, state.status == StatusCode.COMPLETED
+        return state, jax.tree_util.tree_map(lambda array, one: array.at[index].set(one), saved_arrays, values)
 
-    one = state.x, state.energy, state.entropy, jnp.zeros((), bool)
-    kept = tuple(jnp.zeros((capacity, *a.shape), a.dtype) for a in one)
-    state, kept = jax.lax.fori_loop(0, saves, one_save, (state, kept))  # as many passes as saves, not as the capacity
-    return back(state), kept
+    initial_values = state.x, state.energy, state.entropy, jnp.zeros((), bool)
+    saved_arrays = tuple(jnp.zeros((capacity, *a.shape), a.dtype) for a in initial_values)
+    # saves passes, not capacity passes
+    state, saved_arrays = jax.lax.fori_loop(0, saves, advance_to_save, (state, saved_arrays))
+    return restore_order(state), saved_arrays
 
 
-MAX_SAVES_PER_CALL, MAX_SAVED_VALUES_PER_CALL = 1024, 2**16
-"""States that one call keeps at most, and their components: enough to hide the cost of a call, few enough to show
-progress."""
+MAX_SAVES_PER_CALL = 1024
+"""Largest number of states that one call saves: enough to hide the cost of a call, few enough to show progress."""
+
+MAX_SAVED_VALUES_PER_CALL = 2**16
+"""Largest number of components in all states that one call saves, which bounds its memory and its duration."""
 
 
 def max_saves_per_call(system: System) -> int:
-    """The states that one call keeps at most: one number for all runs of a system, so that one program serves them."""
+    """Return the largest number of saves per call, one number for all runs so that they share a program."""
     return min(MAX_SAVES_PER_CALL, max(1, MAX_SAVED_VALUES_PER_CALL // system.dim))
 
 
 class LazyNewton:
-    """Calls of programs that take steps, without Newton's method until a step needs it: the call goes on from there.
+    """Compile steps without Newton's method first, and with it once a step does not converge.
 
-    It is two thirds of what there is to compile.
+    The call resumes at the failed step. Newton's method is two thirds of what there is to compile.
     """
 
     def __init__(self, method: OneStepMethod):
-        # Where there are no equations it makes no difference; a reference solver has none of its own.
+        # Explicit methods have no equations, and a reference solver does not use Newton's method of this package.
         self.has_newton = not isinstance(method, OneStepMethod) or method.explicit
 
-    def advance(self, call: Callable, state: State, every) -> tuple[State, tuple]:
-        """The state after ``call(state, newton, first)``, that of one trajectory or of many, and what is kept."""
-        first = state.step
-        state, kept = call(state, self.has_newton, first)
-        lacking = np.isin(state.status, FAILED_STEP_CODES)
-        if self.has_newton or not lacking.any():
-            return state, kept
+    def advance(self, call: Callable, state: State, save_every) -> tuple[State, tuple]:
+        """Return the state and the saved arrays after ``call(state, with_newton, first_step)``."""
+        first_step = state.step
+        state, saved = call(state, self.has_newton, first_step)
+        needs_newton = np.isin(state.status, FAILED_STEP_CODES)
+        if self.has_newton or not needs_newton.any():
+            return state, saved
         self.has_newton = True
-        done = np.arange(kept[-1].shape[-1]) < (np.asarray(state.step - first) // every)[..., None]
-        state, more = call(state._replace(status=jnp.where(lacking, 0, state.status)), True, first)
-        old = [done.reshape(*done.shape, *[1] * (a.ndim - done.ndim)) for a in kept]
-        return state, tuple(jnp.where(where, a, b) for where, a, b in zip(old, kept, more, strict=True))
+        is_saved = np.arange(saved[-1].shape[-1]) < (np.asarray(state.step - first_step) // save_every)[..., None]
+        state, saved_later = call(state._replace(status=jnp.where(needs_newton, 0, state.status)), True, first_step)
+        masks = [is_saved.reshape(*is_saved.shape, *[1] * (a.ndim - is_saved.ndim)) for a in saved]
+        return state, tuple(jnp.where(mask, a, b) for mask, a, b in zip(masks, saved, saved_later, strict=True))
 
-    def advance_adaptive(self, call: Callable, pace):
-        """The pace after ``call(pace, newton)``, of one trajectory or of many."""
-        pace = call(pace, self.has_newton)
-        if self.has_newton or not np.isin(pace.last_attempt_status, FAILED_STEP_CODES).any():
-            return pace
+    def advance_adaptive(self, call: Callable, adaptive_state):
+        """Return the adaptive state after ``call(adaptive_state, with_newton)``, of one trajectory or many."""
+        adaptive_state = call(adaptive_state, self.has_newton)
+        if self.has_newton or not np.isin(adaptive_state.last_attempt_status, FAILED_STEP_CODES).any():
+            return adaptive_state
         self.has_newton = True
-        return call(pace, True)
+        return call(adaptive_state, True)
 
 
 class ArrayEngine:
-    """The array engine for one system and method.
+    """Array engine for one system and method.
 
     Attributes
     ----------
     max_saves_per_call : int
-        Saves that one call takes at most.
+        Largest number of saves in one call of :meth:`advance`.
     """
 
     name = "array"
@@ -124,64 +128,65 @@ class ArrayEngine:
         self._lazy_newton = LazyNewton(method)
 
     def initial_run_state(self, x) -> State:
-        """The state of a run about to start at x."""
+        """Return the state of a run that starts at x."""
         return initial_run_state_program(self.system, self.method, x)
 
-    def advance(self, state: State, h, saves: int, every: int, noise=None):
-        """Up to ``saves <= portion`` times ``every`` steps of size h: see :func:`advance`."""
-        given = (
+    def advance(self, state: State, h, saves: int, save_every: int, noise=None):
+        """Take ``save_every`` steps up to ``saves <= max_saves_per_call`` times: see :func:`advance`."""
+        arguments = (
             jnp.asarray(h),
             jnp.asarray(saves),
-            jnp.asarray(every),
+            jnp.asarray(save_every),
             self.max_saves_per_call,
             self.options,
             padded_increments(noise),
         )
         return self._lazy_newton.advance(
-            lambda s, *how: advance(self.system, self.method, s, *given, *how), state, every
+            lambda s, *how: advance(self.system, self.method, s, *arguments, *how), state, save_every
         )
 
     def step(self, state: State, h, noise=None) -> State:
-        """The state after one step, or as it was with the status of a failure."""
+        """Return the state after one step, or the old state with a failure status."""
         return self.advance(state, h, 1, 1, noise)[0]
 
     def step_ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
-        """Where steps of these sizes end that begin at these states, shape (m, n); NaN where one cannot be taken.
+        """Return the ends of single steps of sizes h from states x, shape (m, n); NaN if a step fails.
 
         Each is the first step of a run of its own.
         """
-        found, block = np.empty_like(x), min(STEP_ENDS_PER_CALL, self.max_saves_per_call)
-        for first in range(0, len(x), block):
-            some = np.minimum(np.arange(first, first + block), len(x) - 1)  # of one length, for one program
-            ends = _step_ends_program(
-                self.system, self.method, jnp.asarray(x[some]), jnp.asarray(h[some]), self.options
+        ends, block = np.empty_like(x), min(STEP_ENDS_PER_CALL, self.max_saves_per_call)
+        for start in range(0, len(x), block):
+            # always of the same length, for one program
+            indices = np.minimum(np.arange(start, start + block), len(x) - 1)
+            block_ends = _step_ends_program(
+                self.system, self.method, jnp.asarray(x[indices]), jnp.asarray(h[indices]), self.options
             )
-            found[some] = np.asarray(ends)
-        return found
+            ends[indices] = np.asarray(block_ends)
+        return ends
 
 
 STEP_ENDS_PER_CALL = 64
-"""Steps from states of their own that one call takes."""
+"""Number of single steps in one call of ``ArrayEngine.step_ends``."""
 
 
 @jit_program
-def _step_ends_program(system: System, method: OneStepMethod, x, h, rules: SolverOptions):
-    def end(given):
-        start, size = given
-        after = take_step(system, method, initial_run_state(system, method, start), size, rules)
-        return jnp.where(after.status == StatusCode.COMPLETED, after.x, jnp.nan)
+def _step_ends_program(system: System, method: OneStepMethod, x, h, options: SolverOptions):
+    def end_of_step(inputs):
+        x_start, step_size = inputs
+        new_state = take_step(system, method, initial_run_state(system, method, x_start), step_size, options)
+        return jnp.where(new_state.status == StatusCode.COMPLETED, new_state.x, jnp.nan)
 
-    return jax.lax.map(end, (x, h))
+    return jax.lax.map(end_of_step, (x, h))
 
 
 def padded_increments(noise) -> jax.Array | None:
-    """Increments, shape (..., steps, increments), with as many steps as a power of two: few shapes, few programs.
+    """Return noise increments zero-padded to a power of two of steps: few shapes, few programs.
 
-    Short calls share one program: as many steps as :data:`MAX_SAVED_VALUES_PER_CALL` increments are for cost nothing.
+    Short calls share one program: padding up to :data:`MAX_SAVED_VALUES_PER_CALL` increments costs nothing.
     """
     if noise is None:
         return None
-    *members, steps, increments = noise.shape
-    short = MAX_SAVED_VALUES_PER_CALL // max(1, math.prod(members) * increments)
-    missing = (1 << max(0, max(steps, short) - 1).bit_length()) - steps
-    return jnp.asarray(np.pad(noise, [(0, 0)] * (noise.ndim - 2) + [(0, missing), (0, 0)]))
+    *members, steps, n_increments = noise.shape
+    short_call_steps = MAX_SAVED_VALUES_PER_CALL // max(1, math.prod(members) * n_increments)
+    n_missing = (1 << max(0, max(steps, short_call_steps) - 1).bit_length()) - steps
+    return jnp.asarray(np.pad(noise, [(0, 0)] * (noise.ndim - 2) + [(0, n_missing), (0, 0)]))

@@ -1,4 +1,4 @@
-"""Which engine runs a method on a system, and what takes over where it cannot."""
+"""Choice of the engine that runs a method on a system, and the fallback if it cannot."""
 
 from __future__ import annotations
 
@@ -25,59 +25,67 @@ from .sparse.newton import SparseEngine
 from .stepping import State
 
 ENGINES = ("auto", "array", "compiled", "sparse")
+"""Values of the option ``engine``."""
 
 MAX_COMPILED_DIM = 40
-"""Components up to which unrolled scalar code is a good idea."""
+"""Largest dimension for which the compiled engine, with its unrolled scalar code, is considered."""
 
 MAX_AUTO_COMPILED_OPERATIONS = 30_000
-"""Operations of a step up to which it is compiled in no more time than XLA takes, so that "auto" always takes it. On a
-step of 8,000 operations XLA spends three times as long, on one of 28,000 as long."""
+"""Largest number of operations of a step for which "auto" always compiles it, in no more time than XLA takes.
+
+On a step of 8,000 operations XLA spends three times as long, on one of 28,000 as long.
+"""
 
 SLOW_COMPILE_OPERATIONS = 50_000
-"""Operations from which it is said that compiling takes minutes: the time grows with their square."""
+"""Number of operations above which the user is warned that compiling takes minutes: the time grows quadratically."""
 
 MIN_STEPS_TO_COMPILE = 20_000
-"""Steps from which it is worth compiling for some seconds more."""
+"""Number of planned steps from which a compilation of some seconds pays off."""
 
 MIN_SPARSE_DIM = 200
-"""Components from which a system that knows its sparsity is solved by it."""
+"""Smallest dimension for which "auto" picks the sparse engine for a system with a known sparsity pattern."""
 
 
 SUBSTEP_COUNTS = (1, 2, 4, 8, 16)
-"""Into how many steps a part of a step is divided, one number after another, until it can be taken."""
+"""Numbers of substeps into which a partial step is divided, tried in this order until it succeeds."""
 
 
 Engine: TypeAlias = ArrayEngine | CompiledEngine | SparseEngine
-"""Takes the steps of one method on one system: see :class:`.array.ArrayEngine`."""
+"""An engine takes the steps of one method on one system: see :class:`.array.ArrayEngine`."""
 
 
 class CompiledEngineWarning(UserWarning):
-    """A system that the compiled engine cannot run, so that the array engine does, or that it compiles for minutes."""
+    """Warning that the array engine replaces the compiled engine, or that compiling takes minutes."""
 
 
 class EngineWithFallback:
-    """The engine of a run, an :class:`Engine` itself: chosen when the run begins.
+    """The engine of a run, chosen when the run begins; it has the methods of an :class:`Engine`.
 
-    With "auto", the array engine takes over where the compiled one meets what it cannot unroll, or fails: at the start,
-    or where a step first needs Newton's method. It goes on from the last good state, and says so.
+    With "auto", the array engine takes over if the compiled engine meets a primitive that it cannot unroll, or fails:
+    at the start, or when a step first needs Newton's method. The run resumes from the last good state, with a warning.
 
     Parameters
     ----------
     requested_engine : one of ENGINES
     planned_steps : int
-        How many are to be taken.
+        Number of steps that the run will take.
     noise : function of (first, steps, h), optional
-        The increments of so many steps of size h from a first one on, shape (steps, increments).
+        Returns the increments of ``steps`` steps of size h from step ``first`` on, shape (steps, increments).
     """
 
-    def __init__(self, system: System, method: OneStepMethod, asked: str, steps: int, noise: Callable | None = None):
-        self.system, self.method, self.requested_engine, self.planned_steps, self.noise = (
-            system,
-            method,
-            asked,
-            steps,
-            noise,
-        )
+    def __init__(
+        self,
+        system: System,
+        method: OneStepMethod,
+        requested_engine: str,
+        planned_steps: int,
+        noise: Callable | None = None,
+    ):
+        self.system = system
+        self.method = method
+        self.requested_engine = requested_engine
+        self.planned_steps = planned_steps
+        self.noise = noise
         self._engine: Engine = ArrayEngine(system, method)
         self._is_engine_chosen = False
 
@@ -93,40 +101,40 @@ class EngineWithFallback:
         self._choose_engine(lambda compiled: compiled.n_operations)
         return self._call_with_fallback(lambda engine, _: engine.initial_run_state(x))
 
-    def advance(self, state: State, h, saves: int, every: int) -> tuple[State, tuple]:
-        noise = self._noise_increments(state, int(saves) * int(every), h)
-        return self._call_with_fallback(lambda engine, state: engine.advance(state, h, saves, every, noise), state)
+    def advance(self, state: State, h, saves: int, save_every: int) -> tuple[State, tuple]:
+        noise = self._noise_increments(state, int(saves) * int(save_every), h)
+        return self._call_with_fallback(lambda engine, state: engine.advance(state, h, saves, save_every, noise), state)
 
     def step(self, state: State, h) -> State:
         noise = self._noise_increments(state, 1, h)
         return self._call_with_fallback(lambda engine, state: engine.step(state, h, noise), state)
 
     def partial_step(self, state: State, h: float) -> State:
-        """Return the state after a part of a step that the run has taken whole, of size h.
+        """Return the state after a step of size h that is a part of a step of the run.
 
-        Where the part cannot be taken at once, it is divided. If that does not help either, the status says why.
+        If the partial step fails it is divided into substeps. If they fail too, the status says why.
         """
         for substeps in SUBSTEP_COUNTS:
-            after = self.advance(state, h / substeps, 1, substeps)[0]
-            if int(after.status) == StatusCode.COMPLETED:
+            new_state = self.advance(state, h / substeps, 1, substeps)[0]
+            if int(new_state.status) == StatusCode.COMPLETED:
                 break
-        return after
+        return new_state
 
     def step_ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
-        """Return where parts of steps end, of sizes h, that begin at states x, shape (m, n).
+        """Return the end states, shape (m, n), of partial steps of sizes h from states x.
 
-        Where a part cannot be taken at once, it is divided; NaN if that does not help either.
+        A partial step that fails is divided into substeps; the result is NaN if they fail too.
         """
-        found = np.array(self._engine_step_ends(x, h))
+        ends = np.array(self._engine_step_ends(x, h))
         for substeps in SUBSTEP_COUNTS[1:]:
-            missing = np.isnan(found).any(axis=1) & np.isfinite(x).all(axis=1)
-            if not missing.any():
+            is_missing = np.isnan(ends).any(axis=1) & np.isfinite(x).all(axis=1)
+            if not is_missing.any():
                 break
-            some, size = x[missing], h[missing] / substeps
+            x_sub, substep_size = x[is_missing], h[is_missing] / substeps
             for _ in range(substeps):
-                some = self._engine_step_ends(some, size)
-            found[missing] = some
-        return found
+                x_sub = self._engine_step_ends(x_sub, substep_size)
+            ends[is_missing] = x_sub
+        return ends
 
     def _engine_step_ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
         return self._call_with_fallback(lambda engine, _: engine.step_ends(x, h))
@@ -134,79 +142,77 @@ class EngineWithFallback:
     def _noise_increments(self, state: State, steps: int, h) -> np.ndarray | None:
         return None if self.noise is None else self.noise(int(state.step), steps, h)
 
-    def start_adaptive(self, pacing: StepControl, x, t: float, stop: float, length: float) -> AdaptiveRuns:
-        """The run with a pace, about to start at x at a time; see :func:`.pacing.begun`."""
-        self._choose_engine(lambda compiled: compiled.adaptive_step_loop(pacing)[0].n_operations)
+    def start_adaptive(self, control: StepControl, x, t: float, stop_time: float, span_length: float) -> AdaptiveRuns:
+        """Start an adaptive run at x at time t; see :func:`.pacing.initial_adaptive_state`."""
+        self._choose_engine(lambda compiled: compiled.adaptive_step_loop(control)[0].n_operations)
 
         def start_on_engine(engine: Engine, _) -> AdaptiveRuns:
             if isinstance(engine, CompiledEngine):
-                stepper, whole = engine.adaptive_step_loop(pacing)
+                step_loop, parameters = engine.adaptive_step_loop(control)
                 return CompiledAdaptiveRuns(
-                    stepper, whole, whole, np.asarray(x, dtype=np.float64)[None], t, stop, length
+                    step_loop, parameters, parameters, np.asarray(x, dtype=np.float64)[None], t, stop_time, span_length
                 )
             step = engine.step if isinstance(engine, SparseEngine) else None
-            return start_one(self.system, self.method, pacing, x, t, stop, length, step)
+            return start_one(self.system, self.method, control, x, t, stop_time, span_length, step)
 
         return self._call_with_fallback(start_on_engine)
 
     def fall_back_adaptive(
-        self, error: UnsupportedPrimitive, pacing: StepControl, paces: AdaptiveRuns
+        self, error: UnsupportedPrimitive, control: StepControl, adaptive_runs: AdaptiveRuns
     ) -> ArrayAdaptiveRuns:
-        """What goes on with a run with a pace, where the compiled engine meets what it cannot unroll."""
+        """Continue an adaptive run on the array engine after the compiled engine raised UnsupportedPrimitive."""
         self._fall_back(error)
-        return resume_on_array_engine(self.system, self.method, pacing, paces)
+        return resume_on_array_engine(self.system, self.method, control, adaptive_runs)
 
-    def _choose_engine(self, operations: Callable[[CompiledEngine], int]) -> None:
-        """Choose an engine when the run begins; ``operations`` counts those of a step of the compiled one."""
+    def _choose_engine(self, count_operations: Callable[[CompiledEngine], int]) -> None:
+        """Choose an engine when the run begins; ``count_operations`` counts the operations of a compiled step."""
         if not self._is_engine_chosen:
-            self._engine = self._preferred_engine(operations)
+            self._engine = self._preferred_engine(count_operations)
             self._is_engine_chosen = True
 
-    def _preferred_engine(self, operations: Callable[[CompiledEngine], int]) -> Engine:
-        system, method, auto = self.system, self.method, self.requested_engine == "auto"
+    def _preferred_engine(self, count_operations: Callable[[CompiledEngine], int]) -> Engine:
+        system, method, is_auto = self.system, self.method, self.requested_engine == "auto"
         if self.requested_engine == "sparse" and self.noise is not None:
-            raise InputError("the sparse engine takes no steps with noise: leave out engine")
+            raise InputError("the sparse engine cannot take steps with noise. Leave out engine=")
         if self.requested_engine == "sparse" and method.explicit:
-            raise InputError(
-                f"{method} has no equations to solve, so the sparse engine is not for it: leave out engine"
-            )
+            raise InputError(f"the sparse engine needs an implicit method, got {method}. Leave out engine=")
         if self.requested_engine == "sparse" or (
-            auto and system.dim >= MIN_SPARSE_DIM and not method.explicit and self.noise is None
+            is_auto and system.dim >= MIN_SPARSE_DIM and not method.explicit and self.noise is None
         ):
             if system.sparsity_pattern() is not None:
                 return SparseEngine(system, method)
-            if not auto:
+            if not is_auto:
                 raise InputError(
-                    f"the sparse engine cannot run a {system.kind} that does not know its sparsity: a "
-                    "ComposedSystem of lt.Copies joined by lt.Each does"
+                    f"the sparse engine cannot run a {system.kind} that does not know its sparsity. Build the system "
+                    "as a ComposedSystem of lt.Copies joined by lt.Each"
                 )
-        long = self.planned_steps >= MIN_STEPS_TO_COMPILE or system.has_matrix_functions
-        if self.requested_engine == "compiled" or (auto and is_worth_compiling(system)):
+        repays_compiling = self.planned_steps >= MIN_STEPS_TO_COMPILE or system.has_matrix_functions
+        if self.requested_engine == "compiled" or (is_auto and is_worth_compiling(system)):
             compiled = CompiledEngine(system, method, planned_steps=self.planned_steps)
             try:
-                size = operations(compiled)
-                if not auto and size > SLOW_COMPILE_OPERATIONS:
+                n_operations = count_operations(compiled)
+                if not is_auto and n_operations > SLOW_COMPILE_OPERATIONS:
                     warn(
-                        f"a step of {size:,} operations takes minutes to compile: leave out engine, or take "
-                        "engine='array', to start at once",
+                        f"a step of {n_operations:,} operations takes minutes to compile. Leave out engine=, or "
+                        "take engine='array', to start at once",
                         CompiledEngineWarning,
                     )
-                if size <= MAX_AUTO_COMPILED_OPERATIONS or not auto or long:
+                if n_operations <= MAX_AUTO_COMPILED_OPERATIONS or not is_auto or repays_compiling:
                     return compiled
             except UnsupportedPrimitive as error:
-                if not (auto and error.too_large):  # as little of a surprise as one that is too long to be worth it
+                if not (is_auto and error.too_large):  # no warning: a program that is too large is expected with auto
                     self._fall_back(error)
         return ArrayEngine(system, method)
 
     def _call_with_fallback(self, call: Callable[[Engine, Any], Any], state: State | None = None) -> Any:
-        """What an engine makes of a state; the array engine where the compiled one cannot."""
+        """Return ``call(engine, state)``, on the array engine if the compiled one raises UnsupportedPrimitive."""
         try:
             return call(self._engine, state)
         except UnsupportedPrimitive as error:
             self._fall_back(error)
             if state is not None:
-                like = self._engine.initial_run_state(jnp.asarray(state.x))
-                state = jax.tree_util.tree_map(lambda a, b: jnp.asarray(a, b.dtype), state, like)
+                template = self._engine.initial_run_state(jnp.asarray(state.x))
+                state = jax.tree_util.tree_map(lambda a, b: jnp.asarray(a, b.dtype), state, template)
             return call(self._engine, state)
 
     def _fall_back(self, error: UnsupportedPrimitive) -> None:
@@ -217,10 +223,10 @@ class EngineWithFallback:
 
 
 def is_worth_compiling(system: System) -> bool:
-    """Whether a system is worth trying to compile: unrolled code, on the CPU, for few components."""
+    """Return whether compiling a system may pay off: it can be unrolled, has few components, and runs on the CPU."""
     return system.can_unroll and system.dim <= MAX_COMPILED_DIM and jax.default_backend() == "cpu"
 
 
 def warn_of_fallback(error: UnsupportedPrimitive) -> None:
-    """Say that the array engine takes over."""
+    """Warn that the array engine runs the system instead of the compiled engine."""
     warn(f"{error}; the array engine runs it instead", CompiledEngineWarning)

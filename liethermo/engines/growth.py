@@ -1,4 +1,4 @@
-"""How fast the motion takes apart what lies near: what adaptive steps have to resolve."""
+"""Growth rates of the linearised flow, which limit adaptive steps."""
 
 from __future__ import annotations
 
@@ -11,70 +11,76 @@ import numpy as np
 from ..systems import System
 from ..tracing.programs import jit_program
 
-DENSE_JACOBIAN_DIM, KRYLOV_DIM = 8, 24
-"""Components up to which the whole Jacobian matrix of the motion is looked at at every step, and vectors from which its
-growing modes are found otherwise."""
+DENSE_JACOBIAN_DIM = 8
+"""Largest dimension for which the whole Jacobian matrix of the vector field is computed after every step."""
 
+KRYLOV_DIM = 24
+"""Dimension of the Krylov space from which the growth rate of a larger system is computed."""
 
 POWER_ITERATIONS = 4
-"""Times that the Jacobian matrix is applied to see how large it is."""
+"""Number of power iterations that estimate the spectral radius of the Jacobian of a larger system."""
 
 
 def jacobian_probe(system: System, x) -> jax.Array:
-    """How the motion stretches what lies near a state.
+    """Return a probe of the Jacobian of the vector field at x, from which growth rates are estimated.
 
-    The Jacobian matrix, shape (n, n), of a few components; otherwise its first :data:`POWER_ITERATIONS` powers times a vector,
-    each over the size of the one before, shape (POWERS, n).
+    For at most :data:`DENSE_JACOBIAN_DIM` components the probe is the Jacobian matrix, shape (n, n). Otherwise it has
+    shape (:data:`POWER_ITERATIONS`, n): the images of normalised iterates of the power method.
     """
-    stretched, n = _jacobian_product(system, x), x.shape[0]
+    jacobian_product, n = _jacobian_product(system, x), x.shape[0]
     if n <= DENSE_JACOBIAN_DIM:
-        return jax.vmap(stretched)(jnp.eye(n)).T
+        return jax.vmap(jacobian_product)(jnp.eye(n)).T
 
-    def power(v, _):
-        v = stretched(v)
+    def power_step(v, _):
+        v = jacobian_product(v)
         return _unit_vector(v), v
 
-    return jax.lax.scan(power, _unit_vector(_generic_vector(n)), length=POWER_ITERATIONS)[1]
+    return jax.lax.scan(power_step, _unit_vector(_generic_vector(n)), length=POWER_ITERATIONS)[1]
 
 
 @jit_program
 def arnoldi_hessenberg(system, method, x):
-    """The matrix of the Jacobian in a Krylov space, shape (m, m): its eigenvalues lie near the outer ones [Arnoldi]."""
+    """Return the Hessenberg matrix of Arnoldi's method, shape (m, m), for the Jacobian of the vector field at x.
+
+    Its eigenvalues approximate the extremal eigenvalues of the Jacobian.
+    """
     system, x = system.solved_part(x)
-    stretched, n = _jacobian_product(system, x), x.shape[0]
+    jacobian_product, n = _jacobian_product(system, x), x.shape[0]
     m = min(n, KRYLOV_DIM)
 
     def arnoldi_step(carry, i):
-        frame, matrix = carry
-        v = stretched(frame[i])
-        parts, rest = orthogonalise(frame, v)
-        length = jnp.linalg.norm(rest)
-        closed = length <= 1e-10 * jnp.linalg.norm(v)  # a space that the motion keeps: go on outside of it
-        length, rest = jnp.where(closed, 0.0, length), jnp.where(closed, jnp.roll(_generic_vector(n), i + 1), rest)
-        matrix = matrix.at[:m, i].set(parts[:m]).at[i + 1, i].set(length)
-        return (frame.at[i + 1].set(_unit_vector(orthogonalise(frame, _unit_vector(rest))[1])), matrix), None
+        basis, matrix = carry
+        v = jacobian_product(basis[i])
+        coefficients, remainder = orthogonalise(basis, v)
+        remainder_norm = jnp.linalg.norm(remainder)
+        # in an invariant subspace the remainder vanishes: continue outside of it
+        is_invariant = remainder_norm <= 1e-10 * jnp.linalg.norm(v)
+        remainder_norm = jnp.where(is_invariant, 0.0, remainder_norm)
+        remainder = jnp.where(is_invariant, jnp.roll(_generic_vector(n), i + 1), remainder)
+        matrix = matrix.at[:m, i].set(coefficients[:m]).at[i + 1, i].set(remainder_norm)
+        return (basis.at[i + 1].set(_unit_vector(orthogonalise(basis, _unit_vector(remainder))[1])), matrix), None
 
-    def orthogonalise(frame, v):
-        parts = frame @ v
-        v = v - parts @ frame
-        again = frame @ v  # the second pass removes what rounding left of the first
-        return parts + again, v - again @ frame
+    def orthogonalise(basis, v):
+        coefficients = basis @ v
+        v = v - coefficients @ basis
+        correction = basis @ v  # the second pass removes the rounding errors of the first
+        return coefficients + correction, v - correction @ basis
 
-    frame = jnp.zeros((m + 1, n)).at[0].set(_unit_vector(_generic_vector(n)))
-    (_, matrix), _ = jax.lax.scan(arnoldi_step, (frame, jnp.zeros((m + 1, m))), jnp.arange(m))
+    initial_basis = jnp.zeros((m + 1, n)).at[0].set(_unit_vector(_generic_vector(n)))
+    (_, matrix), _ = jax.lax.scan(arnoldi_step, (initial_basis, jnp.zeros((m + 1, m))), jnp.arange(m))
     return matrix[:m]
 
 
 def _jacobian_product(system: System, x) -> Callable:
-    """The derivative of the motion at x, on tangent vectors."""
+    """Return the product of the Jacobian of the vector field at x with tangent vectors, as a function."""
     return lambda v: system.project_tangent(x, jax.jvp(system.vector_field, (x,), (system.project_tangent(x, v),))[1])
 
 
 def _generic_vector(n: int) -> np.ndarray:
-    """A vector that has a part in every direction of interest."""
+    """Return a fixed random vector, which has a component along every eigenvector."""
     return np.random.default_rng(0).standard_normal(n)
 
 
 def _unit_vector(v):
-    length = jnp.linalg.norm(v)
-    return v / jnp.where(length > 0.0, length, 1.0)
+    norm = jnp.linalg.norm(v)
+    return v / jnp.where(norm > 0.0, norm, 1.0)

@@ -1,4 +1,4 @@
-"""Linear equations of any size by products with their matrix alone, in ``lax`` loops: for Newton's method."""
+"""Matrix-free solution of linear equations in ``lax`` loops, for Newton's method on large systems."""
 
 from __future__ import annotations
 
@@ -10,36 +10,37 @@ import jax.numpy as jnp
 from .rules import SolverOptions
 
 
-def solve_krylov(product: Callable, b: jax.Array, rules: SolverOptions) -> jax.Array:
-    """An x with ``|b - product(x)| <= rules.forcing |b|``, of the shape of b, or the best found.
+def solve_krylov(matvec: Callable, b: jax.Array, options: SolverOptions) -> jax.Array:
+    """Solve ``matvec(x) = b`` to the relative residual ``options.krylov_forcing_term``; return x, of the shape of b.
 
-    Conjugate residuals, each direction made orthogonal to the last few [Eisenstat, Elman & Schultz 1983, "Orthomin"]:
-    as long as they are all, the x of least residual in the Krylov space; the memory is ``2 rules.kept`` vectors. It
-    converges where the symmetric part of the matrix is definite, as that of a step is unless what grows outgrows it.
-    Eigenvalues that lie together are found together, so what a few components of a large state do costs a few products.
+    Conjugate residuals, each direction made orthogonal to the last few [Eisenstat, Elman & Schultz 1983, "Orthomin"].
+    With all directions kept, x would have the least residual in the Krylov space; the memory is ``2
+    options.krylov_basis_size`` vectors. It converges if the symmetric part of the matrix is definite, which holds for a
+    step unless growth is faster than 1/h. After ``options.max_krylov_products`` products the last iterate is returned.
+    Clustered eigenvalues are resolved together, so a few stiff components of a large state cost a few products.
     """
 
-    def goes_on(carry):
-        _, r, _, _, number = carry
-        return (number < rules.max_krylov_products) & (jnp.linalg.norm(r) > rules.krylov_forcing_term * size) | (
-            number == 0
-        )
+    def is_unfinished(carry):
+        _, r, _, _, n_products = carry
+        return (n_products < options.max_krylov_products) & (
+            jnp.linalg.norm(r) > options.krylov_forcing_term * b_norm
+        ) | (n_products == 0)
 
     def orthomin_step(carry):
-        x, r, directions, images, number = carry
-        p, q = r, product(r)
-        shares = jnp.tensordot(images, q, q.ndim)
-        p, q = p - jnp.tensordot(shares, directions, 1), q - jnp.tensordot(shares, images, 1)
-        length = jnp.linalg.norm(q)
-        over = jnp.where(length > 0.0, 1.0 / jnp.where(length > 0.0, length, 1.0), 0.0)
-        p, q = over * p, over * q
-        along = jnp.vdot(q, r)
-        place = number % rules.krylov_basis_size
-        directions, images = directions.at[place].set(p), images.at[place].set(q)
-        return x + along * p, r - along * q, directions, images, number + 1
+        x, r, directions, images, n_products = carry
+        p, q = r, matvec(r)
+        coefficients = jnp.tensordot(images, q, q.ndim)
+        p, q = p - jnp.tensordot(coefficients, directions, 1), q - jnp.tensordot(coefficients, images, 1)
+        q_norm = jnp.linalg.norm(q)
+        inverse_norm = jnp.where(q_norm > 0.0, 1.0 / jnp.where(q_norm > 0.0, q_norm, 1.0), 0.0)
+        p, q = inverse_norm * p, inverse_norm * q
+        residual_component = jnp.vdot(q, r)
+        slot = n_products % options.krylov_basis_size
+        directions, images = directions.at[slot].set(p), images.at[slot].set(q)
+        return x + residual_component * p, r - residual_component * q, directions, images, n_products + 1
 
-    size = jnp.linalg.norm(b)
-    none = jnp.zeros((rules.krylov_basis_size, *b.shape))
+    b_norm = jnp.linalg.norm(b)
+    empty_basis = jnp.zeros((options.krylov_basis_size, *b.shape))
     return jax.lax.while_loop(
-        goes_on, orthomin_step, (jnp.zeros_like(b), b, none, none, jnp.zeros((), dtype=jnp.int64))
+        is_unfinished, orthomin_step, (jnp.zeros_like(b), b, empty_basis, empty_basis, jnp.zeros((), dtype=jnp.int64))
     )[0]

@@ -1,4 +1,4 @@
-"""Trajectories with paces of their own, one or many, and what takes them on from pause to pause, for every engine."""
+"""Adaptive runs of one or many trajectories, and the host's handling of their pauses, for every engine."""
 
 from __future__ import annotations
 
@@ -22,10 +22,6 @@ from .compiled.paced import CompiledAdaptiveRuns
 from .growth import DENSE_JACOBIAN_DIM
 from .pacing import (
     ATTEMPT_FIELDS,
-    PAUSED_AT_EVENT,
-    PAUSED_AT_STOP,
-    PAUSED_FOR_GROWTH_RATE,
-    REACHED_END,
     AdaptiveState,
     StepControl,
     advance_adaptive,
@@ -41,245 +37,284 @@ from .stepping import State
 
 
 class ArrayAdaptiveRuns:
-    """Trajectories with paces of their own in the array engine; they are read and written with trajectories first.
+    """Adaptive runs of one or many trajectories in the array engine.
 
     Parameters
     ----------
     method : OneStepMethod
-    adaptive_state : Pace
-        Of one trajectory, or of several in front.
-    advance : function from a pace, a count of attempts, and whether there is Newton's method, to a pace
-        See :func:`.pacing.follow`.
-    alone : bool
-        Whether there is one.
+    adaptive_state : AdaptiveState
+        State of one trajectory, or of several along a leading axis.
+    advance : function of (adaptive_state, max_attempts, with_newton) to an AdaptiveState
+        See :func:`.pacing.advance_adaptive`.
+    is_single : bool
+        Whether there is only one trajectory, without the leading axis.
     """
 
-    def __init__(self, method: OneStepMethod, pace: AdaptiveState, follow: Callable, alone: bool = False):
-        self.adaptive_state, self._advance, self._is_single = pace, follow, alone
+    def __init__(
+        self, method: OneStepMethod, adaptive_state: AdaptiveState, advance: Callable, is_single: bool = False
+    ):
+        self.adaptive_state, self._advance, self._is_single = adaptive_state, advance, is_single
         self.lazy_newton = LazyNewton(method)
 
-    def read(self, name: str, chosen: Any = slice(None)) -> np.ndarray:
-        """A field of :class:`.stepping.State` or of :class:`.pacing.Pace` of some of them, trajectories first."""
-        value = np.asarray(getattr(self.adaptive_state.state if name in State._fields else self.adaptive_state, name))
-        return (value[None] if self._is_single else value)[chosen]
+    def read(self, field_name: str, indices: Any = slice(None)) -> np.ndarray:
+        """Return a field of ``State`` or ``AdaptiveState`` of the chosen trajectories, trajectories first."""
+        value = np.asarray(
+            getattr(self.adaptive_state.state if field_name in State._fields else self.adaptive_state, field_name)
+        )
+        return (value[None] if self._is_single else value)[indices]
 
-    def write(self, name: str, chosen: np.ndarray | slice, values) -> None:
-        whole = self.read(name).copy()
-        whole[chosen] = values
-        changed = {name: jnp.asarray(whole[0] if self._is_single else whole)}
-        of_state = name in State._fields
+    def write(self, field_name: str, indices: np.ndarray | slice, values) -> None:
+        values_of_all = self.read(field_name).copy()
+        values_of_all[indices] = values
+        changes = {field_name: jnp.asarray(values_of_all[0] if self._is_single else values_of_all)}
+        is_state_field = field_name in State._fields
         self.adaptive_state = self.adaptive_state._replace(
-            **{"state": self.adaptive_state.state._replace(**changed)} if of_state else changed
+            **{"state": self.adaptive_state.state._replace(**changes)} if is_state_field else changes
         )
 
-    def advance(self, most: int) -> None:
-        """So many attempts of each, or as many as it takes until it pauses."""
+    def advance(self, max_attempts: int) -> None:
+        """Make up to ``max_attempts`` attempts of each trajectory, fewer if it pauses."""
         self.adaptive_state = self.lazy_newton.advance_adaptive(
-            lambda pace, newton: self._advance(pace, most, newton), self.adaptive_state
+            lambda adaptive_state, newton: self._advance(adaptive_state, max_attempts, newton), self.adaptive_state
         )
 
     def state(self) -> State:
-        """That of the only trajectory as it stands."""
+        """Return the state of the only trajectory."""
         return State(*(self.read(name)[0] for name in State._fields))
 
-    def attempt_records(self, most: int) -> dict[str, np.ndarray]:
-        """Make so many attempts of the only trajectory, or fewer.
-
-        Attempts first, what :data:`.pacing.TOLD` names of each.
-        """
-        del most  # one, which nothing else follows
+    def attempt_records(self, max_attempts: int) -> dict[str, np.ndarray]:
+        """Make one attempt of the only trajectory and return its record, the fields ATTEMPT_FIELDS."""
+        del max_attempts  # a single attempt: this engine does not record several at once
         self.advance(1)
         return {name: self.read(name) for name in ATTEMPT_FIELDS}
 
 
 AdaptiveRuns: TypeAlias = ArrayAdaptiveRuns | CompiledAdaptiveRuns
-"""Trajectories that are followed together, each as it would be alone; or one, whose attempts can be looked at."""
+"""Adaptive runs that advance together, each as it would alone; the attempts of a single one can be recorded."""
 
 
 def start_one(
-    system: System, method: OneStepMethod, pacing: StepControl, x, t, stop, length, step: Callable | None = None
+    system: System,
+    method: OneStepMethod,
+    control: StepControl,
+    x,
+    t,
+    stop_time,
+    span_length,
+    step: Callable | None = None,
 ) -> ArrayAdaptiveRuns:
-    """One trajectory, by programs of its own; ``step`` takes a step of an engine whose steps are no program."""
-    pace = initial_adaptive_state_program(
-        system, method, pacing, jnp.asarray(x), *map(jnp.asarray, map(float, (t, stop, length)))
+    """Start an adaptive run of one trajectory; ``step`` takes the steps of an engine that runs on the host."""
+    adaptive_state = initial_adaptive_state_program(
+        system, method, control, jnp.asarray(x), *map(jnp.asarray, map(float, (t, stop_time, span_length)))
     )
 
-    def advance_one(pace: AdaptiveState, most: int, newton: bool) -> AdaptiveState:
+    def advance_one(adaptive_state: AdaptiveState, max_attempts: int, newton: bool) -> AdaptiveState:
         if step is not None:
-            return advance_adaptive_with(step, system, method, pacing, pace, most)
-        return advance_adaptive(system, method, pacing, pace, jnp.asarray(most), DEFAULT_OPTIONS, newton)
+            return advance_adaptive_with(step, system, method, control, adaptive_state, max_attempts)
+        return advance_adaptive(
+            system, method, control, adaptive_state, jnp.asarray(max_attempts), DEFAULT_OPTIONS, newton
+        )
 
-    found = ArrayAdaptiveRuns(method, pace, advance_one, True)
-    found.lazy_newton.has_newton |= step is not None  # which has its own
-    return found
+    run = ArrayAdaptiveRuns(method, adaptive_state, advance_one, True)
+    run.lazy_newton.has_newton |= step is not None  # a host engine has its own Newton's method
+    return run
 
 
 def resume_on_array_engine(
-    system: System, method: OneStepMethod, pacing: StepControl, others: AdaptiveRuns
+    system: System, method: OneStepMethod, control: StepControl, previous_run: AdaptiveRuns
 ) -> ArrayAdaptiveRuns:
-    """The only trajectory of others from where another engine has come to."""
-    found = start_one(system, method, pacing, *(others.read(name)[0] for name in ("x", "t", "stop_time", "stop_time")))
+    """Return an array run that resumes the only trajectory of ``previous_run`` from its current state."""
+    run = start_one(
+        system, method, control, *(previous_run.read(name)[0] for name in ("x", "t", "stop_time", "stop_time"))
+    )
     for name in (*State._fields, *AdaptiveState._fields[1:]):
-        found.write(name, slice(None), others.read(name).reshape(found.read(name).shape))
-    return found
+        run.write(name, slice(None), previous_run.read(name).reshape(run.read(name).shape))
+    return run
 
 
 def start_batch(
-    form: ProgramStructure, parameters, axes, method: OneStepMethod, pacing: StepControl, x, t, stop, length
+    structure: ProgramStructure,
+    parameters,
+    axes,
+    method: OneStepMethod,
+    control: StepControl,
+    x,
+    t,
+    stop_time,
+    span_length,
 ) -> ArrayAdaptiveRuns:
-    """All trajectories of a batch in one program."""
-    given = form, parameters, axes, method, pacing
-    pace = _start_batch_program(*given, jnp.asarray(x), *map(jnp.asarray, map(float, (t, stop, length))))
+    """Start the adaptive runs of all trajectories of a batch, in one program."""
+    static_inputs = structure, parameters, axes, method, control
+    adaptive_state = _start_batch_program(
+        *static_inputs, jnp.asarray(x), *map(jnp.asarray, map(float, (t, stop_time, span_length)))
+    )
     return ArrayAdaptiveRuns(
-        method, pace, lambda pace, most, newton: _advance_batch_program(*given, pace, jnp.asarray(most), newton)
+        method,
+        adaptive_state,
+        lambda pace, max_attempts, newton: _advance_batch_program(
+            *static_inputs, pace, jnp.asarray(max_attempts), newton
+        ),
     )
 
 
 @jit_program
-def _start_batch_program(form, parameters, axes, method, pacing, x, t, stop, length):
-    def one(p, x):
-        return initial_adaptive_state(form.rebuild(p), method, pacing, x, t, stop, length)
+def _start_batch_program(structure, parameters, axes, method, control, x, t, stop_time, span_length):
+    def start_member(p, x):
+        return initial_adaptive_state(structure.rebuild(p), method, control, x, t, stop_time, span_length)
 
-    return jax.vmap(one, in_axes=(axes, 0))(parameters, x)
+    return jax.vmap(start_member, in_axes=(axes, 0))(parameters, x)
 
 
 @jit_program
-def _advance_batch_program(form, parameters, axes, method, pacing, paces, most, newton: bool):
-    def one(p, own):
-        return advance_adaptive(form.rebuild(p), method, pacing, own, most, DEFAULT_OPTIONS, newton)
+def _advance_batch_program(structure, parameters, axes, method, control, adaptive_states, max_attempts, newton: bool):
+    def advance_member(p, adaptive_state):
+        return advance_adaptive(
+            structure.rebuild(p), method, control, adaptive_state, max_attempts, DEFAULT_OPTIONS, newton
+        )
 
-    return jax.vmap(one, in_axes=(axes, 0))(parameters, paces)
+    return jax.vmap(advance_member, in_axes=(axes, 0))(parameters, adaptive_states)
 
 
 EVENT_ZERO_ULPS = 2.0**10
-"""Roundings that a function may be off zero at an event."""
+"""Largest event value, in roundings of the event function, that counts as zero."""
 
 
 def _event_rounding(model: tuple[System, Any], x) -> jax.Array:
-    """The size at which what is watched is rounded at a state, which is rounded itself."""
-    system, watched = model
+    """Return the rounding error scale of the event function at x, including the rounding of x itself."""
+    system, event_function = model
     return propagated_rounding_scale(
-        lambda y: watched(system, y), x, jnp.maximum(jnp.abs(x), system.component_scales(x))
+        lambda y: event_function(system, y), x, jnp.maximum(jnp.abs(x), system.component_scales(x))
     )
 
 
-# -- from pause to pause ----------------------------------------------------------------------------------------------
+# -- pauses -----------------------------------------------------------------------------------------------------------
 
 
 class PauseHandler:
-    """Takes trajectories on from their pauses.
+    """Host-side handling of the pauses of adaptive runs.
 
     Parameters
     ----------
-    adaptive_runs : Paces
-    control : Pacing
+    adaptive_runs : AdaptiveRuns
+    control : StepControl
     method : OneStepMethod
     stop_times : array
         Times at which steps have to end, increasing; the last is the end of the span.
-    system_of : function from a place to the system of that trajectory
+    system_of : function from the index of a trajectory to its system
 
     Attributes
     ----------
     sign_jumps : list of float
-        When what is watched has changed its sign without being zero.
+        Times at which the event function changed its sign without being zero.
     """
 
     def __init__(
-        self, paces: AdaptiveRuns, pacing: StepControl, method: OneStepMethod, stops: np.ndarray, member: Callable
+        self,
+        adaptive_runs: AdaptiveRuns,
+        control: StepControl,
+        method: OneStepMethod,
+        stop_times: np.ndarray,
+        system_of: Callable,
     ):
-        self.adaptive_runs, self.control, self.method, self.stop_times, self.system_of = (
-            paces,
-            pacing,
-            method,
-            stops,
-            member,
-        )
+        self.adaptive_runs = adaptive_runs
+        self.control = control
+        self.method = method
+        self.stop_times = stop_times
+        self.system_of = system_of
         self.sign_jumps: list[float] = []
 
-    def paused_indices(self, why: int) -> np.ndarray:
-        """The places of those that pause for a reason."""
-        return np.flatnonzero(self.adaptive_runs.read("status") == why)
+    def paused_indices(self, reason: int) -> np.ndarray:
+        """Return the indices of the trajectories that pause for ``reason``."""
+        return np.flatnonzero(self.adaptive_runs.read("status") == reason)
 
     def confirm_events(self) -> None:
-        """Those where what is watched changes its sign: an event is where it is zero, to rounding.
+        """Decide for each trajectory paused at a sign change whether it is an event: a zero, to rounding.
 
-        Others go on past the jump, or the pole, as if it were a stop. Where it is not known what the function is
-        between the two signs, since it is not a number, neither is whether the event happens: the run ends.
-        What is watched for a fall alone may jump: it has fallen.
+        A trajectory at a jump or a pole resumes after it, as after a stop. If the function is NaN between the two
+        signs, it is unknown whether the event happens, and the run ends. If only falls are events, a jump is an event
+        too.
         """
-        paces, there = self.adaptive_runs, self.paused_indices(PAUSED_AT_EVENT)
-        if not there.size:
+        runs, indices = self.adaptive_runs, self.paused_indices(StatusCode.PAUSED_AT_EVENT)
+        if not indices.size:
             return
-        value, before = (
-            paces.read("root_bracket", there)[:, searching.LAST_VALUE_INDEX],
-            paces.read("event_value", there),
+        value = runs.read("root_bracket", indices)[:, searching.LAST_VALUE_INDEX]
+        value_before = runs.read("event_value", indices)
+        is_zero = (
+            np.isfinite(value) if self.control.falling_only else self._is_zero_to_rounding(indices, value, value_before)
         )
-        zero = np.isfinite(value) if self.control.falling_only else self._is_zero_to_rounding(there, value, before)
-        paces.write("status", there[zero], StatusCode.EVENT)
-        unknown = ~zero & ~np.isfinite(before)
-        paces.write("status", there[unknown], StatusCode.NON_FINITE)
-        past = ~zero & ~unknown
-        there, t = there[past], paces.read("t", there[past])
-        if there.size:
+        runs.write("status", indices[is_zero], StatusCode.EVENT)
+        is_unknown = ~is_zero & ~np.isfinite(value_before)
+        runs.write("status", indices[is_unknown], StatusCode.NON_FINITE)
+        is_jump = ~is_zero & ~is_unknown
+        indices, t = indices[is_jump], runs.read("t", indices[is_jump])
+        if indices.size:
             self.sign_jumps += t.tolist()
-            paces.write("event_value", there, -before[past])
-            paces.write("last_stop_time", there, t)
-            paces.write("steps_at_last_stop", there, paces.read("step", there))
-            paces.write(
-                "status", there, np.where(t >= paces.read("stop_time", there), PAUSED_AT_STOP, StatusCode.COMPLETED)
+            runs.write("event_value", indices, -value_before[is_jump])
+            runs.write("last_stop_time", indices, t)
+            runs.write("steps_at_last_stop", indices, runs.read("step", indices))
+            runs.write(
+                "status",
+                indices,
+                np.where(t >= runs.read("stop_time", indices), StatusCode.PAUSED_AT_STOP, StatusCode.COMPLETED),
             )
 
-    def _is_zero_to_rounding(self, there: np.ndarray, value: np.ndarray, before: np.ndarray) -> np.ndarray:
-        """Whether what is watched is zero, to rounding, where its value is this and was that when the step began.
+    def _is_zero_to_rounding(self, indices: np.ndarray, value: np.ndarray, value_before: np.ndarray) -> np.ndarray:
+        """Return whether event values are zero, to rounding, given the values at the start of the steps.
 
-        It is beside a value that much larger. Otherwise its rounding is looked at, but not beside a pole, where it is
-        larger than it was and rounded by all that it is.
+        A value is zero if it is negligible relative to the value before. Otherwise it is compared with the rounding of
+        the function, except near a pole, where the value has grown and its rounding is as large as the value.
         """
-        size, before = np.abs(value), np.abs(before)
-        zero = (size == 0.0) | ((size <= EVENT_ZERO_ULPS * EPS * before) & np.isfinite(before))
-        for places in self._group_by_system(there[~zero & np.isfinite(size) & (size <= EVENT_ZERO_ULPS * before)]):
-            own, model = np.isin(there, places), (self.system_of(int(places[0])), self.control.event_function)
-            rounded = evaluate_at_points(_event_rounding, model, self.adaptive_runs.read("x", places))
-            zero[own] = size[own] <= EVENT_ZERO_ULPS * EPS * np.where(np.isnan(rounded), np.inf, rounded)
-        return zero
+        magnitude, value_before = np.abs(value), np.abs(value_before)
+        is_zero = (magnitude == 0.0) | ((magnitude <= EVENT_ZERO_ULPS * EPS * value_before) & np.isfinite(value_before))
+        for group in self._group_by_system(
+            indices[~is_zero & np.isfinite(magnitude) & (magnitude <= EVENT_ZERO_ULPS * value_before)]
+        ):
+            in_group, model = np.isin(indices, group), (self.system_of(int(group[0])), self.control.event_function)
+            rounding_scales = evaluate_at_points(_event_rounding, model, self.adaptive_runs.read("x", group))
+            is_zero[in_group] = magnitude[in_group] <= EVENT_ZERO_ULPS * EPS * np.where(
+                np.isnan(rounding_scales), np.inf, rounding_scales
+            )
+        return is_zero
 
-    def _group_by_system(self, places: np.ndarray) -> list[np.ndarray]:
-        """The places of trajectories of the same system, together."""
-        found: dict[int, list[int]] = {}
-        kept = [self.system_of(int(i)) for i in places]  # held, so that no identity is used twice
-        for i, system in zip(places, kept, strict=True):
-            found.setdefault(id(system), []).append(int(i))
-        return [np.array(group) for group in found.values()]
+    def _group_by_system(self, indices: np.ndarray) -> list[np.ndarray]:
+        """Return the indices of trajectories, one array for each system."""
+        groups: dict[int, list[int]] = {}
+        systems = [self.system_of(int(i)) for i in indices]  # kept alive, so that no id is used twice
+        for i, system in zip(indices, systems, strict=True):
+            groups.setdefault(id(system), []).append(int(i))
+        return [np.array(group) for group in groups.values()]
 
     def resume_paused(self) -> None:
-        """Those at a stop are done or go on to the next, and what grows near a state is looked at."""
-        paces, status = self.adaptive_runs, self.adaptive_runs.read("status")
-        there = np.flatnonzero(status == PAUSED_AT_STOP)
-        if there.size:
-            t = paces.read("t", there)
-            done = t >= self.stop_times[-1]
-            paces.write("status", there[done], REACHED_END)
-            there, t = there[~done], t[~done]
-        if there.size:
-            paces.write("last_stop_time", there, t)
-            paces.write("steps_at_last_stop", there, paces.read("step", there))
-            paces.write("stop_time", there, self.stop_times[np.searchsorted(self.stop_times, t, side="right")])
-        waiting = np.concatenate([there, np.flatnonzero(status == PAUSED_FOR_GROWTH_RATE)])
+        """Resume the trajectories at a stop, finish those at their end, and compute missing growth rates."""
+        runs, status = self.adaptive_runs, self.adaptive_runs.read("status")
+        at_stop = np.flatnonzero(status == StatusCode.PAUSED_AT_STOP)
+        if at_stop.size:
+            t = runs.read("t", at_stop)
+            is_done = t >= self.stop_times[-1]
+            runs.write("status", at_stop[is_done], StatusCode.REACHED_END)
+            at_stop, t = at_stop[~is_done], t[~is_done]
+        if at_stop.size:
+            runs.write("last_stop_time", at_stop, t)
+            runs.write("steps_at_last_stop", at_stop, runs.read("step", at_stop))
+            runs.write("stop_time", at_stop, self.stop_times[np.searchsorted(self.stop_times, t, side="right")])
+        waiting = np.concatenate([at_stop, np.flatnonzero(status == StatusCode.PAUSED_FOR_GROWTH_RATE)])
         if not waiting.size:
             return
-        unknown = waiting[np.isnan(paces.read("growth_rate", waiting))]
-        if unknown.size:
-            self._update_growth_rates(unknown)
-        spent = paces.read("n_attempts", waiting) >= float(self.control.max_attempts)
-        paces.write("status", waiting, np.where(spent, StatusCode.STEP_LIMIT, StatusCode.COMPLETED))
+        without_rate = waiting[np.isnan(runs.read("growth_rate", waiting))]
+        if without_rate.size:
+            self._update_growth_rates(without_rate)
+        is_exhausted = runs.read("n_attempts", waiting) >= float(self.control.max_attempts)
+        runs.write("status", waiting, np.where(is_exhausted, StatusCode.STEP_LIMIT, StatusCode.COMPLETED))
 
-    def _update_growth_rates(self, chosen: np.ndarray) -> None:
-        seen, paces = self.adaptive_runs.read("jacobian_probe", chosen), self.adaptive_runs
-        if seen.shape[2] <= DENSE_JACOBIAN_DIM:
-            rates = max_growth_rates(seen)
+    def _update_growth_rates(self, indices: np.ndarray) -> None:
+        probes, runs = self.adaptive_runs.read("jacobian_probe", indices), self.adaptive_runs
+        if probes.shape[2] <= DENSE_JACOBIAN_DIM:
+            rates = max_growth_rates(probes)
         else:
-            x = paces.read("x", chosen)
-            rates = np.array([growth_rate_at(self.system_of(int(i)), self.method, x[j]) for j, i in enumerate(chosen)])
-        longest = np.divide(max_growth_per_step(self.method), rates, out=np.full(len(rates), np.inf), where=rates > 0.0)
-        paces.write("growth_rate", chosen, rates)
-        paces.write("next_step_size", chosen, np.minimum(paces.read("next_step_size", chosen), longest))
+            x = runs.read("x", indices)
+            rates = np.array([growth_rate_at(self.system_of(int(i)), self.method, x[j]) for j, i in enumerate(indices)])
+        max_steps = np.divide(
+            max_growth_per_step(self.method), rates, out=np.full(len(rates), np.inf), where=rates > 0.0
+        )
+        runs.write("growth_rate", indices, rates)
+        runs.write("next_step_size", indices, np.minimum(runs.read("next_step_size", indices), max_steps))

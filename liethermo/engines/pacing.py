@@ -1,10 +1,9 @@
-"""Steps of sizes of their own: one attempt, how it is judged and what comes next, as functions that every engine runs.
+"""Adaptive steps: one attempt, its acceptance and the choice of the next step, as functions that every engine runs.
 
-A run that looks at every step carries a :class:`AdaptiveState`. One attempt takes a step, judges it by its estimated error, and
-chooses the next. Where something is wanted that no engine does by itself, the run pauses: at a time where a state is
-kept, where what grows near the state has to be looked at, and where an event may be. A step in which what is watched
-changes its sign is tried again in shorter and shorter parts, until one ends where it does: at a zero, or at a jump,
-which is none (:meth:`.paced.Guide.verify`).
+An adaptive run carries an :class:`AdaptiveState`. One attempt takes a step, estimates its error, and chooses the size
+of the next step. The run pauses when the host has to act: at a stop time, if the growth rate must be computed, and at a
+possible event. A step in which the event function changes its sign is repeated with shorter sizes, until it ends at
+the sign change: at a zero, which is an event, or at a jump (:meth:`.paced.PauseHandler.confirm_events`).
 """
 
 from __future__ import annotations
@@ -31,59 +30,63 @@ from .rules import DEFAULT_OPTIONS, EPS, SolverOptions
 from .stages import keep_fixed_point_result
 from .stepping import State, initial_run_state, take_step
 
-MAX_FACTOR_IMPLICIT, MAX_FACTOR_EXPLICIT = 3.0, 10.0
-"""Largest factor from one step to the next: more, and the prediction of the stages of an implicit one is worth
-nothing."""
+MAX_FACTOR_IMPLICIT = 3.0
+"""Largest ratio of consecutive step sizes of an implicit method; beyond it the predicted stages are worthless."""
+
+MAX_FACTOR_EXPLICIT = 10.0
+"""Largest ratio of consecutive step sizes of an explicit method."""
 
 MIN_FACTOR = 0.2
+"""Smallest ratio of consecutive step sizes, after a step with a large error."""
+
 FACTOR_AFTER_NONCONVERGENCE = 0.25
-"""Smallest factor after a step of too large an error, and the factor after one that could not be solved."""
+"""Ratio of the next step size to that of a step whose stage equations were not solved."""
 
 ERROR_TARGET_FRACTION = 0.4
-"""The share of the allowed error that the next step aims at."""
+"""Fraction of the allowed error at which the next step aims."""
 
 TRUNCATED_STEP_RATIO = 0.99
-"""The share of the wanted size below which a step has been cut short."""
+"""Ratio to the planned step size below which a step counts as truncated by a stop time."""
 
 DEADBAND = (0.9, 1.3)
-"""Factors for which the step is kept: changes that small are not worth a worse prediction, and would chatter."""
+"""Range of factors for which the step size is kept: small changes spoil the prediction, and chatter."""
 
 MIN_RELATIVE_ERROR = 4.0 * EPS
-"""The least error that is allowed in a step, relative to the size of the state."""
+"""Smallest allowed error of a step, relative to the norm of the state."""
 
 GROWTH_RATE_RTOL = 2e-3
-"""Largest relative error of the rate at which a small deviation grows: what falls from an unstable rest does so in its
-time, to a few thousandths. The error of the state does not show it, as the deviation is no part of the state yet."""
+"""Largest relative error of the rate at which a small deviation grows.
+
+A fall from an unstable equilibrium then takes the right time, to a few thousandths. The error estimate of the state
+does not show this, because the deviation is not yet visible in the state.
+"""
 
 MIN_GROWTH_TO_FREQUENCY = 0.01
-"""Rate of growth of an oscillation, relative to its frequency, from which it counts: the derivative of a motion that
-goes on varies, and gives oscillations that nothing excites small rates of either sign."""
+"""Smallest ratio of the growth rate of an oscillation to its frequency for which it limits the step.
+
+The Jacobian of an ongoing motion varies, which gives oscillations that nothing excites small rates of either sign.
+"""
 
 JACOBIAN_CHANGE_RTOL = 0.05
-"""Change of the derivative of the motion, relative to it, below which what grows is not looked for again."""
-
-PAUSED_AT_STOP, PAUSED_FOR_GROWTH_RATE, PAUSED_AT_EVENT, REACHED_END = 20, 21, 22, 23
-"""Why a run pauses, beside the :class:`StatusCode` of how it ended: it is where steps had to end; what grows near its state
-is to be looked at; it is where what is watched changes its sign; it is at its end."""
-
+"""Relative change of the Jacobian probe below which the growth rate is not computed again."""
 
 ATTEMPT_FIELDS = ("x", "energy", "entropy", "step", "t", "last_step_size")
-"""What is recorded of each attempt of a trajectory that is watched: fields of its state, its time and its step."""
+"""Fields copied to the host after every attempted step of a single trajectory."""
 
 
 class StepControl(Module):
-    """How steps are chosen and what is watched: parameters of a program, as those of a system are.
+    """Parameters of the step-size controller and of the event search: arguments of a program, like those of a system.
 
     Attributes
     ----------
     rtol, atol, first_step, max_step, min_step, max_attempts : array, shape ()
-        Tolerances; the first step to try, 0 where it is found; the longest and the shortest; how many are tried.
+        Tolerances; the first step size, 0 to estimate it; the largest and smallest step size; the number of attempts.
     event_function : pytree
-        The function ``(system, x)`` whose sign is watched, or None.
+        The function ``(system, x)`` whose sign changes are events, or None.
     falling_only : bool
-        Whether it is watched for a fall alone.
+        Whether only changes from positive to negative are events.
     adaptive : bool
-        Otherwise all steps are of the size ``first_step``, but for those that arrive where they have to.
+        If false, all steps have the size ``first_step``, except those that end at a stop time.
     """
 
     rtol: jax.Array | np.ndarray
@@ -96,375 +99,449 @@ class StepControl(Module):
     falling_only: bool = eqx.field(static=True)
     adaptive: bool = eqx.field(static=True)
 
-    def allowed_error(self, size) -> jax.Array:
-        """The error that a state of a size may have."""
-        return self.atol + self.rtol * size
+    def allowed_error(self, scale) -> jax.Array:
+        """Return the error allowed for a state of norm ``scale``."""
+        return self.atol + self.rtol * scale
 
     def event_value(self, system: System, x) -> jax.Array:
         return jnp.zeros(()) if self.event_function is None else self.event_function(system, x)
 
 
 class AdaptiveState(NamedTuple):
-    """A run under way whose steps are looked at; its status is that of its state, or why it pauses."""
+    """State of an adaptive run; ``state.status`` also holds the reason of a pause."""
 
     state: State
     t: jax.Array
-    stop_time: jax.Array  # when a step has to end next
-    last_stop_time: jax.Array  # when one had to last,
-    steps_at_last_stop: jax.Array  # and the steps taken until then
-    next_step_size: jax.Array  # size of the next step, unless it has to end somewhere
-    last_step_size: jax.Array  # size of the last one tried
-    optimal_step_size: (
-        jax.Array
-    )  # the size with which the last one that counts would have had the allowed error; 0 before
+    stop_time: jax.Array  # next time at which a step has to end
+    last_stop_time: jax.Array
+    steps_at_last_stop: jax.Array  # number of steps taken until the last stop time
+    next_step_size: jax.Array  # unless the step has to end at a stop time
+    last_step_size: jax.Array  # size of the last attempted step
+    optimal_step_size: jax.Array  # size with which the last accepted step would have had the allowed error; 0 at first
     n_attempts: jax.Array
     n_rejected: jax.Array
-    last_attempt_status: jax.Array  # status of the last one tried
-    event_value: jax.Array  # of what is watched; infinite, with the last sign that is known, where it is not a number
-    max_relative_rate: jax.Array  # the largest at which the state has changed, relative to its size
-    growth_rate: jax.Array  # rate of what grows fastest, when it was looked at last,
-    jacobian_probe: jax.Array  # and how the motion stretched what lay near
-    root_bracket: jax.Array  # for the event in a step: a searching.Search
+    last_attempt_status: jax.Array
+    event_value: jax.Array  # of the event function; where that is NaN, infinity with its last known sign
+    max_relative_rate: jax.Array  # largest rate of change of the state so far, relative to its norm
+    growth_rate: jax.Array  # largest growth rate when it was last computed; NaN if it must be computed
+    jacobian_probe: jax.Array  # probe of the Jacobian when the growth rate was last computed
+    root_bracket: jax.Array  # bracket of an event in a step: the fields of a searching.RootBracket
 
 
 def initial_adaptive_state(
-    system: System, method: OneStepMethod, pacing: StepControl, x, t, stop, length
+    system: System, method: OneStepMethod, control: StepControl, x, t, stop_time, span_length
 ) -> AdaptiveState:
-    """The pace of a run about to start at x; ``length`` is that of its whole span."""
+    """Return the state of an adaptive run from x at time t to t + ``span_length``."""
     state, zero = initial_run_state(system, method, x), jnp.zeros(())
-    own, at = system.solved_part(x)
-    size = jnp.max(jnp.abs(at))
-    unit = jnp.where(size > 0.0, size, 1.0)
-    speed = jnp.max(jnp.abs(own.vector_field(at))) / unit
-    share = jnp.minimum(pacing.allowed_error(size) / unit, 1.0)
-    # a step whose error is what is allowed, if each derivative of the motion is faster by the same rate; half of it
-    found = 0.5 * share ** (1.0 / method.order) / jnp.where(speed > 0.0, speed, 1.0)
-    found = jnp.where((speed > 0.0) & (size > 0.0), jnp.minimum(length, found), 1e-3 * length)
-    proposed = jnp.minimum(jnp.where(pacing.first_step > 0.0, pacing.first_step, found), pacing.max_step)
-    now = jacobian_probe(own, at) if pacing.adaptive else jnp.zeros((1, 1))
-    pace = AdaptiveState(
+    solved_system, components = system.solved_part(x)
+    norm = jnp.max(jnp.abs(components))
+    scale = jnp.where(norm > 0.0, norm, 1.0)
+    relative_rate = jnp.max(jnp.abs(solved_system.vector_field(components))) / scale
+    relative_tolerance = jnp.minimum(control.allowed_error(norm) / scale, 1.0)
+    # half of the step with the allowed error, if each derivative of the motion is larger by the same rate
+    estimated_step = (
+        0.5 * relative_tolerance ** (1.0 / method.order) / jnp.where(relative_rate > 0.0, relative_rate, 1.0)
+    )
+    estimated_step = jnp.where(
+        (relative_rate > 0.0) & (norm > 0.0), jnp.minimum(span_length, estimated_step), 1e-3 * span_length
+    )
+    first_step = jnp.minimum(jnp.where(control.first_step > 0.0, control.first_step, estimated_step), control.max_step)
+    probe = jacobian_probe(solved_system, components) if control.adaptive else jnp.zeros((1, 1))
+    adaptive_state = AdaptiveState(
         state=state,
         t=zero + t,
-        stop_time=zero + stop,
+        stop_time=zero + stop_time,
         last_stop_time=zero + t,
         steps_at_last_stop=zero,
-        next_step_size=proposed,
+        next_step_size=first_step,
         last_step_size=zero,
         optimal_step_size=zero,
         n_attempts=zero,
         n_rejected=zero,
         last_attempt_status=zero,
-        event_value=pacing.event_value(system, x),
-        max_relative_rate=speed,
+        event_value=control.event_value(system, x),
+        max_relative_rate=relative_rate,
         growth_rate=zero,
-        jacobian_probe=jnp.full_like(now, jnp.nan),
+        jacobian_probe=jnp.full_like(probe, jnp.nan),
         root_bracket=jnp.asarray(searching.EMPTY_BRACKET),
     )
-    return limit_by_growth_rate(method, pace, now) if pacing.adaptive else pace
+    return limit_by_growth_rate(method, adaptive_state, probe) if control.adaptive else adaptive_state
 
 
-def jacobian_probe_shape(system: System, method: OneStepMethod, pacing: StepControl) -> tuple[int, ...]:
-    """The shape of what a pace knows of the motion nearby."""
-    if not pacing.adaptive:
+def jacobian_probe_shape(system: System, method: OneStepMethod, control: StepControl) -> tuple[int, ...]:
+    """Return the shape of the field ``jacobian_probe`` of an adaptive state; (1, 1) for fixed steps."""
+    if not control.adaptive:
         return 1, 1
     x = jax.ShapeDtypeStruct((system.dim,), jnp.float64)
     return jax.eval_shape(lambda x: jacobian_probe(*system.solved_part(x)), x).shape
 
 
-def next_step(pacing: StepControl, pace: AdaptiveState) -> tuple[jax.Array, jax.Array]:
-    """The size of the next step, and the time after it."""
-    h, reached = next_full_step(pacing, pace)
-    if pacing.event_function is None:
-        return h, reached
-    search = searching.RootBracket(*pace.root_bracket)
-    part = search.trial_fraction * search.step_size
-    end_of_part = jnp.minimum(pace.t + part, pace.stop_time)
-    return jnp.where(search.step_size > 0.0, part, h), jnp.where(search.step_size > 0.0, end_of_part, reached)
+def next_step(control: StepControl, adaptive_state: AdaptiveState) -> tuple[jax.Array, jax.Array]:
+    """Return the size of the next step, a full step or a trial step of an event search, and the time after it."""
+    h, time_after = next_full_step(control, adaptive_state)
+    if control.event_function is None:
+        return h, time_after
+    bracket = searching.RootBracket(*adaptive_state.root_bracket)
+    trial_step = bracket.trial_fraction * bracket.step_size
+    trial_time = jnp.minimum(adaptive_state.t + trial_step, adaptive_state.stop_time)
+    return jnp.where(bracket.step_size > 0.0, trial_step, h), jnp.where(bracket.step_size > 0.0, trial_time, time_after)
 
 
-def next_full_step(pacing: StepControl, pace: AdaptiveState) -> tuple[jax.Array, jax.Array]:
-    """The same for one that is not a part of another: none ends just short of where one has to end."""
-    if pacing.adaptive:
-        left = pace.stop_time - pace.t
-        arrives = left <= pace.next_step_size * (1 + 1e-12)
-        h = jnp.where(arrives, left, jnp.where(left < 2.0 * pace.next_step_size, 0.5 * left, pace.next_step_size))
-        reached = jnp.where(arrives, pace.stop_time, pace.t + h)
-        # the step that the clock sees, so that rounding of the times does not add up
-        return jnp.where(arrives | ~(reached > pace.t), h, reached - pace.t), reached
-    # as a timetable has them
-    length, done = pace.stop_time - pace.last_stop_time, pace.state.step - pace.steps_at_last_stop
-    full = jnp.floor(length / pace.next_step_size * (1 + 1e-12))
-    last = pace.stop_time - (pace.last_stop_time + full * pace.next_step_size)
-    short = last > 1e-12 * length
-    arrives = done + 1.0 >= jnp.where(short, full + 1.0, full)
-    return jnp.where(done < full, pace.next_step_size, last), jnp.where(
-        arrives, pace.stop_time, pace.last_stop_time + (done + 1.0) * pace.next_step_size
+def next_full_step(control: StepControl, adaptive_state: AdaptiveState) -> tuple[jax.Array, jax.Array]:
+    """Return the size of the next full step and the time after it; none ends just before a stop time."""
+    if control.adaptive:
+        remaining = adaptive_state.stop_time - adaptive_state.t
+        reaches_stop = remaining <= adaptive_state.next_step_size * (1 + 1e-12)
+        h = jnp.where(
+            reaches_stop,
+            remaining,
+            jnp.where(remaining < 2.0 * adaptive_state.next_step_size, 0.5 * remaining, adaptive_state.next_step_size),
+        )
+        time_after = jnp.where(reaches_stop, adaptive_state.stop_time, adaptive_state.t + h)
+        # the step as the difference of the rounded times, so that their rounding errors do not accumulate
+        return jnp.where(reaches_stop | ~(time_after > adaptive_state.t), h, time_after - adaptive_state.t), time_after
+    # the same steps as runs.timetable
+    interval = adaptive_state.stop_time - adaptive_state.last_stop_time
+    n_done = adaptive_state.state.step - adaptive_state.steps_at_last_stop
+    n_full = jnp.floor(interval / adaptive_state.next_step_size * (1 + 1e-12))
+    remainder = adaptive_state.stop_time - (adaptive_state.last_stop_time + n_full * adaptive_state.next_step_size)
+    has_remainder = remainder > 1e-12 * interval
+    reaches_stop = n_done + 1.0 >= jnp.where(has_remainder, n_full + 1.0, n_full)
+    return jnp.where(n_done < n_full, adaptive_state.next_step_size, remainder), jnp.where(
+        reaches_stop,
+        adaptive_state.stop_time,
+        adaptive_state.last_stop_time + (n_done + 1.0) * adaptive_state.next_step_size,
     )
 
 
 def attempt_step(
     system: System,
     method: OneStepMethod,
-    pacing: StepControl,
-    pace: AdaptiveState,
-    rules: SolverOptions = DEFAULT_OPTIONS,
-    second=None,
+    control: StepControl,
+    adaptive_state: AdaptiveState,
+    options: SolverOptions = DEFAULT_OPTIONS,
+    newton_fallback=None,
 ) -> AdaptiveState:
-    """One attempt; ``second`` as for :func:`.stepping.take_step`."""
-    h, reached = next_step(pacing, pace)
+    """Return the adaptive state after one attempted step; ``newton_fallback`` as for :func:`.stepping.take_step`."""
+    h, time_after = next_step(control, adaptive_state)
     return accept_or_reject(
-        system, method, pacing, pace, h, reached, take_step(system, method, pace.state, h, rules, second)
+        system,
+        method,
+        control,
+        adaptive_state,
+        h,
+        time_after,
+        take_step(system, method, adaptive_state.state, h, options, newton_fallback),
     )
 
 
 def accept_or_reject(
-    system: System, method: OneStepMethod, pacing: StepControl, pace: AdaptiveState, h, reached, new: State
+    system: System,
+    method: OneStepMethod,
+    control: StepControl,
+    adaptive_state: AdaptiveState,
+    h,
+    time_after,
+    new_state: State,
 ) -> AdaptiveState:
-    """The pace after an attempt: the step from it to the state ``new`` counts, or another is to be tried."""
-    old, solved, cause = pace.state, new.status == StatusCode.COMPLETED, 1.0 * new.status
-    good, proposed, code = solved, pace.next_step_size, new.status
-    speed, optimal = pace.max_relative_rate, pace.optimal_step_size
-    if pacing.adaptive:
-        here, there = (system.solved_part(x)[1] for x in (old.x, new.x))
-        size = jnp.maximum(jnp.max(jnp.abs(here)), jnp.max(jnp.abs(there)))
-        gone = jnp.max(jnp.abs(there - here)) / jnp.where(size > 0.0, size, 1.0)
-        speed = jnp.maximum(speed, jnp.where(solved, gone / h, 0.0))
-        part = h * speed  # of the time in which the state, at its fastest, changes by its size
-        allowed = jnp.maximum(
-            pacing.allowed_error(size) * jnp.minimum(part, 1.0), MIN_RELATIVE_ERROR * size + DEFAULT_OPTIONS.tiny
+    """Return the adaptive state after an attempted step to ``new_state``: accept the step, or choose another size."""
+    old_state, is_solved = adaptive_state.state, new_state.status == StatusCode.COMPLETED
+    attempt_status = 1.0 * new_state.status
+    is_accepted, next_step_size, code = is_solved, adaptive_state.next_step_size, new_state.status
+    max_rate, optimal_step = adaptive_state.max_relative_rate, adaptive_state.optimal_step_size
+    if control.adaptive:
+        x_before, x_after = (system.solved_part(x)[1] for x in (old_state.x, new_state.x))
+        norm = jnp.maximum(jnp.max(jnp.abs(x_before)), jnp.max(jnp.abs(x_after)))
+        relative_change = jnp.max(jnp.abs(x_after - x_before)) / jnp.where(norm > 0.0, norm, 1.0)
+        max_rate = jnp.maximum(max_rate, jnp.where(is_solved, relative_change / h, 0.0))
+        time_fraction = h * max_rate  # of the time in which the state, at its fastest, changes by its norm
+        allowed_error = jnp.maximum(
+            control.allowed_error(norm) * jnp.minimum(time_fraction, 1.0),
+            MIN_RELATIVE_ERROR * norm + DEFAULT_OPTIONS.tiny,
         )
-        error = method.error(system, old.x, old.compensation, h, new.k) / allowed
-        error = jnp.where(solved, error, jnp.inf)
-        good = error <= 1.0
-        power = 1.0 / (method.order + jnp.where(part < 1.0, 0.0, 1.0))
-        optimal = h * jnp.maximum(error, 1e-12) ** -power
-        longer = step_size_after_acceptance(
-            optimal, pace.optimal_step_size, h, proposed, power, pacing.max_step, method.explicit
+        error = method.error(system, old_state.x, old_state.compensation, h, new_state.k) / allowed_error
+        error = jnp.where(is_solved, error, jnp.inf)
+        is_accepted = error <= 1.0
+        power = 1.0 / (method.order + jnp.where(time_fraction < 1.0, 0.0, 1.0))
+        optimal_step = h * jnp.maximum(error, 1e-12) ** -power
+        accepted_step_size = step_size_after_acceptance(
+            optimal_step, adaptive_state.optimal_step_size, h, next_step_size, power, control.max_step, method.explicit
         )
-        optimal = jnp.where(h < TRUNCATED_STEP_RATIO * proposed, pace.optimal_step_size, optimal)
-        proposed = jnp.where(good, longer, step_size_after_rejection(error, h, power))
-        seen = reached > pace.t  # or else the step is less than the last place of the time
-        good = good & seen
-        code = jnp.where(good | (seen & (proposed >= pacing.min_step)), StatusCode.COMPLETED, StatusCode.STEP_UNDERFLOW)
-    sight = AttemptOutcome(
-        is_accepted=good,
+        optimal_step = jnp.where(
+            h < TRUNCATED_STEP_RATIO * next_step_size, adaptive_state.optimal_step_size, optimal_step
+        )
+        next_step_size = jnp.where(is_accepted, accepted_step_size, step_size_after_rejection(error, h, power))
+        time_advances = time_after > adaptive_state.t  # unless the step is below the rounding of the time
+        is_accepted = is_accepted & time_advances
+        code = jnp.where(
+            is_accepted | (time_advances & (next_step_size >= control.min_step)),
+            StatusCode.COMPLETED,
+            StatusCode.STEP_UNDERFLOW,
+        )
+    outcome = AttemptOutcome(
+        is_accepted=is_accepted,
         is_at_event=jnp.zeros((), dtype=bool),
-        event_value=pace.event_value,
-        time_after=reached,
-        next_step_size=proposed,
+        event_value=adaptive_state.event_value,
+        time_after=time_after,
+        next_step_size=next_step_size,
         status=code,
-        n_rejected=1.0 * ~good,
-        root_bracket=pace.root_bracket,
+        n_rejected=1.0 * ~is_accepted,
+        root_bracket=adaptive_state.root_bracket,
     )
-    if pacing.event_function is not None:
-        sight = apply_event_detection(system, method, pacing, pace, h, new, sight)
-    good, ends, value, reached, proposed, code, rejected, search = sight
-    goes_on = good & ~ends
+    if control.event_function is not None:
+        outcome = apply_event_detection(system, method, control, adaptive_state, h, new_state, outcome)
+    is_accepted, is_at_event, event_value, time_after, next_step_size, code, n_rejected, root_bracket = outcome
+    continues = is_accepted & ~is_at_event
 
-    def select_if_running(after, before):
-        return jnp.where(goes_on, after, before)
+    def select_if_running(new_value, old_value):
+        return jnp.where(continues, new_value, old_value)
 
-    state = jax.tree_util.tree_map(lambda after, before: jnp.where(good, after, before), new, old)
-    code = jnp.where(goes_on & (reached >= pace.stop_time), PAUSED_AT_STOP, code)
-    tried = pace.n_attempts + 1.0
-    after = AdaptiveState(
-        state=state._replace(status=code.astype(old.status.dtype), residual=new.residual),
-        t=jnp.where(good | ends, reached, pace.t),
-        stop_time=pace.stop_time,
-        last_stop_time=pace.last_stop_time,
-        steps_at_last_stop=pace.steps_at_last_stop,
-        next_step_size=proposed,
+    state = jax.tree_util.tree_map(lambda after, before: jnp.where(is_accepted, after, before), new_state, old_state)
+    code = jnp.where(continues & (time_after >= adaptive_state.stop_time), StatusCode.PAUSED_AT_STOP, code)
+    n_attempts = adaptive_state.n_attempts + 1.0
+    new_adaptive_state = AdaptiveState(
+        state=state._replace(status=code.astype(old_state.status.dtype), residual=new_state.residual),
+        t=jnp.where(is_accepted | is_at_event, time_after, adaptive_state.t),
+        stop_time=adaptive_state.stop_time,
+        last_stop_time=adaptive_state.last_stop_time,
+        steps_at_last_stop=adaptive_state.steps_at_last_stop,
+        next_step_size=next_step_size,
         last_step_size=h,
-        optimal_step_size=select_if_running(optimal, pace.optimal_step_size),
-        n_attempts=tried,
-        n_rejected=pace.n_rejected + rejected,
-        last_attempt_status=cause,
-        event_value=select_if_running(value, pace.event_value),
-        max_relative_rate=select_if_running(speed, pace.max_relative_rate),
-        growth_rate=pace.growth_rate,
-        jacobian_probe=pace.jacobian_probe,
-        root_bracket=search,
+        optimal_step_size=select_if_running(optimal_step, adaptive_state.optimal_step_size),
+        n_attempts=n_attempts,
+        n_rejected=adaptive_state.n_rejected + n_rejected,
+        last_attempt_status=attempt_status,
+        event_value=select_if_running(event_value, adaptive_state.event_value),
+        max_relative_rate=select_if_running(max_rate, adaptive_state.max_relative_rate),
+        growth_rate=adaptive_state.growth_rate,
+        jacobian_probe=adaptive_state.jacobian_probe,
+        root_bracket=root_bracket,
     )
-    if not pacing.adaptive:
-        return after
-    looked = limit_by_growth_rate(method, after, jacobian_probe(*system.solved_part(new.x)))
-    after = jax.tree_util.tree_map(select_if_running, looked, after)
-    spent = (tried >= pacing.max_attempts) & (after.state.status == StatusCode.COMPLETED)
-    status = jnp.where(spent, StatusCode.STEP_LIMIT, after.state.status).astype(old.status.dtype)
-    return after._replace(state=after.state._replace(status=status))
+    if not control.adaptive:
+        return new_adaptive_state
+    limited_state = limit_by_growth_rate(method, new_adaptive_state, jacobian_probe(*system.solved_part(new_state.x)))
+    new_adaptive_state = jax.tree_util.tree_map(select_if_running, limited_state, new_adaptive_state)
+    is_exhausted = (n_attempts >= control.max_attempts) & (new_adaptive_state.state.status == StatusCode.COMPLETED)
+    status = jnp.where(is_exhausted, StatusCode.STEP_LIMIT, new_adaptive_state.state.status).astype(
+        old_state.status.dtype
+    )
+    return new_adaptive_state._replace(state=new_adaptive_state.state._replace(status=status))
 
 
 # -- events -----------------------------------------------------------------------------------------------------------
 
 
 class AttemptOutcome(NamedTuple):
-    """What an attempt means."""
+    """Outcome of an attempted step."""
 
-    is_accepted: jax.Array  # whether its state is the next one
-    is_at_event: jax.Array  # whether an event is there
-    event_value: jax.Array  # of what is watched
-    time_after: jax.Array  # when it ends
-    next_step_size: jax.Array  # size of the next
-    status: jax.Array  # whether the run goes on, pauses or fails
-    n_rejected: jax.Array  # 1 for an attempt in vain, or 0
+    is_accepted: jax.Array  # whether the new state is accepted
+    is_at_event: jax.Array  # whether a sign change of the event function is at the time after
+    event_value: jax.Array
+    time_after: jax.Array  # time at the end of the attempt
+    next_step_size: jax.Array
+    status: jax.Array  # the run continues (COMPLETED), pauses or fails
+    n_rejected: jax.Array  # 1 for a rejected attempt, or 0
     root_bracket: jax.Array
 
 
 def apply_event_detection(
     system: System,
     method: OneStepMethod,
-    pacing: StepControl,
-    pace: AdaptiveState,
+    control: StepControl,
+    adaptive_state: AdaptiveState,
     h,
-    new: State,
-    sight: AttemptOutcome,
+    new_state: State,
+    outcome: AttemptOutcome,
 ) -> AttemptOutcome:
-    """An attempt as it was judged, with a view to the event.
+    """Return the outcome of an attempt, corrected for sign changes of the event function.
 
-    A step in which it happens begins a search among steps from the same state, so that the event is as accurate as the
-    method, and the laws hold there. Where it happens and is undone within a step, as the polynomial of the step tells,
-    a shorter one is tried first; and where a part of a step fails of which the whole did not. A step may end where what
-    is watched is not a number. The search in one that begins there takes it for what it was, so it ends where it is a
-    number again. What the value is where a search ends is left in its place: see :func:`.searching.located`.
+    A step in which the event happens starts a search among steps from the same state, so the event is as accurate as
+    the method, and the laws hold there. If the dense output shows that the sign change is undone within the step, a
+    shorter step is tried first, and likewise if a trial step fails although the full step did not. A step may end where
+    the event function is NaN. A search that starts there assumes the previous value, so it ends where the function is a
+    number again. The value at the end of a search is stored by :func:`.searching.empty_bracket_with_value`.
     """
-    value, search = pacing.event_value(system, new.x), searching.RootBracket(*pace.root_bracket)
-    seen = jnp.where(jnp.isnan(value) & jnp.isinf(pace.event_value), pace.event_value, value)
-    looking, solved = search.step_size > 0.0, (new.status == StatusCode.COMPLETED) & ~jnp.isnan(seen)
-    begins = sight.is_accepted & is_event_crossing(pacing, pace.event_value, value) & ~looking
-    cut, first = jnp.zeros((), dtype=bool), jnp.ones(())
-    if pacing.adaptive:
-        first, undone = first_sign_change_in_step(system, method, pacing, pace, h * new.k, value)
-        cut = sight.is_accepted & undone & ~looking
-        begins = begins & ~cut
-    narrower, found = searching.narrow_bracket(search, seen)
-    at_root = looking & solved & found
-    at_start = looking & solved & ~found & (narrower.trial_fraction <= 4.0 * EPS)
-    later = sight.time_after > pace.t
-    lost, ends = looking & ~solved, at_root | at_start
-    proposed = jnp.where(cut, first * h, jnp.where(looking | begins, pace.next_step_size, sight.next_step_size))
-    code = jnp.where(ends, PAUSED_AT_EVENT, jnp.where(looking, StatusCode.COMPLETED, sight.status))
-    if pacing.adaptive:
-        proposed = jnp.where(lost, FACTOR_AFTER_NONCONVERGENCE * search.step_size, proposed)
-        short = jnp.where(new.status == StatusCode.COMPLETED, StatusCode.NON_FINITE, StatusCode.STEP_UNDERFLOW)
-        code = jnp.where(lost & (proposed < pacing.min_step), short, code)
+    value, bracket = control.event_value(system, new_state.x), searching.RootBracket(*adaptive_state.root_bracket)
+    signed_value = jnp.where(
+        jnp.isnan(value) & jnp.isinf(adaptive_state.event_value), adaptive_state.event_value, value
+    )
+    is_searching = bracket.step_size > 0.0
+    is_solved = (new_state.status == StatusCode.COMPLETED) & ~jnp.isnan(signed_value)
+    starts_search = outcome.is_accepted & is_event_crossing(control, adaptive_state.event_value, value) & ~is_searching
+    is_shortened, first_fraction = jnp.zeros((), dtype=bool), jnp.ones(())
+    if control.adaptive:
+        first_fraction, is_undone = first_sign_change_in_step(
+            system, method, control, adaptive_state, h * new_state.k, value
+        )
+        is_shortened = outcome.is_accepted & is_undone & ~is_searching
+        starts_search = starts_search & ~is_shortened
+    next_bracket, is_root = searching.narrow_bracket(bracket, signed_value)
+    ends_at_root = is_searching & is_solved & is_root
+    ends_at_start = is_searching & is_solved & ~is_root & (next_bracket.trial_fraction <= 4.0 * EPS)
+    time_advances = outcome.time_after > adaptive_state.t
+    has_failed, is_at_event = is_searching & ~is_solved, ends_at_root | ends_at_start
+    next_step_size = jnp.where(
+        is_shortened,
+        first_fraction * h,
+        jnp.where(is_searching | starts_search, adaptive_state.next_step_size, outcome.next_step_size),
+    )
+    status = jnp.where(
+        is_at_event, StatusCode.PAUSED_AT_EVENT, jnp.where(is_searching, StatusCode.COMPLETED, outcome.status)
+    )
+    if control.adaptive:
+        next_step_size = jnp.where(has_failed, FACTOR_AFTER_NONCONVERGENCE * bracket.step_size, next_step_size)
+        failure_code = jnp.where(
+            new_state.status == StatusCode.COMPLETED, StatusCode.NON_FINITE, StatusCode.STEP_UNDERFLOW
+        )
+        status = jnp.where(has_failed & (next_step_size < control.min_step), failure_code, status)
     else:
-        code = jnp.where(lost, jnp.where(new.status == StatusCode.COMPLETED, StatusCode.NON_FINITE, new.status), code)
-    begun = jnp.stack(searching.bracket_from_step(h, pace.event_value, value))
-    there = searching.closed_bracket(jnp.where(at_start, pace.event_value, jnp.where(later, seen, 0.0)))
-    goes_on = jnp.where(
-        looking & ~lost, jnp.where(ends, jnp.stack(there), jnp.stack(narrower)), searching.EMPTY_BRACKET
+        status = jnp.where(
+            has_failed,
+            jnp.where(new_state.status == StatusCode.COMPLETED, StatusCode.NON_FINITE, new_state.status),
+            status,
+        )
+    initial_bracket = jnp.stack(searching.bracket_from_step(h, adaptive_state.event_value, value))
+    event_bracket = searching.empty_bracket_with_value(
+        jnp.where(ends_at_start, adaptive_state.event_value, jnp.where(time_advances, signed_value, 0.0))
+    )
+    updated_bracket = jnp.where(
+        is_searching & ~has_failed,
+        jnp.where(is_at_event, jnp.stack(event_bracket), jnp.stack(next_bracket)),
+        searching.EMPTY_BRACKET,
     )
     return AttemptOutcome(
-        is_accepted=jnp.where(looking, at_root & later, sight.is_accepted & ~cut & ~begins),
-        is_at_event=ends,
-        event_value=jnp.where(jnp.isnan(value), jnp.inf * pace.event_value, value),
-        time_after=jnp.where(at_start, pace.t + narrower.trial_fraction * search.step_size, sight.time_after),
-        next_step_size=proposed,
-        status=code,
-        n_rejected=jnp.where(looking, 1.0 * lost, jnp.where(cut, 1.0, sight.n_rejected)),
-        root_bracket=jnp.where(begins, begun, goes_on),
+        is_accepted=jnp.where(
+            is_searching, ends_at_root & time_advances, outcome.is_accepted & ~is_shortened & ~starts_search
+        ),
+        is_at_event=is_at_event,
+        event_value=jnp.where(jnp.isnan(value), jnp.inf * adaptive_state.event_value, value),
+        time_after=jnp.where(
+            ends_at_start, adaptive_state.t + next_bracket.trial_fraction * bracket.step_size, outcome.time_after
+        ),
+        next_step_size=next_step_size,
+        status=status,
+        n_rejected=jnp.where(is_searching, 1.0 * has_failed, jnp.where(is_shortened, 1.0, outcome.n_rejected)),
+        root_bracket=jnp.where(starts_search, initial_bracket, updated_bracket),
     )
 
 
-def is_event_crossing(pacing: StepControl, before, after) -> jax.Array:
-    """Whether what is watched changes its sign as an event does."""
-    falls = (before > 0.0) & (after <= 0.0)
-    return falls if pacing.falling_only else falls | ((before < 0.0) & (after >= 0.0))
+def is_event_crossing(control: StepControl, value_before, value_after) -> jax.Array:
+    """Return whether the event function changes its sign between two values in the direction of the event."""
+    is_falling = (value_before > 0.0) & (value_after <= 0.0)
+    return is_falling if control.falling_only else is_falling | ((value_before < 0.0) & (value_after >= 0.0))
 
 
-def first_sign_change_in_step(system: System, method: OneStepMethod, pacing: StepControl, pace: AdaptiveState, d, end):
-    """The first share of a step, among `event_check_fractions`, with another sign; and whether a later one undoes that.
+def first_sign_change_in_step(
+    system: System, method: OneStepMethod, control: StepControl, adaptive_state: AdaptiveState, increments, end_value
+):
+    """Return the fraction of the first sign change in a step, and whether a later one undoes it.
 
-    An end at which what is watched is not a number does so too.
+    A NaN at the end of the step also undoes a sign change.
     """
 
-    def value(weights) -> jax.Array:
-        return pacing.event_value(system, method.displace(system, pace.state.x, weights @ d))
+    def value_at(weights) -> jax.Array:
+        return control.event_value(system, method.displace(system, adaptive_state.state.x, weights @ increments))
 
-    share, changed, undone = jnp.ones(()), jnp.zeros((), dtype=bool), jnp.zeros((), dtype=bool)
-    shares = event_check_fractions(method.order)
-    seen = jax.vmap(value)(jnp.asarray(method.weights(shares))) if len(shares) else ()
-    for theta, there in zip([*shares, 1.0], [*seen, end], strict=True):
-        other = pace.event_value * there < 0.0
-        undone = undone | (changed & (pace.event_value * there > 0.0))
-        share = jnp.where(other & ~changed, theta, share)
-        changed = changed | other
-    return share, undone | (changed & jnp.isnan(end))
-
-
-# -- the size of the next step ----------------------------------------------------------------------------------------
+    fraction, has_changed, is_undone = jnp.ones(()), jnp.zeros((), dtype=bool), jnp.zeros((), dtype=bool)
+    fractions = event_check_fractions(method.order)
+    values = jax.vmap(value_at)(jnp.asarray(method.weights(fractions))) if len(fractions) else ()
+    for theta, value in zip([*fractions, 1.0], [*values, end_value], strict=True):
+        is_opposite = adaptive_state.event_value * value < 0.0
+        is_undone = is_undone | (has_changed & (adaptive_state.event_value * value > 0.0))
+        fraction = jnp.where(is_opposite & ~has_changed, theta, fraction)
+        has_changed = has_changed | is_opposite
+    return fraction, is_undone | (has_changed & jnp.isnan(end_value))
 
 
-def step_size_after_acceptance(optimal, before, h, proposed, power, largest, explicit: bool) -> jax.Array:
-    """The size of the next step, after one of size h that would have had the allowed error with the size ``optimal``.
+# -- choice of the step size ------------------------------------------------------------------------------------------
 
-    Where the optimal size shrinks, from ``before``, it is taken to go on as it does [Gustafsson; Hairer & Wanner 1996,
-    IV.8]. The size of an implicit method's steps is kept where the change would be small. A step that is cut short to
-    end somewhere says little about the next.
+
+def step_size_after_acceptance(
+    optimal, previous_optimal, h, planned_size, power, max_step, explicit: bool
+) -> jax.Array:
+    """Return the step size after an accepted step of size h; ``optimal`` would have had the allowed error.
+
+    If the optimal size shrinks, from ``previous_optimal``, the trend is extrapolated [Gustafsson; Hairer & Wanner 1996,
+    IV.8]. The step size of an implicit method is kept if the change would be small. A truncated step tells little about
+    the next one.
     """
-    most = MAX_FACTOR_EXPLICIT if explicit else MAX_FACTOR_IMPLICIT
-    trend = jnp.where(optimal < before, optimal / jnp.where(before > 0.0, before, 1.0), 1.0)
-    factor = jnp.clip(ERROR_TARGET_FRACTION**power * optimal / h * trend, MIN_FACTOR, most)
-    longer = jnp.minimum(h * factor, largest)
-    same = (DEADBAND[0] < factor) & (factor < DEADBAND[1]) & (not explicit)
+    max_factor = MAX_FACTOR_EXPLICIT if explicit else MAX_FACTOR_IMPLICIT
+    trend = jnp.where(
+        optimal < previous_optimal, optimal / jnp.where(previous_optimal > 0.0, previous_optimal, 1.0), 1.0
+    )
+    factor = jnp.clip(ERROR_TARGET_FRACTION**power * optimal / h * trend, MIN_FACTOR, max_factor)
+    new_size = jnp.minimum(h * factor, max_step)
+    is_in_deadband = (DEADBAND[0] < factor) & (factor < DEADBAND[1]) & (not explicit)
     return jnp.where(
-        h < TRUNCATED_STEP_RATIO * proposed, jnp.maximum(proposed, longer), jnp.where(same, proposed, longer)
+        h < TRUNCATED_STEP_RATIO * planned_size,
+        jnp.maximum(planned_size, new_size),
+        jnp.where(is_in_deadband, planned_size, new_size),
     )
 
 
 def step_size_after_rejection(error, h, power) -> jax.Array:
-    """The size of the next step after one with too large an error; infinity where its equations are not solved."""
-    finite = jnp.isfinite(error)
-    factor = jnp.maximum(MIN_FACTOR, (ERROR_TARGET_FRACTION / jnp.where(finite, jnp.maximum(error, 1.0), 1.0)) ** power)
-    return h * jnp.minimum(jnp.where(finite, factor, FACTOR_AFTER_NONCONVERGENCE), 0.9)
+    """Return the step size after a rejected step; an infinite error means unsolved stage equations."""
+    is_solved = jnp.isfinite(error)
+    factor = jnp.maximum(
+        MIN_FACTOR, (ERROR_TARGET_FRACTION / jnp.where(is_solved, jnp.maximum(error, 1.0), 1.0)) ** power
+    )
+    return h * jnp.minimum(jnp.where(is_solved, factor, FACTOR_AFTER_NONCONVERGENCE), 0.9)
 
 
-# -- what grows -------------------------------------------------------------------------------------------------------
+# -- growth rates -----------------------------------------------------------------------------------------------------
 
 
 def max_growth_per_step(method: OneStepMethod) -> float:
-    """Largest product of a step and a rate of growth: what grows near the state then does so to :data:`GROWTH_RATE_RTOL`.
+    """Return the largest product of step size and growth rate at which growth is accurate to :data:`GROWTH_RATE_RTOL`.
 
     A step of a one-step method multiplies the solution of a linear equation of rate r by R(h r), instead of exp(h r).
-    Implicit ones damp or keep what they do not resolve, so they sleep through an instability in long steps.
-    R is taken to be the diagonal Padé approximation of the method's order.
+    Implicit methods damp or preserve what they do not resolve, so a long step can miss an instability. R is assumed to
+    be the diagonal Padé approximation of the method's order.
     """
     s = max(1, method.order // 2)
-    constant = math.factorial(2 * s) * math.factorial(2 * s + 1) / math.factorial(s) ** 2
-    return (GROWTH_RATE_RTOL * constant) ** (0.5 / s)  # ln R(z) / z = 1 +- z^2s / constant + ...
+    pade_constant = math.factorial(2 * s) * math.factorial(2 * s + 1) / math.factorial(s) ** 2
+    return (GROWTH_RATE_RTOL * pade_constant) ** (0.5 / s)  # ln R(z) / z = 1 +- z^2s / pade_constant + ...
 
 
-def limit_by_growth_rate(method: OneStepMethod, pace: AdaptiveState, now) -> AdaptiveState:
-    """No step longer than what grows near the state allows; a pause where that is not known.
+def limit_by_growth_rate(method: OneStepMethod, adaptive_state: AdaptiveState, probe) -> AdaptiveState:
+    """Return the adaptive state with its next step limited by the growth rate; pause if that rate is unknown.
 
-    ``now`` is how the motion stretches what lies near, as :func:`.growth.stretch` finds it.
+    ``probe`` is the Jacobian probe at the state: see :func:`.growth.jacobian_probe`.
     """
-    short = ~(
-        (max_growth_per_step(method) < spectral_radius_bound(now) * pace.next_step_size)
-        & jnp.isfinite(spectral_radius_bound(now))
+    is_short = ~(
+        (max_growth_per_step(method) < spectral_radius_bound(probe) * adaptive_state.next_step_size)
+        & jnp.isfinite(spectral_radius_bound(probe))
     )
-    same = frobenius_norm(now - pace.jacobian_probe) <= JACOBIAN_CHANGE_RTOL * frobenius_norm(pace.jacobian_probe)
+    is_unchanged = frobenius_norm(probe - adaptive_state.jacobian_probe) <= JACOBIAN_CHANGE_RTOL * frobenius_norm(
+        adaptive_state.jacobian_probe
+    )
     limit = jnp.where(
-        pace.growth_rate > 0.0,
-        max_growth_per_step(method) / jnp.where(pace.growth_rate > 0.0, pace.growth_rate, 1.0),
+        adaptive_state.growth_rate > 0.0,
+        max_growth_per_step(method) / jnp.where(adaptive_state.growth_rate > 0.0, adaptive_state.growth_rate, 1.0),
         jnp.inf,
     )
-    unknown = ~short & ~same
-    paused = jnp.where(unknown & (pace.state.status == StatusCode.COMPLETED), PAUSED_FOR_GROWTH_RATE, pace.state.status)
-    return pace._replace(
-        state=pace.state._replace(status=paused.astype(pace.state.status.dtype)),
-        next_step_size=jnp.where(short | unknown, pace.next_step_size, jnp.minimum(pace.next_step_size, limit)),
-        jacobian_probe=jnp.where(unknown, now, pace.jacobian_probe),
-        growth_rate=jnp.where(unknown, jnp.nan, pace.growth_rate),
+    needs_rate = ~is_short & ~is_unchanged
+    status = jnp.where(
+        needs_rate & (adaptive_state.state.status == StatusCode.COMPLETED),
+        StatusCode.PAUSED_FOR_GROWTH_RATE,
+        adaptive_state.state.status,
+    )
+    return adaptive_state._replace(
+        state=adaptive_state.state._replace(status=status.astype(adaptive_state.state.status.dtype)),
+        next_step_size=jnp.where(
+            is_short | needs_rate, adaptive_state.next_step_size, jnp.minimum(adaptive_state.next_step_size, limit)
+        ),
+        jacobian_probe=jnp.where(needs_rate, probe, adaptive_state.jacobian_probe),
+        growth_rate=jnp.where(needs_rate, jnp.nan, adaptive_state.growth_rate),
     )
 
 
-def spectral_radius_bound(stretch) -> jax.Array:
-    """No eigenvalue of the linearised motion is larger: from its matrix, or about so from its powers."""
-    if stretch.shape[1] > DENSE_JACOBIAN_DIM:
-        return jnp.sqrt(jnp.max(jnp.sum(stretch * stretch, axis=1)))
-    square = stretch @ stretch
-    return jnp.sqrt(jnp.sqrt(frobenius_norm(square @ square)))
+def spectral_radius_bound(probe) -> jax.Array:
+    """Return an upper bound (from the matrix) or an estimate (from power iterates) of the spectral radius."""
+    if probe.shape[1] > DENSE_JACOBIAN_DIM:
+        return jnp.sqrt(jnp.max(jnp.sum(probe * probe, axis=1)))
+    matrix_squared = probe @ probe
+    return jnp.sqrt(jnp.sqrt(frobenius_norm(matrix_squared @ matrix_squared)))
 
 
 def frobenius_norm(matrix) -> jax.Array:
@@ -472,14 +549,14 @@ def frobenius_norm(matrix) -> jax.Array:
 
 
 def max_growth_rates(matrices: np.ndarray) -> np.ndarray:
-    """The sizes of the largest eigenvalues among those that grow, of matrices of shape (..., n, n)."""
-    finite = np.isfinite(matrices).all(axis=(-2, -1))
-    rates = np.linalg.eigvals(np.where(finite[..., None, None], matrices, 0.0))
+    """Return the largest modulus of the growing eigenvalues of each matrix, for matrices of shape (..., n, n)."""
+    is_finite = np.isfinite(matrices).all(axis=(-2, -1))
+    rates = np.linalg.eigvals(np.where(is_finite[..., None, None], matrices, 0.0))
     return np.where(rates.real > MIN_GROWTH_TO_FREQUENCY * np.abs(rates), np.abs(rates), 0.0).max(axis=-1, initial=0.0)
 
 
 def growth_rate_at(system: System, method: OneStepMethod, x) -> float:
-    """How fast what grows near a state does, of a system whose stretch is no matrix."""
+    """Return the largest growth rate at x by Arnoldi's method, for more than DENSE_JACOBIAN_DIM components."""
     return float(max_growth_rates(np.asarray(arnoldi_hessenberg(system, method, jnp.asarray(x)))))
 
 
@@ -488,63 +565,71 @@ def growth_rate_at(system: System, method: OneStepMethod, x) -> float:
 
 @jit_program
 def initial_adaptive_state_program(
-    system: System, method: OneStepMethod, pacing: StepControl, x, t, stop, length
+    system: System, method: OneStepMethod, control: StepControl, x, t, stop_time, span_length
 ) -> AdaptiveState:
-    return initial_adaptive_state(system, method, pacing, x, t, stop, length)
+    return initial_adaptive_state(system, method, control, x, t, stop_time, span_length)
 
 
 @jit_program
 def advance_adaptive(
     system: System,
     method: OneStepMethod,
-    pacing: StepControl,
-    pace: AdaptiveState,
-    most,
-    rules: SolverOptions,
+    control: StepControl,
+    adaptive_state: AdaptiveState,
+    max_attempts,
+    options: SolverOptions,
     newton: bool = True,
 ) -> AdaptiveState:
-    """The pace after so many attempts, or where it pauses; without ``newton`` also before one that lacks it."""
-    second = None if newton else keep_fixed_point_result
+    """Return the adaptive state after up to ``max_attempts`` attempts; the run stops where it pauses.
 
-    def goes_on(carry):
-        pace, attempts = carry
+    Without ``newton`` it also stops before the first attempt that needs Newton's method.
+    """
+    newton_fallback = None if newton else keep_fixed_point_result
+
+    def continues(carry):
+        adaptive_state, n_attempts = carry
         return (
-            (pace.state.status == StatusCode.COMPLETED)
-            & (attempts < most)
-            & (newton | (pace.last_attempt_status == StatusCode.COMPLETED))
+            (adaptive_state.state.status == StatusCode.COMPLETED)
+            & (n_attempts < max_attempts)
+            & (newton | (adaptive_state.last_attempt_status == StatusCode.COMPLETED))
         )
 
     def attempt_once(carry):
-        pace, attempts = carry
-        after = attempt_step(system, method, pacing, pace, rules, second)
+        adaptive_state, n_attempts = carry
+        next_state = attempt_step(system, method, control, adaptive_state, options, newton_fallback)
         if not newton:
-            lacking = (
-                pace._replace(last_attempt_status=after.last_attempt_status),
-                after.last_attempt_status == StatusCode.COMPLETED,
-            )
-            after = jax.tree_util.tree_map(lambda a, b: jnp.where(lacking[1], a, b), after, lacking[0])
-        return after, attempts + 1
+            is_solved = next_state.last_attempt_status == StatusCode.COMPLETED
+            unsolved_state = adaptive_state._replace(last_attempt_status=next_state.last_attempt_status)
+            next_state = jax.tree_util.tree_map(lambda a, b: jnp.where(is_solved, a, b), next_state, unsolved_state)
+        return next_state, n_attempts + 1
 
-    return jax.lax.while_loop(goes_on, attempt_once, (pace, jnp.zeros((), dtype=jnp.int64)))[0]
+    return jax.lax.while_loop(continues, attempt_once, (adaptive_state, jnp.zeros((), dtype=jnp.int64)))[0]
 
 
 def advance_adaptive_with(
-    step: Callable, system: System, method: OneStepMethod, pacing: StepControl, pace: AdaptiveState, most: int
+    step: Callable,
+    system: System,
+    method: OneStepMethod,
+    control: StepControl,
+    adaptive_state: AdaptiveState,
+    max_attempts: int,
 ) -> AdaptiveState:
-    """The same, by an engine whose steps are no program."""
-    for _ in range(most):
-        if int(pace.state.status) != StatusCode.COMPLETED:
+    """Return the adaptive state after up to ``max_attempts`` attempts, with steps by ``step(state, h)`` on the host."""
+    for _ in range(max_attempts):
+        if int(adaptive_state.state.status) != StatusCode.COMPLETED:
             break
-        h, reached = _next_step_program(pacing, pace)
-        pace = _accept_or_reject_program(system, method, pacing, pace, h, reached, step(pace.state, h))
-    return pace
+        h, time_after = _next_step_program(control, adaptive_state)
+        adaptive_state = _accept_or_reject_program(
+            system, method, control, adaptive_state, h, time_after, step(adaptive_state.state, h)
+        )
+    return adaptive_state
 
 
 @jit_program
-def _next_step_program(pacing, pace):
-    return next_step(pacing, pace)
+def _next_step_program(control, adaptive_state):
+    return next_step(control, adaptive_state)
 
 
 @jit_program
-def _accept_or_reject_program(system, method, pacing, pace, h, reached, new):
-    return accept_or_reject(system, method, pacing, pace, h, reached, new)
+def _accept_or_reject_program(system, method, control, adaptive_state, h, time_after, new_state):
+    return accept_or_reject(system, method, control, adaptive_state, h, time_after, new_state)

@@ -1,4 +1,4 @@
-"""When an iteration on the stage equations goes on, has converged, or is given up: one object, for every engine."""
+"""Options of the nonlinear solver: when an iteration continues, has converged, or is given up."""
 
 from __future__ import annotations
 
@@ -15,59 +15,57 @@ from ..integrators.levels import LEVEL_RTOL_OF_STATE, LEVEL_RTOL_OF_STEP
 
 @dataclass(frozen=True)
 class SolverOptions:
-    """The solver's rules.
+    """Limits and tolerances of the iterations that solve the stage equations, for every engine.
 
-    Updates of the slopes k are measured against ``|x|/h + |k|``, their scale. The size of a vector is its largest
-    component, or of large systems its root mean square: neither grows with their number, but of many components there
-    is always one whose updates shrink late, and the largest is the one where rounding is.
+    Updates of the slopes k are measured relative to ``|x|/h + |k|``. The norm is the maximum norm, or for systems of
+    many components the root mean square. Neither grows with the dimension, but the largest component is the one where
+    rounding shows, while among many components there is always one whose updates shrink late.
 
     Attributes
     ----------
     rms_norm_dim : int
-        Components of a state above which they are many: for its size, and for the order that they are stored in. Among
-        64 spins with noise one always shrinks so late that Newton's method was tried, for all of them.
+        Dimension above which the norm is the root mean square and components are reordered for speed. Among 64 spins
+        with noise one always converges so late that Newton's method was started, for all of them.
     matrix_free_dim : int
-        Components of a state above which a system is large. Newton's equations are then solved by products with the
-        Jacobian matrix, which is not formed.
+        Dimension above which Newton's equations are solved by Jacobian-vector products, without the Jacobian matrix.
     max_fixed_point_iterations, max_newton_iterations : int
-        The most iterations of each kind.
+        Largest number of iterations of each kind.
     max_jacobian_reuse : int
-        Newton iterations with one factorisation before the Jacobian is taken afresh.
+        Number of Newton iterations with one factorisation before the Jacobian is computed again.
     max_newton_halvings : int
-        Times that a Newton step is halved until the equations are solved better than before, in the second attempt.
-        Whole steps come first: where halved ones get stuck in a valley of the misfit, whole ones leap out of it.
+        Number of times that a Newton step is halved until the residual decreases, in the second attempt. The first
+        attempt takes full steps: damped ones can get stuck in a valley of the residual that full ones leave.
     fixed_point_contraction_limit : float
-        Contraction rate above which fixed-point iteration is given up for Newton's.
+        Contraction rate above which fixed-point iteration is given up for Newton's method.
     jacobian_contraction_limit : float
-        Contraction rate above which Newton's method takes the Jacobian afresh.
+        Contraction rate above which Newton's method computes the Jacobian again.
     krylov_forcing_term : float
-        Share of the misfit that such a solution may leave: each Newton iteration then gains two digits.
+        Relative residual of a Krylov solution: each Newton iteration then gains two digits.
     krylov_basis_size, max_krylov_products : int
-        Directions that it is kept orthogonal to, two vectors each; and the most products for one solution.
+        Number of directions to which a new one is made orthogonal (two vectors each); largest number of products.
     stall_ratio : float
-        An update above this fraction of the smallest so far has not shrunk: rounding makes the iterates cycle, and the
-        cycle itself may still converge, by parts in 1e9.
+        An update above this fraction of the smallest one so far has not shrunk: rounding makes the iterates cycle, and
+        the cycle itself may still converge, by parts in 1e9.
     update_floor : float
-        Update below which nothing is gained: even of one sign, errors of this size change the energy by 2e-15 in 1e6
-        steps. (Stopping at one eps lets it drift by 4e-14.)
+        Relative update below which iterating further gains nothing: even of one sign, errors of this size change the
+        energy by 2e-15 in 1e6 steps. (Stopping at one eps lets it drift by 4e-14.)
     plateau_rtol : float
-        Largest update at which an iteration that has stopped shrinking counts as converged. Rounding in the vector
-        field leaves a few eps; a conditioning of 100 is allowed for. Near a rest that lies at the origin the scale
-        vanishes, but not what cancels in the slopes: there the misfit is measured against the size at which the slopes
-        are rounded.
+        Largest relative update at which a stalled iteration counts as converged. Rounding in the vector field leaves a
+        few eps; a condition number of 100 is allowed for. Near an equilibrium at the origin ``|x|/h + |k|`` vanishes,
+        but not the terms that cancel in k: there the residual is compared with the rounding scale of the slopes.
     projection_rtol : float
-        What an explicit step may miss of the levels that it ends on, relative to its length. A step that leaves more
-        has not been corrected, even where that is less than rounding of the state: near an equilibrium, where gradients
-        depend on each other, all that is left has one sign, and adds up.
+        Largest constraint residual of an explicit step, relative to its length. A step with a larger one has not been
+        projected, even if the residual is below the rounding of the state: near an equilibrium, where gradients are
+        linearly dependent, all residuals have one sign and add up.
     projection_state_rtol : float
-        What it may miss relative to the state, if the step is short.
+        Largest constraint residual of a short explicit step, relative to the state.
     tiny : float
-        Size, of a state over a step, that is none: below it lie the numbers that have lost their digits.
+        Slope norm below which a state counts as zero, because smaller numbers have lost digits.
     drift_threshold : float
-        Energy error, relative to the size of H, from which the energy is steered back: a few roundings of H itself.
+        Energy error, relative to the magnitude of H, above which it is corrected: a few roundings of H itself.
     large_offset_ratio : float
-        Value of H, relative to what it varies by, from which its rounding is far above that of the state: see
-        :data:`..functions.gradients.NOISY`.
+        Ratio of H to its variation above which the rounding of H far exceeds that of the state: see
+        :data:`..functions.gradients.MAX_DIFFERENCE_NOISE`.
     """
 
     rms_norm_dim: int = 100
@@ -90,9 +88,9 @@ class SolverOptions:
     drift_threshold: float = 4 * EPS
     large_offset_ratio: float = 100.0
 
-    def norm_for_dim(self, components: int) -> Callable[[jax.Array], jax.Array]:
-        """What the size of a vector, shape (n,) or (stages, n), is for so many components of a state."""
-        return _rms_norm if components > self.rms_norm_dim else _max_norm
+    def norm_for_dim(self, dim: int) -> Callable[[jax.Array], jax.Array]:
+        """Return the norm of vectors, shape (n,) or (stages, n), for systems of dimension ``dim``."""
+        return _rms_norm if dim > self.rms_norm_dim else _max_norm
 
 
 def _max_norm(v) -> jax.Array:
@@ -104,4 +102,4 @@ def _rms_norm(v) -> jax.Array:
 
 
 DEFAULT_OPTIONS = SolverOptions()
-"""Those of every run."""
+"""Default solver options, used by every run."""

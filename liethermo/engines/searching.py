@@ -1,4 +1,4 @@
-"""Where in a step a function changes its sign, looked for one attempt after another [Chandrupatla 1997]."""
+"""Location of a root of the event function within a step, one evaluation per attempt [Chandrupatla 1997]."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from .rules import EPS
 
 
 class RootBracket(NamedTuple):
-    """What is known of the root: it is between a and b, shares of a step, at which the function has other signs.
+    """Bracket of a root: the function has opposite signs at the fractions a and b of a step.
 
     Attributes
     ----------
     step_size : array, shape ()
-        Size of the step; 0 where nothing is looked for.
+        Size of the step; 0 if no root is bracketed.
     trial_fraction : array, shape ()
-        The one to look at next.
+        Fraction of the step at which the function is evaluated next.
     a, fa, b, fb, c, fc : array, shape ()
-        Shares and the values there, that at ``a`` the last one; ``c`` was given up for it.
+        Fractions of the step and the values there; ``a`` is the latest, and ``c`` was replaced by it.
     """
 
     step_size: jax.Array
@@ -35,51 +35,58 @@ class RootBracket(NamedTuple):
 
 
 EMPTY_BRACKET = np.zeros(len(RootBracket._fields))
-"""No search, as an array."""
+"""Bracket without a root, as an array of the fields of :class:`RootBracket`."""
 
 LAST_VALUE_INDEX = RootBracket._fields.index("fa")
-"""The place of the last value in a search as an array."""
+"""Index of the latest function value in a bracket as an array."""
 
 
-def bracket_from_step(whole, before, after) -> RootBracket:
-    """The search in a step with these values at its ends."""
+def bracket_from_step(step_size, value_before, value_after) -> RootBracket:
+    """Return the bracket for a step whose event values at its ends are ``value_before`` and ``value_after``."""
     zero, one = jnp.zeros(()), jnp.ones(())
-    search = RootBracket(zero + whole, 0.5 * one, zero, zero + before, one, zero + after, zero, zero + before)
-    return _select_bracket(after == 0.0, _final_evaluation(whole, one), search)
+    bracket = RootBracket(
+        zero + step_size, 0.5 * one, zero, zero + value_before, one, zero + value_after, zero, zero + value_before
+    )
+    return _select_bracket(value_after == 0.0, _last_trial_bracket(step_size, one), bracket)
 
 
-def narrow_bracket(search: RootBracket, value) -> tuple[RootBracket, jax.Array]:
-    """The search after the value at its share, and whether this is the root, to rounding: the next look may be last."""
-    t = search.trial_fraction
-    same = jnp.sign(value) == jnp.sign(search.fa)
-    c, fc = jnp.where(same, search.a, search.b), jnp.where(same, search.fa, search.fb)
-    other, fo = jnp.where(same, search.b, search.a), jnp.where(same, search.fb, search.fa)
-    best = jnp.where((jnp.abs(value) < jnp.abs(fo)) | (value == 0.0), t, other)
-    width, least = jnp.abs(other - t), 4.0 * EPS * jnp.abs(best) + 1e-300
-    done = (width <= least) | (value == 0.0)
-    share = t + _next_trial_fraction(t, other, c, value, fo, fc, 0.5 * least / jnp.maximum(width, least)) * (other - t)
-    narrower = RootBracket(search.step_size, share, t, value, other, fo, c, fc)
-    return _select_bracket(done, _final_evaluation(search.step_size, best), narrower), done & (best == t)
+def narrow_bracket(bracket: RootBracket, value) -> tuple[RootBracket, jax.Array]:
+    """Return the bracket updated by the value at its trial fraction, and whether that is the root, to rounding."""
+    t = bracket.trial_fraction
+    has_sign_of_a = jnp.sign(value) == jnp.sign(bracket.fa)
+    c, fc = jnp.where(has_sign_of_a, bracket.a, bracket.b), jnp.where(has_sign_of_a, bracket.fa, bracket.fb)
+    opposite = jnp.where(has_sign_of_a, bracket.b, bracket.a)
+    f_opposite = jnp.where(has_sign_of_a, bracket.fb, bracket.fa)
+    best_fraction = jnp.where((jnp.abs(value) < jnp.abs(f_opposite)) | (value == 0.0), t, opposite)
+    width, tolerance = jnp.abs(opposite - t), 4.0 * EPS * jnp.abs(best_fraction) + 1e-300
+    is_converged = (width <= tolerance) | (value == 0.0)
+    next_fraction = t + _next_trial_fraction(
+        t, opposite, c, value, f_opposite, fc, 0.5 * tolerance / jnp.maximum(width, tolerance)
+    ) * (opposite - t)
+    new_bracket = RootBracket(bracket.step_size, next_fraction, t, value, opposite, f_opposite, c, fc)
+    return _select_bracket(
+        is_converged, _last_trial_bracket(bracket.step_size, best_fraction), new_bracket
+    ), is_converged & (best_fraction == t)
 
 
-def closed_bracket(value) -> RootBracket:
-    """No search any more, but what the function is where one has ended."""
+def empty_bracket_with_value(value) -> RootBracket:
+    """Return an empty bracket whose ``fa`` holds the event value where the search ended."""
     return RootBracket(*jnp.asarray(EMPTY_BRACKET))._replace(fa=jnp.zeros(()) + value)
 
 
-def _final_evaluation(whole, share) -> RootBracket:
-    """One look at a share, whatever is found."""
-    infinite, share = jnp.full((), jnp.inf), jnp.zeros(()) + share
-    return RootBracket(jnp.zeros(()) + whole, share, share, infinite, share, infinite, share, infinite)
+def _last_trial_bracket(step_size, fraction) -> RootBracket:
+    """Return a bracket that is evaluated once more, at ``fraction``, and then closed."""
+    infinite, fraction = jnp.full((), jnp.inf), jnp.zeros(()) + fraction
+    return RootBracket(jnp.zeros(()) + step_size, fraction, fraction, infinite, fraction, infinite, fraction, infinite)
 
 
-def _next_trial_fraction(a, b, c, fa, fb, fc, least) -> jax.Array:
-    """Where between a and b to look next: by inverse quadratic interpolation where that is safe, or halfway."""
+def _next_trial_fraction(a, b, c, fa, fb, fc, margin) -> jax.Array:
+    """Return the next trial fraction between a and b: by inverse quadratic interpolation, or halfway."""
     xi, phi = (a - b) / (c - b), (fa - fb) / (fc - fb)
-    safe = (phi**2 < xi) & ((1.0 - phi) ** 2 < 1.0 - xi)
+    is_safe = (phi**2 < xi) & ((1.0 - phi) ** 2 < 1.0 - xi)
     t = fa / (fb - fa) * fc / (fb - fc) + (c - a) / (b - a) * fa / (fc - fa) * fb / (fc - fb)
-    return jnp.clip(jnp.where(safe & jnp.isfinite(t), t, 0.5), least, 1.0 - least)
+    return jnp.clip(jnp.where(is_safe & jnp.isfinite(t), t, 0.5), margin, 1.0 - margin)
 
 
-def _select_bracket(first, one: RootBracket, other: RootBracket) -> RootBracket:
-    return RootBracket(*(jnp.where(first, u, v) for u, v in zip(one, other, strict=True)))
+def _select_bracket(condition, if_true: RootBracket, if_false: RootBracket) -> RootBracket:
+    return RootBracket(*(jnp.where(condition, u, v) for u, v in zip(if_true, if_false, strict=True)))

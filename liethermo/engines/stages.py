@@ -1,9 +1,9 @@
-"""The equations of a step, ``k = slopes(k)``, and how they are solved.
+"""Stage equations of a step, ``k = slopes(k)``, and their solution.
 
-By fixed-point iteration from extrapolated slopes and, where that converges slowly or not at all, by simplified Newton
-with the exact Jacobian: its matrix, or of large systems products with it. Both stop at the *rounding plateau*, where
-the update no longer shrinks, rather than at a tolerance that could lie below it. All loops are ``lax.while_loop``:
-unrolling them would make the compiler duplicate work exponentially.
+They are solved by fixed-point iteration from extrapolated slopes. If that converges slowly or not at all, simplified
+Newton iteration follows, with the exact Jacobian matrix or, for large systems, Jacobian-vector products. Both stop at
+the *rounding plateau*, where the update no longer shrinks, rather than at a tolerance that could lie below it. All
+loops are ``lax.while_loop``: unrolling them would make the compiler duplicate work exponentially.
 """
 
 from __future__ import annotations
@@ -27,220 +27,244 @@ from .rules import DEFAULT_OPTIONS, SolverOptions
 
 
 class StageSolution(NamedTuple):
-    """Outcome of the stage equations.
-
-    ``converged``; whether the last evaluation was finite (``is_finite``); the last update; iterations of both kinds; and
-    ``slope_rounding``, the size at which the slopes are rounded, where the iteration did not settle without it, else 0.
-    """
+    """Solution of the stage equations, and how the iteration ended."""
 
     k: jax.Array
     converged: jax.Array
-    is_finite: jax.Array
-    residual: jax.Array
+    is_finite: jax.Array  # whether the last update was finite
+    residual: jax.Array  # norm of the last update
     fixed_point_iterations: jax.Array
     newton_iterations: jax.Array
-    slope_rounding: jax.Array
+    slope_rounding: jax.Array  # rounding scale of the slopes if the iteration converged only relative to it, else 0
 
 
 class StageEquations(NamedTuple):
-    """What a step has to solve, ``k = slopes(k)``, and what is needed for it."""
+    """Stage equations ``k = slopes(k)`` of one step, with the functions that solve them."""
 
     slopes: Callable
     guess: jax.Array
-    scale: Callable  # from k to the size that the plateau is measured against
-    newton_solve_at: Callable  # from k to a function from ``slopes - k`` to what Newton's method takes off k
-    slope_rounding: Callable = lambda: jnp.zeros(
-        ()
-    )  # the size at which the slopes are rounded, where it has to be known
+    scale: Callable  # of k; updates are measured relative to it
+    newton_solve_at: Callable  # of k; returns a function from ``slopes(k) - k`` to the step that is subtracted from k
+    slope_rounding: Callable = lambda: jnp.zeros(())  # rounding scale of the slopes
 
 
 class IterationState(NamedTuple):
-    """An iteration on the stage equations under way."""
+    """State of an iteration on the stage equations."""
 
     k: jax.Array
-    update: jax.Array
+    update: jax.Array  # norm of the last update of k
     smallest_update: jax.Array
-    n_stalled: jax.Array  # iterations in a row that did not shrink the update
-    previous_update: jax.Array  # the update before the last
-    earlier_update: jax.Array  # the one before that; zero where there is none
-    n_iterations: jax.Array  # iterations so far
+    n_stalled: jax.Array  # consecutive iterations that did not shrink the update
+    previous_update: jax.Array
+    earlier_update: jax.Array  # the update before the previous one; 0 if there is none
+    n_iterations: jax.Array
 
     @classmethod
     def initial(cls, k) -> IterationState:
-        infinite, none = jnp.asarray(jnp.inf), jnp.zeros((), dtype=jnp.int64)
-        return cls(k, infinite, infinite, none, infinite, jnp.zeros(()), none)
+        infinite, zero_count = jnp.asarray(jnp.inf), jnp.zeros((), dtype=jnp.int64)
+        return cls(k, infinite, infinite, zero_count, infinite, jnp.zeros(()), zero_count)
 
-    def next_state(self, k, rules: SolverOptions) -> IterationState:
-        update = rules.norm_for_dim(k.shape[-1])(k - self.k)
-        earlier = jnp.where(self.n_iterations > 1, self.previous_update, 0.0)
-        stalled = jnp.where(update < rules.stall_ratio * self.smallest_update, 0, self.n_stalled + 1)
-        best = jnp.where(update < self.smallest_update, update, self.smallest_update)
-        return IterationState(k, update, best, stalled, self.update, earlier, self.n_iterations + 1)
+    def next_state(self, k, options: SolverOptions) -> IterationState:
+        update = options.norm_for_dim(k.shape[-1])(k - self.k)
+        earlier_update = jnp.where(self.n_iterations > 1, self.previous_update, 0.0)
+        n_stalled = jnp.where(update < options.stall_ratio * self.smallest_update, 0, self.n_stalled + 1)
+        smallest_update = jnp.where(update < self.smallest_update, update, self.smallest_update)
+        return IterationState(k, update, smallest_update, n_stalled, self.update, earlier_update, self.n_iterations + 1)
 
     def is_slower_than(self, rate: float) -> jax.Array:
-        """Whether updates shrink by less than a rate of contraction: the last one, and the last two together.
+        """Return whether updates shrink by less than ``rate``, in the last iteration and in the last two together.
 
-        Two parts of a state that drive each other, such as spins and the bath that they heat, are each corrected in
-        every second iteration. Where their units differ, updates then grow and shrink in turn while both converge.
+        Two components that drive each other, such as spins and the bath that they heat, are each corrected in every
+        second iteration. If their units differ, updates then grow and shrink in turn while both converge.
         """
         return (self.update > rate * self.previous_update) & (self.update > rate * rate * self.earlier_update)
 
-    def is_at_plateau(self, scale, rules: SolverOptions, misfit=None, noise=None) -> jax.Array:
-        """At the rounding plateau: nothing left to gain, or the update is small and has twice not shrunk.
+    def is_at_plateau(self, scale, options: SolverOptions, residual_norm=None, slope_rounding=None) -> jax.Array:
+        """Return whether the update is negligible, or small and stalled twice (the rounding plateau).
 
-        Small beside the scale of the slopes and the state; or the misfit is, beside the ``noise`` that slopes have.
+        An update is small relative to ``scale``; the residual may be small relative to ``slope_rounding`` instead.
         """
-        small = self.update <= rules.plateau_rtol * scale
-        if noise is not None:
-            small |= misfit <= rules.plateau_rtol * noise
-        return (self.update <= rules.update_floor * scale) | ((self.n_stalled >= 2) & small)
+        is_small = self.update <= options.plateau_rtol * scale
+        if slope_rounding is not None:
+            is_small |= residual_norm <= options.plateau_rtol * slope_rounding
+        return (self.update <= options.update_floor * scale) | ((self.n_stalled >= 2) & is_small)
 
-    def converged_and_continue(self, scale, rules: SolverOptions) -> tuple[jax.Array, jax.Array]:
-        """How a fixed-point iteration that has begun stands: whether it has converged, and whether to go on."""
-        slow = (
+    def converged_and_continue(self, scale, options: SolverOptions) -> tuple[jax.Array, jax.Array]:
+        """Return whether a fixed-point iteration has converged, and whether it goes on."""
+        is_slow = (
             (self.n_iterations >= 3)
-            & self.is_slower_than(rules.fixed_point_contraction_limit)
-            & (self.smallest_update > rules.plateau_rtol * scale)
+            & self.is_slower_than(options.fixed_point_contraction_limit)
+            & (self.smallest_update > options.plateau_rtol * scale)
         )
-        finite = jnp.isfinite(self.update)
-        settled = self.is_at_plateau(scale, rules)
-        return settled & finite, ~settled & ~slow & finite & (self.n_iterations < rules.max_fixed_point_iterations)
+        is_finite = jnp.isfinite(self.update)
+        at_plateau = self.is_at_plateau(scale, options)
+        return at_plateau & is_finite, ~at_plateau & ~is_slow & is_finite & (
+            self.n_iterations < options.max_fixed_point_iterations
+        )
 
 
-def solve_fixed_point(equations: StageEquations, rules: SolverOptions = DEFAULT_OPTIONS) -> StageSolution:
-    """The first attempt: fixed-point iteration, given up where it is slow."""
+def solve_fixed_point(equations: StageEquations, options: SolverOptions = DEFAULT_OPTIONS) -> StageSolution:
+    """Solve the stage equations by fixed-point iteration, which is given up if it converges slowly."""
 
     def iterate(carry):
-        s = carry[0].next_state(equations.slopes(carry[0].k), rules)
-        return s, *s.converged_and_continue(equations.scale(s.k), rules)
+        s = carry[0].next_state(equations.slopes(carry[0].k), options)
+        return s, *s.converged_and_continue(equations.scale(s.k), options)
 
-    begin = IterationState.initial(equations.guess), jnp.asarray(False), jnp.asarray(True)
-    s, converged, _ = jax.lax.while_loop(lambda carry: carry[2], iterate, begin)
+    initial_carry = IterationState.initial(equations.guess), jnp.asarray(False), jnp.asarray(True)
+    s, converged, _ = jax.lax.while_loop(lambda carry: carry[2], iterate, initial_carry)
     return StageSolution(
         s.k, converged, jnp.isfinite(s.update), s.update, s.n_iterations, jnp.zeros_like(s.n_iterations), jnp.zeros(())
     )
 
 
-def slope_rounding_scale(system: System, x, rules: SolverOptions = DEFAULT_OPTIONS) -> jax.Array:
-    """The size at which the motion from a state is rounded, as a whole."""
+def slope_rounding_scale(system: System, x, options: SolverOptions = DEFAULT_OPTIONS) -> jax.Array:
+    """Return the norm of the scales at which the components of the vector field at x are rounded."""
     system, x = system.solved_part(x)
-    return rules.norm_for_dim(x.size)(value_and_rounding_scale(system.vector_field, x)[1])
+    return options.norm_for_dim(x.size)(value_and_rounding_scale(system.vector_field, x)[1])
 
 
-def solve_stages(equations: StageEquations, rules: SolverOptions = DEFAULT_OPTIONS) -> StageSolution:
-    """The solution by either attempt."""
-    first = solve_fixed_point(equations, rules)
-    # a branch, since what is carried to a loop, and back, is copied
-    return jax.lax.cond(first.converged, lambda: first, lambda: solve_newton(equations, rules, first))
+def solve_stages(equations: StageEquations, options: SolverOptions = DEFAULT_OPTIONS) -> StageSolution:
+    """Solve the stage equations by fixed-point iteration, and by Newton's method if that fails."""
+    fixed_point_result = solve_fixed_point(equations, options)
+    # a branch, because a loop would copy its carry
+    return jax.lax.cond(
+        fixed_point_result.converged,
+        lambda: fixed_point_result,
+        lambda: solve_newton(equations, options, fixed_point_result),
+    )
 
 
-def keep_fixed_point_result(first: StageSolution, *_) -> StageSolution:
-    """No second attempt."""
-    return first
+def keep_fixed_point_result(fixed_point_result: StageSolution, *_) -> StageSolution:
+    """Return the result of the fixed-point iteration, without Newton's method."""
+    return fixed_point_result
 
 
-def solve_newton(equations: StageEquations, rules: SolverOptions, first: StageSolution | None = None) -> StageSolution:
-    """The second attempt; of trajectories side by side it does nothing for those that the first has solved."""
-    slopes, guess, scale, inverted, noise = equations
-    measure, size, none = rules.norm_for_dim(guess.shape[-1]), noise(), jnp.zeros((), dtype=jnp.int64)
-    done, iterations = (False, none) if first is None else (first.converged, first.fixed_point_iterations)
+def solve_newton(
+    equations: StageEquations, options: SolverOptions, fixed_point_result: StageSolution | None = None
+) -> StageSolution:
+    """Solve the stage equations by simplified Newton iteration, unless fixed-point iteration has solved them.
 
-    def residual(k):
+    Under ``vmap`` it leaves the trajectories unchanged whose equations are solved. Full steps are tried first; a failed
+    iteration restarts once from the guess with damped steps.
+    """
+    slopes, guess, scale, newton_solve_at, get_slope_rounding = equations
+    norm = options.norm_for_dim(guess.shape[-1])
+    slope_rounding = get_slope_rounding()
+    zero_count = jnp.zeros((), dtype=jnp.int64)
+    is_solved, n_fixed_point = (
+        (False, zero_count)
+        if fixed_point_result is None
+        else (fixed_point_result.converged, fixed_point_result.fixed_point_iterations)
+    )
+
+    def evaluate_residual(k):
         return slopes(k) - k
 
-    def has_failed(s: IterationState, damped):
-        return (s.n_iterations >= jnp.where(damped, 2, 1) * rules.max_newton_iterations) | ~jnp.isfinite(jnp.sum(s.k))
+    def has_failed(s: IterationState, is_damped):
+        return (s.n_iterations >= jnp.where(is_damped, 2, 1) * options.max_newton_iterations) | ~jnp.isfinite(
+            jnp.sum(s.k)
+        )
 
-    def is_unsolved(s: IterationState, found):
-        return jnp.logical_not(done) & ~s.is_at_plateau(scale(s.k), rules, measure(found), size)
+    def is_unsolved(s: IterationState, residual):
+        return jnp.logical_not(is_solved) & ~s.is_at_plateau(scale(s.k), options, norm(residual), slope_rounding)
 
-    def damp_newton_step(k, step, size, plateau, damped):
-        """k less the step, halved until the misfit is smaller than ``size``; at the plateau all of the step."""
+    def damp_newton_step(k, step, residual_norm, plateau_update, is_damped):
+        """Return k minus the step, halved until the residual decreases (not at the plateau), and the residual."""
 
         def needs_halving(carry):
-            factor, found = carry
-            halve = damped & (factor > 0.5**rules.max_newton_halvings) & (factor * measure(step) > plateau)
-            return (factor > 1.0) | (~(jnp.linalg.norm(found) < size) & halve)
+            factor, residual = carry
+            can_halve = is_damped & (factor > 0.5**options.max_newton_halvings) & (factor * norm(step) > plateau_update)
+            return (factor > 1.0) | (~(jnp.linalg.norm(residual) < residual_norm) & can_halve)
 
         def halve_step(carry):
             factor = 0.5 * carry[0]
-            return factor, residual(k - factor * step)
+            return factor, evaluate_residual(k - factor * step)
 
-        factor, found = jax.lax.while_loop(needs_halving, halve_step, (jnp.asarray(2.0), step))
-        return k - factor * step, found, factor == 1.0
+        factor, residual = jax.lax.while_loop(needs_halving, halve_step, (jnp.asarray(2.0), step))
+        return k - factor * step, residual, factor == 1.0
 
     def newton_cycle(carry):
-        s, found, damped = carry
-        again = has_failed(s, damped)
-        restart = IterationState.initial(start)._replace(n_iterations=s.n_iterations), start_misfit
-        s, found = jax.tree_util.tree_map(lambda a, b: jnp.where(again, a, b), restart, (s, found))
-        damped, step_from, before = damped | again, inverted(s.k), s.n_iterations
+        s, residual, is_damped = carry
+        needs_restart = has_failed(s, is_damped)
+        restart = IterationState.initial(initial_k)._replace(n_iterations=s.n_iterations), initial_residual
+        s, residual = jax.tree_util.tree_map(lambda a, b: jnp.where(needs_restart, a, b), restart, (s, residual))
+        is_damped, newton_step, n_previous = is_damped | needs_restart, newton_solve_at(s.k), s.n_iterations
 
         def newton_iteration(carry):
-            inner, found, _ = carry
-            k, found, whole = damp_newton_step(
-                inner.k, step_from(found), jnp.linalg.norm(found), rules.plateau_rtol * scale(inner.k), damped
+            inner, residual, _ = carry
+            k, residual, is_full_step = damp_newton_step(
+                inner.k,
+                newton_step(residual),
+                jnp.linalg.norm(residual),
+                options.plateau_rtol * scale(inner.k),
+                is_damped,
             )
-            inner = inner.next_state(k, rules)
-            return inner, found, jnp.where(whole, inner.n_iterations - before, rules.max_jacobian_reuse)
+            inner = inner.next_state(k, options)
+            return inner, residual, jnp.where(is_full_step, inner.n_iterations - n_previous, options.max_jacobian_reuse)
 
         def can_reuse_jacobian(carry):
-            inner, found, used = carry
-            # by the last update alone: a matrix that is stale leads astray before two updates show it
-            fresh = (used == 0) | (
-                (used < rules.max_jacobian_reuse)
-                & ~(inner.update > rules.jacobian_contraction_limit * inner.previous_update)
+            inner, residual, n_uses = carry
+            # by the last update alone: a stale matrix misleads the iteration before two updates show it
+            is_fresh = (n_uses == 0) | (
+                (n_uses < options.max_jacobian_reuse)
+                & ~(inner.update > options.jacobian_contraction_limit * inner.previous_update)
             )
-            return fresh & is_unsolved(inner, found) & ~has_failed(inner, damped)
+            return is_fresh & is_unsolved(inner, residual) & ~has_failed(inner, is_damped)
 
-        s, found, _ = jax.lax.while_loop(
-            can_reuse_jacobian, newton_iteration, (s, found, jnp.zeros_like(s.n_iterations))
+        s, residual, _ = jax.lax.while_loop(
+            can_reuse_jacobian, newton_iteration, (s, residual, jnp.zeros_like(s.n_iterations))
         )
-        return s, found, damped
+        return s, residual, is_damped
 
     def is_unfinished(carry):
-        s, found, damped = carry
-        return is_unsolved(s, found) & ~(damped & has_failed(s, damped))
+        s, residual, is_damped = carry
+        return is_unsolved(s, residual) & ~(is_damped & has_failed(s, is_damped))
 
-    start, start_misfit = best_initial_guess(residual, guess)
-    s, found, _ = jax.lax.while_loop(
-        is_unfinished, newton_cycle, (IterationState.initial(start), start_misfit, jnp.asarray(False))
+    initial_k, initial_residual = best_initial_guess(evaluate_residual, guess)
+    s, residual, _ = jax.lax.while_loop(
+        is_unfinished, newton_cycle, (IterationState.initial(initial_k), initial_residual, jnp.asarray(False))
     )
-    converged = ~is_unsolved(s, found) & jnp.isfinite(jnp.sum(s.k))
-    size = jnp.where(s.is_at_plateau(scale(s.k), rules), 0.0, size)
-    return StageSolution(s.k, converged, jnp.isfinite(s.update), s.update, iterations, s.n_iterations, size)
+    converged = ~is_unsolved(s, residual) & jnp.isfinite(jnp.sum(s.k))
+    slope_rounding = jnp.where(s.is_at_plateau(scale(s.k), options), 0.0, slope_rounding)
+    return StageSolution(
+        s.k, converged, jnp.isfinite(s.update), s.update, n_fixed_point, s.n_iterations, slope_rounding
+    )
 
 
-def best_initial_guess(misfit: Callable, guess: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The guess, or a step of size zero where that solves the equations better, and the misfit there.
+def best_initial_guess(residual_function: Callable, guess: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return the guess, or zero slopes if their residual is smaller, and the residual there.
 
-    Far out Newton may wander.
+    Far from a solution Newton's method may wander.
     """
-    rest, none = jnp.zeros_like(guess), jnp.zeros((), dtype=jnp.int64)
+    zero_slopes, zero_count = jnp.zeros_like(guess), jnp.zeros((), dtype=jnp.int64)
 
     def try_guess(carry):
-        tries, k, found, size = carry
-        start = jnp.where(tries == 0, rest, guess)
-        defect = misfit(start)
-        new = jnp.linalg.norm(defect)
-        better = (tries == 0) | (new <= size)
-        return tries + 1, *(jnp.where(better, a, b) for a, b in ((start, k), (defect, found), (new, size)))
+        n_tried, best_k, best_residual, best_norm = carry
+        trial_k = jnp.where(n_tried == 0, zero_slopes, guess)
+        residual = residual_function(trial_k)
+        norm = jnp.linalg.norm(residual)
+        is_better = (n_tried == 0) | (norm <= best_norm)
+        return n_tried + 1, *(
+            jnp.where(is_better, a, b) for a, b in ((trial_k, best_k), (residual, best_residual), (norm, best_norm))
+        )
 
-    # a loop, so that programs hold the equations once
-    return jax.lax.while_loop(lambda carry: carry[0] < 2, try_guess, (none, rest, rest, jnp.zeros(())))[1:3]
+    # a loop, so that the program contains the equations only once
+    return jax.lax.while_loop(
+        lambda carry: carry[0] < 2, try_guess, (zero_count, zero_slopes, zero_slopes, jnp.zeros(()))
+    )[1:3]
 
 
 _inverse = Primitive("inverse")
-"""The inverse of a square matrix, for Newton's method, which corrects what it loses."""
+"""Primitive for the inverse of a square matrix; Newton's iteration corrects its rounding errors."""
 
 
 @_inverse.def_abstract_eval
-def _same_shape(matrix):
+def _inverse_abstract_eval(matrix):
     return jax.core.ShapedArray(matrix.shape, matrix.dtype)
 
 
 def _inverse_batching_rule(arguments, axes):
-    # not by LAPACK, whose batched calls can wait for each other forever: see manifolds.matrices.linear.solve
+    # without LAPACK, whose batched calls can deadlock: see manifolds.matrices.linear.solve
     (matrices,), (axis,) = arguments, axes
     return inverse(jnp.moveaxis(matrices, axis, 0)), 0
 
@@ -251,17 +275,17 @@ mlir.register_lowering(_inverse, mlir.lower_fun(jnp.linalg.inv, multiple_results
 
 
 def explicit_slopes(
-    system: System, method: OneStepMethod, x, compensation, h, k, rules: SolverOptions = DEFAULT_OPTIONS
+    system: System, method: OneStepMethod, x, compensation, h, k, options: SolverOptions = DEFAULT_OPTIONS
 ) -> StageSolution:
-    """The slopes of an explicit method, which there is nothing to solve for."""
+    """Return the slopes of an explicit step; it has converged if its end satisfies the constraints."""
     k = method.slopes(system, x, compensation, h, k)
-    x, none = system.solved_part(x)[1], jnp.zeros((), dtype=jnp.int64)
-    size = rules.norm_for_dim(x.size)
-    missed = size(jnp.zeros_like(x).at[0].set(constraint_residual(k)))  # it is the length of a vector
-    converged = missed <= rules.projection_rtol * size(k[0]) + rules.projection_state_rtol * update_scale(
-        x, h, k[0], rules
+    x, zero_count = system.solved_part(x)[1], jnp.zeros((), dtype=jnp.int64)
+    norm = options.norm_for_dim(x.size)
+    residual = norm(jnp.zeros_like(x).at[0].set(constraint_residual(k)))  # the residual is the length of a vector
+    converged = residual <= options.projection_rtol * norm(k[0]) + options.projection_state_rtol * update_scale(
+        x, h, k[0], options
     )
-    return StageSolution(k, converged, jnp.isfinite(missed), missed, none + 1, none, jnp.zeros(()))
+    return StageSolution(k, converged, jnp.isfinite(residual), residual, zero_count + 1, zero_count, jnp.zeros(()))
 
 
 def make_newton_solve(
@@ -270,31 +294,33 @@ def make_newton_solve(
     x,
     compensation,
     h,
-    rules: SolverOptions = DEFAULT_OPTIONS,
-    columns: Callable | None = None,
+    options: SolverOptions = DEFAULT_OPTIONS,
+    map_function: Callable | None = None,
 ) -> Callable:
-    """For each k a function from the misfit ``slopes - k`` to the step of Newton's method, linearised there.
+    """Return a function from k to the solver of Newton's equation at k, a function from the residual to the step.
 
-    ``columns``, of a function and vectors, makes the columns of the Jacobian matrix; without it there is none of large
-    systems.
+    ``map_function(function, vectors)`` computes the columns of the Jacobian matrix; without it ``vmap`` does, and large
+    systems are solved without a matrix.
     """
 
     def linearise_at(k) -> Callable:
-        product = method.residual_jvp(system, x, compensation, h, k)
-        if columns is None and k.shape[-1] > rules.matrix_free_dim:
-            return lambda found: solve_krylov(product, found, rules)
-        matrix = (columns or _apply_vmapped)(lambda d: product(d.reshape(k.shape)).ravel(), jnp.eye(k.size)).T
-        inverse = _inverse.bind(matrix)
-        return lambda found: (inverse @ found.ravel()).reshape(k.shape)
+        jacobian_product = method.residual_jvp(system, x, compensation, h, k)
+        if map_function is None and k.shape[-1] > options.matrix_free_dim:
+            return lambda residual: solve_krylov(jacobian_product, residual, options)
+        matrix = (map_function or _map_with_vmap)(
+            lambda d: jacobian_product(d.reshape(k.shape)).ravel(), jnp.eye(k.size)
+        ).T
+        jacobian_inverse = _inverse.bind(matrix)
+        return lambda residual: (jacobian_inverse @ residual.ravel()).reshape(k.shape)
 
     return linearise_at
 
 
-def _apply_vmapped(function: Callable, vectors) -> jax.Array:
+def _map_with_vmap(function: Callable, vectors) -> jax.Array:
     return jax.vmap(function)(vectors)
 
 
-def update_scale(x, h, k, rules: SolverOptions = DEFAULT_OPTIONS):
-    """What updates of slopes are measured against, either way in time; x is the part of a state that they are of."""
-    measure = rules.norm_for_dim(x.size)
-    return measure(x) / jnp.abs(h) + measure(k) + rules.tiny
+def update_scale(x, h, k, options: SolverOptions = DEFAULT_OPTIONS):
+    """Return the scale ``|x|/|h| + |k|`` of updates of the slopes."""
+    norm = options.norm_for_dim(x.size)
+    return norm(x) / jnp.abs(h) + norm(k) + options.tiny

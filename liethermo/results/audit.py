@@ -1,4 +1,4 @@
-"""The audit: did the laws hold along a run, at every step, and is it a run of the system at all?"""
+"""Audit of a run: whether its laws hold at every step, and whether it follows the vector field of the system."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class AuditedRun(Protocol):
-    """What an audit looks at: see :class:`liethermo.Solution`."""
+    """Attributes of a run that an audit reads: see :class:`liethermo.Solution`."""
 
     @property
     def energy_balance(self) -> np.ndarray: ...
@@ -38,36 +38,38 @@ class AuditedRun(Protocol):
 
 
 VALUE_ROUNDING_RTOL = 8 * EPS
-"""Change of a function, relative to its value, that its own rounding can account for, whatever it varies by: as much as
-the engines leave uncorrected of the energy, and as much again for the values at both ends."""
+"""Allowed change of a function, relative to its value, for the rounding of the value itself.
+
+The engines leave half of it uncorrected in the energy; the other half is for the values at both ends.
+"""
 
 
 @dataclass(frozen=True)
 class Tolerances:
-    """What an audit accepts.
+    """Tolerances of an audit.
 
-    A change of a function is judged against the size at which rounding sees the function, its *sensitivity*
+    A change of a function is judged relative to the scale at which rounding acts on it, its *sensitivity*
     ``max |grad f(x)| |x|`` along the run (:meth:`liethermo.Energy.sensitivity`), whatever its value is at the start.
-    Eight roundings of the value itself are allowed besides, and of the terms that cancel in it: nothing smaller can be
-    seen where a constant is added, or in ``1 - cos q`` near q = 0.
+    Eight roundings of the value itself are allowed besides, and of the terms that cancel in it: smaller changes cannot
+    be seen if a constant is added to the function, or in ``1 - cos q`` near q = 0.
 
     Attributes
     ----------
     energy : float
         Drift. Exact schemes stay near 1e-15 for thousands of steps, below 2e-14 for a million.
     entropy : float
-        Fall of the entropy in one step: four roundings of the state.
+        Decrease of the entropy in one step: four roundings of the state.
     casimirs : float
-        Drift of the functions that the system conserves, and of the momentum in space; the fall of the entropy in all.
+        Drift of the functions that the system conserves and of the spatial momentum; decrease of the entropy in total.
     residual : float
-        Of the stage equations: their rounding plateau.
+        Residual of the stage equations, which reaches their rounding plateau.
     attitude : float
-        Distance from the group, relative to the size of the attitude, as ``manifolds.MatrixGroup.belongs`` has it.
+        Distance from the group, relative to the norm of the attitude, as in ``manifolds.MatrixGroup.belongs``.
     accuracy : float
-        Local error of a step, measured against short ones, relative to the distance that it goes (or to a hundredth
-        of the whole motion, where that is more): a second-order method has 0.05 where it takes eight steps to a period.
+        Local error of a step, measured against short steps, relative to its length (or to a hundredth of the whole
+        motion, if that is longer). A second-order method has 0.05 with eight steps per period.
     consistency : float
-        How far the slope of a step is from the vector field, relative to that, as the step gets shorter.
+        Distance of the slope of a step from the vector field, relative to the field, as the step gets shorter.
     """
 
     energy: float = 1e-13
@@ -81,20 +83,20 @@ class Tolerances:
     def __post_init__(self):
         for name, value in vars(self).items():
             if not value >= 0.0:
-                raise InputError(f"the tolerance {name} must be >= 0, not {value}")
+                raise InputError(f"the tolerance {name} must be >= 0, got {value}")
 
     @classmethod
-    def with_defaults(cls, **given: float) -> Tolerances:
-        """Those given by name, and the defaults of the others; InputError where there is none of a name."""
+    def with_defaults(cls, **tolerances: float) -> Tolerances:
+        """Return the tolerances given by name, with the defaults of the others; InputError for an unknown name."""
         names = [field.name for field in fields(cls)]
-        unknown = [name for name in given if name not in names]
+        unknown = [name for name in tolerances if name not in names]
         if unknown:
-            raise InputError(f"an audit has no tolerance {unknown[0]!r}; those that it has are {', '.join(names)}")
-        return cls(**given)
+            raise InputError(f"there is no tolerance {unknown[0]!r}; an audit has {', '.join(names)}")
+        return cls(**tolerances)
 
 
 class AuditRow(TableRow):
-    """One law: what was measured, what is allowed, and the verdict (None where nothing is promised)."""
+    """A row of an audit: law, measured value, tolerance, and verdict (None if nothing is promised)."""
 
     @property
     def law(self) -> str:
@@ -105,42 +107,48 @@ class AuditRow(TableRow):
         return self.allowed
 
 
-ACCURACY_ROW, CONSISTENCY_ROW, STEPS_TAKEN_ROW, FAILED_TRAJECTORIES_ROW = (
-    "accuracy",
-    "consistency",
-    "steps taken",
-    "trajectories that failed",
-)
-"""The rows that are not about laws."""
+ACCURACY_ROW = "accuracy"
+"""Name of the row that judges the local errors."""
+
+CONSISTENCY_ROW = "consistency"
+"""Name of the row that compares short steps with the vector field."""
+
+STEPS_TAKEN_ROW = "steps taken"
+"""Name of the row for whether a run reached its end."""
+
+FAILED_TRAJECTORIES_ROW = "trajectories that failed"
+"""Name of the row that counts the trajectories of an ensemble that did not reach their end."""
 
 LAW_FAILURE_VERDICT = "A LAW FAILS"
+"""Verdict of an audit in which a law is violated."""
 
 
 @dataclass(frozen=True)
 class Audit(Tabular):
-    """The laws of a run, its accuracy, and its consistency with the vector field. Printing it gives a table.
+    """The laws of a run, its accuracy, and its consistency with the vector field; printed as a table.
 
     Attributes
     ----------
     energy_drift : float
-        ``max |H - H0|`` over every step, H less the work done from outside, relative to the size at which H is rounded:
-        the larger of ``|H0|`` and ``max |grad H(x)| |x|`` along the run.
+        ``max |H - H0|`` over all steps, H less the work done from outside, relative to the rounding scale of H: the
+        larger of ``|H0|`` and ``max |grad H(x)| |x|`` along the run.
     entropy_min_increment : float
         Smallest increment of the entropy in one step; NaN without an entropy.
     casimir_drift : float
-        Largest drift, relative to the same of each, of the functions that the system conserves and the method promises
-        to keep; NaN where there is none.
+        Largest drift, relative to the rounding scale of each, of the functions that the system conserves and the method
+        promises to keep; NaN if there are none.
     worst_residual : float
+        Largest residual of the stage equations.
     passed : bool
-        Whether the laws hold along the motion of the system. ``resolved`` and ``verdict`` are about the accuracy of the
-        steps.
+        Whether the laws hold along the motion of the system. The accuracy of the steps is judged by ``resolved`` and
+        ``verdict``.
     resolved : bool or None
-        Whether the examined steps resolve the motion: whether the worst of them, compared with short steps, is within
-        the tolerance ``accuracy``. It is about single steps and not about the accumulated error. None without
-        information about the steps.
+        Whether the examined steps resolve the motion: the largest local error, compared with short steps, is within the
+        tolerance ``accuracy``. It is about single steps and not about the accumulated error. None without information
+        about the steps.
     rows : tuple of AuditRow
     coverage : str
-        How many of the steps were looked at for that, where it was not all; the verdict says it too.
+        Number of steps that were checked, if not all; the verdict says it too.
 
     Examples
     --------
@@ -169,16 +177,16 @@ class Audit(Tabular):
 
     @property
     def verdict(self) -> str:
-        """The whole in one line."""
-        failing = {row.law for row in self.rows if row.passed is False}
-        if failing - {ACCURACY_ROW, CONSISTENCY_ROW, STEPS_TAKEN_ROW, FAILED_TRAJECTORIES_ROW}:
+        """Summary of the audit in one line."""
+        violated_rows = {row.law for row in self.rows if row.passed is False}
+        if violated_rows - {ACCURACY_ROW, CONSISTENCY_ROW, STEPS_TAKEN_ROW, FAILED_TRAJECTORIES_ROW}:
             return LAW_FAILURE_VERDICT
-        if STEPS_TAKEN_ROW in failing:
+        if STEPS_TAKEN_ROW in violated_rows:
             return "THE RUN STOPPED before its end; the laws hold until there"
-        if FAILED_TRAJECTORIES_ROW in failing:
+        if FAILED_TRAJECTORIES_ROW in violated_rows:
             return "SOME TRAJECTORIES STOPPED before their end; the laws hold until there"
-        if CONSISTENCY_ROW in failing:
-            return "the laws hold, but THIS IS NOT THE MOTION of the system"
+        if CONSISTENCY_ROW in violated_rows:
+            return "the laws hold, but THE STEPS DO NOT FOLLOW THE VECTOR FIELD"
         if self.resolved is None:
             return "the laws hold"
         if self.resolved:
@@ -194,15 +202,15 @@ class Audit(Tabular):
 
 @dataclass(frozen=True)
 class RoundingScale:
-    """The size at which a function is rounded along a run, and what an audit allows it to change by.
+    """Rounding scale of a function along a run, and the change of the function that an audit allows.
 
     Attributes
     ----------
     value : float or ndarray
-        Its size, at the start or the largest.
+        Value of the function, at the start or the largest.
     sensitivity : float or ndarray
     term_size : float or ndarray
-        The size of the largest terms that the value is computed from.
+        Magnitude of the largest terms of which the value is the sum.
     """
 
     value: Any
@@ -211,27 +219,30 @@ class RoundingScale:
 
     @property
     def scale(self) -> Any:
-        """What changes are given relative to."""
-        size = np.maximum(np.abs(self.value), self.sensitivity)
-        return np.where(size > 0.0, size, 1.0)
+        """Scale relative to which changes of the function are given."""
+        magnitude = np.maximum(np.abs(self.value), self.sensitivity)
+        return np.where(magnitude > 0.0, magnitude, 1.0)
 
     def allowed_change(self, tolerance: float) -> Any:
-        """The largest change accepted, relative to the size."""
-        parts = self.sensitivity, np.maximum(np.abs(self.value), self.term_size)
-        with np.errstate(invalid="ignore"):  # of what has overflowed all is as large as the size
-            shares = (np.where(np.isinf(self.scale), 1.0, part / self.scale) for part in parts)
-            return sum(share * allowed for share, allowed in zip(shares, (tolerance, VALUE_ROUNDING_RTOL), strict=True))
+        """Return the largest accepted change of the function, relative to ``scale``."""
+        scales = self.sensitivity, np.maximum(np.abs(self.value), self.term_size)
+        with np.errstate(invalid="ignore"):  # after an overflow the fraction is 1
+            fractions = (np.where(np.isinf(self.scale), 1.0, part_scale / self.scale) for part_scale in scales)
+            return sum(
+                fraction * allowed
+                for fraction, allowed in zip(fractions, (tolerance, VALUE_ROUNDING_RTOL), strict=True)
+            )
 
 
 def audit_run(solution: AuditedRun, tolerances: Tolerances) -> Audit:
-    """See :meth:`liethermo.Solution.audit`."""
+    """Audit a run: see :meth:`liethermo.Solution.audit`."""
     stats, laws, evidence, rows, energy = solution.stats, solution.laws, solution.evidence, [], solution.energy_balance
     name = " minus ".join(["energy", *laws.balance])
-    low, high = stats.energy_range or (np.inf, -np.inf)
-    lowest, highest = min(low, float(energy.min())), max(high, float(energy.max()))
-    first = float(energy[0])
+    min_step_energy, max_step_energy = stats.energy_range or (np.inf, -np.inf)
+    min_energy, max_energy = min(min_step_energy, float(energy.min())), max(max_step_energy, float(energy.max()))
+    initial_energy = float(energy[0])
     rounding = _rounding_scale(energy, evidence.energy, evidence.terms.get("energy"))
-    drift = float(max(highest - first, first - lowest) / rounding.scale)
+    drift = float(max(max_energy - initial_energy, initial_energy - min_energy) / rounding.scale)
     allowed = float(rounding.allowed_change(tolerances.energy))
     if laws.energy == "conserved":
         rows.append(_judged_row(f"{name} drift", drift, allowed, _inexact_law_note(laws, "energy")))
@@ -239,22 +250,24 @@ def audit_run(solution: AuditedRun, tolerances: Tolerances) -> Audit:
         rows.append(AuditRow(f"{name} drift", drift, None, None, _why_no_law(laws, "energy")))
     else:
         increments = [*np.diff(energy), _value_or(stats.largest_energy_increment, -np.inf)]
-        risen = float(max(increments)) / rounding.scale
-        rows.append(_judged_row(f"largest {name} increment", risen, allowed, _inexact_law_note(laws, "energy")))
+        relative_increment = float(max(increments)) / rounding.scale
+        rows.append(
+            _judged_row(f"largest {name} increment", relative_increment, allowed, _inexact_law_note(laws, "energy"))
+        )
 
-    least = np.nan
+    min_entropy_increment = np.nan
     if solution.entropy is not None:
-        least, row = _entropy_row(solution, tolerances)
+        min_entropy_increment, row = _entropy_row(solution, tolerances)
         rows.append(row)
 
-    kept = []
+    drifts = []
     for name, series in solution.casimirs.items():
         if name in laws.ledger:
             continue
         rounding = _rounding_scale(series, evidence.invariants.get(name), evidence.terms.get(name))
         change = float(np.abs(series - series[0]).max() / rounding.scale)
         if name in laws.conserved:
-            kept.append(change)
+            drifts.append(change)
             rows.append(_judged_row(f"drift of {name}", change, float(rounding.allowed_change(tolerances.casimirs))))
         elif name in laws.unpromised:
             rows.append(AuditRow(f"drift of {name}", change, None, None, UNPROMISED_CONSTANT_NOTE))
@@ -263,8 +276,16 @@ def audit_run(solution: AuditedRun, tolerances: Tolerances) -> Audit:
             rows.append(AuditRow(f"change of {name}", change, None, None, note))
     for name in laws.ledger:
         series = solution.casimirs[name]
-        what = "the momentum in space below" if name.startswith("impulse") else "the energy above"
-        rows.append(AuditRow(name, float(series[-1] - series[0]), None, None, f"from outside: {what} is without"))
+        law_name = "momentum in space" if name.startswith("impulse") else "energy"
+        rows.append(
+            AuditRow(
+                name,
+                float(series[-1] - series[0]),
+                None,
+                None,
+                f"received from outside; already subtracted in the {law_name} row",
+            )
+        )
     rows.append(_judged_row("stage residual", stats.worst_residual, tolerances.residual))
     if stats.attitude_residual is not None:
         rows.append(_judged_row("attitude in group", stats.attitude_residual, tolerances.attitude))
@@ -272,18 +293,22 @@ def audit_run(solution: AuditedRun, tolerances: Tolerances) -> Audit:
         rows.append(_spatial_momentum_row(stats.spatial_momentum_change, laws, tolerances))
     rows += _step_rows(evidence, tolerances)
     status = solution.status  # a run stopped by its user is short, but breaks no law
-    failed = not status.ok and status.code != StatusCode.INTERRUPTED.status_name
+    has_failed = not status.ok and status.code != StatusCode.INTERRUPTED.status_name
     rows.append(
         AuditRow(
-            STEPS_TAKEN_ROW, float(stats.steps), None, False if failed else None, "" if status.ok else str(status.code)
+            STEPS_TAKEN_ROW,
+            float(stats.steps),
+            None,
+            False if has_failed else None,
+            "" if status.ok else str(status.code),
         )
     )
     coverage = coverage_text(evidence, stats.steps)
-    return Audit(drift, least, max(kept, default=np.nan), stats.worst_residual, tuple(rows), coverage)
+    return Audit(drift, min_entropy_increment, max(drifts, default=np.nan), stats.worst_residual, tuple(rows), coverage)
 
 
 def _spatial_momentum_row(change: float, laws: Laws, tolerances: Tolerances) -> AuditRow:
-    """The momentum in space is a constant where no torque acts from outside, or less the impulse of one."""
+    """Return the row of the spatial momentum, which is constant without an external torque, or less its impulse."""
     name = "momentum in space"
     if any(entry.startswith("impulse") for entry in laws.ledger):
         name += " less the impulse"
@@ -291,69 +316,85 @@ def _spatial_momentum_row(change: float, laws: Laws, tolerances: Tolerances) -> 
         return _judged_row(f"drift of {name}", change, tolerances.casimirs)
     if name in laws.unpromised:
         return AuditRow(f"drift of {name}", change, None, None, UNPROMISED_CONSTANT_NOTE)
-    return AuditRow(f"change of {name}", change, None, None, "a torque acts: not a constant of this system")
+    return AuditRow(f"change of {name}", change, None, None, "not a constant of this system, because a torque acts")
 
 
 UNKNOWN_CONSTANCY_NOTE = (
-    "whether this is a constant of this system is not known: it could be evaluated at no point that was tried"
+    "whether the system conserves this function is unknown: it could not be evaluated at any point that was tried"
 )
+"""Note of a function of which it is unknown whether the system conserves it."""
 
-UNPROMISED_CONSTANT_NOTE = "a constant of this system, which the method does not promise to keep exactly"
+UNPROMISED_CONSTANT_NOTE = "a constant of this system, but the method does not conserve it exactly"
+"""Note of a conserved function that the method does not conserve exactly."""
 
 
 def _entropy_row(solution: AuditedRun, tolerances: Tolerances) -> tuple[float, AuditRow]:
-    """The least increment of the entropy, and its law: at every step, and over all of the run."""
+    """Return the smallest increment of the entropy and the row of its law, for every step and for the whole run."""
     S, law = solution.entropy, solution.laws.entropy
     assert S is not None
     note, evidence = _inexact_law_note(solution.laws, "entropy"), solution.evidence
     rounding = _rounding_scale(S, evidence.entropy, evidence.terms.get("entropy"))
-    least = float(min([*np.diff(S), _value_or(solution.stats.least_entropy_increment, np.inf)]))
+    min_increment = float(min([*np.diff(S), _value_or(solution.stats.least_entropy_increment, np.inf)]))
     if law == "conserved":
         change = float(np.abs(S - S[0]).max() / rounding.scale)
-        return least, _judged_row("entropy drift", change, float(rounding.allowed_change(tolerances.casimirs)), note)
+        return min_increment, _judged_row(
+            "entropy drift", change, float(rounding.allowed_change(tolerances.casimirs)), note
+        )
     if law is None:
-        return least, AuditRow("least entropy increment", least, None, None, _why_no_law(solution.laws, "entropy"))
+        return min_increment, AuditRow(
+            "least entropy increment", min_increment, None, None, _why_no_law(solution.laws, "entropy")
+        )
     rounding = replace(rounding, value=float(np.abs(S).max()))
-    one, all_ = (float(rounding.allowed_change(t) * rounding.scale) for t in (tolerances.entropy, tolerances.casimirs))
+    step_tolerance, total_tolerance = (
+        float(rounding.allowed_change(t) * rounding.scale) for t in (tolerances.entropy, tolerances.casimirs)
+    )
     fall = float((np.maximum.accumulate(S) - S).max())
-    if fall > all_ >= 0.0 and least >= -one:  # step by step below what rounding hides
+    if fall > total_tolerance >= 0.0 and min_increment >= -step_tolerance:  # each step is within the rounding
         note = f"in all it falls by {fall:.2g}"
-    return least, AuditRow("least entropy increment", least, -one, bool(least >= -one and fall <= all_), note)
+    return min_increment, AuditRow(
+        "least entropy increment",
+        min_increment,
+        -step_tolerance,
+        bool(min_increment >= -step_tolerance and fall <= total_tolerance),
+        note,
+    )
 
 
 def _step_rows(evidence: Evidence, tolerances: Tolerances) -> list[AuditRow]:
-    """Whether the steps resolve the motion, and whether it is that of the system."""
-    rows, defect = [accuracy_row(evidence, tolerances)], evidence.inconsistency
-    if defect is not None:
-        row = _judged_row(CONSISTENCY_ROW, defect, tolerances.consistency)
+    """Return the rows of accuracy and consistency."""
+    rows, inconsistency = [accuracy_row(evidence, tolerances)], evidence.inconsistency
+    if inconsistency is not None:
+        row = _judged_row(CONSISTENCY_ROW, inconsistency, tolerances.consistency)
         note = "" if row.passed else "short steps of this method do not follow the vector field of this system"
         rows.append(replace(row, note=note))
     return rows
 
 
 def accuracy_row(evidence: Evidence, tolerances: Tolerances) -> AuditRow:
-    """Whether the steps resolve the motion."""
+    """Return the row that judges whether the steps resolve the motion."""
     if evidence.local_error is None:
-        return AuditRow(ACCURACY_ROW, np.nan, None, None, "not estimated: how accurate the run is is not known")
+        return AuditRow(ACCURACY_ROW, np.nan, None, None, "the local errors were not estimated")
     row = _judged_row(ACCURACY_ROW, evidence.local_error, tolerances.accuracy)
-    where = f"local error of a step, of the distance it goes; worst at t = {evidence.error_time:.4g}"
-    return replace(row, note=where if row.passed else f"the steps do not resolve the motion: try suggest_step; {where}")
+    location = f"largest local error, relative to the length of the step; worst at t = {evidence.error_time:.4g}"
+    return replace(
+        row, note=location if row.passed else f"the steps do not resolve the motion: try suggest_step; {location}"
+    )
 
 
 def coverage_text(evidence: Evidence, steps: int) -> str:
-    """How many of the steps were looked at, where it was not all of them."""
-    looked = evidence.looked
-    return "" if looked is None or looked >= steps else f"looked at: {looked:,} steps of {steps:,}"
+    """Return how many of the steps were checked; empty if all were."""
+    n_checked = evidence.looked
+    return "" if n_checked is None or n_checked >= steps else f"checked {n_checked:,} of {steps:,} steps"
 
 
-def _rounding_scale(series: np.ndarray, sensitivity: float | None, terms: float | None) -> RoundingScale:
-    """How a function with this series is rounded; its largest value replaces a sensitivity that is not known."""
-    largest = float(np.abs(series).max()) if sensitivity is None else sensitivity
-    return RoundingScale(abs(float(series[0])), largest, _value_or(terms, 0.0))
+def _rounding_scale(series: np.ndarray, sensitivity: float | None, term_size: float | None) -> RoundingScale:
+    """Return the rounding scale of a function with these values; their maximum replaces an unknown sensitivity."""
+    known_sensitivity = float(np.abs(series).max()) if sensitivity is None else sensitivity
+    return RoundingScale(abs(float(series[0])), known_sensitivity, _value_or(term_size, 0.0))
 
 
 INEXACT_LAW_NOTE = "not kept exactly by this method"
-"""Beside a law that a method does not claim to keep."""
+"""Note of a law that the method does not promise to keep."""
 
 
 def _judged_row(law: str, value: float, tolerance: float, note: str = "") -> AuditRow:
@@ -368,5 +409,5 @@ def _why_no_law(laws: Laws, law: str) -> str:
     return "a law of the mean: it fluctuates on paths" if law in laws.mean else "no law promised"
 
 
-def _value_or(value: float | None, otherwise: float) -> float:
-    return otherwise if value is None else value
+def _value_or(value: float | None, default: float) -> float:
+    return default if value is None else value

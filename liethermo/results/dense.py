@@ -16,21 +16,21 @@ def _identity(x: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class DenseOutput:
-    """``x(t)`` anywhere: where a step of the method ends that begins at the last state before t.
+    """Dense output ``x(t)``: the end of a step of the method that begins at the last state before t.
 
-    So states between have the order of the method and its laws: the energy and the invariants are those of the state
-    that the step begins at, and the entropy is no less.
+    Such states have the order of the method and obey its laws: the energy and the invariants equal those of the state
+    at which the step begins, and the entropy is not smaller.
 
     Attributes
     ----------
     t : ndarray, shape (steps + 1,)
-        When the steps of the run begin, and when the last one ends.
+        Times at which the steps of the run begin, and the end of the last.
     x : ndarray, shape (steps + 1, n)
-        The states then.
-    step_ends : function from states, shape (m, n), and sizes of steps, shape (m,), to states
-        NaN where a step cannot be taken.
+        States at these times.
+    step_ends : function from states, shape (m, n), and step sizes, shape (m,), to states
+        Returns NaN for a step that fails.
     to_user_state : function from states, shape (m, n), to states
-        What a user sees of them.
+        Converts internal states to those that the user sees.
     """
 
     t: np.ndarray
@@ -40,31 +40,31 @@ class DenseOutput:
 
     def __call__(self, t) -> np.ndarray:
         t = np.asarray(t, dtype=np.float64)
-        first, last = self.t[0], self.t[-1]
-        slack = 1e-12 * (last - first)
-        if not np.all((t >= first - slack) & (t <= last + slack)):
-            raise InputError(f"the solution is known from t = {first:g} to {last:g}, not at {t}")
-        times = np.clip(t.ravel(), first, last)
+        start, end = self.t[0], self.t[-1]
+        slack = 1e-12 * (end - start)
+        if not np.all((t >= start - slack) & (t <= end + slack)):
+            raise InputError(f"t must be from {start:g} to {end:g}, the span of the solution, got {t}")
+        times = np.clip(t.ravel(), start, end)
         i = np.searchsorted(self.t, times, side="right") - 1
-        h, found = times - self.t[i], self.x[i]
-        between = np.flatnonzero(h > 0.0)
-        if between.size:
-            found[between] = self.step_ends(found[between], h[between])
-            self._check_solved(times[between], found[between])
-        found = self.to_user_state(found)
-        return found.reshape(*t.shape, found.shape[-1])
+        h, x = times - self.t[i], self.x[i]
+        inside_steps = np.flatnonzero(h > 0.0)
+        if inside_steps.size:
+            x[inside_steps] = self.step_ends(x[inside_steps], h[inside_steps])
+            self._check_solved(times[inside_steps], x[inside_steps])
+        x = self.to_user_state(x)
+        return x.reshape(*t.shape, x.shape[-1])
 
     def _check_solved(self, t: np.ndarray, x: np.ndarray) -> None:
-        """Raise where a part of a step cannot be taken, although the run has taken the whole."""
-        unknown = np.isnan(x).any(axis=1)
-        if unknown.any():
+        """Raise if a partial step failed, although the run has taken the full step."""
+        is_unknown = np.isnan(x).any(axis=1)
+        if is_unknown.any():
             raise ConvergenceError(
-                f"the state at t = {t[unknown][0]:g}, between two steps, cannot be found: a part of the step is not "
-                "solved. Ask for the states at the ends of the steps, or run with smaller steps",
+                f"the state at t = {t[is_unknown][0]:g}, between two steps, cannot be found: the equations of a "
+                "partial step were not solved. Evaluate the solution at the ends of the steps, or take smaller steps",
                 None,
             )
 
-    def with_output_map(self, change: Callable[[np.ndarray], np.ndarray]) -> DenseOutput:
-        """The same, of which a user sees what a function makes of it."""
-        before = self.to_user_state
-        return replace(self, to_user_state=lambda x: np.asarray(change(before(x))))
+    def with_output_map(self, output_map: Callable[[np.ndarray], np.ndarray]) -> DenseOutput:
+        """Return this dense output with ``output_map`` applied to the states that the user sees."""
+        previous_map = self.to_user_state
+        return replace(self, to_user_state=lambda x: np.asarray(output_map(previous_map(x))))

@@ -1,4 +1,4 @@
-"""What an ensemble of runs returns: all trajectories with their laws, and how each of them ended."""
+"""Result of an ensemble of runs: all trajectories with their laws and their statuses."""
 
 from __future__ import annotations
 
@@ -35,26 +35,26 @@ if TYPE_CHECKING:
 
 STATUS_MESSAGES = {
     StatusCode.COMPLETED: "reached t = {t:.15g} in {n} steps",
-    StatusCode.NOT_CONVERGED: "the equations of step {next}, from t = {t:.15g}, were not solved: the iteration stopped at "
-    "a residual of {r:.2g} relative to the state; try a smaller step",
-    StatusCode.NON_FINITE: "NaN or infinity in step {next}, from t = {t:.15g}: the energy, the entropy, the vector field or "
-    "the event function is not finite there; check the domain of the functions, or try a smaller step",
+    StatusCode.NOT_CONVERGED: "the equations of step {next}, from t = {t:.15g}, were not solved: the iteration "
+    "stopped at a residual of {r:.2g} relative to the state. Try a smaller step",
+    StatusCode.NON_FINITE: "NaN or infinity in step {next}, from t = {t:.15g}: the energy, the entropy, the vector "
+    "field or the event function is not finite there. Check the domain of the functions, or try a smaller step",
     StatusCode.INTERRUPTED: "stopped by the user after step {n}, t = {t:.15g}",
     StatusCode.EVENT: "the event happened at t = {t:.15g} in {n} steps",
-    StatusCode.STEP_UNDERFLOW: "no step from t = {t:.15g}, after step {n}, was short enough for the tolerance: it may be "
-    "below what rounding allows, or the functions not smooth there",
-    StatusCode.STEP_LIMIT: "as many steps were tried as are allowed, and t = {t:.15g} is reached: Adaptive(most_steps=...) "
-    "allows more, and a larger tolerance or a method of higher order takes fewer",
+    StatusCode.STEP_UNDERFLOW: "no step from t = {t:.15g}, after step {n}, was short enough for the tolerance: the "
+    "tolerance may be below the rounding errors, or the functions may not be smooth there",
+    StatusCode.STEP_LIMIT: "the largest number of attempted steps was used up at t = {t:.15g}. Allow more with "
+    "Adaptive(most_steps=...), or take a larger tolerance or a method of higher order",
     StatusCode.INADMISSIBLE: "{reason}",
 }
-"""How a trajectory ended, by its time t, its steps n, its residual r."""
+"""Template of the message for each status: t is the end time, n the number of steps, r the residual."""
 
 
 @dataclass(frozen=True)
 class Ensemble(AuditableResult):
-    """What :func:`ensemble` returns; trajectories come first in every array, and B is their number.
+    """The result of :func:`ensemble`: B trajectories, which come first in every array.
 
-    ``e[i]`` is one trajectory as a :class:`Solution`, and a loop over an ensemble is one over these.
+    ``e[i]`` is one trajectory as a :class:`Solution`, and iterating over an ensemble gives all of them.
 
     Attributes
     ----------
@@ -64,37 +64,37 @@ class Ensemble(AuditableResult):
         Final states, shape (B, n), or trajectories, shape (B, times, n), with NaN from where one failed; None for
         ``outputs="summary"``.
     energy, entropy : ndarray, shape (B,) or (B, times), as x has
-        Final ones for ``"summary"``. ``entropy`` is None for a system without one.
+        Final values for ``"summary"``. ``entropy`` is None for a system without one.
     status : ndarray of int8, shape (B,)
-        Places in ``STATUS_NAMES``: 0 completed, 1 not converged, 2 not finite, 3 interrupted, 4 ended by its event, 5 and 6
-        adaptive steps that were too short or too many, 8 inadmissible: a trajectory that could not be started, with its
-        parameters or from its state.
+        Indices in ``STATUS_NAMES``: 0 completed, 1 not converged, 2 not finite, 3 interrupted, 4 ended by its event, 5
+        and 6 adaptive steps that were too short or too many, 8 inadmissible: a trajectory that could not be started,
+        with its parameters or from its state.
     steps : ndarray of int64, shape (B,)
-        Steps taken; where the status is not 0 the one after is the one that failed.
+        Number of steps taken; if the status is a failure, the next step failed.
     residual : ndarray, shape (B,)
-        ``h |k - slopes(k)| / |x|`` of the last step tried.
+        ``h |k - slopes(k)| / |x|`` of the last attempted step.
     energy_drift : ndarray, shape (B,)
-        ``max |H - H0|`` over every step, relative to the size at which H is rounded: as for :class:`Audit`.
+        ``max |H - H0|`` over every step, relative to the rounding scale of H: as for :class:`Audit`.
     largest_energy_increment, least_entropy_increment : ndarray, shape (B,)
-        Of one step, over every step.
+        Extreme increments in one step, over every step.
     entropy_scale : ndarray, shape (B,)
         ``max(|S(0)|, |S(T)|)``.
     energy_sensitivity, entropy_sensitivity : ndarray, shape (B,)
-        Largest :meth:`liethermo.Energy.sensitivity` over every step: what rounding is measured against.
+        Largest :meth:`liethermo.Energy.sensitivity` over every step, relative to which rounding is judged.
     first_energy : ndarray, shape (B,)
     entropy_change : ndarray, shape (B,)
         ``S(T) - S(0)``.
     relaxation_time : ndarray, shape (B,)
         ``int_0^T (S(T) - S(t)) dt / (S(T) - S(0))``, T the end of the trajectory: the time constant of an exponential
-        relaxation that is over by T. The energy takes the place of S under a double bracket. NaN where nothing relaxes.
+        relaxation that is over by T. Under a double bracket the energy replaces S. NaN if nothing relaxes.
     iterations : ndarray, shape (B,)
-        Of the solver, in all.
+        Total number of solver iterations.
     smallest_energy, largest_energy : ndarray, shape (B,)
-        Over every step, less the work done from outside.
+        Extremes over every step, less the work done from outside.
     end_time : ndarray, shape (B,)
         Time reached.
     rejected : ndarray of int64, shape (B,)
-        Adaptive steps that were tried and were too long.
+        Number of attempted adaptive steps that were too long.
     x0 : ndarray, shape (B, n); on sites, as x, with ``(*sites, d)`` instead of n
         Initial states.
     laws : Laws
@@ -102,14 +102,14 @@ class Ensemble(AuditableResult):
     wall_time : float
         Seconds, compilation included.
     attitude : ndarray, shape (B, m, m) or (B, times, m, m), or None
-        Elements of the group, where the system has one and states are kept.
+        Elements of the group, if the system has one and states are kept.
     attitude0 : ndarray, shape (B, m, m), or None
-        Those at the start.
+        Attitudes at the start.
     work : ndarray, shape (B,) or (B, times), or None
-        Done on the system from outside, where its energy depends on time; the drift and the increments of the energy
+        Work done on the system from outside, if its energy depends on time; the drift and the increments of the energy
         are then those of the energy less the work.
     reasons : mapping from int to str
-        Why trajectories are inadmissible, or have failed where that is known.
+        Why trajectories are inadmissible, or have failed if that is known.
     provenance : dict
         Library version, method, step, system, date: JSON data.
     """
@@ -150,27 +150,27 @@ class Ensemble(AuditableResult):
     solution_builder: Callable[[Ensemble, int], Solution] | None = field(default=None, repr=False, compare=False)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "alone": None}
+        return {**super().__getstate__(), "solution_builder": None}
 
     def __len__(self) -> int:
         return len(self.status)
 
     @property
     def ok(self) -> np.ndarray:
-        """Which trajectories came to their end, shape (B,)."""
+        """True for each trajectory that reached its end, shape (B,)."""
         return np.isin(self.status, (StatusCode.COMPLETED, StatusCode.EVENT))
 
     @property
     def event_time(self) -> np.ndarray:
-        """When events happened, shape (B,); NaN where none did."""
+        """Times of the events, shape (B,); NaN if a trajectory has none."""
         return np.where(self.status == StatusCode.EVENT, self.end_time, np.nan)
 
     # -- one trajectory -------------------------------------------------------------------------------------------
 
     def __getitem__(self, i: int) -> Solution:
-        """One trajectory, with what is recorded along a run: at the times kept, or at its start and its end.
+        """Return one trajectory as a solution at the saved times, or at its start and end.
 
-        Its Casimirs, and the evidence for its audit, are found now; an ensemble from a file has none.
+        Its Casimirs and the evidence for its audit are computed now; a trajectory of an ensemble from a file has none.
 
         Raises
         ------
@@ -181,7 +181,7 @@ class Ensemble(AuditableResult):
         """
         i = self._member_index(i)
         if self.x is None:
-            raise InputError('no states were kept: outputs="final" or "trajectory" keeps some')
+            raise InputError('no states were kept: run the ensemble with outputs="final" or "trajectory"')
         if self.status[i] == StatusCode.INADMISSIBLE:
             raise InputError(self.message(i))
         return self.member_solution(i) if self.solution_builder is None else self.solution_builder(self, i)
@@ -191,13 +191,13 @@ class Ensemble(AuditableResult):
 
     def _member_index(self, i) -> int:
         if isinstance(i, bool) or not isinstance(i, int | np.integer):
-            raise InputError(f"a trajectory is chosen by a number, not by {i!r}")
+            raise InputError(f"a trajectory is chosen by a number, got {i!r}")
         if not -len(self) <= i < len(self):
-            raise IndexError(f"there is no trajectory {i} among {len(self)}")
+            raise IndexError(f"there is no trajectory {i}; the ensemble has {len(self)}")
         return int(i) % len(self)
 
     def message(self, i: int) -> str:
-        """How a trajectory ended, in words, its index first."""
+        """Return how a trajectory ended, as a text that begins with its index."""
         i = self._member_index(i)
         facts = {"t": self.end_time[i], "n": self.steps[i], "next": self.steps[i] + 1, "r": self.residual[i]}
         code, reason = StatusCode(self.status[i]), self.reasons.get(i, "")
@@ -207,7 +207,7 @@ class Ensemble(AuditableResult):
         return f"trajectory {i}: {text}"
 
     def member_status(self, i: int) -> Status:
-        """How a trajectory ended."""
+        """Return the status of a trajectory."""
         i = self._member_index(i)
         residual = float(np.nan_to_num(self.residual[i]))
         return Status(
@@ -215,43 +215,45 @@ class Ensemble(AuditableResult):
         )
 
     def member_stats(self, i: int) -> Stats:
-        """What was counted of a trajectory, and its extremes; the iterations of both kinds together."""
-        moved = self.steps[i] > 0
-        entropy = float(self.least_entropy_increment[i]) if moved else None
+        """Return the statistics of a trajectory; fixed-point and Newton iterations are counted together."""
+        has_stepped = self.steps[i] > 0
+        min_entropy_increment = float(self.least_entropy_increment[i]) if has_stepped else None
         return Stats(
             steps=int(self.steps[i]),
             fixed_point_iterations=int(self.iterations[i]),
             rejected=int(self.rejected[i]),
             worst_residual=float(self.residual[i]) if self.ok[i] else 0.0,
-            energy_range=(float(self.smallest_energy[i]), float(self.largest_energy[i])) if moved else None,
-            least_entropy_increment=entropy,
-            largest_energy_increment=float(self.largest_energy_increment[i]) if moved else None,
+            energy_range=(float(self.smallest_energy[i]), float(self.largest_energy[i])) if has_stepped else None,
+            least_entropy_increment=min_entropy_increment,
+            largest_energy_increment=float(self.largest_energy_increment[i]) if has_stepped else None,
             wall_time=self.wall_time,
         )
 
     def member_solution(self, i: int) -> Solution:
-        """One trajectory as it is kept here, without Casimirs."""
-        path = self.energy.ndim == 2
-        reached = np.isfinite(self.energy[i]) if path else np.array([True])
+        """Return one trajectory as it is stored here, without Casimirs."""
+        has_time_series = self.energy.ndim == 2
+        is_reached = np.isfinite(self.energy[i]) if has_time_series else np.array([True])
         work = None if self.work is None else self.work[i]
 
-        def series(values, first):
-            """The values at the times kept, or at both ends."""
-            return values[i][reached] if path else np.stack([first, values[i]])
+        def series(values, initial_value):
+            """Return the values at the saved times, or at both ends."""
+            return values[i][is_reached] if has_time_series else np.stack([initial_value, values[i]])
 
         assert self.x is not None
-        first = self.first_energy[i]
-        entropy = None if self.entropy is None else float(self.entropy_sensitivity[i])
+        first_energy = self.first_energy[i]
+        entropy_sensitivity = None if self.entropy is None else float(self.entropy_sensitivity[i])
         attitude = None
         if self.attitude is not None and self.attitude0 is not None:
             attitude = series(self.attitude, self.attitude0[i])
-        evidence = Evidence(energy=float(self.energy_sensitivity[i]), entropy=entropy)
+        evidence = Evidence(energy=float(self.energy_sensitivity[i]), entropy=entropy_sensitivity)
         return Solution(
-            t=self.t[reached] if path else np.array([self.provenance["t_span"][0], self.end_time[i]]),
+            t=self.t[is_reached] if has_time_series else np.array([self.provenance["t_span"][0], self.end_time[i]]),
             x=series(self.x, self.x0[i]),
-            energy=series(self.energy, first),
+            energy=series(self.energy, first_energy),
             entropy=None if self.entropy is None else series(self.entropy, self._initial_entropy(i)),
-            casimirs={} if work is None else {"work": work[reached] if path else np.stack([0.0 * work, work])},
+            casimirs={}
+            if work is None
+            else {"work": work[is_reached] if has_time_series else np.stack([0.0 * work, work])},
             status=self.member_status(i),
             stats=self.member_stats(i),
             laws=self.laws,
@@ -272,9 +274,9 @@ class Ensemble(AuditableResult):
             f"{(self.status == code).sum()} {name}" for code, name in enumerate(STATUS_NAMES) if code in self.status
         ]
         lines = [f"{len(self)} trajectories to t = {self.t[-1]:g}: {', '.join(counts)}"]
-        failed = np.flatnonzero(~self.ok)
-        lines += [f"  {STATUS_NAMES[self.status[i]]}: {self.message(i)}" for i in failed[:5]]
-        lines += [f"  and {len(failed) - 5} more"] if len(failed) > 5 else []
+        failed_indices = np.flatnonzero(~self.ok)
+        lines += [f"  {STATUS_NAMES[self.status[i]]}: {self.message(i)}" for i in failed_indices[:5]]
+        lines += [f"  and {len(failed_indices) - 5} more"] if len(failed_indices) > 5 else []
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
@@ -286,45 +288,45 @@ class Ensemble(AuditableResult):
     def audit(
         self, energy: float = Tolerances.energy, entropy: float = Tolerances.entropy, **tolerances: float
     ) -> Audit:
-        """The laws at every step of every trajectory, each by the one that kept it worst; printing it gives a table.
+        """Audit the laws at every step of every trajectory; each row shows the worst trajectory.
 
-        Local errors are measured along at most 32 trajectories, from their start as far as can be afforded; of adaptive
-        steps, in the first one. The verdict says how many steps were looked at, where it was not all.
+        Local errors are measured along at most 32 trajectories, from their start as far as is affordable; with adaptive
+        steps, in the first step. If not all steps were checked, the verdict says how many.
 
         Parameters
         ----------
         energy, entropy, casimirs, residual, accuracy : float
-            What is accepted: see :class:`liethermo.results.audit.Tolerances`.
+            Tolerances: see :class:`liethermo.results.audit.Tolerances`.
 
         Raises
         ------
         InputError
-            If there is no tolerance of a name, or it is negative.
+            If the name of a tolerance is unknown, or a tolerance is negative.
         """
-        accepted = Tolerances.with_defaults(energy=energy, entropy=entropy, **tolerances)
-        moved, terms = self.steps > 0, self.evidence.terms
+        limits = Tolerances.with_defaults(energy=energy, entropy=entropy, **tolerances)
+        has_stepped, terms = self.steps > 0, self.evidence.terms
         rows = []
-        for law in evaluate_ensemble_laws(
-            self, self.laws, accepted, terms.get("energy", 0.0), terms.get("entropy", 0.0)
-        ):
+        for law in evaluate_ensemble_laws(self, self.laws, limits, terms.get("energy", 0.0), terms.get("entropy", 0.0)):
             i = law.worst_member
             rows.append(law.audit_row(i, f"worst is trajectory {i}"))
         if self.evidence_source is not None or self.evidence.local_error is not None:
-            rows.append(accuracy_row(self.evidence, accepted))
-        failed = int((~self.ok & (self.status != StatusCode.INTERRUPTED)).sum())
-        rows.append(AuditRow(FAILED_TRAJECTORIES_ROW, float(failed), 0.0, failed == 0))
-        least = np.nan if self.entropy is None else float(self.least_entropy_increment.min(initial=0.0, where=moved))
-        drift, residual = (float(a.max(initial=0.0, where=moved)) for a in (self.energy_drift, self.residual))
+            rows.append(accuracy_row(self.evidence, limits))
+        n_failed = int((~self.ok & (self.status != StatusCode.INTERRUPTED)).sum())
+        rows.append(AuditRow(FAILED_TRAJECTORIES_ROW, float(n_failed), 0.0, n_failed == 0))
+        min_entropy_increment = (
+            np.nan if self.entropy is None else float(self.least_entropy_increment.min(initial=0.0, where=has_stepped))
+        )
+        drift, residual = (float(a.max(initial=0.0, where=has_stepped)) for a in (self.energy_drift, self.residual))
         coverage = coverage_text(self.evidence, int(self.steps.sum()))
-        return Audit(drift, least, np.nan, residual, tuple(rows), coverage)
+        return Audit(drift, min_entropy_increment, np.nan, residual, tuple(rows), coverage)
 
     # -- files --------------------------------------------------------------------------------------------------------
 
     def to_xarray(self, units: Mapping[str, str] | None = None) -> xarray.Dataset:
-        """An ``xarray.Dataset`` with coordinates ``trajectory`` and ``time``; all else as attributes (JSON).
+        """Return an ``xarray.Dataset`` with coordinates ``trajectory`` and ``time``; all else is in attributes (JSON).
 
-        ``status_text`` and ``message`` say of every trajectory how it ended. Each variable says its long
-        name, energy and entropy the law that the system promises of them.
+        ``status_text`` and ``message`` describe the end of every trajectory. Each variable has a long name, energy and
+        entropy also the law that the system promises of them.
 
         Parameters
         ----------
@@ -336,22 +338,22 @@ class Ensemble(AuditableResult):
         InputError
             If there is no variable of a name.
         """
-        path = self.energy.ndim == 2
-        each = ("trajectory", "time") if path else ("trajectory",)
+        has_time_series = self.energy.ndim == 2
+        series_dims = ("trajectory", "time") if has_time_series else ("trajectory",)
         variables: dict[str, Any] = {
-            name: (each if name in TIME_SERIES_FIELDS else ("trajectory",), value)
+            name: (series_dims if name in TIME_SERIES_FIELDS else ("trajectory",), value)
             for name in (*TIME_SERIES_FIELDS, *PER_MEMBER_FIELDS)
             if (value := getattr(self, name)) is not None
         }
-        for name, dims in (("x", each), ("x0", ("trajectory",))):
+        for name, dims in (("x", series_dims), ("x0", ("trajectory",))):
             if (value := getattr(self, name)) is not None:
                 variables[name] = ((*dims, *state_axis_names(value.ndim - len(dims))), value)
-        for name, dims in (("attitude", each), ("attitude0", ("trajectory",))):
+        for name, dims in (("attitude", series_dims), ("attitude0", ("trajectory",))):
             if (value := getattr(self, name)) is not None:
                 variables[name] = ((*dims, "row", "column", "part"), split_complex(value))
         variables["status_text"] = ("trajectory", np.array([STATUS_NAMES[code] for code in self.status], dtype=object))
-        failed = ~self.ok
-        messages = [self.message(i) if failed[i] else "" for i in range(len(self))]
+        is_failed = ~self.ok
+        messages = [self.message(i) if is_failed[i] else "" for i in range(len(self))]
         variables["message"] = ("trajectory", np.array(messages, dtype=object))
         attributes = {
             "format": ENSEMBLE_FORMAT,
@@ -368,31 +370,34 @@ class Ensemble(AuditableResult):
 
     @classmethod
     def from_file(cls, series: dict[str, np.ndarray], attributes: dict[str, Any]) -> Ensemble:
-        """From what :func:`.files.read` returns; KeyError, TypeError or ValueError where a part is missing."""
+        """Build an ensemble from the arrays and attributes of a file, as :func:`.files.read_dataset` returns them.
+
+        KeyError, TypeError or ValueError if a part is missing or does not fit.
+        """
         if len(series["time"]) != int(attributes["times"]):
             raise ValueError(f"{len(series['time'])} times of {attributes['times']}")
-        number, times = len(series["x0"]), len(array_of_shape(series, "time", (None,)))
-        each = {name: array_of_shape(series, name, (number,)) for name in PER_MEMBER_FIELDS}
-        along = {
-            name: array_of_shape(series, name, (number,), (number, times))
+        n_trajectories, n_times = len(series["x0"]), len(array_of_shape(series, "time", (None,)))
+        per_member = {name: array_of_shape(series, name, (n_trajectories,)) for name in PER_MEMBER_FIELDS}
+        time_series = {
+            name: array_of_shape(series, name, (n_trajectories,), (n_trajectories, n_times))
             for name in TIME_SERIES_FIELDS
             if name in series
         }
         states = {name: series[name] for name in ("x0", "x", "attitude0", "attitude") if name in series}
         for name in states:
-            array_of_shape(series, name, (number, *[None] * max(series[name].ndim - 1, 1)))
+            array_of_shape(series, name, (n_trajectories, *[None] * max(series[name].ndim - 1, 1)))
         for name in ("attitude", "attitude0"):
             if name in states:
                 states[name] = join_complex(states[name])
         reasons, provenance = (json.loads(attributes[name]) for name in ("reasons", "provenance"))
         if not isinstance(reasons, dict) or not isinstance(provenance, dict):
-            raise ValueError("what is said of the ensemble is not what this version writes")
-        if not ((each["status"] >= 0) & (each["status"] < len(STATUS_NAMES))).all():
-            raise ValueError(f"a trajectory ended in a way that there is not: {int(each['status'].max())}")
+            raise ValueError("its attributes reasons and provenance are not JSON objects")
+        if not ((per_member["status"] >= 0) & (per_member["status"] < len(STATUS_NAMES))).all():
+            raise ValueError(f"its status has an unknown code: {int(per_member['status'].max())}")
         evidence = dataclass_from_json(Evidence, json.loads(attributes["evidence"]))
         return cls(
             t=series["time"],
-            **dict.fromkeys(("x", "entropy", "work")) | each | along | states,  # type: ignore[arg-type]
+            **dict.fromkeys(("x", "entropy", "work")) | per_member | time_series | states,  # type: ignore[arg-type]
             laws=dataclass_from_json(Laws, json.loads(attributes["laws"])),
             engine=str(attributes["engine"]),
             wall_time=float(attributes["wall_time"]),
@@ -403,29 +408,29 @@ class Ensemble(AuditableResult):
 
 
 TIME_SERIES_FIELDS = ("energy", "entropy", "work")
-"""What is known at each of the times kept."""
+"""Fields with a value at each saved time."""
 
 PER_MEMBER_FIELDS = tuple(
     "status steps residual energy_drift largest_energy_increment least_entropy_increment entropy_scale "
     "energy_sensitivity entropy_sensitivity first_energy entropy_change relaxation_time iterations smallest_energy "
     "largest_energy end_time rejected".split()
 )
-"""One of each trajectory."""
+"""Fields with one value for each trajectory."""
 
 REQUIRED_FIELDS = ("energy", "x0", *PER_MEMBER_FIELDS)
-"""What every ensemble has."""
+"""Fields that every ensemble has."""
 
 STATE_FIELDS = ("x", "x0", "attitude", "attitude0")
-"""The arrays of states, trajectories first."""
+"""Fields that are arrays of states, trajectories first."""
 
 
 class Subset(NamedTuple):
-    """Some trajectories of an ensemble.
+    """Subset of the trajectories of an ensemble.
 
     Attributes
     ----------
     trajectory_numbers : array of int
-        Their numbers in the whole ensemble, increasing.
+        Indices of the trajectories in the full ensemble, increasing.
     ensemble : Ensemble
     """
 
@@ -433,60 +438,62 @@ class Subset(NamedTuple):
     ensemble: Ensemble
 
 
-def join_subsets(parts: Sequence[Subset], size: int, **fields: Any) -> Ensemble:
-    """Return the ensemble of all trajectories; those in no part are inadmissible.
+def join_subsets(subsets: Sequence[Subset], n_trajectories: int, **fields: Any) -> Ensemble:
+    """Return the ensemble of all trajectories; those in no subset are inadmissible.
 
     Parameters
     ----------
-    parts : sequence of Subset
+    subsets : sequence of Subset
         At least one.
-    size : int
-        The number of trajectories.
+    n_trajectories : int
+        Number of trajectories of the full ensemble.
     fields
-        The attributes ``reasons``, ``wall_time`` and ``provenance`` of the result.
+        Attributes ``reasons``, ``wall_time`` and ``provenance`` of the result.
     """
-    ensembles = [part.ensemble for part in parts]
-    first = ensembles[0]
+    ensembles = [subset.ensemble for subset in subsets]
+    first_ensemble = ensembles[0]
     engine = " and ".join(sorted({e.engine for e in ensembles}))
     fields["provenance"] = {**fields["provenance"], "engine": engine}
-    if len(ensembles) == 1 and len(first) == size:
-        return replace(first, **fields)
+    if len(ensembles) == 1 and len(first_ensemble) == n_trajectories:
+        return replace(first_ensemble, **fields)
 
     def joined_field(name: str) -> np.ndarray | None:
-        values = getattr(first, name)
+        values = getattr(first_ensemble, name)
         if values is None:
             return None
-        empty = {"status": StatusCode.INADMISSIBLE}.get(name, 0 if values.dtype.kind == "i" else np.nan)
-        whole = np.full((size, *values.shape[1:]), empty, dtype=values.dtype)
-        for part, ensemble in zip(parts, ensembles, strict=True):
-            whole[part.trajectory_numbers] = getattr(ensemble, name)
-        return whole
+        fill_value = {"status": StatusCode.INADMISSIBLE}.get(name, 0 if values.dtype.kind == "i" else np.nan)
+        joined = np.full((n_trajectories, *values.shape[1:]), fill_value, dtype=values.dtype)
+        for subset, ensemble in zip(subsets, ensembles, strict=True):
+            joined[subset.trajectory_numbers] = getattr(ensemble, name)
+        return joined
 
-    def build_solution(many: Ensemble, i: int) -> Solution:
-        part = next(part for part in parts if i in part.trajectory_numbers)
-        assert part.ensemble.solution_builder is not None
-        return part.ensemble.solution_builder(many, i)
+    def build_solution(ensemble: Ensemble, i: int) -> Solution:
+        member_subset = next(subset for subset in subsets if i in subset.trajectory_numbers)
+        assert member_subset.ensemble.solution_builder is not None
+        return member_subset.ensemble.solution_builder(ensemble, i)
 
-    witnesses = [e.evidence_source for e in ensembles]
+    evidence_sources = [e.evidence_source for e in ensembles]
     conserved = [set(e.laws.conserved) for e in ensembles]
     promised = set.intersection(*conserved)
-    others = [name for e in ensembles for name in (*e.laws.conserved, *e.laws.unpromised) if name not in promised]
+    not_promised = [name for e in ensembles for name in (*e.laws.conserved, *e.laws.unpromised) if name not in promised]
     laws = replace(
-        first.laws,
-        conserved=tuple(name for name in first.laws.conserved if name in promised),
-        unpromised=tuple(dict.fromkeys(others)),
+        first_ensemble.laws,
+        conserved=tuple(name for name in first_ensemble.laws.conserved if name in promised),
+        unpromised=tuple(dict.fromkeys(not_promised)),
     )
-    whole: dict[str, Any] = {
+    joined_fields: dict[str, Any] = {
         name: joined_field(name) for name in (*STATE_FIELDS, *TIME_SERIES_FIELDS, *PER_MEMBER_FIELDS)
     }
     return replace(
-        first,
-        **whole,
+        first_ensemble,
+        **joined_fields,
         laws=laws,
         engine=engine,
         evidence_source=None
-        if None in witnesses
-        else lambda: merge_evidence([w() for w in witnesses if w is not None]),
+        if None in evidence_sources
+        else lambda: merge_evidence(
+            [evidence_source() for evidence_source in evidence_sources if evidence_source is not None]
+        ),
         solution_builder=build_solution,
         **fields,
     )

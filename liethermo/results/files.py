@@ -1,4 +1,4 @@
-"""Solutions and ensembles in NetCDF files: written whole, sealed, and checked before they are read."""
+"""Solutions and ensembles in NetCDF files, written atomically and verified by a checksum."""
 
 from __future__ import annotations
 
@@ -27,20 +27,26 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-SOLUTION_FORMAT, FORMATS_WITHOUT_CHECKSUM = "liethermo-solution-2", ("liethermo-solution-1",)
+SOLUTION_FORMAT = "liethermo-solution-2"
+"""Format name in the file of a solution."""
+
+FORMATS_WITHOUT_CHECKSUM = ("liethermo-solution-1",)
+"""Older formats, which can be read but have no checksum."""
+
 ENSEMBLE_FORMAT = "liethermo-ensemble-1"
+"""Format name in the file of an ensemble."""
 
 FILE_ATTRIBUTES = tuple(
     "format times status stats laws evidence provenance event_time engine wall_time reasons sha256".split()
 )
-"""What a file may have."""
+"""Attributes that a file may have."""
 
 CHECKSUM_TAG = b"\nliethermo sha256 "
-"""What comes after the end of the NetCDF file, with the digest of all before it."""
+"""Tag after the end of the NetCDF file, followed by the digest of all bytes before it."""
 
 
 MAX_COMPRESSION_RATIO = 2_000
-"""How many times as large as a file its content can be: numbers of one value alone take hardly any place."""
+"""Largest ratio of the size of the content to the size of its file: equal numbers compress to almost nothing."""
 
 LONG_NAMES = {
     "time": "time",
@@ -60,10 +66,11 @@ LONG_NAMES = {
     "invariant_name": "names of the recorded functions",
     "invariant": "Casimirs, momentum maps, preserved functions and what comes from outside",
 }
+"""Long name of each variable in a file."""
 
 
 def state_axis_names(axes: int) -> list[str]:
-    """The names of the axes of a state: those of its sites, if it has any, and its components."""
+    """Return the names of the axes of a state: its sites, if it has any, and its components."""
     sites = ["site"] if axes == 2 else [f"site_{i + 1}" for i in range(axes - 1)]
     return [*sites, "component"]
 
@@ -75,34 +82,36 @@ def build_dataset(
     laws: Laws,
     units: Mapping[str, str] | None,
 ) -> xarray.Dataset:
-    """The dataset of a result: what each variable is, its unit, the law that is promised of it, and a checksum."""
+    """Return the dataset of a result, with a long name, a unit and a promised law for each variable, and a checksum."""
     import xarray
 
     dataset, units = xarray.Dataset(variables, coordinates, attributes), units or {}
-    unknown = [name for name in units if name not in dataset.variables]
-    if unknown:
-        raise InputError(f"a result has no variable {unknown[0]!r}; it has {', '.join(map(str, dataset.variables))}")
-    promised = {"energy": laws.energy, "entropy": laws.entropy}
+    unknown_names = [name for name in units if name not in dataset.variables]
+    if unknown_names:
+        raise InputError(
+            f"a result has no variable {unknown_names[0]!r}; it has {', '.join(map(str, dataset.variables))}"
+        )
+    laws_by_variable = {"energy": laws.energy, "entropy": laws.entropy}
     for name, variable in dataset.variables.items():
-        said = {
+        variable_attributes = {
             "long_name": LONG_NAMES.get(str(name), str(name).replace("_", " ")),
             "units": units.get(str(name)),
-            "law": promised.get(str(name)),
+            "law": laws_by_variable.get(str(name)),
         }
-        variable.attrs.update({key: text for key, text in said.items() if text is not None})
+        variable.attrs.update({key: text for key, text in variable_attributes.items() if text is not None})
     content = {str(name): values.to_numpy() for name, values in dataset.variables.items()}
     return dataset.assign_attrs(sha256=checksum(content, attributes))
 
 
 class SaveableResult(ABC):
-    """What can be kept in a file, from which :func:`liethermo.load` brings it back."""
+    """A result that can be saved to a file, which :func:`liethermo.load` reads."""
 
     @abstractmethod
     def to_xarray(self, units: Mapping[str, str] | None = None) -> xarray.Dataset:
-        """The whole as a dataset, its variables with these units."""
+        """Return the result as a dataset whose variables have these units."""
 
     def save(self, path: str | os.PathLike, units: Mapping[str, str] | None = None) -> Path:
-        """Write a NetCDF file, which :func:`load` reads; it appears whole or not at all.
+        """Write a NetCDF file, which :func:`load` reads; it is complete or does not appear at all.
 
         Parameters
         ----------
@@ -121,22 +130,22 @@ class SaveableResult(ABC):
 
 
 def write_dataset(dataset: xarray.Dataset, path: str | os.PathLike) -> Path:
-    """Write a NetCDF file; it appears whole or not at all.
+    """Write a NetCDF file; it is complete or does not appear at all.
 
-    HDF5 makes it in memory, since it does not survive a disk that is full.
+    HDF5 writes it to memory, because it does not survive a full disk.
     """
     path = Path(path)
-    numbers = [name for name, v in dataset.variables.items() if v.dtype.kind == "f" and v.size]
-    made = io.BytesIO()
+    float_names = [name for name, v in dataset.variables.items() if v.dtype.kind == "f" and v.size]
+    buffer = io.BytesIO()
     with _synchronous_dask():
-        dataset.to_netcdf(made, engine="h5netcdf", encoding={name: {"fletcher32": True} for name in numbers})
-    made.seek(0, io.SEEK_END)
-    made.write(CHECKSUM_TAG + hashlib.sha256(made.getbuffer()).hexdigest().encode())
+        dataset.to_netcdf(buffer, engine="h5netcdf", encoding={name: {"fletcher32": True} for name in float_names})
+    buffer.seek(0, io.SEEK_END)
+    buffer.write(CHECKSUM_TAG + hashlib.sha256(buffer.getbuffer()).hexdigest().encode())
     try:
-        disk.write_atomically(path, made.getbuffer())
-    except (OSError, ValueError) as error:  # the latter for what is no path
+        disk.write_atomically(path, buffer.getbuffer())
+    except (OSError, ValueError) as error:  # ValueError for an invalid path
         raise FileError(
-            f"cannot write {path!s:.200}: {disk.why_os_failed(error)}. The result itself is as it was"
+            f"cannot write {path!s:.200}: {disk.why_os_failed(error)}. The result in memory is unchanged"
         ) from error
     disk.remove_dead_parts(path.parent, path.name)
     return path
@@ -144,7 +153,7 @@ def write_dataset(dataset: xarray.Dataset, path: str | os.PathLike) -> Path:
 
 @contextlib.contextmanager
 def _synchronous_dask() -> Iterator[None]:
-    """Let xarray ask no scheduler of Dask for a lock: where there is a client, it might be one that is gone."""
+    """Keep xarray from asking a scheduler of Dask for a lock: a client might be of a scheduler that is gone."""
     if "dask" not in sys.modules:
         yield
         return
@@ -155,7 +164,7 @@ def _synchronous_dask() -> Iterator[None]:
 
 
 def read_dataset(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The variables and the attributes of a file that :func:`write` wrote, checked.
+    """Return the variables and the attributes of a file that :func:`write_dataset` wrote, after checking it.
 
     Raises
     ------
@@ -165,7 +174,7 @@ def read_dataset(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[s
     Warns
     -----
     UserWarning
-        If an earlier version wrote the file, without a checksum: damage may show in nothing.
+        If an earlier version wrote the file, without a checksum, so that damage might not be noticed.
     """
     path = Path(path)
     try:
@@ -178,13 +187,13 @@ def read_dataset(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[s
         raise FileError(f"cannot read {path!s:.200}: {disk.why_os_failed(error)}") from error
     try:
         series, attributes = _read_hdf5(path)
-    except Exception as error:  # the readers beneath raise a dozen kinds for a broken file
+    except Exception as error:  # HDF5's readers raise a dozen kinds of errors for a broken file
         raise FileError(
-            f"{path} cannot be read as NetCDF: it is cut short, damaged or of another kind ({error})"
+            f"{path} cannot be read as NetCDF: it is cut short, damaged or of another format. {error}"
         ) from error
     if attributes.get("format") not in (SOLUTION_FORMAT, ENSEMBLE_FORMAT, *FORMATS_WITHOUT_CHECKSUM):
         raise FileError(
-            f"{path} is a NetCDF file, but not a liethermo result (its format is {attributes.get('format')!r})"
+            f"{path} is not a liethermo result: the format of this NetCDF file is {attributes.get('format')!r}"
         )
     if attributes["format"] in FORMATS_WITHOUT_CHECKSUM:
         warn(f"{path} has no checksum, as an earlier version wrote it: damage would not show")
@@ -194,105 +203,111 @@ def read_dataset(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[s
 
 
 def _check_file_digest(path: Path) -> None:
-    """Before HDF5 sees the file: a damaged one can keep its reader in an endless loop.
+    """Raise FileError if the digest after the end of a file does not fit, before HDF5 opens it.
 
-    A file without a seal is let through: programs that write to an HDF5 file may cut off what follows its end.
+    A damaged file can keep the reader of HDF5 in an endless loop. A file without a digest is let through: programs that
+    write to an HDF5 file may cut off what follows its end.
     """
-    length = len(CHECKSUM_TAG) + 2 * hashlib.sha256().digest_size
-    whole = path.stat().st_size - length
-    if whole < 0:
+    tag_length = len(CHECKSUM_TAG) + 2 * hashlib.sha256().digest_size
+    content_length = path.stat().st_size - tag_length
+    if content_length < 0:
         return
     with open(path, "rb") as file:
-        file.seek(whole)
+        file.seek(content_length)
         end = file.read()
-    if end.startswith(CHECKSUM_TAG) and end != CHECKSUM_TAG + _sha256_of_prefix(path, whole):
+    if end.startswith(CHECKSUM_TAG) and end != CHECKSUM_TAG + _sha256_of_prefix(path, content_length):
         raise FileError(f"{path} is damaged, or was changed: it does not have the checksum that it was written with")
 
 
-def _sha256_of_prefix(path: Path, length: int) -> bytes:
-    """SHA-256 of the beginning of a file, in hexadecimal digits."""
-    found = hashlib.sha256()
+def _sha256_of_prefix(path: Path, n_remaining: int) -> bytes:
+    """Return the SHA-256 of the first ``n_remaining`` bytes of a file, in hexadecimal digits."""
+    digest = hashlib.sha256()
     with open(path, "rb") as file:
-        while length > 0:
-            part = file.read(min(length, 2**20))
-            if not part:
+        while n_remaining > 0:
+            chunk = file.read(min(n_remaining, 2**20))
+            if not chunk:
                 break
-            found.update(part)
-            length -= len(part)
-    return found.hexdigest().encode()
+            digest.update(chunk)
+            n_remaining -= len(chunk)
+    return digest.hexdigest().encode()
 
 
 def _read_hdf5(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The variables of a file by name, and its attributes."""
-    import h5py  # not through h5netcdf, which prints a traceback of its own for a file that it cannot open
+    """Return the variables of a file by name, and its attributes."""
+    import h5py  # not through h5netcdf, which prints a traceback if it cannot open a file
 
     with h5py.File(path) as file:
-        for name in file:  # before anything that they lead to is opened
+        for name in file:  # before any link is followed
             if not isinstance(file.get(name, getlink=True), h5py.HardLink):
                 raise ValueError(f"{name!r} is a link to another place")
-        found = {name: v for name, v in file.items() if not _is_dimension_scale(v)}
-        for name, v in found.items():
+        variables = {name: v for name, v in file.items() if not _is_dimension_scale(v)}
+        for name, v in variables.items():
             if not isinstance(v, h5py.Dataset) or v.is_virtual or v.external:
                 raise ValueError(f"{name!r} is not an array of this file")
             if v.size * max(v.dtype.itemsize, 1) > MAX_COMPRESSION_RATIO * path.stat().st_size:
-                raise ValueError(f"{name!r} says that it is larger than the file can hold")
+                raise ValueError(f"{name!r} claims to be larger than the file can hold")
         series = {
-            name: np.array(v.asstr()[...] if h5py.check_string_dtype(v.dtype) else v[...]) for name, v in found.items()
+            name: np.array(v.asstr()[...] if h5py.check_string_dtype(v.dtype) else v[...])
+            for name, v in variables.items()
         }
-        said = {name: np.asarray(file.attrs[name]).item() for name in FILE_ATTRIBUTES if name in file.attrs}
-        return series, said
+        attributes = {name: np.asarray(file.attrs[name]).item() for name in FILE_ATTRIBUTES if name in file.attrs}
+        return series, attributes
 
 
 def _is_dimension_scale(variable) -> bool:
-    """Whether a variable is but the length of a dimension."""
+    """Return whether a variable only stores the length of a dimension."""
     return bytes(variable.attrs.get("NAME", b"")).startswith(b"This is a netCDF dimension but not a netCDF variable")
 
 
-def dataclass_from_json(kind: type[T], stored: Any) -> T:
-    """An object of a dataclass from the JSON data that it was written as; ValueError where that is something else."""
+def dataclass_from_json(cls: type[T], data: Any) -> T:
+    """Build an object of the dataclass ``cls`` from JSON data; ValueError if the data do not fit."""
     import pydantic
 
-    known = {field.name for field in fields(kind)}  # type: ignore[arg-type]
-    if not isinstance(stored, dict) or not known.issuperset(stored):
-        raise ValueError(f"it has no {kind.__name__.lower()} as this version writes it")
+    field_names = {field.name for field in fields(cls)}  # type: ignore[arg-type]
+    if not isinstance(data, dict) or not field_names.issuperset(data):
+        raise ValueError(f"its {cls.__name__.lower()} was not written by this version")
     try:
-        return pydantic.TypeAdapter(kind).validate_python(stored)
+        return pydantic.TypeAdapter(cls).validate_python(data)
     except pydantic.ValidationError as error:
-        fault = error.errors()[0]
-        at = ".".join(map(str, fault["loc"]))
-        raise ValueError(f"its {kind.__name__.lower()} cannot be used: {at} {fault['msg']}") from None
+        first_error = error.errors()[0]
+        location = ".".join(map(str, first_error["loc"]))
+        raise ValueError(f"its {cls.__name__.lower()} cannot be used: {location} {first_error['msg']}") from None
 
 
 def array_of_shape(series: Mapping[str, np.ndarray], name: str, *shapes: tuple[int | None, ...]) -> np.ndarray:
-    """An array of a file; ValueError unless it has numbers, in one of these shapes, where None stands for any size."""
-    found = series[name]
-    fits = [len(s) == found.ndim and all(n in (None, m) for n, m in zip(s, found.shape, strict=True)) for s in shapes]
-    if found.dtype.kind not in "fiu" or not any(fits):
-        raise ValueError(f"{name!r} is an array of {found.dtype}, shape {found.shape}, which does not fit the others")
-    return found
+    """Return a numeric array of a file; ValueError unless it has one of the shapes, where None is any length."""
+    array = series[name]
+    matches = [
+        len(s) == array.ndim and all(n in (None, m) for n, m in zip(s, array.shape, strict=True)) for s in shapes
+    ]
+    if array.dtype.kind not in "fiu" or not any(matches):
+        raise ValueError(f"{name!r} is an array of {array.dtype}, shape {array.shape}, which does not fit the others")
+    return array
 
 
 def split_complex(values: np.ndarray) -> np.ndarray:
-    """Matrices with real and imaginary parts along a last axis: NetCDF has no complex numbers."""
+    """Return matrices with real and imaginary parts along a last axis, because NetCDF has no complex numbers."""
     return np.stack([values.real, values.imag][: 1 + np.iscomplexobj(values)], axis=-1)
 
 
 def join_complex(parts: np.ndarray) -> np.ndarray:
-    """The inverse of :func:`split_complex`."""
+    """Return the matrices that :func:`split_complex` has split."""
     return parts[..., 0] if parts.shape[-1] == 1 else parts[..., 0] + 1j * parts[..., 1]
 
 
 def checksum(series: Mapping[str, np.ndarray], attributes: Mapping[str, Any]) -> str:
-    """SHA-256 of the names, types, shapes and bytes of all variables, and of the attributes."""
-    found = hashlib.sha256()
+    """Return the SHA-256 of the names, types, shapes and bytes of all variables, and of the attributes."""
+    digest = hashlib.sha256()
     for name in sorted(series):
         values = np.asarray(series[name])
-        text = values.dtype.kind in "OUS"
-        kind = "text" if text or not values.size else values.dtype.newbyteorder("<").str
-        found.update(json.dumps([name, kind, values.shape]).encode())
-        found.update(
-            json.dumps(values.tolist()).encode() if kind == "text" else values.astype(kind, order="C").tobytes()
+        is_text = values.dtype.kind in "OUS"
+        type_code = "text" if is_text or not values.size else values.dtype.newbyteorder("<").str
+        digest.update(json.dumps([name, type_code, values.shape]).encode())
+        digest.update(
+            json.dumps(values.tolist()).encode()
+            if type_code == "text"
+            else values.astype(type_code, order="C").tobytes()
         )
-    said = [[name, str(attributes[name])] for name in FILE_ATTRIBUTES[:-1] if name in attributes]
-    found.update(json.dumps(said).encode())
-    return found.hexdigest()
+    stored_attributes = [[name, str(attributes[name])] for name in FILE_ATTRIBUTES[:-1] if name in attributes]
+    digest.update(json.dumps(stored_attributes).encode())
+    return digest.hexdigest()

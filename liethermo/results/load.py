@@ -1,4 +1,4 @@
-"""Results from files, whatever they are of."""
+"""Reading of results from files."""
 
 from __future__ import annotations
 

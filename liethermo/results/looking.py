@@ -1,6 +1,6 @@
-"""The steps of a run that an audit looks at: all of them, or those where the motion is fastest.
+"""Steps of a run that an audit checks: all of them, or those where the motion is fastest.
 
-Each is compared with the vector field at its ends and at places between, so that what a step jumps over is seen.
+Each step is compared with the vector field at its ends and at points between, so that it cannot jump over a feature.
 """
 
 from __future__ import annotations
@@ -14,30 +14,30 @@ from ..systems import System
 from ..tracing.interpret import evaluate_at_points
 
 MAX_SAMPLED_VALUES = 500_000
-"""Numbers in the states of all steps that are looked at."""
+"""Largest number of components in the states of all steps that are checked."""
 
 REPLAY_COST_RATIO = 5
-"""Cost of a step that has to be taken again to be looked at, over that of one both ends of which are kept."""
+"""Cost of checking a step that must be repeated, relative to one whose end states are saved."""
 
 DEFECT_POINTS_RANGE = (4, 32)
-"""Places between the ends of a step where it is compared with the field, the least and the most."""
+"""Smallest and largest number of points inside a step at which it is compared with the field."""
 
 MAX_FIELD_VALUES_PER_CALL = 200_000
-"""Numbers in the states at which the field is evaluated at once: bounded memory."""
+"""Largest number of components in the states at which the field is evaluated in one call, to bound the memory."""
 
 MIN_SAMPLED_STEPS = 8
-"""States at which the speed of the motion is looked at, and steps that are looked at, however large the system is."""
+"""Number of states, and of steps, that are checked at least, however large the system is."""
 
 
 class StepSample(NamedTuple):
-    """Steps of a run, in any order.
+    """Sample of the steps of a run, in any order.
 
     Attributes
     ----------
     t, h : array, shape (m,)
-        When they begin, and their sizes.
+        Times at which the steps begin, and their sizes.
     x, x_end : array, shape (m, n)
-        The states at their ends.
+        States at which they begin and end.
     """
 
     t: np.ndarray
@@ -47,92 +47,101 @@ class StepSample(NamedTuple):
 
 
 def sample_steps(system: System, x: np.ndarray, t: np.ndarray, h: np.ndarray, replay: Callable) -> StepSample:
-    """All the steps of a run, or as many as can be afforded.
+    """Return all steps of a run, or as many as are affordable, those with the fastest motion first.
 
     Parameters
     ----------
     x : array, shape (times, n)
-        The states that are kept.
+        Saved states.
     t, h : array, shape (times,) and (times - 1,)
-        Their times; the size of the step from each.
+        Their times; the size of the steps from each.
     replay : function of (x, h, steps) to an array, shape (at most steps, n)
-        The states after steps that are taken again.
+        Returns the states after repeated steps.
     """
     gaps = np.diff(t)
     counts = np.rint(gaps / h)
-    alike = (counts > 0) & (np.abs(gaps - counts * h) <= 1e-6 * h)  # as many steps of that size lead to the next state
-    counts = np.where(alike, counts, 1).astype(int)
-    kept = alike & (counts == 1)
-    costs, left = (
-        np.where(kept, 1, REPLAY_COST_RATIO * counts),
-        max(MIN_SAMPLED_STEPS * REPLAY_COST_RATIO, MAX_SAMPLED_VALUES // x.shape[1]),
-    )
+    # whether ``counts`` steps of size h lead from a saved state to the next
+    is_uniform = (counts > 0) & (np.abs(gaps - counts * h) <= 1e-6 * h)
+    counts = np.where(is_uniform, counts, 1).astype(int)
+    has_both_ends = is_uniform & (counts == 1)
+    costs = np.where(has_both_ends, 1, REPLAY_COST_RATIO * counts)
+    budget = max(MIN_SAMPLED_STEPS * REPLAY_COST_RATIO, MAX_SAMPLED_VALUES // x.shape[1])
     order = (
         np.arange(len(h))
-        if costs.sum() <= left
-        else _order_by_field_change(system, x, h, max(MIN_SAMPLED_STEPS, left // 4))
+        if costs.sum() <= budget
+        else _order_by_field_change(system, x, h, max(MIN_SAMPLED_STEPS, budget // 4))
     )
-    spent = np.cumsum(costs[order])
-    order = order[spent - costs[order] < left]
-    if kept[order].all():
+    cumulative_cost = np.cumsum(costs[order])
+    order = order[cumulative_cost - costs[order] < budget]
+    if has_both_ends[order].all():
         return StepSample(t[order], h[order], x[order], x[order + 1])
-    found: list[StepSample] = []
+    samples: list[StepSample] = []
     for i in order:
-        path = x[i : i + 2]
-        if not kept[i]:
-            path = np.vstack([x[i], replay(x[i], h[i], min(counts[i], -(-left // REPLAY_COST_RATIO)))])
-        size = np.full(len(path) - 1, h[i])
-        found.append(StepSample(t[i] + h[i] * np.arange(len(size)), size, path[:-1], path[1:]))
-        left -= costs[i]
-    return StepSample(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+        states = x[i : i + 2]
+        if not has_both_ends[i]:
+            states = np.vstack([x[i], replay(x[i], h[i], min(counts[i], -(-budget // REPLAY_COST_RATIO)))])
+        step_sizes = np.full(len(states) - 1, h[i])
+        samples.append(StepSample(t[i] + h[i] * np.arange(len(step_sizes)), step_sizes, states[:-1], states[1:]))
+        budget -= costs[i]
+    return StepSample(*(np.concatenate(arrays) for arrays in zip(*samples, strict=True)))
 
 
-def _order_by_field_change(system: System, x: np.ndarray, h: np.ndarray, most: int) -> np.ndarray:
-    """The places of all steps, those first near which a step changes the field most: looked at from ``most`` states."""
-    some = np.unique(np.linspace(0, len(h) - 1, min(most, len(h))).astype(int))
-    before = vector_field_at(system, x[some])
-    step = h[some, None] * before
-    change = np.abs(h[some, None] * vector_field_at(system, x[some] + 0.5 * step) - step).max(axis=1)
+def _order_by_field_change(system: System, x: np.ndarray, h: np.ndarray, max_states: int) -> np.ndarray:
+    """Return the indices of all steps, by decreasing change of the field, evaluated at ``max_states`` states."""
+    indices = np.unique(np.linspace(0, len(h) - 1, min(max_states, len(h))).astype(int))
+    field = vector_field_at(system, x[indices])
+    step = h[indices, None] * field
+    change = np.abs(h[indices, None] * vector_field_at(system, x[indices] + 0.5 * step) - step).max(axis=1)
     change = np.nan_to_num(change, nan=np.inf)
-    ends = np.maximum(change, np.append(change[1:], 0.0))  # between two states that were seen
-    block = np.searchsorted(some, np.arange(len(h)), side="right") - 1
-    return np.lexsort([np.arange(len(h)), -ends[block]])
+    interval_change = np.maximum(change, np.append(change[1:], 0.0))  # for the interval between two sampled states
+    interval = np.searchsorted(indices, np.arange(len(h)), side="right") - 1
+    return np.lexsort([np.arange(len(h)), -interval_change[interval]])
 
 
 def hermite_defect(field: Callable, steps: StepSample) -> np.ndarray:
-    """How far the cubic through the ends of each step, with the field as its slopes, misses the field, shape (m,).
+    """Return the defect of the cubic Hermite interpolant of each step relative to the field, shape (m,).
 
-    The mean over places between, times the size of the step: about what the state at the end is off by, for a method of
-    order three. It ranks steps. At a place where the field is not finite nothing is known.
+    The defect is the mean over points inside the step, times the step size: about the local error of a method of order
+    three. It serves to rank steps. Points where the field is not finite do not decide.
 
     Parameters
     ----------
-    field : function of the places of steps and an array, shape (places, q, n), to an array of that shape
+    field : function of step indices and states, shape (steps, q, n), to an array of that shape
         The vector field.
     """
-    number, n = steps.x.shape
-    places = int(np.clip(MAX_SAMPLED_VALUES // max(number * n, 1), *DEFECT_POINTS_RANGE))
-    theta = (np.arange(places) + 0.5)[:, None] / places
-    left = 1.0 - theta
-    value = left**2 * (1 + 2 * theta), theta * left**2, theta**2 * (3 - 2 * theta), -(theta**2) * left
-    slope = -6 * theta * left, left * (1 - 3 * theta), 6 * theta * left, theta * (3 * theta - 2)
-    found, size = np.zeros(number), max(1, MAX_FIELD_VALUES_PER_CALL // (n * places))
-    for first in range(0, number, size):
-        part = np.arange(first, min(first + size, number))
-        x, end, h = steps.x[part], steps.x_end[part], steps.h[part, None]
-        ends = np.stack([x, end], axis=1)
-        slopes = h[:, None] * field(part, ends)
+    n_steps, n = steps.x.shape
+    n_points = int(np.clip(MAX_SAMPLED_VALUES // max(n_steps * n, 1), *DEFECT_POINTS_RANGE))
+    theta = (np.arange(n_points) + 0.5)[:, None] / n_points
+    one_minus_theta = 1.0 - theta
+    value_weights = (
+        one_minus_theta**2 * (1 + 2 * theta),
+        theta * one_minus_theta**2,
+        theta**2 * (3 - 2 * theta),
+        -(theta**2) * one_minus_theta,
+    )
+    slope_weights = (
+        -6 * theta * one_minus_theta,
+        one_minus_theta * (1 - 3 * theta),
+        6 * theta * one_minus_theta,
+        theta * (3 * theta - 2),
+    )
+    defects, block_size = np.zeros(n_steps), max(1, MAX_FIELD_VALUES_PER_CALL // (n * n_points))
+    for start in range(0, n_steps, block_size):
+        indices = np.arange(start, min(start + block_size, n_steps))
+        x, x_end, h = steps.x[indices], steps.x_end[indices], steps.h[indices, None]
+        ends = np.stack([x, x_end], axis=1)
+        slopes = h[:, None] * field(indices, ends)
         data = [v[:, i : i + 1] for i in (0, 1) for v in (ends, slopes)]
-        between = sum(c * v for c, v in zip(value, data, strict=True))
-        defect = np.abs(h[:, None] * field(part, between) - sum(c * v for c, v in zip(slope, data, strict=True))).max(
-            axis=2
-        )
-        found[part] = np.nan_to_num(defect, nan=0.0, posinf=1e300).mean(axis=1)
-    return found
+        cubic_states = sum(c * v for c, v in zip(value_weights, data, strict=True))
+        defect = np.abs(
+            h[:, None] * field(indices, cubic_states) - sum(c * v for c, v in zip(slope_weights, data, strict=True))
+        ).max(axis=2)
+        defects[indices] = np.nan_to_num(defect, nan=0.0, posinf=1e300).mean(axis=1)
+    return defects
 
 
 def vector_field_at(system: System, x: np.ndarray) -> np.ndarray:
-    """The vector field at states, shape (m, n)."""
+    """Return the vector field at states, shape (m, n)."""
     with np.errstate(all="ignore"):
         return np.asarray(evaluate_at_points(_vector_field, system, x))
 

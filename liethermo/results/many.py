@@ -1,4 +1,4 @@
-"""The laws of many trajectories at once: what was measured along each, and what is allowed there."""
+"""Laws of an ensemble: the measured value and its limit for each trajectory."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from .status import Laws
 
 @dataclass(frozen=True)
 class EnsembleLaw:
-    """One law.
+    """A law of an ensemble, as each trajectory obeys it.
 
     Attributes
     ----------
     law : str
     values, limits : ndarray, shape (B,)
-        What was measured of it along each trajectory; what is allowed.
+        Measured value along each trajectory; largest value allowed.
     """
 
     law: str
@@ -28,51 +28,62 @@ class EnsembleLaw:
 
     @property
     def is_violated(self) -> np.ndarray:
-        """By which trajectories, shape (B,)."""
+        """True for each trajectory that violates the law, shape (B,)."""
         return ~(self.values <= self.limits)
 
     @property
     def worst_member(self) -> int:
-        """The trajectory that kept it worst."""
+        """Index of the trajectory whose value exceeds its limit by most, or comes nearest to it."""
         return int(np.argmax(self.values - self.limits))
 
     def audit_row(self, i: int, note: str = "") -> AuditRow:
-        """The law as trajectory i kept it."""
+        """Return the audit row of the law for trajectory i."""
         return AuditRow(self.law, float(self.values[i]), float(self.limits[i]), not self.is_violated[i], note)
 
 
 def evaluate_ensemble_laws(
-    many: Any, laws: Laws, accepted: Tolerances, energy_terms: Any = 0.0, entropy_terms: Any = 0.0
+    ensemble: Any, laws: Laws, tolerances: Tolerances, energy_terms: Any = 0.0, entropy_terms: Any = 0.0
 ) -> list[EnsembleLaw]:
-    """How each law was kept; a trajectory that took no step has kept them all.
+    """Return the laws of an ensemble as each trajectory obeys them; a trajectory without a step obeys all.
 
     Parameters
     ----------
-    many : Ensemble, or what has its arrays of numbers
+    ensemble : Ensemble, or an object with its numeric arrays
     laws : Laws
-        What is promised of each.
-    accepted : Tolerances
+        Laws promised of each trajectory.
+    tolerances : Tolerances
     energy_terms, entropy_terms : float or array, shape (B,)
-        Sizes of the largest terms that the values of energy and entropy are computed from.
+        Magnitudes of the largest terms of which energy and entropy are sums.
     """
-    found, moved, name = [], many.steps > 0, " minus ".join(["energy", *laws.balance])
+    ensemble_laws, has_stepped, name = [], ensemble.steps > 0, " minus ".join(["energy", *laws.balance])
 
-    def ensemble_law(law: str, values, allowed) -> EnsembleLaw:
-        return EnsembleLaw(law, np.where(moved, values, 0.0), np.where(moved, allowed, 0.0))
+    def ensemble_law(law: str, values, limits) -> EnsembleLaw:
+        return EnsembleLaw(law, np.where(has_stepped, values, 0.0), np.where(has_stepped, limits, 0.0))
 
-    rounding = RoundingScale(many.first_energy, many.energy_sensitivity, energy_terms)
+    rounding = RoundingScale(ensemble.first_energy, ensemble.energy_sensitivity, energy_terms)
     if laws.energy == "conserved":
-        found.append(ensemble_law(f"{name} drift", many.energy_drift, rounding.allowed_change(accepted.energy)))
-    elif laws.energy == "nonincreasing":
-        increment = many.largest_energy_increment / rounding.scale
-        found.append(ensemble_law(f"relative {name} increment", increment, rounding.allowed_change(accepted.energy)))
-    if laws.entropy == "nondecreasing":
-        rounding = RoundingScale(many.entropy_scale, many.entropy_sensitivity, entropy_terms)
-        fall = -many.least_entropy_increment / rounding.scale
-        found.append(ensemble_law("relative fall of the entropy", fall, rounding.allowed_change(accepted.entropy)))
-        in_all = ensemble_law(
-            "the same in all", -many.entropy_change / rounding.scale, rounding.allowed_change(accepted.casimirs)
+        ensemble_laws.append(
+            ensemble_law(f"{name} drift", ensemble.energy_drift, rounding.allowed_change(tolerances.energy))
         )
-        found += [in_all] if in_all.is_violated.any() else []  # each step below what rounding hides
-    found.append(ensemble_law("stage residual", np.where(many.ok, many.residual, 0.0), accepted.residual))
-    return found
+    elif laws.energy == "nonincreasing":
+        increment = ensemble.largest_energy_increment / rounding.scale
+        ensemble_laws.append(
+            ensemble_law(f"relative {name} increment", increment, rounding.allowed_change(tolerances.energy))
+        )
+    if laws.entropy == "nondecreasing":
+        rounding = RoundingScale(ensemble.entropy_scale, ensemble.entropy_sensitivity, entropy_terms)
+        fall = -ensemble.least_entropy_increment / rounding.scale
+        ensemble_laws.append(
+            ensemble_law("relative fall of the entropy", fall, rounding.allowed_change(tolerances.entropy))
+        )
+        total_fall_law = ensemble_law(
+            "relative fall of the entropy in all",
+            -ensemble.entropy_change / rounding.scale,
+            rounding.allowed_change(tolerances.casimirs),
+        )
+        if total_fall_law.is_violated.any():  # although each step is within the rounding
+            ensemble_laws.append(total_fall_law)
+    ensemble_laws.append(
+        ensemble_law("stage residual", np.where(ensemble.ok, ensemble.residual, 0.0), tolerances.residual)
+    )
+    return ensemble_laws

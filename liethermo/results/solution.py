@@ -1,4 +1,4 @@
-"""What a run returns: the trajectory, the record of its laws, how it ended, and where it came from."""
+"""Result of a run: the trajectory, its laws, its status and its provenance."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from .status import Laws, Stats, Status
 
 @dataclass(frozen=True)
 class Solution(AuditableResult):
-    """A trajectory with its laws.
+    """The result of a run: times, states, energy, entropy and conserved quantities.
 
     Attributes
     ----------
@@ -52,11 +52,11 @@ class Solution(AuditableResult):
     provenance : dict
         Library version, method, step, system, date, spec: JSON data.
     event_time : float or None
-        When the event of ``integrate(until=...)`` happened.
-    dense : Dense or None
+        Time of the event of ``integrate(until=...)``.
+    dense : DenseOutput or None
         The states between the steps (``integrate(dense=True)``); not written to files.
     attitude : ndarray, shape (times, m, m), or None
-        Elements of the group of the system, where it has one.
+        Elements of the group of the system, if it has one.
     evidence : Evidence
         The data that an audit needs besides the series: computed at its first use, and saved in files.
 
@@ -86,9 +86,9 @@ class Solution(AuditableResult):
 
     @with_library_settings
     def __call__(self, t) -> np.ndarray:
-        """States at any times, shape (..., n): each is where a step ends that begins at the last state before.
+        """Return the states at times t, shape (..., n): ends of steps that begin at the last state before.
 
-        So it has the order of the method, and the laws hold there too.
+        Such a state has the order of the method and obeys its laws.
 
         Raises
         ------
@@ -97,17 +97,17 @@ class Solution(AuditableResult):
         """
         if self.dense is None:
             raise InputError("this solution has no dense output; ask for it with integrate(..., dense=True)")
-        found = self.dense(t)
-        return found.reshape(*found.shape[:-1], *self.x.shape[1:])
+        states = self.dense(t)
+        return states.reshape(*states.shape[:-1], *self.x.shape[1:])
 
     @property
     def energy_balance(self) -> np.ndarray:
-        """The energy less the work done from outside, shape (times,): what the first law keeps of a driven system."""
+        """The energy less the work done from outside, shape (times,); driven systems conserve it."""
         return self.energy - sum(self.casimirs[name] for name in self.laws.balance)
 
     @with_library_settings
     def audit(self, **tolerances: float) -> Audit:
-        """Whether the laws held and the steps resolve the motion, as a table.
+        """Audit the run: judge whether the laws held and the steps resolve the motion, as a table.
 
         The first call examines the steps: all of them in runs of ordinary length, otherwise those where the motion is
         fastest, and the verdict then says how many. It computes the worst of them again.
@@ -115,23 +115,23 @@ class Solution(AuditableResult):
         Parameters
         ----------
         energy, entropy, casimirs, residual, attitude, accuracy, consistency : float
-            The accepted deviation of each, relative (dimensionless): see :class:`liethermo.results.audit.Tolerances`.
+            Tolerance of each, relative (dimensionless): see :class:`liethermo.results.audit.Tolerances`.
 
         Raises
         ------
         InputError
-            If there is no tolerance of a name, or it is negative.
+            If the name of a tolerance is unknown, or a tolerance is negative.
         """
         return audit_run(self, Tolerances.with_defaults(**tolerances))
 
     def with_provenance(self, **entries) -> Solution:
-        """The same solution with more said about where it comes from."""
+        """Return this solution with more entries in its provenance."""
         return replace(self, provenance={**self.provenance, **entries})
 
     def to_xarray(self, units: Mapping[str, str] | None = None) -> xarray.Dataset:
-        """An ``xarray.Dataset`` with coordinate ``time`` and all series; the rest as attributes (JSON).
+        """Return an ``xarray.Dataset`` with coordinate ``time`` and all series; the rest is in attributes (JSON).
 
-        Each variable says its long name, energy and entropy the law that the system promises of them. A body with
+        Each variable has a long name, energy and entropy also the law that the system promises of them. A body with
         attitudes has its ``quaternion``, ``nutation``, ``precession`` and ``spin`` too [:mod:`liethermo.bodies`].
 
         Parameters
@@ -173,7 +173,7 @@ class Solution(AuditableResult):
         return f"Solution({len(self.t)} times to t = {self.status.time:g}, {self.status.code})"
 
     def _repr_html_(self) -> str:
-        """What a notebook shows: how the run ended, and small pictures. The laws are for :meth:`audit` to judge."""
+        """Return a summary for notebooks: how the run ended, with small pictures, and without a verdict on the laws."""
         facts = [
             ("system", str(self.provenance.get("system", "-"))),
             ("method", str(self.provenance.get("method", "-"))),
@@ -189,8 +189,11 @@ class Solution(AuditableResult):
 
     @classmethod
     def from_file(cls, series: dict[str, np.ndarray], attributes: dict[str, Any]) -> Solution:
-        """From what :func:`.files.read` returns; KeyError, TypeError or ValueError where a part is missing."""
-        stored = {name: json.loads(attributes[name]) for name in ("status", "stats", "laws", "provenance")}
+        """Build a solution from the arrays and attributes of a file, as :func:`.files.read_dataset` returns them.
+
+        KeyError, TypeError or ValueError if a part is missing or does not fit.
+        """
+        json_data = {name: json.loads(attributes[name]) for name in ("status", "stats", "laws", "provenance")}
         t, x = array_of_shape(series, "time", (None,)), series["x"]
         if len(t) != int(attributes["times"]):
             raise ValueError(f"{len(t)} times of {attributes['times']}")
@@ -201,8 +204,8 @@ class Solution(AuditableResult):
             m = series["attitude"].shape[1:2]
             attitude = join_complex(array_of_shape(series, "attitude", *((len(t), *m, *m, parts) for parts in (1, 2))))
         event_time = json.loads(attributes.get("event_time", "null"))
-        if not isinstance(event_time, int | float | None) or not isinstance(stored["provenance"], dict):
-            raise ValueError("what is said of the run is not what this version writes")
+        if not isinstance(event_time, int | float | None) or not isinstance(json_data["provenance"], dict):
+            raise ValueError("its event_time is not a number, or its provenance is not a JSON object")
         evidence = dataclass_from_json(Evidence, json.loads(attributes.get("evidence", "{}")))
         return cls(
             t=t,
@@ -210,10 +213,10 @@ class Solution(AuditableResult):
             energy=array_of_shape(series, "energy", (len(t),)),
             entropy=entropy,
             casimirs=dict(zip(names, array_of_shape(series, "invariant", (len(names), len(t))), strict=True)),
-            status=dataclass_from_json(Status, stored["status"]),
-            stats=dataclass_from_json(Stats, stored["stats"]),
-            laws=dataclass_from_json(Laws, stored["laws"]),
-            provenance=stored["provenance"],
+            status=dataclass_from_json(Status, json_data["status"]),
+            stats=dataclass_from_json(Stats, json_data["stats"]),
+            laws=dataclass_from_json(Laws, json_data["laws"]),
+            provenance=json_data["provenance"],
             event_time=event_time,
             attitude=attitude,
             evidence_source=lambda: evidence,

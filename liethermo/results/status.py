@@ -1,4 +1,4 @@
-"""How a run ended, what it counted, and which laws it is judged by."""
+"""Status, statistics and laws of a run."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from ..errors import InputError
 
 @dataclass(frozen=True)
 class Status:
-    """How a run ended.
+    """Status of a run at its end: a code and a message.
 
     Attributes
     ----------
     code : {"completed", "event", "not_converged", "non_finite", "step_underflow", "step_limit", "interrupted", \
 "reference_failed", "inadmissible"}
-        Or its :class:`liethermo.engines.codes.StatusCode`.
+        Given by name or as a :class:`liethermo.engines.codes.StatusCode`.
     message : str
         A full sentence: what happened, where, and what to try.
     step : int
-        Steps taken; where ``ok`` is false the step after it is the one that failed.
+        Number of steps taken; if ``ok`` is false, the next step failed.
     time : float
         Time reached.
     residual : float
-        ``h |k - slopes(k)| / |x|`` of the last step tried.
+        ``h |k - slopes(k)| / |x|`` of the last attempted step.
     """
 
     code: str | StatusCode
@@ -48,24 +48,25 @@ class Status:
 
 @dataclass(frozen=True)
 class Stats:
-    """The work of a run and its extremes over *all* steps, saved or not.
+    """Work of a run, and extremes over *all* steps, saved or not.
 
     Attributes
     ----------
     steps, fixed_point_iterations, newton_iterations, most_iterations : int
-        ``most_iterations`` is the largest number in one step.
+        ``most_iterations`` is the largest number of iterations in one step.
     rejected : int
-        Steps that were tried and were too long.
+        Number of attempted steps that were too long.
     worst_residual : float
-        Largest ``h |k - slopes(k)| / |x|`` accepted.
+        Largest accepted ``h |k - slopes(k)| / |x|``.
     energy_range : (float, float)
-        Smallest and largest energy met; less the work done from outside, where there is any.
+        Smallest and largest energy, less the work done from outside.
     least_entropy_increment, largest_energy_increment : float
-        Of one step. These three are None where no step was followed (no step taken, or ``Reference``).
+        Extreme increments in one step. These and ``energy_range`` are None if no step was followed (no step taken, or
+        ``Reference``).
     attitude_residual : float or None
-        Largest distance from the group of the attitudes kept, relative to their size; None without a group.
+        Largest distance of the saved attitudes from the group, relative to their norm; None without a group.
     spatial_momentum_change : float or None
-        Largest change of the momentum in space ``Ad_star(inverse(g), mu)`` among the states kept, relative to its size.
+        Largest change of the spatial momentum ``Ad_star(inverse(g), mu)`` among the saved states, relative to its norm.
     wall_time : float
         Seconds, compilation included.
     """
@@ -90,15 +91,15 @@ class Stats:
 
 @dataclass(frozen=True)
 class Laws:
-    """What the system promises: the law of the energy, of the entropy, and the functions it conserves.
+    """Laws that a system promises: of the energy, of the entropy, and the functions that it conserves.
 
-    ``conserved`` names those that the method promises to keep to rounding, ``unpromised`` those that it does not: an
-    audit shows how far these drift, without a verdict. ``ledger`` names the recorded functions that say what comes from
-    outside. ``balance`` names those of them that the energy of a solution contains, and its law is stated without
-    (``dH = work``). ``inexact`` says which of the two laws ("energy", "entropy") the method makes no claim to keep: an
-    audit judges them all the same, and says so. ``mean`` names those of the two laws that fluctuations leave for the
-    mean alone: on paths both may rise and fall. ``unknown`` names the functions of which it could not be found out
-    whether the system conserves them.
+    ``conserved`` names the functions that the method conserves to rounding, ``unpromised`` those that it does not: an
+    audit shows their drift without a verdict. ``ledger`` names the recorded functions that count what is received from
+    outside. ``balance`` names the ledger functions that the energy of a solution contains; its law is stated without
+    them (``dH = work``). ``inexact`` names the laws ("energy", "entropy") that the method does not claim to keep: an
+    audit judges them nevertheless, and says so. ``mean`` names the laws that hold only in the mean, because of
+    fluctuations: on single paths both functions may rise and fall. ``unknown`` names the functions for which it could
+    not be determined whether the system conserves them.
     """
 
     energy: str | None = "conserved"
@@ -114,4 +115,6 @@ class Laws:
     def __post_init__(self):
         for law in (self.energy, self.entropy):
             if law not in (None, "conserved", "nondecreasing", "nonincreasing"):
-                raise InputError(f"there is no law {law!r:.60}")
+                raise InputError(
+                    f"a law must be None, 'conserved', 'nondecreasing' or 'nonincreasing', got {law!r:.60}"
+                )

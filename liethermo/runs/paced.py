@@ -10,7 +10,7 @@ import numpy as np
 from ..engines.codes import StatusCode
 from ..engines.compiled.paced import CompiledAdaptiveRuns
 from ..engines.paced import AdaptiveRuns, PauseHandler, start_batch
-from ..engines.pacing import PAUSED_AT_STOP, PAUSED_FOR_GROWTH_RATE, REACHED_END, StepControl
+from ..engines.pacing import StepControl
 from ..engines.stepping import REPORTED_FIELDS
 from ..integrators import OneStepMethod
 from .batches import (
@@ -112,17 +112,20 @@ class AdaptiveEnsembleRun:
             while followed.any() and not stopped():
                 paces.advance(int(np.clip(TARGET_ATTEMPTS_PER_CALL // len(places), *ATTEMPTS_PER_CALL_RANGE)))
                 guide.confirm_events()
-                there = guide.paused_indices(PAUSED_AT_STOP)
+                there = guide.paused_indices(StatusCode.PAUSED_AT_STOP)
                 if there.size:
                     columns = [paces.read("x", there), *(paces.read(n, there)[:, None] for n in ("energy", "entropy"))]
                     record.store_states_at(places[there], paces.read("t", there), np.hstack(columns))
                 guide.resume_paused()
                 status = paces.read("status")
                 ended = np.flatnonzero(
-                    followed & ~np.isin(status, (StatusCode.COMPLETED, PAUSED_AT_STOP, PAUSED_FOR_GROWTH_RATE))
+                    followed
+                    & ~np.isin(
+                        status, (StatusCode.COMPLETED, StatusCode.PAUSED_AT_STOP, StatusCode.PAUSED_FOR_GROWTH_RATE)
+                    )
                 )
                 if ended.size:
-                    codes = np.where(status[ended] == REACHED_END, StatusCode.COMPLETED, status[ended])
+                    codes = np.where(status[ended] == StatusCode.REACHED_END, StatusCode.COMPLETED, status[ended])
                     record_finished(ended, codes, fields_of(ended), paces.read("t", ended))
                 followed[ended] = False
                 self.progress_counter.add(np.unique(places[ended]).size)

@@ -16,7 +16,7 @@ import numpy as np
 from ..engines.choice import EngineWithFallback
 from ..engines.codes import StatusCode
 from ..engines.paced import AdaptiveRuns, PauseHandler
-from ..engines.pacing import ATTEMPT_FIELDS, REACHED_END, StepControl
+from ..engines.pacing import ATTEMPT_FIELDS, StepControl
 from ..engines.stepping import State
 from ..tracing.scalarize import UnsupportedPrimitive
 from .ending import INTERRUPTING_ERRORS, interruption_reason
@@ -168,7 +168,7 @@ def _advance_to_end(
         outcome.state = outcome.state._replace(
             status=np.int64(scalar("last_attempt_status")), residual=scalar("residual")
         )
-    elif code not in (StatusCode.EVENT, REACHED_END):
+    elif code not in (StatusCode.EVENT, StatusCode.REACHED_END):
         outcome.state = outcome.state._replace(status=np.int64(code), residual=scalar("residual"))
         outcome.exhausted_limit = "sight" if scalar("last_attempt_status") == StatusCode.COMPLETED else ""
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..engines.codes import StatusCode
+from ..engines.codes import RESULT_CODES, StatusCode
 from ..integrators import OneStepMethod
 from ..results.audit import Tolerances
 from ..results.ensemble import Ensemble
@@ -26,7 +26,7 @@ from .members import PointParameters, PointwiseArrays, StudySystems
 
 LAW_BROKEN, MEASURE_FAILED, NOT_COMPUTED = 64, 65, -1
 
-STATUSES = {code.status_name: int(code) for code in StatusCode if code != StatusCode.INTERRUPTED} | {
+STATUSES = {code.status_name: int(code) for code in RESULT_CODES if code != StatusCode.INTERRUPTED} | {
     "law_broken": LAW_BROKEN,
     "measure_failed": MEASURE_FAILED,
     "missing": NOT_COMPUTED,

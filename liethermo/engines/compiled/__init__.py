@@ -1,1 +1,1 @@
-"""Machine code for small systems on the CPU."""
+"""Compiled engine: machine code for small systems on the CPU."""

@@ -1,4 +1,4 @@
-"""Loops and calls as LLVM instructions, for all lanes at once."""
+"""Loops, calls and tables of scalar programs as LLVM instructions, for all lanes at once."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ INT32 = ir.IntType(32)
 
 
 def write_block(writer: Any, block: Block, args: Sequence[Any]) -> BlockResults:
-    """Write a block, of values and tables.
+    """Write the instructions of a block (a loop, call or matrix product) on ``args``, values and tables.
 
     Parameters
     ----------
-    writer : Writer
+    writer : ProgramWriter
     """
     if isinstance(block, WhileLoop):
         return _write_while(writer, block, args)
@@ -37,29 +37,29 @@ def write_block(writer: Any, block: Block, args: Sequence[Any]) -> BlockResults:
     return _call_kernel(writer, block, args)
 
 
-def clamp_index(writer: Any, place: ir.Value, length: int) -> ir.Value:
-    """A place, or the nearest one of a table of some length."""
+def clamp_index(writer: Any, index: ir.Value, length: int) -> ir.Value:
+    """Clamp an index to the range of a table of ``length`` entries."""
     build, last = writer.builder, writer.constant(length - 1)
-    place = build.select(build.icmp_signed("<", place, writer.constant(0)), writer.constant(0), place)
-    return build.select(build.icmp_signed(">", place, last), last, place)
+    index = build.select(build.icmp_signed("<", index, writer.constant(0)), writer.constant(0), index)
+    return build.select(build.icmp_signed(">", index, last), last, index)
 
 
-def select_entry(writer: Any, place: ir.Value, entries: Sequence[ir.Value]) -> ir.Value:
-    """The entry at a place, by the bits of its number: of one that lies outside the nearest."""
-    build, place = writer.builder, clamp_index(writer, place, len(entries))
+def select_entry(writer: Any, index: ir.Value, entries: Sequence[ir.Value]) -> ir.Value:
+    """Select the entry at ``index``, clamped to the range, by the bits of the index."""
+    build, index = writer.builder, clamp_index(writer, index, len(entries))
     entries, bit = list(entries), 0
     while len(entries) > 1:
-        odd = build.trunc(build.lshr(place, writer.constant(bit)), writer.bool_type)
+        odd = build.trunc(build.lshr(index, writer.constant(bit)), writer.bool_type)
         pairs = [build.select(odd, b, a) for a, b in zip(entries[::2], entries[1::2], strict=False)]
         entries, bit = pairs + entries[2 * len(pairs) :], bit + 1
     return entries[0]
 
 
 def _allocate_slots(writer: Any, kinds: Sequence[str], values: Sequence[ir.Value]) -> list[ir.Value]:
-    """Memory for values of some kinds, that holds them."""
+    """Allocate a stack slot for each value and store the value there."""
     build, slots = writer.builder, []
     for kind, value in zip(kinds, values, strict=True):
-        with build.goto_entry_block():  # else each pass of a loop around would take more of the stack
+        with build.goto_entry_block():  # otherwise each pass of an outer loop would take more of the stack
             slot = build.alloca(writer.type_of_kind[kind])
         build.store(writer.cast(value, kind), slot)
         slots.append(slot)
@@ -71,89 +71,92 @@ def _array_reader(*arrays: Sequence[ir.Value]) -> Callable[[int, int], ir.Value]
 
 
 def _write_while(writer: Any, loop: WhileLoop, args: Sequence[ir.Value]) -> BlockResults:
-    """Until the test fails in every lane that is :attr:`.Writer.active`.
+    """Write a while loop, which runs until the test fails in every active lane.
 
-    A pass need not wait for the test of which lanes the one before has left: those go on too, and what they
-    come to is not kept. They wait where a loop inside might not end for them.
+    A pass does not wait for the test of which lanes have left the loop: these lanes run on, and their results are
+    discarded. They do wait if an inner loop might not end for them.
     """
-    build, fixed = writer.builder, len(loop.test.inputs[0])
-    constants, slots = args[:fixed], _allocate_slots(writer, loop.kinds, args[fixed:])
-    apart = writer.lanes > 1 and not any(isinstance(i.op, Block) for i in loop.body.instructions)
-    kept = _allocate_slots(writer, loop.kinds, args[fixed:]) if apart else slots
-    outer = writer.active_lanes
-    (going,) = _allocate_slots(writer, "b", [writer.constant(True) if outer is None else outer])
+    build, n_constants = writer.builder, len(loop.test.inputs[0])
+    constants, slots = args[:n_constants], _allocate_slots(writer, loop.kinds, args[n_constants:])
+    has_separate_slots = writer.lanes > 1 and not any(isinstance(i.op, Block) for i in loop.body.instructions)
+    result_slots = _allocate_slots(writer, loop.kinds, args[n_constants:]) if has_separate_slots else slots
+    outer_lanes = writer.active_lanes
+    (running_lanes,) = _allocate_slots(writer, "b", [writer.constant(True) if outer_lanes is None else outer_lanes])
 
-    def goes_on() -> ir.Value:
+    def has_running_lane() -> ir.Value:
         carried = [build.load(slot) for slot in slots]
         ((test,),) = writer.write_program(loop.test, _array_reader(constants, carried))
-        build.store(build.and_(build.load(going), writer.cast(test, "b")), going)
-        return writer.has_true_lane(build.load(going))
+        build.store(build.and_(build.load(running_lanes), writer.cast(test, "b")), running_lanes)
+        return writer.has_true_lane(build.load(running_lanes))
 
-    with writer.loop_while(goes_on):
-        before = [build.load(slot) for slot in slots]
-        writer.active_lanes = build.load(going)
-        (new,) = writer.write_program(loop.body, _array_reader(constants, before))
-        for slot, out, kind, after in zip(slots, kept, loop.kinds, new, strict=True):
-            value = writer.cast(after, kind)
+    with writer.loop_while(has_running_lane):
+        previous_values = [build.load(slot) for slot in slots]
+        writer.active_lanes = build.load(running_lanes)
+        (new_values,) = writer.write_program(loop.body, _array_reader(constants, previous_values))
+        for slot, result_slot, kind, new_value in zip(slots, result_slots, loop.kinds, new_values, strict=True):
+            value = writer.cast(new_value, kind)
             if writer.lanes > 1:
-                build.store(build.select(writer.active_lanes, value, build.load(out)), out)
-            if apart or writer.lanes == 1:
+                build.store(build.select(writer.active_lanes, value, build.load(result_slot)), result_slot)
+            if has_separate_slots or writer.lanes == 1:
                 build.store(value, slot)
-        writer.active_lanes = outer
-    return BlockResults([build.load(slot) for slot in kept])
+        writer.active_lanes = outer_lanes
+    return BlockResults([build.load(slot) for slot in result_slots])
 
 
 def _write_scan(writer: Any, loop: ScanLoop, args: Sequence[Any]) -> BlockResults:
-    build, fixed = writer.builder, len(loop.body.inputs[0])
-    start = fixed + len(loop.carry_kinds)
-    constants, slots, tables = args[:fixed], _allocate_slots(writer, loop.carry_kinds, args[fixed:start]), args[start:]
-    stacked = [Table(writer, writer.type_of_kind[kind], length=loop.length) for kind in loop.stacked_kinds]
+    build, n_constants = writer.builder, len(loop.body.inputs[0])
+    start = n_constants + len(loop.carry_kinds)
+    constants = args[:n_constants]
+    slots = _allocate_slots(writer, loop.carry_kinds, args[n_constants:start])
+    tables = args[start:]
+    stacked_tables = [Table(writer, writer.type_of_kind[kind], length=loop.length) for kind in loop.stacked_kinds]
     with writer.loop_range(writer.int64(loop.length)) as count:
         i = build.sub(writer.int64(loop.length - 1), count) if loop.reverse else count
         carried, row = [build.load(slot) for slot in slots], [table.read(i) for table in tables]
-        new, out = writer.write_program(loop.body, _array_reader(constants, carried, row))
-        for slot, kind, value in zip(slots, loop.carry_kinds, new, strict=True):
+        new_carry, stacked_values = writer.write_program(loop.body, _array_reader(constants, carried, row))
+        for slot, kind, value in zip(slots, loop.carry_kinds, new_carry, strict=True):
             build.store(writer.cast(value, kind), slot)
-        for table, kind, value in zip(stacked, loop.stacked_kinds, out, strict=True):
+        for table, kind, value in zip(stacked_tables, loop.stacked_kinds, stacked_values, strict=True):
             table.write(i, writer.cast(value, kind))
-    return BlockResults([build.load(slot) for slot in slots], stacked, loop.length)
+    return BlockResults([build.load(slot) for slot in slots], stacked_tables, loop.length)
 
 
 class Table:
-    """Values of one kind in memory, by their numbers.
+    """Values of one type in memory, read and written by their indices.
 
     Parameters
     ----------
     value_type : ir.Type
-        A number, where lanes have several, is the same for all.
+        Type of an entry; a scalar type while there are several lanes means that all lanes share the entry.
     values : sequence of values, optional
-        What it holds; written there, or a constant.
+        Entries, stored in memory of the table, or a global constant if all are constant.
     length, start, stride : int, value, int
-        How many there are, without values; where the first lies, and how far apart they are, if they lie somewhere.
+        Number of entries without ``values``; pointer to the first and distance of entries, for memory that exists.
     """
 
     def __init__(
         self,
         writer: Any,
-        kind: ir.Type,
+        value_type: ir.Type,
         values: Sequence[ir.Value] = (),
         length: int = 0,
         start: ir.Value | None = None,
         stride: int = 1,
     ):
-        self.builder, self.value_type, self.writer, self.stride = writer.builder, kind, writer, stride
+        self.builder, self.value_type, self.writer, self.stride = writer.builder, value_type, writer, stride
         self.length = max(len(values), length)
-        self.memory_type = (
-            writer.type_of_kind["i"] if kind == writer.type_of_kind["b"] else None
-        )  # bits are awkward in memory
+        # truth values are stored as integers
+        self.memory_type = writer.type_of_kind["i"] if value_type == writer.type_of_kind["b"] else None
         if start is not None:
             self.start = start
             return
         if values and not self.memory_type and all(isinstance(value, ir.Constant) for value in values):
-            rows, module = ir.ArrayType(self.value_type, len(values)), self.builder.module
-            fixed = ir.GlobalVariable(module, rows, module.get_unique_name("table"))
-            fixed.initializer, fixed.global_constant, fixed.linkage = ir.Constant(rows, list(values)), True, "internal"
-            self.start = self.builder.bitcast(fixed, self.value_type.as_pointer())
+            array_type, module = ir.ArrayType(self.value_type, len(values)), self.builder.module
+            global_table = ir.GlobalVariable(module, array_type, module.get_unique_name("table"))
+            global_table.initializer = ir.Constant(array_type, list(values))
+            global_table.global_constant = True
+            global_table.linkage = "internal"
+            self.start = self.builder.bitcast(global_table, self.value_type.as_pointer())
             return
         with self.builder.goto_entry_block():
             self.start = self.builder.alloca(self.memory_type or self.value_type, self.length)
@@ -161,12 +164,12 @@ class Table:
             self.write(writer.int64(i), value)
 
     def view_at(self, writer: Any, start: ir.Value) -> Table:
-        """The same in another function, at an address of its own."""
+        """Return a view of this table in another function, with its own pointer ``start``."""
         return Table(writer, self.value_type, length=self.length, start=start, stride=self.stride)
 
     @property
     def signature(self) -> tuple:
-        """What a function that is given it has to know."""
+        """Type, length and stride: the part of the table that is compiled into a function that takes it."""
         return str(self.start.type), self.length, self.stride
 
     def _entry_pointer(self, i: ir.Value) -> ir.Value:
@@ -175,25 +178,27 @@ class Table:
         return self.builder.gep(self.start, [i])
 
     def read(self, i: ir.Value) -> ir.Value:
-        found = self.builder.load(self._entry_pointer(i))
+        value = self.builder.load(self._entry_pointer(i))
         if isinstance(self.value_type, ir.DoubleType):
-            return self.writer.splat(found)
-        return self.builder.trunc(found, self.value_type) if self.memory_type else found
+            return self.writer.splat(value)
+        return self.builder.trunc(value, self.value_type) if self.memory_type else value
 
-    def gather(self, places: ir.Value) -> ir.Value:
-        """What each lane has at a place of its own, or at the nearest."""
-        build, lanes, places = self.builder, self.writer.lanes, clamp_index(self.writer, places, self.length)
+    def gather(self, indices: ir.Value) -> ir.Value:
+        """Return in each lane the entry at the index of that lane, clamped to the range."""
+        build, lanes, indices = self.builder, self.writer.lanes, clamp_index(self.writer, indices, self.length)
         if lanes == 1:
-            return self.read(places)
-        found: Any = None
+            return self.read(indices)
+        gathered: Any = None
         for lane in range(lanes):
-            at = ir.Constant(INT32, lane)
-            value = build.load(self._entry_pointer(build.extract_element(places, at)))
+            lane_index = ir.Constant(INT32, lane)
+            value = build.load(self._entry_pointer(build.extract_element(indices, lane_index)))
             if isinstance(value.type, ir.VectorType):
-                value = build.extract_element(value, at)
+                value = build.extract_element(value, lane_index)
             kind = ir.VectorType(value.type, lanes)
-            found = build.insert_element(ir.Constant(kind, ir.Undefined) if found is None else found, value, at)
-        return build.trunc(found, self.value_type) if self.memory_type else found
+            gathered = build.insert_element(
+                ir.Constant(kind, ir.Undefined) if gathered is None else gathered, value, lane_index
+            )
+        return build.trunc(gathered, self.value_type) if self.memory_type else gathered
 
     def write(self, i: ir.Value, value: ir.Value) -> None:
         value = self.builder.zext(value, self.memory_type) if self.memory_type else value
@@ -201,7 +206,7 @@ class Table:
 
 
 class BlockResults:
-    """The results of a block: values, then tables of one length. What is in those is read where it is used."""
+    """Results of a block: values, then the columns of tables of one length, which are read when they are used."""
 
     def __init__(self, values: Sequence[ir.Value], tables: Sequence[Table] = (), length: int = 1):
         self.values, self.tables, self.length = values, tables, length
@@ -217,100 +222,110 @@ class BlockResults:
 
 
 def make_table(writer: Any, values: Sequence[ir.Value]) -> Table:
-    """Values as a table; they are numbers where one of them is."""
-    kind = writer.double_type if any(value.type == writer.double_type for value in values) else values[0].type
-    return Table(writer, kind, [writer.cast(v, "f") if kind == writer.double_type else v for v in values])
+    """Return a table of values, converted to doubles if one of them is a double."""
+    value_type = writer.double_type if any(value.type == writer.double_type for value in values) else values[0].type
+    return Table(writer, value_type, [writer.cast(v, "f") if value_type == writer.double_type else v for v in values])
 
 
 def _call_routine(writer: Any, routine: Routine, args: Sequence[Any]) -> BlockResults:
-    """By a function of its own, which all that need it call: numbers are handed over in memory, tables stay there."""
-    build, count = writer.builder, len(routine.kinds)
+    """Call a routine as a shared function: numbers are passed in memory, and tables by pointer."""
+    build, n_results = writer.builder, len(routine.kinds)
     tables = {i: a for i, a in enumerate(args) if isinstance(a, Table)}
     numbers = [writer.cast(a, "f") for i, a in enumerate(args) if i not in tables]
-    given, found = Table(writer, writer.double_type, numbers, length=1), Table(writer, writer.double_type, length=count)
-    said = repr((routine, *((i, a.signature) for i, a in tables.items())))
-    name = "routine_" + hashlib.sha256(said.encode()).hexdigest()[:16]
+    inputs = Table(writer, writer.double_type, numbers, length=1)
+    results = Table(writer, writer.double_type, length=n_results)
+    signature = repr((routine, *((i, a.signature) for i, a in tables.items())))
+    name = "routine_" + hashlib.sha256(signature.encode()).hexdigest()[:16]
     function = build.module.globals.get(name) or _routine_function(writer, routine, name, tables)
-    build.call(function, [given.start, found.start, *(a.start for a in tables.values())])
-    return BlockResults([], [found], count)
+    build.call(function, [inputs.start, results.start, *(a.start for a in tables.values())])
+    return BlockResults([], [results], n_results)
 
 
 def _routine_function(writer: Any, routine: Routine, name: str, tables: Mapping[int, Table]) -> ir.Function:
-    kinds = [writer.double_type.as_pointer()] * 2 + [a.start.type for a in tables.values()]
-    function, inside = writer.new_function(name, kinds)
-    build, (given, found, *starts) = inside.builder, function.args
-    own = {i: a.view_at(inside, start) for (i, a), start in zip(tables.items(), starts, strict=True)}
-    order = {j: i for i, j in enumerate(j for j in range(len(routine.program.inputs[0])) if j not in tables)}
+    argument_types = [writer.double_type.as_pointer()] * 2 + [a.start.type for a in tables.values()]
+    function, function_writer = writer.new_function(name, argument_types)
+    build, (inputs, results, *starts) = function_writer.builder, function.args
+    table_views = {i: a.view_at(function_writer, start) for (i, a), start in zip(tables.items(), starts, strict=True)}
+    number_positions = {j: i for i, j in enumerate(j for j in range(len(routine.program.inputs[0])) if j not in tables)}
 
     def read(i: int, j: int) -> Any:
-        return own[j] if j in own else build.load(build.gep(given, [inside.int64(order[j])]))
+        return (
+            table_views[j]
+            if j in table_views
+            else build.load(build.gep(inputs, [function_writer.int64(number_positions[j])]))
+        )
 
-    for i, value in enumerate(inside.write_as_doubles(routine.program, read)[0]):
-        build.store(value, build.gep(found, [inside.int64(i)]))
+    for i, value in enumerate(function_writer.write_as_doubles(routine.program, read)[0]):
+        build.store(value, build.gep(results, [function_writer.int64(i)]))
     build.ret_void()
     return function
 
 
 PRODUCT_TILE_WIDTH = 8
-"""Sums of a product of matrices that are made at a time: each waits for its own last term alone."""
+"""Number of sums of a matrix product that are accumulated at once, so that none waits for the term of another."""
 
 
 def _write_product(writer: Any, block: MatrixProduct, args: Sequence[Table]) -> BlockResults:
-    """By a function of its own for these sizes; its sums are in the order of their terms."""
+    """Write a matrix product as a call of a function for these shapes, which adds the terms in order."""
     build, (m, _, n) = writer.builder, block.sizes
-    found = Table(writer, writer.double_type, length=m * n)
-    said = repr((block.sizes, block.strides, *(a.signature for a in args)))
-    name = "product_" + hashlib.sha256(said.encode()).hexdigest()[:16]
+    product = Table(writer, writer.double_type, length=m * n)
+    signature = repr((block.sizes, block.strides, *(a.signature for a in args)))
+    name = "product_" + hashlib.sha256(signature.encode()).hexdigest()[:16]
     function = build.module.globals.get(name) or _product_function(writer, block, args, name)
-    build.call(function, [*(a.start for a in args), found.start])
-    return BlockResults([], [found], m * n)
+    build.call(function, [*(a.start for a in args), product.start])
+    return BlockResults([], [product], m * n)
 
 
 def _product_function(writer: Any, block: MatrixProduct, tables: Sequence[Table], name: str) -> ir.Function:
     m, k, n = block.sizes
-    function, inside = writer.new_function(name, [*(a.start.type for a in tables), writer.double_type.as_pointer()])
-    build, number = inside.builder, inside.int64
-    *starts, out = function.args
-    given = [a.view_at(inside, start) for a, start in zip(tables, starts, strict=True)]
-    by_rows = m >= n  # which sums stand beside each other
+    function, function_writer = writer.new_function(
+        name, [*(a.start.type for a in tables), writer.double_type.as_pointer()]
+    )
+    build, int64 = function_writer.builder, function_writer.int64
+    *starts, product_pointer = function.args
+    factors = [a.view_at(function_writer, start) for a, start in zip(tables, starts, strict=True)]
+    sums_run_over_rows = m >= n  # whether the sums of a tile are in one column
 
-    def entry(which: int, i: ir.Value, j: ir.Value) -> ir.Value:
-        rows, columns = block.strides[which]
-        place = build.add(build.mul(i, number(rows)), build.mul(j, number(columns)))
-        return given[which].read(place)
+    def entry(factor: int, i: ir.Value, j: ir.Value) -> ir.Value:
+        row_stride, column_stride = block.strides[factor]
+        offset = build.add(build.mul(i, int64(row_stride)), build.mul(j, int64(column_stride)))
+        return factors[factor].read(offset)
 
-    def sums(first: ir.Value, other: ir.Value, width: int) -> None:
-        places = [build.add(first, number(w)) for w in range(width)]
-        places = [(place, other) if by_rows else (other, place) for place in places]
-        totals = _allocate_slots(inside, "f" * width, [inside.constant(0.0)] * width)
-        with inside.loop_range(number(k)) as l:
-            common = entry(1, l, other) if by_rows else entry(0, other, l)
-            for (i, j), total in zip(places, totals, strict=True):
-                own = entry(0, i, l) if by_rows else entry(1, l, j)
+    def write_sums(start: ir.Value, outer: ir.Value, width: int) -> None:
+        entries = [build.add(start, int64(w)) for w in range(width)]
+        entries = [(index, outer) if sums_run_over_rows else (outer, index) for index in entries]
+        totals = _allocate_slots(function_writer, "f" * width, [function_writer.constant(0.0)] * width)
+        with function_writer.loop_range(int64(k)) as l:
+            shared_factor = entry(1, l, outer) if sums_run_over_rows else entry(0, outer, l)
+            for (i, j), total in zip(entries, totals, strict=True):
+                own_factor = entry(0, i, l) if sums_run_over_rows else entry(1, l, j)
                 build.store(
-                    inside.call_intrinsic("llvm.fmuladd", (own, common, build.load(total)), inside.double_type), total
+                    function_writer.call_intrinsic(
+                        "llvm.fmuladd", (own_factor, shared_factor, build.load(total)), function_writer.double_type
+                    ),
+                    total,
                 )
-        for (i, j), total in zip(places, totals, strict=True):
-            build.store(build.load(total), build.gep(out, [build.add(build.mul(i, number(n)), j)]))
+        for (i, j), total in zip(entries, totals, strict=True):
+            build.store(build.load(total), build.gep(product_pointer, [build.add(build.mul(i, int64(n)), j)]))
 
-    count, others = (m, n) if by_rows else (n, m)
-    with inside.loop_range(number(others)) as other:
-        if count >= PRODUCT_TILE_WIDTH:
-            with inside.loop_range(number(count // PRODUCT_TILE_WIDTH)) as chunk:
-                sums(build.mul(chunk, number(PRODUCT_TILE_WIDTH)), other, PRODUCT_TILE_WIDTH)
-        if count % PRODUCT_TILE_WIDTH:
-            sums(number(count - count % PRODUCT_TILE_WIDTH), other, count % PRODUCT_TILE_WIDTH)
+    n_tiled, n_outer = (m, n) if sums_run_over_rows else (n, m)
+    with function_writer.loop_range(int64(n_outer)) as outer_index:
+        if n_tiled >= PRODUCT_TILE_WIDTH:
+            with function_writer.loop_range(int64(n_tiled // PRODUCT_TILE_WIDTH)) as chunk:
+                write_sums(build.mul(chunk, int64(PRODUCT_TILE_WIDTH)), outer_index, PRODUCT_TILE_WIDTH)
+        if n_tiled % PRODUCT_TILE_WIDTH:
+            write_sums(int64(n_tiled - n_tiled % PRODUCT_TILE_WIDTH), outer_index, n_tiled % PRODUCT_TILE_WIDTH)
     build.ret_void()
     return function
 
 
 def _call_kernel(writer: Any, call: LapackCall, args: Sequence[ir.Value]) -> BlockResults:
-    """By a function of its own, lane by lane: what it makes of one does not depend on the others."""
-    build, count = writer.builder, len(call.kinds)
-    given = Table(writer, writer.double_type, [writer.cast(a, "f") for a in args])
-    found = Table(writer, writer.double_type, length=count)
-    pointers = [build.bitcast(table.start, ir.DoubleType().as_pointer()) for table in (given, found)]
+    """Call a LAPACK kernel lane by lane, so that the result of one does not depend on the others."""
+    build, n_results = writer.builder, len(call.kinds)
+    inputs = Table(writer, writer.double_type, [writer.cast(a, "f") for a in args])
+    results = Table(writer, writer.double_type, length=n_results)
+    pointers = [build.bitcast(table.start, ir.DoubleType().as_pointer()) for table in (inputs, results)]
     function = lapack_kernel(writer, call)
     with writer.loop_range(writer.int64(writer.lanes)) as lane:
         build.call(function, [build.gep(pointer, [lane]) for pointer in pointers])
-    return BlockResults([], [found], count)
+    return BlockResults([], [results], n_results)

@@ -1,4 +1,4 @@
-"""What systems and methods are to the compiled engine: a form, which is compiled, and parameters, its arguments."""
+"""Split of systems and methods into a structure, which is compiled, and parameters, its arguments."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from ...tracing.caching import memoize
 
 @dataclass(frozen=True)
 class ProgramStructure:
-    """What systems, or methods, have in common that differ in their parameters.
+    """Structure that systems, methods or step controls share if they differ only in their parameters.
 
     Attributes
     ----------
     key : hashable
-        The same for the same form.
+        Equal for equal structures.
     shapes : tuple of shapes
-        Of the parameters, which are arrays.
-    rebuild : function from a list of arrays to one of them
+        Shapes of the parameters, which are arrays.
+    rebuild : function from a list of arrays to a module with these parameters
     """
 
     key: Any
@@ -34,36 +34,36 @@ class ProgramStructure:
 
     @staticmethod
     @memoize
-    def from_module(system: eqx.Module) -> ProgramStructure:
-        """The form of a system, a method or a pacing, its parameters being the arrays among its leaves."""
-        dynamic, static = eqx.partition(system, eqx.is_inexact_array)
+    def from_module(module: eqx.Module) -> ProgramStructure:
+        """Return the structure of a module; its parameters are the arrays among its leaves."""
+        dynamic, static = eqx.partition(module, eqx.is_inexact_array)
         leaves, structure = jax.tree_util.tree_flatten(dynamic)
-        functions, outline = jax.tree_util.tree_flatten(static)
+        static_leaves, static_structure = jax.tree_util.tree_flatten(static)
         return ProgramStructure(
-            (outline, tuple(functions)),
+            (static_structure, tuple(static_leaves)),
             tuple(np.shape(leaf) for leaf in leaves),
             lambda arrays: eqx.combine(jax.tree_util.tree_unflatten(structure, arrays), static),
         )
 
     @property
     def n_parameters(self) -> int:
-        """How many numbers the parameters are."""
+        """Number of all entries of the parameter arrays."""
         return sum(map(math.prod, self.shapes))
 
     def build(self, p) -> Any:
-        """The one with the parameters p, shape (size,), all arrays one after another."""
+        """Return the module with the parameters p, shape (n_parameters,), all arrays flattened one after another."""
         ends = list(itertools.accumulate(map(math.prod, self.shapes)))
         arrays = [p[end - math.prod(shape) : end].reshape(shape) for end, shape in zip(ends, self.shapes, strict=True)]
         return self.rebuild(arrays)
 
 
 @memoize
-def parameter_arrays(tree: eqx.Module) -> tuple[np.ndarray, ...]:
-    """The parameters of a system, a method or a pacing."""
-    leaves = jax.tree_util.tree_leaves(eqx.filter(tree, eqx.is_inexact_array))
+def parameter_arrays(module: eqx.Module) -> tuple[np.ndarray, ...]:
+    """Return the parameter arrays of a system, a method or a step control."""
+    leaves = jax.tree_util.tree_leaves(eqx.filter(module, eqx.is_inexact_array))
     return tuple(np.asarray(leaf, dtype=np.float64) for leaf in leaves)
 
 
-def flat_parameters(*trees: eqx.Module) -> np.ndarray:
-    """The parameters of systems, methods or pacings, one after another, shape (p,)."""
-    return np.concatenate([np.zeros(0), *(array.ravel() for tree in trees for array in parameter_arrays(tree))])
+def flat_parameters(*modules: eqx.Module) -> np.ndarray:
+    """Return the parameters of systems, methods or step controls, one after another, shape (p,)."""
+    return np.concatenate([np.zeros(0), *(array.ravel() for module in modules for array in parameter_arrays(module))])

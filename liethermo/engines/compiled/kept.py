@@ -1,4 +1,4 @@
-"""Machine code on disk. It is run as it is found, so it is taken from folders and files of this user alone."""
+"""Cache of machine code on disk, in files and folders that only this user can have written."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ from ... import disk
 
 
 class CacheWarning(UserWarning):
-    """Machine code is compiled anew in every process, since it cannot be kept safely."""
+    """Warning that machine code cannot be cached safely, so that every process compiles it again."""
 
 
 CHECKSUM_BYTES = 32
-"""Bytes of a file before the code: its checksum, for a file that was cut short."""
+"""Length in bytes of the checksum at the start of a file, which shows that a file was cut short."""
 
 MAX_FILE_BYTES = 2**28
-"""Bytes of a file."""
+"""Largest size in bytes of a file that is read."""
 
 SAFE_OPEN_FLAGS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
-"""Flags that open no link, and do not wait for the other end of a pipe."""
+"""Flags that refuse to open a link and do not wait for the other end of a pipe."""
 
 
 def cache_folder() -> Path | None:
-    """Where machine code is kept: ``$LIETHERMO_CACHE``, or a folder in the user's cache directory; None without."""
-    if named := os.environ.get("LIETHERMO_CACHE"):
-        return Path(named)
+    """Return the folder ``$LIETHERMO_CACHE`` or one in the user's cache directory; None if there is none."""
+    if user_folder := os.environ.get("LIETHERMO_CACHE"):
+        return Path(user_folder)
     try:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "liethermo"
-    except RuntimeError:  # there is no HOME, and nobody knows the user
+    except RuntimeError:  # no HOME, and no entry for the user
         return None
 
 
 def read_code(name: str) -> bytes | None:
-    """What was written under a name; None where there is nothing, it is damaged, or it may be somebody else's."""
+    """Return the machine code written under ``name``; None if it is missing, damaged, or may be another user's."""
     folder = _trusted_folder()
     if folder is None:
         return None
@@ -47,21 +47,21 @@ def read_code(name: str) -> bytes | None:
         with open(
             folder / f"{name}.o", "rb", opener=lambda path, flags: os.open(path, flags | SAFE_OPEN_FLAGS)
         ) as file:
-            said = os.fstat(file.fileno())
-            if not stat.S_ISREG(said.st_mode) or said.st_size > MAX_FILE_BYTES:
+            file_status = os.fstat(file.fileno())
+            if not stat.S_ISREG(file_status.st_mode) or file_status.st_size > MAX_FILE_BYTES:
                 return None
-            if fault := _why_untrusted(said):
-                _warn_untrusted(str(folder / f"{name}.o"), fault)
+            if reason := _why_untrusted(file_status):
+                _warn_untrusted(str(folder / f"{name}.o"), reason)
                 return None
-            whole = file.read()
+            content = file.read()
     except (OSError, ValueError):
         return None
-    seal, found = whole[:CHECKSUM_BYTES], whole[CHECKSUM_BYTES:]
-    return found if found and seal == hashlib.sha256(found).digest() else None
+    checksum, code = content[:CHECKSUM_BYTES], content[CHECKSUM_BYTES:]
+    return code if code and checksum == hashlib.sha256(code).digest() else None
 
 
 def write_code(name: str, code: bytes) -> None:
-    """Keep machine code under a name; nothing where there is no folder for it."""
+    """Write machine code to the cache under ``name``, if there is a folder that can be used."""
     folder = _trusted_folder()
     if folder is not None:
         with contextlib.suppress(OSError):
@@ -70,7 +70,7 @@ def write_code(name: str, code: bytes) -> None:
 
 
 def _trusted_folder() -> Path | None:
-    """The folder, made where there is none; None where it cannot be used, or others might write to it."""
+    """Return the cache folder, created if necessary; None if it cannot be used or others might write to it."""
     folder = cache_folder()
     if folder is None:
         return None
@@ -78,34 +78,34 @@ def _trusted_folder() -> Path | None:
         folder.parent.mkdir(parents=True, exist_ok=True)
         with contextlib.suppress(FileExistsError):
             folder.mkdir(mode=0o700)
-        said = os.lstat(folder)
+        folder_status = os.lstat(folder)
     except (OSError, ValueError):
         return None
-    if stat.S_ISLNK(said.st_mode):
+    if stat.S_ISLNK(folder_status.st_mode):
         _warn_untrusted(str(folder), "it is a link")
-    elif not stat.S_ISDIR(said.st_mode):
+    elif not stat.S_ISDIR(folder_status.st_mode):
         _warn_untrusted(str(folder), "it is no folder")
-    elif fault := _why_untrusted(said):
-        _warn_untrusted(str(folder), fault)
+    elif reason := _why_untrusted(folder_status):
+        _warn_untrusted(str(folder), reason)
     else:
         return folder
     return None
 
 
-def _why_untrusted(said: os.stat_result) -> str:
-    """Why what is found on disk may be somebody else's, in words; empty where it is this user's alone."""
+def _why_untrusted(status: os.stat_result) -> str:
+    """Return why a file or folder may be another user's; empty if it is this user's alone."""
     if not hasattr(os, "geteuid"):
         return ""
-    if said.st_uid != os.geteuid():
+    if status.st_uid != os.geteuid():
         return "it belongs to another user"
-    return "others may write to it" if said.st_mode & (stat.S_IWGRP | stat.S_IWOTH) else ""
+    return "others may write to it" if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH) else ""
 
 
 @functools.cache
-def _warn_untrusted(path: str, fault: str) -> None:
-    """Say so once."""
+def _warn_untrusted(path: str, reason: str) -> None:
+    """Warn, once for each path, that machine code is not cached there."""
     warn(
-        f"machine code is not kept in {path}: {fault}, and it could run anything as you. It is compiled in memory; "
-        "give LIETHERMO_CACHE a folder of your own (chmod 700)",
+        f"machine code is not kept in {path}: {reason}, and the code there could do anything in your name. It is "
+        "compiled in memory instead. Set LIETHERMO_CACHE to a folder of your own (chmod 700)",
         CacheWarning,
     )

@@ -1,4 +1,4 @@
-"""Modules of LLVM instructions as machine code: kept on disk, unloaded when unused."""
+"""Compilation of LLVM modules to machine code, cached on disk and unloaded when unused."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from . import kept, lapack
 
 
 class MachineCode:
-    """A module as machine code: unloaded with this object.
+    """Machine code of a module, unloaded with this object.
 
     Parameters
     ----------
     module : ir.Module, or its text
     skip_optimisation : bool
-        Do not optimise it, which takes longer than a short run. Its numbers are the same.
+        Do not optimise the code, which takes longer than a short run. Its results are the same.
 
     Attributes
     ----------
     skip_optimisation : bool
-        Whether it is not optimised: what is found on disk may be.
+        Whether the code is not optimised; code from the cache may be, even if it was not asked for.
     ir_text : str
     """
 
@@ -40,19 +40,19 @@ class MachineCode:
                 name = hashlib.sha256(f"{_host_target()[-1]} {self.skip_optimisation}\n{text}".encode()).hexdigest()[
                     :32
                 ]
-                found = _object_file(kept.read_code(name))
-                if found is not None:
+                object_file = _object_file(kept.read_code(name))
+                if object_file is not None:
                     break
             else:
                 code = _compile_module(text, skip_optimisation)
                 kept.write_code(name, code)
-                found = _object_file(code)
+                object_file = _object_file(code)
             self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _target_machine())
-            self._engine.add_object_file(found)
+            self._engine.add_object_file(object_file)
             self._engine.finalize_object()
 
     def function_address(self, name: str) -> int:
-        """The address of a function."""
+        """Return the address of the function ``name``."""
         return self._engine.get_function_address(name)
 
 
@@ -61,31 +61,31 @@ _lock = threading.Lock()
 
 @functools.cache
 def _host_target() -> tuple[llvm.Target, str, str, str]:
-    """This machine, and what tells its machine code, and the compiler's version, from others.
+    """Return the LLVM target, CPU and features of this machine, and a text that identifies them and the LLVM version.
 
-    ``$LIETHERMO_CPU`` names another processor whose instructions to use, one that this machine can stand in for: as
-    LLVM names them, such as ``x86-64-v3``, which has AVX2 and no AVX-512.
+    ``$LIETHERMO_CPU`` selects another CPU whose instructions this machine supports, by its LLVM name, such as
+    ``x86-64-v3``, which has AVX2 and no AVX-512.
     """
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
-    library = ctypes.util.find_library("m")
-    if library:
-        llvm.load_library_permanently(library)
-    triple, named = llvm.get_process_triple(), os.environ.get("LIETHERMO_CPU", "")
-    cpu = named or llvm.get_host_cpu_name()
-    features = "" if named else llvm.get_host_cpu_features().flatten()
+    math_library = ctypes.util.find_library("m")
+    if math_library:
+        llvm.load_library_permanently(math_library)
+    triple, cpu_variable = llvm.get_process_triple(), os.environ.get("LIETHERMO_CPU", "")
+    cpu = cpu_variable or llvm.get_host_cpu_name()
+    features = "" if cpu_variable else llvm.get_host_cpu_features().flatten()
     version = ".".join(map(str, llvm.llvm_version_info))
     return llvm.Target.from_triple(triple), cpu, features, f"{triple} {cpu} {features} {version}"
 
 
-def _target_machine(hasty: bool = False) -> llvm.TargetMachine:
-    """A compiler for this machine; an engine that is made with one owns it."""
+def _target_machine(skip_optimisation: bool = False) -> llvm.TargetMachine:
+    """Return an LLVM compiler for this machine; an engine created with it owns it."""
     target, cpu, features, _ = _host_target()
-    return target.create_target_machine(cpu, features, opt=0 if hasty else 3, jit=True, reloc="pic")
+    return target.create_target_machine(cpu, features, opt=0 if skip_optimisation else 3, jit=True, reloc="pic")
 
 
 def _object_file(code: bytes | None) -> llvm.ObjectFileRef | None:
-    """Code for the linker; None where there is none, or it is something else, which LLVM does not survive."""
+    """Return the code as an object file for the linker; None if it is no valid object file, which would crash LLVM."""
     if code is None or not (code.startswith(OBJECT_FILE_MAGICS) or _is_valid_elf(code)):
         return None
     try:
@@ -95,32 +95,34 @@ def _object_file(code: bytes | None) -> llvm.ObjectFileRef | None:
 
 
 OBJECT_FILE_MAGICS = (b"\xcf\xfa\xed\xfe", b"\x64\x86", b"\x64\xaa")
-"""How objects of macOS and of Windows begin."""
+"""First bytes of object files of macOS and Windows."""
 
 
 def _is_valid_elf(code: bytes) -> bool:
-    """Whether these bytes are a relocatable object of Linux whose parts all lie within them."""
+    """Return whether the bytes are a relocatable ELF object whose sections all lie within them."""
     if len(code) < 64 or code[:5] != b"\x7fELF\x02" or struct.unpack_from("<H", code, 16) != (1,):
         return False
-    (start,) = struct.unpack_from("<Q", code, 40)
-    size, count, names = struct.unpack_from("<HHH", code, 58)
-    if size != 64 or not 0 < names < count or start + size * count > len(code):
+    (table_offset,) = struct.unpack_from("<Q", code, 40)
+    header_size, n_sections, names_index = struct.unpack_from("<HHH", code, 58)
+    if header_size != 64 or not 0 < names_index < n_sections or table_offset + header_size * n_sections > len(code):
         return False
-    for i in range(count):
-        kind, _, _, place, length = struct.unpack_from("<4xIQQQQ", code, start + size * i)
-        if kind != SHT_NOBITS and place + length > len(code):
+    for i in range(n_sections):
+        section_type, _, _, section_offset, section_size = struct.unpack_from(
+            "<4xIQQQQ", code, table_offset + header_size * i
+        )
+        if section_type != SHT_NOBITS and section_offset + section_size > len(code):
             return False
     return True
 
 
 SHT_NOBITS = 8
-"""The kind of a section that takes no place in its file."""
+"""ELF section type of a section that occupies no space in its file."""
 
 
-def _compile_module(text: str, hasty: bool) -> bytes:
-    module, target = llvm.parse_assembly(text), _target_machine(hasty)
+def _compile_module(text: str, skip_optimisation: bool) -> bytes:
+    module, target = llvm.parse_assembly(text), _target_machine(skip_optimisation)
     module.verify()
-    if hasty:
+    if skip_optimisation:
         return target.emit_object(module)
     options = llvm.create_pipeline_tuning_options(speed_level=3)
     options.slp_vectorization = False

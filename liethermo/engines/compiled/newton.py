@@ -1,4 +1,4 @@
-"""Newton's method for one trajectory of a block, which the step loop calls where fixed-point iteration fails."""
+"""Newton's method for one trajectory of a block, which the step loop calls if fixed-point iteration fails."""
 
 from __future__ import annotations
 
@@ -14,38 +14,46 @@ from .machine_code import MachineCode
 from .writer import FLOAT64, INT64, ProgramWriter
 
 
-def compile_newton_solver(program: Program, block: BlockLayout, varies: np.ndarray, lanes: int) -> MachineCode:
-    """The function ``solve(p, block, lane)``: a program on the arrays of one lane, as machine code.
+def compile_newton_solver(
+    program: Program, layout: BlockLayout, is_per_trajectory: np.ndarray, lanes: int
+) -> MachineCode:
+    """Compile the function ``solve(p, block, lane)``, which runs ``program`` on the arrays of one lane.
 
     Parameters
     ----------
     program : Program
-        :func:`..stages.by_newton`, of the parameters p and of what is :data:`.loop.DEFERRED`, whose first rows it
-        replaces.
-    block : Layout
-    varies : array of bool, shape (p,)
-        Which parameters lie in the block; the others are the same for all.
+        :func:`..stages.solve_newton`, of the parameters p and the rows :data:`.loop.NEWTON_BUFFER`; the results
+        overwrite the first of these rows.
+    layout : BlockLayout
+    is_per_trajectory : array of bool, shape (p,)
+        Parameters that lie in the block; the others are common to all trajectories.
     """
     module = ir.Module("newton")
     function = ir.Function(module, ir.FunctionType(ir.VoidType(), [FLOAT64_POINTER, FLOAT64_POINTER, INT64]), "solve")
-    build, (p, w, lane), own = ir.IRBuilder(function.append_basic_block()), function.args, np.cumsum(varies) - 1
-    writer, first = ProgramWriter(build, 1), block.first_rows[NEWTON_BUFFER]
+    build = ir.IRBuilder(function.append_basic_block())
+    (p, block, lane) = function.args
+    parameter_row = np.cumsum(is_per_trajectory) - 1
+    writer, first_row = ProgramWriter(build, 1), layout.first_rows[NEWTON_BUFFER]
 
-    def place(row: int) -> ir.Value:
-        return build.gep(w, [build.add(writer.int64(row * lanes), lane)])
+    def row_pointer(row: int) -> ir.Value:
+        return build.gep(block, [build.add(writer.int64(row * lanes), lane)])
 
     def read(i: int, j: int) -> ir.Value:
         if i:
-            return build.load(place(first + j))
-        return build.load(place(block.first_rows["p"] + int(own[j])) if varies[j] else build.gep(p, [writer.int64(j)]))
+            return build.load(row_pointer(first_row + j))
+        return build.load(
+            row_pointer(layout.first_rows["p"] + int(parameter_row[j]))
+            if is_per_trajectory[j]
+            else build.gep(p, [writer.int64(j)])
+        )
 
-    def memory(i: int, places: range) -> Table | None:
-        if i or varies[places].any():
+    def find_table(i: int, entries: range) -> Table | None:
+        if i or is_per_trajectory[entries].any():
             return None
-        start = build.gep(p, [writer.int64(places[0])])
-        return Table(writer, FLOAT64, start=start, length=len(places), stride=places.step)
+        start = build.gep(p, [writer.int64(entries[0])])
+        return Table(writer, FLOAT64, start=start, length=len(entries), stride=entries.step)
 
-    for i, value in enumerate(itertools.chain.from_iterable(writer.write_as_doubles(program, read, memory))):
-        build.store(value, place(first + i))
+    for i, value in enumerate(itertools.chain.from_iterable(writer.write_as_doubles(program, read, find_table))):
+        build.store(value, row_pointer(first_row + i))
     build.ret_void()
     return MachineCode(module)

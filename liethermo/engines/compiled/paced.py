@@ -1,4 +1,4 @@
-"""Trajectories with steps of sizes of their own in the compiled engine."""
+"""Adaptive runs in the compiled engine."""
 
 from __future__ import annotations
 
@@ -10,57 +10,60 @@ from .stepper import CompiledStepLoop
 
 
 class CompiledAdaptiveRuns:
-    """Trajectories in lanes, each with a pace of its own, in place of :class:`..paced.ArrayPaces`.
+    """Adaptive runs of trajectories in lanes, the counterpart of :class:`..paced.ArrayAdaptiveRuns`.
 
     Parameters
     ----------
-    step_loop : Stepper
+    step_loop : CompiledStepLoop
     first_parameters : array, shape (p,)
-        The parameters of one of them, those of the method and the pacing among them.
+        Parameters of one trajectory: of its system, the method and the step control.
     parameters : array, shape (p,) or (trajectories, p)
     x : array, shape (trajectories, n)
-    t, stop, length : float
-        See :func:`..pacing.begun`.
+    t, stop_time, span_length : float
+        See :func:`..pacing.initial_adaptive_state`.
     """
 
-    def __init__(self, stepper: CompiledStepLoop, first, parameters, x: np.ndarray, t, stop, length):
-        self.step_loop, self.first_parameters, self.n_trajectories = stepper, first, len(x)
-        each = {
-            name: np.full((len(x), 1), value) for name, value in (("t", t), ("stop_time", stop), ("length", length))
+    def __init__(
+        self, step_loop: CompiledStepLoop, first_parameters, parameters, x: np.ndarray, t, stop_time, span_length
+    ):
+        self.step_loop, self.first_parameters, self.n_trajectories = step_loop, first_parameters, len(x)
+        initial_fields = {
+            name: np.full((len(x), 1), value)
+            for name, value in (("t", t), ("stop_time", stop_time), ("length", span_length))
         }
-        self.blocks = stepper.start_blocks(parameters, x, 0, **each)
+        self.blocks = step_loop.start_blocks(parameters, x, 0, **initial_fields)
 
-    def advance(self, most: int) -> None:
-        self.step_loop.run(self.first_parameters, self.blocks, 0.0, 1, most)
+    def advance(self, max_attempts: int) -> None:
+        self.step_loop.run(self.first_parameters, self.blocks, 0.0, 1, max_attempts)
 
     def state(self) -> State:
         return self.step_loop.state_from_block(self.blocks.copy())
 
-    def attempt_records(self, most: int) -> dict[str, np.ndarray]:
-        """Make so many attempts of the only trajectory, or fewer: see :meth:`..paced.ArrayPaces.attempts`."""
-        before, out = self.read("n_attempts")[0], np.empty((1, most, self.step_loop.n_saved_values))
+    def attempt_records(self, max_attempts: int) -> dict[str, np.ndarray]:
+        """Make up to ``max_attempts`` attempts of the only trajectory and return their records: see ATTEMPT_FIELDS."""
+        n_before, out = self.read("n_attempts")[0], np.empty((1, max_attempts, self.step_loop.n_saved_values))
         try:
-            self.step_loop.run(self.first_parameters, self.blocks, 0.0, most, 1, out=out)
+            self.step_loop.run(self.first_parameters, self.blocks, 0.0, max_attempts, 1, out=out)
         except UnsupportedPrimitive:
-            if self.read("n_attempts")[0] == before:
+            if self.read("n_attempts")[0] == n_before:
                 raise
-        return self.step_loop.saved_fields_of_one(out[0, : int(self.read("n_attempts")[0] - before)])
+        return self.step_loop.saved_fields_of_one(out[0, : int(self.read("n_attempts")[0] - n_before)])
 
-    def read(self, name: str, chosen: np.ndarray | slice = slice(None)) -> np.ndarray:
-        if isinstance(chosen, slice):
-            return self.step_loop.read_fields(self.blocks, (name,))[name][: self.n_trajectories][chosen].copy()
-        values = self._lane_values(chosen, name)
-        return values if name == "p" else values.reshape(len(chosen), *self.step_loop.field_shape(name))
+    def read(self, name: str, indices: np.ndarray | slice = slice(None)) -> np.ndarray:
+        if isinstance(indices, slice):
+            return self.step_loop.read_fields(self.blocks, (name,))[name][: self.n_trajectories][indices].copy()
+        values = self._lane_values(indices, name)
+        return values if name == "p" else values.reshape(len(indices), *self.step_loop.field_shape(name))
 
-    def write(self, name: str, chosen: np.ndarray, values) -> None:
-        block, lane = np.divmod(chosen, self.step_loop.lanes)
-        self.step_loop.block_rows(self.blocks, name)[block, :, lane] = np.broadcast_to(values, chosen.shape)[:, None]
+    def write(self, name: str, indices: np.ndarray, values) -> None:
+        block, lane = np.divmod(indices, self.step_loop.lanes)
+        self.step_loop.block_rows(self.blocks, name)[block, :, lane] = np.broadcast_to(values, indices.shape)[:, None]
 
-    def _lane_values(self, chosen: np.ndarray, name: str | None = None) -> np.ndarray:
-        """A field of some of them, or all that is known of them, shape (trajectories, rows)."""
-        block, lane = np.divmod(chosen, self.step_loop.lanes)
+    def _lane_values(self, indices: np.ndarray, name: str | None = None) -> np.ndarray:
+        """Return a field of the chosen trajectories, or all their rows, shape (trajectories, rows)."""
+        block, lane = np.divmod(indices, self.step_loop.lanes)
         return self.step_loop.block_rows(self.blocks, name)[block, :, lane]
 
-    def keep_only(self, chosen: np.ndarray) -> None:
-        """Go on with some of them."""
-        self.blocks, self.n_trajectories = self.step_loop.blocks_from_rows(self._lane_values(chosen)), len(chosen)
+    def keep_only(self, indices: np.ndarray) -> None:
+        """Drop all trajectories except the chosen ones."""
+        self.blocks, self.n_trajectories = self.step_loop.blocks_from_rows(self._lane_values(indices)), len(indices)

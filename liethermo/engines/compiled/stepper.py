@@ -1,9 +1,8 @@
-"""The compiled engine: a user's plain functions as machine code, for small systems on the CPU.
+"""Compiled engine: a user's plain functions as machine code, for small systems on the CPU.
 
 The steps of the array engine, for one system and method, are traced, unrolled to scalar programs (:mod:`liethermo.
 tracing.scalarize`) and placed in a loop over steps (:mod:`.loop`) that LLVM compiles. The system's parameters (the
-arrays among its leaves) stay arguments: a sweep compiles once. Machine code is kept on disk, so that another process
-finds it.
+arrays among its leaves) stay arguments: a sweep compiles once. Machine code is cached on disk for other processes.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ import itertools
 import math
 import threading
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +25,7 @@ from ...tracing.caching import LRUCache
 from ...tracing.calls import deferred_p
 from ...tracing.scalarize import report_compiler_faults, scalarize
 from ..array import max_saves_per_call
+from ..codes import StatusCode
 from ..pacing import (
     ATTEMPT_FIELDS,
     AdaptiveState,
@@ -44,48 +44,62 @@ from .machine_code import MachineCode
 from .newton import compile_newton_solver
 
 STATE_FIELDS = State._fields
+"""Fields of a state."""
+
 ADAPTIVE_FIELDS = tuple(name for name in AdaptiveState._fields if name != "state")
-"""Those of a pace beside them."""
-NEWTON_INPUTS = ("dW", "x", "compensation", "h", "k", "previous_slopes")
-"""What it is given."""
+"""Fields of an adaptive state besides the state."""
+
+
+class NewtonInputs(NamedTuple):
+    """Inputs of the Newton fallback, as they are packed into the Newton buffer."""
+
+    dW: jax.Array
+    x: jax.Array
+    compensation: jax.Array
+    h: jax.Array
+    k: jax.Array
+    previous_slopes: jax.Array
+
+
+NEWTON_INPUTS = NewtonInputs._fields
+"""Names of the inputs of the Newton fallback."""
+
 NEWTON_OUTPUTS = ("converged", "is_finite", "residual", "newton_iterations", "slope_rounding", "k")
-"""What Newton's method may make better of :class:`..stages.Solved`."""
+"""Fields of :class:`..stages.StageSolution` that the Newton fallback replaces."""
 
 
 class CompiledEngine:
-    """The compiled engine for one system and method: its results are those of the array engine.
+    """Compiled engine for one system and method; its steps are those of the array engine.
 
     Raises
     ------
     UnsupportedPrimitive
-        If the system or the method uses what cannot be unrolled; of Newton's method, when a step first needs it.
+        If the system or the method uses a primitive that cannot be unrolled; if only Newton's method does, at the first
+        step that needs it.
     """
 
     name = "compiled"
 
     def __init__(
-        self, system: System, method: OneStepMethod, rules: SolverOptions = DEFAULT_OPTIONS, planned_steps: int = 0
+        self, system: System, method: OneStepMethod, options: SolverOptions = DEFAULT_OPTIONS, planned_steps: int = 0
     ):
-        self._parameters, self.max_saves_per_call, self._planned_steps = (
-            flat_parameters(system, method),
-            max_saves_per_call(system),
-            planned_steps,
-        )
-        self._structure, self._method, self._options = ProgramStructure.from_module(system), method, rules
+        self._parameters, self._planned_steps = flat_parameters(system, method), planned_steps
+        self.max_saves_per_call = max_saves_per_call(system)
+        self._structure, self._method, self._options = ProgramStructure.from_module(system), method, options
 
     @functools.cached_property
     def _step_loop(self) -> CompiledStepLoop:
-        """Its loop of steps, made when it is first needed: a run with a pace has one of its own."""
+        """Loop of fixed steps, compiled at its first use: an adaptive run has a loop of its own."""
         return cached_step_loop(self._structure, self._parameters, self._method, options=self._options)
 
-    def adaptive_step_loop(self, pacing: StepControl) -> tuple[CompiledStepLoop, np.ndarray]:
-        """The stepper of a run with a pace, and its parameters."""
-        whole = np.append(self._parameters, flat_parameters(pacing))
-        return cached_step_loop(self._structure, whole, self._method, pacing, options=self._options), whole
+    def adaptive_step_loop(self, control: StepControl) -> tuple[CompiledStepLoop, np.ndarray]:
+        """Return the step loop of an adaptive run, and its parameters."""
+        parameters = np.append(self._parameters, flat_parameters(control))
+        return cached_step_loop(self._structure, parameters, self._method, control, options=self._options), parameters
 
     @property
     def n_operations(self) -> int:
-        """How many scalar operations a step takes."""
+        """Number of scalar operations of a step."""
         return self._step_loop.n_operations
 
     def initial_run_state(self, x) -> State:
@@ -93,10 +107,10 @@ class CompiledEngine:
             self._step_loop.start_blocks(self._parameters, np.asarray(x, dtype=np.float64)[None], self._planned_steps)
         )
 
-    def advance(self, state: State, h, saves: int, every: int, noise=None):
-        new, out = self._run(state, h, saves, every, noise)
-        reached = np.arange(saves) < (int(new.step) - int(state.step)) // every
-        return new, (out[:, :-2], out[:, -2], out[:, -1], reached)
+    def advance(self, state: State, h, saves: int, save_every: int, noise=None):
+        new_state, out = self._run(state, h, saves, save_every, noise)
+        is_reached = np.arange(saves) < (int(new_state.step) - int(state.step)) // save_every
+        return new_state, (out[:, :-2], out[:, -2], out[:, -1], is_reached)
 
     def step(self, state: State, h, noise=None) -> State:
         return self._run(state, h, 1, 1, noise)[0]
@@ -104,12 +118,14 @@ class CompiledEngine:
     def step_ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
         blocks = self._step_loop.start_blocks(self._parameters, x)
         self._step_loop.run(self._parameters, blocks, h, 1, 1)
-        found = self._step_loop.read_fields(blocks, ("x", "status"))
-        return np.where(found["status"].reshape(-1, 1) == 0.0, found["x"], np.nan)
+        fields = self._step_loop.read_fields(blocks, ("x", "status"))
+        return np.where(fields["status"].reshape(-1, 1) == 0.0, fields["x"], np.nan)
 
-    def _run(self, state: State, h, saves: int, every: int, noise) -> tuple[State, np.ndarray]:
+    def _run(self, state: State, h, saves: int, save_every: int, noise) -> tuple[State, np.ndarray]:
         blocks = self._step_loop.block_from_state(state)
-        out = self._step_loop.run(self._parameters, blocks, h, saves, every, None if noise is None else noise[None])[0]
+        out = self._step_loop.run(
+            self._parameters, blocks, h, saves, save_every, None if noise is None else noise[None]
+        )[0]
         return self._state_from_block(blocks), out
 
     def _state_from_block(self, blocks: np.ndarray) -> State:
@@ -117,291 +133,317 @@ class CompiledEngine:
 
 
 class CompiledStepLoop:
-    """The step loop of one method on systems of one form, compiled; parameters are arguments.
+    """Compiled step loop of one method on systems of one structure; parameters are arguments.
 
-    With a pacing a step is an attempt, whose size the loop chooses.
+    With a ``control`` a step is an attempt of an adaptive run, whose size the loop chooses.
 
     Parameters
     ----------
-    forms : sequence of Form
-        Of the system and of the method, and of the pacing where there is one.
+    structures : sequence of ProgramStructure
+        Structures of the system, the method and, in an adaptive run, the step control.
     parameters : array, shape (p,)
-        Those of one of each, one after another. Zeros among them hold for all, unless they vary.
+        Example parameters of these, one after another. Zeros among them are compiled in, unless they vary.
     method : OneStepMethod
-    pacing : Pacing or None
+    control : StepControl or None
     lanes : int
-        Trajectories that advance together, a block.
-    varies : array of bool, shape (p,)
-        Which parameters are each trajectory's own.
+        Number of trajectories in a block, which advance together.
+    is_per_trajectory : array of bool, shape (p,)
+        Parameters that differ between trajectories.
 
     Attributes
     ----------
     field_names : tuple of str
-        The fields of a trajectory.
+        Fields of a trajectory.
     initial_inputs, step_inputs : tuple of str
-        The input of a run besides its x, and what a step is given besides the fields.
+        Inputs of the initial state besides p and x; inputs of a step besides the fields.
     saved_fields : tuple of str
-        The fields that are written down at each save.
+        Fields that are written out at each save.
     """
 
     def __init__(
         self,
-        forms: Sequence[ProgramStructure],
+        structures: Sequence[ProgramStructure],
         parameters: np.ndarray,
         method: OneStepMethod,
-        pacing: StepControl | None,
+        control: StepControl | None,
         lanes: int,
-        varies: np.ndarray,
-        rules: SolverOptions,
+        is_per_trajectory: np.ndarray,
+        options: SolverOptions,
     ):
-        self.lanes, self._options, self._is_per_trajectory = lanes, rules, varies
-        self._constant_parameters = np.where((parameters == 0.0) & ~varies, 0.0, np.nan)
+        self.lanes, self._options, self._is_per_trajectory = lanes, options, is_per_trajectory
+        self._constant_parameters = np.where((parameters == 0.0) & ~is_per_trajectory, 0.0, np.nan)
         self._lock = threading.Lock()
         self._newton_code: MachineCode | None = None
-        self._structures = forms
-        system = forms[0].build(parameters[: forms[0].n_parameters])
-        n, slopes = system.dim, jax.eval_shape(lambda x: method.start(system, x), jnp.zeros(system.dim)).shape
-        self._shapes: dict[str, tuple[int, ...]] = {"x": (n,), "compensation": (n,), "k": slopes, "p": parameters.shape}
+        self._structures = structures
+        system = structures[0].build(parameters[: structures[0].n_parameters])
+        n, slopes_shape = system.dim, jax.eval_shape(lambda x: method.start(system, x), jnp.zeros(system.dim)).shape
+        self._shapes: dict[str, tuple[int, ...]] = {
+            "x": (n,),
+            "compensation": (n,),
+            "k": slopes_shape,
+            "p": parameters.shape,
+        }
         self._shapes |= {
-            "previous_slopes": (0 if method.explicit else method.stages, slopes[1]),
+            "previous_slopes": (0 if method.explicit else method.stages, slopes_shape[1]),
             "dW": (noise_dimension(method),),
         }
-        self.field_names: tuple[str, ...] = STATE_FIELDS if pacing is None else (*STATE_FIELDS, *ADAPTIVE_FIELDS)
-        self.saved_fields = ("x", "energy", "entropy") if pacing is None else ATTEMPT_FIELDS
-        self.initial_inputs = () if pacing is None else ("t", "stop_time", "length")
-        self.step_inputs = ("p", "dW", "h") if pacing is None else ("p", "dW")
-        if pacing is not None:
+        self.field_names: tuple[str, ...] = STATE_FIELDS if control is None else (*STATE_FIELDS, *ADAPTIVE_FIELDS)
+        self.saved_fields = ("x", "energy", "entropy") if control is None else ATTEMPT_FIELDS
+        self.initial_inputs = () if control is None else ("t", "stop_time", "length")
+        self.step_inputs = ("p", "dW", "h") if control is None else ("p", "dW")
+        if control is not None:
             self._shapes |= {
-                "jacobian_probe": jacobian_probe_shape(system, method, pacing),
+                "jacobian_probe": jacobian_probe_shape(system, method, control),
                 "root_bracket": EMPTY_BRACKET.shape,
             }
-        step = self._trace_program(self.fields_after_step, (*self.step_inputs, *self.field_names), self.field_names)
+        step_program = self._trace_program(
+            self.fields_after_step, (*self.step_inputs, *self.field_names), self.field_names
+        )
         if method.explicit:
-            changing = [i for i, a in enumerate(step.arguments) if a not in ("p", "h")]
-            step = step._replace(program=step.program.factor_constants(changing))
-        begin = self._trace_program(self.initial_fields, ("p", "x", *self.initial_inputs), self.field_names)
-        self._programs = {"step": step, "begin": begin}
-        handed = (
+            variable_inputs = [i for i, a in enumerate(step_program.arguments) if a not in ("p", "h")]
+            step_program = step_program._replace(program=step_program.program.factor_constants(variable_inputs))
+        initial_program = self._trace_program(self.initial_fields, ("p", "x", *self.initial_inputs), self.field_names)
+        self._programs = {"step": step_program, "begin": initial_program}
+        buffer_size = (
             0
             if method.explicit
             else sum(math.prod(self.field_shape(name)) for name in (*NEWTON_OUTPUTS, *NEWTON_INPUTS))
         )
         names = (*self.field_names, *self.initial_inputs, *self.step_inputs[1:])
         shapes = {name: self.field_shape(name) for name in names} | {
-            "p": (int(varies.sum()),),
-            NEWTON_BUFFER: (handed,),
+            "p": (int(is_per_trajectory.sum()),),
+            NEWTON_BUFFER: (buffer_size,),
         }
         self._layout = BlockLayout(shapes)
-        rows, sizes = self._layout.first_rows, self._layout.row_counts
-        self._state_rows = [(rows[name], rows[name] + sizes[name], self.field_shape(name)) for name in STATE_FIELDS]
-        state = [name for name in (*self.field_names, "h") if name in rows]
-        make = functools.partial(
-            compile_step_loop, self._programs, self._layout, state, varies, lanes, self.saved_fields
+        first_rows, row_counts = self._layout.first_rows, self._layout.row_counts
+        self._state_rows = [
+            (first_rows[name], first_rows[name] + row_counts[name], self.field_shape(name)) for name in STATE_FIELDS
+        ]
+        state_names = [name for name in (*self.field_names, "h") if name in first_rows]
+        compile_loops = functools.partial(
+            compile_step_loop, self._programs, self._layout, state_names, is_per_trajectory, lanes, self.saved_fields
         )
-        self._loops = CompiledLoops(make, lanes == 1 and self.n_operations <= MAX_UNOPTIMISED_OPERATIONS)
+        self._loops = CompiledLoops(compile_loops, lanes == 1 and self.n_operations <= MAX_UNOPTIMISED_OPERATIONS)
 
     # -- what is compiled -----------------------------------------------------------------------------------------
 
     def build_modules(self, p) -> list[Any]:
-        """System and method, and pacing, with the parameters p."""
-        ends = itertools.accumulate(form.n_parameters for form in self._structures)
-        return [form.build(p[end - form.n_parameters : end]) for form, end in zip(self._structures, ends, strict=True)]
+        """Return system and method, and the step control of an adaptive run, with the parameters p."""
+        ends = itertools.accumulate(structure.n_parameters for structure in self._structures)
+        return [
+            structure.build(p[end - structure.n_parameters : end])
+            for structure, end in zip(self._structures, ends, strict=True)
+        ]
 
     def initial_fields(self, p, x, *times) -> tuple:
-        """The fields of a run about to start at x."""
-        system, method, *way = self.build_modules(p)
-        if not way:
+        """Return the fields of a run that starts at x."""
+        system, method, *control = self.build_modules(p)
+        if not control:
             return initial_run_state(system, method, x)
-        pace = initial_adaptive_state(system, method, way[0], x, *times)
-        return *pace.state, *pace[1:]
+        adaptive_state = initial_adaptive_state(system, method, control[0], x, *times)
+        return *adaptive_state.state, *adaptive_state[1:]
 
-    def fields_after_step(self, p, dW, *given) -> tuple:
-        """The fields after a step, or an attempt, from its size and those before, or these alone."""
-        system, method, *way = self.build_modules(p)
-        if not way:
-            h, *fields = given
+    def fields_after_step(self, p, dW, *inputs) -> tuple:
+        """Return the fields after a step or an attempt; ``inputs`` are h (fixed steps only) and the old fields."""
+        system, method, *control = self.build_modules(p)
+        if not control:
+            h, *fields = inputs
             return take_step(
                 system, set_noise_increments(method, dW), State(*fields), h, self._options, self._newton_fallback(dW)
             )
-        before = AdaptiveState(State(*given[: len(STATE_FIELDS)]), *given[len(STATE_FIELDS) :])
-        pace = attempt_step(system, method, way[0], before, self._options, self._newton_fallback(dW))
-        return *pace.state, *pace[1:]
+        previous_state = AdaptiveState(State(*inputs[: len(STATE_FIELDS)]), *inputs[len(STATE_FIELDS) :])
+        adaptive_state = attempt_step(
+            system, method, control[0], previous_state, self._options, self._newton_fallback(dW)
+        )
+        return *adaptive_state.state, *adaptive_state[1:]
 
     def _newton_fallback(self, dW) -> Callable:
-        """Newton's method, for :func:`..stepping.take_step`: a program of its own, compiled when a step needs it."""
+        """Return the fallback for :func:`..stepping.take_step`: a program compiled at its first use."""
 
-        def second(first: StageSolution, *given) -> StageSolution:
-            handed = [1.0 * getattr(first, name) for name in NEWTON_OUTPUTS]
-            found = deferred_p.bind(*handed, dW, *(jnp.asarray(a) for a in given), results=len(NEWTON_OUTPUTS))
-            solved = first._replace(**dict(zip(NEWTON_OUTPUTS, found, strict=True)))
-            return solved._replace(converged=solved.converged > 0.0, is_finite=solved.is_finite > 0.0)
+        def bind_deferred_newton(fixed_point_result: StageSolution, *stage_inputs) -> StageSolution:
+            initial_outputs = [1.0 * getattr(fixed_point_result, name) for name in NEWTON_OUTPUTS]
+            outputs = deferred_p.bind(
+                *initial_outputs, dW, *(jnp.asarray(a) for a in stage_inputs), results=len(NEWTON_OUTPUTS)
+            )
+            solution = fixed_point_result._replace(**dict(zip(NEWTON_OUTPUTS, outputs, strict=True)))
+            return solution._replace(converged=solution.converged > 0.0, is_finite=solution.is_finite > 0.0)
 
-        return second
+        return bind_deferred_newton
 
-    def _solve_packed_newton(self, p, handed) -> tuple:
-        """What takes the place of what is handed over."""
+    def _solve_packed_newton(self, p, packed) -> tuple:
+        """Run Newton's method on the packed outputs and inputs; return the new outputs."""
         system, method, *_ = self.build_modules(p)
         shapes = [self.field_shape(name) for name in (*NEWTON_OUTPUTS, *NEWTON_INPUTS)]
         ends = itertools.accumulate(map(math.prod, shapes))
-        parts = [handed[end - math.prod(shape) : end].reshape(shape) for end, shape in zip(ends, shapes, strict=True)]
-        dW, x, compensation, h, k, before = parts[len(NEWTON_OUTPUTS) :]
-        own = stage_equations(
-            system, set_noise_increments(method, dW), x, compensation, h, k, before, self._options, jax.lax.map
+        arrays = [packed[end - math.prod(shape) : end].reshape(shape) for end, shape in zip(ends, shapes, strict=True)]
+        inputs = NewtonInputs(*arrays[len(NEWTON_OUTPUTS) :])
+        equations = stage_equations(
+            system,
+            set_noise_increments(method, inputs.dW),
+            inputs.x,
+            inputs.compensation,
+            inputs.h,
+            inputs.k,
+            inputs.previous_slopes,
+            self._options,
+            jax.lax.map,
         )
-        found = solve_newton(own, self._options)
-        return tuple(1.0 * getattr(found, name) for name in NEWTON_OUTPUTS)
+        solution = solve_newton(equations, self._options)
+        return tuple(1.0 * getattr(solution, name) for name in NEWTON_OUTPUTS)
 
     @property
     def n_operations(self) -> int:
-        """Scalar operations of a step with one iteration."""
+        """Number of scalar operations of a step with one iteration."""
         return self._programs["step"].program.instruction_count
 
     def _trace_program(self, function: Callable, names: Sequence[str], results: Sequence[str] = ()) -> NamedProgram:
         shapes = [jax.ShapeDtypeStruct(self.field_shape(a), jnp.float64) for a in names]
-        known = [self._constant_parameters if a == "p" else None for a in names]
-        return NamedProgram(scalarize(jax.make_jaxpr(function)(*shapes), known), tuple(names), tuple(results))
+        constants = [self._constant_parameters if a == "p" else None for a in names]
+        return NamedProgram(scalarize(jax.make_jaxpr(function)(*shapes), constants), tuple(names), tuple(results))
 
     # -- trajectories in blocks -----------------------------------------------------------------------------------
 
-    def start_blocks(self, parameters, x: np.ndarray, planned: int = 0, **fields: np.ndarray) -> np.ndarray:
-        """Blocks, shape (blocks, rows * lanes), of trajectories about to start at x, shape (trajectories, n).
+    def start_blocks(self, parameters, x: np.ndarray, planned_steps: int = 0, **fields: np.ndarray) -> np.ndarray:
+        """Return blocks, shape (blocks, rows * lanes), of trajectories that start at x, shape (trajectories, n).
 
-        ``parameters`` has shape (p,), or (trajectories, p) where some vary; so many steps are ``planned``.
+        ``parameters`` has shape (p,), or (trajectories, p) if some differ; ``planned_steps`` decides on optimisation.
         """
         blocks = self.make_blocks({"x": x, **fields}, parameters)
-        first = np.ascontiguousarray(parameters if np.ndim(parameters) == 1 else parameters[0], dtype=np.float64)
+        first_parameters = np.ascontiguousarray(
+            parameters if np.ndim(parameters) == 1 else parameters[0], dtype=np.float64
+        )
         status = self.block_rows(blocks, "status")
-        empty = status == EMPTY_LANE_STATUS
-        self._loops.loop_functions(0, planned)[0](first.ctypes.data, blocks.ctypes.data, len(blocks))
-        status[empty] = EMPTY_LANE_STATUS
+        is_empty = status == StatusCode.EMPTY_LANE
+        self._loops.loop_functions(0, planned_steps)[0](first_parameters.ctypes.data, blocks.ctypes.data, len(blocks))
+        status[is_empty] = StatusCode.EMPTY_LANE
         return blocks
 
     def block_rows(self, blocks: np.ndarray, name: str | None = None) -> np.ndarray:
-        """A field of blocks, or all rows of them, shape (blocks, entries, lanes)."""
-        whole = blocks.reshape(len(blocks), self.n_rows, self.lanes)
-        return whole if name is None else whole[:, self.row_slice(name)]
+        """Return a field of blocks, or all their rows, as a view of shape (blocks, rows, lanes)."""
+        rows = blocks.reshape(len(blocks), self.n_rows, self.lanes)
+        return rows if name is None else rows[:, self.row_slice(name)]
 
     @property
     def n_rows(self) -> int:
-        """How many rows a trajectory has."""
+        """Number of rows of a block."""
         return self._layout.n_rows
 
     def row_slice(self, name: str) -> slice:
-        """Those of a field."""
-        first = self._layout.first_rows[name]
-        return slice(first, first + self._layout.row_counts[name])
+        """Return the rows of a field."""
+        start = self._layout.first_rows[name]
+        return slice(start, start + self._layout.row_counts[name])
 
     def field_shape(self, name: str) -> tuple[int, ...]:
-        """The shape of a field of one trajectory."""
+        """Return the shape of a field of one trajectory."""
         return self._shapes.get(name, ())
 
     def make_blocks(self, fields: dict[str, Any], parameters=None) -> np.ndarray:
-        """Blocks of trajectories with the given fields, trajectories first; nothing else is set but their status."""
+        """Return blocks of trajectories with these fields and status 0; other fields are undefined."""
         if self._is_per_trajectory.any() and "p" not in fields:
             fields = fields | {"p": parameters[:, self._is_per_trajectory]}
-        number = len(fields["x"])
-        whole = np.empty((-(-number // self.lanes), self.n_rows, self.lanes))
-        whole[:, self.row_slice("status")] = 0.0
+        n_trajectories = len(fields["x"])
+        blocks = np.empty((-(-n_trajectories // self.lanes), self.n_rows, self.lanes))
+        blocks[:, self.row_slice("status")] = 0.0
         for name, values in fields.items():
-            whole[:, self.row_slice(name)] = self._rows_to_lanes(np.reshape(values, (number, -1)))
-        return self._mark_empty_lanes(whole, number)
+            blocks[:, self.row_slice(name)] = self._rows_to_lanes(np.reshape(values, (n_trajectories, -1)))
+        return self._mark_empty_lanes(blocks, n_trajectories)
 
     def block_from_state(self, state: State) -> np.ndarray:
-        """The only block of a trajectory by itself."""
-        whole = np.zeros((1, self.n_rows))
-        row = whole[0]
-        for (first, end, shape), value in zip(self._state_rows, state, strict=True):
+        """Return the block of a single trajectory."""
+        block = np.zeros((1, self.n_rows))
+        row = block[0]
+        for (start, end, shape), value in zip(self._state_rows, state, strict=True):
             if shape:
-                row[first:end].reshape(shape)[...] = value
+                row[start:end].reshape(shape)[...] = value
             else:
-                row[first] = value
-        return whole
+                row[start] = value
+        return block
 
     def state_from_block(self, blocks: np.ndarray) -> State:
-        """The state in the only block of a trajectory by itself."""
+        """Return the state of a single trajectory from its block."""
         row = blocks[0]
         return State(
-            *(row[first:end].reshape(shape) if shape else row[first] for first, end, shape in self._state_rows)
+            *(row[start:end].reshape(shape) if shape else row[start] for start, end, shape in self._state_rows)
         )
 
-    def blocks_from_rows(self, whole: np.ndarray) -> np.ndarray:
-        """Blocks of trajectories from all their rows, shape (trajectories, rows)."""
-        return self._mark_empty_lanes(np.ascontiguousarray(self._rows_to_lanes(whole)), len(whole))
+    def blocks_from_rows(self, rows: np.ndarray) -> np.ndarray:
+        """Return blocks of trajectories from all their rows, shape (trajectories, rows)."""
+        return self._mark_empty_lanes(np.ascontiguousarray(self._rows_to_lanes(rows)), len(rows))
 
     def _rows_to_lanes(self, rows: np.ndarray) -> np.ndarray:
-        """Rows of trajectories, shape (trajectories, m), as (blocks, m, lanes); the last one fills empty lanes."""
-        count = -(-len(rows) // self.lanes)
-        if empty := count * self.lanes - len(rows):
-            rows = np.concatenate([rows, np.repeat(rows[-1:], empty, axis=0)])
-        return rows.reshape(count, self.lanes, -1).swapaxes(1, 2)
+        """Rearrange rows, shape (trajectories, m), to (blocks, m, lanes); the last trajectory fills the empty lanes."""
+        n_blocks = -(-len(rows) // self.lanes)
+        if n_empty := n_blocks * self.lanes - len(rows):
+            rows = np.concatenate([rows, np.repeat(rows[-1:], n_empty, axis=0)])
+        return rows.reshape(n_blocks, self.lanes, -1).swapaxes(1, 2)
 
-    def _mark_empty_lanes(self, whole: np.ndarray, number: int) -> np.ndarray:
-        """Blocks, shape (blocks, rows, lanes), of so many trajectories, their empty lanes marked; each in one row."""
-        used = number - (len(whole) - 1) * self.lanes
-        whole[-1, self._layout.first_rows["status"], used:] = EMPTY_LANE_STATUS
-        return whole.reshape(len(whole), -1)
+    def _mark_empty_lanes(self, blocks: np.ndarray, n_trajectories: int) -> np.ndarray:
+        """Mark the empty lanes of blocks, shape (blocks, rows, lanes), and return the blocks with one row each."""
+        n_used = n_trajectories - (len(blocks) - 1) * self.lanes
+        blocks[-1, self._layout.first_rows["status"], n_used:] = StatusCode.EMPTY_LANE
+        return blocks.reshape(len(blocks), -1)
 
     def read_fields(self, blocks: np.ndarray, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
-        """Fields of trajectories, trajectories first, those of empty lanes among them."""
-        found, number = {}, len(blocks) * self.lanes
+        """Return fields of all lanes by name, trajectories first, including empty lanes."""
+        fields, n_lanes = {}, len(blocks) * self.lanes
         for name in self.field_names if names is None else names:
             values = self.block_rows(blocks, name).swapaxes(0, 1)
-            found[name] = values.reshape(-1, number).T.reshape(number, *self.field_shape(name))
-        return found
+            fields[name] = values.reshape(-1, n_lanes).T.reshape(n_lanes, *self.field_shape(name))
+        return fields
 
     def run(
-        self, parameters, blocks: np.ndarray, h: float | np.ndarray, saves: int, every: int, noise=None, out=None
+        self, parameters, blocks: np.ndarray, h: float | np.ndarray, saves: int, save_every: int, noise=None, out=None
     ) -> np.ndarray:
-        """Advance blocks in place by ``saves * every`` steps of size h, or less where steps fail.
+        """Advance blocks in place by up to ``saves * save_every`` steps of size h; return the saved fields.
 
-        The size is one for all, or one for each lane, those of empty ones among them.
-        ``noise`` has the increments, shape (trajectories, steps, increments), of a method that is driven by any.
+        h is one step size, or one for each lane, empty lanes included. ``noise`` holds the increments of a stochastic
+        method, shape (trajectories, steps, increments).
 
-        Returns, at each save, what is :attr:`kept` of every trajectory: shape (trajectories, saves, width), with those
-        of empty lanes, and undefined after a failure. It is written to ``out``, if there is one.
+        The result has shape (trajectories, saves, n_saved_values), including empty lanes, and is undefined after a
+        failed step. It is written to ``out`` if that is given.
         """
-        lanes, count, width = self.lanes, len(blocks), self.n_saved_values
+        lanes, n_blocks, width = self.lanes, len(blocks), self.n_saved_values
         if "h" in self._layout.first_rows:
             self.block_rows(blocks, "h")[:, 0] = np.reshape(h, (-1, lanes)) if np.ndim(h) else h
         parameters = np.ascontiguousarray(parameters, dtype=np.float64)
-        out = np.empty((count, saves, width * lanes)) if out is None else out
-        done = np.zeros(count, dtype=np.int64)
-        saves, every = int(saves), int(every)
-        arguments = [parameters.ctypes.data, blocks.ctypes.data, done.ctypes.data, count, saves, every]
-        increments = self._noise_by_block(noise, count, saves * every)
-        arguments += [out.ctypes.data, saves * every, increments.ctypes.data]
-        solve = 0 if self._newton_code is None else self._newton_address()
-        _, advance = self._loops.loop_functions(count * saves * every)
-        while advance(*arguments, solve) < count:
-            solve = self._newton_address()
-        return out.reshape(count, saves, width, lanes).transpose(0, 3, 1, 2).reshape(count * lanes, saves, width)
+        out = np.empty((n_blocks, saves, width * lanes)) if out is None else out
+        steps_done = np.zeros(n_blocks, dtype=np.int64)
+        saves, save_every = int(saves), int(save_every)
+        arguments = [parameters.ctypes.data, blocks.ctypes.data, steps_done.ctypes.data, n_blocks, saves, save_every]
+        increments = self._noise_by_block(noise, n_blocks, saves * save_every)
+        arguments += [out.ctypes.data, saves * save_every, increments.ctypes.data]
+        newton_address = 0 if self._newton_code is None else self._newton_address()
+        _, advance = self._loops.loop_functions(n_blocks * saves * save_every)
+        while advance(*arguments, newton_address) < n_blocks:
+            newton_address = self._newton_address()
+        return out.reshape(n_blocks, saves, width, lanes).transpose(0, 3, 1, 2).reshape(n_blocks * lanes, saves, width)
 
     def saved_fields_of_one(self, out: np.ndarray) -> dict[str, np.ndarray]:
-        """By name what is kept of a trajectory that is a block by itself, from rows of ``out``."""
+        """Return the saved fields of a single trajectory by name, from rows of ``out``."""
         ends = np.cumsum([self._layout.row_counts[name] for name in self.saved_fields])
-        parts = np.split(out, ends[:-1], axis=-1)
+        arrays = np.split(out, ends[:-1], axis=-1)
         return {
-            name: part.reshape(len(out), *self.field_shape(name))
-            for name, part in zip(self.saved_fields, parts, strict=True)
+            name: values.reshape(len(out), *self.field_shape(name))
+            for name, values in zip(self.saved_fields, arrays, strict=True)
         }
 
     @property
     def n_saved_values(self) -> int:
-        """Numbers that are kept of a trajectory at each save."""
+        """Number of values of a trajectory at each save."""
         return sum(self._layout.row_counts[name] for name in self.saved_fields)
 
-    def _noise_by_block(self, noise: np.ndarray | None, count: int, steps: int) -> np.ndarray:
-        """Increments as the loop reads them, shape (blocks, steps, increments, lanes)."""
+    def _noise_by_block(self, noise: np.ndarray | None, n_blocks: int, n_steps: int) -> np.ndarray:
+        """Rearrange noise increments to the order of the loop, shape (blocks, steps, increments, lanes)."""
         if noise is None or not self._shapes["dW"][0]:
-            return np.zeros((count, steps, self._shapes["dW"][0], self.lanes))
-        padded = np.zeros((count * self.lanes, steps, self._shapes["dW"][0]))
+            return np.zeros((n_blocks, n_steps, self._shapes["dW"][0], self.lanes))
+        padded = np.zeros((n_blocks * self.lanes, n_steps, self._shapes["dW"][0]))
         padded[: len(noise)] = noise
-        return np.ascontiguousarray(padded.reshape(count, self.lanes, steps, -1).transpose(0, 2, 3, 1))
+        return np.ascontiguousarray(padded.reshape(n_blocks, self.lanes, n_steps, -1).transpose(0, 2, 3, 1))
 
     # -- machine code -------------------------------------------------------------------------------------------------
 
     def _newton_address(self) -> int:
-        """The address of Newton's method, which is compiled when a step first needs it."""
+        """Return the address of Newton's method, which is compiled at the first call."""
         with self._lock, report_compiler_faults():
             if self._newton_code is None:
                 self._shapes[NEWTON_BUFFER] = (self._layout.row_counts[NEWTON_BUFFER],)
@@ -410,41 +452,38 @@ class CompiledStepLoop:
             return self._newton_code.function_address("solve")
 
 
-EMPTY_LANE_STATUS = 9.0
-"""Status of a lane without a trajectory."""
-
 MAX_CACHED_STEP_LOOPS = 128
-"""Forms whose loops are held in memory."""
+"""Number of compiled step loops held in memory."""
 
 _step_loop_cache: LRUCache[Any] = LRUCache(MAX_CACHED_STEP_LOOPS)
 
 
 def cached_step_loop(
-    form: ProgramStructure,
+    structure: ProgramStructure,
     parameters: np.ndarray,
     method: OneStepMethod,
-    pacing: StepControl | None = None,
+    control: StepControl | None = None,
     lanes: int = 1,
-    varies: np.ndarray | None = None,
+    is_per_trajectory: np.ndarray | None = None,
     options: SolverOptions = DEFAULT_OPTIONS,
 ) -> CompiledStepLoop:
-    """The stepper for systems of a form, a method, and a pacing.
+    """Return the compiled step loop for a structure, a method and a step control, cached if possible.
 
-    Which of their parameters are zero belongs to it: a diagonal matrix makes a shorter program.
+    The cache key contains which parameters are zero: a diagonal matrix makes a shorter program.
 
     Parameters
     ----------
     parameters : array, shape (p,)
-        Of a system of that form, of the method, and of the pacing: see :func:`flat_parameters`.
+        Parameters of such a system, of the method, and of the step control: see :func:`flat_parameters`.
     """
-    forms = [
-        form,
+    structures = [
+        structure,
         ProgramStructure.from_module(method),
-        *([] if pacing is None else [ProgramStructure.from_module(pacing)]),
+        *([] if control is None else [ProgramStructure.from_module(control)]),
     ]
-    varies = np.zeros(len(parameters), dtype=bool) if varies is None else varies
-    known = ((parameters == 0.0) & ~varies).tobytes(), varies.tobytes()
-    key = *((form.key, form.shapes) for form in forms), *known, lanes, options
+    is_per_trajectory = np.zeros(len(parameters), dtype=bool) if is_per_trajectory is None else is_per_trajectory
+    masks = ((parameters == 0.0) & ~is_per_trajectory).tobytes(), is_per_trajectory.tobytes()
+    key = *((form.key, form.shapes) for form in structures), *masks, lanes, options
     return _step_loop_cache.get_or_compute(
-        key, lambda: CompiledStepLoop(forms, parameters, method, pacing, lanes, varies, options)
+        key, lambda: CompiledStepLoop(structures, parameters, method, control, lanes, is_per_trajectory, options)
     )

@@ -18,20 +18,27 @@ from .blocks import BlockResults, Table, make_table, select_entry, write_block
 from .exponential import write_exponential
 from .lapack import SPECIAL_FUNCTIONS, declare_symbol
 
-FLOAT64, BOOL, INT64 = ir.DoubleType(), ir.IntType(1), ir.IntType(64)
+FLOAT64 = ir.DoubleType()
+BOOL = ir.IntType(1)
+INT64 = ir.IntType(64)
 
 LLVM_INTRINSICS = {name: name for name in "sqrt exp2 log sin cos floor ceil rint trunc pow".split()} | {"abs": "fabs"}
-"""Operations that LLVM has functions for."""
+"""Operations that are LLVM intrinsics, with their LLVM names."""
 
 C_LIBRARY_FUNCTIONS = frozenset(
     "cbrt expm1 log1p tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh erf erfc".split()
 )
-"""Operations that are functions of the C library, by the same names."""
+"""Operations that are functions of the C library, with the same names."""
 
 COMPARISONS = {"eq": "==", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
+"""Comparisons, with their LLVM predicates."""
+
 ARITHMETIC = {"add": ("fadd", "add"), "sub": ("fsub", "sub"), "mul": ("fmul", "mul"), "neg": ("fneg", "neg")}
 ARITHMETIC |= {"div": ("fdiv", ""), "rem": ("frem", "")}
+"""Arithmetic operations, with the builder's methods for doubles and for integers."""
+
 LOGICAL = {"and": "and_", "or": "or_", "xor": "xor", "not": "not_"}
+"""Operations on truth values and integers, with the builder's method for each."""
 
 
 InputReader: TypeAlias = Callable[[int, int], ir.Value]
@@ -39,58 +46,62 @@ TableFinder: TypeAlias = Callable[[int, range], Table | None]
 
 
 class ProgramWriter:
-    """Writes programs where a builder stands, on numbers, or on vectors with a number for each lane.
+    """Writer of scalar programs as LLVM instructions, on numbers or on vectors with a number for each lane.
 
-    Truth values are bits, integers have 64. Sums are never reassociated. A product that is only added to something is
-    fused with the sum, and rounded once, on processors that can. The choice of these products does not depend on the
-    number of lanes. Instructions for one side of a branch are skipped where no lane takes that side. Each lane chooses
-    for itself, so that its numbers do not depend on the others.
+    Truth values are bits, integers have 64. Sums are never reassociated. A product whose only use is a sum is fused
+    with it, and rounded once, on processors that can. The choice of these products does not depend on the number of
+    lanes. Instructions for one side of a branch are skipped if no lane takes that side. Each lane chooses for itself,
+    so its numbers do not depend on the others.
 
     Attributes
     ----------
     active_lanes : value or None
-        The lanes that what is being written is for; None where it is for all.
+        Lanes for which instructions are being written; None for all.
     """
 
     def __init__(self, builder: ir.IRBuilder, lanes: int):
         self.builder, self.lanes = builder, lanes
         self.double_type, self.bool_type, self.int_type = (
-            kind if lanes == 1 else ir.VectorType(kind, lanes) for kind in (FLOAT64, BOOL, INT64)
+            value_type if lanes == 1 else ir.VectorType(value_type, lanes) for value_type in (FLOAT64, BOOL, INT64)
         )
         self.type_of_kind = {"f": self.double_type, "b": self.bool_type, "i": self.int_type}
         self.active_lanes: ir.Value | None = None
 
-    def new_function(self, name: str, kinds: Sequence[ir.Type]) -> tuple[ir.Function, ProgramWriter]:
-        """A function of the module that returns nothing, and what writes it, for as many lanes."""
-        function = ir.Function(self.builder.module, ir.FunctionType(ir.VoidType(), list(kinds)), name)
+    def new_function(self, name: str, argument_types: Sequence[ir.Type]) -> tuple[ir.Function, ProgramWriter]:
+        """Return a new function of the module without a result, and a writer of its body with as many lanes."""
+        function = ir.Function(self.builder.module, ir.FunctionType(ir.VoidType(), list(argument_types)), name)
         function.linkage = "internal"
         function.attributes.add("noinline")
         return function, ProgramWriter(ir.IRBuilder(function.append_basic_block("entry")), self.lanes)
 
     def write_as_doubles(
-        self, program: Program, read: InputReader, memory: TableFinder | None = None
+        self, program: Program, read_input: InputReader, find_table: TableFinder | None = None
     ) -> list[list[ir.Value]]:
-        """The values of the outputs, array by array.
+        """Write a program and return its outputs as doubles, array by array.
 
         Parameters
         ----------
-        read : function from the places of an array among the inputs, and of an entry in it, to its value
-            Asked for what the program uses.
-        memory : function from the place of an array among the inputs, and those of entries in it, to a table, optional
-            None where they do not lie in memory at equal distances.
+        read_input : function of (array, entry), the indices of an input array and of an entry in it, to a value
+            Called for the inputs that the program uses.
+        find_table : function of (array, entries), the index of an input array and a range of entries, to a table,
+        optional
+            Returns None if these entries are not equidistant in memory.
         """
-        return [[self._to_double(value) for value in entries] for entries in self.write_program(program, read, memory)]
+        return [
+            [self._to_double(value) for value in entries]
+            for entries in self.write_program(program, read_input, find_table)
+        ]
 
     def write_program(
-        self, program: Program, read: InputReader, memory: TableFinder | None = None
+        self, program: Program, read_input: InputReader, find_table: TableFinder | None = None
     ) -> list[list[ir.Value]]:
-        """The same, integers and truth values as they are."""
-        written = _ProgramEmitter(self, program, read, memory)
-        written.write_items(nest_branches(program))
-        return [[written.value(a) for a in entries] for entries in program.outputs]
+        """Write a program and return its outputs, array by array, with integers and truth values unconverted."""
+        emitter = _ProgramEmitter(self, program, read_input, find_table)
+        emitter.write_items(nest_branches(program))
+        return [[emitter.value(a) for a in entries] for entries in program.outputs]
 
     def cast(self, value: ir.Value, kind: str) -> ir.Value:
-        """A value as one of a kind, a key of ``kinds``."""
+        """Convert a value to a kind, "f", "b" or "i"."""
         if value.type == self.type_of_kind[kind]:
             return value
         if kind == "f":
@@ -100,122 +111,125 @@ class ProgramWriter:
         raise UnsupportedPrimitive("convert_element_type", "of unknown origin", f"from {value.type}")
 
     def constant(self, number: bool | int | float) -> ir.Value:
-        kind = {bool: self.bool_type, int: self.int_type}.get(type(number), self.double_type)
-        plain = int(number) if isinstance(number, bool) else number
-        return ir.Constant(kind, plain if self.lanes == 1 else [plain] * self.lanes)
+        value_type = {bool: self.bool_type, int: self.int_type}.get(type(number), self.double_type)
+        value = int(number) if isinstance(number, bool) else number
+        return ir.Constant(value_type, value if self.lanes == 1 else [value] * self.lanes)
 
     def write_operation(self, op: str, args: Sequence[ir.Value]) -> ir.Value:
-        """The result of one operation, a key of :data:`liethermo.tracing.builder.SYMPY_OPERATIONS`."""
+        """Write one operation, a key of :data:`liethermo.tracing.builder.SYMPY_OPERATIONS`, and return its result."""
         build, (x, *rest) = self.builder, args
-        real = x.type == self.double_type
+        is_real = x.type == self.double_type
         if op in ARITHMETIC:
-            name = ARITHMETIC[op][0 if real else 1]
+            name = ARITHMETIC[op][0 if is_real else 1]
             return getattr(build, name)(*args)
-        if op in LOGICAL and not real:
+        if op in LOGICAL and not is_real:
             return getattr(build, LOGICAL[op])(*args)
         if op in COMPARISONS:
-            of_whole = build.icmp_unsigned if x.type == self.bool_type else build.icmp_signed  # true, one bit, is no -1
-            return (build.fcmp_ordered if real else of_whole)(COMPARISONS[op], *args)
+            # as a signed bit, true would be -1
+            compare_integers = build.icmp_unsigned if x.type == self.bool_type else build.icmp_signed
+            return (build.fcmp_ordered if is_real else compare_integers)(COMPARISONS[op], *args)
         if op == "ne":
-            return build.fcmp_unordered("!=", *args) if real else build.icmp_signed("!=", *args)
+            return build.fcmp_unordered("!=", *args) if is_real else build.icmp_signed("!=", *args)
         if op == "select":
             return build.select(x, *rest)
-        if op in ("max", "min"):  # like XLA's, NaN if either is
-            better = self.write_operation("gt" if op == "max" else "lt", args)
-            if real:
-                better = build.or_(better, build.fcmp_unordered("uno", x, x))
-            return build.select(better, x, rest[0])
+        if op in ("max", "min"):  # NaN if either is NaN, as in XLA
+            takes_x = self.write_operation("gt" if op == "max" else "lt", args)
+            if is_real:
+                takes_x = build.or_(takes_x, build.fcmp_unordered("uno", x, x))
+            return build.select(takes_x, x, rest[0])
         if op == "branch":
             return x
         if op == "pick":
             return select_entry(self, x, rest)
         if op == "quotient":
             return self._integer_quotient(x, *rest)
-        if real and op == "single":
-            short = ir.FloatType() if self.lanes == 1 else ir.VectorType(ir.FloatType(), self.lanes)
-            return build.fpext(build.fptrunc(x, short), self.double_type)
-        if real and op in SPECIAL_FUNCTIONS:
+        if is_real and op == "single":
+            float32_type = ir.FloatType() if self.lanes == 1 else ir.VectorType(ir.FloatType(), self.lanes)
+            return build.fpext(build.fptrunc(x, float32_type), self.double_type)
+        if is_real and op in SPECIAL_FUNCTIONS:
             return self._call_special_function(op, args)
         if op == "float":
             return self._to_double(x)
         if op == "int":
             return build.zext(x, self.int_type) if x.type == self.bool_type else x
-        if real and op == "exp":
+        if is_real and op == "exp":
             return write_exponential(self, x)
-        if real and op in LLVM_INTRINSICS:
+        if is_real and op in LLVM_INTRINSICS:
             return self.call_intrinsic(f"llvm.{LLVM_INTRINSICS[op]}", args, self.double_type)
-        if real and op in C_LIBRARY_FUNCTIONS:
+        if is_real and op in C_LIBRARY_FUNCTIONS:
             return self.call_per_lane(op, args)
-        if real and op == "truncate":  # NaN to 0, and what is too large to the nearest integer
+        if is_real and op == "truncate":  # NaN becomes 0, and too large numbers the nearest integer
             return self.call_intrinsic("llvm.fptosi.sat", args, self.int_type)
-        if real and op == "is_finite":
+        if is_real and op == "is_finite":
             return build.fcmp_ordered("<", self.write_operation("abs", args), self.constant(np.inf))
-        if real and op == "sign":  # NaN of NaN, a zero of a zero
-            signed = self.call_intrinsic("llvm.copysign", [self.constant(1.0), x], self.double_type)
-            return build.select(build.fcmp_ordered("one", x, self.constant(0.0)), signed, x)
+        if is_real and op == "sign":  # NaN for NaN, a signed zero for a zero
+            signed_one = self.call_intrinsic("llvm.copysign", [self.constant(1.0), x], self.double_type)
+            return build.select(build.fcmp_ordered("one", x, self.constant(0.0)), signed_one, x)
         if op in ("abs", "sign") and x.type == self.int_type:
-            negative = build.icmp_signed("<", x, self.constant(0))
+            is_negative = build.icmp_signed("<", x, self.constant(0))
             if op == "abs":
-                return build.select(negative, build.neg(x), x)
-            positive = build.zext(build.icmp_signed(">", x, self.constant(0)), self.int_type)
-            return build.select(negative, self.constant(-1), positive)
+                return build.select(is_negative, build.neg(x), x)
+            is_positive = build.zext(build.icmp_signed(">", x, self.constant(0)), self.int_type)
+            return build.select(is_negative, self.constant(-1), is_positive)
         raise UnsupportedPrimitive(op, "of unknown origin", f"on {x.type}")
 
     def _integer_quotient(self, x: ir.Value, n: ir.Value) -> ir.Value:
-        """The quotient of integers, towards zero; by zero -1, and by -1 without a trap."""
+        """Write the quotient of integers, towards zero; a divisor 0 gives -1, and -1 does not trap."""
         build, one = self.builder, self.constant(1)
-        zero, minus = (build.icmp_signed("==", n, self.constant(c)) for c in (0, -1))
-        found = build.sdiv(x, build.select(build.or_(zero, minus), one, n))
-        return build.select(zero, self.constant(-1), build.select(minus, build.neg(x), found))
+        is_zero, is_minus_one = (build.icmp_signed("==", n, self.constant(c)) for c in (0, -1))
+        quotient = build.sdiv(x, build.select(build.or_(is_zero, is_minus_one), one, n))
+        return build.select(is_zero, self.constant(-1), build.select(is_minus_one, build.neg(x), quotient))
 
-    def call_newton(self, args: Sequence[ir.Value], results: int) -> list[ir.Value]:
-        """What takes the place of the first arguments: see :class:`...tracing.calls.Deferred`."""
-        raise NotImplementedError(f"nothing fills in {results} of {len(args)} values here")
+    def call_newton(self, args: Sequence[ir.Value], n_results: int) -> list[ir.Value]:
+        """Write the deferred Newton iteration and return its results: see :class:`...tracing.calls.DeferredBlock`."""
+        raise NotImplementedError(f"nothing fills in {n_results} of {len(args)} values here")
 
-    def wrap_integer(self, x: ir.Value, bits: int, signed: bool) -> ir.Value:
-        """An integer as so many bits hold it."""
-        short = ir.IntType(bits) if self.lanes == 1 else ir.VectorType(ir.IntType(bits), self.lanes)
-        widen = self.builder.sext if signed else self.builder.zext
-        return widen(self.builder.trunc(x, short), self.int_type)
+    def wrap_integer(self, x: ir.Value, bits: int, is_signed: bool) -> ir.Value:
+        """Wrap an integer to the range of ``bits`` bits."""
+        narrow_type = ir.IntType(bits) if self.lanes == 1 else ir.VectorType(ir.IntType(bits), self.lanes)
+        widen = self.builder.sext if is_signed else self.builder.zext
+        return widen(self.builder.trunc(x, narrow_type), self.int_type)
 
     def _call_special_function(self, op: str, args: Sequence[ir.Value]) -> ir.Value:
-        """SciPy's, one lane after another; its last argument is none of the mathematics."""
-        skip = ir.Constant(ir.IntType(32), 0)
-        kinds = [FLOAT64] * SPECIAL_FUNCTIONS[op][1] + [skip.type]
-        function = declare_symbol(self.builder.module, op, FLOAT64, kinds)
-        return self._apply_per_lane(lambda own: self.builder.call(function, [*own, skip]), args)
+        """Call a special function of SciPy lane by lane; its last argument is a flag of Cython's."""
+        dispatch_flag = ir.Constant(ir.IntType(32), 0)
+        argument_types = [FLOAT64] * SPECIAL_FUNCTIONS[op][1] + [dispatch_flag.type]
+        function = declare_symbol(self.builder.module, op, FLOAT64, argument_types)
+        return self._apply_per_lane(lambda lane_args: self.builder.call(function, [*lane_args, dispatch_flag]), args)
 
     def fused_multiply_add(
-        self, op: str, place: int, factors: Sequence[ir.Value], terms: Sequence[ir.Value]
+        self, op: str, product_index: int, factors: Sequence[ir.Value], terms: Sequence[ir.Value]
     ) -> ir.Value:
-        """A sum or difference whose term at a place is a product."""
-        (x, y), other = factors, terms[1 - place]
+        """Write a sum or difference whose term ``product_index`` is the product of ``factors``, rounded once."""
+        (x, y), addend = factors, terms[1 - product_index]
         if op == "sub":
-            x, other = (x, self.builder.fneg(other)) if place == 0 else (self.builder.fneg(x), other)
-        return self.call_intrinsic("llvm.fmuladd", (x, y, other), self.double_type)
+            x, addend = (x, self.builder.fneg(addend)) if product_index == 0 else (self.builder.fneg(x), addend)
+        return self.call_intrinsic("llvm.fmuladd", (x, y, addend), self.double_type)
 
     def nonnegative_max(self, x: ir.Value, y: ir.Value) -> ir.Value:
-        """The larger of two numbers without a sign, NaN if either is: their bits are in the order of the numbers."""
-        build, count = self.builder, max(self.lanes, 2)
-        number, whole = ir.VectorType(FLOAT64, count), ir.VectorType(INT64, count)
-        first = ir.Constant(ir.IntType(32), 0)
+        """Write the maximum of two nonnegative numbers, NaN if either is, by comparing their bits."""
+        build, width = self.builder, max(self.lanes, 2)
+        double_vector, int_vector = ir.VectorType(FLOAT64, width), ir.VectorType(INT64, width)
+        lane_zero = ir.Constant(ir.IntType(32), 0)
         if self.lanes == 1:
-            x, y = (build.insert_element(ir.Constant(number, ir.Undefined), v, first) for v in (x, y))
-        bits = [build.bitcast(v, whole) for v in (x, y)]
-        found = build.bitcast(build.call(self._declare_function(f"llvm.smax.v{count}i64", whole, bits), bits), number)
-        return build.extract_element(found, first) if self.lanes == 1 else found
+            x, y = (build.insert_element(ir.Constant(double_vector, ir.Undefined), v, lane_zero) for v in (x, y))
+        bits = [build.bitcast(v, int_vector) for v in (x, y)]
+        maxima = build.bitcast(
+            build.call(self._declare_function(f"llvm.smax.v{width}i64", int_vector, bits), bits), double_vector
+        )
+        return build.extract_element(maxima, lane_zero) if self.lanes == 1 else maxima
 
     def splat(self, number: ir.Value) -> ir.Value:
-        """A number in every lane."""
+        """Copy a number to every lane."""
         if self.lanes == 1:
             return number
         build, zero = self.builder, ir.Constant(ir.IntType(32), 0)
-        one = build.insert_element(ir.Constant(self.double_type, ir.Undefined), number, zero)
-        order = ir.Constant(ir.VectorType(ir.IntType(32), self.lanes), [0] * self.lanes)
-        return build.shuffle_vector(one, ir.Constant(self.double_type, ir.Undefined), order)
+        first_lane = build.insert_element(ir.Constant(self.double_type, ir.Undefined), number, zero)
+        lane_indices = ir.Constant(ir.VectorType(ir.IntType(32), self.lanes), [0] * self.lanes)
+        return build.shuffle_vector(first_lane, ir.Constant(self.double_type, ir.Undefined), lane_indices)
 
     def has_true_lane(self, tests: ir.Value) -> ir.Value:
-        """Whether a truth value holds in any lane, as one bit."""
+        """Return whether a truth value holds in any lane, as one bit."""
         if self.lanes == 1:
             return tests
         bits = ir.IntType(self.lanes)
@@ -226,23 +240,23 @@ class ProgramWriter:
         return ir.Constant(INT64, n)
 
     @contextlib.contextmanager
-    def loop_while(self, goes_on: Callable[[], ir.Value]) -> Iterator[None]:
-        """While a test holds."""
+    def loop_while(self, condition: Callable[[], ir.Value]) -> Iterator[None]:
+        """Write a loop around the body of the ``with`` statement, which runs while a condition holds."""
         build = self.builder
-        head, body, after = (build.append_basic_block(name) for name in ("head", "body", "after"))
+        head, body, exit_block = (build.append_basic_block(name) for name in ("head", "body", "after"))
         build.branch(head)
         build.position_at_end(head)
-        build.cbranch(goes_on(), body, after)
+        build.cbranch(condition(), body, exit_block)
         build.position_at_end(body)
         yield
         build.branch(head)
-        build.position_at_end(after)
+        build.position_at_end(exit_block)
 
     @contextlib.contextmanager
     def loop_range(self, count: ir.Value) -> Iterator[ir.Value]:
-        """For each number from zero to before ``count``."""
+        """Write a loop around the body of the ``with`` statement, with a counter from 0 to ``count - 1``."""
         build = self.builder
-        with build.goto_entry_block():  # else each pass would take more of the stack
+        with build.goto_entry_block():  # otherwise each pass would take more of the stack
             counter = build.alloca(INT64)
         build.store(self.int64(0), counter)
         with self.loop_while(lambda: build.icmp_signed("<", build.load(counter), count)):
@@ -250,10 +264,10 @@ class ProgramWriter:
             build.store(build.add(build.load(counter), self.int64(1)), counter)
 
     def match_constant_types(self, op: str | Block, values: list[ir.Value], args: Sequence[Scalar]) -> list[ir.Value]:
-        """Constants as numbers of the type of what stands beside them."""
-        chosen = slice(1, None) if op in ("select", "pick") else slice(None)
-        types = [v.type for v, a in zip(values[chosen], args[chosen], strict=True) if isinstance(a, str)]
-        for i in range(len(values))[chosen]:
+        """Convert constants among the operands to the type of the other operands."""
+        operands = slice(1, None) if op in ("select", "pick") else slice(None)
+        types = [v.type for v, a in zip(values[operands], args[operands], strict=True) if isinstance(a, str)]
+        for i in range(len(values))[operands]:
             if not isinstance(args[i], str) and types and values[i].type != types[0] and types[0] == self.double_type:
                 values[i] = self.constant(float(args[i]))
         return values
@@ -264,33 +278,33 @@ class ProgramWriter:
         convert = self.builder.uitofp if value.type == self.bool_type else self.builder.sitofp
         return convert(value, self.double_type)
 
-    def call_intrinsic(self, name: str, args: Sequence[ir.Value], result: ir.Type) -> ir.Value:
+    def call_intrinsic(self, name: str, args: Sequence[ir.Value], return_type: ir.Type) -> ir.Value:
         suffix = "" if self.lanes == 1 else f"v{self.lanes}"
-        kinds = [f"{suffix}i64"] if result == self.int_type else []
+        kinds = [f"{suffix}i64"] if return_type == self.int_type else []
         name = ".".join([name, *kinds, f"{suffix}f64"])
-        return self.builder.call(self._declare_function(name, result, args), args)
+        return self.builder.call(self._declare_function(name, return_type, args), args)
 
     def call_per_lane(self, name: str, args: Sequence[ir.Value]) -> ir.Value:
         return self._apply_per_lane(
-            lambda own: self.builder.call(self._declare_function(name, FLOAT64, own), own), args
+            lambda lane_args: self.builder.call(self._declare_function(name, FLOAT64, lane_args), lane_args), args
         )
 
     def _apply_per_lane(self, call: Callable[[Sequence[ir.Value]], ir.Value], args: Sequence[ir.Value]) -> ir.Value:
-        """What a call for one number makes of each lane."""
+        """Apply a scalar call to each lane."""
         if self.lanes == 1:
             return call(args)
         result = ir.Constant(self.double_type, ir.Undefined)
         for lane in range(self.lanes):
-            place = ir.Constant(ir.IntType(32), lane)
-            found = call([self.builder.extract_element(a, place) for a in args])
-            result = self.builder.insert_element(result, found, place)
+            lane_index = ir.Constant(ir.IntType(32), lane)
+            lane_result = call([self.builder.extract_element(a, lane_index) for a in args])
+            result = self.builder.insert_element(result, lane_result, lane_index)
         return result
 
-    def _declare_function(self, name: str, result: ir.Type, args: Sequence[ir.Value]) -> ir.Function:
+    def _declare_function(self, name: str, return_type: ir.Type, args: Sequence[ir.Value]) -> ir.Function:
         module = self.builder.module
         if name in module.globals:
             return module.globals[name]
-        function = ir.Function(module, ir.FunctionType(result, [a.type for a in args]), name)
+        function = ir.Function(module, ir.FunctionType(return_type, [a.type for a in args]), name)
         if not name.startswith("llvm."):
             for attribute in ("nounwind", "readnone"):
                 function.attributes.add(attribute)
@@ -298,16 +312,18 @@ class ProgramWriter:
 
 
 class _ProgramEmitter:
-    """The variables of a program so far, as it is written: those of one side of a branch are known there alone."""
+    """Emitter of one program; values written on one side of a branch have a scope of their own."""
 
-    def __init__(self, writer: ProgramWriter, program: Program, read: InputReader, memory: TableFinder | None):
-        self.writer, self.read_input, self.find_table = writer, read, memory
+    def __init__(
+        self, writer: ProgramWriter, program: Program, read_input: InputReader, find_table: TableFinder | None
+    ):
+        self.writer, self.read_input, self.find_table = writer, read_input, find_table
         self.input_positions = {name: (i, j) for i, names in enumerate(program.inputs) for j, name in enumerate(names)}
         self.use_counts = Counter(a for _, _, args in program.instructions for a in args)
         self.use_counts.update(a for entries in program.outputs for a in entries)
         self.values: ChainMap[str, ir.Value] = ChainMap()
-        self.fusible_products: dict[Scalar, list[ir.Value]] = {}  # that nothing else needs
-        self.nonnegative: set[Scalar] = set()  # numbers without a sign
+        self.fusible_products: dict[Scalar, list[ir.Value]] = {}  # factors of products with a single use
+        self.nonnegative: set[Scalar] = set()  # variables that are known to be nonnegative
         self.block_results: dict[Scalar, BlockResults] = {}
         self.tables: dict[Scalar, Table] = {}
 
@@ -319,7 +335,7 @@ class _ProgramEmitter:
         return self.values[a]
 
     def operand(self, a: Scalar) -> Any:
-        """A value, or a table."""
+        """Return a value or a table."""
         return self.tables.get(a) or self.value(a)
 
     def write_items(self, items: Sequence[Instruction | Branch]) -> None:
@@ -338,9 +354,13 @@ class _ProgramEmitter:
             self.values[target] = self.block_results[args[0]].item(int(args[1]))
             return
         if op in ("table", "column"):
-            whole = op == "table"
-            made = self.table_of_inputs(args) or make_table(writer, [self.value(a) for a in args]) if whole else None
-            self.tables[target] = made or self.block_results[args[0]].column(int(args[1]))
+            is_new_table = op == "table"
+            new_table = (
+                self.table_of_inputs(args) or make_table(writer, [self.value(a) for a in args])
+                if is_new_table
+                else None
+            )
+            self.tables[target] = new_table or self.block_results[args[0]].column(int(args[1]))
             return
         if op == "lookup":
             self.values[target] = self.operand(args[1]).gather(self.value(args[0]))
@@ -348,51 +368,59 @@ class _ProgramEmitter:
         if op == "wrap":
             self.values[target] = writer.wrap_integer(self.value(args[0]), int(args[1]), bool(args[2]))
             return
-        given = writer.match_constant_types(op, [self.value(a) for a in args], args)
-        unsigned = op == "max" and self.nonnegative.issuperset(args)
-        fused = [i for i, a in enumerate(args) if a in self.fusible_products] if op in ("add", "sub") else []
-        if fused:
-            found = writer.fused_multiply_add(op, fused[-1], self.fusible_products[args[fused[-1]]], given)
-        elif unsigned:
-            found = writer.nonnegative_max(*given)
+        operands = writer.match_constant_types(op, [self.value(a) for a in args], args)
+        is_unsigned_max = op == "max" and self.nonnegative.issuperset(args)
+        product_indices = [i for i, a in enumerate(args) if a in self.fusible_products] if op in ("add", "sub") else []
+        if product_indices:
+            result = writer.fused_multiply_add(
+                op, product_indices[-1], self.fusible_products[args[product_indices[-1]]], operands
+            )
+        elif is_unsigned_max:
+            result = writer.nonnegative_max(*operands)
         else:
-            found = writer.write_operation(op, given)
-        self.values[target] = found
-        if op == "mul" and self.use_counts[target] == 1 and found.type == writer.double_type:
-            self.fusible_products[target] = given
-        if op == "abs" or unsigned:
+            result = writer.write_operation(op, operands)
+        self.values[target] = result
+        if op == "mul" and self.use_counts[target] == 1 and result.type == writer.double_type:
+            self.fusible_products[target] = operands
+        if op == "abs" or is_unsigned_max:
             self.nonnegative.add(target)
 
     def table_of_inputs(self, names: Sequence[Scalar]) -> Table | None:
-        """A table of inputs that lie in memory at equal distances: nothing is copied."""
-        found = [self.input_positions[a] for a in names if a in self.input_positions]
-        if self.find_table is None or len(found) < max(len(names), 2):
+        """Return a table of inputs that are equidistant in memory, without a copy; None if they are not."""
+        positions = [self.input_positions[a] for a in names if a in self.input_positions]
+        if self.find_table is None or len(positions) < max(len(names), 2):
             return None
-        arrays, (first, second, *rest) = {i for i, _ in found}, [j for _, j in found]
+        arrays, (first, second, *rest) = {i for i, _ in positions}, [j for _, j in positions]
         last = rest[-1] if rest else second
-        places = range(first, last + 1, second - first) if second > first else range(0)
+        entries = range(first, last + 1, second - first) if second > first else range(0)
         return (
-            self.find_table(found[0][0], places) if len(arrays) == 1 and [*places] == [first, second, *rest] else None
+            self.find_table(positions[0][0], entries)
+            if len(arrays) == 1 and [*entries] == [first, second, *rest]
+            else None
         )
 
     def write_branch(self, branch: Branch) -> None:
-        """Each side where any lane takes it, then what each lane chooses."""
+        """Write each side of a branch, skipped if no lane takes it, then the choices of each lane."""
         writer, build = self.writer, self.writer.builder
         self.write_instruction(branch.test)
         test = self.values[branch.test.target]
-        for place, (side, taken) in enumerate(zip(branch.sides, (test, build.not_(test)), strict=True), start=1):
+        for choice_index, (side, is_taken) in enumerate(
+            zip(branch.sides, (test, build.not_(test)), strict=True), start=1
+        ):
             if not side:
                 continue
-            before, outside = build.block, self.values
-            inside, active = outside.new_child(), writer.active_lanes
-            self.values, writer.active_lanes = inside, taken if active is None else build.and_(active, taken)
+            block_before, outer_values = build.block, self.values
+            side_values, outer_lanes = outer_values.new_child(), writer.active_lanes
+            self.values = side_values
+            writer.active_lanes = is_taken if outer_lanes is None else build.and_(outer_lanes, is_taken)
             with build.if_then(writer.has_true_lane(writer.active_lanes)):
                 self.write_items(side)
-                after = build.block
-            self.values, writer.active_lanes = outside, active
-            for a in dict.fromkeys(choice.args[place] for choice in branch.choices):
-                if isinstance(a, str) and a in inside.maps[0] and a not in self.input_positions:
-                    outside[a] = build.phi(inside[a].type)
-                    outside[a].add_incoming(inside[a], after)
-                    outside[a].add_incoming(ir.Constant(inside[a].type, None), before)  # which no lane chooses
+                side_block = build.block
+            self.values, writer.active_lanes = outer_values, outer_lanes
+            for a in dict.fromkeys(choice.args[choice_index] for choice in branch.choices):
+                if isinstance(a, str) and a in side_values.maps[0] and a not in self.input_positions:
+                    outer_values[a] = build.phi(side_values[a].type)
+                    outer_values[a].add_incoming(side_values[a], side_block)
+                    unused = ir.Constant(side_values[a].type, None)  # no lane chooses it
+                    outer_values[a].add_incoming(unused, block_before)
         self.write_items(branch.choices)

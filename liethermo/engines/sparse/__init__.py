@@ -1,1 +1,1 @@
-"""Newton's method with sparse matrices for large networks."""
+"""Sparse engine: Newton's method with sparse matrices for large networks."""

@@ -1,4 +1,4 @@
-"""Sparse matrices of derivatives, and linear equations with them, on the host."""
+"""Sparse Jacobian matrices and the solution of linear equations with them, on the host."""
 
 from __future__ import annotations
 
@@ -9,45 +9,49 @@ import numpy as np
 import scipy
 
 MAX_FRONT_WIDTH = 1_000
-"""Widest level of a breadth-first search up to which a matrix is factorised.
+"""Largest width of a level of a breadth-first search for which a matrix is factorised.
 
-Such a level cuts the graph in two, and elimination ends with about its square filled: a plane grid of 1e6 nodes is at
-the limit, taking seconds. What is wider (grids in space, networks without a long way in them) is well connected, and
-Krylov iteration is quick there: tens to hundreds of products."""
+Such a level cuts the graph in two, and elimination fills about the square of its width: a plane grid of 1e6 nodes is at
+the limit, taking seconds. Wider graphs (grids in space, networks of small diameter) are well connected, and Krylov
+iteration is quick for them: tens to hundreds of products.
+"""
 
 KRYLOV_RTOL = 1e-6
-"""Relative residual of a Krylov solution; Newton's iteration makes up for the rest. (1e-12 gave the same laws, at 1.7
-times the products.)"""
+"""Relative residual of a Krylov solution; Newton's iteration corrects the rest.
+
+(1e-12 gave the same laws, at 1.7 times the products.)
+"""
 
 MAX_KRYLOV_ITERATIONS = 2_000
+"""Largest number of Krylov iterations for one solution."""
 
 
 class JacobianCompression:
-    """How to find all entries of a sparse Jacobian matrix from few derivatives.
+    """Compression of a sparse Jacobian matrix: all its entries from few Jacobian-vector products.
 
-    Columns that have no row in common have one colour and are found together, by a derivative along their sum [Curtis,
-    Powell & Reid 1974]. Rows of many entries would need as many colours; these *hubs* are found one by one, by pulling
-    back. How many entries make a hub is chosen to need the fewest derivatives.
+    Columns without a common row get one colour and are computed together, by a derivative along their sum [Curtis,
+    Powell & Reid 1974]. Dense rows (of *hubs*) would need as many colours as they have entries; they are computed one
+    by one, by vector-Jacobian products. The limit between both is chosen to need the fewest derivatives.
 
     Parameters
     ----------
     pattern : scipy.sparse.csr_array, shape (n, n)
-        Every entry that can be different from zero.
+        Entries that can be different from zero.
     stages : int
-        The function is from (stages, n) to (stages, n), and every stage depends on every other by the same pattern.
+        The function maps (stages, n) to (stages, n), and every stage depends on every other by the same pattern.
     """
 
     def __init__(self, pattern: scipy.sparse.csr_array, stages: int = 1):
         self.dim, self.stages = pattern.shape[0], stages
         self.front_width = _max_level_width(pattern)
-        sizes = np.diff(pattern.indptr)
-        self.dense_rows = np.flatnonzero(sizes > _max_coloured_row_size(sizes))
+        row_sizes = np.diff(pattern.indptr)
+        self.dense_rows = np.flatnonzero(row_sizes > _max_coloured_row_size(row_sizes))
         self._dense_row_columns = [pattern.indices[pattern.indptr[i] : pattern.indptr[i + 1]] for i in self.dense_rows]
-        rows, columns = np.repeat(np.arange(self.dim), sizes), pattern.indices
-        plain = ~np.isin(rows, self.dense_rows)
-        rows, columns = rows[plain], columns[plain]
-        rest = scipy.sparse.csr_array((np.ones(len(rows), dtype=bool), (rows, columns)), pattern.shape)
-        self.colours = _colour_columns(rest)
+        rows, columns = np.repeat(np.arange(self.dim), row_sizes), pattern.indices
+        is_coloured = ~np.isin(rows, self.dense_rows)
+        rows, columns = rows[is_coloured], columns[is_coloured]
+        coloured_pattern = scipy.sparse.csr_array((np.ones(len(rows), dtype=bool), (rows, columns)), pattern.shape)
+        self.colours = _colour_columns(coloured_pattern)
         order = np.argsort(self.colours[columns], kind="stable")
         ends = np.cumsum(np.bincount(self.colours[columns], minlength=self.colours.max(initial=-1) + 1))
         self._colour_entries = list(
@@ -56,51 +60,51 @@ class JacobianCompression:
 
     @property
     def n_derivatives(self) -> int:
-        """How many are taken."""
+        """Number of derivatives that one Jacobian matrix takes."""
         return self.stages * (len(self._colour_entries) + len(self.dense_rows))
 
-    def assemble_jacobian(self, push: Callable, pull: Callable) -> scipy.sparse.csc_array:
-        """The Jacobian matrix, shape (stages n, stages n).
+    def assemble_jacobian(self, jvp: Callable, vjp: Callable) -> scipy.sparse.csc_array:
+        """Return the Jacobian matrix, shape (stages n, stages n).
 
         Parameters
         ----------
-        push, pull : functions from an array, shape (stages, n), to one
+        jvp, vjp : functions from an array, shape (stages, n), to one
             The product of the matrix, and of its transpose, with a vector.
         """
         n, stages = self.dim, range(self.stages)
         rows, columns, entries = [], [], []
         seed = np.zeros((self.stages, n))
         for colour, (r, c) in enumerate(self._colour_entries):
-            members = self.colours == colour
+            has_colour = self.colours == colour
             for j in stages:
-                seed[j] = members
-                found = np.asarray(push(seed))
+                seed[j] = has_colour
+                product = np.asarray(jvp(seed))
                 seed[j] = 0.0
                 for i in stages:
                     rows.append(i * n + r)
                     columns.append(j * n + c)
-                    entries.append(found[i, r])
-        for hub, c in zip(self.dense_rows, self._dense_row_columns, strict=True):
+                    entries.append(product[i, r])
+        for dense_row, c in zip(self.dense_rows, self._dense_row_columns, strict=True):
             for i in stages:
-                seed[i, hub] = 1.0
-                found = np.asarray(pull(seed))
-                seed[i, hub] = 0.0
+                seed[i, dense_row] = 1.0
+                product = np.asarray(vjp(seed))
+                seed[i, dense_row] = 0.0
                 for j in stages:
-                    rows.append(np.full(len(c), i * n + hub))
+                    rows.append(np.full(len(c), i * n + dense_row))
                     columns.append(j * n + c)
-                    entries.append(found[j, c])
-        places = np.concatenate(rows), np.concatenate(columns)
-        return scipy.sparse.csc_array((np.concatenate(entries), places), (self.stages * n, self.stages * n))
+                    entries.append(product[j, c])
+        indices = np.concatenate(rows), np.concatenate(columns)
+        return scipy.sparse.csc_array((np.concatenate(entries), indices), (self.stages * n, self.stages * n))
 
 
 class SparseInverse:
-    """Solutions of ``matrix @ x = b``: by factorisation where elimination fills little, or by Krylov iteration.
+    """Solver of ``matrix @ x = b``, by factorisation if elimination fills little, else by Krylov iteration.
 
     Parameters
     ----------
     matrix : scipy.sparse.csc_array, shape (n, n)
-    width : int
-        Of the widest level of its graph: see :data:`MAX_FRONT_WIDTH`.
+    front_width : int
+        Width of the widest level of its graph: see :data:`MAX_FRONT_WIDTH`.
 
     Raises
     ------
@@ -108,11 +112,11 @@ class SparseInverse:
         If the matrix is singular or not finite.
     """
 
-    def __init__(self, matrix: scipy.sparse.csc_array, width: int):
+    def __init__(self, matrix: scipy.sparse.csc_array, front_width: int):
         if not np.isfinite(matrix.data).all():
             raise np.linalg.LinAlgError("the matrix is not finite")
-        if width <= MAX_FRONT_WIDTH:
-            options = {"SymmetricMode": True}  # elimination on the diagonal, as far as that is stable
+        if front_width <= MAX_FRONT_WIDTH:
+            options = {"SymmetricMode": True}  # pivots on the diagonal, as far as that is stable
             try:
                 factors = scipy.sparse.linalg.splu(matrix, "MMD_AT_PLUS_A", diag_pivot_thresh=0.01, options=options)
             except RuntimeError as error:
@@ -121,53 +125,59 @@ class SparseInverse:
             return
         diagonal = matrix.diagonal()
         scaling = scipy.sparse.diags_array(1.0 / np.where(diagonal != 0.0, diagonal, 1.0))
-        rowwise = scipy.sparse.csr_array(scaling @ matrix)
+        scaled_matrix = scipy.sparse.csr_array(scaling @ matrix)
 
-        def iterate(b):
-            size = float(np.linalg.norm(scaling @ b)) or 1.0  # SciPy gives up on small residuals of an absolute size
+        def solve_bicgstab(b):
+            b_norm = float(np.linalg.norm(scaling @ b)) or 1.0  # SciPy stops at a small absolute residual
             x, _ = scipy.sparse.linalg.bicgstab(
-                rowwise, scaling @ b / size, rtol=KRYLOV_RTOL, maxiter=MAX_KRYLOV_ITERATIONS
+                scaled_matrix, scaling @ b / b_norm, rtol=KRYLOV_RTOL, maxiter=MAX_KRYLOV_ITERATIONS
             )
-            return size * x
+            return b_norm * x
 
-        self._solve = iterate
+        self._solve = solve_bicgstab
 
     def __call__(self, b: np.ndarray) -> np.ndarray:
         return self._solve(b)
 
 
-def _max_coloured_row_size(sizes: np.ndarray) -> int:
-    """The largest row that is coloured: about as many colours are needed, and a derivative for each larger row."""
-    candidates = np.unique(sizes)
-    larger = len(sizes) - np.searchsorted(np.sort(sizes), candidates, side="right")
-    return int(candidates[np.argmin(candidates + larger)])
+def _max_coloured_row_size(row_sizes: np.ndarray) -> int:
+    """Return the largest number of entries of a row that is coloured.
+
+    About as many colours are needed, and a derivative for each larger row: their sum is minimised.
+    """
+    candidates = np.unique(row_sizes)
+    n_larger = len(row_sizes) - np.searchsorted(np.sort(row_sizes), candidates, side="right")
+    return int(candidates[np.argmin(candidates + n_larger)])
 
 
 def _max_level_width(pattern: scipy.sparse.csr_array) -> int:
-    """Nodes in the widest level of a breadth-first search through the largest part, from an end of it."""
+    """Return the number of nodes in the widest level of a breadth-first search through the largest component.
+
+    The search starts at a peripheral node.
+    """
     graph = scipy.sparse.csr_array(pattern + pattern.T, dtype=float)
     label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
     start = int(np.argmax(label == np.bincount(label).argmax()))
     for _ in range(2):  # the second search starts where the first ended
         distance = scipy.sparse.csgraph.dijkstra(graph, directed=False, indices=start, unweighted=True)
-        reached = np.isfinite(distance)
-        start = int(np.argmax(np.where(reached, distance, -1.0)))
-    return int(np.bincount(distance[reached].astype(int)).max())
+        is_reached = np.isfinite(distance)
+        start = int(np.argmax(np.where(is_reached, distance, -1.0)))
+    return int(np.bincount(distance[is_reached].astype(int)).max())
 
 
 def _colour_columns(pattern: scipy.sparse.csr_array) -> np.ndarray:
-    """A colour for each column, so that no row has two columns of one colour; greedily, in order."""
-    columnwise = scipy.sparse.csc_array(pattern)
-    rows = columnwise.indices.tolist()
-    taken = [0] * pattern.shape[0]  # by each row: a bit for every colour that one of its columns has
+    """Return a colour for each column, greedily and in order, so that no row has two columns of one colour."""
+    csc_pattern = scipy.sparse.csc_array(pattern)
+    rows = csc_pattern.indices.tolist()
+    row_colours = [0] * pattern.shape[0]  # for each row, a bit mask of the colours of its columns
     colours = []
-    for start, end in itertools.pairwise(columnwise.indptr.tolist()):
-        of_column = rows[start:end]
-        used = 0
-        for row in of_column:
-            used |= taken[row]
-        free = ~used & (used + 1)  # the lowest bit that is not set
-        for row in of_column:
-            taken[row] |= free
-        colours.append(free.bit_length() - 1)
+    for start, end in itertools.pairwise(csc_pattern.indptr.tolist()):
+        column_rows = rows[start:end]
+        used_colours = 0
+        for row in column_rows:
+            used_colours |= row_colours[row]
+        free_colour = ~used_colours & (used_colours + 1)  # the lowest bit that is not set
+        for row in column_rows:
+            row_colours[row] |= free_colour
+        colours.append(free_colour.bit_length() - 1)
     return np.array(colours, dtype=int)

@@ -1,9 +1,9 @@
-"""The sparse engine: systems of any size that know which of their components act on which.
+"""Sparse engine: systems of any size whose sparsity pattern is known.
 
-A step is tried by fixed-point iteration, as by the array engine; a stiff one is solved by Newton's method with a sparse
-Jacobian matrix. Its entries come from few derivatives: columns that no row has in common are taken in one, and the rows
-of hubs, which have many neighbours, are taken by themselves [Curtis, Powell & Reid 1974; Coleman & Verma 1998]. The
-Newton iteration runs on the host, where SciPy factorises; all else is the array engine's.
+A step is tried by fixed-point iteration, as in the array engine; a stiff one is solved by Newton's method with a sparse
+Jacobian matrix. Its entries come from few derivatives: columns without a common row are computed together, and the rows
+of hubs, which have many neighbours, by themselves [Curtis, Powell & Reid 1974; Coleman & Verma 1998]. The Newton
+iteration runs on the host, where SciPy factorises; all else is shared with the array engine.
 """
 
 from __future__ import annotations
@@ -33,21 +33,24 @@ SPARSE_SOLVER_OPTIONS = replace(
     jacobian_contraction_limit=0.1,
     matrix_free_dim=sys.maxsize,
 )
-"""Newton iterations are cheap here: most use factors that are there already, kept from step to step. Their matrix is
-formed whatever its size, and a few stiff components of many are not to be lost in a mean."""
+"""Solver options of the sparse engine.
+
+Newton iterations are cheap: most use factors that are kept from step to step. The matrix is formed for any dimension,
+and the norm is the maximum norm, because a root mean square could hide a few stiff components among many.
+"""
 
 
 class SparseEngine:
-    """The engine for one system and method; the factors of its Jacobian matrix are kept from step to step.
+    """Sparse engine for one system and method; the factors of its Jacobian matrix are kept from step to step.
 
     Raises
     ------
     ValueError
-        If the system does not know its sparsity.
+        If the system has no sparsity pattern.
     """
 
     name = "sparse"
-    max_saves_per_call = 1  # its steps may take seconds: show each, and keep each on Ctrl-C
+    max_saves_per_call = 1  # a step may take seconds: show each, and keep each on Ctrl-C
 
     def __init__(self, system: System, method: OneStepMethod):
         self.system, self.method = system, method
@@ -62,111 +65,122 @@ class SparseEngine:
     def initial_run_state(self, x) -> State:
         return initial_run_state_program(self.system, self.method, x)
 
-    def advance(self, state, h, saves, every, noise=None):
-        """Keeps no more than it reaches."""
-        del noise  # steps with noise are not for this engine
-        kept: list[State] = []
+    def advance(self, state, h, saves, save_every, noise=None):
+        """Take ``save_every`` steps up to ``saves`` times; the saved arrays have only the saves that were reached."""
+        del noise  # this engine takes no steps with noise
+        saved_states: list[State] = []
         for _ in range(int(saves)):
-            for _ in range(int(every)):
+            for _ in range(int(save_every)):
                 state = self.step(state, h)
                 if int(state.status) != StatusCode.COMPLETED:
                     break
             if int(state.status) != StatusCode.COMPLETED:
                 break
-            kept.append(state)
-        x = np.array([np.asarray(s.x) for s in kept]).reshape(len(kept), self.system.dim)
-        energy, entropy = (np.array([float(getattr(s, name)) for s in kept]) for name in ("energy", "entropy"))
-        return state, (x, energy, entropy, np.ones(len(kept), dtype=bool))
+            saved_states.append(state)
+        x = np.array([np.asarray(s.x) for s in saved_states]).reshape(len(saved_states), self.system.dim)
+        energy, entropy = (np.array([float(getattr(s, name)) for s in saved_states]) for name in ("energy", "entropy"))
+        return state, (x, energy, entropy, np.ones(len(saved_states), dtype=bool))
 
     def step_ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
-        states = [self.step(self.initial_run_state(jnp.asarray(start)), size) for start, size in zip(x, h, strict=True)]
-        solved = np.array([int(s.status) == StatusCode.COMPLETED for s in states])
-        return np.where(solved[:, None], np.array([np.asarray(s.x) for s in states]), np.nan)
+        states = [
+            self.step(self.initial_run_state(jnp.asarray(start)), step_size)
+            for start, step_size in zip(x, h, strict=True)
+        ]
+        is_taken = np.array([int(s.status) == StatusCode.COMPLETED for s in states])
+        return np.where(is_taken[:, None], np.array([np.asarray(s.x) for s in states]), np.nan)
 
     def step(self, state: State, h, noise=None) -> State:
         del noise
         h = jnp.asarray(h, dtype=jnp.float64)
-        solved = _solve_fixed_point_program(self.system, self.method, state, h)
-        if not bool(solved.converged):
-            solved = self._solve_newton(state, h, int(solved.fixed_point_iterations))
-        return _finish_step_program(self.system, self.method, state, h, solved)
+        solution = _solve_fixed_point_program(self.system, self.method, state, h)
+        if not bool(solution.converged):
+            solution = self._solve_newton(state, h, int(solution.fixed_point_iterations))
+        return _finish_step_program(self.system, self.method, state, h, solution)
 
     # -- Newton's method ------------------------------------------------------------------------------------------
 
-    def _solve_newton(self, state: State, h, before: int) -> StageSolution:
-        k, misfit, scale = _best_guess_program(self.system, self.method, state, h)
-        s, renew = IterationState.initial(k), float(h) != self._factored_step_size
-        noise = jnp.zeros(())
+    def _solve_newton(self, state: State, h, n_fixed_point: int) -> StageSolution:
+        k, residual, scale = _best_guess_program(self.system, self.method, state, h)
+        s, needs_jacobian = IterationState.initial(k), float(h) != self._factored_step_size
+        slope_rounding = jnp.zeros(())
         while (
-            not self._is_at_plateau(s, scale, misfit, noise)
+            not self._is_at_plateau(s, scale, residual, slope_rounding)
             and int(s.n_iterations) < SPARSE_SOLVER_OPTIONS.max_newton_iterations
         ):
-            if renew or self._inverse is None:
+            if needs_jacobian or self._inverse is None:
                 self._inverse, self._factored_step_size = self._jacobian_inverse(state, h, s.k), float(h)
                 if self._inverse is None:
                     break
-            found = self._damped_newton_step(
-                state, h, s, misfit, scale, self._inverse, SPARSE_SOLVER_OPTIONS.max_newton_halvings if renew else 1
+            newton_step = self._damped_newton_step(
+                state,
+                h,
+                s,
+                residual,
+                scale,
+                self._inverse,
+                SPARSE_SOLVER_OPTIONS.max_newton_halvings if needs_jacobian else 1,
             )
-            if found is None and renew:
-                s = s._replace(n_stalled=jnp.asarray(2))  # no step, however short, solves the equations better
-                noise = _residual_rounding(self.system, self.method, state.x)
+            if newton_step is None and needs_jacobian:
+                s = s._replace(n_stalled=jnp.asarray(2))  # no damped step decreases the residual
+                slope_rounding = _residual_rounding(self.system, self.method, state.x)
                 break
-            renew = found is None
-            if found is not None:
-                s, misfit, scale = found
-                renew = bool(s.update > SPARSE_SOLVER_OPTIONS.jacobian_contraction_limit * s.previous_update) and float(
-                    s.update
-                ) > SPARSE_SOLVER_OPTIONS.plateau_rtol * float(scale)
-            if int(s.n_stalled) >= 2 and not noise and not bool(s.is_at_plateau(scale, SPARSE_SOLVER_OPTIONS)):
-                noise = _residual_rounding(self.system, self.method, state.x)
-        defined = bool(jnp.isfinite(misfit).all())
+            needs_jacobian = newton_step is None
+            if newton_step is not None:
+                s, residual, scale = newton_step
+                needs_jacobian = bool(
+                    s.update > SPARSE_SOLVER_OPTIONS.jacobian_contraction_limit * s.previous_update
+                ) and float(s.update) > SPARSE_SOLVER_OPTIONS.plateau_rtol * float(scale)
+            if int(s.n_stalled) >= 2 and not slope_rounding and not bool(s.is_at_plateau(scale, SPARSE_SOLVER_OPTIONS)):
+                slope_rounding = _residual_rounding(self.system, self.method, state.x)
+        is_finite = bool(jnp.isfinite(residual).all())
         return StageSolution(
             k=s.k,
-            converged=jnp.asarray(self._is_at_plateau(s, scale, misfit, noise) and defined),
-            is_finite=jnp.asarray(defined),
+            converged=jnp.asarray(self._is_at_plateau(s, scale, residual, slope_rounding) and is_finite),
+            is_finite=jnp.asarray(is_finite),
             residual=s.update,
-            fixed_point_iterations=jnp.asarray(before),
+            fixed_point_iterations=jnp.asarray(n_fixed_point),
             newton_iterations=s.n_iterations,
-            slope_rounding=jnp.where(s.is_at_plateau(scale, SPARSE_SOLVER_OPTIONS), 0.0, noise),
+            slope_rounding=jnp.where(s.is_at_plateau(scale, SPARSE_SOLVER_OPTIONS), 0.0, slope_rounding),
         )
 
     @staticmethod
-    def _is_at_plateau(s: IterationState, scale, misfit, noise) -> bool:
-        return bool(s.is_at_plateau(scale, SPARSE_SOLVER_OPTIONS, jnp.max(jnp.abs(misfit)), noise))
+    def _is_at_plateau(s: IterationState, scale, residual, slope_rounding) -> bool:
+        return bool(s.is_at_plateau(scale, SPARSE_SOLVER_OPTIONS, jnp.max(jnp.abs(residual)), slope_rounding))
 
-    def _damped_newton_step(self, state, h, s: IterationState, misfit, scale, inverse: SparseInverse, attempts: int):
-        """After a Newton step, halved until the equations are solved better than before; None if that fails.
+    def _damped_newton_step(
+        self, state, h, s: IterationState, residual, scale, inverse: SparseInverse, max_trials: int
+    ):
+        """Return state, residual and scale after a Newton step, halved until the residual decreases, or None.
 
-        At the rounding plateau they are not, and a whole step is taken.
+        At the rounding plateau the residual does not decrease, and a full step is taken.
         """
-        step = inverse(np.asarray(misfit).ravel()).reshape(s.k.shape)
+        step = inverse(np.asarray(residual).ravel()).reshape(s.k.shape)
         if not np.isfinite(step).all():
             return None
-        size = float(jnp.linalg.norm(misfit))
-        for _ in range(attempts):
+        norm = float(jnp.linalg.norm(residual))
+        for _ in range(max_trials):
             k = s.k - step
-            found, new_scale = _weighted_residual(self.system, self.method, state, h, k)
-            new_size = float(jnp.linalg.norm(found))
-            rounding = float(np.abs(step).max()) <= SPARSE_SOLVER_OPTIONS.plateau_rtol * float(scale)
-            if new_size < size or (rounding and np.isfinite(new_size)):
-                return s.next_state(k, SPARSE_SOLVER_OPTIONS), found, new_scale
+            new_residual, new_scale = _weighted_residual(self.system, self.method, state, h, k)
+            new_norm = float(jnp.linalg.norm(new_residual))
+            is_rounding = float(np.abs(step).max()) <= SPARSE_SOLVER_OPTIONS.plateau_rtol * float(scale)
+            if new_norm < norm or (is_rounding and np.isfinite(new_norm)):
+                return s.next_state(k, SPARSE_SOLVER_OPTIONS), new_residual, new_scale
             step = 0.5 * step
         return None
 
     def _jacobian_inverse(self, state, h, k) -> SparseInverse | None:
-        """The inverse of the Jacobian matrix of the misfit; None where there is none."""
+        """Return the inverse of the Jacobian matrix of the residual; None if it is singular or not finite."""
         if self._compression is None:
             self._compression = JacobianCompression(self._pattern, self.method.stages)
 
-        def push(seed):
+        def jvp(seed):
             return _residual_jvp(self.system, self.method, state, h, k, seed)
 
-        def pull(seed):
+        def vjp(seed):
             return _residual_vjp(self.system, self.method, state, h, k, seed)
 
         try:
-            return SparseInverse(self._compression.assemble_jacobian(push, pull), self._compression.front_width)
+            return SparseInverse(self._compression.assemble_jacobian(jvp, vjp), self._compression.front_width)
         except np.linalg.LinAlgError:
             return None
 
@@ -186,51 +200,51 @@ def _stage_equations(system: System, method: OneStepMethod, state: State, h) -> 
 
 
 @jit_program
-def _finish_step_program(system: System, method: OneStepMethod, state: State, h, solved: StageSolution) -> State:
-    return finish_step(system, method, state, h, solved, SPARSE_SOLVER_OPTIONS)
+def _finish_step_program(system: System, method: OneStepMethod, state: State, h, solution: StageSolution) -> State:
+    return finish_step(system, method, state, h, solution, SPARSE_SOLVER_OPTIONS)
 
 
 def _weighted_equations(system: System, method: OneStepMethod, state: State, h):
-    """The misfit ``w (slopes(k) - k)``, a guess of k, and the size that the plateau is measured against.
+    """Return the residual ``w (slopes(k) - k)`` as a function of k, a guess of k, and the scale of updates.
 
-    With the weights w of :meth:`liethermo.System.weights` a stiff step is nearest to linear.
+    With the weights w of :meth:`liethermo.System.residual_weights` a stiff step is nearest to linear.
     """
     slopes, guess, scale, *_ = _stage_equations(system, method, state, h)
 
-    def misfit(k):
-        middle = state.x + (state.compensation + 0.5 * method.increment(h, k))
-        return system.residual_weights(middle) * (slopes(k) - k)
+    def residual(k):
+        midpoint = state.x + (state.compensation + 0.5 * method.increment(h, k))
+        return system.residual_weights(midpoint) * (slopes(k) - k)
 
-    return misfit, guess, scale
+    return residual, guess, scale
 
 
 @jit_program
 def _weighted_residual(system: System, method: OneStepMethod, state: State, h, k) -> tuple[Any, Any]:
-    misfit, _, scale = _weighted_equations(system, method, state, h)
-    return misfit(k), scale(k)
+    residual, _, scale = _weighted_equations(system, method, state, h)
+    return residual(k), scale(k)
 
 
 @jit_program
 def _residual_rounding(system: System, method: OneStepMethod, x) -> Any:
-    """The size at which the misfit is rounded."""
+    """Return the scale at which the weighted residual is rounded."""
     return jnp.max(value_and_rounding_scale(lambda x: system.residual_weights(x) * system.vector_field(x), x)[1])
 
 
 @jit_program
 def _best_guess_program(system: System, method: OneStepMethod, state: State, h):
-    """The predicted slopes, or a step of size zero where that solves the equations better; with misfit and scale."""
-    misfit, guess, scale = _weighted_equations(system, method, state, h)
-    k, found = best_initial_guess(misfit, guess)
-    return k, found, scale(k)
+    """Return the predicted slopes, or zero slopes if their residual is smaller, with residual and scale."""
+    residual_function, guess, scale = _weighted_equations(system, method, state, h)
+    k, residual = best_initial_guess(residual_function, guess)
+    return k, residual, scale(k)
 
 
 @jit_program
 def _residual_jvp(system: System, method: OneStepMethod, state: State, h, k, seed):
-    misfit = _weighted_equations(system, method, state, h)[0]
-    return jax.jvp(misfit, (k,), (jnp.asarray(seed),))[1]
+    residual = _weighted_equations(system, method, state, h)[0]
+    return jax.jvp(residual, (k,), (jnp.asarray(seed),))[1]
 
 
 @jit_program
 def _residual_vjp(system: System, method: OneStepMethod, state: State, h, k, seed):
-    misfit = _weighted_equations(system, method, state, h)[0]
-    return jax.vjp(misfit, k)[1](jnp.asarray(seed))[0]
+    residual = _weighted_equations(system, method, state, h)[0]
+    return jax.vjp(residual, k)[1](jnp.asarray(seed))[0]

@@ -1,4 +1,4 @@
-"""Pictures of runs and of studies: ``lt.plot``."""
+"""Figures of runs and of studies: ``lt.plot``."""
 
 from manifolds._names import public_dir
 

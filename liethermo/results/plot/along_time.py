@@ -1,4 +1,4 @@
-"""The laws of a run along time."""
+"""Figure of the laws of a run over time."""
 
 from __future__ import annotations
 
@@ -17,17 +17,21 @@ from .figures import BLUE, DPI, GREEN, GREY, RED, checked_figure_path, save_figu
 
 
 def laws(solution: Solution, path: str | os.PathLike | None = None) -> Figure:
-    """Energy error, entropy and entropy production along a run, with the verdict of the audit above them.
+    """Plot energy error, entropy and entropy production of a run, with the verdict of the audit as title.
 
     The production is the difference quotient of the saved entropies, on a logarithmic axis. Increments below the
-    rounding of the entropy itself (the tolerance of the audit) are marked at that level in grey, falls beyond it in red
-    at their size. A solution without entropy has the first panel only.
+    rounding of the entropy itself (the tolerance of the audit) are marked at that level in grey, larger decreases in
+    red by their magnitude. A solution without entropy has the first panel only.
 
     Parameters
     ----------
     solution : Solution
     path : path, optional
         Write the figure to this .pdf, .png or .svg file, and close it.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
 
     Raises
     ------
@@ -54,17 +58,17 @@ def laws(solution: Solution, path: str | os.PathLike | None = None) -> Figure:
     return save_figure(figure, path)
 
 
-def _draw_energy(ax: Axes, t: np.ndarray, H: np.ndarray, less: str) -> None:
-    first = float(H[0])
-    error = (H - first) / (abs(first) or 1.0)
-    largest = float(np.abs(error).max())
+def _draw_energy(ax: Axes, t: np.ndarray, H: np.ndarray, work_label: str) -> None:
+    initial_energy = float(H[0])
+    error = (H - initial_energy) / (abs(initial_energy) or 1.0)
+    max_error = float(np.abs(error).max())
     ax.axhline(0.0, color=GREY, linewidth=0.8)
-    if largest < 20 * EPS:  # beside one unit of rounding
+    if max_error < 20 * EPS:  # the scale is one unit of rounding
         ax.axhspan(-EPS, EPS, color="0.93", linewidth=0)
-        ax.set_ylim(-1.4 * max(largest, EPS), 1.4 * max(largest, EPS))
+        ax.set_ylim(-1.4 * max(max_error, EPS), 1.4 * max(max_error, EPS))
     ax.plot(t, error, color=BLUE, linewidth=0.8)
     ax.ticklabel_format(axis="y", style="sci", scilimits=(-2, 3), useMathText=True)
-    ax.set_ylabel(rf"$(H{less} - H_0)\,/\,|H_0|$" if first else f"$H{less} - H_0$")
+    ax.set_ylabel(rf"$(H{work_label} - H_0)\,/\,|H_0|$" if initial_energy else f"$H{work_label} - H_0$")
 
 
 def _draw_entropy(ax: Axes, t: np.ndarray, S: np.ndarray) -> None:
@@ -77,41 +81,50 @@ def _draw_entropy(ax: Axes, t: np.ndarray, S: np.ndarray) -> None:
     tail = S[t >= t[-1] - 0.1 * (t[-1] - t[0])]
     if len(tail) > 2 and float(np.ptp(tail)) <= 1e-4 * change:
         ax.axhline(S[-1], color=GREY, linewidth=0.8, linestyle="--", zorder=1)
-        across = ax.get_yaxis_transform()  # x in units of the axes, y of the data
+        transform = ax.get_yaxis_transform()  # x in units of the axes, y of the data
         style: dict[str, Any] = {"ha": "right", "va": "top", "color": "0.3", "fontsize": "small"}
-        ax.annotate(f"{S[-1]:.6g}", (1.0, S[-1]), (0, -4), across, "offset points", **style)
+        ax.annotate(f"{S[-1]:.6g}", (1.0, S[-1]), (0, -4), transform, "offset points", **style)
 
 
 def _allowed_entropy_fall(audit: Audit) -> float:
-    """Fall of the entropy in one step that the audit allows."""
+    """Return the decrease of the entropy in one step that the audit allows."""
     return next((-row.tolerance for row in audit.rows if row.law == "least entropy increment" and row.tolerance), 0.0)
 
 
 def _draw_production(ax: Axes, t: np.ndarray, S: np.ndarray, rounding: float) -> None:
     dt, dS, t = np.diff(t), np.diff(S), (t[:-1] + t[1:]) / 2
     rounding = rounding or 4 * EPS * float(np.abs(S).max())
-    risen, fallen = dS > rounding, dS < -rounding
-    still = ~(risen | fallen)
+    is_rising, is_falling = dS > rounding, dS < -rounding
+    is_constant = ~(is_rising | is_falling)
     ax.set_yscale("log")
-    ax.plot(t, np.where(risen, dS / dt, np.nan), color=GREEN, linewidth=1.5, marker="." if len(t) < 50 else "")
-    if still.any():
+    ax.plot(t, np.where(is_rising, dS / dt, np.nan), color=GREEN, linewidth=1.5, marker="." if len(t) < 50 else "")
+    if is_constant.any():
         level = rounding / float(dt.max())
-        ax.plot(t[still], np.full(still.sum(), level), ".", color=GREY, markersize=2, label="at or below rounding")
-        if still.all():
+        ax.plot(
+            t[is_constant],
+            np.full(is_constant.sum(), level),
+            ".",
+            color=GREY,
+            markersize=2,
+            label="at or below rounding",
+        )
+        if is_constant.all():
             ax.set_ylim(level / 10, level * 10)
-    if fallen.any():
-        ax.plot(t[fallen], -dS[fallen] / dt[fallen], "v", color=RED, markersize=4, label="falling: $-dS/dt$")
-    if still.any() or fallen.any():
+    if is_falling.any():
+        ax.plot(
+            t[is_falling], -dS[is_falling] / dt[is_falling], "v", color=RED, markersize=4, label="falling: $-dS/dt$"
+        )
+    if is_constant.any() or is_falling.any():
         ax.legend(frameon=False, fontsize="small", markerscale=2)
     ax.set_ylabel("production $dS/dt$")
 
 
 def _verdict_title(audit: Audit) -> str:
-    failing = [row for row in audit.rows if row.passed is False]
-    if failing:
-        law = audit.verdict == LAW_FAILURE_VERDICT
-        return ("A law fails: " if law else f"{audit.verdict.capitalize()}: ") + "; ".join(
-            f"{row.law} {row.value:.2g}" + (f" ({row.note})" if row.note else "") for row in failing
+    violated_rows = [row for row in audit.rows if row.passed is False]
+    if violated_rows:
+        is_law_failure = audit.verdict == LAW_FAILURE_VERDICT
+        return ("A law fails: " if is_law_failure else f"{audit.verdict.capitalize()}: ") + "; ".join(
+            f"{row.law} {row.value:.2g}" + (f" ({row.note})" if row.note else "") for row in violated_rows
         )
-    shown = [row for row in audit.rows if row.law.startswith(("energy", "entropy", "least", "largest"))]
-    return "The laws hold: " + ", ".join(f"{row.law} {row.value:.2g}" for row in shown)
+    law_rows = [row for row in audit.rows if row.law.startswith(("energy", "entropy", "least", "largest"))]
+    return "The laws hold: " + ", ".join(f"{row.law} {row.value:.2g}" for row in law_rows)

@@ -1,4 +1,4 @@
-"""What all pictures share: colours, and how a figure becomes a file."""
+"""Colours of all figures, and the writing of figures to files."""
 
 from __future__ import annotations
 
@@ -13,29 +13,38 @@ from ... import disk
 from ...errors import FileError, InputError
 
 SUFFIXES = (".pdf", ".png", ".svg")
-DPI = 150
+"""Suffixes of the file formats of figures."""
 
-# Colours that colour-blind readers tell apart [Okabe & Ito 2008].
-BLUE, ORANGE, GREEN, RED, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "0.55"
+DPI = 150
+"""Resolution of figures, in dots per inch."""
+
+# These colours can be told apart by colour-blind readers [Okabe & Ito 2008].
+BLUE = "#0072B2"
+ORANGE = "#E69F00"
+GREEN = "#009E73"
+RED = "#D55E00"
+GREY = "0.55"
 
 
 def checked_figure_path(path: str | os.PathLike | None) -> Path | None:
-    """The path of a figure, whose suffix is one of those that can be written."""
+    """Return the path of a figure; InputError if its suffix is not one of SUFFIXES."""
     if path is not None and Path(path).suffix.lower() not in SUFFIXES:
-        raise InputError(f"a figure is written as {', '.join(SUFFIXES)}, and {Path(path).name!r} ends in none of them")
+        raise InputError(
+            f"the suffix of path must be one of {', '.join(SUFFIXES)}, but {Path(path).name!r} ends in none of them"
+        )
     return None if path is None else Path(path)
 
 
 def save_figure(figure: Figure, path: Path | None) -> Figure:
-    """The figure, written to the path and closed if there is one."""
+    """Write a figure to the path, if there is one, and close it; return the figure."""
     if path is not None:
-        drawn = io.BytesIO()
+        buffer = io.BytesIO()
         try:
-            figure.savefig(drawn, format=path.suffix[1:].lower())
+            figure.savefig(buffer, format=path.suffix[1:].lower())
         finally:
             plt.close(figure)
         try:
-            disk.write_atomically(path, drawn.getbuffer())
-        except (OSError, ValueError) as error:  # the latter for what is no path
+            disk.write_atomically(path, buffer.getbuffer())
+        except (OSError, ValueError) as error:  # ValueError for an invalid path
             raise FileError(f"cannot write {path}: {disk.why_os_failed(error)}") from error
     return figure

@@ -1,4 +1,4 @@
-"""Pictures of a study: a heat map over two axes, lines over one, points of a sample."""
+"""Figures of a study: a heat map over two axes, lines over one, points of a sample."""
 
 from __future__ import annotations
 
@@ -20,12 +20,13 @@ if TYPE_CHECKING:
     import xarray
 
 NON_MEASURE_VARIABLES = ("status", "message", "laws")
-"""Variables that are no measures."""
+"""Names of the variables of a study that are not measures."""
 
 MAX_CLASSES = 10
-"""Different whole numbers up to which values are classes, each with a colour of its own."""
+"""Largest number of different integers for which values are drawn as classes, each with its own colour."""
 
 HATCH_STYLE: dict[str, Any] = {"hatch": "////", "facecolor": "0.93", "edgecolor": GREY, "linewidth": 0.0}
+"""Style of the cells of points that failed."""
 
 
 def study(
@@ -35,11 +36,11 @@ def study(
     ax: Axes | None = None,
     contours: int = 8,
 ) -> Figure:
-    """A measure of a study over its axes: points that failed are hatched, those not done yet are left white.
+    """Plot a measure of a study over its axes; failed points are hatched, missing ones are left white.
 
     Over two axes it is a heat map with contours; over one a line, one for each component; over a sample of two
-    parameters coloured points. An axis whose values are spaced geometrically is logarithmic. A measure with few whole
-    numbers, such as the number of a basin, has a colour for each.
+    parameters coloured points. An axis with geometrically spaced values is logarithmic. A measure with few integer
+    values, such as the number of a basin, has a colour for each.
 
     Parameters
     ----------
@@ -53,7 +54,7 @@ def study(
     ax : Axes, optional
         Draw here; by default in a new figure.
     contours : int
-        How many; 0 for none.
+        Number of contours; 0 for none.
 
     Raises
     ------
@@ -64,25 +65,27 @@ def study(
     """
     path = checked_figure_path(path)
     if "status" not in dataset:
-        raise InputError("this dataset is not one of a study: it has no variable status")
+        raise InputError("dataset must be the results of a study, but it has no variable status")
     axes = [str(dim) for dim in dataset["status"].dims]
     values = dataset[_measure_name(dataset, axes, variable)]
-    more = [str(dim) for dim in values.dims if dim not in axes]
-    own = {name: c for name, c in dataset.coords.items() if c.dims == tuple(axes) and name not in axes}
-    columns = [str(name) for name, c in own.items() if c.dtype.kind in "fiu"]
-    sample = len(axes) == 1 and len(columns) > 1
-    if len(axes) not in (1, 2) or len(more) > (0 if sample or len(axes) == 2 else 1):
-        dims = ", ".join(f"{dim} ({dataset.sizes[dim]})" for dim in (*axes, *more))
-        raise InputError(f"a picture has one or two axes, and {values.name} has {dims}: choose with results.isel(...)")
+    extra_dims = [str(dim) for dim in values.dims if dim not in axes]
+    point_coordinates = {name: c for name, c in dataset.coords.items() if c.dims == tuple(axes) and name not in axes}
+    columns = [str(name) for name, c in point_coordinates.items() if c.dtype.kind in "fiu"]
+    is_sample = len(axes) == 1 and len(columns) > 1
+    if len(axes) not in (1, 2) or len(extra_dims) > (0 if is_sample or len(axes) == 2 else 1):
+        dims = ", ".join(f"{dim} ({dataset.sizes[dim]})" for dim in (*axes, *extra_dims))
+        raise InputError(
+            f"a picture has one or two axes, but {values.name} has {dims}. Choose points with results.isel(...)"
+        )
     if ax is None:
         _, ax = plt.subplots(figsize=(6.4, 4.4), dpi=DPI, layout="constrained")
-    failed = _has_failed(dataset)
-    if sample:
-        _draw_points(ax, values, failed, *(dataset[name] for name in columns[:2]))
+    is_failed = _has_failed(dataset)
+    if is_sample:
+        _draw_points(ax, values, is_failed, *(dataset[name] for name in columns[:2]))
     elif len(axes) == 1:
-        _draw_lines(ax, values.transpose(axes[0], *more), failed, dataset[axes[0]])
+        _draw_lines(ax, values.transpose(axes[0], *extra_dims), is_failed, dataset[axes[0]])
     else:
-        _draw_map(ax, values.transpose(*axes), failed.transpose(*axes), contours)
+        _draw_map(ax, values.transpose(*axes), is_failed.transpose(*axes), contours)
     return save_figure(ax.figure, path)  # type: ignore[arg-type]
 
 
@@ -92,14 +95,14 @@ def _measure_name(dataset: xarray.Dataset, axes: list[str], variable: str | None
         if variable not in measures:
             raise InputError(f"there is no measure {variable!r}; there are {', '.join(measures)}")
         return variable
-    plain = [name for name in measures if set(dataset[name].dims) == set(axes)]
-    if not (plain or measures):
+    scalar_measures = [name for name in measures if set(dataset[name].dims) == set(axes)]
+    if not (scalar_measures or measures):
         raise InputError("this dataset has no measure")
-    return (plain or measures)[0]
+    return (scalar_measures or measures)[0]
 
 
 def _has_failed(dataset: xarray.Dataset) -> xarray.DataArray:
-    """Where a point came to another end than the one it should."""
+    """Return for each point whether its status is none of "completed", "event" and "missing"."""
     codes = dict(zip(dataset["status"].flag_meanings.split(), dataset["status"].flag_values, strict=True))
     return ~dataset["status"].isin([codes[name] for name in ("completed", "event", "missing") if name in codes])
 
@@ -109,72 +112,75 @@ def _label(values: xarray.DataArray) -> str:
     return f"{name} [{units}]" if units else name
 
 
-def _is_geometric(places: np.ndarray) -> bool:
-    if len(places) < 3 or not (places > 0.0).all() or places.max() < 4.0 * places.min():
+def _is_geometric(points: np.ndarray) -> bool:
+    if len(points) < 3 or not (points > 0.0).all() or points.max() < 4.0 * points.min():
         return False
-    spread = [np.ptp(np.diff(p)) / np.abs(np.diff(p)).max() for p in (places, np.log(places))]
-    return bool(spread[1] < 0.1 < spread[0])
+    gap_variations = [np.ptp(np.diff(p)) / np.abs(np.diff(p)).max() for p in (points, np.log(points))]
+    return bool(gap_variations[1] < 0.1 < gap_variations[0])
 
 
-def _cell_edges(places: np.ndarray) -> np.ndarray:
-    """The edges of cells around places: the middles between them, as the axis is scaled."""
-    if len(places) == 1:
-        return places[0] + np.array([-0.5, 0.5]) * (abs(places[0]) or 1.0)
-    p = np.log(places) if _is_geometric(places) else places
-    middle = (p[1:] + p[:-1]) / 2
-    edges = np.concatenate([[2 * p[0] - middle[0]], middle, [2 * p[-1] - middle[-1]]])
-    return np.exp(edges) if _is_geometric(places) else edges
+def _cell_edges(centres: np.ndarray) -> np.ndarray:
+    """Return the edges of cells around their centres: midpoints on a linear or, if geometric, logarithmic axis."""
+    if len(centres) == 1:
+        return centres[0] + np.array([-0.5, 0.5]) * (abs(centres[0]) or 1.0)
+    p = np.log(centres) if _is_geometric(centres) else centres
+    midpoints = (p[1:] + p[:-1]) / 2
+    edges = np.concatenate([[2 * p[0] - midpoints[0]], midpoints, [2 * p[-1] - midpoints[-1]]])
+    return np.exp(edges) if _is_geometric(centres) else edges
 
 
 def _axis_values(coordinate: xarray.DataArray) -> np.ndarray:
-    """Numbers along an axis; texts have the numbers from 0 on."""
+    """Return the numbers along an axis; texts are numbered from 0."""
     return coordinate.to_numpy().astype(float) if coordinate.dtype.kind in "fiub" else np.arange(coordinate.size) * 1.0
 
 
-def _set_axis(ax: Axes, which: str, coordinate: xarray.DataArray, places: np.ndarray) -> None:
-    axis = getattr(ax, f"{which}axis")
-    if _is_geometric(np.sort(places)):
-        getattr(ax, f"set_{which}scale")("log")
+def _set_axis(ax: Axes, letter: str, coordinate: xarray.DataArray, points: np.ndarray) -> None:
+    axis = getattr(ax, f"{letter}axis")
+    if _is_geometric(np.sort(points)):
+        getattr(ax, f"set_{letter}scale")("log")
     if coordinate.dtype.kind not in "fiub":
-        axis.set_ticks(places, [str(text) for text in coordinate.to_numpy()])
+        axis.set_ticks(points, [str(text) for text in coordinate.to_numpy()])
     axis.set_label_text(_label(coordinate))
 
 
 def _colour_map(values: np.ndarray) -> dict[str, Any]:
-    """A map that is even in lightness; for classes a colour each."""
-    known = np.unique(values[np.isfinite(values)])
-    if 0 < len(known) <= MAX_CLASSES and (known == np.round(known)).all():
-        classes = np.arange(known.min(), known.max() + 2) - 0.5
+    """Return a colour map of even lightness, with one colour for each class if the values are classes."""
+    distinct_values = np.unique(values[np.isfinite(values)])
+    if 0 < len(distinct_values) <= MAX_CLASSES and (distinct_values == np.round(distinct_values)).all():
+        classes = np.arange(distinct_values.min(), distinct_values.max() + 2) - 0.5
         return {"cmap": plt.get_cmap("viridis", len(classes) - 1), "norm": BoundaryNorm(classes, len(classes) - 1)}
     return {"cmap": "viridis"}
 
 
 def _draw_map(ax: Axes, values: xarray.DataArray, failed: xarray.DataArray, contours: int) -> None:
-    down, across = (values[dim] for dim in values.dims)
-    y, x = _axis_values(down), _axis_values(across)
+    y_coordinate, x_coordinate = (values[dim] for dim in values.dims)
+    y, x = _axis_values(y_coordinate), _axis_values(x_coordinate)
     rows, columns = np.argsort(y), np.argsort(x)
     y, x, z = y[rows], x[columns], values.to_numpy()[np.ix_(rows, columns)]
-    bad = failed.to_numpy()[np.ix_(rows, columns)]
-    colours, seen = _colour_map(z), np.ma.masked_invalid(np.where(bad, np.nan, z))
-    mesh = ax.pcolormesh(_cell_edges(x), _cell_edges(y), seen, rasterized=True, **colours)
+    is_failed = failed.to_numpy()[np.ix_(rows, columns)]
+    colours, masked_values = _colour_map(z), np.ma.masked_invalid(np.where(is_failed, np.nan, z))
+    mesh = ax.pcolormesh(_cell_edges(x), _cell_edges(y), masked_values, rasterized=True, **colours)
     bar = ax.figure.colorbar(mesh, ax=ax, label=_label(values))
     if "norm" in colours:
         bar.set_ticks(np.unique(z[np.isfinite(z)]).tolist())
-    elif contours and min(z.shape) > 2 and seen.count() > 3 and np.ptp(seen.compressed()) > 0.0:
-        lines = ax.contour(x, y, seen, contours, colors="white", linewidths=0.6, alpha=0.8)
+    elif contours and min(z.shape) > 2 and masked_values.count() > 3 and np.ptp(masked_values.compressed()) > 0.0:
+        lines = ax.contour(x, y, masked_values, contours, colors="white", linewidths=0.6, alpha=0.8)
         ax.clabel(lines, fontsize="xx-small", fmt="%.3g")
-    _hatch_cells(ax, _cell_edges(x), _cell_edges(y), bad)
-    for which, coordinate, places in (("x", across, _axis_values(across)), ("y", down, _axis_values(down))):
-        _set_axis(ax, which, coordinate, places)
+    _hatch_cells(ax, _cell_edges(x), _cell_edges(y), is_failed)
+    for letter, coordinate, points in (
+        ("x", x_coordinate, _axis_values(x_coordinate)),
+        ("y", y_coordinate, _axis_values(y_coordinate)),
+    ):
+        _set_axis(ax, letter, coordinate, points)
 
 
-def _hatch_cells(ax: Axes, x: np.ndarray, y: np.ndarray, bad: np.ndarray) -> None:
-    """Hatch cells, neighbours in a row together."""
+def _hatch_cells(ax: Axes, x: np.ndarray, y: np.ndarray, is_failed: np.ndarray) -> None:
+    """Hatch the cells of failed points; neighbours in a row are joined."""
     patches = []
-    for i, row in enumerate(bad):
+    for i, row in enumerate(is_failed):
         turns = np.flatnonzero(np.diff(np.concatenate([[0], row.astype(int), [0]])))
-        for first, last in zip(turns[::2], turns[1::2], strict=True):
-            patches.append(Rectangle((x[first], y[i]), x[last] - x[first], y[i + 1] - y[i]))
+        for start, end in zip(turns[::2], turns[1::2], strict=True):
+            patches.append(Rectangle((x[start], y[i]), x[end] - x[start], y[i + 1] - y[i]))
     if patches:
         ax.add_collection(PatchCollection(patches, **HATCH_STYLE), autolim=False)
         _add_failure_legend(ax)
@@ -187,23 +193,23 @@ def _add_failure_legend(ax: Axes) -> None:
 
 
 def _draw_lines(ax: Axes, values: xarray.DataArray, failed: xarray.DataArray, coordinate: xarray.DataArray) -> None:
-    places = _axis_values(coordinate)
-    order = np.argsort(places)
-    z, bad = values.to_numpy().reshape(len(places), -1)[order], failed.to_numpy()[order]
+    points = _axis_values(coordinate)
+    order = np.argsort(points)
+    z, is_failed = values.to_numpy().reshape(len(points), -1)[order], failed.to_numpy()[order]
     names = values[values.dims[1]].to_numpy() if values.ndim == 2 else [""]
     colours = (BLUE, ORANGE, GREEN, RED)
     for k, name in enumerate(names):
         style: dict[str, Any] = (
             {"color": colours[k], "label": str(name)} if len(names) <= len(colours) and values.ndim == 2 else {}
         )
-        ax.plot(places[order], np.where(bad, np.nan, z[:, k]), marker="." if len(places) < 60 else "", **style)
-    edges = _cell_edges(places[order])
-    for i in np.flatnonzero(bad):
+        ax.plot(points[order], np.where(is_failed, np.nan, z[:, k]), marker="." if len(points) < 60 else "", **style)
+    edges = _cell_edges(points[order])
+    for i in np.flatnonzero(is_failed):
         ax.axvspan(edges[i], edges[i + 1], zorder=0, **HATCH_STYLE)
-    _set_axis(ax, "x", coordinate, places)
+    _set_axis(ax, "x", coordinate, points)
     ax.set_ylabel(_label(values))
     ax.spines[["top", "right"]].set_visible(False)
-    if bad.any():
+    if is_failed.any():
         _add_failure_legend(ax)
     elif values.ndim == 2 and len(names) <= len(colours):
         ax.legend(frameon=False, fontsize="small")
@@ -212,16 +218,16 @@ def _draw_lines(ax: Axes, values: xarray.DataArray, failed: xarray.DataArray, co
 def _draw_points(
     ax: Axes, values: xarray.DataArray, failed: xarray.DataArray, x: xarray.DataArray, y: xarray.DataArray
 ) -> None:
-    z, bad = values.to_numpy(), failed.to_numpy()
-    colours = _colour_map(z[~bad])
-    good = ~bad & np.isfinite(z)
-    points = ax.scatter(x.to_numpy()[good], y.to_numpy()[good], c=z[good], s=14, linewidth=0, **colours)
+    z, is_failed = values.to_numpy(), failed.to_numpy()
+    colours = _colour_map(z[~is_failed])
+    is_drawn = ~is_failed & np.isfinite(z)
+    points = ax.scatter(x.to_numpy()[is_drawn], y.to_numpy()[is_drawn], c=z[is_drawn], s=14, linewidth=0, **colours)
     ax.figure.colorbar(points, ax=ax, label=_label(values))
-    if bad.any():
-        ax.plot(x.to_numpy()[bad], y.to_numpy()[bad], "x", color=GREY, markersize=5, label="failed")
+    if is_failed.any():
+        ax.plot(x.to_numpy()[is_failed], y.to_numpy()[is_failed], "x", color=GREY, markersize=5, label="failed")
         ax.legend(loc="upper left", fontsize="small", framealpha=0.9)
-    for which, coordinate in (("x", x), ("y", y)):
-        places = coordinate.to_numpy().astype(float)
-        if (places > 0.0).all() and places.max() > 50.0 * places.min():
-            getattr(ax, f"set_{which}scale")("log")
-        getattr(ax, f"set_{which}label")(_label(coordinate))
+    for letter, coordinate in (("x", x), ("y", y)):
+        coordinate_values = coordinate.to_numpy().astype(float)
+        if (coordinate_values > 0.0).all() and coordinate_values.max() > 50.0 * coordinate_values.min():
+            getattr(ax, f"set_{letter}scale")("log")
+        getattr(ax, f"set_{letter}label")(_label(coordinate))

@@ -1,4 +1,4 @@
-"""The path of a run on its energy surface and its Casimir surface."""
+"""Figure of a trajectory on its energy surface and its Casimir surface."""
 
 from __future__ import annotations
 
@@ -26,9 +26,10 @@ from ..solution import Solution
 from .figures import BLUE, DPI, GREY, ORANGE, checked_figure_path, save_figure
 
 MAX_SEGMENTS = 20_000
-"""A longer trajectory is thinned for the 3D picture, in which each segment is drawn by itself."""
+"""Largest number of segments in a 3D figure, each drawn by itself; longer trajectories are thinned."""
 
 TIME_COLORMAP = plt.get_cmap("viridis")
+"""Colour map of the time along a trajectory."""
 
 PointFunction = Callable[[np.ndarray], np.ndarray]  # points, shape (..., 3), to values, shape (...)
 
@@ -39,26 +40,27 @@ def momentum_sphere(
     path: str | os.PathLike | None = None,
     ax: Axes3D | None = None,
 ) -> Figure:
-    """The trajectory on its energy surface, and the surfaces of constant entropy on which it starts and ends.
+    """Plot a trajectory on its energy surface, with the surfaces of constant entropy on which it starts and ends.
 
     The energy surface is solid, with lines of constant entropy on it; the entropy surfaces are drawn by their sections
-    with the coordinate planes and the plane of the paper. The trajectory is coloured by time. What the solid hides
-    from the viewpoint of ``ax`` is pale or left out, so turn the axes before drawing, not after. A system without
-    entropy shows its first Casimir or momentum map instead; where the energy falls (double bracket) the two change
-    places. So it is with a system that has baths: they are left out, and the body loses the energy that they gain.
+    with the coordinate planes and the plane of the paper. The trajectory is coloured by time. Parts that the solid
+    hides from the viewpoint of ``ax`` are pale or left out, so turn the axes before drawing, not after. A system
+    without entropy shows its first Casimir or momentum map instead. If the energy decreases (double bracket), the two
+    functions change places. They also do for a system with baths, which are left out: the body loses the energy that
+    they gain.
 
-    Surfaces are found along rays from the origin. One that a ray meets twice is left out; one that does not close
+    Surfaces are found along rays from the origin. A surface that a ray meets twice is left out; one that does not close
     around the origin, such as a cylinder, is drawn by sections that end a little beyond the trajectory.
 
     Parameters
     ----------
     solution : Solution
-        Of a system with three components, such as one on so(3)*, and baths besides.
+        A result of a system with three components, such as one on so(3)*, and baths besides.
     system : System, optional
-        What was integrated. It is not known for a solution read from a file. The energy surface is then the quadric
-        through all states, if there is exactly one. The entropy surfaces are spheres if the algebra is so(3) or su(2),
-        where every Casimir is a function of ``|mu|``. What remains unknown is left out. The axes are labelled by the
-        names of its algebra's basis elements, if they have some.
+        The system that was integrated, which a solution read from a file does not know. Without it the energy surface
+        is the quadric through all states, if there is exactly one, and the entropy surfaces are spheres if the algebra
+        is so(3) or su(2), where every Casimir is a function of ``|mu|``; what remains unknown is left out. The axes are
+        labelled by the names of the basis elements of its algebra, if they have some.
     path : path, optional
         Write the figure to this .pdf, .png or .svg file, and close it.
     ax : Axes3D, optional
@@ -76,28 +78,28 @@ def momentum_sphere(
         solution = _body_solution(solution, system)
     if solution.x.shape[1] != 3:
         raise InputError(
-            f"momentum_sphere draws states of 3 components, not {solution.x.shape[1]}; lt.plot.laws draws any, and "
-            "where the others are the entropies of baths, give the system too"
+            f"momentum_sphere draws states of 3 components, got {solution.x.shape[1]}. If the others are the entropies "
+            "of baths, pass the system too; lt.plot.laws draws any solution"
         )
     if system is not None and system.body_dim != 3:
-        raise InputError(f"the states have 3 components, but those of this system have {system.body_dim}")
+        raise InputError(f"system must have 3 components like the solution, got {system.body_dim}")
     if ax is not None and not isinstance(ax, Axes3D):
-        raise InputError("ax must be three-dimensional: make it with subplot_kw={'projection': '3d'}")
+        raise InputError("ax must be three-dimensional. Make it with subplot_kw={'projection': '3d'}")
     if ax is None:
         ax = plt.figure(figsize=(6.4, 5.2), dpi=DPI, layout="constrained").add_subplot(projection="3d")
         _turn_axes_towards(solution.x[-1], ax)
     ax.set_proj_type("ortho")
-    ax.computed_zorder = False  # what is behind what is settled here, by the zorder of each piece
+    ax.computed_zorder = False  # the zorder of each piece is set here
 
     scene = _Scene(ax, solution.x)
-    kept, changing = _conserved_and_changing(solution, system)
-    if kept is not None:
-        scene.draw_solid(kept.function, kept.label(0))
-    if changing is not None:
-        scene.draw_contours(changing.function, 12)
-        scene.draw_sections(changing.function, 0, ORANGE, changing.label(0))
-        if not changing.is_constant:
-            scene.draw_sections(changing.function, -1, BLUE, changing.label(-1))
+    conserved_quantity, changing_quantity = _conserved_and_changing(solution, system)
+    if conserved_quantity is not None:
+        scene.draw_solid(conserved_quantity.function, conserved_quantity.label(0))
+    if changing_quantity is not None:
+        scene.draw_contours(changing_quantity.function, 12)
+        scene.draw_sections(changing_quantity.function, 0, ORANGE, changing_quantity.label(0))
+        if not changing_quantity.is_constant:
+            scene.draw_sections(changing_quantity.function, -1, BLUE, changing_quantity.label(-1))
     _draw_trajectory(solution, scene)
 
     name = "x" if solution.provenance.get("algebra") is None else r"\mu"
@@ -116,7 +118,7 @@ def momentum_sphere(
 
 
 def _body_solution(solution: Solution, system: System) -> Solution:
-    """The body alone: its states, and the energy that it has left."""
+    """Return the solution of the body alone: its states, and the energy that it has left."""
     x = solution.x[:, : system.body_dim]
     energy = np.asarray(_restrict_to_body(system.energy, system)(x))
     laws = dataclasses.replace(solution.laws, energy="nonincreasing")
@@ -124,14 +126,14 @@ def _body_solution(solution: Solution, system: System) -> Solution:
 
 
 def _restrict_to_body(function: Callable, system: System) -> Callable:
-    """A function of the states of a system as one of its body, the entropies of baths being zero."""
-    number = system.dim - system.body_dim
-    return lambda x: function(jnp.concatenate([x, jnp.zeros((*x.shape[:-1], number))], axis=-1))
+    """Return a function of the states of a system as a function of its body, with the entropies of baths zero."""
+    n_bath_entropies = system.dim - system.body_dim
+    return lambda x: function(jnp.concatenate([x, jnp.zeros((*x.shape[:-1], n_bath_entropies))], axis=-1))
 
 
 @dataclass(frozen=True)
 class _Quantity:
-    """A function of the state and its values along a run."""
+    """A function of the state, with its values along a run."""
 
     name: str
     function: PointFunction
@@ -147,40 +149,41 @@ class _Quantity:
 
 
 def _conserved_and_changing(solution: Solution, system: System | None) -> tuple[_Quantity | None, _Quantity | None]:
-    """Energy and entropy, or whatever stands for them, as far as they are known; the conserved one first."""
+    """Return energy and entropy, or their substitutes, as far as they are known; the conserved one first."""
     energy: PointFunction | None
     entropy: PointFunction | None
     if system is not None:
         energy = _vectorize_in_blocks(_restrict_to_body(system.energy, system))
-        own = system.entropy if system.body_dim == system.dim else None  # that of baths is no function of the body
-        second = own or next((J for J, kept in system.invariants().values() if kept), None)
-        entropy = None if second is None else _vectorize_in_blocks(_restrict_to_body(second, system))
+        # the entropy of baths is no function of the body
+        body_entropy = system.entropy if system.body_dim == system.dim else None
+        function = body_entropy or next((J for J, is_conserved in system.invariants().values() if is_conserved), None)
+        entropy = None if function is None else _vectorize_in_blocks(_restrict_to_body(function, system))
     else:
         energy = _fit_quadric(solution.x) if solution.laws.energy == "conserved" else None
         spheres = solution.provenance.get("algebra") in ("so(3)", "su(2)", "bianchi('IX')")
         entropy = (lambda x: (x * x).sum(axis=-1)) if spheres else None
-    found = [None if energy is None else _Quantity("energy", energy, solution.energy), None]
+    quantities = [None if energy is None else _Quantity("energy", energy, solution.energy), None]
     if entropy is not None and solution.entropy is not None:
-        found[1] = _Quantity("entropy", entropy, solution.entropy)
+        quantities[1] = _Quantity("entropy", entropy, solution.entropy)
     elif entropy is not None:
-        found[1] = _Quantity("invariant", entropy, entropy(solution.x))
-    return (found[0], found[1]) if solution.laws.energy == "conserved" else (found[1], found[0])
+        quantities[1] = _Quantity("invariant", entropy, entropy(solution.x))
+    return (quantities[0], quantities[1]) if solution.laws.energy == "conserved" else (quantities[1], quantities[0])
 
 
 def _vectorize_in_blocks(function: Callable, block: int = 8192) -> PointFunction:
-    """The function on arrays of points of any shape, in blocks of one size so that it is compiled once."""
-    compiled = jax.jit(lambda x: function(x))
+    """Vectorize a function over arrays of points of any shape, in blocks of one size so that it is compiled once."""
+    compiled_function = jax.jit(lambda x: function(x))
 
-    def values(points: np.ndarray) -> np.ndarray:
+    def evaluate(points: np.ndarray) -> np.ndarray:
         flat = points.reshape(-1, 3)
         padded = np.concatenate([flat, np.zeros((-len(flat) % block, 3))]).reshape(-1, block, 3)
-        return np.concatenate([compiled(x) for x in padded])[: len(flat)].reshape(points.shape[:-1])
+        return np.concatenate([compiled_function(x) for x in padded])[: len(flat)].reshape(points.shape[:-1])
 
-    return values
+    return evaluate
 
 
 def _fit_quadric(states: np.ndarray) -> PointFunction | None:
-    """The polynomial of degree two that vanishes at all states, where there is one and only one up to a factor."""
+    """Return the quadratic polynomial that vanishes at all states; None unless it is unique up to a factor."""
     scale = float(np.abs(states).max()) or 1.0
     i, j = np.triu_indices(3)
 
@@ -190,13 +193,13 @@ def _fit_quadric(states: np.ndarray) -> PointFunction | None:
 
     if len(states) < 10:
         return None
-    _, singular, rows = np.linalg.svd(monomials(states), full_matrices=False)
-    unique = singular[-1] < 1e-13 * singular[0] and singular[-2] > 1e-7 * singular[0]
-    return (lambda points: monomials(points) @ rows[-1]) if unique else None
+    _, singular_values, rows = np.linalg.svd(monomials(states), full_matrices=False)
+    is_unique = singular_values[-1] < 1e-13 * singular_values[0] and singular_values[-2] > 1e-7 * singular_values[0]
+    return (lambda points: monomials(points) @ rows[-1]) if is_unique else None
 
 
 class _LevelSurface:
-    """The surface on which a function has the value it has at a point, seen along rays from the origin.
+    """Level surface of a function through a point, found along rays from the origin.
 
     Attributes
     ----------
@@ -211,35 +214,35 @@ class _LevelSurface:
         self.is_simple, self.is_closed = bool(meetings.max() == 1), bool((meetings == 1).all())
 
     def intersect_rays(self, directions: np.ndarray) -> np.ndarray:
-        """Where rays from the origin along unit vectors (..., 3) meet it, NaN where they do not, shape (..., 3)."""
-        crossed = self._ray_crossings(directions)
-        first = crossed.argmax(axis=0)
-        low, high = self.radii[first], self.radii[first + 1]
-        above = self._is_above_level(low[..., None] * directions)
+        """Return the points where rays along unit vectors (..., 3) meet the surface, NaN if they do not."""
+        has_crossing = self._ray_crossings(directions)
+        first_interval = has_crossing.argmax(axis=0)
+        inner, outer = self.radii[first_interval], self.radii[first_interval + 1]
+        inner_side = self._is_above_level(inner[..., None] * directions)
         for _ in range(40):
-            middle = (low + high) / 2
-            before = self._is_above_level(middle[..., None] * directions) == above
-            low, high = np.where(before, middle, low), np.where(before, high, middle)
-        met = crossed.any(axis=0) & (self.is_closed | (high <= 1.5 * self.extent))
-        return np.where(met[..., None], high[..., None] * directions, np.nan)
+            midpoint = (inner + outer) / 2
+            is_on_inner_side = self._is_above_level(midpoint[..., None] * directions) == inner_side
+            inner, outer = np.where(is_on_inner_side, midpoint, inner), np.where(is_on_inner_side, outer, midpoint)
+        is_hit = has_crossing.any(axis=0) & (self.is_closed | (outer <= 1.5 * self.extent))
+        return np.where(is_hit[..., None], outer[..., None] * directions, np.nan)
 
     def hides(self, points: np.ndarray, view: np.ndarray) -> np.ndarray:
-        """Whether it stands between points (..., 3) and an eye far away in the direction ``view``, shape (...)."""
+        """Return whether the surface hides points, shape (..., 3), from a distant eye in the direction ``view``."""
         depths = np.geomspace(0.01, 20.0, 80) * self.extent
-        above = self._is_above_level(points + depths.reshape(-1, *[1] * points.ndim) * view)
-        return (above[1:] != above[:-1]).any(axis=0)
+        side = self._is_above_level(points + depths.reshape(-1, *[1] * points.ndim) * view)
+        return (side[1:] != side[:-1]).any(axis=0)
 
     def _is_above_level(self, points: np.ndarray) -> np.ndarray:
         return self.function(points) > self.level
 
     def _ray_crossings(self, directions: np.ndarray) -> np.ndarray:
-        """In which intervals of ``radii`` rays meet it, shape (intervals, ...)."""
-        above = self._is_above_level(self.radii.reshape(-1, *[1] * directions.ndim) * directions)
-        return above[1:] != above[:-1]
+        """Return the intervals of ``radii`` in which rays cross the surface, shape (intervals, ...)."""
+        side = self._is_above_level(self.radii.reshape(-1, *[1] * directions.ndim) * directions)
+        return side[1:] != side[:-1]
 
 
 class _Scene:
-    """One solid and curves around it, those parts left out that the solid hides."""
+    """A solid with curves around it, without the parts that the solid hides."""
 
     def __init__(self, ax: Axes3D, states: np.ndarray):
         self.ax, self.states, self.view_direction = ax, states, _view_direction(ax)
@@ -247,14 +250,14 @@ class _Scene:
         self.solid: _LevelSurface | None = None
 
     def draw_solid(self, function: PointFunction, label: str) -> None:
-        """The level surface of the function through the first state, with its outline; sections if it is open."""
+        """Draw the level surface of the function through the first state, with its outline; sections if it is open."""
         surface = _LevelSurface(function, self.states[0], self.extent)
         if not surface.is_closed:
             self.draw_sections(function, 0, GREY, label)
             return
         self.solid, self.mesh = surface, surface.intersect_rays(_sphere_grid(96, 192))
         normals = np.cross(np.gradient(self.mesh, axis=0), np.gradient(self.mesh, axis=1))
-        normals[[0, -1]] = normals[[1, -2]]  # at the poles of the mesh all longitudes meet
+        normals[[0, -1]] = normals[[1, -2]]  # the normals vanish at the poles of the mesh
         normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
         grey = 0.80 + 0.18 * normals @ (0.6 * self.view_direction + [0.0, 0.0, 0.8])  # lit from in front and above
         shades = np.repeat(np.clip(grey, 0.0, 1.0)[..., None], 3, axis=-1)
@@ -265,34 +268,34 @@ class _Scene:
             self._draw_line(line, color=GREY, linewidth=0.8)
 
     def draw_contours(self, function: PointFunction, count: int) -> None:
-        """Curves on the solid along which the function is constant."""
+        """Draw curves on the solid along which the function is constant."""
         if self.solid is not None:
             values = function(self.mesh)
             for level in np.linspace(values.min(), values.max(), count + 2)[1:-1]:
                 self._draw_contour(values, level, color=GREY, linewidth=0.4)
 
     def draw_sections(self, function: PointFunction, index: int, color: str, label: str) -> None:
-        """The level surface of the function through a state: plane sections, and where it cuts the solid."""
+        """Draw plane sections of the level surface through a state, and its intersection with the solid."""
         surface = _LevelSurface(function, self.states[index], self.extent)
         if not surface.is_simple:
             return
         for normal in (*np.eye(3), self.view_direction):
             section = surface.intersect_rays(_great_circle(normal))
-            seen, far = ~self.is_hidden(section), surface.hides(section, self.view_direction)
-            self._draw_line(section, seen & ~far, color=color, linewidth=0.7)
-            self._draw_line(section, seen & far, color=color, linewidth=0.7, alpha=0.3)
+            is_visible, is_behind = ~self.is_hidden(section), surface.hides(section, self.view_direction)
+            self._draw_line(section, is_visible & ~is_behind, color=color, linewidth=0.7)
+            self._draw_line(section, is_visible & is_behind, color=color, linewidth=0.7, alpha=0.3)
         if self.solid is not None:
             self._draw_contour(function(self.mesh), surface.level, color=color, linewidth=1.2)
         self.ax.plot([], [], [], color=color, label=label)
 
     def is_hidden(self, points: np.ndarray) -> np.ndarray:
-        """Whether the solid hides the points, shape (m, 3)."""
+        """Return whether the solid hides points, shape (m, 3)."""
         return (
             np.zeros(len(points), dtype=bool) if self.solid is None else self.solid.hides(points, self.view_direction)
         )
 
-    def _draw_line(self, points: np.ndarray, seen: np.ndarray | bool = True, **style) -> None:
-        self.ax.plot(*np.where(np.reshape(seen, (-1, 1)), points, np.nan).T, zorder=2, **style)
+    def _draw_line(self, points: np.ndarray, is_visible: np.ndarray | bool = True, **style) -> None:
+        self.ax.plot(*np.where(np.reshape(is_visible, (-1, 1)), points, np.nan).T, zorder=2, **style)
 
     def _draw_contour(self, values: np.ndarray, level: float, **style) -> None:
         for line in _level_curves(self.mesh, values, level):
@@ -300,7 +303,7 @@ class _Scene:
 
 
 def _level_curves(mesh: np.ndarray, values: np.ndarray, level: float) -> Iterator[np.ndarray]:
-    """The curves, shape (m, 3), in a mesh (rows, columns, 3) along which values (rows, columns) equal the level."""
+    """Yield the curves, shape (m, 3), in a mesh (rows, columns, 3) on which ``values`` equal the level."""
     contours: Any = contour_generator(z=values)
     for line in contours.lines(level):
         column, row = line.T
@@ -308,48 +311,50 @@ def _level_curves(mesh: np.ndarray, values: np.ndarray, level: float) -> Iterato
 
 
 def _draw_trajectory(solution: Solution, scene: _Scene) -> None:
-    """The trajectory, coloured by time and pale where it is hidden; its start and its end."""
-    last = len(solution.t) - 1
-    kept = np.linspace(0, last, min(last, MAX_SEGMENTS) + 1).round().astype(int)
-    t, x = solution.t[kept], solution.x[kept]
-    hidden = scene.is_hidden(x)
+    """Draw the trajectory, coloured by time and pale where it is hidden, with its start and its end."""
+    n_segments = len(solution.t) - 1
+    indices = np.linspace(0, n_segments, min(n_segments, MAX_SEGMENTS) + 1).round().astype(int)
+    t, x = solution.t[indices], solution.x[indices]
+    is_hidden = scene.is_hidden(x)
     scale = Normalize(solution.t[0], solution.t[-1])
     segments, colors = np.stack([x[:-1], x[1:]], axis=1), TIME_COLORMAP(scale((t[:-1] + t[1:]) / 2))
-    behind = hidden[:-1] & hidden[1:]
-    for part, alpha, zorder in ((behind, 0.25, 3), (~behind, 1.0, 4)):
-        if part.any():
-            lines = Line3DCollection(segments[part], colors=colors[part], alpha=alpha, linewidths=1.7, zorder=zorder)
-            lines.set_capstyle("round")  # segments would show gaps at their joints
+    is_segment_hidden = is_hidden[:-1] & is_hidden[1:]
+    for is_selected, alpha, zorder in ((is_segment_hidden, 0.25, 3), (~is_segment_hidden, 1.0, 4)):
+        if is_selected.any():
+            lines = Line3DCollection(
+                segments[is_selected], colors=colors[is_selected], alpha=alpha, linewidths=1.7, zorder=zorder
+            )
+            lines.set_capstyle("round")  # otherwise gaps show at the joints of segments
             scene.ax.add_collection3d(lines)
     for i, face, label in ((0, "white", "start"), (-1, "black", "end")):
         style = {"color": "black", "markerfacecolor": face, "markersize": 5, "zorder": 5}
-        scene.ax.plot(*x[[i]].T, "o", alpha=0.25 if hidden[i] else 1.0, **style)
+        scene.ax.plot(*x[[i]].T, "o", alpha=0.25 if is_hidden[i] else 1.0, **style)
         scene.ax.plot([], [], [], "o", label=label, **style)
     bar = {"label": "time", "shrink": 0.6, "pad": 0.05, "aspect": 30}
     scene.ax.figure.colorbar(ScalarMappable(scale, TIME_COLORMAP), ax=scene.ax, **bar)
 
 
 def _sphere_grid(rows: int, columns: int) -> np.ndarray:
-    """Unit vectors by latitude and longitude, shape (rows + 1, columns + 1, 3)."""
+    """Return unit vectors by latitude and longitude, shape (rows + 1, columns + 1, 3)."""
     theta, phi = np.meshgrid(np.linspace(0, np.pi, rows + 1), np.linspace(0, 2 * np.pi, columns + 1), indexing="ij")
     return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
 
 
 def _great_circle(normal: np.ndarray, points: int = 360) -> np.ndarray:
-    """Unit vectors orthogonal to ``normal``, shape (points + 1, 3)."""
+    """Return unit vectors orthogonal to ``normal``, shape (points + 1, 3)."""
     phi = np.linspace(0, 2 * np.pi, points + 1)[:, None]
-    _, _, (_, first, second) = np.linalg.svd(normal[None])
-    return np.cos(phi) * first + np.sin(phi) * second
+    _, _, (_, a, b) = np.linalg.svd(normal[None])
+    return np.cos(phi) * a + np.sin(phi) * b
 
 
 def _view_direction(ax: Axes3D) -> np.ndarray:
-    """The unit vector towards the eye."""
+    """Return the unit vector towards the eye."""
     elevation, azimuth = np.radians([ax.elev, ax.azim])
     return np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
 
 
 def _turn_axes_towards(state: np.ndarray, ax: Axes3D) -> None:
-    """Turn the axes so that the state is on the near side, from above if that is possible."""
+    """Turn the axes so that the state is on the near side, seen from above if possible."""
     azimuth = float(np.degrees(np.arctan2(state[1], state[0]))) + 40.0
     ax.view_init(elev=22.0, azim=azimuth)
     if _view_direction(ax) @ state < 0.0:

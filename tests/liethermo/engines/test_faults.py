@@ -1,4 +1,4 @@
-"""What crashed the compiler is compiled now, and a crash that nobody has seen yet becomes the array engine's run."""
+"""Energies that once crashed the compiler are compiled, and after an unknown crash the array engine runs."""
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,7 @@ ENERGIES = {
     "float to narrow integers": lambda m: m[0] ** 2 + m[1] ** 2 * (200.0 * m[2]).astype(jnp.uint8).astype(float),
     "larger truth value": lambda m: m[0] ** 2 + m[1] ** 2 * jnp.maximum(m[2] > 0, m[0] > 0),
 }
+"""Energies that once crashed the compiler."""
 
 
 def run(system, engine, **options):
@@ -35,13 +36,13 @@ def run(system, engine, **options):
 @pytest.mark.parametrize("name", ENERGIES)
 def test_is_compiled(name):
     system = lt.LiePoissonSystem(mf.so(3), ENERGIES[name])
-    ours, other = run(system, "auto"), run(system, "array")
-    assert ours.provenance["engine"] == "compiled"
-    assert np.abs(ours.x - other.x).max() <= 2e-14
+    compiled_run, array_run = run(system, "auto"), run(system, "array")
+    assert compiled_run.provenance["engine"] == "compiled"
+    assert np.abs(compiled_run.x - array_run.x).max() <= 2e-14
 
 
 def test_entries_that_a_function_is_applied_to():
-    """``x.at[i].apply(f)`` was zero; JAX does not differentiate it, so that it stands in a friction."""
+    """``x.at[i].apply(f)``, which JAX does not differentiate and which once gave zero, is compiled in a friction."""
 
     def friction(m):
         return jnp.diag(m.at[1].apply(jnp.cos).at[0].apply(lambda a: 1.0 + a * a) ** 2)
@@ -49,8 +50,8 @@ def test_entries_that_a_function_is_applied_to():
     system = lt.LiePoissonSystem(
         mf.so(3), lambda m: m[0] ** 2 + m[1] ** 2 / 2, lambda m: m @ m, lt.FrictionOperator(friction), validate=False
     )
-    ours, other = run(system, "compiled"), run(system, "array")
-    assert np.abs(ours.x - other.x).max() <= 2e-14
+    compiled_run, array_run = run(system, "compiled"), run(system, "array")
+    assert np.abs(compiled_run.x - array_run.x).max() <= 2e-14
 
 
 def sine(m):
@@ -59,36 +60,37 @@ def sine(m):
 
 @pytest.fixture
 def fresh_programs(monkeypatch):
-    """No program that was made before is found again."""
-    monkeypatch.setattr("liethermo.engines.compiled.stepper._steppers", lt.tracing.remembered.LRUCache(4))
-    monkeypatch.setattr("liethermo.tracing.interpret._unrolled", lt.tracing.remembered.LRUCache(4))
+    """Empty the caches of programs."""
+    monkeypatch.setattr("liethermo.engines.compiled.stepper._step_loop_cache", lt.tracing.caching.LRUCache(4))
+    monkeypatch.setattr("liethermo.tracing.interpret._unrolled_cache", lt.tracing.caching.LRUCache(4))
 
 
-def raising(*arguments, **named):
+def raising(*arguments, **keywords):
     raise ZeroDivisionError("nobody has seen this yet")
 
 
 FAULTS = {
     "rule of a primitive": lambda patch: patch.setitem(UNROLLING_RULES, "sin", raising),
-    "scalar compiler": lambda patch: patch.setattr(scalarize, "_program", raising),
+    "scalar compiler": lambda patch: patch.setattr(scalarize, "_collect_program", raising),
     "builder": lambda patch: patch.setattr(Builder, "mul", raising),
-    "writer": lambda patch: patch.setattr(ProgramWriter, "operation", raising),
+    "writer": lambda patch: patch.setattr(ProgramWriter, "write_operation", raising),
     "LLVM": lambda patch: patch.setattr("liethermo.engines.compiled.loop.MachineCode", raising),
 }
+"""Patches that raise an error in a part of the compiler."""
 
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_of_the_compiler_is_no_fault_of_the_run(fault, monkeypatch, fresh_programs):
     system = lt.LiePoissonSystem(mf.so(3), sine)
-    right = run(system, "array").x
+    expected_x = run(system, "array").x
     FAULTS[fault](monkeypatch)
     with pytest.warns(CompiledEngineWarning, match="ZeroDivisionError: nobody has seen this yet.*array engine runs it"):
-        found = run(system, "auto")
-    assert found.provenance["engine"] == "array"
-    assert np.array_equal(found.x, right)
+        solution = run(system, "auto")
+    assert solution.provenance["engine"] == "array"
+    assert np.array_equal(solution.x, expected_x)
     with pytest.warns(CompiledEngineWarning, match="nobody has seen this yet"):
-        many = lt.ensemble(system, [X0, X0], (0.0, 0.5), 0.1, lt.MetriplecticRungeKutta(4))
-    assert np.abs(many.x[1] - right[-1]).max() <= 1e-14
+        ensemble = lt.ensemble(system, [X0, X0], (0.0, 0.5), 0.1, lt.MetriplecticRungeKutta(4))
+    assert np.abs(ensemble.x[1] - expected_x[-1]).max() <= 1e-14
     with pytest.raises(lt.LiethermoError, match=r"the compiled engine failed.*This is a fault of liethermo"):
         run(system, "compiled")
 
@@ -96,23 +98,23 @@ def test_a_fault_of_the_compiler_is_no_fault_of_the_run(fault, monkeypatch, fres
 @pytest.mark.parametrize("options", [{"until": lambda m: m[0] + 9.0}, {}], ids=["event", "adaptive"])
 def test_a_fault_where_a_run_has_a_pace(options, monkeypatch, fresh_programs):
     system = lt.LiePoissonSystem(mf.so(3), sine)
-    monkeypatch.setattr(ProgramWriter, "operation", raising)
+    monkeypatch.setattr(ProgramWriter, "write_operation", raising)
     with pytest.warns(CompiledEngineWarning, match="nobody has seen this yet"):
-        found = lt.integrate(system, X0, (0.0, 0.5), lt.Adaptive(1e-8), **options)
-    assert found.provenance["engine"] == "array"
+        solution = lt.integrate(system, X0, (0.0, 0.5), lt.Adaptive(1e-8), **options)
+    assert solution.provenance["engine"] == "array"
 
 
 def test_a_fault_in_newtons_method(monkeypatch, fresh_programs):
-    """Which is compiled when a step first needs it: the run goes on from there."""
+    """A fault while Newton's method is compiled, at the first step that needs it: the array engine resumes the run."""
     system = lt.LiePoissonSystem(mf.so(3), sine)
-    monkeypatch.setattr("liethermo.engines.compiled.stepper.solver", raising)
+    monkeypatch.setattr("liethermo.engines.compiled.stepper.compile_newton_solver", raising)
     with pytest.warns(CompiledEngineWarning, match="nobody has seen this yet"):
-        found = lt.integrate(system, 3.0 * X0, (0.0, 4.0), 0.4, lt.MetriplecticMidpoint())
-    assert found.stats.newton_iterations > 0
+        solution = lt.integrate(system, 3.0 * X0, (0.0, 4.0), 0.4, lt.MetriplecticMidpoint())
+    assert solution.stats.newton_iterations > 0
 
 
 def test_the_primitive_and_the_line_of_a_fault_are_named(monkeypatch):
     monkeypatch.setitem(UNROLLING_RULES, "sin", raising)
-    with pytest.raises(scalarize.CompilerFault, match=r"on the JAX primitive 'sin' \(test_faults.py:\d+") as caught:
+    with pytest.raises(scalarize.CompilerFault, match=r"on the JAX primitive 'sin' \(test_faults.py:\d+") as error_info:
         scalarize.scalarize(jax.make_jaxpr(sine)(X0))
-    assert isinstance(caught.value.__cause__, ZeroDivisionError)
+    assert isinstance(error_info.value.__cause__, ZeroDivisionError)

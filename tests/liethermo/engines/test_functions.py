@@ -1,4 +1,4 @@
-"""Whatever an energy is written with is compiled, and the trajectory is that of the array engine."""
+"""Energies written with all kinds of functions are compiled, and the trajectory is that of the array engine."""
 
 import functools
 
@@ -18,32 +18,32 @@ X0 = np.array([0.3, 1.0, -0.5])
 
 
 def matrix(m):
-    """Positive definite, its eigenvalues apart."""
+    """Return a positive definite matrix with distinct eigenvalues."""
     return jnp.diag(jnp.array([2.0, 4.0, 7.0])) + 0.3 * jnp.outer(m, m)
 
 
 def root(s):
-    """By Newton's method, in as many passes as it takes."""
+    """Return the square root of s by Newton's method, in a ``while_loop``."""
     start = jnp.zeros(()), s
 
-    def off(carried):
-        return jnp.abs(carried[1] ** 2 - s) > 1e-13 * s
+    def is_unconverged(carry):
+        return jnp.abs(carry[1] ** 2 - s) > 1e-13 * s
 
-    return lax.while_loop(off, lambda c: (c[0] + 1, (c[1] + s / c[1]) / 2), start)[1]
-
-
-def doubled(m):
-    """Six by six."""
-    whole = jnp.tile(m, 2)
-    return jnp.kron(matrix(m), jnp.eye(2)) + jnp.outer(whole, whole)
+    return lax.while_loop(is_unconverged, lambda c: (c[0] + 1, (c[1] + s / c[1]) / 2), start)[1]
 
 
-def spectral(m):
+def six_by_six(m):
+    """Return a positive definite 6 x 6 matrix."""
+    repeated_m = jnp.tile(m, 2)
+    return jnp.kron(matrix(m), jnp.eye(2)) + jnp.outer(repeated_m, repeated_m)
+
+
+def spectral_entropy(m):
     values, vectors = jnp.linalg.eigh(matrix(m))
     return jnp.sum(values * jnp.log(values) * vectors[0] ** 2)
 
 
-def bent(m):
+def complex_eigenvalue_sum(m):
     return jnp.sum(jnp.linalg.eigvalsh(matrix(m) + 0.5j * mf.so(3).ad(m)))
 
 
@@ -59,9 +59,9 @@ FUNCTIONS = {
     "integers": lambda m: m[0] ** 4 * ((m > -99.0).sum() // 2 + 5 % (m > -99.0).sum()),
     "single precision": lambda m: jnp.float32(1.1) * m[0] ** 4 * jnp.mean(m > -99.0),
     "complex": lambda m: jnp.abs((m[0] + 1j * m[1] + 2.0) ** 3 * jnp.exp(0.1j * m[2])),
-    "eigh": spectral,
+    "eigh": spectral_entropy,
     "eigvalsh": lambda m: jnp.sum(jnp.exp(0.2 * jnp.linalg.eigvalsh(matrix(m)))),
-    "eigvalsh, complex": bent,
+    "eigvalsh, complex": complex_eigenvalue_sum,
     "solve": lambda m: m @ jnp.linalg.solve(matrix(m), m),
     "inv": lambda m: jnp.trace(jnp.linalg.inv(matrix(m))),
     "inv, larger": lambda m: jnp.trace(
@@ -85,6 +85,7 @@ FUNCTIONS = {
     "bessel_jn": lambda m: special.bessel_jn(m[0] + 4.0, v=1)[1],
     "convolve": lambda m: jnp.sum(jnp.convolve(m, m)[1:3]),
 }
+"""Function of the momentum for each JAX feature, a part of the energy."""
 
 METHODS = lt.MetriplecticMidpoint(), lt.MetriplecticRungeKutta(4)
 CASIMIR = functools.partial(lt.Quadratic, np.ones(3))
@@ -106,41 +107,43 @@ def body(function, dissipation=True):
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_functions_of_every_kind(name, method):
     system = body(FUNCTIONS[name])
-    ours, other = (lt.integrate(system, X0, (0.0, 1.0), 0.1, method, engine=e) for e in ("compiled", "array"))
-    assert ours.provenance["engine"] == "compiled"
-    assert np.abs(ours.x - other.x).max() <= 2e-14  # at most 4e-15 of them all
-    assert ours.audit().energy_drift <= 4e-15
-    assert (np.diff(ours.entropy) > 0.0).all()
+    compiled_run, array_run = (
+        lt.integrate(system, X0, (0.0, 1.0), 0.1, method, engine=e) for e in ("compiled", "array")
+    )
+    assert compiled_run.provenance["engine"] == "compiled"
+    assert np.abs(compiled_run.x - array_run.x).max() <= 2e-14  # 4e-15 measured, over all of them
+    assert compiled_run.audit().energy_drift <= 4e-15
+    assert (np.diff(compiled_run.entropy) > 0.0).all()
 
 
 @pytest.mark.parametrize("name", ["while_loop", "eigh", pytest.param("inv, larger", marks=pytest.mark.slow)])
 def test_a_lane_is_a_single_run(name):
-    """To the bit, where loops of the lanes end at different times."""
+    """A lane equals a single run to the bit, also if loops of the lanes end at different times."""
     system, starts = body(FUNCTIONS[name]), np.random.default_rng(0).uniform(-1.5, 1.5, (11, 3))
-    together = lt.ensemble(system, starts, (0.0, 0.5), 0.1, lt.MetriplecticMidpoint(), engine="compiled").x
-    alone = [
+    ensemble_x = lt.ensemble(system, starts, (0.0, 0.5), 0.1, lt.MetriplecticMidpoint(), engine="compiled").x
+    single_x = [
         lt.integrate(system, x, (0.0, 0.5), 0.1, lt.MetriplecticMidpoint(), engine="compiled").x[-1] for x in starts
     ]
-    assert np.array_equal(together, alone)
+    assert np.array_equal(ensemble_x, single_x)
 
 
 @pytest.mark.parametrize("name", ["solve", pytest.param("long scan", marks=pytest.mark.slow)])
 def test_newton_has_them_too(name):
-    """Steps that fixed-point iteration does not solve."""
+    """Newton's method is compiled with these functions, in steps that fixed-point iteration does not solve."""
     system = body(FUNCTIONS[name])
-    ours, other = (
+    compiled_run, array_run = (
         lt.integrate(system, 3.0 * X0, (0.0, 4.0), 2.0, lt.MetriplecticMidpoint(), engine=e)
         for e in ("compiled", "array")
     )
-    assert ours.stats.newton_iterations > 0
-    assert np.abs(ours.x - other.x).max() <= 1e-12
+    assert compiled_run.stats.newton_iterations > 0
+    assert np.abs(compiled_run.x - array_run.x).max() <= 1e-12
 
 
 def test_a_power_of_a_complex_number():
-    """Traced without NumPy's warning that an imaginary part is lost, which none is."""
+    """A complex power is traced without NumPy's warning that an imaginary part is lost."""
     f = lambda m: jnp.real((1.5 + 1j * m[0]) ** 2.5) + m[1] ** 2  # noqa: E731
-    found = lt.LiePoissonSystem(mf.so(3), f).energy.gradient(X0)
-    np.testing.assert_allclose(found, jax.grad(f)(X0), rtol=1e-15)
+    gradient = lt.LiePoissonSystem(mf.so(3), f).energy.gradient(X0)
+    np.testing.assert_allclose(gradient, jax.grad(f)(X0), rtol=1e-15)
 
 
 def test_the_order_of_a_polygamma_function_is_known_to_the_compiler():
@@ -153,9 +156,11 @@ def test_what_cannot_be_compiled_is_named():
     system = body(lambda m: jnp.abs(lax.asinh(m[0] + 1j)))
     with pytest.raises(lt.LiethermoError, match=r"primitive 'asinh' on complex numbers \(test_functions.py:\d+"):
         lt.integrate(system, X0, (0.0, 0.1), 0.1, engine="compiled")
-    transformed = body(lambda m: jnp.sum(jnp.abs(jnp.fft.fft(m)) ** 4))  # of which no line is known
+    system_with_fft = body(
+        lambda m: jnp.sum(jnp.abs(jnp.fft.fft(m)) ** 4)
+    )  # a transformed function without a source line
     with pytest.raises(lt.LiethermoError, match=r"primitive 'fft' \((of unknown origin|test_functions.py:\d+)"):
-        lt.integrate(transformed, X0, (0.0, 0.1), 0.1, engine="compiled")
+        lt.integrate(system_with_fft, X0, (0.0, 0.1), 0.1, engine="compiled")
 
 
 FUNCTIONS_OF_MATRICES = {
@@ -164,14 +169,17 @@ FUNCTIONS_OF_MATRICES = {
         mf.spectral(jnp.sqrt, 2.0 * jnp.eye(4) + 0.3j * mf.so(4).hat(jnp.tile(m, 2)))[0, 0].real
     ),
 }
+"""Matrix functions of the momentum, a part of the energy."""
 
 
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", METHODS, ids=["implicit", "explicit"])
 @pytest.mark.parametrize("name", FUNCTIONS_OF_MATRICES)
 def test_functions_of_matrices(name, method):
-    """The second has eigenvectors from LAPACK, of eigenvalues that come in equal pairs for some m."""
+    """Matrix functions are compiled, by LAPACK for the second, which has equal pairs of eigenvalues for some m."""
     system = body(FUNCTIONS_OF_MATRICES[name])
-    ours, other = (lt.integrate(system, X0, (0.0, 1.0), 0.1, method, engine=e) for e in ("compiled", "array"))
-    assert np.abs(ours.x - other.x).max() <= 2e-14
-    assert ours.audit().energy_drift <= 4e-15
+    compiled_run, array_run = (
+        lt.integrate(system, X0, (0.0, 1.0), 0.1, method, engine=e) for e in ("compiled", "array")
+    )
+    assert np.abs(compiled_run.x - array_run.x).max() <= 2e-14
+    assert compiled_run.audit().energy_drift <= 4e-15

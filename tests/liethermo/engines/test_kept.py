@@ -1,4 +1,4 @@
-"""Machine code that is kept on disk: only what this user alone can have written is run."""
+"""Cache of machine code on disk: only files that this user alone can have written are run."""
 
 import hashlib
 import os
@@ -24,108 +24,117 @@ def folder(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def made(monkeypatch):
-    found = []
+def compilations(monkeypatch):
+    """Return a list that grows by one with each compilation."""
+    calls = []
     monkeypatch.setattr(
-        machine_code, "_compile_module", lambda *a, make=machine_code._compile_module: found.append(1) or make(*a)
+        machine_code, "_compile_module", lambda *a, make=machine_code._compile_module: calls.append(1) or make(*a)
     )
-    return found
+    return calls
 
 
 def run() -> None:
     assert compiled(program_of(lambda a: a * 7.25, np.ones(2)))(np.ones(2))[0][0] == 7.25
 
 
-def test_the_folder_and_its_files_are_the_users_alone(folder, made):
+def test_the_folder_and_its_files_are_the_users_alone(folder, compilations):
     run()
     assert stat.S_IMODE(os.stat(folder).st_mode) == 0o700
     (file,) = folder.glob("*.o")
     assert stat.S_IMODE(os.stat(file).st_mode) == 0o600
     run()
-    assert len(made) == 1
+    assert len(compilations) == 1
 
 
 @pytest.mark.parametrize("mode", [0o777, 0o770, 0o702])
-def test_a_folder_that_others_may_write_to_is_not_used(folder, made, mode):
+def test_a_folder_that_others_may_write_to_is_not_used(folder, compilations, mode):
     run()
     os.chmod(folder, mode)
     with pytest.warns(CacheWarning, match="others may write to it"):
         run()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        run()  # told once
-    assert len(made) == 3
+        run()  # the warning is not repeated
+    assert len(compilations) == 3
 
 
-def test_a_file_that_others_may_write_to_is_not_run(folder, made):
+def test_a_file_that_others_may_write_to_is_not_run(folder, compilations):
     run()
     (file,) = folder.glob("*.o")
     os.chmod(file, 0o666)
     with pytest.warns(CacheWarning, match="others may write to it"):
         run()
-    assert len(made) == 2
-    run()  # it has been replaced
-    assert len(made) == 2
+    assert len(compilations) == 2
+    run()  # the file has been replaced
+    assert len(compilations) == 2
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root gives files away")
-def test_what_belongs_to_another_user_is_not_run(folder, made):
+def test_what_belongs_to_another_user_is_not_run(folder, compilations):
     run()
     (file,) = folder.glob("*.o")
     os.chown(file, 12345, 12345)
     with pytest.warns(CacheWarning, match="belongs to another user"):
         run()
-    assert len(made) == 2
+    assert len(compilations) == 2
     os.chown(folder, 12345, 12345)
     with pytest.warns(CacheWarning, match="belongs to another user"):
         run()
-    assert len(made) == 3
+    assert len(compilations) == 3
 
 
-def test_links_are_not_followed(folder, made, tmp_path):
+def test_links_are_not_followed(folder, compilations, tmp_path):
     run()
     (file,) = folder.glob("*.o")
     file.rename(tmp_path / "elsewhere.o")
     file.symlink_to(tmp_path / "elsewhere.o")
     run()
-    assert len(made) == 2
+    assert len(compilations) == 2
     assert not file.is_symlink()
     folder.rename(tmp_path / "moved")
     folder.symlink_to(tmp_path / "moved")
     with pytest.warns(CacheWarning, match="it is a link"):
         run()
-    assert len(made) == 3
+    assert len(compilations) == 3
 
 
 ELF = b"\x7fELF\x02\x01\x01" + bytes(9) + b"\x01\0\x3e\0" + b"\xff" * 44
-"""The head of an object, whose sections lie beyond its end."""
+"""Header of an ELF object whose sections lie beyond its end."""
 
 
-def sealed(code: bytes) -> bytes:
+def with_checksum(code: bytes) -> bytes:
     return hashlib.sha256(code).digest() + code
 
 
 @pytest.mark.parametrize(
-    "content", [b"", sealed(b""), sealed(b"#!/bin/sh\n"), sealed(b"\x7fELF"), sealed(ELF), sealed(b"\0" * 500)]
+    "content",
+    [
+        b"",
+        with_checksum(b""),
+        with_checksum(b"#!/bin/sh\n"),
+        with_checksum(b"\x7fELF"),
+        with_checksum(ELF),
+        with_checksum(b"\0" * 500),
+    ],
 )
-def test_what_is_no_object_is_passed_over(folder, made, content):
+def test_what_is_no_object_is_passed_over(folder, compilations, content):
     run()
     (file,) = folder.glob("*.o")
     file.write_bytes(content)
     run()
-    assert len(made) == 2
+    assert len(compilations) == 2
 
 
-def test_a_pipe_is_passed_over(folder, made):
+def test_a_pipe_is_passed_over(folder, compilations):
     run()
     (file,) = folder.glob("*.o")
     file.unlink()
     os.mkfifo(file)
     run()
-    assert len(made) == 2
+    assert len(compilations) == 2
 
 
-HOMELESS = """
+HOMELESS_SCRIPT = """
 import os, pathlib
 def nobody():
     raise RuntimeError("Could not determine home directory.")
@@ -135,23 +144,23 @@ print(lt.integrate(lt.models.rigid_body(), [0.1, 1.0, 0.1], (0.0, 1.0), 0.1).aud
 """
 
 
-@pytest.mark.parametrize("named", [True, False])
-def test_without_a_home(tmp_path, named):
-    away = {"HOME", "LIETHERMO_CACHE", "XDG_CACHE_HOME"}
-    environment = {name: value for name, value in os.environ.items() if name not in away}
-    if named:
+@pytest.mark.parametrize("has_xdg_cache", [True, False])
+def test_without_a_home(tmp_path, has_xdg_cache):
+    removed_variables = {"HOME", "LIETHERMO_CACHE", "XDG_CACHE_HOME"}
+    environment = {name: value for name, value in os.environ.items() if name not in removed_variables}
+    if has_xdg_cache:
         environment["XDG_CACHE_HOME"] = str(tmp_path)
-    done = subprocess.run(
-        [sys.executable, "-c", HOMELESS], capture_output=True, text=True, env=environment, check=False
+    process = subprocess.run(
+        [sys.executable, "-c", HOMELESS_SCRIPT], capture_output=True, text=True, env=environment, check=False
     )
-    assert done.stdout.strip() == "True", done.stderr
-    assert (tmp_path / "liethermo").exists() == named
+    assert process.stdout.strip() == "True", process.stderr
+    assert (tmp_path / "liethermo").exists() == has_xdg_cache
 
 
-def test_a_folder_that_cannot_be_made_is_no_fault(monkeypatch, made):
-    for where in ("/dev/null/cache", "a\0b"):
-        monkeypatch.setattr(kept, "cache_folder", lambda where=where: kept.Path(where))
+def test_a_folder_that_cannot_be_made_is_no_fault(monkeypatch, compilations):
+    for folder_name in ("/dev/null/cache", "a\0b"):
+        monkeypatch.setattr(kept, "cache_folder", lambda where=folder_name: kept.Path(where))
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             run()
-    assert len(made) == 2
+    assert len(compilations) == 2

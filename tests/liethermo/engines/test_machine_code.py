@@ -1,4 +1,4 @@
-"""Programs as machine code mean what they mean to NumPy, in every lane; code is unloaded, and found again on disk."""
+"""Machine code computes what NumPy computes, in every lane; it is unloaded, and found on disk."""
 
 import gc
 import itertools
@@ -25,62 +25,67 @@ from tests.machine_code import compile_program as compiled
 from tests.machine_code import count_memory_maps as memory_maps
 from tests.scalar_programs import check_outputs as check
 
-PAIRS = {*"add sub mul div pow rem max min atan2 igamma igammac".split(), *COMPARISONS - {"is_finite"}}
-SPECIAL = np.array([0.0, -0.0, 1.0, -1.5, 2.5, 0.3, -3.7, np.inf, -np.inf, np.nan, 1e300, 1e-300])
-GRID = np.array(list(itertools.product(SPECIAL, SPECIAL)))
+BINARY_OPERATIONS = {*"add sub mul div pow rem max min atan2 igamma igammac".split(), *COMPARISONS - {"is_finite"}}
+"""Operations on two numbers."""
+
+SPECIAL_NUMBERS = np.array([0.0, -0.0, 1.0, -1.5, 2.5, 0.3, -3.7, np.inf, -np.inf, np.nan, 1e300, 1e-300])
+"""Ordinary and special numbers."""
+
+NUMBER_PAIRS = np.array(list(itertools.product(SPECIAL_NUMBERS, SPECIAL_NUMBERS)))
+"""All pairs of these numbers, shape (pairs, 2)."""
 
 
-def of_one_operation(op: str) -> Program:
-    """A program of two numbers."""
-    first = [Instruction("p", "lt", ("a", "b")), Instruction("q", "gt", ("a", 0.5))]
+def single_operation_program(op: str) -> Program:
+    """Return a program that applies one operation to two numbers."""
+    operand_instructions = [Instruction("p", "lt", ("a", "b")), Instruction("q", "gt", ("a", 0.5))]
     if op in BOOLEAN_OPERATIONS:
-        second = {"not": (), "branch": (0,)}.get(op, ("q",))
-        chosen = [Instruction("t", op, ("p", *second))]
+        other_operands = {"not": (), "branch": (0,)}.get(op, ("q",))
+        tested_instruction = [Instruction("t", op, ("p", *other_operands))]
     elif op == "select":
-        chosen = [Instruction("t", op, ("p", "a", "b"))]
+        tested_instruction = [Instruction("t", op, ("p", "a", "b"))]
     elif op in ("float", "int"):
-        chosen = [Instruction("t", op, ("p",))]
+        tested_instruction = [Instruction("t", op, ("p",))]
     elif op in ("quotient", "wrap"):
-        first += [Instruction("i", "truncate", ("a",)), Instruction("j", "truncate", ("b",))]
-        chosen = [Instruction("t", op, ("i", "j") if op == "quotient" else ("i", 8, True))]
+        operand_instructions += [Instruction("i", "truncate", ("a",)), Instruction("j", "truncate", ("b",))]
+        tested_instruction = [Instruction("t", op, ("i", "j") if op == "quotient" else ("i", 8, True))]
     elif op == "pick":
-        first += [Instruction("i", "truncate", ("a",))]
-        chosen = [Instruction("t", op, ("i", "a", "b", 0.5, "a", "b"))]
+        operand_instructions += [Instruction("i", "truncate", ("a",))]
+        tested_instruction = [Instruction("t", op, ("i", "a", "b", 0.5, "a", "b"))]
     elif op == "regularized_incomplete_beta":
-        chosen = [Instruction("t", op, ("a", "b", 0.3))]
+        tested_instruction = [Instruction("t", op, ("a", "b", 0.3))]
     else:
-        chosen = [Instruction("t", op, ("a", "b") if op in PAIRS else ("a",))]
-    return Program((("a",), ("b",)), (*first, *chosen), (("t",),), ((1,),))
+        tested_instruction = [Instruction("t", op, ("a", "b") if op in BINARY_OPERATIONS else ("a",))]
+    return Program((("a",), ("b",)), (*operand_instructions, *tested_instruction), (("t",),), ((1,),))
 
 
 @pytest.mark.parametrize("lanes", [1, 4])
 @pytest.mark.parametrize(
     "op", sorted(set(OPERATIONS) - {"item", "table", "column", "lookup"})
-)  # which belong to blocks
+)  # those belong to blocks
 def test_every_operation_at_every_kind_of_number(op, lanes):
-    program = of_one_operation(op)
+    program = single_operation_program(op)
     function = compiled(program, lanes)
-    for a, b in GRID.reshape(-1, lanes, 2).swapaxes(1, 2):
-        (found,), (right,) = function(a, b), program.evaluate(a, b, batch=True)
-        np.testing.assert_allclose(np.ravel(found), np.ravel(right).astype(float), rtol=4e-15, equal_nan=True)
-        numbers = ~np.isnan(np.ravel(right).astype(float))
-        if right.dtype.kind == "f" and op not in ("max", "min", "sign"):  # whose zeros may have either sign
-            assert np.array_equal(np.signbit(np.ravel(found))[numbers], np.signbit(np.ravel(right))[numbers])
+    for a, b in NUMBER_PAIRS.reshape(-1, lanes, 2).swapaxes(1, 2):
+        (result,), (expected,) = function(a, b), program.evaluate(a, b, batch=True)
+        np.testing.assert_allclose(np.ravel(result), np.ravel(expected).astype(float), rtol=4e-15, equal_nan=True)
+        is_number = ~np.isnan(np.ravel(expected).astype(float))
+        if expected.dtype.kind == "f" and op not in ("max", "min", "sign"):  # the zeros of those may have either sign
+            assert np.array_equal(np.signbit(np.ravel(result))[is_number], np.signbit(np.ravel(expected))[is_number])
 
 
 @pytest.mark.parametrize("lanes", [1, 4])
 def test_comparisons_of_truth_values_and_of_integers(lanes):
-    """True, which is one bit, is more than false."""
+    """Comparisons of truth values take true, which is one bit, as greater than false."""
     tests = sorted(COMPARISONS - {"is_finite"})
-    first = [Instruction("p", "lt", ("a", "b")), Instruction("q", "gt", ("a", 0.5))]
-    first += [Instruction("i", "truncate", ("a",)), Instruction("j", "truncate", ("b",))]
-    compared = [Instruction(x + op, op, (x, y)) for op in tests for x, y in ("pq", "ij")]
-    names = tuple(one.target for one in compared)
-    program = Program((("a",), ("b",)), (*first, *compared), (names,), ((len(names),),))
-    function, finite = compiled(program, lanes), GRID[np.abs(GRID).max(axis=1) < 1e6]
-    for a, b in finite[: len(finite) // lanes * lanes].reshape(-1, lanes, 2).swapaxes(1, 2):
-        (found,), (right,) = function(a, b), program.evaluate(a, b, batch=True)
-        np.testing.assert_array_equal(found.reshape(right.shape), right)
+    operand_instructions = [Instruction("p", "lt", ("a", "b")), Instruction("q", "gt", ("a", 0.5))]
+    operand_instructions += [Instruction("i", "truncate", ("a",)), Instruction("j", "truncate", ("b",))]
+    comparisons = [Instruction(x + op, op, (x, y)) for op in tests for x, y in ("pq", "ij")]
+    names = tuple(instruction.target for instruction in comparisons)
+    program = Program((("a",), ("b",)), (*operand_instructions, *comparisons), (names,), ((len(names),),))
+    function, finite_pairs = compiled(program, lanes), NUMBER_PAIRS[np.abs(NUMBER_PAIRS).max(axis=1) < 1e6]
+    for a, b in finite_pairs[: len(finite_pairs) // lanes * lanes].reshape(-1, lanes, 2).swapaxes(1, 2):
+        (result,), (expected,) = function(a, b), program.evaluate(a, b, batch=True)
+        np.testing.assert_array_equal(result.reshape(expected.shape), expected)
 
 
 @pytest.mark.sampled(6)
@@ -92,34 +97,34 @@ def test_every_primitive(name):
 
 
 def test_products_in_sums_are_the_same_in_every_lane():
-    """Rounded once where the processor can, and alike alone and in lanes: no trajectory knows its neighbours."""
+    """Fused products are rounded equally in a single run and in every lane."""
 
     def run(a):
         x, y, z = a
         return x * y + z, z - x * y, x * y - z, x * y - z * x, -(x * y) + z, (x * y - z) + x * y
 
     program, lanes = program_of(run, np.ones(3)), 4
-    alone, together = compiled(program), compiled(program, lanes)
-    given = np.random.default_rng(0).uniform(-1.0, 1.0, (100, lanes, 3))
-    for a in given:
-        rows = [np.concatenate([np.ravel(v) for v in alone(own)]) for own in a]
-        found = np.stack([np.ravel(v) for v in together(a)], axis=1)
-        assert np.array_equal(found, rows)
+    single_function, lane_function = compiled(program), compiled(program, lanes)
+    inputs = np.random.default_rng(0).uniform(-1.0, 1.0, (100, lanes, 3))
+    for a in inputs:
+        rows = [np.concatenate([np.ravel(v) for v in single_function(lane_input)]) for lane_input in a]
+        result = np.stack([np.ravel(v) for v in lane_function(a)], axis=1)
+        assert np.array_equal(result, rows)
         expected = np.stack([np.ravel(v) for v in program.evaluate(a, batch=True)], axis=1)
-        assert np.abs(found - expected).max() <= 4e-16
+        assert np.abs(result - expected).max() <= 4e-16
 
 
 @pytest.mark.parametrize("lanes", [1, 4])
 def test_the_largest_component(lanes):
-    """Sizes are compared by their bits; one that is NaN shows."""
+    """The maximum of absolute values, compared by their bits, propagates NaN."""
     program = program_of(lambda a: jnp.max(jnp.abs(a)), np.ones(3))
-    triples = np.array(list(itertools.product(SPECIAL, repeat=3))).reshape(-1, lanes, 3)
+    triples = np.array(list(itertools.product(SPECIAL_NUMBERS, repeat=3))).reshape(-1, lanes, 3)
     function = compiled(program, lanes)
     for a in triples:
-        (found,) = function(a)
+        (result,) = function(a)
         expected = np.maximum(np.maximum(abs(a[:, 0]), abs(a[:, 1])), abs(a[:, 2]))
-        np.testing.assert_array_equal(np.ravel(found), expected)
-        assert not np.signbit(np.ravel(found)[~np.isnan(expected)]).any()
+        np.testing.assert_array_equal(np.ravel(result), expected)
+        assert not np.signbit(np.ravel(result)[~np.isnan(expected)]).any()
 
 
 def test_arithmetic_of_integers_and_constants():
@@ -127,24 +132,24 @@ def test_arithmetic_of_integers_and_constants():
     for lanes in (1, 2):
         function = compiled(program, lanes)
         a = np.array([[0.3, -1.0, 2.0], [5.0, np.nan, 1.0]])[:lanes]
-        for found, right in zip(function(a), program.evaluate(a, batch=True), strict=True):
-            assert np.array_equal(np.ravel(found), np.ravel(right))
+        for result, expected in zip(function(a), program.evaluate(a, batch=True), strict=True):
+            assert np.array_equal(np.ravel(result), np.ravel(expected))
 
 
 @settings(max_examples=12)
 @given(st.lists(steps, min_size=1, max_size=7), shapes, shapes, st.integers(0, 99), st.sampled_from([1, 3]))
-def test_random_programs_agree(chosen, shape_x, shape_y, seed, lanes):
+def test_random_programs_agree(step_choices, shape_x, shape_y, seed, lanes):
     def run(x, y):
         values = [x, y]
-        for name, i, j, k in chosen:
+        for name, i, j, k in step_choices:
             values.append(STEPS[name](values[-1 - i % len(values)], values[-1 - j % len(values)], k))
         return values[2:]
 
     random = np.random.default_rng(seed)
     x, y = (random.uniform(-1.5, 1.5, (lanes, *shape)) for shape in (shape_x, shape_y))
     program = program_of(run, x[0], y[0])
-    for seen, found in zip(compiled(program, lanes)(x, y), program.evaluate(x, y, batch=True), strict=True):
-        np.testing.assert_allclose(seen.reshape(found.shape), found, rtol=1e-12, atol=1e-12, equal_nan=True)
+    for result, expected in zip(compiled(program, lanes)(x, y), program.evaluate(x, y, batch=True), strict=True):
+        np.testing.assert_allclose(result.reshape(expected.shape), expected, rtol=1e-12, atol=1e-12, equal_nan=True)
 
 
 def test_an_operation_without_an_instruction_is_refused():
@@ -156,44 +161,48 @@ def test_an_operation_without_an_instruction_is_refused():
 
 
 def test_code_is_unloaded():
-    """A function that is compiled anew again and again takes no more memory maps than one."""
+    """Repeated compilation takes no more memory maps than a single one."""
     program = lambda i: program_of(lambda a: a * (i + 0.5), np.ones(2))  # noqa: E731
     for i in range(3):
         compiled(program(i))
     gc.collect()
-    before = memory_maps()
+    n_maps_before = memory_maps()
     for i in range(60):
         assert compiled(program(i))(np.ones(2))[0][0] == i + 0.5
     gc.collect()
-    assert memory_maps() <= before + 30
+    assert memory_maps() <= n_maps_before + 30
 
 
 def test_code_is_found_on_disk_and_damage_is_seen(tmp_path, monkeypatch):
     monkeypatch.setenv("LIETHERMO_CACHE", str(tmp_path / "cache"))
-    made = []
+    compilations = []
     monkeypatch.setattr(
-        machine_code, "_compile_module", lambda *a, make=machine_code._compile_module: made.append(1) or make(*a)
+        machine_code,
+        "_compile_module",
+        lambda *a, make=machine_code._compile_module: compilations.append(1) or make(*a),
     )
     program = program_of(lambda a: a * 3.25, np.ones(2))
     for _ in range(2):
         assert compiled(program)(np.ones(2))[0][0] == 3.25
-    assert len(made) == 1
+    assert len(compilations) == 1
     (file,) = (tmp_path / "cache").glob("*.o")
-    whole = file.read_bytes()
-    for damaged in (whole[: len(whole) // 2], b"", whole[:-1] + bytes([whole[-1] ^ 1])):
-        file.write_bytes(damaged)
+    content = file.read_bytes()
+    for damaged_content in (content[: len(content) // 2], b"", content[:-1] + bytes([content[-1] ^ 1])):
+        file.write_bytes(damaged_content)
         assert compiled(program)(np.ones(2))[0][0] == 3.25
-    assert len(made) == 4
-    assert file.read_bytes() == whole
+    assert len(compilations) == 4
+    assert file.read_bytes() == content
 
 
 @pytest.mark.skipif(platform.machine().lower() not in ("x86_64", "amd64"), reason="its processors have other names")
 def test_code_is_made_for_the_processor_that_is_named(tmp_path, monkeypatch):
-    """Its instructions alone, and in files of its own."""
+    """``LIETHERMO_CPU`` limits the instructions, and its code has files of its own."""
     monkeypatch.setenv("LIETHERMO_CACHE", str(tmp_path))
-    program, made = program_of(lambda a: a * 3.75 + 1.0, np.ones(2)), []
+    program, compilations = program_of(lambda a: a * 3.75 + 1.0, np.ones(2)), []
     monkeypatch.setattr(
-        machine_code, "_compile_module", lambda *a, make=machine_code._compile_module: made.append(1) or make(*a)
+        machine_code,
+        "_compile_module",
+        lambda *a, make=machine_code._compile_module: compilations.append(1) or make(*a),
     )
     try:
         for cpu in ("x86-64", "x86-64-v2"):
@@ -201,14 +210,14 @@ def test_code_is_made_for_the_processor_that_is_named(tmp_path, monkeypatch):
             machine_code._host_target.cache_clear()
             for _ in range(2):
                 assert compiled(program, 8)(np.ones((8, 2)))[0].tolist() == [[4.75, 4.75]] * 8
-            assert "ymm" not in machine_code._target_machine().emit_assembly(llvm.parse_assembly(WIDE))
+            assert "ymm" not in machine_code._target_machine().emit_assembly(llvm.parse_assembly(VECTOR_ADD_IR))
     finally:
         monkeypatch.delenv("LIETHERMO_CPU")
         machine_code._host_target.cache_clear()
-    assert len(made) == len(list(tmp_path.glob("*.o"))) == 2
+    assert len(compilations) == len(list(tmp_path.glob("*.o"))) == 2
 
 
-WIDE = """
+VECTOR_ADD_IR = """
 define void @add(<8 x double>* %p) {
   %a = load <8 x double>, <8 x double>* %p
   %b = fadd <8 x double> %a, %a
@@ -221,24 +230,26 @@ define void @add(<8 x double>* %p) {
 def test_a_module_that_llvm_refuses_is_an_error():
     module = ir.Module()
     function = ir.Function(module, ir.FunctionType(FLOAT64, []), "f")
-    ir.IRBuilder(function.append_basic_block())  # without an end
+    ir.IRBuilder(function.append_basic_block())  # a block without a terminator
     with pytest.raises(RuntimeError):
         MachineCode(module)
 
 
 @pytest.mark.parametrize("lanes", [1, 4, 8])
 def test_the_exponential_is_that_of_the_field(lanes):
-    """To one unit in the last place against many digits, wherever it is a number; infinite, zero and NaN beyond."""
-    of_one = scalarize(jax.make_jaxpr(jnp.exp)(jax.ShapeDtypeStruct((1,), jnp.float64)))
-    function = compiled(of_one, lanes)
+    """The exponential is accurate to one unit in the last place, and infinite, zero or NaN beyond its range."""
+    program = scalarize(jax.make_jaxpr(jnp.exp)(jax.ShapeDtypeStruct((1,), jnp.float64)))
+    function = compiled(program, lanes)
     random = np.random.default_rng(0)
-    ordinary = np.concatenate([random.uniform(-708.0, 709.7, 400), random.uniform(-1.0, 1.0, 400), [0.0, -1e-300]])
-    special = np.array([709.79, -745.2, 1e308, -1e308, np.inf, -np.inf, np.nan, -744.0, 700.0, -700.0])
-    x = np.resize(np.concatenate([ordinary, special]), lanes * 900)
+    normal_arguments = np.concatenate(
+        [random.uniform(-708.0, 709.7, 400), random.uniform(-1.0, 1.0, 400), [0.0, -1e-300]]
+    )
+    special_arguments = np.array([709.79, -745.2, 1e308, -1e308, np.inf, -np.inf, np.nan, -744.0, 700.0, -700.0])
+    x = np.resize(np.concatenate([normal_arguments, special_arguments]), lanes * 900)
     rows = x.reshape(-1, lanes)
-    found = np.concatenate([np.ravel(function(row[:, None] if lanes > 1 else row)[0]) for row in rows])
-    for at, value in zip(x[: len(ordinary)], found, strict=False):
-        exact = mpmath.exp(mpmath.mpf(at))
+    results = np.concatenate([np.ravel(function(row[:, None] if lanes > 1 else row)[0]) for row in rows])
+    for argument, value in zip(x[: len(normal_arguments)], results, strict=False):
+        exact = mpmath.exp(mpmath.mpf(argument))
         assert abs(mpmath.mpf(value) - exact) <= 1.01 * np.spacing(float(exact))
     with np.errstate(over="ignore", under="ignore"):
-        np.testing.assert_allclose(found, np.exp(x), rtol=5e-16, atol=5e-324)
+        np.testing.assert_allclose(results, np.exp(x), rtol=5e-16, atol=5e-324)

@@ -1,4 +1,4 @@
-"""The audit: sizes that rounding is judged by, how accurate a run is, whether it is one of its system; its controls."""
+"""Audit: rounding scales, accuracy of a run, consistency with the system, with controls that must fail."""
 
 import dataclasses
 import pickle
@@ -23,7 +23,7 @@ def rows(audit, law):
     return [row for row in audit.rows if row.law.startswith(law)]
 
 
-def the_row(audit, law):
+def only_row(audit, law):
     (row,) = rows(audit, law)
     return row
 
@@ -32,13 +32,13 @@ def the_row(audit, law):
 
 
 def heavy_top():
-    """Pi . Gamma = 0 at the start, a Casimir of se(3)*."""
+    """Return a heavy top whose Casimir Pi . Gamma of se(3)* is zero."""
     energy = lt.Quadratic(np.diag([1.0, 1.0, 0.5, 0.0, 0.0, 0.0]), b=[0.0, 0.0, 0.0, 0.3, 0.0, 1.0])
     return lt.LiePoissonSystem(mf.se(3), energy), [0.3, -0.4, 1.1, 0.8, 0.6, 0.0]
 
 
 def three_particles():
-    """Joined by springs in a row, their centre of mass at rest."""
+    """Return three particles in a row joined by springs, whose momentum is zero."""
     q, p = np.eye(6)[:3], np.eye(6)[3:]
     springs = sum(np.outer(q[i] - q[j], q[i] - q[j]) for i, j in ((0, 1), (1, 2)))
     momentum = lt.Quadratic(np.zeros((6, 6)), b=p.sum(axis=0))
@@ -49,12 +49,12 @@ def three_particles():
 
 
 def pendulum():
-    """Let go at 90 degrees, where its energy is zero."""
+    """Return a pendulum that starts at 90 degrees, where its energy is zero."""
     return lt.MetriplecticSystem(mf.Canonical(1), lambda x: 0.5 * x[1] ** 2 - jnp.cos(x[0])), [np.pi / 2, 0.0]
 
 
 def separatrix():
-    """On the way up to the unstable equilibrium, at its energy, which is zero."""
+    """Return a motion towards an unstable equilibrium, at its energy, which is zero."""
     q = 1.0
     return lt.MetriplecticSystem(mf.Canonical(1), lambda x: 0.5 * x[1] ** 2 + jnp.cos(x[0]) - 1.0), [
         q,
@@ -71,16 +71,16 @@ def test_laws_of_what_starts_at_zero(case, tmp_path):
     assert np.abs(starts).min() < 1e-15
     assert solution.audit().passed, f"\n{solution.audit()}"
     assert solution.audit().energy_drift < 1e-14
-    loaded = lt.load(solution.save(tmp_path / "run.nc"))
-    assert str(loaded.audit()) == str(solution.audit())
-    broken = dataclasses.replace(solution, energy=solution.energy + np.linspace(0.0, 1e-11, len(solution.t)))
-    assert the_row(broken.audit(), "energy drift").passed is False
+    loaded_solution = lt.load(solution.save(tmp_path / "run.nc"))
+    assert str(loaded_solution.audit()) == str(solution.audit())
+    drifting_solution = dataclasses.replace(solution, energy=solution.energy + np.linspace(0.0, 1e-11, len(solution.t)))
+    assert only_row(drifting_solution.audit(), "energy drift").passed is False
     if case is pendulum:
         result = CliRunner().invoke(app, ["audit", str(tmp_path / "run.nc")])
         assert result.exit_code == 0, result.output
-        many = lt.ensemble(system, [x0, [1.0, 0.5]], (0.0, 15.0), 0.05)
-        assert many.audit().passed, f"\n{many.audit()}"
-        assert many.energy_drift[0] < 1e-14
+        ensemble = lt.ensemble(system, [x0, [1.0, 0.5]], (0.0, 15.0), 0.05)
+        assert ensemble.audit().passed, f"\n{ensemble.audit()}"
+        assert ensemble.energy_drift[0] < 1e-14
 
 
 @pytest.mark.slow
@@ -94,32 +94,36 @@ def test_laws_of_what_starts_at_zero(case, tmp_path):
     ],
 )
 def test_entropies_fall_by_the_rounding_of_what_they_are_computed_from(entropy):
-    """Gauss keeps the law exactly; what is left is rounding, whatever the value of S is there."""
+    """Gauss methods keep the entropy law exactly; only rounding is left, whatever the value of S."""
     system = lt.LiePoissonSystem(mf.so(3), lt.Quadratic([1.0, 1 / 2, 1 / 3]), entropy, lt.ProjectedMetric(rate=0.3))
     x0s = np.random.default_rng(0).standard_normal((64, 3))
     x0s /= np.linalg.norm(x0s, axis=1)[:, None]
-    many = lt.ensemble(system, x0s, (0.0, 60.0), 0.2, lt.MetriplecticGauss(1))
-    assert many.audit().passed, f"\n{many.audit()}"
-    fall = np.full(64, 1e-11) + 16 * np.spacing(many.entropy_scale)
-    damaged = dataclasses.replace(many, least_entropy_increment=-fall)
-    assert the_row(damaged.audit(), "relative fall").passed is False
-    in_all = dataclasses.replace(many, entropy_change=-fall)
-    assert the_row(in_all.audit(), "the same in all").passed is False
+    ensemble = lt.ensemble(system, x0s, (0.0, 60.0), 0.2, lt.MetriplecticGauss(1))
+    assert ensemble.audit().passed, f"\n{ensemble.audit()}"
+    fall = np.full(64, 1e-11) + 16 * np.spacing(ensemble.entropy_scale)
+    step_damage = dataclasses.replace(ensemble, least_entropy_increment=-fall)
+    assert only_row(step_damage.audit(), "relative fall").passed is False
+    total_damage = dataclasses.replace(ensemble, entropy_change=-fall)
+    assert only_row(total_damage.audit(), "relative fall of the entropy in all").passed is False
 
 
 def test_a_constant_does_not_hide_a_drift():
-    """What can be seen beside a constant of 1e10 is seen: a drift of 1e-4, eight orders above what is promised."""
+    """A drift of 1e-4 is seen beside a constant of 1e10, eight orders above what is promised."""
     moments = jnp.array([3.0, 2.0, 1.0])
-    high = lt.LiePoissonSystem(
+    offset_system = lt.LiePoissonSystem(
         mf.so(3), lambda m: 1e10 + 0.5 * jnp.sum(m * m / moments), lambda m: 0.5 * m @ m + 1e12, lt.ProjectedMetric()
     )
-    kept = lt.integrate(high, [0.3, 1.0, 0.2], (0.0, 10.0), 0.1)
-    assert kept.audit().passed, f"\n{kept.audit()}"
-    drifting = dataclasses.replace(kept, energy=kept.energy + np.linspace(0.0, 1e-4, len(kept.t)))
-    assert the_row(drifting.audit(), "energy drift").passed is False
-    assert drifting.audit().energy_drift == pytest.approx(1e-14, rel=0.1)  # relative to the value, as it is defined
-    falling = dataclasses.replace(kept, entropy=1e12 - 4e-4 * np.arange(len(kept.t)))  # each step as rounding might
-    row = the_row(falling.audit(), "least entropy increment")
+    solution = lt.integrate(offset_system, [0.3, 1.0, 0.2], (0.0, 10.0), 0.1)
+    assert solution.audit().passed, f"\n{solution.audit()}"
+    drifting_solution = dataclasses.replace(solution, energy=solution.energy + np.linspace(0.0, 1e-4, len(solution.t)))
+    assert only_row(drifting_solution.audit(), "energy drift").passed is False
+    assert drifting_solution.audit().energy_drift == pytest.approx(
+        1e-14, rel=0.1
+    )  # relative to the value by definition
+    falling_entropy = dataclasses.replace(
+        solution, entropy=1e12 - 4e-4 * np.arange(len(solution.t))
+    )  # each decrease is as small as rounding
+    row = only_row(falling_entropy.audit(), "least entropy increment")
     assert (row.passed, "in all it falls by 0.04" in row.note) == (False, True)
 
 
@@ -137,12 +141,12 @@ def test_the_size_of_a_function():
 
 @pytest.mark.slow
 def test_steps_that_do_not_resolve_the_motion(tmp_path):
-    """One step of 300 over the paper's figure keeps every law."""
+    """One step of 300, as long as the figure of the paper, keeps every law."""
     solution = lt.integrate(BODY, X0, (0.0, 300.0), 300.0)
     audit = solution.audit()
-    assert the_row(audit, "accuracy").passed is False
+    assert only_row(audit, "accuracy").passed is False
     assert (audit.passed, audit.resolved) == (True, False)
-    assert "try suggest_step" in the_row(audit, "accuracy").note
+    assert "try suggest_step" in only_row(audit, "accuracy").note
     assert "DO NOT RESOLVE" in str(audit).splitlines()[-1]
     assert [row.law for row in audit.rows if row.passed is False] == ["accuracy"]
     assert solution.audit(accuracy=np.inf).resolved
@@ -152,24 +156,24 @@ def test_steps_that_do_not_resolve_the_motion(tmp_path):
 
 
 KEPLER = lt.Function(lambda x: 0.5 * (x[2] ** 2 + x[3] ** 2) - 1.0 / jnp.hypot(x[0], x[1]))
-"""About a centre of mass one; a circle of radius one takes 2 pi."""
+"""Energy of a Kepler orbit about a centre of mass one; a circle of radius one takes 2 pi."""
 
 
-def from_afar(e):
-    """The farthest point of an ellipse with a half axis of one."""
+def apocentre(e):
+    """Return the state at the farthest point of an ellipse of eccentricity e with a semi-major axis of one."""
     return [-(1.0 + e), 0.0, 0.0, -np.sqrt((1.0 - e) / (1.0 + e))]
 
 
-def on_the_ellipse(e, t):
-    """The places at times after the farthest point, by Kepler's equation, shape (times, 2)."""
-    mean = np.asarray(t) + np.pi
-    u = np.array([scipy.optimize.brentq(lambda u, m=m: u - e * np.sin(u) - m, m - 1.0, m + 1.0) for m in mean])
+def kepler_positions(e, t):
+    """Return the positions at times t after the farthest point by Kepler's equation, shape (times, 2)."""
+    mean_anomaly = np.asarray(t) + np.pi
+    u = np.array([scipy.optimize.brentq(lambda u, m=m: u - e * np.sin(u) - m, m - 1.0, m + 1.0) for m in mean_anomaly])
     return np.stack([np.cos(u) - e, np.sqrt(1.0 - e * e) * np.sin(u)], axis=1)
 
 
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(
-    ("method", "e", "number", "every", "resolved"),
+    ("method", "e", "n_steps", "save_every", "is_resolved"),
     [
         (lt.MetriplecticGauss(2), 0.99, 101, 1, False),
         (lt.MetriplecticGauss(2), 0.99, 203, 1, False),
@@ -182,81 +186,89 @@ def on_the_ellipse(e, t):
         (lt.MetriplecticMidpoint(), 0.9, 451, 1, False),
     ],
 )
-def test_the_audit_finds_the_steps_past_the_centre(method, e, number, every, resolved):
-    """Few steps of many pass the centre, and long ones jump over all of the passage, after which nothing is right."""
+def test_the_audit_finds_the_steps_past_the_centre(method, e, n_steps, save_every, is_resolved):
+    """Few of the steps pass the centre, and long ones jump over the passage, after which the orbit is wrong."""
     system = lt.MetriplecticSystem(mf.Canonical(2), KEPLER)
-    solution = lt.integrate(system, from_afar(e), (0.0, 2 * np.pi), 2 * np.pi / number, method, save_every=every)
-    error = np.abs(solution.x[:, :2] - on_the_ellipse(e, solution.t)).max()
+    solution = lt.integrate(system, apocentre(e), (0.0, 2 * np.pi), 2 * np.pi / n_steps, method, save_every=save_every)
+    error = np.abs(solution.x[:, :2] - kepler_positions(e, solution.t)).max()
     audit = solution.audit()
-    assert (error < 0.02) == resolved == audit.resolved, f"{error}\n{audit}"
+    assert (error < 0.02) == is_resolved == audit.resolved, f"{error}\n{audit}"
     assert audit.passed
     assert solution.evidence.looked == solution.stats.steps
-    assert audit.verdict.endswith("resolve the motion" if resolved else "THE STEPS DO NOT RESOLVE THE MOTION")
+    assert audit.verdict.endswith("resolve the motion" if is_resolved else "THE STEPS DO NOT RESOLVE THE MOTION")
     assert solution.evidence.error_time == pytest.approx(np.pi, abs=0.2)
 
 
-@pytest.mark.parametrize("every", [1, 6])
-def test_the_audit_finds_a_step_through_a_barrier(every):
-    """It is as thin as a twentieth of the step, and twice as high as would stop the particle."""
+@pytest.mark.parametrize("save_every", [1, 6])
+def test_the_audit_finds_a_step_through_a_barrier(save_every):
+    """The barrier is a twentieth of a step wide, and twice as high as would stop the particle."""
     barrier = lt.MetriplecticSystem(mf.Canonical(1), lambda x: 0.5 * x[1] ** 2 + jnp.exp(-((x[0] / 0.01) ** 2)))
-    solution = lt.integrate(barrier, [-1.05, 1.0], (0.0, 2.4), 0.4, lt.MetriplecticMidpoint(), save_every=every)
-    assert solution.x[-1] == pytest.approx([1.35, 1.0])  # where it would be without a barrier
+    solution = lt.integrate(barrier, [-1.05, 1.0], (0.0, 2.4), 0.4, lt.MetriplecticMidpoint(), save_every=save_every)
+    assert solution.x[-1] == pytest.approx([1.35, 1.0])  # its position without a barrier
     assert solution.audit().resolved is False
-    turned = lt.integrate(barrier, [-1.05, 1.0], (0.0, 2.4), 1e-3, lt.MetriplecticGauss(3), save_every=every)
-    assert turned.x[-1] == pytest.approx([-1.36, -1.0], abs=0.02)
-    assert turned.audit().resolved
-
-
-@pytest.mark.parametrize("every", [1, 40])
-def test_the_verdict_says_how_many_steps_were_looked_at(monkeypatch, every):
-    """They are those where the motion is fastest."""
-    monkeypatch.setattr(looking, "LOOKED_NUMBERS", 3_000)
-    system, orbit = lt.MetriplecticSystem(mf.Canonical(2), KEPLER), 2 * np.pi
-    few = lt.integrate(
-        system, from_afar(0.9), (0.0, 4 * orbit), orbit / 451, lt.MetriplecticMidpoint(), save_every=every
+    fine_solution = lt.integrate(
+        barrier, [-1.05, 1.0], (0.0, 2.4), 1e-3, lt.MetriplecticGauss(3), save_every=save_every
     )
-    assert few.evidence.looked < few.stats.steps
-    assert few.audit().resolved is False
-    many = lt.integrate(system, from_afar(0.9), (0.0, orbit), orbit / 4001, lt.MetriplecticGauss(2), save_every=every)
-    audit, looked = many.audit(), many.evidence.looked
+    assert fine_solution.x[-1] == pytest.approx([-1.36, -1.0], abs=0.02)
+    assert fine_solution.audit().resolved
+
+
+@pytest.mark.parametrize("save_every", [1, 40])
+def test_the_verdict_says_how_many_steps_were_looked_at(monkeypatch, save_every):
+    """The verdict tells the number of checked steps, which are those where the motion is fastest."""
+    monkeypatch.setattr(looking, "MAX_SAMPLED_VALUES", 3_000)
+    system, orbit = lt.MetriplecticSystem(mf.Canonical(2), KEPLER), 2 * np.pi
+    coarse_run = lt.integrate(
+        system, apocentre(0.9), (0.0, 4 * orbit), orbit / 451, lt.MetriplecticMidpoint(), save_every=save_every
+    )
+    assert coarse_run.evidence.looked < coarse_run.stats.steps
+    assert coarse_run.audit().resolved is False
+    fine_run = lt.integrate(
+        system, apocentre(0.9), (0.0, orbit), orbit / 4001, lt.MetriplecticGauss(2), save_every=save_every
+    )
+    audit, n_checked = fine_run.audit(), fine_run.evidence.looked
     assert audit.resolved
-    assert 8 <= looked < 4001
-    assert audit.verdict == f"the laws hold, and the steps resolve the motion (looked at: {looked:,} steps of 4,001)"
-    assert abs(many.evidence.error_time - np.pi) < 0.3
+    assert 8 <= n_checked < 4001
+    assert audit.verdict == f"the laws hold, and the steps resolve the motion (checked {n_checked:,} of 4,001 steps)"
+    assert abs(fine_run.evidence.error_time - np.pi) < 0.3
 
 
 def test_an_ensemble_is_followed_past_the_centre():
-    """Its first steps are all it has kept, and they tell nothing."""
-    system, x0s = lt.MetriplecticSystem(mf.Canonical(2), KEPLER), [from_afar(0.5), from_afar(0.9), from_afar(0.1)]
-    found = {
-        number: lt.ensemble(system, x0s, (0.0, 2 * np.pi), 2 * np.pi / number, lt.MetriplecticGauss(2))
-        for number in (101, 901)
+    """An ensemble of final states is replayed beyond its first steps, which tell nothing."""
+    system, x0s = lt.MetriplecticSystem(mf.Canonical(2), KEPLER), [apocentre(0.5), apocentre(0.9), apocentre(0.1)]
+    ensembles = {
+        n_steps: lt.ensemble(system, x0s, (0.0, 2 * np.pi), 2 * np.pi / n_steps, lt.MetriplecticGauss(2))
+        for n_steps in (101, 901)
     }
-    assert not found[101].ok[1] or found[101].audit().resolved is False
-    assert found[101].evidence.error_time == pytest.approx(np.pi, abs=0.3)
-    assert found[901].audit().resolved
-    assert found[901].audit().coverage == ""
-    alike = lt.ensemble(system, np.tile(x0s[0], (40, 1)), (0.0, 2 * np.pi), 2 * np.pi / 101, lt.MetriplecticGauss(2))
-    assert alike.audit().verdict.endswith("(looked at: 3,232 steps of 4,040)")
+    assert not ensembles[101].ok[1] or ensembles[101].audit().resolved is False
+    assert ensembles[101].evidence.error_time == pytest.approx(np.pi, abs=0.3)
+    assert ensembles[901].audit().resolved
+    assert ensembles[901].audit().coverage == ""
+    equal_members = lt.ensemble(
+        system, np.tile(x0s[0], (40, 1)), (0.0, 2 * np.pi), 2 * np.pi / 101, lt.MetriplecticGauss(2)
+    )
+    assert equal_members.audit().verdict.endswith("(checked 3,232 of 4,040 steps)")
 
 
 def test_the_estimate_is_of_the_order_of_the_method():
-    found = [
-        the_row(lt.integrate(BODY, [0.3, 1.0, -0.2], (0.0, 8.0), h).audit(), "accuracy").value for h in (0.8, 0.4, 0.2)
+    errors = [
+        only_row(lt.integrate(BODY, [0.3, 1.0, -0.2], (0.0, 8.0), h).audit(), "accuracy").value for h in (0.8, 0.4, 0.2)
     ]
-    assert np.abs(np.log2(np.divide(found[:-1], found[1:])) - 2.0).max() < 0.2  # a step is of its length to h^2
-    assert the_row(lt.ensemble(BODY, [0.3, 1.0, -0.2], (0.0, 8.0), 0.2).audit(), "accuracy").passed
+    assert (
+        np.abs(np.log2(np.divide(errors[:-1], errors[1:])) - 2.0).max() < 0.2
+    )  # relative to the length of a step the error is of order h^2
+    assert only_row(lt.ensemble(BODY, [0.3, 1.0, -0.2], (0.0, 8.0), 0.2).audit(), "accuracy").passed
 
 
 def test_long_steps_at_rest_are_no_fault():
-    """A body that has relaxed is at rest, and adaptive steps are long there."""
+    """Adaptive steps are long when a body has relaxed, and the audit accepts them."""
     solution = lt.integrate(BODY, [0.1, 1.0, 0.1], (0.0, 300.0), lt.Adaptive(1e-6))
     assert np.diff(solution.t).max() > 3.0
     assert solution.audit().passed, f"\n{solution.audit()}"
 
 
 def test_methods_without_an_estimate_say_so():
-    row = the_row(lt.integrate(BODY, X0, (0.0, 5.0), 0.5, lt.Reference(rtol=1e-6)).audit(), "accuracy")
+    row = only_row(lt.integrate(BODY, X0, (0.0, 5.0), 0.5, lt.Reference(rtol=1e-6)).audit(), "accuracy")
     assert (row.passed, row.tolerance, "not estimated" in row.note) == (None, None, True)
 
 
@@ -269,7 +281,7 @@ def test_a_copy_knows_the_evidence():
 
 
 def test_a_method_that_follows_another_field():
-    """An entropy that is no Casimir, let through: Gauss holds it by force, and integrates something else."""
+    """A method that holds an entropy that is no Casimir integrates another field, and the audit says so."""
     system = lt.MetriplecticSystem(
         mf.LiePoisson(mf.so(3)),
         lt.Quadratic([1.0, 1 / 2, 1 / 3]),
@@ -278,53 +290,55 @@ def test_a_method_that_follows_another_field():
         validate=False,
     )
     solution = lt.integrate(system, [0.6, 0.5, -0.7], (0.0, 5.0), 0.02, lt.MetriplecticGauss(1))
-    row = the_row(solution.audit(), "consistency")
+    row = only_row(solution.audit(), "consistency")
     assert row.passed is False
     assert row.value > 0.05
     assert not solution.audit().passed
-    assert "NOT THE MOTION" in str(solution.audit()) or "A LAW FAILS" in str(solution.audit())
+    assert "DO NOT FOLLOW THE VECTOR FIELD" in str(solution.audit()) or "A LAW FAILS" in str(solution.audit())
 
 
 def test_a_run_that_stopped_is_no_law_that_fails():
     system = lt.models.rigid_body()
-    x0, explicit = [0.1, 1.0, 0.3], lt.MetriplecticRungeKutta(8)
-    solution = lt.integrate(system, x0, (0.0, 60.0), 15.0, explicit, on_failure="return")
+    x0, method = [0.1, 1.0, 0.3], lt.MetriplecticRungeKutta(8)
+    solution = lt.integrate(system, x0, (0.0, 60.0), 15.0, method, on_failure="return")
     assert not solution.status.ok
     assert not solution.audit().passed
     assert solution.audit().verdict == "THE RUN STOPPED before its end; the laws hold until there"
 
 
-class Late(lt.MetriplecticMidpoint):
-    """Control: consistent, but of first order only."""
+class FirstOrderMidpoint(lt.MetriplecticMidpoint):
+    """Control: consistent, but only of first order."""
 
     def slopes(self, system, x, compensation, h, k):
         return system.vector_field(x + h * k[0])[None]
 
 
-class Slow(lt.MetriplecticMidpoint):
-    """Control: a thousandth too slow, which no law sees."""
+class SlowedMidpoint(lt.MetriplecticMidpoint):
+    """Control: slower than the motion by a thousandth, which no law shows."""
 
     def slopes(self, system, x, compensation, h, k):
         return 0.999 * super().slopes(system, x, compensation, h, k)
 
 
 @pytest.mark.sampled(1)
-@pytest.mark.parametrize(("method", "passed"), [(Late(), True), (Slow(), False)], ids=["late", "slow"])
-def test_consistency_is_judged_by_short_steps(method, passed):
+@pytest.mark.parametrize(
+    ("method", "is_consistent"), [(FirstOrderMidpoint(), True), (SlowedMidpoint(), False)], ids=["late", "slow"]
+)
+def test_consistency_is_judged_by_short_steps(method, is_consistent):
     solution = lt.integrate(BODY, [0.3, 1.0, -0.2], (0.0, 4.0), 0.4, method)
-    row = the_row(solution.audit(), "consistency")
-    assert row.passed is passed, row
-    assert passed or row.value == pytest.approx(1e-3, rel=0.01)
+    row = only_row(solution.audit(), "consistency")
+    assert row.passed is is_consistent, row
+    assert is_consistent or row.value == pytest.approx(1e-3, rel=0.01)
 
 
-class Cold(lt.MetriplecticMidpoint):
-    """Control: a thousandth of the heat that friction makes in :func:`with_wheel` is missing."""
+class MidpointWithLessWheelHeat(lt.MetriplecticMidpoint):
+    """Control: a thousandth of the heat of friction in :func:`body_with_wheel` is missing."""
 
     def slopes(self, system, x, compensation, h, k):
         return super().slopes(system, x, compensation, h, k).at[:, 4].multiply(0.999)
 
 
-def with_wheel(attitude):
+def body_with_wheel(attitude):
     return lt.models.damper_wheel(inertia=(1.6, 2.0, 1.0), attitude=attitude)
 
 
@@ -334,26 +348,30 @@ def with_wheel(attitude):
     "method", [lt.MetriplecticMidpoint(), lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(4)], ids=["mid", "2", "4"]
 )
 def test_the_heat_of_a_wheel_at_rest_is_rounding(method, attitude):
-    """The wheel turns by 1e-17 relative to the body, and makes a heat of 1e-34 from an entropy of zero."""
-    solution = lt.integrate(with_wheel(attitude), [1e-17, 1.0, 2e-17, 0.05, 0.0], (0.0, 20.0), 0.1, method)
+    """The wheel turns by 1e-17 relative to the body, and its heat of 1e-34 is not judged."""
+    solution = lt.integrate(body_with_wheel(attitude), [1e-17, 1.0, 2e-17, 0.05, 0.0], (0.0, 20.0), 0.1, method)
     assert abs(solution.entropy[-1]) < 1e-30
     assert solution.audit().passed, f"\n{solution.audit()}"
     assert attitude or solution.evidence.inconsistency is None  # nothing moves
 
 
 @pytest.mark.parametrize("nutation", [1e-3, 1e-9])
-@pytest.mark.parametrize(("method", "passed"), [(lt.MetriplecticMidpoint(), True), (Cold(), False)], ids=["", "cold"])
-def test_heat_that_is_missing_in_a_body_almost_at_rest(method, passed, nutation):
-    """Control of the test above: the heat, as small as the square of the nutation, is looked at while there is one."""
+@pytest.mark.parametrize(
+    ("method", "is_consistent"),
+    [(lt.MetriplecticMidpoint(), True), (MidpointWithLessWheelHeat(), False)],
+    ids=["", "cold"],
+)
+def test_heat_that_is_missing_in_a_body_almost_at_rest(method, is_consistent, nutation):
+    """Control of the test above: heat as small as the square of the nutation is judged."""
     x0 = [nutation, 1.0, 0.0, 0.05 + nutation, 0.0]
-    solution = lt.integrate(with_wheel(True), x0, (0.0, 20.0), 0.1, method)
-    row = the_row(solution.audit(), "consistency")
-    assert row.passed is passed, row
-    assert passed or row.value == pytest.approx(1e-3, rel=0.01)
+    solution = lt.integrate(body_with_wheel(True), x0, (0.0, 20.0), 0.1, method)
+    row = only_row(solution.audit(), "consistency")
+    assert row.passed is is_consistent, row
+    assert is_consistent or row.value == pytest.approx(1e-3, rel=0.01)
 
 
-def with_drag(name):
-    """A system with drag that heats a bath, a state at rest, and its field without the bath in NumPy."""
+def system_with_drag(name):
+    """Return a system with drag that heats a bath, a state at rest, and its field without the bath in NumPy."""
     baths = lt.HeatBaths(2.0, 1.0)
     if name == "heavy top":
         inertia, rate, gravity = np.array([1.0, 1.2, 0.5]), 0.2, np.array([0.0, 0.0, 1.0])
@@ -366,8 +384,8 @@ def with_drag(name):
 
         def field(t, x):
             omega = x[:3] / inertia
-            turned = np.cross(x[:3], omega) + np.cross(x[3:], gravity) - rate * omega
-            return np.concatenate([turned, np.cross(x[3:], omega)])
+            momentum_rate = np.cross(x[:3], omega) + np.cross(x[3:], gravity) - rate * omega
+            return np.concatenate([momentum_rate, np.cross(x[3:], omega)])
 
         return system, [0.0, 0.0, 0.0, 0.6, 0.0, 0.8], field
     potential, force = {
@@ -390,20 +408,20 @@ def with_drag(name):
 )
 @pytest.mark.parametrize("name", ["spring", "pendulum", "heavy top"])
 def test_drag_from_rest_is_the_motion(name, method, step):
-    """The entropy of the bath begins as t^3, so that every step misses the same share of its mean rate."""
-    system, x0, field = with_drag(name)
+    """The entropy of the bath begins as t^3, so every step misses the same fraction of its mean rate."""
+    system, x0, field = system_with_drag(name)
     solution = lt.integrate(system, x0, (0.0, 10.0), step, method)
-    exact = scipy.integrate.solve_ivp(field, (0.0, 10.0), x0, method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
-    assert np.abs(solution.x[-1, : len(x0)] - exact).max() < 1e-6
+    exact_state = scipy.integrate.solve_ivp(field, (0.0, 10.0), x0, method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+    assert np.abs(solution.x[-1, : len(x0)] - exact_state).max() < 1e-6
     audit = solution.audit()
     assert audit.verdict == "the laws hold, and the steps resolve the motion", str(audit)
-    assert the_row(audit, "consistency").value < 1e-10
+    assert only_row(audit, "consistency").value < 1e-10
 
 
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("power", [1, 2, 4])
 def test_a_force_that_grows_from_zero_is_the_motion(power):
-    """From rest at the equilibrium, so that the velocity begins as t^(power + 1)."""
+    """A body at rest in equilibrium gets a velocity that begins as t^(power + 1), and its steps are consistent."""
     system = lt.MetriplecticSystem(
         mf.Canonical(1),
         lambda x, t: 0.5 * x[0] ** 2 + 0.5 * x[1] ** 2 - x[0] * t**power,
@@ -414,7 +432,7 @@ def test_a_force_that_grows_from_zero_is_the_motion(power):
     assert audit.passed, str(audit)
 
 
-class Cool(lt.MetriplecticMidpoint):
+class MidpointWithLessBathHeat(lt.MetriplecticMidpoint):
     """Control: a thousandth of the heat of drag on a spring is missing."""
 
     def slopes(self, system, x, compensation, h, k):
@@ -422,37 +440,37 @@ class Cool(lt.MetriplecticMidpoint):
 
 
 def test_heat_that_is_missing_from_rest_on():
-    system, x0, _ = with_drag("spring")
-    row = the_row(lt.integrate(system, x0, (0.0, 10.0), 0.05, Cool()).audit(), "consistency")
+    system, x0, _ = system_with_drag("spring")
+    row = only_row(lt.integrate(system, x0, (0.0, 10.0), 0.05, MidpointWithLessBathHeat()).audit(), "consistency")
     assert row.passed is False
     assert row.value == pytest.approx(1e-3, rel=0.01)
 
 
 def test_members_of_an_ensemble_that_start_at_rest():
-    """The audit of all, and that of one trajectory, which takes its steps again."""
-    system, x0, _ = with_drag("spring")
+    """The audits of an ensemble and of one trajectory, which replays its steps, pass for members that start at rest."""
+    system, x0, _ = system_with_drag("spring")
     x0s = np.outer([1.0, 0.5, -2.0], x0)
-    many = lt.ensemble(system, x0s, (0.0, 10.0), 0.05, lt.MetriplecticRungeKutta(4), outputs="trajectory")
-    assert many.audit().verdict == "the laws hold, and the steps resolve the motion"
-    alone = many[1].audit()
-    assert alone.passed, str(alone)
-    assert the_row(alone, "consistency").value < 1e-10
+    ensemble = lt.ensemble(system, x0s, (0.0, 10.0), 0.05, lt.MetriplecticRungeKutta(4), outputs="trajectory")
+    assert ensemble.audit().verdict == "the laws hold, and the steps resolve the motion"
+    member_audit = ensemble[1].audit()
+    assert member_audit.passed, str(member_audit)
+    assert only_row(member_audit, "consistency").value < 1e-10
 
 
 # -- what is conserved ------------------------------------------------------------------------------------------------
 
 
 def test_what_the_method_does_not_promise():
-    """A cubic momentum map: a constant of the system, and not of the method; and a function that is neither."""
+    """The audit shows a cubic momentum map, which the method does not promise to keep, and a function that changes."""
     H = lt.Quadratic([1.0, 1.0, 0.5])
     system = lt.LiePoissonSystem(mf.so(3), H, momentum_maps={"cube": lambda m: m[2] ** 3 + jnp.sin(m[2])})
     assert system.check().passed
     solution = lt.integrate(system, [0.4, -0.8, 1.2], (0.0, 5.0), 0.1)
     (row,) = rows(solution.audit(), "drift of cube")
-    assert (row.passed, row.tolerance, "does not promise" in row.note) == (None, None, True)
+    assert (row.passed, row.tolerance, "does not conserve it exactly" in row.note) == (None, None, True)
     assert row.value < 1e-14
-    relaxed = lt.integrate(BODY, X0, (0.0, 5.0), 0.1)
-    (row,) = rows(relaxed.audit(), "change of mu1**2")
+    body_run = lt.integrate(BODY, X0, (0.0, 5.0), 0.1)
+    (row,) = rows(body_run.audit(), "change of mu1**2")
     assert row.note == "not a constant of this system"
     assert solution.laws.unpromised == ("cube",)
 
@@ -460,17 +478,17 @@ def test_what_the_method_does_not_promise():
 @pytest.mark.parametrize("rate", [1e-13, 1.0, 1e13])
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
 def test_slow_friction_is_friction_still(rate, scale):
-    """Which Casimirs a system conserves does not depend on its units."""
+    """The set of Casimirs that a system conserves does not depend on its units."""
     quadratic = lt.Quadratic(np.ones(3))
     for dissipation in (lt.KillingDissipation(rate), lt.ProjectedMetric(rate=rate)):
         system = lt.LiePoissonSystem(mf.so(3), lt.Quadratic(np.array([1.0, 2.0, 5.0]) / scale), quadratic, dissipation)
         assert system.conserves((quadratic, system.energy)) == [False, True]
-    free = lt.LiePoissonSystem(mf.so(3), lt.Quadratic(np.array([1.0, 2.0, 5.0]) / scale))
-    assert free.conserves((quadratic, lt.Quadratic(np.zeros(3), b=[0.0, 0.0, 1.0]))) == [True, False]
+    free_system = lt.LiePoissonSystem(mf.so(3), lt.Quadratic(np.array([1.0, 2.0, 5.0]) / scale))
+    assert free_system.conserves((quadratic, lt.Quadratic(np.zeros(3), b=[0.0, 0.0, 1.0]))) == [True, False]
 
 
 def test_large_states_of_a_slow_body():
-    """At states of 1e12 the Casimir grows, and the audit does not ask that it stays."""
+    """The Casimir of states of 1e12 grows by friction, and the audit does not require that it is constant."""
     system = lt.models.rigid_body((3e12, 2e12, 1e12), rate=1e-12)
     solution = lt.integrate(system, [1e10, 1e12, 3e11], (0.0, 20.0), 0.1)
     assert solution.entropy[-1] > solution.entropy[0]
@@ -481,8 +499,8 @@ def test_large_states_of_a_slow_body():
 
 
 def test_unknown_tolerances_are_named():
-    solution, many = lt.integrate(BODY, X0, (0.0, 1.0), 0.1), lt.ensemble(BODY, X0, (0.0, 1.0), 0.1)
-    for run in (solution, many):
+    solution, ensemble = lt.integrate(BODY, X0, (0.0, 1.0), 0.1), lt.ensemble(BODY, X0, (0.0, 1.0), 0.1)
+    for run in (solution, ensemble):
         with pytest.raises(
             lt.InputError, match=r"'energy_drift'.*energy, entropy, casimirs, residual, attitude, accuracy"
         ):
@@ -491,8 +509,8 @@ def test_unknown_tolerances_are_named():
 
 # -- what has nothing to do -------------------------------------------------------------------------------------------
 
-TURNED = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3, 2)) @ np.array([1.0, 1.0j]))[0]
-LEVELS, PHASES = ((TURNED * values) @ TURNED.conj().T for values in ([0.0, 1.0, 2.5], [1.0, -1.0, 0.3]))
+UNITARY = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3, 2)) @ np.array([1.0, 1.0j]))[0]
+LEVELS, PHASES = ((UNITARY * values) @ UNITARY.conj().T for values in ([0.0, 1.0, 2.5], [1.0, -1.0, 0.3]))
 LOWERING = np.diag([1.0, 1.0], 1)
 
 
@@ -509,7 +527,7 @@ def body(dissipation, energy=(1.0, 1 / 2, 1 / 3), capacity=2.0):
     return system, system.state(np.append([0.4, 0.5, 0.8], [0.0] * (system.dim - 3)))
 
 
-IDLE = {
+IDLE_SYSTEMS = {
     "jumps at rate zero": lambda: quantum(LEVELS, LOWERING, 0.0, 0.8),
     "jumps without a Hamiltonian": lambda: quantum(0.0 * LEVELS, LOWERING, 0.5, np.inf),
     "jumps of equal levels": lambda: quantum(np.eye(3), LOWERING, 0.5, np.inf),
@@ -524,16 +542,17 @@ IDLE = {
         lt.FourBracket.kulkarni_nomizu(np.eye(3), np.eye(3)), np.zeros(3), None
     ),
 }
+"""Systems whose dissipation does nothing, with initial states."""
 
 
 @pytest.mark.sampled(
     "jumps without a Hamiltonian-Gauss", "jumps that exchange no heat-Gauss", "a bracket at rate zero-explicit"
 )
-@pytest.mark.parametrize("by", ["Gauss", "explicit"])
-@pytest.mark.parametrize("name", IDLE)
-def test_what_rounding_makes_of_nothing_is_no_motion(name, by):
-    """Baths that take no heat, and energies that are zero, are moved by rounding alone."""
+@pytest.mark.parametrize("method_name", ["Gauss", "explicit"])
+@pytest.mark.parametrize("name", IDLE_SYSTEMS)
+def test_what_rounding_makes_of_nothing_is_no_motion(name, method_name):
+    """Baths that receive no heat, and energies that are zero, change by rounding alone, and the audit passes."""
     methods = {"Gauss": lt.MetriplecticGauss(2), "explicit": lt.MetriplecticRungeKutta(4)}
-    system, x0 = IDLE[name]()
-    audit = lt.integrate(system, x0, (0.0, 2.0), 0.05, methods[by]).audit()
+    system, x0 = IDLE_SYSTEMS[name]()
+    audit = lt.integrate(system, x0, (0.0, 2.0), 0.05, methods[method_name]).audit()
     assert audit.passed, str(audit)

@@ -1,5 +1,4 @@
-"""Files of results: written whole or not at all, by however many at once, and refused where they are not what was
-written."""
+"""Files of results: written atomically, also by concurrent writers, and refused if their content was changed."""
 
 import json
 import os
@@ -24,18 +23,18 @@ def solution():
     return lt.integrate(lt.models.rigid_body(), [0.1, 1.0, 0.1], (0.0, 2.0), 0.1)
 
 
-def rewritten(path: Path, change) -> Path:
-    """A file that somebody has changed who knows how it is sealed."""
+def rewrite(path: Path, change) -> Path:
+    """Change a file and give it a valid checksum; return its path."""
     path.write_bytes(path.read_bytes()[: -len(files.CHECKSUM_TAG) - 64])
     with h5py.File(path, "r+") as file:
         change(file)
-    series, said = files._read_hdf5(path)
+    series, attributes = files._read_hdf5(path)
     with h5py.File(path, "r+") as file:
-        file.attrs["sha256"] = files.checksum(series, said)
+        file.attrs["sha256"] = files.checksum(series, attributes)
     return path
 
 
-FULL = """
+FULL_DISK_SCRIPT = """
 import resource, signal, sys
 import liethermo as lt
 solution = lt.integrate(lt.models.rigid_body(), [0.1, 1.0, 0.1], (0.0, 200.0), 0.1)
@@ -54,8 +53,10 @@ assert solution.save(sys.argv[1]).exists() and (lt.load(sys.argv[1]).x == soluti
 
 def test_a_full_disk_is_an_error_and_no_crash(tmp_path):
     path = tmp_path / "run.nc"
-    done = subprocess.run([sys.executable, "-c", FULL, str(path)], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
+    process = subprocess.run(
+        [sys.executable, "-c", FULL_DISK_SCRIPT, str(path)], capture_output=True, text=True, check=False
+    )
+    assert process.returncode == 0, process.stdout + process.stderr
     assert os.listdir(tmp_path) == ["run.nc"]
 
 
@@ -77,65 +78,68 @@ def test_a_disk_without_room(tmp_path):
 
 def test_a_save_that_fails_leaves_the_old_file(solution, tmp_path, monkeypatch):
     path = solution.save(tmp_path / "run.nc")
-    before = path.read_bytes()
+    content = path.read_bytes()
 
-    def full(*ends):
+    def raise_disk_full(*ends):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(disk.os, "replace", full)
-    with pytest.raises(lt.FileError, match=r"the disk is full .*The result itself is as it was"):
+    monkeypatch.setattr(disk.os, "replace", raise_disk_full)
+    with pytest.raises(lt.FileError, match=r"the disk is full .*The result in memory is unchanged"):
         solution.save(path)
-    assert path.read_bytes() == before
+    assert path.read_bytes() == content
     assert os.listdir(tmp_path) == ["run.nc"]
 
 
 def test_many_write_to_one_path(solution, tmp_path):
-    path, failed = tmp_path / "run.nc", []
+    path, errors = tmp_path / "run.nc", []
 
     def save():
         try:
             for _ in range(5):
                 solution.save(path)
-        except Exception as error:  # told below
-            failed.append(error)
+        except Exception as error:  # asserted below
+            errors.append(error)
 
     threads = [threading.Thread(target=save) for _ in range(4)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert failed == []
+    assert errors == []
     assert np.array_equal(lt.load(path).x, solution.x)
     assert os.listdir(tmp_path) == ["run.nc"]
 
 
 def test_a_planted_link_is_not_written_through(solution, tmp_path, monkeypatch):
-    other = tmp_path / "precious"
-    other.write_text("mine")
-    part = disk.part_name("run.nc")
-    monkeypatch.setattr(disk, "part_name", lambda name: part)
-    (tmp_path / part).symlink_to(other)
+    link_target = tmp_path / "precious"
+    link_target.write_text("mine")
+    part_name = disk.part_name("run.nc")
+    monkeypatch.setattr(disk, "part_name", lambda name: part_name)
+    (tmp_path / part_name).symlink_to(link_target)
     with pytest.raises(lt.FileError, match="cannot write"):
         solution.save(tmp_path / "run.nc")
-    assert other.read_text() == "mine"
+    assert link_target.read_text() == "mine"
 
 
 def test_parts_of_dead_processes_are_swept(solution, tmp_path):
-    dead = subprocess.Popen([sys.executable, "-c", ""])
-    dead.wait()
-    mine, theirs = disk.part_name("run.nc"), disk.part_name("run.nc").replace(f".{os.getpid()}.", f".{dead.pid}.")
-    of_other = disk.part_name("other.nc").replace(f".{os.getpid()}.", f".{dead.pid}.")
-    for name in (mine, theirs, of_other):
+    ended_process = subprocess.Popen([sys.executable, "-c", ""])
+    ended_process.wait()
+    live_part, dead_part = (
+        disk.part_name("run.nc"),
+        disk.part_name("run.nc").replace(f".{os.getpid()}.", f".{ended_process.pid}."),
+    )
+    other_file_part = disk.part_name("other.nc").replace(f".{os.getpid()}.", f".{ended_process.pid}.")
+    for name in (live_part, dead_part, other_file_part):
         (tmp_path / name).write_bytes(b"half")
     solution.save(tmp_path / "run.nc")
-    assert set(os.listdir(tmp_path)) == {"run.nc", mine, of_other}
+    assert set(os.listdir(tmp_path)) == {"run.nc", live_part, other_file_part}
 
 
-def _said(name, value):
+def _set_attribute(name, value):
     return lambda file: file.attrs.__setitem__(name, value)
 
 
-def _replaced(name, values):
+def _replace_array(name, values):
     def change(file):
         del file[name]
         file[name] = values
@@ -143,7 +147,7 @@ def _replaced(name, values):
     return change
 
 
-def _linked(link):
+def _add_link(link):
     def change(file):
         file["energy2"] = link
 
@@ -151,27 +155,28 @@ def _linked(link):
 
 
 CHANGES = {
-    "deep JSON": _said("provenance", "[" * 20_000 + "]" * 20_000),
-    "a number for the provenance": _said("provenance", "5"),
-    "a list for the stats": _said("stats", "[1]"),
-    "more than the stats": _said("stats", json.dumps({"steps": 1, "more": 2})),
-    "steps in words": _said("stats", json.dumps({"steps": "many"})),
-    "no such status": _said("status", json.dumps({"code": "fine", "message": "", "step": 1, "time": 1.0})),
-    "a law that there is not": _said("laws", json.dumps({"energy": "maybe"})),
-    "a time of an event in words": _said("event_time", '"noon"'),
-    "states of another number": _replaced("x", np.zeros((3, 3))),
-    "states in one row": _replaced("x", np.zeros(21)),
-    "states in words": _replaced("x", np.array([[b"a"] * 3] * 21)),
-    "an energy of another number": _replaced("energy", np.zeros(4)),
+    "deep JSON": _set_attribute("provenance", "[" * 20_000 + "]" * 20_000),
+    "a number for the provenance": _set_attribute("provenance", "5"),
+    "a list for the stats": _set_attribute("stats", "[1]"),
+    "more than the stats": _set_attribute("stats", json.dumps({"steps": 1, "more": 2})),
+    "steps in words": _set_attribute("stats", json.dumps({"steps": "many"})),
+    "no such status": _set_attribute("status", json.dumps({"code": "fine", "message": "", "step": 1, "time": 1.0})),
+    "a law that there is not": _set_attribute("laws", json.dumps({"energy": "maybe"})),
+    "a time of an event in words": _set_attribute("event_time", '"noon"'),
+    "states of another number": _replace_array("x", np.zeros((3, 3))),
+    "states in one row": _replace_array("x", np.zeros(21)),
+    "states in words": _replace_array("x", np.array([[b"a"] * 3] * 21)),
+    "an energy of another number": _replace_array("energy", np.zeros(4)),
 }
+"""Changes of a file that make it no result."""
 
 
-@pytest.mark.parametrize("what", CHANGES)
-def test_what_is_no_result_is_refused(what, solution, tmp_path):
-    path = rewritten(solution.save(tmp_path / "run.nc"), CHANGES[what])
-    with pytest.raises(lt.FileError) as refused:
+@pytest.mark.parametrize("change_name", CHANGES)
+def test_what_is_no_result_is_refused(change_name, solution, tmp_path):
+    path = rewrite(solution.save(tmp_path / "run.nc"), CHANGES[change_name])
+    with pytest.raises(lt.FileError) as error_info:
         lt.load(path)
-    assert "\n" not in str(refused.value)
+    assert "\n" not in str(error_info.value)
 
 
 @pytest.mark.parametrize("link", [h5py.ExternalLink("other.nc", "/x"), h5py.SoftLink("/x")])
@@ -198,11 +203,11 @@ def test_an_array_that_the_file_cannot_hold_is_not_made(solution, tmp_path):
 def test_an_ensemble_that_was_changed_is_refused(tmp_path):
     ensemble = lt.ensemble(lt.models.rigid_body(), [[0.1, 1.0, 0.1], [0.2, 1.0, 0.1]], (0.0, 1.0), 0.1)
     for change in (
-        _replaced("status", np.array([0, 77], dtype=np.int8)),
-        _said("reasons", "3"),
-        _said("provenance", "3"),
+        _replace_array("status", np.array([0, 77], dtype=np.int8)),
+        _set_attribute("reasons", "3"),
+        _set_attribute("provenance", "3"),
     ):
-        path = rewritten(ensemble.save(tmp_path / "many.nc"), change)
+        path = rewrite(ensemble.save(tmp_path / "many.nc"), change)
         with pytest.raises(lt.FileError):
             lt.load(path)
 
@@ -215,22 +220,25 @@ def test_what_is_no_path(path, solution, tmp_path):
         lt.load(tmp_path / path)
 
 
-def full(*arguments):
+def raise_disk_full(*arguments):
     raise OSError(28, "No space left on device")
 
 
 @pytest.mark.parametrize("step", [0.1, lt.Adaptive(1e-6)])
 def test_a_run_that_cannot_be_kept_is_not_lost(tmp_path, monkeypatch, step):
-    monkeypatch.setattr(disk.os, "replace", full)
+    monkeypatch.setattr(disk.os, "replace", raise_disk_full)
     monkeypatch.setattr(run, "CHECKPOINT_SECONDS", 0.0)
     body, x0 = lt.models.rigid_body(), [0.1, 1.0, 0.1]
-    goes_on = pytest.warns(UserWarning, match="the disk is full .*The run goes on")
-    with goes_on, pytest.raises(lt.FileError, match=r"the disk is full .*It is the exception's \.solution") as told:
+    warns_and_continues = pytest.warns(UserWarning, match="the disk is full .*The run goes on")
+    with (
+        warns_and_continues,
+        pytest.raises(lt.FileError, match=r"the disk is full .*It is the exception's \.solution") as error_info,
+    ):
         lt.integrate(body, x0, (0.0, 2.0), step, save_to=tmp_path / "run.nc")
     monkeypatch.undo()
-    whole = lt.integrate(body, x0, (0.0, 2.0), step)
-    assert np.array_equal(told.value.solution.x, whole.x)
-    assert told.value.solution.status.ok
+    undisturbed_run = lt.integrate(body, x0, (0.0, 2.0), step)
+    assert np.array_equal(error_info.value.solution.x, undisturbed_run.x)
+    assert error_info.value.solution.status.ok
     assert os.listdir(tmp_path) == []
 
 
@@ -238,11 +246,11 @@ def test_a_run_that_cannot_be_kept_is_not_lost(tmp_path, monkeypatch, step):
 def test_pictures_appear_whole_or_not_at_all(solution, tmp_path, monkeypatch, suffix):
     path = tmp_path / f"laws.{suffix}"
     lt.plot.laws(solution, path=path)
-    before = path.read_bytes()
-    monkeypatch.setattr(disk.os, "replace", full)
+    content = path.read_bytes()
+    monkeypatch.setattr(disk.os, "replace", raise_disk_full)
     with pytest.raises(lt.FileError, match="the disk is full"):
         lt.plot.laws(solution, path=path)
-    assert path.read_bytes() == before
+    assert path.read_bytes() == content
     assert os.listdir(tmp_path) == [path.name]
 
 
@@ -252,18 +260,18 @@ def test_a_pipe_or_a_device_is_not_replaced(solution, tmp_path):
         with pytest.raises(lt.FileError, match="no plain file"):
             solution.save(path)
     assert (tmp_path / "pipe.nc").is_fifo()
-    with pytest.raises(lt.FileError, match="there is no file"):  # and is not waited for
+    with pytest.raises(lt.FileError, match="there is no file"):  # without waiting for the pipe
         lt.load(tmp_path / "pipe.nc")
 
 
 def test_no_scheduler_is_asked_whether_a_file_may_be_written(solution, tmp_path, monkeypatch):
-    """xarray asks that of Dask for a lock where there is a client, which fails where it is gone."""
+    """xarray asks a Dask scheduler for a lock if there is a client, which fails if the scheduler is gone."""
     import distributed
 
-    def gone(*arguments, **named):
+    def raise_gone(*arguments, **keywords):
         raise OSError("the scheduler is gone")
 
     with distributed.Client(processes=False, n_workers=1, threads_per_worker=1, dashboard_address=None):
-        monkeypatch.setattr(distributed.Lock, "acquire", gone)
+        monkeypatch.setattr(distributed.Lock, "acquire", raise_gone)
         solution.save(tmp_path / "run.nc")
     assert np.array_equal(lt.load(tmp_path / "run.nc").x, solution.x)

@@ -1,4 +1,4 @@
-"""What a notebook shows of results, and what a file says of its variables."""
+"""Notebook views of results, and the descriptions of variables in files."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ def solution(body):
 
 
 def test_everything_shown_is_well_formed_and_says_what_the_print_says(body, solution):
-    many = lt.ensemble(body, np.eye(3) + 0.1, (0.0, 1.0), 0.1)
-    named = mf.so(3).with_basis_names("Jx", "Jy", "Jz")
-    shown = {
+    ensemble = lt.ensemble(body, np.eye(3) + 0.1, (0.0, 1.0), 0.1)
+    algebra = mf.so(3).with_basis_names("Jx", "Jy", "Jz")
+    expected_texts = {
         "Solution": (solution, solution.status.message),
         "Audit": (solution.audit(), solution.audit().verdict),
         "Check": (body.check(), "all axioms hold"),
-        "Ensemble": (many, "3 trajectories to t = 1"),
-        "LieAlgebra": (named, "[Jx, Jy]"),
+        "Ensemble": (ensemble, "3 trajectories to t = 1"),
+        "LieAlgebra": (algebra, "[Jx, Jy]"),
         "Report": (mf.testing.check_algebra(mf.so(3)), "all of them hold"),
     }
-    for name, (value, expected) in shown.items():
+    for name, (value, expected) in expected_texts.items():
         tree = ElementTree.fromstring(f"<div>{value._repr_html_()}</div>")
         assert expected in "".join(tree.itertext()), name
         assert len(repr(value)) < 100 or name in ("Ensemble", "Report"), name
@@ -55,13 +55,13 @@ def test_a_picture_of_what_is_not_finite_or_long_is_still_one():
     t = np.arange(5000.0)
     series = np.stack([np.sin(t), np.full_like(t, np.nan)], axis=-1)
     tree = ElementTree.fromstring(svg_sketch(t, series, "a test"))
-    first, second = (node.get("points").split() for node in tree.iter() if node.tag.endswith("polyline"))
-    assert len(first) == MAX_POINTS
-    assert second == []
+    sine_points, nan_points = (node.get("points").split() for node in tree.iter() if node.tag.endswith("polyline"))
+    assert len(sine_points) == MAX_POINTS
+    assert nan_points == []
 
 
 @pytest.mark.parametrize(
-    ("polynomial", "typeset"),
+    ("polynomial", "latex"),
     [
         (mf.so(3).casimirs(2)[0], r"\mu_{1}^{2} + \mu_{2}^{2} + \mu_{3}^{2}"),
         (mf.Polynomial([[1, 0], [0, 2]], [-1, 0.5]).with_names("q", "p"), r"-\mathrm{q} + 0.5 \mathrm{p}^{2}"),
@@ -69,8 +69,8 @@ def test_a_picture_of_what_is_not_finite_or_long_is_still_one():
         (mf.Polynomial(np.zeros((0, 2), dtype=int), []), "0"),
     ],
 )
-def test_polynomials_are_typeset(polynomial, typeset):
-    assert polynomial._repr_latex_() == rf"$\displaystyle {typeset}$"
+def test_polynomials_are_typeset(polynomial, latex):
+    assert polynomial._repr_latex_() == rf"$\displaystyle {latex}$"
 
 
 def test_variables_of_a_file_say_what_they_are(solution, tmp_path):
@@ -89,5 +89,7 @@ def test_variables_of_a_file_say_what_they_are(solution, tmp_path):
 
 def test_the_version_is_told():
     assert lt.__version__.count(".") == 2
-    asked = subprocess.run([sys.executable, "-m", "liethermo", "--version"], capture_output=True, text=True, check=True)
-    assert asked.stdout == f"liethermo {lt.__version__}\n"
+    process = subprocess.run(
+        [sys.executable, "-m", "liethermo", "--version"], capture_output=True, text=True, check=True
+    )
+    assert process.stdout == f"liethermo {lt.__version__}\n"

@@ -1,4 +1,4 @@
-"""Results: files that come back whole or say why not, xarray, the audit's verdicts."""
+"""Solutions: files that restore them or are refused, xarray, and the verdicts of the audit."""
 
 import dataclasses
 import json
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import liethermo as lt
-from liethermo.engines.codes import StatusCode
+from liethermo.engines.codes import RESULT_CODES
 
 X0 = [0.001, 1.0, 0.001]
 
@@ -21,15 +21,19 @@ def solution():
 
 def test_save_and_load(solution, tmp_path):
     path = solution.with_provenance(seed=7).save(tmp_path / "deep" / "run.nc")
-    loaded = lt.load(path)
+    loaded_solution = lt.load(path)
     for name in ("t", "x", "energy", "entropy"):
-        assert np.array_equal(getattr(loaded, name), getattr(solution, name)), name
-    assert loaded.casimirs.keys() == solution.casimirs.keys()
-    assert all(np.array_equal(loaded.casimirs[k], solution.casimirs[k]) for k in solution.casimirs)
-    assert (loaded.status, loaded.stats, loaded.laws) == (solution.status, solution.stats, solution.laws)
-    assert loaded.provenance["seed"] == 7
-    assert loaded.provenance["step"] == 0.1
-    assert str(loaded.audit()) == str(solution.audit())
+        assert np.array_equal(getattr(loaded_solution, name), getattr(solution, name)), name
+    assert loaded_solution.casimirs.keys() == solution.casimirs.keys()
+    assert all(np.array_equal(loaded_solution.casimirs[k], solution.casimirs[k]) for k in solution.casimirs)
+    assert (loaded_solution.status, loaded_solution.stats, loaded_solution.laws) == (
+        solution.status,
+        solution.stats,
+        solution.laws,
+    )
+    assert loaded_solution.provenance["seed"] == 7
+    assert loaded_solution.provenance["step"] == 0.1
+    assert str(loaded_solution.audit()) == str(solution.audit())
     assert [p.name for p in path.parent.iterdir()] == ["run.nc"]
 
 
@@ -37,11 +41,11 @@ def test_no_entropy_and_no_invariants(tmp_path):
     import manifolds as mf
 
     system = lt.MetriplecticSystem(mf.Canonical(1), lambda x: x @ x)
-    loaded = lt.load(lt.integrate(system, [1.0, 0.0], (0.0, 1.0), 0.1).save(tmp_path / "a.nc"))
-    assert loaded.entropy is None
-    assert loaded.casimirs == {}
-    assert loaded.audit().passed
-    assert np.isnan(loaded.audit().entropy_min_increment)
+    loaded_solution = lt.load(lt.integrate(system, [1.0, 0.0], (0.0, 1.0), 0.1).save(tmp_path / "a.nc"))
+    assert loaded_solution.entropy is None
+    assert loaded_solution.casimirs == {}
+    assert loaded_solution.audit().passed
+    assert np.isnan(loaded_solution.audit().entropy_min_increment)
 
 
 def test_xarray(solution):
@@ -51,41 +55,42 @@ def test_xarray(solution):
     assert json.loads(dataset.attrs["provenance"])["library"].startswith("liethermo ")
 
 
-@pytest.mark.parametrize("keep", [0, 10, 0.3, 0.9, 0.99])
-def test_a_file_cut_short(solution, tmp_path, keep):
+@pytest.mark.parametrize("kept_length", [0, 10, 0.3, 0.9, 0.99])
+def test_a_file_cut_short(solution, tmp_path, kept_length):
     path = solution.save(tmp_path / "run.nc")
     content = path.read_bytes()
-    path.write_bytes(content[: int(keep if keep >= 1 else keep * len(content))])
+    path.write_bytes(content[: int(kept_length if kept_length >= 1 else kept_length * len(content))])
     with pytest.raises(lt.FileError, match=r"run\.nc"):
         lt.load(path)
 
 
-def same(a, b) -> bool:
+def have_equal_content(a, b) -> bool:
     arrays = all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("t", "x", "energy", "entropy"))
     casimirs = a.casimirs.keys() == b.casimirs.keys()
     casimirs = casimirs and all(np.array_equal(a.casimirs[name], b.casimirs[name]) for name in a.casimirs)
-    rest = ("status", "stats", "laws", "provenance", "event_time")
-    return arrays and casimirs and all(getattr(a, name) == getattr(b, name) for name in rest)
+    other_fields = ("status", "stats", "laws", "provenance", "event_time")
+    return arrays and casimirs and all(getattr(a, name) == getattr(b, name) for name in other_fields)
 
 
 @pytest.mark.filterwarnings("error")
 def test_a_damaged_file_is_refused_or_loads_unharmed(solution, tmp_path, capfd):
-    """One bit of a file is flipped, at places all over it: never another trajectory, nor a word on the terminal.
+    """A flipped bit anywhere in a file never gives another trajectory, nor output on the terminal.
 
-    Nor does it ever reach the reader of HDF5, which some such files keep busy for ever; but in the words of the seal.
+    HDF5's reader, which some such files keep busy for ever, never sees them, unless the bit is in the tag of the
+    digest.
     """
-    path, other = solution.save(tmp_path / "run.nc"), tmp_path / "damaged.nc"
-    content, random, refused = path.read_bytes(), np.random.default_rng(12), 0
-    words = range(len(content) - 80, len(content) - 70)
-    for place in [*random.integers(len(content) - 100, size=300), *words]:
-        damaged = bytearray(content)
-        damaged[place] ^= 1 << random.integers(8)
-        other.write_bytes(damaged)
+    path, damaged_path = solution.save(tmp_path / "run.nc"), tmp_path / "damaged.nc"
+    content, random, n_refused = path.read_bytes(), np.random.default_rng(12), 0
+    tag_indices = range(len(content) - 80, len(content) - 70)
+    for index in [*random.integers(len(content) - 100, size=300), *tag_indices]:
+        damaged_content = bytearray(content)
+        damaged_content[index] ^= 1 << random.integers(8)
+        damaged_path.write_bytes(damaged_content)
         try:
-            assert same(lt.load(other), solution), place
+            assert have_equal_content(lt.load(damaged_path), solution), index
         except lt.FileError:
-            refused += 1
-    assert refused == 300
+            n_refused += 1
+    assert n_refused == 300
     assert capfd.readouterr().err == ""
 
 
@@ -104,7 +109,7 @@ def test_a_changed_number_and_a_changed_word(solution, tmp_path):
 
 
 def test_a_file_of_an_earlier_version(solution, tmp_path):
-    """It has no checksum, loads, and says so."""
+    """A file of an earlier version has no checksum, loads, and warns."""
     import h5py
 
     path = solution.save(tmp_path / "old.nc")
@@ -115,7 +120,7 @@ def test_a_file_of_an_earlier_version(solution, tmp_path):
         with_checksum.write_bytes(path.read_bytes())
         file.attrs["format"] = "liethermo-solution-1"
     with pytest.warns(UserWarning, match="no checksum"):
-        assert same(lt.load(path), solution)
+        assert have_equal_content(lt.load(path), solution)
     with pytest.raises(lt.FileError, match="checksum"):
         lt.load(with_checksum)
 
@@ -133,12 +138,14 @@ def test_other_files(tmp_path):
 
 def test_save_to_writes_on_failure_and_on_the_way(tmp_path, monkeypatch):
     monkeypatch.setattr("liethermo.runs.run.CHECKPOINT_SECONDS", 0.0)
-    saved = []
+    saved_lengths = []
     original = lt.Solution.save
-    monkeypatch.setattr(lt.Solution, "save", lambda self, path: saved.append(len(self.t)) or original(self, path))
+    monkeypatch.setattr(
+        lt.Solution, "save", lambda self, path: saved_lengths.append(len(self.t)) or original(self, path)
+    )
     lt.integrate(lt.models.rigid_body(), X0, (0.0, 300.0), 0.1, save_to=tmp_path / "run.nc")
-    assert len(saved) > 2
-    assert saved == sorted(saved)
+    assert len(saved_lengths) > 2
+    assert saved_lengths == sorted(saved_lengths)
     assert len(lt.load(tmp_path / "run.nc").t) == 3001
 
 
@@ -185,9 +192,9 @@ def test_zero_energy_is_measured_absolutely():
 
 
 def test_import_is_light():
-    """What is not needed to integrate is not imported; the time itself is measured in benchmarks, not here."""
-    heavy = ("geomstats", "matplotlib", "xarray", "pandas", "rich", "dask", "distributed", "zarr")
-    script = f"import sys, liethermo; print([m for m in {heavy} if m in sys.modules])"
+    """Packages that are not needed to integrate are not imported; the duration is measured in benchmarks, not here."""
+    heavy_packages = ("geomstats", "matplotlib", "xarray", "pandas", "rich", "dask", "distributed", "zarr")
+    script = f"import sys, liethermo; print([m for m in {heavy_packages} if m in sys.modules])"
     result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
 
@@ -199,8 +206,8 @@ def test_double_precision_is_on():
 
 
 def test_statuses_have_one_vocabulary():
-    for code in StatusCode:
+    for code in RESULT_CODES:
         assert lt.Status(code, "a sentence", 1, 0.0) == lt.Status(code.status_name, "a sentence", 1, 0.0)
-    assert [code.status_name for code in StatusCode if lt.Status(code, "", 0, 0.0).ok] == ["completed", "event"]
+    assert [code.status_name for code in RESULT_CODES if lt.Status(code, "", 0, 0.0).ok] == ["completed", "event"]
     with pytest.raises(lt.InputError, match=r"no status 'finished'; there are completed, not_converged"):
         lt.Status("finished", "a sentence", 1, 0.0)
