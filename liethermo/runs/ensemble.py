@@ -277,7 +277,9 @@ class _EnsembleOptions(NamedTuple):
             laws=promised_laws(member, method, {}),
             engine=chosen,
             wall_time=0.0,
-            evidence_source=None if noise_dimension(method) else EnsembleEvidenceCollector(record, method, again, equal),
+            evidence_source=None
+            if noise_dimension(method)
+            else EnsembleEvidenceCollector(record, method, again, equal),
             solution_builder=MemberSolutionBuilder(record, method, run),
         )
         return Subset(run, found), reasons | {int(run[j]): text for j, text in record.failure_reasons.items()}
