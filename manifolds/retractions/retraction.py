@@ -79,7 +79,7 @@ class Retraction(ABC):
                 f"{self}: the step h v{format_index(index)} is {float(reach[index]):.6g} times as long as its inverse reaches "
                 f"(injectivity radius of the space {radius:.6g}): take a smaller step"
             )
-        return run_kernel(self, "_ends", (), z, v)
+        return run_kernel(self, "_end_points", (), z, v)
 
     def inverse(self, x, y, h=1.0) -> tuple[jax.Array, jax.Array]:
         """``R_h^-1(x, y)``: the base point z and the tangent vector v there that the step from x to y comes from.
@@ -100,7 +100,7 @@ class Retraction(ABC):
         OffManifoldError
         """
         x, y = self.space._checked_point(x, "x"), self.space._checked_point(y, "y")
-        z, v = run_kernel(self, "_base", (), x, y)
+        z, v = run_kernel(self, "_base_and_vector", (), x, y)
         self.space._raise_if_nan(v, len(self.space.shape), x, y, f"the inverse of {type(self).__name__}")
         return z, v / h
 

@@ -110,7 +110,7 @@ class Product(Space):
         return self.join(*(factor._point_from_normals(own) for factor, own in pairs))
 
     def _restore(self, x):
-        return self._apply_and_join("_returned", x)
+        return self._apply_and_join("_restore", x)
 
     def _project_tangent(self, x, w):
         return self._apply_and_join("_project_tangent", x, w)
@@ -129,7 +129,7 @@ class Product(Space):
         return self._apply_and_concatenate("_constraints", x)
 
     def _constraint_scales(self, x):
-        return self._apply_and_concatenate("_rounded", x)
+        return self._apply_and_concatenate("_constraint_scales", x)
 
     def _apply_and_concatenate(self, kernel: str, *arrays):
         """What a kernel of every factor gives, shape (..., m), side by side."""
@@ -138,7 +138,7 @@ class Product(Space):
         return jnp.concatenate([jnp.broadcast_to(c, (*batch, c.shape[-1])) for c in parts], axis=-1)
 
     def _minimal_correction(self, x, c):
-        return self._apply_to_constraint_parts("_normal", x, c)
+        return self._apply_to_constraint_parts("_minimal_correction", x, c)
 
     def _correction(self, x, c):
         return self._apply_to_constraint_parts("_correction", x, c)
@@ -150,7 +150,7 @@ class Product(Space):
         return self.join(*(getattr(factor, kernel)(part, own) for factor, part, own in triples))
 
     def _tangential_part(self, x, w):
-        return self._apply_and_join("_along", x, w)
+        return self._apply_and_join("_tangential_part", x, w)
 
     def _inside(self, x):
         return jnp.stack(self._apply_to_factors("_inside", x)).all(axis=0)
@@ -223,7 +223,7 @@ class Product(Space):
         return all(factor.is_smooth for factor in self.factors)
 
     def _euclidean_reach(self, x, v):
-        return jnp.stack(self._apply_to_factors("_straight_reach", x, v)).max(axis=0)
+        return jnp.stack(self._apply_to_factors("_euclidean_reach", x, v)).max(axis=0)
 
     def _group_exp(self, x, v):
         return self._apply_and_join("_group_exp", x, v)
@@ -232,7 +232,7 @@ class Product(Space):
         return self._apply_and_join("_group_log", x, y)
 
     def _left_translate(self, x, y, u):
-        return self._apply_and_join("_left_carry", x, y, u)
+        return self._apply_and_join("_left_translate", x, y, u)
 
     def _cayley(self, x, v):
         return self._apply_and_join("_cayley", x, v)

@@ -300,7 +300,7 @@ def test_degrees_that_are_refused(degree):
 def test_too_many_monomials_are_refused_with_their_number(monkeypatch):
     with pytest.raises(mf.LieAlgebraError, match=r"se\(7\) has 1107568 monomials of degree 6, more than the 20000"):
         mf.se(7).casimirs(6)
-    monkeypatch.setattr(module, "LARGEST_BLOCK", 5)
+    monkeypatch.setattr(module, "MAX_BLOCK_SIZE", 5)
     with pytest.raises(mf.LieAlgebraError, match="couples 10 monomials of degree 2, more than the 5"):
         mf.se(5).casimirs(2)
 
