@@ -62,7 +62,11 @@ class Homogeneous(Space):
         if not len(rest):
             raise ParameterError(f"{upstairs.name}: the stabilizer is the whole group, and leaves a single point")
         chosen = f"{upstairs.name}/H" if name is None else name
-        values = {"upstairs": upstairs, "horizontal": tuple(map(tuple, rest.tolist())), "name": chosen}
+        values = {
+            "group_space": upstairs,
+            "horizontal_basis": tuple(map(tuple, rest.tolist())),
+            "name": chosen,
+        }
         for field, value in values.items():
             object.__setattr__(self, field, value)
 

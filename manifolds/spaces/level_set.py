@@ -106,7 +106,9 @@ class LevelSet(Space):
                 f"{self.name}: Newton's method finds no point of it from {N_RANDOM_TRIALS} random arrays: its constraints may "
                 "contradict each other, or depend on each other at its points"
             )
-        sizes = [np.linalg.norm(np.asarray(self._call_compiled("_constraint_jacobian", y)), axis=-1) for y in (x, points)]
+        sizes = [
+            np.linalg.norm(np.asarray(self._call_compiled("_constraint_jacobian", y)), axis=-1) for y in (x, points)
+        ]
         shrunk = (sizes[1][found] / np.median(sizes[0], axis=0)).max(axis=0)
         if (shrunk < MIN_GRADIENT_RATIO).any():
             i = int(np.argmin(shrunk))
@@ -232,7 +234,8 @@ class LevelSet(Space):
     def _why_off_space(self, x, residual):
         if (
             np.isfinite(x).all()
-            and not float(self._call_compiled("_min_gradient_singular_value", jnp.asarray(x))) > MIN_GRADIENT_SINGULAR_VALUE
+            and not float(self._call_compiled("_min_gradient_singular_value", jnp.asarray(x)))
+            > MIN_GRADIENT_SINGULAR_VALUE
         ):
             return "the gradients of its constraints depend on each other there"
         return super()._why_off_space(x, residual)
