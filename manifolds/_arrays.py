@@ -27,7 +27,7 @@ def real_components(x, dim: int, label: str) -> jax.Array:
 
 
 def square_matrices(x, size: int, label: str) -> jax.Array:
-    """Return ``x`` as an array of doubles (or complex doubles), after checking that its last axes are ``(size, size)``."""
+    """Return ``x`` as an array of (complex) doubles, after checking that its last axes are ``(size, size)``."""
     array = jnp.asarray(numeric_array(x, label))
     if array.shape[-2:] != (size, size):
         raise ShapeError(f"{label} must have last axes ({size}, {size}), but its shape is {array.shape}")

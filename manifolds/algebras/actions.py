@@ -55,7 +55,7 @@ def nonzero_terms(constants: np.ndarray) -> tuple[tuple[int, int, int, float], .
 
 @partial(jax.jit, static_argnames=("terms", "dim"))  # one compiled program for calls outside of a jitted function
 def unrolled_bracket(terms: tuple[tuple[int, int, int, float], ...], x, y, dim: int) -> jax.Array:
-    """Compute ``sum_ab value x_a y_b`` for each c from the terms (a, b, c, value): one pass over a batch, no matrices."""
+    """Compute ``sum_ab value x_a y_b`` for each c from terms (a, b, c, value): one pass over a batch, no matrices."""
     columns: list[list[jax.Array]] = [[] for _ in range(dim)]
     for a, b, c, value in terms:
         product = x[..., a] * y[..., b]

@@ -125,7 +125,7 @@ class DirectSum(BracketAlgebra):
         return BlockAction(self, x)
 
     def ad(self, x) -> jax.Array:
-        """Return the matrix of ``y -> [x, y]``, shape (..., dim, dim); it is mostly zeros, so only small sums allow it."""
+        """Return the matrix of ``y -> [x, y]``, shape (..., dim, dim); mostly zeros, so only small sums allow it."""
         self._check_matrix_memory("the matrix of ad")
         ads = [g.ad(component) for (g, _), component in zip(self.blocks, self.split(x), strict=True)]
         return _block_diagonal(ads)

@@ -87,7 +87,7 @@ def casimirs(g: AlgebraStructure, degree: int) -> list[Polynomial | TracePolynom
 
 
 def leading_casimirs(g: AlgebraStructure) -> list[tuple[str, Callable]]:
-    """Return pairs (name, Casimir) of the polynomial Casimirs of low degree; see :meth:`LieAlgebra.leading_casimirs`."""
+    """Return pairs (name, Casimir) of polynomial Casimirs of low degree; see :meth:`LieAlgebra.leading_casimirs`."""
     named_casimirs: list[tuple[str, Callable]] = []
     count = g.casimir_count()
     for degree in range(1, g.dim + 1):

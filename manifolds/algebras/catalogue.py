@@ -206,7 +206,7 @@ def heisenberg(n: int = 1) -> LieAlgebra:
 
 @register((2,), (3,))
 def galilei(n: int) -> LieAlgebra:
-    """Return the Galilei algebra of R^n: rotations J, boosts K, translations P, time translation H; ``[K_i, H] = P_i``."""
+    """Return the Galilei algebra of R^n: rotations J, boosts K, translations P, time shift H; ``[K_i, H] = P_i``."""
     n = checked_size(n, 2, "galilei(n)")
     rotations = np.zeros((n * (n - 1) // 2, n + 2, n + 2))
     rotations[:, :n, :n] = so(n).basis

@@ -121,7 +121,8 @@ class TracePolynomial:
         n_monomials = math.comb(self.dim + self.degree - 1, self.degree)
         if n_monomials > MAX_EXPANSION_MONOMIALS:
             raise LieAlgebraError(
-                f"{self} has up to {n_monomials} monomials, more than the {MAX_EXPANSION_MONOMIALS} that are written out"
+                f"{self} has up to {n_monomials} monomials, more than the {MAX_EXPANSION_MONOMIALS} that are written "
+                "out"
             )
         coefficients, m = self.weight[None], self.weight.shape[0]
         factors = np.zeros((1, 0), dtype=np.int64)
@@ -315,7 +316,7 @@ def _commutant(X: np.ndarray, name: str) -> list[np.ndarray]:
 
 
 def _pfaffian(basis: np.ndarray, X: np.ndarray, name: str) -> Polynomial | None:
-    """Return the Pfaffian of ``J X(mu)``, if the matrices preserve only one form J, up to a factor, and J is symmetric."""
+    """Return the Pfaffian of ``J X(mu)`` if the matrices preserve just one form J, up to a factor, a symmetric one."""
     m = X.shape[1]
     if m % 2 or m > MAX_COMMUTANT_SIZE:
         return None

@@ -208,7 +208,7 @@ class LieAlgebra:
         return self._killing_form
 
     def killing_signature(self) -> tuple[int, int, int]:
-        """Return the numbers of positive, negative and zero eigenvalues of the Killing form; every basis has the same."""
+        """Return the numbers of positive, negative and zero eigenvalues of the Killing form, in any basis."""
         eigenvalues = np.linalg.eigvalsh(killing_form_of(self._balanced_constants[0]))
         positive, negative = (int((sign * eigenvalues > STRUCTURE_TOLERANCE).sum()) for sign in (1, -1))
         return positive, negative, self.dim - positive - negative

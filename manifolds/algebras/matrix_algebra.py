@@ -155,7 +155,7 @@ class MatrixAlgebra(BracketAlgebra):
         return self.matrix_basis.inner_products(self._split_parts(square_matrices(M, self.matrix_size, "M")))
 
     def trace_covector(self, x) -> jax.Array:
-        """Return the covector ``Re tr(x .)`` of the trace form, which is invariant and nondegenerate, shape (..., dim)."""
+        """Return the covector ``Re tr(x .)`` of the invariant, nondegenerate trace form, shape (..., dim)."""
         x = self._element(x, "x")
         if self.classical_data.is_compact:
             return -self.matrix_basis.lower_index(x)

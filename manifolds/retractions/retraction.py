@@ -76,8 +76,8 @@ class Retraction(ABC):
         if not is_traced(reach) and (index := first_true_index(~np.asarray(reach < 1.0))) is not None:
             radius = self.space.injectivity_radius(jnp.broadcast_arrays(z, v)[0][index])
             raise DomainError(
-                f"{self}: the step h v{format_index(index)} is {float(reach[index]):.6g} times as long as its inverse reaches "
-                f"(injectivity radius of the space {radius:.6g}): take a smaller step"
+                f"{self}: the step h v{format_index(index)} is {float(reach[index]):.6g} times as long as its inverse "
+                f"reaches (injectivity radius of the space {radius:.6g}): take a smaller step"
             )
         return run_kernel(self, "_end_points", (), z, v)
 

@@ -323,8 +323,9 @@ class Space(SpaceMaps):
         if (index := first_true_index(~(residual <= tolerance))) is not None:
             worst = float(residual[index])
             raise OffManifoldError(
-                f"{self.name}: {what}{format_index(index)} is off the space: {self._why_off_space(values[index], worst)}, "
-                f"tolerance {tolerance:.0e}; point({what}, project=True) moves it there",
+                f"{self.name}: {what}{format_index(index)} is off the space: "
+                f"{self._why_off_space(values[index], worst)}, tolerance {tolerance:.0e}; "
+                f"point({what}, project=True) moves it there",
                 residual=worst,
                 tolerance=tolerance,
             )

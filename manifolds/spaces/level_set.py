@@ -103,8 +103,8 @@ class LevelSet(Space):
         found = np.asarray(jnp.isfinite(points).all(axis=self._axes))
         if not found.any():
             raise SpaceError(
-                f"{self.name}: Newton's method finds no point of it from {N_RANDOM_TRIALS} random arrays: its constraints may "
-                "contradict each other, or depend on each other at its points"
+                f"{self.name}: Newton's method finds no point of it from {N_RANDOM_TRIALS} random arrays: its "
+                "constraints may contradict each other, or depend on each other at its points"
             )
         sizes = [
             np.linalg.norm(np.asarray(self._call_compiled("_constraint_jacobian", y)), axis=-1) for y in (x, points)

@@ -55,8 +55,8 @@ def frechet_mean(space: Space, points, weights=None) -> jax.Array:
             return mean
         mean = space.exp(mean, step)
     raise DomainError(
-        f"the mean on {space.name} did not come to rest: the last of {MAX_ITERATIONS} steps had the length {size:.3g}. The "
-        "points may be too far apart for one mean: take those of a smaller region"
+        f"the mean on {space.name} did not come to rest: the last of {MAX_ITERATIONS} steps had the length {size:.3g}. "
+        "The points may be too far apart for one mean: take points of a smaller region"
     )
 
 
