@@ -54,7 +54,7 @@ class Correlation(PositiveDefinite):
         return jnp.where(np.eye(self.n, dtype=bool), 1.0, x)
 
     def _constraint_residual(self, x):
-        """Return the skew part of a matrix, with the diagonal minus one on its diagonal."""
+        """Return the skew part of x off the diagonal, and x - 1 on it."""
         return jnp.where(np.eye(self.n, dtype=bool), x - 1.0, 0.5 * (x - x.swapaxes(-1, -2)))
 
     def _constraints(self, x):
