@@ -22,8 +22,8 @@ def _track_compilation(event: str, duration_secs: float, **kwargs: str | int) ->
     del duration_secs, kwargs
     if event == LOWERING_EVENT and _forked_after_compile:
         raise ForkError(
-            "this process was forked after JAX had run, and XLA cannot compile here: it would wait for threads that the"
-            ' fork has left behind. Start processes by multiprocessing.get_context("spawn")'
+            "this process was forked after JAX had run, so XLA cannot compile in it. "
+            'Start processes by multiprocessing.get_context("spawn")'
         )
     _has_compiled = _has_compiled or event == BACKEND_COMPILE_EVENT
 

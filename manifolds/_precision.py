@@ -39,8 +39,8 @@ def library_settings() -> Iterator[None]:
     config: Any = jax.config
     if not config.jax_enable_x64:
         raise PrecisionError(
-            "JAX computes in single precision, since jax_enable_x64 was switched off after the import: no law holds to "
-            'rounding then. Switch it on again with jax.config.update("jax_enable_x64", True)'
+            "JAX must compute in double precision, but jax_enable_x64 was switched off after the import. "
+            'Switch it on again with jax.config.update("jax_enable_x64", True)'
         )
     user_values = (config.jax_numpy_rank_promotion, config.jax_numpy_dtype_promotion, config.jax_debug_infs)
     if user_values == LIBRARY_SETTINGS:

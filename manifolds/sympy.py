@@ -100,7 +100,7 @@ def algebra(constants: Any, name: str = "g", basis_names: Sequence[str] | None =
     """
     entries = sympy.ImmutableDenseNDimArray(constants)
     if len(entries.shape) != 3:
-        raise ShapeError(f"structure constants have three indices, not {len(entries.shape)}")
+        raise ShapeError(f"structure constants must have three indices, got {len(entries.shape)}")
     coefficients = [_coefficient(entries[i]) for i in np.ndindex(*entries.shape)]
     table = np.empty(len(coefficients), dtype=object)
     table[:] = coefficients

@@ -25,7 +25,7 @@ def checked_constants(values) -> np.ndarray:
     except (TypeError, ValueError) as error:
         raise ComponentError(f"the structure constants are not a rectangular array of numbers: {error}") from None
     if array.ndim != 3 or len(set(array.shape)) != 1 or array.shape[0] == 0:
-        raise ShapeError(f"structure constants have shape (dim, dim, dim), not {array.shape}")
+        raise ShapeError(f"structure constants must have shape (dim, dim, dim), got {array.shape}")
     if np.iscomplexobj(numeric):
         raise ComponentError("structure constants must be real: use a real basis of the algebra")
     if not np.isfinite(numeric).all():
@@ -45,13 +45,15 @@ def constants_from_matrices(basis) -> tuple[np.ndarray, np.ndarray]:
     except (TypeError, ValueError) as error:
         raise ComponentError(f"the basis is not a rectangular array of numbers: {error}") from None
     if matrices.ndim != 3 or matrices.shape[1] != matrices.shape[2] or 0 in matrices.shape:
-        raise ShapeError(f"a matrix basis has shape (dim, m, m), not {matrices.shape}")
+        raise ShapeError(f"a matrix basis must have shape (dim, m, m), got {matrices.shape}")
     if not np.isfinite(matrices).all():
-        raise ComponentError("the matrix basis has entries that are not finite")
+        raise ComponentError("the entries of a matrix basis must be finite")
     dim = len(matrices)
     norms = np.linalg.norm(matrices, axis=(1, 2))
     if not norms.all():
-        raise ClosureError(f"e{norms.argmin() + 1} is the zero matrix; a basis is linearly independent")
+        raise ClosureError(
+            f"e{norms.argmin() + 1} is the zero matrix; remove it, since a basis must be linearly independent"
+        )
     matrices, input_matrices = (
         matrices / norms[:, None, None],
         matrices,

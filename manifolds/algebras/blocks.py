@@ -57,10 +57,10 @@ def power(g: LieAlgebra, sites) -> DirectSum:
         If one element would not fit into memory.
     """
     if not isinstance(g, LieAlgebra):
-        raise ParameterError(f"copies are of a LieAlgebra, not of {type(g).__name__}")
+        raise ParameterError(f"power(g, sites): g must be a LieAlgebra, got {type(g).__name__}")
     shape = tuple(sites) if isinstance(sites, tuple | list) else (sites,)
     if not shape:
-        raise ParameterError("copies of an algebra need the number of sites")
+        raise ParameterError("power(g, sites): sites must not be empty")
     shape = tuple(checked_size(n, 1, "power(g, sites)", "each number of sites") for n in shape)
     if isinstance(g, DirectSum) and g.sites is not None:
         shape = (*shape, *g.sites)
@@ -155,7 +155,7 @@ class DirectSum(BracketAlgebra):
             return real_components(array, self.dim, what), True
         if self.sites is not None and array.shape[-1:] != (self.dim,):
             raise ShapeError(
-                f"{what} has shape (..., {_axes_text(self.shape)}) or (..., {self.dim}), not {array.shape}"
+                f"{what} must have shape (..., {_axes_text(self.shape)}) or (..., {self.dim}), got {array.shape}"
             )
         return real_components(array, self.dim, what), False
 

@@ -248,10 +248,10 @@ def bianchi(kind: str, h: float | None = None) -> LieAlgebra:
         If the kind is unknown, h is missing, has the wrong sign, or is given where it has no meaning.
     """
     if kind not in BIANCHI_KINDS:
-        raise ParameterError(f"no Bianchi type {kind!r}; the types are {', '.join(BIANCHI_KINDS)}")
+        raise ParameterError(f"kind must be one of {', '.join(BIANCHI_KINDS)}, got {kind!r}")
     is_family = kind in ("VI", "VII")
     if is_family and h is None:
-        raise ParameterError(f"Bianchi {kind} is a family: give h, for example bianchi({kind!r}, h=0)")
+        raise ParameterError(f"Bianchi {kind} is a family and needs h, for example bianchi({kind!r}, h=0)")
     if not is_family and h is not None:
         raise ParameterError(f"Bianchi {kind} has no parameter h")
     if h is not None and (not math.isfinite(h) or h * (1 if kind == "VII" else -1) < 0):

@@ -80,10 +80,10 @@ class TracePolynomial:
     def __init__(self, matrices, degree: int, weight=None, label: str | None = None):
         X = np.array(matrices, dtype=np.float64)
         if X.ndim != 3 or X.shape[1] != X.shape[2]:
-            raise ShapeError(f"the matrices of a trace have shape (dim, m, m), not {X.shape}")
+            raise ShapeError(f"the matrices of a trace must have shape (dim, m, m), got {X.shape}")
         W = np.eye(X.shape[1]) if weight is None else np.array(weight, dtype=np.float64)
         if W.shape != X.shape[1:]:
-            raise ShapeError(f"the weight of a trace has shape {X.shape[1:]}, not {W.shape}")
+            raise ShapeError(f"the weight of a trace must have shape {X.shape[1:]}, got {W.shape}")
         X.setflags(write=False)
         W.setflags(write=False)
         label = label or f"tr(X**{degree})"

@@ -29,10 +29,10 @@ def trilinear_form(algebra, form=None) -> np.ndarray:
         ``c[a, b, d] = form(e_a, [e_b, e_d])``.
     """
     if not hasattr(algebra, "killing_form"):
-        raise LieAlgebraError(f"the algebra is a manifolds.LieAlgebra, such as mf.so(3), not {algebra!r}")
+        raise LieAlgebraError(f"algebra must be a manifolds.LieAlgebra, such as mf.so(3), got {algebra!r}")
     form = np.asarray(real_components(algebra.killing_form() if form is None else form, algebra.dim, "the form"))
     if form.shape != (algebra.dim, algebra.dim):
-        raise ShapeError(f"the form on {algebra.name} has shape ({algebra.dim}, {algebra.dim}), not {form.shape}")
+        raise ShapeError(f"the form on {algebra.name} must have shape ({algebra.dim}, {algebra.dim}), got {form.shape}")
     if not np.isfinite(form).all():
         raise ComponentError(f"the form on {algebra.name} must be finite, not {form.tolist()}")
     return np.einsum("ae,bde->abd", form, np.asarray(algebra.structure_constants))

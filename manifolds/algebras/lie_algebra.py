@@ -384,7 +384,7 @@ class LieAlgebra:
     def _require_basis(self) -> np.ndarray:
         if self.basis is None:
             raise LieAlgebraError(
-                f"{self.name} was defined by structure constants, so its matrices are not known; build it with "
+                f"{self.name} was defined by structure constants and has no matrices; build it with "
                 "LieAlgebra.from_matrices to use hat and vee"
             )
         return self.basis

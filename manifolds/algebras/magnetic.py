@@ -49,7 +49,7 @@ def magnetic_extension(g: LieAlgebra, by_brackets: bool | None = None) -> LieAlg
     ParameterError
     """
     if not isinstance(g, LieAlgebra):
-        raise ParameterError(f"the magnetic extension is that of a LieAlgebra, not of {type(g).__name__}")
+        raise ParameterError(f"magnetic_extension(g): g must be a LieAlgebra, got {type(g).__name__}")
     extension = MagneticExtension(g)
     is_small = extension.dim <= MAX_DIM_BY_CONSTANTS
     return extension.algebra_by_constants if (is_small if by_brackets is None else not by_brackets) else extension

@@ -58,7 +58,7 @@ class Polynomial:
                 f"not {powers.shape}"
             )
         if powers.size and (not np.issubdtype(powers.dtype, np.integer) or powers.min() < 0):
-            raise ComponentError("the exponents of a polynomial are integers >= 0")
+            raise ComponentError("the exponents of a polynomial must be integers >= 0")
         terms: dict[tuple[int, ...], Coefficient] = {}
         for power, coefficient in zip(map(tuple, powers.tolist()), coefficients, strict=True):
             terms[power] = terms.get(power, Fraction(0)) + _coefficient(coefficient)

@@ -70,13 +70,13 @@ def semidirect_sum(g: LieAlgebra, representation, name: str | None = None, *, id
         ``[rho(e_a) u, v] + [u, rho(e_a) v]`` for some pair of the ideal; the message names the pair.
     """
     if ideal is not None and not isinstance(ideal, LieAlgebra):
-        raise ComponentError(f"the ideal is a LieAlgebra, not {type(ideal).__name__}")
+        raise ComponentError(f"ideal must be a LieAlgebra, got {type(ideal).__name__}")
     if callable(representation):
         representation = [np.asarray(representation(e)) for e in np.eye(g.dim)]
     rho = np.asarray(representation, dtype=np.float64)
     m = ideal.dim if ideal is not None else rho.shape[-1] if rho.ndim else 0
     if rho.shape != (g.dim, m, m):
-        raise ShapeError(f"a representation of {g.name} has shape ({g.dim}, {m}, {m}), not {rho.shape}")
+        raise ShapeError(f"a representation of {g.name} must have shape ({g.dim}, {m}, {m}), got {rho.shape}")
     _check_representation(g, rho)
     dim = g.dim + m
     constants = np.zeros((dim, dim, dim))

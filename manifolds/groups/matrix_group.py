@@ -405,7 +405,7 @@ class MatrixGroup:
         map_text, remedy = _MAP_TEXTS[kind]
         residual = self.map_defect(kind)
         if residual <= MAP_DEFECT_TOLERANCE:
-            raise LieAlgebraError(f"{self.name} has been given None for its {kind}_map; {remedy}")
+            raise LieAlgebraError(f"{self.name} has no {kind}_map; {remedy}")
         raise LieAlgebraError(
             f"{map_text} does not take {self.algebra.name} into {self.name}: at random elements it misses by "
             f"{residual:.3g} (tolerance {MAP_DEFECT_TOLERANCE:.0e}); {remedy}",

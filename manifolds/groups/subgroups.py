@@ -36,7 +36,7 @@ def subalgebra_basis(group: MatrixGroup, stabilizer) -> np.ndarray:
     if matrices.shape[1:] != basis.shape[1:]:
         n = group.matrix_size
         raise ParameterError(
-            f"the stabilizer in {group.name} is given by matrices, shape (k, {n}, {n}), not {matrices.shape}"
+            f"the stabilizer in {group.name} must be matrices of shape (k, {n}, {n}), got {matrices.shape}"
         )
 
     def components(a):

@@ -181,7 +181,8 @@ class MidpointRetraction(Retraction):
     def __post_init__(self):
         if not isinstance(self.chart, Chart):
             raise SpaceError(
-                f"MidpointRetraction is made from a chart, such as RiemannianRetraction(space), not from {self.chart!r}"
+                "MidpointRetraction(chart): chart must be a Chart, such as RiemannianRetraction(space), got "
+                f"{self.chart!r}"
             )
 
     space = forward_to("chart")
@@ -244,5 +245,5 @@ def retraction(space: Space | MatrixGroup, kind: str = "midpoint") -> Retraction
     """
     space = GroupSpace(space) if isinstance(space, MatrixGroup) else space
     if kind not in RETRACTIONS:
-        raise ParameterError(f"no retraction {kind!r}; take one of {', '.join(RETRACTIONS)}")
+        raise ParameterError(f"kind must be one of {', '.join(RETRACTIONS)}, got {kind!r}")
     return RETRACTIONS[kind](space)

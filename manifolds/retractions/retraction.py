@@ -219,8 +219,8 @@ class Chart(Retraction):
     def __post_init__(self):
         if not isinstance(self.space, Space):
             raise SpaceError(
-                f"{type(self).__name__} is made for a state space, not for {type(self.space).__name__}; of a group "
-                "make GroupSpace(group)"
+                f"{type(self).__name__}(space): space must be a state space, got {type(self.space).__name__}. For a "
+                "group, use GroupSpace(group)"
             )
         struct = jax.ShapeDtypeStruct(self.space.shape, self.space.dtype)
         for kernel in ("_point", "_vector", "_reach"):  # a space that lacks one refuses here

@@ -30,7 +30,7 @@ class Flag(Homogeneous):
 
     def __init__(self, *steps: int):
         if len(steps) < 2:
-            raise ParameterError(f"a flag has two pieces or more, such as Flag(1, 2), not {len(steps)}")
+            raise ParameterError(f"Flag(*steps) needs at least two steps, as in Flag(1, 2), got {len(steps)}")
         sizes = [checked_size(step, 1, "Flag(*steps)", "a step") for step in steps]
         n, start, rotations = sum(sizes), 0, []
         for size in sizes:

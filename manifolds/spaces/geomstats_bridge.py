@@ -59,13 +59,15 @@ def from_geomstats(space, injectivity_radius: float | None = None) -> GeomstatsS
         raise SpaceError(f"{_name(space)} has complex points, which are not supported")
 
     if not isinstance(space, Manifold):
-        raise SpaceError(f"from_geomstats takes a geomstats manifold, not {type(space).__name__}")
+        raise SpaceError(f"from_geomstats(space): space must be a geomstats manifold, got {type(space).__name__}")
     if not backend.__name__.endswith("numpy"):
-        raise SpaceError(f"geomstats runs with the backend {backend.__name__}: set GEOMSTATS_BACKEND=numpy")
+        raise SpaceError(
+            f"geomstats must run with NumPy, got the backend {backend.__name__}; set GEOMSTATS_BACKEND=numpy"
+        )
     if getattr(space, "metric", None) is None:
         raise SpaceError(f"{_name(space)} has no metric: equip it with one, space.equip_with_metric(...)")
     if injectivity_radius is not None and not injectivity_radius > 0.0:
-        raise ParameterError(f"an injectivity radius is positive, not {injectivity_radius!r}")
+        raise ParameterError(f"injectivity_radius must be positive, got {injectivity_radius!r}")
     bridge = GeomstatsSpace(space, _known_radius(space) if injectivity_radius is None else injectivity_radius)
     for kernel in ("exp", "log", "inner", "project_tangent"):
         bridge._require_kernel(kernel)

@@ -59,17 +59,17 @@ class GroupSpace(Space):
 
     def __init__(self, group: MatrixGroup, inner=None):
         if not isinstance(group, MatrixGroup):
-            raise SpaceError(f"GroupSpace is made of a MatrixGroup such as SL(3), not of {type(group).__name__}")
+            raise SpaceError(
+                f"GroupSpace(group): group must be a MatrixGroup, such as SL(3), got {type(group).__name__}"
+            )
         inner = np.eye(group.dim) if inner is None else np.asarray(numeric_array(inner, "inner"), dtype=np.float64)
         if inner.shape != (group.dim,) * 2 or not np.allclose(inner, inner.T, rtol=1e-12, atol=0.0):
-            raise ParameterError(f"inner is a symmetric matrix of shape {(group.dim,) * 2} for {group.name}")
+            raise ParameterError(f"inner must be a symmetric matrix of shape {(group.dim,) * 2} for {group.name}")
         try:
             self._root = np.linalg.cholesky(inner)
         except np.linalg.LinAlgError:
             min_eigenvalue = np.linalg.eigvalsh(inner)[0]
-            raise ParameterError(
-                f"inner has the eigenvalue {min_eigenvalue:.3g}: inner products are positive definite"
-            ) from None
+            raise ParameterError(f"inner must be positive definite, got the eigenvalue {min_eigenvalue:.3g}") from None
         self._group = group
 
     def __eq__(self, other):
@@ -431,7 +431,7 @@ class SpecialEuclidean(GroupSpace):
     def __post_init__(self):
         checked_size(self.n, 2, "SpecialEuclidean(n)")
         if not 0.0 < self.length < math.inf:
-            raise ParameterError(f"SpecialEuclidean(n, length): the length is a positive number, not {self.length!r}")
+            raise ParameterError(f"SpecialEuclidean(n, length): length must be a positive number, got {self.length!r}")
 
     @property
     def group(self):

@@ -64,7 +64,9 @@ class Homogeneous(Space):
             np.linalg.svd(rows, full_matrices=True)[2][len(rows) :] if len(rows) else np.eye(group_space.dim)
         )
         if not len(horizontal_rows):
-            raise ParameterError(f"{group_space.name}: the stabilizer is the whole group, and leaves a single point")
+            raise ParameterError(
+                f"{group_space.name}: the stabilizer must not be the full group, whose quotient is a single point"
+            )
         full_name = f"{group_space.name}/H" if name is None else name
         values = {
             "group_space": group_space,
@@ -155,4 +157,4 @@ def _group_space_of(group) -> BiInvariantSpace:
             if group.name == f"{name}({group.matrix_size})":
                 return space_class(group.matrix_size)
     group_name = getattr(group, "name", type(group).__name__)
-    raise SpaceError(f"Homogeneous(group, stabilizer): the group is SO(n) or SU(n), not {group_name}")
+    raise SpaceError(f"Homogeneous(group, stabilizer): group must be SO(n) or SU(n), got {group_name}")

@@ -119,7 +119,9 @@ class LevelSet(Space):
                 "give a function that changes its sign there"
             )
         if self.form is not None and self._call_compiled("_metric_at", x).shape[-2:] != (self.size, self.size):
-            raise ParameterError(f"{self.name}: the metric is a matrix of shape {(self.size, self.size)} at each point")
+            raise ParameterError(
+                f"{self.name}: the metric must be a matrix of shape {(self.size, self.size)} at each point"
+            )
 
     @property
     def metric(self):  # type: ignore[override]
@@ -255,10 +257,10 @@ class _ConstantMetric:
         matrix = np.asarray(metric, dtype=np.float64)
         n = math.prod(space.sizes)
         if matrix.shape != (n, n) or not np.allclose(matrix, matrix.T, rtol=1e-12, atol=0.0):
-            raise ParameterError(f"{space.name}: the metric is a symmetric matrix of shape {(n, n)}")
+            raise ParameterError(f"{space.name}: the metric must be a symmetric matrix of shape {(n, n)}")
         if not (min_eigenvalue := np.linalg.eigvalsh(matrix)[0]) > 0.0:
             raise ParameterError(
-                f"{space.name}: the metric has the eigenvalue {min_eigenvalue:.3g}: it is positive definite"
+                f"{space.name}: the metric must be positive definite, got the eigenvalue {min_eigenvalue:.3g}"
             )
         return cls(tuple(map(tuple, matrix.tolist())))
 

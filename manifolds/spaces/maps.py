@@ -129,7 +129,7 @@ class SpaceMaps(ABC):
 
     def _exp(self, x, v):
         raise SpaceError(
-            f"{self.name} does not say what its geodesics are: give _exp, _log and _transport, or go by a chart that "
+            f"{self.name} has no geodesics. Implement _exp, _log and _transport, or use a chart that "
             "needs none, such as manifolds.ProjectionRetraction(space)"
         )
 
@@ -184,7 +184,10 @@ class SpaceMaps(ABC):
             return rows(self._project(x + t * e), e.conj())
 
         if not (self.has_geodesics or self._has_induced_metric):
-            raise SpaceError(f"divergences on {self.name} are found along geodesics: give _exp, _log and _transport")
+            raise SpaceError(
+                f"{self.name} has no geodesics, along which divergences are computed. Implement _exp, _log and "
+                "_transport"
+            )
         rows_along = rows_along_geodesic if self.has_geodesics else rows_along_line
         frame = jnp.moveaxis(self._frame(x), -1 - len(self.shape), 0)
         return jax.vmap(lambda e: jax.jvp(lambda t: rows_along(t, e), (0.0,), (1.0,))[1])(frame)

@@ -34,7 +34,7 @@ class Product(Space):
         flat_factors: list[Space] = []
         for factor in factors:
             if not isinstance(factor, Space):
-                raise SpaceError(f"a product is made of state spaces, not of {type(factor).__name__}")
+                raise SpaceError(f"the factors of a product must be state spaces, got {type(factor).__name__}")
             flat_factors.extend(factor.factors if isinstance(factor, Product) else [factor])
         if not flat_factors:
             raise SpaceError("a product needs at least one factor")
@@ -267,7 +267,7 @@ class Power(Space):
 
     def __post_init__(self):
         if not isinstance(self.base, Space):
-            raise SpaceError(f"a power is that of a state space, not of {type(self.base).__name__}")
+            raise SpaceError(f"Power(base, count): base must be a state space, got {type(self.base).__name__}")
         checked_size(self.count, 1, "Power(base, count)", "count")
 
     @property

@@ -124,12 +124,12 @@ def _points_and_weights(space: Space, points, weights) -> tuple[jax.Array, jax.A
     batch = x.shape[: x.ndim - len(space.shape)]
     x = x.reshape(-1, *space.shape)
     if len(x) == 0:
-        raise ParameterError("no points: they have no mean")
+        raise ParameterError("points must not be empty")
     if weights is None:
         return x, jnp.full(len(x), 1.0 / len(x))
     w = jnp.asarray(weights, dtype=jnp.float64)
     if w.shape != batch:
-        raise ParameterError(f"one weight for each point, of shape {batch}, not {w.shape}")
+        raise ParameterError(f"weights must have one weight for each point, shape {batch}, got {w.shape}")
     if not is_traced(w) and not bool((w >= 0.0).all() & (w.sum() > 0.0) & jnp.isfinite(w).all()):
-        raise ParameterError("weights are finite and not negative, with a positive sum")
+        raise ParameterError("weights must be finite and not negative, with a positive sum")
     return x, w.ravel() / w.sum()

@@ -35,9 +35,11 @@ class TangentBundle(Space):
 
     def __post_init__(self):
         if not isinstance(self.base, Space):
-            raise SpaceError(f"a tangent bundle is that of a state space, not of {type(self.base).__name__}")
+            raise SpaceError(f"TangentBundle(base): base must be a state space, got {type(self.base).__name__}")
         if self.base.dtype.kind == "c":
-            raise SpaceError(f"a tangent bundle is that of a space of real arrays, and {self.base.name} is complex")
+            raise SpaceError(
+                f"TangentBundle(base): base must be a space of real arrays, but {self.base.name} is complex"
+            )
 
     @property
     def name(self):

@@ -145,10 +145,10 @@ class ContactForm(ContactStructure):
 
     def __init__(self, function: Callable, dim: int):
         if not isinstance(dim, int) or dim < 3 or dim % 2 == 0:
-            raise ParameterError(f"a contact structure has an odd number of coordinates, 2n + 1 >= 3, not {dim!r}")
+            raise ParameterError(f"dim must be odd and at least 3, the number 2n + 1 of coordinates, got {dim!r}")
         shape = jax.eval_shape(lambda x: jnp.asarray(function(x)), jax.ShapeDtypeStruct((dim,), jnp.float64)).shape
         if shape != (dim,):
-            raise ShapeError(f"a form on {dim} coordinates has {dim} components, but this one has shape {shape}")
+            raise ShapeError(f"a form on {dim} coordinates must have shape ({dim},), got {shape}")
         self.function, self.size = function, dim
 
     @property
@@ -221,7 +221,7 @@ class SplitContact(ContactStructure):
 
     def __check_init__(self):
         if not isinstance(self.degrees_of_freedom, int) or self.degrees_of_freedom < 1:
-            raise ParameterError(f"degrees of freedom are a positive integer, not {self.degrees_of_freedom!r}")
+            raise ParameterError(f"degrees_of_freedom must be a positive integer, got {self.degrees_of_freedom!r}")
 
     @property
     def dim(self) -> int:

@@ -16,10 +16,10 @@ from .poisson import PoissonBySharp
 class DensityMatrices(PoissonBySharp):
     """Lie-Poisson structure of u(N)* on Hermitian matrices: ``Pi dE = -i [dE, rho]``, in units where hbar is 1.
 
-    A matrix has N^2 real coordinates in a basis that is orthonormal for ``tr(A B)``: its diagonal, then for each pair
-    j < k ``sqrt(2)`` times the real part of ``rho_jk``, and in the order of these pairs ``sqrt(2)`` times the imaginary part. The
-    gradient of ``tr(rho H)`` has the coordinates of H. It is :class:`LiePoisson` of ``u(N)`` where ``i rho`` is the
-    matrix of an element of the dual, and ``i H`` that of an element of the algebra.
+    A matrix has N^2 real coordinates in a basis that is orthonormal for ``tr(A B)``: its diagonal, then for each pair j
+    < k ``sqrt(2)`` times the real part of ``rho_jk``, and in the order of these pairs ``sqrt(2)`` times the imaginary
+    part. The gradient of ``tr(rho H)`` has the coordinates of H. It is :class:`LiePoisson` of ``u(N)`` where ``i rho``
+    is the matrix of an element of the dual, and ``i H`` that of an element of the algebra.
 
     Attributes
     ----------

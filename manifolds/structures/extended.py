@@ -43,7 +43,7 @@ class ExtendedPhaseSpace(PoissonStructure):
     def __check_init__(self):
         for numbers, label in ((self.degrees_of_freedom, "degrees of freedom"), (self.species or (0,), "species")):
             if not (isinstance(numbers, tuple) and numbers and all(isinstance(n, int) and n >= 0 for n in numbers)):
-                raise ParameterError(f"{label} are a tuple of integers >= 0, not {numbers!r}")
+                raise ParameterError(f"{label} must be a tuple of integers >= 0, got {numbers!r}")
         if self.species and len(self.species) != len(self.degrees_of_freedom):
             raise ParameterError(f"species are given for {len(self.species)} of {len(self.degrees_of_freedom)} bodies")
 

@@ -173,7 +173,7 @@ class Canonical(PoissonStructure):
 
     def __check_init__(self):
         if not isinstance(self.degrees_of_freedom, int) or self.degrees_of_freedom < 1:
-            raise ParameterError(f"degrees of freedom are a positive integer, not {self.degrees_of_freedom!r}")
+            raise ParameterError(f"degrees_of_freedom must be a positive integer, got {self.degrees_of_freedom!r}")
 
     @property
     def dim(self) -> int:
@@ -203,7 +203,7 @@ class PoissonTensor(PoissonStructure):
         if not callable(matrix):
             matrix = jnp.asarray(matrix, dtype=jnp.float64)
             if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
-                raise ShapeError(f"a Poisson tensor is a square matrix, not an array of shape {matrix.shape}")
+                raise ShapeError(f"a Poisson tensor must be a square matrix, got an array of shape {matrix.shape}")
             dim = matrix.shape[0]
         self.matrix, self.size = matrix, dim
 

@@ -53,14 +53,14 @@ class Spins(PoissonBySharp):
     def __init__(self, sites, others: int = 0, ratio=1.0, margins: tuple[int, ...] | None = None):
         shape = tuple(sites) if isinstance(sites, tuple | list) else (sites,)
         if not shape:
-            raise ParameterError("spins need the number of sites")
+            raise ParameterError("sites must not be empty")
         self.sites = tuple(checked_size(n, 1, "Spins", "each number of sites") for n in shape)
         self.others = checked_size(others, 0, "Spins", "the number of other components")
         self.ratio, self.margins = real_array(ratio), margins
         if self.ratio.shape not in ((), self.sites):
-            raise ParameterError(f"the ratio is one number, or has shape {self.sites}, not {self.ratio.shape}")
+            raise ParameterError(f"ratio must be one number, or have shape {self.sites}, got {self.ratio.shape}")
         if not isinstance(self.ratio, jax.core.Tracer) and not np.isfinite(np.asarray(self.ratio)).all():
-            raise ParameterError("gyromagnetic ratios are finite numbers")
+            raise ParameterError("gyromagnetic ratios must be finite")
 
     @property
     def count(self) -> int:

@@ -71,5 +71,5 @@ def test_large_ones_make_no_constants():
     assert g == mf.magnetic_extension(mf.su(64)) != mf.magnetic_extension(mf.su(65))
     with pytest.raises(mf.SizeError, match="GB"):
         _ = g.structure_constants
-    with pytest.raises(mf.ParameterError, match="of a LieAlgebra, not of int"):
+    with pytest.raises(mf.ParameterError, match="must be a LieAlgebra, got int"):
         mf.magnetic_extension(3)

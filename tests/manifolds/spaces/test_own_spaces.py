@@ -140,7 +140,7 @@ def test_a_group_names_its_space():
     assert repr(mf.retraction(mf.SE(3), "cayley")) == "CayleyRetraction(SE(3))"
     with pytest.raises(mf.SpaceError, match=r"make GroupSpace\(group\)"):
         mf.CayleyRetraction(MINE)
-    with pytest.raises(mf.SpaceError, match="made of a MatrixGroup such as"):
+    with pytest.raises(mf.SpaceError, match="must be a MatrixGroup, such as"):
         mf.GroupSpace(mf.so(3))
     for inner, message in [(np.eye(2), "symmetric matrix of shape"), (np.diag([1.0, 1.0, -2.0]), "the eigenvalue -2:")]:
         with pytest.raises(mf.ParameterError, match=message):
