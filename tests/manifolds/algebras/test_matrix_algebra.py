@@ -73,7 +73,7 @@ def test_derivatives_of_traces_are_those_of_powers_of_matrices(pair):
     mu, nu, direction = np.random.default_rng(2).standard_normal((3, m.dim))
 
     def plain(mu, degree):
-        M = m.dual_matrix(mu) * (1j if m.known.is_compact else 1.0)
+        M = m.dual_matrix(mu) * (1j if m.classical_data.is_compact else 1.0)
         return jnp.trace(jnp.linalg.matrix_power(M, degree)).real
 
     for degree in (2, 3, 4, 5):

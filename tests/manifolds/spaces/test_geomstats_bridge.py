@@ -193,7 +193,7 @@ def test_points_refused():
 
 
 def test_manifolds_refused():
-    with pytest.raises(mf.SpaceError, match="takes a geomstats manifold, not Sphere"):
+    with pytest.raises(mf.SpaceError, match="must be a geomstats manifold, got Sphere"):
         mf.from_geomstats(mf.Sphere(2))
     with pytest.raises(mf.SpaceError, match="has no metric: equip it"):
         mf.from_geomstats(gs_hypersphere.Hypersphere(2, equip=False))
@@ -216,7 +216,7 @@ def test_manifolds_refused():
         sphere.equip_with_metric(metric)
         with pytest.raises(mf.SpaceError, match=message):
             mf.from_geomstats(sphere)
-    with pytest.raises(mf.ParameterError, match="is positive"):
+    with pytest.raises(mf.ParameterError, match="must be positive"):
         mf.from_geomstats(gs_hypersphere.Hypersphere(2), injectivity_radius=-1.0)
     with pytest.raises(mf.SpaceError, match="is not a group"):
         mf.retraction(mf.from_geomstats(gs_hypersphere.Hypersphere(2)), "cayley")

@@ -93,7 +93,7 @@ def test_a_space_without_geodesics():
     assert not (space * mf.Sphere(2)).has_geodesics
     assert (mf.Sphere(1) ** 2).has_geodesics
     for refused in (lambda: space.exp(x, 0 * x), lambda: space.log(x, x), lambda: mf.retraction(space)):
-        with pytest.raises(mf.SpaceError, match=r"give _exp, _log and _transport, or .*ProjectionRetraction"):
+        with pytest.raises(mf.SpaceError, match=r"Implement _exp, _log and _transport, or .*ProjectionRetraction"):
             refused()
     R = mf.retraction(space, "projection")
     v = space.random_tangent(1, x, 0.4)
@@ -138,11 +138,11 @@ def test_a_group_of_ones_own_as_a_space():
 def test_a_group_names_its_space():
     assert mf.retraction(MINE, "cayley").space == mf.GroupSpace(MINE)
     assert repr(mf.retraction(mf.SE(3), "cayley")) == "CayleyRetraction(SE(3))"
-    with pytest.raises(mf.SpaceError, match=r"make GroupSpace\(group\)"):
+    with pytest.raises(mf.SpaceError, match=r"use GroupSpace\(group\)"):
         mf.CayleyRetraction(MINE)
     with pytest.raises(mf.SpaceError, match="must be a MatrixGroup, such as"):
         mf.GroupSpace(mf.so(3))
-    for inner, message in [(np.eye(2), "symmetric matrix of shape"), (np.diag([1.0, 1.0, -2.0]), "the eigenvalue -2:")]:
+    for inner, message in [(np.eye(2), "symmetric matrix of shape"), (np.diag([1.0, 1.0, -2.0]), "the eigenvalue -2")]:
         with pytest.raises(mf.ParameterError, match=message):
             mf.GroupSpace(MINE, inner)
 
@@ -156,5 +156,5 @@ def test_a_chart_by_a_map_that_leaves_the_group():
     X = np.asarray(group.algebra.hat(np.ones(8) / 4))
     assert abs(np.linalg.det(np.linalg.solve(one - X / 2, one + X / 2)) - 1.0) > 1e-3
     assert info.value.residual > 1e-3
-    with pytest.raises(mf.LieAlgebraError, match="None for its cayley_map"):
+    with pytest.raises(mf.LieAlgebraError, match="has no cayley_map"):
         mf.retraction(replace(mf.SO(3), cayley_map=None), "cayley")

@@ -670,7 +670,7 @@ def test_arrays_of_the_wrong_kind():
         mf.Sphere(0)
     with pytest.raises(mf.ParameterError, match="take SpecialOrthogonal"):
         mf.Stiefel(3, 3)
-    with pytest.raises(mf.ParameterError, match="length is a positive number"):
+    with pytest.raises(mf.ParameterError, match="length must be a positive number"):
         mf.SpecialEuclidean(3, -1.0)
     with pytest.raises(mf.SpaceError, match="must be state spaces"):
         mf.Product(mf.Sphere(2), 3)

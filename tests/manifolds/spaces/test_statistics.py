@@ -111,7 +111,7 @@ def test_what_has_no_mean():
     poles = jnp.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
     with pytest.raises(mf.DomainError, match="antipode"):
         mf.frechet_mean(sphere, poles)
-    with pytest.raises(mf.ParameterError, match="no points"):
+    with pytest.raises(mf.ParameterError, match="points must not be empty"):
         mf.frechet_mean(sphere, np.zeros((0, 3)))
     with pytest.raises(mf.ParameterError, match="one weight for each point"):
         mf.frechet_mean(sphere, poles, [1.0])

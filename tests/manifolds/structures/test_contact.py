@@ -372,9 +372,9 @@ def test_unusable_structures():
         with pytest.raises(mf.ParameterError, match="positive integer"):
             mf.CanonicalContact(n)
     for dim in (2, 1, 3.0):
-        with pytest.raises(mf.ParameterError, match="odd number"):
+        with pytest.raises(mf.ParameterError, match="must be odd"):
             mf.ContactForm(lambda x: x, dim)
-    with pytest.raises(mf.ShapeError, match="5 components"):
+    with pytest.raises(mf.ShapeError, match=r"shape \(5,\)"):
         mf.ContactForm(lambda x: x[:2], 5)
     with pytest.raises(mf.ShapeError, match="last axis 3"):
         mf.CanonicalContact(1).evolution_vector_field(lambda x: x[0])([1.0, 2.0])
