@@ -105,7 +105,7 @@ import sys
 from pathlib import Path
 import liethermo as lt
 from liethermo.spec import read
-from liethermo.spec.trust import sent
+from liethermo.spec.trust import pickle_by_value
 assert "xarray" not in sys.modules
 try:
     read(Path(sys.argv[1]))
