@@ -98,10 +98,10 @@ def entropy_of(g: mf.LieAlgebra):
     for degree in (1, 2, 3):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", mf.NoPolynomialCasimirWarning)
-            found = g.casimirs(degree)
-        if found:
+            casimirs = g.casimirs(degree)
+        if casimirs:
             # of several quadratic ones the sum: se(3) has |p|^2 and l.p
-            return make_energy(found[0], "S")
+            return make_energy(casimirs[0], "S")
     raise AssertionError(f"no Casimir known for {g.name}: add one to TRANSCENDENTAL")
 
 
@@ -158,7 +158,7 @@ def _curvature_tensor(g, energy, rng):
     return lt.FourBracket(np.einsum("aij,akl->ijkl", A, A))
 
 
-def _no_killing(g: mf.LieAlgebra) -> str | None:
+def _killing_exemption(g: mf.LieAlgebra) -> str | None:
     if g.is_semisimple():
         return None
     if np.linalg.eigvalsh(-g.killing_form())[0] < -1e-10:
@@ -166,50 +166,54 @@ def _no_killing(g: mf.LieAlgebra) -> str | None:
     return "the Killing form vanishes on brackets (Cartan's criterion)" if g.is_solvable() else None
 
 
-def _line(g: mf.LieAlgebra) -> str | None:
+def _dimension_exemption(g: mf.LieAlgebra) -> str | None:
     return "a line has no covector beside dH: K is the rounding error of zero" if g.dim < 2 else None
 
 
-def _abelian(g: mf.LieAlgebra) -> str | None:
+def _abelian_exemption(g: mf.LieAlgebra) -> str | None:
     return "nothing brackets to anything in an abelian algebra" if g.is_abelian() else None
 
 
 DISSIPATIONS = [
-    Case("killing", lambda g, H, rng: lt.KillingDissipation(rate=0.3 / g.dim), _no_killing),
-    Case("inner_product", lambda g, H, rng: lt.InnerProductDissipation(0.3 * _spd(rng, g.dim)), _abelian),
+    Case("killing", lambda g, H, rng: lt.KillingDissipation(rate=0.3 / g.dim), _killing_exemption),
+    Case("inner_product", lambda g, H, rng: lt.InnerProductDissipation(0.3 * _spd(rng, g.dim)), _abelian_exemption),
     Case("projected", lambda g, H, rng: lt.ProjectedMetric(rate=0.1)),
-    Case("projected_cometric", lambda g, H, rng: lt.ProjectedMetric(0.3 * _spd(rng, g.dim)), _line),
-    Case("projected_normalized", lambda g, H, rng: lt.ProjectedMetric(normalized=True, rate=0.3), _line),
+    Case("projected_cometric", lambda g, H, rng: lt.ProjectedMetric(0.3 * _spd(rng, g.dim)), _dimension_exemption),
+    Case("projected_normalized", lambda g, H, rng: lt.ProjectedMetric(normalized=True, rate=0.3), _dimension_exemption),
     Case(
         "projected_preserve",
         lambda g, H, rng: lt.ProjectedMetric(preserve=(lt.Quadratic(_spd(rng, g.dim)),), normalized=True, rate=0.3),
         lambda g: "one dimension leaves no room beside H and another function" if g.dim < 3 else None,
     ),
-    Case("friction_operator", _friction_operator, _line),
+    Case("friction_operator", _friction_operator, _dimension_exemption),
     Case(
         "kulkarni_nomizu",
         lambda g, H, rng: lt.FourBracket.kulkarni_nomizu(0.1 * _spd(rng, g.dim), _spd(rng, g.dim)),
-        _line,
+        _dimension_exemption,
     ),
     Case("four_bracket", _curvature_tensor),
-    Case("four_bracket_algebra", lambda g, H, rng: lt.FourBracket.lie_algebra(0.3 * np.eye(g.dim)), _abelian),
-    Case("potential_coulomb", lambda g, H, rng: lt.DissipationPotential(lt.CoulombFriction(0.3, 0.1)), _line),
+    Case("four_bracket_algebra", lambda g, H, rng: lt.FourBracket.lie_algebra(0.3 * np.eye(g.dim)), _abelian_exemption),
+    Case(
+        "potential_coulomb",
+        lambda g, H, rng: lt.DissipationPotential(lt.CoulombFriction(0.3, 0.1)),
+        _dimension_exemption,
+    ),
     Case(
         "potential_power_law",
         lambda g, H, rng: lt.DissipationPotential(
             lt.PowerLawFriction(2.5, 0.2, each=True), of=lt.ProjectedMetric(0.3 * _spd(rng, g.dim))
         ),
-        _line,
+        _dimension_exemption,
     ),
     Case(
         "potential_activated",
         lambda g, H, rng: lt.DissipationPotential(
             lt.ActivatedFriction(0.3, 2.0), of=lt.InnerProductDissipation(0.1 * _spd(rng, g.dim))
         ),
-        _abelian,
+        _abelian_exemption,
     ),
-    Case("double_bracket", lambda g, H, rng: lt.DoubleBracket(rate=0.1), _abelian),
-    Case("force", lambda g, H, rng: lt.EulerPoincareForce(lambda xi: 0.1 * jnp.sin(xi[::-1])), _abelian),
+    Case("double_bracket", lambda g, H, rng: lt.DoubleBracket(rate=0.1), _abelian_exemption),
+    Case("force", lambda g, H, rng: lt.EulerPoincareForce(lambda xi: 0.1 * jnp.sin(xi[::-1])), _abelian_exemption),
     Case(
         "sum",
         lambda g, H, rng: (

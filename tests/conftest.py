@@ -14,7 +14,7 @@ import hypothesis
 import jax
 import pytest
 
-QUICKLY_COMPILED = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+FAST_COMPILE_FLAGS = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 """Most programs of the default tier run once, and take longer to compile than to run: this takes a third off. With
 ``XLA_FLAGS`` of one's own, and in the slow tier, XLA optimises as it does for users."""
 
@@ -57,15 +57,15 @@ class Part:
 def pytest_configure(config):
     if config.option.part:
         config.pluginmanager.register(Part(config.option.part))
-    slow = "slow" in (config.option.markexpr or "") and "not slow" not in config.option.markexpr
-    hypothesis.settings.load_profile("liethermo-slow" if slow else "liethermo")
-    if not slow:
-        os.environ.setdefault("XLA_FLAGS", QUICKLY_COMPILED)
+    is_slow_tier = "slow" in (config.option.markexpr or "") and "not slow" not in config.option.markexpr
+    hypothesis.settings.load_profile("liethermo-slow" if is_slow_tier else "liethermo")
+    if not is_slow_tier:
+        os.environ.setdefault("XLA_FLAGS", FAST_COMPILE_FLAGS)
     if hasattr(config, "cache"):
-        _keep_what_is_compiled(config.cache.mkdir("compiled"))
+        _keep_compiled_programs(config.cache.mkdir("compiled"))
 
 
-def _keep_what_is_compiled(folder: Path) -> None:
+def _keep_compiled_programs(folder: Path) -> None:
     """By XLA and by the library, for later runs and for all processes of this one; ``--cache-clear`` forgets it."""
     os.environ["LIETHERMO_CACHE"] = str(folder / "liethermo")
     for name, value in {
@@ -88,45 +88,45 @@ def pytest_collection_modifyitems(config, items):
         mark = item.get_closest_marker("sampled")
         if mark and not item.get_closest_marker("slow"):
             cases[item.parent.nodeid, item.originalname, mark.args].append(item)
-    whole = not any("::" in argument for argument in config.args)
-    for (file, test, wanted), crossed in cases.items():
-        if isinstance(wanted[0], str):
-            unknown = set(wanted) - {item.callspec.id for item in crossed}
-            if unknown and whole:
+    no_test_is_named = not any("::" in argument for argument in config.args)
+    for (file, test, sample), test_cases in cases.items():
+        if isinstance(sample[0], str):
+            unknown = set(sample) - {item.callspec.id for item in test_cases}
+            if unknown and no_test_is_named:
                 raise pytest.UsageError(
                     f"{file}::{test} is to be sampled at {sorted(unknown)}, which are no cases of it"
                 )
-            kept = {i for i, item in enumerate(crossed) if item.callspec.id in wanted}
+            chosen_indices = {i for i, item in enumerate(test_cases) if item.callspec.id in sample}
         else:
-            kept = {(2 * i + 1) * len(crossed) // (2 * wanted[0]) for i in range(wanted[0])}
-        for i, item in enumerate(crossed):
-            if i not in kept:
+            chosen_indices = {(2 * i + 1) * len(test_cases) // (2 * sample[0]) for i in range(sample[0])}
+        for i, item in enumerate(test_cases):
+            if i not in chosen_indices:
                 item.add_marker("slow")
 
 
-COMPILED_BY_READING = 10
+MAX_COMPILED_BY_MODULE = 10
 """Programs that reading one module of tests may compile: constants and one small system. The most seen is 8."""
 
-_compiled: list[str] = []
+_compile_events: list[str] = []
 
 
 @jax.monitoring.register_event_duration_secs_listener
-def _count(event, *_, **__):
+def _record_compilation(event, *_, **__):
     if event == "/jax/core/compile/backend_compile_duration":
-        _compiled.append(event)
+        _compile_events.append(event)
 
 
 @pytest.hookimpl(hookwrapper=True)
 def pytest_make_collect_report(collector):
     """Every worker reads every module: what a module builds when it is read costs all of them, for any selection."""
-    before = len(_compiled)
+    compiled_before = len(_compile_events)
     outcome = yield
-    count = len(_compiled) - before
-    if isinstance(collector, pytest.Module) and count > COMPILED_BY_READING:
+    count = len(_compile_events) - compiled_before
+    if isinstance(collector, pytest.Module) and count > MAX_COMPILED_BY_MODULE:
         report = outcome.get_result()
         report.outcome = "failed"
         report.longrepr = (
-            f"{collector.nodeid} compiles {count} programs when it is read, more than {COMPILED_BY_READING}: "
+            f"{collector.nodeid} compiles {count} programs when it is read, more than {MAX_COMPILED_BY_MODULE}: "
             "build systems where they are used (tests.cases.BuiltOnUse, functools.cache)"
         )
 

@@ -20,7 +20,7 @@ import numpy as np
 from jax.extend.core import jaxprs_in_params
 
 from liethermo.tracing.scalarize import CompilerFault, UnsupportedPrimitive, scalarize
-from tests.fuzz_operations import DTYPES, INTEGERS, OPERATIONS, cut
+from tests.fuzz_operations import DTYPES, INTEGERS, OPERATIONS, limit_size
 from tests.machine_code import compiled
 from tests.scalar_programs import check
 
@@ -78,55 +78,55 @@ def function_of(seed: int, names: Sequence[str] | None = None, steps: int = 5) -
     random = np.random.default_rng(seed)
     names = list(OPERATIONS) if names is None else list(names)
     x = [jax.ShapeDtypeStruct((n,), jnp.float64) for n in SIZES]
-    program: list[tuple[Callable, tuple[int, ...], int]] = []
-    known, text = list(x), []
+    steps_done: list[tuple[Callable, tuple[int, ...], int]] = []
+    abstract_values, text = list(x), []
 
-    def applied(values):
+    def evaluate_steps(values):
         values = list(values)
-        for function, places, k in program:
+        for function, places, k in steps_done:
             values.append(function(*(values[i] for i in places), k))
         return values
 
-    def of_kind(kind: str) -> int:
+    def find_value(kind: str) -> int:
         """The place of a value of a kind; one that is converted where there is none."""
         if kind == "i":
-            fitting = [i for i, a in enumerate(known) if jnp.issubdtype(a.dtype, jnp.integer)]
+            candidates = [i for i, a in enumerate(abstract_values) if jnp.issubdtype(a.dtype, jnp.integer)]
         else:
-            fitting = [i for i, a in enumerate(known) if a.dtype == DTYPES[kind]]
-        if fitting and (kind == "f" or random.random() < 0.7):
-            newest = [i for i in fitting if i >= len(SIZES)]
-            return int(random.choice(newest if newest and random.random() < 0.8 else fitting))
-        source = of_kind("f")
+            candidates = [i for i, a in enumerate(abstract_values) if a.dtype == DTYPES[kind]]
+        if candidates and (kind == "f" or random.random() < 0.7):
+            computed = [i for i in candidates if i >= len(SIZES)]
+            return int(random.choice(computed if computed and random.random() < 0.8 else candidates))
+        source = find_value("f")
         number = float(np.round(random.uniform(-1.0, 1.0), 1))
         if kind == "b":
-            convert, said = (lambda a, k: a > number), f"> {number}"
+            convert, label = (lambda a, k: a > number), f"> {number}"
         elif kind == "i":
             t = random.choice(list(INTEGERS))
-            convert, said = (lambda a, k: (3.0 * a).astype(INTEGERS[t])), f"3 * . as {t}"
+            convert, label = (lambda a, k: (3.0 * a).astype(INTEGERS[t])), f"3 * . as {t}"
         else:
-            convert, said = (lambda a, k: a.astype(DTYPES[kind])), str(np.dtype(DTYPES[kind]))
-        return added(convert, (source,), 0, said)
+            convert, label = (lambda a, k: a.astype(DTYPES[kind])), str(np.dtype(DTYPES[kind]))
+        return add_step(convert, (source,), 0, label)
 
-    def added(function, places: tuple[int, ...], k: int, name: str) -> int:
-        result = jax.eval_shape(lambda *values: function(*values, k), *(known[i] for i in places))
-        program.append((function, places, k))
-        known.append(result)
+    def add_step(function, places: tuple[int, ...], k: int, name: str) -> int:
+        result = jax.eval_shape(lambda *values: function(*values, k), *(abstract_values[i] for i in places))
+        steps_done.append((function, places, k))
+        abstract_values.append(result)
         arguments = ", ".join(f"v{i}" for i in places)
-        text.append(f"v{len(known) - 1} = {name}({arguments}; {k})  # {result.dtype}{list(result.shape)}")
-        return len(known) - 1
+        text.append(f"v{len(abstract_values) - 1} = {name}({arguments}; {k})  # {result.dtype}{list(result.shape)}")
+        return len(abstract_values) - 1
 
     for _ in range(steps):
         name = str(random.choice(names))
         kinds, function = OPERATIONS[name]
-        places = tuple(of_kind(kind) for kind in kinds)
-        added(lambda *a, f=function: cut(f(*a)), places, int(random.integers(6)), name)
-    if known[-1].dtype != jnp.float64:
-        convert = jnp.abs if known[-1].dtype == jnp.complex128 else lambda a: a.astype(jnp.float64)
-        added(lambda a, k: convert(a), (len(known) - 1,), 0, "as a number")
-    results = [i for i, a in enumerate(known) if i >= len(SIZES)]
+        places = tuple(find_value(kind) for kind in kinds)
+        add_step(lambda *a, f=function: limit_size(f(*a)), places, int(random.integers(6)), name)
+    if abstract_values[-1].dtype != jnp.float64:
+        convert = jnp.abs if abstract_values[-1].dtype == jnp.complex128 else lambda a: a.astype(jnp.float64)
+        add_step(lambda a, k: convert(a), (len(abstract_values) - 1,), 0, "as a number")
+    results = [i for i, a in enumerate(abstract_values) if i >= len(SIZES)]
 
     def call(x, y):
-        values = applied((x, y))
+        values = evaluate_steps((x, y))
         outputs = []
         for i in results:
             a = values[i]
@@ -154,11 +154,11 @@ def points_of(random, count: int) -> list[list[np.ndarray]]:
 
 def primitives_drawn() -> set[str]:
     """Return the names of the primitives that the operations are made of, and their derivatives."""
-    found: set[str] = set()
+    names: set[str] = set()
 
     def collect(jaxpr) -> None:
         for eqn in jaxpr.eqns:
-            found.add(eqn.primitive.name)
+            names.add(eqn.primitive.name)
             for inner in jaxprs_in_params(eqn.params):
                 collect(inner)
 
@@ -167,9 +167,9 @@ def primitives_drawn() -> set[str]:
         for k in range(6):
             collect(jax.make_jaxpr(lambda *a, f=function, k=k: f(*a, k))(*arrays).jaxpr)
     for name, summary in (("solve", "gradient"), ("where", "gradient"), ("scatter set", "gradient")):
-        closed = jax.make_jaxpr(SUMMARIES[summary](function_of(0, [name], steps=1).call))
-        collect(closed(*[jax.ShapeDtypeStruct((n,), jnp.float64) for n in SIZES]).jaxpr)
-    return found
+        make_jaxpr = jax.make_jaxpr(SUMMARIES[summary](function_of(0, [name], steps=1).call))
+        collect(make_jaxpr(*[jax.ShapeDtypeStruct((n,), jnp.float64) for n in SIZES]).jaxpr)
+    return names
 
 
 class Outcome(NamedTuple):
@@ -184,12 +184,12 @@ LANES = 4
 TOLERANT: dict[str, Any] = {"hidden_nan": True, "composed": True, "slack": 64.0}
 
 
-def _agrees_one_by_one(f: Callable, program, point, found) -> bool:
+def _agrees_one_by_one(f: Callable, program, point, outputs) -> bool:
     """Whether values are JAX's where each operation is compiled by itself: XLA simplifies NaN times a zero away."""
     with jax.disable_jit():
-        right = [np.asarray(leaf) for leaf in jax.tree_util.tree_leaves(f(*map(jnp.asarray, point)))]
+        expected = [np.asarray(leaf) for leaf in jax.tree_util.tree_leaves(f(*map(jnp.asarray, point)))]
     try:
-        check(program, point, right, found, **TOLERANT)
+        check(program, point, expected, outputs, **TOLERANT)
     except AssertionError:
         return False
     return True
@@ -200,42 +200,47 @@ def compared(function: Function, summary: str, seed: int, count: int = 6, machin
     f, points = SUMMARIES[summary](function.call), points_of(np.random.default_rng(seed), count)
     structs = [jax.ShapeDtypeStruct((n,), jnp.float64) for n in SIZES]
     try:
-        closed = jax.make_jaxpr(f)(*structs)
+        jaxpr = jax.make_jaxpr(f)(*structs)
     except (NotImplementedError, ValueError, TypeError) as error:  # JAX cannot differentiate it
         return Outcome("refused", f"by JAX: {type(error).__name__} {str(error)[:60]}")
     try:
-        program = scalarize(closed)
+        program = scalarize(jaxpr)
     except UnsupportedPrimitive as error:
         if isinstance(error, CompilerFault):
             return Outcome("differs", f"the compiler fails: {error}")
         return Outcome("refused", f"{error.primitive} {error.reason}")
     except Exception:
         return Outcome("differs", f"the compiler fails:\n{traceback.format_exc(limit=-3)}")
-    right = jax.jit(f)
-    expected = [[np.asarray(leaf) for leaf in jax.tree_util.tree_leaves(right(*point))] for point in points]
+    reference = jax.jit(f)
+    expected = [[np.asarray(leaf) for leaf in jax.tree_util.tree_leaves(reference(*point))] for point in points]
     try:
-        interpreted = [program.evaluate(*point) for point in points]
-        ways = {"interpreted": interpreted}
+        interpreted_values = [program.evaluate(*point) for point in points]
+        values_by_engine = {"interpreted": interpreted_values}
         if machine_code:
-            alone = compiled(program)
-            ways["machine code"] = [alone(*point) for point in points]
-            lanes = compiled(program, LANES)
+            run_one = compiled(program)
+            values_by_engine["machine code"] = [run_one(*point) for point in points]
+            run_lanes = compiled(program, LANES)
             for i in range(0, count, LANES):
-                some = [points[(i + j) % count] for j in range(LANES)]
-                found = lanes(*(np.stack(column) for column in zip(*some, strict=True)))
+                lane_points = [points[(i + j) % count] for j in range(LANES)]
+                lane_outputs = run_lanes(*(np.stack(column) for column in zip(*lane_points, strict=True)))
                 for j in range(LANES):
-                    for own, one in zip(found, ways["machine code"][(i + j) % count], strict=True):
-                        if not np.array_equal(own[j], one, equal_nan=True):
-                            return Outcome("differs", f"lane {j} has {own[j]}, a single run {one} at {some[j]}")
+                    for lane_output, single_output in zip(
+                        lane_outputs, values_by_engine["machine code"][(i + j) % count], strict=True
+                    ):
+                        if not np.array_equal(lane_output[j], single_output, equal_nan=True):
+                            return Outcome(
+                                "differs",
+                                f"lane {j} has {lane_output[j]}, a single run {single_output} at {lane_points[j]}",
+                            )
     except Exception:
         return Outcome("differs", f"fails at run time:\n{traceback.format_exc(limit=-3)}")
-    for way, values in ways.items():
-        for point, right, found in zip(points, expected, values, strict=True):
+    for engine, values in values_by_engine.items():
+        for point, expected_outputs, outputs in zip(points, expected, values, strict=True):
             try:
-                check(program, point, right, found, **TOLERANT)
+                check(program, point, expected_outputs, outputs, **TOLERANT)
             except AssertionError as error:
-                if not _agrees_one_by_one(f, program, point, found):
-                    return Outcome("differs", f"{way}, at {[a.tolist() for a in point]}: {error}")
+                if not _agrees_one_by_one(f, program, point, outputs):
+                    return Outcome("differs", f"{engine}, at {[a.tolist() for a in point]}: {error}")
     return Outcome("agrees", "")
 
 
@@ -266,10 +271,10 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=None, help="of the first function; by default one of the clock")
     parser.add_argument("--only", nargs="*", help="names of operations")
     parser.add_argument("--no-machine-code", action="store_true")
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    seed = int(time.time()) if given.seed is None else given.seed
-    counts = searched(given.seconds, seed, given.only, not given.no_machine_code)
+    seed = int(time.time()) if arguments.seed is None else arguments.seed
+    counts = searched(arguments.seconds, seed, arguments.only, not arguments.no_machine_code)
     for name, count in counts.most_common():
         print(f"{count:6}  {name}")
     return int(counts["differs"] > 0)

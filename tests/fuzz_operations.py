@@ -26,12 +26,12 @@ class Operation(NamedTuple):
     function: Callable
 
 
-def resized(b, a):
+def resize_like(b, a):
     """b in the shape of a."""
     return jnp.resize(b, a.shape)
 
 
-def cut(a):
+def limit_size(a):
     """An array with at most MAX_ENTRIES entries and two axes."""
     a = a.reshape(-1, a.shape[-1]) if a.ndim > 2 else a
     if a.size <= MAX_ENTRIES:
@@ -69,7 +69,7 @@ def distinct(a):
 
 
 def complex_of(a, b):
-    return lax.complex(a, resized(b, a))
+    return lax.complex(a, resize_like(b, a))
 
 
 def index_of(i, n: int):
@@ -83,15 +83,15 @@ def unary(name: str):
 
 def binary(name: str):
     function = getattr(lax, name)
-    return lambda a, b, k: function(a, resized(b, a).astype(a.dtype))
+    return lambda a, b, k: function(a, resize_like(b, a).astype(a.dtype))
 
 
-def chosen(*choices):
+def choose_by_k(*choices):
     """``k`` says which."""
     return lambda *arguments: choices[arguments[-1] % len(choices)](*arguments[:-1])
 
 
-def on_indices(f):
+def with_index(f):
     """A function of a vector, an index that is computed, and a vector of values."""
     return lambda a, i, b, k: f(vector(a), i.astype(jnp.int64).ravel()[0] if k % 2 else index_of(i, 4), vector(b))
 
@@ -102,7 +102,7 @@ logistic erf erfc square floor ceil
 """
 BINARY = "add sub mul div max min atan2 rem pow"
 COMPARISONS = "eq ne lt le gt ge"
-OF_COMPLEX = "neg sign exp log log1p expm1 sqrt sin cos sinh cosh tanh tan square conj"
+COMPLEX_UNARY = "neg sign exp log log1p expm1 sqrt sin cos sinh cosh tanh tan square conj"
 SCATTERS = ("set", "add", "subtract", "multiply", "min", "max")
 
 OPERATIONS: dict[str, Operation] = {
@@ -110,19 +110,21 @@ OPERATIONS: dict[str, Operation] = {
     **{name: Operation("ff", binary(name)) for name in BINARY.split()},
     **{f"{name} of {kind}": Operation(kind * 2, binary(name)) for name in COMPARISONS.split() for kind in "fibs"},
     # truth values
-    "and": Operation("bb", lambda a, b, k: a & resized(b, a)),
-    "or": Operation("bb", lambda a, b, k: a | resized(b, a)),
-    "xor": Operation("bb", lambda a, b, k: a ^ resized(b, a)),
+    "and": Operation("bb", lambda a, b, k: a & resize_like(b, a)),
+    "or": Operation("bb", lambda a, b, k: a | resize_like(b, a)),
+    "xor": Operation("bb", lambda a, b, k: a ^ resize_like(b, a)),
     "not": Operation("b", lambda a, k: ~a),
     "is_finite": Operation("f", lambda a, k: jnp.isfinite(a)),
     "max of truths": Operation(
-        "bb", chosen(lambda a, b: lax.max(a, resized(b, a)), lambda a, b: lax.min(a, resized(b, a)))
+        "bb", choose_by_k(lambda a, b: lax.max(a, resize_like(b, a)), lambda a, b: lax.min(a, resize_like(b, a)))
     ),
-    "all, any": Operation("b", chosen(jnp.all, jnp.any, lambda a: jnp.argmax(a) > 1, lambda a: jnp.sort(vector(a)))),
-    "sum of truths": Operation("b", chosen(jnp.sum, jnp.mean, jnp.cumsum, jnp.prod, lambda a: jnp.max(a) * 2)),
+    "all, any": Operation(
+        "b", choose_by_k(jnp.all, jnp.any, lambda a: jnp.argmax(a) > 1, lambda a: jnp.sort(vector(a)))
+    ),
+    "sum of truths": Operation("b", choose_by_k(jnp.sum, jnp.mean, jnp.cumsum, jnp.prod, lambda a: jnp.max(a) * 2)),
     "product with truths": Operation(
         "bf",
-        chosen(
+        choose_by_k(
             lambda a, b: jnp.dot(vector(a), vector(b)),
             lambda a, b: jnp.einsum("i,j->ij", vector(a, 2), vector(b, 2)),
             lambda a, b: vector(a) * vector(b),
@@ -132,7 +134,7 @@ OPERATIONS: dict[str, Operation] = {
     ),
     "product with integers": Operation(
         "if",
-        chosen(
+        choose_by_k(
             lambda a, b: jnp.dot(vector(a), vector(b)),
             lambda a, b: jnp.einsum("i,i->i", vector(a), vector(b)),
             lambda a, b: vector(b) ** vector(a),
@@ -148,17 +150,17 @@ OPERATIONS: dict[str, Operation] = {
         for name in "add sub mul max min div rem bitwise_and bitwise_or bitwise_xor".split()
     },
     "unary of integers": Operation(
-        "i", chosen(lax.neg, jnp.abs, lax.sign, lax.square, lambda a: lax.integer_pow(a, 3))
+        "i", choose_by_k(lax.neg, jnp.abs, lax.sign, lax.square, lambda a: lax.integer_pow(a, 3))
     ),
     "sums of integers": Operation(
-        "i", chosen(jnp.sum, jnp.prod, jnp.cumsum, jnp.max, jnp.argmin, lambda a: jnp.sort(vector(a)), jnp.argsort)
+        "i", choose_by_k(jnp.sum, jnp.prod, jnp.cumsum, jnp.max, jnp.argmin, lambda a: jnp.sort(vector(a)), jnp.argsort)
     ),
     "floor_divide": Operation(
         "ii",
-        chosen(
-            lambda a, b: a // resized(b, a).astype(a.dtype),
-            lambda a, b: a % resized(b, a).astype(a.dtype),
-            lambda a, b: jnp.where(a > resized(b, a), a, 3),
+        choose_by_k(
+            lambda a, b: a // resize_like(b, a).astype(a.dtype),
+            lambda a, b: a % resize_like(b, a).astype(a.dtype),
+            lambda a, b: jnp.where(a > resize_like(b, a), a, 3),
         ),
     ),
     "power of integers": Operation("i", lambda a, k: jnp.clip(a, -3, 3) ** (k % 4)),
@@ -179,52 +181,57 @@ OPERATIONS: dict[str, Operation] = {
     "to single": Operation("f", lambda a, k: a.astype(jnp.float32)),
     "from single": Operation("s", lambda a, k: a.astype(jnp.float64)),
     # single precision
-    "unary of single": Operation("s", chosen(lax.neg, lax.abs, lax.sign, lax.square, lax.floor, lax.sqrt)),
+    "unary of single": Operation("s", choose_by_k(lax.neg, lax.abs, lax.sign, lax.square, lax.floor, lax.sqrt)),
     "binary of single": Operation(
-        "ss", chosen(*(lambda a, b, f=f: f(a, resized(b, a)) for f in (lax.add, lax.sub, lax.mul, lax.max, lax.min)))
+        "ss",
+        choose_by_k(
+            *(lambda a, b, f=f: f(a, resize_like(b, a)) for f in (lax.add, lax.sub, lax.mul, lax.max, lax.min))
+        ),
     ),
-    "sum of single": Operation("s", chosen(jnp.sum, jnp.max, lambda a: jnp.sort(vector(a)))),
+    "sum of single": Operation("s", choose_by_k(jnp.sum, jnp.max, lambda a: jnp.sort(vector(a)))),
     # complex numbers
     "complex": Operation("ff", lambda a, b, k: complex_of(a, b)),
     "to complex": Operation("f", lambda a, k: a.astype(jnp.complex128)),
-    **{f"complex {name}": Operation("c", unary(name)) for name in OF_COMPLEX.split()},
+    **{f"complex {name}": Operation("c", unary(name)) for name in COMPLEX_UNARY.split()},
     **{f"complex {name}": Operation("cc", binary(name)) for name in "add sub mul div".split()},
     "complex power": Operation(
-        "c", chosen(lambda a: lax.integer_pow(a, 3), lambda a: lax.integer_pow(a, -2), lambda a: a**0.5)
+        "c", choose_by_k(lambda a: lax.integer_pow(a, 3), lambda a: lax.integer_pow(a, -2), lambda a: a**0.5)
     ),
-    "from complex": Operation("c", chosen(jnp.real, jnp.imag, jnp.abs)),
+    "from complex": Operation("c", choose_by_k(jnp.real, jnp.imag, jnp.abs)),
     "complex moved": Operation(
         "cc",
-        chosen(
-            lambda a, b: jnp.where(jnp.real(a) > 0, a, resized(b, a)),
+        choose_by_k(
+            lambda a, b: jnp.where(jnp.real(a) > 0, a, resize_like(b, a)),
             lambda a, b: vector(a) @ vector(b),
             lambda a, b: jnp.sum(a),
             lambda a, b: jnp.prod(vector(a, 3)),
-            lambda a, b: a == resized(b, a),
+            lambda a, b: a == resize_like(b, a),
             lambda a, b: vector(a)[::-1],
         ),
     ),
     # choices
     "where": Operation(
         "bff",
-        chosen(
-            lambda b, x, y: jnp.where(resized(b, x), x, resized(y, x)),
-            lambda b, x, y: jnp.where(resized(b, x), x, 0.0),
-            lambda b, x, y: jnp.where(resized(b, x), 1.0 / x, resized(y, x)),
+        choose_by_k(
+            lambda b, x, y: jnp.where(resize_like(b, x), x, resize_like(y, x)),
+            lambda b, x, y: jnp.where(resize_like(b, x), x, 0.0),
+            lambda b, x, y: jnp.where(resize_like(b, x), 1.0 / x, resize_like(y, x)),
         ),
     ),
     "select_n": Operation(
-        "iff", lambda i, x, y, k: lax.select_n(jnp.abs(resized(i, x)).astype(jnp.int32) % 3, x, resized(y, x), x * x)
+        "iff",
+        lambda i, x, y, k: lax.select_n(jnp.abs(resize_like(i, x)).astype(jnp.int32) % 3, x, resize_like(y, x), x * x),
     ),
     "clamp": Operation(
-        "fff", lambda a, b, c, k: lax.clamp(resized(b, a), a, resized(c, a)) if k % 2 else jnp.clip(a, -0.5, 1.0)
+        "fff",
+        lambda a, b, c, k: lax.clamp(resize_like(b, a), a, resize_like(c, a)) if k % 2 else jnp.clip(a, -0.5, 1.0),
     ),
     "round": Operation(
-        "f", chosen(jnp.round, lambda a: lax.round(a, lax.RoundingMethod.AWAY_FROM_ZERO), jnp.trunc, jnp.rint)
+        "f", choose_by_k(jnp.round, lambda a: lax.round(a, lax.RoundingMethod.AWAY_FROM_ZERO), jnp.trunc, jnp.rint)
     ),
     "cond": Operation(
         "bf",
-        chosen(
+        choose_by_k(
             lambda b, a: lax.cond(b.ravel()[0], lambda z: jnp.sin(z) * z, lambda z: 2.0 * z, a),
             lambda b, a: lax.cond(
                 b.ravel()[0], lambda z: z, lambda z: jnp.exp(jnp.sin(z)) - jnp.cos(z**3) / (1 + z * z), a
@@ -254,7 +261,7 @@ OPERATIONS: dict[str, Operation] = {
         "ii", lambda a, i, k: vector(a).at[i.ravel()[0]].get(mode=["fill", "clip", None][k % 3])
     ),
     **{
-        f"scatter {name}": Operation("fif", on_indices(lambda a, i, b, name=name: getattr(a.at[i], name)(b[0])))
+        f"scatter {name}": Operation("fif", with_index(lambda a, i, b, name=name: getattr(a.at[i], name)(b[0])))
         for name in SCATTERS
     },
     **{
@@ -283,9 +290,9 @@ OPERATIONS: dict[str, Operation] = {
     ),
     "searchsorted": Operation("f", lambda a, k: jnp.searchsorted(jnp.array([-1.0, 0.0, 0.0, 2.0]), a)),
     # arrangement
-    "flip": Operation("f", chosen(jnp.flip, lambda a: jnp.flip(a.ravel()[0], ()), lambda a: a.T)),
+    "flip": Operation("f", choose_by_k(jnp.flip, lambda a: jnp.flip(a.ravel()[0], ()), lambda a: a.T)),
     "flip of others": Operation(
-        "ib", chosen(lambda i, b: jnp.flip(i), lambda i, b: jnp.flip(b), lambda i, b: jnp.flip(b.ravel()[0], ()))
+        "ib", choose_by_k(lambda i, b: jnp.flip(i), lambda i, b: jnp.flip(b), lambda i, b: jnp.flip(b.ravel()[0], ()))
     ),
     "transpose": Operation("f", lambda a, k: matrix(a, 2).T),
     "broadcast": Operation("f", lambda a, k: jnp.broadcast_to(a.ravel()[0], (k % 3 + 1,))),
@@ -294,7 +301,7 @@ OPERATIONS: dict[str, Operation] = {
     "stack": Operation("ff", lambda a, b, k: jnp.stack([vector(a, 3), vector(b, 3)], axis=k % 2)),
     "stack of scalars": Operation(
         "fbi",
-        chosen(
+        choose_by_k(
             lambda a, b, i: jnp.stack([a.ravel()[0]] * 2),
             lambda a, b, i: jnp.stack([b.ravel()[0]] * 2),
             lambda a, b, i: jnp.stack([i.ravel()[0]] * 2),
@@ -302,7 +309,7 @@ OPERATIONS: dict[str, Operation] = {
     ),
     "unstack, split": Operation(
         "f",
-        chosen(
+        choose_by_k(
             lambda a: jnp.unstack(vector(a))[2],
             lambda a: jnp.split(vector(a), 2)[1],
             lambda a: jnp.unstack(matrix(a, 2), axis=1)[0],
@@ -316,23 +323,24 @@ OPERATIONS: dict[str, Operation] = {
     "iota": Operation("f", lambda a, k: vector(a) * jnp.arange(4) + lax.broadcasted_iota(jnp.float64, (4,), 0)),
     "tril": Operation("f", lambda a, k: jnp.tril(matrix(a, 2), k - 2)),
     "diagonal": Operation(
-        "f", chosen(lambda a: jnp.diag(matrix(a)), lambda a: jnp.diag(vector(a, 2)), lambda a: jnp.trace(matrix(a)))
+        "f",
+        choose_by_k(lambda a: jnp.diag(matrix(a)), lambda a: jnp.diag(vector(a, 2)), lambda a: jnp.trace(matrix(a))),
     ),
     # reductions
     "reduce": Operation(
-        "f", chosen(jnp.sum, jnp.prod, jnp.max, jnp.min, jnp.mean, lambda a: jnp.sum(a, axis=-1) if a.ndim else a)
+        "f", choose_by_k(jnp.sum, jnp.prod, jnp.max, jnp.min, jnp.mean, lambda a: jnp.sum(a, axis=-1) if a.ndim else a)
     ),
-    "argmax": Operation("f", chosen(jnp.argmax, jnp.argmin)),
+    "argmax": Operation("f", choose_by_k(jnp.argmax, jnp.argmin)),
     "cumulative": Operation("f", lambda a, k: (jnp.cumsum, jnp.cumprod, lax.cummax, lax.cummin)[k % 4](vector(a), 0)),
     "cumulative, reverse": Operation(
         "f", lambda a, k: (lax.cumsum, lax.cumprod, lax.cummax)[k % 3](vector(a), 0, reverse=True)
     ),
     "logsumexp": Operation(
-        "f", chosen(jax.scipy.special.logsumexp, lambda a: jax.nn.softmax(vector(a)), jnp.linalg.norm)
+        "f", choose_by_k(jax.scipy.special.logsumexp, lambda a: jax.nn.softmax(vector(a)), jnp.linalg.norm)
     ),
     "sort": Operation(
         "f",
-        chosen(
+        choose_by_k(
             lambda a: jnp.sort(vector(a)), jnp.median, lambda a: jnp.argsort(a), lambda a: jnp.sort(vector(a))[::-1]
         ),
     ),
@@ -342,13 +350,13 @@ OPERATIONS: dict[str, Operation] = {
     "matmul": Operation("ff", lambda a, b, k: matrix(a, 2) @ jnp.resize(b, (2, k % 3 + 1))),
     "einsum": Operation(
         "ff",
-        chosen(
+        choose_by_k(
             lambda a, b: jnp.einsum("ij,j->i", matrix(a, 2), vector(b, 2)),
             lambda a, b: jnp.outer(vector(a, 2), vector(b, 3)),
             lambda a, b: jnp.einsum("ij,ij->j", matrix(a, 2), matrix(b, 2)),
             lambda a, b: jnp.cross(vector(a, 3), vector(b, 3)),
             lambda a, b: jnp.kron(vector(a, 2), vector(b, 2)),
-            lambda a, b: jnp.vdot(a.ravel(), resized(b, a).ravel()),
+            lambda a, b: jnp.vdot(a.ravel(), resize_like(b, a).ravel()),
         ),
     ),
     "convolve": Operation("ff", lambda a, b, k: jnp.convolve(vector(a, 3), vector(b, 2), mode=["full", "same"][k % 2])),
@@ -356,11 +364,15 @@ OPERATIONS: dict[str, Operation] = {
     # linear algebra
     "solve": Operation(
         "ff",
-        chosen(lambda a, b: jnp.linalg.solve(positive(a), vector(b, 3)), lambda a, b: jnp.linalg.inv(positive(a))[0]),
+        choose_by_k(
+            lambda a, b: jnp.linalg.solve(positive(a), vector(b, 3)), lambda a, b: jnp.linalg.inv(positive(a))[0]
+        ),
     ),
-    "det": Operation("f", chosen(lambda a: jnp.linalg.det(positive(a)), lambda a: jnp.linalg.slogdet(positive(a))[1])),
+    "det": Operation(
+        "f", choose_by_k(lambda a: jnp.linalg.det(positive(a)), lambda a: jnp.linalg.slogdet(positive(a))[1])
+    ),
     "eigh": Operation(
-        "f", chosen(lambda a: jnp.linalg.eigvalsh(distinct(a)), lambda a: jnp.linalg.eigh(distinct(a))[1] ** 2)
+        "f", choose_by_k(lambda a: jnp.linalg.eigvalsh(distinct(a)), lambda a: jnp.linalg.eigh(distinct(a))[1] ** 2)
     ),
     "svd": Operation("f", lambda a, k: jnp.linalg.svd(distinct(a), compute_uv=False)),
     "qr": Operation("f", lambda a, k: jnp.abs(jnp.diag(jnp.linalg.qr(positive(a))[1]))),
@@ -375,7 +387,7 @@ OPERATIONS: dict[str, Operation] = {
     # loops
     "scan": Operation(
         "ff",
-        chosen(
+        choose_by_k(
             lambda a, b: lax.scan(lambda c, t: (0.5 * jnp.sin(c) + t, c * t), jnp.float64(1.0), vector(a))[1],
             lambda a, b: lax.scan(lambda c, t: (c * t, c), a, vector(b, 3), reverse=True)[0],
             lambda a, b: lax.scan(lambda c, t: (jnp.where(c > t, c, t), c > t), jnp.float64(0.0), vector(a))[1],
@@ -386,14 +398,14 @@ OPERATIONS: dict[str, Operation] = {
     ),
     "fori_loop": Operation(
         "f",
-        chosen(
+        choose_by_k(
             lambda a: lax.fori_loop(0, 3, lambda i, s: jnp.sin(s) + i, a),
             lambda a: lax.fori_loop(0, 40, lambda i, s: 0.9 * s + 0.1 * jnp.cos(s + i), a),
         ),
     ),
     "while": Operation(
         "f",
-        chosen(
+        choose_by_k(
             lambda a: lax.while_loop(
                 lambda s: jnp.sum(jnp.abs(s[1])) > 1.0, lambda s: (s[0] + 1, 0.5 * s[1]), (0, tame(a))
             )[1],
@@ -414,14 +426,14 @@ OPERATIONS: dict[str, Operation] = {
     # calls
     "jit": Operation("f", lambda a, k: jax.jit(lambda z: jnp.sin(z) * z)(a)),
     "custom derivatives": Operation(
-        "f", chosen(jax.nn.softplus, jax.nn.relu, jax.nn.gelu, jax.nn.silu, jax.nn.elu, jax.nn.log_sigmoid)
+        "f", choose_by_k(jax.nn.softplus, jax.nn.relu, jax.nn.gelu, jax.nn.silu, jax.nn.elu, jax.nn.log_sigmoid)
     ),
     "checkpoint": Operation("f", lambda a, k: jax.checkpoint(lambda z: jnp.sin(z) * z)(a)),
     "stop_gradient": Operation("f", lambda a, k: lax.stop_gradient(a) * a),
     "optimization_barrier": Operation("f", lambda a, k: lax.optimization_barrier(a) + 1.0),
     "mod": Operation(
         "f",
-        chosen(
+        choose_by_k(
             lambda a: jnp.mod(a, 0.7),
             lambda a: jnp.floor_divide(a, 0.3),
             lambda a: jnp.fmod(a, 0.3),
@@ -436,11 +448,12 @@ OPERATIONS: dict[str, Operation] = {
     "lgamma": Operation("f", lambda a, k: lax.lgamma(a)),
     "digamma": Operation("f", lambda a, k: lax.digamma(a)),
     "polygamma": Operation("f", lambda a, k: jax.scipy.special.polygamma(k % 4, a)),
-    "zeta": Operation("ff", lambda a, b, k: lax.zeta(a, resized(b, a))),
+    "zeta": Operation("ff", lambda a, b, k: lax.zeta(a, resize_like(b, a))),
     "erf_inv": Operation("f", lambda a, k: lax.erf_inv(a)),
-    "bessel": Operation("f", chosen(lax.bessel_i0e, lax.bessel_i1e)),
+    "bessel": Operation("f", choose_by_k(lax.bessel_i0e, lax.bessel_i1e)),
     "igamma": Operation(
-        "ff", lambda a, b, k: (lax.igamma, lax.igammac)[k % 2](lax.stop_gradient(moderate(a)), moderate(resized(b, a)))
+        "ff",
+        lambda a, b, k: (lax.igamma, lax.igammac)[k % 2](lax.stop_gradient(moderate(a)), moderate(resize_like(b, a))),
     ),
-    "betainc": Operation("ff", lambda a, b, k: lax.betainc(1.5, 0.5 + k, moderate(resized(b, a)))),
+    "betainc": Operation("ff", lambda a, b, k: lax.betainc(1.5, 0.5 + k, moderate(resize_like(b, a)))),
 }

@@ -26,7 +26,7 @@ def jax_values(f, *args) -> list[np.ndarray]:
     return [np.asarray(leaf) for leaf in jax.tree_util.tree_leaves(jax.jit(f)(*args))]
 
 
-def nudged(program: Program, args, seed: int, composed: bool = False) -> list[np.ndarray]:
+def perturbed_outputs(program: Program, args, seed: int, composed: bool = False) -> list[np.ndarray]:
     """The outputs when every instruction's result is off by up to four units in its last place.
 
     ``composed``: zeros get any sign, as a structural zero has none, and subnormal numbers become zero in some runs, as
@@ -34,7 +34,7 @@ def nudged(program: Program, args, seed: int, composed: bool = False) -> list[np
     """
     noise = np.random.default_rng(seed)
 
-    def moved(value, eps=EPS):
+    def perturb(value, eps=EPS):
         if not isinstance(value, tuple | list) and np.asarray(value).dtype == np.float64:
             value = value * (1.0 + eps * noise.uniform(-4, 4, np.shape(value)))
             if composed:
@@ -45,12 +45,12 @@ def nudged(program: Program, args, seed: int, composed: bool = False) -> list[np
 
     entries = np.concatenate([np.ravel(x) for x in args]).astype(np.float64)
     names = sum(program.inputs, ())
-    given = [moved(a) if composed and abs(a) < SMALLEST_NORMAL else a for a in entries]
-    values = dict(zip(names, given, strict=True))
+    inputs = [perturb(a) if composed and abs(a) < SMALLEST_NORMAL else a for a in entries]
+    values = dict(zip(names, inputs, strict=True))
     with np.errstate(all="ignore"):
         for target, op, operands in program.instructions:
             result = implementation(op)(*(values[a] if isinstance(a, str) else a for a in operands))
-            values[target] = moved(result, EPS_SINGLE if composed and op == "single" else EPS)
+            values[target] = perturb(result, EPS_SINGLE if composed and op == "single" else EPS)
     return [np.array([values[a] if isinstance(a, str) else a for a in row], float) for row in program.outputs]
 
 
@@ -69,13 +69,13 @@ def check(
     """
     found = program.evaluate(*args) if found is None else found
     assert [a.shape for a in found] == [a.shape for a in expected]
-    runs = [nudged(program, args, seed, composed) for seed in range(6)]
+    runs = [perturbed_outputs(program, args, seed, composed) for seed in range(6)]
     for i, (right, got) in enumerate(zip(expected, found, strict=True)):
         right, got = right.astype(float).ravel(), got.astype(float).ravel()
-        moved = np.array([run[i] for run in runs])
-        steady = (kind(moved) == kind(got)).all(axis=0)
+        perturbed = np.array([run[i] for run in runs])
+        steady = (kind(perturbed) == kind(got)).all(axis=0)
         with np.errstate(all="ignore"):
-            spread = np.abs(moved - got).max(axis=0)
+            spread = np.abs(perturbed - got).max(axis=0)
             close = np.abs(got - right) <= slack * spread + 2 * slack * EPS * np.abs(right) + 1e-300
         bad = ~np.where(np.isfinite(right), close, hidden_nan & np.isnan(right) | (kind(right) == kind(got))) & steady
         assert not bad.any(), f"output {i}: {got[bad]} is not {right[bad]}, spread {spread[bad]}"

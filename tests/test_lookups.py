@@ -68,10 +68,10 @@ def lookups():
 
 
 def test_no_member_of_ours_is_looked_up_with_a_silent_default():
-    unknown = [found for found in lookups() if found[2] not in FOREIGN and (found[0], found[2]) not in OURS]
+    unknown = [lookup for lookup in lookups() if lookup[2] not in FOREIGN and (lookup[0], lookup[2]) not in OURS]
     assert not unknown, unknown
 
 
-@pytest.mark.parametrize("known", OURS)
-def test_what_is_excused_is_still_there(known):
-    assert known in {(file, name) for file, _, name in lookups()}
+@pytest.mark.parametrize("excused_lookup", OURS)
+def test_what_is_excused_is_still_there(excused_lookup):
+    assert excused_lookup in {(file, name) for file, _, name in lookups()}

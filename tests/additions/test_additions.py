@@ -24,13 +24,13 @@ def prey():
 
 
 @functools.cache
-def on_the_ring():
+def ring_system():
     friction = lt.ProjectedMetric(normalized=True)
     return lt.MetriplecticSystem(None, lambda x: x[2] + 0.1 * x[0], lambda x: x[1] - x[0] ** 2, friction, space=Ring())
 
 
-def moved_on_the_ring(method):
-    return lt.integrate(on_the_ring(), Ring().random(0), (0.0, 2.0), 0.1, method)
+def run_on_ring(method):
+    return lt.integrate(ring_system(), Ring().random(0), (0.0, 2.0), 0.1, method)
 
 
 def test_the_algebra():
@@ -48,7 +48,7 @@ def test_the_group():
 
 
 def test_the_space():
-    run = moved_on_the_ring(lt.MetriplecticMidpoint())
+    run = run_on_ring(lt.MetriplecticMidpoint())
     assert np.ptp(run.energy) < 1e-14
     assert run.entropy[-1] > run.entropy[0]
     assert Ring().belongs(run.x).all()
@@ -70,7 +70,7 @@ def test_the_integrator():
     [
         lambda: mf.testing.check_group(AFFINE),
         lambda: mf.testing.check_space(Ring()),
-        lambda: moved_on_the_ring(lt.MetriplecticRungeKutta(4)).audit(),
+        lambda: run_on_ring(lt.MetriplecticRungeKutta(4)).audit(),
         lambda: lt.testing.check_dissipation(Steep(0.2), mf.so(3)),
         lambda: lt.testing.check_method(Simpson()),
         lambda: lt.testing.check_system(prey(), START),

@@ -73,30 +73,30 @@ def row(paper: str, where: str, what: str, beside: str, *arguments) -> Callable:
     return enter
 
 
-def agree(found: Figure, kept: str) -> bool:
+def agree(figure: Figure, page_text: str) -> bool:
     """Whether a figure is that of the page: orders and values to their digits, rounding within a power of ten."""
-    if isinstance(found, Order):
-        return kept.startswith("order ") and abs(found - float(kept.removeprefix("order "))) < 0.02
-    number = float(re.sub(r"\$(.*) \\cdot 10\^\{(.*)\}\$", r"\1e\2", kept))
-    if isinstance(found, Value):
-        return abs(found - number) < 0.05 * abs(number)
-    return 0.0 <= found <= max(10.0 * number, 1e-15)
+    if isinstance(figure, Order):
+        return page_text.startswith("order ") and abs(figure - float(page_text.removeprefix("order "))) < 0.02
+    number = float(re.sub(r"\$(.*) \\cdot 10\^\{(.*)\}\$", r"\1e\2", page_text))
+    if isinstance(figure, Value):
+        return abs(figure - number) < 0.05 * abs(number)
+    return 0.0 <= figure <= max(10.0 * number, 1e-15)
 
 
 def tables(figures: dict[str, Figure]) -> dict[str, str]:
     """The table of each paper, from the figures by the names of their lines."""
-    found: dict[str, list[str]] = {}
+    lines_by_paper: dict[str, list[str]] = {}
     for name, line in ROWS.items():
-        lines = found.setdefault(line.paper, ["| where | what | beside | figure |", "|---|---|---|---|"])
+        lines = lines_by_paper.setdefault(line.paper, ["| where | what | beside | figure |", "|---|---|---|---|"])
         lines.append(f"| {line.where} | {line.what} | {line.beside} | {figures[name]} |")
-    return {paper: "\n".join(lines) for paper, lines in found.items()}
+    return {paper: "\n".join(lines) for paper, lines in lines_by_paper.items()}
 
 
-def marked(text: str, paper: str) -> re.Match[str]:
+def find_table(text: str, paper: str) -> re.Match[str]:
     """The table of a paper in the text of the page."""
-    found = re.search(rf"(?<=<!-- {paper}: python -m tests.papers -->\n\n).*?(?=\n\n<!-- end -->)", text, re.S)
-    assert found is not None, f"the page has no place for the table of {paper}"
-    return found
+    match = re.search(rf"(?<=<!-- {paper}: python -m tests.papers -->\n\n).*?(?=\n\n<!-- end -->)", text, re.S)
+    assert match is not None, f"the page has no place for the table of {paper}"
+    return match
 
 
 class Tests:
@@ -121,17 +121,17 @@ def _field(system, x):
     return system.vector_field(x)
 
 
-def apart(found, expected) -> Difference:
+def relative_difference(array, reference) -> Difference:
     """The largest difference of two arrays, relative to the largest entry of the second."""
-    found, expected = np.asarray(found), np.asarray(expected)
-    return Difference(np.abs(found - expected).max() / np.abs(expected).max())
+    array, reference = np.asarray(array), np.asarray(reference)
+    return Difference(np.abs(array - reference).max() / np.abs(reference).max())
 
 
-def worst(*figures: Difference) -> Difference:
+def largest_difference(*figures: Difference) -> Difference:
     return Difference(max(figures))
 
 
-def solved(rate: Callable, y0, t: float) -> np.ndarray:
+def solve_with_scipy(rate: Callable, y0, t: float) -> np.ndarray:
     """SciPy, to its rounding."""
     return solve_ivp(rate, (0.0, t), y0, method="DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
 
