@@ -1,8 +1,8 @@
-"""Random functions of every primitive that the scalar compiler claims, composed, beside JAX.
+"""Compare random compositions of every primitive that the scalar compiler claims with JAX.
 
 ``python -m tests.fuzz --seconds 60`` (``make fuzz SECONDS=60``) draws functions until the time is over. It compares
 values, gradients, second derivatives and lanes, at random points and at special ones: zeros of both signs, infinity,
-subnormal numbers, equal entries. What differs is printed with the seed that makes the same function again.
+subnormal numbers, equal entries. Each difference is printed with the seed that makes the same function again.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ SUMMARIES: dict[str, Callable] = {
 }
 
 SIZES = 3, 2
-"""Entries of the two arguments of a function."""
+"""Numbers of entries of the two arguments of a function."""
 
 # XLA's complex abs is 0 where squares underflow, so nothing normal is smaller than 1e-140
 SPECIAL_NUMBERS = np.array(
@@ -64,9 +64,9 @@ SPECIAL_NUMBERS = np.array(
 
 
 class Function(NamedTuple):
-    """A random function of two vectors.
+    """Random function of two vectors.
 
-    ``text`` says what it is made of, a step a line.
+    ``text`` lists its operations, one step a line.
     """
 
     call: Callable
@@ -74,7 +74,7 @@ class Function(NamedTuple):
 
 
 def function_of(seed: int, names: Sequence[str] | None = None, steps: int = 5) -> Function:
-    """A random function of the operations of these names, each step of which uses what the steps before it made."""
+    """Return a random function of the named operations, each step of which uses results of earlier steps."""
     random = np.random.default_rng(seed)
     names = list(OPERATIONS) if names is None else list(names)
     x = [jax.ShapeDtypeStruct((n,), jnp.float64) for n in SIZES]
@@ -88,14 +88,14 @@ def function_of(seed: int, names: Sequence[str] | None = None, steps: int = 5) -
         return values
 
     def find_value(kind: str) -> int:
-        """The place of a value of a kind; one that is converted where there is none."""
+        """Return the index of a value of a kind; convert one where there is none."""
         if kind == "i":
             candidates = [i for i, a in enumerate(abstract_values) if jnp.issubdtype(a.dtype, jnp.integer)]
         else:
             candidates = [i for i, a in enumerate(abstract_values) if a.dtype == DTYPES[kind]]
         if candidates and (kind == "f" or random.random() < 0.7):
-            computed = [i for i in candidates if i >= len(SIZES)]
-            return int(random.choice(computed if computed and random.random() < 0.8 else candidates))
+            results = [i for i in candidates if i >= len(SIZES)]
+            return int(random.choice(results if results and random.random() < 0.8 else candidates))
         source = find_value("f")
         number = float(np.round(random.uniform(-1.0, 1.0), 1))
         if kind == "b":
@@ -137,7 +137,8 @@ def function_of(seed: int, names: Sequence[str] | None = None, steps: int = 5) -
 
 
 def points_of(random, count: int) -> list[list[np.ndarray]]:
-    """Arguments: ordinary ones, then with special numbers among them, and equal entries."""
+    """Return ``count`` pairs of arguments: ordinary numbers, then with special numbers among them, and with equal
+    entries."""
     points = []
     for i in range(count):
         arrays = [random.normal(0.0, 1.5, n) for n in SIZES]
@@ -173,7 +174,8 @@ def primitives_drawn() -> set[str]:
 
 
 class Outcome(NamedTuple):
-    """What came of a comparison: ``kind`` is "agrees", "refused" or "differs"; ``text`` says what differs, or why."""
+    """Result of a comparison: ``kind`` is "agrees", "refused" or "differs"; ``text`` names the difference or the
+    reason."""
 
     kind: str
     text: str
@@ -185,7 +187,10 @@ TOLERANT: dict[str, Any] = {"hidden_nan": True, "composed": True, "slack": 64.0}
 
 
 def _agrees_one_by_one(f: Callable, program, point, outputs) -> bool:
-    """Whether values are JAX's where each operation is compiled by itself: XLA simplifies NaN times a zero away."""
+    """Return True if outputs equal JAX's with each operation compiled by itself.
+
+    Compiled together, XLA simplifies NaN times a zero away.
+    """
     with jax.disable_jit():
         expected = [np.asarray(leaf) for leaf in jax.tree_util.tree_leaves(f(*map(jnp.asarray, point)))]
     try:
@@ -196,7 +201,7 @@ def _agrees_one_by_one(f: Callable, program, point, outputs) -> bool:
 
 
 def compared(function: Function, summary: str, seed: int, count: int = 6, machine_code: bool = True) -> Outcome:
-    """Compare a function with JAX's at random points."""
+    """Compare a function with JAX's at random points and return the outcome."""
     f, points = SUMMARIES[summary](function.call), points_of(np.random.default_rng(seed), count)
     structs = [jax.ShapeDtypeStruct((n,), jnp.float64) for n in SIZES]
     try:
@@ -265,7 +270,7 @@ def searched(seconds: float, seed: int, names: Sequence[str] | None = None, mach
 
 
 def main() -> int:
-    """Return 1 where something differs."""
+    """Compare functions as the command line asks, and return 1 if any differs, otherwise 0."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--seed", type=int, default=None, help="of the first function; by default one of the clock")

@@ -1,4 +1,4 @@
-"""Operations that random functions are made of: every primitive that the scalar compiler claims, and how it is used."""
+"""Define the operations of random functions: every primitive that the scalar compiler claims, with its arguments."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from jax import lax
 
 MAX_ENTRIES = 6
-"""Entries of an intermediate array; more are cut off."""
+"""Most entries of an intermediate array; more are cut off."""
 
 INTEGERS = {"i64": jnp.int64, "i32": jnp.int32, "i16": jnp.int16, "i8": jnp.int8}
 INTEGERS |= {"u8": jnp.uint8, "u16": jnp.uint16, "u32": jnp.uint32}
@@ -20,19 +20,22 @@ DTYPES = {"f": jnp.float64, "s": jnp.float32, "b": jnp.bool_, "i": jnp.int64, "c
 
 
 class Operation(NamedTuple):
-    """``function(*arrays, k)`` of arrays of these kinds (keys of DTYPES, ``"i"`` being any integers), k from 0 to 5."""
+    """Operation of a random function: ``function(*arrays, k)``, k an integer from 0 to 5.
+
+    ``kinds`` has one letter for each array: a key of DTYPES, or ``"i"`` for any integers.
+    """
 
     kinds: str
     function: Callable
 
 
 def resize_like(b, a):
-    """b in the shape of a."""
+    """Return b resized to the shape of a."""
     return jnp.resize(b, a.shape)
 
 
 def limit_size(a):
-    """An array with at most MAX_ENTRIES entries and two axes."""
+    """Return an array cut to at most MAX_ENTRIES entries and two axes."""
     a = a.reshape(-1, a.shape[-1]) if a.ndim > 2 else a
     if a.size <= MAX_ENTRIES:
         return a
@@ -48,12 +51,12 @@ def matrix(a, n: int = 3):
 
 
 def tame(a):
-    """Numbers of moderate size."""
+    """Map an array to finite numbers of moderate size."""
     return jnp.where(jnp.abs(a) < 3.0, a, jnp.tanh(jnp.where(jnp.isfinite(a), a, 1.0)))
 
 
 def moderate(a):
-    """Numbers below 100, or infinite: with larger ones JAX's loops for ``igamma`` do not end."""
+    """Replace finite numbers of 100 and more: with them JAX's loops for ``igamma`` do not end."""
     return jnp.where((jnp.abs(a) < 100.0) | ~jnp.isfinite(a), a, 7.5)
 
 
@@ -63,7 +66,7 @@ def positive(a):
 
 
 def distinct(a):
-    """A symmetric matrix whose eigenvalues are apart."""
+    """Return a symmetric matrix made from a whose eigenvalues are well apart."""
     m = 0.1 * matrix(tame(a))
     return m + m.T + jnp.diag(jnp.array([1.0, 3.0, 6.0]))
 
@@ -87,12 +90,12 @@ def binary(name: str):
 
 
 def choose_by_k(*choices):
-    """``k`` says which."""
+    """Return an operation that applies the choice of index ``k``, modulo their number."""
     return lambda *arguments: choices[arguments[-1] % len(choices)](*arguments[:-1])
 
 
 def with_index(f):
-    """A function of a vector, an index that is computed, and a vector of values."""
+    """Return an operation on a vector, a computed index and a vector of values."""
     return lambda a, i, b, k: f(vector(a), i.astype(jnp.int64).ravel()[0] if k % 2 else index_of(i, 4), vector(b))
 
 

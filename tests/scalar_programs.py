@@ -1,7 +1,7 @@
-"""Scalar programs beside JAX, for the tests: equal to rounding, which is measured.
+"""Compare scalar programs with JAX, to rounding, which is measured.
 
-A program is run again with every result moved by a few units in its last place, and the spread is what rounding can do
-to it. A branch that rounding can turn (``floor`` of an integer) shows as a wide one.
+A program is run again with every result moved by a few units in its last place: the spread of the outputs is the effect
+that rounding can have. A branch that rounding can turn (``floor`` of an integer) shows as a wide spread.
 """
 
 import jax
@@ -27,10 +27,11 @@ def jax_values(f, *args) -> list[np.ndarray]:
 
 
 def perturbed_outputs(program: Program, args, seed: int, composed: bool = False) -> list[np.ndarray]:
-    """The outputs when every instruction's result is off by up to four units in its last place.
+    """Return the outputs when every instruction's result is off by up to four units in its last place.
 
-    ``composed``: zeros get any sign, as a structural zero has none, and subnormal numbers become zero in some runs, as
-    XLA rounds them to zero on some processors; and numbers of single precision move by units in their last place.
+    With ``composed``, zeros get any sign, as a structural zero has none, and subnormal numbers become zero in some
+    runs, as XLA rounds them to zero on some processors; and numbers of single precision move by units in their last
+    place.
     """
     noise = np.random.default_rng(seed)
 
@@ -65,24 +66,36 @@ def check(
 ) -> None:
     """Raise unless a program gives the expected outputs: numbers to rounding, NaN and infinity where they belong.
 
-    ``hidden_nan``: where JAX has NaN a number may stand, as a structural zero times NaN is zero.
+    With ``hidden_nan`` a number may stand where JAX has NaN, as a structural zero times NaN is zero.
     """
     found = program.evaluate(*args) if found is None else found
     assert [a.shape for a in found] == [a.shape for a in expected]
     runs = [perturbed_outputs(program, args, seed, composed) for seed in range(6)]
-    for i, (right, got) in enumerate(zip(expected, found, strict=True)):
-        right, got = right.astype(float).ravel(), got.astype(float).ravel()
-        perturbed = np.array([run[i] for run in runs])
-        steady = (kind(perturbed) == kind(got)).all(axis=0)
+    for i, (reference_entries, entries) in enumerate(zip(expected, found, strict=True)):
+        reference_entries, entries = reference_entries.astype(float).ravel(), entries.astype(float).ravel()
+        perturbed_entries = np.array([run[i] for run in runs])
+        is_stable = (kind(perturbed_entries) == kind(entries)).all(axis=0)
         with np.errstate(all="ignore"):
-            spread = np.abs(perturbed - got).max(axis=0)
-            close = np.abs(got - right) <= slack * spread + 2 * slack * EPS * np.abs(right) + 1e-300
-        bad = ~np.where(np.isfinite(right), close, hidden_nan & np.isnan(right) | (kind(right) == kind(got))) & steady
-        assert not bad.any(), f"output {i}: {got[bad]} is not {right[bad]}, spread {spread[bad]}"
+            rounding_spread = np.abs(perturbed_entries - entries).max(axis=0)
+            is_close = (
+                np.abs(entries - reference_entries)
+                <= slack * rounding_spread + 2 * slack * EPS * np.abs(reference_entries) + 1e-300
+            )
+        is_wrong = (
+            ~np.where(
+                np.isfinite(reference_entries),
+                is_close,
+                hidden_nan & np.isnan(reference_entries) | (kind(reference_entries) == kind(entries)),
+            )
+            & is_stable
+        )
+        assert not is_wrong.any(), (
+            f"output {i}: {entries[is_wrong]} is not {reference_entries[is_wrong]}, spread {rounding_spread[is_wrong]}"
+        )
 
 
 def kind(a):
-    """0 for a number, 1 for infinity, -1 for minus infinity, 2 for NaN."""
+    """Return 0 for each number, 1 for infinity, -1 for minus infinity and 2 for NaN."""
     return np.where(np.isinf(a), np.sign(a), 0.0) + 2 * np.isnan(a)
 
 

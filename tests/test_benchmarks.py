@@ -110,7 +110,7 @@ def test_the_statistics_of_the_magnet():
     time = magnet.integrated_autocorrelation(x)
     assert abs(time / ((1 + rho) / (2 * (1 - rho))) - 1.0) < 0.2  # 0.06 is its standard error
     rows = np.column_stack([x, x, np.zeros((n, 2))])
-    mean, error = magnet.with_error(lambda s, chosen: s.energy[chosen].mean(), _series(rows))
+    mean, error = magnet.with_error(lambda s, selection: s.energy[selection].mean(), _series(rows))
     assert 0.5 < error / np.sqrt(2 * time / n) < 1.5
     assert abs(mean) < 4 * error
 

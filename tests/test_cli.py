@@ -240,13 +240,13 @@ def test_check_prints_the_axioms():
 
 
 def test_check_fails_with_an_axiom(folder):
-    validated = folder.call("check", folder.spec(function("no_casimir"), RUN))
-    assert validated.exit_code == 1
-    assert "not a Casimir" in validated.stderr
-    unvalidated = folder.call("check", folder.spec(function("no_casimir", "{validate = false}"), RUN))
-    assert unvalidated.exit_code == 1
-    assert "FAILS" in unvalidated.stdout
-    assert "NOT metriplectic" in unvalidated.stdout
+    check_of_strict_system = folder.call("check", folder.spec(function("no_casimir"), RUN))
+    assert check_of_strict_system.exit_code == 1
+    assert "not a Casimir" in check_of_strict_system.stderr
+    check_of_lax_system = folder.call("check", folder.spec(function("no_casimir", "{validate = false}"), RUN))
+    assert check_of_lax_system.exit_code == 1
+    assert "FAILS" in check_of_lax_system.stdout
+    assert "NOT metriplectic" in check_of_lax_system.stdout
 
 
 def test_models_lists_all_with_their_parameters():

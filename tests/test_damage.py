@@ -56,9 +56,9 @@ def test_results(tmp_path, kind, count):
         path.write_bytes(damage(content, random))
         start = time.perf_counter()
         try:
-            loaded = lt.load(path)
-            assert np.array_equal(loaded.x, result.x)
-            assert np.array_equal(loaded.energy, result.energy)
+            result_read = lt.load(path)
+            assert np.array_equal(result_read.x, result.x)
+            assert np.array_equal(result_read.energy, result.energy)
         except lt.FileError:
             n_refused += 1
         assert time.perf_counter() - start < MAX_READ_SECONDS
@@ -89,9 +89,9 @@ def test_what_is_said_in_results(tmp_path, count):
             file.attrs[name] = json.dumps(word)
 
         try:
-            loaded = lt.load(rewritten(path, change))
-            assert np.array_equal(loaded.x, solution.x)
-            str(loaded.audit())
+            result_read = lt.load(rewritten(path, change))
+            assert np.array_equal(result_read.x, solution.x)
+            str(result_read.audit())
         except lt.FileError:
             pass
 
@@ -110,7 +110,7 @@ def test_stores(tmp_path, count):
         chunk=2,
     )
     study.run()
-    points, passed, dataset = load_status(store).points, audit_store(store).passed, load_study(store).load()
+    points, audit_passes, dataset = load_status(store).points, audit_store(store).passed, load_study(store).load()
     files = sorted(path for path in store.rglob("*") if path.is_file() and path.name != ".lock")
     random, messages = np.random.default_rng(3), []
     for _ in range(count // 4):
@@ -121,7 +121,7 @@ def test_stores(tmp_path, count):
         try:
             status = load_status(store)
             assert status.points == points
-            assert audit_store(store).passed == passed or status.done < points
+            assert audit_store(store).passed == audit_passes or status.done < points
             assert load_study(store).load().identical(dataset) or status.done < points
         except lt.FileError as error:
             messages.append(str(error))

@@ -30,11 +30,11 @@ def test_the_others_solve_the_equations_of_the_library(chart_module):
     assert np.abs(np.array(chart_module.field(1.01 * y, math.exp))[:4] - ours).max() > 1e-4
     # The momentum in space is constant, which the quaternion alone can make true.
     q, dq, m, dm = y[4:] / np.linalg.norm(y[4:]), field_by_hand[4:] / np.linalg.norm(y[4:]), y[:3], field_by_hand[:3]
-    as_quaternion = lambda v: np.array([0.0, *v])  # noqa: E731
+    pure_quaternion = lambda v: np.array([0.0, *v])  # noqa: E731
     rate = (
-        _times(_times(dq, as_quaternion(m)), _bar(q))
-        + _times(_times(q, as_quaternion(dm)), _bar(q))
-        + _times(_times(q, as_quaternion(m)), _bar(dq))
+        _times(_times(dq, pure_quaternion(m)), _bar(q))
+        + _times(_times(q, pure_quaternion(dm)), _bar(q))
+        + _times(_times(q, pure_quaternion(m)), _bar(dq))
     )
     assert np.abs(rate).max() < 1e-14
 

@@ -54,8 +54,8 @@ def test_every_argument_is_told(package):
             names = [
                 parameter for parameter in inspect.signature(function).parameters if parameter not in ("self", "cls")
             ]
-            undocumented = [n for n in names if not re.search(rf"\b{n}\b", doc) and n not in arguments]
-            untold += [f"{name}: {', '.join(undocumented)}"] if undocumented else []
+            names_missing = [n for n in names if not re.search(rf"\b{n}\b", doc) and n not in arguments]
+            untold += [f"{name}: {', '.join(names_missing)}"] if names_missing else []
     assert untold == []
 
 
@@ -63,16 +63,16 @@ def test_every_argument_is_told(package):
 def test_everything_public_is_described(package):
     """By a docstring of its own, or as an attribute by the table or the docstring of its class."""
     _, attributes = _table_names()
-    undocumented = []
+    failures = []
     for name, value, doc in _public(package):
         needs_docstring = (
             inspect.isclass(value) or _function(value) or isinstance(value, property | functools.cached_property)
         )
         owner, _, member = name.partition(".")
-        in_class_docstring = member and re.search(rf"\b{member}\b", inspect.getdoc(getattr(package, owner)) or "")
-        if needs_docstring and not doc and member not in attributes and not in_class_docstring:
-            undocumented.append(name)
-    assert undocumented == []
+        class_mention = member and re.search(rf"\b{member}\b", inspect.getdoc(getattr(package, owner)) or "")
+        if needs_docstring and not doc and member not in attributes and not class_mention:
+            failures.append(name)
+    assert failures == []
 
 
 MODULES = ("bodies", "diffrax", "learn", "magnetism", "models", "plot", "scipy", "sympy", "testing", "torques")

@@ -98,8 +98,8 @@ def test_a_file_beside_the_spec_shadows_nothing(folder):
     path = spec(folder, model("mine_of_trust:build"))
     result = CliRunner().invoke(app, ["run", str(path), "--out", "results", "--set", "run.step=0.01"])
     assert result.exit_code == 0, result.stderr
-    checked = CliRunner().invoke(app, ["check", str(spec(folder, model("xarray:build")))])
-    assert "there is another module 'xarray'" in checked.stderr
+    check_result = CliRunner().invoke(app, ["check", str(spec(folder, model("xarray:build")))])
+    assert "there is another module 'xarray'" in check_result.stderr
 
 
 SHADOWING = """

@@ -22,7 +22,7 @@ BALL = lt.Quadratic(np.ones(3))
 
 
 def H(m):
-    """Not quadratic, so that discrete gradients are no plain ones."""
+    """Return an energy that is not quadratic, so that discrete gradients differ from gradients at the midpoint."""
     return 0.5 * jnp.sum(m * m / I) + 0.1 * jnp.sum(m**4)
 
 
@@ -43,7 +43,7 @@ def _friction(system, x):
 
 
 def project_out(K, *kernel):
-    """``K - K D (D^T K D)^-1 D^T K``."""
+    """Return ``K - K D (D^T K D)^-1 D^T K``, D the vectors of the kernel."""
     D = np.stack(kernel, axis=1)
     return K - K @ D @ np.linalg.solve(D.T @ K @ D, D.T @ K)
 
@@ -96,12 +96,12 @@ def momentum_maps():
 
 @row("BFM", "(3.1), Example 3.1", "`LiePoissonSystem`, so(3) and se(3)", "cross product; constants")
 def euler_poincare():
-    free = lt.LiePoissonSystem(mf.so(3), H)
+    free_system = lt.LiePoissonSystem(mf.so(3), H)
     g, weights = mf.se(3), np.linspace(1.0, 2.0, 6)
     points = np.random.default_rng(1).standard_normal((4, 6))
     euler_poincare_rates = [np.einsum("ijk,i,k->j", g.structure_constants, weights * m, m) for m in points]
     return largest_difference(
-        relative_difference(fields(free, POINTS), [np.cross(m, dH(m)) for m in POINTS]),
+        relative_difference(fields(free_system, POINTS), [np.cross(m, dH(m)) for m in POINTS]),
         relative_difference(fields(lt.LiePoissonSystem(g, lt.Quadratic(weights)), points), euler_poincare_rates),
     )
 

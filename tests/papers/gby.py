@@ -26,7 +26,8 @@ POINTS = np.random.default_rng(0).standard_normal((5, 5))
 
 
 def friction_field(t, y, push=(0.0, 0.0), power=0.0):
-    """(2.4) by hand, with a friction tensor that is not symmetric, and what comes from outside."""
+    """Evaluate (2.4) by hand, with a friction tensor that is not symmetric, a force ``push`` and a heat supply
+    ``power``."""
     q, v, S = y[:2], y[2:4], y[4]
     M, T, F = np.array([[1.0 + 0.3 * q[0] ** 2, 0.2], [0.2, 1.0]]), 0.5 * np.exp(0.5 * S), -R @ v
     dL_dq = np.array([0.3 * q[0] * v[0] ** 2 - q[0] - 0.4 * q[0] ** 3, -q[1]])
@@ -64,26 +65,26 @@ def ledger() -> Order:
 
 
 @row("GBY", "§2 on a group", '`EulerPoincareClosedSystem`, `LieVariational("exp")`', "SciPy at $10^{-13}$")
-def on_a_group() -> Order:
+def group_order() -> Order:
     x0 = np.array([0.5, 0.3, -0.4, 0.2])
     exact = solve_with_scipy(on_groups.forced, np.append(x0, np.zeros(3)), 2.0)
     return order(on_groups.forced_system(), x0, 2.0, exact, lt.LieVariational("exp"), laws=False)
 
 
 @row("GBY", "§2 on a manifold", "`space=`, a pendulum by `MetriplecticGauss(2)`", "SciPy, in angles")
-def on_a_manifold() -> Order:
+def manifold_order() -> Order:
     case = configurations.pendulum()
     return order(case.system, case.x0, case.duration, case.end, lt.MetriplecticGauss(2), (40, 80))
 
 
 @row("GBY", "§3.2 on a manifold", "`VariationalIntegrator.midpoint()`, the pendulum", "SciPy, in angles")
-def maps_on_a_manifold() -> Order:
+def manifold_map_order() -> Order:
     case = configurations.pendulum()
     return order(case.system, case.x0, case.duration, case.end, V.midpoint(), (40, 80), laws=False)
 
 
 def recursions(name: str) -> Difference:
-    """500 steps of Case 1 with friction 10 and a long step."""
+    """Compare 500 steps of Case 1 with the printed recursion, with friction 10 and a long step."""
     h, system, method = 0.05, lt.models.mass_spring_gas(**CASES[1], friction=10.0), variational.SCHEMES[name]
     run = lt.integrate(system, method.state(system, 0.3, 0.31, 0.0, h), (0.0, 500 * h), h, method)
     x, S = variational._printed(name, 0.3, 0.31, 0.0, 500, 5.0, 5.0, 10.0, 1.5 * 8.31446261815324, 300.0, h)
@@ -135,8 +136,8 @@ def regularity():
         [2 * friction * speed / h, -T / h * (h * s / (2 * heat) + 1)],
     ]
     discrete = V.midpoint().discrete_system(lt.models.mass_spring_gas(m, k, friction), h)
-    found, _ = evaluate_at_points(variational._matrices, discrete, np.array([[x0, x1, S0, S1]]))
-    return relative_difference(found[0], expected)
+    matrices, _ = evaluate_at_points(variational._matrices, discrete, np.array([[x0, x1, S0, S1]]))
+    return relative_difference(matrices[0], expected)
 
 
 @row("GBY", "(4.7), Theorem 4.3", "the structure of the flow of scheme 2", "both sides")
@@ -174,7 +175,7 @@ def closed_solution():
 
 
 def energies(case: int, scheme: int) -> Value:
-    """The largest energy error of 10^4 steps without friction."""
+    """Return the largest energy error of 10^4 steps without friction."""
     system, method = lt.models.mass_spring_gas(**CASES[case], friction=0.0), variational.SCHEMES[f"scheme {scheme}"]
     x0 = method.state(system, STARTS[case], STARTS[case], 0.0, variational.H)
     run = lt.integrate(system, x0, (0.0, 10_000 * variational.H), variational.H, method)

@@ -42,7 +42,7 @@ def H(q, p, S):
 
 
 def gradients(x):
-    """Of H by q, p and S, by hand."""
+    """Return the derivatives of H by q, p and S, by hand."""
     q, p, S = x[:2], x[2:4], x[4]
     wave, slope = np.sin(BENT * q[0] * q[1]), np.cos(BENT * q[0] * q[1]) * BENT * q[::-1]
     return slope * np.exp(0.2 * S) + q, p / MASS, 0.2 * wave * np.exp(0.2 * S) + np.exp(S)
@@ -97,7 +97,7 @@ def contact_field():
 
 
 def herglotz_rates(x, action: bool):
-    """(10), (12) for the Lagrangian of the tests of ChetaevSystem."""
+    """Evaluate (10) or (12) by hand, for the Lagrangian of the tests of ChetaevSystem."""
     q, v, S = x[:2], x[2:4], x[4]
     M, T = np.array([[1.0 + 0.3 * q[0] ** 2, 0.2], [0.2, 1.0]]), 0.5 * np.exp(0.5 * S)
     dL_dq = np.array([0.3 * q[0] * v[0] ** 2 - q[0] - 0.4 * q[0] ** 3, -q[1]])

@@ -15,12 +15,12 @@ mag = lt.magnetism
 
 
 def field_of(energy, s):
-    """The effective field at every spin, of the shape of s."""
+    """Return the effective field at every spin, in the shape of s."""
     return -np.asarray(energy.gradient(jnp.asarray(s, dtype=float).ravel())).reshape(np.shape(s))
 
 
 def index_spins(*sites):
-    """Spins (i, j, k), their indices, which are not of length one."""
+    """Return spins that equal their indices (i, j, k); their length is not one."""
     return np.stack(np.meshgrid(*map(np.arange, sites), indexing="ij"), axis=-1).astype(float)
 
 
@@ -186,7 +186,7 @@ def test_energy():
 
 
 def relax(energy, start, time, step, rate=0.5):
-    """Spins that are damped, of the shape of the start, without precession to speak of."""
+    """Return the spins after damping with almost no precession, in the shape of the start."""
     system = lt.SpinSystem(len(start), energy, lt.LandauLifshitz(rate), ratio=1e-3)
     run = lt.integrate(system, np.ravel(start), (0.0, time), step, lt.MetriplecticRungeKutta(4), save_every=1000)
     return run.x[-1].reshape(-1, 3)
@@ -257,14 +257,14 @@ def test_spin_waves():
 
 
 def chirality(s):
-    """The finite spin chirality of two triangles at each site [PRL 108, 017601], over 8 pi."""
+    """Return the finite spin chirality of two triangles at each site [PRL 108, 017601], over 8 pi."""
     x, y = (lambda by: np.roll(s, -by, 0)), (lambda by: np.roll(s, -by, 1))
     triangles = sum(np.sum(s * np.cross(x(by), y(by)), axis=-1) for by in (1, -1))
     return triangles.sum() / (8 * np.pi)
 
 
 def berg_luscher(s):
-    """The solid angles of two triangles at each site [Berg & Luescher 1981], over 4 pi."""
+    """Return the solid angles of two triangles at each site [Berg & Luescher 1981], over 4 pi."""
     x, y = (lambda by: np.roll(s, -by, 0)), (lambda by: np.roll(s, -by, 1))
     total = 0.0
     for by in (1, -1):

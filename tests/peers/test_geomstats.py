@@ -214,8 +214,8 @@ def test_rigid_motions_exp_and_log():
         for u in shifts:
             g = np.eye(4)
             g[:3, :3], g[:3, 3] = group_rotation(v), u
-            mapped_back = np.asarray(group.exp(group.log(g)))
-            assert max_abs(mapped_back - g) < 1e-14 * max(1.0, np.abs(u).max())
+            roundtrip = np.asarray(group.exp(group.log(g)))
+            assert max_abs(roundtrip - g) < 1e-14 * max(1.0, np.abs(u).max())
 
 
 def group_rotation(v):

@@ -32,7 +32,7 @@ def group(request):
 
 
 def vectors(group, seed=0, count=20):
-    """Rotations by less than pi, uniform in the ball; translations of order one."""
+    """Return random tangent vectors: rotations by less than pi, uniform in angle; translations of order one."""
     c = np.random.default_rng(seed).standard_normal((count, group.dim))
     turns = {1: 1, 3: 3 if group.matrix_size == 3 and group.dim == 3 and group.name == "SO(3)" else 1, 6: 3}[group.dim]
     sizes = np.linalg.norm(c[:, :turns], axis=1, keepdims=True)

@@ -17,7 +17,7 @@ import liethermo as lt
 
 SZ, SX = np.diag([1.0, -1.0]), np.array([[0.0, 1.0], [1.0, 0.0]])
 COLD = 1.0 / 50.0
-"""The temperature of a bath, relative to the frequency of a jump, beside which it is zero."""
+"""Temperature of a bath, relative to the frequency of a jump, at which jumps upwards are rounding."""
 
 
 def destroy(levels):
@@ -29,7 +29,7 @@ def basis(levels, n):
 
 
 def decay(operator, rate, frequency=1.0, bath=0):
-    """Jumps of this operator at this rate, in a bath of the temperature ``COLD * frequency``."""
+    """Return jumps by an operator at a rate, in a bath of the temperature ``COLD * frequency``."""
     return lt.ThermalJumps([(operator, lambda omega, T: rate * jnp.exp(-omega / (2.0 * T)))], bath)
 
 
@@ -38,7 +38,7 @@ def cold(frequency=1.0):
 
 
 class Qobj:
-    """An operator that gives its matrix by ``full()``."""
+    """Operator that gives its matrix by ``full()``."""
 
     def __init__(self, matrix):
         self.matrix = matrix
@@ -100,8 +100,8 @@ def test_stepping_and_a_rate_that_is_switched_off():
 
 def test_pickling():
     q = lt.QuantumSystem(NUMBER, lt.ThermalJumps([(A, 0.1)]), lt.HeatBaths(np.inf, 0.5))
-    unpickled = pickle.loads(pickle.dumps(q))
-    ends = [lt.integrate(s, basis(LEVELS, 9), (0.0, 1.0), 0.25, lt.MetriplecticTaylor(8)).x[-1] for s in (q, unpickled)]
+    copy = pickle.loads(pickle.dumps(q))
+    ends = [lt.integrate(s, basis(LEVELS, 9), (0.0, 1.0), 0.25, lt.MetriplecticTaylor(8)).x[-1] for s in (q, copy)]
     assert np.array_equal(*ends)
 
 

@@ -36,12 +36,12 @@ def linear_energy(x):
 
 
 LINEAR = canonical(linear_energy)
-"""q' = -q - 5 p, p' = q + p: SciPy's fun_linear, which is Hamiltonian."""
+"""Hamiltonian system of SciPy's fun_linear: q' = -q - 5 p, p' = q + p."""
 
 OSCILLATOR = canonical(lambda x: 0.5 * (x @ x))
 
 RATIONAL = canonical(lambda x, t: 0.5 * x[1] ** 2 + 20.0 * x[0] / (t + 10.0) ** 3)
-"""A driven particle along q = t / (t + 10), the first component of SciPy's fun_rational; the second is t p."""
+"""Driven particle along q = t / (t + 10), the first component of SciPy's fun_rational; the second is t p."""
 
 AT_5 = [1.0 / 3.0, 10.0 / 15.0**2]
 
@@ -66,7 +66,7 @@ def with_attributes(function, **attributes):
 
 
 def crossing_1(t, y):
-    """SciPy's event_rational_1, y the components of its fun_rational."""
+    """Evaluate SciPy's event_rational_1, y the components of its fun_rational."""
     return y[0] - (t * y[1]) ** 0.7
 
 
@@ -298,9 +298,9 @@ def test_array_rtol():
     with pytest.warns(UserWarning, match="At least one element"):
         assert error(rtol=[1e-1, 1e-16]) < loose
     assert error(rtol=[1e-1, 1e-6], atol=[1e-9, 1.0]) < loose
-    for wrong in ({"atol": [1e-6] * 3}, {"rtol": [1e-3]}):
+    for bad_tolerances in ({"atol": [1e-6] * 3}, {"rtol": [1e-3]}):
         with pytest.raises(ValueError, match=r"must be a number or an array of shape \(2,\), as y0"):
-            error(**wrong)
+            error(**bad_tolerances)
 
 
 @pytest.mark.parametrize("method", METHODS, ids=str)
