@@ -1,4 +1,7 @@
-"""The benchmarks run, their opponents in C run the same scheme, and what is missing is said. Nothing is timed here."""
+"""Check that the benchmarks run, that their peers in C run the same scheme, and that missing peers are reported.
+
+Nothing is timed here.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +37,7 @@ needs_compiler = pytest.mark.skipif(native.find_c_compiler() is None, reason="no
 
 @pytest.fixture
 def bare_machine(monkeypatch):
-    """A machine without a C compiler and without the peers that the library does not need itself."""
+    """Hide the C compiler and the peers that the library does not need itself."""
     monkeypatch.setenv("CC", "no-such-compiler")
     for name in ("diffrax", "heyoka"):
         monkeypatch.setitem(sys.modules, name, None)
@@ -102,7 +105,7 @@ def test_a_page_has_one_row_a_comparison_and_escapes_bars():
 
 
 def test_the_statistics_of_the_magnet():
-    """Autocorrelation and error of a process that is known."""
+    """Autocorrelation and error of an autoregressive process, whose values are known."""
     random, rho, n = np.random.default_rng(0), 0.9, 60_000
     x = random.standard_normal(n)
     for i in range(1, n):
@@ -120,7 +123,10 @@ def _series(rows, temperature=1.0):
 
 
 def test_where_the_cumulants_of_two_lattices_are_equal():
-    """A double well, whose cumulants are integrals, and vectors in a plane of energy m⁴, where it is 1 - pi / 6."""
+    """Check the crossing on a double well, whose cumulants are integrals, and on vectors in a plane of energy m⁴.
+
+    The cumulant of the vectors is 1 - pi / 6.
+    """
     x, random, n = np.linspace(-4.0, 4.0, 8_001), np.random.default_rng(0), 40_000
     well = 0.8 * (x**2 - 1.2) ** 2
 
@@ -152,7 +158,7 @@ def test_where_the_cumulants_of_two_lattices_are_equal():
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("T", [10.0, 20.0])
 def test_monte_carlo_of_the_magnet_at_high_temperatures(T):
-    """The energy of a bond is Langevin's function of J / kT there, but for loops of four bonds."""
+    """At high temperatures the energy of a bond is Langevin's function of J / kT, but for loops of four bonds."""
     (rows,) = sample_heat_bath(6, [T], 400)
     energies = rows[:, 0].reshape(20, -1).mean(axis=1)
     exact = -3.0 * (1.0 / np.tanh(1.0 / T) - T)
@@ -231,7 +237,7 @@ def test_a_c_program_that_fails_says_so():
 
 
 def test_the_reference_is_the_trajectory(monkeypatch):
-    """Against SciPy, which knows nothing of series, and against itself with another step."""
+    """Compare with SciPy, which uses no series, and with the reference itself at another step."""
     x0 = [0.3, -0.8, 0.5]
     exact = reference.exact_state(x0, 0.7, 5.0)
     assert np.abs(scipy_run(1e-13, x0, 5.0, 0.7).solve_end() - exact).max() < 1e-11
@@ -245,7 +251,7 @@ def test_the_reference_is_the_trajectory(monkeypatch):
     not memory.PROCESS_STATUS_FILE.is_file(), reason="this system does not tell a process its largest size"
 )
 def test_a_process_is_not_charged_its_parent_s_memory():
-    """getrusage would: its figure survives the start of another program."""
+    """A process reports its own peak memory; getrusage would report its parent's after a start by exec."""
     array = np.ones(100_000_000)
     child_bytes = child.run_python(
         "-c", "from benchmarks.measurements.memory import peak_resident_bytes; print(peak_resident_bytes())"
@@ -324,7 +330,7 @@ def test_simulators_that_are_missing_are_told(monkeypatch):
 
 
 def test_gradient_flows_beside_steepest_descent_of_pymanopt():
-    """The difference is that of their steps, of first order: it halves with them, and is gone where they vanish."""
+    """The difference to pymanopt is of first order in the step: it halves with it, and its extrapolation vanishes."""
     pytest.importorskip("pymanopt")
     for _, _, full_step_difference, half_step_difference, extrapolated_difference in manifolds.pymanopt_rows():
         assert 1.9 < half_step_difference / full_step_difference < 2.1

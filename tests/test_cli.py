@@ -1,4 +1,4 @@
-"""The command line: what it prints, what it writes, and its exit status."""
+"""Check the command line: its output, the files it writes, and its exit status."""
 
 import os
 import re
@@ -60,7 +60,7 @@ not_a_function = 3
 
 
 class Folder:
-    """A user's current folder."""
+    """Current folder of a user."""
 
     def __init__(self, path):
         self.path = path
@@ -73,7 +73,7 @@ class Folder:
         return CliRunner().invoke(app, list(map(str, arguments)))
 
     def refusal(self, *parts):
-        """What ``check`` says to a spec that it refuses, a line for each problem."""
+        """Return the lines that ``check`` prints for a spec that it refuses, one for each problem."""
         result = self.call("check", self.spec(*parts))
         assert result.exit_code == 2
         assert re.fullmatch(r"(spec\.toml: imports .*\n)?", result.stdout)
@@ -101,7 +101,7 @@ def function(name, parameters="{}"):
 
 @pytest.fixture(scope="module")
 def example(tmp_path_factory):
-    """The example of the README, run once."""
+    """Run the example of the README once; return the command's result and the folder of its files."""
     results = tmp_path_factory.mktemp("example") / "results"
     return CliRunner().invoke(app, ["run", str(EXAMPLE), "--out", str(results)]), results
 
@@ -206,7 +206,7 @@ def test_outputs_are_as_asked(folder):
 
 
 def test_a_process_with_a_users_function(tmp_path):
-    """As a user calls it, from a folder that is not the spec's."""
+    """Run the command in a process of its own, from a folder that is not the spec's."""
     home = tmp_path / "home"
     home.mkdir()
     (home / f"{MODULE}.py").write_text(SOURCE)
@@ -269,7 +269,7 @@ def test_methods_are_listed_with_what_they_keep():
 
 
 def test_a_variational_scheme_by_its_name(tmp_path):
-    """It keeps the second law and not the energy, and the exit status says so."""
+    """A variational scheme keeps the second law and not the energy, and the exit status says so."""
     spec = tmp_path / "spring.toml"
     spec.write_text(
         """

@@ -1,4 +1,4 @@
-"""Studies on the command line, and what spec files say besides: adaptive steps, events, attitudes, changes."""
+"""Check studies on the command line, and adaptive steps, events, attitudes and changes in spec files."""
 
 import sys
 

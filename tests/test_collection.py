@@ -1,4 +1,4 @@
-"""Reading the tests builds nothing: a module that does is refused."""
+"""Check that a module of tests that builds systems when it is read is refused."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""Files that chance has damaged: whatever is read is what was written, or an error of the library, and soon."""
+"""Check files that chance has damaged: reading gives the content as written or an error of the library, and soon."""
 
 import json
 import os
@@ -18,14 +18,14 @@ from tests.liethermo.results.test_files import rewritten
 
 REFUSAL_ERRORS = (lt.LiethermoError, lt.FileError)
 MAX_READ_SECONDS = 20.0
-"""Seconds that none may take; a hundredth of it is usual."""
+"""Most seconds that one read may take; a hundredth of it is usual."""
 
 BODY, X0 = lt.models.rigid_body, np.array([0.1, 1.0, 0.1])
 sizes = pytest.mark.parametrize("count", [60, pytest.param(6000, marks=pytest.mark.slow)])
 
 
 def damage(content: bytes, random: np.random.Generator) -> bytes:
-    """A file with a part changed, lost, moved or added."""
+    """Return a file's content with a part changed, lost, moved or added."""
     start, length = int(random.integers(len(content))), int(random.integers(1, 64))
     rest = content[start + length :]
     match int(random.integers(6)):
@@ -70,7 +70,7 @@ WORDS = [None, True, 5, -1, 1e999, "", "x", [], {}, [[]], "[" * 5000, {"a": {"b"
 
 @sizes
 def test_what_is_said_in_results(tmp_path, count):
-    """Files that are whole, with their checksums right, of which somebody has changed what they say."""
+    """Read complete files with right checksums in which somebody has changed one attribute."""
     solution, random = lt.integrate(BODY(), X0, (0.0, 1.0), 0.1), np.random.default_rng(2)
     file_path = solution.save(tmp_path / "whole.nc")
     attribute_names = ("status", "stats", "laws", "provenance", "evidence", "event_time", "times")

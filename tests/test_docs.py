@@ -1,4 +1,4 @@
-"""What a user is shown runs: the Python blocks of the README and of the documentation, and the gallery's examples."""
+"""Check that what a user is shown runs: the Python blocks of the README and the pages, and the gallery's examples."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def _name(path: Path) -> str:
 
 @pytest.fixture
 def scratch(tmp_path, monkeypatch):
-    """An empty working directory and a backend without a screen; figures are closed afterwards."""
+    """Enter an empty folder and use a backend without a screen; close all figures afterwards."""
     monkeypatch.chdir(tmp_path)
     matplotlib.use("Agg")
     yield tmp_path
@@ -46,7 +46,7 @@ SLOW_PAGES = (
     *("asteroid_wobble", "real_bodies", "qubit_and_bath", "events", "derivatives", "ensembles", "audits"),
     *("geometer", "relaxation", "spins", "fluids", "quantum", "learning", "learn_own_data", "method_author"),
 )
-"""Pages that compile much: in the slow tier."""
+"""Pages that compile many programs: they run in the slow tier."""
 
 
 def _pages():
@@ -66,7 +66,7 @@ def test_the_python_blocks_of_a_page_run_in_order(page, scratch):
 
 
 FAST_EXAMPLES = ("plot_relaxed_rigid_body", "plot_own_lie_algebra", "plot_damped_oscillator", "plot_discrete_herglotz")
-"""Examples that compile little; the others are in the slow tier."""
+"""Examples that compile few programs; the others are in the slow tier."""
 
 
 def _examples():
@@ -96,7 +96,7 @@ FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 
 
 def _words(page: Path) -> str:
-    """A page without its code."""
+    """Return the text of a page without its code."""
     return FENCE.sub("", page.read_text())
 
 
@@ -132,7 +132,7 @@ def test_every_page_is_in_the_navigation():
 
 
 def test_names_in_code_font_exist(code_links):
-    """A page may call on nothing that the packages do not have."""
+    """A page may name nothing that the packages do not have."""
     unknown = []
     for page in PAGES:
         for word in re.findall(r"(?<!`)`([^`\n]+)`(?!`)", _words(page)):
@@ -152,7 +152,7 @@ def test_a_name_that_does_not_exist_is_found(code_links):
 
 
 def test_python_in_code_font_is_right(code_spans):
-    """What a page says in passing: names exist, arguments are those of their functions, what is complete runs."""
+    """Check short code in the text: names exist, arguments belong to their functions, complete statements run."""
     errors, n_checked = [], 0
     for page in PAGES:
         text = page.read_text()
@@ -167,7 +167,7 @@ def test_python_in_code_font_is_right(code_spans):
 
 
 def test_blocks_that_are_not_executed_are_right(code_spans):
-    """Those for clusters: a page marks them as ``py``. Other blocks of Python are marked as ``python``, and run."""
+    """Check the blocks for clusters, marked as ``py``; all other blocks of Python are marked as ``python`` and run."""
     fences = [(page, fence) for page in PAGES for fence in re.findall(r"^```(\w+)$", page.read_text(), re.MULTILINE)]
     assert {fence for _, fence in fences} <= {"python", "py", "sh", "bash", "toml", "text"}
     for page in PAGES:
@@ -217,7 +217,7 @@ UNLIMITED_PROMISE = re.compile(
 
 
 def test_orders_and_step_sizes_are_told_as_they_are():
-    """As many stages as the methods take, and no promise for steps that a method cannot take."""
+    """The pages name as many stages as the methods take, and promise nothing for steps that a method cannot take."""
     max_stages = max(s for s in range(1, 20) if _has_stages(s))
     orders_by_page = {page: re.findall(r"even orders? up to (\d+)", page.read_text()) for page in PAGES}
     assert {_name(page): set(orders) for page, orders in orders_by_page.items() if orders} == {
@@ -261,11 +261,11 @@ SPEED = re.compile(
     rf"|\btakes?\s+(?:a second|some seconds|a few seconds|{NUMBER} (?:seconds|minutes))",
     re.IGNORECASE,
 )
-"""How fast the library is, in numbers."""
+"""Statements in numbers about the speed of the library."""
 
 
 def _figures_of_speed(path: Path) -> list[str]:
-    """Those in the words of a page, or in the docstrings of a module."""
+    """Return the statements about speed in the words of a page, or in the docstrings of a module."""
     if path.suffix == ".py":
         nodes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Expr)]
         words = [node.value.value for node in nodes if isinstance(node.value, ast.Constant)]
@@ -276,7 +276,8 @@ def _figures_of_speed(path: Path) -> list[str]:
 
 
 def test_figures_of_speed_are_on_the_pages_of_benchmarks_alone():
-    """Those pages are written by what measures them; elsewhere they would differ from it sooner or later."""
+    """Only the pages of benchmarks, which the measurements write, have figures of speed: elsewhere they would get
+    stale."""
     benchmarks = [ROOT / f"docs/reference/{name}.md" for name in ("benchmarks", "benchmarks_runs")]
     assert all(len(_figures_of_speed(page)) > 50 for page in benchmarks)
     ours = [path for path in TEXT_FILES if path not in benchmarks and not path.is_relative_to(ROOT / "examples")]
@@ -336,10 +337,10 @@ OTHER_BODIES = re.compile(r"DoubleBracket|body_with_wheels|tumbling_body")
 
 
 def _wrong_bodies(text: str) -> list[str]:
-    """Paragraphs that tell of friction inside a body that keeps its kinetic energy.
+    """Return the paragraphs about friction inside a body that keeps its kinetic energy.
 
-    That of the controlled body is constant, but a torque acts on it. Where one text has both kinds of bodies, which
-    is which is for its reader to judge.
+    The energy of the controlled body is constant, but a torque acts on it. A text with both kinds of bodies is left to
+    its reader.
     """
     only_controlled = CONTROLLED_BODY.search(text) and not OTHER_BODIES.search(text)
     paragraphs = [re.sub(r"\s*\n(?:#|\s)*", " ", paragraph) for paragraph in re.split(r"\n\s*\n", text)]
@@ -377,7 +378,7 @@ CITATION = re.compile(r"[\[(]([A-Z][^\[\]()`]*?\b(?:19|20)\d\d\b[^\[\]()`]*)[\])
 
 
 def _find_citations(text: str) -> list[tuple[str, str]]:
-    """Names and years of what a text cites in parentheses or brackets, such as ``(Holm and Janke 1993)``."""
+    """Return the names and years of the works that a text cites, such as ``(Holm and Janke 1993)``."""
     works = [work for citation in CITATION.findall(" ".join(text.split())) for work in citation.split(";")]
     matches = [part for work in works if (part := re.match(r"\s*(\D+?),? ((?:19|20)\d\d)", work))]
     names = re.compile(" and others| et al\\.|,? and |,? & |, ")

@@ -1,4 +1,4 @@
-"""The examples in the docstrings of the main names are executed, and print what they say."""
+"""Check that the examples in the docstrings of the main names run, and print the output they show."""
 
 import doctest
 import inspect
@@ -19,7 +19,7 @@ LISTED_NAME = re.compile(r"currentmodule:: (\w+)|^ {3}([\w.]+)$", re.MULTILINE)
 
 
 def _main_names():
-    """What the first page of the reference lists, with its package."""
+    """Yield the names that the first page of the reference lists, each with its package."""
     package = lt
     for module, name in LISTED_NAME.findall((ROOT / "docs/reference/api.md").read_text()):
         if module:
@@ -55,7 +55,7 @@ def test_an_example_that_is_wrong_is_found():
 
 
 def _run_doctest(text: str, name: str) -> int:
-    """How many lines were run."""
+    """Run the examples of a docstring and return the number of lines that were run."""
     names = {"lt": lt, "mf": mf, "np": np, "jnp": jnp, "jax": jax}
     test = doctest.DocTestParser().get_doctest(text, names, name, None, None)
     runner = doctest.DebugRunner(optionflags=doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS)

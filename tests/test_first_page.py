@@ -1,4 +1,4 @@
-"""The picture of the first page shows runs of one body, and the line above it has what is true of the package."""
+"""Check the picture of the first page, which shows runs of one body, and the line of facts above it."""
 
 import importlib
 import math
@@ -21,7 +21,7 @@ def chart_module(monkeypatch):
 
 
 def test_the_others_solve_the_equations_of_the_library(chart_module):
-    """The equations are written out by hand for them: they are those of the model, its attitude too."""
+    """The equations written out by hand for the other packages are those of the model and of its attitude."""
     body = lt.models.tumbling_body(chart_module.INERTIA, rate=chart_module.RATE)
     y = np.random.default_rng(0).standard_normal(8)
     field_by_hand = np.array(chart_module.field(y, math.exp))

@@ -1,11 +1,11 @@
-"""What the set-up commands install: a run needs few packages, and tests, pages and studies bring their own."""
+"""Check the packages that the set-up commands install: a run needs few, and every extra brings its own."""
 
 import re
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 MAX_PACKAGES = 60
-"""Packages of a run: more would make the first demo wait."""
+"""Most packages of a run: more would make the first demo wait."""
 
 EXTRA_PACKAGES = {
     "studies": {"dask", "distributed", "zarr"},
@@ -18,7 +18,7 @@ EXTRA_PACKAGES = {
 
 
 def _packages(lock: str) -> dict[str, str]:
-    """Names and versions of a lock."""
+    """Return the versions of the packages in a lock file, by their names."""
     lines = (ROOT / lock).read_text().splitlines()
     return {
         name.lower(): version for name, version in (line.split("==") for line in lines if re.match(r"\w.*==", line))

@@ -1,7 +1,7 @@
-"""Attributes that are looked up by a string, with a silent default: of what others define alone, never of our own.
+"""Allow attribute lookups by a string with a silent default only for attributes that other packages define.
 
-A member of a class of ours that is looked up so fails without a word when it gets another name: the entropy of a
-quantum system lost its floor in this way. A member exists, or the type says that it does not.
+If a member of one of our classes were looked up in this way, renaming it would go unnoticed: the entropy of a quantum
+system once lost its floor so. Our members exist, or the type says that they do not.
 """
 
 import ast
@@ -56,7 +56,7 @@ OURS = {
 
 
 def lookups():
-    """The file, the line and the name of each lookup with a silent default."""
+    """Yield the file, the line and the name of each lookup with a silent default."""
     for package in ("liethermo", "manifolds"):
         for path in sorted((ROOT / package).rglob("*.py")):
             for node in ast.walk(ast.parse(path.read_text())):

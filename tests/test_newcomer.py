@@ -1,4 +1,4 @@
-"""Ten tasks of a newcomer, done from the pages of the site alone: ``docs/howto/ten_tasks.md`` lists them."""
+"""Do ten tasks of a newcomer with the pages of the site alone: ``docs/howto/ten_tasks.md`` lists them."""
 
 from __future__ import annotations
 

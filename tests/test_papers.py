@@ -1,4 +1,4 @@
-"""The figures of the page of verification: computed again, and those that the page has."""
+"""Compute the figures of the page of verification again, and compare them with the page."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tests.papers import PAGE, ROUNDING, ROWS, Difference, Order, Value, agree, 
 
 
 def page_figures() -> dict[str, str]:
-    """The figures on the page by the names of their lines, and nothing else in its tables."""
+    """Return the figures on the page by the names of their lines, and check that its tables have nothing else."""
     text, figures = PAGE.read_text(), {}
     for paper in dict.fromkeys(line.paper for line in ROWS.values()):
         names = [name for name, line in ROWS.items() if line.paper == paper]

@@ -1,4 +1,4 @@
-"""The reference is complete: every public class, function, method and argument is told on the site."""
+"""Check that the reference is complete: the site describes every public class, function, method and argument."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ARGUMENTS_PAGE = Path(__file__).resolve().parent.parent / "docs" / "reference" /
 
 
 def _table_names() -> tuple[set[str], set[str]]:
-    """The arguments and the attributes that the table tells."""
+    """Return the names of the arguments and of the attributes that the table describes."""
     arguments, attributes = ARGUMENTS_PAGE.read_text().split("## Attributes")
     return tuple(  # type: ignore[return-value]
         {name for row in re.findall(r"^\| (`.*?) \|", part, re.MULTILINE) for name in re.findall(r"`(\w+)`", row)}
@@ -61,7 +61,7 @@ def test_every_argument_is_told(package):
 
 @pytest.mark.parametrize("package", [manifolds, liethermo], ids=lambda package: package.__name__)
 def test_everything_public_is_described(package):
-    """By a docstring of its own, or as an attribute by the table or the docstring of its class."""
+    """A public name has a docstring, or is described as an attribute in the table or in the docstring of its class."""
     _, attributes = _table_names()
     failures = []
     for name, value, doc in _public(package):
@@ -81,7 +81,7 @@ GEOMETRY = ("manifolds", "manifolds.sympy", "manifolds.testing")
 
 @pytest.mark.parametrize("name", ["liethermo", *(f"liethermo.{name}" for name in MODULES), *GEOMETRY])
 def test_modules_show_what_is_public_and_nothing_else(name):
-    """Other modules too only where the package has them for its users."""
+    """``dir`` of a module lists its public names, and other modules only where they are public too."""
     package, _, inner = name.partition(".")
     if inner in ("diffrax", "sympy"):
         pytest.importorskip(inner)
@@ -110,11 +110,11 @@ OTHER_MAIN_NAMES = (
     "LandauLifshitz",
     "SteepestEntropyAscent",
 )
-"""Main names besides those that the first page of the reference lists."""
+"""Main names that the first page of the reference does not list."""
 
 WRITTEN_BY_THE_LIBRARY = ("Solution", "Audit")
 CLASSES_WITHOUT_INIT = ("LieAlgebra",)
-"""Nobody calls these: their docstrings describe what they hold."""
+"""Classes that nobody calls: their docstrings describe what they hold."""
 
 UNITLESS_PARAMETERS = frozenset(
     """
@@ -125,7 +125,7 @@ UNITLESS_PARAMETERS = frozenset(
     store substeps units validate validation window
     """.split()
 )
-"""Options, names, counts and objects that have their own units. Any other parameter names its unit."""
+"""Parameters that need no unit: options, names, counts, and objects that have their own units."""
 
 UNIT = re.compile(
     r"\bunits?\b|dimensionless|without a unit|"
@@ -144,7 +144,7 @@ def _main_names():
 
 
 def _description_faults(thing, doc: str) -> list[str]:
-    """What is wrong with the description of each parameter."""
+    """Return the parameters that lack words or a unit in a docstring, each with the fault."""
     descriptions: dict[str, str] = {}
     section = re.search(r"^Parameters\n-+\n(.*?)(?=^\S[^\n]*\n---|\Z)", doc, re.MULTILINE | re.DOTALL)
     for entry in re.split(r"\n(?=\S)", section[1]) if section else []:

@@ -1,4 +1,4 @@
-"""What the check of the site finds: each fault is planted here, in a page that is right without it."""
+"""Check that the check of the site finds each fault, planted in a page that is right without it."""
 
 import importlib
 import shutil

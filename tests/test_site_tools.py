@@ -1,4 +1,4 @@
-"""What builds the site: blocks run as in a notebook, and notebooks are well formed."""
+"""Check the tools that build the site: blocks run as in a notebook, and notebooks are well formed."""
 
 from __future__ import annotations
 

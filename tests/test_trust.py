@@ -1,4 +1,4 @@
-"""Spec files of strangers: what they can make run, and what they can make wait."""
+"""Check spec files of strangers: nothing outside their folder runs, and nothing makes the user wait."""
 
 import subprocess
 import sys
@@ -119,7 +119,10 @@ print(xarray.__version__)
 
 
 def test_a_file_beside_the_spec_is_taken_for_no_other(folder):
-    """Nor where the other has not been imported yet: afterwards it would be the one beside the spec."""
+    """A file beside the spec is refused if another module has its name, even one that is not imported yet.
+
+    Afterwards the import would give the file beside the spec.
+    """
     (folder / "xarray.py").write_text("def build(): return 5")
     path = spec(folder, model("xarray:build"))
     command = [sys.executable, "-P", "-c", SHADOWING, str(path)]
@@ -129,7 +132,7 @@ def test_a_file_beside_the_spec_is_taken_for_no_other(folder):
 
 
 def test_what_is_beside_the_spec_is_sent_to_workers(folder):
-    """As it is, with what it imports from beside it: a worker has other folders."""
+    """A module beside the spec is pickled by value, with the modules it imports there: a worker has other folders."""
     import cloudpickle
 
     build, pickle_file = read(spec(folder, model("mine_of_trust:build"))).build, folder / "build.pickle"

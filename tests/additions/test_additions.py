@@ -1,4 +1,4 @@
-"""Each addition goes through the suite of its kind in one call, and runs."""
+"""Run each addition through the suite of its kind, in one call, and integrate with it."""
 
 import functools
 from pathlib import Path
@@ -89,7 +89,7 @@ def test_the_system():
 
 
 def test_what_an_addition_costs():
-    """Lines of each file, with its imports and its docstring."""
+    """Each file has at most 30 lines, with its imports and its docstring."""
     lines = {path.stem: len(path.read_text().splitlines()) for path in Path(__file__).parent.glob("[a-s]*.py")}
     assert set(lines) == {"algebra", "dissipation", "group", "integrator", "space", "system"}
     assert max(lines.values()) <= 30, lines
