@@ -54,8 +54,8 @@ def test_every_argument_is_told(package):
             names = [
                 parameter for parameter in inspect.signature(function).parameters if parameter not in ("self", "cls")
             ]
-            names_missing = [n for n in names if not re.search(rf"\b{n}\b", doc) and n not in arguments]
-            untold += [f"{name}: {', '.join(names_missing)}"] if names_missing else []
+            absent = [n for n in names if not re.search(rf"\b{n}\b", doc) and n not in arguments]
+            untold += [f"{name}: {', '.join(absent)}"] if absent else []
     assert untold == []
 
 

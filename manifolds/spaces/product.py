@@ -67,7 +67,7 @@ class Product(Space):
         return points
 
     def join(self, *parts) -> jax.Array:
-        """Return the flat array of the components: the inverse of :meth:`split`."""
+        """Return the flat array of ``parts``, a point of each factor: the inverse of :meth:`split`."""
         arrays = [factor._point_array(part, "part") for factor, part in zip(self.factors, parts, strict=True)]
         rows = [a.reshape(*a.shape[: a.ndim - len(f.shape)], -1) for f, a in zip(self.factors, arrays, strict=True)]
         batch = jnp.broadcast_shapes(*(row.shape[:-1] for row in rows))

@@ -133,7 +133,7 @@ class LiePoisson(PoissonStructure):
         return self.algebra.ad_star(alpha, x)
 
     def stages_on_leaf(self, x, alpha, A) -> jax.Array | None:
-        """Return stage points on the leaf; known for the matrices of u(n), su(n) and so(n), else None."""
+        """Return stage points on the leaf of x, by the stages A; None but for the matrices of u(n), su(n) and so(n)."""
         skew_matrices = _skew_matrices(self.algebra)
         if skew_matrices is None:
             return None
