@@ -54,10 +54,20 @@ def find_c_compiler() -> str | None:
     return shutil.which(os.environ.get("CC", "cc"))
 
 
+SOLVER_MACROS = {
+    "FIXED_POINT": "max_fixed_point_iterations",
+    "SLOW": "fixed_point_contraction_limit",
+    "SHRINKING": "stall_ratio",
+    "FLOOR": "update_floor",
+    "PLATEAU": "plateau_rtol",
+    "STEERED": "drift_threshold",
+}
+"""Macros of the C sources, and the solver options whose values they get."""
+
+
 def solver_definitions() -> list[str]:
-    """The library's rules, as definitions for the compiler."""
-    names = ("fixed_point", "slow", "shrinking", "floor", "plateau", "steered")
-    return [f"-D{name.upper()}={getattr(DEFAULT_OPTIONS, name)!r}" for name in names]
+    """Return the compiler flags that define each macro as the library's solver option."""
+    return [f"-D{macro}={getattr(DEFAULT_OPTIONS, option)!r}" for macro, option in SOLVER_MACROS.items()]
 
 
 @functools.cache

@@ -12,48 +12,48 @@ from .errors import ComponentError, ShapeError
 
 
 def is_traced(*values) -> bool:
-    """Whether any leaf is a JAX tracer, whose value cannot be looked at."""
+    """Return True if any leaf is a JAX tracer, whose value is not available."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(values))
 
 
-def real_components(x, dim: int, what: str) -> jax.Array:
-    """``x`` as a real array of doubles with last axis ``dim``."""
-    array = jnp.asarray(numeric_array(x, what))
+def real_components(x, dim: int, label: str) -> jax.Array:
+    """Return ``x`` as a real array of doubles, after checking that its last axis has length ``dim``."""
+    array = jnp.asarray(numeric_array(x, label))
     if jnp.issubdtype(array.dtype, jnp.complexfloating):
-        raise ComponentError(f"{what} must be real, not {array.dtype}: take its real part if that is meant")
+        raise ComponentError(f"{label} must be real, not {array.dtype}: take its real part if that is meant")
     if array.ndim == 0 or array.shape[-1] != dim:
-        raise ShapeError(f"{what} must have last axis {dim}, but its shape is {array.shape}")
+        raise ShapeError(f"{label} must have last axis {dim}, but its shape is {array.shape}")
     return array.astype(jnp.float64)
 
 
-def square_matrices(x, size: int, what: str) -> jax.Array:
-    """``x`` as an array of doubles (or complex doubles) with last axes ``(size, size)``."""
-    array = jnp.asarray(numeric_array(x, what))
+def square_matrices(x, size: int, label: str) -> jax.Array:
+    """Return ``x`` as an array of (complex) doubles, after checking that its last axes are ``(size, size)``."""
+    array = jnp.asarray(numeric_array(x, label))
     if array.shape[-2:] != (size, size):
-        raise ShapeError(f"{what} must have last axes ({size}, {size}), but its shape is {array.shape}")
+        raise ShapeError(f"{label} must have last axes ({size}, {size}), but its shape is {array.shape}")
     complex_input = jnp.issubdtype(array.dtype, jnp.complexfloating)
     return array.astype(jnp.complex128 if complex_input else jnp.float64)
 
 
-def first_true_index(failed: np.ndarray) -> tuple[int, ...] | None:
-    """Index of the first true entry, or None."""
-    return tuple(int(i) for i in np.argwhere(failed)[0]) if failed.any() else None
+def first_true_index(mask: np.ndarray) -> tuple[int, ...] | None:
+    """Return the index of the first true entry, or None."""
+    return tuple(int(i) for i in np.argwhere(mask)[0]) if mask.any() else None
 
 
 def format_index(index: tuple[int, ...]) -> str:
-    """An index as a message shows it after the name of an array: nothing where there is one entry alone."""
+    """Return an index as text in brackets, such as ``[0, 2]``, for messages; the empty index gives an empty text."""
     return f"[{', '.join(map(str, index))}]" if index else ""
 
 
-def numeric_array(x, what: str):
-    """``x`` as an array of numbers, of NumPy or JAX."""
+def numeric_array(x, label: str):
+    """Return ``x`` as a NumPy or JAX array of numbers; raise ComponentError if it is none."""
     if isinstance(x, jax.Array):
         return x
     try:
         array = np.asarray(x)
         return array.astype(np.float64) if array.dtype == object else _require_numeric_dtype(array)
     except (TypeError, ValueError) as error:
-        raise ComponentError(f"{what} is not a rectangular array of numbers: {error}") from None
+        raise ComponentError(f"{label} is not a rectangular array of numbers: {error}") from None
 
 
 def _require_numeric_dtype(array: np.ndarray) -> np.ndarray:
@@ -63,26 +63,30 @@ def _require_numeric_dtype(array: np.ndarray) -> np.ndarray:
 
 
 def real_array(value) -> jax.Array:
-    """``value`` as a JAX array of doubles, by NumPy where it is a plain number: XLA would compile a conversion."""
+    """Return ``value`` as a JAX array of doubles.
+
+    NumPy converts plain numbers, because XLA would compile a program for the conversion.
+    """
     if isinstance(value, jax.Array):
         return value if value.dtype == jnp.float64 else value.astype(jnp.float64)
-    if is_traced(value):  # some of its entries
+    if is_traced(value):  # a list with traced entries
         return jnp.asarray(value, dtype=jnp.float64)
     return jnp.asarray(np.asarray(value, dtype=np.float64))
 
 
 MAX_SELECT_COLUMNS = 4
-"""Arrays up to which the entries of one are selected among them."""
+"""Largest number of columns that :func:`stack_columns` combines by selection."""
 
 
 def stack_columns(columns: Sequence[jax.Array]) -> jax.Array:
-    """Arrays of one shape as the columns of one, shape (..., columns).
+    """Stack arrays of equal shape along a new last axis, shape (..., n_columns).
 
-    A few by selection: the loop of a concatenation has a branch for every entry.
+    Up to MAX_SELECT_COLUMNS columns are combined by selection, since XLA's loop for a concatenation branches at every
+    entry.
     """
     if len(columns) > MAX_SELECT_COLUMNS:
         return jnp.stack(columns, axis=-1)
-    *others, found = (column[..., None] for column in columns)
-    for i, column in enumerate(others):
-        found = jnp.where(np.arange(len(columns)) == i, column, found)
-    return found
+    *leading_columns, stacked_columns = (column[..., None] for column in columns)
+    for i, column in enumerate(leading_columns):
+        stacked_columns = jnp.where(np.arange(len(columns)) == i, column, stacked_columns)
+    return stacked_columns

@@ -1,4 +1,4 @@
-"""Keys of jaxprs: equal for equal operations, whatever objects they are made of."""
+"""Hashable keys of jaxprs that are equal for equal operations, whichever Python objects the jaxprs are made of."""
 
 from __future__ import annotations
 
@@ -10,30 +10,33 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Var
 
 
-def content_key(thing: Any) -> Hashable:
-    """A key that is equal for equal operations; where something has none, its identity."""
-    if isinstance(thing, ClosedJaxpr):
-        return ("closed", _jaxpr_key(thing.jaxpr), tuple(map(content_key, thing.consts)))
-    if isinstance(thing, Jaxpr):
-        return _jaxpr_key(thing)
-    if isinstance(thing, Literal):
-        return ("literal", str(thing.aval), np.asarray(thing.val).tobytes())
-    if isinstance(thing, jax.core.Tracer):
-        return ("is", _IdentityKey(thing))
-    if isinstance(thing, jax.Array | np.ndarray | np.generic) or hasattr(thing, "__array__"):
-        array = np.asarray(thing)
+def content_key(obj: Any) -> Hashable:
+    """Return a hashable key that is equal for equal operations and numbers.
+
+    An object that cannot be compared by content has its identity as its key.
+    """
+    if isinstance(obj, ClosedJaxpr):
+        return ("closed", _jaxpr_key(obj.jaxpr), tuple(map(content_key, obj.consts)))
+    if isinstance(obj, Jaxpr):
+        return _jaxpr_key(obj)
+    if isinstance(obj, Literal):
+        return ("literal", str(obj.aval), np.asarray(obj.val).tobytes())
+    if isinstance(obj, jax.core.Tracer):
+        return ("is", _IdentityKey(obj))
+    if isinstance(obj, jax.Array | np.ndarray | np.generic) or hasattr(obj, "__array__"):
+        array = np.asarray(obj)
         return ("array", str(array.dtype), array.shape, array.tobytes())
-    if isinstance(thing, tuple | list):
-        return (type(thing), *map(content_key, thing))
-    if isinstance(thing, dict):
-        return (dict, *((name, content_key(value)) for name, value in sorted(thing.items())))
-    if type(thing).__name__ == "WrappedFun":
-        return _derivative_rule_key(thing)
+    if isinstance(obj, tuple | list):
+        return (type(obj), *map(content_key, obj))
+    if isinstance(obj, dict):
+        return (dict, *((name, content_key(value)) for name, value in sorted(obj.items())))
+    if type(obj).__name__ == "WrappedFun":
+        return _derivative_rule_key(obj)
     try:
-        hash(thing)
+        hash(obj)
     except TypeError:
-        return ("is", _IdentityKey(thing))
-    return (type(thing), thing)
+        return ("is", _IdentityKey(obj))
+    return (type(obj), obj)
 
 
 def _jaxpr_key(jaxpr: Jaxpr) -> Hashable:
@@ -42,8 +45,8 @@ def _jaxpr_key(jaxpr: Jaxpr) -> Hashable:
     def name(atom) -> Hashable:
         return content_key(atom) if isinstance(atom, Literal) else numbering.setdefault(atom, len(numbering))
 
-    front = tuple((name(v), str(v.aval)) for v in (*jaxpr.constvars, *jaxpr.invars))
-    body = tuple(
+    inputs = tuple((name(v), str(v.aval)) for v in (*jaxpr.constvars, *jaxpr.invars))
+    equations = tuple(
         (
             eqn.primitive,
             tuple((k, content_key(v)) for k, v in sorted(eqn.params.items())),
@@ -52,20 +55,35 @@ def _jaxpr_key(jaxpr: Jaxpr) -> Hashable:
         )
         for eqn in jaxpr.eqns
     )
-    return (front, body, tuple(map(name, jaxpr.outvars)))
+    return (inputs, equations, tuple(map(name, jaxpr.outvars)))
 
 
 def _derivative_rule_key(rule) -> Hashable:
-    """A derivative rule of someone's own: the function that was given, where it can be told and is there for good."""
-    for _ in range(4):  # JAX wraps it in functions of its own, which are new in every trace
-        found = _closure_values(rule.f)
-        inner = next((c for c in found if type(c).__name__ == "WrappedFun"), None)
+    """Return the key of a user's derivative rule: the user's own function, unwrapped, and the parameters of its
+    transforms."""
+    for _ in range(4):  # JAX wraps the rule in functions that are new in every trace
+        cells = _closure_values(rule.f)
+        inner = next((cell for cell in cells if type(cell).__name__ == "WrappedFun"), None)
         if inner is None:
-            inner = next((g for c in found if callable(c) for g in _closure_values(c) if type(g) is type(rule)), None)
+            inner = next(
+                (
+                    function
+                    for cell in cells
+                    if callable(cell)
+                    for function in _closure_values(cell)
+                    if type(function) is type(rule)
+                ),
+                None,
+            )
         if inner is None:
             break
         rule = inner
-    parameters = tuple(content_key(getattr(p, "val", p)) for _, ps in rule.transforms for p in ps if not callable(p))
+    parameters = tuple(
+        content_key(getattr(param, "val", param))
+        for _, params in rule.transforms
+        for param in params
+        if not callable(param)
+    )
     return ("rule", rule.f, parameters)
 
 
@@ -81,10 +99,10 @@ def _has_contents(cell) -> bool:
 
 
 class _IdentityKey:
-    """A thing that equals itself alone, and is held on to."""
+    """Key that is equal only to keys of the same object, and keeps the object alive."""
 
-    def __init__(self, thing: Any):
-        self.wrapped = thing
+    def __init__(self, obj: Any):
+        self.wrapped = obj
 
     def __eq__(self, other) -> bool:
         return isinstance(other, _IdentityKey) and self.wrapped is other.wrapped

@@ -1,4 +1,4 @@
-"""Processes that are forked after JAX has run: they cannot compile, and raise an error instead of waiting for ever."""
+"""Raise an error in processes that were forked after JAX had run: XLA cannot compile there and would wait for ever."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import jax
 from .errors import ForkError
 
 BACKEND_COMPILE_EVENT = "/jax/core/compile/backend_compile_duration"
-"""What JAX says when XLA has compiled a program."""
+"""Event that JAX reports when XLA has compiled a program."""
 
 LOWERING_EVENT = "/jax/core/compile/jaxpr_to_mlir_module_duration"
-"""What it says just before XLA does."""
+"""Event that JAX reports just before XLA compiles a program."""
 
 _has_compiled, _forked_after_compile = False, False
 
@@ -22,8 +22,8 @@ def _track_compilation(event: str, duration_secs: float, **kwargs: str | int) ->
     del duration_secs, kwargs
     if event == LOWERING_EVENT and _forked_after_compile:
         raise ForkError(
-            "this process was forked after JAX had run, and XLA cannot compile here: it would wait for threads that the"
-            ' fork has left behind. Start processes by multiprocessing.get_context("spawn")'
+            "this process was forked after JAX had run, so XLA cannot compile in it. "
+            'Start processes by multiprocessing.get_context("spawn")'
         )
     _has_compiled = _has_compiled or event == BACKEND_COMPILE_EVENT
 

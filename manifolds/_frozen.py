@@ -1,4 +1,4 @@
-"""A function as it is when it is given: what it reads may change later."""
+"""Functions that are traced once, so that later changes of the values they read have no effect."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ._content_keys import content_key
 
 
 class FrozenFunction:
-    """A function of one array, traced for a shape; equal to others of the same operations and numbers.
+    """Function of one array, traced for a given shape; instances with equal operations and numbers are equal.
 
     Programs are kept by the spaces that they belong to. A space must therefore not equal another one whose function
     read other numbers when it was given, though both were given the same function object.
@@ -30,9 +30,8 @@ class FrozenFunction:
     def __init__(self, function: Callable, shape: tuple[int, ...]):
         self.function, self.shape = function, shape
         x = jax.ShapeDtypeStruct(shape, jnp.float64)
-        self.closed_jaxpr: ClosedJaxpr = jax.make_jaxpr(lambda x: jnp.asarray(function(x)))(
-            x
-        )  # JAX keeps the trace of a function
+        # a new lambda, since JAX caches the trace of a function
+        self.closed_jaxpr: ClosedJaxpr = jax.make_jaxpr(lambda x: jnp.asarray(function(x)))(x)
         self._key = content_key(self.closed_jaxpr)
 
     def __call__(self, x):

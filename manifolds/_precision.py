@@ -1,4 +1,5 @@
-"""The settings of JAX: 64-bit floating point, and those that this library runs under whatever its user debugs with."""
+"""Settings of JAX: 64-bit floating point, and the settings that the library's code runs under whatever the user has
+set."""
 
 from __future__ import annotations
 
@@ -17,15 +18,18 @@ jax.config.update("jax_enable_x64", True)  # before anything is traced
 F = TypeVar("F", bound=Callable)
 
 LIBRARY_SETTINGS = ("allow", "standard", False)
-"""Rank promotion, dtype promotion and the search for infinities, as the code of this library has them."""
+"""Rank promotion, dtype promotion and ``debug_infs`` while library code runs.
+
+The library relies on rank promotion, and its searches may produce infinities.
+"""
 
 _saved_user_settings: ContextVar[tuple[Any, ...] | None] = ContextVar("asked", default=None)
-"""What the user has them at, while code of this library runs."""
+"""Settings of the user, in the order of LIBRARY_SETTINGS, while library code runs; None otherwise."""
 
 
 @contextlib.contextmanager
 def library_settings() -> Iterator[None]:
-    """Run code of this library: its ranks are promoted, and infinities in its searches are no faults.
+    """Context manager that runs library code under LIBRARY_SETTINGS.
 
     Raises
     ------
@@ -35,14 +39,14 @@ def library_settings() -> Iterator[None]:
     config: Any = jax.config
     if not config.jax_enable_x64:
         raise PrecisionError(
-            "JAX computes in single precision, since jax_enable_x64 was switched off after the import: no law holds to "
-            'rounding then. Switch it on again with jax.config.update("jax_enable_x64", True)'
+            "JAX must compute in double precision, but jax_enable_x64 was switched off after the import. "
+            'Switch it on again with jax.config.update("jax_enable_x64", True)'
         )
-    asked = (config.jax_numpy_rank_promotion, config.jax_numpy_dtype_promotion, config.jax_debug_infs)
-    if asked == LIBRARY_SETTINGS:
+    user_values = (config.jax_numpy_rank_promotion, config.jax_numpy_dtype_promotion, config.jax_debug_infs)
+    if user_values == LIBRARY_SETTINGS:
         yield
         return
-    token = _saved_user_settings.set(asked)
+    token = _saved_user_settings.set(user_values)
     try:
         with _apply_settings(LIBRARY_SETTINGS):
             yield
@@ -52,32 +56,36 @@ def library_settings() -> Iterator[None]:
 
 @contextlib.contextmanager
 def user_settings() -> Iterator[None]:
-    """Run a function of the user's as the user has JAX set."""
-    asked = _saved_user_settings.get()
-    if asked is None:
+    """Context manager that restores the user's settings while a function of the user runs."""
+    user_values = _saved_user_settings.get()
+    if user_values is None:
         yield
         return
     token = _saved_user_settings.set(None)
     try:
-        with _apply_settings(asked):
+        with _apply_settings(user_values):
             yield
     finally:
         _saved_user_settings.reset(token)
 
 
 def with_library_settings(function: F) -> F:
-    """A function that users call, run under :func:`library_settings`."""
+    """Decorate a public function so that it runs under :func:`library_settings`."""
 
     @functools.wraps(function)
-    def called(*arguments, **named):
+    def called(*args, **kwargs):
         with library_settings():
-            return function(*arguments, **named)
+            return function(*args, **kwargs)
 
     return cast("F", called)
 
 
 @contextlib.contextmanager
-def _apply_settings(values: tuple[Any, ...]) -> Iterator[None]:
-    ranks, kinds, infinities = values
-    with jax.numpy_rank_promotion(ranks), jax.numpy_dtype_promotion(kinds), jax.debug_infs(infinities):
+def _apply_settings(settings: tuple[Any, ...]) -> Iterator[None]:
+    rank_promotion, dtype_promotion, debug_infs = settings
+    with (
+        jax.numpy_rank_promotion(rank_promotion),
+        jax.numpy_dtype_promotion(dtype_promotion),
+        jax.debug_infs(debug_infs),
+    ):
         yield

@@ -1,4 +1,4 @@
-"""The base of all pytrees here."""
+"""Base class of all pytrees of the library, and attributes forwarded to a wrapped object."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ import jax
 
 
 class Module(eqx.Module):
-    """An equinox module whose methods are bound as Python binds them, unless they are given to another module to keep.
+    """Equinox module whose methods are ordinary bound methods, except when they become fields of another module.
 
-    Equinox makes a pytree of each method that is looked up, which is a good part of what it costs to trace a step, and
-    of a short run. A pytree is needed only where a method becomes part of another module,
-    so that the parameters of its object are parameters there.
+    Equinox makes a pytree of each method that is looked up, which takes a good part of the time to trace a step and of
+    a
+    short run. A pytree is needed only when a method becomes a field of another module, so that the parameters of its
+    object are parameters there.
     """
 
     if not TYPE_CHECKING:
@@ -23,8 +24,8 @@ class Module(eqx.Module):
     def __check_init__(self) -> None:
         leaves, structure = jax.tree_util.tree_flatten(self)
         if any(map(_is_module_method, leaves)):
-            whole = jax.tree_util.tree_unflatten(structure, [_method_to_partial(leaf) for leaf in leaves])
-            for name, value in vars(whole).items():
+            rebuilt_module = jax.tree_util.tree_unflatten(structure, [_method_to_partial(leaf) for leaf in leaves])
+            for name, value in vars(rebuilt_module).items():
                 object.__setattr__(self, name, value)
 
 
@@ -37,10 +38,10 @@ def _method_to_partial(leaf: Any) -> Any:
 
 
 class _ForwardedMember:
-    """See :func:`forwarded`."""
+    """Descriptor of :func:`forward_to`."""
 
-    def __init__(self, inside: str, name: str | None):
-        self.attribute, self.name = inside, name
+    def __init__(self, attribute: str, name: str | None):
+        self.attribute, self.name = attribute, name
 
     def __set_name__(self, owner: type, name: str) -> None:
         self.name = self.name or name
@@ -49,9 +50,9 @@ class _ForwardedMember:
         return self if instance is None else getattr(getattr(instance, self.attribute), str(self.name))
 
 
-def forward_to(inside: str, name: str | None = None) -> Any:
-    """In the body of a class that wraps an object: a member of that object, which the attribute ``inside`` holds.
+def forward_to(attribute: str, name: str | None = None) -> Any:
+    """Return a descriptor that reads a member of the wrapped object ``self.<attribute>``.
 
-    The member of the same name, or of another one.
+    The member is called ``name``, by default like the descriptor.
     """
-    return _ForwardedMember(inside, name)
+    return _ForwardedMember(attribute, name)

@@ -1,4 +1,4 @@
-"""Sizes that catalogues are asked for."""
+"""Checks of sizes that users ask for, and of the memory that they need."""
 
 from __future__ import annotations
 
@@ -9,25 +9,26 @@ import numpy as np
 from .errors import ParameterError, SizeError
 
 
-def checked_size(value: int, least: int, name: str, what: str = "n") -> int:
+def checked_size(value: int, minimum: int, name: str, label: str = "n") -> int:
+    """Return ``value`` as an int, after checking that it is an integer and at least ``minimum``."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise ParameterError(f"{name}: {what} must be an integer, not {value!r}")
-    if value < least:
-        raise ParameterError(f"{name}: {what} must be at least {least}, not {value}")
+        raise ParameterError(f"{name}: {label} must be an integer, not {value!r}")
+    if value < minimum:
+        raise ParameterError(f"{name}: {label} must be at least {minimum}, not {value}")
     return int(value)
 
 
-def check_memory(numbers: float, what: str, instead: str, number_size: int = 8) -> None:
-    """Raise SizeError where an array of so many numbers would not fit into half of this machine's memory."""
-    needed, there = float(numbers) * number_size, memory_bytes()
-    if needed > there / 2:
+def check_memory(n_numbers: float, label: str, advice: str, bytes_per_number: int = 8) -> None:
+    """Raise SizeError if an array of ``n_numbers`` numbers would take more than half of this machine's memory."""
+    n_bytes, memory = float(n_numbers) * bytes_per_number, memory_bytes()
+    if n_bytes > memory / 2:
         raise SizeError(
-            f"{what} would take {needed / 1e9:.3g} GB, and this machine has {there / 1e9:.3g} GB of memory; {instead}"
+            f"{label} would take {n_bytes / 1e9:.3g} GB, and this machine has {memory / 1e9:.3g} GB of memory; {advice}"
         )
 
 
 def memory_bytes() -> float:
-    """The bytes of memory of this machine; 16 GB where it does not say."""
+    """Return the memory of this machine in bytes; 16 GB if the system does not report it."""
     try:
         return float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):  # not on Windows

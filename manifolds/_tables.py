@@ -1,4 +1,4 @@
-"""Tables of measured numbers with verdicts, as they are printed to a user."""
+"""Tables of measured values with their limits and verdicts, as text and as HTML."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from dataclasses import dataclass
 from html import escape
 
 VERDICT_TEXTS = {True: "ok", False: "FAILS", None: "-"}
+"""Text of each verdict; None means that the value has no limit."""
 
 
 @dataclass(frozen=True)
 class TableRow:
-    """What was measured, what is allowed, and the verdict (None where nothing is asked)."""
+    """Row of a table: a measured value, its limit, and the verdict (None if the value is not judged)."""
 
     name: str
     value: float
@@ -23,11 +24,11 @@ class TableRow:
 
 
 class Tabular(ABC):
-    """What prints as a table, and shows as one in a notebook."""
+    """Base class of objects that print as a table of text, and show as an HTML table in a notebook."""
 
     @abstractmethod
     def _table_content(self) -> tuple[Iterable[TableRow], tuple[str, str, str], str]:
-        """The rows, their headings, and a last line."""
+        """Return the rows, the three headings, and the footer."""
 
     def __str__(self) -> str:
         return text_table(*self._table_content())
@@ -37,42 +38,42 @@ class Tabular(ABC):
 
 
 PAGE_WIDTH = 80
-"""Columns of a terminal, and of a page."""
+"""Columns of a terminal, which tables do not exceed."""
 
 NUMBER_COLUMNS_WIDTH = 30
-"""Columns of what stands behind the name of a row."""
+"""Columns reserved for the value, the limit and the verdict after the name of a row."""
 
 
-def text_table(rows: Iterable[TableRow], headings: tuple[str, str, str], last: str) -> str:
-    """The rows under their headings, and a last line; names and notes that are too long go on in lines of their own."""
+def text_table(rows: Iterable[TableRow], headings: tuple[str, str, str], footer: str) -> str:
+    """Return the rows under their headings and above a footer, as text; long names and notes are wrapped."""
     rows = list(rows)
     width = min(max([len(headings[0]), *(len(row.name) for row in rows)]), PAGE_WIDTH - NUMBER_COLUMNS_WIDTH)
     lines = [f"{headings[0]:<{width}}  {headings[1]:>10}  {headings[2]:>9}"]
     for row in rows:
-        *above, name = wrap_lines(row.name, width, "  ")
-        allowed = " " * 9 if row.allowed is None or row.passed is None else f"{row.allowed:9.1e}"
-        line = f"{name:<{width}}  {row.value:10.2e}  {allowed}  {VERDICT_TEXTS[row.passed]:<5}"
-        short = f"{line} {row.note}".rstrip()
-        fits = len(short) <= PAGE_WIDTH
+        *name_lines, name = wrap_lines(row.name, width, "  ")
+        limit_text = " " * 9 if row.allowed is None or row.passed is None else f"{row.allowed:9.1e}"
+        line = f"{name:<{width}}  {row.value:10.2e}  {limit_text}  {VERDICT_TEXTS[row.passed]:<5}"
+        one_line = f"{line} {row.note}".rstrip()
+        fits_on_page = len(one_line) <= PAGE_WIDTH
         lines += [
-            *above,
-            short if fits else line.rstrip(),
-            *([] if fits else wrap_lines(f"    {row.note}", PAGE_WIDTH, "    ")),
+            *name_lines,
+            one_line if fits_on_page else line.rstrip(),
+            *([] if fits_on_page else wrap_lines(f"    {row.note}", PAGE_WIDTH, "    ")),
         ]
-    return "\n".join([*lines, *wrap_lines(last, PAGE_WIDTH)])
+    return "\n".join([*lines, *wrap_lines(footer, PAGE_WIDTH)])
 
 
 def wrap_lines(text: str, width: int = PAGE_WIDTH, hang: str = "") -> list[str]:
-    """Lines of at most so many columns, broken between words; a word that is longer stays whole."""
-    found = [
+    """Return ``text`` as lines of at most ``width`` columns, broken between words; a longer word has its own line."""
+    wrapped_lines = [
         textwrap.wrap(line, width, subsequent_indent=hang, break_long_words=False, break_on_hyphens=False) or [""]
         for line in text.split("\n")
     ]
-    return [line for lines in found for line in lines]
+    return [line for lines in wrapped_lines for line in lines]
 
 
-def html_table(rows: Iterable[TableRow], headings: tuple[str, str, str], last: str) -> str:
-    """The same table for a notebook."""
+def html_table(rows: Iterable[TableRow], headings: tuple[str, str, str], footer: str) -> str:
+    """Return the rows with their headings and footer as an HTML table for a notebook."""
     cells = [
         (
             row.name,
@@ -83,12 +84,12 @@ def html_table(rows: Iterable[TableRow], headings: tuple[str, str, str], last: s
         )
         for row in rows
     ]
-    return html_grid([*headings, "", ""], cells, last)
+    return html_grid([*headings, "", ""], cells, footer)
 
 
-def html_grid(headings: Iterable[str], rows: Iterable[Iterable[str]], last: str = "") -> str:
-    """A table of texts for a notebook, with a line below it."""
+def html_grid(headings: Iterable[str], rows: Iterable[Iterable[str]], footer: str = "") -> str:
+    """Return an HTML table of escaped texts, with an optional footer below."""
     head = "".join(f"<th>{escape(text)}</th>" for text in headings)
     body = "".join("<tr>" + "".join(f"<td>{escape(text)}</td>" for text in row) + "</tr>" for row in rows)
-    below = f"<p><strong>{escape(last)}</strong></p>" if last else ""
-    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>{below}"
+    footer_html = f"<p><strong>{escape(footer)}</strong></p>" if footer else ""
+    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>{footer_html}"

@@ -1,4 +1,4 @@
-"""Errors of the geometry layer: each carries the value found, the tolerance and what to do."""
+"""Errors of the geometry layer; each states the value found, the tolerance and the remedy."""
 
 from __future__ import annotations
 
@@ -11,40 +11,40 @@ class ManifoldsError(Exception):
 
 
 class ShapeError(ManifoldsError, ValueError):
-    """An array whose last axes do not fit the algebra, group or manifold."""
+    """Raised when the last axes of an array do not fit the algebra, group or manifold."""
 
 
 class ComponentError(ManifoldsError, TypeError):
-    """Components of the wrong kind: complex, textual or ragged where real numbers are meant."""
+    """Raised when components are complex, textual or ragged but must be real numbers."""
 
 
 class ParameterError(ManifoldsError, ValueError):
-    """A catalogue entry asked for with a parameter outside its range."""
+    """Raised when a parameter is outside its allowed range."""
 
 
 class ForkError(ManifoldsError, RuntimeError):
-    """A process that was forked after JAX had run is to compile a program, which it cannot."""
+    """Raised when a process that was forked after JAX had run is about to compile a program."""
 
 
 class PrecisionError(ManifoldsError, RuntimeError):
-    """JAX has been set to single precision, in which no law holds to rounding."""
+    """Raised when JAX has been set to single precision, in which no law holds to rounding."""
 
 
 class SizeError(ParameterError):
-    """Something that would not fit into the memory of this machine, refused before it is tried."""
+    """Raised before an object is built that would not fit into the memory of this machine."""
 
 
 class DomainError(ManifoldsError, ValueError):
-    """A map evaluated outside its domain, such as the logarithm of -I in SU(2)."""
+    """Raised when a map is evaluated outside its domain, such as the logarithm of -I in SU(2)."""
 
 
 class OffManifoldError(DomainError):
-    """A point off its state space, or a vector that is not tangent to it.
+    """Raised when a point is not on its state space, or a vector is not tangent to it.
 
     Attributes
     ----------
     residual, tolerance : float
-        How far it is away, relative to its size, and how far it may be.
+        Distance from the space, relative to the size of the point or vector, and its limit.
     """
 
     def __init__(self, message: str, *, residual: float, tolerance: float):
@@ -53,16 +53,16 @@ class OffManifoldError(DomainError):
 
 
 class SpaceError(ManifoldsError, TypeError):
-    """An operation that a state space does not have, or an object that cannot be one."""
+    """Raised when a state space lacks an operation, or an object cannot be a state space."""
 
 
 class LieAlgebraError(ManifoldsError, ValueError):
-    """Data that do not define a Lie algebra, or an operation this algebra does not have.
+    """Raised when data do not define a Lie algebra, or the algebra lacks an operation.
 
     Attributes
     ----------
     residual, tolerance : float or None
-        How far the axiom is from holding, and how far it may be.
+        Violation of the axiom, and its limit.
     indices : tuple of int
         The offending basis elements, counted from 0.
     """
@@ -73,23 +73,23 @@ class LieAlgebraError(ManifoldsError, ValueError):
 
 
 class AntisymmetryError(LieAlgebraError):
-    """``C[a, b, :] != -C[b, a, :]``."""
+    """Raised when structure constants are not antisymmetric: ``C[a, b, :] != -C[b, a, :]``."""
 
 
 class JacobiError(LieAlgebraError):
-    """``[[a, b], c] + [[b, c], a] + [[c, a], b] != 0``."""
+    """Raised when the Jacobi identity fails: ``[[a, b], c] + [[b, c], a] + [[c, a], b] != 0``."""
 
 
 class ClosureError(LieAlgebraError):
-    """Matrices that are dependent, or whose commutators leave their span."""
+    """Raised when matrices are linearly dependent, or their commutators leave their span."""
 
 
 class RepresentationError(LieAlgebraError):
-    """Matrices ``rho_a`` with ``[rho_a, rho_b] != rho([e_a, e_b])``."""
+    """Raised when matrices ``rho_a`` are no representation: ``[rho_a, rho_b] != rho([e_a, e_b])``."""
 
 
 def warn(message: str, category: type[Warning] = UserWarning) -> None:
-    """A warning that points to the line of the user's that led to it, however deep inside the library it arises."""
+    """Issue a warning that points to the user's line that led to it, however deep in the library it arises."""
     frame, depth = sys._getframe(1), 2
     while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] in ("liethermo", "manifolds"):
         frame, depth = frame.f_back, depth + 1

@@ -1,4 +1,4 @@
-"""To and from SymPy: polynomials, Casimirs and Lie algebras, exactly. SymPy is an optional package.
+"""Exact conversion of polynomials, Casimirs and Lie algebras to and from SymPy, an optional package.
 
 ``mf.sympy.expression(casimir)``, ``mf.sympy.polynomial(expression, symbols)``, ``mf.sympy.structure_constants(g)`` and
 ``mf.sympy.algebra(constants)``.
@@ -23,50 +23,50 @@ __dir__ = public_dir(__all__)
 
 
 def symbols(dim: int, names: Sequence[str] | None = None) -> tuple[sympy.Symbol, ...]:
-    """Real symbols for the components of ``mu``, by default ``mu1``, ``mu2``, …"""
+    """Return real symbols for the components of ``mu``, by default ``mu1``, ``mu2``, …"""
     return tuple(
         sympy.Symbol(name, real=True) for name in component_names(None if names is None else tuple(names), dim)
     )
 
 
 def expression(polynomial: Polynomial, variables: Sequence[sympy.Symbol] | None = None) -> sympy.Expr:
-    """A polynomial as a SymPy expression; fractions stay fractions.
+    """Return a polynomial as a SymPy expression; fractions stay exact.
 
     Parameters
     ----------
     polynomial : Polynomial
-        Such as a Casimir; write out a ``TracePolynomial`` by its ``expanded()`` first.
+        A Casimir, for example; expand a ``TracePolynomial`` by its ``expanded()`` first.
     variables : sequence of dim symbols, optional
-        By default those of :func:`symbols`, with the names of the polynomial.
+        By default the symbols of :func:`symbols`, with the names of the polynomial.
 
     Raises
     ------
     ShapeError
-        If the number of symbols is another.
+        If there are not ``dim`` symbols.
     """
-    own = symbols(polynomial.dim, polynomial.names) if variables is None else tuple(variables)
-    if len(own) != polynomial.dim:
-        raise ShapeError(f"a polynomial in {polynomial.dim} variables needs as many symbols, not {len(own)}")
+    generators = symbols(polynomial.dim, polynomial.names) if variables is None else tuple(variables)
+    if len(generators) != polynomial.dim:
+        raise ShapeError(f"a polynomial in {polynomial.dim} variables needs as many symbols, not {len(generators)}")
     return sympy.Add(
         *(
-            _number(coefficient) * sympy.Mul(*(x**e for x, e in zip(own, power, strict=True)))
+            _number(coefficient) * sympy.Mul(*(x**e for x, e in zip(generators, power, strict=True)))
             for power, coefficient in polynomial.terms
         )
     )
 
 
 def polynomial(expression: Any, variables: Sequence[sympy.Symbol]) -> Polynomial:
-    """A SymPy expression as a polynomial in the given symbols, whose names it prints with.
+    """Return a SymPy expression as a polynomial in the given symbols, whose names it prints with.
 
     Raises
     ------
     ComponentError
-        If it is no polynomial in them with real numbers as coefficients.
+        If the expression is no polynomial in the symbols with real coefficients.
     """
     terms: dict[tuple[int, ...], Any] = {}
     for term in sympy.Add.make_args(sympy.expand(sympy.sympify(expression))):
-        number, rest = term.as_independent(*variables, as_Add=False)  # numbers stay what each of them is
-        powers_of = rest.as_powers_dict()
+        number, monomial = term.as_independent(*variables, as_Add=False)  # keeps the type of the number
+        powers_of = monomial.as_powers_dict()
         if not set(powers_of) <= {*variables, sympy.S.One} or not all(
             e.is_Integer and e >= 0 for e in powers_of.values()
         ):
@@ -74,12 +74,12 @@ def polynomial(expression: Any, variables: Sequence[sympy.Symbol]) -> Polynomial
         power = tuple(int(powers_of.get(x, 0)) for x in variables)
         terms[power] = terms.get(power, 0) + number
     powers = np.array(list(terms), dtype=np.int64).reshape(-1, len(variables))
-    made = Polynomial(powers, [_coefficient(value) for value in terms.values()])
-    return made.with_names(*map(str, variables))
+    result = Polynomial(powers, [_coefficient(value) for value in terms.values()])
+    return result.with_names(*map(str, variables))
 
 
 def structure_constants(g: LieAlgebra) -> sympy.ImmutableDenseNDimArray:
-    """``C[a, b, c]`` of an algebra: fractions where they are known as such, else floats."""
+    """Return ``C[a, b, c]`` of an algebra: rationals where they are known exactly, else floats."""
     exact = g.rational_constants
     if exact is None:
         entries = [sympy.Float(float(value), 17) for value in g.structure_constants.ravel()]
@@ -89,7 +89,7 @@ def structure_constants(g: LieAlgebra) -> sympy.ImmutableDenseNDimArray:
 
 
 def algebra(constants: Any, name: str = "g", basis_names: Sequence[str] | None = None) -> LieAlgebra:
-    """The Lie algebra of structure constants in SymPy, shape (dim, dim, dim); fractions are taken exactly.
+    """Return the Lie algebra of SymPy structure constants, shape (dim, dim, dim); rationals stay exact.
 
     Raises
     ------
@@ -100,10 +100,10 @@ def algebra(constants: Any, name: str = "g", basis_names: Sequence[str] | None =
     """
     entries = sympy.ImmutableDenseNDimArray(constants)
     if len(entries.shape) != 3:
-        raise ShapeError(f"structure constants have three indices, not {len(entries.shape)}")
-    flat = [_coefficient(entries[i]) for i in np.ndindex(*entries.shape)]
-    table = np.empty(len(flat), dtype=object)
-    table[:] = flat
+        raise ShapeError(f"structure constants must have three indices, got {len(entries.shape)}")
+    coefficients = [_coefficient(entries[i]) for i in np.ndindex(*entries.shape)]
+    table = np.empty(len(coefficients), dtype=object)
+    table[:] = coefficients
     return LieAlgebra.from_structure_constants(table.reshape(entries.shape), name, basis_names)
 
 

@@ -1,7 +1,7 @@
-"""The cases on which the shared property suite runs, and its tolerances.
+"""Define the cases on which the shared property suite runs, and its tolerances.
 
-An algebra, a dissipation or a method enters by being registered (algebras and methods in the library, dissipations in
-``DISSIPATIONS`` below); every property then runs on it. Exemptions carry a reason.
+An algebra or a method takes part as soon as the library registers it, a dissipation as soon as it is listed in
+``DISSIPATIONS`` below. Every property then runs on it. Exemptions carry a reason.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ def tolerance(name: str) -> float:
 
 
 class BuiltOnUse(Mapping):
-    """What is built when it is first asked for, by name: collecting the tests builds nothing."""
+    """Mapping from names to objects that are built when they are first asked for: collecting the tests builds
+    nothing."""
 
     def __init__(self, makers: Mapping[str, Callable]) -> None:
         self._makers = dict(makers)
@@ -86,11 +87,11 @@ TRANSCENDENTAL = {
     "bianchi('VII', h=1)": (_bianchi_vii(1.0), [0.3, 1.5, 0.2]),
     "bianchi('VII', h=0.3)": (_bianchi_vii(0.3**0.5), [0.3, 1.5, 0.2]),
 }
-"""Casimirs that are not polynomials, and a state inside their domain."""
+"""Casimirs that are not polynomials, each with a state inside its domain."""
 
 
 def entropy_of(g: mf.LieAlgebra):
-    """A Casimir of lowest degree, or None for an algebra without any."""
+    """Return a Casimir of lowest degree as the entropy, or None for an algebra without any."""
     if g.casimir_count() == 0:
         return None
     if g.name in TRANSCENDENTAL:
@@ -98,10 +99,10 @@ def entropy_of(g: mf.LieAlgebra):
     for degree in (1, 2, 3):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", mf.NoPolynomialCasimirWarning)
-            found = g.casimirs(degree)
-        if found:
+            casimirs = g.casimirs(degree)
+        if casimirs:
             # of several quadratic ones the sum: se(3) has |p|^2 and l.p
-            return make_energy(found[0], "S")
+            return make_energy(casimirs[0], "S")
     raise AssertionError(f"no Casimir known for {g.name}: add one to TRANSCENDENTAL")
 
 
@@ -113,7 +114,7 @@ def state_of(g: mf.LieAlgebra, seed: int) -> np.ndarray:
 
 
 def energy_of(dim: int, seed: int):
-    """A nonlinear energy: a positive quadratic part, a quartic and a cosine."""
+    """Return a random nonlinear energy: a positive quadratic part, a quartic and a cosine."""
     rng = np.random.default_rng(1000 + seed)
     root = rng.standard_normal((dim, dim)) / np.sqrt(dim)
     A, b, c = root @ root.T + np.eye(dim), rng.standard_normal(dim), rng.standard_normal(dim)
@@ -127,7 +128,7 @@ def energy_of(dim: int, seed: int):
 
 @dataclass(frozen=True)
 class Case:
-    """A dissipation as the suite runs it: how to build it for an algebra and an energy."""
+    """Dissipation as the suite runs it: how to build it for an algebra and an energy."""
 
     name: str
     build: Callable  # (algebra, energy, rng) -> Dissipation
@@ -140,7 +141,7 @@ def _spd(rng, n):
 
 
 def _friction_operator(g, energy, rng):
-    """A K(x) of its own: two squared vectors orthogonal to grad H."""
+    """Return a friction operator K(x) of the suite's own: two squared vectors orthogonal to grad H."""
     vectors = rng.standard_normal((2, g.dim))
 
     def K(x):
@@ -152,13 +153,14 @@ def _friction_operator(g, energy, rng):
 
 
 def _curvature_tensor(g, energy, rng):
-    """A curvature-like tensor: R = sum of A (x) A over antisymmetric A, so that (F, F) >= 0."""
+    """Return a tensor with the symmetries of a curvature: the sum of A (x) A over antisymmetric A, so that (F, F) >=
+    0."""
     A = rng.standard_normal((3, g.dim, g.dim)) / g.dim
     A = A - A.swapaxes(1, 2)
     return lt.FourBracket(np.einsum("aij,akl->ijkl", A, A))
 
 
-def _no_killing(g: mf.LieAlgebra) -> str | None:
+def _killing_exemption(g: mf.LieAlgebra) -> str | None:
     if g.is_semisimple():
         return None
     if np.linalg.eigvalsh(-g.killing_form())[0] < -1e-10:
@@ -166,50 +168,54 @@ def _no_killing(g: mf.LieAlgebra) -> str | None:
     return "the Killing form vanishes on brackets (Cartan's criterion)" if g.is_solvable() else None
 
 
-def _line(g: mf.LieAlgebra) -> str | None:
+def _dimension_exemption(g: mf.LieAlgebra) -> str | None:
     return "a line has no covector beside dH: K is the rounding error of zero" if g.dim < 2 else None
 
 
-def _abelian(g: mf.LieAlgebra) -> str | None:
+def _abelian_exemption(g: mf.LieAlgebra) -> str | None:
     return "nothing brackets to anything in an abelian algebra" if g.is_abelian() else None
 
 
 DISSIPATIONS = [
-    Case("killing", lambda g, H, rng: lt.KillingDissipation(rate=0.3 / g.dim), _no_killing),
-    Case("inner_product", lambda g, H, rng: lt.InnerProductDissipation(0.3 * _spd(rng, g.dim)), _abelian),
+    Case("killing", lambda g, H, rng: lt.KillingDissipation(rate=0.3 / g.dim), _killing_exemption),
+    Case("inner_product", lambda g, H, rng: lt.InnerProductDissipation(0.3 * _spd(rng, g.dim)), _abelian_exemption),
     Case("projected", lambda g, H, rng: lt.ProjectedMetric(rate=0.1)),
-    Case("projected_cometric", lambda g, H, rng: lt.ProjectedMetric(0.3 * _spd(rng, g.dim)), _line),
-    Case("projected_normalized", lambda g, H, rng: lt.ProjectedMetric(normalized=True, rate=0.3), _line),
+    Case("projected_cometric", lambda g, H, rng: lt.ProjectedMetric(0.3 * _spd(rng, g.dim)), _dimension_exemption),
+    Case("projected_normalized", lambda g, H, rng: lt.ProjectedMetric(normalized=True, rate=0.3), _dimension_exemption),
     Case(
         "projected_preserve",
         lambda g, H, rng: lt.ProjectedMetric(preserve=(lt.Quadratic(_spd(rng, g.dim)),), normalized=True, rate=0.3),
         lambda g: "one dimension leaves no room beside H and another function" if g.dim < 3 else None,
     ),
-    Case("friction_operator", _friction_operator, _line),
+    Case("friction_operator", _friction_operator, _dimension_exemption),
     Case(
         "kulkarni_nomizu",
         lambda g, H, rng: lt.FourBracket.kulkarni_nomizu(0.1 * _spd(rng, g.dim), _spd(rng, g.dim)),
-        _line,
+        _dimension_exemption,
     ),
     Case("four_bracket", _curvature_tensor),
-    Case("four_bracket_algebra", lambda g, H, rng: lt.FourBracket.lie_algebra(0.3 * np.eye(g.dim)), _abelian),
-    Case("potential_coulomb", lambda g, H, rng: lt.DissipationPotential(lt.CoulombFriction(0.3, 0.1)), _line),
+    Case("four_bracket_algebra", lambda g, H, rng: lt.FourBracket.lie_algebra(0.3 * np.eye(g.dim)), _abelian_exemption),
+    Case(
+        "potential_coulomb",
+        lambda g, H, rng: lt.DissipationPotential(lt.CoulombFriction(0.3, 0.1)),
+        _dimension_exemption,
+    ),
     Case(
         "potential_power_law",
         lambda g, H, rng: lt.DissipationPotential(
             lt.PowerLawFriction(2.5, 0.2, each=True), of=lt.ProjectedMetric(0.3 * _spd(rng, g.dim))
         ),
-        _line,
+        _dimension_exemption,
     ),
     Case(
         "potential_activated",
         lambda g, H, rng: lt.DissipationPotential(
             lt.ActivatedFriction(0.3, 2.0), of=lt.InnerProductDissipation(0.1 * _spd(rng, g.dim))
         ),
-        _abelian,
+        _abelian_exemption,
     ),
-    Case("double_bracket", lambda g, H, rng: lt.DoubleBracket(rate=0.1), _abelian),
-    Case("force", lambda g, H, rng: lt.EulerPoincareForce(lambda xi: 0.1 * jnp.sin(xi[::-1])), _abelian),
+    Case("double_bracket", lambda g, H, rng: lt.DoubleBracket(rate=0.1), _abelian_exemption),
+    Case("force", lambda g, H, rng: lt.EulerPoincareForce(lambda xi: 0.1 * jnp.sin(xi[::-1])), _abelian_exemption),
     Case(
         "sum",
         lambda g, H, rng: (
@@ -220,7 +226,10 @@ DISSIPATIONS = [
 
 
 def build(g: mf.LieAlgebra, case: Case, seed: int = 0) -> lt.LiePoissonSystem:
-    """The system of a case; the axioms at random points are the tests' business where S has a domain."""
+    """Return the system of a case.
+
+    Where S has a domain, the axioms are not checked at random points here: the tests do it.
+    """
     energy, rng = energy_of(g.dim, seed), np.random.default_rng(seed)
     return lt.LiePoissonSystem(
         g, energy, entropy_of(g), case.build(g, energy, rng), validate=g.name not in TRANSCENDENTAL
@@ -228,11 +237,11 @@ def build(g: mf.LieAlgebra, case: Case, seed: int = 0) -> lt.LiePoissonSystem:
 
 
 REPRESENTATIVE = [mf.so(3), mf.se(3), mf.sl(2), mf.su(3)]
-"""Compact, semidirect, noncompact and irrational: enough for what does not depend on the algebra."""
+"""Compact, semidirect, noncompact and irrational algebras: enough for properties that do not depend on the algebra."""
 
 
 def slow(case):
-    """A parameter of a test, or a set of them, for the slow tier."""
+    """Return a parameter of a test, or a set of parameters, marked for the slow tier."""
     import pytest
 
     values, name = (case.values, case.id) if hasattr(case, "values") else ((case,), None)
@@ -240,7 +249,7 @@ def slow(case):
 
 
 def combinations(algebras) -> list:
-    """All (algebra, dissipation) pairs that apply: those without a Casimir have no entropy to produce."""
+    """Return all (algebra, dissipation) pairs that apply: an algebra without a Casimir has no entropy to produce."""
     import pytest
 
     return [

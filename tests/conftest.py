@@ -1,4 +1,4 @@
-"""Shared settings.
+"""Define the settings that all tests share.
 
 By default property tests are deterministic, so that a failure here is a failure everywhere. The slow tier draws other
 examples each time, and prints how to repeat one that fails.
@@ -14,9 +14,10 @@ import hypothesis
 import jax
 import pytest
 
-QUICKLY_COMPILED = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
-"""Most programs of the default tier run once, and take longer to compile than to run: this takes a third off. With
-``XLA_FLAGS`` of one's own, and in the slow tier, XLA optimises as it does for users."""
+FAST_COMPILE_FLAGS = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+"""Flags that make XLA compile faster and optimise less. Most programs of the default tier run once and take longer to
+compile than to run: the flags save a third of the time. They are not used in the slow tier, nor where the user sets
+``XLA_FLAGS``; there XLA optimises as it does for users."""
 
 hypothesis.settings.register_profile(
     "liethermo", derandomize=True, deadline=None, database=None, print_blob=True, max_examples=6
@@ -35,7 +36,8 @@ def pytest_addoption(parser):
 
 
 class Part:
-    """One of several parts of the selected tests: every N-th, so that the cases of a test are spread over all parts."""
+    """Plugin that keeps one of N parts of the selected tests: every N-th test, so that each part has cases of every
+    test."""
 
     def __init__(self, text: str):
         try:
@@ -57,16 +59,19 @@ class Part:
 def pytest_configure(config):
     if config.option.part:
         config.pluginmanager.register(Part(config.option.part))
-    slow = "slow" in (config.option.markexpr or "") and "not slow" not in config.option.markexpr
-    hypothesis.settings.load_profile("liethermo-slow" if slow else "liethermo")
-    if not slow:
-        os.environ.setdefault("XLA_FLAGS", QUICKLY_COMPILED)
+    is_slow_tier = "slow" in (config.option.markexpr or "") and "not slow" not in config.option.markexpr
+    hypothesis.settings.load_profile("liethermo-slow" if is_slow_tier else "liethermo")
+    if not is_slow_tier:
+        os.environ.setdefault("XLA_FLAGS", FAST_COMPILE_FLAGS)
     if hasattr(config, "cache"):
-        _keep_what_is_compiled(config.cache.mkdir("compiled"))
+        _keep_compiled_programs(config.cache.mkdir("compiled"))
 
 
-def _keep_what_is_compiled(folder: Path) -> None:
-    """By XLA and by the library, for later runs and for all processes of this one; ``--cache-clear`` forgets it."""
+def _keep_compiled_programs(folder: Path) -> None:
+    """Let XLA and the library store compiled programs in a folder, for later runs and for every process of this one.
+
+    ``--cache-clear`` empties the folder.
+    """
     os.environ["LIETHERMO_CACHE"] = str(folder / "liethermo")
     for name, value in {
         "jax_compilation_cache_dir": str(folder / "xla"),
@@ -79,61 +84,67 @@ def _keep_what_is_compiled(folder: Path) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config, items):
-    """Of the cases of a test marked ``sampled`` some run by default; the rest are slow.
+    """Mark the cases of a test marked ``sampled`` as slow, except for a sample of them.
 
-    ``sampled(n)``: n spread over all of them; ``sampled("a", "b")``: those of these ids.
+    ``sampled(n)`` keeps n cases, spread over all of them; ``sampled("a", "b")`` keeps the cases with these ids.
     """
     cases = defaultdict(list)
     for item in items:
         mark = item.get_closest_marker("sampled")
         if mark and not item.get_closest_marker("slow"):
             cases[item.parent.nodeid, item.originalname, mark.args].append(item)
-    whole = not any("::" in argument for argument in config.args)
-    for (file, test, wanted), crossed in cases.items():
-        if isinstance(wanted[0], str):
-            unknown = set(wanted) - {item.callspec.id for item in crossed}
-            if unknown and whole:
+    runs_whole_files = not any("::" in argument for argument in config.args)
+    for (file, test, sample), test_cases in cases.items():
+        if isinstance(sample[0], str):
+            unknown = set(sample) - {item.callspec.id for item in test_cases}
+            if unknown and runs_whole_files:
                 raise pytest.UsageError(
                     f"{file}::{test} is to be sampled at {sorted(unknown)}, which are no cases of it"
                 )
-            kept = {i for i, item in enumerate(crossed) if item.callspec.id in wanted}
+            chosen_indices = {i for i, item in enumerate(test_cases) if item.callspec.id in sample}
         else:
-            kept = {(2 * i + 1) * len(crossed) // (2 * wanted[0]) for i in range(wanted[0])}
-        for i, item in enumerate(crossed):
-            if i not in kept:
+            chosen_indices = {(2 * i + 1) * len(test_cases) // (2 * sample[0]) for i in range(sample[0])}
+        for i, item in enumerate(test_cases):
+            if i not in chosen_indices:
                 item.add_marker("slow")
 
 
-COMPILED_BY_READING = 10
-"""Programs that reading one module of tests may compile: constants and one small system. The most seen is 8."""
+MAX_COMPILED_BY_MODULE = 10
+"""Most programs that reading one module of tests may compile: constants and one small system. The most seen is 8."""
 
-_compiled: list[str] = []
+_compile_events: list[str] = []
 
 
 @jax.monitoring.register_event_duration_secs_listener
-def _count(event, *_, **__):
+def _record_compilation(event, *_, **__):
     if event == "/jax/core/compile/backend_compile_duration":
-        _compiled.append(event)
+        _compile_events.append(event)
 
 
 @pytest.hookimpl(hookwrapper=True)
 def pytest_make_collect_report(collector):
-    """Every worker reads every module: what a module builds when it is read costs all of them, for any selection."""
-    before = len(_compiled)
+    """Fail a module of tests that compiles too many programs when it is read.
+
+    Every worker reads every module: a system that a module builds at import costs all workers, for any selection.
+    """
+    start_count = len(_compile_events)
     outcome = yield
-    count = len(_compiled) - before
-    if isinstance(collector, pytest.Module) and count > COMPILED_BY_READING:
+    count = len(_compile_events) - start_count
+    if isinstance(collector, pytest.Module) and count > MAX_COMPILED_BY_MODULE:
         report = outcome.get_result()
         report.outcome = "failed"
         report.longrepr = (
-            f"{collector.nodeid} compiles {count} programs when it is read, more than {COMPILED_BY_READING}: "
+            f"{collector.nodeid} compiles {count} programs when it is read, more than {MAX_COMPILED_BY_MODULE}: "
             "build systems where they are used (tests.cases.BuiltOnUse, functools.cache)"
         )
 
 
 @pytest.fixture(autouse=True)
 def _bounded_compilation_cache(request):
-    """Every compiled program holds memory, and maps, of which a process has 65,530: drop them where many are held."""
+    """Drop JAX's compiled programs between tests when they hold too many memory maps or too much memory.
+
+    A process may have 65,530 maps, and every compiled program holds some.
+    """
     yield
     request.session.liethermo_count = count = getattr(request.session, "liethermo_count", 0) + 1
     if count % 10 == 0 and (_memory_maps() > 30_000 or _megabytes() > 3_000):
@@ -142,7 +153,7 @@ def _bounded_compilation_cache(request):
 
 
 def _megabytes() -> int:
-    """That are resident; none where the system does not tell."""
+    """Return the resident memory of this process, in MiB, or 0 where the system does not report it."""
     pages = Path("/proc/self/statm")
     return int(pages.read_text().split()[1]) * resource.getpagesize() // 2**20 if pages.exists() else 0
 

@@ -1,4 +1,4 @@
-"""The command line: what it prints, what it writes, and its exit status."""
+"""Check the command line: its output, the files it writes, and its exit status."""
 
 import os
 import re
@@ -60,7 +60,7 @@ not_a_function = 3
 
 
 class Folder:
-    """A user's current folder."""
+    """Current folder of a user."""
 
     def __init__(self, path):
         self.path = path
@@ -73,7 +73,7 @@ class Folder:
         return CliRunner().invoke(app, list(map(str, arguments)))
 
     def refusal(self, *parts):
-        """What ``check`` says to a spec that it refuses, a line for each problem."""
+        """Return the lines that ``check`` prints for a spec that it refuses, one for each problem."""
         result = self.call("check", self.spec(*parts))
         assert result.exit_code == 2
         assert re.fullmatch(r"(spec\.toml: imports .*\n)?", result.stdout)
@@ -101,7 +101,7 @@ def function(name, parameters="{}"):
 
 @pytest.fixture(scope="module")
 def example(tmp_path_factory):
-    """The example of the README, run once."""
+    """Run the example of the README once; return the command's result and the folder of its files."""
     results = tmp_path_factory.mktemp("example") / "results"
     return CliRunner().invoke(app, ["run", str(EXAMPLE), "--out", str(results)]), results
 
@@ -140,10 +140,14 @@ def test_saved_run_is_audited(example):
 
 
 def test_result_cut_short_is_refused(example, tmp_path):
-    cut = tmp_path / "cut.nc"
-    whole = (example[1] / "solution.nc").read_bytes()
-    cut.write_bytes(whole[: len(whole) // 2])
-    for file, message in ((cut, "cut short"), (EXAMPLE, "cannot be read as NetCDF"), (tmp_path / "no.nc", "no file")):
+    cut_file = tmp_path / "cut.nc"
+    content = (example[1] / "solution.nc").read_bytes()
+    cut_file.write_bytes(content[: len(content) // 2])
+    for file, message in (
+        (cut_file, "cut short"),
+        (EXAMPLE, "cannot be read as NetCDF"),
+        (tmp_path / "no.nc", "no file"),
+    ):
         result = CliRunner().invoke(app, ["audit", str(file)])
         assert (result.exit_code, result.stdout) == (2, "")
         assert message in result.stderr
@@ -176,13 +180,13 @@ def test_a_run_that_stops_early_is_kept(folder):
 def test_ctrl_c_keeps_what_exists(folder, monkeypatch):
     advance, calls = CompiledEngine.advance, []
 
-    def interrupted(*arguments):
+    def advance_until_interrupt(*arguments):
         calls.append(arguments)
         if len(calls) == 2:
             raise KeyboardInterrupt
         return advance(*arguments)
 
-    monkeypatch.setattr(CompiledEngine, "advance", interrupted)
+    monkeypatch.setattr(CompiledEngine, "advance", advance_until_interrupt)
     result = folder.call("run", folder.spec(MODEL, RUN.replace("2.0]", "500.0]"), NO_FIGURES))
     assert result.exit_code == 1
     assert "stopped by the user" in result.stdout
@@ -202,7 +206,7 @@ def test_outputs_are_as_asked(folder):
 
 
 def test_a_process_with_a_users_function(tmp_path):
-    """As a user calls it, from a folder that is not the spec's."""
+    """Run the command in a process of its own, from a folder that is not the spec's."""
     home = tmp_path / "home"
     home.mkdir()
     (home / f"{MODULE}.py").write_text(SOURCE)
@@ -236,13 +240,13 @@ def test_check_prints_the_axioms():
 
 
 def test_check_fails_with_an_axiom(folder):
-    refused = folder.call("check", folder.spec(function("no_casimir"), RUN))
-    assert refused.exit_code == 1
-    assert "not a Casimir" in refused.stderr
-    unchecked = folder.call("check", folder.spec(function("no_casimir", "{validate = false}"), RUN))
-    assert unchecked.exit_code == 1
-    assert "FAILS" in unchecked.stdout
-    assert "NOT metriplectic" in unchecked.stdout
+    check_of_strict_system = folder.call("check", folder.spec(function("no_casimir"), RUN))
+    assert check_of_strict_system.exit_code == 1
+    assert "not a Casimir" in check_of_strict_system.stderr
+    check_of_lax_system = folder.call("check", folder.spec(function("no_casimir", "{validate = false}"), RUN))
+    assert check_of_lax_system.exit_code == 1
+    assert "FAILS" in check_of_lax_system.stdout
+    assert "NOT metriplectic" in check_of_lax_system.stdout
 
 
 def test_models_lists_all_with_their_parameters():
@@ -265,7 +269,7 @@ def test_methods_are_listed_with_what_they_keep():
 
 
 def test_a_variational_scheme_by_its_name(tmp_path):
-    """It keeps the second law and not the energy, and the exit status says so."""
+    """A variational scheme keeps the second law and not the energy, and the exit status says so."""
     spec = tmp_path / "spring.toml"
     spec.write_text(
         """
@@ -388,15 +392,15 @@ REFUSALS = {
 @pytest.mark.parametrize("case", REFUSALS)
 def test_a_bad_spec_is_told_why(folder, case):
     parts, expected = REFUSALS[case]
-    for found, text in zip(folder.refusal(*parts), expected, strict=True):
-        assert text in found
+    for problem, text in zip(folder.refusal(*parts), expected, strict=True):
+        assert text in problem
 
 
 def test_all_problems_are_told_at_once(folder):
     bad_method = REFERENCE.replace("rtol", "rtoll")
-    found = folder.refusal(MODEL, "parameters = {rat = 1}", RUN.replace("step", "stepp"), bad_method)
+    problems = folder.refusal(MODEL, "parameters = {rat = 1}", RUN.replace("step", "stepp"), bad_method)
     keys = ("run.step is missing", "run.stepp: no", "model.parameters.rat: no", "method.rtoll: no")
-    assert [line[: len(key)] for line, key in zip(found, keys, strict=True)] == list(keys)
+    assert [line[: len(key)] for line, key in zip(problems, keys, strict=True)] == list(keys)
 
 
 def test_a_module_that_cannot_be_imported(folder):

@@ -1,4 +1,4 @@
-"""Studies on the command line, and what spec files say besides: adaptive steps, events, attitudes, changes."""
+"""Check studies on the command line, and adaptive steps, events, attitudes and changes in spec files."""
 
 import sys
 
@@ -45,24 +45,24 @@ def test_a_study_from_a_spec_file_its_status_and_its_picture(folder):
     assert "12 of 12 points are done" in result.stdout
     assert "the laws hold" in result.stdout
     assert (folder / "body.png").read_bytes().startswith(b"\x89PNG")
-    found = lt.load_study("body.zarr")
-    assert dict(found.sizes)["inertia[0]"] == 3
-    assert found.rate.units == "1/s"
-    wanted = lt.integrate(lt.models.rigid_body((2.4, 1.5, 1.0), 2.0), [0.1, 1.0, 0.1], (0.0, 4.0), 0.1).x[-1]
-    np.testing.assert_allclose(found.final[3, 2], wanted, rtol=0, atol=1e-14)
-    assert found.attrs["spec"]["study"]["chunk"] == 4
+    results = lt.load_study("body.zarr")
+    assert dict(results.sizes)["inertia[0]"] == 3
+    assert results.rate.units == "1/s"
+    exact = lt.integrate(lt.models.rigid_body((2.4, 1.5, 1.0), 2.0), [0.1, 1.0, 0.1], (0.0, 4.0), 0.1).x[-1]
+    np.testing.assert_allclose(results.final[3, 2], exact, rtol=0, atol=1e-14)
+    assert results.attrs["spec"]["study"]["chunk"] == 4
 
-    again = call("study", "spec.toml", "--out", "body.zarr")
-    assert again.exit_code == 0
-    told = call("status", "body.zarr")
-    assert (told.exit_code, "12 of 12 points are done (100 %)" in told.stdout) == (0, True)
-    drawn = call("plot", "body.zarr", "--measure", "tau", "--out", "tau.svg")
-    assert drawn.exit_code == 0, drawn.output
+    second_call = call("study", "spec.toml", "--out", "body.zarr")
+    assert second_call.exit_code == 0
+    status_call = call("status", "body.zarr")
+    assert (status_call.exit_code, "12 of 12 points are done (100 %)" in status_call.stdout) == (0, True)
+    plot_call = call("plot", "body.zarr", "--measure", "tau", "--out", "tau.svg")
+    assert plot_call.exit_code == 0, plot_call.output
     assert (folder / "tau.svg").is_file()
     assert call("plot", "body.zarr", "--measure", "sigma").exit_code == 2
-    other = call("study", "spec.toml", "--out", "body.zarr", "--set", "run.step=0.2")
-    assert other.exit_code == 2
-    assert "step is 0.2, and 0.1 in the store" in other.stderr
+    changed_call = call("study", "spec.toml", "--out", "body.zarr", "--set", "run.step=0.2")
+    assert changed_call.exit_code == 2
+    assert "step is 0.2, and 0.1 in the store" in changed_call.stderr
     assert call("status", "none.zarr").exit_code == 2
     assert "there is no Dask scheduler" in call("study", "spec.toml", "--cluster", "nonsense://here").stderr
 
@@ -152,8 +152,8 @@ def test_changes_that_cannot_be_made(folder, change, problem):
 
 
 def test_every_key_is_explained():
-    listed = list_spec_keys()
-    assert {section for section, *_ in listed} >= {
+    spec_keys = list_spec_keys()
+    assert {section for section, *_ in spec_keys} >= {
         "model",
         "run",
         "method",
@@ -162,4 +162,4 @@ def test_every_key_is_explained():
         "run.step",
         "run.until",
     }
-    assert [(section, name) for section, name, _, what in listed if not what] == []
+    assert [(section, name) for section, name, _, explanation in spec_keys if not explanation] == []

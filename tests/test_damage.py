@@ -1,4 +1,4 @@
-"""Files that chance has damaged: whatever is read is what was written, or an error of the library, and soon."""
+"""Check files that chance has damaged: reading gives the content as written or an error of the library, and soon."""
 
 import json
 import os
@@ -16,53 +16,53 @@ from liethermo.spec.study import build_study
 from liethermo.studies.store_results import audit_store, load_status, load_study
 from tests.liethermo.results.test_files import rewritten
 
-REFUSED = (lt.LiethermoError, lt.FileError)
-SOON = 20.0
-"""Seconds that none may take; a hundredth of it is usual."""
+REFUSAL_ERRORS = (lt.LiethermoError, lt.FileError)
+MAX_READ_SECONDS = 20.0
+"""Most seconds that one read may take; a hundredth of it is usual."""
 
 BODY, X0 = lt.models.rigid_body, np.array([0.1, 1.0, 0.1])
 sizes = pytest.mark.parametrize("count", [60, pytest.param(6000, marks=pytest.mark.slow)])
 
 
-def damaged(content: bytes, random: np.random.Generator) -> bytes:
-    """A file with a part changed, lost, moved or added."""
-    where, length = int(random.integers(len(content))), int(random.integers(1, 64))
-    rest = content[where + length :]
+def damage(content: bytes, random: np.random.Generator) -> bytes:
+    """Return a file's content with a part changed, lost, moved or added."""
+    start, length = int(random.integers(len(content))), int(random.integers(1, 64))
+    rest = content[start + length :]
     match int(random.integers(6)):
         case 0:
-            return content[:where] + bytes([content[where] ^ (1 << int(random.integers(8)))]) + content[where + 1 :]
+            return content[:start] + bytes([content[start] ^ (1 << int(random.integers(8)))]) + content[start + 1 :]
         case 1:
-            return content[:where]
+            return content[:start]
         case 2:
-            return content[:where] + random.bytes(length) + rest
+            return content[:start] + random.bytes(length) + rest
         case 3:
-            return content[:where] + rest
+            return content[:start] + rest
         case 4:
-            return content[:where] + random.bytes(length) + content[where:]
+            return content[:start] + random.bytes(length) + content[start:]
         case _:
-            return content[:where] + bytes(len(content[where : where + length])) + rest
+            return content[:start] + bytes(len(content[start : start + length])) + rest
 
 
 @pytest.mark.parametrize("kind", ["solution", "ensemble"])
 @sizes
 def test_results(tmp_path, kind, count):
     if kind == "solution":
-        whole = lt.integrate(BODY(), X0, (0.0, 1.0), 0.1)
+        result = lt.integrate(BODY(), X0, (0.0, 1.0), 0.1)
     else:
-        whole = lt.ensemble(BODY(), [X0, 2 * X0], (0.0, 1.0), 0.1, outputs="trajectory")
-    content = whole.save(tmp_path / "whole.nc").read_bytes()
-    random, path, refused = np.random.default_rng(1), tmp_path / "damaged.nc", 0
+        result = lt.ensemble(BODY(), [X0, 2 * X0], (0.0, 1.0), 0.1, outputs="trajectory")
+    content = result.save(tmp_path / "whole.nc").read_bytes()
+    random, path, n_refused = np.random.default_rng(1), tmp_path / "damaged.nc", 0
     for _ in range(count // 2):
-        path.write_bytes(damaged(content, random))
+        path.write_bytes(damage(content, random))
         start = time.perf_counter()
         try:
-            found = lt.load(path)
-            assert np.array_equal(found.x, whole.x)
-            assert np.array_equal(found.energy, whole.energy)
+            result_read = lt.load(path)
+            assert np.array_equal(result_read.x, result.x)
+            assert np.array_equal(result_read.energy, result.energy)
         except lt.FileError:
-            refused += 1
-        assert time.perf_counter() - start < SOON
-    assert refused > 0.7 * (count // 2)  # some changes are none
+            n_refused += 1
+        assert time.perf_counter() - start < MAX_READ_SECONDS
+    assert n_refused > 0.7 * (count // 2)  # some changes are none
 
 
 WORDS = [None, True, 5, -1, 1e999, "", "x", [], {}, [[]], "[" * 5000, {"a": {"b": []}}, 10**400]
@@ -70,25 +70,28 @@ WORDS = [None, True, 5, -1, 1e999, "", "x", [], {}, [[]], "[" * 5000, {"a": {"b"
 
 @sizes
 def test_what_is_said_in_results(tmp_path, count):
-    """Files that are whole, with their checksums right, of which somebody has changed what they say."""
+    """Read complete files with right checksums in which somebody has changed one attribute."""
     solution, random = lt.integrate(BODY(), X0, (0.0, 1.0), 0.1), np.random.default_rng(2)
-    whole = solution.save(tmp_path / "whole.nc")
-    said = ("status", "stats", "laws", "provenance", "evidence", "event_time", "times")
+    file_path = solution.save(tmp_path / "whole.nc")
+    attribute_names = ("status", "stats", "laws", "provenance", "evidence", "event_time", "times")
     for _ in range(count // 10):
-        path, name = Path(shutil.copy(whole, tmp_path / "changed.nc")), said[random.integers(len(said))]
-        word = WORDS[random.integers(len(WORDS))]
+        path, name = (
+            Path(shutil.copy(file_path, tmp_path / "changed.nc")),
+            attribute_names[random.integers(len(attribute_names))],
+        )
+        value = WORDS[random.integers(len(WORDS))]
 
-        def change(file, name=name, word=word):
-            given = json.loads(str(file.attrs[name]))
-            if isinstance(given, dict) and given and random.random() < 0.8:
-                given[list(given)[random.integers(len(given))]] = word
-                word = given
+        def change(file, name=name, word=value):
+            attribute = json.loads(str(file.attrs[name]))
+            if isinstance(attribute, dict) and attribute and random.random() < 0.8:
+                attribute[list(attribute)[random.integers(len(attribute))]] = word
+                word = attribute
             file.attrs[name] = json.dumps(word)
 
         try:
-            found = lt.load(rewritten(path, change))
-            assert np.array_equal(found.x, solution.x)
-            str(found.audit())
+            result_read = lt.load(rewritten(path, change))
+            assert np.array_equal(result_read.x, solution.x)
+            str(result_read.audit())
         except lt.FileError:
             pass
 
@@ -107,26 +110,26 @@ def test_stores(tmp_path, count):
         chunk=2,
     )
     study.run()
-    points, judged, whole = load_status(store).points, audit_store(store).passed, load_study(store).load()
+    points, audit_passes, dataset = load_status(store).points, audit_store(store).passed, load_study(store).load()
     files = sorted(path for path in store.rglob("*") if path.is_file() and path.name != ".lock")
-    random, told = np.random.default_rng(3), []
+    random, messages = np.random.default_rng(3), []
     for _ in range(count // 4):
         path = files[random.integers(len(files))]
         content = path.read_bytes()
-        path.write_bytes(damaged(content, random))
+        path.write_bytes(damage(content, random))
         start = time.perf_counter()
         try:
-            found = load_status(store)
-            assert found.points == points
-            assert audit_store(store).passed == judged or found.done < points
-            assert load_study(store).load().identical(whole) or found.done < points
+            status = load_status(store)
+            assert status.points == points
+            assert audit_store(store).passed == audit_passes or status.done < points
+            assert load_study(store).load().identical(dataset) or status.done < points
         except lt.FileError as error:
-            told.append(str(error))
-        assert time.perf_counter() - start < SOON
+            messages.append(str(error))
+        assert time.perf_counter() - start < MAX_READ_SECONDS
         path.write_bytes(content)
     assert load_status(store).complete
-    assert told
-    assert not any("\n" in text for text in told)
+    assert messages
+    assert not any("\n" in text for text in messages)
 
 
 SPEC = Path(__file__).parent.parent / "examples" / "relaxed_rigid_body.toml"
@@ -158,14 +161,14 @@ def test_specs(tmp_path, count, monkeypatch):
     text = (
         SPEC.read_text() + '\n[study.axes]\nrate = [0.5, 1.0]\n"initial[0]" = {first = 0.1, last = 0.2, points = 3}\n'
     )
-    random, path, told = np.random.default_rng(4), tmp_path / "spec.toml", []
+    random, path, messages = np.random.default_rng(4), tmp_path / "spec.toml", []
     monkeypatch.setattr(os, "system", lambda command: pytest.fail(f"it ran {command}"))
     path.write_text(text)
     build_study(read(path), tmp_path / "unused.zarr")
     for _ in range(count // 2):
-        where, length = int(random.integers(len(text))), int(random.integers(0, 12))
+        position, length = int(random.integers(len(text))), int(random.integers(0, 12))
         token = TOKENS[random.integers(len(TOKENS))]
-        path.write_text(text[:where] + token + text[where + length :])
+        path.write_text(text[:position] + token + text[position + length :])
         start = time.perf_counter()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -174,8 +177,8 @@ def test_specs(tmp_path, count, monkeypatch):
                 plan.build_system()
                 if plan.study is not None:
                     build_study(plan, tmp_path / "unused.zarr")
-            except REFUSED as error:
-                told.append(str(error))
-        assert time.perf_counter() - start < SOON
-    assert told
-    assert max(map(len, told)) < 20_000
+            except REFUSAL_ERRORS as error:
+                messages.append(str(error))
+        assert time.perf_counter() - start < MAX_READ_SECONDS
+    assert messages
+    assert max(map(len, messages)) < 20_000

@@ -1,4 +1,4 @@
-"""What a user is shown runs: the Python blocks of the README and of the documentation, and the gallery's examples."""
+"""Check that what a user is shown runs: the Python blocks of the README and the pages, and the gallery's examples."""
 
 from __future__ import annotations
 
@@ -16,10 +16,12 @@ import liethermo
 import manifolds
 
 ROOT = Path(__file__).resolve().parent.parent
-BUILT = ("_build", "gallery", "generated")
+BUILT_FOLDERS = ("_build", "gallery", "generated")
 PAGES = [
     ROOT / "README.md",
-    *sorted(page for page in (ROOT / "docs").rglob("*.md") if not set(BUILT) & set(page.relative_to(ROOT).parts)),
+    *sorted(
+        page for page in (ROOT / "docs").rglob("*.md") if not set(BUILT_FOLDERS) & set(page.relative_to(ROOT).parts)
+    ),
 ]
 EXAMPLES = sorted((ROOT / "examples").rglob("plot_*.py"))
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -31,26 +33,26 @@ def _name(path: Path) -> str:
 
 @pytest.fixture
 def scratch(tmp_path, monkeypatch):
-    """An empty working directory and a backend without a screen; figures are closed afterwards."""
+    """Enter an empty folder and use a backend without a screen; close all figures afterwards."""
     monkeypatch.chdir(tmp_path)
     matplotlib.use("Agg")
     yield tmp_path
     plt.close("all")
 
 
-COSTLY = (
+SLOW_PAGES = (
     *("on_manifolds", "own_space", "friction_heat_work", "own_algebra", "heat_friction", "learn"),
     *("studies", "own_method", "coming_from", "choose_method", "own_loop", "exact_laws", "errors"),
     *("asteroid_wobble", "real_bodies", "qubit_and_bath", "events", "derivatives", "ensembles", "audits"),
     *("geometer", "relaxation", "spins", "fluids", "quantum", "learning", "learn_own_data", "method_author"),
 )
-"""Pages that compile much: in the slow tier."""
+"""Pages that compile many programs: they run in the slow tier."""
 
 
 def _pages():
     for page in PAGES:
         if BLOCK.search(page.read_text()):
-            yield pytest.param(page, id=_name(page), marks=pytest.mark.slow if page.stem in COSTLY else ())
+            yield pytest.param(page, id=_name(page), marks=pytest.mark.slow if page.stem in SLOW_PAGES else ())
 
 
 @pytest.mark.sampled(3)
@@ -63,13 +65,13 @@ def test_the_python_blocks_of_a_page_run_in_order(page, scratch):
         exec(compile("\n" * above + block[1], str(page), "exec"), namespace)
 
 
-QUICK = ("plot_relaxed_rigid_body", "plot_own_lie_algebra", "plot_damped_oscillator", "plot_discrete_herglotz")
-"""Examples that compile little; the others are in the slow tier."""
+FAST_EXAMPLES = ("plot_relaxed_rigid_body", "plot_own_lie_algebra", "plot_damped_oscillator", "plot_discrete_herglotz")
+"""Examples that compile few programs; the others are in the slow tier."""
 
 
 def _examples():
     for path in EXAMPLES:
-        yield pytest.param(path, id=_name(path), marks=() if path.stem in QUICK else pytest.mark.slow)
+        yield pytest.param(path, id=_name(path), marks=() if path.stem in FAST_EXAMPLES else pytest.mark.slow)
 
 
 @pytest.mark.sampled(1)
@@ -82,8 +84,8 @@ def test_an_example_runs_and_draws(example, scratch):
 @pytest.mark.parametrize("package", [liethermo, manifolds], ids=lambda package: package.__name__)
 def test_the_reference_lists_every_public_name(package):
     pages = [page.read_text() for page in (ROOT / "docs/reference").glob("api_*.md")]
-    listed = [name for page in pages for name in re.findall(r"^ {3}([\w.]+)$", page, re.MULTILINE)]
-    assert sorted(set(package.__all__) - {part for name in listed for part in name.split(".")}) == []
+    listed_names = [name for page in pages for name in re.findall(r"^ {3}([\w.]+)$", page, re.MULTILINE)]
+    assert sorted(set(package.__all__) - {part for name in listed_names for part in name.split(".")}) == []
 
 
 LINK = re.compile(
@@ -94,7 +96,7 @@ FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 
 
 def _words(page: Path) -> str:
-    """A page without its code."""
+    """Return the text of a page without its code."""
     return FENCE.sub("", page.read_text())
 
 
@@ -102,14 +104,14 @@ def _words(page: Path) -> str:
 def test_links_of_a_page_lead_somewhere(page):
     targets = [a or b or c for a, b, c in LINK.findall(_words(page))]
     local = [target.partition("#")[0] for target in targets if "://" not in target and not target.startswith("#")]
-    missing = [
+    dead_links = [
         target
         for target in local
         if target != "../gallery/index"  # made by the build
         and not target.startswith("generated/")  # likewise
         and not any((page.parent / f"{target}{suffix}").is_file() for suffix in ("", ".md"))
     ]
-    assert missing == []
+    assert dead_links == []
 
 
 @pytest.mark.parametrize("page", PAGES, ids=_name)
@@ -119,18 +121,18 @@ def test_pictures_are_told_in_words(page):
 
 def test_every_page_is_in_the_navigation():
     docs = ROOT / "docs"
-    listed = {"index"}
+    toctree_pages = {"index"}
     for page in PAGES[1:]:
         for tree in re.findall(r"^```\{toctree\}\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL):
             for line in tree.splitlines():
                 if line and not line.startswith(":"):
-                    listed.add(str((page.parent / line).resolve().relative_to(docs)))
-    assert {str(page.relative_to(docs).with_suffix("")) for page in PAGES[1:]} - listed == set()
-    assert {entry for entry in listed if not (docs / f"{entry}.md").is_file()} == {"gallery/index"}
+                    toctree_pages.add(str((page.parent / line).resolve().relative_to(docs)))
+    assert {str(page.relative_to(docs).with_suffix("")) for page in PAGES[1:]} - toctree_pages == set()
+    assert {entry for entry in toctree_pages if not (docs / f"{entry}.md").is_file()} == {"gallery/index"}
 
 
 def test_names_in_code_font_exist(code_links):
-    """A page may call on nothing that the packages do not have."""
+    """A page may name nothing that the packages do not have."""
     unknown = []
     for page in PAGES:
         for word in re.findall(r"(?<!`)`([^`\n]+)`(?!`)", _words(page)):
@@ -150,22 +152,22 @@ def test_a_name_that_does_not_exist_is_found(code_links):
 
 
 def test_python_in_code_font_is_right(code_spans):
-    """What a page says in passing: names exist, arguments are those of their functions, what is complete runs."""
-    wrong, read = [], 0
+    """Check short code in the text: names exist, arguments belong to their functions, complete statements run."""
+    errors, n_checked = [], 0
     for page in PAGES:
         text = page.read_text()
-        bound = code_spans.names_of("\n".join(BLOCK.findall(text)))
+        page_names = code_spans.names_of("\n".join(BLOCK.findall(text)))
         for span in code_spans.spans(text):
             try:
-                read += code_spans.check(span, bound)
+                n_checked += code_spans.check(span, page_names)
             except code_spans.SpanError as error:
-                wrong.append(f"{_name(page)}: {span}: {error}")
-    assert wrong == []
-    assert read > 400
+                errors.append(f"{_name(page)}: {span}: {error}")
+    assert errors == []
+    assert n_checked > 400
 
 
 def test_blocks_that_are_not_executed_are_right(code_spans):
-    """Those for clusters: a page marks them as ``py``. Other blocks of Python are marked as ``python``, and run."""
+    """Check the blocks for clusters, marked as ``py``; all other blocks of Python are marked as ``python`` and run."""
     fences = [(page, fence) for page in PAGES for fence in re.findall(r"^```(\w+)$", page.read_text(), re.MULTILINE)]
     assert {fence for _, fence in fences} <= {"python", "py", "sh", "bash", "toml", "text"}
     for page in PAGES:
@@ -206,7 +208,7 @@ def test_what_is_no_python_is_left_alone(code_spans):
     assert code_spans.spans(table) == ["lt.Adaptive(rtol=1e-3)", "step=0.1"]
 
 
-UNLIMITED = re.compile(
+UNLIMITED_PROMISE = re.compile(
     r"any even order|\b(?:holds?|monotone)\b[^.]*\b(?:any|every) step size"
     r"|\bsteps?\b[^.;]*whatever\s+(?:its|the step) size",
     re.IGNORECASE,
@@ -215,16 +217,18 @@ UNLIMITED = re.compile(
 
 
 def test_orders_and_step_sizes_are_told_as_they_are():
-    """As many stages as the methods take, and no promise for steps that a method cannot take."""
-    most = max(s for s in range(1, 20) if _takes(s))
-    told = {page: re.findall(r"even orders? up to (\d+)", page.read_text()) for page in PAGES}
-    assert {_name(page): set(orders) for page, orders in told.items() if orders} == {
-        "README.md": {str(2 * most)},
-        "docs/index.md": {str(2 * most)},
+    """The pages name as many stages as the methods take, and promise nothing for steps that a method cannot take."""
+    max_stages = max(s for s in range(1, 20) if _has_stages(s))
+    orders_by_page = {page: re.findall(r"even orders? up to (\d+)", page.read_text()) for page in PAGES}
+    assert {_name(page): set(orders) for page, orders in orders_by_page.items() if orders} == {
+        "README.md": {str(2 * max_stages)},
+        "docs/index.md": {str(2 * max_stages)},
     }
-    assert f"s = 1 … {most} " in (ROOT / "docs/explanation/accuracy.md").read_text()
-    found = [f"{_name(path)}: {words}" for path in TEXTS for words in UNLIMITED.findall(path.read_text())]
-    assert found == []
+    assert f"s = 1 … {max_stages} " in (ROOT / "docs/explanation/accuracy.md").read_text()
+    promises = [
+        f"{_name(path)}: {words}" for path in TEXT_FILES for words in UNLIMITED_PROMISE.findall(path.read_text())
+    ]
+    assert promises == []
 
 
 @pytest.mark.parametrize(
@@ -237,10 +241,10 @@ def test_orders_and_step_sizes_are_told_as_they_are():
     ],
 )
 def test_a_promise_without_limits_is_found(words):
-    assert UNLIMITED.search(words)
+    assert UNLIMITED_PROMISE.search(words)
 
 
-def _takes(stages: int) -> bool:
+def _has_stages(stages: int) -> bool:
     try:
         liethermo.MetriplecticGauss(stages)
     except liethermo.InputError:
@@ -257,11 +261,11 @@ SPEED = re.compile(
     rf"|\btakes?\s+(?:a second|some seconds|a few seconds|{NUMBER} (?:seconds|minutes))",
     re.IGNORECASE,
 )
-"""How fast the library is, in numbers."""
+"""Statements in numbers about the speed of the library."""
 
 
 def _figures_of_speed(path: Path) -> list[str]:
-    """Those in the words of a page, or in the docstrings of a module."""
+    """Return the statements about speed in the words of a page, or in the docstrings of a module."""
     if path.suffix == ".py":
         nodes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Expr)]
         words = [node.value.value for node in nodes if isinstance(node.value, ast.Constant)]
@@ -272,14 +276,15 @@ def _figures_of_speed(path: Path) -> list[str]:
 
 
 def test_figures_of_speed_are_on_the_pages_of_benchmarks_alone():
-    """Those pages are written by what measures them; elsewhere they would differ from it sooner or later."""
+    """Only the pages of benchmarks, which the measurements write, have figures of speed: elsewhere they would get
+    stale."""
     benchmarks = [ROOT / f"docs/reference/{name}.md" for name in ("benchmarks", "benchmarks_runs")]
     assert all(len(_figures_of_speed(page)) > 50 for page in benchmarks)
-    ours = [path for path in TEXTS if path not in benchmarks and not path.is_relative_to(ROOT / "examples")]
+    ours = [path for path in TEXT_FILES if path not in benchmarks and not path.is_relative_to(ROOT / "examples")]
     texts = [*ours, ROOT / "CHANGELOG.md"]
     assert len(texts) > 300
-    found = [f"{_name(path)}: {figure}" for path in texts for figure in _figures_of_speed(path)]
-    assert found == []
+    figures = [f"{_name(path)}: {figure}" for path in texts for figure in _figures_of_speed(path)]
+    assert figures == []
 
 
 @pytest.mark.parametrize(
@@ -314,35 +319,43 @@ def code_spans(monkeypatch):
     return importlib.import_module("code_spans")
 
 
-TEXTS = [
+TEXT_FILES = [
     *PAGES,
     *(path for path in sorted((ROOT / "examples").rglob("*")) if path.suffix in (".py", ".rst", ".toml")),
     *(path for package in ("liethermo", "manifolds") for path in sorted((ROOT / package).rglob("*.py"))),
 ]
-INSIDE = re.compile(
+INTERNAL_FRICTION = re.compile(
     r"internal friction|friction (?:inside|between its parts)|inside (?:it|them) rubs?|nothing acts"
     r"|friction (?:turns|brings|lets)[^.]* (?:body|whole)",
     re.IGNORECASE,
 )
-KEPT = re.compile(r"(?:keeps|constant|cannot change|takes nothing from)\s+(?:\w+\s+){0,2}energy|energy is\s+constant")
-CONTROLLED = re.compile(r"\brigid_body\b|KillingDissipation\(")
-LEFT_ALONE = re.compile(r"DoubleBracket|body_with_wheels|tumbling_body")
+CONSTANT_ENERGY = re.compile(
+    r"(?:keeps|constant|cannot change|takes nothing from)\s+(?:\w+\s+){0,2}energy|energy is\s+constant"
+)
+CONTROLLED_BODY = re.compile(r"\brigid_body\b|KillingDissipation\(")
+OTHER_BODIES = re.compile(r"DoubleBracket|body_with_wheels|tumbling_body")
 
 
 def _wrong_bodies(text: str) -> list[str]:
-    """Paragraphs that tell of friction inside a body that keeps its kinetic energy.
+    """Return the paragraphs about friction inside a body that keeps its kinetic energy.
 
-    That of the controlled body is constant, but a torque acts on it. Where one text has both kinds of bodies, which
-    is which is for its reader to judge.
+    The energy of the controlled body is constant, but a torque acts on it. A text with both kinds of bodies is left to
+    its reader.
     """
-    one = CONTROLLED.search(text) and not LEFT_ALONE.search(text)
+    only_controlled = CONTROLLED_BODY.search(text) and not OTHER_BODIES.search(text)
     paragraphs = [re.sub(r"\s*\n(?:#|\s)*", " ", paragraph) for paragraph in re.split(r"\n\s*\n", text)]
-    return [paragraph for paragraph in paragraphs if INSIDE.search(paragraph) and (one or KEPT.search(paragraph))]
+    return [
+        paragraph
+        for paragraph in paragraphs
+        if INTERNAL_FRICTION.search(paragraph) and (only_controlled or CONSTANT_ENERGY.search(paragraph))
+    ]
 
 
 def test_no_text_mistakes_the_controlled_body_for_one_with_friction_inside():
-    wrong = [f"{_name(path)}: {paragraph[:120]}" for path in TEXTS for paragraph in _wrong_bodies(path.read_text())]
-    assert wrong == []
+    mistakes = [
+        f"{_name(path)}: {paragraph[:120]}" for path in TEXT_FILES for paragraph in _wrong_bodies(path.read_text())
+    ]
+    assert mistakes == []
 
 
 @pytest.mark.parametrize(
@@ -361,24 +374,24 @@ def test_a_body_told_wrongly_is_found(text):
     assert _wrong_bodies(text)
 
 
-CITED = re.compile(r"[\[(]([A-Z][^\[\]()`]*?\b(?:19|20)\d\d\b[^\[\]()`]*)[\])](?!\()")
+CITATION = re.compile(r"[\[(]([A-Z][^\[\]()`]*?\b(?:19|20)\d\d\b[^\[\]()`]*)[\])](?!\()")
 
 
-def _cited(text: str) -> list[tuple[str, str]]:
-    """Names and years of what a text cites in parentheses or brackets, such as ``(Holm and Janke 1993)``."""
-    works = [work for found in CITED.findall(" ".join(text.split())) for work in found.split(";")]
-    parts = [part for work in works if (part := re.match(r"\s*(\D+?),? ((?:19|20)\d\d)", work))]
+def _find_citations(text: str) -> list[tuple[str, str]]:
+    """Return the names and years of the works that a text cites, such as ``(Holm and Janke 1993)``."""
+    works = [work for citation in CITATION.findall(" ".join(text.split())) for work in citation.split(";")]
+    matches = [part for work in works if (part := re.match(r"\s*(\D+?),? ((?:19|20)\d\d)", work))]
     names = re.compile(" and others| et al\\.|,? and |,? & |, ")
-    return [(name, part[2]) for part in parts for name in names.split(part[1]) if name]
+    return [(name, part[2]) for part in matches for name in names.split(part[1]) if name]
 
 
 def test_what_the_pages_cite_is_in_the_bibliography():
-    own = ROOT / "docs" / "reference" / "bibliography.md"
-    entries = [" ".join(entry.split()) for entry in own.read_text().split("\n\n")]
+    bibliography = ROOT / "docs" / "reference" / "bibliography.md"
+    entries = [" ".join(entry.split()) for entry in bibliography.read_text().split("\n\n")]
     for page in PAGES:
-        if page == own or page.parent.name == "reference":
+        if page == bibliography or page.parent.name == "reference":
             continue
-        for name, year in _cited(page.read_text()):
+        for name, year in _find_citations(page.read_text()):
             assert any(name in entry and f"({year})" in entry for entry in entries), f"{_name(page)}: {name} {year}"
 
 
@@ -386,7 +399,7 @@ def test_citations_are_found():
     text = (
         "as (Holm and Janke 1993; Beretta 1984) and [Hairer, Lubich & Wanner 2006, II.4], not (in 2005) or [A 1999](b)"
     )
-    assert _cited(text) == [
+    assert _find_citations(text) == [
         *[(name, "1993") for name in ("Holm", "Janke")],
         ("Beretta", "1984"),
         *[(name, "2006") for name in ("Hairer", "Lubich", "Wanner")],

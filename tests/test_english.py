@@ -1,11 +1,15 @@
-"""Pages, docstrings and messages follow the rules in ``docs/vale``, whether Vale is installed or not."""
+"""Pages, docstrings and messages follow the rules in ``docs/vale``; names and first sentences those of ``plain_names``."""
 
 import ast
+import collections
+import functools
 import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from .plain_names import Named, fault_of_docstring, fault_of_name, names_in
 
 yaml = pytest.importorskip("yaml")
 
@@ -115,3 +119,69 @@ def test_a_fault_is_found(sentence):
 def test_every_rule_is_understood():
     assert {rule["extends"] for rule in RULES.values()} == {"substitution", "existence", "occurrence"}
     assert "docs/vale" in (ROOT / ".vale.ini").read_text()
+
+
+# -- names ------------------------------------------------------------------------------------------------------------
+
+CODE = [
+    path
+    for folder in ("liethermo", "manifolds", "benchmarks", "tests")
+    for path in sorted((ROOT / folder).rglob("*.py"))
+]
+
+PUBLIC_NAMES = frozenset(
+    """
+    At Determined Each Learned NoPoisson NoPolynomialCasimirWarning OffManifoldError Place Relaxed Tabulated Zipped
+    at_time coupled determined expanded on_grid outside passed preserved reduced registered resolved several spread
+    symmetrised until zipped
+    """.split()
+)
+"""Names that users call, or that their extensions define, which stay."""
+
+MAX_LOCALS_PERCENT = 4.0
+"""Share of locals and parameters in a room whose names may have a form that is rarely plain: some are the field's."""
+
+
+@functools.cache
+def named(kind: str) -> tuple[Named, ...]:
+    return tuple(name for path in CODE for name in names_in(path) if name.kind == kind)
+
+
+@pytest.mark.parametrize("kind", ["constant", "definition"])
+def test_names_are_plain(kind):
+    assert len(named(kind)) > 400
+    faults = [n for n in named(kind) if n.fault and n.name not in PUBLIC_NAMES]
+    assert not faults, "\n".join(f"{n.path.relative_to(ROOT)}:{n.line}: {n.name}: {n.fault}" for n in faults)
+
+
+def test_docstrings_begin_with_a_subject_or_a_verb():
+    faults = [n for n in named("docstring") if n.fault]
+    assert not faults, "\n".join(f"{n.path.relative_to(ROOT)}:{n.line}: {n.name}" for n in faults)
+
+
+def test_locals_are_plain_in_every_room():
+    rooms = collections.defaultdict(collections.Counter)
+    for n in named("local"):
+        rooms["/".join(n.path.relative_to(ROOT).parts[:2])][bool(n.fault)] += 1
+    percents = {room: 100.0 * count[True] / count.total() for room, count in rooms.items() if count.total() > 50}
+    assert {room: percent for room, percent in percents.items() if percent > MAX_LOCALS_PERCENT} == {}
+
+
+@pytest.mark.parametrize(
+    "name", ["settled", "own", "of_steps", "by_paces", "SOON", "TOGETHER", "_begun", "kept_before", "WhatIsGiven"]
+)
+def test_a_name_that_is_not_plain_is_found(name):
+    assert fault_of_name(name)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["solve_newton", "h", "ad_star", "why_not_startable", "seed", "embed_in_arrays", "StepControl", "MAX_FACTOR"],
+)
+def test_a_plain_name_is_left_alone(name):
+    assert not fault_of_name(name)
+
+
+@pytest.mark.parametrize("text", ["What a run is made of.", "Those of every run.", "The same for x.", "Of a step."])
+def test_a_docstring_without_a_subject_is_found(text):
+    assert fault_of_docstring(text)

@@ -1,4 +1,4 @@
-"""The examples in the docstrings of the main names are executed, and print what they say."""
+"""Check that the examples in the docstrings of the main names run, and print the output they show."""
 
 import doctest
 import inspect
@@ -15,13 +15,13 @@ import liethermo as lt
 import manifolds as mf
 
 ROOT = Path(__file__).resolve().parent.parent
-LISTED = re.compile(r"currentmodule:: (\w+)|^ {3}([\w.]+)$", re.MULTILINE)
+LISTED_NAME = re.compile(r"currentmodule:: (\w+)|^ {3}([\w.]+)$", re.MULTILINE)
 
 
 def _main_names():
-    """What the first page of the reference lists, with its package."""
+    """Yield the names that the first page of the reference lists, each with its package."""
     package = lt
-    for module, name in LISTED.findall((ROOT / "docs/reference/api.md").read_text()):
+    for module, name in LISTED_NAME.findall((ROOT / "docs/reference/api.md").read_text()):
         if module:
             package = {"liethermo": lt, "manifolds": mf}[module]
         else:
@@ -39,23 +39,23 @@ def test_there_are_thirty_main_names():
 @pytest.mark.parametrize(("package", "name"), MAIN, ids=[name for _, name in MAIN])
 def test_the_example_of_a_main_name_is_true(package, name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert _run(inspect.getdoc(operator.attrgetter(name)(package)) or "", name) > 0, "no example"
+    assert _run_doctest(inspect.getdoc(operator.attrgetter(name)(package)) or "", name) > 0, "no example"
 
 
 @pytest.mark.parametrize("name", [name for _, name in MAIN])
 def test_every_main_name_has_an_example(name):
-    package = next(package for package, other in MAIN if other == name)
+    package = next(package for package, main_name in MAIN if main_name == name)
     assert "\n>>> " in (inspect.getdoc(operator.attrgetter(name)(package)) or "")
 
 
 def test_an_example_that_is_wrong_is_found():
-    assert _run(">>> mf.so(3).dim\n3\n", "right") == 1
+    assert _run_doctest(">>> mf.so(3).dim\n3\n", "right") == 1
     with pytest.raises(doctest.DocTestFailure):
-        _run(">>> mf.so(3).dim\n4\n", "wrong")
+        _run_doctest(">>> mf.so(3).dim\n4\n", "wrong")
 
 
-def _run(text: str, name: str) -> int:
-    """How many lines were run."""
+def _run_doctest(text: str, name: str) -> int:
+    """Run the examples of a docstring and return the number of lines that were run."""
     names = {"lt": lt, "mf": mf, "np": np, "jnp": jnp, "jax": jax}
     test = doctest.DocTestParser().get_doctest(text, names, name, None, None)
     runner = doctest.DebugRunner(optionflags=doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS)

@@ -1,4 +1,4 @@
-"""The picture of the first page shows runs of one body, and the line above it has what is true of the package."""
+"""Check the picture of the first page, which shows runs of one body, and the line of facts above it."""
 
 import importlib
 import math
@@ -15,26 +15,26 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
 
 
 @pytest.fixture
-def beside(monkeypatch):
+def chart_module(monkeypatch):
     monkeypatch.syspath_prepend(str(DOCS))
     return importlib.import_module("beside")
 
 
-def test_the_others_solve_the_equations_of_the_library(beside):
-    """The equations are written out by hand for them: they are those of the model, its attitude too."""
-    body = lt.models.tumbling_body(beside.INERTIA, rate=beside.RATE)
+def test_the_others_solve_the_equations_of_the_library(chart_module):
+    """The equations written out by hand for the other packages are those of the model and of its attitude."""
+    body = lt.models.tumbling_body(chart_module.INERTIA, rate=chart_module.RATE)
     y = np.random.default_rng(0).standard_normal(8)
-    written = np.array(beside.field(y, math.exp))
+    field_by_hand = np.array(chart_module.field(y, math.exp))
     ours = np.asarray(jax.jit(body.vector_field)(jnp.asarray(y[:4])))
-    assert np.abs(written[:4] - ours).max() < 1e-14
-    assert np.abs(np.array(beside.field(1.01 * y, math.exp))[:4] - ours).max() > 1e-4
+    assert np.abs(field_by_hand[:4] - ours).max() < 1e-14
+    assert np.abs(np.array(chart_module.field(1.01 * y, math.exp))[:4] - ours).max() > 1e-4
     # The momentum in space is constant, which the quaternion alone can make true.
-    q, dq, m, dm = y[4:] / np.linalg.norm(y[4:]), written[4:] / np.linalg.norm(y[4:]), y[:3], written[:3]
-    pure = lambda v: np.array([0.0, *v])  # noqa: E731
+    q, dq, m, dm = y[4:] / np.linalg.norm(y[4:]), field_by_hand[4:] / np.linalg.norm(y[4:]), y[:3], field_by_hand[:3]
+    pure_quaternion = lambda v: np.array([0.0, *v])  # noqa: E731
     rate = (
-        _times(_times(dq, pure(m)), _bar(q))
-        + _times(_times(q, pure(dm)), _bar(q))
-        + _times(_times(q, pure(m)), _bar(dq))
+        _times(_times(dq, pure_quaternion(m)), _bar(q))
+        + _times(_times(q, pure_quaternion(dm)), _bar(q))
+        + _times(_times(q, pure_quaternion(m)), _bar(dq))
     )
     assert np.abs(rate).max() < 1e-14
 

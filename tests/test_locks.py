@@ -1,13 +1,13 @@
-"""What the set-up commands install: a run needs few packages, and tests, pages and studies bring their own."""
+"""Check the packages that the set-up commands install: a run needs few, and every extra brings its own."""
 
 import re
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-MOST = 60
-"""Packages of a run: more would make the first demo wait."""
+MAX_PACKAGES = 60
+"""Most packages of a run: more would make the first demo wait."""
 
-BESIDE = {
+EXTRA_PACKAGES = {
     "studies": {"dask", "distributed", "zarr"},
     "learn": {"optax"},
     "quantum": {"qutip"},
@@ -18,7 +18,7 @@ BESIDE = {
 
 
 def _packages(lock: str) -> dict[str, str]:
-    """Names and versions of a lock."""
+    """Return the versions of the packages in a lock file, by their names."""
     lines = (ROOT / lock).read_text().splitlines()
     return {
         name.lower(): version for name, version in (line.split("==") for line in lines if re.match(r"\w.*==", line))
@@ -28,12 +28,12 @@ def _packages(lock: str) -> dict[str, str]:
 def test_a_run_needs_few_packages():
     run = _packages("requirements.lock")
     assert {"jax", "numpy", "llvmlite"} <= run.keys()
-    assert len(run) <= MOST
+    assert len(run) <= MAX_PACKAGES
 
 
 def test_each_extra_locks_what_it_needs_beside():
     run = _packages("requirements.lock")
-    for extra, named in BESIDE.items():
-        found = _packages(f"requirements-{extra}.lock").keys()
-        assert named <= found, extra
-        assert not found & run.keys(), extra
+    for extra, required_packages in EXTRA_PACKAGES.items():
+        locked_packages = _packages(f"requirements-{extra}.lock").keys()
+        assert required_packages <= locked_packages, extra
+        assert not locked_packages & run.keys(), extra

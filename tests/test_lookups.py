@@ -1,7 +1,7 @@
-"""Attributes that are looked up by a string, with a silent default: of what others define alone, never of our own.
+"""Allow attribute lookups by a string with a silent default only for attributes that other packages define.
 
-A member of a class of ours that is looked up so fails without a word when it gets another name: the entropy of a
-quantum system lost its floor in this way. A member exists, or the type says that it does not.
+If a member of one of our classes were looked up in this way, renaming it would go unnoticed: the entropy of a quantum
+system once lost its floor so. Our members exist, or the type says that they do not.
 """
 
 import ast
@@ -56,7 +56,7 @@ OURS = {
 
 
 def lookups():
-    """The file, the line and the name of each lookup with a silent default."""
+    """Yield the file, the line and the name of each lookup with a silent default."""
     for package in ("liethermo", "manifolds"):
         for path in sorted((ROOT / package).rglob("*.py")):
             for node in ast.walk(ast.parse(path.read_text())):
@@ -68,10 +68,10 @@ def lookups():
 
 
 def test_no_member_of_ours_is_looked_up_with_a_silent_default():
-    unknown = [found for found in lookups() if found[2] not in FOREIGN and (found[0], found[2]) not in OURS]
+    unknown = [lookup for lookup in lookups() if lookup[2] not in FOREIGN and (lookup[0], lookup[2]) not in OURS]
     assert not unknown, unknown
 
 
-@pytest.mark.parametrize("known", OURS)
-def test_what_is_excused_is_still_there(known):
-    assert known in {(file, name) for file, _, name in lookups()}
+@pytest.mark.parametrize("excused_lookup", OURS)
+def test_what_is_excused_is_still_there(excused_lookup):
+    assert excused_lookup in {(file, name) for file, _, name in lookups()}

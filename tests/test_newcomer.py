@@ -1,4 +1,4 @@
-"""Ten tasks of a newcomer, done from the pages of the site alone: ``docs/howto/ten_tasks.md`` lists them."""
+"""Do ten tasks of a newcomer with the pages of the site alone: ``docs/howto/ten_tasks.md`` lists them."""
 
 from __future__ import annotations
 
@@ -48,9 +48,9 @@ def test_3_an_energy_of_my_own():
 def test_4_a_method_and_a_step():
     body, x0 = lt.models.rigid_body((3.0, 2.0, 1.0)), [0.1, 0.2, 1.0]
     suggestion = lt.suggest_method(body, x0, rtol=1e-8)
-    found = lt.integrate(body, x0, (0.0, 10.0), suggestion.step, suggestion.method).x[-1]
+    end_state = lt.integrate(body, x0, (0.0, 10.0), suggestion.step, suggestion.method).x[-1]
     exact = lt.integrate(body, x0, (0.0, 10.0), 10.0, lt.Reference(rtol=1e-12)).x[-1]
-    assert np.abs(found - exact).max() < 1e-6
+    assert np.abs(end_state - exact).max() < 1e-6
 
 
 def test_5_until_it_has_relaxed():
@@ -63,7 +63,7 @@ def test_5_until_it_has_relaxed():
 
 def test_6_a_sweep():
     rates = np.linspace(0.2, 2.0, 20)
-    many = lt.ensemble(
+    sweep = lt.ensemble(
         lt.models.rigid_body((3.0, 2.0, 1.0)),
         [0.1, 0.2, 1.0],
         (0.0, 200.0),
@@ -71,8 +71,8 @@ def test_6_a_sweep():
         parameters={"dissipation.rate": rates / 2},
         outputs="summary",
     )
-    assert many.ok.all()
-    assert many.relaxation_time[0] > 3 * many.relaxation_time[-1]  # more friction, less time
+    assert sweep.ok.all()
+    assert sweep.relaxation_time[0] > 3 * sweep.relaxation_time[-1]  # more friction, less time
 
 
 @pytest.mark.slow
@@ -102,9 +102,9 @@ def test_8_heat_and_rubbing():
         conductance=0.5,
     )
     run = lt.integrate(pair, [1.2, 1.0, 0.0, 0.1], (0.0, 60.0), 0.1)
-    first, second = map(float, pair.temperatures(run.x[-1]))
+    stone_temperature, slider_temperature = map(float, pair.temperatures(run.x[-1]))
     assert run.audit().passed
-    assert first == pytest.approx(second, rel=1e-3)
+    assert stone_temperature == pytest.approx(slider_temperature, rel=1e-3)
 
 
 @pytest.mark.slow
@@ -126,10 +126,10 @@ def test_10_saved_and_read(tmp_path):
 
 def test_the_page_lists_these_tasks_and_their_lines():
     rows = re.findall(r"^\| (\d+) \|.*\| (\d+) \|$", PAGE.read_text(), re.MULTILINE)
-    written = {}
+    line_counts = {}
     for name, thing in globals().items():
         if (number := re.sub(r"^test_(\d+)_.*", r"\1", name)).isdigit():
             body = inspect.getsource(thing).partition("):\n")[2]
-            written[int(number)] = sum(1 for line in body.splitlines() if line.strip())
-    assert {int(number): int(lines) for number, lines in rows} == written
-    assert sorted(written) == list(range(1, 11))
+            line_counts[int(number)] = sum(1 for line in body.splitlines() if line.strip())
+    assert {int(number): int(lines) for number, lines in rows} == line_counts
+    assert sorted(line_counts) == list(range(1, 11))

@@ -1,4 +1,4 @@
-"""The figures of the page of verification: computed again, and those that the page has."""
+"""Compute the figures of the page of verification again, and compare them with the page."""
 
 from __future__ import annotations
 
@@ -6,34 +6,36 @@ import re
 
 import pytest
 
-from tests.papers import PAGE, ROUNDING, ROWS, Difference, Order, Value, agree, bfm, gby, marked, sml  # noqa: F401
+from tests.papers import PAGE, ROUNDING, ROWS, Difference, Order, Value, agree, bfm, find_table, gby, sml  # noqa: F401
 
 
-def kept() -> dict[str, str]:
-    """The figures on the page by the names of their lines, and nothing else in its tables."""
-    text, found = PAGE.read_text(), {}
+def page_figures() -> dict[str, str]:
+    """Return the figures on the page by the names of their lines, and check that its tables have nothing else."""
+    text, figures = PAGE.read_text(), {}
     for paper in dict.fromkeys(line.paper for line in ROWS.values()):
         names = [name for name, line in ROWS.items() if line.paper == paper]
-        lines = marked(text, paper).group().splitlines()[2:]
+        lines = find_table(text, paper).group().splitlines()[2:]
         for name, text_line in zip(names, lines, strict=True):
             *cells, figure = [cell.strip() for cell in re.split(r"(?<!\\)\|", text_line)[1:-1]]
             assert cells == [ROWS[name].where, ROWS[name].what, ROWS[name].beside], name
-            found[name] = figure
-    return found
+            figures[name] = figure
+    return figures
 
 
 def test_every_line_is_on_the_page():
-    assert set(kept()) == set(ROWS)
+    assert set(page_figures()) == set(ROWS)
     assert len(ROWS) >= 39
 
 
 @pytest.mark.sampled(6)
 @pytest.mark.parametrize("name", ROWS)
 def test_the_figures(name):
-    found = ROWS[name].figure()
-    assert agree(found, kept()[name]), f"{found}, and the page has {kept()[name]}: python -m tests.papers"
-    if isinstance(found, Difference):
-        assert found <= ROUNDING
+    figure = ROWS[name].figure()
+    assert agree(figure, page_figures()[name]), (
+        f"{figure}, and the page has {page_figures()[name]}: python -m tests.papers"
+    )
+    if isinstance(figure, Difference):
+        assert figure <= ROUNDING
 
 
 def test_figures_that_are_not_those_of_the_page():

@@ -1,4 +1,4 @@
-"""The reference is complete: every public class, function, method and argument is told on the site."""
+"""Check that the reference is complete: the site describes every public class, function, method and argument."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ import pytest
 import liethermo
 import manifolds
 
-TABLE = Path(__file__).resolve().parent.parent / "docs" / "reference" / "arguments.md"
+ARGUMENTS_PAGE = Path(__file__).resolve().parent.parent / "docs" / "reference" / "arguments.md"
 
 
-def _told() -> tuple[set[str], set[str]]:
-    """The arguments and the attributes that the table tells."""
-    arguments, attributes = TABLE.read_text().split("## Attributes")
+def _table_names() -> tuple[set[str], set[str]]:
+    """Return the names of the arguments and of the attributes that the table describes."""
+    arguments, attributes = ARGUMENTS_PAGE.read_text().split("## Attributes")
     return tuple(  # type: ignore[return-value]
         {name for row in re.findall(r"^\| (`.*?) \|", part, re.MULTILINE) for name in re.findall(r"`(\w+)`", row)}
         for part in (arguments, attributes)
@@ -46,7 +46,7 @@ def _function(value):
 
 @pytest.mark.parametrize("package", [manifolds, liethermo], ids=lambda package: package.__name__)
 def test_every_argument_is_told(package):
-    arguments, _ = _told()
+    arguments, _ = _table_names()
     untold = []
     for name, value, doc in _public(package):
         function = None if inspect.isclass(value) else _function(value)
@@ -54,25 +54,25 @@ def test_every_argument_is_told(package):
             names = [
                 parameter for parameter in inspect.signature(function).parameters if parameter not in ("self", "cls")
             ]
-            missing = [n for n in names if not re.search(rf"\b{n}\b", doc) and n not in arguments]
-            untold += [f"{name}: {', '.join(missing)}"] if missing else []
+            absent = [n for n in names if not re.search(rf"\b{n}\b", doc) and n not in arguments]
+            untold += [f"{name}: {', '.join(absent)}"] if absent else []
     assert untold == []
 
 
 @pytest.mark.parametrize("package", [manifolds, liethermo], ids=lambda package: package.__name__)
 def test_everything_public_is_described(package):
-    """By a docstring of its own, or as an attribute by the table or the docstring of its class."""
-    _, attributes = _told()
-    silent = []
+    """A public name has a docstring, or is described as an attribute in the table or in the docstring of its class."""
+    _, attributes = _table_names()
+    failures = []
     for name, value, doc in _public(package):
-        described = (
+        needs_docstring = (
             inspect.isclass(value) or _function(value) or isinstance(value, property | functools.cached_property)
         )
         owner, _, member = name.partition(".")
-        by_class = member and re.search(rf"\b{member}\b", inspect.getdoc(getattr(package, owner)) or "")
-        if described and not doc and member not in attributes and not by_class:
-            silent.append(name)
-    assert silent == []
+        class_mention = member and re.search(rf"\b{member}\b", inspect.getdoc(getattr(package, owner)) or "")
+        if needs_docstring and not doc and member not in attributes and not class_mention:
+            failures.append(name)
+    assert failures == []
 
 
 MODULES = ("bodies", "diffrax", "learn", "magnetism", "models", "plot", "scipy", "sympy", "testing", "torques")
@@ -81,34 +81,42 @@ GEOMETRY = ("manifolds", "manifolds.sympy", "manifolds.testing")
 
 @pytest.mark.parametrize("name", ["liethermo", *(f"liethermo.{name}" for name in MODULES), *GEOMETRY])
 def test_modules_show_what_is_public_and_nothing_else(name):
-    """Other modules too only where the package has them for its users."""
+    """``dir`` of a module lists its public names, and other modules only where they are public too."""
     package, _, inner = name.partition(".")
     if inner in ("diffrax", "sympy"):
         pytest.importorskip(inner)
     module = sys.modules[package] if not inner else getattr(sys.modules[package], inner)
     version = {"__version__"} if name == "liethermo" else set()
     assert set(dir(module)) == {*module.__all__, "__doc__", "__name__"} | version
-    found = {shown for shown in module.__all__ if inspect.ismodule(getattr(module, shown))}
-    assert found <= (set() if inner else {*MODULES})
+    public_modules = {public_name for public_name in module.__all__ if inspect.ismodule(getattr(module, public_name))}
+    assert public_modules <= (set() if inner else {*MODULES})
 
 
 def test_an_argument_that_nobody_tells_is_found():
-    arguments, attributes = _told()
+    arguments, attributes = _table_names()
     assert {"x", "system", "compensation"} <= arguments
     assert {"dim", "order"} <= attributes
     assert "colour" not in arguments | attributes
 
 
-PAGE = TABLE.with_name("api.md")
-ALSO = ("Fluctuations", "FourBracket", "Friction", "FrictionOperator", "LandauLifshitz", "SteepestEntropyAscent")
-MORE = ("Solution.audit", "learn.fit", *ALSO)
-"""Main names besides those that the first page of the reference lists."""
+API_PAGE = ARGUMENTS_PAGE.with_name("api.md")
+OTHER_MAIN_NAMES = (
+    "Solution.audit",
+    "learn.fit",
+    "Fluctuations",
+    "FourBracket",
+    "Friction",
+    "FrictionOperator",
+    "LandauLifshitz",
+    "SteepestEntropyAscent",
+)
+"""Main names that the first page of the reference does not list."""
 
 WRITTEN_BY_THE_LIBRARY = ("Solution", "Audit")
-BY_CLASS_METHODS = ("LieAlgebra",)
-"""Nobody calls these: their docstrings describe what they hold."""
+CLASSES_WITHOUT_INIT = ("LieAlgebra",)
+"""Classes that nobody calls: their docstrings describe what they hold."""
 
-WITHOUT_UNIT = frozenset(
+UNITLESS_PARAMETERS = frozenset(
     """
     algebra algebras also attitude axes basis batch bath build by_matrices checkpoint chunk constraints dense dim
     dissipation engine first gradient group held kind matching measure method momentum_maps most_steps moving n
@@ -117,7 +125,7 @@ WITHOUT_UNIT = frozenset(
     store substeps units validate validation window
     """.split()
 )
-"""Options, names, counts and objects that have their own units. Any other parameter names its unit."""
+"""Parameters that need no unit: options, names, counts, and objects that have their own units."""
 
 UNIT = re.compile(
     r"\bunits?\b|dimensionless|without a unit|"
@@ -127,38 +135,40 @@ UNIT = re.compile(
 
 def _main_names():
     package = liethermo
-    for line in PAGE.read_text().partition("## By theme")[0].splitlines():
+    for line in API_PAGE.read_text().partition("## By theme")[0].splitlines():
         if line.startswith(".. currentmodule:: "):
             package = {"liethermo": liethermo, "manifolds": manifolds}[line.split()[-1]]
         elif re.fullmatch(r" {3}[A-Za-z][\w.]*", line):
             yield package, line.strip()
-    yield from ((liethermo, name) for name in MORE)
+    yield from ((liethermo, name) for name in OTHER_MAIN_NAMES)
 
 
-def _undescribed(thing, doc: str) -> list[str]:
-    """What is wrong with the description of each parameter."""
-    described: dict[str, str] = {}
+def _description_faults(thing, doc: str) -> list[str]:
+    """Return the parameters that lack words or a unit in a docstring, each with the fault."""
+    descriptions: dict[str, str] = {}
     section = re.search(r"^Parameters\n-+\n(.*?)(?=^\S[^\n]*\n---|\Z)", doc, re.MULTILINE | re.DOTALL)
     for entry in re.split(r"\n(?=\S)", section[1]) if section else []:
         head, _, words = entry.partition("\n")
         names, _, kind = head.partition(" : ")
-        described |= {name.strip(): words.strip() and f"{kind} {words}" for name in names.split(",")}
-    wrong = []
+        descriptions |= {name.strip(): words.strip() and f"{kind} {words}" for name in names.split(",")}
+    problems = []
     for name, parameter in inspect.signature(thing).parameters.items():
-        keywords = parameter.kind is parameter.VAR_KEYWORD and described
-        text = described.get(name, "given by name" if keywords else "")
+        keywords = parameter.kind is parameter.VAR_KEYWORD and descriptions
+        text = descriptions.get(name, "given by name" if keywords else "")
         if name not in ("self", "cls"):
-            wrong += [] if text else [f"{name}: no words"]
-            wrong += [] if keywords or not text or name in WITHOUT_UNIT or UNIT.search(text) else [f"{name}: no unit"]
-    return wrong
+            problems += [] if text else [f"{name}: no words"]
+            problems += (
+                [] if keywords or not text or name in UNITLESS_PARAMETERS or UNIT.search(text) else [f"{name}: no unit"]
+            )
+    return problems
 
 
 @pytest.mark.parametrize(("package", "name"), [pytest.param(*each, id=each[1]) for each in _main_names()])
 def test_parameters_of_the_main_names_have_words_and_units(package, name):
-    if name in WRITTEN_BY_THE_LIBRARY + BY_CLASS_METHODS:
+    if name in WRITTEN_BY_THE_LIBRARY + CLASSES_WITHOUT_INIT:
         pytest.skip("nobody calls it")
     thing = functools.reduce(getattr, name.split("."), package)
-    assert _undescribed(thing, inspect.getdoc(thing)) == []
+    assert _description_faults(thing, inspect.getdoc(thing)) == []
 
 
 def test_there_are_some_thirty_main_names():
@@ -166,7 +176,7 @@ def test_there_are_some_thirty_main_names():
 
 
 def test_a_parameter_without_words_or_unit_is_found():
-    def turned(rate, method, x0):
+    def turn(rate, method, x0):
         """Turned.
 
         Parameters
@@ -178,5 +188,5 @@ def test_a_parameter_without_words_or_unit_is_found():
             The start, in units of length.
         """
 
-    assert _undescribed(turned, inspect.getdoc(turned)) == ["rate: no unit", "method: no words"]
-    assert _undescribed(turned, "Turned.") == ["rate: no words", "method: no words", "x0: no words"]
+    assert _description_faults(turn, inspect.getdoc(turn)) == ["rate: no unit", "method: no words"]
+    assert _description_faults(turn, "Turned.") == ["rate: no words", "method: no words", "x0: no words"]

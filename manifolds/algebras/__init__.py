@@ -1,1 +1,1 @@
-"""Lie algebras: definition and checks, sums, Casimirs, the catalogue."""
+"""Lie algebras: definitions and checks, sums, Casimirs, and the catalogue of named algebras."""

@@ -1,4 +1,4 @@
-"""What elements of an algebra do: one to many others, and many to as many others."""
+"""Bracket and coadjoint action of one fixed element, and brackets of large batches."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import numpy as np
 from .._arrays import stack_columns
 
 MAX_UNROLLED_TERMS = 64
-"""Structure constants other than zero up to which the bracket of many copies is written out, term by term."""
+"""Largest number of nonzero structure constants for which the bracket of a batch is written out term by term."""
 
 
 class Action(Protocol):
-    """What one element x does to others, with what these have in common computed once: see :meth:`LieAlgebra.action`.
+    """Bracket and coadjoint operator of one fixed x; shared work is done once. See :meth:`LieAlgebra.action`.
 
     Arrays have the shape (dim,).
     """
@@ -26,13 +26,13 @@ class Action(Protocol):
 
 
 class Operator(Protocol):
-    """A linear map: a matrix, or what acts like one."""
+    """Linear map that is applied by ``@``: a matrix, or an object that acts like one."""
 
     def __matmul__(self, other) -> jax.Array: ...
 
 
 class AdMatrixAction:
-    """The action of x by the matrix of ``ad_x``."""
+    """Action of x by the matrix of ``ad_x``."""
 
     def __init__(self, ad):
         self.ad = ad
@@ -45,16 +45,17 @@ class AdMatrixAction:
 
 
 def nonzero_terms(constants: np.ndarray) -> tuple[tuple[int, int, int, float], ...] | None:
-    """The structure constants that are not zero with their indices; None if there are many."""
-    places = np.argwhere(constants)
-    if len(places) > MAX_UNROLLED_TERMS:
+    """Return the nonzero structure constants as tuples (a, b, c, value); None if there are more than
+    MAX_UNROLLED_TERMS."""
+    indices = np.argwhere(constants)
+    if len(indices) > MAX_UNROLLED_TERMS:
         return None
-    return tuple((a, b, c, float(constants[a, b, c])) for a, b, c in places.tolist())
+    return tuple((a, b, c, float(constants[a, b, c])) for a, b, c in indices.tolist())
 
 
-@partial(jax.jit, static_argnames=("terms", "dim"))  # one program where it is called by itself
+@partial(jax.jit, static_argnames=("terms", "dim"))  # one compiled program for calls outside of a jitted function
 def unrolled_bracket(terms: tuple[tuple[int, int, int, float], ...], x, y, dim: int) -> jax.Array:
-    """``sum_ab value x_a y_b`` for each c, from (a, b, c, value): one pass over a batch, without matrices."""
+    """Compute ``sum_ab value x_a y_b`` for each c from terms (a, b, c, value): one pass over a batch, no matrices."""
     columns: list[list[jax.Array]] = [[] for _ in range(dim)]
     for a, b, c, value in terms:
         product = x[..., a] * y[..., b]

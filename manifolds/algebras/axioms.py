@@ -1,4 +1,4 @@
-"""Structure constants: read, checked, and freed from rounding."""
+"""Reading and checking of structure constants, and removal of their rounding errors."""
 
 from __future__ import annotations
 
@@ -14,17 +14,18 @@ from ..errors import (
 from ._rational import RationalArray, max_jacobi_residual
 
 AXIOM_TOLERANCE = 1e-12
-"""Relative residual allowed in an axiom when the constants are not rational (rounding of a few products)."""
+"""Largest relative residual of an axiom for constants that are not rational (rounding of a few products)."""
 
 
 def checked_constants(values) -> np.ndarray:
+    """Return structure constants as an array, after checking that it is cubic, real and finite."""
     try:
         array = np.asarray(values)
         numeric = array.astype(np.complex128 if np.iscomplexobj(array) else np.float64)
     except (TypeError, ValueError) as error:
         raise ComponentError(f"the structure constants are not a rectangular array of numbers: {error}") from None
     if array.ndim != 3 or len(set(array.shape)) != 1 or array.shape[0] == 0:
-        raise ShapeError(f"structure constants have shape (dim, dim, dim), not {array.shape}")
+        raise ShapeError(f"structure constants must have shape (dim, dim, dim), got {array.shape}")
     if np.iscomplexobj(numeric):
         raise ComponentError("structure constants must be real: use a real basis of the algebra")
     if not np.isfinite(numeric).all():
@@ -34,9 +35,9 @@ def checked_constants(values) -> np.ndarray:
 
 
 def constants_from_matrices(basis) -> tuple[np.ndarray, np.ndarray]:
-    """The structure constants of the algebra that matrices span over the reals, and the matrices as an array.
+    """Return the structure constants of the algebra that matrices span over the reals, and the matrices as an array.
 
-    Raises what :meth:`manifolds.LieAlgebra.from_matrices` does.
+    Raises the errors of :meth:`manifolds.LieAlgebra.from_matrices`.
     """
     try:
         matrices = np.asarray(basis)
@@ -44,22 +45,27 @@ def constants_from_matrices(basis) -> tuple[np.ndarray, np.ndarray]:
     except (TypeError, ValueError) as error:
         raise ComponentError(f"the basis is not a rectangular array of numbers: {error}") from None
     if matrices.ndim != 3 or matrices.shape[1] != matrices.shape[2] or 0 in matrices.shape:
-        raise ShapeError(f"a matrix basis has shape (dim, m, m), not {matrices.shape}")
+        raise ShapeError(f"a matrix basis must have shape (dim, m, m), got {matrices.shape}")
     if not np.isfinite(matrices).all():
-        raise ComponentError("the matrix basis has entries that are not finite")
+        raise ComponentError("the entries of a matrix basis must be finite")
     dim = len(matrices)
-    sizes = np.linalg.norm(matrices, axis=(1, 2))
-    if not sizes.all():
-        raise ClosureError(f"e{sizes.argmin() + 1} is the zero matrix; a basis is linearly independent")
-    matrices, given = matrices / sizes[:, None, None], matrices  # of norm 1: what is rounding has one size
+    norms = np.linalg.norm(matrices, axis=(1, 2))
+    if not norms.all():
+        raise ClosureError(
+            f"e{norms.argmin() + 1} is the zero matrix; remove it, since a basis must be linearly independent"
+        )
+    matrices, input_matrices = (
+        matrices / norms[:, None, None],
+        matrices,
+    )  # of norm 1, so that all rounding errors are of one size
     columns = real_columns(matrices)
-    singular = np.linalg.svd(columns, compute_uv=False)
-    if dim > columns.shape[0] or singular[-1] <= 1e-10 * singular[0]:
+    singular_values = np.linalg.svd(columns, compute_uv=False)
+    if dim > columns.shape[0] or singular_values[-1] <= 1e-10 * singular_values[0]:
         raise ClosureError(
             f"the {dim} matrices are linearly dependent over the reals (smallest over largest singular value "
-            f"{singular[-1] / singular[0]:.1e}); remove the superfluous ones",
-            residual=float(singular[-1]),
-            tolerance=float(1e-10 * singular[0]),
+            f"{singular_values[-1] / singular_values[0]:.1e}); remove the superfluous ones",
+            residual=float(singular_values[-1]),
+            tolerance=float(1e-10 * singular_values[0]),
         )
     products = np.einsum("aij,bjk->abik", matrices, matrices)
     commutators = real_columns((products - products.swapaxes(0, 1)).reshape(dim * dim, *matrices.shape[1:]))
@@ -78,35 +84,38 @@ def constants_from_matrices(basis) -> tuple[np.ndarray, np.ndarray]:
         )
     constants = coordinates.T.reshape(dim, dim, dim)
     constants = (constants - constants.swapaxes(0, 1)) / 2
-    scales = sizes[:, None, None] * sizes[:, None] / sizes
-    return snap_to_fractions(constants, scales, columns, commutators), given
+    scales = norms[:, None, None] * norms[:, None] / norms
+    return snap_to_fractions(constants, scales, columns, commutators), input_matrices
 
 
 def check_axioms(constants: np.ndarray, name: str, exact: RationalArray | None) -> None:
-    """Antisymmetry and Jacobi; ``constants`` are the integer numerators where ``exact`` is given."""
+    """Raise an error if antisymmetry or the Jacobi identity fails.
+
+    With ``exact`` the constants are its integer numerators, and the check is exact.
+    """
     unit = 1.0 if exact is None else 1.0 / exact.denominator
-    how = "checked exactly" if exact is not None else "tolerance {:.1g}"
+    check_text = "checked exactly" if exact is not None else "tolerance {:.1g}"
     scale = float(np.abs(constants).max())
-    symmetric = np.abs(constants + constants.swapaxes(0, 1)).max(axis=2)
+    symmetric_parts = np.abs(constants + constants.swapaxes(0, 1)).max(axis=2)
     tolerance = 0.0 if exact is not None else AXIOM_TOLERANCE * scale
-    if symmetric.max() > tolerance:
-        a, b = (int(i) for i in np.unravel_index(symmetric.argmax(), symmetric.shape))
+    if symmetric_parts.max() > tolerance:
+        a, b = (int(i) for i in np.unravel_index(symmetric_parts.argmax(), symmetric_parts.shape))
         raise AntisymmetryError(
             f"{name}: [e{a + 1}, e{b + 1}] + [e{b + 1}, e{a + 1}] has a component of size "
-            f"{symmetric.max() * unit:.3g} ({how.format(tolerance)}); set C[b, a, :] = -C[a, b, :]",
-            residual=float(symmetric.max() * unit),
+            f"{symmetric_parts.max() * unit:.3g} ({check_text.format(tolerance)}); set C[b, a, :] = -C[a, b, :]",
+            residual=float(symmetric_parts.max() * unit),
             tolerance=tolerance,
             indices=(a, b),
         )
-    worst, triple = max_jacobi_residual(constants)
+    max_component, triple = max_jacobi_residual(constants)
     tolerance = 0.0 if exact is not None else AXIOM_TOLERANCE * scale**2 * len(constants)
-    if worst > tolerance:
-        residual = worst * unit**2
+    if max_component > tolerance:
+        residual = max_component * unit**2
         a, b, c = sorted(triple)
         raise JacobiError(
             f"{name}: the Jacobi identity fails for (e{a + 1}, e{b + 1}, e{c + 1}): "
             f"[[e{a + 1}, e{b + 1}], e{c + 1}] + cyclic has a component of size {residual:.3g} "
-            f"({how.format(tolerance)})",
+            f"({check_text.format(tolerance)})",
             residual=residual,
             tolerance=tolerance,
             indices=(a, b, c),
@@ -116,31 +125,35 @@ def check_axioms(constants: np.ndarray, name: str, exact: RationalArray | None) 
 def snap_to_fractions(
     constants: np.ndarray, scales: np.ndarray, columns: np.ndarray, commutators: np.ndarray
 ) -> np.ndarray:
-    """The constants, times their scales, snapped to nearby fractions, if the commutators then hold at least as well.
+    """Return ``constants * scales`` rounded to nearby fractions, if the commutators then hold at least as well.
 
-    The constants are those of matrices of norm 1, the ``columns``.
+    The constants are those of the matrices of norm 1 in ``columns``.
     """
 
-    def defect(constants):
+    def max_residual(constants):
         return np.abs(columns @ constants.reshape(len(constants) ** 2, -1).T - commutators).max()
 
-    scaled = constants * scales
-    snapped = _nearest_fractions(scaled, 1e-12 * np.maximum(scales, np.abs(scaled)))
-    return snapped if defect(snapped / scales) <= max(4 * np.finfo(float).eps, defect(constants)) else scaled
+    scaled_constants = constants * scales
+    rounded_constants = _nearest_fractions(scaled_constants, 1e-12 * np.maximum(scales, np.abs(scaled_constants)))
+    return (
+        rounded_constants
+        if max_residual(rounded_constants / scales) <= max(4 * np.finfo(float).eps, max_residual(constants))
+        else scaled_constants
+    )
 
 
-def _nearest_fractions(values: np.ndarray, within: np.ndarray) -> np.ndarray:
-    """Each value, or the nearest fraction of denominator 64 or less where that is nearer than ``within``."""
-    found, least = values, within
+def _nearest_fractions(values: np.ndarray, max_distances: np.ndarray) -> np.ndarray:
+    """Round each value to the nearest fraction of denominator at most 64, if that is closer than ``max_distances``."""
+    snapped_values, min_distances = values, max_distances
     for denominator in range(1, 65):
         fractions = np.round(values * denominator) / denominator
         distances = np.abs(fractions - values)
-        found = np.where(distances < least, fractions, found)
-        least = np.minimum(distances, least)
-    return found
+        snapped_values = np.where(distances < min_distances, fractions, snapped_values)
+        min_distances = np.minimum(distances, min_distances)
+    return snapped_values
 
 
 def real_columns(matrices: np.ndarray) -> np.ndarray:
-    """Each matrix as a column of its real and imaginary parts: linear algebra over the reals."""
-    flat = matrices.reshape(len(matrices), -1)
-    return np.concatenate([flat.real, flat.imag], axis=1).T
+    """Return each matrix as a column of its real and imaginary parts, for linear algebra over the reals."""
+    flat_matrices = matrices.reshape(len(matrices), -1)
+    return np.concatenate([flat_matrices.real, flat_matrices.imag], axis=1).T

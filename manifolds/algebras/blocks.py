@@ -1,6 +1,6 @@
-"""Direct sums of many algebras, and copies of one on sites: what they do is done block by block.
+"""Direct sums of many algebras, and copies of one algebra on sites, computed block by block.
 
-No array over pairs of components is made: a bracket costs what those of the blocks cost, and so does the memory.
+No array over pairs of components is made: time and memory are the sums of those of the blocks.
 """
 
 from __future__ import annotations
@@ -25,26 +25,29 @@ from .lie_algebra import LieAlgebra
 from .polynomial import Polynomial
 
 MAX_COPIES_LISTED = 8
-"""Copies up to which the Casimirs of each are followed along a motion; of more copies their sum is."""
+"""Largest number of copies whose Casimirs are followed one by one along a motion; for more copies their sum is
+followed."""
 
 MAX_LISTED_EXPONENTS = 1_000_000
-"""Exponents in the Casimirs of all sites up to which they are listed one by one."""
+"""Largest number of exponents in the Casimirs of all sites for which they are listed one by one."""
 
 
 def power(g: LieAlgebra, sites) -> DirectSum:
-    """Copies of an algebra on sites, also written ``g ** sites``: elements of different sites commute.
+    """Return the direct sum of copies of an algebra on sites, also written ``g ** sites``.
+
+    Elements of different sites commute.
 
     Parameters
     ----------
     g : LieAlgebra
     sites : int or tuple of int
-        How many copies; a tuple, such as ``(64, 64)``, for a lattice.
+        Number of copies; a tuple, such as ``(64, 64)``, for a lattice.
 
     Returns
     -------
     LieAlgebra
-        Of dimension ``n * g.dim`` for n sites. Its elements have the shape ``(*sites, g.dim)``, or are flat: what
-        operations return has the shape of what they are given.
+        With dimension ``n * g.dim`` for n sites. Its elements have the shape ``(*sites, g.dim)``, or are flat: results
+        have the shape of the arguments.
 
     Raises
     ------
@@ -54,10 +57,10 @@ def power(g: LieAlgebra, sites) -> DirectSum:
         If one element would not fit into memory.
     """
     if not isinstance(g, LieAlgebra):
-        raise ParameterError(f"copies are of a LieAlgebra, not of {type(g).__name__}")
+        raise ParameterError(f"power(g, sites): g must be a LieAlgebra, got {type(g).__name__}")
     shape = tuple(sites) if isinstance(sites, tuple | list) else (sites,)
     if not shape:
-        raise ParameterError("copies of an algebra need the number of sites")
+        raise ParameterError("power(g, sites): sites must not be empty")
     shape = tuple(checked_size(n, 1, "power(g, sites)", "each number of sites") for n in shape)
     if isinstance(g, DirectSum) and g.sites is not None:
         shape = (*shape, *g.sites)
@@ -68,28 +71,28 @@ def power(g: LieAlgebra, sites) -> DirectSum:
 
 
 def merged_direct_sum(algebras: Sequence[LieAlgebra]) -> DirectSum:
-    """The direct sum of algebras in a row, equal neighbours taken together."""
+    """Return the direct sum of algebras in order, with equal neighbours merged into one block."""
     blocks: list[tuple[LieAlgebra, int]] = []
     for g in algebras:
-        parts = g.blocks if isinstance(g, DirectSum) else ((g, 1),)
-        for part, count in parts:
-            if blocks and (blocks[-1][0] is part or blocks[-1][0] == part):
+        summands = g.blocks if isinstance(g, DirectSum) else ((g, 1),)
+        for summand, count in summands:
+            if blocks and (blocks[-1][0] is summand or blocks[-1][0] == summand):
                 blocks[-1] = (blocks[-1][0], blocks[-1][1] + count)
             else:
-                blocks.append((part, count))
+                blocks.append((summand, count))
     return DirectSum(tuple(blocks))
 
 
 @jax.tree_util.register_static
 class DirectSum(BracketAlgebra):
-    """A direct sum by its blocks; see :func:`manifolds.power` and :func:`manifolds.direct_sum`.
+    """Direct sum of algebras, by blocks; see :func:`manifolds.power` and :func:`manifolds.direct_sum`.
 
     Attributes
     ----------
     blocks : tuple of (LieAlgebra, int)
-        Each with how often it stands in a row.
+        Each algebra with the number of its consecutive copies.
     sites : tuple of int, or None
-        Of copies of one algebra, as they were asked for.
+        Numbers of sites, if the blocks are copies of one algebra on sites.
     """
 
     def __init__(self, blocks: tuple[tuple[LieAlgebra, int], ...], sites: tuple[int, ...] | None = None):
@@ -111,48 +114,48 @@ class DirectSum(BracketAlgebra):
     # -- the operations, block by block -----------------------------------------------------------------------------
 
     def bracket(self, x, y) -> jax.Array:
-        """Lie bracket ``[x, y]``; elements have shape (..., dim) or ``(..., *sites, d)``, and so has the result."""
+        """Return the Lie bracket ``[x, y]``; elements and result have shape (..., dim) or ``(..., *sites, d)``."""
         return self._blockwise("_batched_bracket", (x, "x"), (y, "y"))
 
     def ad_star(self, x, mu) -> jax.Array:
-        """Coadjoint operator ``ad*_x mu``, for elements of shape (..., dim) or ``(..., *sites, d)``."""
+        """Return the coadjoint operator ``ad*_x mu``; elements have shape (..., dim) or ``(..., *sites, d)``."""
         return self._blockwise("_batched_ad_star", (x, "x"), (mu, "mu"))
 
     def action(self, x) -> BlockAction:
         return BlockAction(self, x)
 
     def ad(self, x) -> jax.Array:
-        """Matrix of ``y -> [x, y]``, shape (..., dim, dim), mostly zeros: for small sums alone."""
+        """Return the matrix of ``y -> [x, y]``, shape (..., dim, dim); mostly zeros, so only small sums allow it."""
         self._check_matrix_memory("the matrix of ad")
-        ads = [g.ad(part) for (g, _), part in zip(self.blocks, self.split(x), strict=True)]
+        ads = [g.ad(component) for (g, _), component in zip(self.blocks, self.split(x), strict=True)]
         return _block_diagonal(ads)
 
     def split(self, x, what: str = "x") -> list[jax.Array]:
-        """The parts of an element in each kind of block, shape (..., count, d)."""
-        x, parts, start = self._flatten_element(x, what)[0], [], 0
+        """Return the components of an element in each block, each of shape (..., count, d)."""
+        x, components, start = self._flatten_element(x, what)[0], [], 0
         for g, count in self.blocks:
             stop = start + g.dim * count
-            parts.append(x[..., start:stop].reshape(*x.shape[:-1], count, g.dim))
+            components.append(x[..., start:stop].reshape(*x.shape[:-1], count, g.dim))
             start = stop
-        return parts
+        return components
 
-    def _blockwise(self, kernel: str, *elements) -> jax.Array:
-        shaped = any(self._flatten_element(x, what)[1] for x, what in elements)
-        columns = zip(*(self.split(x, what) for x, what in elements), strict=True)
-        found = [getattr(g, kernel)(*parts) for (g, _), parts in zip(self.blocks, columns, strict=True)]
-        rows = [part.reshape(*part.shape[:-2], -1) for part in found]
-        joined = rows[0] if len(rows) == 1 else jnp.concatenate(rows, axis=-1)
-        return joined.reshape(*joined.shape[:-1], *self.shape) if shaped else joined
+    def _blockwise(self, method_name: str, *elements) -> jax.Array:
+        has_site_axes = any(self._flatten_element(x, what)[1] for x, what in elements)
+        argument_blocks = zip(*(self.split(x, what) for x, what in elements), strict=True)
+        results = [getattr(g, method_name)(*parts) for (g, _), parts in zip(self.blocks, argument_blocks, strict=True)]
+        rows = [result.reshape(*result.shape[:-2], -1) for result in results]
+        components = rows[0] if len(rows) == 1 else jnp.concatenate(rows, axis=-1)
+        return components.reshape(*components.shape[:-1], *self.shape) if has_site_axes else components
 
     def _flatten_element(self, x, what: str) -> tuple[jax.Array, bool]:
-        """An element with its components in one axis, and whether it came with axes for the sites."""
+        """Return an element of shape (..., dim), and True if it came with axes for the sites."""
         array = jnp.asarray(numeric_array(x, what))
         if self.sites is not None and array.shape[-len(self.shape) :] == self.shape:
             array = array.reshape(*array.shape[: -len(self.shape)], self.dim)
             return real_components(array, self.dim, what), True
         if self.sites is not None and array.shape[-1:] != (self.dim,):
             raise ShapeError(
-                f"{what} has shape (..., {_axes_text(self.shape)}) or (..., {self.dim}), not {array.shape}"
+                f"{what} must have shape (..., {_axes_text(self.shape)}) or (..., {self.dim}), got {array.shape}"
             )
         return real_components(array, self.dim, what), False
 
@@ -165,7 +168,7 @@ class DirectSum(BracketAlgebra):
     def _batched_ad_star(self, x, mu) -> jax.Array:
         return self.ad_star(x, mu)
 
-    # -- structure: that of the blocks ------------------------------------------------------------------------------
+    # -- structure, from the blocks -----------------------------------------------------------------------------------
 
     def killing_form(self) -> np.ndarray:
         return self._block_diagonal_matrix("the Killing form", lambda g: g.killing_form())
@@ -202,12 +205,12 @@ class DirectSum(BracketAlgebra):
         return sum(count * g.casimir_count() for g, count in self.blocks)
 
     def casimirs(self, degree: int) -> list:
-        """The Casimirs of each block in turn, as functions of the whole mu.
+        """Return the Casimirs of each block in turn, as functions of the full mu.
 
         Raises
         ------
         LieAlgebraError
-            If they are too many to be listed: :meth:`site_casimirs` evaluates those of all sites together.
+            If there are too many to list; :meth:`site_casimirs` evaluates the Casimirs of all sites together.
         """
         number = sum(count * len(g.casimirs(degree)) for g, count in self.blocks)
         if number * self.dim > MAX_LISTED_EXPONENTS:
@@ -223,9 +226,9 @@ class DirectSum(BracketAlgebra):
         ]
 
     def site_casimirs(self, degree: int) -> list[SiteCasimirs]:
-        """The Casimirs of the blocks, each a function of the whole mu with a value for every copy.
+        """Return the Casimirs of the blocks, each a function of the full mu with one value per copy.
 
-        Those of copies on sites have values of shape ``(..., *sites)``.
+        For copies on sites the values have shape ``(..., *sites)``.
         """
         return [
             self._casimir_at_copies(F, g, count, start)
@@ -234,18 +237,20 @@ class DirectSum(BracketAlgebra):
         ]
 
     def leading_casimirs(self) -> list[tuple[str, Callable]]:
-        found: list[tuple[str, Callable]] = []
+        named_casimirs: list[tuple[str, Callable]] = []
         for i, (g, count, start) in enumerate(self._blocks_with_starts()):
-            place = "" if len(self.blocks) == 1 else f" in block {i + 1}"
+            block_text = "" if len(self.blocks) == 1 else f" in block {i + 1}"
             for name, F in g.leading_casimirs():
                 if count > MAX_COPIES_LISTED:
-                    found.append((f"sum of {name}{place}", CasimirSum(self._casimir_at_copies(F, g, count, start))))
+                    named_casimirs.append(
+                        (f"sum of {name}{block_text}", CasimirSum(self._casimir_at_copies(F, g, count, start)))
+                    )
                     continue
                 for j in range(count):
-                    found.append(
-                        (f"{name} at {j + 1}{place}", _casimir_of_block(F, start + j * g.dim, g.dim, self.dim))
+                    named_casimirs.append(
+                        (f"{name} at {j + 1}{block_text}", _casimir_of_block(F, start + j * g.dim, g.dim, self.dim))
                     )
-        return found
+        return named_casimirs
 
     def _casimir_at_copies(self, F: Callable, g: LieAlgebra, count: int, start: int) -> SiteCasimirs:
         return SiteCasimirs(F, g.dim, count, start, self.dim, self.sites)
@@ -261,13 +266,13 @@ class DirectSum(BracketAlgebra):
     def _build_by_constants(self) -> LieAlgebra:
         return direct_sum_by_constants([g for g, count in self.blocks for _ in range(count)])
 
-    def _block_diagonal_matrix(self, what: str, of: Callable[[LieAlgebra], np.ndarray]) -> np.ndarray:
+    def _block_diagonal_matrix(self, what: str, matrix_of_block: Callable[[LieAlgebra], np.ndarray]) -> np.ndarray:
         self._check_matrix_memory(what)
-        return scipy.linalg.block_diag(*(block for g, count in self.blocks for block in [of(g)] * count))
+        return scipy.linalg.block_diag(*(block for g, count in self.blocks for block in [matrix_of_block(g)] * count))
 
 
 class BlockAction:
-    """The action of one element of a sum: that of its parts."""
+    """Action of one element of a direct sum, block by block."""
 
     def __init__(self, g: DirectSum, x):
         self.g, self.x = g, x
@@ -282,7 +287,7 @@ class BlockAction:
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class SiteCasimirs:
-    """A Casimir of one algebra at each of its copies: ``mu -> values``, shape (..., dim) to (..., copies).
+    """Casimir of one algebra, evaluated at each of its copies: shape (..., dim) to (..., copies).
 
     With sites, mu may have the shape ``(..., *sites, d)``, and the values have ``(..., *sites)``.
     """
@@ -310,11 +315,11 @@ class SiteCasimirs:
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class CasimirSum:
-    """The sum of a Casimir over the copies, shape (..., dim) to (...)."""
+    """Sum of a Casimir over all copies of its algebra, shape (..., dim) to (...)."""
 
     site_casimirs: SiteCasimirs
 
-    dim = forward_to("part")
+    dim = forward_to("site_casimirs")
 
     def __call__(self, mu) -> jax.Array:
         return jnp.sum(
@@ -328,7 +333,7 @@ class CasimirSum:
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class BlockCasimir:
-    """A Casimir of one block as a function of the whole mu, shape (..., dim) to (...)."""
+    """Casimir of one block as a function of the full mu, shape (..., dim) to (...)."""
 
     casimir: Callable
     start: int
@@ -351,7 +356,7 @@ def _casimir_of_block(F, start: int, size: int, dim: int) -> Polynomial | BlockC
 
 
 def direct_sum_by_constants(algebras: Sequence[LieAlgebra]) -> LieAlgebra:
-    """The direct sum as one array of structure constants."""
+    """Return the direct sum as an algebra with one array of structure constants."""
     dim = sum(g.dim for g in algebras)
     constants, start = np.zeros((dim, dim, dim)), 0
     for g in algebras:
@@ -359,14 +364,16 @@ def direct_sum_by_constants(algebras: Sequence[LieAlgebra]) -> LieAlgebra:
         constants[block, block, block] = g.structure_constants
         start += g.dim
     bases = [g.basis for g in algebras]
-    known = [basis for basis in bases if basis is not None]
+    matrix_bases = [basis for basis in bases if basis is not None]
     basis = None
-    if len(known) == len(bases):
+    if len(matrix_bases) == len(bases):
         basis = np.array(
             [
-                scipy.linalg.block_diag(*(e if i == j else np.zeros_like(other[0]) for j, other in enumerate(known)))
-                for i, own in enumerate(known)
-                for e in own
+                scipy.linalg.block_diag(
+                    *(e if i == j else np.zeros_like(neighbour[0]) for j, neighbour in enumerate(matrix_bases))
+                )
+                for i, block_basis in enumerate(matrix_bases)
+                for e in block_basis
             ]
         )
     name = " + ".join(g.name for g in algebras)
@@ -374,27 +381,27 @@ def direct_sum_by_constants(algebras: Sequence[LieAlgebra]) -> LieAlgebra:
 
 
 def joined_names(*algebras: LieAlgebra) -> tuple[str, ...] | None:
-    """The names of all basis elements, where all have some and no two the same."""
+    """Return the names of all basis elements in order; None if an algebra has none, or two names are equal."""
     names = [name for g in algebras for name in g.basis_names or ()]
     return tuple(names) if len(set(names)) == sum(g.dim for g in algebras) else None
 
 
 def _sum_series(series: list[tuple[list[int], int]]) -> list[int]:
-    """Dimensions added up, each series so many times, and going on where it has ended."""
-    longest = max(len(dims) for dims, _ in series)
-    return [sum(count * dims[min(i, len(dims) - 1)] for dims, count in series) for i in range(longest)]
+    """Add up series of dimensions, each times its count; a series that has ended continues with its last value."""
+    n_terms = max(len(dims) for dims, _ in series)
+    return [sum(count * dims[min(i, len(dims) - 1)] for dims, count in series) for i in range(n_terms)]
 
 
-def _block_diagonal(parts: list[jax.Array]) -> jax.Array:
-    """Matrices, shapes (..., count, d, d), in the blocks of one, shape (..., n, n)."""
-    size = sum(part.shape[-3] * part.shape[-1] for part in parts)
-    found, start = jnp.zeros((*parts[0].shape[:-3], size, size)), 0
-    for part in parts:
-        count, d = part.shape[-3], part.shape[-1]
-        own = jnp.einsum("...idm,ij->...idjm", part, np.eye(count)).reshape(*part.shape[:-3], count * d, count * d)
-        found = found.at[..., start : start + count * d, start : start + count * d].set(own)
+def _block_diagonal(stacks: list[jax.Array]) -> jax.Array:
+    """Return block-diagonal matrices, shape (..., n, n), from stacks of shape (..., count, d, d)."""
+    size = sum(part.shape[-3] * part.shape[-1] for part in stacks)
+    matrix, start = jnp.zeros((*stacks[0].shape[:-3], size, size)), 0
+    for stack in stacks:
+        count, d = stack.shape[-3], stack.shape[-1]
+        block = jnp.einsum("...idm,ij->...idjm", stack, np.eye(count)).reshape(*stack.shape[:-3], count * d, count * d)
+        matrix = matrix.at[..., start : start + count * d, start : start + count * d].set(block)
         start += count * d
-    return found
+    return matrix
 
 
 def _to_operator(form):

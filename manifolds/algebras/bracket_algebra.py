@@ -1,4 +1,4 @@
-"""Algebras that know what they do; their structure constants and matrices are made when they are asked for."""
+"""Algebras defined by their bracket; structure constants and matrices are computed on demand."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from .lie_algebra import LieAlgebra
 
 
 class BracketAlgebra(LieAlgebra):
-    """An algebra given by its bracket. What its constants alone tell is asked of :attr:`algebra_by_constants`.
+    """Algebra defined by its bracket; :attr:`algebra_by_constants` serves operations that need structure constants.
 
-    A subclass sets ``name`` and ``dim``, gives :meth:`bracket`, :meth:`ad_star`, ``_rounded_key`` and
-    :meth:`_build_by_constants`, and whatever else it knows without constants.
+    A subclass sets ``name`` and ``dim``, implements :meth:`bracket`, :meth:`ad_star`, ``_key`` and
+    :meth:`_build_by_constants`, and overrides the properties that it knows without constants.
     """
 
     name: str
@@ -30,12 +30,12 @@ class BracketAlgebra(LieAlgebra):
 
     @cached_property
     def algebra_by_constants(self) -> LieAlgebra:
-        """The same algebra, given by its structure constants.
+        """Equal algebra with an array of structure constants.
 
         Raises
         ------
         SizeError
-            If they would not fit into memory; nothing is tried then.
+            If the constants would not fit into memory; they are not computed then.
         """
         check_memory(
             float(self.dim) ** 3,
@@ -57,7 +57,7 @@ class BracketAlgebra(LieAlgebra):
     _balanced_constants = forward_to("algebra_by_constants")
 
     def _check_matrix_memory(self, what: str) -> None:
-        """Raise SizeError where a dim by dim matrix would not fit."""
+        """Raise SizeError if a dim by dim matrix would not fit into memory."""
         check_memory(float(self.dim) ** 2, f"{what} of {self.name}", "bracket, ad_star and action make no matrices")
 
     def ad(self, x):

@@ -1,9 +1,9 @@
-"""Casimirs: how many independent ones an algebra has, and which polynomials they are.
+"""Casimirs: the number of independent ones of an algebra, and the polynomials among them.
 
 A Casimir is a function F on g* with ``ad*_{grad F(mu)} mu = 0`` for every mu. It is enough that F Poisson-commutes
 with elements that generate the algebra, by the Jacobi identity; on the coefficients of a homogeneous polynomial each
 of these conditions is linear. Where the structure constants are rational, perhaps after a scaling of the basis, the
-polynomials found are exact and proved to be all there are.
+polynomials found are exact and proved to be complete.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from .polynomial_casimirs import TooLargeError, casimir_count, new_casimirs
 from .structure import AlgebraStructure
 
 MAX_LEADING_MONOMIALS = 400
-"""Casimirs are looked for up to the degree whose monomials number at most this many (a second's work)."""
+"""Largest number of monomials of a degree in which leading Casimirs are searched for (a second's work)."""
 
 
 class NoPolynomialCasimirWarning(UserWarning):
-    """The algebra has Casimirs, but none found is a polynomial."""
+    """Issued when an algebra has Casimirs but no polynomial one was found."""
 
 
 def casimirs(g: AlgebraStructure, degree: int) -> list[Polynomial | TracePolynomial]:
-    """All homogeneous polynomial Casimirs of this degree, modulo the span of products of those of lower degree.
+    """Return all homogeneous polynomial Casimirs of this degree, modulo products of Casimirs of lower degree.
 
     The lists of degrees 1, 2, … together generate the ring of polynomial Casimirs. Each is a reduced row echelon
     basis in the lexicographic order of monomials, less the elements whose leading monomial is that of a combination
@@ -37,7 +37,7 @@ def casimirs(g: AlgebraStructure, degree: int) -> list[Polynomial | TracePolynom
 
     Parameters
     ----------
-    g : Structure
+    g : AlgebraStructure
     degree : int
         At least 1.
 
@@ -66,37 +66,37 @@ def casimirs(g: AlgebraStructure, degree: int) -> list[Polynomial | TracePolynom
     """
     if isinstance(degree, bool) or not isinstance(degree, int | np.integer) or degree < 1:
         raise ParameterError(f"the degree of a Casimir must be an integer >= 1, not {degree!r}")
-    found: list[Polynomial | TracePolynomial]
+    casimir_list: list[Polynomial | TracePolynomial]
     try:
-        found = list(new_casimirs(g, int(degree)))
+        casimir_list = list(new_casimirs(g, int(degree)))
     except TooLargeError:
         generators = fundamental_invariants(g)
         if generators is None:
             raise
-        found = [F for F in generators if F.degree == degree]
-    number = 0 if found or g.is_semisimple() else casimir_count(g)
-    if number and not any(new_casimirs(g, d) for d in range(1, int(degree) + 1)):
+        casimir_list = [F for F in generators if F.degree == degree]
+    n_casimirs = 0 if casimir_list or g.is_semisimple() else casimir_count(g)
+    if n_casimirs and not any(new_casimirs(g, d) for d in range(1, int(degree) + 1)):
         warn(
-            f"{g.name} has {number} independent Casimir{'s' if number > 1 else ''}, but no polynomial one "
+            f"{g.name} has {n_casimirs} independent Casimir{'s' if n_casimirs > 1 else ''}, but no polynomial one "
             f"{'of degree 1' if degree == 1 else f'up to degree {degree}'}. There may be one of higher degree, or "
             "they may be rational or transcendental (for bianchi('V') it is mu2/mu3): raise the degree, or solve "
             "ad*_(grad C) mu = 0 by hand and use the solution as a function of mu",
             NoPolynomialCasimirWarning,
         )
-    return found
+    return casimir_list
 
 
 def leading_casimirs(g: AlgebraStructure) -> list[tuple[str, Callable]]:
-    """The polynomial Casimirs of low degree with names, as many as there are; see the method of the algebra."""
-    found: list[tuple[str, Callable]] = []
+    """Return pairs (name, Casimir) of polynomial Casimirs of low degree; see :meth:`LieAlgebra.leading_casimirs`."""
+    named_casimirs: list[tuple[str, Callable]] = []
     count = g.casimir_count()
     for degree in range(1, g.dim + 1):
-        if len(found) >= count or math.comb(g.dim + degree - 1, degree) > MAX_LEADING_MONOMIALS:
+        if len(named_casimirs) >= count or math.comb(g.dim + degree - 1, degree) > MAX_LEADING_MONOMIALS:
             break
-        with warnings.catch_warnings():  # an algebra without polynomial Casimirs has simply none to follow
+        with warnings.catch_warnings():  # an algebra without polynomial Casimirs has none to follow
             warnings.simplefilter("ignore", NoPolynomialCasimirWarning)
             polynomials = g.casimirs(degree)
         for i, casimir in enumerate(polynomials):
             text = str(casimir)
-            found.append((text if len(text) <= 60 else f"Casimir {i + 1} of degree {degree}", casimir))
-    return found
+            named_casimirs.append((text if len(text) <= 60 else f"Casimir {i + 1} of degree {degree}", casimir))
+    return named_casimirs

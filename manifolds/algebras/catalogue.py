@@ -27,34 +27,38 @@ from .sums import direct_sum, semidirect_sum
 _registry: list[tuple[Callable[..., LieAlgebra], tuple, dict]] = []
 
 MAX_DIM_BY_CONSTANTS = 120
-"""Dimension up to which the classical algebras are arrays of structure constants: su(11), so(16), sp(7)."""
+"""Largest dimension in which classical algebras are arrays of structure constants: su(11), so(16), sp(7)."""
 
 MIN_WORKING_MATRICES = 20
-"""Matrices of doubles that a step of a method works with, at the least."""
+"""Number of matrices that a step of a method needs at least, used in the check of memory."""
 
 BIANCHI_KINDS = ("I", "II", "III", "IV", "V", "VI", "VII", "VIII", "IX")
+"""Bianchi's types of three-dimensional Lie algebras."""
 
 
-def register(*arguments: tuple, **named: list):
-    """Decorator: run the property suite on the constructor called with each of these argument tuples."""
+def register(*positional: tuple, **keyword_values: list):
+    """Decorate a constructor to register the algebra of each argument tuple, and of each keyword value.
 
-    def remember(constructor):
-        _registry.extend((constructor, a, {}) for a in arguments)
-        _registry.extend((constructor, (), {key: value}) for key, values in named.items() for value in values)
+    The property suite runs on every registered algebra.
+    """
+
+    def add_to_registry(constructor):
+        _registry.extend((constructor, a, {}) for a in positional)
+        _registry.extend((constructor, (), {key: value}) for key, values in keyword_values.items() for value in values)
         return constructor
 
-    return remember
+    return add_to_registry
 
 
 def registered() -> Iterator[LieAlgebra]:
-    """One instance after another of every registered algebra."""
-    for constructor, arguments, keywords in _registry:
-        yield constructor(*arguments, **keywords)
+    """Yield one instance of every registered algebra."""
+    for constructor, args, kwargs in _registry:
+        yield constructor(*args, **kwargs)
 
 
 @register((1,), (3,))
 def abelian(n: int) -> LieAlgebra:
-    """The abelian algebra R^n, as translations."""
+    """Return the abelian algebra R^n, as translations."""
     n = checked_size(n, 1, "abelian(n)")
     basis = np.zeros((n, n + 1, n + 1))
     basis[np.arange(n), np.arange(n), n] = 1.0
@@ -63,7 +67,7 @@ def abelian(n: int) -> LieAlgebra:
 
 @register((2,), (3,), (4,), (5,), (2, 1), (3, 1))
 def so(p: int, q: int = 0, *, by_matrices: bool | None = None) -> LieAlgebra:
-    """Rotations so(p), or so(p, q) of the form diag(1, …, 1, -1, …, -1).
+    """Return the rotation algebra so(p), or so(p, q) of the form diag(1, …, 1, -1, …, -1).
 
     so(3) has ``[e1, e2] = e3``: its bracket is the cross product and ``hat(x) @ y = x × y``. Otherwise the basis is
     ``E_ij g - E_ji g`` for i < j in lexicographic order, g the form.
@@ -95,69 +99,71 @@ def so(p: int, q: int = 0, *, by_matrices: bool | None = None) -> LieAlgebra:
             ],
             "so(3)",
         )
-    even = tuple(range(2, n, 2))
+    trace_degrees = tuple(range(2, n, 2))
     pfaffian = n // 2 if n % 2 == 0 else None
-    known = ClassicalData(n // 2, (p * q, n * (n - 1) // 2 - p * q, 0), (n - 2.0, 0.0), q == 0, even, pfaffian)
+    data = ClassicalData(n // 2, (p * q, n * (n - 1) // 2 - p * q, 0), (n - 2.0, 0.0), q == 0, trace_degrees, pfaffian)
     return _classical_algebra(
-        f"so({p},{q})" if q else f"so({n})", n, known, by_matrices, lambda: matrix_bases.orthogonal_basis(p, q)
+        f"so({p},{q})" if q else f"so({n})", n, data, by_matrices, lambda: matrix_bases.orthogonal_basis(p, q)
     )
 
 
 @register((2,), (3,), (4,))
 def su(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
-    """Anti-Hermitian traceless matrices ``-i lambda_a / 2``, lambda the (generalised) Gell-Mann matrices.
+    """Return su(n): anti-Hermitian traceless matrices ``-i lambda_a / 2`` of the (generalised) Gell-Mann matrices.
 
     su(2) has the structure constants of so(3); su(3) the usual f_abc.
     """
     n = checked_size(n, 2, "su(n)")
-    known = ClassicalData(n - 1, (0, n * n - 1, 0), (2.0 * n, 0.0), True, tuple(range(2, n + 1)))
-    return _classical_algebra(f"su({n})", n, known, by_matrices, lambda: matrix_bases.unitary_basis(n, centre=False))
+    data = ClassicalData(n - 1, (0, n * n - 1, 0), (2.0 * n, 0.0), True, tuple(range(2, n + 1)))
+    return _classical_algebra(f"su({n})", n, data, by_matrices, lambda: matrix_bases.unitary_basis(n, centre=False))
 
 
 @register((2,))
 def u(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
-    """Anti-Hermitian matrices: the basis of su(n), then the centre ``-i/2 sqrt(2/n) 1``."""
+    """Return u(n), the anti-Hermitian matrices: the basis of su(n), then the centre ``-i/2 sqrt(2/n) 1``."""
     n = checked_size(n, 1, "u(n)")
-    known = ClassicalData(n, (0, n * n - 1, 1), (2.0 * n, 2.0), True, tuple(range(1, n + 1)))
-    return _classical_algebra(f"u({n})", n, known, by_matrices, lambda: matrix_bases.unitary_basis(n, centre=True))
+    data = ClassicalData(n, (0, n * n - 1, 1), (2.0 * n, 2.0), True, tuple(range(1, n + 1)))
+    return _classical_algebra(f"u({n})", n, data, by_matrices, lambda: matrix_bases.unitary_basis(n, centre=True))
 
 
 @register((2,), (3,))
 def sl(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
-    """Traceless real matrices: ``E_ii - E_(i+1)(i+1)`` first, then the E_ij of the upper and of the lower triangle.
+    """Return sl(n), the traceless real matrices: ``E_ii - E_(i+1)(i+1)``, then E_ij of the upper and the lower
+    triangle.
 
     sl(2) is (h, e, f) with ``[h, e] = 2e``, ``[h, f] = -2f``, ``[e, f] = h``.
     """
     n = checked_size(n, 2, "sl(n)")
     rotations = n * (n - 1) // 2
-    known = ClassicalData(n - 1, (n * n - 1 - rotations, rotations, 0), (2.0 * n, 0.0), False, tuple(range(2, n + 1)))
-    return _classical_algebra(f"sl({n})", n, known, by_matrices, lambda: matrix_bases.special_linear_basis(n))
+    data = ClassicalData(n - 1, (n * n - 1 - rotations, rotations, 0), (2.0 * n, 0.0), False, tuple(range(2, n + 1)))
+    return _classical_algebra(f"sl({n})", n, data, by_matrices, lambda: matrix_bases.special_linear_basis(n))
 
 
 @register((1,), (2,))
 def sp(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
-    """sp(2n, R): the matrices ``[[A, B], [C, -A^T]]`` with B and C symmetric; A row by row, then B, then C."""
+    """Return sp(2n, R): matrices ``[[A, B], [C, -A^T]]`` with B and C symmetric; A row by row, then B, then C."""
     n = checked_size(n, 1, "sp(n)")
-    known = ClassicalData(n, (n * (n + 1), n * n, 0), (2.0 * n + 2.0, 0.0), False, tuple(range(2, 2 * n + 1, 2)))
-    return _classical_algebra(f"sp({n})", 2 * n, known, by_matrices, lambda: matrix_bases.symplectic_basis(n))
+    data = ClassicalData(n, (n * (n + 1), n * n, 0), (2.0 * n + 2.0, 0.0), False, tuple(range(2, 2 * n + 1, 2)))
+    return _classical_algebra(f"sp({n})", 2 * n, data, by_matrices, lambda: matrix_bases.symplectic_basis(n))
 
 
 @register(())
 def g2() -> LieAlgebra:
-    """The compact exceptional algebra of dimension 14: the matrices of so(7) that keep a three-form of octonions.
+    """Return the compact exceptional algebra of dimension 14: the matrices of so(7) that preserve the octonion
+    three-form.
 
-    The form is ``e123 + e145 + e167 + e246 - e257 - e347 - e356``; each matrix is the sum or difference of two of the
-    basis of so(7), E_ij - E_ji. Its Casimirs have the degrees 2 and 6.
+    The form is ``e123 + e145 + e167 + e246 - e257 - e347 - e356``; each matrix is the sum or difference of two basis
+    elements of so(7), E_ij - E_ji. The Casimirs have the degrees 2 and 6.
     """
     form = np.zeros((7, 7, 7), dtype=np.int64)
     for i, j, k, sign in _OCTONIONS:
         for p, q, r in ((i, j, k), (j, k, i), (k, i, j)):
             form[p, q, r], form[q, p, r] = sign, -sign
     rotations = np.asarray(so(7).basis, dtype=np.int64)
-    moved = np.einsum("api,ijk->apjk", rotations, form)
-    moved = moved + moved.transpose(0, 2, 3, 1) + moved.transpose(0, 3, 1, 2)
-    kept = np.array(rational_null_space(moved.reshape(len(rotations), -1).T))
-    return _algebra_from_basis(np.einsum("na,aij->nij", kept, rotations), "g2")
+    derivatives = np.einsum("api,ijk->apjk", rotations, form)
+    derivatives = derivatives + derivatives.transpose(0, 2, 3, 1) + derivatives.transpose(0, 3, 1, 2)
+    stabilizer = np.array(rational_null_space(derivatives.reshape(len(rotations), -1).T))
+    return _algebra_from_basis(np.einsum("na,aij->nij", stabilizer, rotations), "g2")
 
 
 _OCTONIONS = (
@@ -169,20 +175,21 @@ _OCTONIONS = (
     (2, 3, 6, -1),
     (2, 4, 5, -1),
 )
+"""Indices and signs of the terms of the octonion three-form."""
 
 
 @register((1,), (2,))
 def gl(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
-    """All real matrices, basis E_ij row by row."""
+    """Return gl(n), all real matrices, with the basis E_ij row by row."""
     n = checked_size(n, 1, "gl(n)")
     rotations = n * (n - 1) // 2
-    known = ClassicalData(n, (n * n - 1 - rotations, rotations, 1), (2.0 * n, 2.0), False, tuple(range(1, n + 1)))
-    return _classical_algebra(f"gl({n})", n, known, by_matrices, lambda: matrix_bases.general_linear_basis(n))
+    data = ClassicalData(n, (n * n - 1 - rotations, rotations, 1), (2.0 * n, 2.0), False, tuple(range(1, n + 1)))
+    return _classical_algebra(f"gl({n})", n, data, by_matrices, lambda: matrix_bases.general_linear_basis(n))
 
 
 @register((2,), (3,))
 def se(n: int) -> LieAlgebra:
-    """Rigid motions of R^n: the rotations so(n) first, then the translations."""
+    """Return the rigid motions of R^n: the rotations so(n) first, then the translations."""
     n = checked_size(n, 2, "se(n)")
     rotations = so(n)
     return semidirect_sum(rotations, rotations.basis, name=f"se({n})")
@@ -190,7 +197,7 @@ def se(n: int) -> LieAlgebra:
 
 @register((1,), (2,))
 def heisenberg(n: int = 1) -> LieAlgebra:
-    """Heisenberg algebra (q_1 … q_n, p_1 … p_n, z) with ``[q_i, p_i] = z``, upper triangular matrices."""
+    """Return the Heisenberg algebra (q_1 … q_n, p_1 … p_n, z) with ``[q_i, p_i] = z``, as upper triangular matrices."""
     n = checked_size(n, 1, "heisenberg(n)")
     q = [_matrix_unit(n + 2, 0, i + 1) for i in range(n)]
     p = [_matrix_unit(n + 2, i + 1, n + 1) for i in range(n)]
@@ -199,7 +206,7 @@ def heisenberg(n: int = 1) -> LieAlgebra:
 
 @register((2,), (3,))
 def galilei(n: int) -> LieAlgebra:
-    """Galilei algebra of R^n: rotations J, boosts K, translations P, time translation H; ``[K_i, H] = P_i``."""
+    """Return the Galilei algebra of R^n: rotations J, boosts K, translations P, time shift H; ``[K_i, H] = P_i``."""
     n = checked_size(n, 2, "galilei(n)")
     rotations = np.zeros((n * (n - 1) // 2, n + 2, n + 2))
     rotations[:, :n, :n] = so(n).basis
@@ -210,14 +217,14 @@ def galilei(n: int) -> LieAlgebra:
 
 @register((1,), (2,))
 def aff(n: int = 1) -> LieAlgebra:
-    """Affine maps of R^n: gl(n) row by row, then the translations. aff(1) has ``[e1, e2] = e2``."""
+    """Return the affine maps of R^n: gl(n) row by row, then the translations. aff(1) has ``[e1, e2] = e2``."""
     n = checked_size(n, 1, "aff(n)")
     return semidirect_sum(gl(n), gl(n).basis, name=f"aff({n})")
 
 
 @register(kind=[k for k in BIANCHI_KINDS if k not in ("VI", "VII")])
 def bianchi(kind: str, h: float | None = None) -> LieAlgebra:
-    """Bianchi's three-dimensional algebras, in the form of Ellis and MacCallum (1969).
+    """Return one of Bianchi's three-dimensional algebras, in the form of Ellis and MacCallum (1969).
 
     ``[e2, e3] = n1 e1``, ``[e3, e1] = n2 e2 - a e3``, ``[e1, e2] = n3 e3 + a e2``, where (n1, n2, n3, a) is
 
@@ -241,11 +248,11 @@ def bianchi(kind: str, h: float | None = None) -> LieAlgebra:
         If the kind is unknown, h is missing, has the wrong sign, or is given where it has no meaning.
     """
     if kind not in BIANCHI_KINDS:
-        raise ParameterError(f"no Bianchi type {kind!r}; the types are {', '.join(BIANCHI_KINDS)}")
-    family = kind in ("VI", "VII")
-    if family and h is None:
-        raise ParameterError(f"Bianchi {kind} is a family: give h, for example bianchi({kind!r}, h=0)")
-    if not family and h is not None:
+        raise ParameterError(f"kind must be one of {', '.join(BIANCHI_KINDS)}, got {kind!r}")
+    is_family = kind in ("VI", "VII")
+    if is_family and h is None:
+        raise ParameterError(f"Bianchi {kind} is a family and needs h, for example bianchi({kind!r}, h=0)")
+    if not is_family and h is not None:
         raise ParameterError(f"Bianchi {kind} has no parameter h")
     if h is not None and (not math.isfinite(h) or h * (1 if kind == "VII" else -1) < 0):
         raise ParameterError(f"Bianchi {kind} needs h {'>=' if kind == 'VII' else '<='} 0, not {h}")
@@ -298,13 +305,16 @@ def _matrix_unit(n: int, i: int, j: int) -> np.ndarray:
 
 
 def _classical_algebra(
-    name: str, size: int, known: ClassicalData, by_matrices: bool | None, tables: Callable[[], MatrixBasis]
+    name: str, size: int, data: ClassicalData, by_matrices: bool | None, make_basis: Callable[[], MatrixBasis]
 ) -> LieAlgebra:
-    """By constants up to LARGEST_BY_CONSTANTS, by products of matrices beyond, or as asked; the basis is the same."""
+    """Return the algebra by structure constants up to MAX_DIM_BY_CONSTANTS, else by products of matrices.
+
+    ``by_matrices`` overrides this choice; the basis does not depend on it.
+    """
     check_memory(MIN_WORKING_MATRICES * float(size) ** 2, f"one step with matrices of {name}", "take smaller ones")
-    if not (sum(known.signature) > MAX_DIM_BY_CONSTANTS if by_matrices is None else by_matrices):
-        return _algebra_from_basis(tables().basis_matrices(), name)
-    return MatrixAlgebra(name, tables(), known)
+    if not (sum(data.signature) > MAX_DIM_BY_CONSTANTS if by_matrices is None else by_matrices):
+        return _algebra_from_basis(make_basis().basis_matrices(), name)
+    return MatrixAlgebra(name, make_basis(), data)
 
 
 def _algebra_from_basis(basis, name: str) -> LieAlgebra:

@@ -1,4 +1,4 @@
-"""How a notebook shows a Lie algebra."""
+"""Display of a Lie algebra in a notebook."""
 
 from __future__ import annotations
 
@@ -8,25 +8,29 @@ import numpy as np
 
 from .._tables import html_grid
 
-MAX_LISTED_DIM, MAX_LISTED_BRACKETS = 12, 12
-"""More brackets than these are not listed."""
+MAX_LISTED_DIM = 12
+"""Largest dimension in which brackets are listed."""
+
+MAX_LISTED_BRACKETS = 12
+"""Largest number of brackets in a list."""
 
 
 def algebra_html(
     name: str, dim: int, structure_constants: Callable[[], np.ndarray], basis_names: tuple[str, ...] | None
 ) -> str:
-    """Name, dimension and, of a small algebra, the brackets of its basis elements that do not vanish."""
+    """Return an HTML table of the name, the dimension and, for a small algebra, the nonzero brackets."""
     names = basis_names or tuple(f"e{a + 1}" for a in range(dim))
     rows = [("dimension", str(dim))]
     if dim <= MAX_LISTED_DIM:
         a, b = np.triu_indices(dim, 1)
         brackets = structure_constants()[a, b]
-        found = np.flatnonzero(brackets.any(axis=-1))
+        nonzero_pairs = np.flatnonzero(brackets.any(axis=-1))
         rows += [
-            (f"[{names[a[i]]}, {names[b[i]]}]", _combination(brackets[i], names)) for i in found[:MAX_LISTED_BRACKETS]
+            (f"[{names[a[i]]}, {names[b[i]]}]", _combination(brackets[i], names))
+            for i in nonzero_pairs[:MAX_LISTED_BRACKETS]
         ]
-        if len(found) > MAX_LISTED_BRACKETS:
-            rows.append((f"and {len(found) - MAX_LISTED_BRACKETS} more", ""))
+        if len(nonzero_pairs) > MAX_LISTED_BRACKETS:
+            rows.append((f"and {len(nonzero_pairs) - MAX_LISTED_BRACKETS} more", ""))
     return html_grid((f"Lie algebra {name}", ""), rows)
 
 

@@ -33,26 +33,27 @@ from .polynomial_casimirs import casimir_count, new_casimirs
 from .structure import AlgebraStructure
 
 MAX_COMMUTANT_SIZE = 40
-"""Matrices up to this size are searched for others that commute with them."""
+"""Largest size of matrices whose commutant is computed."""
 
 MAX_PFAFFIAN_PRODUCTS = 20000
-"""Most products in a Pfaffian that is written out."""
+"""Largest number of products in a Pfaffian that is expanded."""
 
 MAX_EXPANSION_MONOMIALS = 200_000
-"""Most monomials in a trace that is written out."""
+"""Largest number of monomials in a trace that is expanded."""
 
 MIN_INDEPENDENCE_SINE = 1e-6
-"""Sine of the angle from the span of other gradients above which a gradient is independent of them."""
+"""Smallest sine of the angle between a gradient and the span of others for which it counts as independent."""
 
 
 @jax.tree_util.register_static
 @dataclass(frozen=True, init=False, repr=False, eq=False)
 class TracePolynomial:
-    """The homogeneous polynomial ``tr(W X(mu)**degree)``, ``X(mu) = sum_a mu_a X_a``, as powers of matrices.
+    """Homogeneous polynomial ``tr(W X(mu)**degree)``, ``X(mu) = sum_a mu_a X_a``, evaluated by powers of matrices.
 
-    It stands for a Casimir with too many monomials to be written out. Like a :class:`Polynomial` it is immutable,
-    hashable, a static leaf of a pytree, and callable on batches; its derivatives are JAX's (``jax.grad``). A value
-    costs a few products of matrices.
+    It represents a Casimir with too many monomials to expand. Like a :class:`Polynomial` it is immutable, hashable, a
+    static leaf of a pytree, and callable on batches; JAX differentiates it (``jax.grad``). One value costs a few
+    products
+    of matrices.
 
     Parameters
     ----------
@@ -62,7 +63,7 @@ class TracePolynomial:
     weight : array of float, shape (m, m), optional
         W, the identity by default.
     label : str
-        What ``str`` says.
+        Text of ``str``.
 
     Attributes
     ----------
@@ -79,10 +80,10 @@ class TracePolynomial:
     def __init__(self, matrices, degree: int, weight=None, label: str | None = None):
         X = np.array(matrices, dtype=np.float64)
         if X.ndim != 3 or X.shape[1] != X.shape[2]:
-            raise ShapeError(f"the matrices of a trace have shape (dim, m, m), not {X.shape}")
+            raise ShapeError(f"the matrices of a trace must have shape (dim, m, m), got {X.shape}")
         W = np.eye(X.shape[1]) if weight is None else np.array(weight, dtype=np.float64)
         if W.shape != X.shape[1:]:
-            raise ShapeError(f"the weight of a trace has shape {X.shape[1:]}, not {W.shape}")
+            raise ShapeError(f"the weight of a trace must have shape {X.shape[1:]}, got {W.shape}")
         X.setflags(write=False)
         W.setflags(write=False)
         label = label or f"tr(X**{degree})"
@@ -96,53 +97,55 @@ class TracePolynomial:
         return self.matrices.shape[0]
 
     def with_names(self, *names: str) -> TracePolynomial:
-        """The same trace; names show where it is :meth:`expanded`."""
-        named = TracePolynomial(self.matrices, self.degree, self.weight, self.label)
-        object.__setattr__(named, "names", checked_names(names, self.dim))
-        return named
+        """Return an equal trace whose expansion (:meth:`expanded`) prints with these names."""
+        trace = TracePolynomial(self.matrices, self.degree, self.weight, self.label)
+        object.__setattr__(trace, "names", checked_names(names, self.dim))
+        return trace
 
     def __call__(self, mu) -> jax.Array:
-        """The value at ``mu``, shape (..., dim) -> (...)."""
+        """Return the value at ``mu``, shape (..., dim) -> (...)."""
         X = jnp.einsum("...a,aij->...ij", real_components(mu, self.dim, "mu"), self.matrices)
         half = _matrix_power(X, self.degree // 2)
-        other = half @ X if self.degree % 2 else half
-        return jnp.einsum("...ij,...ji->...", self.weight @ half, other)
+        remaining_power = half @ X if self.degree % 2 else half
+        return jnp.einsum("...ij,...ji->...", self.weight @ half, remaining_power)
 
     def expanded(self) -> Polynomial:
-        """The same written out: a :class:`Polynomial` with coefficients of float, those that are rounding left out.
+        """Expand the trace into a :class:`Polynomial` with float coefficients; coefficients that are rounding are left
+        out.
 
         Raises
         ------
         LieAlgebraError
             If there are more than 200,000 monomials of this degree.
         """
-        size = math.comb(self.dim + self.degree - 1, self.degree)
-        if size > MAX_EXPANSION_MONOMIALS:
+        n_monomials = math.comb(self.dim + self.degree - 1, self.degree)
+        if n_monomials > MAX_EXPANSION_MONOMIALS:
             raise LieAlgebraError(
-                f"{self} has up to {size} monomials, more than the {MAX_EXPANSION_MONOMIALS} that are written out"
+                f"{self} has up to {n_monomials} monomials, more than the {MAX_EXPANSION_MONOMIALS} that are written "
+                "out"
             )
         coefficients, m = self.weight[None], self.weight.shape[0]
         factors = np.zeros((1, 0), dtype=np.int64)
         for _ in range(self.degree):  # the matrix W X**k: a coefficient for each monomial, given by its sorted factors
             products = np.einsum("nij,ajk->naik", coefficients, self.matrices, optimize=True).reshape(-1, m, m)
-            last = np.tile(np.arange(self.dim), len(factors))[:, None]
-            longer = np.hstack([np.repeat(factors, self.dim, axis=0), last])
-            factors, row = np.unique(np.sort(longer, axis=1), axis=0, return_inverse=True)
+            new_factors = np.tile(np.arange(self.dim), len(factors))[:, None]
+            extended_factors = np.hstack([np.repeat(factors, self.dim, axis=0), new_factors])
+            factors, row = np.unique(np.sort(extended_factors, axis=1), axis=0, return_inverse=True)
             coefficients = np.zeros((len(factors), m, m))
             np.add.at(coefficients, row.ravel(), products)
         values = np.einsum("nii->n", coefficients)
-        kept = np.abs(values) > 1e-13 * np.abs(values).max()
-        exponents = (factors[kept][:, :, None] == np.arange(self.dim)).sum(axis=1)
-        written = Polynomial(exponents, values[kept].tolist())
-        return written if self.names is None else written.with_names(*self.names)
+        is_nonzero = np.abs(values) > 1e-13 * np.abs(values).max()
+        exponents = (factors[is_nonzero][:, :, None] == np.arange(self.dim)).sum(axis=1)
+        polynomial = Polynomial(exponents, values[is_nonzero].tolist())
+        return polynomial if self.names is None else polynomial.with_names(*self.names)
 
     def _gradient(self, mu: np.ndarray) -> np.ndarray:
-        """Where W commutes with X; zero where it is rounding."""
+        """Return the gradient at mu, shape (dim,), if W commutes with X; zero where it is rounding."""
         X = np.einsum("a,aij->ij", mu, self.matrices)
         product = self.weight @ np.linalg.matrix_power(X, self.degree - 1)
-        bound = np.linalg.norm(self.weight) * np.linalg.norm(X) ** (self.degree - 1) * np.linalg.norm(self.matrices)
+        scale = np.linalg.norm(self.weight) * np.linalg.norm(X) ** (self.degree - 1) * np.linalg.norm(self.matrices)
         gradient = np.einsum("ij,aji->a", product, self.matrices)
-        return self.degree * np.where(np.linalg.norm(gradient) > 1e-12 * bound, gradient, 0.0)
+        return self.degree * np.where(np.linalg.norm(gradient) > 1e-12 * scale, gradient, 0.0)
 
     @cached_property
     def _key(self):
@@ -162,7 +165,7 @@ class TracePolynomial:
 
 
 def _matrix_power(X, exponent: int):
-    """``X**exponent``, exponent >= 0, by squaring."""
+    """Return ``X**exponent`` by squaring, exponent >= 0."""
     result = None
     while exponent:
         if exponent % 2:
@@ -178,37 +181,38 @@ def _matrix_power(X, exponent: int):
 
 @lru_cache(maxsize=64)
 def fundamental_invariants(g: AlgebraStructure) -> tuple[TracePolynomial | Polynomial, ...] | None:
-    """Casimirs that generate all polynomial ones, in the order of their degrees; None where no such set is found."""
+    """Return Casimirs that generate all polynomial ones, by increasing degree; None if no such set is found."""
     sources: list[_EquivariantSource] = []
     for source in _equivariant_sources(g):
         sources.append(source)
-        found = _independent_invariants(g, sources)
-        if found is not None:
-            return found
+        generators = _independent_invariants(g, sources)
+        if generators is not None:
+            return generators
     return None
 
 
 def _independent_invariants(
     g: AlgebraStructure, sources: list[_EquivariantSource]
 ) -> tuple[TracePolynomial | Polynomial, ...] | None:
+    """Return independent invariants of the sources, if they are complete by number and degrees; else None."""
     count = casimir_count(g)
-    total = (g.dim + count) // 2
+    degree_sum = (g.dim + count) // 2
     points = np.random.default_rng(0).standard_normal((3, g.dim))
-    found: list[TracePolynomial | Polynomial] = []
+    generators: list[TracePolynomial | Polynomial] = []
     spans = [np.zeros((0, g.dim)) for _ in points]
-    for degree in range(1, total + 1):
+    for degree in range(1, degree_sum + 1):
         for F in (F for source in sources for F in source.invariants(degree)):
             gradients = [_gradient_at(F, mu) for mu in points]
             if not all(_is_invariant(g, row, mu) for row, mu in zip(gradients, points, strict=True)):
                 return None  # an algebra whose constants are too inaccurate
-            wider = [_extend_span(span, row) for span, row in zip(spans, gradients, strict=True)]
-            if all(len(new) > len(old) for new, old in zip(wider, spans, strict=True)):
-                spans = wider
-                found.append(F)
-        if len(found) >= count:
+            extended_spans = [_extend_span(span, row) for span, row in zip(spans, gradients, strict=True)]
+            if all(len(new) > len(old) for new, old in zip(extended_spans, spans, strict=True)):
+                spans = extended_spans
+                generators.append(F)
+        if len(generators) >= count:
             break
-    complete = len(found) == count and sum(F.degree for F in found) == total
-    return tuple(found) if complete else None
+    is_complete = len(generators) == count and sum(F.degree for F in generators) == degree_sum
+    return tuple(generators) if is_complete else None
 
 
 def _gradient_at(F: TracePolynomial | Polynomial, mu: np.ndarray) -> np.ndarray:
@@ -217,20 +221,20 @@ def _gradient_at(F: TracePolynomial | Polynomial, mu: np.ndarray) -> np.ndarray:
 
 def _is_invariant(g: AlgebraStructure, gradient: np.ndarray, mu: np.ndarray) -> bool:
     motion = np.einsum("abc,a,c->b", g.structure_constants, gradient, mu)
-    size = np.abs(g.structure_constants).max() * np.linalg.norm(gradient) * np.linalg.norm(mu)
-    return bool(np.linalg.norm(motion) <= 1e-10 * size)
+    scale = np.abs(g.structure_constants).max() * np.linalg.norm(gradient) * np.linalg.norm(mu)
+    return bool(np.linalg.norm(motion) <= 1e-10 * scale)
 
 
 def _extend_span(span: np.ndarray, row: np.ndarray) -> np.ndarray:
-    """The orthonormal rows, and the direction of the part of ``row`` orthogonal to them if it is a part that counts."""
-    rest = row - span.T @ (span @ row)
-    rest -= span.T @ (span @ rest)
-    size = np.linalg.norm(rest)
-    return np.vstack([span, rest / size]) if size > MIN_INDEPENDENCE_SINE * np.linalg.norm(row) else span
+    """Append the direction of ``row`` orthogonal to the orthonormal rows of ``span``, unless it is negligible."""
+    remainder = row - span.T @ (span @ row)
+    remainder -= span.T @ (span @ remainder)
+    norm = np.linalg.norm(remainder)
+    return np.vstack([span, remainder / norm]) if norm > MIN_INDEPENDENCE_SINE * np.linalg.norm(row) else span
 
 
 class _EquivariantSource(NamedTuple):
-    """Equivariant matrices X_a, those that commute with all of them, and the Pfaffian or None."""
+    """Equivariant matrices X_a, the matrices that commute with all of them, and the Pfaffian or None."""
 
     name: str
     matrices: np.ndarray
@@ -246,7 +250,8 @@ class _EquivariantSource(NamedTuple):
 
 
 def _equivariant_sources(g: AlgebraStructure) -> Iterator[_EquivariantSource]:
-    """The cheap ones first: the matrices of the algebra, the adjoint ones, the second derivatives of cubic Casimirs."""
+    """Yield sources by increasing cost: matrices of the algebra, adjoint matrices, second derivatives of cubic
+    Casimirs."""
     if g.basis is not None:
         basis = _real_matrices(g.basis)
         X = _dual_matrices(basis)
@@ -273,32 +278,32 @@ def _third_derivatives(cubic: Polynomial) -> np.ndarray:
     derivatives = np.zeros((cubic.dim,) * 3)
     for power, coefficient in cubic.terms:
         value = float(coefficient) * math.prod(math.factorial(e) for e in power)
-        for place in set(permutations(np.repeat(np.arange(cubic.dim), power).tolist())):
-            derivatives[place] = value
+        for index in set(permutations(np.repeat(np.arange(cubic.dim), power).tolist())):
+            derivatives[index] = value
     return derivatives
 
 
 def _real_matrices(basis: np.ndarray) -> np.ndarray:
-    """Complex matrices of size m as real ones of size 2m."""
+    """Return complex matrices of size m as real matrices of size 2m."""
     if not np.iscomplexobj(basis):
         return np.asarray(basis)
     return np.block([[basis.real, -basis.imag], [basis.imag, basis.real]])
 
 
 def _dual_matrices(basis: np.ndarray) -> np.ndarray | None:
-    """The matrices X_a of ``X(mu)``, dual by the form ``tr(xy)``; None where that is degenerate.
+    """Return the matrices X_a of ``X(mu)``, dual by the form ``tr(xy)``; None if the form is degenerate.
 
-    Only a reductive algebra has a nondegenerate one.
+    Only a reductive algebra has a nondegenerate trace form.
     """
     form = np.einsum("aij,bji->ab", basis, basis)
-    sizes = np.linalg.norm(basis, axis=(1, 2))
-    if np.abs(np.linalg.eigvalsh(form / np.outer(sizes, sizes))).min() < 1e-8:
+    norms = np.linalg.norm(basis, axis=(1, 2))
+    if np.abs(np.linalg.eigvalsh(form / np.outer(norms, norms))).min() < 1e-8:
         return None
     return np.linalg.solve(form, basis.reshape(len(basis), -1)).reshape(basis.shape)
 
 
 def _commutant(X: np.ndarray, name: str) -> list[np.ndarray]:
-    """A basis of the matrices that commute with all of X, the identity first."""
+    """Return a basis of the matrices that commute with all of X, the identity first."""
     m = X.shape[1]
     identity = np.eye(m)
     if m > MAX_COMMUTANT_SIZE:
@@ -306,12 +311,12 @@ def _commutant(X: np.ndarray, name: str) -> list[np.ndarray]:
     random = np.random.default_rng(1).standard_normal((2, len(X)))  # two elements generate a semisimple algebra
     generic = np.einsum("ra,aij->rij", random / np.abs(X).max(), X)
     conditions = np.concatenate([np.kron(identity, x.T) - np.kron(x, identity) for x in generic])
-    found = numerical_null_space(conditions, name).reshape(-1, m, m)
-    return [identity, *found[1:]]
+    commuting_matrices = numerical_null_space(conditions, name).reshape(-1, m, m)
+    return [identity, *commuting_matrices[1:]]
 
 
 def _pfaffian(basis: np.ndarray, X: np.ndarray, name: str) -> Polynomial | None:
-    """The Pfaffian of ``J X(mu)``, where the matrices keep one form J alone, up to a factor, and J is symmetric."""
+    """Return the Pfaffian of ``J X(mu)`` if the matrices preserve just one form J, up to a factor, a symmetric one."""
     m = X.shape[1]
     if m % 2 or m > MAX_COMMUTANT_SIZE:
         return None
@@ -325,26 +330,26 @@ def _pfaffian(basis: np.ndarray, X: np.ndarray, name: str) -> Polynomial | None:
     skew = (skew - skew.transpose(2, 1, 0)) / 2
     skew /= np.abs(skew).max()
     skew[np.abs(skew) < 1e-12] = 0.0
-    nearest = np.rint(skew)
-    skew = nearest if np.abs(skew - nearest).max() < 1e-12 else skew
+    integer_skew = np.rint(skew)
+    skew = integer_skew if np.abs(skew - integer_skew).max() < 1e-12 else skew
     terms = max(int((skew[i, :, j] != 0).sum()) for i in range(m) for j in range(i))
     if terms ** (m // 2) * math.prod(range(m - 1, 0, -2)) > MAX_PFAFFIAN_PRODUCTS:
         return None
-    number, units = int if skew is nearest else float, np.eye(len(X), dtype=np.int64)
+    number, units = int if skew is integer_skew else float, np.eye(len(X), dtype=np.int64)
     entries = {(i, j): Polynomial(units, [number(c) for c in skew[i, :, j]]) for i in range(m) for j in range(i + 1, m)}
     pfaffian = _expand_pfaffian(entries, tuple(range(m)))
     return -pfaffian if pfaffian.coefficients[0] < 0 else pfaffian
 
 
 def _expand_pfaffian(entries: dict, rows: tuple[int, ...]) -> Polynomial:
-    """By its first row; ``entries`` are those above the diagonal."""
-    first, *others = rows
+    """Expand a Pfaffian along its first row; ``entries`` are the entries above the diagonal."""
+    row, *columns = rows
     if len(rows) == 2:
-        return entries[first, others[0]]
+        return entries[row, columns[0]]
     total = None
-    for k, j in enumerate(others):
-        minor = _expand_pfaffian(entries, tuple(r for r in others if r != j))
-        term = entries[first, j] * minor * (-1) ** k
+    for k, j in enumerate(columns):
+        minor = _expand_pfaffian(entries, tuple(r for r in columns if r != j))
+        term = entries[row, j] * minor * (-1) ** k
         total = term if total is None else total + term
     assert total is not None
     return total

@@ -1,4 +1,4 @@
-"""The Killing form, ranks, and the Cartan involution."""
+"""The Killing form, the span of brackets, and the Cartan involution."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def killing_form_of(constants: np.ndarray) -> np.ndarray:
 
 
 def trilinear_form(algebra, form=None) -> np.ndarray:
-    """The covariant tensor ``c(x, y, z) = form(x, [y, z])`` of an inner product [BFM Remark 3.3].
+    """Return the covariant tensor ``c(x, y, z) = form(x, [y, z])`` of an inner product [BFM Remark 3.3].
 
     Parameters
     ----------
@@ -29,57 +29,65 @@ def trilinear_form(algebra, form=None) -> np.ndarray:
         ``c[a, b, d] = form(e_a, [e_b, e_d])``.
     """
     if not hasattr(algebra, "killing_form"):
-        raise LieAlgebraError(f"the algebra is a manifolds.LieAlgebra, such as mf.so(3), not {algebra!r}")
+        raise LieAlgebraError(f"algebra must be a manifolds.LieAlgebra, such as mf.so(3), got {algebra!r}")
     form = np.asarray(real_components(algebra.killing_form() if form is None else form, algebra.dim, "the form"))
     if form.shape != (algebra.dim, algebra.dim):
-        raise ShapeError(f"the form on {algebra.name} has shape ({algebra.dim}, {algebra.dim}), not {form.shape}")
+        raise ShapeError(f"the form on {algebra.name} must have shape ({algebra.dim}, {algebra.dim}), got {form.shape}")
     if not np.isfinite(form).all():
         raise ComponentError(f"the form on {algebra.name} must be finite, not {form.tolist()}")
     return np.einsum("ae,bde->abd", form, np.asarray(algebra.structure_constants))
 
 
 def row_space(rows: np.ndarray) -> np.ndarray:
-    """An orthonormal basis of the span of rows of size 1; what is smaller than STRUCTURE_TOLERANCE is rounding."""
-    _, singular, basis = np.linalg.svd(rows, full_matrices=False)
-    return basis[singular > STRUCTURE_TOLERANCE]
+    """Return an orthonormal basis of the span of rows of size 1; singular values up to STRUCTURE_TOLERANCE are
+    rounding."""
+    _, singular_values, basis = np.linalg.svd(rows, full_matrices=False)
+    return basis[singular_values > STRUCTURE_TOLERANCE]
 
 
 def cartan_involution_of(constants: np.ndarray, name: str) -> np.ndarray:
-    """Newton's method for the inner product of least bracket norm (see LieAlgebra.cartan_involution)."""
+    """Compute the Cartan involution by Newton's method for the inner product of least bracket norm.
+
+    See :meth:`LieAlgebra.cartan_involution`.
+    """
     dim = len(constants)
     upper = np.triu_indices(dim)
     directions = np.zeros((len(upper[0]), dim, dim))
     directions[np.arange(len(upper[0])), upper[0], upper[1]] = 1.0
     directions = (directions + directions.swapaxes(1, 2)) / 2
-    directions -= np.einsum("kaa->k", directions)[:, None, None] * np.eye(dim) / dim  # volume is kept
-    change = np.eye(dim)  # columns: the current basis in terms of the given one
+    directions -= (
+        np.einsum("kaa->k", directions)[:, None, None] * np.eye(dim) / dim
+    )  # of trace 0: the volume is preserved
+    basis_change = np.eye(dim)  # columns: the current basis in terms of the initial one
 
-    def transported(basis: np.ndarray) -> np.ndarray:
+    def constants_in_basis(basis: np.ndarray) -> np.ndarray:
         return np.einsum("ai,bj,abc,kc->ijk", basis, basis, constants, np.linalg.inv(basis), optimize=True)
 
-    current = transported(change)
+    current_constants = constants_in_basis(basis_change)
     for _ in range(100):
         # d/dt of the constants when the basis moves by exp(t S), for each symmetric direction S
-        moved = (
-            np.einsum("kai,abc->kibc", directions, current, optimize=True)
-            + np.einsum("kbj,abc->kajc", directions, current, optimize=True)
-            - np.einsum("kdc,abc->kabd", directions, current, optimize=True)
+        derivatives = (
+            np.einsum("kai,abc->kibc", directions, current_constants, optimize=True)
+            + np.einsum("kbj,abc->kajc", directions, current_constants, optimize=True)
+            - np.einsum("kdc,abc->kabd", directions, current_constants, optimize=True)
         )
         # |exp(tS) C|^2 = |C|^2 + 2t <C, SC> + 2 t^2 |SC|^2 + …, minimised by -1/2 of a least-squares solution.
         # Near the minimum the derivations in p move nothing (S C -> 0); the cut-off keeps such directions out.
-        weights, *_ = np.linalg.lstsq(moved.reshape(len(moved), -1).T, current.ravel(), rcond=1e-3)
-        newton = -np.einsum("k,kij->ij", weights, directions) / 2
-        size = np.abs(newton).max()
-        if size < 1e-15 * dim:
+        weights, *_ = np.linalg.lstsq(
+            derivatives.reshape(len(derivatives), -1).T, current_constants.ravel(), rcond=1e-3
+        )
+        newton_direction = -np.einsum("k,kij->ij", weights, directions) / 2
+        step_size = np.abs(newton_direction).max()
+        if step_size < 1e-15 * dim:
             break
-        change = change @ scipy.linalg.expm(newton * min(1.0, 0.5 / size))
-        current = transported(change)
-        if size < 1e-13:
+        basis_change = basis_change @ scipy.linalg.expm(newton_direction * min(1.0, 0.5 / step_size))
+        current_constants = constants_in_basis(basis_change)
+        if step_size < 1e-13:
             break
-    # In the adapted basis ad_x^T = -ad_{theta x}: solve for theta, then return to the given basis.
-    ad = current.swapaxes(1, 2)  # ad[a] is the matrix of e_a
+    # In the adapted basis ad_x^T = -ad_{theta x}: solve for theta, then return to the initial basis.
+    ad = current_constants.swapaxes(1, 2)  # ad[a] is the matrix of e_a
     theta, *_ = np.linalg.lstsq(ad.reshape(dim, -1).T, -ad.swapaxes(1, 2).reshape(dim, -1).T, rcond=None)
-    theta = change @ theta @ np.linalg.inv(change)
+    theta = basis_change @ theta @ np.linalg.inv(basis_change)
     automorphism = np.einsum("abd,cd->abc", constants, theta) - np.einsum(
         "da,eb,dec->abc", theta, theta, constants, optimize=True
     )

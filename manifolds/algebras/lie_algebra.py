@@ -73,15 +73,15 @@ class LieAlgebra:
 
     def __init__(self, structure_constants, *, name: str = "g", basis=None, basis_names=None):
         constants = checked_constants(structure_constants)
-        exact = rational_array(constants)
-        machine_size = exact is not None and exact.numerator.dtype != object
-        self._rational: RationalArray | None = exact if machine_size else None
-        self._constants = _read_only_copy(np.asarray(constants if exact is None else exact, dtype=np.float64))
+        fractions = rational_array(constants)
+        fits_int64 = fractions is not None and fractions.numerator.dtype != object
+        self._rational: RationalArray | None = fractions if fits_int64 else None
+        self._constants = _read_only_copy(np.asarray(constants if fractions is None else fractions, dtype=np.float64))
         self.dim: int = self._constants.shape[0]
         self.name = name
         self._basis: np.ndarray | None = None if basis is None else _read_only_copy(np.asarray(basis))
         self.basis_names = None if basis_names is None else checked_names(basis_names, self.dim)
-        check_axioms(self._constants if exact is None else exact.numerator, name, exact)
+        check_axioms(self._constants if fractions is None else fractions.numerator, name, fractions)
 
     @property
     def structure_constants(self) -> np.ndarray:
@@ -97,14 +97,14 @@ class LieAlgebra:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """The shape in which elements are shown: ``(dim,)``; of copies on sites ``(*sites, dim of one)``."""
+        """Shape of one element: ``(dim,)``; for copies on sites ``(*sites, dim of one copy)``."""
         return (self.dim,)
 
     # -- construction -------------------------------------------------------------------------------------------
 
     @classmethod
     def from_structure_constants(cls, structure_constants, name: str = "g", basis_names=None) -> LieAlgebra:
-        """The algebra with ``[e_a, e_b] = sum_c C[a, b, c] e_c``.
+        """Return the algebra with ``[e_a, e_b] = sum_c C[a, b, c] e_c``.
 
         Parameters
         ----------
@@ -124,7 +124,7 @@ class LieAlgebra:
 
     @classmethod
     def from_matrices(cls, basis, name: str = "g", basis_names=None) -> LieAlgebra:
-        """The algebra spanned over the reals by ``basis``, with the commutator.
+        """Return the algebra that ``basis`` spans over the reals, with the commutator as bracket.
 
         Parameters
         ----------
@@ -137,13 +137,14 @@ class LieAlgebra:
         ClosureError
             If the matrices are linearly dependent over the reals or a commutator leaves their span.
         """
-        constants, given = constants_from_matrices(basis)
-        return cls(constants, name=name, basis=given, basis_names=basis_names)
+        constants, matrices = constants_from_matrices(basis)
+        return cls(constants, name=name, basis=matrices, basis_names=basis_names)
 
     def with_basis_names(self, *names: str) -> LieAlgebra:
-        """The same algebra with names for its basis elements, equal to the one without.
+        """Return an equal algebra whose basis elements have names.
 
-        Its Casimirs print with these names in place of ``mu1``, ``mu2``, …, pictures label their axes so, and sums of
+        Its Casimirs print with these names instead of ``mu1``, ``mu2``, …; pictures label their axes with them, and
+        sums of
         algebras that all have names keep them.
 
         Raises
@@ -157,22 +158,22 @@ class LieAlgebra:
         >>> print(*g.casimirs(2))
         Px**2 + Py**2
         """
-        named = copy(self)
-        named.basis_names = checked_names(names, self.dim)
-        return named
+        algebra = copy(self)
+        algebra.basis_names = checked_names(names, self.dim)
+        return algebra
 
     # -- the operations -----------------------------------------------------------------------------------------
 
     def bracket(self, x, y) -> jax.Array:
-        """Lie bracket ``[x, y]``; ``x``, ``y`` and the result have shape (..., dim)."""
+        """Return the Lie bracket ``[x, y]``; ``x``, ``y`` and the result have shape (..., dim)."""
         return jnp.einsum("abc,...a,...b->...c", self.structure_constants, self._element(x, "x"), self._element(y, "y"))
 
     def ad(self, x) -> jax.Array:
-        """Matrix of ``y -> [x, y]``, shape (..., dim, dim): ``ad(x) @ y == bracket(x, y)``."""
+        """Return the matrix of ``y -> [x, y]``, shape (..., dim, dim): ``ad(x) @ y == bracket(x, y)``."""
         return jnp.einsum("abc,...a->...cb", self.structure_constants, self._element(x, "x"))
 
     def ad_star(self, x, mu) -> jax.Array:
-        """Coadjoint operator ``ad*_x mu``, defined by ``<ad*_x mu, y> = <mu, [x, y]>`` [BFM, after 3.1].
+        """Return the coadjoint operator ``ad*_x mu``, defined by ``<ad*_x mu, y> = <mu, [x, y]>`` [BFM, after 3.1].
 
         Parameters
         ----------
@@ -195,29 +196,29 @@ class LieAlgebra:
         )
 
     def poisson_tensor(self, mu) -> jax.Array:
-        """The matrix ``Pi(mu)[b, a] = sum_c C[a, b, c] mu_c``, shape (dim, dim), at one mu, shape (dim,)."""
+        """Return the matrix ``Pi(mu)[b, a] = sum_c C[a, b, c] mu_c``, shape (dim, dim), at one mu, shape (dim,)."""
         return jnp.einsum("abc,c->ba", self.structure_constants, mu)
 
     def action(self, x) -> Action:
-        """``y -> [x, y]`` and ``mu -> ad*_x mu`` for one x, shape (dim,)."""
+        """Return the maps ``y -> [x, y]`` and ``mu -> ad*_x mu`` of one x, shape (dim,)."""
         return AdMatrixAction(self.ad(x))
 
     def killing_form(self) -> np.ndarray:
-        """Killing form ``kappa[a, b] = tr(ad_a ad_b)``, shape (dim, dim)."""
+        """Return the Killing form ``kappa[a, b] = tr(ad_a ad_b)``, shape (dim, dim)."""
         return self._killing_form
 
     def killing_signature(self) -> tuple[int, int, int]:
-        """Numbers of positive, negative and zero eigenvalues of the Killing form, the same in every basis."""
+        """Return the numbers of positive, negative and zero eigenvalues of the Killing form, in any basis."""
         eigenvalues = np.linalg.eigvalsh(killing_form_of(self._balanced_constants[0]))
         positive, negative = (int((sign * eigenvalues > STRUCTURE_TOLERANCE).sum()) for sign in (1, -1))
         return positive, negative, self.dim - positive - negative
 
     def hat(self, x) -> jax.Array:
-        """The matrix ``sum_a x_a e_a``, shape (..., m, m)."""
+        """Return the matrix ``sum_a x_a e_a``, shape (..., m, m)."""
         return jnp.einsum("...a,aij->...ij", self._element(x, "x"), self._require_basis())
 
     def vee(self, X) -> jax.Array:
-        """Components of a matrix of the algebra, shape (..., dim): the inverse of :meth:`hat`.
+        """Return the components of a matrix of the algebra, shape (..., dim): the inverse of :meth:`hat`.
 
         Raises
         ------
@@ -226,12 +227,12 @@ class LieAlgebra:
         """
         basis = self._require_basis()
         matrix = square_matrices(X, basis.shape[-1], "X")
-        flat = matrix.reshape(*matrix.shape[:-2], -1)
-        flat = jnp.concatenate([flat.real, flat.imag], axis=-1)
-        components = jnp.einsum("ai,...i->...a", self._left_inverse, flat)
-        if not is_traced(flat):
-            residual = float(jnp.max(jnp.abs(components @ real_columns(basis).T - flat), initial=0.0))
-            tolerance = 1e-8 * max(float(np.abs(basis).max()), float(jnp.max(jnp.abs(flat), initial=0.0)))
+        entries = matrix.reshape(*matrix.shape[:-2], -1)
+        entries = jnp.concatenate([entries.real, entries.imag], axis=-1)
+        components = jnp.einsum("ai,...i->...a", self._left_inverse, entries)
+        if not is_traced(entries):
+            residual = float(jnp.max(jnp.abs(components @ real_columns(basis).T - entries), initial=0.0))
+            tolerance = 1e-8 * max(float(np.abs(basis).max()), float(jnp.max(jnp.abs(entries), initial=0.0)))
             if not residual <= tolerance:
                 raise LieAlgebraError(
                     f"the matrix is not in {self.name}: it is {residual:.3g} away from its span "
@@ -244,43 +245,44 @@ class LieAlgebra:
     # -- structure ----------------------------------------------------------------------------------------------
 
     def is_abelian(self) -> bool:
-        """Whether every bracket vanishes."""
+        """Return True if every bracket vanishes."""
         return not self.structure_constants.any()
 
     def is_semisimple(self) -> bool:
-        """Whether the Killing form is nondegenerate (Cartan's criterion)."""
+        """Return True if the Killing form is nondegenerate (Cartan's criterion)."""
         return self.killing_signature()[2] == 0
 
     def is_compact_type(self) -> bool:
-        """Whether the Killing form is negative definite: the algebra of a compact semisimple group."""
+        """Return True if the Killing form is negative definite: the algebra of a compact semisimple group."""
         return self.killing_signature() == (0, self.dim, 0)
 
     def is_solvable(self) -> bool:
-        """Whether the derived series ends at zero."""
+        """Return True if the derived series ends at zero."""
         return self.derived_series()[-1] == 0
 
     def is_nilpotent(self) -> bool:
-        """Whether the lower central series ends at zero."""
+        """Return True if the lower central series ends at zero."""
         return self.lower_central_series()[-1] == 0
 
     def is_unimodular(self) -> bool:
-        """Whether ``tr ad_x = 0`` for every x."""
+        """Return True if ``tr ad_x = 0`` for every x."""
         traces = np.einsum("abb->a", self._balanced_constants[0])
         return bool(np.abs(traces).max() <= STRUCTURE_TOLERANCE)
 
     def derived_series(self) -> list[int]:
-        """Dimensions of g, [g, g], [[g, g], [g, g]], … until they no longer fall."""
+        """Return the dimensions of g, [g, g], [[g, g], [g, g]], … until they no longer fall."""
         return self._ideal_series(lambda ideal: (ideal, ideal))
 
     def lower_central_series(self) -> list[int]:
-        """Dimensions of g, [g, g], [g, [g, g]], … until they no longer fall."""
+        """Return the dimensions of g, [g, g], [g, [g, g]], … until they no longer fall."""
         return self._ideal_series(lambda ideal: (np.eye(self.dim), ideal))
 
     def cartan_involution(self) -> np.ndarray:
-        """A Cartan involution theta, shape (dim, dim), for which ``-kappa(x, theta y)`` is positive definite.
+        """Return a Cartan involution theta, shape (dim, dim), for which ``-kappa(x, theta y)`` is positive definite.
 
-        The identity on compact type. Otherwise found without matrices: among all inner products of unit volume, the
-        one that minimises the norm of the bracket satisfies ``ad_x^T = -ad_{theta x}`` [Lauret 2003]; the norm is
+        It is the identity on compact type. Otherwise it is computed without matrices: among all inner products of unit
+        volume,
+        the one that minimises the norm of the bracket satisfies ``ad_x^T = -ad_{theta x}`` [Lauret 2003]; the norm is
         convex along the geodesics of inner products, so Newton's method finds it. For ``sl``, ``so`` and ``sp`` in
         their usual bases theta is ``X -> -X^T``.
 
@@ -292,9 +294,9 @@ class LieAlgebra:
         return self._cartan_involution
 
     def killing_inner_product(self) -> Operator:
-        """The form ``-kappa(x, theta y)`` as a matrix, theta a Cartan involution; ``-kappa`` where there is none.
+        """Return the matrix of ``-kappa(x, theta y)``, theta a Cartan involution; ``-kappa`` if there is none.
 
-        On a semisimple algebra it is positive definite. ``form @ x`` is the covector that it makes of x, shape (dim,).
+        On a semisimple algebra it is positive definite. ``form @ x`` is the covector of x, shape (dim,).
         """
         if not self.is_semisimple():
             return -self.killing_form()
@@ -307,16 +309,16 @@ class LieAlgebra:
         return self._power(self, sites)
 
     _power: ClassVar[Callable[..., LieAlgebra]]
-    """Copies are algebras of a class that is defined after this one, and that enters here."""
+    """Constructor of copies, set by :mod:`manifolds.algebras.blocks`, which is imported after this module."""
 
     def _batched_bracket(self, x, y) -> jax.Array:
-        """The bracket for large batches, shape (..., dim)."""
+        """Return the bracket for large batches, shape (..., dim)."""
         return (
             self.bracket(x, y) if self._nonzero_terms is None else unrolled_bracket(self._nonzero_terms, x, y, self.dim)
         )
 
     def _batched_ad_star(self, x, mu) -> jax.Array:
-        """The coadjoint operator for large batches, shape (..., dim)."""
+        """Return the coadjoint operator for large batches, shape (..., dim)."""
         if self._nonzero_terms is None:
             return self.ad_star(x, mu)
         return unrolled_bracket(tuple((a, c, b, value) for a, b, c, value in self._nonzero_terms), x, mu, self.dim)
@@ -328,28 +330,32 @@ class LieAlgebra:
     # -- Casimirs -----------------------------------------------------------------------------------------------
 
     def casimir_count(self) -> int:
-        """Number of independent Casimir functions near a generic point of g*.
+        """Return the number of independent Casimir functions near a generic point of g*.
 
-        That is dim minus the generic rank of the Lie-Poisson tensor; they need not be polynomials.
+        This is dim minus the generic rank of the Lie-Poisson tensor; the Casimirs need not be polynomials.
         """
         return casimir_count(self)
 
     def casimirs(self, degree: int):
-        """All homogeneous polynomial Casimirs of this degree, modulo products of those of lower degree.
+        """Return all homogeneous polynomial Casimirs of this degree, modulo products of Casimirs of lower degree.
 
-        Returns a list of :class:`manifolds.Polynomial`, callable on ``mu`` and printing as
-        ``mu1**2 + mu2**2 + mu3**2``; the coefficients are exact when the structure constants are rational. Where there
-        are too many monomials and the algebra is semisimple or reductive, :class:`manifolds.TracePolynomial`.
+        The list holds :class:`manifolds.Polynomial`, callable on ``mu`` and printing as ``mu1**2 + mu2**2 + mu3**2``;
+        the
+        coefficients are exact when the structure constants are rational. It holds :class:`manifolds.TracePolynomial` if
+        there
+        are too many monomials and the algebra is semisimple or reductive.
         """
-        found = casimirs(self, degree)
-        return found if self.basis_names is None else [F.with_names(*self.basis_names) for F in found]
+        polynomials = casimirs(self, degree)
+        return polynomials if self.basis_names is None else [F.with_names(*self.basis_names) for F in polynomials]
 
     def leading_casimirs(self) -> list[tuple[str, Callable]]:
-        """Casimirs of low degree that are quick to find and to evaluate, with names; worth following along a motion.
+        """Return pairs (name, Casimir) of low degree that are quick to find and to evaluate, to follow along a motion.
 
-        Functions from mu, shape (dim,), to a number: of a small algebra the polynomial ones, as many as there are; of
-        copies on sites those of each of a few, and the sums over many; of a large matrix algebra the traces of the
-        first powers.
+        The Casimirs are functions from mu, shape (dim,), to a number. A small algebra has its polynomial ones, as many
+        as
+        there are; copies on sites have the Casimirs of a few copies, or the sums over many; a large matrix algebra has
+        the
+        traces of the first powers.
         """
         return leading_casimirs(self)
 
@@ -378,7 +384,7 @@ class LieAlgebra:
     def _require_basis(self) -> np.ndarray:
         if self.basis is None:
             raise LieAlgebraError(
-                f"{self.name} was defined by structure constants, so its matrices are not known; build it with "
+                f"{self.name} was defined by structure constants and has no matrices; build it with "
                 "LieAlgebra.from_matrices to use hat and vee"
             )
         return self.basis
@@ -393,7 +399,7 @@ class LieAlgebra:
 
     @cached_property
     def _balanced_constants(self) -> tuple[np.ndarray, np.ndarray]:
-        """The constants in a basis scaled by factors, the largest of size 1, and the factors."""
+        """Constants in the basis scaled by factors, the largest of size 1, and the factors."""
         return balance_constants(self.structure_constants)
 
     @cached_property
@@ -404,14 +410,16 @@ class LieAlgebra:
             return _read_only_copy(np.eye(self.dim))
         constants, factors = self._balanced_constants
         theta = cartan_involution_of(constants, self.name) * factors[:, None] / factors
-        snapped = np.asarray(np.round(theta))
-        return _read_only_copy(snapped if np.abs(snapped - theta).max() < 1e-10 else theta)
+        rounded_theta = np.asarray(np.round(theta))
+        return _read_only_copy(rounded_theta if np.abs(rounded_theta - theta).max() < 1e-10 else theta)
 
-    def _ideal_series(self, factors: Callable) -> list[int]:
+    def _ideal_series(self, pair_to_bracket: Callable) -> list[int]:
         ideal, dims = np.eye(self.dim), [self.dim]
         while True:
-            left, right = factors(ideal)
-            products = np.einsum("ia,jb,abc->ijc", left, right, self._balanced_constants[0], optimize=True)
+            left_factor, right_factor = pair_to_bracket(ideal)
+            products = np.einsum(
+                "ia,jb,abc->ijc", left_factor, right_factor, self._balanced_constants[0], optimize=True
+            )
             ideal = row_space(products.reshape(-1, self.dim))
             if len(ideal) == dims[-1]:
                 return dims

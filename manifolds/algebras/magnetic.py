@@ -1,4 +1,4 @@
-"""The magnetic extension of a Lie algebra: its semidirect sum with its own dual."""
+"""Magnetic extension of a Lie algebra: its semidirect sum with its own dual."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from .matrix_algebra import MatrixAlgebra
 from .sums import MAX_DIM_BY_CONSTANTS, semidirect_sum
 
 MAX_FOLLOWED_CASIMIRS = 2
-"""Casimirs of g that are followed along a motion of its extension, where each makes two."""
+"""Number of Casimirs of g that are followed along a motion of its extension, where each gives two Casimirs."""
 
 
 def magnetic_extension(g: LieAlgebra, by_brackets: bool | None = None) -> LieAlgebra:
-    """``g ⋉ g*`` by the coadjoint action: ``[(x, a), (y, b)] = ([x, y], ad*_y a - ad*_x b)``.
+    """Return ``g ⋉ g*`` by the coadjoint action: ``[(x, a), (y, b)] = ([x, y], ad*_y a - ad*_x b)``.
 
     Momenta are pairs (W, B) of W in g* and B in g, with ``ad*_(x, a) (W, B) = (ad*_x W - ad*_B a, -[x, B])``: B is
     carried by the velocity x and pushes back on W. The extension of so(3) is the algebra of the heavy top, and that of
@@ -49,20 +49,20 @@ def magnetic_extension(g: LieAlgebra, by_brackets: bool | None = None) -> LieAlg
     ParameterError
     """
     if not isinstance(g, LieAlgebra):
-        raise ParameterError(f"the magnetic extension is that of a LieAlgebra, not of {type(g).__name__}")
+        raise ParameterError(f"magnetic_extension(g): g must be a LieAlgebra, got {type(g).__name__}")
     extension = MagneticExtension(g)
-    few = extension.dim <= MAX_DIM_BY_CONSTANTS
-    return extension.algebra_by_constants if (few if by_brackets is None else not by_brackets) else extension
+    is_small = extension.dim <= MAX_DIM_BY_CONSTANTS
+    return extension.algebra_by_constants if (is_small if by_brackets is None else not by_brackets) else extension
 
 
 @jax.tree_util.register_static
 class MagneticExtension(BracketAlgebra):
-    """``g ⋉ g*`` by what g does; see :func:`manifolds.magnetic_extension`.
+    """Algebra ``g ⋉ g*``, computed by the operations of g; see :func:`manifolds.magnetic_extension`.
 
     Attributes
     ----------
     algebra : LieAlgebra
-        g.
+        The algebra g.
     """
 
     def __init__(self, algebra: LieAlgebra):
@@ -78,7 +78,7 @@ class MagneticExtension(BracketAlgebra):
         return semidirect_sum(self.algebra, -self.algebra.structure_constants, name=self.name)
 
     def halves(self, x, what: str = "x") -> tuple[jax.Array, jax.Array]:
-        """The two parts of an element, shape (..., dim) each."""
+        """Return the components of an element in g and in g*, shape (..., dim of g) each."""
         x = real_components(x, self.dim, what)
         return x[..., : self.algebra.dim], x[..., self.algebra.dim :]
 
@@ -132,9 +132,10 @@ class MagneticExtension(BracketAlgebra):
         return self.algebra_by_constants.casimir_count() if invariant_form(g) is None else 2 * g.casimir_count()
 
     def casimirs(self, degree: int) -> list:
-        """``f(B)`` and ``<W, grad f(B)>`` of each Casimir f of g, moved to g by its invariant form.
+        """Return ``f(B)`` and ``<W, grad f(B)>`` for each Casimir f of g, where B is mapped to g* by the invariant
+        form.
 
-        Where no such form is known, those that the structure constants have.
+        If no invariant form is known, return the Casimirs found from the structure constants.
         """
         if invariant_form(self.algebra) is None:
             return self.algebra_by_constants.casimirs(degree)
@@ -145,13 +146,17 @@ class MagneticExtension(BracketAlgebra):
             return [("<W, B>", CrossHelicity(self))]
         return self._extended_casimirs(self.algebra.leading_casimirs()[:MAX_FOLLOWED_CASIMIRS])
 
-    def _extended_casimirs(self, known: list[tuple[str, Callable]]) -> list[tuple[str, Callable]]:
+    def _extended_casimirs(self, base_casimirs: list[tuple[str, Callable]]) -> list[tuple[str, Callable]]:
         kinds = (("of B", FieldCasimir), ("along W at B", MomentumFieldCasimir))
-        return [(f"{name} {where}", kind(self, f)) for name, f in known for where, kind in kinds]
+        return [
+            (f"{name} {argument_text}", casimir_class(self, f))
+            for name, f in base_casimirs
+            for argument_text, casimir_class in kinds
+        ]
 
 
 class ExtendedAction:
-    """The action of one element, by that of its part in g."""
+    """Action of one element of the extension, computed by the action of its component in g."""
 
     def __init__(self, g: MagneticExtension, x):
         self.g, (x, self.a) = g, g.halves(x)
@@ -165,14 +170,14 @@ class ExtendedAction:
 
     def ad_star(self, mu) -> jax.Array:
         W, B = self.g.halves(mu, "mu")
-        pushed = self.base_action.ad_star(W) - self.g.algebra.ad_star(B, self.a)
-        return jnp.concatenate([pushed, -self.base_action.bracket(B)], axis=-1)
+        momentum_rate = self.base_action.ad_star(W) - self.g.algebra.ad_star(B, self.a)
+        return jnp.concatenate([momentum_rate, -self.base_action.bracket(B)], axis=-1)
 
 
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class _DoubledForm:
-    """Twice a linear map."""
+    """Linear map ``2 form``."""
 
     form: Any
 
@@ -181,14 +186,14 @@ class _DoubledForm:
 
 
 def invariant_form(g: LieAlgebra) -> Callable | None:
-    """An invariant bilinear form without a kernel, as a map from elements to dual vectors, shape (..., dim).
+    """Return a nondegenerate invariant form as a map from elements to dual vectors, shape (..., dim); None if unknown.
 
-    The trace form of large matrix algebras, the Killing form of others that are semisimple; None where none is known.
+    Large matrix algebras have the trace form, other semisimple algebras the Killing form.
     """
     if isinstance(g, MatrixAlgebra):
         return g.trace_covector
     if isinstance(g, DirectSum):
-        forms = [invariant_form(part) for part, _ in g.blocks]
+        forms = [invariant_form(block) for block, _ in g.blocks]
         return None if None in forms else lambda x: _apply_forms_blockwise(g, forms, x)
     if not g.is_semisimple():
         return None
@@ -197,14 +202,14 @@ def invariant_form(g: LieAlgebra) -> Callable | None:
 
 
 def _apply_forms_blockwise(g: DirectSum, forms, x) -> jax.Array:
-    parts = [form(part) for form, part in zip(forms, g.split(x), strict=True)]
-    return jnp.concatenate([part.reshape(*part.shape[:-2], -1) for part in parts], axis=-1)
+    covectors = [form(component) for form, component in zip(forms, g.split(x), strict=True)]
+    return jnp.concatenate([component.reshape(*component.shape[:-2], -1) for component in covectors], axis=-1)
 
 
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class CrossHelicity:
-    """``<W, B>``, shape (..., dim) to (...)."""
+    """Cross helicity ``<W, B>``, shape (..., dim) to (...)."""
 
     algebra: MagneticExtension
 
@@ -223,7 +228,7 @@ class CrossHelicity:
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class FieldCasimir:
-    """A Casimir f of g at the invariant form of B, shape (..., dim) to (...)."""
+    """Casimir f of g, evaluated at the dual vector of B, shape (..., dim) to (...)."""
 
     algebra: MagneticExtension
     casimir: Callable
@@ -242,7 +247,7 @@ class FieldCasimir:
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class MomentumFieldCasimir(FieldCasimir):
-    """``<W, grad f>`` there: of the Casimir of degree two a multiple of the cross helicity."""
+    """Casimir ``<W, grad f>`` at the dual vector of B; a multiple of the cross helicity if f is quadratic."""
 
     def __call__(self, mu) -> jax.Array:
         W, B = self.algebra.halves(mu, "mu")

@@ -1,4 +1,4 @@
-"""Classical matrix algebras of any size: what they do is done by products of matrices, O(N^3), in O(N^2) memory."""
+"""Classical matrix algebras of any size, computed by products of matrices in O(N^3) time and O(N^2) memory."""
 
 from __future__ import annotations
 
@@ -22,30 +22,30 @@ from .lie_algebra import LieAlgebra
 from .matrix_bases import MatrixBasis
 
 MAX_FOLLOWED_DEGREE = 4
-"""Traces of powers up to this one are followed along a motion."""
+"""Largest power whose trace is followed along a motion."""
 
 MatrixParts = tuple[jax.Array, ...]
-"""A matrix by its real part and, of complex ones, its imaginary part; none of the identity."""
+"""Real part of a matrix and, if it is complex, its imaginary part; the empty tuple stands for the identity."""
 
 
 @dataclass(frozen=True)
 class ClassicalData:
-    """What is known of a classical algebra without a computation.
+    """Facts about a classical algebra that need no computation.
 
     Attributes
     ----------
     rank : int
-        The number of Casimirs.
+        Number of Casimirs.
     signature : tuple of int
-        Positive, negative and zero eigenvalues of the Killing form.
+        Numbers of positive, negative and zero eigenvalues of the Killing form.
     killing_coefficients : tuple of float
         (c, d) of the Killing form ``c tr(xy) - d tr(x) tr(y)``.
     is_compact : bool
-        Whether all matrices are anti-Hermitian.
+        True if all matrices are anti-Hermitian.
     trace_degrees : tuple of int
-        Those of the traces of powers that generate the Casimirs.
+        Degrees of the traces of powers that generate the Casimirs.
     pfaffian_degree : int or None
-        The degree of the Pfaffian, where there is one besides.
+        Degree of the Pfaffian, if there is one besides.
     """
 
     rank: int
@@ -58,18 +58,19 @@ class ClassicalData:
 
 @jax.tree_util.register_static
 class MatrixAlgebra(BracketAlgebra):
-    """A classical algebra of large matrices; ``manifolds.su(N)`` and its neighbours make one where N is large.
+    """Classical algebra of large matrices, as made by ``manifolds.su(N)``, ``so``, ``sl``, ``sp``, ``u`` and ``gl``.
 
-    ``[x, y]`` and ``ad*_x mu`` are found from the matrices of x, y and mu: mu is the matrix M of the algebra with
-    ``<mu, y> = Re tr(M^H y)``, so that ``ad*_x mu`` is that of ``[x^H, M]``. Products of complex matrices are three of
-    real ones, and of anti-Hermitian matrices a commutator takes one product.
+    ``[x, y]`` and ``ad*_x mu`` are computed from the matrices of x, y and mu: mu is the matrix M of the algebra with
+    ``<mu, y> = Re tr(M^H y)``, so ``ad*_x mu`` is the covector of ``[x^H, M]``. A product of complex matrices takes
+    three
+    real ones, and a commutator of anti-Hermitian matrices takes one product.
 
     Attributes
     ----------
     matrix_size : int
-        N.
+        The size N.
     matrix_basis : MatrixBasis
-    classical_data : Classical
+    classical_data : ClassicalData
     """
 
     def __init__(self, name: str, tables: MatrixBasis, known: ClassicalData):
@@ -100,9 +101,9 @@ class MatrixAlgebra(BracketAlgebra):
         return self._commutator(_adjoint(X), self.matrix_basis.matrix(self.matrix_basis.raise_index(mu)))
 
     def _commutator(self, X: MatrixParts, Y: MatrixParts) -> jax.Array:
-        """``<[X, Y], e_a>`` for each a, shape (..., dim).
+        """Return ``<[X, Y], e_a>`` for each a, shape (..., dim).
 
-        For anti-Hermitian matrices ``[X, Y] = X Y - (X Y)^H``, and the two terms have the same products with each e_a.
+        For anti-Hermitian matrices ``[X, Y] = X Y - (X Y)^H``, and the two terms have equal products with each e_a.
         """
         products = self.matrix_basis.inner_products(_product(X, Y))
         return (
@@ -115,11 +116,11 @@ class MatrixAlgebra(BracketAlgebra):
         return self.matrix_basis.raise_index(self.matrix_basis.inner_products(X))
 
     def hat(self, x) -> jax.Array:
-        """The matrix ``sum_a x_a e_a``, shape (..., N, N)."""
+        """Return the matrix ``sum_a x_a e_a``, shape (..., N, N)."""
         return _combine_parts(self.matrix_basis.matrix(self._element(x, "x")))
 
     def vee(self, X) -> jax.Array:
-        """Components of a matrix of the algebra, shape (..., dim): the inverse of :meth:`hat`.
+        """Return the components of a matrix of the algebra, shape (..., dim): the inverse of :meth:`hat`.
 
         Raises
         ------
@@ -135,25 +136,26 @@ class MatrixAlgebra(BracketAlgebra):
             tolerance = 1e-8 * max(1.0, float(jnp.max(jnp.abs(matrix), initial=0.0)))
             if not residual <= tolerance:
                 trace = float(jnp.max(jnp.abs(jnp.trace(matrix, axis1=-2, axis2=-1))))
-                what = f", and its trace is {trace:.3g}" if trace > tolerance else ""
+                trace_text = f", and its trace is {trace:.3g}" if trace > tolerance else ""
                 raise LieAlgebraError(
                     f"the matrix is not in {self.name}: it is {residual:.3g} away from it (tolerance {tolerance:.1g})"
-                    + what,
+                    + trace_text,
                     residual=residual,
                     tolerance=tolerance,
                 )
         return components
 
     def dual_matrix(self, mu) -> jax.Array:
-        """The matrix M of the algebra with ``<mu, y> = Re tr(M^H hat(y))`` for every y, shape (..., N, N)."""
+        """Return the matrix M of the algebra with ``<mu, y> = Re tr(M^H hat(y))`` for every y, shape (..., N, N)."""
         return _combine_parts(self.matrix_basis.matrix(self.matrix_basis.raise_index(self._element(mu, "mu"))))
 
     def from_dual_matrix(self, M) -> jax.Array:
-        """The inverse of :meth:`dual_matrix`; of any matrix, that of its part in the algebra, shape (..., dim)."""
+        """Return mu of a matrix M, shape (..., dim): the inverse of :meth:`dual_matrix`; M is first projected onto the
+        algebra."""
         return self.matrix_basis.inner_products(self._split_parts(square_matrices(M, self.matrix_size, "M")))
 
     def trace_covector(self, x) -> jax.Array:
-        """The covector ``Re tr(x .)`` of the trace form, which is invariant and has no kernel, shape (..., dim)."""
+        """Return the covector ``Re tr(x .)`` of the invariant, nondegenerate trace form, shape (..., dim)."""
         x = self._element(x, "x")
         if self.classical_data.is_compact:
             return -self.matrix_basis.lower_index(x)
@@ -185,7 +187,7 @@ class MatrixAlgebra(BracketAlgebra):
         return np.asarray(jax.vmap(self._killing_covector)(jnp.eye(self.dim)))
 
     def _killing_covector(self, x) -> jax.Array:
-        """The covector ``kappa(x, .)``."""
+        """Return the covector ``kappa(x, .)``."""
         c, d = self.classical_data.killing_coefficients
         X = self.matrix_basis.matrix(x)
         traces = [jnp.trace(part, axis1=-2, axis2=-1)[..., None, None] * np.eye(self.matrix_size) for part in X]
@@ -227,12 +229,12 @@ class MatrixAlgebra(BracketAlgebra):
         return self.classical_data.rank
 
     def casimirs(self, degree: int) -> list:
-        """The trace of a power of the matrix of mu, where it is no polynomial in those of lower degree.
+        """Return the trace of a power of the matrix of mu, if it is independent of the traces of lower degree.
 
         Raises
         ------
         LieAlgebraError
-            Of the degree of the Pfaffian, which is not formed for large matrices.
+            If the degree is that of the Pfaffian, which is not formed for large matrices.
         """
         if isinstance(degree, bool) or not isinstance(degree, int | np.integer) or degree < 1:
             raise ParameterError(f"the degree of a Casimir must be an integer >= 1, not {degree!r}")
@@ -253,7 +255,7 @@ class MatrixAlgebra(BracketAlgebra):
 
 
 class MatrixAction:
-    """The action of one x, by its matrix."""
+    """Action of one x by its matrix."""
 
     def __init__(self, g: MatrixAlgebra, X: MatrixParts):
         self.g, self.X = g, X
@@ -268,7 +270,7 @@ class MatrixAction:
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class TraceForm:
-    """``-kappa(x, theta y)`` or, of an algebra that is not semisimple, ``-kappa(x, y)``, as a linear map."""
+    """Linear map of ``-kappa(x, theta y)`` or, if the algebra is not semisimple, of ``-kappa(x, y)``."""
 
     algebra: MatrixAlgebra
 
@@ -282,7 +284,7 @@ class TraceForm:
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class MatrixTrace:
-    """The Casimir ``tr(M(mu)**degree)``, of anti-Hermitian matrices ``tr((i M)**degree)``: (..., dim) to (...).
+    """Casimir ``tr(M(mu)**degree)``, for anti-Hermitian matrices ``tr((i M)**degree)``: shape (..., dim) to (...).
 
     M(mu) is :meth:`MatrixAlgebra.dual_matrix`.
     """
@@ -294,10 +296,10 @@ class MatrixTrace:
 
     def __call__(self, mu) -> jax.Array:
         g = self.algebra
-        raised = g.matrix_basis.raise_index(real_components(mu, g.dim, "mu"))
+        element = g.matrix_basis.raise_index(real_components(mu, g.dim, "mu"))
         if g.classical_data.is_compact and self.degree == 2:
-            return jnp.sum(jnp.asarray(mu) * raised, axis=-1)
-        M = g.matrix_basis.matrix(raised)
+            return jnp.sum(jnp.asarray(mu) * element, axis=-1)
+        M = g.matrix_basis.matrix(element)
         if g.classical_data.is_compact:  # i (a + i b) = -b + i a
             M = (-M[1], M[0]) if len(M) == 2 else (jnp.zeros_like(M[0]), M[0])
         return _trace_of_power(self.degree, g.classical_data.is_compact, M)
@@ -308,7 +310,7 @@ class MatrixTrace:
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _trace_of_power(n: int, hermitian: bool, M: MatrixParts) -> jax.Array:
-    """``Re tr(M**n)``, shape (..., N, N) to (...); its derivatives take as few products as it takes itself."""
+    """Return ``Re tr(M**n)``, shape (..., N, N) to (...); its derivatives take as few products as the value."""
     return _real_trace(_matrix_power(M, n - n // 2), _matrix_power(M, n // 2))
 
 
@@ -320,23 +322,25 @@ def _trace_of_power_jvp(n: int, hermitian: bool, primals, tangents):
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _trace_of_power_times(n: int, hermitian: bool, M: MatrixParts, D: MatrixParts) -> jax.Array:
-    """``Re tr(M**n D)``."""
+    """Return ``Re tr(M**n D)``."""
     return _real_trace(_matrix_power(M, n), D)
 
 
 @_trace_of_power_times.defjvp
 def _trace_of_power_times_jvp(n: int, hermitian: bool, primals, tangents):
-    """The sum of ``Re tr(M**(n-1-i) D M**i dM)``; of Hermitian matrices those of i and n-1-i are equal."""
+    """Sum ``Re tr(M**(n-1-i) D M**i dM)`` over i; for Hermitian matrices the terms of i and n-1-i are equal."""
     (M, D), (dM, dD) = primals, tangents
-    found = _trace_of_power_times(n, hermitian, M, dD)
+    derivative = _trace_of_power_times(n, hermitian, M, dD)
     for i in range(n if not hermitian else (n + 1) // 2):
-        times = 2.0 if hermitian and 2 * i != n - 1 else 1.0
-        found = found + times * _real_trace(_product(_product(_matrix_power(M, n - 1 - i), D), _matrix_power(M, i)), dM)
-    return _trace_of_power_times(n, hermitian, M, D), found
+        multiplicity = 2.0 if hermitian and 2 * i != n - 1 else 1.0
+        derivative = derivative + multiplicity * _real_trace(
+            _product(_product(_matrix_power(M, n - 1 - i), D), _matrix_power(M, i)), dM
+        )
+    return _trace_of_power_times(n, hermitian, M, D), derivative
 
 
 def _matrix_power(M: MatrixParts, n: int) -> MatrixParts:
-    """``M**n``, an empty tuple being 1."""
+    """Return ``M**n``; the empty tuple stands for 1."""
     if n <= 1:
         return M if n else ()
     half = _matrix_power(M, n // 2)
@@ -344,11 +348,11 @@ def _matrix_power(M: MatrixParts, n: int) -> MatrixParts:
 
 
 def _real_trace(X: MatrixParts, Y: MatrixParts) -> jax.Array:
-    """``Re tr(X Y)``."""
+    """Return ``Re tr(X Y)``."""
     if not (X and Y):
         return jnp.trace((X or Y)[0], axis1=-2, axis2=-1)
-    terms = [jnp.sum(x * jnp.swapaxes(y, -1, -2), axis=(-2, -1)) for x, y in zip(X, Y, strict=True)]
-    return terms[0] - sum(terms[1:])
+    traces = [jnp.sum(x * jnp.swapaxes(y, -1, -2), axis=(-2, -1)) for x, y in zip(X, Y, strict=True)]
+    return traces[0] - sum(traces[1:])
 
 
 def _product(X: MatrixParts, Y: MatrixParts) -> MatrixParts:
@@ -357,8 +361,8 @@ def _product(X: MatrixParts, Y: MatrixParts) -> MatrixParts:
     if len(X) == 1:
         return (X[0] @ Y[0],)
     (a, b), (c, d) = X, Y
-    real, imaginary, both = a @ c, b @ d, (a + b) @ (c + d)
-    return real - imaginary, both - real - imaginary
+    real, imaginary, combined = a @ c, b @ d, (a + b) @ (c + d)
+    return real - imaginary, combined - real - imaginary
 
 
 def _adjoint(X: MatrixParts) -> MatrixParts:

@@ -1,7 +1,7 @@
-"""Bases of classical algebras as tables: each entry of a matrix is one component times a number, off the diagonal.
+"""Bases of classical algebras as tables: each entry of a matrix off the diagonal is one component times a number.
 
-So components become a matrix, and a matrix components, by reading: O(N^2) operations, without a list of matrices.
-On the diagonal, where su(N) has all components in every entry, the table is an N by r matrix.
+Components are therefore gathered into a matrix, and matrices into components, in O(N^2) operations, without a list of
+basis matrices. On the diagonal, where su(N) has all components in every entry, the table is an N by r matrix.
 """
 
 from __future__ import annotations
@@ -14,11 +14,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-REAL, IMAGINARY = 0, 1
+REAL = 0
+"""Index of the real part of a matrix."""
+
+IMAGINARY = 1
+"""Index of the imaginary part of a matrix."""
 
 
 class EntryTable(NamedTuple):
-    """Where components stand off the diagonal, or one to an entry: arrays of one length.
+    """Matrix entries that hold one component times a number, as arrays of equal length.
 
     Attributes
     ----------
@@ -34,15 +38,15 @@ class EntryTable(NamedTuple):
     value: np.ndarray
 
     @classmethod
-    def concatenate(cls, *parts: tuple) -> EntryTable:
-        """From tuples of arrays that are broadcast against each other."""
-        rows = [[a.ravel() for a in np.broadcast_arrays(*part)] for part in parts]
-        component, part, row, column, value = (np.concatenate(column) for column in zip(*rows, strict=True))
-        return cls(component, part, row, column, value.astype(np.float64))
+    def concatenate(cls, *entry_groups: tuple) -> EntryTable:
+        """Build a table from tuples (component, part, row, column, value), each broadcast to one length."""
+        rows = [[a.ravel() for a in np.broadcast_arrays(*part)] for part in entry_groups]
+        component, group, row, column, value = (np.concatenate(column) for column in zip(*rows, strict=True))
+        return cls(component, group, row, column, value.astype(np.float64))
 
 
 class DiagonalEntries(NamedTuple):
-    """Components that are spread over the diagonal: ``diag = table @ x[components]``, in one part of the matrix."""
+    """Components that contribute to all diagonal entries of one part: ``diag = coefficients @ x[components]``."""
 
     components: np.ndarray
     part: int
@@ -50,91 +54,101 @@ class DiagonalEntries(NamedTuple):
 
 
 class MatrixBasis:
-    """A basis of N by N matrices, and the maps between components and matrices, given by their parts.
+    """Basis of N by N matrices, with the maps between components and matrices.
 
-    A matrix is a tuple of real arrays, shape (..., N, N): the real part and, of complex ones, the imaginary part.
-    Orthogonality is that of ``<X, Y> = Re tr(X^H Y)``; elements off the diagonal are orthogonal to all others.
+    A matrix is a tuple of real arrays, shape (..., N, N): the real part and, if complex, the imaginary part.
+    Orthogonality refers to ``<X, Y> = Re tr(X^H Y)``; elements off the diagonal are orthogonal to all others.
 
     Parameters
     ----------
     size : int
-        N.
-    entries : Entries
+        The size N.
+    entries : EntryTable
         Each entry of the matrix at most once.
-    diagonal : Diagonal, optional
+    diagonal : DiagonalEntries, optional
 
     Attributes
     ----------
     entry_components, values : array, shape (parts, N * N)
-        The component that stands in each entry of a matrix, ``dim`` where none does, and the number that it has there.
+        The component in each entry of a matrix, ``dim`` for none, and its factor there.
     """
 
     def __init__(self, size: int, entries: EntryTable, diagonal: DiagonalEntries | None = None):
         self.size, self.diagonal = size, diagonal
         self.dim = len(np.unique(entries.component)) + (0 if diagonal is None else len(diagonal.components))
-        used = [entries.part] if diagonal is None else [entries.part, np.array([diagonal.part])]
-        self.parts = 2 if np.concatenate(used).any() else 1
-        place = entries.row * size + entries.column
+        matrix_parts = [entries.part] if diagonal is None else [entries.part, np.array([diagonal.part])]
+        self.parts = 2 if np.concatenate(matrix_parts).any() else 1
+        position = entries.row * size + entries.column
         self.entry_components = np.full(
             (self.parts, size * size), self.dim, dtype=np.int32
         )  # dim: a component that is zero
         self.values = np.zeros((self.parts, size * size))
-        self.entry_components[entries.part, place], self.values[entries.part, place] = entries.component, entries.value
+        self.entry_components[entries.part, position], self.values[entries.part, position] = (
+            entries.component,
+            entries.value,
+        )
         order = np.argsort(entries.component, kind="stable")
-        component, place = entries.component[order], (entries.part * size * size + place)[order]
-        rank = np.arange(len(order)) - np.searchsorted(component, component)
-        self._component_entries = np.zeros((int(rank.max()) + 1 if len(rank) else 1, self.dim), dtype=np.int32)
+        component, position = entries.component[order], (entries.part * size * size + position)[order]
+        occurrence = np.arange(len(order)) - np.searchsorted(component, component)
+        self._component_entries = np.zeros(
+            (int(occurrence.max()) + 1 if len(occurrence) else 1, self.dim), dtype=np.int32
+        )
         self._weights = np.zeros(self._component_entries.shape)
-        self._component_entries[rank, component], self._weights[rank, component] = place, entries.value[order]
+        self._component_entries[occurrence, component], self._weights[occurrence, component] = (
+            position,
+            entries.value[order],
+        )
 
     def matrix(self, x) -> tuple[jax.Array, ...]:
-        """``sum_a x_a e_a`` by its parts, for x of shape (..., dim)."""
-        padded = jnp.concatenate([x, jnp.zeros((*x.shape[:-1], 1))], axis=-1)
+        """Return ``sum_a x_a e_a`` as a tuple of parts, for x of shape (..., dim)."""
+        components_and_zero = jnp.concatenate([x, jnp.zeros((*x.shape[:-1], 1))], axis=-1)
         parts = []
         for part in range(self.parts):
-            found = padded[..., self.entry_components[part]] * self.values[part]
-            found = found.reshape(*x.shape[:-1], self.size, self.size)
+            entries = components_and_zero[..., self.entry_components[part]] * self.values[part]
+            entries = entries.reshape(*x.shape[:-1], self.size, self.size)
             if self.diagonal is not None and self.diagonal.part == part:
                 diagonal = x[..., self.diagonal.components] @ self.diagonal.coefficients.T
-                found = found + diagonal[..., None] * np.eye(self.size)
-            parts.append(found)
+                entries = entries + diagonal[..., None] * np.eye(self.size)
+            parts.append(entries)
         return tuple(parts)
 
     def inner_products(self, parts: tuple[jax.Array, ...]) -> jax.Array:
-        """``<A, e_a>`` for each a, shape (..., dim), of a matrix by its parts: the transpose of :meth:`matrix`."""
-        flat = jnp.concatenate([part.reshape(*part.shape[:-2], -1) for part in parts], axis=-1)
+        """Return ``<A, e_a>`` for each a, shape (..., dim), for a matrix A in parts: the transpose of
+        :meth:`matrix`."""
+        entries = jnp.concatenate([part.reshape(*part.shape[:-2], -1) for part in parts], axis=-1)
         terms = [
-            flat[..., places] * weights for places, weights in zip(self._component_entries, self._weights, strict=True)
+            entries[..., indices] * weights
+            for indices, weights in zip(self._component_entries, self._weights, strict=True)
         ]
-        found = sum(terms[1:], terms[0])
+        products = sum(terms[1:], terms[0])
         if self.diagonal is not None:
             diagonal = jnp.diagonal(parts[self.diagonal.part], axis1=-2, axis2=-1) @ self.diagonal.coefficients
-            found = found.at[..., self.diagonal.components].set(diagonal)
-        return found
+            products = products.at[..., self.diagonal.components].set(diagonal)
+        return products
 
     def raise_index(self, mu) -> jax.Array:
-        """The components of the matrix M of the span with ``<M, e_a> = mu_a`` for each a, shape (..., dim)."""
-        found = jnp.asarray(mu) / self.squared_norms
+        """Return the components of the matrix M in the span with ``<M, e_a> = mu_a`` for each a, shape (..., dim)."""
+        components = jnp.asarray(mu) / self.squared_norms
         if self.diagonal is None or self.is_orthogonal:
-            return found
-        own = jnp.asarray(mu)[..., self.diagonal.components] @ self._inverse_gram
-        return found.at[..., self.diagonal.components].set(own)
+            return components
+        diagonal_components = jnp.asarray(mu)[..., self.diagonal.components] @ self._inverse_gram
+        return components.at[..., self.diagonal.components].set(diagonal_components)
 
     def lower_index(self, x) -> jax.Array:
-        """``<M, e_a>`` for each a, of the matrix M with the components x: the inverse of :meth:`raised`."""
+        """Return ``<M, e_a>`` for each a, for the matrix M with components x: the inverse of :meth:`raise_index`."""
         return jnp.asarray(x) * self.squared_norms if self.is_orthogonal else self.inner_products(self.matrix(x))
 
     @cached_property
     def squared_norms(self) -> np.ndarray:
-        """``<e_a, e_a>``, shape (dim,)."""
-        found = (self._weights**2).sum(axis=0)
+        """Squared norms ``<e_a, e_a>``, shape (dim,)."""
+        norms_squared = (self._weights**2).sum(axis=0)
         if self.diagonal is not None:
-            found[self.diagonal.components] = (self.diagonal.coefficients**2).sum(axis=0)
-        return found
+            norms_squared[self.diagonal.components] = (self.diagonal.coefficients**2).sum(axis=0)
+        return norms_squared
 
     @cached_property
     def is_orthogonal(self) -> bool:
-        """Whether ``<e_a, e_b> = 0`` for all a != b."""
+        """True if ``<e_a, e_b> = 0`` for all a != b."""
         if self.diagonal is None:
             return True
         gram = self.diagonal.coefficients.T @ self.diagonal.coefficients
@@ -147,22 +161,25 @@ class MatrixBasis:
         return np.linalg.inv(gram)
 
     def basis_matrices(self) -> np.ndarray:
-        """The e_a, shape (dim, N, N)."""
-        flat = np.zeros((self.parts, self.dim + 1, self.size * self.size))
+        """Return the matrices e_a, shape (dim, N, N)."""
+        entries = np.zeros((self.parts, self.dim + 1, self.size * self.size))
         for part in range(self.parts):
-            flat[part, self.entry_components[part], np.arange(self.size * self.size)] = self.values[part]
-        found = flat[:, :-1].reshape(self.parts, self.dim, self.size, self.size)
+            entries[part, self.entry_components[part], np.arange(self.size * self.size)] = self.values[part]
+        matrices = entries[:, :-1].reshape(self.parts, self.dim, self.size, self.size)
         if self.diagonal is not None:
-            on = np.arange(self.size)
-            found[self.diagonal.part, self.diagonal.components[:, None], on, on] = self.diagonal.coefficients.T
-        return found[0] if self.parts == 1 else found[0] + 1j * found[1]
+            diagonal = np.arange(self.size)
+            matrices[self.diagonal.part, self.diagonal.components[:, None], diagonal, diagonal] = (
+                self.diagonal.coefficients.T
+            )
+        return matrices[0] if self.parts == 1 else matrices[0] + 1j * matrices[1]
 
 
-# -- the classical ones -----------------------------------------------------------------------------------------------
+# -- bases of the classical algebras ----------------------------------------------------------------------------------
 
 
 def unitary_basis(n: int, centre: bool) -> MatrixBasis:
-    """``-i lambda_a / 2``, lambda the (generalised) Gell-Mann matrices; with the centre ``-i/2 sqrt(2/n) 1`` last."""
+    """Return the basis ``-i lambda_a / 2`` of generalised Gell-Mann matrices; with the centre ``-i/2 sqrt(2/n) 1``
+    last."""
     k, j = np.tril_indices(n, -1)
     symmetric, k0 = k * k - 1 + 2 * j, np.arange(1, n)
     table = np.zeros((n, n - 1))
@@ -183,7 +200,7 @@ def unitary_basis(n: int, centre: bool) -> MatrixBasis:
 
 
 def orthogonal_basis(p: int, q: int) -> MatrixBasis:
-    """``(E_ij - E_ji) g`` for i < j in lexicographic order, g = diag(1, …, 1, -1, …, -1)."""
+    """Return the basis ``(E_ij - E_ji) g`` for i < j in lexicographic order, g = diag(1, …, 1, -1, …, -1)."""
     n = p + q
     form = np.where(np.arange(n) < p, 1.0, -1.0)
     i, j = np.triu_indices(n, 1)
@@ -192,13 +209,13 @@ def orthogonal_basis(p: int, q: int) -> MatrixBasis:
 
 
 def general_linear_basis(n: int) -> MatrixBasis:
-    """E_ij row by row."""
+    """Return the basis E_ij row by row."""
     i, j = (index.ravel() for index in np.indices((n, n)))
     return MatrixBasis(n, EntryTable.concatenate((np.arange(n * n), REAL, i, j, 1.0)))
 
 
 def special_linear_basis(n: int) -> MatrixBasis:
-    """``E_ii - E_(i+1)(i+1)`` first, then the E_ij of the upper and, transposed, of the lower triangle."""
+    """Return the basis ``E_ii - E_(i+1)(i+1)``, then E_ij of the upper triangle, then E_ji of the lower triangle."""
     i, j = np.triu_indices(n, 1)
     a = n - 1 + np.arange(len(i))
     table = (np.eye(n) - np.eye(n, k=-1))[:, : n - 1]
@@ -207,18 +224,18 @@ def special_linear_basis(n: int) -> MatrixBasis:
 
 
 def symplectic_basis(n: int) -> MatrixBasis:
-    """``[[A, B], [C, -A^T]]`` with B and C symmetric: A row by row, then B, then C."""
+    """Return the basis of ``[[A, B], [C, -A^T]]`` with B and C symmetric: A row by row, then B, then C."""
     i, j = (index.ravel() for index in np.indices((n, n)))
     a = np.arange(n * n)
     s, t = np.triu_indices(n)
-    b, off = n * n + np.arange(len(s)), s != t
+    b, off_diagonal = n * n + np.arange(len(s)), s != t
     c = b + len(s)
     entries = EntryTable.concatenate(
         (a, REAL, i, j, 1.0),
         (a, REAL, n + j, n + i, -1.0),
         (b, REAL, s, n + t, 1.0),
-        (b[off], REAL, t[off], n + s[off], 1.0),
+        (b[off_diagonal], REAL, t[off_diagonal], n + s[off_diagonal], 1.0),
         (c, REAL, n + s, t, 1.0),
-        (c[off], REAL, n + t[off], s[off], 1.0),
+        (c[off_diagonal], REAL, n + t[off_diagonal], s[off_diagonal], 1.0),
     )
     return MatrixBasis(2 * n, entries)

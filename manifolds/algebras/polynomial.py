@@ -1,4 +1,4 @@
-"""Polynomials on the dual of a Lie algebra: exact where they can be, printable, and callable under JAX."""
+"""Polynomials on the dual of a Lie algebra: exact where possible, printable, and callable under JAX."""
 
 from __future__ import annotations
 
@@ -23,10 +23,11 @@ Coefficient = Fraction | float
 @jax.tree_util.register_static
 @dataclass(frozen=True, init=False, repr=False)
 class Polynomial:
-    """A polynomial in the components ``mu1, mu2, …`` of ``mu``.
+    """Polynomial in the components ``mu1, mu2, …`` of ``mu``.
 
-    Immutable and hashable, hence a static leaf of a pytree. Sums, differences and products with polynomials and
-    numbers are polynomials; coefficients stay exact as long as every number involved is an integer or a fraction.
+    Polynomials are immutable and hashable, hence static leaves of a pytree. Sums, differences and products with
+    polynomials
+    and numbers are polynomials; coefficients stay exact as long as every number involved is an integer or a fraction.
 
     Parameters
     ----------
@@ -57,7 +58,7 @@ class Polynomial:
                 f"not {powers.shape}"
             )
         if powers.size and (not np.issubdtype(powers.dtype, np.integer) or powers.min() < 0):
-            raise ComponentError("the exponents of a polynomial are integers >= 0")
+            raise ComponentError("the exponents of a polynomial must be integers >= 0")
         terms: dict[tuple[int, ...], Coefficient] = {}
         for power, coefficient in zip(map(tuple, powers.tolist()), coefficients, strict=True):
             terms[power] = terms.get(power, Fraction(0)) + _coefficient(coefficient)
@@ -67,48 +68,48 @@ class Polynomial:
         object.__setattr__(self, "names", None)
 
     def with_names(self, *names: str) -> Polynomial:
-        """The same polynomial, equal to this one, printed with these names of its components."""
-        named = copy(self)
-        object.__setattr__(named, "names", checked_names(names, self.dim))
-        return named
+        """Return an equal polynomial that prints its components with these names."""
+        polynomial = copy(self)
+        object.__setattr__(polynomial, "names", checked_names(names, self.dim))
+        return polynomial
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        """The coefficients of :attr:`terms`."""
+        """Coefficients of :attr:`terms`."""
         return tuple(coefficient for _, coefficient in self.terms)
 
     @cached_property
     def exponents(self) -> np.ndarray:
-        """The exponents of :attr:`terms`, shape (terms, dim), read-only."""
+        """Exponents of :attr:`terms`, shape (terms, dim), read-only."""
         array = np.array([power for power, _ in self.terms], dtype=np.int64).reshape(len(self.terms), self.dim)
         array.setflags(write=False)
         return array
 
     @property
     def degree(self) -> int:
-        """The largest total degree of a term; 0 for a constant, zero included."""
+        """Largest total degree of a term; 0 for a constant, zero included."""
         return max((sum(power) for power, _ in self.terms), default=0)
 
     def __call__(self, mu) -> jax.Array:
-        """The value at ``mu``, shape (..., dim) -> (...)."""
+        """Return the value at ``mu``, shape (..., dim) -> (...)."""
         mu = real_components(mu, self.dim, "mu")
         # Products of gathered components: mu**0 would have the derivative 0 * mu**-1, which is NaN at zero.
-        padded = jnp.concatenate([mu, jnp.ones((*mu.shape[:-1], 1))], axis=-1)
+        mu_and_one = jnp.concatenate([mu, jnp.ones((*mu.shape[:-1], 1))], axis=-1)
         values = jnp.ones((*mu.shape[:-1], len(self.terms)))
         for factor in self._factor_indices:
-            values = values * padded[..., factor]
+            values = values * mu_and_one[..., factor]
         return values @ np.array([float(c) for c in self.coefficients])
 
     @cached_property
     def _factor_indices(self) -> np.ndarray:
-        """Shape (degree, terms): the components to multiply; the index ``dim`` stands for the number 1."""
+        """Components to multiply in each term, shape (degree, terms); the index ``dim`` stands for the number 1."""
         factors = np.full((self.degree, len(self.terms)), self.dim)
         for term, (power, _) in enumerate(self.terms):
             factors[: sum(power), term] = np.repeat(np.arange(self.dim), power)
         return factors
 
     def gradient(self) -> tuple[Polynomial, ...]:
-        """The partial derivatives by mu1, mu2, …"""
+        """Return the partial derivatives by mu1, mu2, …"""
         return tuple(self._derivative(a) for a in range(self.dim))
 
     def _derivative(self, a: int) -> Polynomial:
@@ -143,19 +144,19 @@ class Polynomial:
     def __rsub__(self, other) -> Polynomial:
         return -self + other
 
-    def _to_operand(self, other) -> Polynomial | None:
-        if isinstance(other, Real):
-            return self._with_terms([((0,) * self.dim, other)])
-        if isinstance(other, Polynomial) and other.dim != self.dim:
-            raise ShapeError(f"polynomials in {self.dim} and in {other.dim} variables do not combine")
-        return other if isinstance(other, Polynomial) else None
+    def _to_operand(self, operand) -> Polynomial | None:
+        if isinstance(operand, Real):
+            return self._with_terms([((0,) * self.dim, operand)])
+        if isinstance(operand, Polynomial) and operand.dim != self.dim:
+            raise ShapeError(f"polynomials in {self.dim} and in {operand.dim} variables do not combine")
+        return operand if isinstance(operand, Polynomial) else None
 
     def _with_terms(self, terms, names=None) -> Polynomial:
-        """A polynomial in the same components, with the names of this one or those given."""
+        """Return a polynomial in the same components, with this polynomial's names or else ``names``."""
         powers = np.array([power for power, _ in terms], dtype=np.int64).reshape(len(terms), self.dim)
-        made = Polynomial(powers, [coefficient for _, coefficient in terms])
+        polynomial = Polynomial(powers, [coefficient for _, coefficient in terms])
         names = self.names or names
-        return made if names is None else made.with_names(*names)
+        return polynomial if names is None else polynomial.with_names(*names)
 
     # -- printing ---------------------------------------------------------------------------------------------------
 
@@ -168,7 +169,7 @@ class Polynomial:
         return f"<Polynomial {self}>"
 
     def _repr_latex_(self) -> str:
-        """As a notebook typesets it."""
+        """Return the polynomial in LaTeX, for a notebook."""
         text = " + ".join(_latex_term(power, coefficient, self.names) for power, coefficient in self.terms)
         return f"$\\displaystyle {text.replace('+ -', '- ') or '0'}$"
 
@@ -193,8 +194,8 @@ def _latex_term(power: tuple[int, ...], coefficient: Coefficient, names: tuple[s
     letters = [rf"\mu_{{{i + 1}}}" for i in range(len(power))] if names is None else [rf"\mathrm{{{n}}}" for n in names]
     factors = " ".join(letter + (f"^{{{e}}}" if e > 1 else "") for letter, e in zip(letters, power, strict=True) if e)
     if isinstance(coefficient, Fraction):
-        over, under = abs(coefficient.numerator), coefficient.denominator
-        number = str(over) if under == 1 else rf"\tfrac{{{over}}}{{{under}}}"
+        numerator, denominator = abs(coefficient.numerator), coefficient.denominator
+        number = str(numerator) if denominator == 1 else rf"\tfrac{{{numerator}}}{{{denominator}}}"
     else:
         digits, _, exponent = f"{abs(coefficient):.15g}".partition("e")
         number = digits + (rf" \cdot 10^{{{int(exponent)}}}" if exponent else "")

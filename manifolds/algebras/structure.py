@@ -1,4 +1,4 @@
-"""What is asked of an algebra to find its Casimirs."""
+"""Protocol of an algebra in the search for Casimirs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ._rational import RationalArray
 
 
 class AlgebraStructure(Protocol):
-    """An algebra as its structure constants show it: see :class:`manifolds.LieAlgebra`."""
+    """Operations of an algebra that the search for Casimirs uses; see :class:`manifolds.LieAlgebra`."""
 
     name: str
 

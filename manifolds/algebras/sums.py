@@ -1,4 +1,4 @@
-"""Sums of Lie algebras: direct, and semidirect by matrices or by derivations."""
+"""Direct sums of Lie algebras, and semidirect sums by matrices or by derivations."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from .killing import row_space
 from .lie_algebra import LieAlgebra
 
 MAX_DIM_BY_CONSTANTS = 40
-"""Dimension up to which a direct sum is an array of structure constants."""
+"""Largest dimension in which a direct sum is an array of structure constants."""
 
 
 def direct_sum(*algebras: LieAlgebra) -> LieAlgebra:
-    """Direct sum: the elements of the first algebra, then of the second, …; different summands commute.
+    """Return the direct sum of algebras: the elements of the first, then of the second, …; different summands commute.
 
-    Up to dimension 40 it is given by its structure constants; a larger one acts block by block, without them, and
-    copies of one algebra in a row as one batch. See :func:`manifolds.power`.
+    Up to dimension 40 the sum has structure constants; a larger one acts block by block, without them, and consecutive
+    copies of one algebra act as one batch. See :func:`manifolds.power`.
 
     Parameters
     ----------
@@ -44,39 +44,39 @@ def direct_sum(*algebras: LieAlgebra) -> LieAlgebra:
 
 
 def semidirect_sum(g: LieAlgebra, representation, name: str | None = None, *, ideal=None) -> LieAlgebra:
-    """Semidirect sum of g with what it acts on: ``[(x, u), (y, v)] = ([x, y], rho(x) v - rho(y) u + [u, v])``.
+    """Return the semidirect sum of g with an ideal: ``[(x, u), (y, v)] = ([x, y], rho(x) v - rho(y) u + [u, v])``.
 
     Parameters
     ----------
     g : LieAlgebra
     representation : array, shape (g.dim, m, m), or callable
-        The matrices ``rho(e_a)``, or a function from components x, shape (dim,), to ``rho(x)``. With an ideal its
-        derivations: the columns of ``rho(e_a)`` are the images of the basis elements.
+        The matrices ``rho(e_a)``, or a function from components x, shape (dim,), to ``rho(x)``. With an ideal these are
+        derivations of it: the columns of ``rho(e_a)`` are the images of the basis elements.
     name : str, optional
     ideal : LieAlgebra, of dimension m, optional
-        The algebra that u and v are in; by default the abelian one of a vector space.
+        The algebra of u and v; by default the abelian algebra of a vector space.
 
     Returns
     -------
     LieAlgebra
-        Dimension ``g.dim + m``: the elements of g first, then those of the ideal. On a vector space its matrices are
-        the affine ones ``[[rho(x), v], [0, 0]]``, preceded by those of g where rho alone is not faithful. With an ideal
-        they are the adjoint ones where its centre is zero, and unknown otherwise.
+        Of dimension ``g.dim + m``: the elements of g first, then those of the ideal. On a vector space its matrices are
+        the affine ones ``[[rho(x), v], [0, 0]]``, preceded by the matrices of g if rho alone is not faithful. With an
+        ideal they are the adjoint matrices if its centre is zero, and unknown otherwise.
 
     Raises
     ------
     RepresentationError
         If ``[rho(e_a), rho(e_b)] != rho([e_a, e_b])`` for some pair, or ``rho(e_a) [u, v]`` is not
-        ``[rho(e_a) u, v] + [u, rho(e_a) v]`` for some pair of the ideal; they are named.
+        ``[rho(e_a) u, v] + [u, rho(e_a) v]`` for some pair of the ideal; the message names the pair.
     """
     if ideal is not None and not isinstance(ideal, LieAlgebra):
-        raise ComponentError(f"the ideal is a LieAlgebra, not {type(ideal).__name__}")
+        raise ComponentError(f"ideal must be a LieAlgebra, got {type(ideal).__name__}")
     if callable(representation):
         representation = [np.asarray(representation(e)) for e in np.eye(g.dim)]
     rho = np.asarray(representation, dtype=np.float64)
     m = ideal.dim if ideal is not None else rho.shape[-1] if rho.ndim else 0
     if rho.shape != (g.dim, m, m):
-        raise ShapeError(f"a representation of {g.name} has shape ({g.dim}, {m}, {m}), not {rho.shape}")
+        raise ShapeError(f"a representation of {g.name} must have shape ({g.dim}, {m}, {m}), got {rho.shape}")
     _check_representation(g, rho)
     dim = g.dim + m
     constants = np.zeros((dim, dim, dim))
@@ -89,11 +89,11 @@ def semidirect_sum(g: LieAlgebra, representation, name: str | None = None, *, id
     constants[g.dim :, g.dim :, g.dim :] = ideal.structure_constants
     total = LieAlgebra(constants, name=name or f"{g.name} x {ideal.name}", basis_names=joined_names(g, ideal))
     adjoint = total._balanced_constants[0].reshape(dim, -1)
-    faithful = adjoint.any() and len(row_space(adjoint)) == dim
+    is_faithful = adjoint.any() and len(row_space(adjoint)) == dim
     return LieAlgebra(
         constants,
         name=total.name,
-        basis=total.structure_constants.swapaxes(1, 2) if faithful else None,
+        basis=total.structure_constants.swapaxes(1, 2) if is_faithful else None,
         basis_names=total.basis_names,
     )
 
@@ -137,10 +137,10 @@ def _affine_matrices(g: LieAlgebra, rho: np.ndarray) -> np.ndarray | None:
     affine = np.zeros((dim, m + 1, m + 1))
     affine[: g.dim, :m, :m] = rho
     affine[np.arange(g.dim, dim), np.arange(m), m] = 1.0
-    sizes = np.linalg.norm(rho, axis=(1, 2))
-    if sizes.all() and len(row_space(rho.reshape(g.dim, -1) / sizes[:, None])) == g.dim:
+    norms = np.linalg.norm(rho, axis=(1, 2))
+    if norms.all() and len(row_space(rho.reshape(g.dim, -1) / norms[:, None])) == g.dim:
         return affine
     if g.basis is None:
         return None
-    upper = np.concatenate([g.basis, np.zeros((m, *g.basis.shape[1:]))])
-    return np.array([scipy.linalg.block_diag(u, e) for u, e in zip(upper, affine, strict=True)])
+    padded_basis = np.concatenate([g.basis, np.zeros((m, *g.basis.shape[1:]))])
+    return np.array([scipy.linalg.block_diag(u, e) for u, e in zip(padded_basis, affine, strict=True)])

@@ -1,4 +1,4 @@
-"""The classical groups."""
+"""Constructors of the classical matrix groups."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .rotations import rotation_log
 
 @register((2,), (3,), (4,))
 def SO(n: int) -> MatrixGroup:
-    """Rotations of R^n: ``g^T g = I``, ``det g = 1``.
+    """Return the group of rotations of R^n: ``g^T g = I``, ``det g = 1``.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def SO(n: int) -> MatrixGroup:
 
 @register((2,), (3,))
 def SE(n: int) -> MatrixGroup:
-    """Rigid motions of R^n, as homogeneous matrices ``[[rotation, translation], [0, 1]]``."""
+    """Return the group of rigid motions of R^n, homogeneous matrices ``[[rotation, translation], [0, 1]]``."""
     group = MatrixGroup(
         f"SE({n})",
         catalogue.se(n),
@@ -74,7 +74,7 @@ def SE(n: int) -> MatrixGroup:
 
 @register((2,), (3,))
 def SU(n: int) -> MatrixGroup:
-    """Unitary complex matrices of determinant 1."""
+    """Return the group of unitary complex matrices of determinant 1."""
     group = MatrixGroup(
         f"SU({n})",
         catalogue.su(n),
@@ -93,7 +93,7 @@ def SU(n: int) -> MatrixGroup:
 
 @register((2,), (3,))
 def SL(n: int) -> MatrixGroup:
-    """Real matrices of determinant 1. The Cayley map exists for n = 2 only, where SL(2) = Sp(1)."""
+    """Return the group of real matrices of determinant 1. The Cayley map exists for n = 2 only, where SL(2) = Sp(1)."""
     group = MatrixGroup(f"SL({n})", catalogue.sl(n), closed.unimodular_defect, restore_map=closed.restore_unimodular)
     if n == 2:
         return replace(group, adjoint_cayley_map=closed.plane_adjoint_cayley, equations=closed.symplectic_equations)
@@ -102,7 +102,7 @@ def SL(n: int) -> MatrixGroup:
 
 @register((2,))
 def Sp(n: int) -> MatrixGroup:
-    """Sp(2n, R): ``g^T J g = J`` with ``J = [[0, I], [-I, 0]]``."""
+    """Return the group Sp(2n, R): ``g^T J g = J`` with ``J = [[0, I], [-I, 0]]``."""
     return MatrixGroup(
         f"Sp({n})",
         catalogue.sp(n),
@@ -116,7 +116,8 @@ def Sp(n: int) -> MatrixGroup:
 
 @register((2,))
 def GL(n: int) -> MatrixGroup:
-    """Invertible real matrices; ``exp`` and ``log`` concern the component GL+ of positive determinant."""
+    """Return the group of invertible real matrices; ``exp`` and ``log`` concern GL+, the component of positive
+    determinant."""
     return MatrixGroup(
         f"GL({n})",
         catalogue.gl(n),
@@ -127,7 +128,7 @@ def GL(n: int) -> MatrixGroup:
 
 @register((1,), (2,))
 def Heisenberg(n: int = 1) -> MatrixGroup:
-    """Upper triangular matrices ``[[1, q, z], [0, I, p], [0, 0, 1]]``. Here the Cayley map is the exponential."""
+    """Return the group of matrices ``[[1, q, z], [0, I, p], [0, 0, 1]]``, whose Cayley map is the exponential."""
     return MatrixGroup(
         f"Heisenberg({n})",
         catalogue.heisenberg(n),

@@ -1,8 +1,8 @@
-"""Formulas of particular groups: exp, log, Cayley of SO(2), SO(3), SE(3), SU(2), Heisenberg; distances and inverses.
+"""Closed formulas of particular groups: exp, log and Cayley maps, distances, equations and inverses.
 
 The exponentials are combinations of the Stumpff functions of the squared angle, entire functions with no division at
 zero, so values keep full relative accuracy down to the smallest angle and derivatives of every order exist there. The
-logarithms are written with :func:`arc`, which does the same for them.
+logarithms use :func:`manifolds.matrices.stumpff.angle_over_sine`, which is smooth at zero too.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from ..matrices.stumpff import HALF_TURN_MARGIN, _root_or_nan, _squared_length, 
 
 
 def so2_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
-    """``cos(t) I + sin(t)/t X``."""
+    """Return ``cos(t) I + sin(t)/t X``."""
     z = _squared_length(x)[..., None]
     return stumpff(0, z) * np.eye(2) + stumpff(1, z) * algebra.hat(x)
 
 
 def so2_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
-    """The angle, by way of its sine and cosine, from -pi + HALF_TURN_MARGIN to pi + HALF_TURN_MARGIN."""
+    """Return the angle from its sine and cosine, between -pi + HALF_TURN_MARGIN and pi + HALF_TURN_MARGIN."""
     sine, cosine = ((g - g.swapaxes(-1, -2)) / 2)[..., 0, 1:2], (g[..., :1, 0] + g[..., 1:2, 1]) / 2
     angle = jnp.arctan2(sine, cosine)
     angle = jnp.where(angle < HALF_TURN_MARGIN - math.pi, angle + 2 * math.pi, angle)
@@ -33,32 +33,32 @@ def so2_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
 
 
 def so3_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
-    """Rodrigues' formula ``I + c1 X + c2 X^2``."""
+    """Return the rotation by Rodrigues' formula ``I + c1 X + c2 X^2``."""
     z, X = _squared_length(x)[..., None], algebra.hat(x)
     return jnp.eye(3) + stumpff(1, z) * X + stumpff(2, z) * X @ X
 
 
 def so3_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
-    """Rotation vector by way of the quaternion, accurate at every angle; at the half turn by :func:`leading_sign`."""
+    """Return the rotation vector from the quaternion, accurate at every angle; half turns use :func:`leading_sign`."""
     w, v = _quaternion(g)
     sign = jnp.where(_rotation_angle(w, v) > math.pi - HALF_TURN_MARGIN, leading_sign(v), 1.0)
     return 2 * angle_over_sine(_squared_length(v), sign * w) * sign * v
 
 
 def so3_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
-    """``I + (X + X^2/2) / (1 + |x|^2/4)``."""
+    """Return ``I + (X + X^2/2) / (1 + |x|^2/4)``."""
     X = algebra.hat(x)[..., :3, :3]
     return jnp.eye(3) + (X + X @ X / 2) / (1.0 + _squared_length(x[..., :3])[..., None] / 4)
 
 
 def so3_inverse_cayley(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
-    """``2 tan(a/2)`` times the axis, for the angle a: ``2 v / w`` of the quaternion (w, v)."""
+    """Return ``2 tan(a/2)`` times the axis, for the angle a: ``2 v / w`` of the quaternion (w, v)."""
     w, v = _quaternion(g)
     return jnp.where(_rotation_angle(w, v) <= math.pi - HALF_TURN_MARGIN, 2 * v / w, jnp.nan)
 
 
 def se3_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
-    """Rotation by Rodrigues' formula, translation ``(I + c2 W + c3 W^2) u``."""
+    """Return the rotation by Rodrigues' formula with the translation ``(I + c2 W + c3 W^2) u``."""
     z, u = _squared_length(x[..., :3])[..., None], x[..., 3:, None]
     W = algebra.hat(x)[..., :3, :3]
     rotation = jnp.eye(3) + stumpff(1, z) * W + stumpff(2, z) * W @ W
@@ -66,7 +66,7 @@ def se3_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
 
 
 def rigid_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
-    """In the plane and in space: logarithm w of the rotation, and ``(I - W/2 + d W^2) t`` with W = hat(w).
+    """Return the logarithm w of the rotation and ``(I - W/2 + d W^2) t`` with W = hat(w), in the plane and in space.
 
     ``d = (1 - (a/2) cot(a/2)) / a^2`` for the angle a; in Stumpff functions of the half angle, d = (c2 - c3) / (4 c1):
     no cancellation.
@@ -81,25 +81,25 @@ def rigid_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
 
 
 def se3_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
-    """That of the rotation, R, and the translation ``(I - W/2)^-1 u = (R u + u) / 2``."""
+    """Return the Cayley map R of the rotation, with the translation ``(I - W/2)^-1 u = (R u + u) / 2``."""
     rotation, u = so3_cayley(algebra, x), x[..., 3:, None]
     return affine_matrix(rotation, 0.5 * (rotation @ u + u))
 
 
 def se3_inverse_cayley(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
-    """That of the rotation, and ``(I - W/2) t``."""
+    """Return the inverse Cayley map of the rotation, and ``(I - W/2) t``."""
     w, t = so3_inverse_cayley(algebra, g[..., :3, :3]), g[..., :3, 3]
     return jnp.concatenate([w, t - jnp.cross(w, t) / 2], axis=-1)
 
 
 def su2_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
-    """``cos(|x|/2) I + sin(|x|/2) X / (|x|/2)``."""
+    """Return ``cos(|x|/2) I + sin(|x|/2) X / (|x|/2)``."""
     z = _squared_length(x)[..., None] / 4
     return stumpff(0, z) * np.eye(2) + stumpff(1, z) * algebra.hat(x)
 
 
 def su2_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
-    """Rotation vector of length below 2 pi: g is the unit quaternion ``w - i v . sigma``."""
+    """Return the rotation vector of length below 2 pi: g is the unit quaternion ``w - i v . sigma``."""
     w, v = _unit_quaternion(g)
     return jnp.where(
         _rotation_angle(w, v) <= 2 * (math.pi - HALF_TURN_MARGIN),
@@ -109,7 +109,7 @@ def su2_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
 
 
 def su2_inverse_cayley(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
-    """``4 tan(a/4)`` times the axis, for the angle a: ``4 v / (1 + w)`` of the unit quaternion (w, v)."""
+    """Return ``4 tan(a/4)`` times the axis, for the angle a: ``4 v / (1 + w)`` of the unit quaternion (w, v)."""
     w, v = _unit_quaternion(g)
     square = jnp.where(w > 0, 1.0, _squared_length(v))
     x = 4 * v * jnp.where(w > 0, 1 / jnp.where(w > 0, 1 + w, 1.0), (1 - w) / square)  # 1 + w may cancel
@@ -117,7 +117,7 @@ def su2_inverse_cayley(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
 
 
 def plane_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
-    """``(I + X) / sqrt(det(I + X))`` for matrices X of size 2 without trace, times the exponential of half of a trace.
+    """Return ``(I + X) / sqrt(det(I + X))`` for a traceless 2 x 2 matrix X, times the exponential of half the trace.
 
     X^2 is a number, so that both sides of ``Ad(g) = cay(ad x)`` turn, or boost, by the same angle. NaN where
     det(I + X) <= 0.
@@ -130,32 +130,33 @@ def plane_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
 
 
 def so4_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
-    """``(I + P)(I + M) / (|I + P| |I + M|)``, P and M the self-dual and the anti-self-dual part of X."""
+    """Return ``(I + P)(I + M) / (|I + P| |I + M|)``, P and M the self-dual and the anti-self-dual part of X."""
     X, identity = algebra.hat(x), jnp.eye(4)
     rows = [[X[..., i, j] for j in range(4)] for i in range(4)]
     dual = jnp.zeros_like(X)
     for i, j, k, m in [(0, 1, 2, 3), (0, 2, 3, 1), (0, 3, 1, 2), (1, 2, 0, 3), (3, 1, 0, 2), (2, 3, 0, 1)]:
         dual = dual.at[..., i, j].set(rows[k][m]).at[..., j, i].set(rows[m][k])
     factors = [identity + (X + sign * dual) / 2 for sign in (1.0, -1.0)]
-    sizes = [jnp.sqrt((f**2).sum(axis=(-2, -1), keepdims=True)) / 2 for f in factors]
-    return (factors[0] / sizes[0]) @ (factors[1] / sizes[1])
+    norms = [jnp.sqrt((f**2).sum(axis=(-2, -1), keepdims=True)) / 2 for f in factors]
+    return (factors[0] / norms[0]) @ (factors[1] / norms[1])
 
 
 def se3_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
-    """Cayley's rotation, and the translation ``(u + w × u / 2) / (1 + |w|^2/4)``: Cayley's of the dual rotation."""
+    """Return Cayley's rotation with the translation ``(u + w × u / 2) / (1 + |w|^2/4)``: Cayley's map of the dual
+    rotation."""
     w, u = x[..., :3], x[..., 3:]
     translation = (u + jnp.cross(w, u) / 2) / (1.0 + _squared_length(w) / 4)
     return affine_matrix(so3_cayley(algebra, x), translation[..., None])
 
 
 def heisenberg_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
-    """``I + X + X^2/2``, exact because X^3 = 0; for the same reason it is the Cayley map too."""
+    """Return ``I + X + X^2/2``, exact because X^3 = 0; for the same reason it is the Cayley map too."""
     X = algebra.hat(x)
     return jnp.eye(X.shape[-1]) + X + X @ X / 2
 
 
 def heisenberg_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
-    """``N - N^2/2`` with N = g - I."""
+    """Return ``N - N^2/2`` with N = g - I."""
     N = g - np.eye(g.shape[-1])
     return algebra.vee(N - N @ N / 2)
 
@@ -164,36 +165,40 @@ def heisenberg_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
 
 
 def unitary_defect(g) -> jax.Array:
-    """Distance of ``g^H g`` from I, or of ``det g`` from 1."""
+    """Return the distance of ``g^H g`` from I, or of ``det g`` from 1 if that is larger."""
     return jnp.maximum(max_abs_entry(adjoint(g) @ g - np.eye(g.shape[-1])), jnp.abs(determinant(g) - 1.0))
 
 
 def rigid_defect(g) -> jax.Array:
-    """Distance of the linear part from the rotations, or of the last row from (0, …, 0, 1)."""
-    last = jnp.abs(g[..., -1, :] - np.eye(g.shape[-1])[-1]).max(axis=-1)
-    return jnp.maximum(unitary_defect(g[..., :-1, :-1]), last)
+    """Return the distance of the linear part from the rotations, or of the last row from (0, …, 0, 1) if that is
+    larger."""
+    last_row_residual = jnp.abs(g[..., -1, :] - np.eye(g.shape[-1])[-1]).max(axis=-1)
+    return jnp.maximum(unitary_defect(g[..., :-1, :-1]), last_row_residual)
 
 
 def unimodular_defect(g) -> jax.Array:
-    """Distance of ``det g`` from 1, over the norms of the rows, multiplied: a relative change of g moves it so far."""
-    rows = jnp.prod(jnp.linalg.norm(g, axis=-1), axis=-1)
-    return jnp.abs(determinant(g) - 1.0) / jnp.maximum(rows, 1.0)
+    """Return the distance of ``det g`` from 1, relative to the product of the norms of the rows.
+
+    A relative change of g changes the determinant by as much.
+    """
+    row_norm_product = jnp.prod(jnp.linalg.norm(g, axis=-1), axis=-1)
+    return jnp.abs(determinant(g) - 1.0) / jnp.maximum(row_norm_product, 1.0)
 
 
 def symplectic_defect(g) -> jax.Array:
-    """Distance of ``-J g^T J g`` from I."""
-    size = jnp.maximum(max_abs_entry(g) ** 2, 1.0)
-    return max_abs_entry(symplectic_inverse(g) @ g - np.eye(g.shape[-1])) / size
+    """Return the distance of ``-J g^T J g`` from I, relative to the squared size of g."""
+    scale = jnp.maximum(max_abs_entry(g) ** 2, 1.0)
+    return max_abs_entry(symplectic_inverse(g) @ g - np.eye(g.shape[-1])) / scale
 
 
 def invertible_defect(g) -> jax.Array:
-    """0 on the group, which is open; infinite where the condition number shows g to be singular to rounding."""
+    """Return 0 on the group, which is open; infinity if the condition number shows that g is singular to rounding."""
     condition = g.shape[-1] * max_abs_entry(g) * max_abs_entry(inverse(g))
     return jnp.where(condition * np.finfo(float).eps < 1.0, 0.0, jnp.inf)
 
 
 def heisenberg_defect(g) -> jax.Array:
-    """Distance of the entries outside the first row and the last column from those of I."""
+    """Return the distance from I of the entries outside the first row and the last column."""
     return max_abs_entry(jnp.where(_coordinate_entries(g), 0.0, g - np.eye(g.shape[-1])))
 
 
@@ -201,19 +206,19 @@ def heisenberg_defect(g) -> jax.Array:
 
 
 def orthogonal_equations(g) -> jax.Array:
-    """The entries of ``g g^T - I`` above and on the diagonal."""
+    """Return the entries of ``g g^T - I`` on and above the diagonal."""
     n = g.shape[-1]
     return (g @ g.swapaxes(-1, -2) - np.eye(n))[..., *np.triu_indices(n)]
 
 
 def rigid_equations(g) -> jax.Array:
-    """Those of the linear part, and the last row less (0, …, 0, 1)."""
-    last = g[..., -1, :] - np.eye(g.shape[-1])[-1]
-    return jnp.concatenate([orthogonal_equations(g[..., :-1, :-1]), last], axis=-1)
+    """Return the orthogonal equations of the linear part, and the last row minus (0, …, 0, 1)."""
+    last_row_residual = g[..., -1, :] - np.eye(g.shape[-1])[-1]
+    return jnp.concatenate([orthogonal_equations(g[..., :-1, :-1]), last_row_residual], axis=-1)
 
 
 def symplectic_equations(g) -> jax.Array:
-    """The entries of ``g J g^T - J`` above the diagonal; of 2 x 2 matrices ``det g - 1``."""
+    """Return the entries of ``g J g^T - J`` above the diagonal; for 2 x 2 matrices ``det g - 1``."""
     n = g.shape[-1] // 2
     top, bottom = g[..., :n], g[..., n:]
     form = top @ bottom.swapaxes(-1, -2)
@@ -222,15 +227,15 @@ def symplectic_equations(g) -> jax.Array:
 
 
 def unimodular_equations(g) -> jax.Array:
-    """``det g - 1``."""
+    """Return ``det g - 1``, shape (..., 1)."""
     return determinant(g)[..., None] - 1.0
 
 
 def unitary_equations(g) -> jax.Array:
-    """Those entries of ``g g^H - I``, real parts and imaginary ones, and the imaginary part of ``det g``."""
+    """Return independent real and imaginary parts of ``g g^H - I``, and the imaginary part of ``det g``."""
     n = g.shape[-1]
-    rest = g @ adjoint(g) - np.eye(n)
-    parts = rest.real[..., *np.triu_indices(n)], rest.imag[..., *np.triu_indices(n, 1)]
+    residual = g @ adjoint(g) - np.eye(n)
+    parts = residual.real[..., *np.triu_indices(n)], residual.imag[..., *np.triu_indices(n, 1)]
     return jnp.concatenate([*parts, determinant(g).imag[..., None]], axis=-1)
 
 
@@ -238,20 +243,20 @@ def unitary_equations(g) -> jax.Array:
 
 
 def rigid_inverse(g) -> jax.Array:
-    """``[[R^T, -R^T t], [0, 1]]``."""
-    transposed = g[..., :-1, :-1].swapaxes(-1, -2)
-    return affine_matrix(transposed, -transposed @ g[..., :-1, -1:])
+    """Return ``[[R^T, -R^T t], [0, 1]]``."""
+    rotation_transpose = g[..., :-1, :-1].swapaxes(-1, -2)
+    return affine_matrix(rotation_transpose, -rotation_transpose @ g[..., :-1, -1:])
 
 
 def symplectic_inverse(g) -> jax.Array:
-    """``-J g^T J``."""
+    """Return ``-J g^T J``."""
     n = g.shape[-1] // 2
     J = np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(n))
     return -J @ g.swapaxes(-1, -2) @ J
 
 
 def heisenberg_inverse(g) -> jax.Array:
-    """``I - N + N^2`` with N = g - I."""
+    """Return ``I - N + N^2`` with N = g - I."""
     N = g - np.eye(g.shape[-1])
     return np.eye(g.shape[-1]) - N + N @ N
 
@@ -260,54 +265,54 @@ def heisenberg_inverse(g) -> jax.Array:
 
 
 def return_unchanged(g) -> jax.Array:
-    """g itself."""
+    """Return g itself, for groups without a formula of restoration."""
     return g
 
 
 def restore_unitary(g) -> jax.Array:
-    """Orthonormal rows, and determinant 1."""
+    """Return g after one Newton step towards orthonormal rows and determinant 1."""
     return restore_unimodular(newton_schulz_step(g))
 
 
 def restore_rigid(g) -> jax.Array:
-    """An orthonormal linear part."""
+    """Return g after one Newton step of its linear part towards the orthogonal matrices."""
     return affine_matrix(newton_schulz_step(g[..., :-1, :-1]), g[..., :-1, -1:])
 
 
 def restore_unimodular(g) -> jax.Array:
-    """Determinant 1."""
+    """Return g after one Newton step towards determinant 1."""
     return g * (1.0 - (determinant(g) - 1.0) / g.shape[-1])[..., None, None]
 
 
 def restore_symplectic(g) -> jax.Array:
-    """``g (3 I - g^* g) / 2`` with ``g^* = -J g^T J``, which squares the distance of ``g^* g`` from I."""
+    """Return ``g (3 I - g^* g) / 2`` with ``g^* = -J g^T J``, which squares the distance of ``g^* g`` from I."""
     return 1.5 * g - 0.5 * g @ (symplectic_inverse(g) @ g)
 
 
 def restore_heisenberg(g) -> jax.Array:
-    """The entries outside the first row and the last column are those of I."""
+    """Return g with the entries outside the first row and the last column replaced by those of I."""
     return jnp.where(_coordinate_entries(g), g, np.eye(g.shape[-1]))
 
 
 def affine_matrix(linear: jax.Array, translation: jax.Array) -> jax.Array:
-    """Homogeneous matrix ``[[linear, translation], [0, 1]]``; ``translation`` has shape (..., n, 1)."""
+    """Return the homogeneous matrix ``[[linear, translation], [0, 1]]``; ``translation`` has shape (..., n, 1)."""
     top = jnp.concatenate([linear, translation], axis=-1)
-    last = jnp.broadcast_to(np.eye(top.shape[-1])[-1:], (*top.shape[:-2], 1, top.shape[-1]))
-    return jnp.concatenate([top, last], axis=-2)
+    last_row = jnp.broadcast_to(np.eye(top.shape[-1])[-1:], (*top.shape[:-2], 1, top.shape[-1]))
+    return jnp.concatenate([top, last_row], axis=-2)
 
 
 # -- helpers ------------------------------------------------------------------------------------------------------
 
 
 def _coordinate_entries(g) -> np.ndarray:
-    """Which entries of a matrix of the Heisenberg group are its coordinates."""
-    free = np.zeros(g.shape[-2:], dtype=bool)
-    free[0, 1:] = free[:-1, -1] = True
-    return free
+    """Return a mask of the entries that are coordinates of the Heisenberg group, shape (m, m)."""
+    mask = np.zeros(g.shape[-2:], dtype=bool)
+    mask[0, 1:] = mask[:-1, -1] = True
+    return mask
 
 
 def _quaternion(g: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Quaternion (w, v) of a rotation, w >= 0, of some norm between 1/2 and 4.
+    """Return the quaternion (w, v) of a rotation, w >= 0, with a norm between 1/2 and 4.
 
     ``4 q q^T`` is linear in the rotation; its row with the largest diagonal entry gives q without cancellation
     [Shepperd 1978].
@@ -317,19 +322,21 @@ def _quaternion(g: jax.Array) -> tuple[jax.Array, jax.Array]:
     skew = (g - g.swapaxes(-1, -2))[..., [2, 0, 1], [1, 2, 0]]
     outer = jnp.concatenate([skew[..., None, :], outer], axis=-2)
     outer = jnp.concatenate([jnp.concatenate([1.0 + trace, skew[..., None]], axis=-2), outer], axis=-1)
-    best = jnp.argmax(jnp.diagonal(outer, axis1=-2, axis2=-1), axis=-1)[..., None]
-    q = jnp.where((np.arange(4) == best)[..., None], outer, 0.0).sum(axis=-2)  # no index that varies
+    row = jnp.argmax(jnp.diagonal(outer, axis1=-2, axis2=-1), axis=-1)[..., None]
+    q = jnp.where((np.arange(4) == row)[..., None], outer, 0.0).sum(
+        axis=-2
+    )  # a mask, since programs of scalars cannot index by a variable
     q = q * jnp.where(q[..., :1] < 0, -1.0, 1.0)
     return q[..., :1], q[..., 1:]
 
 
 def _unit_quaternion(g: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The unit quaternion (w, v) of ``g = w - i v . sigma`` in SU(2)."""
+    """Return the unit quaternion (w, v) of ``g = w - i v . sigma`` in SU(2)."""
     a, b, c, d = g[..., 0, 0], g[..., 0, 1], g[..., 1, 0], g[..., 1, 1]
     w, v = (a + d).real / 2, jnp.stack([-(b + c).imag, (c - b).real, (d - a).imag], axis=-1) / 2
     return w[..., None], v
 
 
 def _rotation_angle(w: jax.Array, v: jax.Array) -> jax.Array:
-    """Twice the angle of the quaternion (w, v), of any norm, shape (..., 1)."""
+    """Return twice the angle of the quaternion (w, v), of any norm, shape (..., 1)."""
     return 2 * jnp.arctan2(jnp.sqrt(_squared_length(v)), w)

@@ -1,4 +1,4 @@
-"""Maps between an algebra of matrices and its group, for any algebra."""
+"""Maps between an algebra of matrices and its group that work for any algebra."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ from ..matrices.exponential import CAYLEY_CONDITION_LIMIT, cayley_of, expm
 from ..matrices.linear import _one_norm, _square_root, determinant, max_abs_entry, solve, solve_near_identity
 
 _NODES, _WEIGHTS = (a[16:] for a in np.polynomial.legendre.leggauss(32))
+"""Gauss quadrature of even functions on [0, 1] in 16 nodes: half of the rule on [-1, 1]."""
 
 
 def exp(algebra: LieAlgebra, x) -> jax.Array:
-    """``expm(hat(x))``."""
+    """Return ``expm(hat(x))``."""
     return expm(algebra.hat(x))
 
 
 def dexp(algebra: LieAlgebra, x) -> jax.Array:
-    """Left-trivialised derivative of exp, ``int_0^1 exp(-s ad x) ds``: a block of a larger exponential [Van Loan 1978].
+    """Return the left-trivialised derivative of exp, ``int_0^1 exp(-s ad x) ds``, shape (..., dim, dim).
 
-    ``d exp(x) = exp(x) hat(dexp(x) dx)``; shape (..., dim, dim).
+    ``d exp(x) = exp(x) hat(dexp(x) dx)``. The integral is a block of a larger exponential [Van Loan 1978].
     """
     ad, one = algebra.ad(x), jnp.broadcast_to(np.eye(algebra.dim), (*x.shape, algebra.dim))
     top = jnp.concatenate([-ad, one], axis=-1)
@@ -33,9 +34,10 @@ def dexp(algebra: LieAlgebra, x) -> jax.Array:
 
 
 def inverse_dexp(algebra: LieAlgebra, x, v, order: int) -> jax.Array:
-    """``dexp(x)^-1 v`` to a power of x: ``sum_j (-1)^j B_j / j! ad_x^j v``, j <= order, B_j Bernoulli's numbers.
+    """Return ``dexp(x)^-1 v`` to the order of x: ``sum_j (-1)^j B_j / j! ad_x^j v``, j <= order, B_j Bernoulli's
+    numbers.
 
-    The x' with which ``exp(x)`` turns at the velocity v, ``d exp(x) / dt = exp(x) hat(v)``.
+    This is the rate x' for which ``exp(x)`` turns at the velocity v, ``d exp(x) / dt = exp(x) hat(v)``.
     """
     term, total = v, v
     for j in range(1, order + 1):
@@ -46,23 +48,25 @@ def inverse_dexp(algebra: LieAlgebra, x, v, order: int) -> jax.Array:
 
 
 def _bernoulli(count: int) -> list[float]:
+    """Return the coefficients B_0 … B_(count - 1), Bernoulli's numbers."""
     numbers = [Fraction(1)]
     for m in range(1, count):
-        known = sum((comb(m + 1, j) * b for j, b in enumerate(numbers)), Fraction(0))
-        numbers.append(-known / (m + 1))
+        weighted_sum = sum((comb(m + 1, j) * b for j, b in enumerate(numbers)), Fraction(0))
+        numbers.append(-weighted_sum / (m + 1))
     return list(map(float, numbers))
 
 
 _BERNOULLI = _bernoulli(26)
+"""Bernoulli's numbers up to the largest order of :func:`inverse_dexp`."""
 
 
 def cayley(algebra: LieAlgebra, x) -> jax.Array:
-    """:func:`cayley_of` hat(x)."""
+    """Return the Cayley map of hat(x); see :func:`cayley_of`."""
     return cayley_of(algebra.hat(x))
 
 
 def inverse_cayley(algebra: LieAlgebra, g) -> jax.Array:
-    """``2 (g + I)^-1 (g - I)`` in components, NaN where g + I is singular."""
+    """Return ``2 (g + I)^-1 (g - I)`` in components, NaN where g + I is singular."""
     identity = np.eye(g.shape[-1])
     x = algebra.vee(2 * solve(g + identity, g - identity))
     condition = max_abs_entry(g + identity) * max_abs_entry(identity - algebra.hat(x) / 2) / 2  # 2 (g + I)^-1 = I - X/2
@@ -70,71 +74,84 @@ def inverse_cayley(algebra: LieAlgebra, g) -> jax.Array:
 
 
 def adjoint_cayley(algebra: LieAlgebra, x) -> jax.Array:
-    """``exp(y)`` with ``exp(ad y) = cay(ad x)``, for any algebra where there is such a y, x its part in the centre.
+    """Return ``exp(y)`` with ``exp(ad y) = cay(ad x)``, for any algebra with such a y; x keeps its component in the
+    centre.
 
     ``ad y = 2 artanh(A/2) = int_0^1 A (I - t^2 A^2/4)^-1 dt`` with A = ad(x), by Gauss quadrature: right to rounding
     where the eigenvalues of A are imaginary and below 3, or real and below 1.5; to 1e-13 at 4, and to 1e-11 at 1.8.
     """
     adjoint, identity = _adjoint_representation(algebra), np.eye(algebra.dim)
     A = adjoint.hat(x)[..., None, :, :]
-    parts = solve_near_identity(identity - _NODES[:, None, None] ** 2 / 4 * (A @ A), A + jnp.zeros((len(_NODES), 1, 1)))
-    return exp(algebra, adjoint.vee((_WEIGHTS[:, None, None] * parts).sum(axis=-3)) + central_part(algebra, x))
+    values = solve_near_identity(
+        identity - _NODES[:, None, None] ** 2 / 4 * (A @ A), A + jnp.zeros((len(_NODES), 1, 1))
+    )
+    return exp(algebra, adjoint.vee((_WEIGHTS[:, None, None] * values).sum(axis=-3)) + central_part(algebra, x))
 
 
 def from_adjoint_cayley(algebra: LieAlgebra, g) -> jax.Array:
-    """The components x, none in the centre, with ``cay(ad x) = g``, for g of the size of the algebra, near I."""
+    """Return the components x, none in the centre, with ``cay(ad x) = g``, for a matrix g near I, shape (..., dim,
+    dim)."""
     identity = np.eye(algebra.dim)
     return _adjoint_representation(algebra).vee(2 * solve_near_identity(g + identity, g - identity))
 
 
 def central_part(algebra: LieAlgebra, x) -> jax.Array:
-    """The part of x in the centre of the algebra, the one orthogonal to it left out."""
+    """Return the component of x in the centre of the algebra, without its orthogonal complement."""
     adjoint = _adjoint_representation(algebra)
     return x - adjoint.vee(adjoint.hat(x))
 
 
 @cache
 def _adjoint_representation(algebra: LieAlgebra) -> LieAlgebra:
-    """The algebra with the matrices ad(e_a); ``vee`` finds the components with none in the centre."""
+    """Return the algebra with the matrices ad(e_a); its ``vee`` returns components with none in the centre."""
     constants = algebra.structure_constants
     return LieAlgebra(constants, name=f"ad({algebra.name})", basis=constants.swapaxes(1, 2))
 
 
 _MAX_OUTSIDE_FRACTION = 1e-3
-"""Part of a logarithm outside of the algebra, relative to its size: more than rounding makes, less than 2 pi / n."""
+"""Largest fraction of a logarithm outside of the algebra, relative to its size.
+
+It is more than rounding makes and less than 2 pi / n, the phase of SU(n) that leaves the algebra.
+"""
 
 
 def log(algebra: LieAlgebra, g) -> jax.Array:
-    """Principal logarithm in components, NaN where an eigenvalue is on or next to the negative axis.
+    """Return the principal logarithm in components, NaN where an eigenvalue is on or next to the negative axis.
 
-    NaN too where that of the matrix is not in the algebra, as in SU(n) where the angles of eigenvalues sum to 2 pi.
-
-    Square roots until s is near I; then ``log s = 2 artanh (s - I)(s + I)^-1``, which keeps to the algebra of a group
-    with a quadratic form; then one Newton step on ``exp(x) = g`` in components, which removes the rounding that the
-    roots amplify.
+    The result is NaN too where the matrix logarithm is not in the algebra, as in SU(n) if the angles of the eigenvalues
+    sum
+    to 2 pi. The algorithm takes square roots until s is near I; then ``log s = 2 artanh (s - I)(s + I)^-1``, which
+    keeps to
+    the algebra of a group with a quadratic form; then one Newton step on ``exp(x) = g`` in components, which removes
+    the
+    rounding that the roots amplify.
     """
     identity, batch = jnp.eye(g.shape[-1], dtype=g.dtype), g.shape[:-2]
 
-    def far(state):
-        s, _, converged = state
-        return converged & (_one_norm(s - identity) > 0.25)
+    def is_far(state):
+        s, _, is_converged = state
+        return is_converged & (_one_norm(s - identity) > 0.25)
 
     def halve(state):
-        s, halvings, converged = state
+        s, halvings, is_converged = state
         root, _, success = _square_root(s)
-        act = far(state)
-        return jnp.where(act[..., None, None], root, s), halvings + act, converged & (success | ~act)
+        needs_root = is_far(state)
+        return (
+            jnp.where(needs_root[..., None, None], root, s),
+            halvings + needs_root,
+            is_converged & (success | ~needs_root),
+        )
 
-    size = jnp.log(jnp.abs(determinant(g)))[..., None, None] / g.shape[-1]
-    start = (g / jnp.exp(size), jnp.zeros(batch), jnp.ones(batch, dtype=bool))
-    s, halvings, converged = jax.lax.while_loop(lambda state: far(state).any(), halve, start)
+    log_scale = jnp.log(jnp.abs(determinant(g)))[..., None, None] / g.shape[-1]
+    start = (g / jnp.exp(log_scale), jnp.zeros(batch), jnp.ones(batch, dtype=bool))
+    s, halvings, is_converged = jax.lax.while_loop(lambda state: is_far(state).any(), halve, start)
     Z = solve(s + identity, s - identity)
     Z2, series = Z @ Z, jnp.zeros_like(g)
     for k in reversed(range(9)):  # |Z| < 1/7, so the first term left out is below rounding
         series = identity / (2 * k + 1) + Z2 @ series
-    X = size * identity + 2.0 ** (halvings + 1.0)[..., None, None] * Z @ series
+    X = log_scale * identity + 2.0 ** (halvings + 1.0)[..., None, None] * Z @ series
     x = algebra.vee(X)
-    converged &= max_abs_entry(X - algebra.hat(x)) < _MAX_OUTSIDE_FRACTION * (1.0 + max_abs_entry(X))
+    is_converged &= max_abs_entry(X - algebra.hat(x)) < _MAX_OUTSIDE_FRACTION * (1.0 + max_abs_entry(X))
     remainder = algebra.vee(expm(algebra.hat(-x)) @ g - identity)
     x = x + solve(dexp(algebra, x), remainder[..., None])[..., 0]
-    return jnp.where(converged[..., None], x, jnp.nan)
+    return jnp.where(is_converged[..., None], x, jnp.nan)

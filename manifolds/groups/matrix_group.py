@@ -5,8 +5,8 @@ Conventions: an element of the group is a matrix, shape (..., m, m), an element 
 transpose of ``Ad(g)``, with no inverse, so that its derivative at the identity is ``ad_star``. Derivatives of paths are
 left-trivialised: ``g' = g hat(x)``.
 
-All maps can be jitted, vmapped and differentiated. Where a map is not defined they raise :class:`DomainError`; under
-tracing, where values cannot be looked at, they return NaN instead.
+All maps can be jitted, vmapped and differentiated. Outside of their domain they raise :class:`DomainError`; under
+tracing, where values are not available, they return NaN instead.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from . import closed_forms as closed
 from . import maps
 
 MEMBERSHIP_TOLERANCE = 1e-8
-"""How far from the group, relative to its size, a matrix may lie for its logarithm to be taken."""
+"""Largest distance of a matrix from the group, relative to its size, at which its logarithm is taken."""
 
 MAP_DEFECT_TOLERANCE = 1e-10
-"""How far from the group, relative to its size, a map may end that is said to stay in it."""
+"""Largest distance from the group, relative to its size, of the values of a map that counts as staying in the group."""
 
 _LOG_DOMAIN_TEXT = (
     f"principal logarithm needs angles below pi - {HALF_TURN_MARGIN:.0e}, since at pi there may be a continuum "
@@ -41,56 +41,58 @@ _LOG_DOMAIN_TEXT = (
 
 _registry: list[tuple[Callable[..., MatrixGroup], tuple]] = []
 _catalogued_groups: set[MatrixGroup] = set()
-"""Groups made by a registered constructor: the property suite has tested their maps, so that no user waits for it."""
+"""Groups made by registered constructors; the property suite has tested their maps, so the maps are not tested
+again."""
 
 
-def register(*arguments: tuple):
-    """Decorator: run the property suite on the constructor called with each of these argument tuples."""
+def register(*argument_tuples: tuple):
+    """Decorate a constructor to register the group of each argument tuple; the property suite runs on these groups."""
 
-    def remember(constructor):
+    def add_to_registry(constructor):
         @wraps(constructor)
-        def build(*arguments, **keywords):
-            _catalogued_groups.add(group := constructor(*arguments, **keywords))
+        def build(*args, **kwargs):
+            _catalogued_groups.add(group := constructor(*args, **kwargs))
             return group
 
-        _registry.extend((build, a) for a in arguments)
+        _registry.extend((build, a) for a in argument_tuples)
         return build
 
-    return remember
+    return add_to_registry
 
 
 def registered_groups() -> Iterator[MatrixGroup]:
-    """One instance after another of every registered group."""
-    for constructor, arguments in _registry:
-        yield constructor(*arguments)
+    """Yield one instance of every registered group."""
+    for constructor, args in _registry:
+        yield constructor(*args)
 
 
 @jax.tree_util.register_static
 @dataclass(frozen=True, repr=False)
 class MatrixGroup:
-    """A group of matrices: its algebra, a measure of distance from it, and the maps that have a special form.
+    """Group of matrices: its algebra, a measure of distance from it, and maps with special formulas.
 
     Build one with its name (``manifolds.SO(3)``). A new group needs its algebra, with matrices, and ``defect``; the
-    rest defaults to general matrix functions. Whether those stay in the group is tested where they are used, at random
-    elements: see :meth:`leaves`.
+    other maps default to general matrix functions. Before such a map is used, :meth:`map_defect` tests at random
+    elements
+    that it stays in the group.
 
     Attributes
     ----------
     name : str
     algebra : LieAlgebra
     defect : callable
-        ``g -> array``, shape (...): how far g is from the group relative to its size, of the order of the smallest
-        relative change of g that brings it there. One that takes one matrix is applied to each.
+        ``g -> array``, shape (...): the distance of g from the group relative to its size, of the order of the smallest
+        relative change of g that brings it there. A function of one matrix is applied to each matrix of a batch.
     inverse_map, exp_map, log_map, cayley_map, inverse_cayley_map : callable or None
         ``g -> g^-1``; ``(algebra, x) -> g``; ``(algebra, g) -> x`` with NaN outside the domain; ``(algebra, x) -> g``
-        or None where the Cayley map leaves the group; ``(algebra, g) -> x`` with NaN outside the domain.
+        or None if the Cayley map leaves the group; ``(algebra, g) -> x`` with NaN outside the domain.
     adjoint_cayley_map : callable or None
-        ``(algebra, x) -> g`` with ``Ad(g) = cay(ad x)``, or None where ``cay(ad x)`` is not an adjoint action.
+        ``(algebra, x) -> g`` with ``Ad(g) = cay(ad x)``, or None if ``cay(ad x)`` is not an adjoint action.
     restore_map : callable
-        ``g -> g``: one Newton step to the group for a matrix that rounding has moved off it, where it has a formula.
+        ``g -> g``: one Newton step to the group for a matrix that rounding has moved off it; by default g itself.
     equations : callable or None
         ``g -> array``, shape (..., m): independent functions that vanish on the group, and are constant along every
-        ``g exp(t X)`` for X in the algebra, wherever g is; where it has such.
+        ``g exp(t X)`` for X in the algebra, wherever g is; None if there are none.
     """
 
     name: str
@@ -116,30 +118,30 @@ class MatrixGroup:
 
     @property
     def matrix_size(self) -> int:
-        """Number m of rows of its matrices."""
+        """Number m of rows of the matrices."""
         return self.algebra._require_basis().shape[-1]
 
     @property
     def is_complex(self) -> bool:
-        """Whether its matrices have complex entries."""
+        """True if the matrices have complex entries."""
         return jnp.iscomplexobj(self.algebra._require_basis())
 
     @property
     def identity(self) -> jax.Array:
-        """The identity matrix, shape (m, m)."""
+        """Identity matrix, shape (m, m)."""
         return jnp.eye(self.matrix_size, dtype=self.algebra._require_basis().dtype)
 
     def compose(self, g, h) -> jax.Array:
-        """Product ``g h`` of group elements, shape (..., m, m)."""
+        """Return the product ``g h`` of group elements, shape (..., m, m)."""
         return self._element(g, "g") @ self._element(h, "h")
 
     def inverse(self, g) -> jax.Array:
-        """Inverse of a group element, by the group's own formula (a transpose for SO(n)), shape (..., m, m).
+        """Return the inverse of a group element by the group's own formula (a transpose for SO(n)), shape (..., m, m).
 
         Raises
         ------
         DomainError
-            If g is singular. That g is in the group is taken for granted: see :meth:`belongs`.
+            If g is singular. Membership in the group is not checked: see :meth:`belongs`.
         """
         g = self._element(g, "g")
         inverse = _call_compiled(self.inverse_map, g)
@@ -148,7 +150,8 @@ class MatrixGroup:
         return inverse
 
     def belongs(self, g, tolerance: float = 1e-10) -> jax.Array:
-        """Whether each matrix is in the group, up to a relative change of the matrix by about ``tolerance``.
+        """Return True for each matrix that is in the group, up to a relative change of the matrix by about
+        ``tolerance``.
 
         GL(n) is open: there the tolerance plays no part, and a matrix belongs if rounding cannot make it singular.
 
@@ -159,7 +162,8 @@ class MatrixGroup:
         return _call_compiled(self.defect, self._element(g, "g")) <= tolerance
 
     def random(self, key_or_seed, size: tuple[int, ...] = (), scale: float = 0.5) -> jax.Array:
-        """Random elements ``exp(x)``, the components of x normal with standard deviation ``scale``; not Haar measure.
+        """Return random elements ``exp(x)`` with normal components of x of standard deviation ``scale``; not Haar
+        measure.
 
         Parameters
         ----------
@@ -176,11 +180,12 @@ class MatrixGroup:
         return self.exp(scale * jax.random.normal(key, (*size, self.dim)))
 
     def exp(self, x) -> jax.Array:
-        """Exponential map, from components of the algebra, shape (..., dim), to the group, shape (..., m, m)."""
+        """Return the exponential of components of the algebra, shape (..., dim), as a group element, shape (..., m,
+        m)."""
         return _call_compiled(self.exp_map, self.algebra, self._components(x, "x"))
 
     def log(self, g) -> jax.Array:
-        """Principal logarithm: the x with ``exp(x) = g`` and eigenvalues of ``hat(x)`` at heights below pi.
+        """Return the principal logarithm: the x with ``exp(x) = g`` and eigenvalues of ``hat(x)`` at heights below pi.
 
         Parameters
         ----------
@@ -212,7 +217,7 @@ class MatrixGroup:
         return x
 
     def cayley(self, x) -> jax.Array:
-        """Cayley map ``(I - X/2)^-1 (I + X/2)``, X = hat(x): agrees with ``exp`` to second order.
+        """Return the Cayley map ``(I - X/2)^-1 (I + X/2)``, X = hat(x); it agrees with ``exp`` to second order.
 
         Parameters
         ----------
@@ -234,12 +239,12 @@ class MatrixGroup:
         g = _cayley(self, x)
         if (index := _first_nonfinite_index(g, 2)) is not None:
             x = np.asarray(x[index])
-            why = self._why_no_cayley(x, self.algebra.hat(x) if np.isfinite(x).all() else x)
-            raise DomainError(f"cayley on {self.name}: x{format_index(index)} {why}")
+            reason = self._why_no_cayley(x, self.algebra.hat(x) if np.isfinite(x).all() else x)
+            raise DomainError(f"cayley on {self.name}: x{format_index(index)} {reason}")
         return g
 
     def inverse_cayley(self, g) -> jax.Array:
-        """Inverse of the Cayley map, ``2 (g + I)^-1 (g - I)``, shape (..., dim).
+        """Return the inverse of the Cayley map, ``2 (g + I)^-1 (g - I)``, shape (..., dim).
 
         Raises
         ------
@@ -252,12 +257,12 @@ class MatrixGroup:
         g = self._element(g, "g")
         x = _inverse_cayley(self, g)
         if (index := _first_nonfinite_index(x, 1)) is not None:
-            why = self._why_not_in_domain(np.asarray(g[index]), "inverse Cayley map needs no eigenvalue -1", "map")
-            raise DomainError(f"inverse_cayley on {self.name}: g{format_index(index)} {why}")
+            reason = self._why_not_in_domain(np.asarray(g[index]), "inverse Cayley map needs no eigenvalue -1", "map")
+            raise DomainError(f"inverse_cayley on {self.name}: g{format_index(index)} {reason}")
         return x
 
     def adjoint_cayley(self, x) -> jax.Array:
-        """The group element near ``exp(x)`` whose adjoint action is Cayley's map of ``ad x``: ``Ad(g) = cay(ad(x))``.
+        """Return the group element near ``exp(x)`` with ``Ad(g) = cay(ad(x))``, Cayley's map of ``ad x``.
 
         ``Ad_star(g, mu)`` is then the end of a step of the midpoint scheme, ``nu = mu + ad_star(x, (mu + nu) / 2)``.
         It is :meth:`cayley` for SO(3) and SE(2), and another map to third order for SU(2), SL(2), SE(3) and SO(4).
@@ -284,12 +289,13 @@ class MatrixGroup:
         g = _call_compiled(self.adjoint_cayley_map, self.algebra, x)
         if (index := _first_nonfinite_index(g, 2)) is not None:
             x = np.asarray(x[index])
-            why = self._why_no_cayley(x, self.algebra.ad(x))
-            raise DomainError(f"adjoint_cayley on {self.name}: for ad(x), x{format_index(index)} {why}")
+            reason = self._why_no_cayley(x, self.algebra.ad(x))
+            raise DomainError(f"adjoint_cayley on {self.name}: for ad(x), x{format_index(index)} {reason}")
         return g
 
     def map_defect(self, kind: str) -> float:
-        """How far a map of this group leads away from it: the largest :attr:`defect` at random elements of the algebra.
+        """Return the largest distance from the group, :attr:`defect`, of the values of a map at random elements of the
+        algebra.
 
         Parameters
         ----------
@@ -299,12 +305,12 @@ class MatrixGroup:
         Returns
         -------
         float
-            Of the order of rounding for a map that stays in the group; infinite where it gives no finite result.
+            Of the order of rounding for a map that stays in the group; infinite if a value is not finite.
         """
         return _map_defect(self, kind)
 
     def Ad(self, g) -> jax.Array:
-        """Adjoint action, the matrix of ``x -> vee(g hat(x) g^-1)``, shape (..., dim, dim).
+        """Return the adjoint action, the matrix of ``x -> vee(g hat(x) g^-1)``, shape (..., dim, dim).
 
         Raises
         ------
@@ -314,15 +320,15 @@ class MatrixGroup:
         g = self._element(g, "g")
         if not is_traced(g):
             with jax.ensure_compile_time_eval():  # g may be a constant in a program being traced
-                outside = ~np.asarray(self.belongs(g, MEMBERSHIP_TOLERANCE))
-                if (index := first_true_index(outside)) is not None:
+                is_outside = ~np.asarray(self.belongs(g, MEMBERSHIP_TOLERANCE))
+                if (index := first_true_index(is_outside)) is not None:
                     raise DomainError(
                         f"Ad on {self.name}: g{format_index(index)} {self._why_not_in_domain(np.asarray(g[index]))}"
                     )
         return _adjoint_action(self, g)
 
     def Ad_star(self, g, mu) -> jax.Array:
-        """Coadjoint action, defined by ``<Ad_star(g, mu), x> = <mu, Ad(g) x>``.
+        """Return the coadjoint action, defined by ``<Ad_star(g, mu), x> = <mu, Ad(g) x>``.
 
         A right action: ``Ad_star(g h, mu) = Ad_star(h, Ad_star(g, mu))``. Its derivative along ``g = exp(t x)`` at
         t = 0 is ``ad_star(x, mu)``; the spatial momentum of a body is ``Ad_star(inverse(g), mu)``.
@@ -341,18 +347,20 @@ class MatrixGroup:
     def __repr__(self) -> str:
         return f"MatrixGroup({self.name!r}, dim={self.dim})"
 
-    def _components(self, x, what: str) -> jax.Array:
-        return real_components(x, self.dim, what)
+    def _components(self, x, label: str) -> jax.Array:
+        return real_components(x, self.dim, label)
 
-    def _element(self, g, what: str) -> jax.Array:
-        matrix = square_matrices(g, self.matrix_size, what)
+    def _element(self, g, label: str) -> jax.Array:
+        matrix = square_matrices(g, self.matrix_size, label)
         if jnp.iscomplexobj(matrix) and not np.iscomplexobj(self.algebra._require_basis()):
             raise ComponentError(
-                f"{what} must be real for {self.name}, not {matrix.dtype}: take its real part if that is meant"
+                f"{label} must be real for {self.name}, not {matrix.dtype}: take its real part if that is meant"
             )
         return matrix.astype(self.algebra._require_basis().dtype)
 
-    def _why_not_in_domain(self, g: np.ndarray, needs: str = _LOG_DOMAIN_TEXT, image: str = "logarithm") -> str:
+    def _why_not_in_domain(
+        self, g: np.ndarray, requirement: str = _LOG_DOMAIN_TEXT, map_name: str = "logarithm"
+    ) -> str:
         if not np.isfinite(g).all():
             return "has entries that are not finite"
         defect = float(self.defect(g))
@@ -363,43 +371,44 @@ class MatrixGroup:
             )
         eigenvalues = np.linalg.eigvals(g)
         angles = np.angle(eigenvalues)
-        no_half_turn = np.abs(angles).max() < np.pi - HALF_TURN_MARGIN
-        if image == "logarithm" and self.is_complex and no_half_turn and abs(total := angles.sum()) > np.pi:
+        is_below_half_turn = np.abs(angles).max() < np.pi - HALF_TURN_MARGIN
+        if map_name == "logarithm" and self.is_complex and is_below_half_turn and abs(total := angles.sum()) > np.pi:
             return (
                 f"has eigenvalues whose angles sum to {total:.6g}, so its principal logarithm is not in "
                 f"{self.algebra.name}: take the logarithm of g relative to a nearer element h, that is of "
                 "compose(inverse(h), g)"
             )
-        worst = eigenvalues[np.abs(np.angle(eigenvalues)).argmax()]
+        eigenvalue = eigenvalues[np.abs(np.angle(eigenvalues)).argmax()]
         return (
-            f"has the eigenvalue {worst:.6g} at the angle {abs(np.angle(worst)):.10f}, and det g = "
-            f"{np.linalg.det(g):.3g}; the {needs}: take the {image} of g relative to a nearer element h, that is of "
-            "compose(inverse(h), g)"
+            f"has the eigenvalue {eigenvalue:.6g} at the angle {abs(np.angle(eigenvalue)):.10f}, and det g = "
+            f"{np.linalg.det(g):.3g}; the {requirement}: take the {map_name} of g relative to a nearer element h, that "
+            "is of compose(inverse(h), g)"
         )
 
     def cayley_is_adjoint(self) -> bool:
-        """Whether :meth:`cayley` is :meth:`adjoint_cayley`: ``Ad(cayley(x)) = cay(ad(x))``, as for SO(3) and SE(2)."""
+        """Return True if :meth:`cayley` is :meth:`adjoint_cayley`, that is ``Ad(cayley(x)) = cay(ad(x))``: SO(3) and
+        SE(2)."""
         if self.cayley_map is None or self.cayley_map is self.adjoint_cayley_map or self in _catalogued_groups:
             return self.cayley_map is self.adjoint_cayley_map and self._is_map_in_group("cayley")
         return replace(self, adjoint_cayley_map=self.cayley_map)._is_map_in_group("adjoint_cayley")
 
     def _is_map_in_group(self, kind: str) -> bool:
-        """Whether the group has a map, and the map stays in it."""
+        """Return True if the group has the map, and the map stays in the group."""
         if getattr(self, f"{kind}_map") is None:
             return False
         return self in _catalogued_groups or self.map_defect(kind) <= MAP_DEFECT_TOLERANCE
 
     def _require_map(self, kind: str) -> None:
-        """Raise unless the group has a map, and the map stays in it."""
+        """Raise LieAlgebraError unless the group has the map, and the map stays in the group."""
         if self._is_map_in_group(kind):
             return
-        what, otherwise = _MAP_TEXTS[kind]
+        map_text, remedy = _MAP_TEXTS[kind]
         residual = self.map_defect(kind)
         if residual <= MAP_DEFECT_TOLERANCE:
-            raise LieAlgebraError(f"{self.name} has been given None for its {kind}_map; {otherwise}")
+            raise LieAlgebraError(f"{self.name} has no {kind}_map; {remedy}")
         raise LieAlgebraError(
-            f"{what} does not take {self.algebra.name} into {self.name}: at random elements it misses by "
-            f"{residual:.3g} (tolerance {MAP_DEFECT_TOLERANCE:.0e}); {otherwise}",
+            f"{map_text} does not take {self.algebra.name} into {self.name}: at random elements it misses by "
+            f"{residual:.3g} (tolerance {MAP_DEFECT_TOLERANCE:.0e}); {remedy}",
             residual=residual,
             tolerance=MAP_DEFECT_TOLERANCE,
         )
@@ -408,16 +417,16 @@ class MatrixGroup:
         if not np.isfinite(x).all():
             return "has entries that are not finite"
         eigenvalues = np.linalg.eigvals(np.asarray(matrix))
-        nearest = eigenvalues[np.abs(eigenvalues**2 - 4).argmin()]
+        eigenvalue = eigenvalues[np.abs(eigenvalues**2 - 4).argmin()]
         return (
-            f"has the eigenvalue {nearest:.10g}, and at 2 and -2 the Cayley map is singular (limit on the condition "
+            f"has the eigenvalue {eigenvalue:.10g}, and at 2 and -2 the Cayley map is singular (limit on the condition "
             f"number {CAYLEY_CONDITION_LIMIT:.0e}); shorten x or use exp"
         )
 
 
 @dataclass(frozen=True)
 class _BatchedFunction:
-    """A function of one matrix, shape (m, m), as one of batches."""
+    """Function of one matrix, shape (m, m), applied to batches."""
 
     function: Callable
 
@@ -426,7 +435,7 @@ class _BatchedFunction:
 
 
 def _batch_defect(defect: Callable, name: str, basis: np.ndarray) -> Callable:
-    """The defect of a group as a function of batches; LieAlgebraError where it is none of a matrix."""
+    """Return the defect of a group as a function of batches; LieAlgebraError if it maps no matrix to a number."""
 
     def shape(batch: tuple[int, ...]) -> tuple[int, ...] | None:
         try:
@@ -449,15 +458,15 @@ _MAP_TEXTS = {
     "cayley": ("the Cayley map", "use exp"),
     "adjoint_cayley": ("the map that makes Cayley's of ad x an adjoint action", "use exp"),
 }
-"""The maps from the algebra to the group, and what to do where one leaves it."""
+"""Name of each map from the algebra to the group, and the remedy if it leaves the group."""
 
 
 # -- compiled maps --------------------------------------------------------------------------------------------------
 
 
 @partial(jax.jit, static_argnums=0)
-def _call_compiled(function: Callable, *arguments):
-    return function(*arguments)
+def _call_compiled(function: Callable, *args):
+    return function(*args)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -482,44 +491,46 @@ def _inverse_cayley(group: MatrixGroup, g):
 
 @cache
 def _map_defect(group: MatrixGroup, kind: str) -> float:
-    """See :meth:`MatrixGroup.leaves`."""
+    """Compute :meth:`MatrixGroup.map_defect` once for each group and map."""
     algebra, x = group.algebra, np.random.default_rng(0).standard_normal((4, group.dim))
     x /= np.linalg.norm(np.einsum("...a,aij->...ij", x, algebra._require_basis()), axis=(-2, -1))[:, None]
-    if kind == "adjoint_cayley" and not (miss := _automorphism_residual(algebra, x)) <= MAP_DEFECT_TOLERANCE:
-        return miss
-    move = getattr(group, f"{kind}_map") or getattr(maps, kind)
+    if kind == "adjoint_cayley" and not (residual := _automorphism_residual(algebra, x)) <= MAP_DEFECT_TOLERANCE:
+        return residual
+    group_map = getattr(group, f"{kind}_map") or getattr(maps, kind)
 
     @jax.jit
-    def misses(x):
-        g = move(algebra, x)
-        miss = group.defect(g)
+    def residuals(x):
+        g = group_map(algebra, x)
+        defect = group.defect(g)
         if kind != "adjoint_cayley":
-            return miss
-        wanted = cayley_of(algebra.ad(x))
-        return jnp.maximum(miss, max_abs_entry(_adjoint_action(group, g) - wanted) / max_abs_entry(wanted))
+            return defect
+        expected_action = cayley_of(algebra.ad(x))
+        return jnp.maximum(
+            defect, max_abs_entry(_adjoint_action(group, g) - expected_action) / max_abs_entry(expected_action)
+        )
 
     with jax.ensure_compile_time_eval():  # it may be asked for while a program is being traced
-        return float(np.nan_to_num(np.asarray(misses(x)), nan=np.inf).max())
+        return float(np.nan_to_num(np.asarray(residuals(x)), nan=np.inf).max())
 
 
 def _automorphism_residual(algebra: LieAlgebra, x: np.ndarray) -> float:
-    """How far ``cay(ad x)`` is from keeping brackets, relative to its size: an adjoint action keeps them."""
-    C, one = algebra.structure_constants, np.eye(algebra.dim)
+    """Return how far ``cay(ad x)`` is from preserving brackets, relative to its size; adjoint actions preserve them."""
+    C, identity = algebra.structure_constants, np.eye(algebra.dim)
     ad = np.einsum("abc,...a->...cb", C, x)
-    R = np.linalg.solve(one - ad / 2, one + ad / 2)
-    apart = np.einsum("...ia,...jb,ijc->...abc", R, R, C) - np.einsum("abd,...cd->...abc", C, R)
-    return float(np.abs(apart).max() / max(np.abs(C).max() * np.abs(R).max() ** 2, np.finfo(float).tiny))
+    R = np.linalg.solve(identity - ad / 2, identity + ad / 2)
+    difference = np.einsum("...ia,...jb,ijc->...abc", R, R, C) - np.einsum("abd,...cd->...abc", C, R)
+    return float(np.abs(difference).max() / max(np.abs(C).max() * np.abs(R).max() ** 2, np.finfo(float).tiny))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _principal_log(group: MatrixGroup, g):
-    member = group.defect(g) <= MEMBERSHIP_TOLERANCE
-    return jnp.where(member[..., None], group.log_map(group.algebra, g), jnp.nan)
+    is_member = group.defect(g) <= MEMBERSHIP_TOLERANCE
+    return jnp.where(is_member[..., None], group.log_map(group.algebra, g), jnp.nan)
 
 
 @_principal_log.defjvp
 def _log_derivative(group: MatrixGroup, primals, tangents):
-    """From ``exp(x) = g``: ``dexp(x) x' = vee(g^-1 g')``."""
+    """Solve ``dexp(x) x' = vee(g^-1 g')``, the derivative of ``exp(x) = g``."""
     (g,), (dg,) = primals, tangents
     x = _principal_log(group, g)
     velocity = group.algebra.vee(group.inverse_map(g) @ dg)
@@ -529,8 +540,11 @@ def _log_derivative(group: MatrixGroup, primals, tangents):
 _log = jax.jit(_principal_log, static_argnums=0)
 
 
-def _first_nonfinite_index(result, core: int) -> tuple[int, ...] | None:
-    """Batch index of the first result that is not finite, its last ``core`` axes one element; None while tracing."""
+def _first_nonfinite_index(result, n_core_axes: int) -> tuple[int, ...] | None:
+    """Return the batch index of the first result that is not finite, or None; None while tracing.
+
+    The last ``n_core_axes`` axes of the result hold one element.
+    """
     if is_traced(result):
         return None
-    return first_true_index(~np.isfinite(np.asarray(result)).all(axis=tuple(range(-core, 0))))
+    return first_true_index(~np.isfinite(np.asarray(result)).all(axis=tuple(range(-n_core_axes, 0))))

@@ -1,4 +1,4 @@
-"""Block diagonal matrices of equal blocks, without their zeros."""
+"""Block diagonal matrices of repeated blocks, stored without their zeros."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from .._pytree_module import Module
 
 
 class BlockDiagonal(Module):
-    """The linear map of a block diagonal matrix, some of whose blocks are repeated.
+    """Linear map of a block diagonal matrix whose blocks may be repeated.
 
     Attributes
     ----------
     blocks : tuple
         Square matrices, or other linear maps that ``@`` applies to one vector.
     sizes, counts : tuple of int
-        Rows of each block, and how often it stands in a row.
+        Rows of each block, and the number of its consecutive copies.
     """
 
     blocks: tuple[Any, ...]
@@ -27,17 +27,17 @@ class BlockDiagonal(Module):
     counts: tuple[int, ...] = eqx.field(static=True)
 
     def __matmul__(self, x) -> jax.Array:
-        """The image of a vector, shape (n,)."""
-        parts, start = [], 0
+        """Return the image of a vector, shape (n,)."""
+        images, start = [], 0
         for block, size, count in zip(self.blocks, self.sizes, self.counts, strict=True):
-            part = x[start : start + size * count].reshape(count, size)
-            parts.append(jax.vmap(lambda v, block=block: block @ v)(part).ravel())
+            block_vectors = x[start : start + size * count].reshape(count, size)
+            images.append(jax.vmap(lambda v, block=block: block @ v)(block_vectors).ravel())
             start += size * count
-        return parts[0] if len(parts) == 1 else jnp.concatenate(parts)
+        return images[0] if len(images) == 1 else jnp.concatenate(images)
 
 
 class Diagonal(Module):
-    """The linear map of a diagonal matrix, shape (n,) of its entries, or () for a multiple of the identity."""
+    """Linear map of a diagonal matrix; ``entries`` has shape (n,), or () for a multiple of the identity."""
 
     entries: jax.Array
 

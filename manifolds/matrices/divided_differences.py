@@ -15,57 +15,63 @@ import scipy.special
 from .._pytree_module import forward_to
 
 MAX_SPREAD_FOR_MEAN = 1 / 16
-"""Spread of points, relative to the width of a function, up to which divided differences are means of derivatives.
+"""Largest spread of points, relative to the width of a function, for which divided differences are means of
+derivatives.
 
-Beyond, a quotient of differences loses four bits. Up to it, what four nodes leave out of the mean is rounding.
+Beyond, a quotient of differences loses four bits. Up to it, the error of a mean over four nodes is rounding.
 """
 
 
 class ScalarFunction:
-    """A function of a number with its derivatives; equal ones can be hashed and are one function."""
+    """Function of a number with its derivatives; instances must be hashable, and equal ones must be one function."""
 
     @abstractmethod
     def derivative(self, x, order: int) -> jax.Array:
-        """The derivative of an order, entry by entry; of order 0 the function."""
+        """Return the derivative of an order, entry by entry; order 0 is the function itself."""
 
     @abstractmethod
     def width(self, x) -> jax.Array:
-        """The distance to the next place where the function has no Taylor series, or over which it changes much."""
+        """Return the distance from x to the nearest singularity, or the length over which the function changes much."""
 
     def difference_quotient(self, x, y) -> jax.Array:
-        """``f[x, y]``."""
+        """Return the first divided difference ``f[x, y]``."""
         return self._mean_or_quotient(x, y)
 
     @property
     def derivative_function(self) -> ScalarFunction:
-        """The derivative as such a function."""
+        """Derivative as a :class:`ScalarFunction`."""
         return Derivative(self)
 
     def divided_difference(self, *points) -> jax.Array:
-        """``f[x0, …, xk]``, which no order of the points changes; arrays that are broadcast."""
+        """Return ``f[x0, …, xk]`` of arrays that broadcast; it does not depend on the order of the points."""
         if len(points) == 1:
             return self.derivative(points[0], 0)
-        alike = jnp.broadcast_arrays(*points)
-        return self.difference_quotient(*alike) if len(alike) == 2 else self._mean_or_quotient(*alike)
+        broadcast_points = jnp.broadcast_arrays(*points)
+        return (
+            self.difference_quotient(*broadcast_points)
+            if len(broadcast_points) == 2
+            else self._mean_or_quotient(*broadcast_points)
+        )
 
     def _mean_or_quotient(self, *points) -> jax.Array:
-        ordered = _sort_entrywise(points)
-        width = jnp.stack([self.width(x) for x in ordered]).min(axis=0)
-        gap = ordered[-1] - ordered[0]
-        close = gap <= MAX_SPREAD_FOR_MEAN * width
-        further = self.divided_difference(*ordered[1:]) - self.divided_difference(*ordered[:-1])
-        return jnp.where(close, self._simplex_mean(ordered, 4), further / jnp.where(close, 1.0, gap))
+        sorted_points = _sort_entrywise(points)
+        width = jnp.stack([self.width(x) for x in sorted_points]).min(axis=0)
+        gap = sorted_points[-1] - sorted_points[0]
+        use_mean = gap <= MAX_SPREAD_FOR_MEAN * width
+        difference = self.divided_difference(*sorted_points[1:]) - self.divided_difference(*sorted_points[:-1])
+        return jnp.where(use_mean, self._simplex_mean(sorted_points, 4), difference / jnp.where(use_mean, 1.0, gap))
 
-    def _simplex_mean(self, points, nodes: int) -> jax.Array:
-        """The mean of a derivative over the simplex of the points [Genocchi & Hermite], by Gauss's quadrature."""
+    def _simplex_mean(self, points, n_nodes: int) -> jax.Array:
+        """Return the mean of the k-th derivative over the simplex of k + 1 points [Genocchi & Hermite], by Gauss
+        quadrature."""
         k = len(points) - 1
-        places, weights = _simplex_quadrature(k, nodes)
-        at = jnp.tensordot(places, jnp.stack(points), 1)
-        return jnp.tensordot(weights, self.derivative(at, k), 1)
+        barycentric, weights = _simplex_quadrature(k, n_nodes)
+        nodes_at = jnp.tensordot(barycentric, jnp.stack(points), 1)
+        return jnp.tensordot(weights, self.derivative(nodes_at, k), 1)
 
 
 def _sort_entrywise(points) -> list[jax.Array]:
-    """Points in ascending order, entry by entry; NaN stays."""
+    """Sort points in ascending order, entry by entry; NaN propagates."""
     points = list(points)
     for end in range(len(points) - 1, 0, -1):
         for i in range(end):
@@ -73,21 +79,28 @@ def _sort_entrywise(points) -> list[jax.Array]:
     return points
 
 
-def _simplex_quadrature(k: int, nodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Barycentric coordinates and weights, which sum to 1 / k!, of Gauss's quadrature in collapsed coordinates."""
-    places, weights = np.ones((1, 1)), np.ones(1)
+def _simplex_quadrature(k: int, n_nodes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return barycentric coordinates and weights of Gauss quadrature on a simplex; the weights sum to 1 / k!.
+
+    The rule is a product rule in collapsed coordinates.
+    """
+    barycentric, weights = np.ones((1, 1)), np.ones(1)
     for i in range(k):
-        x, w = scipy.special.roots_jacobi(nodes, k - 1 - i, 0)  # of the weight (1 - u)^(k - 1 - i)
+        x, w = scipy.special.roots_jacobi(n_nodes, k - 1 - i, 0)  # of the weight (1 - u)^(k - 1 - i)
         u, w = (x + 1) / 2, w / 2.0 ** (k - i)
-        kept = np.repeat(places, nodes, axis=0)
-        own = np.tile(u, len(places))[:, None]
-        places = np.concatenate([kept[:, :-1], kept[:, -1:] * own, kept[:, -1:] * (1 - own)], axis=1)
-        weights = np.repeat(weights, nodes) * np.tile(w, len(weights))
-    return places, weights
+        repeated = np.repeat(barycentric, n_nodes, axis=0)
+        node_column = np.tile(u, len(barycentric))[:, None]
+        barycentric = np.concatenate(
+            [repeated[:, :-1], repeated[:, -1:] * node_column, repeated[:, -1:] * (1 - node_column)], axis=1
+        )
+        weights = np.repeat(weights, n_nodes) * np.tile(w, len(weights))
+    return barycentric, weights
 
 
 @dataclass(frozen=True)
 class Exp(ScalarFunction):
+    """Exponential function."""
+
     def derivative(self, x, order):
         return jnp.exp(x)
 
@@ -96,8 +109,8 @@ class Exp(ScalarFunction):
 
     def difference_quotient(self, x, y):
         gap = jnp.abs(x - y)
-        same = gap == 0.0
-        return jnp.exp(jnp.maximum(x, y)) * jnp.where(same, 1.0, -jnp.expm1(-gap) / jnp.where(same, 1.0, gap))
+        is_equal = gap == 0.0
+        return jnp.exp(jnp.maximum(x, y)) * jnp.where(is_equal, 1.0, -jnp.expm1(-gap) / jnp.where(is_equal, 1.0, gap))
 
     @property
     def derivative_function(self):
@@ -106,7 +119,7 @@ class Exp(ScalarFunction):
 
 @dataclass(frozen=True)
 class Log(ScalarFunction):
-    """``log(start + x)``."""
+    """Function ``log(offset + x)``."""
 
     offset: float = 0.0
 
@@ -119,9 +132,11 @@ class Log(ScalarFunction):
         return self.offset + x
 
     def difference_quotient(self, x, y):
-        least, gap = self.offset + jnp.minimum(x, y), jnp.abs(x - y)
-        same = gap == 0.0
-        return jnp.where(same, 1.0 / least, jnp.log1p(gap / least) / jnp.where(same, 1.0, gap))
+        smaller_argument, gap = self.offset + jnp.minimum(x, y), jnp.abs(x - y)
+        is_equal = gap == 0.0
+        return jnp.where(
+            is_equal, 1.0 / smaller_argument, jnp.log1p(gap / smaller_argument) / jnp.where(is_equal, 1.0, gap)
+        )
 
     @property
     def derivative_function(self):
@@ -130,7 +145,7 @@ class Log(ScalarFunction):
 
 @dataclass(frozen=True)
 class Reciprocal(ScalarFunction):
-    """``1 / (start + x)``."""
+    """Function ``1 / (offset + x)``."""
 
     offset: float = 0.0
 
@@ -141,14 +156,16 @@ class Reciprocal(ScalarFunction):
         return jnp.abs(self.offset + x)
 
     def divided_difference(self, *points):
-        found = self.derivative(points[0], 0)
+        quotient = self.derivative(points[0], 0)
         for x in points[1:]:
-            found = -found * self.derivative(x, 0)
-        return found
+            quotient = -quotient * self.derivative(x, 0)
+        return quotient
 
 
 @dataclass(frozen=True)
 class Sqrt(ScalarFunction):
+    """Square root."""
+
     def derivative(self, x, order):
         factor = math.prod(0.5 - i for i in range(order))
         return factor * jnp.sqrt(x) / x**order if order else jnp.sqrt(x)
@@ -162,6 +179,8 @@ class Sqrt(ScalarFunction):
 
 @dataclass(frozen=True)
 class Derivative(ScalarFunction):
+    """Derivative of a :class:`ScalarFunction`."""
+
     function: ScalarFunction
 
     def derivative(self, x, order):
@@ -172,7 +191,7 @@ class Derivative(ScalarFunction):
 
 @dataclass(frozen=True)
 class GenericFunction(ScalarFunction):
-    """A function that nothing is known of, with as many derivatives as JAX takes."""
+    """Function without a known formula, with as many derivatives as JAX takes."""
 
     function: Callable
 
@@ -185,16 +204,26 @@ class GenericFunction(ScalarFunction):
         raise NotImplementedError
 
     def _mean_or_quotient(self, *points):
-        """The more accurate one, by what rounding makes of a quotient, and by what more nodes make of a mean."""
-        ordered = _sort_entrywise(points)
-        gap = ordered[-1] - ordered[0]
-        one, other = self.divided_difference(*ordered[1:]), self.divided_difference(*ordered[:-1])
-        same = gap == 0.0
-        quotient = (one - other) / jnp.where(same, 1.0, gap)
-        rounding = jnp.finfo(jnp.float64).eps * (jnp.abs(one) + jnp.abs(other)) / jnp.where(same, 1.0, gap)
-        mean = self._simplex_mean(ordered, 8)
-        by_mean = same | (jnp.abs(mean - self._simplex_mean(ordered, 6)) <= rounding)
-        return jnp.where(by_mean, mean, quotient)
+        """Return the more accurate of two estimates: a quotient of differences, or a mean of derivatives.
+
+        The rounding error of the quotient is compared to the change of the mean from six nodes to eight.
+        """
+        sorted_points = _sort_entrywise(points)
+        gap = sorted_points[-1] - sorted_points[0]
+        upper_difference, lower_difference = (
+            self.divided_difference(*sorted_points[1:]),
+            self.divided_difference(*sorted_points[:-1]),
+        )
+        is_equal = gap == 0.0
+        quotient = (upper_difference - lower_difference) / jnp.where(is_equal, 1.0, gap)
+        rounding = (
+            jnp.finfo(jnp.float64).eps
+            * (jnp.abs(upper_difference) + jnp.abs(lower_difference))
+            / jnp.where(is_equal, 1.0, gap)
+        )
+        mean = self._simplex_mean(sorted_points, 8)
+        use_mean = is_equal | (jnp.abs(mean - self._simplex_mean(sorted_points, 6)) <= rounding)
+        return jnp.where(use_mean, mean, quotient)
 
 
 KNOWN_FUNCTIONS: dict[Callable, ScalarFunction] = {
@@ -204,8 +233,9 @@ KNOWN_FUNCTIONS: dict[Callable, ScalarFunction] = {
     jnp.sqrt: Sqrt(),
     jnp.reciprocal: Reciprocal(),
 }
+"""Functions of ``jax.numpy`` with divided differences in closed form."""
 
 
 def scalar_function(f: Callable | ScalarFunction) -> ScalarFunction:
-    """A function of a number as one with divided differences."""
+    """Return ``f`` as a :class:`ScalarFunction`."""
     return f if isinstance(f, ScalarFunction) else KNOWN_FUNCTIONS.get(f) or GenericFunction(f)

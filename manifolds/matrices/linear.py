@@ -1,4 +1,4 @@
-"""Linear algebra of small matrices: elimination, frames, square roots."""
+"""Linear algebra of small matrices: elimination, orthonormal complements, square roots, determinants."""
 
 from __future__ import annotations
 
@@ -8,22 +8,23 @@ import numpy as np
 
 
 def adjoint(a):
-    """The adjoints of matrices, shape (..., n, m), those of NumPy too."""
+    """Return the conjugate transposes of matrices, shape (..., n, m), of NumPy or JAX."""
     return a.conj().swapaxes(-1, -2)
 
 
 def newton_schulz_step(u) -> jax.Array:
-    """One step of Newton and Schulz towards the nearest matrix with orthonormal columns.
+    """Take one Newton-Schulz step towards the nearest matrix with orthonormal columns.
 
-    It squares the distance of ``u^H u`` from I.
+    The step squares the distance of ``u^H u`` from I.
     """
     return 1.5 * u - 0.5 * u @ (adjoint(u) @ u)
 
 
 def orthonormal_complement(u) -> jax.Array:
-    """Columns that complete the orthonormal ones of u, shape (..., n, p), to a basis, shape (..., n, n - p).
+    """Return columns that complete the orthonormal columns of u, shape (..., n, p), to a basis, shape (..., n, n - p).
 
-    By Householder reflections, which take u to the first axes; smooth where none of its pivots changes sign.
+    The columns are images of the last axes under the Householder reflections that take u to the first axes. They are a
+    smooth function of u where no pivot changes sign.
     """
     n, p = u.shape[-2:]
     axes, normals = np.eye(n), []
@@ -35,23 +36,23 @@ def orthonormal_complement(u) -> jax.Array:
 
     for k in range(p):
         column = jnp.where(np.arange(n) < k, 0.0, u[..., :, k])
-        size = jnp.sqrt((column**2).sum(axis=-1, keepdims=True))
-        normals.append(column + jnp.where(column[..., k : k + 1] < 0, -size, size) * axes[k])
+        norm = jnp.sqrt((column**2).sum(axis=-1, keepdims=True))
+        normals.append(column + jnp.where(column[..., k : k + 1] < 0, -norm, norm) * axes[k])
         u = reflect(u, normals[-1])
-    rest = jnp.asarray(axes[:, p:])
+    complement = jnp.asarray(axes[:, p:])
     for normal in reversed(normals):
-        rest = reflect(rest, normal)
-    return rest
+        complement = reflect(complement, normal)
+    return complement
 
 
 def _square_root(a):
-    """Principal square root, its inverse, whether they converged: Denman and Beavers' iteration.
+    """Return the principal square root, its inverse, and a flag of convergence, by Denman and Beavers' iteration.
 
     The iterates (y, z) tend to (a^1/2, a^-1/2) [Higham 2008, eq. 6.15]. An eigenvalue at the angle pi - d costs
-    log2(1/d) steps more and loses as many bits.
+    log2(1/d) more steps and loses as many bits.
     """
 
-    def unfinished(state):
+    def is_unfinished(state):
         _, change, steps = state
         return ((change > 1e-8) & (steps < _MAX_ROOT_STEPS)).any()
 
@@ -61,19 +62,19 @@ def _square_root(a):
         return new, max_abs_entry(new[0] - roots[0]) / max_abs_entry(new[0]), steps + 1
 
     roots = jnp.stack([a, jnp.broadcast_to(np.eye(a.shape[-1], dtype=a.dtype), a.shape)])
-    roots, change, _ = jax.lax.while_loop(unfinished, newton, (roots, jnp.full(a.shape[:-2], jnp.inf), 0))
+    roots, change, _ = jax.lax.while_loop(is_unfinished, newton, (roots, jnp.full(a.shape[:-2], jnp.inf), 0))
     return *roots, change <= 1e-8  # quadratic convergence: a step of 1e-8 ends at rounding
 
 
 _MAX_ROOT_STEPS = 33
-"""Enough for every angle up to pi - HALF_TURN_MARGIN, and little more."""
+"""Largest number of iterations; just enough for every angle up to pi - HALF_TURN_MARGIN."""
 
 
 def solve(a, b) -> jax.Array:
-    """Solution x of ``a x = b``, shapes (..., m, m) and (..., m, k): Gauss-Jordan elimination with partial pivoting.
+    """Solve ``a x = b``, shapes (..., m, m) and (..., m, k), by Gauss-Jordan elimination with partial pivoting.
 
-    Plain array operations, on purpose. ``jnp.linalg.solve`` calls LAPACK, and on a CPU two calls that do not depend on
-    each other, in one compiled program, can wait for each other forever (jax 0.10.2, batches from about 1000).
+    It uses array operations only. ``jnp.linalg.solve`` calls LAPACK, and on a CPU two independent calls
+    in one compiled program can wait for each other forever (jax 0.10.2, batches from about 1000).
     """
     return jax.lax.custom_linear_solve(
         lambda x: a @ x,
@@ -84,9 +85,9 @@ def solve(a, b) -> jax.Array:
 
 
 def solve_near_identity(a, b) -> jax.Array:
-    """Solution x of ``a x = b`` without a search for pivots, for matrices whose symmetric part is positive definite.
+    """Solve ``a x = b`` without pivoting, for matrices whose symmetric part is positive definite.
 
-    In a program of scalars that search is most of the work. Batches broadcast.
+    In a program of scalars the search for pivots would be most of the work. Batches broadcast.
     """
     if a.shape[-1] == 1:
         return b / a
@@ -95,15 +96,16 @@ def solve_near_identity(a, b) -> jax.Array:
 
     def step(_, table):
         pivot_row = table[..., :1, :] / table[..., :1, :1]
-        rest = table[..., 1:, :] - table[..., 1:, :1] * pivot_row
-        table = jnp.concatenate([rest, pivot_row], axis=-2)[..., 1:]
+        lower_rows = table[..., 1:, :] - table[..., 1:, :1] * pivot_row
+        table = jnp.concatenate([lower_rows, pivot_row], axis=-2)[..., 1:]
         return jnp.concatenate([table, jnp.zeros_like(table[..., :1])], axis=-1)
 
     return jax.lax.fori_loop(0, a.shape[-1], step, jnp.concatenate([a, b], axis=-1))[..., : b.shape[-1]]
 
 
 def solve_lyapunov(g, c) -> jax.Array:
-    """Symmetric s with ``g s + s g = c``, symmetric, of one or two rows, by Cayley and Hamilton's theorem."""
+    """Solve ``g s + s g = c`` for symmetric s, with g and c symmetric of one or two rows, by Cayley and Hamilton's
+    theorem."""
     if g.shape[-1] == 1:
         return c / (2.0 * g)
     (a, b), (_, d) = (tuple(g[..., i, j][..., None, None] for j in range(2)) for i in range(2))
@@ -112,14 +114,14 @@ def solve_lyapunov(g, c) -> jax.Array:
 
 
 def inverse(a) -> jax.Array:
-    """Inverse matrix, with entries that are not finite where a is singular."""
+    """Return the inverse matrix; its entries are not finite if a is singular."""
     return solve(a, jnp.broadcast_to(np.eye(a.shape[-1], dtype=a.dtype), a.shape))
 
 
 def conjugate_by_stages(B, w, A) -> jax.Array:
-    """``U_i w U_i^H``, shape (s, n, n), where the U_i are the stages of ``U' = B U`` from the identity.
+    """Return ``U_i w U_i^H``, shape (s, n, n), where the U_i are the stages of ``U' = B U`` from the identity.
 
-    Multiples of the identity are left out of B: they move the phase of U alone, and may be large.
+    Multiples of the identity are removed from B: they change only the phase of U, and may be large.
 
     Parameters
     ----------
@@ -137,68 +139,69 @@ def conjugate_by_stages(B, w, A) -> jax.Array:
 
 
 def _remove_trace(a):
-    """Matrices, shape (..., n, n), less multiples of the identity."""
+    """Return matrices, shape (..., n, n), minus the multiples of the identity with equal traces."""
     n = a.shape[-1]
     return a - (jnp.trace(a, axis1=-2, axis2=-1) / n)[..., None, None] * np.eye(n)
 
 
 def cayley_rate(k, b) -> jax.Array:
-    """``k'`` for which ``U = (1 - k/2)^-1 (1 + k/2)`` moves by ``U' = B U``, of skew-Hermitian k and B, shape (n, n).
+    """Return ``k'`` for which ``U = (1 - k/2)^-1 (1 + k/2)`` moves by ``U' = B U``, for skew-Hermitian k and B, shape
+    (n, n).
 
-    Both are taken without their traces, and k' is without one: it moves U by B and a multiple of the identity, which
-    changes the phase of U alone.
+    The traces of k and B are removed, and k' has none: it moves U by B and a multiple of the identity, which
+    changes only the phase of U.
     """
-    half, one = 0.5 * _remove_trace(k), np.eye(k.shape[-1])
-    found, square = (one - half) @ _remove_trace(b) @ (one + half), one - half @ half
-    return found - (jnp.trace(found) / jnp.trace(square)) * square
+    half, identity = 0.5 * _remove_trace(k), np.eye(k.shape[-1])
+    rate, square = (identity - half) @ _remove_trace(b) @ (identity + half), identity - half @ half
+    return rate - (jnp.trace(rate) / jnp.trace(square)) * square
 
 
 def spectral_radius(X) -> jax.Array:
-    """Upper bound ``|X^64|^(1/64)`` on the size of the eigenvalues, and little above it."""
-    total = jnp.zeros(X.shape[:-2])
+    """Return the upper bound ``|X^64|^(1/64)`` on the moduli of the eigenvalues, which is little above the largest."""
+    log_norm_sum = jnp.zeros(X.shape[:-2])
     for k in range(7):
-        size = jnp.sqrt((jnp.abs(X) ** 2).sum(axis=(-2, -1)))
-        total = total + jnp.log(size) / 2.0**k
-        X = X / jnp.where(size > 0.0, size, 1.0)[..., None, None]
+        norm = jnp.sqrt((jnp.abs(X) ** 2).sum(axis=(-2, -1)))
+        log_norm_sum = log_norm_sum + jnp.log(norm) / 2.0**k
+        X = X / jnp.where(norm > 0.0, norm, 1.0)[..., None, None]
         X = X @ X
-    return jnp.exp(total)
+    return jnp.exp(log_norm_sum)
 
 
 def determinant(a) -> jax.Array:
-    """Determinant: the sum of products of at most three rows, or the signed product of the pivots."""
+    """Return the determinant: by minors for at most three rows, else the signed product of the pivots."""
     if a.shape[-1] <= 3:
-        first, *rest = jnp.moveaxis(a, (-2, -1), (0, 1))
-        return _determinant_by_minors(first, *rest)
+        row, *other_rows = jnp.moveaxis(a, (-2, -1), (0, 1))
+        return _determinant_by_minors(row, *other_rows)
     det = _eliminate(a, a[..., :0])[1]
     # a matrix of numbers leads to NaN only by way of a pivot of zero
     return jnp.where(jnp.isnan(det) & jnp.isfinite(a).all(axis=(-2, -1)), 0.0, det)
 
 
-def _determinant_by_minors(first, *rest):
-    """The determinant of a few rows, by minors."""
-    if not rest:
-        return first[0]
-    if len(rest) == 1:
-        return first[0] * rest[0][1] - first[1] * rest[0][0]
-    (a, b, c), (d, e, f) = rest
-    return first[0] * (b * f - c * e) + first[1] * (c * d - a * f) + first[2] * (a * e - b * d)
+def _determinant_by_minors(row, *other_rows):
+    """Return the determinant of at most three rows, by minors."""
+    if not other_rows:
+        return row[0]
+    if len(other_rows) == 1:
+        return row[0] * other_rows[0][1] - row[1] * other_rows[0][0]
+    (a, b, c), (d, e, f) = other_rows
+    return row[0] * (b * f - c * e) + row[1] * (c * d - a * f) + row[2] * (a * e - b * d)
 
 
 def skew_matrix(w, n: int) -> jax.Array:
-    """The skew matrices with the entries w above the diagonal, row by row, shape (..., n, n)."""
+    """Return the skew matrices with the entries w above the diagonal, row by row, shape (..., n, n)."""
     upper = jnp.zeros((*w.shape[:-1], n, n)).at[..., *np.triu_indices(n, 1)].add(w)
     return upper - upper.swapaxes(-1, -2)
 
 
 def symmetric_matrix(w, n: int) -> jax.Array:
-    """The symmetric matrices with the entries w on and above the diagonal, row by row, shape (..., n, n)."""
-    places = np.zeros((n, n), int)
-    places[np.triu_indices(n)] = np.arange(w.shape[-1])
-    return w[..., np.maximum(places, places.T)]
+    """Return the symmetric matrices with the entries w on and above the diagonal, row by row, shape (..., n, n)."""
+    indices = np.zeros((n, n), int)
+    indices[np.triu_indices(n)] = np.arange(w.shape[-1])
+    return w[..., np.maximum(indices, indices.T)]
 
 
 def max_abs_entry(matrix) -> jax.Array:
-    """Largest absolute value of the entries."""
+    """Return the largest absolute value of the entries, shape (...)."""
     return jnp.abs(matrix).max(axis=(-2, -1))
 
 
@@ -207,10 +210,10 @@ def _one_norm(matrix) -> jax.Array:
 
 
 def _eliminate(a, b):
-    """Solution of ``a x = b`` and determinant of a.
+    """Return the solution of ``a x = b`` and the determinant of a.
 
     In each step the pivot column leaves the table on the left and the pivot row enters at the bottom, so that the
-    program needs no indices that vary.
+    program needs no variable indices.
     """
     m = a.shape[-1]
     row = np.arange(m)
@@ -218,15 +221,15 @@ def _eliminate(a, b):
     def step(k, state):
         table, det = state
         column = table[..., 0]
-        best = jnp.argmax(jnp.where(row < m - k, jnp.abs(column), -1.0), axis=-1)[..., None]
-        chosen = (row == best)[..., None]
-        pivot_row = jnp.where(chosen, table, 0.0).sum(axis=-2, keepdims=True)
+        pivot_index = jnp.argmax(jnp.where(row < m - k, jnp.abs(column), -1.0), axis=-1)[..., None]
+        is_pivot = (row == pivot_index)[..., None]
+        pivot_row = jnp.where(is_pivot, table, 0.0).sum(axis=-2, keepdims=True)
         pivot = pivot_row[..., :1]
         pivot_row = pivot_row / pivot
-        rest = jnp.where(chosen, table[..., :1, :], table)[..., 1:, :]
-        table = jnp.concatenate([rest - rest[..., :1] * pivot_row, pivot_row], axis=-2)
+        other_rows = jnp.where(is_pivot, table[..., :1, :], table)[..., 1:, :]
+        table = jnp.concatenate([other_rows - other_rows[..., :1] * pivot_row, pivot_row], axis=-2)
         table = jnp.concatenate([table[..., 1:], jnp.zeros_like(table[..., :1])], axis=-1)
-        return table, det * jnp.where(best == 0, pivot[..., 0], -pivot[..., 0])[..., 0]
+        return table, det * jnp.where(pivot_index == 0, pivot[..., 0], -pivot[..., 0])[..., 0]
 
     start = (jnp.concatenate([a, b], axis=-1), jnp.ones(a.shape[:-2], dtype=a.dtype))
     table, det = jax.lax.fori_loop(0, m, step, start)

@@ -19,11 +19,11 @@ from .linear import adjoint
 from .symmetric import eigh
 
 MAX_JACOBI_ROWS = 3
-"""Rows up to which eigenvectors are found by rotations; beyond, LAPACK is called."""
+"""Largest number of rows for which Jacobi rotations compute eigenvectors; beyond, LAPACK does."""
 
 
 def spectral(f: Callable | ScalarFunction, a) -> jax.Array:
-    """``f(A) = U f(p) U^H`` of a Hermitian matrix ``A = U p U^H``, with all its derivatives.
+    """Return ``f(A) = U f(p) U^H`` of a Hermitian matrix ``A = U p U^H``, with all its derivatives.
 
     Forward and reverse mode have derivatives of any order, finite and exact also where eigenvalues meet [Daleckii &
     Krein 1965]. A function that is defined anew has another identity, and is compiled again.
@@ -45,7 +45,7 @@ def spectral(f: Callable | ScalarFunction, a) -> jax.Array:
 
 
 def spectral_trace(f: Callable | ScalarFunction, a) -> jax.Array:
-    """``tr f(A)``, shape (...), whose gradient is ``f'(A)``.
+    """Return ``tr f(A)``, shape (...), whose gradient is ``f'(A)``.
 
     Parameters
     ----------
@@ -68,10 +68,12 @@ def _trace_derivative(f, primals, tangents):
 
 
 def spectral_difference(f: Callable | ScalarFunction, a, b) -> jax.Array:
-    """The Hermitian G with ``tr(G (b - a)) = tr f(b) - tr f(a)``, a discrete gradient of ``tr f``, shape (..., n, n).
+    """Return the Hermitian G with ``tr(G (b - a)) = tr f(b) - tr f(a)``, a discrete gradient of ``tr f``, shape (...,
+    n, n).
 
-    ``G = sum f[p_k, q_l] |k><k|l><l|``, or its Hermitian part, over the eigenvectors of a and of b. It is ``f'(a)``
-    where both are equal, it is symmetric in both, and its rounding is relative: no difference of values is taken.
+    ``G = sum f[p_k, q_l] |k><k|l><l|``, or its Hermitian part, over the eigenvectors of a and of b. It is ``f'(a)`` if
+    a
+    and b are equal, it is symmetric in a and b, and its rounding error is relative: no difference of values is taken.
 
     Parameters
     ----------
@@ -81,16 +83,18 @@ def spectral_difference(f: Callable | ScalarFunction, a, b) -> jax.Array:
         Hermitian.
     """
     a, b = jnp.asarray(a), jnp.asarray(b)
-    found = chain(
+    gradient = chain(
         SpectralFunction(scalar_function(f)), [a, b], (0, 1), np.zeros(2), [np.eye(a.shape[-1], dtype=a.dtype)]
     )
-    return (found + adjoint(found)) / 2
+    return (gradient + adjoint(gradient)) / 2
 
 
 def log_mean(logs, shift, x) -> jax.Array:
-    """``L X``, with the logarithmic mean of ``e^-s A`` from the left and ``e^s A`` from the right, ``A = exp(logs)``.
+    """Return ``L X``, with the logarithmic mean of ``e^-s A`` from the left and ``e^s A`` from the right, ``A =
+    exp(logs)``.
 
-    In eigenvectors of A ``(L X)_kl = X_kl (u - v) / (ln u - ln v)`` with ``u = e^-s p_k`` and ``v = e^s p_l``. It is
+    In eigenvectors of A ``(L X)_kl = X_kl (u - v) / (ln u - ln v)`` with ``u = e^-s p_k`` and ``v = e^s p_l``. The mean
+    is
     the divided difference of exp at the logarithms, and so has all its derivatives [Carlen & Maas 2017].
 
     Parameters
@@ -107,25 +111,27 @@ def log_mean(logs, shift, x) -> jax.Array:
 
 @dataclass(frozen=True)
 class SpectralFunction:
-    """A function of the eigenvalues of Hermitian matrices: see :class:`.chains.Chained`."""
+    """Function of Hermitian matrices by their eigenvalues, with its chains: see :class:`.chains.MatrixFunction`."""
 
     function: ScalarFunction
 
     def decompose(self, a, unrolled: bool) -> tuple[jax.Array, jax.Array]:
         return _eigenvectors(a)
 
-    def chain(self, prepared, slots, shifts, directions, unrolled: bool) -> jax.Array:
-        found = prepared
-        vectors, k = [found[slot][1] for slot in slots], len(directions)
+    def chain(self, decompositions, slots, shifts, directions, unrolled: bool) -> jax.Array:
+        eigensystems = decompositions
+        vectors, k = [eigensystems[slot][1] for slot in slots], len(directions)
         points = [
-            (found[slot][0] + shifts[..., j, None])[(..., *(slice(None) if i == j else None for i in range(k + 1)))]
+            (eigensystems[slot][0] + shifts[..., j, None])[
+                (..., *(slice(None) if i == j else None for i in range(k + 1)))
+            ]
             for j, slot in enumerate(slots)
         ]
         weights, adjoints = self.function.divided_difference(*points), [adjoint(u) for u in vectors]
         inner = [adjoints[j] @ E @ vectors[j + 1] for j, E in enumerate(directions)]
         if k == 0:
             return (vectors[0] * weights[..., None, :]) @ adjoints[0]
-        if k > 1:  # sum over all places but the first and the last
+        if k > 1:  # sum over all positions but the first and the last
             letters = "abcdefghijklm"[: k + 1]
             pairs = ",".join("..." + letters[j : j + 2] for j in range(k))
             middle = jnp.einsum(f"...{letters},{pairs}->...{letters[0]}{letters[-1]}", weights, *inner)

@@ -1,4 +1,4 @@
-"""The charts of spaces that retractions are made of, and retractions by name."""
+"""Charts of state spaces, and retractions by name."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from .retraction import Chart, Retraction
 @jax.tree_util.register_static
 @dataclass(frozen=True, repr=False)
 class RiemannianRetraction(Chart):
-    """``R_h(z, v) = (z, exp_z(h v))`` with the exponential map of the space, that of its metric [BFM §4.4].
+    """Retraction ``R_h(z, v) = (z, exp_z(h v))`` by the Riemannian exponential map of the space [BFM §4.4].
 
-    On every space that has geodesics. The domain is the ball of the injectivity radius.
+    It exists on every space that has geodesics. The domain is the ball of the injectivity radius.
     """
 
     space: Space
@@ -39,10 +39,10 @@ class RiemannianRetraction(Chart):
 @jax.tree_util.register_static
 @dataclass(frozen=True, repr=False)
 class EuclideanRetraction(Chart):
-    """``R_h(z, v) = (z, z + h v)``, on spaces that are open sets of arrays: Euclidean ones, SPD(n) and their products.
+    """Retraction ``R_h(z, v) = (z, z + h v)`` on open sets of arrays: Euclidean spaces, SPD(n) and their products.
 
-    On SPD(n) the step is bounded to length 1 in the affine-invariant metric, where z + h v is positive definite for
-    sure.
+    On SPD(n) the step is bounded to length 1 in the affine-invariant metric, which guarantees that z + h v is positive
+    definite.
     """
 
     space: Space
@@ -72,9 +72,9 @@ class EuclideanRetraction(Chart):
 @jax.tree_util.register_static
 @dataclass(frozen=True, repr=False)
 class ProjectionRetraction(Chart):
-    """``R_h(z, v) = (z, project(z + h v))``, on every space, also on one that does not know its geodesics.
+    """Retraction ``R_h(z, v) = (z, project(z + h v))``, on every space, with geodesics or without.
 
-    Its inverse is found by Newton's method in the frame of z. The order is one with any projection, and two with the
+    Newton's method in the frame of z computes its inverse. The order is one with any projection, and two with the
     nearest point [Absil & Malick 2012].
     """
 
@@ -89,25 +89,28 @@ class ProjectionRetraction(Chart):
         space = self.space
         z, x = jnp.broadcast_arrays(z, x)
 
-        def rest(c):
+        def residual(c):
             return self._point(z, space._from_coordinates(z, c)) - x
 
         def newton(_, c):
-            defect, push = jax.linearize(rest, c)
+            residual_value, push_forward = jax.linearize(residual, c)
             axes = jnp.broadcast_to(jnp.eye(space.dim), (*c.shape, space.dim))
-            columns = jax.vmap(lambda axis: space._coordinates(z, push(axis)), in_axes=-1, out_axes=-1)(axes)
-            return c - solve(columns, space._coordinates(z, defect)[..., None])[..., 0]
+            columns = jax.vmap(lambda axis: space._coordinates(z, push_forward(axis)), in_axes=-1, out_axes=-1)(axes)
+            return c - solve(columns, space._coordinates(z, residual_value)[..., None])[..., 0]
 
         c = jax.lax.fori_loop(0, _MAX_NEWTON_STEPS, newton, space._coordinates(z, space._project_tangent(z, x - z)))
-        defect = jnp.abs(rest(c)).max(axis=space._axes, keepdims=True)
-        size = jnp.maximum(jnp.abs(x).max(axis=space._axes, keepdims=True), 1.0)
-        return jnp.where(defect <= MEMBERSHIP_TOLERANCE * size, space._from_coordinates(z, c), jnp.nan)
+        defect = jnp.abs(residual(c)).max(axis=space._axes, keepdims=True)
+        scale = jnp.maximum(jnp.abs(x).max(axis=space._axes, keepdims=True), 1.0)
+        return jnp.where(defect <= MEMBERSHIP_TOLERANCE * scale, space._from_coordinates(z, c), jnp.nan)
 
 
 _MAX_NEWTON_STEPS = 8
+"""Number of Newton steps for the inverse of a projection."""
 
 
 class _GroupChart(Chart):
+    """Chart of a group, whose vectors are carried by left translation."""
+
     def _middle(self, x, y):
         return self.space._group_exp(x, 0.5 * self.space._group_log(x, y))
 
@@ -118,10 +121,10 @@ class _GroupChart(Chart):
 @jax.tree_util.register_static
 @dataclass(frozen=True, repr=False)
 class GroupRetraction(_GroupChart):
-    """``R_h(z, v) = (z, z exp(h z^-1 v))`` with the exponential of the group, on groups and their products.
+    """Retraction ``R_h(z, v) = (z, z exp(h z^-1 v))`` by the group exponential, on groups and their products.
 
-    On SO(n) and SU(n) it is the Riemannian one, and on a GroupSpace that of the space. On SE(n) it follows screw
-    motions, to first order the same.
+    On SO(n) and SU(n) it is the Riemannian retraction, and on a GroupSpace that of the space. On SE(n) it follows screw
+    motions, which agree with geodesics to first order.
     """
 
     space: Space
@@ -137,10 +140,10 @@ class GroupRetraction(_GroupChart):
 @jax.tree_util.register_static
 @dataclass(frozen=True, repr=False)
 class CayleyRetraction(_GroupChart):
-    """``R_h(z, v) = (z, z cayley(h z^-1 v))``, on groups that Cayley's map stays in, and products.
+    """Retraction ``R_h(z, v) = (z, z cayley(h z^-1 v))``, on groups that Cayley's map stays in, and their products.
 
-    Rational, so cheaper than the exponential, and one to one on the whole tangent space, which covers all of the group
-    but the half turns. With z in the middle, a step is bounded by 4/pi of the injectivity radius: there it is a half
+    It is rational, so cheaper than the exponential, and one to one on the whole tangent space, which covers the group
+    except the half turns. With z in the middle, a step is bounded by 4/pi of the injectivity radius: there it is a half
     turn.
     """
 
@@ -163,9 +166,9 @@ class CayleyRetraction(_GroupChart):
 @jax.tree_util.register_static
 @dataclass(frozen=True, repr=False)
 class MidpointRetraction(Retraction):
-    """``R_h(z, v) = (point(z, -h v/2), point(z, h v/2))``, with z in the middle of the step [BFM 4.8].
+    """Retraction ``R_h(z, v) = (point(z, -h v/2), point(z, h v/2))``, with z in the middle of the step [BFM 4.8].
 
-    With the Riemannian chart this is the paper's ``exp~_h``, and z the midpoint of the geodesic from x to y.
+    With the Riemannian chart this is the paper's ``exp~_h``, and z is the midpoint of the geodesic from x to y.
 
     Parameters
     ----------
@@ -178,7 +181,8 @@ class MidpointRetraction(Retraction):
     def __post_init__(self):
         if not isinstance(self.chart, Chart):
             raise SpaceError(
-                f"MidpointRetraction is made from a chart, such as RiemannianRetraction(space), not from {self.chart!r}"
+                "MidpointRetraction(chart): chart must be a Chart, such as RiemannianRetraction(space), got "
+                f"{self.chart!r}"
             )
 
     space = forward_to("chart")
@@ -208,10 +212,11 @@ RETRACTIONS: dict[str, Callable[[Space], Retraction]] = {
     "midpoint_group_exp": lambda space: MidpointRetraction(GroupRetraction(space)),
     "midpoint_cayley": lambda space: MidpointRetraction(CayleyRetraction(space)),
 }
+"""Constructor of each retraction by name."""
 
 
 def retraction(space: Space | MatrixGroup, kind: str = "midpoint") -> Retraction:
-    """A retraction of a space by name.
+    """Return a retraction of a space by name.
 
     Parameters
     ----------
@@ -240,5 +245,5 @@ def retraction(space: Space | MatrixGroup, kind: str = "midpoint") -> Retraction
     """
     space = GroupSpace(space) if isinstance(space, MatrixGroup) else space
     if kind not in RETRACTIONS:
-        raise ParameterError(f"no retraction {kind!r}; take one of {', '.join(RETRACTIONS)}")
+        raise ParameterError(f"kind must be one of {', '.join(RETRACTIONS)}, got {kind!r}")
     return RETRACTIONS[kind](space)

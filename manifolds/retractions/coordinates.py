@@ -1,8 +1,8 @@
-"""Coordinates around a point of a state space: a chart, and the orthonormal frame that its vectors are counted in.
+"""Coordinates around a point of a state space: a chart, and the orthonormal frame that its vectors refer to.
 
-In coordinates c, shape (dim,), a manifold is R^dim: functions of points become functions of c, and tangent vectors and
-covectors at the point of c are taken to R^dim by the derivative of the chart. In products that is done factor by
-factor, so that the work grows with the number of factors and no faster.
+In coordinates c, shape (dim,), a manifold is R^dim: functions of points become functions of c, and the derivative of
+the chart maps tangent vectors and covectors at the point of c to R^dim. Products are treated factor by
+factor, so that the work is linear in the number of factors.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from .retraction import Chart
 
 
 class Place(NamedTuple):
-    """A point with coordinates c, and what takes vectors there to R^dim and covectors of R^dim there.
+    """Point with coordinates c, with the maps of vectors and covectors between it and R^dim.
 
     Attributes
     ----------
     point : array, shape ``(..., *shape)``
     lift : function
-        From a covector of R^dim, shape (..., dim), to the ambient covector that is paired with tangent vectors alike.
+        From a covector of R^dim, shape (..., dim), to the ambient covector with equal products with tangent vectors.
     lower : function
         From a tangent vector, shape ``(..., *shape)``, to the velocity of its coordinates, shape (..., dim).
     """
@@ -42,36 +42,40 @@ class Place(NamedTuple):
 class Coordinates(Module):
     """Coordinates c of the points ``chart.point(z, sum_a c_a E_a)`` around z, E the orthonormal frame of z.
 
-    Made by :func:`coordinates_around`.
+    Build them by :func:`coordinates_around`.
     """
 
     @abstractmethod
     def point(self, c) -> jax.Array:
-        """The point with the coordinates c, shape ``(..., *shape)``."""
+        """Return the point with the coordinates c, shape ``(..., *shape)``."""
 
     @abstractmethod
     def components(self, v) -> jax.Array:
-        """A tangent vector at z in the frame, shape (..., dim): the velocity of c where c = 0."""
+        """Return the components of a tangent vector at z in the frame, shape (..., dim): the velocity of c at c = 0."""
 
     @abstractmethod
     def vector(self, c) -> jax.Array:
-        """The inverse of :meth:`components`."""
+        """Return the tangent vector at z with components c: the inverse of :meth:`components`."""
 
     @abstractmethod
     def at(self, c) -> Place:
-        """The point with the coordinates c, and the maps of vectors and covectors there."""
+        """Return the point with the coordinates c, with the maps of vectors and covectors there."""
 
     @abstractmethod
     def centre(self) -> Place:
-        """``at(0)``, where the derivative of the chart is the identity."""
+        """Return ``at(0)``, where the derivative of the chart is the identity."""
 
 
 def coordinates_around(chart: Chart, z) -> Coordinates:
-    """Coordinates around a point, shape ``(*space.shape)``, or around each point of a batch."""
+    """Return coordinates around a point, shape ``(*space.shape)``, or around each point of a batch."""
     if isinstance(chart.space, Product):
-        parts = zip(chart.space.factors, chart.space.split(z), strict=True)
+        factor_points = zip(chart.space.factors, chart.space.split(z), strict=True)
         return _ProductCoordinates(
-            chart.space, tuple(coordinates_around(_chart_on_factor(chart, factor), part) for factor, part in parts)
+            chart.space,
+            tuple(
+                coordinates_around(_chart_on_factor(chart, factor), factor_point)
+                for factor, factor_point in factor_points
+            ),
         )
     if isinstance(chart.space, Power):
         return _PowerCoordinates(chart.space, coordinates_around(_chart_on_factor(chart, chart.space.base), z))
@@ -79,11 +83,13 @@ def coordinates_around(chart: Chart, z) -> Coordinates:
 
 
 def _chart_on_factor(chart: Chart, space) -> Chart:
-    """The chart of the same kind on a factor."""
+    """Return a chart of equal kind on a factor of the space."""
     return dataclasses.replace(chart, space=space)  # type: ignore[type-var]
 
 
 class _ChartCoordinates(Coordinates):
+    """Coordinates of one chart."""
+
     chart: Chart
     z: jax.Array
 
@@ -99,14 +105,16 @@ class _ChartCoordinates(Coordinates):
     def at(self, c):
         space = self.chart.space
         axes = np.broadcast_to(np.eye(space.dim)[(slice(None), *(None,) * (c.ndim - 1))], (space.dim, *c.shape))
-        x, push = jax.linearize(self.point, c)
-        columns = jax.vmap(lambda axis: space._coordinates(x, push(axis)))(jnp.asarray(axes))
-        back = inverse(jnp.moveaxis(columns, 0, -1))  # of the derivative, in the frames of both ends
+        x, push_forward = jax.linearize(self.point, c)
+        columns = jax.vmap(lambda axis: space._coordinates(x, push_forward(axis)))(jnp.asarray(axes))
+        inverse_jacobian = inverse(jnp.moveaxis(columns, 0, -1))  # of the derivative, in the frames of both ends
 
         def lift(alpha):
-            return space._flat(x, space._from_coordinates(x, (back.swapaxes(-1, -2) @ alpha[..., None])[..., 0]))
+            return space._flat(
+                x, space._from_coordinates(x, (inverse_jacobian.swapaxes(-1, -2) @ alpha[..., None])[..., 0])
+            )
 
-        return Place(x, lift, lambda v: (back @ space._coordinates(x, v)[..., None])[..., 0])
+        return Place(x, lift, lambda v: (inverse_jacobian @ space._coordinates(x, v)[..., None])[..., 0])
 
     def centre(self):
         space = self.chart.space
@@ -114,38 +122,44 @@ class _ChartCoordinates(Coordinates):
 
 
 class _ProductCoordinates(Coordinates):
+    """Coordinates of a product, factor by factor."""
+
     space: Product
     parts: tuple[Coordinates, ...]
 
     def point(self, c):
         return self.space.join(
-            *(part.point(own) for part, own in zip(self.parts, self._split_components(c), strict=True))
+            *(factor.point(component) for factor, component in zip(self.parts, self._split_components(c), strict=True))
         )
 
     def components(self, v):
         return self._join_components(
-            [part.components(own) for part, own in zip(self.parts, self.space.split(v), strict=True)]
+            [factor.components(component) for factor, component in zip(self.parts, self.space.split(v), strict=True)]
         )
 
     def vector(self, c):
         return self.space.join(
-            *(part.vector(own) for part, own in zip(self.parts, self._split_components(c), strict=True))
+            *(factor.vector(component) for factor, component in zip(self.parts, self._split_components(c), strict=True))
         )
 
     def at(self, c):
         return self._join_places(
-            [part.at(own) for part, own in zip(self.parts, self._split_components(c), strict=True)]
+            [factor.at(component) for factor, component in zip(self.parts, self._split_components(c), strict=True)]
         )
 
     def centre(self):
-        return self._join_places([part.centre() for part in self.parts])
+        return self._join_places([factor.centre() for factor in self.parts])
 
     def _join_places(self, places: list[Place]) -> Place:
         def lift(alpha):
-            return self.space.join(*(p.lift(own) for p, own in zip(places, self._split_components(alpha), strict=True)))
+            return self.space.join(
+                *(place.lift(component) for place, component in zip(places, self._split_components(alpha), strict=True))
+            )
 
         def lower(v):
-            return self._join_components([p.lower(own) for p, own in zip(places, self.space.split(v), strict=True)])
+            return self._join_components(
+                [place.lower(component) for place, component in zip(places, self.space.split(v), strict=True)]
+            )
 
         return Place(self.space.join(*(p.point for p in places)), lift, lower)
 
@@ -153,12 +167,12 @@ class _ProductCoordinates(Coordinates):
         return jnp.split(c, np.cumsum([factor.dim for factor in self.space.factors])[:-1], axis=-1)
 
     @staticmethod
-    def _join_components(parts):
-        return jnp.concatenate(parts, axis=-1)
+    def _join_components(components):
+        return jnp.concatenate(components, axis=-1)
 
 
 class _PowerCoordinates(Coordinates):
-    """The copies are a batch of the base."""
+    """Coordinates of a power of a space, whose copies are a batch of the base."""
 
     space: Power
     base: Coordinates

@@ -1,12 +1,12 @@
 """Retraction maps R_h: TP -> P x P and their inverses: finite differences on a manifold [BFM §4.4].
 
-A tangent vector v at z becomes the pair of points that a step h with velocity v leads from and to. Two choices make a
-retraction: a *chart* ``v -> point(z, v)`` of the space around z, with ``point(z, 0) = z`` and derivative the identity
-there, and the place of z in the step. At its start, ``R_h(z, v) = (z, point(z, h v))``, as every chart here does by
-itself; in its middle, ``(point(z, -h v/2), point(z, h v/2))``, as in :class:`MidpointRetraction`.
+A retraction maps a tangent vector v at z to the end points of a step h with velocity v. Two choices define it: a
+*chart* ``v -> point(z, v)`` of the space around z, with ``point(z, 0) = z`` and derivative the identity
+there, and the position of z in the step. At the start of the step, ``R_h(z, v) = (z, point(z, h v))``, as in every
+chart; in its middle, ``(point(z, -h v/2), point(z, h v/2))``, as in :class:`MidpointRetraction`.
 
 All maps can be jitted, vmapped and differentiated. A step that leaves the domain raises; under tracing, where values
-cannot be looked at, ask :meth:`Retraction.reach`, which must be below 1.
+are not available, check that :meth:`Retraction.reach` is below 1.
 """
 
 from __future__ import annotations
@@ -24,11 +24,14 @@ from ..spaces.base import Space
 from ..spaces.maps import run_kernel
 
 _MIDPOINT_ITERATIONS = 32
-"""Each shortens the distance from the middle by the square of that between the points, relative to the curvature."""
+"""Number of iterations for the midpoint.
+
+Each iteration multiplies the distance from the middle by the squared distance of the points, relative to the curvature.
+"""
 
 
 class Retraction(ABC):
-    """A map ``R_h(z, v) -> (x, y)`` on a state space, with its inverse.
+    r"""Map ``R_h(z, v) -> (x, y)`` on a state space, with its inverse.
 
     Attributes
     ----------
@@ -36,10 +39,10 @@ class Retraction(ABC):
     chart : Chart
         The chart it is made with: itself, unless it is a :class:`MidpointRetraction`.
     order : float
-        The largest p with ``R_1(z, v)`` within O(\\|v\\|^(p+1)) of what the Riemannian exponential gives in its place;
-        infinite where they are equal.
+        The largest p with ``R_1(z, v)`` within O(\|v\|^(p+1)) of the points that the Riemannian exponential would give;
+        infinite if they are equal.
     symmetric : bool
-        Whether ``R_h(z, -v)`` is ``R_h(z, v)`` with its two points exchanged.
+        True if ``R_h(z, -v)`` is ``R_h(z, v)`` with its two points exchanged.
     """
 
     space: Space
@@ -51,7 +54,7 @@ class Retraction(ABC):
     def order(self) -> float: ...
 
     def __call__(self, z, v, h=1.0) -> tuple[jax.Array, jax.Array]:
-        """``R_h(z, v)``: the points x and y that the step leads from and to.
+        """Return the points x and y of ``R_h(z, v)``, between which the step leads.
 
         Parameters
         ----------
@@ -76,13 +79,13 @@ class Retraction(ABC):
         if not is_traced(reach) and (index := first_true_index(~np.asarray(reach < 1.0))) is not None:
             radius = self.space.injectivity_radius(jnp.broadcast_arrays(z, v)[0][index])
             raise DomainError(
-                f"{self}: the step h v{format_index(index)} is {float(reach[index]):.6g} times as long as its inverse reaches "
-                f"(injectivity radius of the space {radius:.6g}): take a smaller step"
+                f"{self}: the step h v{format_index(index)} is {float(reach[index]):.6g} times as long as its inverse "
+                f"reaches (injectivity radius of the space {radius:.6g}): take a smaller step"
             )
-        return run_kernel(self, "_ends", (), z, v)
+        return run_kernel(self, "_end_points", (), z, v)
 
     def inverse(self, x, y, h=1.0) -> tuple[jax.Array, jax.Array]:
-        """``R_h^-1(x, y)``: the base point z and the tangent vector v there that the step from x to y comes from.
+        """Return ``R_h^-1(x, y)``: the base point z, and the tangent vector v there, of the step from x to y.
 
         Parameters
         ----------
@@ -100,12 +103,13 @@ class Retraction(ABC):
         OffManifoldError
         """
         x, y = self.space._checked_point(x, "x"), self.space._checked_point(y, "y")
-        z, v = run_kernel(self, "_base", (), x, y)
+        z, v = run_kernel(self, "_base_and_vector", (), x, y)
         self.space._raise_if_nan(v, len(self.space.shape), x, y, f"the inverse of {type(self).__name__}")
         return z, v / h
 
     def reach(self, z, v, h=1.0) -> jax.Array:
-        """Length of h v relative to the domain of the inverse, shape (...): a step is valid where it is below 1."""
+        """Return the length of h v relative to the domain of the inverse, shape (...); a step is valid if it is below
+        1."""
         return run_kernel(self, "_reach", (), *self._checked_step(z, v, h))
 
     @abstractmethod
@@ -126,12 +130,12 @@ class Retraction(ABC):
 
 
 class Chart(Retraction):
-    """A retraction with its base point at the start of the step: ``R_h(z, v) = (z, point(z, h v))``.
+    """Retraction with its base point at the start of the step: ``R_h(z, v) = (z, point(z, h v))``.
 
-    A subclass is a frozen dataclass with a ``space``, decorated with ``jax.tree_util.register_static``. It gives
-    ``_point``, ``_vector`` and ``order``, plain JAX functions of arrays already checked, with batches in front. It may
-    give ``_reach``, where the chart does not reach as far as the geodesics of the space do, and ``_carry``, which
-    :class:`MidpointRetraction` needs in integrators, and replace the ``_middle`` that is found by iteration.
+    A subclass is a frozen dataclass with a ``space``, decorated with ``jax.tree_util.register_static``. It implements
+    ``_point``, ``_vector`` and ``order``, plain JAX functions of checked arrays with leading batch axes. It may
+    override ``_reach``, if the chart does not reach as far as the geodesics of the space do, ``_carry``, which
+    :class:`MidpointRetraction` needs in integrators, and ``_middle``, which is found by iteration otherwise.
     """
 
     symmetric = False
@@ -141,14 +145,14 @@ class Chart(Retraction):
         return self
 
     def point(self, z, v) -> jax.Array:
-        """The point of the space that the chart around z gives the tangent vector v, shape ``(..., *space.shape)``.
+        """Return the point that the chart around z assigns to the tangent vector v, shape ``(..., *space.shape)``.
 
-        Defined beyond the domain of :meth:`vector` too.
+        It is defined beyond the domain of :meth:`vector` too.
         """
         return run_kernel(self, "_point", (), *self._checked_step(z, v, 1.0))
 
     def vector(self, z, x) -> jax.Array:
-        """The tangent vector at z that the chart gives the point x: the inverse of :meth:`point`.
+        """Return the tangent vector at z that the chart assigns to the point x: the inverse of :meth:`point`.
 
         Raises
         ------
@@ -158,35 +162,37 @@ class Chart(Retraction):
         return self.inverse(z, x)[1]
 
     def differential(self, z, v, w) -> jax.Array:
-        """Derivative of ``v -> point(z, v)`` along w: a tangent vector at ``point(z, v)``."""
+        """Return the derivative of ``v -> point(z, v)`` along w, a tangent vector at ``point(z, v)``."""
         return run_kernel(self, "_differential", (), *self.space._checked_vectors(z, "z", v=v, w=w))
 
     def carry(self, z, v, u) -> jax.Array:
-        """The tangent vector u at z, taken along to ``x = point(z, v)``: such that ``point(x, -carry(z, v, v))`` is z.
+        """Carry the tangent vector u from z to ``x = point(z, v)``, such that ``point(x, -carry(z, v, v))`` is z.
 
-        Parallel transport with the Riemannian chart, the same left-trivialised velocity with those of groups. With
+        The Riemannian chart carries by parallel transport; charts of groups preserve the left-trivialised velocity.
+        With
         ``w = carry(z, v, u)``, ``carry(x, -carry(z, v, v), w)`` is u again.
         """
         return run_kernel(self, "_carry", (), *self.space._checked_vectors(z, "z", v=v, u=u))
 
     @abstractmethod
     def _point(self, z, v):
-        """The point of the chart around z for the tangent vector v: z for 0, with the derivative the identity there."""
+        """Return the point of the chart around z for the tangent vector v: z for 0, with the derivative the identity
+        there."""
 
     @abstractmethod
     def _vector(self, z, x):
-        """The inverse of :meth:`_point`, NaN where it is not defined."""
+        """Return the inverse of :meth:`_point`, NaN where it is not defined."""
 
     def _middle(self, x, y):
-        """The z with ``vector(z, x) = -vector(z, y)``."""
+        """Return the z with ``vector(z, x) = -vector(z, y)``."""
 
-        def nearer(_, z):
+        def improve_midpoint(_, z):
             return self._point(z, 0.5 * (self._vector(z, x) + self._vector(z, y)))
 
-        return jax.lax.fori_loop(0, _MIDPOINT_ITERATIONS, nearer, self._point(x, 0.5 * self._vector(x, y)))
+        return jax.lax.fori_loop(0, _MIDPOINT_ITERATIONS, improve_midpoint, self._point(x, 0.5 * self._vector(x, y)))
 
     def _carry(self, z, v, u):
-        """See :meth:`carry`."""
+        """Implement :meth:`carry`."""
         raise SpaceError(
             f"{self} gives no _carry, so its base point cannot lie in the middle of a step: take retraction='exp', "
             "which has it at the start"
@@ -195,7 +201,7 @@ class Chart(Retraction):
     _reach = forward_to("space")
 
     def _midpoint_reach(self, z, v):
-        """Reach of the step v with z in its middle."""
+        """Return the reach of the step v with z in its middle."""
         return self.space._reach(z, v)
 
     def _differential(self, z, v, w):
@@ -213,9 +219,9 @@ class Chart(Retraction):
     def __post_init__(self):
         if not isinstance(self.space, Space):
             raise SpaceError(
-                f"{type(self).__name__} is made for a state space, not for {type(self.space).__name__}; of a group "
-                "make GroupSpace(group)"
+                f"{type(self).__name__}(space): space must be a state space, got {type(self.space).__name__}. For a "
+                "group, use GroupSpace(group)"
             )
-        like = jax.ShapeDtypeStruct(self.space.shape, self.space.dtype)
+        struct = jax.ShapeDtypeStruct(self.space.shape, self.space.dtype)
         for kernel in ("_point", "_vector", "_reach"):  # a space that lacks one refuses here
-            jax.eval_shape(getattr(self, kernel), like, like)
+            jax.eval_shape(getattr(self, kernel), struct, struct)

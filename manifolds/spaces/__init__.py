@@ -1,4 +1,4 @@
-"""State spaces: Riemannian manifolds with their geodesics in JAX, one abstraction and its native instances."""
+"""State spaces: Riemannian manifolds with geodesics in JAX; one base class and its native instances."""
 
 from .base import Space, registered_spaces
 from .correlation import Correlation

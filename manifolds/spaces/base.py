@@ -1,4 +1,4 @@
-"""A state space as its users see it: points, tangent vectors, a metric and its geodesics, all of them checked."""
+"""Base class of state spaces: points, tangent vectors, a metric and its geodesics, with checked arguments."""
 
 from __future__ import annotations
 
@@ -17,44 +17,46 @@ from .maps import SpaceMaps
 __all__ = ["CUT_MARGIN", "MEMBERSHIP_TOLERANCE", "Space", "register", "register_operation", "registered_spaces"]
 
 CUT_MARGIN = 1e-8
-"""A logarithm is taken up to this relative distance from the cut locus; beyond, its direction is decided by noise."""
+"""Smallest relative distance from the cut locus at which a logarithm is taken; below, rounding decides its
+direction."""
 
 _registry: list[tuple[Callable[..., Space], tuple]] = []
 
 
-def register(*arguments: tuple):
-    """Decorator: run the property suite on the constructor called with each of these argument tuples."""
+def register(*argument_tuples: tuple):
+    """Decorate a constructor to register the space of each argument tuple; the property suite runs on these spaces."""
 
-    def remember(constructor):
-        _registry.extend((constructor, a) for a in arguments)
+    def add_to_registry(constructor):
+        _registry.extend((constructor, a) for a in argument_tuples)
         return constructor
 
-    return remember
+    return add_to_registry
 
 
 def registered_spaces() -> Iterator[Space]:
-    """One instance after another of every registered state space."""
-    for constructor, arguments in _registry:
-        yield constructor(*arguments)
+    """Yield one instance of every registered state space."""
+    for constructor, args in _registry:
+        yield constructor(*args)
 
 
 class Space(SpaceMaps):
-    """A Riemannian manifold in an ambient space of arrays; leading axes of all arguments are batches, and broadcast.
+    """Riemannian manifold in an ambient space of arrays; leading axes of all arguments are batches, and broadcast.
 
-    A point is an array of the given shape, a tangent vector at it an array of the same shape, with the components of
+    A point is an array of shape ``shape``, a tangent vector at it an array of equal shape, with the components of
     its velocity in the ambient space. A covector, such as the gradient that ``jax.grad`` takes of a function of the
     ambient array, is paired with a tangent vector by ``Re sum(alpha * v)``.
 
-    All maps can be jitted, vmapped and differentiated. What they are handed is checked, and they raise where they are
-    not defined; under tracing, where values cannot be looked at, they return NaN instead.
+    All maps can be jitted, vmapped and differentiated. They check their arguments, and raise where they are
+    not defined; under tracing, where values are not available, they return NaN instead.
 
-    A subclass is a frozen dataclass, decorated with ``jax.tree_util.register_static``. It gives ``name``, ``dim``,
-    ``shape`` and ``_project``, and may replace the other members that begin with an underscore; each is a plain JAX
-    function of arrays already checked, with batches in front. The tangent spaces follow from ``_project``, any smooth
-    map from arrays to points that leaves points alone; the metric is that of the ambient array until ``_inner`` says
-    otherwise. There are geodesics where ``_exp``, ``_log`` and ``_transport`` are given, with
-    :meth:`injectivity_radius`; a space without is run in the chart of a :class:`manifolds.ProjectionRetraction`, or of
-    one's own. A closed form in place of what is derived is faster: the native spaces give all of it.
+    A subclass is a frozen dataclass, decorated with ``jax.tree_util.register_static``. It implements ``name``, ``dim``,
+    ``shape`` and ``_project``, and may override the other members that begin with an underscore; each is a plain JAX
+    function of checked arrays with leading batch axes. The tangent spaces follow from ``_project``, any smooth
+    map from arrays to points that leaves points unchanged; the metric is that of the ambient array unless ``_inner`` is
+    overridden. There are geodesics if ``_exp``, ``_log`` and ``_transport`` are given, with
+    :meth:`injectivity_radius`; a space without geodesics runs in the chart of a
+    :class:`manifolds.ProjectionRetraction`, or
+    of a chart of your own. A closed form is faster than a derived map: the native spaces have all of them.
 
     Attributes
     ----------
@@ -70,7 +72,7 @@ class Space(SpaceMaps):
     # -- points ---------------------------------------------------------------------------------------------------
 
     def point(self, x, project: bool = False, tolerance: float = MEMBERSHIP_TOLERANCE) -> jax.Array:
-        """``x`` as a point of the space, or a batch of points, shape ``(..., *shape)``.
+        """Return ``x`` as a point of the space, or a batch of points, shape ``(..., *shape)``, after a check.
 
         Parameters
         ----------
@@ -89,15 +91,15 @@ class Space(SpaceMaps):
         return self._checked_point(self.project(x) if project else self._point_array(x, "x"), "x", tolerance)
 
     def residual(self, x) -> jax.Array:
-        """Distance from the space relative to the size of x, to the order of magnitude, shape (...)."""
+        """Return the distance from the space relative to the size of x, to the order of magnitude, shape (...)."""
         return self._call_compiled("_residual", self._point_array(x, "x"))
 
     def belongs(self, x, tolerance: float = 1e-10) -> jax.Array:
-        """Whether each point lies on the space: ``residual(x) <= tolerance``, shape (...)."""
+        """Return True for each point with ``residual(x) <= tolerance``, shape (...)."""
         return self.residual(x) <= tolerance
 
     def project(self, x) -> jax.Array:
-        """A point of the space near x, the nearest one where that has a simple form, shape ``(..., *shape)``.
+        """Return a point of the space near x, the nearest one if that has a simple form, shape ``(..., *shape)``.
 
         Raises
         ------
@@ -111,7 +113,8 @@ class Space(SpaceMaps):
         return y
 
     def random(self, key_or_seed, size: tuple[int, ...] = ()) -> jax.Array:
-        """Random points, shape ``(*size, *shape)``: uniform on a compact space, else within a few units of a centre.
+        """Return random points, shape ``(*size, *shape)``: uniform on a compact space, else within a few units of a
+        centre.
 
         Parameters
         ----------
@@ -121,13 +124,14 @@ class Space(SpaceMaps):
         return self._call_compiled("_random", random_key(key_or_seed), static=(tuple(size),))
 
     def to_vector(self, x) -> jax.Array:
-        """Points or tangent vectors as flat real arrays, shape (..., size): real parts, then imaginary ones."""
+        """Return points or tangent vectors as flat real arrays, shape (..., size): real parts, then imaginary parts."""
         x = self._point_array(x, "x")
         rows = x.reshape(*x.shape[: x.ndim - len(self.shape)], -1)
         return rows if self.dtype.kind != "c" else jnp.concatenate([rows.real, rows.imag], axis=-1)
 
     def from_vector(self, x) -> jax.Array:
-        """The inverse of :meth:`to_vector`, shape ``(..., *shape)``."""
+        """Return the points or tangent vectors of flat real arrays, shape ``(..., *shape)``: the inverse of
+        :meth:`to_vector`."""
         x = jnp.asarray(numeric_array(x, "x"))
         if x.shape[-1:] != (self.size,):
             raise ShapeError(f"x must have last axis {self.size} for {self.name}, but its shape is {x.shape}")
@@ -139,25 +143,26 @@ class Space(SpaceMaps):
     # -- tangent vectors ------------------------------------------------------------------------------------------
 
     def project_tangent(self, x, w) -> jax.Array:
-        """The tangent vector at x nearest to the ambient array w in the Euclidean sense, shape ``(..., *shape)``."""
+        """Return the tangent vector at x nearest to the ambient array w in the Euclidean norm, shape ``(...,
+        *shape)``."""
         return self._call_compiled("_project_tangent", self._checked_point(x, "x"), self._point_array(w, "w"))
 
     def random_tangent(self, key_or_seed, x, scale: float = 1.0) -> jax.Array:
-        """Random tangent vectors at x, their components in a frame normal with standard deviation ``scale``."""
+        """Return random tangent vectors at x, with normal components of standard deviation ``scale`` in the frame."""
         x = self._checked_point(x, "x")
         batch = x.shape[: x.ndim - len(self.shape)]
         return self.from_coordinates(x, scale * jax.random.normal(random_key(key_or_seed), (*batch, self.dim)))
 
     def frame(self, x) -> jax.Array:
-        """An orthonormal basis of the tangent space at x, shape ``(..., dim, *shape)``."""
+        """Return an orthonormal basis of the tangent space at x, shape ``(..., dim, *shape)``."""
         return self._call_compiled("_frame", self._checked_point(x, "x"))
 
     def coordinates(self, x, v) -> jax.Array:
-        """Components of a tangent vector in :meth:`frame`, shape (..., dim)."""
+        """Return the components of a tangent vector in :meth:`frame`, shape (..., dim)."""
         return self._call_compiled("_coordinates", *self._checked_vectors(x, v=v))
 
     def from_coordinates(self, x, c) -> jax.Array:
-        """The tangent vector at x with the components c, shape (..., dim), in :meth:`frame`."""
+        """Return the tangent vector at x with the components c, shape (..., dim), in :meth:`frame`."""
         c = jnp.asarray(numeric_array(c, "c"))
         if c.shape[-1:] != (self.dim,):
             raise ShapeError(f"c must have last axis {self.dim} for {self.name}, but its shape is {c.shape}")
@@ -166,19 +171,20 @@ class Space(SpaceMaps):
     # -- metric ---------------------------------------------------------------------------------------------------
 
     def inner(self, x, u, v) -> jax.Array:
-        """Inner product of two tangent vectors at x, shape (...)."""
+        """Return the inner product of two tangent vectors at x, shape (...)."""
         return self._call_compiled("_inner", *self._checked_vectors(x, u=u, v=v))
 
     def norm(self, x, v) -> jax.Array:
-        """Length of a tangent vector, shape (...); its derivative at v = 0 is taken as 0."""
+        """Return the length of a tangent vector, shape (...); its derivative at v = 0 is taken as 0."""
         return self._call_compiled("_norm", *self._checked_vectors(x, v=v))
 
     def flat(self, x, v) -> jax.Array:
-        """The covector ``w -> inner(x, v, w)``, as an ambient array, shape ``(..., *shape)``."""
+        """Return the covector ``w -> inner(x, v, w)``, as an ambient array, shape ``(..., *shape)``."""
         return self._call_compiled("_flat", *self._checked_vectors(x, v=v))
 
     def sharp(self, x, alpha) -> jax.Array:
-        """The tangent vector v with ``inner(x, v, w) = Re sum(alpha * w)`` for all w: of dH, the gradient of H.
+        """Return the tangent vector v with ``inner(x, v, w) = Re sum(alpha * w)`` for all w; dH gives the gradient of
+        H.
 
         Parameters
         ----------
@@ -189,7 +195,8 @@ class Space(SpaceMaps):
         return self._call_compiled("_sharp", self._checked_point(x, "x"), self._point_array(alpha, "alpha"))
 
     def isotropic(self, x, w) -> jax.Array:
-        """``R w``, a tangent vector, with ``R R^T`` the inverse of the metric: of normal numbers, isotropic noise.
+        """Return the tangent vector ``R w``, with ``R R^T`` the inverse of the metric; normal numbers w give isotropic
+        noise.
 
         Parameters
         ----------
@@ -203,7 +210,8 @@ class Space(SpaceMaps):
         return self._call_compiled("_isotropic", self._checked_point(x, "x"), w.astype(jnp.float64))
 
     def divergence(self, field, x) -> jax.Array:
-        """The divergence of a vector field at one point, shape (): how fast its flow expands Riemannian volume.
+        """Return the divergence of a vector field at one point, shape (): the rate at which its flow expands Riemannian
+        volume.
 
         Parameters
         ----------
@@ -222,11 +230,12 @@ class Space(SpaceMaps):
     # -- geodesics ------------------------------------------------------------------------------------------------
 
     def exp(self, x, v) -> jax.Array:
-        """Riemannian exponential map: the geodesic from x with velocity v, at time 1, shape ``(..., *shape)``."""
+        """Return the point at time 1 of the geodesic from x with velocity v, shape ``(..., *shape)``: Riemannian
+        exponential."""
         return self._call_compiled("_exp", *self._checked_vectors(x, v=v))
 
     def log(self, x, y) -> jax.Array:
-        """Riemannian logarithm: the v of least length with ``exp(x, v) = y``, a tangent vector at x.
+        """Return the v of least length with ``exp(x, v) = y``, a tangent vector at x: the Riemannian logarithm.
 
         Parameters
         ----------
@@ -245,7 +254,7 @@ class Space(SpaceMaps):
         return v
 
     def distance(self, x, y) -> jax.Array:
-        """Length of the shortest geodesic from x to y, shape (...).
+        """Return the length of the shortest geodesic from x to y, shape (...).
 
         The distance has no derivative where x and y are one point; there its derivative is taken as 0. Its square has
         all: ``distance(x, y)**2`` has the exact gradient 0 and, as its Hessian, twice the metric. Other functions of
@@ -263,7 +272,7 @@ class Space(SpaceMaps):
         return d
 
     def squared_distance(self, x, y) -> jax.Array:
-        """Square of :meth:`distance`, shape (...): a smooth function, also where x and y are one point.
+        """Return the square of :meth:`distance`, shape (...): a smooth function, also where x and y are one point.
 
         Raises
         ------
@@ -276,14 +285,15 @@ class Space(SpaceMaps):
         return square
 
     def midpoint(self, x, y) -> jax.Array:
-        """Half way along the shortest geodesic from x to y, shape ``(..., *shape)``; raises as :meth:`log`."""
+        """Return the point half way along the shortest geodesic from x to y, shape ``(..., *shape)``; raises as
+        :meth:`log`."""
         x, y = self._checked_point(x, "x"), self._checked_point(y, "y")
         z = self._midpoint(x, y)
         self._raise_if_nan(z, len(self.shape), x, y, "midpoint")
         return z
 
     def transport(self, x, v, u) -> jax.Array:
-        """Parallel transport of the tangent vector u along ``t -> exp(x, t v)``, from t = 0 to 1.
+        """Return the parallel transport of the tangent vector u along ``t -> exp(x, t v)``, from t = 0 to 1.
 
         Returns
         -------
@@ -293,39 +303,44 @@ class Space(SpaceMaps):
         return self._call_compiled("_transport", *self._checked_vectors(x, v=v, u=u))
 
     def reach(self, x, v) -> jax.Array:
-        """Length of v over the injectivity radius, shape (...): below 1, ``log`` recovers v from ``exp(x, v)``.
+        """Return the length of v over the injectivity radius, shape (...); below 1, ``log`` recovers v from ``exp(x,
+        v)``.
 
-        Defined under tracing too: it is how to ask whether a step stays in the domain. In a product, the largest over
+        It is defined under tracing too, where it tells if a step stays in the domain. In a product it is the largest
+        over
         the factors.
         """
         return self._call_compiled("_reach", *self._checked_vectors(x, v=v))
 
     # -- checks ---------------------------------------------------------------------------------------------------
 
-    def _point_array(self, x, what: str) -> jax.Array:
-        """``x`` as an array of the shape and kind of points."""
-        array = jnp.asarray(numeric_array(x, what))
+    def _point_array(self, x, label: str) -> jax.Array:
+        """Return ``x`` as an array with the shape and dtype of points."""
+        array = jnp.asarray(numeric_array(x, label))
         if jnp.iscomplexobj(array) and self.dtype.kind != "c":
             raise ComponentError(
-                f"{what} must be real for {self.name}, not {array.dtype}: take its real part if that is meant"
+                f"{label} must be real for {self.name}, not {array.dtype}: take its real part if that is meant"
             )
         if array.shape[array.ndim - len(self.shape) :] != self.shape or array.ndim < len(self.shape):
-            expected = f"(..., {', '.join(map(str, self.shape))})"
-            raise ShapeError(f"{what} must have the shape {expected} for {self.name}, but its shape is {array.shape}")
+            expected_shape = f"(..., {', '.join(map(str, self.shape))})"
+            raise ShapeError(
+                f"{label} must have the shape {expected_shape} for {self.name}, but its shape is {array.shape}"
+            )
         return array.astype(self.dtype)
 
-    def _checked_point(self, x, what: str, tolerance: float = MEMBERSHIP_TOLERANCE) -> jax.Array:
-        x = self._point_array(x, what)
+    def _checked_point(self, x, label: str, tolerance: float = MEMBERSHIP_TOLERANCE) -> jax.Array:
+        x = self._point_array(x, label)
         if is_traced(x):
             return x
         with jax.ensure_compile_time_eval():  # x may be a constant in a program being traced
             residual, values = np.asarray(self._call_compiled("_residual", x)), np.asarray(x)
         if (index := first_true_index(~(residual <= tolerance))) is not None:
-            worst = float(residual[index])
+            largest_residual = float(residual[index])
             raise OffManifoldError(
-                f"{self.name}: {what}{format_index(index)} is off the space: {self._why_off_space(values[index], worst)}, "
-                f"tolerance {tolerance:.0e}; point({what}, project=True) moves it there",
-                residual=worst,
+                f"{self.name}: {label}{format_index(index)} is off the space: "
+                f"{self._why_off_space(values[index], largest_residual)}, tolerance {tolerance:.0e}; "
+                f"point({label}, project=True) moves it there",
+                residual=largest_residual,
                 tolerance=tolerance,
             )
         return x
@@ -334,45 +349,45 @@ class Space(SpaceMaps):
         return f"residual {residual:.3g}" if np.isfinite(x).all() else "residual nan, as it is not finite"
 
     def _checked_vectors(self, x, name: str = "x", **vectors) -> list[jax.Array]:
-        """The point, and each of the vectors as a tangent vector there."""
-        x, checked = self._checked_point(x, name), []
-        for what, v in vectors.items():
-            v = self._point_array(v, what)
+        """Return the point and the vectors, after checking that each vector is tangent at the point."""
+        x, arrays = self._checked_point(x, name), []
+        for label, v in vectors.items():
+            v = self._point_array(v, label)
             if not is_traced(x, v):
-                self._check_tangent(x, name, v, what)
-            checked.append(v)
-        return [x, *checked]
+                self._check_tangent(x, name, v, label)
+            arrays.append(v)
+        return [x, *arrays]
 
-    def _check_tangent(self, x, name: str, v, what: str) -> None:
+    def _check_tangent(self, x, name: str, v, label: str) -> None:
         with jax.ensure_compile_time_eval():
             residual = np.asarray(self._call_compiled("_tangent_residual", x, v))
         if (index := first_true_index(~(residual <= MEMBERSHIP_TOLERANCE))) is not None:
-            worst = float(residual[index])
+            largest_residual = float(residual[index])
             raise OffManifoldError(
-                f"{self.name}: {what}{format_index(index)} is not tangent at {name}: residual {worst:.3g}, tolerance "
-                f"{MEMBERSHIP_TOLERANCE:.0e}; project_tangent({name}, {what}) makes it so",
-                residual=worst,
+                f"{self.name}: {label}{format_index(index)} is not tangent at {name}: residual {largest_residual:.3g}, "
+                f"tolerance {MEMBERSHIP_TOLERANCE:.0e}; project_tangent({name}, {label}) makes it so",
+                residual=largest_residual,
                 tolerance=MEMBERSHIP_TOLERANCE,
             )
 
     def _tangent_residual(self, x, v):
         axes = self._axes
-        size = jnp.maximum(jnp.abs(v).max(axis=axes, initial=0.0), 1.0)
-        return jnp.abs(v - self._project_tangent(x, v)).max(axis=axes, initial=0.0) / size
+        scale = jnp.maximum(jnp.abs(v).max(axis=axes, initial=0.0), 1.0)
+        return jnp.abs(v - self._project_tangent(x, v)).max(axis=axes, initial=0.0) / scale
 
-    def _raise_if_nan(self, value, core: int, x, y, what: str) -> None:
-        if (index := self._first_nan_index(value, core)) is not None:
-            batch = value.shape[: value.ndim - core]
+    def _raise_if_nan(self, value, n_core_axes: int, x, y, map_name: str) -> None:
+        if (index := self._first_nan_index(value, n_core_axes)) is not None:
+            batch = value.shape[: value.ndim - n_core_axes]
             x, y = (np.asarray(jnp.broadcast_to(a, (*batch, *self.shape))[index]) for a in (x, y))
             raise DomainError(
-                f"{self.name}: {what}(x, y){format_index(index)} is not defined: {self._why_no_log(x, y)}"
+                f"{self.name}: {map_name}(x, y){format_index(index)} is not defined: {self._why_no_log(x, y)}"
             )
 
     @staticmethod
-    def _first_nan_index(value, core: int) -> tuple[int, ...] | None:
+    def _first_nan_index(value, n_core_axes: int) -> tuple[int, ...] | None:
         if is_traced(value):
             return None
-        return first_true_index(~np.isfinite(np.asarray(value)).all(axis=tuple(range(-core, 0))))
+        return first_true_index(~np.isfinite(np.asarray(value)).all(axis=tuple(range(-n_core_axes, 0))))
 
     # -- helpers --------------------------------------------------------------------------------------------------
 
@@ -386,18 +401,20 @@ class Space(SpaceMaps):
         return self._power(self, count)
 
     _product: ClassVar[Callable[..., Space]]
+    """Class of products of spaces, set by :func:`register_operation`, since it is defined after this class."""
+
     _power: ClassVar[Callable[..., Space]]
-    """Products are spaces themselves, of classes that are defined after this one: they enter by :func:`makes`."""
+    """Class of powers of spaces, set by :func:`register_operation`, since it is defined after this class."""
 
 
 def register_operation(operation: str) -> Callable[[type[Space]], type[Space]]:
-    """Decorator: spaces of this class are what the operation of spaces makes, ``"_product"`` or ``"_power"``."""
+    """Return a decorator that makes a class the result of an operation, ``"_product"`` or ``"_power"``, of spaces."""
 
-    def entered(space: type[Space]) -> type[Space]:
-        setattr(Space, operation, space)
-        return space
+    def set_operation(space_class: type[Space]) -> type[Space]:
+        setattr(Space, operation, space_class)
+        return space_class
 
-    return entered
+    return set_operation
 
 
 def random_key(key_or_seed):

@@ -45,7 +45,7 @@ class Correlation(PositiveDefinite):
         return jnp.where(self._inside(x), max_abs_entry(self._constraint_residual(x)), jnp.inf)
 
     def _project(self, x):
-        """The correlations of a covariance."""
+        """Return the correlation matrix of a covariance matrix."""
         scale = 1.0 / jnp.sqrt(jnp.diagonal(x, axis1=-2, axis2=-1))
         y = self._with_unit_diagonal(symmetrize(x) * scale[..., :, None] * scale[..., None, :])
         return jnp.where(self._inside(y)[..., None, None], y, jnp.nan)
@@ -54,7 +54,7 @@ class Correlation(PositiveDefinite):
         return jnp.where(np.eye(self.n, dtype=bool), 1.0, x)
 
     def _constraint_residual(self, x):
-        """What of a matrix is skew, and its diagonal less one."""
+        """Return the skew part of x off the diagonal, and x - 1 on it."""
         return jnp.where(np.eye(self.n, dtype=bool), x - 1.0, 0.5 * (x - x.swapaxes(-1, -2)))
 
     def _constraints(self, x):
@@ -96,9 +96,9 @@ class Correlation(PositiveDefinite):
         return jax.jvp(self._chart, (x,), (v,))[1]
 
     def _from_coordinates(self, x, c):
-        start = self._chart(x)
-        start, c = jnp.broadcast_arrays(start, c)
-        return jax.jvp(self._inverse_chart, (start,), (c,))[1]
+        start_coordinates = self._chart(x)
+        start_coordinates, c = jnp.broadcast_arrays(start_coordinates, c)
+        return jax.jvp(self._inverse_chart, (start_coordinates,), (c,))[1]
 
     def _frame(self, x):
         return jax.vmap(lambda e: self._from_coordinates(x, e), out_axes=-3)(jnp.eye(self.dim))
@@ -111,8 +111,8 @@ class Correlation(PositiveDefinite):
 
     def _sharp(self, x, alpha):
         x, alpha = jnp.broadcast_arrays(x, alpha)
-        start = self._chart(x)
-        return self._from_coordinates(x, jax.vjp(self._inverse_chart, start)[1](alpha)[0])
+        start_coordinates = self._chart(x)
+        return self._from_coordinates(x, jax.vjp(self._inverse_chart, start_coordinates)[1](alpha)[0])
 
     def _exp(self, x, v):
         return self._inverse_chart(self._chart(x) + self._coordinates(x, v))

@@ -17,7 +17,7 @@ from .base import Space, register
 @jax.tree_util.register_static
 @dataclass(frozen=True, init=False, repr=False)
 class Euclidean(Space):
-    """Arrays of the given shape: ``Euclidean(3)`` is R^3, ``Euclidean(2, 4)`` the 2 x 4 matrices."""
+    """Arrays of a given shape: ``Euclidean(3)`` is R^3, ``Euclidean(2, 4)`` the 2 x 4 matrices."""
 
     sizes: tuple[int, ...]
     metric = "flat"
@@ -104,7 +104,7 @@ class Euclidean(Space):
         return u + jnp.zeros_like(y)
 
     def _cayley(self, x, v):
-        """That of the translations, as matrices ``[[I, x], [0, 1]]``."""
+        """Return the Cayley map of the translations, as matrices ``[[I, x], [0, 1]]``."""
         return x + v
 
     def _inverse_cayley(self, x, y):

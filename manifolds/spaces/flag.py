@@ -1,4 +1,4 @@
-"""Flags: subspaces one in another."""
+"""Flag manifolds: nested subspaces of R^n."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from .homogeneous import Homogeneous
 @register((1, 1, 2))
 @jax.tree_util.register_static
 class Flag(Homogeneous):
-    """Flags ``V_1 < V_2 < ... < R^n``: each subspace has so many dimensions more than the one before.
+    """Flags ``V_1 < V_2 < ... < R^n``: each subspace has ``steps[i]`` dimensions more than the one before.
 
     ``Flag(1, 1, 2)`` has a line in a plane in R^4. A point is a rotation x whose first columns span V_1, the next ones
-    what V_2 has beside it, and so on; each piece is oriented. Two pieces are a Grassmann manifold, at ``1 / sqrt(2)``
-    of its distances.
+    complete them to a basis of V_2, and so on; each piece is oriented. Two pieces are a Grassmann manifold, at
+    ``1 / sqrt(2)`` of its distances.
 
     Parameters
     ----------
@@ -30,27 +30,28 @@ class Flag(Homogeneous):
 
     def __init__(self, *steps: int):
         if len(steps) < 2:
-            raise ParameterError(f"a flag has two pieces or more, such as Flag(1, 2), not {len(steps)}")
+            raise ParameterError(f"Flag(*steps) needs at least two steps, as in Flag(1, 2), got {len(steps)}")
         sizes = [checked_size(step, 1, "Flag(*steps)", "a step") for step in steps]
-        n, start, turns = sum(sizes), 0, []
+        n, start, rotations = sum(sizes), 0, []
         for size in sizes:
             for i in range(start, start + size):
                 for j in range(i + 1, start + size):
-                    turn = np.zeros((n, n))
-                    turn[i, j], turn[j, i] = -1.0, 1.0
-                    turns.append(turn)
+                    rotation = np.zeros((n, n))
+                    rotation[i, j], rotation[j, i] = -1.0, 1.0
+                    rotations.append(rotation)
             start += size
-        super().__init__(SpecialOrthogonal(n), np.reshape(turns, (-1, n, n)), f"Fl({', '.join(map(str, sizes))})")
+        super().__init__(SpecialOrthogonal(n), np.reshape(rotations, (-1, n, n)), f"Fl({', '.join(map(str, sizes))})")
         object.__setattr__(self, "steps", tuple(sizes))
 
     steps: tuple[int, ...]
 
     def projectors(self, x) -> jax.Array:
-        """The orthogonal projectors to the pieces, shape (..., pieces, n, n): what functions of flags are made of.
+        """Return the orthogonal projectors onto the pieces, shape (..., pieces, n, n), of which functions of flags are
+        made.
 
         Parameters
         ----------
         x : array, shape (..., n, n)
         """
-        parts = jnp.split(self._point_array(x, "x"), np.cumsum(self.steps)[:-1], axis=-1)
-        return jnp.stack([part @ part.swapaxes(-1, -2) for part in parts], axis=-3)
+        frames = jnp.split(self._point_array(x, "x"), np.cumsum(self.steps)[:-1], axis=-1)
+        return jnp.stack([frame @ frame.swapaxes(-1, -2) for frame in frames], axis=-3)

@@ -1,11 +1,11 @@
-"""Any geomstats manifold with a metric as a state space, through a callback to the host.
+"""Any geomstats manifold with a metric as a state space, through callbacks to the host.
 
-geomstats runs in NumPy: a compiled program stops at every call and hands it the arrays. That makes such a space slower
-than a native one, and confines it to the CPU and the array engine. Batches go over in one call.
+geomstats runs in NumPy: a compiled program stops at every call and hands the arrays over. Such a space is therefore
+slower than a native one, and confined to the CPU and the array engine. Batches go over in one call.
 
 Derivatives, forward and reverse, are central differences of order 8 on the host, over geodesics where a point varies:
-right to about 1e-12 for the closed forms of geomstats, to less for its numerical solvers. There are none of second
-order.
+right to about 1e-12 for the closed forms of geomstats, to less for its numerical solvers. There are no second
+derivatives.
 
 geomstats is imported by :func:`from_geomstats`, not before.
 """
@@ -34,15 +34,16 @@ _DIFFERENCE_STEP = 0.02
 
 
 def from_geomstats(space, injectivity_radius: float | None = None) -> GeomstatsSpace:
-    """A geomstats manifold, equipped with a metric, as a state space.
+    """Return a geomstats manifold, equipped with a metric, as a state space.
 
     Parameters
     ----------
     space : geomstats Manifold
         For example ``Hypersphere(2)`` or ``PoincareBall(2)``, with points of its own kind: see ``space.shape``.
     injectivity_radius : float, optional
-        By default what the metric says, and infinite where it does not know; for SO(n) and SE(n) pi and sqrt(2) pi, as
-        geomstats 2.8 gives them larger than they are.
+        By default the radius of the metric, and infinite if the metric has none; for SO(n) and SE(n) pi and sqrt(2) pi,
+        as
+        geomstats 2.8 returns larger values than the true ones.
 
     Raises
     ------
@@ -58,22 +59,24 @@ def from_geomstats(space, injectivity_radius: float | None = None) -> GeomstatsS
         raise SpaceError(f"{_name(space)} has complex points, which are not supported")
 
     if not isinstance(space, Manifold):
-        raise SpaceError(f"from_geomstats takes a geomstats manifold, not {type(space).__name__}")
+        raise SpaceError(f"from_geomstats(space): space must be a geomstats manifold, got {type(space).__name__}")
     if not backend.__name__.endswith("numpy"):
-        raise SpaceError(f"geomstats runs with the backend {backend.__name__}: set GEOMSTATS_BACKEND=numpy")
+        raise SpaceError(
+            f"geomstats must run with NumPy, got the backend {backend.__name__}; set GEOMSTATS_BACKEND=numpy"
+        )
     if getattr(space, "metric", None) is None:
         raise SpaceError(f"{_name(space)} has no metric: equip it with one, space.equip_with_metric(...)")
     if injectivity_radius is not None and not injectivity_radius > 0.0:
-        raise ParameterError(f"an injectivity radius is positive, not {injectivity_radius!r}")
-    found = GeomstatsSpace(space, _known_radius(space) if injectivity_radius is None else injectivity_radius)
+        raise ParameterError(f"injectivity_radius must be positive, got {injectivity_radius!r}")
+    bridge = GeomstatsSpace(space, _known_radius(space) if injectivity_radius is None else injectivity_radius)
     for kernel in ("exp", "log", "inner", "project_tangent"):
-        found._require_kernel(kernel)
-    return found
+        bridge._require_kernel(kernel)
+    return bridge
 
 
 @jax.tree_util.register_static
 class GeomstatsSpace(Space):
-    """A geomstats manifold as a state space, made by :func:`from_geomstats`.
+    """Geomstats manifold as a state space, made by :func:`from_geomstats`.
 
     Attributes
     ----------
@@ -100,7 +103,7 @@ class GeomstatsSpace(Space):
         return tuple(int(n) for n in self.source.shape)
 
     def random(self, key_or_seed, size=()) -> jax.Array:
-        """Points from geomstats' own distribution, shape ``(*size, *shape)``; not under tracing."""
+        """Return points from geomstats' own distribution, shape ``(*size, *shape)``; not under tracing."""
         seed = int(jax.random.randint(random_key(key_or_seed), (), 0, 2**31 - 1))
         state = np.random.get_state()  # noqa: NPY002
         try:
@@ -144,18 +147,18 @@ class GeomstatsSpace(Space):
         return self._call_kernel("transport", x, v, u)
 
     def _flat(self, x, v):
-        """The inner products with the projected axes."""
+        """Return the inner products with the projected axes."""
         x, v = self._with_frame_axis(x), self._with_frame_axis(v)
         values = self._inner(x, v, self._project_tangent(x, self._axis_vectors))
         return values.reshape(*values.shape[:-1], *self.shape)
 
     def _frame(self, x):
-        """Gram-Schmidt on the projections of axes, as many as the space has dimensions, chosen for independence."""
-        chosen = jnp.asarray(self._axis_vectors)[_independent_axes(self, x)]
+        """Return Gram-Schmidt vectors of the projections of ``dim`` axes, which are chosen for independence."""
+        axis_vectors = jnp.asarray(self._axis_vectors)[_independent_axes(self, x)]
         base = self._with_frame_axis(x)
-        vectors = self._project_tangent(base, chosen)
-        left, right = jnp.expand_dims(vectors, -2 - len(self.shape)), self._with_frame_axis(vectors)
-        gram = self._inner(self._with_frame_axis(base), left, right)
+        vectors = self._project_tangent(base, axis_vectors)
+        left_vectors, right_vectors = jnp.expand_dims(vectors, -2 - len(self.shape)), self._with_frame_axis(vectors)
+        gram = self._inner(self._with_frame_axis(base), left_vectors, right_vectors)
         rows = solve_lower(cholesky(gram), vectors.reshape(*gram.shape[:-1], -1))
         return rows.reshape(vectors.shape)
 
@@ -183,7 +186,7 @@ class GeomstatsSpace(Space):
         return _call_on_host(self, kernel, jnp.broadcast_arrays(*arrays))
 
     def _require_kernel(self, kernel: str) -> None:
-        """Raise unless geomstats has what a kernel calls, found out at a random point."""
+        """Raise SpaceError unless geomstats implements a kernel, tested at a random point."""
         if kernel in self._available_kernels:
             return
         x = np.asarray(self.source.random_point(), dtype=float)[None]
@@ -194,11 +197,12 @@ class GeomstatsSpace(Space):
         self._available_kernels.add(kernel)
 
     def _result_shape(self, kernel: str) -> tuple[int, ...]:
-        """Shape of the result for one point."""
+        """Return the shape of the result for one point."""
         return self.shape if _KERNEL_SIGNATURES[kernel][1] == "array" else ()
 
     def _evaluate_on_host(self, kernel: str, *arrays: np.ndarray) -> np.ndarray:
-        """A kernel on arrays of shape ``(count, *shape)``: all at once, or one by one where some are refused."""
+        """Evaluate a kernel on arrays of shape ``(count, *shape)``: as one batch, or one by one if geomstats refuses
+        some."""
         count = len(arrays[0])
         try:
             with np.errstate(all="ignore"), warnings.catch_warnings():  # what comes of it is looked at
@@ -214,7 +218,7 @@ class GeomstatsSpace(Space):
             )
 
     def _jacobian_on_host(self, kernel: str, *arrays: np.ndarray) -> np.ndarray:
-        """Derivatives by all entries of all arguments, shape (count, size of the result, number of entries)."""
+        """Return derivatives by all entries of all arguments, shape (count, size of the result, number of entries)."""
         columns = [
             self._derivative(kernel, arrays, k, np.broadcast_to(axis, arrays[k].shape))
             for k in range(len(arrays))
@@ -223,75 +227,78 @@ class GeomstatsSpace(Space):
         return np.stack(columns, axis=-1)
 
     def _derivative(self, kernel: str, arrays, k: int, direction: np.ndarray) -> np.ndarray:
-        """Derivative along a direction of the k-th argument, shape (count, size of the result)."""
+        """Return the derivative along a direction of the k-th argument, shape (count, size of the result)."""
         kind, length = _KERNEL_SIGNATURES[kernel][0][k], np.ones(len(direction))
         if kind != "a":
             x = arrays[k if kind == "p" else 0]
             direction = self._evaluate_on_host("project_tangent", x, direction)
             length = np.sqrt(np.maximum(self._evaluate_on_host("inner", x, direction, direction), 0.0))
-        unit = direction / np.where(length > 0.0, length, 1.0).reshape(-1, *(1,) * len(self.shape))
-        total = np.zeros((len(direction), math.prod(self._result_shape(kernel))))
+        unit_direction = direction / np.where(length > 0.0, length, 1.0).reshape(-1, *(1,) * len(self.shape))
+        weighted_sum = np.zeros((len(direction), math.prod(self._result_shape(kernel))))
         for offset, weight in _STENCIL.items():
-            after, before = (
+            forward, backward = (
                 self._evaluate_on_host(
-                    kernel, *self._displace_argument(kernel, arrays, k, sign * offset * _DIFFERENCE_STEP * unit)
+                    kernel,
+                    *self._displace_argument(kernel, arrays, k, sign * offset * _DIFFERENCE_STEP * unit_direction),
                 )
                 for sign in (1, -1)
             )
-            total += weight * (after - before).reshape(total.shape)
-        return total / _DIFFERENCE_STEP * length[:, None]
+            weighted_sum += weight * (forward - backward).reshape(weighted_sum.shape)
+        return weighted_sum / _DIFFERENCE_STEP * length[:, None]
 
-    def _displace_argument(self, kernel: str, arrays, k: int, shift: np.ndarray) -> list[np.ndarray]:
-        """The arguments with the k-th moved: a point along a geodesic, taking the tangent vectors at it along."""
-        kinds, moved = _KERNEL_SIGNATURES[kernel][0], list(arrays)
+    def _displace_argument(self, kernel: str, arrays, k: int, displacement: np.ndarray) -> list[np.ndarray]:
+        """Return the arguments with the k-th displaced: a point along a geodesic, with its tangent vectors projected
+        there."""
+        kinds, displaced = _KERNEL_SIGNATURES[kernel][0], list(arrays)
         if kinds[k] != "p":
-            moved[k] = moved[k] + shift
-            return moved
-        moved[k] = self._evaluate_on_host("exp", moved[k], shift)
+            displaced[k] = displaced[k] + displacement
+            return displaced
+        displaced[k] = self._evaluate_on_host("exp", displaced[k], displacement)
         if k == 0:
-            tangent = [i for i, kind in enumerate(kinds) if kind == "v"]
-            for i in tangent:
-                moved[i] = self._evaluate_on_host("project_tangent", moved[0], moved[i])
-        return moved
+            tangent_indices = [i for i, kind in enumerate(kinds) if kind == "v"]
+            for i in tangent_indices:
+                displaced[i] = self._evaluate_on_host("project_tangent", displaced[0], displaced[i])
+        return displaced
 
 
-# -- what geomstats computes, on arrays of shape (count, *shape) --------------------------------------------------
+# -- kernels of geomstats, on arrays of shape (count, *shape) -----------------------------------------------------
 
 
 def _checked_log(space: GeomstatsSpace, x, y):
-    """The logarithm, NaN where it does not lead to y or is too long: solvers that fail return numbers all the same."""
+    """Return the logarithm, NaN if it does not lead to y or is too long, since failing solvers return numbers too."""
     axes = tuple(range(1, x.ndim))
     v = np.array(space.source.metric.log(y, x), dtype=float)
-    miss = np.abs(space.source.metric.exp(v, x) - y).max(axis=axes) / np.maximum(np.abs(y).max(axis=axes), 1.0)
+    residual = np.abs(space.source.metric.exp(v, x) - y).max(axis=axes) / np.maximum(np.abs(y).max(axis=axes), 1.0)
     length = np.sqrt(space.source.metric.inner_product(v, v, x))
     radius = _radius(space, x) if space._radius is None else space._radius
-    v[~((miss <= 1e-6) & (length < radius * (1.0 - CUT_MARGIN)))] = np.nan
+    v[~((residual <= 1e-6) & (length < radius * (1.0 - CUT_MARGIN)))] = np.nan
     return v
 
 
 def _radius(space: GeomstatsSpace, x):
+    """Return the injectivity radius at each point."""
     return np.array([float(np.squeeze(space.source.metric.injectivity_radius(point))) for point in x])
 
 
 def _residual(space: GeomstatsSpace, x):
-    """What the equations of the space leave, or the distance to the projection, relative; infinite without either."""
+    """Return the relative residual of the equations, or distance to the projection; infinite if the space has
+    neither."""
     axes = tuple(range(1, x.ndim))
-    size = np.maximum(np.abs(x).max(axis=axes), 1.0)
-    inside = np.array([np.all(space.source.belongs(point, atol=MEMBERSHIP_TOLERANCE)) for point in x])
-    rest = np.where(inside, 0.0, np.inf)
+    scale = np.maximum(np.abs(x).max(axis=axes), 1.0)
+    is_inside = np.array([np.all(space.source.belongs(point, atol=MEMBERSHIP_TOLERANCE)) for point in x])
+    residual = np.where(is_inside, 0.0, np.inf)
     if hasattr(space.source, "submersion"):
-        rest = np.abs(np.asarray(space.source.submersion(x))).reshape(len(x), -1).max(axis=1) / size**2
-    elif not inside.all():
+        residual = np.abs(np.asarray(space.source.submersion(x))).reshape(len(x), -1).max(axis=1) / scale**2
+    elif not is_inside.all():
         try:
-            moved = np.abs(space.source.projection(x) - x).max(axis=axes) / size
-            rest = np.where(inside, 0.0, np.where(moved > MEMBERSHIP_TOLERANCE, moved, np.inf))
+            distance = np.abs(space.source.projection(x) - x).max(axis=axes) / scale
+            residual = np.where(is_inside, 0.0, np.where(distance > MEMBERSHIP_TOLERANCE, distance, np.inf))
         except (NotImplementedError, AttributeError):
             pass
-    return np.where(np.isfinite(x).all(axis=axes), rest, np.nan)
+    return np.where(np.isfinite(x).all(axis=axes), residual, np.nan)
 
 
 _KERNEL_SIGNATURES = {
-    # kernel: its arguments (p a point, v a vector tangent at the first one, a any array) and its result
     "exp": ("pv", "array"),
     "log": ("pp", "array"),
     "transport": ("pvv", "array"),
@@ -302,6 +309,10 @@ _KERNEL_SIGNATURES = {
     "radius": ("p", "scalar"),
     "residual": ("a", "scalar"),
 }
+"""Kinds of the arguments and of the result of each kernel.
+
+The kinds are p, a point, v, a vector tangent at the first point, and a, any array.
+"""
 
 _KERNELS: dict[str, Callable] = {
     "exp": lambda space, x, v: space.source.metric.exp(v, x),
@@ -314,22 +325,24 @@ _KERNELS: dict[str, Callable] = {
     "radius": _radius,
     "residual": _residual,
 }
+r"""Implementation of each kernel on arrays of shape (count, \*shape)."""
 
 
 # -- callbacks ----------------------------------------------------------------------------------------------------
 
 
-def _callback(space: GeomstatsSpace, function: Callable, core: tuple[int, ...], dtype, arrays):
-    """``function`` on the host, of arrays with one batch axis, as part of a JAX program with any."""
+def _callback(space: GeomstatsSpace, function: Callable, result_shape: tuple[int, ...], dtype, arrays):
+    """Call ``function`` on the host, on arrays with one batch axis, from a JAX program with any number of batch
+    axes."""
     batch = arrays[0].shape[: arrays[0].ndim - len(space.shape)]
 
     def on_host(*arrays):
-        leading = arrays[0].shape[: arrays[0].ndim - len(space.shape)]
+        host_batch = arrays[0].shape[: arrays[0].ndim - len(space.shape)]
         result = function(*(np.asarray(a).reshape(-1, *space.shape) for a in arrays))
-        return result.reshape((*leading, *core)).astype(dtype)
+        return result.reshape((*host_batch, *result_shape)).astype(dtype)
 
     return jax.pure_callback(
-        on_host, jax.ShapeDtypeStruct((*batch, *core), dtype), *arrays, vmap_method="broadcast_all"
+        on_host, jax.ShapeDtypeStruct((*batch, *result_shape), dtype), *arrays, vmap_method="broadcast_all"
     )
 
 
@@ -340,10 +353,12 @@ def _call_on_host(space: GeomstatsSpace, kernel: str, arrays):
 
 @_call_on_host.defjvp
 def _call_derivative(space: GeomstatsSpace, kernel: str, primals, tangents):
-    (arrays,), (moves,) = primals, tangents
+    (arrays,), (array_tangents,) = primals, tangents
     value = _call_on_host(space, kernel, arrays)
     jacobian = _jacobian(space, kernel, arrays)
-    entries = jnp.concatenate([move.reshape(*jacobian.shape[:-2], -1) for move in moves], axis=-1)
+    entries = jnp.concatenate(
+        [array_tangent.reshape(*jacobian.shape[:-2], -1) for array_tangent in array_tangents], axis=-1
+    )
     return value, jnp.einsum("...ij,...j->...i", jacobian, entries).reshape(value.shape)
 
 
@@ -354,34 +369,35 @@ def _log(space: GeomstatsSpace, x, y):
 
 @_log.defjvp
 def _log_derivative(space: GeomstatsSpace, primals, tangents):
-    """From ``exp(x, v) = y``: a logarithm may be the result of an iteration, which differences would only blur.
+    """Differentiate ``exp(x, v) = y``, because differences would blur a logarithm that is found by iteration.
 
-    As x moves by x', v moves with the tangent space, by D, and in it, by the combination of frame vectors that makes
+    As x moves by x', v moves with the tangent space, by D, and in it, by the combination of frame vectors that
+    satisfies
     ``d_v exp (D + frame c) + d_x exp x' = y'``.
     """
     (x, y), (dx, dy) = primals, tangents
     v, size = _log(space, x, y), math.prod(space.shape)
 
-    def rows(a):
+    def to_rows(a):
         return a.reshape(*a.shape[: a.ndim - len(space.shape)], size)
 
-    of_exp, of_projection = (_jacobian(space, kernel, [x, v]) for kernel in ("exp", "project_tangent"))
-    dx, frame = rows(dx), space._frame(x)
-    along = jnp.einsum("...ij,...aj->...ai", of_exp[..., size:], rows(frame))
-    rest = rows(dy) - jnp.einsum(
-        "...ij,...j->...i", of_exp[..., :size], dx
-    )  # exp projects what it is handed, hence no D
-    dual = rows(space._flat(space._with_frame_axis(y), space._frame(y)))
-    matrix = jnp.einsum("...bi,...ai->...ba", dual, along)
-    c = solve(matrix, jnp.einsum("...bi,...i->...b", dual, rest)[..., None])[..., 0]
-    dv = jnp.einsum("...ij,...j->...i", of_projection[..., :size], dx).reshape(v.shape)
+    exp_jacobian, projection_jacobian = (_jacobian(space, kernel, [x, v]) for kernel in ("exp", "project_tangent"))
+    dx, frame = to_rows(dx), space._frame(x)
+    exp_of_frame = jnp.einsum("...ij,...aj->...ai", exp_jacobian[..., size:], to_rows(frame))
+    remainder = to_rows(dy) - jnp.einsum(
+        "...ij,...j->...i", exp_jacobian[..., :size], dx
+    )  # exp projects its argument, hence no D
+    dual = to_rows(space._flat(space._with_frame_axis(y), space._frame(y)))
+    matrix = jnp.einsum("...bi,...ai->...ba", dual, exp_of_frame)
+    c = solve(matrix, jnp.einsum("...bi,...i->...b", dual, remainder)[..., None])[..., 0]
+    dv = jnp.einsum("...ij,...j->...i", projection_jacobian[..., :size], dx).reshape(v.shape)
     return v, dv + (c.reshape(*c.shape, *(1,) * len(space.shape)) * frame).sum(axis=-1 - len(space.shape))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _jacobian(space: GeomstatsSpace, kernel: str, arrays):
-    core = (math.prod(space._result_shape(kernel)), len(arrays) * math.prod(space.shape))
-    return _callback(space, partial(space._jacobian_on_host, kernel), core, np.float64, arrays)
+    result_shape = (math.prod(space._result_shape(kernel)), len(arrays) * math.prod(space.shape))
+    return _callback(space, partial(space._jacobian_on_host, kernel), result_shape, np.float64, arrays)
 
 
 @_jacobian.defjvp
@@ -391,14 +407,15 @@ def _refuse_second_derivative(space: GeomstatsSpace, kernel: str, primals, tange
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _independent_axes(space: GeomstatsSpace, x):
-    """The axes, shape (dim,), whose projections to the tangent space at x make the best basis: pivoted Gram-Schmidt."""
+    """Return the axes, shape (dim,), whose projections are the best basis of the tangent space at x: pivoted
+    Gram-Schmidt."""
     return _callback(space, partial(_pivot_axes, space), (space.dim,), np.int64, [x])
 
 
 @_independent_axes.defjvp
 def _independent_axes_jvp(space: GeomstatsSpace, primals, tangents):
-    chosen = _independent_axes(space, *primals)
-    return chosen, np.zeros(chosen.shape, jax.dtypes.float0)
+    indices = _independent_axes(space, *primals)
+    return indices, np.zeros(indices.shape, jax.dtypes.float0)
 
 
 def _pivot_axes(space: GeomstatsSpace, x: np.ndarray) -> np.ndarray:
@@ -407,20 +424,23 @@ def _pivot_axes(space: GeomstatsSpace, x: np.ndarray) -> np.ndarray:
         axes = space._axis_vectors
         points = np.broadcast_to(point, axes.shape)
         vectors = space._evaluate_on_host("project_tangent", points, axes).reshape(len(axes), -1)
-        chosen: list[int] = []
+        indices: list[int] = []
         for _ in range(space.dim):
-            chosen.append(int((vectors**2).sum(axis=1).argmax()))
-            direction = vectors[chosen[-1]] / np.linalg.norm(vectors[chosen[-1]])
+            indices.append(int((vectors**2).sum(axis=1).argmax()))
+            direction = vectors[indices[-1]] / np.linalg.norm(vectors[indices[-1]])
             vectors = vectors - np.outer(vectors @ direction, direction)
-        rows.append(chosen)
+        rows.append(indices)
     return np.array(rows).reshape(len(x), space.dim)
 
 
 def _known_radius(space) -> float | None:
-    """The injectivity radius where it is the same everywhere, infinity where geomstats does not know it."""
-    corrected = {"BiInvariantMetric": math.pi, "SpecialEuclideanMatricesCanonicalLeftMetric": math.sqrt(2.0) * math.pi}
-    if (kind := type(space.metric).__name__) in corrected:
-        return corrected[kind]
+    """Return the injectivity radius if it is constant, infinity if geomstats does not know it, else None."""
+    corrected_radii = {
+        "BiInvariantMetric": math.pi,
+        "SpecialEuclideanMatricesCanonicalLeftMetric": math.sqrt(2.0) * math.pi,
+    }
+    if (kind := type(space.metric).__name__) in corrected_radii:
+        return corrected_radii[kind]
     try:
         radii = [float(np.squeeze(space.metric.injectivity_radius(space.random_point()))) for _ in range(2)]
     except (NotImplementedError, AttributeError):

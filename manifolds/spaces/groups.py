@@ -1,4 +1,5 @@
-"""Matrix groups as state spaces: any with a left-invariant metric; SO(n), SU(n), SE(n) with Riemannian geodesics."""
+"""Matrix groups as state spaces: any group with a left-invariant metric; SO(n), SU(n), SE(n) with Riemannian
+geodesics."""
 
 from __future__ import annotations
 
@@ -27,26 +28,28 @@ _so, _su, _se = lru_cache(SO), lru_cache(SU), lru_cache(SE)
 
 @jax.tree_util.register_static
 class GroupSpace(Space):
-    """A matrix group as a state space, also one of one's own; tangent vectors at g are ``g hat(xi)``.
+    """Matrix group as a state space, native or user-defined; tangent vectors at g are ``g hat(xi)``.
 
-    The metric is left-invariant. ``exp(x, x hat(xi))`` is ``x exp(xi)``, whatever the metric: geodesics of the
-    connection for which left-invariant fields are parallel, which keeps inner products, and of the metric itself where
-    that is right-invariant too. So :meth:`transport` keeps the velocity xi, and :meth:`distance` is the length of
+    The metric is left-invariant. ``exp(x, x hat(xi))`` is ``x exp(xi)``, whatever the metric: these curves are
+    geodesics of
+    the connection for which left-invariant fields are parallel, which preserves inner products, and of the metric
+    itself if
+    it is right-invariant too. Therefore :meth:`transport` preserves the velocity xi, and :meth:`distance` is the length
+    of
     ``log(x^-1 y)``, not less than that of the shortest curve. SO(n), SU(n) and SE(n) are spaces of their own, with the
     Riemannian geodesics: :class:`SpecialOrthogonal`, :class:`SpecialUnitary`, :class:`SpecialEuclidean`.
 
     Parameters
     ----------
     group : MatrixGroup
-        With its exponential, logarithm, Cayley map and adjoint actions. A point near it is projected to it by its
-        ``restore_map`` alone.
+        The group, whose ``restore_map`` alone projects a nearby point to it.
     inner : array, shape (dim, dim), optional
         Inner products of the basis of the algebra; by default the basis is orthonormal.
 
     Raises
     ------
     SpaceError
-        If that is not a group of matrices.
+        If ``group`` is no MatrixGroup.
     ParameterError
         If ``inner`` is not symmetric and positive definite.
     """
@@ -56,22 +59,22 @@ class GroupSpace(Space):
 
     def __init__(self, group: MatrixGroup, inner=None):
         if not isinstance(group, MatrixGroup):
-            raise SpaceError(f"GroupSpace is made of a MatrixGroup such as SL(3), not of {type(group).__name__}")
+            raise SpaceError(
+                f"GroupSpace(group): group must be a MatrixGroup, such as SL(3), got {type(group).__name__}"
+            )
         inner = np.eye(group.dim) if inner is None else np.asarray(numeric_array(inner, "inner"), dtype=np.float64)
         if inner.shape != (group.dim,) * 2 or not np.allclose(inner, inner.T, rtol=1e-12, atol=0.0):
-            raise ParameterError(f"inner is a symmetric matrix of shape {(group.dim,) * 2} for {group.name}")
+            raise ParameterError(f"inner must be a symmetric matrix of shape {(group.dim,) * 2} for {group.name}")
         try:
             self._root = np.linalg.cholesky(inner)
         except np.linalg.LinAlgError:
-            least = np.linalg.eigvalsh(inner)[0]
-            raise ParameterError(
-                f"inner has the eigenvalue {least:.3g}: inner products are positive definite"
-            ) from None
+            min_eigenvalue = np.linalg.eigvalsh(inner)[0]
+            raise ParameterError(f"inner must be positive definite, got the eigenvalue {min_eigenvalue:.3g}") from None
         self._group = group
 
     def __eq__(self, other):
-        same = type(self) is type(other)
-        return same and self._group == other._group and np.array_equal(self._root, other._root)
+        is_same_class = type(self) is type(other)
+        return is_same_class and self._group == other._group and np.array_equal(self._root, other._root)
 
     def __hash__(self):
         return hash((self._group, self._root.tobytes()))
@@ -93,11 +96,12 @@ class GroupSpace(Space):
         return (self.group.matrix_size,) * 2
 
     def velocity(self, x, v) -> jax.Array:
-        """Left-trivialised velocity: the ``xi`` in ``v = x hat(xi)``, components in the algebra, shape (..., dim)."""
+        """Return the left-trivialised velocity: the ``xi`` in ``v = x hat(xi)``, components in the algebra, shape (...,
+        dim)."""
         return self._call_compiled("_velocity", *self._checked_vectors(x, v=v))
 
     def from_velocity(self, x, xi) -> jax.Array:
-        """``x hat(xi)``, the inverse of :meth:`velocity`."""
+        """Return ``x hat(xi)``, the inverse of :meth:`velocity`."""
         xi = self.group._components(xi, "xi")
         return self._call_compiled("_from_velocity", self._checked_point(x, "x"), xi)
 
@@ -132,12 +136,12 @@ class GroupSpace(Space):
         return self._from_velocity(x, self.group.inverse_cayley_map(self.group.algebra, self._relative_element(x, y)))
 
     def _apply_restore_map(self, x):
-        """One Newton step to the group, so that rounding does not add up."""
+        """Take one Newton step to the group, so that rounding errors do not add up."""
         return self.group.restore_map(x)
 
     @property
     def can_be_embedded(self):
-        """Not where all that is known of the group is its algebra and a distance from it."""
+        """False if nothing but the algebra and a distance from the group is known."""
         return self._has_equations or self.group.restore_map is not return_unchanged or self.dim == self.size
 
     @property
@@ -156,10 +160,12 @@ class GroupSpace(Space):
     # -- the metric of this space, which its subclasses replace -----------------------------------------------------
 
     def injectivity_radius(self, x=None):
-        """One that is sure: there eigenvalues of the velocity are smaller than pi."""
+        """Return a lower bound of the radius: below it eigenvalues of the velocity are smaller than pi."""
         basis = self._orthonormal_basis
-        mixed = np.einsum("a,aij->ij", np.random.default_rng(0).standard_normal(len(basis)), basis)
-        if not np.abs(np.linalg.matrix_power(mixed, len(mixed))).max() > 1e-12 * np.abs(mixed).max() ** len(mixed):
+        generic_element = np.einsum("a,aij->ij", np.random.default_rng(0).standard_normal(len(basis)), basis)
+        if not np.abs(np.linalg.matrix_power(generic_element, len(generic_element))).max() > 1e-12 * np.abs(
+            generic_element
+        ).max() ** len(generic_element):
             return math.inf  # nilpotent: no eigenvalue but zero
         rows = basis.reshape(len(basis), -1)
         return math.pi / math.sqrt(np.linalg.eigvalsh((rows.conj() @ rows.T).real)[-1])
@@ -183,13 +189,13 @@ class GroupSpace(Space):
         xi = self._velocity(x, w)
         basis = x[..., None, :, :] @ self.group.algebra._require_basis()
         rows = basis.reshape(*basis.shape[:-2], -1)
-        rest = (w - self._from_velocity(x, xi)).reshape(*xi.shape[:-1], -1, 1)
+        remainder = (w - self._from_velocity(x, xi)).reshape(*xi.shape[:-1], -1, 1)
         gram = (rows.conj() @ rows.swapaxes(-1, -2)).real
-        return self._from_velocity(x, xi + solve(gram, (rows.conj() @ rest).real)[..., 0])
+        return self._from_velocity(x, xi + solve(gram, (rows.conj() @ remainder).real)[..., 0])
 
     @cached_property
     def _orthonormal_basis(self) -> np.ndarray:
-        """An orthonormal basis of the algebra, shape (dim, m, m)."""
+        """Orthonormal basis of the algebra, shape (dim, m, m)."""
         return np.einsum("ab,bij->aij", np.linalg.inv(self._root), self.group.algebra._require_basis())
 
     def _frame(self, x):
@@ -205,19 +211,19 @@ class GroupSpace(Space):
 
     @cached_property
     def _adjoint_traces(self) -> np.ndarray:
-        """``tr ad`` of the orthonormal basis, shape (dim,): zero on a unimodular group."""
+        """Traces ``tr ad`` of the orthonormal basis, shape (dim,): zero on a unimodular group."""
         with jax.ensure_compile_time_eval():
             axes = np.eye(self.dim)
             brackets = np.asarray(self.group.algebra.bracket(axes[:, None], axes[None]))
         return np.linalg.solve(self._root, np.einsum("kaa->k", brackets))
 
     def _divergence_terms(self, x, rows):
-        """Those along left translations, and the divergences ``-tr ad_E`` of the left-invariant fields themselves."""
-        along = super()._divergence_terms(x, rows)
+        """Return the terms along left translations, and the divergences ``-tr ad_E`` of the left-invariant fields."""
+        translation_terms = super()._divergence_terms(x, rows)
         if self.group.algebra.is_unimodular():
-            return along
-        own = rows(x, self._flat(x, self._from_coordinates(x, -self._adjoint_traces)))
-        return jnp.concatenate([along, own[None]])
+            return translation_terms
+        field_terms = rows(x, self._flat(x, self._from_coordinates(x, -self._adjoint_traces)))
+        return jnp.concatenate([translation_terms, field_terms[None]])
 
     def _exp(self, x, v):
         return self._group_exp(x, v)
@@ -233,10 +239,10 @@ class GroupSpace(Space):
 
 
 _MAX_RESTORE_STEPS = 8
-"""Each squares the distance, so that from 1/2 on these reach rounding."""
+"""Number of Newton steps to the group; each squares the distance, so that eight of them reach rounding from 1/2."""
 
 _REAL_EIGENVALUE_SINE = 1e-9
-"""Sine of an angle up to which an eigenvalue is taken to be 1 or -1, so that its angle has no sign."""
+"""Largest sine of the angle of an eigenvalue that counts as 1 or -1, so that its angle has no sign."""
 
 register(())(lambda: GroupSpace(Heisenberg(1)))
 register(())(lambda: GroupSpace(SL(2), np.diag([1.0, 2.0, 2.0]) + 0.5))
@@ -245,7 +251,7 @@ register(())(lambda: GroupSpace(SL(2), np.diag([1.0, 2.0, 2.0]) + 0.5))
 class BiInvariantSpace(GroupSpace):
     """Unitary matrices, with the inner product of components in the basis of the algebra.
 
-    It is invariant under translations from both sides, so geodesics are ``x exp(t xi)`` [Milnor 1976].
+    The metric is invariant under translations from both sides, so geodesics are ``x exp(t xi)`` [Milnor 1976].
     """
 
     metric = "bi-invariant"
@@ -278,29 +284,31 @@ class BiInvariantSpace(GroupSpace):
         return extended_squared_distance(self, x, y)
 
     def _squared_distance_value(self, x, y):
-        """The squares of the angles of the eigenvalues of ``x^-1 y``, defined at half turns too.
+        """Return the sum of the squared angles of the eigenvalues of ``x^-1 y``, defined at half turns too.
 
-        ``|g v + v| = 2 cos(t/2)`` and ``|g v - v| = 2 sin(t/2)`` for eigenvectors v; they are found from the former,
-        to a rounding also where it is small. NaN where the angles are not those of one logarithm in the algebra.
+        ``|g v + v| = 2 cos(t/2)`` and ``|g v - v| = 2 sin(t/2)`` for eigenvectors v; these are computed from ``g + 1``,
+        to a rounding also where the cosine is small. NaN if the angles are not those of one logarithm in the algebra.
         """
-        g, one = self._relative_element(x, y), np.eye(self.shape[0])
-        cosines, vectors = orthogonal_images(g + one)
-        sines = (g - one) @ vectors
+        g, identity = self._relative_element(x, y), np.eye(self.shape[0])
+        cosines, vectors = orthogonal_images(g + identity)
+        sines = (g - identity) @ vectors
         angles = 2.0 * jnp.arctan2(*(jnp.sqrt((jnp.abs(a) ** 2).sum(axis=-2)) for a in (sines, cosines)))
         square = (angles**2).sum(axis=-1) / (jnp.abs(self.group.algebra._require_basis()[0]) ** 2).sum()
         if not self.group.is_complex:
             return square
-        heights = (vectors.conj() * (g @ vectors)).sum(axis=-2).imag
-        turned = jnp.sin(angles)
+        eigenvalue_imaginary_parts = (vectors.conj() * (g @ vectors)).sum(axis=-2).imag
+        angle_sines = jnp.sin(angles)
         signs = jnp.where(
-            turned > _REAL_EIGENVALUE_SINE, heights / jnp.where(turned > _REAL_EIGENVALUE_SINE, turned, 1.0), 0.0
+            angle_sines > _REAL_EIGENVALUE_SINE,
+            eigenvalue_imaginary_parts / jnp.where(angle_sines > _REAL_EIGENVALUE_SINE, angle_sines, 1.0),
+            0.0,
         )
-        half_turns = (jnp.where(turned > _REAL_EIGENVALUE_SINE, 0.0, angles)).sum(axis=-1)
+        half_turns = (jnp.where(angle_sines > _REAL_EIGENVALUE_SINE, 0.0, angles)).sum(axis=-1)
         total = jnp.abs((signs * angles).sum(axis=-1))
         return jnp.where(total <= half_turns + 1.0, square, jnp.nan)
 
     def _transport(self, x, v, u):
-        """``x m eta m`` with ``m = exp(xi/2)``: the velocity eta turns by Ad(m^-1)."""
+        """Return ``x m eta m`` with ``m = exp(xi/2)``: the velocity eta turns by Ad(m^-1)."""
         half = self.group.exp_map(self.group.algebra, 0.5 * self._velocity(x, v))
         return x @ half @ self._relative_element(x, u) @ half
 
@@ -309,9 +317,9 @@ class BiInvariantSpace(GroupSpace):
 @jax.tree_util.register_static
 @dataclass(frozen=True, repr=False)
 class SpecialOrthogonal(BiInvariantSpace):
-    """Rotations of R^n, with ``inner(x, u, v) = tr(u^T v) / 2``: rotations of a plane are as far apart as their angles.
+    """Rotations of R^n, with ``inner(x, u, v) = tr(u^T v) / 2``: the distance of rotations of one plane is their angle.
 
-    Closed forms for n = 2 and 3; general matrix functions otherwise.
+    n = 2 and 3 have closed forms; other n use general matrix functions.
     """
 
     n: int
@@ -354,7 +362,8 @@ class SpecialOrthogonal(BiInvariantSpace):
 class SpecialUnitary(BiInvariantSpace):
     """Complex unitary matrices of determinant 1, with ``inner(x, u, v) = 2 Re tr(u^H v)``.
 
-    SU(2) is a sphere S^3 of radius 2; closed forms. The logarithm is the principal one: for n > 2 it reaches to the
+    SU(2) is a sphere S^3 of radius 2, with closed forms. The logarithm is the principal one: for n > 2 it reaches to
+    the
     radius ``pi sqrt(2n/(n-1))`` given here, less than the injectivity radius 2 pi of the space.
     """
 
@@ -385,15 +394,15 @@ class SpecialUnitary(BiInvariantSpace):
         return self._scale_to_unit_determinant(orthonormal_columns(self.from_vector(w)))
 
     def _correction(self, x, c):
-        of_real, of_imaginary, of_phase = jnp.split(
+        real_entries, imaginary_entries, phase = jnp.split(
             c, np.cumsum([self.n * (self.n + 1) // 2, math.comb(self.n, 2)]), -1
         )
-        hermitian = symmetric_matrix(of_real, self.n) + 1j * skew_matrix(of_imaginary, self.n)
-        return 0.5 * hermitian @ x + (1j / self.n) * of_phase[..., None] * x
+        hermitian = symmetric_matrix(real_entries, self.n) + 1j * skew_matrix(imaginary_entries, self.n)
+        return 0.5 * hermitian @ x + (1j / self.n) * phase[..., None] * x
 
     def _constraint_scales(self, x):
-        sizes = 2.0 * jnp.abs(x) @ jnp.abs(x).swapaxes(-1, -2)
-        upper = [sizes[..., *np.triu_indices(self.n, k)] for k in (0, 1)]
+        products = 2.0 * jnp.abs(x) @ jnp.abs(x).swapaxes(-1, -2)
+        upper = [products[..., *np.triu_indices(self.n, k)] for k in (0, 1)]
         return jnp.concatenate([*upper, jnp.full((*x.shape[:-2], 1), float(self.n))], axis=-1)
 
 
@@ -403,9 +412,10 @@ class SpecialUnitary(BiInvariantSpace):
 class SpecialEuclidean(GroupSpace):
     """Rigid motions of R^n, with ``inner = tr(W^T W') / 2 + u·u' / length^2`` of velocities W of rotation and u.
 
-    The metric is left-invariant and that of the product of SO(n) and R^n: geodesics turn at a constant rate while the
-    origin of the body goes straight. They are not the one-parameter subgroups, which are screw motions: for those take
-    the group retraction.
+    The metric is left-invariant and that of the product of SO(n) and R^n: along geodesics the body turns at a constant
+    rate
+    while its origin moves straight. One-parameter subgroups are different curves, screw motions: the group retraction
+    follows them.
 
     Parameters
     ----------
@@ -421,7 +431,7 @@ class SpecialEuclidean(GroupSpace):
     def __post_init__(self):
         checked_size(self.n, 2, "SpecialEuclidean(n)")
         if not 0.0 < self.length < math.inf:
-            raise ParameterError(f"SpecialEuclidean(n, length): the length is a positive number, not {self.length!r}")
+            raise ParameterError(f"SpecialEuclidean(n, length): length must be a positive number, got {self.length!r}")
 
     @property
     def group(self):
@@ -429,7 +439,7 @@ class SpecialEuclidean(GroupSpace):
 
     @property
     def rotations(self) -> SpecialOrthogonal:
-        """The space of the rotation parts."""
+        """Space of the rotations of the motions."""
         return SpecialOrthogonal(self.n)
 
     def injectivity_radius(self, x=None):
@@ -443,9 +453,9 @@ class SpecialEuclidean(GroupSpace):
         return self.n * (self.n + 1)
 
     def _point_from_normals(self, w):
-        of_rotation, of_translation = jnp.split(w, [self.n**2], axis=-1)
-        rotation = _random_rotation(of_rotation.reshape(*w.shape[:-1], self.n, self.n))
-        return affine_matrix(rotation, self.length * of_translation[..., None])
+        rotation_normals, translation_normals = jnp.split(w, [self.n**2], axis=-1)
+        rotation = _random_rotation(rotation_normals.reshape(*w.shape[:-1], self.n, self.n))
+        return affine_matrix(rotation, self.length * translation_normals[..., None])
 
     def _project_tangent(self, x, w):
         return self._map_blocks(self.rotations._project_tangent, lambda x, w: w, x, w)
@@ -453,9 +463,11 @@ class SpecialEuclidean(GroupSpace):
     _tangential_part = tangential_part_by_projection
 
     def _correction(self, x, c):
-        of_rotation, of_last = jnp.split(c, [self.n * (self.n + 1) // 2], axis=-1)
-        top = self.rotations._correction(x[..., :-1, :-1], of_rotation)
-        return jnp.concatenate([jnp.pad(top, [(0, 0)] * (top.ndim - 1) + [(0, 1)]), of_last[..., None, :]], axis=-2)
+        rotation_change, last_row_change = jnp.split(c, [self.n * (self.n + 1) // 2], axis=-1)
+        top = self.rotations._correction(x[..., :-1, :-1], rotation_change)
+        return jnp.concatenate(
+            [jnp.pad(top, [(0, 0)] * (top.ndim - 1) + [(0, 1)]), last_row_change[..., None, :]], axis=-2
+        )
 
     def _constraint_scales(self, x):
         return jnp.concatenate([self.rotations._constraint_scales(x[..., :-1, :-1]), jnp.abs(x[..., -1, :])], axis=-1)
@@ -483,8 +495,8 @@ class SpecialEuclidean(GroupSpace):
         return self._map_blocks(self.rotations._log, lambda x, y: y - x, x, y)
 
     def _squared_distance(self, x, y):
-        moved = (y[..., :-1, -1] - x[..., :-1, -1]) / self.length
-        return self.rotations._squared_distance(x[..., :-1, :-1], y[..., :-1, :-1]) + (moved**2).sum(axis=-1)
+        displacement = (y[..., :-1, -1] - x[..., :-1, -1]) / self.length
+        return self.rotations._squared_distance(x[..., :-1, :-1], y[..., :-1, :-1]) + (displacement**2).sum(axis=-1)
 
     def _transport(self, x, v, u):
         return self._map_blocks(self.rotations._transport, lambda x, v, u: u + jnp.zeros_like(v), x, v, u)
@@ -493,7 +505,7 @@ class SpecialEuclidean(GroupSpace):
         return self.rotations._reach(x[..., :-1, :-1], v[..., :-1, :-1])
 
     def _map_blocks(self, rotational, translational, *arrays):
-        """Blocks ``[[rotational, translational], [0, 0]]`` of functions of the same blocks."""
+        """Return blocks ``[[rotational, translational], [0, 0]]`` of functions of the blocks of the arrays."""
         rotation = rotational(*(a[..., :-1, :-1] for a in arrays))
         translation = translational(*(a[..., :-1, -1:] for a in arrays))
         batch = jnp.broadcast_shapes(rotation.shape[:-2], translation.shape[:-2])
@@ -505,12 +517,13 @@ class SpecialEuclidean(GroupSpace):
 
 
 def _nearest_rotation(x):
-    """The nearest rotation, NaN where there is a reflection nearer than any."""
+    """Return the nearest rotation, NaN if a reflection is nearer."""
     x = polar(x)
     return jnp.where((determinant(x) > 0.0)[..., None, None], x, jnp.nan)
 
 
 def _random_rotation(w):
-    """The rotation that normal numbers make, whose measure is Haar's: that of the columns is rotation invariant."""
+    """Return the rotation made of normal numbers w; its distribution is Haar's, since that of w is rotation
+    invariant."""
     x = orthonormal_columns(w)
     return x * jnp.where(np.arange(w.shape[-1]) == 0, determinant(x)[..., None, None], 1.0)

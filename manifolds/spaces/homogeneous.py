@@ -1,4 +1,4 @@
-"""Homogeneous spaces G/H of compact groups: points are elements of the group."""
+"""Homogeneous spaces G/H of compact groups, with elements of G as points."""
 
 from __future__ import annotations
 
@@ -23,13 +23,15 @@ from .maps import inner_by_coordinates
 @jax.tree_util.register_static
 @dataclass(frozen=True, init=False, repr=False)
 class Homogeneous(Space):
-    """The space G/H of a group SO(n) or SU(n) and a subgroup H, with the metric that G gives it.
+    """Space G/H of a group SO(n) or SU(n) and a subgroup H, with the metric that it inherits from G.
 
-    A point is any element g of its class gH; functions are those of g that H leaves alone. A tangent vector is
-    horizontal: ``g hat(xi)`` with xi orthogonal to the algebra of H, and as long as xi. So a system moves upstairs in
+    A point is any element g of its class gH; functions must be invariant under ``g -> g h``, h in H. A tangent vector
+    is
+    horizontal: ``g hat(xi)`` with xi orthogonal to the algebra of H; its length is that of xi. A system therefore moves
+    in
     G, along horizontal fields. Geodesics are ``g exp(t xi)``, and parallel transport along one solves
-    ``eta' = -[xi, eta]_m / 2``, m being the horizontal part [O'Neill 1966; Milnor 1976]. The logarithm is found by
-    Newton's method, and accepted below the distance at which geodesics can have conjugate points; where H winds around
+    ``eta' = -[xi, eta]_m / 2``, m being the horizontal part [O'Neill 1966; Milnor 1976]. Newton's method computes the
+    logarithm, which is accepted below the distance at which geodesics can have conjugate points; where H winds around
     in G, as in lens spaces, there may be a shorter one.
 
     Parameters
@@ -56,13 +58,21 @@ class Homogeneous(Space):
     is_quotient = True
 
     def __init__(self, group, stabilizer, name: str | None = None):
-        upstairs = _group_space_of(group)
-        rows = subalgebra_basis(upstairs.group, stabilizer)
-        rest = np.linalg.svd(rows, full_matrices=True)[2][len(rows) :] if len(rows) else np.eye(upstairs.dim)
-        if not len(rest):
-            raise ParameterError(f"{upstairs.name}: the stabilizer is the whole group, and leaves a single point")
-        chosen = f"{upstairs.name}/H" if name is None else name
-        values = {"upstairs": upstairs, "horizontal": tuple(map(tuple, rest.tolist())), "name": chosen}
+        group_space = _group_space_of(group)
+        rows = subalgebra_basis(group_space.group, stabilizer)
+        horizontal_rows = (
+            np.linalg.svd(rows, full_matrices=True)[2][len(rows) :] if len(rows) else np.eye(group_space.dim)
+        )
+        if not len(horizontal_rows):
+            raise ParameterError(
+                f"{group_space.name}: the stabilizer must not be the full group, whose quotient is a single point"
+            )
+        full_name = f"{group_space.name}/H" if name is None else name
+        values = {
+            "group_space": group_space,
+            "horizontal_basis": tuple(map(tuple, horizontal_rows.tolist())),
+            "name": full_name,
+        }
         for field, value in values.items():
             object.__setattr__(self, field, value)
 
@@ -74,21 +84,24 @@ class Homogeneous(Space):
     dtype = forward_to("group_space")
 
     def injectivity_radius(self, x=None):
-        """Curvatures are at most ``|[X, Y]|^2`` for unit X, Y [Bloch & Iserles 2005]: 2 in SO(n) with n > 3, else 1."""
-        steep = isinstance(self.group_space, SpecialOrthogonal) and self.group_space.n > 3
-        return math.pi / math.sqrt(2.0) if steep else math.pi
+        """Return a lower bound of the radius, pi over the root of the largest sectional curvature.
+
+        Curvatures are at most ``|[X, Y]|^2`` for unit X, Y [Bloch & Iserles 2005]: 2 in SO(n) with n > 3, else 1.
+        """
+        has_curvature_two = isinstance(self.group_space, SpecialOrthogonal) and self.group_space.n > 3
+        return math.pi / math.sqrt(2.0) if has_curvature_two else math.pi
 
     @cached_property
     def _m(self) -> np.ndarray:
-        """The horizontal part of the algebra: orthonormal components, shape (dim, dim of the group)."""
+        """Orthonormal basis of the horizontal part of the algebra, in components, shape (dim, dim of the group)."""
         return np.array(self.horizontal_basis)
 
     @cached_property
     def _h(self) -> np.ndarray:
-        """That of H."""
+        """Orthonormal basis of the algebra of H, in components, shape (dim of H, dim of the group)."""
         return np.linalg.svd(self._m, full_matrices=True)[2][self.dim :]
 
-    # -- points: those of the group -----------------------------------------------------------------------------------
+    # -- points of the group ------------------------------------------------------------------------------------------
 
     _residual = forward_to("group_space")
     _project = forward_to("group_space")
@@ -131,7 +144,7 @@ class Homogeneous(Space):
         return self._from_coordinates(x, jnp.vectorize(self._single_log, signature=pair)(x, y))
 
     def _single_log(self, x, y):
-        """The horizontal c, with b in H, for which ``exp(c) exp(b)`` is the way from x to y."""
+        """Return the horizontal c with ``exp(c) exp(b) = x^-1 y`` for some b in the algebra of H."""
         reach = self.injectivity_radius() * (1.0 - CUT_MARGIN)
         return factor_element(self.group_space.group, self._m, self._h, self.group_space._relative_element(x, y), reach)
 
@@ -140,8 +153,8 @@ def _group_space_of(group) -> BiInvariantSpace:
     if isinstance(group, BiInvariantSpace):
         return group
     if isinstance(group, MatrixGroup):
-        for kind, name in ((SpecialOrthogonal, "SO"), (SpecialUnitary, "SU")):
+        for space_class, name in ((SpecialOrthogonal, "SO"), (SpecialUnitary, "SU")):
             if group.name == f"{name}({group.matrix_size})":
-                return kind(group.matrix_size)
-    given = getattr(group, "name", type(group).__name__)
-    raise SpaceError(f"Homogeneous(group, stabilizer): the group is SO(n) or SU(n), not {given}")
+                return space_class(group.matrix_size)
+    group_name = getattr(group, "name", type(group).__name__)
+    raise SpaceError(f"Homogeneous(group, stabilizer): group must be SO(n) or SU(n), got {group_name}")

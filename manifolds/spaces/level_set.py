@@ -1,4 +1,4 @@
-"""A manifold from its equations."""
+"""Manifolds defined by equations."""
 
 from __future__ import annotations
 
@@ -18,33 +18,34 @@ from .base import MEMBERSHIP_TOLERANCE, Space, register
 from .maps import inner_by_flat
 
 MIN_GRADIENT_SINGULAR_VALUE = 1e-9
-"""Least singular value of the gradients of the constraints, made unit vectors, that counts as independent."""
+"""Smallest singular value of the normalised gradients of the constraints for which these count as independent."""
 
 N_RANDOM_TRIALS = 16
-"""Random arrays, of which at least one has to lead to a point."""
+"""Number of random arrays, of which at least one has to lead to a point."""
 
 MIN_GRADIENT_RATIO = 1e-5
-"""Length of a gradient on the manifold, relative to that at random arrays, that counts as none."""
+"""Length of a gradient on the manifold, relative to that at random arrays, below which it counts as zero."""
 
 _MAX_NEWTON_STEPS = 24
+"""Number of Newton steps of a projection."""
 
 
 @jax.tree_util.register_static
 @dataclass(frozen=True, init=False, repr=False)
 class LevelSet(Space):
-    """The arrays x with ``constraints(x) = 0``: ``LevelSet(lambda x: x @ x - 1, 3)`` is a sphere.
+    """Manifold of the arrays x with ``constraints(x) = 0``: ``LevelSet(lambda x: x @ x - 1, 3)`` is a sphere.
 
-    Points are projected, and random ones found, by Newton's method along the gradients. A point at which these depend
-    on each other is none. There are geodesics by integration, :meth:`geodesic`, and none in closed form.
+    Newton's method along the gradients projects points, and finds random ones. Points must have linearly independent
+    gradients. Geodesics are integrated, see :meth:`geodesic`; there is no closed form.
 
     Parameters
     ----------
     constraints : function, or a sequence of functions
         From an array of the given shape to a number, or to an array of them: smooth, and independent of each other.
     shape : int, or tuple of int
-        Of a point.
+        The shape of a point.
     metric : array, shape (n, n), or function from x to one; optional
-        Positive definite (dimensionless, or in any units): inner products of arrays in one row, n their number of
+        Positive definite (dimensionless, or in any units): inner products of flattened arrays, n their number of
         entries, restricted to the manifold. By default the sum of products.
     name : str
         The name in messages.
@@ -88,34 +89,39 @@ class LevelSet(Space):
         self._check_constraints()
 
     def _check_constraints(self) -> None:
-        count = jax.eval_shape(self._constraints, jax.ShapeDtypeStruct(self.shape, jnp.float64)).shape[-1]
-        if not 0 < count < self.size:
-            raise SpaceError(f"{self.name}: {count} constraints on {self.size} numbers leave no manifold")
+        """Raise an error unless the constraints define a manifold and the metric has the right shape."""
+        n_constraints = jax.eval_shape(self._constraints, jax.ShapeDtypeStruct(self.shape, jnp.float64)).shape[-1]
+        if not 0 < n_constraints < self.size:
+            raise SpaceError(f"{self.name}: {n_constraints} constraints on {self.size} numbers leave no manifold")
         x = jax.random.normal(jax.random.key(0), (N_RANDOM_TRIALS, *self.shape))
-        dependence = self._call_compiled("_min_gradient_singular_value", x)
-        if not bool((dependence > MIN_GRADIENT_SINGULAR_VALUE).any()):
-            worst = float(np.nanmax(np.asarray(dependence), initial=0.0))
+        singular_values = self._call_compiled("_min_gradient_singular_value", x)
+        if not bool((singular_values > MIN_GRADIENT_SINGULAR_VALUE).any()):
+            largest_value = float(np.nanmax(np.asarray(singular_values), initial=0.0))
             raise SpaceError(
                 f"{self.name}: its constraints depend on each other: of their gradients, made unit vectors, the least "
-                f"singular value is at most {worst:.1e} at {N_RANDOM_TRIALS} random arrays; leave one out"
+                f"singular value is at most {largest_value:.1e} at {N_RANDOM_TRIALS} random arrays; leave one out"
             )
         points = self._call_compiled("_project", x)
-        found = np.asarray(jnp.isfinite(points).all(axis=self._axes))
-        if not found.any():
+        has_point = np.asarray(jnp.isfinite(points).all(axis=self._axes))
+        if not has_point.any():
             raise SpaceError(
-                f"{self.name}: Newton's method finds no point of it from {N_RANDOM_TRIALS} random arrays: its constraints may "
-                "contradict each other, or depend on each other at its points"
+                f"{self.name}: Newton's method finds no point of it from {N_RANDOM_TRIALS} random arrays: its "
+                "constraints may contradict each other, or depend on each other at its points"
             )
-        sizes = [np.linalg.norm(np.asarray(self._call_compiled("_constraint_jacobian", y)), axis=-1) for y in (x, points)]
-        shrunk = (sizes[1][found] / np.median(sizes[0], axis=0)).max(axis=0)
-        if (shrunk < MIN_GRADIENT_RATIO).any():
-            i = int(np.argmin(shrunk))
+        gradient_norms = [
+            np.linalg.norm(np.asarray(self._call_compiled("_constraint_jacobian", y)), axis=-1) for y in (x, points)
+        ]
+        gradient_ratios = (gradient_norms[1][has_point] / np.median(gradient_norms[0], axis=0)).max(axis=0)
+        if (gradient_ratios < MIN_GRADIENT_RATIO).any():
+            i = int(np.argmin(gradient_ratios))
             raise SpaceError(
-                f"{self.name}: the gradient of constraint {i} vanishes on it, near {np.asarray(points)[found][0]}: "
+                f"{self.name}: the gradient of constraint {i} vanishes on it, near {np.asarray(points)[has_point][0]}: "
                 "give a function that changes its sign there"
             )
         if self.form is not None and self._call_compiled("_metric_at", x).shape[-2:] != (self.size, self.size):
-            raise ParameterError(f"{self.name}: the metric is a matrix of shape {(self.size, self.size)} at each point")
+            raise ParameterError(
+                f"{self.name}: the metric must be a matrix of shape {(self.size, self.size)} at each point"
+            )
 
     @property
     def metric(self):  # type: ignore[override]
@@ -130,10 +136,11 @@ class LevelSet(Space):
         return self.sizes
 
     def geodesic(self, x, v, steps: int = 200) -> jax.Array:
-        """The point that the geodesic from x with velocity v reaches at time 1, shape ``shape``, by integration.
+        """Return the point at time 1 of the geodesic from x with velocity v, shape ``shape``, by integration.
 
-        Classical Runge-Kutta steps for ``x' = sharp(p)``, ``p' = -d(p . sharp(p))/dx / 2``: the error falls like the
-        fourth power of their number.
+        The method takes classical Runge-Kutta steps for ``x' = sharp(p)``, ``p' = -d(p . sharp(p))/dx / 2``: the error
+        falls
+        like the fourth power of their number.
 
         Parameters
         ----------
@@ -152,10 +159,10 @@ class LevelSet(Space):
     def _constraints(self, x):
         batch = x.shape[: x.ndim - len(self.shape)]
 
-        def of_one(y):
+        def constraints_at(y):
             return jnp.concatenate([jnp.ravel(jnp.asarray(c(y))) for c in self.constraints])
 
-        return jax.vmap(of_one)(x.reshape(-1, *self.shape)).reshape(*batch, -1) if batch else of_one(x)
+        return jax.vmap(constraints_at)(x.reshape(-1, *self.shape)).reshape(*batch, -1) if batch else constraints_at(x)
 
     def _project(self, x):
         x = jax.lax.fori_loop(
@@ -167,14 +174,14 @@ class LevelSet(Space):
         return x - self._minimal_correction(x, self._constraints(x))
 
     def _residual(self, x):
-        away = jnp.abs(self._minimal_correction(x, self._constraints(x))).max(axis=self._axes)
-        return away / jnp.maximum(jnp.abs(x).max(axis=self._axes), 1.0)
+        distance = jnp.abs(self._minimal_correction(x, self._constraints(x))).max(axis=self._axes)
+        return distance / jnp.maximum(jnp.abs(x).max(axis=self._axes), 1.0)
 
     def _random(self, key, size):
-        tries = self._project(jax.random.normal(key, (N_RANDOM_TRIALS, *size, *self.shape)))
-        found = jnp.isfinite(tries).all(axis=self._axes, keepdims=True)
-        chosen = jnp.argmax(found, axis=0, keepdims=True)
-        return jnp.take_along_axis(tries, chosen, axis=0)[0]
+        candidates = self._project(jax.random.normal(key, (N_RANDOM_TRIALS, *size, *self.shape)))
+        is_point = jnp.isfinite(candidates).all(axis=self._axes, keepdims=True)
+        indices = jnp.argmax(is_point, axis=0, keepdims=True)
+        return jnp.take_along_axis(candidates, indices, axis=0)[0]
 
     def _project_tangent(self, x, w):
         return self._tangential_part(x, w)
@@ -182,8 +189,8 @@ class LevelSet(Space):
     def _metric_at(self, x):
         assert self.form is not None
         batch, form = x.shape[: x.ndim - len(self.shape)], self.form
-        found = jax.vmap(lambda y: jnp.asarray(form(y)))(x.reshape(-1, *self.shape))
-        return found.reshape(*batch, *found.shape[1:])
+        matrices = jax.vmap(lambda y: jnp.asarray(form(y)))(x.reshape(-1, *self.shape))
+        return matrices.reshape(*batch, *matrices.shape[1:])
 
     _inner = inner_by_flat
 
@@ -197,8 +204,8 @@ class LevelSet(Space):
             return self._tangential_part(x, alpha)
         g, alpha = self._metric_at(x), self.to_vector(alpha + jnp.zeros_like(x))[..., None]
         columns = self._constraint_jacobian(x).swapaxes(-1, -2)
-        raised = solve_near_identity(g, jnp.concatenate([columns, alpha], axis=-1))
-        normal, v = raised[..., :-1], raised[..., -1:]
+        vectors = solve_near_identity(g, jnp.concatenate([columns, alpha], axis=-1))
+        normal, v = vectors[..., :-1], vectors[..., -1:]
         weights = solve_near_identity(columns.swapaxes(-1, -2) @ normal, columns.swapaxes(-1, -2) @ v)
         return self.from_vector((v - normal @ weights)[..., 0])
 
@@ -218,11 +225,11 @@ class LevelSet(Space):
             return velocity, -0.5 * jax.grad(lambda y: self._pair(p, self._sharp(y, p)))(x)
 
         def step(_, state):
-            moved = lambda share, k: jax.tree_util.tree_map(lambda a, b: a + share / steps * b, state, k)  # noqa: E731
+            advance = lambda share, k: jax.tree_util.tree_map(lambda a, b: a + share / steps * b, state, k)  # noqa: E731
             a = rate(state)
-            b = rate(moved(0.5, a))
-            c = rate(moved(0.5, b))
-            d = rate(moved(1.0, c))
+            b = rate(advance(0.5, a))
+            c = rate(advance(0.5, b))
+            d = rate(advance(1.0, c))
             return jax.tree_util.tree_map(
                 lambda y, a, b, c, d: y + (a + 2.0 * b + 2.0 * c + d) / (6.0 * steps), state, a, b, c, d
             )
@@ -232,7 +239,8 @@ class LevelSet(Space):
     def _why_off_space(self, x, residual):
         if (
             np.isfinite(x).all()
-            and not float(self._call_compiled("_min_gradient_singular_value", jnp.asarray(x))) > MIN_GRADIENT_SINGULAR_VALUE
+            and not float(self._call_compiled("_min_gradient_singular_value", jnp.asarray(x)))
+            > MIN_GRADIENT_SINGULAR_VALUE
         ):
             return "the gradients of its constraints depend on each other there"
         return super()._why_off_space(x, residual)
@@ -240,7 +248,7 @@ class LevelSet(Space):
 
 @dataclass(frozen=True)
 class _ConstantMetric:
-    """A metric that is the same everywhere."""
+    """Metric with a constant matrix."""
 
     rows: tuple[tuple[float, ...], ...]
 
@@ -249,9 +257,11 @@ class _ConstantMetric:
         matrix = np.asarray(metric, dtype=np.float64)
         n = math.prod(space.sizes)
         if matrix.shape != (n, n) or not np.allclose(matrix, matrix.T, rtol=1e-12, atol=0.0):
-            raise ParameterError(f"{space.name}: the metric is a symmetric matrix of shape {(n, n)}")
-        if not (least := np.linalg.eigvalsh(matrix)[0]) > 0.0:
-            raise ParameterError(f"{space.name}: the metric has the eigenvalue {least:.3g}: it is positive definite")
+            raise ParameterError(f"{space.name}: the metric must be a symmetric matrix of shape {(n, n)}")
+        if not (min_eigenvalue := np.linalg.eigvalsh(matrix)[0]) > 0.0:
+            raise ParameterError(
+                f"{space.name}: the metric must be positive definite, got the eigenvalue {min_eigenvalue:.3g}"
+            )
         return cls(tuple(map(tuple, matrix.tolist())))
 
     def __call__(self, x):

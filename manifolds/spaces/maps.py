@@ -1,4 +1,4 @@
-"""What the author of a state space gives, and what follows from it."""
+"""Maps of a state space that its author writes, and the defaults derived from them."""
 
 from __future__ import annotations
 
@@ -17,21 +17,23 @@ from ..matrices.linear import solve_near_identity
 
 
 class SpaceMaps(ABC):
-    """The maps of a state space as its author writes them: plain JAX functions of arrays already checked.
+    """Maps of a state space as its author writes them: plain JAX functions of checked arrays.
 
-    Batches are in front. ``name``, ``dim``, ``shape`` and ``_project`` have to be given; all the others follow from
-    these, or are refused with the reason, and may be replaced. :class:`manifolds.Space` says what each means to users.
+    Leading axes are batches. ``name``, ``dim``, ``shape`` and ``_project`` are required; the other maps have defaults
+    that
+    follow from these, or raise an error with the reason, and may be overridden. :class:`manifolds.Space` documents the
+    public ones.
     """
 
     metric: str = "induced"
     bi_invariant: bool = False
-    """Whether the space is a group whose exponential is the Riemannian one."""
+    """True if the space is a group whose exponential is the Riemannian one."""
     exp_is_group_exp: bool = False
-    """Whether the space is a group and :meth:`exp` the exponential of it, as with a bi-invariant metric."""
+    """True if the space is a group and :meth:`exp` its exponential, as with a bi-invariant metric."""
     is_smooth: bool = True
-    """Whether its maps have derivatives of every order, not of the first alone."""
+    """True if the maps have derivatives of every order; False if only first ones exist."""
     has_iterative_log: bool = False
-    """Whether ``log`` looks for the geodesic, up to the injectivity radius."""
+    """True if ``log`` searches for the geodesic, up to the injectivity radius."""
     dtype: np.dtype = np.dtype(np.float64)
 
     @property
@@ -61,7 +63,7 @@ class SpaceMaps(ABC):
 
     @abstractmethod
     def _project(self, x):
-        """A point of the space, x itself where it is one; NaN where there is none."""
+        """Return a point of the space, x itself if it is one; NaN if there is none."""
 
     def _residual(self, x):
         y = self._project(x)
@@ -69,36 +71,40 @@ class SpaceMaps(ABC):
 
     @property
     def _n_normals(self) -> int | None:
-        """How many normal numbers a random point is made of, None where it is drawn otherwise."""
+        """Number of normal numbers from which a random point is made, None if it is drawn otherwise."""
         return self.size if type(self)._random is SpaceMaps._random else None
 
     def _point_from_normals(self, w):
-        """A random point from normal numbers, shape (..., normals)."""
+        """Return a random point made of normal numbers, shape (..., normals)."""
         return self._project(self.from_vector(w))
 
     def _random(self, key, size):
         return self._point_from_normals(jax.random.normal(key, (*size, self._n_normals or 0)))
 
     def _tangent_basis(self, x):
-        """A basis of the tangent space, orthonormal as flat arrays, shape (..., dim, size): of what _project lets by.
+        """Return a basis of the tangent space, orthonormal as flat arrays, shape (..., dim, size).
 
-        By Gram and Schmidt's process, the longest rest first.
+        Gram-Schmidt orthogonalises the projected axes, the longest remainder first.
         """
-        push = (lambda w: self._tangential_part(x, w)) if self._has_equations else jax.linearize(self._project, x)[1]
+        tangent_map = (
+            (lambda w: self._tangential_part(x, w)) if self._has_equations else jax.linearize(self._project, x)[1]
+        )
         axes = self.from_vector(jnp.eye(self.size))
-        rest = jax.vmap(lambda axis: self.to_vector(push(jnp.broadcast_to(axis, x.shape))), out_axes=-2)(axes)
+        remainders = jax.vmap(lambda axis: self.to_vector(tangent_map(jnp.broadcast_to(axis, x.shape))), out_axes=-2)(
+            axes
+        )
         basis: list[jax.Array] = []
         for _ in range(self.dim):
-            best = jnp.argmax((rest**2).sum(axis=-1), axis=-1)[..., None] == jnp.arange(self.size)
-            e = jnp.where(best[..., None], rest, 0.0).sum(axis=-2)
+            is_longest = jnp.argmax((remainders**2).sum(axis=-1), axis=-1)[..., None] == jnp.arange(self.size)
+            e = jnp.where(is_longest[..., None], remainders, 0.0).sum(axis=-2)
             e = e / jnp.sqrt((e**2).sum(axis=-1, keepdims=True))
-            rest = rest - (rest * e[..., None, :]).sum(axis=-1, keepdims=True) * e[..., None, :]
+            remainders = remainders - (remainders * e[..., None, :]).sum(axis=-1, keepdims=True) * e[..., None, :]
             basis.append(e)
         return jnp.stack(basis, axis=-2)
 
     def _project_tangent(self, x, w):
-        basis, flat = self._tangent_basis(x), self.to_vector(w)
-        weights = (basis * flat[..., None, :]).sum(axis=-1, keepdims=True)
+        basis, vector = self._tangent_basis(x), self.to_vector(w)
+        weights = (basis * vector[..., None, :]).sum(axis=-1, keepdims=True)
         return self.from_vector((weights * basis).sum(axis=-2))
 
     def _frame(self, x):
@@ -118,17 +124,17 @@ class SpaceMaps(ABC):
 
     @property
     def has_geodesics(self) -> bool:
-        """Whether the space knows its geodesics: has :meth:`exp`, :meth:`log`, :meth:`transport` and what follows."""
+        """True if the space has :meth:`exp`, :meth:`log`, :meth:`transport` and what follows from them."""
         return type(self)._exp is not SpaceMaps._exp
 
     def _exp(self, x, v):
         raise SpaceError(
-            f"{self.name} does not say what its geodesics are: give _exp, _log and _transport, or go by a chart that "
+            f"{self.name} has no geodesics. Implement _exp, _log and _transport, or use a chart that "
             "needs none, such as manifolds.ProjectionRetraction(space)"
         )
 
     def _log(self, x, y):
-        """NaN where it is not defined."""
+        """Return the logarithm, NaN where it is not defined."""
         return self._exp(x, y)  # raises
 
     def _transport(self, x, v, u):
@@ -146,11 +152,11 @@ class SpaceMaps(ABC):
 
     @property
     def isotropic_size(self) -> int:
-        """How many numbers :meth:`isotropic` takes."""
+        """Number of components of w in :meth:`isotropic`."""
         return self.size if self._has_induced_metric else self.dim
 
     def _isotropic(self, x, w):
-        """``R w`` with ``R R^T`` the inverse of the metric, and R differentiable in x.
+        """Return ``R w`` with ``R R^T`` the inverse of the metric, and R differentiable in x.
 
         A smooth frame is such an R; so are the fields of a group of isometries, and the projection of arrays.
         """
@@ -160,27 +166,31 @@ class SpaceMaps(ABC):
 
     @property
     def _has_induced_metric(self) -> bool:
-        """Whether the metric is known to be that of the arrays around."""
+        """True if the metric is known to be that of the ambient arrays."""
         return type(self)._inner is SpaceMaps._inner
 
     def _divergence_terms(self, x, rows):
-        """``<E_i, nabla_{E_i} X>`` over a frame E, shape (dim, ...): the divergence of X is the sum over i.
+        """Return ``<E_i, nabla_{E_i} X>`` over a frame E, shape (dim, ...): the divergence of X is the sum over i.
 
-        ``rows(y, alpha)`` is what a covector alpha at y makes of the field X, or of each of several.
+        ``rows(y, alpha)`` returns the product of a covector alpha at y with the field X, or with each of several
+        fields.
         """
 
-        def geodesic(t, e):
+        def rows_along_geodesic(t, e):
             y = self._exp(x, t * e)
             return rows(y, self._flat(y, self._transport(x, t * e, e)))
 
-        def straight(t, e):  # the metric being that of the arrays around
+        def rows_along_line(t, e):  # the metric being that of the arrays around
             return rows(self._project(x + t * e), e.conj())
 
         if not (self.has_geodesics or self._has_induced_metric):
-            raise SpaceError(f"divergences on {self.name} are found along geodesics: give _exp, _log and _transport")
-        along = geodesic if self.has_geodesics else straight
+            raise SpaceError(
+                f"{self.name} has no geodesics, along which divergences are computed. Implement _exp, _log and "
+                "_transport"
+            )
+        rows_along = rows_along_geodesic if self.has_geodesics else rows_along_line
         frame = jnp.moveaxis(self._frame(x), -1 - len(self.shape), 0)
-        return jax.vmap(lambda e: jax.jvp(lambda t: along(t, e), (0.0,), (1.0,))[1])(frame)
+        return jax.vmap(lambda e: jax.jvp(lambda t: rows_along(t, e), (0.0,), (1.0,))[1])(frame)
 
     def _norm(self, x, v):
         return safe_sqrt(self._inner(x, v, v))
@@ -191,7 +201,7 @@ class SpaceMaps(ABC):
     # These two are made of compiled maps, as a logarithm can be long to compile.
 
     def _squared_distance(self, x, y):
-        """The square of the distance, with its derivatives of every order also where both points are one."""
+        """Return the squared distance, with its derivatives of every order also where the two points are equal."""
         if type(self)._distance is not SpaceMaps._distance:
             return self._distance(x, y) ** 2
         v = self._call_compiled("_log", x, y)
@@ -203,30 +213,31 @@ class SpaceMaps(ABC):
     def _reach(self, x, v):
         return self._norm(x, v) / self.injectivity_radius()
 
-    # -- in the arrays around ---------------------------------------------------------------------------------------
-    # Systems are run there where no retraction is asked for. These maps are asked for near the space too.
+    # -- in the ambient arrays --------------------------------------------------------------------------------------
+    # Systems run there when no retraction is given. These maps are evaluated near the space too.
 
     @property
     def can_be_embedded(self) -> bool:
-        """Whether systems are run in the arrays around the space where no retraction is asked for."""
+        """True if systems run in the ambient arrays of the space when no retraction is given."""
         return True
 
     is_quotient: ClassVar[bool] = False
-    """Whether many points are one: functions have to be the same at all of these."""
+    """True if many points represent one class; functions must then be constant on each class."""
 
     def _constraints(self, x):
-        """Independent functions that vanish on the space, shape (..., m): by default what :meth:`_returned` takes off.
+        """Return independent functions that vanish on the space, shape (..., m); by default the change by
+        :meth:`_restore`.
 
-        Quadratic ones are kept by collocation, and cost an implicit step nothing.
+        Collocation conserves quadratic constraints, at no cost to an implicit step.
         """
         return self.to_vector(x - self._restore(x))
 
     def _restore(self, x):
-        """A point near x that is nearer to the space, as Newton's method comes nearer; x itself where it is one."""
+        """Take a step, such as Newton's, from a nearby x towards the space; x itself if it is a point."""
         return self._project(x)
 
     def _inside(self, x):
-        """Whether a solution of the constraints is in the space, shape (...)."""
+        """Return True for each solution of the constraints that is in the space, shape (...)."""
         return jnp.ones(x.shape[: x.ndim - len(self.shape)], bool)
 
     @property
@@ -234,13 +245,13 @@ class SpaceMaps(ABC):
         return type(self)._constraints is not SpaceMaps._constraints
 
     def _constraint_jacobian(self, x):
-        """The derivatives of the constraints, shape (..., m, size)."""
-        found, pull = jax.vjp(lambda y: self._constraints(self.from_vector(y)), self.to_vector(x))
-        axes = np.eye(found.shape[-1])
-        return jax.vmap(lambda e: pull(jnp.broadcast_to(e, found.shape))[0], out_axes=-2)(axes)
+        """Return the derivatives of the constraints, shape (..., m, size)."""
+        values, pullback = jax.vjp(lambda y: self._constraints(self.from_vector(y)), self.to_vector(x))
+        axes = np.eye(values.shape[-1])
+        return jax.vmap(lambda e: pullback(jnp.broadcast_to(e, values.shape))[0], out_axes=-2)(axes)
 
     def _minimal_correction(self, x, c):
-        """The least displacement at x that changes the constraints by c, shape (..., m)."""
+        """Return the least displacement at x that changes the constraints by c, shape (..., m)."""
         if not self._has_equations:
             return self.from_vector(c)
         rows = self._constraint_jacobian(x)
@@ -248,49 +259,51 @@ class SpaceMaps(ABC):
         return self.from_vector((weights * rows).sum(axis=-2))
 
     def _correction(self, x, c):
-        """A displacement that changes the constraints by c, shape (..., m), at a point x; near it, by about as much."""
+        """Return a displacement that changes the constraints by c, shape (..., m), at a point x; near it, by about as
+        much."""
         return self._minimal_correction(x, c)
 
     def _tangential_part(self, x, w):
-        """The array w less what would change the constraints at x."""
+        """Return w minus the displacement that would change the constraints at x."""
         if not self._has_equations:
             return self._project_tangent(x, w)
         x, w = jnp.broadcast_arrays(x, w)
         return w - self._minimal_correction(x, jax.jvp(self._constraints, (x,), (w,))[1])
 
     def _constraint_scales(self, x):
-        """The sizes at which the constraints are rounded at x, shape (..., m)."""
+        """Return the sizes at which the constraints are rounded at x, shape (..., m)."""
         if not self._has_equations:
             return jnp.abs(self.to_vector(x))
         return (jnp.abs(self._constraint_jacobian(x)) * jnp.abs(self.to_vector(x))[..., None, :]).sum(axis=-1)
 
-    # What retractions other than the Riemannian one are made of, where a space has it.
+    # Maps of the retractions other than the Riemannian one, on spaces that have them.
 
     def _euclidean_reach(self, x, v):
-        """Length of v over that up to which ``x + v`` is sure to stay in a space that is an open set of arrays."""
+        """Return the length of v over that up to which ``x + v`` stays in the space, an open set of arrays, for
+        certain."""
         raise SpaceError(f"{self.name} is not an open set of arrays: x + v leaves it")
 
     def _group_exp(self, x, v):
-        """``x exp(x^-1 v)``."""
+        """Return ``x exp(x^-1 v)``."""
         raise SpaceError(f"{self.name} is not a group: it has no group exponential and no Cayley map")
 
     def _group_log(self, x, y):
-        """The inverse of :meth:`_group_exp`, NaN where it is not defined."""
+        """Return the inverse of :meth:`_group_exp`, NaN where it is not defined."""
         return self._group_exp(x, y)  # raises
 
     def _left_translate(self, x, y, u):
-        """``y x^-1 u``."""
+        """Return ``y x^-1 u``."""
         return self._group_exp(x, u)  # raises
 
     def _cayley(self, x, v):
-        """``x cayley(x^-1 v)``."""
+        """Return ``x cayley(x^-1 v)``."""
         return self._group_exp(x, v)  # raises
 
     def _inverse_cayley(self, x, y):
         return self._group_exp(x, y)  # raises
 
     def _why_no_log(self, x, y) -> str:
-        """Why ``log(x, y)`` is NaN, for one pair of NumPy arrays."""
+        """Return the reason why ``log(x, y)`` is NaN, for one pair of NumPy arrays."""
         if not self.has_geodesics:
             return "the chart around x does not reach y; go by a point between them"
         if self.has_iterative_log:
@@ -304,9 +317,9 @@ class SpaceMaps(ABC):
         )
 
     def injectivity_radius(self, x=None) -> float:
-        """Radius of the ball of tangent vectors at x that ``exp`` maps one to one, with ``log`` its inverse.
+        """Return the radius of the ball of tangent vectors at x that ``exp`` maps one to one, with ``log`` its inverse.
 
-        The same at every point of a native space, which is then not needed.
+        The radius of a native space is constant, so x is not needed.
         """
         return math.inf
 
@@ -314,29 +327,34 @@ class SpaceMaps(ABC):
 
     @property
     def _axes(self) -> tuple[int, ...]:
-        """The axes of one point."""
+        """Axes of one point."""
         return tuple(range(-len(self.shape), 0))
 
     def _pair(self, alpha, v):
-        """``Re sum(alpha * v)`` over the axes of one point."""
+        """Return ``Re sum(alpha * v)`` over the axes of one point."""
         return (alpha * v).sum(axis=self._axes).real
 
     def _scale(self, factor, v):
-        """Vectors times numbers, one for each point."""
+        """Multiply each vector by its factor."""
         return factor.reshape(*factor.shape, *(1,) * len(self.shape)) * v
 
     def _with_frame_axis(self, v):
-        """``v`` with an axis of length 1 for the vectors of a frame."""
+        """Return ``v`` with an axis of length 1 for the vectors of a frame."""
         return jnp.expand_dims(v, -1 - len(self.shape))
 
     def _call_compiled(self, kernel: str, *arrays, static: tuple = ()):
-        few = sum(np.size(array) for array in arrays) + np.prod(static) * self.size <= MAX_UNOPTIMIZED_SIZE
-        hasty = few and not any(is_traced(array) for array in arrays)  # a part of another program has no options
-        return (run_kernel_unoptimized if hasty else run_kernel)(self, kernel, static, *arrays)
+        is_small = sum(np.size(array) for array in arrays) + np.prod(static) * self.size <= MAX_UNOPTIMIZED_SIZE
+        skip_optimization = is_small and not any(
+            is_traced(array) for array in arrays
+        )  # a part of another program has no options
+        return (run_kernel_unoptimized if skip_optimization else run_kernel)(self, kernel, static, *arrays)
 
 
 MAX_UNOPTIMIZED_SIZE = 10_000
-"""Numbers up to which a compiler that does not optimise is the faster one, as long as a kernel is run a few times."""
+"""Largest number of array entries for which a kernel is compiled without optimisation.
+
+Up to it compilation takes longer than the run, as long as the kernel is called a few times.
+"""
 
 
 def _call_kernel(space: SpaceMaps, kernel: str, static: tuple, *arrays) -> Any:
@@ -350,16 +368,19 @@ run_kernel_unoptimized = jax.jit(
 
 
 ZERO_LENGTH_LIMIT = 2.0**-300
-"""Lengths below this, of any unit, count as zero where a derivative divides by them; a power of two divides exactly."""
+"""Lengths below this, in any unit, count as zero where a derivative divides by them; division by a power of two is
+exact."""
 
 
 @jax.custom_jvp
 def safe_sqrt(z):
-    """``sqrt(max(z, 0))``, with a derivative that is zero where z and its derivative are, so that its square has all.
+    """Return ``sqrt(max(z, 0))``, with a derivative that is zero if z and its derivative are, so that its square is
+    smooth.
 
-    The root d of a square z has no derivative at zero, but ``d**2`` has: z', and z'' after it. JAX computes them as
-    ``2 d d'`` with ``d' = z' / (2 d)``. So where z vanishes, the derivative is that of a root EQUAL, and this root
-    enters the product too.
+    The root d of a square z has no derivative at zero, but ``d**2`` has: z', and then z''. JAX computes them as
+    ``2 d d'`` with ``d' = z' / (2 d)``. So where z vanishes, the derivative is that of a root ZERO_LENGTH_LIMIT, and
+    this
+    root is the factor in the product too.
     """
     positive = z > 0.0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, z, 1.0)), jnp.where(z <= 0.0, 0.0, z))
@@ -368,17 +389,19 @@ def safe_sqrt(z):
 @safe_sqrt.defjvp
 def _safe_sqrt_jvp(primals, tangents):
     (z,), (dz,) = primals, tangents
-    small = z < ZERO_LENGTH_LIMIT**2
-    far = jnp.sqrt(jnp.where(small, 1.0, z))
-    slope = jnp.where(small, 0.5 / ZERO_LENGTH_LIMIT, 0.5 / far)  # of constants, which have no derivatives to overflow
-    return jnp.where(small, ZERO_LENGTH_LIMIT, far), jnp.where(z < 0.0, 0.0, slope) * dz
+    is_small = z < ZERO_LENGTH_LIMIT**2
+    root = jnp.sqrt(jnp.where(is_small, 1.0, z))
+    slope = jnp.where(
+        is_small, 0.5 / ZERO_LENGTH_LIMIT, 0.5 / root
+    )  # of constants, which have no derivatives to overflow
+    return jnp.where(is_small, ZERO_LENGTH_LIMIT, root), jnp.where(z < 0.0, 0.0, slope) * dz
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def extended_squared_distance(space: Any, x, y):
-    """The squared distance from ``_squared_distance_value``, defined at the cut locus too, with derivatives by the log.
+    """Return the squared distance from ``_squared_distance_value``, defined at the cut locus too.
 
-    At the cut locus there are no derivatives: they are NaN.
+    Derivatives follow from the logarithm; at the cut locus they are NaN.
     """
     return space._squared_distance_value(x, y)
 
@@ -390,19 +413,19 @@ def _extended_squared_distance_jvp(space, primals, tangents):
     )[1]
 
 
-# -- what several spaces have: ``_inner = by_flat`` in the body of a class ---------------------------------------------
+# -- methods of several spaces: ``_inner = inner_by_flat`` in the body of a class --------------------------------------
 
 
 def inner_by_flat(self: SpaceMaps, x, u, v):
-    """The inner product, by :meth:`SpaceMaps._flat`."""
+    """Return the inner product by :meth:`SpaceMaps._flat`."""
     return self._pair(self._flat(x, u), v)
 
 
 def inner_by_coordinates(self: SpaceMaps, x, u, v):
-    """The inner product, in the orthonormal frame."""
+    """Return the inner product of coordinates in the orthonormal frame."""
     return (self._coordinates(x, u) * self._coordinates(x, v)).sum(axis=-1)
 
 
 def tangential_part_by_projection(self: SpaceMaps, x, w):
-    """What is along a space whose :meth:`SpaceMaps._project_tangent` is right near it too."""
+    """Return ``_project_tangent(x, w)``, for spaces where that is right near the space too."""
     return self._project_tangent(x, w)

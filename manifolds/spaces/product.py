@@ -1,4 +1,4 @@
-"""Products of state spaces, and powers of one."""
+"""Products of state spaces, and powers of one space."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ from .sphere import Sphere
 @jax.tree_util.register_static
 @dataclass(frozen=True, init=False, repr=False)
 class Product(Space):
-    """The product of several spaces, also written ``A * B``: a point is one flat array, the factors' points in a row.
+    """Product of several spaces, also written ``A * B``: a point is one flat array of the factors' points in order.
 
-    :meth:`split` and :meth:`join` go between that array and the points of the factors. The metric is the sum.
+    :meth:`split` and :meth:`join` convert between that array and the points of the factors. The metric is the sum.
     """
 
     factors: tuple[Space, ...]
     metric = "product"
 
     def __init__(self, *factors: Space):
-        flat: list[Space] = []
+        flat_factors: list[Space] = []
         for factor in factors:
             if not isinstance(factor, Space):
-                raise SpaceError(f"a product is made of state spaces, not of {type(factor).__name__}")
-            flat.extend(factor.factors if isinstance(factor, Product) else [factor])
-        if not flat:
+                raise SpaceError(f"the factors of a product must be state spaces, got {type(factor).__name__}")
+            flat_factors.extend(factor.factors if isinstance(factor, Product) else [factor])
+        if not flat_factors:
             raise SpaceError("a product needs at least one factor")
-        object.__setattr__(self, "factors", tuple(flat))
+        object.__setattr__(self, "factors", tuple(flat_factors))
 
     @property
     def name(self):
@@ -57,33 +57,37 @@ class Product(Space):
         return np.result_type(*(factor.dtype for factor in self.factors))
 
     def split(self, x) -> list[jax.Array]:
-        """The parts of a point or tangent vector, each an array of its factor's shape."""
-        x, parts, start = self._point_array(x, "x"), [], 0
+        """Return the components of a point or tangent vector, each an array of its factor's shape."""
+        x, points, start = self._point_array(x, "x"), [], 0
         for factor in self.factors:
             size = math.prod(factor.shape)
-            part = x[..., start : start + size].reshape(*x.shape[:-1], *factor.shape)
-            parts.append(part if factor.dtype.kind == "c" else part.real)
+            point = x[..., start : start + size].reshape(*x.shape[:-1], *factor.shape)
+            points.append(point if factor.dtype.kind == "c" else point.real)
             start += size
-        return parts
+        return points
 
     def join(self, *parts) -> jax.Array:
-        """The flat array of the parts: the inverse of :meth:`split`."""
+        """Return the flat array of ``parts``, a point of each factor: the inverse of :meth:`split`."""
         arrays = [factor._point_array(part, "part") for factor, part in zip(self.factors, parts, strict=True)]
         rows = [a.reshape(*a.shape[: a.ndim - len(f.shape)], -1) for f, a in zip(self.factors, arrays, strict=True)]
         batch = jnp.broadcast_shapes(*(row.shape[:-1] for row in rows))
         return jnp.concatenate([jnp.broadcast_to(row, (*batch, row.shape[-1])) for row in rows], axis=-1)
 
     def injectivity_radius(self, x=None):
-        parts = [None] * len(self.factors) if x is None else self.split(x)
-        return min(factor.injectivity_radius(part) for factor, part in zip(self.factors, parts, strict=True))
+        points = [None] * len(self.factors) if x is None else self.split(x)
+        return min(factor.injectivity_radius(point) for factor, point in zip(self.factors, points, strict=True))
 
-    def _apply_to_factors(self, kernel: str, *arrays) -> list:
-        """A kernel of every factor on its parts of the arrays."""
-        parts = zip(*(self.split(a) for a in arrays), strict=True)
-        return [getattr(factor, kernel)(*part) for factor, part in zip(self.factors, parts, strict=True)]
+    def _apply_to_factors(self, method_name: str, *arrays) -> list:
+        """Call a method of every factor on its components of the arrays; return the list of results."""
+        factor_arguments = zip(*(self.split(a) for a in arrays), strict=True)
+        return [
+            getattr(factor, method_name)(*arguments)
+            for factor, arguments in zip(self.factors, factor_arguments, strict=True)
+        ]
 
-    def _apply_and_join(self, kernel: str, *arrays):
-        return self.join(*self._apply_to_factors(kernel, *arrays))
+    def _apply_and_join(self, method_name: str, *arrays):
+        """Call a method of every factor on its components; join the resulting points or vectors."""
+        return self.join(*self._apply_to_factors(method_name, *arrays))
 
     def _residual(self, x):
         imaginary = jnp.abs(x - self.join(*self.split(x))).max(axis=-1)  # where a factor is real
@@ -107,10 +111,10 @@ class Product(Space):
     def _point_from_normals(self, w):
         ends = np.cumsum([factor._n_normals or 0 for factor in self.factors])[:-1]
         pairs = zip(self.factors, jnp.split(w, ends, axis=-1), strict=True)
-        return self.join(*(factor._point_from_normals(own) for factor, own in pairs))
+        return self.join(*(factor._point_from_normals(factor_normals) for factor, factor_normals in pairs))
 
     def _restore(self, x):
-        return self._apply_and_join("_returned", x)
+        return self._apply_and_join("_restore", x)
 
     def _project_tangent(self, x, w):
         return self._apply_and_join("_project_tangent", x, w)
@@ -129,37 +133,38 @@ class Product(Space):
         return self._apply_and_concatenate("_constraints", x)
 
     def _constraint_scales(self, x):
-        return self._apply_and_concatenate("_rounded", x)
+        return self._apply_and_concatenate("_constraint_scales", x)
 
-    def _apply_and_concatenate(self, kernel: str, *arrays):
-        """What a kernel of every factor gives, shape (..., m), side by side."""
-        parts = self._apply_to_factors(kernel, *arrays)
-        batch = jnp.broadcast_shapes(*(c.shape[:-1] for c in parts))
-        return jnp.concatenate([jnp.broadcast_to(c, (*batch, c.shape[-1])) for c in parts], axis=-1)
+    def _apply_and_concatenate(self, method_name: str, *arrays):
+        """Call a method of every factor on its components; concatenate the results, shape (..., m)."""
+        values = self._apply_to_factors(method_name, *arrays)
+        batch = jnp.broadcast_shapes(*(c.shape[:-1] for c in values))
+        return jnp.concatenate([jnp.broadcast_to(c, (*batch, c.shape[-1])) for c in values], axis=-1)
 
     def _minimal_correction(self, x, c):
-        return self._apply_to_constraint_parts("_normal", x, c)
+        return self._apply_to_constraint_parts("_minimal_correction", x, c)
 
     def _correction(self, x, c):
         return self._apply_to_constraint_parts("_correction", x, c)
 
-    def _apply_to_constraint_parts(self, kernel: str, x, c):
-        parts = self.split(x)
+    def _apply_to_constraint_parts(self, method_name: str, x, c):
+        """Call a method of every factor on its point and its constraints; join the results."""
+        points = self.split(x)
         sizes = [c.shape[-1] for c in jax.eval_shape(lambda x: self._apply_to_factors("_constraints", x), x)]
-        triples = zip(self.factors, parts, jnp.split(c, np.cumsum(sizes)[:-1], axis=-1), strict=True)
-        return self.join(*(getattr(factor, kernel)(part, own) for factor, part, own in triples))
+        triples = zip(self.factors, points, jnp.split(c, np.cumsum(sizes)[:-1], axis=-1), strict=True)
+        return self.join(*(getattr(factor, method_name)(point, component) for factor, point, component in triples))
 
     def _tangential_part(self, x, w):
-        return self._apply_and_join("_along", x, w)
+        return self._apply_and_join("_tangential_part", x, w)
 
     def _inside(self, x):
         return jnp.stack(self._apply_to_factors("_inside", x)).all(axis=0)
 
     def _frame(self, x):
         batch, columns = x.shape[:-1], []
-        for i, (factor, part) in enumerate(zip(self.factors, self.split(x), strict=True)):
+        for i, (factor, point) in enumerate(zip(self.factors, self.split(x), strict=True)):
             zeros = [jnp.zeros((*batch, factor.dim, *other.shape)) for other in self.factors]
-            columns.append(self.join(*zeros[:i], factor._frame(part), *zeros[i + 1 :]))
+            columns.append(self.join(*zeros[:i], factor._frame(point), *zeros[i + 1 :]))
         return jnp.concatenate(columns, axis=-2)
 
     def _coordinates(self, x, v):
@@ -168,7 +173,7 @@ class Product(Space):
     def _from_coordinates(self, x, c):
         ends = np.cumsum([factor.dim for factor in self.factors])[:-1]
         triples = zip(self.factors, self.split(x), jnp.split(c, ends, axis=-1), strict=True)
-        return self.join(*(factor._from_coordinates(part, components) for factor, part, components in triples))
+        return self.join(*(factor._from_coordinates(point, components) for factor, point, components in triples))
 
     @property
     def isotropic_size(self):
@@ -177,7 +182,7 @@ class Product(Space):
     def _isotropic(self, x, w):
         ends = np.cumsum([factor.isotropic_size for factor in self.factors])[:-1]
         triples = zip(self.factors, self.split(x), jnp.split(w, ends, axis=-1), strict=True)
-        return self.join(*(factor._isotropic(part, own) for factor, part, own in triples))
+        return self.join(*(factor._isotropic(point, component) for factor, point, component in triples))
 
     def _inner(self, x, u, v):
         return sum(self._apply_to_factors("_inner", x, u, v))
@@ -223,7 +228,7 @@ class Product(Space):
         return all(factor.is_smooth for factor in self.factors)
 
     def _euclidean_reach(self, x, v):
-        return jnp.stack(self._apply_to_factors("_straight_reach", x, v)).max(axis=0)
+        return jnp.stack(self._apply_to_factors("_euclidean_reach", x, v)).max(axis=0)
 
     def _group_exp(self, x, v):
         return self._apply_and_join("_group_exp", x, v)
@@ -232,7 +237,7 @@ class Product(Space):
         return self._apply_and_join("_group_log", x, y)
 
     def _left_translate(self, x, y, u):
-        return self._apply_and_join("_left_carry", x, y, u)
+        return self._apply_and_join("_left_translate", x, y, u)
 
     def _cayley(self, x, v):
         return self._apply_and_join("_cayley", x, v)
@@ -251,9 +256,9 @@ class Product(Space):
 @jax.tree_util.register_static
 @dataclass(frozen=True, repr=False)
 class Power(Space):
-    """The product of ``count`` copies of a space, also written ``A**count``: points of shape ``(count, *base.shape)``.
+    """Product of ``count`` copies of a space, also written ``A**count``: points of shape ``(count, *base.shape)``.
 
-    ``Sphere(2) ** 100`` holds the states of a chain of a hundred spins. The copies are run as one batch.
+    ``Sphere(2) ** 100`` holds the states of a chain of a hundred spins. The copies run as one batch.
     """
 
     base: Space
@@ -262,7 +267,7 @@ class Power(Space):
 
     def __post_init__(self):
         if not isinstance(self.base, Space):
-            raise SpaceError(f"a power is that of a state space, not of {type(self.base).__name__}")
+            raise SpaceError(f"Power(base, count): base must be a state space, got {type(self.base).__name__}")
         checked_size(self.count, 1, "Power(base, count)", "count")
 
     @property
@@ -282,7 +287,7 @@ class Power(Space):
     def injectivity_radius(self, x=None):
         if x is None:
             return self.base.injectivity_radius()
-        return min(self.base.injectivity_radius(part) for part in self._point_array(x, "x"))
+        return min(self.base.injectivity_radius(point) for point in self._point_array(x, "x"))
 
     def _residual(self, x):
         return self.base._residual(x).max(axis=-1)
@@ -386,8 +391,8 @@ class Power(Space):
     _inverse_cayley = forward_to("base")
 
     def _why_no_log(self, x, y):
-        lost = ~np.isfinite(np.asarray(self.base._log(x, y))).reshape(self.count, -1).all(axis=1)
-        i = int(lost.argmax())
+        is_undefined = ~np.isfinite(np.asarray(self.base._log(x, y))).reshape(self.count, -1).all(axis=1)
+        i = int(is_undefined.argmax())
         return f"in copy {i}, {self.base._why_no_log(x[i], y[i])}"
 
 
@@ -398,7 +403,7 @@ register((Sphere(2), 4))(Power)
 @register((3, 2))
 @jax.tree_util.register_static
 class Oblique(Power):
-    """The oblique manifold: p unit vectors of R^n, the rows of a matrix, shape (p, n). A power of a sphere.
+    """Oblique manifold: p unit vectors of R^n, the rows of a matrix, shape (p, n). It is a power of a sphere.
 
     Parameters
     ----------

@@ -16,7 +16,7 @@ from .base import Space, register
 
 
 class PositiveDefinite(Space):
-    """Symmetric positive definite n x n matrices of some kind."""
+    """Base class of spaces of symmetric positive definite n x n matrices."""
 
     n: int
 
@@ -40,8 +40,9 @@ class SPD(PositiveDefinite):
     """Symmetric positive definite n x n matrices with ``inner(x, u, v) = tr(x^-1 u x^-1 v)``.
 
     The metric is invariant under every ``x -> g x g^T``; it makes the space complete and of nonpositive curvature, so
-    that exp and log are one to one everywhere [Pennec, Fillard & Ayache 2006]. Written with the Cholesky factor L of x,
-    where they use the square root: ``exp(x, v) = L expm(L^-1 v L^-T) L^T``. The result is known to rounding of its
+    that exp and log are one to one everywhere [Pennec, Fillard & Ayache 2006]. The formulas use the Cholesky factor L
+    of x
+    instead of their square root: ``exp(x, v) = L expm(L^-1 v L^-T) L^T``. The result is known to rounding of its
     largest entry, so eigenvalues smaller than that by 1e16 are lost.
     """
 
@@ -85,12 +86,12 @@ class SPD(PositiveDefinite):
         return L @ self._basis @ L.swapaxes(-1, -2)
 
     def _inner(self, x, u, v):
-        inverse = self._inverse_factor(x)
-        return self._pair(_congruence(inverse, u), _congruence(inverse, v))
+        inverse_factor = self._inverse_factor(x)
+        return self._pair(_congruence(inverse_factor, u), _congruence(inverse_factor, v))
 
     def _flat(self, x, v):
-        inverse = self._inverse_factor(x)
-        return _congruence(inverse.swapaxes(-1, -2), _congruence(inverse, v))
+        inverse_factor = self._inverse_factor(x)
+        return _congruence(inverse_factor.swapaxes(-1, -2), _congruence(inverse_factor, v))
 
     def _sharp(self, x, alpha):
         return x @ symmetrize(alpha) @ x
@@ -103,17 +104,17 @@ class SPD(PositiveDefinite):
         return _congruence(cholesky(x), self._log_at_identity(x, y))
 
     def _log_at_identity(self, x, y):
-        """The logarithm of y at x, as both are carried by the isometry that takes x to the identity."""
-        inverse = self._inverse_factor(x)
-        return spd_log(_congruence(inverse, y), _congruence(inverse, y - x))
+        """Return the logarithm of y at x, carried by the isometry that takes x to the identity."""
+        inverse_factor = self._inverse_factor(x)
+        return spd_log(_congruence(inverse_factor, y), _congruence(inverse_factor, y - x))
 
     def _squared_distance(self, x, y):
         v = self._log_at_identity(x, y)
         return self._pair(v, v)
 
     def _transport(self, x, v, u):
-        inverse = self._inverse_factor(x)
-        return _congruence(cholesky(x) @ expm(0.5 * _congruence(inverse, v)) @ inverse, u)
+        inverse_factor = self._inverse_factor(x)
+        return _congruence(cholesky(x) @ expm(0.5 * _congruence(inverse_factor, v)) @ inverse_factor, u)
 
     def _euclidean_reach(self, x, v):
         return self._norm(x, v)  # x + v = L (I + a) L^T, with a of this norm
@@ -123,7 +124,7 @@ class SPD(PositiveDefinite):
 
     @property
     def _basis(self) -> np.ndarray:
-        """An orthonormal basis of the symmetric matrices, shape (dim, n, n)."""
+        """Orthonormal basis of the symmetric matrices, shape (dim, n, n)."""
         units = np.eye(self.n)
         return np.array(
             [
@@ -135,5 +136,5 @@ class SPD(PositiveDefinite):
 
 
 def _congruence(g, a):
-    """``g a g^T``, symmetric to the last bit."""
+    """Return ``g a g^T``, symmetric to the last bit."""
     return symmetrize(g @ a @ g.swapaxes(-1, -2))

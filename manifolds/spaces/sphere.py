@@ -1,4 +1,4 @@
-"""The sphere S^n with its round metric."""
+"""Sphere S^n with its round metric."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ from .maps import safe_sqrt
 @jax.tree_util.register_static
 @dataclass(frozen=True, repr=False)
 class Sphere(Space):
-    """Unit vectors of R^(n+1), shape (n + 1,), with the metric that R^(n+1) gives them.
+    """Unit vectors of R^(n+1), shape (n + 1,), with the metric induced by R^(n+1).
 
-    Distances are angles. Closed forms throughout, accurate to rounding up to the antipode; there the direction of the
+    Distances are angles. All maps have closed forms, accurate to rounding up to the antipode; there the direction of
+    the
     logarithm is known to 1e-16 over the distance from the antipode, as its arguments are.
 
     Parameters
@@ -88,7 +89,7 @@ class Sphere(Space):
         return math.comb(self.n + 1, 2)
 
     def _isotropic(self, x, w):
-        """By the rotations of every plane."""
+        """Sum the rotations of all planes, weighted by w."""
         return (skew_matrix(w, self.n + 1) @ x[..., None])[..., 0]
 
     def _inner(self, x, u, v):
@@ -110,17 +111,17 @@ class Sphere(Space):
         w = step - _dot(x, step) * x  # of length sin(angle); free of cancellation for neighbours
         w = w - _dot(x, w) * x  # near the antipode the first pass leaves rounding that is not tangent
         z, cosine = _dot(w, w), _dot(x, y)
-        defined = (cosine > 0) | (z > (math.pi * CUT_MARGIN) ** 2)
-        return jnp.where(defined, angle_over_sine(z, cosine) * w, jnp.nan)
+        is_defined = (cosine > 0) | (z > (math.pi * CUT_MARGIN) ** 2)
+        return jnp.where(is_defined, angle_over_sine(z, cosine) * w, jnp.nan)
 
     def _squared_distance(self, x, y):
         chord, cochord = (((y + s * x) ** 2).sum(axis=-1) for s in (-1.0, 1.0))
         return 4.0 * chord * angle_over_sine(chord, safe_sqrt(cochord)) ** 2
 
     def _midpoint(self, x, y):
-        total = x + y
-        z = _dot(total, total)
-        return jnp.where(z > (math.pi * CUT_MARGIN) ** 2, total / jnp.sqrt(z), jnp.nan)
+        chord_sum = x + y
+        z = _dot(chord_sum, chord_sum)
+        return jnp.where(z > (math.pi * CUT_MARGIN) ** 2, chord_sum / jnp.sqrt(z), jnp.nan)
 
     def _transport(self, x, v, u):
         z = _dot(v, v)

@@ -1,4 +1,4 @@
-"""The Stiefel manifold of orthonormal p-frames in R^n, with its canonical metric."""
+"""Stiefel manifold of orthonormal p-frames in R^n, with its canonical metric."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from .base import CUT_MARGIN, Space, register
 from .maps import inner_by_flat
 
 _MAX_NEWTON_STEPS = 30
-"""Iterations of Newton's method for the logarithm; at most 11 were needed inside the injectivity radius."""
+"""Largest number of Newton iterations for the logarithm; at most 11 were needed inside the injectivity radius."""
 
 
 @register((4, 2))
@@ -38,8 +38,9 @@ class Stiefel(Space):
     This is the metric of SO(n)/SO(n - p), in which a rotation counts once, whether it turns the columns of x among
     themselves or out of their span. A tangent vector v at x is ``W x`` for one skew W of least norm; the geodesic is
     ``expm(t W) x`` [Edelman, Arias & Smith 1998]. Parallel transport solves the linear equation
-    ``eta' = -[W, eta]/2``, projected, of a naturally reductive space. There is no closed form of the logarithm: it is
-    found by Gauss and Newton's method from the projected chord, and accepted inside the injectivity radius only, where
+    ``eta' = -[W, eta]/2``, projected, of a naturally reductive space. The logarithm has no closed form: Gauss and
+    Newton's
+    method computes it from the projected chord, and it is accepted inside the injectivity radius only, where
     it is unique. That radius is pi for p = 1 and p = n - 1; otherwise the bound ``2 pi / sqrt 5`` [Rentmeesters 2013].
     """
 
@@ -78,8 +79,8 @@ class Stiefel(Space):
         return polar(x)
 
     def _constraints(self, x):
-        rest = _transpose_matrix(x) @ x - np.eye(self.p)
-        return rest[..., *np.triu_indices(self.p)]
+        residual = _transpose_matrix(x) @ x - np.eye(self.p)
+        return residual[..., *np.triu_indices(self.p)]
 
     def _minimal_correction(self, x, c):
         if self.p > 2:
@@ -106,20 +107,21 @@ class Stiefel(Space):
         return w - x @ (product + _transpose_matrix(product)) / 2
 
     def _frame(self, x):
-        """Rotations of the columns of x among themselves, then of each column into the rest of the space."""
+        """Return rotations of the columns of x among themselves, then of each column into the complement of their
+        span."""
         units = np.eye(self.p)
         pairs = [(i, j) for i in range(self.p) for j in range(i + 1, self.p)]
         skew = [np.outer(units[j], units[i]) - np.outer(units[i], units[j]) for i, j in pairs]
-        within = x[..., None, :, :] @ np.array(skew).reshape(-1, self.p, self.p)
-        outwards = jnp.einsum("...ni,jp->...ijnp", orthonormal_complement(x), units)
-        return jnp.concatenate([within, outwards.reshape(*x.shape[:-2], -1, *self.shape)], axis=-3)
+        tangential_vectors = x[..., None, :, :] @ np.array(skew).reshape(-1, self.p, self.p)
+        normal_vectors = jnp.einsum("...ni,jp->...ijnp", orthonormal_complement(x), units)
+        return jnp.concatenate([tangential_vectors, normal_vectors.reshape(*x.shape[:-2], -1, *self.shape)], axis=-3)
 
     @property
     def isotropic_size(self):
         return math.comb(self.n, 2)
 
     def _isotropic(self, x, w):
-        """By the rotations of every plane."""
+        """Sum the rotations of all planes, weighted by w."""
         return skew_matrix(w, self.n) @ x
 
     _inner = inner_by_flat
@@ -149,38 +151,40 @@ class Stiefel(Space):
         return expm(W) @ self._from_coordinates(x, c)
 
     def _least_skew_generator(self, x, v):
-        """The skew matrix W, n x n, of least norm with ``W x = v``."""
+        """Return the skew n x n matrix W of least norm with ``W x = v``."""
         outer = v @ _transpose_matrix(x)
         return outer - _transpose_matrix(outer) - x @ (_transpose_matrix(x) @ outer)
 
     def _single_log(self, x, y):
-        def gap(c):
+        def residual(c):
             return self._exp(x, self._from_coordinates(x, c)) - y
 
-        def step(state):
+        def newton_step(state):
             c, _, steps = state
-            J, f = jax.jacfwd(lambda c: (gap(c),) * 2, has_aux=True)(c)
+            J, f = jax.jacfwd(lambda c: (residual(c),) * 2, has_aux=True)(c)
             J, f = J.reshape(-1, self.dim), f.ravel()
             direction = solve(J.T @ J, -(J.T @ f)[:, None])[:, 0]
             lengths = 0.5 ** jnp.arange(8)
-            sizes = jax.vmap(lambda t: (gap(c + t * direction) ** 2).sum())(lengths)
-            move = lengths[jnp.nanargmin(sizes)] * direction
+            squared_residuals = jax.vmap(lambda t: (residual(c + t * direction) ** 2).sum())(lengths)
+            move = lengths[jnp.nanargmin(squared_residuals)] * direction
             return c + move, jnp.abs(move).max(), steps + 1
 
-        def newton(_, start):
-            unfinished = lambda state: (state[1] > 1e-8) & (state[2] < _MAX_NEWTON_STEPS)  # noqa: E731
-            c, change, _ = jax.lax.while_loop(unfinished, step, (start, jnp.inf, 0))
-            inside = (c**2).sum() < (self.injectivity_radius() * (1.0 - CUT_MARGIN)) ** 2
-            found = (change <= 1e-8) & (jnp.abs(gap(c)).max() <= 1e-10)  # not just a point where Newton gets stuck
-            return jnp.where(inside & found, c, jnp.nan)
+        def newton_solve(_, start):
+            is_unfinished = lambda state: (state[1] > 1e-8) & (state[2] < _MAX_NEWTON_STEPS)  # noqa: E731
+            c, change, _ = jax.lax.while_loop(is_unfinished, newton_step, (start, jnp.inf, 0))
+            is_inside = (c**2).sum() < (self.injectivity_radius() * (1.0 - CUT_MARGIN)) ** 2
+            is_solution = (change <= 1e-8) & (
+                jnp.abs(residual(c)).max() <= 1e-10
+            )  # not just a point where Newton gets stuck
+            return jnp.where(is_inside & is_solution, c, jnp.nan)
 
         chord = self._project_tangent(x, y - x)
         length = jnp.sqrt(self._inner(x, y - x, y - x) / jnp.maximum(self._inner(x, chord, chord), 1e-300))
         start = jax.lax.stop_gradient(self._coordinates(x, length * chord))
         c = jax.lax.custom_root(  # for the derivatives, of every order, by the implicit function theorem
-            lambda c: self._coordinates(y, self._project_tangent(y, gap(c))),
+            lambda c: self._coordinates(y, self._project_tangent(y, residual(c))),
             start,
-            newton,
+            newton_solve,
             lambda linear, b: solve(jax.jacfwd(linear)(jnp.zeros_like(b)), b[:, None])[:, 0],
         )
         return self._from_coordinates(x, c)

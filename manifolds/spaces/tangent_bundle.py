@@ -1,4 +1,4 @@
-"""The tangent bundle of a state space: positions with their velocities, or with their momenta."""
+"""Tangent bundle of a state space: positions with their velocities, or with their momenta."""
 
 from __future__ import annotations
 
@@ -20,23 +20,26 @@ from .sphere import Sphere
 class TangentBundle(Space):
     """Pairs (q, v) of a point of a space and a tangent vector there, shape ``(2, *base.shape)``.
 
-    It stands for the cotangent bundle too: a covector p at q is paired with tangent vectors by ``sum(p * v)``, and of
-    all arrays that do the same the one that is tangent itself is taken. In these arrays the form ``p dq`` is the
-    canonical one of T*Q. The metric is that of the arrays around.
+    It represents the cotangent bundle too: a covector p at q is paired with tangent vectors by ``sum(p * v)``, and
+    among
+    the arrays with equal products the tangent one is taken. In these arrays the form ``p dq`` is the
+    canonical one of T*Q. The metric is that of the ambient arrays.
 
     Parameters
     ----------
     base : Space
-        Of real arrays.
+        Space of real arrays.
     """
 
     base: Space
 
     def __post_init__(self):
         if not isinstance(self.base, Space):
-            raise SpaceError(f"a tangent bundle is that of a state space, not of {type(self.base).__name__}")
+            raise SpaceError(f"TangentBundle(base): base must be a state space, got {type(self.base).__name__}")
         if self.base.dtype.kind == "c":
-            raise SpaceError(f"a tangent bundle is that of a space of real arrays, and {self.base.name} is complex")
+            raise SpaceError(
+                f"TangentBundle(base): base must be a space of real arrays, but {self.base.name} is complex"
+            )
 
     @property
     def name(self):
@@ -55,29 +58,31 @@ class TangentBundle(Space):
     _has_equations = forward_to("base")
 
     def tangential_part(self, q, w) -> jax.Array:
-        """The part along Q of an array w at a point q of it, both in one row, shape (n,), with n their entries."""
+        """Return the component along Q of an array w at a point q of it, all of them flat, shape (n,)."""
         base = self.base
         return base.to_vector(base._tangential_part(base.from_vector(q), base.from_vector(w)))
 
     def tangent_matrices(self, x) -> tuple[jax.Array, jax.Array]:
-        """How the point (q, v), in one row, can move: the matrices P and N, shape (n, n).
+        """Return the matrices P and N, shape (n, n), of the tangent vectors ``(P a, P b + N P a)`` at the flat point
+        (q, v).
 
-        P is the projector along Q. Moving q takes v out of the tangent space: ``N q'`` is the part of v' across Q that
-        takes it along. So tangent vectors are the ``(P a, P b + N P a)``.
+        P is the projector along Q. Moving q takes v out of the tangent space: ``N q'`` is the component of v' across Q
+        that
+        compensates for it.
         """
         base, (q, v) = self.base, self._position_and_vector(self.from_vector(x))
-        tilts = jax.jacfwd(lambda y: self._constraint_rates(base.from_vector(y), v))(base.to_vector(q))
+        rate_jacobian = jax.jacfwd(lambda y: self._constraint_rates(base.from_vector(y), v))(base.to_vector(q))
         if not self._has_equations:
             P = jax.vmap(lambda w: self.tangential_part(x[: base.size], w), out_axes=1)(jnp.eye(base.size))
-            return P, -tilts
+            return P, -rate_jacobian
         rows = base._constraint_jacobian(q)
-        raised = solve_near_identity(rows @ rows.T, rows).T
-        return jnp.eye(base.size) - raised @ rows, -raised @ tilts
+        pseudo_inverse = solve_near_identity(rows @ rows.T, rows).T
+        return jnp.eye(base.size) - pseudo_inverse @ rows, -pseudo_inverse @ rate_jacobian
 
     # -- maps ---------------------------------------------------------------------------------------------------------
 
     def _constraint_rates(self, q, v):
-        """What v has across the space, shape (..., m): the rates of the constraints of Q along it."""
+        """Return the rates of the constraints of Q along v, shape (..., m), which vanish if v is tangent."""
         if self._has_equations:
             return jax.jvp(self.base._constraints, (q,), (v,))[1]
         return self.base.to_vector(v - self.base._tangential_part(q, v))
@@ -100,9 +105,9 @@ class TangentBundle(Space):
         return self._stack_pair(q, self.base._project_tangent(q, v))
 
     def _random(self, key, size):
-        at, along = jax.random.split(random_key(key))
-        q = self.base._random(at, size)
-        return self._stack_pair(q, self.base._project_tangent(q, jax.random.normal(along, q.shape)))
+        point_key, vector_key = jax.random.split(random_key(key))
+        q = self.base._random(point_key, size)
+        return self._stack_pair(q, self.base._project_tangent(q, jax.random.normal(vector_key, q.shape)))
 
     def _project_tangent(self, x, w):
         return self._tangential_part(x, w) if self._has_equations else super()._project_tangent(x, w)

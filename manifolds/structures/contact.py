@@ -23,7 +23,7 @@ from .poisson import PoissonStructure
 
 
 class ContactStructure(Module):
-    """A contact structure; subclasses give :meth:`form`, and whatever they know in closed form.
+    """Contact structure; subclasses implement :meth:`form`, and override what they know in closed form.
 
     Attributes
     ----------
@@ -37,43 +37,46 @@ class ContactStructure(Module):
 
     @abstractmethod
     def form(self, x) -> jax.Array:
-        """The contact form eta at one point: its components, shape (dim,)."""
+        """Return the contact form eta at one point: its components, shape (dim,)."""
 
     # -- what the form determines -------------------------------------------------------------------------------------
 
     def differential(self, x) -> jax.Array:
-        """The two-form d eta at x, ``d_i eta_j - d_j eta_i``, shape (dim, dim)."""
+        """Return the two-form d eta at x, ``d_i eta_j - d_j eta_i``, shape (dim, dim)."""
         jacobian = jax.jacfwd(self.form)(x)
         return jacobian.T - jacobian
 
     def volume(self, x) -> jax.Array:
-        """``|eta ^ (d eta)^n| / n!`` in these coordinates, shape (): positive where the form is a contact form."""
+        """Return ``|eta ^ (d eta)^n| / n!`` in these coordinates, shape (): positive where the form is a contact
+        form."""
         return jnp.sqrt(jnp.abs(determinant(self._flat_matrix(x))))
 
     def flat(self, x, v) -> jax.Array:
-        """``i_v d eta + eta(v) eta``: an isomorphism of vectors and covectors, both of shape (dim,)."""
+        """Return ``i_v d eta + eta(v) eta``: an isomorphism of vectors and covectors, both of shape (dim,)."""
         form = self.form(x)
         return v @ self.differential(x) + jnp.dot(form, v) * form
 
     def sharp(self, x, alpha) -> jax.Array:
-        """The inverse of :meth:`flat`; not finite where the form is not a contact form."""
+        """Return the inverse of :meth:`flat`; not finite where the form is not a contact form."""
         return solve(self._flat_matrix(x), alpha[:, None])[:, 0]
 
     def reeb(self, x) -> jax.Array:
-        """The Reeb vector field R, shape (dim,): ``eta(R) = 1`` and ``i_R d eta = 0``."""
+        """Return the Reeb vector field R, shape (dim,): ``eta(R) = 1`` and ``i_R d eta = 0``."""
         return self.sharp(x, self.form(x))
 
     def horizontal(self, x, v) -> jax.Array:
-        """The part of v in the kernel of eta, ``v - eta(v) R`` [SML 1]."""
+        """Return the component of v in the kernel of eta, ``v - eta(v) R`` [SML 1]."""
         return v - jnp.dot(self.form(x), v) * self.reeb(x)
 
     def bivector(self, x) -> jax.Array:
-        """``Lambda(alpha, beta) = -d eta(sharp alpha, sharp beta)`` as a matrix, shape (dim, dim) [SML 3, 11]."""
-        raised = inverse(self._flat_matrix(x))
-        return -raised.T @ self.differential(x) @ raised
+        """Return the matrix of ``Lambda(alpha, beta) = -d eta(sharp alpha, sharp beta)``, shape (dim, dim) [SML 3,
+        11]."""
+        sharp_matrix = inverse(self._flat_matrix(x))
+        return -sharp_matrix.T @ self.differential(x) @ sharp_matrix
 
     def bivector_sharp(self, x, alpha) -> jax.Array:
-        """``Lambda(alpha, .)`` as a vector, shape (dim,): ``sharp(alpha) - alpha(R) R``, in the kernel of eta."""
+        """Return ``Lambda(alpha, .)`` as a vector, shape (dim,): ``sharp(alpha) - alpha(R) R``, in the kernel of
+        eta."""
         reeb = self.reeb(x)
         return self.sharp(x, alpha) - jnp.dot(alpha, reeb) * reeb
 
@@ -84,7 +87,8 @@ class ContactStructure(Module):
     # -- brackets and fields of functions -----------------------------------------------------------------------------
 
     def cartan_bracket(self, f: Callable, g: Callable) -> Callable:
-        """The function ``[f, g] = Lambda(df, dg)``: obeys Leibniz' rule, but not the Jacobi identity [SML §2.1]."""
+        """Return the function ``[f, g] = Lambda(df, dg)``: it obeys Leibniz' rule, but not the Jacobi identity [SML
+        §2.1]."""
 
         return self._bracket(self.bivector_sharp, f, g)
 
@@ -96,7 +100,7 @@ class ContactStructure(Module):
         return value
 
     def jacobi_bracket(self, f: Callable, g: Callable) -> Callable:
-        """The function ``{f, g} = Lambda(df, dg) + f E(g) - g E(f)``, E = -R [SML §2.1].
+        """Return the function ``{f, g} = Lambda(df, dg) + f E(g) - g E(f)``, E = -R [SML §2.1].
 
         It obeys the Jacobi identity, but of Leibniz' rule only the generalised form
         ``{f, g h} = g {f, h} + h {f, g} + g h E(f)`` [SML 5, where E(h) is printed].
@@ -110,7 +114,8 @@ class ContactStructure(Module):
         return value
 
     def evolution_vector_field(self, f: Callable) -> Callable:
-        """The field ``E_f = Lambda(df, .)``, which conserves f and lies in the kernel of eta [SML 7, Prop. 2.1]."""
+        """Return the field ``E_f = Lambda(df, .)``, which conserves f and lies in the kernel of eta [SML 7, Prop.
+        2.1]."""
 
         def field(x):
             x = real_components(x, self.dim, "x")
@@ -119,7 +124,8 @@ class ContactStructure(Module):
         return field
 
     def hamiltonian_vector_field(self, f: Callable) -> Callable:
-        """The contact field ``X_f = Lambda(df, .) - f R``, along which ``f' = -R(f) f`` [SML §2.2, Prop. 2.1]."""
+        """Return the contact field ``X_f = Lambda(df, .) - f R``, along which ``f' = -R(f) f`` [SML §2.2, Prop.
+        2.1]."""
 
         def field(x):
             x = real_components(x, self.dim, "x")
@@ -129,9 +135,9 @@ class ContactStructure(Module):
 
 
 class ContactForm(ContactStructure):
-    """A structure given by its form, a function from x, shape (dim,), to the components of eta.
+    """Contact structure given by its form, a function from x, shape (dim,), to the components of eta.
 
-    Nothing is checked here: ``volume`` measures at a point whether the form is a contact form.
+    The form is not checked: ``volume`` measures at a point whether it is a contact form.
     """
 
     function: Callable
@@ -139,10 +145,10 @@ class ContactForm(ContactStructure):
 
     def __init__(self, function: Callable, dim: int):
         if not isinstance(dim, int) or dim < 3 or dim % 2 == 0:
-            raise ParameterError(f"a contact structure has an odd number of coordinates, 2n + 1 >= 3, not {dim!r}")
+            raise ParameterError(f"dim must be odd and at least 3, the number 2n + 1 of coordinates, got {dim!r}")
         shape = jax.eval_shape(lambda x: jnp.asarray(function(x)), jax.ShapeDtypeStruct((dim,), jnp.float64)).shape
         if shape != (dim,):
-            raise ShapeError(f"a form on {dim} coordinates has {dim} components, but this one has shape {shape}")
+            raise ShapeError(f"a form on {dim} coordinates must have shape ({dim},), got {shape}")
         self.function, self.size = function, dim
 
     @property
@@ -165,46 +171,48 @@ class Bundle(Protocol):
 
 
 class TangentMap(NamedTuple):
-    """The tangent vectors of a bundle at a point, and what covectors do along them.
+    """Map of arrays to tangent vectors of a bundle at one point, and its transpose.
 
     Attributes
     ----------
     P : array, shape (n, n)
         The projector along Q.
     N : array, shape (n, n)
-        What takes v along with q: ``N q'`` is the part across Q of the velocity of v.
+        ``N q'`` is the component across Q of the velocity of v.
     """
 
     P: jax.Array
     N: jax.Array
 
     def lift(self, w) -> jax.Array:
-        """The tangent vector with the part of w along Q, its second part nearest to that of w; shape (2n + 1,)."""
+        """Return the tangent vector with the component of w along Q and the nearest second component, shape (2n +
+        1,)."""
         n = len(self.P)
         a = self.P @ w[:n]
         return jnp.concatenate([a, self.P @ w[n : 2 * n] + self.N @ a, w[2 * n :]])
 
     def lower(self, alpha) -> jax.Array:
-        """The transposed map: it forgets what of a covector acts on no tangent vector."""
+        """Apply the transposed map, which removes the components of a covector that act on no tangent vector."""
         n = len(self.P)
-        by_v = alpha[n : 2 * n]
-        return jnp.concatenate([self.P @ (alpha[:n] + by_v @ self.N), self.P @ by_v, alpha[2 * n :]])
+        v_components = alpha[n : 2 * n]
+        return jnp.concatenate([self.P @ (alpha[:n] + v_components @ self.N), self.P @ v_components, alpha[2 * n :]])
 
 
 class SplitContact(ContactStructure):
-    """A contact structure whose bivector is a Poisson bivector and a rest: ``Lambda = Lambda_0 + Delta ^ R`` [SML 6].
+    """Contact structure whose bivector is the sum of a Poisson bivector and a remainder: ``Lambda_0 + Delta ^ R`` [SML
+    6].
 
     The brackets are ``[f, g] = {f, g}_0 + {f, g}_Delta``: a reversible part, for which S is a Casimir function, and
     the thermodynamic one. Delta is the Liouville field ``p d/dp`` on T*Q x R [SML 2].
 
-    With a ``bundle``, the positions are those of a manifold Q in the arrays around it, and so are the momenta: all of
-    the structure is that of T*Q x R, or TQ x R. Its fields are tangent to it, near it to the level sets of its
-    constraints; and what a covector does across these counts for nothing.
+    With a ``bundle``, positions and momenta are those of a manifold Q in its ambient arrays: the structure is that of
+    T*Q x R, or TQ x R. Its fields are tangent to that space, and near it to the level sets of its
+    constraints; components of a covector across these have no effect.
 
     Attributes
     ----------
     degrees_of_freedom : int
-        Components of q: more than the dimension of Q where it lies in arrays.
+        Components of q: more than the dimension of Q if it is embedded in arrays.
     bundle : manifolds.TangentBundle, optional
     """
 
@@ -213,7 +221,7 @@ class SplitContact(ContactStructure):
 
     def __check_init__(self):
         if not isinstance(self.degrees_of_freedom, int) or self.degrees_of_freedom < 1:
-            raise ParameterError(f"degrees of freedom are a positive integer, not {self.degrees_of_freedom!r}")
+            raise ParameterError(f"degrees_of_freedom must be a positive integer, got {self.degrees_of_freedom!r}")
 
     @property
     def dim(self) -> int:
@@ -221,29 +229,29 @@ class SplitContact(ContactStructure):
 
     @abstractmethod
     def liouville(self, x) -> jax.Array:
-        """The Liouville vector field Delta, shape (dim,)."""
+        """Return the Liouville vector field Delta, shape (dim,)."""
 
     @abstractmethod
     def cosymplectic_sharp(self, x, alpha) -> jax.Array:
-        """``Lambda_0(alpha, .)``, shape (dim,)."""
+        """Return ``Lambda_0(alpha, .)``, shape (dim,)."""
 
     @abstractmethod
     def liouville_sharp(self, x, alpha) -> jax.Array:
-        """``(Delta ^ R)(alpha, .) = alpha(Delta) R - alpha(R) Delta``, shape (dim,)."""
+        """Return ``(Delta ^ R)(alpha, .) = alpha(Delta) R - alpha(R) Delta``, shape (dim,)."""
 
     def bivector_sharp(self, x, alpha) -> jax.Array:
         return self.cosymplectic_sharp(x, alpha) + self.liouville_sharp(x, alpha)
 
     def cosymplectic_bracket(self, f: Callable, g: Callable) -> Callable:
-        """The function ``{f, g}_0 = Lambda_0(df, dg)``, a Poisson bracket [SML §2.1]."""
+        """Return the function ``{f, g}_0 = Lambda_0(df, dg)``, a Poisson bracket [SML §2.1]."""
         return self._bracket(self.cosymplectic_sharp, f, g)
 
     def liouville_bracket(self, f: Callable, g: Callable) -> Callable:
-        """The function ``{f, g}_Delta = R(g) Delta(f) - R(f) Delta(g)`` [SML §2.1]."""
+        """Return the function ``{f, g}_Delta = R(g) Delta(f) - R(f) Delta(g)`` [SML §2.1]."""
         return self._bracket(self.liouville_sharp, f, g)
 
     def _split_coordinates(self, x):
-        """The parts (q, p, S) or (q, v, S) of a point, a vector or a covector; S has shape (1,)."""
+        """Return the components (q, p, S) or (q, v, S) of a point, vector or covector; S has shape (1,)."""
         n = self.degrees_of_freedom
         return x[:n], x[n : 2 * n], x[2 * n :]
 
@@ -255,18 +263,18 @@ class SplitContact(ContactStructure):
     # -- on a manifold ------------------------------------------------------------------------------------------------
 
     def tangential_part(self, q, v) -> jax.Array:
-        """The part of a velocity, of a momentum or of a force at q that is along Q, shape (n,); itself on R^n."""
+        """Return the component along Q of a velocity, momentum or force at q, shape (n,); on R^n all of it."""
         return v if self.bundle is None else self.bundle.tangential_part(q, v)
 
     def tangent_map(self, x) -> TangentMap | None:
-        """What makes vectors tangent at x, on a manifold."""
+        """Return the map of arrays to tangent vectors at x; None without a manifold."""
         return (
             None if self.bundle is None else TangentMap(*self.bundle.tangent_matrices(x[: 2 * self.degrees_of_freedom]))
         )
 
 
 class CanonicalContact(SplitContact):
-    """``eta = dS - p dq`` on T*Q x R, coordinates (q_1 … q_n, p_1 … p_n, S) [SML §2].
+    """Contact structure ``eta = dS - p dq`` on T*Q x R, coordinates (q_1 … q_n, p_1 … p_n, S) [SML §2].
 
     ``Lambda = d/dp ^ (d/dq + p d/dS)`` (4), and the evolution field of f is
     ``q' = f_p, p' = -f_q - p f_S, S' = p . f_p`` (7).
@@ -287,20 +295,21 @@ class CanonicalContact(SplitContact):
         return self.bivector_sharp(x, alpha) + alpha[-1] * self.reeb(x)
 
     def cosymplectic_sharp(self, x, alpha) -> jax.Array:
-        tangents = self.tangent_map(x)
-        by_q, by_p, by_S = self._split_coordinates(alpha if tangents is None else tangents.lower(alpha))
-        motion = jnp.concatenate([by_p, -by_q, jnp.zeros_like(by_S)])
-        return motion if tangents is None else tangents.lift(motion)
+        tangent_map = self.tangent_map(x)
+        alpha_q, alpha_p, alpha_S = self._split_coordinates(alpha if tangent_map is None else tangent_map.lower(alpha))
+        vector = jnp.concatenate([alpha_p, -alpha_q, jnp.zeros_like(alpha_S)])
+        return vector if tangent_map is None else tangent_map.lift(vector)
 
     def liouville_sharp(self, x, alpha) -> jax.Array:
-        p, (by_q, by_p, by_S) = self._split_coordinates(self.liouville(x))[1], self._split_coordinates(alpha)
-        return jnp.concatenate([jnp.zeros_like(by_q), -p * by_S, jnp.dot(p, by_p)[None]])
+        p, (alpha_q, alpha_p, alpha_S) = self._split_coordinates(self.liouville(x))[1], self._split_coordinates(alpha)
+        return jnp.concatenate([jnp.zeros_like(alpha_q), -p * alpha_S, jnp.dot(p, alpha_p)[None]])
 
 
 class LagrangianContact(SplitContact):
-    """``eta_L = dS - L_v dq`` on TQ x R, coordinates (q, v, S): the canonical structure in the chart FL [SML §3.1].
+    """Contact structure ``eta_L = dS - L_v dq`` on TQ x R, coordinates (q, v, S), the canonical one in the chart FL
+    [SML §3.1].
 
-    A contact form where the Lagrangian is regular, that is where its Hessian ``W = L_vv`` is invertible.
+    It is a contact form where the Lagrangian is regular, that is where its Hessian ``W = L_vv`` is invertible.
 
     Parameters
     ----------
@@ -316,36 +325,36 @@ class LagrangianContact(SplitContact):
         self.lagrangian, self.degrees_of_freedom, self.bundle = lagrangian, degrees_of_freedom, bundle
 
     def momentum(self, x) -> jax.Array:
-        """``p = L_v``, shape (n,), as a covector of Q."""
+        """Return ``p = L_v``, shape (n,), as a covector of Q."""
         return self.tangential_part(
             self._split_coordinates(x)[0], self._split_coordinates(jax.grad(self.lagrangian)(x))[1]
         )
 
     def rates(self, x) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """The derivatives of the momentum by q, v and S, shapes (n, n), (n, n) and (n, 1), along the manifold.
+        """Return the derivatives of the momentum by q, v and S, shapes (n, n), (n, n) and (n, 1), along the manifold.
 
         The second is the Hessian W, which on a manifold is made invertible: across Q it is a multiple of 1.
         """
-        n, tangents = self.degrees_of_freedom, self.tangent_map(x)
+        n, tangent_map = self.degrees_of_freedom, self.tangent_map(x)
         rates = jax.jacfwd(self.momentum)(x)
-        by_q, W, by_S = rates[:, :n], rates[:, n : 2 * n], rates[:, 2 * n :]
-        if tangents is None:
-            return by_q, W, by_S
-        P, N = tangents
-        by_q, W = P @ (by_q + W @ N) @ P, P @ W @ P
-        return by_q, W + jnp.max(jnp.abs(W)) * (jnp.eye(n) - P), P @ by_S
+        q_jacobian, W, S_jacobian = rates[:, :n], rates[:, n : 2 * n], rates[:, 2 * n :]
+        if tangent_map is None:
+            return q_jacobian, W, S_jacobian
+        P, N = tangent_map
+        q_jacobian, W = P @ (q_jacobian + W @ N) @ P, P @ W @ P
+        return q_jacobian, W + jnp.max(jnp.abs(W)) * (jnp.eye(n) - P), P @ S_jacobian
 
     def legendre(self, x) -> jax.Array:
-        """The Legendre transform ``FL(q, v, S) = (q, p, S)``, shape (dim,)."""
+        """Return the Legendre transform ``FL(q, v, S) = (q, p, S)``, shape (dim,)."""
         q, _, S = self._split_coordinates(x)
         return jnp.concatenate([q, self.momentum(x), S])
 
     def hessian(self, x) -> jax.Array:
-        """``W = L_vv``, shape (n, n) [SML 8]; as :meth:`rates` has it on a manifold."""
+        """Return ``W = L_vv``, shape (n, n) [SML 8]; on a manifold as in :meth:`rates`."""
         return self.rates(x)[1]
 
     def energy(self, x) -> jax.Array:
-        """``E_L = v·L_v - L``, shape ()."""
+        """Return ``E_L = v·L_v - L``, shape ()."""
         return jnp.dot(self._split_coordinates(x)[1], self.momentum(x)) - self.lagrangian(x)
 
     def form(self, x) -> jax.Array:
@@ -374,19 +383,19 @@ class LagrangianContact(SplitContact):
         return CanonicalContact(self.degrees_of_freedom, bundle=self.bundle)
 
     def _pullback(self, x, sharp: Callable, alpha) -> jax.Array:
-        """``TFL^-1 sharp(FL(x), TFL^-T alpha)``: with p = L_v, ``dp = L_vq dq + W dv + L_vS dS``."""
-        (by_q, W, by_S), tangents = self.rates(x), self.tangent_map(x)
-        alpha_q, alpha_v, alpha_S = self._split_coordinates(alpha if tangents is None else tangents.lower(alpha))
+        """Return ``TFL^-1 sharp(FL(x), TFL^-T alpha)``: with p = L_v, ``dp = L_vq dq + W dv + L_vS dS``."""
+        (q_jacobian, W, S_jacobian), tangent_map = self.rates(x), self.tangent_map(x)
+        alpha_q, alpha_v, alpha_S = self._split_coordinates(alpha if tangent_map is None else tangent_map.lower(alpha))
         beta_p = solve(W, alpha_v[:, None])[:, 0]  # W is symmetric
-        beta = jnp.concatenate([alpha_q - beta_p @ by_q, beta_p, alpha_S - beta_p @ by_S])
+        beta = jnp.concatenate([alpha_q - beta_p @ q_jacobian, beta_p, alpha_S - beta_p @ S_jacobian])
         q_dot, p_dot, S_dot = self._split_coordinates(sharp(self.legendre(x), beta))
-        v_dot = solve(W, (p_dot - by_q @ q_dot - by_S @ S_dot)[:, None])[:, 0]
-        motion = jnp.concatenate([q_dot, v_dot, S_dot])
-        return motion if tangents is None else tangents.lift(motion)
+        v_dot = solve(W, (p_dot - q_jacobian @ q_dot - S_jacobian @ S_dot)[:, None])[:, 0]
+        vector = jnp.concatenate([q_dot, v_dot, S_dot])
+        return vector if tangent_map is None else tangent_map.lift(vector)
 
 
 class Cosymplectic(PoissonStructure):
-    """The Poisson structure Lambda_0 of a split contact structure: S is a Casimir function [SML §2.1].
+    """Poisson structure Lambda_0 of a split contact structure; S is a Casimir function [SML §2.1].
 
     On T*R^n x R it is the canonical one, ``q' = H_p, p' = -H_q, S' = 0``; on T*Q x R that of T*Q.
     """

@@ -1,4 +1,4 @@
-"""The phase space of several bodies with an entropy each: canonical in all positions and momenta [SML §5]."""
+"""Phase space of several bodies with an entropy each: canonical in all positions and momenta [SML §5]."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .poisson import PoissonStructure
 
 
 class StateIndices(NamedTuple):
-    """Where things are in a state of several (q_a, p_a, S_a): indices of all q, p and S, and whose each q is."""
+    """Indices of all q, p and S in a state of several (q_a, p_a, S_a), and the body a that owns each q."""
 
     q: np.ndarray
     p: np.ndarray
@@ -24,26 +24,26 @@ class StateIndices(NamedTuple):
 
 
 class ParticleIndices(NamedTuple):
-    """Where particle numbers are in such a state, and whose each is."""
+    """Indices of the particle numbers in a state, and the body that owns each."""
 
     N: np.ndarray
     owner: np.ndarray
 
 
 class ExtendedPhaseSpace(PoissonStructure):
-    """``T*R^n_1 x R x … x T*R^n_N x R``, coordinates (q_1, p_1, S_1, q_2, …): canonical in all (q, p) [SML §5].
+    """Poisson structure on ``T*R^n_1 x R x … x T*R^n_N x R``, coordinates (q_1, p_1, S_1, q_2, …): canonical [SML §5].
 
-    Every S_a is a Casimir function. An n_a of 0 leaves S_a alone. With ``species``, so many particle numbers follow the
-    S_a of each body, Casimir functions too.
+    Every S_a is a Casimir function. With n_a = 0 a body has S_a alone. ``species`` gives the number of particle numbers
+    that follow the S_a of each body; they are Casimir functions too.
     """
 
     degrees_of_freedom: tuple[int, ...] = eqx.field(static=True)
     species: tuple[int, ...] = eqx.field(static=True, default=())
 
     def __check_init__(self):
-        for numbers, what in ((self.degrees_of_freedom, "degrees of freedom"), (self.species or (0,), "species")):
+        for numbers, label in ((self.degrees_of_freedom, "degrees of freedom"), (self.species or (0,), "species")):
             if not (isinstance(numbers, tuple) and numbers and all(isinstance(n, int) and n >= 0 for n in numbers)):
-                raise ParameterError(f"{what} are a tuple of integers >= 0, not {numbers!r}")
+                raise ParameterError(f"{label} must be a tuple of integers >= 0, got {numbers!r}")
         if self.species and len(self.species) != len(self.degrees_of_freedom):
             raise ParameterError(f"species are given for {len(self.species)} of {len(self.degrees_of_freedom)} bodies")
 
@@ -53,12 +53,12 @@ class ExtendedPhaseSpace(PoissonStructure):
 
     @property
     def state_indices(self) -> StateIndices:
-        """Indices into a state."""
+        """Indices of all q, p and S in a state."""
         return _build_indices(self.degrees_of_freedom, self.species)[0]
 
     @property
     def particle_indices(self) -> ParticleIndices:
-        """Indices of the particle numbers."""
+        """Indices of the particle numbers in a state."""
         return _build_indices(self.degrees_of_freedom, self.species)[1]
 
     def tensor(self, x) -> jax.Array:

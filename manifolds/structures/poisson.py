@@ -20,7 +20,7 @@ from ..matrices.linear import adjoint, cayley_rate, conjugate_by_stages
 
 
 class PoissonStructure(Module):
-    """A Poisson structure on R^n; subclasses give :meth:`tensor`, and :meth:`sharp` where it is cheaper.
+    """Poisson structure on R^n; subclasses implement :meth:`tensor`, and :meth:`sharp` if it is cheaper.
 
     Attributes
     ----------
@@ -34,17 +34,18 @@ class PoissonStructure(Module):
 
     @abstractmethod
     def tensor(self, x) -> jax.Array:
-        """The matrix Pi(x), shape (n, n), at one point x, shape (n,)."""
+        """Return the matrix Pi(x), shape (n, n), at one point x, shape (n,)."""
 
     def sharp(self, x, alpha) -> jax.Array:
-        """``Pi(x) alpha``, shape (n,), for a covector alpha, shape (n,)."""
+        """Return ``Pi(x) alpha``, shape (n,), for a covector alpha, shape (n,)."""
         return self.tensor(x) @ alpha
 
     def stages_on_leaf(self, x, alpha, A) -> jax.Array | None:
-        """Points of stages whose motions add up to one along the symplectic leaf of x, shape (s, n); None: not known.
+        """Return stage points whose motions add up to one along the symplectic leaf of x, shape (s, n); None if not
+        known.
 
         With the weights b of a symplectic Runge-Kutta method, ``x + sum_i b_i Pi(u_i) alpha_i`` is on the leaf, and has
-        all Casimirs of x, wherever their gradients depend on each other [Modin & Viviani 2020].
+        all Casimirs of x, even where their gradients are linearly dependent [Modin & Viviani 2020].
 
         Parameters
         ----------
@@ -57,7 +58,8 @@ class PoissonStructure(Module):
         return None
 
     def leaf_displacement(self, x, covector) -> jax.Array:
-        """The displacement of x along its leaf, shape (n,): ``Pi(u) K``, u the middle of that step.
+        """Return the displacement of x along its leaf by a covector K, shape (n,): ``Pi(u) K``, u the middle of that
+        step.
 
         Parameters
         ----------
@@ -70,10 +72,11 @@ class PoissonStructure(Module):
         return self.sharp(points[0], covector)
 
     def leaf_covector_rate(self, covector, alpha) -> jax.Array | None:
-        """``K'`` for which x, :meth:`carried` by K, moves by ``x' = Pi(x) alpha``, shape (n,); None: not known.
+        """Return ``K'`` for which x, displaced by K, moves by ``x' = Pi(x) alpha``, shape (n,); None if not known.
 
-        It begins at K = 0, where it is alpha, and is smooth: so K is found by any method, at its order, and what it
-        carries is on the leaf however K is rounded.
+        The displacement is :meth:`leaf_displacement`. The rate is smooth, and alpha at K = 0: any method finds K, at
+        its order,
+        and the displaced point is on the leaf however K is rounded.
 
         Parameters
         ----------
@@ -84,7 +87,7 @@ class PoissonStructure(Module):
         return None
 
     def bracket(self, f: Callable, g: Callable) -> Callable:
-        """The function ``{f, g}``: ``x -> grad f @ Pi(x) @ grad g``."""
+        """Return the function ``{f, g}``: ``x -> grad f @ Pi(x) @ grad g``."""
 
         def value(x):
             x = jnp.asarray(x, dtype=jnp.float64)
@@ -93,7 +96,7 @@ class PoissonStructure(Module):
         return value
 
     def hamiltonian_vector_field(self, H: Callable) -> Callable:
-        """The vector field ``X_H = Pi grad H``, for which ``X_H(f) = {f, H}``."""
+        """Return the vector field ``X_H = Pi grad H``, for which ``X_H(f) = {f, H}``."""
 
         def field(x):
             x = jnp.asarray(x, dtype=jnp.float64)
@@ -102,14 +105,14 @@ class PoissonStructure(Module):
         return field
 
     def jacobi_residual(self, x) -> jax.Array:
-        """Largest ``|Pi_il d_l Pi_jk + cyclic|`` at the point x: zero for a Poisson tensor [BFM §2.1]."""
+        """Return the largest ``|Pi_il d_l Pi_jk + cyclic|`` at the point x: zero for a Poisson tensor [BFM §2.1]."""
         x = real_components(x, self._dimension(x), "x")
         tensor, derivative = self.tensor(x), jax.jacfwd(self.tensor)(x)
         term = jnp.einsum("il,jkl->ijk", tensor, derivative)
         return jnp.max(jnp.abs(term + term.transpose(1, 2, 0) + term.transpose(2, 0, 1)))
 
     def rank(self, x) -> int:
-        """Rank of Pi(x): the dimension of the symplectic leaf through x."""
+        """Return the rank of Pi(x): the dimension of the symplectic leaf through x."""
         return int(np.linalg.matrix_rank(np.asarray(self.tensor(real_components(x, self._dimension(x), "x")))))
 
     def _dimension(self, x) -> int:
@@ -130,28 +133,28 @@ class LiePoisson(PoissonStructure):
         return self.algebra.ad_star(alpha, x)
 
     def stages_on_leaf(self, x, alpha, A) -> jax.Array | None:
-        """By A as for every structure; known for the matrices of u(n), su(n) and so(n)."""
-        found = _skew_matrices(self.algebra)
-        if found is None:
+        """Return stage points on the leaf of x, by the stages A; None but for the matrices of u(n), su(n) and so(n)."""
+        skew_matrices = _skew_matrices(self.algebra)
+        if skew_matrices is None:
             return None
-        basis, dual = found
-        turned = conjugate_by_stages(-jnp.tensordot(alpha, basis, 1), jnp.tensordot(x, dual, 1), A)
-        return jnp.einsum("sij,aji->sa", turned, basis).real
+        basis, dual = skew_matrices
+        conjugates = conjugate_by_stages(-jnp.tensordot(alpha, basis, 1), jnp.tensordot(x, dual, 1), A)
+        return jnp.einsum("sij,aji->sa", conjugates, basis).real
 
     def leaf_covector_rate(self, covector, alpha) -> jax.Array | None:
-        found = _skew_matrices(self.algebra)
-        if found is None:
+        skew_matrices = _skew_matrices(self.algebra)
+        if skew_matrices is None:
             return None
-        basis, dual = found
+        basis, dual = skew_matrices
         k, b = (-jnp.tensordot(v, basis, 1) for v in (covector, alpha))
         return -jnp.einsum("ij,aji->a", cayley_rate(k, b), dual).real
 
 
 @functools.lru_cache(maxsize=64)
 def _skew_matrices(algebra: LieAlgebra) -> tuple[np.ndarray, np.ndarray] | None:
-    """A basis of all skew-Hermitian matrices of a size, of those of trace zero or of the real ones, and its dual basis.
+    """Return the basis of all skew-Hermitian matrices of a size, or the traceless or the real ones, and its dual basis.
 
-    None of an algebra that is none of these: its group is not all that keeps a form.
+    None for other algebras: their groups are not all of the matrices that preserve a form.
     """
     basis = None if isinstance(algebra, BracketAlgebra) else algebra.basis  # which may be too large to be made
     if basis is None or np.abs(basis + adjoint(basis)).max() > 1e-14 * np.abs(basis).max():
@@ -170,7 +173,7 @@ class Canonical(PoissonStructure):
 
     def __check_init__(self):
         if not isinstance(self.degrees_of_freedom, int) or self.degrees_of_freedom < 1:
-            raise ParameterError(f"degrees of freedom are a positive integer, not {self.degrees_of_freedom!r}")
+            raise ParameterError(f"degrees_of_freedom must be a positive integer, got {self.degrees_of_freedom!r}")
 
     @property
     def dim(self) -> int:
@@ -187,10 +190,10 @@ class Canonical(PoissonStructure):
 
 
 class PoissonTensor(PoissonStructure):
-    """A structure given by its tensor: a constant (n, n) matrix, or a function from x, shape (n,), to one.
+    """Poisson structure given by its tensor: a constant (n, n) matrix, or a function from x, shape (n,), to one.
 
-    Nothing is checked here: ``jacobi_residual`` measures the Jacobi identity at a point, and a dynamical system
-    built on the structure checks skewness and Jacobi at random ones.
+    The tensor is not checked: ``jacobi_residual`` measures the Jacobi identity at a point, and a dynamical system
+    built on the structure checks skewness and Jacobi at random points.
     """
 
     matrix: Callable | jax.Array
@@ -200,7 +203,7 @@ class PoissonTensor(PoissonStructure):
         if not callable(matrix):
             matrix = jnp.asarray(matrix, dtype=jnp.float64)
             if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
-                raise ShapeError(f"a Poisson tensor is a square matrix, not an array of shape {matrix.shape}")
+                raise ShapeError(f"a Poisson tensor must be a square matrix, got an array of shape {matrix.shape}")
             dim = matrix.shape[0]
         self.matrix, self.size = matrix, dim
 
@@ -213,7 +216,7 @@ class PoissonTensor(PoissonStructure):
 
 
 class PoissonBySharp(PoissonStructure):
-    """A structure that is given by :meth:`sharp` alone."""
+    """Poisson structure that is defined by :meth:`sharp`."""
 
     @abstractmethod
     def sharp(self, x, alpha) -> jax.Array: ...
@@ -223,9 +226,9 @@ class PoissonBySharp(PoissonStructure):
 
 
 class PoissonMap(PoissonBySharp):
-    """A structure given by what it does: a function from x and a covector alpha, shapes (n,), to ``Pi(x) alpha``.
+    """Poisson structure given by a function from x and a covector alpha, shapes (n,), to ``Pi(x) alpha``.
 
-    For large n, where the matrix would be mostly zeros. Nothing is checked, as in :class:`PoissonTensor`.
+    It serves large n, where the matrix would be mostly zeros. It is not checked, as in :class:`PoissonTensor`.
     """
 
     function: Callable
@@ -240,7 +243,7 @@ class PoissonMap(PoissonBySharp):
 
 
 class ProductPoisson(PoissonStructure):
-    """Two structures on states (x, y), neither of which has to do with the components of the other."""
+    """Product of two structures on states (x, y), each of which concerns its own components only."""
 
     first: PoissonStructure
     second: PoissonStructure
@@ -261,19 +264,19 @@ class ProductPoisson(PoissonStructure):
 
     def stages_on_leaf(self, x, alpha, A) -> jax.Array | None:
         n = self.first.dim
-        first = self.first.stages_on_leaf(x[:n], alpha[:, :n], A)
-        second = self.second.stages_on_leaf(x[n:], alpha[:, n:], A)
-        return None if first is None or second is None else jnp.concatenate([first, second], axis=-1)
+        x_stages = self.first.stages_on_leaf(x[:n], alpha[:, :n], A)
+        y_stages = self.second.stages_on_leaf(x[n:], alpha[:, n:], A)
+        return None if x_stages is None or y_stages is None else jnp.concatenate([x_stages, y_stages], axis=-1)
 
     def leaf_covector_rate(self, covector, alpha) -> jax.Array | None:
         n = self.first.dim
-        first = self.first.leaf_covector_rate(covector[:n], alpha[:n])
-        second = self.second.leaf_covector_rate(covector[n:], alpha[n:])
-        return None if first is None or second is None else jnp.concatenate([first, second])
+        x_rate = self.first.leaf_covector_rate(covector[:n], alpha[:n])
+        y_rate = self.second.leaf_covector_rate(covector[n:], alpha[n:])
+        return None if x_rate is None or y_rate is None else jnp.concatenate([x_rate, y_rate])
 
 
 class NoPoisson(PoissonStructure):
-    """``Pi = 0``: nothing moves by itself, and every function is a Casimir."""
+    """Trivial structure ``Pi = 0``: no reversible motion, and every function is a Casimir."""
 
     size: int = eqx.field(static=True)
 

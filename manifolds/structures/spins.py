@@ -1,4 +1,4 @@
-"""Many spins, each a vector in space, beside quantities that move with none of them."""
+"""Poisson structure of many spins, each a vector in space, beside components that commute with all."""
 
 from __future__ import annotations
 
@@ -16,26 +16,29 @@ from ..errors import ParameterError
 from .poisson import PoissonBySharp
 
 VectorComponents = tuple[jax.Array, jax.Array, jax.Array]
-"""Vectors in space by components: three arrays of one shape. What is computed from these is put together once."""
+"""Vectors in space by components: three arrays of one shape, which are joined only after a computation."""
 
 
 class Spins(PoissonBySharp):
-    """``Pi(x) alpha = (gamma_i s_i x alpha_i, 0)`` for states ``x = (s_1, s_2, …, y)``, s_i in R^3 at each site.
+    """Structure ``Pi(x) alpha = (gamma_i s_i x alpha_i, 0)`` on states ``x = (s_1, s_2, …, y)``, s_i in R^3 at each
+    site.
 
-    That of ``so(3)`` at every site, times gyromagnetic ratios, beside ``others`` components y that commute with all.
-    Its Casimirs are the functions of the lengths |s_i| and of y. Nothing is formed that is larger than a state.
+    It is that of ``so(3)`` at every site, times gyromagnetic ratios, beside ``others`` components y that commute with
+    all.
+    Its Casimirs are the functions of the lengths |s_i| and of y. No array is larger than a state.
 
     Parameters
     ----------
     sites : int or tuple of int
         Sites in C order.
     others : int
-        Components behind the spins.
+        Number of components behind the spins.
     ratio : float, or array of the shape of the sites
         gamma_i: with ``s' = s x grad H``, the physics of a moment ``-gamma s`` in the field ``-grad H``.
     margins : tuple of int, optional
-        If given, states have the spins component by component, ``(s_1x, s_2x, …, s_1y, …)``, which large ones go
-        through the memory faster with. They are worked on with margins of so many sites, see :class:`PaddedLattice`.
+        If given, states have the spins component by component, ``(s_1x, s_2x, …, s_1y, …)``, which makes memory access
+        of large states faster, and computations use a halo of this many sites along each axis, see
+        :class:`PaddedLattice`.
 
     Raises
     ------
@@ -50,18 +53,18 @@ class Spins(PoissonBySharp):
     def __init__(self, sites, others: int = 0, ratio=1.0, margins: tuple[int, ...] | None = None):
         shape = tuple(sites) if isinstance(sites, tuple | list) else (sites,)
         if not shape:
-            raise ParameterError("spins need the number of sites")
+            raise ParameterError("sites must not be empty")
         self.sites = tuple(checked_size(n, 1, "Spins", "each number of sites") for n in shape)
         self.others = checked_size(others, 0, "Spins", "the number of other components")
         self.ratio, self.margins = real_array(ratio), margins
         if self.ratio.shape not in ((), self.sites):
-            raise ParameterError(f"the ratio is one number, or has shape {self.sites}, not {self.ratio.shape}")
+            raise ParameterError(f"ratio must be one number, or have shape {self.sites}, got {self.ratio.shape}")
         if not isinstance(self.ratio, jax.core.Tracer) and not np.isfinite(np.asarray(self.ratio)).all():
-            raise ParameterError("gyromagnetic ratios are finite numbers")
+            raise ParameterError("gyromagnetic ratios must be finite")
 
     @property
     def count(self) -> int:
-        """How many spins there are."""
+        """Number of spins."""
         return math.prod(self.sites)
 
     @property
@@ -70,11 +73,11 @@ class Spins(PoissonBySharp):
 
     @property
     def is_component_major(self) -> bool:
-        """Whether states have the spins component by component."""
+        """True if states have the spins component by component."""
         return self.margins is not None
 
     def spins(self, x) -> VectorComponents:
-        """The components of the spins of a state, shape (n,): three arrays, shape (count,)."""
+        """Return the components of the spins of a state, shape (n,): three arrays, shape (count,)."""
         if self.margins is None:
             return self.split_covectors(x)
         return reshape_vectors(
@@ -82,15 +85,15 @@ class Spins(PoissonBySharp):
         )
 
     def split_covectors(self, alpha) -> VectorComponents:
-        """The components of covectors of the spins, likewise."""
+        """Return the components of covectors of the spins: three arrays, shape (count,)."""
         return spins_from_state(alpha, self.count, self.is_component_major)
 
     def join_state(self, spins: VectorComponents, others) -> jax.Array:
-        """A state, shape (n,), from the components of its spins and the other components, shape (others,)."""
+        """Return a state, shape (n,), from the components of its spins and the other components, shape (others,)."""
         return state_from_spins(spins, others, self.is_component_major)
 
     def precession_rates(self, x, alpha) -> VectorComponents:
-        """The components of ``gamma_i s_i x alpha_i``."""
+        """Return the components of ``gamma_i s_i x alpha_i``."""
         return scale_vectors(self.ratio.reshape(-1), cross_vectors(self.spins(x), self.split_covectors(alpha)))
 
     def sharp(self, x, alpha) -> jax.Array:
@@ -98,24 +101,24 @@ class Spins(PoissonBySharp):
 
 
 class Lattice:
-    """Spins on a lattice, by their components."""
+    """Spins on a periodic lattice, by components."""
 
-    def __init__(self, here: VectorComponents):
-        self.site_spins = here
+    def __init__(self, site_spins: VectorComponents):
+        self.site_spins = site_spins
 
     def at(self, offset: Sequence[int]) -> VectorComponents:
-        """For each site the spin so many sites ahead, beyond the end those at the start."""
+        """Return for each site the spin ``offset`` sites ahead; the lattice is periodic."""
         a, b, c = (jnp.roll(component, [-o for o in offset], range(len(offset))) for component in self.site_spins)
         return a, b, c
 
 
 class PaddedLattice(Lattice):
-    """A large lattice, kept with a margin all around: it is put into the memory once, and neighbours are parts of it.
+    """Large periodic lattice stored with a halo, so that neighbours are contiguous slices of one array.
 
     Parameters
     ----------
     reach : sequence of int
-        How far neighbours are at most, along each axis.
+        Largest distance of neighbours along each axis.
     """
 
     def __init__(self, spins: VectorComponents, reach: Sequence[int]):
@@ -127,51 +130,52 @@ class PaddedLattice(Lattice):
         super().__init__(self.at([0 for _ in reach]))
 
     def at(self, offset: Sequence[int]) -> VectorComponents:
-        places = tuple(slice(r + o, r + o + n) for r, o, n in zip(self.reach, offset, self.sites, strict=True))
-        a, b, c = (component[places] for component in self.padded_spins)
+        slices = tuple(slice(r + o, r + o + n) for r, o, n in zip(self.reach, offset, self.sites, strict=True))
+        a, b, c = (component[slices] for component in self.padded_spins)
         return a, b, c
 
 
-def spins_from_state(x, count: int, planar: bool = False) -> VectorComponents:
-    """The components of the first vectors of a state, shape (n,): three arrays, shape (count,)."""
-    if planar:
+def spins_from_state(x, count: int, is_component_major: bool = False) -> VectorComponents:
+    """Return the components of the first ``count`` vectors of a state, shape (n,): three arrays, shape (count,)."""
+    if is_component_major:
         return x[:count], x[count : 2 * count], x[2 * count : 3 * count]
     return split_vectors(x[: 3 * count].reshape(count, 3))
 
 
-def state_from_spins(spins: VectorComponents, others, planar: bool = False) -> jax.Array:
-    """The state, shape (n,), that has these, and the other components behind."""
-    parts = spins if planar else (stack_columns(spins).reshape(-1),)
-    return jnp.concatenate([*parts, others]) if planar or others.size else parts[0]
+def state_from_spins(spins: VectorComponents, others, is_component_major: bool = False) -> jax.Array:
+    """Return the state, shape (n,), of spins by components, with the other components behind."""
+    columns = spins if is_component_major else (stack_columns(spins).reshape(-1),)
+    return jnp.concatenate([*columns, others]) if is_component_major or others.size else columns[0]
 
 
 def split_vectors(v) -> VectorComponents:
-    """The components of vectors in space, shape (..., 3)."""
+    """Return the components of vectors in space, shape (..., 3)."""
     return v[..., 0], v[..., 1], v[..., 2]
 
 
 def cross_vectors(u: VectorComponents, v: VectorComponents) -> VectorComponents:
-    """``u x v``, by components."""
+    """Return ``u x v``, by components."""
     return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
 
 
 def add_vectors(u: VectorComponents, v: VectorComponents) -> VectorComponents:
-    """``u + v``, by components."""
+    """Return ``u + v``, by components."""
     return u[0] + v[0], u[1] + v[1], u[2] + v[2]
 
 
 def scale_vectors(factor, vectors: VectorComponents) -> VectorComponents:
-    """Vectors times a factor, or one for each, by components."""
+    """Return vectors times a factor, or times one factor each, by components."""
     return factor * vectors[0], factor * vectors[1], factor * vectors[2]
 
 
 def dot_vectors(u: VectorComponents, v: VectorComponents) -> jax.Array:
-    """``u . v`` of each, by components."""
+    """Return ``u . v`` of each pair of vectors."""
     return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
 
 
 def sum_of_dots(u: VectorComponents, v: VectorComponents) -> jax.Array:
-    """``sum u_i . v_i`` over all, as products of vectors, which is faster than a sum over what v is made of."""
+    """Return ``sum u_i . v_i`` over all vectors, by ``jnp.dot``, which is faster than a sum over the expression of
+    v."""
     return sum(
         (jnp.dot(jnp.broadcast_to(a, b.shape).reshape(-1), b.reshape(-1)) for a, b in zip(u, v, strict=True)),
         jnp.zeros(()),
@@ -179,10 +183,10 @@ def sum_of_dots(u: VectorComponents, v: VectorComponents) -> jax.Array:
 
 
 def reshape_vectors(vectors: VectorComponents, shape: tuple[int, ...]) -> VectorComponents:
-    """Vectors on an array of sites of another shape, by components."""
+    """Return vectors by components, on an array of sites of another shape."""
     return vectors[0].reshape(shape), vectors[1].reshape(shape), vectors[2].reshape(shape)
 
 
 def cross(u, v) -> jax.Array:
-    """``u x v`` of vectors in space, shape (..., 3)."""
+    """Return ``u x v`` of vectors in space, shape (..., 3)."""
     return stack_columns(cross_vectors(split_vectors(u), split_vectors(v)))

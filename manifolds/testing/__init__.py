@@ -1,7 +1,7 @@
-"""The property suites of this package, for algebras, groups and spaces of one's own.
+"""Property suites of this package, for user-defined algebras, groups and spaces.
 
-Each ``check_*`` puts an object through what every registered one goes through. It returns a :class:`Report`, or raises
-:class:`PropertyError` with the table of what was measured.
+Each ``check_*`` runs the checks of every registered object of that kind. It returns a :class:`Report`, or raises
+:class:`PropertyError` with the table of the residuals.
 """
 
 from .._names import public_dir

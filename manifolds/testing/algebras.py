@@ -1,4 +1,4 @@
-"""The suite of Lie algebras."""
+"""Property suite of Lie algebras."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from ..errors import LieAlgebraError
 from .report import Report, Suite
 
 BATCH_SHAPE = (4, 3)
+"""Shape of the batch of random elements."""
 
 
 def check_algebra(g: LieAlgebra, degree: int = 3, seed: int = 0) -> Report:
-    """Axioms, duality, forms, matrices and Casimirs of a Lie algebra, at random elements.
+    """Check axioms, duality, forms, matrices and Casimirs of a Lie algebra at random elements.
 
     Parameters
     ----------
@@ -45,23 +46,25 @@ def check_algebra(g: LieAlgebra, degree: int = 3, seed: int = 0) -> Report:
     traces = np.einsum("acd,bdc->ab", g.structure_constants, g.structure_constants)
     suite.check_equal("Killing form = tr(ad ad)", kappa, traces)
     form = np.einsum("...a,ab,...b->...", bracket(x, y), kappa, z)
-    turned = np.einsum("...a,ab,...b->...", x, kappa, bracket(y, z))
-    suite.check_small("Killing form is invariant", form - turned, 100 * unit * max(1.0, np.abs(kappa).max()))
-    one = np.asarray(bracket(x[2, 1], y[2, 1]))
-    suite.check_small("batches equal loops", np.asarray(bracket(x, y))[2, 1] - one, 10 * unit)
+    cyclic_form = np.einsum("...a,ab,...b->...", x, kappa, bracket(y, z))
+    suite.check_small("Killing form is invariant", form - cyclic_form, 100 * unit * max(1.0, np.abs(kappa).max()))
+    single_bracket = np.asarray(bracket(x[2, 1], y[2, 1]))
+    suite.check_small("batches equal loops", np.asarray(bracket(x, y))[2, 1] - single_bracket, 10 * unit)
     suite.check_small("vmap equals batches", jax.vmap(jax.vmap(bracket))(x, y) - bracket(x, y), 10 * unit)
     if g.basis is None:
         suite.skip_check("matrices", "the algebra has none")
     else:
         X, Y = g.hat(x), g.hat(y)
-        size = max(1.0, float(np.abs(X).max())) ** 2 * g.dim
-        suite.check_small("hat [x, y] = [hat x, hat y]", g.hat(bracket(x, y)) - (X @ Y - Y @ X), 10 * size)
-        suite.check_small("vee hat x = x", g.vee(X) - x, 10 * size)
+        scale = max(1.0, float(np.abs(X).max())) ** 2 * g.dim
+        suite.check_small("hat [x, y] = [hat x, hat y]", g.hat(bracket(x, y)) - (X @ Y - Y @ X), 10 * scale)
+        suite.check_small("vee hat x = x", g.vee(X) - x, 10 * scale)
     if g.is_semisimple():
         theta = g.cartan_involution()
         suite.check_equal("Cartan involution: theta^2 = 1", theta @ theta, np.eye(g.dim), 1e-9)
-        moved = bracket(x @ theta.T, y @ theta.T) - np.asarray(bracket(x, y)) @ theta.T
-        suite.check_small("Cartan involution: automorphism", moved, 100 * unit * np.abs(theta).max() ** 2, 1e-9)
+        automorphism_residual = bracket(x @ theta.T, y @ theta.T) - np.asarray(bracket(x, y)) @ theta.T
+        suite.check_small(
+            "Cartan involution: automorphism", automorphism_residual, 100 * unit * np.abs(theta).max() ** 2, 1e-9
+        )
         suite.check_true("Cartan involution: -kappa(x, theta x) > 0", np.linalg.eigvalsh(-kappa @ theta)[0] > 0.0)
     _casimirs(suite, g, degree, mu.reshape(-1, g.dim))
     return suite.report()
@@ -73,14 +76,14 @@ def _casimirs(suite: Suite, g: LieAlgebra, degree: int, mu: np.ndarray) -> None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NoPolynomialCasimirWarning)
             try:
-                found = g.casimirs(d)
+                polynomials = g.casimirs(d)
             except LieAlgebraError as error:
                 suite.skip_check(f"Casimirs of degree {d}", str(error))
                 continue
-        for F in found:
+        for F in polynomials:
             gradient = np.asarray(jax.vmap(jax.grad(F))(mu))
-            size = np.linalg.norm(gradient, axis=1) * np.linalg.norm(mu, axis=1)
-            residual = np.linalg.norm(g.ad_star(gradient, mu), axis=1) / np.where(size > 0.0, size, 1.0)
+            scale = np.linalg.norm(gradient, axis=1) * np.linalg.norm(mu, axis=1)
+            residual = np.linalg.norm(g.ad_star(gradient, mu), axis=1) / np.where(scale > 0.0, scale, 1.0)
             unit = max(1.0, float(np.abs(g.structure_constants).max()))
             suite.check_small(f"Casimir {str(F)[:40]}", residual, unit)
             gradients.append(gradient[0])

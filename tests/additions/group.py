@@ -11,8 +11,8 @@ LINE = mf.LieAlgebra.from_matrices(
 
 
 def distance(g):
-    last = jnp.abs(g[..., 1, :] - jnp.array([0.0, 1.0])).max(axis=-1)
-    return jnp.maximum(last, jnp.maximum(-g[..., 0, 0], 0.0))
+    last_row_error = jnp.abs(g[..., 1, :] - jnp.array([0.0, 1.0])).max(axis=-1)
+    return jnp.maximum(last_row_error, jnp.maximum(-g[..., 0, 0], 0.0))
 
 
 AFFINE = mf.MatrixGroup("affine maps of the line", LINE, distance)

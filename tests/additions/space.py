@@ -17,6 +17,6 @@ class Ring(mf.Space):
     shape = (3,)
 
     def _project(self, x):
-        around = jnp.linalg.norm(x[..., :2], axis=-1, keepdims=True)
-        centre = jnp.concatenate([self.radius * x[..., :2] / around, jnp.zeros_like(around)], axis=-1)
+        axis_distance = jnp.linalg.norm(x[..., :2], axis=-1, keepdims=True)
+        centre = jnp.concatenate([self.radius * x[..., :2] / axis_distance, jnp.zeros_like(axis_distance)], axis=-1)
         return centre + (x - centre) / jnp.linalg.norm(x - centre, axis=-1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Each addition goes through the suite of its kind in one call, and runs."""
+"""Run each addition through the suite of its kind, in one call, and integrate with it."""
 
 import functools
 from pathlib import Path
@@ -24,13 +24,13 @@ def prey():
 
 
 @functools.cache
-def on_the_ring():
+def ring_system():
     friction = lt.ProjectedMetric(normalized=True)
     return lt.MetriplecticSystem(None, lambda x: x[2] + 0.1 * x[0], lambda x: x[1] - x[0] ** 2, friction, space=Ring())
 
 
-def moved_on_the_ring(method):
-    return lt.integrate(on_the_ring(), Ring().random(0), (0.0, 2.0), 0.1, method)
+def run_on_ring(method):
+    return lt.integrate(ring_system(), Ring().random(0), (0.0, 2.0), 0.1, method)
 
 
 def test_the_algebra():
@@ -48,7 +48,7 @@ def test_the_group():
 
 
 def test_the_space():
-    run = moved_on_the_ring(lt.MetriplecticMidpoint())
+    run = run_on_ring(lt.MetriplecticMidpoint())
     assert np.ptp(run.energy) < 1e-14
     assert run.entropy[-1] > run.entropy[0]
     assert Ring().belongs(run.x).all()
@@ -70,7 +70,7 @@ def test_the_integrator():
     [
         lambda: mf.testing.check_group(AFFINE),
         lambda: mf.testing.check_space(Ring()),
-        lambda: moved_on_the_ring(lt.MetriplecticRungeKutta(4)).audit(),
+        lambda: run_on_ring(lt.MetriplecticRungeKutta(4)).audit(),
         lambda: lt.testing.check_dissipation(Steep(0.2), mf.so(3)),
         lambda: lt.testing.check_method(Simpson()),
         lambda: lt.testing.check_system(prey(), START),
@@ -89,7 +89,7 @@ def test_the_system():
 
 
 def test_what_an_addition_costs():
-    """Lines of each file, with its imports and its docstring."""
+    """Each file has at most 30 lines, with its imports and its docstring."""
     lines = {path.stem: len(path.read_text().splitlines()) for path in Path(__file__).parent.glob("[a-s]*.py")}
     assert set(lines) == {"algebra", "dissipation", "group", "integrator", "space", "system"}
     assert max(lines.values()) <= 30, lines

@@ -166,8 +166,8 @@ CASES = {
         r"q1 must have shape \(1,\) or \(\), got \(2,\)",
     ),
     # algebras
-    "no algebra": (lambda: mf.trilinear_form("a"), r"a manifolds.LieAlgebra, such as mf.so\(3\), not 'a'"),
-    "number": (lambda: mf.trilinear_form(3), r"a manifolds.LieAlgebra, such as mf.so\(3\), not 3"),
+    "no algebra": (lambda: mf.trilinear_form("a"), r"a manifolds.LieAlgebra, such as mf.so\(3\), got 'a'"),
+    "number": (lambda: mf.trilinear_form(3), r"a manifolds.LieAlgebra, such as mf.so\(3\), got 3"),
     "NaN": (lambda: mf.trilinear_form(SO3, np.full((3, 3), np.nan)), "must be finite, not .*nan"),
     "complex form": (lambda: mf.trilinear_form(SO3, 1j * np.eye(3)), "must be real, not complex128"),
 }

@@ -1,4 +1,4 @@
-"""The base of all pytrees: methods are ordinary ones, and pytrees where another module keeps them."""
+"""Base class of pytrees: methods are ordinary ones, and pytrees if another module stores them."""
 
 import types
 
@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from manifolds._pytree_module import Module
 
 
-class Scaled(Module):
+class ScaledNorm(Module):
     factor: jax.Array
 
     def value(self, x):
@@ -23,13 +23,13 @@ class Holder(Module):
 
 
 def test_methods_are_ordinary_ones():
-    assert isinstance(Scaled(jnp.array(2.0)).value, types.MethodType)
+    assert isinstance(ScaledNorm(jnp.array(2.0)).value, types.MethodType)
 
 
 def test_a_method_that_is_kept_has_the_parameters_of_its_object():
-    held = Holder((Scaled(jnp.array(2.0)).value, jnp.sum))
-    assert [float(leaf) for leaf in jax.tree_util.tree_leaves(held) if isinstance(leaf, jax.Array)] == [2.0]
+    holder = Holder((ScaledNorm(jnp.array(2.0)).value, jnp.sum))
+    assert [float(leaf) for leaf in jax.tree_util.tree_leaves(holder) if isinstance(leaf, jax.Array)] == [2.0]
     x = jnp.array([1.0, 2.0])
-    assert held(x) == 13.0
-    twice = jax.tree_util.tree_map(lambda leaf: 2 * leaf if isinstance(leaf, jax.Array) else leaf, held)
-    assert twice(x) == 23.0
+    assert holder(x) == 13.0
+    doubled_holder = jax.tree_util.tree_map(lambda leaf: 2 * leaf if isinstance(leaf, jax.Array) else leaf, holder)
+    assert doubled_holder(x) == 23.0

@@ -1,4 +1,4 @@
-"""To SymPy and back, exactly."""
+"""Exact conversion to SymPy and back."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ def test_casimirs_and_constants_return_unchanged(g):
     for casimir in g.casimirs(1 if g.name.startswith("heisenberg") else 2):
         expression = mf.sympy.expression(casimir)
         assert mf.sympy.polynomial(expression, mf.sympy.symbols(g.dim)) == casimir
-    again = mf.sympy.algebra(mf.sympy.structure_constants(g), name=g.name)
-    assert np.array_equal(again.structure_constants, g.structure_constants)
-    assert again.rational_constants is not None
+    returned_algebra = mf.sympy.algebra(mf.sympy.structure_constants(g), name=g.name)
+    assert np.array_equal(returned_algebra.structure_constants, g.structure_constants)
+    assert returned_algebra.rational_constants is not None
 
 
 def test_sympy_proves_that_a_casimir_is_one():
@@ -51,7 +51,7 @@ def test_what_is_no_polynomial_or_algebra_is_refused():
         mf.sympy.expression(mf.so(3).casimirs(2)[0], (q,))
     with pytest.raises(mf.ManifoldsError, match="three indices"):
         mf.sympy.algebra([[0, 1], [1, 0]])
-    broken = np.array(mf.so(3).structure_constants, dtype=int)
-    broken[0, 1, 1], broken[1, 0, 1] = 1, -1
+    constants = np.array(mf.so(3).structure_constants, dtype=int)
+    constants[0, 1, 1], constants[1, 0, 1] = 1, -1
     with pytest.raises(mf.JacobiError):
-        mf.sympy.algebra(broken.tolist())
+        mf.sympy.algebra(constants.tolist())

@@ -1,4 +1,5 @@
-"""The papers formula by formula: what the library and a calculation of its own differ by, as figures.
+"""Check the papers formula by formula: each figure is the difference between the library and an independent
+calculation.
 
 ``python -m tests.papers`` computes every figure and writes them into ``docs/reference/verification.md``.
 """
@@ -22,25 +23,25 @@ from liethermo.tracing.interpret import evaluate_at_points
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "verification.md"
 
 ROUNDING = 1e-12
-"""Largest difference of a formula without a step: at most 3e-14 seen, in sums of some hundred products."""
+"""Largest relative difference of a formula without a step: at most 3e-14 seen, in sums of some hundred products."""
 
 
 class Order(float):
-    """A measured order of convergence."""
+    """Measured order of convergence."""
 
     def __str__(self) -> str:
         return f"order {float(self):.2f}"
 
 
 class Value(float):
-    """A figure that is not rounding, and that both calculations have."""
+    """Figure that is not rounding, and that both calculations have."""
 
     def __str__(self) -> str:
         return _power(self, 2) if self < 0.01 else f"{float(self):.2g}"
 
 
 class Difference(float):
-    """What two calculations differ by, relative to the largest number of theirs."""
+    """Largest difference between two calculations, relative to the largest number of the second."""
 
     def __str__(self) -> str:
         return "0" if self == 0.0 else _power(self, 1)
@@ -50,7 +51,8 @@ Figure = Order | Value | Difference
 
 
 class Row(NamedTuple):
-    """A line of the tables: a place of a paper, what is there, in the library, and beside what it was compared."""
+    """Line of the tables: the place in a paper, the part of the library, the comparison, and the function for the
+    figure."""
 
     paper: str
     where: str
@@ -63,7 +65,7 @@ ROWS: dict[str, Row] = {}
 
 
 def row(paper: str, where: str, what: str, beside: str, *arguments) -> Callable:
-    """Decorator: the figure of a line, a function of these arguments."""
+    """Return a decorator that enters a function as the figure of a line, called with these arguments."""
 
     def enter(figure: Callable[..., Figure]) -> Callable[..., Figure]:
         name = " ".join([figure.__name__, *map(str, arguments)])
@@ -73,34 +75,35 @@ def row(paper: str, where: str, what: str, beside: str, *arguments) -> Callable:
     return enter
 
 
-def agree(found: Figure, kept: str) -> bool:
-    """Whether a figure is that of the page: orders and values to their digits, rounding within a power of ten."""
-    if isinstance(found, Order):
-        return kept.startswith("order ") and abs(found - float(kept.removeprefix("order "))) < 0.02
-    number = float(re.sub(r"\$(.*) \\cdot 10\^\{(.*)\}\$", r"\1e\2", kept))
-    if isinstance(found, Value):
-        return abs(found - number) < 0.05 * abs(number)
-    return 0.0 <= found <= max(10.0 * number, 1e-15)
+def agree(figure: Figure, page_text: str) -> bool:
+    """Return True if a figure is the one on the page: orders and values to their digits, rounding within a power of
+    ten."""
+    if isinstance(figure, Order):
+        return page_text.startswith("order ") and abs(figure - float(page_text.removeprefix("order "))) < 0.02
+    number = float(re.sub(r"\$(.*) \\cdot 10\^\{(.*)\}\$", r"\1e\2", page_text))
+    if isinstance(figure, Value):
+        return abs(figure - number) < 0.05 * abs(number)
+    return 0.0 <= figure <= max(10.0 * number, 1e-15)
 
 
 def tables(figures: dict[str, Figure]) -> dict[str, str]:
-    """The table of each paper, from the figures by the names of their lines."""
-    found: dict[str, list[str]] = {}
+    """Return the table of each paper in Markdown, with a figure for the name of each line."""
+    lines_by_paper: dict[str, list[str]] = {}
     for name, line in ROWS.items():
-        lines = found.setdefault(line.paper, ["| where | what | beside | figure |", "|---|---|---|---|"])
+        lines = lines_by_paper.setdefault(line.paper, ["| where | what | beside | figure |", "|---|---|---|---|"])
         lines.append(f"| {line.where} | {line.what} | {line.beside} | {figures[name]} |")
-    return {paper: "\n".join(lines) for paper, lines in found.items()}
+    return {paper: "\n".join(lines) for paper, lines in lines_by_paper.items()}
 
 
-def marked(text: str, paper: str) -> re.Match[str]:
-    """The table of a paper in the text of the page."""
-    found = re.search(rf"(?<=<!-- {paper}: python -m tests.papers -->\n\n).*?(?=\n\n<!-- end -->)", text, re.S)
-    assert found is not None, f"the page has no place for the table of {paper}"
-    return found
+def find_table(text: str, paper: str) -> re.Match[str]:
+    """Return the match of a paper's table in the text of the page."""
+    match = re.search(rf"(?<=<!-- {paper}: python -m tests.papers -->\n\n).*?(?=\n\n<!-- end -->)", text, re.S)
+    assert match is not None, f"the page has no place for the table of {paper}"
+    return match
 
 
 class Tests:
-    """A module of tests, read when something of it is asked for: reading a module of lines builds nothing."""
+    """Module of tests that is imported when an attribute of it is asked for: importing this package builds nothing."""
 
     def __init__(self, name: str):
         self._name = f"tests.liethermo.{name}"
@@ -113,7 +116,7 @@ class Tests:
 
 
 def fields(system, points) -> np.ndarray:
-    """The vector field of a system at points, shape (m, n)."""
+    """Return the vector field of a system at points, shape (m, n)."""
     return evaluate_at_points(_field, system, np.atleast_2d(np.asarray(points, dtype=float)))
 
 
@@ -121,23 +124,26 @@ def _field(system, x):
     return system.vector_field(x)
 
 
-def apart(found, expected) -> Difference:
-    """The largest difference of two arrays, relative to the largest entry of the second."""
-    found, expected = np.asarray(found), np.asarray(expected)
-    return Difference(np.abs(found - expected).max() / np.abs(expected).max())
+def relative_difference(array, reference) -> Difference:
+    """Return the largest difference of two arrays, relative to the largest entry of the second."""
+    array, reference = np.asarray(array), np.asarray(reference)
+    return Difference(np.abs(array - reference).max() / np.abs(reference).max())
 
 
-def worst(*figures: Difference) -> Difference:
+def largest_difference(*figures: Difference) -> Difference:
     return Difference(max(figures))
 
 
-def solved(rate: Callable, y0, t: float) -> np.ndarray:
-    """SciPy, to its rounding."""
+def solve_with_scipy(rate: Callable, y0, t: float) -> np.ndarray:
+    """Return the state at time t by SciPy's DOP853 with tolerances of 1e-13."""
     return solve_ivp(rate, (0.0, t), y0, method="DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
 
 
 def order(system, x0, t: float, exact, method, counts: Sequence[int] = (20, 40), laws: bool = True) -> Order:
-    """The order of a method between two numbers of steps, against a state at the end; its laws hold on the way."""
+    """Return the order of a method from its errors with two numbers of steps.
+
+    ``exact`` is the state at the end. The run's audit must pass unless ``laws`` is False.
+    """
     errors = []
     for count in counts:
         run = lt.integrate(system, x0, (0.0, t), t / count, method)

@@ -3,7 +3,7 @@
 import sys
 import time
 
-from . import PAGE, ROWS, Figure, bfm, gby, marked, sml, tables  # noqa: F401
+from . import PAGE, ROWS, Figure, bfm, find_table, gby, sml, tables  # noqa: F401
 
 figures: dict[str, Figure] = {}
 for name, line in ROWS.items():
@@ -12,6 +12,6 @@ for name, line in ROWS.items():
     print(f"{name}: {figures[name]}  ({time.process_time() - start:.1f} s)", file=sys.stderr, flush=True)
 text = PAGE.read_text()
 for paper, table in tables(figures).items():
-    place = marked(text, paper)
+    place = find_table(text, paper)
     text = text[: place.start()] + table + text[place.end() :]
 PAGE.write_text(text)

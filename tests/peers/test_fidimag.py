@@ -15,12 +15,12 @@ mag = lt.magnetism
 
 
 def field_of(energy, s):
-    """The effective field at every spin, of the shape of s."""
+    """Return the effective field at every spin, in the shape of s."""
     return -np.asarray(energy.gradient(jnp.asarray(s, dtype=float).ravel())).reshape(np.shape(s))
 
 
-def numbered(*sites):
-    """Spins (i, j, k), their indices, which are not of length one."""
+def index_spins(*sites):
+    """Return spins that equal their indices (i, j, k); their length is not one."""
     return np.stack(np.meshgrid(*map(np.arange, sites), indexing="ij"), axis=-1).astype(float)
 
 
@@ -28,34 +28,34 @@ def numbered(*sites):
 
 
 def test_exch_1d():
-    field = field_of(mag.exchange((5, 1, 1), 1.0, periodic=False), numbered(5, 1, 1))
+    field = field_of(mag.exchange((5, 1, 1), 1.0, periodic=False), index_spins(5, 1, 1))
     np.testing.assert_array_equal(field[:, 0, 0, 0], [1, 2, 4, 6, 3])
     np.testing.assert_array_equal(field[..., 1:], 0.0)
 
 
 def test_exch_1d_pbc():
     """Periodic along x alone: along an axis with one site a period would join a site with itself."""
-    field = field_of(mag.exchange((5, 1, 1), 1.0, periodic=(True, False, False)), numbered(5, 1, 1))
+    field = field_of(mag.exchange((5, 1, 1), 1.0, periodic=(True, False, False)), index_spins(5, 1, 1))
     np.testing.assert_array_equal(field[:, 0, 0, 0], [1 + 4, 2, 4, 6, 3 + 0])
     np.testing.assert_array_equal(field[..., 1:], 0.0)
 
 
 def test_exch_2d():
-    field = field_of(mag.exchange((5, 2, 1), 1.0, periodic=False), numbered(5, 2, 1))
+    field = field_of(mag.exchange((5, 2, 1), 1.0, periodic=False), index_spins(5, 2, 1))
     np.testing.assert_array_equal(field[:, 0, 0, 0], [1, 2 + 1, 1 + 2 + 3, 2 + 3 + 4, 3 + 4])
     np.testing.assert_array_equal(field[..., 2], 0.0)
 
 
 def test_exch_2d_pbc2d():
     """Two sites along y are neighbours twice."""
-    field = field_of(mag.exchange((3, 2, 1), 1.0, periodic=(True, True, False)), numbered(3, 2, 1))
+    field = field_of(mag.exchange((3, 2, 1), 1.0, periodic=(True, True, False)), index_spins(3, 2, 1))
     np.testing.assert_array_equal(field[..., 0].ravel(), [3, 3, 4, 4, 5, 5])
     np.testing.assert_array_equal(field[..., 1].ravel(), [2, 2, 2, 2, 2, 2])
     np.testing.assert_array_equal(field[..., 2], 0.0)
 
 
 def test_exch_3d():
-    field = field_of(mag.exchange((4, 3, 2), 1.0, periodic=False), numbered(4, 3, 2))
+    field = field_of(mag.exchange((4, 3, 2), 1.0, periodic=False), index_spins(4, 3, 2))
     np.testing.assert_array_equal(field[:, 0, 0, 0], [1, 4, 8, 8])
     np.testing.assert_array_equal(field[:, 1, 0, 0], [1, 5, 10, 11])
 
@@ -92,9 +92,9 @@ def test_exch_micro_1d():
 
 
 def test_atom_dmi_1d():
-    energy, along = mag.dzyaloshinskii_moriya(2, (1.0, 0.0, 0.0), periodic=False), np.array([[1.0, 0.0, 0.0]] * 2)
-    np.testing.assert_array_equal(field_of(energy, along), 0.0)
-    assert float(energy.value(along.ravel())) == 0.0
+    energy, spins = mag.dzyaloshinskii_moriya(2, (1.0, 0.0, 0.0), periodic=False), np.array([[1.0, 0.0, 0.0]] * 2)
+    np.testing.assert_array_equal(field_of(energy, spins), 0.0)
+    assert float(energy.value(spins.ravel())) == 0.0
 
 
 def test_atom_dmi_1d_field():
@@ -185,8 +185,8 @@ def test_energy():
     assert (np.diff(run.energy) < 0.0).all()
 
 
-def relaxed(energy, start, time, step, rate=0.5):
-    """Spins that are damped, of the shape of the start, without precession to speak of."""
+def relax(energy, start, time, step, rate=0.5):
+    """Return the spins after damping with almost no precession, in the shape of the start."""
     system = lt.SpinSystem(len(start), energy, lt.LandauLifshitz(rate), ratio=1e-3)
     run = lt.integrate(system, np.ravel(start), (0.0, time), step, lt.MetriplecticRungeKutta(4), save_every=1000)
     return run.x[-1].reshape(-1, 3)
@@ -199,7 +199,7 @@ def test_dw_dmi_atomistic():
     start = np.where((x < 140)[:, None], [1.0, 0, 0], np.where((x > 160)[:, None], [-1.0, 0, 0], [0, 1.0, 0]))
     energy = mag.exchange(300, periodic=False) + mag.anisotropy(300, K, (1.0, 0.0, 0.0))
     energy = energy + mag.dzyaloshinskii_moriya(300, (D, 0.0, 0.0), periodic=False)
-    m, x = relaxed(energy, start, 4000.0, 0.5), x - 150.0
+    m, x = relax(energy, start, 4000.0, 0.5), x - 150.0
     A = 0.5
     width = np.sqrt(A / (K - D**2 / (4 * A)))
     angle = -D / (2 * A) * x
@@ -216,7 +216,7 @@ def test_domain_wall_cobalt():
     m_z = 1.0 - 2.0 * x / 100.0
     start = np.stack([0 * x, np.sqrt(1.0 - m_z**2), m_z], axis=-1)
     energy = mag.exchange(100, 2 * A / cell**2 / K, periodic=False) + mag.anisotropy(100, 1.0)
-    m = relaxed(energy, start, 30.0, 0.01)
+    m = relax(energy, start, 30.0, 0.01)
     exact = -np.tanh((x - 50.0) * cell / np.sqrt(A / K))
     assert np.abs(m[:, 2] - exact).max() < 1e-2
 
@@ -233,10 +233,10 @@ def test_prb88_184422():
     x = np.arange(100) + 0.5
     energy = mag.exchange(100, 2 * A / cell**2 / K, periodic=False) + mag.anisotropy(100, 1.0)
     energy = energy + mag.dzyaloshinskii_moriya(100, (0.0, D / cell / K, 0.0), periodic=False)
-    m = relaxed(energy, np.tile([0.0, 0.0, 1.0], (100, 1)), 20.0, 0.01)
+    m = relax(energy, np.tile([0.0, 0.0, 1.0], (100, 1)), 20.0, 0.01)
     width, pitch = np.sqrt(A / K) / cell, 2 * A / D / cell
-    at_edge = np.arcsin(width / pitch)
-    angle = 2 * np.arctan(np.tan(at_edge / 2) * np.exp(-x / width))
+    edge_angle = np.arcsin(width / pitch)
+    angle = 2 * np.arctan(np.tan(edge_angle / 2) * np.exp(-x / width))
     assert np.abs(np.abs(m[:50, 0]) - np.sin(angle[:50])).max() < 0.01
     np.testing.assert_allclose(m[:, 0], -m[::-1, 0], rtol=0, atol=1e-9)
     np.testing.assert_allclose(m[:, 1], 0.0, atol=1e-9)
@@ -257,14 +257,14 @@ def test_spin_waves():
 
 
 def chirality(s):
-    """The finite spin chirality of two triangles at each site [PRL 108, 017601], over 8 pi."""
+    """Return the finite spin chirality of two triangles at each site [PRL 108, 017601], over 8 pi."""
     x, y = (lambda by: np.roll(s, -by, 0)), (lambda by: np.roll(s, -by, 1))
     triangles = sum(np.sum(s * np.cross(x(by), y(by)), axis=-1) for by in (1, -1))
     return triangles.sum() / (8 * np.pi)
 
 
 def berg_luscher(s):
-    """The solid angles of two triangles at each site [Berg & Luescher 1981], over 4 pi."""
+    """Return the solid angles of two triangles at each site [Berg & Luescher 1981], over 4 pi."""
     x, y = (lambda by: np.roll(s, -by, 0)), (lambda by: np.roll(s, -by, 1))
     total = 0.0
     for by in (1, -1):
@@ -279,8 +279,8 @@ def berg_luscher(s):
 def test_skx_num_atomistic():
     """A skyrmion that points down, of 120 x 120 spins with D = 0.09 J in a field of 0.005 J."""
     x, y = np.meshgrid(np.arange(120) + 0.5, np.arange(120) + 0.5, indexing="ij")
-    inside = np.array([0.05, 0.01, -1.0]) / np.linalg.norm([0.05, 0.01, -1.0])
-    s = np.where(((x - 60) ** 2 + (y - 60) ** 2 < 400)[..., None], inside, [0.0, 0.0, 1.0])
+    core_spin = np.array([0.05, 0.01, -1.0]) / np.linalg.norm([0.05, 0.01, -1.0])
+    s = np.where(((x - 60) ** 2 + (y - 60) ** 2 < 400)[..., None], core_spin, [0.0, 0.0, 1.0])
     system = lt.models.spin_lattice(
         (120, 120), 1.0, field=(0, 0, 5e-3), dmi=[(0.09, 0, 0), (0, 0.09, 0)], rate=0.5, baths=False
     )

@@ -21,11 +21,11 @@ EXACT = 1e-14
 LN_2, SINH_1 = np.log(2.0), np.sinh(1.0)
 
 
-def largest(a) -> float:
+def max_abs(a) -> float:
     return float(np.abs(np.asarray(a)).max(initial=0.0))
 
 
-def normalized(x):
+def unit_vector(x):
     return np.asarray(x) / np.linalg.norm(x)
 
 
@@ -34,9 +34,9 @@ def normalized(x):
 
 def test_hypersphere_distances():
     space = mf.Sphere(4)
-    right = normalized([10.0, -2.0, -0.5, 0.0, 0.0]), normalized([2.0, 10.0, 0.0, 0.0, 0.0])
-    assert abs(float(space.distance(*right)) - np.pi / 2) < EXACT
-    a, b = normalized([10.0, -2.0, -5.0, 0.0, 0.0]), normalized([1.0, -20.0, -5.0, 0.0, 3.0])
+    orthogonal_points = unit_vector([10.0, -2.0, -0.5, 0.0, 0.0]), unit_vector([2.0, 10.0, 0.0, 0.0, 0.0])
+    assert abs(float(space.distance(*orthogonal_points)) - np.pi / 2) < EXACT
+    a, b = unit_vector([10.0, -2.0, -5.0, 0.0, 0.0]), unit_vector([1.0, -20.0, -5.0, 0.0, 3.0])
     assert abs(float(space.distance(a, b)) - 1.24864502) < 1e-8
     poles = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # the diameter of these three
     assert abs(float(mf.Sphere(2).distance(poles[:, None], poles[None]).max()) - np.pi) < EXACT
@@ -49,15 +49,15 @@ def test_hypersphere_inner_product():
 
 def test_hypersphere_log_and_exp():
     space = mf.Sphere(4)
-    x = normalized([1.0, 2.0, 3.0, 4.0, 6.0])
-    y = normalized(x + 1e-4 * np.array([-1.0, -2.0, 1.0, 1.0, 0.1]))
-    assert largest(space.exp(x, space.log(x, y)) - y) < EXACT
+    x = unit_vector([1.0, 2.0, 3.0, 4.0, 6.0])
+    y = unit_vector(x + 1e-4 * np.array([-1.0, -2.0, 1.0, 1.0, 0.1]))
+    assert max_abs(space.exp(x, space.log(x, y)) - y) < EXACT
     x, v = np.eye(5)[0], np.pi / 6 * np.eye(5)[2]
-    assert largest(space.log(x, space.exp(x, v)) - v) < EXACT
-    x = normalized([16.0, -2.0, -2.5, 84.0, 3.0])
+    assert max_abs(space.log(x, space.exp(x, v)) - v) < EXACT
+    x = unit_vector([16.0, -2.0, -2.5, 84.0, 3.0])
     v = space.project_tangent(x, np.array([9.0, 0.0, -1.0, -2.0, 1.0]))
-    turned = float(space.norm(x, v)) % (2 * np.pi)  # once around and further
-    assert abs(float(space.distance(x, space.exp(x, v))) - min(turned, 2 * np.pi - turned)) < 10 * EXACT
+    angle = float(space.norm(x, v)) % (2 * np.pi)  # once around and further
+    assert abs(float(space.distance(x, space.exp(x, v))) - min(angle, 2 * np.pi - angle)) < 10 * EXACT
 
 
 # -- positive definite matrices ----------------------------------------------------------------------------------------
@@ -69,19 +69,19 @@ def test_spd_membership():
     cases.append(([[1.0, -1.0], [0.0, 1.0]], False))
     assert [bool(space.belongs(np.array(x))) for x, _ in cases] == [expected for _, expected in cases]
     assert not bool(mf.SPD(3).belongs(np.array([[1.0, 2.0, 3.0], [2.0, 4.0, 5.0], [3.0, 5.0, 6.0]])))
-    assert largest(np.asarray(space.project(np.eye(2))) - np.eye(2)) == 0.0
+    assert max_abs(np.asarray(space.project(np.eye(2))) - np.eye(2)) == 0.0
     with pytest.raises(mf.DomainError):  # geomstats moves it to 1e-12 times the identity
         space.project(-np.diag([1.0, 2.0]))
 
 
 def test_spd_exp_and_log():
     space, one = mf.SPD(2), np.eye(2)
-    assert largest(space.exp(one, 2.0 * one) - np.exp(2.0) * one) < 10 * EXACT
-    assert largest(space.log(2.0 * one, one) + 2.0 * LN_2 * one) < EXACT
+    assert max_abs(space.exp(one, 2.0 * one) - np.exp(2.0) * one) < 10 * EXACT
+    assert max_abs(space.log(2.0 * one, one) + 2.0 * LN_2 * one) < EXACT
 
 
 @pytest.mark.parametrize(
-    ("function", "base", "moved", "expected"),
+    ("function", "base", "tangent", "expected"),
     [
         (
             lambda a: spectral(jnp.sqrt, a),
@@ -104,16 +104,16 @@ def test_spd_exp_and_log():
     ],
     ids=["power 1/2", "log", "exp"],
 )
-def test_differentials_of_matrix_functions(function, base, moved, expected):
+def test_differentials_of_matrix_functions(function, base, tangent, expected):
     """At matrices with equal eigenvalues among them."""
-    base, moved = np.array(base), np.array(moved)
-    assert largest(jax.jit(lambda a, b: jax.jvp(function, (a,), (b,))[1])(base, moved) - np.array(expected)) < EXACT
+    base, tangent = np.array(base), np.array(tangent)
+    assert max_abs(jax.jit(lambda a, b: jax.jvp(function, (a,), (b,))[1])(base, tangent) - np.array(expected)) < EXACT
 
 
 # -- rotations ---------------------------------------------------------------------------------------------------------
 
 
-def rotated(angle, sign=-1.0):
+def plane_rotation(angle, sign=-1.0):
     return np.array([[np.cos(angle), sign * np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
@@ -132,10 +132,10 @@ VECTORS = {
 
 def test_rotations_members():
     space = mf.SpecialOrthogonal(2)
-    assert bool(space.belongs(rotated(np.pi / 3)))
-    assert not bool(space.belongs(rotated(np.pi / 3, sign=1.0)))
+    assert bool(space.belongs(plane_rotation(np.pi / 3)))
+    assert not bool(space.belongs(plane_rotation(np.pi / 3, sign=1.0)))
     assert [mf.SpecialOrthogonal(n).dim for n in (2, 3, 4)] == [1, 3, 6]
-    assert largest(space.project(np.eye(2) + 1e-12) - np.eye(2)) < 1e-12
+    assert max_abs(space.project(np.eye(2) + 1e-12) - np.eye(2)) < 1e-12
     with pytest.raises(mf.ManifoldsError):
         space.belongs(np.zeros((2, 3)))  # False there
 
@@ -147,33 +147,33 @@ def test_rotation_vectors(name):
     g = np.asarray(group.exp(v))
     w = np.asarray(group.log(g))
     angle, length = np.linalg.norm(v), np.linalg.norm(w)
-    turned = angle % (2 * np.pi)
-    assert abs(length - min(turned, 2 * np.pi - turned)) < 1e-14
-    assert largest(np.asarray(group.exp(w)) - g) < EXACT
+    angle_mod_2pi = angle % (2 * np.pi)
+    assert abs(length - min(angle_mod_2pi, 2 * np.pi - angle_mod_2pi)) < 1e-14
+    assert max_abs(np.asarray(group.exp(w)) - g) < EXACT
 
 
 def test_rotation_matrices_of_vectors():
     group = mf.SO(3)
     half, root = 0.5, np.sqrt(3.0) / 2
     expected = [[1.0, 0.0, 0.0], [0.0, half, -root], [0.0, root, half]]
-    assert largest(group.exp([np.pi / 3, 0.0, 0.0]) - np.array(expected)) < EXACT
+    assert max_abs(group.exp([np.pi / 3, 0.0, 0.0]) - np.array(expected)) < EXACT
     for v in (1e-11 * np.array([12.0, 1.0, -81.0]), np.array([0.1, 1.3, -0.5])):
         skew = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
         t = np.linalg.norm(v)
         rodrigues = np.eye(3) + np.sin(t) / t * skew + (2 * np.sin(t / 2) ** 2) / t**2 * skew @ skew
-        assert largest(group.exp(v) - rodrigues) < EXACT
+        assert max_abs(group.exp(v) - rodrigues) < EXACT
     c, s = np.cos(0.12), np.sin(0.12)
     assert (
-        largest(group.log(np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])) - np.array([0.12, 0.0, 0.0])) < EXACT
+        max_abs(group.log(np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])) - np.array([0.12, 0.0, 0.0])) < EXACT
     )
     # so(2) begins with E_12, which turns the second axis to the first: the angle is theirs with the other sign
-    assert largest(mf.SO(2).log(rotated(2 * np.pi / 5)) + 2 * np.pi / 5) < EXACT
+    assert max_abs(mf.SO(2).log(plane_rotation(2 * np.pi / 5)) + 2 * np.pi / 5) < EXACT
 
 
 def test_antipodal_rotations_have_a_logarithm_here():
     """geomstats refuses it. Here one of the two is chosen, and leads there."""
     space, x = mf.SpecialOrthogonal(3), np.diag([1.0, -1.0, -1.0])
-    assert largest(space.exp(x, space.log(x, np.eye(3))) - np.eye(3)) < EXACT
+    assert max_abs(space.exp(x, space.log(x, np.eye(3))) - np.eye(3)) < EXACT
 
 
 # -- rigid motions -----------------------------------------------------------------------------------------------------
@@ -182,17 +182,17 @@ def test_antipodal_rotations_have_a_logarithm_here():
 def test_rigid_motions_members():
     def matrix(angle, corner=1.0):
         g = np.eye(3)
-        g[:2, :2], g[:2, 2], g[2, 2] = rotated(angle), [2.0, 3.0], corner
+        g[:2, :2], g[:2, 2], g[2, 2] = plane_rotation(angle), [2.0, 3.0], corner
         return g
 
     space, g = mf.SpecialEuclidean(2), matrix(np.pi / 3)
     assert bool(space.belongs(g))
     assert not bool(space.belongs(matrix(np.pi / 3, corner=0.0)))
     t = np.pi / 3
-    inside = np.array([[0.0, -t, 2.0], [t, 0.0, 3.0], [0.0, 0.0, 0.0]])
-    assert largest(space.project_tangent(g, g @ inside) - g @ inside) < EXACT
+    twist = np.array([[0.0, -t, 2.0], [t, 0.0, 3.0], [0.0, 0.0, 0.0]])
+    assert max_abs(space.project_tangent(g, g @ twist) - g @ twist) < EXACT
     with pytest.raises(mf.OffManifoldError, match="not tangent"):
-        space.norm(g, g @ (inside + np.diag([0.0, 0.0, 1.0])))
+        space.norm(g, g @ (twist + np.diag([0.0, 0.0, 1.0])))
     assert [mf.SE(n).dim for n in (2, 3)] == [3, 6]
 
 
@@ -200,7 +200,7 @@ def test_rigid_motions_exp_and_log():
     """The vectors are theirs, (rotation, translation); translations up to 555 and angles up to 2 pi."""
     plane = mf.SE(2)
     shift = np.array([0.0, 0.6, 0.7])
-    assert largest(plane.log(plane.exp(shift)) - shift) < EXACT
+    assert max_abs(plane.log(plane.exp(shift)) - shift) < EXACT
     group = mf.SE(3)
     shifts = [
         [1.0, 5.0, 2.0],
@@ -214,8 +214,8 @@ def test_rigid_motions_exp_and_log():
         for u in shifts:
             g = np.eye(4)
             g[:3, :3], g[:3, 3] = group_rotation(v), u
-            found = np.asarray(group.exp(group.log(g)))
-            assert largest(found - g) < 1e-14 * max(1.0, np.abs(u).max())
+            roundtrip = np.asarray(group.exp(group.log(g)))
+            assert max_abs(roundtrip - g) < 1e-14 * max(1.0, np.abs(u).max())
 
 
 def group_rotation(v):
@@ -224,7 +224,11 @@ def group_rotation(v):
 
 # -- subspaces and frames ----------------------------------------------------------------------------------------------
 
-XY, YZ, XZ = np.diag([1.0, 1.0, 0.0]), np.diag([0.0, 1.0, 1.0]), np.diag([1.0, 0.0, 1.0])
+XY = np.diag([1.0, 1.0, 0.0])
+YZ = np.diag([0.0, 1.0, 1.0])
+XZ = np.diag([1.0, 0.0, 1.0])
+"""Projectors on the coordinate planes."""
+
 R_Y = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
 R_Z = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
 
@@ -234,7 +238,7 @@ def test_grassmannian_exp_by_a_right_angle():
     assert bool(space.belongs(np.array([XY, YZ, XZ])).all())
     for x, turn, y in ((XY, R_Y, YZ), (YZ, R_Y, XY), (YZ, R_Z, XZ)):
         v = np.pi / 2 * (turn @ x - x @ turn)
-        assert largest(np.asarray(space.exp(x, v)) - y) < EXACT
+        assert max_abs(np.asarray(space.exp(x, v)) - y) < EXACT
         assert abs(float(space.distance(x, y)) - np.pi / np.sqrt(2.0)) < EXACT  # where their logarithm is not unique
 
 
@@ -242,8 +246,8 @@ def test_stiefel_to_grassmannian():
     frame = np.array([[1.0, -1.0], [1.0, 1.0], [0.0, 0.0]]) / np.sqrt(2.0)
     space = mf.Grassmann(3, 2)
     for n in (2, 3, 4):
-        turned = np.asarray(expm(jnp.asarray(np.pi / n * R_Z))) @ frame
-        assert largest(space.subspace(turned) - XY) < EXACT
+        turned_frame = np.asarray(expm(jnp.asarray(np.pi / n * R_Z))) @ frame
+        assert max_abs(space.subspace(turned_frame) - XY) < EXACT
 
 
 @pytest.mark.slow
@@ -253,7 +257,7 @@ def test_stiefel_canonical_metric():
     b = a.copy()
     b[:, 0] = np.array([1.0, 0.0, 0.0, 1.0]) / np.sqrt(2.0)
     assert abs(float(space.distance(a, b)) - np.pi / 4) < 1e-13
-    assert largest(space.exp(a, space.log(a, b)) - b) < 1e-13
+    assert max_abs(space.exp(a, space.log(a, b)) - b) < 1e-13
     with pytest.raises(mf.ParameterError, match="SpecialOrthogonal"):  # two sheets: refused there by the logarithm
         mf.Stiefel(3, 3)
 
@@ -261,11 +265,11 @@ def test_stiefel_canonical_metric():
 # -- hyperbolic space --------------------------------------------------------------------------------------------------
 
 
-def above(*coordinates):
+def lift(*coordinates):
     return np.array([np.sqrt(1.0 + np.square(coordinates).sum()), *coordinates])
 
 
-def of_ball(x):
+def from_ball(x):
     square = float(np.dot(x, x))
     return np.array([1.0 + square, *(2.0 * np.asarray(x))]) / (1.0 - square)
 
@@ -273,7 +277,7 @@ def of_ball(x):
 def test_hyperboloid_members():
     assert bool(mf.Hyperbolic(3).belongs(np.array([1.0, 0.0, 0.0, 0.0])))
     assert not bool(mf.Hyperbolic(2).belongs(np.array([0.5, 7.0, 3.0])))
-    assert bool(mf.Hyperbolic(2).belongs(above(0.5, 7.0)))
+    assert bool(mf.Hyperbolic(2).belongs(lift(0.5, 7.0)))
     with pytest.raises(mf.OffManifoldError):
         mf.Hyperbolic(3).point(np.array([-1.0, 1.0, 0.0, 0.0]))
 
@@ -290,10 +294,10 @@ def test_hyperboloid_distances():
     """In the ball and from coordinates; their test compares these two only."""
     space, a, b = mf.Hyperbolic(2), np.array([0.7, 0.2]), np.array([0.2, 0.2])
     expected = np.arccosh(1.0 + 2.0 * np.sum((a - b) ** 2) / ((1.0 - a @ a) * (1.0 - b @ b)))
-    assert abs(float(space.distance(of_ball(a), of_ball(b))) - expected) < EXACT
+    assert abs(float(space.distance(from_ball(a), from_ball(b))) - expected) < EXACT
     for a, b in (((10.0, 0.2), (1.0, 6.0)), ((10.0, 0.2, 3.0, 4.0), (1.0, 6.0, 2.0, 1.0))):
-        x, y = above(*a), above(*b)
-        found = float(mf.Hyperbolic(len(a)).distance(x, y))
-        assert abs(found - np.arccosh(x[0] * y[0] - x[1:] @ y[1:])) < EXACT * 10
-    x, y = above(4.0, 0.2), above(3.0, 3.0)
-    assert largest(space.exp(x, space.log(x, y)) - y) < 50 * EXACT
+        x, y = lift(*a), lift(*b)
+        distance = float(mf.Hyperbolic(len(a)).distance(x, y))
+        assert abs(distance - np.arccosh(x[0] * y[0] - x[1:] @ y[1:])) < EXACT * 10
+    x, y = lift(4.0, 0.2), lift(3.0, 3.0)
+    assert max_abs(space.exp(x, space.log(x, y)) - y) < 50 * EXACT

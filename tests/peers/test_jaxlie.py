@@ -21,7 +21,7 @@ EXACT = 2e-14
 GROUPS = {"SO(2)": (mf.SO, 2), "SE(2)": (mf.SE, 2), "SO(3)": (mf.SO, 3), "SE(3)": (mf.SE, 3)}
 
 
-def largest(a) -> float:
+def max_abs(a) -> float:
     return float(np.abs(np.asarray(a)).max(initial=0.0))
 
 
@@ -32,7 +32,7 @@ def group(request):
 
 
 def vectors(group, seed=0, count=20):
-    """Rotations by less than pi, uniform in the ball; translations of order one."""
+    """Return random tangent vectors: rotations by less than pi, uniform in angle; translations of order one."""
     c = np.random.default_rng(seed).standard_normal((count, group.dim))
     turns = {1: 1, 3: 3 if group.matrix_size == 3 and group.dim == 3 and group.name == "SO(3)" else 1, 6: 3}[group.dim]
     sizes = np.linalg.norm(c[:, :turns], axis=1, keepdims=True)
@@ -44,33 +44,35 @@ def vectors(group, seed=0, count=20):
 def test_log_and_exp_are_inverse(group):
     v = vectors(group)
     g = np.asarray(group.exp(v))
-    assert largest(group.log(g) - v) < 20 * EXACT  # angles up to 3.1
-    assert largest(group.exp(group.log(g)) - g) < EXACT
+    assert max_abs(group.log(g) - v) < 20 * EXACT  # angles up to 3.1
+    assert max_abs(group.exp(group.log(g)) - g) < EXACT
 
 
 def test_group_axioms(group):
     a, b, c = (np.asarray(group.exp(vectors(group, seed))) for seed in (1, 2, 3))
     one = np.eye(group.matrix_size)
-    assert largest(group.compose(a, group.inverse(a)) - one) < EXACT
-    assert largest(np.asarray(group.inverse(group.inverse(a))) - a) < EXACT
-    assert largest(np.asarray(group.inverse(a)) - np.linalg.inv(a)) < EXACT
-    left = group.compose(group.compose(a, b), c)
-    assert largest(left - group.compose(a, group.compose(b, c))) < EXACT
-    assert bool(group.belongs(left, 1e-13).all())
+    assert max_abs(group.compose(a, group.inverse(a)) - one) < EXACT
+    assert max_abs(np.asarray(group.inverse(group.inverse(a))) - a) < EXACT
+    assert max_abs(np.asarray(group.inverse(a)) - np.linalg.inv(a)) < EXACT
+    abc = group.compose(group.compose(a, b), c)
+    assert max_abs(abc - group.compose(a, group.compose(b, c))) < EXACT
+    assert bool(group.belongs(abc, 1e-13).all())
 
 
 def test_adjoint(group):
     """``g exp(w) = exp(Ad(g) w) g``."""
     g, w = np.asarray(group.exp(vectors(group, 4))), 0.5 * np.random.default_rng(5).standard_normal((20, group.dim))
-    moved = np.einsum("nab,nb->na", group.Ad(g), w)
-    assert largest(np.asarray(group.compose(g, group.exp(w))) - np.asarray(group.compose(group.exp(moved), g))) < EXACT
+    adjoint_w = np.einsum("nab,nb->na", group.Ad(g), w)
+    assert (
+        max_abs(np.asarray(group.compose(g, group.exp(w))) - np.asarray(group.compose(group.exp(adjoint_w), g))) < EXACT
+    )
 
 
 def test_right_plus_and_right_minus(group):
     """``a + (b - a) = b``, with ``b - a = log(a^-1 b)``."""
     a, b = (np.asarray(group.exp(vectors(group, seed))) for seed in (6, 7))
     difference = group.log(group.compose(group.inverse(a), b))
-    assert largest(np.asarray(group.compose(a, group.exp(difference))) - b) < 5 * EXACT
+    assert max_abs(np.asarray(group.compose(a, group.exp(difference))) - b) < 5 * EXACT
 
 
 def cross(w):
@@ -80,7 +82,7 @@ def cross(w):
 def test_jacobian_of_the_logarithm():
     """``d log(g exp(t))`` at t = 0 is the inverse of the right Jacobian of SO(3), as in their ``jlog``."""
     group = mf.SO(3)
-    jacobian = jax.jit(jax.jacfwd(lambda t, g: group.log(group.compose(g, group.exp(t)))))
+    forward = jax.jit(jax.jacfwd(lambda t, g: group.log(group.compose(g, group.exp(t)))))
     backward = jax.jit(jax.jacrev(lambda t, g: group.log(group.compose(g, group.exp(t)))))
     for angle in (1e-10, 1e-6, 1e-3, 0.5, 2.0, 3.0):
         w = angle * np.array([2.0, -1.0, 2.0]) / 3.0
@@ -92,8 +94,8 @@ def test_jacobian_of_the_logarithm():
         )
         expected = np.eye(3) + W / 2 + quotient * W @ W
         g = group.exp(w)
-        for found in (jacobian, backward):
-            assert largest(found(jnp.zeros(3), g) - expected) < 50 * EXACT
+        for derivative in (forward, backward):
+            assert max_abs(derivative(jnp.zeros(3), g) - expected) < 50 * EXACT
 
 
 def test_translation_of_the_exponential():
@@ -102,13 +104,13 @@ def test_translation_of_the_exponential():
     for angle in (1e-9, 1e-4, 1.0, 3.0):
         w = angle * np.array([1.0, 2.0, -2.0]) / 3.0
         W, t = cross(w), angle
-        far = t > 0.01
-        a = 2 * np.sin(t / 2) ** 2 / t**2 if far else 0.5 - t**2 / 24
-        b = (t - np.sin(t)) / t**3 if far else 1 / 6 - t**2 / 120
+        is_large = t > 0.01
+        a = 2 * np.sin(t / 2) ** 2 / t**2 if is_large else 0.5 - t**2 / 24
+        b = (t - np.sin(t)) / t**3 if is_large else 1 / 6 - t**2 / 120
         V = np.eye(3) + a * W + b * W @ W
         g = np.asarray(group.exp(np.concatenate([w, u])))
-        assert largest(g[:3, 3] - V @ u) < 20 * EXACT
-        assert largest(np.asarray(group.log(g))[3:] - u) < 20 * EXACT  # V^-1
+        assert max_abs(g[:3, 3] - V @ u) < 20 * EXACT
+        assert max_abs(np.asarray(group.log(g))[3:] - u) < 20 * EXACT  # V^-1
 
 
 def test_descent_in_the_group(group):

@@ -17,7 +17,7 @@ import liethermo as lt
 
 SZ, SX = np.diag([1.0, -1.0]), np.array([[0.0, 1.0], [1.0, 0.0]])
 COLD = 1.0 / 50.0
-"""The temperature of a bath, relative to the frequency of a jump, beside which it is zero."""
+"""Temperature of a bath, relative to the frequency of a jump, at which jumps upwards are rounding."""
 
 
 def destroy(levels):
@@ -29,7 +29,7 @@ def basis(levels, n):
 
 
 def decay(operator, rate, frequency=1.0, bath=0):
-    """Jumps of this operator at this rate, in a bath of the temperature ``COLD * frequency``."""
+    """Return jumps by an operator at a rate, in a bath of the temperature ``COLD * frequency``."""
     return lt.ThermalJumps([(operator, lambda omega, T: rate * jnp.exp(-omega / (2.0 * T)))], bath)
 
 
@@ -38,7 +38,7 @@ def cold(frequency=1.0):
 
 
 class Qobj:
-    """An operator that gives its matrix by ``full()``."""
+    """Operator that gives its matrix by ``full()``."""
 
     def __init__(self, matrix):
         self.matrix = matrix
@@ -90,18 +90,18 @@ def test_a_rate_is_no_function_of_time():
 
 def test_stepping_and_a_rate_that_is_switched_off():
     """A run in two parts; in the second the rate is zero, and the number of quanta stays (1e-6)."""
-    on, off = (lt.QuantumSystem(NUMBER, decay(A, rate), cold()) for rate in (1.0, 0.0))
-    first = lt.integrate(on, basis(LEVELS, 9), (0.0, 1.0), 0.125, lt.MetriplecticTaylor(12)).x[-1]
-    second = lt.integrate(off, first, (1.0, 2.0), 0.125, lt.MetriplecticTaylor(12)).x[-1]
-    numbers = [float(on.expectation(x, NUMBER)) for x in (first, second)]
-    assert numbers[0] == pytest.approx(9.0 * np.exp(-1.0), abs=1e-10)
-    assert numbers[1] == pytest.approx(numbers[0], abs=1e-13)
+    decaying, lossless = (lt.QuantumSystem(NUMBER, decay(A, rate), cold()) for rate in (1.0, 0.0))
+    state = lt.integrate(decaying, basis(LEVELS, 9), (0.0, 1.0), 0.125, lt.MetriplecticTaylor(12)).x[-1]
+    final_state = lt.integrate(lossless, state, (1.0, 2.0), 0.125, lt.MetriplecticTaylor(12)).x[-1]
+    quanta = [float(decaying.expectation(x, NUMBER)) for x in (state, final_state)]
+    assert quanta[0] == pytest.approx(9.0 * np.exp(-1.0), abs=1e-10)
+    assert quanta[1] == pytest.approx(quanta[0], abs=1e-13)
 
 
 def test_pickling():
     q = lt.QuantumSystem(NUMBER, lt.ThermalJumps([(A, 0.1)]), lt.HeatBaths(np.inf, 0.5))
-    copied = pickle.loads(pickle.dumps(q))
-    ends = [lt.integrate(s, basis(LEVELS, 9), (0.0, 1.0), 0.25, lt.MetriplecticTaylor(8)).x[-1] for s in (q, copied)]
+    copy = pickle.loads(pickle.dumps(q))
+    ends = [lt.integrate(s, basis(LEVELS, 9), (0.0, 1.0), 0.25, lt.MetriplecticTaylor(8)).x[-1] for s in (q, copy)]
     assert np.array_equal(*ends)
 
 
@@ -144,12 +144,12 @@ def jaynes_cummings(levels, frequency, coupling):
 def test_vacuum_rabi_oscillations(end):
     """Case 1: photons and excitation are exchanged with ``2 g sqrt(n + 1)``; QuTiP asks for 5e-3 up to t = 1000."""
     g, n = 2.0 * np.pi * 0.01, 2
-    H, photons, excited = jaynes_cummings(4, 2.0 * np.pi, g)
+    H, photons, excitation = jaynes_cummings(4, 2.0 * np.pi, g)
     q = lt.QuantumSystem(H, parts=[4, 2])
     run = lt.integrate(q, np.kron(basis(4, n), basis(2, 1)), (0.0, end), 0.1, lt.MetriplecticTaylor(20), save_every=5)
     phase = np.cos(2.0 * g * np.sqrt(n + 1) * run.t)
     assert np.abs(q.expectation(run.x, photons) - n - 0.5 * (1.0 - phase)).max() <= 1e-8
-    assert np.abs(q.expectation(run.x, excited) - 0.5 * (1.0 + phase)).max() <= 1e-8
+    assert np.abs(q.expectation(run.x, excitation) - 0.5 * (1.0 + phase)).max() <= 1e-8
     assert run.audit().passed
 
 
@@ -160,12 +160,12 @@ def test_decay_without_interaction():
     cavity = lt.QuantumSystem(w * destroy(4).T @ destroy(4), decay(destroy(4), kappa), cold(w))
     atom = lt.QuantumSystem(w * destroy(2).T @ destroy(2), decay(destroy(2), gamma), cold(w))
     q = cavity * atom
-    _, photons, excited = jaynes_cummings(4, w, 0.0)
+    _, photons, excitation = jaynes_cummings(4, w, 0.0)
     run = lt.integrate(
         q, np.kron(basis(4, n), basis(2, 1)), (0.0, 50.0), 0.25, lt.MetriplecticTaylor(16), save_every=10
     )
     assert np.abs(q.expectation(run.x, photons) - n * np.exp(-kappa * run.t)).max() <= 1e-10
-    assert np.abs(q.expectation(run.x, excited) - np.exp(-gamma * run.t)).max() <= 1e-10
+    assert np.abs(q.expectation(run.x, excitation) - np.exp(-gamma * run.t)).max() <= 1e-10
 
 
 # -- coefficients that are step functions: TestMESolveStepFuncCoeff ----------------------------------------------------
@@ -184,5 +184,5 @@ def test_step_functions_turn_a_qubit_by_half_a_turn(name):
     ket = np.array([[0.6], [0.8j]])
     q = lt.QuantumSystem([(SX, f)])
     run = lt.integrate(q, ket, (0.0, end), np.pi / 40, lt.MetriplecticGauss(3))
-    wanted = SX @ ket
-    assert abs((wanted.conj().T @ np.asarray(q.density(run.x[-1])) @ wanted)[0, 0] - 1.0) <= 1e-6
+    final_ket = SX @ ket
+    assert abs((final_ket.conj().T @ np.asarray(q.density(run.x[-1])) @ final_ket)[0, 0] - 1.0) <= 1e-6

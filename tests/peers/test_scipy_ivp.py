@@ -36,12 +36,12 @@ def linear_energy(x):
 
 
 LINEAR = canonical(linear_energy)
-"""q' = -q - 5 p, p' = q + p: SciPy's fun_linear, which is Hamiltonian."""
+"""Hamiltonian system of SciPy's fun_linear: q' = -q - 5 p, p' = q + p."""
 
 OSCILLATOR = canonical(lambda x: 0.5 * (x @ x))
 
 RATIONAL = canonical(lambda x, t: 0.5 * x[1] ** 2 + 20.0 * x[0] / (t + 10.0) ** 3)
-"""A driven particle along q = t / (t + 10), the first component of SciPy's fun_rational; the second is t p."""
+"""Driven particle along q = t / (t + 10), the first component of SciPy's fun_rational; the second is t p."""
 
 AT_5 = [1.0 / 3.0, 10.0 / 15.0**2]
 
@@ -66,7 +66,7 @@ def with_attributes(function, **attributes):
 
 
 def crossing_1(t, y):
-    """SciPy's event_rational_1, y the components of its fun_rational."""
+    """Evaluate SciPy's event_rational_1, y the components of its fun_rational."""
     return y[0] - (t * y[1]) ** 0.7
 
 
@@ -119,8 +119,8 @@ def test_events(method, direction, numbers):
 
 def test_events_with_a_terminal_one():
     """test_events, third part: the second event would come after the end."""
-    last = with_attributes(lambda t, y: t - 7.4, terminal=True)
-    res = solve_ivp(RATIONAL, [5, 8], AT_5, events=(crossing_1, crossing_2, last), dense_output=True)
+    end_event = with_attributes(lambda t, y: t - 7.4, terminal=True)
+    res = solve_ivp(RATIONAL, [5, 8], AT_5, events=(crossing_1, crossing_2, end_event), dense_output=True)
     assert res.status == 1
     assert [len(times) for times in res.t_events] == [1, 0, 1]
     assert 5.3 < res.t_events[0][0] < 5.7
@@ -182,9 +182,9 @@ def test_first_step():
     assert res.t[1] - 5 == pytest.approx(0.1)
     assert res.t[-1] == 9
     assert np.all(compute_error(res.y, sol_rational(res.t)) < 5)
-    for wrong in (-1, 0, 5):
+    for first_step in (-1, 0, 5):
         with pytest.raises(ValueError, match="first_step must be positive and at most the length of t_span, 4, got"):
-            solve_ivp(RATIONAL, [5, 9], AT_5, first_step=wrong)
+            solve_ivp(RATIONAL, [5, 9], AT_5, first_step=first_step)
 
 
 @pytest.mark.parametrize(
@@ -207,8 +207,8 @@ def test_t_eval_outside():
 
 
 def test_t_eval_early_event():
-    early = with_attributes(lambda t, y: t - 7, terminal=True)
-    res = solve_ivp(RATIONAL, [5, 9], AT_5, rtol=RTOL, atol=ATOL, t_eval=np.linspace(7.5, 9, 16), events=early)
+    end_event = with_attributes(lambda t, y: t - 7, terminal=True)
+    res = solve_ivp(RATIONAL, [5, 9], AT_5, rtol=RTOL, atol=ATOL, t_eval=np.linspace(7.5, 9, 16), events=end_event)
     assert res.success
     assert res.status == 1
     assert res.message == "A termination event occurred."
@@ -232,9 +232,9 @@ def test_no_integration():
     assert np.array_equal(theirs.t, res.t)
     assert np.array_equal(theirs.y, res.y)
     assert solve_ivp(OSCILLATOR, [4, 4], [2, 3], t_eval=[4]).t.tolist() == [4.0]
-    ended = solve_ivp(OSCILLATOR, [4, 4], [2, 3], events=with_attributes(lambda t, y: y[0] - 2, terminal=True))
-    assert ended.status == 1
-    assert ended.t_events[0].tolist() == [4.0]
+    stopped_run = solve_ivp(OSCILLATOR, [4, 4], [2, 3], events=with_attributes(lambda t, y: y[0] - 2, terminal=True))
+    assert stopped_run.status == 1
+    assert stopped_run.t_events[0].tolist() == [4.0]
 
 
 def oscillator_and_logistic(omega, k):
@@ -298,9 +298,9 @@ def test_array_rtol():
     with pytest.warns(UserWarning, match="At least one element"):
         assert error(rtol=[1e-1, 1e-16]) < loose
     assert error(rtol=[1e-1, 1e-6], atol=[1e-9, 1.0]) < loose
-    for wrong in ({"atol": [1e-6] * 3}, {"rtol": [1e-3]}):
+    for bad_tolerances in ({"atol": [1e-6] * 3}, {"rtol": [1e-3]}):
         with pytest.raises(ValueError, match=r"must be a number or an array of shape \(2,\), as y0"):
-            error(**wrong)
+            error(**bad_tolerances)
 
 
 @pytest.mark.parametrize("method", METHODS, ids=str)
@@ -319,11 +319,11 @@ def test_initial_state_finiteness(fill):
 
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_tbound_respected_small_interval(method):
-    small = 1e-4
-    system = canonical(lambda x, t: jnp.where(t > small, jnp.nan, 2.0) * x[0] * x[1])
-    res = solve_ivp(system, (0.0, small), [1.0, 1.0], method)
+    t_end = 1e-4
+    system = canonical(lambda x, t: jnp.where(t > t_end, jnp.nan, 2.0) * x[0] * x[1])
+    res = solve_ivp(system, (0.0, t_end), [1.0, 1.0], method)
     assert res.success
-    assert res.y[:, -1] == pytest.approx(np.exp([2 * small, -2 * small]), rel=1e-12)
+    assert res.y[:, -1] == pytest.approx(np.exp([2 * t_end, -2 * t_end]), rel=1e-12)
 
 
 @pytest.mark.parametrize("method", METHODS[:2], ids=str)
@@ -367,10 +367,10 @@ def test_event_dense_output():
 
 def test_initial_max_step():
     """test_inital_maxstep: the first step that is chosen is no longer than the longest allowed."""
-    free = solve_ivp(RATIONAL, [5, 9], AT_5, rtol=RTOL, atol=ATOL)
-    largest = 0.5 * (free.t[1] - free.t[0])
-    assert solve_ivp(RATIONAL, [5, 9], AT_5, rtol=RTOL, atol=ATOL, max_step=largest).t[1] - 5.0 == pytest.approx(
-        largest
+    unlimited_run = solve_ivp(RATIONAL, [5, 9], AT_5, rtol=RTOL, atol=ATOL)
+    max_step = 0.5 * (unlimited_run.t[1] - unlimited_run.t[0])
+    assert solve_ivp(RATIONAL, [5, 9], AT_5, rtol=RTOL, atol=ATOL, max_step=max_step).t[1] - 5.0 == pytest.approx(
+        max_step
     )
 
 
@@ -382,5 +382,7 @@ def test_an_endless_span_needs_an_end():
         lt.integrate(OSCILLATOR, [1.0, 0.0], (0.0, np.inf), 0.1)
     run = lt.integrate(OSCILLATOR, [1.0, 0.0], (0.0, np.inf), lt.Adaptive(1e-8), until=lambda x: x[0])
     assert run.event_time == pytest.approx(0.5 * np.pi, rel=1e-6)
-    at_rest = solve_ivp(OSCILLATOR, (0, np.inf), [0, 0], events=with_attributes(lambda t, y: t - 1e3, terminal=True))
-    assert at_rest.t[-1] == pytest.approx(1e3)
+    resting_run = solve_ivp(
+        OSCILLATOR, (0, np.inf), [0, 0], events=with_attributes(lambda t, y: t - 1e3, terminal=True)
+    )
+    assert resting_run.t[-1] == pytest.approx(1e3)

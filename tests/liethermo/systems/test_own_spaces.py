@@ -8,7 +8,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from tests.manifolds.spaces.test_own_spaces import MINE, Ellipsoid
+from tests.manifolds.spaces.test_own_spaces import HEISENBERG, Ellipsoid
 
 
 def on_the_group():
@@ -20,14 +20,14 @@ def on_the_group():
         energy=lambda g: (g[0, 1] ** 2 + g[0, 2] ** 2) / 2 + g[0, 1] ** 4 / 4 + jnp.exp(g[1, 2]),
         entropy=lambda g: g[1, 2],
         dissipation=lt.ProjectedMetric(rate=0.3),
-        space=MINE,
+        space=HEISENBERG,
     )
 
 
 def test_a_system_on_a_group_of_ones_own():
     """The group stands for its space, and the axioms hold at random elements of it."""
     system = on_the_group()
-    assert system.space == mf.GroupSpace(MINE)
+    assert system.space == mf.GroupSpace(HEISENBERG)
     assert system.check().passed
 
 

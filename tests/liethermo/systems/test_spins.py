@@ -407,7 +407,7 @@ def test_refusals(attempt, says):
 
 
 def test_ratios_and_sites_of_the_structure_are_checked():
-    with pytest.raises(mf.ParameterError, match=r"has shape \(3,\), not \(2,\)"):
+    with pytest.raises(mf.ParameterError, match=r"have shape \(3,\), got \(2,\)"):
         mf.Spins(3, ratio=np.ones(2))
     assert mf.Spins((2, 3), 1).tensor(RANDOM.standard_normal(19)).shape == (19, 19)
     assert float(mf.Spins(2, 1, [1.0, 3.0]).jacobi_residual(RANDOM.standard_normal(7))) < 1e-14

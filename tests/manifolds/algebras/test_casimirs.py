@@ -1,4 +1,4 @@
-"""Casimirs: their number, their degrees, their exact form; and the polynomials they are made of."""
+"""Casimirs: their number, degrees and exact form; and the arithmetic of polynomials."""
 
 import dataclasses
 import warnings
@@ -18,18 +18,19 @@ from manifolds.algebras.polynomial import Polynomial
 
 REGISTERED = list(mf.registered())
 INVARIANCE_TOLERANCE = 1e-15
-"""Of |ad*_{grad F} mu| / (|grad F| |mu|); the largest measured is 2e-16 (sl(3) and su(4), degree 3)."""
+"""Largest |ad*_{grad F} mu| / (|grad F| |mu|) of a Casimir; the largest measured is 2e-16 (sl(3) and su(4), degree
+3)."""
 
 
 def casimirs(g, degree):
-    """``g.casimirs(degree)``, with or without a warning."""
+    """Return ``g.casimirs(degree)``, ignoring a warning that there are no polynomial ones."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", mf.NoPolynomialCasimirWarning)
         return g.casimirs(degree)
 
 
 def invariance_residual(g, F, seed=0):
-    """Largest |ad*_{grad F} mu| / (|grad F| |mu|) at random points."""
+    """Return the largest |ad*_{grad F} mu| / (|grad F| |mu|) at random points."""
     mu = jnp.asarray(np.random.default_rng(seed).standard_normal((20, g.dim)))
     gradient = jax.vmap(jax.grad(F))(mu)
     size = jnp.linalg.norm(gradient, axis=1) * jnp.linalg.norm(mu, axis=1)
@@ -111,18 +112,18 @@ def test_known_degrees_of_generators_which_are_independent(g, degrees):
 @pytest.mark.parametrize("g", REGISTERED, ids=lambda g: g.name)
 @pytest.mark.parametrize("degree", [1, 2, 3])
 def test_casimirs_are_invariant_and_perturbed_ones_are_not(g, degree):
-    moving = int(np.abs(g.structure_constants).sum(axis=(1, 2)).argmax())
-    power = np.eye(g.dim, dtype=int)[[moving]] * degree
+    noncentral_index = int(np.abs(g.structure_constants).sum(axis=(1, 2)).argmax())
+    power = np.eye(g.dim, dtype=int)[[noncentral_index]] * degree
     for F in casimirs(g, degree):
         assert F.degree == degree
         assert invariance_residual(g, F) < INVARIANCE_TOLERANCE
         if not g.is_abelian():
-            perturbed = F + Polynomial(power, [1e-6])
-            assert invariance_residual(g, perturbed) > 1e3 * INVARIANCE_TOLERANCE
+            perturbed_casimir = F + Polynomial(power, [1e-6])
+            assert invariance_residual(g, perturbed_casimir) > 1e3 * INVARIANCE_TOLERANCE
 
 
 @pytest.mark.parametrize(
-    ("g", "degree", "expected"),
+    ("g", "degree", "expected_texts"),
     [
         (mf.so(3), 2, ["mu1**2 + mu2**2 + mu3**2"]),
         (mf.su(2), 2, ["mu1**2 + mu2**2 + mu3**2"]),
@@ -148,8 +149,8 @@ def test_casimirs_are_invariant_and_perturbed_ones_are_not(g, degree):
     ],
     ids=lambda value: getattr(value, "name", None),
 )
-def test_exact_form(g, degree, expected):
-    assert [str(F) for F in casimirs(g, degree)] == expected
+def test_exact_form(g, degree, expected_texts):
+    assert [str(F) for F in casimirs(g, degree)] == expected_texts
     assert all(isinstance(c, Fraction) for F in casimirs(g, degree) for c in F.coefficients)
 
 
@@ -200,18 +201,18 @@ def test_casimirs_do_not_depend_on_the_basis(g, steps):
     random = np.random.default_rng(0)
     points = [[Fraction(int(x), 7) for x in random.integers(-20, 20, g.dim)] for _ in range(6)]
     for degree in (1, 2):
-        old, new = casimirs(g, degree), casimirs(h, degree)
-        assert len(old) == len(new)
-        lower = [F for F in casimirs(g, 1) if degree == 2]
-        span = old + [F * G for F in lower for G in lower]
+        original_casimirs, new_casimirs = casimirs(g, degree), casimirs(h, degree)
+        assert len(original_casimirs) == len(new_casimirs)
+        linear_casimirs = [F for F in casimirs(g, 1) if degree == 2]
+        span = original_casimirs + [F * G for F in linear_casimirs for G in linear_casimirs]
         values = np.array([[exact_value(F, mu) for F in span] for mu in points]).reshape(6, -1)
-        for F in new:
+        for F in new_casimirs:
             assert all(c.denominator == 1 for c in F.coefficients)
             assert F.coefficients[0] > 0
-            moved = np.array([exact_value(F, change @ mu) for mu in points])  # mu'_i = <mu, e'_i>
-            both, _ = linear.row_echelon(np.column_stack([values, moved]))
-            only, _ = linear.row_echelon(values)
-            assert len(both) == len(only)  # in the span of the old ones, exactly
+            transformed_values = np.array([exact_value(F, change @ mu) for mu in points])  # mu'_i = <mu, e'_i>
+            extended_echelon, _ = linear.row_echelon(np.column_stack([values, transformed_values]))
+            echelon, _ = linear.row_echelon(values)
+            assert len(extended_echelon) == len(echelon)  # in the span of the old ones, exactly
 
 
 def test_constants_that_are_not_rational():
@@ -221,16 +222,16 @@ def test_constants_that_are_not_rational():
     h = mf.LieAlgebra.from_structure_constants((constants - constants.swapaxes(0, 1)) / 2, name="rotated so(4)")
     assert module._rational_form(h)[0].rational_constants is None
     assert h.casimir_count() == 2
-    first, second = h.casimirs(2)
-    assert str(first).startswith("mu1**2 + ")
-    assert isinstance(first.coefficients[0], float)
-    assert max(invariance_residual(h, first), invariance_residual(h, second)) < 1e-12
+    F, G = h.casimirs(2)
+    assert str(F).startswith("mu1**2 + ")
+    assert isinstance(F.coefficients[0], float)
+    assert max(invariance_residual(h, F), invariance_residual(h, G)) < 1e-12
     assert h.casimirs(4) == []
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
 def test_casimirs_in_a_basis_of_any_scale(scale):
-    """Units of every size, no constant a fraction: the Casimirs of se(3), in the units given."""
+    """Constants are no fractions and of every size: the Casimirs are those of se(3) in the given units."""
     g, random = mf.se(3), np.random.default_rng(3)
     units = scale * 10.0 ** random.uniform(-3, 3, g.dim)
     constants = np.einsum("a,b,abc,c->abc", units, units, g.structure_constants, 1 / units)
@@ -239,8 +240,8 @@ def test_casimirs_in_a_basis_of_any_scale(scale):
     assert h.casimir_count() == 2
     mu = random.standard_normal(g.dim)
     for F, G in zip(g.casimirs(2), h.casimirs(2), strict=True):
-        first = np.prod(units ** G.exponents[0])
-        assert G(units * mu) == pytest.approx(first * float(F(mu)), rel=1e-12)
+        leading_factor = np.prod(units ** G.exponents[0])
+        assert G(units * mu) == pytest.approx(leading_factor * float(F(mu)), rel=1e-12)
 
 
 @pytest.mark.parametrize("g", [mf.se(3), mf.so(4), mf.sl(3), mf.bianchi("VI", h=-0.5)], ids=lambda g: g.name)
@@ -254,12 +255,15 @@ def test_square_roots_are_scaled_away(g):
     for degree in (1, 2, 3):
         for F, G in zip(casimirs(g, degree), casimirs(h, degree), strict=True):
             weights = np.prod(scale**G.exponents, axis=1)
-            expected = weights[0] / weights * np.array([float(c / F.coefficients[0]) for c in F.coefficients])
-            np.testing.assert_allclose(G.coefficients, expected, rtol=5e-15)
+            expected_coefficients = (
+                weights[0] / weights * np.array([float(c / F.coefficients[0]) for c in F.coefficients])
+            )
+            np.testing.assert_allclose(G.coefficients, expected_coefficients, rtol=5e-15)
 
 
 def test_a_rank_without_a_clear_gap_is_an_error():
-    """Two elements that act on a plane almost alike. No scaling tells them apart, as it does two so(3) below."""
+    """Two elements act on a plane almost alike, and no scaling separates them. The two so(3) below are separated by
+    one."""
     constants = np.zeros((4, 4, 4))
     constants[0, 2, 2] = constants[0, 3, 3] = constants[1, 2, 2] = 1.0
     constants[1, 3, 3] = 1.0 + 1e-9 * np.pi
@@ -267,8 +271,8 @@ def test_a_rank_without_a_clear_gap_is_an_error():
     with pytest.raises(mf.LieAlgebraError, match=r"not clear.*rescale the basis") as caught:
         g.casimir_count()
     assert 1e-10 < caught.value.residual < 1e-7
-    small = mf.LieAlgebra.from_structure_constants(1e-9 * np.pi * mf.so(3).structure_constants, name="small")
-    assert mf.direct_sum(mf.so(3), small).casimir_count() == 2
+    small_so3 = mf.LieAlgebra.from_structure_constants(1e-9 * np.pi * mf.so(3).structure_constants, name="small")
+    assert mf.direct_sum(mf.so(3), small_so3).casimir_count() == 2
 
 
 # -- when there is none -------------------------------------------------------------------------------------------
@@ -300,7 +304,7 @@ def test_degrees_that_are_refused(degree):
 def test_too_many_monomials_are_refused_with_their_number(monkeypatch):
     with pytest.raises(mf.LieAlgebraError, match=r"se\(7\) has 1107568 monomials of degree 6, more than the 20000"):
         mf.se(7).casimirs(6)
-    monkeypatch.setattr(module, "LARGEST_BLOCK", 5)
+    monkeypatch.setattr(module, "MAX_BLOCK_SIZE", 5)
     with pytest.raises(mf.LieAlgebraError, match="couples 10 monomials of degree 2, more than the 5"):
         mf.se(5).casimirs(2)
 
@@ -316,12 +320,12 @@ def test_rational_null_space(data):
     entry = st.one_of(st.integers(-3, 3), st.integers(-(2**40), 2**40), st.sampled_from([p, -2 * p]))
     matrix = np.array([[data.draw(entry) for _ in range(columns)] for _ in range(rows)], dtype=np.int64)
     matrix = matrix.reshape(rows, columns)
-    found = linear.rational_null_space(matrix)
+    basis = linear.rational_null_space(matrix)
     echelon, _ = linear.row_echelon(
         np.array([[Fraction(int(x)) for x in row] for row in matrix]).reshape(rows, columns)
     )
-    assert len(found) == columns - len(echelon)
-    for vector in found:
+    assert len(basis) == columns - len(echelon)
+    for vector in basis:
         assert all(sum(int(a) * v for a, v in zip(row, vector, strict=True)) == 0 for row in matrix)
         assert np.gcd.reduce(np.array(vector, dtype=object)) == 1
         assert next(v for v in vector if v) > 0
@@ -380,14 +384,14 @@ def test_arithmetic_agrees_with_values(F, G, c):
     mu = np.random.default_rng(0).uniform(-1.5, 1.5, (2, 5, 3))
     a, b = np.asarray(F(mu)), np.asarray(G(mu))
     assert a.shape == (2, 5)
-    for combined, expected in [
+    for polynomial, expected_values in [
         (F + G, a + b),
         (F - G, a - b),
         (F * G, a * b),
         (c * F, float(c) * a),
         (F - c, a - c),
     ]:
-        np.testing.assert_allclose(combined(mu), np.asarray(expected, dtype=float), rtol=1e-11, atol=1e-9)
+        np.testing.assert_allclose(polynomial(mu), np.asarray(expected_values, dtype=float), rtol=1e-11, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -395,10 +399,10 @@ def test_arithmetic_agrees_with_values(F, G, c):
 @given(F=polynomials, mask=st.lists(st.sampled_from([0.0, 1.0]), min_size=3, max_size=3))
 def test_derivatives_at_vanishing_components(F, mask):
     mu = jnp.array([1.3, -0.7, 0.4]) * jnp.array(mask)
-    expected = jnp.array([dF(mu) for dF in F.gradient()])
-    np.testing.assert_allclose(jax.grad(F)(mu), expected, atol=1e-10)
-    second = jnp.array([[d(mu) for d in dF.gradient()] for dF in F.gradient()])
-    np.testing.assert_allclose(jax.hessian(F)(mu), second, atol=1e-10)
+    expected_gradient = jnp.array([dF(mu) for dF in F.gradient()])
+    np.testing.assert_allclose(jax.grad(F)(mu), expected_gradient, atol=1e-10)
+    expected_hessian = jnp.array([[d(mu) for d in dF.gradient()] for dF in F.gradient()])
+    np.testing.assert_allclose(jax.hessian(F)(mu), expected_hessian, atol=1e-10)
 
 
 def test_polynomials_that_are_refused():

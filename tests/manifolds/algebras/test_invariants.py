@@ -1,4 +1,4 @@
-"""Casimirs by traces of powers: invariance, independence, number and degrees; and against those of linear algebra."""
+"""Casimirs by traces of powers: invariance, independence, number and degrees, also compared to linear algebra."""
 
 import dataclasses
 
@@ -18,11 +18,11 @@ def unitary(n):
     return mf.LieAlgebra.from_matrices(np.concatenate([mf.su(n).basis, [1j * np.eye(n)]]), name=f"u({n})")
 
 
-def without_matrices(g):
+def remove_matrices(g):
     return mf.LieAlgebra.from_structure_constants(g.structure_constants, name=f"{g.name} by constants")
 
 
-def in_random_basis(g):
+def change_to_random_basis(g):
     change = np.linalg.qr(np.random.default_rng(3).standard_normal((g.dim, g.dim)))[0]
     return mf.LieAlgebra.from_matrices(np.einsum("ba,aij->bij", change, g.basis), name=f"{g.name} moved")
 
@@ -42,22 +42,23 @@ DEGREES = {
     "gl(4)": (lambda: mf.gl(4), (1, 2, 3, 4)),
     "u(3)": (lambda: unitary(3), (1, 2, 3)),
     "su(3) + so(5)": (lambda: mf.direct_sum(mf.su(3), mf.so(5)), (2, 2, 3, 4)),
-    "g2 moved": (lambda: in_random_basis(mf.g2()), (2, 6)),
-    "g2 by constants": (lambda: without_matrices(mf.g2()), (2, 6)),
-    "su(5) by constants": (lambda: without_matrices(mf.su(5)), (2, 3, 4, 5)),
-    "sl(5) by constants": (lambda: without_matrices(mf.sl(5)), (2, 3, 4, 5)),
+    "g2 moved": (lambda: change_to_random_basis(mf.g2()), (2, 6)),
+    "g2 by constants": (lambda: remove_matrices(mf.g2()), (2, 6)),
+    "su(5) by constants": (lambda: remove_matrices(mf.su(5)), (2, 3, 4, 5)),
+    "sl(5) by constants": (lambda: remove_matrices(mf.sl(5)), (2, 3, 4, 5)),
 }
-"""The degrees of the fundamental invariants [Bourbaki, Lie, V, VI]; u(n) and gl(n) have one of degree 1 besides."""
+"""Constructors and degrees of the fundamental invariants [Bourbaki, Lie, V, VI]; u(n) and gl(n) have degree 1 too."""
 
 
-LARGE = ("so(10)", "su(5) by constants", "sl(5) by constants")
+LARGE_ALGEBRAS = ("so(10)", "su(5) by constants", "sl(5) by constants")
+"""Names of the algebras whose tests are slow."""
 
 
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     "name",
     [
-        slow(pytest.param(name, id=f"{name}-")) if name in LARGE else pytest.param(name, id=f"{name}-")
+        slow(pytest.param(name, id=f"{name}-")) if name in LARGE_ALGEBRAS else pytest.param(name, id=f"{name}-")
         for name in DEGREES
     ],
 )
@@ -65,11 +66,11 @@ def test_generators(name):
     make, degrees = DEGREES[name]
     g = make()
     assert g.name == name
-    found = fundamental_invariants(g)
-    assert tuple(F.degree for F in found) == degrees
-    assert len({str(F) for F in found}) == len(found) == g.casimir_count()
+    generators = fundamental_invariants(g)
+    assert tuple(F.degree for F in generators) == degrees
+    assert len({str(F) for F in generators}) == len(generators) == g.casimir_count()
     mu = np.random.default_rng(7).standard_normal(g.dim)
-    gradients = np.array([np.asarray(jax.grad(F)(jnp.asarray(mu))) for F in found])
+    gradients = np.array([np.asarray(jax.grad(F)(jnp.asarray(mu))) for F in generators])
     gradients /= np.linalg.norm(gradients, axis=1)[:, None]
     motion = np.einsum("abc,na,c->nb", g.structure_constants, gradients, mu)
     assert np.linalg.norm(motion, axis=1).max() < 1e-14 * np.linalg.norm(mu)
@@ -95,29 +96,29 @@ def test_what_has_too_many_monomials_for_linear_algebra():
 
 
 def test_they_are_those_of_linear_algebra(monkeypatch):
-    """Modulo products of lower degree, and a factor, which the values at a few points have to show."""
+    """The quartics agree modulo products of lower degree and a factor, as the values at a few points show."""
     rng, g = np.random.default_rng(1), mf.so(5)
     mu = rng.standard_normal((6, g.dim))
     [quadratic], [quartic] = g.casimirs(2), g.casimirs(4)
-    by_traces = fundamental_invariants(g)[1]
-    columns = np.column_stack([by_traces(mu), quartic(mu), quadratic(mu) ** 2])
+    trace_casimir = fundamental_invariants(g)[1]
+    columns = np.column_stack([trace_casimir(mu), quartic(mu), quadratic(mu) ** 2])
     assert np.linalg.svd(columns / np.linalg.norm(columns, axis=0), compute_uv=False)[-1] < 1e-14
-    monkeypatch.setattr(module, "LARGEST_MONOMIAL_COUNT", 100)
+    monkeypatch.setattr(module, "MAX_MONOMIAL_COUNT", 100)
     module.new_casimirs.cache_clear()
     try:
-        assert g.casimirs(4) == [by_traces]
+        assert g.casimirs(4) == [trace_casimir]
     finally:
         module.new_casimirs.cache_clear()
 
 
 def test_written_out():
-    """The polynomial of the powers, against the one of linear algebra and against its values."""
+    """The expansion of a trace has the coefficients found by linear algebra, and the values of the trace."""
     g = mf.su(3)
     [cubic] = g.casimirs(3)
-    expanded = fundamental_invariants(g)[1].expanded()
-    factor = expanded.coefficients[0] / cubic.coefficients[0]
-    assert np.array_equal(expanded.exponents, cubic.exponents)
-    np.testing.assert_allclose(expanded.coefficients, factor * np.array(cubic.coefficients), rtol=1e-13)
+    polynomial = fundamental_invariants(g)[1].expanded()
+    factor = polynomial.coefficients[0] / cubic.coefficients[0]
+    assert np.array_equal(polynomial.exponents, cubic.exponents)
+    np.testing.assert_allclose(polynomial.coefficients, factor * np.array(cubic.coefficients), rtol=1e-13)
     [sextic] = mf.g2().casimirs(6)
     mu = np.random.default_rng(2).standard_normal((3, 14))
     np.testing.assert_allclose(sextic.expanded()(mu), sextic(mu), rtol=1e-12)
@@ -127,10 +128,10 @@ def test_written_out():
 
 def test_a_trace_is_like_a_polynomial():
     [sextic] = mf.g2().casimirs(6)
-    same = mf.TracePolynomial(sextic.matrices, 6, sextic.weight)
-    assert same == sextic
-    assert hash(same) == hash(sextic)
-    assert same != mf.TracePolynomial(sextic.matrices, 5)
+    equal_trace = mf.TracePolynomial(sextic.matrices, 6, sextic.weight)
+    assert equal_trace == sextic
+    assert hash(equal_trace) == hash(sextic)
+    assert equal_trace != mf.TracePolynomial(sextic.matrices, 5)
     assert jax.tree.leaves(sextic) == []
     mu = np.random.default_rng(4).standard_normal((2, 3, 14))
     values = jax.jit(lambda F, mu: F(mu))(sextic, mu)
@@ -157,7 +158,7 @@ def test_none_without_a_nondegenerate_trace_form(g):
 
 
 def test_g2():
-    """It keeps a three-form of R^7, and a cross product: |x × y|^2 = |x|^2 |y|^2 - (x·y)^2."""
+    """The matrices preserve a three-form of R^7, and a cross product: |x × y|^2 = |x|^2 |y|^2 - (x·y)^2."""
     g = mf.g2()
     assert g.dim == 14
     assert g.rational_constants.denominator == 1
@@ -171,5 +172,5 @@ def test_g2():
     assert product @ product == pytest.approx((x @ x) * (y @ y) - (x @ y) ** 2, rel=1e-14)
     for X in g.basis:
         assert np.array_equal(X, -X.T)
-        turned = np.einsum("ijk,i->jk", form, X @ x) + np.einsum("ijk,i,jl->lk", form, x, X)
-        assert np.abs(turned + np.einsum("ijk,i,kl->jl", form, x, X)).max() < 1e-14
+        derivative = np.einsum("ijk,i->jk", form, X @ x) + np.einsum("ijk,i,jl->lk", form, x, X)
+        assert np.abs(derivative + np.einsum("ijk,i,kl->jl", form, x, X)).max() < 1e-14

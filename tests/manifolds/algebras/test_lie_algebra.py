@@ -1,4 +1,4 @@
-"""Lie algebras: every registered one through the same properties, and controls that must fail."""
+"""Lie algebras: every registered one passes the property tests, and controls fail them."""
 
 from fractions import Fraction
 
@@ -16,11 +16,11 @@ seeds = st.integers(0, 10**6)
 each_algebra = pytest.mark.parametrize("g", ALGEBRAS, ids=algebra_id)
 
 
-def vectors(g, seed, count, shape=()):
+def random_elements(g, seed, count, shape=()):
     return np.random.default_rng(seed).standard_normal((count, *shape, g.dim))
 
 
-def close(a, b, scale=1.0):
+def is_close(a, b, scale=1.0):
     return np.abs(np.asarray(a) - np.asarray(b)).max(initial=0.0) <= tolerance("axiom") * scale
 
 
@@ -31,29 +31,29 @@ def close(a, b, scale=1.0):
 @each_algebra
 @given(seed=seeds)
 def test_bracket_is_antisymmetric_and_satisfies_jacobi(g, seed):
-    x, y, z = vectors(g, seed, 3)
+    x, y, z = random_elements(g, seed, 3)
     b = g.bracket
-    assert close(b(x, y), -b(y, x))
-    assert close(b(b(x, y), z) + b(b(y, z), x) + b(b(z, x), y), 0.0, 100.0)
+    assert is_close(b(x, y), -b(y, x))
+    assert is_close(b(b(x, y), z) + b(b(y, z), x) + b(b(z, x), y), 0.0, 100.0)
 
 
 @pytest.mark.sampled(7)
 @each_algebra
 @given(seed=seeds)
 def test_ad_star_is_dual_to_ad(g, seed):
-    x, y, mu = vectors(g, seed, 3)
-    assert close(g.ad(x) @ y, g.bracket(x, y), 10.0)
-    assert close(jnp.dot(g.ad_star(x, mu), y), jnp.dot(mu, g.bracket(x, y)), 100.0)
-    assert close(g.ad(g.bracket(x, y)), g.ad(x) @ g.ad(y) - g.ad(y) @ g.ad(x), 100.0)
+    x, y, mu = random_elements(g, seed, 3)
+    assert is_close(g.ad(x) @ y, g.bracket(x, y), 10.0)
+    assert is_close(jnp.dot(g.ad_star(x, mu), y), jnp.dot(mu, g.bracket(x, y)), 100.0)
+    assert is_close(g.ad(g.bracket(x, y)), g.ad(x) @ g.ad(y) - g.ad(y) @ g.ad(x), 100.0)
 
 
 @pytest.mark.sampled(6)
 @each_algebra
 def test_flipped_ad_star_breaks_duality(g):
     """Control: with the other sign convention the duality test must fail, unless nothing brackets at all."""
-    x, y, mu = vectors(g, 1, 3)
-    wrong = jnp.dot(-g.ad_star(x, mu), y) - jnp.dot(mu, g.bracket(x, y))
-    assert g.is_abelian() or abs(float(wrong)) > 1e-6
+    x, y, mu = random_elements(g, 1, 3)
+    duality_residual = jnp.dot(-g.ad_star(x, mu), y) - jnp.dot(mu, g.bracket(x, y))
+    assert g.is_abelian() or abs(float(duality_residual)) > 1e-6
 
 
 @pytest.mark.sampled(6)
@@ -62,30 +62,30 @@ def test_flipped_ad_star_breaks_duality(g):
 def test_killing_form_is_invariant(g, seed):
     """kappa(x, [y, z]) is totally skew (BFM Remark 3.3)."""
     kappa = g.killing_form()
-    x, y, z = vectors(g, seed, 3)
+    x, y, z = random_elements(g, seed, 3)
 
     def form(a, b, c):
         return float(a @ kappa @ np.asarray(g.bracket(b, c)))
 
     scale = 100.0 * max(1.0, np.abs(kappa).max())
-    assert close(form(x, y, z), form(y, z, x), scale)
-    assert close(form(x, y, z), -form(y, x, z), scale)
-    assert close(np.einsum("abc,a,b,c", mf.trilinear_form(g), x, y, z), form(x, y, z), scale)
+    assert is_close(form(x, y, z), form(y, z, x), scale)
+    assert is_close(form(x, y, z), -form(y, x, z), scale)
+    assert is_close(np.einsum("abc,a,b,c", mf.trilinear_form(g), x, y, z), form(x, y, z), scale)
     assert np.allclose(kappa, [[np.trace(np.asarray(g.ad(a) @ g.ad(b))) for b in np.eye(g.dim)] for a in np.eye(g.dim)])
 
 
 @pytest.mark.sampled(5)
 @each_algebra
 def test_batches_equal_loops(g):
-    x, y = vectors(g, 2, 2, (4, 3))
+    x, y = random_elements(g, 2, 2, (4, 3))
     for operation in (g.bracket, g.ad_star):
-        batched = np.asarray(operation(x, y))
-        assert batched.shape == (4, 3, g.dim)
-        assert close(batched[2, 1], operation(x[2, 1], y[2, 1]), 10.0)
+        batch = np.asarray(operation(x, y))
+        assert batch.shape == (4, 3, g.dim)
+        assert is_close(batch[2, 1], operation(x[2, 1], y[2, 1]), 10.0)
     assert g.ad(x).shape == (4, 3, g.dim, g.dim)
-    assert close(g.bracket(x, y[0, 0])[1, 2], g.bracket(x[1, 2], y[0, 0]), 10.0)
-    mapped = jax.jit(jax.vmap(jax.vmap(g.bracket)))(x, y)
-    assert close(mapped, g.bracket(x, y), 10.0)
+    assert is_close(g.bracket(x, y[0, 0])[1, 2], g.bracket(x[1, 2], y[0, 0]), 10.0)
+    vmap_brackets = jax.jit(jax.vmap(jax.vmap(g.bracket)))(x, y)
+    assert is_close(vmap_brackets, g.bracket(x, y), 10.0)
 
 
 @pytest.mark.sampled(5)
@@ -94,10 +94,10 @@ def test_batches_equal_loops(g):
 def test_matrices_represent_the_bracket(g, seed):
     if g.basis is None:  # only where no faithful matrices are at hand
         pytest.fail(f"{g.name} has no matrices")
-    x, y = vectors(g, seed, 2)
+    x, y = random_elements(g, seed, 2)
     X, Y = g.hat(x), g.hat(y)
-    assert close(g.hat(g.bracket(x, y)), X @ Y - Y @ X, 100.0)
-    assert close(g.vee(X), x, 10.0)
+    assert is_close(g.hat(g.bracket(x, y)), X @ Y - Y @ X, 100.0)
+    assert is_close(g.vee(X), x, 10.0)
 
 
 # -- structure ----------------------------------------------------------------------------------------------------
@@ -147,16 +147,17 @@ STRUCTURE = {
     "so(3) + heisenberg(1)": (0, 0, 0, 0, 1),
     "sl(2) x R^2": (0, 0, 0, 0, 1),
 }
+"""Predicates of each algebra from the literature: semisimple, compact type, solvable, nilpotent, unimodular."""
 
 
 @each_algebra
 def test_structural_predicates(g):
-    found = (g.is_semisimple(), g.is_compact_type(), g.is_solvable(), g.is_nilpotent(), g.is_unimodular())
-    assert found == tuple(map(bool, STRUCTURE[g.name]))
+    predicates = (g.is_semisimple(), g.is_compact_type(), g.is_solvable(), g.is_nilpotent(), g.is_unimodular())
+    assert predicates == tuple(map(bool, STRUCTURE[g.name]))
 
 
 def structure(g):
-    """Everything about the structure that does not depend on a basis."""
+    """Return all properties of the structure that do not depend on a basis."""
     return {
         "abelian": g.is_abelian(),
         "semisimple": g.is_semisimple(),
@@ -172,47 +173,47 @@ def structure(g):
 
 
 def random_basis(dim, rng, condition=1e2):
-    """Columns: the elements of a random basis of this condition number."""
-    left, right = (np.linalg.qr(rng.standard_normal((dim, dim)))[0] for _ in range(2))
-    return left * np.geomspace(1.0, 1.0 / condition, dim) @ right
+    """Return a random basis with this condition number, as columns."""
+    left_rotation, right_rotation = (np.linalg.qr(rng.standard_normal((dim, dim)))[0] for _ in range(2))
+    return left_rotation * np.geomspace(1.0, 1.0 / condition, dim) @ right_rotation
 
 
-def in_basis(g, columns):
-    """The algebra from floating-point constants, in the basis of the columns."""
+def change_basis(g, columns):
+    """Return the algebra in the basis of the columns, from floating-point constants."""
     constants = np.einsum(
         "ai,bj,abc,kc->ijk", columns, columns, g.structure_constants, np.linalg.inv(columns), optimize=True
     )
     return mf.LieAlgebra.from_structure_constants((constants - constants.swapaxes(0, 1)) / 2, name=f"{g.name} moved")
 
 
-def _triangular(n):
+def upper_triangular_algebra(n):
     units = [np.eye(n)[:, [i]] * np.eye(n)[j] for i in range(n) for j in range(i + 1, n)]
     return mf.LieAlgebra.from_matrices(units, name=f"upper triangular {n}")
 
 
-@pytest.mark.parametrize("g", [*ALGEBRAS, _triangular(5)], ids=algebra_id)
+@pytest.mark.parametrize("g", [*ALGEBRAS, upper_triangular_algebra(5)], ids=algebra_id)
 def test_structure_does_not_depend_on_the_basis(g):
-    """Random bases, scaled as a whole and each element by itself."""
-    rng, expected = np.random.default_rng(20), structure(g)
+    """Random bases are scaled by one factor, and each element by its own."""
+    rng, expected_structure = np.random.default_rng(20), structure(g)
     for scale in (1e-6, 1.0, 1e6):
-        assert structure(in_basis(g, scale * random_basis(g.dim, rng))) == expected
+        assert structure(change_basis(g, scale * random_basis(g.dim, rng))) == expected_structure
     units = 10.0 ** rng.uniform(-3, 3, g.dim)
-    assert structure(in_basis(g, np.diag(units))) == expected
-    assert structure(in_basis(g, random_basis(g.dim, rng) * units)) == expected
+    assert structure(change_basis(g, np.diag(units))) == expected_structure
+    assert structure(change_basis(g, random_basis(g.dim, rng) * units)) == expected_structure
 
 
 def test_a_nilpotent_algebra_with_rounding_is_not_semisimple():
-    """Its Killing form is rounding, of either sign, and no scale but that of the constants shows it."""
+    """The Killing form is rounding, of either sign, as only the scale of the constants shows."""
     g = mf.heisenberg(1)
     for seed in range(10):
-        h = in_basis(g, np.random.default_rng(seed).standard_normal((3, 3)))
+        h = change_basis(g, np.random.default_rng(seed).standard_normal((3, 3)))
         assert not h.is_semisimple()
         assert not h.is_compact_type()
         assert h.is_nilpotent()
 
 
 def test_matrices_that_commute_to_rounding():
-    """Their commutators are rounding, not constants that break the Jacobi identity."""
+    """Commutators that are rounding become zero constants, instead of constants that violate the Jacobi identity."""
     rng = np.random.default_rng(22)
     columns = random_basis(6, rng, 1e3)
     diagonal = [columns * rng.standard_normal(6) @ np.linalg.inv(columns) for _ in range(4)]
@@ -221,7 +222,7 @@ def test_matrices_that_commute_to_rounding():
 
 @pytest.mark.parametrize("scale", [1e-12, 1e-5, 1e7])
 def test_matrices_of_any_size(scale):
-    """Closure and dependence are judged relative to the matrices; so is what counts as a zero constant."""
+    """Closure, dependence and zero constants are judged relative to the size of the matrices."""
     g = mf.LieAlgebra.from_matrices(scale * np.asarray(mf.so(3).basis))
     np.testing.assert_allclose(g.structure_constants, scale * mf.so(3).structure_constants, rtol=1e-14)
     assert g.is_compact_type()
@@ -244,16 +245,16 @@ def test_cartan_involution(g):
             g.cartan_involution()
         return
     theta = g.cartan_involution()
-    x, y = vectors(g, 5, 2)
-    assert close(theta @ theta, np.eye(g.dim), 10.0)
-    assert close(theta @ np.asarray(g.bracket(x, y)), g.bracket(theta @ x, theta @ y), 100.0)
+    x, y = random_elements(g, 5, 2)
+    assert is_close(theta @ theta, np.eye(g.dim), 10.0)
+    assert is_close(theta @ np.asarray(g.bracket(x, y)), g.bracket(theta @ x, theta @ y), 100.0)
     assert np.linalg.eigvalsh(-g.killing_form() @ theta).min() > 0.1
 
 
 def test_cartan_involution_in_a_basis_of_any_scale():
     g, rng = mf.sl(3), np.random.default_rng(21)
     for columns in (1e-6 * random_basis(8, rng, 10.0), np.diag(10.0 ** rng.uniform(-3, 3, 8))):
-        h = in_basis(g, columns)
+        h = change_basis(g, columns)
         theta = h.cartan_involution()
         assert np.abs(theta @ theta - np.eye(8)).max() < 1e-8 * np.abs(theta).max() ** 2
         form, units = -h.killing_form() @ theta, np.linalg.norm(columns, axis=0)
@@ -269,20 +270,20 @@ def test_cartan_involution_without_matrices_in_a_skew_basis(g, seed):
     """The construction from constants alone does not depend on a lucky basis."""
     change = np.eye(g.dim) + 0.3 * np.random.default_rng(seed).standard_normal((g.dim, g.dim))
     constants = np.einsum("ai,bj,abc,kc->ijk", change, change, g.structure_constants, np.linalg.inv(change))
-    skew = mf.LieAlgebra.from_structure_constants((constants - constants.swapaxes(0, 1)) / 2)
-    theta = skew.cartan_involution()
-    form = -skew.killing_form() @ theta
+    oblique_algebra = mf.LieAlgebra.from_structure_constants((constants - constants.swapaxes(0, 1)) / 2)
+    theta = oblique_algebra.cartan_involution()
+    form = -oblique_algebra.killing_form() @ theta
     assert np.abs(theta @ theta - np.eye(g.dim)).max() < 1e-8
     assert np.linalg.eigvalsh((form + form.T) / 2).min() > 0
 
 
 def test_conventions():
-    """The signs and orders that other code relies on."""
+    """The signs and orders are those that other code relies on."""
     assert np.array_equal(mf.so(3).bracket([1, 0, 0], [0, 1, 0]), [0, 0, 1])
     assert np.array_equal(mf.su(2).structure_constants, mf.so(3).structure_constants)
     x, mu = np.array([0.3, -0.2, 0.9]), np.array([0.1, 0.7, -0.4])
-    assert close(mf.so(3).ad_star(x, mu), np.cross(mu, x))
-    assert close(mf.so(3).hat(x) @ mu, np.cross(x, mu))
+    assert is_close(mf.so(3).ad_star(x, mu), np.cross(mu, x))
+    assert is_close(mf.so(3).hat(x) @ mu, np.cross(x, mu))
     assert np.array_equal(mf.so(3).killing_form(), -2 * np.eye(3))
     rotation, translation = np.eye(6)[0], np.eye(6)[4]
     assert np.array_equal(mf.se(3).bracket(rotation, translation), np.eye(6)[5])
@@ -299,8 +300,8 @@ def test_conventions():
 def test_sums():
     g = mf.direct_sum(mf.so(3), mf.sl(2))
     assert g.dim == 6
-    assert close(g.bracket(np.eye(6)[0], np.eye(6)[4]), 0.0)
-    assert close(g.bracket(np.eye(6)[3], np.eye(6)[4])[3:], mf.sl(2).bracket([1, 0, 0], [0, 1, 0]))
+    assert is_close(g.bracket(np.eye(6)[0], np.eye(6)[4]), 0.0)
+    assert is_close(g.bracket(np.eye(6)[3], np.eye(6)[4])[3:], mf.sl(2).bracket([1, 0, 0], [0, 1, 0]))
     motions = mf.semidirect_sum(mf.so(3), mf.so(3).hat)
     assert motions == mf.se(3)
     assert hash(motions) == hash(mf.se(3))
@@ -333,8 +334,8 @@ def test_semidirect_sums_by_derivations():
     so3 = mf.so(3)
     twice = mf.semidirect_sum(so3, so3.ad, ideal=so3)
     assert structure(twice) == structure(mf.so(4))
-    x, y = vectors(twice, 3, 2)
-    assert close(twice.vee(twice.hat(x) @ twice.hat(y) - twice.hat(y) @ twice.hat(x)), twice.bracket(x, y), 100.0)
+    x, y = random_elements(twice, 3, 2)
+    assert is_close(twice.vee(twice.hat(x) @ twice.hat(y) - twice.hat(y) @ twice.hat(x)), twice.bracket(x, y), 100.0)
     # on an abelian ideal it is the sum with a vector space
     assert np.array_equal(
         mf.semidirect_sum(so3, so3.basis, ideal=mf.abelian(3)).structure_constants, mf.se(3).structure_constants
@@ -362,12 +363,12 @@ def test_names_of_basis_elements():
     assert str(mf.se(2).casimirs(2)[0]) == "mu2**2 + mu3**2"  # although both are remembered
     assert str(2 * F * F - 1) == "2*Px**4 + 4*Px**2*Py**2 + 2*Py**4 - 1"
     assert [str(dF) for dF in F.gradient()] == ["0", "2*Px", "2*Py"]
-    by_constants = mf.LieAlgebra.from_structure_constants(g.structure_constants, basis_names=g.basis_names)
-    by_matrices = mf.LieAlgebra.from_matrices(g.basis, basis_names=["L", "Px", "Py"])
-    assert by_constants.basis_names == by_matrices.basis_names == ("L", "Px", "Py")
+    constants_algebra = mf.LieAlgebra.from_structure_constants(g.structure_constants, basis_names=g.basis_names)
+    matrix_algebra = mf.LieAlgebra.from_matrices(g.basis, basis_names=["L", "Px", "Py"])
+    assert constants_algebra.basis_names == matrix_algebra.basis_names == ("L", "Px", "Py")
     spin = mf.so(3).with_basis_names("Sx", "Sy", "Sz")
-    both = mf.direct_sum(g, spin)
-    assert both.basis_names == ("L", "Px", "Py", "Sx", "Sy", "Sz")
+    direct_sum = mf.direct_sum(g, spin)
+    assert direct_sum.basis_names == ("L", "Px", "Py", "Sx", "Sy", "Sz")
     assert mf.direct_sum(spin, spin).basis_names is None
     assert mf.direct_sum(spin, mf.so(3)).basis_names is None
     assert mf.semidirect_sum(spin, spin.ad, ideal=mf.so(3).with_basis_names("a", "b", "c")).basis_names[3:] == tuple(
@@ -383,8 +384,8 @@ def test_names_of_basis_elements():
 # -- what is refused ----------------------------------------------------------------------------------------------
 
 
-def broken(change):
-    """The constants of se(3), a good control for Jacobi (on so(3) almost anything passes), with one of them changed."""
+def changed_se3_constants(change):
+    """Return the constants of se(3) after a change; so(3) is a poor control, since it passes almost any Jacobi test."""
     constants = mf.se(3).structure_constants.astype(int).astype(object)
     change(constants)
     return constants
@@ -395,14 +396,14 @@ def test_jacobi_failure_names_the_triple():
         C[0, 1, 2], C[1, 0, 2] = 2, -2
 
     with pytest.raises(mf.JacobiError, match=r"\(e1, e2, e4\).*checked exactly") as caught:
-        mf.LieAlgebra.from_structure_constants(broken(change))
+        mf.LieAlgebra.from_structure_constants(changed_se3_constants(change))
     assert caught.value.indices == (0, 1, 3)
     assert caught.value.residual == 1.0
     assert isinstance(caught.value, ValueError)
 
 
 def test_jacobi_is_exact_for_fractions():
-    """A defect of 1e-14 passes no exact check, though a tolerance would let it through."""
+    """A residual of 1e-14 fails the exact check, though it would pass a tolerance."""
     tiny = Fraction(1, 10**14)
 
     def change(C):
@@ -410,7 +411,7 @@ def test_jacobi_is_exact_for_fractions():
         C[1, 0, 2] -= tiny
 
     with pytest.raises(mf.JacobiError):
-        mf.LieAlgebra.from_structure_constants(broken(change))
+        mf.LieAlgebra.from_structure_constants(changed_se3_constants(change))
     thirds = mf.se(3).structure_constants.astype(int).astype(object) * Fraction(1, 3)
     assert mf.LieAlgebra.from_structure_constants(thirds).rational_constants.denominator == 3
 
@@ -488,8 +489,8 @@ def test_random_rational_algebras_keep_their_identity(seed):
     """A rational change of basis gives an algebra that is found rational again and passes the exact check."""
     rng = np.random.default_rng(seed)
     g = mf.se(2)
-    upper = np.triu(rng.integers(-3, 4, (3, 3)), 1) + np.eye(3, dtype=int)
-    inverse = np.round(np.linalg.inv(upper)).astype(int)
-    C = np.einsum("ia,jb,abc,ck->ijk", upper, upper, g.structure_constants.astype(int), inverse)
+    triangular = np.triu(rng.integers(-3, 4, (3, 3)), 1) + np.eye(3, dtype=int)
+    inverse = np.round(np.linalg.inv(triangular)).astype(int)
+    C = np.einsum("ia,jb,abc,ck->ijk", triangular, triangular, g.structure_constants.astype(int), inverse)
     assert mf.LieAlgebra.from_structure_constants(C).rational_constants is not None
     assert mf.LieAlgebra.from_structure_constants(C.astype(float)).rational_constants is not None

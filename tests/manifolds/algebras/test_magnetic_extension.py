@@ -1,4 +1,4 @@
-"""g ⋉ g* by the brackets of g, against the semidirect sum with structure constants."""
+"""The magnetic extension g ⋉ g* by the brackets of g, compared to the semidirect sum with structure constants."""
 
 import jax
 import numpy as np
@@ -42,17 +42,17 @@ def test_casimirs_are_in_the_kernel_and_as_many_as_there_are(pair):
     m, c = pair
     (mu,) = np.random.default_rng(1).standard_normal((1, m.dim))
 
-    def moved(F):
+    def casimir_residual(F):
         gradient = np.asarray(jax.grad(F)(mu))
         return np.abs(c.ad_star(gradient, mu)).max() / np.abs(gradient).max()
 
-    assert all(moved(F) < 1e-12 for _, F in m.leading_casimirs())
-    assert moved(lambda mu: jax.numpy.sum(mu[: m.algebra.dim] ** 2)) > 1e-3  # control: no Casimir
+    assert all(casimir_residual(F) < 1e-12 for _, F in m.leading_casimirs())
+    assert casimir_residual(lambda mu: jax.numpy.sum(mu[: m.algebra.dim] ** 2)) > 1e-3  # control: no Casimir
     if m.algebra.is_semisimple():
-        found = [F for degree in range(1, 5) for F in m.casimirs(degree)]
-        gradients = np.array([jax.grad(F)(mu) for F in found])
+        casimirs = [F for degree in range(1, 5) for F in m.casimirs(degree)]
+        gradients = np.array([jax.grad(F)(mu) for F in casimirs])
         gradients /= np.linalg.norm(gradients, axis=1, keepdims=True)
-        assert all(moved(F) < 1e-12 for F in found)
+        assert all(casimir_residual(F) < 1e-12 for F in casimirs)
         assert np.linalg.matrix_rank(gradients, tol=1e-8) == m.casimir_count()
 
 
@@ -71,5 +71,5 @@ def test_large_ones_make_no_constants():
     assert g == mf.magnetic_extension(mf.su(64)) != mf.magnetic_extension(mf.su(65))
     with pytest.raises(mf.SizeError, match="GB"):
         _ = g.structure_constants
-    with pytest.raises(mf.ParameterError, match="of a LieAlgebra, not of int"):
+    with pytest.raises(mf.ParameterError, match="must be a LieAlgebra, got int"):
         mf.magnetic_extension(3)

@@ -1,4 +1,4 @@
-"""Classical algebras by products of matrices, against the same algebras by structure constants."""
+"""Classical algebras by products of matrices, compared to equal algebras by structure constants."""
 
 import functools
 
@@ -10,19 +10,19 @@ import pytest
 import manifolds as mf
 from manifolds.algebras.matrix_algebra import MatrixTrace
 
-LONG = [("u", 3), ("so", 5), ("sp", 2), ("gl", 3)]
-PAIRS = [("su", 3), ("so", 3, 2), ("sl", 3), *(pytest.param(p, marks=pytest.mark.slow) for p in LONG)]
+SLOW_PAIRS = [("u", 3), ("so", 5), ("sp", 2), ("gl", 3)]
+PAIRS = [("su", 3), ("so", 3, 2), ("sl", 3), *(pytest.param(p, marks=pytest.mark.slow) for p in SLOW_PAIRS)]
 
 
 @pytest.fixture(scope="module", params=PAIRS, ids=lambda p: f"{p[0]}{p[1:]}")
 def pair(request):
     name, *sizes = request.param
     constructor = getattr(mf, name)
-    by_matrices = constructor(*sizes, by_matrices=True)
-    by_constants = constructor(*sizes)
-    assert isinstance(by_matrices, mf.MatrixAlgebra)
-    assert not isinstance(by_constants, mf.MatrixAlgebra)
-    return by_matrices, by_constants
+    matrix_algebra = constructor(*sizes, by_matrices=True)
+    constants_algebra = constructor(*sizes)
+    assert isinstance(matrix_algebra, mf.MatrixAlgebra)
+    assert not isinstance(constants_algebra, mf.MatrixAlgebra)
+    return matrix_algebra, constants_algebra
 
 
 def test_operations_and_forms_are_those_of_the_constants(pair):
@@ -39,8 +39,8 @@ def test_operations_and_forms_are_those_of_the_constants(pair):
     if c.is_semisimple():
         np.testing.assert_allclose(m.cartan_involution(), c.cartan_involution(), atol=1e-14)
     M = np.asarray(m.dual_matrix(mu))
-    paired = np.einsum("nij,nij->n", M.conj(), np.asarray(m.hat(y))).real
-    np.testing.assert_allclose(paired, (mu * y).sum(axis=1), atol=1e-14)
+    pairings = np.einsum("nij,nij->n", M.conj(), np.asarray(m.hat(y))).real
+    np.testing.assert_allclose(pairings, (mu * y).sum(axis=1), atol=1e-14)
     np.testing.assert_allclose(m.from_dual_matrix(M), mu, atol=1e-14)
 
 
@@ -68,21 +68,21 @@ def test_traces_are_independent_casimirs_as_many_as_there_are(pair):
 
 
 def test_derivatives_of_traces_are_those_of_powers_of_matrices(pair):
-    """First and second ones, and those of the first along a second momentum, against powers differentiated by JAX."""
+    """First and second derivatives, and those of the first along a second momentum, equal JAX's for matrix powers."""
     m, _ = pair
     mu, nu, direction = np.random.default_rng(2).standard_normal((3, m.dim))
 
-    def plain(mu, degree):
-        M = m.dual_matrix(mu) * (1j if m.known.is_compact else 1.0)
+    def trace_of_power(mu, degree):
+        M = m.dual_matrix(mu) * (1j if m.classical_data.is_compact else 1.0)
         return jnp.trace(jnp.linalg.matrix_power(M, degree)).real
 
     for degree in (2, 3, 4, 5):
-        F, f = MatrixTrace(m, degree), functools.partial(plain, degree=degree)
-        along = [jax.grad(lambda mu, f=f: jax.jvp(f, (mu,), (nu,))[1]) for f in (F, f)]
+        F, f = MatrixTrace(m, degree), functools.partial(trace_of_power, degree=degree)
+        derivatives_along_nu = [jax.grad(lambda mu, f=f: jax.jvp(f, (mu,), (nu,))[1]) for f in (F, f)]
         pairs = [(F(mu), f(mu)), (jax.hessian(F)(mu), jax.hessian(f)(mu))]
-        pairs += zip(*(jax.jvp(gradient, (mu,), (direction,)) for gradient in along), strict=True)
-        for found, expected in pairs:
-            np.testing.assert_allclose(found, expected, atol=1e-12 * max(1.0, np.abs(expected).max()))
+        pairs += zip(*(jax.jvp(gradient, (mu,), (direction,)) for gradient in derivatives_along_nu), strict=True)
+        for value, expected_value in pairs:
+            np.testing.assert_allclose(value, expected_value, atol=1e-12 * max(1.0, np.abs(expected_value).max()))
 
 
 @pytest.mark.slow
@@ -91,9 +91,9 @@ def test_suite_holds(pair):
 
 
 def test_the_representation_changes_with_the_size():
-    largest = mf.su(11)
-    assert type(largest) is mf.LieAlgebra
-    assert np.count_nonzero(largest.structure_constants) < 0.01 * largest.dim**3, "rounding is among the constants"
+    su11 = mf.su(11)
+    assert type(su11) is mf.LieAlgebra
+    assert np.count_nonzero(su11.structure_constants) < 0.01 * su11.dim**3, "rounding is among the constants"
     assert isinstance(mf.su(12), mf.MatrixAlgebra)
     assert mf.su(12) == mf.su(12) != mf.su(13)
 
@@ -113,7 +113,7 @@ def test_large_algebras_take_memory_of_a_few_states():
 
 
 @pytest.mark.parametrize(
-    ("attempt", "error", "says"),
+    ("attempt", "error", "message"),
     [
         (lambda: mf.su(10**5), mf.SizeError, "one step with matrices of su.100000. would take 1.6e.03 GB"),
         (lambda: mf.su(512).structure_constants, mf.SizeError, "1.44e.08 GB"),
@@ -126,6 +126,6 @@ def test_large_algebras_take_memory_of_a_few_states():
         (lambda: mf.su(12).casimirs(0), mf.ParameterError, "degree"),
     ],
 )
-def test_refusals(attempt, error, says):
-    with pytest.raises(error, match=says):
+def test_refusals(attempt, error, message):
+    with pytest.raises(error, match=message):
         attempt()

@@ -1,4 +1,4 @@
-"""Matrix groups: every registered one through the same properties, closed forms against general ones, and controls."""
+"""Matrix groups: every registered one passes the property tests; closed forms equal general ones; controls fail."""
 
 from dataclasses import replace
 from fractions import Fraction
@@ -33,35 +33,36 @@ TOLERANCES = {
 }
 
 seeds = st.integers(0, 10**6)
-BATCH = 4
+BATCH_SIZE = 4
 
 
-def close(a, b, name, scale=1.0):
+def is_close(a, b, name, scale=1.0):
     return np.abs(np.asarray(a) - np.asarray(b)).max(initial=0.0) <= TOLERANCES[name][0] * scale
 
 
 def elements(group, seed, count=1, size=1.0):
-    """Batches of algebra elements of Euclidean norm ``size``: inside the domain of log for sizes below pi / 2."""
-    x = np.random.default_rng(seed).standard_normal((count, BATCH, group.dim))
+    """Return batches of algebra elements of Euclidean norm ``size``; log is defined for sizes below pi / 2."""
+    x = np.random.default_rng(seed).standard_normal((count, BATCH_SIZE, group.dim))
     x *= size / np.linalg.norm(x, axis=-1, keepdims=True)
     return x if count > 1 else x[0]
 
 
 def duals(group, seed):
-    return np.random.default_rng(10_000 + seed).standard_normal((BATCH, group.dim))
+    return np.random.default_rng(10_000 + seed).standard_normal((BATCH_SIZE, group.dim))
 
 
-OTHERS = ("SO(2)", "SO(4)", "SE(2)", "SL(3)", "GL(2)", "Heisenberg(2)")
-"""Groups of the slow tier: of each family one or two are in the default one."""
+SLOW_GROUPS = ("SO(2)", "SO(4)", "SE(2)", "SL(3)", "GL(2)", "Heisenberg(2)")
+"""Groups whose tests are slow; one or two of each family are in the default tier."""
 
 
 @pytest.fixture(
     scope="module",
-    params=[pytest.param(g, marks=pytest.mark.slow if g.name in OTHERS else ()) for g in mf.registered_groups()],
+    params=[pytest.param(g, marks=pytest.mark.slow if g.name in SLOW_GROUPS else ()) for g in mf.registered_groups()],
     ids=lambda group: group.name,
 )
 def G(request):
-    """Module scope: pytest then runs all tests of one group together, which share its compiled maps."""
+    """Return each registered group; with module scope pytest runs all tests of one group together, on its compiled
+    maps."""
     return request.param
 
 
@@ -73,9 +74,9 @@ def G(request):
 def test_exp_lands_in_the_group(G, seed):
     for size in (1e-3, 1.0, 3.0):
         g = G.exp(elements(G, seed, size=size))
-        assert g.shape == (BATCH, G.matrix_size, G.matrix_size)
+        assert g.shape == (BATCH_SIZE, G.matrix_size, G.matrix_size)
         assert bool(G.belongs(g, TOLERANCES["member"][0]).all())
-    assert np.array_equal(G.exp(np.zeros((BATCH, G.dim)))[0], G.identity)
+    assert np.array_equal(G.exp(np.zeros((BATCH_SIZE, G.dim)))[0], G.identity)
 
 
 @pytest.mark.sampled(1)
@@ -83,18 +84,18 @@ def test_exp_lands_in_the_group(G, seed):
 def test_log_inverts_exp(G, seed):
     for size in (1e-3, 0.5, 1.5):
         x = elements(G, seed, size=size)
-        assert close(G.log(G.exp(x)), x, "roundtrip")
+        assert is_close(G.log(G.exp(x)), x, "roundtrip")
 
 
 @given(seed=seeds)
 def test_group_axioms_and_one_parameter_subgroups(G, seed):
     x, y, z = elements(G, seed, 3)
     g, h, k = G.exp(x), G.exp(y), G.exp(z)
-    assert close(G.compose(G.exp(0.3 * x), G.exp(0.7 * x)), g, "product")
-    assert close(G.compose(g, G.inverse(g)), G.identity, "product")
-    assert close(G.compose(G.inverse(g), g), G.identity, "product")
-    assert close(G.compose(G.compose(g, h), k), G.compose(g, G.compose(h, k)), "product")
-    assert close(G.inverse(G.compose(g, h)), G.compose(G.inverse(h), G.inverse(g)), "product")
+    assert is_close(G.compose(G.exp(0.3 * x), G.exp(0.7 * x)), g, "product")
+    assert is_close(G.compose(g, G.inverse(g)), G.identity, "product")
+    assert is_close(G.compose(G.inverse(g), g), G.identity, "product")
+    assert is_close(G.compose(G.compose(g, h), k), G.compose(g, G.compose(h, k)), "product")
+    assert is_close(G.inverse(G.compose(g, h)), G.compose(G.inverse(h), G.inverse(g)), "product")
     assert bool(G.belongs(G.compose(g, h), TOLERANCES["member"][0]).all())
     assert bool(G.belongs(G.inverse(g), TOLERANCES["member"][0]).all())
 
@@ -108,10 +109,10 @@ SIZES = np.array([0.2, 0.1, 0.05, 0.025])
 
 def test_product_is_baker_campbell_hausdorff_to_second_order(G):
     x, y = elements(G, 1, 2)[:, :1] * SIZES[:, None]
-    third = G.log(G.compose(G.exp(x), G.exp(y))) - (x + y + G.algebra.bracket(x, y) / 2)
-    errors = np.abs(third).max(axis=-1)
+    remainder = G.log(G.compose(G.exp(x), G.exp(y))) - (x + y + G.algebra.bracket(x, y) / 2)
+    errors = np.abs(remainder).max(axis=-1)
     if G.algebra.is_nilpotent():  # the series ends here
-        assert close(third, 0.0, "roundtrip")
+        assert is_close(remainder, 0.0, "roundtrip")
     else:
         assert abs(slope(SIZES, errors) - 3) < 0.2
 
@@ -125,10 +126,10 @@ def test_adjoint_action(G, seed):
     x, y, z = elements(G, seed, 3)
     g, h = G.exp(x), G.exp(y)
     conjugate = g @ G.algebra.hat(z) @ G.inverse(g)
-    assert close(jnp.einsum("...ab,...b->...a", G.Ad(g), z), G.algebra.vee(conjugate), "product")
-    assert close(G.Ad(G.compose(g, h)), G.Ad(g) @ G.Ad(h), "product")
-    expected = scipy.linalg.expm(np.asarray(G.algebra.ad(x)))
-    assert close(G.Ad(g), expected, "adjoint", np.abs(expected).max())
+    assert is_close(jnp.einsum("...ab,...b->...a", G.Ad(g), z), G.algebra.vee(conjugate), "product")
+    assert is_close(G.Ad(G.compose(g, h)), G.Ad(g) @ G.Ad(h), "product")
+    expected_action = scipy.linalg.expm(np.asarray(G.algebra.ad(x)))
+    assert is_close(G.Ad(g), expected_action, "adjoint", np.abs(expected_action).max())
 
 
 @pytest.mark.sampled(7)
@@ -137,23 +138,23 @@ def test_coadjoint_action(G, seed):
     (x, y), mu = elements(G, seed, 2), duals(G, seed)
     g, h = G.exp(x), G.exp(y)
 
-    def paired(mu, x):
+    def pairing(mu, x):
         return (np.asarray(mu) * x).sum(axis=-1)
 
-    moved = np.einsum("...ab,...b->...a", G.Ad(g), y)
-    assert close(paired(G.Ad_star(g, mu), y), paired(mu, moved), "product")
-    assert close(G.Ad_star(G.compose(g, h), mu), G.Ad_star(h, G.Ad_star(g, mu)), "product")
+    adjoint_y = np.einsum("...ab,...b->...a", G.Ad(g), y)
+    assert is_close(pairing(G.Ad_star(g, mu), y), pairing(mu, adjoint_y), "product")
+    assert is_close(G.Ad_star(G.compose(g, h), mu), G.Ad_star(h, G.Ad_star(g, mu)), "product")
     if not G.algebra.is_abelian():  # control: the action of the inverse, another convention in use, is not dual
-        assert not close(paired(G.Ad_star(G.inverse(g), mu), y), paired(mu, moved), "product", 1e6)
+        assert not is_close(pairing(G.Ad_star(G.inverse(g), mu), y), pairing(mu, adjoint_y), "product", 1e6)
 
 
 def test_derivative_of_the_coadjoint_action_is_ad_star(G):
     x, mu = elements(G, 2), duals(G, 2)
     h = 1e-4
     rate = (G.Ad_star(G.exp(h * x), mu) - G.Ad_star(G.exp(-h * x), mu)) / (2 * h)
-    assert close(rate, G.algebra.ad_star(x, mu), "central_difference")
+    assert is_close(rate, G.algebra.ad_star(x, mu), "central_difference")
     if not G.algebra.is_abelian():  # control
-        assert not close(-rate, G.algebra.ad_star(x, mu), "central_difference", 1e6)
+        assert not is_close(-rate, G.algebra.ad_star(x, mu), "central_difference", 1e6)
 
 
 # -- every registered group: Cayley -----------------------------------------------------------------------------------
@@ -168,46 +169,57 @@ def test_cayley(G):
         return
     x = elements(G, 3)
     g, X = G.cayley(x), np.asarray(G.algebra.hat(x))
-    one = np.eye(G.matrix_size)
+    identity = np.eye(G.matrix_size)
     assert bool(G.belongs(g, TOLERANCES["member"][0]).all())
-    assert close(g, np.linalg.solve(one - X / 2, one + X / 2), "product")
-    assert close(G.cayley(-x), G.inverse(g), "product")
-    assert close(G.inverse_cayley(g), x, "product")
+    assert is_close(g, np.linalg.solve(identity - X / 2, identity + X / 2), "product")
+    assert is_close(G.cayley(-x), G.inverse(g), "product")
+    assert is_close(G.inverse_cayley(g), x, "product")
     x = x[:1] * SIZES[:, None]
     errors = np.abs(G.cayley(x) - G.exp(x)).max(axis=(-2, -1))
     if G.algebra.is_nilpotent() and not G.algebra.is_abelian():  # X^3 = 0, and the two agree
-        assert close(errors, 0.0, "member")
+        assert is_close(errors, 0.0, "member")
     else:
         assert abs(slope(SIZES, errors) - 3) < 0.2
 
 
-ADJOINT = ("SO(2)", "SO(3)", "SO(4)", "SE(2)", "SE(3)", "SU(2)", "SL(2)", "GL(2)", "Heisenberg(1)", "Heisenberg(2)")
-"""Groups in which Cayley's map of ad x is an adjoint action, by hand."""
+GROUPS_WITH_ADJOINT_CAYLEY = (
+    "SO(2)",
+    "SO(3)",
+    "SO(4)",
+    "SE(2)",
+    "SE(3)",
+    "SU(2)",
+    "SL(2)",
+    "GL(2)",
+    "Heisenberg(1)",
+    "Heisenberg(2)",
+)
+"""Groups in which Cayley's map of ad x is an adjoint action, listed by hand."""
 
 
 @pytest.mark.sampled(1)
 def test_adjoint_cayley(G):
-    if G.name not in ADJOINT:
+    if G.name not in GROUPS_WITH_ADJOINT_CAYLEY:
         with pytest.raises(mf.LieAlgebraError, match=r"an adjoint action does not take .* misses by 0\.0.*use exp"):
             G.adjoint_cayley(np.zeros(G.dim))
         return
     x, mu = elements(G, 3), duals(G, 3)
     g, ad = G.adjoint_cayley(x), np.asarray(G.algebra.ad(x))
-    one = np.eye(G.dim)
+    identity = np.eye(G.dim)
     assert bool(G.belongs(g, TOLERANCES["member"][0]).all())
-    assert close(G.Ad(g), np.linalg.solve(one - ad / 2, one + ad / 2), "product")
+    assert is_close(G.Ad(g), np.linalg.solve(identity - ad / 2, identity + ad / 2), "product")
     nu = np.asarray(G.Ad_star(g, mu))
-    assert close(nu, mu + G.algebra.ad_star(x, (mu + nu) / 2), "product")  # a step of the midpoint scheme
+    assert is_close(nu, mu + G.algebra.ad_star(x, (mu + nu) / 2), "product")  # a step of the midpoint scheme
     if not G.algebra.is_abelian():  # where every map will do; else the same by way of the exponential
-        assert close(G.adjoint_cayley(x / 2), maps.adjoint_cayley(G.algebra, x / 2), "product")
+        assert is_close(G.adjoint_cayley(x / 2), maps.adjoint_cayley(G.algebra, x / 2), "product")
     gaps = np.abs(G.adjoint_cayley(x[:1] * SIZES[:, None]) - G.exp(x[:1] * SIZES[:, None])).max(axis=(-2, -1))
     assert gaps[-1] < 2e-15 or abs(slope(SIZES, gaps) - 3) < 0.2
-    assert G.cayley_is_adjoint() == bool(close(G.cayley(x), g, "product"))
+    assert G.cayley_is_adjoint() == bool(is_close(G.cayley(x), g, "product"))
 
 
 @pytest.mark.sampled(1)
 def test_maps_stay_in_the_group(G):
-    """What the constructor of a group says of its maps, measured."""
+    """The measured defects of the maps agree with the declarations of the constructor."""
     tolerance = TOLERANCES["member"][0]
     assert G.map_defect("exp") <= tolerance
     assert (G.map_defect("cayley") <= tolerance) is (G.cayley_map is not None)
@@ -217,9 +229,9 @@ def test_maps_stay_in_the_group(G):
 @pytest.mark.sampled(5)
 def test_restoring_squares_the_distance(G):
     g = np.asarray(G.exp(elements(G, 20)))
-    near = np.asarray(G.restore_map(g + 1e-5 * np.random.default_rng(0).standard_normal(g.shape)))
-    assert close(G.restore_map(g), g, "product")
-    assert bool(G.belongs(near, 1e-8).all())
+    restored = np.asarray(G.restore_map(g + 1e-5 * np.random.default_rng(0).standard_normal(g.shape)))
+    assert is_close(G.restore_map(g), g, "product")
+    assert bool(G.belongs(restored, 1e-8).all())
 
 
 # -- every registered group: arrays, derivatives, compiled programs ---------------------------------------------------
@@ -228,29 +240,29 @@ def test_restoring_squares_the_distance(G):
 def test_exp_and_log_equal_scipy(G):
     x = elements(G, 4)
     g = np.asarray(G.exp(x))
-    expected = scipy.linalg.expm(np.asarray(G.algebra.hat(x)))
-    assert close(g, expected, "reference", np.abs(expected).max())
+    expected_elements = scipy.linalg.expm(np.asarray(G.algebra.hat(x)))
+    assert is_close(g, expected_elements, "reference", np.abs(expected_elements).max())
     logarithms = np.stack([scipy.linalg.logm(one) for one in g])
-    assert close(G.algebra.hat(G.log(g)), logarithms, "reference")
+    assert is_close(G.algebra.hat(G.log(g)), logarithms, "reference")
 
 
 def test_elements_of_a_batch_do_not_meet(G):
     x, mu = elements(G, 5), duals(G, 5)
     g = G.exp(x)
-    alone = np.stack([g[2]] * BATCH)
-    assert close(G.exp(np.stack([x[2]] * BATCH)), alone, "member")
-    assert close(G.log(alone), np.stack([G.log(g)[2]] * BATCH), "roundtrip")
-    assert close(G.Ad(alone), np.stack([G.Ad(g)[2]] * BATCH), "product")
-    assert close(G.Ad_star(alone, mu)[1], G.Ad_star(np.stack([g[2], g[2], g[0], g[1]]), mu)[1], "product")
-    assert G.belongs(g).shape == (BATCH,)
+    copies = np.stack([g[2]] * BATCH_SIZE)
+    assert is_close(G.exp(np.stack([x[2]] * BATCH_SIZE)), copies, "member")
+    assert is_close(G.log(copies), np.stack([G.log(g)[2]] * BATCH_SIZE), "roundtrip")
+    assert is_close(G.Ad(copies), np.stack([G.Ad(g)[2]] * BATCH_SIZE), "product")
+    assert is_close(G.Ad_star(copies, mu)[1], G.Ad_star(np.stack([g[2], g[2], g[0], g[1]]), mu)[1], "product")
+    assert G.belongs(g).shape == (BATCH_SIZE,)
 
 
 @pytest.mark.sampled(6)
 def test_tiny_elements_keep_their_digits(G):
     x = elements(G, 8, size=1e-9)
     X = np.asarray(G.algebra.hat(x))
-    off_diagonal = ~np.eye(G.matrix_size, dtype=bool)
-    assert close(G.exp(x)[:, off_diagonal], (X + X @ X / 2)[:, off_diagonal], "roundtrip", 1e-9)
+    is_off_diagonal = ~np.eye(G.matrix_size, dtype=bool)
+    assert is_close(G.exp(x)[:, is_off_diagonal], (X + X @ X / 2)[:, is_off_diagonal], "roundtrip", 1e-9)
 
 
 # -- every registered group: the edge of the domain of log ------------------------------------------------------------
@@ -268,20 +280,21 @@ PLANE_ROTATION = {
     "Sp(2)": [0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, -1.0, 0.0, 0.0],
     "GL(2)": [0.0, 1.0, -1.0, 0.0],
 }
-"""An algebra element with the eigenvalues i and -i, in every group that turns a plane; in SU(3) with i and -i/2."""
+"""Algebra element with the eigenvalues i and -i, in every group that rotates a plane; in SU(3) with i and -i/2."""
 
-WITHOUT_LOG = {
+ELEMENTS_WITHOUT_LOG = {
     "SO(3)": [(np.diag([1.0, 1.0, -1.0]), "relative distance 2,")],
     "SO(4)": [(-np.eye(4), "eigenvalue -1")],
     "SU(2)": [(-np.eye(2), "eigenvalue -1")],
     "SL(2)": [(np.diag([-2.0, -0.5]), "eigenvalue -2 at the angle 3.1415926536")],
     "GL(2)": [(np.diag([3.0, -2.0]), "eigenvalue -2 .*det g = -6;")],
 }
+"""Matrices without a principal logarithm, and a part of the message."""
 
 
 @pytest.mark.sampled(2)
 def test_log_up_to_the_half_turn(G):
-    """Exact to rounding in the compact directions; elsewhere the condition number of the logarithm itself is 1/gap."""
+    """The error is rounding in compact directions; in others the condition number of the logarithm is 1/gap."""
     if G.algebra.is_nilpotent() and not G.algebra.is_abelian():
         assert G.name not in PLANE_ROTATION  # log is defined on the whole of a Heisenberg group
         return
@@ -290,7 +303,7 @@ def test_log_up_to_the_half_turn(G):
     for gap in (1e-2, 1e-4, 1e-6, 1e-7):
         x = (pi - gap) * plane
         name, scale = ("half_turn", 1.0) if compact else ("half_turn_condition", 1 / gap)
-        assert close(G.log(G.exp(x)), x, name, scale)
+        assert is_close(G.log(G.exp(x)), x, name, scale)
     for gap in (1e-9, 0.0) if compact else ():  # elsewhere rounding has split the pair already
         g = G.exp((pi - gap) * plane)
         if G.name.startswith("SU"):
@@ -299,10 +312,10 @@ def test_log_up_to_the_half_turn(G):
             ):
                 G.log(g)
         else:
-            assert close(G.exp(G.log(g)), g, "half_turn", 10.0)
-    for matrix, message in WITHOUT_LOG.get(G.name, []):
+            assert is_close(G.exp(G.log(g)), g, "half_turn", 10.0)
+    for matrix, message in ELEMENTS_WITHOUT_LOG.get(G.name, []):
         with pytest.raises(mf.DomainError, match=rf"g\[0\] .*{message}"):
-            G.log([matrix] * BATCH)
+            G.log([matrix] * BATCH_SIZE)
 
 
 @pytest.mark.sampled("group1-3")
@@ -310,25 +323,26 @@ def test_log_up_to_the_half_turn(G):
     ("group", "count"), [(mf.SO(2), 1), (mf.SO(3), 3), (mf.SO(4), 6), (mf.SE(2), 1), (mf.SE(3), 3)]
 )
 def test_one_of_the_two_logarithms_of_a_half_turn(group, count):
-    """pi times the axis of which the first component is positive, whatever the rounding, and its derivative."""
+    """The logarithm is pi times the axis with positive first component, whatever the rounding; its derivative is right
+    too."""
     for i in range(count):
         axis = np.eye(count)[i] if count > 3 else np.eye(count)[i] + 0.3 * np.arange(count) * (np.arange(count) > i)
         axis /= np.linalg.norm(axis)
-        expected = np.concatenate([pi * axis, np.zeros(group.dim - count)])
-        turns = expected * np.array([1.0, -1.0, 1.0 - 1e-10, -1.0 + 1e-10, 1.0 + 1e-15, 1.0 - 1e-15])[:, None]
-        found = np.asarray(group.log(group.exp(turns)))
-        assert np.abs(found - expected).max() < 1e-9
-        assert close(group.exp(found), group.exp(turns), "half_turn", 10.0)
-    g = group.exp(expected)
-    along = jax.jvp(group.log, (g,), (g @ group.algebra.hat(expected / pi),))[1]
-    assert close(along, expected / pi, "derivative", 10.0)
+        expected_log = np.concatenate([pi * axis, np.zeros(group.dim - count)])
+        turns = expected_log * np.array([1.0, -1.0, 1.0 - 1e-10, -1.0 + 1e-10, 1.0 + 1e-15, 1.0 - 1e-15])[:, None]
+        logs = np.asarray(group.log(group.exp(turns)))
+        assert np.abs(logs - expected_log).max() < 1e-9
+        assert is_close(group.exp(logs), group.exp(turns), "half_turn", 10.0)
+    g = group.exp(expected_log)
+    derivative = jax.jvp(group.log, (g,), (g @ group.algebra.hat(expected_log / pi),))[1]
+    assert is_close(derivative, expected_log / pi, "derivative", 10.0)
 
 
 def test_the_logarithm_at_a_half_turn_of_an_affine_motion():
-    """The screw of SE(3) and the rotation about a point of SE(2), where the translation counts too."""
+    """For the screw of SE(3) and the rotation about a point of SE(2) the translation counts too."""
     for group, count in ((mf.SE(2), 1), (mf.SE(3), 3)):
         x = np.concatenate([pi * np.ones(count) / np.sqrt(count), [0.3, -0.7, 0.2][: group.dim - count]])
-        assert close(group.log(group.exp(x)), x, "half_turn", 10.0)
+        assert is_close(group.log(group.exp(x)), x, "half_turn", 10.0)
 
 
 # -- every registered group: what is refused --------------------------------------------------------------------------
@@ -369,7 +383,7 @@ def test_wrong_shapes_and_kinds(G):
 
 
 def test_a_group_whose_cayley_map_leaves_it():
-    """The general map is the default of a new group, and is not what SL(3) takes."""
+    """The general Cayley map is the default of a new group, but it leaves SL(3)."""
     group = mf.MatrixGroup("mine", mf.sl(3), lambda g: jnp.abs(jnp.linalg.det(g) - 1.0))
     for call in (lambda: group.cayley(np.zeros(8)), lambda: jax.jit(group.cayley)(np.zeros(8))):
         with pytest.raises(mf.LieAlgebraError, match=r"sl\(3\) into mine: .* misses by 0\.0\d+ .*use exp") as info:
@@ -377,7 +391,7 @@ def test_a_group_whose_cayley_map_leaves_it():
         assert info.value.tolerance < 1e-3 < info.value.residual
     assert group.map_defect("exp") < 1e-14
     assert not group.cayley_is_adjoint()
-    with pytest.raises(mf.LieAlgebraError, match="None for its cayley_map"):
+    with pytest.raises(mf.LieAlgebraError, match="has no cayley_map"):
         replace(mf.SO(3), cayley_map=None).cayley(np.zeros(3))
 
 
@@ -385,24 +399,24 @@ def test_a_group_whose_cayley_map_leaves_it():
 
 
 PROGRAMS = [mf.SO(3), mf.SE(3), mf.SU(2), mf.Heisenberg(1), mf.SL(2)]
-"""Every closed form and the general functions: for what depends on the program rather than on the group."""
+"""Groups that cover every closed form and the general functions, for properties of programs rather than of groups."""
 each_program = pytest.mark.parametrize("group", PROGRAMS, ids=lambda group: group.name)
 
 
 @pytest.mark.sampled(1)
 @each_program
 def test_gradient_of_log_after_exp_is_that_of_the_identity(group):
-    """At zero, next to it and elsewhere; mapped over a batch, so that maps and batches are compared too."""
+    """At zero, near it and elsewhere; vmap is used, so that it is compared to batches too."""
 
-    def paired(x, mu):
+    def pairing(x, mu):
         return jnp.dot(mu, group.log(group.exp(x)))
 
-    mapped, mu = jax.jit(jax.vmap(jax.value_and_grad(paired))), duals(group, 6)
+    vmap_value_and_grad, mu = jax.jit(jax.vmap(jax.value_and_grad(pairing))), duals(group, 6)
     for size in (0.0, 1e-10, 1.0):
         x = elements(group, 7, size=size)
-        value, gradient = mapped(x, mu)
-        assert close(value, (mu * x).sum(axis=-1), "roundtrip")
-        assert close(gradient, mu, "derivative")
+        value, gradient = vmap_value_and_grad(x, mu)
+        assert is_close(value, (mu * x).sum(axis=-1), "roundtrip")
+        assert is_close(gradient, mu, "derivative")
 
 
 @pytest.mark.sampled(1)
@@ -411,16 +425,16 @@ def test_batches_equal_loops(group):
     x, mu = elements(group, 5).reshape(2, 2, -1), duals(group, 5)[0]
     g = group.exp(x)
     assert g.shape == (2, 2, group.matrix_size, group.matrix_size)
-    assert close(g[1, 0], group.exp(x[1, 0]), "member")
-    assert close(group.Ad(g)[1, 0], group.Ad(g[1, 0]), "product")
-    assert close(group.Ad_star(g, mu)[1, 0], group.Ad_star(g[1, 0], mu), "product")
+    assert is_close(g[1, 0], group.exp(x[1, 0]), "member")
+    assert is_close(group.Ad(g)[1, 0], group.Ad(g[1, 0]), "product")
+    assert is_close(group.Ad_star(g, mu)[1, 0], group.Ad_star(g[1, 0], mu), "product")
     assert group.belongs(g).shape == (2, 2)
     assert group.belongs(g[0, 0]).shape == ()
 
 
 @each_program
 def test_compiled_programs_make_no_lapack_calls(group):
-    """Two of them in one program can wait for each other forever (see manifolds.matrices.linear.solve)."""
+    """Two LAPACK calls in one program can wait for each other forever (see manifolds.matrices.linear.solve)."""
 
     def everything(x):
         return group.Ad(group.inverse(group.cayley(group.log(group.exp(x)))))
@@ -439,11 +453,11 @@ def test_second_derivatives():
 
     derivatives = jax.jit(lambda x: (jax.jacrev(f)(x), jax.jacfwd(jax.jacrev(f))(x)))
     h = 1e-4
-    for at in (x, np.zeros(group.dim)):
-        gradient, hessian = derivatives(at)
-        rates = [(f(at + h * e) - f(at - h * e)) / (2 * h) for e in np.eye(group.dim)]
-        assert close(gradient, rates, "central_difference")
-        assert close(hessian, hessian.T, "derivative")
+    for point in (x, np.zeros(group.dim)):
+        gradient, hessian = derivatives(point)
+        rates = [(f(point + h * e) - f(point - h * e)) / (2 * h) for e in np.eye(group.dim)]
+        assert is_close(gradient, rates, "central_difference")
+        assert is_close(hessian, hessian.T, "derivative")
 
 
 @pytest.mark.sampled(1)
@@ -452,8 +466,8 @@ def test_log_is_nan_under_tracing_where_it_would_raise(group):
     g = np.array(group.exp(elements(group, 14)))
     g[1] *= 1.001
     g[2] = np.diag([-1.0, -1.0, 1.0][: group.matrix_size])  # a half turn in SO(3), none at all in SL(2)
-    lost = np.isnan(jax.jit(group.log)(g)).any(axis=1).tolist()
-    assert lost == [False, True, group.name == "SL(2)", False]
+    is_nan = np.isnan(jax.jit(group.log)(g)).any(axis=1).tolist()
+    assert is_nan == [False, True, group.name == "SL(2)", False]
 
 
 @pytest.mark.parametrize(
@@ -468,11 +482,11 @@ def test_poles_of_the_cayley_map(group, x, eigenvalue):
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("n", [2, 3, 4])
 def test_inverse_cayley_near_the_half_turn(n):
-    """2 tan(a/2) grows without bound, and with it the condition of the map."""
+    """The values 2 tan(a/2) grow without bound, and with them the condition number of the map."""
     group, x = mf.SO(n), np.eye(mf.SO(n).dim)[0]
     for length in (1e2, 1e4, 1e6):
-        found = group.inverse_cayley(group.cayley(length * x))
-        assert close(found, length * x, "half_turn_condition", length**2)
+        x_again = group.inverse_cayley(group.cayley(length * x))
+        assert is_close(x_again, length * x, "half_turn_condition", length**2)
     half_turn = np.diag([-1.0, -1.0, *[1.0] * (n - 2)])
     with pytest.raises(
         mf.DomainError, match=r"g\[1\] has the eigenvalue -1.*inverse Cayley map needs no eigenvalue -1"
@@ -481,10 +495,10 @@ def test_inverse_cayley_near_the_half_turn(n):
 
 
 def test_inverse_cayley_beyond_a_rotation_by_pi():
-    """SU(2) covers the rotations twice: there the inverse Cayley map reaches angles up to 2 pi."""
+    """SU(2) covers the rotations twice, so its inverse Cayley map reaches angles up to 2 pi."""
     group = mf.SU(2)
     x = np.array([[0.0, 0.0, length] for length in (1e-9, 1.0, 4.0, 4.1, 40.0)])
-    assert close(
+    assert is_close(
         group.inverse_cayley(group.cayley(x)) / (1 + x[:, 2:] ** 2 / 16), x / (1 + x[:, 2:] ** 2 / 16), "member"
     )
     with pytest.raises(mf.DomainError, match="inverse_cayley"):
@@ -498,10 +512,10 @@ def test_adjoint_action_off_the_group():
 
 def test_an_element_that_is_constant_in_a_compiled_program_is_checked_while_it_is_traced():
     group, mu = mf.SO(3), np.array([1.0, 2.0, 3.0])
-    g, outside = group.exp([0.3, -0.2, 0.5]), 2 * group.identity
-    assert close(jax.jit(lambda mu: group.Ad_star(g, mu))(mu), group.Ad_star(g, mu), "member")
+    g, not_in_group = group.exp([0.3, -0.2, 0.5]), 2 * group.identity
+    assert is_close(jax.jit(lambda mu: group.Ad_star(g, mu))(mu), group.Ad_star(g, mu), "member")
     with pytest.raises(mf.DomainError, match="not in the group"):
-        jax.jit(lambda mu: group.Ad_star(outside, mu))(mu)
+        jax.jit(lambda mu: group.Ad_star(not_in_group, mu))(mu)
 
 
 def test_random_elements():
@@ -515,14 +529,14 @@ def test_random_elements():
 
 def test_groups_are_static_and_compare_by_value():
     twins = list(zip(mf.registered_groups(), mf.registered_groups(), strict=True))
-    for one, other in twins:
-        assert one is not other
-        assert one == other
-        assert hash(one) == hash(other)
-        assert jax.tree_util.tree_leaves(one) == []
+    for group_a, group_b in twins:
+        assert group_a is not group_b
+        assert group_a == group_b
+        assert hash(group_a) == hash(group_b)
+        assert jax.tree_util.tree_leaves(group_a) == []
     assert len({one for one, _ in twins}) == len(twins)
     group = mf.SO(3)
-    assert close(jax.jit(lambda group, x: group.exp(x))(group, np.zeros(3)), group.identity, "member")
+    assert is_close(jax.jit(lambda group, x: group.exp(x))(group, np.zeros(3)), group.identity, "member")
     assert repr(group) == "MatrixGroup('SO(3)', dim=3)"
 
 
@@ -534,17 +548,17 @@ def test_inverse_of_a_singular_matrix():
 def test_log_of_large_and_small_scales():
     group = mf.GL(2)
     factors = np.array([1e-100, 1e-10, 1e10, 1e100])
-    expected = np.log(factors)[:, None] * np.array([1.0, 0.0, 0.0, 1.0])
-    assert close(group.log(factors[:, None, None] * np.eye(2)), expected, "roundtrip", 100.0)
+    expected_logs = np.log(factors)[:, None] * np.array([1.0, 0.0, 0.0, 1.0])
+    assert is_close(group.log(factors[:, None, None] * np.eye(2)), expected_logs, "roundtrip", 100.0)
 
 
 def test_a_group_of_ones_own():
-    """The docstring's promise: an algebra with matrices and a defect are enough."""
+    """An algebra with matrices and a defect are enough, as the docstring promises."""
     group = mf.MatrixGroup("Aff+(1)", mf.aff(1), lambda g: jnp.abs(g[..., 1, :] - jnp.array([0.0, 1.0])).max(axis=-1))
     x = elements(group, 13)
     g = group.exp(x)
-    assert close(group.log(g), x, "roundtrip")
-    assert close(g[:, 0, 0], np.exp(x[:, 0]), "member")
+    assert is_close(group.log(g), x, "roundtrip")
+    assert is_close(g[:, 0, 0], np.exp(x[:, 0]), "member")
     assert bool(group.belongs(group.inverse(g)).all())
 
 
@@ -567,7 +581,7 @@ def test_matrix_exponential_of_rotations():
     for angle in (1e-5, 1.0, 5.3, 5.5, 10.6, 21.0, 1000.0):
         g = expm(np.array([[0.0, -angle], [angle, 0.0]]))
         exact = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-        assert close(g, exact, "member", max(1.0, angle / 5))
+        assert is_close(g, exact, "member", max(1.0, angle / 5))
     assert bool(jnp.isnan(expm(1e6 * np.eye(2))).all())
     assert bool(jnp.isnan(expm(np.full((2, 2), np.nan))).all())
 
@@ -607,10 +621,10 @@ def test_a_defect_of_one_matrix_is_applied_to_each(defect):
 
 
 @pytest.mark.parametrize(
-    ("defect", "told"), [(lambda g: float(g[0, 0]), "an error"), (lambda g: g - 1.0, r"an array of shape \(2, 2\)")]
+    ("defect", "fault"), [(lambda g: float(g[0, 0]), "an error"), (lambda g: g - 1.0, r"an array of shape \(2, 2\)")]
 )
-def test_what_is_no_defect(defect, told):
+def test_what_is_no_defect(defect, fault):
     with pytest.raises(
-        mf.LieAlgebraError, match=f"^the defect of mine must be a number for a matrix.* it gives {told}$"
+        mf.LieAlgebraError, match=f"^the defect of mine must be a number for a matrix.* it gives {fault}$"
     ):
         mf.MatrixGroup("mine", mf.sl(2), defect)

@@ -1,4 +1,4 @@
-"""Functions of Hermitian matrices beside mpmath, their derivatives where eigenvalues meet, and the exponential's."""
+"""Functions of Hermitian matrices compared to mpmath, and their derivatives where eigenvalues meet."""
 
 import functools
 import itertools
@@ -27,30 +27,30 @@ def hermitian(n, seed=0, is_complex=True):
 @pytest.mark.parametrize("points", [(2.0, 2.0), (2.0, 2.0 + 1e-9), (2.0, 2.05, 2.0), (2.0, 7.0, 2.0), (1e-9, 3.0, 0.5)])
 @pytest.mark.parametrize("name", NAMES)
 def test_divided_differences(name, points):
-    """Beside mpmath with 60 digits; points that coincide are moved apart there by 1e-20."""
+    """The reference is mpmath with 90 digits, with coincident points separated by 1e-20."""
     exact = {"log1p": lambda x: mpmath.log(1 + x), "reciprocal": lambda x: 1 / x}.get(name) or getattr(mpmath, name)
     with mpmath.workdps(90):
-        found = [mpmath.mpf(x) + k * mpmath.mpf(10) ** -20 for k, x in enumerate(points)]
-        table = [exact(x) for x in found]
-        for k in range(1, len(found)):
-            table = [(b - a) / (found[i + k] - found[i]) for i, (a, b) in enumerate(itertools.pairwise(table))]
-        wanted = float(table[0])
-    got = float(scalar_function(getattr(jnp, name)).divided_difference(*map(jnp.asarray, points)))
-    assert got == pytest.approx(wanted, rel=3e-14)  # at most 5e-15
+        mp_points = [mpmath.mpf(x) + k * mpmath.mpf(10) ** -20 for k, x in enumerate(points)]
+        table = [exact(x) for x in mp_points]
+        for k in range(1, len(mp_points)):
+            table = [(b - a) / (mp_points[i + k] - mp_points[i]) for i, (a, b) in enumerate(itertools.pairwise(table))]
+        expected_value = float(table[0])
+    value = float(scalar_function(getattr(jnp, name)).divided_difference(*map(jnp.asarray, points)))
+    assert value == pytest.approx(expected_value, rel=3e-14)  # at most 5e-15
 
 
 def test_what_a_trace_changes_by():
-    """Its product with the step is the difference, to rounding relative to the step."""
+    """The product of the discrete gradient with the step is the difference, to rounding relative to the step."""
     A, B = hermitian(3, 1) @ hermitian(3, 1) + np.eye(3), hermitian(3, 2)
 
     @jax.jit
-    def along(b):
+    def difference_from_A(b):
         return mf.spectral_difference(jnp.log, A, b)
 
     for h in (0.5, 1e-3, 1e-10, 0.0):
-        found = np.asarray(along(A + h * B))
-        assert np.abs(found - found.conj().T).max() == 0.0
-        change = np.trace(found @ B).real
+        difference = np.asarray(difference_from_A(A + h * B))
+        assert np.abs(difference - difference.conj().T).max() == 0.0
+        change = np.trace(difference @ B).real
         if h > 1e-4:
             exact = (np.log(np.linalg.eigvalsh(A + h * B)).sum() - np.log(np.linalg.eigvalsh(A)).sum()) / h
             assert change == pytest.approx(exact, rel=1e-12)
@@ -61,55 +61,62 @@ def test_what_a_trace_changes_by():
 def test_divided_differences_of_a_function_of_ones_own():
     f = GenericFunction(jnp.tanh)
     for x, y in ((0.3, 0.3), (0.3, 0.3 + 1e-8), (0.0, 1e-9), (0.3, 2.5)):
-        wanted = float(mpmath.tanh(x) - mpmath.tanh(y)) / (x - y) if abs(x - y) > 1 else 1 - np.tanh((x + y) / 2) ** 2
-        assert float(f.divided_difference(jnp.asarray(x), jnp.asarray(y))) == pytest.approx(wanted, rel=1e-14)
+        expected_value = (
+            float(mpmath.tanh(x) - mpmath.tanh(y)) / (x - y) if abs(x - y) > 1 else 1 - np.tanh((x + y) / 2) ** 2
+        )
+        assert float(f.divided_difference(jnp.asarray(x), jnp.asarray(y))) == pytest.approx(expected_value, rel=1e-14)
 
 
 @pytest.mark.parametrize("is_complex", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_derivatives_of_every_order_where_eigenvalues_meet(is_complex):
-    """Both modes agree, and each order is the difference quotient of the one before."""
+    """Both modes agree, and each derivative is the difference quotient of the next lower one."""
     A = np.diag([2.0, 2.0])
     B, C, G = (hermitian(2, seed, is_complex) for seed in range(3))
 
-    def along(x):
+    def spectral_product(x):
         return jnp.sum(jnp.asarray(G) * mf.spectral(jnp.log, A + x[0] * B + x[1] * C).conj()).real
 
-    gradient, hessian = jax.jit(jax.grad(along)), jax.jit(jax.hessian(along))
-    third = jax.jit(jax.jacfwd(jax.hessian(along)))
+    gradient, hessian = jax.jit(jax.grad(spectral_product)), jax.jit(jax.hessian(spectral_product))
+    third = jax.jit(jax.jacfwd(jax.hessian(spectral_product)))
     x, h = jnp.zeros(2), 1e-4
-    reverse = jax.jacrev(jax.grad(along))(x)
+    reverse = jax.jacrev(jax.grad(spectral_product))(x)
     assert np.abs(reverse - hessian(x)).max() <= 1e-14
-    for before, found in ((along, gradient(x)), (gradient, hessian(x)), (hessian, third(x))):
-        quotient = np.stack([(before(x + h * e) - before(x - h * e)) / (2 * h) for e in np.eye(2)], axis=-1)
-        assert np.abs(quotient - found).max() <= 1e-6 * np.abs(found).max()
+    for lower_derivative, derivative in ((spectral_product, gradient(x)), (gradient, hessian(x)), (hessian, third(x))):
+        quotient = np.stack(
+            [(lower_derivative(x + h * e) - lower_derivative(x - h * e)) / (2 * h) for e in np.eye(2)], axis=-1
+        )
+        assert np.abs(quotient - derivative).max() <= 1e-6 * np.abs(derivative).max()
     # The control: the derivative of an eigenvector is not finite here.
-    by_vectors = jax.grad(lambda t: jnp.linalg.eigh(A + t * B)[1].real.sum())(0.0)
-    assert not np.isfinite(by_vectors)
+    eigenvector_derivative = jax.grad(lambda t: jnp.linalg.eigh(A + t * B)[1].real.sum())(0.0)
+    assert not np.isfinite(eigenvector_derivative)
 
 
 def test_gradients_of_traces():
     A, B = np.diag([2.0, 2.0, 5.0]), hermitian(3)
     for f, slope in ((jnp.log, np.diag([0.5, 0.5, 0.2])), (jnp.exp, np.diag(np.exp([2.0, 2.0, 5.0])))):
-        found = jax.grad(lambda t, f=f: mf.spectral_trace(f, A + t * B))(0.0)
-        assert found == pytest.approx(np.trace(slope @ B).real, rel=1e-14)
+        derivative = jax.grad(lambda t, f=f: mf.spectral_trace(f, A + t * B))(0.0)
+        assert derivative == pytest.approx(np.trace(slope @ B).real, rel=1e-14)
 
 
 def test_the_logarithmic_mean():
     p, s, X = np.array([0.7, 0.3, 1e-12]), 0.4, hermitian(3)
-    left, right = np.exp(-s) * p[:, None], np.exp(s) * p[None, :]
-    wanted = X * (left - right) / np.log(left / right)
+    u, v = np.exp(-s) * p[:, None], np.exp(s) * p[None, :]
+    expected_mean = X * (u - v) / np.log(u / v)
     logs = jnp.diag(jnp.log(p)).astype(complex)
-    assert np.abs(log_mean(logs, s, X) - wanted).max() <= 1e-15
+    assert np.abs(log_mean(logs, s, X) - expected_mean).max() <= 1e-15
     quotient = (log_mean(logs, s + 1e-5, X) - log_mean(logs, s - 1e-5, X)) / 2e-5
     assert np.abs(jax.jacfwd(lambda s: log_mean(logs, s, X))(s) - quotient).max() <= 1e-9
 
 
 def test_batches_and_maps():
-    many = jnp.stack([hermitian(3, seed) for seed in range(4)])
-    together = mf.spectral(jnp.exp, many)
-    assert np.abs(together - jax.vmap(functools.partial(mf.spectral, jnp.exp))(many)).max() == 0.0
-    found = jax.vmap(lambda B: jax.jvp(functools.partial(mf.spectral, jnp.exp), (many[0],), (B,))[1])(many)
-    assert np.abs(found[2] - jax.jvp(functools.partial(mf.spectral, jnp.exp), (many[0],), (many[2],))[1]).max() <= 1e-14
+    batch = jnp.stack([hermitian(3, seed) for seed in range(4)])
+    exponentials = mf.spectral(jnp.exp, batch)
+    assert np.abs(exponentials - jax.vmap(functools.partial(mf.spectral, jnp.exp))(batch)).max() == 0.0
+    derivatives = jax.vmap(lambda B: jax.jvp(functools.partial(mf.spectral, jnp.exp), (batch[0],), (B,))[1])(batch)
+    assert (
+        np.abs(derivatives[2] - jax.jvp(functools.partial(mf.spectral, jnp.exp), (batch[0],), (batch[2],))[1]).max()
+        <= 1e-14
+    )
 
 
 @pytest.mark.parametrize("n", [2, 3, 8])
@@ -124,11 +131,16 @@ def test_derivatives_of_the_exponential():
     rng = np.random.default_rng(0)
     X, D, E = rng.normal(size=(3, 2, 2))
 
-    def along(t):
+    def exponential_product(t):
         return jnp.sum(E * expm(X + t[0] * D + t[1] * E))
 
     t, h = jnp.zeros(2), 1e-5
-    hessian = jax.hessian(along)(t)
-    assert np.abs(jax.jacrev(jax.grad(along))(t) - hessian).max() <= 1e-13
-    quotient = np.stack([(jax.grad(along)(t + h * e) - jax.grad(along)(t - h * e)) / (2 * h) for e in np.eye(2)])
+    hessian = jax.hessian(exponential_product)(t)
+    assert np.abs(jax.jacrev(jax.grad(exponential_product))(t) - hessian).max() <= 1e-13
+    quotient = np.stack(
+        [
+            (jax.grad(exponential_product)(t + h * e) - jax.grad(exponential_product)(t - h * e)) / (2 * h)
+            for e in np.eye(2)
+        ]
+    )
     assert np.abs(quotient - hessian).max() <= 1e-7 * np.abs(hessian).max()

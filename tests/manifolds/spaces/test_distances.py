@@ -1,4 +1,4 @@
-"""Distances: the derivatives of their squares at equal points, and their values at all scales and at cut loci.
+"""Distances: derivatives of their squares at equal points, and values at all scales and at cut loci.
 
 The references are Hessians known by definition, mpmath, and points made from the angles between them.
 """
@@ -28,23 +28,23 @@ def tolerance(name: str) -> float:
     return TOLERANCES[name][0]
 
 
-def largest(a) -> float:
+def max_abs(a) -> float:
     return float(np.abs(np.asarray(a)).max(initial=0.0))
 
 
 # -- derivatives at equal points ---------------------------------------------------------------------------------------
 
-COMPOSED = [
+COMPOSED_SPACES = [
     mf.Sphere(2) * mf.SPD(2),
     mf.Hyperbolic(2) ** 2,
     mf.SPD(2) ** 2,
     mf.Grassmann(3, 1) * mf.Sphere(1),
     mf.Power(mf.Sphere(2) * mf.Euclidean(1), 2),
 ]
-QUICK = ("R^3", "S^2", "(S^2)^4", "Oblique(3, 2)")
+QUICK_SPACE_NAMES = ("R^3", "S^2", "(S^2)^4", "Oblique(3, 2)")
 SPACES = [
-    pytest.param(space, id=space.name, marks=[] if space.name in QUICK else [pytest.mark.slow])
-    for space in (*mf.registered_spaces(), *COMPOSED)
+    pytest.param(space, id=space.name, marks=[] if space.name in QUICK_SPACE_NAMES else [pytest.mark.slow])
+    for space in (*mf.registered_spaces(), *COMPOSED_SPACES)
     if space.has_geodesics
 ]
 
@@ -59,9 +59,9 @@ def test_the_square_of_a_distance_has_twice_the_metric_as_hessian(space):
         lambda x: space.distance(c, space.from_vector(x)) ** 2,
     ):
         gradient = jax.jit(jax.grad(square))
-        assert largest(frame @ gradient(start)) < tolerance("gradient")
+        assert max_abs(frame @ gradient(start)) < tolerance("gradient")
         hessian = frame @ np.asarray(jax.jit(jax.jacfwd(gradient))(start)) @ frame.T
-        assert largest(hessian - 2.0 * np.eye(space.dim)) < tolerance("hessian")
+        assert max_abs(hessian - 2.0 * np.eye(space.dim)) < tolerance("hessian")
 
 
 def test_a_distance_of_zero_is_zero():
@@ -76,18 +76,18 @@ def test_derivatives_of_every_order_at_equal_points():
     c = space.random(1)
     v = space.from_coordinates(c, jnp.eye(space.dim)[0])
 
-    def differentiated(f):
+    def derivative_of(f):
         return lambda t: jax.jvp(f, (t,), (1.0,))[1]
 
     functions = [lambda t: space._distance(space._exp(c, t * v), c) ** 2]
     for _ in range(5):
-        functions.append(differentiated(functions[-1]))
-    found = jax.jit(lambda t: jnp.stack([f(t) for f in functions[1:]]))(0.0)
-    assert np.abs(np.asarray(found) - [0.0, 2.0, 0.0, 0.0, 0.0]).max() < 1e-12
+        functions.append(derivative_of(functions[-1]))
+    derivatives = jax.jit(lambda t: jnp.stack([f(t) for f in functions[1:]]))(0.0)
+    assert np.abs(np.asarray(derivatives) - [0.0, 2.0, 0.0, 0.0, 0.0]).max() < 1e-12
 
 
 @pytest.mark.parametrize(
-    ("method", "allowed"),
+    ("method", "max_difference"),
     [
         (lt.MetriplecticGauss(2), 1e-11),
         pytest.param(lt.MetriplecticMidpoint(), 1e-7, marks=pytest.mark.slow),
@@ -96,10 +96,10 @@ def test_derivatives_of_every_order_at_equal_points():
     ],
     ids=lambda value: type(value).__name__,
 )
-def test_a_run_from_the_centre_of_a_potential_of_the_distance(method, allowed):
-    """A spin whose energy is the squared distance from its start, and a field that moves it away from there.
+def test_a_run_from_the_centre_of_a_potential_of_the_distance(method, max_difference):
+    """The energy of a spin is the squared distance from its start, with a field that moves it away.
 
-    What is allowed is the error of the method: the two energies differ off the sphere, where stages are.
+    The tolerance is the error of the method: the two energies differ off the sphere, where stages are.
     """
     space, c = mf.Sphere(2), np.array([0.6, 0.64, 0.48])
     field = np.array([0.3, -0.2, 0.5])
@@ -107,7 +107,9 @@ def test_a_run_from_the_centre_of_a_potential_of_the_distance(method, allowed):
     def energy(s):
         return space.distance(s, c) ** 2 + field @ s
 
-    def smooth(s):  # the same, written with the angle's cosine: acos(u)^2 has a series at 1, unlike JAX's derivative
+    def smooth_energy(
+        s,
+    ):  # the same, written with the angle's cosine: acos(u)^2 has a series at 1, unlike JAX's derivative
         gap = 1.0 - s @ c
         series = 2.0 * gap + gap**2 / 3.0 + 4.0 * gap**3 / 45.0 + gap**4 / 35.0 + 16.0 * gap**5 / 1575.0
         return series + field @ s
@@ -116,11 +118,11 @@ def test_a_run_from_the_centre_of_a_potential_of_the_distance(method, allowed):
         lt.integrate(
             lt.MetriplecticSystem(mf.LiePoisson(mf.so(3)), H, space=space, validate=False), c, (0.0, 0.2), 0.02, method
         )
-        for H in (energy, smooth)
+        for H in (energy, smooth_energy)
     ]
     assert np.isfinite(runs[0].x).all()
-    assert largest(runs[0].x - runs[1].x) < allowed
-    assert largest(runs[0].x[-1] - c) > 0.05  # control: it moves
+    assert max_abs(runs[0].x - runs[1].x) < max_difference
+    assert max_abs(runs[0].x[-1] - c) > 0.05  # control: it moves
 
 
 # -- hyperbolic space, far out -----------------------------------------------------------------------------------------
@@ -131,8 +133,8 @@ def hyperbolic_point(r, angle):
     return np.concatenate([[np.sqrt(1.0 + space @ space)], space])
 
 
-def exact_hyperbolic(x, y) -> float:
-    """The distance of the points above the given coordinates, which are taken as exact."""
+def exact_hyperbolic_distance(x, y) -> float:
+    """Return the distance of the points above the given coordinates, which are taken as exact."""
     with mpmath.workdps(150):
         p, q = ([mpmath.mpf(float(a)) for a in z[1:]] for z in (x, y))
         x0, y0 = (mpmath.sqrt(1 + sum(a * a for a in z)) for z in (p, q))
@@ -148,18 +150,18 @@ def test_hyperbolic_distances_at_all_scales():
         for angle in (0.0, 1e-12, 1e-8, 1e-3, 0.5, 2.0, np.pi)
     ]
     x, y = (np.array(points) for points in zip(*pairs, strict=True))
-    exact = np.array([exact_hyperbolic(a, b) for a, b in pairs])
-    nearer = np.minimum(x[:, 0], y[:, 0])
+    exact = np.array([exact_hyperbolic_distance(a, b) for a, b in pairs])
+    min_cosh = np.minimum(x[:, 0], y[:, 0])
     for a, b in ((x, y), (y, x)):
-        found = np.asarray(space.distance(a, b))
-        assert (np.abs(found - exact) <= tolerance("far") * (nearer + exact)).all()
-        near = a[:, 0] < 1e9  # further out vectors have no digits
-        along = np.asarray(space._norm(a, space._log(a, b)))
-        assert (np.abs(along - exact) <= 10 * tolerance("far") * a[:, 0] * (1.0 + exact))[near].all()
+        distances = np.asarray(space.distance(a, b))
+        assert (np.abs(distances - exact) <= tolerance("far") * (min_cosh + exact)).all()
+        has_digits = a[:, 0] < 1e9  # further out vectors have no digits
+        log_lengths = np.asarray(space._norm(a, space._log(a, b)))
+        assert (np.abs(log_lengths - exact) <= 10 * tolerance("far") * a[:, 0] * (1.0 + exact))[has_digits].all()
 
 
 def test_hyperbolic_points_ten_apart_far_out():
-    """On a ray radii are distances; from radius 18 on the difference of two squares was 0."""
+    """On a ray distances are differences of radii; from radius 18 on the difference of two squares was 0."""
     space = mf.Hyperbolic(2)
     for r in (17.0, 18.0, 19.0, 20.0, 25.0):
         assert abs(float(space.distance(hyperbolic_point(r, 0.0), hyperbolic_point(r + 10.0, 0.0))) - 10.0) < 1e-13
@@ -171,17 +173,17 @@ def test_hyperbolic_derivatives_far_out():
     c = space.point([0.0, 3.0, 4.0], project=True)
     frame = np.asarray(space.frame(c))
     hessian = jax.jit(jax.hessian(lambda x: space.distance(x, c) ** 2))(c)
-    assert largest(frame @ hessian @ frame.T - 2.0 * np.eye(2)) < 5e-14
+    assert max_abs(frame @ hessian @ frame.T - 2.0 * np.eye(2)) < 5e-14
     y = np.array([c[0], c[2], c[1]])  # of the same radius
-    found = np.asarray(jax.jit(jax.grad(lambda x: space.distance(x, y) ** 2))(c))
-    assert largest(frame @ found + 2.0 * np.asarray(space.coordinates(c, space.log(c, y)))) < 1e-13
+    gradient = np.asarray(jax.jit(jax.grad(lambda x: space.distance(x, y) ** 2))(c))
+    assert max_abs(frame @ gradient + 2.0 * np.asarray(space.coordinates(c, space.log(c, y)))) < 1e-13
 
 
 # -- cut loci ----------------------------------------------------------------------------------------------------------
 
 
 def subspaces(n, p, angles, seed):
-    """Two subspaces with given principal angles, as projectors."""
+    """Return two subspaces with given principal angles, as projectors."""
     q = np.linalg.qr(np.random.default_rng(seed).standard_normal((n, n)))[0]
     x, y = q[:, :p], q[:, :p].copy()
     for i, t in enumerate(angles):
@@ -194,10 +196,10 @@ def subspaces(n, p, angles, seed):
 )
 def test_grassmann_near_a_right_angle(n, p):
     space = mf.Grassmann(n, p)
-    others = [0.3, 1.1][: p - 1]
+    other_angles = [0.3, 1.1][: p - 1]
     for gap in (1.0, 1e-2, 1e-5, 3e-8, 1e-10, 0.0):
-        x, y = subspaces(n, p, [np.pi / 2 - gap, *others], seed=int(1e3 * gap))
-        length = np.sqrt(2.0 * ((np.pi / 2 - gap) ** 2 + np.sum(np.square(others))))
+        x, y = subspaces(n, p, [np.pi / 2 - gap, *other_angles], seed=int(1e3 * gap))
+        length = np.sqrt(2.0 * ((np.pi / 2 - gap) ** 2 + np.sum(np.square(other_angles))))
         assert abs(float(space.distance(x, y)) - length) < tolerance("angle")
         if gap < 1e-8:
             with pytest.raises(mf.DomainError, match="right angle"):
@@ -205,7 +207,7 @@ def test_grassmann_near_a_right_angle(n, p):
             continue
         v = space.log(x, y)
         assert abs(float(space.norm(x, v)) - length) < tolerance("angle")
-        assert largest(np.asarray(space.exp(x, v)) - y) < tolerance("way")
+        assert max_abs(np.asarray(space.exp(x, v)) - y) < tolerance("way")
 
 
 def test_grassmann_neighbours_keep_their_relative_accuracy():
@@ -216,7 +218,7 @@ def test_grassmann_neighbours_keep_their_relative_accuracy():
         assert abs(float(space.norm(x, space.log(x, y))) / (np.sqrt(2.0) * gap) - 1.0) < 1e-15
 
 
-def rotation_by(angles, n, seed):
+def rotation_by_angles(angles, n, seed):
     g = np.eye(n)
     for i, t in enumerate(angles):
         g[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = [[np.cos(t), -np.sin(t)], [np.sin(t), np.cos(t)]]
@@ -226,14 +228,14 @@ def rotation_by(angles, n, seed):
 
 @pytest.mark.parametrize("n", [3, pytest.param(4, marks=pytest.mark.slow), pytest.param(5, marks=pytest.mark.slow)])
 def test_rotations_at_half_turns(n):
-    """Also by two of them, where there is a continuum of logarithms: the distance is ``pi sqrt(2)``."""
+    """Two half turns have a continuum of logarithms, but the distance is ``pi sqrt(2)``."""
     space, x = mf.SpecialOrthogonal(n), np.asarray(mf.SpecialOrthogonal(n).random(1))
-    rest = [0.7] * (n // 2 - 1)
-    cases = [[np.pi - gap, *rest] for gap in (1e-3, 1e-6, 3e-8, 0.0)]
+    other_angles = [0.7] * (n // 2 - 1)
+    cases = [[np.pi - gap, *other_angles] for gap in (1e-3, 1e-6, 3e-8, 0.0)]
     if n > 3:
         cases += [[np.pi, np.pi], [np.pi - 1e-9, np.pi - 1e-7], [1e-9, np.pi - 1e-6]]
     for angles in cases:
-        y = np.asarray(space.project(x @ rotation_by(angles, n, seed=2)))
+        y = np.asarray(space.project(x @ rotation_by_angles(angles, n, seed=2)))
         assert abs(float(space.distance(x, y)) - np.linalg.norm(angles)) < tolerance("angle")
     rigid = mf.SpecialEuclidean(3, 2.0)
     a, b = np.eye(4), np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -262,9 +264,9 @@ def test_a_logarithm_that_is_not_in_the_algebra_is_refused():
         mf.SU(3).log(g)
     with pytest.raises(mf.DomainError, match=r"angles sum to 6\.28"):
         mf.SpecialUnitary(3).distance(np.eye(3), g)
-    nearer = np.diag(np.exp(0.5j * np.array([2.5, 2.5, -5.0])))  # what the message says
-    x = mf.SU(3).log(mf.SU(3).compose(mf.SU(3).inverse(nearer), g))
-    assert largest(nearer @ np.asarray(mf.SU(3).exp(x)) - g) < 1e-14
+    half_way = np.diag(np.exp(0.5j * np.array([2.5, 2.5, -5.0])))  # what the message says
+    x = mf.SU(3).log(mf.SU(3).compose(mf.SU(3).inverse(half_way), g))
+    assert max_abs(half_way @ np.asarray(mf.SU(3).exp(x)) - g) < 1e-14
 
 
 def test_positive_definite_matrices_at_all_scales():
@@ -279,7 +281,7 @@ def test_positive_definite_matrices_at_all_scales():
         )
     g = np.diag([1e-6, 1.0, 1e6])
     x, y = g @ g, g @ np.array([[2.0, 0.5, 0.1], [0.5, 1.0, 0.2], [0.1, 0.2, 3.0]]) @ g
-    inside = np.array([[2.0, 0.5, 0.1], [0.5, 1.0, 0.2], [0.1, 0.2, 3.0]])
-    expected = np.linalg.norm(np.log(np.linalg.eigvalsh(inside)))
-    assert abs(float(space.distance(x, y)) - expected) < 1e-14 * 10
-    assert abs(float(space.distance(y, x)) - expected) < 1e-14 * 10
+    middle_matrix = np.array([[2.0, 0.5, 0.1], [0.5, 1.0, 0.2], [0.1, 0.2, 3.0]])
+    expected_distance = np.linalg.norm(np.log(np.linalg.eigvalsh(middle_matrix)))
+    assert abs(float(space.distance(x, y)) - expected_distance) < 1e-14 * 10
+    assert abs(float(space.distance(y, x)) - expected_distance) < 1e-14 * 10

@@ -1,4 +1,4 @@
-"""Grassmann manifolds against geomstats; the suite of spaces runs on them by registration."""
+"""Grassmann manifolds compared to geomstats; the suite of spaces runs on them by registration."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Manifolds from their equations: against closed forms, and what is refused."""
+"""Manifolds from their equations: compared to closed forms, and refusals."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def torus(x):
 
 
 def test_a_sphere_from_its_equation():
-    """The maps of the sphere with closed forms, also with another metric."""
+    """The maps equal those of the sphere in closed form, also with other metrics."""
     space, sphere = mf.LevelSet(square, 3, name="ball's edge"), mf.Sphere(2)
     assert (space.name, space.dim, space.shape, space.metric) == ("ball's edge", 2, (3,), "induced")
     x = np.asarray(space.random(0, (2,)))
@@ -30,13 +30,13 @@ def test_a_sphere_from_its_equation():
     v = np.asarray(space.random_tangent(1, x[0]))
     assert np.abs(space.geodesic(x[0], v, steps=400) - sphere.exp(x[0], v)).max() < 1e-10  # 4e-12 seen
     g = np.diag([1.0, 2.0, 3.0])
-    stretched = mf.LevelSet(square, 3, metric=g)
-    gradient = np.asarray(stretched.sharp(x[0], w[0]))
+    anisotropic_sphere = mf.LevelSet(square, 3, metric=g)
+    gradient = np.asarray(anisotropic_sphere.sharp(x[0], w[0]))
     assert abs(gradient @ x[0]) < 1e-15
     assert abs(gradient @ g @ v - w[0] @ v) < 1e-14
-    assert abs(float(stretched.inner(x[0], v, v)) - v @ g @ v) < 1e-14
-    curved = mf.LevelSet(square, 3, metric=lambda x: jnp.diag(1.0 + x**2))
-    assert abs(float(curved.inner(x[0], v, v)) - v @ np.diag(1.0 + x[0] ** 2) @ v) < 1e-14
+    assert abs(float(anisotropic_sphere.inner(x[0], v, v)) - v @ g @ v) < 1e-14
+    curved_sphere = mf.LevelSet(square, 3, metric=lambda x: jnp.diag(1.0 + x**2))
+    assert abs(float(curved_sphere.inner(x[0], v, v)) - v @ np.diag(1.0 + x[0] ** 2) @ v) < 1e-14
 
 
 @pytest.mark.slow
@@ -47,7 +47,7 @@ def test_the_suite_of_spaces():
 
 
 def test_a_run_on_a_torus():
-    """Equations that are no polynomials: the implicit method is brought back to them, with its laws."""
+    """The equations are no polynomials: the implicit method projects its steps onto them and keeps its laws."""
     space = mf.LevelSet(torus, 3, name="torus")
     system = lt.MetriplecticSystem(
         None, lambda x: x[0] + 0.3 * x[2], lambda x: -(x[1] ** 2) - x[2], lt.ProjectedMetric(), space=space
@@ -78,17 +78,17 @@ def test_a_run_on_a_torus():
     ],
 )
 def test_refusals(build, error, message):
-    with pytest.raises(error, match=message) as found:
+    with pytest.raises(error, match=message) as caught:
         build()
-    assert "\n" not in str(found.value)
+    assert "\n" not in str(caught.value)
 
 
 def test_an_energy_that_is_not_finite_there():
-    """One line that names the function, not a NaN."""
+    """The error is one line that names the function, instead of a NaN."""
     space = mf.LevelSet(square, 3)
     system = lt.MetriplecticSystem(
         None, lambda x: jnp.log(x[0]), dissipation=lt.Friction(), space=space, validate=False
     )
-    with pytest.raises(lt.NonFiniteError, match="energy") as found:
+    with pytest.raises(lt.NonFiniteError, match="energy") as caught:
         lt.integrate(system, np.array([-0.6, 0.8, 0.0]), (0.0, 1.0), 0.1, lt.MetriplecticRungeKutta(4))
-    assert "\n" not in str(found.value)
+    assert "\n" not in str(caught.value)

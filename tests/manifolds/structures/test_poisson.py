@@ -59,8 +59,10 @@ def test_a_tensor_of_ones_own():
     P = mf.PoissonTensor(lambda x: jnp.array([[0.0, x[0]], [-x[0], 0.0]]), dim=2)  # in two dimensions any tensor is one
     assert float(P.jacobi_residual([0.4, 0.2])) == 0.0
     # {x1, x2} = x2, {x2, x3} = 1: v . curl v = 1 for the vector v of the tensor, so Jacobi fails
-    not_poisson = mf.PoissonTensor(lambda x: jnp.array([[0.0, x[1], 0.0], [-x[1], 0.0, 1.0], [0.0, -1.0, 0.0]]), dim=3)
-    assert float(not_poisson.jacobi_residual([0.4, 0.2, 1.0])) > 0.1
+    no_jacobi_tensor = mf.PoissonTensor(
+        lambda x: jnp.array([[0.0, x[1], 0.0], [-x[1], 0.0, 1.0], [0.0, -1.0, 0.0]]), dim=3
+    )
+    assert float(no_jacobi_tensor.jacobi_residual([0.4, 0.2, 1.0])) > 0.1
     with pytest.raises(mf.ShapeError):
         mf.PoissonTensor(np.zeros((2, 3)))
     with pytest.raises(mf.ParameterError):
@@ -72,47 +74,48 @@ LEAVES = [mf.LiePoisson(mf.su(3)), mf.LiePoisson(mf.so(5)), mf.LiePoisson(mf.u(2
 
 @pytest.mark.parametrize("P", LEAVES, ids=lambda P: f"{type(P).__name__}-{P.dim}")
 def test_stages_on_a_leaf(P):
-    """With any covectors, at long steps, and at states of small orbits; the control: stages that are not on it."""
-    rng, (A, b) = np.random.default_rng(3), gauss_of_two()
-    matrices = P.matrix if isinstance(P, mf.DensityMatrices) else lambda x: jnp.tensordot(x, dual(P.algebra), 1)
+    """The spectrum is conserved for any covectors and long steps; the control has stages off the leaf."""
+    rng, (A, b) = np.random.default_rng(3), two_stage_gauss()
+    matrices = P.matrix if isinstance(P, mf.DensityMatrices) else lambda x: jnp.tensordot(x, dual_basis(P.algebra), 1)
     x, alpha = rng.standard_normal(P.dim), rng.standard_normal((2, P.dim))
 
-    def moved(points):
+    def end_point(points):
         return x + 0.7 * b @ np.stack([P.sharp(u, a) for u, a in zip(points, alpha, strict=True)])
 
     def spectrum(x):
         return np.sort(np.linalg.eigvals(matrices(x)).imag + np.linalg.eigvals(matrices(x)).real)
 
     points = P.stages_on_leaf(x, alpha, 0.7 * A)
-    assert np.abs(spectrum(moved(points)) - spectrum(x)).max() <= 2e-14
-    assert np.abs(spectrum(moved([x, x])) - spectrum(x)).max() >= 1e-3
+    assert np.abs(spectrum(end_point(points)) - spectrum(x)).max() <= 2e-14
+    assert np.abs(spectrum(end_point([x, x])) - spectrum(x)).max() >= 1e-3
     slopes = np.stack([P.sharp(u, a) for u, a in zip(P.stages_on_leaf(x, alpha, 1e-6 * A), alpha, strict=True)])
     assert np.abs(P.stages_on_leaf(x, alpha, 1e-6 * A) - (x + 1e-6 * A @ slopes)).max() <= 1e-10
 
 
 @pytest.mark.parametrize("P", LEAVES, ids=lambda P: f"{type(P).__name__}-{P.dim}")
 def test_a_covector_that_carries_a_state(P):
-    """Its rate is that of the motion, at a covector that is not small; the control: the covector as it is."""
+    """The rate is that of the motion, at a covector that is not small; the control uses the covector itself as the
+    rate."""
     rng = np.random.default_rng(4)
     x, covector, alpha = rng.standard_normal((3, P.dim))
     end = x + P.leaf_displacement(x, covector)
-    moved = jax.jvp(lambda K: P.leaf_displacement(x, K), (covector,), (P.leaf_covector_rate(covector, alpha),))[1]
-    assert np.abs(moved - P.sharp(end, alpha)).max() <= 1e-13 * np.abs(x).max() * np.abs(covector).max() ** 2
+    rate = jax.jvp(lambda K: P.leaf_displacement(x, K), (covector,), (P.leaf_covector_rate(covector, alpha),))[1]
+    assert np.abs(rate - P.sharp(end, alpha)).max() <= 1e-13 * np.abs(x).max() * np.abs(covector).max() ** 2
     if isinstance(P, mf.DensityMatrices):  # a constant that is added to the energy moves nothing
         constant = np.append(np.ones(P.size), np.zeros(P.dim - P.size))
         assert (
             np.abs(P.leaf_covector_rate(covector, alpha + 1e6 * constant) - P.leaf_covector_rate(covector, alpha)).max()
             <= 1e-8
         )
-    assert np.abs(jax.jvp(lambda K: P.leaf_displacement(x, K), (covector,), (alpha,))[1] - moved).max() >= 1e-2
+    assert np.abs(jax.jvp(lambda K: P.leaf_displacement(x, K), (covector,), (alpha,))[1] - rate).max() >= 1e-2
 
 
-def gauss_of_two():
+def two_stage_gauss():
     root = np.sqrt(3.0) / 6.0
     return np.array([[0.25, 0.25 - root], [0.25 + root, 0.25]]), np.array([0.5, 0.5])
 
 
-def dual(g):
+def dual_basis(g):
     basis = np.asarray(g.basis)
     return np.tensordot(np.linalg.inv(np.einsum("aij,bji->ab", basis, basis).real), basis, 1)
 

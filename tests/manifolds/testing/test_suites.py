@@ -1,4 +1,4 @@
-"""The public suites: everything that is registered goes through, and broken objects do not."""
+"""Public property suites: all registered objects pass, and broken objects fail."""
 
 import dataclasses
 
@@ -10,30 +10,30 @@ import manifolds as mf
 from manifolds import testing
 
 
-def named(objects):
+def params_by_name(objects):
     return [pytest.param(thing, id=thing.name) for thing in objects]
 
 
 @pytest.mark.sampled(2)
-@pytest.mark.parametrize("g", named(mf.registered()))
+@pytest.mark.parametrize("g", params_by_name(mf.registered()))
 def test_algebras(g):
     assert testing.check_algebra(g, degree=2).passed
 
 
 @pytest.mark.sampled("SO(3)")
-@pytest.mark.parametrize("G", named(mf.registered_groups()))
+@pytest.mark.parametrize("G", params_by_name(mf.registered_groups()))
 def test_groups(G):
     assert testing.check_group(G).passed
 
 
 @pytest.mark.sampled("S^2")
-@pytest.mark.parametrize("M", named(mf.registered_spaces()))
+@pytest.mark.parametrize("M", params_by_name(mf.registered_spaces()))
 def test_spaces(M):
     assert testing.check_space(M).passed
 
 
-class Crooked(mf.LieAlgebra):
-    """Control: its ad* has the other sign."""
+class WrongSignAlgebra(mf.LieAlgebra):
+    """Control: ad* has the wrong sign."""
 
     def ad_star(self, x, mu):
         return -super().ad_star(x, mu)
@@ -41,25 +41,25 @@ class Crooked(mf.LieAlgebra):
 
 def test_a_broken_algebra():
     with pytest.raises(testing.PropertyError, match=r"<ad\*_x mu, y> .*FAILS") as failure:
-        testing.check_algebra(Crooked(mf.so(3).structure_constants, name="crooked", basis=mf.so(3).basis))
+        testing.check_algebra(WrongSignAlgebra(mf.so(3).structure_constants, name="crooked", basis=mf.so(3).basis))
     assert "NOT ALL OF THEM HOLD" in str(failure.value)
     assert not failure.value.report.passed
 
 
 def test_a_broken_group():
-    """Control: an exponential of second order leaves the group."""
-    good = mf.SO(3)
+    """Control: an exponential truncated at second order leaves the group."""
+    group = mf.SO(3)
 
-    def short(algebra, x):
+    def truncated_exp(algebra, x):
         X = algebra.hat(x)
         return jnp.eye(3) + X + X @ X / 2
 
     with pytest.raises(testing.PropertyError, match=r"exp x is in the group .*FAILS"):
-        testing.check_group(dataclasses.replace(good, name="short", exp_map=short))
+        testing.check_group(dataclasses.replace(group, name="short", exp_map=truncated_exp))
 
 
-class Slanted(mf.Sphere):
-    """Control: its metric is not the one of its frame."""
+class MismatchedSphere(mf.Sphere):
+    """Control: the metric is not that of the frame."""
 
     def _inner(self, x, u, v):
         return 2.0 * jnp.sum(u * v, axis=-1)
@@ -67,7 +67,7 @@ class Slanted(mf.Sphere):
 
 def test_a_broken_space():
     with pytest.raises(testing.PropertyError, match=r"the frame is orthonormal .*FAILS"):
-        testing.check_space(Slanted(2))
+        testing.check_space(MismatchedSphere(2))
 
 
 def test_what_is_not_asked_is_said():
