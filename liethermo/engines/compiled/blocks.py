@@ -15,6 +15,9 @@ from .lapack import lapack_kernel
 
 INT32 = ir.IntType(32)
 
+TABLE_ALIGNMENT_BYTES = 8
+"""Alignment of the entries of tables. Some tables lie in NumPy arrays, which are not aligned to whole vectors."""
+
 
 def write_block(writer: Any, block: Block, args: Sequence[Any]) -> BlockResults:
     """Write the instructions of a block (a loop, call or matrix product) on ``args``, values and tables.
@@ -178,7 +181,7 @@ class Table:
         return self.builder.gep(self.start, [i])
 
     def read(self, i: ir.Value) -> ir.Value:
-        value = self.builder.load(self._entry_pointer(i))
+        value = self.builder.load(self._entry_pointer(i), align=TABLE_ALIGNMENT_BYTES)
         if isinstance(self.value_type, ir.DoubleType):
             return self.writer.splat(value)
         return self.builder.trunc(value, self.value_type) if self.memory_type else value
@@ -191,7 +194,8 @@ class Table:
         gathered: Any = None
         for lane in range(lanes):
             lane_index = ir.Constant(INT32, lane)
-            value = build.load(self._entry_pointer(build.extract_element(indices, lane_index)))
+            pointer = self._entry_pointer(build.extract_element(indices, lane_index))
+            value = build.load(pointer, align=TABLE_ALIGNMENT_BYTES)
             if isinstance(value.type, ir.VectorType):
                 value = build.extract_element(value, lane_index)
             kind = ir.VectorType(value.type, lanes)
@@ -202,7 +206,7 @@ class Table:
 
     def write(self, i: ir.Value, value: ir.Value) -> None:
         value = self.builder.zext(value, self.memory_type) if self.memory_type else value
-        self.builder.store(value, self._entry_pointer(i))
+        self.builder.store(value, self._entry_pointer(i), align=TABLE_ALIGNMENT_BYTES)
 
 
 class BlockResults:

@@ -17,9 +17,11 @@ from liethermo.engines import array
 from liethermo.engines.choice import CompiledEngineWarning
 from liethermo.engines.codes import StatusCode
 from liethermo.engines.compiled import machine_code
-from liethermo.engines.compiled.stepper import CompiledEngine
+from liethermo.engines.compiled.stepper import CompiledEngine, CompiledStepLoop
 from liethermo.engines.rules import SolverOptions
 from tests.cases import DISSIPATIONS, build, state_of
+from tests.liethermo import random_systems
+from tests.machine_code import copy_at_offset
 
 BODY = lt.models.rigid_body()
 X0 = [0.001, 1.0, 0.001]
@@ -209,6 +211,25 @@ def test_parameters_are_arguments(monkeypatch):
         system = lt.LiePoissonSystem(mf.so(3), Quartic(jnp.asarray(strength)), lt.Quadratic(np.ones(3)))
         assert_equal_runs(*run_both_engines(system, [0.5, 1.0, 0.2], (0.0, 5.0), 0.1), tolerance=1e-12)
     assert len(compiled_texts) == 1
+
+
+@pytest.mark.sampled("fixed")
+@pytest.mark.parametrize("h", [0.01, lt.Adaptive(1e-6)], ids=["fixed", "adaptive"])
+def test_blocks_may_begin_at_any_number(h, monkeypatch):
+    """Members have matrices of their own in memory that is not aligned to whole vectors, as NumPy's is not."""
+    g, make_blocks = mf.se(3), CompiledStepLoop.make_blocks
+    arguments = random_systems.family(g), random_systems.states(g, 9), (0.0, 0.05), h, lt.MetriplecticMidpoint()
+
+    def final_states(offset: int) -> np.ndarray:
+        monkeypatch.setattr(
+            CompiledStepLoop, "make_blocks", lambda *fields: copy_at_offset(make_blocks(*fields), offset)
+        )
+        many = lt.ensemble(*arguments, parameters=random_systems.parameters(g, 9), engine="compiled")
+        assert many.ok.all()
+        return many.x
+
+    expected = final_states(0)
+    assert all(np.array_equal(final_states(offset), expected) for offset in range(1, 8))
 
 
 def system_with_fft():

@@ -152,6 +152,28 @@ def test_random_programs_agree(step_choices, shape_x, shape_y, seed, lanes):
         np.testing.assert_allclose(result.reshape(expected.shape), expected, rtol=1e-12, atol=1e-12, equal_nan=True)
 
 
+TABLE_PROGRAMS = {
+    "product": (lambda a, b: a @ b, (6, 6), (6, 6)),
+    "loop": (lambda a, x: jax.lax.scan(lambda s, row: (jnp.sin(s) @ row / 9.0, s), x, a), (70, 3, 3), (3,)),
+    "lookup": (lambda a, x: a[jnp.floor(x).astype(int)], (40,), (1,)),
+}
+"""Programs that read tables from memory, with the shapes of their arguments."""
+
+
+@pytest.mark.parametrize("lanes", [1, 8])
+@pytest.mark.parametrize("name", TABLE_PROGRAMS)
+def test_tables_may_begin_at_any_number(name, lanes):
+    """NumPy aligns its arrays to 16 bytes, but a vector has up to 64."""
+    f, *shapes = TABLE_PROGRAMS[name]
+    random = np.random.default_rng(0)
+    arrays = [random.uniform(0.0, 1.5, (lanes, *shape)) for shape in shapes]
+    program = program_of(f, *(a[0] for a in arrays))
+    function, expected = compiled(program, lanes), program.evaluate(*arrays, batch=True)
+    for offset in range(8):
+        for result, right in zip(function(*arrays, offset=offset), expected, strict=True):
+            np.testing.assert_allclose(result.reshape(right.shape), right, rtol=1e-13)
+
+
 def test_an_operation_without_an_instruction_is_refused():
     writer = ProgramWriter(
         ir.IRBuilder(ir.Function(ir.Module(), ir.FunctionType(FLOAT64, [FLOAT64]), "f").append_basic_block()), 1
