@@ -179,7 +179,7 @@ def test_interrupted(monkeypatch):
     def interrupt(*args):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(batches, "advance_all", interrupt)
+    monkeypatch.setattr(batches, "advance_vmapped", interrupt)
     many = lt.ensemble(BODY, states(3), (0.0, 1.0), 0.1, engine="array")
     assert [STATUS_NAMES[code] for code in many.status] == ["interrupted"] * 3
     assert not many.steps.any()

@@ -47,7 +47,7 @@ def test_the_first_of_several_in_a_step_is_found(method, until, engine):
 
 
 def test_control_without_looks_a_later_one_is_taken_for_the_first(monkeypatch):
-    monkeypatch.setattr(pacing, "event_shares", lambda order: np.zeros(0))
+    monkeypatch.setattr(pacing, "event_check_fractions", lambda order: np.zeros(0))
     method = lt.MetriplecticTaylor(19)  # which nothing has been compiled for
     arguments = (0.0, 8.0), lt.Adaptive(1e-9), method
     assert lt.integrate(OSCILLATOR, [1.0, 0.0], *arguments, until=two_levels_and_one).event_time > FIRST + 0.1

@@ -92,7 +92,7 @@ def test_newton_is_compiled_where_a_step_needs_it(monkeypatch):
     def refused(own):
         raise Needed
 
-    monkeypatch.setattr(flow_module, "iterated", refused)
+    monkeypatch.setattr(flow_module, "solve_or_nan", refused)
 
     def end(x, h=0.125):
         return jnp.sum(lt.flow(nonlinear(PARAMETERS), x, (0.0, 4 * h), h) ** 3)
@@ -367,7 +367,7 @@ def test_derivatives_found_at_once(order, monkeypatch):
 
     y = jnp.append(X0, 1.0)
     found = derived(y)
-    monkeypatch.setattr(flow_module, "DERIVATIVES", 0)
+    monkeypatch.setattr(flow_module, "MAX_FORWARD_DERIVATIVES", 0)
     through = derived(y)
     assert np.abs(found - through).max() < 1e-12 * np.abs(through).max()
     assert np.abs(through).max() > 1e-3

@@ -50,7 +50,7 @@ def test_save_every(every):
 
 def test_chunks_do_not_show(monkeypatch):
     whole = lt.integrate(BODY, X0, (0.0, 30.0), 0.1)
-    monkeypatch.setattr(array, "KEPT_STATES", 16)
+    monkeypatch.setattr(array, "MAX_SAVES_PER_CALL", 16)
     pieces = lt.integrate(BODY, X0, (0.0, 30.0), 0.1)
     assert np.array_equal(whole.x, pieces.x)
 
@@ -253,7 +253,7 @@ def test_ctrl_c_before_the_first_step(monkeypatch):
     def interrupted(*arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(array, "begin", interrupted)
+    monkeypatch.setattr(array, "initial_run_state_program", interrupted)
     solution = lt.integrate(BODY, X0, (0.0, 1.0), 0.1, engine="array")
     assert (solution.status.code, solution.x.tolist(), solution.stats.steps) == ("interrupted", [X0], 0)
 

@@ -223,7 +223,7 @@ def test_an_interruption_stops_all_groups(monkeypatch):
         calls.append(len(record.x0))
 
     calls: list[int] = []
-    monkeypatch.setattr(module, "run_compiled", interrupted)
+    monkeypatch.setattr(module, "run_fixed_compiled", interrupted)
     many = lt.ensemble(body, START, SPAN, STEP, parameters={"a": A}, engine="compiled")
     assert calls == [1]
     assert many.status.tolist() == [StatusCode.INTERRUPTED] * 3

@@ -93,9 +93,9 @@ def test_a_trajectory_does_not_depend_on_its_neighbours(engine, monkeypatch):
     assert plain.ok.all()
     same(plain, run(order), order)
     same(plain, run(np.arange(5)), slice(5))
-    monkeypatch.setattr(batches, "BATCH", 8)
-    monkeypatch.setattr(paced, "ARRAY_BATCH", 16)
-    monkeypatch.setattr(paced, "ATTEMPTS", (1, 3))
+    monkeypatch.setattr(batches, "THREAD_BATCH_SIZE", 8)
+    monkeypatch.setattr(paced, "ARRAY_BATCH_SIZE", 16)
+    monkeypatch.setattr(paced, "ATTEMPTS_PER_CALL_RANGE", (1, 3))
     same(plain, run(np.arange(41)))
 
 

@@ -149,7 +149,7 @@ def test_attempts_together_are_attempts_one_by_one(monkeypatch):
         return lt.integrate(SYSTEM, START, (0.0, 20.0), step, method, engine="compiled")
 
     together = run()
-    monkeypatch.setattr(stepwise, "TOGETHER", 1)
+    monkeypatch.setattr(stepwise, "ATTEMPTS_PER_CALL", 1)
     single = run()
     assert together.stats.steps > 100
     assert together.stats.rejected > 0
@@ -173,7 +173,7 @@ def test_the_array_engine_takes_over_amid_attempts_made_together(monkeypatch):
         raise UnsupportedPrimitive("newton", "in this test")
 
     whole = followed("array")
-    monkeypatch.setattr(compiled.CompiledStepLoop, "_solver", solver)
+    monkeypatch.setattr(compiled.CompiledStepLoop, "_newton_address", solver)
     with pytest.warns(UserWarning, match="newton"):
         parts = followed("auto")
     assert asked

@@ -35,7 +35,7 @@ def test_fixed_steps(monkeypatch, error, why):
         return advance(self, *arguments)
 
     monkeypatch.setattr(EngineWithFallback, "advance", stopped)
-    monkeypatch.setattr(EngineWithFallback, "portion", property(lambda self: 10))
+    monkeypatch.setattr(EngineWithFallback, "max_saves_per_call", property(lambda self: 10))
     whole = lt.integrate(BODY, X0, (0.0, 5.0), 0.1, engine="array")
     assert whole.status.code == "interrupted"
     assert why in whole.status.message
@@ -55,7 +55,7 @@ def test_adaptive_steps(monkeypatch):
             raise MemoryError
         return append(self, *arguments)
 
-    monkeypatch.setattr(Run, "_append", stopped)
+    monkeypatch.setattr(Run, "_save_steps", stopped)
     found = lt.integrate(BODY, X0, (0.0, 500.0), lt.Adaptive(1e-9))
     assert "no memory left" in found.status.message
     assert 1 < len(found.t) == len(found.x) == len(found.energy)
@@ -79,7 +79,7 @@ def test_the_reference_solver(monkeypatch):
             raise KeyboardInterrupt
         return field(*arguments)
 
-    monkeypatch.setattr(reference, "_field", stopped)
+    monkeypatch.setattr(reference, "_vector_field", stopped)
     found = lt.integrate(BODY, X0, (0.0, 50.0), 0.1, lt.Reference(1e-9))
     assert found.status.code == "interrupted"
     assert "stopped by the user after t =" in found.status.message
