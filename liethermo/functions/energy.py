@@ -389,7 +389,7 @@ class StateTimeEnergy(Energy):
         return jnp.concatenate([by_state, scheme.general(Function(mean_by_time), x[-1:], d[-1:], compensation[-1:])])
 
     def stage_gradients(self, scheme, path) -> jax.Array:
-        return scheme(self, path, along=_squared_gradient_weights)
+        return scheme(self, path, correction_weights=_squared_gradient_weights)
 
 
 def _squared_gradient_weights(gradients) -> jax.Array:

@@ -66,7 +66,7 @@ class Kinetic(Energy):
 
     def stage_gradients(self, scheme, path) -> jax.Array:
         size = len(path.start)
-        return scheme(self, path, along=np.arange(size) < size // 2)
+        return scheme(self, path, correction_weights=np.arange(size) < size // 2)
 
 
 class Potential(Pullback):

@@ -46,7 +46,7 @@ class TaylorSeriesError(InputError):
 
 
 def check_taylor_series(function: Callable, x) -> None:
-    """Raise NoSeriesError unless a function of an array like x has Taylor series, of which nothing is computed."""
+    """Raise TaylorSeriesError unless a function of an array like x has Taylor series, of which nothing is computed."""
     jax.eval_shape(lambda x: _Recurrences(function, x).evaluation_order and (), jnp.zeros_like(x))
 
 
@@ -58,7 +58,7 @@ def taylor_coefficients(field: Callable, x, h, order: int) -> jax.Array:
 
     Raises
     ------
-    NoSeriesError
+    TaylorSeriesError
         Where the field has none.
     """
     recurrences = _Recurrences(field, x)
@@ -116,7 +116,7 @@ class _Recurrences:
 
     Attributes
     ----------
-    terms : list of _Term
+    terms : list of _SeriesTerm
         The argument is the first.
     result : int or None
         The place of the result; None where it is ``constant``.
@@ -237,7 +237,7 @@ def _linear_rule(recurrences: _Recurrences, eqn, values) -> list:
 
     rising = all(recurrences.terms[place].starts_at_zero for place in moving)
     return [
-        recurrences.add_term(start, _select_output(rule, which), moving, rising=rising)
+        recurrences.add_term(start, _select_output(rule, which), moving, starts_at_zero=rising)
         for which, start in enumerate(_evaluate_equation(eqn, map(recurrences.initial_value, values)))
     ]
 
@@ -270,7 +270,7 @@ def _bilinear_rule(recurrences: _Recurrences, eqn, values) -> list:
                 rule,
                 now,
                 (a.term_index, b.term_index),
-                rising=recurrences.starts_at_zero(a) or recurrences.starts_at_zero(b),
+                starts_at_zero=recurrences.starts_at_zero(a) or recurrences.starts_at_zero(b),
             )
         ]
     moving = a if isinstance(a, _SeriesIndex) else b
@@ -278,7 +278,7 @@ def _bilinear_rule(recurrences: _Recurrences, eqn, values) -> list:
     def single(n, number, now, past):
         return _evaluate_equation(eqn, [now[0] if value is moving else value for value in values])[0]
 
-    return [recurrences.add_term(start, single, (moving.term_index,), rising=recurrences.starts_at_zero(moving))]
+    return [recurrences.add_term(start, single, (moving.term_index,), starts_at_zero=recurrences.starts_at_zero(moving))]
 
 
 def _solve_bilinear(recurrences: _Recurrences, start, product: Callable, solve: Callable, a: _SeriesIndex, b) -> list:
@@ -290,7 +290,7 @@ def _solve_bilinear(recurrences: _Recurrences, start, product: Callable, solve: 
         rest = cauchy_product(product, past[0], past[1], n)  # without coefficient n of c, which is zero yet
         return solve(now[0] - rest if moving else -rest)
 
-    return [recurrences.add_term(start, rule, now, (a.term_index, len(recurrences.terms)), rising=rising)]
+    return [recurrences.add_term(start, rule, now, (a.term_index, len(recurrences.terms)), starts_at_zero=rising)]
 
 
 def _division_rule(recurrences: _Recurrences, eqn, values) -> list:
@@ -415,7 +415,7 @@ MAX_INTEGER_PARAMETER = 6
 
 def _euler_derivative(recurrences: _Recurrences, a: _SeriesIndex) -> _SeriesIndex:
     zero = jnp.zeros_like(recurrences.initial_value(a))
-    return recurrences.add_term(zero, lambda n, number, now, past: number * now[0], (a.term_index,), rising=True)
+    return recurrences.add_term(zero, lambda n, number, now, past: number * now[0], (a.term_index,), starts_at_zero=True)
 
 
 def _power_derivative(recurrences: _Recurrences, y: _SeriesIndex, a, p) -> list:
