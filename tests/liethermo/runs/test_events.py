@@ -100,7 +100,7 @@ def test_the_edge_of_a_hole_is_no_event(order, engine, step):
     for w in (1e-3, 0.01, 0.02, 0.05, 0.1, 0.3):
         found = watched(hole(w), step, engine, order)
         assert (found.status.code, found.event_time) == ("non_finite", None), w
-        assert "the event function is not a number" in found.status.message
+        assert "the event function is NaN near" in found.status.message
         assert found.t[-1] == pytest.approx(HALF, abs=0.11 + 2 * w)
 
 
@@ -230,5 +230,5 @@ def test_a_study_of_bodies_whose_energy_falls():
 
 def test_what_does_not_relax_has_no_relaxed_state():
     free = lt.LiePoissonSystem(mf.so(3), lt.Quadratic([0.3, 0.5, 1.0]))
-    with pytest.raises(lt.InputError, match="the entropy production or the fall of the energy"):
+    with pytest.raises(lt.InputError, match="produces entropy or loses energy"):
         lt.integrate(free, [1.0, 0.3, 0.5], (0.0, 1.0), 0.1, until=lt.Relaxed(1e-8))

@@ -88,11 +88,11 @@ def test_no_noise_is_the_run_without_to_the_bit():
 def test_noise_and_motion_are_checked():
     report = BATH.check(spin())
     assert report.passed
-    assert "no: what the states tend to" not in str(report)
+    assert "no: the equilibrium measure" not in str(report)
     shrinking = damped(SPHERE, field, poisson=lambda x: (1.0 + 0.5 * x[0]) * spins(x))  # a Poisson tensor too
-    assert "no: what the states tend to" in str(BATH.check(shrinking))
+    assert "no: the equilibrium measure" in str(BATH.check(shrinking))
     density = lt.Fluctuations(1.0, temperature=T, density=lambda x: -jnp.log(1.0 + 0.5 * x[0]))
-    assert "no: what the states tend to" not in str(density.check(shrinking))
+    assert "no: the equilibrium measure" not in str(density.check(shrinking))
 
 
 def test_what_has_no_noise():
