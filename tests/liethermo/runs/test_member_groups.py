@@ -123,7 +123,7 @@ def test_a_control_one_verdict_for_all_is_found(monkeypatch):
         mf.so(3), lt.Quadratic([1.0, 2.0, 3.0]), lambda m: jnp.log(1 + m @ m), lt.KillingDissipation(0.3)
     )
     assert lt.testing.check_relations(system, lt.MetriplecticGauss(1), START, 0.1, relations=["company"]).passed
-    monkeypatch.setattr("liethermo.runs.ensemble.groups_of", of_first)
+    monkeypatch.setattr("liethermo.runs.ensemble.group_members", of_first)
     with pytest.raises(lt.testing.PropertyError, match="company"):
         lt.testing.check_relations(system, lt.MetriplecticGauss(1), START, 0.1, relations=["company"])
 

@@ -108,7 +108,7 @@ def test_an_adaptive_run_takes_no_more_than_it_may(monkeypatch):
         lt.integrate(body, x0, (0.0, 50.0), lt.Adaptive(1e-8, most_steps=20), lt.MetriplecticGauss(2))
     with pytest.raises(lt.InputError, match="most_steps must be"):
         lt.Adaptive(most_steps=0)
-    monkeypatch.setattr("liethermo.runs.run.MOST_KEPT", 60)
+    monkeypatch.setattr("liethermo.runs.run.MAX_STORED_VALUES", 60)
     solution = lt.integrate(body, x0, (0.0, 50.0), lt.Adaptive(1e-8), **few)
     assert "save_every or save_at" in solution.status.message
     assert solution.stats.steps == 20

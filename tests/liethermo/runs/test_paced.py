@@ -234,7 +234,7 @@ def test_interrupted(monkeypatch):
     def interrupt(*args):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("liethermo.engines.paced._follow_all", interrupt)
+    monkeypatch.setattr("liethermo.engines.paced._advance_batch_program", interrupt)
     many = lt.ensemble(BODY, states(3), SPAN, lt.Adaptive(1e-6), METHOD, engine="array")
     assert many.status.tolist() == [StatusCode.INTERRUPTED] * 3
     assert not many.steps.any()
