@@ -78,7 +78,7 @@ class MatterExchange(Dissipation):
         numbers, heated, carried = (
             np.array([getattr(e, name) for e in self.processes]) for name in ("stoichiometry", "heated", "carried")
         )
-        N, S = system.poisson.particle_indices.N, system.poisson.places.S
+        N, S = system.poisson.particle_indices.N, system.poisson.state_indices.S
         mu, T = dH[N], dH[S]
         T, touched = jnp.where(T > 0.0, T, jnp.nan), np.abs(carried)
         affinity = -(numbers @ mu)
