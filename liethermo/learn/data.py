@@ -96,7 +96,8 @@ def _checked_trajectory(number: int, t, x, system: System, observation: Observat
             )
             row = int(non_finite_indices[0][0])
             raise InputError(
-                f"{name_of_trajectory}: {component_text}{name} {row} is {values[tuple(non_finite_indices[0])]}; leave that row out"
+                f"{name_of_trajectory}: {component_text}{name} {row} is {values[tuple(non_finite_indices[0])]}. "
+                "Leave out this row"
             )
     decreasing_indices = np.flatnonzero(np.diff(t) <= 0.0)
     if len(decreasing_indices):

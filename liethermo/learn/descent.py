@@ -64,8 +64,11 @@ def soap_optimiser(shapes: Sequence[tuple[int, ...]], rate: Callable) -> Any:
 
     def update(gradient, state, vector=None):
         count, mean, square, sides = state
-        means = [[MEAN_DECAY * S + (1.0 - MEAN_DECAY) * P for (_, S), P in zip(pair, _gram_matrices(gradient[indices].reshape(shape)),
-                  strict=True)] for (indices, shape), pair in zip(matrices, sides, strict=True)]  # fmt: skip
+        grams = [_gram_matrices(gradient[indices].reshape(shape)) for indices, shape in matrices]
+        means = [
+            [MEAN_DECAY * S + (1.0 - MEAN_DECAY) * P for (_, S), P in zip(pair, products, strict=True)]
+            for pair, products in zip(sides, grams, strict=True)
+        ]
         mean_decays, square_decays = moment_decays(gradient.size)
         rotated_slope, mean = (
             _rotate_matrices(gradient, matrices, sides),

@@ -173,7 +173,8 @@ class Training:
         ]
         if undetermined:
             messages.append(
-                f"the data do not determine {', '.join(undetermined)}: give more data, or leave known numbers out of the fit"
+                f"the data do not determine {', '.join(undetermined)}: give more data, or leave known numbers out of "
+                "the fit"
             )
         if self.noise.size and self.residual > MAX_RESIDUAL_TO_NOISE:
             messages.append(
@@ -190,7 +191,8 @@ class Training:
                 last_loss, held_out_loss = self.loss[indices[-1]], self.validation[indices[-1]]
                 held_out_text = "" if np.isnan(held_out_loss) else f", held out {held_out_loss:.2e}"
                 lines.append(
-                    f"{name}: loss {self.loss[indices[0]]:.2e} to {last_loss:.2e}{held_out_text}; {ending}{self._late_decrease(indices)}"
+                    f"{name}: loss {self.loss[indices[0]]:.2e} to {last_loss:.2e}{held_out_text}; {ending}"
+                    f"{self._late_decrease(indices)}"
                 )
         if self.noise.size:
             min_noise, max_noise = float(self.noise.min()), float(self.noise.max())

@@ -167,8 +167,8 @@ T, X = np.linspace(0.0, 1.0, 5), np.arange(15.0).reshape(5, 3)
         ((T, X), {"observed": [0, 1]}, "2 components are observed"),
         ((T, np.ones((5, 3))), {}, "nothing moves"),
         ((T, X), {"noise": -1.0}, "positive standard deviation"),
-        ((T, X), {"matching": -1}, "matching is an integer >= 0"),
-        ((T, X), {"validation": 1.0}, "share from 0 to below 1"),
+        ((T, X), {"matching": -1}, "matching must be an integer >= 0"),
+        ((T, X), {"validation": 1.0}, "fraction from 0 to below 1"),
         ({"t": T}, {}, "pair"),
         ([], {}, "no trajectories"),
         ("records.csv", {}, "pair"),
@@ -184,10 +184,10 @@ T, X = np.linspace(0.0, 1.0, 5), np.arange(15.0).reshape(5, 3)
         ((T, X), {"observed": [[0], [1, 2]]}, "sequence of different component numbers"),
         ((T, X), {"noise": "some"}, "positive standard deviation"),
         ((T, X), {"noise": [0.1, 0.1]}, "one for each of 3 components"),
-        ((T, X), {"validation": "a fifth"}, "share from 0 to below 1"),
-        ((T, X), {"rate": float("nan")}, "rate is a positive number"),
-        ((T, X), {"method": "RK4"}, "method is a OneStepMethod"),
-        ((T, X), {"batch": 0}, "batch is an integer >= 1"),
+        ((T, X), {"validation": "a fifth"}, "fraction from 0 to below 1"),
+        ((T, X), {"rate": float("nan")}, "rate must be a positive number"),
+        ((T, X), {"method": "RK4"}, "method must be a OneStepMethod"),
+        ((T, X), {"batch": 0}, "batch must be an integer >= 1"),
     ],
 )
 def test_bad_data_has_an_error_of_one_line(data, how, words):
@@ -203,7 +203,7 @@ def test_a_system_of_which_nothing_is_learned_is_refused():
 
 
 def test_what_is_no_system_is_refused():
-    with pytest.raises(lt.InputError, match="fit takes a system"):
+    with pytest.raises(lt.InputError, match="fit needs a system"):
         lt.learn.fit(lambda x: x, (T, X))
 
 
@@ -281,7 +281,7 @@ def test_components_and_a_function_of_the_state_are_one_mechanism():
         ({"observe": lambda x: x[:, 0]}, "could not be evaluated"),
         ({"observe": lambda x: 1}, "real numbers"),
         ({"observe": lambda x: x[:2]}, r"shape \(5, 3\), but observe returns shape \(2,\)"),
-        ({"observe": lambda x: x, "validation": 0.5}, "no start that is known"),
+        ({"observe": lambda x: x, "validation": 0.5}, "initial values of unobserved components"),
     ],
 )
 def test_an_observation_that_cannot_be_used_has_an_error_of_one_line(how, words):

@@ -153,7 +153,7 @@ def test_a_number_that_moves_nothing_is_called_so():
 
 def test_a_model_that_cannot_describe_the_data_is_called_so():
     data = [(t, x + 0.3 * np.sin(3.0 * t)[:, None]) for t, x in records(0)]
-    with pytest.warns(lt.learn.FitWarning, match=r"times the noise: the model cannot describe them"):
+    with pytest.warns(lt.learn.FitWarning, match=r"times the noise: the model cannot describe the data"):
         found = lt.learn.fit(spring(0.5), data, positive=rate_of, noise=NOISE, **FEW)
     assert found.training.residual > 3.0
 

@@ -195,8 +195,8 @@ def test_noise_inside_a_body_keeps_its_momentum_in_space(engine):
     [
         ({"boltzmann": -1.0}, "boltzmann must be finite and >= 0"),
         ({"boltzmann": "much"}, "one number"),
-        ({"seed": -1}, "seed is an integer"),
-        ({"seed": 0.5}, "seed is an integer"),
+        ({"seed": -1}, "seed must be an integer"),
+        ({"seed": 0.5}, "seed must be an integer"),
         ({"seed": (1, 2, 1)}, "trajectories 0 and 2 have the same seed 1"),
         ({"temperature": -2.0}, "temperature"),
         ({"first": -1}, "first is an integer"),
