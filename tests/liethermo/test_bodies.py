@@ -35,19 +35,19 @@ def free(inertia, mu0, t_end, times=None, rate=0.0):
 def test_periods_against_an_integration(mu0, order):
     """After a period the momentum is back, and the axis has turned about L by its mean rate times the period."""
     inertia, mu0 = ASYMMETRIC[list(order)], np.array(mu0)[list(order)]
-    found = lt.bodies.periods(inertia, mu0)
-    run = free(inertia, mu0, float(found.rotation))
+    periods = lt.bodies.periods(inertia, mu0)
+    run = free(inertia, mu0, float(periods.rotation))
     mu, g = run.y[:3, -1], run.y[3:, -1].reshape(3, 3)
     assert np.allclose(mu, mu0, rtol=0, atol=3e-12)
     back = Rotation.from_matrix(g).as_rotvec()  # the whole turns about the momentum in space
     L = mu0 / np.linalg.norm(mu0)
-    turned = 2 * np.pi * found.rotation / found.precession
+    turned = 2 * np.pi * periods.rotation / periods.precession
     assert np.linalg.norm(np.cross(back, L)) < 3e-12
     assert abs(np.sin(0.5 * (back @ L - turned))) < 3e-12
-    axis = order[found.axis]
+    axis = order[periods.axis]
     assert axis == (2 if abs(mu0[list(order).index(2)]) > 0.9 else 0)
     by_energy = lt.bodies.periods(inertia, np.linalg.norm(mu0), 0.5 * np.sum(mu0**2 / inertia))
-    assert np.allclose([*found[:2]], [*by_energy[:2]], rtol=1e-12)
+    assert np.allclose([*periods[:2]], [*by_energy[:2]], rtol=1e-12)
 
 
 def test_periods_in_their_limits():
@@ -58,9 +58,9 @@ def test_periods_in_their_limits():
     separatrix = lt.bodies.periods(ASYMMETRIC, 1.0, 1.0 / (2 * 2.0))
     assert np.isinf(separatrix.rotation)
     assert separatrix.precession == pytest.approx(2 * np.pi * 2.0)
-    many = lt.bodies.periods(ASYMMETRIC, np.array([[0.3, 0.2, 1.0], [1.0, 0.3, -0.2]]))
-    assert many.rotation.shape == many.axis.shape == (2,)
-    assert many.axis.tolist() == [2, 0]
+    periods = lt.bodies.periods(ASYMMETRIC, np.array([[0.3, 0.2, 1.0], [1.0, 0.3, -0.2]]))
+    assert periods.rotation.shape == periods.axis.shape == (2,)
+    assert periods.axis.tolist() == [2, 0]
     for energy, momentum in ((7.0, 1.0), (0.1, 1.0)):
         with pytest.raises(lt.InputError, match="has an energy from") as error:
             lt.bodies.periods(ASYMMETRIC, momentum, energy)
@@ -104,9 +104,9 @@ def test_angles_of_a_free_round_body():
 def test_what_files_tell(tmp_path):
     body = lt.models.tumbling_body((3.0, 2.0, 1.5), rate=0.1)
     run = lt.integrate(body, (0.06, 0.1, 1.0), (0.0, 5.0), 0.1)
-    again = lt.load(run.save(tmp_path / "run.nc"))
+    loaded_run = lt.load(run.save(tmp_path / "run.nc"))
     for told in (lt.bodies.nutation, lt.bodies.precession, lt.bodies.spin, lt.bodies.quaternions):
-        assert np.array_equal(told(again), told(run))
+        assert np.array_equal(told(loaded_run), told(run))
 
 
 def test_a_rod_has_its_nutation_from_its_own_axis():
@@ -208,9 +208,9 @@ def test_a_tensor_is_one_body():
     assert np.allclose([*one], [*other], rtol=1e-12)
     by_energy = lt.bodies.periods(TENSOR, np.linalg.norm(mu), 0.5 * np.sum(mu**2 / [2.0, 2.5, 3.0]))
     assert np.allclose([*by_energy], [*other], rtol=1e-12)
-    many = lt.bodies.periods(np.stack([TENSOR, np.diag([1.0, 2.0, 2.5])]), np.stack([TURNED @ mu, mu]))
-    assert np.allclose(many.rotation[0], other.rotation, rtol=1e-12)
-    assert np.allclose(many.rotation[1], lt.bodies.periods((1.0, 2.0, 2.5), mu).rotation, rtol=1e-12)
+    periods = lt.bodies.periods(np.stack([TENSOR, np.diag([1.0, 2.0, 2.5])]), np.stack([TURNED @ mu, mu]))
+    assert np.allclose(periods.rotation[0], other.rotation, rtol=1e-12)
+    assert np.allclose(periods.rotation[1], lt.bodies.periods((1.0, 2.0, 2.5), mu).rotation, rtol=1e-12)
     assert float(lt.bodies.rate_of(3.0, TENSOR, 1.0)) == pytest.approx(float(lt.bodies.rate_of(3.0, (2, 2.5, 3), 1.0)))
     moments, axes = lt.bodies.principal_axes(TENSOR)
     assert np.allclose(moments, [2.0, 2.5, 3.0], rtol=1e-14)
@@ -221,9 +221,9 @@ def test_a_tensor_is_one_body():
 def test_three_bodies_are_three_bodies():
     """Moments that happen to make a symmetric array, which is then no tensor of a rigid body."""
     three = np.array([[2.0, 3.0, 4.0], [3.0, 4.0, 2.0], [4.0, 2.0, 3.0]])
-    found = lt.bodies.periods(three, 1.0, 0.5 / 2.5)
-    alone = [lt.bodies.periods(body, 1.0, 0.5 / 2.5).rotation for body in three]
-    assert np.array_equal(found.rotation, alone)
+    periods = lt.bodies.periods(three, 1.0, 0.5 / 2.5)
+    single_runs = [lt.bodies.periods(body, 1.0, 0.5 / 2.5).rotation for body in three]
+    assert np.array_equal(periods.rotation, single_runs)
     assert lt.bodies.rate_of(1.0, np.ones((3, 3)) * [1.0, 1.5, 2.0], 1.0).shape == (3,)
     equal = [[3.0, 2.0, 2.0], [2.0, 3.0, 2.0], [2.0, 2.0, 3.0]]  # positive definite, and its rows are bodies
     assert lt.bodies.rate_of(1.0, equal, 1.0).shape == (3,)

@@ -42,7 +42,7 @@ def test_other_parameters_of_any_system_are_found():
     body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
     runs = [lt.integrate(body, x0, (0.0, 6.0), 0.1, method=lt.MetriplecticRungeKutta(6)) for x0 in np.eye(3) + 0.3]
     start = lt.models.rigid_body((2.5, 2.2, 1.3), rate=0.5)
-    found = lt.learn.fit(
+    fitted_system = lt.learn.fit(
         start,
         runs,
         matching=1500,
@@ -51,16 +51,16 @@ def test_other_parameters_of_any_system_are_found():
         validation=0,
         positive=lambda s: (s.energy.A, s.dissipation.rate),
     )
-    np.testing.assert_allclose(1.0 / found.energy.A, [3.0, 2.0, 1.0], rtol=1e-2)
-    assert float(found.dissipation.rate) == pytest.approx(float(body.dissipation.rate), rel=1e-2)
+    np.testing.assert_allclose(1.0 / fitted_system.energy.A, [3.0, 2.0, 1.0], rtol=1e-2)
+    assert float(fitted_system.dissipation.rate) == pytest.approx(float(body.dissipation.rate), rel=1e-2)
 
 
 def test_a_network_learns_the_force_and_the_laws_hold_in_the_forecast():
     t, x = cases.record(8)
     energy = lt.Quadratic(np.ones(1)).on([1]) + lt.learn.Energy(1, width=8, depth=1).on([0]) + _Heat().on([2])
     system = cases.oscillator(energy=energy, gamma=0.5)
-    found = lt.learn.fit(system, (t, x), matching=600, shooting=50, rate=0.02)
-    run = lt.integrate(found, x[0, 0], (0.0, 4.0), 0.1, method=lt.MetriplecticRungeKutta(4))
+    fitted_system = lt.learn.fit(system, (t, x), matching=600, shooting=50, rate=0.02)
+    run = lt.integrate(fitted_system, x[0, 0], (0.0, 4.0), 0.1, method=lt.MetriplecticRungeKutta(4))
     assert np.abs(run.x - x[0]).max() < 0.05  # 0.012
     assert np.ptp(run.energy) < 1e-14 * np.abs(run.energy).max() + 1e-14
     assert (np.diff(run.entropy) > 0.0).all()
@@ -74,7 +74,7 @@ def test_the_same_twice_and_on_from_a_checkpoint(tmp_path, monkeypatch):
     t, x = cases.record()
     how = {"matching": 150, "shooting": 100, "rate": 0.05, "window": 2}
     system = cases.oscillator()
-    whole = lt.learn.fit(system, (t, x), **how)
+    whole_run = lt.learn.fit(system, (t, x), **how)
 
     class Interrupted(training.Progress):
         stop = np.inf
@@ -87,13 +87,13 @@ def test_the_same_twice_and_on_from_a_checkpoint(tmp_path, monkeypatch):
     monkeypatch.setattr(training, "Progress", Interrupted)
     for stop in (100, 200, np.inf):  # in the matching, in the shooting, not at all
         Interrupted.stop = stop
-        found = lt.learn.fit(system, (t, x), checkpoint=path, **how)
-    assert "interrupted" not in found.training.ended.values()
-    for a, b in zip(jax.tree_util.tree_leaves(whole), jax.tree_util.tree_leaves(found), strict=True):
+        fitted_system = lt.learn.fit(system, (t, x), checkpoint=path, **how)
+    assert "interrupted" not in fitted_system.training.ended.values()
+    for a, b in zip(jax.tree_util.tree_leaves(whole_run), jax.tree_util.tree_leaves(fitted_system), strict=True):
         np.testing.assert_array_equal(a, b)
-    np.testing.assert_array_equal(whole.training.loss, found.training.loss)
+    np.testing.assert_array_equal(whole_run.training.loss, fitted_system.training.loss)
     other = lt.learn.fit(system, (t, x), **{**how, "shooting": 0}, seed=1)
-    assert not np.array_equal(whole.training.loss[:3], other.training.loss)
+    assert not np.array_equal(whole_run.training.loss[:3], other.training.loss)
     with pytest.raises(lt.FileError, match="the checkpoint of a fit of another model"):
         lt.learn.fit(system, (t, x), checkpoint=path, **{**how, "rate": 0.06})
 
@@ -104,8 +104,8 @@ def test_units_make_no_difference():
     seen = []
     for time, size in ((1.0, 1.0), (1e-12, 1e12), (1e20, 1e-20)):
         system = lt.learn.Metriplectic(3, width=4, depth=1)
-        found = lt.learn.fit(system, (time * t, size * x), matching=50, shooting=0)
-        seen.append(np.r_[found.training.loss, found.training.validation])
+        fitted_system = lt.learn.fit(system, (time * t, size * x), matching=50, shooting=0)
+        seen.append(np.r_[fitted_system.training.loss, fitted_system.training.validation])
     np.testing.assert_allclose(seen[1:], [seen[0]] * 2, rtol=1e-6)
 
 
@@ -114,9 +114,9 @@ def test_what_is_not_observed_is_known_through_the_laws():
     t, x = cases.record(3, 31, 3.0)
     energy = lt.learn.Energy(_Bath(jnp.zeros(())))
     system = cases.oscillator(energy=energy, friction=lt.learn.Friction(3, function=_Drag(jnp.zeros(()))))
-    found = lt.learn.fit(system, (t, x[..., :2]), observed=[0, 1], shooting=400, rate=0.1, window=5)
-    stiffness = np.exp(float(found.energy.function.function.log_stiffness))
-    drag = np.exp(float(found.dissipation.function.function.log_gamma))
+    fitted_system = lt.learn.fit(system, (t, x[..., :2]), observed=[0, 1], shooting=400, rate=0.1, window=5)
+    stiffness = np.exp(float(fitted_system.energy.function.function.log_stiffness))
+    drag = np.exp(float(fitted_system.dissipation.function.function.log_gamma))
     np.testing.assert_allclose([stiffness, drag], [cases.STIFFNESS, cases.GAMMA], rtol=0.02)
 
 
@@ -139,17 +139,17 @@ def test_noise_and_times_at_any_distances():
     for states in x:
         kept = np.sort(random.choice(len(t), 60, replace=False))
         data.append((t[kept], states[kept] + 0.01 * random.standard_normal((60, 3))))
-    found = lt.learn.fit(cases.oscillator(), data, noise=0.01, matching=150, shooting=200, rate=0.1, window=8)
-    np.testing.assert_allclose(_numbers(found), [cases.STIFFNESS, cases.GAMMA], rtol=0.03)
-    last = found.training.loss[-1]
+    fitted_system = lt.learn.fit(cases.oscillator(), data, noise=0.01, matching=150, shooting=200, rate=0.1, window=8)
+    np.testing.assert_allclose(_numbers(fitted_system), [cases.STIFFNESS, cases.GAMMA], rtol=0.03)
+    last = fitted_system.training.loss[-1]
     assert 0.3 < last < 3.0  # of the size of the noise
 
 
 def test_early_stopping_keeps_the_best():
     t, x = cases.record()
-    found = lt.learn.fit(cases.oscillator(2.0, 0.3), (t, x), matching=2000, shooting=0, rate=1e-9, patience=2)
-    assert found.training.step[-1] < 2000
-    assert "no better for 2 looks" in found.training.ended["matching"]
+    fitted_system = lt.learn.fit(cases.oscillator(2.0, 0.3), (t, x), matching=2000, shooting=0, rate=1e-9, patience=2)
+    assert fitted_system.training.step[-1] < 2000
+    assert "no better for 2 looks" in fitted_system.training.ended["matching"]
 
 
 T, X = np.linspace(0.0, 1.0, 5), np.arange(15.0).reshape(5, 3)
@@ -244,7 +244,7 @@ def test_the_first_states_show_the_attitudes_and_move_as_they_do():
 def test_a_body_is_found_from_its_attitudes_alone():
     """Up to the unit of momenta, which attitudes do not tell."""
     with pytest.warns(lt.learn.FitWarning, match=r"the data do not determine energy.body.A\[0\]"):
-        found = lt.learn.fit(
+        fitted_system = lt.learn.fit(
             lt.models.tumbling_body((2.5, 2.0, 1.2), rate=0.1),
             _attitudes(1e-3),
             observe=lambda x, R: R,
@@ -254,10 +254,10 @@ def test_a_body_is_found_from_its_attitudes_alone():
             window=10,
             positive=lambda s: (s.energy.body.A, s.dissipation.part.rate),
         )
-    assert (found.training.rank, found.training.parameters) == (3, 4)
-    inertia = 1.0 / np.asarray(found.energy.body.A)
+    assert (fitted_system.training.rank, fitted_system.training.parameters) == (3, 4)
+    inertia = 1.0 / np.asarray(fitted_system.energy.body.A)
     np.testing.assert_allclose(inertia / inertia[2], [3.0, 2.0, 1.0], rtol=0.02)
-    assert float(found.dissipation.part.rate) * inertia[2] == pytest.approx(0.08, rel=0.1)
+    assert float(fitted_system.dissipation.part.rate) * inertia[2] == pytest.approx(0.08, rel=0.1)
 
 
 def test_components_and_a_function_of_the_state_are_one_mechanism():

@@ -90,8 +90,8 @@ def test_a_plain_step_is_the_step_but_for_rounding(order):
     run, method = prepare_for_method(system, lt.MetriplecticRungeKutta(order))
     plain = jax.jit(lambda h: method.step_without_compensation(run, x, h))
     for h in (0.2, 0.1):
-        whole = lt.flow(system, x, (0.0, h), h, method=lt.MetriplecticRungeKutta(order))
-        assert np.abs(plain(h) - whole).max() < 10.0 * h ** (2 * order + 2) + 1e-15
+        whole_run = lt.flow(system, x, (0.0, h), h, method=lt.MetriplecticRungeKutta(order))
+        assert np.abs(plain(h) - whole_run).max() < 10.0 * h ** (2 * order + 2) + 1e-15
 
 
 @pytest.mark.parametrize(

@@ -79,8 +79,8 @@ def test_the_energy_is_conserved_in_every_derivative():
 def test_a_batch():
     states = jnp.asarray(np.random.default_rng(0).standard_normal((4, 3)))
     ends = jax.jit(jax.vmap(lambda x: lt.flow(body(PARAMETERS), x, (0.0, 2.0), 0.1)))(states)
-    alone = lt.ensemble(body(PARAMETERS), states, (0.0, 2.0), 0.1).x
-    assert np.abs(ends - alone).max() < 1e-13
+    single_runs = lt.ensemble(body(PARAMETERS), states, (0.0, 2.0), 0.1).x
+    assert np.abs(ends - single_runs).max() < 1e-13
 
 
 def test_newton_is_compiled_where_a_step_needs_it(monkeypatch):
@@ -134,13 +134,13 @@ def test_a_system_that_closes_over_tracers(entropy):
 
     p, d = jnp.array([0.3, 0.5]), jnp.array([1e-4, -2e-4])
     difference = 0.5 * (speed(p + d) - speed(p - d))
-    for found in (
+    for derivative in (
         jax.jacfwd(speed)(p) @ d,
         jax.jacrev(speed)(p) @ d,
         jax.jit(jax.jacfwd(speed))(p) @ d,
         0.5 * jnp.array([1.0, -1.0]) @ jax.vmap(speed)(jnp.stack([p + d, p - d])),
     ):
-        assert np.abs(found - difference).max() < 1e-10
+        assert np.abs(derivative - difference).max() < 1e-10
     seen = []
     jax.eval_shape(lambda p: seen.append(closed(p, entropy).energy.is_quadratic), p)
     assert seen == [False]
@@ -326,12 +326,12 @@ def test_the_derivative_at_an_equilibrium(method):
     system = lt.LiePoissonSystem(mf.so(3), energy, lambda m: jnp.log(1.0 + jnp.dot(m, m)), friction)
     x, h = jnp.array([1.0, 0.0, 0.0]), 0.1
     end = jax.jit(lambda y: lt.flow(system, y, (0.0, h), h, method))
-    found = np.asarray(jax.jit(jax.jacfwd(end))(x))
+    derivative = np.asarray(jax.jit(jax.jacfwd(end))(x))
     steps = 1e-5 * np.eye(3)
     differences = np.stack([(np.asarray(end(x + d)) - np.asarray(end(x - d))) / 2e-5 for d in steps], axis=1)
-    assert np.abs(found - differences).max() <= 1e-8
+    assert np.abs(derivative - differences).max() <= 1e-8
     exact = scipy.linalg.expm(h * np.asarray(jax.jacfwd(system.vector_field)(x)))
-    assert np.abs(found - exact).max() <= 0.02 * h ** (method.order + 1)
+    assert np.abs(derivative - exact).max() <= 0.02 * h ** (method.order + 1)
     assert np.abs(exact - np.eye(3)).max() > 0.01
 
 
@@ -342,11 +342,11 @@ def test_a_system_has_the_parameters_of_the_object_whose_method_is_its_energy():
         system = lt.LiePoissonSystem(mf.so(3), energy=lt.Quadratic(jnp.diag(factor / jnp.array([3.0, 2.0, 1.0]))).value)
         return lt.flow(system, jnp.array([0.3, 0.5, 0.2]), (0.0, 0.3), 0.1)
 
-    found = jax.jacfwd(end)(jnp.ones(3))
+    derivative = jax.jacfwd(end)(jnp.ones(3))
     h = 1e-6
     columns = [(end(jnp.ones(3) + h * e) - end(jnp.ones(3) - h * e)) / (2 * h) for e in np.eye(3)]
-    assert np.abs(found - np.stack(columns, axis=1)).max() < 1e-9
-    assert np.abs(found).max() > 1e-3
+    assert np.abs(derivative - np.stack(columns, axis=1)).max() < 1e-9
+    assert np.abs(derivative).max() > 1e-3
 
 
 @pytest.mark.slow

@@ -49,10 +49,10 @@ def test_save_every(every):
 
 
 def test_chunks_do_not_show(monkeypatch):
-    whole = lt.integrate(BODY, X0, (0.0, 30.0), 0.1)
+    whole_run = lt.integrate(BODY, X0, (0.0, 30.0), 0.1)
     monkeypatch.setattr(array, "MAX_SAVES_PER_CALL", 16)
     pieces = lt.integrate(BODY, X0, (0.0, 30.0), 0.1)
-    assert np.array_equal(whole.x, pieces.x)
+    assert np.array_equal(whole_run.x, pieces.x)
 
 
 def test_runs_are_reproducible_and_pure():
@@ -211,10 +211,10 @@ def test_nan_midway_keeps_what_was_computed():
 @pytest.mark.parametrize("every", [1, 7, 10_000])
 def test_on_failure_return(every):
     solution = lt.integrate(domain_system(), X0, (0.0, 500.0), 0.1, save_every=every, on_failure="return")
-    whole = lt.integrate(domain_system(), X0, (0.0, 500.0), 0.1, on_failure="return")
-    assert str(solution.status) == str(whole.status)
-    assert np.array_equal(solution.x[-1], whole.x[-1])  # the last good state, between two saves too
-    assert solution.t[-1] == whole.t[-1]
+    whole_run = lt.integrate(domain_system(), X0, (0.0, 500.0), 0.1, on_failure="return")
+    assert str(solution.status) == str(whole_run.status)
+    assert np.array_equal(solution.x[-1], whole_run.x[-1])  # the last good state, between two saves too
+    assert solution.t[-1] == whole_run.t[-1]
 
 
 def test_the_reference_method_reports_failure_too():

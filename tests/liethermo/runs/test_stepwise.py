@@ -88,13 +88,13 @@ def test_the_estimate_of_the_local_error(stages, h):
 @pytest.mark.slow
 def test_the_estimate_scales_with_the_motion():
     """Near a relative equilibrium the error shrinks with the amplitude of what moves, not with the state."""
-    free, method, h = lt.models.free_rigid_body(), lt.MetriplecticGauss(2), 0.4
+    body, method, h = lt.models.free_rigid_body(), lt.MetriplecticGauss(2), 0.4
     methods = method, lt.MetriplecticGauss(5)
     ratios = []
     for amplitude in (1e-1, 1e-3, 1e-5):
         x = np.array([amplitude, 0.0, 1.0])
-        new, right = (e.step(e.initial_run_state(x), h) for e in (compiled.CompiledEngine(free, m) for m in methods))
-        estimate = method.error(free, x, np.zeros(3), h, new.k)
+        new, right = (e.step(e.initial_run_state(x), h) for e in (compiled.CompiledEngine(body, m) for m in methods))
+        estimate = method.error(body, x, np.zeros(3), h, new.k)
         ratios.append(float(estimate) / np.abs(new.x - right.x).max())
     assert max(ratios) < 1.5 * min(ratios), ratios
 
@@ -111,8 +111,8 @@ def test_steps_grow_as_a_body_relaxes():
 
 def test_steps_do_not_chatter():
     """In a steady rotation the step settles: it is changed in few of the steps, and nothing is rejected."""
-    free = lt.models.free_rigid_body()
-    solution = lt.integrate(free, [0.5, 0.0, 0.9], (0.0, 200.0), lt.Adaptive(1e-7), lt.MetriplecticGauss(3))
+    body = lt.models.free_rigid_body()
+    solution = lt.integrate(body, [0.5, 0.0, 0.9], (0.0, 200.0), lt.Adaptive(1e-7), lt.MetriplecticGauss(3))
     steps = np.diff(solution.t)[5:-3]
     assert (np.abs(np.diff(steps)) > 1e-9 * steps[1:]).mean() < 0.5
     assert np.abs(np.diff(np.log(steps))).max() < np.log(3.1)
@@ -268,9 +268,9 @@ def test_a_body_on_its_middle_axis_falls_when_it_has_to(p, rtol, stages, most):
     x0 = [p, 1.0, p]
     exact = falls(relaxed_body, x0, lambda t, x: x[0] - 0.5, 600.0)
     method = lt.MetriplecticGauss(stages)
-    found = lt.integrate(BODY, x0, (0.0, 600.0), lt.Adaptive(rtol), method, until=lambda x: x[0] - 0.5)
-    assert found.event_time == pytest.approx(exact, rel=0.005)
-    assert found.stats.steps < most
+    solution = lt.integrate(BODY, x0, (0.0, 600.0), lt.Adaptive(rtol), method, until=lambda x: x[0] - 0.5)
+    assert solution.event_time == pytest.approx(exact, rel=0.005)
+    assert solution.stats.steps < most
 
 
 @pytest.mark.slow
@@ -284,8 +284,8 @@ def test_other_unstable_rests(name):
     exact = falls(lambda x: np.array([x[1], force(x[0])]), [1e-12, 0.0], lambda t, x: x[0] - 0.5, 100.0)
     system = lt.MetriplecticSystem(mf.Canonical(1), energy)
     options = {"method": lt.MetriplecticGauss(2), "until": lambda x: x[0] - 0.5}
-    found = lt.integrate(system, [1e-12, 0.0], (0.0, 100.0), lt.Adaptive(1e-6), **options)
-    assert found.event_time == pytest.approx(exact, rel=0.01)
+    solution = lt.integrate(system, [1e-12, 0.0], (0.0, 100.0), lt.Adaptive(1e-6), **options)
+    assert solution.event_time == pytest.approx(exact, rel=0.01)
 
 
 @pytest.mark.slow
@@ -346,13 +346,13 @@ def test_relaxed(step):
 
 def test_an_event_is_located_to_rounding():
     """The free body's third component crosses zero; the time does not depend on the step but by its accuracy."""
-    free = lt.models.free_rigid_body()
+    body = lt.models.free_rigid_body()
     found = [
-        lt.integrate(free, [0.1, 0.2, 0.9], (0.0, 100.0), h, lt.MetriplecticGauss(6), until=lambda x: x[0]).event_time
+        lt.integrate(body, [0.1, 0.2, 0.9], (0.0, 100.0), h, lt.MetriplecticGauss(6), until=lambda x: x[0]).event_time
         for h in (0.05, 0.031)
     ]
     assert found[0] == pytest.approx(found[1], rel=1e-13)
-    solution = lt.integrate(free, [0.1, 0.2, 0.9], (0.0, 100.0), 0.05, lt.MetriplecticGauss(6), until=lambda x: x[0])
+    solution = lt.integrate(body, [0.1, 0.2, 0.9], (0.0, 100.0), 0.05, lt.MetriplecticGauss(6), until=lambda x: x[0])
     assert abs(solution.x[-1, 0]) < 1e-13
     assert solution.audit().passed
 
@@ -455,14 +455,14 @@ def test_bad_tolerances(options, message):
 @pytest.mark.parametrize(("rate", "explicit"), [(1.0, True), (300.0, False)])
 def test_a_method_is_suggested_by_what_it_costs(rate, explicit):
     system, x0 = lt.models.rigid_body(rate=rate), np.array([0.1, 1.0, 0.1])
-    found = lt.suggest_method(system, x0, 1e-6)
-    assert found.method.explicit == explicit
-    assert ("stiff, explicit steps cost" in found.reason) != explicit
-    assert [trial.evaluations for trial in found.trials] == sorted(trial.evaluations for trial in found.trials)
-    assert found.trials[0].method is found.method
-    assert len(str(found).splitlines()) == len(found.trials) + 2
-    span = 20 * found.step
-    run = lt.integrate(system, x0, (0.0, span), found.step, found.method)
+    suggestion = lt.suggest_method(system, x0, 1e-6)
+    assert suggestion.method.explicit == explicit
+    assert ("stiff, explicit steps cost" in suggestion.reason) != explicit
+    assert [trial.evaluations for trial in suggestion.trials] == sorted(trial.evaluations for trial in suggestion.trials)
+    assert suggestion.trials[0].method is suggestion.method
+    assert len(str(suggestion).splitlines()) == len(suggestion.trials) + 2
+    span = 20 * suggestion.step
+    run = lt.integrate(system, x0, (0.0, span), suggestion.step, suggestion.method)
     exact = lt.integrate(system, x0, (0.0, span), span, lt.Reference(rtol=1e-12, scheme="Radau")).x[-1]
     assert np.abs(run.x[-1] - exact).max() < 1e-4
     with pytest.raises(lt.errors.InputError, match="nothing moves"):

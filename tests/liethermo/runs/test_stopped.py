@@ -36,12 +36,12 @@ def test_fixed_steps(monkeypatch, error, why):
 
     monkeypatch.setattr(EngineWithFallback, "advance", stopped)
     monkeypatch.setattr(EngineWithFallback, "max_saves_per_call", property(lambda self: 10))
-    whole = lt.integrate(BODY, X0, (0.0, 5.0), 0.1, engine="array")
-    assert whole.status.code == "interrupted"
-    assert why in whole.status.message
-    assert len(whole.t) == len(whole.x) == len(whole.energy) == 21
+    whole_run = lt.integrate(BODY, X0, (0.0, 5.0), 0.1, engine="array")
+    assert whole_run.status.code == "interrupted"
+    assert why in whole_run.status.message
+    assert len(whole_run.t) == len(whole_run.x) == len(whole_run.energy) == 21
     monkeypatch.undo()
-    assert np.array_equal(lt.integrate(BODY, X0, (0.0, 2.0), 0.1, engine="array").x, whole.x)
+    assert np.array_equal(lt.integrate(BODY, X0, (0.0, 2.0), 0.1, engine="array").x, whole_run.x)
 
 
 def test_adaptive_steps(monkeypatch):
@@ -56,9 +56,9 @@ def test_adaptive_steps(monkeypatch):
         return append(self, *arguments)
 
     monkeypatch.setattr(Run, "_save_steps", stopped)
-    found = lt.integrate(BODY, X0, (0.0, 500.0), lt.Adaptive(1e-9))
-    assert "no memory left" in found.status.message
-    assert 1 < len(found.t) == len(found.x) == len(found.energy)
+    solution = lt.integrate(BODY, X0, (0.0, 500.0), lt.Adaptive(1e-9))
+    assert "no memory left" in solution.status.message
+    assert 1 < len(solution.t) == len(solution.x) == len(solution.energy)
 
 
 def test_another_error_is_not_hidden(monkeypatch):
@@ -80,13 +80,13 @@ def test_the_reference_solver(monkeypatch):
         return field(*arguments)
 
     monkeypatch.setattr(reference, "_vector_field", stopped)
-    found = lt.integrate(BODY, X0, (0.0, 50.0), 0.1, lt.Reference(1e-9))
-    assert found.status.code == "interrupted"
-    assert "stopped by the user after t =" in found.status.message
-    assert 2 < len(found.t) == len(found.x) < 501
+    solution = lt.integrate(BODY, X0, (0.0, 50.0), 0.1, lt.Reference(1e-9))
+    assert solution.status.code == "interrupted"
+    assert "stopped by the user after t =" in solution.status.message
+    assert 2 < len(solution.t) == len(solution.x) < 501
     monkeypatch.undo()
-    whole = lt.integrate(BODY, X0, (0.0, 50.0), 0.1, lt.Reference(1e-9))
-    assert np.array_equal(whole.x[: len(found.x)], found.x)
+    whole_run = lt.integrate(BODY, X0, (0.0, 50.0), 0.1, lt.Reference(1e-9))
+    assert np.array_equal(whole_run.x[: len(solution.x)], solution.x)
 
 
 # -- processes that are forked ----------------------------------------------------------------------------------------

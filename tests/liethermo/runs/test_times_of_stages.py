@@ -87,12 +87,12 @@ def test_kept_states_dense_output_and_events():
 def test_members_of_an_ensemble_are_single_runs_to_the_bit(step, engine):
     starts, stiffness = np.array([[1.0, 0.0], [0.5, 0.2], [-1.0, 2.0]]), np.array([1.0, 1.5, 0.5])
     method = lt.MetriplecticGauss(2)
-    many = lt.ensemble(lambda p: forced(stiffness=p), starts, SPAN, step, method, parameters=stiffness, engine=engine)
-    assert many.ok.all()
+    ensemble = lt.ensemble(lambda p: forced(stiffness=p), starts, SPAN, step, method, parameters=stiffness, engine=engine)
+    assert ensemble.ok.all()
     for i, (x, k) in enumerate(zip(starts, stiffness, strict=True)):
         one = lt.integrate(forced(stiffness=k), x, SPAN, step, method, engine=engine).x[-1]
         # XLA compiles lanes and single runs by different instructions
-        assert np.array_equal(many.x[i], one) if engine == "compiled" else np.abs(many.x[i] - one).max() < 1e-14
+        assert np.array_equal(ensemble.x[i], one) if engine == "compiled" else np.abs(ensemble.x[i] - one).max() < 1e-14
 
 
 def test_a_flow_and_its_derivative():
