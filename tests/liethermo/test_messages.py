@@ -99,13 +99,13 @@ FUNCTIONS = {
 
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_functions_that_cannot_be_traced(name):
-    use, wrong, message, right = FUNCTIONS[name]
+    use, wrong_function, message, right_function = FUNCTIONS[name]
     with pytest.raises(lt.FunctionError, match=message) as caught:
-        use(wrong)
-    first, _, reported = str(caught.value).partition(" JAX reports: ")
-    assert "Tracer" not in first
-    assert "\n" not in reported
-    use(right)
+        use(wrong_function)
+    cause, _, jax_text = str(caught.value).partition(" JAX reports: ")
+    assert "Tracer" not in cause
+    assert "\n" not in jax_text
+    use(right_function)
 
 
 def test_the_line_is_named():

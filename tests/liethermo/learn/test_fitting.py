@@ -27,14 +27,14 @@ def _numbers(system):
 def test_numbers_are_found_by_matching_and_shooting():
     """The splines are off by 1e-6 here; the runs, whose steps are of order 4, by 1e-5."""
     t, x = cases.record()
-    matched = lt.learn.fit(cases.oscillator(), (t, x), matching=300, shooting=0, rate=0.1)
+    matching_fit = lt.learn.fit(cases.oscillator(), (t, x), matching=300, shooting=0, rate=0.1)
     shot = lt.learn.fit(cases.oscillator(), (t, x), matching=0, shooting=200, rate=0.1)
-    for found in (matched, shot):
-        np.testing.assert_allclose(_numbers(found), [cases.STIFFNESS, cases.GAMMA], rtol=1e-3)
-        assert found.check().passed
-    assert matched.training.parameters == 2
-    assert matched.training.loss[-1] < 1e-6 < matched.training.loss[0]
-    assert "matching" in str(matched.training)
+    for fit in (matching_fit, shot):
+        np.testing.assert_allclose(_numbers(fit), [cases.STIFFNESS, cases.GAMMA], rtol=1e-3)
+        assert fit.check().passed
+    assert matching_fit.training.parameters == 2
+    assert matching_fit.training.loss[-1] < 1e-6 < matching_fit.training.loss[0]
+    assert "matching" in str(matching_fit.training)
 
 
 def test_other_parameters_of_any_system_are_found():
@@ -92,8 +92,8 @@ def test_the_same_twice_and_on_from_a_checkpoint(tmp_path, monkeypatch):
     for a, b in zip(jax.tree_util.tree_leaves(whole_run), jax.tree_util.tree_leaves(fitted_system), strict=True):
         np.testing.assert_array_equal(a, b)
     np.testing.assert_array_equal(whole_run.training.loss, fitted_system.training.loss)
-    other = lt.learn.fit(system, (t, x), **{**how, "shooting": 0}, seed=1)
-    assert not np.array_equal(whole_run.training.loss[:3], other.training.loss)
+    other_fit = lt.learn.fit(system, (t, x), **{**how, "shooting": 0}, seed=1)
+    assert not np.array_equal(whole_run.training.loss[:3], other_fit.training.loss)
     with pytest.raises(lt.FileError, match="the checkpoint of a fit of another model"):
         lt.learn.fit(system, (t, x), checkpoint=path, **{**how, "rate": 0.06})
 
@@ -101,12 +101,12 @@ def test_the_same_twice_and_on_from_a_checkpoint(tmp_path, monkeypatch):
 def test_units_make_no_difference():
     """Seconds or 1e-12 of them, metres or 1e12 of them: the losses are the same but for rounding."""
     t, x = cases.record(3, 21)
-    seen = []
+    results = []
     for time, size in ((1.0, 1.0), (1e-12, 1e12), (1e20, 1e-20)):
         system = lt.learn.Metriplectic(3, width=4, depth=1)
         fitted_system = lt.learn.fit(system, (time * t, size * x), matching=50, shooting=0)
-        seen.append(np.r_[fitted_system.training.loss, fitted_system.training.validation])
-    np.testing.assert_allclose(seen[1:], [seen[0]] * 2, rtol=1e-6)
+        results.append(np.r_[fitted_system.training.loss, fitted_system.training.validation])
+    np.testing.assert_allclose(results[1:], [results[0]] * 2, rtol=1e-6)
 
 
 def test_what_is_not_observed_is_known_through_the_laws():
@@ -137,12 +137,12 @@ def test_noise_and_times_at_any_distances():
     random = np.random.default_rng(1)
     data = []
     for states in x:
-        kept = np.sort(random.choice(len(t), 60, replace=False))
-        data.append((t[kept], states[kept] + 0.01 * random.standard_normal((60, 3))))
+        kept_rows = np.sort(random.choice(len(t), 60, replace=False))
+        data.append((t[kept_rows], states[kept_rows] + 0.01 * random.standard_normal((60, 3))))
     fitted_system = lt.learn.fit(cases.oscillator(), data, noise=0.01, matching=150, shooting=200, rate=0.1, window=8)
     np.testing.assert_allclose(_numbers(fitted_system), [cases.STIFFNESS, cases.GAMMA], rtol=0.03)
-    last = fitted_system.training.loss[-1]
-    assert 0.3 < last < 3.0  # of the size of the noise
+    last_loss = fitted_system.training.loss[-1]
+    assert 0.3 < last_loss < 3.0  # of the size of the noise
 
 
 def test_early_stopping_keeps_the_best():
@@ -219,22 +219,22 @@ def test_a_loss_that_is_not_finite_is_an_error():
 
 def _attitudes(noise, seed=0):
     """Records of the attitudes of a body with friction inside, each turned by a small random angle."""
-    body, random, found = lt.models.tumbling_body((3.0, 2.0, 1.0), rate=0.08), np.random.default_rng(seed), []
+    body, random, observations = lt.models.tumbling_body((3.0, 2.0, 1.0), rate=0.08), np.random.default_rng(seed), []
     for start in random.standard_normal((4, 3)):
         run = lt.integrate(body, start, (0.0, 8.0), 0.05, method=lt.MetriplecticRungeKutta(6), save_every=4)
-        turned = mf.SO(3).exp(noise * random.standard_normal((len(run.t), 3)))
-        found.append((run.t, run.attitude[5] @ run.attitude @ np.asarray(turned)))  # in axes of its own
-    return found
+        noise_rotations = mf.SO(3).exp(noise * random.standard_normal((len(run.t), 3)))
+        observations.append((run.t, run.attitude[5] @ run.attitude @ np.asarray(noise_rotations)))  # in axes of its own
+    return observations
 
 
 def test_the_first_states_show_the_attitudes_and_move_as_they_do():
     """Of the body that made them, from any attitude: a spline is off by the noise over the distance of the times."""
     body = lt.models.tumbling_body((3.0, 2.0, 1.0), rate=0.08)
     (t, R), *_ = _attitudes(0.0)
-    seen = make_observation(body, None, lambda x, R: R)
+    observation = make_observation(body, None, lambda x, R: R)
     run = differentiable_stepper(body, lt.MetriplecticRungeKutta(4), 1, True)[0]
-    shown = spline_states_and_rates(Trajectory(t, R.reshape(-1, 9)), None)
-    states = states_matching_rates(seen, run, [shown], np.ones(9), 1.0)[0]
+    smoothed_data = spline_states_and_rates(Trajectory(t, R.reshape(-1, 9)), None)
+    states = states_matching_rates(observation, run, [smoothed_data], np.ones(9), 1.0)[0]
     true = lt.integrate(body, np.random.default_rng(0).standard_normal(3), (0.0, 8.0), 0.05, save_every=4)
     np.testing.assert_allclose(states[:, 4:], R.reshape(-1, 9), atol=2e-3)  # splines are worst at their ends: 4e-4
     np.testing.assert_allclose(states[5:-5, :3], true.x[5:-5, :3], atol=2e-2)
@@ -265,11 +265,11 @@ def test_components_and_a_function_of_the_state_are_one_mechanism():
     system = cases.oscillator(energy=lt.learn.Energy(_Bath(jnp.zeros(()))))
     how = {"shooting": 60, "rate": 0.1, "window": 5}
     with pytest.warns(lt.learn.FitWarning, match="do not determine"):  # a first entropy can make up for the friction
-        by_index = lt.learn.fit(system, (t, x[..., 1:2]), observed=[1], **how)
+        index_fit = lt.learn.fit(system, (t, x[..., 1:2]), observed=[1], **how)
     with pytest.warns(lt.learn.FitWarning, match="do not determine"):
-        by_function = lt.learn.fit(system, (t, x[..., 1]), observe=lambda x: x[1], **how)
-    for found in (by_index, by_function):
-        assert found.training.loss[-1] < 0.5 * found.training.loss[0]
+        function_fit = lt.learn.fit(system, (t, x[..., 1]), observe=lambda x: x[1], **how)
+    for fit in (index_fit, function_fit):
+        assert fit.training.loss[-1] < 0.5 * fit.training.loss[0]
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,9 @@ def test_a_constant_of_the_energy_is_not_determined():
     assert determination.rank == 2
     np.testing.assert_allclose(np.abs(determination.directions[-1]), [0.0, 0.0, 1.0], atol=1e-12)
     y = jnp.array([0.5, 0.2, 0.1])
-    value, difference = determination.share(lambda s: jnp.stack([s.energy.value(y), s.energy.value(y) - s.energy.value(0 * y)]))
+    value, difference = determination.share(
+        lambda s: jnp.stack([s.energy.value(y), s.energy.value(y) - s.energy.value(0 * y)])
+    )
     assert value < 0.3  # mostly c
     assert difference == pytest.approx(1.0, abs=1e-12)
 
@@ -59,9 +61,9 @@ def test_fits_differ_by_what_is_not_known():
     fits = lt.learn.several(
         lambda seed: cases.oscillator(1.0 + 0.1 * seed), (t, x), 2, matching=200, shooting=0, rate=0.1, validation=0
     )
-    mean, spread = fits.spread(lambda s: jnp.exp(s.energy.function.function.log_stiffness))
+    mean, std = fits.spread(lambda s: jnp.exp(s.energy.function.function.log_stiffness))
     assert mean == pytest.approx(cases.STIFFNESS, rel=1e-2)
-    assert 0.0 < spread < 0.02
+    assert 0.0 < std < 0.02
     times, states, deviation = fits.forecast(x[0, 0], (0.0, 1.0), 0.1, lt.MetriplecticRungeKutta(4))
     assert states.shape == deviation.shape == (len(times), 3)
     with pytest.raises(lt.InputError, match="integer >= 2"):
@@ -86,20 +88,22 @@ def test_a_fitted_system_comes_back_from_its_file(tmp_path):
         lt.learn.load(tmp_path / "none.npz", system)
     with np.load(path) as file:
         honest = dict(file)
-    for changed in (
+    for changed_arrays in (
         {"leaf_0": honest["leaf_0"] + 1e-9},
         {"leaf_0": honest["leaf_0"].astype(str)},
         {"loss": np.zeros(0)},
     ):
-        np.savez(tmp_path / "other.npz", **{**honest, **changed})
+        np.savez(tmp_path / "other.npz", **{**honest, **changed_arrays})
         with pytest.raises(lt.FileError, match="not those that were written"):
             lt.learn.load(tmp_path / "other.npz", system)
-    for changed, words in (
+    for changed_arrays, words in (
         ({"leaf_0": np.nan * honest["leaf_0"]}, "not finite"),
         ({"leaf_0": "text"}, "built otherwise"),
     ):
         metadata, arrays = training.read_archive(path, files.MODEL_FORMAT)
-        training.write_archive(tmp_path / "other.npz", metadata, arrays | changed)  # by someone who knows the format
+        training.write_archive(
+            tmp_path / "other.npz", metadata, arrays | changed_arrays
+        )  # by someone who knows the format
         with pytest.raises(lt.FileError, match=words):
             lt.learn.load(tmp_path / "other.npz", system)
     metadata["training"].pop("seconds")
@@ -114,6 +118,6 @@ def test_a_fitted_system_comes_back_from_its_file(tmp_path):
 def test_a_fitted_system_goes_into_ensembles():
     system = lt.learn.Metriplectic(3, width=4, depth=1)
     starts = np.random.default_rng(0).standard_normal((4, 3))
-    found = lt.ensemble(system, starts, (0.0, 0.5), 0.1, lt.MetriplecticMidpoint(), outputs="final")
+    ensemble = lt.ensemble(system, starts, (0.0, 0.5), 0.1, lt.MetriplecticMidpoint(), outputs="final")
     one = lt.integrate(system, starts[2], (0.0, 0.5), 0.1, method=lt.MetriplecticMidpoint())
-    np.testing.assert_allclose(found.x[2], one.x[-1], atol=1e-13)
+    np.testing.assert_allclose(ensemble.x[2], one.x[-1], atol=1e-13)

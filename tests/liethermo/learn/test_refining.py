@@ -59,9 +59,9 @@ def least_squares(data, noise=NOISE):
         runs = [run(start, v[0], t) for start, (t, _) in zip(v[1:].reshape(-1, 3), data, strict=True)]
         return np.concatenate([(x - y).ravel() for x, (_, y) in zip(runs, data, strict=True)]) / noise
 
-    found = scipy.optimize.least_squares(missed, np.concatenate([[0.2], *(x[0] for _, x in data)]))
-    variance = 2 * found.cost / (found.fun.size - found.x.size)
-    return found.x[0], np.sqrt(np.linalg.inv(found.jac.T @ found.jac)[0, 0] * variance)
+    result = scipy.optimize.least_squares(missed, np.concatenate([[0.2], *(x[0] for _, x in data)]))
+    variance = 2 * result.cost / (result.fun.size - result.x.size)
+    return result.x[0], np.sqrt(np.linalg.inv(result.jac.T @ result.jac)[0, 0] * variance)
 
 
 def test_the_rate_and_its_error_are_those_of_least_squares():
@@ -97,7 +97,9 @@ def test_the_friction_is_found_where_the_noise_is_not_given(seed):
 def test_two_observed_components_determine_it_too():
     """It was 0.184: the descent had not come to its end, and nothing said so."""
     data = [(t, x[:, :2]) for t, x in records(0)]
-    fitted_system = lt.learn.fit(spring(0.5), data, observed=[0, 1], positive=rate_of, noise=NOISE, shooting=100).training
+    fitted_system = lt.learn.fit(
+        spring(0.5), data, observed=[0, 1], positive=rate_of, noise=NOISE, shooting=100
+    ).training
     assert fitted_system.converged
     assert abs(fitted_system.values[0] - RATE) < 2.5 * fitted_system.standard_errors[0]
     assert fitted_system.standard_errors[0] < 0.002
@@ -168,8 +170,8 @@ def test_noise_is_told_from_motion():
         data = [Trajectory(times, run(start, RATE, times)) for start in STARTS]
         assert estimate_noise(data, np.ones(3)) is None
     assert estimate_noise([Trajectory(t[:3], np.zeros((3, 1)))], np.ones(1)) is None
-    rounded = [Trajectory(TIMES, run(STARTS[0], RATE) + 1e-9 * np.random.default_rng(0).standard_normal((81, 3)))]
-    assert estimate_noise(rounded, np.ones(3)) is None
+    rounded_data = [Trajectory(TIMES, run(STARTS[0], RATE) + 1e-9 * np.random.default_rng(0).standard_normal((81, 3)))]
+    assert estimate_noise(rounded_data, np.ones(3)) is None
 
 
 def test_data_without_noise_can_be_said_to_be_exact():
@@ -194,8 +196,8 @@ def test_trajectories_of_any_lengths_and_attitudes():
 @pytest.mark.parametrize("number", [2, pytest.param(8, marks=pytest.mark.slow)])
 def test_fits_to_few_trajectories_spread_as_their_errors(number):
     """Three trajectories were drawn again and again, and the deviation was 0.0."""
-    data, few = records(0), {"matching": 50, "shooting": 20, "validation": 0}
-    fits = lt.learn.several(lambda seed: spring(0.3), data, number, positive=rate_of, noise=NOISE, **few)
+    data, options = records(0), {"matching": 50, "shooting": 20, "validation": 0}
+    fits = lt.learn.several(lambda seed: spring(0.3), data, number, positive=rate_of, noise=NOISE, **options)
     mean, deviation = fits.spread(rate_of)
     error = least_squares(data)[1]
     assert (0.01 if number == 2 else 0.4) * error < deviation < (4.0 if number == 2 else 2.0) * error

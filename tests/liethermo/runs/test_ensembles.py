@@ -40,8 +40,8 @@ def test_each_is_the_trajectory_it_would_be_alone(engine):
 def test_a_trajectory_does_not_depend_on_its_neighbours():
     x0s = states(40)
     ensemble = lt.ensemble(BODY, x0s, (0.0, 10.0), 0.1, engine="compiled")
-    others = lt.ensemble(BODY, x0s[::-1], (0.0, 10.0), 0.1, engine="compiled")
-    assert np.array_equal(ensemble.x, others.x[::-1])
+    reversed_ensemble = lt.ensemble(BODY, x0s[::-1], (0.0, 10.0), 0.1, engine="compiled")
+    assert np.array_equal(ensemble.x, reversed_ensemble.x[::-1])
 
 
 def test_outputs():
@@ -99,10 +99,12 @@ def test_parameters_of_user_functions():
     strengths = np.array([0.1, 0.5, 0.9])
     ensemble = lt.ensemble(system, [0.5, 1.0, 0.2], (0.0, 2.0), 0.1, parameters={"energy.function.strength": strengths})
     for i, strength in enumerate(strengths):
-        own = lt.LiePoissonSystem(
+        single_system = lt.LiePoissonSystem(
             mf.so(3), Quartic(jnp.asarray(strength)), lt.Quadratic(np.ones(3)), lt.ProjectedMetric()
         )
-        assert np.abs(lt.integrate(own, [0.5, 1.0, 0.2], (0.0, 2.0), 0.1).x[-1] - ensemble.x[i]).max() <= 1e-14
+        assert (
+            np.abs(lt.integrate(single_system, [0.5, 1.0, 0.2], (0.0, 2.0), 0.1).x[-1] - ensemble.x[i]).max() <= 1e-14
+        )
 
 
 def leaves_its_domain():
@@ -122,15 +124,15 @@ def test_a_failure_stays_where_it_is(engine):
     assert one.status.code == "non_finite"
     assert [STATUS_NAMES[code] for code in ensemble.status] == [*["completed"] * 7, "non_finite", *["completed"] * 12]
     assert ensemble.steps[7] == one.status.step
-    kept = one.status.step // 7 + 1
-    assert np.isfinite(ensemble.x[7, :kept]).all()
-    assert np.abs(ensemble.x[7, :kept] - one.x[:kept]).max() < 1e-12
-    assert np.isnan(ensemble.x[7, kept:]).all()
+    n_saved = one.status.step // 7 + 1
+    assert np.isfinite(ensemble.x[7, :n_saved]).all()
+    assert np.abs(ensemble.x[7, :n_saved] - one.x[:n_saved]).max() < 1e-12
+    assert np.isnan(ensemble.x[7, n_saved:]).all()
     assert np.isfinite(np.delete(ensemble.x, 7, axis=0)).all()
     assert not ensemble.audit().passed
     assert f"non_finite: trajectory 7: NaN or infinity in step {one.status.step + 1}" in str(ensemble)
     assert ensemble[7].status.code == "non_finite"
-    assert ensemble[7].t[-1] == ensemble.t[kept - 1]
+    assert ensemble[7].t[-1] == ensemble.t[n_saved - 1]
 
 
 @pytest.mark.sampled(1)
@@ -138,7 +140,9 @@ def test_a_failure_stays_where_it_is(engine):
 def test_newton_where_a_lane_needs_it(engine):
     """One stiff body among soft ones."""
     rates = np.array([0.5, 0.5, 100.0, 0.5])
-    ensemble = lt.ensemble(BODY, [0.1, 1.0, 0.1], (0.0, 50.0), 0.5, parameters={"dissipation.rate": rates}, engine=engine)
+    ensemble = lt.ensemble(
+        BODY, [0.1, 1.0, 0.1], (0.0, 50.0), 0.5, parameters={"dissipation.rate": rates}, engine=engine
+    )
     one = lt.integrate(lt.models.rigid_body(rate=200.0), [0.1, 1.0, 0.1], (0.0, 50.0), 0.5)
     assert one.stats.newton_iterations > 0
     assert np.abs(ensemble.x[2] - one.x[-1]).max() < 1e-13

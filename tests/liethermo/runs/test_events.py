@@ -65,8 +65,8 @@ def test_a_body_that_relaxes_for_a_moment_is_relaxed(method):
     assert np.array_equal(np.isfinite(long.event_time), np.isfinite(fine.event_time))
     assert np.nanmax(np.abs(long.event_time - fine.event_time)) < 1e-3
     ends = lt.ensemble(*arguments, 1.0, lt.MetriplecticRungeKutta(8), until=lt.Relaxed(1e-6))
-    late = ends.event_time > fine.event_time + 0.1
-    assert late.any(), "steps of given size are looked at where they end, and miss some"
+    is_late = ends.event_time > fine.event_time + 0.1
+    assert is_late.any(), "steps of given size are looked at where they end, and miss some"
 
 
 # -- an event is a zero, or there is none -----------------------------------------------------------------------------
@@ -80,14 +80,14 @@ def hole(w):
     return lambda x: jnp.where(jnp.abs(x[0] - 0.5) < w, jnp.nan, x[0] - 0.5)
 
 
-def watched(until, step, engine="compiled", order=8, rounded=1e-13):
-    """Alone, and in an ensemble, whose program may round otherwise: by ``rounded``, in the time."""
+def watched(until, step, engine="compiled", order=8, noise_size=1e-13):
+    """Alone, and in an ensemble, whose program may round otherwise: by ``noise_size``, in the time."""
     arguments = (0.0, 3.0), step, lt.MetriplecticRungeKutta(order)
     solution = lt.integrate(OSCILLATOR, [1.0, 0.0], *arguments, until=until, engine=engine, on_failure="return")
     ensemble = lt.ensemble(OSCILLATOR, [[1.0, 0.0], [1.0, 0.0]], *arguments, until=until, engine=engine)
     assert [solution.status.code] * 2 == [status.code for status in map(ensemble.member_status, range(2))]
     times = np.nan if solution.event_time is None else solution.event_time
-    assert ensemble.event_time == pytest.approx([times] * 2, abs=rounded, nan_ok=True)
+    assert ensemble.event_time == pytest.approx([times] * 2, abs=noise_size, nan_ok=True)
     return solution
 
 
@@ -143,7 +143,7 @@ ZEROS = {
 @pytest.mark.parametrize("step", [0.1, lt.Adaptive(1e-8)])
 def test_a_zero_is_an_event_however_it_is_rounded(name, engine, step):
     until, exact = ZEROS[name]
-    solution = watched(until, step, engine, rounded=3e-10 if name == "among large terms" else 1e-13)  # that of 1e6
+    solution = watched(until, step, engine, noise_size=3e-10 if name == "among large terms" else 1e-13)  # that of 1e6
     assert solution.event_time == pytest.approx(exact, abs=1e-6 if name != "of no slope" else 1e-4)
     assert solution.audit().passed
 
@@ -224,8 +224,8 @@ def test_a_study_of_bodies_whose_energy_falls():
         measure={"relaxed": lt.Relaxed(1e-6)},
     )  # fmt: skip
     study.run()
-    slow, fast = study.results.relaxed.values
-    assert 0.3 * slow < fast < 0.7 * slow < 700.0
+    slow_body, fast_body = study.results.relaxed.values
+    assert 0.3 * slow_body < fast_body < 0.7 * slow_body < 700.0
 
 
 def test_what_does_not_relax_has_no_relaxed_state():

@@ -61,14 +61,14 @@ def midpoint_step(x, h):
     def gradient(m):
         return np.array([c / i for c, i in zip(m, MOMENTS, strict=True)]) + np.array([4 * QUARTIC * m[0] ** 3, 0, 0])
 
-    d, moved = np.array([Decimal(0)] * 3), Decimal(1)
-    while moved > Decimal("1e-40"):
+    d, displacement_norm = np.array([Decimal(0)] * 3), Decimal(1)
+    while displacement_norm > Decimal("1e-40"):
         z = x + d / 2
         dH, dS = gradient(z), 2 * z / (1 + z @ z)
         if d @ d > 0:
             dH = dH + (energy(x + d) - energy(x) - dH @ d) / (d @ d) * d
         new = h * (np.cross(z, dH) + RATE * ((dH @ dH) * dS - (dH @ dS) * dH))
-        moved, d = max(abs(c) for c in new - d), new
+        displacement_norm, d = max(abs(c) for c in new - d), new
     return x + d
 
 
@@ -189,8 +189,8 @@ def test_at_equilibria(method, name):
     expected = by_differences(lambda y: np.asarray(end(jnp.asarray(y))), np.asarray(x))
     assert np.abs(jax.jit(jax.jacrev(end))(x) - derivative).max() < 1e-12
     linear = np.asarray(jax.jit(jax.jacfwd(system.vector_field))(x))
-    corrected = 0.1 * (h * np.abs(linear).max()) ** (method.order + 1) if method.explicit else 0.0
-    assert np.abs(derivative - expected).max() < 2e-9 + corrected
+    correction_error = 0.1 * (h * np.abs(linear).max()) ** (method.order + 1) if method.explicit else 0.0
+    assert np.abs(derivative - expected).max() < 2e-9 + correction_error
     exact = scipy.linalg.expm(h * linear)
     assert np.abs(derivative - exact).max() < (2.0 * h * np.abs(linear).max()) ** (method.order + 1)
     assert np.abs(exact - np.eye(len(x))).max() > 0.01

@@ -54,9 +54,9 @@ def test_a_run_says_that_its_state_grows_without_bound(case, method, adaptive):
 def test_what_stays_bounded_is_told_what_helps():
     """A step that is too long, of a motion that stays on its circle."""
     body = lt.models.rigid_body()
-    stopped = lt.integrate(body, [0.1, 1.0, 0.3], (0.0, 60.0), 15.0, lt.MetriplecticRungeKutta(8), on_failure="return")
-    assert "smaller step" in stopped.status.message
-    assert "without bound" not in stopped.status.message
+    solution = lt.integrate(body, [0.1, 1.0, 0.3], (0.0, 60.0), 15.0, lt.MetriplecticRungeKutta(8), on_failure="return")
+    assert "smaller step" in solution.status.message
+    assert "without bound" not in solution.status.message
 
 
 @pytest.mark.parametrize("engine", ["compiled", pytest.param("array", marks=pytest.mark.slow)])

@@ -102,17 +102,17 @@ def test_a_flow_under_vmap(method):
     def end(a):
         return lt.flow(body({"a": a}), jnp.asarray(START), SPAN, STEP, method)
 
-    alone = np.array([end(a) for a in A])
-    assert np.abs(jax.vmap(end)(jnp.asarray(A)) - alone).max() < 1e-12
-    assert np.abs(jax.jit(jax.vmap(end))(jnp.asarray(A)) - alone).max() < 1e-12
+    single_flows = np.array([end(a) for a in A])
+    assert np.abs(jax.vmap(end)(jnp.asarray(A)) - single_flows).max() < 1e-12
+    assert np.abs(jax.jit(jax.vmap(end))(jnp.asarray(A)) - single_flows).max() < 1e-12
 
 
 def test_a_control_one_verdict_for_all_is_found(monkeypatch):
     """Control: with what the first member conserves held for all, the relation of company fails."""
 
     def of_first(family, method, states):
-        decided = family.member(0)._find_invariants()
-        facts = member_groups.InvariantFacts(None, decided)
+        first_verdicts = family.member(0)._find_invariants()
+        facts = member_groups.InvariantFacts(None, first_verdicts)
         return [
             member_groups.MemberGroup(
                 np.arange(len(states)), family.annotate_members(member_groups.with_invariant_facts, facts)
@@ -180,7 +180,9 @@ def test_a_member_outside_its_own_domain_is_not_started():
 
     a = np.array([0.0, 1.0, 3.0])  # temperatures 0.5, -0.5, 3.5
     ensemble = lt.ensemble(gas, [0.3, 0.1, 1.0], (0.0, 1.0), 0.1, parameters={"a": a})
-    assert ensemble.status.tolist() == [StatusCode.COMPLETED, StatusCode.INADMISSIBLE, StatusCode.COMPLETED], str(ensemble)
+    assert ensemble.status.tolist() == [StatusCode.COMPLETED, StatusCode.INADMISSIBLE, StatusCode.COMPLETED], str(
+        ensemble
+    )
     assert "temperature" in ensemble.reasons[1]
 
 
@@ -206,11 +208,11 @@ def test_one_inertia_only_if_all_have_it():
 
 
 def test_groups_are_few_and_in_order():
-    many = np.array([2.0, 1.0, 0.5, 1.0, 3.0])
-    family = Family.from_arguments(body, {"a": many})
-    groups, refused = member_groups.group_members(family, lt.MetriplecticMidpoint(), np.tile(START, (5, 1)))
+    values = np.array([2.0, 1.0, 0.5, 1.0, 3.0])
+    family = Family.from_arguments(body, {"a": values})
+    groups, refusal_reasons = member_groups.group_members(family, lt.MetriplecticMidpoint(), np.tile(START, (5, 1)))
     assert [group.indices.tolist() for group in groups] == [[0, 2, 4], [1, 3]]
-    assert refused == {}
+    assert refusal_reasons == {}
     names = [group.family.member(0).invariant_verdicts.conserved_names for group in groups]
     assert names[0] == frozenset()
     assert len(names[1]) == 1
@@ -241,11 +243,11 @@ def test_files_of_mixed_groups(tmp_path, outputs):
 
 def test_names_of_parameters_that_end_with_an_index():
     """The numbers in a function are leaves called ``numbers[0]``; an entry of one is ``numbers[0][1]``."""
-    closed = lt.LiePoissonSystem(mf.so(3), lambda m: 0.5 * (m[0] ** 2 + 3.0 * m[1] ** 2) + jnp.cosh(0.7 * m[2]))
+    body = lt.LiePoissonSystem(mf.so(3), lambda m: 0.5 * (m[0] ** 2 + 3.0 * m[1] ** 2) + jnp.cosh(0.7 * m[2]))
     name = "energy.function.numbers[0][0]"
-    study = lt.Study(closed, {name: [3.0, 1.0]}, x0=START, t_span=(0.0, 1.0), step=STEP, measure={"x": "final"})
+    study = lt.Study(body, {name: [3.0, 1.0]}, x0=START, t_span=(0.0, 1.0), step=STEP, measure={"x": "final"})
     study.run(progress=False)
-    same = lt.integrate(closed, START, (0.0, 1.0), STEP).x[-1]
-    gaps = np.abs(study.results.x.values - same).max(axis=1)
+    end_state = lt.integrate(body, START, (0.0, 1.0), STEP).x[-1]
+    gaps = np.abs(study.results.x.values - end_state).max(axis=1)
     assert gaps.min() < 1e-14
     assert gaps.max() > 1e-3

@@ -35,18 +35,18 @@ def family():
 def test_a_member_is_the_solution_of_its_own_run(family, outputs):
     ensemble = lt.ensemble(build, states(7), SPAN, STEP, parameters=family, outputs=outputs, save_every=5)
     one = lt.integrate(build({k: v[4] for k, v in family.items()}), states(7)[4], SPAN, STEP, save_every=5)
-    found, kept = ensemble[4], slice(None) if outputs == "trajectory" else [0, -1]
-    assert np.array_equal(found.t, one.t[kept])
+    solution, saved = ensemble[4], slice(None) if outputs == "trajectory" else [0, -1]
+    assert np.array_equal(solution.t, one.t[saved])
     for name in ("x", "energy", "entropy"):
-        assert np.abs(getattr(found, name) - getattr(one, name)[kept]).max() < 1e-14, name
-    assert found.casimirs.keys() == one.casimirs.keys()
-    assert found.laws == one.laws
-    assert found.stats.energy_range == pytest.approx(one.stats.energy_range, rel=1e-15)
-    assert (found.stats.steps, found.status.code) == (one.stats.steps, "completed")
-    assert found.status.message == "trajectory 4: reached t = 6 in 60 steps"
-    assert found.audit().passed, str(found.audit())
-    assert found.evidence.local_error == pytest.approx(one.evidence.local_error, rel=0.5)
-    assert found.provenance["trajectory"] == 4
+        assert np.abs(getattr(solution, name) - getattr(one, name)[saved]).max() < 1e-14, name
+    assert solution.casimirs.keys() == one.casimirs.keys()
+    assert solution.laws == one.laws
+    assert solution.stats.energy_range == pytest.approx(one.stats.energy_range, rel=1e-15)
+    assert (solution.stats.steps, solution.status.code) == (one.stats.steps, "completed")
+    assert solution.status.message == "trajectory 4: reached t = 6 in 60 steps"
+    assert solution.audit().passed, str(solution.audit())
+    assert solution.evidence.local_error == pytest.approx(one.evidence.local_error, rel=0.5)
+    assert solution.provenance["trajectory"] == 4
 
 
 def test_counting():
@@ -95,7 +95,11 @@ def test_save_and_load(tmp_path, outputs):
             assert value.dtype == getattr(loaded_run, name).dtype, name
     assert str(loaded_run) == str(ensemble)
     assert str(loaded_run.audit()) == str(ensemble.audit())
-    assert (loaded_run.laws, loaded_run.reasons, loaded_run.provenance) == (ensemble.laws, dict(ensemble.reasons), ensemble.provenance)
+    assert (loaded_run.laws, loaded_run.reasons, loaded_run.provenance) == (
+        ensemble.laws,
+        dict(ensemble.reasons),
+        ensemble.provenance,
+    )
     if outputs != "summary":
         assert np.array_equal(loaded_run[3].x, ensemble[3].x)
         assert loaded_run[3].casimirs == {}
@@ -130,15 +134,15 @@ def test_xarray():
 # -- which cannot be started ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("named", [True, False])
-def test_inadmissible_parameters_are_a_status_of_their_member(named):
+@pytest.mark.parametrize("is_named", [True, False])
+def test_inadmissible_parameters_are_a_status_of_their_member(is_named):
     """Three of a thousand, one of them not a number; the others are what they are without them."""
     rates = np.linspace(0.1, 2.0, 1000)
     rates[[17, 400, 999]] = -1.0, np.nan, -2.0
     options = {"outputs": "final", "engine": "compiled"}
 
     def run(rates, x0s):
-        if named:
+        if is_named:
             return lt.ensemble(BODY, x0s, SPAN, STEP, parameters={"dissipation.rate": rates}, **options)
         return lt.ensemble(lambda rate: lt.models.rigid_body(rate=rate), x0s, SPAN, STEP, parameters=rates, **options)
 
@@ -152,8 +156,8 @@ def test_inadmissible_parameters_are_a_status_of_their_member(named):
     assert "inadmissible: trajectory 17: " in str(many)
     with pytest.raises(lt.InputError, match="trajectory 17: "):
         many[17]
-    failed = [row.law for row in many.audit().rows if row.passed is False]
-    assert set(failed) - {"accuracy"} == {"trajectories that failed"}
+    failed_laws = [row.law for row in many.audit().rows if row.passed is False]
+    assert set(failed_laws) - {"accuracy"} == {"trajectories that failed"}
     assert np.array_equal(many[998].x[-1], many.x[998])
 
 

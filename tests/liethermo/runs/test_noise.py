@@ -98,18 +98,20 @@ def test_random_numbers_are_those_of_the_paper():
 
 def test_random_numbers_in_portions():
     """Normal, independent, bounded; the same however they are asked for."""
-    whole = NOISE.consecutive_increments(3, np.arange(40), 0, 1000, 1.0)
-    assert np.array_equal(NOISE.consecutive_increments(3, np.arange(10, 20), 100, 57, 1.0), whole[10:20, 100:157])
-    assert abs((2.0 * NOISE.consecutive_increments(3, np.arange(40), 0, 1000, 0.25) * whole).mean()) < 4 / np.sqrt(
-        whole.size
+    all_increments = NOISE.consecutive_increments(3, np.arange(40), 0, 1000, 1.0)
+    assert np.array_equal(
+        NOISE.consecutive_increments(3, np.arange(10, 20), 100, 57, 1.0), all_increments[10:20, 100:157]
     )
-    sample = whole.ravel()
+    assert abs(
+        (2.0 * NOISE.consecutive_increments(3, np.arange(40), 0, 1000, 0.25) * all_increments).mean()
+    ) < 4 / np.sqrt(all_increments.size)
+    sample = all_increments.ravel()
     count = len(sample)
     assert abs(sample.mean()) < 4 / np.sqrt(count)
     assert abs(sample.var() - 1.0) < 4 * np.sqrt(2 / count)
     assert abs((sample**4).mean() - 3.0) < 4 * np.sqrt(96 / count)
-    assert abs((whole[:, 1:] * whole[:, :-1]).mean()) < 4 / np.sqrt(count)
-    assert abs((whole[1:] * whole[:-1]).mean()) < 4 / np.sqrt(count)
+    assert abs((all_increments[:, 1:] * all_increments[:, :-1]).mean()) < 4 / np.sqrt(count)
+    assert abs((all_increments[1:] * all_increments[:-1]).mean()) < 4 / np.sqrt(count)
     assert np.abs(sample).max() < 6.0
 
 
@@ -123,15 +125,15 @@ def test_no_noise_is_the_run_without_to_the_bit(engine):
 def test_little_noise_is_nearly_the_run_without():
     """Of the size of the square root of k."""
     still = run(BODY, None, "compiled", method=lt.MetriplecticMidpoint()).x
-    away = [np.abs(run(BODY, lt.Fluctuations(k, 1), "compiled").x - still).max() for k in (1e-8, 1e-10, 1e-12)]
-    assert np.allclose(np.array(away[:-1]) / away[1:], 10.0, rtol=0.01)
+    distances = [np.abs(run(BODY, lt.Fluctuations(k, 1), "compiled").x - still).max() for k in (1e-8, 1e-10, 1e-12)]
+    assert np.allclose(np.array(distances[:-1]) / distances[1:], 10.0, rtol=0.01)
 
 
 @pytest.mark.slow
 def test_a_lattice_needs_few_programs(monkeypatch):
     """One takes the steps, one begins a run, and the axioms have one: no size adds any, nor does another run."""
-    traced = []
-    monkeypatch.setattr(programs._ArrayFunction, "__call__", _counted(programs._ArrayFunction.__call__, traced))
+    trace_counts = []
+    monkeypatch.setattr(programs._ArrayFunction, "__call__", _counted(programs._ArrayFunction.__call__, trace_counts))
     sites = (3, 5, 4)
     magnet = lt.models.spin_lattice(sites, rate=1.0, baths=lt.HeatBaths(np.inf, 1.0))
     up = magnet.state(np.tile([0.0, 0.0, 1.0], (*sites, 1)))
@@ -140,7 +142,7 @@ def test_a_lattice_needs_few_programs(monkeypatch):
             magnet, up, (0.0, 0.025 * steps), 0.025, noise=lt.Fluctuations(seed=seed), save_every=steps, engine="array"
         )
         assert run.stats.newton_iterations == 0
-    programs_of_runs = [name for name in traced if name in ("advance", "first_state", "_compiled")]
+    programs_of_runs = [name for name in trace_counts if name in ("advance", "first_state", "_compiled")]
     assert sorted(programs_of_runs) == ["_compiled", "advance", "first_state"]
 
 
@@ -259,10 +261,10 @@ class Summed:
     fine: np.ndarray
     factor: int
 
-    def __call__(self, first, steps, h):
+    def __call__(self, first_step, steps, h):
         del h
-        chosen = self.fine[first * self.factor : (first + steps) * self.factor]
-        return chosen.reshape(steps, self.factor, -1).sum(axis=1)
+        increments = self.fine[first_step * self.factor : (first_step + steps) * self.factor]
+        return increments.reshape(steps, self.factor, -1).sum(axis=1)
 
 
 @pytest.mark.slow
@@ -296,11 +298,11 @@ def test_a_spin_with_a_bath_of_its_own():
     assert ensemble.energy_drift.max() < 1e-13
     assert np.abs(np.linalg.norm(ensemble.x[..., :3], axis=-1) - 1.0).max() < 1e-13
     heat = 200.0 * 0.8 * np.expm1(ensemble.x[..., 3] / 200.0)
-    lost = 2.0 * (ensemble.x[..., 2] - 0.8)
-    assert np.abs(heat - lost).max() < 1e-11
-    late = ensemble.x[:, ensemble.t >= 6.0, 2].mean(axis=1)
+    lost_energy = 2.0 * (ensemble.x[..., 2] - 0.8)
+    assert np.abs(heat - lost_energy).max() < 1e-11
+    late_means = ensemble.x[:, ensemble.t >= 6.0, 2].mean(axis=1)
     z = 2.0 / 0.8
-    assert abs(late.mean() - (1 / np.tanh(z) - 1 / z)) < 3.5 * late.std() / np.sqrt(2000) + 0.005
+    assert abs(late_means.mean() - (1 / np.tanh(z) - 1 / z)) < 3.5 * late_means.std() / np.sqrt(2000) + 0.005
 
 
 def _of(g, energy, entropy, rate):
@@ -349,7 +351,9 @@ def test_a_thousand_paths_of_ten_thousand_steps_keep_their_energy(name):
     k, h, system, x0 = LONG[name]
     times = (0.0, 10_000 * h)
     x0 = np.tile(np.asarray(x0, dtype=float), (1000, 1))
-    ensemble = lt.ensemble(system, x0, times, h, noise=lt.Fluctuations(k, seed=1), outputs="trajectory", save_every=2500)
+    ensemble = lt.ensemble(
+        system, x0, times, h, noise=lt.Fluctuations(k, seed=1), outputs="trajectory", save_every=2500
+    )
     assert ensemble.ok.all()
     assert ensemble.energy_drift.max() < 1e-13
     assert np.ptp(ensemble.x[:, -1], axis=0).max() > 0.0
@@ -371,12 +375,13 @@ def test_heat_of_a_bath_is_what_the_energy_changes_by():
     def defect(x, new, dW):
         d, compensation = new - x, jnp.zeros(3)
         dH = gradient(system.energy, x, d, compensation)
-        moved = system.poisson.sharp(x + 0.5 * d, dH)
+        velocity = system.poisson.sharp(x + 0.5 * d, dH)
         heat = jnp.dot(
             dH,
-            0.05 * (set_noise_increments(noisy, dW).slopes(system, x, compensation, 0.05, d[None] / 0.05)[0] - moved),
+            0.05
+            * (set_noise_increments(noisy, dW).slopes(system, x, compensation, 0.05, d[None] / 0.05)[0] - velocity),
         )
-        return heat - (system.energy.value(new) - system.energy.value(x)), jnp.dot(dH, moved)
+        return heat - (system.energy.value(new) - system.energy.value(x)), jnp.dot(dH, velocity)
 
     heat, motion = defect(*map(jnp.asarray, (solution.x[:100], solution.x[1:101], rows)))
     assert np.abs(heat).max() < 1e-13

@@ -96,9 +96,9 @@ def test_noise_and_motion_are_checked():
 
 
 def test_what_has_no_noise():
-    own = on_level(lt.ProjectedMetric(np.diag([1.0, 2.0, 3.0])))
+    system_without_noise = on_level(lt.ProjectedMetric(np.diag([1.0, 2.0, 3.0])))
     with pytest.raises(lt.InputError, match=r"ProjectedMetric gives no factor .* on S\^2"):
-        lt.integrate(own, START, (0.0, 1.0), 0.1, noise=NOISE)
+        lt.integrate(system_without_noise, START, (0.0, 1.0), 0.1, noise=NOISE)
 
 
 @pytest.mark.slow
@@ -158,9 +158,9 @@ def _affine(x):
 
 def ring_points(count):
     u, v = (a.ravel() for a in np.meshgrid(*[np.linspace(0.0, 2.0 * np.pi, int(np.sqrt(count)), endpoint=False)] * 2))
-    out = 3.0 + np.cos(v)
-    points = np.stack([out * np.cos(u), out * np.sin(u), np.sin(v)], axis=1)
-    return points, out * np.exp(-_ring(points.T) / T)
+    radius = 3.0 + np.cos(v)
+    points = np.stack([radius * np.cos(u), radius * np.sin(u), np.sin(v)], axis=1)
+    return points, radius * np.exp(-_ring(points.T) / T)
 
 
 def _ring(x):
@@ -228,7 +228,9 @@ def test_noise_moves_a_state_far_on_a_surface_of_no_degree():
     system, noise, samples, _ = CASES["ring"]
     ensemble = lt.ensemble(system, samples(100)[0], (0.0, 3.0), 0.02, noise=noise)
     assert ensemble.ok.all()
-    assert system.space.residual(ensemble.x).max() < 1e-13  # differences of values of size 4, 64 roundings of which count
+    assert (
+        system.space.residual(ensemble.x).max() < 1e-13
+    )  # differences of values of size 4, 64 roundings of which count
 
 
 @pytest.mark.slow

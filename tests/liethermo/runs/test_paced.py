@@ -30,7 +30,7 @@ def nonlinear():
     )
 
 
-def same(many, others, order=slice(None)):
+def same(ensemble, other_ensemble, order=slice(None)):
     """To the last bit."""
     for name in (
         "x",
@@ -43,7 +43,7 @@ def same(many, others, order=slice(None)):
         "energy_drift",
         "relaxation_time",
     ):
-        assert np.array_equal(getattr(many, name)[order], getattr(others, name), equal_nan=True), name
+        assert np.array_equal(getattr(ensemble, name)[order], getattr(other_ensemble, name), equal_nan=True), name
 
 
 # -- each as alone ----------------------------------------------------------------------------------------------------
@@ -89,14 +89,14 @@ def test_a_trajectory_does_not_depend_on_its_neighbours(engine, monkeypatch):
             BODY, x0s[order], (0.0, 60.0), lt.Adaptive(1e-7), METHOD, parameters=parameters, engine=engine
         )
 
-    plain, order = run(np.arange(41)), np.random.default_rng(1).permutation(41)
-    assert plain.ok.all()
-    same(plain, run(order), order)
-    same(plain, run(np.arange(5)), slice(5))
+    default_run, order = run(np.arange(41)), np.random.default_rng(1).permutation(41)
+    assert default_run.ok.all()
+    same(default_run, run(order), order)
+    same(default_run, run(np.arange(5)), slice(5))
     monkeypatch.setattr(batches, "THREAD_BATCH_SIZE", 8)
     monkeypatch.setattr(paced, "ARRAY_BATCH_SIZE", 16)
     monkeypatch.setattr(paced, "ATTEMPTS_PER_CALL_RANGE", (1, 3))
-    same(plain, run(np.arange(41)))
+    same(default_run, run(np.arange(41)))
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -126,7 +126,7 @@ def test_stiff_failing_and_early_ones_together(engine):
     assert ensemble.x[3, 0] > 0.5  # it has fallen in its time
     rows = {row.law: row.passed for row in ensemble.audit().rows}
     assert rows.pop("trajectories that failed") is False
-    assert all(passed is not False for law, passed in rows.items() if law != "accuracy")
+    assert all(is_obeyed is not False for law, is_obeyed in rows.items() if law != "accuracy")
 
 
 def test_limits():
@@ -172,8 +172,8 @@ def test_events_happen_when_they_do_alone(engine, step):
         assert one.t[-1] == pytest.approx(ensemble.end_time[i], rel=1e-13)
         assert one.event_time == (None if i == 9 else pytest.approx(ensemble.event_time[i], rel=1e-13))
         assert np.abs(one.x[-1] - ensemble.x[i]).max() < 1e-12
-    produced = [float(BODY.entropy_production(x)) for x in ensemble.x[ensemble.status == StatusCode.EVENT]]
-    assert produced == pytest.approx([1e-4] * len(produced), rel=1e-9)
+    entropy_productions = [float(BODY.entropy_production(x)) for x in ensemble.x[ensemble.status == StatusCode.EVENT]]
+    assert entropy_productions == pytest.approx([1e-4] * len(entropy_productions), rel=1e-9)
     assert ensemble.audit().passed
 
 
@@ -184,10 +184,10 @@ def test_an_event_of_ones_own_in_a_family():
     options = {"until": lambda x: x[0] - level}
     arguments = {"parameters": {"dissipation.rate": rates}}
     ensemble = lt.ensemble(BODY, x0s, (0.0, 30.0), lt.Adaptive(1e-9), METHOD, **arguments, **options)
-    happened = ensemble.status == StatusCode.EVENT
-    assert happened.sum() >= 2
-    i = int(np.flatnonzero(happened)[-1])
-    assert np.abs(ensemble.x[happened, 0] - level).max() < 1e-13
+    has_event = ensemble.status == StatusCode.EVENT
+    assert has_event.sum() >= 2
+    i = int(np.flatnonzero(has_event)[-1])
+    assert np.abs(ensemble.x[has_event, 0] - level).max() < 1e-13
     one = lt.integrate(
         lt.models.rigid_body(rate=2 * rates[i]), x0s[i], (0.0, 30.0), lt.Adaptive(1e-9), METHOD, **options
     )

@@ -66,8 +66,8 @@ def test_a_noisy_run_in_parts_is_the_run_to_the_bit(name, engine):
     assert np.abs(np.diff(whole_run.x, axis=0)).max() > 0.1
     if whole_run.attitude is not None:
         assert np.array_equal(parts.attitude[-1], whole_run.attitude[-1])
-    again = lt.integrate(system, parts.x[0], (0.0, times[-1] - times[-2]), step, noise=noise, engine=engine)
-    assert np.abs(again.x[-1] - parts.x[-1]).max() > 1e-3  # the noise of another time is another one
+    shifted_run = lt.integrate(system, parts.x[0], (0.0, times[-1] - times[-2]), step, noise=noise, engine=engine)
+    assert np.abs(shifted_run.x[-1] - parts.x[-1]).max() > 1e-3  # the noise of another time is another one
 
 
 @pytest.mark.slow
@@ -117,11 +117,11 @@ def test_a_noisy_study_in_parts():
     """Replicas have seeds of their own; a study that starts where another one ended goes on with them."""
 
     def study(x0s, span):
-        found = lt.Study(
+        new_study = lt.Study(
             body(), {"replica": lt.replicas(x0s)}, t_span=span, step=0.05, measure={"final": "final"}, noise=NOISE
         )
-        found.run(progress=False)
-        return found.results.final.values
+        new_study.run(progress=False)
+        return new_study.results.final.values
 
     starts = np.random.default_rng(0).standard_normal((4, 3))
     assert np.array_equal(study(study(starts, (0.0, 1.0)), (1.0, 2.0)), study(starts, (0.0, 2.0)))
@@ -171,26 +171,26 @@ def test_energy_and_casimirs_of_noisy_runs_do_not_drift(name):
 @pytest.mark.parametrize("offset", [0.0, 0.5, 0.25, 1 / 3, 0.1, 0.3, 1 / 128, 3 / 1024])
 def test_steps_at_times_that_are_rounded_otherwise_have_the_same_names(step, offset):
     """Summed up one by one, multiplied, or as parts begin; from times far below zero to far above."""
-    for first in (0, -1000, 10**6, -(10**9)):
-        start = (first + offset) * step
+    for first_step in (0, -1000, 10**6, -(10**9)):
+        start = (first_step + offset) * step
         n = np.arange(2000)
-        multiplied = start + n * step
-        summed = np.cumsum(np.append(start, np.full(1999, step)))
-        shifted = (start + 700 * step) + (n - 700) * step
-        whole = step_cells(multiplied, step, step)
-        for times in (summed, shifted, (first + offset + n) * step):
-            assert step_cells(times, step, step)[0] == whole[0]
-            assert np.array_equal(step_cells(times, step, step)[1], whole[1])
-        assert (np.diff(whole[1]) == 64).all()
+        product_times = start + n * step
+        sum_times = np.cumsum(np.append(start, np.full(1999, step)))
+        shifted_times = (start + 700 * step) + (n - 700) * step
+        product_cells = step_cells(product_times, step, step)
+        for times in (sum_times, shifted_times, (first_step + offset + n) * step):
+            assert step_cells(times, step, step)[0] == product_cells[0]
+            assert np.array_equal(step_cells(times, step, step)[1], product_cells[1])
+        assert (np.diff(product_cells[1]) == 64).all()
 
 
 @pytest.mark.parametrize(("step", "steps"), [(0.1, 1), (0.1, 10), (0.01, 1), (1e-3, 100), (1 / 3, 3)])
 def test_parts_have_the_steps_of_the_run_however_late_they_are(step, steps):
     """1024.9 - 1024.8 is more than 0.1 by rounding, which is no time for a step."""
-    for first in [*range(0, 200_000, 17), 10**6, 10**7 + 3, 10**8 + 1]:
-        part = ScheduleSegment.from_span(first * steps * step, (first + 1) * steps * step, step)
+    for first_step in [*range(0, 200_000, 17), 10**6, 10**7 + 3, 10**8 + 1]:
+        part = ScheduleSegment.from_span(first_step * steps * step, (first_step + 1) * steps * step, step)
         assert (part.n_full_steps, part.last_step_size) == (steps, 0.0)
-        part = ScheduleSegment.from_span(first * steps * step, (first + 1) * steps * step + 0.25 * step, step)
+        part = ScheduleSegment.from_span(first_step * steps * step, (first_step + 1) * steps * step + 0.25 * step, step)
         assert part.n_full_steps == steps
         assert np.isclose(part.last_step_size, 0.25 * step, rtol=1e-4)
 
@@ -234,12 +234,12 @@ def increments(noise=NOISE, count=2, members=8, starts=None, length=0.1, step=0.
 
 def test_noise_of_other_times_seeds_trajectories_and_steps_is_independent():
     """Moments up to the fourth, and correlations, within four standard errors."""
-    here = increments()
-    n = here.size
+    reference = increments()
+    n = reference.size
     for power, mean, variance in ((1, 0.0, 1.0), (2, 1.0, 2.0), (3, 0.0, 15.0), (4, 3.0, 96.0)):
-        assert abs((here**power).mean() - mean) < 4.0 * np.sqrt(variance / n)
-    others = {
-        "the next step": here[:, 1:],
+        assert abs((reference**power).mean() - mean) < 4.0 * np.sqrt(variance / n)
+    independent_increments = {
+        "the next step": reference[:, 1:],
         "a later part": increments(starts=400.0 + 0.1 * np.arange(4000)),
         "before zero": increments(starts=-400.0 + 0.1 * np.arange(4000)),
         "half a step later": increments(starts=0.05 + 0.1 * np.arange(4000)),
@@ -249,12 +249,12 @@ def test_noise_of_other_times_seeds_trajectories_and_steps_is_independent():
         "another step": increments(length=0.2, step=0.2, starts=0.2 * np.arange(4000)),
         "shorter steps": increments(length=0.05, step=0.05, starts=0.05 * np.arange(4000)),
         "shortened steps": increments(length=0.04),
-        "the other components": here[..., ::-1],
-        "the trajectories in another order": here[::-1],
+        "the other components": reference[..., ::-1],
+        "the trajectories in another order": reference[::-1],
     }
-    for what, other in others.items():
-        steps = other.shape[1]
-        for f, g in ((here, other), (here**2 - 1.0, other**2 - 1.0)):
+    for what, increments_of_case in independent_increments.items():
+        steps = increments_of_case.shape[1]
+        for f, g in ((reference, increments_of_case), (reference**2 - 1.0, increments_of_case**2 - 1.0)):
             product = f[:, -steps:] * g if what != "the next step" else f[:, :-1] * g
             assert abs(product.mean()) < 4.0 * product.std() / np.sqrt(product.size), what
 
@@ -270,8 +270,8 @@ def test_parts_that_end_within_a_step_have_noise_of_their_own():
         t = end
         if t > 12.0:
             means.append(x[:, 2])
-    of_paths = np.mean(means, axis=0)
-    assert abs(of_paths.mean() - (1.0 / np.tanh(1.0) - 1.0)) < 4.0 * of_paths.std() / np.sqrt(400)
+    path_means = np.mean(means, axis=0)
+    assert abs(path_means.mean() - (1.0 / np.tanh(1.0) - 1.0)) < 4.0 * path_means.std() / np.sqrt(400)
 
 
 # -- without noise -----------------------------------------------------------------------------------------------------
@@ -330,9 +330,9 @@ def test_a_run_in_parts_is_the_run_to_rounding(name):
     assert np.allclose(parts.t, whole_run.t[24:], rtol=0.0, atol=1e-14)
     if whole_run.attitude is not None:
         assert np.abs(parts.attitude[-1] - whole_run.attitude[-1]).max() < 1e-13
-    shifted = in_parts(system, x0, tuple(t + 1.0 for t in TIMES), 0.1, method=method)
-    moved = np.abs(shifted.x[-1] - whole_run.x[-1]).max()
-    assert moved > 1e-2 if system.is_driven else moved < 1e-12  # the control: times are absolute
+    shifted_run = in_parts(system, x0, tuple(t + 1.0 for t in TIMES), 0.1, method=method)
+    distance = np.abs(shifted_run.x[-1] - whole_run.x[-1]).max()
+    assert distance > 1e-2 if system.is_driven else distance < 1e-12  # the control: times are absolute
 
 
 @pytest.mark.parametrize("name", ["body, Gauss", "attitude, Runge-Kutta", "bath", "torque, Gauss"])
@@ -366,12 +366,12 @@ def test_a_run_goes_on_from_a_file(name, tmp_path):
 def test_adaptive_steps_in_parts_agree_to_their_tolerance(name):
     """Each part begins with a step that it has to find; a tenth of the tolerance brings both ten times nearer."""
     system, x0, method = PLAIN[name]
-    apart = []
+    distances = []
     for rtol in (1e-6, 1e-9):
         whole_run = lt.integrate(system, x0, (TIMES[0], TIMES[-1]), lt.Adaptive(rtol), method)
         parts = in_parts(system, x0, TIMES, lt.Adaptive(rtol), method=method)
-        apart.append(np.abs(parts.x[-1] - whole_run.x[-1]).max() / rtol)
-    assert max(apart) < 30.0
+        distances.append(np.abs(parts.x[-1] - whole_run.x[-1]).max() / rtol)
+    assert max(distances) < 30.0
 
 
 @pytest.mark.slow
@@ -387,19 +387,19 @@ OSCILLATOR = lt.MetriplecticSystem(mf.Canonical(1), lambda z: 0.5 * jnp.dot(z, z
 
 
 @pytest.mark.parametrize("step", [0.1, lt.Adaptive(1e-10)], ids=["fixed", "adaptive"])
-@pytest.mark.parametrize("cut", [0.3, 1.5, 1.57, 1.5707, 1.6, 4.7, 5.0])
-def test_events_of_a_run_in_parts_are_those_of_the_run(step, cut):
+@pytest.mark.parametrize("cut_time", [0.3, 1.5, 1.57, 1.5707, 1.6, 4.7, 5.0])
+def test_events_of_a_run_in_parts_are_those_of_the_run(step, cut_time):
     """q = cos t is zero at pi/2, 3 pi/2, ...: wherever parts end, each is found once, at its time."""
     events, x, t = [], [1.0, 0.0], 0.0
-    for end in (cut, 9.0):
+    for end in (cut_time, 9.0):
         while t < end:
             run = lt.integrate(OSCILLATOR, x, (t, end), step, lt.MetriplecticGauss(4), until=lambda z: z[0])
             x, t = run.x[-1], run.t[-1]
             if run.event_time is not None:
                 events.append(run.event_time)
-                off = min(1e-3, end - t)  # off the event: by a step without one
-                if off > 0.0:
-                    rest = lt.integrate(OSCILLATOR, x, (t, t + off), off, lt.MetriplecticGauss(4))
+                tolerance = min(1e-3, end - t)  # off the event: by a step without one
+                if tolerance > 0.0:
+                    rest = lt.integrate(OSCILLATOR, x, (t, t + tolerance), tolerance, lt.MetriplecticGauss(4))
                     x, t = rest.x[-1], rest.t[-1]
     assert np.allclose(events, np.pi * np.array([0.5, 1.5, 2.5]), rtol=0.0, atol=2e-8)
 

@@ -113,10 +113,10 @@ assert os.waitpid(child, 0)[1] == 0
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
 def test_a_forked_process_does_not_wait_for_ever():
     run = [sys.executable, "-W", "ignore", "-c", FORKED]
-    done = subprocess.run(run, capture_output=True, text=True, check=False, timeout=120)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("ForkError this process was forked after JAX had run")
-    assert 'get_context("spawn")' in done.stdout
+    completed_process = subprocess.run(run, capture_output=True, text=True, check=False, timeout=120)
+    assert completed_process.returncode == 0, completed_process.stderr
+    assert completed_process.stdout.startswith("ForkError this process was forked after JAX had run")
+    assert 'get_context("spawn")' in completed_process.stdout
     assert issubclass(mf.ForkError, RuntimeError)
 
 
