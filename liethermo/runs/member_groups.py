@@ -199,7 +199,7 @@ class _MemberFunctions:
         )
 
     def are_momentum_maps(self) -> np.ndarray:
-        """Return True for each function that the method is asked to preserve and that is no Casimir: shape (B,
+        """Return True for each function that the method must preserve and that is not a Casimir: shape (B,
         functions)."""
         if not self.requested_functions:
             return np.zeros((len(self.states), 0), dtype=int)

@@ -281,7 +281,7 @@ def _terminal_count(function: Any) -> int | None:
     if terminal is None or terminal is False or terminal == 0:
         return None
     if int(terminal) != terminal or terminal < 0:
-        raise InputError(f"terminal must be True or a number of zeros after which the run ends, got {terminal!r}")
+        raise InputError(f"terminal must be True or the number of zeros that ends the run, got {terminal!r}")
     return int(terminal)
 
 

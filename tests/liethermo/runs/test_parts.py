@@ -153,9 +153,10 @@ def test_a_loop_of_short_noisy_runs_has_the_mean_of_equilibrium():
 def test_energy_and_casimirs_of_noisy_runs_do_not_drift(name):
     """Though no step hands on what rounding has kept: over 1e5 steps they stay within a few roundings."""
     system, x0, noise, _, _ = NOISY[name]
-    ensemble = lt.ensemble(system, np.tile(x0, (8, 1)), (0.0, 2000.0), 0.02, noise=noise, outputs="trajectory", save_at=[
-        500.0, 1000.0, 2000.0
-    ])  # fmt: skip
+    times = [500.0, 1000.0, 2000.0]
+    ensemble = lt.ensemble(
+        system, np.tile(x0, (8, 1)), (0.0, 2000.0), 0.02, noise=noise, outputs="trajectory", save_at=times
+    )
     assert ensemble.ok.all()
     if noise is not BATH:
         assert ensemble.energy_drift.max() < 5e-15
