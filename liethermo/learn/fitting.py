@@ -232,7 +232,7 @@ def fit(
         )
     settings = (matching, shooting, rate, batch, window, substeps, method, held_out_fraction, patience, seed)
     if not phases:
-        phase_text = "matching" if observation.is_full_state else "shooting, as not all of the states is observed"
+        phase_text = "matching" if observation.is_full_state else "shooting, because the state is observed in part"
         raise InputError(f"fit has no iterations. Give more than 0 of the {phase_text}")
     data_arrays = [values for trajectory in trajectories for values in trajectory]
     training_run = TrainingRun(
@@ -293,7 +293,7 @@ def _fitted_initial_states(
         [trajectory for trajectory, _ in train], [states for _, states in train], window, finds_initial_states
     )
     displacements = (
-        np.asarray(vector)[params.start.size :].reshape(len(windows.initial_states), -1)[windows.first_windows]
+        np.asarray(vector)[params.initial_values.size :].reshape(len(windows.initial_states), -1)[windows.first_windows]
         * search_units
     )
     return np.asarray(

@@ -230,11 +230,9 @@ def differentiable_stepper(
     needs_no_compensation = isinstance(inner, MetriplecticRungeKutta) and prepared_system.surface is None
 
     def step(carry, h):
-        return (
-            method.step_without_compensation(prepared_system, carry, h)
-            if needs_no_compensation
-            else differentiable_step(prepared_system, method, carry, h)
-        )  # type: ignore[attr-defined]
+        if needs_no_compensation:
+            return method.step_without_compensation(prepared_system, carry, h)  # type: ignore[attr-defined]
+        return differentiable_step(prepared_system, method, carry, h)
 
     def advance(carry, h):
         if substeps == 1:

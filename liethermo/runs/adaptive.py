@@ -93,6 +93,8 @@ def make_step_control(step: float | Adaptive, method: OneStepMethod, length: flo
         numbers += [min_step, step.most_steps]
     else:
         numbers = [0.0, 0.0, step, math.inf, min_step, math.inf]
-    limits = (np.asarray(float(number)) for number in numbers)
     event_function, falling_only = (None, False) if event is None else (event.function, event.falling_only)
-    return StepControl(*limits, event_function, falling_only, adaptive)
+    rtol, atol, first_step, max_step, min_step_array, max_attempts = (np.asarray(float(number)) for number in numbers)
+    return StepControl(
+        rtol, atol, first_step, max_step, min_step_array, max_attempts, event_function, falling_only, adaptive
+    )

@@ -172,8 +172,8 @@ T, X = np.linspace(0.0, 1.0, 5), np.arange(15.0).reshape(5, 3)
         ({"t": T}, {}, "pair"),
         ([], {}, "no trajectories"),
         ("records.csv", {}, "pair"),
-        ((T, X), {"matching": 0, "shooting": 0}, "nothing to do"),
-        ((T, X[:, :2]), {"observed": [0, 1], "shooting": 0}, "iterations of the shooting"),
+        ((T, X), {"matching": 0, "shooting": 0}, "fit has no iterations"),
+        ((T, X[:, :2]), {"observed": [0, 1], "shooting": 0}, "of the shooting"),
         ([[]], {}, "no trajectories"),
         ((T, 5.0), {}, "5 times and no states"),
         ((T, [[1.0, 2.0, 3.0], [1.0, 2.0]]), {}, "not made of real numbers"),
@@ -198,7 +198,7 @@ def test_bad_data_has_an_error_of_one_line(data, how, words):
 
 def test_a_system_of_which_nothing_is_learned_is_refused():
     body = lt.models.rigid_body()
-    with pytest.raises(lt.InputError, match="nothing is learned"):
+    with pytest.raises(lt.InputError, match="nothing to learn"):
         lt.learn.fit(body, (T, X))
 
 
@@ -275,9 +275,9 @@ def test_components_and_a_function_of_the_state_are_one_mechanism():
 @pytest.mark.parametrize(
     ("how", "words"),
     [
-        ({"observe": lambda x: x, "observed": [0]}, "not both"),
+        ({"observe": lambda x: x, "observed": [0]}, "cannot be combined"),
         ({"observe": 3}, "function of the state"),
-        ({"observe": lambda x, R: R}, "give the system a group"),
+        ({"observe": lambda x, R: R}, "Give the system a group"),
         ({"observe": lambda x: x[:, 0]}, "could not be evaluated"),
         ({"observe": lambda x: 1}, "real numbers"),
         ({"observe": lambda x: x[:2]}, r"shape \(5, 3\), but observe returns shape \(2,\)"),

@@ -98,13 +98,13 @@ def test_a_plain_step_is_the_step_but_for_rounding(order):
     ("call", "words"),
     [
         (lambda: lt.learn.Energy(lt.Quadratic(np.ones(2))), "Add known terms"),
-        (lambda: lt.learn.Energy(0), "number of components is a positive integer, not 0"),
+        (lambda: lt.learn.Energy(0), "number of components must be a positive integer, got 0"),
         (lambda: lt.learn.Friction(3, construction="other"), "'skew' or 'projected'"),
         (lambda: lt.learn.Friction(3, rank=0), "rank must be a positive integer"),
         (lambda: lt.learn.Metriplectic(4, friction=lt.learn.Friction(3)), "3 components, but the state has 4"),
         (lambda: lt.learn.Metriplectic(2, poisson=mf.Canonical(2)), "4 coordinates, more than the 2"),
         (lambda: lt.learn.Metriplectic(4, poisson=lt.learn.Poisson(3)), "dim is 4, but the Poisson structure has 3"),
-        (lambda: lt.learn.Metriplectic(2, friction="some"), "not 'some'"),
+        (lambda: lt.learn.Metriplectic(2, friction="some"), "got 'some'"),
     ],
 )
 def test_what_cannot_be_used_is_refused(call, words):
