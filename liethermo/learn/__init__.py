@@ -1,4 +1,4 @@
-"""Systems with networks in them, fitted to data: both laws hold by construction, before, during and after training."""
+"""Fit systems with neural networks to data; both laws hold by construction before, during and after training."""
 
 from manifolds._names import public_dir
 

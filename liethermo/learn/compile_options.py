@@ -1,4 +1,4 @@
-"""How the programs of a fit are compiled."""
+"""Compiler options for the programs of a fit."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import Any
 
 
 def fast_compile_options() -> dict[str, Any]:
-    """Options for programs that derivatives make long: they compile sooner, and run about as fast.
+    """Return options with which long programs of derivatives compile sooner and run about as fast.
 
-    Where the user has chosen a level of optimisation, that is taken.
+    A level of optimisation that the user has set is respected.
     """
     if "optimization_level" in os.environ.get("XLA_FLAGS", ""):
         return {}

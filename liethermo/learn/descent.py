@@ -1,4 +1,4 @@
-"""The descent of a fit: Adam, for matrices in the eigenvectors of what their gradients are like."""
+"""The optimiser of a fit: SOAP, which is Adam in the eigenvectors of each layer's gradients."""
 
 from __future__ import annotations
 
@@ -12,32 +12,35 @@ import jax.numpy as jnp
 import numpy as np
 
 MEAN_DECAY = 0.95
-"""The share of a mean of gradients, of their squares or of their products that is kept from step to step."""
+"""Decay per step of the running means of gradients, of their squares and of their products, for matrices."""
 
 ADAM_DECAYS = 0.9, 0.99
-"""The same of means of gradients and of their squares, of numbers outside matrices, for which Adam is run."""
+"""Decays per step of the running means of gradients and of their squares, for parameters outside of matrices (Adam)."""
 
 STEPS_PER_EIGENBASIS = 10
-"""Steps between two looks at the eigenvectors."""
+"""Number of steps between two updates of the eigenvectors."""
 
 MAX_PRECONDITIONED_DIM = 256
-"""Rows or columns of a matrix that is turned: of more, eigenvectors cost more than they bring."""
+"""Largest number of rows or columns of a preconditioned matrix; for larger ones eigenvectors cost more than they
+gain."""
 
 ADAM_EPSILON = 1e-8
-"""What is added to the sizes of gradients, as in Adam."""
+"""Number added to the root of the mean squares, as in Adam."""
 
 
 def soap_optimiser(shapes: Sequence[tuple[int, ...]], rate: Callable) -> Any:
-    """An optimiser of optax for a vector: SOAP [Vyas et al. 2025].
+    """Return the optax optimiser SOAP [Vyas et al. 2025] for a parameter vector.
 
-    The gradient of a matrix W of weights is turned into the eigenvectors of the means of ``G G^T`` and ``G^T G``. Adam
-    works there: the directions in which a layer is steep and flat are apart. All other numbers are left to Adam.
+    The gradient of a weight matrix W is rotated into the eigenvectors of the running means of ``G G^T`` and ``G^T G``,
+    which separate steep from flat directions of a layer. Adam works in these coordinates. All other parameters are
+    updated by Adam directly.
 
     Parameters
     ----------
     shapes : sequence of tuple of int
-        Of the arrays that the vector begins with; what is behind them is one array more.
+        Shapes of the arrays at the start of the vector; the rest of the vector is one more array.
     rate : function from the number of a step to a number
+        Learning rate.
     """
     import optax
 
@@ -49,36 +52,42 @@ def soap_optimiser(shapes: Sequence[tuple[int, ...]], rate: Callable) -> Any:
     ]
 
     def moment_decays(size: int) -> tuple[np.ndarray, np.ndarray]:
-        first, second = (np.full(size, memory) for memory in ADAM_DECAYS)
-        for at, _ in matrices:
-            first[at] = second[at] = MEAN_DECAY
-        return first, second
+        mean_decays, square_decays = (np.full(size, decay) for decay in ADAM_DECAYS)
+        for indices, _ in matrices:
+            mean_decays[indices] = square_decays[indices] = MEAN_DECAY
+        return mean_decays, square_decays
 
     def init(vector):
         zero = jnp.zeros_like(vector)
         sides = [[(jnp.eye(n), jnp.zeros((n, n))) for n in shape] for _, shape in matrices]
         return jnp.zeros((), int), zero, zero, sides
 
-    def update(slope, state, vector=None):
+    def update(gradient, state, vector=None):
         count, mean, square, sides = state
-        means = [[MEAN_DECAY * S + (1.0 - MEAN_DECAY) * P for (_, S), P in zip(pair, _gram_matrices(slope[at].reshape(shape)),
-                  strict=True)] for (at, shape), pair in zip(matrices, sides, strict=True)]  # fmt: skip
-        first, second = moment_decays(slope.size)
-        turned, mean = _rotate_matrices(slope, matrices, sides), first * mean + (1.0 - first) * slope
-        square = second * square + (1.0 - second) * turned**2
-        step = _rotate_matrices(mean / (1.0 - first ** (count + 1.0)), matrices, sides)
-        step = step / (jnp.sqrt(square / (1.0 - second ** (count + 1.0))) + ADAM_EPSILON)
+        grams = [_gram_matrices(gradient[indices].reshape(shape)) for indices, shape in matrices]
+        means = [
+            [MEAN_DECAY * S + (1.0 - MEAN_DECAY) * P for (_, S), P in zip(pair, products, strict=True)]
+            for pair, products in zip(sides, grams, strict=True)
+        ]
+        mean_decays, square_decays = moment_decays(gradient.size)
+        rotated_slope, mean = (
+            _rotate_matrices(gradient, matrices, sides),
+            mean_decays * mean + (1.0 - mean_decays) * gradient,
+        )
+        square = square_decays * square + (1.0 - square_decays) * rotated_slope**2
+        step = _rotate_matrices(mean / (1.0 - mean_decays ** (count + 1.0)), matrices, sides)
+        step = step / (jnp.sqrt(square / (1.0 - square_decays ** (count + 1.0))) + ADAM_EPSILON)
         step = _rotate_matrices(step, matrices, [[(Q.T, S) for Q, S in pair] for pair in sides])
 
         def update_bases(_):
-            return [[_update_eigenvectors(count, Q, S) for (Q, _), S in zip(pair, own, strict=True)]
-                    for pair, own in zip(sides, means, strict=True)]  # fmt: skip
+            return [[_update_eigenvectors(count, Q, S) for (Q, _), S in zip(pair, gram_means, strict=True)]
+                    for pair, gram_means in zip(sides, means, strict=True)]  # fmt: skip
 
         def keep_bases(_):
             return [[Q for Q, _ in pair] for pair in sides]
 
-        turns = jax.lax.cond(count % STEPS_PER_EIGENBASIS == 0, update_bases, keep_bases, None)
-        sides = [list(zip(*both, strict=True)) for both in zip(turns, means, strict=True)]
+        bases = jax.lax.cond(count % STEPS_PER_EIGENBASIS == 0, update_bases, keep_bases, None)
+        sides = [list(zip(*basis_and_mean, strict=True)) for basis_and_mean in zip(bases, means, strict=True)]
         return -rate(count) * step, (count + 1, mean, square, sides)
 
     return optax.GradientTransformation(init, update)
@@ -89,12 +98,12 @@ def _gram_matrices(G: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def _rotate_matrices(vector: jax.Array, matrices: Sequence, sides: Sequence) -> jax.Array:
-    """``Q^T G R`` in place of each matrix G."""
-    for (at, shape), ((Q, _), (R, _)) in zip(matrices, sides, strict=True):
-        vector = vector.at[at].set((Q.T @ vector[at].reshape(shape) @ R).ravel())
+    """Replace each matrix G in a vector by ``Q^T G R``."""
+    for (indices, shape), ((Q, _), (R, _)) in zip(matrices, sides, strict=True):
+        vector = vector.at[indices].set((Q.T @ vector[indices].reshape(shape) @ R).ravel())
     return vector
 
 
 def _update_eigenvectors(count: jax.Array, Q: jax.Array, S: jax.Array) -> jax.Array:
-    """Those of S: at first, and then one step of orthogonal iteration from those so far."""
+    """Return the eigenvectors of S: exact at step 0, then by one step of orthogonal iteration from Q."""
     return jax.lax.cond(count == 0, lambda: jnp.linalg.eigh(S)[1][:, ::-1], lambda: jnp.linalg.qr(S @ Q)[0])

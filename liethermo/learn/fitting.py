@@ -1,4 +1,4 @@
-"""``fit``: a system that is learned from trajectories."""
+"""``fit``: learn a system from trajectories."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ from .training import FitWarning, Phase, TrainingRun, fingerprint
 T = TypeVar("T", bound=System)
 
 BATCH_SIZES = {"matching": 256, "shooting": 32}
-"""Points, and short runs, of one step."""
+"""Default batch sizes: points of an iteration of the matching, and short runs of one of the shooting."""
 
 SHOOTING_RATE_FACTOR = 0.3
-"""The rate of the shooting, relative to that of the matching before it."""
+"""Learning rate of the shooting, relative to that of the matching before it."""
 
 
 @with_library_settings
@@ -58,18 +58,18 @@ def fit(
     checkpoint: str | os.PathLike | None = None,
     progress: bool | None = None,
 ) -> T:
-    """A system like the given one, with what is learned of it fitted to trajectories.
+    """Return a copy of a system whose learned parts are fitted to trajectories.
 
-    The first part matches the vector field to the derivatives of splines through the data. The second part matches the
-    states at the ends of short runs from the data (multiple shooting), whose steps obey both discrete laws. Each part
-    is a descent by SOAP [Vyas et al. 2025], which is Adam in the eigenvectors of each layer's gradients, with a rate
-    that falls along a cosine. The same arguments give the same result.
+    The first phase matches the vector field to the derivatives of splines through the data. The second phase matches
+    the states at the ends of short runs from the data (multiple shooting), whose steps obey both discrete laws. Both
+    minimise by SOAP [Vyas et al. 2025], which is Adam in the eigenvectors of each layer's gradients, with a learning
+    rate that falls along a cosine. Equal arguments give equal results.
 
-    If at most 64 numbers are learned, none of them in networks of this module, a third part follows the second: least
-    squares over whole trajectories by Levenberg and Marquardt's method, which finds the first states too. It gives
-    standard errors of the numbers, says how many combinations of them the data determine, and whether the iteration has
-    converged: see :class:`Training`. The errors suppose that those of the data are independent, and that the model can
-    describe the data.
+    If at most 64 parameters are learned, none of them in networks of this module, a third phase follows: least squares
+    over whole trajectories by the Levenberg-Marquardt method, which fits the initial states too. It gives standard
+    errors of the parameters, the number of their combinations that the data determine, and whether the iteration has
+    converged: see :class:`Training`. The standard errors assume that the errors of the data are independent, and that
+    the model can describe the data.
 
     Parameters
     ----------
@@ -127,8 +127,8 @@ def fit(
     Warns
     -----
     FitWarning
-        If the least squares have not converged, the data do not determine a number, or what the runs miss of the data
-        is much more than the noise.
+        If the least squares have not converged, the data do not determine a parameter, or the residuals of the runs are
+        much larger than the noise.
 
     Raises
     ------
@@ -137,115 +137,144 @@ def fit(
     FileError
         If the checkpoint is of another fit, or cannot be written.
     """
-    began = time.perf_counter()
+    start_time = time.perf_counter()
     if not isinstance(system, System):
-        raise InputError(f"fit takes a system, such as lt.learn.Metriplectic(4), not {type(system).__name__}")
+        raise InputError(f"fit needs a system such as lt.learn.Metriplectic(4), got {type(system).__name__}")
     if not isinstance(method, OneStepMethod | None):
-        raise InputError(f"method is a OneStepMethod, such as lt.MetriplecticRungeKutta(4), not {method!r}")
+        raise InputError(f"method must be a OneStepMethod such as lt.MetriplecticRungeKutta(4), got {method!r}")
     if not (_is_real_number(rate) and 0.0 < rate < np.inf):
-        raise InputError(f"rate is a positive number, not {rate!r}")
+        raise InputError(f"rate must be a positive number, got {rate!r}")
     counts = {"matching": matching, "shooting": shooting, "batch": batch, "window": window, "substeps": substeps}
     for name, value in {**counts, "patience": patience, "seed": seed}.items():
         _check_count(name, value, 0 if name in BATCH_SIZES or name == "seed" else 1, name in ("batch", "patience"))
     if system.is_driven:
-        raise InputError("a fit is for systems without an energy that depends on time, and without torques")
-    seen = make_observation(system, observed, observe)
+        raise InputError("fit needs a system without torques, whose energy does not depend on time")
+    observation = make_observation(system, observed, observe)
     method = MetriplecticRungeKutta(4) if method is None else method
-    run = losses.differentiable_stepper(system, method, substeps, seen.group is not None)[0]
-    whole = [trajectory.flat_trajectory for trajectory in parse_trajectories(data, system, seen)]
-    shown = data_scales(whole)
-    sigma = checked_noise(noise, shown.scale.size)
+    run = losses.differentiable_stepper(system, method, substeps, observation.group is not None).system
+    trajectories = [trajectory.flat_trajectory for trajectory in parse_trajectories(data, system, observation)]
+    data_scale = data_scales(trajectories)
+    sigma = checked_noise(noise, data_scale.scale.size)
     noise_is_estimated = noise is None
     if noise_is_estimated:
-        sigma = estimate_noise(whole, shown.scale)
-    smooth = [spline_states_and_rates(trajectory, sigma) for trajectory in whole]
-    if seen.is_full_state or has_networks(system):
-        starts = [default_states(seen, run, x) for x, _ in smooth]
+        sigma = estimate_noise(trajectories, data_scale.scale)
+    smoothed_trajectories = [spline_states_and_rates(trajectory, sigma) for trajectory in trajectories]
+    if observation.is_full_state or has_networks(system):
+        starts = [default_states(observation, run, x) for x, _ in smoothed_trajectories]
     else:
-        starts = states_matching_rates(seen, run, smooth, shown.scale, shown.time_scale)
+        starts = states_matching_rates(observation, run, smoothed_trajectories, data_scale.scale, data_scale.time_scale)
     states = np.concatenate(starts)
-    found = shown.extend_to_states(seen.component_indices, states[:, : system.dim])
-    system = scale_networks(system, found, states[:, : system.dim])
-    if not seen.is_full_state and validation:
-        raise InputError("validation is for data of all components: what is not observed has no start that is known")
-    own = losses.parameter_vector(system, also, positive)
-    if not own.initial_values.size:
+    state_scale = data_scale.extend_to_states(observation.component_indices, states[:, : system.dim])
+    system = scale_networks(system, state_scale, states[:, : system.dim])
+    if not observation.is_full_state and validation:
         raise InputError(
-            "nothing is learned of this system: give it parts of lt.learn, or name parameters with also= or positive="
+            "validation= cannot be combined with observed= or observe=: the initial values of unobserved components "
+            "are unknown"
         )
-    share = (0.2 if seen.is_full_state else 0.0) if validation is None else validation
-    train, held = _split_held_out(list(zip(whole, starts, strict=True)), share, seed)
-    noisy = 1.0 if sigma is None else float(np.sqrt(np.mean((sigma / shown.scale) ** 2)))
-    behind = np.ones(run.dim - system.dim)  # the numbers of an attitude
-    searched = found.scale.copy()
-    if sigma is not None and len(seen.component_indices):
-        searched[seen.component_indices] = sigma
-    searched = np.concatenate([searched, noisy * np.ones(n_coordinates(run) - system.dim)])
-    units = shown.scale if sigma is None else sigma, searched, noisy * np.concatenate([found.scale, behind])
+    params = losses.parameter_vector(system, also, positive)
+    if not params.initial_values.size:
+        raise InputError(
+            "the system has nothing to learn. Give it parts of lt.learn, or name parameters with also= or positive="
+        )
+    held_out_fraction = (0.2 if observation.is_full_state else 0.0) if validation is None else validation
+    training_data, held_out_data = _split_held_out(
+        list(zip(trajectories, starts, strict=True)), held_out_fraction, seed
+    )
+    relative_noise = 1.0 if sigma is None else float(np.sqrt(np.mean((sigma / data_scale.scale) ** 2)))
+    attitude_units = np.ones(run.dim - system.dim)  # the numbers of an attitude
+    search_units = state_scale.scale.copy()
+    if sigma is not None and len(observation.component_indices):
+        search_units[observation.component_indices] = sigma
+    search_units = np.concatenate([search_units, relative_noise * np.ones(n_coordinates(run) - system.dim)])
+    units = (
+        data_scale.scale if sigma is None else sigma,
+        search_units,
+        relative_noise * np.concatenate([state_scale.scale, attitude_units]),
+    )
 
-    def make_matching_objective(part: list) -> Objective:
-        return losses.trajectory_matching(own, [trajectory for trajectory, _ in part], sigma, found)
+    def make_matching_objective(data: list) -> Objective:
+        return losses.trajectory_matching(params, [trajectory for trajectory, _ in data], sigma, state_scale)
 
-    def make_shooting_objective(part: list, free: bool) -> Objective:
-        pieces = cut_windows([trajectory for trajectory, _ in part], [own for _, own in part], window, free)
-        return losses.shooting_objective(own, method, pieces, seen, units, substeps, free)
+    def make_shooting_objective(data: list, finds_initial_states: bool) -> Objective:
+        windows = cut_windows(
+            [trajectory for trajectory, _ in data], [params for _, params in data], window, finds_initial_states
+        )
+        return losses.shooting_objective(params, method, windows, observation, units, substeps, finds_initial_states)
 
     phases = []
-    if matching and seen.is_full_state:
-        task = make_matching_objective(train)
+    if matching and observation.is_full_state:
+        objective = make_matching_objective(training_data)
         phases.append(
             Phase(
                 "matching",
-                task,
-                make_matching_objective(held) if held else None,
+                objective,
+                make_matching_objective(held_out_data) if held_out_data else None,
                 matching,
                 rate,
                 batch or BATCH_SIZES["matching"],
-                own.array_shapes,
+                params.array_shapes,
             )
         )
-    free = sigma is not None or not seen.is_full_state
+    finds_initial_states = sigma is not None or not observation.is_full_state
     if shooting:
-        slower = SHOOTING_RATE_FACTOR if phases else 1.0
-        task = make_shooting_objective(train, free)
+        rate_factor = SHOOTING_RATE_FACTOR if phases else 1.0
+        objective = make_shooting_objective(training_data, finds_initial_states)
         phases.append(
             Phase(
                 "shooting",
-                task,
-                make_shooting_objective(held, False) if held else None,
+                objective,
+                make_shooting_objective(held_out_data, False) if held_out_data else None,
                 shooting,
-                slower * rate,
+                rate_factor * rate,
                 batch or BATCH_SIZES["shooting"],
-                own.array_shapes,
+                params.array_shapes,
             )
         )
-    settings = (matching, shooting, rate, batch, window, substeps, method, share, patience, seed)
+    settings = (matching, shooting, rate, batch, window, substeps, method, held_out_fraction, patience, seed)
     if not phases:
-        way = "matching" if seen.is_full_state else "shooting, as not all of the states is observed"
-        raise InputError(f"there is nothing to do: give more than 0 iterations of the {way}")
-    numbers = [values for trajectory in whole for values in trajectory]
-    course = TrainingRun(
+        phase_text = "matching" if observation.is_full_state else "shooting, because the state is observed in part"
+        raise InputError(f"fit has no iterations. Give more than 0 of the {phase_text}")
+    data_arrays = [values for trajectory in trajectories for values in trajectory]
+    training_run = TrainingRun(
         phases,
-        own.initial_values,
+        params.initial_values,
         fingerprint(
-            *numbers, own.initial_values, sigma, seen.component_indices, *seen.fingerprint_parts(run), repr(settings)
+            *data_arrays,
+            params.initial_values,
+            sigma,
+            observation.component_indices,
+            *observation.fingerprint_parts(run),
+            repr(settings),
         ),
     )
     path = None if checkpoint is None else Path(checkpoint)
     if path is not None and path.exists():
-        course.resume(path)
-    course.run(seed, patience, path, progress)
-    weights, refined = course.weights, None
-    if shooting and can_refine(own, system, whole, run, substeps) and "interrupted" not in course.ended.values():
-        firsts = _fitted_initial_states(course.best_vector, own, train, window, free, seen, run, searched)
-        parts = [pair[0] for pair in (*train, *held)]
-        runs = pad_runs(parts, [*firsts, *(states[0] for _, states in held)])
-        is_held_out = np.arange(len(parts)) >= len(train)
-        refined = refine_by_least_squares(own, weights, method, runs, is_held_out, seen, units[:2], substeps)
+        training_run.resume(path)
+    training_run.run(seed, patience, path, progress)
+    weights, refined = training_run.weights, None
+    if (
+        shooting
+        and can_refine(params, system, trajectories, run, substeps)
+        and "interrupted" not in training_run.ended.values()
+    ):
+        initial_states = _fitted_initial_states(
+            training_run.best_vector,
+            params,
+            training_data,
+            window,
+            finds_initial_states,
+            observation,
+            run,
+            search_units,
+        )
+        trajectories_and_held_out = [pair[0] for pair in (*training_data, *held_out_data)]
+        runs = pad_runs(trajectories_and_held_out, [*initial_states, *(states[0] for _, states in held_out_data)])
+        is_held_out = np.arange(len(trajectories_and_held_out)) >= len(training_data)
+        refined = refine_by_least_squares(params, weights, method, runs, is_held_out, observation, units[:2], substeps)
         weights = refined.weights
-    fitted = cast(T, own.build_system(jnp.asarray(weights)))
-    training = course.training_record(time.perf_counter() - began).with_estimates(
-        own, refined, sigma, noise_is_estimated
+    fitted = cast(T, params.build_system(jnp.asarray(weights)))
+    training = training_run.training_record(time.perf_counter() - start_time).with_estimates(
+        params, refined, sigma, noise_is_estimated
     )
     object.__setattr__(fitted, "training", training)
     for problem in training.problems:
@@ -253,23 +282,30 @@ def fit(
     return fitted
 
 
-def _fitted_initial_states(vector, own, train: list, window: int, free: bool, seen, run, searched) -> np.ndarray:
-    """Return the states in which whole trajectories begin, as the shooting has found them, shape (B, N)."""
+def _fitted_initial_states(
+    vector, params, train: list, window: int, finds_initial_states: bool, observation, run, search_units
+) -> np.ndarray:
+    """Return the initial states of whole trajectories, shape (B, N), as fitted by the shooting."""
     starts = np.stack([states[0] for _, states in train])
-    if not free:
+    if not finds_initial_states:
         return starts
-    pieces = cut_windows([trajectory for trajectory, _ in train], [states for _, states in train], window, free)
-    moves = (
-        np.asarray(vector)[own.start.size :].reshape(len(pieces.initial_states), -1)[pieces.first_windows] * searched
+    windows = cut_windows(
+        [trajectory for trajectory, _ in train], [states for _, states in train], window, finds_initial_states
     )
-    return np.asarray(jax.vmap(lambda x, z: seen.displace(run, x, z))(jnp.asarray(starts), jnp.asarray(moves)))
+    displacements = (
+        np.asarray(vector)[params.initial_values.size :].reshape(len(windows.initial_states), -1)[windows.first_windows]
+        * search_units
+    )
+    return np.asarray(
+        jax.vmap(lambda x, z: observation.displace(run, x, z))(jnp.asarray(starts), jnp.asarray(displacements))
+    )
 
 
-def _check_count(name: str, value: Any, least: int, optional: bool) -> None:
+def _check_count(name: str, value: Any, minimum: int, optional: bool) -> None:
     if optional and value is None:
         return
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise InputError(f"{name} is an integer >= {least}, not {value!r}")
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < minimum:
+        raise InputError(f"{name} must be an integer >= {minimum}, got {value!r}")
 
 
 def _is_real_number(value: Any) -> bool:
@@ -277,7 +313,7 @@ def _is_real_number(value: Any) -> bool:
 
 
 def checked_noise(noise: float | Sequence[float] | None, count: int) -> np.ndarray | None:
-    """Return standard deviations of the errors of data, shape (count,); None where none are given, or 0."""
+    """Return standard deviations of the errors of data, shape (count,); None if ``noise`` is None or 0."""
     if noise is None:
         return None
     try:
@@ -288,24 +324,24 @@ def checked_noise(noise: float | Sequence[float] | None, count: int) -> np.ndarr
         return None
     if sigma.shape not in ((), (count,)) or not (np.isfinite(sigma).all() and (sigma > 0.0).all()):
         raise InputError(
-            f"noise is a positive standard deviation, or one for each of {count} components, not {noise!r}"
+            f"noise must be a positive standard deviation, or one for each of {count} components, got {noise!r}"
         )
     return np.broadcast_to(sigma, (count,)).copy()
 
 
-def _split_held_out(data: list, share: float, seed: int) -> tuple[list, list]:
-    """What is learned from, and what is held out: whole trajectories with their states, or the end of the only one."""
-    if not (_is_real_number(share) and 0.0 <= share < 1.0):
-        raise InputError(f"validation is a share from 0 to below 1, not {share!r}")
-    if share == 0.0:
+def _split_held_out(data: list, held_out_fraction: float, seed: int) -> tuple[list, list]:
+    """Split data into a training set and a held-out set: whole trajectories, or the end of the only one."""
+    if not (_is_real_number(held_out_fraction) and 0.0 <= held_out_fraction < 1.0):
+        raise InputError(f"validation must be a fraction from 0 to below 1, got {held_out_fraction!r}")
+    if held_out_fraction == 0.0:
         return data, []
     if len(data) == 1:
         (t, x), states = data[0]
-        cut = round((1.0 - share) * (len(t) - 1))
+        cut = round((1.0 - held_out_fraction) * (len(t) - 1))
         if min(cut, len(t) - 1 - cut) < 1:
             return data, []
-        first = Trajectory(t[: cut + 1], x[: cut + 1]), states[: cut + 1]
-        return [first], [(Trajectory(t[cut:], x[cut:]), states[cut:])]
+        training_part = Trajectory(t[: cut + 1], x[: cut + 1]), states[: cut + 1]
+        return [training_part], [(Trajectory(t[cut:], x[cut:]), states[cut:])]
     order = np.random.default_rng(seed).permutation(len(data))
-    count = min(max(1, round(share * len(data))), len(data) - 1)
+    count = min(max(1, round(held_out_fraction * len(data))), len(data) - 1)
     return [data[i] for i in sorted(order[count:])], [data[i] for i in sorted(order[:count])]

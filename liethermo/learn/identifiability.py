@@ -1,4 +1,4 @@
-"""What data determine of a system: the rank of the sensitivity, and fits of several first weights."""
+"""Identifiability of learned parameters: the rank of the sensitivity, and repeated fits."""
 
 from __future__ import annotations
 
@@ -26,29 +26,29 @@ from .training import FitWarning
 T = TypeVar("T", bound=System)
 
 RANK_RTOL = 1e-8
-"""Singular values, relative to the largest, below which a combination of parameters changes nothing."""
+"""Singular value, relative to the largest, below which a combination of parameters counts as undetermined."""
 
 
 MIN_BOOTSTRAP_TRAJECTORIES = 8
-"""Trajectories from which they are drawn again: of fewer the draws are often the same."""
+"""Smallest number of trajectories for a bootstrap; draws from fewer are often equal."""
 
 MAX_BOOTSTRAP_DRAWS = 100
-"""Draws of trajectories in the search for one that has not been drawn before."""
+"""Largest number of attempts to draw trajectories that were not drawn before."""
 
 
 @dataclass(frozen=True)
 class Determined:
-    """Which combinations of the parameters something depends on, to first order.
+    """Combinations of the parameters on which an observation depends, to first order.
 
     Attributes
     ----------
     values : ndarray, shape (p,)
         Singular values of the sensitivity, relative to the largest.
     rank : int
-        How many combinations are determined.
+        Number of determined combinations.
     directions : ndarray, shape (p, p)
-        Combinations, a row each, by what they are determined: the last ``p - rank`` change nothing. Those of
-        parameters that are ``positive`` are of their logarithms.
+        Combinations as rows, the best determined first; the last ``p - rank`` change nothing. For parameters that are
+        ``positive`` they refer to the logarithms.
     """
 
     values: np.ndarray
@@ -58,9 +58,10 @@ class Determined:
 
     @with_library_settings
     def share(self, quantity: Callable[[Any], Any]) -> np.ndarray:
-        """How far quantities are determined: 1 where fully, 0 where not at all.
+        """Return how far quantities are determined, from 0 (not at all) to 1 (fully).
 
-        The share of the length of each gradient by the parameters that lies in the combinations that are determined.
+        The result is the fraction of the norm of each gradient by the parameters that lies in the determined
+        combinations.
 
         Parameters
         ----------
@@ -68,10 +69,10 @@ class Determined:
             Such as an energy at some state, or the difference of two.
         """
         rows = _parameter_jacobian(self.parameters, quantity)
-        along = rows @ self.directions[: self.rank].T
-        sizes = np.linalg.norm(rows, axis=1)
-        found = np.linalg.norm(along, axis=1) / np.where(sizes > 0.0, sizes, 1.0)
-        return np.where(sizes > 0.0, found, 1.0)
+        determined_components = rows @ self.directions[: self.rank].T
+        norms = np.linalg.norm(rows, axis=1)
+        fractions = np.linalg.norm(determined_components, axis=1) / np.where(norms > 0.0, norms, 1.0)
+        return np.where(norms > 0.0, fractions, 1.0)
 
 
 @with_library_settings
@@ -83,54 +84,56 @@ def determined(
     positive: Callable[[T], Any] | None = None,
     tolerance: float = RANK_RTOL,
 ) -> Determined:
-    """Which combinations of the learned parameters are determined by what is observed.
+    """Return the combinations of the learned parameters that an observation determines.
 
-    A learned energy is known up to what the data cannot tell: a constant, a function of what is conserved. No fit shows
-    that; the rank of the derivative of what is observed by the parameters does.
+    Data determine a learned energy only up to a gauge: a constant, or a function of conserved quantities. A fit does
+    not reveal this; the rank of the Jacobian of the observations by the parameters does.
 
     Parameters
     ----------
     system : System
     observed : function from such a system to an array
-        What the data are of, in units in which all are known about equally well: ``lambda s: s.vector_field(x)`` at the
-        states x of the data, or the states of a run by ``lt.flow``.
+        The observed quantities, in units in which all are known about equally well: ``lambda s: s.vector_field(x)`` at
+        the states x of the data, or the states of a run by ``lt.flow``.
     also, positive
-        As of :func:`fit`.
+        As for :func:`fit`.
     tolerance : float
-        Singular value, relative to the largest, below which a combination counts as not determined: what the data are
-        known to.
+        Singular value, relative to the largest, below which a combination counts as undetermined: the relative accuracy
+        of the data.
 
     Raises
     ------
     InputError
         If nothing is learned.
     """
-    own = losses.parameter_vector(system, also, positive)
-    if not own.initial_values.size:
-        raise InputError("nothing is learned of this system, so there is nothing to determine")
-    jacobian = _parameter_jacobian(own, observed)
+    params = losses.parameter_vector(system, also, positive)
+    if not params.initial_values.size:
+        raise InputError(
+            "the system has nothing to learn. Give it parts of lt.learn, or name parameters with also= or positive="
+        )
+    jacobian = _parameter_jacobian(params, observed)
     _, values, directions = np.linalg.svd(jacobian, full_matrices=jacobian.shape[0] < jacobian.shape[1])
-    relative = np.zeros(own.initial_values.size)
+    relative = np.zeros(params.initial_values.size)
     relative[: len(values)] = values / (values[0] if values[0] > 0.0 else 1.0)
-    return Determined(relative, int(np.sum(relative > tolerance)), directions, own)
+    return Determined(relative, int(np.sum(relative > tolerance)), directions, params)
 
 
-def _parameter_jacobian(own: losses.ParameterVector, quantity: Callable) -> np.ndarray:
+def _parameter_jacobian(params: losses.ParameterVector, quantity: Callable) -> np.ndarray:
     def values(vector):
-        return jnp.ravel(jnp.asarray(quantity(own.build_system(vector))))
+        return jnp.ravel(jnp.asarray(quantity(params.build_system(vector))))
 
-    start = jnp.asarray(own.initial_values)
-    size = jax.eval_shape(values, start).shape[0]
-    by = jax.jacfwd if own.initial_values.size <= size else jax.jacrev
-    found = np.asarray(jax.jit(by(values))(start))
-    if not np.isfinite(found).all():
-        raise InputError("the derivative of what is observed by the parameters is not finite")
-    return found
+    start = jnp.asarray(params.initial_values)
+    n_values = jax.eval_shape(values, start).shape[0]
+    jacobian_transform = jax.jacfwd if params.initial_values.size <= n_values else jax.jacrev
+    jacobian = np.asarray(jax.jit(jacobian_transform(values))(start))
+    if not np.isfinite(jacobian).all():
+        raise InputError("the derivative of the observations by the parameters is not finite")
+    return jacobian
 
 
 @dataclass(frozen=True)
 class Fits:
-    """Systems fitted to the same data from different first weights.
+    """Systems fitted to equal or resampled data from different initial weights.
 
     Attributes
     ----------
@@ -140,7 +143,7 @@ class Fits:
     systems: tuple[System, ...]
 
     def spread(self, quantity: Callable[[Any], Any]) -> tuple[np.ndarray, np.ndarray]:
-        """The mean and the standard deviation of a quantity over the systems.
+        """Return the mean and the standard deviation of a quantity over the systems.
 
         Parameters
         ----------
@@ -149,21 +152,25 @@ class Fits:
         Warns
         -----
         FitWarning
-            If all systems have the same values: then their deviation of 0 says nothing of what the data determine.
+            If all systems have equal values; then the deviation of 0 says nothing about what the data determine.
         """
-        found = np.stack([np.asarray(quantity(system)) for system in self.systems])
-        if (found == found[0]).all():
+        values = np.stack([np.asarray(quantity(system)) for system in self.systems])
+        if (values == values[0]).all():
             warn(
                 "the quantity is equal in all fits, so its deviation of 0 is no error: the fits had the same data and "
                 "first weights, or it does not depend on what was learned. Give noise=, or more trajectories",
                 FitWarning,
             )
-        return found.mean(axis=0), found.std(axis=0, ddof=1)
+        return values.mean(axis=0), values.std(axis=0, ddof=1)
 
     def forecast(
         self, x0, t_span: tuple[float, float], step: float, method: OneStepMethod | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Times, mean states and their standard deviations, shapes (times,) and (times, n); arguments of integrate."""
+        """Integrate all systems; return times, mean states and standard deviations, shapes (times,), (times, n),
+        (times, n).
+
+        The arguments are those of :func:`liethermo.integrate`.
+        """
         runs = [integrate(system, x0, t_span, step, method=method) for system in self.systems]
         states = np.stack([run.x for run in runs])
         return runs[0].t, states.mean(axis=0), states.std(axis=0, ddof=1)
@@ -172,61 +179,75 @@ class Fits:
 def several(
     build: Callable[[int], T], data: Any, number: int = 5, *, seed: int = 0, resample: bool = True, **how
 ) -> Fits:
-    """Fits from different first weights to data that are drawn again from those given: how far they agree.
+    """Fit several systems from different initial weights to resampled data, which shows how far the fits agree.
 
-    From 8 trajectories or more, each fit draws as many with replacement (bootstrap). Draws of fewer are often the same.
-    Then each fit has the data with further errors of the size of the noise, given or estimated, and the deviation of
-    the fits is the standard error of one. Fewer trajectories without noise are drawn too, no draw twice. If there is
-    only one, without noise, the fits differ in their first weights and batches alone.
+    With 8 trajectories or more, each fit draws as many with replacement (bootstrap). With fewer, draws are often equal.
+    So each fit adds errors of the size of the noise, given or estimated, to the data, and the deviation of the fits is
+    the standard error of one. Fewer trajectories without noise are drawn with replacement, no draw twice. With one
+    trajectory and no noise, the fits differ in their initial weights and batches only.
 
     Parameters
     ----------
     build : function from a seed to a system
         Such as ``lambda seed: lt.learn.Metriplectic(4, seed=seed)``.
     data, how
-        As of :func:`fit`.
+        As for :func:`fit`.
     number : int
-        Of fits.
+        Number of fits.
     seed : int
-        Of the first.
+        Seed of the first fit.
     resample : bool
-        Draw data again for each fit.
+        Resample the data for each fit.
 
     Raises
     ------
     InputError
-        As of :func:`fit`.
+        As for :func:`fit`.
     """
     if isinstance(number, bool) or not isinstance(number, int) or number < 2:
-        raise InputError(f"number of fits is an integer >= 2, not {number!r}")
+        raise InputError(f"number of fits must be an integer >= 2, got {number!r}")
     systems: list[System] = []
-    drawn: set[tuple[int, ...]] = set()
-    for own in range(seed, seed + number):
-        system, random = build(own), np.random.default_rng(own)
-        whole = parse_trajectories(data, system, make_observation(system, how.get("observed"), how.get("observe")))
-        sigma = _noise_std(whole, how.get("noise")) if resample and len(whole) < MIN_BOOTSTRAP_TRAJECTORIES else None
+    previous_draws: set[tuple[int, ...]] = set()
+    for fit_seed in range(seed, seed + number):
+        system, random = build(fit_seed), np.random.default_rng(fit_seed)
+        trajectories = parse_trajectories(
+            data, system, make_observation(system, how.get("observed"), how.get("observe"))
+        )
+        sigma = (
+            _noise_std(trajectories, how.get("noise"))
+            if resample and len(trajectories) < MIN_BOOTSTRAP_TRAJECTORIES
+            else None
+        )
         if sigma is not None:
-            noisy = [(t, x + (sigma * random.standard_normal((len(t), sigma.size))).reshape(x.shape)) for t, x in whole]
-            more = {} if how.get("noise") is None else {"noise": np.sqrt(2.0) * sigma}
-            systems.append(fit(system, noisy, seed=own, **{**how, **more}))
+            noisy_data = [
+                (t, x + (sigma * random.standard_normal((len(t), sigma.size))).reshape(x.shape))
+                for t, x in trajectories
+            ]
+            noise_option = {} if how.get("noise") is None else {"noise": np.sqrt(2.0) * sigma}
+            systems.append(fit(system, noisy_data, seed=fit_seed, **{**how, **noise_option}))
             continue
-        chosen = _draw_bootstrap_indices(len(whole), random, drawn) if resample else range(len(whole))
-        systems.append(fit(system, [whole[i] for i in chosen], seed=own, **how))
+        draw = (
+            _draw_bootstrap_indices(len(trajectories), random, previous_draws) if resample else range(len(trajectories))
+        )
+        systems.append(fit(system, [trajectories[i] for i in draw], seed=fit_seed, **how))
     return Fits(tuple(systems))
 
 
-def _noise_std(whole: list[Trajectory], noise) -> np.ndarray | None:
-    """Return the standard deviations of the errors of data, given or estimated; None where there are none."""
-    flat = [trajectory.flat_trajectory for trajectory in whole]
-    size = data_scales(flat).scale
-    return estimate_noise(flat, size) if noise is None else checked_noise(noise, size.size)
+def _noise_std(trajectories: list[Trajectory], noise) -> np.ndarray | None:
+    """Return the standard deviations of the errors of data, given or estimated; None if there are none."""
+    flat_trajectories = [trajectory.flat_trajectory for trajectory in trajectories]
+    scale = data_scales(flat_trajectories).scale
+    return estimate_noise(flat_trajectories, scale) if noise is None else checked_noise(noise, scale.size)
 
 
-def _draw_bootstrap_indices(count: int, random: np.random.Generator, drawn: set[tuple[int, ...]]) -> np.ndarray:
-    """Draw so many out of as many, with replacement, and remember it; another draw than before, where there is one."""
+def _draw_bootstrap_indices(
+    count: int, random: np.random.Generator, previous_draws: set[tuple[int, ...]]
+) -> np.ndarray:
+    """Draw ``count`` of ``count`` indices with replacement, a new draw if possible, and add it to
+    ``previous_draws``."""
     for _ in range(MAX_BOOTSTRAP_DRAWS):
-        chosen = random.integers(count, size=count)
-        if tuple(sorted(chosen.tolist())) not in drawn:
+        indices = random.integers(count, size=count)
+        if tuple(sorted(indices.tolist())) not in previous_draws:
             break
-    drawn.add(tuple(sorted(chosen.tolist())))
-    return chosen
+    previous_draws.add(tuple(sorted(indices.tolist())))
+    return indices

@@ -1,4 +1,4 @@
-"""What a fit makes small: what the motion misses of the rates of change, or of the states after short runs."""
+"""Loss functions of a fit: residuals of rates of change (matching), and of states after short runs (shooting)."""
 
 from __future__ import annotations
 
@@ -22,23 +22,24 @@ from .observation import Observation
 from .parts import Poisson
 
 MEAN_SQUARE_RATE_FLOOR = 0.1
-"""Mean square of the rates of change, in units of their usual size, below which they count as slow."""
+"""Mean square of the rates of change, in units of their scale, that is added to the denominator of the matching loss,
+so that slow states do not dominate."""
 
 
 class ParameterVector(NamedTuple):
-    """The numbers of a system that are learned, as one vector.
+    """The learned parameters of a system as one vector.
 
     Attributes
     ----------
     initial_values : array, shape (p,)
-        As they are; the logarithms of those that have to be positive.
+        Initial values; logarithms for parameters that stay positive.
     array_shapes : tuple of tuple of int
-        Of the arrays that stand in it, one after another.
+        Shapes of the arrays in the vector, in order.
     build_system : function from such a vector to the system
     names : tuple of str, of length p
-        Where each number stands in the system: ``"dissipation.rate"``, ``"energy.A[0]"``.
+        Name of each number in the system: ``"dissipation.rate"``, ``"energy.A[0]"``.
     is_log : array of bool, shape (p,)
-        Which of them are logarithms.
+        True for logarithms.
     """
 
     initial_values: np.ndarray
@@ -49,51 +50,58 @@ class ParameterVector(NamedTuple):
 
 
 def parameter_vector(system: System, also: Callable | None = None, positive: Callable | None = None) -> ParameterVector:
-    """What is learned of a system: the arrays inside of marks, and those that two functions choose."""
+    """Return the learned parameters of a system: arrays marked by :class:`Learned`, and those that two functions
+    choose."""
     mask = learned_mask(system)
     if isinstance(system.poisson, Poisson) and system.poisson.entropy is not None:
         mask = eqx.tree_at(lambda m: m.poisson.entropy, mask, False)  # the same weights as in the entropy
     for choose in (also, positive):
         if choose is not None:
             mask = eqx.tree_at(choose, mask, replace_fn=lambda part: jax.tree_util.tree_map(lambda _: True, part))
-    none = jax.tree_util.tree_map(lambda _: False, mask)
-    signs = none if positive is None else eqx.tree_at(positive, none, replace_fn=lambda _: True)
-    varied, fixed = eqx.partition(system, mask)
-    logs, plain = eqx.partition(varied, signs)
-    both = jax.tree_util.tree_map(jnp.log, logs), plain
-    first, back = ravel_pytree(both)
+    no_mask = jax.tree_util.tree_map(lambda _: False, mask)
+    positive_mask = no_mask if positive is None else eqx.tree_at(positive, no_mask, replace_fn=lambda _: True)
+    learned_part, fixed_part = eqx.partition(system, mask)
+    logs, values = eqx.partition(learned_part, positive_mask)
+    logs_and_values = jax.tree_util.tree_map(jnp.log, logs), values
+    initial_values, unravel = ravel_pytree(logs_and_values)
 
     def build_system(vector) -> System:
-        logs, plain = back(vector)
-        return tie_entropy(eqx.combine(jax.tree_util.tree_map(jnp.exp, logs), plain, fixed))
+        logs, values = unravel(vector)
+        return tie_entropy(eqx.combine(jax.tree_util.tree_map(jnp.exp, logs), values, fixed_part))
 
-    shapes = tuple(np.shape(leaf) for leaf in jax.tree_util.tree_leaves(both))
+    shapes = tuple(np.shape(leaf) for leaf in jax.tree_util.tree_leaves(logs_and_values))
     count = sum(np.size(leaf) for leaf in jax.tree_util.tree_leaves(logs))
-    return ParameterVector(np.asarray(first), shapes, build_system, _entry_names(both), np.arange(first.size) < count)
+    return ParameterVector(
+        np.asarray(initial_values),
+        shapes,
+        build_system,
+        _entry_names(logs_and_values),
+        np.arange(initial_values.size) < count,
+    )
 
 
 def _entry_names(trees: tuple) -> tuple[str, ...]:
-    """Where each number of some trees stands in its tree, in the order of the numbers."""
-    found: list[str] = []
+    """Return the name of each number in some trees, such as ``energy.A[0]``, in order."""
+    names: list[str] = []
     for tree in trees:
         for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
             name = jax.tree_util.keystr(path).lstrip(".")
             shape = np.shape(leaf)
-            found += [name + (f"[{', '.join(map(str, i))}]" if shape else "") for i in np.ndindex(shape)]
-    return tuple(found)
+            names += [name + (f"[{', '.join(map(str, i))}]" if shape else "") for i in np.ndindex(shape)]
+    return tuple(names)
 
 
 class Objective(NamedTuple):
-    """What is to be made small.
+    """A loss function and its data.
 
     Attributes
     ----------
     loss : function from a vector, the arrays and indices of items, to a number
-        The vector is that of the weights, with the free numbers behind it.
+        The vector holds the weights, followed by the free numbers.
     arrays : tuple of arrays
     n_items : int
     initial_free : array, shape (f,)
-        Numbers that are found beside the weights, as they are at first.
+        Initial values of the free numbers, which are fitted with the weights.
     """
 
     loss: Callable[[jax.Array, tuple, jax.Array], jax.Array]
@@ -102,61 +110,64 @@ class Objective(NamedTuple):
     initial_free: np.ndarray
 
 
-def matching_objective(own: ParameterVector, x: np.ndarray, rates: np.ndarray, size: np.ndarray) -> Objective:
-    """The mean square of what ``x'`` misses of rates of change, in units of ``size``, shape (n,).
+def matching_objective(params: ParameterVector, x: np.ndarray, rates: np.ndarray, unit: np.ndarray) -> Objective:
+    """Return the mean square of the residual of ``x'`` against rates of change, in units of ``unit``, shape (n,).
 
-    Relative to how fast the state changes: else a loss is all about the few fastest moments, and the phase of a slow
-    motion, which errors pile up in, counts for nothing.
+    The residual is relative to the speed of the state. Otherwise the few fastest moments would dominate the loss, and
+    the phase of a slow motion, in which errors accumulate, would not count.
     """
 
-    def loss(vector, arrays, chosen):
-        points, wanted = (values[chosen] for values in arrays)
-        found = jax.vmap(own.build_system(vector)._vector_field)(points)
-        speed = jnp.mean((wanted / size) ** 2, axis=1, keepdims=True)
-        return jnp.mean(((found - wanted) / size) ** 2 / (MEAN_SQUARE_RATE_FLOOR + speed))
+    def loss(vector, arrays, indices):
+        points, rates = (values[indices] for values in arrays)
+        field = jax.vmap(params.build_system(vector)._vector_field)(points)
+        speed = jnp.mean((rates / unit) ** 2, axis=1, keepdims=True)
+        return jnp.mean(((field - rates) / unit) ** 2 / (MEAN_SQUARE_RATE_FLOOR + speed))
 
     return Objective(loss, (jnp.asarray(x), jnp.asarray(rates)), len(x), np.zeros(0))
 
 
 def trajectory_matching(
-    own: ParameterVector, data: list[Trajectory], noise: np.ndarray | None, found: DataScales
+    params: ParameterVector, data: list[Trajectory], noise: np.ndarray | None, scales: DataScales
 ) -> Objective:
-    """:func:`matching` at the points of trajectories, by splines through them or as near as the noise allows."""
-    smooth = [spline_states_and_rates(trajectory, noise) for trajectory in data]
-    inner = [slice(1, -1) if len(x) > 8 else slice(None) for x, _ in smooth]  # a spline is worst at its ends
+    """Return :func:`matching_objective` at the points of trajectories; splines give states and rates."""
+    smoothed_trajectories = [spline_states_and_rates(trajectory, noise) for trajectory in data]
+    inner = [
+        slice(1, -1) if len(x) > 8 else slice(None) for x, _ in smoothed_trajectories
+    ]  # a spline is worst at its ends
     x, rates = (
-        np.concatenate([values[i] for values, i in zip(each, inner, strict=True)]) for each in zip(*smooth, strict=True)
+        np.concatenate([values[i] for values, i in zip(arrays, inner, strict=True)])
+        for arrays in zip(*smoothed_trajectories, strict=True)
     )
-    return matching_objective(own, x, rates, found.scale / found.time_scale)
+    return matching_objective(params, x, rates, scales.scale / scales.time_scale)
 
 
 def shooting_objective(
-    own: ParameterVector,
+    params: ParameterVector,
     method: OneStepMethod,
-    pieces: Windows,
-    seen: Observation,
+    windows: Windows,
+    observation: Observation,
     units: tuple[np.ndarray, np.ndarray, np.ndarray],
     substeps: int,
-    free: bool,
+    finds_initial_states: bool,
 ) -> Objective:
-    """The mean square of what runs miss of the data at the ends of all intervals.
+    """Return the mean square of the differences between short runs and the data at the ends of all intervals.
 
-    With ``free`` the states where the runs begin are found too, and what they show of the data counts, and what a run
-    misses of where the next one begins.
+    With ``finds_initial_states`` the initial states of the runs are fitted too. Then the loss includes their
+    differences to the data, and the gaps between the end of a run and the start of the next one.
 
     Parameters
     ----------
     units : three arrays, shapes (k,), (coordinates of a state,), (numbers of a state,)
-        Of what is observed, of the search for the states where runs begin, and of what a run misses of the next one.
+        Units of the observations, of the search for initial states, and of the gaps.
     """
-    p = len(own.initial_values)
-    of_data, of_search, of_gaps = map(jnp.asarray, units)
-    count, length = pieces.intervals.shape
+    p = len(params.initial_values)
+    data_unit, search_unit, gap_unit = map(jnp.asarray, units)
+    count, length = windows.intervals.shape
 
-    def loss(vector, arrays, chosen):
-        starts, sizes, shown, following = arrays
-        system = own.build_system(vector[:p])
-        run, begin, advance, state_of = differentiable_stepper(system, method, substeps, seen.group is not None)
+    def loss(vector, arrays, indices):
+        initial_guess, intervals, observations, next_window = arrays
+        system = params.build_system(vector[:p])
+        run, begin, advance, state_of = differentiable_stepper(system, method, substeps, observation.group is not None)
 
         def run_window(x, h):
             def interval(carry, h):
@@ -166,46 +177,73 @@ def shooting_objective(
             return jax.lax.scan(interval, begin(x), h)[1]
 
         def observe_states(states):
-            return jax.vmap(lambda x: seen.observe(run, x))(states)
+            return jax.vmap(lambda x: observation.observe(run, x))(states)
 
-        moves = vector[p:].reshape(count, -1) * of_search if free else None
+        displacements = vector[p:].reshape(count, -1) * search_unit if finds_initial_states else None
 
         def initial_states(i):
-            return starts[i] if moves is None else jax.vmap(lambda x, z: seen.displace(run, x, z))(starts[i], moves[i])
+            return (
+                initial_guess[i]
+                if displacements is None
+                else jax.vmap(lambda x, z: observation.displace(run, x, z))(initial_guess[i], displacements[i])
+            )
 
-        at = initial_states(chosen)
-        found = jax.vmap(run_window)(at, sizes[chosen])
-        missed = jnp.mean(((jax.vmap(observe_states)(found) - shown[chosen, 1:]) / of_data) ** 2)
-        if moves is None:
-            return missed
-        begun = jnp.mean(((observe_states(at) - shown[chosen, 0]) / of_data) ** 2) / length
-        next_ = following[chosen]
-        gaps = jnp.where(next_[:, None] >= 0, (found[:, -1] - initial_states(next_)) / of_gaps, 0.0)
-        return missed + begun + jnp.mean(gaps**2)
+        start_states = initial_states(indices)
+        path = jax.vmap(run_window)(start_states, intervals[indices])
+        path_loss = jnp.mean(((jax.vmap(observe_states)(path) - observations[indices, 1:]) / data_unit) ** 2)
+        if displacements is None:
+            return path_loss
+        initial_loss = jnp.mean(((observe_states(start_states) - observations[indices, 0]) / data_unit) ** 2) / length
+        next_indices = next_window[indices]
+        gaps = jnp.where(next_indices[:, None] >= 0, (path[:, -1] - initial_states(next_indices)) / gap_unit, 0.0)
+        return path_loss + initial_loss + jnp.mean(gaps**2)
 
-    arrays = tuple(map(jnp.asarray, (pieces.initial_states, pieces.intervals, pieces.observations, pieces.next_window)))
-    return Objective(loss, arrays, count, np.zeros(count * of_search.size if free else 0))
+    arrays = tuple(
+        map(jnp.asarray, (windows.initial_states, windows.intervals, windows.observations, windows.next_window))
+    )
+    return Objective(loss, arrays, count, np.zeros(count * search_unit.size if finds_initial_states else 0))
+
+
+class DifferentiableStepper(NamedTuple):
+    """A prepared system, and the functions of a differentiable run of it.
+
+    Attributes
+    ----------
+    system : System
+    init : function from a state to a carry
+    advance : function from a carry and the length of an interval to the next carry
+    get_state : function from a carry to its state
+    """
+
+    system: System
+    init: Callable
+    advance: Callable
+    get_state: Callable
 
 
 def differentiable_stepper(
     system: System, method: OneStepMethod, substeps: int, attitude: bool = False
-) -> tuple[System, Callable, Callable, Callable]:
-    """The system as it is run, what begins a run at a state, takes it over an interval, and what its state is then.
-
-    For derivatives.
-    """
-    run, method = prepare_for_method(system, method, None, attitude)
+) -> DifferentiableStepper:
+    """Return the differentiable stepper of a system and a method, with ``substeps`` steps per interval."""
+    prepared_system, method = prepare_for_method(system, method, None, attitude)
     inner = method.method if isinstance(method, WithAttitude) else method
-    plain = isinstance(inner, MetriplecticRungeKutta) and run.surface is None
+    needs_no_compensation = isinstance(inner, MetriplecticRungeKutta) and prepared_system.surface is None
 
     def step(carry, h):
-        return method.step_without_compensation(run, carry, h) if plain else differentiable_step(run, method, carry, h)  # type: ignore[attr-defined]
+        if needs_no_compensation:
+            return method.step_without_compensation(prepared_system, carry, h)  # type: ignore[attr-defined]
+        return differentiable_step(prepared_system, method, carry, h)
 
     def advance(carry, h):
         if substeps == 1:
             return step(carry, h)
         return jax.lax.scan(lambda carry, _: (step(carry, h / substeps), None), carry, length=substeps)[0]
 
-    if plain:
-        return run, lambda x: x, advance, lambda x: x
-    return run, lambda x: initial_carry(run, method, x), advance, lambda carry: carry[0][: run.dim]
+    if needs_no_compensation:
+        return DifferentiableStepper(prepared_system, lambda x: x, advance, lambda x: x)
+    return DifferentiableStepper(
+        prepared_system,
+        lambda x: initial_carry(prepared_system, method, x),
+        advance,
+        lambda carry: carry[0][: prepared_system.dim],
+    )

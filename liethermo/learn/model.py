@@ -1,4 +1,4 @@
-"""Metriplectic systems of which any part is learned, and the units in which their networks work."""
+"""Metriplectic systems with learned parts, and the scaling of their networks to the data."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ T = TypeVar("T", bound=System)
 
 
 class Metriplectic(MetriplecticSystem):
-    """``x' = Pi(x) grad H + K(x) grad S`` of which any part is learned: both laws hold before, during and after that.
+    """Metriplectic system ``x' = Pi(x) grad H + K(x) grad S`` with learned parts; both laws hold for all weights.
 
-    What is not given is learned by a network of its own. A system like any other: every method runs it, with its laws
-    exact in every step.
+    Each part that is not given is learned by its own network. Every method can integrate the system, with exact laws in
+    every step.
 
     Parameters
     ----------
@@ -37,17 +37,18 @@ class Metriplectic(MetriplecticSystem):
     energy, entropy : Energy, or function from x, shape (dim,), to a scalar; optional
         Known, learned [:class:`Energy`, :class:`Entropy`], or the sum of both.
     poisson : manifolds.PoissonStructure, skew matrix or function from x to one; optional
-        Known, or :class:`Poisson`. One of fewer coordinates is that of the first components: the others, such as
-        entropies, are at rest without friction.
+        Known, or :class:`Poisson`. A structure of fewer coordinates acts on the first components; the others, such as
+        entropies, are constant without friction.
     friction : Dissipation, list of them, or None; optional
-        Known, or :class:`Friction`; None of a system without.
+        Known, or :class:`Friction`; None for a system without friction.
     width, depth, rank : int
-        Of the networks, and of the friction.
+        Size of the networks, and rank of the friction.
     seed : int
-        Of the first weights.
+        Seed of the initial weights.
     validate : bool
-        Where the Poisson tensor is known, test the axioms at a few random points: an entropy that is not constant along
-        its motions is refused, learned or not. A learned tensor has the entropy in its kernel.
+        If the Poisson tensor is known, test the axioms at a few random points: an entropy that is not constant along
+        the Hamiltonian motion is refused, learned or not. A learned tensor has the gradient of the entropy in its
+        kernel.
 
     Raises
     ------
@@ -77,39 +78,41 @@ class Metriplectic(MetriplecticSystem):
             poisson = extend_poisson(poisson, dim)
         if isinstance(friction, str):
             if friction != "learned":
-                raise InputError(f"friction is a Dissipation, a list of them, 'learned' or None, not {friction!r}")
+                raise InputError(f"friction must be a Dissipation, a list of them, 'learned' or None, got {friction!r}")
             friction = Friction(dim, rank, width=width, depth=depth, seed=4 * seed + 3)
-        by_form = isinstance(poisson, Poisson)  # but for the Jacobi identity
-        super().__init__(poisson, energy, entropy, friction, dim=dim, validate=validate and not by_form)
+        has_learned_tensor = isinstance(poisson, Poisson)  # but for the Jacobi identity
+        super().__init__(poisson, energy, entropy, friction, dim=dim, validate=validate and not has_learned_tensor)
         self.poisson = poisson_with_entropy(self.poisson, self.entropy)
 
 
 def poisson_with_entropy(poisson: mf.PoissonStructure, entropy: AnyEnergy | None) -> mf.PoissonStructure:
-    """The structure with the entropy of its system in it, where it is one that has to know it."""
+    """Return the structure with the system's entropy filled in, if it is a learned one that needs it."""
     if not isinstance(poisson, Poisson) or poisson.entropy is None:
         return poisson
     return eqx.tree_at(lambda p: p.entropy, poisson, entropy)
 
 
 def tie_entropy(system: T) -> T:
-    """The system with the weights of its entropy wherever that occurs."""
+    """Return the system with the current weights of its entropy also in its Poisson structure."""
     return eqx.tree_at(lambda s: s.poisson, system, poisson_with_entropy(system.poisson, system.entropy))
 
 
-def scale_networks(system: T, found: DataScales, points: np.ndarray) -> T:
-    """The system with networks that work on numbers of the size of one; those that do already are left alone.
+def scale_networks(system: T, scales: DataScales, points: np.ndarray) -> T:
+    """Return the system with its networks scaled to the data, so that their inputs and outputs are of order one.
+
+    Networks that have scales already are not changed.
 
     Parameters
     ----------
-    found : Scales
-        Of the data.
+    scales : DataScales
+        Scales of the data.
     points : array, shape (m, n)
         Some states.
     """
-    x, s, tau = jnp.asarray(points), jnp.asarray(found.scale), found.time_scale
+    x, s, tau = jnp.asarray(points), jnp.asarray(scales.scale), scales.time_scale
 
     def mean_variation(function: AnyEnergy) -> float:
-        """What a known function varies by over the data."""
+        """Return the mean variation of a known function over the data."""
         return float(jnp.mean(jnp.abs(jax.vmap(function.gradient)(x) * s)))
 
     energy = entropy = 1.0
@@ -118,8 +121,8 @@ def scale_networks(system: T, found: DataScales, points: np.ndarray) -> T:
         energy = mean_variation(system.energy)
     elif not has_networks(poisson):
         tensor = jnp.mean(jnp.abs(jax.vmap(poisson.tensor)(x)), axis=0)
-        largest = float(jnp.max(tensor / jnp.outer(s, s)))
-        energy = 1.0 / (tau * largest) if largest > 0.0 else 1.0
+        max_entry = float(jnp.max(tensor / jnp.outer(s, s)))
+        energy = 1.0 / (tau * max_entry) if max_entry > 0.0 else 1.0
     if system.entropy is not None and not has_networks(system.entropy):
         entropy = mean_variation(system.entropy)
     entropy = entropy if entropy > 0.0 else 1.0
@@ -143,22 +146,25 @@ def scale_networks(system: T, found: DataScales, points: np.ndarray) -> T:
         "dissipation": map_instances(Friction, system.dissipation, scale_friction),
     }
     if isinstance(poisson, Poisson):
-        inner = _fill_network_scales(poisson.function, x, pairs / (energy * tau))
-        poisson = eqx.tree_at(lambda p: (p.function, p.metric), poisson, (inner, s**2))
+        scaled_function = _fill_network_scales(poisson.function, x, pairs / (energy * tau))
+        poisson = eqx.tree_at(lambda p: (p.function, p.metric), poisson, (scaled_function, s**2))
     parts["poisson"] = poisson
     names = list(parts)
-    there = [name for name in names if parts[name] is not None]
-    changed = eqx.tree_at(lambda m: [getattr(m, name) for name in there], system, [parts[name] for name in there])
-    return tie_entropy(changed)
+    present_names = [name for name in names if parts[name] is not None]
+    scaled_system = eqx.tree_at(
+        lambda m: [getattr(m, name) for name in present_names], system, [parts[name] for name in present_names]
+    )
+    return tie_entropy(scaled_system)
 
 
 def has_networks(tree: Any) -> bool:
-    """Whether anything in a pytree is learned."""
+    """Return True if a pytree has learned parts."""
     return any(jax.tree_util.tree_leaves(learned_mask(tree)))
 
 
 def _fill_network_scales(tree: Any, x: jax.Array, unit) -> Any:
-    """The networks in a pytree with the scales of their inputs, and outputs in a unit, unless they have scales."""
+    """Set the input scales of the networks in a pytree from points x, and their output unit, unless they are set
+    already."""
 
     def change(part):
         if isinstance(part, Pullback):

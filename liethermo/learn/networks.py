@@ -1,4 +1,4 @@
-"""Networks that are functions of states in the units of data, and the mark of what is learned."""
+"""Neural networks as functions of states in the units of the data, and the mark of learned parts."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from ..tracing.traced import TracedFunction
 
 
 class Learned(Module):
-    """The mark of what is learned: floating-point arrays inside are parameters of :func:`liethermo.learn.fit`.
+    """Mark of a learned function: floating-point arrays inside it are parameters of :func:`liethermo.learn.fit`.
 
-    Called, it is the function that it holds. All that is outside of such marks stays as it is.
+    Calling it calls the function. Arrays outside of such marks are not changed by a fit.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ class Learned(Module):
 
 @eqx.filter_jit
 def _call_jitted(function: Callable, arguments: tuple):
-    """A call that is traced once: machine code has one routine for all of its places."""
+    """Call a function under ``jit``, so that compiled programs contain one routine for all calls."""
     return function(*arguments)
 
 
@@ -45,7 +45,7 @@ class Perceptron(Module):
     Parameters
     ----------
     sizes : sequence of int
-        Of the input, the hidden layers and the output.
+        Widths of the input, the hidden layers and the output.
     seed : int
     """
 
@@ -65,14 +65,14 @@ class Perceptron(Module):
 
 
 class Network(Module):
-    """``unit * function((x - centre) / size)``: a function whose inputs and outputs are of the size of one.
+    """A scaled network ``output_scale * function((x - centre) / scale)`` whose inner values are of order one.
 
     Attributes
     ----------
     centre, scale : array, shape (m,)
-        Of the inputs: mean and spread of the data, which :func:`liethermo.learn.fit` fills in.
+        Mean and standard deviation of the inputs over the data, which :func:`liethermo.learn.fit` fills in.
     output_scale : array, shape (outputs,)
-        Of the outputs, likewise.
+        Scale of the outputs, which :func:`liethermo.learn.fit` fills in.
     function : Learned
     """
 
@@ -83,29 +83,29 @@ class Network(Module):
 
     @classmethod
     def from_sizes(cls, dim: int, outputs: int, width: int, depth: int, seed: int) -> Network:
-        """A perceptron with ``depth`` hidden layers of ``width`` neurons."""
+        """Return a perceptron with ``depth`` hidden layers of ``width`` neurons, with default scales."""
         for name, value in {"the number of components": dim, "width": width, "depth": depth}.items():
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise InputError(f"{name} is a positive integer, not {value!r}")
+                raise InputError(f"{name} must be a positive integer, got {value!r}")
         if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-            raise InputError(f"seed is an integer >= 0, not {seed!r}")
+            raise InputError(f"seed must be an integer >= 0, got {seed!r}")
         layers = Perceptron([dim, *[width] * depth, outputs], int(seed))
         return cls(jnp.zeros(dim), jnp.ones(dim), jnp.ones(outputs), Learned(layers))
 
     @property
     def has_default_scales(self) -> bool:
-        """Whether nothing is known yet of its inputs."""
+        """True if no scales have been filled in."""
         fields = ((self.centre, 0.0), (self.scale, 1.0), (self.output_scale, 1.0))
-        return all(bool(np.all(np.asarray(values) == first)) for values, first in fields)
+        return all(bool(np.all(np.asarray(values) == default)) for values, default in fields)
 
     def __call__(self, x):
         return self.output_scale * self.function((x - self.centre) / self.scale)
 
 
 def learned_mask(tree: Any) -> Any:
-    """Which leaves of a pytree are learned: a tree of True and False, one False for a part without any.
+    """Return a pytree that is True for learned leaves; a part without any is a single False.
 
-    Numbers that a plain function inside of a mark is written with are none.
+    Constants in plain functions inside a mark are not learned.
     """
 
     def is_parameter(part):

@@ -1,4 +1,4 @@
-"""What a learned system is made of: energies, entropies, Poisson tensors and frictions with networks in them."""
+"""Parts of a learned system: energies, entropies, Poisson tensors and frictions that contain networks."""
 
 from __future__ import annotations
 
@@ -23,25 +23,24 @@ from .networks import Learned, Network
 
 
 class Energy(Function):
-    """An energy that is learned: a network, or any ``equinox.Module``.
+    """A learned energy: a network, or any ``equinox.Module``.
 
-    Known terms are added to it, ``lt.Quadratic(A) + lt.learn.Energy(4)``, and stay as they are; ``.on(indices)`` makes
-    it a function of some components of a larger state.
+    Known terms can be added, as in ``lt.Quadratic(A) + lt.learn.Energy(4)``; the fit does not change them.
+    ``.on(indices)`` makes it a function of some components of a larger state.
 
     Parameters
     ----------
     function : int, or function from x, shape (n,), to a scalar
-        The number n of components that a network is a function of; or an ``equinox.Module``, whose floating-point
-        arrays are learned.
+        The number n of inputs of a network; or an ``equinox.Module``, whose floating-point arrays are learned.
     width, depth : int
-        Neurons of a hidden layer of the network, and how many such layers.
+        Neurons per hidden layer of the network, and number of hidden layers.
     seed : int
-        Of the first weights.
+        Seed of the initial weights.
 
     Raises
     ------
     InputError
-        If there is nothing to be learned.
+        If nothing can be learned.
     """
 
     def __init__(self, function: int | Callable, width: int = 32, depth: int = 2, seed: int = 0):
@@ -51,8 +50,8 @@ class Energy(Function):
             self.function = Learned(function)
         else:
             raise InputError(
-                f"lt.learn.{type(self).__name__} takes the number of components of a network, or an equinox.Module, "
-                f"not {type(function).__name__}; what is known is added to it with +"
+                f"lt.learn.{type(self).__name__} needs the number of components of a network, or an equinox.Module, "
+                f"got {type(function).__name__}. Add known terms to it with +"
             )
         self.degree = math.inf
 
@@ -62,19 +61,19 @@ class Energy(Function):
 
 @eqx.filter_jit
 def _gradient_jitted(function: Callable, x) -> jax.Array:
-    """A gradient that is traced once, as the calls of :class:`.networks.Learned` are."""
+    """Return the gradient of a function under ``jit``, so that it is traced once."""
     return jax.grad(lambda y: jnp.asarray(function(y)))(x)
 
 
 class Entropy(Energy):
-    """An entropy that is learned: as :class:`Energy`, with other first weights for the same seed."""
+    """A learned entropy: :class:`Energy` with another default seed of the initial weights."""
 
     def __init__(self, function: int | Callable, width: int = 32, depth: int = 2, seed: int = 1):
         super().__init__(function, width, depth, seed)
 
 
 class _ScalarOutput(eqx.Module):
-    """The only output of a network."""
+    """A network with one output, as a scalar function."""
 
     network: Network
 
@@ -89,25 +88,25 @@ def _function_or_network(
 
 
 class Poisson(mf.PoissonStructure):
-    """A skew tensor that is learned, with the gradient of the entropy in its kernel by form: ``Pi = P A(x) P^T``.
+    """A learned skew tensor ``Pi = P A(x) P^T`` whose kernel contains the gradient of the entropy by construction.
 
-    A is skew, its entries are outputs of a network, and ``P^T = 1 - dS (G dS)^T / (dS . G dS)``, G diagonal with the
-    squares of the spreads of the data [cf. Gruber et al. 2025]. So energy and entropy obey their laws whatever the
-    weights are. The Jacobi identity is not built in, except where the tensor is known: the row "Jacobi" of
-    ``system.check()`` says how far it is from holding.
+    A is skew, and its entries are outputs of a network. ``P^T = 1 - dS (G dS)^T / (dS . G dS)``, where G is diagonal
+    with the squared standard deviations of the data [cf. Gruber et al. 2025]. So energy and entropy obey their laws for
+    all weights. The Jacobi identity is not built in, except where the tensor is known: the row "Jacobi" of
+    ``system.check()`` measures its violation.
 
     Parameters
     ----------
     dim : int
     width, depth, seed
-        As of :class:`Energy`.
+        As for :class:`Energy`.
     function : function from x, shape (dim,), to the entries above the diagonal, row by row; optional
         An ``equinox.Module`` in place of the network.
 
     Attributes
     ----------
     entropy : Energy or None
-        That of the system, which :class:`Metriplectic` fills in.
+        Entropy of the system, which :class:`Metriplectic` fills in.
     """
 
     function: Callable
@@ -121,12 +120,14 @@ class Poisson(mf.PoissonStructure):
 
     @staticmethod
     def canonical(degrees_of_freedom: int, dim: int | None = None) -> mf.PoissonStructure:
-        """The known tensor of (q, p) in the first components of a state; the others are at rest without friction."""
+        """Return the canonical tensor of (q, p) in the first components of a state; the others are constant without
+        friction."""
         return extend_poisson(mf.Canonical(degrees_of_freedom), dim)
 
     @staticmethod
     def lie_poisson(algebra: mf.LieAlgebra, dim: int | None = None) -> mf.PoissonStructure:
-        """The known tensor of the dual of a Lie algebra in the first components of a state, likewise."""
+        """Return the Lie-Poisson tensor of an algebra in the first components of a state; the others are constant
+        without friction."""
         return extend_poisson(mf.LiePoisson(algebra), dim)
 
     @property
@@ -138,15 +139,15 @@ class Poisson(mf.PoissonStructure):
         if self.entropy is None:
             return A
         dS = self.entropy.gradient(x)
-        raised = self.metric * dS
-        square = jnp.dot(raised, dS)
+        metric_dS = self.metric * dS
+        square = jnp.dot(metric_dS, dS)
         image = A @ dS  # P A P^T = A - (g (A dS)^T - (A dS) g^T) / g . dS with g = G dS
-        turned = jnp.outer(raised, image)
-        return A + (turned - turned.T) / jnp.where(square > 0.0, square, 1.0)
+        correction = jnp.outer(metric_dS, image)
+        return A + (correction - correction.T) / jnp.where(square > 0.0, square, 1.0)
 
 
 def extend_poisson(poisson: mf.PoissonStructure, dim: int | None) -> mf.PoissonStructure:
-    """A structure with components behind its own, up to ``dim``, that nothing is conjugate to."""
+    """Return a Poisson structure extended to ``dim`` components; the additional ones commute with all functions."""
     assert poisson.dim is not None
     if dim is None or dim == poisson.dim:
         return poisson
@@ -156,24 +157,24 @@ def extend_poisson(poisson: mf.PoissonStructure, dim: int | None) -> mf.PoissonS
 
 
 class Friction(Dissipation):
-    """A friction that is learned, ``K = B B^T`` with ``B^T grad H = 0`` by form, whatever the weights are.
+    """A learned friction ``K = B B^T`` with ``B^T grad H = 0`` by construction, for all weights.
 
-    The columns of B are, by ``construction``,
+    ``construction`` selects the columns of B:
 
     - ``"skew"``: ``A_k(x) dH`` with skew matrices A_k [cf. Zhang et al. 2022]; smooth where dH = 0 too.
-    - ``"projected"``: ``b_k(x)`` less its component along ``G dH``, G diagonal with the squares of the spreads of the
-      data [cf. Gruber et al. 2025]: n numbers a column instead of n (n - 1)/2.
+    - ``"projected"``: ``b_k(x)`` minus its component along ``G dH``, where G is diagonal with the squared standard
+    deviations of the data [cf. Gruber et al. 2025]: n numbers a column instead of n (n - 1)/2.
 
-    Handed a discrete gradient dH, they have that in their kernel: so the energy is conserved exactly in every step.
+    A discrete gradient dH is in their kernel too, so the energy is conserved exactly in every step.
 
     Parameters
     ----------
     dim : int
     rank : int
-        Columns of B: in how many ways the system dissipates.
+        Number of columns of B, the number of dissipation channels.
     construction : {"skew", "projected"}
     width, depth, seed
-        As of :class:`Energy`.
+        As for :class:`Energy`.
     function : function from x, shape (dim,), to the numbers of all columns, one after another; optional
         An ``equinox.Module`` in place of the network.
     """
@@ -195,26 +196,26 @@ class Friction(Dissipation):
         function: Callable | None = None,
     ):
         if construction not in ("skew", "projected"):
-            raise InputError(f"construction is 'skew' or 'projected', not {construction!r}")
+            raise InputError(f"construction must be 'skew' or 'projected', got {construction!r}")
         if isinstance(rank, bool) or not isinstance(rank, int) or rank < 1:
-            raise InputError(f"rank is a positive integer, not {rank!r}")
+            raise InputError(f"rank must be a positive integer, got {rank!r}")
         numbers = rank * (dim * (dim - 1) // 2 if construction == "skew" else dim)
         self.function = _function_or_network(function, dim, numbers, width, depth, seed)
         self.n_components, self.rank, self.construction, self.metric = dim, rank, construction, jnp.ones(dim)
 
     def bind_to(self, system):
         if system.dim != self.n_components:
-            raise InputError(f"the friction is of {self.n_components} components, but the state has {system.dim}")
+            raise InputError(f"the friction has {self.n_components} components, but the state has {system.dim}")
         return self
 
     def factor_columns(self, x, dH) -> jax.Array:
-        """B, shape (dim, rank)."""
-        found = self.function(x).reshape(self.rank, -1)
+        """Return B, shape (dim, rank)."""
+        entries = self.function(x).reshape(self.rank, -1)
         if self.construction == "skew":
-            return (skew_matrix(found, self.n_components) @ dH).T
-        raised = self.metric * dH
-        overlap = jnp.dot(raised, dH)
-        return (found - jnp.outer(found @ dH, raised) / jnp.where(overlap > 0.0, overlap, 1.0)).T
+            return (skew_matrix(entries, self.n_components) @ dH).T
+        metric_dH = self.metric * dH
+        overlap = jnp.dot(metric_dH, dH)
+        return (entries - jnp.outer(entries @ dH, metric_dH) / jnp.where(overlap > 0.0, overlap, 1.0)).T
 
     def force(self, system, x, dH, dS, dL):
         B = self.factor_columns(x, dH)

@@ -1,4 +1,4 @@
-"""Steps chosen by an estimate of the local error: the request, in the form that engines take."""
+"""Adaptive step control: the user's request, and its form for the engines."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..integrators.base import has_error_estimate
 from .events import Event
 
 MIN_STEP_FRACTION = 1e-14
-"""Smallest step, relative to the span."""
+"""Smallest step size, as a fraction of the span."""
 
 
 @dataclass(frozen=True)
@@ -71,17 +71,18 @@ class Adaptive:
 
     @property
     def tolerance(self) -> float:
-        """What a method of any order takes its order from."""
+        """The relative tolerance, or the absolute one if that is zero; methods of variable order choose their order by
+        it."""
         return self.rtol or self.atol
 
 
 def make_step_control(step: float | Adaptive, method: OneStepMethod, length: float, event: Event | None) -> StepControl:
-    """How the steps of a run over a span of some length are chosen, and what is watched.
+    """Return the step control of a run over a span of some length, with the event function that it monitors.
 
     Raises
     ------
     InputError
-        If steps of this method cannot be adaptive.
+        If the method has no error estimate and so cannot take adaptive steps.
     """
     adaptive = isinstance(step, Adaptive)
     min_step = MIN_STEP_FRACTION * length if math.isfinite(length) else 0.0
@@ -92,6 +93,8 @@ def make_step_control(step: float | Adaptive, method: OneStepMethod, length: flo
         numbers += [min_step, step.most_steps]
     else:
         numbers = [0.0, 0.0, step, math.inf, min_step, math.inf]
-    watched, falling = (None, False) if event is None else (event.function, event.falling_only)
-    rtol, atol, first, largest, shortest, most = (np.asarray(float(number)) for number in numbers)
-    return StepControl(rtol, atol, first, largest, shortest, most, watched, falling, adaptive)
+    event_function, falling_only = (None, False) if event is None else (event.function, event.falling_only)
+    rtol, atol, first_step, max_step, min_step_array, max_attempts = (np.asarray(float(number)) for number in numbers)
+    return StepControl(
+        rtol, atol, first_step, max_step, min_step_array, max_attempts, event_function, falling_only, adaptive
+    )

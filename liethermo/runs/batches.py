@@ -1,4 +1,4 @@
-"""Equal steps of many trajectories: in lanes over threads, or all of a batch in one program."""
+"""Fixed steps of many trajectories: SIMD lanes over threads (compiled), or one vmapped program per batch (array)."""
 
 from __future__ import annotations
 
@@ -30,26 +30,28 @@ from .record import EnsembleRecord
 from .timetable import CHUNK_STEPS
 
 LANES_PER_BLOCK = 8
-"""Trajectories in a block of the compiled engine: one AVX-512 vector or two of AVX2."""
+"""Number of trajectories in a block of the compiled engine: one AVX-512 vector, or two of AVX2."""
 
 THREAD_BATCH_SIZE = 8192
-"""Trajectories that a thread of the compiled engine takes at once, at most: enough to hide the cost of Python."""
+"""Largest number of trajectories that a thread of the compiled engine runs at once; enough to hide Python's
+overhead."""
 
 ARRAY_BATCH_SIZE = 65_536
-"""Trajectories that the array engine takes at once: bounded memory."""
+"""Largest number of trajectories that the array engine runs at once, which bounds memory."""
 
 ARRAY_MAX_SAVED_VALUES = 2**26
-"""Numbers of states that a call of it keeps, about."""
+"""Approximate number of state components that one call of the array engine saves at most."""
 
 RECORDED_INITIAL_FIELDS = ("x", "energy", "entropy")
-"""Fields of the states before a batch that its record is made from; after it those of :data:`.stepping.TELLING`."""
+"""Fields of the initial engine states that a record needs; of final states it needs
+:data:`.stepping.REPORTED_FIELDS`."""
 
 
 class ProgressCounter:
-    """Counts how many trajectories are done, parts of them among them, from any thread."""
+    """Thread-safe counter of finished trajectories, fractions included; it reports each new total."""
 
-    def __init__(self, tell: Callable[[float], None]):
-        self._report_total, self._n_finished, self._lock = tell, 0.0, threading.Lock()
+    def __init__(self, report: Callable[[float], None]):
+        self._report_total, self._n_finished, self._lock = report, 0.0, threading.Lock()
 
     def add(self, trajectories: float) -> None:
         with self._lock:
@@ -61,69 +63,75 @@ class ProgressCounter:
 
 
 MIN_STEPS_FOR_THREADS = 20_000
-"""Steps, of all trajectories together, that take less time than starting threads for them."""
+"""Number of steps, summed over trajectories, below which starting threads takes longer than the steps."""
 
 
-def run_in_threads(work: Callable[[slice, threading.Event], None], size: int, steps: float = math.inf) -> None:
-    """Portions of trajectories, dealt out to a thread for each core; Ctrl-C sets the event.
+def run_in_threads(
+    work: Callable[[slice, threading.Event], None], n_trajectories: int, max_steps: float = math.inf
+) -> None:
+    """Call ``work(members, stop)`` for slices of the trajectories, in one thread per core; Ctrl-C sets the event
+    ``stop``.
 
-    Where each takes few steps, ``steps`` at most, there is one portion, and no thread.
+    If each trajectory takes few steps, at most ``max_steps``, one call without threads does all the work.
     """
     cores, stop = _available_cores(), threading.Event()
-    if size * steps <= MIN_STEPS_FOR_THREADS:
+    if n_trajectories * max_steps <= MIN_STEPS_FOR_THREADS:
         with contextlib.suppress(KeyboardInterrupt):
-            work(slice(0, size), stop)
+            work(slice(0, n_trajectories), stop)
         return
-    portion = LANES_PER_BLOCK * math.ceil(
-        size / (LANES_PER_BLOCK * cores * math.ceil(size / (THREAD_BATCH_SIZE * cores)))
+    batch_size = LANES_PER_BLOCK * math.ceil(
+        n_trajectories / (LANES_PER_BLOCK * cores * math.ceil(n_trajectories / (THREAD_BATCH_SIZE * cores)))
     )
-    pool, starts = _thread_pool(cores, os.getpid()), range(0, size, portion)
-    tasks = [pool.submit(work, slice(first, min(first + portion, size)), stop) for first in starts]
+    pool, starts = _thread_pool(cores, os.getpid()), range(0, n_trajectories, batch_size)
+    tasks = [pool.submit(work, slice(start, min(start + batch_size, n_trajectories)), stop) for start in starts]
     try:
         for task in tasks:
             task.result()
     except KeyboardInterrupt:
         pass
     finally:
-        stop.set()  # those that have not begun have nothing to do
+        stop.set()  # slices that have not started return at once
         wait(tasks)
 
 
 @functools.cache
-def _thread_pool(number: int, process: int) -> ThreadPoolExecutor:
-    """Threads that stay, since starting them takes as long as many an ensemble; a forked process has none of them."""
-    del process
-    return ThreadPoolExecutor(number)
+def _thread_pool(n_threads: int, process_id: int) -> ThreadPoolExecutor:
+    """Return a pool of threads that is reused, because starting it takes as long as a small ensemble.
+
+    Each process has its own pool, because a forked process does not inherit threads.
+    """
+    del process_id
+    return ThreadPoolExecutor(n_threads)
 
 
 MAX_THREADS: contextvars.ContextVar[int | None] = contextvars.ContextVar("THREADS", default=None)
-"""Threads of an ensemble at most: for those who run several in several processes of one machine."""
+"""Largest number of threads of an ensemble, for running several ensembles in separate processes of one machine."""
 
 
 def _available_cores() -> int:
-    """That this process may use, where the system tells."""
+    """Return the number of cores that this process may use."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return min(cores, MAX_THREADS.get() or cores)
 
 
 class LaneParameters:
-    """The stepper of a family, a method and a pacing, and the parameters of its trajectories."""
+    """Compiled step loop of a family and a method, with the parameters of its trajectories."""
 
-    def __init__(self, family: Family, method: OneStepMethod, pacing: StepControl | None = None):
-        self.family, self.shared_parameters = family, flat_parameters(method, *([] if pacing is None else [pacing]))
+    def __init__(self, family: Family, method: OneStepMethod, control: StepControl | None = None):
+        self.family, self.shared_parameters = family, flat_parameters(method, *([] if control is None else [control]))
         self.first_lane_parameters = np.append(family.parameter_matrix(slice(0, 1), 1)[0], self.shared_parameters)
         self.is_per_trajectory = np.append(family.is_per_trajectory, np.zeros(len(self.shared_parameters), dtype=bool))
         self.step_loop = cached_step_loop(
-            family.form, self.first_lane_parameters, method, pacing, LANES_PER_BLOCK, self.is_per_trajectory
+            family.form, self.first_lane_parameters, method, control, LANES_PER_BLOCK, self.is_per_trajectory
         )
 
-    def parameters(self, chosen: slice, number: int) -> np.ndarray:
+    def parameters(self, members: slice, n_members: int) -> np.ndarray:
         if not self.is_per_trajectory.any():
             return self.first_lane_parameters
         return np.hstack(
             [
-                self.family.parameter_matrix(chosen, number),
-                np.broadcast_to(self.shared_parameters, (number, len(self.shared_parameters))),
+                self.family.parameter_matrix(members, n_members),
+                np.broadcast_to(self.shared_parameters, (n_members, len(self.shared_parameters))),
             ]
         )
 
@@ -132,160 +140,217 @@ def run_fixed_compiled(
     family: Family,
     method: OneStepMethod,
     record: EnsembleRecord,
-    tally: ProgressCounter,
+    progress_counter: ProgressCounter,
     noise: NoisePaths | None = None,
 ) -> None:
-    """Blocks of lanes; the loop does not hold the interpreter's lock."""
-    lanes = LaneParameters(family, method)
-    stepper, course, turn = lanes.step_loop, record.schedule, threading.Lock()
+    """Run all trajectories with fixed steps on the compiled engine, in blocks of lanes over threads, and fill the
+    record.
 
-    def work(chosen: slice, stop: threading.Event) -> None:
+    The compiled loop releases the interpreter's lock.
+    """
+    lanes = LaneParameters(family, method)
+    stepper, schedule, record_lock = lanes.step_loop, record.schedule, threading.Lock()
+
+    def work(members: slice, stop: threading.Event) -> None:
         if stop.is_set():
             return
-        number = chosen.stop - chosen.start
-        with turn:  # NumPy lets other threads in at every operation, and each change takes longer than the operation
-            blocks = stepper.start_blocks(lanes.parameters(chosen, number), record.x0[chosen])
-            before = {
-                name: value[:number].copy("K")
+        n_members = members.stop - members.start
+        # NumPy releases the interpreter's lock in every operation, and switching threads takes longer than these
+        with record_lock:
+            blocks = stepper.start_blocks(lanes.parameters(members, n_members), record.x0[members])
+            initial = {
+                name: value[:n_members].copy("K")
                 for name, value in stepper.read_fields(blocks, RECORDED_INITIAL_FIELDS).items()
             }
-            record.record_initial(chosen, before["x"], before["energy"], before["entropy"])
-        taken, place = 0, 1
-        for h, saves, every, kept in course.engine_calls(CHUNK_STEPS * 16 // max(number, LANES_PER_BLOCK)):
+            record.record_initial(members, initial["x"], initial["energy"], initial["entropy"])
+        first_step, first_save = 0, 1
+        for h, n_saves, steps_per_save, keep in schedule.engine_calls(
+            CHUNK_STEPS * 16 // max(n_members, LANES_PER_BLOCK)
+        ):
             if stop.is_set():
                 break
-            increments = None if noise is None else noise.step_increments(chosen, taken, saves * every, h)
-            states, taken = (
-                stepper.run(lanes.first_lane_parameters, blocks, h, saves, every, increments)[:number],
-                taken + saves * every,
+            increments = (
+                None if noise is None else noise.step_increments(members, first_step, n_saves * steps_per_save, h)
             )
-            if kept:
-                record.store_states(chosen, place, states)
-                place += saves
-            tally.add(number * saves * every / course.n_steps)
-        with turn:
-            after = {name: value[:number] for name, value in stepper.read_fields(blocks, REPORTED_FIELDS).items()}
-            record.finish_fixed_step_members(chosen, before, after)
+            states, first_step = (
+                stepper.run(lanes.first_lane_parameters, blocks, h, n_saves, steps_per_save, increments)[:n_members],
+                first_step + n_saves * steps_per_save,
+            )
+            if keep:
+                record.store_states(members, first_save, states)
+                first_save += n_saves
+            progress_counter.add(n_members * n_saves * steps_per_save / schedule.n_steps)
+        with record_lock:
+            final = {name: value[:n_members] for name, value in stepper.read_fields(blocks, REPORTED_FIELDS).items()}
+            record.finish_fixed_step_members(members, initial, final)
 
-    run_in_threads(work, len(record.x0), course.n_steps)
+    run_in_threads(work, len(record.x0), schedule.n_steps)
 
 
 ReplayedSteps = tuple[dict[str, np.ndarray], np.ndarray]
-"""The fields of states after some steps, and the states after each, shape (trajectories, steps, n)."""
+"""Engine fields after some steps, and the states after each step, shape (trajectories, steps, n)."""
 
 
 def replay_compiled(
     family: Family, method: OneStepMethod, x: np.ndarray, h: np.ndarray, steps: int = 1
 ) -> ReplayedSteps:
-    """All members of a small family after so many steps, each of its own size."""
-    lanes, number = LaneParameters(family, method), len(x)
-    blocks = lanes.step_loop.start_blocks(lanes.parameters(slice(None), number), x)
+    """Take ``steps`` steps of size h[i] with each member i of a small family, on the compiled engine."""
+    lanes, n_members = LaneParameters(family, method), len(x)
+    blocks = lanes.step_loop.start_blocks(lanes.parameters(slice(None), n_members), x)
     states = lanes.step_loop.run(
         lanes.first_lane_parameters, blocks, np.resize(h, len(blocks) * LANES_PER_BLOCK), steps, 1
     )
-    after = {name: values[:number] for name, values in lanes.step_loop.read_fields(blocks).items()}
-    return after, np.asarray(states)[:number, :, :-2]
+    fields = {name: values[:n_members] for name, values in lanes.step_loop.read_fields(blocks).items()}
+    return fields, np.asarray(states)[:n_members, :, :-2]
 
 
 # -- the array engine -------------------------------------------------------------------------------------------------
 
 
-def padded_member_indices(first: int, last: int, dim: int) -> np.ndarray:
-    """Places of trajectories, the last one repeated until they fill vectors: what is left over is rounded otherwise.
+def padded_member_indices(start: int, stop: int, dim: int) -> np.ndarray:
+    """Return the indices from ``start`` to ``stop``, the last one repeated until they fill whole SIMD vectors.
 
-    So the numbers of a trajectory do not depend on how many there are. Large states, shape (dim,), fill vectors alone.
+    A partly filled vector would round differently, so padding makes results independent of the number of trajectories.
+    States of large ``dim`` fill vectors by themselves.
     """
-    filled = LANES_PER_BLOCK * math.ceil((last - first) / LANES_PER_BLOCK) if dim <= MAX_COMPILED_DIM else last - first
-    return np.minimum(np.arange(first, first + filled), last - 1)
+    n_padded = (
+        LANES_PER_BLOCK * math.ceil((stop - start) / LANES_PER_BLOCK) if dim <= MAX_COMPILED_DIM else stop - start
+    )
+    return np.minimum(np.arange(start, start + n_padded), stop - 1)
 
 
 def run_fixed_array(
     family: Family,
     method: OneStepMethod,
     record: EnsembleRecord,
-    tally: ProgressCounter,
+    progress_counter: ProgressCounter,
     noise: NoisePaths | None = None,
 ) -> None:
-    """All trajectories of a batch in one program, by ``vmap``."""
-    size, course, interrupted = len(record.x0), record.schedule, False
-    portion, on_demand = min(ARRAY_BATCH_SIZE, size), array.LazyNewton(method)
-    limit = CHUNK_STEPS if noise is None else max(1, CHUNK_STEPS * 16 // portion)  # bounded memory for the increments
-    most = max(1, min(array.MAX_SAVES_PER_CALL, ARRAY_MAX_SAVED_VALUES // (portion * record.x0.shape[1])))
-    for start in range(0, size, portion):
-        number = min(portion, size - start)
-        chosen = padded_member_indices(start, start + number, record.x0.shape[1])
-        given = family.form, *family.vmap_arguments(chosen), method
-        state = before = begin_vmapped(*given, jnp.asarray(record.x0[chosen]))
-        first = {name: np.asarray(value) for name, value in before._asdict().items()}
-        record.record_initial(chosen, first["x"], first["energy"], first["entropy"])
-        taken, place = 0, 1
+    """Run all trajectories with fixed steps on the array engine, a vmapped program per batch, and fill the record."""
+    n_trajectories, schedule, is_interrupted = len(record.x0), record.schedule, False
+    batch_size, lazy_newton = min(ARRAY_BATCH_SIZE, n_trajectories), array.LazyNewton(method)
+    max_steps = (
+        CHUNK_STEPS if noise is None else max(1, CHUNK_STEPS * 16 // batch_size)
+    )  # bounded memory for the increments
+    max_saves = max(1, min(array.MAX_SAVES_PER_CALL, ARRAY_MAX_SAVED_VALUES // (batch_size * record.x0.shape[1])))
+    for start in range(0, n_trajectories, batch_size):
+        n_members = min(batch_size, n_trajectories - start)
+        members = padded_member_indices(start, start + n_members, record.x0.shape[1])
+        batch_arguments = family.form, *family.vmap_arguments(members), method
+        state = initial_state = begin_vmapped(*batch_arguments, jnp.asarray(record.x0[members]))
+        initial = {name: np.asarray(value) for name, value in initial_state._asdict().items()}
+        record.record_initial(members, initial["x"], initial["energy"], initial["entropy"])
+        first_step, first_save = 0, 1
         try:
-            for h, saves, every, keep in course.engine_calls(limit, most):
+            for h, n_saves, steps_per_save, keep in schedule.engine_calls(max_steps, max_saves):
                 increments = (
                     None
                     if noise is None
-                    else array.padded_increments(noise.step_increments(chosen, taken, saves * every, h))
+                    else array.padded_increments(
+                        noise.step_increments(members, first_step, n_saves * steps_per_save, h)
+                    )
                 )
-                sizes, capacity = np.full(len(chosen), h), 1 << (saves - 1).bit_length()  # few shapes, few programs
-                state, kept = advance_batch(on_demand, given, state, sizes, saves, every, capacity, increments)
-                taken += saves * every
+                step_sizes, capacity = (
+                    np.full(len(members), h),
+                    1 << (n_saves - 1).bit_length(),
+                )  # few shapes, few programs
+                state, saved_states = advance_batch(
+                    lazy_newton, batch_arguments, state, step_sizes, n_saves, steps_per_save, capacity, increments
+                )
+                first_step += n_saves * steps_per_save
                 if keep:
-                    record.store_states(chosen, place, kept)
-                    place += saves
-                tally.add(number * saves * every / course.n_steps)
+                    record.store_states(members, first_save, saved_states)
+                    first_save += n_saves
+                progress_counter.add(n_members * n_saves * steps_per_save / schedule.n_steps)
         except KeyboardInterrupt:
-            interrupted = True
+            is_interrupted = True
         record.finish_fixed_step_members(
-            chosen, first, {name: np.asarray(value) for name, value in state._asdict().items()}
+            members, initial, {name: np.asarray(value) for name, value in state._asdict().items()}
         )
-        if interrupted:
+        if is_interrupted:
             return
 
 
 REPLAY_STEPS_PER_CALL = 32
-"""Steps that one call follows at most."""
+"""Largest number of steps that one call replays."""
 
 
 def replay_array(family: Family, method: OneStepMethod, x: np.ndarray, h: np.ndarray, steps: int = 1) -> ReplayedSteps:
-    """All members of a small family after so many steps, each of its own size."""
-    given, on_demand = (family.form, *family.vmap_arguments(slice(None)), method), array.LazyNewton(method)
-    state, found = begin_vmapped(*given, jnp.asarray(x)), []
-    for done in range(0, steps, REPLAY_STEPS_PER_CALL):
-        state, kept = advance_batch(
-            on_demand, given, state, h, min(REPLAY_STEPS_PER_CALL, steps - done), 1, REPLAY_STEPS_PER_CALL
+    """Take ``steps`` steps of size h[i] with each member i of a small family, on the array engine."""
+    batch_arguments, lazy_newton = (family.form, *family.vmap_arguments(slice(None)), method), array.LazyNewton(method)
+    state, chunks = begin_vmapped(*batch_arguments, jnp.asarray(x)), []
+    for n_done in range(0, steps, REPLAY_STEPS_PER_CALL):
+        state, saved_states = advance_batch(
+            lazy_newton, batch_arguments, state, h, min(REPLAY_STEPS_PER_CALL, steps - n_done), 1, REPLAY_STEPS_PER_CALL
         )
-        found.append(kept[..., :-2])
-    return {name: np.asarray(value) for name, value in state._asdict().items()}, np.concatenate(found, axis=1)
+        chunks.append(saved_states[..., :-2])
+    return {name: np.asarray(value) for name, value in state._asdict().items()}, np.concatenate(chunks, axis=1)
 
 
 @jit_program
 def begin_vmapped(form, parameters, axes, method, x):
+    """Return the engine states of a batch of trajectories at their initial states x."""
     return jax.vmap(lambda p, x: initial_run_state_program(form.rebuild(p), method, x), in_axes=(axes, 0))(
         parameters, x
     )
 
 
 def advance_batch(
-    on_demand: array.LazyNewton, given: tuple, state: State, h, saves: int, every: int, capacity: int, noise=None
+    lazy_newton: array.LazyNewton,
+    batch_arguments: tuple,
+    state: State,
+    h,
+    n_saves: int,
+    steps_per_save: int,
+    capacity: int,
+    noise=None,
 ):
-    """States after steps of sizes h, one each, and all that are kept: shape (trajectories, saves, n + 2).
+    """Advance a batch by steps of sizes h, one size per trajectory; return engine states and saved states.
 
-    ``given`` is form, parameters, their axes, and method.
+    Parameters
+    ----------
+    batch_arguments : tuple
+        Program structure, parameters, their vmap axes, and method.
+
+    Returns
+    -------
+    State
+    array, shape (trajectories, n_saves, n + 2)
+        Saved states with energy and entropy.
     """
-    form, parameters, axes, method = given
-    own, count = (form, parameters, axes, method), (jnp.asarray(saves), jnp.asarray(every), capacity, noise)
-    state, kept = on_demand.advance(
-        lambda s, *how: advance_vmapped(*own, s, jnp.asarray(h), *count, *how), state, every
+    form, parameters, axes, method = batch_arguments
+    system_arguments, step_arguments = (
+        (form, parameters, axes, method),
+        (jnp.asarray(n_saves), jnp.asarray(steps_per_save), capacity, noise),
     )
-    x, energy, entropy = (np.asarray(values)[:, :saves] for values in kept[:3])
+    state, saved_fields = lazy_newton.advance(
+        lambda s, *newton_arguments: advance_vmapped(
+            *system_arguments, s, jnp.asarray(h), *step_arguments, *newton_arguments
+        ),
+        state,
+        steps_per_save,
+    )
+    x, energy, entropy = (np.asarray(values)[:, :n_saves] for values in saved_fields[:3])
     return state, np.concatenate([x, energy[..., None], entropy[..., None]], axis=-1)
 
 
 @jit_program
-def advance_vmapped(form, parameters, axes, method, state, h, saves, every, capacity: int, noise, newton: bool, first):
-    def one(p, state, h, noise, first):
+def advance_vmapped(
+    form, parameters, axes, method, state, h, n_saves, steps_per_save, capacity: int, noise, newton: bool, first_steps
+):
+    def one(p, state, h, noise, first_step):
         return array.advance(
-            form.rebuild(p), method, state, h, saves, every, capacity, DEFAULT_OPTIONS, noise, newton, first
+            form.rebuild(p),
+            method,
+            state,
+            h,
+            n_saves,
+            steps_per_save,
+            capacity,
+            DEFAULT_OPTIONS,
+            noise,
+            newton,
+            first_step,
         )
 
-    return jax.vmap(one, in_axes=(axes, 0, 0, 0, 0))(parameters, state, h, noise, first)
+    return jax.vmap(one, in_axes=(axes, 0, 0, 0, 0))(parameters, state, h, noise, first_steps)

@@ -1,4 +1,4 @@
-"""How a run ended, in words: what happened, where, and what to try."""
+"""Final status of a run: the cause of a failure, its time, and advice."""
 
 from __future__ import annotations
 
@@ -17,46 +17,55 @@ from ..systems import System
 from .adaptive import Adaptive
 
 RETRY_DIVISORS = (2.0, 8.0, 64.0, 1024.0, 16384.0)
-"""Parts of a step that could not be solved that are tried, to see whether shorter ones can."""
+"""Divisors of a failed step size; the quotients are tried, to advise a smaller step."""
 
 BLOW_UP_SIZE = float(np.finfo(float).max) ** 0.25
-"""Size of a state beyond which a function of the fourth power is no number any more."""
+"""Norm of a state that counts as unbounded; a quartic function overflows there."""
 
 BLOW_UP_TIME_FRACTION = 1e-6
-"""Share of the time since the start in which a state doubles at its speed, below which it goes to infinity in finite
-time."""
+"""Doubling time of a state, as a fraction of the elapsed time, below which it diverges in finite time."""
 
-BLOW_UP_HORIZON_STEPS, BLOW_UP_GROWTH_FACTOR, BLOW_UP_RATE_FACTOR, PROBE_STEPS_PER_CALL = 8.0, 1e6, 10.0, 16
-"""Where a step has failed, in how many times its length shorter ones have to find what growth, at a rate that grows by
-how much, to say the same; how many of them are taken at once."""
+BLOW_UP_HORIZON_STEPS = 8.0
+"""Time, in lengths of a failed step, in which shorter steps must show that the state blows up."""
+
+BLOW_UP_GROWTH_FACTOR = 1e6
+"""Growth of the norm of the state over this time that counts as blow-up."""
+
+BLOW_UP_RATE_FACTOR = 10.0
+"""Smallest increase of the relative growth rate over this time. A state that leaves an equilibrium grows at a constant
+rate, which ends."""
+
+PROBE_STEPS_PER_CALL = 16
+"""Number of shorter steps in one call of the engine."""
 
 MIN_GROWTH_TO_REPORT = 10.0
-"""Growth since the start from which anything is said."""
+"""Growth of the norm since the start above which growth is reported."""
 
 BLOW_UP_ADVICE = "No step helps there: does the energy have a lower bound, and do the forces that drive the system end?"
+"""Advice at the end of messages about unbounded growth."""
 
 
 def run_statistics(state: State) -> Stats:
-    """What an engine has counted."""
-    followed = int(state.step) > 0
+    """Return the work counters and extreme values of an engine state."""
+    has_steps = int(state.step) > 0
     return Stats(
         steps=int(state.step),
         fixed_point_iterations=int(state.fixed_point_iterations),
         newton_iterations=int(state.newton_iterations),
         most_iterations=int(state.most_iterations),
         worst_residual=float(state.worst_residual),
-        energy_range=(float(state.smallest_energy), float(state.largest_energy)) if followed else None,
-        least_entropy_increment=float(state.least_entropy_increment) if followed else None,
-        largest_energy_increment=float(state.largest_energy_increment) if followed else None,
+        energy_range=(float(state.smallest_energy), float(state.largest_energy)) if has_steps else None,
+        least_entropy_increment=float(state.least_entropy_increment) if has_steps else None,
+        largest_energy_increment=float(state.largest_energy_increment) if has_steps else None,
     )
 
 
 SUFFICIENT_ORDER = 6
-"""Order of a method from which no higher one is recommended."""
+"""Order of a method from which no higher order is advised."""
 
 
 def higher_order_advice(method: OneStepMethod, step: Adaptive) -> str:
-    """Advice to take a method of higher order, if that of a run is low; otherwise an empty text."""
+    """Return the advice to use a method of higher order, or "" if its order is high enough."""
     if method.order >= SUFFICIENT_ORDER:
         return ""
     better = "lt.MetriplecticRungeKutta(8)" if method.explicit else "lt.MetriplecticGauss(4)"
@@ -64,25 +73,26 @@ def higher_order_advice(method: OneStepMethod, step: Adaptive) -> str:
 
 
 def adaptive_failure_status(
-    system: System, method: OneStepMethod, x0, outcome, step: Adaptive, span: tuple[float, float], now: float
+    system: System, method: OneStepMethod, x0, outcome, step: Adaptive, span: tuple[float, float], t: float
 ) -> Status:
-    """How adaptive steps ended before the end, where none of them failed for good."""
+    """Return the status of an adaptive run that stopped before its end at time t: step size, step count or memory ran
+    out."""
     (start, end), steps, residual = span, int(outcome.state.step), float(outcome.state.residual)
     x = np.asarray(outcome.state.x)
     if outcome.exhausted_limit != "memory" and (
-        text := blow_up_message(x, x0, vector_field_at(system, x[None])[0], now - start, now)
+        text := blow_up_message(x, x0, vector_field_at(system, x[None])[0], t - start, t)
     ):
         code = StatusCode.STEP_LIMIT if outcome.exhausted_limit else StatusCode.STEP_UNDERFLOW
-        return Status(code, f"after {steps} steps {text}", steps, now, residual)
+        return Status(code, f"after {steps} steps {text}", steps, t, residual)
     if outcome.exhausted_limit == "steps":
-        text = f"{step.most_steps} steps were tried and t = {now:g} of {end:g} is reached: "
-        text += f"Adaptive(most_steps=...) allows more, and a larger tolerance takes fewer{higher_order_advice(method, step)}"
-        return Status(StatusCode.STEP_LIMIT, text, steps, now, residual)
+        text = f"{step.most_steps} steps were tried and t = {t:g} of {end:g} is reached: Adaptive(most_steps=...) "
+        text += f"allows more, and a larger tolerance takes fewer{higher_order_advice(method, step)}"
+        return Status(StatusCode.STEP_LIMIT, text, steps, t, residual)
     if outcome.exhausted_limit:
-        text = f"what is kept of {steps} steps fills the memory and t = {now:g} of {end:g} is reached: "
-        return Status(StatusCode.STEP_LIMIT, text + "save_every or save_at keeps fewer states", steps, now, residual)
-    text = f"the step fell to {outcome.underflow_step_size:.2g} after step {steps}, t = {now:g}, and "
-    if now + outcome.underflow_step_size == now:
+        text = f"the saved values of {steps} steps fill the memory and t = {t:g} of {end:g} is reached: "
+        return Status(StatusCode.STEP_LIMIT, text + "save_every or save_at keeps fewer states", steps, t, residual)
+    text = f"the step fell to {outcome.underflow_step_size:.2g} after step {steps}, t = {t:g}, and "
+    if t + outcome.underflow_step_size == t:
         text += "double precision does not tell t + h from t. Measure the time from a start nearer to zero"
     elif int(outcome.state.status) == StatusCode.COMPLETED:
         text += "the error is still too large: the tolerance may be below what rounding allows, or the functions not "
@@ -90,72 +100,75 @@ def adaptive_failure_status(
     else:
         text += "its equations are still not solved, so no step size helps: check that the functions are smooth and "
         text += "finite near that state"
-    return Status(StatusCode.STEP_UNDERFLOW, text, steps, now, residual)
+    return Status(StatusCode.STEP_UNDERFLOW, text, steps, t, residual)
 
 
-def blow_up_message(x: np.ndarray, x0: np.ndarray, speed: np.ndarray, elapsed: float, now: float) -> str:
-    """What is said of a state that grows without bound: that it does, its size and the time; nothing of others."""
-    size = np.abs(x).max()
-    if size > BLOW_UP_SIZE or (
-        size > MIN_GROWTH_TO_REPORT * np.abs(x0).max() and _doubles_within(x, speed, BLOW_UP_TIME_FRACTION * elapsed)
+def blow_up_message(x: np.ndarray, x0: np.ndarray, velocity: np.ndarray, time_elapsed: float, t: float) -> str:
+    """Return a message if the state grows without bound, with its norm and the time; otherwise ""."""
+    norm = np.abs(x).max()
+    if norm > BLOW_UP_SIZE or (
+        norm > MIN_GROWTH_TO_REPORT * np.abs(x0).max()
+        and _doubles_within(x, velocity, BLOW_UP_TIME_FRACTION * time_elapsed)
     ):
-        return f"the state grows without bound: |x| = {size:.3g} at t = {now:g}. {BLOW_UP_ADVICE}"
+        return f"the state grows without bound: |x| = {norm:.3g} at t = {t:g}. {BLOW_UP_ADVICE}"
     return ""
 
 
-def _doubles_within(x: np.ndarray, speed: np.ndarray, time: float) -> bool:
-    """Whether a state goes outwards so fast that it doubles in a time."""
-    size = np.abs(x).max()
+def _doubles_within(x: np.ndarray, velocity: np.ndarray, time: float) -> bool:
+    """Return True if a state moves outwards so fast that its norm doubles within a time."""
+    norm = np.abs(x).max()
     with np.errstate(all="ignore"):
-        return bool(np.abs(speed).max() * time > size > 0.0 and np.dot(x / size, speed) > 0.0)
+        return bool(np.abs(velocity).max() * time > norm > 0.0 and np.dot(x / norm, velocity) > 0.0)
 
 
-def _blow_up_by_shorter_steps(engine: EngineWithFallback, state, now: float, h: float) -> str:
-    """What is said of a state that a step of size h failed from, where shorter ones see it grow without bound."""
-    x, t, part = np.asarray(state.x), 0.0, h / 8.0
-    size, speed = np.abs(x).max(), vector_field_at(engine.system, x[None])[0]
-    if not _doubles_within(x, speed, BLOW_UP_HORIZON_STEPS * h):
+def _blow_up_by_shorter_steps(engine: EngineWithFallback, state, t: float, h: float) -> str:
+    """Retry a failed step of size h with shorter steps; return a message if they show unbounded growth, otherwise
+    ""."""
+    x, probe_time, probe_step_size = np.asarray(state.x), 0.0, h / 8.0
+    norm, velocity = np.abs(x).max(), vector_field_at(engine.system, x[None])[0]
+    if not _doubles_within(x, velocity, BLOW_UP_HORIZON_STEPS * h):
         return ""
-    while t < BLOW_UP_HORIZON_STEPS * h and part > h / 8.0**8 and now + part > now:
-        before = int(state.step)
+    while probe_time < BLOW_UP_HORIZON_STEPS * h and probe_step_size > h / 8.0**8 and t + probe_step_size > t:
+        previous_step = int(state.step)
         state = engine.advance(
-            state._replace(status=jnp.zeros_like(jnp.asarray(state.status))), part, 1, PROBE_STEPS_PER_CALL
+            state._replace(status=jnp.zeros_like(jnp.asarray(state.status))), probe_step_size, 1, PROBE_STEPS_PER_CALL
         )[0]
-        t += (int(state.step) - before) * part
+        probe_time += (int(state.step) - previous_step) * probe_step_size
         y = np.asarray(state.x)
-        later = np.abs(y).max()
-        if later > BLOW_UP_GROWTH_FACTOR * size:
-            rate = np.abs(vector_field_at(engine.system, y[None])).max() / later
-            if not rate > BLOW_UP_RATE_FACTOR * np.abs(speed).max() / size:  # as in leaving a state of rest, which ends
+        probe_norm = np.abs(y).max()
+        if probe_norm > BLOW_UP_GROWTH_FACTOR * norm:
+            rate = np.abs(vector_field_at(engine.system, y[None])).max() / probe_norm
+            if not rate > BLOW_UP_RATE_FACTOR * np.abs(velocity).max() / norm:  # the state leaves an equilibrium
                 return ""
-            text = (
-                f"the state grows without bound: |x| = {size:.3g} at t = {now:g}, and shorter steps find {later:.3g} "
-            )
-            return f"{text}before t = {now + BLOW_UP_HORIZON_STEPS * h:g}. {BLOW_UP_ADVICE}"
+            text = f"the state grows without bound: |x| = {norm:.3g} at t = {t:g}, and shorter steps find "
+            return f"{text}{probe_norm:.3g} before t = {t + BLOW_UP_HORIZON_STEPS * h:g}. {BLOW_UP_ADVICE}"
         if int(state.status) != StatusCode.COMPLETED:
-            part /= 8.0
+            probe_step_size /= 8.0
     return ""
 
 
 def ensemble_failure_message(
-    x: np.ndarray, x0: np.ndarray, speed: np.ndarray, elapsed: float, now: float, h: float
+    x: np.ndarray, x0: np.ndarray, velocity: np.ndarray, time_elapsed: float, t: float, h: float
 ) -> str:
-    """The same of a trajectory of an ensemble, from which no shorter steps are taken; h is NaN of adaptive ones."""
-    if text := blow_up_message(x, x0, speed, elapsed if np.isnan(h) else 0.0, now):
+    """Return a message if a failed trajectory of an ensemble grows without bound, otherwise "".
+
+    No shorter steps are tried. The step size h is NaN for adaptive steps.
+    """
+    if text := blow_up_message(x, x0, velocity, time_elapsed if np.isnan(h) else 0.0, t):
         return text
-    first, size = np.abs(x0).max(), np.abs(x).max()
-    if _doubles_within(x, speed, BLOW_UP_HORIZON_STEPS * h) and size > MIN_GROWTH_TO_REPORT * first:
-        text = f"|x| has grown from {first:.3g} to {size:.3g} at t = {now:g}, and doubles in a few steps"
+    initial_norm, norm = np.abs(x0).max(), np.abs(x).max()
+    if _doubles_within(x, velocity, BLOW_UP_HORIZON_STEPS * h) and norm > MIN_GROWTH_TO_REPORT * initial_norm:
+        text = f"|x| has grown from {initial_norm:.3g} to {norm:.3g} at t = {t:g}, and doubles in a few steps"
         return f"{text}: if it grows without bound, no step helps; otherwise try a smaller one"
     return ""
 
 
 INTERRUPTING_ERRORS = (KeyboardInterrupt, MemoryError, jax.errors.JaxRuntimeError)
-"""What stops a run without a fault of the system: what there is so far is kept."""
+"""Errors that stop a run without a fault of the system; the states so far are returned."""
 
 
 def interruption_reason(error: BaseException) -> str:
-    """What stopped a run, in words; raised again where it is something else."""
+    """Return in words why a run was interrupted; raise the error again if it is no interruption."""
     if isinstance(error, KeyboardInterrupt):
         return "by the user"
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
@@ -163,72 +176,73 @@ def interruption_reason(error: BaseException) -> str:
     raise error
 
 
-def final_status(engine: EngineWithFallback, state, now: float, h: float, stopped: str) -> Status:
-    """How fixed steps of size h ended, or a step that could not be taken."""
+def final_status(engine: EngineWithFallback, state, t: float, h: float, interruption: str) -> Status:
+    """Return the status of a run with steps of size h, from its last engine state."""
     code, step, residual = int(state.status), int(state.step), float(state.residual)
-    if stopped:
-        return Status(StatusCode.INTERRUPTED, f"stopped {stopped} after step {step}, t = {now:g}", step, now)
+    if interruption:
+        return Status(StatusCode.INTERRUPTED, f"stopped {interruption} after step {step}, t = {t:g}", step, t)
     if code == StatusCode.COMPLETED:
-        return Status(StatusCode.COMPLETED, f"reached t = {now:g} in {step} steps", step, now, residual)
-    where = f"step {step + 1}, from t = {now:g} with h = {h:g}"
+        return Status(StatusCode.COMPLETED, f"reached t = {t:g} in {step} steps", step, t, residual)
+    step_text = f"step {step + 1}, from t = {t:g} with h = {h:g}"
     x = np.asarray(state.x)
-    if text := blow_up_message(x, x, np.zeros_like(x), 0.0, now) or _blow_up_by_shorter_steps(engine, state, now, h):
-        return Status(StatusCode(code), f"{where}, could not be taken: {text}", step, now, residual)
+    if text := blow_up_message(x, x, np.zeros_like(x), 0.0, t) or _blow_up_by_shorter_steps(engine, state, t, h):
+        return Status(StatusCode(code), f"{step_text}, could not be taken: {text}", step, t, residual)
     if code == StatusCode.NOT_CONVERGED and engine.method.explicit:
         message = (
-            f"the corrections of {where} did not reach the levels that the laws ask for: they miss them by "
-            f"{residual:.2g} relative to the state (wanted: rounding, below {DEFAULT_OPTIONS.projection_rtol:.0e} of the step). "
-            + _step_size_advice(engine, state, h)
+            f"the corrections of {step_text} did not reach the levels that the laws ask for: they miss them by "
+            f"{residual:.2g} relative to the state (wanted: rounding, below {DEFAULT_OPTIONS.projection_rtol:.0e} of "
+            "the step). " + _step_size_advice(engine, state, h)
         )
-        return Status(StatusCode.NOT_CONVERGED, message, step, now, residual)
+        return Status(StatusCode.NOT_CONVERGED, message, step, t, residual)
     if code == StatusCode.NOT_CONVERGED:
         message = (
-            f"the equations of {where} were not solved: the iteration stopped at a residual of {residual:.2g} "
+            f"the equations of {step_text} were not solved: the iteration stopped at a residual of {residual:.2g} "
             f"relative to the state (wanted: rounding, below {DEFAULT_OPTIONS.plateau_rtol:.0e}). "
             + _step_size_advice(engine, state, h)
         )
-        return Status(StatusCode.NOT_CONVERGED, message, step, now, residual)
+        return Status(StatusCode.NOT_CONVERGED, message, step, t, residual)
     if engine.system.surface is not None and (reason := engine.system.outside(_predicted_state(engine, state, h))):
-        text = f"{where}, could not be taken: {reason}. Try a smaller step, where the motion itself stays inside"
-        return Status(StatusCode.NON_FINITE, text, step, now, residual)
+        text = f"{step_text}, could not be taken: {reason}. Try a smaller step, where the motion itself stays inside"
+        return Status(StatusCode.NON_FINITE, text, step, t, residual)
     message = (
-        f"NaN or infinity in {where}: the energy, the entropy or the vector field is not finite there "
+        f"NaN or infinity in {step_text}: the energy, the entropy or the vector field is not finite there "
         f"({_why_non_finite(engine, state, h)}). Check the domain of your functions along the trajectory, or try "
         "a smaller step"
     )
-    return Status(StatusCode.NON_FINITE, message, step, now, residual)
+    return Status(StatusCode.NON_FINITE, message, step, t, residual)
 
 
 def _step_size_advice(engine: EngineWithFallback, state, h: float) -> str:
-    """What helps where a step of size h could not be solved: shorter ones are tried."""
+    """Try fractions of a failed step of size h; return the advice that follows."""
     state = state._replace(status=jnp.zeros_like(jnp.asarray(state.status)))
-    for part in RETRY_DIVISORS:
-        if int(engine.step(state, h / part).status) == StatusCode.COMPLETED:
+    for divisor in RETRY_DIVISORS:
+        if int(engine.step(state, h / divisor).status) == StatusCode.COMPLETED:
             stiff = (
                 "; if that is far below what the motion needs, it is stiff or not smooth, and lt.MetriplecticGauss "
                 "takes long steps"
             )
-            return f"Try a smaller step, for example {h / part:g}{stiff if engine.method.explicit else ''}"
+            return f"Try a smaller step, for example {h / divisor:g}{stiff if engine.method.explicit else ''}"
     return (
-        f"Steps down to {h / RETRY_DIVISORS[-1]:g} were tried and do not help: the functions may not be smooth there, or "
-        "lose more digits than the iteration expects, as differences of large terms do"
+        f"Steps down to {h / RETRY_DIVISORS[-1]:g} were tried and do not help: the functions may not be smooth there, "
+        "or lose more digits than the iteration expects, as differences of large terms do"
     )
 
 
 def _predicted_state(engine: EngineWithFallback, state, h: float) -> jax.Array:
     """Return the state, shape (n,), to which a step of size h along the last slope leads.
 
-    The method applies the displacement: slopes need not have the shape of a state, as those of a body with an attitude.
+    The method applies the displacement, because slopes may differ in shape from states, as those of a body with an
+    attitude.
     """
     displacement = h * jnp.nan_to_num(jnp.asarray(state.k[0]))
     return engine.method.displace(engine.system, jnp.asarray(state.x), displacement)
 
 
 def _why_non_finite(engine: EngineWithFallback, state, h: float) -> str:
-    """Which function is not finite just ahead of the last good state."""
+    """Return in words which function is not finite at the predicted end of the failed step."""
     system = engine.system
-    ahead = _predicted_state(engine, state, h)
-    if reason := system.outside(ahead):
+    predicted_state = _predicted_state(engine, state, h)
+    if reason := system.outside(predicted_state):
         return reason
     if reason := engine.method.why_step_failed(system, state.x, state.k, h):
         return reason
@@ -236,7 +250,7 @@ def _why_non_finite(engine: EngineWithFallback, state, h: float) -> str:
     if system.entropy is not None:
         suspects |= {"entropy": system.entropy.value, "gradient of the entropy": system.entropy.gradient}
     for name, function in suspects.items():
-        if not bool(jnp.isfinite(jnp.asarray(function(ahead))).all()):
-            near = np.array2string(np.asarray(system.user_state(ahead)), precision=4, threshold=8)
-            return f"the {name} first, near x = {near}"
+        if not bool(jnp.isfinite(jnp.asarray(function(predicted_state))).all()):
+            state_text = np.array2string(np.asarray(system.user_state(predicted_state)), precision=4, threshold=8)
+            return f"the {name} first, near x = {state_text}"
     return f"the iteration overflowed{system.domain and f', or did not find {system.domain}'}"

@@ -1,4 +1,4 @@
-"""Many trajectories at once: initial states and parameters broadcast, one status for each."""
+"""``ensemble``: many trajectories at once, with broadcast initial states and parameters and a status for each."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ from .timetable import StepSchedule, make_schedule
 __all__ = ["MAX_THREADS", "Ensemble", "ensemble"]
 
 DOMAIN_CHECK_BATCH_SIZE = 8192
-"""States that are looked at together, at most: bounded memory."""
+"""Largest number of initial states that are checked together, which bounds memory."""
 
 MAX_REPLAYED_STEPS = 256
-"""Steps that an audit takes again of a trajectory by the array engine, whose steps are slow."""
+"""Largest number of steps of a trajectory that an audit replays on the array engine, whose steps are slow."""
 
 
 @with_library_settings
@@ -123,71 +123,77 @@ def ensemble(
     >>> many.energy.shape, bool(many.ok.all())
     ((100,), True)
     """
-    started = time.perf_counter()
+    start_time = time.perf_counter()
     method = (DEFAULT_METHOD if noise is None else DEFAULT_NOISE_METHOD) if method is None else method
     if not isinstance(method, OneStepMethod):
-        raise InputError(f"the method must be an integrator such as lt.MetriplecticGauss(), not {method!r}")
+        raise InputError(f"method must be an integrator such as lt.MetriplecticGauss(), got {method!r}")
     outputs = outputs or ("final" if save_at is None else "trajectory")
     check_choice("outputs", outputs, ("final", "trajectory", "summary"))
     check_choice("engine", engine, ("auto", "array", "compiled"))
     if save_at is not None and outputs != "trajectory":
-        raise InputError(f'save_at is for outputs="trajectory", not {outputs!r}')
-    own_ends = isinstance(step, Adaptive) or until is not None
-    if own_ends and outputs == "trajectory" and save_at is None:
+        raise InputError(f'save_at needs outputs="trajectory", got {outputs!r}')
+    has_step_control = isinstance(step, Adaptive) or until is not None
+    if has_step_control and outputs == "trajectory" and save_at is None:
+        raise InputError('outputs="trajectory" with adaptive steps or events needs save_at, common times to save')
+    if has_step_control and noise is not None:
         raise InputError(
-            "trajectories with adaptive steps or events are kept at times that all have in common: give save_at"
+            "noise= needs fixed steps and cannot be combined with Adaptive or until. Give the step as a number"
         )
-    if own_ends and noise is not None:
-        raise InputError("steps with noise are of one size, and nothing is known of a path between them: give a step")
-    course = make_schedule(t_span, step, save_every if outputs == "trajectory" and save_at is None else None, save_at)
+    schedule = make_schedule(t_span, step, save_every if outputs == "trajectory" and save_at is None else None, save_at)
 
     family = Family.from_arguments(system, parameters)
     states, reasons = _checked_initial_states(family, x0s, len(attitude) if np.ndim(attitude) == 3 else 1)
     check_noise(noise, len(states))
-    size = len(states)
-    run = np.arange(size)
+    n_trajectories = len(states)
+    started_numbers = np.arange(n_trajectories)
     if reasons:
-        run = np.setdiff1d(run, list(reasons))
-        family, states = family.select(run), states[run]
-    plan = _EnsembleOptions(method, step, course, outputs, engine, until, noise)
-    described = run_provenance(
+        started_numbers = np.setdiff1d(started_numbers, list(reasons))
+        family, states = family.select(started_numbers), states[started_numbers]
+    options = _EnsembleOptions(method, step, schedule, outputs, engine, until, noise)
+    provenance = run_provenance(
         family.representative,
         method,
-        step if isinstance(step, Adaptive) else course.h,
-        (course.start, course.end),
-        course.save_every,
+        step if isinstance(step, Adaptive) else schedule.h,
+        (schedule.start, schedule.end),
+        schedule.save_every,
     )
     inertia = common_inertia(family)
-    described["inertia"] = None if inertia is None else inertia.tolist()
-    groups, refused = group_members(family, method, states)
-    reasons = dict(reasons) | {int(run[i]): text for i, text in refused.items()}
-    parts: list[Subset] = []
-    with Progress((0, len(run)), progress, "{:.0f} trajectories") as bar:
-        for places, group in groups:
-            own = np.asarray(attitude)[run[places]] if np.ndim(attitude) == 3 and len(attitude) > 1 else attitude
-            done = sum(len(part.trajectory_numbers) for part in parts)
-            stopped = any((part.ensemble.status == StatusCode.INTERRUPTED).any() for part in parts)
-            tell = functools.partial(_update_progress, bar, done)
-            part, why = plan.run_group(group, states[places], run[places], own, tell, stopped)
-            parts += [] if part is None else [part]
-            reasons |= why
-    if not parts:
+    provenance["inertia"] = None if inertia is None else inertia.tolist()
+    groups, refusal_reasons = group_members(family, method, states)
+    reasons = dict(reasons) | {int(started_numbers[i]): text for i, text in refusal_reasons.items()}
+    subsets: list[Subset] = []
+    with Progress((0, len(started_numbers)), progress, "{:.0f} trajectories") as bar:
+        for member_indices, group in groups:
+            group_attitude = (
+                np.asarray(attitude)[started_numbers[member_indices]]
+                if np.ndim(attitude) == 3 and len(attitude) > 1
+                else attitude
+            )
+            n_done = sum(len(part.trajectory_numbers) for part in subsets)
+            is_interrupted = any((part.ensemble.status == StatusCode.INTERRUPTED).any() for part in subsets)
+            report = functools.partial(_update_progress, bar, n_done)
+            subset, group_reasons = options.run_group(
+                group, states[member_indices], started_numbers[member_indices], group_attitude, report, is_interrupted
+            )
+            subsets += [] if subset is None else [subset]
+            reasons |= group_reasons
+    if not subsets:
         raise InputError(f"no trajectory can be started; trajectory {min(reasons)}: {reasons[min(reasons)]}")
     return join_subsets(
-        parts,
-        size,
+        subsets,
+        n_trajectories,
         reasons=reasons,
-        wall_time=time.perf_counter() - started,
-        provenance={**described, "noise": None if noise is None else noise.as_provenance()},
+        wall_time=time.perf_counter() - start_time,
+        provenance={**provenance, "noise": None if noise is None else noise.to_provenance()},
     )
 
 
-def _update_progress(bar: Progress, done: int, more: float) -> None:
-    bar.update(done + more)
+def _update_progress(bar: Progress, n_done: int, n_more: float) -> None:
+    bar.update(n_done + n_more)
 
 
 class _EnsembleOptions(NamedTuple):
-    """What is done with each trajectory: the arguments of :func:`ensemble`."""
+    """Options of :func:`ensemble` that all groups of trajectories share."""
 
     method: OneStepMethod
     step: float | Adaptive
@@ -201,157 +207,173 @@ class _EnsembleOptions(NamedTuple):
         self,
         family: Family,
         states: np.ndarray,
-        run: np.ndarray,
+        trajectory_numbers: np.ndarray,
         attitude,
-        tell: Callable[[float], None],
-        stopped: bool,
+        report: Callable[[float], None],
+        is_interrupted: bool,
     ) -> tuple[Subset | None, dict[int, str]]:
-        """Run the members of a group from their initial states; None if none can be started.
+        """Run a group of trajectories; return their results, or None if none can start, and the reasons of failures.
 
-        The second result says why trajectories could not be started, or have failed, by their numbers.
+        The reasons belong to trajectories that could not start or have failed, by their numbers.
 
         Parameters
         ----------
         states : array, shape (B, n)
-        run : array of int, shape (B,)
+            Initial states.
+        trajectory_numbers : array of int, shape (B,)
             The numbers of the trajectories in the ensemble.
         attitude : array, shape (m, m) or (B, m, m), or None
-        tell : function
-            Called with the number of trajectories that are done.
-        stopped : bool
-            Whether the user has interrupted the ensemble before: no step is taken then.
+        report : function
+            Called with the number of finished trajectories.
+        is_interrupted : bool
+            True after the user has interrupted the ensemble; then no step is taken.
         """
-        step, course, noise = self.step, self.schedule, self.noise
+        step, schedule, noise = self.step, self.schedule, self.noise
         member = resolve_invariants(family.member(0), states)
         tolerance = step.tolerance if isinstance(step, Adaptive) else None
         member, method = prepare_run(member, self.method, noise, tolerance)
         family = wrap_family(family, member)
-        states = np.asarray(initial_state(member, states, course.start, attitude, batch=True))
+        states = np.asarray(initial_state(member, states, schedule.start, attitude, batch=True))
         method.check(member)
-        span = course.start, course.end
+        span = schedule.start, schedule.end
         family, member = limit_family_to_span(family, member, *span), limit_to_span(member, *span)
-        reasons = {int(run[i]): text for i, text in _unstartable_members(family, member, method, states).items()}
+        reasons = {
+            int(trajectory_numbers[i]): text for i, text in _unstartable_members(family, member, method, states).items()
+        }
         if reasons:
-            left = np.flatnonzero(~np.isin(run, list(reasons)))
-            run, family, states = run[left], family.select(left), states[left]
-            if not len(run):
+            startable = np.flatnonzero(~np.isin(trajectory_numbers, list(reasons)))
+            trajectory_numbers, family, states = (
+                trajectory_numbers[startable],
+                family.select(startable),
+                states[startable],
+            )
+            if not len(trajectory_numbers):
                 return None, reasons
-        paths = (
+        noise_paths = (
             None
             if noise is None or not noise_dimension(method)
-            else NoisePaths(noise, noise_dimension(method), run, course)
+            else NoisePaths(noise, noise_dimension(method), trajectory_numbers, schedule)
         )
         record = EnsembleRecord(
-            family, member, states, course, self.outputs, np.nan if tolerance is not None else course.h
+            family, member, states, schedule, self.outputs, np.nan if tolerance is not None else schedule.h
         )
         event = None if self.until is None else Event(self.until, member)
-        own_ends = tolerance is not None or event is not None
-        pacing = make_step_control(step, method, course.end - course.start, event) if own_ends else None
+        has_step_control = tolerance is not None or event is not None
+        control = make_step_control(step, method, schedule.end - schedule.start, event) if has_step_control else None
 
-        def run_with_engine(engine: str, tally: ProgressCounter) -> None:
-            if stopped:
+        def run_with_engine(engine: str, progress_counter: ProgressCounter) -> None:
+            if is_interrupted:
                 return
-            if pacing is not None:
-                many = AdaptiveEnsembleRun(family, method, pacing, record, tally)
-                (many.run_compiled if engine == "compiled" else many.run_array)()
+            if control is not None:
+                adaptive_run = AdaptiveEnsembleRun(family, method, control, record, progress_counter)
+                (adaptive_run.run_compiled if engine == "compiled" else adaptive_run.run_array)()
             else:
-                (run_fixed_compiled if engine == "compiled" else run_fixed_array)(family, method, record, tally, paths)
+                (run_fixed_compiled if engine == "compiled" else run_fixed_array)(
+                    family, method, record, progress_counter, noise_paths
+                )
 
-        small = self.engine == "auto" and is_worth_compiling(member)
-        chosen = "compiled" if self.engine == "compiled" or small else "array"
-        if chosen == "compiled":
+        prefers_compiled = self.engine == "auto" and is_worth_compiling(member)
+        engine_name = "compiled" if self.engine == "compiled" or prefers_compiled else "array"
+        if engine_name == "compiled":
             try:
-                run_with_engine(chosen, ProgressCounter(tell))
+                run_with_engine(engine_name, ProgressCounter(report))
             except UnsupportedPrimitive as error:
                 if self.engine == "compiled":
                     raise
                 warn_of_fallback(error)
-                chosen = "array"
-        if chosen == "array":
-            run_with_engine(chosen, ProgressCounter(tell))
+                engine_name = "array"
+        if engine_name == "array":
+            run_with_engine(engine_name, ProgressCounter(report))
         record.set_unfinished_to_nan()
-        again, most = (replay_compiled, course.n_steps) if chosen == "compiled" else (replay_array, MAX_REPLAYED_STEPS)
-        equal = 1 if tolerance is not None else min(course.segments[0].n_full_steps, most)
-        found = record.to_ensemble(
+        replay, max_replayed_steps = (
+            (replay_compiled, schedule.n_steps) if engine_name == "compiled" else (replay_array, MAX_REPLAYED_STEPS)
+        )
+        n_equal_steps = 1 if tolerance is not None else min(schedule.segments[0].n_full_steps, max_replayed_steps)
+        result = record.to_ensemble(
             reasons={},
             laws=promised_laws(member, method, {}),
-            engine=chosen,
+            engine=engine_name,
             wall_time=0.0,
             evidence_source=None
             if noise_dimension(method)
-            else EnsembleEvidenceCollector(record, method, again, equal),
-            solution_builder=MemberSolutionBuilder(record, method, run),
+            else EnsembleEvidenceCollector(record, method, replay, n_equal_steps),
+            solution_builder=MemberSolutionBuilder(record, method, trajectory_numbers),
         )
-        return Subset(run, found), reasons | {int(run[j]): text for j, text in record.failure_reasons.items()}
+        return Subset(trajectory_numbers, result), reasons | {
+            int(trajectory_numbers[j]): text for j, text in record.failure_reasons.items()
+        }
 
 
-def _checked_initial_states(family: Family, x0s, attitudes: int) -> tuple[np.ndarray, Mapping[int, str]]:
-    """An initial state for each trajectory, and which of them cannot be started, and why.
+def _checked_initial_states(family: Family, x0s, n_attitudes: int) -> tuple[np.ndarray, Mapping[int, str]]:
+    """Return the initial states of all trajectories, shape (B, n), and the reasons why some cannot start.
 
     Raises
     ------
     InputError
-        If none can.
+        If no trajectory can start.
     """
     member = family.example
     if member is None:
         member = family.member(next(i for i in range(family.size) if i not in family.refusal_reasons))
-    x0s, bad = _convert_initial_states(member, x0s)
+    x0s, x0_reasons = _convert_initial_states(member, x0s)
     if x0s.ndim > 2:
-        raise InputError(f"initial states have shape (n,) or (trajectories, n), not {x0s.shape}")
-    size = broadcast_size(len(x0s), family.size, attitudes)
-    states = np.broadcast_to(x0s, (size, x0s.shape[1]))
-    if bad and len(x0s) == 1:
-        raise InputError(bad[0])
-    reasons = dict(family.refusal_reasons) | bad
+        raise InputError(f"initial states must have shape (n,) or (trajectories, n), got {x0s.shape}")
+    n_trajectories = broadcast_size(len(x0s), family.size, n_attitudes)
+    states = np.broadcast_to(x0s, (n_trajectories, x0s.shape[1]))
+    if x0_reasons and len(x0s) == 1:
+        raise InputError(x0_reasons[0])
+    reasons = dict(family.refusal_reasons) | x0_reasons
     if family.size > 1 and family.example is None:
         reasons = family.rejected_members(lambda i: family.axiom_violation(i, states[i]), reasons)
-    if len(reasons) == size:
+    if len(reasons) == n_trajectories:
         raise InputError(f"no trajectory can be started; trajectory 0: {reasons[0]}")
     return states, reasons
 
 
 def _unstartable_members(family: Family, member: System, method: OneStepMethod, states: np.ndarray) -> dict[int, str]:
-    """The trajectories, as they are run, whose first states the method cannot start at, and why."""
-    reasons = _bisect_invalid_rows(lambda part: why_not_startable(member, method, states[part]), len(states))
+    """Return the prepared trajectories that the method cannot start at their initial states, with the reasons."""
+    reasons = _bisect_invalid_rows(lambda rows: why_not_startable(member, method, states[rows]), len(states))
     if not any(family.has_member_axis):
         return reasons
     suspects = {*reasons, *family.extreme_members(), *members_outside_domain(family, states)}
-    own = {i: why_not_startable(family.member(i), method, states[i]) for i in sorted(suspects)}
-    return {i: text for i, text in own.items() if text}
+    member_reasons = {i: why_not_startable(family.member(i), method, states[i]) for i in sorted(suspects)}
+    return {i: text for i, text in member_reasons.items() if text}
 
 
-def _bisect_invalid_rows(complaint: Callable[[slice], str], size: int) -> dict[int, str]:
-    """Which of so many rows there is a complaint of, and which one: halves, as far as there is something to find."""
-    found: dict[int, str] = {}
+def _bisect_invalid_rows(why_invalid: Callable[[slice], str], n_rows: int) -> dict[int, str]:
+    """Return the rows for which ``why_invalid`` gives a reason, located by bisection of slices."""
+    reasons: dict[int, str] = {}
 
-    def search_rows(first: int, last: int) -> None:
-        text = complaint(slice(first, last))
-        if text and last - first == 1:
-            found[first] = text
+    def search_rows(start: int, stop: int) -> None:
+        text = why_invalid(slice(start, stop))
+        if text and stop - start == 1:
+            reasons[start] = text
         elif text:
-            search_rows(first, (first + last) // 2)
-            search_rows((first + last) // 2, last)
+            search_rows(start, (start + stop) // 2)
+            search_rows((start + stop) // 2, stop)
 
-    for first in range(0, size, DOMAIN_CHECK_BATCH_SIZE):
-        search_rows(first, min(first + DOMAIN_CHECK_BATCH_SIZE, size))
-    return found
+    for batch_start in range(0, n_rows, DOMAIN_CHECK_BATCH_SIZE):
+        search_rows(batch_start, min(batch_start + DOMAIN_CHECK_BATCH_SIZE, n_rows))
+    return reasons
 
 
 def _convert_initial_states(member: System, x0s) -> tuple[np.ndarray, dict[int, str]]:
-    """Initial states, shape (trajectories, n), and those among them that are none, and why."""
+    """Return initial states, shape (trajectories, n), and the invalid rows of x0s with the reasons.
+
+    An invalid row is replaced by a valid one.
+    """
     try:
         return np.atleast_2d(np.asarray(member.state_array(x0s, batch=True))), {}
     except (InputError, ValueError):
         rows = np.asarray(x0s)
         if rows.ndim < 2 or rows.dtype.kind not in "fiubc" or not len(rows):
             raise
-    bad = _bisect_invalid_rows(
-        lambda part: error_message_of(lambda: member.state_array(rows[part], batch=True)), len(rows)
+    reasons = _bisect_invalid_rows(
+        lambda batch: error_message_of(lambda: member.state_array(rows[batch], batch=True)), len(rows)
     )
-    good = [i for i in range(len(rows)) if i not in bad]
-    if not good:
-        raise InputError(f"no trajectory can be started; trajectory 0: {bad[0]}")
-    filled = rows.copy()
-    filled[list(bad)] = rows[good[0]]
-    return np.asarray(member.state_array(filled, batch=True)), bad
+    valid_rows = [i for i in range(len(rows)) if i not in reasons]
+    if not valid_rows:
+        raise InputError(f"no trajectory can be started; trajectory 0: {reasons[0]}")
+    valid_x0s = rows.copy()
+    valid_x0s[list(reasons)] = rows[valid_rows[0]]
+    return np.asarray(member.state_array(valid_x0s, batch=True)), reasons

@@ -1,4 +1,4 @@
-"""Where a run ends before its time: events, and the relaxation of the state."""
+"""Events that end a run: zeros of a user's function, and the relaxation of the state."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ class Relaxed:
 
     def __post_init__(self):
         if not (math.isfinite(self.tol) and self.tol > 0.0):
-            raise InputError(f"the rate to stop at must be positive and finite, not {self.tol!r}")
+            raise InputError(f"tol must be positive and finite, got {self.tol!r}")
 
 
 class Event:
-    """A function of the state whose sign is watched.
+    """An event function of system and state, whose sign changes the engines detect.
 
     Parameters
     ----------
@@ -59,41 +59,41 @@ class Event:
     Attributes
     ----------
     function : pytree
-        Of a system and a state, for engines.
+        Function of a system and a state, for engines.
     falling_only : bool
-        Whether it is watched for a fall alone.
+        True if only a fall through zero is an event.
     """
 
     def __init__(self, until: Relaxed | Callable, system: System):
         self.falling_only = isinstance(until, Relaxed)
         self.name = "the event function"
         if isinstance(until, Relaxed):
-            if system.entropy_law == "nondecreasing":  # what vanishes as a system relaxes, by its laws
+            if system.entropy_law == "nondecreasing":  # the laws say which rate vanishes as the system relaxes
                 rate, name = "entropy_production", "entropy production"
             elif system.energy_law == "nonincreasing":
                 rate, name = "energy_fall", "fall of the energy"
             else:
                 raise InputError(
-                    "Relaxed(tol) watches the entropy production or the fall of the energy, and this system produces "
-                    "no entropy and keeps its energy, or promises nothing: give a function of the state as until"
+                    "Relaxed(tol) needs a system that produces entropy or loses energy, and this system promises "
+                    "neither. Give a function of the state as until"
                 )
             self.name = f"{name} below {until.tol:g}"
             self.function: Any = RateAboveThreshold(jnp.asarray(until.tol), rate)
         elif callable(until):
-            seen = jax.eval_shape(system.user_state, jax.ShapeDtypeStruct((system.dim,), jnp.float64))
+            user_state = jax.eval_shape(system.user_state, jax.ShapeDtypeStruct((system.dim,), jnp.float64))
             try:
-                self.function = UserStateFunction(trace_callables(until, lambda f, x: f(x), seen.shape))
+                self.function = UserStateFunction(trace_callables(until, lambda f, x: f(x), user_state.shape))
             except IndexOutOfRangeError as error:
-                raise error.with_function(f"the event function, at a state of shape {seen.shape},") from None
+                raise error.with_function(f"the event function, at a state of shape {user_state.shape},") from None
             except TRACE_ERRORS as error:
-                what = f"the event function could not be evaluated on a state of shape {seen.shape}"
-                raise FunctionError(explain_trace_error(what, error)) from error
+                description = f"the event function could not be evaluated on a state of shape {user_state.shape}"
+                raise FunctionError(explain_trace_error(description, error)) from error
         else:
-            raise InputError(f"until must be lt.Relaxed(tol) or a function of the state, not {until!r}")
+            raise InputError(f"until must be lt.Relaxed(tol) or a function of the state, got {until!r}")
         x = jax.ShapeDtypeStruct((system.dim,), jnp.float64)
-        found = jax.eval_shape(lambda x: self.function(system, x), x)
-        if getattr(found, "shape", None) != ():
-            shape = getattr(found, "shape", type(found).__name__)
+        output = jax.eval_shape(lambda x: self.function(system, x), x)
+        if getattr(output, "shape", None) != ():
+            shape = getattr(output, "shape", type(output).__name__)
             raise FunctionError(
                 f"the event function must return one number, got shape {shape}. For several events, return the "
                 "smallest one, jnp.min, or the product"
@@ -101,7 +101,7 @@ class Event:
 
 
 class RateAboveThreshold(Module):
-    """A rate of a system above one."""
+    """A rate of a system minus a threshold."""
 
     threshold: jax.Array
     rate_name: str = eqx.field(static=True)
@@ -111,7 +111,7 @@ class RateAboveThreshold(Module):
 
 
 class UserStateFunction(Module):
-    """A function of what the user sees of a state."""
+    """A user's event function, applied to the state in the user's form."""
 
     function: Callable
 

@@ -1,4 +1,4 @@
-"""Families of systems: one form, and parameters that differ from trajectory to trajectory."""
+"""Families of systems: one program structure, with parameters that differ between trajectories."""
 
 from __future__ import annotations
 
@@ -20,34 +20,34 @@ from ..tracing.caching import fingerprint
 from ..tracing.traced import TracedFunction, trace_function
 
 MAX_CHECKED_MEMBERS = 8
-"""Members of a family that are built, and so checked, one by one."""
+"""Largest number of members that are built and checked one by one at a time."""
 
 MAX_FAILED_MEMBERS = 32
-"""Members that are tried before it is said that none can be run."""
+"""Number of members to try before concluding that none can be run."""
 
 
 @dataclass(frozen=True)
 class Family:
-    """Systems that differ in some of their parameters.
+    """A family of systems that differ in some of their parameters.
 
     Attributes
     ----------
-    form : Form
+    form : ProgramStructure
         Builds a member from its parameters, a list of arrays.
     parameter_arrays : list of ndarray
-        The parameters of all members, members first; one member where all have the same.
+        The parameters of all members along the first axis, which has length 1 if all members share them.
     common_system : System, optional
-        The one system that all members are: what has been found for it once need not be found again.
+        The system, if all members are equal; its cached properties are used again.
     example : System, optional
-        The member that is shown for all, such as in what is said of where results come from, for whoever has checked
-        the members. Nothing of a run is decided by it: see :mod:`liethermo.runs.member_groups`.
+        The member that is reported for all, such as in the provenance. A caller that gives it has checked the members.
+        It decides nothing about a run: see :mod:`liethermo.runs.member_groups`.
     n_builder_arrays : int
-        How many of the values, the first ones, are what a function that builds systems is given.
+        Number of leading parameter arrays that are arguments of the function that builds systems.
     refusal_reasons : dict from int to str
-        Members that cannot be built, and why.
+        Members that cannot be built, with the reasons.
     has_member_axis : tuple of bool
-        Which of the values differ between members, so that they have one row for each. By default those that have more
-        than one row; a selection of one member keeps what it was selected from, and is run by the same program.
+        For each parameter array, whether it has one row for each member. By default True for arrays with more than one
+        row. A selection of one member keeps these flags, so the same program runs it.
     """
 
     form: ProgramStructure
@@ -60,27 +60,27 @@ class Family:
 
     def __post_init__(self):
         if len(self.has_member_axis) != len(self.parameter_arrays):
-            known = (
+            axis_flags = (
                 *self.has_member_axis,
                 *(len(value) > 1 for value in self.parameter_arrays[len(self.has_member_axis) :]),
             )
-            object.__setattr__(self, "has_member_axis", known[: len(self.parameter_arrays)])
+            object.__setattr__(self, "has_member_axis", axis_flags[: len(self.parameter_arrays)])
 
     @classmethod
     def from_arguments(cls, system, parameters) -> Family:
-        """From what :func:`liethermo.ensemble` is given."""
+        """Return the family for the arguments ``system`` and ``parameters`` of :func:`liethermo.ensemble`."""
         if isinstance(system, Family):
             return system
         if isinstance(system, System):
             return cls._from_named_parameters(system, parameters)
         if not callable(system):
-            raise InputError(f"the first argument is a system, or a function that builds one, not {system!r}")
+            raise InputError(f"the first argument must be a system or a function that builds one, got {system!r}")
         if parameters is None:
             raise InputError("a function that builds systems needs parameters=..., one set for each trajectory")
         family = cls.from_function(system, parameters)
-        # the constructors of systems check what they are given; a program that is traced does not
-        refused = family.rejected_members(lambda i: error_message_of(lambda: family.member(i)))
-        return replace(family.as_traced_program(), refusal_reasons=refused)
+        # constructors of systems check their arguments, but a traced program does not
+        refusal_reasons = family.rejected_members(lambda i: error_message_of(lambda: family.member(i)))
+        return replace(family.trace_builder(), refusal_reasons=refusal_reasons)
 
     @classmethod
     def _from_named_parameters(cls, system: System, parameters) -> Family:
@@ -90,8 +90,8 @@ class Family:
             )
         if not isinstance(parameters, Mapping):
             raise InputError(
-                "parameters of a system are a dict from names to arrays; "
-                "for another form give a function that builds the system in its place"
+                "parameters of a system must be a dict from names to arrays. "
+                "For parameters of another form, give a function that builds the system"
             )
         leaves = named_parameters(system)
         values = {name: leaf[None] for name, leaf in leaves.items()}
@@ -100,17 +100,17 @@ class Family:
                 raise InputError(f"the system has no parameter {name!r}; its parameters are {', '.join(leaves)}")
             values[name] = np.asarray(value, dtype=np.float64)
             if values[name].ndim == 0 or values[name].shape[1:] != leaves[name].shape:
-                wanted = ", ".join(["trajectories", *map(str, leaves[name].shape)])
-                raise InputError(f"the values of {name} have shape ({wanted}), not {values[name].shape}")
+                expected_shape = ", ".join(["trajectories", *map(str, leaves[name].shape)])
+                raise InputError(f"the values of {name} must have shape ({expected_shape}), got {values[name].shape}")
         return cls(ProgramStructure.from_module(system), list(values.values()), None if parameters else system)
 
     @classmethod
     def from_function(cls, build: Callable, parameters) -> Family:
-        """The members as the function builds them."""
-        found, structure = jax.tree_util.tree_flatten(parameters)
-        values = [np.asarray(value, dtype=np.float64) for value in found]
+        """Return the family whose members are built by a function, one from each set of parameters."""
+        leaves, structure = jax.tree_util.tree_flatten(parameters)
+        values = [np.asarray(value, dtype=np.float64) for value in leaves]
         if not values or any(value.ndim == 0 for value in values):
-            raise InputError("parameters are arrays with one entry, or row, for each trajectory")
+            raise InputError("parameters must be arrays with one entry, or row, for each trajectory")
 
         def rebuild(arrays):
             system = build(jax.tree_util.tree_unflatten(structure, arrays))
@@ -121,19 +121,20 @@ class Family:
         shapes = tuple(value.shape[1:] for value in values)
         return cls(ProgramStructure((build, structure), shapes, rebuild), values, n_builder_arrays=len(values))
 
-    def as_traced_program(self) -> Family:
-        """The same family, built by one program that is traced: its numbers are parameters that all members share.
+    def trace_builder(self) -> Family:
+        """Return the family with its builder traced into one program, whose constants become parameters that all
+        members share.
 
         Raises
         ------
         InputError
-            If the function that builds members has to see the values of its parameters.
+            If the builder needs the values of its parameters.
         """
-        rest = None
+        static_part = None
 
         def arrays_of(*arrays):
-            nonlocal rest
-            arrays, rest = eqx.partition(self.form.rebuild(list(arrays)), eqx.is_array)
+            nonlocal static_part
+            arrays, static_part = eqx.partition(self.form.rebuild(list(arrays)), eqx.is_array)
             return arrays
 
         try:
@@ -145,44 +146,49 @@ class Family:
                 "the function that builds systems must accept traced JAX arrays, as under jax.vmap; or give a system "
                 f"and parameters= by the names of its own: {str(error).splitlines()[0]}"
             ) from error
-        if fingerprint(rest) is None:
+        if fingerprint(static_part) is None:
             return self
-        given = self.n_builder_arrays
+        n_builder_arrays = self.n_builder_arrays
 
         def rebuild(arrays):
             return eqx.combine(
-                TracedFunction(tuple(arrays[given:]), program.program, program.label)(*arrays[:given]), rest
+                TracedFunction(tuple(arrays[n_builder_arrays:]), program.program, program.label)(
+                    *arrays[:n_builder_arrays]
+                ),
+                static_part,
             )
 
         values = [*self.parameter_arrays, *(np.asarray(number)[None] for number in program.numbers)]
         form = ProgramStructure(
-            (program.program, fingerprint(rest)), tuple(value.shape[1:] for value in values), rebuild
+            (program.program, fingerprint(static_part)), tuple(value.shape[1:] for value in values), rebuild
         )
         return replace(self, form=form, parameter_arrays=values)
 
-    def with_builder_arrays(self, given: list[np.ndarray]) -> Family:
-        """The family of the same form whose members are built from other values."""
+    def with_builder_arrays(self, builder_arrays: list[np.ndarray]) -> Family:
+        """Return the family with other arguments of its builder."""
         return replace(
-            self, parameter_arrays=[*given, *self.parameter_arrays[self.n_builder_arrays :]], has_member_axis=()
+            self,
+            parameter_arrays=[*builder_arrays, *self.parameter_arrays[self.n_builder_arrays :]],
+            has_member_axis=(),
         )
 
-    def map_members(self, change: Callable[..., System], *fixed: Hashable) -> Family:
-        """The family of what a function, one that has an identity, makes of the members, with these arguments."""
+    def map_members(self, change: Callable[..., System], *arguments: Hashable) -> Family:
+        """Return the family of the systems ``change(member, *arguments)``; the function ``change`` must be hashable."""
         form = self.form
-        key = form.key, change, fixed
-        changed = ProgramStructure(key, form.shapes, lambda arrays: change(form.rebuild(arrays), *fixed))
-        return Family(changed, self.parameter_arrays, has_member_axis=self.has_member_axis)
+        key = form.key, change, arguments
+        form_of_changed = ProgramStructure(key, form.shapes, lambda arrays: change(form.rebuild(arrays), *arguments))
+        return Family(form_of_changed, self.parameter_arrays, has_member_axis=self.has_member_axis)
 
-    def annotate_members(self, tell: Callable[..., System], *fixed: Hashable) -> Family:
-        """The same family, of whose members a function tells more."""
+    def annotate_members(self, annotate: Callable[..., System], *arguments: Hashable) -> Family:
+        """Return the family of the systems ``annotate(member, *arguments)``; a common system remains common."""
         if self.common_system is not None:
-            return Family.from_arguments(tell(self.common_system, *fixed), None)
-        return self.map_members(tell, *fixed)
+            return Family.from_arguments(annotate(self.common_system, *arguments), None)
+        return self.map_members(annotate, *arguments)
 
     def map_members_with_numbers(self, change: Callable[..., System], *numbers: float) -> Family:
-        """The family of what a function, one that has an identity, makes of the members with some numbers.
+        """Return the family of the systems ``change(member, *numbers)``; the function ``change`` must be hashable.
 
-        Families with other numbers have the same form.
+        The numbers become parameters, so families with other numbers share the compiled program.
         """
         form, count = self.form, len(numbers)
 
@@ -200,12 +206,12 @@ class Family:
 
     @property
     def size(self) -> int:
-        """How many members there are."""
-        return broadcast_size(*(len(value) for value, varies in self._arrays_with_axis_flags if varies))
+        """Number of members."""
+        return broadcast_size(*(len(value) for value, has_axis in self._arrays_with_axis_flags if has_axis))
 
     def member_arrays(self, i: int) -> list[jax.Array]:
-        """The parameters of one member."""
-        return [jnp.asarray(value[i if varies else 0]) for value, varies in self._arrays_with_axis_flags]
+        """Return the parameter arrays of member i."""
+        return [jnp.asarray(value[i if has_axis else 0]) for value, has_axis in self._arrays_with_axis_flags]
 
     @property
     def _arrays_with_axis_flags(self) -> list[tuple[np.ndarray, bool]]:
@@ -216,48 +222,55 @@ class Family:
 
     @property
     def representative(self) -> System:
-        """The member that is shown for all: an example where there is one, the first otherwise."""
+        """The member that is reported for all: the example if there is one, otherwise the first."""
         return self.member(0) if self.example is None else self.example
 
     def extreme_members(self) -> list[int]:
-        """The members with the smallest and the largest parameters: what is out of range shows there."""
-        found = {0: None}
+        """Return members with the smallest and largest parameters, which are the likeliest to be out of range."""
+        indices = {0: None}
         for value in self.parameter_arrays:
             rows = value.reshape(len(value), -1)
-            found |= dict.fromkeys(int(i) for i in (*rows.argmin(axis=0), *rows.argmax(axis=0)))
-        return list(found)[:MAX_CHECKED_MEMBERS]
+            indices |= dict.fromkeys(int(i) for i in (*rows.argmin(axis=0), *rows.argmax(axis=0)))
+        return list(indices)[:MAX_CHECKED_MEMBERS]
 
-    def rejected_members(self, reason: Callable[[int], str], known: Mapping[int, str] | None = None) -> dict[int, str]:
-        """Members that cannot be run, and why: those with extreme parameters are tried, and the next where one cannot.
+    def rejected_members(
+        self, reason: Callable[[int], str], known_reasons: Mapping[int, str] | None = None
+    ) -> dict[int, str]:
+        """Return the members that cannot be run, with the reasons.
+
+        Members with extreme parameters are tried; if some fail, the most extreme of the remaining ones are tried next.
 
         Parameters
         ----------
-        reason : function from the number of a member to why it cannot be run, or an empty text
-        known : dict, optional
-            Members that are known to be such.
+        reason : function from a member's number to a text
+            Returns why the member cannot be run, or "".
+        known_reasons : dict, optional
+            Members that are already rejected.
 
         Raises
         ------
         InputError
-            If none can, or none of the first :data:`HOPELESS` that are tried.
+            If all members are rejected, or the first :data:`MAX_FAILED_MEMBERS` that are tried.
         """
-        found = dict(known or {}) | self._members_with_nan()
-        left, tried = np.setdiff1d(np.arange(self.size), list(found)), dict[int, str]()
-        while left.size:
-            new = [i for i in map(int, left[self.select(left).extreme_members()]) if i not in tried]
-            tried |= {i: reason(i) for i in new}
-            wanting = {i: tried[i] for i in new if tried[i]}
-            found |= wanting
-            left = np.setdiff1d(left, list(wanting))
-            if not wanting or (len(tried) >= MAX_FAILED_MEMBERS and all(tried.values())):
+        reasons = dict(known_reasons or {}) | self._members_with_nan()
+        candidates, tried_reasons = np.setdiff1d(np.arange(self.size), list(reasons)), dict[int, str]()
+        while candidates.size:
+            new_members = [
+                i for i in map(int, candidates[self.select(candidates).extreme_members()]) if i not in tried_reasons
+            ]
+            tried_reasons |= {i: reason(i) for i in new_members}
+            failures = {i: tried_reasons[i] for i in new_members if tried_reasons[i]}
+            reasons |= failures
+            candidates = np.setdiff1d(candidates, list(failures))
+            if not failures or (len(tried_reasons) >= MAX_FAILED_MEMBERS and all(tried_reasons.values())):
                 break
-        if not left.size or (tried and all(tried.values())):
-            first = min(found)
-            raise InputError(f"no trajectory can be started; trajectory {first}: {found[first]}")
-        return found
+        if not candidates.size or (tried_reasons and all(tried_reasons.values())):
+            first_member = min(reasons)
+            raise InputError(f"no trajectory can be started; trajectory {first_member}: {reasons[first_member]}")
+        return reasons
 
     def axiom_violation(self, i: int, x: np.ndarray) -> str:
-        """What the axioms say of a member at a state; an empty text where they hold."""
+        """Return the report or error of the axiom check of member i at x, or "" if it passes."""
         report = None
 
         def check():
@@ -267,39 +280,41 @@ class Family:
         return error_message_of(check) or ("" if report is None or report.passed else str(report))
 
     def _members_with_nan(self) -> dict[int, str]:
-        """Members that have parameters that are NaN."""
-        bad = np.zeros(self.size, dtype=bool)
-        # what all share may be the NaN that a function is written with, such as a table beyond its ends
+        """Return the members that have NaN among their parameters, with a reason."""
+        is_nan = np.zeros(self.size, dtype=bool)
+        # a NaN that all members share may be a constant of a function, such as a table beyond its ends
         for value in self.parameter_arrays[: self.n_builder_arrays] or [
             value for value in self.parameter_arrays if len(value) > 1
         ]:
-            bad |= np.isnan(value.reshape(len(value), -1)).any(axis=1)
-        return {int(i): "one of its parameters is NaN" for i in np.flatnonzero(bad)}
+            is_nan |= np.isnan(value.reshape(len(value), -1)).any(axis=1)
+        return {int(i): "one of its parameters is NaN" for i in np.flatnonzero(is_nan)}
 
-    def select(self, chosen: np.ndarray) -> Family:
-        """The family of some members."""
-        values = [value[chosen] if varies else value for value, varies in self._arrays_with_axis_flags]
+    def select(self, members: np.ndarray) -> Family:
+        """Return the family of the selected members."""
+        values = [value[members] if has_axis else value for value, has_axis in self._arrays_with_axis_flags]
         return replace(self, parameter_arrays=values, refusal_reasons={})
 
     # -- as the engines take them -----------------------------------------------------------------------------------
 
     @property
     def is_per_trajectory(self) -> np.ndarray:
-        """Which parameters differ, shape (p,), all arrays one after another."""
+        """Mask of the parameters that differ between members, shape (p,), all arrays one after another."""
         return np.concatenate(
-            [np.zeros(0, bool), *(np.full(value[0].size, varies) for value, varies in self._arrays_with_axis_flags)]
+            [np.zeros(0, bool), *(np.full(value[0].size, has_axis) for value, has_axis in self._arrays_with_axis_flags)]
         )
 
-    def parameter_matrix(self, chosen: slice | np.ndarray, number: int) -> np.ndarray:
-        """The parameters of some members, shape (number, p)."""
-        rows = [value[chosen] if varies else value for value, varies in self._arrays_with_axis_flags]
-        columns = [np.broadcast_to(row.reshape(len(row), -1), (number, row[0].size)) for row in rows]
-        return np.concatenate([np.zeros((number, 0)), *columns], axis=1)
+    def parameter_matrix(self, members: slice | np.ndarray, n_members: int) -> np.ndarray:
+        """Return the parameters of the selected members as rows, shape (n_members, p)."""
+        rows = [value[members] if has_axis else value for value, has_axis in self._arrays_with_axis_flags]
+        columns = [np.broadcast_to(row.reshape(len(row), -1), (n_members, row[0].size)) for row in rows]
+        return np.concatenate([np.zeros((n_members, 0)), *columns], axis=1)
 
-    def vmap_arguments(self, chosen: slice | np.ndarray) -> tuple[list[jax.Array], list[Any]]:
-        """The parameters of some members, in front where they differ, and the axes for ``vmap``."""
-        arrays = [jnp.asarray(value[chosen] if varies else value[0]) for value, varies in self._arrays_with_axis_flags]
-        return arrays, [0 if varies else None for varies in self.has_member_axis]
+    def vmap_arguments(self, members: slice | np.ndarray) -> tuple[list[jax.Array], list[Any]]:
+        """Return the parameter arrays of the selected members, and their axes for ``jax.vmap``."""
+        arrays = [
+            jnp.asarray(value[members] if has_axis else value[0]) for value, has_axis in self._arrays_with_axis_flags
+        ]
+        return arrays, [0 if has_axis else None for has_axis in self.has_member_axis]
 
 
 def named_parameters(system: System) -> dict[str, np.ndarray]:
@@ -309,17 +324,19 @@ def named_parameters(system: System) -> dict[str, np.ndarray]:
 
 
 def broadcast_size(*sizes: int) -> int:
-    """The number of trajectories, where one thing is for all of them or there is one for each."""
-    several = {size for size in sizes if size != 1}
-    if len(several) > 1:
-        raise InputError(f"initial states and parameters are for different numbers of trajectories: {sorted(several)}")
-    if 0 in several:
+    """Return the common size of axes that broadcast, each 1 or the number of trajectories."""
+    distinct_sizes = {size for size in sizes if size != 1}
+    if len(distinct_sizes) > 1:
+        raise InputError(
+            f"initial states and parameters are for different numbers of trajectories: {sorted(distinct_sizes)}"
+        )
+    if 0 in distinct_sizes:
         raise InputError("an ensemble has at least one trajectory")
-    return several.pop() if several else 1
+    return distinct_sizes.pop() if distinct_sizes else 1
 
 
 def error_message_of(call: Callable[[], Any]) -> str:
-    """What a call complains of; an empty text where it does not."""
+    """Return the message of the error that ``call()`` raises, or ""."""
     try:
         call()
     except (LiethermoError, ManifoldsError, ValueError, ArithmeticError) as error:

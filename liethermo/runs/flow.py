@@ -44,7 +44,7 @@ def flow(
     save_every: int | None = None,
     attitude=None,
 ) -> jax.Array:
-    """The final state of the flow from x0, a differentiable function of x0 and of the parameters of the system.
+    """Return the final state of the flow from x0, a differentiable function of x0 and the parameters of the system.
 
     The steps are those of :func:`integrate` with the array engine. A derivative does not pass through their iterations.
     The stage equations ``k = slopes(x, k)`` define k, and their linearisation defines its derivative (implicit function
@@ -94,131 +94,156 @@ def flow(
     """
     method = DEFAULT_METHOD if method is None else method
     _check_arguments(system, t_span, step, method)
-    x, table = system.state(x0), StepSchedule(t_span, step, save_every)
-    n, shown = system.dim, system
+    x, schedule = system.state(x0), StepSchedule(t_span, step, save_every)
+    n, user_system = system.dim, system
     system, method = prepare_for_method(system, method, None, attitude is not None)
-    system = limit_to_span(system, table.start, table.end)
-    begin = x, table.start, attitude
-    # of what is traced nothing is known that a start could be refused for
+    system = limit_to_span(system, schedule.start, schedule.end)
+    initial_arguments = x, schedule.start, attitude
+    # the values of a traced state are unknown, so it cannot be checked
     x = jnp.asarray(
-        initial_state(system, *begin) if is_traced(system, x) else checked_initial_state(system, method, *begin)
+        initial_state(system, *initial_arguments)
+        if is_traced(system, x)
+        else checked_initial_state(system, method, *initial_arguments)
     )
-    calls = tuple(table.engine_calls(max_steps=table.n_steps, max_saves=table.n_steps))
-    sizes, counts = np.array([h for h, *_ in calls]), tuple((saves, every) for _, saves, every, _ in calls)
-    # A derivative is that of steps whose slopes are known: their iterations are left to a program without one.
-    given, last = (system, method, x), save_every is None
-    known = not method.explicit and is_traced(given)
-    values = _stop_gradients(given) if known else given
+    calls = tuple(schedule.engine_calls(max_steps=schedule.n_steps, max_saves=schedule.n_steps))
+    step_sizes, save_counts = (
+        np.array([h for h, *_ in calls]),
+        tuple((n_saves, steps_per_save) for _, n_saves, steps_per_save, _ in calls),
+    )
+    # Derivatives need solved slopes only. So a program without derivatives runs the iterations.
+    arguments, final_only = (system, method, x), save_every is None
+    is_differentiated = not method.explicit and is_traced(arguments)
+    values = _stop_gradients(arguments) if is_differentiated else arguments
     newton = method.explicit or is_traced(values)
-    compiled = jit_unoptimised if table.n_steps * x.size <= MAX_UNOPTIMISED_WORK else jit_program
-    path, steps = compiled(_compute_path)(values, sizes, counts, newton, known, last)
-    if not newton and not np.isfinite(np.asarray(path)[-1]).all():  # it is compiled where a step needs it
-        path, steps = compiled(_compute_path)(values, sizes, counts, True, known, last)
-    if known:
-        leaves = jax.tree_util.tree_leaves(given)
-        moves, moving = tuple(map(is_traced, leaves)), [leaf for leaf in leaves if is_traced(leaf)]
-        order = _differentiation_order(moving)
-        count = sum(leaf.size for leaf in moving)
-        if order and count <= MAX_FORWARD_DIRECTIONS and count**order <= MAX_FORWARD_DERIVATIVES:
-            found = _saved_path_derivatives(values, moves, order, sizes, counts, steps, last)
-            path = jit_program(_taylor_path)(path, found, moving, _stop_gradients(moving))
+    compile_program = jit_unoptimised if schedule.n_steps * x.size <= MAX_UNOPTIMISED_WORK else jit_program
+    path, steps = compile_program(_compute_path)(values, step_sizes, save_counts, newton, is_differentiated, final_only)
+    if not newton and not np.isfinite(np.asarray(path)[-1]).all():  # compile Newton's method only if a step needs it
+        path, steps = compile_program(_compute_path)(
+            values, step_sizes, save_counts, True, is_differentiated, final_only
+        )
+    if is_differentiated:
+        leaves = jax.tree_util.tree_leaves(arguments)
+        leaf_is_traced, traced_leaves = tuple(map(is_traced, leaves)), [leaf for leaf in leaves if is_traced(leaf)]
+        order = _differentiation_order(traced_leaves)
+        n_directions = sum(leaf.size for leaf in traced_leaves)
+        if order and n_directions <= MAX_FORWARD_DIRECTIONS and n_directions**order <= MAX_FORWARD_DERIVATIVES:
+            derivatives = _saved_path_derivatives(
+                values, leaf_is_traced, order, step_sizes, save_counts, steps, final_only
+            )
+            path = jit_program(_attach_derivatives)(path, derivatives, traced_leaves, _stop_gradients(traced_leaves))
         else:
-            path = jit_program(_path_of_solved_steps)(*given, sizes, steps, last)
+            path = jit_program(_recompute_path)(*arguments, step_sizes, steps, final_only)
     path = path if path.shape[-1] == n else path[..., :n]
-    return shown.points(path) if shown.space is None else path
+    return user_system.points(path) if user_system.space is None else path
 
 
 def _check_arguments(system, t_span, step, method) -> None:
-    """Raise InputError where what is given is for another kind of run."""
+    """Raise InputError if the arguments do not belong to a run with fixed steps."""
     if not isinstance(system, System):
-        raise InputError(f"flow takes a system, such as lt.models.rigid_body(), not {type(system).__name__}")
+        raise InputError(f"flow needs a system such as lt.models.rigid_body(), got {type(system).__name__}")
     if not isinstance(method, OneStepMethod):
-        raise InputError(f"method is a OneStepMethod, such as lt.MetriplecticGauss(2), not {method!r}")
+        raise InputError(f"method must be a OneStepMethod such as lt.MetriplecticGauss(2), got {method!r}")
     if isinstance(step, Adaptive):
-        raise InputError("flow takes steps of one size, a number, not lt.Adaptive: lt.integrate has adaptive steps")
+        raise InputError("flow needs a fixed step, a number, got lt.Adaptive. For adaptive steps use lt.integrate")
     if is_traced(t_span, step):
         raise InputError(
-            "t_span and step are numbers, not traced: they are not differentiated or mapped. The derivative by the end "
-            "time is system.vector_field at the end; for other times multiply the energy and the rates by a factor"
+            "t_span and step must be numbers, got traced values. The derivative by the end time is system.vector_field "
+            "at the end; for other times multiply the energy and the rates by a factor"
         )
 
 
 MAX_UNOPTIMISED_WORK = 1_000
-"""Steps times components up to which a program is not optimised: that would take longer than it saves in many calls."""
+"""Number of steps times components up to which a program is compiled without optimisation, which saves time unless it
+is called very often."""
 
-MAX_FORWARD_DIRECTIONS, MAX_FORWARD_DERIVATIVES = 64, 256
-"""Numbers that are differentiated by, and entries of the derivative of one component, up to which a derivative is found
-at once, forwards, for all that is differentiated by."""
+MAX_FORWARD_DIRECTIONS = 64
+"""Largest number of variables by which derivatives are computed in forward mode, all at once."""
+
+MAX_FORWARD_DERIVATIVES = 256
+"""Largest number of entries of the derivative of one component that is computed in forward mode."""
 
 
 def _stop_gradients(tree: Any) -> Any:
-    """A pytree of which nothing is differentiated."""
+    """Return the pytree with its derivatives stopped."""
     return jax.tree_util.tree_map(lambda a: jax.lax.stop_gradient(a) if isinstance(a, jax.Array) else a, tree)
 
 
-def _differentiation_order(moving: Sequence) -> int:
-    """How many derivatives are taken by some tracers whose values are known; zero where one is not known."""
-    most = 0
-    for leaf in moving:
-        count = 0
+def _differentiation_order(leaves: Sequence) -> int:
+    """Return how many times traced leaves with known values are differentiated; 0 if some value is unknown."""
+    max_order = 0
+    for leaf in leaves:
+        leaf_order = 0
         while isinstance(leaf, jax.core.Tracer):
             if leaf.to_concrete_value() is None:
                 return 0
-            leaf, count = leaf.primal, count + 1
-        most = max(most, count)
-    return most
+            leaf, leaf_order = leaf.primal, leaf_order + 1
+        max_order = max(max_order, leaf_order)
+    return max_order
 
 
 def _compute_path(
-    given: tuple[System, OneStepMethod, jax.Array],
-    sizes,
-    counts: tuple[tuple[int, int], ...],
+    arguments: tuple[System, OneStepMethod, jax.Array],
+    step_sizes,
+    save_counts: tuple[tuple[int, int], ...],
     newton: bool,
-    known: bool,
-    last: bool,
+    return_slopes: bool,
+    final_only: bool,
 ) -> tuple[jax.Array, list]:
-    """The states kept, the first among them, or the last alone: for programs in which all numbers are arguments.
+    """Return the saved states and the last, or the last alone, computed with all numbers as program arguments.
 
-    With ``known`` also, for each call, the state at the begin of each step, its compensation, and the slopes that solve
-    its equations.
+    With ``return_slopes`` also return, for each engine call, the state at the start of each step, its compensation, and
+    the slopes that solve its equations.
     """
-    system, method, x = given
+    system, method, x = arguments
     carry, states, steps = initial_carry(system, method, x), [x[None]], []
-    for i, (saves, every) in enumerate(counts):
+    for i, (n_saves, n_substeps) in enumerate(save_counts):
 
-        def step(carry, _, h=sizes[i]):
-            after = differentiable_step(system, method, carry, h, solve_or_nan if newton else fixed_point_or_nan)
-            return after, (*carry[:2], after[2]) if known else None
+        def step(carry, _, h=step_sizes[i]):
+            new_carry = differentiable_step(system, method, carry, h, solve_or_nan if newton else fixed_point_or_nan)
+            return new_carry, (*carry[:2], new_carry[2]) if return_slopes else None
 
-        def save(carry, _, step=step, every=every):
-            carry, solved = jax.lax.scan(step, carry, length=every)
-            return carry, (carry[0], solved)
+        def save(carry, _, step=step, steps_per_save=n_substeps):
+            carry, solved_steps = jax.lax.scan(step, carry, length=steps_per_save)
+            return carry, (carry[0], solved_steps)
 
-        carry, (kept, solved) = jax.lax.scan(save, carry, length=saves)
-        states.append(kept)
-        steps.append(solved)
-    return _select_saved(states, last), steps
+        carry, (saved_states, call_steps) = jax.lax.scan(save, carry, length=n_saves)
+        states.append(saved_states)
+        steps.append(call_steps)
+    return _select_saved(states, final_only), steps
 
 
-def _select_saved(states: Sequence, last: bool) -> jax.Array:
-    return states[-1][-1] if last else jnp.concatenate(states)
+def _select_saved(states: Sequence, final_only: bool) -> jax.Array:
+    return states[-1][-1] if final_only else jnp.concatenate(states)
 
 
 def _saved_path_derivatives(
-    given: tuple, moves: tuple[bool, ...], order: int, sizes, counts, steps: list, last: bool
+    arguments: tuple,
+    leaf_is_traced: tuple[bool, ...],
+    order: int,
+    step_sizes,
+    save_counts,
+    steps: list,
+    final_only: bool,
 ) -> list[np.ndarray]:
-    """The derivatives of the path up to an order, by all leaves that move in one row: shapes (..., n, p, ..., p)."""
-    each = [np.repeat(h, saves * every) for h, (saves, every) in zip(sizes, counts, strict=True)]
-    parts = [[np.asarray(part).reshape(-1, *part.shape[2:]) for part in call] for call in steps]
-    x, compensation, k = (np.concatenate(part) for part in zip(*parts, strict=True))
-    found = state_derivatives(given, moves, order, np.concatenate(each), (x, compensation, k))
-    ends = np.cumsum([0, *(every for saves, every in counts for _ in range(saves))])
-    return [derivative[-1] if last else derivative[ends] for derivative in found]
+    """Return the derivatives of the saved states up to an order, by all traced leaves in one row: shapes (..., n, p,
+    ..., p)."""
+    repeated_sizes = [
+        np.repeat(h, n_saves * steps_per_save)
+        for h, (n_saves, steps_per_save) in zip(step_sizes, save_counts, strict=True)
+    ]
+    flat_calls = [[np.asarray(array).reshape(-1, *array.shape[2:]) for array in call] for call in steps]
+    x, compensation, k = (np.concatenate(array) for array in zip(*flat_calls, strict=True))
+    derivatives = state_derivatives(
+        arguments, leaf_is_traced, order, np.concatenate(repeated_sizes), (x, compensation, k)
+    )
+    save_indices = np.cumsum([0, *(steps_per_save for n_saves, steps_per_save in save_counts for _ in range(n_saves))])
+    return [derivative[-1] if final_only else derivative[save_indices] for derivative in derivatives]
 
 
-def _taylor_path(path, derivatives: Sequence, moving: Sequence, here: Sequence) -> jax.Array:
-    """Taylor's polynomial where it is differentiated: its derivatives there are those given."""
-    d = ravel_pytree([a - b for a, b in zip(moving, here, strict=True)])[0]
+def _attach_derivatives(path, derivatives: Sequence, leaves: Sequence, base_leaves: Sequence) -> jax.Array:
+    """Return the path plus its Taylor polynomial in ``leaves - base_leaves``, which is zero but has the given
+    derivatives."""
+    d = ravel_pytree([a - b for a, b in zip(leaves, base_leaves, strict=True)])[0]
     for order, term in enumerate(derivatives, start=1):
         for _ in range(order):
             term = term @ d
@@ -226,74 +251,74 @@ def _taylor_path(path, derivatives: Sequence, moving: Sequence, here: Sequence) 
     return path
 
 
-def _path_of_solved_steps(system: System, method: OneStepMethod, x, sizes, steps: list, last: bool) -> jax.Array:
-    """The states of a path whose steps are solved: as functions of the first and of the parameters."""
+def _recompute_path(system: System, method: OneStepMethod, x, step_sizes, steps: list, final_only: bool) -> jax.Array:
+    """Return the path from solved steps, as a differentiable function of the initial state and the parameters."""
     states = [x[None]]
-    for i, solved in enumerate(steps):
+    for i, call_steps in enumerate(steps):
 
-        def step(x, known, h=sizes[i]):
-            _, compensation, k = known
+        def step(x, solved_step, h=step_sizes[i]):
+            _, compensation, k = solved_step
             k = _implicit_slopes(system, method, x, compensation, h, k)
             return method.move(system, x, compensation, h, k)[0], None
 
-        def save(x, known, step=step):
-            x, _ = jax.lax.scan(step, x, known)
+        def save(x, solved_steps, step=step):
+            x, _ = jax.lax.scan(step, x, solved_steps)
             return x, x
 
-        x, kept = jax.lax.scan(save, x, solved)
-        states.append(kept)
-    return _select_saved(states, last)
+        x, saved_states = jax.lax.scan(save, x, call_steps)
+        states.append(saved_states)
+    return _select_saved(states, final_only)
 
 
 def _implicit_slopes(system: System, method: OneStepMethod, x, compensation, h, k) -> jax.Array:
-    """The slopes of a step that are known, differentiated as the implicit function that they are."""
-    return _solve_stages_implicitly(system, method, x, compensation, h, k, lambda own: own.guess)
+    """Return known slopes k of a step, with the derivative that the stage equations define."""
+    return _solve_stages_implicitly(system, method, x, compensation, h, k, lambda equations: equations.guess)
 
 
 def initial_carry(system: System, method: OneStepMethod, x) -> tuple[jax.Array, ...]:
-    """What steps hand on, at the start: the state, what rounding keeps from it, the slopes of the last two steps."""
+    """Return the carry of the first step: the state, its compensation, and the slopes of the last two steps."""
     k = method.start(system, x)
     return x, jnp.zeros_like(x), k, k
 
 
-def solve_or_nan(own: StageEquations) -> jax.Array:
-    """The slopes that solve the equations of a step; NaN where they are not found."""
-    return _slopes_or_nan(solve_stages(own))
+def solve_or_nan(equations: StageEquations) -> jax.Array:
+    """Return the slopes that solve the stage equations of a step, or NaN if the solver fails."""
+    return _slopes_or_nan(solve_stages(equations))
 
 
-def fixed_point_or_nan(own: StageEquations) -> jax.Array:
-    """The same by fixed-point iteration alone."""
-    return _slopes_or_nan(solve_fixed_point(own))
+def fixed_point_or_nan(equations: StageEquations) -> jax.Array:
+    """Return the slopes that solve the stage equations by fixed-point iteration, or NaN if it fails."""
+    return _slopes_or_nan(solve_fixed_point(equations))
 
 
-def _slopes_or_nan(solved: StageSolution) -> jax.Array:
-    return jnp.where(solved.converged, solved.k, jnp.nan)
+def _slopes_or_nan(solution: StageSolution) -> jax.Array:
+    return jnp.where(solution.converged, solution.k, jnp.nan)
 
 
 def differentiable_step(
     system: System, method: OneStepMethod, carry: tuple[jax.Array, ...], h, solve: Callable = solve_or_nan
 ) -> tuple[jax.Array, ...]:
-    """A step that JAX differentiates, from what :func:`initial_carry` says; NaN where it could not be solved."""
-    x, compensation, k, before = carry
+    """Return the carry after a step that JAX can differentiate; NaN if its equations cannot be solved."""
+    x, compensation, k, older_k = carry
     if method.explicit:
-        new = _slopes_or_nan(explicit_slopes(system, method, x, compensation, h, k))
+        new_k = _slopes_or_nan(explicit_slopes(system, method, x, compensation, h, k))
     else:
-        new = _solve_stages_implicitly(system, method, x, compensation, h, method.predict(k, before), solve)
-    after, after_compensation, energy, *_ = end_of_step(system, method, x, compensation, h, new)
+        new_k = _solve_stages_implicitly(system, method, x, compensation, h, method.predict(k, older_k), solve)
+    new_x, new_compensation, energy, *_ = end_of_step(system, method, x, compensation, h, new_k)
     if can_correct_energy_drift(system, method):
-        after_compensation = apply_drift_correction(
+        new_compensation = apply_drift_correction(
             system,
-            after,
-            after_compensation,
-            energy_drift_correction(system, after, after_compensation, energy, system.energy.value(x)),
+            new_x,
+            new_compensation,
+            energy_drift_correction(system, new_x, new_compensation, energy, system.energy.value(x)),
         )
-    return after, after_compensation, new, k
+    return new_x, new_compensation, new_k, k
 
 
 def _solve_stages_implicitly(
     system: System, method: OneStepMethod, x, compensation, h, guess, solve: Callable
 ) -> jax.Array:
-    """The solution of the stage equations by ``solve``, differentiated as the implicit function that it is."""
+    """Solve the stage equations by ``solve``; the derivative of the solution is that of the implicit function."""
     dynamic, static = eqx.partition((system, method, x, compensation, h), eqx.is_array)
 
     def slopes(dynamic, k):

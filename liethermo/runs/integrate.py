@@ -1,4 +1,4 @@
-"""``integrate``: arguments checked, a run made and driven, its failures raised."""
+"""``integrate``: check the arguments, run the time loop, raise the errors of a failed run."""
 
 from __future__ import annotations
 
@@ -32,6 +32,7 @@ from .watch import EventSet
 CONVERGENCE_FAILURES = tuple(
     code.status_name for code in (StatusCode.NOT_CONVERGED, StatusCode.STEP_UNDERFLOW, StatusCode.STEP_LIMIT)
 )
+"""Names of the statuses for which ``integrate`` raises ConvergenceError."""
 
 
 @with_library_settings
@@ -108,7 +109,7 @@ def integrate(
     Returns
     -------
     Solution
-        After Ctrl-C, what exists, with status "interrupted".
+        The trajectory; after Ctrl-C the part computed so far, with status "interrupted".
 
     Raises
     ------
@@ -138,10 +139,10 @@ def integrate(
     default = DEFAULT_METHOD if noise is None else DEFAULT_NOISE_METHOD
     method = default if method is None else method
     if not isinstance(method, OneStepMethod | Reference):
-        raise InputError(f"the method must be an integrator such as lt.MetriplecticGauss(), not {method!r}")
+        raise InputError(f"method must be an integrator such as lt.MetriplecticGauss(), got {method!r}")
     if not isinstance(system, System):
         raise InputError(
-            f"the first argument must be a system such as lt.LiePoissonSystem, not {type(system).__name__}"
+            f"the first argument must be a system such as lt.LiePoissonSystem, got {type(system).__name__}"
         )
     check_choice("engine", engine, ("auto", "array", "compiled", "sparse"))
     check_choice("on_failure", on_failure, ("raise", "return"))
@@ -150,24 +151,24 @@ def integrate(
     )
     invariants_and_laws(system, method)  # refuses what the method cannot run
     adaptive = isinstance(step, Adaptive)
-    looks = adaptive or dense or save_at is not None or until is not None
-    if looks and isinstance(method, Reference):
+    needs_own_steps = adaptive or dense or save_at is not None or until is not None
+    if needs_own_steps and isinstance(method, Reference):
         raise InputError(
-            "Reference chooses its own steps: Adaptive, save_at, until and dense are for the other methods"
+            "Reference chooses its own steps and cannot be combined with Adaptive, save_at, until or dense. Use "
+            "another method"
         )
     if noise is not None and (adaptive or dense or until is not None):
         raise InputError(
-            "steps with noise are of one size, and nothing is known of a path between them: Adaptive, until and dense "
-            "are for runs without"
+            "noise= needs fixed steps and cannot be combined with Adaptive, until or dense. Give the step as a number"
         )
-    course = make_schedule(t_span, step, save_every, save_at, allow_infinite_end=adaptive and until is not None)
-    x = checked_initial_state(system, method, x0, course.start, attitude)
-    run = Run(system, method, x, course, save_to, engine, noise, dense)
-    with Progress((course.start, course.end), progress) as bar:
+    schedule = make_schedule(t_span, step, save_every, save_at, allow_infinite_end=adaptive and until is not None)
+    x = checked_initial_state(system, method, x0, schedule.start, attitude)
+    run = Run(system, method, x, schedule, save_to, engine, noise, dense)
+    with Progress((schedule.start, schedule.end), progress) as bar:
         if isinstance(method, Reference):
             run.run_reference(bar)
         elif adaptive or until is not None:
-            run.run_with_step_control(bar, step if adaptive else course.h, until)
+            run.run_with_step_control(bar, step if adaptive else schedule.h, until)
         else:
             run.run_fixed(bar)
     solution = run.solution()
@@ -185,12 +186,12 @@ def integrate(
 
 @with_library_settings
 def solution_without_steps(system: System, x0, t: float, method: OneStepMethod) -> Solution:
-    """Return the solution over a span of length zero: the initial state at a time.
+    """Return the solution over a span of length zero: the initial state at time t.
 
     Raises
     ------
     InputError
-        If no run of the method can start there.
+        If the method cannot start at x0.
     """
     system, method = prepare_run(resolve_invariants(system, x0), method)
     invariants_and_laws(system, method)
@@ -198,7 +199,7 @@ def solution_without_steps(system: System, x0, t: float, method: OneStepMethod) 
         system,
         method,
         checked_initial_state(system, method, x0, t),
-        StepSchedule.of_zero_length(t),
+        StepSchedule.zero_length(t),
         None,
         "auto",
         dense=True,

@@ -28,21 +28,27 @@ from ..tracing.interpret import evaluate_at_points
 from .family import Family
 
 MAX_VALUES_PER_CALL = 2**21
-"""Largest number of parameters and state components, of all points together, at which a function is evaluated."""
+"""Largest number of parameters and state components, summed over all points of one evaluation, which bounds memory."""
 
-VERDICT_UNKNOWN, VERDICT_NOT_CONSERVED, VERDICT_CONSERVED = -1, 0, 1
-"""What is known of a function and a member."""
+VERDICT_UNKNOWN = -1
+"""Verdict on a function of a member whose conservation could not be decided."""
+
+VERDICT_NOT_CONSERVED = 0
+"""Verdict on a function that a member does not conserve."""
+
+VERDICT_CONSERVED = 1
+"""Verdict on a function that a member conserves."""
 
 
 class InvariantFacts(NamedTuple):
-    """What depends on the parameters of a member and belongs to the program that runs it.
+    """Properties of a member that depend on its parameters and select the program that runs it.
 
     Attributes
     ----------
     preserved_labels : tuple of str or None
-        The names of the functions that its dissipation has to preserve.
-    invariant_verdicts : Decided
-        Which functions it conserves.
+        Names of the functions that its dissipation must preserve.
+    invariant_verdicts : InvariantVerdicts
+        Verdicts on the functions that it conserves.
     """
 
     preserved_labels: tuple[str, ...] | None
@@ -50,7 +56,7 @@ class InvariantFacts(NamedTuple):
 
 
 def with_invariant_facts(system: System, facts: InvariantFacts) -> System:
-    """Return the system with what is known of it."""
+    """Return a copy of the system that has these facts as attributes."""
     system = copy(system)
     for name, value in facts._asdict().items():
         object.__setattr__(system, name, value)
@@ -58,13 +64,14 @@ def with_invariant_facts(system: System, facts: InvariantFacts) -> System:
 
 
 class MemberGroup(NamedTuple):
-    """Members that one program can run.
+    """Members of a family that one program can run.
 
     Attributes
     ----------
     indices : array of int
-        Their numbers in the family.
+        Numbers of the members in the whole family.
     family : Family
+        The family of these members.
     """
 
     indices: np.ndarray
@@ -74,7 +81,9 @@ class MemberGroup(NamedTuple):
 def group_members(
     family: Family, method: OneStepMethod, states: np.ndarray
 ) -> tuple[list[MemberGroup], dict[int, str]]:
-    """Return the groups of a family, and the members that a method cannot run with the reasons.
+    """Return the groups of members that conserve the same functions, and the members that the method cannot run.
+
+    The second result maps members to the reasons.
 
     Parameters
     ----------
@@ -84,39 +93,45 @@ def group_members(
     states : array, shape (B, n)
         The initial state of each trajectory. A function that cannot be evaluated at random states is judged near it.
     """
-    everyone, member = np.arange(len(states)), family.representative
+    all_members, member = np.arange(len(states)), family.representative
     if member.invariant_verdicts is not None:
-        return [MemberGroup(everyone, family)], {}
+        return [MemberGroup(all_members, family)], {}
     if not any(family.has_member_axis) and not member.undecided_functions():
-        return [MemberGroup(everyone, family)], {}
+        return [MemberGroup(all_members, family)], {}
     members = _MemberFunctions(family, member, method, states)
     if not (members.casimirs or member.preserved or members.requested_functions):
-        return [MemberGroup(everyone, family)], {}
-    multiples, named, asked = members.multiple_indices(), members.verdicts_of_named(), members.verdicts_of_requested()
-    refused = {
+        return [MemberGroup(all_members, family)], {}
+    multiples, known_verdicts, requested_verdicts = (
+        members.proportional_function_indices(),
+        members.verdicts_of_casimirs_and_preserved(),
+        members.verdicts_of_requested_functions(),
+    )
+    refusal_reasons = {
         int(i): why_not_preserved(members.requested_functions[j])
-        for i, j in np.argwhere(asked == VERDICT_NOT_CONSERVED)[::-1]
+        for i, j in np.argwhere(requested_verdicts == VERDICT_NOT_CONSERVED)[::-1]
     }
-    rows = np.concatenate([multiples, named, members.are_momentum_maps()], axis=1)
+    rows = np.concatenate([multiples, known_verdicts, members.are_momentum_maps()], axis=1)
     groups = []
-    kinds, kind_of = np.unique(rows, axis=0, return_inverse=True)
-    for kind, row in enumerate(kinds):
-        places = np.setdiff1d(np.flatnonzero(kind_of.ravel() == kind), list(refused))
-        if places.size:
-            facts = members.invariant_facts(*np.split(row[: multiples.shape[1] + named.shape[1]], [multiples.shape[1]]))
-            groups.append(MemberGroup(places, family.select(places).annotate_members(with_invariant_facts, facts)))
-    return sorted(groups, key=lambda group: int(group.indices[0])), refused
+    unique_rows, row_kinds = np.unique(rows, axis=0, return_inverse=True)
+    for kind, row in enumerate(unique_rows):
+        indices = np.setdiff1d(np.flatnonzero(row_kinds.ravel() == kind), list(refusal_reasons))
+        if indices.size:
+            facts = members.invariant_facts(
+                *np.split(row[: multiples.shape[1] + known_verdicts.shape[1]], [multiples.shape[1]])
+            )
+            groups.append(MemberGroup(indices, family.select(indices).annotate_members(with_invariant_facts, facts)))
+    return sorted(groups, key=lambda group: int(group.indices[0])), refusal_reasons
 
 
 def common_inertia(family: Family) -> np.ndarray | None:
-    """Return the tensor of inertia of a rigid body, shape (3, 3), if all members have the same; otherwise None."""
+    """Return the tensor of inertia of a rigid body, shape (3, 3), if all members have the same one; otherwise None."""
     member = family.member(0)
     inertia = member.inertia
     if inertia is None or not any(family.has_member_axis):
         return inertia
-    own = family.parameter_matrix(slice(None), family.size)
-    for rows in (own[[0, -1]], own):  # two are enough to see that they differ
-        inverses = evaluate_at_points(_inverse_inertia, (family.form, own.shape[1]), rows)
+    parameters = family.parameter_matrix(slice(None), family.size)
+    for rows in (parameters[[0, -1]], parameters):  # two are enough to see that they differ
+        inverses = evaluate_at_points(_inverse_inertia, (family.form, parameters.shape[1]), rows)
         if not (inverses == inverses[0]).all():
             return None
     return inertia
@@ -126,19 +141,21 @@ def members_outside_domain(family: Family, states: np.ndarray) -> list[int]:
     """Return the members whose parameters do not allow their initial states, shape (B, n)."""
     if family.member(0).domain_margin(jnp.asarray(states[0])) is None:
         return []
-    own = family.parameter_matrix(slice(None), len(states))
-    margins = evaluate_at_points(_domain_margin, (family.form, own.shape[1]), np.concatenate([own, states], axis=1))
+    parameters = family.parameter_matrix(slice(None), len(states))
+    margins = evaluate_at_points(
+        _domain_margin, (family.form, parameters.shape[1]), np.concatenate([parameters, states], axis=1)
+    )
     return np.flatnonzero(~(margins > 0.0)).tolist()
 
 
 class _MemberFunctions:
-    """Functions of the members of a family, evaluated at states of each.
+    """Conserved functions of the members of a family, evaluated at states of each member.
 
     Parameters
     ----------
     family : Family
     member : System
-        One of them: all have functions of the same names.
+        One member; all members have functions of the same names.
     method : OneStepMethod
     states : array, shape (B, n)
     """
@@ -150,58 +167,61 @@ class _MemberFunctions:
 
     # -- facts --------------------------------------------------------------------------------------------------------
 
-    def multiple_indices(self) -> np.ndarray:
-        """The place of the function of which each preserved one is a multiple, shape (B, preserved); -1 for none."""
+    def proportional_function_indices(self) -> np.ndarray:
+        """Return, for each preserved function, the index of a function proportional to it, or -1: shape (B,
+        preserved)."""
         count = len(self.member.preserved)
         if not count:
             return np.zeros((len(self.states), 0), dtype=int)
         points = self.member.test_states(2)
-        each = len(points) * len(self.member.functions_for_naming()) * self.member.dim
+        values_per_member = len(points) * len(self.member.functions_for_naming()) * self.member.dim
         return self._evaluate_in_batches(
             lambda rows: first_multiple_indices(
-                self._evaluate_at(_nameable_gradients, rows, self._points_per_member(points, rows)), count
+                self._evaluate_at(_gradients_for_naming, rows, self._points_per_member(points, rows)), count
             ),
-            each,
+            values_per_member,
         )
 
-    def verdicts_of_named(self) -> np.ndarray:
-        """On each Casimir that is not conserved by form, then on what is preserved: shape (B, functions)."""
+    def verdicts_of_casimirs_and_preserved(self) -> np.ndarray:
+        """Return verdicts on the Casimirs not conserved by construction, then on preserved functions: shape (B,
+        functions)."""
         count, member = len(self.casimirs) + len(self.member.preserved), self.member
-        verdicts = self._judge_functions(_named_rates, count, self.casimirs, near=True)
-        # a torque that is zero at some times tells nothing of others
-        acted_on = [member.torque_name and name not in member.torque_invariant_casimirs for name in self.casimirs]
-        acted_on += [bool(member.torque_name)] * len(member.preserved)
-        return np.where(np.array(acted_on, dtype=bool), VERDICT_NOT_CONSERVED, verdicts)
+        verdicts = self._judge_functions(_casimir_and_preserved_rates, count, self.casimirs, use_nearby_states=True)
+        # a torque may be zero at the test times only, so no function on which it acts counts as conserved
+        has_torque = [member.torque_name and name not in member.torque_invariant_casimirs for name in self.casimirs]
+        has_torque += [bool(member.torque_name)] * len(member.preserved)
+        return np.where(np.array(has_torque, dtype=bool), VERDICT_NOT_CONSERVED, verdicts)
 
-    def verdicts_of_requested(self) -> np.ndarray:
-        """On each function that the method is asked to preserve, shape (B, functions)."""
+    def verdicts_of_requested_functions(self) -> np.ndarray:
+        """Return verdicts on the functions that the method is asked to preserve, shape (B, functions)."""
         return self._judge_functions(
-            _requested_rates, len(self.requested_functions), self.requested_functions, near=False
+            _requested_rates, len(self.requested_functions), self.requested_functions, use_nearby_states=False
         )
 
     def are_momentum_maps(self) -> np.ndarray:
-        """Which of the functions that the method is asked to preserve are no Casimirs, shape (B, functions)."""
+        """Return True for each function that the method must preserve and that is not a Casimir: shape (B,
+        functions)."""
         if not self.requested_functions:
             return np.zeros((len(self.states), 0), dtype=int)
         points = self.member.samples(4)
-        each = points.size * len(self.requested_functions)
+        values_per_member = points.size * len(self.requested_functions)
         return self._evaluate_in_batches(
             lambda rows: is_momentum_map(
                 self._evaluate_at(
-                    _requested_moved_fractions, rows, self._points_per_member(points, rows), self.requested_functions
+                    _requested_casimir_residuals, rows, self._points_per_member(points, rows), self.requested_functions
                 )
             ),
-            each,
+            values_per_member,
         )
 
-    def invariant_facts(self, multiples: np.ndarray, named: np.ndarray) -> InvariantFacts:
-        """From what was found of one member."""
+    def invariant_facts(self, multiples: np.ndarray, verdict_row: np.ndarray) -> InvariantFacts:
+        """Return the facts of one member from its rows of indices and verdicts."""
         member = self.member
         names = member.names_from_multiples(multiples.tolist())
-        known = {VERDICT_UNKNOWN: None, VERDICT_NOT_CONSERVED: False, VERDICT_CONSERVED: True}
+        truth_values = {VERDICT_UNKNOWN: None, VERDICT_NOT_CONSERVED: False, VERDICT_CONSERVED: True}
         verdicts: dict[str, bool | None] = {}
-        for name, verdict in zip((*names, *self.casimirs), np.roll(named, len(names)).tolist(), strict=True):
-            verdicts[name] = known[verdict]  # a Casimir after what is preserved, which may have its name
+        for name, verdict in zip((*names, *self.casimirs), np.roll(verdict_row, len(names)).tolist(), strict=True):
+            verdicts[name] = truth_values[verdict]  # a Casimir overwrites a preserved function of the same name
         verdicts |= dict.fromkeys(member.invariants_by_construction(), True)
         return InvariantFacts(
             names if names else member.preserved_labels, InvariantVerdicts.from_verdicts(verdicts, names)
@@ -209,127 +229,137 @@ class _MemberFunctions:
 
     # -- verdicts -----------------------------------------------------------------------------------------------------
 
-    def _judge_functions(self, rates: Callable, count: int, functions: tuple, near: bool) -> np.ndarray:
-        """What is known of some functions of each member, as :meth:`.System.conserves` finds it of one.
+    def _judge_functions(self, rates: Callable, count: int, functions: tuple, use_nearby_states: bool) -> np.ndarray:
+        """Return verdicts on functions of each member, shape (B, count), by the rules of :meth:`.System.conserves`.
 
-        With ``near``, states near the first of a trajectory are tried where random states have left a function open.
+        With ``use_nearby_states``, states near the initial state are tried where random states leave a function
+        undecided.
         """
         times = range(len(self.member.systems_at_test_times())) if self.member.is_driven else (None,)
-        each = np.stack([self._judge_functions_at_time(rates, count, functions, time, near) for time in times])
-        unknown = np.where((each == VERDICT_UNKNOWN).any(axis=0), VERDICT_UNKNOWN, VERDICT_CONSERVED)
-        return np.where((each == VERDICT_NOT_CONSERVED).any(axis=0), VERDICT_NOT_CONSERVED, unknown)
+        verdicts_at_times = np.stack(
+            [self._judge_functions_at_time(rates, count, functions, time, use_nearby_states) for time in times]
+        )
+        unknown = np.where((verdicts_at_times == VERDICT_UNKNOWN).any(axis=0), VERDICT_UNKNOWN, VERDICT_CONSERVED)
+        return np.where((verdicts_at_times == VERDICT_NOT_CONSERVED).any(axis=0), VERDICT_NOT_CONSERVED, unknown)
 
     def _judge_functions_at_time(
-        self, rates: Callable, count: int, functions: tuple, time: int | None, near: bool
+        self, rates: Callable, count: int, functions: tuple, time: int | None, use_nearby_states: bool
     ) -> np.ndarray:
-        size, member = len(self.states), self.member
+        n_members, member = len(self.states), self.member
         if not count:
-            return np.zeros((size, 0), dtype=int)
-        defined, broken = np.zeros((2, size, count), dtype=bool)
+            return np.zeros((n_members, 0), dtype=int)
+        is_defined, is_violated = np.zeros((2, n_members, count), dtype=bool)
 
         def try_states(rows: np.ndarray, states_of: Callable[[np.ndarray], np.ndarray], number: int) -> None:
             def judge_rows(rows: np.ndarray) -> np.ndarray:
-                found = judge_conservation(self._evaluate_at(rates, rows, states_of(rows), functions, time))
+                judgement = judge_conservation(self._evaluate_at(rates, rows, states_of(rows), functions, time))
                 return np.stack(
-                    [found.is_defined.any(axis=1), (found.is_defined & ~found.is_conserved).any(axis=1)], axis=1
+                    [judgement.is_defined.any(axis=1), (judgement.is_defined & ~judgement.is_conserved).any(axis=1)],
+                    axis=1,
                 )
 
             if rows.size:
                 result = self._evaluate_in_batches(judge_rows, number * member.dim, rows)
-                defined[rows] |= result[:, 0]
-                broken[rows] |= result[:, 1]
+                is_defined[rows] |= result[:, 0]
+                is_violated[rows] |= result[:, 1]
 
         random = member.test_states(member.test_states_per_scale)
-        for some in (random[:1], random[1:]):  # one state is enough to see that a function is not conserved
-            left = np.flatnonzero(~broken.all(axis=1))
-            try_states(left, functools.partial(self._points_per_member, some), len(some))
-        if near:
-            left = np.flatnonzero(~(defined | broken).all(axis=1))
-            number = len(member.states_near(self.states[0]))
-            try_states(left, lambda rows: np.stack([member.states_near(x) for x in self.states[rows]]), number)
-        return np.where(broken, VERDICT_NOT_CONSERVED, np.where(defined, VERDICT_CONSERVED, VERDICT_UNKNOWN))
+        for points in (random[:1], random[1:]):  # one state is enough to see that a function is not conserved
+            open_members = np.flatnonzero(~is_violated.all(axis=1))
+            try_states(open_members, functools.partial(self._points_per_member, points), len(points))
+        if use_nearby_states:
+            open_members = np.flatnonzero(~(is_defined | is_violated).all(axis=1))
+            n_states = len(member.states_near(self.states[0]))
+            try_states(
+                open_members, lambda rows: np.stack([member.states_near(x) for x in self.states[rows]]), n_states
+            )
+        return np.where(is_violated, VERDICT_NOT_CONSERVED, np.where(is_defined, VERDICT_CONSERVED, VERDICT_UNKNOWN))
 
     # -- evaluation ---------------------------------------------------------------------------------------------------
 
     def _evaluate_at(self, function: Callable, rows: np.ndarray, points: np.ndarray, *model) -> Any:
-        """What a function of members gives at points of each, shape (rows, points, n): with both axes in front."""
-        own = self.family.parameter_matrix(rows, len(rows))
-        at = np.concatenate([np.repeat(own, points.shape[1], axis=0), points.reshape(-1, points.shape[-1])], axis=1)
+        """Evaluate a function of members at points of each, shape (rows, points, n); both axes lead in the result."""
+        parameters = self.family.parameter_matrix(rows, len(rows))
+        inputs = np.concatenate(
+            [np.repeat(parameters, points.shape[1], axis=0), points.reshape(-1, points.shape[-1])], axis=1
+        )
         with np.errstate(all="ignore"):
-            found = evaluate_at_points(function, (self.family.form, own.shape[1], *model), at)
+            values = evaluate_at_points(function, (self.family.form, parameters.shape[1], *model), inputs)
         leading = points.shape[:2]
-        if isinstance(found, tuple):
-            return type(found)(*(np.asarray(a).reshape(*leading, *np.shape(a)[1:]) for a in found))
-        return np.asarray(found).reshape(*leading, *np.shape(found)[1:])
+        if isinstance(values, tuple):
+            return type(values)(*(np.asarray(a).reshape(*leading, *np.shape(a)[1:]) for a in values))
+        return np.asarray(values).reshape(*leading, *np.shape(values)[1:])
 
     def _points_per_member(self, points: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Random states of one member, shape (points, n), as those of others, shape (rows, points, n).
+        """Return random states for each member, shape (rows, points, n), from those of one member, shape (points, n).
 
-        The entropies of baths are random relative to the capacities, which are those of each member.
+        Entropies of baths are rescaled by the heat capacities of each member.
         """
         points = np.broadcast_to(points, (len(rows), *points.shape))
         baths = self.member.baths
         if baths is None or not any(self.family.has_member_axis):
             return points
-        own = self.family.parameter_matrix(rows, len(rows))
-        scales = evaluate_at_points(_bath_entropy_scales, (self.family.form, own.shape[1]), own)[:, None]
+        parameters = self.family.parameter_matrix(rows, len(rows))
+        scales = evaluate_at_points(_bath_entropy_scales, (self.family.form, parameters.shape[1]), parameters)[:, None]
         points = points.copy()
         points[..., self.member.body_dim :] *= scales / baths.scale
         return points
 
-    def _evaluate_in_batches(self, function: Callable, numbers: int, rows: np.ndarray | None = None) -> np.ndarray:
-        """The values of a function of rows of members, a portion after another: bounded memory."""
+    def _evaluate_in_batches(
+        self, function: Callable, values_per_member: int, rows: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Evaluate a function of member rows batch by batch, which bounds memory."""
         rows = np.arange(len(self.states)) if rows is None else rows
-        portion = max(1, MAX_VALUES_PER_CALL // max(numbers, 1))
-        found = [function(rows[i : i + portion]) for i in range(0, len(rows), portion)]
-        return np.concatenate(found) if len(found) > 1 else found[0]
+        batch_size = max(1, MAX_VALUES_PER_CALL // max(values_per_member, 1))
+        values = [function(rows[i : i + batch_size]) for i in range(0, len(rows), batch_size)]
+        return np.concatenate(values) if len(values) > 1 else values[0]
 
 
-def _member_and_state(form, p: int, at, time: int | None = None) -> tuple[System, jnp.ndarray]:
-    """The member with the parameters that a row begins with, as it is at one of some times; and the state behind."""
-    system = form.build(at[:p])
-    return (system if time is None else system.systems_at_test_times()[time]), at[p:]
+def _member_and_state(form, p: int, row, time: int | None = None) -> tuple[System, jnp.ndarray]:
+    """Return the member and the state that a row holds; a driven member at its test time number ``time``."""
+    system = form.build(row[:p])
+    return (system if time is None else system.systems_at_test_times()[time]), row[p:]
 
 
-def _nameable_gradients(model, at):
+def _gradients_for_naming(model, row):
     form, p = model
-    system, x = _member_and_state(form, p, at)
+    system, x = _member_and_state(form, p, row)
     return stack_gradients(system.functions_for_naming(), x)
 
 
-def _named_rates(model, at):
+def _casimir_and_preserved_rates(model, row):
     form, p, casimirs, time = model
-    system, x = _member_and_state(form, p, at, time)
-    known = system.casimirs()
-    return rates_of_change((system, (*(known[name] for name in casimirs), *system.preserved)), x)
+    system, x = _member_and_state(form, p, row, time)
+    all_casimirs = system.casimirs()
+    return rates_of_change((system, (*(all_casimirs[name] for name in casimirs), *system.preserved)), x)
 
 
-def _requested_rates(model, at):
+def _requested_rates(model, row):
     form, p, functions, time = model
-    system, x = _member_and_state(form, p, at, time)
+    system, x = _member_and_state(form, p, row, time)
     return rates_of_change((system, functions), x)
 
 
-def _requested_moved_fractions(model, at):
+def _requested_casimir_residuals(model, row):
     form, p, functions = model
-    system, x = _member_and_state(form, p, at)
+    system, x = _member_and_state(form, p, row)
     return casimir_residuals((system, functions), x)
 
 
-def _bath_entropy_scales(model, at):
+def _bath_entropy_scales(model, row):
     form, p = model
-    system, _ = _member_and_state(form, p, at)
+    system, _ = _member_and_state(form, p, row)
     assert isinstance(system.baths, HeatBaths)
     return system.baths.entropy_scales()
 
 
-def _domain_margin(model, at):
+def _domain_margin(model, row):
     form, p = model
-    system, x = _member_and_state(form, p, at)
+    system, x = _member_and_state(form, p, row)
     return system.domain_margin(x)
 
 
-def _inverse_inertia(model, at):
+def _inverse_inertia(model, row):
     form, p = model
-    body = _member_and_state(form, p, at)[0].drop_baths()
+    body = _member_and_state(form, p, row)[0].drop_baths()
     return jax.jacfwd(body.energy.gradient)(jnp.zeros(body.dim))

@@ -1,4 +1,4 @@
-"""Many trajectories with steps of their own, or with events: from pause to pause, each as it would be alone."""
+"""Ensembles with adaptive steps or events: each trajectory takes the steps that it would take alone."""
 
 from __future__ import annotations
 
@@ -25,117 +25,159 @@ from .family import Family
 from .record import EnsembleRecord
 
 ATTEMPTS_PER_CALL_RANGE = (16, 2048)
-"""Attempts in a call of an engine, at least and at most: those that pause wait for the others' to be made."""
+"""Smallest and largest number of attempted steps per engine call; paused trajectories wait until the call ends."""
 
 TARGET_ATTEMPTS_PER_CALL = 2**15
-"""Attempts in a call, of all trajectories together, between these."""
+"""Target number of attempted steps per engine call, summed over trajectories and clipped to
+``ATTEMPTS_PER_CALL_RANGE``."""
 
 
 class AdaptiveEnsembleRun:
-    """The paces of an ensemble.
+    """Run of an ensemble with adaptive steps or events.
 
     Parameters
     ----------
     family : Family
     method : OneStepMethod
-    control : Pacing
-    record : Record
-    progress_counter : Tally
+    control : StepControl
+    record : EnsembleRecord
+    progress_counter : ProgressCounter
     """
 
     def __init__(
-        self, family: Family, method: OneStepMethod, pacing: StepControl, record: EnsembleRecord, tally: ProgressCounter
+        self,
+        family: Family,
+        method: OneStepMethod,
+        control: StepControl,
+        record: EnsembleRecord,
+        progress_counter: ProgressCounter,
     ):
         self.family, self.method, self.control, self.record, self.progress_counter = (
             family,
             method,
-            pacing,
+            control,
             record,
-            tally,
+            progress_counter,
         )
         self.interrupted = False
         self.stop_times = record.schedule.stop_times
 
     @property
     def _start_stop_length(self) -> tuple[float, float, float]:
-        course = self.record.schedule
-        return course.start, float(self.stop_times[0]), course.end - course.start
+        schedule = self.record.schedule
+        return schedule.start, float(self.stop_times[0]), schedule.end - schedule.start
 
     def run_compiled(self) -> None:
-        """In lanes over threads; those that are at their end leave their lanes to others."""
-        lanes, size = LaneParameters(self.family, self.method, self.control), len(self.record.x0)
+        """Run all trajectories in SIMD lanes over threads; finished ones free their lanes."""
+        lanes, n_members = LaneParameters(self.family, self.method, self.control), len(self.record.x0)
 
-        def work(chosen: slice, stop: threading.Event) -> None:
-            own = lanes.parameters(chosen, chosen.stop - chosen.start)
-            paces = CompiledAdaptiveRuns(
-                lanes.step_loop, lanes.first_lane_parameters, own, self.record.x0[chosen], *self._start_stop_length
+        def work(members: slice, stop: threading.Event) -> None:
+            parameters = lanes.parameters(members, members.stop - members.start)
+            adaptive_runs = CompiledAdaptiveRuns(
+                lanes.step_loop,
+                lanes.first_lane_parameters,
+                parameters,
+                self.record.x0[members],
+                *self._start_stop_length,
             )
-            self._advance_to_end(paces, np.arange(chosen.start, chosen.stop), paces.keep_only, stop.is_set)
+            self._advance_to_end(
+                adaptive_runs, np.arange(members.start, members.stop), adaptive_runs.keep_only, stop.is_set
+            )
 
-        run_in_threads(work, size)
+        run_in_threads(work, n_members)
 
     def run_array(self) -> None:
-        """All of a batch in one program."""
-        size = len(self.record.x0)
-        for start in range(0, size, ARRAY_BATCH_SIZE):
-            places = padded_member_indices(start, min(start + ARRAY_BATCH_SIZE, size), self.record.x0.shape[1])
-            parameters, axes = self.family.vmap_arguments(places)
-            given = self.family.form, parameters, axes, self.method, self.control
-            paces = start_batch(*given, self.record.x0[places], *self._start_stop_length)
-            self._advance_to_end(paces, places, None, lambda: self.interrupted)
+        """Run all trajectories on the array engine, one vmapped program per batch."""
+        n_members = len(self.record.x0)
+        for start in range(0, n_members, ARRAY_BATCH_SIZE):
+            members = padded_member_indices(start, min(start + ARRAY_BATCH_SIZE, n_members), self.record.x0.shape[1])
+            parameters, axes = self.family.vmap_arguments(members)
+            batch_arguments = self.family.form, parameters, axes, self.method, self.control
+            adaptive_runs = start_batch(*batch_arguments, self.record.x0[members], *self._start_stop_length)
+            self._advance_to_end(adaptive_runs, members, None, lambda: self.interrupted)
 
     def _advance_to_end(
-        self, paces: AdaptiveRuns, places: np.ndarray, only: Callable | None, stopped: Callable[[], bool]
+        self,
+        adaptive_runs: AdaptiveRuns,
+        members: np.ndarray,
+        keep_only: Callable | None,
+        is_stopped: Callable[[], bool],
     ) -> None:
-        """Trajectories with these places, to the ends of all."""
+        """Advance the trajectories with these member indices until all have ended, and fill the record.
+
+        Parameters
+        ----------
+        keep_only : function of indices, or None
+            Removes all other trajectories from the batch.
+        is_stopped : function
+            Returns True if the user has interrupted the run.
+        """
         record = self.record
-        guide = PauseHandler(
-            paces, self.control, self.method, self.stop_times, lambda i: self.family.member(int(places[i]))
+        pause_handler = PauseHandler(
+            adaptive_runs, self.control, self.method, self.stop_times, lambda i: self.family.member(int(members[i]))
         )
-        before = {name: paces.read(name).copy() for name in RECORDED_INITIAL_FIELDS}
-        record.record_initial(places, before["x"], before["energy"], before["entropy"])
-        followed = np.ones(len(places), dtype=bool)
-        guide.resume_paused()
-        record.quantities["first_step"][places] = np.minimum(paces.read("next_step_size"), self._start_stop_length[2])
+        initial = {name: adaptive_runs.read(name).copy() for name in RECORDED_INITIAL_FIELDS}
+        record.record_initial(members, initial["x"], initial["energy"], initial["entropy"])
+        is_running = np.ones(len(members), dtype=bool)
+        pause_handler.resume_paused()
+        record.quantities["first_step"][members] = np.minimum(
+            adaptive_runs.read("next_step_size"), self._start_stop_length[2]
+        )
 
         def record_finished(
-            ended: np.ndarray, status: np.ndarray, fields: dict[str, np.ndarray], end_time: np.ndarray
+            indices: np.ndarray, status: np.ndarray, fields: dict[str, np.ndarray], end_time: np.ndarray
         ) -> None:
-            at = {name: values[ended] for name, values in before.items()}
-            record.finish_members(places[ended], at, fields, status, end_time)
-            record.rejected[places[ended]] = paces.read("n_rejected", ended)
+            initial_fields = {name: values[indices] for name, values in initial.items()}
+            record.finish_members(members[indices], initial_fields, fields, status, end_time)
+            record.rejected[members[indices]] = adaptive_runs.read("n_rejected", indices)
 
-        def fields_of(chosen: np.ndarray) -> dict[str, np.ndarray]:
-            return {name: paces.read(name, chosen) for name in REPORTED_FIELDS}
+        def fields_of(indices: np.ndarray) -> dict[str, np.ndarray]:
+            return {name: adaptive_runs.read(name, indices) for name in REPORTED_FIELDS}
 
         try:
-            while followed.any() and not stopped():
-                paces.advance(int(np.clip(TARGET_ATTEMPTS_PER_CALL // len(places), *ATTEMPTS_PER_CALL_RANGE)))
-                guide.confirm_events()
-                there = guide.paused_indices(StatusCode.PAUSED_AT_STOP)
-                if there.size:
-                    columns = [paces.read("x", there), *(paces.read(n, there)[:, None] for n in ("energy", "entropy"))]
-                    record.store_states_at(places[there], paces.read("t", there), np.hstack(columns))
-                guide.resume_paused()
-                status = paces.read("status")
-                ended = np.flatnonzero(
-                    followed
+            while is_running.any() and not is_stopped():
+                adaptive_runs.advance(int(np.clip(TARGET_ATTEMPTS_PER_CALL // len(members), *ATTEMPTS_PER_CALL_RANGE)))
+                pause_handler.confirm_events()
+                stopped_indices = pause_handler.paused_indices(StatusCode.PAUSED_AT_STOP)
+                if stopped_indices.size:
+                    columns = [
+                        adaptive_runs.read("x", stopped_indices),
+                        *(adaptive_runs.read(n, stopped_indices)[:, None] for n in ("energy", "entropy")),
+                    ]
+                    record.store_states_at(
+                        members[stopped_indices], adaptive_runs.read("t", stopped_indices), np.hstack(columns)
+                    )
+                pause_handler.resume_paused()
+                status = adaptive_runs.read("status")
+                finished_indices = np.flatnonzero(
+                    is_running
                     & ~np.isin(
                         status, (StatusCode.COMPLETED, StatusCode.PAUSED_AT_STOP, StatusCode.PAUSED_FOR_GROWTH_RATE)
                     )
                 )
-                if ended.size:
-                    codes = np.where(status[ended] == StatusCode.REACHED_END, StatusCode.COMPLETED, status[ended])
-                    record_finished(ended, codes, fields_of(ended), paces.read("t", ended))
-                followed[ended] = False
-                self.progress_counter.add(np.unique(places[ended]).size)
-                if only is not None and 2 * followed.sum() <= len(places) and followed.any():
-                    left = np.flatnonzero(followed)
-                    only(left)
-                    places, followed = places[left], followed[left]
-                    before = {name: values[left] for name, values in before.items()}
+                if finished_indices.size:
+                    codes = np.where(
+                        status[finished_indices] == StatusCode.REACHED_END,
+                        StatusCode.COMPLETED,
+                        status[finished_indices],
+                    )
+                    record_finished(
+                        finished_indices, codes, fields_of(finished_indices), adaptive_runs.read("t", finished_indices)
+                    )
+                is_running[finished_indices] = False
+                self.progress_counter.add(np.unique(members[finished_indices]).size)
+                if keep_only is not None and 2 * is_running.sum() <= len(members) and is_running.any():
+                    running_indices = np.flatnonzero(is_running)
+                    keep_only(running_indices)
+                    members, is_running = members[running_indices], is_running[running_indices]
+                    initial = {name: values[running_indices] for name, values in initial.items()}
         except KeyboardInterrupt:
             self.interrupted = True
-        left = np.flatnonzero(followed)
-        if left.size:
-            record_finished(left, np.full(left.size, StatusCode.INTERRUPTED), fields_of(left), paces.read("t", left))
+        running_indices = np.flatnonzero(is_running)
+        if running_indices.size:
+            record_finished(
+                running_indices,
+                np.full(running_indices.size, StatusCode.INTERRUPTED),
+                fields_of(running_indices),
+                adaptive_runs.read("t", running_indices),
+            )

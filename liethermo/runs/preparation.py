@@ -1,4 +1,4 @@
-"""What a run is made of: the system and the method as they are run, and the laws that it will be judged by."""
+"""Preparation of a run: the system and the method as the engines run them, the initial state, and the promised laws."""
 
 from __future__ import annotations
 
@@ -34,17 +34,18 @@ from .fluctuations import Fluctuations
 Result = TypeVar("Result")
 
 MISSING_GROUP_MESSAGE = "an attitude is for a system with a group: give LiePoissonSystem one, such as group=mf.SO(3)"
+"""Error message for an attitude of a system without a group."""
 
 
 def refuse_tracers(function: Callable[..., Result]) -> Callable[..., Result]:
-    """Decorator: say that a run takes numbers, and what to take instead, where JAX traces its arguments."""
+    """Decorate a function of numbers: if JAX traces its arguments, raise an InputError that names ``lt.flow``."""
 
     @functools.wraps(function)
-    def call(*arguments, **named) -> Result:
+    def call(*arguments, **keywords) -> Result:
         try:
-            return function(*arguments, **named)
+            return function(*arguments, **keywords)
         except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError) as error:
-            if not is_traced(arguments, named):
+            if not is_traced(arguments, keywords):
                 raise
             raise InputError(
                 f"{function.__name__} runs on numbers, and jax.jit, jax.grad or jax.vmap traces its arguments. Use "
@@ -54,14 +55,14 @@ def refuse_tracers(function: Callable[..., Result]) -> Callable[..., Result]:
     return call
 
 
-def check_choice(what: str, given, choices: tuple[str, ...]) -> None:
-    if given not in choices:
-        *others, last = map(repr, choices)
-        raise InputError(f"{what} must be {', '.join(others)} or {last}, not {given!r}")
+def check_choice(name: str, value, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        *leading_choices, last_choice = map(repr, choices)
+        raise InputError(f"{name} must be {', '.join(leading_choices)} or {last_choice}, got {value!r}")
 
 
 def resolve_invariants(system: System, x0) -> System:
-    """The system, with what it conserves found out near the states that a run starts from, where that is open."""
+    """Return the system with undecided conservation laws decided at states near x0."""
     return system.resolve_invariants_near(x0) if _has_undecided_invariants(system) else system
 
 
@@ -74,16 +75,19 @@ def _has_undecided_invariants(system: System) -> bool:
 def prepare_run(
     system: System, method, noise: Fluctuations | None = None, tolerance: float | None = None
 ) -> tuple[System, Any]:
-    """The system and the method as they are run, with adaptive steps of a tolerance or with given ones.
+    """Return the system and the method as they are run, for a tolerance of adaptive steps or for fixed steps.
 
-    With clock and work where the energy depends on time, with noise, with attitudes where there is a group, in charts
-    on a manifold or in the space around it.
+    They include clock and work for a driven system, noise, the attitude if there is a group, and charts or the
+    embedding of a manifold.
     """
     if not isinstance(method, OneStepMethod):
         if noise is not None:
-            raise InputError(f"steps with noise are those of lt.MetriplecticMidpoint, and {method} has none")
+            raise InputError(f"noise= works only with lt.MetriplecticMidpoint, got {method}")
         if system.needs_attitude:
-            raise InputError(f"{method} follows no attitude, and the torque {system.torque_name} depends on it")
+            raise InputError(
+                f"the torque {system.torque_name} depends on the attitude, which {method} cannot integrate. Use a "
+                "method of the library, such as lt.MetriplecticGauss()"
+            )
         return make_autonomous(system, unit=1.0), method  # its errors are measured component by component
     method = method if noise is None else noise.method_with_noise(make_autonomous(system), method)
     return prepare_for_method(system, method, tolerance, True)
@@ -93,24 +97,26 @@ def prepare_run(
 def prepare_for_method(
     system: System, method: OneStepMethod, tolerance: float | None = None, attitude: bool = False
 ) -> tuple[System, OneStepMethod]:
-    """The same for a method of the library; attitudes where a torque depends on them, or where they are asked for."""
-    found = make_autonomous(system if method.uses_charts else embed_in_arrays(system))
-    method = trace_energies(pullback_method(method, found).on(found, tolerance), found.dim)
-    wanted = system.reconstruction if isinstance(system, LiePoissonSystem) else None
-    if wanted is None or not (attitude or system.needs_attitude):
-        return found, method
-    assert isinstance(found, LiePoissonSystem | DrivenSystem)
-    kind = "exp" if method.explicit else wanted
-    return AttitudeSystem(found, kind), WithAttitude(method, kind)
+    """Return the system and the method as they are run, with an attitude if wanted or needed by a torque."""
+    autonomous_system = make_autonomous(system if method.uses_charts else embed_in_arrays(system))
+    method = trace_energies(
+        pullback_method(method, autonomous_system).on(autonomous_system, tolerance), autonomous_system.dim
+    )
+    reconstruction = system.reconstruction if isinstance(system, LiePoissonSystem) else None
+    if reconstruction is None or not (attitude or system.needs_attitude):
+        return autonomous_system, method
+    assert isinstance(autonomous_system, LiePoissonSystem | DrivenSystem)
+    kind = "exp" if method.explicit else reconstruction
+    return AttitudeSystem(autonomous_system, kind), WithAttitude(method, kind)
 
 
 def initial_state(system: System, x0, t: float, attitude=None, batch: bool = False) -> jax.Array | np.ndarray:
-    """The state of a run that starts from one of its user; or several, with ``batch``.
+    """Return the initial state of a prepared system from the user's x0; with ``batch``, from a batch of them.
 
     Raises
     ------
     InputError
-        If there is an attitude and no group.
+        If ``attitude`` is given and the system has no group.
     """
     if isinstance(system, AttitudeSystem):
         return system.initial_state(x0, attitude, batch, t)
@@ -120,12 +126,12 @@ def initial_state(system: System, x0, t: float, attitude=None, batch: bool = Fal
 
 
 def checked_initial_state(system: System, method, x0, t: float, attitude=None) -> jax.Array | np.ndarray:
-    """The state of a run of a method that starts from one of its user.
+    """Return the initial state of a prepared system from the user's x0, after checking that a run can start there.
 
     Raises
     ------
     InputError
-        If there is an attitude and no group, or no run can start there.
+        If ``attitude`` is given and the system has no group, or no run can start at x0.
     """
     x = initial_state(system, x0, t, attitude)
     if reason := why_not_startable(system, method, x):
@@ -134,14 +140,14 @@ def checked_initial_state(system: System, method, x0, t: float, attitude=None) -
 
 
 def why_not_startable(system: System, method, x) -> str:
-    """Why no run can start at x, or at one of several states, in words; empty where one can."""
-    spared = system.has_generator and (not isinstance(method, OneStepMethod) or method.explicit)
-    reason = system.outside(x) or ("" if spared else system.why_singular(x))
+    """Return why no run can start at x, a state or a batch of states; "" if it can."""
+    ignores_singularity = system.has_generator and (not isinstance(method, OneStepMethod) or method.explicit)
+    reason = system.outside(x) or ("" if ignores_singularity else system.why_singular(x))
     return reason and f"the run cannot start at this x0: {reason}"
 
 
 def wrap_family(family: Family, system: System) -> Family:
-    """The family of what the members are run as, where the system is what one of them is."""
+    """Return the family with each member wrapped as ``system`` wraps one of them."""
     if isinstance(system, AttitudeSystem):
         return wrap_family(family, system.body).map_members(AttitudeSystem, system.reconstruction)
     if isinstance(system, EmbeddedSystem):
@@ -150,39 +156,45 @@ def wrap_family(family: Family, system: System) -> Family:
 
 
 MAX_LIMITED_SYSTEMS = 64
-"""Systems with the spans of their runs that are held in memory, those last used."""
+"""Largest number of systems limited to a span that are cached; the least recently used are dropped."""
 
 _limited_systems: LRUCache[tuple[System, System]] = LRUCache(MAX_LIMITED_SYSTEMS)
 
 
 def limit_to_span(system: System, start: float, end: float) -> System:
-    """Return a system as it is run, its functions of time evaluated at times from ``start`` to ``end`` only.
+    """Return the prepared system with its functions of time evaluated only at times from ``start`` to ``end``.
 
-    One object for equal arguments, so that what is found for it is found once.
+    Equal arguments return the same object, so that cached results are shared.
     """
     if not is_driven_run(system):
         return system
     if is_traced(system):
         return limit_times(system, start, end)
-    # held with what it is made of, whose identity no other object takes meanwhile
+    # the value holds the system, so that its id stays its own
     return _limited_systems.get_or_compute((id(system), start, end), lambda: (system, limit_times(system, start, end)))[
         1
     ]
 
 
 def limit_family_to_span(family: Family, system: System, start: float, end: float) -> Family:
-    """Return the family of what :func:`limit_to_span` makes of the members, where the system is one of them."""
+    """Return the family with each member limited to a span; ``system`` is one of the members."""
     return family.map_members_with_numbers(limit_times, start, end) if is_driven_run(system) else family
 
 
 def is_driven_run(system: System) -> bool:
-    """Whether a system as it is run has a clock, since its functions depend on time."""
+    """Return True if a prepared system has a clock, because its functions depend on time."""
     return isinstance(system.body if isinstance(system, AttitudeSystem) else system, DrivenSystem)
 
 
 @memoize
 def invariants_and_laws(system: System, method) -> tuple[dict, Laws]:
-    """What is recorded along a run and what is promised of it; raises InputError where the method cannot be used."""
+    """Return the invariants recorded along a run and the laws promised for it.
+
+    Raises
+    ------
+    InputError
+        If the method cannot run the system.
+    """
     if isinstance(method, OneStepMethod):
         method.check(system)
     invariants = system.invariants()
@@ -190,21 +202,29 @@ def invariants_and_laws(system: System, method) -> tuple[dict, Laws]:
 
 
 def promised_laws(system: System, method, invariants) -> Laws:
-    """What the system promises and, of its invariants, what the method keeps."""
-    keeps = method.preserves_function if isinstance(method, OneStepMethod) else lambda system, name: False
-    constants = [*(name for name, (_, kept) in invariants.items() if kept), *system.constant_names]
-    unknown = tuple(name for name, (_, kept) in invariants.items() if kept is None)
-    conserved = tuple(name for name in constants if keeps(system, name))
-    unpromised = tuple(name for name in constants if name not in conserved)
+    """Return the laws that the system promises and, of its invariants, those that the method preserves."""
+    method_preserves = method.preserves_function if isinstance(method, OneStepMethod) else lambda system, name: False
+    constants = [*(name for name, (_, is_conserved) in invariants.items() if is_conserved), *system.constant_names]
+    unknown = tuple(name for name, (_, is_conserved) in invariants.items() if is_conserved is None)
+    conserved_names = tuple(name for name in constants if method_preserves(system, name))
+    unpromised_names = tuple(name for name in constants if name not in conserved_names)
     if isinstance(method, OneStepMethod) and noise_dimension(method):  # what holds on paths, and what in the mean
         energy = "conserved" if system.energy_law == "conserved" else None
-        mean = ("energy", "entropy") if energy is None else ("entropy",)
+        laws_in_mean = ("energy", "entropy") if energy is None else ("entropy",)
         return Laws(
-            energy, None, conserved, tuple(system.ledger), (), system.balance_entries, unpromised, mean, unknown
+            energy,
+            None,
+            conserved_names,
+            tuple(system.ledger),
+            (),
+            system.balance_entries,
+            unpromised_names,
+            laws_in_mean,
+            unknown,
         )
     quadratic = system.entropy is not None and system.entropy.is_quadratic
     exact = {"energy": {"energy"}, "entropy": {"entropy_law", *(["entropy_law_quadratic"] if quadratic else [])}}
     inexact = tuple(law for law, claims in exact.items() if not claims & method.preserves)
     ledger = tuple(system.ledger)
-    of_both = system.energy_law, system.entropy_law
-    return Laws(*of_both, conserved, ledger, inexact, system.balance_entries, unpromised, unknown=unknown)
+    law_names = system.energy_law, system.entropy_law
+    return Laws(*law_names, conserved_names, ledger, inexact, system.balance_entries, unpromised_names, unknown=unknown)

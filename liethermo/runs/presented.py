@@ -1,4 +1,4 @@
-"""What a run is presented as: its states with what is recorded of them, where it comes from, its evidence."""
+"""The solution of a run: states in the user's form, recorded functions, provenance, and evidence."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ def build_solution(
     system_without_span: System | None = None,
     **fields,
 ) -> Solution:
-    """The solution that a user sees of the states x, shape (times, n), of a run.
+    """Return the solution in the user's form from the states x, shape (times, n), of a run.
 
     Parameters
     ----------
     step_sizes : array, shape (times - 1,)
-        Sizes of steps that the run took from the states.
-    replay : Replay
+        Size of a step that the run took after each state.
+    replay : StepReplay
     system_without_span : System, optional
-        The system without the span of the run, for which the laws are known already; by default ``system``.
+        The system before it was limited to the span, whose laws are cached; by default ``system``.
     **fields
-        The others of :class:`Solution`.
+        Further fields of :class:`Solution`.
     """
     invariants, laws = invariants_and_laws(system if system_without_span is None else system_without_span, method)
     functions = {name: f for name, (f, _) in invariants.items()}
-    found = Solution(
+    solution = Solution(
         x=x,
         entropy=None if system.entropy is None else entropy,
         casimirs={
@@ -57,7 +57,7 @@ def build_solution(
         evidence_source=EvidenceCollector(system, method, functions, x, np.asarray(fields["t"]), step_sizes, replay),
         **fields,
     )
-    return system.to_user_solution(found)
+    return system.to_user_solution(solution)
 
 
 def _function_value(function, x):
@@ -66,7 +66,7 @@ def _function_value(function, x):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class EngineReplay:
-    """Steps from any state, by the program that a run has compiled: a :class:`StepReplay`."""
+    """Replays steps from any state with the compiled program of a run: a :class:`StepReplay`."""
 
     engine: EngineWithFallback
 
@@ -74,19 +74,19 @@ class EngineReplay:
         return self.engine.advance(self.engine.initial_run_state(jnp.asarray(x)), h, 1, steps)[0]
 
     def states_after_steps(self, x: np.ndarray, h: float, steps: int) -> np.ndarray:
-        state, found = self.engine.initial_run_state(jnp.asarray(x)), [np.empty((0, len(x)))]
+        state, chunks = self.engine.initial_run_state(jnp.asarray(x)), [np.empty((0, len(x)))]
         while steps > 0 and int(state.status) == StatusCode.COMPLETED:
-            saves = min(steps, self.engine.max_saves_per_call)
-            state, (states, _, _, reached) = self.engine.advance(state, h, saves, 1)
-            found.append(np.asarray(states)[:saves][np.asarray(reached)[:saves].astype(bool)])
-            steps -= saves
-        return np.concatenate(found)
+            n_saves = min(steps, self.engine.max_saves_per_call)
+            state, (states, _, _, is_reached) = self.engine.advance(state, h, n_saves, 1)
+            chunks.append(np.asarray(states)[:n_saves][np.asarray(is_reached)[:n_saves].astype(bool)])
+            steps -= n_saves
+        return np.concatenate(chunks)
 
 
 def run_provenance(
-    system: System, method: Any, step: float | Adaptive, span: tuple[float, float], every: int | None
+    system: System, method: Any, step: float | Adaptive, span: tuple[float, float], save_every: int | None
 ) -> dict[str, Any]:
-    """Where a run comes from: JSON data."""
+    """Return the provenance of a run as JSON data: versions, date, method, step, span and system."""
     algebra, group, inertia = system.lie_algebra, system.matrix_group, system.inertia
     return {
         "library": f"liethermo {_library_version()}",
@@ -95,7 +95,7 @@ def run_provenance(
         "method": str(method),
         "step": dataclasses.asdict(step) if isinstance(step, Adaptive) else step,
         "t_span": list(span),
-        "save_every": every,
+        "save_every": save_every,
         "system": type(system).__name__,
         "algebra": None if algebra is None else algebra.name,
         "group": None if group is None else group.name,

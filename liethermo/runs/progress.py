@@ -11,22 +11,22 @@ if TYPE_CHECKING:
 
 
 class Progress:
-    """A progress bar on the standard error, shown only where someone is there to see it.
+    """A progress bar on the standard error, shown by default only in a terminal.
 
     Parameters
     ----------
     span : (float, float)
-        What is shown at the start and at the end: a time, or how much is done.
+        Values at the start and at the end: times, or numbers of finished items.
     is_shown : bool or None
-        None where the standard error tells.
+        With None, the bar is shown if the standard error is a terminal.
     text_format : str
-        Of the place between these.
+        Format of the current value.
     """
 
-    def __init__(self, span: tuple[float, float], wanted: bool | None, text: str = "t = {:.4g}"):
-        self.span, self.text_format = span, text
+    def __init__(self, span: tuple[float, float], is_shown: bool | None, text_format: str = "t = {:.4g}"):
+        self.span, self.text_format = span, text_format
         self.bar: Bar | None = None
-        self.is_shown = sys.stderr.isatty() if wanted is None else wanted
+        self.is_shown = sys.stderr.isatty() if is_shown is None else is_shown
 
     def __enter__(self):
         if self.is_shown:

@@ -1,4 +1,4 @@
-"""What is kept of the trajectories of an ensemble, and where the evidence for its audit comes from."""
+"""Record of an ensemble run: outcome and saved states of each trajectory, and evidence for the audit."""
 
 from __future__ import annotations
 
@@ -41,150 +41,162 @@ RECORDED_QUANTITIES = (
     "residual energy_sensitivity entropy_sensitivity first_energy entropy_change smallest_energy largest_energy "
     "end_time first_step distance"
 ).split()
+"""Names of the arrays, one number per trajectory, that an ensemble record holds."""
 
 FAILURE_CODES = (StatusCode.NOT_CONVERGED, StatusCode.NON_FINITE, StatusCode.STEP_UNDERFLOW, StatusCode.STEP_LIMIT)
+"""Status codes of failed trajectories."""
 
 MAX_EXPLAINED_FAILURES = 1_000
-"""Trajectories that failed of which more is said than that, at most."""
+"""Largest number of failed trajectories that are checked for unbounded growth."""
 
 MemberSelection = slice | np.ndarray
-"""Which trajectories, of those that are run."""
+"""Indices of trajectories in a record."""
 
 
 class EnsembleRecord:
-    """What is kept of each trajectory, filled in part by part.
+    """Outcomes and saved states of all trajectories of an ensemble run, filled in batch by batch.
 
     Parameters
     ----------
     family : Family
-        Of the systems that are run.
+        The systems as they are run.
     member : System
-        One of them.
+        One member of the family.
     x0 : array, shape (B, n)
-    schedule : Course
+    schedule : StepSchedule
     outputs : {"final", "trajectory", "summary"}
     h : float
-        The size of the steps; NaN of adaptive ones.
+        Step size; NaN for adaptive steps.
     """
 
-    def __init__(self, family: Family, member: System, x0: np.ndarray, course: StepSchedule, outputs: str, h: float):
+    def __init__(self, family: Family, member: System, x0: np.ndarray, schedule: StepSchedule, outputs: str, h: float):
         self.h = h
-        self.family, self.member, self.x0, self.schedule = family, member, x0, course
+        self.family, self.member, self.x0, self.schedule = family, member, x0, schedule
         self.saved_times, self.saved_step_counts, self.n_steps = (
-            course.saved_times,
-            course.saved_step_counts,
-            course.n_steps,
+            schedule.saved_times,
+            schedule.saved_step_counts,
+            schedule.n_steps,
         )
-        size = len(x0)
-        self.quantities: dict[str, np.ndarray] = {name: np.empty(size) for name in RECORDED_QUANTITIES}
-        self.is_finished = np.zeros(size, dtype=bool)
-        self.status = np.full(size, StatusCode.INTERRUPTED, dtype=np.int8)
-        self.steps, self.iterations, self.rejected = (np.zeros(size, dtype=np.int64) for _ in range(3))
-        self.quantities["first_step"][:] = course.longest_steps[0]
-        self.quantities["end_time"][:] = course.start
-        self.x = np.empty((size, member.dim)) if outputs == "final" else None
+        n_members = len(x0)
+        self.quantities: dict[str, np.ndarray] = {name: np.empty(n_members) for name in RECORDED_QUANTITIES}
+        self.is_finished = np.zeros(n_members, dtype=bool)
+        self.status = np.full(n_members, StatusCode.INTERRUPTED, dtype=np.int8)
+        self.steps, self.iterations, self.rejected = (np.zeros(n_members, dtype=np.int64) for _ in range(3))
+        self.quantities["first_step"][:] = schedule.longest_steps[0]
+        self.quantities["end_time"][:] = schedule.start
+        self.x = np.empty((n_members, member.dim)) if outputs == "final" else None
         self.trajectories = (
-            np.full((size, len(self.saved_times), member.dim + 2), np.nan) if outputs == "trajectory" else None
+            np.full((n_members, len(self.saved_times), member.dim + 2), np.nan) if outputs == "trajectory" else None
         )
-        self.work = np.empty(size)
+        self.work = np.empty(n_members)
         self.failure_reasons: dict[int, str] = {}
 
-    def record_initial(self, chosen: MemberSelection, x: np.ndarray, energy: np.ndarray, entropy: np.ndarray) -> None:
-        """The states at the start."""
+    def record_initial(self, members: MemberSelection, x: np.ndarray, energy: np.ndarray, entropy: np.ndarray) -> None:
+        """Store the initial states with energy and entropy, if trajectories are saved."""
         if self.trajectories is not None:
-            self.trajectories[chosen, 0] = np.column_stack([x, energy, entropy])
+            self.trajectories[members, 0] = np.column_stack([x, energy, entropy])
 
-    def store_states(self, chosen: MemberSelection, first: int, states: np.ndarray) -> None:
-        """States at the kept times from a first one on, with energy and entropy, shape (trajectories, m, n + 2)."""
+    def store_states(self, members: MemberSelection, first_save: int, states: np.ndarray) -> None:
+        """Store states from save number ``first_save`` on, with energy and entropy, shape (members, saves, n + 2)."""
         if self.trajectories is not None:
-            self.trajectories[chosen, first : first + states.shape[1]] = states
+            self.trajectories[members, first_save : first_save + states.shape[1]] = states
 
-    def store_states_at(self, chosen: np.ndarray, t: np.ndarray, states: np.ndarray) -> None:
-        """The states of some trajectories, each at one of the kept times."""
+    def store_states_at(self, members: np.ndarray, t: np.ndarray, states: np.ndarray) -> None:
+        """Store states with energy and entropy, shape (members, n + 2), each at its saved time t."""
         if self.trajectories is not None:
-            self.trajectories[chosen, np.searchsorted(self.saved_times, t)] = states
+            self.trajectories[members, np.searchsorted(self.saved_times, t)] = states
 
     def finish_fixed_step_members(
-        self, chosen: MemberSelection, before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray]
+        self, members: MemberSelection, initial: Mapping[str, np.ndarray], final: Mapping[str, np.ndarray]
     ) -> None:
-        """The outcome of some trajectories of equal steps: fields of :class:`liethermo.engines.stepping.State`."""
-        steps = after["step"].astype(np.int64)
-        status = np.where((after["status"] == 0) & (steps < self.n_steps), StatusCode.INTERRUPTED, after["status"])
-        self.finish_members(chosen, before, after, status, self.schedule.times_after(steps))
+        """Record the outcome of trajectories with fixed steps, from their first and last engine states.
+
+        Parameters
+        ----------
+        initial, final : mapping of arrays
+            Fields of :class:`liethermo.engines.stepping.State`.
+        """
+        steps = final["step"].astype(np.int64)
+        status = np.where((final["status"] == 0) & (steps < self.n_steps), StatusCode.INTERRUPTED, final["status"])
+        self.finish_members(members, initial, final, status, self.schedule.times_after(steps))
         if self.trajectories is not None:
-            late = (
+            is_after_end = (
                 np.arange(len(self.saved_step_counts))
                 >= np.searchsorted(self.saved_step_counts, steps, side="right")[:, None]
             )
-            self.trajectories[chosen] = np.where(late[..., None], np.nan, self.trajectories[chosen])
+            self.trajectories[members] = np.where(is_after_end[..., None], np.nan, self.trajectories[members])
 
-    @np.errstate(over="ignore", invalid="ignore")  # what has overflowed is not known
+    @np.errstate(over="ignore", invalid="ignore")  # overflowed states have the status non_finite
     def finish_members(
-        self, chosen: MemberSelection, before: Mapping, after: Mapping, status: np.ndarray, end_time: np.ndarray
+        self, members: MemberSelection, initial: Mapping, final: Mapping, status: np.ndarray, end_time: np.ndarray
     ) -> None:
-        """How some trajectories ended, and when."""
-        rows, energy, first = self.quantities, after["energy"], before["energy"]
-        self.is_finished[chosen] = True
-        rows["energy"][chosen], rows["entropy"][chosen] = energy, after["entropy"]
-        drift = np.maximum(after["largest_energy"] - first, first - after["smallest_energy"])
-        rows["energy_drift"][chosen] = drift / RoundingScale(first, after["energy_sensitivity"]).scale
+        """Record the outcome of trajectories: status, end time, final state and the quantities of the audit."""
+        quantities, energy, initial_energy = self.quantities, final["energy"], initial["energy"]
+        self.is_finished[members] = True
+        quantities["energy"][members], quantities["entropy"][members] = energy, final["entropy"]
+        drift = np.maximum(final["largest_energy"] - initial_energy, initial_energy - final["smallest_energy"])
+        quantities["energy_drift"][members] = drift / RoundingScale(initial_energy, final["energy_sensitivity"]).scale
         for name in ("energy_sensitivity", "entropy_sensitivity", "first_energy", "smallest_energy", "largest_energy"):
-            rows[name][chosen] = after[name]
-        rows["entropy_change"][chosen] = after["entropy"] - before["entropy"]
-        rows["distance"][chosen] = np.abs(after["x"] - before["x"]).max(axis=1)
-        rows["largest_energy_increment"][chosen] = after["largest_energy_increment"]
-        rows["least_entropy_increment"][chosen] = after["least_entropy_increment"]
-        rows["entropy_scale"][chosen] = np.maximum(np.abs(before["entropy"]), np.abs(after["entropy"]))
-        rows["residual"][chosen] = after["residual"]
-        rows["end_time"][chosen] = end_time
+            quantities[name][members] = final[name]
+        quantities["entropy_change"][members] = final["entropy"] - initial["entropy"]
+        quantities["distance"][members] = np.abs(final["x"] - initial["x"]).max(axis=1)
+        quantities["largest_energy_increment"][members] = final["largest_energy_increment"]
+        quantities["least_entropy_increment"][members] = final["least_entropy_increment"]
+        quantities["entropy_scale"][members] = np.maximum(np.abs(initial["entropy"]), np.abs(final["entropy"]))
+        quantities["residual"][members] = final["residual"]
+        quantities["end_time"][members] = end_time
         start, end = (
-            np.asarray(relaxation_functional(self.member, f["energy"], f["entropy"])) for f in (before, after)
+            np.asarray(relaxation_functional(self.member, f["energy"], f["entropy"])) for f in (initial, final)
         )
         change = np.where(np.abs(end - start) > 1e-12 * np.abs(end), end - start, np.nan)
-        rows["relaxation_time"][chosen] = (
-            end * (end_time - self.schedule.start) - after["relaxation_integral"]
+        quantities["relaxation_time"][members] = (
+            end * (end_time - self.schedule.start) - final["relaxation_integral"]
         ) / change
-        self.status[chosen], self.steps[chosen] = status, after["step"]
-        self.iterations[chosen] = after["fixed_point_iterations"] + after["newton_iterations"]
-        self._explain_failures(chosen, after["x"], status, end_time)
+        self.status[members], self.steps[members] = status, final["step"]
+        self.iterations[members] = final["fixed_point_iterations"] + final["newton_iterations"]
+        self._explain_failures(members, final["x"], status, end_time)
         if self.x is not None:
-            self.x[chosen] = after["x"]
+            self.x[members] = final["x"]
         if (driven := driven_system(self.member)) is not None:
-            self.work[chosen] = driven.work(after["x"][..., : driven.dim])
+            self.work[members] = driven.work(final["x"][..., : driven.dim])
 
     def _explain_failures(
-        self, chosen: MemberSelection, x: np.ndarray, status: np.ndarray, end_time: np.ndarray
+        self, members: MemberSelection, x: np.ndarray, status: np.ndarray, end_time: np.ndarray
     ) -> None:
-        """What is known of trajectories that failed, of the first of them at least."""
+        """Store failure messages of trajectories that grow without bound, for the first failures at least."""
         status, end_time = (np.broadcast_to(a, len(x)) for a in (status, end_time))
-        failed = np.flatnonzero(np.isin(status, FAILURE_CODES))[
+        failed_rows = np.flatnonzero(np.isin(status, FAILURE_CODES))[
             : max(0, MAX_EXPLAINED_FAILURES - len(self.failure_reasons))
         ]
-        if not len(failed):
+        if not len(failed_rows):
             return
-        places = np.arange(len(self.x0))[chosen][failed]
-        own = self.family.select(places).parameter_matrix(slice(None), len(places))
-        speeds = _vector_fields((self.family.form, own.shape[1]), np.concatenate([own, x[failed]], axis=1))
-        for i, j, speed in zip(failed, places, speeds, strict=True):
-            now = float(end_time[i])
-            if text := ensemble_failure_message(x[i], self.x0[j], speed, now - self.schedule.start, now, self.h):
+        member_indices = np.arange(len(self.x0))[members][failed_rows]
+        parameters = self.family.select(member_indices).parameter_matrix(slice(None), len(member_indices))
+        velocities = _vector_fields(
+            (self.family.form, parameters.shape[1]), np.concatenate([parameters, x[failed_rows]], axis=1)
+        )
+        for i, j, velocity in zip(failed_rows, member_indices, velocities, strict=True):
+            t = float(end_time[i])
+            if text := ensemble_failure_message(x[i], self.x0[j], velocity, t - self.schedule.start, t, self.h):
                 self.failure_reasons[int(j)] = text
 
     def set_unfinished_to_nan(self) -> None:
-        """Nothing is known of trajectories that were not finished."""
+        """Set the quantities of unfinished trajectories to NaN."""
         if not self.is_finished.all():
-            known = [values for name, values in self.quantities.items() if name not in ("first_step", "end_time")]
-            for values in [*known, self.work, *([] if self.x is None else [self.x])]:
+            outcome_arrays = [
+                values for name, values in self.quantities.items() if name not in ("first_step", "end_time")
+            ]
+            for values in [*outcome_arrays, self.work, *([] if self.x is None else [self.x])]:
                 values[~self.is_finished] = np.nan
 
     # -- the result ---------------------------------------------------------------------------------------------------
 
     def to_ensemble(self, **fields: Any) -> Ensemble:
-        """All trajectories that were run."""
-        rows: dict[str, Any] = {
+        """Return the recorded trajectories as an :class:`Ensemble`, with further fields of it."""
+        quantities: dict[str, Any] = {
             n: values for n, values in self.quantities.items() if n not in ("distance", "first_step")
         }
-        x, energy, entropy, t = self.x, rows.pop("energy"), rows.pop("entropy"), self.saved_times[-1:]
+        x, energy, entropy, t = self.x, quantities.pop("energy"), quantities.pop("entropy"), self.saved_times[-1:]
         if self.trajectories is not None:
             x, energy, entropy, t = (
                 self.trajectories[..., :-2],
@@ -200,7 +212,7 @@ class EnsembleRecord:
         if (driven := driven_system(self.member)) is not None:
             work = self.work if self.trajectories is None else np.asarray(driven.work(x))
             x, x0, energy = None if x is None else x[..., :-2], x0[..., :-2], energy + work
-        found = Ensemble(
+        result = Ensemble(
             t=t,
             x=x,
             energy=energy,
@@ -213,132 +225,158 @@ class EnsembleRecord:
             attitude=attitude,
             attitude0=attitude0,
             work=work,
-            **rows,
+            **quantities,
             **fields,
         )
-        return self.member.reshape_to_sites(found)
+        return self.member.reshape_to_sites(result)
 
 
 class MemberSolutionBuilder:
-    """Finds one trajectory of an ensemble as a run of its own would present it."""
+    """Builds the :class:`Solution` of one trajectory of an ensemble, as a single run would present it."""
 
-    def __init__(self, record: EnsembleRecord, method: OneStepMethod, run: np.ndarray):
-        self.record, self.method, self.trajectory_numbers = record, method, run
+    def __init__(self, record: EnsembleRecord, method: OneStepMethod, trajectory_numbers: np.ndarray):
+        self.record, self.method, self.trajectory_numbers = record, method, trajectory_numbers
 
-    def __call__(self, many: Ensemble, i: int) -> Solution:
-        record, j, plain = self.record, int(np.searchsorted(self.trajectory_numbers, i)), many.member_solution(i)
+    def __call__(self, ensemble: Ensemble, i: int) -> Solution:
+        record, j, member_solution = (
+            self.record,
+            int(np.searchsorted(self.trajectory_numbers, i)),
+            ensemble.member_solution(i),
+        )
         system = record.family.member(j)
         if record.trajectories is None:
             assert record.x is not None
             x = np.stack([record.x0[j], record.x[j]])
         else:
-            x = record.trajectories[j, : len(plain.t), :-2]
-        steps = np.minimum(np.diff(plain.t), record.quantities["first_step"][j])
-        energy = plain.energy_balance
-        found = build_solution(
+            x = record.trajectories[j, : len(member_solution.t), :-2]
+        steps = np.minimum(np.diff(member_solution.t), record.quantities["first_step"][j])
+        energy = member_solution.energy_balance
+        solution = build_solution(
             system,
             self.method,
             x,
-            t=plain.t,
+            t=member_solution.t,
             energy=energy,
-            entropy=plain.entropy,
+            entropy=member_solution.entropy,
             step_sizes=steps,
             replay=EngineReplay(EngineWithFallback(system, self.method, "auto", 1)),
-            status=plain.status,
-            stats=plain.stats,
-            provenance=plain.provenance,
-            event_time=plain.event_time,
+            status=member_solution.status,
+            stats=member_solution.stats,
+            provenance=member_solution.provenance,
+            event_time=member_solution.event_time,
         )
         inertia = None if system.inertia is None else system.inertia.tolist()
-        return replace(found, provenance={**plain.provenance, "inertia": inertia})
+        return replace(solution, provenance={**member_solution.provenance, "inertia": inertia})
 
 
 class EnsembleEvidenceCollector:
-    """Finds the local errors of steps, and how the laws' functions are rounded, when it is called.
+    """Computes local errors and rounding scales of an ensemble when it is called.
 
-    Some trajectories are followed again from their start: half of them those that took most iterations, half evenly
-    spread. Their worst steps are compared with short ones.
+    A sample of trajectories is replayed from the start: half of them are those that took most iterations, half are
+    evenly spaced. Their worst steps are compared with substeps.
 
     Parameters
     ----------
     replay : function of (family, method, x, h, steps)
-        As :func:`.batches.follow_compiled` and :func:`.batches.follow_array`.
-    equal : int
-        Steps of one size that the run has taken from its start.
+        :func:`.batches.replay_compiled` or :func:`.batches.replay_array`.
+    n_equal_steps : int
+        Number of equal steps at the start of the run.
     """
 
-    def __init__(self, record: EnsembleRecord, method: OneStepMethod, follow: Callable, equal: int):
+    def __init__(self, record: EnsembleRecord, method: OneStepMethod, replay: Callable, n_equal_steps: int):
         effort = record.iterations / np.fmax(record.steps, 1)
-        some = largest_and_evenly_spaced(effort, MAX_LOCAL_ERROR_STEPS)
-        self.family, self.member, self.method = record.family.select(some), record.member, method
-        self.x, self.distance = np.ascontiguousarray(record.x0[some]), record.quantities["distance"][some]
-        self.h, self.start_time, self.replay = record.quantities["first_step"][some], record.schedule.start, follow
-        self.n_steps_taken = record.steps[some]
-        self.max_replayed_steps = max(1, min(equal, MAX_SAMPLED_VALUES // (REPLAY_COST_RATIO * self.x.size)))
+        sample = largest_and_evenly_spaced(effort, MAX_LOCAL_ERROR_STEPS)
+        self.family, self.member, self.method = record.family.select(sample), record.member, method
+        self.x, self.distance = np.ascontiguousarray(record.x0[sample]), record.quantities["distance"][sample]
+        self.h, self.start_time, self.replay = record.quantities["first_step"][sample], record.schedule.start, replay
+        self.n_steps_taken = record.steps[sample]
+        self.max_replayed_steps = max(1, min(n_equal_steps, MAX_SAMPLED_VALUES // (REPLAY_COST_RATIO * self.x.size)))
 
-    @np.errstate(over="ignore", invalid="ignore")  # what has overflowed is not known
+    @np.errstate(over="ignore", invalid="ignore")  # overflowed states have the status non_finite
     def __call__(self) -> Evidence:
-        form, number = self.family.form, len(self.x)
-        own = self.family.parameter_matrix(slice(None), number)
-        found = Evidence(terms=self._rounding_scales(own))
-        after, states = self.replay(self.family, self.method, self.x, self.h, self.max_replayed_steps)
-        of, place = np.nonzero(np.arange(self.max_replayed_steps) < np.fmin(after["step"], self.n_steps_taken)[:, None])
-        if not len(of):
-            return found
+        form, n_members = self.family.form, len(self.x)
+        parameters = self.family.parameter_matrix(slice(None), n_members)
+        evidence = Evidence(terms=self._rounding_scales(parameters))
+        final, states = self.replay(self.family, self.method, self.x, self.h, self.max_replayed_steps)
+        member_of_step, step_number = np.nonzero(
+            np.arange(self.max_replayed_steps) < np.fmin(final["step"], self.n_steps_taken)[:, None]
+        )
+        if not len(member_of_step):
+            return evidence
         path = np.concatenate([self.x[:, None], states], axis=1)
-        steps = StepSample(self.start_time + place * self.h[of], self.h[of], path[of, place], path[of, place + 1])
-        model, whole = (form, own.shape[1]), MIN_MOTION_FRACTION * self.distance
+        steps = StepSample(
+            self.start_time + step_number * self.h[member_of_step],
+            self.h[member_of_step],
+            path[member_of_step, step_number],
+            path[member_of_step, step_number + 1],
+        )
+        model, min_motion = (form, parameters.shape[1]), MIN_MOTION_FRACTION * self.distance
 
-        def field(at: np.ndarray, x: np.ndarray) -> np.ndarray:
-            given = np.broadcast_to(own[of[at], None], (*x.shape[:2], own.shape[1]))
-            flat = np.concatenate([given, x], axis=2).reshape(-1, own.shape[1] + x.shape[2])
-            return _vector_fields(model, flat).reshape(x.shape)
+        def field(step_indices: np.ndarray, x: np.ndarray) -> np.ndarray:
+            step_parameters = np.broadcast_to(
+                parameters[member_of_step[step_indices], None], (*x.shape[:2], parameters.shape[1])
+            )
+            rows = np.concatenate([step_parameters, x], axis=2).reshape(-1, parameters.shape[1] + x.shape[2])
+            return _vector_fields(model, rows).reshape(x.shape)
 
-        again, defect = select_worst_steps(steps, field, whole[of], n_replayed_steps(self.x.shape[1]))
-        chosen, x, h = self.family.select(of[again]), steps.x[again], steps.h[again]
-        parts = n_replayed_steps(self.x.shape[1])
-        (one, _), (short, _) = (self.replay(chosen, self.method, x, h / m, m) for m in (1, parts))
-        ends = [self._user_states(after["x"] + after["compensation"]) for after in (one, short)]
+        worst_indices, defect = select_worst_steps(
+            steps, field, min_motion[member_of_step], n_replayed_steps(self.x.shape[1])
+        )
+        members, x, h = (
+            self.family.select(member_of_step[worst_indices]),
+            steps.x[worst_indices],
+            steps.h[worst_indices],
+        )
+        n_substeps = n_replayed_steps(self.x.shape[1])
+        (single_step, _), (substeps, _) = (self.replay(members, self.method, x, h / m, m) for m in (1, n_substeps))
+        ends = [self._user_states(after["x"] + after["compensation"]) for after in (single_step, substeps)]
         start = self._user_states(x)
-        moved = np.abs(ends[0] - start).max(axis=1)
-        known = (one["status"] == 0) & (short["status"] == 0)
-        moving = ~known | (moved > MIN_RELATIVE_MOTION * np.abs(start).max(axis=1))
-        if not moving.any():
-            return found
-        errors = np.abs(ends[1] - ends[0]).max(axis=1) / np.fmax(np.fmax(moved, whole[of[again]]), SMALLEST_NORMAL)
-        errors = np.where(moving, np.where(known, errors, defect), 0.0)
-        worst = int(np.argmax(errors))
+        motion = np.abs(ends[0] - start).max(axis=1)
+        is_known = (single_step["status"] == 0) & (substeps["status"] == 0)
+        is_moving = ~is_known | (motion > MIN_RELATIVE_MOTION * np.abs(start).max(axis=1))
+        if not is_moving.any():
+            return evidence
+        errors = np.abs(ends[1] - ends[0]).max(axis=1) / np.fmax(
+            np.fmax(motion, min_motion[member_of_step[worst_indices]]), SMALLEST_NORMAL
+        )
+        errors = np.where(is_moving, np.where(is_known, errors, defect), 0.0)
+        max_index = int(np.argmax(errors))
         return replace(
-            found, local_error=float(errors[worst]), error_time=float(steps.t[again[worst]]), looked=len(steps.h)
+            evidence,
+            local_error=float(errors[max_index]),
+            error_time=float(steps.t[worst_indices[max_index]]),
+            looked=len(steps.h),
         )
 
-    def _rounding_scales(self, own: np.ndarray) -> dict[str, float]:
-        """The sizes at which the energy and the entropy are rounded, the largest of some trajectories."""
-        at = np.concatenate([own, self.x], axis=1)
-        largest = evaluate_at_points(_rounding_scales_at, (self.family.form, own.shape[1]), at).max(axis=0)
-        return {name: float(size) for name, size in zip(("energy", "entropy"), np.nan_to_num(largest), strict=False)}
+    def _rounding_scales(self, parameters: np.ndarray) -> dict[str, float]:
+        """Return the scales at which energy and entropy are rounded, each the largest of the sample."""
+        rows = np.concatenate([parameters, self.x], axis=1)
+        max_scales = evaluate_at_points(_rounding_scales_at, (self.family.form, parameters.shape[1]), rows).max(axis=0)
+        return {
+            name: float(scale) for name, scale in zip(("energy", "entropy"), np.nan_to_num(max_scales), strict=False)
+        }
 
     def _user_states(self, x: np.ndarray) -> np.ndarray:
         return np.asarray(self.member.points(x)).reshape(len(x), -1)
 
 
 def driven_system(system: System) -> DrivenSystem | None:
-    """What knows of a system as it is run which work is done on it."""
-    found = system.body if isinstance(system, AttitudeSystem) else system
-    return found if isinstance(found, DrivenSystem) else None
+    """Return the part of a prepared system that records external work, or None."""
+    body = system.body if isinstance(system, AttitudeSystem) else system
+    return body if isinstance(body, DrivenSystem) else None
 
 
-def _rounding_scales_at(model: tuple[ProgramStructure, int], at):
+def _rounding_scales_at(model: tuple[ProgramStructure, int], row):
     form, p = model
-    return rounding_scales(energy_and_entropy(form.build(at[:p])), at[p:])[1]
+    return rounding_scales(energy_and_entropy(form.build(row[:p])), row[p:])[1]
 
 
-def _vector_fields(model: tuple[ProgramStructure, int], at: np.ndarray) -> np.ndarray:
-    """The vector fields of systems at states, shape (m, n), from their parameters and the states, shape (m, p + n)."""
+def _vector_fields(model: tuple[ProgramStructure, int], rows: np.ndarray) -> np.ndarray:
+    """Return vector fields, shape (m, n), from rows of parameters and states, shape (m, p + n)."""
     with np.errstate(all="ignore"):
-        return np.asarray(evaluate_at_points(_vector_field, model, at))
+        return np.asarray(evaluate_at_points(_vector_field, model, rows))
 
 
-def _vector_field(model: tuple[ProgramStructure, int], at):
+def _vector_field(model: tuple[ProgramStructure, int], row):
     form, p = model
-    return form.build(at[:p]).vector_field(at[p:])
+    return form.build(row[:p]).vector_field(row[p:])

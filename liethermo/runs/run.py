@@ -1,4 +1,4 @@
-"""The only time loop: a run under way, what is kept of it, and how it ended."""
+"""The time loop of ``integrate``: one run, the states that it saves, and its final status."""
 
 from __future__ import annotations
 
@@ -33,89 +33,91 @@ from .timetable import StepSchedule
 from .watch import EventSet
 
 MAX_PROVENANCE_COMPONENTS = 1_000
-"""Components up to which the first state is listed in the provenance; an attribute of a file cannot be of any size."""
+"""Largest number of components of an initial state that the provenance lists; attributes of a file are limited in
+size."""
 
 CHECKPOINT_SECONDS = 60.0
-"""A run with ``save_to`` rewrites its file at most this often before the end."""
+"""Shortest time in seconds between two intermediate writes of the file ``save_to``."""
 
 
 ENDLESS_SPAN_LENGTH = 1.0
-"""The length that an endless span counts for where the first step is a share of it, from a state at rest."""
+"""Length assumed for an infinite span where the first step is a fraction of the span, as from a state at rest."""
 
 
 class Run:
-    """A run under way: what has been saved, and how it stands."""
+    """One run of ``integrate``: its engine, the states that it has saved, and its status."""
 
     def __init__(
         self,
         system,
         method,
         x0,
-        course: StepSchedule,
+        schedule: StepSchedule,
         save_to,
         engine: str,
         noise: Fluctuations | None = None,
         dense: bool = False,
     ):
-        self.system_without_span, self.system = system, limit_to_span(system, course.start, course.end)
-        self.method, self.schedule = method, course
+        self.system_without_span, self.system = system, limit_to_span(system, schedule.start, schedule.end)
+        self.method, self.schedule = method, schedule
         self.save_to, self.start_wall_time = save_to, time.perf_counter()
         self.last_checkpoint_time = self.start_wall_time
-        self.saved_times = [np.array([course.start])]
+        self.saved_times = [np.array([schedule.start])]
         self.saved_states = [np.asarray(x0)[None]]
-        self.saved_energies_entropies: list[np.ndarray] = []  # energies and entropies of the states
+        self.saved_energies_entropies: list[np.ndarray] = []  # shapes (saved states, 2)
         self.status: Status | None = None
         self.stats = Stats()
-        self.step: float | Adaptive = course.h
+        self.step: float | Adaptive = schedule.h
         self.event_time: float | None = None
-        self.all_states = [(self.saved_times[0], self.saved_states[0])] if dense else None  # all states
-        self.taken_steps: list[
-            np.ndarray
-        ] = []  # sizes of steps that are looked at, and whether states after them are kept
+        self.all_states = [(self.saved_times[0], self.saved_states[0])] if dense else None  # for dense output
+        self.taken_steps: list[np.ndarray] = []  # rows: step sizes, whether the state after the step is saved
         self.noise = noise
-        path: Callable | None = None
-        if noise is not None and (increments := noise_dimension(method)):
-            only = NoisePaths(noise, increments, np.zeros(1, dtype=int), course)
-            path = lambda first, steps, h: only.step_increments(slice(None), first, steps, h)[0]  # noqa: E731
-        self.engine = EngineWithFallback(self.system, method, engine, course.n_steps, path)
+        noise_increments: Callable | None = None
+        if noise is not None and (n_increments := noise_dimension(method)):
+            noise_paths = NoisePaths(noise, n_increments, np.zeros(1, dtype=int), schedule)
+
+            def noise_increments(first_step: int, steps: int, h: float) -> np.ndarray:
+                return noise_paths.step_increments(slice(None), first_step, steps, h)[0]
+
+        self.engine = EngineWithFallback(self.system, method, engine, schedule.n_steps, noise_increments)
 
     @property
     def last_saved_time(self) -> float:
-        """The time of the last state that is kept."""
+        """Time of the last saved state."""
         return next(float(times[-1]) for times in reversed(self.saved_times) if len(times))
 
     # -- the library's own methods ----------------------------------------------------------------------------------
 
     def run_fixed(self, bar) -> None:
-        """Drive the engine call by call, to the end, a failure or Ctrl-C."""
-        state, stopped = None, ""
+        """Take all steps of the schedule, one engine call after another, until the end, a failure or Ctrl-C."""
+        state, interruption = None, ""
         try:
             state = self.engine.initial_run_state(self.saved_states[0][0])
             self.saved_energies_entropies = [np.array([[float(state.energy), float(state.entropy)]])]
-            for h, saves, every, kept in self.schedule.engine_calls(
+            for h, n_saves, steps_per_save, keep in self.schedule.engine_calls(
                 max_saves=self.engine.max_saves_per_call, save_all=self.all_states is not None
             ):
-                state = self._advance_and_save(state, h, saves, every, kept)
+                state = self._advance_and_save(state, h, n_saves, steps_per_save, keep)
                 bar.update(float(self.schedule.times_after(np.asarray(int(state.step)))))
                 if int(state.status) != StatusCode.COMPLETED:
                     break
                 self._checkpoint(state)
         except INTERRUPTING_ERRORS as error:
-            stopped = interruption_reason(error)
+            interruption = interruption_reason(error)
         if state is None:
-            self._set_interrupted_at_start(stopped)
+            self._set_interrupted_at_start(interruption)
             return
         step = int(state.step)
-        now, h = float(self.schedule.times_after(np.asarray(step))), self.schedule.step_size_after(step)
-        if now > self.last_saved_time:  # it ended between two states that are kept
+        t, h = float(self.schedule.times_after(np.asarray(step))), self.schedule.step_size_after(step)
+        if t > self.last_saved_time:  # the run ended between two saved states
             self._save_states(
-                np.array([now]), np.asarray(state.x)[None], np.array([[float(state.energy), float(state.entropy)]])
+                np.array([t]), np.asarray(state.x)[None], np.array([[float(state.energy), float(state.entropy)]])
             )
-        self.stats, self.status = run_statistics(state), final_status(self.engine, state, now, h, stopped)
+        self.stats, self.status = run_statistics(state), final_status(self.engine, state, t, h, interruption)
 
-    def _set_interrupted_at_start(self, stopped: str) -> None:
+    def _set_interrupted_at_start(self, reason: str) -> None:
         self.saved_energies_entropies = [self._energies_and_entropies(self.saved_states[0])]
-        self.status = Status(StatusCode.INTERRUPTED, f"stopped {stopped} before the first step", 0, self.schedule.start)
+        self.status = Status(StatusCode.INTERRUPTED, f"stopped {reason} before the first step", 0, self.schedule.start)
 
     def take_no_step(self) -> None:
         """Complete a run over a span of length zero."""
@@ -125,117 +127,121 @@ class Run:
         )
 
     def run_with_step_control(self, bar, step: float | Adaptive, until) -> None:
-        """Look at every step: adaptive ones, and those with events."""
-        start, end, every = self.schedule.start, self.schedule.end, self.schedule.save_every or 1
-        at_stops, watch = self.schedule.save_every is None, until if isinstance(until, EventSet) else None
+        """Take adaptive steps, or steps of a given size with events; every step is examined."""
+        start, end, save_every = self.schedule.start, self.schedule.end, self.schedule.save_every or 1
+        saves_at_stops, event_set = self.schedule.save_every is None, until if isinstance(until, EventSet) else None
         stops = self.schedule.stop_times
-        event = None if until is None or watch else Event(until, self.system)
-        self.step, last = step, None
+        event = None if until is None or event_set else Event(until, self.system)
+        self.step, unsaved_steps = step, None
 
         def save_steps(steps: AcceptedSteps):
-            nonlocal last
+            nonlocal unsaved_steps
             ends = steps.t[1:]
-            kept = np.isin(ends, stops) if at_stops else steps.step_counts % every == 0
-            self._save_steps(steps, kept)
-            self.taken_steps.append(np.stack([steps.h, kept]))
-            last = None if kept[-1] else steps
+            is_saved = np.isin(ends, stops) if saves_at_stops else steps.step_counts % save_every == 0
+            self._save_steps(steps, is_saved)
+            self.taken_steps.append(np.stack([steps.h, is_saved]))
+            unsaved_steps = None if is_saved[-1] else steps
             if self.all_states is not None:
                 self.all_states.append((ends, steps.x))
             bar.update(ends[-1])
             self._checkpoint(steps.state_after)
 
         length = end - start if math.isfinite(end) else ENDLESS_SPAN_LENGTH
-        pacing = make_step_control(step, self.method, end - start, event)
+        control = make_step_control(step, self.method, end - start, event)
         try:
-            paces = self.engine.start_adaptive(pacing, self.saved_states[0][0], start, float(stops[0]), length)
+            adaptive_runs = self.engine.start_adaptive(control, self.saved_states[0][0], start, float(stops[0]), length)
         except INTERRUPTING_ERRORS as error:
             self._set_interrupted_at_start(interruption_reason(error))
             return
-        state = paces.state()
+        state = adaptive_runs.state()
         self.saved_energies_entropies = [np.array([[float(state.energy), float(state.entropy)]])]
-        numbers = self.system.dim * ((0 if at_stops else 1) / every + (self.all_states is not None))
-        room = MAX_STORED_VALUES / max(numbers, 1e-9)
-        outcome = advance_to_end(self.engine, paces, pacing, stops, save_steps, room, watch)
-        if last is not None:
-            self._save_steps(last, slice(-1, None))
+        values_per_step = self.system.dim * ((0 if saves_at_stops else 1) / save_every + (self.all_states is not None))
+        max_steps = MAX_STORED_VALUES / max(values_per_step, 1e-9)
+        outcome = advance_to_end(self.engine, adaptive_runs, control, stops, save_steps, max_steps, event_set)
+        if unsaved_steps is not None:
+            self._save_steps(unsaved_steps, slice(-1, None))
         self.event_time = outcome.event_time
-        state, now = outcome.state, self.last_saved_time
+        state, t = outcome.state, self.last_saved_time
         self.stats = dataclasses.replace(run_statistics(state), rejected=outcome.n_rejected)
         steps = int(state.step)
         if isinstance(step, Adaptive) and (
             outcome.underflow_step_size is not None or outcome.exhausted_limit in ("steps", "memory")
         ):
             self.status = adaptive_failure_status(
-                self.system, self.method, np.asarray(self.saved_states[0][0]), outcome, step, (start, end), now
+                self.system, self.method, np.asarray(self.saved_states[0][0]), outcome, step, (start, end), t
             )
         elif outcome.unknown_state_error is not None:
             self.status = Status(
-                outcome.unknown_state_error.code, str(outcome.unknown_state_error), steps, now, float(state.residual)
+                outcome.unknown_state_error.code, str(outcome.unknown_state_error), steps, t, float(state.residual)
             )
         elif event is not None and outcome.exhausted_limit:
-            text = f"{event.name} is not a number at some states near t = {now:g}, and has other signs before and "
-            text += "after: whether it is zero there is not known, so extend the function"
-            self.status = Status(StatusCode.NON_FINITE, text, steps, now, float(state.residual))
+            text = f"{event.name} is NaN near t = {t:g} between values of opposite sign, so its zero cannot be "
+            text += "located. Define it there"
+            self.status = Status(StatusCode.NON_FINITE, text, steps, t, float(state.residual))
         elif outcome.event_time is not None:
-            text = f"{EventSet.name if event is None else event.name}: reached at t = {now:.15g} in {steps} steps"
-            self.status = Status(StatusCode.EVENT, text, steps, now, float(state.residual))
+            text = f"{EventSet.name if event is None else event.name}: reached at t = {t:.15g} in {steps} steps"
+            self.status = Status(StatusCode.EVENT, text, steps, t, float(state.residual))
         else:
             h = step if isinstance(step, float) else float("nan")
-            self.status = final_status(self.engine, state, now, h, outcome.interruption)
-            if watch and watch.why_undefined and self.status.ok:
-                self.status = dataclasses.replace(self.status, message=f"{self.status.message}; {watch.why_undefined}")
+            self.status = final_status(self.engine, state, t, h, outcome.interruption)
+            if event_set and event_set.why_undefined and self.status.ok:
+                self.status = dataclasses.replace(
+                    self.status, message=f"{self.status.message}; {event_set.why_undefined}"
+                )
             if event is not None and self.status.ok:
                 text = f"{self.status.message}; the event ({event.name}) did not happen"
                 if outcome.sign_jumps:
                     text += f": it changed its sign {len(outcome.sign_jumps)} times without being zero, first at t = "
                     text += f"{outcome.sign_jumps[0]:g}"
                 if outcome.is_event_undefined:
-                    text = f"{self.status.message}; whether the event ({event.name}) happened is not known, since the "
+                    text = f"{self.status.message}; whether the event ({event.name}) happened is unknown, because the "
                     text += "function is NaN at the end. Define it for all states of the run"
                 self.status = dataclasses.replace(self.status, message=text)
 
-    def _save_steps(self, steps: AcceptedSteps, kept: np.ndarray | slice) -> None:
-        self._save_states(steps.t[1:][kept], steps.x[kept], np.column_stack([steps.energy, steps.entropy])[kept])
+    def _save_steps(self, steps: AcceptedSteps, selection: np.ndarray | slice) -> None:
+        self._save_states(
+            steps.t[1:][selection], steps.x[selection], np.column_stack([steps.energy, steps.entropy])[selection]
+        )
 
-    def _advance_and_save(self, state, h, saves, every, kept: bool):
-        before = int(state.step)
-        state, (x, energy, entropy, reached) = self.engine.advance(state, h, saves, every)
-        number = int(np.asarray(reached).sum())
-        steps, x = before + every * np.arange(1, number + 1), np.asarray(x)[:number]
-        times, values = self.schedule.times_after(steps), np.column_stack([energy, entropy])[:number]
+    def _advance_and_save(self, state, h, n_saves, steps_per_save, keep: bool):
+        previous_step = int(state.step)
+        state, (x, energy, entropy, is_reached) = self.engine.advance(state, h, n_saves, steps_per_save)
+        n_reached = int(np.asarray(is_reached).sum())
+        steps, x = previous_step + steps_per_save * np.arange(1, n_reached + 1), np.asarray(x)[:n_reached]
+        times, energies_entropies = self.schedule.times_after(steps), np.column_stack([energy, entropy])[:n_reached]
         if self.all_states is not None:
             self.all_states.append((times, x))
-            chosen = np.isin(steps, self.schedule.saved_step_counts)
-            times, x, values = times[chosen], x[chosen], values[chosen]
-        if kept:
-            self._save_states(times, x, values)
+            is_saved = np.isin(steps, self.schedule.saved_step_counts)
+            times, x, energies_entropies = times[is_saved], x[is_saved], energies_entropies[is_saved]
+        if keep:
+            self._save_states(times, x, energies_entropies)
         return state
 
-    def _save_states(self, times: np.ndarray, x: np.ndarray, values: np.ndarray) -> None:
+    def _save_states(self, times: np.ndarray, x: np.ndarray, energies_entropies: np.ndarray) -> None:
         self.saved_times.append(times)
         self.saved_states.append(x)
-        self.saved_energies_entropies.append(values)
+        self.saved_energies_entropies.append(energies_entropies)
 
     # -- SciPy --------------------------------------------------------------------------------------------------------
 
     def run_reference(self, bar) -> None:
-        """One call of the reference solver, its output at the times a fixed step would have."""
+        """Run SciPy's solver and save its states at the times of a run with fixed steps."""
         times = self.schedule.saved_times
         self.saved_energies_entropies = [self._energies_and_entropies(self.saved_states[0])]
-        x, evaluations, message, interrupted = self.method.trajectory(self.system, self.saved_states[0][0], times)
+        x, n_evaluations, message, was_interrupted = self.method.trajectory(self.system, self.saved_states[0][0], times)
         self.saved_times, self.saved_states = [times[: len(x)]], [x]
         self.saved_energies_entropies = [self._energies_and_entropies(x)]
-        self.stats = Stats(steps=len(x) - 1, fixed_point_iterations=evaluations)
-        now = self.last_saved_time
-        bar.update(now)
-        if interrupted:
-            text = f"stopped by the user after t = {now:g}"
-            self.status = Status(StatusCode.INTERRUPTED, text, len(x) - 1, now)
+        self.stats = Stats(steps=len(x) - 1, fixed_point_iterations=n_evaluations)
+        t = self.last_saved_time
+        bar.update(t)
+        if was_interrupted:
+            text = f"stopped by the user after t = {t:g}"
+            self.status = Status(StatusCode.INTERRUPTED, text, len(x) - 1, t)
         elif message:
-            text = f"SciPy's {self.method.scheme} stopped after t = {now:g}: {message}"
-            self.status = Status(StatusCode.REFERENCE_FAILED, text, len(x) - 1, now)
+            text = f"SciPy's {self.method.scheme} stopped after t = {t:g}: {message}"
+            self.status = Status(StatusCode.REFERENCE_FAILED, text, len(x) - 1, t)
         else:
-            self.status = Status(StatusCode.COMPLETED, f"reached t = {now:g}", len(x) - 1, now)
+            self.status = Status(StatusCode.COMPLETED, f"reached t = {t:g}", len(x) - 1, t)
 
     def _energies_and_entropies(self, x: np.ndarray) -> np.ndarray:
         return np.stack(evaluate_at_points(energy_and_entropy_at, self.system, x), axis=1)
@@ -243,7 +249,7 @@ class Run:
     # -- the result ---------------------------------------------------------------------------------------------------
 
     def solution(self) -> Solution:
-        """What there is so far."""
+        """Return the solution of the run so far."""
         x = np.concatenate(self.saved_states)
         energy, entropy = np.concatenate(self.saved_energies_entropies).T
         return build_solution(
@@ -269,19 +275,19 @@ class Run:
         times, states = zip(*self.all_states, strict=True)
         return DenseOutput(np.concatenate(times), np.concatenate(states), self.engine.step_ends)
 
-    def _longest_steps_between_saves(self, number: int) -> np.ndarray:
-        """The longest of the steps after each state that is kept."""
+    def _longest_steps_between_saves(self, n_intervals: int) -> np.ndarray:
+        """Return the longest step after each saved state, shape (n_intervals,)."""
         if not self.taken_steps:
-            return self.schedule.longest_steps[:number]
-        h, kept = np.concatenate(self.taken_steps, axis=1)
-        return np.maximum.reduceat(h, np.flatnonzero(np.append(1.0, kept[:-1])))[:number]
+            return self.schedule.longest_steps[:n_intervals]
+        h, is_saved = np.concatenate(self.taken_steps, axis=1)
+        return np.maximum.reduceat(h, np.flatnonzero(np.append(1.0, is_saved[:-1])))[:n_intervals]
 
     def _checkpoint(self, state) -> None:
         if self.save_to is not None and time.perf_counter() - self.last_checkpoint_time > CHECKPOINT_SECONDS:
             self.stats = run_statistics(state)
             try:
                 self.solution().save(self.save_to)
-            except FileError as error:  # there may be room at the end
+            except FileError as error:  # the disk may have space again at the end
                 warn(f"{error}. The run goes on")
             self.last_checkpoint_time = time.perf_counter()
 
@@ -291,7 +297,7 @@ class Run:
                 self.system, self.method, self.step, (self.schedule.start, self.schedule.end), self.schedule.save_every
             ),
             "engine": None if isinstance(self.method, Reference) else self.engine.name,
-            "noise": None if self.noise is None else self.noise.as_provenance(),
+            "noise": None if self.noise is None else self.noise.to_provenance(),
             "x0": np.asarray(self.saved_states[0][0]).tolist()
             if self.system.dim <= MAX_PROVENANCE_COMPONENTS
             else None,

@@ -1,13 +1,15 @@
-"""Derivatives of a path whose steps are solved, of any order: of each step along directions, then from step to step.
+"""Derivatives of any order of a path whose steps are solved: of each step along directions, then accumulated over
+steps.
 
 A step maps ``z = (x, p)``, the state and the parameters, to the next state by the slopes k that solve its equations:
 
-    0 = misfit(z, k),    x' = move(z, k).
+    0 = residual(z, k),    x' = move(z, k).
 
-Their derivative along directions ``a, b, ...`` follows from lower ones (implicit function theorem): with that of k
-left out, ``misfit`` leaves a residual, and k makes up for it by the inverse of ``D_k misfit``. All steps and all
-directions are points at which one function is computed, with its derivatives along a few directions as arguments. It
-is no more than some times as long as a step, and does not grow with the number of directions.
+Its derivative along directions ``a, b, ...`` follows from those of lower order by the implicit function theorem.
+Without the highest derivative of k, the derivative of ``residual`` is not zero; the inverse of ``D_k residual`` gives
+the derivative of k that cancels it. All steps and all directions are points at which one function is evaluated, with
+its derivatives along a few directions as arguments. This function is only a few times as long as a step, and its length
+does not grow with the number of directions.
 """
 
 from __future__ import annotations
@@ -26,22 +28,23 @@ from jax.flatten_util import ravel_pytree
 from ..tracing.interpret import evaluate_at_points
 
 MAX_VALUES_PER_CALL = 1_000_000
-"""Numbers in the points that a function is computed at in one go."""
+"""Largest number of values in the points of one evaluation, which bounds memory."""
 
 
 class _StepFunction(eqx.Module):
-    """A step as a function of z and k in one row, and of what else it starts from.
+    """One step as a function of z and k in one row, for given step size and compensation.
 
     Attributes
     ----------
     system_method_state : tuple
-        The system, the method, and the first state.
+        The system, the method, and the initial state.
     is_differentiated : tuple of bool
-        Which leaves of these are differentiated by: those of system and method are the parameters.
+        For each leaf of ``system_method_state``, whether it is differentiated by; in system and method these are the
+        parameters.
     slopes_shape : tuple of int
         The shape of k.
     order : int
-        Of the derivative, that is how many directions it is taken along.
+        Order of the derivative, the number of its directions.
     """
 
     system_method_state: tuple
@@ -50,27 +53,33 @@ class _StepFunction(eqx.Module):
     order: int = eqx.field(static=True)
 
     def unpack(self, z) -> tuple[Any, Any, jax.Array, jax.Array]:
-        """System, method, state and slopes that a row says."""
+        """Return system, method, state and slopes from a row."""
         leaves, structure = jax.tree_util.tree_flatten(self.system_method_state)
-        *own, x = leaves
-        _, rest = ravel_pytree([leaf for leaf, moving in zip(own, self.is_differentiated[:-1], strict=True) if moving])
+        *other_leaves, x = leaves
+        _, unravel_parameters = ravel_pytree(
+            [leaf for leaf, is_parameter in zip(other_leaves, self.is_differentiated[:-1], strict=True) if is_parameter]
+        )
         n, m = np.size(x), self.slopes_shape[0] * self.slopes_shape[1]
-        moved = iter(rest(z[n : len(z) - m]))
-        own = [next(moved) if moving else leaf for leaf, moving in zip(own, self.is_differentiated[:-1], strict=True)]
-        system, method, _ = jax.tree_util.tree_unflatten(structure, [*own, x])
+        parameters = iter(unravel_parameters(z[n : len(z) - m]))
+        other_leaves = [
+            next(parameters) if is_parameter else leaf
+            for leaf, is_parameter in zip(other_leaves, self.is_differentiated[:-1], strict=True)
+        ]
+        system, method, _ = jax.tree_util.tree_unflatten(structure, [*other_leaves, x])
         return system, method, z[:n], z[len(z) - m :].reshape(self.slopes_shape)
 
     def __call__(self, h, compensation, z) -> jax.Array:
-        """The misfit, then the next state."""
+        """Return the residual of the stage equations, followed by the next state."""
         system, method, x, k = self.unpack(z)
-        misfit = method.slopes(system, x, compensation, h, k) - k
-        return jnp.concatenate([misfit.ravel(), method.move(system, x, compensation, h, k)[0]])
+        residual = method.slopes(system, x, compensation, h, k) - k
+        return jnp.concatenate([residual.ravel(), method.move(system, x, compensation, h, k)[0]])
 
 
 def _directional_derivative(step: _StepFunction, point) -> jax.Array:
-    """The derivative along as many directions as its order says; rows of the point are z and k, and their derivatives.
+    """Return the derivative of a step along ``step.order`` directions, by nested forward mode.
 
-    The row of a set of directions has the bits of its number set at their places.
+    Rows of the point are z and k and their derivatives; the row of a subset of directions is the one whose number has
+    the bits of the subset.
     """
     n = np.size(step.system_method_state[-1])
     h, compensation, rows = point[0], point[1 : 1 + n], point[1 + n :].reshape(2**step.order, -1)
@@ -78,123 +87,158 @@ def _directional_derivative(step: _StepFunction, point) -> jax.Array:
     def value(rows):
         return step(h, compensation, rows[0])[None]
 
-    def tangent(function):
+    def differentiate(function):
         def value_and_tangent(rows):
-            lower, upper = jnp.split(rows, 2)
-            return jnp.concatenate(jax.jvp(function, (lower,), (upper,)))
+            primals, tangents = jnp.split(rows, 2)
+            return jnp.concatenate(jax.jvp(function, (primals,), (tangents,)))
 
         return value_and_tangent
 
     function = value
     for _ in range(step.order):
-        function = tangent(function)
+        function = differentiate(function)
     return function(rows)[-1]
 
 
 def state_derivatives(
-    given: tuple, moves: Sequence[bool], order: int, sizes: np.ndarray, path: tuple[np.ndarray, np.ndarray, np.ndarray]
+    arguments: tuple,
+    leaf_is_traced: Sequence[bool],
+    order: int,
+    step_sizes: np.ndarray,
+    path: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> list[np.ndarray]:
-    """Those of the states of a path, from the first on, up to an order.
+    """Return the derivatives of the states of a path, from the initial state on, of orders 1 to ``order``.
 
     Parameters
     ----------
-    given : (System, OneStepMethod, array)
-        With numbers only, nothing traced. The array is the first state.
-    moves : sequence of bool
-        Which of the leaves of ``given`` are differentiated by.
+    arguments : (System, OneStepMethod, array)
+        Concrete values, nothing traced. The array is the initial state.
+    leaf_is_traced : sequence of bool
+        For each leaf of ``arguments``, whether it is differentiated by.
     order : int
-    sizes : array, shape (steps,)
-        Of each step (time).
+    step_sizes : array, shape (steps,)
     path : (array, array, array)
-        For each step its state, shape (n,), the compensation of that, and the slopes that solve its equations, shape
-        (stages, n).
+        For each step its state, shape (n,), the compensation of the state, and the slopes that solve its equations,
+        shape (stages, n).
 
     Returns
     -------
     list of array
-        Shapes (steps + 1, n, p), (steps + 1, n, p, p) and so on; p is the number of entries of all leaves that move, in
-        one row.
+        Shapes (steps + 1, n, p), (steps + 1, n, p, p) and so on; p is the number of entries of all leaves that are
+        differentiated by, in one row.
     """
     x, compensation, k = path
     count, n, m = len(x), x.shape[1], k[0].size
-    parameters, start = _differentiated_values(given, moves)
-    q, p = len(parameters), len(parameters) + len(start)
-    place = np.concatenate([x, np.broadcast_to(parameters, (count, q)), k.reshape(count, m)], axis=1)
+    parameters, initial_state = _differentiated_values(arguments, leaf_is_traced)
+    q, p = len(parameters), len(parameters) + len(initial_state)
+    base_rows = np.concatenate([x, np.broadcast_to(parameters, (count, q)), k.reshape(count, m)], axis=1)
 
-    def evaluate_along(rows: Callable[[slice], np.ndarray], many: int, rank: int) -> tuple[np.ndarray, np.ndarray]:
-        """Derivatives of misfit and move, shapes (steps, m, many) and (steps, n, many).
+    def evaluate_along(rows: Callable[[slice], np.ndarray], n_sets: int, rank: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return derivatives of residual and move, shapes (steps, m, n_sets) and (steps, n, n_sets).
 
-        ``rows`` gives the rows of some steps, shape (steps, many, 2**rank, n + q + m): those of all steps are large.
+        ``rows`` returns the rows of a chunk of steps, shape (steps, n_sets, 2**rank, n + q + m); the rows of all steps
+        would fill the memory.
         """
-        step, found = _StepFunction(given, tuple(moves), k.shape[1:], rank), np.empty((count, many, m + n))
-        portion = max(1, MAX_VALUES_PER_CALL // (many * 2**rank * (n + q + m)))
-        for some in (slice(i, i + portion) for i in range(0, count, portion)):
-            begin = np.concatenate([sizes[some, None], compensation[some]], axis=1)[:, None].repeat(many, axis=1)
-            points = np.concatenate([begin, rows(some).reshape(*begin.shape[:2], -1)], axis=2)
-            moved = evaluate_at_points(_directional_derivative, step, points.reshape(-1, points.shape[-1]))
-            found[some] = moved.reshape(*begin.shape[:2], m + n)
-        return found[..., :m].swapaxes(1, 2), found[..., m:].swapaxes(1, 2)
+        step, derivatives = (
+            _StepFunction(arguments, tuple(leaf_is_traced), k.shape[1:], rank),
+            np.empty((count, n_sets, m + n)),
+        )
+        chunk_size = max(1, MAX_VALUES_PER_CALL // (n_sets * 2**rank * (n + q + m)))
+        for chunk in (slice(i, i + chunk_size) for i in range(0, count, chunk_size)):
+            begin = np.concatenate([step_sizes[chunk, None], compensation[chunk]], axis=1)[:, None].repeat(
+                n_sets, axis=1
+            )
+            points = np.concatenate([begin, rows(chunk).reshape(*begin.shape[:2], -1)], axis=2)
+            values = evaluate_at_points(_directional_derivative, step, points.reshape(-1, points.shape[-1]))
+            derivatives[chunk] = values.reshape(*begin.shape[:2], m + n)
+        return derivatives[..., :m].swapaxes(1, 2), derivatives[..., m:].swapaxes(1, 2)
 
-    def unit_directions(some: slice) -> np.ndarray:
-        units = np.broadcast_to(np.eye(n + q + m), (len(place[some]), n + q + m, n + q + m))
-        return np.stack([np.broadcast_to(place[some, None], units.shape), units], axis=2)
+    def unit_directions(chunk: slice) -> np.ndarray:
+        units = np.broadcast_to(np.eye(n + q + m), (len(base_rows[chunk]), n + q + m, n + q + m))
+        return np.stack([np.broadcast_to(base_rows[chunk, None], units.shape), units], axis=2)
 
-    misfit, move = evaluate_along(unit_directions, n + q + m, 1)
-    back = -_inverse_or_nan(misfit[..., n + q :])  # from a residual to the k that makes up for it
-    onward = move[..., : n + q] + move[..., n + q :] @ back @ misfit[..., : n + q]
-    states, known = [], [place]  # derivatives of each order: of the states, and of z and k, (steps, n + q + m, p, ...)
+    residual_jacobian, state_jacobian = evaluate_along(unit_directions, n + q + m, 1)
+    slopes_of_residual = -_inverse_or_nan(
+        residual_jacobian[..., n + q :]
+    )  # from a residual to the k that makes up for it
+    step_jacobian = (
+        state_jacobian[..., : n + q]
+        + state_jacobian[..., n + q :] @ slopes_of_residual @ residual_jacobian[..., : n + q]
+    )
+    states, row_derivatives = (
+        [],
+        [base_rows],
+    )  # derivatives of each order: of the states, and of z and k, (steps, n + q + m, p, ...)
     for rank in range(1, order + 1):
-        chosen, where = _symmetric_indices(p, rank)
+        direction_sets, entry_index = _symmetric_indices(p, rank)
         if rank == 1:
-            still = np.eye(q, p)  # parameters move in the directions of their own
-            residual, forced = misfit[..., n : n + q] @ still, onward[..., n:] @ still
+            parameter_derivative = np.eye(q, p)  # parameters move in the directions of their own
+            residual, forcing = (
+                residual_jacobian[..., n : n + q] @ parameter_derivative,
+                step_jacobian[..., n:] @ parameter_derivative,
+            )
         else:
-            still = np.zeros((q, len(chosen)))
-            residual, forced = evaluate_along(functools.partial(_lower_order_rows, known, chosen), len(chosen), rank)
-            forced = forced + move[..., n + q :] @ back @ residual
-        own = np.zeros((count + 1, n, len(chosen)))
+            parameter_derivative = np.zeros((q, len(direction_sets)))
+            residual, forcing = evaluate_along(
+                functools.partial(_lower_order_rows, row_derivatives, direction_sets), len(direction_sets), rank
+            )
+            forcing = forcing + state_jacobian[..., n + q :] @ slopes_of_residual @ residual
+        state_derivative = np.zeros((count + 1, n, len(direction_sets)))
         if rank == 1:
-            own[0, :, q:] = np.eye(n, len(start))
+            state_derivative[0, :, q:] = np.eye(n, len(initial_state))
         for j in range(count):
-            own[j + 1] = onward[j, :, :n] @ own[j] + forced[j]
-        states.append(own[..., where])
+            state_derivative[j + 1] = step_jacobian[j, :, :n] @ state_derivative[j] + forcing[j]
+        states.append(state_derivative[..., entry_index])
         if rank < order:
-            slopes = back @ (misfit[..., :n] @ own[:-1] + residual)
-            whole = np.concatenate([own[:-1], np.broadcast_to(still, (count, *still.shape)), slopes], axis=1)
-            known.append(whole[..., where])
+            slopes = slopes_of_residual @ (residual_jacobian[..., :n] @ state_derivative[:-1] + residual)
+            row_derivative = np.concatenate(
+                [
+                    state_derivative[:-1],
+                    np.broadcast_to(parameter_derivative, (count, *parameter_derivative.shape)),
+                    slopes,
+                ],
+                axis=1,
+            )
+            row_derivatives.append(row_derivative[..., entry_index])
     return states
 
 
-def _lower_order_rows(known: Sequence[np.ndarray], chosen: Sequence[tuple[int, ...]], some: slice) -> np.ndarray:
-    """Derivatives along all sets of some directions but the whole: shape (steps, many, 2**rank, n + q + m)."""
-    own, rank = [a[some] for a in known], len(chosen[0])
-    rows = np.zeros((len(own[0]), len(chosen), 2**rank, own[0].shape[1]))
-    for i, directions in enumerate(chosen):
+def _lower_order_rows(
+    derivatives: Sequence[np.ndarray], direction_sets: Sequence[tuple[int, ...]], chunk: slice
+) -> np.ndarray:
+    """Return derivatives along all proper subsets of each direction set: shape (steps, sets, 2**rank, n + q + m)."""
+    chunk_derivatives, rank = [a[chunk] for a in derivatives], len(direction_sets[0])
+    rows = np.zeros((len(chunk_derivatives[0]), len(direction_sets), 2**rank, chunk_derivatives[0].shape[1]))
+    for i, directions in enumerate(direction_sets):
         for subset in range(2**rank - 1):
-            inside: tuple = tuple(d for bit, d in enumerate(directions) if subset >> bit & 1)
-            rows[:, i, subset] = own[len(inside)][(..., *inside)]
+            subset_directions: tuple = tuple(d for bit, d in enumerate(directions) if subset >> bit & 1)
+            rows[:, i, subset] = chunk_derivatives[len(subset_directions)][(..., *subset_directions)]
     return rows
 
 
-def _differentiated_values(given: tuple, moves: Sequence[bool]) -> tuple[np.ndarray, np.ndarray]:
-    """The parameters that are differentiated by, and the first state where it is: each in one row."""
-    leaves = jax.tree_util.tree_leaves(given)
-    *own, start = (np.ravel(leaf) if moving else np.zeros(0) for leaf, moving in zip(leaves, moves, strict=True))
-    return np.concatenate([np.zeros(0), *own]), start
+def _differentiated_values(arguments: tuple, leaf_is_traced: Sequence[bool]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the parameters and the initial state that are differentiated by, one row each; empty if there are none."""
+    leaves = jax.tree_util.tree_leaves(arguments)
+    *parameters, initial_state = (
+        np.ravel(leaf) if is_differentiated else np.zeros(0)
+        for leaf, is_differentiated in zip(leaves, leaf_is_traced, strict=True)
+    )
+    return np.concatenate([np.zeros(0), *parameters]), initial_state
 
 
 def _symmetric_indices(p: int, rank: int) -> tuple[list[tuple[int, ...]], np.ndarray]:
-    """The derivatives of a rank by p variables that differ, and which of them an entry of the whole is."""
-    chosen = list(itertools.combinations_with_replacement(range(p), rank))
-    where = np.empty((p,) * rank, dtype=int)
-    for i, directions in enumerate(chosen):
-        for same in itertools.permutations(directions):
-            where[same] = i
-    return chosen, where
+    """Return the distinct index sets of a symmetric tensor of a rank over p variables, and the set number of each
+    entry."""
+    direction_sets = list(itertools.combinations_with_replacement(range(p), rank))
+    entry_index = np.empty((p,) * rank, dtype=int)
+    for i, directions in enumerate(direction_sets):
+        for permutation in itertools.permutations(directions):
+            entry_index[permutation] = i
+    return direction_sets, entry_index
 
 
 def _inverse_or_nan(matrices: np.ndarray) -> np.ndarray:
-    """NaN where there is none: the derivative does not exist there."""
+    """Return the inverses of matrices, NaN for singular ones, where the derivative does not exist."""
     try:
         return np.linalg.inv(matrices)
     except np.linalg.LinAlgError:

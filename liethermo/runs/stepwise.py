@@ -1,7 +1,6 @@
-"""Runs that look at every step: adaptive steps, events, outputs at given times, dense output.
+"""Runs that examine every step: adaptive steps, events, outputs at given times, dense output.
 
-The step itself is an engine's; what is here decides on its size and on where to stop. Nothing here touches the laws:
-they hold in every step.
+An engine takes the steps. This module stops them at given times and locates events. The laws hold in every step.
 """
 
 from __future__ import annotations
@@ -23,43 +22,41 @@ from .ending import INTERRUPTING_ERRORS, interruption_reason
 from .watch import EventSet, UnknownStateError
 
 ATTEMPTS_PER_CALL = 64
-"""Attempts between looks at an adaptive run."""
+"""Number of attempted steps between two checks of an adaptive run."""
 
 MAX_STORED_VALUES = 2**28
-"""Numbers that an adaptive run keeps at most (2 GiB)."""
+"""Largest number of values that an adaptive run stores (2 GiB)."""
 
 
 @dataclass
 class RunOutcome:
-    """What a stepwise run leaves: states kept, with times, and how it ended."""
+    """Outcome of an adaptive run: its last state, and the reason why it ended."""
 
     state: Any
     n_rejected: int = 0
     event_time: float | None = None
     underflow_step_size: float | None = None
     interruption: str = ""
-    sign_jumps: list[float] = field(default_factory=list)  # when the event function changed its sign without a zero
-    is_event_undefined: bool = False  # whether the event function is not a number at the end
-    unknown_state_error: UnknownStateError | None = None  # what is not known of an event
-    exhausted_limit: str = (
-        ""  # what an adaptive run has used up, "steps" or "memory"; "sight" where the event is not a number
-    )
+    sign_jumps: list[float] = field(default_factory=list)  # times at which the event function jumps across zero
+    is_event_undefined: bool = False  # the event function is NaN at the end
+    unknown_state_error: UnknownStateError | None = None  # a state inside a step could not be computed
+    exhausted_limit: str = ""  # "steps" or "memory"; "sight" if the event function is NaN
 
 
 class AcceptedSteps(NamedTuple):
-    """Steps one after another.
+    """Consecutive accepted steps of a run.
 
     Attributes
     ----------
     t : array, shape (m + 1,)
-        When they begin, and when the last ends.
+        Times at which the steps start, and the end of the last.
     h : array, shape (m,)
     x : array, shape (m, n)
-        The states after them, with ``energy`` and ``entropy``, shape (m,).
+        States after the steps, with ``energy`` and ``entropy``, shape (m,).
     step_counts : array, shape (m,)
-        How many steps the run has with each.
+        Number of steps of the run up to and including each.
     state_before, state_after : State
-        Of the engine, before the first and after the last.
+        Engine states before the first step and after the last.
     """
 
     t: np.ndarray
@@ -73,37 +70,46 @@ class AcceptedSteps(NamedTuple):
 
 
 StepCallback = Callable[[AcceptedSteps], None]
+"""Function called with the steps that a run has accepted."""
 
 
 def advance_to_end(
     engine: EngineWithFallback,
-    paces: AdaptiveRuns,
-    pacing: StepControl,
+    adaptive_runs: AdaptiveRuns,
+    control: StepControl,
     stops: np.ndarray,
-    on_steps: StepCallback,
+    step_callback: StepCallback,
     max_steps: float = MAX_STORED_VALUES,
     events: EventSet | None = None,
     attempts_per_call: int = ATTEMPTS_PER_CALL,
 ) -> RunOutcome:
-    """Follow a run from its start to its end, an event, a failure or Ctrl-C.
+    """Advance a run until its end, an event, a failure or Ctrl-C, and return the outcome.
 
     Parameters
     ----------
     stops : array
-        Times at which steps have to end, increasing; the last is the end of the span.
-    on_steps : function of Steps
-        Told of every step taken, of many together.
+        Times at which steps must end, in increasing order; the last is the end of the span.
+    step_callback : function of AcceptedSteps
+        Called with all accepted steps, several at a time.
     max_steps : float
-        Steps after which there is no room for more.
-    events : Watch, optional
-        Looks at each step, and may end the run in it.
+        Number of steps that fit into memory.
+    events : EventSet, optional
+        Examines each step and may end the run in it.
     attempts_per_call : int
-        Attempts between looks, at most.
+        Largest number of attempted steps between two checks.
     """
-    outcome = RunOutcome(_clear_pause_status(paces.state()))
+    outcome = RunOutcome(_clear_pause_status(adaptive_runs.state()))
     try:
         _advance_to_end(
-            engine, paces, pacing, outcome, stops, on_steps, max_steps, events, 1 if events else attempts_per_call
+            engine,
+            adaptive_runs,
+            control,
+            outcome,
+            stops,
+            step_callback,
+            max_steps,
+            events,
+            1 if events else attempts_per_call,
         )
     except INTERRUPTING_ERRORS as error:
         outcome.interruption = interruption_reason(error)
@@ -112,55 +118,66 @@ def advance_to_end(
 
 def _advance_to_end(
     engine,
-    paces: AdaptiveRuns,
-    pacing,
+    adaptive_runs: AdaptiveRuns,
+    control,
     outcome: RunOutcome,
     stops,
-    keep,
-    most_kept,
-    watch: EventSet | None,
-    together: int,
+    step_callback,
+    max_steps,
+    event_set: EventSet | None,
+    attempts_per_call: int,
 ) -> None:
-    guide = PauseHandler(paces, pacing, engine.method, stops, lambda i: engine.system)
-    outcome.sign_jumps = guide.sign_jumps
+    pause_handler = PauseHandler(adaptive_runs, control, engine.method, stops, lambda i: engine.system)
+    outcome.sign_jumps = pause_handler.sign_jumps
 
     def scalar(name: str) -> float:
-        return float(paces.read(name)[0])
+        return float(adaptive_runs.read(name)[0])
 
     while True:
-        guide.confirm_events()
-        guide.resume_paused()
+        pause_handler.confirm_events()
+        pause_handler.resume_paused()
         code, t = int(scalar("status")), scalar("t")
         outcome.is_event_undefined = not math.isfinite(scalar("event_value"))
         if code == StatusCode.EVENT:
             outcome.event_time = t
         if code != StatusCode.COMPLETED:
             break
-        if int(outcome.state.step) >= most_kept:
+        if int(outcome.state.step) >= max_steps:
             outcome.exhausted_limit = "memory"
             return
-        before = outcome.state
+        previous_state = outcome.state
         try:
-            rows = paces.attempt_records(int(min(together, max(1.0, most_kept - int(before.step)))))
+            attempts = adaptive_runs.attempt_records(
+                int(min(attempts_per_call, max(1.0, max_steps - int(previous_state.step))))
+            )
         except UnsupportedPrimitive as error:
-            guide.adaptive_runs = paces = engine.fall_back_adaptive(error, pacing, paces)
+            pause_handler.adaptive_runs = adaptive_runs = engine.fall_back_adaptive(error, control, adaptive_runs)
             continue
         outcome.n_rejected = int(scalar("n_rejected"))
-        outcome.state = _clear_pause_status(paces.state())
-        if (taken := np.diff(rows["step"], prepend=int(before.step)) > 0).any():  # some attempts do not count
-            x, energy, entropy, number, ends, h = (rows[name][taken] for name in ATTEMPT_FIELDS)
+        outcome.state = _clear_pause_status(adaptive_runs.state())
+        is_accepted = np.diff(attempts["step"], prepend=int(previous_state.step)) > 0
+        if is_accepted.any():
+            x, energy, entropy, step_counts, end_times, h = (attempts[name][is_accepted] for name in ATTEMPT_FIELDS)
             try:
-                caught = watch.find_events(engine, t, h[0], ends[0], before, outcome.state) if watch else None
+                event = (
+                    event_set.find_events(engine, t, h[0], end_times[0], previous_state, outcome.state)
+                    if event_set
+                    else None
+                )
             except UnknownStateError as error:
-                outcome.state, outcome.unknown_state_error = before, error
+                outcome.state, outcome.unknown_state_error = previous_state, error
                 return
-            if caught:
-                outcome.event_time, part, at = caught
-                outcome.state = before if at is None else at
-                if at is not None:
-                    keep(_single_step(t, outcome.event_time, part, before, at))
+            if event:
+                outcome.event_time, event_step_size, event_state = event
+                outcome.state = previous_state if event_state is None else event_state
+                if event_state is not None:
+                    step_callback(_single_step(t, outcome.event_time, event_step_size, previous_state, event_state))
                 return
-            keep(AcceptedSteps(np.append(t, ends), h, x, energy, entropy, number, before, outcome.state))
+            step_callback(
+                AcceptedSteps(
+                    np.append(t, end_times), h, x, energy, entropy, step_counts, previous_state, outcome.state
+                )
+            )
     if code == StatusCode.STEP_LIMIT:
         outcome.exhausted_limit = "steps"
     elif code == StatusCode.STEP_UNDERFLOW:
@@ -174,10 +191,10 @@ def _advance_to_end(
 
 
 def _clear_pause_status(state: State) -> State:
-    """Return a state of a run that goes on, in place of one with the reason of a pause."""
+    """Return the state of a running trajectory without the code of a pause."""
     return state._replace(status=np.int64(0))  # type: ignore[arg-type]
 
 
-def _single_step(t: float, end: float, h: float, before: State, after: State) -> AcceptedSteps:
-    x, energy, entropy, number = (np.asarray(getattr(after, name))[None] for name in ATTEMPT_FIELDS[:4])
-    return AcceptedSteps(np.array([t, end]), np.array([h]), x, energy, entropy, number, before, after)
+def _single_step(t: float, end: float, h: float, state_before: State, state_after: State) -> AcceptedSteps:
+    x, energy, entropy, step_counts = (np.asarray(getattr(state_after, name))[None] for name in ATTEMPT_FIELDS[:4])
+    return AcceptedSteps(np.array([t, end]), np.array([h]), x, energy, entropy, step_counts, state_before, state_after)

@@ -1,4 +1,4 @@
-"""A step, and a method, for an accuracy that is asked for."""
+"""Suggest a step size, or a method, for a given accuracy."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from .stepwise import AcceptedSteps, RunOutcome, advance_to_end
 
 @with_library_settings
 def suggest_step(system: System, x0, rtol: float = 1e-8, method: OneStepMethod | None = None, t0: float = 0.0) -> float:
-    """A step size for fixed steps as accurate as those of ``lt.Adaptive(rtol)``, near x0.
+    """Return a step size for fixed steps that are as accurate as ``lt.Adaptive(rtol)`` near x0.
 
-    It is the smallest of the first thirty adaptive steps, after their first growth at the largest allowed rate, rounded
-    down to two digits.
+    The step size is the smallest of the first thirty adaptive steps, after their initial growth at the largest allowed
+    rate, rounded down to two digits.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def suggest_step(system: System, x0, rtol: float = 1e-8, method: OneStepMethod |
     Raises
     ------
     InputError
-        Where nothing moves at x0, so that any step will do.
+        If nothing moves at x0, so that any step will do.
 
     Examples
     --------
@@ -60,15 +60,15 @@ def suggest_step(system: System, x0, rtol: float = 1e-8, method: OneStepMethod |
 
 @dataclass(frozen=True)
 class Trial:
-    """A method tried on a system.
+    """Result of a short trial of a method on a system.
 
     Attributes
     ----------
     method : OneStepMethod
     step : float
-        Of the size that the tolerance asks for.
+        Step size (time) for the tolerance.
     evaluations : float
-        Of the vector field, in a unit of time.
+        Number of evaluations of the vector field per unit of time.
     """
 
     method: OneStepMethod
@@ -78,7 +78,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class MethodSuggestion:
-    """The method that takes least work, and what others would take; prints as a table.
+    """The method with the least work, and the trials of all methods; prints as a table.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class MethodSuggestion:
     step : float
     reason : str
     trials : tuple of Trial
-        Least work first.
+        In order of increasing work.
     """
 
     reason: str
@@ -107,13 +107,14 @@ class MethodSuggestion:
 
 
 CANDIDATE_METHODS = (*map(MetriplecticRungeKutta, (4, 6, 8)), *map(MetriplecticGauss, (1, 2, 3, 4)))
+"""Methods that :func:`suggest_method` tries, beside a Taylor method of an order that depends on the tolerance."""
 
 
 @with_library_settings
 def suggest_method(system: System, x0, rtol: float = 1e-8, t0: float = 0.0) -> MethodSuggestion:
-    """The method, of those that keep both laws, that reaches an accuracy with the least work near x0.
+    """Compare the methods that obey both laws near x0, and return the cheapest one for ``rtol``.
 
-    Each method runs for some thirty adaptive steps. Its cost is stages times iterations, divided by the step. So
+    Each method runs for about thirty adaptive steps. Its cost is stages times iterations, divided by the step size. So
     stiffness, which makes explicit steps short, is taken into account.
 
     Parameters
@@ -124,7 +125,7 @@ def suggest_method(system: System, x0, rtol: float = 1e-8, t0: float = 0.0) -> M
     Raises
     ------
     InputError
-        Where nothing moves at x0, or no method reaches the accuracy.
+        If nothing moves at x0, or no method reaches the accuracy.
 
     Examples
     --------
@@ -143,58 +144,64 @@ def suggest_method(system: System, x0, rtol: float = 1e-8, t0: float = 0.0) -> M
     if not trials:
         raise InputError("; ".join(refusals))
     trials.sort(key=lambda trial: trial.evaluations)
-    best, explicit = trials[0], [trial for trial in trials if trial.method.explicit]
-    if best.method.explicit:
-        reason = f"{best.method} with steps of {best.step:g}: the system is not stiff at this accuracy"
-    elif explicit:
-        ratio = explicit[0].evaluations / best.evaluations
-        reason = (
-            f"{best.method} with steps of {best.step:g}: it is stiff, explicit steps cost {ratio:.1f} times as much"
-        )
+    cheapest, explicit_trials = trials[0], [trial for trial in trials if trial.method.explicit]
+    if cheapest.method.explicit:
+        reason = f"{cheapest.method} with steps of {cheapest.step:g}: the system is not stiff at this accuracy"
+    elif explicit_trials:
+        ratio = explicit_trials[0].evaluations / cheapest.evaluations
+        reason = f"{cheapest.method} with steps of {cheapest.step:g}: the system is stiff, explicit steps cost "
+        reason += f"{ratio:.1f} times as much"
     else:
-        reason = f"{best.method} with steps of {best.step:g}: no explicit method takes steps from this state"
+        reason = f"{cheapest.method} with steps of {cheapest.step:g}: no explicit method takes steps from this state"
     return MethodSuggestion(reason, tuple(trials))
 
 
 def _try_method(system: System, x0, rtol: float, method: OneStepMethod, t0: float) -> Trial:
-    system, used = prepare_for_method(system, method, rtol)
-    used.check(system)
-    x = np.asarray(checked_initial_state(system, used, x0, t0))
-    speed, size = float(np.abs(np.asarray(system.vector_field(x))).max()), float(np.abs(x).max())
-    if not speed > 0.0:
+    system, prepared_method = prepare_for_method(system, method, rtol)
+    prepared_method.check(system)
+    x = np.asarray(checked_initial_state(system, prepared_method, x0, t0))
+    max_rate, norm = float(np.abs(np.asarray(system.vector_field(x))).max()), float(np.abs(x).max())
+    if not max_rate > 0.0:
         raise InputError("nothing moves at this state, so there is no step to suggest: start elsewhere")
-    taken: list[float] = []
+    step_sizes: list[float] = []
     iterations = [0]
 
     def record_first_step(steps: AcceptedSteps):
-        taken.append(float(steps.h[0]))
+        step_sizes.append(float(steps.h[0]))
         iterations.append(int(steps.state_after.fixed_point_iterations) + int(steps.state_after.newton_iterations))
-        if len(taken) == 30:
+        if len(step_sizes) == 30:
             raise _TrialCompleteError
 
     def run_trial(rate: float) -> RunOutcome:
-        """Over a span in which what goes at this rate goes far."""
-        taken.clear()
+        """Take up to thirty steps over a span of 1e6 / rate."""
+        step_sizes.clear()
         iterations[1:] = []
         length = 1e6 / rate
-        pacing = make_step_control(Adaptive(rtol), used, length, None)
-        paces = engine.start_adaptive(pacing, x, 0.0, length, length)
+        control = make_step_control(Adaptive(rtol), prepared_method, length, None)
+        adaptive_runs = engine.start_adaptive(control, x, 0.0, length, length)
         return advance_to_end(
-            engine, paces, pacing, np.array([length]), record_first_step, attempts_per_call=1
+            engine, adaptive_runs, control, np.array([length]), record_first_step, attempts_per_call=1
         )  # since iterations are counted
 
     with contextlib.suppress(_TrialCompleteError):
-        engine, rate = EngineWithFallback(system, used, "auto", 1), speed / max(size, 1e-300)
-        if run_trial(rate).underflow_step_size is not None and (growth := growth_rate_at(system, used, x)) > rate:
-            run_trial(growth)  # from near a rest, where steps are short beside the time that the state takes
-    if len(taken) < 2:
-        raise InputError(f"no step from this state is as accurate as {rtol:g}: {len(taken)} steps were taken")
-    settled = next((i for i, (a, b) in enumerate(pairwise(taken)) if b < DEADBAND[1] * a), len(taken) - 1)
-    h = min(taken[settled:])
+        engine, rate = EngineWithFallback(system, prepared_method, "auto", 1), max_rate / max(norm, 1e-300)
+        if (
+            run_trial(rate).underflow_step_size is not None
+            and (growth := growth_rate_at(system, prepared_method, x)) > rate
+        ):
+            run_trial(growth)  # near an equilibrium, steps resolve the growth rate and not the slow motion
+    if len(step_sizes) < 2:
+        raise InputError(f"no step from this state is as accurate as {rtol:g}: {len(step_sizes)} steps were taken")
+    n_growing = next((i for i, (a, b) in enumerate(pairwise(step_sizes)) if b < DEADBAND[1] * a), len(step_sizes) - 1)
+    h = min(step_sizes[n_growing:])
     digits = 1 - math.floor(math.log10(h))
-    work = used.evaluations_per_iteration * (iterations[-1] - iterations[settled]) / sum(taken[settled:])
+    work = (
+        prepared_method.evaluations_per_iteration
+        * (iterations[-1] - iterations[n_growing])
+        / sum(step_sizes[n_growing:])
+    )
     return Trial(method, math.floor(h * 10.0**digits) / 10.0**digits, work)
 
 
 class _TrialCompleteError(Exception):
-    """Ends a run that has served its purpose."""
+    """Ends a trial after enough steps."""

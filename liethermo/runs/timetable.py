@@ -1,4 +1,4 @@
-"""Where a run of equal steps arrives when, what it keeps, and in which portions the engines take it."""
+"""Schedules of fixed steps: their times, the steps whose states are saved, and the calls of an engine."""
 
 from __future__ import annotations
 
@@ -16,15 +16,17 @@ from ..functions.gradients import EPS
 from .adaptive import Adaptive
 
 CHUNK_STEPS = 100_000
-"""Steps per call of the engine at most (about a second), so that Ctrl-C is heard."""
+"""Largest number of steps in one call of an engine, about a second of work; Ctrl-C acts between calls."""
 
 
 TIME_TOLERANCE_ULPS = 4.0
-"""Roundings of the larger end of a span that its length may be off by, where the ends are multiples of a step."""
+"""Allowed error of the length of a span, in units in the last place of its larger end; the ends are themselves rounded
+multiples of a step."""
 
 
 class ScheduleSegment(NamedTuple):
-    """Equal steps from one time to another, and a shorter one, of size ``last_step_size``, where they do not arrive there."""
+    """Equal steps from ``start`` to ``end``, and a last one of size ``last_step_size`` if the equal steps do not reach
+    the end."""
 
     start: float
     end: float
@@ -39,35 +41,50 @@ class ScheduleSegment(NamedTuple):
         # asking for a second one: the times themselves are rounded.
         rounding = min(TIME_TOLERANCE_ULPS * EPS * max(abs(start), abs(end)), 0.01 * h)
         tolerance = max(1e-12 * (end - start), rounding)
-        full = math.floor((end - start + tolerance) / h)
-        last = end - (start + full * h)
-        return cls(start, end, full, last if last > tolerance else 0.0)
+        n_full_steps = math.floor((end - start + tolerance) / h)
+        last_step_size = end - (start + n_full_steps * h)
+        return cls(start, end, n_full_steps, last_step_size if last_step_size > tolerance else 0.0)
 
     @property
     def n_steps(self) -> int:
         return self.n_full_steps + (self.last_step_size > 0.0)
 
 
+class EngineCall(NamedTuple):
+    """One call of an engine: ``n_saves`` saves, each after ``steps_per_save`` steps of size h.
+
+    Attributes
+    ----------
+    keep : bool
+        False if the states of this call are not among the saved states of the run.
+    """
+
+    h: float
+    n_saves: int
+    steps_per_save: int
+    keep: bool
+
+
 class StepSchedule:
-    """Steps of one size over a span of time, from stop to stop.
+    """A schedule of steps of one size over a time span, with stops at which steps must end.
 
     Parameters
     ----------
     span : (float, float)
     step : float
     save_every : int or None
-        Keep the states of every ``save_every``-th step, and the last; None keeps those at the stops alone.
+        Save every ``save_every``-th state and the last; with None save only the states at the stops.
     stop_times : array, optional
-        Times at which steps end, the end of the span the last, which is the only one otherwise.
+        Times at which steps end; the last is the end of the span. By default the end of the span is the only stop.
     allow_infinite_end : bool
-        Whether the end may be infinite, for steps that are not of one size.
+        Allow an infinite end, for adaptive steps.
 
     Attributes
     ----------
     start, end, h : float
-    segments : list of Part
+    segments : list of ScheduleSegment
     n_steps : int
-        How many there are.
+        Number of steps of all segments.
 
     Raises
     ------
@@ -83,111 +100,125 @@ class StepSchedule:
         if save_every is not None and (
             isinstance(save_every, bool) or not isinstance(save_every, int) or save_every < 1
         ):
-            raise InputError(f"save_every must be a positive integer, not {save_every!r}")
-        ends = [self.end] if stop_times is None else [float(t) for t in stop_times if t > self.start]
+            raise InputError(f"save_every must be a positive integer, got {save_every!r}")
+        stops = [self.end] if stop_times is None else [float(t) for t in stop_times if t > self.start]
         self.save_every, self.segments = (
             save_every,
-            [ScheduleSegment.from_span(*ends, self.h) for ends in itertools.pairwise([self.start, *ends])],
+            [ScheduleSegment.from_span(*ends, self.h) for ends in itertools.pairwise([self.start, *stops])],
         )
-        self.n_steps = sum(part.n_steps for part in self.segments)
+        self.n_steps = sum(segment.n_steps for segment in self.segments)
 
     @classmethod
-    def of_zero_length(cls, t: float) -> StepSchedule:
-        """Return the course over a span of length zero, without a step."""
-        course = cls.__new__(cls)
-        course.start = course.end = t
-        course.h, course.save_every, course.segments, course.n_steps = 0.0, None, [], 0
-        return course
+    def zero_length(cls, t: float) -> StepSchedule:
+        """Return the schedule of a span of length zero at time t; it has no step."""
+        schedule = cls.__new__(cls)
+        schedule.start = schedule.end = t
+        schedule.h, schedule.save_every, schedule.segments, schedule.n_steps = 0.0, None, [], 0
+        return schedule
 
     def engine_calls(
         self, max_steps: int = CHUNK_STEPS, max_saves: int = MAX_SAVES_PER_CALL, save_all: bool = False
-    ) -> Iterator[tuple[float, int, int, bool]]:
-        """The run in calls ``(h, saves, every, kept)`` of an engine: so many saves, each after so many steps of size h.
+    ) -> Iterator[EngineCall]:
+        """Yield the engine calls that take all steps in order.
 
-        None has more than ``max_saves`` saves, nor more than ``max_steps`` steps unless that is a single save. With ``save_all``
-        every state is saved. ``kept`` is whether what is saved is kept.
+        A call has at most ``max_saves`` saves, and at most ``max_steps`` steps unless it has a single save. With
+        ``save_all`` every step is saved.
         """
-        own = 1 if save_all else self.save_every
-        for part in self.segments:
-            done = 0
-            while done < part.n_full_steps:
-                left = part.n_full_steps - done
-                every = min(own or max_steps, left)
-                count = 1 if own is None else max(1, min(max_saves, max_steps // every, left // every))
-                done += count * every
-                yield self.h, count, every, own is not None or done >= part.n_steps
-            if part.last_step_size:
-                yield part.last_step_size, 1, 1, True
+        save_every = 1 if save_all else self.save_every
+        for segment in self.segments:
+            n_done = 0
+            while n_done < segment.n_full_steps:
+                n_remaining = segment.n_full_steps - n_done
+                steps_per_save = min(save_every or max_steps, n_remaining)
+                n_saves = (
+                    1
+                    if save_every is None
+                    else max(1, min(max_saves, max_steps // steps_per_save, n_remaining // steps_per_save))
+                )
+                n_done += n_saves * steps_per_save
+                yield EngineCall(self.h, n_saves, steps_per_save, save_every is not None or n_done >= segment.n_steps)
+            if segment.last_step_size:
+                yield EngineCall(segment.last_step_size, 1, 1, True)
 
     @property
     def stop_times(self) -> np.ndarray:
-        """The times at which steps have to end, increasing; the last is the end of the span."""
-        return np.array([part.end for part in self.segments])
+        """Times at which steps must end, in increasing order; the last is the end of the span."""
+        return np.array([segment.end for segment in self.segments])
 
-    def step_size_after(self, step: int) -> float:
-        """The size of the step after so many; of the last where there are no more."""
-        for part in self.segments:
-            if step < part.n_steps or part is self.segments[-1]:
+    def step_size_after(self, n_steps: int) -> float:
+        """Return the size of the step that follows the first ``n_steps`` steps; at the end, the size of the last
+        step."""
+        for segment in self.segments:
+            if n_steps < segment.n_steps or segment is self.segments[-1]:
                 break
-            step -= part.n_steps
-        return part.last_step_size if step >= part.n_full_steps else self.h
+            n_steps -= segment.n_steps
+        return segment.last_step_size if n_steps >= segment.n_full_steps else self.h
 
     @property
     def longest_steps(self) -> np.ndarray:
-        """The longest of the steps after each state that is kept."""
-        longest = [self.h if part.n_full_steps else part.last_step_size for part in self.segments]
-        return np.array(longest) if self.save_every is None else np.full(len(self.saved_step_counts) - 1, longest[0])
+        """The longest step after each saved state, shape (saved states - 1,)."""
+        step_sizes = [self.h if segment.n_full_steps else segment.last_step_size for segment in self.segments]
+        return (
+            np.array(step_sizes) if self.save_every is None else np.full(len(self.saved_step_counts) - 1, step_sizes[0])
+        )
 
     @functools.cached_property
     def saved_step_counts(self) -> np.ndarray:
-        """Steps after which states are kept, 0 (the start) and the last among them."""
+        """Numbers of steps after which states are saved, from 0 (the start) to ``n_steps``."""
         if self.save_every is None:
             return self._steps_before_segments
-        kept = np.arange(0, self.segments[0].n_full_steps + 1, self.save_every)
+        counts = np.arange(0, self.segments[0].n_full_steps + 1, self.save_every)
         return np.append(
-            kept, [n for n in sorted({self.segments[0].n_full_steps, self.n_steps}) if n > kept[-1]]
+            counts, [n for n in sorted({self.segments[0].n_full_steps, self.n_steps}) if n > counts[-1]]
         ).astype(int)
 
     @functools.cached_property
     def _steps_before_segments(self) -> np.ndarray:
-        """The steps before each part, and all."""
-        return np.cumsum([0, *(part.n_steps for part in self.segments)])
+        """Number of steps before each segment; the total is the last entry."""
+        return np.cumsum([0, *(segment.n_steps for segment in self.segments)])
 
     @property
     def saved_times(self) -> np.ndarray:
-        """The times at :attr:`counts`."""
+        """Times of the saved states."""
         return self.times_after(self.saved_step_counts)
 
     def times_after(self, steps: np.ndarray) -> np.ndarray:
-        """The times after so many steps."""
+        """Return the times after the given numbers of steps."""
         if len(self.segments) == 1:
             return np.where(
                 steps >= self.n_steps, self.end, np.minimum(_time_after(self.start, steps, self.h), self.end)
             )
-        place = np.clip(
+        segment_index = np.clip(
             np.searchsorted(self._steps_before_segments, steps, side="right") - 1, 0, len(self.segments) - 1
         )
-        starts, ends = (np.array([getattr(part, name) for part in self.segments])[place] for name in ("start", "end"))
-        last = steps >= self._steps_before_segments[place + 1]
+        starts, ends = (
+            np.array([getattr(segment, name) for segment in self.segments])[segment_index] for name in ("start", "end")
+        )
+        is_last_step = steps >= self._steps_before_segments[segment_index + 1]
         return np.where(
-            last, ends, np.minimum(_time_after(starts, steps - self._steps_before_segments[place], self.h), ends)
+            is_last_step,
+            ends,
+            np.minimum(_time_after(starts, steps - self._steps_before_segments[segment_index], self.h), ends),
         )
 
 
 def make_schedule(
     span, step: float | Adaptive, save_every: int | None, save_at=None, allow_infinite_end: bool = False
 ) -> StepSchedule:
-    """The course of a run whose states are kept at these times, if any are given; adaptive steps are as one."""
+    """Return the schedule of a run; an adaptive run has one nominal step, as long as the span.
+
+    With ``save_at`` the steps end at these times, and only the states there are saved.
+    """
     start, end = _checked_span(span, allow_infinite_end)
-    size = end - start if isinstance(step, Adaptive) else step
-    course = StepSchedule((start, end), size, save_every, allow_infinite_end=allow_infinite_end)
+    step_size = end - start if isinstance(step, Adaptive) else step
+    schedule = StepSchedule((start, end), step_size, save_every, allow_infinite_end=allow_infinite_end)
     if save_at is None:
-        return course
-    return StepSchedule((start, end), size, None, _stop_times(save_at, start, end), allow_infinite_end)
+        return schedule
+    return StepSchedule((start, end), step_size, None, _stop_times(save_at, start, end), allow_infinite_end)
 
 
 def _stop_times(save_at, start: float, end: float) -> np.ndarray:
-    """The times at which steps have to end, the end of the span among them."""
+    """Return the sorted times of ``save_at`` and the end of the span."""
     times = np.atleast_1d(np.asarray(save_at, dtype=np.float64))
     if times.ndim != 1 or not np.isfinite(times).all() or times.size == 0:
         raise InputError(f"save_at must be a list of times, got {save_at!r}")
@@ -195,46 +226,48 @@ def _stop_times(save_at, start: float, end: float) -> np.ndarray:
 
 
 def clip_times_to_span(times: np.ndarray, start: float, end: float, name: str) -> np.ndarray:
-    """Return times that are moved to an end of a span if they lie beyond it by rounding: 0.1 + 0.1 + 0.1 > 0.3.
+    """Return times clipped to a span, if they lie outside of it by rounding alone: 0.1 + 0.1 + 0.1 > 0.3.
 
     Raises
     ------
     InputError
-        If one lies outside of the span.
+        If a time lies outside of the span.
     """
     rounding = TIME_TOLERANCE_ULPS * EPS * max(abs(start), abs(end) if math.isfinite(end) else 0.0)
-    outside = times[~((times >= start - rounding) & (times <= end + rounding))]
-    if outside.size:
-        raise InputError(f"{name} must be times of t_span = ({start:g}, {end:g}), got {outside[0]:g}, outside of it")
+    invalid_times = times[~((times >= start - rounding) & (times <= end + rounding))]
+    if invalid_times.size:
+        raise InputError(
+            f"{name} must be times of t_span = ({start:g}, {end:g}), got {invalid_times[0]:g}, outside of it"
+        )
     return np.clip(times, start, end)
 
 
 def _time_after(start, steps, h: float) -> np.ndarray:
     """Return ``start + steps * h``, rounded once (Dekker's product and Knuth's sum)."""
-    steps, (h_high, h_low) = np.asarray(steps, dtype=np.float64), _split_double(np.float64(h))
-    high, low = _split_double(steps)
+    steps, (h_high, h_low) = np.asarray(steps, dtype=np.float64), _veltkamp_split(np.float64(h))
+    steps_high, steps_low = _veltkamp_split(steps)
     product = steps * h
-    lost = ((high * h_high - product) + high * h_low + low * h_high) + low * h_low
-    found = start + product
-    other = found - start
-    lost = lost + (start - (found - other)) + (product - other)
-    return np.where(np.isfinite(lost), found + lost, found)
+    rounding_error = ((steps_high * h_high - product) + steps_high * h_low + steps_low * h_high) + steps_low * h_low
+    total = start + product
+    increment = total - start
+    rounding_error = rounding_error + (start - (total - increment)) + (product - increment)
+    return np.where(np.isfinite(rounding_error), total + rounding_error, total)
 
 
-def _split_double(a) -> tuple[np.ndarray, np.ndarray]:
-    """Two numbers of 26 bits whose sum is a."""
+def _veltkamp_split(a) -> tuple[np.ndarray, np.ndarray]:
+    """Return two numbers of at most 26 bits whose sum is ``a`` (Veltkamp's splitting)."""
     with np.errstate(over="ignore", invalid="ignore"):
-        shifted = a * (2.0**27 + 1.0)
-        high = shifted - (shifted - a)
-        return high, a - high
+        scaled_value = a * (2.0**27 + 1.0)
+        high_part = scaled_value - (scaled_value - a)
+        return high_part, a - high_part
 
 
-def _checked_span(span, endless: bool) -> tuple[float, float]:
+def _checked_span(span, allow_infinite_end: bool) -> tuple[float, float]:
     try:
         start, end = (float(t) for t in span)
     except (TypeError, ValueError):
         raise InputError(f"t_span must be two numbers (start, end), got {span!r:.60}") from None
-    if not (math.isfinite(start) and end > start and (endless or math.isfinite(end))):
+    if not (math.isfinite(start) and end > start and (allow_infinite_end or math.isfinite(end))):
         cure = "" if end != math.inf else (
             ". An infinite end needs lt.integrate with adaptive steps and an event to stop at: step=lt.Adaptive(rtol), "
             "until=event"
@@ -247,9 +280,12 @@ def _checked_step(step, start: float, end: float) -> float:
     try:
         h = float(step)
     except (TypeError, ValueError):
-        raise InputError(f"step must be a number, not {step!r}") from None
+        raise InputError(f"step must be a number, got {step!r}") from None
     if not (math.isfinite(h) and h > 0.0):
         raise InputError(f"step must be positive and finite, got {h:g}")
     if start + h == start or end + h == end:
-        raise InputError(f"step {h:g} vanishes beside the times {start:g} and {end:g} in double precision")
+        raise InputError(
+            f"step {h:g} is below the rounding of the times {start:g} and {end:g} in double precision. Give a larger "
+            "step, or measure the time from a start nearer to zero"
+        )
     return h

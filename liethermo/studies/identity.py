@@ -49,7 +49,7 @@ def describe_study(solver: PointSolver, columns: PointResults, x0: np.ndarray) -
         "step": _step_as_json(task.step),
         "method": repr(task.method),
         "until": _event_as_json(task.until),
-        "noise": None if task.noise is None else task.noise.as_provenance(),
+        "noise": None if task.noise is None else task.noise.to_provenance(),
         "measures": {name: measure.description() for name, measure in task.measures.items()},
         "values": {name: _as_json_numbers(columns.measures[name][0]) for name in task.measures},
     }

@@ -136,7 +136,7 @@ class StudySystems:
             )
             if given:
                 self._conditions = _ParameterConditions(self._build_system, parameters)
-                family = family.as_traced_program()
+                family = family.trace_builder()
             self.family = replace(family, example=self.example_system)
         except Exception as error:  # whatever a builder does with a tracer; with numbers it will say what is wrong
             self.why_no_family = f"{type(error).__name__}: {error}".partition("\n")[0]

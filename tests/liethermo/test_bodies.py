@@ -23,8 +23,10 @@ def free(inertia, mu0, t_end, times=None, rate=0.0):
     def f(t, s):
         mu, R = s[:3], s[3:].reshape(3, 3)
         xi = mu / inertia
-        whole = xi + rate * np.cross(mu, xi)
-        return np.concatenate([np.cross(mu, whole), np.cross(R, whole).ravel()])  # rows r: (R hat(w))_r = r x w
+        derivative = xi + rate * np.cross(mu, xi)
+        return np.concatenate(
+            [np.cross(mu, derivative), np.cross(R, derivative).ravel()]
+        )  # rows r: (R hat(w))_r = r x w
 
     start = np.concatenate([mu0, np.eye(3).ravel()])
     return solve_ivp(f, (0.0, t_end), start, "DOP853", t_eval=times, rtol=3e-14, atol=1e-15)
@@ -35,19 +37,19 @@ def free(inertia, mu0, t_end, times=None, rate=0.0):
 def test_periods_against_an_integration(mu0, order):
     """After a period the momentum is back, and the axis has turned about L by its mean rate times the period."""
     inertia, mu0 = ASYMMETRIC[list(order)], np.array(mu0)[list(order)]
-    found = lt.bodies.periods(inertia, mu0)
-    run = free(inertia, mu0, float(found.rotation))
+    periods = lt.bodies.periods(inertia, mu0)
+    run = free(inertia, mu0, float(periods.rotation))
     mu, g = run.y[:3, -1], run.y[3:, -1].reshape(3, 3)
     assert np.allclose(mu, mu0, rtol=0, atol=3e-12)
-    back = Rotation.from_matrix(g).as_rotvec()  # the whole turns about the momentum in space
+    rotation_vector = Rotation.from_matrix(g).as_rotvec()  # the whole turns about the momentum in space
     L = mu0 / np.linalg.norm(mu0)
-    turned = 2 * np.pi * found.rotation / found.precession
-    assert np.linalg.norm(np.cross(back, L)) < 3e-12
-    assert abs(np.sin(0.5 * (back @ L - turned))) < 3e-12
-    axis = order[found.axis]
+    angle = 2 * np.pi * periods.rotation / periods.precession
+    assert np.linalg.norm(np.cross(rotation_vector, L)) < 3e-12
+    assert abs(np.sin(0.5 * (rotation_vector @ L - angle))) < 3e-12
+    axis = order[periods.axis]
     assert axis == (2 if abs(mu0[list(order).index(2)]) > 0.9 else 0)
-    by_energy = lt.bodies.periods(inertia, np.linalg.norm(mu0), 0.5 * np.sum(mu0**2 / inertia))
-    assert np.allclose([*found[:2]], [*by_energy[:2]], rtol=1e-12)
+    periods_of_energy = lt.bodies.periods(inertia, np.linalg.norm(mu0), 0.5 * np.sum(mu0**2 / inertia))
+    assert np.allclose([*periods[:2]], [*periods_of_energy[:2]], rtol=1e-12)
 
 
 def test_periods_in_their_limits():
@@ -58,9 +60,9 @@ def test_periods_in_their_limits():
     separatrix = lt.bodies.periods(ASYMMETRIC, 1.0, 1.0 / (2 * 2.0))
     assert np.isinf(separatrix.rotation)
     assert separatrix.precession == pytest.approx(2 * np.pi * 2.0)
-    many = lt.bodies.periods(ASYMMETRIC, np.array([[0.3, 0.2, 1.0], [1.0, 0.3, -0.2]]))
-    assert many.rotation.shape == many.axis.shape == (2,)
-    assert many.axis.tolist() == [2, 0]
+    periods = lt.bodies.periods(ASYMMETRIC, np.array([[0.3, 0.2, 1.0], [1.0, 0.3, -0.2]]))
+    assert periods.rotation.shape == periods.axis.shape == (2,)
+    assert periods.axis.tolist() == [2, 0]
     for energy, momentum in ((7.0, 1.0), (0.1, 1.0)):
         with pytest.raises(lt.InputError, match="has an energy from") as error:
             lt.bodies.periods(ASYMMETRIC, momentum, energy)
@@ -71,8 +73,8 @@ def test_angles_of_a_free_round_body():
     """The axis goes round L at L / I_1, and the body round its axis at L cos(theta) (1/I_3 - 1/I_1), in whole turns."""
     inertia, mu0 = np.array([1.0, 1.0, 1.6]), np.array([0.6, 0.0, 0.8])
     body = lt.models.tumbling_body(inertia, rate=0.0)
-    turned = Rotation.from_rotvec([0.3, -2.0, 0.5]).as_matrix()
-    run = lt.integrate(body, mu0, (0.0, 60.0), 0.1, lt.MetriplecticGauss(4), attitude=turned)
+    rotation = Rotation.from_rotvec([0.3, -2.0, 0.5]).as_matrix()
+    run = lt.integrate(body, mu0, (0.0, 60.0), 0.1, lt.MetriplecticGauss(4), attitude=rotation)
     assert np.ptp(lt.bodies.nutation(run)) < 1e-14
     assert lt.bodies.nutation(run)[0] == pytest.approx(np.arctan2(0.6, 0.8), rel=1e-14)
     assert np.allclose(np.diff(lt.bodies.precession(run)), 0.1, rtol=0, atol=1e-9)
@@ -89,7 +91,7 @@ def test_angles_of_a_free_round_body():
     relative = Rotation.from_euler("ZXZ", np.stack([phi, theta, psi], axis=1)).as_matrix()
     frame = run.attitude @ relative.swapaxes(1, 2)  # the axes of space about L, the same at all times
     assert np.ptp(frame, axis=0).max() < 1e-12
-    L = turned @ mu0
+    L = rotation @ mu0
     axes = run.attitude @ np.array([0.0, 0.0, 1.0])
     assert np.allclose(axes @ L / np.linalg.norm(L), np.cos(theta), rtol=0, atol=1e-13)
 
@@ -104,9 +106,9 @@ def test_angles_of_a_free_round_body():
 def test_what_files_tell(tmp_path):
     body = lt.models.tumbling_body((3.0, 2.0, 1.5), rate=0.1)
     run = lt.integrate(body, (0.06, 0.1, 1.0), (0.0, 5.0), 0.1)
-    again = lt.load(run.save(tmp_path / "run.nc"))
-    for told in (lt.bodies.nutation, lt.bodies.precession, lt.bodies.spin, lt.bodies.quaternions):
-        assert np.array_equal(told(again), told(run))
+    loaded_run = lt.load(run.save(tmp_path / "run.nc"))
+    for angle_function in (lt.bodies.nutation, lt.bodies.precession, lt.bodies.spin, lt.bodies.quaternions):
+        assert np.array_equal(angle_function(loaded_run), angle_function(run))
 
 
 def test_a_rod_has_its_nutation_from_its_own_axis():
@@ -177,12 +179,12 @@ def test_nearly_equal_moments_with_strong_friction_fall_to_their_plane_in_the_re
     d2, d3 = 1 / inertia[1:] - 1 / inertia[0]
     linear = np.array([[-rate * L**2 * d2, -L * d3], [L * d2, -rate * L**2 * d3]])
     roots, modes = np.linalg.eig(linear)
-    fast = modes[:, np.argmin(roots)]  # -0.06 rad across the plane for each rad within it
-    mu0 = np.array([L, *(1e-4 * L * fast)])
+    fast_mode = modes[:, np.argmin(roots)]  # -0.06 rad across the plane for each rad within it
+    mu0 = np.array([L, *(1e-4 * L * fast_mode)])
     run = free(inertia, mu0, 3 * tau, tau * np.arange(4), rate)
     assert np.allclose(np.diff(np.log(np.abs(run.y[2]))), -1.0, rtol=0, atol=1e-4)
-    within_the_plane = free(inertia, L * np.array([np.cos(0.02), np.sin(0.02), 0.0]), rate / d2, [0, rate / d2], rate)
-    assert np.log(within_the_plane.y[1, 0] / within_the_plane.y[1, -1]) == pytest.approx(1.0, abs=0.12)
+    plane_run = free(inertia, L * np.array([np.cos(0.02), np.sin(0.02), 0.0]), rate / d2, [0, rate / d2], rate)
+    assert np.log(plane_run.y[1, 0] / plane_run.y[1, -1]) == pytest.approx(1.0, abs=0.12)
 
 
 def test_the_rate_has_derivatives_and_is_continuous_at_a_rod():
@@ -203,14 +205,14 @@ TENSOR = TURNED @ np.diag([2.0, 2.5, 3.0]) @ TURNED.T
 def test_a_tensor_is_one_body():
     """It was read as three bodies, and the answers looked plausible."""
     mu = np.array([0.1, 0.2, 1.0])
-    one, other = lt.bodies.periods(TENSOR, TURNED @ mu), lt.bodies.periods((2.0, 2.5, 3.0), mu)
+    one, diagonal_periods = lt.bodies.periods(TENSOR, TURNED @ mu), lt.bodies.periods((2.0, 2.5, 3.0), mu)
     assert one.rotation.shape == ()
-    assert np.allclose([*one], [*other], rtol=1e-12)
-    by_energy = lt.bodies.periods(TENSOR, np.linalg.norm(mu), 0.5 * np.sum(mu**2 / [2.0, 2.5, 3.0]))
-    assert np.allclose([*by_energy], [*other], rtol=1e-12)
-    many = lt.bodies.periods(np.stack([TENSOR, np.diag([1.0, 2.0, 2.5])]), np.stack([TURNED @ mu, mu]))
-    assert np.allclose(many.rotation[0], other.rotation, rtol=1e-12)
-    assert np.allclose(many.rotation[1], lt.bodies.periods((1.0, 2.0, 2.5), mu).rotation, rtol=1e-12)
+    assert np.allclose([*one], [*diagonal_periods], rtol=1e-12)
+    periods_of_energy = lt.bodies.periods(TENSOR, np.linalg.norm(mu), 0.5 * np.sum(mu**2 / [2.0, 2.5, 3.0]))
+    assert np.allclose([*periods_of_energy], [*diagonal_periods], rtol=1e-12)
+    periods = lt.bodies.periods(np.stack([TENSOR, np.diag([1.0, 2.0, 2.5])]), np.stack([TURNED @ mu, mu]))
+    assert np.allclose(periods.rotation[0], diagonal_periods.rotation, rtol=1e-12)
+    assert np.allclose(periods.rotation[1], lt.bodies.periods((1.0, 2.0, 2.5), mu).rotation, rtol=1e-12)
     assert float(lt.bodies.rate_of(3.0, TENSOR, 1.0)) == pytest.approx(float(lt.bodies.rate_of(3.0, (2, 2.5, 3), 1.0)))
     moments, axes = lt.bodies.principal_axes(TENSOR)
     assert np.allclose(moments, [2.0, 2.5, 3.0], rtol=1e-14)
@@ -221,12 +223,12 @@ def test_a_tensor_is_one_body():
 def test_three_bodies_are_three_bodies():
     """Moments that happen to make a symmetric array, which is then no tensor of a rigid body."""
     three = np.array([[2.0, 3.0, 4.0], [3.0, 4.0, 2.0], [4.0, 2.0, 3.0]])
-    found = lt.bodies.periods(three, 1.0, 0.5 / 2.5)
-    alone = [lt.bodies.periods(body, 1.0, 0.5 / 2.5).rotation for body in three]
-    assert np.array_equal(found.rotation, alone)
+    periods = lt.bodies.periods(three, 1.0, 0.5 / 2.5)
+    single_runs = [lt.bodies.periods(body, 1.0, 0.5 / 2.5).rotation for body in three]
+    assert np.array_equal(periods.rotation, single_runs)
     assert lt.bodies.rate_of(1.0, np.ones((3, 3)) * [1.0, 1.5, 2.0], 1.0).shape == (3,)
-    equal = [[3.0, 2.0, 2.0], [2.0, 3.0, 2.0], [2.0, 2.0, 3.0]]  # positive definite, and its rows are bodies
-    assert lt.bodies.rate_of(1.0, equal, 1.0).shape == (3,)
+    equal_moments = [[3.0, 2.0, 2.0], [2.0, 3.0, 2.0], [2.0, 2.0, 3.0]]  # positive definite, and its rows are bodies
+    assert lt.bodies.rate_of(1.0, equal_moments, 1.0).shape == (3,)
 
 
 @settings(max_examples=50, deadline=None)
@@ -262,17 +264,17 @@ def test_models_take_tensors():
     """The same motion in other axes: rows of states are turned, energies are equal."""
     moments, mu = np.array([2.0, 2.5, 3.0]), np.array([0.1, 0.2, 1.0])
     axis = np.array([0.0, 1.0, 0.0])
-    for make, more in (
+    for make, further_state in (
         (lambda I, axis: lt.models.tumbling_body(I, relaxation_time=5.0, momentum=1.0), []),
         (lambda I, axis: lt.models.rigid_body(I, 0.1), []),
         (lambda I, axis: lt.models.free_rigid_body(I), []),
         (lambda I, axis: lt.models.damper_wheel(I, axis), [0.1]),
         (lambda I, axis: lt.models.dual_spin(I, axis, platform_rate=0.1, rotor_rate=0.2), [0.1]),
     ):
-        one = lt.integrate(make(TENSOR, TURNED @ axis), [*(TURNED @ mu), *more], (0.0, 2.0), 0.1)
-        other = lt.integrate(make(moments, axis), [*mu, *more], (0.0, 2.0), 0.1)
-        assert np.allclose(one.x[:, :3] @ TURNED, other.x[:, :3], rtol=0, atol=1e-13)
-        assert np.allclose(one.energy, other.energy, rtol=1e-13)
+        one = lt.integrate(make(TENSOR, TURNED @ axis), [*(TURNED @ mu), *further_state], (0.0, 2.0), 0.1)
+        diagonal_run = lt.integrate(make(moments, axis), [*mu, *further_state], (0.0, 2.0), 0.1)
+        assert np.allclose(one.x[:, :3] @ TURNED, diagonal_run.x[:, :3], rtol=0, atol=1e-13)
+        assert np.allclose(one.energy, diagonal_run.energy, rtol=1e-13)
     assert spin_temperature(1.0, 2.0, TENSOR) == pytest.approx(spin_temperature(1.0, 2.0, moments), rel=1e-14)
     diagonal = lt.models.free_rigid_body(np.diag(moments))
     assert np.array_equal(diagonal.energy.A, 1.0 / moments)

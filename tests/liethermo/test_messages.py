@@ -99,13 +99,13 @@ FUNCTIONS = {
 
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_functions_that_cannot_be_traced(name):
-    use, wrong, message, right = FUNCTIONS[name]
+    use, wrong_function, message, right_function = FUNCTIONS[name]
     with pytest.raises(lt.FunctionError, match=message) as caught:
-        use(wrong)
-    first, _, reported = str(caught.value).partition(" JAX reports: ")
-    assert "Tracer" not in first
-    assert "\n" not in reported
-    use(right)
+        use(wrong_function)
+    cause, _, jax_text = str(caught.value).partition(" JAX reports: ")
+    assert "Tracer" not in cause
+    assert "\n" not in jax_text
+    use(right_function)
 
 
 def test_the_line_is_named():
@@ -180,8 +180,8 @@ def test_times_that_are_a_rounding_beyond_the_end_are_the_end():
         run_ = run(system, span=(0.0, 0.3), step=step, save_at=[0.1, SUM])
         assert run_.t.tolist() == [0.0, 0.1, 0.3]
     assert lt.scipy.solve_ivp(system, (0.0, 0.3), START, t_eval=[0.1, SUM]).t.tolist() == [0.1, 0.3]
-    many = lt.ensemble(system, START, (0.0, 0.3), STEP, save_at=[0.1, SUM])
-    assert many.t.tolist() == [0.0, 0.1, 0.3]
+    ensemble = lt.ensemble(system, START, (0.0, 0.3), STEP, save_at=[0.1, SUM])
+    assert ensemble.t.tolist() == [0.0, 0.1, 0.3]
 
 
 @pytest.mark.parametrize(

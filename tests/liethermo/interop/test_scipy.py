@@ -258,7 +258,7 @@ def test_a_failure_is_told_as_scipy_tells_it():
         ({"t_span": 3.0}, "two numbers"),
         ({"args": (1.0,)}, "args are passed to the events, and there are none"),
         ({"args": 1.0, "events": crossing}, r"write args=\(1.0,\)"),
-        ({"events": _event(crossing, terminal=-1)}, "terminal is True or how many"),
+        ({"events": _event(crossing, terminal=-1)}, "terminal must be True or the number"),
         ({"jac": None}, "leave out jac: the methods take it from the system"),
         ({"rtoll": 1e-6}, "leave out rtoll: solve_ivp has no such option"),
         ({"max_step": -1.0}, "largest step"),

@@ -58,5 +58,5 @@ def oscillator(stiffness=1.0, gamma=1.0, **parts):
     """The system, of which two numbers are to be learned, or as it is with parts in their place."""
     energy = lt.learn.Energy(Spring(jnp.log(jnp.asarray(stiffness))))
     friction = lt.learn.Friction(3, function=Rubbing(jnp.log(jnp.asarray(gamma))))
-    given = {"energy": energy, "entropy": entropy, "poisson": mf.Canonical(1), "friction": friction}
-    return lt.learn.Metriplectic(3, **{**given, **parts})
+    arguments = {"energy": energy, "entropy": entropy, "poisson": mf.Canonical(1), "friction": friction}
+    return lt.learn.Metriplectic(3, **{**arguments, **parts})

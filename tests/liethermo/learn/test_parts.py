@@ -21,15 +21,15 @@ def _failed(system):
     return {row.axiom for row in system.check().rows if row.passed is False}
 
 
-@pytest.mark.parametrize(("construction", "dim", "failed"), [("skew", 4, {"Jacobi"}), ("projected", 3, set())])
-def test_the_laws_hold_before_training(construction, dim, failed):
+@pytest.mark.parametrize(("construction", "dim", "failed_rows"), [("skew", 4, {"Jacobi"}), ("projected", 3, set())])
+def test_the_laws_hold_before_training(construction, dim, failed_rows):
     """With every part learned. The Jacobi identity is not built in, and the check says so.
 
     In three dimensions a skew tensor with a gradient in its kernel is a Poisson tensor.
     """
     friction = lt.learn.Friction(dim, rank=2, construction=construction, width=4)
     system = lt.learn.Metriplectic(dim, friction=friction, width=4, seed=3)
-    assert _failed(system) == failed
+    assert _failed(system) == failed_rows
     run = lt.integrate(system, [0.3, -0.2, 0.5, 0.1][:dim], (0.0, 4.0), 0.1, method=lt.MetriplecticGauss(1))
     assert np.ptp(run.energy) < 2e-14 * max(1.0, abs(run.energy[0]))
     assert (np.diff(run.entropy) > 0.0).all()
@@ -68,7 +68,7 @@ def test_a_friction_off_another_energy_is_found():
 def test_the_factor_is_that_of_the_friction():
     system = lt.learn.Metriplectic(3, friction=lt.learn.Friction(3, rank=2, construction="projected", width=8), width=8)
     x = jnp.array([0.3, -0.2, 0.5])
-    columns = system.dissipation.columns(x, system.energy.gradient(x))
+    columns = system.dissipation.factor_columns(x, system.energy.gradient(x))
     np.testing.assert_allclose(columns @ columns.T, system.friction_matrix(x), atol=1e-14)
     factor = system.dissipation.continuous_factor(system, x)
     np.testing.assert_allclose(factor.times(jnp.array([1.0, -2.0])), columns @ np.array([1.0, -2.0]), atol=1e-15)
@@ -88,23 +88,23 @@ def test_a_plain_step_is_the_step_but_for_rounding(order):
     system = cases.oscillator(2.0, 0.3)
     x = jnp.array([0.7, -0.4, 0.1])
     run, method = prepare_for_method(system, lt.MetriplecticRungeKutta(order))
-    plain = jax.jit(lambda h: method.step_without_compensation(run, x, h))
+    step_without_compensation = jax.jit(lambda h: method.step_without_compensation(run, x, h))
     for h in (0.2, 0.1):
-        whole = lt.flow(system, x, (0.0, h), h, method=lt.MetriplecticRungeKutta(order))
-        assert np.abs(plain(h) - whole).max() < 10.0 * h ** (2 * order + 2) + 1e-15
+        whole_run = lt.flow(system, x, (0.0, h), h, method=lt.MetriplecticRungeKutta(order))
+        assert np.abs(step_without_compensation(h) - whole_run).max() < 10.0 * h ** (2 * order + 2) + 1e-15
 
 
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda: lt.learn.Energy(lt.Quadratic(np.ones(2))), "what is known is added"),
-        (lambda: lt.learn.Energy(0), "number of components is a positive integer, not 0"),
+        (lambda: lt.learn.Energy(lt.Quadratic(np.ones(2))), "Add known terms"),
+        (lambda: lt.learn.Energy(0), "number of components must be a positive integer, got 0"),
         (lambda: lt.learn.Friction(3, construction="other"), "'skew' or 'projected'"),
-        (lambda: lt.learn.Friction(3, rank=0), "rank is a positive integer"),
+        (lambda: lt.learn.Friction(3, rank=0), "rank must be a positive integer"),
         (lambda: lt.learn.Metriplectic(4, friction=lt.learn.Friction(3)), "3 components, but the state has 4"),
         (lambda: lt.learn.Metriplectic(2, poisson=mf.Canonical(2)), "4 coordinates, more than the 2"),
         (lambda: lt.learn.Metriplectic(4, poisson=lt.learn.Poisson(3)), "dim is 4, but the Poisson structure has 3"),
-        (lambda: lt.learn.Metriplectic(2, friction="some"), "not 'some'"),
+        (lambda: lt.learn.Metriplectic(2, friction="some"), "got 'some'"),
     ],
 )
 def test_what_cannot_be_used_is_refused(call, words):

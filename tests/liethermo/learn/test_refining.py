@@ -59,18 +59,18 @@ def least_squares(data, noise=NOISE):
         runs = [run(start, v[0], t) for start, (t, _) in zip(v[1:].reshape(-1, 3), data, strict=True)]
         return np.concatenate([(x - y).ravel() for x, (_, y) in zip(runs, data, strict=True)]) / noise
 
-    found = scipy.optimize.least_squares(missed, np.concatenate([[0.2], *(x[0] for _, x in data)]))
-    variance = 2 * found.cost / (found.fun.size - found.x.size)
-    return found.x[0], np.sqrt(np.linalg.inv(found.jac.T @ found.jac)[0, 0] * variance)
+    result = scipy.optimize.least_squares(missed, np.concatenate([[0.2], *(x[0] for _, x in data)]))
+    variance = 2 * result.cost / (result.fun.size - result.x.size)
+    return result.x[0], np.sqrt(np.linalg.inv(result.jac.T @ result.jac)[0, 0] * variance)
 
 
 def test_the_rate_and_its_error_are_those_of_least_squares():
     data = records(3)
-    found = lt.learn.fit(spring(0.5), data, positive=rate_of, noise=NOISE, validation=0, **FEW)
+    fitted_system = lt.learn.fit(spring(0.5), data, positive=rate_of, noise=NOISE, validation=0, **FEW)
     rate, error = least_squares(data)
-    result = found.training
-    assert float(rate_of(found)) == pytest.approx(rate, abs=0.02 * error)
-    assert result.values == pytest.approx([float(rate_of(found))], rel=1e-14)
+    result = fitted_system.training
+    assert float(rate_of(fitted_system)) == pytest.approx(rate, abs=0.02 * error)
+    assert result.values == pytest.approx([float(rate_of(fitted_system))], rel=1e-14)
     assert result.standard_errors == pytest.approx([error], rel=0.02)
     assert result.names == ("dissipation.part.rate",)
     assert result.converged
@@ -85,22 +85,24 @@ def test_the_rate_and_its_error_are_those_of_least_squares():
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_friction_is_found_where_the_noise_is_not_given(seed):
     """It was 0.28 and 0.10 for a true 0.15: splines through noisy data have its derivatives."""
-    found = lt.learn.fit(spring(0.5), records(seed), positive=rate_of, **FEW).training
-    assert abs(found.values[0] - RATE) < 2.5 * found.standard_errors[0]
-    assert found.standard_errors[0] < 0.002
-    assert found.noise_is_estimated
-    np.testing.assert_allclose(found.noise, NOISE, rtol=0.3)
-    assert found.held_out == pytest.approx(1.0, abs=0.4)
-    assert "estimated" in str(found)
+    fitted_system = lt.learn.fit(spring(0.5), records(seed), positive=rate_of, **FEW).training
+    assert abs(fitted_system.values[0] - RATE) < 2.5 * fitted_system.standard_errors[0]
+    assert fitted_system.standard_errors[0] < 0.002
+    assert fitted_system.noise_is_estimated
+    np.testing.assert_allclose(fitted_system.noise, NOISE, rtol=0.3)
+    assert fitted_system.held_out == pytest.approx(1.0, abs=0.4)
+    assert "estimated" in str(fitted_system)
 
 
 def test_two_observed_components_determine_it_too():
     """It was 0.184: the descent had not come to its end, and nothing said so."""
     data = [(t, x[:, :2]) for t, x in records(0)]
-    found = lt.learn.fit(spring(0.5), data, observed=[0, 1], positive=rate_of, noise=NOISE, shooting=100).training
-    assert found.converged
-    assert abs(found.values[0] - RATE) < 2.5 * found.standard_errors[0]
-    assert found.standard_errors[0] < 0.002
+    fitted_system = lt.learn.fit(
+        spring(0.5), data, observed=[0, 1], positive=rate_of, noise=NOISE, shooting=100
+    ).training
+    assert fitted_system.converged
+    assert abs(fitted_system.values[0] - RATE) < 2.5 * fitted_system.standard_errors[0]
+    assert fitted_system.standard_errors[0] < 0.002
 
 
 @pytest.mark.slow
@@ -110,9 +112,9 @@ def test_the_defaults_find_it_within_two_standard_errors(guess, observed):
     errors = []
     for seed in range(4):
         data = [(t, x if observed is None else x[:, observed]) for t, x in records(seed)]
-        found = lt.learn.fit(spring(guess), data, positive=rate_of, observed=observed).training
-        assert found.converged
-        errors.append((found.values[0] - RATE) / found.standard_errors[0])
+        fitted_system = lt.learn.fit(spring(guess), data, positive=rate_of, observed=observed).training
+        assert fitted_system.converged
+        errors.append((fitted_system.values[0] - RATE) / fitted_system.standard_errors[0])
     assert np.abs(errors).max() < 3.0
     assert np.sqrt(np.mean(np.square(errors))) < 2.0
 
@@ -121,8 +123,8 @@ def test_three_rows_do_not_determine_it():
     """0.43 came without a word."""
     data = [(t[:3], x[:3]) for t, x in records(1)[:1]]
     with pytest.warns(lt.learn.FitWarning, match=r"the data do not determine dissipation.part.rate = .* ± "):
-        found = lt.learn.fit(spring(0.5), data, positive=rate_of, **FEW)
-    result = found.training
+        fitted_system = lt.learn.fit(spring(0.5), data, positive=rate_of, **FEW)
+    result = fitted_system.training
     assert result.standard_errors[0] > 0.5 * result.values[0]
     assert "CAUTION: the data do not determine" in str(result)
 
@@ -142,8 +144,8 @@ def test_a_number_that_moves_nothing_is_called_so():
     energy = lt.learn.Energy(Shifted(jnp.array(1.3), jnp.array(0.1)))
     start = lt.MetriplecticSystem(mf.Canonical(1), energy, dissipation=friction, baths=lt.HeatBaths(1.0, 1.0))
     with pytest.warns(lt.learn.FitWarning, match=r"the data do not determine .*c = 0\.1 ± inf"):
-        found = lt.learn.fit(start, records(0), noise=NOISE, **FEW)
-    result = found.training
+        fitted_system = lt.learn.fit(start, records(0), noise=NOISE, **FEW)
+    result = fitted_system.training
     assert (result.rank, result.parameters) == (1, 2)
     assert np.isinf(result.condition)
     k = [name.endswith("k") for name in result.names].index(True)
@@ -153,9 +155,9 @@ def test_a_number_that_moves_nothing_is_called_so():
 
 def test_a_model_that_cannot_describe_the_data_is_called_so():
     data = [(t, x + 0.3 * np.sin(3.0 * t)[:, None]) for t, x in records(0)]
-    with pytest.warns(lt.learn.FitWarning, match=r"times the noise: the model cannot describe them"):
-        found = lt.learn.fit(spring(0.5), data, positive=rate_of, noise=NOISE, **FEW)
-    assert found.training.residual > 3.0
+    with pytest.warns(lt.learn.FitWarning, match=r"times the noise: the model cannot describe the data"):
+        fitted_system = lt.learn.fit(spring(0.5), data, positive=rate_of, noise=NOISE, **FEW)
+    assert fitted_system.training.residual > 3.0
 
 
 def test_noise_is_told_from_motion():
@@ -168,8 +170,8 @@ def test_noise_is_told_from_motion():
         data = [Trajectory(times, run(start, RATE, times)) for start in STARTS]
         assert estimate_noise(data, np.ones(3)) is None
     assert estimate_noise([Trajectory(t[:3], np.zeros((3, 1)))], np.ones(1)) is None
-    rounded = [Trajectory(TIMES, run(STARTS[0], RATE) + 1e-9 * np.random.default_rng(0).standard_normal((81, 3)))]
-    assert estimate_noise(rounded, np.ones(3)) is None
+    rounded_data = [Trajectory(TIMES, run(STARTS[0], RATE) + 1e-9 * np.random.default_rng(0).standard_normal((81, 3)))]
+    assert estimate_noise(rounded_data, np.ones(3)) is None
 
 
 def test_data_without_noise_can_be_said_to_be_exact():
@@ -185,17 +187,17 @@ def test_data_without_noise_can_be_said_to_be_exact():
 def test_trajectories_of_any_lengths_and_attitudes():
     """The rest of a shorter trajectory is left out; what is not finite there does no harm."""
     data = [(t[: 81 - 20 * i], x[: 81 - 20 * i]) for i, (t, x) in enumerate(records(2))]
-    found = lt.learn.fit(spring(0.5), data, positive=rate_of, noise=NOISE, validation=0, **FEW).training
+    fitted_system = lt.learn.fit(spring(0.5), data, positive=rate_of, noise=NOISE, validation=0, **FEW).training
     rate, error = least_squares(data)
-    assert found.values[0] == pytest.approx(rate, abs=0.02 * error)
-    assert found.standard_errors == pytest.approx([error], rel=0.02)
+    assert fitted_system.values[0] == pytest.approx(rate, abs=0.02 * error)
+    assert fitted_system.standard_errors == pytest.approx([error], rel=0.02)
 
 
 @pytest.mark.parametrize("number", [2, pytest.param(8, marks=pytest.mark.slow)])
 def test_fits_to_few_trajectories_spread_as_their_errors(number):
     """Three trajectories were drawn again and again, and the deviation was 0.0."""
-    data, few = records(0), {"matching": 50, "shooting": 20, "validation": 0}
-    fits = lt.learn.several(lambda seed: spring(0.3), data, number, positive=rate_of, noise=NOISE, **few)
+    data, options = records(0), {"matching": 50, "shooting": 20, "validation": 0}
+    fits = lt.learn.several(lambda seed: spring(0.3), data, number, positive=rate_of, noise=NOISE, **options)
     mean, deviation = fits.spread(rate_of)
     error = least_squares(data)[1]
     assert (0.01 if number == 2 else 0.4) * error < deviation < (4.0 if number == 2 else 2.0) * error
@@ -210,20 +212,20 @@ def test_fits_that_are_all_equal_say_nothing():
 
 
 def test_the_findings_come_back_from_a_file(tmp_path):
-    found = lt.learn.fit(spring(0.5), records(0), positive=rate_of, **FEW)
-    path = lt.learn.save(found, tmp_path / "spring.npz")
-    back = lt.learn.load(path, spring(1.0))
-    assert str(back.training) == str(found.training)
-    np.testing.assert_array_equal(back.training.covariance, found.training.covariance)
-    said, arrays = training.read_archive(path, files.MODEL_FORMAT)  # a file of before
+    fitted_system = lt.learn.fit(spring(0.5), records(0), positive=rate_of, **FEW)
+    path = lt.learn.save(fitted_system, tmp_path / "spring.npz")
+    loaded_system = lt.learn.load(path, spring(1.0))
+    assert str(loaded_system.training) == str(fitted_system.training)
+    np.testing.assert_array_equal(loaded_system.training.covariance, fitted_system.training.covariance)
+    metadata, arrays = training.read_archive(path, files.MODEL_FORMAT)  # a file of before
     for name in files.ESTIMATE_FIELDS:
         arrays.pop(name)
-    said["training"] = {name: said["training"][name] for name in ("parameters", "seconds", "ended")}
-    training.write_archive(path, said, arrays)
+    metadata["training"] = {name: metadata["training"][name] for name in ("parameters", "seconds", "ended")}
+    training.write_archive(path, metadata, arrays)
     old = lt.learn.load(path, spring(1.0)).training
     assert old.converged is None
     assert old.names == ()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert "matching" in str(old)
-    assert len(jax.tree_util.tree_leaves(found)) == len(jax.tree_util.tree_leaves(spring(1.0)))
+    assert len(jax.tree_util.tree_leaves(fitted_system)) == len(jax.tree_util.tree_leaves(spring(1.0)))

@@ -19,26 +19,28 @@ def _study(system, axes, **how):
 
 def test_a_fitted_system_is_studied_and_its_study_goes_on_with_the_one_from_the_file(tmp_path):
     t, x = cases.record(2, 21)
-    fitted = lt.learn.fit(cases.oscillator(), (t, x), matching=50, shooting=0)
-    path = lt.learn.save(fitted, tmp_path / "model.npz")
-    again = lt.learn.load(path, cases.oscillator())
+    fitted_system = lt.learn.fit(cases.oscillator(), (t, x), matching=50, shooting=0)
+    path = lt.learn.save(fitted_system, tmp_path / "model.npz")
+    loaded_system = lt.learn.load(path, cases.oscillator())
     starts = {"start": lt.replicas(x[:, 0])}
-    first = _study(fitted, starts, store=tmp_path / "store.zarr")
-    assert first.run().ok
-    assert first.audit().passed
-    one = lt.integrate(fitted, x[1, 0], (0.0, 1.0), 0.1)
-    np.testing.assert_allclose(first.results.needs_final_state[1], one.x[-1], atol=1e-13)
-    second = _study(again, starts, store=tmp_path / "store.zarr")  # would be refused if it was of another system
-    np.testing.assert_array_equal(second.results.needs_final_state, first.results.needs_final_state)
+    first_study = _study(fitted_system, starts, store=tmp_path / "store.zarr")
+    assert first_study.run().ok
+    assert first_study.audit().passed
+    one = lt.integrate(fitted_system, x[1, 0], (0.0, 1.0), 0.1)
+    np.testing.assert_allclose(first_study.results.needs_final_state[1], one.x[-1], atol=1e-13)
+    second = _study(
+        loaded_system, starts, store=tmp_path / "store.zarr"
+    )  # would be refused if it was of another system
+    np.testing.assert_array_equal(second.results.needs_final_state, first_study.results.needs_final_state)
 
 
 def test_a_learned_number_is_an_axis():
     t, x = cases.record(2, 21)
-    fitted = lt.learn.fit(cases.oscillator(), (t, x), matching=50, shooting=0)
+    fitted_system = lt.learn.fit(cases.oscillator(), (t, x), matching=50, shooting=0)
     name = "energy.function.function.log_stiffness"
-    own = float(fitted.energy.function.function.log_stiffness)
-    study = _study(fitted, {name: [own, own + 0.1]}, x0=x[0, 0])
+    fitted_value = float(fitted_system.energy.function.function.log_stiffness)
+    study = _study(fitted_system, {name: [fitted_value, fitted_value + 0.1]}, x0=x[0, 0])
     assert study.run().ok
-    one = lt.integrate(fitted, x[0, 0], (0.0, 1.0), 0.1)
+    one = lt.integrate(fitted_system, x[0, 0], (0.0, 1.0), 0.1)
     np.testing.assert_allclose(study.results.needs_final_state[0], one.x[-1], atol=1e-13)
     assert np.abs(study.results.needs_final_state[1] - one.x[-1]).max() > 1e-3

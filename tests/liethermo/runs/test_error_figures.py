@@ -44,26 +44,26 @@ def flown(field, x, times):
 
 def ratios(method, rtol: float) -> list[float]:
     """The largest true errors of runs over those asked for."""
-    found = []
+    errors = []
     for system, field, x0, time in problems():
         assert np.abs(np.asarray(system.vector_field(np.array(x0))) - field(np.array(x0))).max() < 1e-14
         run = lt.integrate(system, x0, (0.0, time), lt.Adaptive(rtol), method, engine="compiled")
-        found.append(np.abs(run.x - flown(field, x0, run.t)).max() / (rtol * np.abs(run.x).max()))
-    return found
+        errors.append(np.abs(run.x - flown(field, x0, run.t)).max() / (rtol * np.abs(run.x).max()))
+    return errors
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_the_error_of_a_run_is_what_was_asked_for(method):
     """In the median over the problems, and the same share of it at every tolerance: it is proportional to that."""
-    found = {
+    error_ratios = {
         rtol: ratios(method, rtol)
         for rtol in TOLERANCES
         if rtol >= LEAST.get(method.on(lt.models.rigid_body(), rtol).order, 0.0)
     }
-    medians = {rtol: float(np.median(values).round(3)) for rtol, values in found.items()}
+    medians = {rtol: float(np.median(values).round(3)) for rtol, values in error_ratios.items()}
     print(method, medians)
     assert min(medians.values()) > 0.05
     assert max(medians.values()) < 3.0
     assert max(medians.values()) < 4.0 * min(medians.values())
-    assert 0.1 < np.median(np.concatenate(list(found.values()))) < 10.0
+    assert 0.1 < np.median(np.concatenate(list(error_ratios.values()))) < 10.0

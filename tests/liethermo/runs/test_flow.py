@@ -61,10 +61,10 @@ def test_derivatives_against_differences(build, method):
         for i in range(a.shape[1]):
             arguments = [PARAMETERS, X0]
             size = 1e-5 * float(jnp.abs(arguments[argument][i]))
-            moved = [[*arguments], [*arguments]]
-            for sign, version in zip((1.0, -1.0), moved, strict=True):
+            shifted_arguments = [[*arguments], [*arguments]]
+            for sign, version in zip((1.0, -1.0), shifted_arguments, strict=True):
                 version[argument] = arguments[argument].at[i].add(sign * size)
-            difference = (end(*moved[0]) - end(*moved[1])) / (2 * size)
+            difference = (end(*shifted_arguments[0]) - end(*shifted_arguments[1])) / (2 * size)
             assert np.abs(difference - a[:, i]).max() < 1e-7 * np.abs(a).max()
 
 
@@ -79,27 +79,27 @@ def test_the_energy_is_conserved_in_every_derivative():
 def test_a_batch():
     states = jnp.asarray(np.random.default_rng(0).standard_normal((4, 3)))
     ends = jax.jit(jax.vmap(lambda x: lt.flow(body(PARAMETERS), x, (0.0, 2.0), 0.1)))(states)
-    alone = lt.ensemble(body(PARAMETERS), states, (0.0, 2.0), 0.1).x
-    assert np.abs(ends - alone).max() < 1e-13
+    single_runs = lt.ensemble(body(PARAMETERS), states, (0.0, 2.0), 0.1).x
+    assert np.abs(ends - single_runs).max() < 1e-13
 
 
 def test_newton_is_compiled_where_a_step_needs_it(monkeypatch):
     """It is two thirds of a program, and none of one for a derivative: that is of slopes which are known."""
 
-    class Needed(Exception):
+    class NewtonCompiled(Exception):
         pass
 
-    def refused(own):
-        raise Needed
+    def raise_needed(equations):
+        raise NewtonCompiled
 
-    monkeypatch.setattr(flow_module, "iterated", refused)
+    monkeypatch.setattr(flow_module, "solve_or_nan", raise_needed)
 
     def end(x, h=0.125):
         return jnp.sum(lt.flow(nonlinear(PARAMETERS), x, (0.0, 4 * h), h) ** 3)
 
     assert np.isfinite(end(X0))
     assert np.isfinite(jax.grad(end)(X0)).all()
-    with pytest.raises(Needed):
+    with pytest.raises(NewtonCompiled):
         end(X0, 40.0)
 
 
@@ -134,16 +134,16 @@ def test_a_system_that_closes_over_tracers(entropy):
 
     p, d = jnp.array([0.3, 0.5]), jnp.array([1e-4, -2e-4])
     difference = 0.5 * (speed(p + d) - speed(p - d))
-    for found in (
+    for derivative in (
         jax.jacfwd(speed)(p) @ d,
         jax.jacrev(speed)(p) @ d,
         jax.jit(jax.jacfwd(speed))(p) @ d,
         0.5 * jnp.array([1.0, -1.0]) @ jax.vmap(speed)(jnp.stack([p + d, p - d])),
     ):
-        assert np.abs(found - difference).max() < 1e-10
-    seen = []
-    jax.eval_shape(lambda p: seen.append(closed(p, entropy).energy.is_quadratic), p)
-    assert seen == [False]
+        assert np.abs(derivative - difference).max() < 1e-10
+    traced_systems = []
+    jax.eval_shape(lambda p: traced_systems.append(closed(p, entropy).energy.is_quadratic), p)
+    assert traced_systems == [False]
 
 
 @pytest.mark.slow
@@ -207,8 +207,8 @@ def test_models_of_traced_numbers(name):
     system = MODELS[name](p)
     x = 0.5 + 0.05 * np.arange(system.dim)
     expected = system.vector_field(x)
-    traced = jax.jit(lambda p: MODELS[name](p).vector_field(x))(p)
-    assert np.abs(traced - expected).max() < 1e-14 * np.abs(expected).max()
+    field = jax.jit(lambda p: MODELS[name](p).vector_field(x))(p)
+    assert np.abs(field - expected).max() < 1e-14 * np.abs(expected).max()
 
 
 # -- derivatives of derivatives --------------------------------------------------------------------------------------
@@ -234,21 +234,26 @@ def root(p, x):
 def test_implicit_functions_have_derivatives_of_derivatives():
     """In every combination of modes, through a loop and in a batch."""
     p, x = 0.7, np.array([0.3, 1.0])
-    y, first, second = x, np.ones(2), np.zeros(2)
+    y, y_first, second = x, np.ones(2), np.zeros(2)
     for _ in range(3):
         y = np.array([scipy.optimize.brentq(lambda y, x=x: y + 0.5 * p * np.sin(y) - x, -2.0, 2.0) for x in y])
         slope = 1.0 / (1.0 + 0.5 * p * np.cos(y))
-        first, second = slope * first, 0.5 * p * np.sin(y) * slope**3 * first**2 + slope * second
+        y_first, second = slope * y_first, 0.5 * p * np.sin(y) * slope**3 * y_first**2 + slope * second
     modes = jax.jacfwd, jax.jacrev
     for outer, inner in itertools.product(modes, modes):
         slopes = inner(root, 1)
         found = [jax.jit(jax.vmap(f, (None, 0)))(p, x) for f in (slopes, outer(slopes, 1))]
-        assert np.abs(found[0] - first).max() < 1e-12
+        assert np.abs(found[0] - y_first).max() < 1e-12
         assert np.abs(found[1] - second).max() < 1e-12
-    by_guess = jax.grad(lambda guess: implicit.implicit_solution(lambda p, guess: p, lambda p, y: y - p, p, guess))(0.0)
-    assert by_guess == 0.0
-    both = jax.jit(jax.jacrev(jax.jacrev(root, 0), 0))(p, x[0]), jax.jit(jax.jacfwd(jax.jacfwd(root, 0), 0))(p, x[0])
-    assert np.abs(both[0] - both[1]) < 1e-12
+    guess_derivative = jax.grad(
+        lambda guess: implicit.implicit_solution(lambda p, guess: p, lambda p, y: y - p, p, guess)
+    )(0.0)
+    assert guess_derivative == 0.0
+    second_derivatives = (
+        jax.jit(jax.jacrev(jax.jacrev(root, 0), 0))(p, x[0]),
+        jax.jit(jax.jacfwd(jax.jacfwd(root, 0), 0))(p, x[0]),
+    )
+    assert np.abs(second_derivatives[0] - second_derivatives[1]) < 1e-12
 
 
 @pytest.mark.slow
@@ -260,12 +265,12 @@ def test_second_derivatives():
 
     y = jnp.append(X0, 0.3)
     forwards, backwards = jax.jacfwd, jax.jacrev
-    found = [a(b(end))(y) for a in (forwards, backwards) for b in (forwards, backwards)]
-    for hessian in found:
-        assert np.abs(hessian - found[0]).max() < 1e-12 * np.abs(found[0]).max()
+    hessians = [a(b(end))(y) for a in (forwards, backwards) for b in (forwards, backwards)]
+    for hessian in hessians:
+        assert np.abs(hessian - hessians[0]).max() < 1e-12 * np.abs(hessians[0]).max()
     gradient, size = jax.jit(jax.grad(end)), 1e-5
     differences = np.stack([(gradient(y + size * e) - gradient(y - size * e)) / (2 * size) for e in np.eye(4)])
-    assert np.abs(differences - found[0]).max() < 1e-8 * np.abs(found[0]).max()
+    assert np.abs(differences - hessians[0]).max() < 1e-8 * np.abs(hessians[0]).max()
 
 
 # -- loops of unknown length ------------------------------------------------------------------------------------------
@@ -275,8 +280,8 @@ def looping(p):
     """``p**3 x_0^2 / 2 + cos(x_1)``, by a loop of unknown length."""
 
     def energy(x):
-        tripled = jax.lax.while_loop(lambda c: c[0] < 3, lambda c: (c[0] + 1, c[1] * p), (0, 0.5 * x[0] ** 2))[1]
-        return tripled + jnp.cos(x[1])
+        product = jax.lax.while_loop(lambda c: c[0] < 3, lambda c: (c[0] + 1, c[1] * p), (0, 0.5 * x[0] ** 2))[1]
+        return product + jnp.cos(x[1])
 
     return lt.LiePoissonSystem(mf.so(3), energy, lt.Quadratic(np.ones(3)), lt.KillingDissipation(0.5))
 
@@ -326,12 +331,12 @@ def test_the_derivative_at_an_equilibrium(method):
     system = lt.LiePoissonSystem(mf.so(3), energy, lambda m: jnp.log(1.0 + jnp.dot(m, m)), friction)
     x, h = jnp.array([1.0, 0.0, 0.0]), 0.1
     end = jax.jit(lambda y: lt.flow(system, y, (0.0, h), h, method))
-    found = np.asarray(jax.jit(jax.jacfwd(end))(x))
+    derivative = np.asarray(jax.jit(jax.jacfwd(end))(x))
     steps = 1e-5 * np.eye(3)
     differences = np.stack([(np.asarray(end(x + d)) - np.asarray(end(x - d))) / 2e-5 for d in steps], axis=1)
-    assert np.abs(found - differences).max() <= 1e-8
+    assert np.abs(derivative - differences).max() <= 1e-8
     exact = scipy.linalg.expm(h * np.asarray(jax.jacfwd(system.vector_field)(x)))
-    assert np.abs(found - exact).max() <= 0.02 * h ** (method.order + 1)
+    assert np.abs(derivative - exact).max() <= 0.02 * h ** (method.order + 1)
     assert np.abs(exact - np.eye(3)).max() > 0.01
 
 
@@ -342,11 +347,11 @@ def test_a_system_has_the_parameters_of_the_object_whose_method_is_its_energy():
         system = lt.LiePoissonSystem(mf.so(3), energy=lt.Quadratic(jnp.diag(factor / jnp.array([3.0, 2.0, 1.0]))).value)
         return lt.flow(system, jnp.array([0.3, 0.5, 0.2]), (0.0, 0.3), 0.1)
 
-    found = jax.jacfwd(end)(jnp.ones(3))
+    derivative = jax.jacfwd(end)(jnp.ones(3))
     h = 1e-6
     columns = [(end(jnp.ones(3) + h * e) - end(jnp.ones(3) - h * e)) / (2 * h) for e in np.eye(3)]
-    assert np.abs(found - np.stack(columns, axis=1)).max() < 1e-9
-    assert np.abs(found).max() > 1e-3
+    assert np.abs(derivative - np.stack(columns, axis=1)).max() < 1e-9
+    assert np.abs(derivative).max() > 1e-3
 
 
 @pytest.mark.slow
@@ -366,10 +371,10 @@ def test_derivatives_found_at_once(order, monkeypatch):
         return derivative(y)
 
     y = jnp.append(X0, 1.0)
-    found = derived(y)
-    monkeypatch.setattr(flow_module, "DERIVATIVES", 0)
+    derivatives = derived(y)
+    monkeypatch.setattr(flow_module, "MAX_FORWARD_DERIVATIVES", 0)
     through = derived(y)
-    assert np.abs(found - through).max() < 1e-12 * np.abs(through).max()
+    assert np.abs(derivatives - through).max() < 1e-12 * np.abs(through).max()
     assert np.abs(through).max() > 1e-3
 
 
@@ -386,7 +391,7 @@ def test_a_linearised_flow_in_another_program():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         ({"system": lambda x: x}, "takes a system.*not function"),
         ({"method": "DOP853"}, "OneStepMethod.*not 'DOP853'"),
@@ -395,8 +400,8 @@ def test_a_linearised_flow_in_another_program():
     ],
     ids=["system", "name", "reference", "adaptive"],
 )
-def test_what_is_for_another_kind_of_run(arguments, said):
-    with pytest.raises(lt.InputError, match=said):
+def test_what_is_for_another_kind_of_run(arguments, message):
+    with pytest.raises(lt.InputError, match=message):
         lt.flow(**({"system": body(PARAMETERS), "x0": X0, "t_span": (0.0, 1.0), "step": 0.1} | arguments))
 
 
@@ -417,7 +422,7 @@ def test_derivatives_in_other_units():
         return lt.flow(lt.LiePoissonSystem(mf.so(3), lambda m: 0.5 * jnp.sum(m * m * y[3:])), y[:3], (0.0, 1.0), 0.1)
 
     y, units = jnp.append(X0, 1.0 / PARAMETERS[:3]), np.repeat([1e20, 1e-20], 3)
-    first, second = (derivative(y) for derivative in (jax.jacfwd(end), jax.hessian(end)))
-    assert np.abs(jax.jacfwd(end)(units * y) * units / 1e20 - first).max() < 1e-15
+    first_derivative, second = (derivative(y) for derivative in (jax.jacfwd(end), jax.hessian(end)))
+    assert np.abs(jax.jacfwd(end)(units * y) * units / 1e20 - first_derivative).max() < 1e-15
     assert np.abs(jax.hessian(end)(units * y) * units[:, None] * units / 1e20 - second).max() < 1e-14
     assert np.abs(second).max() > 0.1

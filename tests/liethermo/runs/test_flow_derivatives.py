@@ -39,9 +39,9 @@ def test_along_trajectories(method, name):
     problem, system, h = PROBLEMS[name], SYSTEMS[name](), 0.1
     end = jax.jit(lambda x: lt.flow(system, x, (0.0, 3 * h), h, method))
     x = jnp.asarray(problem.start)
-    found = jax.jit(jax.jacfwd(end))(x), jax.jit(jax.jacrev(end))(x)
+    derivative = jax.jit(jax.jacfwd(end))(x), jax.jit(jax.jacrev(end))(x)
     expected = by_differences(lambda y: np.asarray(end(jnp.asarray(y))), np.asarray(problem.start))
-    for jacobian in found:
+    for jacobian in derivative:
         assert np.abs(jacobian - expected).max() < 2e-10 * max(1.0, np.abs(expected).max())
 
 
@@ -61,14 +61,14 @@ def midpoint_step(x, h):
     def gradient(m):
         return np.array([c / i for c, i in zip(m, MOMENTS, strict=True)]) + np.array([4 * QUARTIC * m[0] ** 3, 0, 0])
 
-    d, moved = np.array([Decimal(0)] * 3), Decimal(1)
-    while moved > Decimal("1e-40"):
+    d, displacement_norm = np.array([Decimal(0)] * 3), Decimal(1)
+    while displacement_norm > Decimal("1e-40"):
         z = x + d / 2
         dH, dS = gradient(z), 2 * z / (1 + z @ z)
         if d @ d > 0:
             dH = dH + (energy(x + d) - energy(x) - dH @ d) / (d @ d) * d
         new = h * (np.cross(z, dH) + RATE * ((dH @ dH) * dS - (dH @ dS) * dH))
-        moved, d = max(abs(c) for c in new - d), new
+        displacement_norm, d = max(abs(c) for c in new - d), new
     return x + d
 
 
@@ -185,12 +185,12 @@ def test_at_equilibria(method, name):
     system, x, h = build(), jnp.asarray(x), 0.1
     assert np.abs(system.vector_field(x)).max() < 1e-15
     end = jax.jit(lambda y: lt.flow(system, y, (0.0, h), h, method))
-    found = np.asarray(jax.jit(jax.jacfwd(end))(x))
+    derivative = np.asarray(jax.jit(jax.jacfwd(end))(x))
     expected = by_differences(lambda y: np.asarray(end(jnp.asarray(y))), np.asarray(x))
-    assert np.abs(jax.jit(jax.jacrev(end))(x) - found).max() < 1e-12
+    assert np.abs(jax.jit(jax.jacrev(end))(x) - derivative).max() < 1e-12
     linear = np.asarray(jax.jit(jax.jacfwd(system.vector_field))(x))
-    corrected = 0.1 * (h * np.abs(linear).max()) ** (method.order + 1) if method.explicit else 0.0
-    assert np.abs(found - expected).max() < 2e-9 + corrected
+    correction_error = 0.1 * (h * np.abs(linear).max()) ** (method.order + 1) if method.explicit else 0.0
+    assert np.abs(derivative - expected).max() < 2e-9 + correction_error
     exact = scipy.linalg.expm(h * linear)
-    assert np.abs(found - exact).max() < (2.0 * h * np.abs(linear).max()) ** (method.order + 1)
+    assert np.abs(derivative - exact).max() < (2.0 * h * np.abs(linear).max()) ** (method.order + 1)
     assert np.abs(exact - np.eye(len(x))).max() > 0.01

@@ -54,9 +54,9 @@ def test_a_run_says_that_its_state_grows_without_bound(case, method, adaptive):
 def test_what_stays_bounded_is_told_what_helps():
     """A step that is too long, of a motion that stays on its circle."""
     body = lt.models.rigid_body()
-    stopped = lt.integrate(body, [0.1, 1.0, 0.3], (0.0, 60.0), 15.0, lt.MetriplecticRungeKutta(8), on_failure="return")
-    assert "smaller step" in stopped.status.message
-    assert "without bound" not in stopped.status.message
+    solution = lt.integrate(body, [0.1, 1.0, 0.3], (0.0, 60.0), 15.0, lt.MetriplecticRungeKutta(8), on_failure="return")
+    assert "smaller step" in solution.status.message
+    assert "without bound" not in solution.status.message
 
 
 @pytest.mark.parametrize("engine", ["compiled", pytest.param("array", marks=pytest.mark.slow)])
@@ -64,16 +64,16 @@ def test_ensembles_that_overflow_raise_no_warnings(engine, tmp_path):
     system, end, h = hill()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        many = lt.ensemble(system, [[1.0, 1.0], [2.0, -1.0], [0.0, 0.0]], (0.0, end), h, GAUSS, engine=engine)
-        audit = many.audit()
-        text, loaded = str(many), lt.load(many.save(tmp_path / "many.nc"))
-    assert list(many.ok) == [False, False, True]  # the last stays on the top
+        ensemble = lt.ensemble(system, [[1.0, 1.0], [2.0, -1.0], [0.0, 0.0]], (0.0, end), h, GAUSS, engine=engine)
+        audit = ensemble.audit()
+        text, loaded_run = str(ensemble), lt.load(ensemble.save(tmp_path / "many.nc"))
+    assert list(ensemble.ok) == [False, False, True]  # the last stays on the top
     assert not audit.passed
     assert [row.law for row in audit.rows if row.passed is False] == ["trajectories that failed"]
     assert audit.verdict == "SOME TRAJECTORIES STOPPED before their end; the laws hold until there"
     assert text.count("grows without bound: |x| = ") == 2
     assert "smaller step" not in text
-    assert loaded.message(0) == many.message(0)
+    assert loaded_run.message(0) == ensemble.message(0)
 
 
 @pytest.mark.parametrize("step", [0.05, lt.Adaptive(1e-6)], ids=["equal", "adaptive"])
@@ -81,13 +81,13 @@ def test_ensembles_say_what_has_grown(step):
     system, end, _ = cubic()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        many = lt.ensemble(system, [[1.0, 1.0], [0.5, 1.0]], (0.0, end), step, EXPLICIT, outputs="summary")
-        many.audit()
-    assert not many.ok.any()
+        ensemble = lt.ensemble(system, [[1.0, 1.0], [0.5, 1.0]], (0.0, end), step, EXPLICIT, outputs="summary")
+        ensemble.audit()
+    assert not ensemble.ok.any()
     for i in range(2):
-        message = many.message(i)
+        message = ensemble.message(i)
         assert "without bound" in message
-        assert f"at t = {many.end_time[i]:g}" in message
+        assert f"at t = {ensemble.end_time[i]:g}" in message
 
 
 def test_a_single_run_that_overflows_is_audited():

@@ -38,27 +38,27 @@ def test_the_run_ends_where_it_was_told_to(end, h, steps):
 @pytest.mark.parametrize("every", [1, 2, 7, 10, 100, 1000])
 def test_save_every(every):
     full = lt.integrate(BODY, X0, (2.0, 12.05), 0.1)
-    thin = lt.integrate(BODY, X0, (2.0, 12.05), 0.1, save_every=every)
-    kept = sorted({*range(0, 101, every), 100, 101})
+    saved_run = lt.integrate(BODY, X0, (2.0, 12.05), 0.1, save_every=every)
+    saved_steps = sorted({*range(0, 101, every), 100, 101})
     if every > 1:
-        kept = [n for n in kept if n % every == 0 or n in (100, 101)]
-    assert np.array_equal(thin.x, full.x[kept])
-    assert np.array_equal(thin.t, full.t[kept])
-    assert thin.stats.steps == full.stats.steps
-    assert thin.stats.least_entropy_increment == full.stats.least_entropy_increment
+        saved_steps = [n for n in saved_steps if n % every == 0 or n in (100, 101)]
+    assert np.array_equal(saved_run.x, full.x[saved_steps])
+    assert np.array_equal(saved_run.t, full.t[saved_steps])
+    assert saved_run.stats.steps == full.stats.steps
+    assert saved_run.stats.least_entropy_increment == full.stats.least_entropy_increment
 
 
 def test_chunks_do_not_show(monkeypatch):
-    whole = lt.integrate(BODY, X0, (0.0, 30.0), 0.1)
-    monkeypatch.setattr(array, "KEPT_STATES", 16)
+    whole_run = lt.integrate(BODY, X0, (0.0, 30.0), 0.1)
+    monkeypatch.setattr(array, "MAX_SAVES_PER_CALL", 16)
     pieces = lt.integrate(BODY, X0, (0.0, 30.0), 0.1)
-    assert np.array_equal(whole.x, pieces.x)
+    assert np.array_equal(whole_run.x, pieces.x)
 
 
 def test_runs_are_reproducible_and_pure():
-    first, second = (lt.integrate(BODY, X0, (0.0, 5.0), 0.1) for _ in range(2))
-    assert np.array_equal(first.x, second.x)
-    assert first.provenance["method"] == "MetriplecticGauss(stages=1)"
+    first_run, second = (lt.integrate(BODY, X0, (0.0, 5.0), 0.1) for _ in range(2))
+    assert np.array_equal(first_run.x, second.x)
+    assert first_run.provenance["method"] == "MetriplecticGauss(stages=1)"
 
 
 # -- input --------------------------------------------------------------------------------------------------------
@@ -127,8 +127,10 @@ def test_a_step_too_large_names_step_time_residual_and_advice():
     assert np.array_equal(solution.x, [[0.3, 1.0, -0.2]])
     assert not solution.audit().passed
     assert isinstance(caught.value, ArithmeticError)
-    advised = float(str(caught.value).split()[-1])
-    assert lt.integrate(stiff, [0.3, 1.0, -0.2], (0.0, advised), advised).status.ok  # half the step would not do
+    advised_step = float(str(caught.value).split()[-1])
+    assert lt.integrate(
+        stiff, [0.3, 1.0, -0.2], (0.0, advised_step), advised_step
+    ).status.ok  # half the step would not do
 
 
 @pytest.mark.slow
@@ -211,10 +213,10 @@ def test_nan_midway_keeps_what_was_computed():
 @pytest.mark.parametrize("every", [1, 7, 10_000])
 def test_on_failure_return(every):
     solution = lt.integrate(domain_system(), X0, (0.0, 500.0), 0.1, save_every=every, on_failure="return")
-    whole = lt.integrate(domain_system(), X0, (0.0, 500.0), 0.1, on_failure="return")
-    assert str(solution.status) == str(whole.status)
-    assert np.array_equal(solution.x[-1], whole.x[-1])  # the last good state, between two saves too
-    assert solution.t[-1] == whole.t[-1]
+    whole_run = lt.integrate(domain_system(), X0, (0.0, 500.0), 0.1, on_failure="return")
+    assert str(solution.status) == str(whole_run.status)
+    assert np.array_equal(solution.x[-1], whole_run.x[-1])  # the last good state, between two saves too
+    assert solution.t[-1] == whole_run.t[-1]
 
 
 def test_the_reference_method_reports_failure_too():
@@ -231,10 +233,10 @@ def test_the_reference_method_reports_failure_too():
 @pytest.mark.parametrize("engine", ["array", "compiled"])
 def test_ctrl_c_returns_what_exists(engine, monkeypatch):
     """The signal comes in the middle of a run that would go on for days."""
-    seen = itertools.count()
+    counter = itertools.count()
 
     def update(self, t):
-        if next(seen) == 2:
+        if next(counter) == 2:
             signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(Progress, "update", update)
@@ -253,7 +255,7 @@ def test_ctrl_c_before_the_first_step(monkeypatch):
     def interrupted(*arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(array, "begin", interrupted)
+    monkeypatch.setattr(array, "initial_run_state_program", interrupted)
     solution = lt.integrate(BODY, X0, (0.0, 1.0), 0.1, engine="array")
     assert (solution.status.code, solution.x.tolist(), solution.stats.steps) == ("interrupted", [X0], 0)
 

@@ -33,15 +33,15 @@ def test_relaxing_to_rounding_and_staying_there(name):
         lt.ProjectedMetric(rate=0.3),
     )
     method = lt.MetriplecticMidpoint(name)
-    early = lt.integrate(system, [0.8, 0.5, 0.9], (0.0, 3000.0), 0.1, method, save_every=100)
-    late = lt.integrate(system, early.x[-1], (0.0, 0.1 * MILLION), 0.1, method, save_every=1000)
-    assert early.audit().passed, f"\n{early.audit()}"
-    assert np.abs(early.x[-1] - early.x[-2]).max() < 1e-15
-    audit = late.audit(energy=1e-14)
+    early_run = lt.integrate(system, [0.8, 0.5, 0.9], (0.0, 3000.0), 0.1, method, save_every=100)
+    late_run = lt.integrate(system, early_run.x[-1], (0.0, 0.1 * MILLION), 0.1, method, save_every=1000)
+    assert early_run.audit().passed, f"\n{early_run.audit()}"
+    assert np.abs(early_run.x[-1] - early_run.x[-2]).max() < 1e-15
+    audit = late_run.audit(energy=1e-14)
     assert audit.passed, f"\n{audit}"
-    assert np.abs(late.x - late.x[0]).max() < 1e-13  # no random walk along the equilibria
-    assert late.stats.iterations_per_step <= early.stats.iterations_per_step
-    assert late.stats.newton_iterations == 0
+    assert np.abs(late_run.x - late_run.x[0]).max() < 1e-13  # no random walk along the equilibria
+    assert late_run.stats.iterations_per_step <= early_run.stats.iterations_per_step
+    assert late_run.stats.newton_iterations == 0
 
 
 @pytest.mark.sampled(1)

@@ -48,25 +48,25 @@ def field(a):
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_members_are_as_if_alone(method):
-    alone = np.array([lt.integrate(body({"a": a}), START, SPAN, STEP, method).x[-1] for a in A])
+    single_runs = np.array([lt.integrate(body({"a": a}), START, SPAN, STEP, method).x[-1] for a in A])
     exact = [solve_ivp(field(a), SPAN, START, "DOP853", rtol=1e-12, atol=1e-14).y[:, -1] for a in A]
-    assert np.abs(alone - exact).max() < (2e-3 if method.order == 2 else 2e-5)
+    assert np.abs(single_runs - exact).max() < (2e-3 if method.order == 2 else 2e-5)
     for order in ORDERS:
-        many = lt.ensemble(body, START, SPAN, STEP, method, parameters={"a": A[order]})
-        assert np.array_equal(many.status, np.zeros(3))
-        assert np.abs(many.x - alone[order]).max() < 1e-14, order
-        assert many.audit().passed, str(many.audit())
-        assert many.laws.energy == "conserved"
-    assert many[0].audit().passed
+        ensemble = lt.ensemble(body, START, SPAN, STEP, method, parameters={"a": A[order]})
+        assert np.array_equal(ensemble.status, np.zeros(3))
+        assert np.abs(ensemble.x - single_runs[order]).max() < 1e-14, order
+        assert ensemble.audit().passed, str(ensemble.audit())
+        assert ensemble.laws.energy == "conserved"
+    assert ensemble[0].audit().passed
 
 
 @pytest.mark.parametrize("method", [lt.MetriplecticMidpoint(), lt.MetriplecticRungeKutta(6)], ids=str)
 def test_adaptive_steps_and_saved_times(method):
     options = {"parameters": {"a": A}, "save_at": [0.5, 2.0]}
-    many = lt.ensemble(body, START, SPAN, lt.Adaptive(1e-6), method, **options)
+    ensemble = lt.ensemble(body, START, SPAN, lt.Adaptive(1e-6), method, **options)
     for i, a in enumerate(A):
         one = lt.integrate(body({"a": a}), START, SPAN, lt.Adaptive(1e-6), method, save_at=[0.5, 2.0])
-        assert np.abs(many.x[i] - one.x).max() < 1e-12
+        assert np.abs(ensemble.x[i] - one.x).max() < 1e-12
 
 
 def test_named_parameters():
@@ -74,26 +74,26 @@ def test_named_parameters():
         mf.so(3), lt.Quadratic(np.eye(3)), lambda m: jnp.log(1 + m @ m), lt.KillingDissipation(0.3)
     )
     quadratics = np.stack([np.diag([1.0, 1.0, a]) for a in A])
-    many = lt.ensemble(system, START, SPAN, STEP, parameters={"energy.A": quadratics})
-    alone = lt.ensemble(body, START, SPAN, STEP, parameters={"a": A})
-    assert np.abs(many.x - alone.x).max() < 1e-14
+    ensemble = lt.ensemble(system, START, SPAN, STEP, parameters={"energy.A": quadratics})
+    single_runs = lt.ensemble(body, START, SPAN, STEP, parameters={"a": A})
+    assert np.abs(ensemble.x - single_runs.x).max() < 1e-14
 
 
 @pytest.mark.parametrize("method", METHODS[2:], ids=str)
 def test_an_isotropic_body_does_not_stop_the_others(method):
     """The steps of the others cannot end on its levels: they were not converged."""
     inertia = np.array([[1.0, 1.0, 1.0], [3.0, 2.0, 1.0], [1.0, 2.0, 3.0]])
-    many = lt.ensemble(lambda p: lt.models.rigid_body(p["I"]), START, SPAN, STEP, method, parameters={"I": inertia})
-    assert many.ok.all(), str(many)
-    assert many.audit().passed
+    ensemble = lt.ensemble(lambda p: lt.models.rigid_body(p["I"]), START, SPAN, STEP, method, parameters={"I": inertia})
+    assert ensemble.ok.all(), str(ensemble)
+    assert ensemble.audit().passed
 
 
 def test_a_point_of_a_study():
     axes = {"a": [1.0, 0.5, 2.0]}
     study = lt.Study(body, axes, x0=START, t_span=SPAN, step=STEP, measure={"x": "final"})
     study.run(progress=False)
-    alone = np.array([lt.integrate(body({"a": a}), START, SPAN, STEP).x[-1] for a in A])
-    assert np.abs(study.results.x.values - alone).max() < 1e-14
+    single_runs = np.array([lt.integrate(body({"a": a}), START, SPAN, STEP).x[-1] for a in A])
+    assert np.abs(study.results.x.values - single_runs).max() < 1e-14
 
 
 @pytest.mark.slow
@@ -102,17 +102,17 @@ def test_a_flow_under_vmap(method):
     def end(a):
         return lt.flow(body({"a": a}), jnp.asarray(START), SPAN, STEP, method)
 
-    alone = np.array([end(a) for a in A])
-    assert np.abs(jax.vmap(end)(jnp.asarray(A)) - alone).max() < 1e-12
-    assert np.abs(jax.jit(jax.vmap(end))(jnp.asarray(A)) - alone).max() < 1e-12
+    single_flows = np.array([end(a) for a in A])
+    assert np.abs(jax.vmap(end)(jnp.asarray(A)) - single_flows).max() < 1e-12
+    assert np.abs(jax.jit(jax.vmap(end))(jnp.asarray(A)) - single_flows).max() < 1e-12
 
 
 def test_a_control_one_verdict_for_all_is_found(monkeypatch):
     """Control: with what the first member conserves held for all, the relation of company fails."""
 
     def of_first(family, method, states):
-        decided = family.member(0)._find_invariants()
-        facts = member_groups.InvariantFacts(None, decided)
+        first_verdicts = family.member(0)._find_invariants()
+        facts = member_groups.InvariantFacts(None, first_verdicts)
         return [
             member_groups.MemberGroup(
                 np.arange(len(states)), family.annotate_members(member_groups.with_invariant_facts, facts)
@@ -123,7 +123,7 @@ def test_a_control_one_verdict_for_all_is_found(monkeypatch):
         mf.so(3), lt.Quadratic([1.0, 2.0, 3.0]), lambda m: jnp.log(1 + m @ m), lt.KillingDissipation(0.3)
     )
     assert lt.testing.check_relations(system, lt.MetriplecticGauss(1), START, 0.1, relations=["company"]).passed
-    monkeypatch.setattr("liethermo.runs.ensemble.groups_of", of_first)
+    monkeypatch.setattr("liethermo.runs.ensemble.group_members", of_first)
     with pytest.raises(lt.testing.PropertyError, match="company"):
         lt.testing.check_relations(system, lt.MetriplecticGauss(1), START, 0.1, relations=["company"])
 
@@ -139,12 +139,12 @@ def lopsided(p):
 @pytest.mark.parametrize("method", [lt.MetriplecticGauss, lt.MetriplecticRungeKutta])
 def test_what_a_member_does_not_conserve_is_not_held(method):
     holding = method(4, preserve=[lambda m: m[2]])
-    many = lt.ensemble(lopsided, START, SPAN, STEP, holding, parameters={"b": np.array([1.0, 2.0, 1.0])})
-    assert many.status.tolist() == [StatusCode.COMPLETED, StatusCode.INADMISSIBLE, StatusCode.COMPLETED]
-    assert "does not conserve the preserved function" in many.reasons[1]
-    assert np.abs(many.x[[0, 2], 2] - START[2]).max() < 1e-15
-    many = lt.ensemble(lopsided, START, SPAN, STEP, holding, parameters={"b": np.array([2.0, 1.0])})
-    assert many.status.tolist() == [StatusCode.INADMISSIBLE, StatusCode.COMPLETED]
+    ensemble = lt.ensemble(lopsided, START, SPAN, STEP, holding, parameters={"b": np.array([1.0, 2.0, 1.0])})
+    assert ensemble.status.tolist() == [StatusCode.COMPLETED, StatusCode.INADMISSIBLE, StatusCode.COMPLETED]
+    assert "does not conserve the preserved function" in ensemble.reasons[1]
+    assert np.abs(ensemble.x[[0, 2], 2] - START[2]).max() < 1e-15
+    ensemble = lt.ensemble(lopsided, START, SPAN, STEP, holding, parameters={"b": np.array([2.0, 1.0])})
+    assert ensemble.status.tolist() == [StatusCode.INADMISSIBLE, StatusCode.COMPLETED]
 
 
 def test_a_preserved_function_that_is_a_casimir_of_one_member():
@@ -159,12 +159,12 @@ def test_a_preserved_function_that_is_a_casimir_of_one_member():
     matrices = np.stack([np.eye(3), np.diag([1.0, 2.0, 4.0]), 2.0 * np.eye(3)])
     method = lt.MetriplecticGauss(2)
     for order in ORDERS:
-        many = lt.ensemble(build, START, SPAN, STEP, method, parameters={"A": matrices[order]})
+        ensemble = lt.ensemble(build, START, SPAN, STEP, method, parameters={"A": matrices[order]})
         for i, k in enumerate(order):
             one = lt.integrate(build({"A": matrices[k]}), START, SPAN, STEP, method)
-            assert np.abs(many.x[i] - one.x[-1]).max() < 1e-14
-            assert many[i].casimirs.keys() == one.casimirs.keys()
-            assert set(many[i].laws.conserved) == set(one.laws.conserved)
+            assert np.abs(ensemble.x[i] - one.x[-1]).max() < 1e-14
+            assert ensemble[i].casimirs.keys() == one.casimirs.keys()
+            assert set(ensemble[i].laws.conserved) == set(one.laws.conserved)
 
 
 # -- domains and inertia ----------------------------------------------------------------------------------------------
@@ -179,9 +179,11 @@ def test_a_member_outside_its_own_domain_is_not_started():
         )
 
     a = np.array([0.0, 1.0, 3.0])  # temperatures 0.5, -0.5, 3.5
-    many = lt.ensemble(gas, [0.3, 0.1, 1.0], (0.0, 1.0), 0.1, parameters={"a": a})
-    assert many.status.tolist() == [StatusCode.COMPLETED, StatusCode.INADMISSIBLE, StatusCode.COMPLETED], str(many)
-    assert "temperature" in many.reasons[1]
+    ensemble = lt.ensemble(gas, [0.3, 0.1, 1.0], (0.0, 1.0), 0.1, parameters={"a": a})
+    assert ensemble.status.tolist() == [StatusCode.COMPLETED, StatusCode.INADMISSIBLE, StatusCode.COMPLETED], str(
+        ensemble
+    )
+    assert "temperature" in ensemble.reasons[1]
 
 
 def test_one_inertia_only_if_all_have_it():
@@ -206,11 +208,11 @@ def test_one_inertia_only_if_all_have_it():
 
 
 def test_groups_are_few_and_in_order():
-    many = np.array([2.0, 1.0, 0.5, 1.0, 3.0])
-    family = Family.from_arguments(body, {"a": many})
-    groups, refused = member_groups.group_members(family, lt.MetriplecticMidpoint(), np.tile(START, (5, 1)))
+    values = np.array([2.0, 1.0, 0.5, 1.0, 3.0])
+    family = Family.from_arguments(body, {"a": values})
+    groups, refusal_reasons = member_groups.group_members(family, lt.MetriplecticMidpoint(), np.tile(START, (5, 1)))
     assert [group.indices.tolist() for group in groups] == [[0, 2, 4], [1, 3]]
-    assert refused == {}
+    assert refusal_reasons == {}
     names = [group.family.member(0).invariant_verdicts.conserved_names for group in groups]
     assert names[0] == frozenset()
     assert len(names[1]) == 1
@@ -223,29 +225,29 @@ def test_an_interruption_stops_all_groups(monkeypatch):
         calls.append(len(record.x0))
 
     calls: list[int] = []
-    monkeypatch.setattr(module, "run_compiled", interrupted)
-    many = lt.ensemble(body, START, SPAN, STEP, parameters={"a": A}, engine="compiled")
+    monkeypatch.setattr(module, "run_fixed_compiled", interrupted)
+    ensemble = lt.ensemble(body, START, SPAN, STEP, parameters={"a": A}, engine="compiled")
     assert calls == [1]
-    assert many.status.tolist() == [StatusCode.INTERRUPTED] * 3
+    assert ensemble.status.tolist() == [StatusCode.INTERRUPTED] * 3
 
 
 @pytest.mark.parametrize("outputs", ["final", "trajectory", "summary"])
 def test_files_of_mixed_groups(tmp_path, outputs):
-    many = lt.ensemble(body, START, SPAN, STEP, parameters={"a": A}, outputs=outputs)
-    loaded = lt.load(many.save(tmp_path / "many.nc"))
-    assert str(loaded.audit()) == str(many.audit())
-    assert np.array_equal(loaded.energy, many.energy)
+    ensemble = lt.ensemble(body, START, SPAN, STEP, parameters={"a": A}, outputs=outputs)
+    loaded_run = lt.load(ensemble.save(tmp_path / "many.nc"))
+    assert str(loaded_run.audit()) == str(ensemble.audit())
+    assert np.array_equal(loaded_run.energy, ensemble.energy)
     if outputs != "summary":
-        assert np.array_equal(many[1].x[-1], many.x[1] if outputs == "final" else many.x[1, -1])
+        assert np.array_equal(ensemble[1].x[-1], ensemble.x[1] if outputs == "final" else ensemble.x[1, -1])
 
 
 def test_names_of_parameters_that_end_with_an_index():
     """The numbers in a function are leaves called ``numbers[0]``; an entry of one is ``numbers[0][1]``."""
-    closed = lt.LiePoissonSystem(mf.so(3), lambda m: 0.5 * (m[0] ** 2 + 3.0 * m[1] ** 2) + jnp.cosh(0.7 * m[2]))
+    body = lt.LiePoissonSystem(mf.so(3), lambda m: 0.5 * (m[0] ** 2 + 3.0 * m[1] ** 2) + jnp.cosh(0.7 * m[2]))
     name = "energy.function.numbers[0][0]"
-    study = lt.Study(closed, {name: [3.0, 1.0]}, x0=START, t_span=(0.0, 1.0), step=STEP, measure={"x": "final"})
+    study = lt.Study(body, {name: [3.0, 1.0]}, x0=START, t_span=(0.0, 1.0), step=STEP, measure={"x": "final"})
     study.run(progress=False)
-    same = lt.integrate(closed, START, (0.0, 1.0), STEP).x[-1]
-    gaps = np.abs(study.results.x.values - same).max(axis=1)
+    end_state = lt.integrate(body, START, (0.0, 1.0), STEP).x[-1]
+    gaps = np.abs(study.results.x.values - end_state).max(axis=1)
     assert gaps.min() < 1e-14
     assert gaps.max() > 1e-3

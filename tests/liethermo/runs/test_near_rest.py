@@ -98,8 +98,8 @@ def test_a_state_that_leaves_the_numbers():
 @pytest.mark.slow
 def test_an_adaptive_run_takes_no_more_than_it_may(monkeypatch):
     body, x0 = lt.models.rigid_body(), [0.1, 1.0, 0.1]
-    few = {"method": lt.MetriplecticGauss(2), "on_failure": "return"}
-    solution = lt.integrate(body, x0, (0.0, 50.0), lt.Adaptive(1e-8, most_steps=20), **few)
+    options = {"method": lt.MetriplecticGauss(2), "on_failure": "return"}
+    solution = lt.integrate(body, x0, (0.0, 50.0), lt.Adaptive(1e-8, most_steps=20), **options)
     assert (solution.status.code, solution.status.ok) == ("step_limit", False)
     assert "20 steps were tried" in solution.status.message
     assert 10 < solution.stats.steps <= 20
@@ -108,11 +108,11 @@ def test_an_adaptive_run_takes_no_more_than_it_may(monkeypatch):
         lt.integrate(body, x0, (0.0, 50.0), lt.Adaptive(1e-8, most_steps=20), lt.MetriplecticGauss(2))
     with pytest.raises(lt.InputError, match="most_steps must be"):
         lt.Adaptive(most_steps=0)
-    monkeypatch.setattr("liethermo.runs.run.MOST_KEPT", 60)
-    solution = lt.integrate(body, x0, (0.0, 50.0), lt.Adaptive(1e-8), **few)
+    monkeypatch.setattr("liethermo.runs.run.MAX_STORED_VALUES", 60)
+    solution = lt.integrate(body, x0, (0.0, 50.0), lt.Adaptive(1e-8), **options)
     assert "save_every or save_at" in solution.status.message
     assert solution.stats.steps == 20
-    assert lt.integrate(body, x0, (0.0, 5.0), lt.Adaptive(1e-8), save_at=[1.0], **few).status.ok
+    assert lt.integrate(body, x0, (0.0, 5.0), lt.Adaptive(1e-8), save_at=[1.0], **options).status.ok
 
 
 @pytest.mark.slow

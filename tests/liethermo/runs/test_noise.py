@@ -45,10 +45,10 @@ def run(system, noise, engine, **arguments):
 )
 def test_both_engines_take_the_same_path(system, noise):
     """The energy is exact on it, and so is the length of a spin in a bath; a short last step has its own noise."""
-    array, compiled = (run(system, noise, engine) for engine in ("array", "compiled"))
-    assert np.abs(array.x - compiled.x).max() < 1e-13
+    array, compiled_run = (run(system, noise, engine) for engine in ("array", "compiled"))
+    assert np.abs(array.x - compiled_run.x).max() < 1e-13
     assert np.abs(np.diff(array.x, axis=0)).max() > 0.1
-    for solution in (array, compiled):
+    for solution in (array, compiled_run):
         audit = solution.audit()
         assert audit.passed, str(audit)
         assert audit.energy_drift < 1e-14 or noise is BATH
@@ -62,27 +62,27 @@ def test_both_engines_take_the_same_path(system, noise):
 
 def test_a_path_depends_on_seed_and_numbers_alone():
     """Not on what is saved, on the size of the ensemble, its lanes and portions, or the engine."""
-    whole = lt.ensemble(BODY, np.tile(START, (19, 1)), (0.0, 2.0), 0.05, noise=NOISE, outputs="trajectory")
-    assert whole.engine == "compiled"
-    assert len({x.tobytes() for x in whole.x[:, -1]}) == 19
+    whole_run = lt.ensemble(BODY, np.tile(START, (19, 1)), (0.0, 2.0), 0.05, noise=NOISE, outputs="trajectory")
+    assert whole_run.engine == "compiled"
+    assert len({x.tobytes() for x in whole_run.x[:, -1]}) == 19
     one = lt.integrate(BODY, START, (0.0, 2.0), 0.05, noise=NOISE.of(17), engine="compiled", save_every=7)
-    assert np.array_equal(one.x[:-1], whole.x[17, ::7])
+    assert np.array_equal(one.x[:-1], whole_run.x[17, ::7])
     part = lt.ensemble(BODY, np.tile(START, (3, 1)), (0.0, 2.0), 0.05, noise=NOISE.of(16))
-    assert np.array_equal(part.x, whole.x[16:, -1])
+    assert np.array_equal(part.x, whole_run.x[16:, -1])
     seeds = lt.Fluctuations(1.0, seed=(5, 3))
     two = lt.ensemble(BODY, np.tile(START, (2, 1)), (0.0, 2.0), 0.05, noise=seeds)
-    assert np.array_equal(two.x[1], whole.x[0, -1])
+    assert np.array_equal(two.x[1], whole_run.x[0, -1])
     assert not np.array_equal(two.x[0], two.x[1])
     stops = lt.ensemble(BODY, np.tile(START, (2, 1)), (0.0, 2.0), 0.05, noise=NOISE, save_at=[0.5, 1.0, 2.0])
-    assert np.abs(stops.x[:, 1:] - whole.x[:2, [10, 20, 40]]).max() < 1e-12
+    assert np.abs(stops.x[:, 1:] - whole_run.x[:2, [10, 20, 40]]).max() < 1e-12
 
 
 @pytest.mark.slow
 def test_an_ensemble_of_the_array_engine():
     """By ``vmap``, over several calls of the engine."""
     arguments = np.tile(START, (3, 1)), (0.0, 2.02), 0.05
-    array, compiled = (lt.ensemble(BODY, *arguments, noise=NOISE, engine=e) for e in ("array", "compiled"))
-    assert np.abs(array.x - compiled.x).max() < 1e-13
+    array, compiled_run = (lt.ensemble(BODY, *arguments, noise=NOISE, engine=e) for e in ("array", "compiled"))
+    assert np.abs(array.x - compiled_run.x).max() < 1e-13
 
 
 def test_random_numbers_are_those_of_the_paper():
@@ -98,18 +98,20 @@ def test_random_numbers_are_those_of_the_paper():
 
 def test_random_numbers_in_portions():
     """Normal, independent, bounded; the same however they are asked for."""
-    whole = NOISE.consecutive_increments(3, np.arange(40), 0, 1000, 1.0)
-    assert np.array_equal(NOISE.consecutive_increments(3, np.arange(10, 20), 100, 57, 1.0), whole[10:20, 100:157])
-    assert abs((2.0 * NOISE.consecutive_increments(3, np.arange(40), 0, 1000, 0.25) * whole).mean()) < 4 / np.sqrt(
-        whole.size
+    all_increments = NOISE.consecutive_increments(3, np.arange(40), 0, 1000, 1.0)
+    assert np.array_equal(
+        NOISE.consecutive_increments(3, np.arange(10, 20), 100, 57, 1.0), all_increments[10:20, 100:157]
     )
-    sample = whole.ravel()
+    assert abs(
+        (2.0 * NOISE.consecutive_increments(3, np.arange(40), 0, 1000, 0.25) * all_increments).mean()
+    ) < 4 / np.sqrt(all_increments.size)
+    sample = all_increments.ravel()
     count = len(sample)
     assert abs(sample.mean()) < 4 / np.sqrt(count)
     assert abs(sample.var() - 1.0) < 4 * np.sqrt(2 / count)
     assert abs((sample**4).mean() - 3.0) < 4 * np.sqrt(96 / count)
-    assert abs((whole[:, 1:] * whole[:, :-1]).mean()) < 4 / np.sqrt(count)
-    assert abs((whole[1:] * whole[:-1]).mean()) < 4 / np.sqrt(count)
+    assert abs((all_increments[:, 1:] * all_increments[:, :-1]).mean()) < 4 / np.sqrt(count)
+    assert abs((all_increments[1:] * all_increments[:-1]).mean()) < 4 / np.sqrt(count)
     assert np.abs(sample).max() < 6.0
 
 
@@ -123,15 +125,15 @@ def test_no_noise_is_the_run_without_to_the_bit(engine):
 def test_little_noise_is_nearly_the_run_without():
     """Of the size of the square root of k."""
     still = run(BODY, None, "compiled", method=lt.MetriplecticMidpoint()).x
-    away = [np.abs(run(BODY, lt.Fluctuations(k, 1), "compiled").x - still).max() for k in (1e-8, 1e-10, 1e-12)]
-    assert np.allclose(np.array(away[:-1]) / away[1:], 10.0, rtol=0.01)
+    distances = [np.abs(run(BODY, lt.Fluctuations(k, 1), "compiled").x - still).max() for k in (1e-8, 1e-10, 1e-12)]
+    assert np.allclose(np.array(distances[:-1]) / distances[1:], 10.0, rtol=0.01)
 
 
 @pytest.mark.slow
 def test_a_lattice_needs_few_programs(monkeypatch):
     """One takes the steps, one begins a run, and the axioms have one: no size adds any, nor does another run."""
-    traced = []
-    monkeypatch.setattr(programs._ArrayFunction, "__call__", _counted(programs._ArrayFunction.__call__, traced))
+    trace_counts = []
+    monkeypatch.setattr(programs._ArrayFunction, "__call__", _counted(programs._ArrayFunction.__call__, trace_counts))
     sites = (3, 5, 4)
     magnet = lt.models.spin_lattice(sites, rate=1.0, baths=lt.HeatBaths(np.inf, 1.0))
     up = magnet.state(np.tile([0.0, 0.0, 1.0], (*sites, 1)))
@@ -140,7 +142,7 @@ def test_a_lattice_needs_few_programs(monkeypatch):
             magnet, up, (0.0, 0.025 * steps), 0.025, noise=lt.Fluctuations(seed=seed), save_every=steps, engine="array"
         )
         assert run.stats.newton_iterations == 0
-    programs_of_runs = [name for name in traced if name in ("advance", "first_state", "_compiled")]
+    programs_of_runs = [name for name in trace_counts if name in ("advance", "first_state", "_compiled")]
     assert sorted(programs_of_runs) == ["_compiled", "advance", "first_state"]
 
 
@@ -155,13 +157,13 @@ def _counted(call, names: list):
 def test_newton_where_the_fixed_point_is_too_far():
     """Noise so large that fixed-point iteration fails; both engines solve the same equation."""
     noise = lt.Fluctuations(6.0, 0)
-    array, compiled = (
+    array, compiled_run = (
         lt.integrate(BODY, START, (0.0, 20.0), 0.1, noise=noise, engine=e) for e in ("array", "compiled")
     )
-    assert min(array.stats.newton_iterations, compiled.stats.newton_iterations) > 0
-    for solution in (array, compiled):
+    assert min(array.stats.newton_iterations, compiled_run.stats.newton_iterations) > 0
+    for solution in (array, compiled_run):
         assert solution.audit().passed
-    assert np.abs(array.x[:20] - compiled.x[:20]).max() < 1e-9
+    assert np.abs(array.x[:20] - compiled_run.x[:20]).max() < 1e-9
 
 
 @pytest.mark.slow
@@ -195,9 +197,9 @@ def test_noise_inside_a_body_keeps_its_momentum_in_space(engine):
     [
         ({"boltzmann": -1.0}, "boltzmann must be finite and >= 0"),
         ({"boltzmann": "much"}, "one number"),
-        ({"seed": -1}, "seed is an integer"),
-        ({"seed": 0.5}, "seed is an integer"),
-        ({"seed": (1, 2, 1)}, "the seed 1 is given to the trajectories 0 and 2"),
+        ({"seed": -1}, "seed must be an integer"),
+        ({"seed": 0.5}, "seed must be an integer"),
+        ({"seed": (1, 2, 1)}, "trajectories 0 and 2 have the same seed 1"),
         ({"temperature": -2.0}, "temperature"),
         ({"first": -1}, "first is an integer"),
     ],
@@ -259,10 +261,10 @@ class Summed:
     fine: np.ndarray
     factor: int
 
-    def __call__(self, first, steps, h):
+    def __call__(self, first_step, steps, h):
         del h
-        chosen = self.fine[first * self.factor : (first + steps) * self.factor]
-        return chosen.reshape(steps, self.factor, -1).sum(axis=1)
+        increments = self.fine[first_step * self.factor : (first_step + steps) * self.factor]
+        return increments.reshape(steps, self.factor, -1).sum(axis=1)
 
 
 @pytest.mark.slow
@@ -291,16 +293,16 @@ def test_a_spin_with_a_bath_of_its_own():
     """The bath is a body: the energy of both is exact on a path, and the length of the spin; the heat is recorded."""
     system = lt.models.single_spin(field=2.0, rate=0.5, baths=lt.HeatBaths(capacity=200.0, temperature=0.8))
     x0 = np.tile([0.6, 0.0, 0.8, 0.0], (2000, 1))
-    many = lt.ensemble(system, x0, (0.0, 12.0), 0.05, noise=NOISE, outputs="trajectory", save_every=10)
-    assert many.audit().passed
-    assert many.energy_drift.max() < 1e-13
-    assert np.abs(np.linalg.norm(many.x[..., :3], axis=-1) - 1.0).max() < 1e-13
-    heat = 200.0 * 0.8 * np.expm1(many.x[..., 3] / 200.0)
-    lost = 2.0 * (many.x[..., 2] - 0.8)
-    assert np.abs(heat - lost).max() < 1e-11
-    late = many.x[:, many.t >= 6.0, 2].mean(axis=1)
+    ensemble = lt.ensemble(system, x0, (0.0, 12.0), 0.05, noise=NOISE, outputs="trajectory", save_every=10)
+    assert ensemble.audit().passed
+    assert ensemble.energy_drift.max() < 1e-13
+    assert np.abs(np.linalg.norm(ensemble.x[..., :3], axis=-1) - 1.0).max() < 1e-13
+    heat = 200.0 * 0.8 * np.expm1(ensemble.x[..., 3] / 200.0)
+    lost_energy = 2.0 * (ensemble.x[..., 2] - 0.8)
+    assert np.abs(heat - lost_energy).max() < 1e-11
+    late_means = ensemble.x[:, ensemble.t >= 6.0, 2].mean(axis=1)
     z = 2.0 / 0.8
-    assert abs(late.mean() - (1 / np.tanh(z) - 1 / z)) < 3.5 * late.std() / np.sqrt(2000) + 0.005
+    assert abs(late_means.mean() - (1 / np.tanh(z) - 1 / z)) < 3.5 * late_means.std() / np.sqrt(2000) + 0.005
 
 
 def _of(g, energy, entropy, rate):
@@ -349,12 +351,14 @@ def test_a_thousand_paths_of_ten_thousand_steps_keep_their_energy(name):
     k, h, system, x0 = LONG[name]
     times = (0.0, 10_000 * h)
     x0 = np.tile(np.asarray(x0, dtype=float), (1000, 1))
-    many = lt.ensemble(system, x0, times, h, noise=lt.Fluctuations(k, seed=1), outputs="trajectory", save_every=2500)
-    assert many.ok.all()
-    assert many.energy_drift.max() < 1e-13
-    assert np.ptp(many.x[:, -1], axis=0).max() > 0.0
+    ensemble = lt.ensemble(
+        system, x0, times, h, noise=lt.Fluctuations(k, seed=1), outputs="trajectory", save_every=2500
+    )
+    assert ensemble.ok.all()
+    assert ensemble.energy_drift.max() < 1e-13
+    assert np.ptp(ensemble.x[:, -1], axis=0).max() > 0.0
     if name == "spin with a bath":
-        assert np.abs(np.linalg.norm(many.x[..., :3], axis=-1) - 1.0).max() < 1e-13
+        assert np.abs(np.linalg.norm(ensemble.x[..., :3], axis=-1) - 1.0).max() < 1e-13
 
 
 @pytest.mark.slow
@@ -371,12 +375,13 @@ def test_heat_of_a_bath_is_what_the_energy_changes_by():
     def defect(x, new, dW):
         d, compensation = new - x, jnp.zeros(3)
         dH = gradient(system.energy, x, d, compensation)
-        moved = system.poisson.sharp(x + 0.5 * d, dH)
+        velocity = system.poisson.sharp(x + 0.5 * d, dH)
         heat = jnp.dot(
             dH,
-            0.05 * (set_noise_increments(noisy, dW).slopes(system, x, compensation, 0.05, d[None] / 0.05)[0] - moved),
+            0.05
+            * (set_noise_increments(noisy, dW).slopes(system, x, compensation, 0.05, d[None] / 0.05)[0] - velocity),
         )
-        return heat - (system.energy.value(new) - system.energy.value(x)), jnp.dot(dH, moved)
+        return heat - (system.energy.value(new) - system.energy.value(x)), jnp.dot(dH, velocity)
 
     heat, motion = defect(*map(jnp.asarray, (solution.x[:100], solution.x[1:101], rows)))
     assert np.abs(heat).max() < 1e-13

@@ -59,12 +59,12 @@ START = np.array([0.6, 0.0, 0.8])
 @pytest.mark.parametrize(("system", "noise"), [(spin, BATH), (held, NOISE)], ids=["bath", "level"])
 def test_paths_stay_on_the_space_and_on_their_level(system, noise):
     """By both engines the same."""
-    array, compiled = (
+    array, compiled_run = (
         lt.integrate(system(), START, (0.0, 5.02), 0.05, noise=noise, engine=e) for e in ("array", "compiled")
     )
-    assert np.abs(array.x - compiled.x).max() < 1e-12
+    assert np.abs(array.x - compiled_run.x).max() < 1e-12
     assert np.abs(np.diff(array.x, axis=0)).max() > 0.1
-    for solution in (array, compiled):
+    for solution in (array, compiled_run):
         assert solution.audit().passed, str(solution.audit())
         assert np.abs(np.linalg.norm(solution.x, axis=1) - 1.0).max() < 1e-14
         if noise is NOISE:
@@ -73,10 +73,10 @@ def test_paths_stay_on_the_space_and_on_their_level(system, noise):
 
 
 def test_ensembles_take_the_paths_of_single_runs():
-    many = lt.ensemble(spin(), np.tile(START, (5, 1)), (0.0, 1.0), 0.05, noise=BATH)
+    ensemble = lt.ensemble(spin(), np.tile(START, (5, 1)), (0.0, 1.0), 0.05, noise=BATH)
     one = lt.integrate(spin(), START, (0.0, 1.0), 0.05, noise=BATH.of(3))
-    assert np.abs(one.x[-1] - many.x[3]).max() < 1e-13
-    assert len({x.tobytes() for x in many.x}) == 5
+    assert np.abs(one.x[-1] - ensemble.x[3]).max() < 1e-13
+    assert len({x.tobytes() for x in ensemble.x}) == 5
 
 
 def test_no_noise_is_the_run_without_to_the_bit():
@@ -88,17 +88,17 @@ def test_no_noise_is_the_run_without_to_the_bit():
 def test_noise_and_motion_are_checked():
     report = BATH.check(spin())
     assert report.passed
-    assert "no: what the states tend to" not in str(report)
+    assert "no: the equilibrium measure" not in str(report)
     shrinking = damped(SPHERE, field, poisson=lambda x: (1.0 + 0.5 * x[0]) * spins(x))  # a Poisson tensor too
-    assert "no: what the states tend to" in str(BATH.check(shrinking))
+    assert "no: the equilibrium measure" in str(BATH.check(shrinking))
     density = lt.Fluctuations(1.0, temperature=T, density=lambda x: -jnp.log(1.0 + 0.5 * x[0]))
-    assert "no: what the states tend to" not in str(density.check(shrinking))
+    assert "no: the equilibrium measure" not in str(density.check(shrinking))
 
 
 def test_what_has_no_noise():
-    own = on_level(lt.ProjectedMetric(np.diag([1.0, 2.0, 3.0])))
+    system_without_noise = on_level(lt.ProjectedMetric(np.diag([1.0, 2.0, 3.0])))
     with pytest.raises(lt.InputError, match=r"ProjectedMetric gives no factor .* on S\^2"):
-        lt.integrate(own, START, (0.0, 1.0), 0.1, noise=NOISE)
+        lt.integrate(system_without_noise, START, (0.0, 1.0), 0.1, noise=NOISE)
 
 
 @pytest.mark.slow
@@ -158,9 +158,9 @@ def _affine(x):
 
 def ring_points(count):
     u, v = (a.ravel() for a in np.meshgrid(*[np.linspace(0.0, 2.0 * np.pi, int(np.sqrt(count)), endpoint=False)] * 2))
-    out = 3.0 + np.cos(v)
-    points = np.stack([out * np.cos(u), out * np.sin(u), np.sin(v)], axis=1)
-    return points, out * np.exp(-_ring(points.T) / T)
+    radius = 3.0 + np.cos(v)
+    points = np.stack([radius * np.cos(u), radius * np.sin(u), np.sin(v)], axis=1)
+    return points, radius * np.exp(-_ring(points.T) / T)
 
 
 def _ring(x):
@@ -226,13 +226,15 @@ def test_equilibria_with_the_volume_of_the_space(name):
 def test_noise_moves_a_state_far_on_a_surface_of_no_degree():
     """Where the energy is least its gradient is no way to change it: noise has no law of the energy to hold."""
     system, noise, samples, _ = CASES["ring"]
-    many = lt.ensemble(system, samples(100)[0], (0.0, 3.0), 0.02, noise=noise)
-    assert many.ok.all()
-    assert system.space.residual(many.x).max() < 1e-13  # differences of values of size 4, 64 roundings of which count
+    ensemble = lt.ensemble(system, samples(100)[0], (0.0, 3.0), 0.02, noise=noise)
+    assert ensemble.ok.all()
+    assert (
+        system.space.residual(ensemble.x).max() < 1e-13
+    )  # differences of values of size 4, 64 roundings of which count
 
 
 @pytest.mark.slow
 def test_the_energy_is_exact_on_a_thousand_paths_of_ten_thousand_steps():
-    many = lt.ensemble(held(), np.tile(START, (1000, 1)), (0.0, 200.0), 0.02, noise=NOISE)
-    assert many.ok.all()
-    assert many.energy_drift.max() < 1e-13
+    ensemble = lt.ensemble(held(), np.tile(START, (1000, 1)), (0.0, 200.0), 0.02, noise=NOISE)
+    assert ensemble.ok.all()
+    assert ensemble.energy_drift.max() < 1e-13

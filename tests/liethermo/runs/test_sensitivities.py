@@ -48,9 +48,9 @@ def test_all_states_of_a_path(build, order):
     def path(y):
         return lt.flow(build(y[3:]), y[:3], (0.0, 0.55), 0.1, save_every=2)
 
-    found, expected = both_ways(path, order, jnp.concatenate([STARTS[build], P]))
-    assert found.shape == (5, 3) + order * (5,)  # at 0, 0.2, 0.4, 0.5 and 0.55
-    assert np.abs(found - expected).max() < 1e-12 * np.abs(expected).max()
+    derivatives, expected = both_ways(path, order, jnp.concatenate([STARTS[build], P]))
+    assert derivatives.shape == (5, 3) + order * (5,)  # at 0, 0.2, 0.4, 0.5 and 0.55
+    assert np.abs(derivatives - expected).max() < 1e-12 * np.abs(expected).max()
     assert np.abs(expected[-1]).max(axis=0).min() > 1e-3 if order == 1 else np.abs(expected[-1]).max() > 0.1
 
 
@@ -63,8 +63,8 @@ def test_every_method(method):
         (lambda p: lt.flow(body(p), x, (0.0, 0.2), 0.1, method), P),
         (lambda x: lt.flow(body(P), x, (0.0, 0.2), 0.1, method), x),
     ):
-        found, expected = both_ways(function, 1, y)
-        assert np.abs(found - expected).max() < 1e-12 * np.abs(expected).max()
+        derivatives, expected = both_ways(function, 1, y)
+        assert np.abs(derivatives - expected).max() < 1e-12 * np.abs(expected).max()
         assert np.abs(expected).max() > 1e-3
 
 
@@ -77,16 +77,16 @@ def test_the_third_derivative_is_the_difference_of_second_ones(build):
     x = STARTS[build]
     differences = np.stack([(second(x + size * e) - second(x - size * e)) / (2 * size) for e in np.eye(3)], axis=-1)
     assert np.abs(third - differences).max() < 1e-6 * np.abs(third).max()
-    for same in ((0, 1, 3, 2), (0, 3, 2, 1)):
-        assert np.array_equal(third, np.transpose(third, same))
+    for axes in ((0, 1, 3, 2), (0, 3, 2, 1)):
+        assert np.array_equal(third, np.transpose(third, axes))
 
 
 @pytest.mark.slow
 def test_a_step_that_fails_has_no_derivative():
     """NaN, as the state is, from there on."""
-    large = lambda x: lt.flow(body(P), x, (0.0, 300.0), 100.0, save_every=1)  # noqa: E731
+    long_step_path = lambda x: lt.flow(body(P), x, (0.0, 300.0), 100.0, save_every=1)  # noqa: E731
     x = 10.0 * STARTS[body]
-    state, derivative = np.asarray(large(x)), np.asarray(jax.jacfwd(large)(x))
+    state, derivative = np.asarray(long_step_path(x)), np.asarray(jax.jacfwd(long_step_path)(x))
     assert np.isnan(state[1:]).all()
     assert np.isnan(derivative[1:]).all()
     assert np.array_equal(derivative[0], np.eye(3))

@@ -35,13 +35,13 @@ def test_fixed_steps(monkeypatch, error, why):
         return advance(self, *arguments)
 
     monkeypatch.setattr(EngineWithFallback, "advance", stopped)
-    monkeypatch.setattr(EngineWithFallback, "portion", property(lambda self: 10))
-    whole = lt.integrate(BODY, X0, (0.0, 5.0), 0.1, engine="array")
-    assert whole.status.code == "interrupted"
-    assert why in whole.status.message
-    assert len(whole.t) == len(whole.x) == len(whole.energy) == 21
+    monkeypatch.setattr(EngineWithFallback, "max_saves_per_call", property(lambda self: 10))
+    whole_run = lt.integrate(BODY, X0, (0.0, 5.0), 0.1, engine="array")
+    assert whole_run.status.code == "interrupted"
+    assert why in whole_run.status.message
+    assert len(whole_run.t) == len(whole_run.x) == len(whole_run.energy) == 21
     monkeypatch.undo()
-    assert np.array_equal(lt.integrate(BODY, X0, (0.0, 2.0), 0.1, engine="array").x, whole.x)
+    assert np.array_equal(lt.integrate(BODY, X0, (0.0, 2.0), 0.1, engine="array").x, whole_run.x)
 
 
 def test_adaptive_steps(monkeypatch):
@@ -55,10 +55,10 @@ def test_adaptive_steps(monkeypatch):
             raise MemoryError
         return append(self, *arguments)
 
-    monkeypatch.setattr(Run, "_append", stopped)
-    found = lt.integrate(BODY, X0, (0.0, 500.0), lt.Adaptive(1e-9))
-    assert "no memory left" in found.status.message
-    assert 1 < len(found.t) == len(found.x) == len(found.energy)
+    monkeypatch.setattr(Run, "_save_steps", stopped)
+    solution = lt.integrate(BODY, X0, (0.0, 500.0), lt.Adaptive(1e-9))
+    assert "no memory left" in solution.status.message
+    assert 1 < len(solution.t) == len(solution.x) == len(solution.energy)
 
 
 def test_another_error_is_not_hidden(monkeypatch):
@@ -79,14 +79,14 @@ def test_the_reference_solver(monkeypatch):
             raise KeyboardInterrupt
         return field(*arguments)
 
-    monkeypatch.setattr(reference, "_field", stopped)
-    found = lt.integrate(BODY, X0, (0.0, 50.0), 0.1, lt.Reference(1e-9))
-    assert found.status.code == "interrupted"
-    assert "stopped by the user after t =" in found.status.message
-    assert 2 < len(found.t) == len(found.x) < 501
+    monkeypatch.setattr(reference, "_vector_field", stopped)
+    solution = lt.integrate(BODY, X0, (0.0, 50.0), 0.1, lt.Reference(1e-9))
+    assert solution.status.code == "interrupted"
+    assert "stopped by the user after t =" in solution.status.message
+    assert 2 < len(solution.t) == len(solution.x) < 501
     monkeypatch.undo()
-    whole = lt.integrate(BODY, X0, (0.0, 50.0), 0.1, lt.Reference(1e-9))
-    assert np.array_equal(whole.x[: len(found.x)], found.x)
+    whole_run = lt.integrate(BODY, X0, (0.0, 50.0), 0.1, lt.Reference(1e-9))
+    assert np.array_equal(whole_run.x[: len(solution.x)], solution.x)
 
 
 # -- processes that are forked ----------------------------------------------------------------------------------------
@@ -113,10 +113,10 @@ assert os.waitpid(child, 0)[1] == 0
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
 def test_a_forked_process_does_not_wait_for_ever():
     run = [sys.executable, "-W", "ignore", "-c", FORKED]
-    done = subprocess.run(run, capture_output=True, text=True, check=False, timeout=120)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("ForkError this process was forked after JAX had run")
-    assert 'get_context("spawn")' in done.stdout
+    completed_process = subprocess.run(run, capture_output=True, text=True, check=False, timeout=120)
+    assert completed_process.returncode == 0, completed_process.stderr
+    assert completed_process.stdout.startswith("ForkError this process was forked after JAX had run")
+    assert 'get_context("spawn")' in completed_process.stdout
     assert issubclass(mf.ForkError, RuntimeError)
 
 

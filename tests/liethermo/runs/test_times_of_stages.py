@@ -87,12 +87,14 @@ def test_kept_states_dense_output_and_events():
 def test_members_of_an_ensemble_are_single_runs_to_the_bit(step, engine):
     starts, stiffness = np.array([[1.0, 0.0], [0.5, 0.2], [-1.0, 2.0]]), np.array([1.0, 1.5, 0.5])
     method = lt.MetriplecticGauss(2)
-    many = lt.ensemble(lambda p: forced(stiffness=p), starts, SPAN, step, method, parameters=stiffness, engine=engine)
-    assert many.ok.all()
+    ensemble = lt.ensemble(
+        lambda p: forced(stiffness=p), starts, SPAN, step, method, parameters=stiffness, engine=engine
+    )
+    assert ensemble.ok.all()
     for i, (x, k) in enumerate(zip(starts, stiffness, strict=True)):
         one = lt.integrate(forced(stiffness=k), x, SPAN, step, method, engine=engine).x[-1]
         # XLA compiles lanes and single runs by different instructions
-        assert np.array_equal(many.x[i], one) if engine == "compiled" else np.abs(many.x[i] - one).max() < 1e-14
+        assert np.array_equal(ensemble.x[i], one) if engine == "compiled" else np.abs(ensemble.x[i] - one).max() < 1e-14
 
 
 def test_a_flow_and_its_derivative():
@@ -119,9 +121,9 @@ def test_a_torque_that_ends_as_a_root(method):
         rtol=1e-12,
         atol=1e-12,
     )
-    for step, close in ((0.1, 3e-3), (lt.Adaptive(1e-5), 1e-3)):
+    for step, tolerance in ((0.1, 3e-3), (lt.Adaptive(1e-5), 1e-3)):
         run = lt.integrate(turned(torque), [0.4, 0.5, -0.3], (0.0, 0.3), step, method)
-        assert np.abs(run.x[-1] - exact.y[:, -1]).max() < close
+        assert np.abs(run.x[-1] - exact.y[:, -1]).max() < tolerance
 
 
 @pytest.mark.parametrize("method", [lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(4)], ids=str)
@@ -181,7 +183,7 @@ def test_a_step_below_the_last_place_of_the_times_is_refused():
         span, method = (start, start + 2.0**-8), lt.MetriplecticRungeKutta(4)
         return lt.integrate(system, START, span, lt.Adaptive(1e-8), method, on_failure="return")
 
-    far = run(2.0**40)
-    assert far.status.code == "step_underflow"
-    assert "nearer to zero" in far.status.message
+    run_far_from_zero = run(2.0**40)
+    assert run_far_from_zero.status.code == "step_underflow"
+    assert "nearer to zero" in run_far_from_zero.status.message
     assert run(0.0).status.ok  # as the message says

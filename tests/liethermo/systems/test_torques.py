@@ -488,7 +488,7 @@ def test_what_the_user_asks_of_a_system():
         (lambda: rubbing(lambda t, mu: mu @ jnp.ones(4)), "could not be evaluated"),
         (lambda: rubbing(TORQUES["space"]).vector_field(START, 0.0), "a time and the attitude"),
         (lambda: rubbing(TORQUES["body"]).vector_field(START), "give the time"),
-        (lambda: lt.integrate(rubbing(TORQUES["space"]), START, SPAN, 0.1, lt.Reference()), "follows no attitude"),
+        (lambda: lt.integrate(rubbing(TORQUES["space"]), START, SPAN, 0.1, lt.Reference()), "cannot integrate"),
         (lambda: lt.torques.ConstantInSpace([1.0, 2.0]), r"shape \(3,\), not \(2,\)"),
         (lambda: lt.torques.Magnetic([np.nan, 0.0, 0.0], np.ones(3)), "must be finite"),
         (lambda: lt.torques.GravityGradient(INERTIA, -1.0), "must be positive"),
