@@ -47,6 +47,10 @@ class ScheduleSegment(NamedTuple):
     def n_steps(self) -> int:
         return self.n_full_steps + (self.last_step_size > 0.0)
 
+    def equal_steps(self, h: float) -> list[tuple[float, int]]:
+        """Return the step sizes, and how many steps of each size follow one another."""
+        return [(size, n) for size, n in ((h, self.n_full_steps), (self.last_step_size, 1)) if n and size]
+
 
 class StepSchedule:
     """Steps of one size over a span of time, from stop to stop.
@@ -78,8 +82,8 @@ class StepSchedule:
     def __init__(
         self, span, step, save_every: int | None, stop_times: np.ndarray | None = None, allow_infinite_end: bool = False
     ):
-        self.start, self.end = _checked_span(span, allow_infinite_end)
-        self.h = math.inf if math.isinf(self.end) else _checked_step(step, self.start, self.end)
+        self.start, self.end = checked_span(span, allow_infinite_end)
+        self.h = math.inf if math.isinf(self.end) else checked_step(step, self.start, self.end)
         if save_every is not None and (
             isinstance(save_every, bool) or not isinstance(save_every, int) or save_every < 1
         ):
@@ -178,7 +182,7 @@ def make_schedule(
     span, step: float | Adaptive, save_every: int | None, save_at=None, allow_infinite_end: bool = False
 ) -> StepSchedule:
     """The course of a run whose states are kept at these times, if any are given; adaptive steps are as one."""
-    start, end = _checked_span(span, allow_infinite_end)
+    start, end = checked_span(span, allow_infinite_end)
     size = end - start if isinstance(step, Adaptive) else step
     course = StepSchedule((start, end), size, save_every, allow_infinite_end=allow_infinite_end)
     if save_at is None:
@@ -229,7 +233,7 @@ def _split_double(a) -> tuple[np.ndarray, np.ndarray]:
         return high, a - high
 
 
-def _checked_span(span, endless: bool) -> tuple[float, float]:
+def checked_span(span, endless: bool = False) -> tuple[float, float]:
     try:
         start, end = (float(t) for t in span)
     except (TypeError, ValueError):
@@ -243,7 +247,7 @@ def _checked_span(span, endless: bool) -> tuple[float, float]:
     return start, end
 
 
-def _checked_step(step, start: float, end: float) -> float:
+def checked_step(step, start: float, end: float) -> float:
     try:
         h = float(step)
     except (TypeError, ValueError):
