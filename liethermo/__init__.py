@@ -73,6 +73,7 @@ from .runs.events import Relaxed
 from .runs.flow import flow
 from .runs.fluctuations import Fluctuations
 from .runs.integrate import integrate
+from .runs.propagator import Propagator
 from .runs.suggest import MethodSuggestion, suggest_method, suggest_step
 from .studies.axes import Zipped, latin_hypercube, replicas, sobol, zipped
 from .studies.measures import At
@@ -174,6 +175,7 @@ __all__ = [
     "Potential",
     "PowerLawFriction",
     "ProjectedMetric",
+    "Propagator",
     "Quadratic",
     "QuantumSystem",
     "Reaction",

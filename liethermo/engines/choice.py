@@ -18,7 +18,7 @@ from ..tracing.scalarize import UnsupportedPrimitive
 from .array import ArrayEngine
 from .codes import StatusCode
 from .compiled.paced import CompiledAdaptiveRuns
-from .compiled.stepper import CompiledEngine
+from .compiled.stepper import CompiledEngine, FinalStateRunner
 from .paced import AdaptiveRuns, ArrayAdaptiveRuns, resume_on_array_engine, start_one
 from .pacing import StepControl
 from .sparse.newton import SparseEngine
@@ -100,6 +100,11 @@ class EngineWithFallback:
     def initial_run_state(self, x) -> State:
         self._choose_engine(lambda compiled: compiled.n_operations)
         return self._call_with_fallback(lambda engine, _: engine.initial_run_state(x))
+
+    def final_state_runner(self) -> FinalStateRunner | None:
+        """Return a runner that returns final states alone; None if the compiled engine does not run the system."""
+        self._choose_engine(lambda compiled: compiled.n_operations)
+        return self._engine.final_state_runner() if isinstance(self._engine, CompiledEngine) else None
 
     def advance(self, state: State, h, saves: int, save_every: int) -> tuple[State, tuple]:
         noise = self._noise_increments(state, int(saves) * int(save_every), h)

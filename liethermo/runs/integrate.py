@@ -8,31 +8,23 @@ from typing import Literal
 
 from manifolds._precision import with_library_settings
 
-from ..engines.codes import StatusCode
-from ..errors import ConvergenceError, FileError, InputError, NonFiniteError
-from ..integrators import DEFAULT_METHOD, OneStepMethod, Reference
+from ..integrators import OneStepMethod, Reference
 from ..results.solution import Solution
 from ..systems import System
 from .adaptive import Adaptive
 from .events import Relaxed
-from .fluctuations import DEFAULT_NOISE_METHOD, Fluctuations, check_noise
+from .fluctuations import Fluctuations
 from .preparation import (
-    check_choice,
     checked_initial_state,
     invariants_and_laws,
     prepare_run,
     refuse_tracers,
     resolve_invariants,
 )
-from .progress import Progress
+from .propagator import Propagator
 from .run import Run
-from .timetable import StepSchedule, make_schedule
+from .timetable import StepSchedule
 from .watch import EventSet
-
-CONVERGENCE_FAILURES = tuple(
-    code.status_name for code in (StatusCode.NOT_CONVERGED, StatusCode.STEP_UNDERFLOW, StatusCode.STEP_LIMIT)
-)
-"""Names of the statuses for which ``integrate`` raises ConvergenceError."""
 
 
 @with_library_settings
@@ -135,53 +127,19 @@ def integrate(
     >>> solution.status.code, solution.event_time < 1e3
     ('event', True)
     """
-    check_noise(noise)
-    default = DEFAULT_METHOD if noise is None else DEFAULT_NOISE_METHOD
-    method = default if method is None else method
-    if not isinstance(method, OneStepMethod | Reference):
-        raise InputError(f"method must be an integrator such as lt.MetriplecticGauss(), got {method!r}")
-    if not isinstance(system, System):
-        raise InputError(
-            f"the first argument must be a system such as lt.LiePoissonSystem, got {type(system).__name__}"
-        )
-    check_choice("engine", engine, ("auto", "array", "compiled", "sparse"))
-    check_choice("on_failure", on_failure, ("raise", "return"))
-    system, method = prepare_run(
-        resolve_invariants(system, x0), method, noise, step.tolerance if isinstance(step, Adaptive) else None
+    propagator = Propagator(system, method, step, engine=engine, noise=noise)
+    return propagator(
+        x0,
+        t_span,
+        save_every=save_every,
+        save_at=save_at,
+        until=until,
+        dense=dense,
+        on_failure=on_failure,
+        progress=progress,
+        save_to=save_to,
+        attitude=attitude,
     )
-    invariants_and_laws(system, method)  # refuses what the method cannot run
-    adaptive = isinstance(step, Adaptive)
-    needs_own_steps = adaptive or dense or save_at is not None or until is not None
-    if needs_own_steps and isinstance(method, Reference):
-        raise InputError(
-            "Reference chooses its own steps and cannot be combined with Adaptive, save_at, until or dense. Use "
-            "another method"
-        )
-    if noise is not None and (adaptive or dense or until is not None):
-        raise InputError(
-            "noise= needs fixed steps and cannot be combined with Adaptive, until or dense. Give the step as a number"
-        )
-    schedule = make_schedule(t_span, step, save_every, save_at, allow_infinite_end=adaptive and until is not None)
-    x = checked_initial_state(system, method, x0, schedule.start, attitude)
-    run = Run(system, method, x, schedule, save_to, engine, noise, dense)
-    with Progress((schedule.start, schedule.end), progress) as bar:
-        if isinstance(method, Reference):
-            run.run_reference(bar)
-        elif adaptive or until is not None:
-            run.run_with_step_control(bar, step if adaptive else schedule.h, until)
-        else:
-            run.run_fixed(bar)
-    solution = run.solution()
-    if save_to is not None:
-        try:
-            solution.save(save_to)
-        except FileError as error:
-            raise FileError(f"{error}. It is the exception's .solution", solution) from error
-    if on_failure == "raise" and solution.status.code in CONVERGENCE_FAILURES:
-        raise ConvergenceError(solution.status.message, solution)
-    if on_failure == "raise" and not solution.status.ok and solution.status.code != StatusCode.INTERRUPTED.status_name:
-        raise NonFiniteError(solution.status.message, solution)
-    return solution
 
 
 @with_library_settings

@@ -48,7 +48,7 @@ def refuse_tracers(function: Callable[..., Result]) -> Callable[..., Result]:
             if not is_traced(arguments, keywords):
                 raise
             raise InputError(
-                f"{function.__name__} runs on numbers, and jax.jit, jax.grad or jax.vmap traces its arguments. Use "
+                "a run needs numbers, but jax.jit, jax.grad or jax.vmap traces its arguments. Use "
                 "lt.flow(system, x0, t_span, step, method), which JAX compiles and differentiates"
             ) from error
 

@@ -49,6 +49,10 @@ class ScheduleSegment(NamedTuple):
     def n_steps(self) -> int:
         return self.n_full_steps + (self.last_step_size > 0.0)
 
+    def equal_steps(self, h: float) -> list[tuple[float, int]]:
+        """Return the step sizes, and how many steps of each size follow one another."""
+        return [(size, n) for size, n in ((h, self.n_full_steps), (self.last_step_size, 1)) if n and size]
+
 
 class EngineCall(NamedTuple):
     """One call of an engine: ``n_saves`` saves, each after ``steps_per_save`` steps of size h.
@@ -95,8 +99,8 @@ class StepSchedule:
     def __init__(
         self, span, step, save_every: int | None, stop_times: np.ndarray | None = None, allow_infinite_end: bool = False
     ):
-        self.start, self.end = _checked_span(span, allow_infinite_end)
-        self.h = math.inf if math.isinf(self.end) else _checked_step(step, self.start, self.end)
+        self.start, self.end = checked_span(span, allow_infinite_end)
+        self.h = math.inf if math.isinf(self.end) else checked_step(step, self.start, self.end)
         if save_every is not None and (
             isinstance(save_every, bool) or not isinstance(save_every, int) or save_every < 1
         ):
@@ -209,7 +213,7 @@ def make_schedule(
 
     With ``save_at`` the steps end at these times, and only the states there are saved.
     """
-    start, end = _checked_span(span, allow_infinite_end)
+    start, end = checked_span(span, allow_infinite_end)
     step_size = end - start if isinstance(step, Adaptive) else step
     schedule = StepSchedule((start, end), step_size, save_every, allow_infinite_end=allow_infinite_end)
     if save_at is None:
@@ -262,7 +266,7 @@ def _veltkamp_split(a) -> tuple[np.ndarray, np.ndarray]:
         return high_part, a - high_part
 
 
-def _checked_span(span, allow_infinite_end: bool) -> tuple[float, float]:
+def checked_span(span, allow_infinite_end: bool = False) -> tuple[float, float]:
     try:
         start, end = (float(t) for t in span)
     except (TypeError, ValueError):
@@ -276,7 +280,7 @@ def _checked_span(span, allow_infinite_end: bool) -> tuple[float, float]:
     return start, end
 
 
-def _checked_step(step, start: float, end: float) -> float:
+def checked_step(step, start: float, end: float) -> float:
     try:
         h = float(step)
     except (TypeError, ValueError):

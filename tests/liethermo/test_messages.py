@@ -132,14 +132,14 @@ def end_of(call, **options):
 )
 def test_a_run_inside_of_jax(transform):
     """The message names lt.flow, which works in the place of integrate."""
-    with pytest.raises(lt.InputError, match=r"integrate runs on numbers.*lt\.flow\(system, x0, t_span, step, method\)"):
+    with pytest.raises(lt.InputError, match=r"a run needs numbers.*lt\.flow\(system, x0, t_span, step, method\)"):
         transform(lambda x: end_of(lt.integrate)(x).x[-1])(jnp.asarray(START))
     assert np.isfinite(transform(end_of(lt.flow))(jnp.asarray(START))).all()
 
 
 def test_an_ensemble_inside_of_jax():
     starts = jnp.asarray(np.random.default_rng(0).standard_normal((2, 3)))
-    with pytest.raises(lt.InputError, match=r"ensemble runs on numbers.*lt\.flow"):
+    with pytest.raises(lt.InputError, match=r"a run needs numbers.*lt\.flow"):
         jax.jit(lambda x: end_of(lt.ensemble)(x).x)(starts)
     assert jax.jit(jax.vmap(end_of(lt.flow)))(starts).shape == (2, 3)
 

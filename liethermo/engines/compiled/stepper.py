@@ -102,6 +102,10 @@ class CompiledEngine:
         """Number of scalar operations of a step."""
         return self._step_loop.n_operations
 
+    def final_state_runner(self) -> FinalStateRunner:
+        """Return a runner that returns final states alone, with buffers of its own; each thread needs one."""
+        return FinalStateRunner(self._step_loop, self._parameters)
+
     def initial_run_state(self, x) -> State:
         return self._state_from_block(
             self._step_loop.start_blocks(self._parameters, np.asarray(x, dtype=np.float64)[None], self._planned_steps)
@@ -130,6 +134,52 @@ class CompiledEngine:
 
     def _state_from_block(self, blocks: np.ndarray) -> State:
         return self._step_loop.state_from_block(blocks)
+
+
+class FinalStateRunner:
+    """Runs one trajectory at a time through a compiled loop of steps, in buffers that are allocated once.
+
+    A call costs a few microseconds beside the steps. The buffers are written in place, so each thread needs a runner
+    of its own.
+
+    Parameters
+    ----------
+    step_loop : CompiledStepLoop
+        A loop of one lane, with steps of given sizes.
+    parameters : array, shape (p,)
+        Parameters of the system and the method, one after another.
+    """
+
+    def __init__(self, step_loop: CompiledStepLoop, parameters: np.ndarray):
+        self._loop, self._parameters = step_loop, np.ascontiguousarray(parameters, dtype=np.float64)
+        self._block = step_loop.make_blocks({"x": np.zeros((1, *step_loop.field_shape("x")))})
+        rows = step_loop.block_rows(self._block)[0, :, 0]
+        self._x, self._status, self._h = (rows[step_loop.row_slice(name)] for name in ("x", "status", "h"))
+        self._n_done, self._saved = np.zeros(1, dtype=np.int64), np.empty(step_loop.n_saved_values)
+        arrays = self._parameters, self._block, self._n_done, self._saved, np.zeros(0)
+        self._arrays, self._addresses = arrays, [array.ctypes.data for array in arrays]
+
+    def run(self, x0: np.ndarray, segments: Sequence[tuple[float, int]]) -> tuple[np.ndarray, float]:
+        """Take steps from a state, and return the last state, shape (n,), and its status code.
+
+        Parameters
+        ----------
+        x0 : array, shape (n,)
+        segments : sequence of (h, n_steps)
+            Step sizes, and how many steps of each size follow one another.
+        """
+        parameters, block, n_done, saved, noise = self._addresses
+        begin, advance = self._loop.machine_functions(sum(n_steps for _, n_steps in segments))
+        self._status[0], self._x[:] = 0.0, x0
+        begin(parameters, block, 1)
+        newton = self._loop.newton_address(is_needed=False)
+        for h, n_steps in segments:
+            self._h[0], self._n_done[0] = h, 0
+            while advance(parameters, block, n_done, 1, 1, n_steps, saved, n_steps, noise, newton) < 1:
+                newton = self._loop.newton_address(is_needed=True)
+            if self._status[0]:
+                break
+        return self._x.copy(), float(self._status[0])
 
 
 class CompiledStepLoop:
@@ -412,10 +462,10 @@ class CompiledStepLoop:
         arguments = [parameters.ctypes.data, blocks.ctypes.data, steps_done.ctypes.data, n_blocks, saves, save_every]
         increments = self._noise_by_block(noise, n_blocks, saves * save_every)
         arguments += [out.ctypes.data, saves * save_every, increments.ctypes.data]
-        newton_address = 0 if self._newton_code is None else self._newton_address()
+        newton_address = self.newton_address(is_needed=False)
         _, advance = self._loops.loop_functions(n_blocks * saves * save_every)
         while advance(*arguments, newton_address) < n_blocks:
-            newton_address = self._newton_address()
+            newton_address = self.newton_address(is_needed=True)
         return out.reshape(n_blocks, saves, width, lanes).transpose(0, 3, 1, 2).reshape(n_blocks * lanes, saves, width)
 
     def saved_fields_of_one(self, out: np.ndarray) -> dict[str, np.ndarray]:
@@ -441,6 +491,14 @@ class CompiledStepLoop:
         return np.ascontiguousarray(padded.reshape(n_blocks, self.lanes, n_steps, -1).transpose(0, 2, 3, 1))
 
     # -- machine code -------------------------------------------------------------------------------------------------
+
+    def machine_functions(self, n_steps: int) -> Sequence[Callable]:
+        """Return the functions ``begin`` and ``advance`` of the loop, optimised if many steps are taken in all."""
+        return self._loops.loop_functions(n_steps)
+
+    def newton_address(self, is_needed: bool) -> int:
+        """Return the address of Newton's method; 0 if it is not compiled yet and no step has needed it."""
+        return self._newton_address() if is_needed or self._newton_code is not None else 0
 
     def _newton_address(self) -> int:
         """Return the address of Newton's method, which is compiled at the first call."""

@@ -1,0 +1,380 @@
+"""``Propagator``: a system, a method and a step, prepared once and called many times."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from manifolds._precision import with_library_settings
+
+from ..engines.choice import ENGINES, EngineWithFallback
+from ..engines.codes import StatusCode
+from ..engines.compiled.stepper import FinalStateRunner
+from ..errors import ConvergenceError, FileError, InputError, NonFiniteError
+from ..integrators import DEFAULT_METHOD, OneStepMethod, Reference
+from ..results.ensemble import Ensemble
+from ..results.solution import Solution
+from ..systems import AttitudeSystem, System
+from ..systems.interface import SystemInterface
+from ..tracing.caching import LRUCache
+from .adaptive import Adaptive
+from .ensemble import ensemble
+from .events import Relaxed
+from .family import named_parameters
+from .fluctuations import DEFAULT_NOISE_METHOD, Fluctuations, check_noise
+from .preparation import (
+    check_choice,
+    checked_initial_state,
+    invariants_and_laws,
+    is_driven_run,
+    prepare_for_method,
+    prepare_run,
+    refuse_tracers,
+    resolve_invariants,
+    why_not_startable,
+)
+from .progress import Progress
+from .run import Run
+from .timetable import CHUNK_STEPS, ScheduleSegment, checked_span, checked_step, make_schedule
+from .watch import EventSet
+
+CONVERGENCE_FAILURES = tuple(
+    code.status_name for code in (StatusCode.NOT_CONVERGED, StatusCode.STEP_UNDERFLOW, StatusCode.STEP_LIMIT)
+)
+
+REFERENCE_STEPS = (
+    "Reference chooses its own steps and cannot be combined with Adaptive, save_at, until or dense. Use another method"
+)
+"""Message for options that need steps of the library's own methods."""
+
+NOISY_STEPS = "noise= needs fixed steps and cannot be combined with Adaptive, until or dense. Give the step as a number"
+"""Message for options that a run with noise does not have."""
+
+MAX_CACHED_PARAMETER_SETS = 32
+"""Sets of parameters whose prepared propagators are held in memory, those last used."""
+
+
+class Propagator:
+    """A system, a method and a step, prepared once: for optimisers, samplers and control loops.
+
+    ``p(x0, t_span)`` is what :func:`integrate` returns, and ``p.final(x0, t_span)`` is the last state alone, which costs
+    some ten microseconds beside the steps where the compiled engine takes steps of one size. A propagator may be called
+    from several threads, and pickled.
+
+    Parameters
+    ----------
+    system : System
+        It fixes the units.
+    method : OneStepMethod, Reference or None
+        None means ``MetriplecticGauss()``, and ``MetriplecticMidpoint()`` with noise.
+    step : float or Adaptive
+        Step size, in the unit of time of the system, or tolerances of adaptive steps.
+    engine : {"auto", "array", "compiled", "sparse"}
+        As for :func:`integrate`.
+    noise : Fluctuations, optional
+        As for :func:`integrate`.
+
+    Raises
+    ------
+    InputError
+        If the method cannot run the system.
+
+    Examples
+    --------
+    >>> body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
+    >>> p = lt.Propagator(body, lt.MetriplecticRungeKutta(8), step=0.5)
+    >>> p.final([0.1, 0.2, 1.0], (0.0, 10.0)).shape
+    (3,)
+    >>> p([0.1, 0.2, 1.0], (0.0, 10.0)).audit().passed
+    True
+    """
+
+    @with_library_settings
+    @refuse_tracers
+    def __init__(
+        self,
+        system: System,
+        method: OneStepMethod | Reference | None,
+        step: float | Adaptive,
+        *,
+        engine: Literal["auto", "array", "compiled", "sparse"] = "auto",
+        noise: Fluctuations | None = None,
+    ):
+        check_noise(noise)
+        if method is None:
+            method = DEFAULT_METHOD if noise is None else DEFAULT_NOISE_METHOD
+        if not isinstance(method, OneStepMethod | Reference):
+            raise InputError(f"method must be an integrator such as lt.MetriplecticGauss(), got {method!r}")
+        if not isinstance(system, System):
+            raise InputError(
+                f"the first argument must be a system such as lt.LiePoissonSystem, got {type(system).__name__}"
+            )
+        check_choice("engine", engine, ENGINES)
+        if isinstance(step, Adaptive) and isinstance(method, Reference):
+            raise InputError(REFERENCE_STEPS)
+        if isinstance(step, Adaptive) and noise is not None:
+            raise InputError(NOISY_STEPS)
+        self.system, self.method, self.step, self.engine, self.noise = system, method, step, engine, noise
+        self._variants: LRUCache[Propagator] = LRUCache(MAX_CACHED_PARAMETER_SETS)
+        self._local = threading.local()
+
+    def __getstate__(self) -> tuple:
+        return self.system, self.method, self.step, self.engine, self.noise
+
+    def __setstate__(self, state: tuple) -> None:
+        system, method, step, engine, noise = state
+        self.__init__(system, method, step, engine=engine, noise=noise)  # type: ignore[misc]
+
+    def __repr__(self) -> str:
+        return f"Propagator({type(self.system).__name__}, {self.method}, step={self.step})"
+
+    # -- one trajectory -------------------------------------------------------------------------------------------
+
+    @with_library_settings
+    @refuse_tracers
+    def __call__(
+        self,
+        x0,
+        t_span: tuple[float, float],
+        *,
+        parameters: Mapping[str, Any] | None = None,
+        save_every: int = 1,
+        save_at=None,
+        until: Relaxed | Callable | EventSet | None = None,
+        dense: bool = False,
+        on_failure: Literal["raise", "return"] = "raise",
+        progress: bool | None = False,
+        save_to: str | os.PathLike | None = None,
+        attitude=None,
+    ) -> Solution:
+        """Return the solution from a state over a span of time.
+
+        Parameters
+        ----------
+        x0, t_span, save_every, save_at, until, dense, on_failure, progress, save_to, attitude
+            As for :func:`integrate`; without a progress bar by default.
+        parameters : dict from str to array, optional
+            New values of parameters of the system, by their names, such as ``{"dissipation.rate": 0.1}``.
+
+        Raises
+        ------
+        InputError, ConvergenceError, NonFiniteError, FileError
+            As :func:`integrate`.
+        """
+        if parameters:
+            return self.with_parameters(parameters)(
+                x0,
+                t_span,
+                save_every=save_every,
+                save_at=save_at,
+                until=until,
+                dense=dense,
+                on_failure=on_failure,
+                progress=progress,
+                save_to=save_to,
+                attitude=attitude,
+            )
+        check_choice("on_failure", on_failure, ("raise", "return"))
+        step, adaptive = self.step, isinstance(self.step, Adaptive)
+        system, method = self._prepared(x0)
+        invariants_and_laws(system, method)  # refuses what the method cannot run
+        if isinstance(method, Reference) and (dense or save_at is not None or until is not None):
+            raise InputError(REFERENCE_STEPS)
+        if self.noise is not None and (dense or until is not None):
+            raise InputError(NOISY_STEPS)
+        schedule = make_schedule(t_span, step, save_every, save_at, allow_infinite_end=adaptive and until is not None)
+        x = checked_initial_state(system, method, x0, schedule.start, attitude)
+        run = Run(system, method, x, schedule, save_to, self.engine, self.noise, dense)
+        with Progress((schedule.start, schedule.end), progress) as bar:
+            if isinstance(method, Reference):
+                run.run_reference(bar)
+            elif adaptive or until is not None:
+                run.run_with_step_control(bar, step if adaptive else schedule.h, until)
+            else:
+                run.run_fixed(bar)
+        solution = run.solution()
+        if save_to is not None:
+            try:
+                solution.save(save_to)
+            except FileError as error:
+                raise FileError(f"{error}. It is the exception's .solution", solution) from error
+        if on_failure == "raise":
+            raise_failure(solution)
+        return solution
+
+    def final(self, x0, t_span: tuple[float, float], *, parameters: Mapping[str, Any] | None = None) -> np.ndarray:
+        """Return the last state of the trajectory from x0, equal to ``p(x0, t_span).x[-1]`` to the bit.
+
+        Parameters
+        ----------
+        x0 : array, shape (n,), or (*sites, d)
+        t_span : (float, float)
+        parameters : dict from str to array, optional
+            As in a call of the propagator.
+
+        Raises
+        ------
+        InputError, ConvergenceError, NonFiniteError
+            As :func:`integrate`.
+        """
+        if parameters:
+            return self.with_parameters(parameters).final(x0, t_span)
+        fast = self._final_state_calls()
+        if fast is not None:
+            x = fast(x0, t_span)
+            if x is not None:
+                return x
+        return self(x0, t_span, save_every=CHUNK_STEPS).x[-1]
+
+    def many(self, x0s, t_span: tuple[float, float], *, parameters=None, **options) -> Ensemble:
+        """Return an ensemble of trajectories, as :func:`ensemble` does.
+
+        Parameters
+        ----------
+        x0s, t_span, parameters
+            As for :func:`ensemble`.
+        **options
+            Other arguments of :func:`ensemble`, such as ``outputs="summary"``.
+        """
+        if isinstance(self.method, Reference):
+            raise InputError("Reference runs single trajectories: call the propagator for each of them")
+        if self.engine == "sparse":
+            raise InputError('ensembles have no engine "sparse": leave out engine')
+        return ensemble(
+            self.system,
+            x0s,
+            t_span,
+            self.step,
+            self.method,
+            parameters=parameters,
+            engine=self.engine,
+            noise=self.noise,
+            **options,
+        )
+
+    # -- what is prepared -----------------------------------------------------------------------------------------
+
+    def with_parameters(self, parameters: Mapping[str, Any]) -> Propagator:
+        """Return the propagator of the system with new values of some parameters.
+
+        Raises
+        ------
+        InputError
+            If the system has no parameter of a name, or a value has another shape.
+        """
+        values = {name: np.asarray(value, dtype=np.float64) for name, value in parameters.items()}
+        key = tuple((name, value.shape, value.tobytes()) for name, value in sorted(values.items()))
+        return self._variants.get_or_compute(
+            key,
+            lambda: Propagator(
+                replace_parameters(self.system, values), self.method, self.step, engine=self.engine, noise=self.noise
+            ),
+        )
+
+    def _prepared(self, x0) -> tuple[System, Any]:
+        """Return the system and the method as they are run from x0."""
+        tolerance = self.step.tolerance if isinstance(self.step, Adaptive) else None
+        return prepare_run(resolve_invariants(self.system, x0), self.method, self.noise, tolerance)
+
+    def _final_state_calls(self) -> FinalStateCalls | None:
+        """Return what computes final states in this thread by machine code, or None where it cannot."""
+        if not hasattr(self._local, "calls"):
+            self._local.calls = self._make_final_state_calls()
+        return self._local.calls
+
+    @with_library_settings
+    def _make_final_state_calls(self) -> FinalStateCalls | None:
+        system = self.system
+        if isinstance(self.step, Adaptive) or self.noise is not None or isinstance(self.method, Reference):
+            return None
+        if system.undecided_functions():  # what is conserved may depend on the initial state
+            return None
+        prepared, method = prepare_for_method(system, self.method)
+        if is_driven_run(prepared) or isinstance(prepared, AttitudeSystem):
+            return None
+        invariants_and_laws(prepared, method)
+        engine = EngineWithFallback(prepared, method, self.engine, 0)
+        runner = engine.final_state_runner()
+        return None if runner is None else FinalStateCalls(system, prepared, method, self.step, runner)
+
+
+class FinalStateCalls:
+    """Final states of one thread, by machine code and steps of one size.
+
+    Parameters
+    ----------
+    system : System
+        The system of the user.
+    prepared, method : System, OneStepMethod
+        The system and the method as they are run.
+    step : float
+    runner : FinalStateRunner
+    """
+
+    def __init__(self, system: System, prepared: System, method: OneStepMethod, step: float, runner: FinalStateRunner):
+        self._system, self._prepared, self._method = system, prepared, method
+        self._step, self._runner = step, runner
+        self._dim, self._shape = prepared.dim, system.shape if system.sites else (prepared.dim,)
+        kind = type(prepared)
+        self._starts_anywhere = system.space is None and (
+            kind.outside is SystemInterface.outside and kind.why_singular is SystemInterface.why_singular
+        )
+
+    def __call__(self, x0, t_span: tuple[float, float]) -> np.ndarray | None:
+        """Return the last state; None where a step fails, so that a run has to say why."""
+        start, end = checked_span(t_span)
+        segment = ScheduleSegment.from_span(start, end, checked_step(self._step, start, end))
+        if segment.n_full_steps > CHUNK_STEPS:
+            return None  # a run in portions, which Ctrl-C can stop
+        x, status = self._runner.run(self._initial_state(x0), segment.equal_steps(self._step))
+        return x.reshape(self._shape) if status == StatusCode.COMPLETED else None
+
+    def _initial_state(self, x0) -> np.ndarray:
+        is_plain = type(x0) is np.ndarray and x0.dtype == np.float64 and x0.shape == (self._dim,)
+        if not (is_plain and self._starts_anywhere and np.isfinite(x0).all()):
+            x0 = self._prepared.state_array(x0)
+            if reason := why_not_startable(self._prepared, self._method, x0):
+                raise InputError(reason)
+        return x0
+
+
+def replace_parameters(system: System, values: Mapping[str, np.ndarray]) -> System:
+    """Return a system with new values of some of its parameters, by the names of :func:`named_parameters`.
+
+    Raises
+    ------
+    InputError
+        If the system has no parameter of a name, or a value has another shape.
+    """
+    leaves = named_parameters(system)
+    for name, value in values.items():
+        if name not in leaves:
+            raise InputError(f"the system has no parameter {name!r}; its parameters are {', '.join(leaves)}")
+        if value.shape != leaves[name].shape:
+            raise InputError(f"{name} must have shape {leaves[name].shape}, got {value.shape}")
+    dynamic, static = eqx.partition(system, eqx.is_inexact_array)
+    arrays, structure = jax.tree_util.tree_flatten(dynamic)
+    new = [
+        jax.numpy.asarray(values[name]) if name in values else array for name, array in zip(leaves, arrays, strict=True)
+    ]
+    return eqx.combine(jax.tree_util.tree_unflatten(structure, new), static)
+
+
+def raise_failure(solution: Solution) -> None:
+    """Raise the error of a run that failed; the run is its ``.solution``.
+
+    Raises
+    ------
+    ConvergenceError, NonFiniteError
+    """
+    status = solution.status
+    if status.code in CONVERGENCE_FAILURES:
+        raise ConvergenceError(status.message, solution)
+    if not status.ok and status.code != StatusCode.INTERRUPTED.status_name:
+        raise NonFiniteError(status.message, solution)

@@ -1,0 +1,191 @@
+"""A prepared propagator returns what ``integrate`` and ``ensemble`` return, to the bit."""
+
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liethermo as lt
+import manifolds as mf
+
+SPAN = (0.0, 1.3)
+STEP = 0.25
+MU = np.array([0.3, 0.9, -0.4])
+
+
+def rigid_body():
+    return lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
+
+
+def body_with_group():
+    return lt.LiePoissonSystem(
+        mf.so(3), lt.Quadratic([0.5, 1.0, 1.5]), dissipation=lt.DoubleBracket(0.1), group=mf.SO(3)
+    )
+
+
+def body_with_bath():
+    return lt.models.tumbling_body((3.0, 2.0, 1.0), rate=0.1, attitude=False)
+
+
+def spin_on_sphere():
+    return lt.MetriplecticSystem(mf.LiePoisson(mf.so(3)), lambda s: s[0] ** 4 + s[1] ** 2, space=mf.Sphere(2))
+
+
+def driven_body():
+    energy = lambda m, t: 0.5 * jnp.sum(m**2 / jnp.array([3.0, 2.0, 1.0])) + 0.1 * jnp.sin(t) * m[0]  # noqa: E731
+    return lt.LiePoissonSystem(mf.so(3), energy)
+
+
+def spins_on_sites():
+    return lt.models.spin_lattice((3, 1), exchange_constant=1.0, rate=0.1, baths=True)
+
+
+SYSTEMS = {
+    "body": (rigid_body, MU),
+    "group": (body_with_group, MU),
+    "bath": (body_with_bath, MU),
+    "sphere": (spin_on_sphere, np.array([0.6, 0.64, 0.48])),
+    "driven": (driven_body, MU),
+    "sites": (spins_on_sites, np.array([[[1.0, 0, 0]], [[0, 1.0, 0]], [[0, 0.6, 0.8]]])),
+}
+METHODS = {
+    "Gauss": lt.MetriplecticGauss(2),
+    "Runge-Kutta": lt.MetriplecticRungeKutta(4),
+}
+
+
+def start_of(system, x0):
+    return system.state(x0) if system.sites else x0
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize("method", METHODS.values(), ids=METHODS.keys())
+def test_final_state_equals_that_of_integrate(name, method):
+    build, x0 = SYSTEMS[name]
+    system = build()
+    x0 = start_of(system, x0)
+    expected = lt.integrate(system, x0, SPAN, STEP, method)
+    propagator = lt.Propagator(system, method, STEP)
+    assert np.array_equal(propagator.final(x0, SPAN), expected.x[-1])
+    solution = propagator(x0, SPAN)
+    assert np.array_equal(solution.x, expected.x)
+    assert np.array_equal(solution.t, expected.t)
+    assert solution.audit().passed
+
+
+@pytest.mark.parametrize("span", [(0.0, 1.0), (0.5, 0.6), (2.0, 2.0 + 3 * STEP), (-1.0, 0.1)])
+def test_spans_that_end_between_steps(span):
+    body, method = rigid_body(), lt.MetriplecticGauss(2)
+    propagator = lt.Propagator(body, method, STEP)
+    assert np.array_equal(propagator.final(MU, span), lt.integrate(body, MU, span, STEP, method).x[-1])
+
+
+def test_adaptive_steps_and_options_of_a_call():
+    body = rigid_body()
+    propagator = lt.Propagator(body, lt.MetriplecticRungeKutta(8), lt.Adaptive(1e-8))
+    expected = lt.integrate(body, MU, (0.0, 9.0), lt.Adaptive(1e-8), lt.MetriplecticRungeKutta(8))
+    assert np.array_equal(propagator.final(MU, (0.0, 9.0)), expected.x[-1])
+    saved = propagator(MU, (0.0, 9.0), save_at=[1.0, 2.0], dense=True)
+    assert saved.t.tolist() == [0.0, 1.0, 2.0, 9.0]
+    assert propagator(MU, (0.0, np.inf), until=lt.Relaxed(1e-6)).status.code == "event"
+
+
+def test_noise_is_that_of_integrate():
+    body, noise = body_with_bath(), lt.Fluctuations(1e-3, seed=3)
+    expected = lt.integrate(body, MU, SPAN, STEP, noise=noise)
+    propagator = lt.Propagator(body, None, STEP, noise=noise)
+    assert np.array_equal(propagator.final(MU, SPAN), expected.x[-1])
+
+
+def test_many_is_an_ensemble():
+    body, x0s = rigid_body(), np.array([MU, 2.0 * MU, -MU])
+    propagator = lt.Propagator(body, lt.MetriplecticGauss(2), STEP)
+    many = propagator.many(x0s, SPAN)
+    assert np.array_equal(many.x, lt.ensemble(body, x0s, SPAN, STEP, lt.MetriplecticGauss(2)).x)
+    assert np.array_equal(many.x, [propagator.final(x0, SPAN) for x0 in x0s])
+
+
+def test_parameters_of_a_call():
+    propagator = lt.Propagator(rigid_body(), lt.MetriplecticGauss(2), STEP)
+    other = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.7)  # whose dissipation has half this rate
+    expected = lt.integrate(other, MU, SPAN, STEP, lt.MetriplecticGauss(2))
+    parameters = {"dissipation.rate": 0.35}
+    assert np.array_equal(propagator.final(MU, SPAN, parameters=parameters), expected.x[-1])
+    assert np.array_equal(propagator(MU, SPAN, parameters=parameters).x, expected.x)
+    assert not np.array_equal(propagator.final(MU, SPAN), expected.x[-1])
+    with pytest.raises(lt.InputError, match=r"no parameter 'rate'; its parameters are .*dissipation\.rate"):
+        propagator.final(MU, SPAN, parameters={"rate": 0.7})
+    with pytest.raises(lt.InputError, match=r"dissipation\.rate must have shape \(\), got \(2,\)"):
+        propagator.final(MU, SPAN, parameters={"dissipation.rate": [0.7, 0.1]})
+
+
+def test_what_is_conserved_belongs_to_the_parameters_of_the_call():
+    """An isotropic body conserves more than others: its neighbours in a loop over parameters must not."""
+    energy = lt.Quadratic([1.0, 1.0, 1.0])
+    body = lt.LiePoissonSystem(mf.so(3), energy, lt.Quadratic([1.0, 2.0, 1.0]), lt.ProjectedMetric(rate=0.3))
+    propagator = lt.Propagator(body, lt.MetriplecticRungeKutta(4), STEP)
+    for A in ([1.0, 1.0, 1.0], [1.0, 0.5, 2.0]):
+        other = lt.LiePoissonSystem(mf.so(3), lt.Quadratic(A), body.entropy, lt.ProjectedMetric(rate=0.3))
+        expected = lt.integrate(other, MU, SPAN, STEP, lt.MetriplecticRungeKutta(4)).x[-1]
+        assert np.array_equal(propagator.final(MU, SPAN, parameters={"energy.A": A}), expected)
+
+
+def test_threads_and_pickles():
+    propagator = lt.Propagator(rigid_body(), lt.MetriplecticGauss(2), STEP)
+    x0s = np.random.default_rng(0).standard_normal((40, 3))
+    expected = [propagator.final(x0, SPAN) for x0 in x0s]
+    with ThreadPoolExecutor(4) as pool:
+        assert np.array_equal(list(pool.map(lambda x0: propagator.final(x0, SPAN), x0s)), expected)
+    again = pickle.loads(pickle.dumps(propagator))
+    assert np.array_equal([again.final(x0, SPAN) for x0 in x0s[:3]], expected[:3])
+    assert repr(again) == repr(propagator)
+
+
+def test_a_result_is_not_overwritten_by_the_next_call():
+    propagator = lt.Propagator(rigid_body(), lt.MetriplecticGauss(2), STEP)
+    one = propagator.final(MU, SPAN)
+    copy = one.copy()
+    propagator.final(-MU, SPAN)
+    assert np.array_equal(one, copy)
+
+
+def test_steps_that_need_newton():
+    body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=60.0)
+    propagator = lt.Propagator(body, lt.MetriplecticGauss(1), 0.5)
+    expected = lt.integrate(body, MU, (0.0, 3.0), 0.5, lt.MetriplecticGauss(1))
+    assert expected.stats.newton_iterations > 0
+    assert np.array_equal(propagator.final(MU, (0.0, 3.0)), expected.x[-1])
+    assert np.array_equal(propagator.final(MU, (0.0, 3.0)), expected.x[-1])
+
+
+def test_a_step_that_fails_raises_what_integrate_raises():
+    body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=1e3)
+    propagator = lt.Propagator(body, lt.MetriplecticRungeKutta(4), 5.0)
+    with pytest.raises(lt.NonFiniteError) as expected:
+        lt.integrate(body, 9.0 * MU, (0.0, 50.0), 5.0, lt.MetriplecticRungeKutta(4))
+    with pytest.raises(lt.NonFiniteError) as error:
+        propagator.final(9.0 * MU, (0.0, 50.0))
+    assert str(error.value) == str(expected.value)
+    assert str(error.value.solution.status) == str(expected.value.solution.status)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: lt.Propagator(rigid_body(), "RK4", 0.1), "method must be an integrator"),
+        (lambda: lt.Propagator("body", None, 0.1), "the first argument must be a system"),
+        (lambda: lt.Propagator(rigid_body(), None, 0.1, engine="gpu"), "engine must be"),
+        (lambda: lt.Propagator(rigid_body(), lt.Reference(), lt.Adaptive(1e-8)), "Reference chooses its own steps"),
+        (lambda: lt.Propagator(rigid_body(), None, -0.1).final(MU, SPAN), "step must be positive"),
+        (lambda: lt.Propagator(rigid_body(), None, None).final(MU, SPAN), "step must be a number"),
+        (lambda: lt.Propagator(rigid_body(), None, 0.1).final(MU, (1.0, 0.0)), "t_span must be finite and increasing"),
+        (lambda: lt.Propagator(rigid_body(), None, 0.1).final(MU[:2], SPAN), "a state of this system has shape"),
+        (lambda: lt.Propagator(rigid_body(), None, 0.1).final(MU * np.nan, SPAN), "the state is not finite"),
+        (lambda: lt.Propagator(rigid_body(), lt.Reference(), 0.1).many(MU, SPAN), "runs single trajectories"),
+    ],
+)
+def test_bad_arguments(call, message):
+    with pytest.raises(lt.InputError, match=message):
+        call()
