@@ -220,7 +220,7 @@ class ContactFriction(SkewFriction):
 
 
 def _state_indices(system) -> StateIndices:
-    return system.poisson.places
+    return system.poisson.state_indices
 
 
 def _nan_unless_positive(T):

@@ -76,9 +76,10 @@ class MatterExchange(Dissipation):
     def _flux_directions(self, system, x, dH) -> tuple[Callable, Callable]:
         """``z . dS`` of each process, and the sum of fluxes times z."""
         numbers, heated, carried = (
-            np.array([getattr(e, name) for e in self.processes]) for name in ("stoichiometry", "heated", "carried")
+            np.array([getattr(e, name) for e in self.processes])
+            for name in ("stoichiometry", "heat_shares", "entropy_transport")
         )
-        N, S = system.poisson.particle_indices.N, system.poisson.places.S
+        N, S = system.poisson.particle_indices.N, system.poisson.state_indices.S
         mu, T = dH[N], dH[S]
         T, touched = jnp.where(T > 0.0, T, jnp.nan), np.abs(carried)
         affinity = -(numbers @ mu)

@@ -152,7 +152,7 @@ class ThermalJumps(Dissipation):
         if baths is None:
             jumps = tuple(Jump(V, i, 0.5 if _is_hermitian(V) else 1.0) for i, V in enumerate(self.operators))
             kept = all(_is_commuting(H, V) for H in hamiltonians for V in map(np.asarray, self.operators))
-            return self._replace_fields(jumps=jumps, frame=None, isolated=True, keeps_energy=kept)
+            return self._replace_fields(jumps=jumps, jump_frame=None, is_isolated=True, conserves_energy=kept)
         vectors = _common_eigenvectors(hamiltonians)
         parts = [_split_coupling(V, i, hamiltonians, vectors) for i, V in enumerate(self.operators)]
         frame = None if np.array_equal(vectors, np.eye(structure.size)) else Operator(vectors)
@@ -160,7 +160,7 @@ class ThermalJumps(Dissipation):
         levels = np.diag(adjoint(vectors) @ _subtract_common_energy(hamiltonians[0]) @ vectors).real
         order, driven = tuple(int(i) for i in np.argsort(levels)), system.is_driven
         found = self._replace_fields(
-            jumps=jumps, frame=frame, order=order, driven=driven, isolated=False, keeps_energy=True
+            jumps=jumps, jump_frame=frame, level_order=order, is_driven=driven, is_isolated=False, conserves_energy=True
         )
         if not is_traced((self.rates, baths)):
             found._check_rates(system.systems_at_test_times()[0] if system.is_driven else system)

@@ -220,7 +220,7 @@ class ConstantFactor(HeatConduction):
     """Control: the skew tensor with a constant in place of the Fourier factor, the Poisson tensor of SML §5."""
 
     def force(self, system, x, dH, dS, dL):
-        T = dH[S := system.poisson.places.S]
+        T = dH[S := system.poisson.state_indices.S]
         i, j = np.array(self.first_bodies), np.array(self.second_bodies)
         return jnp.zeros_like(x).at[S[i]].add(self.conductance * T[j]).at[S[j]].add(-self.conductance * T[i])
 
@@ -229,7 +229,7 @@ class AtTheMidpoint(HeatConduction):
     """Control: the heat of the discrete temperatures, divided by those at the midpoint."""
 
     def force(self, system, x, dH, dS, dL):
-        S = system.poisson.places.S
+        S = system.poisson.state_indices.S
         T = system.energy.gradient(x)[S]
         return super().force(system, x, dH, dS, dL) * jnp.ones_like(x).at[S].set(dH[S] / T)
 
