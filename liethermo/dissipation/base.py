@@ -220,7 +220,7 @@ class DissipationSum(Dissipation):
         return DissipationSum(tuple(part.bind_to(system) for part in self.summands))
 
     def force(self, system, x, dH, dS, dL):
-        return sum(part.force(system, x, dH, dS, own) for part, own in terms_with_preserved(self, dL))
+        return sum(term.force(system, x, dH, dS, dL_part) for term, dL_part in terms_with_preserved(self, dL))
 
     @property
     def has_generator(self) -> bool:
@@ -230,12 +230,12 @@ class DissipationSum(Dissipation):
         return sum(part.generator_field(system, x, dH) for part in self.summands)
 
     def factor(self, system, x, dH, dL):
-        found = [part.factor(system, x, dH, own) for part, own in terms_with_preserved(self, dL)]
-        given = [B for B in found if B is not None]
-        return concatenate_factors(given) if len(given) == len(found) else None
+        factors = [term.factor(system, x, dH, dL_part) for term, dL_part in terms_with_preserved(self, dL)]
+        known_factors = [B for B in factors if B is not None]
+        return concatenate_factors(known_factors) if len(known_factors) == len(factors) else None
 
 
-def sum_dissipations(given: Dissipation | Sequence[Dissipation] | None) -> Dissipation | None:
+def sum_dissipations(dissipations: Dissipation | Sequence[Dissipation] | None) -> Dissipation | None:
     """What a system is given as its dissipation: one, none, or a list or tuple of those that act together.
 
     Raises
@@ -243,28 +243,26 @@ def sum_dissipations(given: Dissipation | Sequence[Dissipation] | None) -> Dissi
     InputError
         If the list is empty, or an entry is not a dissipation.
     """
-    if given is None or isinstance(given, Dissipation):
-        return given
-    if not isinstance(given, list | tuple):
+    if dissipations is None or isinstance(dissipations, Dissipation):
+        return dissipations
+    if not isinstance(dissipations, list | tuple):
         raise InputError(
-            f"dissipation must be a Dissipation of this library, a list of them or None, not {type(given).__name__}"
+            f"dissipation must be a Dissipation of this library, a list of them or None, not {type(dissipations).__name__}"
         )
-    if not given:
+    if not dissipations:
         raise InputError("dissipation is an empty list: a system without dissipation is given None")
-    for i, part in enumerate(given):
-        if not isinstance(part, Dissipation):
-            raise InputError(f"dissipation[{i}] must be a Dissipation of this library, not {type(part).__name__}")
-    return functools.reduce(operator.add, given)
+    for i, term in enumerate(dissipations):
+        if not isinstance(term, Dissipation):
+            raise InputError(f"dissipation[{i}] must be a Dissipation of this library, not {type(term).__name__}")
+    return functools.reduce(operator.add, dissipations)
 
 
-def terms_with_preserved(
-    dissipation: Dissipation, preserved: Sequence[T]
-) -> Iterator[tuple[Dissipation, tuple[T, ...]]]:
+def terms_with_preserved(dissipation: Dissipation, values: Sequence[T]) -> Iterator[tuple[Dissipation, tuple[T, ...]]]:
     """Each summand with its portion of what belongs to the functions in ``dissipation.preserve``, in their order."""
     start = 0
-    for part in dissipation.terms:
-        end = start + len(part.preserve)
-        yield part, tuple(preserved[start:end])
+    for term in dissipation.terms:
+        end = start + len(term.preserve)
+        yield term, tuple(values[start:end])
         start = end
 
 
@@ -312,35 +310,37 @@ class LiftedDissipation(Dissipation):
         """Where it acts when it is asked for at x."""
 
     def force(self, system, x, dH, dS, dL):
-        at = self.lifted_geometry(system, x)
-        return at.lower(self.inner.force(at.system, at.x, *at.lift_gradients(dH, dS, dL)))
+        geometry = self.lifted_geometry(system, x)
+        return geometry.lower(self.inner.force(geometry.system, geometry.x, *geometry.lift_gradients(dH, dS, dL)))
 
     has_generator = forward_to("inner")
 
     def generator_field(self, system, x, dH):
-        at = self.lifted_geometry(system, x)
-        return at.lower(self.inner.generator_field(at.system, at.x, at.lift(dH)))
+        geometry = self.lifted_geometry(system, x)
+        return geometry.lower(self.inner.generator_field(geometry.system, geometry.x, geometry.lift(dH)))
 
     def factor(self, system, x, dH, dL):
-        at = self.lifted_geometry(system, x)
-        B = self.inner.factor(at.system, at.x, at.lift(dH), tuple(map(at.lift, dL)))
+        geometry = self.lifted_geometry(system, x)
+        B = self.inner.factor(geometry.system, geometry.x, geometry.lift(dH), tuple(map(geometry.lift, dL)))
         if B is None:
             return None
-        return B._replace(times=lambda w: at.lower(B.times(w)), solenoidal=at.preserves_solenoidal and B.solenoidal)
+        return B._replace(
+            times=lambda w: geometry.lower(B.times(w)), solenoidal=geometry.preserves_solenoidal and B.solenoidal
+        )
 
     def input_residuals(self, system, x):
-        at = self.lifted_geometry(system, x)
-        return self.inner.input_residuals(at.system, at.x)
+        geometry = self.lifted_geometry(system, x)
+        return self.inner.input_residuals(geometry.system, geometry.x)
 
     @classmethod
     def lift_terms(
-        cls, dissipation: Dissipation | None, pulled: Callable[[Energy], Energy], *more
+        cls, dissipation: Dissipation | None, pullback: Callable[[Energy], Energy], *extra_fields
     ) -> Dissipation | None:
-        """That of each summand, what it preserves pulled back; ``more`` is what a subclass has besides."""
+        """That of each summand, what it preserves pulled back; ``extra_fields`` is what a subclass has besides."""
         if dissipation is None:
             return None
-        parts = tuple(cls(part, tuple(map(pulled, part.preserve)), *more) for part in dissipation.terms)
-        return parts[0] if len(parts) == 1 else DissipationSum(parts)
+        terms = tuple(cls(term, tuple(map(pullback, term.preserve)), *extra_fields) for term in dissipation.terms)
+        return terms[0] if len(terms) == 1 else DissipationSum(terms)
 
     energy_law = forward_to("inner")
     entropy_law = forward_to("inner")

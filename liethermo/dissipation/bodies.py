@@ -63,16 +63,16 @@ class HeatConduction(Dissipation):
         """Those of the edges between bodies of these temperatures, shape (edges,); NaN where one is negative."""
         if not self.laws:
             return self.conductance
-        found = jnp.stack([jnp.asarray(law(T_i[e], T_j[e], x)) for e, law in enumerate(self.laws)])
-        return jnp.where(found >= 0.0, found, jnp.nan)
+        values = jnp.stack([jnp.asarray(law(T_i[e], T_j[e], x)) for e, law in enumerate(self.laws)])
+        return jnp.where(values >= 0.0, values, jnp.nan)
 
     def force(self, system, x, dH, dS, dL):
         S, i, j = _state_indices(system).S, np.asarray(self.first_bodies), np.asarray(self.second_bodies)
-        T, along = _nan_unless_positive(dH[S]), dS[S]
-        at = T if self.fourier_factors == "discrete" else _nan_unless_positive(system.energy.gradient(x)[S])
-        heat = self.conductances(x, at[i], at[j]) * (along[i] * at[j] - along[j] * at[i])
-        share = heat / (at[i] * at[j])
-        return jnp.zeros_like(x).at[S[i]].add(share * T[j]).at[S[j]].add(-share * T[i])
+        T, dS_S = _nan_unless_positive(dH[S]), dS[S]
+        T_factors = T if self.fourier_factors == "discrete" else _nan_unless_positive(system.energy.gradient(x)[S])
+        heat = self.conductances(x, T_factors[i], T_factors[j]) * (dS_S[i] * T_factors[j] - dS_S[j] * T_factors[i])
+        ratio = heat / (T_factors[i] * T_factors[j])
+        return jnp.zeros_like(x).at[S[i]].add(ratio * T[j]).at[S[j]].add(-ratio * T[i])
 
     def factor(self, system, x, dH, dL):
         S, i, j = _state_indices(system).S, np.asarray(self.first_bodies), np.asarray(self.second_bodies)
@@ -115,8 +115,8 @@ class LinearFriction(Dissipation):
 
     def factor(self, system, x, dH, dL):
         p, S, R, v, T = self._friction_data(system, x, dH)
-        full = semidefinite_root if callable(self.R) else semidefinite_factor
-        root = jnp.sqrt(R) if jnp.ndim(R) < 2 else full(R)
+        matrix_root = semidefinite_root if callable(self.R) else semidefinite_factor
+        root = jnp.sqrt(R) if jnp.ndim(R) < 2 else matrix_root(R)
         return Factor(len(p), lambda w: self._apply_directions(x, p, S, v, T, _apply_form(root, w) / jnp.sqrt(T)))
 
     @staticmethod
@@ -125,10 +125,12 @@ class LinearFriction(Dissipation):
 
     def _friction_data(self, system, x, dH):
         """Where the momenta and the entropies are, R, the velocities and the temperatures."""
-        places = _state_indices(system)
-        mine = np.arange(len(places.p)) if self.body_index is None else np.flatnonzero(places.owner == self.body_index)
-        R = self.R(x[_body_components(places, mine)]) if callable(self.R) else self.R
-        p, S = places.p[mine], places.S[places.owner[mine]]
+        indices = _state_indices(system)
+        numbers = (
+            np.arange(len(indices.p)) if self.body_index is None else np.flatnonzero(indices.owner == self.body_index)
+        )
+        R = self.R(x[_body_components(indices, numbers)]) if callable(self.R) else self.R
+        p, S = indices.p[numbers], indices.S[indices.owner[numbers]]
         return p, S, R, dH[p], _nan_unless_positive(dH[S])
 
     def couplings(self, system):
@@ -157,33 +159,33 @@ class Drag(Dissipation):
         self.coefficient = graph.weight
 
     def force(self, system, x, dH, dS, dL):
-        (p_i, p_j, S_i, S_j), (T_i, T_j, w), weight, spread = self._edge_data(system, x, dH)
-        along = dS[p_j] - dS[p_i] + 0.5 * w * (dS[S_i] / T_i + dS[S_j] / T_j)
-        return spread(weight * along)
+        (p_i, p_j, S_i, S_j), (T_i, T_j, w), weight, apply_directions = self._edge_data(system, x, dH)
+        z_dot_dS = dS[p_j] - dS[p_i] + 0.5 * w * (dS[S_i] / T_i + dS[S_j] / T_j)
+        return apply_directions(weight * z_dot_dS)
 
     def factor(self, system, x, dH, dL):
-        _, _, weight, spread = self._edge_data(system, x, dH)
-        return Factor(len(weight), lambda w: spread(jnp.sqrt(weight) * w))
+        _, _, weight, apply_directions = self._edge_data(system, x, dH)
+        return Factor(len(weight), lambda w: apply_directions(jnp.sqrt(weight) * w))
 
     def _edge_data(self, system, x, dH):
         """Where momenta and entropies are, the temperatures and the velocity between, ``c / theta``, and ``flux z``."""
-        places = _state_indices(system)
-        i, j, edge = _momentum_pairs(self.first_bodies, self.second_bodies, places)
-        S_i, S_j, p_i, p_j = places.S[places.owner[i]], places.S[places.owner[j]], places.p[i], places.p[j]
+        indices = _state_indices(system)
+        i, j, edge = _momentum_pairs(self.first_bodies, self.second_bodies, indices)
+        S_i, S_j, p_i, p_j = indices.S[indices.owner[i]], indices.S[indices.owner[j]], indices.p[i], indices.p[j]
         T_i, T_j, w = _nan_unless_positive(dH[S_i]), _nan_unless_positive(dH[S_j]), dH[p_i] - dH[p_j]
 
         def apply_directions(flux):
-            made = jnp.zeros_like(x).at[S_i].add(0.5 * w * flux / T_i).at[S_j].add(0.5 * w * flux / T_j)
-            return made.at[p_i].add(-flux).at[p_j].add(flux)
+            force = jnp.zeros_like(x).at[S_i].add(0.5 * w * flux / T_i).at[S_j].add(0.5 * w * flux / T_j)
+            return force.at[p_i].add(-flux).at[p_j].add(flux)
 
         weight = self.coefficient[edge] * (2.0 * T_i * T_j / (T_i + T_j))
         return (p_i, p_j, S_i, S_j), (T_i, T_j, w), weight, apply_directions
 
     def couplings(self, system):
-        places = _state_indices(system)
-        i, j, _ = _momentum_pairs(self.first_bodies, self.second_bodies, places)
-        S_i, S_j = places.S[places.owner[i]], places.S[places.owner[j]]
-        return clique_pattern(np.stack([places.p[i], S_i, places.p[j], S_j], axis=1), system.dim)
+        indices = _state_indices(system)
+        i, j, _ = _momentum_pairs(self.first_bodies, self.second_bodies, indices)
+        S_i, S_j = indices.S[indices.owner[i]], indices.S[indices.owner[j]]
+        return clique_pattern(np.stack([indices.p[i], S_i, indices.p[j], S_j], axis=1), system.dim)
 
 
 class ContactFriction(SkewFriction):
@@ -207,9 +209,9 @@ class ContactFriction(SkewFriction):
         return "nondecreasing" if self.is_nondecreasing else None
 
     def force(self, system, x, dH, dS, dL):
-        places = _state_indices(system)
-        mine = np.flatnonzero(np.isin(places.owner, self.body_indices))
-        p, S = places.p[mine], places.S[places.owner[mine]]
+        indices = _state_indices(system)
+        numbers = np.flatnonzero(np.isin(indices.owner, self.body_indices))
+        p, S = indices.p[numbers], indices.S[indices.owner[numbers]]
         return jnp.zeros_like(x).at[p].add(-x[p] * dH[S]).at[S].add(x[p] * dH[p])
 
     def couplings(self, system):
@@ -232,25 +234,25 @@ def _apply_form(R, v):
     return R * v if jnp.ndim(R) < 2 else R @ v
 
 
-def _body_components(places: StateIndices, mine: np.ndarray) -> np.ndarray:
+def _body_components(indices: StateIndices, numbers: np.ndarray) -> np.ndarray:
     """The components of the state of the body that some of the momenta belong to."""
-    return np.concatenate([places.q[mine], places.p[mine], places.S[places.owner[mine[:1]]]])
+    return np.concatenate([indices.q[numbers], indices.p[numbers], indices.S[indices.owner[numbers[:1]]]])
 
 
-def _momentum_pairs(first: Indices, second: Indices, places: StateIndices):
+def _momentum_pairs(first_bodies: Indices, second_bodies: Indices, indices: StateIndices):
     """For each edge and component: the numbers of the two momenta, and of the edge."""
-    i, j = np.asarray(first), np.asarray(second)
-    starts = np.searchsorted(places.owner, np.arange(len(places.S)))
-    sizes = np.bincount(places.owner, minlength=len(places.S))[i]
-    edge = np.repeat(np.arange(len(i)), sizes)
-    within = np.arange(len(edge)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-    return starts[i][edge] + within, starts[j][edge] + within, edge
+    i, j = np.asarray(first_bodies), np.asarray(second_bodies)
+    starts = np.searchsorted(indices.owner, np.arange(len(indices.S)))
+    counts = np.bincount(indices.owner, minlength=len(indices.S))[i]
+    edge = np.repeat(np.arange(len(i)), counts)
+    offsets = np.arange(len(edge)) - np.repeat(np.cumsum(counts) - counts, counts)
+    return starts[i][edge] + offsets, starts[j][edge] + offsets, edge
 
 
-def _block_pattern(places: StateIndices, dim: int) -> scipy.sparse.csr_array:
+def _block_pattern(indices: StateIndices, dim: int) -> scipy.sparse.csr_array:
     """The pattern in which all components of a body depend on each other, and on none of another body."""
-    starts = np.concatenate([[0], places.S[:-1] + 1])
-    body = np.repeat(np.arange(len(starts)), places.S + 1 - starts)
+    starts = np.concatenate([[0], indices.S[:-1] + 1])
+    body = np.repeat(np.arange(len(starts)), indices.S + 1 - starts)
     member = pattern_of_matrix(
         scipy.sparse.coo_array((np.ones(dim, dtype=bool), (np.arange(dim), body)), (dim, len(starts)))
     )

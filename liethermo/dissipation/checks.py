@@ -51,8 +51,8 @@ def checked_rates(rates) -> jax.Array:
     """A rate, or one for each site, as an array of non-negative numbers (or traced ones)."""
     array = check_numbers(rates, "a rate")
     if not isinstance(array, jax.core.Tracer) and not np.all(np.asarray(array) >= 0.0):
-        least = float(np.asarray(array).min())
-        raise InputError(f"a dissipation rate must be >= 0, not {least}: a negative one would lower the entropy")
+        min_rate = float(np.asarray(array).min())
+        raise InputError(f"a dissipation rate must be >= 0, not {min_rate}: a negative one would lower the entropy")
     return array
 
 
@@ -82,8 +82,10 @@ def checked_semidefinite(form, what: str, symmetric: bool = True) -> jax.Array:
         raise InputError(f"{what} must be a square matrix, not an array of shape {matrix.shape}")
     if isinstance(matrix, jax.core.Tracer):
         eigenvalues = jnp.linalg.eigvalsh((matrix + matrix.T) / 2)
-        allowed = 1e-12 * matrix.shape[0] * jnp.abs(matrix).max()
-        require_condition(eigenvalues[0], lambda low: low >= -allowed, f"{what} {NEGATIVE_EIGENVALUE_MESSAGE}")
+        tolerance = 1e-12 * matrix.shape[0] * jnp.abs(matrix).max()
+        require_condition(
+            eigenvalues[0], lambda eigenvalue: eigenvalue >= -tolerance, f"{what} {NEGATIVE_EIGENVALUE_MESSAGE}"
+        )
         return matrix
     entries = np.asarray(matrix)
     if not np.isfinite(entries).all():
@@ -92,11 +94,11 @@ def checked_semidefinite(form, what: str, symmetric: bool = True) -> jax.Array:
     asymmetry = float(np.abs(entries - entries.T).max())
     if symmetric and not asymmetry <= 1e-12 * scale:
         raise InputError(f"{what} is not symmetric: it differs from its transpose by {asymmetry:.3g}")
-    lowest = float(np.linalg.eigvalsh(0.5 * (entries + entries.T))[0])
-    if lowest < -1e-12 * scale * matrix.shape[0]:
+    min_eigenvalue = float(np.linalg.eigvalsh(0.5 * (entries + entries.T))[0])
+    if min_eigenvalue < -1e-12 * scale * matrix.shape[0]:
         raise IndefiniteError(
-            f"{what} {NEGATIVE_EIGENVALUE_MESSAGE}".format(value=lowest),
-            residual=lowest,
+            f"{what} {NEGATIVE_EIGENVALUE_MESSAGE}".format(value=min_eigenvalue),
+            residual=min_eigenvalue,
             tolerance=1e-12 * scale * matrix.shape[0],
         )
     return matrix

@@ -90,8 +90,8 @@ class DoubleBracket(Dissipation):
         def times(w):
             return system.poisson.sharp(x, velocity(w))
 
-        size = system.isotropic_size if root is None else system.dim
-        return Factor(size, times, velocity=velocity).scale_by(self.rate)
+        n_columns = system.isotropic_size if root is None else system.dim
+        return Factor(n_columns, times, velocity=velocity).scale_by(self.rate)
 
 
 def _checked_metric(metric) -> Any:

@@ -48,17 +48,19 @@ class Factor(NamedTuple):
     def scale_by(self, rate) -> Factor:
         """The factor of ``rate * K``; the rate is a number, which may depend on the state."""
         scale = sqrt_or_zero(rate)
-        velocity = None if (along := self.velocity) is None else lambda w: scale * along(w)
-        turning = None if self.spin_coefficients is None else scale * self.spin_coefficients
-        return self._replace(times=lambda w: scale * self.times(w), velocity=velocity, spin_coefficients=turning)
+        velocity = None if (velocity_map := self.velocity) is None else lambda w: scale * velocity_map(w)
+        spin_coefficients = None if self.spin_coefficients is None else scale * self.spin_coefficients
+        return self._replace(
+            times=lambda w: scale * self.times(w), velocity=velocity, spin_coefficients=spin_coefficients
+        )
 
 
 def form_root(form) -> Any:
     """R with ``R R^T = form``, for a semidefinite matrix or what acts like one; None where it has no root that acts."""
     if isinstance(form, BlockDiagonal):
         roots = tuple(form_root(block) for block in form.blocks)
-        known = all(root is not None for root in roots)
-        return eqx.tree_at(lambda f: f.blocks, form, roots) if known else None
+        has_roots = all(root is not None for root in roots)
+        return eqx.tree_at(lambda f: f.blocks, form, roots) if has_roots else None
     if isinstance(form, Diagonal):
         return Diagonal(jnp.sqrt(form.entries))
     return semidefinite_factor(form) if isinstance(form, jax.Array | np.ndarray) else None
@@ -69,7 +71,7 @@ def concatenate_factors(factors: Sequence[Factor]) -> Factor:
     ends = list(itertools.accumulate((B.size for B in factors), initial=0))
 
     def times(w):
-        parts = zip(factors, itertools.pairwise(ends), strict=True)
-        return sum(B.times(w[start:end]) for B, (start, end) in parts)
+        slices = zip(factors, itertools.pairwise(ends), strict=True)
+        return sum(B.times(w[start:end]) for B, (start, end) in slices)
 
     return Factor(ends[-1], times, all(B.solenoidal for B in factors))

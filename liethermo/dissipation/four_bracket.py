@@ -127,13 +127,13 @@ class KulkarniNomizu(Dissipation):
 def _check_semidefinite_on_pairs(form) -> None:
     if isinstance(form, jax.core.Tracer):
         return
-    lowest, size = float(np.linalg.eigvalsh(np.asarray(form))[0]), float(np.abs(form).max())
-    if lowest < -1e-12 * size * len(form):
+    min_eigenvalue, scale = float(np.linalg.eigvalsh(np.asarray(form))[0]), float(np.abs(form).max())
+    if min_eigenvalue < -1e-12 * scale * len(form):
         raise IndefiniteError(
-            f"the 4-bracket has no factor: on pairs of covectors it has the negative eigenvalue {lowest:.3g}. "
+            f"the 4-bracket has no factor: on pairs of covectors it has the negative eigenvalue {min_eigenvalue:.3g}. "
             "What it makes of two covectors may be semidefinite all the same: give that as a FrictionOperator",
-            residual=lowest,
-            tolerance=1e-12 * size * len(form),
+            residual=min_eigenvalue,
+            tolerance=1e-12 * scale * len(form),
         )
 
 

@@ -77,33 +77,33 @@ class FrictionOperator(Dissipation):
             return {}
         K, dH = evaluate_form(self.K, x), system.energy.gradient(x)
         dH = dH if system.space is None else system.lower_index(x, system.raise_index(x, dH))
-        size = jnp.max(jnp.abs(K)) * jnp.max(jnp.abs(dH))
-        defect = jnp.max(jnp.abs(jnp.stack([K @ dH, dH @ K])))
-        return {FRICTION_KERNEL_CHECK: defect / jnp.where(size > 0.0, size, 1.0)}
+        scale = jnp.max(jnp.abs(K)) * jnp.max(jnp.abs(dH))
+        residual = jnp.max(jnp.abs(jnp.stack([K @ dH, dH @ K])))
+        return {FRICTION_KERNEL_CHECK: residual / jnp.where(scale > 0.0, scale, 1.0)}
 
     def force(self, system, x, dH, dS, dL):
-        along = self._projection_direction(system, x, dH)
-        image = evaluate_form(self.K, x) @ (dS - jnp.dot(along, dS) * dH)
-        return self.rate * (image - jnp.dot(dH, image) * along)
+        direction = self._projection_direction(system, x, dH)
+        image = evaluate_form(self.K, x) @ (dS - jnp.dot(direction, dS) * dH)
+        return self.rate * (image - jnp.dot(dH, image) * direction)
 
     def factor(self, system, x, dH, dL):
         """The symmetric root of K(x), or a Cholesky factor of a constant K, likewise projected."""
         root = semidefinite_root(self.K(x)) if callable(self.K) else semidefinite_factor(self.K)
-        along = self._projection_direction(system, x, dH)
+        direction = self._projection_direction(system, x, dH)
 
         def times(w):
             image = root @ w
-            return image - jnp.dot(dH, image) * along
+            return image - jnp.dot(dH, image) * direction
 
         return Factor(system.dim, times).scale_by(self.rate)
 
     def _projection_direction(self, system, x, dH):
         """The vector a with ``a . dH = 1`` that P projects along."""
-        raised = system.raise_index(x, dH)
-        gradient = raised if self.projection == "orthogonal" else system.raise_index(x, system.energy.gradient(x))
-        overlap, square = jnp.dot(gradient, dH), jnp.dot(raised, dH)
+        dH_vector = system.raise_index(x, dH)
+        gradient = dH_vector if self.projection == "orthogonal" else system.raise_index(x, system.energy.gradient(x))
+        overlap, square = jnp.dot(gradient, dH), jnp.dot(dH_vector, dH)
         # Where grad H is tiny or turned away from dH, project orthogonally off dH instead.
-        safe = overlap > 1e-3 * square
-        along = jnp.where(safe, gradient, raised)
-        overlap = jnp.where(safe, overlap, square)
-        return along / jnp.where(overlap > 0.0, overlap, 1.0)
+        is_usable = overlap > 1e-3 * square
+        direction = jnp.where(is_usable, gradient, dH_vector)
+        overlap = jnp.where(is_usable, overlap, square)
+        return direction / jnp.where(overlap > 0.0, overlap, 1.0)

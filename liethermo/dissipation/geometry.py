@@ -19,7 +19,7 @@ from ..tracing.programs import subprogram
 class Geometry(Module):
     """What a dissipation may ask of the system that it acts in. Every system has it, whatever its class.
 
-    ``poisson.places`` says where the bodies are in the state of a system of several.
+    ``poisson.state_indices`` has the indices of all q, p and S in a state of several bodies.
 
     Attributes
     ----------

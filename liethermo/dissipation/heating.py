@@ -68,10 +68,10 @@ class Heating(LiftedDissipation):
         def times(w):
             return self._join_with_entropies(body, body.scale_at_sites(scale, B.times(w)), dH, n)
 
-        along = B.velocity
-        velocity = None if along is None else lambda w: body.scale_at_sites(scale, along(w))
-        turning = None if B.spin_coefficients is None else scale * B.spin_coefficients
-        return B._replace(times=times, velocity=velocity, spin_coefficients=turning, solenoidal=False)
+        velocity_map = B.velocity
+        velocity = None if velocity_map is None else lambda w: body.scale_at_sites(scale, velocity_map(w))
+        spin_coefficients = None if B.spin_coefficients is None else scale * B.spin_coefficients
+        return B._replace(times=times, velocity=velocity, spin_coefficients=spin_coefficients, solenoidal=False)
 
     def divergence(self, system, x):
         """``sqrt(T) div B0 + T' B0^T dH / (2 T^3/2)``, T' the derivative of T by y: no matrix is formed."""
@@ -82,12 +82,12 @@ class Heating(LiftedDissipation):
         if self.has_site_baths and not B.solenoidal:  # each site has a temperature of its own
             return super().divergence(system, x)
         T = jnp.abs(self._values_at_sites(dH[n:]))
-        own = jnp.zeros(B.size) if B.solenoidal else jnp.sqrt(T) * self.inner.divergence(body, x[:n])
-        warmer = temperature_slopes(system.energy, x, n)
-        if warmer is None:
-            return own
-        share = jnp.where(T > 0.0, 0.5 * self._values_at_sites(warmer) / jnp.where(T > 0.0, T, 1.0) ** 1.5, 0.0)
-        return own + B.transpose_times(body.scale_at_sites(share, dH[:n]))
+        body_divergence = jnp.zeros(B.size) if B.solenoidal else jnp.sqrt(T) * self.inner.divergence(body, x[:n])
+        slopes = temperature_slopes(system.energy, x, n)
+        if slopes is None:
+            return body_divergence
+        ratio = jnp.where(T > 0.0, 0.5 * self._values_at_sites(slopes) / jnp.where(T > 0.0, T, 1.0) ** 1.5, 0.0)
+        return body_divergence + B.transpose_times(body.scale_at_sites(ratio, dH[:n]))
 
     def lifted_geometry(self, system, x) -> LiftedGeometry:
         return _body_geometry(system, x)
@@ -106,16 +106,16 @@ class Heating(LiftedDissipation):
             return jnp.ones(np.shape(self.bath)).ravel() if self.has_site_baths else jnp.ones(())
         return jnp.where(self._values_at_sites(T) < 0.0, -1.0, 1.0)
 
-    def entropy_rates(self, lost, T) -> jax.Array:
+    def entropy_rates(self, energy_loss, T) -> jax.Array:
         """What the entropies grow by, shape (m,), where a body loses an energy, of shape () or at each site."""
         if self.has_site_baths:
-            return jax.ops.segment_sum(lost, np.asarray(self.bath).ravel(), len(T)) / T
-        return jnp.where(np.arange(len(T)) == int(np.asarray(self.bath)), lost / T, 0.0)
+            return jax.ops.segment_sum(energy_loss, np.asarray(self.bath).ravel(), len(T)) / T
+        return jnp.where(np.arange(len(T)) == int(np.asarray(self.bath)), energy_loss / T, 0.0)
 
     def _force_gradient(self, body: Geometry, dH, dS, n: int) -> jax.Array:
         """What takes the place of dH in the force on the body, shape (n,): dH, where the entropy is that of baths."""
-        T, e, sign = self._values_at_sites(dH[n:]), self._values_at_sites(dS[n:]), self.temperature_signs(dH[n:])
-        return body.scale_at_sites(sign, body.scale_at_sites(e, dH[:n]) - body.scale_at_sites(T, dS[:n]))
+        T, dS_y, sign = self._values_at_sites(dH[n:]), self._values_at_sites(dS[n:]), self.temperature_signs(dH[n:])
+        return body.scale_at_sites(sign, body.scale_at_sites(dS_y, dH[:n]) - body.scale_at_sites(T, dS[:n]))
 
     def _values_at_sites(self, values) -> jax.Array:
         """Values of baths, shape (m,), at the sites that heat them, shape () or (sites,)."""
@@ -123,8 +123,8 @@ class Heating(LiftedDissipation):
 
     def _join_with_entropies(self, body: Geometry, v, dH, n: int) -> jax.Array:
         """What moves the body, shape (n,), and the entropies that take the energy which it loses."""
-        gained = body.dot_at_sites(dH[:n], v) if self.has_site_baths else jnp.dot(dH[:n], v)
-        return jnp.concatenate([v, self.entropy_rates(-gained, dH[n:])])
+        energy_gain = body.dot_at_sites(dH[:n], v) if self.has_site_baths else jnp.dot(dH[:n], v)
+        return jnp.concatenate([v, self.entropy_rates(-energy_gain, dH[n:])])
 
 
 class HeatlessDissipation(LiftedDissipation):
@@ -134,8 +134,8 @@ class HeatlessDissipation(LiftedDissipation):
         return _body_geometry(system, x)
 
     def velocity(self, system, x, dH, dS, dL):
-        at = _body_geometry(system, x)
-        return self.inner.velocity(at.system, at.x, *at.lift_gradients(dH, dS, dL))
+        geometry = _body_geometry(system, x)
+        return self.inner.velocity(geometry.system, geometry.x, *geometry.lift_gradients(dH, dS, dL))
 
 
 def _body_geometry(system: Geometry, x) -> LiftedGeometry:
@@ -150,7 +150,11 @@ def _body_geometry(system: Geometry, x) -> LiftedGeometry:
 
 
 def couple_to_baths(
-    dissipation: Dissipation | None, body: Geometry, number: int, positive: bool, pulled: Callable[[Energy], Energy]
+    dissipation: Dissipation | None,
+    body: Geometry,
+    n_baths: int,
+    has_positive_temperatures: bool,
+    pullback: Callable[[Energy], Energy],
 ) -> Dissipation:
     """The dissipation of a body, beside baths that take its heat: so many, of positive temperatures or of any.
 
@@ -159,29 +163,35 @@ def couple_to_baths(
     InputError
         If it makes no heat, or there is no bath of the number that it names.
     """
-    parts = () if dissipation is None else dissipation.terms
-    if not any(part.energy_law == "nonincreasing" for part in parts):
-        found = f"{type(parts[0]).__name__} makes none" if parts else "there is none"
+    terms = () if dissipation is None else dissipation.terms
+    if not any(term.energy_law == "nonincreasing" for term in terms):
+        reason = f"{type(terms[0]).__name__} makes none" if terms else "there is none"
         raise InputError(
             "baths take the heat of a dissipation that lowers the energy, such as lt.DoubleBracket or lt.Friction, and "
-            f"{found}: leave out baths="
+            f"{reason}: leave out baths="
         )
-    carried = tuple(_couple_term_to_baths(part, body, number, positive, pulled) for part in parts)
-    return carried[0] if len(carried) == 1 else DissipationSum(carried)
+    coupled_terms = tuple(
+        _couple_term_to_baths(term, body, n_baths, has_positive_temperatures, pullback) for term in terms
+    )
+    return coupled_terms[0] if len(coupled_terms) == 1 else DissipationSum(coupled_terms)
 
 
 def _couple_term_to_baths(
-    part: Dissipation, body: Geometry, number: int, positive: bool, pulled: Callable[[Energy], Energy]
+    term: Dissipation,
+    body: Geometry,
+    n_baths: int,
+    has_positive_temperatures: bool,
+    pullback: Callable[[Energy], Energy],
 ) -> Dissipation:
-    functions = tuple(map(pulled, part.preserve))
-    if part.energy_law != "nonincreasing":
-        return HeatlessDissipation(part, functions)
-    bath = Indices(0) if part.heated_bath_index is None else part.heated_bath_index
+    functions = tuple(map(pullback, term.preserve))
+    if term.energy_law != "nonincreasing":
+        return HeatlessDissipation(term, functions)
+    bath = Indices(0) if term.heated_bath_index is None else term.heated_bath_index
     numbers = np.asarray(bath)
     if numbers.shape not in ((), body.heating_sites):
-        there = f", or of the shape {body.heating_sites} of the sites" if body.heating_sites else ""
-        raise InputError(f"bath is the number of a bath{there}, not an array of shape {numbers.shape}")
-    if not (numbers.min() >= 0 and numbers.max() < number):
-        outside = int(numbers[(numbers < 0) | (numbers >= number)][0]) if numbers.shape else int(numbers)
-        raise InputError(f"a dissipation heats bath {outside}, but there are {number}, which count from 0")
-    return Heating(part, functions, bath, positive)
+        shape_text = f", or of the shape {body.heating_sites} of the sites" if body.heating_sites else ""
+        raise InputError(f"bath is the number of a bath{shape_text}, not an array of shape {numbers.shape}")
+    if not (numbers.min() >= 0 and numbers.max() < n_baths):
+        bad_number = int(numbers[(numbers < 0) | (numbers >= n_baths)][0]) if numbers.shape else int(numbers)
+        raise InputError(f"a dissipation heats bath {bad_number}, but there are {n_baths}, which count from 0")
+    return Heating(term, functions, bath, has_positive_temperatures)

@@ -117,14 +117,14 @@ class KillingDissipation(BracketDissipation):
     @staticmethod
     def inner_product(g: mf.LieAlgebra) -> Any:
         """The positive semidefinite form 𝒦 on g for rate 1: a matrix, shape (dim, dim), or what acts like one."""
-        if not g.is_semisimple() and (positive := g.killing_signature()[0]):
-            lowest = float(np.linalg.eigvalsh(-g.killing_form())[0])
+        if not g.is_semisimple() and (n_negative := g.killing_signature()[0]):
+            min_eigenvalue = float(np.linalg.eigvalsh(-g.killing_form())[0])
             raise IndefiniteError(
-                f"{g.name} is not semisimple and minus its Killing form is indefinite ({positive} negative "
-                f"eigenvalues, the lowest {lowest:.3g}), so it cannot measure dissipation: entropy would fall along "
+                f"{g.name} is not semisimple and minus its Killing form is indefinite ({n_negative} negative "
+                f"eigenvalues, the lowest {min_eigenvalue:.3g}), so it cannot measure dissipation: entropy would fall along "
                 "some motions. Give an inner product with InnerProductDissipation(K), or use ProjectedMetric(), which "
                 "needs none",
-                residual=lowest,
+                residual=min_eigenvalue,
                 tolerance=0.0,
             )
         return g.killing_inner_product()

@@ -97,19 +97,19 @@ class LandauLifshitz(Dissipation):
         s, rate = spins.spins(x), sign * self.rate.reshape(-1)
         torque = cross_vectors(s, spins.split_covectors(dH))
         if rate.size == 1 and not per_site:
-            lost = rate[0] * sum_of_dots(torque, torque)
+            energy_loss = rate[0] * sum_of_dots(torque, torque)
         else:
-            lost = rate * dot_vectors(torque, torque)
-            lost = lost if per_site else jnp.sum(lost)
-        return scale_vectors(rate, cross_vectors(s, torque)), lost
+            energy_loss = rate * dot_vectors(torque, torque)
+            energy_loss = energy_loss if per_site else jnp.sum(energy_loss)
+        return scale_vectors(rate, cross_vectors(s, torque)), energy_loss
 
     def factor(self, system, x, dH, dL):
         spins = system.poisson
         s, scale = spins.spins(x), sqrt_or_zero(self.rate.reshape(-1))
 
         def times(w):
-            pull = split_vectors(w.reshape(spins.count, 3))
-            return spins.join_state(scale_vectors(scale, cross_vectors(pull, s)), jnp.zeros(0))
+            vectors = split_vectors(w.reshape(spins.count, 3))
+            return spins.join_state(scale_vectors(scale, cross_vectors(vectors, s)), jnp.zeros(0))
 
         # solenoidal, as w x s is, of any w that does not depend on s
         return Factor(

@@ -65,7 +65,7 @@ class LocalProjectedMetric(Dissipation):
         gradients = dH.reshape(count, d) @ L
 
         def times(w):
-            turns = skew_matrix(w.reshape(count, -1), d)
-            return (sqrt_or_zero(rates) * (jnp.einsum("nij,nj->ni", turns, gradients) @ L.T)).ravel()
+            rotations = skew_matrix(w.reshape(count, -1), d)
+            return (sqrt_or_zero(rates) * (jnp.einsum("nij,nj->ni", rotations, gradients) @ L.T)).ravel()
 
         return Factor(count * math.comb(d, 2), times, solenoidal=True)

@@ -59,36 +59,36 @@ class MatterExchange(Dissipation):
         self.processes = tuple(processes)
 
     def force(self, system, x, dH, dS, dL):
-        along, spread = self._flux_directions(system, x, dH)
-        return spread(self._coefficients(x) * along(dS))
+        z_dot, apply_fluxes = self._flux_directions(system, x, dH)
+        return apply_fluxes(self._coefficients(x) * z_dot(dS))
 
     def factor(self, system, x, dH, dL):
-        _, spread = self._flux_directions(system, x, dH)
+        _, apply_fluxes = self._flux_directions(system, x, dH)
         root = jnp.sqrt(self._coefficients(x))
-        return Factor(len(self.processes), lambda w: spread(root * w))
+        return Factor(len(self.processes), lambda w: apply_fluxes(root * w))
 
     def _coefficients(self, x) -> jax.Array:
         """L of each process; NaN where it is negative: the step is then refused."""
-        found = [e.coefficient(x) if callable(e.coefficient) else e.coefficient for e in self.processes]
-        L = jnp.stack([jnp.asarray(value) for value in found])
+        coefficients = [e.coefficient(x) if callable(e.coefficient) else e.coefficient for e in self.processes]
+        L = jnp.stack([jnp.asarray(value) for value in coefficients])
         return jnp.where(L >= 0.0, L, jnp.nan)
 
     def _flux_directions(self, system, x, dH) -> tuple[Callable, Callable]:
         """``z . dS`` of each process, and the sum of fluxes times z."""
-        numbers, heated, carried = (
+        stoichiometry, heat_shares, entropy_transport = (
             np.array([getattr(e, name) for e in self.processes])
             for name in ("stoichiometry", "heat_shares", "entropy_transport")
         )
         N, S = system.poisson.particle_indices.N, system.poisson.state_indices.S
         mu, T = dH[N], dH[S]
-        T, touched = jnp.where(T > 0.0, T, jnp.nan), np.abs(carried)
-        affinity = -(numbers @ mu)
-        mean = touched @ T / np.maximum(touched.sum(axis=1), 1.0)
-        heat = jnp.stack([e.entropy_per_particle for e in self.processes]) * mean
-        entropies = (heated * affinity[:, None] + carried * heat[:, None]) / T
+        T, n_ends = jnp.where(T > 0.0, T, jnp.nan), np.abs(entropy_transport)
+        affinity = -(stoichiometry @ mu)
+        mean_temperature = n_ends @ T / np.maximum(n_ends.sum(axis=1), 1.0)
+        transported_heat = jnp.stack([e.entropy_per_particle for e in self.processes]) * mean_temperature
+        entropies = (heat_shares * affinity[:, None] + entropy_transport * transported_heat[:, None]) / T
         return (
-            lambda dS: numbers @ dS[N] + entropies @ dS[S],
-            lambda flux: jnp.zeros_like(x).at[N].add(flux @ numbers).at[S].add(flux @ entropies),
+            lambda dS: stoichiometry @ dS[N] + entropies @ dS[S],
+            lambda flux: jnp.zeros_like(x).at[N].add(flux @ stoichiometry).at[S].add(flux @ entropies),
         )
 
 

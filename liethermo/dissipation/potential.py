@@ -21,11 +21,17 @@ from .checks import state_shape_dtype
 from .factor import Factor
 from .projected_metric import ProjectedMetric
 
-CONVEXITY_CHECK, MINIMUM_AT_ZERO_CHECK = "psi convex", "psi least at 0"
-"""The rows of a check on a dissipation potential."""
+CONVEXITY_CHECK = "psi convex"
+"""Row of ``system.check()``: convexity of a dissipation potential, tested on random pairs of forces."""
 
-CONVEXITY_PAIRS, CONVEXITY_FORCE_SCALES = 8, (1e-3, 1e-1, 1.0, 10.0)
-"""Random pairs of forces that the convexity of a potential is tried on, and their sizes."""
+MINIMUM_AT_ZERO_CHECK = "psi least at 0"
+"""Row of ``system.check()``: the slope of a dissipation potential vanishes at zero force."""
+
+CONVEXITY_PAIRS = 8
+"""Number of random pairs of forces, at each scale, that test the convexity of a potential."""
+
+CONVEXITY_FORCE_SCALES = (1e-3, 1e-1, 1.0, 10.0)
+"""Lengths, per component, of the random forces that test the convexity of a potential."""
 
 
 class DissipationPotential(Dissipation):
@@ -78,14 +84,14 @@ class DissipationPotential(Dissipation):
     couplings = forward_to("of")
 
     def bind_to(self, system):
-        found = eqx.tree_at(lambda d: d.of, self, self.of.bind_to(system))
+        bound_potential = eqx.tree_at(lambda d: d.of, self, self.of.bind_to(system))
         shape = result_shape(
-            lambda x: found.psi_at_state(x)(jnp.zeros(found._continuous_factor(system, x).size)),
+            lambda x: bound_potential.psi_at_state(x)(jnp.zeros(bound_potential._continuous_factor(system, x).size)),
             state_shape_dtype(system.dim),
         )
         if shape.shape != ():
             raise FunctionError(f"psi must return one number, but it returns shape {shape.shape}")
-        return found
+        return bound_potential
 
     def psi_at_state(self, x) -> Callable:
         """The potential as a function of the forces at a state."""
@@ -104,11 +110,11 @@ class DissipationPotential(Dissipation):
             length = jnp.linalg.norm(a - b) * jnp.max(jnp.linalg.norm(slopes, axis=1))
             return jnp.maximum(-jnp.dot(a - b, slopes[0] - slopes[1]), 0.0) / jnp.where(length > 0.0, length, 1.0)
 
-        largest = jnp.max(jnp.linalg.norm(jax.vmap(slope)(pairs[:, 0]), axis=1))
-        at_rest = jnp.linalg.norm(slope(jnp.zeros(size))) / jnp.where(largest > 0.0, largest, 1.0)
+        max_slope = jnp.max(jnp.linalg.norm(jax.vmap(slope)(pairs[:, 0]), axis=1))
+        slope_at_zero = jnp.linalg.norm(slope(jnp.zeros(size))) / jnp.where(max_slope > 0.0, max_slope, 1.0)
         return self.of.input_residuals(system, x) | {
             CONVEXITY_CHECK: jnp.max(jax.vmap(monotonicity_residual)(pairs)),
-            MINIMUM_AT_ZERO_CHECK: at_rest,
+            MINIMUM_AT_ZERO_CHECK: slope_at_zero,
         }
 
     def force(self, system, x, dH, dS, dL):
@@ -121,8 +127,10 @@ class DissipationPotential(Dissipation):
     def _require_factor(self, system, x, dH, dL) -> Factor:
         B = self.of.factor(system, x, dH, dL)
         if B is None:
-            where = "" if system.space is None else f" on {system.space.name}"
-            raise InputError(f"{type(self.of).__name__} gives no factor of its friction matrix{where} to compose with")
+            space_text = "" if system.space is None else f" on {system.space.name}"
+            raise InputError(
+                f"{type(self.of).__name__} gives no factor of its friction matrix{space_text} to compose with"
+            )
         return B
 
 
@@ -228,8 +236,8 @@ class ActivatedFriction(NamedPotential):
         return self.rate * q * hyperbolic_stumpff(2, q / self.scale**2)
 
 
-def _checked_number(value, what: str, zero: bool) -> jax.Array:
+def _checked_number(value, what: str, allow_zero: bool) -> jax.Array:
     number = check_numbers(value, what, ())
-    if not isinstance(number, jax.core.Tracer) and not (float(number) >= 0.0 if zero else float(number) > 0.0):
-        raise InputError(f"{what} must be {'>=' if zero else '>'} 0, not {float(number):g}")
+    if not isinstance(number, jax.core.Tracer) and not (float(number) >= 0.0 if allow_zero else float(number) > 0.0):
+        raise InputError(f"{what} must be {'>=' if allow_zero else '>'} 0, not {float(number):g}")
     return number

@@ -94,16 +94,16 @@ class ProjectedMetric(Dissipation):
         )
 
     def force(self, system, x, dH, dS, dL):
-        raised = self._cometric_map(system, x)
+        raise_index = self._cometric_map(system, x)
         if not dL and not self.normalized:
-            GdH = raised(dH)
+            GdH = raise_index(dH)
             square = jnp.dot(GdH, dH)
-            share = jnp.dot(GdH, dS) / jnp.where(square > 0.0, square, 1.0)
-            image = raised(dS - share * dH)  # the rest first: near an equilibrium its image has digits of its own
+            ratio = jnp.dot(GdH, dS) / jnp.where(square > 0.0, square, 1.0)
+            image = raise_index(dS - ratio * dH)  # the rest first: near an equilibrium its image has digits of its own
             return self.rate * (square * image - jnp.dot(image, dH) * GdH)
-        held = gram_schmidt((dH, *dL), metric_map=raised)
-        projected = held.project_off_images(raised(held.project_off(dS)))
-        return self.rate * (projected if self.normalized else math.prod(held.squared_norms) * projected)
+        frame = gram_schmidt((dH, *dL), metric_map=raise_index)
+        projection = frame.project_off_images(raise_index(frame.project_off(dS)))
+        return self.rate * (projection if self.normalized else math.prod(frame.squared_norms) * projection)
 
     def factor(self, system, x, dH, dL):
         """``P^T L`` with ``L L^T = G``. For the energy alone all ``(l_j . dH) l_i - (l_i . dH) l_j``, i < j.
@@ -126,10 +126,10 @@ class ProjectedMetric(Dissipation):
             return Factor(math.comb(n, 2), times, solenoidal=not callable(self.cometric)).scale_by(self.rate)
         return self._projected_factor(system, x, dH, dL, n, lambda w: root @ w)
 
-    def _projected_factor(self, system, x, dH, dL, size: int, root: Callable) -> Factor:
-        held = gram_schmidt((dH, *dL), metric_map=self._cometric_map(system, x))
-        rate = self.rate if self.normalized else self.rate * math.prod(held.squared_norms)
-        return Factor(size, lambda w: held.project_off_images(root(w))).scale_by(rate)
+    def _projected_factor(self, system, x, dH, dL, n_columns: int, root: Callable) -> Factor:
+        frame = gram_schmidt((dH, *dL), metric_map=self._cometric_map(system, x))
+        rate = self.rate if self.normalized else self.rate * math.prod(frame.squared_norms)
+        return Factor(n_columns, lambda w: frame.project_off_images(root(w))).scale_by(rate)
 
     def _cometric_map(self, system, x):
         G = evaluate_form(self.cometric, x)

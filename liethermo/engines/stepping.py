@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from ..functions.energy import Energy
 from ..integrators import OneStepMethod
 from ..integrators.base import is_permutation_equivariant, pullback_method
-from ..integrators.explicit import INITIAL_LEVELS_ROW
+from ..integrators.explicit import StepRow
 from ..systems import System
 from ..tracing.programs import jit_unoptimised
 from .codes import StatusCode
@@ -118,7 +118,7 @@ def reorder_components(
     def permute_state(s: State, change: Callable) -> State:
         k = change(s.k)
         k = (
-            k.at[INITIAL_LEVELS_ROW].set(s.k[INITIAL_LEVELS_ROW]) if method.explicit else k
+            k.at[StepRow.INITIAL_LEVELS].set(s.k[StepRow.INITIAL_LEVELS]) if method.explicit else k
         )  # which are values of functions
         return s._replace(
             x=change(s.x), compensation=change(s.compensation), k=k, previous_slopes=change(s.previous_slopes)

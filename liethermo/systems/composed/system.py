@@ -83,7 +83,7 @@ class ComposedSystem(System):
     Attributes
     ----------
     poisson : manifolds.ExtendedPhaseSpace
-        ``poisson.places`` has the indices of all q, p and S in a state.
+        ``poisson.state_indices`` has the indices of all q, p and S in a state.
     subsystems : tuple of Subsystem or Copies
     names : tuple of str
         Of the bodies.

@@ -9,7 +9,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.integrators.explicit import CONSTRAINT_RESIDUAL_ROW, INITIAL_LEVELS_ROW, MEAN_SLOPE_ROW
+from liethermo.integrators.explicit import StepRow
 from tests.liethermo import random_systems
 
 RK, Taylor = lt.MetriplecticRungeKutta, lt.MetriplecticTaylor
@@ -332,7 +332,7 @@ def uncorrected(method):
             laws = self._laws(system)
             rates = lambda y: self.rates(system, laws, y)  # noqa: E731
             d, _, error, between = self.base_step(rates, False, x, compensation, h)
-            return jnp.stack([d / h, error, jnp.zeros_like(x), k[INITIAL_LEVELS_ROW], *between])
+            return jnp.stack([d / h, error, jnp.zeros_like(x), k[StepRow.INITIAL_LEVELS], *between])
 
     return Uncorrected(method.order)
 
@@ -375,7 +375,7 @@ def test_an_energy_is_not_steered_where_the_levels_hardly_meet():
     x, method, zero = jnp.array([1.0 + 1e-10, 1.0]), RK(4).on(system), jnp.zeros(2)
     k = method.start(system, x)
     for off in (0.0, 6.0 * EPS, -6.0 * EPS):  # levels of a start that roundings have taken the run away from
-        levels = k.at[INITIAL_LEVELS_ROW, 0].multiply(1.0 + off)
+        levels = k.at[StepRow.INITIAL_LEVELS, 0].multiply(1.0 + off)
         found = method.slopes(system, x, zero, 0.01, levels)
-        assert np.abs(found[CONSTRAINT_RESIDUAL_ROW]).max() * 0.01 < 1e-14
-        assert np.abs(found[MEAN_SLOPE_ROW]).max() < 1e-9
+        assert np.abs(found[StepRow.CONSTRAINT_RESIDUAL]).max() * 0.01 < 1e-14
+        assert np.abs(found[StepRow.MEAN_SLOPE]).max() < 1e-9
