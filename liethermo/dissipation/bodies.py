@@ -1,8 +1,9 @@
-"""Dissipation in composed systems: heat that flows, friction that heats [SML §5].
+"""Dissipation in composed systems: heat conduction, and friction that heats [SML §5].
 
-All act on states (q_1, p_1, S_1, q_2, …) of several bodies, see :class:`manifolds.ExtendedPhaseSpace`. Temperatures and
-velocities are components of the gradient of the energy that they are handed: from a discrete gradient they are discrete
-ones, and both laws hold exactly, for every energy, as long as the discrete temperatures are positive.
+All classes act on states (q_1, p_1, S_1, q_2, …) of several bodies, see :class:`manifolds.ExtendedPhaseSpace`.
+Temperatures and velocities are components of the energy gradient that they are passed. With a discrete gradient these
+are discrete temperatures, and both laws hold exactly, for every energy, as long as the discrete temperatures are
+positive.
 """
 
 from __future__ import annotations
@@ -27,21 +28,21 @@ from .factor import Factor
 class HeatConduction(Dissipation):
     """Fourier's law on a graph: ``S_i' = sum_j k_ij (T_j - T_i) / T_i``, ``T = H_S`` [SML 32].
 
-    In terms of the Fourier factors ``K_ij = k_ij (1/T_i - 1/T_j)``, which are skew, ``S_i' = sum_j K_ij T_j``, so the
-    energy is constant; the total entropy grows by ``sum k_ij (T_i - T_j)^2 / (T_i T_j)`` over the edges. In
-    metriplectic form K is the sum of ``k_ij T_i T_j w w^T`` with ``w = e_i / T_i - e_j / T_j``.
+    With the Fourier factors ``K_ij = k_ij (1/T_i - 1/T_j)``, which are skew, ``S_i' = sum_j K_ij T_j``. So the energy
+    is constant, and the total entropy grows by ``sum k_ij (T_i - T_j)^2 / (T_i T_j)`` over the edges. In metriplectic
+    form K is the sum of ``k_ij T_i T_j w w^T`` with ``w = e_i / T_i - e_j / T_j``.
 
-    The temperatures are those of the gradient that it is handed, so a discretisation has discrete ones, which keep both
-    laws for every energy. With ``factors="midpoint"`` the Fourier factors alone are taken at the point x instead, as
-    SML §6.2 prints them; the energy is constant then too, but the entropy is known to grow for quadratic energies only
+    The temperatures are components of the gradient passed, so a discretisation uses discrete ones, which keep both laws
+    for every energy. With ``factors="midpoint"`` only the Fourier factors are evaluated at the point x instead, as
+    printed in SML §6.2. The energy is constant then too, but the entropy is known to grow only for quadratic energies
     [SML Lemma 6.2].
 
     Parameters
     ----------
     graph : Edges
-        Of bodies, with their conductances (power / temperature).
+        Edges between bodies, with their conductances (power / temperature).
     laws : tuple of functions of (T_i, T_j, x), optional
-        In place of the weights: the conductance of each edge, >= 0.
+        The conductance of each edge, >= 0, in place of the weights.
     fourier_factors : {"discrete", "midpoint"}
     """
 
@@ -60,7 +61,7 @@ class HeatConduction(Dissipation):
         return "nondecreasing" if self.fourier_factors == "discrete" else None
 
     def conductances(self, x, T_i, T_j) -> jax.Array:
-        """Those of the edges between bodies of these temperatures, shape (edges,); NaN where one is negative."""
+        """Return the conductances of the edges at these temperatures, shape (edges,); NaN where one is negative."""
         if not self.laws:
             return self.conductance
         values = jnp.stack([jnp.asarray(law(T_i[e], T_j[e], x)) for e, law in enumerate(self.laws)])
@@ -86,7 +87,7 @@ class HeatConduction(Dissipation):
 
     def couplings(self, system):
         if self.laws:
-            return None  # they may depend on everything
+            return None  # the laws may depend on all components
         S = _state_indices(system).S
         return clique_pattern(
             np.stack([S[np.asarray(self.first_bodies)], S[np.asarray(self.second_bodies)]], axis=1), system.dim
@@ -94,7 +95,7 @@ class HeatConduction(Dissipation):
 
 
 class LinearFriction(Dissipation):
-    """Friction against the surroundings, that heats the body itself: ``p' = -R v``, ``S' = v . R v / T``, v = H_p.
+    """Friction against the surroundings that heats the body itself: ``p' = -R v``, ``S' = v . R v / T``, v = H_p.
 
     In metriplectic form K is ``z R z^T / T`` with ``z = -T d/dp + v d/dS``.
 
@@ -103,7 +104,7 @@ class LinearFriction(Dissipation):
     R : array, shape (m,) for a diagonal matrix, or (m, m); or function from the state of the body to one
         Positive semidefinite (mass / time).
     body_index : int, optional
-        Whose m momenta these are; by default R is diagonal and has an entry for every momentum of the whole system.
+        The body with these m momenta; by default R is diagonal with an entry for every momentum of the whole system.
     """
 
     R: jax.Array | Callable
@@ -124,7 +125,7 @@ class LinearFriction(Dissipation):
         return jnp.zeros_like(x).at[p].add(-T * flux).at[S].add(v * flux)
 
     def _friction_data(self, system, x, dH):
-        """Where the momenta and the entropies are, R, the velocities and the temperatures."""
+        """Return the indices of momenta and entropies, R, the velocities and the temperatures: (p, S, R, v, T)."""
         indices = _state_indices(system)
         numbers = (
             np.arange(len(indices.p)) if self.body_index is None else np.flatnonzero(indices.owner == self.body_index)
@@ -138,16 +139,16 @@ class LinearFriction(Dissipation):
 
 
 class Drag(Dissipation):
-    """Friction between bodies: the force ``-c_ij (v_i - v_j)`` on i, and half the heat for either.
+    """Friction between bodies: the force ``-c_ij (v_i - v_j)`` on i, with half of the heat for each body.
 
-    ``S_i' = sum_j c_ij |v_i - v_j|^2 / (2 T_i)``; the total momentum is conserved. In metriplectic form K is
-    ``c_ij z z^T / theta`` with ``z = -d/dp_i + d/dp_j + (v_i - v_j) (d/dS_i / T_i + d/dS_j / T_j) / 2`` and
-    ``theta = (1/T_i + 1/T_j) / 2``, summed over edges and components.
+    ``S_i' = sum_j c_ij |v_i - v_j|^2 / (2 T_i)``; the total momentum is conserved. In metriplectic form K is ``c_ij z
+    z^T / theta`` with ``z = -d/dp_i + d/dp_j + (v_i - v_j) (d/dS_i / T_i + d/dS_j / T_j) / 2`` and ``theta = (1/T_i +
+    1/T_j) / 2``, summed over edges and components.
 
     Parameters
     ----------
     graph : Edges
-        Of bodies with the same number of degrees of freedom, with coefficients c (mass / time).
+        Edges between bodies with equal numbers of degrees of freedom, with coefficients c (mass / time).
     """
 
     first_bodies: Indices = eqx.field(static=True)
@@ -168,7 +169,7 @@ class Drag(Dissipation):
         return Factor(len(weight), lambda w: apply_directions(jnp.sqrt(weight) * w))
 
     def _edge_data(self, system, x, dH):
-        """Where momenta and entropies are, the temperatures and the velocity between, ``c / theta``, and ``flux z``."""
+        """Return indices (p_i, p_j, S_i, S_j), values (T_i, T_j, v_i - v_j), ``c / theta``, and flux -> ``flux z``."""
         indices = _state_indices(system)
         i, j, edge = _momentum_pairs(self.first_bodies, self.second_bodies, indices)
         S_i, S_j, p_i, p_j = indices.S[indices.owner[i]], indices.S[indices.owner[j]], indices.p[i], indices.p[j]
@@ -189,16 +190,16 @@ class Drag(Dissipation):
 
 
 class ContactFriction(SkewFriction):
-    """The friction of evolution fields, in some of the bodies: ``p' = -p T``, ``S' = p . v`` [SML 7].
+    """Friction of evolution fields in some of the bodies: ``p' = -p T``, ``S' = p . v`` [SML 7].
 
-    A skew bracket with the energy. The entropy cannot fall if the energy of each of the bodies is
-    ``p . G(q) p / 2 + V(q, S)``, in terms of that form; for other energies nothing is promised.
+    It is a skew bracket with the energy. The entropy cannot fall if the energy of each of the bodies is ``p . G(q) p /
+    2 + V(q, S)`` with a semidefinite G; for other energies nothing is guaranteed.
 
     Parameters
     ----------
     body_indices : tuple of int
     is_nondecreasing : bool
-        Whether their energies are known to be of that form.
+        True if the energies are known to have that form.
     """
 
     body_indices: tuple[int, ...] = eqx.field(static=True)
@@ -226,7 +227,7 @@ def _state_indices(system) -> StateIndices:
 
 
 def _nan_unless_positive(T):
-    """Temperatures, NaN where they are not positive: the step is then refused."""
+    """Return the temperatures, with NaN for those that are not positive: the step is then rejected."""
     return jnp.where(T > 0.0, T, jnp.nan)
 
 
@@ -235,12 +236,12 @@ def _apply_form(R, v):
 
 
 def _body_components(indices: StateIndices, numbers: np.ndarray) -> np.ndarray:
-    """The components of the state of the body that some of the momenta belong to."""
+    """Return the indices of all state components of the body with these momenta."""
     return np.concatenate([indices.q[numbers], indices.p[numbers], indices.S[indices.owner[numbers[:1]]]])
 
 
 def _momentum_pairs(first_bodies: Indices, second_bodies: Indices, indices: StateIndices):
-    """For each edge and component: the numbers of the two momenta, and of the edge."""
+    """Return, for each edge and component, the numbers of the two momenta and of the edge."""
     i, j = np.asarray(first_bodies), np.asarray(second_bodies)
     starts = np.searchsorted(indices.owner, np.arange(len(indices.S)))
     counts = np.bincount(indices.owner, minlength=len(indices.S))[i]
@@ -250,7 +251,7 @@ def _momentum_pairs(first_bodies: Indices, second_bodies: Indices, indices: Stat
 
 
 def _block_pattern(indices: StateIndices, dim: int) -> scipy.sparse.csr_array:
-    """The pattern in which all components of a body depend on each other, and on none of another body."""
+    """Return the pattern in which the components of a body depend on each other, and on no other body."""
     starts = np.concatenate([[0], indices.S[:-1] + 1])
     body = np.repeat(np.arange(len(starts)), indices.S + 1 - starts)
     member = pattern_of_matrix(

@@ -1,4 +1,4 @@
-"""Matter that passes membranes, and that reacts: friction between chemical potentials [after GBY; SML §7]."""
+"""Matter that crosses membranes, and chemical reactions: friction between chemical potentials [after GBY; SML §7]."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from .factor import Factor
 
 
 class Process(Module):
-    """One way in which particle numbers change together, ``N' = nu J``.
+    """A process that changes several particle numbers together, ``N' = nu J``.
 
     Attributes
     ----------
     stoichiometry : tuple of float
-        nu, of all particle numbers of the system.
+        The coefficients nu of all particle numbers of the system.
     heat_shares : tuple of float
-        The shares of the released energy ``A = -nu . mu`` that heat each body, of sum 1.
+        The fractions of the released energy ``A = -nu . mu`` that heat each body, of sum 1.
     entropy_transport : tuple of float
-        Which bodies entropy is carried to (1) and from (-1).
+        1 for a body that receives entropy, -1 for one that gives entropy, otherwise 0.
     entropy_per_particle : array, shape ()
-        What is carried with a particle (entropy).
+        Entropy transported with a particle.
     coefficient : array, shape (), or function of the whole state
         L >= 0.
     """
@@ -68,13 +68,13 @@ class MatterExchange(Dissipation):
         return Factor(len(self.processes), lambda w: apply_fluxes(root * w))
 
     def _coefficients(self, x) -> jax.Array:
-        """L of each process; NaN where it is negative: the step is then refused."""
+        """Return L of each process; NaN where it is negative: the step is then rejected."""
         coefficients = [e.coefficient(x) if callable(e.coefficient) else e.coefficient for e in self.processes]
         L = jnp.stack([jnp.asarray(value) for value in coefficients])
         return jnp.where(L >= 0.0, L, jnp.nan)
 
     def _flux_directions(self, system, x, dH) -> tuple[Callable, Callable]:
-        """``z . dS`` of each process, and the sum of fluxes times z."""
+        """Return two functions: dS to ``z . dS`` of each process, and fluxes to the sum of fluxes times z."""
         stoichiometry, heat_shares, entropy_transport = (
             np.array([getattr(e, name) for e in self.processes])
             for name in ("stoichiometry", "heat_shares", "entropy_transport")
@@ -93,7 +93,7 @@ class MatterExchange(Dissipation):
 
 
 def conserved_numbers(processes: Sequence[Process], count: int) -> np.ndarray:
-    """Combinations of particle numbers that no process changes, shape (combinations, count), reduced by rows."""
+    """Return combinations of particle numbers that no process changes, shape (combinations, count), row-reduced."""
     rows = np.array([e.stoichiometry for e in processes]).reshape(-1, count)
     _, singular, basis = np.linalg.svd(rows, full_matrices=True)
     rank = int((singular > 1e-12 * max(1.0, singular.max(initial=0.0))).sum())

@@ -1,4 +1,4 @@
-"""Noise of a dissipation as a whole: the factors of its summands side by side, and the divergences of their columns."""
+"""Noise of a sum of dissipations: the factors of its summands side by side, and the divergences of their columns."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ FACTOR_DIVERGENCE_CHECK = "div B = 0, as stated"
 def terms_with_factors(
     dissipation: Dissipation, system: Geometry, x, dH, dL: Sequence
 ) -> list[tuple[Dissipation, Factor]]:
-    """Each summand with its factor at the given gradients.
+    """Return each summand with its factor at the given gradients.
 
     Raises
     ------
     InputError
-        If one has none.
+        If a summand has no factor.
     """
     result = []
     for term, dL_part in _noisy_terms(dissipation, dL):
@@ -39,26 +39,26 @@ def terms_with_factors(
         if B is None:
             space_text = "" if system.space is None else f" on {system.space.name}"
             raise InputError(
-                f"{type(term).__name__} gives no factor of its friction matrix{space_text}, so there is no noise that "
-                "belongs to it: see Dissipation.factor"
+                f"{type(term).__name__} gives no factor of its friction matrix{space_text}, so it has no noise. Define "
+                "Dissipation.factor"
             )
         result.append((term, B))
     return result
 
 
 def factor_divergence(dissipation: Dissipation, system: Geometry, x) -> jax.Array:
-    """The divergence of every column of the factors, at the gradients of the functions, shape (columns,)."""
+    """Return the divergence of every column of the factors, at the gradients of the functions, shape (columns,)."""
     return jnp.concatenate([jnp.zeros(0), *(term.divergence(system, x) for term, _ in _noisy_terms(dissipation))])
 
 
 def terms_with_continuous_factors(dissipation: Dissipation, system: Geometry, x) -> list[tuple[Dissipation, Factor]]:
-    """Those at the gradients of the functions."""
+    """Return each summand with its factor at the gradients of the functions."""
     dL = [L.gradient(x) for L in dissipation.preserve]
     return terms_with_factors(dissipation, system, x, system.energy.gradient(x), dL)
 
 
 def factor_residuals(dissipation: Dissipation, system: Geometry, x) -> dict[str, jax.Array]:
-    """What the factors miss of what they are to be, at a state and relative to what cancels: the largest of each."""
+    """Return the largest residual at x of each property of the factors, relative to the terms that cancel, by name."""
     dH = system.energy.gradient(x)
     (generic,) = generic_covectors(x.shape[0], 1)
     residuals: dict[str, list[jax.Array]] = {
@@ -80,20 +80,19 @@ def factor_residuals(dissipation: Dissipation, system: Geometry, x) -> dict[str,
         residuals[FACTOR_KERNEL_CHECK] += kernel
         if B.solenoidal:
             divergence_terms = term.divergence_terms(system, x)
-            scale = jnp.max(jnp.abs(divergence_terms)) + size / (
-                1.0 + jnp.linalg.norm(x)
-            )  # the former may be rounding alone
+            # The first scale alone would be too small where the terms are mere rounding.
+            scale = jnp.max(jnp.abs(divergence_terms)) + size / (1.0 + jnp.linalg.norm(x))
             residuals[FACTOR_DIVERGENCE_CHECK].append(_relative_max(jnp.sum(divergence_terms, axis=0), scale))
     return {name: jnp.max(jnp.stack(values)) for name, values in residuals.items() if values}
 
 
 def generic_covectors(n: int, number: int) -> jax.Array:
-    """Covectors in no special direction, shape (number, n): not those of the test points, which are drawn from 0 on."""
+    """Return covectors in no special direction, shape (number, n); test points have other seeds, from 0."""
     return jnp.asarray(np.random.default_rng(20_241).standard_normal((number, n)))
 
 
 def _noisy_terms(dissipation: Dissipation, values: Sequence | None = None) -> list[tuple[Dissipation, tuple]]:
-    """The summands that noise may belong to, each with its portion of what belongs to the functions that they keep."""
+    """Return the summands that can have noise, each with its portion of ``values``, by default its functions."""
     terms = terms_with_preserved(dissipation, dissipation.preserve if values is None else values)
     return [(term, term_values) for term, term_values in terms if not term.is_noiseless]
 

@@ -1,4 +1,4 @@
-"""Metrics projected off the gradients of what is to stay constant."""
+"""Metrics projected off the gradients of conserved functions."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from .factor import Factor
 
 
 class GlobalRateWarning(UserWarning):
-    """A dissipation that couples all sites of a system, and damps each the faster the more there are."""
+    """Warns that a dissipation couples all sites, so that the damping of each site grows with their number."""
 
 
 class ProjectedMetric(Dissipation):
-    """Dissipation by a cometric G, projected off what it has to conserve [BFM 2.2, Remark 2.1].
+    """Gradient of the entropy in a cometric G, without the components along conserved gradients [BFM 2.2, Remark 2.1].
 
     ``K(alpha, beta) = det(C) G(P alpha, P beta)``, P the G-orthogonal projector off the span of dH and the
     gradients dL_a of ``preserve``, and ``C_ab = G(dL_a, dL_b)`` with L_1 = H. For the energy alone
@@ -81,8 +81,8 @@ class ProjectedMetric(Dissipation):
         if system.sites and not self.normalized:
             warn(
                 f"ProjectedMetric damps each of the {math.prod(system.sites)} sites at a rate that grows with their "
-                "number, since G(dH, dH) is a sum over all of them: LocalProjectedMetric acts site by site, and "
-                "normalized=True leaves the factor out",
+                "number, since G(dH, dH) is a sum over all sites. Use LocalProjectedMetric, which acts site by site, "
+                "or normalized=True, which leaves this factor out",
                 GlobalRateWarning,
             )
         if system.space is not None:
@@ -99,16 +99,18 @@ class ProjectedMetric(Dissipation):
             GdH = raise_index(dH)
             square = jnp.dot(GdH, dH)
             ratio = jnp.dot(GdH, dS) / jnp.where(square > 0.0, square, 1.0)
-            image = raise_index(dS - ratio * dH)  # the rest first: near an equilibrium its image has digits of its own
+            image = raise_index(
+                dS - ratio * dH
+            )  # subtract first: near an equilibrium the difference of images would lose digits
             return self.rate * (square * image - jnp.dot(image, dH) * GdH)
         frame = gram_schmidt((dH, *dL), metric_map=raise_index)
         projection = frame.project_off_images(raise_index(frame.project_off(dS)))
         return self.rate * (projection if self.normalized else math.prod(frame.squared_norms) * projection)
 
     def factor(self, system, x, dH, dL):
-        """``P^T L`` with ``L L^T = G``. For the energy alone all ``(l_j . dH) l_i - (l_i . dH) l_j``, i < j.
+        """Return ``P^T L`` with ``L L^T = G``; for the energy alone all ``(l_j . dH) l_i - (l_i . dH) l_j``, i < j.
 
-        Their divergence is zero where G is constant.
+        The divergence of the latter is zero if G is constant.
         """
         G, n = evaluate_form(self.cometric, x), system.dim
         if system.space is not None:

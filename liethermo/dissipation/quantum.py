@@ -29,12 +29,12 @@ from .base import Dissipation
 from .checks import checked_rate
 
 ENERGY_RTOL = 8.0 * EPS
-"""Error of an energy, relative to the largest one; times the number of levels, where energies are eigenvalues."""
+"""Error of an energy, relative to the largest one; times the number of levels if energies are eigenvalues."""
 
 
 @runtime_checkable
 class HasMatrix(Protocol):
-    """An operator that is not an array and gives its matrix, as a ``Qobj`` of QuTiP does."""
+    """An operator that is no array and returns its matrix, as a ``Qobj`` of QuTiP does."""
 
     def full(self) -> np.ndarray: ...
 
@@ -46,16 +46,16 @@ class Operator(StaticArray):
 
 
 class Jump(NamedTuple):
-    """A part of a coupling that takes the energy omega out of the system, ``[H, V] = -omega V``.
+    """A component of a coupling that takes the energy omega out of the system, ``[H, V] = -omega V``.
 
     Attributes
     ----------
     operator : Operator
-        V in the frame of the jumps; together with its adjoint, which puts that energy in.
+        V in the frame of the jumps. Its adjoint, which puts the energy omega in, belongs to the jump too.
     coupling_index : int
         The number of the coupling.
     weight : float
-        One half where V is its own adjoint: the two are then one.
+        One half if V is its own adjoint: the two jumps are then one.
     """
 
     operator: Operator
@@ -66,12 +66,12 @@ class Jump(NamedTuple):
 class ThermalJumps(Dissipation):
     """Jumps of an open quantum system that exchange heat with a bath [Carlen & Maas 2017; Mittnenzweig & Mielke 2017].
 
-    A coupling V is split into parts with ``[H, V] = -omega V``. With ``B(A, a) = [V, A] - (a / T) [V, dE]`` and L the
-    logarithmic mean of ``e^(-omega / 2T) rho`` from the left and ``e^(omega / 2T) rho`` from the right, the friction is
-    ``K = sum (rate / 2) B* L B`` over the parts and their adjoints. ``K dE = 0`` and ``K >= 0`` by form, for discrete
-    gradients too: the energy of system and bath is constant and the entropy cannot fall. While T is constant the motion
-    is Lindblad's equation with detailed balance: jumps V at the rate ``rate * exp(omega / 2T)`` and V^H at
-    ``rate * exp(-omega / 2T)``. The Hamiltonian may change in time if its eigenvectors do not change.
+    A coupling V is split into components with ``[H, V] = -omega V``. With ``B(A, a) = [V, A] - (a / T) [V, dE]`` and L
+    the logarithmic mean of ``e^(-omega / 2T) rho`` from the left and ``e^(omega / 2T) rho`` from the right, the
+    friction is ``K = sum (rate / 2) B* L B`` over the components and their adjoints. ``K dE = 0`` and ``K >= 0`` by
+    form, for discrete gradients too: the energy of system and bath is constant and the entropy cannot fall. While T is
+    constant the motion is Lindblad's equation with detailed balance: jumps V at the rate ``rate * exp(omega / 2T)`` and
+    V^H at ``rate * exp(-omega / 2T)``. The Hamiltonian may depend on time if its eigenvectors do not.
 
     In a system without baths the jumps exchange no heat. This is the limit of infinite temperature: the identity is at
     rest (the noise is unital), and the entropy cannot fall. The energy is constant if every V commutes with H, as in
@@ -82,7 +82,8 @@ class ThermalJumps(Dissipation):
     couplings : list of (V, rate)
         V is a dimensionless matrix, shape (N, N). A Hermitian V acts once, any other together with its adjoint. The
         rate is a number >= 0 (1 / time), or a function of omega >= 0 and T, such as ``g / (2 sinh(omega / 2T))`` for a
-        bath of bosons. Where a Hamiltonian that depends on time changes the sign of omega, it has to be even in omega.
+        bath of bosons. If a Hamiltonian that depends on time changes the sign of omega, the rate has to be even in
+        omega.
     bath : int
         The number of the bath, from 0.
 
@@ -115,13 +116,13 @@ class ThermalJumps(Dissipation):
     def __init__(self, couplings: Sequence[tuple[Any, Any]], bath: int = 0):
         pairs = list(couplings)
         if not pairs or not all(isinstance(pair, tuple | list) and len(pair) == 2 for pair in pairs):
-            raise InputError("ThermalJumps takes a list of pairs (V, rate), such as [(V, 0.1)]")
+            raise InputError("couplings must be a list of pairs (V, rate), such as [(V, 0.1)]")
         if isinstance(bath, bool) or not isinstance(bath, int) or bath < 0:
-            raise InputError(f"bath is the number of a bath, from 0, not {bath!r}")
+            raise InputError(f"bath must be the number of a bath, from 0, got {bath!r}")
         self.operators = tuple(Operator(checked_matrix(V, f"the coupling V[{i}]")) for i, (V, _) in enumerate(pairs))
         for i, V in enumerate(self.operators):
             if not np.asarray(V).any():
-                raise InputError(f"the coupling V[{i}] is zero: leave it out")
+                raise InputError(f"the coupling V[{i}] is zero. Leave it out")
         self.rates = tuple(
             _checked_rate_function(rate, i) if callable(rate) else checked_rate(rate)
             for i, (_, rate) in enumerate(pairs)
@@ -138,15 +139,17 @@ class ThermalJumps(Dissipation):
         for i, V in enumerate(self.operators):
             if np.shape(V) != (structure.size,) * 2:
                 raise InputError(
-                    f"the coupling V[{i}] has shape {np.shape(V)}, and the Hamiltonian ({structure.size},"
-                    f" {structure.size})"
+                    f"the coupling V[{i}] has shape {np.shape(V)}, but the Hamiltonian has shape ({structure.size}, "
+                    f"{structure.size})"
                 )
         if baths is not None and self.bath >= baths.number:
-            raise InputError(f"ThermalJumps exchange heat with bath {self.bath}, but there are {baths.number}, from 0")
+            raise InputError(
+                f"ThermalJumps exchange heat with bath {self.bath}, but there are {baths.number} baths, numbered from 0"
+            )
         if is_traced(system.energy.body if isinstance(system.energy, BodyBathsEnergy) else system.energy):
             raise InputError(
-                "ThermalJumps are split by the eigenvectors of the Hamiltonian, which has to be a known one: build a "
-                "system for each, as lt.Study does. Rates, temperatures and capacities may be parameters of a function"
+                "ThermalJumps need the eigenvectors of the Hamiltonian, so it must not be a traced value. Build a "
+                "system for each Hamiltonian, as lt.Study does. Rates, temperatures and capacities may be traced"
             )
         hamiltonians = system.hamiltonians()
         if baths is None:
@@ -169,20 +172,21 @@ class ThermalJumps(Dissipation):
         return bound_jumps
 
     def _replace_fields(self, **fields) -> ThermalJumps:
+        """Return a copy with some fields replaced."""
         copy = object.__new__(ThermalJumps)
         for field in dataclasses.fields(self):
             object.__setattr__(copy, field.name, fields.get(field.name, getattr(self, field.name)))
         return copy
 
     def replace_operators(self, matrices: Sequence[Any], bath: int) -> ThermalJumps:
-        """The same rates with other matrices, such as those of a larger system, and another bath."""
+        """Return jumps with these matrices, for example of a larger system, another bath, and unchanged rates."""
         return self._replace_fields(operators=tuple(map(Operator, matrices)), bath=bath, jumps=())
 
     def force(self, system, x, dH, dS, dL):
-        """The force, of which Lindblad's equation is the part that is exact: no logarithm of rho is in it.
+        """Return the force; for exact gradients it is Lindblad's equation, without the logarithm of rho.
 
-        ``L B(dS)`` is ``e^(-omega / 2T) rho V - e^(omega / 2T) V rho`` at the gradient of the entropy. L has to be
-        applied to what a discrete gradient differs by. So eigenvalues that are zero to rounding stay so.
+        At the gradient of the entropy ``L B(dS)`` is ``e^(-omega / 2T) rho V - e^(omega / 2T) V rho``. L is applied
+        only to the difference of a discrete gradient from it. So eigenvalues that are zero to rounding stay zero.
         """
         structure, n = system.structure, system.body_dim
         rho, H, A = (self._to_jump_frame(structure.matrix(a[:n])) for a in (x, dH, dS))
@@ -195,7 +199,7 @@ class ThermalJumps(Dissipation):
         T = jnp.asarray(jnp.inf) if self.is_isolated else dH[n + self.bath]
         shift, commutators = omega / (2.0 * T), _commutator(V, A + logs)
         if not self.is_isolated:
-            # [V, H] by differences of levels, which lose no digits, and by what H has beside them, which is mostly zero
+            # Differences of levels lose no digits; the off-diagonal entries of H are mostly zero.
             levels, off_diagonal = self._energy_levels(structure, dH[:n]), 1.0 - np.eye(structure.size)
             H_commutators = V * (levels[None, :] - levels[:, None]) + _commutator(V, H * off_diagonal)
             commutators = commutators - (dS[n + self.bath] * H_commutators - omega[:, None, None] * V) / T
@@ -207,32 +211,32 @@ class ThermalJumps(Dissipation):
     has_generator = True
 
     def generator_field(self, system, x, dH):
-        """Lindblad's equation, and the heat that the bath takes."""
+        """Return Lindblad's equation, and the entropy rate of the bath."""
         structure, n = system.structure, system.body_dim
         rho, omega = self._to_jump_frame(structure.matrix(x[:n])), self._jump_frequencies(structure, dH[:n])
         T = jnp.asarray(jnp.inf) if self.is_isolated else dH[n + self.bath]
         strengths, boltzmann_factors = self._jump_strengths(omega, T), jnp.exp(omega / (2.0 * T))
         rates = jnp.concatenate([strengths * boltzmann_factors, strengths / boltzmann_factors])
-        # the Hermitian part has both terms of what is lost
+        # the Hermitian part, taken later, has both terms of the loss
         drho = _apply_jumps(self.jumps, rates, rho) - jnp.tensordot(rates, _adjoint_products(self.jumps), 1) @ rho
         return self._append_bath_entropy(system, dH, T, drho)
 
     def _check_rates(self, system) -> None:
-        """Raise InputError where rates at the first temperature of the bath cannot be computed with."""
+        """Raise InputError if double precision cannot represent the rates at the first temperature of the bath."""
         n, dH = system.body_dim, system.energy.gradient(jnp.zeros(system.dim))
         omega, T = self._jump_frequencies(system.structure, dH[:n]), dH[n + self.bath]
         strengths, energies = self._jump_strengths(omega, T), np.abs(np.asarray(omega))
         rates = np.asarray(strengths * jnp.exp(jnp.abs(omega) / (2.0 * T)))
         for jump, rate, w in zip(self.jumps, rates, energies, strict=True):
-            if w > -2.0 * np.log(EPS) * T and not rate * EPS <= w:  # not so by the rate that was given
+            if w > -2.0 * np.log(EPS) * T and not rate * EPS <= w:  # the exponential is to blame, not the rate
                 raise InputError(
-                    f"jumps of V[{jump.coupling_index}] that take the energy {w:.3g} from the system have, at T = {T:.3g}, "
-                    f"rate * exp(omega / 2T) = {rate:.3g}: no rate that doubles hold beside that energy. Give the rate "
-                    "as a function, such as lambda omega, T: g * jnp.exp(-omega / (2 * T)), or a higher temperature"
+                    f"jumps of V[{jump.coupling_index}] with the energy {w:.3g} have, at T = {T:.3g}, "
+                    f"rate * exp(omega / 2T) = {rate:.3g}, too large for double precision. Give the rate as a "
+                    "function, such as lambda omega, T: g * jnp.exp(-omega / (2 * T)), or a higher temperature"
                 )
 
     def _to_jump_frame(self, matrix):
-        """A matrix in the frame, in which most entries of the jumps are zero."""
+        """Return a matrix in the frame of the jumps, in which most of their entries are zero."""
         return (
             matrix
             if self.jump_frame is None
@@ -240,6 +244,7 @@ class ThermalJumps(Dissipation):
         )
 
     def _from_jump_frame(self, matrix):
+        """Return a matrix of the frame of the jumps in the basis of the system."""
         return (
             matrix
             if self.jump_frame is None
@@ -247,9 +252,9 @@ class ThermalJumps(Dissipation):
         )
 
     def _jump_frequencies(self, structure: mf.DensityMatrices, dH) -> jax.Array:
-        """The energies that the jumps take: linear in H, by tables that are known when programs are written.
+        """Return the energies omega of the jumps, shape (jumps,): linear in H, from tables known at trace time.
 
-        ``tr(H [V^H, V]) / tr(V^H V)``, the diagonal of H by differences of levels, which lose no digits.
+        ``tr(H [V^H, V]) / tr(V^H V)``, with the diagonal of H by differences of levels, which lose no digits.
         """
         operators, off_diagonal, levels = (
             _stack_operators(self.jumps),
@@ -264,14 +269,14 @@ class ThermalJumps(Dissipation):
         return omega + structure.vector(self._from_jump_frame(rest)) @ dH if rest.any() else omega
 
     def _energy_levels(self, structure: mf.DensityMatrices, dH) -> jax.Array:
-        """The diagonal of H in the frame, shape (N,)."""
+        """Return the diagonal of H in the frame of the jumps, shape (N,)."""
         if self.jump_frame is None:
             return dH[: structure.size]
         vectors = np.asarray(self.jump_frame).T
         return structure.vector(vectors[:, :, None] * vectors[:, None, :].conj()) @ dH
 
     def _append_bath_entropy(self, system, dH, T, drho) -> jax.Array:
-        """The coordinates of what the jumps do to rho, in the frame, and the entropy that the bath takes."""
+        """Return the coordinates of ``drho``, given in the frame of the jumps, followed by the bath entropy rates."""
         structure, n = system.structure, system.body_dim
         force = structure.vector(self._from_jump_frame(drho))
         if self.is_isolated:
@@ -280,7 +285,7 @@ class ThermalJumps(Dissipation):
         return jnp.concatenate([force, np.eye(system.dim - n)[self.bath] * entropy_rate])
 
     def _energy_rate(self, structure: mf.DensityMatrices, dH, drho, force) -> jax.Array:
-        """``tr(H moved)``, shape (), of a matrix of trace zero in the frame, and of its coordinates outside.
+        """Return ``tr(H drho)``, shape (), for drho of trace zero in the frame, and its coordinates ``force``.
 
         It is summed by parts, from differences of neighbouring levels and the populations that cross between them. So
         levels that no jump connects do not matter, however large their energies are.
@@ -297,6 +302,7 @@ class ThermalJumps(Dissipation):
         return rate + jnp.sum(((1.0 - np.eye(size)) * H.conj() * drho).real)
 
     def _jump_strengths(self, omega, T) -> jax.Array:
+        """Return the rate of each jump at its omega and T, times its weight, shape (jumps,)."""
         rates = [self.rates[jump.coupling_index] for jump in self.jumps]
         return jnp.stack(
             [
@@ -310,10 +316,10 @@ class SteepestEntropyAscent(Dissipation):
     """Steepest entropy ascent of an isolated quantum system [Beretta 1984].
 
     ``K = rate P^T L P`` with the metric ``L A = (rho A + A rho) / 2`` and P the projector, orthogonal for L, off the
-    energy, the trace and what else is preserved. An eigenvalue of rho that is zero stays zero: so a state keeps its
-    rank, and a pure state moves by the Hamiltonian alone. For such states take ``lt.VonNeumann(floor=...)``, and
-    ``lt.MetriplecticMidpoint``: it keeps the rank to rounding, the other methods to their order. A run does not start
-    where the Hamiltonian turns the eigenvectors of the eigenvalue zero, as those of most pure states: the error of a
+    energy, the trace and the other preserved functions. An eigenvalue of rho that is zero stays zero. So a state keeps
+    its rank, and a pure state moves by the Hamiltonian alone. For such states use ``lt.VonNeumann(floor=...)`` and
+    ``lt.MetriplecticMidpoint``, which keeps the rank to rounding; other methods keep it to their order. A run does not
+    start if the Hamiltonian rotates the eigenvectors of the eigenvalue zero, as for most pure states: the error of a
     step would grow there.
 
     Parameters
@@ -321,7 +327,7 @@ class SteepestEntropyAscent(Dissipation):
     rate : float, >= 0
         The rate gamma of the ascent (1 / time).
     preserve : list of matrices, shape (N, N), or of functions from rho, shape (N, N), to a scalar; optional
-        Observables ``tr(rho A)`` that are kept, or other functions.
+        Observables ``tr(rho A)``, or other functions, that are conserved.
     """
 
     rate: jax.Array
@@ -342,7 +348,7 @@ class SteepestEntropyAscent(Dissipation):
         return self
 
     def bind_to_structure(self, structure: mf.DensityMatrices) -> SteepestEntropyAscent:
-        """What it preserves as functions of states, whose structure is given."""
+        """Return this dissipation with its preserved functions as functions of state vectors."""
         functions = []
         for i, f in enumerate(self.preserved_functions):
             if isinstance(f, Operator):
@@ -364,12 +370,12 @@ class SteepestEntropyAscent(Dissipation):
         return jnp.pad(self.rate * force, (0, system.dim - system.body_dim))
 
     def ascent_direction(self, system, x, dH, dS, dL) -> jax.Array:
-        """``P dS``, shape (N^2,): the gradient of the entropy, less the part along what is preserved."""
+        """Return ``P dS``, shape (N^2,): the gradient of the entropy without its components along preserved ones."""
         frame, _ = self._constraint_frame(system, x, dH, dL)
         return frame.project_off(dS[: system.body_dim])
 
     def _constraint_frame(self, system, x, dH, dL) -> tuple[OrthonormalFrame, Callable]:
-        """The gradients of what is preserved, orthogonal for L, and L."""
+        """Return the frame of the preserved gradients, orthogonal for L, and the map L."""
         structure, n = system.structure, system.body_dim
         rho = positive_part(structure.matrix(x[:n]))  # a negative eigenvalue would fall ever faster
 
@@ -381,7 +387,7 @@ class SteepestEntropyAscent(Dissipation):
 
 
 class _Observable(eqx.Module):
-    """``tr(rho A)``, of a state whose first coordinates are those of rho."""
+    """The observable ``tr(rho A)`` of a state whose first coordinates are those of rho."""
 
     coordinates: jax.Array
 
@@ -390,30 +396,32 @@ class _Observable(eqx.Module):
 
 
 def require_density_structure(system, name: str) -> mf.DensityMatrices:
-    """The structure of a system of density matrices."""
+    """Return the structure of a system of density matrices; InputError for other systems."""
     structure = getattr(system, "structure", None)
     if not isinstance(structure, mf.DensityMatrices):
-        raise InputError(f"{name} acts on density matrices: use it in an lt.QuantumSystem")
+        raise InputError(f"{name} needs density matrices. Use it in an lt.QuantumSystem")
     return structure
 
 
 def checked_matrix(matrix, what: str) -> np.ndarray:
-    """A square complex matrix; that of a ``Qobj`` too, which is read by its ``full()``."""
+    """Return a square complex matrix, from an array or from the ``full()`` of a ``Qobj``."""
     array = np.asarray(matrix.full() if isinstance(matrix, HasMatrix) else matrix)
     if array.dtype.kind not in "fiuc" or array.ndim != 2 or array.shape[0] != array.shape[1] or not array.size:
-        raise InputError(f"{what} is a square matrix of numbers, not an array of {array.dtype}, shape {array.shape}")
+        raise InputError(
+            f"{what} must be a square matrix of numbers, got an array of {array.dtype}, shape {array.shape}"
+        )
     if not np.isfinite(array).all():
         raise InputError(f"{what} is not finite")
     return array.astype(complex)
 
 
 def checked_hermitian(matrix, what: str) -> np.ndarray:
-    """A Hermitian matrix."""
+    """Return a matrix, made exactly Hermitian; InputError if it is not Hermitian to rounding."""
     array = checked_matrix(matrix, what)
     residual, scale = float(np.abs(array - adjoint(array)).max()), float(np.abs(array).max())
     if residual > 1e-12 * scale:
         raise InputError(
-            f"{what} is not Hermitian: it differs from its adjoint by {residual:.3g}; its Hermitian part is "
+            f"{what} is not Hermitian: it differs from its adjoint by {residual:.3g}. Its Hermitian part is "
             "(A + A.conj().T) / 2"
         )
     return (array + adjoint(array)) / 2
@@ -424,15 +432,14 @@ def _commutator(a, b):
 
 
 GENERIC_WEIGHTS = (1.0, 0.7548776662466927, 0.5698402909980532)
-"""Weights of Hamiltonians in a sum whose eigenvectors are those of each, if they commute."""
+"""Weights in a sum of commuting Hamiltonians, chosen so that its eigenvectors are common to all of them."""
 
 
 def _common_eigenvectors(hamiltonians: Sequence[np.ndarray]) -> np.ndarray:
-    """The eigenvectors that Hamiltonians have in common, if they have any; those of diagonal matrices are the axes."""
+    """Return the common eigenvectors of Hamiltonians that commute; for diagonal matrices the axes."""
     scales = [np.abs(H).max() for H in hamiltonians]
-    triples = zip(
-        GENERIC_WEIGHTS, map(_subtract_common_energy, hamiltonians), scales, strict=False
-    )  # there may be fewer than weights
+    # There may be fewer Hamiltonians than weights.
+    triples = zip(GENERIC_WEIGHTS, map(_subtract_common_energy, hamiltonians), scales, strict=False)
     H = sum((w * H / (scale or 1.0) for w, H, scale in triples), np.zeros_like(hamiltonians[0]))
     return np.eye(len(H)) if _is_diagonal(H) else np.linalg.eigh(H)[1]
 
@@ -442,26 +449,26 @@ def _is_diagonal(H: np.ndarray) -> bool:
 
 
 def _stack_operators(jumps: tuple[Jump, ...]) -> np.ndarray:
-    """The matrices of jumps, real ones where they are."""
+    """Return the matrices of the jumps, shape (jumps, N, N), as real ones if possible."""
     operators = np.stack([np.asarray(jump.operator) for jump in jumps])
     return operators if operators.imag.any() else operators.real
 
 
 def _operators_and_adjoints(jumps: tuple[Jump, ...]) -> np.ndarray:
-    """The matrices of jumps, and then their adjoints."""
+    """Return the matrices of the jumps, followed by their adjoints, shape (2 jumps, N, N)."""
     operators = _stack_operators(jumps)
     return np.concatenate([operators, adjoint(operators)])
 
 
 @functools.lru_cache(maxsize=64)
 def _adjoint_products(jumps: tuple[Jump, ...]) -> np.ndarray:
-    """``V^H V`` of each jump, and then of each adjoint."""
+    """Return ``V^H V`` of each jump, followed by that of each adjoint."""
     matrices = _operators_and_adjoints(jumps)
     return adjoint(matrices) @ matrices
 
 
 def _apply_jumps(jumps: tuple[Jump, ...], rates, rho) -> jax.Array:
-    """``sum rate V rho V^H`` over the jumps and then their adjoints."""
+    """Return ``sum rate V rho V^H`` over the jumps and then their adjoints."""
     table = _jump_table(jumps)
     if table is None:
         matrices = _operators_and_adjoints(jumps)
@@ -472,9 +479,9 @@ def _apply_jumps(jumps: tuple[Jump, ...], rates, rho) -> jax.Array:
 
 @functools.lru_cache(maxsize=64)
 def _jump_table(jumps: tuple[Jump, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """The numbers of the jumps, the entries of rho and the factors that make up each entry of ``sum V rho V^H``.
+    """Return, for each entry of ``sum V rho V^H``, the jump numbers, the entries of rho and the factors of its terms.
 
-    None where products of matrices are shorter, as with a few full matrices.
+    None if products of matrices need fewer operations, as for a few full matrices.
     """
     matrices = _operators_and_adjoints(jumps)
     size = matrices.shape[-1]
@@ -487,9 +494,8 @@ def _jump_table(jumps: tuple[Jump, ...]) -> tuple[np.ndarray, np.ndarray, np.nda
     first_entry, second_entry, target = first_entry[order], second_entry[order], target[order]
     counts = np.bincount(target, minlength=size**2)
     table_position = target, np.arange(len(target)) - np.repeat(np.cumsum(counts) - counts, counts)
-    jump_numbers, rho_entries = np.zeros(
-        (2, size**2, counts.max()), np.uint32
-    )  # no sign: JAX then looks for no negative ones
+    # Unsigned, so that JAX does not test for negative indices.
+    jump_numbers, rho_entries = np.zeros((2, size**2, counts.max()), np.uint32)
     factors = np.zeros(jump_numbers.shape, matrices.dtype)
     jump_numbers[table_position], rho_entries[table_position] = (
         jump[first_entry],
@@ -503,7 +509,7 @@ def _jump_table(jumps: tuple[Jump, ...]) -> tuple[np.ndarray, np.ndarray, np.nda
 
 
 def _checked_rate_function(rate: Callable, i: int) -> Callable:
-    """A rate as a function of omega and T, tried where both are one."""
+    """Return a rate function of omega and T, tested at omega = T = 1."""
     what = f"the rate of V[{i}] is a number, or a function of omega and T to a number >= 0"
     try:
         value = rate(1.0, 1.0)
@@ -522,17 +528,17 @@ def _is_hermitian(V) -> bool:
 
 
 def _subtract_common_energy(H: np.ndarray) -> np.ndarray:
-    """A Hamiltonian less the energy that all levels have in common."""
+    """Return a Hamiltonian less the energy that all levels have in common."""
     return H - choose_reference_level(np.diag(H).real) * np.eye(len(H))
 
 
 def energy_rounding(H: np.ndarray) -> float:
-    """Largest difference between two differences of levels that are equal but for rounding."""
+    """Return the largest rounding difference between two equal differences of levels."""
     return ENERGY_RTOL * (1 if _is_diagonal(H) else len(H)) * float(np.linalg.norm(H, 2))
 
 
 def _is_commuting(H: np.ndarray, V: np.ndarray) -> bool:
-    """Whether two matrices commute but for rounding; a constant that is added to H makes no difference."""
+    """Return True if two matrices commute to rounding; a constant added to H makes no difference."""
     H = _subtract_common_energy(H)
     products = np.abs(H) @ np.abs(V) + np.abs(V) @ np.abs(H)
     return bool(np.abs(_commutator(H, V)).max() <= ENERGY_RTOL * len(H) * products.max())
@@ -541,9 +547,9 @@ def _is_commuting(H: np.ndarray, V: np.ndarray) -> bool:
 def _split_coupling(
     operator: Operator, coupling_index: int, hamiltonians: Sequence[np.ndarray], frame: np.ndarray
 ) -> list[Jump]:
-    """The eigenoperators of ``[H, .]`` at all times that a coupling is the sum of; of a Hermitian one up to adjoints.
+    """Split a coupling into eigenoperators of ``[H, .]`` at all times; for a Hermitian one, up to adjoints.
 
-    The entries of one have the same difference of levels, in the frame, under each of the Hamiltonians.
+    The entries of an eigenoperator have the same difference of levels, in the frame, under each of the Hamiltonians.
     """
     V = np.asarray(operator)
     V_framed = adjoint(frame) @ V @ frame
@@ -566,10 +572,10 @@ def _split_coupling(
         for H, omega, tolerance in zip(framed_hamiltonians, omegas, tolerances, strict=True):
             if not np.abs(_commutator(H, part) + omega * part).max() <= len(H) * tolerance * np.abs(part).max():
                 raise InputError(
-                    f"the coupling V[{coupling_index}] has no parts with [H, V] = -omega V at all times: the eigenvectors of "
-                    "the Hamiltonian turn. Jumps are for Hamiltonians whose eigenvalues alone depend on time"
+                    f"the coupling V[{coupling_index}] cannot be split into components with [H, V] = -omega V, "
+                    "since the eigenvectors of the Hamiltonian depend on time. Only its eigenvalues may"
                 )
-        part = part if sign >= 0.0 else adjoint(part)  # both act, and a rate is asked at a positive omega
+        part = part if sign >= 0.0 else adjoint(part)  # both act, and rates are evaluated at a positive omega
         jumps.append(Jump(Operator(part), coupling_index, 0.5 if is_hermitian and sign == 0.0 else 1.0))
     return jumps
 
@@ -577,7 +583,7 @@ def _split_coupling(
 def _entry_rounding(
     V_framed: np.ndarray, frame: np.ndarray, framed_hamiltonians: Sequence[np.ndarray], tolerances: Sequence[float]
 ) -> np.ndarray | float:
-    """The size up to which entries of a matrix in the frame may be rounding, shape (N, N), or zero in that of the axes.
+    """Return the bound, shape (N, N), below which entries of a matrix in the frame may be rounding; 0 for the axes.
 
     An eigenvector contains another one by the rounding of the energies, relative to their difference.
     """
@@ -589,12 +595,12 @@ def _entry_rounding(
         levels = np.diag(H).real
         level_gaps = np.abs(levels[:, None] - levels)
         rotation_bounds = np.minimum(rotation_bounds, tolerance / np.maximum(level_gaps, tolerance or 1.0))
-    rotation_bounds = np.where(rotation_bounds < 1.0, rotation_bounds, 0.0)  # those of one level may be any
+    rotation_bounds = np.where(rotation_bounds < 1.0, rotation_bounds, 0.0)  # eigenvectors of one level are arbitrary
     return ENERGY_RTOL * len(sizes) * sizes.max() + rotation_bounds @ sizes + sizes @ rotation_bounds
 
 
 def _cluster_labels(numbers: np.ndarray, tolerance: float) -> np.ndarray:
-    """The number of the cluster that each of some numbers belongs to: one begins beyond ``tolerance`` from the last."""
+    """Return the cluster of each number; a new cluster begins more than ``tolerance`` above the start of the last."""
     labels, cluster_start, label = np.empty(len(numbers), int), -np.inf, -1
     for i in np.argsort(numbers):
         if numbers[i] > cluster_start + tolerance:

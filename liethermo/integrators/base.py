@@ -60,7 +60,7 @@ class OneStepMethod(Module):
         retraction = getattr(self, "retraction", None)
         if not isinstance(retraction, mf.Retraction | None) and retraction not in tuple(RETRACTIONS):
             names = ", ".join(map(repr, RETRACTIONS))
-            raise InputError(f"retraction is a manifolds.Retraction, or the name of one ({names}), not {retraction!r}")
+            raise InputError(f"retraction must be a manifolds.Retraction or one of {names}, got {retraction!r}")
 
     # -- every method gives -------------------------------------------------------------------------------------------
 
@@ -247,9 +247,9 @@ class GaussMethod(OneStepMethod):
 
 
 WHY_FIXED_VARIATIONAL_STEP = (
-    "what a variational scheme keeps without holding it, such as the energy of a free motion, it keeps by steps of one "
-    "size alone, which conserve a function near it [Hairer, Lubich & Wanner 2006, VIII.1]; steps that follow an error "
-    "let it drift. Take a smaller fixed step, or lt.MetriplecticGauss where laws are to hold in long steps too"
+    "a variational scheme conserves a function near the energy only if all steps have one size [Hairer, Lubich & "
+    "Wanner 2006, VIII.1]; with adaptive steps the energy would drift. Use a smaller fixed step, or "
+    "lt.MetriplecticGauss if the laws have to hold in long steps too"
 )
 """Reason, for error messages, why variational schemes have steps of a fixed size."""
 
@@ -307,7 +307,7 @@ def pullback_method(method: OneStepMethod, local) -> OneStepMethod:
 def checked_stages(stages) -> int:
     """Return a number of Gauss nodes; raise InputError if there is no tableau for it."""
     if isinstance(stages, bool) or not isinstance(stages, int) or not 1 <= stages <= MAX_STAGES:
-        raise InputError(f"stages is an integer from 1 to {MAX_STAGES}, not {stages!r}")
+        raise InputError(f"stages must be an integer from 1 to {MAX_STAGES}, got {stages!r}")
     return stages
 
 
@@ -319,7 +319,9 @@ def kind_name(system) -> str:
 def checked_step_size(h) -> jax.Array:
     """Return the step size of a run as a finite scalar that is not zero."""
     h = check_numbers(h, "the step h", ())
-    require_condition(h, lambda h: (abs(h) > 0.0) & (abs(h) < np.inf), "the step h is finite and not zero, not {value}")
+    require_condition(
+        h, lambda h: (abs(h) > 0.0) & (abs(h) < np.inf), "the step h must be finite and not zero, got {value}"
+    )
     return h
 
 
@@ -327,7 +329,7 @@ def checked_run_states(system: System, x) -> jax.Array:
     """Return the states of a run, shape (times, n), at least two."""
     x = system.state(x, batch=True)
     if x.ndim != 2 or len(x) < 2:
-        raise InputError(f"x has the states of a run, at least two, shape (times, {system.dim}), not {x.shape}")
+        raise InputError(f"x must have at least two states of a run, shape (times, {system.dim}), got {x.shape}")
     return x
 
 

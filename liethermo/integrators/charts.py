@@ -91,8 +91,8 @@ class InCharts(MethodWrapper):
             return self.method.why_step_failed(system, x, k, h)
         radius = self.retraction.space.injectivity_radius(system.points(x))
         return (
-            f"the last step was {domain_fraction:.3g} times as long as the domain of {self.retraction} allows (injectivity "
-            f"radius {radius:.6g}), and none may be longer: try a step of {0.25 * h / domain_fraction:.2g}"
+            f"the last step was {domain_fraction:.3g} times as long as the domain of {self.retraction} allows "
+            f"(injectivity radius {radius:.6g}). Try a step of {0.25 * h / domain_fraction:.2g}"
         )
 
     def _domain_fraction(self, system: System, x, v) -> jax.Array:
@@ -148,7 +148,7 @@ class InCharts(MethodWrapper):
     def predict(self, k, before) -> jax.Array:
         if self.explicit or self.stages == 1:
             return self.method.predict(k, before)
-        return 2.0 * k - before  # whatever the method's own: the chart has changed
+        return 2.0 * k - before  # the extrapolation of the method does not apply: the chart has changed
 
     def __str__(self) -> str:
         return f"{self.method} with {self.retraction}"
@@ -179,7 +179,7 @@ def wrap_in_charts(
     """
     if system.space is None:
         if retraction is not None:
-            raise InputError("a retraction is for a system on a manifold, and this one is on R^n")
+            raise InputError("retraction= needs a system on a manifold, and this one is on R^n. Leave retraction= out")
         return method
     if retraction is None:
         retraction = default if system.space.has_geodesics else "projection"
@@ -190,5 +190,5 @@ def resolve_retraction(space: mf.Space, name_or_retraction: str | mf.Retraction)
     """Return a retraction of the space, from its name or unchanged."""
     retraction = mf.retraction(space, name_or_retraction) if isinstance(name_or_retraction, str) else name_or_retraction
     if retraction.space != space:
-        raise InputError(f"the retraction is one of {retraction.space.name}, not of {space.name}")
+        raise InputError(f"the retraction belongs to {retraction.space.name}, but the system is on {space.name}")
     return retraction

@@ -66,8 +66,8 @@ MAX_DRIFT_CORRECTION = 0.25 * EPS
 MAX_CORRECTION_DISPLACEMENT = 1e-10
 """Largest displacement of a drift correction, relative to the state; larger ones are skipped.
 
-A larger displacement means that the gradients of the laws are nearly parallel, as at an equilibrium. The levels then have
-hardly any common point, and the initial levels may have none."""
+A larger displacement means that the gradients of the laws are nearly parallel, as at an equilibrium. The levels then
+have hardly any common point, and the initial levels may have none."""
 
 
 class UncorrectedStep(NamedTuple):
@@ -174,7 +174,8 @@ class ExplicitMethod(TransportingMethod):
         error. Momenta of internal parts, such as a wheel with friction, do not matter for the attitude.
         """
         orbit_dim, casimirs = system.orbit_levels
-        casimirs_are_held = system.has_impulse or casimirs <= set(self.held)  # of a torque, the impulse is made to fit
+        # With a torque, the impulse is projected onto the orbit instead.
+        casimirs_are_held = system.has_impulse or casimirs <= set(self.held)
         return system.has_all_casimirs and casimirs_are_held and orbit_dim - len(casimirs) <= 2
 
     def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
@@ -184,7 +185,7 @@ class ExplicitMethod(TransportingMethod):
         method = wrap_in_charts(method_on_states, system, self.retraction, "exp")
         if isinstance(method, InCharts) and not isinstance(method.retraction, mf.Chart):
             raise InputError(
-                f"{self} needs a retraction with its base point where the step starts, not {method.retraction}"
+                f"{self} needs a retraction with its base point at the start of the step, got {method.retraction}"
             )
         return method
 
@@ -198,7 +199,9 @@ class ExplicitMethod(TransportingMethod):
     def check(self, system: System) -> None:
         """Raise InputError unless the system has a law to hold and conserves the functions that are to be preserved."""
         if not self._laws(system):
-            raise InputError(f"{self} holds the laws of a system, and this one claims none: take lt.Reference")
+            raise InputError(
+                f"{self} needs a system with an energy or entropy law, and this one has none. Use lt.Reference"
+            )
         check_preserved(system, self.functions)
 
     def start(self, system: System, x) -> jax.Array:
@@ -237,7 +240,7 @@ class ExplicitMethod(TransportingMethod):
         )
         if leaf:
             d, error, interpolation_rows = d[n:], error[:n], interpolation_rows[:, :n]
-        if not isinstance(system, ChartSystem):  # whose row of levels is new at every step
+        if not isinstance(system, ChartSystem):  # in charts the initial levels are new at every step
             changes = changes + self._drift_correction(
                 system, laws, start_gradients, x, compensation, k[StepRow.INITIAL_LEVELS], leaf
             )
@@ -393,8 +396,8 @@ class ExplicitMethod(TransportingMethod):
         if not bool(jnp.isfinite(system.vector_field(jnp.asarray(x))).all()):
             return ""
         return (
-            f"the stages of a step of {h:g} run away, or leave the domain of the functions: it is too long for an "
-            "explicit method; lt.MetriplecticGauss takes longer ones of a stiff system"
+            f"the step h = {h:g} is too long for an explicit method: its stages diverge or leave the domain of the "
+            "functions. Try a smaller step, or lt.MetriplecticGauss if the system is stiff"
         )
 
     def __str__(self) -> str:

@@ -100,7 +100,7 @@ class StochasticMidpoint(MethodWrapper, TransportingMethod):
         ]
         if not rotations or not isinstance(system, SpinSystem):
             return slope[None]
-        # The same solution, in a fraction of the iterations: of many spins some are turned far in every step.
+        # Solve for the rotation by noise at once: among many spins some rotate far, and the iteration would be slow.
         return (k[0] + system.solve_rotation(0.5 * h * sum(rotations), slope - k[0]))[None]
 
     def stage_velocities(self, system: System, x, compensation, h, k) -> jax.Array:
@@ -147,8 +147,8 @@ class StochasticMidpoint(MethodWrapper, TransportingMethod):
         residual = np.nanmax(_sampled_noise_tests(system)[0], initial=0.0)
         if not residual <= FACTOR_RTOL:
             raise InputError(
-                f"the factor B that a dissipation gives is none of its friction matrix K: B B^T dS misses K dS "
-                f"by {residual:.3g} of its size (tolerance {FACTOR_RTOL:.0g})"
+                f"B B^T does not equal the friction matrix K: B B^T dS differs from K dS by a relative error of "
+                f"{residual:.3g} (tolerance {FACTOR_RTOL:.0g}). Correct Dissipation.factor"
             )
 
     def __str__(self) -> str:
@@ -181,9 +181,9 @@ def add_noise(
         If the system has no fluctuations, or the method cannot have any.
     """
     if not isinstance(method, MetriplecticMidpoint):
-        raise InputError(f"steps with noise are those of lt.MetriplecticMidpoint, and {method} has none")
+        raise InputError(f"noise= works only with lt.MetriplecticMidpoint, got {method}")
     if system.dissipation is None or all(part.is_noiseless for part in system.dissipation.terms):
-        raise InputError("noise belongs to a dissipation, and this system has none")
+        raise InputError("noise= needs a system with a dissipation that has noise, and this one has none")
     lowering_terms = [part for part in system.dissipation.terms if part.energy_law != "conserved"]
     if lowering_terms and temperature is None:
         raise InputError(
@@ -191,7 +191,9 @@ def add_noise(
             "lt.Fluctuations(boltzmann, seed, temperature=...)"
         )
     if temperature is not None and not lowering_terms:
-        raise InputError("the dissipation keeps the energy, so there is no bath that could have a temperature")
+        raise InputError(
+            "temperature= needs a dissipation that lowers the energy, and this one conserves it. Leave it out"
+        )
     T = 1.0 if temperature is None else temperature
     return StochasticMidpoint(
         method,
@@ -250,7 +252,7 @@ def _noise_tests(system: System, x):
     """Return the residual of ``B B^T = K``, and for each function the pair (change by noise, scale of that change)."""
     assert system.dissipation is not None
     B = concatenate_factors([B for _, B in terms_with_continuous_factors(system.dissipation, system, x)])
-    # they see columns as large as any
+    # The scale is the largest product with generic covectors, which none of the columns is orthogonal to.
     max_product = jnp.max(
         jnp.stack([jnp.max(jnp.abs(B.transpose_times(covector))) for covector in generic_covectors(x.shape[0], 2)])
     )

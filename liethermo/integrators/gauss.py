@@ -155,7 +155,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         if np.linalg.matrix_rank(gradients, tol=1e-9).max() >= system.dim:
             raise InputError(
                 f"energy, entropy and {len(self.functions)} preserved functions are independent and leave no room to "
-                f"move in {system.dim} dimensions"
+                f"move in {system.dim} dimensions. Preserve fewer functions"
             )
 
     # -- the stage equations ------------------------------------------------------------------------------------------

@@ -85,9 +85,11 @@ class DiscreteHerglotz(OneStepMethod):
 
     def __init__(self, discrete_lagrangian: Callable, order: Literal[1, 2, 4] = 1):
         if order not in tuple(SUBSTEPS):
-            raise InputError(f"the order is 1, 2 or 4, not {order!r}")
+            raise InputError(f"order must be 1, 2 or 4, got {order!r}")
         if not callable(discrete_lagrangian):
-            raise InputError(f"a discrete Lagrangian is a function of (q_0, q_1, S_0, h), not {discrete_lagrangian!r}")
+            raise InputError(
+                f"the discrete Lagrangian must be a function of (q_0, q_1, S_0, h), got {discrete_lagrangian!r}"
+            )
         self.discrete_lagrangian, self.composed = discrete_lagrangian, order
 
     @classmethod
@@ -135,7 +137,7 @@ class DiscreteHerglotz(OneStepMethod):
         """Raise InputError unless the state has the form (q, p, S)."""
         system = _manifold_system(system)
         if not isinstance(system, EvolutionSystem):
-            raise InputError(f"DiscreteHerglotz runs an lt.EvolutionSystem, not a {system.kind}")
+            raise InputError(f"DiscreteHerglotz needs an lt.EvolutionSystem, got a {system.kind}")
         space = system.configurations
         self._check_action((system.dim // 2,) if space is None else space.shape)
 
@@ -211,7 +213,7 @@ def _newton_velocity(residual: Callable, contact: mf.SplitContact, q, h, velocit
     if isinstance(contact.bundle, mf.TangentBundle):
         surface, mass = ConstraintSurface(contact.bundle.base, tangent=True), jnp.max(jnp.abs(A))
 
-        def distance_from_manifold(v):  # how far its end is off Q, as a momentum
+        def distance_from_manifold(v):  # times a mass, so that it is a momentum
             return mass * surface._correction_displacement(q, surface._constraint_change(q, 0.0, h * v) / h)
 
         A = jax.vmap(lambda column: contact.tangential_part(q, column), in_axes=1, out_axes=1)(A) + jax.jacfwd(

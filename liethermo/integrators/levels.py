@@ -242,7 +242,7 @@ def project_onto_levels(
         *apply_correction(ProjectionState(start_d, jnp.zeros(()), zero_residual, zero_residual, start_correction))
     )
     is_near = residual_length(s, jnp.where(signs == 0.0, 0.0, jnp.inf)) <= MAX_RELAXED_RESIDUAL * jnp.linalg.norm(s.d)
-    s, last_gradients = apply_correction(s)  # of a short step one correction is enough
+    s, last_gradients = apply_correction(s)  # one correction is enough for a short step
     has_converged = is_converged(s)
 
     n_conserved = sum(law.sign == 0.0 for law in laws)
@@ -273,7 +273,7 @@ def correction_directions(system: System, x, gradients: Sequence[jax.Array], lea
 
 def _leaf_direction(system: System, x, gradient) -> jax.Array:
     """Return ``Pi(x) gradient``, shape (n,); zero if it is only rounding, as at a state at rest on its leaf."""
-    direction, n = system.poisson.sharp(x, gradient), system.body_dim  # behind which a clock and work have other units
+    direction, n = system.poisson.sharp(x, gradient), system.body_dim  # a clock and work have other units
     is_at_rest = jnp.linalg.norm(direction[:n]) <= REST_RTOL * jnp.linalg.norm(x[:n]) * jnp.linalg.norm(gradient[:n])
     return jnp.where(is_at_rest & (jnp.arange(direction.size) < n), 0.0, direction)
 

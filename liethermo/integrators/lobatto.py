@@ -37,7 +37,7 @@ LOBATTO_ORDERS = (4, 6, 8)
 @functools.cache
 def lobatto_rule(nodes: int) -> tuple[np.ndarray, np.ndarray]:
     """Return nodes (with both ends) and weights on [0, 1]: exact to degree ``2 nodes - 3``, all weights positive."""
-    m = nodes - 1  # the inner ones are the roots of P_m'
+    m = nodes - 1  # the inner nodes are the roots of P_m'
     x = np.polynomial.legendre.Legendre.basis(m).deriv().roots().astype(np.longdouble)
     for _ in range(3):  # Newton's method from double precision
         values, previous_values = _legendre_value(m, x), _legendre_value(m - 1, x)
@@ -59,7 +59,7 @@ def lobatto_tableau(order: int) -> ExplicitTableau:
     d, q = _error_weights(A, order)
     powers = [np.ones(len(b))]
     for _ in range(order):
-        powers.append(A @ powers[-1])  # A^n 1, what a linear equation asks of the weights at order n + 1
+        powers.append(A @ powers[-1])  # A^n 1: for a linear equation, order n + 1 means b . A^n 1 = 1 / (n + 1)!
     order_residual = abs(1.0 / np.prod(np.arange(1.0, order + 2)) - b @ powers[order])
     linear_response = abs(d @ powers[q])
     assert linear_response > 0.0
@@ -74,7 +74,7 @@ def _error_weights(A: np.ndarray, order: int) -> tuple[np.ndarray, int]:
         _, singular_values, right_vectors = np.linalg.svd(conditions)
         null_space = right_vectors[np.sum(singular_values > 1e-10 * singular_values[0]) :]
         power = np.linalg.matrix_power(A, q) @ np.ones(len(A))
-        response = null_space @ power  # of all such weights those that see most of a linear equation
+        response = null_space @ power  # choose the weights with the largest response to a linear equation
         if np.linalg.norm(response) > 1e-8 * np.linalg.norm(power):
             weights_and_order = response @ null_space / np.linalg.norm(response), q
             break

@@ -71,16 +71,14 @@ class WithAttitude(MethodWrapper):
 
     def __check_init__(self):
         if self.kind not in RECONSTRUCTIONS:
-            raise InputError(f"the reconstruction is {', '.join(map(repr, RECONSTRUCTIONS))}, not {self.kind!r}")
+            raise InputError(f"reconstruction must be {', '.join(map(repr, RECONSTRUCTIONS))}, got {self.kind!r}")
 
     @property
     def _transporting_method(self) -> TransportingMethod:
         """The inner method; InputError if it does not give the velocities with which it moves a body."""
         if isinstance(self.method, TransportingMethod):
             return self.method
-        raise InputError(
-            f"{self.method} does not say which velocities it moves with, so attitudes cannot be reconstructed"
-        )
+        raise InputError(f"{self.method} does not give its stage velocities, so attitudes cannot be reconstructed")
 
     def preserves_function(self, system, name: str) -> bool:
         if name not in (SPATIAL_MOMENTUM, MOMENTUM_LESS_IMPULSE):
@@ -173,7 +171,7 @@ class WithAttitude(MethodWrapper):
             )
             if keeps_orbit:
                 p, p_compensation = _project_onto_orbit(system.momentum_system, p, new_mu), jnp.zeros_like(p)
-        else:  # that of the start of the run, since the roundings of steps would add up
+        else:  # use the spatial momentum at the start of the run: the roundings of steps would add up
             p = k[StepRow.INITIAL_LEVELS, system.body.dim : system.body.dim + n]
         if keeps_orbit:
             new_g = _align_attitude(group, new_g, p, new_mu[:n])
@@ -212,7 +210,9 @@ class WithAttitude(MethodWrapper):
         if self.kind == "cayley":
             attitudes = (g + g_compensation) @ _collocation_stages(group.algebra.hat(xi))
         else:
-            attitudes = 0.5 * (g + g @ self._attitude_increment(group, xi))[None]  # the same from either end
+            attitudes = (
+                0.5 * (g + g @ self._attitude_increment(group, xi))[None]
+            )  # the midpoint is the same from both ends
         for _ in range(RESTORE_STEPS):
             attitudes = group.restore_map(attitudes)
         return attitudes
@@ -262,7 +262,7 @@ class WithAttitude(MethodWrapper):
         Each sweep of the iteration gains a power of h; there is one more sweep than the order needs.
         """
         tableau, k = gauss_tableau(len(xi)), xi
-        for _ in range(2 * len(xi) - 1 if len(xi) > 1 else 0):  # of one stage k is xi, which commutes with itself
+        for _ in range(2 * len(xi) - 1 if len(xi) > 1 else 0):  # with one stage k is xi, which commutes with itself
             k = inverse_dexp(algebra, tableau.A @ k, xi, self.order)
         return k
 
@@ -316,8 +316,8 @@ MAX_NEWTON_ITERATIONS = 3
 NEWTON_DAMPING = 1e-8
 """Number added to the diagonal of a matrix that may be singular, relative to its largest entry.
 
-A Newton step leaves this fraction of the residual, or its square. It is also the residual below which no further step is
-taken."""
+A Newton step leaves this fraction of the residual, or its square. It is also the residual below which no further
+step is taken."""
 
 
 def _project_onto_orbit(momenta, p, mu) -> jax.Array:

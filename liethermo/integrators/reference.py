@@ -43,9 +43,9 @@ class Reference:
 
     def __post_init__(self):
         if not 0.0 < self.rtol < 1.0:
-            raise InputError(f"rtol lies between 0 and 1, not at {self.rtol}")
+            raise InputError(f"rtol must be between 0 and 1, got {self.rtol}")
         if self.scheme not in ("DOP853", "RK45", "RK23", "Radau", "BDF", "LSODA"):
-            raise InputError(f"no SciPy scheme {self.scheme!r}; take DOP853, RK45, RK23, Radau, BDF or LSODA")
+            raise InputError(f"scheme must be DOP853, RK45, RK23, Radau, BDF or LSODA, got {self.scheme!r}")
 
     def trajectory(self, system: System, x0: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, int, str, bool]:
         """Integrate with SciPy; return (states, shape (times reached, n), field evaluations, message, was interrupted).

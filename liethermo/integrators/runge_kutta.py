@@ -72,7 +72,7 @@ class MetriplecticRungeKutta(ExplicitMethod):
         held: tuple[str, ...] = (),
     ):
         if type(order) is not int or order not in LOBATTO_ORDERS:
-            raise InputError(f"the order is 4, 6 or 8, not {order!r}")
+            raise InputError(f"order must be 4, 6 or 8, got {order!r}")
         super().__init__(order, preserve, retraction, held)
 
     stages = END_SLOPE_ROW + 1
@@ -99,7 +99,7 @@ class MetriplecticRungeKutta(ExplicitMethod):
         """
         laws, t = self._laws(system), self.tableau
 
-        @jax.checkpoint  # what is computed again is not carried from step to step: a shorter program, and faster
+        @jax.checkpoint  # recomputing is faster than storing from step to step, and the program is shorter
         def field_and_law_rates(x) -> tuple[jax.Array, jax.Array]:
             """Return the field, and the rates of the laws by the whole field (the motion adds rounding alone)."""
             dH = system.energy.gradient(x)

@@ -78,7 +78,7 @@ class MetriplecticTaylor(ExplicitMethod):
         held: tuple[str, ...] = (),
     ):
         if order is not None and (type(order) is not int or not MIN_ORDER <= order <= MAX_ORDER):
-            raise InputError(f"the order is an integer from {MIN_ORDER} to {MAX_ORDER}, or None, not {order!r}")
+            raise InputError(f"order must be an integer from {MIN_ORDER} to {MAX_ORDER} or None, got {order!r}")
         super().__init__(order, preserve, retraction, held)
 
     def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
@@ -140,7 +140,9 @@ class MetriplecticTaylor(ExplicitMethod):
     def base_step(self, rates: Callable, skip_law_rates: bool, x, compensation, h) -> UncorrectedStep:
         nodes, b = self._lobatto_rule
         powers = np.arange(1.0, self.order + 1.0)
-        c = taylor_coefficients(lambda y: rates(y)[0], x, h, self.order)  # from the centre of a chart, exactly
+        c = taylor_coefficients(
+            lambda y: rates(y)[0], x, h, self.order
+        )  # compensation is left out: in a chart x is its centre, exactly
         points = jnp.concatenate([x[None], x + (compensation + nodes[1:, None] ** powers @ c)])
         fields, law_rates = jax.vmap(rates)(points[-1:] if skip_law_rates else points)
         residual, changes = fields[-1] - (powers @ c) / h, law_rates[-1] if skip_law_rates else h * (b @ law_rates)

@@ -52,7 +52,7 @@ class ComposedVariational(MethodWrapper):
                 + map_weights[0] * values[0]
             )
 
-        # the points of the maps, with a momentum of its own each
+        # the points of the maps, each with its own momentum
         displacements = [
             (h * map_fractions(system, map) * k[0]).at[p].set(h * row[p]) for map, row in zip(maps, k[1:], strict=True)
         ]
@@ -63,7 +63,7 @@ class ComposedVariational(MethodWrapper):
         rates = []
         for point, dH in zip(points, gradients, strict=True):
             rate = jnp.zeros_like(x).at[p].set(-dH[q])
-            if system.dissipation is not None:  # with temperatures that are the same at all points
+            if system.dissipation is not None:  # with the mean temperatures at all points
                 rate = rate + system.dissipation.force(system, point, dH.at[S].set(temperatures), dS, ())
             rates.append(rate)
         step = mean(rates)

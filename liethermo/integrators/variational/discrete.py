@@ -54,9 +54,9 @@ class FiniteDifference(Module):
         beta = alpha if beta is None else beta
         for name, value in (("alpha", alpha), ("beta", beta)):
             if not isinstance(value, int | float | np.number) or not 0.0 <= value <= 1.0:
-                raise InputError(f"{name} says where between two points a map looks: from 0 to 1, not {value!r}")
+                raise InputError(f"{name} must be between 0 and 1, got {value!r}")
         if not isinstance(weight, int | float | np.number) or not 0.0 < weight < np.inf:
-            raise InputError(f"the weight of a finite difference map must be > 0 and finite, not {weight!r}")
+            raise InputError(f"the weight of a finite difference map must be > 0 and finite, got {weight!r}")
         self.alpha, self.beta, self.weight = float(alpha), float(beta), float(weight)
 
     def position(self, q0, V, h) -> jax.Array:

@@ -56,7 +56,7 @@ class LieVariational(OneStepMethod):
 
     def __init__(self, tau: Literal["cayley", "exp"] = "cayley"):
         if tau not in ("cayley", "exp"):
-            raise InputError(f"tau is 'cayley' or 'exp', not {tau!r}")
+            raise InputError(f"tau must be 'cayley' or 'exp', got {tau!r}")
         self.tau = tau
 
     def __str__(self) -> str:
@@ -73,7 +73,7 @@ class LieVariational(OneStepMethod):
     def check(self, system: System) -> None:
         """Raise InputError if the system has the wrong kind, or its algebra has no group by the Cayley map."""
         if not isinstance(system, EulerPoincareClosedSystem):
-            raise InputError(f"LieVariational runs an lt.EulerPoincareClosedSystem, not a {kind_name(system)}")
+            raise InputError(f"LieVariational needs an lt.EulerPoincareClosedSystem, got a {kind_name(system)}")
         algebra = system.algebra
         if self.tau == "exp":
             return
@@ -136,9 +136,7 @@ class LieVariational(OneStepMethod):
         increments = np.asarray(_group_increments(self, system, checked_run_states(system, x), checked_step_size(h)))
         matrix_size = increments.shape[-1]
         g0 = np.eye(matrix_size) if start is None else square_matrices(start, matrix_size, "start")
-        require_condition(
-            g0, np.isfinite, "start is an element of the group, and has entries that are not finite: {value}"
-        )
+        require_condition(g0, np.isfinite, "start must be finite, got the entry {value}")
         elements = [np.asarray(g0)]
         for increment in increments:
             elements.append(elements[-1] @ increment)
@@ -152,7 +150,7 @@ class _LieStep(NamedTuple):
     tau: str
     S0: jax.Array
     h: jax.Array
-    t: jax.Array  # when it begins
+    t: jax.Array
 
     def _midpoint(self, y) -> tuple[jax.Array, jax.Array, jax.Array]:
         return y[:-1], self.S0 + 0.5 * self.h * y[-1], self.t + 0.5 * self.h

@@ -159,12 +159,14 @@ class VariationalIntegrator(OneStepMethod):
         if isinstance(system, EmbeddedSystem) and isinstance(system.manifold, SimpleClosedSystem):
             if any(type(map) is not FiniteDifference for map in (*self.phi, *self.forces, *self.constraint)):
                 raise InputError(
-                    "on a manifold a finite difference map looks at a curve of the space: give an lt.FiniteDifference "
-                    "and a retraction, no subclass of it"
+                    "on a manifold the maps must be lt.FiniteDifference itself, no subclass: they are evaluated on a "
+                    "curve of the space, which retraction= determines"
                 )
             self.curve(system.manifold)
         elif self.retraction is not None:
-            raise InputError(f"a {system.kind} without a manifold of positions takes no retraction: leave it out")
+            raise InputError(
+                f"retraction= needs a manifold of positions, and this {system.kind} has none. Leave retraction= out"
+            )
         elif isinstance(system, ComposedSystem):
             self._check_bodies(system)
         else:
@@ -172,13 +174,15 @@ class VariationalIntegrator(OneStepMethod):
 
     def _check_bodies(self, system: ComposedSystem) -> None:
         if not (self.phi == self.forces == self.constraint):
-            raise InputError(f"{self} has other maps for forces or the constraint: for several bodies all are phi")
+            raise InputError(f"for several bodies the maps of forces and constraint must be phi, and {self} has others")
         if any(type(map) is not FiniteDifference for map in self.phi):
-            raise InputError(f"{self} has finite difference maps of its own: several bodies take lt.FiniteDifference")
+            raise InputError(
+                f"for several bodies the maps must be lt.FiniteDifference itself, and {self} has a subclass"
+            )
         if len(self.phi) > 1 and system.poisson.species:
             raise InputError(
-                f"{self} takes means over several finite difference maps, and bodies that exchange particles run by "
-                "one: take lt.VariationalIntegrator.midpoint() or .verlet()"
+                f"bodies that exchange particles need a single finite difference map, and {self} has several. Use "
+                "lt.VariationalIntegrator.midpoint() or .verlet()"
             )
 
     def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
@@ -251,7 +255,7 @@ class VariationalIntegrator(OneStepMethod):
             q0, q1 = (space.to_vector(space.point(q)) for q in (q0, q1))
         q0, q1 = jnp.atleast_1d(check_numbers(q0, "q0")), jnp.atleast_1d(check_numbers(q1, "q1"))
         if not q0.shape == q1.shape == (system.degrees_of_freedom,):
-            raise InputError(f"q0 and q1 have shape ({system.degrees_of_freedom},), not {q0.shape} and {q1.shape}")
+            raise InputError(f"q0 and q1 must have shape ({system.degrees_of_freedom},), got {q0.shape} and {q1.shape}")
         discrete, S0 = (
             self.discrete_system(system, checked_step_size(h), check_numbers(t, "t", ())),
             check_numbers(S0, "S0", ()),
@@ -260,8 +264,8 @@ class VariationalIntegrator(OneStepMethod):
         residual, scale = (float(a) for a in _constraint_residual(discrete, q0, q1, S0, S1_used))
         if not residual <= CONSTRAINT_TOLERANCE * scale:
             raise InputError(
-                f"this first step is not on the discrete constraint: |P_d| = {residual:.3g} between a heat and a work of "
-                f"{scale:.3g} (tolerance {CONSTRAINT_TOLERANCE:.0e} of it). "
+                f"this first step is not on the discrete constraint: |P_d| = {residual:.3g}, with heat and work of "
+                f"{scale:.3g} (relative tolerance {CONSTRAINT_TOLERANCE:.0e}). "
                 + (
                     "The temperature may be negative there"
                     if S1 is None
@@ -271,7 +275,7 @@ class VariationalIntegrator(OneStepMethod):
         p0 = discrete.momenta(q0, q1, S0, S1_used)[0]
         v0 = velocity_from_momentum(system, q0, S0, p0, (q1 - q0) / h)
         if not bool(jnp.isfinite(v0).all()):
-            raise InputError(f"no velocity was found that has the momentum {np.asarray(p0)} of this first step")
+            raise InputError(f"no velocity has the momentum {np.asarray(p0)} of this first step")
         ledger = jnp.array([0.0, 0.0, t]) if system.has_ledger else jnp.zeros(0)
         return np.concatenate([q0, v0, S0[None], ledger])
 
@@ -308,8 +312,9 @@ class VariationalIntegrator(OneStepMethod):
         if singular_values[0] < SINGULAR_CONDITION_NUMBER * singular_values[-1]:
             return ""
         return (
-            f"the regularity matrix (3.13) is singular: of its singular values, rows scaled to 1, the least is "
-            f"{singular_values[-1]:.2g}. The discrete Lagrangian does not determine the step: take another step size or scheme"
+            f"the regularity matrix (3.13) is singular: with rows scaled to 1, its smallest singular value is "
+            f"{singular_values[-1]:.2g}. The discrete Lagrangian does not determine the step. Use another step size or "
+            "scheme"
         )
 
 
@@ -337,9 +342,11 @@ SYMMETRIC_RETRACTION_TYPES = (
 
 def require_simple_closed(system: System, name: str) -> None:
     if isinstance(system, EmbeddedSystem):
-        raise InputError(f"{name} runs on R^n: on a manifold take lt.VariationalIntegrator or a metriplectic method")
+        raise InputError(
+            f"{name} runs only on R^n. On a manifold use lt.VariationalIntegrator or a metriplectic method"
+        )
     if not isinstance(system, SimpleClosedSystem):
-        raise InputError(f"{name} runs an lt.SimpleClosedSystem, not a {kind_name(system)}")
+        raise InputError(f"{name} needs an lt.SimpleClosedSystem, got a {kind_name(system)}")
 
 
 SCHEMES: dict[str, tuple[FiniteDifference, ...]] = {
@@ -356,7 +363,7 @@ def _checked_maps(maps: Maps, what: str) -> tuple[FiniteDifference, ...]:
     if not map_tuple or not all(isinstance(map, FiniteDifference) for map in map_tuple):
         raise InputError(
             f"{what} must be an lt.FiniteDifference, a sequence of them, or one of {', '.join(map(repr, SCHEMES))}, "
-            f"not {maps!r}"
+            f"got {maps!r}"
         )
     return map_tuple
 

@@ -232,9 +232,9 @@ def test_a_list_of_dissipations_is_their_sum(parts):
     [
         ([], "dissipation is an empty list"),
         ((), "dissipation is an empty list"),
-        ([lt.DoubleBracket(0.1), None], r"dissipation\[1\] must be a Dissipation of this library, not NoneType"),
-        ([[lt.DoubleBracket(0.1)]], r"dissipation\[0\] must be a Dissipation of this library, not list"),
-        ("friction", "a list of them or None, not str"),
+        ([lt.DoubleBracket(0.1), None], r"dissipation\[1\] must be a Dissipation of this library, got NoneType"),
+        ([[lt.DoubleBracket(0.1)]], r"dissipation\[0\] must be a Dissipation of this library, got list"),
+        ("friction", "a list of them or None, got str"),
         ([lt.DoubleBracket(0.1), lt.KillingDissipation(0.1)], "KillingDissipation drives the entropy up"),
     ],
 )
@@ -373,7 +373,7 @@ def test_functions_of_the_state_are_not_repaired_either(dissipation, words):
         (lambda: lt.FourBracket(np.ones((2, 2, 2, 2))), lt.InputError, r"R\[i,j,k,l\] = -R\[j,i,k,l\]"),
         (lambda: lt.FourBracket(np.ones((2, 2, 2))), lt.InputError, r"\(n, n, n, n\)"),
         (lambda: lt.FrictionOperator(-np.eye(2)), lt.IndefiniteError, "friction operator"),
-        (lambda: lt.InnerProductDissipation(lambda x: np.eye(3)), lt.InputError, "a constant matrix, not a function"),
+        (lambda: lt.InnerProductDissipation(lambda x: np.eye(3)), lt.InputError, "a constant matrix, got a function"),
         (lambda: lt.DoubleBracket(metric=-np.eye(2)), lt.IndefiniteError, "metric"),
     ],
 )
@@ -462,5 +462,5 @@ def test_two_ways_to_move_the_kernel_of_a_friction_operator():
         assert all(run.audit().passed for run in runs)
         ends[h] = np.abs(runs[0].x[-1] - runs[1].x[-1]).max()
     assert 6.0 < ends[0.02] / ends[0.01] < 10.0  # a third power: h times what the kernels differ by
-    with pytest.raises(lt.InputError, match="projection is"):
+    with pytest.raises(lt.InputError, match="projection must be"):
         lt.FrictionOperator(np.eye(3), projection="skew")

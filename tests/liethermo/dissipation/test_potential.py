@@ -107,8 +107,11 @@ def test_what_is_no_potential_is_refused(psi, words):
     ("make", "words"),
     [
         (lambda: lt.DissipationPotential(3.0), "function from forces"),
-        (lambda: lt.DissipationPotential(half_square, of=lt.DoubleBracket()), "would not keep the energy"),
-        (lambda: lt.DissipationPotential(half_square, of=3.0), "of is a dissipation"),
+        (
+            lambda: lt.DissipationPotential(half_square, of=lt.DoubleBracket()),
+            "conserves the energy, and DoubleBracket",
+        ),
+        (lambda: lt.DissipationPotential(half_square, of=3.0), "of must be a dissipation"),
         (lambda: lt.PowerLawFriction(1.0), "exponent"),
         (lambda: lt.CoulombFriction(-1.0), ">= 0"),
         (lambda: lt.CoulombFriction(1.0, 0.0), "> 0"),

@@ -566,7 +566,7 @@ def test_what_is_refused():
         lt.LiePoissonSystem(so3, H, group=mf.SE(3))
     with pytest.raises(lt.InputError, match="MatrixGroup"):
         lt.LiePoissonSystem(so3, H, group=mf.SpecialOrthogonal(3))
-    with pytest.raises(lt.InputError, match="'coadjoint', 'cayley', 'exp', not 'euler'"):
+    with pytest.raises(lt.InputError, match="'coadjoint', 'cayley', 'exp', got 'euler'"):
         lt.LiePoissonSystem(so3, H, group=SO3, reconstruction="euler")
     with pytest.raises(lt.InputError, match="needs a group"):
         lt.LiePoissonSystem(so3, H, reconstruction="exp")

@@ -333,7 +333,7 @@ def test_a_degenerate_regularity_matrix_is_reported(engine):
 @pytest.mark.parametrize(
     ("build", "words"),
     [
-        (lambda: lt.FiniteDifference(1.5), "from 0 to 1, not 1.5"),
+        (lambda: lt.FiniteDifference(1.5), "between 0 and 1, got 1.5"),
         (lambda: lt.FiniteDifference(0.5, beta=-0.1), "beta"),
         (lambda: lt.FiniteDifference(0.5, weight=0.0), "weight"),
         (lambda: lt.VariationalIntegrator([]), "phi must be"),
@@ -342,7 +342,7 @@ def test_a_degenerate_regularity_matrix_is_reported(engine):
             lambda: lt.integrate(
                 lt.models.rigid_body(), [1.0, 0.0, 0.0], (0.0, 1.0), 0.1, lt.VariationalIntegrator.verlet()
             ),
-            "SimpleClosedSystem, not a LiePoissonSystem",
+            "SimpleClosedSystem, got a LiePoissonSystem",
         ),
     ],
 )

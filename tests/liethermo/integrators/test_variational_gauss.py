@@ -74,5 +74,5 @@ def test_the_energy_error_stays_bounded():
 
 @pytest.mark.parametrize("stages", [0, 9, True, 1.5])
 def test_bad_input(stages):
-    with pytest.raises(lt.InputError, match="stages is an integer from 1 to 8"):
+    with pytest.raises(lt.InputError, match="stages must be an integer from 1 to 8"):
         lt.VariationalGauss(stages)

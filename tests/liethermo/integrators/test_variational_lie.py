@@ -227,7 +227,7 @@ def test_a_control_that_does_not_keep_the_spatial_momentum():
             lt.InputError,
             "Cayley map does not take",
         ),
-        (lambda: METHOD.check(lt.models.rigid_body()), lt.InputError, "not a LiePoissonSystem"),
+        (lambda: METHOD.check(lt.models.rigid_body()), lt.InputError, "got a LiePoissonSystem"),
     ],
 )
 def test_bad_input(build, error, words):

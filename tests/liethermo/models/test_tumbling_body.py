@@ -196,15 +196,15 @@ ENERGY, CASIMIR = lt.Quadratic([1.0, 0.5, 0.4]), lt.Quadratic(np.ones(3))
     [
         (
             lambda **baths: lt.LiePoissonSystem(mf.so(3), ENERGY, CASIMIR, lt.KillingDissipation(), **baths),
-            "makes none",
+            "does not lower the energy",
         ),
-        (lambda **baths: lt.LiePoissonSystem(mf.so(3), ENERGY, **baths), "there is none"),
-        (lambda **baths: lt.MetriplecticSystem(mf.LiePoisson(mf.so(3)), ENERGY, **baths), "there is none"),
+        (lambda **baths: lt.LiePoissonSystem(mf.so(3), ENERGY, **baths), "has no dissipation"),
+        (lambda **baths: lt.MetriplecticSystem(mf.LiePoisson(mf.so(3)), ENERGY, **baths), "has no dissipation"),
         (
             lambda **baths: lt.MetriplecticSystem(
                 mf.LiePoisson(mf.so(3)), ENERGY, CASIMIR, lt.ProjectedMetric(), **baths
             ),
-            "makes none",
+            "does not lower the energy",
         ),
     ],
 )
