@@ -128,9 +128,7 @@ class DissipationPotential(Dissipation):
         if B is None:
             space_text = "" if system.space is None else f" on {system.space.name}"
             raise InputError(
-            raise InputError(
                 f"{type(self.of).__name__} gives no factor of its friction matrix{space_text}, so of= cannot use it"
-            )
             )
         return B
 

@@ -330,7 +330,7 @@ def uncorrected(method):
     class Uncorrected(type(method)):
         def slopes(self, system, x, compensation, h, k):
             laws = self._laws(system)
-            rates = lambda y: self.rates(system, laws, y)  # noqa: E731
+            rates = lambda y: self.field_and_law_rates(system, laws, y)  # noqa: E731
             d, _, error, between = self.base_step(rates, False, x, compensation, h)
             return jnp.stack([d / h, error, jnp.zeros_like(x), k[StepRow.INITIAL_LEVELS], *between])
 
@@ -358,7 +358,7 @@ def test_without_corrections_the_energy_drifts_at_the_order_of_the_method(method
 class Unchecked(RK):
     """Corrections but one are left out, and what the step misses of the levels is not."""
 
-    corrections: ClassVar[int] = 1
+    max_corrections: ClassVar[int] = 1
 
 
 def test_a_step_that_misses_its_levels_fails():

@@ -102,12 +102,12 @@ def test_a_run_solves_3_12(kind, name):
     @jax.jit
     @jax.vmap
     def misfits(before, at, after):
-        (a, _, Sa, ta), (b, _, Sb, tb), (c, _, Sc, _) = (system.parts(y) for y in (before, at, after))
+        (a, _, Sa, ta), (b, _, Sb, tb), (c, _, Sc, _) = (system.split_state(y) for y in (before, at, after))
         first, second = method.discrete_system(system, h, ta), method.discrete_system(system, h, tb)
         return (
             first.momenta(a, b, Sa, Sb)[1] - second.momenta(b, c, Sb, Sc)[0],  # (3.12)
             second.constraint(b, c, Sb, Sc),
-            system.momentum(*system.parts(at)[:3]) - second.momenta(b, c, Sb, Sc)[0],
+            system.momentum(*system.split_state(at)[:3]) - second.momenta(b, c, Sb, Sc)[0],
         )
 
     for misfit in misfits(x[:-2], x[1:-1], x[2:]):
