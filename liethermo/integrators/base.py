@@ -105,8 +105,7 @@ class OneStepMethod(Module):
         return x + v
 
     def weights(self, theta) -> np.ndarray:
-        """Return weights w, shape (..., stages): ``h sum_i w_i k_i`` is the displacement at a fraction theta of a
-        step."""
+        """Return weights w, shape (..., stages): ``h sum_i w_i k_i`` is the displacement at the fraction theta."""
         return interpolation_weights(self.stages, theta)
 
     @property

@@ -105,7 +105,10 @@ class DiscreteHerglotz(OneStepMethod):
             callable(lagrangian) and not isinstance(lagrangian, Energy) and required_argument_count(lagrangian) == 3
         )
         return cls(
-            _Midpoint(lagrangian if has_three_arguments else _OfParts(make_energy(lagrangian, "the Lagrangian"))), order
+            _Midpoint(
+                lagrangian if has_three_arguments else _EnergyOfArguments(make_energy(lagrangian, "the Lagrangian"))
+            ),
+            order,
         )
 
     @property
@@ -244,7 +247,7 @@ class _Midpoint(Module):
         return h * self.lagrangian(0.5 * (q0 + q1), (q1 - q0) / h, S0)
 
 
-class _OfParts(Module):
+class _EnergyOfArguments(Module):
     """An energy of (q, v, S) in one array, as a function of three arguments."""
 
     energy: Energy
