@@ -181,55 +181,61 @@ class Dissipation(Module):
 
 
 class DissipationSum(Dissipation):
-    """A sum of dissipations that act together; a law holds if every summand obeys it."""
+    """A sum of dissipations that act together; a law holds if every summand obeys it.
 
-    summands: tuple[Dissipation, ...]
+    Attributes
+    ----------
+    parts : tuple of Dissipation
+        The summands. Names of parameters, such as ``dissipation.parts[1].rate``, contain the name of this field.
+    """
+
+    parts: tuple[Dissipation, ...]
 
     @property
     def terms(self) -> tuple[Dissipation, ...]:
-        return self.summands
+        return self.parts
 
     @property
     def energy_law(self) -> LawName | None:
-        laws = {part.energy_law for part in self.summands}
+        laws = {part.energy_law for part in self.parts}
         return None if None in laws else "nonincreasing" if "nonincreasing" in laws else "conserved"
 
     @property
     def entropy_law(self) -> LawName | None:
-        laws = {part.entropy_law for part in self.summands} - {"conserved"}
+        laws = {part.entropy_law for part in self.parts} - {"conserved"}
         return "conserved" if not laws else ("nondecreasing" if laws == {"nondecreasing"} else None)
 
     @property
     def is_symmetric(self) -> bool:
-        return all(part.is_symmetric for part in self.summands)
+        return all(part.is_symmetric for part in self.parts)
 
     def couplings(self, system):
-        return union_pattern(part.couplings(system) for part in self.summands)
+        return union_pattern(part.couplings(system) for part in self.parts)
 
     @property
     def preserves_casimirs(self) -> bool:
-        return all(part.preserves_casimirs for part in self.summands)
+        return all(part.preserves_casimirs for part in self.parts)
 
     @property
     def preserve(self) -> tuple[Energy, ...]:
-        return tuple(L for part in self.summands for L in part.preserve)
+        return tuple(L for part in self.parts for L in part.preserve)
 
     @property
     def needs_entropy(self) -> bool:
-        return any(part.needs_entropy for part in self.summands)
+        return any(part.needs_entropy for part in self.parts)
 
     def bind_to(self, system: Geometry) -> Dissipation:
-        return DissipationSum(tuple(part.bind_to(system) for part in self.summands))
+        return DissipationSum(tuple(part.bind_to(system) for part in self.parts))
 
     def force(self, system, x, dH, dS, dL):
         return sum(term.force(system, x, dH, dS, dL_part) for term, dL_part in terms_with_preserved(self, dL))
 
     @property
     def has_generator(self) -> bool:
-        return all(part.has_generator for part in self.summands)
+        return all(part.has_generator for part in self.parts)
 
     def generator_field(self, system, x, dH):
-        return sum(part.generator_field(system, x, dH) for part in self.summands)
+        return sum(part.generator_field(system, x, dH) for part in self.parts)
 
     def factor(self, system, x, dH, dL):
         factors = [term.factor(system, x, dH, dL_part) for term, dL_part in terms_with_preserved(self, dL)]
@@ -302,13 +308,18 @@ class LiftedDissipation(Dissipation):
 
     Attributes
     ----------
-    inner : Dissipation
-    preserved_functions : tuple of Energy
+    part : Dissipation
+        The inner dissipation. Names of parameters, such as ``dissipation.part.rate``, contain the name of this field.
+    functions : tuple of Energy
         The preserved functions of the inner dissipation, as functions of the outer state.
     """
 
-    inner: Dissipation
-    preserved_functions: tuple[Energy, ...]
+    part: Dissipation
+    functions: tuple[Energy, ...]
+
+    @property
+    def inner(self) -> Dissipation:
+        return self.part
 
     @abstractmethod
     def lifted_geometry(self, system: Geometry, x) -> LiftedGeometry:
@@ -355,7 +366,7 @@ class LiftedDissipation(Dissipation):
 
     @property
     def preserve(self):
-        return self.preserved_functions
+        return self.functions
 
 
 class SkewFriction(Dissipation):

@@ -27,7 +27,7 @@ class Process(Module):
         The fractions of the released energy ``A = -nu . mu`` that heat each body, of sum 1.
     entropy_transport : tuple of float
         1 for a body that receives entropy, -1 for one that gives entropy, otherwise 0.
-    entropy_per_particle : array, shape ()
+    entropy : array, shape ()
         Entropy transported with a particle.
     coefficient : array, shape (), or function of the whole state
         L >= 0.
@@ -36,7 +36,7 @@ class Process(Module):
     stoichiometry: tuple[float, ...] = eqx.field(static=True)
     heat_shares: tuple[float, ...] = eqx.field(static=True)
     entropy_transport: tuple[float, ...] = eqx.field(static=True)
-    entropy_per_particle: jax.Array
+    entropy: jax.Array
     coefficient: jax.Array | Callable
 
 
@@ -84,7 +84,7 @@ class MatterExchange(Dissipation):
         T, n_ends = jnp.where(T > 0.0, T, jnp.nan), np.abs(entropy_transport)
         affinity = -(stoichiometry @ mu)
         mean_temperature = n_ends @ T / np.maximum(n_ends.sum(axis=1), 1.0)
-        transported_heat = jnp.stack([e.entropy_per_particle for e in self.processes]) * mean_temperature
+        transported_heat = jnp.stack([e.entropy for e in self.processes]) * mean_temperature
         entropies = (heat_shares * affinity[:, None] + entropy_transport * transported_heat[:, None]) / T
         return (
             lambda dS: stoichiometry @ dS[N] + entropies @ dS[S],

@@ -59,7 +59,7 @@ class ProjectedMetric(Dissipation):
     """
 
     cometric: jax.Array | Callable | None
-    preserved_functions: tuple[Energy, ...]
+    functions: tuple[Energy, ...]
     normalized: bool = eqx.field(static=True)
     rate: jax.Array
 
@@ -69,13 +69,13 @@ class ProjectedMetric(Dissipation):
             cometric if cometric is None or callable(cometric) else checked_semidefinite(cometric, "the cometric")
         )
         functions = preserve if isinstance(preserve, list | tuple) else (preserve,)
-        self.preserved_functions = tuple(make_energy(L, "a preserved function") for L in functions)
+        self.functions = tuple(make_energy(L, "a preserved function") for L in functions)
         self.normalized = bool(normalized)
         self.rate = checked_rate(rate)
 
     @property
     def preserve(self):
-        return self.preserved_functions
+        return self.functions
 
     def bind_to(self, system):
         if system.sites and not self.normalized:
@@ -88,9 +88,9 @@ class ProjectedMetric(Dissipation):
         if system.space is not None:
             return self
         return eqx.tree_at(
-            lambda d: d.preserved_functions,
+            lambda d: d.functions,
             self,
-            tuple(mark_polynomial_degrees(L, system.dim) for L in self.preserved_functions),
+            tuple(mark_polynomial_degrees(L, system.dim) for L in self.functions),
         )
 
     def force(self, system, x, dH, dS, dL):

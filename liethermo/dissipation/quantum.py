@@ -331,17 +331,17 @@ class SteepestEntropyAscent(Dissipation):
     """
 
     rate: jax.Array
-    preserved_functions: tuple[Any, ...]
+    functions: tuple[Any, ...]
 
     def __init__(self, rate=1.0, preserve=()):
         self.rate = checked_rate(rate)
-        self.preserved_functions = tuple(
+        self.functions = tuple(
             f if callable(f) else Operator(checked_hermitian(f, f"preserve[{i}]")) for i, f in enumerate(preserve)
         )
 
     @property
     def preserve(self) -> tuple[Energy, ...]:
-        return tuple(f for f in self.preserved_functions if isinstance(f, Energy))
+        return tuple(f for f in self.functions if isinstance(f, Energy))
 
     def bind_to(self, system):
         require_density_structure(system, "SteepestEntropyAscent")
@@ -350,7 +350,7 @@ class SteepestEntropyAscent(Dissipation):
     def bind_to_structure(self, structure: mf.DensityMatrices) -> SteepestEntropyAscent:
         """Return this dissipation with its preserved functions as functions of state vectors."""
         functions = []
-        for i, f in enumerate(self.preserved_functions):
+        for i, f in enumerate(self.functions):
             if isinstance(f, Operator):
                 if np.shape(f) != (structure.size,) * 2:
                     raise InputError(
@@ -361,7 +361,7 @@ class SteepestEntropyAscent(Dissipation):
                 f = Function(DensityMatrixFunction(f, structure))
             functions.append(f)
         bound_ascent = SteepestEntropyAscent(self.rate)
-        object.__setattr__(bound_ascent, "preserved_functions", tuple(functions))
+        object.__setattr__(bound_ascent, "functions", tuple(functions))
         return bound_ascent
 
     def force(self, system, x, dH, dS, dL):

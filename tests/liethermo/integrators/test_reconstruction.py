@@ -25,7 +25,7 @@ GROUP_DISTANCE = 1e-15
 """Largest distance of an attitude from the group; at most 5e-16 seen, after 10^5 steps as after one."""
 
 ORTHOGONALITY_RESIDUAL = 10.0 * np.finfo(float).eps
-"""Largest residual of ``g^T g - I``: entries are up to four roundings off, which count twice, and products are rounded."""
+"""Largest residual of ``g^T g - I``: entries are up to four roundings off, twice, and products are rounded."""
 
 
 def body(reconstruction=None, damped=False, energy=None) -> lt.LiePoissonSystem:
