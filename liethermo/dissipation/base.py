@@ -57,7 +57,7 @@ class Dissipation(Module):
 
     @property
     def is_noiseless(self) -> bool:
-        """True for an external action that is no friction, so that no noise belongs to it."""
+        """True for an external action without friction, to which no noise belongs."""
         return False
 
     def couplings(self, system: Geometry) -> scipy.sparse.csr_array | None:

@@ -23,7 +23,7 @@ FRICTION_KERNEL_CHECK = "K grad H = 0, as given"
 class FrictionOperator(Dissipation):
     """Dissipation by a friction matrix K(x) with ``K(x) grad H(x) = 0`` [BFM Remark 4.7].
 
-    Building a system, and ``system.check()``, test that grad H is in the kernel of K. Of any other K only the
+    Building a system, and ``system.check()``, test that grad H is in the kernel of K. For any other K only the
     projection ``P^T K P`` would act, where P is the projector off grad H; ``project=True`` says that this is intended.
 
     A discretisation passes a discrete gradient dH beside ``grad H(x)``. The kernel is then moved from one to the other:

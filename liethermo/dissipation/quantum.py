@@ -34,7 +34,7 @@ ENERGY_RTOL = 8.0 * EPS
 
 @runtime_checkable
 class HasMatrix(Protocol):
-    """An operator that is no array and returns its matrix, as a ``Qobj`` of QuTiP does."""
+    """An operator, such as a ``Qobj`` of QuTiP, whose matrix is returned by ``full()``."""
 
     def full(self) -> np.ndarray: ...
 

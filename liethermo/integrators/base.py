@@ -304,7 +304,7 @@ def pullback_method(method: OneStepMethod, local) -> OneStepMethod:
 
 
 def checked_stages(stages) -> int:
-    """Return a number of Gauss nodes; raise InputError if there is no tableau for it."""
+    """Return ``stages``, the count of Gauss nodes; raise InputError if there is no tableau for it."""
     if isinstance(stages, bool) or not isinstance(stages, int) or not 1 <= stages <= MAX_STAGES:
         raise InputError(f"stages must be an integer from 1 to {MAX_STAGES}, got {stages!r}")
     return stages

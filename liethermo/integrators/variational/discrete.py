@@ -281,7 +281,7 @@ class DiscreteSystem(Module):
         return matrix[:-1, :-1] - jnp.outer(matrix[:-1, -1], matrix[-1, :-1]) / matrix[-1, -1]
 
     def solve_constraint(self, q0, q1, S0, steps: int = 12) -> jax.Array:
-        """Return S_1 with ``P_d(q_0, q_1, S_0, S_1) = 0`` after a number of Newton steps; differentiable."""
+        """Return S_1 with ``P_d(q_0, q_1, S_0, S_1) = 0`` after ``steps`` Newton steps; differentiable."""
         V = (q1 - q0) / self.h
 
         def newton(_, s):
@@ -291,7 +291,7 @@ class DiscreteSystem(Module):
         return S0 + self.h * jax.lax.fori_loop(0, steps, newton, jnp.zeros(()))
 
     def flow(self, q0, q1, S0, S1, steps: int = 12) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-        """Return the discrete flow on ``C_K^d``, (q_1, q_2, S_1, S_2), after a number of Newton steps [GBY 3.14]."""
+        """Return the discrete flow on ``C_K^d``, (q_1, q_2, S_1, S_2), after ``steps`` Newton steps [GBY 3.14]."""
         p1, start = self.momenta(q0, q1, S0, S1)[1], jnp.append((q1 - q0) / self.h, (S1 - S0) / self.h)
 
         def residual(y):
