@@ -241,7 +241,7 @@ def test_a_list_of_dissipations_is_their_sum(parts):
         ([lt.DoubleBracket(0.1), lt.KillingDissipation(0.1)], "KillingDissipation drives the entropy up"),
     ],
 )
-def test_lists_that_are_no_sum(argument, words):
+def test_invalid_lists_of_dissipations(argument, words):
     """The error is one line that names the entry, also beside a force."""
     H = lt.Quadratic([1 / 3, 1 / 2, 1.0])
     for kind, options in ((lt.LiePoissonSystem, {}), (lt.EulerPoincareSystem, {"force": lambda xi: xi})):
@@ -445,7 +445,7 @@ def test_a_dissipation_that_extends_another_stays_what_it_is():
 
 
 @pytest.mark.parametrize("kind", [lt.ProjectedMetric, lt.Friction, lt.FrictionOperator])
-def test_a_rate_in_the_place_of_a_matrix_is_told_its_name(kind):
+def test_a_rate_in_place_of_a_matrix_is_rejected(kind):
     with pytest.raises(lt.InputError, match=f"^{kind.__name__} takes .* and 0.3 is a number: for a rate say rate=0.3$"):
         kind(0.3)
     assert float(kind(np.eye(3), rate=0.3).rate) == 0.3

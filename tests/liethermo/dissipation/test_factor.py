@@ -141,7 +141,7 @@ HEATING_SYSTEMS = {
 
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("make", HEATING_SYSTEMS.values(), ids=HEATING_SYSTEMS)
-def test_divergences_of_what_heats(make):
+def test_divergences_of_heating_systems(make):
     """The closed form of the divergence agrees with differentiation of every column by every component."""
     system, rng = make(), np.random.default_rng(2)
     x = jnp.asarray(rng.standard_normal(system.dim))

@@ -98,7 +98,7 @@ def test_forces_between_bodies():
     ],
     ids=["concave", "wavy", "tilted", "of the state"],
 )
-def test_what_is_no_potential_is_refused(psi, words):
+def test_invalid_potentials_are_rejected(psi, words):
     with pytest.raises(lt.AxiomError, match=words):
         lt.LiePoissonSystem(mf.so(3), energy_of(3, 0), S, lt.DissipationPotential(psi))
 

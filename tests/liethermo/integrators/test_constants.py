@@ -46,7 +46,7 @@ def test_a_state_that_relaxes(constant):
 @pytest.mark.parametrize("method", [*EXPLICIT, *IMPLICIT], ids=str)
 @pytest.mark.parametrize("constant", [1e3, 1e4, 1e8])
 @pytest.mark.parametrize("build", [damped_system, oscillator_system])
-def test_each_method(build, constant, method):
+def test_a_constant_does_not_change_the_motion(build, constant, method):
     change, run = energy_difference(build, constant, method, 1000, 0.1)
     assert run.audit().passed
     assert change <= 8 * EPS * constant
@@ -103,7 +103,7 @@ def test_engines_and_adaptive_steps(engine):
 @pytest.mark.slow
 @pytest.mark.parametrize("method", [lt.MetriplecticRungeKutta(4), lt.MetriplecticGauss(1)], ids=str)
 @pytest.mark.parametrize("space", [mf.SPD(2), mf.Sphere(2), mf.Stiefel(3, 2)], ids=lambda space: space.name)
-def test_manifolds(space, method):
+def test_a_constant_on_manifolds(space, method):
     def energy(x):
         return jnp.sum(jnp.asarray([[1.0, 0.2], [0.2, 2.0]]) * (x.T @ x)) if x.ndim == 2 else x[0] + 0.4 * x[1] ** 4
 

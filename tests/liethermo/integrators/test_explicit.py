@@ -229,7 +229,7 @@ def test_dependent_gradients(method, excess):
         assert run.status.ok
 
 
-def test_what_is_preserved_on_request():
+def test_functions_preserved_on_request():
     system = lt.MetriplecticSystem(mf.Canonical(2), kepler().energy, dim=4)
     x0 = [1.0, 0.0, 0.0, 1.2]
     runs = [lt.integrate(system, x0, (0.0, 10.0), 0.2, RK(6, preserve)) for preserve in ((), (angular_momentum,))]

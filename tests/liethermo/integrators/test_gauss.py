@@ -300,7 +300,7 @@ def test_dependent_and_vanishing_constraints():
     assert np.abs(reference.x - x0).max() > 0.5
 
 
-def test_what_cannot_be_preserved():
+def test_functions_that_cannot_be_preserved():
     def size(m):
         return jnp.dot(m, m)
 
@@ -319,7 +319,7 @@ def test_stages_are_one_to_eight(stages):
         lt.MetriplecticGauss(stages)
 
 
-def test_what_it_says_of_itself():
+def test_order_stages_and_name():
     method = lt.MetriplecticGauss(3, preserve=lambda m: m[0])
     assert (method.order, method.stages) == (6, 3)
     assert {"energy", "entropy_law", "casimirs"} == method.preserves

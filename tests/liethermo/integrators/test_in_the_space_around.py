@@ -116,7 +116,7 @@ def test_with_charts_and_without(name):
     assert np.abs(runs[0].x - runs[1].x).max() < 1e-5
 
 
-def test_what_is_run_is_a_system_on_arrays():
+def test_the_embedded_system_runs_unless_a_retraction_is_given():
     """Without a retraction a spin runs without chart and projection; with a retraction it runs in charts."""
     spin = lt.MetriplecticSystem(mf.LiePoisson(mf.so(3)), lambda s: s[0] ** 4 + s[1] ** 2, space=mf.Sphere(2))
     system, method = prepare_run(spin, GAUSS)
@@ -174,7 +174,7 @@ def sphere_system(energy):
         ),
     ],
 )
-def test_what_is_no_system_or_no_point_is_refused_in_one_line(build, error, message):
+def test_invalid_systems_and_points_are_rejected_in_one_line(build, error, message):
     with pytest.raises(error, match=message) as refusal:
         build()
     assert "\n" not in str(refusal.value)
@@ -187,7 +187,7 @@ def test_a_start_where_the_energy_is_not_finite_ends_the_run_with_a_reason():
     assert "not finite" in str(refusal.value)
 
 
-def test_a_point_near_the_space_stays_as_near():
+def test_a_point_near_the_space_keeps_its_level():
     """An accepted point near the space is not moved: it stays on the level on which it begins."""
     system = relaxing(mf.Sphere(2))
     x0 = np.array([0.6, 0.64, 0.48]) * (1.0 + 1e-10)

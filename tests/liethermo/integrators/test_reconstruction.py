@@ -280,7 +280,7 @@ def test_the_momentum_in_space_of_a_body_that_heats_over_every_group(group):
 
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", [name for name in GROUPS if name not in SURFACE_ORBIT_GROUPS])
-def test_explicit_methods_elsewhere_keep_it_to_their_order(name):
+def test_explicit_methods_conserve_spatial_momentum_to_their_order(name):
     """The audit does not claim more: near orbits of fewer dimensions explicit methods cannot conserve it."""
     system, drifts = free_body(name, dissipation=lt.DoubleBracket(0.05)), []
     for step in (0.04, 0.02):
@@ -295,7 +295,7 @@ def test_explicit_methods_elsewhere_keep_it_to_their_order(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["SL(2)", *(pytest.param(n, marks=pytest.mark.slow) for n in ("SU(2)", "SE(3)"))])
-def test_cayley_on_the_matrices_does_not_keep_it(name):
+def test_cayley_on_the_matrices_does_not_conserve_spatial_momentum(name):
     """The former default: "g mu" is the coadjoint action of SO(3) and SE(2) alone."""
     assert momentum_drift(name, "cayley", lt.MetriplecticMidpoint(), 50) > 1e4 * RELATIVE_MOMENTUM_DRIFT
 
@@ -573,7 +573,7 @@ def test_complex_groups_and_files(tmp_path):
     assert np.asarray(mf.SU(3).belongs(run.attitude, 1e-14)).all()
 
 
-def test_what_is_refused():
+def test_bad_input():
     so3, H = mf.so(3), lt.Quadratic(1 / INERTIA)
     with pytest.raises(lt.InputError, match="not a group of so"):
         lt.LiePoissonSystem(so3, H, group=mf.SE(3))

@@ -151,7 +151,7 @@ def test_a_negative_weight_breaks_the_second_law():
 
 
 @pytest.mark.parametrize("order", [5, 2, 4.0, True, "4", None])
-def test_orders_that_there_are_not(order):
+def test_invalid_orders(order):
     with pytest.raises(lt.errors.InputError, match="order must be 4, 6 or 8"):
         RK(order)
 

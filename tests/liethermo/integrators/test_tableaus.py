@@ -158,7 +158,7 @@ def test_symplectic_and_symmetric(stages):
     assert np.abs(c + c[::-1] - 1.0).max() <= EPS
 
 
-def test_controls():
+def test_radau_tableau_fails_the_order_and_symplecticity_tests():
     """Radau IIA of two stages has order 3 and is not symplectic: the two tests above tell it from Gauss."""
     A, b, c = np.array([[5 / 12, -1 / 12], [3 / 4, 1 / 4]]), np.array([3 / 4, 1 / 4]), np.array([1 / 3, 1.0])
     assert abs(b @ c**3 - 1 / 4) > 0.01

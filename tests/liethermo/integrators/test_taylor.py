@@ -161,7 +161,7 @@ def test_double_bracket_dissipation():
 
 
 @pytest.mark.parametrize("order", [1, 25, 2.5, True, "6"])
-def test_orders_that_there_are_not(order):
+def test_invalid_orders(order):
     with pytest.raises(lt.errors.InputError, match="order must be an integer from 2 to 24 or None"):
         Taylor(order)
 

@@ -205,7 +205,7 @@ def test_a_number_for_the_friction_is_a_coefficient(R):
 
 
 @pytest.mark.slow
-def test_a_control_that_does_not_keep_the_spatial_momentum():
+def test_an_ordinary_solver_does_not_conserve_spatial_momentum():
     """Control: the |mu| of an ordinary solver, which knows no group, drifts."""
     solution = lt.integrate(body(), X0, (0.0, 20.0), 0.1, lt.Reference(rtol=1e-5))
     norms = np.linalg.norm(np.asarray(body().momenta(solution.x))[:, :3], axis=1)
