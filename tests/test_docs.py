@@ -191,7 +191,7 @@ def test_blocks_that_are_not_executed_are_right(code_spans):
         ("ProjectedMetrics()", "there is no 'ProjectedMetrics'"),
         ("colour()", "no function or method 'colour'"),
         ("Quadratic(A, b, c, d)", "too many positional arguments"),
-        ("MetriplecticGauss(stages=9)", "stages is an integer from 1 to 8"),
+        ("MetriplecticGauss(stages=9)", "stages must be an integer from 1 to 8"),
         ("dissipation='friction'", "no public function takes such a value as 'dissipation'"),
         ("dissipation=[lt.ProjectedMetric(), 3]", "no public function takes such a value as 'dissipation'"),
     ],

@@ -1,1 +1,1 @@
-"""What produces entropy: one construction a file, those between the bodies of a composed system too."""
+"""Dissipation, the part of the motion that produces entropy: one construction a file."""

@@ -1,8 +1,9 @@
-"""Dissipation in composed systems: heat that flows, friction that heats [SML §5].
+"""Dissipation in composed systems: heat conduction, and friction that heats [SML §5].
 
-All act on states (q_1, p_1, S_1, q_2, …) of several bodies, see :class:`manifolds.ExtendedPhaseSpace`. Temperatures and
-velocities are components of the gradient of the energy that they are handed: from a discrete gradient they are discrete
-ones, and both laws hold exactly, for every energy, as long as the discrete temperatures are positive.
+All classes act on states (q_1, p_1, S_1, q_2, …) of several bodies, see :class:`manifolds.ExtendedPhaseSpace`.
+Temperatures and velocities are components of the energy gradient that they are passed. With a discrete gradient these
+are discrete temperatures, and both laws hold exactly, for every energy, as long as the discrete temperatures are
+positive.
 """
 
 from __future__ import annotations
@@ -27,21 +28,21 @@ from .factor import Factor
 class HeatConduction(Dissipation):
     """Fourier's law on a graph: ``S_i' = sum_j k_ij (T_j - T_i) / T_i``, ``T = H_S`` [SML 32].
 
-    In terms of the Fourier factors ``K_ij = k_ij (1/T_i - 1/T_j)``, which are skew, ``S_i' = sum_j K_ij T_j``, so the
-    energy is constant; the total entropy grows by ``sum k_ij (T_i - T_j)^2 / (T_i T_j)`` over the edges. In
-    metriplectic form K is the sum of ``k_ij T_i T_j w w^T`` with ``w = e_i / T_i - e_j / T_j``.
+    With the Fourier factors ``K_ij = k_ij (1/T_i - 1/T_j)``, which are skew, ``S_i' = sum_j K_ij T_j``. So the energy
+    is constant, and the total entropy grows by ``sum k_ij (T_i - T_j)^2 / (T_i T_j)`` over the edges. In metriplectic
+    form K is the sum of ``k_ij T_i T_j w w^T`` with ``w = e_i / T_i - e_j / T_j``.
 
-    The temperatures are those of the gradient that it is handed, so a discretisation has discrete ones, which keep both
-    laws for every energy. With ``factors="midpoint"`` the Fourier factors alone are taken at the point x instead, as
-    SML §6.2 prints them; the energy is constant then too, but the entropy is known to grow for quadratic energies only
+    The temperatures are components of the gradient passed, so a discretisation uses discrete ones, which keep both laws
+    for every energy. With ``factors="midpoint"`` only the Fourier factors are evaluated at the point x instead, as
+    printed in SML §6.2. The energy is constant then too, but the entropy is known to grow only for quadratic energies
     [SML Lemma 6.2].
 
     Parameters
     ----------
     graph : Edges
-        Of bodies, with their conductances (power / temperature).
+        Edges between bodies, with their conductances (power / temperature).
     laws : tuple of functions of (T_i, T_j, x), optional
-        In place of the weights: the conductance of each edge, >= 0.
+        The conductance of each edge, >= 0, in place of the weights.
     fourier_factors : {"discrete", "midpoint"}
     """
 
@@ -60,19 +61,19 @@ class HeatConduction(Dissipation):
         return "nondecreasing" if self.fourier_factors == "discrete" else None
 
     def conductances(self, x, T_i, T_j) -> jax.Array:
-        """Those of the edges between bodies of these temperatures, shape (edges,); NaN where one is negative."""
+        """Return the conductances of the edges at these temperatures, shape (edges,); NaN where one is negative."""
         if not self.laws:
             return self.conductance
-        found = jnp.stack([jnp.asarray(law(T_i[e], T_j[e], x)) for e, law in enumerate(self.laws)])
-        return jnp.where(found >= 0.0, found, jnp.nan)
+        values = jnp.stack([jnp.asarray(law(T_i[e], T_j[e], x)) for e, law in enumerate(self.laws)])
+        return jnp.where(values >= 0.0, values, jnp.nan)
 
     def force(self, system, x, dH, dS, dL):
         S, i, j = _state_indices(system).S, np.asarray(self.first_bodies), np.asarray(self.second_bodies)
-        T, along = _nan_unless_positive(dH[S]), dS[S]
-        at = T if self.fourier_factors == "discrete" else _nan_unless_positive(system.energy.gradient(x)[S])
-        heat = self.conductances(x, at[i], at[j]) * (along[i] * at[j] - along[j] * at[i])
-        share = heat / (at[i] * at[j])
-        return jnp.zeros_like(x).at[S[i]].add(share * T[j]).at[S[j]].add(-share * T[i])
+        T, dS_S = _nan_unless_positive(dH[S]), dS[S]
+        T_factors = T if self.fourier_factors == "discrete" else _nan_unless_positive(system.energy.gradient(x)[S])
+        heat = self.conductances(x, T_factors[i], T_factors[j]) * (dS_S[i] * T_factors[j] - dS_S[j] * T_factors[i])
+        ratio = heat / (T_factors[i] * T_factors[j])
+        return jnp.zeros_like(x).at[S[i]].add(ratio * T[j]).at[S[j]].add(-ratio * T[i])
 
     def factor(self, system, x, dH, dL):
         S, i, j = _state_indices(system).S, np.asarray(self.first_bodies), np.asarray(self.second_bodies)
@@ -86,7 +87,7 @@ class HeatConduction(Dissipation):
 
     def couplings(self, system):
         if self.laws:
-            return None  # they may depend on everything
+            return None  # the laws may depend on all components
         S = _state_indices(system).S
         return clique_pattern(
             np.stack([S[np.asarray(self.first_bodies)], S[np.asarray(self.second_bodies)]], axis=1), system.dim
@@ -94,7 +95,7 @@ class HeatConduction(Dissipation):
 
 
 class LinearFriction(Dissipation):
-    """Friction against the surroundings, that heats the body itself: ``p' = -R v``, ``S' = v . R v / T``, v = H_p.
+    """Friction against the surroundings that heats the body itself: ``p' = -R v``, ``S' = v . R v / T``, v = H_p.
 
     In metriplectic form K is ``z R z^T / T`` with ``z = -T d/dp + v d/dS``.
 
@@ -103,7 +104,7 @@ class LinearFriction(Dissipation):
     R : array, shape (m,) for a diagonal matrix, or (m, m); or function from the state of the body to one
         Positive semidefinite (mass / time).
     body_index : int, optional
-        Whose m momenta these are; by default R is diagonal and has an entry for every momentum of the whole system.
+        The body with these m momenta; by default R is diagonal with an entry for every momentum of the whole system.
     """
 
     R: jax.Array | Callable
@@ -115,8 +116,8 @@ class LinearFriction(Dissipation):
 
     def factor(self, system, x, dH, dL):
         p, S, R, v, T = self._friction_data(system, x, dH)
-        full = semidefinite_root if callable(self.R) else semidefinite_factor
-        root = jnp.sqrt(R) if jnp.ndim(R) < 2 else full(R)
+        matrix_root = semidefinite_root if callable(self.R) else semidefinite_factor
+        root = jnp.sqrt(R) if jnp.ndim(R) < 2 else matrix_root(R)
         return Factor(len(p), lambda w: self._apply_directions(x, p, S, v, T, _apply_form(root, w) / jnp.sqrt(T)))
 
     @staticmethod
@@ -124,11 +125,13 @@ class LinearFriction(Dissipation):
         return jnp.zeros_like(x).at[p].add(-T * flux).at[S].add(v * flux)
 
     def _friction_data(self, system, x, dH):
-        """Where the momenta and the entropies are, R, the velocities and the temperatures."""
-        places = _state_indices(system)
-        mine = np.arange(len(places.p)) if self.body_index is None else np.flatnonzero(places.owner == self.body_index)
-        R = self.R(x[_body_components(places, mine)]) if callable(self.R) else self.R
-        p, S = places.p[mine], places.S[places.owner[mine]]
+        """Return the indices of momenta and entropies, R, the velocities and the temperatures: (p, S, R, v, T)."""
+        indices = _state_indices(system)
+        numbers = (
+            np.arange(len(indices.p)) if self.body_index is None else np.flatnonzero(indices.owner == self.body_index)
+        )
+        R = self.R(x[_body_components(indices, numbers)]) if callable(self.R) else self.R
+        p, S = indices.p[numbers], indices.S[indices.owner[numbers]]
         return p, S, R, dH[p], _nan_unless_positive(dH[S])
 
     def couplings(self, system):
@@ -136,16 +139,16 @@ class LinearFriction(Dissipation):
 
 
 class Drag(Dissipation):
-    """Friction between bodies: the force ``-c_ij (v_i - v_j)`` on i, and half the heat for either.
+    """Friction between bodies: the force ``-c_ij (v_i - v_j)`` on i, with half of the heat for each body.
 
-    ``S_i' = sum_j c_ij |v_i - v_j|^2 / (2 T_i)``; the total momentum is conserved. In metriplectic form K is
-    ``c_ij z z^T / theta`` with ``z = -d/dp_i + d/dp_j + (v_i - v_j) (d/dS_i / T_i + d/dS_j / T_j) / 2`` and
-    ``theta = (1/T_i + 1/T_j) / 2``, summed over edges and components.
+    ``S_i' = sum_j c_ij |v_i - v_j|^2 / (2 T_i)``; the total momentum is conserved. In metriplectic form K is ``c_ij z
+    z^T / theta`` with ``z = -d/dp_i + d/dp_j + (v_i - v_j) (d/dS_i / T_i + d/dS_j / T_j) / 2`` and ``theta = (1/T_i +
+    1/T_j) / 2``, summed over edges and components.
 
     Parameters
     ----------
     graph : Edges
-        Of bodies with the same number of degrees of freedom, with coefficients c (mass / time).
+        Edges between bodies with equal numbers of degrees of freedom, with coefficients c (mass / time).
     """
 
     first_bodies: Indices = eqx.field(static=True)
@@ -157,46 +160,46 @@ class Drag(Dissipation):
         self.coefficient = graph.weight
 
     def force(self, system, x, dH, dS, dL):
-        (p_i, p_j, S_i, S_j), (T_i, T_j, w), weight, spread = self._edge_data(system, x, dH)
-        along = dS[p_j] - dS[p_i] + 0.5 * w * (dS[S_i] / T_i + dS[S_j] / T_j)
-        return spread(weight * along)
+        (p_i, p_j, S_i, S_j), (T_i, T_j, w), weight, apply_directions = self._edge_data(system, x, dH)
+        z_dot_dS = dS[p_j] - dS[p_i] + 0.5 * w * (dS[S_i] / T_i + dS[S_j] / T_j)
+        return apply_directions(weight * z_dot_dS)
 
     def factor(self, system, x, dH, dL):
-        _, _, weight, spread = self._edge_data(system, x, dH)
-        return Factor(len(weight), lambda w: spread(jnp.sqrt(weight) * w))
+        _, _, weight, apply_directions = self._edge_data(system, x, dH)
+        return Factor(len(weight), lambda w: apply_directions(jnp.sqrt(weight) * w))
 
     def _edge_data(self, system, x, dH):
-        """Where momenta and entropies are, the temperatures and the velocity between, ``c / theta``, and ``flux z``."""
-        places = _state_indices(system)
-        i, j, edge = _momentum_pairs(self.first_bodies, self.second_bodies, places)
-        S_i, S_j, p_i, p_j = places.S[places.owner[i]], places.S[places.owner[j]], places.p[i], places.p[j]
+        """Return indices (p_i, p_j, S_i, S_j), values (T_i, T_j, v_i - v_j), ``c / theta``, and flux -> ``flux z``."""
+        indices = _state_indices(system)
+        i, j, edge = _momentum_pairs(self.first_bodies, self.second_bodies, indices)
+        S_i, S_j, p_i, p_j = indices.S[indices.owner[i]], indices.S[indices.owner[j]], indices.p[i], indices.p[j]
         T_i, T_j, w = _nan_unless_positive(dH[S_i]), _nan_unless_positive(dH[S_j]), dH[p_i] - dH[p_j]
 
         def apply_directions(flux):
-            made = jnp.zeros_like(x).at[S_i].add(0.5 * w * flux / T_i).at[S_j].add(0.5 * w * flux / T_j)
-            return made.at[p_i].add(-flux).at[p_j].add(flux)
+            force = jnp.zeros_like(x).at[S_i].add(0.5 * w * flux / T_i).at[S_j].add(0.5 * w * flux / T_j)
+            return force.at[p_i].add(-flux).at[p_j].add(flux)
 
         weight = self.coefficient[edge] * (2.0 * T_i * T_j / (T_i + T_j))
         return (p_i, p_j, S_i, S_j), (T_i, T_j, w), weight, apply_directions
 
     def couplings(self, system):
-        places = _state_indices(system)
-        i, j, _ = _momentum_pairs(self.first_bodies, self.second_bodies, places)
-        S_i, S_j = places.S[places.owner[i]], places.S[places.owner[j]]
-        return clique_pattern(np.stack([places.p[i], S_i, places.p[j], S_j], axis=1), system.dim)
+        indices = _state_indices(system)
+        i, j, _ = _momentum_pairs(self.first_bodies, self.second_bodies, indices)
+        S_i, S_j = indices.S[indices.owner[i]], indices.S[indices.owner[j]]
+        return clique_pattern(np.stack([indices.p[i], S_i, indices.p[j], S_j], axis=1), system.dim)
 
 
 class ContactFriction(SkewFriction):
-    """The friction of evolution fields, in some of the bodies: ``p' = -p T``, ``S' = p . v`` [SML 7].
+    """Friction of evolution fields in some of the bodies: ``p' = -p T``, ``S' = p . v`` [SML 7].
 
-    A skew bracket with the energy. The entropy cannot fall if the energy of each of the bodies is
-    ``p . G(q) p / 2 + V(q, S)``, in terms of that form; for other energies nothing is promised.
+    It is a skew bracket with the energy. The entropy cannot fall if the energy of each of the bodies is ``p . G(q) p /
+    2 + V(q, S)`` with a semidefinite G; for other energies nothing is guaranteed.
 
     Parameters
     ----------
     body_indices : tuple of int
     is_nondecreasing : bool
-        Whether their energies are known to be of that form.
+        True if the energies are known to have that form.
     """
 
     body_indices: tuple[int, ...] = eqx.field(static=True)
@@ -207,9 +210,9 @@ class ContactFriction(SkewFriction):
         return "nondecreasing" if self.is_nondecreasing else None
 
     def force(self, system, x, dH, dS, dL):
-        places = _state_indices(system)
-        mine = np.flatnonzero(np.isin(places.owner, self.body_indices))
-        p, S = places.p[mine], places.S[places.owner[mine]]
+        indices = _state_indices(system)
+        numbers = np.flatnonzero(np.isin(indices.owner, self.body_indices))
+        p, S = indices.p[numbers], indices.S[indices.owner[numbers]]
         return jnp.zeros_like(x).at[p].add(-x[p] * dH[S]).at[S].add(x[p] * dH[p])
 
     def couplings(self, system):
@@ -224,7 +227,7 @@ def _state_indices(system) -> StateIndices:
 
 
 def _nan_unless_positive(T):
-    """Temperatures, NaN where they are not positive: the step is then refused."""
+    """Return the temperatures, with NaN for those that are not positive: the step is then rejected."""
     return jnp.where(T > 0.0, T, jnp.nan)
 
 
@@ -232,25 +235,25 @@ def _apply_form(R, v):
     return R * v if jnp.ndim(R) < 2 else R @ v
 
 
-def _body_components(places: StateIndices, mine: np.ndarray) -> np.ndarray:
-    """The components of the state of the body that some of the momenta belong to."""
-    return np.concatenate([places.q[mine], places.p[mine], places.S[places.owner[mine[:1]]]])
+def _body_components(indices: StateIndices, numbers: np.ndarray) -> np.ndarray:
+    """Return the indices of all state components of the body with these momenta."""
+    return np.concatenate([indices.q[numbers], indices.p[numbers], indices.S[indices.owner[numbers[:1]]]])
 
 
-def _momentum_pairs(first: Indices, second: Indices, places: StateIndices):
-    """For each edge and component: the numbers of the two momenta, and of the edge."""
-    i, j = np.asarray(first), np.asarray(second)
-    starts = np.searchsorted(places.owner, np.arange(len(places.S)))
-    sizes = np.bincount(places.owner, minlength=len(places.S))[i]
-    edge = np.repeat(np.arange(len(i)), sizes)
-    within = np.arange(len(edge)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-    return starts[i][edge] + within, starts[j][edge] + within, edge
+def _momentum_pairs(first_bodies: Indices, second_bodies: Indices, indices: StateIndices):
+    """Return, for each edge and component, the numbers of the two momenta and of the edge."""
+    i, j = np.asarray(first_bodies), np.asarray(second_bodies)
+    starts = np.searchsorted(indices.owner, np.arange(len(indices.S)))
+    counts = np.bincount(indices.owner, minlength=len(indices.S))[i]
+    edge = np.repeat(np.arange(len(i)), counts)
+    offsets = np.arange(len(edge)) - np.repeat(np.cumsum(counts) - counts, counts)
+    return starts[i][edge] + offsets, starts[j][edge] + offsets, edge
 
 
-def _block_pattern(places: StateIndices, dim: int) -> scipy.sparse.csr_array:
-    """The pattern in which all components of a body depend on each other, and on none of another body."""
-    starts = np.concatenate([[0], places.S[:-1] + 1])
-    body = np.repeat(np.arange(len(starts)), places.S + 1 - starts)
+def _block_pattern(indices: StateIndices, dim: int) -> scipy.sparse.csr_array:
+    """Return the pattern in which the components of a body depend on each other, and on no other body."""
+    starts = np.concatenate([[0], indices.S[:-1] + 1])
+    body = np.repeat(np.arange(len(starts)), indices.S + 1 - starts)
     member = pattern_of_matrix(
         scipy.sparse.coo_array((np.ones(dim, dtype=bool), (np.arange(dim), body)), (dim, len(starts)))
     )

@@ -77,7 +77,7 @@ class DoubleBracket(Dissipation):
         return self.rate * self._bracket_velocity(system, x, dH)
 
     def _bracket_velocity(self, system, x, dH) -> jax.Array:
-        """``(Pi dH)^♯``."""
+        """Return ``(Pi dH)^♯``."""
         motion = system.poisson.sharp(x, dH)
         return system.lower_index(x, motion) if self.metric is None else self.metric @ motion
 
@@ -90,13 +90,13 @@ class DoubleBracket(Dissipation):
         def times(w):
             return system.poisson.sharp(x, velocity(w))
 
-        size = system.isotropic_size if root is None else system.dim
-        return Factor(size, times, velocity=velocity).scale_by(self.rate)
+        n_columns = system.isotropic_size if root is None else system.dim
+        return Factor(n_columns, times, velocity=velocity).scale_by(self.rate)
 
 
 def _checked_metric(metric) -> Any:
     if np.ndim(metric) != 1:
         return checked_semidefinite(metric, "the metric")
     entries = check_numbers(metric, "the metric")
-    require_condition(entries, lambda entries: entries >= 0.0, "the diagonal of the metric must be >= 0, not {value}")
+    require_condition(entries, lambda entries: entries >= 0.0, "the diagonal of the metric must be >= 0, got {value}")
     return Diagonal(entries)

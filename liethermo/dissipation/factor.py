@@ -1,4 +1,4 @@
-"""Factors of friction matrices: what makes noise of random numbers, and potentials of forces."""
+"""Factors of friction matrices: they map random numbers to noise, and fluxes to forces."""
 
 from __future__ import annotations
 
@@ -18,21 +18,22 @@ from ..functions.frames import sqrt_or_zero
 
 
 class Factor(NamedTuple):
-    """A matrix B, shape (n, size), with ``B B^T = K``, as what it does.
+    """A matrix B, shape (n, size), with ``B B^T = K``, as a linear function.
 
     Attributes
     ----------
     size : int
         Number of columns.
     times : function
-        From w, shape (size,), to ``B w``, shape (n,); linear.
+        Maps w, shape (size,), to ``B w``, shape (n,); linear.
     solenoidal : bool
-        Whether every column, at the gradients of the functions, is a field of divergence zero.
+        True if every column, at the gradients of the functions, is a field of divergence zero.
     velocity : function or None
-        From w to sigma with ``B w = Pi(x) sigma``, where the construction is such: see :meth:`.Dissipation.velocity`.
+        Maps w to sigma with ``B w = Pi(x) sigma``, if the construction has this form: see
+        :meth:`.Dissipation.velocity`.
     spin_coefficients : array or None
-        The numbers r, of shape () or (sites,), with ``B w = r_i w_i x s_i`` at every spin, where it is such and w has
-        three components for each: see :class:`.Fluctuating`.
+        Numbers r, of shape () or (sites,), with ``B w = r_i w_i x s_i`` at every spin, if B has this form and w has
+        three components for each spin: see :class:`.StochasticMidpoint`.
     """
 
     size: int
@@ -42,34 +43,36 @@ class Factor(NamedTuple):
     spin_coefficients: jax.Array | None = None
 
     def transpose_times(self, alpha) -> jax.Array:
-        """``B^T alpha``, shape (size,)."""
+        """Return ``B^T alpha``, shape (size,)."""
         return jax.linear_transpose(self.times, jax.ShapeDtypeStruct((self.size,), jnp.float64))(alpha)[0]
 
     def scale_by(self, rate) -> Factor:
-        """The factor of ``rate * K``; the rate is a number, which may depend on the state."""
+        """Return the factor of ``rate * K``; the rate is a number, which may depend on the state."""
         scale = sqrt_or_zero(rate)
-        velocity = None if (along := self.velocity) is None else lambda w: scale * along(w)
-        turning = None if self.spin_coefficients is None else scale * self.spin_coefficients
-        return self._replace(times=lambda w: scale * self.times(w), velocity=velocity, spin_coefficients=turning)
+        velocity = None if (velocity_map := self.velocity) is None else lambda w: scale * velocity_map(w)
+        spin_coefficients = None if self.spin_coefficients is None else scale * self.spin_coefficients
+        return self._replace(
+            times=lambda w: scale * self.times(w), velocity=velocity, spin_coefficients=spin_coefficients
+        )
 
 
 def form_root(form) -> Any:
-    """R with ``R R^T = form``, for a semidefinite matrix or what acts like one; None where it has no root that acts."""
+    """Return R with ``R R^T = form``, for a semidefinite matrix or an object that acts like one; None if unknown."""
     if isinstance(form, BlockDiagonal):
         roots = tuple(form_root(block) for block in form.blocks)
-        known = all(root is not None for root in roots)
-        return eqx.tree_at(lambda f: f.blocks, form, roots) if known else None
+        has_roots = all(root is not None for root in roots)
+        return eqx.tree_at(lambda f: f.blocks, form, roots) if has_roots else None
     if isinstance(form, Diagonal):
         return Diagonal(jnp.sqrt(form.entries))
     return semidefinite_factor(form) if isinstance(form, jax.Array | np.ndarray) else None
 
 
 def concatenate_factors(factors: Sequence[Factor]) -> Factor:
-    """The factors side by side: that of the sum of the matrices."""
+    """Return the factors side by side: the factor of the sum of the matrices."""
     ends = list(itertools.accumulate((B.size for B in factors), initial=0))
 
     def times(w):
-        parts = zip(factors, itertools.pairwise(ends), strict=True)
-        return sum(B.times(w[start:end]) for B, (start, end) in parts)
+        slices = zip(factors, itertools.pairwise(ends), strict=True)
+        return sum(B.times(w[start:end]) for B, (start, end) in slices)
 
     return Factor(ends[-1], times, all(B.solenoidal for B in factors))

@@ -45,7 +45,7 @@ class FourBracket(Dissipation):
         if not callable(tensor):
             tensor = check_numbers(tensor, "a 4-bracket")
             if tensor.ndim != 4 or len(set(tensor.shape)) != 1:
-                raise InputError(f"a 4-bracket has shape (n, n, n, n), not {tensor.shape}")
+                raise InputError(f"a 4-bracket must have shape (n, n, n, n), got {tensor.shape}")
             _check_curvature_symmetries(tensor)
         self.tensor = tensor
 
@@ -75,7 +75,7 @@ class FourBracket(Dissipation):
         return jnp.einsum("ijkl,j,k,l->i", evaluate_form(self.tensor, x), dH, dS, dH)
 
     def factor(self, system, x, dH, dL):
-        """Columns ``A dH``, where ``R = sum A (x) A``: as a form on pairs of covectors R has to be semidefinite."""
+        """Return the columns ``A dH``, where ``R = sum A (x) A``: R must be semidefinite on pairs of covectors."""
         i, j = np.triu_indices(system.dim, 1)
         form = evaluate_form(self.tensor, x)[i, j][:, i, j]
         _check_semidefinite_on_pairs(form)
@@ -110,7 +110,7 @@ class KulkarniNomizu(Dissipation):
         return from_sigma + from_mu
 
     def factor(self, system, x, dH, dL):
-        """Columns ``(m_j . dH) s_i - (s_i . dH) m_j``, of divergence zero where the forms are constant."""
+        """Return the columns ``(m_j . dH) s_i - (s_i . dH) m_j``, of divergence zero for constant forms."""
         n, constant = system.dim, not (callable(self.sigma) or callable(self.mu))
         s, m = (
             semidefinite_root(form(x)) if callable(form) else semidefinite_factor(form)
@@ -127,13 +127,13 @@ class KulkarniNomizu(Dissipation):
 def _check_semidefinite_on_pairs(form) -> None:
     if isinstance(form, jax.core.Tracer):
         return
-    lowest, size = float(np.linalg.eigvalsh(np.asarray(form))[0]), float(np.abs(form).max())
-    if lowest < -1e-12 * size * len(form):
+    min_eigenvalue, scale = float(np.linalg.eigvalsh(np.asarray(form))[0]), float(np.abs(form).max())
+    if min_eigenvalue < -1e-12 * scale * len(form):
         raise IndefiniteError(
-            f"the 4-bracket has no factor: on pairs of covectors it has the negative eigenvalue {lowest:.3g}. "
-            "What it makes of two covectors may be semidefinite all the same: give that as a FrictionOperator",
-            residual=lowest,
-            tolerance=1e-12 * size * len(form),
+            f"the 4-bracket has no factor: on pairs of covectors it has the negative eigenvalue {min_eigenvalue:.3g}. "
+            "If the friction matrix that it makes is semidefinite, use that matrix in a FrictionOperator",
+            residual=min_eigenvalue,
+            tolerance=1e-12 * scale * len(form),
         )
 
 

@@ -17,21 +17,21 @@ from .factor import Factor
 
 
 class Friction(Dissipation):
-    """``x' = Pi dH - rate * D(x) dH``: the energy falls, ``H' = -rate dH . D dH <= 0``, and is gone.
+    """Friction against the surroundings: ``x' = Pi dH - rate * D(x) dH``, with ``H' = -rate dH . D dH <= 0``.
 
-    Without a D it is the gradient flow of the metric. With D = diag(0, gamma) on (q, p) it is the drag
-    ``p' = -gamma v``; on the dual of an algebra it is that of a body in a fluid. Where a system has baths
-    (:class:`liethermo.HeatBaths`) they take the heat; where not it is not followed, and no law of an entropy is
+    Without a D it is the gradient flow of the metric. With D = diag(0, gamma) on (q, p) it is the drag ``p' = -gamma
+    v``; on the dual of an algebra it is the drag of a body in a fluid. If a system has baths
+    (:class:`liethermo.HeatBaths`), they take the heat. Otherwise the heat is not recorded, and no law of an entropy is
     claimed. At a constant temperature (:class:`liethermo.Fluctuations`) it is Langevin's equation, and the heat is
     recorded.
 
     Parameters
     ----------
     D : array, shape (n, n), or (n,) for a diagonal matrix, or function from x, shape (n,), to a matrix (n, n); optional
-        Positive semidefinite, in units such that ``rate * D`` has x**2 / (energy * time). A function must have the
-        same rank everywhere. By default the identity, or on a manifold the inverse of the metric of the space.
+        Positive semidefinite, in units such that ``rate * D`` has x**2 / (energy * time). A function must have the same
+        rank everywhere. By default the identity, or on a manifold the inverse of the metric of the space.
     rate : float, >= 0
-        Factor of D: see there for the unit.
+        Factor of D, in the units described there.
     bath : int, or array of int of the shape of the sites, optional
         The number of the bath that takes the heat, from 0; by default the first.
     """

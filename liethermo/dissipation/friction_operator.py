@@ -17,27 +17,27 @@ from .checks import check_matrix, checked_rate, checked_semidefinite, evaluate_f
 from .factor import Factor
 
 FRICTION_KERNEL_CHECK = "K grad H = 0, as given"
-"""The row of a check on a friction operator before it is projected."""
+"""Row of ``system.check()``: K grad H = 0 for a friction operator before it is projected."""
 
 
 class FrictionOperator(Dissipation):
     """Dissipation by a friction matrix K(x) with ``K(x) grad H(x) = 0`` [BFM Remark 4.7].
 
-    That K has grad H in its kernel is tested where a system is built, and by ``system.check()``: of another K only the
-    projection ``P^T K P`` would act, P the projector off grad H. ``project=True`` says that this is meant.
+    Building a system, and ``system.check()``, test that grad H is in the kernel of K. For any other K only the
+    projection ``P^T K P`` would act, where P is the projector off grad H; ``project=True`` says that this is intended.
 
-    A discretisation hands it a discrete gradient dH beside ``grad H(x)``. The kernel is then moved from the one to the
-    other: ``K_d = P^T K P`` with ``P = 1 - dH grad H^T / (grad H . dH)``, the projector along dH onto the complement of
-    grad H. K_d is semidefinite, has dH in its kernel, keeps every other kernel vector of K that is orthogonal to grad H
+    A discretisation passes a discrete gradient dH beside ``grad H(x)``. The kernel is then moved from one to the other:
+    ``K_d = P^T K P`` with ``P = 1 - dH grad H^T / (grad H . dH)``, the projector along dH onto the complement of grad
+    H. K_d is semidefinite, has dH in its kernel, keeps every other kernel vector of K that is orthogonal to grad H
     (momentum maps), and tends to K.
 
-    The remark itself takes the complement of the kernel that is orthogonal in a metric G, and the ``projection``
-    "orthogonal" does: ``P = 1 - dH (G dH)^T / (dH . G dH)``. The two differ by the turn from grad H to dH, so by
-    O(h^2) in a step, and keep the same laws; the orthogonal one moves kernel vectors of K that dH is not orthogonal to,
-    and needs no safeguard where dH turns away from grad H.
+    The remark itself uses the complement of the kernel that is orthogonal in a metric G, as the ``projection``
+    "orthogonal" does: ``P = 1 - dH (G dH)^T / (dH . G dH)``. The two projections differ by the rotation from grad H to
+    dH, O(h^2) in a step, and obey the same laws. The orthogonal one moves kernel vectors of K that are not orthogonal
+    to dH, and needs no safeguard if dH rotates away from grad H.
 
-    Where a system has baths (:class:`liethermo.HeatBaths`) and no entropy of its own, K acts on states with the
-    entropies of the baths behind those of the body, as their sum is the entropy that it drives up.
+    If a system has baths (:class:`liethermo.HeatBaths`) and no entropy of its own, K acts on the state followed by the
+    entropies of the baths, whose sum is the entropy that grows.
 
     Parameters
     ----------
@@ -45,9 +45,9 @@ class FrictionOperator(Dissipation):
         The friction matrix, symmetric and semidefinite, in units such that ``rate * K`` has x**2 / (entropy * time).
         With baths, n counts their entropies too.
     rate : float, >= 0
-        Factor of K: see there for the unit.
+        Factor of K, in the units described there.
     project : bool
-        Take any symmetric semidefinite K, and let its projection off grad H act.
+        Accept any symmetric semidefinite K, and use its projection off grad H.
     projection : {"oblique", "orthogonal"}
         How the kernel is moved to the discrete gradient; G is the metric of the space.
     """
@@ -63,7 +63,7 @@ class FrictionOperator(Dissipation):
         self.rate = checked_rate(rate)
         self.project = bool(project)
         if projection not in ("oblique", "orthogonal"):
-            raise InputError(f"projection is 'oblique' or 'orthogonal', not {projection!r}")
+            raise InputError(f"projection must be 'oblique' or 'orthogonal', got {projection!r}")
         self.projection = projection
 
     can_drive_baths = True
@@ -77,33 +77,33 @@ class FrictionOperator(Dissipation):
             return {}
         K, dH = evaluate_form(self.K, x), system.energy.gradient(x)
         dH = dH if system.space is None else system.lower_index(x, system.raise_index(x, dH))
-        size = jnp.max(jnp.abs(K)) * jnp.max(jnp.abs(dH))
-        defect = jnp.max(jnp.abs(jnp.stack([K @ dH, dH @ K])))
-        return {FRICTION_KERNEL_CHECK: defect / jnp.where(size > 0.0, size, 1.0)}
+        scale = jnp.max(jnp.abs(K)) * jnp.max(jnp.abs(dH))
+        residual = jnp.max(jnp.abs(jnp.stack([K @ dH, dH @ K])))
+        return {FRICTION_KERNEL_CHECK: residual / jnp.where(scale > 0.0, scale, 1.0)}
 
     def force(self, system, x, dH, dS, dL):
-        along = self._projection_direction(system, x, dH)
-        image = evaluate_form(self.K, x) @ (dS - jnp.dot(along, dS) * dH)
-        return self.rate * (image - jnp.dot(dH, image) * along)
+        direction = self._projection_direction(system, x, dH)
+        image = evaluate_form(self.K, x) @ (dS - jnp.dot(direction, dS) * dH)
+        return self.rate * (image - jnp.dot(dH, image) * direction)
 
     def factor(self, system, x, dH, dL):
-        """The symmetric root of K(x), or a Cholesky factor of a constant K, likewise projected."""
+        """Return the projected root: the symmetric root of K(x), or a Cholesky factor of a constant K."""
         root = semidefinite_root(self.K(x)) if callable(self.K) else semidefinite_factor(self.K)
-        along = self._projection_direction(system, x, dH)
+        direction = self._projection_direction(system, x, dH)
 
         def times(w):
             image = root @ w
-            return image - jnp.dot(dH, image) * along
+            return image - jnp.dot(dH, image) * direction
 
         return Factor(system.dim, times).scale_by(self.rate)
 
     def _projection_direction(self, system, x, dH):
-        """The vector a with ``a . dH = 1`` that P projects along."""
-        raised = system.raise_index(x, dH)
-        gradient = raised if self.projection == "orthogonal" else system.raise_index(x, system.energy.gradient(x))
-        overlap, square = jnp.dot(gradient, dH), jnp.dot(raised, dH)
-        # Where grad H is tiny or turned away from dH, project orthogonally off dH instead.
-        safe = overlap > 1e-3 * square
-        along = jnp.where(safe, gradient, raised)
-        overlap = jnp.where(safe, overlap, square)
-        return along / jnp.where(overlap > 0.0, overlap, 1.0)
+        """Return the vector a with ``a . dH = 1`` along which P projects."""
+        dH_vector = system.raise_index(x, dH)
+        gradient = dH_vector if self.projection == "orthogonal" else system.raise_index(x, system.energy.gradient(x))
+        overlap, square = jnp.dot(gradient, dH), jnp.dot(dH_vector, dH)
+        # If grad H is tiny or nearly orthogonal to dH, project orthogonally off dH instead.
+        is_usable = overlap > 1e-3 * square
+        direction = jnp.where(is_usable, gradient, dH_vector)
+        overlap = jnp.where(is_usable, overlap, square)
+        return direction / jnp.where(overlap > 0.0, overlap, 1.0)

@@ -1,4 +1,4 @@
-"""The geometry that a dissipation is handed."""
+"""The geometry of a system, as dissipations use it."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from ..tracing.programs import subprogram
 
 
 class Geometry(Module):
-    """What a dissipation may ask of the system that it acts in. Every system has it, whatever its class.
+    """Interface of a system for its dissipation; every system class has it.
 
-    ``poisson.state_indices`` says where the bodies are in the state of a system of several.
+    ``poisson.state_indices`` has the indices of all q, p and S in a state of several bodies.
 
     Attributes
     ----------
@@ -39,22 +39,22 @@ class Geometry(Module):
 
     @property
     def lie_algebra(self) -> mf.LieAlgebra | None:
-        """The Lie algebra whose dual states are in; None where the system is not on one."""
+        """The Lie algebra with the states in its dual; None for other systems."""
         return None
 
     @property
     def matrix_group(self) -> mf.MatrixGroup | None:
-        """The group of the attitudes; None where there are none."""
+        """The group of the attitudes; None without attitudes."""
         return None
 
     @property
     def sites(self) -> tuple[int, ...]:
-        """The sites of a system of many equal ones, whose states are shown as arrays of shape ``(*sites, d)``."""
+        """The lattice of sites of a system of many equal parts, whose states have the shape ``(*sites, d)``."""
         return ()
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """The shape in which states are shown off manifolds: (n,), or ``(*sites, d)``."""
+        """The shape of a state on R^n: (n,), or ``(*sites, d)``."""
         return (*self.sites, self.dim // math.prod(self.sites))
 
     @property
@@ -65,14 +65,14 @@ class Geometry(Module):
     @property
     @abstractmethod
     def body_dim(self) -> int:
-        """Number of state components, those of baths left out."""
+        """Number of state components without those of baths."""
 
     @abstractmethod
     def drop_baths(self) -> Geometry:
-        """The body alone: the geometry that its dissipation acts in. Itself where there are no baths."""
+        """Return the body alone, the geometry of its dissipation; itself if there are no baths."""
 
     def points(self, x) -> jax.Array:
-        """State vectors, shape (..., n), as they are shown: of shape ``(*sites, d)``, or as points of the space."""
+        """Return state vectors, shape (..., n), in their natural shape: ``(*sites, d)``, or points of the space."""
         if self.space is not None:
             return self.space.from_vector(x)
         x = jnp.asarray(x)
@@ -81,47 +81,46 @@ class Geometry(Module):
     # -- the metric of the space --------------------------------------------------------------------------------------
 
     def raise_index(self, x, alpha) -> jax.Array:
-        """The tangent vector that the metric of the space makes of a covector, shape (n,); itself on R^n."""
+        """Return the tangent vector of a covector by the metric of the space, shape (n,); alpha itself on R^n."""
         if self.space is None:
             return alpha
         return self.space.to_vector(_sharp(self.space, self.points(x), self.points(alpha).conj()))
 
     def lower_index(self, x, v) -> jax.Array:
-        """The covector that the metric of the space makes of a tangent vector: the inverse of :meth:`raised`."""
+        """Return the covector of a tangent vector by the metric of the space: the inverse of :meth:`raise_index`."""
         if self.space is None:
             return v
         return self.space.to_vector(self.space._flat(self.points(x), self.points(v)).conj())
 
     def project_tangent(self, x, w) -> jax.Array:
-        """The tangent vector nearest to an array, shape (n,); itself on R^n."""
+        """Return the tangent vector nearest to an array, shape (n,); the array itself on R^n."""
         if self.space is None:
             return w
         return self.space.to_vector(self.space._project_tangent(self.points(x), self.points(w)))
 
     @property
     def isotropic_size(self) -> int:
-        """How many numbers :meth:`isotropic` takes."""
+        """Number of components of the argument w of :meth:`isotropic_vector`."""
         return self.dim if self.space is None else self.space.isotropic_size
 
     def isotropic_vector(self, x, w) -> jax.Array:
-        """``R w`` with ``R R^T`` the inverse of the metric of the space, shape (n,); w itself on R^n."""
+        """Return ``R w`` with ``R R^T`` the inverse of the metric of the space, shape (n,); w itself on R^n."""
         return w if self.space is None else self.space.to_vector(self.space._isotropic(self.points(x), w))
 
     def scale_at_sites(self, values, v) -> jax.Array:
-        """A vector, shape (n,), times a number for each site, shape (sites,); or times one number."""
+        """Return a vector, shape (n,), times one number for each site, shape (sites,), or times a single number."""
         if jnp.ndim(values) == 0:
             return values * v
         return (values[:, None] * v.reshape(len(values), -1)).ravel()
 
     def dot_at_sites(self, alpha, v) -> jax.Array:
-        """``alpha . v`` at each site, shape (sites,)."""
+        """Return ``alpha . v`` at each site, shape (sites,)."""
         return jnp.sum((alpha * v).reshape(math.prod(self.sites), -1), axis=1)
 
     def divergence_terms(self, x, rows) -> jax.Array:
-        """What the divergence of vector fields is the sum of, over the first axis.
+        """Return the terms whose sum over the first axis is the divergence of vector fields.
 
-        ``rows(y, alpha)`` is what a covector alpha at y makes of the field, or of each of several; vectors of shape
-        (n,).
+        ``rows(y, alpha)`` is the product of a covector alpha at y with the field, or with each of several fields.
         """
         if self.space is None:
             return jax.vmap(lambda e: jax.jvp(lambda y: rows(y, e), (x,), (e,))[1])(jnp.eye(x.shape[0]))

@@ -1,4 +1,4 @@
-"""Dissipation that heats: what a body loses of its energy, baths take up with their entropies."""
+"""Dissipation that heats: baths receive, as entropy, the energy that a body loses."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ class Heating(LiftedDissipation):
         B = sqrt(T) [B0; -dH^T B0 / T],
 
     so that ``x' = … - K0 dH`` and ``T y' = dH . K0 dH``. ``K (dH, T) = 0`` and ``K >= 0`` by form, for discrete
-    gradients too: both laws are exact. What K0 keeps of the body is kept, every Casimir by a double bracket. Where each
-    site has its own bath, K0 acts site by site, and so does this.
+    gradients too: both laws are exact. What K0 conserves of the body is conserved, for example every Casimir by a
+    double bracket. If each site has its own bath, K0 acts site by site, and so does K.
 
-    With a temperature below zero the sign of T is taken out of K: the entropy grows there too.
+    For a negative temperature the sign of T is left out of K: the entropy grows there too.
 
     Attributes
     ----------
     bath : Indices, of shape () or that of the sites
-        The number of the bath that takes the heat, from 0; of all sites, or of each.
+        The number of the bath that takes the heat, from 0; for all sites, or for each.
     has_positive_temperatures : bool
-        Whether the temperatures are positive in every state. Then the motion of the body does not wait for them.
+        True if the temperatures are positive in every state. Then the motion of the body does not depend on them.
     """
 
     bath: Indices = eqx.field(static=True)
@@ -68,13 +68,13 @@ class Heating(LiftedDissipation):
         def times(w):
             return self._join_with_entropies(body, body.scale_at_sites(scale, B.times(w)), dH, n)
 
-        along = B.velocity
-        velocity = None if along is None else lambda w: body.scale_at_sites(scale, along(w))
-        turning = None if B.spin_coefficients is None else scale * B.spin_coefficients
-        return B._replace(times=times, velocity=velocity, spin_coefficients=turning, solenoidal=False)
+        velocity_map = B.velocity
+        velocity = None if velocity_map is None else lambda w: body.scale_at_sites(scale, velocity_map(w))
+        spin_coefficients = None if B.spin_coefficients is None else scale * B.spin_coefficients
+        return B._replace(times=times, velocity=velocity, spin_coefficients=spin_coefficients, solenoidal=False)
 
     def divergence(self, system, x):
-        """``sqrt(T) div B0 + T' B0^T dH / (2 T^3/2)``, T' the derivative of T by y: no matrix is formed."""
+        """Return ``sqrt(T) div B0 + T' B0^T dH / (2 T^3/2)``, with T' the derivative of T by y, without a matrix."""
         body, n = system.drop_baths(), system.body_dim
         dH, dL = system.energy.gradient(x), tuple(L.gradient(x) for L in self.preserve)
         B = self.inner.factor(body, x[:n], dH[:n], tuple(L[:n] for L in dL))
@@ -82,60 +82,61 @@ class Heating(LiftedDissipation):
         if self.has_site_baths and not B.solenoidal:  # each site has a temperature of its own
             return super().divergence(system, x)
         T = jnp.abs(self._values_at_sites(dH[n:]))
-        own = jnp.zeros(B.size) if B.solenoidal else jnp.sqrt(T) * self.inner.divergence(body, x[:n])
-        warmer = temperature_slopes(system.energy, x, n)
-        if warmer is None:
-            return own
-        share = jnp.where(T > 0.0, 0.5 * self._values_at_sites(warmer) / jnp.where(T > 0.0, T, 1.0) ** 1.5, 0.0)
-        return own + B.transpose_times(body.scale_at_sites(share, dH[:n]))
+        body_divergence = jnp.zeros(B.size) if B.solenoidal else jnp.sqrt(T) * self.inner.divergence(body, x[:n])
+        slopes = temperature_slopes(system.energy, x, n)
+        if slopes is None:
+            return body_divergence
+        ratio = jnp.where(T > 0.0, 0.5 * self._values_at_sites(slopes) / jnp.where(T > 0.0, T, 1.0) ** 1.5, 0.0)
+        return body_divergence + B.transpose_times(body.scale_at_sites(ratio, dH[:n]))
 
     def lifted_geometry(self, system, x) -> LiftedGeometry:
         return _body_geometry(system, x)
 
     @property
     def has_site_baths(self) -> bool:
-        """Whether each site has a bath of its own."""
+        """True if each site has its own bath."""
         return bool(self.bath.shape)
 
     def temperature_signs(self, T) -> jax.Array:
-        """That of the temperatures, at the sites that heat them.
+        """Return the signs of the temperatures, shape () or (sites,).
 
-        A temperature changes its sign at no state: so this is a constant, as ``sign`` would not be for Taylor series.
+        No temperature changes its sign in any state, so the sign is a constant; ``jnp.sign`` would have no Taylor
+        series.
         """
         if self.has_positive_temperatures:
             return jnp.ones(np.shape(self.bath)).ravel() if self.has_site_baths else jnp.ones(())
         return jnp.where(self._values_at_sites(T) < 0.0, -1.0, 1.0)
 
-    def entropy_rates(self, lost, T) -> jax.Array:
-        """What the entropies grow by, shape (m,), where a body loses an energy, of shape () or at each site."""
+    def entropy_rates(self, energy_loss, T) -> jax.Array:
+        """Return the growth rates of the bath entropies, shape (m,), from the energy lost, shape () or (sites,)."""
         if self.has_site_baths:
-            return jax.ops.segment_sum(lost, np.asarray(self.bath).ravel(), len(T)) / T
-        return jnp.where(np.arange(len(T)) == int(np.asarray(self.bath)), lost / T, 0.0)
+            return jax.ops.segment_sum(energy_loss, np.asarray(self.bath).ravel(), len(T)) / T
+        return jnp.where(np.arange(len(T)) == int(np.asarray(self.bath)), energy_loss / T, 0.0)
 
     def _force_gradient(self, body: Geometry, dH, dS, n: int) -> jax.Array:
-        """What takes the place of dH in the force on the body, shape (n,): dH, where the entropy is that of baths."""
-        T, e, sign = self._values_at_sites(dH[n:]), self._values_at_sites(dS[n:]), self.temperature_signs(dH[n:])
-        return body.scale_at_sites(sign, body.scale_at_sites(e, dH[:n]) - body.scale_at_sites(T, dS[:n]))
+        """Return the gradient that replaces dH in the force on the body, shape (n,): dH for the bath entropy."""
+        T, dS_y, sign = self._values_at_sites(dH[n:]), self._values_at_sites(dS[n:]), self.temperature_signs(dH[n:])
+        return body.scale_at_sites(sign, body.scale_at_sites(dS_y, dH[:n]) - body.scale_at_sites(T, dS[:n]))
 
     def _values_at_sites(self, values) -> jax.Array:
-        """Values of baths, shape (m,), at the sites that heat them, shape () or (sites,)."""
+        """Return values of baths, shape (m,), at the sites that heat them, shape () or (sites,)."""
         return values[np.asarray(self.bath).ravel()] if self.has_site_baths else values[int(np.asarray(self.bath))]
 
     def _join_with_entropies(self, body: Geometry, v, dH, n: int) -> jax.Array:
-        """What moves the body, shape (n,), and the entropies that take the energy which it loses."""
-        gained = body.dot_at_sites(dH[:n], v) if self.has_site_baths else jnp.dot(dH[:n], v)
-        return jnp.concatenate([v, self.entropy_rates(-gained, dH[n:])])
+        """Return the velocity v of the body, shape (n,), followed by the entropy rates from the energy it loses."""
+        energy_gain = body.dot_at_sites(dH[:n], v) if self.has_site_baths else jnp.dot(dH[:n], v)
+        return jnp.concatenate([v, self.entropy_rates(-energy_gain, dH[n:])])
 
 
 class HeatlessDissipation(LiftedDissipation):
-    """A dissipation of a body that makes no heat, beside baths."""
+    """A dissipation of a body that produces no heat, in a system with baths."""
 
     def lifted_geometry(self, system, x) -> LiftedGeometry:
         return _body_geometry(system, x)
 
     def velocity(self, system, x, dH, dS, dL):
-        at = _body_geometry(system, x)
-        return self.inner.velocity(at.system, at.x, *at.lift_gradients(dH, dS, dL))
+        geometry = _body_geometry(system, x)
+        return self.inner.velocity(geometry.system, geometry.x, *geometry.lift_gradients(dH, dS, dL))
 
 
 def _body_geometry(system: Geometry, x) -> LiftedGeometry:
@@ -150,38 +151,47 @@ def _body_geometry(system: Geometry, x) -> LiftedGeometry:
 
 
 def couple_to_baths(
-    dissipation: Dissipation | None, body: Geometry, number: int, positive: bool, pulled: Callable[[Energy], Energy]
+    dissipation: Dissipation | None,
+    body: Geometry,
+    n_baths: int,
+    has_positive_temperatures: bool,
+    pullback: Callable[[Energy], Energy],
 ) -> Dissipation:
-    """The dissipation of a body, beside baths that take its heat: so many, of positive temperatures or of any.
+    """Return the dissipation of a body with ``n_baths`` baths that take its heat.
 
     Raises
     ------
     InputError
-        If it makes no heat, or there is no bath of the number that it names.
+        If no summand produces heat, or a summand names a bath that does not exist.
     """
-    parts = () if dissipation is None else dissipation.terms
-    if not any(part.energy_law == "nonincreasing" for part in parts):
-        found = f"{type(parts[0]).__name__} makes none" if parts else "there is none"
+    terms = () if dissipation is None else dissipation.terms
+    if not any(term.energy_law == "nonincreasing" for term in terms):
+        reason = f"{type(terms[0]).__name__} does not lower the energy" if terms else "the system has no dissipation"
         raise InputError(
-            "baths take the heat of a dissipation that lowers the energy, such as lt.DoubleBracket or lt.Friction, and "
-            f"{found}: leave out baths="
+            f"{reason}, so there is no heat for baths=. Remove baths=, or use lt.DoubleBracket or lt.Friction"
         )
-    carried = tuple(_couple_term_to_baths(part, body, number, positive, pulled) for part in parts)
-    return carried[0] if len(carried) == 1 else DissipationSum(carried)
+    coupled_terms = tuple(
+        _couple_term_to_baths(term, body, n_baths, has_positive_temperatures, pullback) for term in terms
+    )
+    return coupled_terms[0] if len(coupled_terms) == 1 else DissipationSum(coupled_terms)
 
 
 def _couple_term_to_baths(
-    part: Dissipation, body: Geometry, number: int, positive: bool, pulled: Callable[[Energy], Energy]
+    term: Dissipation,
+    body: Geometry,
+    n_baths: int,
+    has_positive_temperatures: bool,
+    pullback: Callable[[Energy], Energy],
 ) -> Dissipation:
-    functions = tuple(map(pulled, part.preserve))
-    if part.energy_law != "nonincreasing":
-        return HeatlessDissipation(part, functions)
-    bath = Indices(0) if part.heated_bath_index is None else part.heated_bath_index
+    functions = tuple(map(pullback, term.preserve))
+    if term.energy_law != "nonincreasing":
+        return HeatlessDissipation(term, functions)
+    bath = Indices(0) if term.heated_bath_index is None else term.heated_bath_index
     numbers = np.asarray(bath)
     if numbers.shape not in ((), body.heating_sites):
-        there = f", or of the shape {body.heating_sites} of the sites" if body.heating_sites else ""
-        raise InputError(f"bath is the number of a bath{there}, not an array of shape {numbers.shape}")
-    if not (numbers.min() >= 0 and numbers.max() < number):
-        outside = int(numbers[(numbers < 0) | (numbers >= number)][0]) if numbers.shape else int(numbers)
-        raise InputError(f"a dissipation heats bath {outside}, but there are {number}, which count from 0")
-    return Heating(part, functions, bath, positive)
+        shape_text = f", or an array of the shape {body.heating_sites} of the sites" if body.heating_sites else ""
+        raise InputError(f"bath must be the number of a bath{shape_text}, got shape {numbers.shape}")
+    if not (numbers.min() >= 0 and numbers.max() < n_baths):
+        bad_number = int(numbers[(numbers < 0) | (numbers >= n_baths)][0]) if numbers.shape else int(numbers)
+        raise InputError(f"a dissipation heats bath {bad_number}, but there are {n_baths} baths, numbered from 0")
+    return Heating(term, functions, bath, has_positive_temperatures)

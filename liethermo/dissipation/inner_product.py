@@ -1,4 +1,4 @@
-"""Inner products on a Lie algebra, projected off the velocity: BFM's dissipation, and that of the Killing form."""
+"""Dissipation by inner products on a Lie algebra: BFM's construction, and its case with the Killing form."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from .factor import Factor, form_root
 
 
 class BracketDissipation(Dissipation):
-    """``ad*_dH F`` with F linear in ``[dH, dS]``: its ``added_momentum``."""
+    """Base of forces ``ad*_dH F``, where F, the ``added_momentum``, is linear in ``[dH, dS]``."""
 
     def force(self, system, x, dH, dS, dL):
         g = system.algebra
         return g.ad_star(dH, self.added_momentum(dH, g.bracket(dH, dS)))
 
     def rate_of_change(self, system, x, dH, dS, dL, gradient):
-        """``F . [dH, gradient]``: of the entropy, with the bracket that F is made of and no other."""
+        """Return ``F . [dH, gradient]``; for the entropy, the bracket is the same one that F is made of."""
         action = system.algebra.action(dH)
         return action.bracket(gradient) @ self.added_momentum(dH, action.bracket(dS))
 
@@ -62,8 +62,8 @@ class InnerProductDissipation(BracketDissipation):
     def __init__(self, K):
         if callable(K):
             raise InputError(
-                "the inner product 𝒦 is a constant matrix, not a function: one that depends on the state is "
-                "lt.ProjectedMetric(cometric=...), or lt.FrictionOperator(K, project=True)"
+                "the inner product 𝒦 must be a constant matrix, got a function. For a form that depends on the state "
+                "use lt.ProjectedMetric(cometric=...) or lt.FrictionOperator(K, project=True)"
             )
         self.K = checked_semidefinite(K, "the inner product 𝒦")
 
@@ -80,7 +80,7 @@ class InnerProductDissipation(BracketDissipation):
 
 
 class KillingDissipation(BracketDissipation):
-    """Dissipation by the Killing form kappa, made positive: :class:`InnerProductDissipation` with the algebra's own 𝒦.
+    """Dissipation by minus the Killing form kappa; it needs no metric. See :class:`InnerProductDissipation`.
 
     ``𝒦 = -rate * kappa`` on compact type, ``𝒦(x, y) = -rate * kappa(x, theta y)`` with a Cartan involution theta on
     noncompact semisimple algebras, and ``-rate * kappa`` again wherever that is at least semidefinite (se(3)). On so(3)
@@ -112,19 +112,18 @@ class KillingDissipation(BracketDissipation):
 
     def __init__(self, rate=1.0, form=None):
         self.rate = checked_rate(rate)
-        self.form = form  # filled in by prepared(), once the algebra is known
+        self.form = form  # bind_to() fills it in, once the algebra is known
 
     @staticmethod
     def inner_product(g: mf.LieAlgebra) -> Any:
-        """The positive semidefinite form 𝒦 on g for rate 1: a matrix, shape (dim, dim), or what acts like one."""
-        if not g.is_semisimple() and (positive := g.killing_signature()[0]):
-            lowest = float(np.linalg.eigvalsh(-g.killing_form())[0])
+        """Return the positive semidefinite form 𝒦 on g for rate 1: a matrix, shape (dim, dim), or a block form."""
+        if not g.is_semisimple() and (n_negative := g.killing_signature()[0]):
+            min_eigenvalue = float(np.linalg.eigvalsh(-g.killing_form())[0])
             raise IndefiniteError(
-                f"{g.name} is not semisimple and minus its Killing form is indefinite ({positive} negative "
-                f"eigenvalues, the lowest {lowest:.3g}), so it cannot measure dissipation: entropy would fall along "
-                "some motions. Give an inner product with InnerProductDissipation(K), or use ProjectedMetric(), which "
-                "needs none",
-                residual=lowest,
+                f"{g.name} is not semisimple and minus its Killing form is indefinite, with {n_negative} negative "
+                f"eigenvalues, the lowest {min_eigenvalue:.3g}: the entropy could fall. Use ProjectedMetric(), or "
+                "InnerProductDissipation(K) with an inner product K",
+                residual=min_eigenvalue,
                 tolerance=0.0,
             )
         return g.killing_inner_product()
@@ -134,8 +133,8 @@ class KillingDissipation(BracketDissipation):
         form = self.inner_product(g)
         if g.is_solvable():  # Cartan's criterion: kappa(g, [g, g]) = 0
             raise InputError(
-                f"{g.name} is solvable: its Killing form vanishes on brackets, so "
-                "KillingDissipation would do nothing; use ProjectedMetric() or InnerProductDissipation(K)"
+                f"{g.name} is solvable: its Killing form vanishes on brackets, so KillingDissipation would do nothing. "
+                "Instead use ProjectedMetric() or InnerProductDissipation(K)"
             )
         return dataclasses.replace(self, form=jnp.asarray(form) if isinstance(form, np.ndarray) else form)
 
@@ -148,6 +147,6 @@ class KillingDissipation(BracketDissipation):
 
 
 def _bracket_factor(system, dH, form) -> Factor | None:
-    """The factor of ``ad*_dH 𝒦 ad_dH``. As C is skew in a, b, ``div ad*_dH F = C[a, b, c] H_ab F_c`` vanishes."""
+    """Return the factor of ``ad*_dH 𝒦 ad_dH``. C is skew in a, b: ``div ad*_dH F = C[a, b, c] H_ab F_c`` vanishes."""
     root, g = form_root(form), system.algebra
     return None if root is None else Factor(g.dim, lambda w: g.ad_star(dH, root @ w), solenoidal=True)

@@ -26,7 +26,7 @@ from .factor import Factor
 
 
 class LandauLifshitz(Dissipation):
-    """Landau-Lifshitz damping, ``lambda_i s_i x (s_i x dH_i)`` at each site i: every |s_i| is kept, and H falls.
+    """Landau-Lifshitz damping ``lambda_i s_i x (s_i x dH_i)`` at each site i: every |s_i| is constant, and H falls.
 
     It is the double bracket of so(3) at every site, with a rate of its own at each: the energy falls at the rate
     ``sum lambda_i |s_i x dH_i|^2``. In a system without baths that is all. In one with baths the heat goes to the bath
@@ -58,7 +58,7 @@ class LandauLifshitz(Dissipation):
 
     @staticmethod
     def gilbert(alpha, ratio=1.0) -> tuple[jax.Array, jax.Array]:
-        """Gyromagnetic ratio and rate of Landau and Lifshitz for the damping alpha and the ratio of Gilbert's form."""
+        """Return Landau and Lifshitz' gyromagnetic ratio and rate for the alpha and ratio of Gilbert's form."""
         alpha, ratio = check_numbers(alpha, "alpha"), check_numbers(ratio, "ratio")
         return ratio / (1.0 + alpha**2), alpha * ratio / (1.0 + alpha**2)
 
@@ -71,11 +71,11 @@ class LandauLifshitz(Dissipation):
         spins = system.poisson
         if not isinstance(spins, Spins):
             raise InputError(
-                "LandauLifshitz damps the spins of a SpinSystem; on so(3) at every site DoubleBracket is the same"
+                "LandauLifshitz needs a SpinSystem. For so(3) at every site use DoubleBracket, which is the same"
             )
         if self.rate.shape not in ((), spins.sites):
             raise InputError(
-                f"rates are one number, or have the shape {spins.sites} of the sites, not {self.rate.shape}"
+                f"rate must be one number, or have the shape {spins.sites} of the sites, got {self.rate.shape}"
             )
         return self
 
@@ -90,28 +90,28 @@ class LandauLifshitz(Dissipation):
     def damping_force(
         self, spins: Spins, x, dH, sign=1.0, per_site: bool = False
     ) -> tuple[VectorComponents, jax.Array]:
-        """The components of the force on ``spins``, times a sign, and how fast the energy falls by it.
+        """Return the force components on ``spins``, times a sign, and the rate at which the energy falls.
 
-        The energy of all sites together, or with ``per_site`` at each.
+        The rate is that of all sites together, or with ``per_site`` of each site.
         """
         s, rate = spins.spins(x), sign * self.rate.reshape(-1)
         torque = cross_vectors(s, spins.split_covectors(dH))
         if rate.size == 1 and not per_site:
-            lost = rate[0] * sum_of_dots(torque, torque)
+            energy_loss = rate[0] * sum_of_dots(torque, torque)
         else:
-            lost = rate * dot_vectors(torque, torque)
-            lost = lost if per_site else jnp.sum(lost)
-        return scale_vectors(rate, cross_vectors(s, torque)), lost
+            energy_loss = rate * dot_vectors(torque, torque)
+            energy_loss = energy_loss if per_site else jnp.sum(energy_loss)
+        return scale_vectors(rate, cross_vectors(s, torque)), energy_loss
 
     def factor(self, system, x, dH, dL):
         spins = system.poisson
         s, scale = spins.spins(x), sqrt_or_zero(self.rate.reshape(-1))
 
         def times(w):
-            pull = split_vectors(w.reshape(spins.count, 3))
-            return spins.join_state(scale_vectors(scale, cross_vectors(pull, s)), jnp.zeros(0))
+            vectors = split_vectors(w.reshape(spins.count, 3))
+            return spins.join_state(scale_vectors(scale, cross_vectors(vectors, s)), jnp.zeros(0))
 
-        # solenoidal, as w x s is, of any w that does not depend on s
+        # solenoidal: w x s has divergence zero for any w that does not depend on s
         return Factor(
             3 * spins.count, times, solenoidal=True, spin_coefficients=scale.reshape(self.rate.shape and (-1,))
         )

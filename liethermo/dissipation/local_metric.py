@@ -1,4 +1,4 @@
-"""The projected metric of every site by itself."""
+"""The projected metric, site by site."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from .factor import Factor
 
 
 class LocalProjectedMetric(Dissipation):
-    """The projected metric of every site by itself: a system of many sites is damped as each of them would be alone.
+    """The projected metric, site by site: each of many sites is damped as it would be alone.
 
-    ``K(alpha, beta) = sum_i rate_i [G(dH_i, dH_i) G(alpha_i, beta_i) - G(dH_i, alpha_i) G(dH_i, beta_i)]``, the indices
-    those of sites: BFM (2.2) at each, with dH_i the components of the gradient there. Each term has dH in its kernel,
-    so the energy of the whole is constant, and no rate depends on the number of sites. On so(3) at every site the force
-    is ``rate_i dH_i x (dS_i x dH_i)``; there it is also that of ``KillingDissipation(rate / 2)``.
+    ``K(alpha, beta) = sum_i rate_i [G(dH_i, dH_i) G(alpha_i, beta_i) - G(dH_i, alpha_i) G(dH_i, beta_i)]`` over the
+    sites i: BFM (2.2) at each, where dH_i are the components of the gradient there. Each term has dH in its kernel, so
+    the total energy is constant, and no rate depends on the number of sites. On so(3) at every site the force is
+    ``rate_i dH_i x (dS_i x dH_i)``; there it is also the force of ``KillingDissipation(rate / 2)``.
 
     Parameters
     ----------
@@ -41,14 +41,16 @@ class LocalProjectedMetric(Dissipation):
 
     def bind_to(self, system):
         if system.space is not None:
-            raise InputError("LocalProjectedMetric is for systems on copies of an algebra, not on a manifold")
+            raise InputError(
+                "LocalProjectedMetric needs a system on copies of an algebra, and this one is on a manifold"
+            )
         if self.rate.shape not in ((), system.sites):
             raise InputError(
-                f"rates are one number, or have the shape of the sites, {system.sites}, not {self.rate.shape}"
+                f"rate must be one number, or have the shape {system.sites} of the sites, got {self.rate.shape}"
             )
         d = system.shape[-1]
         if self.cometric is not None and self.cometric.shape != (d, d):
-            raise InputError(f"the cometric of a site has shape ({d}, {d}), not {self.cometric.shape}")
+            raise InputError(f"the cometric of a site must have shape ({d}, {d}), got {self.cometric.shape}")
         return self
 
     def force(self, system, x, dH, dS, dL):
@@ -58,14 +60,14 @@ class LocalProjectedMetric(Dissipation):
         return (self.rate[..., None] * (square[..., None] * Gb - overlap[..., None] * Ga)).ravel()
 
     def factor(self, system, x, dH, dL):
-        """At each site all ``(l_j . dH) l_i - (l_i . dH) l_j``, i < j, of the columns l of a root of G."""
+        """Return, at each site, all ``(l_j . dH) l_i - (l_i . dH) l_j``, i < j, for the columns l of a root of G."""
         d, count = system.shape[-1], math.prod(system.sites)
         L = jnp.eye(d) if self.cometric is None else semidefinite_factor(self.cometric)
         rates = jnp.broadcast_to(self.rate, system.sites or ()).reshape(count, 1)
         gradients = dH.reshape(count, d) @ L
 
         def times(w):
-            turns = skew_matrix(w.reshape(count, -1), d)
-            return (sqrt_or_zero(rates) * (jnp.einsum("nij,nj->ni", turns, gradients) @ L.T)).ravel()
+            rotations = skew_matrix(w.reshape(count, -1), d)
+            return (sqrt_or_zero(rates) * (jnp.einsum("nij,nj->ni", rotations, gradients) @ L.T)).ravel()
 
         return Factor(count * math.comb(d, 2), times, solenoidal=True)

@@ -1,4 +1,4 @@
-"""Matter that passes membranes, and that reacts: friction between chemical potentials [after GBY; SML §7]."""
+"""Matter that crosses membranes, and chemical reactions: friction between chemical potentials [after GBY; SML §7]."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from .factor import Factor
 
 
 class Process(Module):
-    """One way in which particle numbers change together, ``N' = nu J``.
+    """A process that changes several particle numbers together, ``N' = nu J``.
 
     Attributes
     ----------
     stoichiometry : tuple of float
-        nu, of all particle numbers of the system.
+        The coefficients nu of all particle numbers of the system.
     heat_shares : tuple of float
-        The shares of the released energy ``A = -nu . mu`` that heat each body, of sum 1.
+        The fractions of the released energy ``A = -nu . mu`` that heat each body, of sum 1.
     entropy_transport : tuple of float
-        Which bodies entropy is carried to (1) and from (-1).
-    entropy_per_particle : array, shape ()
-        What is carried with a particle (entropy).
+        1 for a body that receives entropy, -1 for one that gives entropy, otherwise 0.
+    entropy : array, shape ()
+        Entropy transported with a particle.
     coefficient : array, shape (), or function of the whole state
         L >= 0.
     """
@@ -36,7 +36,7 @@ class Process(Module):
     stoichiometry: tuple[float, ...] = eqx.field(static=True)
     heat_shares: tuple[float, ...] = eqx.field(static=True)
     entropy_transport: tuple[float, ...] = eqx.field(static=True)
-    entropy_per_particle: jax.Array
+    entropy: jax.Array
     coefficient: jax.Array | Callable
 
 
@@ -59,40 +59,41 @@ class MatterExchange(Dissipation):
         self.processes = tuple(processes)
 
     def force(self, system, x, dH, dS, dL):
-        along, spread = self._flux_directions(system, x, dH)
-        return spread(self._coefficients(x) * along(dS))
+        z_dot, apply_fluxes = self._flux_directions(system, x, dH)
+        return apply_fluxes(self._coefficients(x) * z_dot(dS))
 
     def factor(self, system, x, dH, dL):
-        _, spread = self._flux_directions(system, x, dH)
+        _, apply_fluxes = self._flux_directions(system, x, dH)
         root = jnp.sqrt(self._coefficients(x))
-        return Factor(len(self.processes), lambda w: spread(root * w))
+        return Factor(len(self.processes), lambda w: apply_fluxes(root * w))
 
     def _coefficients(self, x) -> jax.Array:
-        """L of each process; NaN where it is negative: the step is then refused."""
-        found = [e.coefficient(x) if callable(e.coefficient) else e.coefficient for e in self.processes]
-        L = jnp.stack([jnp.asarray(value) for value in found])
+        """Return L of each process; NaN where it is negative: the step is then rejected."""
+        coefficients = [e.coefficient(x) if callable(e.coefficient) else e.coefficient for e in self.processes]
+        L = jnp.stack([jnp.asarray(value) for value in coefficients])
         return jnp.where(L >= 0.0, L, jnp.nan)
 
     def _flux_directions(self, system, x, dH) -> tuple[Callable, Callable]:
-        """``z . dS`` of each process, and the sum of fluxes times z."""
-        numbers, heated, carried = (
-            np.array([getattr(e, name) for e in self.processes]) for name in ("stoichiometry", "heated", "carried")
+        """Return two functions: dS to ``z . dS`` of each process, and fluxes to the sum of fluxes times z."""
+        stoichiometry, heat_shares, entropy_transport = (
+            np.array([getattr(e, name) for e in self.processes])
+            for name in ("stoichiometry", "heat_shares", "entropy_transport")
         )
         N, S = system.poisson.particle_indices.N, system.poisson.state_indices.S
         mu, T = dH[N], dH[S]
-        T, touched = jnp.where(T > 0.0, T, jnp.nan), np.abs(carried)
-        affinity = -(numbers @ mu)
-        mean = touched @ T / np.maximum(touched.sum(axis=1), 1.0)
-        heat = jnp.stack([e.entropy_per_particle for e in self.processes]) * mean
-        entropies = (heated * affinity[:, None] + carried * heat[:, None]) / T
+        T, n_ends = jnp.where(T > 0.0, T, jnp.nan), np.abs(entropy_transport)
+        affinity = -(stoichiometry @ mu)
+        mean_temperature = n_ends @ T / np.maximum(n_ends.sum(axis=1), 1.0)
+        transported_heat = jnp.stack([e.entropy for e in self.processes]) * mean_temperature
+        entropies = (heat_shares * affinity[:, None] + entropy_transport * transported_heat[:, None]) / T
         return (
-            lambda dS: numbers @ dS[N] + entropies @ dS[S],
-            lambda flux: jnp.zeros_like(x).at[N].add(flux @ numbers).at[S].add(flux @ entropies),
+            lambda dS: stoichiometry @ dS[N] + entropies @ dS[S],
+            lambda flux: jnp.zeros_like(x).at[N].add(flux @ stoichiometry).at[S].add(flux @ entropies),
         )
 
 
 def conserved_numbers(processes: Sequence[Process], count: int) -> np.ndarray:
-    """Combinations of particle numbers that no process changes, shape (combinations, count), reduced by rows."""
+    """Return combinations of particle numbers that no process changes, shape (combinations, count), row-reduced."""
     rows = np.array([e.stoichiometry for e in processes]).reshape(-1, count)
     _, singular, basis = np.linalg.svd(rows, full_matrices=True)
     rank = int((singular > 1e-12 * max(1.0, singular.max(initial=0.0))).sum())

@@ -21,38 +21,43 @@ from .checks import state_shape_dtype
 from .factor import Factor
 from .projected_metric import ProjectedMetric
 
-CONVEXITY_CHECK, MINIMUM_AT_ZERO_CHECK = "psi convex", "psi least at 0"
-"""The rows of a check on a dissipation potential."""
+CONVEXITY_CHECK = "psi convex"
+"""Row of ``system.check()``: convexity of a dissipation potential, tested on random pairs of forces."""
 
-CONVEXITY_PAIRS, CONVEXITY_FORCE_SCALES = 8, (1e-3, 1e-1, 1.0, 10.0)
-"""Random pairs of forces that the convexity of a potential is tried on, and their sizes."""
+MINIMUM_AT_ZERO_CHECK = "psi least at 0"
+"""Row of ``system.check()``: the slope of a dissipation potential vanishes at zero force."""
+
+CONVEXITY_PAIRS = 8
+"""Number of random pairs of forces, at each scale, that test the convexity of a potential."""
+
+CONVEXITY_FORCE_SCALES = (1e-3, 1e-1, 1.0, 10.0)
+"""Lengths, per component, of the random forces that test the convexity of a potential."""
 
 
 class DissipationPotential(Dissipation):
     """Dissipation by a potential of the thermodynamic forces: ``force = B grad psi(B^T dS)``.
 
-    B is the factor of another dissipation, ``B B^T = K``. By default it is the orthogonal projector P off dH, and this
-    is ``P grad psi(P dS)``; that of a :class:`ProjectedMetric` with a cometric is an oblique one, with functions to
-    ``preserve`` it is off their gradients too; that of a dissipation on an algebra makes forces ``[dH, dS]`` in the
-    algebra, and that of the conduction of heat one force for each pair of bodies.
+    B is the factor of another dissipation, ``B B^T = K``. By default it is the orthogonal projector P off dH, and the
+    force is ``P grad psi(P dS)``. The factor of a :class:`ProjectedMetric` with a cometric is an oblique projector;
+    with functions to ``preserve`` it projects off their gradients too. A dissipation on an algebra has forces ``[dH,
+    dS]`` in the algebra, and heat conduction has one force for each pair of bodies.
 
-    For a psi that is convex and least at zero, ``S' = (B^T dS) . grad psi(B^T dS) >= 0``, and ``B^T dH = 0`` for the
-    discrete gradient too: so every method keeps both laws as it keeps them for K. The potential ``|f|^2 / 2`` is K
-    itself. ``system.check()`` tries whether psi is convex and least at zero, and building a system refuses one that is
-    not; a psi that has a kink is taken with the slope that JAX gives it there, and the iterations of implicit methods
-    want a continuous one.
+    If psi is convex with its minimum at zero, ``S' = (B^T dS) . grad psi(B^T dS) >= 0``, and ``B^T dH = 0`` for the
+    discrete gradient too: so every method keeps both laws as for K. The potential ``|f|^2 / 2`` gives K itself.
+    ``system.check()`` tests that psi is convex with its minimum at zero, and building a system rejects any other psi.
+    At a kink of psi the slope that JAX returns is used; the iterations of implicit methods need a continuous slope.
 
     Parameters
     ----------
     psi : function from the forces, shape (size,), to a scalar; or from a state and the forces
-        :class:`CoulombFriction`, :class:`PowerLawFriction`, :class:`ActivatedFriction`, or one of your own.
+        :class:`CoulombFriction`, :class:`PowerLawFriction`, :class:`ActivatedFriction`, or a function of your own.
     of : Dissipation, optional
-        Whose factor makes the forces; ``ProjectedMetric(normalized=True)`` by default.
+        The dissipation whose factor makes the forces; ``ProjectedMetric(normalized=True)`` by default.
 
     Raises
     ------
     AxiomError
-        When a system is built with a psi that is not convex, or not least at zero.
+        When a system is built, if psi is not convex or has no minimum at 0.
     InputError
         If ``of`` has no factor.
     """
@@ -63,12 +68,12 @@ class DissipationPotential(Dissipation):
 
     def __init__(self, psi: Callable, of: Dissipation | None = None):
         if not callable(psi):
-            raise InputError(f"psi is a function from forces to a number, not {type(psi).__name__}")
+            raise InputError(f"psi must be a function from forces to a number, got {type(psi).__name__}")
         of = ProjectedMetric(normalized=True) if of is None else of
         if not isinstance(of, Dissipation):
-            raise InputError(f"of is a dissipation, not {type(of).__name__}")
+            raise InputError(f"of must be a dissipation, got {type(of).__name__}")
         if of.energy_law != "conserved":
-            raise InputError(f"a potential composed with {type(of).__name__} would not keep the energy")
+            raise InputError(f"of must be a dissipation that conserves the energy, and {type(of).__name__} does not")
         self.psi, self.of, self.depends_on_state = psi, of, required_argument_count(psi) == 2
 
     is_symmetric = False
@@ -78,21 +83,21 @@ class DissipationPotential(Dissipation):
     couplings = forward_to("of")
 
     def bind_to(self, system):
-        found = eqx.tree_at(lambda d: d.of, self, self.of.bind_to(system))
+        bound_potential = eqx.tree_at(lambda d: d.of, self, self.of.bind_to(system))
         shape = result_shape(
-            lambda x: found.psi_at_state(x)(jnp.zeros(found._continuous_factor(system, x).size)),
+            lambda x: bound_potential.psi_at_state(x)(jnp.zeros(bound_potential._continuous_factor(system, x).size)),
             state_shape_dtype(system.dim),
         )
         if shape.shape != ():
             raise FunctionError(f"psi must return one number, but it returns shape {shape.shape}")
-        return found
+        return bound_potential
 
     def psi_at_state(self, x) -> Callable:
-        """The potential as a function of the forces at a state."""
+        """Return the potential as a function of the forces at a state."""
         return lambda f: jnp.asarray(self.psi(x, f) if self.depends_on_state else self.psi(f))
 
     def input_residuals(self, system, x):
-        """By how much the slope falls between two forces, and by how much it pushes at none."""
+        """Return the decrease of the slope between two forces, and the slope at zero force, both relative, by name."""
         slope = jax.grad(self.psi_at_state(x))
         size = self._continuous_factor(system, x).size
         pairs = np.random.default_rng(0).standard_normal((CONVEXITY_PAIRS, 2, size))
@@ -104,11 +109,11 @@ class DissipationPotential(Dissipation):
             length = jnp.linalg.norm(a - b) * jnp.max(jnp.linalg.norm(slopes, axis=1))
             return jnp.maximum(-jnp.dot(a - b, slopes[0] - slopes[1]), 0.0) / jnp.where(length > 0.0, length, 1.0)
 
-        largest = jnp.max(jnp.linalg.norm(jax.vmap(slope)(pairs[:, 0]), axis=1))
-        at_rest = jnp.linalg.norm(slope(jnp.zeros(size))) / jnp.where(largest > 0.0, largest, 1.0)
+        max_slope = jnp.max(jnp.linalg.norm(jax.vmap(slope)(pairs[:, 0]), axis=1))
+        slope_at_zero = jnp.linalg.norm(slope(jnp.zeros(size))) / jnp.where(max_slope > 0.0, max_slope, 1.0)
         return self.of.input_residuals(system, x) | {
             CONVEXITY_CHECK: jnp.max(jax.vmap(monotonicity_residual)(pairs)),
-            MINIMUM_AT_ZERO_CHECK: at_rest,
+            MINIMUM_AT_ZERO_CHECK: slope_at_zero,
         }
 
     def force(self, system, x, dH, dS, dL):
@@ -121,8 +126,10 @@ class DissipationPotential(Dissipation):
     def _require_factor(self, system, x, dH, dL) -> Factor:
         B = self.of.factor(system, x, dH, dL)
         if B is None:
-            where = "" if system.space is None else f" on {system.space.name}"
-            raise InputError(f"{type(self.of).__name__} gives no factor of its friction matrix{where} to compose with")
+            space_text = "" if system.space is None else f" on {system.space.name}"
+            raise InputError(
+                f"{type(self.of).__name__} gives no factor of its friction matrix{space_text}, so of= cannot use it"
+            )
         return B
 
 
@@ -130,7 +137,7 @@ class DissipationPotential(Dissipation):
 
 
 class NamedPotential(Module):
-    """A sum over the forces, or with ``each=False`` a function of their length: then no choice of axes matters."""
+    """Base of potentials: a sum over the forces, or with ``each=False`` an isotropic function of their length."""
 
     each: bool = eqx.field(static=True, default=False, kw_only=True)
 
@@ -138,21 +145,22 @@ class NamedPotential(Module):
         return jnp.sum(self.value_of_square(f * f)) if self.each else self.value_of_square(jnp.dot(f, f))
 
     def value_of_square(self, q):
-        """As a function of the square of a force."""
+        """Return the potential as a function of the square of a force."""
         raise NotImplementedError
 
 
 class CoulombFriction(NamedPotential):
-    """``strength (sqrt(f^2 + width^2) - width)``: what it drives is at most ``strength``, however large the force.
+    """Dry friction ``strength (sqrt(f^2 + width^2) - width)``: its flux is at most ``strength``, for any force f.
 
-    Smooth; for forces far below the width it is linear, with the coefficient ``strength / width``.
+    The potential is smooth. For forces far below the width it is linear friction with the coefficient ``strength /
+    width``.
 
     Parameters
     ----------
     strength : float, >= 0
     width : float, > 0
     each : bool
-        Of every force by itself, or of their length (by default).
+        Apply the potential to every force by itself, or to their length (by default).
     """
 
     strength: jax.Array
@@ -170,17 +178,17 @@ class CoulombFriction(NamedPotential):
 
 
 class PowerLawFriction(NamedPotential):
-    """``strength / p ((f^2 + width^2)^(p/2) - width^p)``: what it drives grows as ``|f|^(p-1)``.
+    """Power law ``strength / p ((f^2 + width^2)^(p/2) - width^p)``: its flux grows as ``|f|^(p-1)``.
 
-    Smooth for a width > 0. Without one its slope is continuous, and of Hölder class p - 1 at f = 0 for p < 2; a width
-    is what helps where Newton's method stalls there. Quadratic for p = 2.
+    The potential is smooth for a width > 0. Without a width its slope is continuous, and of Hölder class p - 1 at f = 0
+    for p < 2; if Newton's method stalls there, a width helps. For p = 2 it is quadratic.
 
     Parameters
     ----------
     exponent : float, > 1
     strength, width : float, >= 0
     each : bool
-        Of every force by itself, or of their length (by default).
+        Apply the potential to every force by itself, or to their length (by default).
     """
 
     exponent: jax.Array
@@ -190,7 +198,7 @@ class PowerLawFriction(NamedPotential):
     def __init__(self, exponent, strength=1.0, width=0.0, *, each: bool = False):
         self.exponent = _checked_number(exponent, "the exponent", False)
         if not isinstance(self.exponent, jax.core.Tracer) and not float(self.exponent) > 1.0:
-            raise InputError(f"the exponent of a power law is > 1, not {float(self.exponent):g}: it has to be convex")
+            raise InputError(f"the exponent of a power law must be > 1, got {float(self.exponent):g}")
         self.strength, self.width = (
             _checked_number(strength, "the strength", True),
             _checked_number(width, "the width", True),
@@ -204,17 +212,17 @@ class PowerLawFriction(NamedPotential):
 
 
 class ActivatedFriction(NamedPotential):
-    """``rate scale^2 (cosh(f / scale) - 1)``: what it drives is ``rate scale sinh(f / scale)``, as over a barrier.
+    """Flow over a barrier, ``rate scale^2 (cosh(f / scale) - 1)``: its flux is ``rate scale sinh(f / scale)``.
 
-    That is the law of mass action, and Eyring's of creep. Smooth; linear with the coefficient ``rate`` for forces far
-    below the scale.
+    This is the law of mass action, and Eyring's law of creep. The potential is smooth. For forces far below the scale
+    it is linear friction with the coefficient ``rate``.
 
     Parameters
     ----------
     rate : float, >= 0
     scale : float, > 0
     each : bool
-        Of every force by itself, or of their length (by default).
+        Apply the potential to every force by itself, or to their length (by default).
     """
 
     rate: jax.Array
@@ -228,8 +236,8 @@ class ActivatedFriction(NamedPotential):
         return self.rate * q * hyperbolic_stumpff(2, q / self.scale**2)
 
 
-def _checked_number(value, what: str, zero: bool) -> jax.Array:
+def _checked_number(value, what: str, allow_zero: bool) -> jax.Array:
     number = check_numbers(value, what, ())
-    if not isinstance(number, jax.core.Tracer) and not (float(number) >= 0.0 if zero else float(number) > 0.0):
-        raise InputError(f"{what} must be {'>=' if zero else '>'} 0, not {float(number):g}")
+    if not isinstance(number, jax.core.Tracer) and not (float(number) >= 0.0 if allow_zero else float(number) > 0.0):
+        raise InputError(f"{what} must be {'>=' if allow_zero else '>'} 0, got {float(number):g}")
     return number

@@ -1,4 +1,4 @@
-"""Metrics projected off the gradients of what is to stay constant."""
+"""Metrics projected off the gradients of conserved functions."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from .factor import Factor
 
 
 class GlobalRateWarning(UserWarning):
-    """A dissipation that couples all sites of a system, and damps each the faster the more there are."""
+    """Warns that a dissipation couples all sites, so that the damping of each site grows with their number."""
 
 
 class ProjectedMetric(Dissipation):
-    """Dissipation by a cometric G, projected off what it has to conserve [BFM 2.2, Remark 2.1].
+    """Gradient of the entropy in a cometric G, without the components along conserved gradients [BFM 2.2, Remark 2.1].
 
     ``K(alpha, beta) = det(C) G(P alpha, P beta)``, P the G-orthogonal projector off the span of dH and the
     gradients dL_a of ``preserve``, and ``C_ab = G(dL_a, dL_b)`` with L_1 = H. For the energy alone
@@ -59,7 +59,7 @@ class ProjectedMetric(Dissipation):
     """
 
     cometric: jax.Array | Callable | None
-    preserved_functions: tuple[Energy, ...]
+    functions: tuple[Energy, ...]
     normalized: bool = eqx.field(static=True)
     rate: jax.Array
 
@@ -69,46 +69,48 @@ class ProjectedMetric(Dissipation):
             cometric if cometric is None or callable(cometric) else checked_semidefinite(cometric, "the cometric")
         )
         functions = preserve if isinstance(preserve, list | tuple) else (preserve,)
-        self.preserved_functions = tuple(make_energy(L, "a preserved function") for L in functions)
+        self.functions = tuple(make_energy(L, "a preserved function") for L in functions)
         self.normalized = bool(normalized)
         self.rate = checked_rate(rate)
 
     @property
     def preserve(self):
-        return self.preserved_functions
+        return self.functions
 
     def bind_to(self, system):
         if system.sites and not self.normalized:
             warn(
                 f"ProjectedMetric damps each of the {math.prod(system.sites)} sites at a rate that grows with their "
-                "number, since G(dH, dH) is a sum over all of them: LocalProjectedMetric acts site by site, and "
-                "normalized=True leaves the factor out",
+                "number, since G(dH, dH) is a sum over all sites. Use LocalProjectedMetric, which acts site by site, "
+                "or normalized=True, which leaves this factor out",
                 GlobalRateWarning,
             )
         if system.space is not None:
             return self
         return eqx.tree_at(
-            lambda d: d.preserved_functions,
+            lambda d: d.functions,
             self,
-            tuple(mark_polynomial_degrees(L, system.dim) for L in self.preserved_functions),
+            tuple(mark_polynomial_degrees(L, system.dim) for L in self.functions),
         )
 
     def force(self, system, x, dH, dS, dL):
-        raised = self._cometric_map(system, x)
+        raise_index = self._cometric_map(system, x)
         if not dL and not self.normalized:
-            GdH = raised(dH)
+            GdH = raise_index(dH)
             square = jnp.dot(GdH, dH)
-            share = jnp.dot(GdH, dS) / jnp.where(square > 0.0, square, 1.0)
-            image = raised(dS - share * dH)  # the rest first: near an equilibrium its image has digits of its own
+            ratio = jnp.dot(GdH, dS) / jnp.where(square > 0.0, square, 1.0)
+            image = raise_index(
+                dS - ratio * dH
+            )  # subtract first: near an equilibrium the difference of images would lose digits
             return self.rate * (square * image - jnp.dot(image, dH) * GdH)
-        held = gram_schmidt((dH, *dL), metric_map=raised)
-        projected = held.project_off_images(raised(held.project_off(dS)))
-        return self.rate * (projected if self.normalized else math.prod(held.squared_norms) * projected)
+        frame = gram_schmidt((dH, *dL), metric_map=raise_index)
+        projection = frame.project_off_images(raise_index(frame.project_off(dS)))
+        return self.rate * (projection if self.normalized else math.prod(frame.squared_norms) * projection)
 
     def factor(self, system, x, dH, dL):
-        """``P^T L`` with ``L L^T = G``. For the energy alone all ``(l_j . dH) l_i - (l_i . dH) l_j``, i < j.
+        """Return ``P^T L`` with ``L L^T = G``; for the energy alone all ``(l_j . dH) l_i - (l_i . dH) l_j``, i < j.
 
-        Their divergence is zero where G is constant.
+        The divergence of the latter is zero if G is constant.
         """
         G, n = evaluate_form(self.cometric, x), system.dim
         if system.space is not None:
@@ -126,10 +128,10 @@ class ProjectedMetric(Dissipation):
             return Factor(math.comb(n, 2), times, solenoidal=not callable(self.cometric)).scale_by(self.rate)
         return self._projected_factor(system, x, dH, dL, n, lambda w: root @ w)
 
-    def _projected_factor(self, system, x, dH, dL, size: int, root: Callable) -> Factor:
-        held = gram_schmidt((dH, *dL), metric_map=self._cometric_map(system, x))
-        rate = self.rate if self.normalized else self.rate * math.prod(held.squared_norms)
-        return Factor(size, lambda w: held.project_off_images(root(w))).scale_by(rate)
+    def _projected_factor(self, system, x, dH, dL, n_columns: int, root: Callable) -> Factor:
+        frame = gram_schmidt((dH, *dL), metric_map=self._cometric_map(system, x))
+        rate = self.rate if self.normalized else self.rate * math.prod(frame.squared_norms)
+        return Factor(n_columns, lambda w: frame.project_off_images(root(w))).scale_by(rate)
 
     def _cometric_map(self, system, x):
         G = evaluate_form(self.cometric, x)

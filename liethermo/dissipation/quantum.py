@@ -29,12 +29,12 @@ from .base import Dissipation
 from .checks import checked_rate
 
 ENERGY_RTOL = 8.0 * EPS
-"""Error of an energy, relative to the largest one; times the number of levels, where energies are eigenvalues."""
+"""Error of an energy, relative to the largest one; times the number of levels if energies are eigenvalues."""
 
 
 @runtime_checkable
 class HasMatrix(Protocol):
-    """An operator that is not an array and gives its matrix, as a ``Qobj`` of QuTiP does."""
+    """An operator, such as a ``Qobj`` of QuTiP, whose matrix is returned by ``full()``."""
 
     def full(self) -> np.ndarray: ...
 
@@ -46,16 +46,16 @@ class Operator(StaticArray):
 
 
 class Jump(NamedTuple):
-    """A part of a coupling that takes the energy omega out of the system, ``[H, V] = -omega V``.
+    """A component of a coupling that takes the energy omega out of the system, ``[H, V] = -omega V``.
 
     Attributes
     ----------
     operator : Operator
-        V in the frame of the jumps; together with its adjoint, which puts that energy in.
+        V in the frame of the jumps. Its adjoint, which puts the energy omega in, belongs to the jump too.
     coupling_index : int
         The number of the coupling.
     weight : float
-        One half where V is its own adjoint: the two are then one.
+        One half if V is its own adjoint: the two jumps are then one.
     """
 
     operator: Operator
@@ -66,12 +66,12 @@ class Jump(NamedTuple):
 class ThermalJumps(Dissipation):
     """Jumps of an open quantum system that exchange heat with a bath [Carlen & Maas 2017; Mittnenzweig & Mielke 2017].
 
-    A coupling V is split into parts with ``[H, V] = -omega V``. With ``B(A, a) = [V, A] - (a / T) [V, dE]`` and L the
-    logarithmic mean of ``e^(-omega / 2T) rho`` from the left and ``e^(omega / 2T) rho`` from the right, the friction is
-    ``K = sum (rate / 2) B* L B`` over the parts and their adjoints. ``K dE = 0`` and ``K >= 0`` by form, for discrete
-    gradients too: the energy of system and bath is constant and the entropy cannot fall. While T is constant the motion
-    is Lindblad's equation with detailed balance: jumps V at the rate ``rate * exp(omega / 2T)`` and V^H at
-    ``rate * exp(-omega / 2T)``. The Hamiltonian may change in time if its eigenvectors do not change.
+    A coupling V is split into components with ``[H, V] = -omega V``. With ``B(A, a) = [V, A] - (a / T) [V, dE]`` and L
+    the logarithmic mean of ``e^(-omega / 2T) rho`` from the left and ``e^(omega / 2T) rho`` from the right, the
+    friction is ``K = sum (rate / 2) B* L B`` over the components and their adjoints. ``K dE = 0`` and ``K >= 0`` by
+    form, for discrete gradients too: the energy of system and bath is constant and the entropy cannot fall. While T is
+    constant the motion is Lindblad's equation with detailed balance: jumps V at the rate ``rate * exp(omega / 2T)`` and
+    V^H at ``rate * exp(-omega / 2T)``. The Hamiltonian may depend on time if its eigenvectors do not.
 
     In a system without baths the jumps exchange no heat. This is the limit of infinite temperature: the identity is at
     rest (the noise is unital), and the entropy cannot fall. The energy is constant if every V commutes with H, as in
@@ -82,7 +82,8 @@ class ThermalJumps(Dissipation):
     couplings : list of (V, rate)
         V is a dimensionless matrix, shape (N, N). A Hermitian V acts once, any other together with its adjoint. The
         rate is a number >= 0 (1 / time), or a function of omega >= 0 and T, such as ``g / (2 sinh(omega / 2T))`` for a
-        bath of bosons. Where a Hamiltonian that depends on time changes the sign of omega, it has to be even in omega.
+        bath of bosons. If a Hamiltonian that depends on time changes the sign of omega, the rate has to be even in
+        omega.
     bath : int
         The number of the bath, from 0.
 
@@ -113,18 +114,18 @@ class ThermalJumps(Dissipation):
     conserves_energy: bool = eqx.field(static=True)
 
     def __init__(self, couplings: Sequence[tuple[Any, Any]], bath: int = 0):
-        given = list(couplings)
-        if not given or not all(isinstance(pair, tuple | list) and len(pair) == 2 for pair in given):
-            raise InputError("ThermalJumps takes a list of pairs (V, rate), such as [(V, 0.1)]")
+        pairs = list(couplings)
+        if not pairs or not all(isinstance(pair, tuple | list) and len(pair) == 2 for pair in pairs):
+            raise InputError("couplings must be a list of pairs (V, rate), such as [(V, 0.1)]")
         if isinstance(bath, bool) or not isinstance(bath, int) or bath < 0:
-            raise InputError(f"bath is the number of a bath, from 0, not {bath!r}")
-        self.operators = tuple(Operator(checked_matrix(V, f"the coupling V[{i}]")) for i, (V, _) in enumerate(given))
+            raise InputError(f"bath must be the number of a bath, from 0, got {bath!r}")
+        self.operators = tuple(Operator(checked_matrix(V, f"the coupling V[{i}]")) for i, (V, _) in enumerate(pairs))
         for i, V in enumerate(self.operators):
             if not np.asarray(V).any():
-                raise InputError(f"the coupling V[{i}] is zero: leave it out")
+                raise InputError(f"the coupling V[{i}] is zero. Leave it out")
         self.rates = tuple(
             _checked_rate_function(rate, i) if callable(rate) else checked_rate(rate)
-            for i, (_, rate) in enumerate(given)
+            for i, (_, rate) in enumerate(pairs)
         )
         self.bath, self.jumps, self.jump_frame, self.level_order, self.is_driven = bath, (), None, (), False
         self.is_isolated, self.conserves_energy = False, True
@@ -138,95 +139,104 @@ class ThermalJumps(Dissipation):
         for i, V in enumerate(self.operators):
             if np.shape(V) != (structure.size,) * 2:
                 raise InputError(
-                    f"the coupling V[{i}] has shape {np.shape(V)}, and the Hamiltonian ({structure.size},"
-                    f" {structure.size})"
+                    f"the coupling V[{i}] has shape {np.shape(V)}, but the Hamiltonian has shape ({structure.size}, "
+                    f"{structure.size})"
                 )
         if baths is not None and self.bath >= baths.number:
-            raise InputError(f"ThermalJumps exchange heat with bath {self.bath}, but there are {baths.number}, from 0")
+            raise InputError(
+                f"ThermalJumps exchange heat with bath {self.bath}, but there are {baths.number} baths, numbered from 0"
+            )
         if is_traced(system.energy.body if isinstance(system.energy, BodyBathsEnergy) else system.energy):
             raise InputError(
-                "ThermalJumps are split by the eigenvectors of the Hamiltonian, which has to be a known one: build a "
-                "system for each, as lt.Study does. Rates, temperatures and capacities may be parameters of a function"
+                "ThermalJumps need the eigenvectors of the Hamiltonian, so it must not be a traced value. Build a "
+                "system for each Hamiltonian, as lt.Study does. Rates, temperatures and capacities may be traced"
             )
         hamiltonians = system.hamiltonians()
         if baths is None:
             jumps = tuple(Jump(V, i, 0.5 if _is_hermitian(V) else 1.0) for i, V in enumerate(self.operators))
-            kept = all(_is_commuting(H, V) for H in hamiltonians for V in map(np.asarray, self.operators))
-            return self._replace_fields(jumps=jumps, frame=None, isolated=True, keeps_energy=kept)
+            conserves_energy = all(_is_commuting(H, V) for H in hamiltonians for V in map(np.asarray, self.operators))
+            return self._replace_fields(
+                jumps=jumps, jump_frame=None, is_isolated=True, conserves_energy=conserves_energy
+            )
         vectors = _common_eigenvectors(hamiltonians)
-        parts = [_split_coupling(V, i, hamiltonians, vectors) for i, V in enumerate(self.operators)]
+        jumps_by_coupling = [_split_coupling(V, i, hamiltonians, vectors) for i, V in enumerate(self.operators)]
         frame = None if np.array_equal(vectors, np.eye(structure.size)) else Operator(vectors)
-        jumps = tuple(itertools.chain.from_iterable(parts))
+        jumps = tuple(itertools.chain.from_iterable(jumps_by_coupling))
         levels = np.diag(adjoint(vectors) @ _subtract_common_energy(hamiltonians[0]) @ vectors).real
         order, driven = tuple(int(i) for i in np.argsort(levels)), system.is_driven
-        found = self._replace_fields(
-            jumps=jumps, frame=frame, order=order, driven=driven, isolated=False, keeps_energy=True
+        bound_jumps = self._replace_fields(
+            jumps=jumps, jump_frame=frame, level_order=order, is_driven=driven, is_isolated=False, conserves_energy=True
         )
         if not is_traced((self.rates, baths)):
-            found._check_rates(system.systems_at_test_times()[0] if system.is_driven else system)
-        return found
+            bound_jumps._check_rates(system.systems_at_test_times()[0] if system.is_driven else system)
+        return bound_jumps
 
     def _replace_fields(self, **fields) -> ThermalJumps:
-        found = object.__new__(ThermalJumps)
+        """Return a copy with some fields replaced."""
+        copy = object.__new__(ThermalJumps)
         for field in dataclasses.fields(self):
-            object.__setattr__(found, field.name, fields.get(field.name, getattr(self, field.name)))
-        return found
+            object.__setattr__(copy, field.name, fields.get(field.name, getattr(self, field.name)))
+        return copy
 
     def replace_operators(self, matrices: Sequence[Any], bath: int) -> ThermalJumps:
-        """The same rates with other matrices, such as those of a larger system, and another bath."""
+        """Return jumps with these matrices, for example of a larger system, another bath, and unchanged rates."""
         return self._replace_fields(operators=tuple(map(Operator, matrices)), bath=bath, jumps=())
 
     def force(self, system, x, dH, dS, dL):
-        """The force, of which Lindblad's equation is the part that is exact: no logarithm of rho is in it.
+        """Return the force; for exact gradients it is Lindblad's equation, without the logarithm of rho.
 
-        ``L B(dS)`` is ``e^(-omega / 2T) rho V - e^(omega / 2T) V rho`` at the gradient of the entropy. L has to be
-        applied to what a discrete gradient differs by. So eigenvalues that are zero to rounding stay so.
+        At the gradient of the entropy ``L B(dS)`` is ``e^(-omega / 2T) rho V - e^(omega / 2T) V rho``. L is applied
+        only to the difference of a discrete gradient from it. So eigenvalues that are zero to rounding stay zero.
         """
         structure, n = system.structure, system.body_dim
         rho, H, A = (self._to_jump_frame(structure.matrix(a[:n])) for a in (x, dH, dS))
-        fixed, logs = _stack_operators(self.jumps), matrix_logarithm(rho)
-        V, back, omega = jnp.asarray(fixed), jnp.asarray(adjoint(fixed)), self._jump_frequencies(structure, dH[:n])
+        operators, logs = _stack_operators(self.jumps), matrix_logarithm(rho)
+        V, V_adjoint, omega = (
+            jnp.asarray(operators),
+            jnp.asarray(adjoint(operators)),
+            self._jump_frequencies(structure, dH[:n]),
+        )
         T = jnp.asarray(jnp.inf) if self.is_isolated else dH[n + self.bath]
-        shift, rest = omega / (2.0 * T), _commutator(V, A + logs)
+        shift, commutators = omega / (2.0 * T), _commutator(V, A + logs)
         if not self.is_isolated:
-            # [V, H] by differences of levels, which lose no digits, and by what H has beside them, which is mostly zero
-            levels, apart = self._energy_levels(structure, dH[:n]), 1.0 - np.eye(structure.size)
-            taken = V * (levels[None, :] - levels[:, None]) + _commutator(V, H * apart)
-            rest = rest - (dS[n + self.bath] * taken - omega[:, None, None] * V) / T
-        grown = jnp.exp(shift)[:, None, None]
-        image = rho @ V / grown - grown * (V @ rho) + log_mean(logs, shift, rest)
-        moved = jnp.sum(_commutator(back, image * self._jump_strengths(omega, T)[:, None, None]), axis=0)
-        return self._append_bath_entropy(system, dH, T, moved)  # the adjoints add the adjoint
+            # Differences of levels lose no digits; the off-diagonal entries of H are mostly zero.
+            levels, off_diagonal = self._energy_levels(structure, dH[:n]), 1.0 - np.eye(structure.size)
+            H_commutators = V * (levels[None, :] - levels[:, None]) + _commutator(V, H * off_diagonal)
+            commutators = commutators - (dS[n + self.bath] * H_commutators - omega[:, None, None] * V) / T
+        boltzmann_factors = jnp.exp(shift)[:, None, None]
+        image = rho @ V / boltzmann_factors - boltzmann_factors * (V @ rho) + log_mean(logs, shift, commutators)
+        drho = jnp.sum(_commutator(V_adjoint, image * self._jump_strengths(omega, T)[:, None, None]), axis=0)
+        return self._append_bath_entropy(system, dH, T, drho)  # the adjoints add the adjoint
 
     has_generator = True
 
     def generator_field(self, system, x, dH):
-        """Lindblad's equation, and the heat that the bath takes."""
+        """Return Lindblad's equation, and the entropy rate of the bath."""
         structure, n = system.structure, system.body_dim
         rho, omega = self._to_jump_frame(structure.matrix(x[:n])), self._jump_frequencies(structure, dH[:n])
         T = jnp.asarray(jnp.inf) if self.is_isolated else dH[n + self.bath]
-        strengths, grown = self._jump_strengths(omega, T), jnp.exp(omega / (2.0 * T))
-        rates = jnp.concatenate([strengths * grown, strengths / grown])
-        # the Hermitian part has both terms of what is lost
-        moved = _apply_jumps(self.jumps, rates, rho) - jnp.tensordot(rates, _adjoint_products(self.jumps), 1) @ rho
-        return self._append_bath_entropy(system, dH, T, moved)
+        strengths, boltzmann_factors = self._jump_strengths(omega, T), jnp.exp(omega / (2.0 * T))
+        rates = jnp.concatenate([strengths * boltzmann_factors, strengths / boltzmann_factors])
+        # the Hermitian part, taken later, has both terms of the loss
+        drho = _apply_jumps(self.jumps, rates, rho) - jnp.tensordot(rates, _adjoint_products(self.jumps), 1) @ rho
+        return self._append_bath_entropy(system, dH, T, drho)
 
     def _check_rates(self, system) -> None:
-        """Raise InputError where rates at the first temperature of the bath cannot be computed with."""
+        """Raise InputError if double precision cannot represent the rates at the first temperature of the bath."""
         n, dH = system.body_dim, system.energy.gradient(jnp.zeros(system.dim))
         omega, T = self._jump_frequencies(system.structure, dH[:n]), dH[n + self.bath]
-        strengths, sizes = self._jump_strengths(omega, T), np.abs(np.asarray(omega))
+        strengths, energies = self._jump_strengths(omega, T), np.abs(np.asarray(omega))
         rates = np.asarray(strengths * jnp.exp(jnp.abs(omega) / (2.0 * T)))
-        for jump, rate, w in zip(self.jumps, rates, sizes, strict=True):
-            if w > -2.0 * np.log(EPS) * T and not rate * EPS <= w:  # not so by the rate that was given
+        for jump, rate, w in zip(self.jumps, rates, energies, strict=True):
+            if w > -2.0 * np.log(EPS) * T and not rate * EPS <= w:  # the exponential is to blame, not the rate
                 raise InputError(
-                    f"jumps of V[{jump.coupling_index}] that take the energy {w:.3g} from the system have, at T = {T:.3g}, "
-                    f"rate * exp(omega / 2T) = {rate:.3g}: no rate that doubles hold beside that energy. Give the rate "
-                    "as a function, such as lambda omega, T: g * jnp.exp(-omega / (2 * T)), or a higher temperature"
+                    f"jumps of V[{jump.coupling_index}] with the energy {w:.3g} have, at T = {T:.3g}, "
+                    f"rate * exp(omega / 2T) = {rate:.3g}, too large for double precision. Give the rate as a "
+                    "function, such as lambda omega, T: g * jnp.exp(-omega / (2 * T)), or a higher temperature"
                 )
 
     def _to_jump_frame(self, matrix):
-        """A matrix in the frame, in which most entries of the jumps are zero."""
+        """Return a matrix in the frame of the jumps, in which most of their entries are zero."""
         return (
             matrix
             if self.jump_frame is None
@@ -234,6 +244,7 @@ class ThermalJumps(Dissipation):
         )
 
     def _from_jump_frame(self, matrix):
+        """Return a matrix of the frame of the jumps in the basis of the system."""
         return (
             matrix
             if self.jump_frame is None
@@ -241,56 +252,57 @@ class ThermalJumps(Dissipation):
         )
 
     def _jump_frequencies(self, structure: mf.DensityMatrices, dH) -> jax.Array:
-        """The energies that the jumps take: linear in H, by tables that are known when programs are written.
+        """Return the energies omega of the jumps, shape (jumps,): linear in H, from tables known at trace time.
 
-        ``tr(H [V^H, V]) / tr(V^H V)``, the diagonal of H by differences of levels, which lose no digits.
+        ``tr(H [V^H, V]) / tr(V^H V)``, with the diagonal of H by differences of levels, which lose no digits.
         """
-        fixed, apart, levels = (
+        operators, off_diagonal, levels = (
             _stack_operators(self.jumps),
             1.0 - np.eye(structure.size),
             self._energy_levels(structure, dH),
         )
-        weights = np.abs(fixed) ** 2
+        weights = np.abs(operators) ** 2
         squares = np.sum(weights, axis=(-2, -1))
-        k, j = np.nonzero(np.sum(weights * apart, axis=0))
+        k, j = np.nonzero(np.sum(weights * off_diagonal, axis=0))
         omega = (weights[:, k, j] / squares[:, None]) @ (levels[j] - levels[k])
-        rest = apart * _commutator(adjoint(fixed), fixed) / squares[:, None, None]
+        rest = off_diagonal * _commutator(adjoint(operators), operators) / squares[:, None, None]
         return omega + structure.vector(self._from_jump_frame(rest)) @ dH if rest.any() else omega
 
     def _energy_levels(self, structure: mf.DensityMatrices, dH) -> jax.Array:
-        """The diagonal of H in the frame, shape (N,)."""
+        """Return the diagonal of H in the frame of the jumps, shape (N,)."""
         if self.jump_frame is None:
             return dH[: structure.size]
         vectors = np.asarray(self.jump_frame).T
         return structure.vector(vectors[:, :, None] * vectors[:, None, :].conj()) @ dH
 
-    def _append_bath_entropy(self, system, dH, T, moved) -> jax.Array:
-        """The coordinates of what the jumps do to rho, in the frame, and the entropy that the bath takes."""
+    def _append_bath_entropy(self, system, dH, T, drho) -> jax.Array:
+        """Return the coordinates of ``drho``, given in the frame of the jumps, followed by the bath entropy rates."""
         structure, n = system.structure, system.body_dim
-        force = structure.vector(self._from_jump_frame(moved))
+        force = structure.vector(self._from_jump_frame(drho))
         if self.is_isolated:
             return force
-        taken = -self._energy_rate(structure, dH[:n], moved, force) / T
-        return jnp.concatenate([force, np.eye(system.dim - n)[self.bath] * taken])
+        entropy_rate = -self._energy_rate(structure, dH[:n], drho, force) / T
+        return jnp.concatenate([force, np.eye(system.dim - n)[self.bath] * entropy_rate])
 
-    def _energy_rate(self, structure: mf.DensityMatrices, dH, moved, force) -> jax.Array:
-        """``tr(H moved)``, shape (), of a matrix of trace zero in the frame, and of its coordinates outside.
+    def _energy_rate(self, structure: mf.DensityMatrices, dH, drho, force) -> jax.Array:
+        """Return ``tr(H drho)``, shape (), for drho of trace zero in the frame, and its coordinates ``force``.
 
         It is summed by parts, from differences of neighbouring levels and the populations that cross between them. So
         levels that no jump connects do not matter, however large their energies are.
         """
         order, size = np.array(self.level_order), structure.size
         levels = self._energy_levels(structure, dH)[order]
-        populations = force[:size] if self.jump_frame is None else jnp.diagonal(moved).real
+        populations = force[:size] if self.jump_frame is None else jnp.diagonal(drho).real
         rate = jnp.dot(levels[:-1] - levels[1:], np.tri(size - 1, size) @ populations[order])
         if self.jump_frame is None:
             return rate + jnp.dot(dH[size:], force[size:])
         if not self.is_driven:  # H is diagonal in the frame
             return rate
         H = self._to_jump_frame(structure.matrix(dH))
-        return rate + jnp.sum(((1.0 - np.eye(size)) * H.conj() * moved).real)
+        return rate + jnp.sum(((1.0 - np.eye(size)) * H.conj() * drho).real)
 
     def _jump_strengths(self, omega, T) -> jax.Array:
+        """Return the rate of each jump at its omega and T, times its weight, shape (jumps,)."""
         rates = [self.rates[jump.coupling_index] for jump in self.jumps]
         return jnp.stack(
             [
@@ -304,10 +316,10 @@ class SteepestEntropyAscent(Dissipation):
     """Steepest entropy ascent of an isolated quantum system [Beretta 1984].
 
     ``K = rate P^T L P`` with the metric ``L A = (rho A + A rho) / 2`` and P the projector, orthogonal for L, off the
-    energy, the trace and what else is preserved. An eigenvalue of rho that is zero stays zero: so a state keeps its
-    rank, and a pure state moves by the Hamiltonian alone. For such states take ``lt.VonNeumann(floor=...)``, and
-    ``lt.MetriplecticMidpoint``: it keeps the rank to rounding, the other methods to their order. A run does not start
-    where the Hamiltonian turns the eigenvectors of the eigenvalue zero, as those of most pure states: the error of a
+    energy, the trace and the other preserved functions. An eigenvalue of rho that is zero stays zero. So a state keeps
+    its rank, and a pure state moves by the Hamiltonian alone. For such states use ``lt.VonNeumann(floor=...)`` and
+    ``lt.MetriplecticMidpoint``, which keeps the rank to rounding; other methods keep it to their order. A run does not
+    start if the Hamiltonian rotates the eigenvectors of the eigenvalue zero, as for most pure states: the error of a
     step would grow there.
 
     Parameters
@@ -315,30 +327,30 @@ class SteepestEntropyAscent(Dissipation):
     rate : float, >= 0
         The rate gamma of the ascent (1 / time).
     preserve : list of matrices, shape (N, N), or of functions from rho, shape (N, N), to a scalar; optional
-        Observables ``tr(rho A)`` that are kept, or other functions.
+        Observables ``tr(rho A)``, or other functions, that are conserved.
     """
 
     rate: jax.Array
-    preserved_functions: tuple[Any, ...]
+    functions: tuple[Any, ...]
 
     def __init__(self, rate=1.0, preserve=()):
         self.rate = checked_rate(rate)
-        self.preserved_functions = tuple(
+        self.functions = tuple(
             f if callable(f) else Operator(checked_hermitian(f, f"preserve[{i}]")) for i, f in enumerate(preserve)
         )
 
     @property
     def preserve(self) -> tuple[Energy, ...]:
-        return tuple(f for f in self.preserved_functions if isinstance(f, Energy))
+        return tuple(f for f in self.functions if isinstance(f, Energy))
 
     def bind_to(self, system):
         require_density_structure(system, "SteepestEntropyAscent")
         return self
 
     def bind_to_structure(self, structure: mf.DensityMatrices) -> SteepestEntropyAscent:
-        """What it preserves as functions of states, whose structure is given."""
-        made = []
-        for i, f in enumerate(self.preserved_functions):
+        """Return this dissipation with its preserved functions as functions of state vectors."""
+        functions = []
+        for i, f in enumerate(self.functions):
             if isinstance(f, Operator):
                 if np.shape(f) != (structure.size,) * 2:
                     raise InputError(
@@ -347,23 +359,23 @@ class SteepestEntropyAscent(Dissipation):
                 f = Function(_Observable(jnp.asarray(structure.vector(np.asarray(f)))))
             elif not isinstance(f, Energy):
                 f = Function(DensityMatrixFunction(f, structure))
-            made.append(f)
-        found = SteepestEntropyAscent(self.rate)
-        object.__setattr__(found, "preserved_functions", tuple(made))
-        return found
+            functions.append(f)
+        bound_ascent = SteepestEntropyAscent(self.rate)
+        object.__setattr__(bound_ascent, "functions", tuple(functions))
+        return bound_ascent
 
     def force(self, system, x, dH, dS, dL):
-        held, raised = self._constraint_frame(system, x, dH, dL)
-        force = held.project_off_images(raised(held.project_off(dS[: system.body_dim])))
+        frame, apply_metric = self._constraint_frame(system, x, dH, dL)
+        force = frame.project_off_images(apply_metric(frame.project_off(dS[: system.body_dim])))
         return jnp.pad(self.rate * force, (0, system.dim - system.body_dim))
 
     def ascent_direction(self, system, x, dH, dS, dL) -> jax.Array:
-        """``P dS``, shape (N^2,): the gradient of the entropy, less the part along what is preserved."""
-        held, _ = self._constraint_frame(system, x, dH, dL)
-        return held.project_off(dS[: system.body_dim])
+        """Return ``P dS``, shape (N^2,): the gradient of the entropy without its components along preserved ones."""
+        frame, _ = self._constraint_frame(system, x, dH, dL)
+        return frame.project_off(dS[: system.body_dim])
 
     def _constraint_frame(self, system, x, dH, dL) -> tuple[OrthonormalFrame, Callable]:
-        """The gradients of what is preserved, orthogonal for L, and L."""
+        """Return the frame of the preserved gradients, orthogonal for L, and the map L."""
         structure, n = system.structure, system.body_dim
         rho = positive_part(structure.matrix(x[:n]))  # a negative eigenvalue would fall ever faster
 
@@ -375,7 +387,7 @@ class SteepestEntropyAscent(Dissipation):
 
 
 class _Observable(eqx.Module):
-    """``tr(rho A)``, of a state whose first coordinates are those of rho."""
+    """The observable ``tr(rho A)`` of a state whose first coordinates are those of rho."""
 
     coordinates: jax.Array
 
@@ -384,33 +396,35 @@ class _Observable(eqx.Module):
 
 
 def require_density_structure(system, name: str) -> mf.DensityMatrices:
-    """The structure of a system of density matrices."""
+    """Return the structure of a system of density matrices; InputError for other systems."""
     structure = getattr(system, "structure", None)
     if not isinstance(structure, mf.DensityMatrices):
-        raise InputError(f"{name} acts on density matrices: use it in an lt.QuantumSystem")
+        raise InputError(f"{name} needs density matrices. Use it in an lt.QuantumSystem")
     return structure
 
 
 def checked_matrix(matrix, what: str) -> np.ndarray:
-    """A square complex matrix; that of a ``Qobj`` too, which is read by its ``full()``."""
-    found = np.asarray(matrix.full() if isinstance(matrix, HasMatrix) else matrix)
-    if found.dtype.kind not in "fiuc" or found.ndim != 2 or found.shape[0] != found.shape[1] or not found.size:
-        raise InputError(f"{what} is a square matrix of numbers, not an array of {found.dtype}, shape {found.shape}")
-    if not np.isfinite(found).all():
+    """Return a square complex matrix, from an array or from the ``full()`` of a ``Qobj``."""
+    array = np.asarray(matrix.full() if isinstance(matrix, HasMatrix) else matrix)
+    if array.dtype.kind not in "fiuc" or array.ndim != 2 or array.shape[0] != array.shape[1] or not array.size:
+        raise InputError(
+            f"{what} must be a square matrix of numbers, got an array of {array.dtype}, shape {array.shape}"
+        )
+    if not np.isfinite(array).all():
         raise InputError(f"{what} is not finite")
-    return found.astype(complex)
+    return array.astype(complex)
 
 
 def checked_hermitian(matrix, what: str) -> np.ndarray:
-    """A Hermitian matrix."""
-    found = checked_matrix(matrix, what)
-    residual, size = float(np.abs(found - adjoint(found)).max()), float(np.abs(found).max())
-    if residual > 1e-12 * size:
+    """Return a matrix, made exactly Hermitian; InputError if it is not Hermitian to rounding."""
+    array = checked_matrix(matrix, what)
+    residual, scale = float(np.abs(array - adjoint(array)).max()), float(np.abs(array).max())
+    if residual > 1e-12 * scale:
         raise InputError(
-            f"{what} is not Hermitian: it differs from its adjoint by {residual:.3g}; its Hermitian part is "
+            f"{what} is not Hermitian: it differs from its adjoint by {residual:.3g}. Its Hermitian part is "
             "(A + A.conj().T) / 2"
         )
-    return (found + adjoint(found)) / 2
+    return (array + adjoint(array)) / 2
 
 
 def _commutator(a, b):
@@ -418,16 +432,15 @@ def _commutator(a, b):
 
 
 GENERIC_WEIGHTS = (1.0, 0.7548776662466927, 0.5698402909980532)
-"""Weights of Hamiltonians in a sum whose eigenvectors are those of each, if they commute."""
+"""Weights in a sum of commuting Hamiltonians, chosen so that its eigenvectors are common to all of them."""
 
 
 def _common_eigenvectors(hamiltonians: Sequence[np.ndarray]) -> np.ndarray:
-    """The eigenvectors that Hamiltonians have in common, if they have any; those of diagonal matrices are the axes."""
-    sizes = [np.abs(H).max() for H in hamiltonians]
-    parts = zip(
-        GENERIC_WEIGHTS, map(_subtract_common_energy, hamiltonians), sizes, strict=False
-    )  # there may be fewer than weights
-    H = sum((w * H / (size or 1.0) for w, H, size in parts), np.zeros_like(hamiltonians[0]))
+    """Return the common eigenvectors of Hamiltonians that commute; for diagonal matrices the axes."""
+    scales = [np.abs(H).max() for H in hamiltonians]
+    # There may be fewer Hamiltonians than weights.
+    triples = zip(GENERIC_WEIGHTS, map(_subtract_common_energy, hamiltonians), scales, strict=False)
+    H = sum((w * H / (scale or 1.0) for w, H, scale in triples), np.zeros_like(hamiltonians[0]))
     return np.eye(len(H)) if _is_diagonal(H) else np.linalg.eigh(H)[1]
 
 
@@ -436,60 +449,67 @@ def _is_diagonal(H: np.ndarray) -> bool:
 
 
 def _stack_operators(jumps: tuple[Jump, ...]) -> np.ndarray:
-    """The matrices of jumps, real ones where they are."""
-    found = np.stack([np.asarray(jump.operator) for jump in jumps])
-    return found if found.imag.any() else found.real
+    """Return the matrices of the jumps, shape (jumps, N, N), as real ones if possible."""
+    operators = np.stack([np.asarray(jump.operator) for jump in jumps])
+    return operators if operators.imag.any() else operators.real
 
 
 def _operators_and_adjoints(jumps: tuple[Jump, ...]) -> np.ndarray:
-    """The matrices of jumps, and then their adjoints."""
-    fixed = _stack_operators(jumps)
-    return np.concatenate([fixed, adjoint(fixed)])
+    """Return the matrices of the jumps, followed by their adjoints, shape (2 jumps, N, N)."""
+    operators = _stack_operators(jumps)
+    return np.concatenate([operators, adjoint(operators)])
 
 
 @functools.lru_cache(maxsize=64)
 def _adjoint_products(jumps: tuple[Jump, ...]) -> np.ndarray:
-    """``V^H V`` of each jump, and then of each adjoint."""
-    both = _operators_and_adjoints(jumps)
-    return adjoint(both) @ both
+    """Return ``V^H V`` of each jump, followed by that of each adjoint."""
+    matrices = _operators_and_adjoints(jumps)
+    return adjoint(matrices) @ matrices
 
 
 def _apply_jumps(jumps: tuple[Jump, ...], rates, rho) -> jax.Array:
-    """``sum rate V rho V^H`` over the jumps and then their adjoints."""
-    found = _jump_table(jumps)
-    if found is None:
-        both = _operators_and_adjoints(jumps)
-        return jnp.sum((rates[:, None, None] * both) @ rho @ adjoint(both), axis=0)
-    which, source, factors = found
-    return jnp.sum(rho.ravel()[source] * (rates[which] * factors), axis=-1).reshape(rho.shape)
+    """Return ``sum rate V rho V^H`` over the jumps and then their adjoints."""
+    table = _jump_table(jumps)
+    if table is None:
+        matrices = _operators_and_adjoints(jumps)
+        return jnp.sum((rates[:, None, None] * matrices) @ rho @ adjoint(matrices), axis=0)
+    jump_numbers, rho_entries, factors = table
+    return jnp.sum(rho.ravel()[rho_entries] * (rates[jump_numbers] * factors), axis=-1).reshape(rho.shape)
 
 
 @functools.lru_cache(maxsize=64)
 def _jump_table(jumps: tuple[Jump, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """The numbers of the jumps, the entries of rho and the factors that make up each entry of ``sum V rho V^H``.
+    """Return, for each entry of ``sum V rho V^H``, the jump numbers, the entries of rho and the factors of its terms.
 
-    None where products of matrices are shorter, as with a few full matrices.
+    None if products of matrices need fewer operations, as for a few full matrices.
     """
-    both = _operators_and_adjoints(jumps)
-    size = both.shape[-1]
-    jump, i, j = np.nonzero(both)
-    if np.sum(np.bincount(jump) ** 2) > 2 * both.size * size:
+    matrices = _operators_and_adjoints(jumps)
+    size = matrices.shape[-1]
+    jump, i, j = np.nonzero(matrices)
+    if np.sum(np.bincount(jump) ** 2) > 2 * matrices.size * size:
         return None
-    one, other = np.nonzero(jump[:, None] == jump)
-    target = i[one] * size + i[other]
+    first_entry, second_entry = np.nonzero(jump[:, None] == jump)
+    target = i[first_entry] * size + i[second_entry]
     order = np.argsort(target, kind="stable")
-    one, other, target = one[order], other[order], target[order]
+    first_entry, second_entry, target = first_entry[order], second_entry[order], target[order]
     counts = np.bincount(target, minlength=size**2)
-    place = target, np.arange(len(target)) - np.repeat(np.cumsum(counts) - counts, counts)
-    which, source = np.zeros((2, size**2, counts.max()), np.uint32)  # no sign: JAX then looks for no negative ones
-    factors = np.zeros(which.shape, both.dtype)
-    which[place], source[place] = jump[one], j[one] * size + j[other]
-    factors[place] = both[jump[one], i[one], j[one]] * both[jump[other], i[other], j[other]].conj()
-    return which, source, factors
+    table_position = target, np.arange(len(target)) - np.repeat(np.cumsum(counts) - counts, counts)
+    # Unsigned, so that JAX does not test for negative indices.
+    jump_numbers, rho_entries = np.zeros((2, size**2, counts.max()), np.uint32)
+    factors = np.zeros(jump_numbers.shape, matrices.dtype)
+    jump_numbers[table_position], rho_entries[table_position] = (
+        jump[first_entry],
+        j[first_entry] * size + j[second_entry],
+    )
+    factors[table_position] = (
+        matrices[jump[first_entry], i[first_entry], j[first_entry]]
+        * matrices[jump[second_entry], i[second_entry], j[second_entry]].conj()
+    )
+    return jump_numbers, rho_entries, factors
 
 
 def _checked_rate_function(rate: Callable, i: int) -> Callable:
-    """A rate as a function of omega and T, tried where both are one."""
+    """Return a rate function of omega and T, tested at omega = T = 1."""
     what = f"the rate of V[{i}] is a number, or a function of omega and T to a number >= 0"
     try:
         value = rate(1.0, 1.0)
@@ -508,80 +528,82 @@ def _is_hermitian(V) -> bool:
 
 
 def _subtract_common_energy(H: np.ndarray) -> np.ndarray:
-    """A Hamiltonian less the energy that all levels have in common."""
+    """Return a Hamiltonian less the energy that all levels have in common."""
     return H - choose_reference_level(np.diag(H).real) * np.eye(len(H))
 
 
 def energy_rounding(H: np.ndarray) -> float:
-    """Largest difference between two differences of levels that are equal but for rounding."""
+    """Return the largest rounding difference between two equal differences of levels."""
     return ENERGY_RTOL * (1 if _is_diagonal(H) else len(H)) * float(np.linalg.norm(H, 2))
 
 
 def _is_commuting(H: np.ndarray, V: np.ndarray) -> bool:
-    """Whether two matrices commute but for rounding; a constant that is added to H makes no difference."""
+    """Return True if two matrices commute to rounding; a constant added to H makes no difference."""
     H = _subtract_common_energy(H)
     products = np.abs(H) @ np.abs(V) + np.abs(V) @ np.abs(H)
     return bool(np.abs(_commutator(H, V)).max() <= ENERGY_RTOL * len(H) * products.max())
 
 
 def _split_coupling(
-    operator: Operator, source: int, hamiltonians: Sequence[np.ndarray], frame: np.ndarray
+    operator: Operator, coupling_index: int, hamiltonians: Sequence[np.ndarray], frame: np.ndarray
 ) -> list[Jump]:
-    """The eigenoperators of ``[H, .]`` at all times that a coupling is the sum of; of a Hermitian one up to adjoints.
+    """Split a coupling into eigenoperators of ``[H, .]`` at all times; for a Hermitian one, up to adjoints.
 
-    The entries of one have the same difference of levels, in the frame, under each of the Hamiltonians.
+    The entries of an eigenoperator have the same difference of levels, in the frame, under each of the Hamiltonians.
     """
     V = np.asarray(operator)
-    inside = adjoint(frame) @ V @ frame
-    framed = [adjoint(frame) @ _subtract_common_energy(H) @ frame for H in hamiltonians]
-    spreads = [energy_rounding(H) for H in hamiltonians]
-    places = np.nonzero(np.abs(inside) > _entry_rounding(inside, frame, framed, spreads))
-    gaps = np.stack([np.diag(H).real[places[1]] - np.diag(H).real[places[0]] for H in framed])
-    labels = np.stack([_cluster_labels(*one) for one in zip(gaps, spreads, strict=True)])
-    own_adjoint, parts = _is_hermitian(V), []
+    V_framed = adjoint(frame) @ V @ frame
+    framed_hamiltonians = [adjoint(frame) @ _subtract_common_energy(H) @ frame for H in hamiltonians]
+    tolerances = [energy_rounding(H) for H in hamiltonians]
+    entries = np.nonzero(np.abs(V_framed) > _entry_rounding(V_framed, frame, framed_hamiltonians, tolerances))
+    gaps = np.stack([np.diag(H).real[entries[1]] - np.diag(H).real[entries[0]] for H in framed_hamiltonians])
+    labels = np.stack(
+        [_cluster_labels(*gaps_and_tolerance) for gaps_and_tolerance in zip(gaps, tolerances, strict=True)]
+    )
+    is_hermitian, jumps = _is_hermitian(V), []
     for label in np.unique(labels, axis=1).T:
-        chosen = (labels == label[:, None]).all(axis=0)
-        omegas = gaps[:, chosen].mean(axis=1)
-        sign = next((np.sign(w) for w, spread in zip(omegas, spreads, strict=True) if abs(w) > spread), 0.0)
-        if own_adjoint and sign < 0.0:
+        is_member = (labels == label[:, None]).all(axis=0)
+        omegas = gaps[:, is_member].mean(axis=1)
+        sign = next((np.sign(w) for w, limit in zip(omegas, tolerances, strict=True) if abs(w) > limit), 0.0)
+        if is_hermitian and sign < 0.0:
             continue
-        part = np.zeros_like(inside)
-        part[places[0][chosen], places[1][chosen]] = inside[places][chosen]
-        for H, omega, spread in zip(framed, omegas, spreads, strict=True):
-            if not np.abs(_commutator(H, part) + omega * part).max() <= len(H) * spread * np.abs(part).max():
+        part = np.zeros_like(V_framed)
+        part[entries[0][is_member], entries[1][is_member]] = V_framed[entries][is_member]
+        for H, omega, tolerance in zip(framed_hamiltonians, omegas, tolerances, strict=True):
+            if not np.abs(_commutator(H, part) + omega * part).max() <= len(H) * tolerance * np.abs(part).max():
                 raise InputError(
-                    f"the coupling V[{source}] has no parts with [H, V] = -omega V at all times: the eigenvectors of "
-                    "the Hamiltonian turn. Jumps are for Hamiltonians whose eigenvalues alone depend on time"
+                    f"the coupling V[{coupling_index}] cannot be split into components with [H, V] = -omega V, "
+                    "since the eigenvectors of the Hamiltonian depend on time. Only its eigenvalues may"
                 )
-        part = part if sign >= 0.0 else adjoint(part)  # both act, and a rate is asked at a positive omega
-        parts.append(Jump(Operator(part), source, 0.5 if own_adjoint and sign == 0.0 else 1.0))
-    return parts
+        part = part if sign >= 0.0 else adjoint(part)  # both act, and rates are evaluated at a positive omega
+        jumps.append(Jump(Operator(part), coupling_index, 0.5 if is_hermitian and sign == 0.0 else 1.0))
+    return jumps
 
 
 def _entry_rounding(
-    inside: np.ndarray, frame: np.ndarray, framed: Sequence[np.ndarray], spreads: Sequence[float]
+    V_framed: np.ndarray, frame: np.ndarray, framed_hamiltonians: Sequence[np.ndarray], tolerances: Sequence[float]
 ) -> np.ndarray | float:
-    """The size up to which entries of a matrix in the frame may be rounding, shape (N, N), or zero in that of the axes.
+    """Return the bound, shape (N, N), below which entries of a matrix in the frame may be rounding; 0 for the axes.
 
     An eigenvector contains another one by the rounding of the energies, relative to their difference.
     """
     if _is_diagonal(frame):
         return 0.0
-    sizes = np.abs(inside)
-    turned = np.ones_like(sizes)
-    for H, spread in zip(framed, spreads, strict=True):
+    sizes = np.abs(V_framed)
+    rotation_bounds = np.ones_like(sizes)
+    for H, tolerance in zip(framed_hamiltonians, tolerances, strict=True):
         levels = np.diag(H).real
-        apart = np.abs(levels[:, None] - levels)
-        turned = np.minimum(turned, spread / np.maximum(apart, spread or 1.0))
-    turned = np.where(turned < 1.0, turned, 0.0)  # those of one level may be any
-    return ENERGY_RTOL * len(sizes) * sizes.max() + turned @ sizes + sizes @ turned
+        level_gaps = np.abs(levels[:, None] - levels)
+        rotation_bounds = np.minimum(rotation_bounds, tolerance / np.maximum(level_gaps, tolerance or 1.0))
+    rotation_bounds = np.where(rotation_bounds < 1.0, rotation_bounds, 0.0)  # eigenvectors of one level are arbitrary
+    return ENERGY_RTOL * len(sizes) * sizes.max() + rotation_bounds @ sizes + sizes @ rotation_bounds
 
 
-def _cluster_labels(numbers: np.ndarray, spread: float) -> np.ndarray:
-    """The number of the cluster that each of some numbers belongs to: one begins beyond ``spread`` from the last."""
-    found, begin, label = np.empty(len(numbers), int), -np.inf, -1
+def _cluster_labels(numbers: np.ndarray, tolerance: float) -> np.ndarray:
+    """Return the cluster of each number; a new cluster begins more than ``tolerance`` above the start of the last."""
+    labels, cluster_start, label = np.empty(len(numbers), int), -np.inf, -1
     for i in np.argsort(numbers):
-        if numbers[i] > begin + spread:
-            begin, label = numbers[i], label + 1
-        found[i] = label
-    return found
+        if numbers[i] > cluster_start + tolerance:
+            cluster_start, label = numbers[i], label + 1
+        labels[i] = label
+    return labels

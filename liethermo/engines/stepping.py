@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from ..functions.energy import Energy
 from ..integrators import OneStepMethod
 from ..integrators.base import is_permutation_equivariant, pullback_method
-from ..integrators.explicit import INITIAL_LEVELS_ROW
+from ..integrators.explicit import StepRow
 from ..systems import System
 from ..tracing.programs import jit_unoptimised
 from .codes import StatusCode
@@ -114,7 +114,7 @@ def reorder_components(
     def permute_state(s: State, permute: Callable) -> State:
         k = permute(s.k)
         if method.explicit:  # this row holds values of functions, which have no components
-            k = k.at[INITIAL_LEVELS_ROW].set(s.k[INITIAL_LEVELS_ROW])
+            k = k.at[StepRow.INITIAL_LEVELS].set(s.k[StepRow.INITIAL_LEVELS])
         return s._replace(
             x=permute(s.x), compensation=permute(s.compensation), k=k, previous_slopes=permute(s.previous_slopes)
         )

@@ -1,4 +1,4 @@
-"""Integrators: each defines a step, its order and its guarantees; how it is run is the engines' business."""
+"""Integrators: each defines a step, its order and its guarantees; the engines run them."""
 
 from .base import OneStepMethod, registered_methods
 from .charts import InCharts
@@ -15,12 +15,12 @@ from .variational.lie import LieVariational
 from .variational.schemes import VariationalIntegrator
 
 DEFAULT_METHOD = MetriplecticGauss(1)
-"""The method has order 2; where energy and entropy are quadratic it is the midpoint scheme."""
+"""Method of runs without ``method=``: order 2, and the midpoint scheme if energy and entropy are quadratic."""
 
 METHODS: dict[str, type] = {type(method).__name__: type(method) for method in registered_methods(special=True)} | {
     "Reference": Reference
 }
-"""The integrators by name, as spec files give them; one registered in a module imported above is among them."""
+"""The integrators by name, as in spec files; an integrator registered in a module imported above is included."""
 
 __all__ = [
     "DEFAULT_METHOD",

@@ -1,9 +1,10 @@
-"""What explicit methods with both laws share: a step is brought back onto the levels that it has to end on."""
+"""Base class of explicit methods with both laws: each step is corrected onto the levels on which it has to end."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
+from enum import IntEnum
 from typing import ClassVar, NamedTuple, Self
 
 import equinox as eqx
@@ -31,19 +32,42 @@ from .levels import (
 )
 from .preserved import check_preserved, function_on_states, preserved_functions
 
-MEAN_SLOPE_ROW, ERROR_ROW, CONSTRAINT_RESIDUAL_ROW, INITIAL_LEVELS_ROW, FIRST_METHOD_ROW = range(5)
-"""What stands in the vectors that a step hands on: its mean slope, the estimate of its local error; in each component,
-what is missed of the levels after the corrections; the levels that the run has begun on; from OWN on what a method adds
-for the states between. Error and what is missed are over h."""
 
-DRIFT_THRESHOLD, MAX_DRIFT_CORRECTION = 4.0 * EPS, 0.25 * EPS
-"""What a function that is conserved has to be off the level of the start, relative to its size, for steps to take it
-back, and the most that one takes back: far below what its rounding is."""
+class StepRow(IntEnum):
+    """Rows of the array ``k``, shape (stages, n), that an explicit step returns.
+
+    Attributes
+    ----------
+    MEAN_SLOPE
+        ``(x' - x) / h``.
+    ERROR
+        The estimate of the local error, over h.
+    CONSTRAINT_RESIDUAL
+        The distance from the levels after the corrections, over h, in every component.
+    INITIAL_LEVELS
+        The values of the conserved functions at the start of the run.
+    FIRST_METHOD_ROW
+        The first of the rows that a method adds for interpolation.
+    """
+
+    MEAN_SLOPE = 0
+    ERROR = 1
+    CONSTRAINT_RESIDUAL = 2
+    INITIAL_LEVELS = 3
+    FIRST_METHOD_ROW = 4
+
+
+DRIFT_THRESHOLD = 4.0 * EPS
+"""Drift of a conserved function from its initial value, relative to its size, above which steps correct it."""
+
+MAX_DRIFT_CORRECTION = 0.25 * EPS
+"""Largest correction of the drift of a conserved function in a step, relative to its size: far below its rounding."""
 
 MAX_CORRECTION_DISPLACEMENT = 1e-10
-"""What a step may move by to be taken back, relative to the state: more where the gradients of the laws are nearly
-parallel. There the levels have next to no points in common, as at an equilibrium, and those of the start may have
-none."""
+"""Largest displacement of a drift correction, relative to the state; larger ones are skipped.
+
+A larger displacement means that the gradients of the laws are nearly parallel, as at an equilibrium. The levels then
+have hardly any common point, and the initial levels may have none."""
 
 
 class UncorrectedStep(NamedTuple):
@@ -54,11 +78,11 @@ class UncorrectedStep(NamedTuple):
     d : array, shape (n,)
         The displacement.
     law_changes : array, shape (laws,)
-        What the functions of the laws have to change by, by a quadrature of their rates with nonnegative weights.
+        Required changes of the functions of the laws, from a quadrature of their rates with nonnegative weights.
     error : array, shape (n,)
-        Of the size of the local error, over h.
+        A vector of the size of the local error, over h.
     interpolation_rows : array, shape (rows, n)
-        Further rows to hand on.
+        Rows of ``k`` for the states inside the step.
     """
 
     d: jax.Array
@@ -68,40 +92,41 @@ class UncorrectedStep(NamedTuple):
 
 
 class ExplicitMethod(TransportingMethod):
-    """A step y of some explicit method, and x' the point near y where
+    """Base of explicit methods: a step y, corrected to the point x' near y on the levels of the laws.
 
-        H(x') = H(x),    C(x') = C(x),    S(x') = S(x) + what it has produced,
+        H(x') = H(x),    C(x') = C(x),    S(x') = S(x) + (entropy produced),
 
-    for every C that the system is known to conserve [:doc:`/explanation/exact_laws`]. What the entropy has produced
-    is a quadrature of ``sigma = grad S . K grad S >= 0`` with nonnegative weights, of the order of the method.
+    for every C that the system is known to conserve [:doc:`/explanation/exact_laws`]. The entropy produced is a
+    quadrature of ``sigma = grad S . K grad S >= 0`` with nonnegative weights, of the order of the method.
 
-    The point x' is found by Newton's method along the gradients of H and the C, and that of S as far as it is
-    independent of these. What a function changes by is taken from a discrete gradient along the step, whose rounding
-    vanishes with the step. So a state that relaxes is not held off its equilibrium by rounding.
+    Newton's method finds x' along the gradients of H and the C, and along the component of grad S that is independent
+    of these. The change of a function is computed from a discrete gradient along the step, whose rounding vanishes with
+    the step. So rounding does not keep a relaxing state off its equilibrium.
 
-    Vectors of constant length, such as many spins, are held one by one, in work and memory that grow with their number:
-    each is brought back to its sphere along its radius, and the corrections above are made along the spheres.
+    Vectors of constant length, such as many spins, are held one by one, with work and memory proportional to their
+    number: each is projected radially onto its sphere, and the corrections above are made along the spheres.
 
-    Where nothing but Casimirs is held besides the energy and the structure can turn a state along its leaf, as in
-    quantum systems without dissipation, a covector is found beside the state, ``K' = turning(K, dH)``, at the order of
-    the method. The step ends where it carries the state [:meth:`manifolds.PoissonStructure.carried`], and corrections
-    are made along the leaf: the gradients of the Casimirs, which may depend on each other, are not needed.
+    If only Casimirs are held besides the energy, and the structure can transport a state along its leaf, as in quantum
+    systems without dissipation, the method integrates a covector beside the state, at its own order
+    [:meth:`manifolds.PoissonStructure.leaf_covector_rate`]. The step ends where the covector carries the state
+    [:meth:`manifolds.PoissonStructure.leaf_displacement`], and corrections are made along the leaf. The gradients of
+    the Casimirs, which may depend on each other, are not needed.
 
-    Where the energy falls and the entropy is conserved, as with double bracket dissipation, the energy falls by its own
+    If the energy falls and the entropy is conserved, as with double bracket dissipation, the energy falls by its own
     quadrature.
 
-    Where the motion has a form without the gradient of the entropy, as Lindblad's equation has
-    [:attr:`liethermo.Dissipation.has_generator`], the stages are spared the entropy:
-    ``S(x') = max(S(y), S(x))``, to the same order, y being the step on the levels of all that is conserved.
+    If the motion has a form without the gradient of the entropy, such as Lindblad's equation
+    [:attr:`liethermo.Dissipation.has_generator`], the stages do not evaluate the entropy: ``S(x') = max(S(y), S(x))``,
+    to the same order, where y is the step on the levels of all conserved functions.
 
-    A subclass says what the step is before it is corrected: :meth:`uncorrected`.
+    A subclass defines the step before its corrections: :meth:`base_step`.
 
     Parameters
     ----------
     number : int or None
-        The order; None until the tolerance of a run has chosen one.
+        The order; None until the tolerance of a run has determined it.
     preserve, retraction, held
-        As of :class:`.MetriplecticRungeKutta`.
+        See :class:`.MetriplecticRungeKutta`.
     """
 
     max_corrections: ClassVar[int] = MAX_PROJECTION_ITERATIONS
@@ -118,15 +143,15 @@ class ExplicitMethod(TransportingMethod):
         self.retraction, self.held = retraction, held
 
     @abstractmethod
-    def base_step(self, rates: Callable, spared: bool, x, compensation, h) -> UncorrectedStep:
-        """The step from x + compensation, which ends near the levels.
+    def base_step(self, rates: Callable, skip_law_rates: bool, x, compensation, h) -> UncorrectedStep:
+        """Return the step from x + compensation before its corrections; it ends near the levels.
 
         Parameters
         ----------
         rates : function from a state, shape (n,), to arrays of shapes (n,) and (laws,)
-            The field, and at what rates the functions of the laws change.
-        spared : bool
-            Whether these are zero.
+            The field, and the rates of change of the functions of the laws.
+        skip_law_rates : bool
+            True if the rates of the functions are zero and need not be evaluated.
         """
 
     @property
@@ -142,36 +167,41 @@ class ExplicitMethod(TransportingMethod):
         return name in system.first_integrals()
 
     def can_transport_attitude(self, system: System) -> bool:
-        """On orbits of two dimensions: their levels are orbits everywhere, but for momenta that nothing moves.
+        """Return True on coadjoint orbits of dimension 2 or less, where levels are orbits except for momenta at rest.
 
-        Among larger ones some have fewer dimensions than the levels around them, as that of a body on se(3) that spins
-        but does not move. Near these the turn that makes up for an error is much larger than the error. Momenta of
-        parts that turn inside, such as a wheel that rubs, are no matter of the attitude's.
+        Some larger orbits have fewer dimensions than the levels around them, for example on se(3) the orbit of a body
+        that spins but does not translate. Near these the rotation that would cancel an error is much larger than the
+        error. Momenta of internal parts, such as a wheel with friction, do not matter for the attitude.
         """
-        size, casimirs = system.orbit_levels
-        held = system.has_impulse or casimirs <= set(self.held)  # of a torque, the impulse is made to fit
-        return system.has_all_casimirs and held and size - len(casimirs) <= 2
+        orbit_dim, casimirs = system.orbit_levels
+        # With a torque, the impulse is projected onto the orbit instead.
+        casimirs_are_held = system.has_impulse or casimirs <= set(self.held)
+        return system.has_all_casimirs and casimirs_are_held and orbit_dim - len(casimirs) <= 2
 
     def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
-        seen = self._map_functions(lambda C: function_on_states(system, C), tuple(sorted(system.first_integrals())))
-        method = wrap_in_charts(seen, system, self.retraction, "exp")
+        method_on_states = self._map_functions(
+            lambda C: function_on_states(system, C), tuple(sorted(system.first_integrals()))
+        )
+        method = wrap_in_charts(method_on_states, system, self.retraction, "exp")
         if isinstance(method, InCharts) and not isinstance(method.retraction, mf.Chart):
             raise InputError(
-                f"{self} needs a retraction with its base point where the step starts, not {method.retraction}"
+                f"{self} needs a retraction with its base point at the start of the step, got {method.retraction}"
             )
         return method
 
     def requested_invariants(self, system: System) -> tuple[Energy, ...]:
         return tuple(function_on_states(system, C) for C in self.functions)
 
-    def _map_functions(self, change: Callable, held: tuple[str, ...]) -> Self:
-        """The method with its preserved functions changed, holding these of the system."""
-        return type(self)(self.number, tuple(map(change, self.functions)), self.retraction, held)
+    def _map_functions(self, transform: Callable, held_names: tuple[str, ...]) -> Self:
+        """Return the method with transformed preserved functions, holding the system's functions of these names."""
+        return type(self)(self.number, tuple(map(transform, self.functions)), self.retraction, held_names)
 
     def check(self, system: System) -> None:
-        """Raise InputError unless the system has a law to hold and conserves what is to be preserved."""
+        """Raise InputError unless the system has a law to hold and conserves the functions that are to be preserved."""
         if not self._laws(system):
-            raise InputError(f"{self} holds the laws of a system, and this one claims none: take lt.Reference")
+            raise InputError(
+                f"{self} needs a system with an energy or entropy law, and this one has none. Use lt.Reference"
+            )
         check_preserved(system, self.functions)
 
     def start(self, system: System, x) -> jax.Array:
@@ -180,68 +210,84 @@ class ExplicitMethod(TransportingMethod):
         levels = jnp.concatenate([levels, jnp.zeros(x.shape[0] - levels.shape[0])])
         return (
             jnp.zeros((self.stages, x.shape[0]))
-            .at[MEAN_SLOPE_ROW]
+            .at[StepRow.MEAN_SLOPE]
             .set(system.vector_field(x))
-            .at[INITIAL_LEVELS_ROW]
+            .at[StepRow.INITIAL_LEVELS]
             .set(levels)
         )
 
     # -- the step -----------------------------------------------------------------------------------------------------
 
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
-        """The vectors that the step hands on; of those before it the levels alone are needed."""
-        leaf, n, spared = self._can_follow_leaf(system), x.shape[0], system.has_generator or system.dissipation is None
+        """Return the rows of :class:`StepRow`; of the k passed in, only the initial levels are used."""
+        leaf, n, skip_law_rates = (
+            self._can_follow_leaf(system),
+            x.shape[0],
+            system.has_generator or system.dissipation is None,
+        )
         laws = self._laws(system, leaf)
-        starts = [law.function.gradient(x + compensation) for law in laws]
+        start_gradients = [law.function.gradient(x + compensation) for law in laws]
 
         def stage_rates(z) -> tuple[jax.Array, jax.Array]:
-            """Those of the state and, along a leaf, of the covector that carries it."""
+            """Return the rates of the state (and of the covector that carries it along a leaf) and of the laws."""
             field, changes = self.field_and_law_rates(system, laws, z[:n])
-            turning = system.poisson.leaf_covector_rate(z[n:], system.energy.gradient(z[:n])) if leaf else None
-            return field if turning is None else jnp.append(field, turning), changes
+            covector_rate = system.poisson.leaf_covector_rate(z[n:], system.energy.gradient(z[:n])) if leaf else None
+            return field if covector_rate is None else jnp.append(field, covector_rate), changes
 
-        begin, rest = (jnp.append(v, jnp.zeros(n)) if leaf else v for v in (x, compensation))
-        d, changes, error, between = self.base_step(stage_rates, spared, begin, rest, h)
+        start, start_compensation = (jnp.append(v, jnp.zeros(n)) if leaf else v for v in (x, compensation))
+        d, changes, error, interpolation_rows = self.base_step(
+            stage_rates, skip_law_rates, start, start_compensation, h
+        )
         if leaf:
-            d, error, between = d[n:], error[:n], between[:, :n]
-        if not isinstance(system, ChartSystem):  # whose row of levels is new at every step
+            d, error, interpolation_rows = d[n:], error[:n], interpolation_rows[:, :n]
+        if not isinstance(system, ChartSystem):  # in charts the initial levels are new at every step
             changes = changes + self._drift_correction(
-                system, laws, starts, x, compensation, k[INITIAL_LEVELS_ROW], leaf
+                system, laws, start_gradients, x, compensation, k[StepRow.INITIAL_LEVELS], leaf
             )
 
         def project_onto(laws: list[Law]) -> tuple[jax.Array, jax.Array]:
-            found = slice(len(laws))
+            selection = slice(len(laws))
             return project_onto_levels(
-                system, laws, starts[found], x, compensation, d, changes[found], self.max_corrections, leaf
+                system,
+                laws,
+                start_gradients[selection],
+                x,
+                compensation,
+                d,
+                changes[selection],
+                self.max_corrections,
+                leaf,
             )
 
-        d, defect = (
+        d, residual = (
             self._project_conserved_first(laws, x, compensation, project_onto)
             if system.has_generator
             else project_onto(laws)
         )
-        return jnp.stack([d / h, error, jnp.broadcast_to(defect / h, x.shape), k[INITIAL_LEVELS_ROW], *between])
+        return jnp.stack(
+            [d / h, error, jnp.broadcast_to(residual / h, x.shape), k[StepRow.INITIAL_LEVELS], *interpolation_rows]
+        )
 
     def _drift_correction(
         self, system: System, laws: list[Law], gradients: list, x, compensation, levels, leaf: bool
     ) -> jax.Array:
-        """What functions that are conserved are to change by, back to the levels that the run has begun on.
+        """Return the changes of the conserved functions, shape (laws,), back to the levels at the start of the run.
 
-        Each step is exact but for a few roundings, whose sum would walk at random. The engines do so with the energy.
-        A function whose gradient depends on those before it, as that of the entropy does at an equilibrium, changes as
-        these make it.
+        Each step is exact except for a few roundings, whose sum would be a random walk. The engines correct the energy
+        in the same way. A function whose gradient depends on the previous ones, such as the entropy at an equilibrium,
+        changes as the corrections of the others determine.
         """
 
         def clipped_drift(law: Law, gradient, level) -> jax.Array:
-            size = jnp.maximum(jnp.abs(level), law.function.sensitivity(x))
-            off = (level - law.function.value(x)) - jnp.dot(gradient, compensation)
+            scale = jnp.maximum(jnp.abs(level), law.function.sensitivity(x))
+            drift = (level - law.function.value(x)) - jnp.dot(gradient, compensation)
             return jnp.where(
-                jnp.abs(off) > DRIFT_THRESHOLD * size,
-                jnp.clip(off, -MAX_DRIFT_CORRECTION * size, MAX_DRIFT_CORRECTION * size),
+                jnp.abs(drift) > DRIFT_THRESHOLD * scale,
+                jnp.clip(drift, -MAX_DRIFT_CORRECTION * scale, MAX_DRIFT_CORRECTION * scale),
                 0.0,
             )
 
-        found = jnp.stack(
+        drifts = jnp.stack(
             [
                 clipped_drift(law, gradient, levels[i])
                 if law.sign == 0.0 and i < _max_stored_levels(system)
@@ -251,42 +297,42 @@ class ExplicitMethod(TransportingMethod):
         )
 
         def is_small_displacement(v) -> jax.Array:
-            move = correction_displacement(system, x, v, leaf)
-            near = [
-                jnp.linalg.norm(move[b]) <= MAX_CORRECTION_DISPLACEMENT * jnp.linalg.norm(x[b])
+            displacement = correction_displacement(system, x, v, leaf)
+            is_small = [
+                jnp.linalg.norm(displacement[b]) <= MAX_CORRECTION_DISPLACEMENT * jnp.linalg.norm(x[b])
                 for b in system.state_blocks
             ]
-            return jnp.stack(near).all()
+            return jnp.stack(is_small).all()
 
         def limited_changes() -> jax.Array:
-            along = correction_directions(system, x, gradients, leaf)
-            move = level_correction(system, along, found, is_small_displacement)
-            return jnp.stack([jnp.dot(v, move) for v in along])
+            directions = correction_directions(system, x, gradients, leaf)
+            correction = level_correction(system, directions, drifts, is_small_displacement)
+            return jnp.stack([jnp.dot(v, correction) for v in directions])
 
-        return jax.lax.stop_gradient(jax.lax.cond((found != 0.0).any(), limited_changes, lambda: found))
+        return jax.lax.stop_gradient(jax.lax.cond((drifts != 0.0).any(), limited_changes, lambda: drifts))
 
     def _project_conserved_first(
-        self, laws: list[Law], x, compensation, ended: Callable
+        self, laws: list[Law], x, compensation, project: Callable
     ) -> tuple[jax.Array, jax.Array]:
-        """The end of a step on the levels of what is conserved; on all of them where a function changes wrongly there.
+        """Project a step onto the conserved levels; onto all levels if a function then changes with a wrong sign.
 
-        These are to rise or to fall, as the motion makes them: so a step with the wrong sign is off the motion by no
-        less than what is mended.
+        A function that rises or falls does so by the motion itself. A step with the wrong sign is therefore off the
+        motion by at least the size of the second projection.
         """
-        conserved = [law for law in laws if law.sign == 0.0]
-        if len(conserved) in (0, len(laws)):
-            return ended(laws)
-        found = ended(conserved)
-        d, others = found[0], laws[len(conserved) :]
-        right = jnp.stack(
-            [law.sign * jnp.dot(CHANGE_GRADIENT(law.function, x, d, compensation), d) >= 0.0 for law in others]
+        conserved_laws = [law for law in laws if law.sign == 0.0]
+        if len(conserved_laws) in (0, len(laws)):
+            return project(laws)
+        projection = project(conserved_laws)
+        d, monotone_laws = projection[0], laws[len(conserved_laws) :]
+        has_right_sign = jnp.stack(
+            [law.sign * jnp.dot(CHANGE_GRADIENT(law.function, x, d, compensation), d) >= 0.0 for law in monotone_laws]
         )
-        return jax.lax.cond(right.all(), lambda: found, lambda: ended(laws))
+        return jax.lax.cond(has_right_sign.all(), lambda: projection, lambda: project(laws))
 
     def field_and_law_rates(self, system: System, laws: list[Law], x) -> tuple[jax.Array, jax.Array]:
-        """The field at a stage, and at what rates the functions of the laws change, of the sign that the law wants.
+        """Return the field at a stage, shape (n,), and the rates of the laws' functions, with the sign of each law.
 
-        Where the field has a form without the entropy, the rates are not needed, and zero.
+        If the field has a form without the entropy, the rates are not needed and zero.
         """
         system = system.freeze_at(x)
         if system.has_generator:
@@ -296,43 +342,44 @@ class ExplicitMethod(TransportingMethod):
             return system.field(x, dH, jnp.zeros_like(x)), jnp.zeros(len(laws))
         dS = jnp.zeros_like(x) if system.entropy is None else system.entropy.gradient(x)
         dL = tuple(L.gradient(x) for L in system.preserved)
-        parts = list(terms_with_preserved(system.dissipation, dL))
+        terms = list(terms_with_preserved(system.dissipation, dL))
 
         def dissipation_rate(law: Law) -> jax.Array:
-            """Without the motion, along which H and S do not change: near rest that is rounding noise."""
+            """Return the rate by dissipation alone: near rest the motion would add rounding noise."""
             if law.sign == 0.0:
                 return jnp.zeros(())
             gradient = law.function.gradient(x)
-            found = sum(part.rate_of_change(system, x, dH, dS, own, gradient) for part, own in parts)
-            return law.sign * jnp.maximum(law.sign * found, 0.0)
+            rate = sum(term.rate_of_change(system, x, dH, dS, dL_term, gradient) for term, dL_term in terms)
+            return law.sign * jnp.maximum(law.sign * rate, 0.0)
 
         return system.field(x, dH, dS, dL), jnp.stack([dissipation_rate(law) for law in laws])
 
     def _can_follow_leaf(self, system: System) -> bool:
-        """Whether a step goes along the symplectic leaf, on which all Casimirs are constant, so that none is corrected.
+        """Return True if a step can follow the symplectic leaf, on which all Casimirs are constant.
 
-        Where it can, and not all Casimirs are quadratic: the gradients of others depend on each other at many states.
+        This requires a structure that knows its leaves, and a Casimir that is not quadratic: the gradients of such
+        Casimirs depend on each other at many states.
         """
         if system.dissipation is not None:
             return False
-        held = [C for name, C in system.casimirs().items() if name in self.held]
-        held += [] if system.entropy is None else [system.entropy]
+        casimirs = [C for name, C in system.casimirs().items() if name in self.held]
+        casimirs += [] if system.entropy is None else [system.entropy]
         v = jax.ShapeDtypeStruct((system.dim,), jnp.float64)
         return (
-            not all(C.is_quadratic for C in held)
+            not all(C.is_quadratic for C in casimirs)
             and jax.eval_shape(system.poisson.leaf_covector_rate, v, v) is not None
         )
 
     def _laws(self, system: System, leaf: bool = False) -> list[Law]:
-        """The functions that a step ends on levels of; the one that changes last, where the others leave it room.
+        """Return the functions whose levels a step ends on: first the conserved ones, then those that rise or fall.
 
-        With ``leaf``, those that are not constant on a symplectic leaf.
+        With ``leaf``, functions that are constant on a symplectic leaf are left out.
         """
         functions = system.functions()
         laws = [Law(system.energy, LAW_SIGNS[system.energy_law])] if system.energy_law in LAW_SIGNS else []
-        others = set() if system.surface is None else {system.surface.name}
-        others |= set(system.casimirs()) if leaf else set()
-        laws += [Law(functions[name], 0.0) for name in self.held if name not in others]
+        constant_names = set() if system.surface is None else {system.surface.name}
+        constant_names |= set(system.casimirs()) if leaf else set()
+        laws += [Law(functions[name], 0.0) for name in self.held if name not in constant_names]
         laws += [Law(C, 0.0) for C in self.functions]
         if system.entropy_law in LAW_SIGNS and not leaf:
             assert system.entropy is not None
@@ -340,7 +387,7 @@ class ExplicitMethod(TransportingMethod):
         return sorted(laws, key=lambda law: law.sign != 0.0)
 
     def increment(self, h, k) -> jax.Array:
-        return h * k[MEAN_SLOPE_ROW]
+        return h * k[StepRow.MEAN_SLOPE]
 
     def predict(self, k, before) -> jax.Array:
         return k
@@ -349,20 +396,20 @@ class ExplicitMethod(TransportingMethod):
         if not bool(jnp.isfinite(system.vector_field(jnp.asarray(x))).all()):
             return ""
         return (
-            f"the stages of a step of {h:g} run away, or leave the domain of the functions: it is too long for an "
-            "explicit method; lt.MetriplecticGauss takes longer ones of a stiff system"
+            f"the step h = {h:g} is too long for an explicit method: its stages diverge or leave the domain of the "
+            "functions. Try a smaller step, or lt.MetriplecticGauss if the system is stiff"
         )
 
     def __str__(self) -> str:
-        kept = f", preserve={len(self.functions)} functions" if self.functions else ""
-        return f"{type(self).__name__}(order={self.number}{kept})"
+        suffix = f", preserve={len(self.functions)} functions" if self.functions else ""
+        return f"{type(self).__name__}(order={self.number}{suffix})"
 
 
 def constraint_residual(k) -> jax.Array:
-    """How far an explicit step misses the levels that it has to end on, as a length of a slope."""
-    return jnp.max(jnp.abs(k[CONSTRAINT_RESIDUAL_ROW]))
+    """Return the distance of an explicit step from the levels on which it has to end, over h, shape ()."""
+    return jnp.max(jnp.abs(k[StepRow.CONSTRAINT_RESIDUAL]))
 
 
 def _max_stored_levels(system: System) -> int:
-    """How many levels a run remembers: no more than the components that functions depend on, as angles are none."""
+    """Return the number of levels that a run stores: the number of components without angles."""
     return system.attitude_system.body.dim if isinstance(system, TurningSystem) else system.dim

@@ -41,7 +41,7 @@ from .tableaus import gauss_tableau, kronrod_rule
 
 
 class MetriplecticGauss(GaussMethod, TransportingMethod):
-    """Implicit Gauss steps with both laws exact, of order 2 s with s stages.
+    """Implicit Gauss steps with both laws exact, of order 2s with s stages.
 
     ``k_i = Pi(u_i) gH_i + K_d gS_i`` at Gauss nodes ``u_i = x + h sum_j A_ij k_j``; ``x' = x + h sum_i b_i k_i``.
 
@@ -124,25 +124,29 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         self.moving = moving
 
     def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
-        held = tuple(sorted(name for name in system.first_integrals() if self._is_held(system, name)))
-        method = self._map_functions(lambda C: function_on_states(system, C), held)
+        held_names = tuple(sorted(name for name in system.first_integrals() if self._is_held(system, name)))
+        method = self._map_functions(lambda C: function_on_states(system, C), held_names)
         if self.functions and not is_traced((system, method)):
-            shares = evaluate_at_points(casimir_residuals, (system, method.functions), system.samples(4))
-            moving = tuple(int(i) for i in np.flatnonzero(is_momentum_map(shares)))
-            method = method._map_functions(lambda C: C, held, moving)
+            residuals = evaluate_at_points(casimir_residuals, (system, method.functions), system.samples(4))
+            momentum_maps = tuple(int(i) for i in np.flatnonzero(is_momentum_map(residuals)))
+            method = method._map_functions(lambda C: C, held_names, momentum_maps)
         return wrap_in_charts(method, system, self.retraction, "exp")
 
     def requested_invariants(self, system: System) -> tuple[Energy, ...]:
         return tuple(function_on_states(system, C) for C in self.functions)
 
-    def _map_functions(self, change: Callable, held: tuple[str, ...], moving: tuple[int, ...] | None = None):
-        """The method with its preserved functions changed, holding these of the system."""
-        return type(self)(self.number, tuple(map(change, self.functions)), self.retraction, held, moving)
+    def _map_functions(
+        self, transform: Callable, held_names: tuple[str, ...], momentum_maps: tuple[int, ...] | None = None
+    ):
+        """Return the method with transformed preserved functions, holding the system's functions of these names."""
+        return type(self)(
+            self.number, tuple(map(transform, self.functions)), self.retraction, held_names, momentum_maps
+        )
 
     preserves = frozenset({"energy", "entropy_law", "casimirs"})
 
     def check(self, system: System) -> None:
-        """Raise InputError unless the system conserves what is to be preserved, and room is left for it to move."""
+        """Raise InputError unless the system conserves the preserved functions, which must leave it room to move."""
         check_preserved(system, self.functions)
         if not self.functions:
             return
@@ -151,21 +155,24 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         if np.linalg.matrix_rank(gradients, tol=1e-9).max() >= system.dim:
             raise InputError(
                 f"energy, entropy and {len(self.functions)} preserved functions are independent and leave no room to "
-                f"move in {system.dim} dimensions"
+                f"move in {system.dim} dimensions. Preserve fewer functions"
             )
 
     # -- the stage equations ------------------------------------------------------------------------------------------
 
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
-        found = self._leaf_slopes(system, x, compensation, h, k)
-        if found is not None:
-            return found
+        leaf_slopes = self._leaf_slopes(system, x, compensation, h, k)
+        if leaf_slopes is not None:
+            return leaf_slopes
         return jax.vmap(lambda *stage: self._stage_slope(system, *stage))(
             *self._stage_gradients(system, x, compensation, h, k)
         )
 
     def _leaf_slopes(self, system: System, x, compensation, h, k) -> jax.Array | None:
-        """The slopes of a motion that Casimirs alone have a part in, where the structure knows the leaf through x."""
+        """Return the slopes along the symplectic leaf through x, shape (s, n), or None if the structure knows no leaf.
+
+        This is for motions without dissipation whose held functions are all Casimirs.
+        """
         functions = self._held_functions(system) | _entropy_arguments(system)
         casimirs = functions.keys() <= {ENTROPY_KEY, *self._held_casimir_names(system)}
         if system.dissipation is not None or not casimirs or all(C.is_quadratic for C in functions.values()):
@@ -177,132 +184,152 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
     def stage_velocities(self, system: System, x, compensation, h, k) -> jax.Array:
         names = tuple(system.preserved_by_name())
 
-        def velocity(u, dH, dS, known):
-            return system.transport(u, dH, dS, tuple(known[name].discrete for name in names))
+        def velocity(u, dH, dS, gradients_by_name):
+            return system.transport(u, dH, dS, tuple(gradients_by_name[name].discrete for name in names))
 
         return jax.vmap(velocity)(*self._stage_gradients(system, x, compensation, h, k))
 
     def _stage_gradients(self, system: System, x, compensation, h, k) -> tuple:
-        """The stages, shape (s, n), and there what the step takes for dH, dS and the other gradients, by name."""
+        """Return the stages, shape (s, n), the step's gradients dH and dS there, and the other gradients by name."""
         A, b, _ = gauss_tableau(self.number)
         u = self._stage_states(x, compensation, h, k)
 
         def gradients_of_function(C: Energy) -> StageGradients:
-            plain = jax.vmap(C.gradient)(u)
+            continuous = jax.vmap(C.gradient)(u)
             if C.is_quadratic:
-                return StageGradients(plain, plain)
-            return StageGradients(stage_gradients(C, x, compensation, h, k, A, b, kronrod_rule(self.number)), plain)
+                return StageGradients(continuous, continuous)
+            return StageGradients(
+                stage_gradients(C, x, compensation, h, k, A, b, kronrod_rule(self.number)), continuous
+            )
 
-        S, parts = system.entropy, _entropy_arguments(system)
+        S, entropy_arguments = system.entropy, _entropy_arguments(system)
         dH = self._energy_gradients(system, u, x, compensation, h, k)
-        known = {
+        gradients_by_name = {
             name: gradients_of_function(C)
-            for name, C in (self._held_functions(system) | parts | system.preserved_by_name()).items()
+            for name, C in (self._held_functions(system) | entropy_arguments | system.preserved_by_name()).items()
         }
         if S is None:
             dS = jnp.zeros_like(k)
-        elif ENTROPY_KEY in parts:
-            dS = known[ENTROPY_KEY].discrete
+        elif ENTROPY_KEY in entropy_arguments:
+            dS = gradients_by_name[ENTROPY_KEY].discrete
         else:
-            discrete = jnp.stack([known[name].discrete for name in parts])
-            dS = composed_entropy_gradients(S, list(parts.values()), discrete, x, compensation, h, k, A, b)
-        return u, dH, dS, known
+            discrete = jnp.stack([gradients_by_name[name].discrete for name in entropy_arguments])
+            dS = composed_entropy_gradients(S, list(entropy_arguments.values()), discrete, x, compensation, h, k, A, b)
+        return u, dH, dS, gradients_by_name
 
     def _stage_states(self, x, compensation, h, k) -> jax.Array:
         return x + (compensation + h * (gauss_tableau(self.number).A @ k))
 
     def _energy_gradients(self, system: System, u, x, compensation, h, k) -> jax.Array:
-        """What the step takes for dH at the stages u, shape (s, n)."""
+        """Return the discrete gradients of the energy at the stages u, shape (s, n)."""
         A, b, _ = gauss_tableau(self.number)
         symmetries = self._symmetry_directions(system, u)
         return stage_gradients(system.energy, x, compensation, h, k, A, b, kronrod_rule(self.number), symmetries)
 
-    def _stage_slope(self, system: System, u, dH, dS, known: dict[str, StageGradients]) -> jax.Array:
-        """``Pi_d dH + K_d dS`` at one stage."""
+    def _stage_slope(self, system: System, u, dH, dS, gradients_by_name: dict[str, StageGradients]) -> jax.Array:
+        """Return ``Pi_d dH + K_d dS`` at one stage."""
         system = system.freeze_at(u)
-        motion = self._conservative_slope(system, u, dH, known)
-        names = tuple(zip(system.preserved_by_name(), system.preserved_names, strict=True))
-        for part, own in () if system.dissipation is None else terms_with_preserved(system.dissipation, names):
-            motion = motion + self._dissipative_slope(part, own, system, u, dH, dS, known)
-        return motion
+        slope = self._conservative_slope(system, u, dH, gradients_by_name)
+        keys_and_names = tuple(zip(system.preserved_by_name(), system.preserved_names, strict=True))
+        for term, preserved_keys in (
+            () if system.dissipation is None else terms_with_preserved(system.dissipation, keys_and_names)
+        ):
+            slope = slope + self._dissipative_slope(term, preserved_keys, system, u, dH, dS, gradients_by_name)
+        return slope
 
-    def _conservative_slope(self, system: System, u, dH, known: dict[str, StageGradients]) -> jax.Array:
-        """``Pi dH``, less what would change S and what is held."""
+    def _conservative_slope(self, system: System, u, dH, gradients_by_name: dict[str, StageGradients]) -> jax.Array:
+        """Return ``Pi dH`` without the components that would change S or a held function."""
         functions = self._held_functions(system) | _entropy_arguments(system)
         if all(C.is_quadratic for C in functions.values()):
             return system.poisson.sharp(u, dH)
-        gradients = [known[name] for name in functions]
+        gradients = [gradients_by_name[name] for name in functions]
         if functions.keys() <= {ENTROPY_KEY, *self._held_casimir_names(system)}:
-            off = _gradient_projector(system, u, gradients, within=system.body_dim)
-            return off(system.poisson.sharp(u, off(dH)))
+            project_off = _gradient_projector(system, u, gradients, n_components=system.body_dim)
+            return project_off(system.poisson.sharp(u, project_off(dH)))
         energy = StageGradients(dH, system.energy.gradient(u))
-        return _gradient_projector(system, u, [energy, *gradients], within=system.body_dim)(system.poisson.sharp(u, dH))
+        return _gradient_projector(system, u, [energy, *gradients], n_components=system.body_dim)(
+            system.poisson.sharp(u, dH)
+        )
 
     def _dissipative_slope(
-        self, part: Dissipation, own: tuple[tuple[str, str], ...], system: System, u, dH, dS, known
+        self,
+        term: Dissipation,
+        preserved_keys: tuple[tuple[str, str], ...],
+        system: System,
+        u,
+        dH,
+        dS,
+        gradients_by_name,
     ) -> jax.Array:
-        """One dissipation, less what would change what it has to keep beside its ``own`` preserved functions.
+        """Return the force of one dissipation without the components that would change functions that it has to keep.
 
-        These have a key among ``known``, and a name among the functions of the system.
+        ``preserved_keys`` has a pair for each function in its own ``preserve``: the key in ``gradients_by_name`` and
+        the name in the functions of the system.
         """
         dL, functions = (
-            tuple(known[key].discrete for key, _ in own),
-            self._functions_to_project(part, {name for _, name in own}, system),
+            tuple(gradients_by_name[key].discrete for key, _ in preserved_keys),
+            self._functions_to_project(term, {name for _, name in preserved_keys}, system),
         )
         if not functions:
-            return part.force(system, u, dH, dS, dL)
-        gradients = [known[name] for name in functions] + [known[key] for key, name in own if name not in functions]
-        if part.energy_law == "nonincreasing":
-            off = _gradient_projector(system, u, gradients)
-            return off(part.force(system, u, off(dH), dS, dL))
-        if part.energy_law == "conserved":
+            return term.force(system, u, dH, dS, dL)
+        gradients = [gradients_by_name[name] for name in functions] + [
+            gradients_by_name[key] for key, name in preserved_keys if name not in functions
+        ]
+        if term.energy_law == "nonincreasing":
+            project_off = _gradient_projector(system, u, gradients)
+            return project_off(term.force(system, u, project_off(dH), dS, dL))
+        if term.energy_law == "conserved":
             gradients = [StageGradients(dH, system.energy.gradient(u)), *gradients]
-        off = _gradient_projector(system, u, gradients)
-        return off(part.force(system, u, dH, off(dS), dL))
+        project_off = _gradient_projector(system, u, gradients)
+        return project_off(term.force(system, u, dH, project_off(dS), dL))
 
-    def _functions_to_project(self, part: Dissipation, own: set[str], system: System) -> dict[str, Energy]:
-        """The functions that a dissipation has to keep, by name, where it does not keep them all by construction."""
+    def _functions_to_project(self, term: Dissipation, preserved_names: set[str], system: System) -> dict[str, Energy]:
+        """Return the functions, by name, that a dissipation has to keep; empty if it keeps all by construction."""
         functions = self._held_functions(system) | (
-            _entropy_arguments(system) if part.energy_law == "nonincreasing" else {}
+            _entropy_arguments(system) if term.energy_law == "nonincreasing" else {}
         )
-        exact = system.energy.is_quadratic and (system.entropy is None or system.entropy.is_quadratic)
-        casimirs = {ENTROPY_KEY, *self._held_casimir_names(system)} if part.preserves_casimirs else set()
+        gradients_are_exact = system.energy.is_quadratic and (system.entropy is None or system.entropy.is_quadratic)
+        casimirs = {ENTROPY_KEY, *self._held_casimir_names(system)} if term.preserves_casimirs else set()
 
-        def is_kept_by_construction(name: str, C: Energy) -> bool:  # kept by construction
-            return name in own or (C.is_quadratic and (exact or name in casimirs))
+        def is_kept_by_construction(name: str, C: Energy) -> bool:
+            return name in preserved_names or (C.is_quadratic and (gradients_are_exact or name in casimirs))
 
         return (
             {}
-            if not part.is_symmetric or all(is_kept_by_construction(*function) for function in functions.items())
+            if not term.is_symmetric or all(is_kept_by_construction(*function) for function in functions.items())
             else functions
         )
 
     def can_transport_attitude(self, system: System) -> bool:
-        """Where nothing is projected off the slopes."""
+        """Return True if nothing is projected off the slopes."""
         names = system.preserved_names
-        parts = () if system.dissipation is None else terms_with_preserved(system.dissipation, names)
-        plain = all(C.is_quadratic for C in (self._held_functions(system) | _entropy_arguments(system)).values())
-        return plain and not any(self._functions_to_project(part, set(own), system) for part, own in parts)
+        terms = () if system.dissipation is None else terms_with_preserved(system.dissipation, names)
+        has_only_quadratics = all(
+            C.is_quadratic for C in (self._held_functions(system) | _entropy_arguments(system)).values()
+        )
+        return has_only_quadratics and not any(
+            self._functions_to_project(term, set(term_names), system) for term, term_names in terms
+        )
 
     def preserves_function(self, system: System, name: str) -> bool:
-        known = name in system.casimirs() or name in system.preserved_names
-        return self._is_held(system, name) if known else super().preserves_function(system, name)
+        is_known_invariant = name in system.casimirs() or name in system.preserved_names
+        return self._is_held(system, name) if is_known_invariant else super().preserves_function(system, name)
 
     def _is_held(self, system: System, name: str) -> bool:
-        """Whether it holds a constant of the system unasked: Casimirs, and what the dissipation has to preserve.
+        """Return True for functions held without request: Casimirs, and those that the dissipation preserves.
 
-        A skew friction is not projected, and keeps by itself what is quadratic alone.
+        A skew friction is not projected, and keeps only quadratic functions by itself.
         """
         if name not in system.casimirs() and name not in system.preserved_names:
             return False
-        projected = system.dissipation is None or system.dissipation.is_symmetric
-        return projected or system.functions()[name].is_quadratic
+        is_projected = system.dissipation is None or system.dissipation.is_symmetric
+        return is_projected or system.functions()[name].is_quadratic
 
     def _held_functions(self, system: System) -> dict[str, Energy]:
-        """What is held, by name."""
+        """Return the held functions by name."""
         functions = system.functions()
-        given = {f"given {i + 1}": C for i, C in enumerate(self.functions)}
-        return {name: functions[name] for name in self.held} | given
+        user_functions = {f"given {i + 1}": C for i, C in enumerate(self.functions)}
+        return {name: functions[name] for name in self.held} | user_functions
 
     def move(self, system: System, x, compensation, h, k) -> tuple[jax.Array, jax.Array]:
         return apply_increment(
@@ -310,12 +337,12 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         )
 
     def _held_casimir_names(self, system: System) -> set[str]:
-        """Names of the Casimirs among what is held."""
-        given = range(len(self.functions)) if self.moving is not None else ()
-        return {*system.casimirs(), *(f"given {i + 1}" for i in given if i not in (self.moving or ()))}
+        """Return the names of the Casimirs among the held functions."""
+        user_indices = range(len(self.functions)) if self.moving is not None else ()
+        return {*system.casimirs(), *(f"given {i + 1}" for i in user_indices if i not in (self.moving or ()))}
 
     def _symmetry_directions(self, system: System, u) -> jax.Array | None:
-        """The directions ``Pi grad J`` at the stages for quadratic momentum maps J, shape (s, r, n)."""
+        """Return the directions ``Pi grad J`` at the stages for quadratic momentum maps J, shape (s, r, n)."""
         if system.energy.is_quadratic:
             return None
         casimirs = self._held_casimir_names(system)
@@ -334,22 +361,26 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         return collocation_error(system, x, compensation, h, k)
 
     def __str__(self) -> str:
-        kept = f", preserve={len(self.functions)} functions" if self.functions else ""
-        return f"MetriplecticGauss(stages={self.number}{kept})"
+        suffix = f", preserve={len(self.functions)} functions" if self.functions else ""
+        return f"MetriplecticGauss(stages={self.number}{suffix})"
 
 
 class StageGradients(NamedTuple):
-    """Gradients of a function at the stages, shape (s, n), or at one: discrete ones, and their limits."""
+    """Gradients of a function at the stages, shape (s, n), or at one stage: the discrete ones and their limits."""
 
     discrete: jax.Array
     continuous: jax.Array
 
 
 ENTROPY_KEY = "the entropy"
+"""Key of the entropy among the gradients by name."""
 
 
 def _entropy_arguments(system: System) -> dict[str, Energy]:
-    """What the entropy is a function of, by name: Casimirs where all are known and that helps, itself otherwise."""
+    """Return the functions that determine the entropy, by name: all Casimirs if known, otherwise the entropy.
+
+    A quadratic entropy stands for itself too.
+    """
     if system.entropy is None:
         return {}
     if system.entropy.is_quadratic or not system.has_all_casimirs:
@@ -357,18 +388,20 @@ def _entropy_arguments(system: System) -> dict[str, Energy]:
     return system.casimirs()
 
 
-def _gradient_projector(system: System, u, gradients: list[StageGradients], within: int | None = None) -> Callable:
-    """The orthogonal projector off discrete gradients, raised: what is driven has a clock, which is not to be moved.
+def _gradient_projector(
+    system: System, u, gradients: list[StageGradients], n_components: int | None = None
+) -> Callable:
+    """Return the orthogonal projector off the vectors of discrete gradients; the clock of a driven system is not moved.
 
-    ``within`` the first components alone: Pi moves no bath, and the rounding of what it moves is none of theirs.
+    Only the first ``n_components`` components are projected: Pi moves no bath, and its rounding must not either.
     """
 
     def raise_index(alpha):
-        found = system.raise_index(u, alpha)
-        return found if within in (None, system.dim) else found.at[within:].set(0.0)
+        vector = system.raise_index(u, alpha)
+        return vector if n_components in (None, system.dim) else vector.at[n_components:].set(0.0)
 
-    pairs = [(raise_index(g.discrete), raise_index(g.continuous)) for g in gradients]
-    return gram_schmidt([d for d, _ in pairs], reference_vectors=[p for _, p in pairs]).project_off
+    vectors = [(raise_index(g.discrete), raise_index(g.continuous)) for g in gradients]
+    return gram_schmidt([d for d, _ in vectors], reference_vectors=[p for _, p in vectors]).project_off
 
 
 register(MetriplecticGauss(1), MetriplecticGauss(2), MetriplecticGauss(3))

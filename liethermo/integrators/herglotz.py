@@ -39,32 +39,35 @@ SUBSTEPS: dict[int, tuple[tuple[float, bool], ...]] = {1: ((1.0, True),)} | {
     order: tuple((0.5 * share, forward) for share in shares for forward in (True, False))
     for order, shares in _SUZUKI_FRACTIONS.items()
 }
-"""What a step of an order consists of: the share of the step, and whether it is of the scheme or of its adjoint."""
+"""Substeps of a step, by order: (fraction of the step, True for the scheme or False for its adjoint)."""
 
 
 class DiscreteHerglotz(OneStepMethod):
-    """``D_1 L_d(q_1, q_2, S_1) + (1 + D_S L_d(q_1, q_2, S_1)) D_2 L_d(q_0, q_1, S_0) = 0`` for q_2 [SML 40],
-    ``S_1 - S_0 = (q_1 - q_0)·D_2 L_d(q_0, q_1, S_0)`` [SML 41].
+    """Discrete Herglotz integrator of an evolution field, of order 1, 2 or 4 [SML §6.3].
 
-    Run here as a one-step method on states (q, p, S) of an :class:`liethermo.EvolutionSystem`, with the momentum
-    ``p_1 = D_2 L_d(q_0, q_1, S_0)``: (40) gives q_2 from (q_1, p_1, S_1), whatever the action S_1 is. The discrete
-    Lagrangian alone makes the step; the system only says what energy and entropy are recorded.
+    It solves ``D_1 L_d(q_1, q_2, S_1) + (1 + D_S L_d(q_1, q_2, S_1)) D_2 L_d(q_0, q_1, S_0) = 0`` for q_2 [SML 40],
+    with ``S_1 - S_0 = (q_1 - q_0)·D_2 L_d(q_0, q_1, S_0)`` [SML 41].
 
-    The scheme is of order 1, since (40) and (41) take the entropy at the start of the step. SML ask for more. Its
-    adjoint, the scheme backwards in time, takes the entropy at the end:
+    It runs as a one-step method on states (q, p, S) of an :class:`liethermo.EvolutionSystem`, with the momentum ``p_1 =
+    D_2 L_d(q_0, q_1, S_0)``: (40) gives q_2 from (q_1, p_1, S_1), for any action S_1. The discrete Lagrangian alone
+    determines the step; the system only determines which energy and entropy are recorded.
+
+    The scheme has order 1, since (40) and (41) use the entropy at the start of the step. Its adjoint, the scheme
+    backward in time, uses the entropy at the end:
 
         D_2 L_d(q_1, q_0, S_1; -h) = p_0,  S_1 - S_0 = (q_1 - q_0)·p_0,  p_1 = -D_1 L_d / (1 + D_S L_d).
 
-    Half a step of one and half a step of the other are symmetric, so of order 2; five such steps in the proportions of
-    Suzuki (1990) are of order 4 [Hairer, Lubich & Wanner 2006, II.4]. The step in the middle goes back in time.
+    Half a step of the scheme and half a step of the adjoint form a symmetric step, of order 2. Five such steps in the
+    proportions of Suzuki (1990) have order 4 [Hairer, Lubich & Wanner 2006, II.4]; the third of them goes backward in
+    time.
 
-    Nothing is kept exactly, neither the energy nor the sign of the entropy production. Where L does not depend on S it
-    is a variational integrator. One equation of the size of q a part, solved by Newton's method; explicit where L_d is
-    quadratic in q_2.
+    Neither the energy nor the sign of the entropy production is exact. If L does not depend on S, the scheme is a
+    variational integrator. Each substep solves one equation of the size of q by Newton's method; it is explicit if L_d
+    is quadratic in q_2.
 
-    On a manifold Q of an evolution system with ``space=`` the equations hold along Q, and q_2 is a point of it to
-    rounding. L_d is then a function of two arrays of the shape of Q; :meth:`midpoint` looks at the middle of their
-    chord, so its Lagrangian has to be defined near Q too.
+    On a manifold Q of an evolution system with ``space=`` the equations hold along Q, and q_2 is on Q to rounding. L_d
+    is then a function of two arrays of the shape of Q. :meth:`midpoint` evaluates L at the middle of their chord, so
+    its Lagrangian has to be defined near Q too.
 
     Parameters
     ----------
@@ -82,22 +85,31 @@ class DiscreteHerglotz(OneStepMethod):
 
     def __init__(self, discrete_lagrangian: Callable, order: Literal[1, 2, 4] = 1):
         if order not in tuple(SUBSTEPS):
-            raise InputError(f"the order is 1, 2 or 4, not {order!r}")
+            raise InputError(f"order must be 1, 2 or 4, got {order!r}")
         if not callable(discrete_lagrangian):
-            raise InputError(f"a discrete Lagrangian is a function of (q_0, q_1, S_0, h), not {discrete_lagrangian!r}")
+            raise InputError(
+                f"the discrete Lagrangian must be a function of (q_0, q_1, S_0, h), got {discrete_lagrangian!r}"
+            )
         self.discrete_lagrangian, self.composed = discrete_lagrangian, order
 
     @classmethod
     def midpoint(cls, lagrangian, order: Literal[1, 2, 4] = 1) -> DiscreteHerglotz:
-        """That of ``L_d(q_0, q_1, S_0) = h L((q_0 + q_1)/2, (q_1 - q_0)/h, S_0)`` [SML Example 7].
+        """Return the integrator of ``L_d(q_0, q_1, S_0) = h L((q_0 + q_1)/2, (q_1 - q_0)/h, S_0)`` [SML Example 7].
 
         Parameters
         ----------
         lagrangian : function of (q, v, S), or of all in one array, shape (2n + 1,), to a scalar; or an Energy
         order : {1, 2, 4}
         """
-        apart = callable(lagrangian) and not isinstance(lagrangian, Energy) and required_argument_count(lagrangian) == 3
-        return cls(_Midpoint(lagrangian if apart else _OfParts(make_energy(lagrangian, "the Lagrangian"))), order)
+        has_three_arguments = (
+            callable(lagrangian) and not isinstance(lagrangian, Energy) and required_argument_count(lagrangian) == 3
+        )
+        return cls(
+            _Midpoint(
+                lagrangian if has_three_arguments else _EnergyOfArguments(make_energy(lagrangian, "the Lagrangian"))
+            ),
+            order,
+        )
 
     @property
     def stages(self) -> int:
@@ -113,7 +125,7 @@ class DiscreteHerglotz(OneStepMethod):
         return "DiscreteHerglotz" if self.composed == 1 else f"DiscreteHerglotz(order={self.composed})"
 
     def state(self, q0, q1, S0, h) -> jax.Array:
-        """The state (q_1, p_1, S_1) after a first step that is known, shape (2n + 1,), to start a run from."""
+        """Return the state (q_1, p_1, S_1) after a known first step, shape (2n + 1,), from which a run can start."""
         q0 = jnp.atleast_1d(check_numbers(q0, "q0"))
         q1, S0, h = (
             jnp.atleast_1d(check_numbers(q1, "q1", q0.shape, ())),
@@ -125,17 +137,19 @@ class DiscreteHerglotz(OneStepMethod):
         return jnp.concatenate([q1, p1, (S0 + jnp.dot(q1 - q0, p1))[None]])
 
     def check(self, system: System) -> None:
-        """Raise InputError unless the state is a (q, p, S)."""
+        """Raise InputError unless the state has the form (q, p, S)."""
         system = _manifold_system(system)
         if not isinstance(system, EvolutionSystem):
-            raise InputError(f"DiscreteHerglotz runs an lt.EvolutionSystem, not a {system.kind}")
+            raise InputError(f"DiscreteHerglotz needs an lt.EvolutionSystem, got a {system.kind}")
         space = system.configurations
         self._check_action((system.dim // 2,) if space is None else space.shape)
 
-    def _check_action(self, at: tuple[int, ...]) -> None:
-        """Raise FunctionError unless the action of a step is a number, of positions of this shape."""
-        where = f"(q_0, q_1, S_0, h), q_0 and q_1 of shape {at}"
-        check_function_shape(self.discrete_lagrangian, [at, at, (), ()], [()], "the discrete Lagrangian", where)
+    def _check_action(self, shape: tuple[int, ...]) -> None:
+        """Raise FunctionError unless the action of a step, at positions of this shape, is a number."""
+        arguments_text = f"(q_0, q_1, S_0, h), q_0 and q_1 of shape {shape}"
+        check_function_shape(
+            self.discrete_lagrangian, [shape, shape, (), ()], [()], "the discrete Lagrangian", arguments_text
+        )
 
     def weights(self, theta) -> np.ndarray:
         return np.asarray(theta)[..., None] * self._substep_fractions
@@ -147,13 +161,15 @@ class DiscreteHerglotz(OneStepMethod):
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
         system = _manifold_system(system)
         assert isinstance(system, EvolutionSystem)
-        space, y, found, n = system.configurations, x + compensation, [], len(x) // 2
+        space, y, slopes, n = system.configurations, x + compensation, [], len(x) // 2
         action = self.discrete_lagrangian if space is None else _ActionOfPoints(self.discrete_lagrangian, space)
-        for (share, forward), guess in zip(SUBSTEPS[self.composed], k, strict=True):
-            slope = (_scheme_slope if forward else _adjoint_slope)(action, system.contact, y, share * h, guess[:n])
-            found.append(slope)
-            y = y + (share * h) * slope
-        return jnp.stack(found)
+        for (fraction, is_forward), guess in zip(SUBSTEPS[self.composed], k, strict=True):
+            slope = (_scheme_slope if is_forward else _adjoint_slope)(
+                action, system.contact, y, fraction * h, guess[:n]
+            )
+            slopes.append(slope)
+            y = y + (fraction * h) * slope
+        return jnp.stack(slopes)
 
     def increment(self, h, k) -> jax.Array:
         return h * (self._substep_fractions @ k)
@@ -162,50 +178,52 @@ class DiscreteHerglotz(OneStepMethod):
         return apply_increment(self, system, x, compensation, self.increment(h, k), ends_on_surface=True)
 
 
-def _scheme_slope(action: Callable, on: mf.SplitContact, y, h, guess) -> jax.Array:
-    """The slope of a step of (40) and (41), after one step of Newton's method for its velocity."""
+def _scheme_slope(action: Callable, contact: mf.SplitContact, y, h, guess) -> jax.Array:
+    """Return the slope of a substep by (40) and (41), after one step of Newton's method for its velocity."""
     n = len(guess)
     q, p, S = y[:n], y[n : 2 * n], y[2 * n]
 
     def momentum_residual(q1):
-        by_q, by_S = jax.grad(action, argnums=(0, 2))(q, q1, S, h)
-        return by_q + (1.0 + by_S) * p
+        dL_dq, dL_dS = jax.grad(action, argnums=(0, 2))(q, q1, S, h)
+        return dL_dq + (1.0 + dL_dS) * p
 
-    velocity = _newton_velocity(momentum_residual, on, q, h, guess)
+    velocity = _newton_velocity(momentum_residual, contact, q, h, guess)
     q1 = q + h * velocity
-    p1 = on.tangential_part(q1, jax.grad(action, argnums=1)(q, q1, S, h))
+    p1 = contact.tangential_part(q1, jax.grad(action, argnums=1)(q, q1, S, h))
     return jnp.concatenate([velocity, (p1 - p) / h, jnp.dot(velocity, p1)[None]])
 
 
-def _adjoint_slope(action: Callable, on: mf.SplitContact, y, h, guess) -> jax.Array:
-    """The same of the adjoint."""
+def _adjoint_slope(action: Callable, contact: mf.SplitContact, y, h, guess) -> jax.Array:
+    """Return the slope of a substep by the adjoint scheme, after one step of Newton's method for its velocity."""
     n = len(guess)
     q, p, S = y[:n], y[n : 2 * n], y[2 * n]
 
     def adjoint_arguments(q1):
         return q1, q, S + jnp.dot(q1 - q, p), -h
 
-    velocity = _newton_velocity(lambda q1: jax.grad(action, argnums=1)(*adjoint_arguments(q1)) - p, on, q, h, guess)
+    velocity = _newton_velocity(
+        lambda q1: jax.grad(action, argnums=1)(*adjoint_arguments(q1)) - p, contact, q, h, guess
+    )
     q1 = q + h * velocity
-    by_q, by_S = jax.grad(action, argnums=(0, 2))(*adjoint_arguments(q1))
-    p1 = on.tangential_part(q1, -by_q / (1.0 + by_S))
+    dL_dq, dL_dS = jax.grad(action, argnums=(0, 2))(*adjoint_arguments(q1))
+    p1 = contact.tangential_part(q1, -dL_dq / (1.0 + dL_dS))
     return jnp.concatenate([velocity, (p1 - p) / h, jnp.dot(velocity, p)[None]])
 
 
-def _newton_velocity(misfit: Callable, on: mf.SplitContact, q, h, velocity) -> jax.Array:
-    """A velocity after one step of Newton's method for ``misfit(q + h velocity) = 0``, on a manifold along it."""
-    A, missed = h * jax.jacfwd(misfit)(q + h * velocity), misfit(q + h * velocity)
-    if isinstance(on.bundle, mf.TangentBundle):
-        surface, mass = ConstraintSurface(on.bundle.base, tangent=True), jnp.max(jnp.abs(A))
+def _newton_velocity(residual: Callable, contact: mf.SplitContact, q, h, velocity) -> jax.Array:
+    """Return the velocity after one Newton step for ``residual(q + h velocity) = 0``, on a manifold along it."""
+    A, residual_value = h * jax.jacfwd(residual)(q + h * velocity), residual(q + h * velocity)
+    if isinstance(contact.bundle, mf.TangentBundle):
+        surface, mass = ConstraintSurface(contact.bundle.base, tangent=True), jnp.max(jnp.abs(A))
 
-        def distance_from_manifold(v):  # how far its end is off Q, as a momentum
+        def distance_from_manifold(v):  # times a mass, so that it is a momentum
             return mass * surface._correction_displacement(q, surface._constraint_change(q, 0.0, h * v) / h)
 
-        A = jax.vmap(lambda column: on.tangential_part(q, column), in_axes=1, out_axes=1)(A) + jax.jacfwd(
+        A = jax.vmap(lambda column: contact.tangential_part(q, column), in_axes=1, out_axes=1)(A) + jax.jacfwd(
             distance_from_manifold
         )(velocity)
-        missed = on.tangential_part(q, missed) + distance_from_manifold(velocity)
-    return velocity - solve(A, missed[:, None])[:, 0]
+        residual_value = contact.tangential_part(q, residual_value) + distance_from_manifold(velocity)
+    return velocity - solve(A, residual_value[:, None])[:, 0]
 
 
 def _manifold_system(system: System) -> System:
@@ -213,7 +231,7 @@ def _manifold_system(system: System) -> System:
 
 
 class _ActionOfPoints(Module):
-    """An action of two points of a space, as one of their numbers in a row."""
+    """An action of two points of a space, as a function of their flat arrays."""
 
     action: Callable
     space: mf.Space = eqx.field(static=True)
@@ -229,8 +247,8 @@ class _Midpoint(Module):
         return h * self.lagrangian(0.5 * (q0 + q1), (q1 - q0) / h, S0)
 
 
-class _OfParts(Module):
-    """An energy of (q, v, S) in one array as a function of the three."""
+class _EnergyOfArguments(Module):
+    """An energy of (q, v, S) in one array, as a function of three arguments."""
 
     energy: Energy
 

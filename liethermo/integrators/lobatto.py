@@ -15,11 +15,12 @@ class ExplicitTableau(NamedTuple):
     ----------
     A, b : ndarray, shapes (s, s) and (s,)
     error_weights : ndarray, shape (s,)
-        ``E = h sum_i d_i k_i`` is O(h^(q + 1)).
+        Weights d for which ``E = h sum_i d_i k_i`` is O(h^(q + 1)).
     error_order : int
+        The exponent q.
     error_scale : float
-        The local error of a step of length l is ``scale l (|E| / l)^(p / q)``, p the order: right for a linear equation
-        as h -> 0.
+        The local error of a step of length l is ``scale l (|E| / l)^(p / q)``, where p is the order: right for a linear
+        equation as h -> 0.
     """
 
     A: np.ndarray
@@ -30,16 +31,17 @@ class ExplicitTableau(NamedTuple):
 
 
 LOBATTO_ORDERS = (4, 6, 8)
+"""Orders for which there is a tableau."""
 
 
 @functools.cache
 def lobatto_rule(nodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes, both ends among them, and weights on [0, 1]: exact to the degree ``2 nodes - 3``, all weights positive."""
-    m = nodes - 1  # the inner ones are the roots of P_m'
+    """Return nodes (with both ends) and weights on [0, 1]: exact to degree ``2 nodes - 3``, all weights positive."""
+    m = nodes - 1  # the inner nodes are the roots of P_m'
     x = np.polynomial.legendre.Legendre.basis(m).deriv().roots().astype(np.longdouble)
     for _ in range(3):  # Newton's method from double precision
-        values, before = _legendre_value(m, x), _legendre_value(m - 1, x)
-        slope = m * (before - x * values) / (1 - x * x)
+        values, previous_values = _legendre_value(m, x), _legendre_value(m - 1, x)
+        slope = m * (previous_values - x * values) / (1 - x * x)
         x = x - slope * (1 - x * x) / (2 * x * slope - m * nodes * values)
     x = np.concatenate([[-1], np.sort(x), [1]])
     b = 1 / (m * nodes * _legendre_value(m, x) ** 2)
@@ -52,54 +54,55 @@ def _legendre_value(m: int, x) -> np.ndarray:
 
 @functools.cache
 def lobatto_tableau(order: int) -> ExplicitTableau:
-    """The tableau of order 4 [Kutta 1901], 6 [Butcher 1964] or 8 [Cooper & Verner 1972]."""
+    """Return the tableau of order 4 [Kutta 1901], 6 [Butcher 1964] or 8 [Cooper & Verner 1972]."""
     A, b = {4: _kutta_coefficients, 6: _butcher_coefficients, 8: _cooper_verner_coefficients}[order]()
     d, q = _error_weights(A, order)
-    tall = [np.ones(len(b))]
+    powers = [np.ones(len(b))]
     for _ in range(order):
-        tall.append(A @ tall[-1])  # A^n 1, what a linear equation asks of the weights at order n + 1
-    defect = abs(1.0 / np.prod(np.arange(1.0, order + 2)) - b @ tall[order])
-    seen = abs(d @ tall[q])
-    assert seen > 0.0
-    return ExplicitTableau(A, b, d, q, defect / seen ** (order / q))
+        powers.append(A @ powers[-1])  # A^n 1: for a linear equation, order n + 1 means b . A^n 1 = 1 / (n + 1)!
+    order_residual = abs(1.0 / np.prod(np.arange(1.0, order + 2)) - b @ powers[order])
+    linear_response = abs(d @ powers[q])
+    assert linear_response > 0.0
+    return ExplicitTableau(A, b, d, q, order_residual / linear_response ** (order / q))
 
 
 def _error_weights(A: np.ndarray, order: int) -> tuple[np.ndarray, int]:
-    """Weights d that every rooted tree of at most q nodes is orthogonal to, q as large as there are any but zero."""
-    vectors, found = tree_vectors(A, order - 1), None
+    """Return weights d orthogonal to every rooted tree of at most q nodes, and q, the largest with nonzero weights."""
+    vectors, weights_and_order = tree_vectors(A, order - 1), None
     for q in range(order - 1, 0, -1):
         conditions = np.array([v for n in range(1, q + 1) for v in vectors[n]])
-        _, sizes, rows = np.linalg.svd(conditions)
-        free = rows[np.sum(sizes > 1e-10 * sizes[0]) :]
-        tall = np.linalg.matrix_power(A, q) @ np.ones(len(A))
-        seen = free @ tall  # of all such weights those that see most of a linear equation
-        if np.linalg.norm(seen) > 1e-8 * np.linalg.norm(tall):
-            found = seen @ free / np.linalg.norm(seen), q
+        _, singular_values, right_vectors = np.linalg.svd(conditions)
+        null_space = right_vectors[np.sum(singular_values > 1e-10 * singular_values[0]) :]
+        power = np.linalg.matrix_power(A, q) @ np.ones(len(A))
+        response = null_space @ power  # choose the weights with the largest response to a linear equation
+        if np.linalg.norm(response) > 1e-8 * np.linalg.norm(power):
+            weights_and_order = response @ null_space / np.linalg.norm(response), q
             break
-    assert found is not None
-    return found
+    assert weights_and_order is not None
+    return weights_and_order
 
 
 def tree_vectors(A: np.ndarray, order: int) -> dict[int, list[np.ndarray]]:
-    """For each number of nodes, up to ``order``, the vectors at the stages of the rooted trees with so many.
+    """Return, for each number of nodes up to ``order``, the stage vectors of the rooted trees with that many nodes.
 
-    That of a tree is the product of ``A v`` over its branches, v their vectors; a method has the order p if ``b . v``
-    is one over the density of the tree for all with at most p nodes [Hairer, Nørsett & Wanner 1993, II.2].
+    The vector of a tree is the product of ``A v`` over its branches, with v the vectors of the branches. A method has
+    order p if ``b . v`` is one over the density of the tree, for all trees of at most p nodes [Hairer, Nørsett & Wanner
+    1993, II.2].
     """
-    found: dict[int, list[np.ndarray]] = {1: [np.ones(len(A))]}
+    vectors: dict[int, list[np.ndarray]] = {1: [np.ones(len(A))]}
     for n in range(2, order + 1):
-        found[n] = list(_forest_products(A, found, n - 1, n - 1))
-    return found
+        vectors[n] = list(_forest_products(A, vectors, n - 1, n - 1))
+    return vectors
 
 
-def _forest_products(A, found, nodes: int, largest: int):
-    """Products of branches with so many nodes together, none of more than ``largest``."""
+def _forest_products(A, vectors, nodes: int, max_branch_nodes: int):
+    """Yield the products of branches with ``nodes`` nodes in total and at most ``max_branch_nodes`` in each branch."""
     if nodes == 0:
         yield np.ones(len(A))
         return
-    for size in range(min(nodes, largest), 0, -1):
-        for v in found[size]:
-            for rest in _forest_products(A, found, nodes - size, size):
+    for branch_nodes in range(min(nodes, max_branch_nodes), 0, -1):
+        for v in vectors[branch_nodes]:
+            for rest in _forest_products(A, vectors, nodes - branch_nodes, branch_nodes):
                 yield (A @ v) * rest
 
 

@@ -17,7 +17,9 @@ from .charts import wrap_in_charts
 
 
 class MetriplecticMidpoint(TransportingMethod):
-    """``(x' - x)/h = Pi(z) dgrad H + K_d(z) grad S(z)``, z the midpoint, dgrad a discrete gradient [BFM 4.5].
+    """The metriplectic midpoint scheme of order 2, with the energy law exact for every energy [BFM 4.5].
+
+    ``(x' - x)/h = Pi(z) dgrad H + K_d(z) grad S(z)``, where z is the midpoint and dgrad a discrete gradient.
 
     K_d is the dissipation rebuilt with dgrad H in its kernel (4.6), so the energy law holds exactly for every H and
     every dissipation. The entropy obeys its law exactly if it is quadratic, and to O(h^3) a step otherwise
@@ -69,7 +71,7 @@ class MetriplecticMidpoint(TransportingMethod):
         return system.field(*self.midpoint_gradients(system, x, compensation, h, k))[None]
 
     def midpoint_gradients(self, system: System, x, compensation, h, k) -> tuple:
-        """The midpoint z, and what the step takes for the gradients dH, dS and dL: the arguments of the field."""
+        """Return the arguments of the field: the midpoint z, and the gradients dH, dS and dL of the step."""
         d = h * k[0]
         z = x + (compensation + 0.5 * d)
         dH = self.gradient(system.energy, x, d, compensation)

@@ -16,49 +16,51 @@ from ..functions.frames import vector_with_products
 from ..functions.gradients import two_sum
 from ..systems import MOMENTUM_LESS_IMPULSE, SPATIAL_MOMENTUM, AttitudeSystem, DrivenSystem, TurningSystem
 from .base import MethodWrapper, TransportingMethod, pullback_method
-from .explicit import INITIAL_LEVELS_ROW
+from .explicit import StepRow
 from .tableaus import gauss_tableau
 
 RECONSTRUCTIONS = ("coadjoint", "cayley", "exp")
+"""Names of the reconstructions."""
 
 
 class WithAttitude(MethodWrapper):
-    """A method for momenta, and after it ``g' = g hat(xi)``, xi_i the velocities that it moves with at its stages.
+    """Step the attitude of a body, ``g' = g hat(xi)``, along with its momentum.
 
-    The equations of a step are those of the momentum alone, and their tolerances are measured by it. The attitude is
-    then found without any: so it does not depend on the units of the momentum. xi is the discrete gradient of the
-    energy, and what friction inside adds to it [:meth:`liethermo.Dissipation.velocity`].
+    The momentum follows the inner method alone, with tolerances for the momentum alone. The attitude is then computed
+    from the velocities xi_i at the stages without an iteration, so it does not depend on the units of the momentum. xi
+    is the discrete gradient of the energy plus the velocity of internal friction
+    [:meth:`liethermo.Dissipation.velocity`].
 
-    ``"cayley"`` is Gauss collocation on the matrices, ``G_i = g + h sum_j A_ij G_j hat(xi_j)``: with one stage
-    ``g' = g cayley(h xi)``. It keeps what is quadratic in g: that g is orthogonal, unitary or symplectic.
+    ``"cayley"`` is Gauss collocation on the matrices, ``G_i = g + h sum_j A_ij G_j hat(xi_j)``: with one stage ``g' = g
+    cayley(h xi)``. It preserves quadratic properties of g: that g is orthogonal, unitary or symplectic.
 
     ``"coadjoint"`` is the same collocation on the matrices Ad(g), which ends at ``Ad(g) R``: ``g' = g
-    adjoint_cayley(x)`` with ``cay(ad x) = R``, and with one stage x = h xi. Where no torque acts ``mu' = ad*_xi mu``
-    gives ``mu' = R^T mu`` at every number of stages, for every step and every energy, as long as the method takes its
-    slopes from Pi alone. So the spatial momentum ``Ad_star(inverse(g), mu)`` is kept to rounding: of a free body, and
-    of one with a :class:`liethermo.DoubleBracket`. That R is an adjoint action
-    is a property of the group: it is for SO(2), SO(3), SO(4), SE(2), SE(3), SU(2), SL(2), Sp(1), GL(2) and
-    Heisenberg(n), of which ``"cayley"`` is the same on SO(2), SO(3), SE(2) and Heisenberg(n). It is not for SU(n) and
-    SL(n) with n > 2, Sp(n) with n > 1, SO(n) with n > 4, SE(n) with n > 3: there collocation takes mu off its coadjoint
-    orbit by O(h^(2s)), as Casimirs of higher degree drift, and the spatial momentum is kept to the order of the method.
+    adjoint_cayley(x)`` with ``cay(ad x) = R``, and with one stage x = h xi. Without a torque ``mu' = ad*_xi mu`` gives
+    ``mu' = R^T mu`` for any number of stages, every step and every energy, if the slopes of the method are Pi times a
+    covector. So the spatial momentum ``Ad_star(inverse(g), mu)`` is conserved to rounding: for a free body, and for a
+    body with a :class:`liethermo.DoubleBracket`. R is an adjoint action for SO(2), SO(3), SO(4), SE(2), SE(3), SU(2),
+    SL(2), Sp(1), GL(2) and Heisenberg(n); on SO(2), SO(3), SE(2) and Heisenberg(n) ``"cayley"`` is the same method. R
+    is no adjoint action for SU(n) and SL(n) with n > 2, Sp(n) with n > 1, SO(n) with n > 4, SE(n) with n > 3. On these
+    groups collocation moves mu off its coadjoint orbit by O(h^(2s)), as Casimirs of higher degree drift, and the
+    spatial momentum is conserved to the order of the method.
 
     ``"exp"`` is collocation in the algebra, ``g' = g exp(h sum b_i k_i)`` with ``k_i = dexp^-1(h sum_j A_ij k_j) xi_i``
-    [Munthe-Kaas 1999]: with one stage ``g' = g exp(h xi)``. It stays in every group; spatial momenta are kept to the
-    order of the method.
+    [Munthe-Kaas 1999]: with one stage ``g' = g exp(h xi)``. The attitude stays in every group; the spatial momentum is
+    conserved to the order of the method.
 
-    Explicit methods turn by ``"exp"``, whatever is asked for: their step is that of (mu, theta), ``g' = g exp(theta)``.
-    Where no torque acts they turn a little further, by no more than the error of the step, so that the momentum in
-    space is what it was when the run began: on coadjoint orbits of two dimensions, as those of SO(3), SU(2), SL(2) and
-    SE(2) are.
+    Explicit methods always use ``"exp"``: their step is that of (mu, theta), ``g' = g exp(theta)``. Without a torque
+    they rotate a little further, by no more than the error of the step, so that the spatial momentum is that of the
+    start of the run. This holds on coadjoint orbits of dimension two, such as those of SO(3), SU(2), SL(2) and SE(2).
 
-    A torque that depends on the attitude is taken at those of the stages, which follow from the slopes of the momentum:
-    so the unknowns of a step are the same. Its impulse is ``h sum_i b_i Ad_star(inverse(g), tau)_i`` with the same
-    collocation on the matrices Ad(g). What is bilinear in these and in mu is kept by it, and so the momentum in space
-    less the impulse is constant to rounding, where it is without a torque. Explicit methods make the impulse by a
-    quadrature of their order. It moves, and the attitude turns, by no more than the error of the step, so that the same
-    holds.
+    A torque that depends on the attitude is evaluated at the attitudes of the stages, which follow from the slopes of
+    the momentum: the unknowns of a step stay the same. Its impulse is ``h sum_i b_i Ad_star(inverse(g), tau)_i`` with
+    the same collocation on the matrices Ad(g). This preserves bilinear functions of these matrices and mu. So the
+    spatial momentum less the impulse is constant to rounding, wherever the spatial momentum is without a torque.
+    Explicit methods compute the impulse by a quadrature of their order; then the impulse and the attitude are
+    corrected, by no more than the error of the step, so that the same holds.
 
-    Momenta are those that the method gives without attitudes; the order is the same for all three.
+    The momenta are those of the inner method without attitudes, and the order is the same for all three
+    reconstructions.
 
     Attributes
     ----------
@@ -69,16 +71,14 @@ class WithAttitude(MethodWrapper):
 
     def __check_init__(self):
         if self.kind not in RECONSTRUCTIONS:
-            raise InputError(f"the reconstruction is {', '.join(map(repr, RECONSTRUCTIONS))}, not {self.kind!r}")
+            raise InputError(f"reconstruction must be {', '.join(map(repr, RECONSTRUCTIONS))}, got {self.kind!r}")
 
     @property
     def _transporting_method(self) -> TransportingMethod:
-        """The method, which says how it moves the body."""
+        """The inner method; InputError if it does not give the velocities with which it moves a body."""
         if isinstance(self.method, TransportingMethod):
             return self.method
-        raise InputError(
-            f"{self.method} does not say which velocities it moves with, so attitudes cannot be reconstructed"
-        )
+        raise InputError(f"{self.method} does not give its stage velocities, so attitudes cannot be reconstructed")
 
     def preserves_function(self, system, name: str) -> bool:
         if name not in (SPATIAL_MOMENTUM, MOMENTUM_LESS_IMPULSE):
@@ -93,7 +93,7 @@ class WithAttitude(MethodWrapper):
     # -- the momentum, which the equations of a step are about --------------------------------------------------------
 
     def slopes(self, system: AttitudeSystem, x, compensation, h, k) -> jax.Array:  # type: ignore[override]
-        """Those of the momentum; of an explicit method those of the angles beside it."""
+        """Return the slopes of the momentum; for an explicit method also those of the rotation angles."""
         method, mu, mu_compensation = self.method, system.points(x), system.points(compensation)
         if self.explicit:
             local = TurningSystem(system, self.order, system.split_state(x)[1])
@@ -103,9 +103,11 @@ class WithAttitude(MethodWrapper):
         body = system.body
         if not (isinstance(body, DrivenSystem) and body.needs_attitude):
             return method.slopes(body, mu, mu_compensation, h, k)
-        pushed = jax.vmap(lambda torque: method.slopes(body.with_torque(torque), mu, mu_compensation, h, k))
-        found = pushed(self._stage_torques(system, x, compensation, h, k))  # all stages with the torques of all
-        return jnp.stack([found[i, i] for i in range(self.stages)])
+        slopes_for_torque = jax.vmap(lambda torque: method.slopes(body.with_torque(torque), mu, mu_compensation, h, k))
+        slopes_by_torque = slopes_for_torque(
+            self._stage_torques(system, x, compensation, h, k)
+        )  # all stages with the torques of all
+        return jnp.stack([slopes_by_torque[i, i] for i in range(self.stages)])
 
     def start(self, system: AttitudeSystem, x) -> jax.Array:  # type: ignore[override]
         if not self.explicit:
@@ -115,7 +117,7 @@ class WithAttitude(MethodWrapper):
         k = self.method.start(
             local, local.local_coordinates(x)
         )  # behind the levels that it has begun on is room for more
-        return k.at[INITIAL_LEVELS_ROW, mu.shape[0] : mu.shape[0] + n].set(mu[:n] @ system.spatial_action(g))
+        return k.at[StepRow.INITIAL_LEVELS, mu.shape[0] : mu.shape[0] + n].set(mu[:n] @ system.spatial_action(g))
 
     def error(self, system: AttitudeSystem, x, compensation, h, k) -> jax.Array:  # type: ignore[override]
         return self.method.error(
@@ -124,17 +126,17 @@ class WithAttitude(MethodWrapper):
 
     def initial_compensation(self, system: AttitudeSystem, x) -> jax.Array:  # type: ignore[override]
         mu, g = system.split_state(x)
-        off = _group_correction(system.group, g) if self.kind == "cayley" else jnp.zeros_like(g)
+        attitude_correction = _group_correction(system.group, g) if self.kind == "cayley" else jnp.zeros_like(g)
         momentum = jnp.zeros_like(system.spatial_impulse(x)) if system.torque_name else None
-        return system.join_state(self.method.initial_compensation(system.body, mu), off, momentum)
+        return system.join_state(self.method.initial_compensation(system.body, mu), attitude_correction, momentum)
 
     # -- the attitude, which follows from it --------------------------------------------------------------------------
 
     def move(self, system: AttitudeSystem, x, compensation, h, k) -> tuple[jax.Array, jax.Array]:  # type: ignore[override]
         (mu, g), (mu_compensation, g_compensation) = system.split_state(x), system.split_state(compensation)
-        new, new_compensation = self.method.move(system.body, mu, mu_compensation, h, system.points(k))
+        new_mu, new_mu_compensation = self.method.move(system.body, mu, mu_compensation, h, system.points(k))
         if self.explicit:
-            return self._apply_explicit_step(system, x, compensation, new, new_compensation, h, k)
+            return self._apply_explicit_step(system, x, compensation, new_mu, new_mu_compensation, h, k)
         xi = (
             h
             * self._transporting_method.stage_velocities(system.body, mu, mu_compensation, h, k)[:, : system.group.dim]
@@ -143,21 +145,23 @@ class WithAttitude(MethodWrapper):
             self._update_spatial_momentum(system, x, compensation, h, k, xi) if system.has_impulse else (None, None)
         )
         if self.kind == "cayley":
-            gained = (g + g_compensation) @ _collocation_increment(system.group.algebra.hat(xi))
-            turned, turned_compensation = two_sum(g, g_compensation + gained)
-            return system.join_state(new, turned, p), system.join_state(
-                new_compensation, turned_compensation + _group_correction(system.group, turned), p_compensation
+            dg = (g + g_compensation) @ _collocation_increment(system.group.algebra.hat(xi))
+            new_g, new_g_compensation = two_sum(g, g_compensation + dg)
+            return system.join_state(new_mu, new_g, p), system.join_state(
+                new_mu_compensation, new_g_compensation + _group_correction(system.group, new_g), p_compensation
             )
-        turned = system.group.restore_map(g @ self._attitude_increment(system.group, xi))
-        return system.join_state(new, turned, p), system.join_state(new_compensation, jnp.zeros_like(g), p_compensation)
+        new_g = system.group.restore_map(g @ self._attitude_increment(system.group, xi))
+        return system.join_state(new_mu, new_g, p), system.join_state(
+            new_mu_compensation, jnp.zeros_like(g), p_compensation
+        )
 
     def _apply_explicit_step(
-        self, system: AttitudeSystem, x, compensation, new, new_compensation, h, k
+        self, system: AttitudeSystem, x, compensation, new_mu, new_mu_compensation, h, k
     ) -> tuple[jax.Array, jax.Array]:
         g, group, n = system.split_state(x)[1], system.group, system.group.dim
         local, step = TurningSystem(system, self.order, g), self.increment(h, k)
-        turned = g @ group.exp_map(group.algebra, local.angles(step))
-        follows, p_compensation = (
+        new_g = g @ group.exp_map(group.algebra, local.angles(step))
+        keeps_orbit, p_compensation = (
             system.body.is_torque_free and self._transporting_method.can_transport_attitude(system.body),
             None,
         )
@@ -165,19 +169,19 @@ class WithAttitude(MethodWrapper):
             p, p_compensation = two_sum(
                 system.spatial_impulse(x), system.spatial_impulse(compensation) + local.spatial_impulse(step)
             )
-            if follows:
-                p, p_compensation = _project_onto_orbit(system.momentum_system, p, new), jnp.zeros_like(p)
-        else:  # that of the start of the run, since the roundings of steps would add up
-            p = k[INITIAL_LEVELS_ROW, system.body.dim : system.body.dim + n]
-        if follows:
-            turned = _align_attitude(group, turned, p, new[:n])
-        turned = group.restore_map(turned)
-        return system.join_state(new, turned, p if system.has_impulse else None), system.join_state(
-            new_compensation, jnp.zeros_like(g), p_compensation
+            if keeps_orbit:
+                p, p_compensation = _project_onto_orbit(system.momentum_system, p, new_mu), jnp.zeros_like(p)
+        else:  # use the spatial momentum at the start of the run: the roundings of steps would add up
+            p = k[StepRow.INITIAL_LEVELS, system.body.dim : system.body.dim + n]
+        if keeps_orbit:
+            new_g = _align_attitude(group, new_g, p, new_mu[:n])
+        new_g = group.restore_map(new_g)
+        return system.join_state(new_mu, new_g, p if system.has_impulse else None), system.join_state(
+            new_mu_compensation, jnp.zeros_like(g), p_compensation
         )
 
     def step_without_compensation(self, system: AttitudeSystem, x, h) -> jax.Array:
-        """A step without care for rounding, of a method that has such: see :meth:`.MetriplecticRungeKutta.plain`."""
+        """Return the state after a step without compensated summation: see :class:`.MetriplecticRungeKutta`."""
         g, group = system.split_state(x)[1], system.group
         local = TurningSystem(system, self.order, g)
         method: Any = pullback_method(self.method, local)
@@ -185,13 +189,13 @@ class WithAttitude(MethodWrapper):
         return system.join_state(system.points(end), g @ group.exp_map(group.algebra, local.angles(end)))
 
     def _attitude_increment(self, group, xi) -> jax.Array:
-        """By what an attitude is turned in a step, of angles h xi at the stages, shape (stages, dim)."""
+        """Return the group element that rotates the attitude, for angles h xi at the stages, shape (stages, dim)."""
         if self.kind == "coadjoint":
             return self._coadjoint_increment(group, xi)
         return group.exp_map(group.algebra, gauss_tableau(len(xi)).b @ self._algebra_slopes(group.algebra, xi))
 
     def _stage_attitudes(self, system: AttitudeSystem, x, compensation, h, k) -> jax.Array:
-        """Those at the stages, at which torques are taken, shape (stages, m, m), in the group."""
+        """Return the attitudes at which the torques of the stages are evaluated, shape (stages, m, m)."""
         (mu, g), (mu_compensation, g_compensation), group = (
             system.split_state(x),
             system.split_state(compensation),
@@ -204,15 +208,17 @@ class WithAttitude(MethodWrapper):
         if self.kind == "exp" or (self.kind == "coadjoint" and len(xi) > 1):
             return g @ group.exp_map(group.algebra, gauss_tableau(len(xi)).A @ self._algebra_slopes(group.algebra, xi))
         if self.kind == "cayley":
-            found = (g + g_compensation) @ _collocation_stages(group.algebra.hat(xi))
+            attitudes = (g + g_compensation) @ _collocation_stages(group.algebra.hat(xi))
         else:
-            found = 0.5 * (g + g @ self._attitude_increment(group, xi))[None]  # the same from either end
+            attitudes = (
+                0.5 * (g + g @ self._attitude_increment(group, xi))[None]
+            )  # the midpoint is the same from both ends
         for _ in range(RESTORE_STEPS):
-            found = group.restore_map(found)
-        return found
+            attitudes = group.restore_map(attitudes)
+        return attitudes
 
     def _stage_torques(self, system: AttitudeSystem, x, compensation, h, k) -> jax.Array:
-        """Those at the stages, shape (stages, size of a state of the body without its clock)."""
+        """Return the torques at the stages, shape (stages, body components without the clock)."""
         body, states = system.body, system.points(x) + (system.points(compensation) + h * (gauss_tableau(len(k)).A @ k))
         assert isinstance(body, DrivenSystem)
         if not body.needs_attitude:
@@ -223,25 +229,25 @@ class WithAttitude(MethodWrapper):
     def _update_spatial_momentum(
         self, system: AttitudeSystem, x, compensation, h, k, xi
     ) -> tuple[jax.Array, jax.Array]:
-        """The momentum in space as the impulse of the step makes it, and what rounding keeps from it."""
+        """Return the spatial momentum after the impulse of the step, and its compensation."""
         torques = self._stage_torques(system, x, compensation, h, k)[:, : system.group.dim]
         actions = _collocation_stages(-system.group.algebra.ad(xi).swapaxes(-1, -2)).swapaxes(
             -1, -2
         )  # Ad(inverse(g)), relative
         impulse = h * jnp.einsum("i,ia,iab->b", gauss_tableau(len(xi)).b, torques, actions)
-        gained = impulse @ system.spatial_action(system.split_state(x)[1])
-        return two_sum(system.spatial_impulse(x), system.spatial_impulse(compensation) + gained)
+        spatial_impulse = impulse @ system.spatial_action(system.split_state(x)[1])
+        return two_sum(system.spatial_impulse(x), system.spatial_impulse(compensation) + spatial_impulse)
 
     def displace(self, system: AttitudeSystem, x, v) -> jax.Array:  # type: ignore[override]
-        """With the momentum displaced: what is looked at on the way of a step are functions of that."""
+        """Displace the momentum alone: functions evaluated inside a step depend on it only."""
         mu, g = system.split_state(x)
         return system.join_state(mu + system.points(v), g, system.spatial_impulse(x))
 
     @staticmethod
     def _coadjoint_increment(group, xi) -> jax.Array:
-        """The element of the group whose adjoint action is that of the step; of angles h xi, shape (stages, dim).
+        """Return the group element whose adjoint action is that of the step, for angles h xi, shape (stages, dim).
 
-        Where the end of collocation is no adjoint action it is that of the nearest, to the order of the method.
+        If the end of the collocation is no adjoint action, the nearest one is used, to the order of the method.
         """
         algebra = group.algebra
         if len(xi) == 1:
@@ -251,12 +257,12 @@ class WithAttitude(MethodWrapper):
         return group.adjoint_cayley_map(algebra, x)
 
     def _algebra_slopes(self, algebra, xi) -> jax.Array:
-        """h theta' at the stages of collocation in the algebra, shape (stages, dim).
+        """Return h theta' at the stages of collocation in the algebra, shape (stages, dim).
 
-        A sweep of iteration gains a power of the step; so many are one more than its order needs.
+        Each sweep of the iteration gains a power of h; there is one more sweep than the order needs.
         """
         tableau, k = gauss_tableau(len(xi)), xi
-        for _ in range(2 * len(xi) - 1 if len(xi) > 1 else 0):  # of one stage k is xi, which commutes with itself
+        for _ in range(2 * len(xi) - 1 if len(xi) > 1 else 0):  # with one stage k is xi, which commutes with itself
             k = inverse_dexp(algebra, tableau.A @ k, xi, self.order)
         return k
 
@@ -265,81 +271,90 @@ class WithAttitude(MethodWrapper):
 
 
 RESTORE_STEPS = 3
-"""Newton steps to the group from the mean of two attitudes: where a step turns by 0.5, what is left is 1e-11, and
-below rounding where it turns by 0.2."""
+"""Newton steps to the group from the mean of two attitudes.
+
+A rotation by 0.5 in a step leaves a residual of 1e-11; a rotation by 0.2 leaves one below rounding.
+"""
 
 
 def _collocation_increment(X) -> jax.Array:
-    """``G - I``, G the end of Gauss collocation of ``G' = G X`` on [0, 1] from I, for X at the stages, (s, m, m)."""
+    """Return ``G - I`` at the end of Gauss collocation of ``G' = G X`` on [0, 1] from I, for X of shape (s, m, m)."""
     return jnp.einsum("j,jab,jbc->ac", gauss_tableau(len(X)).b, _collocation_stages(X), X)
 
 
 def _collocation_stages(X) -> jax.Array:
-    """The stages G_i of that collocation, shape (s, m, m).
+    """Return the stages G_i of Gauss collocation of ``G' = G X`` on [0, 1] from I, shape (s, m, m).
 
-    Solved for their transposes, ``G_i^T = I + sum_j A_ij X_j^T G_j^T``.
+    They are solved for their transposes, ``G_i^T = I + sum_j A_ij X_j^T G_j^T``.
     """
     (stages, m), tableau = X.shape[:2], gauss_tableau(len(X))
-    turned = X.swapaxes(-1, -2)
-    implicit = jnp.einsum("ij,jab->iajb", tableau.A, turned).reshape(stages * m, stages * m)
+    X_transposed = X.swapaxes(-1, -2)
+    implicit = jnp.einsum("ij,jab->iajb", tableau.A, X_transposed).reshape(stages * m, stages * m)
     start = jnp.tile(jnp.eye(m), (stages, 1))
     G = solve_near_identity(jnp.eye(stages * m) - implicit, start).reshape(stages, m, m)
     return G.swapaxes(-1, -2)
 
 
 RESTORE_FRACTION = 2.0**-6
-"""Share of what the entries of an attitude lack by being rounded that a step gives back."""
+"""Fraction of the correction to the group that a step applies where the correction is mere rounding of the entries."""
 
 
 def _group_correction(group, g) -> jax.Array:
-    """What to add to an attitude that steps have left outside of its group.
+    """Return the correction that brings an attitude back to its group.
 
-    What entries lack by being rounded is known beside them, and is not what steps have done. Given back in full at
-    every step it would add up, in one direction while the body spins steadily: to 1e-12 in 1e6 steps.
+    A correction of the size of rounding is no error of the step, since the compensation holds the rounding. Applied in
+    full at every step it would add up, in one direction while the body spins steadily: to 1e-12 in 1e6 steps.
     """
-    missing = group.restore_map(g) - g
-    rounding = jnp.max(jnp.abs(missing)) <= 4.0 * jnp.finfo(jnp.float64).eps * jnp.max(jnp.abs(g))
-    return jnp.where(rounding, RESTORE_FRACTION, 1.0) * missing
+    correction = group.restore_map(g) - g
+    is_rounding = jnp.max(jnp.abs(correction)) <= 4.0 * jnp.finfo(jnp.float64).eps * jnp.max(jnp.abs(g))
+    return jnp.where(is_rounding, RESTORE_FRACTION, 1.0) * correction
 
 
-MAX_NEWTON_ITERATIONS, NEWTON_DAMPING = 3, 1e-8
-"""Newton steps of :func:`_align_attitude`, and what is added to the diagonal of a matrix that may be singular, relative to
-its largest entry. A step leaves the square of the misfit, or this share of it."""
+MAX_NEWTON_ITERATIONS = 3
+"""Newton steps of :func:`_align_attitude` and :func:`_project_onto_orbit`; each squares the relative residual."""
+
+NEWTON_DAMPING = 1e-8
+"""Number added to the diagonal of a matrix that may be singular, relative to its largest entry.
+
+A Newton step leaves this fraction of the residual, or its square. It is also the residual below which no further
+step is taken."""
 
 
 def _project_onto_orbit(momenta, p, mu) -> jax.Array:
-    """The dual vector next to p, of the group, that has the Casimirs of a state mu; other momenta of it stay."""
+    """Return the dual vector of the group near p with the Casimirs of the state mu; other momenta are unchanged."""
     n = len(p)
-    size = jnp.max(jnp.abs(mu[:n]))
-    size, casimirs = jnp.where(size > 0.0, size, 1.0), momenta.momentum_casimirs().values()
-    p, mu = p / size, mu[: momenta.algebra.dim] / size
+    scale = jnp.max(jnp.abs(mu[:n]))
+    scale, casimirs = jnp.where(scale > 0.0, scale, 1.0), momenta.momentum_casimirs().values()
+    p, mu = p / scale, mu[: momenta.algebra.dim] / scale
     for _ in range(MAX_NEWTON_ITERATIONS):
-        whole = jnp.concatenate([p, mu[n:]])
-        defect = jnp.stack([C.value(mu) - C.value(whole) for C in casimirs])
-        p = p + vector_with_products([C.gradient(whole)[:n] for C in casimirs], defect)
-    return size * p
+        momentum = jnp.concatenate([p, mu[n:]])
+        residual = jnp.stack([C.value(mu) - C.value(momentum) for C in casimirs])
+        p = p + vector_with_products([C.gradient(momentum)[:n] for C in casimirs], residual)
+    return scale * p
 
 
-def _align_attitude(group, g, p, new) -> jax.Array:
-    """The element next to g whose coadjoint action takes the momentum in space to the new one, on the same orbit.
+def _align_attitude(group, g, p, target) -> jax.Array:
+    """Return the group element near g whose coadjoint action gives the spatial momentum ``target``, on the same orbit.
 
-    By Newton's method: ``ad*_eta m = new - m`` for the least eta, m being p as seen from g [Marquardt 1963].
+    Newton's method solves ``ad*_eta m = target - m`` for the least eta, where m is p seen from g [Marquardt 1963].
     """
-    algebra, size = group.algebra, jnp.max(jnp.abs(new))
-    p, new = (v / jnp.where(size > 0.0, size, 1.0) for v in (p, new))
+    algebra, scale = group.algebra, jnp.max(jnp.abs(target))
+    p, target = (v / jnp.where(scale > 0.0, scale, 1.0) for v in (p, target))
 
-    def newton_step(made: int, g) -> jax.Array:
+    def newton_step(iteration: int, g) -> jax.Array:
         m = group.Ad_star(g, p)
-        defect, moved = new - m, algebra.ad_star(jnp.eye(algebra.dim), m)
-        square = moved @ moved.T
-        most = jnp.max(jnp.diagonal(square))
+        residual, orbit_tangents = target - m, algebra.ad_star(jnp.eye(algebra.dim), m)
+        square = orbit_tangents @ orbit_tangents.T
+        max_diagonal = jnp.max(jnp.diagonal(square))
         damping = jnp.where(
-            most > 0.0, NEWTON_DAMPING * most, 1.0
+            max_diagonal > 0.0, NEWTON_DAMPING * max_diagonal, 1.0
         )  # what moves m by rounding alone does not turn either
-        eta = solve_near_identity(square + damping * jnp.eye(algebra.dim), (moved @ defect)[:, None])[:, 0]
+        eta = solve_near_identity(square + damping * jnp.eye(algebra.dim), (orbit_tangents @ residual)[:, None])[:, 0]
         g = g @ group.exp_map(algebra, eta)
-        if made == MAX_NEWTON_ITERATIONS:
+        if iteration == MAX_NEWTON_ITERATIONS:
             return g
-        return jax.lax.cond(jnp.max(jnp.abs(defect)) > NEWTON_DAMPING, lambda: newton_step(made + 1, g), lambda: g)
+        return jax.lax.cond(
+            jnp.max(jnp.abs(residual)) > NEWTON_DAMPING, lambda: newton_step(iteration + 1, g), lambda: g
+        )
 
     return newton_step(1, g)

@@ -43,21 +43,21 @@ class Reference:
 
     def __post_init__(self):
         if not 0.0 < self.rtol < 1.0:
-            raise InputError(f"rtol lies between 0 and 1, not at {self.rtol}")
+            raise InputError(f"rtol must be between 0 and 1, got {self.rtol}")
         if self.scheme not in ("DOP853", "RK45", "RK23", "Radau", "BDF", "LSODA"):
-            raise InputError(f"no SciPy scheme {self.scheme!r}; take DOP853, RK45, RK23, Radau, BDF or LSODA")
+            raise InputError(f"scheme must be DOP853, RK45, RK23, Radau, BDF or LSODA, got {self.scheme!r}")
 
     def trajectory(self, system: System, x0: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, int, str, bool]:
-        """States at the times reached, shape (reached, n), the number of field evaluations, a message on failure.
+        """Integrate with SciPy; return (states, shape (times reached, n), field evaluations, message, was interrupted).
 
-        And whether the user has stopped it.
+        The message is "" on success; Ctrl-C returns the states up to that time.
         """
         import scipy.integrate
 
         rtol, atol = max(self.rtol, 3e-14), self.rtol * 1e-2 if self.atol is None else self.atol
         solver, sign = getattr(scipy.integrate, self.scheme), 1.0 if times[-1] >= times[0] else -1.0
-        found, message, interrupted = [np.asarray(x0)[None]], "", False
-        reached = 1
+        chunks, message, was_interrupted = [np.asarray(x0)[None]], "", False
+        n_reached = 1
         try:
             run = solver(
                 lambda _, x: np.asarray(_vector_field(system, x)),
@@ -67,19 +67,19 @@ class Reference:
                 rtol=rtol,
                 atol=atol,
             )
-            while run.status == "running" and reached < len(times):
+            while run.status == "running" and n_reached < len(times):
                 message = run.step() or ""
-                last = int(np.searchsorted(sign * times, sign * run.t, side="right"))
-                if run.status != "failed" and last > reached:
-                    found.append(run.dense_output()(times[reached:last]).T)
-                    reached = last
+                n_passed = int(np.searchsorted(sign * times, sign * run.t, side="right"))
+                if run.status != "failed" and n_passed > n_reached:
+                    chunks.append(run.dense_output()(times[n_reached:n_passed]).T)
+                    n_reached = n_passed
         except KeyboardInterrupt:
-            interrupted = True
-        states = np.concatenate(found)
+            was_interrupted = True
+        states = np.concatenate(chunks)
         finite = np.isfinite(states).all(axis=1)
         if not finite.all():
             states, message = states[: int(finite.argmin())], message or "NaN"
-        return states, int(run.nfev), message, interrupted
+        return states, int(run.nfev), message, was_interrupted
 
     def __str__(self) -> str:
         return f"Reference(rtol={self.rtol:g}, scheme={self.scheme})"

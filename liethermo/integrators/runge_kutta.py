@@ -1,4 +1,4 @@
-"""Explicit Runge-Kutta steps with weights that are nonnegative."""
+"""Explicit Runge-Kutta steps with nonnegative weights."""
 
 from __future__ import annotations
 
@@ -14,11 +14,14 @@ from ..errors import InputError
 from ..functions.frames import vector_with_products
 from ..systems import System
 from .base import register
-from .explicit import ERROR_ROW, FIRST_METHOD_ROW, MEAN_SLOPE_ROW, ExplicitMethod, UncorrectedStep
+from .explicit import ExplicitMethod, StepRow, UncorrectedStep
 from .lobatto import LOBATTO_ORDERS, ExplicitTableau, lobatto_tableau
 
-START_SLOPE_ROW, END_SLOPE_ROW = FIRST_METHOD_ROW, FIRST_METHOD_ROW + 1
-"""The rows of the slopes at the ends of a step."""
+START_SLOPE_ROW = StepRow.FIRST_METHOD_ROW
+"""Row of ``k`` that holds the slope at the start of a step."""
+
+END_SLOPE_ROW = StepRow.FIRST_METHOD_ROW + 1
+"""Row of ``k`` that holds the slope of the last stage, at the end of a step."""
 
 
 class MetriplecticRungeKutta(ExplicitMethod):
@@ -69,7 +72,7 @@ class MetriplecticRungeKutta(ExplicitMethod):
         held: tuple[str, ...] = (),
     ):
         if type(order) is not int or order not in LOBATTO_ORDERS:
-            raise InputError(f"the order is 4, 6 or 8, not {order!r}")
+            raise InputError(f"order must be 4, 6 or 8, got {order!r}")
         super().__init__(order, preserve, retraction, held)
 
     stages = END_SLOPE_ROW + 1
@@ -82,65 +85,73 @@ class MetriplecticRungeKutta(ExplicitMethod):
     def tableau(self) -> ExplicitTableau:
         return lobatto_tableau(self.order)
 
-    def base_step(self, rates: Callable, spared: bool, x, compensation, h) -> UncorrectedStep:
+    def base_step(self, rates: Callable, skip_law_rates: bool, x, compensation, h) -> UncorrectedStep:
         t = self.tableau
         slopes, changes = self._stage_slopes(rates, x, compensation, h)
         ends = jnp.stack([slopes[0], slopes[-1]])
         return UncorrectedStep(h * (t.b @ slopes), h * (t.b @ changes), jnp.asarray(t.error_weights) @ slopes, ends)
 
     def step_without_compensation(self, system: System, x, h) -> jax.Array:
-        """A step with one correction and without care for rounding, for derivatives by the parameters of a system.
+        """Return the state after a step with one correction and no compensation, for derivatives by parameters.
 
-        It misses the levels by the square of what the step does before its correction, O(h^{2p+2}): far below what a
-        fit notices. Its program is short, and so are those of its derivatives.
+        It misses the levels by the square of the error before the correction, O(h^{2p+2}): far below what a fit
+        notices. Its program is short, and so are the programs of its derivatives.
         """
         laws, t = self._laws(system), self.tableau
 
-        @jax.checkpoint  # what is computed again is not carried from step to step: a shorter program, and faster
+        @jax.checkpoint  # recomputing is faster than storing from step to step, and the program is shorter
         def field_and_law_rates(x) -> tuple[jax.Array, jax.Array]:
-            """Those of the laws are by the whole field: along the motion they change by rounding alone."""
+            """Return the field, and the rates of the laws by the whole field (the motion adds rounding alone)."""
             dH = system.energy.gradient(x)
             dS = jnp.zeros_like(x) if system.entropy is None else system.entropy.gradient(x)
             field = system.freeze_at(x).field(x, dH, dS, tuple(L.gradient(x) for L in system.preserved))
-            given = [dS if law.function is system.entropy else law.function.gradient(x) for law in laws if law.sign]
-            changes = [jnp.zeros(())] * (len(laws) - len(given)) + [jnp.dot(g, field) for g in given]  # they come last
+            law_gradients = [
+                dS if law.function is system.entropy else law.function.gradient(x) for law in laws if law.sign
+            ]
+            changes = [jnp.zeros(())] * (len(laws) - len(law_gradients)) + [
+                jnp.dot(g, field) for g in law_gradients
+            ]  # they come last
             return field, jnp.asarray(changes)
 
         slopes, changes = self._stage_slopes(field_and_law_rates, x, 0.0, h)
         end = x + h * (t.b @ slopes)
         if not laws:
             return end
-        both, functions = jnp.stack([x, end]), [law.function for law in laws]
-        values, gradients = zip(*(jax.vmap(jax.value_and_grad(f.value))(both) for f in functions), strict=True)
-        missed = h * (t.b @ changes) - jnp.stack([after - before for before, after in values])
-        return end + vector_with_products([system.raise_index(end, gradient) for _, gradient in gradients], missed)
+        end_points, functions = jnp.stack([x, end]), [law.function for law in laws]
+        values, gradients = zip(*(jax.vmap(jax.value_and_grad(f.value))(end_points) for f in functions), strict=True)
+        residuals = h * (t.b @ changes) - jnp.stack([end_value - start_value for start_value, end_value in values])
+        return end + vector_with_products([system.raise_index(end, gradient) for _, gradient in gradients], residuals)
 
     def _stage_slopes(self, rates: Callable, x, compensation, h) -> tuple[jax.Array, jax.Array]:
-        """The field at the stages, shape (s, n), and the rates of the functions of the laws there, shape (s, laws)."""
+        """Return the field at the stages, shape (s, n), and the rates of the functions of the laws, shape (s, laws)."""
         t = self.tableau
         s = len(t.b)
 
         def stage(slopes, row):
             i, weights = row
-            found, changes = rates(x + (compensation + h * (weights @ slopes)))
-            return jax.lax.dynamic_update_index_in_dim(slopes, found, i, 0), changes
+            slope, changes = rates(x + (compensation + h * (weights @ slopes)))
+            return jax.lax.dynamic_update_index_in_dim(slopes, slope, i, 0), changes
 
         return jax.lax.scan(stage, jnp.zeros((s, x.shape[0])), (np.arange(s), t.A))
 
     def weights(self, theta) -> np.ndarray:
-        """Weights of the cubic through both ends with the slopes there; its error between them is O(h^4)."""
+        """Return the weights of the cubic through both ends and their slopes; its error in the step is O(h^4)."""
         theta = np.asarray(theta, dtype=np.float64)
-        found = np.zeros((*theta.shape, self.stages))
-        found[..., MEAN_SLOPE_ROW] = theta**2 * (3.0 - 2.0 * theta)
-        found[..., START_SLOPE_ROW] = theta * (1.0 - theta) ** 2
-        found[..., END_SLOPE_ROW] = theta**2 * (theta - 1.0)
-        return found
+        row_weights = np.zeros((*theta.shape, self.stages))
+        row_weights[..., StepRow.MEAN_SLOPE] = theta**2 * (3.0 - 2.0 * theta)
+        row_weights[..., START_SLOPE_ROW] = theta * (1.0 - theta) ** 2
+        row_weights[..., END_SLOPE_ROW] = theta**2 * (theta - 1.0)
+        return row_weights
 
     def error(self, system: System, x, compensation, h, k) -> jax.Array:
-        """From weights that lower orders leave undetermined: see :class:`.lobatto.ExplicitTableau`."""
+        """Estimate the error with the weights of :class:`.lobatto.ExplicitTableau`."""
         t = self.tableau
-        found, length = h * jnp.max(jnp.abs(k[ERROR_ROW])), h * jnp.max(jnp.abs(k[MEAN_SLOPE_ROW]))
-        return t.error_scale * length * (found / jnp.where(length > 0.0, length, 1.0)) ** (self.order / t.error_order)
+        error_size, step_length = h * jnp.max(jnp.abs(k[StepRow.ERROR])), h * jnp.max(jnp.abs(k[StepRow.MEAN_SLOPE]))
+        return (
+            t.error_scale
+            * step_length
+            * (error_size / jnp.where(step_length > 0.0, step_length, 1.0)) ** (self.order / t.error_order)
+        )
 
 
 register(*map(MetriplecticRungeKutta, LOBATTO_ORDERS))

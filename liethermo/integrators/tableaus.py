@@ -10,6 +10,7 @@ import numpy as np
 from ..functions.path import KronrodRule
 
 MAX_STAGES = 8
+"""Largest number of Gauss nodes."""
 
 
 class GaussTableau(NamedTuple):
@@ -28,25 +29,25 @@ class GaussTableau(NamedTuple):
 
 @functools.cache
 def gauss_tableau(stages: int) -> GaussTableau:
-    """The tableau, each entry rounded once from extended precision."""
+    """Return the tableau of s Gauss nodes, each entry rounded once from extended precision."""
     A, b, c = _extended_tableau(stages)
     return GaussTableau(*(np.asarray(a, dtype=np.float64) for a in (A, b, c)))
 
 
 @functools.cache
 def extrapolation_matrix(stages: int) -> np.ndarray:
-    """The matrix that takes the stage slopes of a step to those of the next, by the polynomial through them."""
+    """Return the matrix, shape (s, s), that extrapolates the stage slopes to the next step by their polynomial."""
     return _lagrange_values(stages, 1 + _extended_tableau(stages)[2]).astype(np.float64)
 
 
 @functools.cache
 def start_slope_weights(stages: int) -> np.ndarray:
-    """Weights w with ``u'(0) = w @ k``, u the collocation polynomial."""
+    """Return weights w with ``u'(0) = w @ k``, where u is the collocation polynomial, shape (s,)."""
     return _lagrange_values(stages, np.zeros((), dtype=np.longdouble)).astype(np.float64)
 
 
 def interpolation_weights(stages: int, theta) -> np.ndarray:
-    """Weights w(theta), shape (..., s), with ``u(theta) = x + h w @ k`` the collocation polynomial at t + theta h."""
+    """Return weights w, shape (..., s): ``u(theta) = x + h w @ k`` is the collocation polynomial at t + theta h."""
     nodes = 2 * np.asarray(theta, dtype=np.float64) - 1
     values = _legendre_values(stages, nodes)
     return _legendre_integrals(values) @ _lagrange_coefficients(stages).astype(np.float64)
@@ -54,7 +55,7 @@ def interpolation_weights(stages: int, theta) -> np.ndarray:
 
 @functools.cache
 def kronrod_rule(stages: int) -> KronrodRule | None:
-    """The Kronrod rules of 1 + 2 nodes, degree 5, and of 2 + 3, degree 7; more stages need none."""
+    """Return the Kronrod rule for 1 stage (1 + 2 nodes, degree 5) or 2 stages (2 + 3, degree 7), otherwise None."""
     if stages > 2:
         return None
     if stages == 1:
@@ -74,7 +75,7 @@ def _extended_tableau(stages: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @functools.cache
 def _gauss_rule(stages: int) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss nodes on [-1, 1] and weights on [0, 1] in extended precision."""
+    """Return Gauss nodes on [-1, 1] and weights on [0, 1] in extended precision."""
     x = np.polynomial.legendre.leggauss(stages)[0].astype(np.longdouble)
     for _ in range(2):  # Newton's method from double precision; the second pass has the slope at the root
         values = _legendre_values(stages, x)
@@ -84,7 +85,7 @@ def _gauss_rule(stages: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _lagrange_coefficients(stages: int) -> np.ndarray:
-    """The Lagrange polynomials of the nodes in Legendre's: entry m, j is ``(2m + 1) b_j P_m(x_j)``."""
+    """Return the Lagrange polynomials of the nodes in Legendre polynomials: entry m, j is ``(2m + 1) b_j P_m(x_j)``."""
     x, b = _gauss_rule(stages)
     return ((2 * np.arange(stages) + 1) * b[:, None] * _legendre_values(stages, x)[:, :stages]).T
 
@@ -94,7 +95,7 @@ def _lagrange_values(stages: int, theta) -> np.ndarray:
 
 
 def _legendre_values(stages: int, x) -> np.ndarray:
-    """``P_0 … P_s`` at x, along a new last axis."""
+    """Return ``P_0 … P_s`` at x, along a new last axis."""
     values = [np.ones_like(x), x]
     for m in range(1, stages):
         values.append(((2 * m + 1) * x * values[m] - m * values[m - 1]) / (m + 1))
@@ -102,8 +103,8 @@ def _legendre_values(stages: int, x) -> np.ndarray:
 
 
 def _legendre_integrals(values: np.ndarray) -> np.ndarray:
-    """Integrals over [0, theta] of the shifted ``P_0 … P_(s-1)``, from the values of ``P_0 … P_s`` there."""
+    """Return the integrals over [0, theta] of the shifted ``P_0 … P_(s-1)``, from the values of ``P_0 … P_s`` there."""
     stages = values.shape[-1] - 1
-    first = (1 + values[..., 1:2]) / 2
+    integral_0 = (1 + values[..., 1:2]) / 2
     m = np.arange(1, stages)
-    return np.concatenate([first, (values[..., 2:] - values[..., :-2]) / (2 * (2 * m + 1))], axis=-1)
+    return np.concatenate([integral_0, (values[..., 2:] - values[..., :-2]) / (2 * (2 * m + 1))], axis=-1)

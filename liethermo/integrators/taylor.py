@@ -16,19 +16,22 @@ from ..systems import System
 from ..tracing.taylor import TaylorSeriesError, check_taylor_series, taylor_coefficients
 from .base import OneStepMethod, register
 from .charts import resolve_retraction
-from .explicit import ERROR_ROW, FIRST_METHOD_ROW, MEAN_SLOPE_ROW, ExplicitMethod, UncorrectedStep
+from .explicit import ExplicitMethod, StepRow, UncorrectedStep
 from .lobatto import lobatto_rule
 
-MIN_ORDER, MAX_ORDER = 2, 24
-"""Orders: beyond the highest, double precision has no use for more."""
+MIN_ORDER = 2
+"""Lowest order of a Taylor method."""
+
+MAX_ORDER = 24
+"""Highest order of a Taylor method: in double precision a higher one brings nothing."""
 
 
 DEFAULT_RTOL = 1e-10
-"""What the order is chosen for where no tolerance is given."""
+"""Relative tolerance that determines the order if none is given."""
 
 
 def order_for_tolerance(tolerance: float | None) -> int:
-    """The order that a relative tolerance asks for [Jorba & Zou 2005]."""
+    """Return the order for a relative tolerance [Jorba & Zou 2005]."""
     order = math.ceil(1.0 - 0.5 * math.log(DEFAULT_RTOL if tolerance is None else tolerance))
     return min(max(MIN_ORDER, order), MAX_ORDER)
 
@@ -75,7 +78,7 @@ class MetriplecticTaylor(ExplicitMethod):
         held: tuple[str, ...] = (),
     ):
         if order is not None and (type(order) is not int or not MIN_ORDER <= order <= MAX_ORDER):
-            raise InputError(f"the order is an integer from {MIN_ORDER} to {MAX_ORDER}, or None, not {order!r}")
+            raise InputError(f"order must be an integer from {MIN_ORDER} to {MAX_ORDER} or None, got {order!r}")
         super().__init__(order, preserve, retraction, held)
 
     def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
@@ -89,11 +92,11 @@ class MetriplecticTaylor(ExplicitMethod):
 
     @property
     def stages(self) -> int:
-        return FIRST_METHOD_ROW + self.order
+        return StepRow.FIRST_METHOD_ROW + self.order
 
     @property
     def evaluations_per_iteration(self) -> int:
-        """Products of two series take as many multiplications as there are pairs; and the production at the nodes."""
+        """Multiplications in a product of two series, p (p + 1) / 2, plus evaluations of the entropy production."""
         return self.order * (self.order + 1) // 2 + len(self._lobatto_rule[0])
 
     @property
@@ -101,7 +104,7 @@ class MetriplecticTaylor(ExplicitMethod):
         return lobatto_rule((self.order + 1) // 2 + 1)
 
     def check(self, system: System) -> None:
-        """Raise InputError unless there is a law to hold, what is to be preserved is, and all functions are smooth."""
+        """Raise InputError unless there is a law to hold, ``preserve`` is conserved, and all functions are smooth."""
         super().check(system)
         x = jnp.asarray(system.samples(1)[0])
         functions = {"the energy": system.energy.value, "the vector field": system.vector_field}
@@ -118,7 +121,7 @@ class MetriplecticTaylor(ExplicitMethod):
             self._check_chart_series(system.space)
 
     def _check_chart_series(self, space: mf.Space) -> None:
-        """Raise NoSeriesError unless the points of a chart have Taylor series."""
+        """Raise TaylorSeriesError unless the points of the chart have Taylor series."""
         assert self.retraction is not None
         chart = resolve_retraction(space, self.retraction).chart
         z = space.random(0)
@@ -134,31 +137,33 @@ class MetriplecticTaylor(ExplicitMethod):
                 "leave out retraction=, or take lt.MetriplecticGauss or lt.MetriplecticRungeKutta",
             ) from None
 
-    def base_step(self, rates: Callable, spared: bool, x, compensation, h) -> UncorrectedStep:
+    def base_step(self, rates: Callable, skip_law_rates: bool, x, compensation, h) -> UncorrectedStep:
         nodes, b = self._lobatto_rule
-        numbers = np.arange(1.0, self.order + 1.0)
-        c = taylor_coefficients(lambda y: rates(y)[0], x, h, self.order)  # from the centre of a chart, exactly
-        points = jnp.concatenate([x[None], x + (compensation + nodes[1:, None] ** numbers @ c)])
-        fields, found = jax.vmap(rates)(points[-1:] if spared else points)
-        defect, changes = fields[-1] - (numbers @ c) / h, found[-1] if spared else h * (b @ found)
-        return UncorrectedStep(jnp.sum(c, axis=0), changes, defect / (self.order + 1), c / h)
+        powers = np.arange(1.0, self.order + 1.0)
+        c = taylor_coefficients(
+            lambda y: rates(y)[0], x, h, self.order
+        )  # compensation is left out: in a chart x is its centre, exactly
+        points = jnp.concatenate([x[None], x + (compensation + nodes[1:, None] ** powers @ c)])
+        fields, law_rates = jax.vmap(rates)(points[-1:] if skip_law_rates else points)
+        residual, changes = fields[-1] - (powers @ c) / h, law_rates[-1] if skip_law_rates else h * (b @ law_rates)
+        return UncorrectedStep(jnp.sum(c, axis=0), changes, residual / (self.order + 1), c / h)
 
     def weights(self, theta) -> np.ndarray:
-        """Weights of the polynomial and of its correction, which grows like the first term that is left out."""
+        """Return the weights of the polynomial and of its correction, which grows as the first neglected term."""
         theta = np.asarray(theta, dtype=np.float64)[..., None]
-        last = theta ** (self.order + 1)
-        found = np.zeros((*theta.shape[:-1], self.stages))
-        found[..., FIRST_METHOD_ROW:] = theta ** np.arange(1, self.order + 1) - last
-        found[..., MEAN_SLOPE_ROW] = last[..., 0]
-        return found
+        next_power = theta ** (self.order + 1)
+        row_weights = np.zeros((*theta.shape[:-1], self.stages))
+        row_weights[..., StepRow.FIRST_METHOD_ROW :] = theta ** np.arange(1, self.order + 1) - next_power
+        row_weights[..., StepRow.MEAN_SLOPE] = next_power[..., 0]
+        return row_weights
 
     def error(self, system: System, x, compensation, h, k) -> jax.Array:
-        """From how far the polynomial X misses the field at its end: ``h |f(X(1)) - X'(1)| / (p + 1)``.
+        """Estimate the error from the residual of the polynomial X at its end: ``h |f(X(1)) - X'(1)| / (p + 1)``.
 
         The first term left out of X' is p + 1 times that of X, so the estimate is right to a factor that tends to 1. It
-        also sees where a test has been decided otherwise on the way.
+        also detects a condition (``jnp.where``) whose value has changed inside the step.
         """
-        return h * jnp.max(jnp.abs(k[ERROR_ROW]))
+        return h * jnp.max(jnp.abs(k[StepRow.ERROR]))
 
 
 register(*map(MetriplecticTaylor, (6, 12, 20)))

@@ -14,10 +14,10 @@ from .discrete import FiniteDifference
 
 
 class ComposedVariational(MethodWrapper):
-    """A variational integrator as it runs on a composed system; see there for its equations.
+    """A variational integrator as it runs on a composed system; :class:`.VariationalIntegrator` has the equations.
 
-    With one map the slopes are the field at the point where the map looks. With several, a row for each follows, with
-    its momentum: ``(P_i - p_k) / h``. One iteration takes Newton's step for ``H_p(q_i, P_i, S_i) = V``.
+    With one map the slopes are the field at the point of the map. With several maps, a row for each follows with its
+    momentum: ``(P_i - p_k) / h``. One iteration takes a Newton step for ``H_p(q_i, P_i, S_i) = V``.
 
     Attributes
     ----------
@@ -44,35 +44,40 @@ class ComposedVariational(MethodWrapper):
         if len(maps) == 1:
             return system.vector_field(x + (compensation + h * map_fractions(system, maps[0]) * k[0]))[None]
         (q, p, S, _), total = system.poisson.state_indices, sum(map.weight for map in maps)
-        parts, far = [map.weight / total for map in maps], [1.0 - map.alpha for map in maps]
+        map_weights, end_fractions = [map.weight / total for map in maps], [1.0 - map.alpha for map in maps]
 
         def mean(values) -> jax.Array:
-            return sum(part * value for part, value in zip(parts[1:], values[1:], strict=True)) + parts[0] * values[0]
+            return (
+                sum(part * value for part, value in zip(map_weights[1:], values[1:], strict=True))
+                + map_weights[0] * values[0]
+            )
 
-        # the points of the maps, with a momentum of its own each
-        moved = [
+        # the points of the maps, each with its own momentum
+        displacements = [
             (h * map_fractions(system, map) * k[0]).at[p].set(h * row[p]) for map, row in zip(maps, k[1:], strict=True)
         ]
-        points = [x + (compensation + d) for d in moved]
+        points = [x + (compensation + d) for d in displacements]
         gradients = [system.energy.gradient(point) for point in points]
-        warm = mean([dH[S] for dH in gradients])
+        temperatures = mean([dH[S] for dH in gradients])
         dS = jnp.zeros_like(x).at[S].set(1.0)
         rates = []
         for point, dH in zip(points, gradients, strict=True):
             rate = jnp.zeros_like(x).at[p].set(-dH[q])
-            if system.dissipation is not None:  # with temperatures that are the same at all points
-                rate = rate + system.dissipation.force(system, point, dH.at[S].set(warm), dS, ())
+            if system.dissipation is not None:  # with the mean temperatures at all points
+                rate = rate + system.dissipation.force(system, point, dH.at[S].set(temperatures), dS, ())
             rates.append(rate)
         step = mean(rates)
         if not len(p):
             return jnp.concatenate([step[None], jnp.zeros_like(k[1:])])
-        masses = [inverse(_momentum_hessian(system, point, p)) for point in points]
-        needed = mean([share * rate[p] - row[p] for share, rate, row in zip(far, rates, k[1:], strict=True)])
-        carried = mean([M @ dH[p] for M, dH in zip(masses, gradients, strict=True)])
-        V = inverse(mean(masses)) @ (h * needed + carried)
+        mass_matrices = [inverse(_momentum_hessian(system, point, p)) for point in points]
+        momentum_gap = mean(
+            [share * rate[p] - row[p] for share, rate, row in zip(end_fractions, rates, k[1:], strict=True)]
+        )
+        momentum_velocity = mean([M @ dH[p] for M, dH in zip(mass_matrices, gradients, strict=True)])
+        V = inverse(mean(mass_matrices)) @ (h * momentum_gap + momentum_velocity)
         rows = [
             jnp.zeros_like(x).at[p].set(row[p] + M @ (V - dH[p]) / h)
-            for row, M, dH in zip(k[1:], masses, gradients, strict=True)
+            for row, M, dH in zip(k[1:], mass_matrices, gradients, strict=True)
         ]
         return jnp.stack([step.at[q].set(V), *rows])
 
@@ -88,13 +93,13 @@ class ComposedVariational(MethodWrapper):
 
 
 def map_fractions(system: ComposedSystem, map: FiniteDifference) -> np.ndarray:
-    """How far on its way each component of a composed system is looked at."""
+    """Return, for each component of a composed system, the fraction of the step at which the map evaluates it."""
     q, p, _, _ = system.poisson.state_indices
-    found = np.full(system.dim, map.beta)
-    found[q], found[p] = map.alpha, 1.0 - map.alpha
-    return found
+    fractions = np.full(system.dim, map.beta)
+    fractions[q], fractions[p] = map.alpha, 1.0 - map.alpha
+    return fractions
 
 
 def _momentum_hessian(system: ComposedSystem, x, p) -> jax.Array:
-    """``H_pp``, the inverse of the mass matrix of all bodies."""
+    """Return ``H_pp``, the inverse of the mass matrix of all bodies."""
     return jax.jacfwd(lambda y: system.energy.gradient(x.at[p].set(y))[p])(x[p])

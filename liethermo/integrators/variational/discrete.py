@@ -1,8 +1,7 @@
-"""Discrete simple systems: finite difference maps, and what they make of a Lagrangian, of forces and of the constraint.
+"""Discrete simple systems: finite difference maps, and the discrete Lagrangian, forces and constraint.
 
-A pair (q_0, q_1, S_0, S_1) is given to the step equations in the coordinates (q_0, V, S_0, s) with the difference
-quotients ``V = (q_1 - q_0)/h``, ``s = (S_1 - S_0)/h``: differences of nearby positions would lose the digits that
-the step is about.
+The step equations use a pair (q_0, q_1, S_0, S_1) in the coordinates (q_0, V, S_0, s), with the difference quotients
+``V = (q_1 - q_0)/h`` and ``s = (S_1 - S_0)/h``: differences of nearby positions would lose digits.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from ...systems import SimpleClosedSystem
 
 
 class FiniteDifference(Module):
-    """The finite difference map of the alpha family, in the form of its q-, v- and S-representatives [GBY 3.5, §5.1].
+    """Finite difference map of the alpha family, given by its q-, v- and S-representatives [GBY 3.5, §5.1].
 
         phi(q_0, q_1, S_0, S_1) = ((1 - alpha) q_0 + alpha q_1, V; (1 - beta) S_0 + beta S_1, s)
 
@@ -55,9 +54,9 @@ class FiniteDifference(Module):
         beta = alpha if beta is None else beta
         for name, value in (("alpha", alpha), ("beta", beta)):
             if not isinstance(value, int | float | np.number) or not 0.0 <= value <= 1.0:
-                raise InputError(f"{name} says where between two points a map looks: from 0 to 1, not {value!r}")
+                raise InputError(f"{name} must be between 0 and 1, got {value!r}")
         if not isinstance(weight, int | float | np.number) or not 0.0 < weight < np.inf:
-            raise InputError(f"the weight of a finite difference map must be > 0 and finite, not {weight!r}")
+            raise InputError(f"the weight of a finite difference map must be > 0 and finite, got {weight!r}")
         self.alpha, self.beta, self.weight = float(alpha), float(beta), float(weight)
 
     def position(self, q0, V, h) -> jax.Array:
@@ -68,34 +67,34 @@ class FiniteDifference(Module):
         return V
 
     def entropy(self, S0, s, h) -> jax.Array:
-        """The entropy between two; a time between two is found in the same way."""
+        """Return the entropy at the map's point between two entropies; a time is interpolated by the same formula."""
         return S0 + (self.beta * h) * s
 
     def reversed_map(self) -> FiniteDifference | None:
-        """The map that represents (q_1, q_0, S_1, S_0) backward in time as this one does (q_0, …); None if unknown."""
+        """Return the map that represents the pair backward in time as this one does forward; None if unknown."""
         if type(self) is not FiniteDifference:
             return self if self.is_symmetric else None
         return FiniteDifference(1.0 - self.alpha, 1.0 - self.beta, self.weight)
 
     @property
     def is_symmetric(self) -> bool:
-        """Whether it represents (q_1, q_0, S_1, S_0) backward in time as it does (q_0, q_1, S_0, S_1)."""
+        """True if the map represents (q_1, q_0, S_1, S_0) backward in time as it does (q_0, q_1, S_0, S_1)."""
         return type(self) is FiniteDifference and self.alpha == self.beta == 0.5
 
 
 class Curve(Module):
-    """A curve on a space from q_0 to q_1, at the parameters 0 to 1: what finite difference maps are made of there.
+    """A curve on a space from q_0 to q_1, with parameter 0 to 1, at which finite difference maps are evaluated.
 
-    The chord in the arrays around, brought to the space by Newton's method: as symmetric as a chord. Or, with a chart,
-    that which the chart makes of a straight line, ``point(q_0, alpha vector(q_0, q_1))``: of the Riemannian one the
-    geodesic.
+    Without a chart it is the chord in the arrays around, projected onto the space by Newton's method, and as symmetric
+    as a chord. With a chart it is the image of a straight line, ``point(q_0, alpha vector(q_0, q_1))``: for the
+    Riemannian chart the geodesic.
     """
 
     space: mf.Space = eqx.field(static=True)
     chart: mf.Chart | None = eqx.field(static=True, default=None)
 
     def position_and_velocity(self, alpha: float, q0, V, h) -> tuple[jax.Array, jax.Array]:
-        """The point of the curve and its velocity there, from ``V = (q_1 - q_0) / h``; shape (n,) each."""
+        """Return the point of the curve at alpha and its velocity, shape (n,) each, from ``V = (q_1 - q_0) / h``."""
         vector, point = self.space.to_vector, self.space.from_vector
         if self.chart is None:
             return jax.jvp(self._project_to_space, (q0 + (alpha * h) * V,), (V,))
@@ -112,11 +111,11 @@ class Curve(Module):
 
 
 PROJECTION_NEWTON_STEPS = 3
-"""Steps of Newton's method from a chord to the space: each squares the distance, relative to the curvature."""
+"""Newton steps from a chord to the space: each squares the distance, relative to the curvature."""
 
 
 class MapPoint(NamedTuple):
-    """What a map makes of a pair: its part in the mean, and the arguments of the functions."""
+    """A finite difference map at a pair: its weight in the mean, and the arguments (q, v, S, t) of the functions."""
 
     map: FiniteDifference
     weight: float
@@ -171,71 +170,73 @@ class DiscreteSystem(Module):
         return self.curve.position_and_velocity(map.alpha, q0, V, self.h)
 
     def _split_force(self, map: FiniteDifference, pair: Pair, F) -> tuple[jax.Array, jax.Array]:
-        """A force at the representative, as one on q_0 and one on q_1: ``D_1 q·F``, ``D_2 q·F``."""
+        """Return a force at the map's point as forces on q_0 and on q_1: ``D_1 q·F``, ``D_2 q·F``."""
         if self.curve is None and type(map).position is FiniteDifference.position:
             return (1.0 - map.alpha) * F, map.alpha * F
-        _, back = jax.vjp(lambda q0, V: self._position_and_velocity(map, q0, V)[0], pair.q0, pair.V)
-        both, second = back(F)  # V grows with q_1 at fixed q_0, at the rate 1/h
-        return both - second / self.h, second / self.h
+        _, pullback = jax.vjp(lambda q0, V: self._position_and_velocity(map, q0, V)[0], pair.q0, pair.V)
+        force_on_q0, force_on_V = pullback(F)  # V grows with q_1 at fixed q_0, at the rate 1/h
+        return force_on_q0 - force_on_V / self.h, force_on_V / self.h
 
     def action(self, q0, V, S0, s) -> jax.Array:
-        """``L_d / h``."""
+        """Return ``L_d / h``."""
         points = self._map_points(self.lagrangian_maps, Pair(q0, V, S0, s))
         return _sum_arrays([p.weight * self.system.lagrangian_value(p.q, p.v, p.S) for p in points])
 
     def impulses(self, pair: Pair, friction: bool = True, external: bool = True) -> tuple[jax.Array, jax.Array]:
-        """``F^-_d / h`` and ``F^+_d / h``."""
-        first = second = jnp.zeros_like(pair.V)
+        """Return ``F^-_d / h`` and ``F^+_d / h``, shape (n,) each."""
+        impulse_minus = impulse_plus = jnp.zeros_like(pair.V)
         for p in self._map_points(self.force_maps, pair):
             F = jnp.zeros_like(p.v)
             F = F + self.system.friction_force(*p[2:]) if friction else F
             F = F + self.system.external_force(*p[2:]) if external else F
-            at_first, at_second = self._split_force(p.map, pair, p.weight * F)
-            first, second = first + at_first, second + at_second
-        return first, second
+            force_minus, force_plus = self._split_force(p.map, pair, p.weight * F)
+            impulse_minus, impulse_plus = impulse_minus + force_minus, impulse_plus + force_plus
+        return impulse_minus, impulse_plus
 
     def momentum_residual(self, p0, pair: Pair) -> jax.Array:
-        """That of ``p_0 = -D_1 L_d - F^-_d``, (3.12) with the momentum of the step before, shape (n,)."""
-        by_q, by_V = jax.grad(self.action, argnums=(0, 1))(*pair)
-        return p0 - by_V + self.h * (by_q + self.impulses(pair)[0])
+        """Return the residual of ``p_0 = -D_1 L_d - F^-_d``, (3.12) with the momentum of the last step, shape (n,)."""
+        dL_dq, dL_dV = jax.grad(self.action, argnums=(0, 1))(*pair)
+        return p0 - dL_dV + self.h * (dL_dq + self.impulses(pair)[0])
 
     def motion_residual(self, p0, pair: Pair, mass: float | jax.Array = 1.0) -> jax.Array:
-        """What has to vanish, shape (n,): the misfit; on a manifold its part along Q, and how far q_1 is off Q.
+        """Return the momentum residual, shape (n,); on a manifold along Q, plus the distance of q_1 from Q.
 
-        The latter is multiplied by a ``mass`` of the size of L_vv, so that all of it is momentum.
+        The distance is multiplied by a ``mass`` of the size of L_vv, so that the sum is a momentum.
         """
-        missed = self.momentum_residual(p0, pair)
+        residual = self.momentum_residual(p0, pair)
         if self.curve is None:
-            return missed
+            return residual
         surface = ConstraintSurface(self.curve.space, tangent=True)
-        off = surface._constraint_change(pair.q0, 0.0, self.h * pair.V) / self.h
-        return self.system.tangential_part(pair.q0, missed) + mass * surface._correction_displacement(pair.q0, off)
+        constraint_rate = surface._constraint_change(pair.q0, 0.0, self.h * pair.V) / self.h
+        return self.system.tangential_part(pair.q0, residual) + mass * surface._correction_displacement(
+            pair.q0, constraint_rate
+        )
 
     def force(self, p0, pair: Pair) -> jax.Array:
-        """``(p_1 - p_0) / h = (D_1 L_d + D_2 L_d + F^-_d + F^+_d) / h``, shape (n,), on a manifold along it."""
-        first, second = self.impulses(pair)
-        force = jax.grad(self.action)(*pair) + (first + second)
+        """Return ``(p_1 - p_0) / h = (D_1 L_d + D_2 L_d + F^-_d + F^+_d) / h``, shape (n,), on a manifold along it."""
+        impulse_minus, impulse_plus = self.impulses(pair)
+        force = jax.grad(self.action)(*pair) + (impulse_minus + impulse_plus)
         return force if self.curve is None else force - self.momentum_residual(p0, pair) / self.h
 
     def constraint_residual(self, pair: Pair) -> jax.Array:
-        """``-P_d``, the mean of ``T s + F_fr . v - P_H``; NaN where a temperature is not positive [GBY 3.9]."""
+        """Return ``-P_d``, the mean of ``T s + F_fr . v - P_H``; NaN if a temperature is not positive [GBY 3.9]."""
         total = jnp.zeros(())
         for p in self._map_points(self.constraint_maps, pair):
             T = -jax.grad(self.system.lagrangian_value, argnums=2)(p.q, p.v, p.S)
-            gained = jnp.dot(self.system.friction_force(*p[2:]), p.v) - self.system.heating(*p[2:])
-            total = total + p.weight * (jnp.where(T > 0.0, T, jnp.nan) * pair.s + gained)
+            power = jnp.dot(self.system.friction_force(*p[2:]), p.v) - self.system.heating(*p[2:])
+            total = total + p.weight * (jnp.where(T > 0.0, T, jnp.nan) * pair.s + power)
         return total
 
     def work_and_heat_rates(self, pair: Pair) -> tuple[jax.Array, jax.Array]:
-        """Work and heat from outside, per unit of time."""
-        first, second = self.impulses(pair, friction=False)
+        """Return the work and the heat received from outside, per unit of time."""
+        impulse_minus, impulse_plus = self.impulses(pair, friction=False)
         heat = _sum_arrays(
             [p.weight * self.system.heating(*p[2:]) for p in self._map_points(self.constraint_maps, pair)]
         )
-        return jnp.dot(first + second, pair.V), heat
+        return jnp.dot(impulse_minus + impulse_plus, pair.V), heat
 
     def energy(self, pair: Pair) -> jax.Array:
-        """``E = v . L_v - L`` at the points of the discrete Lagrangian, the mean."""
+        """Return ``E = v . L_v - L``, the mean over the points of the discrete Lagrangian."""
         energy = self.system.contact.energy
         points = self._map_points(self.lagrangian_maps, pair)
         return _sum_arrays([p.weight * energy(jnp.concatenate([p.q, p.v, p.S[None]])) for p in points])
@@ -246,27 +247,27 @@ class DiscreteSystem(Module):
         return Pair(q0, (q1 - q0) / self.h, S0, (S1 - S0) / self.h)
 
     def lagrangian(self, q0, q1, S0, S1) -> jax.Array:
-        """``L_d`` [GBY 3.10]."""
+        """Return ``L_d`` [GBY 3.10]."""
         return self.h * self.action(*self.pair(q0, q1, S0, S1))
 
     def forces(self, q0, q1, S0, S1, friction: bool = True, external: bool = True) -> tuple[jax.Array, jax.Array]:
-        """``F^-_d`` and ``F^+_d``, shape (n,) each [GBY Definition 3.2]."""
-        first, second = self.impulses(self.pair(q0, q1, S0, S1), friction, external)
-        return self.h * first, self.h * second
+        """Return ``F^-_d`` and ``F^+_d``, shape (n,) each [GBY Definition 3.2]."""
+        impulse_minus, impulse_plus = self.impulses(self.pair(q0, q1, S0, S1), friction, external)
+        return self.h * impulse_minus, self.h * impulse_plus
 
     def constraint(self, q0, q1, S0, S1) -> jax.Array:
-        """``P_d``: a pair is on ``C_K^d`` where it vanishes [GBY 3.8]."""
+        """Return ``P_d``, which vanishes for a pair on ``C_K^d`` [GBY 3.8]."""
         return -self.constraint_residual(self.pair(q0, q1, S0, S1))
 
     def momenta(self, q0, q1, S0, S1) -> tuple[jax.Array, jax.Array]:
-        """p_0 and p_1 of the discrete Legendre transforms ``FL^-`` and ``FL^+`` with forces [GBY §4.2]."""
-        by_first, by_second = jax.grad(self.lagrangian, argnums=(0, 1))(q0, q1, S0, S1)
-        first, second = self.forces(q0, q1, S0, S1)
-        along = self.system.tangential_part
-        return along(q0, -by_first - first), along(q1, by_second + second)
+        """Return p_0 and p_1 of the discrete Legendre transforms ``FL^-`` and ``FL^+`` with forces [GBY §4.2]."""
+        dL_dq0, dL_dq1 = jax.grad(self.lagrangian, argnums=(0, 1))(q0, q1, S0, S1)
+        force_minus, force_plus = self.forces(q0, q1, S0, S1)
+        tangential_part = self.system.tangential_part
+        return tangential_part(q0, -dL_dq0 - force_minus), tangential_part(q1, dL_dq1 + force_plus)
 
     def regularity_matrix(self, q0, q1, S0, S1) -> jax.Array:
-        """The matrix (3.13), shape (n + 1, n + 1): where it is invertible the step from q_1, S_1 is determined."""
+        """Return the matrix (3.13), shape (n + 1, n + 1): if it is invertible, q_1 and S_1 determine the step."""
 
         def equations(q1, S1):
             return -self.momenta(q0, q1, S0, S1)[0], self.constraint(q0, q1, S0, S1)
@@ -275,34 +276,34 @@ class DiscreteSystem(Module):
         return jnp.block([[A, B[:, None]], [C[None], D[None, None]]])
 
     def reduced_matrix(self, q0, q1, S0, S1) -> jax.Array:
-        """The matrix (3.15), shape (n, n): (3.13) is invertible where it is and ``D_4 P_d`` is not zero."""
+        """Return the matrix (3.15), shape (n, n): (3.13) is invertible if (3.15) is, and ``D_4 P_d`` is not zero."""
         matrix = self.regularity_matrix(q0, q1, S0, S1)
         return matrix[:-1, :-1] - jnp.outer(matrix[:-1, -1], matrix[-1, :-1]) / matrix[-1, -1]
 
     def solve_constraint(self, q0, q1, S0, steps: int = 12) -> jax.Array:
-        """S_1 with ``P_d(q_0, q_1, S_0, S_1) = 0``, by so many Newton steps; differentiable."""
+        """Return S_1 with ``P_d(q_0, q_1, S_0, S_1) = 0`` after ``steps`` Newton steps; differentiable."""
         V = (q1 - q0) / self.h
 
         def newton(_, s):
-            misfit, slope = jax.jvp(lambda s: self.constraint_residual(Pair(q0, V, S0, s)), (s,), (jnp.ones(()),))
-            return s - misfit / slope
+            residual, slope = jax.jvp(lambda s: self.constraint_residual(Pair(q0, V, S0, s)), (s,), (jnp.ones(()),))
+            return s - residual / slope
 
         return S0 + self.h * jax.lax.fori_loop(0, steps, newton, jnp.zeros(()))
 
     def flow(self, q0, q1, S0, S1, steps: int = 12) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-        """The discrete flow on ``C_K^d``, to (q_1, q_2, S_1, S_2), likewise by Newton steps [GBY 3.14]."""
+        """Return the discrete flow on ``C_K^d``, (q_1, q_2, S_1, S_2), after ``steps`` Newton steps [GBY 3.14]."""
         p1, start = self.momenta(q0, q1, S0, S1)[1], jnp.append((q1 - q0) / self.h, (S1 - S0) / self.h)
 
-        def misfit(y):
+        def residual(y):
             pair = Pair(q1, y[:-1], S1, y[-1])
             return jnp.append(self.motion_residual(p1, pair), self.constraint_residual(pair))
 
         def newton(_, y):
-            return y - solve(jax.jacfwd(misfit)(y), misfit(y)[:, None])[:, 0]
+            return y - solve(jax.jacfwd(residual)(y), residual(y)[:, None])[:, 0]
 
         y = jax.lax.fori_loop(0, steps, newton, start)
         return q1, q1 + self.h * y[:-1], S1, S1 + self.h * y[-1]
 
 
-def _sum_arrays(parts: list[jax.Array]) -> jax.Array:
-    return functools.reduce(operator.add, parts)
+def _sum_arrays(arrays: list[jax.Array]) -> jax.Array:
+    return functools.reduce(operator.add, arrays)

@@ -17,33 +17,33 @@ from .discrete import DiscreteSystem, Pair
 
 
 def newton_step(discrete: DiscreteSystem, v0, p0, guess: Pair) -> tuple[jax.Array, jax.Array]:
-    """V and s after one step of Newton's method for (3.12), from a guess or, where that is exact, from nothing."""
+    """Return V and s after one step of Newton's method for (3.12) from a guess; from zero if one step is exact."""
     n, (q0, V, S0, s) = len(guess.V), guess
     mass = mass_scale(discrete.system, q0, v0, S0)
-    outright = discrete.curve is None and (
+    is_affine = discrete.curve is None and (
         polynomial_degree(_motion_residual_of_V, (discrete, p0, guess), n) <= 1
         and polynomial_degree(_motion_residual_of_s, (discrete, p0, guess), 1) == 0
     )
-    if outright:
-        A, misfit = _jacobian_and_value(
+    if is_affine:
+        A, residual = _jacobian_and_value(
             lambda V: discrete.motion_residual(p0, Pair(q0, V, S0, jnp.zeros(()))), jnp.zeros(n)
         )
-        V = -solve(A, misfit[:, None])[:, 0]
+        V = -solve(A, residual[:, None])[:, 0]
     else:  # (3.15), s eliminated
 
         def motion_and_constraint(V, s):
             pair = Pair(q0, V, S0, s)
             return discrete.motion_residual(p0, pair, mass), discrete.constraint_residual(pair)
 
-        ((A, B), (C, D)), (misfit, gain) = _jacobian_and_value(motion_and_constraint, V, s)
-        V = V - solve(A - jnp.outer(B, C) / D, (misfit - B * (gain / D))[:, None])[:, 0]
+        ((A, B), (C, D)), (residual, constraint_value) = _jacobian_and_value(motion_and_constraint, V, s)
+        V = V - solve(A - jnp.outer(B, C) / D, (residual - B * (constraint_value / D))[:, None])[:, 0]
     s = jnp.zeros(()) if polynomial_degree(_constraint_residual_of_s, (discrete, p0, guess), 1) <= 1 else s
-    slope, gain = _jacobian_and_value(lambda s: discrete.constraint_residual(Pair(q0, V, S0, s)), s)
-    return V, s - gain / slope
+    slope, constraint_value = _jacobian_and_value(lambda s: discrete.constraint_residual(Pair(q0, V, S0, s)), s)
+    return V, s - constraint_value / slope
 
 
 def _jacobian_and_value(function: Callable, *at):
-    """The derivatives of a function by all arguments, and its value."""
+    """Return the derivatives of a function by all of its arguments, and its value."""
     return jax.jacfwd(
         lambda *a: (lambda y: (y, y))(function(*a)), argnums=tuple(range(len(at))) if len(at) > 1 else 0, has_aux=True
     )(*at)
@@ -65,27 +65,27 @@ def _constraint_residual_of_s(model, s):
 
 
 def velocity_slope(system: SimpleClosedSystem, start, end, force, h) -> jax.Array:
-    """``(v_1 - v_0)/h`` with ``L_v(q_1, v_1, S_1) = p_0 + h force``, one step of Newton's method.
+    """Return ``(v_1 - v_0)/h`` with ``L_v(q_1, v_1, S_1) = p_0 + h force``, after one step of Newton's method.
 
     Parameters
     ----------
     start : (q_0, v_0, S_0, p_0)
     end : (q_1, slope, S_1)
-        With a guess of the result.
+        ``slope`` is a guess of the result.
     """
     (_, v0, _, p0), (q1, slope, S1) = start, end
     affine = polynomial_degree(_momentum_of_v, (system, q1, S1), len(v0)) <= 1
     slope = jnp.zeros_like(v0) if affine else slope
     W, p = _jacobian_and_value(lambda v: system.momentum(q1, v, S1), v0 + h * slope)
-    W, missed = _restrict_to_tangents(system, q1, v0 + h * slope, W, (p - p0) / h - force, h)
-    return slope - solve(W, missed[:, None])[:, 0]
+    W, residual = _restrict_to_tangents(system, q1, v0 + h * slope, W, (p - p0) / h - force, h)
+    return slope - solve(W, residual[:, None])[:, 0]
 
 
-def _restrict_to_tangents(system: SimpleClosedSystem, q, v, W, missed, h=1.0) -> tuple[jax.Array, jax.Array]:
-    """The matrix and the misfit, over h, of an equation for a momentum at v; on a manifold along Q, and v tangent."""
+def _restrict_to_tangents(system: SimpleClosedSystem, q, v, W, residual, h=1.0) -> tuple[jax.Array, jax.Array]:
+    """Restrict the matrix and the residual (over h) of an equation for a momentum to velocities v tangent to Q."""
     space = system.configurations
     if space is None:
-        return W, missed
+        return W, residual
     surface, mass = ConstraintSurface(space, tangent=True), jnp.max(jnp.abs(W))
 
     def normal_residual(w):
@@ -93,13 +93,13 @@ def _restrict_to_tangents(system: SimpleClosedSystem, q, v, W, missed, h=1.0) ->
             q, jax.jvp(space._constraints, (space.from_vector(q),), (space.from_vector(w),))[1]
         )
 
-    along = jax.vmap(lambda w: system.tangential_part(q, w), in_axes=1, out_axes=1)
-    W = along(W) + mass * jax.vmap(normal_residual, out_axes=1)(jnp.eye(len(v)))
-    return W, system.tangential_part(q, missed) + mass / h * normal_residual(v)
+    tangent_columns = jax.vmap(lambda w: system.tangential_part(q, w), in_axes=1, out_axes=1)
+    W = tangent_columns(W) + mass * jax.vmap(normal_residual, out_axes=1)(jnp.eye(len(v)))
+    return W, system.tangential_part(q, residual) + mass / h * normal_residual(v)
 
 
 def mass_scale(system: SimpleClosedSystem, q, v, S) -> jax.Array:
-    """The size of ``L_vv``."""
+    """Return the size of ``L_vv``, shape ()."""
     return jnp.max(jnp.abs(jax.jacfwd(system.momentum, argnums=1)(q, v, S)))
 
 
@@ -110,13 +110,13 @@ def _momentum_of_v(model, v):
 
 @jit_program
 def velocity_from_momentum(system: SimpleClosedSystem, q, S, p, v):
-    """v with ``L_v(q, v, S) = p``, near a guess; NaN where Newton's method finds none."""
+    """Return v with ``L_v(q, v, S) = p``, near a guess; NaN if Newton's method does not converge."""
 
     def newton(_, v):
-        W, found = _jacobian_and_value(lambda v: system.momentum(q, v, S), v)
-        W, missed = _restrict_to_tangents(system, q, v, W, found - p)
-        return v - solve(W, missed[:, None])[:, 0]
+        W, momentum = _jacobian_and_value(lambda v: system.momentum(q, v, S), v)
+        W, residual = _restrict_to_tangents(system, q, v, W, momentum - p)
+        return v - solve(W, residual[:, None])[:, 0]
 
     v = jax.lax.fori_loop(0, 20, newton, v)
-    defect = jnp.max(jnp.abs(system.tangential_part(q, system.momentum(q, v, S) - p)))
-    return jnp.where(defect <= 1e-12 * (1.0 + jnp.max(jnp.abs(p))), v, jnp.nan)
+    max_residual = jnp.max(jnp.abs(system.tangential_part(q, system.momentum(q, v, S) - p)))
+    return jnp.where(max_residual <= 1e-12 * (1.0 + jnp.max(jnp.abs(p))), v, jnp.nan)

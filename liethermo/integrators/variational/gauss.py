@@ -17,7 +17,7 @@ from .schemes import require_simple_closed
 
 
 class VariationalGauss(GaussMethod):
-    """The variational principle on polynomials of degree s, with Gauss quadrature: of order 2s.
+    """Variational integrator on polynomials of degree s with Gauss quadrature, of order 2s.
 
     The discrete action is ``L_d = h sum b_i L(q_i, V_i, S_i)`` on ``q_i = q_0 + h sum A_ij V_j``, varied over the
     inner V too, with the variational constraint ``T_i dS_i = -F_fr,i . dq_i`` and the phenomenological one at each
@@ -47,7 +47,7 @@ class VariationalGauss(GaussMethod):
     preserves = frozenset({"entropy_law"})
 
     def check(self, system: System) -> None:
-        """Raise InputError unless the system has a variational principle of this kind."""
+        """Raise InputError unless the system is a simple closed system on R^n."""
         require_simple_closed(system, "VariationalGauss")
 
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
@@ -57,21 +57,21 @@ class VariationalGauss(GaussMethod):
         q, S, t, p0 = q0 + h * (A @ V), S0 + h * (A @ s), t0 + h * c, system.momentum(q0, v0, S0)
 
         def forces(q, V, S, t):
-            by_q, p, minus_T = jax.grad(system.lagrangian_value, argnums=(0, 1, 2))(q, V, S)
-            friction, push = system.friction_force(q, V, S, t), system.external_force(q, V, S, t)
+            dL_dq, p, minus_T = jax.grad(system.lagrangian_value, argnums=(0, 1, 2))(q, V, S)
+            friction, external = system.friction_force(q, V, S, t), system.external_force(q, V, S, t)
             power, T = system.heating(q, V, S, t), jnp.where(minus_T < 0.0, -minus_T, jnp.nan)
-            received = jnp.stack([jnp.dot(push, V), power])
-            return by_q + friction + push, p, (power - jnp.dot(friction, V)) / T, received
+            energy_rates = jnp.stack([jnp.dot(external, V), power])
+            return dL_dq + friction + external, p, (power - jnp.dot(friction, V)) / T, energy_rates
 
-        force, p, s, received = jax.vmap(forces)(q, V, S, t)
+        force, p, s, node_rates = jax.vmap(forces)(q, V, S, t)
         W = jax.vmap(jax.jacfwd(system.momentum, argnums=1))(q, V, S)
-        missing = p0 + h * (A @ force) - p
-        V = V + jax.vmap(lambda W, r: solve(W, r[:, None])[:, 0])(W, missing)
+        momentum_residual = p0 + h * (A @ force) - p
+        V = V + jax.vmap(lambda W, r: solve(W, r[:, None])[:, 0])(W, momentum_residual)
         end = q0 + h * (b @ V), k[0, n : 2 * n], S0 + h * (b @ s)
         v_dot = velocity_slope(system, (q0, v0, S0, p0), end, b @ force, h)
         columns = [V, jnp.tile(v_dot, (self.number, 1)), s[:, None]]
         if system.has_ledger:
-            columns += [received, jnp.ones((self.number, 1))]
+            columns += [node_rates, jnp.ones((self.number, 1))]
         return jnp.concatenate(columns, axis=1)
 
     def __str__(self) -> str:

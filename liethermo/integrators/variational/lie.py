@@ -22,25 +22,27 @@ from ...tracing.programs import jit_program
 from ..base import WHY_FIXED_VARIATIONAL_STEP, OneStepMethod, checked_run_states, checked_step_size, kind_name, register
 
 NEWTON_STEPS = 20
-"""For the velocities between the states of a finished run."""
+"""Newton steps for the velocities between the states of a finished run."""
 
 
 class LieVariational(OneStepMethod):
-    """``(dtau^-1_{h xi_k})* l_xi(k) - (dtau^-1_{-h xi_k-1})* l_xi(k-1) = F^-_k + F^+_k-1``, ``T s = P_H - f·xi``.
+    """Variational integrator of order 2 for Euler-Poincaré equations with entropy.
 
-    The discrete principle of GBY Definition 3.7 with ``L_d = h l(xi_k, (S_k + S_k+1)/2)`` and
-    ``g_k+1 = g_k tau(h xi_k)``, tau the Cayley map or exp, varied along ``g_k exp(eta_k)``; without heat, the scheme of
-    Bou-Rabee & Marsden (2009). Forces act by halves on both ends, ``F^± = h (f + F)(xi_k, S)/2``. The inverse of the
-    derivative of the Cayley map is a polynomial, ``dtau^-1_xi eta = (I - xi/2) eta (I + xi/2)``; that of exp,
-    ``ad_xi / (exp(ad_xi) - 1)``, is there for every algebra, SU(n) among them, which the Cayley map leaves for n > 2.
+        (dtau^-1_{h xi_k})* l_xi(k) - (dtau^-1_{-h xi_k-1})* l_xi(k-1) = F^-_k + F^+_k-1,    T s = P_H - f·xi
+
+    is the discrete principle of GBY Definition 3.7 with ``L_d = h l(xi_k, (S_k + S_k+1)/2)`` and ``g_k+1 = g_k tau(h
+    xi_k)``, where tau is the Cayley map or exp, varied along ``g_k exp(eta_k)``. Without heat it is the scheme of
+    Bou-Rabee & Marsden (2009). Half of each force acts at either end, ``F^± = h (f + F)(xi_k, S)/2``. The inverse of
+    the derivative of the Cayley map is a polynomial, ``dtau^-1_xi eta = (I - xi/2) eta (I + xi/2)``. That of exp,
+    ``ad_xi / (exp(ad_xi) - 1)``, exists for every algebra, also for SU(n) with n > 2, which the Cayley map leaves.
 
     It runs as a one-step method on states (xi, S) of an :class:`liethermo.EulerPoincareClosedSystem`, from the momentum
     at one node, ``mu_k = l_xi``, to the next: without friction ``mu_k+1 = Ad*_{tau(h xi_k)} mu_k``. So the spatial
-    momentum is kept exactly (to the solver) wherever f does not act, and its Casimir functions with it; the entropy
-    falls at no step; the energy error is of second order and stays bounded without friction. Order 2. One equation of
-    the size of (xi, S) a step, solved by Newton's method.
+    momentum and its Casimirs are conserved exactly (to the solver) wherever f does not act. The entropy falls at no
+    step. The energy error is of second order, and bounded without friction. A step solves one equation of the size of
+    (xi, S) by Newton's method.
 
-    :meth:`attitudes` gives the group elements g_k of a run.
+    :meth:`attitudes` returns the group elements g_k of a run.
 
     Parameters
     ----------
@@ -54,7 +56,7 @@ class LieVariational(OneStepMethod):
 
     def __init__(self, tau: Literal["cayley", "exp"] = "cayley"):
         if tau not in ("cayley", "exp"):
-            raise InputError(f"tau is 'cayley' or 'exp', not {tau!r}")
+            raise InputError(f"tau must be 'cayley' or 'exp', got {tau!r}")
         self.tau = tau
 
     def __str__(self) -> str:
@@ -69,9 +71,9 @@ class LieVariational(OneStepMethod):
     preserves = frozenset({"entropy_law"})
 
     def check(self, system: System) -> None:
-        """Raise InputError where the Cayley map is to take an algebra to a group, and does not."""
+        """Raise InputError if the system has the wrong kind, or its algebra has no group by the Cayley map."""
         if not isinstance(system, EulerPoincareClosedSystem):
-            raise InputError(f"LieVariational runs an lt.EulerPoincareClosedSystem, not a {kind_name(system)}")
+            raise InputError(f"LieVariational needs an lt.EulerPoincareClosedSystem, got a {kind_name(system)}")
         algebra = system.algebra
         if self.tau == "exp":
             return
@@ -101,17 +103,17 @@ class LieVariational(OneStepMethod):
         step = _LieStep(system, self.tau, S0, h, t)
         mu0 = system.momentum(xi0, S0)
 
-        def misfit(y):
+        def residual(y):
             return jnp.append(mu0 - step.momenta(y)[0], step.constraint_residual(y))
 
         y = jnp.append(k[1, :n], k[0, n])
-        y = y - solve(jax.jacfwd(misfit)(y), misfit(y)[:, None])[:, 0]
+        y = y - solve(jax.jacfwd(residual)(y), residual(y)[:, None])[:, 0]
         S1, mu1 = S0 + h * y[n], step.momenta(y)[1]
         guess = xi0 + h * k[0, :n]
         W = jax.jacfwd(system.momentum)(guess, S1)
         xi_dot = k[0, :n] - solve(W, ((system.momentum(guess, S1) - mu1) / h)[:, None])[:, 0]
-        rest = system.ledger_rates(*step.work_and_heat_rates(y))
-        return jnp.stack([jnp.concatenate([xi_dot, y[n:], rest]), jnp.zeros_like(x).at[:n].set(y[:n])])
+        ledger = system.ledger_rates(*step.work_and_heat_rates(y))
+        return jnp.stack([jnp.concatenate([xi_dot, y[n:], ledger]), jnp.zeros_like(x).at[:n].set(y[:n])])
 
     def residual_jvp(self, system: System, x, compensation, h, k) -> Callable:
         return jnp.negative  # the slopes are Newton's method already: their derivative vanishes at the solution
@@ -120,7 +122,7 @@ class LieVariational(OneStepMethod):
         return h * k[0]
 
     def attitudes(self, system: EulerPoincareClosedSystem, x, h: float, start=None) -> np.ndarray:
-        """The group elements ``g_k+1 = g_k tau(h xi_k)`` along a run, shape (times, m, m).
+        """Return the group elements ``g_k+1 = g_k tau(h xi_k)`` along a run, shape (times, m, m).
 
         Parameters
         ----------
@@ -131,76 +133,74 @@ class LieVariational(OneStepMethod):
             g_0; the identity by default.
         """
         self.check(system)
-        steps = np.asarray(_group_increments(self, system, checked_run_states(system, x), checked_step_size(h)))
-        size = steps.shape[-1]
-        g0 = np.eye(size) if start is None else square_matrices(start, size, "start")
-        require_condition(
-            g0, np.isfinite, "start is an element of the group, and has entries that are not finite: {value}"
-        )
-        path = [np.asarray(g0)]
-        for turn in steps:
-            path.append(path[-1] @ turn)
-        return np.array(path)
+        increments = np.asarray(_group_increments(self, system, checked_run_states(system, x), checked_step_size(h)))
+        matrix_size = increments.shape[-1]
+        g0 = np.eye(matrix_size) if start is None else square_matrices(start, matrix_size, "start")
+        require_condition(g0, np.isfinite, "start must be finite, got the entry {value}")
+        elements = [np.asarray(g0)]
+        for increment in increments:
+            elements.append(elements[-1] @ increment)
+        return np.array(elements)
 
 
 class _LieStep(NamedTuple):
-    """The discrete equations of a step, of y = (xi, s): the velocity in it and the slope of the entropy."""
+    """The discrete equations of a step from the time t, for y = (xi, s): its velocity and the slope of the entropy."""
 
     system: EulerPoincareClosedSystem
     tau: str
     S0: jax.Array
     h: jax.Array
-    t: jax.Array  # when it begins
+    t: jax.Array
 
     def _midpoint(self, y) -> tuple[jax.Array, jax.Array, jax.Array]:
         return y[:-1], self.S0 + 0.5 * self.h * y[-1], self.t + 0.5 * self.h
 
     def momenta(self, y) -> tuple[jax.Array, jax.Array]:
-        """mu at its two ends."""
+        """Return the momenta mu at the start and at the end of the step."""
         xi, S, t = self._midpoint(y)
         force = self.system.friction_force(xi, S, t) + self.system.external_force(xi, S, t)
-        mu, push = self.system.momentum(xi, S), 0.5 * self.h * force
-        first, second = (self._apply_dtau_inverse(sign * self.h * xi, mu) for sign in (1.0, -1.0))
-        return first - push, second + push
+        mu, impulse = self.system.momentum(xi, S), 0.5 * self.h * force
+        mu_start, mu_end = (self._apply_dtau_inverse(sign * self.h * xi, mu) for sign in (1.0, -1.0))
+        return mu_start - impulse, mu_end + impulse
 
     def _apply_dtau_inverse(self, xi, mu) -> jax.Array:
-        """``(dtau^-1_xi)* mu``, the derivative trivialised on the right; of -xi on the left."""
+        """Return ``(dtau^-1_xi)* mu`` with the derivative trivialised on the right; for -xi on the left."""
         algebra = self.system.algebra
         if self.tau == "exp":
             return solve(dexp(algebra, -xi).T, mu[:, None])[:, 0]
         half = 0.5 * algebra.hat(xi)
-        one = jnp.eye(len(half))
+        identity = jnp.eye(len(half))
         basis = jnp.asarray(algebra.basis)
-        return jax.vmap(lambda eta: algebra.vee((one - half) @ eta @ (one + half)))(basis) @ mu
+        return jax.vmap(lambda eta: algebra.vee((identity - half) @ eta @ (identity + half)))(basis) @ mu
 
     def constraint_residual(self, y) -> jax.Array:
-        """``T s + f . xi - P_H``, which vanishes; NaN where the temperature is not positive."""
+        """Return ``T s + f . xi - P_H``, zero for a solution; NaN if the temperature is not positive."""
         xi, S, t = self._midpoint(y)
         T = -jax.grad(self.system.lagrangian, argnums=1)(xi, S)
-        gained = jnp.dot(self.system.friction_force(xi, S, t), xi) - self.system.heating(xi, S, t)
-        return jnp.where(T > 0.0, T, jnp.nan) * y[-1] + gained
+        power = jnp.dot(self.system.friction_force(xi, S, t), xi) - self.system.heating(xi, S, t)
+        return jnp.where(T > 0.0, T, jnp.nan) * y[-1] + power
 
     def work_and_heat_rates(self, y) -> tuple[jax.Array, jax.Array]:
-        """Work and heat from outside, per unit of time."""
+        """Return the work and the heat received from outside, per unit of time."""
         middle = self._midpoint(y)
         return jnp.dot(self.system.external_force(*middle), y[:-1]), self.system.heating(*middle)
 
 
 @jit_program
 def _group_increments(method: LieVariational, system: EulerPoincareClosedSystem, x, h):
-    """``tau(h xi_k)`` of every step, xi_k from the momentum before it."""
-    turn = cayley if method.tau == "cayley" else exp
+    """Return ``tau(h xi_k)`` of every step, with xi_k from the momentum before it, shape (steps, m, m)."""
+    tau = cayley if method.tau == "cayley" else exp
 
-    def group_increment(before, after):
-        (xi0, S0, t), (xi1, S1, _) = system.split_state(before), system.split_state(after)
+    def group_increment(x0, x1):
+        (xi0, S0, t), (xi1, S1, _) = system.split_state(x0), system.split_state(x1)
         step, s, mu0 = _LieStep(system, method.tau, S0, h, t), (S1 - S0) / h, system.momentum(xi0, S0)
 
         def newton(_, xi):
-            misfit = lambda xi: mu0 - step.momenta(jnp.append(xi, s))[0]  # noqa: E731
-            return xi - solve(jax.jacfwd(misfit)(xi), misfit(xi)[:, None])[:, 0]
+            residual = lambda xi: mu0 - step.momenta(jnp.append(xi, s))[0]  # noqa: E731
+            return xi - solve(jax.jacfwd(residual)(xi), residual(xi)[:, None])[:, 0]
 
         xi = jax.lax.fori_loop(0, NEWTON_STEPS, newton, 0.5 * (xi0 + xi1))
-        return turn(system.algebra, h * xi)
+        return tau(system.algebra, h * xi)
 
     return jax.vmap(group_increment)(x[:-1], x[1:])
 

@@ -32,56 +32,57 @@ from .discrete import Curve, DiscreteSystem, FiniteDifference, Pair
 from .equations import newton_step, velocity_from_momentum, velocity_slope
 
 CONSTRAINT_TOLERANCE = 1e-10
-"""Largest misfit of a given first step, relative to the heat ``T |S_1 - S_0|`` and the work that make it up."""
+"""Largest residual of a given first step, relative to its heat ``T |S_1 - S_0|`` plus its work."""
 
 SINGULAR_CONDITION_NUMBER = 1e13
-"""Condition number, of rows scaled alike, from which a matrix counts as singular."""
+"""Condition number, with rows scaled to 1, from which a matrix counts as singular."""
 
 Maps = FiniteDifference | Sequence[FiniteDifference] | str
 
 
 class VariationalIntegrator(OneStepMethod):
-    """``D_1 L_d(r_k) + D_2 L_d(r_k-1) + F^-_d(r_k) + F^+_d(r_k-1) = 0`` and ``P_d(r_k) = 0`` [GBY 3.12].
+    """Variational integrator of simple closed systems, from finite difference maps [GBY 3.12].
 
-    Here ``r_k = (q_k, q_k+1, S_k, S_k+1)``. With finite difference maps phi_i and their weights w_i, of sum 1,
-    ``L_d = h sum w_i L(phi_i)`` (3.10), ``F^±_d`` is the share of ``h sum w_i F(phi_i)`` at either end, and ``P_d = 0``
-    (3.9) is
+        D_1 L_d(r_k) + D_2 L_d(r_k-1) + F^-_d(r_k) + F^+_d(r_k-1) = 0,    P_d(r_k) = 0,    r_k = (q_k, q_k+1, S_k,
+        S_k+1).
+
+    With finite difference maps phi_i and their weights w_i, of sum 1, ``L_d = h sum w_i L(phi_i)`` (3.10), ``F^±_d`` is
+    the portion of ``h sum w_i F(phi_i)`` at either end, and ``P_d = 0`` (3.9) is
 
         sum w_i T_i (S_k+1 - S_k)/h = sum w_i (P_H - F_fr . v)_i,    T = -L_S.
 
     The three schemes of the paper are :meth:`verlet`, :meth:`midpoint` (the alpha family) and :meth:`symmetrised`.
 
     It runs as a one-step method on states (q, v, S) of a :class:`liethermo.SimpleClosedSystem`, from node to node:
-    ``p_k = L_v(q_k, v_k, S_k) = -D_1 L_d(r_k) - F^-_d(r_k)`` and ``p_k+1 = D_2 L_d(r_k) + F^+_d(r_k)`` are (3.12), and
-    make the first step from (q_0, v_0, S_0) one like the others. :meth:`state` starts from (q_0, q_1, S_0).
+    ``p_k = L_v(q_k, v_k, S_k) = -D_1 L_d(r_k) - F^-_d(r_k)`` and ``p_k+1 = D_2 L_d(r_k) + F^+_d(r_k)`` are (3.12), so
+    the first step from (q_0, v_0, S_0) is like the others. :meth:`state` starts from (q_0, q_1, S_0).
 
-    The entropy falls at no step, for every L, friction and step size, since temperatures are positive (where one is
-    not, the run stops). The energy is not kept: its error oscillates or stays bounded, see the paper. The flow obeys
-    (4.7); it is symplectic where nothing depends on S. Order 2 where the maps are symmetric, else 1. One equation of
-    the size of (q, S) a step, solved by Newton's method with the matrix (3.13); where the motion does not depend on
-    S_k+1 and is affine in q_k+1 it is solved outright.
+    The entropy falls at no step, for every L, friction and step size, since temperatures are positive (otherwise the
+    run stops). The energy is not conserved: its error oscillates or stays bounded, see the paper. The flow obeys (4.7);
+    it is symplectic where nothing depends on S. The order is 2 if the maps are symmetric, else 1. A step solves one
+    equation of the size of (q, S) by Newton's method with the matrix (3.13); one Newton step is exact if the motion
+    does not depend on S_k+1 and is affine in q_k+1.
 
-    On a manifold Q the maps look at a curve from q_k to q_k+1, at its parameter alpha, for the position and the
-    velocity. It is the chord in the arrays around, brought to Q; or with ``retraction`` the curve that this makes, such
-    as the geodesic of ``"exp"``, whose difference quotients are logarithms. Equation (3.12) holds along Q, and q_k+1 is
-    a point of it to rounding. The order is that on R^n, but 1 with a chart whose lines are not the same seen from both
-    ends ("cayley", "projection").
+    On a manifold Q the maps are evaluated on a curve from q_k to q_k+1, at its parameter alpha. The curve is the chord
+    in the arrays around, projected onto Q, or with ``retraction`` a curve of the retraction, such as the geodesic of
+    ``"exp"``, whose difference quotients are logarithms. Equation (3.12) holds along Q, and q_k+1 is on Q to rounding.
+    The order is that on R^n, but 1 with a chart whose lines differ from both ends ("cayley", "projection").
 
-    It runs a :class:`liethermo.ComposedSystem` too, of several entropies, in the variables (q, p, S) with
-    ``p_k = -D_1 L_d - F^-_d``. At the point (q_i, P_i, S_i) of each map, with a momentum of its own, the velocity
-    ``H_p`` is ``(q_k+1 - q_k)/h``. The momenta obey ``p_k = sum w_i (P_i - h (1 - alpha_i) (F - H_q)_i)`` and
-    ``p_k+1 = p_k + h sum w_i (F - H_q)_i``. Each entropy grows by the mean of the heat that its body receives, over the
-    mean temperature ``sum w_i H_S``, with which forces and heat are made too. The sum of the entropies falls at no
-    step, for every energy, friction and conductance.
+    It also runs a :class:`liethermo.ComposedSystem`, with several entropies, in the variables (q, p, S) with ``p_k =
+    -D_1 L_d - F^-_d``. At the point (q_i, P_i, S_i) of each map, with a momentum of its own, the velocity ``H_p`` is
+    ``(q_k+1 - q_k)/h``. The momenta obey ``p_k = sum w_i (P_i - h (1 - alpha_i) (F - H_q)_i)`` and ``p_k+1 = p_k + h
+    sum w_i (F - H_q)_i``. Each entropy grows by the mean of the heat that its body receives, over the mean temperature
+    ``sum w_i H_S``; forces and heat use this temperature too. The sum of the entropies falls at no step, for every
+    energy, friction and conductance.
 
     Parameters
     ----------
     phi : FiniteDifference, a sequence of them, or one of "verlet", "midpoint", "symmetrised"
-        For the discrete Lagrangian.
-    forces, constraint : likewise, optional
-        For the forces and the constraint, where they are chosen separately [GBY Remark 3.5]; phi by default.
+        Maps of the discrete Lagrangian.
+    forces, constraint : FiniteDifference, a sequence of them, or a name, optional
+        Maps of the forces and of the constraint, if they are chosen separately [GBY Remark 3.5]; phi by default.
     retraction : str or manifolds.Retraction, optional
-        On a manifold, of which the curves are made: :func:`manifolds.retraction` names them. Chords by default.
+        On a manifold, the retraction of the curves: :func:`manifolds.retraction` has the names. Chords by default.
     """
 
     systems = "simple closed and composed systems"
@@ -106,17 +107,17 @@ class VariationalIntegrator(OneStepMethod):
 
     @classmethod
     def verlet(cls, retraction: str | mf.Retraction | None = None) -> VariationalIntegrator:
-        """Scheme 1: everything at (q_k, S_k); order 1, explicit for quadratic kinetic energy and linear friction.
+        """Scheme 1: evaluate at (q_k, S_k); order 1, explicit for quadratic kinetic energy and linear friction.
 
-        On a manifold along the curves of ``retraction``.
+        ``retraction`` has the curves on a manifold.
         """
         return cls("verlet", retraction=retraction)
 
     @classmethod
     def midpoint(cls, alpha: float = 0.5, retraction: str | mf.Retraction | None = None) -> VariationalIntegrator:
-        """Scheme 2: everything at ``(1 - alpha) (q_k, S_k) + alpha (q_k+1, S_k+1)``; order 1 but for alpha = 1/2.
+        """Scheme 2: evaluate at ``(1 - alpha) (q_k, S_k) + alpha (q_k+1, S_k+1)``; order 2 for alpha = 1/2, else 1.
 
-        On a manifold along the curves of ``retraction``.
+        ``retraction`` has the curves on a manifold.
         """
         return cls(FiniteDifference(alpha), retraction=retraction)
 
@@ -124,7 +125,7 @@ class VariationalIntegrator(OneStepMethod):
     def symmetrised(cls, retraction: str | mf.Retraction | None = None) -> VariationalIntegrator:
         """Scheme 3: the mean of both ends; order 2.
 
-        On a manifold along the curves of ``retraction``.
+        ``retraction`` has the curves on a manifold.
         """
         return cls("symmetrised", retraction=retraction)
 
@@ -140,7 +141,7 @@ class VariationalIntegrator(OneStepMethod):
 
     @property
     def _has_symmetric_curves(self) -> bool:
-        """Whether curves on a manifold are the same seen from both ends."""
+        """True if the curves on a manifold are the same from both ends."""
         return self.retraction in SYMMETRIC_RETRACTION_NAMES or isinstance(self.retraction, SYMMETRIC_RETRACTION_TYPES)
 
     uses_charts = False
@@ -154,16 +155,18 @@ class VariationalIntegrator(OneStepMethod):
         return f"VariationalIntegrator({maps})"
 
     def check(self, system: System) -> None:
-        """Raise InputError unless the system has a variational principle of this kind."""
+        """Raise InputError unless the system is simple closed or composed, and the maps suit it."""
         if isinstance(system, EmbeddedSystem) and isinstance(system.manifold, SimpleClosedSystem):
             if any(type(map) is not FiniteDifference for map in (*self.phi, *self.forces, *self.constraint)):
                 raise InputError(
-                    "on a manifold a finite difference map looks at a curve of the space: give an lt.FiniteDifference "
-                    "and a retraction, no subclass of it"
+                    "on a manifold the maps must be lt.FiniteDifference itself, no subclass: they are evaluated on a "
+                    "curve of the space, which retraction= determines"
                 )
             self.curve(system.manifold)
         elif self.retraction is not None:
-            raise InputError(f"a {system.kind} without a manifold of positions takes no retraction: leave it out")
+            raise InputError(
+                f"retraction= needs a manifold of positions, and this {system.kind} has none. Leave retraction= out"
+            )
         elif isinstance(system, ComposedSystem):
             self._check_bodies(system)
         else:
@@ -171,13 +174,15 @@ class VariationalIntegrator(OneStepMethod):
 
     def _check_bodies(self, system: ComposedSystem) -> None:
         if not (self.phi == self.forces == self.constraint):
-            raise InputError(f"{self} has other maps for forces or the constraint: for several bodies all are phi")
+            raise InputError(f"for several bodies the maps of forces and constraint must be phi, and {self} has others")
         if any(type(map) is not FiniteDifference for map in self.phi):
-            raise InputError(f"{self} has finite difference maps of its own: several bodies take lt.FiniteDifference")
+            raise InputError(
+                f"for several bodies the maps must be lt.FiniteDifference itself, and {self} has a subclass"
+            )
         if len(self.phi) > 1 and system.poisson.species:
             raise InputError(
-                f"{self} takes means over several finite difference maps, and bodies that exchange particles run by "
-                "one: take lt.VariationalIntegrator.midpoint() or .verlet()"
+                f"bodies that exchange particles need a single finite difference map, and {self} has several. Use "
+                "lt.VariationalIntegrator.midpoint() or .verlet()"
             )
 
     def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
@@ -188,12 +193,12 @@ class VariationalIntegrator(OneStepMethod):
         )
 
     def discrete_system(self, system: SimpleClosedSystem, h, t=0.0) -> DiscreteSystem:
-        """L_d, F_d and P_d of a step of size h from the time t on."""
+        """Return L_d, F_d and P_d of a step of size h from the time t."""
         curve = self.curve(system)
         return DiscreteSystem(system, self.phi, self.forces, self.constraint, jnp.asarray(h), jnp.asarray(t), curve)
 
     def curve(self, system: SimpleClosedSystem) -> Curve | None:
-        """What the maps look at on a manifold; None on R^n."""
+        """Return the curve on a manifold at which the maps are evaluated; None on R^n."""
         space, kind = system.configurations, self.retraction
         if space is None or kind is None:
             return None if space is None else Curve(space)
@@ -227,7 +232,7 @@ class VariationalIntegrator(OneStepMethod):
     # -- starts and records -------------------------------------------------------------------------------------------
 
     def state(self, system: SimpleClosedSystem, q0, q1, S0, h: float, S1=None, t: float = 0.0) -> np.ndarray:
-        """The state from which the first step leads to q_1, with the time t in its ledger if it has one.
+        """Return the state from which the first step leads to q_1, with the time t in its ledger if it has one.
 
         Parameters
         ----------
@@ -235,15 +240,14 @@ class VariationalIntegrator(OneStepMethod):
         q0, q1 : array, shape (n,)
         S0 : float
         h : float
-            The step that the run will take.
+            The step size of the run.
         S1 : float, optional
-            To be checked: the constraint determines it.
+            Value to check: the constraint determines it.
 
         Raises
         ------
         InputError
-            If there is no S_1 that goes with q_0, q_1 and S_0, or the one given does not, or no velocity goes with the
-            momentum.
+            If no S_1 belongs to q_0, q_1 and S_0, the given S1 is wrong, or no velocity has the momentum.
         """
         require_simple_closed(system, "VariationalIntegrator")
         space = system.configurations
@@ -251,32 +255,32 @@ class VariationalIntegrator(OneStepMethod):
             q0, q1 = (space.to_vector(space.point(q)) for q in (q0, q1))
         q0, q1 = jnp.atleast_1d(check_numbers(q0, "q0")), jnp.atleast_1d(check_numbers(q1, "q1"))
         if not q0.shape == q1.shape == (system.degrees_of_freedom,):
-            raise InputError(f"q0 and q1 have shape ({system.degrees_of_freedom},), not {q0.shape} and {q1.shape}")
+            raise InputError(f"q0 and q1 must have shape ({system.degrees_of_freedom},), got {q0.shape} and {q1.shape}")
         discrete, S0 = (
             self.discrete_system(system, checked_step_size(h), check_numbers(t, "t", ())),
             check_numbers(S0, "S0", ()),
         )
-        found = discrete.solve_constraint(q0, q1, S0) if S1 is None else check_numbers(S1, "S1", ())
-        misfit, size = (float(a) for a in _constraint_residual(discrete, q0, q1, S0, found))
-        if not misfit <= CONSTRAINT_TOLERANCE * size:
+        S1_used = discrete.solve_constraint(q0, q1, S0) if S1 is None else check_numbers(S1, "S1", ())
+        residual, scale = (float(a) for a in _constraint_residual(discrete, q0, q1, S0, S1_used))
+        if not residual <= CONSTRAINT_TOLERANCE * scale:
             raise InputError(
-                f"this first step is not on the discrete constraint: |P_d| = {misfit:.3g} between a heat and a work of "
-                f"{size:.3g} (tolerance {CONSTRAINT_TOLERANCE:.0e} of it). "
+                f"this first step is not on the discrete constraint: |P_d| = {residual:.3g}, with heat and work of "
+                f"{scale:.3g} (relative tolerance {CONSTRAINT_TOLERANCE:.0e}). "
                 + (
                     "The temperature may be negative there"
                     if S1 is None
                     else "Leave S1 out: q0, q1 and S0 determine it"
                 )
             )
-        p0 = discrete.momenta(q0, q1, S0, found)[0]
+        p0 = discrete.momenta(q0, q1, S0, S1_used)[0]
         v0 = velocity_from_momentum(system, q0, S0, p0, (q1 - q0) / h)
         if not bool(jnp.isfinite(v0).all()):
-            raise InputError(f"no velocity was found that has the momentum {np.asarray(p0)} of this first step")
-        rest = jnp.array([0.0, 0.0, t]) if system.has_ledger else jnp.zeros(0)
-        return np.concatenate([q0, v0, S0[None], rest])
+            raise InputError(f"no velocity has the momentum {np.asarray(p0)} of this first step")
+        ledger = jnp.array([0.0, 0.0, t]) if system.has_ledger else jnp.zeros(0)
+        return np.concatenate([q0, v0, S0[None], ledger])
 
     def energies(self, system: SimpleClosedSystem, x, h: float) -> np.ndarray:
-        """``E = v·L_v - L`` at the scheme's own points between consecutive states, as the paper records it.
+        """Return ``E = v·L_v - L`` at the scheme's own points between consecutive states, as in the paper.
 
         Parameters
         ----------
@@ -303,13 +307,14 @@ class VariationalIntegrator(OneStepMethod):
         )
         if not np.isfinite(matrix).all():
             return ""
-        size = np.abs(matrix).max(axis=1, keepdims=True)
-        singular = np.linalg.svd(matrix / np.where(size > 0.0, size, 1.0), compute_uv=False)
-        if singular[0] < SINGULAR_CONDITION_NUMBER * singular[-1]:
+        row_scales = np.abs(matrix).max(axis=1, keepdims=True)
+        singular_values = np.linalg.svd(matrix / np.where(row_scales > 0.0, row_scales, 1.0), compute_uv=False)
+        if singular_values[0] < SINGULAR_CONDITION_NUMBER * singular_values[-1]:
             return ""
         return (
-            f"the regularity matrix (3.13) is singular: of its singular values, rows scaled to 1, the least is "
-            f"{singular[-1]:.2g}. The discrete Lagrangian does not determine the step: take another step size or scheme"
+            f"the regularity matrix (3.13) is singular: with rows scaled to 1, its smallest singular value is "
+            f"{singular_values[-1]:.2g}. The discrete Lagrangian does not determine the step. Use another step size or "
+            "scheme"
         )
 
 
@@ -325,20 +330,23 @@ SYMMETRIC_RETRACTION_NAMES = (
     "group_exp",
     "midpoint_group_exp",
 )
+"""Names of retractions whose line through two points is the same in the charts around both."""
 SYMMETRIC_RETRACTION_TYPES = (
     mf.RiemannianRetraction,
     mf.EuclideanRetraction,
     mf.GroupRetraction,
     mf.MidpointRetraction,
 )
-"""Retractions of which a line through two points is the same in the charts around both."""
+"""Classes of retractions whose line through two points is the same in the charts around both."""
 
 
 def require_simple_closed(system: System, name: str) -> None:
     if isinstance(system, EmbeddedSystem):
-        raise InputError(f"{name} runs on R^n: on a manifold take lt.VariationalIntegrator or a metriplectic method")
+        raise InputError(
+            f"{name} runs only on R^n. On a manifold use lt.VariationalIntegrator or a metriplectic method"
+        )
     if not isinstance(system, SimpleClosedSystem):
-        raise InputError(f"{name} runs an lt.SimpleClosedSystem, not a {kind_name(system)}")
+        raise InputError(f"{name} needs an lt.SimpleClosedSystem, got a {kind_name(system)}")
 
 
 SCHEMES: dict[str, tuple[FiniteDifference, ...]] = {
@@ -346,18 +354,18 @@ SCHEMES: dict[str, tuple[FiniteDifference, ...]] = {
     "midpoint": (FiniteDifference(0.5),),
     "symmetrised": (FiniteDifference(0.0), FiniteDifference(1.0)),
 }
-"""The schemes of GBY §3.3 by name."""
+"""The finite difference maps of the schemes of GBY §3.3, by name."""
 
 
 def _checked_maps(maps: Maps, what: str) -> tuple[FiniteDifference, ...]:
-    named = SCHEMES.get(maps, ()) if isinstance(maps, str) else maps
-    found: tuple[Any, ...] = tuple(named) if isinstance(named, Sequence) else (named,)
-    if not found or not all(isinstance(map, FiniteDifference) for map in found):
+    map_or_maps = SCHEMES.get(maps, ()) if isinstance(maps, str) else maps
+    map_tuple: tuple[Any, ...] = tuple(map_or_maps) if isinstance(map_or_maps, Sequence) else (map_or_maps,)
+    if not map_tuple or not all(isinstance(map, FiniteDifference) for map in map_tuple):
         raise InputError(
             f"{what} must be an lt.FiniteDifference, a sequence of them, or one of {', '.join(map(repr, SCHEMES))}, "
-            f"not {maps!r}"
+            f"got {maps!r}"
         )
-    return found
+    return map_tuple
 
 
 def _is_symmetric_set(maps: tuple[FiniteDifference, ...]) -> bool:
@@ -366,21 +374,21 @@ def _is_symmetric_set(maps: tuple[FiniteDifference, ...]) -> bool:
 
 @jit_program
 def _constraint_residual(discrete: DiscreteSystem, q0, q1, S0, S1):
-    """``h |P_d|``, and the heat and work between which it is one."""
+    """Return ``h |P_d|``, and the sum of the heat and the work that it is the difference of."""
     pair = discrete.pair(q0, q1, S0, S1)
-    misfit, slope = jax.jvp(lambda s: discrete.constraint_residual(pair._replace(s=s)), (pair.s,), (jnp.ones(()),))
+    residual, slope = jax.jvp(lambda s: discrete.constraint_residual(pair._replace(s=s)), (pair.s,), (jnp.ones(()),))
     heat = jnp.abs(slope * pair.s)
-    return discrete.h * jnp.abs(misfit), discrete.h * (heat + jnp.abs(misfit - slope * pair.s)) + 1e-300
+    return discrete.h * jnp.abs(residual), discrete.h * (heat + jnp.abs(residual - slope * pair.s)) + 1e-300
 
 
 @jit_program
-def _step_energies(method: VariationalIntegrator, system: SimpleClosedSystem, h, before, after):
+def _step_energies(method: VariationalIntegrator, system: SimpleClosedSystem, h, start_states, end_states):
     def step_energy(x, y):
         (q0, _, S0, t), (q1, _, S1, _) = system.split_state(x), system.split_state(y)
         discrete = method.discrete_system(system, h, t)
         return discrete.energy(discrete.pair(q0, q1, S0, S1))
 
-    return jax.vmap(step_energy)(before, after)
+    return jax.vmap(step_energy)(start_states, end_states)
 
 
 @jit_program

@@ -1,8 +1,8 @@
 """Every method, with every option, converges to a solution that an independent program computed.
 
 The vector fields are written out by hand in NumPy and integrated by SciPy's DOP853 at 1e-13, so neither the library's
-brackets nor its gradients take part. A method that keeps every law and follows another flow, as one did that held a
-momentum map, fails here.
+brackets nor its gradients take part. A method that obeys every law and follows another flow fails here, as one did that
+held a momentum map.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ CANONICAL = np.block([[np.zeros((2, 2)), np.eye(2)], [-np.eye(2), np.zeros((2, 2
 
 @dataclass(frozen=True)
 class Problem:
-    """A system, its vector field by hand, where it starts, how long it runs, and what it conserves beside H."""
+    """A system, its vector field by hand, its start and duration, and its conserved functions beside H."""
 
     build: Callable[[], lt.systems.System]
     field: Callable[[np.ndarray], np.ndarray]
@@ -63,21 +63,22 @@ def _central_field(x):
     return np.concatenate([p, -(1.0 + q @ q) * q])
 
 
-MOMENTS, TILT = np.array([1.0, 1.0, 0.5]), 0.3
+MOMENTS = np.array([1.0, 1.0, 0.5])
+FIELD_CUBIC = 0.3
 
 
 def _top():
     """A symmetric heavy top in a field that is not uniform: the body's third momentum is a momentum map."""
 
     def energy(x):
-        return 0.5 * jnp.sum(MOMENTS * x[:3] ** 2) + x[5] + TILT * x[5] ** 3
+        return 0.5 * jnp.sum(MOMENTS * x[:3] ** 2) + x[5] + FIELD_CUBIC * x[5] ** 3
 
     return lt.LiePoissonSystem(mf.se(3), energy, momentum_maps={"third": lambda x: x[2]})
 
 
 def _top_field(x):
     m, p = x[:3], x[3:]
-    w, v = MOMENTS * m, np.array([0.0, 0.0, 1.0 + 3.0 * TILT * p[2] ** 2])
+    w, v = MOMENTS * m, np.array([0.0, 0.0, 1.0 + 3.0 * FIELD_CUBIC * p[2] ** 2])
     return np.concatenate([np.cross(m, w) + np.cross(p, v), np.cross(p, w)])
 
 
@@ -89,7 +90,7 @@ def _length(x):
 
 
 def _warm_top(parts: int = 1):
-    """Friction that keeps |p|^2, from an entropy that is not quadratic."""
+    """A top with friction that conserves |p|^2, from an entropy that is not quadratic."""
 
     def energy(x):
         return 0.5 * jnp.sum(AXES * x[:3] ** 2) + x[5] + 0.1 * x[0] ** 4
@@ -109,7 +110,8 @@ def _warm_top_field(x):
     return motion + 0.2 * (dS - frame @ (frame.T @ dS))
 
 
-TARGET, INERTIA = 1.9, np.array([3.0, 2.0, 1.0])
+TARGET = 1.9
+INERTIA = np.array([3.0, 2.0, 1.0])
 
 
 def _chosen_casimir():
@@ -130,7 +132,7 @@ def _chosen_casimir_field(m):
 
 
 def _bianchi():
-    """A Casimir that is no polynomial; the algebra's is known as the entropy alone."""
+    """A system whose Casimir is no polynomial; it is known as the entropy alone."""
 
     def energy(m):
         return 0.5 * jnp.dot(m, m) + 0.1 * jnp.sin(m[0])
@@ -165,7 +167,7 @@ MATRIX = np.array([[1.0, 0.3, 0.0], [0.3, 0.7, -0.2], [0.0, -0.2, 1.4]])
 
 
 def _cometric():
-    """A friction operator on R^3 with a constant Poisson tensor: a charged oscillator that heats a reservoir."""
+    """A friction operator on R^3 with a constant Poisson tensor: an oscillator that heats a reservoir."""
 
     def energy(x):
         return 0.5 * (x[0] ** 2 + x[1] ** 2) + 0.1 * x[0] ** 4 + jnp.exp(x[2])
@@ -220,13 +222,13 @@ def _squared_casimir(x):
     return jnp.dot(x[:3], x[3:])
 
 
-UP = np.array([0.4, -0.3, 1.2, 0.3, 0.2, 0.9])
+TOP_START = np.array([0.4, -0.3, 1.2, 0.3, 0.2, 0.9])
 PROBLEMS = {
     "central potential": Problem(_central, _central_field, (1.0, 0.0, 0.2, 0.8), 3.0, {"J": angular_momentum}),
     "symmetric top": Problem(
-        _top, _top_field, tuple(UP), 2.0, {"third": lambda x: x[2], "length": _length, "area": _squared_casimir}
+        _top, _top_field, tuple(TOP_START), 2.0, {"third": lambda x: x[2], "length": _length, "area": _squared_casimir}
     ),
-    "warm top": Problem(_warm_top, _warm_top_field, tuple(UP), 2.0, {"length": _length}),
+    "warm top": Problem(_warm_top, _warm_top_field, tuple(TOP_START), 2.0, {"length": _length}),
     "chosen Casimir": Problem(_chosen_casimir, _chosen_casimir_field, (0.8, 0.5, 1.2), 3.0, {}),
     "bianchi V": Problem(_bianchi, _bianchi_field, (0.3, 0.4, 1.5), 1.0, {}),
     "double bracket": Problem(
@@ -234,7 +236,7 @@ PROBLEMS = {
     ),
     "heated oscillator": Problem(_cometric, _cometric_field, (1.0, 0.5, 0.1), 2.0, {}),
     "spin with a bath": Problem(_spin, _spin_field, (0.6, 0.0, 0.8, 0.0), 2.0, {}),
-    "sum of frictions": Problem(lambda: _warm_top(2), _warm_top_field, tuple(UP), 2.0, {"length": _length}),
+    "sum of frictions": Problem(lambda: _warm_top(2), _warm_top_field, tuple(TOP_START), 2.0, {"length": _length}),
 }
 SYSTEMS = {name: functools.cache(problem.build) for name, problem in PROBLEMS.items()}
 
@@ -245,15 +247,16 @@ STEPS = {1: (80, 160), 2: (40, 80), 4: (16, 32), 6: (10, 20), 8: (5, 10)}
 """Numbers of steps, by order, in the asymptotic regime and above rounding."""
 
 FINER = {("spin with a bath", 6): (14, 28)}
-"""Those of single systems, whose order is seen in shorter steps: 5.1, 5.5, 5.7 as they fall."""
+"""Numbers of steps of single systems, whose order shows only in shorter steps: 5.1, 5.5, 5.7 as they shrink."""
 
 
-OF_EVERY_SYSTEM = lt.MetriplecticGauss | lt.MetriplecticMidpoint | lt.MetriplecticRungeKutta
+METRIPLECTIC_METHODS = lt.MetriplecticGauss | lt.MetriplecticMidpoint | lt.MetriplecticRungeKutta
+"""Classes of the methods for every system."""
 
 
-def every_method(name: str) -> list[lt.OneStepMethod]:
-    """Those that a problem is run with: all registered ones, and each option that applies."""
-    methods = [m for m in lt.registered_methods() if isinstance(m, OF_EVERY_SYSTEM)]
+def methods_for(name: str) -> list[lt.OneStepMethod]:
+    """Return the methods that a problem is run with: all registered ones, and each option that applies."""
+    methods = [m for m in lt.registered_methods() if isinstance(m, METRIPLECTIC_METHODS)]
     if name == "central potential":
         methods += [lt.MetriplecticGauss(s, preserve=angular_momentum) for s in (1, 2, 3)]
         methods += [lt.MetriplecticGauss(s, preserve=lambda x: jnp.sin(angular_momentum(x))) for s in (1, 2, 3)]
@@ -267,21 +270,21 @@ def every_method(name: str) -> list[lt.OneStepMethod]:
     return methods
 
 
-BY_DEFAULT = {
+DEFAULT_GAUSS_CASES = {
     ("central potential", 2),
     ("symmetric top", 2),
     ("chosen Casimir", 2),
     ("sum of frictions", 2),
 }
-"""Problem and stages of the Gauss methods that are run in the default tier."""
+"""Problem and stages of the Gauss methods that run in the default tier."""
 
 
 def cases():
     for name in PROBLEMS:
-        for i, method in enumerate(every_method(name)):
-            quick = isinstance(method, lt.MetriplecticGauss) and (name, method.stages) in BY_DEFAULT
+        for i, method in enumerate(methods_for(name)):
+            runs_by_default = isinstance(method, lt.MetriplecticGauss) and (name, method.stages) in DEFAULT_GAUSS_CASES
             case = pytest.param(name, method, id=f"{name}-{method}-{i}")
-            yield case if quick and not method.functions else slow(case)
+            yield case if runs_by_default and not method.functions else slow(case)
 
 
 @pytest.mark.sampled(1)
@@ -289,7 +292,9 @@ def cases():
 def test_convergence(name, method):
     problem, system = PROBLEMS[name], SYSTEMS[name]()
     explicit = isinstance(method, lt.MetriplecticRungeKutta)
-    few, many = (20, 40) if explicit and method.order == 4 else FINER.get((name, method.order), STEPS[method.order])
+    n_coarse, n_fine = (
+        (20, 40) if explicit and method.order == 4 else FINER.get((name, method.order), STEPS[method.order])
+    )
     runs = [
         lt.integrate(
             system,
@@ -297,10 +302,10 @@ def test_convergence(name, method):
             (0.0, problem.time),
             problem.time / n,
             method,
-            save_every=many,
+            save_every=n_fine,
             engine="compiled" if explicit else "array",
         )
-        for n in (few, many)
+        for n in (n_coarse, n_fine)
     ]
     errors = [float(np.abs(run.x[-1] - problem.end).max()) for run in runs]
     assert errors[1] > 1e-13, errors  # above the rounding of the reference
@@ -309,8 +314,10 @@ def test_convergence(name, method):
     for run in runs:
         assert run.audit(energy=1e-13).energy_drift <= 1e-13 or system.energy_law != "conserved"
         if isinstance(method, lt.MetriplecticGauss) or explicit:
-            asked = explicit or method.functions
-            held = [f for name, f in problem.kept.items() if name not in system.momentum_maps or asked]
-            for kept in held:
-                values = np.asarray(jax.vmap(kept)(run.x))
+            preserves_on_request = explicit or method.functions
+            invariants = [
+                f for name, f in problem.kept.items() if name not in system.momentum_maps or preserves_on_request
+            ]
+            for invariant in invariants:
+                values = np.asarray(jax.vmap(invariant)(run.x))
                 assert np.abs(values - values[0]).max() <= 4e-15 * max(1.0, abs(values[0]))

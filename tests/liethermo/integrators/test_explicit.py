@@ -1,4 +1,4 @@
-"""Explicit methods with both laws: laws from rest to instability, engines, derivatives, and what must fail."""
+"""Explicit methods with both laws: laws from rest to instability, engines, derivatives, and controls."""
 
 from typing import ClassVar
 
@@ -9,10 +9,11 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.integrators.explicit import CONSTRAINT_RESIDUAL_ROW, INITIAL_LEVELS_ROW, MEAN_SLOPE_ROW
+from liethermo.integrators.explicit import StepRow
 from tests.liethermo import random_systems
 
-RK, Taylor = lt.MetriplecticRungeKutta, lt.MetriplecticTaylor
+RK = lt.MetriplecticRungeKutta
+Taylor = lt.MetriplecticTaylor
 EPS = float(np.finfo(np.float64).eps)
 BODY = lt.models.rigid_body((5.0, 4.0, 2.0), rate=0.5)
 X0 = np.array([0.2, 1.0, 0.3])
@@ -28,10 +29,12 @@ def random_run(g, number, steps, method, h=0.002, engine="compiled"):
     return lt.ensemble(build, x0s, (0.0, h * steps), h, method, parameters=p, outputs="summary", engine=engine)
 
 
-def assert_laws(many):
-    assert many.ok.all(), str(many)
-    assert many.energy_drift.max() <= 1e-14
-    assert (many.least_entropy_increment >= -4 * EPS * np.maximum(many.entropy_scale, many.entropy_sensitivity)).all()
+def assert_laws(ensemble):
+    assert ensemble.ok.all(), str(ensemble)
+    assert ensemble.energy_drift.max() <= 1e-14
+    assert (
+        ensemble.least_entropy_increment >= -4 * EPS * np.maximum(ensemble.entropy_scale, ensemble.entropy_sensitivity)
+    ).all()
 
 
 @pytest.mark.sampled("MetriplecticRungeKutta(order=4)")
@@ -44,7 +47,7 @@ def test_laws_of_random_systems(method):
 @each_method
 @pytest.mark.parametrize("g", random_systems.ALGEBRAS, ids=lambda g: g.name)
 def test_laws_of_a_thousand_systems(g, method):
-    """143 on each of seven algebras."""
+    """The laws hold for 143 systems on each of seven algebras."""
     assert_laws(random_run(g, 143, 1000, method))
 
 
@@ -61,7 +64,7 @@ def test_drift_over_a_million_steps(method):
 
 
 def assert_no_drift(method, steps):
-    """Of the energy, and of a Casimir that is conserved, for energies that are not quadratic."""
+    """Assert that the energy and a conserved Casimir do not drift, for energies that are not quadratic."""
     quartic = lambda m: 0.5 * jnp.sum(m**2 / jnp.array([5.0, 4.0, 2.0])) + 0.1 * m[0] ** 4 + jnp.cos(m[2])  # noqa: E731
     for friction in (None, lt.KillingDissipation(1e-4)):
         system = lt.LiePoissonSystem(mf.so(3), quartic, lt.Quadratic(np.ones(3)), friction)
@@ -75,15 +78,15 @@ def assert_no_drift(method, steps):
 @pytest.mark.sampled(1)
 @each_method
 def test_a_state_that_relaxes_goes_on_at_its_rate(method):
-    """No rounding holds it off the equilibrium: the deviation decays by 1e-45, at the rate of the linear motion."""
+    """The deviation from equilibrium decays to 1e-45 at the rate of the linear motion: rounding does not stop it."""
     inertia, rate = np.array([5.0, 4.0, 2.0]), 1.0
     system = lt.models.rigid_body(tuple(inertia), rate=rate)
     jacobian = np.asarray(jax.jacfwd(system.vector_field)(jnp.array([1.0, 0.0, 0.0])))[1:, 1:]
     slowest = np.linalg.eigvals(jacobian).real.max()
     run = lt.integrate(system, [1.0, 1e-9, 2e-9], (0.0, 2500.0), 0.5, method, save_every=10)
-    size = np.linalg.norm(run.x[:, 1:], axis=1)
-    assert size[-1] < 1e-40
-    assert np.log(size[-1] / size[100]) / (run.t[-1] - run.t[100]) == pytest.approx(slowest, rel=0.02)
+    deviation = np.linalg.norm(run.x[:, 1:], axis=1)
+    assert deviation[-1] < 1e-40
+    assert np.log(deviation[-1] / deviation[100]) / (run.t[-1] - run.t[100]) == pytest.approx(slowest, rel=0.02)
     assert run.audit().passed
 
 
@@ -124,7 +127,7 @@ def pushed_to_an_axis():
 
 
 def orbit_that_becomes_a_circle():
-    """Friction on the radial velocity alone: the angular momentum is conserved, and the motion goes on."""
+    """Friction acts on the radial velocity alone: the angular momentum is conserved, and the motion goes on."""
 
     def energy(x):
         return 0.5 * jnp.dot(x[2:4], x[2:4]) - 1.0 / jnp.sqrt(jnp.dot(x[:2], x[:2])) + jnp.exp(x[4])
@@ -151,10 +154,10 @@ RELAXING = [rubbing_body, spin_in_a_field, pushed_to_an_axis]
 
 
 def assert_laws_after_relaxation(case, method, end):
-    """In adaptive steps, which grow until they would not be stable: one of them overestimates the entropy's growth.
+    """Assert the laws in adaptive steps, which grow until one overestimates the growth of the entropy.
 
-    The levels have no common point there. Corrections that aimed at one missed the energy and the Casimirs by 1e-15 in
-    each step, all with one sign.
+    The levels then have no common point. Corrections toward one missed the energy and the Casimirs by 1e-15 in each
+    step, all with one sign.
     """
     system, x0 = case()
     run = lt.integrate(system, x0, (0.0, end), lt.Adaptive(1e-7), method)
@@ -179,7 +182,7 @@ def test_adaptive_steps_keep_the_laws_long_after_relaxation(method, case):
 @pytest.mark.slow
 @pytest.mark.parametrize("case", RELAXING)
 def test_fixed_steps_go_on_at_an_equilibrium(case):
-    """Those that are stable; steps of the same size as adaptive ones end up with."""
+    """Stable fixed steps, as long as the final adaptive steps, keep the laws at an equilibrium."""
     system, x0 = case()
     for method, h in ((RK(4), 0.5), (RK(8), 1.0)):
         assert lt.integrate(system, x0, (0.0, 2000.0), h, method).audit(energy=2e-15).passed
@@ -188,7 +191,7 @@ def test_fixed_steps_go_on_at_an_equilibrium(case):
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", [RK(8), RK(6)], ids=str)
 def test_adaptive_steps_on_a_circular_orbit(method):
-    """The gradient of the energy is across each step, and that of the entropy depends on the others."""
+    """The laws hold though grad H is orthogonal to each step, and grad S depends on the other gradients."""
     system, x0 = orbit_that_becomes_a_circle()
     run = lt.integrate(system, x0, (0.0, 1000.0), lt.Adaptive(1e-7), method)
     assert run.stats.rejected < 100
@@ -217,7 +220,7 @@ def kepler():
 @each_method
 @pytest.mark.parametrize("excess", [0.0, 1e-12, 1e-6, 1e-3, 0.1])
 def test_dependent_gradients(method, excess):
-    """Those of energy and angular momentum are near a circular orbit: the laws hold, or a status tells of a step."""
+    """Near a circular orbit grad H and grad J are nearly parallel: the laws hold, or a status says so."""
     run = lt.integrate(kepler(), [1.0, 0.0, 0.0, np.sqrt(1.0 + excess)], (0.0, 20.0), 0.1, method, on_failure="return")
     assert run.status.code in ("completed", "not_converged")
     assert run.audit().energy_drift <= 2e-14
@@ -226,10 +229,10 @@ def test_dependent_gradients(method, excess):
         assert run.status.ok
 
 
-def test_what_is_preserved_on_request():
+def test_functions_preserved_on_request():
     system = lt.MetriplecticSystem(mf.Canonical(2), kepler().energy, dim=4)
     x0 = [1.0, 0.0, 0.0, 1.2]
-    runs = [lt.integrate(system, x0, (0.0, 10.0), 0.2, RK(6, kept)) for kept in ((), (angular_momentum,))]
+    runs = [lt.integrate(system, x0, (0.0, 10.0), 0.2, RK(6, preserve)) for preserve in ((), (angular_momentum,))]
     values = [np.array([angular_momentum(x) for x in run.x]) for run in runs]
     drifts = [np.abs(v / v[0] - 1.0).max() for v in values]
     assert drifts[0] > 1e-9
@@ -237,7 +240,7 @@ def test_what_is_preserved_on_request():
 
 
 def test_a_driven_body():
-    """The energy changes by the work done, exactly."""
+    """The energy changes by exactly the work done."""
     system = lt.LiePoissonSystem(
         mf.so(3),
         lambda m, t: 0.5 * jnp.sum(m**2 / jnp.array([5.0, 4.0, 2.0])) + 0.2 * jnp.sin(t) * m[0] ** 3,
@@ -276,10 +279,10 @@ def test_adaptive_steps_events_and_output_between(method):
         assert run.audit().passed
     assert np.median(errors) < 10.0, errors
     assert np.median(errors) > 0.01 or method.order > 8, errors  # those arrive while their first steps still grow
-    before, after = run.t[len(run.t) // 2 - 1 : len(run.t) // 2 + 1]
-    middle = 0.5 * (before + after)
-    between = lt.integrate(BODY, X0, (0.0, middle), middle, lt.Reference(rtol=1e-13)).x[-1]
-    assert np.abs(run(middle) - between).max() < 1e-10
+    t_left, t_right = run.t[len(run.t) // 2 - 1 : len(run.t) // 2 + 1]
+    t_middle = 0.5 * (t_left + t_right)
+    x_middle = lt.integrate(BODY, X0, (0.0, t_middle), t_middle, lt.Reference(rtol=1e-13)).x[-1]
+    assert np.abs(run(t_middle) - x_middle).max() < 1e-10
     event = lt.integrate(BODY, X0, (0.0, 10.0), lt.Adaptive(1e-9), method, until=lambda m: m[1] - 0.5)
     assert event.status.code == "event"
     assert event.x[-1][1] == pytest.approx(0.5, abs=1e-12)
@@ -295,59 +298,62 @@ def test_engines_take_the_same_steps(method):
     assert np.abs(a.x - b.x).max() <= 1e-14
     assert a.stats.fixed_point_iterations == b.stats.fixed_point_iterations == a.stats.steps
     x0s = np.random.default_rng(0).standard_normal((11, 3))
-    many = lt.ensemble(system, x0s, (0.0, 5.0), 0.2, method, engine="compiled").x
-    alone = [lt.integrate(system, x, (0.0, 5.0), 0.2, method, engine="compiled").x[-1] for x in x0s]
-    assert np.abs(many - alone).max() <= 1e-15 * np.abs(many).max()
+    ensemble_states = lt.ensemble(system, x0s, (0.0, 5.0), 0.2, method, engine="compiled").x
+    single_states = [lt.integrate(system, x, (0.0, 5.0), 0.2, method, engine="compiled").x[-1] for x in x0s]
+    assert np.abs(ensemble_states - single_states).max() <= 1e-15 * np.abs(ensemble_states).max()
 
 
 @pytest.mark.slow
 @each_method
 def test_derivatives(method):
-    """Against differences of fourth order, by the state and by a parameter."""
+    """Derivatives by the state and by a parameter agree with differences of fourth order."""
 
     def end(x, rate):
         return lt.flow(lt.models.rigid_body((5.0, 4.0, 2.0), rate=rate), x, (0.0, 3.0), 0.25, method)
 
-    forwards = jax.jacfwd(end, (0, 1))(jnp.asarray(X0), 0.5)
-    backwards = jax.jacrev(end, (0, 1))(jnp.asarray(X0), 0.5)
+    forward_jacobians = jax.jacfwd(end, (0, 1))(jnp.asarray(X0), 0.5)
+    reverse_jacobians = jax.jacrev(end, (0, 1))(jnp.asarray(X0), 0.5)
 
     def difference(f, h=1e-3):
         return (8 * (f(h) - f(-h)) - (f(2 * h) - f(-2 * h))) / (12 * h)
 
-    by_state = np.stack([difference(lambda e, v=v: np.asarray(end(X0 + e * v, 0.5))) for v in np.eye(3)], axis=1)
-    by_rate = difference(lambda e: np.asarray(end(X0, 0.5 + e)))
-    for found in (forwards, backwards):
-        assert np.abs(found[0] - by_state).max() < 1e-10
-        assert np.abs(found[1] - by_rate).max() < 1e-10
+    state_derivative = np.stack(
+        [difference(lambda e, v=v: np.asarray(end(X0 + e * v, 0.5))) for v in np.eye(3)], axis=1
+    )
+    rate_derivative = difference(lambda e: np.asarray(end(X0, 0.5 + e)))
+    for jacobians in (forward_jacobians, reverse_jacobians):
+        assert np.abs(jacobians[0] - state_derivative).max() < 1e-10
+        assert np.abs(jacobians[1] - rate_derivative).max() < 1e-10
 
 
 # -- controls ---------------------------------------------------------------------------------------------------------
 
 
-def uncorrected(method):
-    """The method without its corrections, and blind to what it misses of the levels."""
+def remove_corrections(method):
+    """Return the method without its corrections, which does not report its constraint residual."""
 
-    class Uncorrected(type(method)):
+    class UncorrectedMethod(type(method)):
         def slopes(self, system, x, compensation, h, k):
             laws = self._laws(system)
-            rates = lambda y: self.rates(system, laws, y)  # noqa: E731
-            d, _, error, between = self.base_step(rates, False, x, compensation, h)
-            return jnp.stack([d / h, error, jnp.zeros_like(x), k[INITIAL_LEVELS_ROW], *between])
+            rates = lambda y: self.field_and_law_rates(system, laws, y)  # noqa: E731
+            d, _, error, interpolation_rows = self.base_step(rates, False, x, compensation, h)
+            return jnp.stack([d / h, error, jnp.zeros_like(x), k[StepRow.INITIAL_LEVELS], *interpolation_rows])
 
-    return Uncorrected(method.order)
+    return UncorrectedMethod(method.order)
 
 
 STEPS_TO_DRIFT = {
     RK: {4: [20, 30, 45], 6: [14, 20, 28], 8: [10, 14, 20]},
     Taylor: {6: [14, 20, 28], 12: [11, 13, 16], 20: [11, 12, 13]},
 }
+"""Numbers of steps, by method and order, that show the drift without corrections."""
 
 
 @pytest.mark.sampled(1)
 @each_method
 def test_without_corrections_the_energy_drifts_at_the_order_of_the_method(method):
     steps, x0 = np.array(STEPS_TO_DRIFT[type(method)][method.order]), 6.0 * X0
-    runs = [lt.integrate(BODY, x0, (0.0, 5.0), 5.0 / n, uncorrected(method)) for n in steps]
+    runs = [lt.integrate(BODY, x0, (0.0, 5.0), 5.0 / n, remove_corrections(method)) for n in steps]
     drifts = [run.audit().energy_drift for run in runs]
     slope = -np.polyfit(np.log(steps), np.log(drifts), 1)[0]
     assert min(drifts) > 1e-13
@@ -355,27 +361,27 @@ def test_without_corrections_the_energy_drifts_at_the_order_of_the_method(method
     assert lt.integrate(BODY, x0, (0.0, 5.0), 5.0 / steps[-1], method).audit().energy_drift < 1e-15
 
 
-class Unchecked(RK):
-    """Corrections but one are left out, and what the step misses of the levels is not."""
+class SingleCorrection(RK):
+    """Control: only one correction is made."""
 
-    corrections: ClassVar[int] = 1
+    max_corrections: ClassVar[int] = 1
 
 
 def test_a_step_that_misses_its_levels_fails():
-    run = lt.integrate(BODY, 6.0 * X0, (0.0, 1.0), 0.5, Unchecked(4), on_failure="return")
+    run = lt.integrate(BODY, 6.0 * X0, (0.0, 1.0), 0.5, SingleCorrection(4), on_failure="return")
     assert run.status.code == "not_converged"
     assert run.status.residual > 1e-10
 
 
 def test_an_energy_is_not_steered_where_the_levels_hardly_meet():
-    """At an equilibrium the entropy is the most that the energy allows: one ulp less of this, and there is none."""
+    """At an equilibrium the entropy is maximal for the energy: with one ulp less energy no such state exists."""
     heat = lambda x: jnp.exp(x[0]) + jnp.exp(x[1])  # noqa: E731
     K = lambda x: 0.1 * jnp.outer(a := jnp.array([jnp.exp(x[1]), -jnp.exp(x[0])]), a)  # noqa: E731
     system = lt.MetriplecticSystem(mf.NoPoisson(2), heat, lambda x: x[0] + x[1], lt.FrictionOperator(K), dim=2)
     x, method, zero = jnp.array([1.0 + 1e-10, 1.0]), RK(4).on(system), jnp.zeros(2)
     k = method.start(system, x)
-    for off in (0.0, 6.0 * EPS, -6.0 * EPS):  # levels of a start that roundings have taken the run away from
-        levels = k.at[INITIAL_LEVELS_ROW, 0].multiply(1.0 + off)
-        found = method.slopes(system, x, zero, 0.01, levels)
-        assert np.abs(found[CONSTRAINT_RESIDUAL_ROW]).max() * 0.01 < 1e-14
-        assert np.abs(found[MEAN_SLOPE_ROW]).max() < 1e-9
+    for drift in (0.0, 6.0 * EPS, -6.0 * EPS):  # levels of a start that roundings have taken the run away from
+        levels = k.at[StepRow.INITIAL_LEVELS, 0].multiply(1.0 + drift)
+        k_new = method.slopes(system, x, zero, 0.01, levels)
+        assert np.abs(k_new[StepRow.CONSTRAINT_RESIDUAL]).max() * 0.01 < 1e-14
+        assert np.abs(k_new[StepRow.MEAN_SLOPE]).max() < 1e-9

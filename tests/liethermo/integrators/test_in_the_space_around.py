@@ -1,4 +1,4 @@
-"""Systems on manifolds without charts: the order, the laws and the constraints in the space around, and refusals."""
+"""Systems on manifolds without charts: order, laws and constraints in the space around, and rejected input."""
 
 from __future__ import annotations
 
@@ -13,17 +13,16 @@ import manifolds as mf
 from liethermo.runs.preparation import prepare_run
 from tests.manifolds.spaces.test_own_spaces import Ellipsoid
 
-RK4, RK8, GAUSS, MIDPOINT = (
-    lt.MetriplecticRungeKutta(4),
-    lt.MetriplecticRungeKutta(8),
-    lt.MetriplecticGauss(2),
-    lt.MetriplecticMidpoint(),
-)
+RK4 = lt.MetriplecticRungeKutta(4)
+RK8 = lt.MetriplecticRungeKutta(8)
+GAUSS = lt.MetriplecticGauss(2)
+MIDPOINT = lt.MetriplecticMidpoint()
 
 STEPS = {2: (20, 40), 4: (10, 20), 8: (6, 9)}
+"""Numbers of steps, by order."""
 
-ON_THE_SPACE = 4e-15
-"""Residual of a state, relative to it; at most 7e-16 seen after 10^4 steps."""
+MAX_SPACE_RESIDUAL = 4e-15
+"""Largest residual of a state, relative to it; at most 7e-16 seen after 10^4 steps."""
 
 SPACES = {
     "sphere": lambda: mf.Sphere(2),
@@ -41,14 +40,14 @@ SPACES = {
     "power": lambda: mf.Sphere(2) ** 2,
     "ellipsoid": lambda: Ellipsoid((1.0, 1.5, 2.0)),
 }
-"""By name. The last has no equations, only a projection."""
+"""Spaces by name; the last has no equations, only a projection."""
 
-FINER = {"hyperboloid": 4}
-"""Where the motion is faster: orders are seen in steps that many times as short."""
+STEP_REFINEMENTS = {"hyperboloid": 4}
+"""Factors on the numbers of steps for spaces with a faster motion."""
 
 
 def relaxing(space: mf.Space) -> lt.MetriplecticSystem:
-    """An energy and an entropy without symmetries, neither quadratic; the metric is that of the space."""
+    """Return a system without symmetries, neither energy nor entropy quadratic, with the metric of the space."""
     random = np.random.default_rng(5)
     (a, b), Q = random.standard_normal((2, space.size)), random.standard_normal((space.size, space.size))
     Q = -(Q @ Q.T) / space.size
@@ -69,23 +68,23 @@ def start(space: mf.Space) -> np.ndarray:
 
 
 def reference(system: lt.MetriplecticSystem, x0, T: float) -> np.ndarray:
-    """SciPy's solution of the field on the manifold, in the arrays around it."""
+    """Return SciPy's solution of the field on the manifold, in the arrays around it."""
     field = jax.jit(lambda x: system.vector_field(x))
-    found = solve_ivp(lambda t, x: np.asarray(field(x)), (0.0, T), x0, method="DOP853", rtol=1e-12, atol=1e-13)
-    return found.y[:, -1]
+    solution = solve_ivp(lambda t, x: np.asarray(field(x)), (0.0, T), x0, method="DOP853", rtol=1e-12, atol=1e-13)
+    return solution.y[:, -1]
 
 
-def check(name: str, method) -> None:
+def check_order_and_laws(name: str, method) -> None:
     space = SPACES[name]()
     system, x0, T = relaxing(space), start(space), 1.0
     exact, errors = reference(system, x0, T), []
-    steps = [FINER.get(name, 1) * n for n in STEPS[method.order]]
+    steps = [STEP_REFINEMENTS.get(name, 1) * n for n in STEPS[method.order]]
     for n in steps:
         run = lt.integrate(system, x0, (0.0, T), T / n, method)
         assert run.audit().passed, run.audit()
         assert run.audit().energy_drift <= 1e-14
         assert run.stats.least_entropy_increment > 0.0
-        assert float(space.residual(system.points(run.x)).max()) <= ON_THE_SPACE
+        assert float(space.residual(system.points(run.x)).max()) <= MAX_SPACE_RESIDUAL
         errors.append(np.abs(run.x[-1] - exact).max())
     slope = np.log(errors[0] / errors[1]) / np.log(steps[1] / steps[0])
     assert errors[-1] < 1e-12 or abs(slope - method.order) < 0.12 * method.order, (errors, slope)
@@ -97,56 +96,56 @@ def check(name: str, method) -> None:
     ids=lambda value: value if isinstance(value, str) else str(value),
 )
 def test_order_laws_and_constraints(name, method):
-    check(name, method)
+    check_order_and_laws(name, method)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", [RK4, RK8, GAUSS, MIDPOINT], ids=str)
 @pytest.mark.parametrize("name", SPACES)
 def test_order_laws_and_constraints_everywhere(name, method):
-    check(name, method)
+    check_order_and_laws(name, method)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["sphere", "SPD", "Stiefel", "hyperboloid", "rotations"])
 def test_with_charts_and_without(name):
-    """The same flow: both are within their errors of the other."""
+    """Runs in charts and without agree within their errors."""
     space = SPACES[name]()
     system, x0 = relaxing(space), start(space)
     runs = [lt.integrate(system, x0, (0.0, 1.0), 0.05, m) for m in (GAUSS, lt.MetriplecticGauss(2, retraction="exp"))]
     assert np.abs(runs[0].x - runs[1].x).max() < 1e-5
 
 
-def test_what_is_run_is_a_system_on_arrays():
-    """No chart: a spin moves along every sphere, so nothing is projected; with a retraction it is in charts."""
+def test_the_embedded_system_runs_unless_a_retraction_is_given():
+    """Without a retraction a spin runs without chart and projection; with a retraction it runs in charts."""
     spin = lt.MetriplecticSystem(mf.LiePoisson(mf.so(3)), lambda s: s[0] ** 4 + s[1] ** 2, space=mf.Sphere(2))
     system, method = prepare_run(spin, GAUSS)
     assert type(system).__name__ == "EmbeddedSystem"
     assert system.is_tangent
     assert method == GAUSS
-    in_charts = prepare_run(spin, lt.MetriplecticGauss(2, retraction="exp"))
-    assert in_charts[0] is spin
-    assert isinstance(in_charts[1], lt.InCharts)
+    chart_run = prepare_run(spin, lt.MetriplecticGauss(2, retraction="exp"))
+    assert chart_run[0] is spin
+    assert isinstance(chart_run[1], lt.InCharts)
 
     def tensor(x):
         a, b, c = x
         c = c + jnp.sum(x**2) - 1.0  # off the sphere it is no longer tangent
         return jnp.array([[0, -c, b], [c, 0, -a], [-b, a, 0]])
 
-    other = lt.MetriplecticSystem(tensor, lambda s: s[0] ** 4 + s[1] ** 2, space=mf.Sphere(2))
-    assert not prepare_run(other, GAUSS)[0].is_tangent
+    not_tangent = lt.MetriplecticSystem(tensor, lambda s: s[0] ** 4 + s[1] ** 2, space=mf.Sphere(2))
+    assert not prepare_run(not_tangent, GAUSS)[0].is_tangent
     x0 = np.array([0.6, 0.64, 0.48])
-    ends = [lt.integrate(s, x0, (0.0, 1.0), 0.01, GAUSS).x[-1] for s in (spin, other)]
+    ends = [lt.integrate(s, x0, (0.0, 1.0), 0.01, GAUSS).x[-1] for s in (spin, not_tangent)]
     assert np.abs(ends[0] - ends[1]).max() < 1e-6
-    assert abs(np.linalg.norm(ends[1]) - 1.0) < ON_THE_SPACE
+    assert abs(np.linalg.norm(ends[1]) - 1.0) < MAX_SPACE_RESIDUAL
 
 
 def test_a_step_out_of_the_domain_ends_the_run():
-    """A covariance that would lose its rank in one long step: a status with the time, not a NaN."""
-    falling = lt.MetriplecticSystem(
+    """A covariance that would lose its rank in one long step ends the run with a status, not with NaN."""
+    shrinking = lt.MetriplecticSystem(
         None, lambda P: 3.0 * jnp.trace(P), dissipation=lt.Friction(np.ones(4)), space=mf.SPD(2), validate=False
     )
-    run = lt.integrate(falling, np.eye(2), (0.0, 2.0), 0.25, RK4, on_failure="return")
+    run = lt.integrate(shrinking, np.eye(2), (0.0, 2.0), 0.25, RK4, on_failure="return")
     assert run.status.code == "non_finite"
     assert "leaves SPD(2): not positive definite" in run.status.message
     assert "t = 0.25" in run.status.message
@@ -154,42 +153,42 @@ def test_a_step_out_of_the_domain_ends_the_run():
     assert len(run.t) == 2
 
 
-def on_a_sphere(energy):
+def sphere_system(energy):
     return lt.MetriplecticSystem(None, energy, lambda x: x[1], lt.ProjectedMetric(), space=mf.Sphere(2))
 
 
 @pytest.mark.parametrize(
     ("build", "error", "message"),
     [
-        (lambda: on_a_sphere(lambda x: jnp.log(x[0] - 2.0)), lt.InputError, "not finite at any of the 4 test points"),
-        (lambda: on_a_sphere(lambda x: x[0] * x[:2]), lt.FunctionError, r"the energy must return one number.*\(2,\)"),
+        (lambda: sphere_system(lambda x: jnp.log(x[0] - 2.0)), lt.InputError, "not finite at any of the 4 test points"),
+        (lambda: sphere_system(lambda x: x[0] * x[:2]), lt.FunctionError, r"the energy must return one number.*\(2,\)"),
         (
-            lambda: lt.integrate(on_a_sphere(lambda x: x[0]), [1.0, 1.0, 0.0], (0.0, 1.0), 0.1, RK4),
+            lambda: lt.integrate(sphere_system(lambda x: x[0]), [1.0, 1.0, 0.0], (0.0, 1.0), 0.1, RK4),
             mf.OffManifoldError,
             r"S\^2: .*is off the space: residual 0\.414.*project=True",
         ),
         (
-            lambda: lt.integrate(on_a_sphere(lambda x: x[0]), [1.0, np.nan, 0.0], (0.0, 1.0), 0.1, RK4),
+            lambda: lt.integrate(sphere_system(lambda x: x[0]), [1.0, np.nan, 0.0], (0.0, 1.0), 0.1, RK4),
             ValueError,
             "not finite",
         ),
     ],
 )
-def test_what_is_no_system_or_no_point_is_refused_in_one_line(build, error, message):
+def test_invalid_systems_and_points_are_rejected_in_one_line(build, error, message):
     with pytest.raises(error, match=message) as refusal:
         build()
     assert "\n" not in str(refusal.value)
 
 
 def test_a_start_where_the_energy_is_not_finite_ends_the_run_with_a_reason():
-    system = on_a_sphere(lambda x: jnp.log(x[0]) + x[1])
+    system = sphere_system(lambda x: jnp.log(x[0]) + x[1])
     with pytest.raises(lt.IntegrationError, match="energy") as refusal:
         lt.integrate(system, [-1.0, 0.0, 0.0], (0.0, 1.0), 0.1, RK4)
     assert "not finite" in str(refusal.value)
 
 
-def test_a_point_near_the_space_stays_as_near():
-    """What passes as a point is not moved: it stays on the level that it begins on."""
+def test_a_point_near_the_space_keeps_its_level():
+    """An accepted point near the space is not moved: it stays on the level on which it begins."""
     system = relaxing(mf.Sphere(2))
     x0 = np.array([0.6, 0.64, 0.48]) * (1.0 + 1e-10)
     run = lt.integrate(system, x0, (0.0, 1.0), 0.1, RK4)
@@ -203,9 +202,9 @@ def test_events_dense_output_and_adaptive_steps():
     space = mf.Stiefel(3, 2)
     system, x0 = relaxing(space), start(space)
     run = lt.integrate(system, x0, (0.0, 3.0), lt.Adaptive(1e-8), RK8, dense=True, until=lambda X: X[0, 0] - 0.1)
-    between = run(np.linspace(0.0, run.t[-1], 20))
-    assert float(space.residual(system.points(between)).max()) <= ON_THE_SPACE
-    assert np.abs(between[-1] - reference(system, x0, run.t[-1])).max() < 1e-6
+    states = run(np.linspace(0.0, run.t[-1], 20))
+    assert float(space.residual(system.points(states)).max()) <= MAX_SPACE_RESIDUAL
+    assert np.abs(states[-1] - reference(system, x0, run.t[-1])).max() < 1e-6
 
 
 @pytest.mark.slow
@@ -213,9 +212,9 @@ def test_an_ensemble_is_its_runs_and_a_flow_has_derivatives():
     space = mf.Sphere(2)
     system = relaxing(space)
     x0s = np.asarray(space.random(1, (3,)))
-    many = lt.ensemble(system, x0s, (0.0, 1.0), 0.1, RK4)
+    ensemble = lt.ensemble(system, x0s, (0.0, 1.0), 0.1, RK4)
     for i, x0 in enumerate(x0s):
-        assert np.array_equal(many.x[i], lt.integrate(system, x0, (0.0, 1.0), 0.1, RK4).x[-1])
+        assert np.array_equal(ensemble.x[i], lt.integrate(system, x0, (0.0, 1.0), 0.1, RK4).x[-1])
     v = np.asarray(space.random_tangent(2, x0s[0]))
     for method in (RK4, GAUSS):
 
@@ -233,7 +232,7 @@ def test_noise_stays_on_the_space(name):
     space = SPACES[name]()
     system = relaxing(space)
     run = lt.integrate(system, start(space), (0.0, 2.0), 0.01, noise=lt.Fluctuations(1e-2, seed=1))
-    assert float(space.residual(system.points(run.x)).max()) <= ON_THE_SPACE
+    assert float(space.residual(system.points(run.x)).max()) <= MAX_SPACE_RESIDUAL
     assert run.audit().energy_drift <= 1e-14
 
 
@@ -247,7 +246,7 @@ def test_an_energy_that_depends_on_time():
     runs = [lt.integrate(system, x0, (0.0, 2.0), 0.05, m) for m in (RK4, lt.MetriplecticGauss(2, retraction="exp"))]
     assert np.abs(runs[0].x - runs[1].x).max() < 1e-5
     assert runs[0].audit().passed
-    assert np.abs(np.linalg.norm(runs[0].x, axis=1) - 1.0).max() < ON_THE_SPACE
+    assert np.abs(np.linalg.norm(runs[0].x, axis=1) - 1.0).max() < MAX_SPACE_RESIDUAL
 
 
 def hypersphere():
@@ -268,7 +267,7 @@ def spd_matrices():
     ids=["sphere", "SPD"],
 )
 def test_gradient_flows_run_along_the_geodesics_of_geomstats(space, theirs):
-    """Half the squared distance from p falls along the geodesic to it: its length shrinks by exp(-t)."""
+    """The gradient flow of half the squared distance from p follows the geodesic to p; its length falls by exp(-t)."""
     metric, p, x0 = theirs().metric, np.asarray(space.random(1)), np.asarray(space.random(2))
 
     def half_the_square(x):

@@ -19,12 +19,13 @@ from tests.cases import (
 )
 
 METHODS = list(lt.registered_methods())
-EACH_METHOD = [  # of the Gauss methods, whose programs take longest to compile, one stands for all by default
+METHOD_PARAMS = [  # of the Gauss methods, whose programs take longest to compile, one stands for all by default
     pytest.param(method, id=str(method), marks=pytest.mark.slow if costly else ())
     for method in METHODS
     for costly in [isinstance(method, lt.MetriplecticGauss) and method.stages != 2]
 ]
-STEPS, STEP = 40, 0.05
+STEPS = 40
+STEP = 0.05
 
 
 def run(system, x0, method=None, steps=STEPS, h=STEP):
@@ -36,7 +37,7 @@ def run(system, x0, method=None, steps=STEPS, h=STEP):
 
 
 def assert_laws(system, solution, method):
-    """What the system promises and the method claims to keep, at every step."""
+    """Assert the laws of the system that the method claims to preserve, at every step."""
     stats, audit = solution.stats, solution.audit()
     scale = abs(solution.energy[0])
     assert solution.status.ok
@@ -50,8 +51,10 @@ def assert_laws(system, solution, method):
     entropy_size = np.abs(solution.entropy).max()
     if system.entropy_law == "nondecreasing":
         # a scheme that is not exact for this entropy may lose O(h^3) of it in a step
-        allowed = max(entropy_size, 1.0) * (tolerance("entropy") if exact else solution.provenance["step"] ** 3)
-        assert stats.least_entropy_increment >= -allowed
+        tolerated_decrease = max(entropy_size, 1.0) * (
+            tolerance("entropy") if exact else solution.provenance["step"] ** 3
+        )
+        assert stats.least_entropy_increment >= -tolerated_decrease
     for name in solution.laws.conserved:
         series = solution.casimirs[name]
         assert np.abs(series - series[0]).max() <= tolerance("casimir") * max(1.0, np.abs(series).max())
@@ -60,13 +63,14 @@ def assert_laws(system, solution, method):
 # -- every algebra, every dissipation, every method ---------------------------------------------------------------
 
 
-BY_DEFAULT = """so(3), so(4), sl(2), su(3), sp(2), gl(2), se(3), sl(2) x R^2, heisenberg(1), galilei(2), bianchi('V'),
-bianchi('VI', h=-0.5), bianchi('VII', h=1)"""
+DEFAULT_ALGEBRAS = """so(3), so(4), sl(2), su(3), sp(2), gl(2), se(3), sl(2) x R^2, heisenberg(1), galilei(2),
+bianchi('V'), bianchi('VI', h=-0.5), bianchi('VII', h=1)"""
+"""Algebras that run in the default tier."""
 
 
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(
-    "g", [g if g.name in BY_DEFAULT else slow(g) for g in ALGEBRAS if g.casimir_count() > 0], ids=lambda g: g.name
+    "g", [g if g.name in DEFAULT_ALGEBRAS else slow(g) for g in ALGEBRAS if g.casimir_count() > 0], ids=lambda g: g.name
 )
 def test_every_algebra(g):
     system = build(g, next(case for case in DISSIPATIONS if case.name == "projected"))
@@ -82,7 +86,7 @@ def test_every_dissipation(g, case):
 
 
 @pytest.mark.sampled(2)
-@pytest.mark.parametrize("method", EACH_METHOD)
+@pytest.mark.parametrize("method", METHOD_PARAMS)
 @pytest.mark.parametrize(
     "name", ["killing", "projected_preserve", *map(slow, ["friction_operator", "double_bracket", "force"])]
 )
@@ -93,9 +97,9 @@ def test_every_method(method, name):
 
 
 @pytest.mark.sampled(1)
-@pytest.mark.parametrize("method", EACH_METHOD)
+@pytest.mark.parametrize("method", METHOD_PARAMS)
 def test_every_method_without_dissipation(method):
-    """Energy and the quadratic Casimirs of a Lie-Poisson system, to rounding."""
+    """The energy and the quadratic Casimirs of a Lie-Poisson system are constant to rounding."""
     g = mf.se(3)
     system = lt.LiePoissonSystem(g, energy_of(6, 2))
     solution = run(system, state_of(g, 2), method)
@@ -108,7 +112,7 @@ def test_every_method_without_dissipation(method):
 @pytest.mark.slow
 @pytest.mark.parametrize(("g", "case"), combinations(ALGEBRAS))
 def test_every_algebra_with_every_dissipation(g, case):
-    """Methods by turns, as in a Latin square: each meets every algebra and every dissipation."""
+    """Methods alternate as in a Latin square: each meets every algebra and every dissipation."""
     method = METHODS[(ALGEBRAS.index(g) + DISSIPATIONS.index(case)) % len(METHODS)]
     system = build(g, case)
     if isinstance(method, lt.MetriplecticTaylor):
@@ -123,7 +127,7 @@ def test_every_algebra_with_every_dissipation(g, case):
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("g", [mf.su(3), mf.so(4), mf.sl(2), mf.sl(3), mf.se(3)], ids=lambda g: g.name)
 def test_killing_dissipation_from_random_states(g):
-    """The named algebras of the paper's reach: laws at every step, from several states."""
+    """On the algebras named in the paper the laws hold at every step, from several states."""
     system = build(g, DISSIPATIONS[0], seed=3)
     for seed in range(4):
         solution = run(system, 0.5 * state_of(g, 10 + seed), steps=60, h=0.02)
@@ -132,7 +136,7 @@ def test_killing_dissipation_from_random_states(g):
 
 
 def test_momentum_maps_are_kept():
-    """A linear momentum map in the kernel of K: BFM §2.4."""
+    """A linear momentum map in the kernel of K is constant: BFM §2.4."""
     g, H = mf.so(3), lt.Quadratic(np.array([1.0, 1.0, 0.5]))  # symmetric about e3, so mu3 is conserved by the motion
     system = lt.LiePoissonSystem(
         g,
@@ -181,8 +185,8 @@ def test_the_reference_method_fails_the_audit():
     assert run(system, [0.001, 1.0, 0.001]).laws.inexact == ()
 
 
-class FromTheWrongGradient(lt.MetriplecticMidpoint):
-    """Control: K built from grad H(x) in place of the discrete gradient."""
+class WrongGradientMidpoint(lt.MetriplecticMidpoint):
+    """Control: K built from grad H(x) instead of the discrete gradient."""
 
     def slopes(self, system, x, compensation, h, k):
         d = h * k[0]
@@ -193,7 +197,7 @@ class FromTheWrongGradient(lt.MetriplecticMidpoint):
         return (motion + system.dissipation.force(system, z, system.energy.gradient(x), dS, ()))[None]
 
 
-class WithoutDiscreteGradient(lt.MetriplecticMidpoint):
+class PlainMidpoint(lt.MetriplecticMidpoint):
     """Control: the plain implicit midpoint rule."""
 
     def slopes(self, system, x, compensation, h, k):
@@ -201,7 +205,7 @@ class WithoutDiscreteGradient(lt.MetriplecticMidpoint):
 
 
 @pytest.mark.sampled(1)
-@pytest.mark.parametrize("method", [FromTheWrongGradient(), WithoutDiscreteGradient()], ids=lambda m: type(m).__name__)
+@pytest.mark.parametrize("method", [WrongGradientMidpoint(), PlainMidpoint()], ids=lambda m: type(m).__name__)
 def test_schemes_that_are_not_rebuilt_lose_energy_and_only_energy(method):
     system = build(mf.so(3), next(case for case in DISSIPATIONS if case.name == "projected"))
     solution = run(system, state_of(mf.so(3), 0), method)
@@ -210,7 +214,7 @@ def test_schemes_that_are_not_rebuilt_lose_energy_and_only_energy(method):
 
 
 def test_transcendental_entropies_are_monotone_to_third_order_only():
-    """What the midpoint scheme does not promise shows: if S is not quadratic its increment is right to O(h^3)."""
+    """For an entropy that is not quadratic the midpoint scheme has the entropy increment right to O(h^3) only."""
     g = mf.bianchi("V")
     system = build(g, next(case for case in DISSIPATIONS if case.name == "projected"))
     defects = []
@@ -218,7 +222,7 @@ def test_transcendental_entropies_are_monotone_to_third_order_only():
         x = state_of(g, 0)
         solution = lt.integrate(system, x, (0.0, h), h)
         z = 0.5 * (solution.x[0] + solution.x[1])
-        produced = float(system.entropy.gradient(z) @ (solution.x[1] - solution.x[0]))
-        defects.append(abs(solution.entropy[1] - solution.entropy[0] - produced))
+        production = float(system.entropy.gradient(z) @ (solution.x[1] - solution.x[0]))
+        defects.append(abs(solution.entropy[1] - solution.entropy[0] - production))
     slopes = np.log2(np.array(defects[:-1]) / defects[1:])
     assert (np.abs(slopes - 3.0) < 0.2).all(), (defects, slopes)

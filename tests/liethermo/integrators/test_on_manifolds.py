@@ -1,4 +1,4 @@
-"""Systems on manifolds: orders, laws at every step, membership, twins in geomstats, both engines, refusals."""
+"""Systems on manifolds: orders, laws at every step, membership, geomstats spaces, both engines, rejected input."""
 
 from __future__ import annotations
 
@@ -27,22 +27,24 @@ def tolerance(name: str) -> float:
 
 
 INERTIA = np.array([1.0, 2.0, 4.0])
-SPHERE, SPIN, BATH = mf.Sphere(2), mf.LiePoisson(mf.so(3)), mf.Sphere(2) * mf.Euclidean(1)
+SPHERE = mf.Sphere(2)
+SPIN = mf.LiePoisson(mf.so(3))
+BATH = mf.Sphere(2) * mf.Euclidean(1)
 START = np.array([0.6, 0.64, 0.48])
 
 
 def cubic(s):
-    """The energy of a spin that is not quadratic."""
+    """Return the energy of a spin, which is not quadratic."""
     return jnp.sum((s[:3] ** 2 + 2 / 3 * s[:3] ** 3) / (2 * INERTIA))
 
 
 def free_spin(space=SPHERE) -> lt.MetriplecticSystem:
-    """``s' = s x grad H``: no entropy, as every Casimir is constant on a sphere."""
+    """Return a spin ``s' = s x grad H`` without entropy, as every Casimir is constant on a sphere."""
     return lt.MetriplecticSystem(SPIN, cubic, space=space, validate=False)
 
 
 def relaxing_spin() -> lt.MetriplecticSystem:
-    """A spin that heats a bath of temperature ``exp(S)``: what it loses to damping appears there."""
+    """Return a spin that heats a bath of temperature ``exp(S)`` by its damping."""
     return lt.MetriplecticSystem(
         mf.LiePoisson(mf.direct_sum(mf.so(3), mf.abelian(1))),
         lambda x: cubic(x) + jnp.exp(x[3]),
@@ -53,7 +55,7 @@ def relaxing_spin() -> lt.MetriplecticSystem:
 
 
 def relaxing_frame() -> lt.MetriplecticSystem:
-    """A rotation that climbs an entropy at constant energy."""
+    """Return a rotation that climbs an entropy at constant energy."""
     A, B = np.array([[1.0, 0.2, 0.0], [0.1, 2.0, 0.3], [0.0, -0.2, 0.5]]), np.diag([1.2, -1.8, 0.9]) + 0.2
     return lt.MetriplecticSystem(
         None,
@@ -66,7 +68,7 @@ def relaxing_frame() -> lt.MetriplecticSystem:
 
 
 def relaxing_covariance() -> lt.MetriplecticSystem:
-    """A covariance that climbs ``log det`` at constant ``tr(A P)``: to a multiple of the inverse of A."""
+    """Return a covariance that climbs ``log det`` at constant ``tr(A P)``, to a multiple of the inverse of A."""
     A = np.array([[1.0, 0.2, 0.0], [0.2, 2.0, 0.3], [0.0, 0.3, 0.5]])
     return lt.MetriplecticSystem(
         None,
@@ -93,7 +95,8 @@ def starts(name: str):
 CASES = {"spin": free_spin, "bath": relaxing_spin, "frame": relaxing_frame, "covariance": relaxing_covariance}
 """Systems by name; each comes with an initial point of :func:`starts`."""
 
-MIDPOINT, GAUSS = lt.MetriplecticMidpoint(), lt.MetriplecticGauss(2)
+MIDPOINT = lt.MetriplecticMidpoint()
+GAUSS = lt.MetriplecticGauss(2)
 
 RUNS = [
     pytest.param("bath", GAUSS, id="bath-gauss2"),
@@ -122,31 +125,31 @@ RUNS = [
 
 @pytest.fixture(scope="module")
 def build():
-    """Systems by name, each built once."""
-    built: dict[str, lt.MetriplecticSystem] = {}
+    """Return a function that builds each system once, by name."""
+    systems: dict[str, lt.MetriplecticSystem] = {}
 
     def get(name):
-        if name not in built:
-            built[name] = CASES[name]()
-        return built[name]
+        if name not in systems:
+            systems[name] = CASES[name]()
+        return systems[name]
 
     return get
 
 
-def entropy_size(system, x) -> float:
-    """What roundings of S are measured by: S itself, and what it changes by where its argument is rounded."""
+def entropy_scale(system, x) -> float:
+    """Return the scale of the rounding of S: S itself, and its change by the rounding of its argument."""
     return abs(float(system.entropy(x))) + float(np.abs(system.entropy.gradient(x)) @ np.abs(x))
 
 
 def final(system, x0, method, steps, T=2.0):
-    """A run that keeps its last state: one program for every number of steps."""
+    """Run and keep the last state only: one program for every number of steps."""
     return lt.integrate(system, x0, (0.0, T), T / steps, method, engine="array", save_every=steps)
 
 
 @pytest.mark.sampled("spin-midpoint-exp")
 @pytest.mark.parametrize(("name", "method"), RUNS)
 def test_orders_and_laws(build, name, method):
-    """Order 2s against SciPy; then the laws at each of many steps, and points of the space at the end of them."""
+    """The order is 2s against SciPy; the laws hold at each of many steps, and the last state is on the space."""
     system, x0 = build(name), starts(name)
     field = jax.jit(lambda x: system.vector_field(x))
     start = np.asarray(system.state(x0))
@@ -163,7 +166,7 @@ def test_orders_and_laws(build, name, method):
     assert solution.audit().energy_drift <= tolerance("energy")
     assert system.space.residual(system.points(solution.x[-1])) <= tolerance("member")
     if system.entropy is not None:
-        size = max(entropy_size(system, x) for x in solution.x)
+        size = max(entropy_scale(system, x) for x in solution.x)
         assert solution.stats.least_entropy_increment >= -tolerance("entropy") * size
         assert solution.entropy[-1] > solution.entropy[0]
 
@@ -182,18 +185,18 @@ def test_a_spin_comes_to_rest_where_its_energy_is_least(build):
     end = final(build("bath"), starts("bath"), GAUSS, 400, T=400.0).x[-1, :3]
     gradient = np.asarray(jax.grad(cubic)(end))
     assert np.abs(np.cross(end, gradient)).max() < 1e-7
-    around = SPHERE.exp(end, SPHERE.random_tangent(0, np.tile(end, (50, 1)), 0.1))
-    assert float(cubic(end)) < min(float(cubic(s)) for s in around)
+    neighbours = SPHERE.exp(end, SPHERE.random_tangent(0, np.tile(end, (50, 1)), 0.1))
+    assert float(cubic(end)) < min(float(cubic(s)) for s in neighbours)
 
 
 @pytest.mark.slow
 def test_a_double_bracket_on_a_sphere():
     """Landau and Lifshitz: ``Pi^2 = -1``, so the spin descends the gradient, and keeps its length."""
-    damped = lt.MetriplecticSystem(SPIN, cubic, dissipation=lt.DoubleBracket(0.5), space=SPHERE, validate=False)
+    system = lt.MetriplecticSystem(SPIN, cubic, dissipation=lt.DoubleBracket(0.5), space=SPHERE, validate=False)
     gradient = np.asarray(jax.grad(cubic)(START))
     descent = gradient - START * np.dot(START, gradient)
-    assert np.allclose(damped.vector_field(START), np.cross(START, gradient) - 0.5 * descent, atol=1e-15)
-    solution = final(damped, START, MIDPOINT, 400, T=40.0)
+    assert np.allclose(system.vector_field(START), np.cross(START, gradient) - 0.5 * descent, atol=1e-15)
+    solution = final(system, START, MIDPOINT, 400, T=40.0)
     assert solution.stats.largest_energy_increment <= 4e-16
     assert solution.energy[-1] < solution.energy[0] - 0.1
 
@@ -231,17 +234,17 @@ def test_both_engines_take_the_same_steps(build, name, method):
 
 @pytest.mark.slow
 def test_spins_that_do_not_interact(build):
-    """A power of a space runs its copies as one batch: each is the spin that it is alone."""
-    both = np.stack([START, -START])
+    """A power of a space runs its copies as one batch: each spin moves as it does alone."""
+    start_states = np.stack([START, -START])
     pair = lt.MetriplecticSystem(
         mf.PoissonMap(lambda x, alpha: jnp.cross(x.reshape(2, 3), alpha.reshape(2, 3)).ravel(), 6),
         lambda s: cubic(s[0]) + cubic(s[1]),
         space=SPHERE**2,
         validate=False,
     )
-    together = final(pair, both, GAUSS, 40).x[-1].reshape(2, 3)
-    alone = [final(build("spin"), s, GAUSS, 40).x[-1] for s in both]
-    assert np.abs(together - np.stack(alone)).max() < 1e-6  # they share one correction of the gradients
+    pair_states = final(pair, start_states, GAUSS, 40).x[-1].reshape(2, 3)
+    single_states = [final(build("spin"), s, GAUSS, 40).x[-1] for s in start_states]
+    assert np.abs(pair_states - np.stack(single_states)).max() < 1e-6  # they share one correction of the gradients
 
 
 # -- the rest of the interface ----------------------------------------------------------------------------------------
@@ -252,8 +255,8 @@ def test_events_dense_output_and_adaptive_steps(build):
     system = build("spin")
     solution = lt.integrate(system, START, (0.0, 5.0), lt.Adaptive(1e-8), GAUSS, until=lambda s: s[2], dense=True)
     assert abs(solution.x[-1][2]) < 1e-13
-    between = solution(np.linspace(0.0, solution.event_time, 50))
-    assert np.asarray(SPHERE.belongs(between)).all()
+    states = solution(np.linspace(0.0, solution.event_time, 50))
+    assert np.asarray(SPHERE.belongs(states)).all()
     fine = lt.integrate(system, START, (0.0, 0.5), 0.01, lt.MetriplecticGauss(3))
     assert np.abs(solution(0.5) - fine.x[-1]).max() < 1e-5
 
@@ -270,7 +273,7 @@ def test_membership_after_a_hundred_thousand_steps(build, name):
 # -- controls that must fail ------------------------------------------------------------------------------------------
 
 
-class WithoutDiscreteGradient(lt.MetriplecticMidpoint):
+class PlainMidpoint(lt.MetriplecticMidpoint):
     """Control: the midpoint rule with plain gradients."""
 
     def slopes(self, system, x, compensation, h, k):
@@ -279,7 +282,7 @@ class WithoutDiscreteGradient(lt.MetriplecticMidpoint):
 
 @pytest.mark.slow
 def test_plain_gradients_lose_energy(build):
-    solution = final(build("bath"), starts("bath"), WithoutDiscreteGradient(), 40)
+    solution = final(build("bath"), starts("bath"), PlainMidpoint(), 40)
     assert solution.audit().energy_drift > 1e4 * tolerance("energy")
     assert BATH.residual(solution.x[-1]) <= tolerance("member")
 
@@ -300,9 +303,9 @@ def test_a_point_off_the_manifold(build):
 
 @pytest.mark.slow
 def test_a_step_beyond_the_injectivity_radius(build):
-    fast = lt.MetriplecticSystem(SPIN, lambda s: 20.0 * s[2], space=SPHERE, validate=False)
+    fast_spin = lt.MetriplecticSystem(SPIN, lambda s: 20.0 * s[2], space=SPHERE, validate=False)
     with pytest.raises(lt.NonFiniteError, match=r"as long as the domain.*injectivity radius 3\.14159") as failure:
-        final(fast, START, lt.MetriplecticMidpoint(retraction="midpoint"), 10, T=10.0)
+        final(fast_spin, START, lt.MetriplecticMidpoint(retraction="midpoint"), 10, T=10.0)
     assert len(failure.value.solution.x) == 1
 
 
@@ -313,11 +316,11 @@ def test_spaces_and_retractions_that_do_not_fit(build):
         lt.MetriplecticSystem(SPIN, cubic, space=mf.SpecialOrthogonal(3))
     with pytest.raises(lt.InputError, match="on R\\^n"):
         lt.integrate(lt.models.rigid_body(), START, (0, 1), 0.1, lt.MetriplecticMidpoint(retraction="exp"))
-    with pytest.raises(lt.InputError, match=r"name of one \('midpoint', 'exp'.*, not 'expo'"):
+    with pytest.raises(lt.InputError, match=r"one of 'midpoint', 'exp'.*, got 'expo'"):
         lt.MetriplecticGauss(2, retraction="expo")
-    other = mf.retraction(mf.SpecialOrthogonal(3), "exp")
-    with pytest.raises(lt.InputError, match="the retraction is one of SO"):
-        lt.integrate(build("spin"), START, (0, 1), 0.1, lt.MetriplecticGauss(2, retraction=other))
+    rotation_retraction = mf.retraction(mf.SpecialOrthogonal(3), "exp")
+    with pytest.raises(lt.InputError, match="the retraction belongs to SO"):
+        lt.integrate(build("spin"), START, (0, 1), 0.1, lt.MetriplecticGauss(2, retraction=rotation_retraction))
     with pytest.raises(mf.SpaceError, match="not a group"):
         lt.integrate(build("spin"), START, (0, 1), 0.1, lt.MetriplecticGauss(2, retraction="cayley"))
     with pytest.raises(lt.InputError, match="Lie algebra"):

@@ -1,4 +1,4 @@
-"""Observed orders, against hand-written ones, on nonlinear problems; and the reference values of the paper's bodies."""
+"""Observed orders on nonlinear problems, with the order written by hand; reference values of the paper's bodies."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +9,7 @@ import manifolds as mf
 from tests.cases import BuiltOnUse
 
 SLACK = 0.2
+"""Largest difference between an observed and an expected order."""
 
 ORDERS = [
     ("gonzalez", 2),
@@ -45,14 +46,14 @@ NONLINEAR = BuiltOnUse(
         "se(3)": lambda: (nonlinear_top(), np.array([0.5, -0.4, 0.8, 0.6, 0.1, 0.7])),
     }
 )
-"""Systems with states, by name."""
+"""Systems with initial states, by name."""
 
 
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize(("gradient", "order"), ORDERS)
 @pytest.mark.parametrize("name", NONLINEAR)
 def test_observed_order(name, gradient, order):
-    """Slope of the error at T = 4 over four halvings, at least three of them above the rounding plateau."""
+    """The slope of the error at T = 4 over three halvings is the order, above the rounding plateau."""
     system, x0 = NONLINEAR[name]
     method = lt.MetriplecticMidpoint(gradient)
     assert method.order == order
@@ -67,21 +68,21 @@ def test_observed_order(name, gradient, order):
 
 
 def test_free_body_reference_values():
-    """A free body with I = (2, 1, 2/3), and its state at t = 10."""
+    """A free body with I = (2, 1, 2/3) reaches its reference state at t = 10."""
     system = lt.models.free_rigid_body(inertia=(2.0, 1.0, 2.0 / 3.0))
     x0 = np.array([np.cos(1.1), 0.0, np.sin(1.1)])
-    expected = np.array([0.407066136588041, 0.283007426812844, 0.868449167661562])
+    reference_state = np.array([0.407066136588041, 0.283007426812844, 0.868449167661562])
     assert float(system.energy(x0)) == pytest.approx(0.647125279313836, abs=1e-15)
     assert float(system.entropy(x0)) == pytest.approx(0.5, abs=1e-16)
     errors = []
     for h in (0.1, 0.05, 0.025, 0.0125):
         solution = lt.integrate(system, x0, (0.0, 10.0), h)
-        errors.append(np.abs(solution.x[-1] - expected).max())
+        errors.append(np.abs(solution.x[-1] - reference_state).max())
         assert solution.audit().energy_drift < 2e-15
     ratios = np.array(errors[:-1]) / errors[1:]
     assert (np.abs(ratios - 4.0) < 0.05).all(), ratios
     accurate = lt.integrate(system, x0, (0.0, 10.0), 10.0, lt.Reference(rtol=1e-13)).x[-1]
-    assert np.abs(accurate - expected).max() < 1e-12
+    assert np.abs(accurate - reference_state).max() < 1e-12
 
 
 def test_figure_1_of_the_paper():

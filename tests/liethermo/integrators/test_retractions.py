@@ -1,4 +1,4 @@
-"""Every space with every retraction that it has: a run ends where one without charts does."""
+"""Every space with each of its retractions: a run in charts ends where a run without charts does."""
 
 from __future__ import annotations
 
@@ -15,25 +15,26 @@ METHODS = {
     "midpoint": (lt.MetriplecticMidpoint, (), 5e-4),
     "explicit": (lt.MetriplecticRungeKutta, (4,), 1e-5),
 }
-"""The class, its arguments, and what two steps of 0.02 may miss by; at most 2e-6 and, on flags, 1.2e-4 seen."""
+"""Class, arguments, and largest error of two steps of 0.02; at most 2e-6 seen, and 1.2e-4 on flags."""
 
-QUICK = {("SO(3)", "projection", "midpoint"), ("S^2", "projection", "midpoint")}
+DEFAULT_CASES = {("SO(3)", "projection", "midpoint"), ("S^2", "projection", "midpoint")}
+"""Cases that run in the default tier."""
 
 
-def kinds(space) -> list[str]:
-    """The retractions that a space has, by the table of its page."""
+def retraction_names(space) -> list[str]:
+    """Return the names of the retractions of a space, by the table of its page."""
     factors = space.factors if isinstance(space, mf.Product) else (space,)
-    found = ["exp", "midpoint", "projection"] if space.has_geodesics else ["projection"]
+    names = ["exp", "midpoint", "projection"] if space.has_geodesics else ["projection"]
     if all(isinstance(factor, mf.Euclidean | mf.SPD) for factor in factors):
-        found += ["euclidean", "midpoint_euclidean"]
+        names += ["euclidean", "midpoint_euclidean"]
     if all(isinstance(factor, mf.Euclidean | mf.GroupSpace) for factor in factors):
-        found += ["group_exp", "midpoint_group_exp"]
-        found += [] if space.name == "SU(3)" else ["cayley", "midpoint_cayley"]
-    return found
+        names += ["group_exp", "midpoint_group_exp"]
+        names += [] if space.name == "SU(3)" else ["cayley", "midpoint_cayley"]
+    return names
 
 
-def methods(kind: str) -> list[str]:
-    """All of them by projection; of the others the one that it is meant for: most of the time is compilation."""
+def methods_for(kind: str) -> list[str]:
+    """Return all methods for the projection, and one for other retractions: most of the time is compilation."""
     if kind == "projection":
         return list(METHODS)
     return ["midpoint" if kind.startswith("midpoint") else "gauss"]
@@ -45,30 +46,30 @@ CASES = [
         kind,
         method,
         id=f"{space.name}-{kind}-{method}",
-        marks=[] if (space.name, kind, method) in QUICK else [pytest.mark.slow],
+        marks=[] if (space.name, kind, method) in DEFAULT_CASES else [pytest.mark.slow],
     )
     for space in mf.registered_spaces()
-    for kind in kinds(space)
-    for method in methods(kind)
+    for kind in retraction_names(space)
+    for method in methods_for(kind)
 ]
 
 
 @pytest.mark.slow
 def test_each_space_has_the_retractions_of_its_page_and_no_others():
     for space in mf.registered_spaces():
-        for kind in set(RETRACTIONS) - set(kinds(space)):
+        for kind in set(RETRACTIONS) - set(retraction_names(space)):
             with pytest.raises(mf.ManifoldsError):
                 mf.retraction(space, kind)
 
 
-def falling(space) -> lt.MetriplecticSystem:
-    """A gradient flow; on a quotient that of a function of its classes."""
+def gradient_flow(space) -> lt.MetriplecticSystem:
+    """Return a gradient flow; on a quotient the energy is a function of its classes."""
     weights = np.random.default_rng(0).standard_normal(space.shape)
 
     def energy(x):
         if isinstance(space, mf.Homogeneous):
-            first = space.from_vector(space.to_vector(x))[:, :1]
-            return jnp.sum(weights[:, :1] * (first @ first.T) @ np.ones((space.shape[0], 1)))
+            first_column = space.from_vector(space.to_vector(x))[:, :1]
+            return jnp.sum(weights[:, :1] * (first_column @ first_column.T) @ np.ones((space.shape[0], 1)))
         return jnp.sum(weights * x).real
 
     return lt.MetriplecticSystem(None, energy, dissipation=lt.Friction(), space=space, validate=False)
@@ -77,22 +78,24 @@ def falling(space) -> lt.MetriplecticSystem:
 @pytest.mark.parametrize(("space", "kind", "method"), CASES)
 def test_a_run_in_charts_ends_where_one_without_does(space, kind, method):
     """The steps without charts are ten times as short, and of another method."""
-    build, arguments, allowed = METHODS[method]
-    system, start = falling(space), np.asarray(space.to_vector(space.random(5)))
+    build, arguments, max_error = METHODS[method]
+    system, start = gradient_flow(space), np.asarray(space.to_vector(space.random(5)))
     run = lt.integrate(system, start, (0.0, 0.04), 0.02, build(*arguments, retraction=kind))
-    around = lt.MetriplecticRungeKutta(6) if space.can_be_embedded else lt.MetriplecticRungeKutta(6, retraction="exp")
-    reference = lt.integrate(system, start, (0.0, 0.04), 0.002, around)
+    embedded_method = (
+        lt.MetriplecticRungeKutta(6) if space.can_be_embedded else lt.MetriplecticRungeKutta(6, retraction="exp")
+    )
+    reference = lt.integrate(system, start, (0.0, 0.04), 0.002, embedded_method)
     assert float(space.residual(system.points(run.x[-1]))) < 1e-14
-    ends = [system.points(found.x[-1]) for found in (run, reference)]
+    ends = [system.points(solution.x[-1]) for solution in (run, reference)]
     if isinstance(space, mf.Flag):  # a chart by projection leaves the horizontal way: the class is what is compared
         ends = [space.projectors(end) for end in ends]
-    assert np.abs(np.asarray(ends[0] - ends[1])).max() < allowed * max(1.0, np.abs(start).max())
-    assert np.abs(run.x[-1] - start).max() > 2 * allowed  # control: it moves
+    assert np.abs(np.asarray(ends[0] - ends[1])).max() < max_error * max(1.0, np.abs(start).max())
+    assert np.abs(run.x[-1] - start).max() > 2 * max_error  # control: it moves
 
 
 def test_taylor_steps_name_the_chart_that_has_no_series():
     space = mf.SPD(2)
-    system, start = falling(space), space.random(5)
+    system, start = gradient_flow(space), space.random(5)
     with pytest.raises(lt.LiethermoError, match=r"(?s)RiemannianRetraction.*leave out retraction="):
         lt.integrate(system, start, (0.0, 0.04), 0.02, lt.MetriplecticTaylor(4, retraction="exp"))
 
@@ -100,7 +103,7 @@ def test_taylor_steps_name_the_chart_that_has_no_series():
 @pytest.mark.slow
 def test_the_advice_for_taylor_steps_works():
     space = mf.SPD(2)
-    system, start = falling(space), space.random(5)
+    system, start = gradient_flow(space), space.random(5)
     ends = [
         lt.integrate(system, start, (0.0, 0.04), 0.01, method).x[-1]
         for method in (

@@ -1,4 +1,4 @@
-"""Explicit Runge-Kutta steps: tableaus, orders, and what must fail."""
+"""Explicit Runge-Kutta steps: tableaus, orders, and controls."""
 
 from typing import ClassVar
 
@@ -23,32 +23,32 @@ ORDERS = [4, 6, 8]
 
 
 def density(sizes_and_densities) -> tuple[int, float]:
-    """Nodes and density of a rooted tree from those of its branches."""
+    """Return nodes and density of a rooted tree from those of its branches."""
     nodes = 1 + sum(n for n, _ in sizes_and_densities)
     return nodes, nodes * float(np.prod([g for _, g in sizes_and_densities]))
 
 
 def rooted_trees(order: int):
-    """All with at most so many nodes, as tuples of branches."""
-    found = {1: [()]}
+    """Return all rooted trees by number of nodes, up to ``order``, as tuples of branches."""
+    trees = {1: [()]}
     for n in range(2, order + 1):
-        found[n] = list({tuple(sorted(f)) for f in forests(found, n - 1)})
-    return found
+        trees[n] = list({tuple(sorted(f)) for f in forests(trees, n - 1)})
+    return trees
 
 
-def forests(found, nodes):
+def forests(trees, nodes):
     if nodes == 0:
         yield ()
         return
-    for size in range(1, nodes + 1):
-        for tree in found[size]:
-            for rest in forests(found, nodes - size):
+    for branch_nodes in range(1, nodes + 1):
+        for tree in trees[branch_nodes]:
+            for rest in forests(trees, nodes - branch_nodes):
                 yield (tree, *rest)
 
 
-def of_tree(A, tree):
-    """Its vector at the stages, its nodes and its density."""
-    branches = [of_tree(A, branch) for branch in tree]
+def tree_vector_and_density(A, tree):
+    """Return the vector of a tree at the stages, its number of nodes and its density."""
+    branches = [tree_vector_and_density(A, branch) for branch in tree]
     vector = np.ones(len(A))
     for v, _, _ in branches:
         vector = vector * (A @ v)
@@ -57,17 +57,17 @@ def of_tree(A, tree):
 
 @pytest.mark.parametrize(("order", "stages"), [(4, 4), (6, 7), (8, 11)])
 def test_order_conditions(order, stages):
-    """Of all rooted trees [Hairer, Nørsett & Wanner 1993, II.2]; and what the weights of the estimate see."""
+    """All rooted trees meet the conditions [Hairer, Nørsett & Wanner 1993, II.2]; error weights vanish up to q."""
     A, b, d, q, _ = lobatto_tableau(order)
     counts = [1, 1, 2, 4, 9, 20, 48, 115, 286]
-    found = rooted_trees(order)
-    assert [len(found[n]) for n in found] == counts[:order]
+    trees = rooted_trees(order)
+    assert [len(trees[n]) for n in trees] == counts[:order]
     assert len(b) == stages
     assert (b >= 0.0).all()
     assert np.array_equal(A, np.tril(A, -1))
-    for n, some in found.items():
-        for tree in some:
-            vector, nodes, gamma = of_tree(A, tree)
+    for n, trees_of_n in trees.items():
+        for tree in trees_of_n:
+            vector, nodes, gamma = tree_vector_and_density(A, tree)
             assert nodes == n
             assert b @ vector == pytest.approx(1.0 / gamma, rel=1e-12)
             if n <= q:
@@ -77,17 +77,17 @@ def test_order_conditions(order, stages):
 
 @pytest.mark.parametrize("order", ORDERS)
 def test_the_estimate_is_right_for_a_linear_oscillation(order):
-    """The error of a step of a rotation is along the circle, where no correction takes it away."""
+    """The error of a step of a rotation is along the circle, where no correction changes it."""
     system = lt.MetriplecticSystem(mf.Canonical(1), lt.Quadratic(np.eye(2)))
     method = RK(order).on(system)
     state = initial_run_state(system, method, jnp.array([1.0, 0.0]))
-    off = []
+    relative_errors = []
     for h in {4: (0.2, 0.1, 0.05), 6: (0.2, 0.1, 0.05), 8: (0.4, 0.2, 0.1)}[order]:
         new = take_step(system, method, state, h)
-        true = np.linalg.norm(np.asarray(new.x) - [np.cos(h), -np.sin(h)])
-        off.append(float(method.error(system, state.x, state.compensation, h, new.k)) / true - 1.0)
-    assert 0.0 < off[2] < 0.01
-    assert 3.0 < off[1] / off[2] < 5.0
+        true_error = np.linalg.norm(np.asarray(new.x) - [np.cos(h), -np.sin(h)])
+        relative_errors.append(float(method.error(system, state.x, state.compensation, h, new.k)) / true_error - 1.0)
+    assert 0.0 < relative_errors[2] < 0.01
+    assert 3.0 < relative_errors[1] / relative_errors[2] < 5.0
 
 
 # -- orders -----------------------------------------------------------------------------------------------------------
@@ -114,7 +114,7 @@ def test_observed_order(name, order):
 
 
 class NegativeWeight(RK):
-    """Of order two, with the weights -3 and 4, whose step is far off: it takes more corrections."""
+    """Control of order two, with the weights -3 and 4, whose step is far off and takes more corrections."""
 
     max_corrections: ClassVar[int] = 20
 
@@ -125,21 +125,21 @@ class NegativeWeight(RK):
         )
 
 
-def braked():
-    """A mass whose friction heats a body: (q, p, S) without forces."""
+def heated_mass():
+    """Return a mass whose friction heats a body: (q, p, S) without forces."""
 
     def friction(x):
         T = jnp.exp(x[2])
-        along = jnp.array([0.0, 1.0, -x[1] / T])
-        return T * jnp.outer(along, along)
+        direction = jnp.array([0.0, 1.0, -x[1] / T])
+        return T * jnp.outer(direction, direction)
 
     energy = lambda x: 0.5 * x[1] ** 2 + jnp.exp(x[2])  # noqa: E731
     return lt.MetriplecticSystem(None, energy, lambda x: x[2], lt.FrictionOperator(friction), dim=3)
 
 
 def test_a_negative_weight_breaks_the_second_law():
-    """Of friction that has halved an eighth of a step on: the quadrature takes back more than is produced."""
-    bad, good = (lt.integrate(braked(), [0.0, 1.0, 0.0], (0.0, 0.8), 0.8, m) for m in (NegativeWeight(4), RK(4)))
+    """The friction has halved at an eighth of the step: the quadrature subtracts more entropy than it adds."""
+    bad, good = (lt.integrate(heated_mass(), [0.0, 1.0, 0.0], (0.0, 0.8), 0.8, m) for m in (NegativeWeight(4), RK(4)))
     assert bad.stats.least_entropy_increment < -0.03
     assert not bad.audit().passed
     assert bad.audit().energy_drift <= 1e-15
@@ -151,8 +151,8 @@ def test_a_negative_weight_breaks_the_second_law():
 
 
 @pytest.mark.parametrize("order", [5, 2, 4.0, True, "4", None])
-def test_orders_that_there_are_not(order):
-    with pytest.raises(lt.errors.InputError, match="the order is 4, 6 or 8"):
+def test_invalid_orders(order):
+    with pytest.raises(lt.errors.InputError, match="order must be 4, 6 or 8"):
         RK(order)
 
 

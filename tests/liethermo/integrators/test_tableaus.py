@@ -19,13 +19,14 @@ from liethermo.integrators.tableaus import (
 STAGES = range(1, MAX_STAGES + 1)
 EPS = float(np.finfo(float).eps)
 DIGITS = 60
+"""Decimal digits of the reference arithmetic."""
 
 
 # -- the oracle: Lagrange interpolation in powers of t, at the roots of d^s/dt^s [t^s (t - 1)^s] -----------------------
 
 
 def value(polynomial, t):
-    """Of a polynomial with coefficients from the constant one up."""
+    """Return the value at t of a polynomial with coefficients from the constant one up."""
     return functools.reduce(lambda total, a: total * t + a, reversed(polynomial), 0 * t)
 
 
@@ -45,32 +46,34 @@ def derivative(polynomial):
 
 
 def roots(polynomial):
-    """All roots, simple and inside (0, 1): between sign changes on a fine grid, by bisection."""
+    """Return all roots, simple and inside (0, 1), by bisection between sign changes on a fine grid."""
     coefficients = [Decimal(a.numerator) / Decimal(a.denominator) for a in polynomial]
     grid = [Decimal(i) / 999 for i in range(1000)]
-    found = []
-    for low, high in itertools.pairwise(grid):
-        rises = value(coefficients, high) > 0
+    zeros = []
+    for low, b in itertools.pairwise(grid):
+        rises = value(coefficients, b) > 0
         if (value(coefficients, low) > 0) == rises:
             continue
         for _ in range(200):
-            middle = (low + high) / 2
-            low, high = (low, middle) if (value(coefficients, middle) > 0) == rises else (middle, high)
-        found.append(low)
-    assert len(found) == len(polynomial) - 1
-    return found
+            middle = (low + b) / 2
+            low, b = (low, middle) if (value(coefficients, middle) > 0) == rises else (middle, b)
+        zeros.append(low)
+    assert len(zeros) == len(polynomial) - 1
+    return zeros
 
 
 def lagrange(nodes):
-    """Coefficients of the polynomials that are 1 at one node and 0 at the others."""
+    """Yield the coefficients of the polynomials that are 1 at one node and 0 at the others."""
     for j, node in enumerate(nodes):
-        factors = [[-other / (node - other), 1 / (node - other)] for i, other in enumerate(nodes) if i != j]
+        factors = [
+            [-other_node / (node - other_node), 1 / (node - other_node)] for i, other_node in enumerate(nodes) if i != j
+        ]
         yield functools.reduce(product, factors, [Decimal(1)])
 
 
 @functools.cache
 def oracle(stages):
-    """Nodes and the Lagrange polynomials through them, to some 50 digits."""
+    """Return nodes and the Lagrange polynomials through them, to some 50 digits."""
     with localcontext(prec=DIGITS):
         power = functools.reduce(product, [[Fraction(0), Fraction(-1), Fraction(1)]] * stages)  # (t^2 - t)^s
         for _ in range(stages):
@@ -81,18 +84,18 @@ def oracle(stages):
 
 @functools.cache
 def exact_tableau(stages):
-    """A, b, c as Decimals."""
+    """Return A, b, c as Decimals."""
     with localcontext(prec=DIGITS):
         c, basis = oracle(stages)
         integrals = [integral(p) for p in basis]
         return [[value(p, t) for p in integrals] for t in c], [value(p, Decimal(1)) for p in integrals], c
 
 
-def roundings(found, exact):
-    """Largest error in units of the rounding of each entry, which is 1/2 for the double nearest to it."""
+def roundings(computed, exact):
+    """Return the largest error in units of the rounding of each entry, which is 1/2 for the nearest double."""
     with localcontext(prec=DIGITS):
-        flat = zip(np.ravel(found), np.ravel(exact), strict=True)
-        return max(float(abs(Decimal(float(a)) - b) / Decimal(float(np.spacing(abs(a))))) for a, b in flat)
+        pairs = zip(np.ravel(computed), np.ravel(exact), strict=True)
+        return max(float(abs(Decimal(float(a)) - b) / Decimal(float(np.spacing(abs(a))))) for a, b in pairs)
 
 
 # -- the tableau ------------------------------------------------------------------------------------------------------
@@ -100,17 +103,17 @@ def roundings(found, exact):
 
 @pytest.mark.parametrize("stages", STAGES)
 def test_every_entry_is_the_nearest_double(stages):
-    """Half a rounding, and what extended precision adds to it; where there is none, a few roundings."""
+    """The error is half a rounding plus that of extended precision; without extended precision a few roundings."""
     tableau, exact = gauss_tableau(stages), exact_tableau(stages)
-    extended = np.finfo(np.longdouble).eps < 1e-18
-    for found, expected in zip(tableau, exact, strict=True):
-        assert roundings(found, expected) <= (0.51 if extended else 40.0)
+    has_extended_precision = np.finfo(np.longdouble).eps < 1e-18
+    for computed, exact_values in zip(tableau, exact, strict=True):
+        assert roundings(computed, exact_values) <= (0.51 if has_extended_precision else 40.0)
 
 
 def test_the_tableaus_of_the_textbook():
     """s = 1, 2, 3 as printed in Hairer, Lubich & Wanner 2006, II (1.20) and table 1.1."""
     r3, r15 = 3**0.5, 15**0.5
-    printed = {
+    textbook = {
         1: ([[1 / 2]], [1.0], [1 / 2]),
         2: ([[1 / 4, 1 / 4 - r3 / 6], [1 / 4 + r3 / 6, 1 / 4]], [1 / 2, 1 / 2], [1 / 2 - r3 / 6, 1 / 2 + r3 / 6]),
         3: (
@@ -123,9 +126,9 @@ def test_the_tableaus_of_the_textbook():
             [1 / 2 - r15 / 10, 1 / 2, 1 / 2 + r15 / 10],
         ),
     }
-    for stages, tableau in printed.items():
-        for found, expected in zip(gauss_tableau(stages), tableau, strict=True):
-            assert np.allclose(found, expected, rtol=0, atol=2 * EPS)
+    for stages, tableau in textbook.items():
+        for computed, exact_values in zip(gauss_tableau(stages), tableau, strict=True):
+            assert np.allclose(computed, exact_values, rtol=0, atol=2 * EPS)
 
 
 @pytest.mark.parametrize("stages", STAGES)
@@ -155,7 +158,7 @@ def test_symplectic_and_symmetric(stages):
     assert np.abs(c + c[::-1] - 1.0).max() <= EPS
 
 
-def test_controls():
+def test_radau_tableau_fails_the_order_and_symplecticity_tests():
     """Radau IIA of two stages has order 3 and is not symplectic: the two tests above tell it from Gauss."""
     A, b, c = np.array([[5 / 12, -1 / 12], [3 / 4, 1 / 4]]), np.array([3 / 4, 1 / 4]), np.array([1 / 3, 1.0])
     assert abs(b @ c**3 - 1 / 4) > 0.01
@@ -167,7 +170,7 @@ def test_controls():
 
 @pytest.mark.parametrize("stages", STAGES)
 def test_beyond_continues_a_polynomial(stages):
-    """Slopes of degree s - 1 at the nodes of one step become those of the next; a degree more is one too many."""
+    """Slopes of degree s - 1 at the nodes of one step become those of the next; one degree more fails."""
     c, rng = gauss_tableau(stages).c, np.random.default_rng(stages)
     size = np.abs(extrapolation_matrix(stages)).sum(axis=1).max()  # what rounding of the slopes is multiplied by
     polynomial = np.polynomial.Polynomial(rng.standard_normal(stages))
@@ -178,7 +181,7 @@ def test_beyond_continues_a_polynomial(stages):
 
 @pytest.mark.parametrize("stages", STAGES)
 def test_integrated_integrates_a_polynomial(stages):
-    """The integrals of the Lagrange polynomials, between and beyond the nodes; 0, A and b at 0, the nodes and 1."""
+    """The weights integrate the Lagrange polynomials everywhere; they are 0, A and b at 0, the nodes and 1."""
     A, b, c = gauss_tableau(stages)
     theta = np.linspace(-0.5, 1.5, 41).reshape(1, 41)
     weights = interpolation_weights(stages, theta)
@@ -202,7 +205,7 @@ def test_tableaus_are_computed_once():
 
 @pytest.mark.parametrize(("stages", "degree"), [(1, 5), (2, 7)])
 def test_finer_quadrature(stages, degree):
-    """The Kronrod rule, through the collocation polynomial: exact to its degree, and not beyond."""
+    """The Kronrod rule, through the collocation polynomial, is exact to its degree, and not beyond."""
     c, rule = gauss_tableau(stages).c, kronrod_rule(stages)
     theta = rule.A @ np.ones(stages)  # slopes of 1 take the polynomial to the node itself
     for power in range(degree + 2):

@@ -1,4 +1,4 @@
-"""Taylor steps: orders on R^n and on manifolds, tolerances, states between the steps, events, and refusals."""
+"""Taylor steps: orders on R^n and on manifolds, tolerances, states between the steps, events, rejected input."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ Taylor = lt.MetriplecticTaylor
 BODY = lt.models.rigid_body((5.0, 4.0, 2.0), rate=0.5)
 X0 = np.array([0.2, 1.0, 0.3])
 MULTIPLES = np.array([4, 5, 6, 7, 8])
+"""Numbers of eighths of the length over which errors are measured."""
 
 
 def reference(system, x, time, pieces=1):
@@ -33,7 +34,7 @@ POWERS = {
 
 
 class Power(eqx.Module):
-    """Its exponent is a parameter of the system."""
+    """A power whose exponent is a parameter of the system."""
 
     exponent: float
 
@@ -43,7 +44,7 @@ class Power(eqx.Module):
 
 @pytest.mark.parametrize("name", [*POWERS, "a parameter"])
 def test_whole_powers_as_floats_near_zero(name):
-    """Against DOP853 on Euler's equations in NumPy."""
+    """Runs agree with DOP853 on Euler's equations in NumPy."""
     power, derivative = POWERS.get(name) or (Power(3.0), lambda x: 3.0 * x**2)
     system = lt.LiePoissonSystem(mf.so(3), lambda m: power(m) + m[1] ** 2 + 0.5 * m[2] ** 2 + 0.1 * m[0] ** 2)
 
@@ -53,8 +54,8 @@ def test_whole_powers_as_floats_near_zero(name):
     for start in (0.0, 1e-6, -1e-3):
         x0 = np.array([start, 0.5, -0.3])
         run = lt.integrate(system, x0, (0.0, 1.0), 0.05, Taylor(8))
-        right = solve_ivp(field, (0.0, 1.0), x0, method="DOP853", rtol=1e-12, atol=1e-14).y[:, -1]
-        assert np.abs(run.x[-1] - right).max() <= 1e-10
+        reference_end = solve_ivp(field, (0.0, 1.0), x0, method="DOP853", rtol=1e-12, atol=1e-14).y[:, -1]
+        assert np.abs(run.x[-1] - reference_end).max() <= 1e-10
         assert run.audit().passed
 
 
@@ -73,7 +74,7 @@ def test_quadrature(nodes):
 @pytest.mark.parametrize(("order", "length"), [(2, 0.1), (5, 0.2), (6, 0.2), (12, 0.3), (20, 0.6)])
 @pytest.mark.parametrize("name", NONLINEAR)
 def test_observed_order(name, order, length):
-    """Of the error of a step, one more: the mean over eight states, for five lengths."""
+    """The error of a step has the slope order + 1: the mean over eight states, for five lengths."""
     system, x0 = NONLINEAR[name]
     x0s = 1.5 * x0 * (1.0 + 0.3 * np.random.default_rng(1).standard_normal((8, len(x0))))
     length = length if len(x0) == 3 else min(length, 0.4)
@@ -81,17 +82,17 @@ def test_observed_order(name, order, length):
     errors = []
     for m in MULTIPLES:
         h = m * length / 8
-        many = lt.ensemble(system, x0s, (0.0, h), h, Taylor(order))
-        errors.append(np.sqrt(np.mean((many.x - exact[:, m]) ** 2)))
-        assert many.energy_drift.max() <= 2e-15
-        assert many.least_entropy_increment.min() >= -1e-15
+        ensemble = lt.ensemble(system, x0s, (0.0, h), h, Taylor(order))
+        errors.append(np.sqrt(np.mean((ensemble.x - exact[:, m]) ** 2)))
+        assert ensemble.energy_drift.max() <= 2e-15
+        assert ensemble.least_entropy_increment.min() >= -1e-15
     assert_slope(errors, order)
 
 
 def assert_slope(errors, order):
-    clear = np.array(errors) > 3e-13
-    assert clear.sum() >= 3, errors
-    slope = np.polyfit(np.log(MULTIPLES[clear]), np.log(np.array(errors)[clear]), 1)[0]
+    is_resolved = np.array(errors) > 3e-13
+    assert is_resolved.sum() >= 3, errors
+    slope = np.polyfit(np.log(MULTIPLES[is_resolved]), np.log(np.array(errors)[is_resolved]), 1)[0]
     assert abs(slope - (order + 1)) < 0.1 * order, (errors, slope)
 
 
@@ -113,7 +114,7 @@ def test_observed_order_on_manifolds(name, order, length):
 
 @pytest.mark.parametrize(("rtol", "order"), [(1e-6, 8), pytest.param(1e-12, 15, marks=pytest.mark.slow)])
 def test_orders_from_tolerances_and_states_between(rtol, order):
-    """By default the order is what the tolerance asks for; the error is less than asked, and so it is between."""
+    """The default order follows from the tolerance; the error is within it, also between the steps."""
     run = lt.integrate(BODY, X0, (0.0, 10.0), lt.Adaptive(rtol), Taylor(), dense=True)
     assert run.provenance["method"] == f"MetriplecticTaylor(order={order})"
     assert run.stats.steps < 20
@@ -126,7 +127,7 @@ def test_orders_from_tolerances_and_states_between(rtol, order):
 
 @pytest.mark.parametrize("rtol", [1e-6, pytest.param(1e-12, marks=pytest.mark.slow)])
 def test_events(rtol):
-    """Located to rounding by a step that ends there, in long steps too."""
+    """An event is located to rounding by a step that ends there, in long steps too."""
     run = lt.integrate(BODY, X0, (0.0, 10.0), lt.Adaptive(rtol), Taylor(), until=lambda m: m[1] - 0.5)
     assert run.status.code == "event"
     assert run.x[-1][1] == pytest.approx(0.5, abs=1e-14)
@@ -135,7 +136,7 @@ def test_events(rtol):
 
 @pytest.mark.slow
 def test_a_kink_is_seen_by_the_estimate():
-    """A choice that is made at the start of a step: adaptive steps end where it is made otherwise."""
+    """A condition is evaluated at the start of a step: adaptive steps end where its value changes."""
 
     def energy(m):
         return 0.5 * jnp.sum(m**2 / jnp.array([5.0, 4.0, 2.0])) + jnp.where(m[0] > 0.0, 0.3 * m[0] ** 4, 0.0)
@@ -149,7 +150,7 @@ def test_a_kink_is_seen_by_the_estimate():
 
 @pytest.mark.slow
 def test_double_bracket_dissipation():
-    """The energy falls, by a quadrature that is exact to the order; the Casimir is held."""
+    """The energy falls, by a quadrature that is exact to the order, and the Casimir is constant."""
     system = lt.LiePoissonSystem(
         mf.so(3), lt.Quadratic(1.0 / np.array([5.0, 4.0, 2.0])), lt.Quadratic(np.ones(3)), lt.DoubleBracket(0.3)
     )
@@ -160,13 +161,13 @@ def test_double_bracket_dissipation():
 
 
 @pytest.mark.parametrize("order", [1, 25, 2.5, True, "6"])
-def test_orders_that_there_are_not(order):
-    with pytest.raises(lt.errors.InputError, match="the order is an integer from 2 to 24, or None"):
+def test_invalid_orders(order):
+    with pytest.raises(lt.errors.InputError, match="order must be an integer from 2 to 24 or None"):
         Taylor(order)
 
 
-class Unpromised(lt.FrictionOperator):
-    """A dissipation that promises nothing."""
+class LawlessFriction(lt.FrictionOperator):
+    """A dissipation without laws."""
 
     energy_law = entropy_law = None
 
@@ -182,14 +183,14 @@ def test_bad_input():
         assert "MetriplecticRungeKutta" in str(e.value)
     with pytest.raises(lt.errors.InputError, match="does not conserve"):
         lt.integrate(BODY, X0, (0.0, 1.0), 0.1, Taylor(8, preserve=lambda m: m[0]))
-    friction = Unpromised(lambda x: jnp.eye(2))
+    friction = LawlessFriction(lambda x: jnp.eye(2))
     lawless = lt.MetriplecticSystem(None, lambda x: x[0], lambda x: x[1], friction, dim=2, validate=False)
-    with pytest.raises(lt.errors.InputError, match="claims none"):
+    with pytest.raises(lt.errors.InputError, match="this one has none"):
         lt.integrate(lawless, [1.0, 2.0], (0.0, 1.0), 0.1, Taylor(8))
 
 
 def test_without_a_tolerance_the_order_is_that_of_1e_10():
-    """By every way to run: what asks the method and what sets it."""
+    """Every way to run uses this order."""
     assert Taylor().order == Taylor().on(BODY).order == Taylor().on(BODY, 1e-10).order == 13
     ours = lt.integrate(BODY, X0, (0.0, 0.4), 0.2, Taylor(13))
     states = [
@@ -204,7 +205,7 @@ def test_without_a_tolerance_the_order_is_that_of_1e_10():
 
 @pytest.mark.parametrize("number", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_spins_that_heat_baths(number):
-    """Against the Runge-Kutta method of order 8, and both laws."""
+    """The run agrees with the Runge-Kutta method of order 8 and obeys both laws."""
     rate = np.array([0.1, 0.5, 0.2])
     system = lt.models.spin_lattice(
         3,
@@ -217,7 +218,7 @@ def test_spins_that_heat_baths(number):
     spins = np.random.default_rng(0).standard_normal((3, 3))
     x0 = system.state(spins / np.linalg.norm(spins, axis=1)[:, None])
     run = lt.integrate(system, x0, (0.0, 1.0), 0.1, Taylor(12))
-    other = lt.integrate(system, x0, (0.0, 1.0), 0.02, lt.MetriplecticRungeKutta(8))
-    assert np.abs(run.x[-1] - other.x[-1]).max() < 1e-12
+    reference_run = lt.integrate(system, x0, (0.0, 1.0), 0.02, lt.MetriplecticRungeKutta(8))
+    assert np.abs(run.x[-1] - reference_run.x[-1]).max() < 1e-12
     assert run.audit().passed, str(run.audit())
     assert np.ptp(run.entropy) > 0.1

@@ -33,18 +33,18 @@ def _run(system, method, x0, steps, h=H, **options):
 # -- the printed equations --------------------------------------------------------------------------------------------
 
 
-def _printed(name, x0, x1, S0, steps, m, k, friction, heat, T0, h):
-    """The recursions of §5.2 in extended precision; of scheme 2 with the temperature of the general form (3.9)."""
+def printed_recursion(name, x0, x1, S0, steps, m, k, friction, heat, T0, h):
+    """Return x and S by the recursions of §5.2 in extended precision; scheme 2 with the temperature of (3.9)."""
     m, k, lam, heat, T0, h = map(np.longdouble, (m, k, friction, heat, T0, h))
 
     def T(S):
         return T0 * np.exp(S / heat)
 
     def entropy(a, b, S):
-        made, S1 = lam * ((b - a) / h) ** 2 * h, S
+        heat_produced, S1 = lam * ((b - a) / h) ** 2 * h, S
         for _ in range(30):  # a contraction, since the temperature hardly changes in a step
             mean = {"scheme 1": T(S), "scheme 2": T((S + S1) / 2), "scheme 3": (T(S) + T(S1)) / 2}[name]
-            S1 = S + made / mean
+            S1 = S + heat_produced / mean
         return S1
 
     x, S = [np.longdouble(x0), np.longdouble(x1)], [np.longdouble(S0)]
@@ -80,7 +80,7 @@ def test_the_printed_schemes(name, engine):
     start = SCHEMES[name].state(system, 0.3, 0.31, 0.0, h)
     solution = _run(system, SCHEMES[name], start, 500, h, engine=engine)
     heat = 1.5 * 8.31446261815324
-    x, S = _printed(name, 0.3, 0.31, 0.0, 500, 5.0, 5.0, 10.0, heat, 300.0, h)
+    x, S = printed_recursion(name, 0.3, 0.31, 0.0, 500, 5.0, 5.0, 10.0, heat, 300.0, h)
     assert np.abs(solution.x[:, 0] - x).max() < 1e-13
     assert np.abs(solution.x[:, 2] - S).max() < 1e-15
 
@@ -101,36 +101,36 @@ def test_a_run_solves_3_12(kind, name):
 
     @jax.jit
     @jax.vmap
-    def misfits(before, at, after):
-        (a, _, Sa, ta), (b, _, Sb, tb), (c, _, Sc, _) = (system.parts(y) for y in (before, at, after))
-        first, second = method.discrete_system(system, h, ta), method.discrete_system(system, h, tb)
+    def step_residuals(x0, x1, x2):
+        (a, _, Sa, ta), (b, _, Sb, tb), (c, _, Sc, _) = (system.split_state(y) for y in (x0, x1, x2))
+        step_1, step_2 = method.discrete_system(system, h, ta), method.discrete_system(system, h, tb)
         return (
-            first.momenta(a, b, Sa, Sb)[1] - second.momenta(b, c, Sb, Sc)[0],  # (3.12)
-            second.constraint(b, c, Sb, Sc),
-            system.momentum(*system.parts(at)[:3]) - second.momenta(b, c, Sb, Sc)[0],
+            step_1.momenta(a, b, Sa, Sb)[1] - step_2.momenta(b, c, Sb, Sc)[0],  # (3.12)
+            step_2.constraint(b, c, Sb, Sc),
+            system.momentum(*system.split_state(x1)[:3]) - step_2.momenta(b, c, Sb, Sc)[0],
         )
 
-    for misfit in misfits(x[:-2], x[1:-1], x[2:]):
-        assert np.abs(misfit).max() < 1e-12
+    for residual in step_residuals(x[:-2], x[1:-1], x[2:]):
+        assert np.abs(residual).max() < 1e-12
 
 
 def test_the_matrix_of_regularity():
-    """(5.2)-(5.4) for the mass and spring, with signs of (3.13): docs/reference/misprints.md has the differences."""
+    """The matrices are (5.2)-(5.4) for the mass and spring, with the signs of (3.13): docs/reference/misprints.md."""
     m, k, lam, h, heat = 5.0, 5.0, 10.0, 0.1, 1.5 * 8.31446261815324
     system = lt.models.mass_spring_gas(m, k, lam)
     x0, x1, S0, S1 = 0.3, 0.35, 0.1, 0.2
     V, s = (x1 - x0) / h, (S1 - S0) / h
     T = 300.0 * np.exp(np.array([S0, 0.5 * (S0 + S1), S1]) / heat)
-    expected = {
+    matrix_by_scheme = {
         "scheme 1": [[-m / h - lam, 0.0], [2 * lam * V / h, -T[0] / h]],
         "scheme 2": [[-m / h - h * k / 4 - lam / 2, 0.0], [2 * lam * V / h, -T[1] / h * (h * s / (2 * heat) + 1)]],
         "scheme 3": [[-m / h - lam / 2, 0.0], [2 * lam * V / h, -(T[2] * s / heat + (T[0] + T[2]) / h) / 2]],
     }
-    for name, matrix in expected.items():
+    for name, matrix in matrix_by_scheme.items():
         discrete = SCHEMES[name].discrete_system(system, h)
-        found, reduced = evaluate_at_points(_matrices, discrete, np.array([[x0, x1, S0, S1]]))
-        assert np.abs(found[0] - np.array(matrix)).max() < 1e-10 * np.abs(matrix).max(), name
-        assert np.allclose(reduced[0], np.array(matrix)[:1, :1], rtol=1e-13)
+        matrices, reduced_matrices = evaluate_at_points(_matrices, discrete, np.array([[x0, x1, S0, S1]]))
+        assert np.abs(matrices[0] - np.array(matrix)).max() < 1e-10 * np.abs(matrix).max(), name
+        assert np.allclose(reduced_matrices[0], np.array(matrix)[:1, :1], rtol=1e-13)
 
 
 def _matrices(discrete, x):
@@ -139,7 +139,7 @@ def _matrices(discrete, x):
 
 
 def test_a_map_of_one_s_own():
-    """A subclass that says in its own words what alpha = 1/2 does makes the same discrete system."""
+    """A subclass that implements alpha = 1/2 by itself makes the same discrete system."""
 
     class Midpoint(lt.FiniteDifference):
         def position(self, q0, V, h):
@@ -149,12 +149,12 @@ def test_a_map_of_one_s_own():
         def is_symmetric(self):
             return True
 
-    own = lt.VariationalIntegrator(Midpoint(0.5))
-    assert own.order == 2
+    user_scheme = lt.VariationalIntegrator(Midpoint(0.5))
+    assert user_scheme.order == 2
     points = np.array([[0.1, 0.2, 0.15, 0.1, 0.2, 0.3]])
     a, b = (
         evaluate_at_points(_momenta, scheme.discrete_system(OPEN["tangled"], 0.1), points)
-        for scheme in (own, SCHEMES["scheme 2"])
+        for scheme in (user_scheme, SCHEMES["scheme 2"])
     )
     assert np.abs(a - b).max() < 1e-14
     assert (
@@ -177,14 +177,14 @@ def _momenta(discrete, x):
 @pytest.mark.parametrize("case", CASES)
 @each_scheme
 def test_the_table_of_energies(case, name):
-    """Cases 1 and 2 over 10^4 steps, at the scheme's own points, within a factor of 3; S grows at every step."""
-    for friction, expected in zip(FRICTIONS, TABLE[case, name], strict=True):
+    """Cases 1 and 2 over 10^4 steps agree with the table within a factor of 3; S grows at every step."""
+    for friction, table_value in zip(FRICTIONS, TABLE[case, name], strict=True):
         system, method = lt.models.mass_spring_gas(**CASES[case], friction=friction), SCHEMES[name]
         solution = _run(system, method, method.state(system, STARTS[case], STARTS[case], 0.0, H), 10_000)
         deviation = _deviation(method, system, solution)
-        assert deviation.max() < 3 * expected, friction
-        if expected > 1e-14:  # not rounding
-            assert deviation.max() > expected / 3, friction
+        assert deviation.max() < 3 * table_value, friction
+        if table_value > 1e-14:  # not rounding
+            assert deviation.max() > table_value / 3, friction
         rises = np.diff(solution.x[:, 2])[1:]  # in the first step nothing moves, x_0 = x_1
         assert (rises > 0.0).all() if friction > 0.0 else (rises == 0.0).all()
 
@@ -198,23 +198,23 @@ def _deviation(method, system, solution):
 @pytest.mark.parametrize("case", CASES)
 @each_scheme
 def test_the_table_over_1e5_steps(case, name):
-    """The bounds hold to the end, and the entropy grows at every step at which friction still does something."""
-    for friction, expected in zip(FRICTIONS, TABLE[case, name], strict=True):
+    """The bounds hold to the end, and the entropy grows at every step at which friction still acts."""
+    for friction, table_value in zip(FRICTIONS, TABLE[case, name], strict=True):
         system, method = lt.models.mass_spring_gas(**CASES[case], friction=friction), SCHEMES[name]
         x0 = method.state(system, STARTS[case], STARTS[case], 0.0, H)
         solution = _run(system, method, x0, 100_000, engine="compiled")
         deviation = _deviation(method, system, solution)
-        assert deviation.max() < 3 * expected, friction
+        assert deviation.max() < 3 * table_value, friction
         assert solution.stats.least_entropy_increment >= 0.0
         if friction > 0.0:  # in the first step nothing moves, x_0 = x_1
-            moving = np.abs(solution.x[:-1, 1]) > 1e-6
-            assert (np.diff(solution.x[:, 2])[moving] > 0.0)[1:].all()
-        late = deviation[-20_000:]
+            is_moving = np.abs(solution.x[:-1, 1]) > 1e-6
+            assert (np.diff(solution.x[:, 2])[is_moving] > 0.0)[1:].all()
+        last_deviations = deviation[-20_000:]
         if name == "scheme 1" and friction > 0.0:
-            assert late.max() < deviation[:20_000].max()  # "decreases in time"
+            assert last_deviations.max() < deviation[:20_000].max()  # "decreases in time"
         elif friction > 1.0:
             assert (
-                np.ptp(late) < 1e-3 * late.max()
+                np.ptp(last_deviations) < 1e-3 * last_deviations.max()
             )  # "stays constant": once the mass is at rest, and so that of scheme 1
 
 
@@ -253,7 +253,7 @@ def test_orders_against_the_exact_solution(name, friction):
     [pytest.param(name, marks=() if name == "scheme 3" else pytest.mark.slow) for name in ORDERS],
 )
 def test_orders_on_a_system_of_no_special_form(name):
-    """With every force, work and heat from outside; the defect of the energy balance has the same order."""
+    """With every force, work and heat from outside, the error of the energy balance has the same order."""
     (method, order), system = ORDERS[name], OPEN["tangled"]
     assert method.order == order
     exact = lt.integrate(system, X0, (0.0, 1.0), 1.0, lt.Reference(rtol=1e-12)).x[-1]
@@ -271,7 +271,7 @@ def test_orders_on_a_system_of_no_special_form(name):
     "name", ["scheme 3", *(pytest.param(n, marks=pytest.mark.slow) for n in ("scheme 1", "scheme 2", "alpha = 0.3"))]
 )
 def test_the_entropy_grows_at_every_step(name):
-    """However coarse; and by the heat over the temperature of the constraint, exactly."""
+    """The entropy grows in coarse steps too, although the energy is not conserved."""
     solution = _run(ISOLATED["mechanical"], ORDERS[name][0], X0, 60, 0.3, engine="compiled")
     assert solution.stats.least_entropy_increment > 0.0
     assert solution.energy.max() - solution.energy.min() > 1e-3  # the energy is not kept
@@ -285,11 +285,11 @@ def test_the_entropy_grows_at_every_step(name):
 def test_two_ways_to_start(name):
     """From (q_0, q_1, S_0) the first step leads to q_1; from (q_0, v_0, S_0) it is exact: v_0 = L_v^-1(p_0)."""
     method, system, h = SCHEMES[name], ISOLATED["tangled"], 0.05
-    first = _run(system, method, X0, 2, h, engine="compiled")
-    again = method.state(system, first.x[0, :2], first.x[1, :2], X0[4], h)
-    assert np.abs(again - X0).max() < 1e-12
-    S1 = first.x[1, 4]
-    assert np.abs(method.state(system, X0[:2], first.x[1, :2], X0[4], h, S1=S1) - X0).max() < 1e-12
+    solution = _run(system, method, X0, 2, h, engine="compiled")
+    state = method.state(system, solution.x[0, :2], solution.x[1, :2], X0[4], h)
+    assert np.abs(state - X0).max() < 1e-12
+    S1 = solution.x[1, 4]
+    assert np.abs(method.state(system, X0[:2], solution.x[1, :2], X0[4], h, S1=S1) - X0).max() < 1e-12
 
 
 def test_inconsistent_first_steps():
@@ -309,15 +309,15 @@ def test_inconsistent_first_steps():
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ["array", pytest.param("compiled", marks=pytest.mark.slow)])
 def test_a_temperature_that_reaches_zero_stops_the_run(engine):
-    """T = 1 - S: friction heats the body until it has none left."""
+    """The temperature is T = 1 - S: friction heats the body until it is zero."""
     system = lt.SimpleClosedSystem(
         lambda q, v, S: 0.5 * v @ v - 0.5 * q @ q - S + 0.5 * S**2, 3, friction=1.0, validate=False
     )
     with pytest.raises(lt.NonFiniteError, match=r"positive temperature|temperature -dL/dS") as caught:
         _run(system, SCHEMES["scheme 3"], [0.0, 1.2, 0.0], 1000, 0.02, engine=engine)
-    kept = caught.value.solution
-    assert 2 < len(kept.t) < 1000
-    assert (np.asarray(system.temperature(kept.x)) > 0.0).all()
+    partial = caught.value.solution
+    assert 2 < len(partial.t) < 1000
+    assert (np.asarray(system.temperature(partial.x)) > 0.0).all()
 
 
 @pytest.mark.slow
@@ -333,7 +333,7 @@ def test_a_degenerate_regularity_matrix_is_reported(engine):
 @pytest.mark.parametrize(
     ("build", "words"),
     [
-        (lambda: lt.FiniteDifference(1.5), "from 0 to 1, not 1.5"),
+        (lambda: lt.FiniteDifference(1.5), "between 0 and 1, got 1.5"),
         (lambda: lt.FiniteDifference(0.5, beta=-0.1), "beta"),
         (lambda: lt.FiniteDifference(0.5, weight=0.0), "weight"),
         (lambda: lt.VariationalIntegrator([]), "phi must be"),
@@ -342,7 +342,7 @@ def test_a_degenerate_regularity_matrix_is_reported(engine):
             lambda: lt.integrate(
                 lt.models.rigid_body(), [1.0, 0.0, 0.0], (0.0, 1.0), 0.1, lt.VariationalIntegrator.verlet()
             ),
-            "SimpleClosedSystem, not a LiePoissonSystem",
+            "SimpleClosedSystem, got a LiePoissonSystem",
         ),
     ],
 )
@@ -357,5 +357,7 @@ def test_bad_input(build, words):
 @pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow) for name in SCHEMES])
 def test_both_engines_take_the_same_steps(name):
     system = OPEN["tangled"]
-    one, other = (_run(system, SCHEMES[name], X0, 50, 0.02, engine=engine) for engine in ("array", "compiled"))
-    assert np.abs(one.x - other.x).max() < 1e-13
+    array_run, compiled_run = (
+        _run(system, SCHEMES[name], X0, 50, 0.02, engine=engine) for engine in ("array", "compiled")
+    )
+    assert np.abs(array_run.x - compiled_run.x).max() < 1e-13

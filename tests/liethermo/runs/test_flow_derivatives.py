@@ -11,9 +11,9 @@ import scipy.linalg
 
 import liethermo as lt
 import manifolds as mf
-from tests.liethermo.integrators.test_convergence import OF_EVERY_SYSTEM, PROBLEMS, SYSTEMS
+from tests.liethermo.integrators.test_convergence import METRIPLECTIC_METHODS, PROBLEMS, SYSTEMS
 
-METHODS = [m for m in lt.registered_methods() if isinstance(m, OF_EVERY_SYSTEM)]
+METHODS = [m for m in lt.registered_methods() if isinstance(m, METRIPLECTIC_METHODS)]
 
 
 def by_differences(f, x, size=2e-3):

@@ -395,12 +395,18 @@ def test_units():
         (lambda: lt.EvolutionSystem(jnp.sum, 5, space=mf.Sphere(2)), r"on S\^2 a state.*has 7 components, not 5"),
         (lambda: lt.EvolutionSystem(jnp.sum), r"2n \+ 1 for n degrees of freedom, 3 at least, not None"),
         (lambda: lt.EvolutionSystem(jnp.sum, space=mf.SpecialUnitary(2)), r"SU\(2\) is complex"),
-        (lambda: lt.integrate(flat(), [1.0, 0.0, 0.0], (0.0, 1.0), 0.1, V.midpoint(retraction="exp")), "leave it out"),
-        (lambda: run(lt.VariationalGauss(2)), r"VariationalGauss runs on R\^n: on a manifold take"),
-        (lambda: run(V(Lazy(0.5))), "no subclass of it"),
-        (lambda: run(lt.DiscreteHerglotz(lambda q0, q1, S0, h: S0)), "not a SimpleClosedSystem"),
+        (
+            lambda: lt.integrate(flat(), [1.0, 0.0, 0.0], (0.0, 1.0), 0.1, V.midpoint(retraction="exp")),
+            "Leave retraction= out",
+        ),
+        (lambda: run(lt.VariationalGauss(2)), r"VariationalGauss runs only on R\^n. On a manifold use"),
+        (lambda: run(V(Lazy(0.5))), "no subclass"),
+        (lambda: run(lt.DiscreteHerglotz(lambda q0, q1, S0, h: S0)), "got a SimpleClosedSystem"),
         (lambda: by_herglotz().system.hamiltonian_system(), r"inverted on R\^n alone.*S\^2.*with space="),
-        (lambda: run(V.midpoint(retraction=mf.retraction(mf.Sphere(3), "exp"))), r"one of S\^3, not of S\^2"),
+        (
+            lambda: run(V.midpoint(retraction=mf.retraction(mf.Sphere(3), "exp"))),
+            r"belongs to S\^3, but the system is on S\^2",
+        ),
         (lambda: run(V.midpoint(), np.array([1.0, 0, 0, 0.5, 1.0, 0, 0])), r"T S\^2.*off the space"),
     ],
 )

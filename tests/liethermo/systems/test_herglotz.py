@@ -282,5 +282,5 @@ def errors_of_order(order, S0) -> list:
 
 
 def test_discrete_herglotz_runs_evolution_systems_only():
-    with pytest.raises(lt.InputError, match=r"EvolutionSystem, not a LiePoissonSystem"):
+    with pytest.raises(lt.InputError, match=r"EvolutionSystem, got a LiePoissonSystem"):
         lt.integrate(lt.models.rigid_body(), [1.0, 0.0, 0.0], (0.0, 1.0), 0.1, lt.DiscreteHerglotz(L_d))

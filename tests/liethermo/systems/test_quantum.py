@@ -419,7 +419,7 @@ def test_a_hamiltonian_that_depends_on_time():
     solution = lt.integrate(q, q.state(RHO), (0.0, 3.0), 0.1)
     assert solution.audit().passed
     assert np.diff(solution.entropy).min() >= -1e-15
-    with pytest.raises(lt.InputError, match="eigenvectors of the Hamiltonian turn"):
+    with pytest.raises(lt.InputError, match="eigenvectors of the Hamiltonian depend on time"):
         lt.QuantumSystem(lambda t: jnp.cos(t) * Z + jnp.sin(t) * X, lt.ThermalJumps([(LOWER, 0.1)]), baths=infinite())
 
 
@@ -1050,7 +1050,7 @@ BAD = {
     r"at T = 0.0001, .* = nan.*Give the rate as a function": lambda q: lt.QuantumSystem(
         QUBIT, lt.ThermalJumps([(X, lambda w, T: 0.1 / (2 * jnp.sinh(w / (2 * T))))]), infinite(1e-4)
     ),
-    "eigenvectors of the Hamiltonian, which has to be a known one": lambda q: lt.ensemble(
+    "eigenvectors of the Hamiltonian, so it must not be a traced value": lambda q: lt.ensemble(
         lambda p: lt.QuantumSystem(p * QUBIT, lt.ThermalJumps([(LOWER, RATE)]), infinite()),
         q.state(RHO),
         (0.0, 1.0),
@@ -1073,7 +1073,7 @@ BAD = {
     r"the rate of V\[0\] is a number, or a function .* not to": lambda q: lt.ThermalJumps([(LOWER, lambda w, T: [w])]),
     "at omega = 1 and T = 1 it is -1": lambda q: lt.ThermalJumps([(LOWER, lambda w, T: -1.0)]),
     r"to a number >= 0: .*positional argument": lambda q: lt.ThermalJumps([(LOWER, lambda w: 1.0)]),
-    r"not an array of float64, shape \(0, 0\)": lambda q: lt.QuantumSystem(np.zeros((0, 0))),
+    r"got an array of float64, shape \(0, 0\)": lambda q: lt.QuantumSystem(np.zeros((0, 0))),
     "the observable has shape": lambda q: q.expectation(q.state(RHO), np.eye(3)),
     "mixed is a share": lambda q: q.state(RHO, mixed="half"),
     "matrix is not Hermitian": lambda q: q.state(RHO + 0.1 * LOWER),

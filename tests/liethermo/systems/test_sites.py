@@ -135,7 +135,7 @@ def test_laws_hold_on_many_sites(method):
         (lambda: system().state(STATE[0]), r"shape \(3, 2, 3\), or flat \(18,\), not \(2, 3\)"),
         (lambda: system().state(np.zeros(17)), r"or flat \(18,\), not \(17,\)"),
         (lambda: system(lt.LocalProjectedMetric(np.ones(6))), r"the shape of the sites, \(3, 2\), not \(6,\)"),
-        (lambda: lt.LocalProjectedMetric([1.0, -1.0]), "must be >= 0, not -1"),
+        (lambda: lt.LocalProjectedMetric([1.0, -1.0]), "must be >= 0, got -1"),
         (lambda: system(lt.LocalProjectedMetric(1.0, np.eye(4))), r"shape \(3, 3\), not \(4, 4\)"),
         (lambda: system(lt.InnerProductDissipation(np.eye(4))), r"\(4, 4\), but \(so\(3\)\)\^3x2 has dimension 18"),
         (lambda: system(lt.EulerPoincareForce(lambda xi: xi[0])), r"force F must have shape \(3, 2, 3\), got \(2, 3\)"),

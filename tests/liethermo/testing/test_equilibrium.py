@@ -102,7 +102,7 @@ CROOKED = lt.LiePoissonSystem(mf.so(3), SPIN.energy, None, Crooked(0.5))
 @pytest.mark.slow
 def test_the_wrong_noise_is_found(monkeypatch):
     """It is refused; and where nobody looks, it has another equilibrium."""
-    with pytest.raises(lt.InputError, match=r"misses K dS by 0.2"):
+    with pytest.raises(lt.InputError, match=r"differs from K dS by a relative error of 0.2"):
         lt.integrate(CROOKED, UP, (0.0, 1.0), 0.1, noise=BATH)
     monkeypatch.setattr(fluctuating, "MISFIT", 1.0)
     with pytest.raises(PropertyError, match="standard errors"):
