@@ -41,7 +41,7 @@ def test_every_point_is_what_a_run_of_its_own_gives(done):
     assert np.array_equal(found.rate, RATES)
     for i, j in ((0, 0), (3, 4), (5, 2)):
         solution = lt.integrate(body({"rate": RATES[i], "ratio": RATIOS[j]}), X0, (0.0, 4.0), 0.1)
-        np.testing.assert_allclose(found.needs_final_state[i, j], solution.x[-1], rtol=0, atol=1e-14)
+        np.testing.assert_allclose(found.final[i, j], solution.x[-1], rtol=0, atol=1e-14)
         kept = found.laws[i, j]
         assert kept.sel(quantity="steps") == 40
         assert kept.sel(quantity="entropy_change") == pytest.approx(
@@ -62,7 +62,7 @@ def test_a_parameter_that_is_refused_is_the_status_of_its_points(done):
         "a dissipation rate must be >= 0, not -1.0: a negative one would lower the entropy"
     }
     assert np.isnan(bad.tau).all()
-    assert np.isnan(bad.needs_final_state).all()
+    assert np.isnan(bad.final).all()
     assert (found.status.sel(rate=RATES[0]) == 0).all()
 
 
@@ -191,7 +191,7 @@ def test_a_builder_that_looks_at_values_is_called_for_each_point(tmp_path):
     results = found.results
     assert results.message.sel(kind="plate", rate=2.0).item() == "ValueError: too fast"
     direct = lt.integrate(lt.models.rigid_body((2.0, 2.0, 1.0), 0.5), X0, (0.0, 4.0), 0.1)
-    np.testing.assert_allclose(results.needs_final_state.sel(kind="plate", rate=0.5), direct.x[-1], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(results.final.sel(kind="plate", rate=0.5), direct.x[-1], rtol=0, atol=1e-14)
 
 
 @pytest.mark.slow
@@ -226,7 +226,7 @@ def test_a_system_can_be_swept_by_the_names_of_its_parameters(tmp_path):
     assert found.run().ok
     direct = lt.ensemble(system, X0, (0.0, 4.0), 0.1, parameters={"dissipation.rate": np.array([0.2, 0.4])})
     wanted = lt.integrate(lt.models.rigid_body((2.5, 2.0, 1.5), 0.8), X0, (0.0, 4.0), 0.1).x[-1]
-    np.testing.assert_allclose(found.results.needs_final_state[1, 1], wanted, atol=1e-14)
+    np.testing.assert_allclose(found.results.final[1, 1], wanted, atol=1e-14)
     assert direct.x.shape == (2, 3)
     with pytest.raises(lt.InputError, match=r"no parameter 'rate' that is one number; it has"):
         study(axes={"rate": [0.1]}, build=system)
@@ -244,7 +244,7 @@ def test_replicas_and_initial_states_of_their_own(tmp_path):
         build=lambda p: body({"ratio": 0.2, "rate": p["rate"]}),
     )
     seeded.run()
-    assert np.array_equal(found.results.needs_final_state.values, seeded.results.needs_final_state.values)
+    assert np.array_equal(found.results.final.values, seeded.results.final.values)
     assert np.array_equal(found.results.replica_state, states)
     named = study(
         tmp_path / "c.zarr",
@@ -253,8 +253,8 @@ def test_replicas_and_initial_states_of_their_own(tmp_path):
         build=lambda p: body({"ratio": 0.2, "rate": 0.3}),
     )
     named.run()
-    assert np.array_equal(named.results.needs_final_state.sel(place="pole"), [0.0, 0.0, 1.0])  # both are equilibria
-    assert np.array_equal(named.results.needs_final_state.sel(place="equator"), [1.0, 0.0, 0.0])
+    assert np.array_equal(named.results.final.sel(place="pole"), [0.0, 0.0, 1.0])  # both are equilibria
+    assert np.array_equal(named.results.final.sel(place="equator"), [1.0, 0.0, 0.0])
     with pytest.raises(lt.InputError, match="x0 and replica"):
         study(axes=axes, build=body)
 
