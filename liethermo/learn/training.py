@@ -412,7 +412,7 @@ def write_archive(path: Path, said: dict[str, Any], arrays: dict[str, Any]) -> N
     try:
         disk.write_atomically(path, made.getvalue())
     except (OSError, ValueError) as error:
-        raise FileError(f"cannot write {path!s:.200}: {disk.why_os_failed(error)}") from error
+        raise FileError(f"cannot write {path!s:.200}: {disk.describe_os_error(error)}") from error
 
 
 def read_archive(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

@@ -136,7 +136,7 @@ def write_dataset(dataset: xarray.Dataset, path: str | os.PathLike) -> Path:
         disk.write_atomically(path, made.getbuffer())
     except (OSError, ValueError) as error:  # the latter for what is no path
         raise FileError(
-            f"cannot write {path!s:.200}: {disk.why_os_failed(error)}. The result itself is as it was"
+            f"cannot write {path!s:.200}: {disk.describe_os_error(error)}. The result itself is as it was"
         ) from error
     disk.remove_dead_parts(path.parent, path.name)
     return path
@@ -175,7 +175,7 @@ def read_dataset(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[s
     except OSError as error:
         if isinstance(error, FileError):
             raise
-        raise FileError(f"cannot read {path!s:.200}: {disk.why_os_failed(error)}") from error
+        raise FileError(f"cannot read {path!s:.200}: {disk.describe_os_error(error)}") from error
     try:
         series, attributes = _read_hdf5(path)
     except Exception as error:  # the readers beneath raise a dozen kinds for a broken file

@@ -1,4 +1,4 @@
-"""What a spec file may say: its sections and their keys, with what each is."""
+"""Schema of spec files: the sections, their keys and descriptions."""
 
 from __future__ import annotations
 
@@ -13,21 +13,22 @@ from ..integrators import METHODS
 from .messages import format_value, suggest_match, validation_error
 
 FIGURES = ("momentum_sphere", "laws")
-FORMATS = ("png", "pdf", "svg")
+"""Names of the figures that ``liethermo run`` can draw."""
 
+FORMATS = ("png", "pdf", "svg")
+"""File formats of figures."""
 
 MAX_AXIS_VALUES = 10**7
-"""Values of an axis."""
+"""Maximum number of values of an axis."""
 
 
 def one_of(options: Iterable[str]) -> BeforeValidator:
-    allowed = list(options)
+    allowed_values = list(options)
 
     def check(value):
-        if value not in allowed:
-            raise validation_error(
-                f"must be one of {', '.join(map(format_value, allowed))}{suggest_match(str(value), allowed)}"
-            )
+        if value not in allowed_values:
+            hint = suggest_match(str(value), allowed_values)
+            raise validation_error(f"must be one of {', '.join(map(format_value, allowed_values))}{hint}")
         return value
 
     return BeforeValidator(check)
@@ -50,7 +51,7 @@ class Section(BaseModel):
 
 
 class SpecContents(Section):
-    """The whole file."""
+    """Top level of a spec file."""
 
     model: Any = None
     run: Any = None
@@ -60,7 +61,7 @@ class SpecContents(Section):
 
 
 class Model(Section):
-    """What is run: a model of the library, or a function of yours that returns a system."""
+    """The model: one of the library, or a user's function that returns a system."""
 
     name: Annotated[str, one_of(models.__all__)] | None = Field(
         None, description="a model of the library; `liethermo models` lists them"
@@ -73,7 +74,7 @@ class Model(Section):
 
 
 class AdaptiveStep(Section):
-    """Steps that the error chooses."""
+    """Adaptive steps, chosen by the estimated error."""
 
     adaptive: FiniteFloat = Field(gt=0, description="the error wanted, relative to the state: `lt.Adaptive(rtol)`")
     atol: FiniteFloat = Field(0.0, ge=0, description="the error that is allowed besides")
@@ -82,7 +83,7 @@ class AdaptiveStep(Section):
 
 
 class StopCondition(Section):
-    """Where a run ends before its time."""
+    """Condition that ends a run early."""
 
     relaxed: FiniteFloat = Field(gt=0, description="the rate of relaxation below which the run ends: `lt.Relaxed(tol)`")
 
@@ -97,7 +98,7 @@ Step = Annotated[
 
 
 class Run(Section):
-    """The initial state, the span of time, and the steps."""
+    """Initial state, time span and steps."""
 
     initial: list[FiniteFloat] = Field(min_length=1, description="the state to start from, a list of numbers")
     t_span: Annotated[tuple[FiniteFloat, FiniteFloat], AfterValidator(_require_increasing)] = Field(
@@ -114,7 +115,7 @@ class Run(Section):
 
 
 class Method(BaseModel):
-    """The integrator; keys other than its name are its parameters."""
+    """The integrator; all keys other than its name are its parameters."""
 
     model_config = ConfigDict(extra="allow")  # the parameters of the method, checked by its signature
     # options without a name are those of the midpoint scheme
@@ -124,7 +125,7 @@ class Method(BaseModel):
 
 
 class Outputs(Section):
-    """What `liethermo run` writes into its folder."""
+    """Files that `liethermo run` writes into its folder."""
 
     netcdf: Annotated[str, AfterValidator(_require_netcdf_name)] = Field(
         "solution.nc", description="the file of the solution"
@@ -134,7 +135,7 @@ class Outputs(Section):
 
 
 class EvenlySpacedAxis(Section):
-    """Values of an axis that lie evenly."""
+    """Evenly spaced values of an axis."""
 
     first: FiniteFloat = Field(description="the first value")
     last: FiniteFloat = Field(description="the last value")
@@ -188,7 +189,7 @@ MeasureEntry = Annotated[
 
 
 class StudySection(Section):
-    """What `liethermo study` runs: the axes, and what is kept of each point."""
+    """The parameter study that `liethermo study` runs: its axes and the measures of each point."""
 
     axes: dict[str, AxisEntry] = Field(
         min_length=1,
@@ -208,18 +209,19 @@ class StudySection(Section):
 
 
 SECTIONS = {"model": Model, "run": Run, "method": Method, "outputs": Outputs, "study": StudySection}
+"""Schema of each section of a spec file."""
 
 
 def list_spec_keys() -> list[tuple[str, str, str, str]]:
-    """Every key of a spec file with its section, its default and what it is, as the documentation lists them."""
+    """Return a row (section, key, default, description) for every key of a spec file, for the documentation."""
     tables = {"run.step": AdaptiveStep, "run.until": StopCondition, "study.axes.NAME": (EvenlySpacedAxis, SampledAxis)}
-    parts = [*SECTIONS.items(), *tables.items(), ("study.measure.NAME", MeasureTable)]
-    found = []
-    for section, schemas in parts:
+    sections = [*SECTIONS.items(), *tables.items(), ("study.measure.NAME", MeasureTable)]
+    rows = []
+    for section, schemas in sections:
         for schema in schemas if isinstance(schemas, tuple) else (schemas,):
             for name, field in schema.model_fields.items():
                 default = (
                     "needed" if field.is_required() else "" if field.default is None else format_value(field.default)
                 )
-                found.append((section, name, default, field.description or ""))
-    return found
+                rows.append((section, name, default, field.description or ""))
+    return rows
