@@ -1,4 +1,4 @@
-"""One gas under a piston, pushed and heated from outside."""
+"""A gas under a piston, with external pressure and heating."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from .parameters import checked_positive
 
 
 class _GasEnergy(Module):
-    """Energy of the gas from (q, S)."""
+    """The internal energy of the gas as a function of (q, S)."""
 
     gas: IdealGas
     area: jax.Array
@@ -58,9 +58,9 @@ def cylinder(
     """
     n, m, A = checked_positive(moles, "moles"), checked_positive(mass, "mass"), checked_positive(area, "area")
     gas = IdealGas(n, A * checked_positive(height, "height"))
-    push = pressure
+    external_force = pressure
     if pressure is not None:
-        push = (
+        external_force = (
             _PressureForce(add_time_argument(pressure), A)
             if callable(pressure)
             else -A * check_numbers(pressure, "pressure", ())[None]
@@ -69,21 +69,22 @@ def cylinder(
         Kinetic(m[None]) - Function(_GasEnergy(gas, A)).on([0, 2]),
         3,
         friction=friction,
-        external=push,
+        external=external_force,
         heat_power=heat_power,
         validate=False,  # half of the normally distributed q lie below the bottom
     )
 
 
 def cylinder_rest(pressure, T, area: float = 0.01, moles: float = 1.0, height: float = 2.5) -> np.ndarray:
-    """The state (q, v, S) of rest under a pressure (Pa) at a temperature (K), shape (3,): ``P A q = n R T``."""
+    """Return the equilibrium state (q, v, S), shape (3,), under a pressure (Pa) at a temperature (K): ``P A q = n R
+    T``."""
     gas = IdealGas(jnp.asarray(moles), jnp.asarray(area * height))
     volume = moles * GAS_CONSTANT * T / pressure
     return np.array([volume / area, 0.0, gas.entropy(T, volume)], dtype=float)
 
 
 class _PressureForce(Module):
-    """``-P A``."""
+    """The external force ``-P A``, shape (1,)."""
 
     pressure: Callable
     area: jax.Array

@@ -21,7 +21,8 @@ from .thermo_particles import ThermalEnergy
 
 
 class IdealMixture(Module):
-    """``U = sum_k N_k (c_k T + e_k)`` with ``S = sum_k N_k (c_k ln T + s_k - ln(N_k / V))``, Boltzmann's constant 1.
+    """A mixture of ideal gases, ``U = sum_k N_k (c_k T + e_k)``, ``S = sum_k N_k (c_k ln T + s_k - ln(N_k / V))``, k_B
+    = 1.
 
     So T is an explicit function of (S, N, V), ``mu_k = e_k + (c_k + 1) T - T (c_k ln T + s_k - ln(N_k / V))`` and
     ``P = sum_k N_k T / V``.
@@ -48,30 +49,30 @@ class IdealMixture(Module):
         return jnp.sum(N * (self.capacity * self.temperature(S, N, V) + self.energy))
 
     def entropy_at(self, T, N, V):
-        """S at a temperature."""
+        """Return the entropy S at a temperature."""
         return jnp.sum(N * (self.capacity * jnp.log(T) + self.entropy - jnp.log(N / V)))
 
     def equilibrium_constant(self, T, stoichiometry) -> jax.Array:
-        """``prod (N_k / V)^nu_k`` where ``nu . mu = 0``: the law of mass action."""
+        """Return ``prod (N_k / V)^nu_k`` at equilibrium, ``nu . mu = 0``: the law of mass action."""
         standard = self.energy + (self.capacity + 1.0) * T - T * (self.capacity * jnp.log(T) + self.entropy)
         return jnp.exp(-jnp.dot(jnp.asarray(stoichiometry), standard) / T)
 
 
 def _single_species_gas(heat_capacity) -> IdealMixture:
-    """One kind of particles, its energy and entropy counted from zero."""
+    """Return a gas of one species with zero energy and entropy constants."""
     return IdealMixture(checked_positive(heat_capacity, "heat_capacity")[None], jnp.zeros(1), jnp.zeros(1))
 
 
 class _TwoGasEnergy(Module):
-    """The energies of the gases left and right of a piston at q, in the volumes ``A q`` and ``A (L - q)``."""
+    """The energy of two gases left and right of a piston at q, in the volumes ``A q`` and ``A (L - q)``."""
 
     gas: IdealMixture
     area: jax.Array
     length: jax.Array
 
     def __call__(self, q, S, N):
-        left, right = self.area * q[0], self.area * (self.length - q[0])
-        return self.gas.internal_energy(S[0], N[:1], left) + self.gas.internal_energy(S[2], N[1:], right)
+        left_volume, right_volume = self.area * q[0], self.area * (self.length - q[0])
+        return self.gas.internal_energy(S[0], N[:1], left_volume) + self.gas.internal_energy(S[2], N[1:], right_volume)
 
 
 def porous_piston(
@@ -128,7 +129,7 @@ def porous_piston(
 def porous_piston_state(
     left: tuple[float, float], right: tuple[float, float], q: float = 1.0, T: float = 1.0, **parameters
 ) -> np.ndarray:
-    """The state of a porous piston at rest at q, at the temperature T itself.
+    """Return the state of a porous piston at rest at q, with the piston at temperature T.
 
     Parameters
     ----------
@@ -139,25 +140,25 @@ def porous_piston_state(
     **parameters
         Those of :func:`porous_piston` that are not its defaults.
     """
-    known = {name: parameter.default for name, parameter in inspect.signature(porous_piston).parameters.items()}
-    if unknown := [name for name in parameters if name not in known]:
-        raise InputError(f"porous_piston has no parameter {unknown[0]!r}: it has {', '.join(known)}")
+    defaults = {name: parameter.default for name, parameter in inspect.signature(porous_piston).parameters.items()}
+    if unknown := [name for name in parameters if name not in defaults]:
+        raise InputError(f"porous_piston has no parameter {unknown[0]!r}: it has {', '.join(defaults)}")
     area, length, capacity = (
-        checked_positive((known | parameters)[name], name) for name in ("area", "length", "capacity")
+        checked_positive((defaults | parameters)[name], name) for name in ("area", "length", "capacity")
     )
-    place = check_numbers(q, "q", ())
+    position = check_numbers(q, "q", ())
     require_condition(
-        place, lambda q: (q > 0.0) & (q < length), f"the piston is between 0 and {length:g}, not at {{value:g}}"
+        position, lambda q: (q > 0.0) & (q < length), f"the piston is between 0 and {length:g}, not at {{value:g}}"
     )
-    gas, state = _single_species_gas((known | parameters)["heat_capacity"]), []
-    for name, side, width in (("left", left, place), ("right", right, length - place)):
-        n, t = checked_positive(side, f"{name}, (particles, temperature),", 2)
+    gas, state = _single_species_gas((defaults | parameters)["heat_capacity"]), []
+    for name, particles_and_temperature, width in (("left", left, position), ("right", right, length - position)):
+        n, t = checked_positive(particles_and_temperature, f"{name}, (particles, temperature),", 2)
         state += [gas.entropy_at(t, n[None], area * width), n]
-    return np.array([*state[:2], place, 0.0, capacity * jnp.log(checked_positive(T, "T")), *state[2:]])
+    return np.array([*state[:2], position, 0.0, capacity * jnp.log(checked_positive(T, "T")), *state[2:]])
 
 
 class _VesselEnergy(Module):
-    """The energy of a mixture in a volume, from (S, N)."""
+    """The energy of a mixture in a fixed volume as a function of (S, N)."""
 
     gas: IdealMixture
     volume: jax.Array

@@ -1,4 +1,4 @@
-"""Bodies with a part that turns inside about an axis fixed in them: damper wheel, ring damper, dual spin."""
+"""Bodies with a rotor about an axis fixed in them: damper wheel, ring damper, dual spin."""
 
 from __future__ import annotations
 
@@ -25,14 +25,15 @@ from .rigid_body import checked_inertia
 
 
 class BearingFriction(Dissipation):
-    """``p' = -k dH/dp`` of the momentum p of a rotor: the bearing rubs, and the angular momentum of the whole stays.
+    """Viscous friction ``p' = -k dH/dp`` in the bearing of a rotor of momentum p; the total angular momentum is
+    conserved.
 
     Parameters
     ----------
     friction : float, >= 0
         k.
     bath : Indices
-        The bath that it heats.
+        The bath that the friction heats.
     """
 
     friction: jax.Array
@@ -53,15 +54,15 @@ class BearingFriction(Dissipation):
         return jnp.zeros_like(dH)
 
     def factor(self, system, x, dH, dL):
-        times = lambda w: jnp.zeros_like(x).at[3].set(w[0])  # noqa: E731
-        return Factor(1, times, True, velocity=lambda w: jnp.zeros_like(x)).scale_by(self.friction)
+        momentum_rate = lambda w: jnp.zeros_like(x).at[3].set(w[0])  # noqa: E731
+        return Factor(1, momentum_rate, True, velocity=lambda w: jnp.zeros_like(x)).scale_by(self.friction)
 
 
 class RotorFriction(Dissipation):
     """Friction inside the rotor: the double bracket in the axes of the rotor.
 
-    ``L' = L × sigma, p' = a . (L × sigma)`` with ``sigma = rate L × (Omega + w a)``: what the rotor sees of the motion
-    of L is damped, and ``H' = -rate |L × (Omega + w a)|**2``. Friction inside the platform is that without a.
+    ``L' = L × sigma, p' = a . (L × sigma)`` with ``sigma = rate L × (Omega + w a)`` damps the motion of L in the
+    rotor's axes, and ``H' = -rate |L × (Omega + w a)|**2``. With a = 0 it is friction inside the platform.
 
     Parameters
     ----------
@@ -84,8 +85,8 @@ class RotorFriction(Dissipation):
         return self.bath
 
     def _momentum_rate(self, x, sigma) -> jax.Array:
-        turned = jnp.cross(x[:3], sigma)
-        return jnp.append(turned, jnp.dot(self.axis, turned))
+        torque = jnp.cross(x[:3], sigma)
+        return jnp.append(torque, jnp.dot(self.axis, torque))
 
     def force(self, system, x, dH, dS, dL):
         return self._momentum_rate(x, self.velocity(system, x, dH, dS, dL)[:3])
@@ -94,8 +95,8 @@ class RotorFriction(Dissipation):
         return jnp.append(self.rate * jnp.cross(x[:3], dH[:3] + dH[3] * self.axis), 0.0)
 
     def factor(self, system, x, dH, dL):
-        moved = lambda w: self._momentum_rate(x, w)  # noqa: E731
-        return Factor(3, moved, velocity=lambda w: jnp.append(w, 0.0)).scale_by(self.rate)
+        momentum_rate = lambda w: self._momentum_rate(x, w)  # noqa: E731
+        return Factor(3, momentum_rate, velocity=lambda w: jnp.append(w, 0.0)).scale_by(self.rate)
 
 
 def damper_wheel(
@@ -225,35 +226,35 @@ def dual_spin(
     """
     k, rates = checked_rate(friction), (checked_rate(platform_rate), checked_rate(rotor_rate))
 
-    def inside(a) -> list[Dissipation]:
-        none = jnp.zeros(3)
+    def make_dissipations(a) -> list[Dissipation]:
+        platform_axis = jnp.zeros(3)
         return [
             BearingFriction(k, Indices(0)),
-            RotorFriction(rates[0], none, Indices(0)),
+            RotorFriction(rates[0], platform_axis, Indices(0)),
             RotorFriction(rates[1], a, Indices(1)),
         ]
 
-    return _rotor_system(inertia, axis, rotor, inside, HeatBaths(capacity, temperature, number=2), attitude)
+    return _rotor_system(inertia, axis, rotor, make_dissipations, HeatBaths(capacity, temperature, number=2), attitude)
 
 
 def spin_temperature(momentum, energy, inertia, capacity=1.0, temperature=1.0) -> float:
-    """The temperature (K) at which a body left to itself has come to its spin, with one bath and parts at rest.
+    """Return the temperature (K) of an isolated body in its final spin, with one bath and parts at rest.
 
     Parameters
     ----------
     momentum : float
-        The size of the angular momentum (kg m**2 / s).
+        Norm of the angular momentum (kg m**2 / s).
     energy : float
-        The whole (J).
+        Total energy (J).
     inertia, capacity, temperature
-        As the models have them.
+        As for the models.
     """
     greatest = float(np.max(principal_moments(inertia)))
     return temperature + (float(energy) - float(momentum) ** 2 / (2.0 * greatest)) / capacity
 
 
-def _rotor_system(inertia, axis, rotor, inside, baths, attitude) -> LiePoissonSystem:
-    """``H = (L - p a) . B (L - p a) / 2 + p**2 / (2 J)``, ``B = (I - J a a^T)^-1``, on so(3) + R."""
+def _rotor_system(inertia, axis, rotor, make_dissipation, baths, attitude) -> LiePoissonSystem:
+    """Return the system ``H = (L - p a) . B (L - p a) / 2 + p**2 / (2 J)``, ``B = (I - J a a^T)^-1``, on so(3) + R."""
     inverse, J = inverse_inertia(checked_inertia(inertia)), checked_positive(rotor, "the moment of the rotor")
     inverse = jnp.diag(inverse) if inverse.ndim == 1 else inverse
     check_numbers(axis, "axis")
@@ -261,14 +262,16 @@ def _rotor_system(inertia, axis, rotor, inside, baths, attitude) -> LiePoissonSy
     if direction.shape != (3,) or not np.isfinite(direction).all() or not direction.any():
         raise InputError(f"axis is a direction in body axes, three numbers that are not all zero, not {axis!r}")
     a = jnp.asarray(direction / np.linalg.norm(direction))
-    turned = inverse @ a
-    left = 1.0 - J * jnp.dot(a, turned)
+    inverse_times_axis = inverse @ a
+    inertia_fraction = 1.0 - J * jnp.dot(a, inverse_times_axis)
     require_condition(
-        left, lambda v: v > 0.0, "a rotor has less than the inertia of the whole about its axis: 1 - J/I is {value}"
+        inertia_fraction,
+        lambda v: v > 0.0,
+        "a rotor has less than the inertia of the whole about its axis: 1 - J/I is {value}",
     )
-    B = inverse + J / left * jnp.outer(turned, turned)
-    Ba = turned / left
+    B = inverse + J / inertia_fraction * jnp.outer(inverse_times_axis, inverse_times_axis)
+    Ba = inverse_times_axis / inertia_fraction
     A = jnp.block([[B, -Ba[:, None]], [-Ba[None], (1.0 / J + jnp.dot(a, Ba))[None, None]]])
     algebra = mf.direct_sum(mf.so(3), mf.abelian(1))
     group = mf.SO(3) if attitude else None
-    return LiePoissonSystem(algebra, Quadratic(A), dissipation=inside(a), group=group, baths=baths)
+    return LiePoissonSystem(algebra, Quadratic(A), dissipation=make_dissipation(a), group=group, baths=baths)

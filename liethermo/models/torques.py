@@ -1,4 +1,5 @@
-"""Torques for ``lt.LiePoissonSystem(..., torque=...)``: their numbers are parameters, swept and differentiated.
+"""Torques for ``lt.LiePoissonSystem(..., torque=...)``; their numbers are parameters that can be varied and
+differentiated.
 
 Each is a function f(t, mu), or f(t, mu, attitude), to a dual vector of the shape of mu. An attitude is the matrix from
 body axes to axes in space, so ``attitude.T @ v`` has the components in the body of a vector v in space. Units are any
@@ -100,11 +101,11 @@ class GravityGradient(Module):
 
     def __call__(self, t, mu, attitude):
         n = attitude.T @ self.to_centre(t)
-        turned = self.inertia * n if self.inertia.ndim == 1 else self.inertia @ n
-        return 3.0 * self.mean_motion**2 * jnp.cross(n, turned)
+        inertia_times_n = self.inertia * n if self.inertia.ndim == 1 else self.inertia @ n
+        return 3.0 * self.mean_motion**2 * jnp.cross(n, inertia_times_n)
 
     def to_centre(self, t) -> jax.Array:
-        """The direction to the centre at a time, in space, shape (3,)."""
+        """Return the direction to the centre at a time, in space, shape (3,)."""
         angle = self.mean_motion * t
         return jnp.cos(angle) * self.towards + jnp.sin(angle) * jnp.cross(self.normal, self.towards)
 
@@ -156,7 +157,7 @@ class Motor(Module):
 
 
 class Tabulated(Module):
-    """A torque in the body that a table gives, linear in t between its times, and zero before them and after.
+    """A torque in body axes from a table, linear in t between its times and zero outside.
 
     A step across a time of the table has an error of second order there, whatever the method: let steps end at these
     times by ``save_at=``. The laws hold all the same.
@@ -184,10 +185,14 @@ class Tabulated(Module):
         )
 
     def __call__(self, t, mu):
-        begun = jnp.where(t >= self.times, 1.0, 0.0)
-        now = begun[:-1] - begun[1:]  # one in the interval that t is in, zero in the others: no search
-        gone = (t - self.times[:-1]) / (self.times[1:] - self.times[:-1])
-        return jnp.tensordot(now * (1.0 - gone), self.moments[:-1], 1) + jnp.tensordot(now * gone, self.moments[1:], 1)
+        has_begun = jnp.where(t >= self.times, 1.0, 0.0)
+        in_interval = (
+            has_begun[:-1] - has_begun[1:]
+        )  # 1 in the interval that contains t, else 0, so that no search is needed
+        fraction = (t - self.times[:-1]) / (self.times[1:] - self.times[:-1])
+        return jnp.tensordot(in_interval * (1.0 - fraction), self.moments[:-1], 1) + jnp.tensordot(
+            in_interval * fraction, self.moments[1:], 1
+        )
 
 
 def _unit_vector(value, name: str) -> jax.Array:

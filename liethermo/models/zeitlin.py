@@ -20,7 +20,8 @@ from .quantised_sphere import QuantisedSphere
 
 
 class KineticEnergy(Energy):
-    """``gamma / 2 tr(W^H (-Delta)^{-1} W)``: gamma times that of the fluid, ``- 1/2 integral omega psi``."""
+    """Gamma times the energy of the fluid, ``gamma / 2 tr(W^H (-Delta)^{-1} W)``; the fluid's is ``-1/2 integral omega
+    psi``."""
 
     sphere: QuantisedSphere = eqx.field(static=True)
 
@@ -85,5 +86,5 @@ def zeitlin(N: int, decay: Literal["enstrophy", "energy"] | None = None, rate=0.
         KineticEnergy(sphere),
         Quadratic(np.full(sphere.algebra.dim, -2.0)),
         dissipation,
-        validate=False,  # its axioms are those of su(N) and of the two constructions; Jacobi takes O(N^6)
+        validate=False,  # the axioms hold by construction, and testing Jacobi would take O(N^6)
     )
