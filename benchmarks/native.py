@@ -21,6 +21,16 @@ from .report import UnavailableError
 SOURCE_FOLDER = Path(__file__).parent / "c"
 COMPILER_OPTIONS = ["-std=gnu11", "-O3", "-march=native", "-fPIC", "-shared"]
 
+SHARED_OPTIONS = (
+    "max_fixed_point_iterations",
+    "fixed_point_contraction_limit",
+    "stall_ratio",
+    "update_floor",
+    "plateau_rtol",
+    "drift_threshold",
+)
+"""Fields of :class:`.SolverOptions` that the C programs use, as macros in capitals."""
+
 STATUSES = ("completed", "not_converged", "non_finite")
 
 
@@ -56,8 +66,7 @@ def find_c_compiler() -> str | None:
 
 def solver_definitions() -> list[str]:
     """The library's rules, as definitions for the compiler."""
-    names = ("fixed_point", "slow", "shrinking", "floor", "plateau", "steered")
-    return [f"-D{name.upper()}={getattr(DEFAULT_OPTIONS, name)!r}" for name in names]
+    return [f"-D{name.upper()}={getattr(DEFAULT_OPTIONS, name)!r}" for name in SHARED_OPTIONS]
 
 
 @functools.cache

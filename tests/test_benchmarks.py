@@ -1,4 +1,4 @@
-"""The benchmarks run, their opponents in C run the same scheme, and what is missing is said. Nothing is timed here."""
+"""The benchmarks run, the C programs take the same steps, and missing peers are reported. Nothing is timed here."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ needs_compiler = pytest.mark.skipif(native.find_c_compiler() is None, reason="no
 
 
 @pytest.fixture
-def bare(monkeypatch):
-    """A machine without a C compiler and without the peers that the library does not need itself."""
+def bare_machine(monkeypatch):
+    """A machine without a C compiler and without the optional peers."""
     monkeypatch.setenv("CC", "no-such-compiler")
     for name in ("diffrax", "heyoka"):
         monkeypatch.setitem(sys.modules, name, None)
@@ -44,15 +44,15 @@ def bare(monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_driver_on_a_bare_machine(bare, tmp_path, capsys):
+def test_the_driver_on_a_bare_machine(bare_machine, tmp_path, capsys):
     main(["work_precision", "--quick", "--out", str(tmp_path)])
-    printed = capsys.readouterr().out
+    output = capsys.readouterr().out
     for name in (
         "midpoint, C (no C compiler was found",
         "diffrax Tsit5 (diffrax is not",
         "heyoka Taylor (heyoka is not",
     ):
-        assert f"Left out: {name}" in printed
+        assert f"Left out: {name}" in output
     result = json.loads((tmp_path / "work_precision.json").read_text())
     rows = {row[0]: row for row in result["report"]["tables"][1]["rows"]}
     assert {"midpoint, compiled engine", "midpoint, array engine", "SciPy DOP853"} == rows.keys()
@@ -77,9 +77,11 @@ def test_both_pages_are_those_of_the_kept_results(tmp_path):
         assert (tmp_path / name).read_text() == (PAGES / name).read_text(), (
             f"{name}: python -m benchmarks --kept --page"
         )
-    first = (tmp_path / "benchmarks.md").read_text()
-    assert len(first.split()) <= 3500
-    assert first.index("![") < first.index("\n- **") < first.index("\n| ")  # the chart, the sentences, the tables
+    main_page = (tmp_path / "benchmarks.md").read_text()
+    assert len(main_page.split()) <= 3500
+    assert (
+        main_page.index("![") < main_page.index("\n- **") < main_page.index("\n| ")
+    )  # the chart, the sentences, the tables
 
 
 def test_a_page_has_one_row_a_comparison_and_escapes_bars():
@@ -89,18 +91,18 @@ def test_a_page_has_one_row_a_comparison_and_escapes_bars():
     rows = [["ours", 2.0, "hold"], ["peer, slow", 9.0, "hold"], ["peer, quick", 1.0, "broken: energy"]]
     report = Report("", "", [Table("", {"": "text", "Time": "seconds", "Laws": "text"}, rows)])
     pair = first_page.RowPair("some", 0, "work", "ours", "peer")
-    found = first_page._compare_rows(report, pair)
-    assert found == first_page.PeerComparison(
+    comparison = first_page._compare_rows(report, pair)
+    assert comparison == first_page.PeerComparison(
         "work", "peer, quick", 2.0, 1.0, "hold", "broken: energy"
     )  # the fastest counts
-    (sentence, laws) = first_page.summary_sentences([dataclasses.replace(found, peer="heyoka")])
+    (sentence, laws) = first_page.summary_sentences([dataclasses.replace(comparison, peer="heyoka")])
     assert "faster in 0 of 1 tasks" in sentence
     assert "1 of 1 runs of this library and in 0 of theirs" in laws
     assert first_page._compare_rows(report, dataclasses.replace(pair, theirs="nobody")) is None
 
 
 def test_the_statistics_of_the_magnet():
-    """Autocorrelation and error of a process that is known."""
+    """The autocorrelation time and the error of an AR(1) process agree with their exact values."""
     random, rho, n = np.random.default_rng(0), 0.9, 60_000
     x = random.standard_normal(n)
     for i in range(1, n):
@@ -118,7 +120,7 @@ def _series(rows, temperature=1.0):
 
 
 def test_where_the_cumulants_of_two_lattices_are_equal():
-    """A double well, whose cumulants are integrals, and vectors in a plane of energy m⁴, where it is 1 - pi / 6."""
+    """A double well, whose cumulants are integrals, and vectors in a plane with energy m⁴ and cumulant 1 - pi / 6."""
     x, random, n = np.linspace(-4.0, 4.0, 8_001), np.random.default_rng(0), 40_000
     well = 0.8 * (x**2 - 1.2) ** 2
 
@@ -126,31 +128,31 @@ def test_where_the_cumulants_of_two_lattices_are_equal():
         second, fourth = (float((x**k * np.exp(-well / T)).sum() / np.exp(-well / T).sum()) for k in (2, 4))
         return 1.0 - fourth / (3.0 * second**2)
 
-    equal = brentq(lambda T: cumulant(T) - (1.0 - np.pi / 6.0), 0.5, 3.0)
-    T = 1.03 * equal
-    below = np.cumsum(np.exp(-well / T))
-    drawn = np.interp(random.random(n), below / below[-1], x)
+    crossing = brentq(lambda T: cumulant(T) - (1.0 - np.pi / 6.0), 0.5, 3.0)
+    T = 1.03 * crossing
+    cumulative = np.cumsum(np.exp(-well / T))
+    positions = np.interp(random.random(n), cumulative / cumulative[-1], x)
     square = np.abs(np.sqrt(T / 2) * random.standard_normal(n))
-    a = _series(np.column_stack([0.8 * (drawn**2 - 1.2) ** 2, drawn, np.zeros((n, 2))]), T)
+    a = _series(np.column_stack([0.8 * (positions**2 - 1.2) ** 2, positions, np.zeros((n, 2))]), T)
     b = _series(np.column_stack([square**2, np.sqrt(square), np.zeros((n, 2))]), T)
     slopes = (cumulant(T + 1e-3) - cumulant(T - 1e-3)) / 2e-3, 0.0
     for series, slope, value in zip((a, b), slopes, (cumulant(T), 1.0 - np.pi / 6.0), strict=True):
         for quantity, exact in (magnet.cumulant_slope, slope), (magnet.binder_cumulant, value):
-            found, error = magnet.with_error(quantity, series)
-            assert abs(found - exact) < 4 * error < 0.05
-    found, error = magnet.cumulant_crossing(a, b)
-    assert abs(found - equal) < 4 * error < 0.4 * equal
-    assert np.abs(np.array(magnet.cumulant_crossing(b, a)) - (found, error)).max() < 1e-12
-    assert magnet.crossing_rows([a, b])[0][1:3] == [found, error]
-    both = magnet.join_runs([a, b])
-    assert both.steps == 2 * n
-    assert len(both.samples) == len(a.equilibrated().rows) + len(b.equilibrated().rows)
+            estimate, error = magnet.with_error(quantity, series)
+            assert abs(estimate - exact) < 4 * error < 0.05
+    estimate, error = magnet.cumulant_crossing(a, b)
+    assert abs(estimate - crossing) < 4 * error < 0.4 * crossing
+    assert np.abs(np.array(magnet.cumulant_crossing(b, a)) - (estimate, error)).max() < 1e-12
+    assert magnet.crossing_rows([a, b])[0][1:3] == [estimate, error]
+    joined = magnet.join_runs([a, b])
+    assert joined.steps == 2 * n
+    assert len(joined.samples) == len(a.equilibrated().rows) + len(b.equilibrated().rows)
 
 
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("T", [10.0, 20.0])
 def test_monte_carlo_of_the_magnet_at_high_temperatures(T):
-    """The energy of a bond is Langevin's function of J / kT there, but for loops of four bonds."""
+    """The energy of a bond is Langevin's function of J / kT, up to loops of four bonds."""
     (rows,) = sample_heat_bath(6, [T], 400)
     energies = rows[:, 0].reshape(20, -1).mean(axis=1)
     exact = -3.0 * (1.0 / np.tanh(1.0 / T) - T)
@@ -167,10 +169,10 @@ def test_the_driver_refuses_unknown_names(capsys):
 
 def test_c_is_handed_the_library_s_rules():
     header = (native.SOURCE_FOLDER / "rules.h").read_text()
-    used = set(re.findall(r"\b[A-Z_]{4,}\b", "".join(p.read_text() for p in native.SOURCE_FOLDER.glob("*.[ch]"))))
+    macros = set(re.findall(r"\b[A-Z_]{4,}\b", "".join(p.read_text() for p in native.SOURCE_FOLDER.glob("*.[ch]"))))
     for flag in native.solver_definitions():
         name, value = flag.removeprefix("-D").split("=")
-        assert name in used
+        assert name in macros
         assert float(value) == getattr(DEFAULT_OPTIONS, name.lower())
         assert f"define {name}" not in header
     statuses = re.search(r"enum \{ (.*) \};", header)
@@ -208,11 +210,11 @@ def test_c_moves_the_same_spin(way):
 
 @needs_compiler
 def test_lanes_do_as_one_body_does():
-    bodies, alone = EnsembleProgram(body_parameters(1.0)), BodyProgram("rigid_body.c", body_parameters(1.0))
+    bodies, single_body = EnsembleProgram(body_parameters(1.0)), BodyProgram("rigid_body.c", body_parameters(1.0))
     x0s = random_states(19)  # no multiple of the lanes
     summaries = bodies.integrate(x0s, 0.05, 200, threads=3)
     for x0, summary in zip(x0s, summaries, strict=True):
-        (end,), (run,) = alone.integrate(x0, 0.05, 200)
+        (end,), (run,) = single_body.integrate(x0, 0.05, 200)
         assert np.abs(summary["x"] - end).max() <= 1e-14
         assert summary["iterations"] == pytest.approx(run["iterations"], rel=0.02)
         assert summary["least_entropy_increment"] == pytest.approx(run["least_entropy_increment"], rel=1e-6)
@@ -229,12 +231,12 @@ def test_a_c_program_that_fails_says_so():
 
 
 def test_the_reference_is_the_trajectory(monkeypatch):
-    """Against SciPy, which knows nothing of series, and against itself with another step."""
+    """The Taylor reference agrees with SciPy, and does not depend on its own step."""
     x0 = [0.3, -0.8, 0.5]
     exact = reference.exact_state(x0, 0.7, 5.0)
     assert np.abs(scipy_run(1e-13, x0, 5.0, 0.7).solve_end() - exact).max() < 1e-11
     assert np.abs(reference.exact_state(x0, 0.71, 5.0) - exact).max() > 1e-3
-    monkeypatch.setattr(reference, "STEP", reference.TAYLOR_STEP / 2)
+    monkeypatch.setattr(reference, "TAYLOR_STEP", reference.TAYLOR_STEP / 2)
     assert np.array_equal(reference.exact_state(x0, 0.7, 5.0), exact)
 
 
@@ -243,18 +245,22 @@ def test_the_reference_is_the_trajectory(monkeypatch):
     not memory.PROCESS_STATUS_FILE.is_file(), reason="this system does not tell a process its largest size"
 )
 def test_a_process_is_not_charged_its_parent_s_memory():
-    """getrusage would: its figure survives the start of another program."""
-    large = np.ones(100_000_000)
-    small = child.run_python("-c", "from benchmarks.measurements.memory import resident; print(resident())")
-    assert 1e7 < float(small) < large.nbytes < memory.peak_resident_bytes()
+    """The peak memory of a child process excludes that of its parent, unlike the value of ``getrusage``."""
+    large_array = np.ones(100_000_000)
+    child_bytes = child.run_python(
+        "-c", "from benchmarks.measurements.memory import peak_resident_bytes; print(peak_resident_bytes())"
+    )
+    assert 1e7 < float(child_bytes) < large_array.nbytes < memory.peak_resident_bytes()
 
 
 @needs_compiler
 def test_c_steers_the_energy():
-    """A general energy keeps its value over a long run, as the library's does; without steering it is off by 5e-13."""
+    """A general energy keeps its value over a long run; without drift corrections it is off by 5e-13."""
     _, run = BodyProgram("general.c", general_parameters(1e-3)).integrate(X0, 0.1, 300_000)
     assert laws.c_run_laws(run).energy_drift < 2e-14
-    _, run = BodyProgram("general.c", general_parameters(1e-3), "-DSTEERED=INFINITY").integrate(X0, 0.1, 300_000)
+    _, run = BodyProgram("general.c", general_parameters(1e-3), "-DDRIFT_THRESHOLD=INFINITY").integrate(
+        X0, 0.1, 300_000
+    )
     assert laws.c_run_laws(run).energy_drift > 2e-14
 
 
@@ -281,9 +287,9 @@ def test_broken_laws_are_named():
 
 
 def test_a_race_takes_turns():
-    taken = []
-    outcomes = race({"a": lambda: taken.append("a"), "b": lambda: taken.append("b") or 7}, rounds=3)
-    turns = re.sub(r"(.)\1+", r"\1", "".join(taken))
+    calls = []
+    outcomes = race({"a": lambda: calls.append("a"), "b": lambda: calls.append("b") or 7}, rounds=3)
+    turns = re.sub(r"(.)\1+", r"\1", "".join(calls))
     assert turns == "ab" * 4  # one before the first round
     assert outcomes["b"].result == 7
     assert 0.0 < outcomes["a"].wall_seconds < 0.02
@@ -293,12 +299,12 @@ def test_a_race_takes_turns():
 def test_the_tumbling_body_is_one_in_the_library_and_in_scipy(body):
     ours = simulators.library_run(body, MetriplecticGauss(3), 0.05, 5.0, 10)()
     exact = simulators.scipy_run(body, 1e-12, 5.0, 10)()
-    other = simulators.scipy_run(dataclasses.replace(body, inertia=1.001 * body.inertia), 1e-12, 5.0, 10)()
+    perturbed = simulators.scipy_run(dataclasses.replace(body, inertia=1.001 * body.inertia), 1e-12, 5.0, 10)()
     assert np.abs(ours.momentum - exact.momentum).max() <= 1e-9  # measured: 6e-11
     assert np.abs(ours.spatial_momentum - exact.spatial_momentum).max() <= 1e-9
     assert ours.total_energy is not None
     assert np.ptp(ours.total_energy) <= 1e-14
-    assert np.abs(ours.momentum - other.momentum).max() > 1e-4
+    assert np.abs(ours.momentum - perturbed.momentum).max() > 1e-4
 
 
 @pytest.mark.parametrize("body", [tumbling.FREE_BODY, tumbling.DAMPED_BODY], ids=["free", "damped"])
@@ -320,8 +326,8 @@ def test_simulators_that_are_missing_are_told(monkeypatch):
 
 
 def test_gradient_flows_beside_steepest_descent_of_pymanopt():
-    """The difference is that of their steps, of first order: it halves with them, and is gone where they vanish."""
+    """The difference of the two steps is of first order: it halves with the step size and vanishes by extrapolation."""
     pytest.importorskip("pymanopt")
-    for _, _, whole, half, extrapolated in manifolds.pymanopt_rows():
-        assert 1.9 < half / whole < 2.1
-        assert extrapolated < 0.02 * whole
+    for _, _, full_step_difference, half_step_difference, extrapolation in manifolds.pymanopt_rows():
+        assert 1.9 < half_step_difference / full_step_difference < 2.1
+        assert extrapolation < 0.02 * full_step_difference
