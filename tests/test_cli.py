@@ -22,7 +22,7 @@ EXAMPLE = Path(__file__).parents[1] / "examples" / "relaxed_rigid_body.toml"
 MODEL = '[model]\nname = "rigid_body"\n'
 RUN = "[run]\ninitial = [0.001, 1.0, 0.001]\nt_span = [0.0, 2.0]\nstep = 0.1\n"
 REFERENCE = '[method]\nname = "Reference"\nrtol = 1e-6\n'
-NO_FIGURES = "[outputs]\nfigures = []\n"
+OUTPUT_WITHOUT_FIGURES = "[outputs]\nfigures = []\n"
 
 # What a user might write; the tests run it under this name.
 MODULE = "a_users_module"
@@ -60,7 +60,7 @@ not_a_function = 3
 
 
 class Folder:
-    """A user's current folder."""
+    """A user's current folder, with a spec and the command line."""
 
     def __init__(self, path):
         self.path = path
@@ -73,7 +73,7 @@ class Folder:
         return CliRunner().invoke(app, list(map(str, arguments)))
 
     def refusal(self, *parts):
-        """What ``check`` says to a spec that it refuses, a line for each problem."""
+        """Return the problems that ``check`` reports for an invalid spec, one line each."""
         result = self.call("check", self.spec(*parts))
         assert result.exit_code == 2
         assert re.fullmatch(r"(spec\.toml: imports .*\n)?", result.stdout)
@@ -140,17 +140,21 @@ def test_saved_run_is_audited(example):
 
 
 def test_result_cut_short_is_refused(example, tmp_path):
-    cut = tmp_path / "cut.nc"
-    whole = (example[1] / "solution.nc").read_bytes()
-    cut.write_bytes(whole[: len(whole) // 2])
-    for file, message in ((cut, "cut short"), (EXAMPLE, "cannot be read as NetCDF"), (tmp_path / "no.nc", "no file")):
+    truncated_file = tmp_path / "cut.nc"
+    content = (example[1] / "solution.nc").read_bytes()
+    truncated_file.write_bytes(content[: len(content) // 2])
+    for file, message in (
+        (truncated_file, "cut short"),
+        (EXAMPLE, "cannot be read as NetCDF"),
+        (tmp_path / "no.nc", "no file"),
+    ):
         result = CliRunner().invoke(app, ["audit", str(file)])
         assert (result.exit_code, result.stdout) == (2, "")
         assert message in result.stderr
 
 
 def test_a_law_that_fails(folder):
-    result = folder.call("run", folder.spec(MODEL, RUN.replace("2.0]", "40.0]"), REFERENCE, NO_FIGURES))
+    result = folder.call("run", folder.spec(MODEL, RUN.replace("2.0]", "40.0]"), REFERENCE, OUTPUT_WITHOUT_FIGURES))
     assert result.exit_code == 1
     assert "energy drift" in result.stdout
     assert "A LAW FAILS" in result.stdout
@@ -176,14 +180,14 @@ def test_a_run_that_stops_early_is_kept(folder):
 def test_ctrl_c_keeps_what_exists(folder, monkeypatch):
     advance, calls = CompiledEngine.advance, []
 
-    def interrupted(*arguments):
+    def advance_once(*arguments):
         calls.append(arguments)
         if len(calls) == 2:
             raise KeyboardInterrupt
         return advance(*arguments)
 
-    monkeypatch.setattr(CompiledEngine, "advance", interrupted)
-    result = folder.call("run", folder.spec(MODEL, RUN.replace("2.0]", "500.0]"), NO_FIGURES))
+    monkeypatch.setattr(CompiledEngine, "advance", advance_once)
+    result = folder.call("run", folder.spec(MODEL, RUN.replace("2.0]", "500.0]"), OUTPUT_WITHOUT_FIGURES))
     assert result.exit_code == 1
     assert "stopped by the user" in result.stdout
     solution = lt.load("spec/solution.nc")
@@ -202,11 +206,11 @@ def test_outputs_are_as_asked(folder):
 
 
 def test_a_process_with_a_users_function(tmp_path):
-    """As a user calls it, from a folder that is not the spec's."""
+    """A separate process, started in another folder than the spec's."""
     home = tmp_path / "home"
     home.mkdir()
     (home / f"{MODULE}.py").write_text(SOURCE)
-    (home / "mine.toml").write_text(function("build", "{rate = 2, inertia = [2, 3, 4]}") + RUN + NO_FIGURES)
+    (home / "mine.toml").write_text(function("build", "{rate = 2, inertia = [2, 3, 4]}") + RUN + OUTPUT_WITHOUT_FIGURES)
 
     def call(*arguments):
         path = os.pathsep.join([str(EXAMPLE.parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])])
@@ -236,13 +240,13 @@ def test_check_prints_the_axioms():
 
 
 def test_check_fails_with_an_axiom(folder):
-    refused = folder.call("check", folder.spec(function("no_casimir"), RUN))
-    assert refused.exit_code == 1
-    assert "not a Casimir" in refused.stderr
-    unchecked = folder.call("check", folder.spec(function("no_casimir", "{validate = false}"), RUN))
-    assert unchecked.exit_code == 1
-    assert "FAILS" in unchecked.stdout
-    assert "NOT metriplectic" in unchecked.stdout
+    default_check = folder.call("check", folder.spec(function("no_casimir"), RUN))
+    assert default_check.exit_code == 1
+    assert "not a Casimir" in default_check.stderr
+    unvalidated_check = folder.call("check", folder.spec(function("no_casimir", "{validate = false}"), RUN))
+    assert unvalidated_check.exit_code == 1
+    assert "FAILS" in unvalidated_check.stdout
+    assert "NOT metriplectic" in unvalidated_check.stdout
 
 
 def test_models_lists_all_with_their_parameters():
@@ -265,7 +269,7 @@ def test_methods_are_listed_with_what_they_keep():
 
 
 def test_a_variational_scheme_by_its_name(tmp_path):
-    """It keeps the second law and not the energy, and the exit status says so."""
+    """The scheme conserves the entropy law but not the energy, and the exit status is 1."""
     spec = tmp_path / "spring.toml"
     spec.write_text(
         """
@@ -362,7 +366,7 @@ REFUSALS = {
         [
             function("six_components"),
             RUN.replace("[0.001", "[0, 0, 0, 0.001"),
-            NO_FIGURES.replace("[]", f"{list(FIGURES)}"),
+            OUTPUT_WITHOUT_FIGURES.replace("[]", f"{list(FIGURES)}"),
         ],
         ['outputs.figures = ["momentum_sphere", "laws"]: momentum_sphere needs states of 3 components'],
     ),
@@ -387,16 +391,16 @@ REFUSALS = {
 
 @pytest.mark.parametrize("case", REFUSALS)
 def test_a_bad_spec_is_told_why(folder, case):
-    parts, expected = REFUSALS[case]
-    for found, text in zip(folder.refusal(*parts), expected, strict=True):
-        assert text in found
+    parts, texts = REFUSALS[case]
+    for line, text in zip(folder.refusal(*parts), texts, strict=True):
+        assert text in line
 
 
 def test_all_problems_are_told_at_once(folder):
     bad_method = REFERENCE.replace("rtol", "rtoll")
-    found = folder.refusal(MODEL, "parameters = {rat = 1}", RUN.replace("step", "stepp"), bad_method)
+    lines = folder.refusal(MODEL, "parameters = {rat = 1}", RUN.replace("step", "stepp"), bad_method)
     keys = ("run.step is missing", "run.stepp: no", "model.parameters.rat: no", "method.rtoll: no")
-    assert [line[: len(key)] for line, key in zip(found, keys, strict=True)] == list(keys)
+    assert [line[: len(key)] for line, key in zip(lines, keys, strict=True)] == list(keys)
 
 
 def test_a_module_that_cannot_be_imported(folder):

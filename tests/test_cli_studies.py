@@ -1,4 +1,4 @@
-"""Studies on the command line, and what spec files say besides: adaptive steps, events, attitudes, changes."""
+"""Studies on the command line, and further keys of spec files: adaptive steps, events, attitudes, changes."""
 
 import sys
 
@@ -45,24 +45,24 @@ def test_a_study_from_a_spec_file_its_status_and_its_picture(folder):
     assert "12 of 12 points are done" in result.stdout
     assert "the laws hold" in result.stdout
     assert (folder / "body.png").read_bytes().startswith(b"\x89PNG")
-    found = lt.load_study("body.zarr")
-    assert dict(found.sizes)["inertia[0]"] == 3
-    assert found.rate.units == "1/s"
-    wanted = lt.integrate(lt.models.rigid_body((2.4, 1.5, 1.0), 2.0), [0.1, 1.0, 0.1], (0.0, 4.0), 0.1).x[-1]
-    np.testing.assert_allclose(found.final[3, 2], wanted, rtol=0, atol=1e-14)
-    assert found.attrs["spec"]["study"]["chunk"] == 4
+    dataset = lt.load_study("body.zarr")
+    assert dict(dataset.sizes)["inertia[0]"] == 3
+    assert dataset.rate.units == "1/s"
+    final_state = lt.integrate(lt.models.rigid_body((2.4, 1.5, 1.0), 2.0), [0.1, 1.0, 0.1], (0.0, 4.0), 0.1).x[-1]
+    np.testing.assert_allclose(dataset.final[3, 2], final_state, rtol=0, atol=1e-14)
+    assert dataset.attrs["spec"]["study"]["chunk"] == 4
 
-    again = call("study", "spec.toml", "--out", "body.zarr")
-    assert again.exit_code == 0
-    told = call("status", "body.zarr")
-    assert (told.exit_code, "12 of 12 points are done (100 %)" in told.stdout) == (0, True)
-    drawn = call("plot", "body.zarr", "--measure", "tau", "--out", "tau.svg")
-    assert drawn.exit_code == 0, drawn.output
+    second_call = call("study", "spec.toml", "--out", "body.zarr")
+    assert second_call.exit_code == 0
+    status_call = call("status", "body.zarr")
+    assert (status_call.exit_code, "12 of 12 points are done (100 %)" in status_call.stdout) == (0, True)
+    plot_call = call("plot", "body.zarr", "--measure", "tau", "--out", "tau.svg")
+    assert plot_call.exit_code == 0, plot_call.output
     assert (folder / "tau.svg").is_file()
     assert call("plot", "body.zarr", "--measure", "sigma").exit_code == 2
-    other = call("study", "spec.toml", "--out", "body.zarr", "--set", "run.step=0.2")
-    assert other.exit_code == 2
-    assert "step is 0.2, and 0.1 in the store" in other.stderr
+    other_step_call = call("study", "spec.toml", "--out", "body.zarr", "--set", "run.step=0.2")
+    assert other_step_call.exit_code == 2
+    assert "step is 0.2, and 0.1 in the store" in other_step_call.stderr
     assert call("status", "none.zarr").exit_code == 2
     assert "there is no Dask scheduler" in call("study", "spec.toml", "--cluster", "nonsense://here").stderr
 
@@ -110,7 +110,7 @@ def refusals(folder, *parts, changes=()):
         ("axes.rate = [1.0]\nchunks = 3", "study.chunks: no such key (did you mean chunk?)"),
     ],
 )
-def test_what_a_section_must_not_say(folder, study, problem):
+def test_invalid_study_sections_are_refused(folder, study, problem):
     problems = refusals(folder, MODEL, RUN, f"[study]\n{study}")
     assert any(line.startswith(problem) for line in problems), problems
 
@@ -152,8 +152,8 @@ def test_changes_that_cannot_be_made(folder, change, problem):
 
 
 def test_every_key_is_explained():
-    listed = list_spec_keys()
-    assert {section for section, *_ in listed} >= {
+    rows = list_spec_keys()
+    assert {section for section, *_ in rows} >= {
         "model",
         "run",
         "method",
@@ -162,4 +162,4 @@ def test_every_key_is_explained():
         "run.step",
         "run.until",
     }
-    assert [(section, name) for section, name, _, what in listed if not what] == []
+    assert [(section, name) for section, name, _, what in rows if not what] == []

@@ -1,4 +1,4 @@
-"""Spec files of strangers: what they can make run, and what they can make wait."""
+"""Spec files of strangers: they cannot run foreign code, and are refused quickly if they are invalid."""
 
 import subprocess
 import sys
@@ -64,30 +64,32 @@ def test_a_spec_runs_nothing_that_is_not_beside_it(folder, command, function, pa
 
 
 def test_a_module_beside_the_spec_is_used_and_told(folder):
-    before = list(sys.path)
+    original_path = list(sys.path)
     path = spec(folder, model("mine_of_trust:build", "{rate = 2.0}"))
     result = CliRunner().invoke(app, ["check", str(path)])
     assert result.exit_code == 0
     assert f"imports mine_of_trust from {folder / 'mine_of_trust.py'}" in result.stdout
-    assert sys.path == before
+    assert sys.path == original_path
 
 
 def test_another_file_of_the_same_name_is_another_module(folder, tmp_path):
     read(spec(folder, model("mine_of_trust:build")))
-    other = tmp_path / "other"
-    other.mkdir()
-    (other / "mine_of_trust.py").write_text("def build(): return 5\n")
-    assert read(spec(other, model("mine_of_trust:build"))).build() == 5
+    other_folder = tmp_path / "other"
+    other_folder.mkdir()
+    (other_folder / "mine_of_trust.py").write_text("def build(): return 5\n")
+    assert read(spec(other_folder, model("mine_of_trust:build"))).build() == 5
 
 
 def test_a_module_elsewhere_has_to_be_allowed(folder, tmp_path, monkeypatch):
-    away = tmp_path / "away"
-    away.mkdir()
-    (away / "elsewhere_of_trust.py").write_text("import liethermo as lt\ndef build(): return lt.models.rigid_body()\n")
-    monkeypatch.syspath_prepend(str(away))
+    other_folder = tmp_path / "away"
+    other_folder.mkdir()
+    (other_folder / "elsewhere_of_trust.py").write_text(
+        "import liethermo as lt\ndef build(): return lt.models.rigid_body()\n"
+    )
+    monkeypatch.syspath_prepend(str(other_folder))
     path = spec(folder, model("elsewhere_of_trust:build"))
-    refused = CliRunner().invoke(app, ["check", str(path)])
-    assert "only if you allow it by name: --allow elsewhere_of_trust" in refused.stderr.replace("\n", " ")
+    result = CliRunner().invoke(app, ["check", str(path)])
+    assert "only if you allow it by name: --allow elsewhere_of_trust" in result.stderr.replace("\n", " ")
     assert CliRunner().invoke(app, ["check", str(path), "--allow", "elsewhere_of_trust"]).exit_code == 0
 
 
@@ -96,8 +98,8 @@ def test_a_file_beside_the_spec_shadows_nothing(folder):
     path = spec(folder, model("mine_of_trust:build"))
     result = CliRunner().invoke(app, ["run", str(path), "--out", "results", "--set", "run.step=0.01"])
     assert result.exit_code == 0, result.stderr
-    refused = CliRunner().invoke(app, ["check", str(spec(folder, model("xarray:build")))])
-    assert "there is another module 'xarray'" in refused.stderr
+    check_result = CliRunner().invoke(app, ["check", str(spec(folder, model("xarray:build")))])
+    assert "there is another module 'xarray'" in check_result.stderr
 
 
 SHADOWING = """
@@ -105,7 +107,7 @@ import sys
 from pathlib import Path
 import liethermo as lt
 from liethermo.spec import read
-from liethermo.spec.trust import sent
+from liethermo.spec.trust import pickle_by_value
 assert "xarray" not in sys.modules
 try:
     read(Path(sys.argv[1]))
@@ -116,31 +118,31 @@ print(xarray.__version__)
 """
 
 
-def test_a_file_beside_the_spec_is_taken_for_no_other(folder):
-    """Nor where the other has not been imported yet: afterwards it would be the one beside the spec."""
+def test_a_file_beside_the_spec_is_not_taken_for_an_installed_module(folder):
+    """A module that has not been imported yet is refused too, since it would be found beside the spec afterwards."""
     (folder / "xarray.py").write_text("def build(): return 5")
     path = spec(folder, model("xarray:build"))
     command = [sys.executable, "-P", "-c", SHADOWING, str(path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "there is another module 'xarray'" in done.stdout
+    process = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert process.returncode == 0, process.stderr
+    assert "there is another module 'xarray'" in process.stdout
 
 
-def test_what_is_beside_the_spec_is_sent_to_workers(folder):
-    """As it is, with what it imports from beside it: a worker has other folders."""
+def test_modules_beside_the_spec_are_sent_to_workers(folder):
+    """They are pickled by value with their own imports, since a worker has other folders."""
     import cloudpickle
 
-    build, packed = read(spec(folder, model("mine_of_trust:build"))).build, folder / "build.pickle"
-    packed.write_bytes(cloudpickle.dumps(build))
-    unpack = f"import pickle; print(type(pickle.load(open({str(packed)!r}, 'rb'))(2.0)).__name__)"
+    build, pickle_file = read(spec(folder, model("mine_of_trust:build"))).build, folder / "build.pickle"
+    pickle_file.write_bytes(cloudpickle.dumps(build))
+    unpack = f"import pickle; print(type(pickle.load(open({str(pickle_file)!r}, 'rb'))(2.0)).__name__)"
     command = [sys.executable, "-P", "-c", unpack]
     assert (
         "No module named 'mine_of_trust'" in subprocess.run(command, capture_output=True, text=True, check=False).stderr
     )
     with pickle_by_value(folder):
-        packed.write_bytes(cloudpickle.dumps(build))
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.stdout.strip() == "LiePoissonSystem", done.stderr
+        pickle_file.write_bytes(cloudpickle.dumps(build))
+    process = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert process.stdout.strip() == "LiePoissonSystem", process.stderr
 
 
 STUDY = f"[model]\nname='rigid_body'\n{RUN}[study.axes]\n"
@@ -167,7 +169,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("what", BAD)
-def test_what_is_no_spec_is_refused_soon(folder, what):
+def test_invalid_specs_are_refused_quickly(folder, what):
     path, start = spec(folder, BAD[what]), time.perf_counter()
     result = CliRunner().invoke(app, ["study", str(path), "--out", "store"])
     assert result.exit_code == 2, result.output
@@ -184,6 +186,6 @@ def test_changes_that_cannot_be_made(folder, change):
         read(spec(folder, f"[model]\nname = 'rigid_body'\n{RUN}"), [change])
 
 
-def test_what_is_no_path():
+def test_an_invalid_path_is_refused():
     with pytest.raises(lt.FileError, match="cannot read the spec file"):
         read("a\0b.toml")
