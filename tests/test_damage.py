@@ -22,7 +22,8 @@ LIBRARY_ERRORS = (lt.LiethermoError, lt.FileError)
 MAX_SECONDS = 20.0
 """Maximum time in seconds for reading one damaged file; a hundredth of it is usual."""
 
-BODY, X0 = lt.models.rigid_body, np.array([0.1, 1.0, 0.1])
+BODY = lt.models.rigid_body
+X0 = np.array([0.1, 1.0, 0.1])
 small_or_many = pytest.mark.parametrize("count", [60, pytest.param(6000, marks=pytest.mark.slow)])
 
 
