@@ -42,7 +42,7 @@ def _rigid_body() -> lt.System:
     return lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
 
 
-def _so4_body() -> lt.System:
+def _four_dimensional_body() -> lt.System:
     g = mf.so(4)
     inertia = jnp.array([1.0, 1.5, 2.0, 2.5, 3.0, 3.5])
     return lt.LiePoissonSystem(
@@ -75,7 +75,7 @@ def _stiff_exchange() -> lt.System:
 
 PROBLEMS = (
     Problem("relaxing body, so(3)", _rigid_body, (0.06, 0.1, 1.0), 40.0, 0.05),
-    Problem("body in four dimensions, so(4)", _so4_body, (0.9, 0.3, -0.5, 0.2, 0.6, -0.4), 20.0, 0.05),
+    Problem("body in four dimensions, so(4)", _four_dimensional_body, (0.9, 0.3, -0.5, 0.2, 0.6, -0.4), 20.0, 0.05),
     Problem("oscillator and its heat", _oscillator, (1.0, 0.0, -2.0), 20.0, 0.05),
     Problem("stiff exchange of heat", _stiff_exchange, (2.0, 0.0, 0.4, 0.0), 10.0, 0.002),
 )

@@ -106,7 +106,7 @@ def refusals(folder, *parts, changes=()):
             "study.measure.m.relaxed = -1.0: must be greater",
         ),
         ("axes.rate = [1.0]\nmeasure = {m = {}}", "study.measure.m: must have one of relaxed and at"),
-        ("axes.rate = [1.0]\nmeasure = {m = 'median'}", "study: the measure 'm' is"),
+        ("axes.rate = [1.0]\nmeasure = {m = 'median'}", "study: the measure 'm' must be"),
         ("axes.rate = [1.0]\nchunks = 3", "study.chunks: no such key (did you mean chunk?)"),
     ],
 )

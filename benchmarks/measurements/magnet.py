@@ -67,11 +67,11 @@ class Series:
         return integrated_autocorrelation(self.squared_magnetisation)
 
     @property
-    def all_indices(self) -> np.ndarray:
+    def row_indices(self) -> np.ndarray:
         """Indices of all rows."""
         return np.arange(len(self.samples))
 
-    def equilibrated(self) -> Series:
+    def without_transient(self) -> Series:
         """Return the series without its beginning: a twentieth, or eight autocorrelation times if that is at most
         half."""
         n = len(self.samples)
@@ -83,7 +83,7 @@ class Series:
     def jackknife_blocks(self) -> list[np.ndarray]:
         """Return row indices in four to forty blocks of at least eight autocorrelation times."""
         count = int(np.clip(len(self.samples) / (8 * self.autocorrelation_time), 4, 40))
-        return np.array_split(self.all_indices, count)
+        return np.array_split(self.row_indices, count)
 
 
 def integrated_autocorrelation(x: np.ndarray) -> float:
@@ -114,14 +114,14 @@ def binder_cumulant(series: Series, rows) -> float:
 
 def with_error(quantity, series: Series) -> tuple[float, float]:
     """Return a quantity and its jackknife standard error."""
-    return quantity(series, series.all_indices), float(
+    return quantity(series, series.row_indices), float(
         np.sqrt(jackknife_variance(lambda chosen: quantity(series, chosen), series))
     )
 
 
 def jackknife_variance(quantity, series: Series) -> float:
     """Return the jackknife variance of a function of row indices."""
-    estimates = [quantity(np.delete(series.all_indices, block)) for block in series.jackknife_blocks()]
+    estimates = [quantity(np.delete(series.row_indices, block)) for block in series.jackknife_blocks()]
     return float((len(estimates) - 1) * np.var(estimates))
 
 
@@ -144,14 +144,14 @@ def cumulant_crossing(a: Series, b: Series) -> tuple[float, float]:
         difference = binder_cumulant(a, rows_a) - binder_cumulant(b, rows_b)
         return temperature - difference / (cumulant_slope(a, rows_a) - cumulant_slope(b, rows_b))
 
-    variance_a = jackknife_variance(lambda of_a: crossing(of_a, b.all_indices), a)
-    variance_b = jackknife_variance(lambda of_b: crossing(a.all_indices, of_b), b)
-    return crossing(a.all_indices, b.all_indices), float(np.sqrt(variance_a + variance_b))
+    variance_a = jackknife_variance(lambda of_a: crossing(of_a, b.row_indices), a)
+    variance_b = jackknife_variance(lambda of_b: crossing(a.row_indices, of_b), b)
+    return crossing(a.row_indices, b.row_indices), float(np.sqrt(variance_a + variance_b))
 
 
 def join_runs(runs: list[Series]) -> Series:
     """Return runs under equal conditions as one series, each without its beginning."""
-    rows = np.concatenate([run.equilibrated().samples for run in runs])
+    rows = np.concatenate([run.without_transient().samples for run in runs])
     return replace(runs[0], steps=sum(run.steps for run in runs), samples=rows)
 
 

@@ -144,11 +144,11 @@ RUNS_PER_TIMING = 20
 
 
 def _repeat(work: Callable) -> Callable:
-    def repeated():
+    def run_repeatedly():
         for _ in range(RUNS_PER_TIMING):
             work()
 
-    return repeated
+    return run_repeatedly
 
 
 def spin_energy(x):

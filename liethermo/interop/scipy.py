@@ -127,10 +127,7 @@ def solve_ivp(
         If an argument cannot be used. A step that fails does not raise: ``success`` is False, as in SciPy.
     """
     if not isinstance(fun, System):
-        raise InputError(
-            f"the first argument must be a system such as lt.LiePoissonSystem, not {type(fun).__name__}: "
-            "the laws are those of its energy and entropy"
-        )
+        raise InputError(f"fun must be a system such as lt.LiePoissonSystem, got {type(fun).__name__}")
     for name in options:
         reason = (
             "the methods take it from the system" if name in UNSUPPORTED_OPTIONS else "solve_ivp has no such option"
@@ -138,7 +135,7 @@ def solve_ivp(
         raise InputError(f"leave out {name}: {reason}")
     functions = [] if events is None else [events] if callable(events) else list(events)
     if args is not None and not functions:
-        raise InputError("args are passed to the events, and there are none: the system has its parameters in itself")
+        raise InputError("args are passed to the events, but there are none. A system contains its parameters")
     start, end = _checked_span(t_span)
     saved_times = None if t_eval is None else _checked_times(t_eval, start, end)
     _check_first_step(first_step, end - start)
@@ -243,14 +240,11 @@ def _checked_span(t_span) -> tuple[float, float]:
     try:
         start, end = map(float, t_span)
     except (TypeError, ValueError):
-        raise InputError(f"t_span is two numbers (start, end), not {t_span!r}") from None
+        raise InputError(f"t_span must be two numbers (start, end), got {t_span!r}") from None
     if math.isnan(start) or math.isnan(end) or math.isinf(start):
         raise InputError(f"t_span must start at a finite time, got ({start:g}, {end:g})")
     if end < start:
-        raise InputError(
-            f"t_span = ({start:g}, {end:g}) runs backwards, and time runs forwards here, since entropy grows: "
-            f"integrate over ({end:g}, {start:g})"
-        )
+        raise InputError(f"t_span = ({start:g}, {end:g}) runs backwards. Integrate over ({end:g}, {start:g}) instead")
     return start, end
 
 
@@ -267,4 +261,4 @@ def _checked_args(args) -> tuple:
     try:
         return (*args,)
     except TypeError:
-        raise InputError(f"args is a tuple, even of one: write args=({args!r},)") from None
+        raise InputError(f"args must be a tuple, even of one. Write args=({args!r},)") from None

@@ -113,7 +113,7 @@ def expressions(system: System, names: Sequence[str] | None = None) -> Expressio
         If the energy depends on time, or a function contains an operation without an expression.
     """
     if system.is_driven:
-        raise InputError("the energy depends on time: take system.at_time(t), a system at one time")
+        raise InputError("the energy depends on time. Use system.at_time(t), the system at one time")
     algebra = system.lie_algebra
     basis_names = None if algebra is None else algebra.basis_names
     names = names or basis_names or [f"x{i + 1}" for i in range(system.dim)]
@@ -152,7 +152,9 @@ def function(expression: Any, variables: Sequence[sympy.Symbol]) -> Callable:
     """
     expression, variables = sympy.sympify(expression), tuple(variables)
     if unknown_symbols := expression.free_symbols - set(variables):
-        raise InputError(f"{', '.join(sorted(map(str, unknown_symbols)))} in {expression} is no component of the state")
+        raise InputError(
+            f"{', '.join(sorted(map(str, unknown_symbols)))} in {expression} is not a component of the state"
+        )
     if expression.is_polynomial(*variables):
         return mf.sympy.polynomial(expression, variables)
     jax_function = _jax_function(expression, variables)

@@ -67,7 +67,7 @@ def periods(inertia, momentum, energy=None) -> Periods:
     moments, L = np.asarray(principal_moments(inertia)), np.asarray(momentum, dtype=float)
     if energy is None:
         if L.shape[-1:] != (3,):
-            raise InputError(f"a momentum without an energy has shape (..., 3), not {L.shape}")
+            raise InputError(f"without energy=, momentum must have shape (..., 3), got {L.shape}")
         if are_tensors(np.asarray(inertia)):
             L = np.einsum("...ji,...j->...i", principal_axes(inertia).axes, L)
         E, L = 0.5 * np.sum(L**2 / moments, axis=-1), np.linalg.norm(L, axis=-1)
@@ -83,8 +83,8 @@ def periods(inertia, momentum, energy=None) -> Periods:
     if not is_possible.all():
         i = np.unravel_index(int(np.argmin(is_possible)), shape)
         raise InputError(
-            f"a free body with the momentum {L[i]:g} and these moments of inertia has an energy from L**2 / (2 I_3) = "
-            f"{min_energy[i]:g} to L**2 / (2 I_1) = {max_energy[i]:g}, not {E[i]:g}"
+            f"the energy for the momentum {L[i]:g} must lie between L**2 / (2 I_3) = {min_energy[i]:g} and "
+            f"L**2 / (2 I_1) = {max_energy[i]:g}, got {E[i]:g}"
         )
     is_short_axis = L_squared >= 2 * E * I2
     a, c = np.where(is_short_axis, I1, I3), np.where(is_short_axis, I3, I1)  # c is the moment of the circled axis
@@ -151,7 +151,7 @@ def rate_of(relaxation_time, inertia, momentum) -> jax.Array:
     tau, L = check_numbers(relaxation_time, "a relaxation time"), check_numbers(momentum, "the size of a momentum")
     for value, label in ((tau, "a relaxation time"), (L, "the size of a momentum")):
         require_condition(
-            value, lambda v: (v > 0.0) & (v < np.inf), label + " must be positive and finite, not {value}"
+            value, lambda v: (v > 0.0) & (v < np.inf), label + " must be positive and finite, got {value}"
         )
     smallest_moment, middle_moment, greatest_moment = jnp.moveaxis(jnp.sort(moments, axis=-1), -1, 0)
     is_unequal = greatest_moment - smallest_moment > EQUAL_MOMENTS_RTOL * greatest_moment
@@ -215,5 +215,5 @@ def damping_time(rigidity, quality, density, radius, spin, shape_factor=100.0) -
     }
     mu, Q, rho, R, omega, A = (np.asarray(value, dtype=float) for value in arguments.values())
     for name, value in arguments.items():
-        require_condition(value, lambda v: (v > 0.0) & (v < np.inf), name + " must be positive and finite, not {value}")
+        require_condition(value, lambda v: (v > 0.0) & (v < np.inf), name + " must be positive and finite, got {value}")
     return A * mu * Q / (rho * R**2 * omega**3)

@@ -68,5 +68,5 @@ def grid_graph(shape: Sequence[int]) -> scipy.sparse.csr_array:
 
 def _checked_shape(shape: Sequence[int]) -> tuple[int, ...]:
     if not isinstance(shape, Sequence) or isinstance(shape, str) or len(shape) == 0:
-        raise InputError(f"shape is the number of nodes along each axis, such as (32, 32), not {shape!r}")
+        raise InputError(f"shape must be the number of nodes along each axis, such as (32, 32), got {shape!r}")
     return tuple(checked_integer(n, "each entry of shape") for n in shape)

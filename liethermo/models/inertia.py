@@ -65,7 +65,7 @@ def principal_axes(inertia) -> PrincipalAxes:
     """
     tensors = np.asarray(check_numbers(inertia, "inertia"), dtype=np.float64)
     if tensors.shape[-2:] != (3, 3):
-        raise InputError(f"a tensor of inertia has shape (..., 3, 3), not {tensors.shape}")
+        raise InputError(f"inertia must have shape (..., 3, 3), got {tensors.shape}")
     moments, axes = np.linalg.eigh(checked_tensors(tensors))
     leading_entries = np.take_along_axis(axes, np.argmax(np.abs(axes) > 1e-8, axis=-2)[..., None, :], axis=-2)
     axes = axes * np.where(leading_entries < 0.0, -1.0, 1.0)
@@ -128,10 +128,10 @@ def principal_moments(inertia) -> jax.Array:
     """Return principal moments, shape (..., 3), of moments in any order or of tensors (then in ascending order)."""
     array = check_numbers(inertia, "inertia")
     if array.shape[-1:] != (3,):
-        raise InputError(f"inertia has shape (..., 3), or (..., 3, 3) of tensors, not {array.shape}")
+        raise InputError(f"inertia must have shape (..., 3), or (..., 3, 3) for tensors, got {array.shape}")
     moments = jnp.linalg.eigvalsh(checked_tensors(array)) if are_tensors(array) else array
     require_condition(
-        moments, lambda m: (m > 0.0) & (m < np.inf), "moments of inertia must be positive and finite, not {value}"
+        moments, lambda m: (m > 0.0) & (m < np.inf), "moments of inertia must be positive and finite, got {value}"
     )
     return moments
 

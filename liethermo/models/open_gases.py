@@ -148,7 +148,7 @@ def porous_piston_state(
     )
     position = check_numbers(q, "q", ())
     require_condition(
-        position, lambda q: (q > 0.0) & (q < length), f"the piston is between 0 and {length:g}, not at {{value:g}}"
+        position, lambda q: (q > 0.0) & (q < length), f"q must be between 0 and {length:g}, got {{value:g}}"
     )
     gas, state = _single_species_gas((defaults | parameters)["heat_capacity"]), []
     for name, particles_and_temperature, width in (("left", left, position), ("right", right, length - position)):

@@ -187,11 +187,11 @@ class QuantisedSphere:
         """
         W = np.asarray(vorticity)
         if W.shape != (self.N, self.N):
-            raise InputError(f"a vorticity matrix has shape ({self.N}, {self.N}), not {W.shape}")
+            raise InputError(f"vorticity must have shape ({self.N}, {self.N}), got {W.shape}")
         norm = max(float(np.linalg.norm(W)), np.finfo(float).tiny)
         skew, trace = float(np.linalg.norm(W + adjoint(W))) / norm, float(abs(np.trace(W))) / norm
         if not skew <= TRACE_RTOL:
-            raise InputError(f"a vorticity matrix is anti-Hermitian, and this one is not, by {skew:.3g} of its norm")
+            raise InputError(f"vorticity must be anti-Hermitian, but W + W^H is {skew:.3g} of its norm")
         if not trace <= TRACE_RTOL:
             raise InputError(
                 f"the vorticity has a trace of {trace:.3g} of its norm: its integral over the sphere has to vanish. "
@@ -231,11 +231,11 @@ class QuantisedSphere:
         """
         a = np.asarray(a, dtype=np.complex128)
         if a.ndim != 2 or a.shape[0] != a.shape[1] or not 1 <= len(a) <= self.N:
-            raise InputError(f"coefficients a[l, m] have shape (L + 1, L + 1) with L < {self.N}, not {a.shape}")
+            raise InputError(f"coefficients a[l, m] must have shape (L + 1, L + 1) with L < {self.N}, got {a.shape}")
         if a[0, 0] != 0.0:
-            raise InputError(f"the mean of a vorticity is zero, and so is a[0, 0], not {a[0, 0]}")
+            raise InputError(f"a[0, 0], the mean of the vorticity, must be 0, got {a[0, 0]}")
         if a[:, 0].imag.any():
-            raise InputError("the coefficients a[l, 0] of a real function are real")
+            raise InputError("the coefficients a[l, 0] of a real function must be real")
         W = np.zeros((self.N, self.N), dtype=np.complex128)
         for m in range(len(a)):
             vectors = self.harmonics(m, len(a) - 1)
@@ -282,7 +282,7 @@ class QuantisedSphere:
         """Return a random vorticity of the given enstrophy, with equal expected amplitudes in a range of degrees l."""
         min_degree, max_degree = degrees
         if not 1 <= min_degree <= max_degree < self.N:
-            raise InputError(f"degrees are from 1 to {self.N - 1}, not {degrees}")
+            raise InputError(f"degrees must be an increasing pair from 1 to {self.N - 1}, got {degrees}")
         random = np.random.default_rng(seed)
         a = random.standard_normal((max_degree + 1, max_degree + 1)) + 1j * random.standard_normal(
             (max_degree + 1, max_degree + 1)

@@ -260,14 +260,14 @@ def _rotor_system(inertia, axis, rotor, make_dissipation, baths, attitude) -> Li
     check_numbers(axis, "axis")
     direction = np.asarray(axis, dtype=float)
     if direction.shape != (3,) or not np.isfinite(direction).all() or not direction.any():
-        raise InputError(f"axis is a direction in body axes, three numbers that are not all zero, not {axis!r}")
+        raise InputError(f"axis must be a direction in body axes, three numbers that are not all zero, got {axis!r}")
     a = jnp.asarray(direction / np.linalg.norm(direction))
     inverse_times_axis = inverse @ a
     inertia_fraction = 1.0 - J * jnp.dot(a, inverse_times_axis)
     require_condition(
         inertia_fraction,
         lambda v: v > 0.0,
-        "a rotor has less than the inertia of the whole about its axis: 1 - J/I is {value}",
+        "a rotor must have less than the inertia of the whole about its axis, got 1 - J/I = {value}",
     )
     B = inverse + J / inertia_fraction * jnp.outer(inverse_times_axis, inverse_times_axis)
     Ba = inverse_times_axis / inertia_fraction

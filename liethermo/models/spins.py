@@ -94,7 +94,7 @@ def spin_lattice(
     if dmi is not None:
         terms += dzyaloshinskii_moriya(shape, dmi, periodic=periodic).terms
     if not isinstance(baths, HeatBaths | bool):
-        raise InputError(f"baths are lt.HeatBaths, True for one of the size of the lattice, or False, not {baths!r}")
+        raise InputError(f"baths must be lt.HeatBaths, True for one as large as the lattice, or False, got {baths!r}")
     lattice_baths = HeatBaths(capacity=float(np.prod(shape))) if baths is True else baths or None
     return SpinSystem(shape, Sum(tuple(terms)), LandauLifshitz(rate, bath), lattice_baths)
 

@@ -89,7 +89,7 @@ def thermoelastic_chain(
     """
     N, n = checked_integer(bodies, "bodies"), checked_integer(dimension, "dimension")
     if n > 3:
-        raise InputError(f"dimension is 1, 2 or 3, not {n}")
+        raise InputError(f"dimension must be 1, 2 or 3, got {n}")
     spring = Thermospring(
         checked_positive(stiffness, "stiffness"),
         check_numbers(expansion, "expansion", ()),

@@ -97,7 +97,7 @@ class GravityGradient(Module):
         if not is_traced((self.towards, self.normal)):
             cosine = float(np.dot(self.towards, self.normal))
             if abs(cosine) > MAX_PERPENDICULAR_COSINE:
-                raise InputError(f"towards lies in the plane of the orbit, normal to it: their cosine is {cosine:.3g}")
+                raise InputError(f"towards and normal must be perpendicular, but their cosine is {cosine:.3g}")
 
     def __call__(self, t, mu, attitude):
         n = attitude.T @ self.to_centre(t)
@@ -177,12 +177,10 @@ class Tabulated(Module):
         self.times, self.moments = checked_finite(times, "times"), checked_finite(moments, "moments")
         if self.times.ndim != 1 or self.times.size < 2 or self.moments.shape[:1] != self.times.shape:
             raise InputError(
-                f"times has shape (m,), m at least 2, and moments m rows: not {self.times.shape} and "
+                f"times must have shape (m,) with m >= 2, and moments m rows, got {self.times.shape} and "
                 f"{self.moments.shape}"
             )
-        require_condition(
-            self.times, lambda t: t[1:] > t[:-1], "the times of a table increase, and these do not: {value}"
-        )
+        require_condition(self.times, lambda t: t[1:] > t[:-1], "the times of a table must increase, got {value}")
 
     def __call__(self, t, mu):
         has_begun = jnp.where(t >= self.times, 1.0, 0.0)
@@ -197,5 +195,5 @@ class Tabulated(Module):
 
 def _unit_vector(value, name: str) -> jax.Array:
     array = checked_finite(value, name, 3)
-    require_condition(array, lambda v: (v**2).sum() > 0.0, name + " is a direction, not {value}")
+    require_condition(array, lambda v: (v**2).sum() > 0.0, name + " must be a direction, not zero, got {value}")
     return array / jnp.sqrt(jnp.sum(array**2))

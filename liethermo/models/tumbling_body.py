@@ -79,7 +79,7 @@ def tumbling_body(
     if (rate is None) == (relaxation_time is None) or (momentum is None) != (relaxation_time is None):
         arguments = {"relaxation_time": relaxation_time, "momentum": momentum, "rate": rate}
         names = ", ".join(name for name, value in arguments.items() if value is not None) or "none of them"
-        raise InputError(f"give relaxation_time= with the momentum= that it belongs to, or rate=, not {names}")
+        raise InputError(f"give rate=, or relaxation_time= and momentum=, at which it holds; got {names}")
     friction = rate if relaxation_time is None else rate_of(relaxation_time, moments, _momentum_norm(momentum))
     return LiePoissonSystem(
         mf.so(3),
@@ -93,5 +93,5 @@ def tumbling_body(
 def _momentum_norm(momentum):
     """Return the norm of a momentum, given as such or as a vector."""
     if np.shape(momentum) not in ((), (3,)):
-        raise InputError(f"momentum is one number, or three, not an array of shape {np.shape(momentum)}")
+        raise InputError(f"momentum must be one number, or three, got an array of shape {np.shape(momentum)}")
     return momentum if np.shape(momentum) == () else np.linalg.norm(momentum)

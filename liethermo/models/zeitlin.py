@@ -75,7 +75,7 @@ def zeitlin(N: int, decay: Literal["enstrophy", "energy"] | None = None, rate=0.
     """
     sphere, rate = QuantisedSphere(N), checked_rate(rate)
     if decay not in (None, "enstrophy", "energy"):
-        raise InputError(f"what decays is 'enstrophy', 'energy' or None, not {decay!r}")
+        raise InputError(f"decay must be 'enstrophy', 'energy' or None, got {decay!r}")
     dissipation: Dissipation | None = None
     if decay == "enstrophy":  # -kappa is N on components, 2N on matrices
         dissipation = KillingDissipation(rate / (2.0 * sphere.N))

@@ -36,7 +36,7 @@ def one_of(options: Iterable[str]) -> BeforeValidator:
 
 def _require_increasing(span: tuple[float, float]) -> tuple[float, float]:
     if span[1] <= span[0]:
-        raise validation_error("must increase: time runs forwards, since entropy grows")
+        raise validation_error("must increase")
     return span
 
 
@@ -68,7 +68,7 @@ class Model(Section):
     )
     function: str | None = Field(
         None,
-        description='in its place `"module:function"`, of a module beside the file, or of one that is allowed',
+        description='instead of a name: `"module:function"`, from a module beside the file or an allowed one',
     )
     parameters: dict[str, Any] = Field({}, description="the arguments of the model or the function")
 
@@ -76,10 +76,10 @@ class Model(Section):
 class AdaptiveStep(Section):
     """Adaptive steps, chosen by the estimated error."""
 
-    adaptive: FiniteFloat = Field(gt=0, description="the error wanted, relative to the state: `lt.Adaptive(rtol)`")
-    atol: FiniteFloat = Field(0.0, ge=0, description="the error that is allowed besides")
+    adaptive: FiniteFloat = Field(gt=0, description="the tolerance relative to the state: `lt.Adaptive(rtol)`")
+    atol: FiniteFloat = Field(0.0, ge=0, description="the absolute tolerance")
     first: FiniteFloat | None = Field(None, gt=0, description="the first step to try")
-    largest: FiniteFloat | None = Field(None, gt=0, description="no step is longer")
+    largest: FiniteFloat | None = Field(None, gt=0, description="the longest step")
 
 
 class StopCondition(Section):
@@ -105,9 +105,9 @@ class Run(Section):
         description="start and end, for example [0.0, 100.0]"
     )
     step: Step = Field(description="the step size, a number greater than 0, or {adaptive = 1e-8}")
-    save_every: int = Field(1, ge=1, description="every n-th state is kept, n this number")
+    save_every: int = Field(1, ge=1, description="the number of steps between saved states")
     until: StopCondition | None = Field(
-        None, description="where the run ends before its time, for example {relaxed = 1e-8}"
+        None, description="a condition that ends the run early, for example {relaxed = 1e-8}"
     )
     attitude: list[list[FiniteFloat]] | None = Field(
         None, description="the element of the group at the start, a matrix, where the system has a group"
@@ -118,7 +118,7 @@ class Method(BaseModel):
     """The integrator; all keys other than its name are its parameters."""
 
     model_config = ConfigDict(extra="allow")  # the parameters of the method, checked by its signature
-    # options without a name are those of the midpoint scheme
+    # options without a name belong to the midpoint scheme
     name: Annotated[str, one_of(METHODS)] | None = Field(
         None, description=f"one of {', '.join(METHODS)}; the default is that of `integrate`"
     )
@@ -139,7 +139,7 @@ class EvenlySpacedAxis(Section):
 
     first: FiniteFloat = Field(description="the first value")
     last: FiniteFloat = Field(description="the last value")
-    points: int = Field(ge=1, le=MAX_AXIS_VALUES, description="how many")
+    points: int = Field(ge=1, le=MAX_AXIS_VALUES, description="the number of values")
     scale: Annotated[str, one_of(("linear", "log"))] = Field("linear", description="linear, or log")
 
 
@@ -148,13 +148,15 @@ class SampledAxis(Section):
 
     zip: dict[str, list[FiniteFloat]] | None = Field(None, description="equally many values of each parameter")
     latin_hypercube: int | None = Field(
-        None, ge=1, le=MAX_AXIS_VALUES, description="points of a Latin hypercube, with `ranges`"
+        None, ge=1, le=MAX_AXIS_VALUES, description="the number of points of a Latin hypercube, with `ranges`"
     )
-    sobol: int | None = Field(None, ge=1, le=MAX_AXIS_VALUES, description="points of a Sobol sequence, with `ranges`")
+    sobol: int | None = Field(
+        None, ge=1, le=MAX_AXIS_VALUES, description="the number of points of a Sobol sequence, with `ranges`"
+    )
     ranges: dict[str, list[FiniteFloat | str]] | None = Field(
-        None, description='of each parameter [low, high], or [low, high, "log"]'
+        None, description='[low, high] or [low, high, "log"] of each parameter'
     )
-    seed: int = Field(0, ge=0, description="of the sample")
+    seed: int = Field(0, ge=0, description="the seed of the sample")
 
 
 def _axis_tag(value: Any) -> str:
@@ -175,8 +177,8 @@ class MeasureTable(Section):
     relaxed: FiniteFloat | None = Field(
         None, gt=0, description="the time of relaxation to a rate below this, where the run ends: `lt.Relaxed(tol)`"
     )
-    at: list[FiniteFloat] | None = Field(None, min_length=1, description="values at these times")
-    what: str = Field("x", description="of which series: x, energy, entropy or attitude")
+    at: list[FiniteFloat] | None = Field(None, min_length=1, description="the times at which values are measured")
+    what: str = Field("x", description="the measured series: x, energy, entropy or attitude")
 
 
 def _measure_tag(value: Any) -> str:
@@ -199,13 +201,13 @@ class StudySection(Section):
     measure: dict[str, MeasureEntry] = Field(
         {"final": "final"},
         min_length=1,
-        description='what is kept, by names of yours: `"final"`, `"relaxation_time"`, ..., {relaxed = 1e-8}, or '
+        description='the measures, by names that you choose: `"final"`, `"relaxation_time"`, ..., {relaxed = 1e-8}, or '
         '{at = [1.0, 2.0], what = "x"}',
     )
-    chunk: int | None = Field(None, ge=1, description="points of a chunk, about")
-    units: dict[str, str] = Field({}, description="of axes and measures")
+    chunk: int | None = Field(None, ge=1, description="the approximate number of points of a chunk")
+    units: dict[str, str] = Field({}, description="units of axes and measures")
     names: dict[str, str] = Field({}, description="long names of axes and measures")
-    figure: str | None = Field(None, description="the measure that is drawn; by default the first that can be")
+    figure: str | None = Field(None, description="the measure to draw; by default the first that can be drawn")
 
 
 SECTIONS = {"model": Model, "run": Run, "method": Method, "outputs": Outputs, "study": StudySection}

@@ -94,7 +94,7 @@ def replicas(states) -> Zipped:
         return Zipped({}, count=_checked_count(states))
     array = np.asarray(states, dtype=np.float64)
     if array.ndim != 2 or not array.size:
-        raise InputError(f"replicas have initial states of shape (replicas, n), not {array.shape}")
+        raise InputError(f"states must have shape (replicas, n), got {array.shape}")
     if not np.isfinite(array).all():
         i = int(np.argwhere(~np.isfinite(array))[0, 0])
         raise InputError(f"the initial state of replica {i} is not finite: {array[i].tolist()}")
@@ -157,11 +157,11 @@ def _scale_sample(draw, ranges: Mapping[str, Any]) -> Zipped:
         if not (
             isinstance(bounds, tuple | list) and len(bounds) in (2, 3) and bounds[2:] in ((), [], ("log",), ["log"])
         ):
-            raise InputError(f"the range of {name} is (low, high) or (low, high, 'log'), not {bounds!r}")
+            raise InputError(f"the range of {name} must be (low, high) or (low, high, 'log'), got {bounds!r}")
         low, high = map(float, bounds[:2])
         if not (np.isfinite([low, high]).all() and low < high and (len(bounds) == 2 or low > 0.0)):
             raise InputError(
-                f"the range of {name} must be finite and increasing, and positive with 'log': not {bounds!r}"
+                f"the range of {name} must be finite and increasing, and positive with 'log', got {bounds!r}"
             )
     unit = draw(len(ranges))
     columns = {}
@@ -172,7 +172,7 @@ def _scale_sample(draw, ranges: Mapping[str, Any]) -> Zipped:
 
 def _checked_count(count) -> int:
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
-        raise InputError(f"a sample has a positive number of points, not {count!r}")
+        raise InputError(f"the number of points must be a positive integer, got {count!r}")
     return int(count)
 
 
@@ -180,15 +180,15 @@ def _checked_column(name: str, values) -> np.ndarray:
     """Return the values as an array of finite numbers or texts, shape (m,), m > 0."""
     array = np.asarray(values)
     if array.dtype.kind == "U" and not all(isinstance(value, str) for value in np.asarray(values, dtype=object).flat):
-        raise InputError(f"the values of {name!r} are numbers or texts, not both")
+        raise InputError(f"the values of {name!r} must be either numbers or texts, got both")
     if array.ndim != 1 or array.dtype.kind not in "fiubU" or not len(array):
         raise InputError(
-            f"the values of {name!r} are a list of numbers or texts, not {array.dtype} of shape {array.shape}; "
-            "several numbers at once are lt.zipped(a=..., b=...)"
+            f"the values of {name!r} must be a list of numbers or texts, got {array.dtype} of shape {array.shape}. "
+            "For several numbers at once use lt.zipped(a=..., b=...)"
         )
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         i = int(np.flatnonzero(~np.isfinite(array))[0])
-        raise InputError(f"value {i} of {name!r} is {array[i]}: parameters are finite")
+        raise InputError(f"value {i} of {name!r} is {array[i]}, but parameters must be finite")
     return array.astype(np.float64) if array.dtype.kind == "f" else array
 
 
@@ -221,7 +221,7 @@ class Axis:
         unique, first_indices = np.unique(values, return_index=True)
         if len(unique) < len(values):
             i = int(np.setdiff1d(np.arange(len(values)), first_indices)[0])
-            raise InputError(f"the axis {name!r} has {values[i]} more than once; replicas are an axis of their own")
+            raise InputError(f"the axis {name!r} has {values[i]} more than once. For repeated runs use lt.replicas")
         return cls(name, values, {name: values})
 
     def __len__(self) -> int:
@@ -267,7 +267,7 @@ class Axes:
         """Make the axes from the argument ``axes`` of :class:`Study`, and check it."""
         if not isinstance(mapping, Mapping) or not mapping:
             raise InputError(
-                f'axes are a dict from names to values, such as {{"rate": [0.1, 1.0]}}, not {mapping!r:.60}'
+                f'axes must be a dict from names to values, such as {{"rate": [0.1, 1.0]}}, got {mapping!r:.60}'
             )
         for name, values in mapping.items():
             for key in (name, *(values.columns if isinstance(values, Zipped) else ())):
@@ -277,7 +277,7 @@ class Axes:
         if axes.size > MAX_POINTS:
             shape = " x ".join(map(str, axes.shape))
             raise InputError(
-                f"a study has at most {MAX_POINTS:.0e} points, and these axes have {shape}: sample them instead"
+                f"a study has at most {MAX_POINTS:.0e} points, but these axes have {shape}. Use lt.sobol instead"
             )
         return axes
 

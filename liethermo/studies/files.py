@@ -174,7 +174,7 @@ def write_file(path: Path, data: bytes) -> None:
     try:
         disk.write_atomically(path, data)
     except OSError as error:
-        advice = "What is done is kept; run the study again to go on"
+        advice = "Finished chunks are saved; run the study again to continue"
         raise FileError(f"cannot write {path}: {disk.describe_os_error(error)}. {advice}") from error
 
 
@@ -197,7 +197,7 @@ def read_plain_file(path: Path) -> bytes:
     try:
         with open(path, "rb", opener=_open_no_follow) as file:
             if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-                raise FileError(f"{path} is no file")
+                raise FileError(f"{path} is not a regular file")
             return file.read()
     except FileError:
         raise
@@ -274,7 +274,7 @@ def lock_store(root: Path) -> Iterator[Callable[[int], None]]:
             if isinstance(error, FileError):
                 raise
             reason = disk.describe_os_error(error)
-            raise FileError(f"{root} cannot be locked ({reason}): two runs at once could not be told") from error
+            raise FileError(f"{root} cannot be locked ({reason}), so two runs at once would go unnoticed") from error
 
         def record_run(n_done: int) -> None:
             run_record = {"host": socket.gethostname(), "pid": os.getpid(), "started": time.time(), "done": n_done}

@@ -48,9 +48,9 @@ class At:
     def __post_init__(self):
         times = np.asarray(self.times, dtype=np.float64)
         if times.ndim != 1 or not len(times) or not np.isfinite(times).all() or (np.diff(times) <= 0.0).any():
-            raise InputError(f"the times of a measure are finite and increase, and are not {self.times!r:.80}")
+            raise InputError(f"the times of lt.At must be finite and increasing, got {self.times!r:.80}")
         if self.what not in ("x", "energy", "entropy", "attitude"):
-            raise InputError(f"At keeps x, energy, entropy or attitude, not {self.what!r}")
+            raise InputError(f"what must be x, energy, entropy or attitude, got {self.what!r}")
         object.__setattr__(self, "times", tuple(times.tolist()))
 
 
@@ -93,7 +93,7 @@ class EnsembleField(Measure):
         field = {"final": "x"}.get(self.name, self.name.removeprefix("final_"))
         values = getattr(ensemble, field)
         if values is None:
-            raise InputError(f"this system has no {field}, so that {self.name!r} is no measure of it")
+            raise InputError(f"the system has no {field}, so the measure {self.name!r} does not exist")
         return _final_values(values, ensemble) if self.name.startswith("final") or self.name == "work" else values, {}
 
     def description(self) -> str:
@@ -169,7 +169,7 @@ class SolutionMeasure(Measure):
                 example = value if example is None else example
                 if value.shape != example.shape or (value.dtype.kind == "c") > (example.dtype.kind == "c"):
                     raise TypeError(
-                        f"it returned {_describe_array(value)}, and {_describe_array(example)} at the first point"
+                        f"it returned {_describe_array(value)}, but {_describe_array(example)} at the first point"
                     )
                 values_by_index[i] = value
             except Exception as error:  # user code; its error becomes the status of this point
@@ -202,7 +202,8 @@ def parse_measures(specification: Mapping[str, Any], until: Any) -> tuple[dict[s
     """
     if not isinstance(specification, Mapping) or not specification:
         raise InputError(
-            f'measure is a dict such as {{"final": "final", "relaxed": lt.Relaxed(1e-8)}}, not {specification!r:.60}'
+            'measure must be a dict such as {"final": "final", "relaxed": lt.Relaxed(1e-8)}, '
+            f"got {specification!r:.60}"
         )
     measures: dict[str, Measure] = {}
     for name, measure in specification.items():
@@ -225,9 +226,9 @@ def parse_measures(specification: Mapping[str, Any], until: Any) -> tuple[dict[s
             measures[name] = SolutionMeasure(measure)
         else:
             raise InputError(
-                f"the measure {name!r} is lt.Relaxed(tol), lt.At(times), a function of a solution, or one of "
+                f"the measure {name!r} must be lt.Relaxed(tol), lt.At(times), a function of a solution, or one of "
                 f"{', '.join(NAMED_MEASURES)}"
                 + (", event_time" if until is not None else "")
-                + f"; not {measure!r:.60}"
+                + f", got {measure!r:.60}"
             )
     return measures, until

@@ -73,7 +73,7 @@ def system_builder(build: System | Callable[[dict], System], parameters: tuple[s
     """
     if not isinstance(build, System):
         if not callable(build):
-            raise InputError(f"a study takes a system, or a function that builds one, not {build!r:.60}")
+            raise InputError(f"build must be a system, or a function that returns one, got {build!r:.60}")
         return build
     leaves = {name: value.shape for name, value in named_parameters(build).items()}
     targets = {}
@@ -158,7 +158,7 @@ class StudySystems:
         """Build the system at a point, with the checks of its constructors."""
         system = self._build_system(to_python_values(point))
         if not isinstance(system, System):
-            raise InputError(f"the builder must return a system, not {type(system).__name__}")
+            raise InputError(f"the builder must return a system, got {type(system).__name__}")
         return system
 
     def inadmissible_points(self, points: PointParameters, n_points: int) -> dict[int, str]:
@@ -262,6 +262,6 @@ class PointwiseArrays:
         example = next((row for row in arrays if row is not None), np.zeros(0))
         for i, row in enumerate(arrays):
             if row is not None and row.shape != example.shape:
-                reasons[i] = f"{self._label} has shape {row.shape}, and {example.shape} at other points"
+                reasons[i] = f"{self._label} has shape {row.shape}, but {example.shape} at other points"
         rows_or_example = [example if i in reasons else row for i, row in enumerate(arrays)]
         return np.array(rows_or_example, dtype=np.float64), reasons

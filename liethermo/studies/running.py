@@ -158,12 +158,12 @@ def run_on_cluster(
                 n_points, seconds = future.result()
             except ImportError as error:
                 raise LiethermoError(
-                    f"a worker cannot import what builds the systems ({error}): install it where the workers run"
+                    f"a worker cannot import the module that builds the systems: {error}. Install it on the workers"
                 ) from error
             except KilledWorker as error:
                 raise LiethermoError(
-                    f"the workers that took the same {chunks[future.key]} chunks died, one after another: they may "
-                    f"lack memory; smaller chunks (chunk=...) need less. What is done is kept. {error}"
+                    f"several workers died while they solved {chunks[future.key]} chunks, perhaps for lack of memory. "
+                    f"Use smaller chunks (chunk=...). Finished chunks are saved. {error}"
                 ) from error
             portions.record_duration(chunks.pop(future.key), seconds)
             bar.advance(n_points)

@@ -31,7 +31,7 @@ from .store_metadata import MAX_CHUNKS, read_group, with_checksum
 STORE_FORMAT = "liethermo-study-1"
 """Value of the attribute ``format`` of a store."""
 
-RERUN_ADVICE = "Run the study again: what is damaged is done again"
+RERUN_ADVICE = "Run the study again to compute the damaged parts anew"
 """End of the error messages about damaged files."""
 
 
@@ -98,7 +98,9 @@ class StudyStore:
         """
         chunks = _chunk_shape(axes.shape, chunk)
         if (n_chunks := math.prod(-(-m // c) for m, c in zip(axes.shape, chunks, strict=True))) > MAX_CHUNKS:
-            raise InputError(f"{axes.size} points in chunks of {chunk} are {n_chunks} files: give a larger chunk")
+            raise InputError(
+                f"{axes.size} points in chunks of {chunk} need {n_chunks} files, which are too many. Use a larger chunk"
+            )
 
         def array(name: str, trailing_dims: Sequence[tuple[str, int]], dtype: str) -> ZarrArray:
             dims, sizes = (tuple(part) for part in zip(*trailing_dims, strict=True)) if trailing_dims else ((), ())
@@ -458,7 +460,7 @@ def match_axes(study_axes: Axes, stored_axes: Axes) -> Axes:
         names = [
             ", ".join(f"{a.name} ({', '.join(a.columns)})" for a in axes.axes) for axes in (study_axes, stored_axes)
         ]
-        raise InputError(f"the axes are {names[0]}, and those of the store {names[1]}")
+        raise InputError(f"the axes are {names[0]}, but those of the store {names[1]}")
     matched_axes = []
     for axis, stored_axis in zip(study_axes.axes, stored_axes.axes, strict=True):
         if axis.has_same_values(stored_axis):  # skip the search, which takes microseconds per value
@@ -471,7 +473,7 @@ def match_axes(study_axes: Axes, stored_axes: Axes) -> Axes:
             if not unmatched_indices.get(row):
                 raise InputError(
                     f"the axis {axis.name!r} lacks {row[0] if len(row) == 1 else row!r}, which is value {i} in the "
-                    "store; an axis can be made longer, and keeps the values that it has"
+                    "store; an axis can be extended, but must keep its values"
                 )
             unmatched_indices[row].pop(0)
         new_indices = sorted(itertools.chain.from_iterable(unmatched_indices.values()))

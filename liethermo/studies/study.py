@@ -141,21 +141,21 @@ class Study:
         check_noise(noise)
         method = (DEFAULT_METHOD if noise is None else DEFAULT_NOISE_METHOD) if method is None else method
         if not isinstance(method, OneStepMethod):
-            raise InputError(f"the method must be an integrator such as lt.MetriplecticGauss(), not {method!r}")
+            raise InputError(f"the method must be an integrator such as lt.MetriplecticGauss(), got {method!r}")
         check_choice("engine", engine, ("auto", "array", "compiled"))
         if chunk is not None and (isinstance(chunk, bool) or not isinstance(chunk, int) or chunk < 1):
-            raise InputError(f"chunk must be a positive integer, not {chunk!r}")
+            raise InputError(f"chunk must be a positive integer, got {chunk!r}")
         sources = [*(["x0"] if x0 is not None else []), *(a.name for a in self._axes.axes if a.states is not None)]
         if not sources:
             raise InputError("x0 is missing: a state, or a function from the dict of a point to one")
         if len(sources) > 1:
-            raise InputError(f"initial states come from one place, not from {' and '.join(sources)}")
+            raise InputError(f"initial states are given more than once, by {' and '.join(sources)}. Keep one of them")
         times = sorted({t for m in self._measures.values() if isinstance(m, ValuesAtTimes) for t in m.at.times})
         needs_path = any(measure.needs_path for measure in self._measures.values())
         schedule = make_schedule(t_span, step, 1)
         if times and not (schedule.start <= times[0] and times[-1] <= schedule.end):
             raise InputError(
-                f"the times of measures lie within t_span = {tuple(t_span)}, and {times[0]:g} to {times[-1]:g} do not"
+                f"the times of lt.At must lie within t_span = {tuple(t_span)}, got {times[0]:g} to {times[-1]:g}"
             )
         needs_all_steps = any(m.needs_path and not isinstance(m, ValuesAtTimes) for m in self._measures.values())
         unreachable_times = [
@@ -163,7 +163,8 @@ class Study:
         ]
         if unreachable_times:
             raise InputError(
-                f"beside a function of a solution lt.At takes times at which steps end, not {unreachable_times[0]:g}"
+                "with a function of a solution among the measures, the times of lt.At must be ends of steps, "
+                f"got {unreachable_times[0]:g}"
             )
         save_at = tuple(times) if times and not needs_all_steps else None
         n_saved = (len(times) if save_at else schedule.n_steps + 1) if needs_path else 0
@@ -401,7 +402,8 @@ class Study:
         elif self._axes.size > WARN_UNVECTORISED_POINTS:
             warn(
                 f"the builder cannot be traced ({solver.systems.why_no_family}), so that each of {self._axes.size} "
-                "points is built by itself; written with jax.numpy and without Python's if, one program builds all"
+                "systems is built separately. Write it with jax.numpy and without Python's if, so that one program "
+                "builds all"
             )
         self._example = solver, columns, self._initial_state(solver, point, states)
         return "", True
@@ -426,9 +428,7 @@ class Study:
                 return
         unread = [name for name in self._axes.parameter_names if name not in recorder.accessed_names]
         if unread:
-            raise InputError(
-                f"{unread[0]!r} is looked at neither by the builder nor by x0; an axis of replicas is lt.replicas"
-            )
+            raise InputError(f"axis {unread[0]!r} is used by neither build nor x0. For repeated runs use lt.replicas")
 
 
 def _with_example_value(measure: Measure, value: np.ndarray) -> Measure:

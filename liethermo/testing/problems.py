@@ -26,7 +26,7 @@ def problems_for(method: OneStepMethod) -> dict[str, Problem]:
         return reference_problems()
     problems = {name: problem for name, problem in special_problems().items() if _accepts_system(method, problem[0])}
     if not problems:
-        raise InputError(f"{method} is for {method.systems}, and none of the suite's is one: give systems=...")
+        raise InputError(f"{method} is for {method.systems}, but no test problem is one. Give systems=...")
     return problems
 
 

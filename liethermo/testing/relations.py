@@ -44,7 +44,7 @@ from .transformations import (
     CoordinateChange,
     UncoupledPair,
     add_constant,
-    as_closure,
+    close_over_parameters,
     replace_parts,
     restrict_near_states,
     split_in_halves,
@@ -226,7 +226,7 @@ def check_closure(case: RelationCase) -> SkipReason:
     if case.system.is_driven or case.system.space is not None:
         return "the energy is no plain function of the state"
     case.compare_run(
-        "parameters closed over", case.run(replace_parts(case.system, energy=as_closure(case.system.energy)))
+        "parameters closed over", case.run(replace_parts(case.system, energy=close_over_parameters(case.system.energy)))
     )
     return None
 

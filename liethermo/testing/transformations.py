@@ -183,7 +183,7 @@ def restrict_near_states(energy: Energy, states, radius: float) -> Energy:
     return Function(_LocalFunction(energy, jnp.asarray(states), jnp.asarray(radius), jnp.asarray(1e-300)))
 
 
-def as_closure(energy: Energy) -> Energy:
+def close_over_parameters(energy: Energy) -> Energy:
     """Return the energy as plain functions that close over its parameters."""
     return energy.map_terms(lambda term: term if isinstance(term, Pullback) else Function(lambda x: term.value(x)))
 

@@ -107,7 +107,7 @@ CASES = {
         lambda: M.gas_piston(conductance=(1.0, 1.0, 1.0)),
         r"conductance has shape \(2,\), not",
     ),
-    "no mass": (lambda: M.porous_piston(mass=0), "mass must be positive and finite, not 0.0"),
+    "no mass": (lambda: M.porous_piston(mass=0), "mass must be positive and finite, got 0.0"),
     "mass": (lambda: M.porous_piston(mass="a"), "mass is made of real numbers, not 'a'"),
     "None": (lambda: M.cylinder(mass=None), "mass is made of real numbers, not None"),
     "inertia": (lambda: M.rigid_body("a"), "inertia is made of real numbers, not 'a'"),

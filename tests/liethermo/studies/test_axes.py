@@ -35,7 +35,7 @@ def test_samples_lie_in_their_ranges_as_their_construction_says():
 @pytest.mark.parametrize(
     ("mapping", "message"),
     [
-        ({}, "axes are a dict"),
+        ({}, "axes must be a dict"),
         ({"a": []}, "of shape"),
         ({"a": [[1.0, 2.0]]}, "several numbers at once"),
         ({"a": [1.0, np.nan]}, "value 1 of 'a' is nan"),
@@ -43,7 +43,7 @@ def test_samples_lie_in_their_ranges_as_their_construction_says():
         ({"status": [1.0]}, "cannot be called 'status'"),
         ({"a/b": [1.0]}, "cannot be called"),
         ({"a": [1.0], "s": lt.zipped(a=[1.0])}, "'a' stands for more than one thing"),
-        ({"a": [None]}, "not object"),
+        ({"a": [None]}, "got object"),
     ],
 )
 def test_invalid_axes_are_refused(mapping, message):
@@ -58,8 +58,8 @@ def test_invalid_axes_are_refused(mapping, message):
         (lambda: lt.zipped(), "needs parameters"),
         (lambda: lt.sobol(4, seed=0, a=(1.0, 0.0)), "the range of a must be finite and increasing"),
         (lambda: lt.latin_hypercube(4, seed=0, a=(0.0, 1.0, "log")), "positive with 'log'"),
-        (lambda: lt.latin_hypercube(4, seed=0, a=3.0), r"is \(low, high\)"),
-        (lambda: lt.latin_hypercube(0, seed=0, a=(0.0, 1.0)), "positive number of points"),
+        (lambda: lt.latin_hypercube(4, seed=0, a=3.0), r"must be \(low, high\)"),
+        (lambda: lt.latin_hypercube(0, seed=0, a=(0.0, 1.0)), "positive integer"),
         (lambda: lt.latin_hypercube(4, seed=0), "needs the ranges"),
         (lambda: lt.replicas([0.0, 1.0]), r"shape \(replicas, n\)"),
         (lambda: lt.replicas([[0.0, 1.0], [np.inf, 1.0]]), "replica 1 is not finite"),

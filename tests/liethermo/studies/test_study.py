@@ -274,7 +274,7 @@ def test_replicas_and_initial_states_of_their_own(tmp_path):
     [
         (
             {"axes": {"rate": [0.1], "ratio": [0.2], "idle": [1.0]}},
-            "'idle' is looked at neither by the builder nor by x0",
+            "axis 'idle' is used by neither build nor x0",
         ),
         ({"axes": {"rate": [0.1]}}, "the builder asks for 'ratio', and no parameter of an axis is called so"),
         ({"axes": {"rate": [-1.0, -2.0], "ratio": [0.2]}}, "no point of the study can be run; the first: rate = -1"),
@@ -291,17 +291,17 @@ def test_a_study_that_cannot_run_is_refused_before_anything_is_written(changes, 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"measure": {}}, "measure is a dict"),
-        ({"measure": {"m": "median"}}, "the measure 'm' is lt.Relaxed"),
+        ({"measure": {}}, "measure must be a dict"),
+        ({"measure": {"m": "median"}}, "the measure 'm' must be lt.Relaxed"),
         ({"measure": {"rate": "final"}}, "'rate' is a measure and an axis"),
-        ({"measure": {"m": lt.At([1.0, 9.0])}}, "and 1 to 9 do not"),
+        ({"measure": {"m": lt.At([1.0, 9.0])}}, "got 1 to 9"),
         ({"measure": {"a": lt.Relaxed(1e-3), "b": lt.Relaxed(1e-4)}}, "is to end it too"),
         ({"chunk": 0}, "chunk must be a positive integer"),
-        ({"measure": {"a": lt.At([0.25]), "f": len}}, "lt.At takes times at which steps end, not 0.25"),
+        ({"measure": {"a": lt.At([0.25]), "f": len}}, "the times of lt.At must be ends of steps, got 0.25"),
         ({"x0": None}, "x0 is missing"),
         ({"method": "midpoint"}, "the method must be an integrator"),
         ({"units": {"speed": "m/s"}}, "no axis, parameter or measure 'speed'"),
-        ({"build": 3}, "a study takes a system"),
+        ({"build": 3}, "build must be a system"),
         ({"step": -0.1}, "step must be positive"),
         ({"engine": "gpu"}, "engine"),
     ],
@@ -339,7 +339,7 @@ def test_a_full_disk_is_said_and_loses_nothing(finished_study, tmp_path, monkeyp
 
     with monkeypatch.context() as patch:
         patch.setattr(disk, "write_atomically", write_to_full_disk)
-        with pytest.raises(lt.FileError, match=r"the disk is full .*What is done is kept"):
+        with pytest.raises(lt.FileError, match=r"the disk is full .*Finished chunks are saved"):
             study(store).run()
     status = study(store).status()
     assert 0 < status.done < status.points
@@ -415,7 +415,7 @@ def test_events_adaptive_steps_given_times_and_functions_of_a_solution(tmp_path)
         pair = {"rate": [0.5, 2.0], "ratio": [0.3]}
         uneven = study(tmp_path / f"u{chunk}.zarr", pair, measure={"g": varying_shape}, chunk=chunk)
         assert uneven.run().counts == {"completed": 1, "measure_failed": 1}
-        assert "real numbers of shape (3,), and real numbers of shape (2,)" in uneven.results.message[1, 0].item()
+        assert "real numbers of shape (3,), but real numbers of shape (2,)" in uneven.results.message[1, 0].item()
 
     array_study = study(
         tmp_path / "f.zarr", {"rate": [0.5, 2.0], "ratio": [0.3]}, measure={"turned": largest_components}
