@@ -42,7 +42,7 @@ def body_with_wheels(
     heat: float = 2.0,
     temperature: float = 1.0,
 ) -> EulerPoincareClosedSystem:
-    """A body whose three wheels, one about each principal axis, rub in their bearings and heat it.
+    """A body with three wheels, one about each principal axis, whose bearing friction heats it.
 
     ``l = sum I_i Omega_i^2 / 2 + sum J_i (Omega_i + w_i)^2 / 2 - C T_0 exp(S / C)`` on so(3) + R^3, ``f = -k w`` on the
     wheels alone, in the state (Omega, w, S). No friction acts on the rotation as a whole, so the spatial angular

@@ -38,23 +38,23 @@ def cylinder(
     pressure=None,
     heat_power=None,
 ) -> SimpleClosedSystem:
-    """A gas in a cylinder below a piston at height q that rubs and so heats it.
+    """A gas in a cylinder below a piston at height q, whose friction heats the gas.
 
     ``L = m v^2 / 2 - U(S, A q)``, q > 0, ``F_fr = -lambda v``, ``F_ext = -P A``, in SI units and in the state
-    (q, v, S), or (q, v, S, W, Q, t) if anything comes from outside. ``m q'' = (P_gas - P) A - lambda q'``.
+    (q, v, S), or (q, v, S, W, Q, t) with external pressure or heating. ``m q'' = (P_gas - P) A - lambda q'``.
 
     Parameters
     ----------
     mass, area : float, > 0
-        Of the piston (kg, m**2).
+        Mass and area of the piston (kg, m**2).
     friction : float, >= 0
         lambda (kg / s).
     moles, height : float, > 0
-        Of the gas, which is monatomic; its entropy is counted from 300 K below the piston at that height (m).
+        Amount of the monatomic gas (mol), and the height of the piston (m) at which its entropy is 0 at 300 K.
     pressure : float, or function of (q, v, S) or (q, v, S, t) to a scalar; optional
-        P from outside (Pa).
+        External pressure P (Pa).
     heat_power : float, or function likewise; optional
-        Heat given to the gas per time (W).
+        External heating power of the gas (W).
     """
     n, m, A = checked_positive(moles, "moles"), checked_positive(mass, "mass"), checked_positive(area, "area")
     gas = IdealGas(n, A * checked_positive(height, "height"))

@@ -50,14 +50,14 @@ def periods(inertia, momentum, energy=None) -> Periods:
         axes have length 3 holds tensors where each block is symmetric and positive definite and its principal moments
         obey ``I_i <= I_j + I_k``; no three rigid bodies have the rows of such a block as their moments.
     momentum : array, shape (..., 3), or (...) beside an energy
-        Angular momentum in body axes, or its size L (mass * length**2 / time).
+        Angular momentum in body axes, or its norm L (mass * length**2 / time).
     energy : array, shape (...), optional
         Kinetic energy E (mass * length**2 / time**2); by default that of the momentum.
 
     Returns
     -------
     Periods
-        Of shape (...); both periods are those of a steady spin in the limit of small circles.
+        Arrays of shape (...); for a steady spin both periods are the limits for small circles.
 
     Raises
     ------
@@ -136,7 +136,7 @@ def rate_of(relaxation_time, inertia, momentum) -> jax.Array:
         Principal moments (mass * length**2), in any order, not all equal; or tensors of inertia, by the rule of
         :func:`periods`.
     momentum : float or array, > 0
-        The size L of the angular momentum (mass * length**2 / time).
+        The norm L of the angular momentum (mass * length**2 / time).
 
     Returns
     -------
@@ -186,7 +186,7 @@ def damping_time(rigidity, quality, density, radius, spin, shape_factor=100.0) -
     rigidity : float or array, > 0
         mu (pressure; Pa).
     quality : float or array, > 0
-        Q, by which strain energy is divided for the loss in a radian.
+        Q, the strain energy over the energy lost in a radian.
     density : float or array, > 0
         rho (mass / length**3; kg / m**3).
     radius : float or array, > 0

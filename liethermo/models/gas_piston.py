@@ -74,7 +74,7 @@ def gas_piston(
     conductance: Sequence[float] = (5.0, 5.0),
     friction: float = 20.0,
 ) -> ComposedSystem:
-    """Two gases in a cylinder with a piston that conducts heat and rubs.
+    """Two gases in a cylinder, separated by a piston with heat conduction and friction.
 
     ``H = p^2 / (2 m) + C exp(S_p / C) + U_l(S_l, A q) + U_r(S_r, A (L - q))``, 0 < q < L, in SI units, and in the state
     (S_l, q, p, S_p, S_r). It rests where the pressures agree, ``q = L n_l / (n_l + n_r)``, and all temperatures,
@@ -83,15 +83,15 @@ def gas_piston(
     Parameters
     ----------
     moles : two numbers > 0
-        Of the gases, monatomic (c = 3/2); their entropies are counted from 300 K and half the cylinder.
+        Amounts of the monatomic gases (c = 3/2); their entropies are 0 at 300 K in half of the cylinder.
     mass, area, length : float, > 0
-        Of the piston and the cylinder (kg, m**2, m).
+        Mass and area of the piston, length of the cylinder (kg, m**2, m).
     capacity : float, > 0
         Heat capacity C of the piston (J / K).
     conductance : two numbers >= 0
-        Between the piston and either gas (W / K).
+        Heat conductance between the piston and each gas (W / K).
     friction : float, >= 0
-        Of the piston on the cylinder, which heats the piston (kg / s).
+        Friction coefficient of the piston in the cylinder (kg / s); the friction heats the piston.
     """
     n = checked_positive(moles, "moles", 2)
     A, L, m = checked_positive(area, "area"), checked_positive(length, "length"), checked_positive(mass, "mass")

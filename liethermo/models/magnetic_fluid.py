@@ -53,7 +53,7 @@ def magnetic_fluid(N: int, rate=0.0) -> LiePoissonSystem:
     ----------
     N : int, >= 2
     rate : float, >= 0
-        Of the decay, the inverse of a time.
+        Rate of the decay (1 / time).
 
     Returns
     -------

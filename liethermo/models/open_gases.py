@@ -85,7 +85,7 @@ def porous_piston(
     capacity: float = 1.0,
     heat_capacity: float = 1.5,
 ) -> ComposedSystem:
-    """Two gases with a piston between them that lets particles through, conducts heat and rubs.
+    """Two gases separated by a porous piston, with flow of particles, heat conduction and friction.
 
     ``H = p^2 / (2 m) + C exp(S_p / C) + U(S_l, N_l, A q) + U(S_r, N_r, A (L - q))``, Boltzmann's constant 1, in the
     state (S_l, N_l, q, p, S_p, S_r, N_r). It rests where temperatures, pressures and chemical potentials agree, so at
@@ -96,14 +96,14 @@ def porous_piston(
     permeability : float, >= 0
         L of the :class:`liethermo.Membrane`.
     conductance : two floats, >= 0
-        Between the left gas and the piston, and between the piston and the right one.
+        Heat conductance between the left gas and the piston, and between the piston and the right gas.
     friction : float, >= 0
-        Of the piston (mass / time).
+        Friction coefficient of the piston (mass / time).
     mass, area, length : float, > 0
     capacity : float, > 0
         C, the heat capacity of the piston.
     heat_capacity : float, > 0
-        Of a particle, at constant volume.
+        Heat capacity of a particle at constant volume.
     """
     gas = _single_species_gas(heat_capacity)
     check_numbers(conductance, "conductance", (2,))
@@ -138,7 +138,7 @@ def porous_piston_state(
         Between 0 and the length.
     T : float, > 0
     **parameters
-        Those of :func:`porous_piston` that are not its defaults.
+        Parameters of :func:`porous_piston` that differ from its defaults.
     """
     defaults = {name: parameter.default for name, parameter in inspect.signature(porous_piston).parameters.items()}
     if unknown := [name for name in parameters if name not in defaults]:
@@ -185,7 +185,7 @@ def reaction_vessel(
     Parameters
     ----------
     stoichiometry : sequence of K floats
-        nu, negative for what is used up.
+        nu, negative for reactants.
     capacity, energy, entropy : sequences of K floats
         c_k > 0, e_k and s_k of :class:`IdealMixture`, Boltzmann's constant 1.
     volume : float, > 0

@@ -10,7 +10,7 @@ from ..functions.conditions import check_numbers, require_condition
 
 
 def checked_positive(value, name: str, count: int | None = None) -> jax.Array:
-    """Return a positive number, or ``count`` of them, as an array; traced values are checked when they are known."""
+    """Return a positive number, or ``count`` of them, as an array; traced values are returned as they are."""
     array = check_numbers(value, name, () if count is None else (count,))
     require_condition(array, lambda a: (a > 0.0) & (a < jnp.inf), name + " must be positive and finite, got {value}")
     return array

@@ -54,7 +54,7 @@ def rigid_body(inertia: Sequence[float] = (10.0, 5.0, 1.0), rate: float = 1.0) -
     Warns
     -----
     InertiaWarning
-        Where no body has the inertias, other than the paper's.
+        If no body can have these moments of inertia, unless they are the paper's.
 
     Examples
     --------

@@ -129,9 +129,9 @@ def damper_wheel(
     friction : float, >= 0
         k (N m s).
     capacity, temperature : float, > 0
-        Of the bath: C (J / K), and T_0 (K) at y = 0.
+        Heat capacity C (J / K) of the bath, and its temperature T_0 (K) at y = 0.
     attitude : bool
-        Whether runs have attitudes of the body, elements of SO(3).
+        If true, runs follow the attitude of the body, an element of SO(3).
 
     Raises
     ------
@@ -153,7 +153,7 @@ def ring_damper(
     temperature: float = 1.0,
     attitude: bool = True,
 ) -> LiePoissonSystem:
-    """A body with a ring full of a viscous liquid about an axis: a nutation damper [Carrier & Miles 1960].
+    """A body with a ring of viscous liquid about an axis: a nutation damper [Carrier & Miles 1960].
 
     The liquid turns in the ring as a wheel does, see :func:`damper_wheel`, with ``J = 2 pi**2 rho a**2 R**3`` and, in
     Poiseuille's flow, ``k = 16 pi**2 eta R**3``. That is for liquids so viscous that the profile of the flow follows
@@ -162,13 +162,13 @@ def ring_damper(
     Parameters
     ----------
     inertia, axis, capacity, temperature, attitude
-        As of :func:`damper_wheel`, the liquid in place of the wheel; ``axis`` is the normal of the ring.
+        As for :func:`damper_wheel`, with the liquid as the wheel; ``axis`` is the normal of the ring.
     radius, tube : float, > 0
         R of the ring and a of the tube (m), a thin one: a is far below R.
     density : float, > 0
         rho of the liquid (kg / m**3).
     viscosity : float, > 0
-        eta, the dynamic one (Pa s).
+        Dynamic viscosity eta (Pa s).
 
     Raises
     ------
@@ -192,14 +192,14 @@ def dual_spin(
     temperature: Sequence[float] | float = 1.0,
     attitude: bool = True,
 ) -> LiePoissonSystem:
-    """Two bodies on a common axis, each with friction inside: a satellite with dual spin [Likins 1967].
+    """Two bodies on a common axis, each with internal friction: a dual-spin satellite [Likins 1967].
 
     The platform carries body axes; the rotor, round about the axis a, turns by w relative to it. As in
     :func:`damper_wheel`, ``L = I Omega + J w a`` and ``p = J (a . Omega + w)``. Friction inside the platform damps
     what it sees of the motion of L, ``L × Omega``, and friction inside the rotor ``L × (Omega + w a)``: each is a
-    double bracket in axes of its own, so |L| and the angular momentum in space are constant, and each heats a bath of
-    its own. The bearing heats the platform. Where the rotor carries most of L along a, the spin about a is stable
-    though its moment is not the greatest, as long as the platform damps and the rotor hardly does.
+    double bracket in the axes of its part, so |L| and the angular momentum in space are constant, and each heats its
+    own bath. The bearing heats the platform. If the rotor carries most of L along a, the spin about a is stable
+    although its moment is not the greatest, as long as the platform damps much more than the rotor.
 
     Everything is in SI units, or in any other consistent ones. The state is (L, p, y of the platform, y of the rotor).
 
@@ -214,11 +214,11 @@ def dual_spin(
     friction : float, >= 0
         k of the bearing (N m s).
     platform_rate, rotor_rate : float, >= 0
-        Of the friction inside the two (s / (kg m**2)), as of :func:`tumbling_body`.
+        Rates of the internal friction of platform and rotor (s / (kg m**2)), as for :func:`tumbling_body`.
     capacity, temperature : float, > 0, or two
-        Of the baths, platform first: C (J / K), and T_0 (K) at y = 0.
+        Heat capacities C (J / K) of the baths, platform first, and their temperatures T_0 (K) at y = 0.
     attitude : bool
-        Whether runs have attitudes of the platform, elements of SO(3).
+        If true, runs follow the attitude of the platform, an element of SO(3).
 
     Raises
     ------

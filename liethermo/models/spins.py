@@ -75,15 +75,15 @@ def spin_lattice(
     dmi : array, list of edges, or None
         D: see :func:`liethermo.magnetism.dzyaloshinskii_moriya`.
     rate : float >= 0, or array of the shape of the sites
-        Of :class:`liethermo.LandauLifshitz`.
+        Rate of :class:`liethermo.LandauLifshitz`.
     baths : HeatBaths or bool
-        What takes the heat. True for one of the heat capacity of the sites together, at first of temperature 1; False
-        for none: the energy falls then.
+        True: one bath with a heat capacity equal to the number of sites and an initial temperature of 1. False: no
+        bath, so the energy falls.
     bath : array of int, of the shape of the sites, optional
-        Which bath each site heats.
+        Index of the bath that each site heats.
     periodic : bool or tuple of bool
     axis : array, shape (3,) or ``(*sites, 3)``
-        Of the anisotropy.
+        Axis of the anisotropy.
     """
     shape = lattice_shape(sites)
     terms: list[Energy] = [*exchange(shape, exchange_constant, periodic=periodic).terms]

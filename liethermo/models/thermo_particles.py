@@ -79,7 +79,7 @@ def moving_thermo_particles(
     capacities, conductance
         As for :func:`thermo_particles`.
     dimension : int
-        Of the space; the state is (q_1, p_1, S_1, q_2, …) with q_a and p_a of that many components.
+        Dimension of the space; the state is (q_1, p_1, S_1, q_2, …), q_a and p_a with ``dimension`` components.
     """
     bodies = _moving_bodies(masses, capacities, dimension, 0.0)
     axis_vectors = np.eye(2 * dimension + 1)[dimension:-1]
@@ -102,8 +102,8 @@ def thermo_springs(
 ) -> ComposedSystem:
     """Two bodies on a line, joined by a spring, exchange heat: ``V = k (q_1 - q_2)^2 / 2`` [SML Example 4].
 
-    Without friction the motion is as if cold, and the heat flows as if at rest. With drag the bodies stop oscillating
-    and share the heat. The total momentum is kept unless they rub on their surroundings.
+    Without friction, motion and heat flow are independent. With drag the bodies stop oscillating and share the heat.
+    The total momentum is conserved unless there is friction on the surroundings.
 
     Parameters
     ----------

@@ -72,18 +72,18 @@ def thermoelastic_chain(
     The a-th state is (q_a, p_a, S_a) with S_a the entropy of the spring that body a hangs on. With two bodies it is the
     double thermoelastic pendulum of Romero (2009) and of García Orden & Romero (2012). Stretching, temperature and the
     flow of heat act on each other, and the oscillation of the springs dies out. The springs enter by their squared
-    lengths, so that the angular momentum about the origin is kept exactly.
+    lengths, so that the angular momentum about the origin is conserved exactly.
 
     Parameters
     ----------
     bodies, dimension : int
         N, and the dimension of the space, 1 to 3.
     mass, capacity, length, temperature : float, > 0
-        Of each body, and of each spring: see :class:`Thermospring`.
+        Mass of each body; capacity, length and temperature of each spring: see :class:`Thermospring`.
     stiffness : float, > 0
     expansion : float
     conductance : float, >= 0
-        Between springs that meet (power / temperature).
+        Heat conductance between neighbouring springs (power / temperature).
     gravity : float
         Acceleration against the last axis; without it the angular momentum is constant, and audited.
     """

@@ -36,7 +36,7 @@ class ConstantInBody(Module):
     Parameters
     ----------
     moment : array, of the shape of mu
-        In body axes (N m, on so(3)).
+        Torque in body axes (N m, on so(3)).
     """
 
     moment: jax.Array
@@ -54,7 +54,7 @@ class ConstantInSpace(Module):
     Parameters
     ----------
     moment : array, shape (3,)
-        In axes in space (N m).
+        Torque in axes fixed in space (N m).
     """
 
     moment: jax.Array
@@ -67,7 +67,7 @@ class ConstantInSpace(Module):
 
 
 class GravityGradient(Module):
-    """The torque that the gravity of a centre has on a body on a circular orbit, ``3 (G M / r^3) n × I n``.
+    """The gravity-gradient torque on a body on a circular orbit, ``3 (G M / r^3) n × I n``.
 
     The unit vector n, in body axes, points to the centre, and ``G M / r^3`` is the square of the mean motion [Hughes,
     *Spacecraft Attitude Dynamics*, 1986, 8.1]. In space n turns in the plane of the orbit from ``towards``, where it is
@@ -167,7 +167,7 @@ class Tabulated(Module):
     times : array, shape (m,)
         Increasing (s).
     moments : array, shape ``(m, *shape of mu)``
-        In body axes at these times (N m, on so(3)).
+        Torques in body axes at these times (N m, on so(3)).
     """
 
     times: jax.Array

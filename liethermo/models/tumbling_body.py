@@ -47,16 +47,16 @@ def tumbling_body(
         as for a rod, the tangent of the angle from the flat spin decays so. For nearly equal moments see
         :func:`liethermo.bodies.rate_of`.
     momentum : float, > 0, or three numbers
-        The size of the angular momentum, or that vector in body axes (kg m**2 / s), to tell a rate from a relaxation
-        time, which falls as ``1 / |mu|**2``. What the body starts with is the state that a run is given.
+        The norm of the angular momentum, or the vector in body axes (kg m**2 / s), at which the relaxation time holds,
+        since it is proportional to ``1 / |mu|**2``. The initial momentum of a run may differ.
     rate : float, >= 0
-        Of the friction (s / (kg m**2)), in place of the relaxation time and the momentum.
+        Rate of the friction (s / (kg m**2)), instead of the relaxation time and the momentum.
     capacity : float, > 0
         C (J / K).
     temperature : float, > 0
         T_0 (K), at y = 0.
     attitude : bool
-        Whether runs have attitudes, elements of SO(3) that take body axes to those of space.
+        If true, runs follow the attitude, an element of SO(3) that maps body axes to axes in space.
 
     Raises
     ------
@@ -66,7 +66,7 @@ def tumbling_body(
     Warns
     -----
     InertiaWarning
-        Where no body has the inertias.
+        If no body can have these moments of inertia.
 
     Examples
     --------

@@ -58,9 +58,9 @@ def zeitlin(N: int, decay: Literal["enstrophy", "energy"] | None = None, rate=0.
     ----------
     N : int, >= 2
     decay : {"enstrophy", "energy"}, optional
-        What falls; nothing by default.
+        The function that decays; by default none.
     rate : float, >= 0
-        Of the decay: a time for "enstrophy", the inverse of one for "energy".
+        Rate of the decay, in units of time for "enstrophy" and 1 / time for "energy".
 
     Returns
     -------
