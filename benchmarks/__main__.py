@@ -15,10 +15,11 @@ from .measurements import MEASUREMENT_NAMES
 from .report import targets_table
 
 RESULT_FOLDER = Path(__file__).parent / "results"
+"""Folder of the results that the page shows."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the measurements that are named, print their tables, and keep each as JSON."""
+    """Run the named measurements, print their tables, and save each as JSON."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=main.__doc__)
     parser.add_argument("names", nargs="*", metavar="name", help=f"all by default: {', '.join(MEASUREMENT_NAMES)}")
     parser.add_argument("--quick", action="store_true", help="see that everything runs; the figures mean nothing")

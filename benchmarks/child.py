@@ -1,4 +1,4 @@
-"""A part of a measurement in a process of its own: ``python -m benchmarks.child MEASUREMENT ARGUMENTS``."""
+"""Parts of measurements that run in a process of their own: ``python -m benchmarks.child MEASUREMENT ARGUMENTS``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ REPOSITORY_ROOT = Path(__file__).parent.parent
 
 
 def run_child(measurement: str, *arguments: str, cache: str | None = None, one_core: bool = False) -> Any:
-    """What ``child(*arguments)`` of a measurement returns in a new process, ``cache`` being its LIETHERMO_CACHE."""
+    """Return the result of ``child(*arguments)`` of a measurement, run in a new process with LIETHERMO_CACHE =
+    ``cache``."""
     options = ["--one-core"] if one_core else []
     return json.loads(
         run_python("-m", "benchmarks.child", *options, measurement, *arguments, cache=cache).splitlines()[-1]
@@ -22,7 +23,7 @@ def run_child(measurement: str, *arguments: str, cache: str | None = None, one_c
 
 
 def run_python(*arguments: str, cache: str | None = None) -> str:
-    """The standard output of a Python process in the repository's root.
+    """Run Python in the repository's root, and return its standard output.
 
     Raises
     ------
@@ -30,16 +31,16 @@ def run_python(*arguments: str, cache: str | None = None) -> str:
         If it fails; with the end of its standard error.
     """
     environment = dict(os.environ) if cache is None else os.environ | {"LIETHERMO_CACHE": cache}
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, *arguments], cwd=REPOSITORY_ROOT, env=environment, capture_output=True, text=True, check=False
     )
-    if done.returncode != 0:
-        raise RuntimeError(f"python {' '.join(arguments[:3])} failed:\n{done.stderr[-2000:]}")
-    return done.stdout
+    if process.returncode != 0:
+        raise RuntimeError(f"python {' '.join(arguments[:3])} failed:\n{process.stderr[-2000:]}")
+    return process.stdout
 
 
 def main(arguments: list[str]) -> None:
-    """Run a child function and print what it returns, as JSON."""
+    """Run a child function and print its result as JSON."""
     if arguments[0] == "--one-core":
         if hasattr(os, "sched_setaffinity"):  # before JAX is imported, which starts a thread for each core it may use
             os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})

@@ -1,4 +1,4 @@
-"""Contests over one trajectory: the library's engines against a program in C that runs the same scheme."""
+"""Comparisons over one trajectory: the library's engines against a C program that takes the same steps."""
 
 from __future__ import annotations
 
@@ -19,28 +19,34 @@ from .timing import race
 Engine = Literal["array", "compiled"]
 
 STEP_SIZE = 0.1
+"""Step size of all runs."""
 
 RATE_TIMES_DURATION = 10.0
-"""Rate times duration: the body relaxes all the way, and its last step still needs most of the first one's work."""
+"""Rate times duration: the body relaxes completely, but its last step still needs most of the work of the first."""
 
 COMPARED_STEPS = 300
+"""Number of steps after which the trajectories of two programs are compared."""
 
 
-def library_run(system: lt.System, steps: int, engine: Engine, every: int | None = None) -> Callable[[], lt.Solution]:
-    """A run of the library from :data:`.problems.X0`; by default only the last state is kept."""
+def library_run(
+    system: lt.System, steps: int, engine: Engine, save_every: int | None = None
+) -> Callable[[], lt.Solution]:
+    """Return a run of the library from :data:`.problems.X0`, which saves only the final state by default."""
     span, midpoint = (0.0, STEP_SIZE * steps), lt.MetriplecticMidpoint()
     return functools.partial(
-        lt.integrate, system, X0, span, STEP_SIZE, midpoint, save_every=every or steps, engine=engine
+        lt.integrate, system, X0, span, STEP_SIZE, midpoint, save_every=save_every or steps, engine=engine
     )
 
 
-def c_run(program: BodyProgram, steps: int, every: int | None = None) -> Callable[[], tuple[np.ndarray, np.ndarray]]:
-    """The same run by a program in C."""
-    return functools.partial(program.integrate, X0, STEP_SIZE, steps, every)
+def c_run(
+    program: BodyProgram, steps: int, save_every: int | None = None
+) -> Callable[[], tuple[np.ndarray, np.ndarray]]:
+    """Return a run of a C program from :data:`.problems.X0`, with the arguments of :func:`library_run`."""
+    return functools.partial(program.integrate, X0, STEP_SIZE, steps, save_every)
 
 
 def race_one_trajectory(caption: str, works: Mapping[str, Callable], steps: int, rounds: int, baseline: str):
-    """Race the works, each of so many steps in one thread; a table, and the seconds of the processor of each.
+    """Race runs of ``steps`` steps in one thread; return a table, and the processor seconds of each.
 
     Returns
     -------
@@ -52,23 +58,24 @@ def race_one_trajectory(caption: str, works: Mapping[str, Callable], steps: int,
     for name, outcome in outcomes.items():
         solution = outcome.result
         if isinstance(solution, lt.Solution):
-            iterations, kept = solution.stats.iterations_per_step, laws.solution_laws(solution)
+            iterations, run_laws = solution.stats.iterations_per_step, laws.solution_laws(solution)
         else:
             run = solution[1]
-            iterations, kept = float((run["iterations"] / run["steps"])[0]), laws.c_run_laws(run)
+            iterations, run_laws = float((run["iterations"] / run["steps"])[0]), laws.c_run_laws(run)
         rows.append([name, times[name] / steps, ratio(times[name], times.get(baseline)), iterations])
-        rows[-1] += kept.table_cells()
+        rows[-1] += run_laws.table_cells()
     columns = {"": "text", "Time a step": "seconds", f"Relative to {baseline}": "ratio", "Iterations a step": "number"}
     return Table(caption, columns | laws.COLUMNS, rows), times
 
 
 def max_difference_from_c(program: BodyProgram, system: lt.System) -> float:
-    """Largest difference between the C program's trajectory and the compiled engine's, relative to the state.
+    """Return the largest difference between the C program's trajectory and the compiled engine's, relative to the
+    state.
 
     Raises
     ------
     RuntimeError
-        As :func:`require_same_scheme`.
+        As for :func:`require_same_scheme`.
     """
     ours = library_run(system, COMPARED_STEPS, "compiled", 1)().x[1:]
     theirs, _ = program.integrate(X0, STEP_SIZE, COMPARED_STEPS, 1)
@@ -76,12 +83,12 @@ def max_difference_from_c(program: BodyProgram, system: lt.System) -> float:
 
 
 def require_same_scheme(difference: float, steps: int) -> float:
-    """The difference of two trajectories after so many steps.
+    """Return the difference of two trajectories after ``steps`` steps, if it is small.
 
     Raises
     ------
     RuntimeError
-        If it exceeds 1e-12: then they are not of the same scheme, and comparing their times means nothing.
+        If it exceeds 1e-12: the programs then use different schemes, and a comparison of their times is meaningless.
     """
     if not difference <= 1e-12:
         raise RuntimeError(f"after {steps} steps C and the compiled engine differ by {difference:.1e}")

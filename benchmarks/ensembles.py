@@ -1,4 +1,4 @@
-"""The library's ensembles as the measurements use them."""
+"""Ensemble runs of the library, and peers at equal accuracy."""
 
 from __future__ import annotations
 
@@ -23,41 +23,43 @@ def library_ensemble(
     method: lt.OneStepMethod | None = None,
     outputs: Literal["final", "summary"] = "final",
 ) -> Callable[[], lt.Ensemble]:
-    """A run of all bodies over so many steps."""
+    """Return a run of all bodies over ``steps`` steps."""
     span, step = (0.0, t_end), t_end / steps
     method = lt.MetriplecticMidpoint() if method is None else method
     return functools.partial(lt.ensemble, system, x0s, span, step, method, outputs=outputs, engine=engine)
 
 
 TOLERANCES = tuple(10.0 ** (-n / 4) for n in range(4, 60))
+"""Tolerances that are tried, four per decade, beginning with the loosest."""
 
 
 def loosest_tolerance_work(
-    build: Callable, x0s: np.ndarray, exact: np.ndarray, wanted: float
+    build: Callable, x0s: np.ndarray, exact: np.ndarray, max_error: float
 ) -> tuple[Callable, float, float]:
-    """A peer's work with the loosest tolerance that reaches an error; that tolerance, and its error.
+    """Return a peer's run with the loosest tolerance whose error is at most ``max_error``, that tolerance, and its
+    error.
 
     Parameters
     ----------
-    build : function from a tolerance and initial states to a work
+    build : function from a tolerance and initial states to a run
     exact : array, shape (m, n)
-        The ends of the first states.
+        Final states of the first m initial states.
     """
     for tolerance in TOLERANCES:
-        reached = max_relative_error(build(tolerance, x0s[: len(exact)])(), exact)
-        if reached <= wanted:
-            return build(tolerance, x0s), tolerance, reached
-    raise RuntimeError(f"no tolerance reaches an error of {wanted:.1e}")
+        error = max_relative_error(build(tolerance, x0s[: len(exact)])(), exact)
+        if error <= max_error:
+            return build(tolerance, x0s), tolerance, error
+    raise RuntimeError(f"no tolerance reaches an error of {max_error:.1e}")
 
 
 def max_relative_error(ends, exact: np.ndarray) -> float:
-    """Largest error of the first ends, relative to their states."""
+    """Return the largest error of the first final states, relative to the states."""
     errors = np.abs(np.asarray(ends)[: len(exact)] - exact).max(axis=1) / np.abs(exact).max(axis=1)
     return float(errors.max())
 
 
 def ensemble_laws(result: lt.Ensemble) -> Laws:
-    """The worst of all bodies, over every step.
+    """Return the worst laws of all bodies, over every step.
 
     Raises
     ------

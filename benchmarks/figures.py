@@ -1,4 +1,4 @@
-"""The pictures of the pages of benchmarks."""
+"""Figures of the benchmark pages."""
 
 from __future__ import annotations
 
@@ -10,14 +10,17 @@ import numpy as np
 from .first_page import PeerComparison
 from .report import Table
 
-FASTER_COLOUR, SLOWER_COLOUR = "#0072b2", "#d55e00"
+FASTER_COLOUR = "#0072b2"
+"""Colour of tasks in which this library is faster."""
+SLOWER_COLOUR = "#d55e00"
+"""Colour of tasks in which this library is slower."""
 
 LINE_STYLES = {", compiled engine": "-", ", array engine": "--", ", C": ":"}
-"""Lines by what runs a method, whose colour is the same for all."""
+"""Line style by the suffix that names the engine; the colour stands for the method."""
 
 
 def draw_work_precision(series: dict[str, list[list[float]]], path: Path) -> None:
-    """Time against error, a curve for each method; the format is that of the file name."""
+    """Draw time against error, one curve for each method; the file name determines the format."""
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
@@ -27,9 +30,9 @@ def draw_work_precision(series: dict[str, list[list[float]]], path: Path) -> Non
         for name, points in series.items():
             errors, seconds = zip(*points, strict=True)
             width = 2.0 if name.endswith("engine") else 1.0  # the library's own stand out
-            by = next((end for end in LINE_STYLES if name.endswith(end)), "")
-            colour = colours.setdefault(name.removesuffix(by), f"C{len(colours)}")
-            line = {"linestyle": LINE_STYLES.get(by, "-"), "linewidth": width, "color": colour}
+            suffix = next((end for end in LINE_STYLES if name.endswith(end)), "")
+            colour = colours.setdefault(name.removesuffix(suffix), f"C{len(colours)}")
+            line = {"linestyle": LINE_STYLES.get(suffix, "-"), "linewidth": width, "color": colour}
             axes.loglog(errors, seconds, marker="o", markersize=2 + width, label=name, **line)
         axes.invert_xaxis()
         axes.set_xlabel("relative error at the end")
@@ -43,11 +46,12 @@ def draw_work_precision(series: dict[str, list[list[float]]], path: Path) -> Non
 
 
 def draw_time_ratios(themes: dict[str, list[PeerComparison]], path: Path) -> None:
-    """The ratio of times, a bar for each work, by theme: to the left of one this library is the faster."""
+    """Draw the ratio of times, one bar per task, grouped by theme; bars to the left of 1 mean that this library is
+    faster."""
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    rows = [(theme, c) for theme, found in themes.items() for c in found]
+    rows = [(theme, c) for theme, comparisons in themes.items() for c in comparisons]
     with matplotlib.rc_context({"svg.hashsalt": "liethermo", "svg.fonttype": "none", "font.size": 8}):
         figure, axes = plt.subplots(figsize=(8.0, 0.6 + 0.19 * len(rows)), layout="constrained")
         for i, (_, c) in enumerate(rows):
@@ -71,7 +75,7 @@ def draw_time_ratios(themes: dict[str, list[PeerComparison]], path: Path) -> Non
 
 
 def draw_magnet(table: Table, path: Path) -> None:
-    """Magnetisation, specific heat and Binder's cumulant against the temperature: lattices, the smaller the paler."""
+    """Draw magnetisation, specific heat and Binder's cumulant against temperature; smaller lattices are paler."""
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
@@ -82,11 +86,11 @@ def draw_magnet(table: Table, path: Path) -> None:
         figure, axes = plt.subplots(1, 3, figsize=(9.0, 3.2), layout="constrained")
         colours = plt.get_cmap("viridis_r")(np.linspace(0.1, 1.0, len(lengths)))
         for colour, length in zip(colours, lengths, strict=True):
-            for by, style in ((NOISE_ROW, {"fmt": "o", "ms": 3.5}), (MONTE_CARLO_ROW, {"fmt": "-", "lw": 0.8})):
-                rows = [row for row in table.rows if row[0] == by and row[1] == length]
+            for generator, style in ((NOISE_ROW, {"fmt": "o", "ms": 3.5}), (MONTE_CARLO_ROW, {"fmt": "-", "lw": 0.8})):
+                rows = [row for row in table.rows if row[0] == generator and row[1] == length]
                 for ax, column in zip(axes, (5, 7, 9), strict=True):
                     values, errors = ([row[i] for row in rows] for i in (column, column + 1))
-                    label = f"{length}³ spins" if by == NOISE_ROW and ax is axes[0] else None
+                    label = f"{length}³ spins" if generator == NOISE_ROW and ax is axes[0] else None
                     temperatures = [float(row[2]) for row in rows]
                     ax.errorbar(temperatures, values, errors, color=colour, label=label, **style)
         for ax, name in zip(axes, ("magnetisation", "specific heat", "Binder's cumulant"), strict=True):

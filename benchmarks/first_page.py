@@ -1,6 +1,7 @@
-"""The first page of the benchmarks: which rows of the measurements stand beside each other on it, theme by theme.
+"""First page of the benchmarks: the pairs of rows that it compares, by theme.
 
-A measurement that is to be on the page has a line in :data:`PAIRS_BY_THEME` or :data:`COST_MEASUREMENTS`; nothing else has to change.
+A measurement appears on the page if it has a line in :data:`PAIRS_BY_THEME` or :data:`COST_MEASUREMENTS`; nothing else
+has to change.
 """
 
 from __future__ import annotations
@@ -10,26 +11,31 @@ from dataclasses import dataclass
 
 from .report import Report, Table, Target
 
-COMPILED_ROW, EXPLICIT_ROW = "compiled engine", "explicit, order 8, compiled engine"
+COMPILED_ROW = "compiled engine"
+"""Row of the compiled engine."""
+EXPLICIT_ROW = "explicit, order 8, compiled engine"
+"""Row of the explicit method in :mod:`.measurements.work_precision`."""
 GAUSS_ROW = "this library, Gauss, order 6"
+"""Row of the Gauss method in :mod:`.measurements.tumbling`."""
 
 
 @dataclass(frozen=True)
 class RowPair:
-    """Two rows of one table of a measurement.
+    """Two rows of one table of a measurement, one of this library and one of another program.
 
     Attributes
     ----------
     measurement, table : str, int
-        The name of the measurement, and which of its tables.
+        The name of the measurement, and the index of its table.
     work : str
-        What both did.
+        Description of the task.
     ours, theirs : str
-        What the rows begin with. Of several rows of another program the fastest counts, unless ``row_number`` is given.
+        Beginnings of the rows' names. Of several rows of another program the fastest counts, unless ``row_number`` is
+        given.
     column : str, optional
         The heading of the times; by default the first that begins with "Time".
     row_number : int, optional
-        Which of several rows that begin alike, where they are of different settings.
+        Index among several rows that begin alike but have different settings.
     """
 
     measurement: str
@@ -43,7 +49,7 @@ class RowPair:
 
 @dataclass(frozen=True)
 class PeerComparison:
-    """What a pair was measured to be; a verdict on the laws is None where the table has none."""
+    """The measured times and laws of a pair; a verdict on the laws is None if the table has none."""
 
     work: str
     peer: str
@@ -57,8 +63,8 @@ class PeerComparison:
         return self.ours / self.theirs
 
 
-def _ensemble_pairs(table: int, what: str) -> list[RowPair]:
-    return [RowPair("ensemble", table, what, COMPILED_ROW, peer) for peer in ("heyoka", "diffrax")]
+def _ensemble_pairs(table: int, work: str) -> list[RowPair]:
+    return [RowPair("ensemble", table, work, COMPILED_ROW, peer) for peer in ("heyoka", "diffrax")]
 
 
 PAIRS_BY_THEME: dict[str, list[RowPair]] = {
@@ -109,21 +115,21 @@ PAIRS_BY_THEME: dict[str, list[RowPair]] = {
     "Manifolds": [RowPair("spin", 2, "a spin with a bath to an error of 1e-8", "Taylor(12)", "heyoka")],
     "Quantum systems": [],
 }
-"""Where each theme's rows come from; a theme of which nothing was measured is left out of the page."""
+"""The pairs of each theme; a theme without measured pairs is omitted from the page."""
 
 COST_MEASUREMENTS = (
     *("first_run", "network", "memory", "scaling", "studies", "manifolds", "functions", "isolated_body", "large"),
     *("magnet", "fluids"),
 )
-"""Measurements without another program: their targets that are no ratios are a table of their own."""
+"""Measurements without another program; their targets that are no ratios form a table of their own."""
 
 FULL_REPORT_THEMES = {"Learning": ("learn_gas", "learn_pendulum", "learn_body")}
-"""Themes whose measurements are about errors: their tables are shown as they are."""
+"""Themes whose measurements are about errors; their tables are shown in full."""
 
 THEME_NOTES = {
     "The same scheme in C": "Two of the variational schemes let the energy drift by their nature, here and in C."
 }
-"""What a reader has to know before a table."""
+"""Notes that precede the table of a theme."""
 
 PEER_GROUPS = {
     "C by hand, the same scheme": ("C",),
@@ -131,14 +137,16 @@ PEER_GROUPS = {
     "diffrax and SciPy": ("diffrax", "SciPy"),
     "MuJoCo and Basilisk": ("MuJoCo", "Basilisk"),
 }
-"""Whom a sentence is about, and how the names of the rows begin."""
+"""Groups of peers, each the subject of one sentence, with the beginnings of their row names."""
 
 
 def compare_themes(reports: Mapping[str, Report]) -> dict[str, list[PeerComparison]]:
-    """By theme, the pairs of which both rows were measured."""
-    found = {theme: [_compare_rows(reports[p.measurement], p) for p in pairs if p.measurement in reports]
+    """Return the comparisons of each theme whose two rows were measured."""
+    pairs_by_theme = {theme: [_compare_rows(reports[p.measurement], p) for p in pairs if p.measurement in reports]
              for theme, pairs in PAIRS_BY_THEME.items()}  # fmt: skip
-    return {theme: kept for theme, pairs in found.items() if (kept := [pair for pair in pairs if pair is not None])}
+    return {
+        theme: kept for theme, pairs in pairs_by_theme.items() if (kept := [pair for pair in pairs if pair is not None])
+    }
 
 
 def _compare_rows(report: Report, pair: RowPair) -> PeerComparison | None:
@@ -150,17 +158,17 @@ def _compare_rows(report: Report, pair: RowPair) -> PeerComparison | None:
     rows = [_find_row(table, column, start, pair.row_number) for start in (pair.ours, pair.theirs)]
     if None in rows or None in (times := [row[column] for row in rows if row]):
         return None
-    said = [None if laws is None else row[laws] for row in rows if row]
-    return PeerComparison(pair.work, _row_name(rows[1] or []), *times, *said)
+    verdicts = [None if laws is None else row[laws] for row in rows if row]
+    return PeerComparison(pair.work, _row_name(rows[1] or []), *times, *verdicts)
 
 
-def _find_row(table: Table, column: int, start: str, which: int | None) -> list | None:
-    """The row of this name, or else of those that begin so; the fastest of them or the one asked for."""
-    named = [row for row in table.rows if _row_name(row) == start]
-    named = named or [row for row in table.rows if _row_name(row).startswith(start)]
-    if which is not None:
-        return named[which] if which < len(named) else None
-    return min((row for row in named if row[column] is not None), key=lambda row: row[column], default=None)
+def _find_row(table: Table, column: int, start: str, row_number: int | None) -> list | None:
+    """Return the row of this name, or else one whose name begins so: the one at ``row_number``, or the fastest."""
+    candidates = [row for row in table.rows if _row_name(row) == start]
+    candidates = candidates or [row for row in table.rows if _row_name(row).startswith(start)]
+    if row_number is not None:
+        return candidates[row_number] if row_number < len(candidates) else None
+    return min((row for row in candidates if row[column] is not None), key=lambda row: row[column], default=None)
 
 
 def _row_name(row: list) -> str:
@@ -168,52 +176,54 @@ def _row_name(row: list) -> str:
 
 
 def page_sections(reports: Mapping[str, Report]) -> Iterator[str]:
-    """The sentences, and a table for each theme."""
+    """Yield the summary, and a section for each theme."""
     themes = compare_themes(reports)
     yield "\n".join(f"- {sentence}" for sentence in summary_sentences([c for found in themes.values() for c in found]))
-    for theme, found in themes.items():
+    for theme, comparisons in themes.items():
         note = f"\n\n{THEME_NOTES[theme]}" if theme in THEME_NOTES else ""
-        yield f"## {theme}{note}" + _comparison_table(found).markdown()
+        yield f"## {theme}{note}" + _comparison_table(comparisons).markdown()
     for theme, names in FULL_REPORT_THEMES.items():
-        shown = [reports[name] for name in names if name in reports]
-        if shown:
-            yield "\n\n".join([f"## {theme}", *(r.markdown().replace("## ", "### ", 1) for r in shown)])
+        theme_reports = [reports[name] for name in names if name in reports]
+        if theme_reports:
+            yield "\n\n".join([f"## {theme}", *(r.markdown().replace("## ", "### ", 1) for r in theme_reports)])
     targets = [t for name in COST_MEASUREMENTS if name in reports for t in reports[name].targets if t.kind != "ratio"]
     if targets:
         table = Table("", {"Work": "text", "Measured": "text"}, [target.row()[::2] for target in targets])
         yield "## Other costs" + table.markdown()
 
 
-def _comparison_table(found: list[PeerComparison]) -> Table:
+def _comparison_table(comparisons: list[PeerComparison]) -> Table:
     columns = {"Work": "text", "Beside": "text", "Here": "seconds", "There": "seconds", "Here / there": "about"}
-    rows = [[c.work, c.peer, c.ours, c.theirs, c.ratio] for c in found]
-    if any(c.our_laws for c in found):
+    rows = [[c.work, c.peer, c.ours, c.theirs, c.ratio] for c in comparisons]
+    if any(c.our_laws for c in comparisons):
         columns |= {"Laws here": "text", "Laws there": "text"}
-        rows = [[*row, c.our_laws, c.their_laws] for row, c in zip(rows, found, strict=True)]
+        rows = [[*row, c.our_laws, c.their_laws] for row, c in zip(rows, comparisons, strict=True)]
     return Table("", columns, rows)
 
 
-def summary_sentences(found: list[PeerComparison]) -> Iterator[str]:
-    """Wins and losses, a sentence for each group of peers and one for the laws."""
+def summary_sentences(comparisons: list[PeerComparison]) -> Iterator[str]:
+    """Yield a sentence on wins and losses for each group of peers, and one on the laws."""
     for name, starts in PEER_GROUPS.items():
-        ours = sorted((c for c in found if c.peer.startswith(starts)), key=lambda c: c.ratio)
+        ours = sorted((c for c in comparisons if c.peer.startswith(starts)), key=lambda c: c.ratio)
         if ours:
-            best, worst, won = ours[0], ours[-1], sum(c.ratio < 1.0 for c in ours)
+            lowest, highest, n_won = ours[0], ours[-1], sum(c.ratio < 1.0 for c in ours)
             yield (
-                f"**{name}**: this library is faster in {won} of {len(ours)} tasks. It takes {best.ratio:.2g} times "
-                f"the other's time at best ({best.work}) and {worst.ratio:.2g} times at worst ({worst.work})."
+                f"**{name}**: this library is faster in {n_won} of {len(ours)} tasks. It takes {lowest.ratio:.2g} "
+                "times "
+                f"the other's time at best ({lowest.work}) and {highest.ratio:.2g} times at worst ({highest.work})."
             )
-    judged = [c for c in found if c.our_laws is not None and not c.peer.startswith("C")]
-    if judged:
-        kept = sum(c.our_laws == "hold" for c in judged)
-        theirs = sum(c.their_laws == "hold" for c in judged)
+    with_verdict = [c for c in comparisons if c.our_laws is not None and not c.peer.startswith("C")]
+    if with_verdict:
+        n_held = sum(c.our_laws == "hold" for c in with_verdict)
+        n_peer_held = sum(c.their_laws == "hold" for c in with_verdict)
         yield (
-            f"**the laws**: beside programs that do not run the same scheme, the laws hold in {kept} of {len(judged)} "
-            f"runs of this library and in {theirs} of theirs."
+            f"**the laws**: beside programs that do not run the same scheme, the laws hold in {n_held} of "
+            f"{len(with_verdict)} "
+            f"runs of this library and in {n_peer_held} of theirs."
         )
 
 
 def missed_targets_text(targets: list[Target]) -> str:
-    """How many targets there are, and how many are missed."""
+    """Return a clause with the number of targets and of missed ones."""
     count = sum(target.verdict == "missed" for target in targets)
     return f"{count} of {len(targets)} targets are missed"

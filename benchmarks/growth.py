@@ -1,4 +1,4 @@
-"""How the cost of both engines grows: one system, in a new process on one core with an empty cache."""
+"""Growth of the cost of both engines with one system, in a new process on one core with an empty cache."""
 
 from __future__ import annotations
 
@@ -19,11 +19,13 @@ from .report import Table, ratio
 from .timing import race, time_once
 
 STEP = 0.05
+"""Step size of all runs."""
 
 CALL_STEPS = 10
-"""Steps of a run whose time is that of the call: it is taken off the time of a long one."""
+"""Steps of the short run, whose time is that of a call and is subtracted from the time of a long run."""
 
 ENGINES: tuple[Engine, ...] = ("array", "compiled")
+"""The engines that are compared."""
 
 COLUMNS = {
     "Dimension": "count",
@@ -34,21 +36,22 @@ COLUMNS = {
     "Array / compiled": "ratio",
     "Iterations a step": "number",
 } | laws.COLUMNS
+"""Columns of the table, with the formats of their numbers."""
 
 
 def growth_table(caption: str, names: Iterable[str], steps: int, rounds: int, heading: str = "") -> Table:
-    """A row for each of the algebras, by name as in :func:`algebra`."""
+    """Return a table with a row for each algebra, named as in :func:`algebra_by_name`."""
     return Table(caption, {heading: "text"} | COLUMNS, [_algebra_row(name, steps, rounds) for name in names])
 
 
 def algebra_by_name(name: str) -> mf.LieAlgebra:
-    """``"so 4"``, ``"su 3"``, or ``"bodies 5"``: the direct sum of five so(3)."""
+    """Return an algebra by name: ``"so 4"``, ``"su 3"``, or ``"bodies 5"``, the direct sum of five so(3)."""
     kind, n = name.split()
     return mf.direct_sum(*[mf.so(3)] * int(n)) if kind == "bodies" else {"so": mf.so, "su": mf.su}[kind](int(n))
 
 
 def measure_engines(name: str, steps: int, rounds: int) -> dict:
-    """Compile and time both engines on one algebra; what the child process does."""
+    """Compile and time both engines on one algebra; this runs in the child process."""
     g = algebra_by_name(name)
     strength = float(np.trace(-g.killing_form())) / g.dim
     system = generalized_body(g, RATE_TIMES_DURATION / (STEP * steps * strength))
@@ -61,29 +64,43 @@ def measure_engines(name: str, steps: int, rounds: int) -> dict:
     works = {
         (engine, count): functools.partial(run, engine, count) for engine in ENGINES for count in (CALL_STEPS, steps)
     }
-    firsts = {engine: time_once(works[engine, CALL_STEPS]).cpu_seconds for engine in ENGINES}
+    first_call_seconds = {engine: time_once(works[engine, CALL_STEPS]).cpu_seconds for engine in ENGINES}
     outcomes = race(works, rounds=rounds, max_seconds=5.0)
-    found: dict[str, Any] = {"dim": g.dim}
+    results: dict[str, Any] = {"dim": g.dim}
     for engine in ENGINES:
-        call, long = outcomes[engine, CALL_STEPS].cpu_seconds, outcomes[engine, steps]
-        kept = laws.solution_laws(long.result)
-        found[engine] = {
-            "compiling": firsts[engine] - call,
+        call, long_run = outcomes[engine, CALL_STEPS].cpu_seconds, outcomes[engine, steps]
+        run_laws = laws.solution_laws(long_run.result)
+        results[engine] = {
+            "compiling": first_call_seconds[engine] - call,
             # A difference smaller than the call itself would be mostly noise.
-            "step": (long.cpu_seconds - call) / (steps - CALL_STEPS) if long.cpu_seconds > 2.0 * call else None,
-            "iterations": long.result.stats.iterations_per_step,
-            "laws": [kept.energy_drift, kept.least_entropy_increment],
+            "step": (long_run.cpu_seconds - call) / (steps - CALL_STEPS) if long_run.cpu_seconds > 2.0 * call else None,
+            "iterations": long_run.result.stats.iterations_per_step,
+            "laws": [run_laws.energy_drift, run_laws.least_entropy_increment],
         }
-    return found
+    return results
 
 
 def _algebra_row(name: str, steps: int, rounds: int) -> list:
     with tempfile.TemporaryDirectory() as cache:
-        found = child.run_child("dimension", name, str(steps), str(rounds), cache=cache, one_core=True)
-    array, compiled = found["array"], found["compiled"]
-    kept = [laws.Laws(*found[engine]["laws"]) for engine in ENGINES]
-    worst = laws.Laws(max(one.energy_drift for one in kept), min(one.least_entropy_increment or 0.0 for one in kept))
+        results = child.run_child("dimension", name, str(steps), str(rounds), cache=cache, one_core=True)
+    array_results, compiled_results = results["array"], results["compiled"]
+    engine_laws = [laws.Laws(*results[engine]["laws"]) for engine in ENGINES]
+    worst_laws = laws.Laws(
+        max(one.energy_drift for one in engine_laws), min(one.least_entropy_increment or 0.0 for one in engine_laws)
+    )
     kind, n = name.split()
     title = n if kind == "bodies" else f"{kind}({n})"
-    row = [title, found["dim"], array["compiling"], compiled["compiling"], array["step"], compiled["step"]]
-    return [*row, ratio(array["step"], compiled["step"]), compiled["iterations"], *worst.table_cells()]
+    row = [
+        title,
+        results["dim"],
+        array_results["compiling"],
+        compiled_results["compiling"],
+        array_results["step"],
+        compiled_results["step"],
+    ]
+    return [
+        *row,
+        ratio(array_results["step"], compiled_results["step"]),
+        compiled_results["iterations"],
+        *worst_laws.table_cells(),
+    ]

@@ -1,4 +1,4 @@
-"""The isospectral midpoint scheme for Zeitlin's fluid, as published: the contestant of the library's explicit methods.
+"""The isospectral midpoint scheme for Zeitlin's fluid, as published: the competitor of the library's explicit methods.
 
 ``W_n = V - h/2 [P, V] - h^2/4 P V P``, ``W_{n+1} = W_n + h [P, V]`` with ``P = Delta^{-1} V`` [Modin & Viviani 2020,
 "A Casimir preserving scheme for long-time simulation of spherical ideal hydrodynamics", J. Fluid Mech. 884, A22, and
@@ -13,10 +13,11 @@ import numba
 import numpy as np
 
 EPS = float(np.finfo(float).eps)
+"""Machine epsilon of double precision."""
 
 
 class IsospectralMidpoint:
-    """The scheme for N by N matrices; time is that of ``W' = [P, W]``."""
+    """The isospectral midpoint scheme for N by N matrices, in the time of ``W' = [P, W]``."""
 
     def __init__(self, N: int):
         s = (N - 1) / 2
@@ -25,7 +26,7 @@ class IsospectralMidpoint:
         self.diagonal = 2.0 * s * (s + 1.0)
 
     def stream_matrix(self, W: np.ndarray) -> np.ndarray:
-        """P, anti-Hermitian and without trace, with ``Delta P = W``."""
+        """Return P, anti-Hermitian and traceless, with ``Delta P = W``."""
         P = np.zeros_like(W)
         _solve_laplacian(W, self.spin_z, self.raising, self.diagonal, P)
         return P
@@ -34,24 +35,24 @@ class IsospectralMidpoint:
         return -0.5 * float(np.vdot(self.stream_matrix(W), W).real)
 
     def integrate(self, W: np.ndarray, h: float, steps: int) -> tuple[np.ndarray, float]:
-        """The matrix after so many steps, and the mean number of iterations of one."""
-        made, change = 0, np.zeros_like(W)
+        """Return the matrix after ``steps`` steps, and the mean number of iterations of a step."""
+        n_iterations, change = 0, np.zeros_like(W)
         for _ in range(steps):
             for _ in range(60):
-                made += 1
+                n_iterations += 1
                 V = W + change
                 P = (0.5 * h) * self.stream_matrix(V)
                 PV = P @ V
                 commutator = PV - PV.conj().T
-                new = commutator + PV @ P
-                residual, size = np.abs(new - change).max(), np.abs(W).max()
-                change = new
-                if residual <= 4 * EPS * size:
+                new_change = commutator + PV @ P
+                residual, scale = np.abs(new_change - change).max(), np.abs(W).max()
+                change = new_change
+                if residual <= 4 * EPS * scale:
                     break
             else:
                 raise RuntimeError("the fixed-point iteration of the isospectral midpoint does not converge")
             W = W + 2.0 * commutator
-        return W, made / steps
+        return W, n_iterations / steps
 
 
 @numba.njit
@@ -59,21 +60,21 @@ def _solve_laplacian(W, z, step, main, P):
     N = W.shape[0]
     ratio, y = np.empty(N), np.empty(N, dtype=np.complex128)
     for m in range(N):
-        size = N - m
-        pivot, before = main - 2.0 * z[0] * z[m], 0.0
-        for i in range(size):
+        length = N - m
+        pivot, previous_ratio = main - 2.0 * z[0] * z[m], 0.0
+        for i in range(length):
             if i > 0:
-                beside = -step[i - 1] * step[i + m - 1]
-                pivot, before = main - 2.0 * z[i] * z[i + m] - beside * ratio[i - 1], ratio[i - 1]
-                y[i] = -W[i, i + m] - before * y[i - 1]
+                off_diagonal = -step[i - 1] * step[i + m - 1]
+                pivot, previous_ratio = main - 2.0 * z[i] * z[i + m] - off_diagonal * ratio[i - 1], ratio[i - 1]
+                y[i] = -W[i, i + m] - previous_ratio * y[i - 1]
             else:
                 y[i] = -W[i, i + m]
-            ratio[i] = -step[i] * step[i + m] / pivot if i + 1 < size else 0.0
-            P[i, i + m] = y[i] / pivot if (m > 0 or i + 1 < size) else 0.0
-        for i in range(size - 2, -1, -1):
+            ratio[i] = -step[i] * step[i + m] / pivot if i + 1 < length else 0.0
+            P[i, i + m] = y[i] / pivot if (m > 0 or i + 1 < length) else 0.0
+        for i in range(length - 2, -1, -1):
             P[i, i + m] -= ratio[i] * P[i + 1, i + m + 1]
         if m > 0:
-            for i in range(size):
+            for i in range(length):
                 P[i + m, i] = -P[i, i + m].conjugate()
     mean = 0.0j
     for i in range(N):

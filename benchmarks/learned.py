@@ -1,4 +1,4 @@
-"""Learned systems: two problems of the field, ours beside a GFINN and an NMS of our own."""
+"""Learned systems: two problems of the field, solved by ``lt.learn`` and by our own GFINN and NMS."""
 
 from __future__ import annotations
 
@@ -18,24 +18,26 @@ from . import learned_peers
 from .report import Report, Table
 
 LEARNING_RATE = 3e-3
-"""Of the descent, for all."""
+"""Learning rate of every contestant."""
 
 LONG_RUN_FACTOR = 100
-"""How many times as long as the data the laws are followed."""
+"""Duration of the run in which the laws are followed, in durations of the data."""
 
 
 REPORT_TEXT = (
     "Errors of forecasts from the first states of trajectories that were not learned from, means over all "
-    f"components and times. The laws are those of one forecast over {LONG_RUN_FACTOR} times the time of the data, of the "
+    f"components and times. The laws are those of one forecast over {LONG_RUN_FACTOR} times the time of the data, "
+    "of the "
     "energy and entropy that were learned. GFINN and NMS are written here from their papers. All have the same data, "
     "loss, descent, rate, batches and networks. Their forecasts run by RK4, ours by a method of the same order with "
     "discrete laws. What rate and loss `lt.learn` has was chosen on other trajectories than these. Figures that the "
     "authors publish are not quoted: their tables could not be looked up."
 )
+"""Description that both reports share."""
 
 
 class Problem(NamedTuple):
-    """Data of a motion, made by SciPy at a tolerance of 1e-10, and what a user may know of it."""
+    """Data of a motion, made by SciPy at a tolerance of 1e-10, and prior knowledge of it."""
 
     title: str
     text: str
@@ -73,7 +75,8 @@ def _pendulum_field(t, x):
 PROBLEMS = {
     "gas": Problem(
         "two gas containers",
-        f"{REPORT_TEXT} The set-up is that of the code of the authors of GFINN. A few starts near the walls, which are rare "
+        f"{REPORT_TEXT} The set-up is that of the code of the authors of GFINN. A few starts near the walls, "
+        "which are rare "
         "in the data, make up a large part of all means. Models of which more is known lose to NMS after T: their "
         "descents end at losses about ten times larger, and more neurons do not help.",
         _gas_field,
@@ -96,49 +99,51 @@ PROBLEMS = {
         lambda x: x[8] + x[9],
     ),
 }
+"""The two problems, by name."""
 
 
 def simulate_data(problem: Problem, quick: bool, seed: int = 0) -> np.ndarray:
-    """States to twice the time of training, shape (trajectories, times, n)."""
+    """Return states to twice the training time, shape (trajectories, times, n)."""
     random, runs = np.random.default_rng(seed), []
     times = np.arange(round(2 * problem.t_end / problem.step) + 1) * problem.step
     for _ in range(5 if quick else problem.n_trajectories):
         x0 = problem.random_state(random)
-        found = scipy.integrate.solve_ivp(
+        solution = scipy.integrate.solve_ivp(
             problem.vector_field, (0, times[-1]), x0, "LSODA", times, rtol=1e-10, atol=1e-10
         )
-        runs.append(found.y.T)
+        runs.append(solution.y.T)
     return np.stack(runs)
 
 
-def _forecast_errors(found: np.ndarray, true: np.ndarray) -> list[float]:
-    """Mean squares and mean sizes of the errors of states, to the end of the training time and after it."""
-    half = (true.shape[1] + 1) // 2
-    parts = [found[:, :half] - true[:, :half], found[:, half:] - true[:, half:]]
-    return [float(f(part)) for f in (lambda e: np.mean(e**2), lambda e: np.mean(np.abs(e))) for part in parts]
+def _forecast_errors(states: np.ndarray, exact_states: np.ndarray) -> list[float]:
+    """Return mean squares and mean magnitudes of state errors, to the end of the training time and after it."""
+    half = (exact_states.shape[1] + 1) // 2
+    error_parts = [states[:, :half] - exact_states[:, :half], states[:, half:] - exact_states[:, half:]]
+    return [float(f(part)) for f in (lambda e: np.mean(e**2), lambda e: np.mean(np.abs(e))) for part in error_parts]
 
 
-def _law_errors(energy: np.ndarray, entropy: np.ndarray, spread: float) -> list[float]:
-    """The drift of a learned energy, which is known up to a constant, relative to its spread over the test states."""
-    return [float(np.max(np.abs(energy - energy[0])) / spread), float(np.diff(entropy).min())]
+def _law_errors(energy: np.ndarray, entropy: np.ndarray, energy_spread: float) -> list[float]:
+    """Return the drift of a learned energy relative to its spread over the test states, and the least entropy
+    increment."""
+    return [float(np.max(np.abs(energy - energy[0])) / energy_spread), float(np.diff(entropy).min())]
 
 
 def compare_models(problem: Problem, quick: bool) -> list[list]:
-    """A row for each contestant, means over the seeds of first weights and batches; of the laws the worst."""
+    """Return a row for each contestant, averaged over the seeds of weights and batches; for the laws the worst."""
     x = simulate_data(problem, quick)
     count = max(1, len(x) // 5)
     half = round(problem.t_end / problem.step) + 1
     test, train = x[:count], [Trajectory(np.arange(half) * problem.step, own[:half]) for own in x[count:]]
-    found_scales = data_scales(train)
+    scales = data_scales(train)
     steps, width, seeds = (50, 8, 1) if quick else (problem.steps, 32, problem.n_seeds)
-    long = round((2 if quick else LONG_RUN_FACTOR) * problem.t_end / problem.step)
+    long_steps = round((2 if quick else LONG_RUN_FACTOR) * problem.t_end / problem.step)
     rows = []
 
-    def ours(build: Callable[[int], Any], name: str) -> None:
-        def one(seed: int) -> list[float]:
+    def add_library_model(build: Callable[[int], Any], name: str) -> None:
+        def measure_seed(seed: int) -> list[float]:
             start = time.process_time()
-            pairs = [tuple(own) for own in train]
-            fitted = lt.learn.fit(
+            pairs = [tuple(trajectory) for trajectory in train]
+            model = lt.learn.fit(
                 build(seed),
                 pairs,
                 matching=steps,
@@ -148,61 +153,76 @@ def compare_models(problem: Problem, quick: bool) -> list[list]:
                 seed=seed,
                 progress=False,
             )
-            spent = time.process_time() - start
+            training_seconds = time.process_time() - start
             method = lt.MetriplecticRungeKutta(4)
             end = (x.shape[1] - 1) * problem.step
-            states = lt.ensemble(fitted, test[:, 0], (0.0, end), problem.step, method, outputs="trajectory").x
+            states = lt.ensemble(model, test[:, 0], (0.0, end), problem.step, method, outputs="trajectory").x
             assert states is not None
-            run = lt.integrate(fitted, test[0, 0], (0.0, long * problem.step), problem.step, method)
+            run = lt.integrate(model, test[0, 0], (0.0, long_steps * problem.step), problem.step, method)
             assert run.entropy is not None
-            laws = _law_errors(run.energy, run.entropy, float(np.std(fitted.energy(test))))
-            return [fitted.training.parameters, *_forecast_errors(states, test), *laws, spent]
+            laws = _law_errors(run.energy, run.entropy, float(np.std(model.energy(test))))
+            return [model.training.parameters, *_forecast_errors(states, test), *laws, training_seconds]
 
-        add(name, [one(seed) for seed in range(seeds)])
+        add_row(name, [measure_seed(seed) for seed in range(seeds)])
 
-    def theirs(build: Callable[[int], learned_peers.PeerModel], name: str) -> None:
-        def one(seed: int) -> list[float]:
+    def add_peer_model(build: Callable[[int], learned_peers.PeerModel], name: str) -> None:
+        def measure_seed(seed: int) -> list[float]:
             start = time.process_time()
-            peer = learned_peers.train(build(seed), train, found_scales, steps, LEARNING_RATE, seed)
-            spent = time.process_time() - start
-            states, laws = learned_peers.forecast(peer, test[:, 0], found_scales, problem.step, x.shape[1] - 1)
-            run, _ = learned_peers.forecast(peer, test[:1, 0], found_scales, problem.step, long)
-            spread = float(np.std(laws(test.reshape(-1, x.shape[2]))[0]))
+            peer = learned_peers.train(build(seed), train, scales, steps, LEARNING_RATE, seed)
+            training_seconds = time.process_time() - start
+            states, laws = learned_peers.forecast(peer, test[:, 0], scales, problem.step, x.shape[1] - 1)
+            run, _ = learned_peers.forecast(peer, test[:1, 0], scales, problem.step, long_steps)
+            energy_spread = float(np.std(laws(test.reshape(-1, x.shape[2]))[0]))
             parameters = sum(leaf.size for leaf in jax.tree_util.tree_leaves(peer))
             energy, entropy = laws(run[0])
-            return [parameters, *_forecast_errors(states, test), *_law_errors(energy, entropy, spread), spent]
+            return [
+                parameters,
+                *_forecast_errors(states, test),
+                *_law_errors(energy, entropy, energy_spread),
+                training_seconds,
+            ]
 
-        add(name, [one(seed) for seed in range(seeds)])
+        add_row(name, [measure_seed(seed) for seed in range(seeds)])
 
-    def add(name: str, found: list[list[float]]) -> None:
-        number, *errors, drift, increment, spent = np.transpose(found)
+    def add_row(name: str, results: list[list[float]]) -> None:
+        n_parameters, *errors, drift, increment, training_seconds = np.transpose(results)
         means = [float(np.mean(values)) for values in errors]
-        rows.append([name, int(number[0]), *means, float(drift.max()), float(increment.min()), float(spent.mean())])
+        rows.append(
+            [
+                name,
+                int(n_parameters[0]),
+                *means,
+                float(drift.max()),
+                float(increment.min()),
+                float(training_seconds.mean()),
+            ]
+        )
         print(rows[-1], flush=True)
 
-    known: dict[str, Any]
-    n, known = x.shape[2], {"poisson": problem.poisson, "entropy": problem.entropy}
-    ours(lambda seed: lt.learn.Metriplectic(n, width=width, seed=seed), "`lt.learn`, nothing known")
+    known_parts: dict[str, Any]
+    n, known_parts = x.shape[2], {"poisson": problem.poisson, "entropy": problem.entropy}
+    add_library_model(lambda seed: lt.learn.Metriplectic(n, width=width, seed=seed), "`lt.learn`, nothing known")
     for construction in ("skew", "projected"):
 
         def build(seed: int, construction=construction) -> Any:
             friction = lt.learn.Friction(n, 1, construction, width=width, seed=4 * seed + 3)
-            return lt.learn.Metriplectic(n, **known, friction=friction, width=width, seed=seed)
+            return lt.learn.Metriplectic(n, **known_parts, friction=friction, width=width, seed=seed)
 
-        ours(build, f"`lt.learn`, Π and S known, {construction}")
-    theirs(lambda seed: learned_peers.NMS(n, width, 2, seed, 1), "NMS, nothing known")
-    theirs(lambda seed: learned_peers.GFINN(n, width, 2, seed), "GFINN, nothing known")
+        add_library_model(build, f"`lt.learn`, Π and S known, {construction}")
+    add_peer_model(lambda seed: learned_peers.NMS(n, width, 2, seed, 1), "NMS, nothing known")
+    add_peer_model(lambda seed: learned_peers.GFINN(n, width, 2, seed), "GFINN, nothing known")
     return rows
 
 
 def problem_report(name: str, quick: bool) -> Report:
-    """The measurement of one of the problems."""
+    """Measure one of the problems."""
     p = PROBLEMS[name]
     columns = {"Model": "text", "Parameters": "count", "MSE to T": "error", "T to 2 T": "error", "MAE to T": "error"}
     columns |= {"MAE, T to 2 T": "error", "Energy drift": "error", "Least entropy increment": "error"}
     columns |= {"Training": "seconds"}
     caption = (
-        f"{p.n_trajectories} trajectories to T = {p.t_end:g}, a fifth of them for the test, {p.steps} steps of 256 points. Means "
+        f"{p.n_trajectories} trajectories to T = {p.t_end:g}, a fifth of them for the test, {p.steps} steps of "
+        "256 points. Means "
         f"over {p.n_seeds} seed{'s' if p.n_seeds > 1 else ''}."
     )
     return Report(f"Learned: {p.title}", p.text, [Table(caption, columns, compare_models(p, quick))])

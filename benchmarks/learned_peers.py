@@ -1,7 +1,7 @@
-"""A GFINN and an NMS of our own, written from their papers: both laws hold in continuous time, and they run by RK4.
+"""Our own GFINN and NMS, written from their papers: both laws hold in continuous time, and RK4 integrates them.
 
-Inputs, outputs and time are scaled as those of ``lt.learn`` are. Points, loss, descent and batches are those of
-``lt.learn.fit``: what differs is how energy, entropy and brackets are made, and what runs them.
+Inputs, outputs and time are scaled as in ``lt.learn``. Points, loss, optimiser and batches are those of
+``lt.learn.fit``; only the construction of energy, entropy and brackets, and the integrator, differ.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from liethermo.learn.training import Phase, TrainingRun
 
 
 class Perceptron(eqx.Module):
-    """Layers of tanh."""
+    """A multilayer perceptron with tanh activations."""
 
     layers: list[tuple[jax.Array, jax.Array]]
 
@@ -40,7 +40,7 @@ class Perceptron(eqx.Module):
 
 
 class PeerModel(eqx.Module):
-    """``x' = L(x) grad E + M(x) grad S`` with ``L grad S = 0`` and ``M grad E = 0``, in scaled variables."""
+    """The system ``x' = L(x) grad E + M(x) grad S`` with ``L grad S = 0`` and ``M grad E = 0``, in scaled variables."""
 
     energy: Perceptron
     entropy: Perceptron
@@ -55,10 +55,11 @@ class PeerModel(eqx.Module):
 
 
 class GFINN(PeerModel):
-    """``L = B^T (s - s^T) B``, rows ``xi_j grad S``, ``M = C^T t t^T C``, rows ``xi_j grad E`` [Zhang et al. 2022].
+    """GFINN: ``L = B^T (s - s^T) B``, rows ``xi_j grad S``, ``M = C^T t t^T C``, rows ``xi_j grad E`` [Zhang et al.
+    2022].
 
-    The xi_j are constant skew matrices, s and t networks: the code of the authors for gas containers, without what it
-    is told of energy and entropy.
+    The xi_j are constant skew matrices, s and t networks, as in the authors' code for gas containers, but without its
+    knowledge of energy and entropy.
     """
 
     skew: jax.Array  # (2, K, n, n): of L, and of M
@@ -82,9 +83,9 @@ class GFINN(PeerModel):
 
 
 class NMS(PeerModel):
-    """``L = P_S A P_S`` and ``M = P_E B D D^T B^T P_E`` [Gruber et al. 2025].
+    """NMS: ``L = P_S A P_S`` and ``M = P_E B D D^T B^T P_E`` [Gruber et al. 2025].
 
-    P are the orthogonal projectors off the gradients. A skew, B and D are networks of the state.
+    The P project orthogonally to the gradients. A (skew), B and D are networks of the state.
     """
 
     tensor: Perceptron
@@ -103,14 +104,14 @@ class NMS(PeerModel):
     def brackets(self, x, dE, dS):
         n = x.shape[0]
         A = jnp.tril(self.tensor(x).reshape(n, n), -1)
-        off_S, off_E = (jnp.eye(n) - jnp.outer(g, g) / jnp.dot(g, g) for g in (dS, dE))
+        projector_S, projector_E = (jnp.eye(n) - jnp.outer(g, g) / jnp.dot(g, g) for g in (dS, dE))
         D = jnp.tril(self.weights(x).reshape(self.rank, self.rank))
-        C = off_E @ self.columns(x).reshape(n, self.rank) @ D
-        return off_S @ (A - A.T) @ off_S, C @ C.T
+        C = projector_E @ self.columns(x).reshape(n, self.rank) @ D
+        return projector_S @ (A - A.T) @ projector_S, C @ C.T
 
 
 class UnscaledPeer(eqx.Module):
-    """A peer in the units of the data."""
+    """A peer model in the units of the data."""
 
     peer: PeerModel
     scales: DataScales
@@ -121,22 +122,26 @@ class UnscaledPeer(eqx.Module):
 
 
 def train(peer: PeerModel, data: list[Trajectory], scales: DataScales, steps: int, rate: float, seed: int) -> PeerModel:
-    """The peer after the matching of ``lt.learn.fit``."""
-    start, back = ravel_pytree(peer)
+    """Return the peer after derivative matching as in ``lt.learn.fit``."""
+    start, unravel = ravel_pytree(peer)
     shapes = tuple(leaf.shape for leaf in jax.tree_util.tree_leaves(peer))
-    own = losses.ParameterVector(np.asarray(start), shapes, lambda vector: UnscaledPeer(back(vector), scales))
-    task = losses.trajectory_matching(own, data, None, scales)
-    course = TrainingRun(
-        [Phase("matching", task, None, steps, rate, BATCH_SIZES["matching"], shapes)], own.initial_values, ""
+    parameter_vector = losses.ParameterVector(
+        np.asarray(start), shapes, lambda vector: UnscaledPeer(unravel(vector), scales)
     )
-    course.run(seed, None, None, False)
-    return back(jnp.asarray(course.weights))
+    task = losses.trajectory_matching(parameter_vector, data, None, scales)
+    training = TrainingRun(
+        [Phase("matching", task, None, steps, rate, BATCH_SIZES["matching"], shapes)],
+        parameter_vector.initial_values,
+        "",
+    )
+    training.run(seed, None, None, False)
+    return unravel(jnp.asarray(training.weights))
 
 
 def forecast(
     peer: PeerModel, x0: np.ndarray, scales: DataScales, step: float, steps: int
 ) -> tuple[np.ndarray, Callable]:
-    """States by RK4, shape (trajectories, steps + 1, n), and what gives energy and entropy of such states."""
+    """Return states by RK4, shape (trajectories, steps + 1, n), and a function that gives their energy and entropy."""
     h = step / scales.time_scale
 
     def rk4(y, _):
@@ -146,13 +151,13 @@ def forecast(
         new = y + h / 6.0 * (a + 2.0 * b + 2.0 * c + peer.rates(y + h * c))
         return new, new
 
-    def whole(y):
+    def trajectory(y):
         return jnp.concatenate([y[None], jax.lax.scan(rk4, y, length=steps)[1]])
 
-    y = jax.jit(jax.vmap(whole))(jnp.asarray((x0 - scales.centre) / scales.scale))
+    y = jax.jit(jax.vmap(trajectory))(jnp.asarray((x0 - scales.centre) / scales.scale))
 
-    def laws(found):
-        z = (found - scales.centre) / scales.scale
+    def laws(states):
+        z = (states - scales.centre) / scales.scale
         return tuple(np.asarray(jax.vmap(f)(jnp.asarray(z)))[..., 0] for f in (peer.energy, peer.entropy))
 
     return np.asarray(y) * scales.scale + scales.centre, laws

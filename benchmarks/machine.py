@@ -1,4 +1,4 @@
-"""The machine and the software that a result was measured with; no names of hosts or folders."""
+"""Description of the machine and the software of a measurement, without names of hosts or folders."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from pathlib import Path
 from .native import find_c_compiler
 
 PACKAGES = "liethermo numpy scipy jax numba llvmlite diffrax heyoka mujoco pymanopt bsk".split()
+"""Packages whose versions are recorded."""
 
 
 def machine_description() -> dict[str, str]:
-    """What is worth knowing, by name."""
+    """Return the hardware, the system and the versions of compiler and packages, by name."""
     return {
         "Processor": _processor(),
         "Cores": str(available_cores()),
@@ -27,12 +28,12 @@ def machine_description() -> dict[str, str]:
 
 
 def available_cores() -> int:
-    """Processors that this process may use."""
+    """Return the number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def load_average() -> str:
-    """How busy the machine is: the load average of the last minute."""
+    """Return the load average of the last minute as text."""
     return f"{os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else "unknown"
 
 

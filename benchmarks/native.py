@@ -1,4 +1,4 @@
-"""The programs in C: built on first use with ``cc -O3 -march=native``, called through ctypes."""
+"""The C programs, built on first use with ``cc -O3 -march=native`` and called through ctypes."""
 
 from __future__ import annotations
 
@@ -19,13 +19,26 @@ from liethermo.engines.rules import DEFAULT_OPTIONS
 from .report import UnavailableError
 
 SOURCE_FOLDER = Path(__file__).parent / "c"
+"""Folder of the C sources."""
 COMPILER_OPTIONS = ["-std=gnu11", "-O3", "-march=native", "-fPIC", "-shared"]
+"""Compiler options of all programs."""
+
+SHARED_OPTIONS = (
+    "max_fixed_point_iterations",
+    "fixed_point_contraction_limit",
+    "stall_ratio",
+    "update_floor",
+    "plateau_rtol",
+    "drift_threshold",
+)
+"""Fields of :class:`.SolverOptions` that the C programs use, as macros in capitals."""
 
 STATUSES = ("completed", "not_converged", "non_finite")
+"""Names of the status codes of the C programs."""
 
 
 def run_dtype(components: int) -> np.dtype:
-    """``PeerRun`` of c/midpoint.h."""
+    """Return the record type ``PeerRun`` of c/midpoint.h for states of n components."""
     vectors = [(name, "f8", components) for name in ("x", "low", "k", "before")]
     energies = ["energy", "entropy", "first_energy", "largest_energy", "smallest_energy"]
     increments = ["least_entropy_increment", "largest_energy_increment"]
@@ -39,40 +52,29 @@ SUMMARY_DTYPE = np.dtype(
     + [(name, "f8") for name in ("least_entropy_increment", "steps", "iterations", "integral")]
     + [("status", "i8")]
 )
-"""``LawSummary`` of c/ensemble.c."""
+"""Record type ``LawSummary`` of c/ensemble.c."""
 
 RING_DTYPE = np.dtype(
     [(name, "f8") for name in ("energy", "entropy", "first_energy", "largest_energy", "smallest_energy")]
     + [("least_entropy_increment", "f8")]
     + [(name, "i8") for name in ("status", "steps", "iterations")]
 )
-"""``Record`` of c/spins.c."""
+"""Record type ``Record`` of c/spins.c."""
 
 
 def find_c_compiler() -> str | None:
-    """The C compiler: ``$CC``, or ``cc``; None where there is none."""
+    """Return the C compiler: ``$CC``, or ``cc``; None if there is none."""
     return shutil.which(os.environ.get("CC", "cc"))
 
 
-SOLVER_MACROS = {
-    "FIXED_POINT": "max_fixed_point_iterations",
-    "SLOW": "fixed_point_contraction_limit",
-    "SHRINKING": "stall_ratio",
-    "FLOOR": "update_floor",
-    "PLATEAU": "plateau_rtol",
-    "STEERED": "drift_threshold",
-}
-"""Macros of the C sources, and the solver options whose values they get."""
-
-
 def solver_definitions() -> list[str]:
-    """Return the compiler flags that define each macro as the library's solver option."""
-    return [f"-D{macro}={getattr(DEFAULT_OPTIONS, option)!r}" for macro, option in SOLVER_MACROS.items()]
+    """Return the library's solver options as macro definitions for the compiler."""
+    return [f"-D{name.upper()}={getattr(DEFAULT_OPTIONS, name)!r}" for name in SHARED_OPTIONS]
 
 
 @functools.cache
 def compile_library(source: str, *options: str) -> ctypes.CDLL:
-    """The library built from a file in ``c/``.
+    """Compile a file in ``c/`` and return the loaded library.
 
     Raises
     ------
@@ -94,14 +96,14 @@ def compile_library(source: str, *options: str) -> ctypes.CDLL:
         "-lm",
         "-lpthread",
     ]
-    built = subprocess.run(arguments, capture_output=True, text=True, check=False)
-    if built.returncode != 0:
-        raise UnavailableError(f"{source} could not be compiled: {built.stderr.strip().splitlines()[-1]}")
+    process = subprocess.run(arguments, capture_output=True, text=True, check=False)
+    if process.returncode != 0:
+        raise UnavailableError(f"{source} could not be compiled: {process.stderr.strip().splitlines()[-1]}")
     return ctypes.CDLL(str(target))
 
 
 class BodyProgram:
-    """The step loop of one body, or of another system with a file of its own.
+    """The step loop in C of one body, or of another system with its own source file.
 
     Parameters
     ----------
@@ -116,35 +118,36 @@ class BodyProgram:
     def __init__(self, source: str, parameters: Sequence[float], *options: str):
         self._library, self._parameters = compile_library(source, *options), np.array(parameters, dtype=float)
 
-    def integrate(self, x0, step: float, steps: int, every: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """``steps`` steps from x0; every n-th state, by default the last, and a record of :func:`run_dtype`."""
-        every = steps if every is None else every
+    def integrate(self, x0, step: float, steps: int, save_every: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Take ``steps`` steps from x0; return every n-th state, by default the last, and a record of
+        :func:`run_dtype`."""
+        save_every = steps if save_every is None else save_every
         x0 = np.ascontiguousarray(x0, dtype=float)
-        saves, run = steps // every, np.zeros(1, run_dtype(len(x0)))
-        out = np.empty((saves, len(x0)))
+        saves, run = steps // save_every, np.zeros(1, run_dtype(len(x0)))
+        states = np.empty((saves, len(x0)))
         self._library.integrate(
             _pointer(self._parameters),
             _pointer(x0),
             ctypes.c_double(step),
             ctypes.c_int64(saves),
-            ctypes.c_int64(every),
-            _pointer(out),
+            ctypes.c_int64(save_every),
+            _pointer(states),
             _pointer(run),
         )
         _require_success(run)
-        return out, run
+        return states, run
 
 
 class EnsembleProgram:
-    """The step loop of many rigid bodies, in SIMD lanes and threads; parameters as of rigid_body.c."""
+    """The step loop in C of many rigid bodies, with SIMD lanes and threads; parameters as for rigid_body.c."""
 
     def __init__(self, parameters: Sequence[float]):
         self._library, self._parameters = compile_library("ensemble.c", "-Wno-psabi"), np.array(parameters, dtype=float)
 
     def integrate(self, x0s, step: float, steps: int, threads: int) -> np.ndarray:
-        """``steps`` steps from each of the x0s, shape (bodies, 3); records of type :data:`SUMMARY`."""
+        """Take ``steps`` steps from each of the x0s, shape (bodies, 3); return records of :data:`SUMMARY_DTYPE`."""
         x0s = np.ascontiguousarray(x0s, dtype=float)
-        out = np.zeros(len(x0s), SUMMARY_DTYPE)
+        records = np.zeros(len(x0s), SUMMARY_DTYPE)
         self._library.integrate_ensemble(
             _pointer(self._parameters),
             _pointer(x0s),
@@ -152,20 +155,20 @@ class EnsembleProgram:
             ctypes.c_double(step),
             ctypes.c_int64(steps),
             ctypes.c_int64(threads),
-            _pointer(out),
+            _pointer(records),
         )
-        _require_success(out)
-        return out
+        _require_success(records)
+        return records
 
 
 class SpinRingProgram:
-    """The step loop of a ring of spins with a bath, in threads of OpenMP; parameters as of spins.c."""
+    """The step loop in C of a ring of spins with a bath, with OpenMP threads; parameters as for spins.c."""
 
     def __init__(self, parameters: Sequence[float]):
         self._library, self._parameters = compile_library("spins.c", "-fopenmp"), np.array(parameters, dtype=float)
 
     def integrate(self, x0, step: float, steps: int, threads: int) -> tuple[np.ndarray, np.ndarray]:
-        """The state after so many steps from x0, shape (3 count + 1,), and a record of :data:`RING_DTYPE`."""
+        """Return the state after ``steps`` steps from x0, shape (3 count + 1,), and a record of :data:`RING_DTYPE`."""
         x, record = np.array(x0, dtype=float), np.zeros(1, RING_DTYPE)
         self._library.omp_set_num_threads(ctypes.c_int(threads))
         self._library.integrate_ring(
@@ -192,6 +195,6 @@ def _pointer(array: np.ndarray) -> ctypes.c_void_p:
 
 
 def _require_success(records: np.ndarray) -> None:
-    worst = int(records["status"].max())
-    if worst != 0:
-        raise RuntimeError(f"a C program stopped early: {STATUSES[worst]}, after {records['steps'].min()} steps")
+    worst_status = int(records["status"].max())
+    if worst_status != 0:
+        raise RuntimeError(f"a C program stopped early: {STATUSES[worst_status]}, after {records['steps'].min()} steps")

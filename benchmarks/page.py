@@ -1,4 +1,4 @@
-"""The two pages of the documentation, from the results that are kept as JSON: wins and losses, and every run."""
+"""The two documentation pages, made from the results saved as JSON: wins and losses, and every run."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .measurements import MEASUREMENT_NAMES
 from .report import Report, Table, Target, targets_table
 
 RUNS_PAGE = "benchmarks_runs"
-"""The name of the second page."""
+"""Name of the page with every run."""
 
 INTRODUCTION = """\
 # Benchmarks
@@ -20,6 +20,7 @@ How fast this library is beside other programs, and where it loses. Bars to the 
 
 ![Time of this library over the time of another program, work by work, on a logarithmic axis](benchmarks.svg)
 """
+"""Beginning of the main page."""
 
 METHODOLOGY = f"""\
 ## How it was measured
@@ -29,7 +30,8 @@ one thread is timed by the clock of the processor; where threads or processes ar
 used. *Equal accuracy* means that the other program has the loosest tolerance with which it is at least as accurate.
 *Laws* compares the drift of the energy and the least increment of the entropy in a step with the tolerances of the
 tests. {{missed}}. {{{{doc}}}}`{RUNS_PAGE}` has the machine, the targets and the figures of every run. `make bench` measures
-everything anew and writes both pages; the programs are in `benchmarks/`."""
+everything anew and writes both pages; the programs are in `benchmarks/`."""  # noqa: E501
+"""Section of the main page on the measurements."""
 
 RUNS_INTRODUCTION = """\
 # Benchmarks: every run
@@ -38,10 +40,11 @@ The figures behind {doc}`benchmarks`: the machine, the targets, and each measure
 take turns, and the best time of each counts; ratios are between times of one run. The load average says how far to
 trust times by the clock on the wall. *Laws* compares the relative drift of the energy and the least increment of the
 entropy in a step, relative to its maximum, with the tolerances of the tests."""
+"""Beginning of the page with every run."""
 
 
 def write_pages(results: Path, page: Path) -> None:
-    """Write both pages and their figures from every result in the folder; the second lies beside the first.
+    """Write both pages and their figures from all results in the folder; the second page is placed beside the first.
 
     Raises
     ------
@@ -49,24 +52,27 @@ def write_pages(results: Path, page: Path) -> None:
         If there is no result.
     """
     files = [file for name in MEASUREMENT_NAMES if (file := results / f"{name}.json").is_file()]
-    found = [result for file in files if not (result := json.loads(file.read_text()))["quick"]]
-    if not found:
+    result_files = [result for file in files if not (result := json.loads(file.read_text()))["quick"]]
+    if not result_files:
         raise ValueError(f"{results} holds no results; run the measurements first")
-    reports = {result["name"]: Report.from_dict(result["report"]) for result in found}
+    reports = {result["name"]: Report.from_dict(result["report"]) for result in result_files}
     targets = [target for report in reports.values() for target in report.targets]
     from .figures import draw_magnet, draw_time_ratios, draw_work_precision
 
     draw_time_ratios(first_page.compare_themes(reports), page.parent / "benchmarks.svg")
-    first, *themes = first_page.page_sections(reports)
+    summary, *themes = first_page.page_sections(reports)
     _write_page(
-        page, [INTRODUCTION + "\n" + first, *themes, METHODOLOGY.format(missed=first_page.missed_targets_text(targets))]
+        page,
+        [INTRODUCTION + "\n" + summary, *themes, METHODOLOGY.format(missed=first_page.missed_targets_text(targets))],
     )
 
-    machines, differing = _machine_section(found)
+    machines, differing = _machine_section(result_files)
     parts = [RUNS_INTRODUCTION, machines, _target_section(targets)]
-    whole = [name for names in first_page.FULL_REPORT_THEMES.values() for name in names]
+    full_reports = [name for names in first_page.FULL_REPORT_THEMES.values() for name in names]
     for name, report in reports.items():
-        parts.append(f"## {report.title}\n\nOn the page {{doc}}`benchmarks`." if name in whole else report.markdown())
+        parts.append(
+            f"## {report.title}\n\nOn the page {{doc}}`benchmarks`." if name in full_reports else report.markdown()
+        )
         if name in differing:
             parts.append(f"Measured elsewhere: {differing[name]}.")
         if report.series:
@@ -82,30 +88,30 @@ def _write_page(page: Path, parts: list[str]) -> None:
     page.write_text("\n\n".join(part.strip("\n") for part in parts) + "\n")
 
 
-def _machine_section(found: list[dict]) -> tuple[str, dict[str, str]]:
-    """The machine of most measurements, and by name how that of another measurement differs."""
-    counted = Counter(json.dumps(result["machine"]) for result in found)
-    usual = json.loads(counted.most_common(1)[0][0])
-    dates = sorted({result["date"] for result in found})
+def _machine_section(results: list[dict]) -> tuple[str, dict[str, str]]:
+    """Return the section on the machine of most measurements, and the differences of other machines by measurement."""
+    machine_counts = Counter(json.dumps(result["machine"]) for result in results)
+    usual = json.loads(machine_counts.most_common(1)[0][0])
+    dates = sorted({result["date"] for result in results})
     rows = [*usual.items(), ("Measured", " to ".join(dict.fromkeys([dates[0], dates[-1]])))]
-    rows.append(("Load average before each measurement", ", ".join(result["load"] for result in found)))
+    rows.append(("Load average before each measurement", ", ".join(result["load"] for result in results)))
     table = Table("", {"Part": "text", "Here": "text"}, [list(row) for row in rows])
-    others = {result["name"]: result["machine"] for result in found if result["machine"] != usual}
+    other_machines = {result["name"]: result["machine"] for result in results if result["machine"] != usual}
     differing = {
         name: "; ".join(
             f"{part} {_additions(text, usual.get(part))}" for part, text in machine.items() if usual.get(part) != text
         )
-        for name, machine in others.items()
+        for name, machine in other_machines.items()
     }
     return "## Machine" + table.markdown(), differing
 
 
 def _additions(text: str, usual: str | None) -> str:
-    """What of an enumeration is not in the usual one."""
+    """Return the items of an enumeration that the usual one lacks."""
     return ", ".join(part for part in text.split(", ") if part not in (usual or "").split(", "))
 
 
 def _target_section(targets: list[Target]) -> str:
-    """Those that are missed come first."""
+    """Return the section on targets, missed ones first."""
     order = sorted(targets, key=lambda target: target.verdict != "missed")
     return "## Targets" + targets_table(order).markdown()

@@ -29,14 +29,14 @@ from .report import UnavailableError
 
 @dataclass(frozen=True)
 class PeerRun:
-    """One trajectory under one tolerance.
+    """One trajectory with one tolerance.
 
     Attributes
     ----------
     solve_end : function without arguments
-        Integrates and returns the state at the end, shape (3,): what is timed.
+        Integrates and returns the final state, shape (3,); this is timed.
     solve_path : function without arguments
-        The states at the solver's own steps, shape (steps + 1, 3).
+        Returns the states at the solver's own steps, shape (steps + 1, 3).
     """
 
     solve_end: Callable[[], np.ndarray]
@@ -44,7 +44,7 @@ class PeerRun:
 
 
 def import_peer(name: str):
-    """A peer, imported when it is wanted."""
+    """Import a peer when it is needed, or raise UnavailableError."""
     try:
         return importlib.import_module(name)
     except ImportError:
@@ -55,7 +55,7 @@ def import_peer(name: str):
 
 
 def scipy_run(tolerance: float, x0, t_end: float, rate: float) -> PeerRun:
-    """DOP853, eighth order."""
+    """Return a run by SciPy's DOP853, of order eight."""
     field = _scipy_field(rate)
 
     def solve():
@@ -68,18 +68,18 @@ def scipy_run(tolerance: float, x0, t_end: float, rate: float) -> PeerRun:
 
 
 def scipy_ensemble(tolerance: float, x0s: np.ndarray, t_end: float, rate: float) -> Callable:
-    """The states at the end from all of the x0s, one after another."""
+    """Return a function that gives the final states from all x0s, computed one after another."""
     runs = [scipy_run(tolerance, x0, t_end, rate) for x0 in x0s]
     return lambda: np.array([run.solve_end() for run in runs])
 
 
 @functools.cache
 def _scipy_field(rate: float) -> Callable:
-    compiled = numba.njit(body_field)
+    scalar_field = numba.njit(body_field)
 
     @numba.njit
     def field(t, x):
-        return np.array(compiled(x[0], x[1], x[2], rate))
+        return np.array(scalar_field(x[0], x[1], x[2], rate))
 
     return field
 
@@ -88,20 +88,20 @@ def _scipy_field(rate: float) -> Callable:
 
 
 def diffrax_run(solver: str, tolerance: float, x0, t_end: float, rate: float) -> PeerRun:
-    """A Runge-Kutta method of diffrax, by name, with its PID controller."""
+    """Return a run by a Runge-Kutta method of diffrax, by name, with its PID controller."""
     dfx, x0 = import_peer("diffrax"), np.asarray(x0, dtype=float)
     end = _diffrax_end(solver, t_end, rate)
 
     def path():
-        saved = dfx.SaveAt(t0=True, steps=True)
-        times, states = _diffrax_solve(solver, t_end, rate, saved, 100_000)(x0, tolerance)
+        saveat = dfx.SaveAt(t0=True, steps=True)
+        times, states = _diffrax_solve(solver, t_end, rate, saveat, 100_000)(x0, tolerance)
         return np.asarray(states)[np.isfinite(np.asarray(times))]
 
     return PeerRun(lambda: np.asarray(end(x0, tolerance)), path)
 
 
 def diffrax_ensemble(solver: str, tolerance: float, x0s: np.ndarray, t_end: float, rate: float) -> Callable:
-    """The states at the end from all of the x0s, under ``vmap``."""
+    """Return a function that gives the final states from all x0s, computed under ``vmap``."""
     ends = _diffrax_ends(solver, t_end, rate)
     return lambda: np.asarray(ends(x0s, tolerance))
 
@@ -119,7 +119,7 @@ def _diffrax_end(solver: str, t_end: float, rate: float) -> Callable:
 
 
 def _diffrax_solve(solver, t_end, rate, saveat, max_steps) -> Callable:
-    """Times and states as diffrax returns them, compiled; NaN where it gave up."""
+    """Return a compiled function that gives diffrax's times and states, or NaN if diffrax gave up."""
     dfx, jax = import_peer("diffrax"), import_peer("jax")
     jnp = jax.numpy
 
@@ -149,12 +149,12 @@ def _diffrax_solve(solver, t_end, rate, saveat, max_steps) -> Callable:
 
 
 def heyoka_run(tolerance: float, x0, t_end: float, rate: float) -> PeerRun:
-    """Taylor series of the order that the tolerance asks for."""
+    """Return a run by heyoka's Taylor series, whose order follows from the tolerance."""
     return heyoka_equations_run(_heyoka_system(rate), tolerance, x0, t_end)
 
 
 def heyoka_equations_run(equations: list, tolerance: float, x0, t_end: float) -> PeerRun:
-    """The same for other equations: pairs of a variable and its derivative."""
+    """Return a run of heyoka for given equations: pairs of a variable and its derivative."""
     hy, x0 = import_peer("heyoka"), np.asarray(x0, dtype=float)
     integrator = hy.taylor_adaptive(equations, x0, tol=tolerance)
 
@@ -179,55 +179,59 @@ def heyoka_equations_run(equations: list, tolerance: float, x0, t_end: float) ->
 
 
 def heyoka_threads(tolerance: float, x0s: np.ndarray, t_end: float, rate: float) -> Callable:
-    """The states at the end from all of the x0s: a SIMD integrator for each core, and the batches dealt out to them."""
+    """Return a function that gives the final states from all x0s: one SIMD integrator per core, which share the
+    batches."""
     return heyoka_equations_threads(_heyoka_system(rate), tolerance, x0s, t_end)
 
 
 def heyoka_equations_threads(equations: list, tolerance: float, x0s: np.ndarray, t_end: float) -> Callable:
-    """The same for other equations: pairs of a variable and its derivative."""
+    """Return a function like that of :func:`heyoka_threads` for given equations: pairs of a variable and its
+    derivative."""
     hy, (batches, states) = import_peer("heyoka"), _simd_batches(x0s)
-    first = hy.taylor_adaptive_batch(equations, states[0].copy(), tol=tolerance)
-    integrators = [copy.deepcopy(first) for _ in range(available_cores())]
+    first_integrator = hy.taylor_adaptive_batch(equations, states[0].copy(), tol=tolerance)
+    integrators = [copy.deepcopy(first_integrator) for _ in range(available_cores())]
 
-    def work(which: int) -> np.ndarray:
-        integrator, mine = integrators[which], states[which :: len(integrators)]
-        found = np.empty_like(mine)
-        for start, end in zip(mine, found, strict=True):
+    def work(thread: int) -> np.ndarray:
+        integrator, thread_batches = integrators[thread], states[thread :: len(integrators)]
+        final_states = np.empty_like(thread_batches)
+        for start, end in zip(thread_batches, final_states, strict=True):
             integrator.set_time(0.0)
             integrator.state[:] = start
             integrator.propagate_until(t_end)
             end[:] = integrator.state
-        return found
+        return final_states
 
     def ends():
-        found = np.empty((batches, *states.shape[1:]))
+        final_states = np.empty((batches, *states.shape[1:]))
         with ThreadPoolExecutor(len(integrators)) as threads:
-            for which, part in enumerate(threads.map(work, range(len(integrators)))):
-                found[which :: len(integrators)] = part
-        return found.swapaxes(1, 2).reshape(-1, x0s.shape[1])[: len(x0s)]
+            for thread, thread_states in enumerate(threads.map(work, range(len(integrators)))):
+                final_states[thread :: len(integrators)] = thread_states
+        return final_states.swapaxes(1, 2).reshape(-1, x0s.shape[1])[: len(x0s)]
 
     return ends
 
 
 def heyoka_ensemble(tolerance: float, x0s: np.ndarray, t_end: float, rate: float) -> Callable:
-    """The states at the end from all of the x0s: heyoka's own ensemble mode, with a copy of an integrator a batch."""
+    """Return a function that gives the final states from all x0s by heyoka's ensemble mode, one integrator copy per
+    batch."""
     hy, (batches, states) = import_peer("heyoka"), _simd_batches(x0s)
     integrator = hy.taylor_adaptive_batch(_heyoka_system(rate), states[0].copy(), tol=tolerance)
 
-    def start(copied, i):
-        copied.set_time(0.0)
-        copied.state[:] = states[i]
-        return copied
+    def start(integrator_copy, i):
+        integrator_copy.set_time(0.0)
+        integrator_copy.state[:] = states[i]
+        return integrator_copy
 
     def ends():
-        finished = hy.ensemble_propagate_until_batch(integrator, t_end, batches, start)
-        return np.stack([one[0].state for one in finished]).swapaxes(1, 2).reshape(-1, 3)[: len(x0s)]
+        outcomes = hy.ensemble_propagate_until_batch(integrator, t_end, batches, start)
+        return np.stack([one[0].state for one in outcomes]).swapaxes(1, 2).reshape(-1, 3)[: len(x0s)]
 
     return ends
 
 
 def _simd_batches(x0s: np.ndarray) -> tuple[int, np.ndarray]:
-    """States as batches for heyoka, shape (batches, n, lanes); the last is filled up with states from the front."""
+    """Return the number of batches for heyoka and the states, shape (batches, n, lanes), padded with states from the
+    front."""
     lanes = import_peer("heyoka").recommended_simd_size()
     batches = -(-len(x0s) // lanes)
     return batches, np.resize(x0s, (batches, lanes, x0s.shape[1])).swapaxes(1, 2).copy()
@@ -239,7 +243,7 @@ def _heyoka_system(rate: float) -> list:
 
 
 def equations_for_heyoka(field: Callable, dim: int) -> list:
-    """The equations of motion of a vector field, from its scalar program: nothing is typed twice."""
+    """Return the equations of a vector field from its traced scalar program, so that no formula is written twice."""
     hy = import_peer("heyoka")
     program = scalarize(jax.make_jaxpr(field)(jnp.zeros(dim)))
     variables = [hy.make_vars(f"x{i}") for i in range(dim)]
@@ -248,8 +252,8 @@ def equations_for_heyoka(field: Callable, dim: int) -> list:
         name = str(op)
         function = getattr(operator, {"div": "truediv"}.get(name, name), None) or getattr(hy, name)
         values[target] = function(*(values[a] if isinstance(a, str) else a for a in args))
-    found = [values[a] if isinstance(a, str) else hy.expression(a) for a in program.outputs[0]]
-    return list(zip(variables, found, strict=True))
+    derivatives = [values[a] if isinstance(a, str) else hy.expression(a) for a in program.outputs[0]]
+    return list(zip(variables, derivatives, strict=True))
 
 
 def _require_time_limit(hy, outcome) -> None:

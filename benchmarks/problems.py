@@ -1,4 +1,4 @@
-"""The systems that are timed."""
+"""The benchmark systems."""
 
 from __future__ import annotations
 
@@ -9,16 +9,19 @@ import liethermo as lt
 import manifolds as mf
 
 INERTIA = (10.0, 5.0, 1.0)
+"""Moments of inertia of the body of [BFM §4.3, Fig. 1]."""
 X0 = (0.001, 1.0, 0.001)
-"""The body of [BFM §4.3, Fig. 1], set spinning about its middle axis."""
+"""Initial angular momentum, nearly along the middle axis [BFM §4.3, Fig. 1]."""
 
 STIFFNESS = 0.1
+"""Coefficient of the quartic term of :func:`general_body`."""
 
 
 def body_field(x, y, z, rate):
-    """The relaxed rigid body for the peers, by hand: ``Pi' = (Pi + rate Omega × Pi) × Omega``, three scalars.
+    """Return the field of the relaxed rigid body for the peers, three scalars: ``Pi' = (Pi + rate Omega × Pi) ×
+    Omega``.
 
-    Plain arithmetic, so that numba, JAX and heyoka can each make of it what suits them.
+    It is plain arithmetic, so that numba, JAX and heyoka can each compile it.
     """
     a, b, c = x / INERTIA[0], y / INERTIA[1], z / INERTIA[2]
     u, v, w = x + rate * (b * z - c * y), y + rate * (c * x - a * z), z + rate * (a * y - b * x)
@@ -26,12 +29,12 @@ def body_field(x, y, z, rate):
 
 
 def quadratic_body(rate: float) -> lt.LiePoissonSystem:
-    """The relaxed rigid body, H and S given as ``lt.Quadratic``."""
+    """Return the relaxed rigid body with H and S as ``lt.Quadratic``."""
     return lt.models.rigid_body(INERTIA, rate)
 
 
 def function_body(rate: float) -> lt.LiePoissonSystem:
-    """The same body, H and S given as plain functions: nothing tells the library that they are quadratic."""
+    """Return the relaxed rigid body with H and S as plain functions, not declared as quadratic."""
     inertia = jnp.array(INERTIA)
     return lt.LiePoissonSystem(
         mf.so(3),
@@ -42,7 +45,7 @@ def function_body(rate: float) -> lt.LiePoissonSystem:
 
 
 def general_body(rate: float) -> lt.LiePoissonSystem:
-    """H quartic and S logarithmic, as in c/general.c."""
+    """Return a body with a quartic H and a logarithmic S, as in c/general.c."""
     inertia = jnp.array(INERTIA)
     return lt.LiePoissonSystem(
         mf.so(3),
@@ -53,17 +56,18 @@ def general_body(rate: float) -> lt.LiePoissonSystem:
 
 
 def body_parameters(rate: float) -> list[float]:
-    """The ``Problem`` of c/rigid_body.c and c/ensemble.c."""
+    """Return the ``Problem`` of c/rigid_body.c and c/ensemble.c."""
     return [*(1.0 / moment for moment in INERTIA), rate]
 
 
 def general_parameters(rate: float) -> list[float]:
-    """The ``Problem`` of c/general.c."""
+    """Return the ``Problem`` of c/general.c."""
     return [*body_parameters(rate), STIFFNESS]
 
 
 def generalized_body(g: mf.LieAlgebra, rate: float) -> lt.LiePoissonSystem:
-    """A body on any algebra whose Killing form is definite: distinct inertias, and that form's Casimir for entropy."""
+    """Return a body on an algebra with a definite Killing form: distinct inertias, and the form's Casimir as
+    entropy."""
     inertia = 1.0 + np.arange(g.dim) / g.dim
     killing = -g.killing_form()
     inverse = np.linalg.inv(killing)
@@ -72,6 +76,6 @@ def generalized_body(g: mf.LieAlgebra, rate: float) -> lt.LiePoissonSystem:
 
 
 def random_states(bodies: int, dim: int = 3) -> np.ndarray:
-    """States of norm one in random directions, shape (bodies, dim)."""
+    """Return states of norm one in random directions, shape (bodies, dim)."""
     states = np.random.default_rng(0).standard_normal((bodies, dim))
     return states / np.linalg.norm(states, axis=1, keepdims=True)

@@ -9,13 +9,15 @@ import numpy as np
 from .problems import INERTIA
 
 DECIMAL_DIGITS = 40
+"""Digits of the decimal arithmetic."""
 TAYLOR_ORDER = 30
+"""Order of the Taylor series."""
 TAYLOR_STEP = Decimal("0.25")
-"""The series' terms fall by a factor of ten or more at this step for states of norm one: what is left out is 1e-30."""
+"""Step of the series; for states of norm one its terms fall by a factor of ten or more, so the error is 1e-30."""
 
 
 def exact_state(x0, rate: float, t_end: float) -> np.ndarray:
-    """The state at ``t_end``, a multiple of 1/4, from x0; correct to double precision."""
+    """Return the state at ``t_end``, a multiple of 1/4, from x0, correct to double precision."""
     with localcontext(prec=DECIMAL_DIGITS):
         x = [Decimal(float(a)) for a in x0]
         for _ in range(int(Decimal(t_end) / TAYLOR_STEP)):
@@ -25,7 +27,7 @@ def exact_state(x0, rate: float, t_end: float) -> np.ndarray:
 
 
 def _taylor_coefficients(x0: list[Decimal], rate: Decimal) -> list[list[Decimal]]:
-    """Taylor coefficients of the three components, from those before by the field of :func:`.problems.body_field`."""
+    """Return the Taylor coefficients of the three components, by the recursion of :func:`.problems.body_field`."""
     inverse = [1 / Decimal(moment) for moment in INERTIA]
     x: list[list[Decimal]] = [[a] for a in x0]
     w: list[list[Decimal]] = [[], [], []]
@@ -42,6 +44,6 @@ def _taylor_coefficients(x0: list[Decimal], rate: Decimal) -> list[list[Decimal]
 
 
 def _cross_coefficient(a, b, i: int, n: int) -> Decimal:
-    """Coefficient n of component i of the cross product of two series."""
+    """Return coefficient n of component i of the cross product of two series."""
     j, k = (i + 1) % 3, (i + 2) % 3
     return sum((a[j][m] * b[k][n - m] - a[k][m] * b[j][n - m] for m in range(n + 1)), Decimal(0))

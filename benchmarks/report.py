@@ -1,4 +1,4 @@
-"""What a measurement returns: tables of plain numbers, and targets; written as JSON and as Markdown."""
+"""Reports of measurements: tables of plain numbers, and targets, written as JSON and as Markdown."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from typing import Any
 
 
 class UnavailableError(Exception):
-    """A contestant that cannot take part on this machine; the message says why."""
+    """A contestant cannot take part on this machine; the message gives the reason."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table; ``columns`` gives each column's heading and how its numbers are written, a name in :data:`FORMATS`."""
+    """A table; ``columns`` maps each heading to the format of its numbers, a name in :data:`FORMATS`."""
 
     caption: str
     columns: dict[str, str]
@@ -39,7 +39,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Target:
-    """A figure that the library is meant to reach: at most ``bound``, or at least. None where it was not measured."""
+    """A figure that the library should reach: at most ``bound``, or at least; None if it was not measured."""
 
     work: str
     bound: float
@@ -54,24 +54,24 @@ class Target:
         return "met" if (self.measured >= self.bound if self.at_least else self.measured <= self.bound) else "missed"
 
     def row(self) -> list[str]:
-        wanted = f"{'≥' if self.at_least else '≤'} {_format_cell(self.bound, self.kind)}"
-        return [self.work, wanted, _format_cell(self.measured, self.kind), self.verdict]
+        limit = f"{'≥' if self.at_least else '≤'} {_format_cell(self.bound, self.kind)}"
+        return [self.work, limit, _format_cell(self.measured, self.kind), self.verdict]
 
 
 @dataclass(frozen=True)
 class Report:
-    """One measurement.
+    """The report of one measurement.
 
     Attributes
     ----------
     title, text : str
-        What was done, for a reader of the page.
+        Description for a reader of the page.
     tables : list of Table
     targets : list of Target
     skipped : dict
         Contestants that did not take part, with the reason.
     series : dict
-        Curves for a figure: for each name the points, as [x, y].
+        Curves of a figure: for each name the points, as [x, y].
     """
 
     title: str
@@ -104,7 +104,7 @@ def targets_table(targets: Sequence[Target]) -> Table:
 
 
 def build_available(builders: Mapping[Any, Callable[[], Any]]) -> tuple[dict[Any, Any], dict[Any, str]]:
-    """What each builder returns, and the reasons of those that raise :class:`UnavailableError`."""
+    """Return the results of the builders, and the reasons of those that raise :class:`UnavailableError`."""
     works, skipped = {}, {}
     for name, build in builders.items():
         try:
@@ -119,14 +119,14 @@ def ratio(a: float | None, b: float | None) -> float | None:
 
 
 def _escape_bars(text: str) -> str:
-    """Bars that belong to the text, not to the table."""
+    """Escape bars in the text, which would separate cells of the table."""
     return text.replace("|", r"\|")
 
 
 def _format_seconds(s: float) -> str:
-    for unit, size in ("s", 1.0), ("ms", 1e-3), ("µs", 1e-6):
-        if s >= size:
-            return f"{s / size:.3g} {unit}"
+    for unit, unit_seconds in ("s", 1.0), ("ms", 1e-3), ("µs", 1e-6):
+        if s >= unit_seconds:
+            return f"{s / unit_seconds:.3g} {unit}"
     return f"{s / 1e-9:.3g} ns"
 
 
@@ -141,6 +141,7 @@ FORMATS: dict[str, Callable[[Any], str]] = {
     "precise": lambda a: f"{a:.4f}",
     "gigabytes": lambda a: f"{a / 1e9:.2f} GB",
 }
+"""Functions that format a number, by name."""
 
 
 def _format_cell(a: Any, kind: str) -> str:

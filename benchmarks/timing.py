@@ -1,7 +1,7 @@
-"""Timing on a machine that does other things too: contestants take turns, and the best time of each counts.
+"""Timing on a busy machine: contestants take turns, and the best time of each counts.
 
-Disturbances only ever add time, so the minimum is the estimate that they spoil least; taking turns spreads a slow spell
-over everyone.
+Disturbances only add time, so the minimum is the most robust estimate; taking turns distributes a slow period over all
+contestants.
 """
 
 from __future__ import annotations
@@ -12,21 +12,22 @@ from dataclasses import dataclass
 from typing import Any
 
 MIN_TURN_SECONDS = 0.1
-"""Seconds that a turn lasts at least: short work, which a disturbance spoils most, is repeated and timed each time."""
+"""Minimum duration of a turn in seconds; short work, which disturbances affect most, is repeated and timed each
+time."""
 
 
 @dataclass(frozen=True)
 class TimedResult:
-    """The best times, and what the work returned.
+    """The best times of a work, and its result.
 
     Attributes
     ----------
     wall_seconds : float
-        By the clock on the wall.
+        Elapsed time.
     cpu_seconds : float
-        Of the processor: what other processes do is not counted, so that for work in one thread it is what the wall
-        would show on an idle machine. Not to be used for work in several: Linux books the time of other threads at its
-        next tick, so that the least of many short times is too small.
+        Processor time, which excludes other processes: for work in one thread it is the elapsed time on an idle
+        machine. It is unsuitable for work in several threads: Linux books the time of other threads at its next tick,
+        so that the least of many short times is too small.
     result : object
     """
 
@@ -44,26 +45,29 @@ def race(works: Mapping[Any, Callable[[], Any]], *, rounds: int, max_seconds: fl
         Each is called once before the first round, which compiles it and fills the caches.
     rounds : int
     max_seconds : float
-        Seconds after which a contestant sits out the remaining rounds, at least two taken.
+        Seconds after which a contestant skips the remaining rounds, but at least two are taken.
 
     Returns
     -------
-    dict of Outcome
+    dict of TimedResult
     """
     results = {name: work() for name, work in works.items()}
-    best = dict.fromkeys(works, (float("inf"), float("inf")))
-    spent = dict.fromkeys(works, 0.0)
+    best_seconds = dict.fromkeys(works, (float("inf"), float("inf")))
+    spent_seconds = dict.fromkeys(works, 0.0)
     for turn in range(rounds):
         for name, work in works.items():
-            if turn < 2 or spent[name] < max_seconds:
-                fastest, total = _time_turn(work)
-                best[name] = (min(best[name][0], fastest[0]), min(best[name][1], fastest[1]))
-                spent[name] += total
-    return {name: TimedResult(*best[name], results[name]) for name in works}
+            if turn < 2 or spent_seconds[name] < max_seconds:
+                turn_seconds, total = _time_turn(work)
+                best_seconds[name] = (
+                    min(best_seconds[name][0], turn_seconds[0]),
+                    min(best_seconds[name][1], turn_seconds[1]),
+                )
+                spent_seconds[name] += total
+    return {name: TimedResult(*best_seconds[name], results[name]) for name in works}
 
 
 def time_once(work: Callable[[], Any]) -> TimedResult:
-    """Time a work that can only be done once, such as compiling."""
+    """Time a work that can be done only once, such as compiling."""
     start, start_processor = time.perf_counter(), time.process_time()
     result = work()
     return TimedResult(time.perf_counter() - start, time.process_time() - start_processor, result)
@@ -73,7 +77,7 @@ def _time_turn(work) -> tuple[tuple[float, float], float]:
     seconds = processor = float("inf")
     total = 0.0
     while total < MIN_TURN_SECONDS:
-        one = time_once(work)
-        seconds, processor = min(seconds, one.wall_seconds), min(processor, one.cpu_seconds)
-        total += one.wall_seconds
+        timed = time_once(work)
+        seconds, processor = min(seconds, timed.wall_seconds), min(processor, timed.cpu_seconds)
+        total += timed.wall_seconds
     return (seconds, processor), total

@@ -1,4 +1,4 @@
-"""Work against precision of the methods on four problems: the picture of the page on choosing a method.
+"""Work against precision of the methods on four problems: the figure of the page on choosing a method.
 
 ``python -m benchmarks.which_method`` writes ``docs/howto/which_method.svg``. Work is counted in evaluations of the
 vector field in a run, stages times iterations, so that it is the same on every machine; precision is the largest error
@@ -20,12 +20,16 @@ import liethermo as lt
 import manifolds as mf
 
 FIGURE_PATH = Path(__file__).resolve().parent.parent / "docs" / "howto" / "which_method.svg"
-STEP_SIZES, N_RUNS = tuple(0.8 / 2**k for k in range(7)), 100
+"""Path of the figure."""
+STEP_SIZES = tuple(0.8 / 2**k for k in range(7))
+"""Step sizes of each method."""
+N_RUNS = 100
+"""Number of runs whose largest error counts."""
 
 
 @dataclass(frozen=True)
 class Problem:
-    """A system, where it starts, and how long it runs."""
+    """A system, its initial state, and the duration of the runs."""
 
     title: str
     build_system: Callable[[], lt.System]
@@ -38,7 +42,7 @@ def _rigid_body() -> lt.System:
     return lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
 
 
-def _so4_body() -> lt.System:
+def _four_dimensional_body() -> lt.System:
     g = mf.so(4)
     inertia = jnp.array([1.0, 1.5, 2.0, 2.5, 3.0, 3.5])
     return lt.LiePoissonSystem(
@@ -56,12 +60,12 @@ def _oscillator() -> lt.System:
 
 
 def _stiff_exchange() -> lt.System:
-    def moving(x):
+    def block_energy(x):
         return 0.5 * x[1] ** 2 + jnp.exp(x[2])
 
     return lt.ComposedSystem(
         {
-            "block": lt.Subsystem(moving, 3, friction=0.3),
+            "block": lt.Subsystem(block_energy, 3, friction=0.3),
             "bed": lt.Subsystem(lambda x: 2.0 * jnp.exp(x[0] / 2.0), 1),
         },
         coupling=lambda q: 0.5 * jnp.sum(q**2),
@@ -71,10 +75,11 @@ def _stiff_exchange() -> lt.System:
 
 PROBLEMS = (
     Problem("relaxing body, so(3)", _rigid_body, (0.06, 0.1, 1.0), 40.0, 0.05),
-    Problem("body in four dimensions, so(4)", _so4_body, (0.9, 0.3, -0.5, 0.2, 0.6, -0.4), 20.0, 0.05),
+    Problem("body in four dimensions, so(4)", _four_dimensional_body, (0.9, 0.3, -0.5, 0.2, 0.6, -0.4), 20.0, 0.05),
     Problem("oscillator and its heat", _oscillator, (1.0, 0.0, -2.0), 20.0, 0.05),
     Problem("stiff exchange of heat", _stiff_exchange, (2.0, 0.0, 0.4, 0.0), 10.0, 0.002),
 )
+"""The four problems."""
 
 METHODS = (
     lt.MetriplecticRungeKutta(4),
@@ -84,30 +89,31 @@ METHODS = (
     lt.MetriplecticGauss(2),
     lt.MetriplecticGauss(3),
 )
+"""The methods that are compared."""
 
 
 def measure_methods(problem: Problem) -> dict[str, list[tuple[float, float]]]:
-    """For each method points (error, evaluations); a step that a method cannot take from every state has none."""
+    """Return points (error, evaluations) for each method; steps that fail from some state are left out."""
     system, span = problem.build_system(), (0.0, problem.t_end)
     states = np.array(problem.initial_state) * (
         1.0 + 0.1 * np.random.default_rng(0).standard_normal((N_RUNS, system.dim))
     )
     exact = lt.ensemble(system, states, span, problem.reference_step, lt.MetriplecticGauss(6), progress=False).x
     assert exact is not None  # final states are kept
-    found: dict[str, list[tuple[float, float]]] = {str(method): [] for method in METHODS}
+    points: dict[str, list[tuple[float, float]]] = {str(method): [] for method in METHODS}
     for method in METHODS:
         for step in STEP_SIZES:
-            many = lt.ensemble(system, states, span, step, method, progress=False)
-            if many.ok.all():
-                error = float(np.abs(np.asarray(many.x) - exact).max() / np.abs(exact).max())
-                found[str(method)].append(
-                    (max(error, 1e-15), float(many.iterations.mean()) * method.evaluations_per_iteration)
+            result = lt.ensemble(system, states, span, step, method, progress=False)
+            if result.ok.all():
+                error = float(np.abs(np.asarray(result.x) - exact).max() / np.abs(exact).max())
+                points[str(method)].append(
+                    (max(error, 1e-15), float(result.iterations.mean()) * method.evaluations_per_iteration)
                 )
-    return found
+    return points
 
 
 def draw_figure(results: dict[str, dict[str, list[tuple[float, float]]]], path: Path) -> None:
-    """One frame for each problem."""
+    """Draw the curves, one frame for each problem."""
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 

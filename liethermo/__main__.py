@@ -1,4 +1,4 @@
-"""``python -m liethermo`` is the command ``liethermo``."""
+"""Run the command ``liethermo`` by ``python -m liethermo``."""
 
 from .cli import main
 

@@ -1,6 +1,6 @@
-"""Rigid bodies: how they are turned along a run, the periods of their free motion, and how fast they come to a spin.
+"""Rigid bodies: their orientation during a run, the periods of their free motion, and the time to reach a spin.
 
-Units are SI or any others that are consistent; angles are in radians.
+Units are SI or any other consistent ones; angles are in radians.
 """
 
 from __future__ import annotations

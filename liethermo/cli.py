@@ -1,4 +1,4 @@
-"""The command line. What a command needs is imported inside it, so that ``--help`` is quick."""
+"""The command line. Each command imports what it needs itself, so that ``--help`` is quick."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from .systems.check import CheckReport
 
 EXIT_LAWS_FAILED = 1
-"""Exit status where a law or an axiom fails, or the run stopped early."""
+"""Exit status if a law or an axiom fails, or the run stopped early."""
 
 EXIT_BAD_INPUT = 2
-"""Exit status for a spec or a file that cannot be used."""
+"""Exit status for a spec or a file that is invalid."""
 
 app = typer.Typer(
     add_completion=False,
@@ -37,8 +37,8 @@ app = typer.Typer(
 )
 
 
-def _print_version(wanted: bool) -> None:
-    if wanted:
+def _print_version(is_requested: bool) -> None:
+    if is_requested:
         from importlib.metadata import version
 
         typer.echo(f"liethermo {version('liethermo')}")
@@ -67,7 +67,7 @@ SpecFile = Annotated[Path, typer.Argument(metavar="SPEC.toml", help="The run, de
 
 @contextlib.contextmanager
 def _report_errors() -> Iterator[None]:
-    """Tell the library's errors in a message and an exit status, without a traceback."""
+    """Print errors of the library as a message and exit with a status, without a traceback."""
     from manifolds import ManifoldsError
 
     from .errors import AxiomError, LiethermoError
@@ -112,12 +112,12 @@ def run(
         save_to=file,
     ).with_provenance(spec=plan.table)
     solution.save(file)
-    passed = _print_audit(solution)
+    laws_hold = _print_audit(solution)
     if not solution.status.ok:
         typer.echo(f"The run stopped early. The trajectory up to t = {solution.t[-1]:g} is kept.")
     figures = _draw_figures(plan, system, solution, folder)
     typer.echo(f"In {folder}{os.sep}: {', '.join([file.name, *figures, spec.name])}")
-    raise typer.Exit(0 if passed and solution.status.ok else EXIT_LAWS_FAILED)
+    raise typer.Exit(0 if laws_hold and solution.status.ok else EXIT_LAWS_FAILED)
 
 
 @app.command()
@@ -133,30 +133,30 @@ def study(
     change: SetOptions = None,
     allow: AllowedModules = None,
 ) -> None:
-    """Run the study of a spec file, or what of it is not done yet; audit the laws, and draw a measure."""
+    """Run the unfinished points of a study, audit the laws, and draw a measure."""
     from .spec import read
     from .spec.study import build_study
 
     plan = read(spec, change or (), allow or ())
     store = Path(f"{spec.stem}.zarr") if out is None else out
-    found = build_study(plan, store)
+    parameter_study = build_study(plan, store)
     typer.echo(plan.summary)
     with _dask_client(cluster, spec.resolve().parent) as client:
-        reached = found.run(client)
-    typer.echo(str(reached))
-    passed = _print_table(found.audit())
-    if plan.study is not None and reached.done:
+        study_status = parameter_study.run(client)
+    typer.echo(str(study_status))
+    laws_hold = _print_table(parameter_study.audit())
+    if plan.study is not None and study_status.done:
         _draw_study(store, plan.study.figure, store.with_suffix(f".{plan.outputs.figure_format}"))
-    raise typer.Exit(0 if passed and reached.ok else EXIT_LAWS_FAILED)
+    raise typer.Exit(0 if laws_hold and study_status.ok else EXIT_LAWS_FAILED)
 
 
 @app.command()
 @_report_errors()
 def status(store: StoreFolder) -> None:
-    """Tell how far the study in a store is, also while it runs."""
-    from .studies.store_results import load_status as told_of
+    """Print the progress of the study in a store, also while it runs."""
+    from .studies.store_results import load_status
 
-    typer.echo(str(told_of(store)))
+    typer.echo(str(load_status(store)))
 
 
 @app.command()
@@ -205,7 +205,7 @@ def models() -> None:
 
 @app.command()
 def methods() -> None:
-    """List the methods that a spec file can name, with their orders, what they keep exactly, and what they are for."""
+    """List the methods that a spec file can name, with their orders, exact conservation laws and purposes."""
     from rich.console import Console
     from rich.table import Table
 
@@ -213,8 +213,8 @@ def methods() -> None:
 
     table = Table("method", "order", "keeps exactly", "for", box=None, pad_edge=False)
     for method in registered_methods(special=True):
-        kept = ", ".join(sorted(name.replace("_", " ") for name in method.preserves))
-        table.add_row(str(method), str(method.order), kept or "-", method.systems)
+        guarantees = ", ".join(sorted(name.replace("_", " ") for name in method.preserves))
+        table.add_row(str(method), str(method.order), guarantees or "-", method.systems)
     Console(markup=False).print(table)
 
 
@@ -240,7 +240,7 @@ def main() -> None:
 
 
 def _prepare_result_folder(spec: Path, folder: Path) -> Path:
-    """The folder of the results, made ready, with a copy of the spec: a place that cannot be written shows at once."""
+    """Create the folder of the results and copy the spec into it, so that an unwritable folder fails at once."""
     from .errors import FileError
 
     try:
@@ -253,21 +253,21 @@ def _prepare_result_folder(spec: Path, folder: Path) -> Path:
 
 
 def _draw_figures(plan: Spec, system: System, solution: Solution, folder: Path) -> list[str]:
-    """Draw the figures of a spec; returns the names of their files."""
-    os.environ.setdefault("MPLBACKEND", "agg")  # files only: no window, and no screen needed
+    """Draw the figures of a spec; return the names of their files."""
+    os.environ.setdefault("MPLBACKEND", "agg")  # write files without a display
     from .results import plot
 
     files = []
     for name in plan.outputs.figures:
         figure = getattr(plot, name)
-        more = {"system": system} if "system" in inspect.signature(figure).parameters else {}
+        options = {"system": system} if "system" in inspect.signature(figure).parameters else {}
         files.append(f"{name}.{plan.outputs.figure_format}")
-        figure(solution, path=folder / files[-1], **more)
+        figure(solution, path=folder / files[-1], **options)
     return files
 
 
 def _print_audit(result: Solution | Ensemble) -> bool:
-    """Print how a run, or each of many, ended and whether the laws held; returns whether they did."""
+    """Print the status of a run or an ensemble and its audit; return True if all laws hold."""
     from .results.solution import Solution
 
     audit = result.audit()
@@ -279,7 +279,7 @@ def _print_audit(result: Solution | Ensemble) -> bool:
 
 
 def _print_table(table: Audit | CheckReport) -> bool:
-    """Print an audit, or a check, its verdicts in colours; returns whether all holds."""
+    """Print an audit or a check with coloured verdicts; return True if it passed."""
     text = str(table).replace(" FAILS", " " + typer.style("FAILS", fg="red", bold=True))
     typer.echo(re.sub(r" ok(?= |$)", " " + typer.style("ok", fg="green"), text, flags=re.MULTILINE))
     return table.passed
@@ -287,7 +287,7 @@ def _print_table(table: Audit | CheckReport) -> bool:
 
 @contextlib.contextmanager
 def _dask_client(address: str | None, folder: Path) -> Iterator[Any]:
-    """A client of a Dask cluster, which is sent what is defined in a folder; None where no address was given."""
+    """Yield a client of a Dask cluster to which modules in a folder are sent, or None without an address."""
     if address is None:
         yield None
         return
@@ -305,14 +305,14 @@ def _dask_client(address: str | None, folder: Path) -> Iterator[Any]:
 
 
 def _draw_study(store: Path, measure: str | None, file: Path) -> None:
-    """Draw a measure of a store into a file, and tell of it; where none can be drawn, why."""
+    """Draw a measure of a store into a file; without a named measure, an undrawable store only prints the reason."""
     os.environ.setdefault("MPLBACKEND", "agg")
     from .errors import InputError
-    from .results.plot import study as draw
+    from .results.plot import study as draw_study
     from .studies.store_results import load_study
 
     try:
-        draw(load_study(store), measure, file)
+        draw_study(load_study(store), measure, file)
         typer.echo(f"In {store}; drawn in {file}")
     except InputError as error:
         if measure is not None:

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, however a process ends and whoever else writes there."""
+"""Atomic writing of files, safe against killed processes and several writers."""
 
 from __future__ import annotations
 
@@ -13,28 +13,30 @@ import time
 from pathlib import Path
 
 PART_SUFFIX = ".part"
-"""How the name of a file ends that is being written."""
+"""Suffix of the name of a file that is being written."""
 
 STALE_PART_SECONDS = 86_400.0
-"""Seconds after which a part that another machine has left is taken for that of a dead process."""
+"""Age in seconds at which a partial file of another machine, whose process cannot be checked, counts as abandoned."""
 
 PART_NAME_PATTERN = re.compile(r"\.[0-9a-f]{12}\.([0-9a-f]{8})\.(\d+)\.[0-9a-f]{16}\.part")
-"""Names of parts: what they are to become, the machine and the process that write them, and a random number."""
+"""Names of partial files: digests of the final name and of the host, process id, and a random number."""
 
 EXCLUSIVE_WRITE_FLAGS = (
     os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)
 )
+"""Flags that create a new file, and neither overwrite a file nor follow a link."""
 
 
 def write_atomically(path: Path, data: bytes | memoryview, mode: int = 0o666) -> None:
-    """Write a file whole: under a random name of its own, then renamed. The last of several writers wins.
+    """Write a file under a random name, then rename it, so that it appears complete or not at all.
 
-    Parts that dead processes have left of the same file are removed.
+    The last of several writers wins. Partial files of killed processes remain until :func:`remove_dead_parts` is
+    called.
 
     Raises
     ------
     OSError
-        With nothing left behind.
+        If the file cannot be written; the partial file is removed.
     """
     part = path.with_name(part_name(path.name))
     if path.exists() and not path.is_file():
@@ -55,12 +57,13 @@ def write_atomically(path: Path, data: bytes | memoryview, mode: int = 0o666) ->
 
 
 def part_name(name: str) -> str:
-    """A name for a part of a file or folder of this name."""
-    return f".{_name_digest(name, 12)}.{_name_digest(socket.gethostname(), 8)}.{os.getpid()}.{secrets.token_hex(8)}{PART_SUFFIX}"
+    """Return a name for a partial copy of the file or folder ``name``."""
+    writer = f"{_name_digest(socket.gethostname(), 8)}.{os.getpid()}"
+    return f".{_name_digest(name, 12)}.{writer}.{secrets.token_hex(8)}{PART_SUFFIX}"
 
 
 def remove_dead_parts(folder: Path, name: str) -> None:
-    """Remove the parts of a file or folder of this name that dead processes have left."""
+    """Remove the partial copies of a file or folder that dead processes have left."""
     with contextlib.suppress(OSError):
         for entry in folder.glob(f".{_name_digest(name, 12)}.*{PART_SUFFIX}"):
             if is_dead(entry):
@@ -69,23 +72,23 @@ def remove_dead_parts(folder: Path, name: str) -> None:
 
 
 def is_dead(part: Path) -> bool:
-    """Whether no process writes this part any more."""
-    named = PART_NAME_PATTERN.fullmatch(part.name)
-    if named is None:
+    """Return True if the process that wrote this partial file has ended."""
+    match = PART_NAME_PATTERN.fullmatch(part.name)
+    if match is None:
         return False
-    if named[1] != _name_digest(socket.gethostname(), 8):
+    if match[1] != _name_digest(socket.gethostname(), 8):
         return time.time() - part.lstat().st_mtime > STALE_PART_SECONDS
     try:
-        os.kill(int(named[2]), 0)
+        os.kill(int(match[2]), 0)
     except ProcessLookupError:
         return True
-    except (OSError, OverflowError):  # somebody else's
+    except (OSError, OverflowError):  # a process of another user
         return False
     return False
 
 
-def why_os_failed(error: OSError | ValueError) -> str:
-    """What went wrong, in words; a ValueError means that it is not a path."""
+def describe_os_error(error: OSError | ValueError) -> str:
+    """Return the cause of an operating system error as text; a ValueError means that the path is invalid."""
     if not isinstance(error, OSError):
         return str(error)
     if error.errno in (errno.ENOSPC, errno.EDQUOT):

@@ -1,4 +1,4 @@
-"""Errors of the dynamics layer; each message says what was found, what is allowed and what to do."""
+"""Errors of the dynamics layer; each message says what is wrong, what is allowed and what to do."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ class LiethermoError(Exception):
 
 
 class InputError(LiethermoError, ValueError):
-    """A value that cannot be used: wrong shape, not finite, not positive, an unknown name."""
+    """An argument that cannot be used: wrong shape, not finite, not positive, an unknown name."""
 
 
 class FunctionError(LiethermoError, TypeError):
-    """A user's function that does not return what its role asks for."""
+    """A user's function whose result does not have the required type or shape."""
 
 
 class IndexOutOfRangeError(FunctionError, IndexError):
-    """A function with a constant index that an array does not have.
+    """A function with a constant index that is out of range for its array.
 
     Attributes
     ----------
@@ -28,10 +28,10 @@ class IndexOutOfRangeError(FunctionError, IndexError):
 
     def __init__(self, index: int, size: int, where: str, function: str = "a function"):
         self.index, self.size, self.where = index, size, where
-        last = f"counts from 0, so the last index is {size - 1}" if size else "finds no entry in it"
+        python_rule = f"counts from 0, so the last index is {size - 1}" if size else "finds no entry in it"
         super().__init__(
             f"{function} has the index {index} of an axis with {size} entries, which is out of range ({where}). "
-            f"Python {last}. JAX would take another entry without a word; where that is meant, write "
+            f"Python {python_rule}. JAX would take another entry without a word; where that is meant, write "
             f'x.at[{index}].get(mode="clip")'
         )
 
@@ -58,11 +58,11 @@ class CasimirError(AxiomError):
 
 
 class IndefiniteError(AxiomError):
-    """A form that has to be positive semidefinite has a negative eigenvalue (given as ``residual``)."""
+    """A matrix or form that must be positive semidefinite has a negative eigenvalue (given as ``residual``)."""
 
 
 class FileError(LiethermoError, OSError):
-    """A result file that is missing, cut short or not one of this library's, or that cannot be written.
+    """A result file that is missing, incomplete, foreign or cannot be written.
 
     Attributes
     ----------
@@ -104,7 +104,7 @@ class SpecError(LiethermoError, ValueError):
     Attributes
     ----------
     problems : tuple of str
-        Everything found wrong, a line each: the key, the value given and what is allowed.
+        All faults, one line each: the key, its value and what is allowed.
     """
 
     def __init__(self, path, problems):

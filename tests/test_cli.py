@@ -1,4 +1,4 @@
-"""Check the command line: its output, the files it writes, and its exit status."""
+"""The command line: what it prints, what it writes, and its exit status."""
 
 import os
 import re
@@ -22,7 +22,7 @@ EXAMPLE = Path(__file__).parents[1] / "examples" / "relaxed_rigid_body.toml"
 MODEL = '[model]\nname = "rigid_body"\n'
 RUN = "[run]\ninitial = [0.001, 1.0, 0.001]\nt_span = [0.0, 2.0]\nstep = 0.1\n"
 REFERENCE = '[method]\nname = "Reference"\nrtol = 1e-6\n'
-NO_FIGURES = "[outputs]\nfigures = []\n"
+OUTPUT_WITHOUT_FIGURES = "[outputs]\nfigures = []\n"
 
 # What a user might write; the tests run it under this name.
 MODULE = "a_users_module"
@@ -60,7 +60,7 @@ not_a_function = 3
 
 
 class Folder:
-    """Current folder of a user."""
+    """A user's current folder, with a spec and the command line."""
 
     def __init__(self, path):
         self.path = path
@@ -73,7 +73,7 @@ class Folder:
         return CliRunner().invoke(app, list(map(str, arguments)))
 
     def refusal(self, *parts):
-        """Return the lines that ``check`` prints for a spec that it refuses, one for each problem."""
+        """Return the problems that ``check`` reports for an invalid spec, one line each."""
         result = self.call("check", self.spec(*parts))
         assert result.exit_code == 2
         assert re.fullmatch(r"(spec\.toml: imports .*\n)?", result.stdout)
@@ -101,7 +101,7 @@ def function(name, parameters="{}"):
 
 @pytest.fixture(scope="module")
 def example(tmp_path_factory):
-    """Run the example of the README once; return the command's result and the folder of its files."""
+    """The example of the README, run once."""
     results = tmp_path_factory.mktemp("example") / "results"
     return CliRunner().invoke(app, ["run", str(EXAMPLE), "--out", str(results)]), results
 
@@ -140,11 +140,11 @@ def test_saved_run_is_audited(example):
 
 
 def test_result_cut_short_is_refused(example, tmp_path):
-    cut_file = tmp_path / "cut.nc"
+    truncated_file = tmp_path / "cut.nc"
     content = (example[1] / "solution.nc").read_bytes()
-    cut_file.write_bytes(content[: len(content) // 2])
+    truncated_file.write_bytes(content[: len(content) // 2])
     for file, message in (
-        (cut_file, "cut short"),
+        (truncated_file, "cut short"),
         (EXAMPLE, "cannot be read as NetCDF"),
         (tmp_path / "no.nc", "no file"),
     ):
@@ -154,7 +154,7 @@ def test_result_cut_short_is_refused(example, tmp_path):
 
 
 def test_a_law_that_fails(folder):
-    result = folder.call("run", folder.spec(MODEL, RUN.replace("2.0]", "40.0]"), REFERENCE, NO_FIGURES))
+    result = folder.call("run", folder.spec(MODEL, RUN.replace("2.0]", "40.0]"), REFERENCE, OUTPUT_WITHOUT_FIGURES))
     assert result.exit_code == 1
     assert "energy drift" in result.stdout
     assert "A LAW FAILS" in result.stdout
@@ -180,14 +180,14 @@ def test_a_run_that_stops_early_is_kept(folder):
 def test_ctrl_c_keeps_what_exists(folder, monkeypatch):
     advance, calls = CompiledEngine.advance, []
 
-    def advance_until_interrupt(*arguments):
+    def advance_once(*arguments):
         calls.append(arguments)
         if len(calls) == 2:
             raise KeyboardInterrupt
         return advance(*arguments)
 
-    monkeypatch.setattr(CompiledEngine, "advance", advance_until_interrupt)
-    result = folder.call("run", folder.spec(MODEL, RUN.replace("2.0]", "500.0]"), NO_FIGURES))
+    monkeypatch.setattr(CompiledEngine, "advance", advance_once)
+    result = folder.call("run", folder.spec(MODEL, RUN.replace("2.0]", "500.0]"), OUTPUT_WITHOUT_FIGURES))
     assert result.exit_code == 1
     assert "stopped by the user" in result.stdout
     solution = lt.load("spec/solution.nc")
@@ -206,11 +206,11 @@ def test_outputs_are_as_asked(folder):
 
 
 def test_a_process_with_a_users_function(tmp_path):
-    """Run the command in a process of its own, from a folder that is not the spec's."""
+    """A separate process, started in another folder than the spec's."""
     home = tmp_path / "home"
     home.mkdir()
     (home / f"{MODULE}.py").write_text(SOURCE)
-    (home / "mine.toml").write_text(function("build", "{rate = 2, inertia = [2, 3, 4]}") + RUN + NO_FIGURES)
+    (home / "mine.toml").write_text(function("build", "{rate = 2, inertia = [2, 3, 4]}") + RUN + OUTPUT_WITHOUT_FIGURES)
 
     def call(*arguments):
         path = os.pathsep.join([str(EXAMPLE.parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])])
@@ -240,13 +240,13 @@ def test_check_prints_the_axioms():
 
 
 def test_check_fails_with_an_axiom(folder):
-    check_of_strict_system = folder.call("check", folder.spec(function("no_casimir"), RUN))
-    assert check_of_strict_system.exit_code == 1
-    assert "not a Casimir" in check_of_strict_system.stderr
-    check_of_lax_system = folder.call("check", folder.spec(function("no_casimir", "{validate = false}"), RUN))
-    assert check_of_lax_system.exit_code == 1
-    assert "FAILS" in check_of_lax_system.stdout
-    assert "NOT metriplectic" in check_of_lax_system.stdout
+    default_check = folder.call("check", folder.spec(function("no_casimir"), RUN))
+    assert default_check.exit_code == 1
+    assert "not a Casimir" in default_check.stderr
+    unvalidated_check = folder.call("check", folder.spec(function("no_casimir", "{validate = false}"), RUN))
+    assert unvalidated_check.exit_code == 1
+    assert "FAILS" in unvalidated_check.stdout
+    assert "NOT metriplectic" in unvalidated_check.stdout
 
 
 def test_models_lists_all_with_their_parameters():
@@ -269,7 +269,7 @@ def test_methods_are_listed_with_what_they_keep():
 
 
 def test_a_variational_scheme_by_its_name(tmp_path):
-    """A variational scheme keeps the second law and not the energy, and the exit status says so."""
+    """The scheme conserves the entropy law but not the energy, and the exit status is 1."""
     spec = tmp_path / "spring.toml"
     spec.write_text(
         """
@@ -338,7 +338,7 @@ REFUSALS = {
     ),
     "value of a parameter": (
         [MODEL, "parameters = {inertia = [1, 2]}", RUN],
-        ['model.name = "rigid_body", model.parameters.inertia = [1, 2]: inertia must have shape (3,) or (3, 3), got (2,)'],
+        ['model.name = "rigid_body", model.parameters.inertia = [1, 2]: inertia has shape (3,) or (3, 3), not (2,)'],
     ),
     "method": (
         [MODEL, RUN, '[method]\nname = "Referense"'],
@@ -355,7 +355,7 @@ REFUSALS = {
         [MODEL, RUN, '[method]\ngradient = "gonzales"'],
         ["method.gradient = \"gonzales\": no discrete gradient 'gonzales'; the names are 'gonzalez', 'mean_value'"],
     ),
-    "rtol": ([MODEL, RUN, REFERENCE.replace("1e-6", "2")], ["method.rtol = 2.0: rtol must be between 0 and 1"]),
+    "rtol": ([MODEL, RUN, REFERENCE.replace("1e-6", "2")], ["method.rtol = 2.0: rtol lies between 0 and 1"]),
     "netcdf": ([MODEL, RUN, '[outputs]\nnetcdf = "a/b.nc"'], ['outputs.netcdf = "a/b.nc": must be a file name']),
     "figures": (
         [MODEL, RUN, '[outputs]\nfigures = ["law"]'],
@@ -366,7 +366,7 @@ REFUSALS = {
         [
             function("six_components"),
             RUN.replace("[0.001", "[0, 0, 0, 0.001"),
-            NO_FIGURES.replace("[]", f"{list(FIGURES)}"),
+            OUTPUT_WITHOUT_FIGURES.replace("[]", f"{list(FIGURES)}"),
         ],
         ['outputs.figures = ["momentum_sphere", "laws"]: momentum_sphere needs states of 3 components'],
     ),
@@ -391,16 +391,16 @@ REFUSALS = {
 
 @pytest.mark.parametrize("case", REFUSALS)
 def test_a_bad_spec_is_told_why(folder, case):
-    parts, expected = REFUSALS[case]
-    for problem, text in zip(folder.refusal(*parts), expected, strict=True):
-        assert text in problem
+    parts, texts = REFUSALS[case]
+    for line, text in zip(folder.refusal(*parts), texts, strict=True):
+        assert text in line
 
 
 def test_all_problems_are_told_at_once(folder):
     bad_method = REFERENCE.replace("rtol", "rtoll")
-    problems = folder.refusal(MODEL, "parameters = {rat = 1}", RUN.replace("step", "stepp"), bad_method)
+    lines = folder.refusal(MODEL, "parameters = {rat = 1}", RUN.replace("step", "stepp"), bad_method)
     keys = ("run.step is missing", "run.stepp: no", "model.parameters.rat: no", "method.rtoll: no")
-    assert [line[: len(key)] for line, key in zip(problems, keys, strict=True)] == list(keys)
+    assert [line[: len(key)] for line, key in zip(lines, keys, strict=True)] == list(keys)
 
 
 def test_a_module_that_cannot_be_imported(folder):

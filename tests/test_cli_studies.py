@@ -1,4 +1,4 @@
-"""Check studies on the command line, and adaptive steps, events, attitudes and changes in spec files."""
+"""Studies on the command line, and further keys of spec files: adaptive steps, events, attitudes, changes."""
 
 import sys
 
@@ -45,12 +45,12 @@ def test_a_study_from_a_spec_file_its_status_and_its_picture(folder):
     assert "12 of 12 points are done" in result.stdout
     assert "the laws hold" in result.stdout
     assert (folder / "body.png").read_bytes().startswith(b"\x89PNG")
-    results = lt.load_study("body.zarr")
-    assert dict(results.sizes)["inertia[0]"] == 3
-    assert results.rate.units == "1/s"
-    exact = lt.integrate(lt.models.rigid_body((2.4, 1.5, 1.0), 2.0), [0.1, 1.0, 0.1], (0.0, 4.0), 0.1).x[-1]
-    np.testing.assert_allclose(results.final[3, 2], exact, rtol=0, atol=1e-14)
-    assert results.attrs["spec"]["study"]["chunk"] == 4
+    dataset = lt.load_study("body.zarr")
+    assert dict(dataset.sizes)["inertia[0]"] == 3
+    assert dataset.rate.units == "1/s"
+    final_state = lt.integrate(lt.models.rigid_body((2.4, 1.5, 1.0), 2.0), [0.1, 1.0, 0.1], (0.0, 4.0), 0.1).x[-1]
+    np.testing.assert_allclose(dataset.final[3, 2], final_state, rtol=0, atol=1e-14)
+    assert dataset.attrs["spec"]["study"]["chunk"] == 4
 
     second_call = call("study", "spec.toml", "--out", "body.zarr")
     assert second_call.exit_code == 0
@@ -60,9 +60,9 @@ def test_a_study_from_a_spec_file_its_status_and_its_picture(folder):
     assert plot_call.exit_code == 0, plot_call.output
     assert (folder / "tau.svg").is_file()
     assert call("plot", "body.zarr", "--measure", "sigma").exit_code == 2
-    changed_call = call("study", "spec.toml", "--out", "body.zarr", "--set", "run.step=0.2")
-    assert changed_call.exit_code == 2
-    assert "step is 0.2, and 0.1 in the store" in changed_call.stderr
+    other_step_call = call("study", "spec.toml", "--out", "body.zarr", "--set", "run.step=0.2")
+    assert other_step_call.exit_code == 2
+    assert "step is 0.2, and 0.1 in the store" in other_step_call.stderr
     assert call("status", "none.zarr").exit_code == 2
     assert "there is no Dask scheduler" in call("study", "spec.toml", "--cluster", "nonsense://here").stderr
 
@@ -106,11 +106,11 @@ def refusals(folder, *parts, changes=()):
             "study.measure.m.relaxed = -1.0: must be greater",
         ),
         ("axes.rate = [1.0]\nmeasure = {m = {}}", "study.measure.m: must have one of relaxed and at"),
-        ("axes.rate = [1.0]\nmeasure = {m = 'median'}", "study: the measure 'm' is"),
+        ("axes.rate = [1.0]\nmeasure = {m = 'median'}", "study: the measure 'm' must be"),
         ("axes.rate = [1.0]\nchunks = 3", "study.chunks: no such key (did you mean chunk?)"),
     ],
 )
-def test_what_a_section_must_not_say(folder, study, problem):
+def test_invalid_study_sections_are_refused(folder, study, problem):
     problems = refusals(folder, MODEL, RUN, f"[study]\n{study}")
     assert any(line.startswith(problem) for line in problems), problems
 
@@ -152,8 +152,8 @@ def test_changes_that_cannot_be_made(folder, change, problem):
 
 
 def test_every_key_is_explained():
-    spec_keys = list_spec_keys()
-    assert {section for section, *_ in spec_keys} >= {
+    rows = list_spec_keys()
+    assert {section for section, *_ in rows} >= {
         "model",
         "run",
         "method",
@@ -162,4 +162,4 @@ def test_every_key_is_explained():
         "run.step",
         "run.until",
     }
-    assert [(section, name) for section, name, _, explanation in spec_keys if not explanation] == []
+    assert [(section, name) for section, name, _, what in rows if not what] == []

@@ -1,4 +1,4 @@
-"""Check spec files of strangers: nothing outside their folder runs, and nothing makes the user wait."""
+"""Spec files of strangers: they cannot run foreign code, and are refused quickly if they are invalid."""
 
 import subprocess
 import sys
@@ -14,7 +14,7 @@ from liethermo.spec import read
 from liethermo.spec.trust import pickle_by_value
 
 RUN = "[run]\ninitial = [0.1, 1.0, 0.1]\nt_span = [0.0, 1.0]\nstep = 0.1\n"
-USER_MODULE = """
+MINE = """
 from os import system
 from mine_too import inertia
 import liethermo as lt
@@ -27,7 +27,7 @@ def build(rate=1.0):
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "mine_of_trust.py").write_text(USER_MODULE)
+    (tmp_path / "mine_of_trust.py").write_text(MINE)
     (tmp_path / "mine_too.py").write_text("inertia = (3.0, 2.0, 1.0)")
     yield tmp_path
     for name in ("mine_of_trust", "mine_too", "elsewhere_of_trust"):
@@ -64,12 +64,12 @@ def test_a_spec_runs_nothing_that_is_not_beside_it(folder, command, function, pa
 
 
 def test_a_module_beside_the_spec_is_used_and_told(folder):
-    search_path = list(sys.path)
+    original_path = list(sys.path)
     path = spec(folder, model("mine_of_trust:build", "{rate = 2.0}"))
     result = CliRunner().invoke(app, ["check", str(path)])
     assert result.exit_code == 0
     assert f"imports mine_of_trust from {folder / 'mine_of_trust.py'}" in result.stdout
-    assert sys.path == search_path
+    assert sys.path == original_path
 
 
 def test_another_file_of_the_same_name_is_another_module(folder, tmp_path):
@@ -81,12 +81,12 @@ def test_another_file_of_the_same_name_is_another_module(folder, tmp_path):
 
 
 def test_a_module_elsewhere_has_to_be_allowed(folder, tmp_path, monkeypatch):
-    module_folder = tmp_path / "away"
-    module_folder.mkdir()
-    (module_folder / "elsewhere_of_trust.py").write_text(
+    other_folder = tmp_path / "away"
+    other_folder.mkdir()
+    (other_folder / "elsewhere_of_trust.py").write_text(
         "import liethermo as lt\ndef build(): return lt.models.rigid_body()\n"
     )
-    monkeypatch.syspath_prepend(str(module_folder))
+    monkeypatch.syspath_prepend(str(other_folder))
     path = spec(folder, model("elsewhere_of_trust:build"))
     result = CliRunner().invoke(app, ["check", str(path)])
     assert "only if you allow it by name: --allow elsewhere_of_trust" in result.stderr.replace("\n", " ")
@@ -118,11 +118,8 @@ print(xarray.__version__)
 """
 
 
-def test_a_file_beside_the_spec_is_taken_for_no_other(folder):
-    """A file beside the spec is refused if another module has its name, even one that is not imported yet.
-
-    Afterwards the import would give the file beside the spec.
-    """
+def test_a_file_beside_the_spec_is_not_taken_for_an_installed_module(folder):
+    """A module that has not been imported yet is refused too, since it would be found beside the spec afterwards."""
     (folder / "xarray.py").write_text("def build(): return 5")
     path = spec(folder, model("xarray:build"))
     command = [sys.executable, "-P", "-c", SHADOWING, str(path)]
@@ -131,8 +128,8 @@ def test_a_file_beside_the_spec_is_taken_for_no_other(folder):
     assert "there is another module 'xarray'" in process.stdout
 
 
-def test_what_is_beside_the_spec_is_sent_to_workers(folder):
-    """A module beside the spec is pickled by value, with the modules it imports there: a worker has other folders."""
+def test_modules_beside_the_spec_are_sent_to_workers(folder):
+    """They are pickled by value with their own imports, since a worker has other folders."""
     import cloudpickle
 
     build, pickle_file = read(spec(folder, model("mine_of_trust:build"))).build, folder / "build.pickle"
@@ -172,7 +169,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("what", BAD)
-def test_what_is_no_spec_is_refused_soon(folder, what):
+def test_invalid_specs_are_refused_quickly(folder, what):
     path, start = spec(folder, BAD[what]), time.perf_counter()
     result = CliRunner().invoke(app, ["study", str(path), "--out", "store"])
     assert result.exit_code == 2, result.output
@@ -189,6 +186,6 @@ def test_changes_that_cannot_be_made(folder, change):
         read(spec(folder, f"[model]\nname = 'rigid_body'\n{RUN}"), [change])
 
 
-def test_what_is_no_path():
+def test_an_invalid_path_is_refused():
     with pytest.raises(lt.FileError, match="cannot read the spec file"):
         read("a\0b.toml")

@@ -68,7 +68,7 @@ static inline void solve(const Problem *p, Block *b, double h, Lanes k[N])
     const Lanes size = largest_of(b->x) / h;
     Lanes update = all(INFINITY), best = update;
     Mask active = b->running, stalled = none();
-    for (int made = 1; made <= FIXED_POINT && any(active); made++) {
+    for (int made = 1; made <= MAX_FIXED_POINT_ITERATIONS && any(active); made++) {
         Lanes new[N], change[N];
         slopes(p, b->x, b->low, h, k, new);
         EACH(i) {
@@ -80,14 +80,15 @@ static inline void solve(const Problem *p, Block *b, double h, Lanes k[N])
         b->iterations += one_in(active);
 
         const Mask defined = finite_lanes(change[0] + change[1] + change[2]);
-        const Mask stuck = ~below(update, SHRINKING * best), twice = stuck & stalled;
+        const Mask stuck = ~below(update, STALL_RATIO * best), twice = stuck & stalled;
         stalled = stuck;
         best = smaller(best, update);
         const Lanes scale = size + largest_of(k);
-        const Mask settled = at_most(update, FLOOR * scale) | (twice & at_most(update, PLATEAU * scale));
+        const Mask settled = at_most(update, UPDATE_FLOOR * scale) | (twice & at_most(update, PLATEAU_RTOL * scale));
         Mask hopeless = ~defined;
         if (made >= 3)
-            hopeless |= ~settled & below(SLOW * previous, update) & below(PLATEAU * scale, best);
+            hopeless |= ~settled & below(FIXED_POINT_CONTRACTION_LIMIT * previous, update)
+                & below(PLATEAU_RTOL * scale, best);
         b->undefined |= active & ~defined;
         b->running &= ~(active & hopeless);
         active &= ~(settled | hopeless);
@@ -105,7 +106,8 @@ static inline void steer(const Problem *p, const Lanes x[N], Lanes energy, Lanes
         size += absolute(gradient[i] * x[i]);
         square += gradient[i] * gradient[i];
     }
-    const Mask off = below(STEERED * larger(absolute(first_energy), size), absolute(error)) & below(all(0.0), square);
+    const Mask off = below(DRIFT_THRESHOLD * larger(absolute(first_energy), size), absolute(error))
+        & below(all(0.0), square);
     if (!any(off))
         return;
     const Lanes most = 0.25 * DBL_EPSILON * size;

@@ -48,7 +48,7 @@ static inline int solve(const Problem *p, const Run *run, double h, double k[N],
     double best = INFINITY;
     int stalled = 0;
     *update = INFINITY;
-    for (int made = 1; made <= FIXED_POINT; made++) {
+    for (int made = 1; made <= MAX_FIXED_POINT_ITERATIONS; made++) {
         double new[N], previous = *update, total = 0.0;
         slopes(p, &s, run->x, run->low, h, k, new);
         *update = 0.0;
@@ -61,12 +61,12 @@ static inline int solve(const Problem *p, const Run *run, double h, double k[N],
         *iterations = made;
         if (!isfinite(total))
             return NON_FINITE;
-        stalled = *update < SHRINKING * best ? 0 : stalled + 1;
+        stalled = *update < STALL_RATIO * best ? 0 : stalled + 1;
         best = smaller(best, *update);
         const double scale = size + largest_of(k);
-        if (*update <= FLOOR * scale || (stalled >= 2 && *update <= PLATEAU * scale))
+        if (*update <= UPDATE_FLOOR * scale || (stalled >= 2 && *update <= PLATEAU_RTOL * scale))
             return RUNNING;
-        if (made >= 3 && *update > SLOW * previous && best > PLATEAU * scale)
+        if (made >= 3 && *update > FIXED_POINT_CONTRACTION_LIMIT * previous && best > PLATEAU_RTOL * scale)
             return NOT_CONVERGED;
     }
     return NOT_CONVERGED;
@@ -82,7 +82,7 @@ static inline void steer(const Problem *p, const double x[N], double energy, dou
         size += fabs(gradient[i] * x[i]);
         square += gradient[i] * gradient[i];
     }
-    if (!(fabs(error) > STEERED * larger(fabs(first_energy), size)) || !(square > 0.0))
+    if (!(fabs(error) > DRIFT_THRESHOLD * larger(fabs(first_energy), size)) || !(square > 0.0))
         return;
     const double most = 0.25 * DBL_EPSILON * size;
     const double shift = larger(-most, smaller(error, most)) / square;

@@ -83,7 +83,7 @@ static int solve(const Problem *p, State *s, double h, int64_t *iterations)
         s->k[i] = guess;
     }
     const double whole = sqrt(square / n) / h;
-    for (int made = 1, stalled = 0; made <= FIXED_POINT; made++) {
+    for (int made = 1, stalled = 0; made <= MAX_FIXED_POINT_ITERATIONS; made++) {
         double update, size, *old = s->k;
         slopes(p, s, h, &update, &size);
         s->k = s->new;
@@ -91,9 +91,9 @@ static int solve(const Problem *p, State *s, double h, int64_t *iterations)
         *iterations += 1;
         if (!isfinite(update))
             return NON_FINITE;
-        stalled = update < SHRINKING * best ? 0 : stalled + 1;
+        stalled = update < STALL_RATIO * best ? 0 : stalled + 1;
         best = fmin(update, best);
-        if (update <= FLOOR * (whole + size) || (stalled >= 2 && update <= PLATEAU * (whole + size)))
+        if (update <= UPDATE_FLOOR * (whole + size) || (stalled >= 2 && update <= PLATEAU_RTOL * (whole + size)))
             return RUNNING;
     }
     return NOT_CONVERGED;
@@ -125,7 +125,7 @@ static void finish(const Problem *p, State *s, double h, Record *r)
     const double energy = spins + bath(p, y), error = energy - r->first_energy + along + T * low[3 * n];
     gradient += T * T;
     const double size = sqrt(gradient) * sqrt(square + y * y);
-    if (fabs(error) > STEERED * fmax(fabs(r->first_energy), size)) {
+    if (fabs(error) > DRIFT_THRESHOLD * fmax(fabs(r->first_energy), size)) {
         const double most = 0.25 * DBL_EPSILON * size, share = fmax(-most, fmin(error, most)) / gradient;
 #pragma omp parallel for
         for (int64_t i = 0; i < n; i++) {

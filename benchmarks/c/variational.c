@@ -4,8 +4,8 @@
 
    -DSCHEME says which. V = (x_1 - x_0)/h is known outright; s = (S_1 - S_0)/h, by Newton's method, is what is iterated. */
 
-#undef STEERED
-#define STEERED INFINITY /* none of them keeps the energy to rounding */
+#undef DRIFT_THRESHOLD
+#define DRIFT_THRESHOLD INFINITY /* none of them keeps the energy to rounding */
 #include <math.h>
 
 #include "rules.h"

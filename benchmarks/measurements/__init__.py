@@ -28,3 +28,4 @@ MEASUREMENT_NAMES = (
     "memory",
     "studies",
 )
+"""Names of the measurements, in the order of the page."""

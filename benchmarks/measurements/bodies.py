@@ -1,4 +1,4 @@
-"""Growth with the number of bodies: together as one system, and apart as an ensemble."""
+"""Growth of time with the number of bodies: coupled as one system, and as an ensemble."""
 
 from __future__ import annotations
 
@@ -13,22 +13,32 @@ from ..report import Report, Table, build_available, ratio
 from ..timing import race
 
 COUPLED_COUNTS = (1, 2, 4, 8, 12)
+"""Numbers of bodies in one system."""
 ENSEMBLE_COUNTS = (1, 10, 100, 1000, 10_000, 100_000)
+"""Numbers of bodies in an ensemble."""
 MAX_ARRAY_BODIES = 10_000
-RATE, T_END, STEPS = 1.0, 10.0, 200
+"""Largest ensemble that the array engine runs, to save time."""
+RATE = 1.0
+"""Dissipation rate of the ensembles."""
+T_END = 10.0
+"""Duration of the ensembles."""
+STEPS = 200
+"""Number of steps of the ensembles."""
 
 
 def run(quick: bool) -> Report:
-    """Two tables."""
-    steps, rounds, together, apart = (2000, 1, (2,), (10,)) if quick else (200_000, 3, COUPLED_COUNTS, ENSEMBLE_COUNTS)
+    """Measure bodies as one system, and as ensembles."""
+    steps, rounds, coupled_counts, ensemble_counts = (
+        (2000, 1, (2,), (10,)) if quick else (200_000, 3, COUPLED_COUNTS, ENSEMBLE_COUNTS)
+    )
     caption = (
         f"Bodies on the direct sum of so(3)s, as one system: runs of {steps:,} steps of size {growth.STEP}, each in a "
         "new process on one core with an empty cache."
     )
-    one_system = growth.growth_table(caption, [f"bodies {n}" for n in together], steps, rounds, "Bodies")
+    one_system = growth.growth_table(caption, [f"bodies {n}" for n in coupled_counts], steps, rounds, "Bodies")
     rows: list[list] = []
     skipped: dict[str, str] = {}
-    for bodies in apart:
+    for bodies in ensemble_counts:
         row, skipped = _ensemble_row(bodies, rounds)
         rows.append(row)
     columns = {"Bodies": "count"} | dict.fromkeys(["Compiled", "Array", "C with SIMD"], "seconds")
@@ -45,9 +55,9 @@ def _ensemble_row(bodies: int, rounds: int) -> tuple[list, dict[str, str]]:
     x0s, system = random_states(bodies), quadratic_body(RATE)
     engines = [e for e in growth.ENGINES if e == "compiled" or bodies <= MAX_ARRAY_BODIES]
     works: dict[str, Callable] = {e: library_ensemble(system, x0s, T_END, STEPS, e) for e in engines}
-    others, skipped = build_available({"C": lambda: EnsembleProgram(body_parameters(RATE))})
-    if "C" in others:
-        works["C"] = lambda: others["C"].integrate(x0s, T_END / STEPS, STEPS, available_cores())
+    c_programs, skipped = build_available({"C": lambda: EnsembleProgram(body_parameters(RATE))})
+    if "C" in c_programs:
+        works["C"] = lambda: c_programs["C"].integrate(x0s, T_END / STEPS, STEPS, available_cores())
     times = {name: outcome.wall_seconds for name, outcome in race(works, rounds=rounds, max_seconds=5.0).items()}
-    each = [times[name] / (bodies * STEPS) if name in times else None for name in ("compiled", "array", "C")]
-    return [bodies, *each, ratio(each[0], each[2])], skipped
+    step_seconds = [times[name] / (bodies * STEPS) if name in times else None for name in ("compiled", "array", "C")]
+    return [bodies, *step_seconds, ratio(step_seconds[0], step_seconds[2])], skipped

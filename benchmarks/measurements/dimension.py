@@ -1,4 +1,4 @@
-"""Relaxation on so(n) and su(n): how compiling and stepping grow with the dimension."""
+"""Relaxation on so(n) and su(n): the growth of compile and step times with the dimension."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from .. import growth
 from ..report import Report, Target
 
 ALGEBRAS = [*(f"so {n}" for n in range(3, 9)), *(f"su {n}" for n in range(2, 6))]
+"""Algebras, named as in :func:`.growth.algebra_by_name`."""
 
 
 def run(quick: bool) -> Report:
@@ -29,5 +30,5 @@ def run(quick: bool) -> Report:
 
 
 def child(name: str, steps: str, rounds: str) -> dict:
-    """The part that runs in a process of its own."""
+    """Measure one algebra in the child process."""
     return growth.measure_engines(name, int(steps), int(rounds))

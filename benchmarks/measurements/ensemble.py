@@ -1,4 +1,4 @@
-"""Many relaxed rigid bodies at once: the time of a body, against C with SIMD and, at equal accuracy, the peers."""
+"""Many relaxed rigid bodies at once: the time per body against C with SIMD and, at equal accuracy, against peers."""
 
 from __future__ import annotations
 
@@ -10,20 +10,24 @@ import numpy as np
 import liethermo as lt
 
 from .. import laws, peers, reference
-from ..ensembles import ensemble_laws as ensemble_laws
-from ..ensembles import library_ensemble, loosest_tolerance_work, max_relative_error
+from ..ensembles import ensemble_laws, library_ensemble, loosest_tolerance_work, max_relative_error
 from ..machine import available_cores
 from ..native import SUMMARY_DTYPE, EnsembleProgram
 from ..problems import body_parameters, quadratic_body, random_states
 from ..report import Report, Table, Target, build_available, ratio
 from ..timing import race
 
-RATE, T_END = 1.0, 10.0
+RATE = 1.0
+"""Dissipation rate."""
+T_END = 10.0
+"""Duration of the runs."""
 
 N_SAMPLED_BODIES = 32
-"""Bodies whose errors are taken; the worst counts."""
+"""Number of bodies whose errors are measured; the worst counts."""
 
-SCIPY_ROW, C_ROW, COMPILED_ROW = "SciPy DOP853, one by one", "C with SIMD", "compiled engine"
+SCIPY_ROW = "SciPy DOP853, one by one"
+C_ROW = "C with SIMD"
+COMPILED_ROW = "compiled engine"
 
 METHODS: dict[str, tuple[lt.OneStepMethod, int]] = {
     "midpoint": (lt.MetriplecticMidpoint(), 200),
@@ -35,7 +39,7 @@ METHODS: dict[str, tuple[lt.OneStepMethod, int]] = {
     "explicit, order 8, to 1e-12": (lt.MetriplecticRungeKutta(8), 96),
     "Taylor, order 16, to 1e-12": (lt.MetriplecticTaylor(16), 26),
 }
-"""The library's methods, each with a number of steps; the peers are set to the accuracy that it reaches."""
+"""The library's methods, each with a number of steps; the peers get the accuracy that it reaches."""
 
 PEERS: dict[str, Callable] = {
     SCIPY_ROW: peers.scipy_ensemble,
@@ -44,10 +48,11 @@ PEERS: dict[str, Callable] = {
     "heyoka, batches over threads": peers.heyoka_threads,
     "heyoka, ensemble mode": peers.heyoka_ensemble,
 }
+"""Functions that build a peer's run."""
 
 
 def run(quick: bool) -> Report:
-    """One table for each of the library's methods."""
+    """Compare each of the library's methods with C and the peers."""
     bodies, rounds = (64, 1) if quick else (10_000, 5)
     x0s = random_states(bodies)
     exact = np.array([reference.exact_state(x0, RATE, T_END) for x0 in x0s[: 2 if quick else N_SAMPLED_BODIES]])
@@ -61,38 +66,40 @@ def run(quick: bool) -> Report:
     for name, (times, _, _) in contests.items():
         diffrax = min((times[title] for title in PEERS if title in times and "vmap" in title), default=None)
         explicit, work = methods[name][0].explicit, f"{bodies:,} relaxed bodies ({name})"
-        wanted = 20.0 if explicit else 10.0
-        by_diffrax = ratio(diffrax, times[COMPILED_ROW])
+        min_speedup = 20.0 if explicit else 10.0
+        speedup = ratio(diffrax, times[COMPILED_ROW])
         targets.append(
-            Target(f"{work}, against diffrax under vmap at equal accuracy", wanted, by_diffrax, at_least=True)
+            Target(f"{work}, against diffrax under vmap at equal accuracy", min_speedup, speedup, at_least=True)
         )
         if explicit:
             heyoka = min((times[title] for title in PEERS if title in times and "heyoka" in title), default=None)
-            most = 1.3 if name.endswith("1e-12") else 1.0
+            max_ratio = 1.3 if name.endswith("1e-12") else 1.0
             targets.append(
-                Target(f"{work}, against heyoka at equal accuracy", most, ratio(times[COMPILED_ROW], heyoka))
+                Target(f"{work}, against heyoka at equal accuracy", max_ratio, ratio(times[COMPILED_ROW], heyoka))
             )
     text = (
-        f"{bodies:,} bodies from random states of norm one to t = {T_END:g}, on {available_cores()} cores. The error is the "
-        f"worst of {len(exact)} bodies against Taylor series of {reference.DECIMAL_DIGITS} digits. Each peer has the loosest "
+        f"{bodies:,} bodies from random states of norm one to t = {T_END:g}, on {available_cores()} cores. The "
+        "error is the "
+        f"worst of {len(exact)} bodies against Taylor series of {reference.DECIMAL_DIGITS} digits. Each peer has "
+        "the loosest "
         "tolerance with which it is at least as accurate as the library's method."
     )
     return Report("Many bodies", text, [table for _, table, _ in contests.values()], targets, skipped)
 
 
 def _race_method(name: str, method: lt.OneStepMethod, steps: int, x0s: np.ndarray, exact: np.ndarray, rounds: int):
-    """Seconds a body by contestant, the table, and who was left out."""
+    """Return the seconds per body of each contestant, the table, and the contestants that are left out."""
     system = quadratic_body(RATE)
     works = {
         COMPILED_ROW: library_ensemble(system, x0s, T_END, steps, "compiled", method),
         "array engine": library_ensemble(system, x0s, T_END, steps, "array", method),
     }
-    reached = max_relative_error(
+    method_error = max_relative_error(
         library_ensemble(system, x0s[: len(exact)], T_END, steps, "compiled", method)().x, exact
     )
     builders: dict[str, Callable] = {
         title: functools.partial(
-            _peer_work, build, x0s[:N_SAMPLED_BODIES] if title == SCIPY_ROW else x0s, exact, reached
+            _peer_work, build, x0s[:N_SAMPLED_BODIES] if title == SCIPY_ROW else x0s, exact, method_error
         )
         for title, build in PEERS.items()
     }
@@ -101,22 +108,22 @@ def _race_method(name: str, method: lt.OneStepMethod, steps: int, x0s: np.ndarra
             C_ROW: lambda: (_c_work(x0s, steps, available_cores()), f"{steps} steps"),
             f"{C_ROW}, one core": lambda: (_c_work(x0s, steps, 1), f"{steps} steps"),
         }
-    others, skipped = build_available(builders)
-    works |= {title: work for title, (work, _) in others.items()}
+    peer_works, skipped = build_available(builders)
+    works |= {title: work for title, (work, _) in peer_works.items()}
     outcomes = race(works, rounds=rounds)
     times: dict[str, float] = {}
     rows: list[list] = []
     for title, outcome in outcomes.items():
-        found = outcome.result
-        if isinstance(found, lt.Ensemble):
-            ends, kept = np.asarray(found.x), ensemble_laws(found)
-        elif found.dtype == SUMMARY_DTYPE:
-            ends, kept = found["x"], laws.c_run_laws(found)
+        result = outcome.result
+        if isinstance(result, lt.Ensemble):
+            ends, run_laws = np.asarray(result.x), ensemble_laws(result)
+        elif result.dtype == SUMMARY_DTYPE:
+            ends, run_laws = result["x"], laws.c_run_laws(result)
         else:
-            ends, kept = found, laws.end_state_laws(x0s[: len(found)], found, system)
+            ends, run_laws = result, laws.end_state_laws(x0s[: len(result)], result, system)
         times[title] = outcome.wall_seconds / len(ends)
-        setting = others[title][1] if title in others else f"{steps} steps"
-        rows.append([title, setting, max_relative_error(ends, exact), times[title], None, *kept.table_cells()])
+        setting = peer_works[title][1] if title in peer_works else f"{steps} steps"
+        rows.append([title, setting, max_relative_error(ends, exact), times[title], None, *run_laws.table_cells()])
     for row in rows:
         row[4] = ratio(row[3], times.get(C_ROW))
     rows.sort(key=lambda row: row[3])
@@ -125,10 +132,11 @@ def _race_method(name: str, method: lt.OneStepMethod, steps: int, x0s: np.ndarra
     return times, Table(caption, columns | laws.COLUMNS, rows), skipped
 
 
-def _peer_work(build: Callable, x0s: np.ndarray, exact: np.ndarray, wanted: float) -> tuple[Callable, str]:
-    """A peer's work with the loosest tolerance that reaches an error, and that tolerance as text."""
+def _peer_work(build: Callable, x0s: np.ndarray, exact: np.ndarray, max_error: float) -> tuple[Callable, str]:
+    """Return a peer's run with the loosest tolerance whose error is at most ``max_error``, and that tolerance as
+    text."""
     work, tolerance, _ = loosest_tolerance_work(
-        lambda tolerance, some: build(tolerance, some, T_END, RATE), x0s, exact, wanted
+        lambda tolerance, states: build(tolerance, states, T_END, RATE), x0s, exact, max_error
     )
     return work, f"tolerance {tolerance:.1e}"
 

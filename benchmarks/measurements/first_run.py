@@ -1,4 +1,4 @@
-"""The first trajectory of a new process, and the first flow: import, trace, compile, run."""
+"""The first trajectory and the first flow of a new process: import, trace, compile, run."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from .. import child
 from ..report import Report, Table, Target
 
 BODY_CODE = "lt.models.rigid_body((10, 5, 1))"
+"""Code of the rigid body."""
 
 FUNCTIONS_CODE = """lt.LiePoissonSystem(
     mf.so(3),
@@ -17,6 +18,7 @@ FUNCTIONS_CODE = """lt.LiePoissonSystem(
     entropy=lambda mu: 0.5 * jnp.sum(mu**2),
     dissipation=lt.KillingDissipation(rate=0.5),
 )"""
+"""Code of a system with plain functions."""
 
 RUN_SCRIPT = """
 import json, sys, time
@@ -31,13 +33,14 @@ built = time.monotonic()
 solution = lt.integrate(system, [0.001, 1.0, 0.001], (0.0, 100.0), 0.1, engine="{engine}")
 print(json.dumps([imported, built, time.monotonic(), solution.audit().passed]))
 """
+"""Script of a user's first trajectory."""
 
 FLOW_SYSTEMS = {
     "so(3)": "lt.models.rigid_body(rate=0.5), jnp.array([0.1, 1.0, 0.1])",
     "S^2": "relaxing(mf.Sphere(2)), jnp.asarray(mf.Sphere(2).random(3))",
     "SPD(2)": "relaxing(mf.SPD(2)), jnp.asarray(mf.SPD(2).random(3))",
 }
-"""Systems, and states to start from."""
+"""Code of systems and initial states."""
 
 FLOW_QUERIES = {
     "value": ("end", 1.0),
@@ -45,10 +48,10 @@ FLOW_QUERIES = {
     "grad": ("jax.grad(lambda x: jnp.sum(end(x) ** 3))", 2.5),
     "hessian": ("jax.hessian(lambda x: jnp.sum(end(x) ** 3))", 5.0),
 }
-"""What is asked of a flow, and the seconds that the first answer may take."""
+"""Functions of a flow, and the maximum seconds of their first result."""
 
 LONG_RUN_QUERIES = ("value", "jacfwd")
-"""What is asked of a long run too, whose programs are optimised."""
+"""Functions that are also computed for a long run, whose programs are optimised."""
 
 FLOW_SCRIPT = """
 import json, time
@@ -70,6 +73,7 @@ for _ in range(20):
     calls.append(time.perf_counter() - began)
 print(json.dumps([first, min(calls)]))
 """
+"""Script of a user's first flow."""
 
 COLUMNS = {
     "": "text",
@@ -79,17 +83,18 @@ COLUMNS = {
     "Total": "seconds",
     "Audit": "text",
 }
+"""Columns of the table of first trajectories."""
 
 
 def run(quick: bool) -> Report:
-    """Run a user's script in new processes, with an empty cache and with the one that it left."""
+    """Run a user's script in new processes, with an empty cache and then with the cache that it left."""
     rounds, systems = (
         (1, {"rigid body": BODY_CODE}) if quick else (3, {"rigid body": BODY_CODE, "plain functions": FUNCTIONS_CODE})
     )
     rows: list[list] = []
     totals: dict[tuple[str, str], float] = {}
     for title, system in systems.items():
-        best: dict[str, list] = {}
+        best_times: dict[str, list] = {}
         for _ in range(rounds):
             with tempfile.TemporaryDirectory() as cache:
                 for name, engine in (
@@ -98,22 +103,22 @@ def run(quick: bool) -> Report:
                     ("compiled engine, cached", "compiled"),
                 ):
                     times = _script_times(RUN_SCRIPT.format(system=system, engine=engine), cache)
-                    best[name] = min(best.get(name, times), times, key=lambda row: row[3])
-        rows += [[f"{title}, {name}", *times] for name, times in best.items()]
-        totals |= {(title, name): times[3] for name, times in best.items()}
+                    best_times[name] = min(best_times.get(name, times), times, key=lambda row: row[3])
+        rows += [[f"{title}, {name}", *times] for name, times in best_times.items()]
+        totals |= {(title, name): times[3] for name, times in best_times.items()}
     table = Table("1000 steps of size 0.1, the whole of it in a new process.", COLUMNS, rows)
     targets = []
-    for name, bound in ("compiled engine, cold", 2.0), ("compiled engine, cached", 1.1):
-        worst = max(total for (_, which), total in totals.items() if which == name)
-        targets.append(Target(f"first trajectory in a new process, {name}", bound, worst, "seconds"))
-    flows, found = _flow_table(quick)
-    targets += found
+    for name, max_seconds in ("compiled engine, cold", 2.0), ("compiled engine, cached", 1.1):
+        slowest_total = max(total for (_, which), total in totals.items() if which == name)
+        targets.append(Target(f"first trajectory in a new process, {name}", max_seconds, slowest_total, "seconds"))
+    flows, flow_targets = _flow_table(quick)
+    targets += flow_targets
     text = "From the start of the Python process to the end of its first trajectory; the slower system counts."
     return Report("First trajectory", text, [table, flows], targets)
 
 
 def _flow_table(quick: bool) -> tuple[Table, list[Target]]:
-    """What `lt.flow` and its derivatives take, each in a new process without a cache."""
+    """Return the times of `lt.flow` and its derivatives, each in a new process without a cache, and the targets."""
     columns = {
         "": "text",
         "Steps": "count",
@@ -123,30 +128,39 @@ def _flow_table(quick: bool) -> tuple[Table, list[Target]]:
     }
     rows: list[list] = []
     for name, system in FLOW_SYSTEMS.items():
-        for what, (asked, bound) in list(FLOW_QUERIES.items())[: 1 if quick else None]:
-            for steps in (10, 1_000) if what in LONG_RUN_QUERIES and not quick else (10,):
+        for query, (expression, max_seconds) in list(FLOW_QUERIES.items())[: 1 if quick else None]:
+            for steps in (10, 1_000) if query in LONG_RUN_QUERIES and not quick else (10,):
                 with tempfile.TemporaryDirectory() as cache:
-                    script = FLOW_SCRIPT.format(system=system, asked=asked, steps=steps)
-                    first, call = json.loads(child.run_python("-c", script, cache=cache))
-                rows.append([f"{name}, {what}", steps, first, bound, call])
+                    script = FLOW_SCRIPT.format(system=system, asked=expression, steps=steps)
+                    first_seconds, call = json.loads(child.run_python("-c", script, cache=cache))
+                rows.append([f"{name}, {query}", steps, first_seconds, max_seconds, call])
     caption = (
         "`lt.flow` by `MetriplecticGauss(1)`, outside of `jax.jit`, from the definition of the system to the first "
         "answer: time of the processor. The gradient and the Hessian are those of the sum of cubes of the end."
     )
-    found = []
-    for what, (_, bound) in FLOW_QUERIES.items():
-        slowest = max((row for row in rows if row[0].endswith(what)), key=lambda row: row[2], default=None)
+    targets = []
+    for query, (_, max_seconds) in FLOW_QUERIES.items():
+        slowest = max((row for row in rows if row[0].endswith(query)), key=lambda row: row[2], default=None)
         if slowest is not None:
-            found.append(
+            targets.append(
                 Target(
-                    f"first {what} of a flow, the slowest ({slowest[0].split(',')[0]})", bound, slowest[2], "seconds"
+                    f"first {query} of a flow, the slowest ({slowest[0].split(',')[0]})",
+                    max_seconds,
+                    slowest[2],
+                    "seconds",
                 )
             )
-    return Table(caption, columns, rows), found
+    return Table(caption, columns, rows), targets
 
 
 def _script_times(script: str, cache: str) -> list:
-    """Seconds from the start to the import, on to the system, on to the end, and altogether; and the audit."""
+    """Return the seconds of import, system, run and in total, measured from the start, and the audit's verdict."""
     start = time.monotonic()  # one clock for all processes
-    imported, built, done, passed = json.loads(child.run_python("-c", script, cache=cache))
-    return [imported - start, built - imported, done - built, done - start, "passed" if passed else "failed"]
+    import_end, build_end, run_end, laws_hold = json.loads(child.run_python("-c", script, cache=cache))
+    return [
+        import_end - start,
+        build_end - import_end,
+        run_end - build_end,
+        run_end - start,
+        "passed" if laws_hold else "failed",
+    ]

@@ -1,4 +1,4 @@
-"""Fluids on the sphere as su(N): against the isospectral midpoint; with a magnetic field, and what it keeps."""
+"""Fluids on the sphere as su(N): against the isospectral midpoint, and with a magnetic field and its invariants."""
 
 from __future__ import annotations
 
@@ -14,23 +14,33 @@ from ..isospectral import IsospectralMidpoint
 from ..report import Report, Table, Target
 from ..timing import race
 
-VORTICITY_DEGREES, TURN_PER_STEP, DECAY_RATE = (2, 12), 0.05, 1e-3
-"""Degrees of the first vorticity; how far the fastest part of the fluid turns in a step, in radians; of the decay."""
+VORTICITY_DEGREES = (2, 12)
+"""Degrees of the initial vorticity."""
 
-LONG_RUN_STEPS, MAGNETIC_RATE = 10_000, 1e-4
-"""Steps in which the invariants of the magnetic fluid are followed, and of its friction."""
+TURN_PER_STEP = 0.05
+"""Angle in radians by which the fastest part of the fluid turns in a step."""
+
+DECAY_RATE = 1e-3
+"""Rate of the selective decay."""
+
+LONG_RUN_STEPS = 10_000
+"""Number of steps over which the invariants of the magnetic fluid are measured."""
+
+MAGNETIC_RATE = 1e-4
+"""Friction rate of the magnetic fluid."""
 
 METHOD = lt.MetriplecticRungeKutta(4)
+"""Method of the library."""
 
 
 def run(quick: bool) -> Report:
-    """Time steps of both, on matrices of growing size."""
+    """Time steps of the library and of the isospectral midpoint on matrices of growing size."""
     sizes = (16, 20) if quick else (32, 64, 128, 256, 512)
     rows, targets = [], []
     for N in sizes:
         steps, rounds = (2, 1) if quick else (max(4, 10_240 // N), 1 if N > 256 else 3)
-        found, ratio = process.run_child("fluids", "plain", str(N), str(steps), str(rounds), one_core=True)
-        rows += found
+        new_rows, ratio = process.run_child("fluids", "plain", str(N), str(steps), str(rounds), one_core=True)
+        rows += new_rows
         if not quick and N in (128, 256):
             targets.append(
                 Target(f"su({N}), one step with exact laws, against the isospectral step without", 1.0, ratio)
@@ -45,7 +55,8 @@ def run(quick: bool) -> Report:
         "Iterations": "number",
     }
     caption = (
-        f"Steps in which the fluid turns by {TURN_PER_STEP} radians; relative changes of the energy and of the Casimirs in all "
+        f"Steps in which the fluid turns by {TURN_PER_STEP} radians; relative changes of the energy and of the "
+        "Casimirs in all "
         "of them. Both run in a process of one core, and the time is that of the processor. Without decay the Casimirs "
         "are to stay; with it the enstrophy, tr W^2, falls and never rises."
     )
@@ -54,62 +65,63 @@ def run(quick: bool) -> Report:
         "NumPy and machine code, without dissipation. The library takes steps of `MetriplecticRungeKutta(4)` with "
         "selective decay, the energy exact and the entropy never falling."
     )
-    magnetic, more = magnetic_tables(quick)
+    magnetic, magnetic_targets = magnetic_tables(quick)
     tables = [Table(caption, columns, rows), *magnetic]
-    return Report("Large matrix algebras: a fluid on the sphere", text, tables, targets + more, {})
+    return Report("Large matrix algebras: a fluid on the sphere", text, tables, targets + magnetic_targets, {})
 
 
 def magnetic_tables(quick: bool) -> tuple[list[Table], list[Target]]:
-    """A step with a magnetic field beside one without, and the invariants in many steps."""
+    """Return tables and targets: steps with and without a magnetic field, and the invariants in many steps."""
     sizes = (12,) if quick else (64, 128, 256)
-    steps, rounds, long = (4, 1, 20) if quick else (40, 3, LONG_RUN_STEPS)
+    steps, rounds, long_steps = (4, 1, 20) if quick else (40, 3, LONG_RUN_STEPS)
     rows, targets = [], []
     for N in sizes:
-        found = process.run_child("fluids", "beside", str(N), str(steps), str(rounds), one_core=True)
-        rows.append([N, *found, found[1] / found[0]])
+        results = process.run_child("fluids", "beside", str(N), str(steps), str(rounds), one_core=True)
+        rows.append([N, *results, results[1] / results[0]])
         targets.append(Target(f"a step with a magnetic field beside one without, su({N})", 2.5, rows[-1][-1]))
-    beside = Table(
+    step_table = Table(
         "A step without decay of `zeitlin` and of `magnetic_fluid` at the same N, by the same method, each so long "
         f"that its fastest part turns by {TURN_PER_STEP} radians.",
         {"N": "count", "Without": "seconds", "With": "seconds", "Ratio": "ratio"},
         rows,
     )
-    kept, runs = [], [(12, 0.0)] if quick else [(64, 0.0), (64, MAGNETIC_RATE), (128, 0.0), (256, 0.0)]
+    invariant_rows, runs = [], [(12, 0.0)] if quick else [(64, 0.0), (64, MAGNETIC_RATE), (128, 0.0), (256, 0.0)]
     for N, rate in runs:
-        found = process.run_child("fluids", "kept", str(N), str(long), str(rate))
-        kept.append([N, "ideal" if rate == 0.0 else "with friction", *found])
+        results = process.run_child("fluids", "kept", str(N), str(long_steps), str(rate))
+        invariant_rows.append([N, "ideal" if rate == 0.0 else "with friction", *results])
         if rate == 0.0:
-            work = f"{long:,} steps of a magnetic fluid, su({N}): energy, cross helicity and tr B^3"
-            targets.append(Target(work, 1e-12, max(found[1], *found[3:6]), "error"))
+            work = f"{long_steps:,} steps of a magnetic fluid, su({N}): energy, cross helicity and tr B^3"
+            targets.append(Target(work, 1e-12, max(results[1], *results[3:6]), "error"))
     names = ("Energy, largest change", "Energy, last by first", "tr W B", "tr B^2", "tr B^3", "tr B^4", "tr W B^2")
     columns = {"N": "count", "": "text", "Time of the run": "seconds"}
     caption = (
-        f"{long:,} steps, each so long that the fastest wave turns by {TURN_PER_STEP} radians; the largest relative changes "
+        f"{long_steps:,} steps, each so long that the fastest wave turns by {TURN_PER_STEP} radians; the largest "
+        "relative changes "
         "along the run. Cross helicity and traces are computed from the matrices of the states, apart from the "
         "library's own. Friction is to lower the energy alone. The trace of the fourth power is not followed by the "
         "steps, so it is kept to their order."
     )
     kinds = ("error", "number", *["error"] * 5)
-    return [beside, Table(caption, columns | dict(zip(names, kinds, strict=True)), kept)], targets
+    return [step_table, Table(caption, columns | dict(zip(names, kinds, strict=True)), invariant_rows)], targets
 
 
-def child(what: str, *given: str):
-    """The part that runs in a process of its own."""
-    parts: dict[str, Callable] = {
+def child(part: str, *numbers: str):
+    """Run one part of the measurement in the child process."""
+    functions: dict[str, Callable] = {
         "plain": race_isospectral,
         "beside": time_with_and_without_field,
         "kept": invariant_changes,
     }
-    return parts[what](*given)
+    return functions[part](*numbers)
 
 
 def max_turning_rate(q: lt.models.QuantisedSphere, mu) -> float:
-    """How fast what the state is the stream function of turns at most."""
+    """Return the largest angular rate of the flow whose stream function is the state."""
     return float(q.gamma * np.ptp(np.linalg.eigvalsh(1j * np.asarray(q.matrix(mu)))))
 
 
 def magnetic_initial_state(N: int) -> tuple:
-    """A flow and a field, as states of their own and as one, and the steps of the flow alone and of both."""
+    """Return the sphere, a flow, a flow with a field, and the step sizes of both."""
     q, degrees = lt.models.QuantisedSphere(N), (min(VORTICITY_DEGREES[0], N - 1), min(VORTICITY_DEGREES[1], N - 1))
     W, B = q.random(0, degrees, 4.0), q.random(1, degrees, 1.0)
     turn = max_turning_rate(q, q.inverse_laplacian(W))
@@ -117,25 +129,25 @@ def magnetic_initial_state(N: int) -> tuple:
 
 
 def time_with_and_without_field(*numbers: str) -> list[float]:
-    """Times of a step without a magnetic field and with one, without the call."""
+    """Return the seconds of a step without and with a magnetic field, excluding those of the call."""
     N, steps, rounds = map(int, numbers)
-    _, W, x, alone, both = magnetic_initial_state(N)
+    _, W, x, flow_step, magnetic_step = magnetic_initial_state(N)
     works = {
         (name, count): functools.partial(
             lt.integrate, system, start, (0.0, count * h), h, METHOD, save_every=count, engine="array"
         )
         for name, system, start, h in (
-            ("without", lt.models.zeitlin(N), W, alone),
-            ("with", lt.models.magnetic_fluid(N), x, both),
+            ("without", lt.models.zeitlin(N), W, flow_step),
+            ("with", lt.models.magnetic_fluid(N), x, magnetic_step),
         )
         for count in (2, 2 + steps)
     }
-    found = race(works, rounds=rounds)
-    return [(found[n, 2 + steps].cpu_seconds - found[n, 2].cpu_seconds) / steps for n in ("without", "with")]
+    outcomes = race(works, rounds=rounds)
+    return [(outcomes[n, 2 + steps].cpu_seconds - outcomes[n, 2].cpu_seconds) / steps for n in ("without", "with")]
 
 
 def invariant_changes(N: str, steps: str, rate: str) -> list[float]:
-    """The time of a run, and the largest relative changes of what the magnetic fluid is to keep."""
+    """Return the seconds of a run, and the largest relative changes of the magnetic fluid's invariants."""
     q, _, x, _, h = magnetic_initial_state(int(N))
     system, count = lt.models.magnetic_fluid(int(N), float(rate)), int(steps)
     run = lt.integrate(system, x, (0.0, count * h), h, METHOD, save_every=max(1, count // 20), engine="array")
@@ -145,20 +157,20 @@ def invariant_changes(N: str, steps: str, rate: str) -> list[float]:
         W, B = (1j * np.asarray(q.matrix(f)) for f in q.magnetic_fields(state))
         powers = [np.linalg.matrix_power(B, k) for k in range(5)]
         traces = [np.trace(W @ B), *(np.trace(powers[k]) for k in (2, 3, 4)), np.trace(W @ powers[2])]
-        sizes = [norm(W) * norm(B), norm(B) ** 2, norm(B) * norm(powers[2]), norm(powers[2]) ** 2]
-        rows.append((np.real(traces), [*sizes, norm(W) * norm(powers[2])]))
-    values, sizes = np.swapaxes(rows, 0, 1)
-    changes = np.abs(values - values[0]).max(axis=0) / sizes[0]
-    first = float(run.energy[0])
-    drift, left = (energy[1] - energy[0]) / abs(first), float(run.energy[-1]) / first
-    return [run.stats.wall_time, float(drift), left, *map(float, changes)]
+        scales = [norm(W) * norm(B), norm(B) ** 2, norm(B) * norm(powers[2]), norm(powers[2]) ** 2]
+        rows.append((np.real(traces), [*scales, norm(W) * norm(powers[2])]))
+    values, scales = np.swapaxes(rows, 0, 1)
+    changes = np.abs(values - values[0]).max(axis=0) / scales[0]
+    first_energy = float(run.energy[0])
+    drift, energy_ratio = (energy[1] - energy[0]) / abs(first_energy), float(run.energy[-1]) / first_energy
+    return [run.stats.wall_time, float(drift), energy_ratio, *map(float, changes)]
 
 
 norm = np.linalg.norm
 
 
 def race_isospectral(*numbers: str):
-    """Both in one process; the rows of the table and the ratio of the times."""
+    """Race both schemes in one process; return the rows of the table and the ratio of the times."""
     N, steps, rounds = map(int, numbers)
     q = lt.models.QuantisedSphere(N)
     x = q.random(0, (min(VORTICITY_DEGREES[0], N - 1), min(VORTICITY_DEGREES[1], N - 1)), 4.0)
@@ -172,21 +184,24 @@ def race_isospectral(*numbers: str):
         {"isospectral midpoint, no dissipation": peer, "this library, selective decay": ours}, rounds=rounds
     )
     (name, theirs), (own_name, mine) = outcomes.items()
-    after, iterations = theirs.result
+    W_end, iterations = theirs.result
     solution = mine.result
     energy = solution.stats.energy_range
-    low, high = energy if energy is not None else (solution.energy.min(), solution.energy.max())
-    drift, kept = abs(scheme.energy(after) / scheme.energy(W) - 1.0), (high - low) / abs(solution.energy[0])
-    changed = _casimir_changes(W, np.asarray(q.matrix(solution.x[-1])))
+    min_energy, max_energy = energy if energy is not None else (solution.energy.min(), solution.energy.max())
+    drift, energy_change = (
+        abs(scheme.energy(W_end) / scheme.energy(W) - 1.0),
+        (max_energy - min_energy) / abs(solution.energy[0]),
+    )
+    casimir_changes = _casimir_changes(W, np.asarray(q.matrix(solution.x[-1])))
     ratio = float(mine.cpu_seconds / theirs.cpu_seconds)
     rows = [
-        [N, name, theirs.cpu_seconds / steps, 1.0, drift, *_casimir_changes(W, after), iterations],
-        [N, own_name, mine.cpu_seconds / steps, ratio, float(kept), *changed, None],
+        [N, name, theirs.cpu_seconds / steps, 1.0, drift, *_casimir_changes(W, W_end), iterations],
+        [N, own_name, mine.cpu_seconds / steps, ratio, float(energy_change), *casimir_changes, None],
     ]
     return rows, ratio
 
 
-def _casimir_changes(before: np.ndarray, after: np.ndarray) -> list[float]:
-    """Relative changes of the traces of powers 2 to 4, the odd one relative to that of its absolute values."""
-    a, b = (np.linalg.eigvalsh(1j * W) for W in (before, after))
+def _casimir_changes(W_start: np.ndarray, W_end: np.ndarray) -> list[float]:
+    """Return relative changes of the traces of powers 2 to 4, the odd one relative to that of absolute values."""
+    a, b = (np.linalg.eigvalsh(1j * W) for W in (W_start, W_end))
     return [float(abs((b**k).sum() - (a**k).sum()) / (np.abs(a) ** k).sum()) for k in (2, 3, 4)]

@@ -1,4 +1,4 @@
-"""Energies with loops, linear algebra, complex numbers and special functions: machine code beside the array engine."""
+"""Energies with loops, linear algebra, complex numbers and special functions, on both engines."""
 
 from __future__ import annotations
 
@@ -18,22 +18,26 @@ from ..contest import STEP_SIZE
 from ..report import Report, Table, Target, ratio
 from ..timing import race
 
-INERTIA, INITIAL_STATE = jnp.array([1.0, 2.0, 3.0]), (0.3, 1.0, -0.5)
+INERTIA = jnp.array([1.0, 2.0, 3.0])
+"""Moments of inertia of the body."""
+INITIAL_STATE = (0.3, 1.0, -0.5)
+"""Initial angular momentum."""
 KNOTS = jnp.linspace(-3.0, 3.0, 400)
+"""Grid of the interpolation and of the scan."""
 
 
 def definite_matrix(m):
-    """Positive definite, its eigenvalues apart."""
+    """Return a positive definite matrix with distinct eigenvalues."""
     return jnp.diag(jnp.array([2.0, 4.0, 7.0])) + 0.3 * jnp.outer(m, m)
 
 
 def newton_root(s):
-    """By Newton's method, in as many passes as it takes."""
+    """Return the square root by Newton's method in a ``while_loop``."""
 
-    def off(carried):
-        return jnp.abs(carried**2 - s) > 1e-13 * s
+    def is_inaccurate(root):
+        return jnp.abs(root**2 - s) > 1e-13 * s
 
-    return lax.while_loop(off, lambda c: (c + s / c) / 2, s)
+    return lax.while_loop(is_inaccurate, lambda c: (c + s / c) / 2, s)
 
 
 FUNCTIONS = {
@@ -51,6 +55,7 @@ FUNCTIONS = {
     "`lgamma`": lambda m: special.gammaln(4.0 + m[0]),
     "Bessel functions": lambda m: special.i0(m[0]) + special.i1e(m[1]),
 }
+"""Functions that a tenth of the energy consists of, by name."""
 
 
 def function_body(function) -> lt.LiePoissonSystem:
@@ -70,7 +75,7 @@ def run(quick: bool) -> Report:
         system = function_body(function)
         start = time.monotonic()
         lt.integrate(system, INITIAL_STATE, (0.0, STEP_SIZE), STEP_SIZE, method, engine="compiled")
-        first = time.monotonic() - start
+        first_seconds = time.monotonic() - start
         works = {
             engine: lambda engine=engine, system=system: lt.integrate(
                 system, INITIAL_STATE, (0.0, STEP_SIZE * steps), STEP_SIZE, method, save_every=steps, engine=engine
@@ -78,10 +83,10 @@ def run(quick: bool) -> Report:
             for engine in ("compiled", "array")
         }
         outcomes = race(works, rounds=rounds)
-        ours, other = (outcomes[engine].cpu_seconds / steps for engine in works)
+        ours, array_seconds = (outcomes[engine].cpu_seconds / steps for engine in works)
         cells = laws.solution_laws(outcomes["compiled"].result).table_cells()
-        rows.append([name, first, ours, ratio(other, ours), *cells])
-        targets.append(Target(f"first answer of an energy with {name}", 3.0, first, "seconds"))
+        rows.append([name, first_seconds, ours, ratio(array_seconds, ours), *cells])
+        targets.append(Target(f"first answer of an energy with {name}", 3.0, first_seconds, "seconds"))
     columns = {"": "text", "First answer": "seconds", "Time a step": "seconds", "Array engine, relative": "ratio"}
     table = Table(f"Midpoint steps of size {STEP_SIZE} on so(3)*.", columns | laws.COLUMNS, rows)
     text = "An energy of a body and a tenth of a function that does not unroll. Processor times of a step."

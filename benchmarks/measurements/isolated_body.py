@@ -1,4 +1,4 @@
-"""The isolated body with friction inside beside the relaxed one of the paper: a step, and the first trajectory."""
+"""The isolated body with internal friction against the relaxed body: a step, and the first trajectory."""
 
 from __future__ import annotations
 
@@ -13,9 +13,13 @@ from ..contest import RATE_TIMES_DURATION, STEP_SIZE
 from ..report import Report, Table, Target, ratio
 from ..timing import race
 
-INERTIA, INITIAL_STATE = (3.0, 2.0, 1.5), (0.06, 0.1, 1.0)
+INERTIA = (3.0, 2.0, 1.5)
+"""Moments of inertia of the bodies."""
+INITIAL_STATE = (0.06, 0.1, 1.0)
+"""Initial angular momentum."""
 
 METHODS = (lt.MetriplecticMidpoint(), lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(6))
+"""Methods that are timed."""
 
 RUN_SCRIPT = """
 import json, time
@@ -26,10 +30,11 @@ body = lt.models.tumbling_body({inertia}, rate=0.1)
 solution = lt.integrate(body, {start}, (0.0, 100.0), 0.1, lt.{method}, engine="compiled")
 print(json.dumps([time.monotonic(), solution.audit().passed]))
 """
+"""Script of a user's first trajectory."""
 
 
 def run(quick: bool) -> Report:
-    """Race both bodies, the isolated one with its attitude too; start its first trajectory with a cache and without."""
+    """Race the relaxed and the isolated body, and time the first trajectory with and without a cache."""
     steps, rounds = (2000, 1) if quick else (300_000, 7)
     rate = RATE_TIMES_DURATION / (STEP_SIZE * steps)
     bodies = {
@@ -46,27 +51,32 @@ def run(quick: bool) -> Report:
             for name, body in bodies.items()
         }
         outcomes = race(works, rounds=rounds)
-        first = outcomes["relaxed body"].cpu_seconds
+        reference_seconds = outcomes["relaxed body"].cpu_seconds
         for name, outcome in outcomes.items():
-            beside = ratio(outcome.cpu_seconds, first)
+            relative_time = ratio(outcome.cpu_seconds, reference_seconds)
             cells = laws.solution_laws(outcome.result).table_cells()
-            rows.append([f"{name}, {method}", outcome.cpu_seconds / steps, beside, *cells])
+            rows.append([f"{name}, {method}", outcome.cpu_seconds / steps, relative_time, *cells])
             if name == "isolated body":
-                targets.append(Target(f"a step of the isolated body beside the relaxed one, {method}", 1.5, beside))
+                targets.append(
+                    Target(f"a step of the isolated body beside the relaxed one, {method}", 1.5, relative_time)
+                )
     columns = {"": "text", "Time a step": "seconds", "Relative to the relaxed body": "ratio"} | laws.COLUMNS
     table = Table(f"A run of {steps:,} steps of size {STEP_SIZE}; one state kept.", columns, rows)
 
-    again, calls = [], ("MetriplecticMidpoint()",) if quick else ("MetriplecticMidpoint()", "MetriplecticRungeKutta(8)")
+    script_rows, calls = (
+        [],
+        ("MetriplecticMidpoint()",) if quick else ("MetriplecticMidpoint()", "MetriplecticRungeKutta(8)"),
+    )
     for call in calls:
         script = RUN_SCRIPT.format(inertia=INERTIA, start=INITIAL_STATE, method=call)
         with tempfile.TemporaryDirectory() as cache:
-            cold, *cached = [_script_seconds(script, cache) for _ in range(2 if quick else 4)]
-        again.append([call, cold, min(cached)])
-        targets.append(Target(f"first trajectory with attitude, cached, {call}", 1.5, min(cached), "seconds"))
+            cold_seconds, *cached_seconds = [_script_seconds(script, cache) for _ in range(2 if quick else 4)]
+        script_rows.append([call, cold_seconds, min(cached_seconds)])
+        targets.append(Target(f"first trajectory with attitude, cached, {call}", 1.5, min(cached_seconds), "seconds"))
     calls_table = Table(
         "1000 steps with attitudes in a new process, from its start to its end.",
         {"": "text", "Empty cache": "seconds", "Cached": "seconds"},
-        again,
+        script_rows,
     )
     text = "Friction inside a body, its heat in a bath and its attitude, beside Morrison's body. Processor times."
     return Report("The isolated body", text, [table, calls_table], targets)
@@ -74,7 +84,7 @@ def run(quick: bool) -> Report:
 
 def _script_seconds(script: str, cache: str) -> float:
     start = time.monotonic()  # one clock for all processes
-    done, passed = json.loads(child.run_python("-c", script, cache=cache))
-    if not passed:
+    end_time, laws_hold = json.loads(child.run_python("-c", script, cache=cache))
+    if not laws_hold:
         raise RuntimeError("the audit of the isolated body failed")
-    return done - start
+    return end_time - start

@@ -11,20 +11,30 @@ import manifolds as mf
 
 from ..report import Report, Table
 
-INERTIA, RATE = (3.0, 2.0, 1.0), 0.08
+INERTIA = (3.0, 2.0, 1.0)
+"""Moments of inertia of the measured body."""
+RATE = 0.08
+"""Friction rate of the measured body."""
 INITIAL_GUESS = lt.models.tumbling_body((2.4, 2.0, 1.4), rate=0.2)
-T_END, STEP, N_RECORDS = 20.0, 0.1, 8
+"""The body from which the fit starts."""
+T_END = 20.0
+"""Duration of a record."""
+STEP = 0.1
+"""Time between two attitudes."""
+N_RECORDS = 8
+"""Number of records."""
 METHOD = lt.MetriplecticRungeKutta(4)
+"""Method of the forecasts."""
 
 
 def _noisy_records(noise: float) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Times and attitudes, of a step a quarter as long and of order 6, each turned by a small random angle."""
-    body, random, found = lt.models.tumbling_body(INERTIA, rate=RATE), np.random.default_rng(0), []
+    """Return times and attitudes of accurate runs, each attitude rotated by a small random angle."""
+    body, random, records = lt.models.tumbling_body(INERTIA, rate=RATE), np.random.default_rng(0), []
     for start in _initial_momenta(random):
         run = lt.integrate(body, start, (0.0, T_END), STEP / 4, lt.MetriplecticRungeKutta(6), save_every=4)
-        turned = np.asarray(mf.SO(3).exp(noise * random.standard_normal((len(run.t), 3))))
-        found.append((run.t, np.asarray(run.attitude) @ turned))
-    return found
+        rotations = np.asarray(mf.SO(3).exp(noise * random.standard_normal((len(run.t), 3))))
+        records.append((run.t, np.asarray(run.attitude) @ rotations))
+    return records
 
 
 def _initial_momenta(random: np.random.Generator) -> np.ndarray:
@@ -34,7 +44,7 @@ def _initial_momenta(random: np.random.Generator) -> np.ndarray:
 
 def _fit_row(noise: float, window: int, steps: int) -> list:
     start = time.process_time()
-    fitted = lt.learn.fit(
+    model = lt.learn.fit(
         INITIAL_GUESS,
         _noisy_records(noise),
         observe=lambda x, R: R,
@@ -45,19 +55,21 @@ def _fit_row(noise: float, window: int, steps: int) -> list:
         positive=lambda s: (s.energy.body.A, s.dissipation.part.rate),
         progress=False,
     )
-    spent = time.process_time() - start
-    inertia = 1.0 / np.asarray(fitted.energy.body.A)
-    shape, friction = inertia / inertia[2], float(fitted.dissipation.part.rate) * inertia[2]
+    training_seconds = time.process_time() - start
+    inertia = 1.0 / np.asarray(model.energy.body.A)
+    shape, friction = inertia / inertia[2], float(model.dissipation.part.rate) * inertia[2]
     unit = inertia[2] / INERTIA[2]  # of momenta, which no attitude tells
-    start_, true = np.array([0.3, 0.9, 0.4]), lt.models.tumbling_body(INERTIA, rate=RATE)
-    own = lt.integrate(fitted, unit * start_, (0.0, 100.0 * T_END), STEP, METHOD)
-    other = lt.integrate(true, start_, (0.0, 2.0 * T_END), STEP / 4, lt.MetriplecticRungeKutta(6), save_every=4)
-    missed = np.einsum("tij,tij->t", np.asarray(own.attitude)[: len(other.t)], np.asarray(other.attitude))
-    angle = float(np.arccos(np.clip((missed.min() - 1.0) / 2.0, -1.0, 1.0)))
+    start_, exact_body = np.array([0.3, 0.9, 0.4]), lt.models.tumbling_body(INERTIA, rate=RATE)
+    forecast = lt.integrate(model, unit * start_, (0.0, 100.0 * T_END), STEP, METHOD)
+    exact_run = lt.integrate(
+        exact_body, start_, (0.0, 2.0 * T_END), STEP / 4, lt.MetriplecticRungeKutta(6), save_every=4
+    )
+    traces = np.einsum("tij,tij->t", np.asarray(forecast.attitude)[: len(exact_run.t)], np.asarray(exact_run.attitude))
+    angle = float(np.arccos(np.clip((traces.min() - 1.0) / 2.0, -1.0, 1.0)))
     errors = [float(e) for e in np.abs(shape[:2] / np.array(INERTIA[:2]) - 1.0)]
-    laws = [own.audit().energy_drift, float(np.diff(np.asarray(own.entropy)).min())]
+    laws = [forecast.audit().energy_drift, float(np.diff(np.asarray(forecast.entropy)).min())]
     kind = "whole records" if window * STEP >= T_END else f"pieces of {window} intervals"
-    return [f"noise {noise:g} rad, {kind}", *errors, float(abs(friction / RATE - 1.0)), angle, *laws, spent]
+    return [f"noise {noise:g} rad, {kind}", *errors, float(abs(friction / RATE - 1.0)), angle, *laws, training_seconds]
 
 
 def run(quick: bool) -> Report:
@@ -69,7 +81,8 @@ def run(quick: bool) -> Report:
     errors = dict.fromkeys(["Error of I₁/I₃", "I₂/I₃", "Friction × I₃", "Angle to 2 T", "Energy drift"], "error")
     columns = {"Records": "text", **errors, "Least entropy increment": "error", "Training": "seconds"}
     text = (
-        f"{N_RECORDS} records of the attitude of a body with the inertia (3, 2, 1) and friction inside, to T = {T_END:g}, "
+        f"{N_RECORDS} records of the attitude of a body with the inertia (3, 2, 1) and friction inside, to T = "
+        f"{T_END:g}, "
         "201 attitudes each, with errors. The fit starts from the inertia (2.4, 2, 1.4) and 2.5 times the friction. No "
         "momentum, temperature or entropy is in the data. Attitudes tell the inertia up to a factor, so the table has "
         "relative errors of what does not depend on it. *Angle* is the largest error of a forecast to 2 T, in radians; "

@@ -1,4 +1,4 @@
-"""Every registered space with three methods: the first answer, the time of a step, drift and order."""
+"""Every registered space with three methods: first result, time of a step, drift and order."""
 
 from __future__ import annotations
 
@@ -22,12 +22,16 @@ METHODS = {
     "RK8": lt.MetriplecticRungeKutta(8),
     "Gauss(2)": lt.MetriplecticGauss(2),
 }
+"""Methods that are measured."""
 
-ORDER_STEP_COUNTS, MIN_ORDER_ERROR = (1, 2, 4, 8, 16), 2e-13
-"""Steps to t = 1, and the error below which an order is not seen."""
+ORDER_STEP_COUNTS = (1, 2, 4, 8, 16)
+"""Numbers of steps to t = 1 from which the order is computed."""
+
+MIN_ORDER_ERROR = 2e-13
+"""Smallest error that counts for an order."""
 
 RETRACTION_BY_SPACE = {"S^2": "exp", "H^2": "exp", "SO(3)": "exp", "S^2 x R^3": "exp"}
-"""Spaces that are run in charts too, and by which retraction."""
+"""Spaces that are also run in charts, and their retraction."""
 
 COLUMNS = {
     "Space": "text",
@@ -41,25 +45,26 @@ COLUMNS = {
     "Off the space": "error",
     "Order": "text",
 }
+"""Columns of the table."""
 
 MAX_SMALL_DIM = 6
-"""Dimension from which a first answer may take twice as long."""
+"""Dimension from which the first result may take twice as long."""
 
 
 def run(quick: bool) -> Report:
-    """One process for each space, with an empty cache, and another with the one that it left."""
+    """Measure each space in a process with an empty cache, and in another with the cache that it left."""
     steps = 1_000 if quick else 100_000
-    flat = mf.Euclidean
-    spaces = [space for space in mf.registered_spaces() if space.can_be_embedded and not isinstance(space, flat)]
+    euclidean = mf.Euclidean
+    spaces = [space for space in mf.registered_spaces() if space.can_be_embedded and not isinstance(space, euclidean)]
     spaces = spaces[:2] if quick else spaces
-    found = {space.name: _space_rows(space, "around", steps) for space in spaces}
-    charted = [space for space in spaces if space.name in RETRACTION_BY_SPACE]
-    beside = [
+    rows_by_space = {space.name: _space_rows(space, "around", steps) for space in spaces}
+    chart_spaces = [space for space in spaces if space.name in RETRACTION_BY_SPACE]
+    chart_rows = [
         row
-        for space in charted
-        for row in (found[space.name][0], *_space_rows(space, RETRACTION_BY_SPACE[space.name], steps))
+        for space in chart_spaces
+        for row in (rows_by_space[space.name][0], *_space_rows(space, RETRACTION_BY_SPACE[space.name], steps))
     ]
-    rows = [row for own in found.values() for row in own]
+    rows = [row for own in rows_by_space.values() for row in own]
     text = (
         "A system with an energy and an entropy that are not quadratic, and the metric of the space projected off the "
         "energy, from its definition to the end of a run; then many steps, of which one state is kept. RK4 comes first "
@@ -68,32 +73,32 @@ def run(quick: bool) -> Report:
         "against SciPy's DOP853; where the error is rounding there is none. Times are of the processor."
     )
     caption = f"{steps:,} steps for the drift, in one thread; a point's residual at the end of them."
-    first = [row for row in rows if row[2] == "RK4"]
+    rk4_rows = [row for row in rows if row[2] == "RK4"]
     targets = []
-    for title, chosen in (
-        ("below", [r for r in first if r[1] < MAX_SMALL_DIM]),
-        ("of", [r for r in first if r[1] >= MAX_SMALL_DIM]),
+    for title, size_rows in (
+        ("below", [r for r in rk4_rows if r[1] < MAX_SMALL_DIM]),
+        ("of", [r for r in rk4_rows if r[1] >= MAX_SMALL_DIM]),
     ):
-        bound = 2.0 if title == "below" else 4.0
-        more = "" if title == "below" else " or more"
-        worst = max((row[3] for row in chosen), default=None)
+        max_value = 2.0 if title == "below" else 4.0
+        suffix = "" if title == "below" else " or more"
+        slowest = max((row[3] for row in size_rows), default=None)
         targets.append(
             Target(
-                f"first answer on a manifold, {title} {MAX_SMALL_DIM} dimensions{more}, the slowest",
-                bound,
-                worst,
+                f"first answer on a manifold, {title} {MAX_SMALL_DIM} dimensions{suffix}, the slowest",
+                max_value,
+                slowest,
                 "seconds",
             )
         )
-    for name, bound in (("S^2", 6.0), ("SPD(3)", 6.0), ("St(4, 2)", 12.0)):
-        own = [row[6] for row in first if row[0] == name]
-        targets.append(Target(f"a step on {name} over one on R^d", bound, own[0] if own else None))
+    for name, max_value in (("S^2", 6.0), ("SPD(3)", 6.0), ("St(4, 2)", 12.0)):
+        own = [row[6] for row in rk4_rows if row[0] == name]
+        targets.append(Target(f"a step on {name} over one on R^d", max_value, own[0] if own else None))
     tables = [
         Table(caption, COLUMNS, rows),
-        Table("Steps of order 4 without charts, and in those of `retraction=`.", COLUMNS, beside),
+        Table("Steps of order 4 without charts, and in those of `retraction=`.", COLUMNS, chart_rows),
     ]
-    found, skipped = build_available({"pymanopt": pymanopt_rows})
-    if found:
+    rows_by_space, skipped = build_available({"pymanopt": pymanopt_rows})
+    if rows_by_space:
         columns = {
             "": "text",
             "Steps": "count",
@@ -105,7 +110,7 @@ def run(quick: bool) -> Report:
             "Gradient flows to t = 1 beside pymanopt's steepest descent in equal steps, which is of first order: the "
             "distance of both ends, and that of the end that is extrapolated to steps of size zero."
         )
-        tables.append(Table(caption, columns, found["pymanopt"]))
+        tables.append(Table(caption, columns, rows_by_space["pymanopt"]))
     return Report("Systems on manifolds", text, tables, targets, skipped)
 
 
@@ -120,43 +125,43 @@ def _space_rows(space: mf.Space, way: str, steps: int) -> list[list]:
             space.name,
             space.dim,
             name + title,
-            own[0],
+            results[0],
             warm[name][0] if name in warm else None,
-            own[1],
-            ratio(own[1], own[2]),
-            *own[3:],
+            results[1],
+            ratio(results[1], results[2]),
+            *results[3:],
         ]
-        for name, own in cold.items()
+        for name, results in cold.items()
     ]
 
 
 def child(number: str, way: str, steps: str) -> dict[str, list]:
-    """For each method the first answer; the time of a step, there and on R^d; drift, residual and order."""
+    """Return for each method the first result's time; step times, also on R^d; drift, residual and order."""
     space, count = list(mf.registered_spaces())[int(number)], int(steps)
     x0 = np.asarray(space.to_vector(space.random(3)))
-    found: dict[str, list] = {}
+    results: dict[str, list] = {}
     methods = METHODS if way == "around" else {"RK4": lt.MetriplecticRungeKutta(4, retraction=way)}
     for name, method in methods.items() if count else [*methods.items()][:1]:
         began = time.process_time()
         system = relaxing(space)
         lt.integrate(system, x0, (0.0, 1.0), 0.1, method)
-        found[name] = [time.process_time() - began]
+        results[name] = [time.process_time() - began]
     if count == 0:
-        return found
-    flat = mf.Euclidean(space.dim)
-    plain, start = relaxing(flat), np.asarray(flat.random(3))
+        return results
+    euclidean = mf.Euclidean(space.dim)
+    euclidean_system, start = relaxing(euclidean), np.asarray(euclidean.random(3))
     exact = _exact_end(system, x0)
     for name, method in methods.items():
-        beside = _step_seconds(plain, start, METHODS[name]) if name == "RK4" else None
-        found[name] += [_step_seconds(system, x0, method), beside]
-        long = lt.integrate(system, x0, (0.0, 0.01 * count), 0.01, method, save_every=count)
-        residual = float(space.residual(system.points(long.x[-1])))
-        found[name] += [long.audit().energy_drift, residual, _observed_order(system, x0, method, exact)]
-    return found
+        euclidean_seconds = _step_seconds(euclidean_system, start, METHODS[name]) if name == "RK4" else None
+        results[name] += [_step_seconds(system, x0, method), euclidean_seconds]
+        long_run = lt.integrate(system, x0, (0.0, 0.01 * count), 0.01, method, save_every=count)
+        residual = float(space.residual(system.points(long_run.x[-1])))
+        results[name] += [long_run.audit().energy_drift, residual, _observed_order(system, x0, method, exact)]
+    return results
 
 
 def relaxing(space: mf.Space) -> lt.MetriplecticSystem:
-    """Bounded functions without symmetries."""
+    """Return a system on a space with bounded functions without symmetries."""
     random = np.random.default_rng(5)
     a, b, c = random.standard_normal((3, space.size)) / np.sqrt(space.size)
 
@@ -173,13 +178,13 @@ def relaxing(space: mf.Space) -> lt.MetriplecticSystem:
 
 
 def _step_seconds(system: lt.MetriplecticSystem, x0, method, steps: int = 20_000) -> float:
-    """Seconds that a step takes, the best of several runs."""
-    best = np.inf
+    """Return the seconds of a step, the best of several runs."""
+    best_seconds = np.inf
     for _ in range(3):
         began = time.process_time()
         lt.integrate(system, x0, (0.0, 0.01 * steps), 0.01, method, save_every=steps)
-        best = min(best, time.process_time() - began)
-    return best / steps
+        best_seconds = min(best_seconds, time.process_time() - began)
+    return best_seconds / steps
 
 
 def _exact_end(system: lt.MetriplecticSystem, x0) -> np.ndarray:
@@ -189,7 +194,7 @@ def _exact_end(system: lt.MetriplecticSystem, x0) -> np.ndarray:
 
 
 def _observed_order(system: lt.MetriplecticSystem, x0, method, exact) -> str:
-    """Of the finest two of some step sizes whose errors are no rounding."""
+    """Return the order from the two finest step sizes whose errors exceed rounding, as text."""
     errors = []
     for steps in ORDER_STEP_COUNTS:
         end = lt.integrate(system, x0, (0.0, 1.0), 1.0 / steps, method).x[-1]
@@ -207,7 +212,7 @@ DESCENT_STEPS = 200
 
 
 class _FixedStepSearch:
-    """A search along a line that takes steps of one size."""
+    """A line search that takes steps of a fixed size."""
 
     def __init__(self, h: float):
         self.h = h
@@ -218,7 +223,7 @@ class _FixedStepSearch:
 
 
 def pymanopt_rows() -> list[list]:
-    """For each space how far pymanopt's steepest descent ends from the gradient flow of the same function.
+    """Return for each space the distance between pymanopt's steepest descent and the gradient flow of the function.
 
     Raises
     ------
@@ -227,21 +232,21 @@ def pymanopt_rows() -> list[list]:
     """
     theirs, A = peers.import_peer("pymanopt"), np.diag([1.0, 2.0, 4.0]) + 0.3
     sphere, definite, lines = mf.Sphere(2), mf.SPD(2), mf.Grassmann(3, 1)
-    of_quadratic = (lambda x: 0.5 * np.sum(x * (A @ x))), lambda x: A @ x
-    of_volume = (
+    quadratic_cost = (lambda x: 0.5 * np.sum(x * (A @ x))), lambda x: A @ x
+    volume_cost = (
         lambda x: np.trace(x) - np.linalg.slogdet(x)[1],
         lambda x: np.eye(2) - np.linalg.inv(x),
     )
     column = np.asarray(sphere.random(1))[:, None]
     cases = [
-        (sphere, lambda x: 0.5 * x @ A @ x, column[:, 0], 1.0, theirs.manifolds.Sphere(3), of_quadratic),
+        (sphere, lambda x: 0.5 * x @ A @ x, column[:, 0], 1.0, theirs.manifolds.Sphere(3), quadratic_cost),
         (
             definite,
             lambda x: jnp.trace(x) - jnp.linalg.slogdet(x)[1],
             np.asarray(definite.random(1)),
             1.0,
             theirs.manifolds.SymmetricPositiveDefinite(2),
-            of_volume,
+            volume_cost,
         ),
         # projectors change by twice the square of what the vectors do that they project to
         (
@@ -250,7 +255,7 @@ def pymanopt_rows() -> list[list]:
             column @ column.T,
             2.0,
             theirs.manifolds.Grassmann(3, 1),
-            of_quadratic,
+            quadratic_cost,
         ),
     ]
     rows = []
@@ -258,8 +263,8 @@ def pymanopt_rows() -> list[list]:
         flow = lt.MetriplecticSystem(None, function, dissipation=lt.Friction(), space=space)
         run = lt.integrate(flow, x0, (0.0, t_end), t_end / 100, lt.MetriplecticRungeKutta(8))
         exact = np.asarray(flow.points(run.x[-1]))
-        asked = theirs.function.numpy(manifold)
-        problem = theirs.Problem(manifold, asked(cost), euclidean_gradient=asked(gradient))
+        wrap = theirs.function.numpy(manifold)
+        problem = theirs.Problem(manifold, wrap(cost), euclidean_gradient=wrap(gradient))
 
         def end(steps, problem=problem, start=column if space is lines else x0):
             optimizer = theirs.optimizers.SteepestDescent(
@@ -272,7 +277,7 @@ def pymanopt_rows() -> list[list]:
             x = optimizer.run(problem, initial_point=start).point
             return x @ x.T if x.shape == column.shape else x
 
-        half, whole = end(DESCENT_STEPS // 2), end(DESCENT_STEPS)
-        ends = whole, half, 2.0 * whole - half
+        half_steps_end, full_steps_end = end(DESCENT_STEPS // 2), end(DESCENT_STEPS)
+        ends = full_steps_end, half_steps_end, 2.0 * full_steps_end - half_steps_end
         rows.append([space.name, DESCENT_STEPS, *(float(np.abs(x - exact).max()) for x in ends)])
     return rows

@@ -1,4 +1,4 @@
-"""The memory of a million bodies of which only summaries are kept."""
+"""Memory of an ensemble of a million bodies that saves only summaries."""
 
 from __future__ import annotations
 
@@ -8,18 +8,23 @@ import numpy as np
 
 from .. import child as process
 from .. import laws
-from ..ensembles import ensemble_laws as ensemble_laws
-from ..ensembles import library_ensemble
+from ..ensembles import ensemble_laws, library_ensemble
 from ..problems import quadratic_body, random_states
 from ..report import Report, Table, Target
 
-RATE, T_END, STEPS = 1.0, 10.0, 200
+RATE = 1.0
+"""Dissipation rate."""
+T_END = 10.0
+"""Duration of the runs."""
+STEPS = 200
+"""Number of steps."""
 
 PROCESS_STATUS_FILE = Path("/proc/self/status")
+"""File in which Linux reports the memory of a process."""
 
 
 def run(quick: bool) -> Report:
-    """Ensembles of two sizes, each in a process of its own."""
+    """Measure ensembles of two sizes, each in a process of its own."""
     sizes: tuple[int, ...] = (100,) if quick else (10_000, 1_000_000)
     rows: list[list] = []
     skipped: dict[str, str] = {}
@@ -27,10 +32,10 @@ def run(quick: bool) -> Report:
     if not PROCESS_STATUS_FILE.is_file():
         sizes, skipped = (), {"all": "this system does not tell a process its largest size"}
     for bodies in sizes:
-        found = process.run_child("memory", str(bodies))
-        peak = found["peak"]
-        kept = laws.Laws(*found["laws"])
-        rows.append([bodies, found["before"], peak, found["seconds"], *kept.table_cells()])
+        results = process.run_child("memory", str(bodies))
+        peak = results["peak"]
+        run_laws = laws.Laws(*results["laws"])
+        rows.append([bodies, results["before"], peak, results["seconds"], *run_laws.table_cells()])
     columns = {"Bodies": "count", "Memory before": "gigabytes", "Peak": "gigabytes", "Time": "seconds"}
     table = Table(f'`outputs="summary"`, {STEPS} steps each, compiled engine.', columns | laws.COLUMNS, rows)
     text = (
@@ -42,25 +47,25 @@ def run(quick: bool) -> Report:
 
 
 def child(bodies: str) -> dict:
-    """The part that runs in a process of its own."""
+    """Measure one ensemble in the child process."""
     work = library_ensemble(
         quadratic_body(RATE), random_states(int(bodies)), T_END, STEPS, "compiled", outputs="summary"
     )
-    before, result = peak_resident_bytes(), work()
-    kept = ensemble_laws(result)
+    initial_bytes, result = peak_resident_bytes(), work()
+    run_laws = ensemble_laws(result)
     assert np.all(np.isfinite(result.energy))
     return {
-        "before": before,
+        "before": initial_bytes,
         "peak": peak_resident_bytes(),
         "seconds": result.wall_time,
-        "laws": [kept.energy_drift, kept.least_entropy_increment],
+        "laws": [run_laws.energy_drift, run_laws.least_entropy_increment],
     }
 
 
 def peak_resident_bytes() -> float:
-    """Largest resident size of this program so far, in bytes.
+    """Return the largest resident size of this program so far, in bytes.
 
-    Not ``getrusage``: a process inherits its figure from the one that started it, which may have been larger.
+    ``getrusage`` is not used, because a process inherits its value from the parent, which may have been larger.
     """
     fields = dict(line.split(":", 1) for line in PROCESS_STATUS_FILE.read_text().splitlines())
     return 1024.0 * int(fields["VmHWM"].split()[0])

@@ -1,4 +1,4 @@
-"""Heat between many bodies: how time and memory of a step grow with their number, where steps are stiff too."""
+"""Heat between many bodies: the growth of time and memory with their number, also for stiff steps."""
 
 from __future__ import annotations
 
@@ -17,25 +17,39 @@ from ..report import Report, Table, Target, ratio
 from .memory import PROCESS_STATUS_FILE, peak_resident_bytes
 
 SIZES = (1_000, 10_000, 100_000)
-MILD_STEP, STIFF_STEP = 0.02, 100.0
-"""Steps in units of the time in which two neighbours exchange their heat: for fixed-point and for Newton iteration."""
+"""Numbers of bodies."""
+MILD_STEP = 0.02
+"""Step solved by fixed-point iteration, in units of the time in which two neighbours exchange their heat."""
+
+STIFF_STEP = 100.0
+"""Step solved by Newton's method, in units of the time in which two neighbours exchange their heat."""
 
 STEPS = 5
+"""Number of steps."""
 GRAPHS = ("plane grid", "grid in space", "random, 4 neighbours")
+"""Kinds of graphs."""
 
 
 def run(quick: bool) -> Report:
-    """One table: graphs, sizes and steps."""
+    """Measure all graphs, sizes and steps."""
     graphs, sizes = (GRAPHS[:1], (100,)) if quick else (GRAPHS, SIZES)
     rows: list[list] = []
     seconds: dict[tuple[str, int, float], float] = {}
     for graph in graphs:
         for nodes in sizes:
             for h in (MILD_STEP, STIFF_STEP):
-                found = process.run_child("network", graph, str(nodes), str(h), one_core=True)
-                seconds[graph, nodes, h] = found["step"]
-                row = [graph, found["nodes"], h, found["first"], found["step"], found["iterations"], found["peak"]]
-                rows.append([*row, *laws.Laws(*found["laws"]).table_cells()])
+                results = process.run_child("network", graph, str(nodes), str(h), one_core=True)
+                seconds[graph, nodes, h] = results["step"]
+                row = [
+                    graph,
+                    results["nodes"],
+                    h,
+                    results["first"],
+                    results["step"],
+                    results["iterations"],
+                    results["peak"],
+                ]
+                rows.append([*row, *laws.Laws(*results["laws"]).table_cells()])
     columns = {
         "Graph": "text",
         "Bodies": "count",
@@ -54,16 +68,16 @@ def run(quick: bool) -> Report:
         "gradient. The short steps are solved by fixed-point iteration, the long ones by Newton's method with a sparse "
         "Jacobian matrix, factorised for plane grids and used by Krylov iteration for the others."
     )
-    few, many = (seconds.get((GRAPHS[0], nodes, STIFF_STEP)) for nodes in SIZES[1:])
+    small_seconds, large_seconds = (seconds.get((GRAPHS[0], nodes, STIFF_STEP)) for nodes in SIZES[1:])
     targets = [
-        Target("stiff step of a plane grid of 10⁵ bodies", 10.0, many, "seconds"),
-        Target("growth of its time from 10⁴ to 10⁵ bodies", 20.0, ratio(many, few)),
+        Target("stiff step of a plane grid of 10⁵ bodies", 10.0, large_seconds, "seconds"),
+        Target("growth of its time from 10⁴ to 10⁵ bodies", 20.0, ratio(large_seconds, small_seconds)),
     ]
     return Report("Networks", text, [Table(caption, columns | laws.COLUMNS, rows)], targets)
 
 
 def child(graph: str, nodes: str, h: str) -> dict:
-    """The part that runs in a process of its own."""
+    """Measure one graph, size and step in the child process."""
     matrix = _make_graph(graph, int(nodes))
     count = matrix.shape[0]
     system = lt.models.thermo_particles([1.0] * count, matrix)
@@ -76,14 +90,14 @@ def child(graph: str, nodes: str, h: str) -> dict:
         times.append(time.perf_counter())
         solution = work()
     times.append(time.perf_counter())
-    kept = laws.solution_laws(solution)
+    run_laws = laws.solution_laws(solution)
     return {
         "nodes": count,
         "first": times[1] - times[0],
         "step": (times[3] - times[2]) / STEPS,
         "iterations": solution.stats.iterations_per_step,
         "peak": peak_resident_bytes() if PROCESS_STATUS_FILE.is_file() else None,
-        "laws": [kept.energy_drift, kept.least_entropy_increment],
+        "laws": [run_laws.energy_drift, run_laws.least_entropy_increment],
     }
 
 
@@ -91,8 +105,8 @@ def _make_graph(kind: str, nodes: int) -> scipy.sparse.csr_array:
     if kind == "random, 4 neighbours":
         rng = np.random.default_rng(1)
         ends = np.concatenate([np.arange(nodes), rng.permutation(nodes)])  # a ring, so that it is connected, and more
-        other = np.concatenate([np.roll(np.arange(nodes), 1), rng.permutation(nodes)])
-        upper = scipy.sparse.coo_array((np.ones(2 * nodes), (ends, other)), (nodes, nodes)).tocsr()
+        starts = np.concatenate([np.roll(np.arange(nodes), 1), rng.permutation(nodes)])
+        upper = scipy.sparse.coo_array((np.ones(2 * nodes), (ends, starts)), (nodes, nodes)).tocsr()
         graph = scipy.sparse.csr_array(upper + upper.T)
         graph.setdiag(0.0)
         graph.eliminate_zeros()

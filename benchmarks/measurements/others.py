@@ -1,4 +1,4 @@
-"""Many states of other systems at once: explicit methods against heyoka at equal accuracy."""
+"""Many states of other systems: explicit methods against heyoka at equal accuracy."""
 
 from __future__ import annotations
 
@@ -12,16 +12,23 @@ import liethermo as lt
 import manifolds as mf
 
 from .. import laws, peers
-from ..ensembles import ensemble_laws as ensemble_laws
-from ..ensembles import library_ensemble, loosest_tolerance_work, max_relative_error
+from ..ensembles import ensemble_laws, library_ensemble, loosest_tolerance_work, max_relative_error
 from ..machine import available_cores
 from ..problems import general_body
 from ..report import Report, Table, build_available, ratio
 from ..timing import race
 from . import spin
 
-T_END, N_SAMPLED_STATES, EXACT_TOLERANCE, RATE = 10.0, 32, 1e-18, 0.1
+T_END = 10.0
+"""Duration of the runs."""
+N_SAMPLED_STATES = 32
+"""Number of states whose errors are measured."""
+EXACT_TOLERANCE = 1e-18
+"""heyoka's tolerance for the exact states."""
+RATE = 0.1
+"""Damping rate of the spin."""
 METHOD = lt.MetriplecticRungeKutta(8)
+"""Method of the library."""
 
 
 def _su3_system() -> lt.System:
@@ -35,21 +42,25 @@ SYSTEMS: dict[str, tuple[Callable[[], lt.System], tuple[int, ...]]] = {
     "su(3)": (_su3_system, (8, 16, 32)),
     "A spin on its sphere, with a bath": (lambda: spin.spin_system(RATE), (32, 64, 128)),
 }
-"""Systems, and numbers of steps."""
+"""Systems, each with numbers of steps."""
 
 
 def run(quick: bool) -> Report:
-    """One table for each system."""
+    """Compare with heyoka on each system."""
     tables: list[Table] = []
     skipped: dict[str, str] = {}
     for name, (build, counts) in SYSTEMS.items():
-        table, missing = _race_heyoka(name, build(), 64 if quick else 10_000, counts[:1] if quick else counts, quick)
+        table, unavailable = _race_heyoka(
+            name, build(), 64 if quick else 10_000, counts[:1] if quick else counts, quick
+        )
         tables.append(table)
-        skipped |= missing
+        skipped |= unavailable
     text = (
-        f"10,000 states of norm one to t = {T_END:g}, on {available_cores()} cores: explicit steps of order 8 and heyoka in "
+        f"10,000 states of norm one to t = {T_END:g}, on {available_cores()} cores: explicit steps of order 8 and "
+        "heyoka in "
         "batches over threads, whose equations are the scalar program of the vector field. The error is the "
-        f"worst of {N_SAMPLED_STATES} states, against heyoka at a tolerance of {EXACT_TOLERANCE:g}; heyoka has the loosest tolerance with "
+        f"worst of {N_SAMPLED_STATES} states, against heyoka at a tolerance of {EXACT_TOLERANCE:g}; heyoka has "
+        "the loosest tolerance with "
         "which it is at least as accurate. heyoka's spin leaves its sphere by its error. There is no target."
     )
     return Report("Other systems", text, tables, skipped=skipped)
@@ -61,30 +72,32 @@ def _race_heyoka(name: str, system: lt.System, number: int, counts: tuple[int, .
         random[:, 3] = 0.0  # of the bath
     x0s = random / np.linalg.norm(random, axis=1)[:, None]
     rows: list[list] = []
-    prepared, skipped = build_available({"heyoka": lambda: _heyoka_builder(system, x0s[:N_SAMPLED_STATES])})
+    heyoka_work, skipped = build_available({"heyoka": lambda: _heyoka_builder(system, x0s[:N_SAMPLED_STATES])})
     for steps in counts:
         ours = library_ensemble(system, x0s, T_END, steps, "compiled", METHOD)
-        works, missed = {"compiled engine": ours}, math.nan
-        if "heyoka" in prepared:
-            build, exact = prepared["heyoka"]
-            missed = max_relative_error(ours().x, exact)
-            works["heyoka"], tolerance, reached = loosest_tolerance_work(build, x0s, exact, missed)
+        works, method_error = {"compiled engine": ours}, math.nan
+        if "heyoka" in heyoka_work:
+            build, exact = heyoka_work["heyoka"]
+            method_error = max_relative_error(ours().x, exact)
+            works["heyoka"], tolerance, heyoka_error = loosest_tolerance_work(build, x0s, exact, method_error)
         outcomes = race(works, rounds=1 if quick else 5)
         seconds = {title: outcome.wall_seconds / number for title, outcome in outcomes.items()}
-        kept = ensemble_laws(outcomes["compiled engine"].result)
-        rows.append(["compiled engine", f"{steps} steps", missed, seconds["compiled engine"],
-                     ratio(seconds["compiled engine"], seconds.get("heyoka")), *kept.table_cells()])  # fmt: skip
-        if "heyoka" in prepared:
+        run_laws = ensemble_laws(outcomes["compiled engine"].result)
+        rows.append(["compiled engine", f"{steps} steps", method_error, seconds["compiled engine"],
+                     ratio(seconds["compiled engine"], seconds.get("heyoka")), *run_laws.table_cells()])  # fmt: skip
+        if "heyoka" in heyoka_work:
             ends = laws.end_state_laws(x0s, outcomes["heyoka"].result, system)
-            rows.append(["heyoka", f"tolerance {tolerance:.1e}", reached, seconds["heyoka"], 1.0, *ends.table_cells()])
+            rows.append(
+                ["heyoka", f"tolerance {tolerance:.1e}", heyoka_error, seconds["heyoka"], 1.0, *ends.table_cells()]
+            )
     columns = {"": "text", "Setting": "text", "Error": "error", "Time a state": "seconds", "Relative": "ratio"}
     return Table(f"{name}.", columns | laws.COLUMNS, rows), skipped
 
 
-def _heyoka_builder(system: lt.System, some: np.ndarray) -> tuple[Callable, np.ndarray]:
-    """What makes a work of a tolerance and states, and where some states end."""
+def _heyoka_builder(system: lt.System, states: np.ndarray) -> tuple[Callable, np.ndarray]:
+    """Return a function that builds heyoka's run from a tolerance and states, and exact final states."""
     field = system.vector_field if system.space is None else functools.partial(spin.spin_field, RATE)
     build = functools.partial(
         peers.heyoka_equations_threads, peers.equations_for_heyoka(field, system.dim), t_end=T_END
     )
-    return build, build(EXACT_TOLERANCE, some)()
+    return build, build(EXACT_TOLERANCE, states)()

@@ -1,4 +1,4 @@
-"""Density matrices in a bath of constant temperature, beside QuTiP."""
+"""Density matrices in a bath of constant temperature, against QuTiP."""
 
 from __future__ import annotations
 
@@ -11,21 +11,33 @@ import scipy.linalg
 import liethermo as lt
 
 from .. import laws, peers
-from ..ensembles import ensemble_laws as ensemble_laws
+from ..ensembles import ensemble_laws
 from ..machine import available_cores
 from ..report import Report, Table, UnavailableError, ratio
 from ..timing import race
 
-TEMPERATURE, RATE, T_END = 0.8, 0.1, 100.0
+TEMPERATURE = 0.8
+"""Temperature of the bath."""
+RATE = 0.1
+"""Rate of the jumps."""
+T_END = 100.0
+"""Duration of the runs."""
 
-LOWERING, ENSEMBLE_T_END = np.array([[0.0, 1.0], [0.0, 0.0]]), 250.0
+LOWERING = np.array([[0.0, 1.0], [0.0, 0.0]])
+"""Lowering operator of a qubit."""
+ENSEMBLE_T_END = 250.0
+"""Duration of the ensemble of qubits."""
 
-EARLY_TIME, N_SAVED = 5.0, 20
-"""The time at which the error is measured beside that at the end, when coherences have decayed; states kept."""
+EARLY_TIME = 5.0
+"""Time of the second error measurement; at the end, the coherences have decayed."""
+
+N_SAVED = 20
+"""Number of saved states."""
 
 
 def operators(levels: int) -> tuple[np.ndarray, np.ndarray]:
-    """Levels whose distances differ, and a coupling of neighbours; no level so high that it is empty to rounding."""
+    """Return the Hamiltonian with unequal level distances and the coupling of neighbours; no level is empty to
+    rounding."""
     distances = np.concatenate([[0.0], np.linspace(0.7, 1.3, levels - 1)])
     return np.diag(np.cumsum(distances)), np.diag(np.sqrt(np.arange(1.0, levels)), 1)
 
@@ -37,19 +49,19 @@ def thermal_system(levels: int) -> lt.QuantumSystem:
 
 
 def jump_operators(levels: int) -> list[np.ndarray]:
-    """The jumps of Lindblad's equation, their rates inside."""
+    """Return the jump operators of Lindblad's equation, including their rates."""
     H, V = operators(levels)
-    found = []
+    jumps = []
     for i in range(levels - 1):
-        one, omega = np.zeros((levels, levels)), H[i + 1, i + 1] - H[i, i]
-        one[i, i + 1] = V[i, i + 1]
-        for L, energy in ((one, omega), (one.T, -omega)):
-            found.append(np.sqrt(RATE * np.exp(energy / (2 * TEMPERATURE))) * L)
-    return found
+        lowering, omega = np.zeros((levels, levels)), H[i + 1, i + 1] - H[i, i]
+        lowering[i, i + 1] = V[i, i + 1]
+        for L, energy in ((lowering, omega), (lowering.T, -omega)):
+            jumps.append(np.sqrt(RATE * np.exp(energy / (2 * TEMPERATURE))) * L)
+    return jumps
 
 
 def exact_states(levels: int, rho: np.ndarray) -> np.ndarray:
-    """The density matrices at the early time and at the end."""
+    """Return the density matrices at the early time and at the end."""
     H, one = operators(levels)[0], np.eye(levels)
     generator = -1j * (np.kron(H, one) - np.kron(one, H.T))
     for L in jump_operators(levels):
@@ -61,7 +73,7 @@ def exact_states(levels: int, rho: np.ndarray) -> np.ndarray:
 
 
 def qutip_work(levels: int, rho: np.ndarray, tolerance: float):
-    """A call of ``qutip.mesolve`` to the end; its density matrices at the early time and there."""
+    """Return a run of ``qutip.mesolve`` that gives the density matrices at the early time and at the end."""
     qutip = peers.import_peer("qutip")
     H, *jumps = (
         qutip.Qobj(L).to("CSR") for L in (operators(levels)[0], *jump_operators(levels))
@@ -82,62 +94,65 @@ def qubit(parameters) -> lt.QuantumSystem:
 
 
 def qubit_ensemble(number: int) -> tuple[lt.Ensemble, np.ndarray]:
-    """A run of qubits from random states in baths of as many temperatures, at as many rates; and how far each is from
-    the Gibbs state of its bath at the end."""
+    """Run qubits from random states with different temperatures and rates; return the ensemble, and final distances
+    from the Gibbs states."""
     rng = np.random.default_rng(0)
     parameters = {"rate": rng.uniform(0.1, 0.4, number), "temperature": rng.uniform(0.4, 2.0, number)}
-    some = qubit({"rate": 0.1, "temperature": 1.0})
-    states = some.samples(number, 1) * np.append(np.ones(some.body_dim), 0.0)
+    example_system = qubit({"rate": 0.1, "temperature": 1.0})
+    states = example_system.samples(number, 1) * np.append(np.ones(example_system.body_dim), 0.0)
     method = lt.MetriplecticTaylor(20)
-    found = lt.ensemble(qubit, states, (0.0, ENSEMBLE_T_END), 2.5, method, parameters=parameters)
+    result = lt.ensemble(qubit, states, (0.0, ENSEMBLE_T_END), 2.5, method, parameters=parameters)
     weights = np.exp(-np.outer(1.0 / parameters["temperature"], [0.0, 1.0]))
-    gibbs = np.zeros((number, some.body_dim))
+    gibbs = np.zeros((number, example_system.body_dim))
     gibbs[:, :2] = weights / weights.sum(axis=1, keepdims=True)
-    return found, np.abs(np.asarray(found.x)[:, : some.body_dim] - gibbs).max(axis=1)
+    return result, np.abs(np.asarray(result.x)[:, : example_system.body_dim] - gibbs).max(axis=1)
 
 
 def _ensemble_table(quick: bool) -> Table:
     number = 100 if quick else 100_000
     outcome = race({"ours": lambda: qubit_ensemble(number)}, rounds=1 if quick else 3)["ours"]
-    found, distance = outcome.result
+    result, distance = outcome.result
     cells = [f"{number:,}", outcome.wall_seconds, outcome.wall_seconds / number, float(distance.max())]
     columns = {"Qubits": "text", "To the end": "seconds", "Time a qubit": "seconds", "Distance from Gibbs": "error"}
     return Table(
         f"An ensemble of qubits, each with a temperature and a rate of its own, by Taylor steps of order 20 to "
         f"T = {ENSEMBLE_T_END:g}: the worst of all. Times by the clock, on {available_cores()} cores.",
         columns | laws.COLUMNS,
-        [[*cells, *ensemble_laws(found).table_cells()]],
+        [[*cells, *ensemble_laws(result).table_cells()]],
     )
 
 
 def run(quick: bool) -> Report:
     rows, rounds = [], 1 if quick else 5
-    small, large = ((2, 20, 2.5), (3, 20, 1.25), (4, 20, 1.25)), ((8, 16, 0.5), (16, 16, 0.25))
-    for levels, order, step in small if quick else small + large:
+    small_cases, large_cases = ((2, 20, 2.5), (3, 20, 1.25), (4, 20, 1.25)), ((8, 16, 0.5), (16, 16, 0.25))
+    for levels, order, step in small_cases if quick else small_cases + large_cases:
         q, rng = thermal_system(levels), np.random.default_rng(levels)
         root = rng.normal(size=(levels, levels)) + 1j * rng.normal(size=(levels, levels))
         rho = root @ root.conj().T / np.trace(root @ root.conj().T).real
-        x, wanted, method = q.state(rho), exact_states(levels, rho), lt.MetriplecticTaylor(order)
+        x, exact, method = q.state(rho), exact_states(levels, rho), lt.MetriplecticTaylor(order)
         start = time.process_time()
         lt.integrate(q, x, (0.0, step), step, method)
-        first, steps = time.process_time() - start, round(T_END / step)
+        first_seconds, steps = time.process_time() - start, round(T_END / step)
 
         def ours(q=q, x=x, step=step, steps=steps, method=method):
             return lt.integrate(q, x, (0.0, T_END), step, method, save_every=steps // N_SAVED)
 
-        error = np.abs(np.asarray(q.density(ours().x[np.array([1, -1])])) - wanted).max()
+        error = np.abs(np.asarray(q.density(ours().x[np.array([1, -1])])) - exact).max()
         works = {"ours": ours}
         with contextlib.suppress(UnavailableError):
             works["QuTiP"] = qutip_work(levels, rho, max(error, 1e-12))
         outcomes = race(works, rounds=rounds)
-        own = outcomes["ours"]
-        cells = [levels, first, own.cpu_seconds / steps, own.cpu_seconds, error]
+        own_outcome = outcomes["ours"]
+        cells = [levels, first_seconds, own_outcome.cpu_seconds / steps, own_outcome.cpu_seconds, error]
         if "QuTiP" in outcomes:
-            other = outcomes["QuTiP"]
-            cells += [ratio(other.cpu_seconds, own.cpu_seconds), np.abs(other.result - wanted).max()]
+            qutip_outcome = outcomes["QuTiP"]
+            cells += [
+                ratio(qutip_outcome.cpu_seconds, own_outcome.cpu_seconds),
+                np.abs(qutip_outcome.result - exact).max(),
+            ]
         else:
             cells += [None, None]
-        rows.append([*cells, *laws.solution_laws(own.result).table_cells()])
+        rows.append([*cells, *laws.solution_laws(own_outcome.result).table_cells()])
     columns = {"Levels": "text", "First answer": "seconds", "Time a step": "seconds", "To the end": "seconds"}
     columns |= {"Error": "error", "QuTiP, relative": "ratio", "Its error": "error"}
     table = Table(

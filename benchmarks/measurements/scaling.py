@@ -1,4 +1,4 @@
-"""Time and memory by size: fields, spins, graphs and matrices from ten sites to ten million, by the engine "auto"."""
+"""Time and memory by size: fields, spins, graphs and matrices from ten to ten million sites, with engine="auto"."""
 
 from __future__ import annotations
 
@@ -23,17 +23,30 @@ from .lattice import random_spins
 from .memory import PROCESS_STATUS_FILE, peak_resident_bytes
 
 SIZES = tuple(10**i for i in range(1, 8))
-SHORT_STEPS, MIN_TIMED_SECONDS, MAX_STEPS = 2, 1.0, 200_000
-"""Steps of a short run; seconds, and steps at most, that the long one takes longer."""
+"""Numbers of sites."""
+SHORT_STEPS = 2
+"""Steps of the short run, whose time is subtracted."""
 
-MAX_STEP_SECONDS, MAX_MEMORY_FRACTION = 20.0, 0.7
-"""Seconds that a step may take, and the share of the memory that a process may: else a size is left out."""
+MIN_TIMED_SECONDS = 1.0
+"""Seconds by which the long run must exceed the short one."""
 
-MIDPOINT, EXPLICIT = lt.MetriplecticMidpoint(), lt.MetriplecticRungeKutta(4)
+MAX_STEPS = 200_000
+"""Maximum number of steps of the long run."""
+
+MAX_STEP_SECONDS = 20.0
+"""Maximum seconds of a step; larger systems are left out."""
+
+MAX_MEMORY_FRACTION = 0.7
+"""Maximum fraction of the memory that a process may use; larger systems are left out."""
+
+MIDPOINT = lt.MetriplecticMidpoint()
+"""Method of most systems."""
+EXPLICIT = lt.MetriplecticRungeKutta(4)
+"""Method of the fluids."""
 
 
 def wave_field(n: int) -> tuple[lt.System, Any]:
-    """A wave equation with a cubic force: a plain function of all positions and momenta."""
+    """Return a wave equation with a cubic force, as a plain function of all positions and momenta, and a state."""
 
     def energy(x):
         q, p = x[:n], x[n:]
@@ -44,19 +57,19 @@ def wave_field(n: int) -> tuple[lt.System, Any]:
 
 
 def spin_ring(n: int) -> tuple[lt.System, Any]:
-    """A ring of spins that heat a bath."""
+    """Return a ring of spins that heat a bath, and a state."""
     return lt.models.spin_lattice(n, 1.0, 0.1, rate=0.1), random_spins(n)
 
 
 def heat_graph(n: int) -> tuple[lt.System, Any]:
-    """Heat on a square grid of bodies, nearly n of them."""
+    """Return heat conduction on a square grid of about n bodies, and a state."""
     edge = round(math.sqrt(n))
     temperatures = np.random.default_rng(0).uniform(0.8, 1.2, edge**2)
     return lt.models.heat_grid((edge, edge)), np.log(temperatures)
 
 
 def sphere_fluid(n: int) -> tuple[lt.System, Any]:
-    """A fluid on the sphere, its matrix of nearly n entries."""
+    """Return a fluid on the sphere with a matrix of about n entries, and a state."""
     N = round(math.sqrt(n))
     sphere = lt.models.QuantisedSphere(N)
     return lt.models.zeitlin(N, "enstrophy", 1e-3), sphere.random(0, (1, min(N - 1, 12)), 1.0)
@@ -68,11 +81,11 @@ SYSTEM_KINDS: dict[str, tuple[Callable, lt.OneStepMethod, float]] = {
     "a graph": (heat_graph, MIDPOINT, 0.1),
     "su(N)": (sphere_fluid, EXPLICIT, 1e-3),
 }
-"""What makes a system and a state of so many sites, the method and the step."""
+"""Functions that make a system and a state with n sites, and the method and step, by kind."""
 
 
 def run(quick: bool) -> Report:
-    """One table, each row in a process of its own."""
+    """Measure every kind and size, each in a process of its own."""
     rows: list[list] = []
     skipped: dict[str, str] = {}
     for kind in SYSTEM_KINDS:
@@ -80,9 +93,9 @@ def run(quick: bool) -> Report:
             if reason := why_too_large(rows[-1] if rows and rows[-1][0] == kind else None):
                 skipped[f"{kind}, {n:,} sites"] = reason
                 break
-            found = process.run_child("scaling", kind, str(n))
-            row = [kind, found["sites"], found["engine"], found["first"], found["step"] / found["sites"]]
-            rows.append([*row, found["step"], found["peak"]])
+            results = process.run_child("scaling", kind, str(n))
+            row = [kind, results["sites"], results["engine"], results["first"], results["step"] / results["sites"]]
+            rows.append([*row, results["step"], results["peak"]])
     columns = {"System": "text", "Sites": "count", "Engine": "text", "First answer": "seconds"}
     columns |= {"A step, for each site": "seconds", "A step": "seconds", "Peak memory": "gigabytes"}
     caption = (
@@ -102,11 +115,11 @@ def run(quick: bool) -> Report:
     return Report("Time and memory by size", text, [Table(caption, columns, rows)], targets, skipped)
 
 
-def why_too_large(last: list | None) -> str:
-    """Why a system of ten times the size of the last row is not tried; empty where it is."""
-    if last is None:
+def why_too_large(last_row: list | None) -> str:
+    """Return the reason why a system ten times larger than the last row is not measured, or ""."""
+    if last_row is None:
         return ""
-    seconds, peak = last[-2:]
+    seconds, peak = last_row[-2:]
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if 10.0 * seconds > MAX_STEP_SECONDS:
         return f"a step would take more than {MAX_STEP_SECONDS:g} s"
@@ -116,11 +129,11 @@ def why_too_large(last: list | None) -> str:
 
 
 PACKAGES_BYTES = 0.5e9
-"""Memory of a process that has compiled something small."""
+"""Memory of a process that has compiled something small, in bytes."""
 
 
 def child(kind: str, n: str) -> dict:
-    """The part that runs in a process of its own."""
+    """Measure one kind and size in the child process."""
     make, method, h = SYSTEM_KINDS[kind]
     times = [time.process_time()]
     system, x0 = make(int(n))
@@ -131,27 +144,27 @@ def child(kind: str, n: str) -> dict:
     for _ in range(2):
         steps(SHORT_STEPS)
         times.append(time.process_time())
-    first, short = np.diff(times)
-    many = SHORT_STEPS + 1
+    first_seconds, short_seconds = np.diff(times)
+    long_steps = SHORT_STEPS + 1
     while (
-        seconds := _processor_seconds(functools.partial(steps, many)) - short
-    ) < MIN_TIMED_SECONDS and many < MAX_STEPS:
-        many = min(MAX_STEPS, 2 * many)
+        seconds := _processor_seconds(functools.partial(steps, long_steps)) - short_seconds
+    ) < MIN_TIMED_SECONDS and long_steps < MAX_STEPS:
+        long_steps = min(MAX_STEPS, 2 * long_steps)
     seconds = min(
-        seconds, _processor_seconds(functools.partial(steps, many)) - short
+        seconds, _processor_seconds(functools.partial(steps, long_steps)) - short_seconds
     )  # Newton's method is compiled where needed
-    chosen = EngineWithFallback(*prepare_run(system, method), "auto", many)
-    chosen.initial_run_state(jnp.asarray(x0))
+    engine = EngineWithFallback(*prepare_run(system, method), "auto", long_steps)
+    engine.initial_run_state(jnp.asarray(x0))
     return {
         "sites": len(np.ravel(x0)) // {"a field": 2, "spins": 3}.get(kind, 1) + (kind == "su(N)"),
-        "engine": chosen.name,
-        "first": first,
-        "step": seconds / (many - SHORT_STEPS),
+        "engine": engine.name,
+        "first": first_seconds,
+        "step": seconds / (long_steps - SHORT_STEPS),
         "peak": peak_resident_bytes() if PROCESS_STATUS_FILE.is_file() else None,
     }
 
 
 def _processor_seconds(work: Callable) -> float:
-    begun = time.process_time()
+    start = time.process_time()
     work()
-    return time.process_time() - begun
+    return time.process_time() - start

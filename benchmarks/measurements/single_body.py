@@ -1,4 +1,4 @@
-"""One relaxed rigid body: the time of a step."""
+"""Time of a step of one relaxed rigid body."""
 
 from __future__ import annotations
 
@@ -15,14 +15,19 @@ from ..native import BodyProgram
 from ..problems import body_parameters, function_body, quadratic_body
 from ..report import Report, Target, build_available, ratio
 
-C_ROW, QUADRATIC_ROW, PLAIN_ROW = "C", "compiled engine, `lt.Quadratic`", "compiled engine, plain functions"
+C_ROW = "C"
+"""Row of the C program."""
+QUADRATIC_ROW = "compiled engine, `lt.Quadratic`"
+"""Row of the compiled engine with quadratic functions."""
+PLAIN_ROW = "compiled engine, plain functions"
+"""Row of the compiled engine with plain functions."""
 
 
 def run(quick: bool) -> Report:
-    """Time a step in a run long enough that calls do not count, and the call of a short one."""
+    """Time a step in a run that is long compared with the call, and the call of a short run."""
     steps, rounds = (2000, 1) if quick else (1_000_000, 5)
     rate = RATE_TIMES_DURATION / (STEP_SIZE * steps)
-    long, skipped = build_available(
+    long_works, skipped = build_available(
         {
             C_ROW: lambda: c_run(_c_program(rate), steps),
             QUADRATIC_ROW: lambda: library_run(quadratic_body(rate), steps, "compiled"),
@@ -32,29 +37,30 @@ def run(quick: bool) -> Report:
         }
     )
     caption = f"A run of {steps:,} steps of size {STEP_SIZE}, relaxing all the way (rate {rate:g}); one state kept."
-    table, times = race_one_trajectory(caption, long, steps, rounds, C_ROW)
+    table, times = race_one_trajectory(caption, long_works, steps, rounds, C_ROW)
 
-    few = 100 if quick else 1000
-    short, _ = build_available(
+    short_steps = 100 if quick else 1000
+    short_works, _ = build_available(
         {
-            C_ROW: lambda: c_run(_c_program(1.0), few, 1),
-            "compiled engine": lambda: library_run(quadratic_body(1.0), few, "compiled", 1),
-            "array engine": lambda: library_run(quadratic_body(1.0), few, "array", 1),
+            C_ROW: lambda: c_run(_c_program(1.0), short_steps, 1),
+            "compiled engine": lambda: library_run(quadratic_body(1.0), short_steps, "compiled", 1),
+            "array engine": lambda: library_run(quadratic_body(1.0), short_steps, "array", 1),
         }
     )
     caption = (
-        f"The run of the paper's figure: one call for {few} steps (rate 1), every state kept. Here the times are "
+        f"The run of the paper's figure: one call for {short_steps} steps (rate 1), every state kept. Here the "
+        "times are "
         "mostly what a call costs before and after its steps."
     )
-    calls, of_calls = race_one_trajectory(caption, short, few, 3 * rounds, C_ROW)
-    beside = of_calls["compiled engine"] - few * times[QUADRATIC_ROW] / steps
+    calls, call_times = race_one_trajectory(caption, short_works, short_steps, 3 * rounds, C_ROW)
+    call_seconds = call_times["compiled engine"] - short_steps * times[QUADRATIC_ROW] / steps
 
     text = (
         "The metriplectic midpoint scheme on one relaxed rigid body, with the same rules for the iteration, "
         "compensated summation, steering of the energy and record of energy and entropy at every step. Times are of "
         "the processor. That H and S are quadratic the library sees from plain functions too."
     )
-    if C_ROW in long:
+    if C_ROW in long_works:
         text += (
             f" Over {COMPARED_STEPS} steps the trajectories of the C program and the compiled engine differ by "
             f"{max_difference_from_c(_c_program(1.0), quadratic_body(1.0)):.0e}."
@@ -66,7 +72,9 @@ def run(quick: bool) -> Report:
         for name in (PLAIN_ROW, QUADRATIC_ROW)
     ]
     targets.append(
-        Target(f"a call of {few} steps that keeps every state, without the steps", 1.5e-4, beside, "seconds")
+        Target(
+            f"a call of {short_steps} steps that keeps every state, without the steps", 1.5e-4, call_seconds, "seconds"
+        )
     )
     return Report("One body", text, [table, calls], targets, skipped)
 

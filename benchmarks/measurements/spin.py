@@ -1,4 +1,4 @@
-"""A spin on S^2 with a bath, on its manifold: the time of a step without charts and with them; heyoka."""
+"""A spin on S^2 with a bath, on its manifold: the time of a step with and without charts, and heyoka."""
 
 from __future__ import annotations
 
@@ -19,34 +19,52 @@ from ..native import BodyProgram
 from ..report import Report, Table, Target, UnavailableError, build_available, ratio
 from ..timing import race
 
-ANISOTROPY, FIELD = 1.5, (0.6, 0.0, 0.2)
-X0, STEP = (np.sin(1.45), 0.0, np.cos(1.45), 0.0), 0.1
+ANISOTROPY = 1.5
+"""Anisotropy constant."""
+FIELD = (0.6, 0.0, 0.2)
+"""External field."""
+X0 = (np.sin(1.45), 0.0, np.cos(1.45), 0.0)
+"""Initial spin and entropy."""
+STEP = 0.1
+"""Step size."""
 
 RATE_TIMES_DURATION = 2.0
-"""Rate times duration: the spin is on its way to the end of the run."""
+"""Rate times duration; the spin still moves at the end of the run."""
 
-C_ROW, COMPILED_ROW = "C", "compiled engine"
+C_ROW = "C"
+"""Row of the C program."""
+COMPILED_ROW = "compiled engine"
+"""Row of the compiled engine."""
 
-T_END, SLOW_RATE, TARGET_ERROR, EXACT_TOLERANCE = 500.0, 1e-3, 1e-8, 1e-18
-"""Of the race with heyoka: the time, the rate, with which the spin still moves then, the error at the end, and heyoka's
-tolerance for what counts as exact."""
+T_END = 500.0
+"""Duration of the comparison with heyoka."""
+
+SLOW_RATE = 1e-3
+"""Rate of the comparison with heyoka, at which the spin still moves at the end."""
+
+TARGET_ERROR = 1e-8
+"""Maximum final error of the comparison with heyoka."""
+
+EXACT_TOLERANCE = 1e-18
+"""heyoka's tolerance for the exact state."""
 
 RETRACTIONS = {"without charts": None, "in charts": "midpoint"}
-"""The retraction of the midpoint scheme."""
+"""Retractions of the midpoint scheme."""
 
 C_SOURCES = {"without charts": "spin_around.c", "in charts": "spin.c"}
+"""C sources of both schemes."""
 
 
 def run(quick: bool) -> Report:
-    """Time a step of the midpoint scheme in one thread, and runs of high order beside heyoka's."""
+    """Time a step of the midpoint scheme in one thread, and runs of high order against heyoka."""
     steps, rounds = (2000, 1) if quick else (100_000, 5)
     rate, tables, text = RATE_TIMES_DURATION / (STEP * steps), [], [INTRODUCTION]
     ratios: dict[str, float | None] = {}
     skipped: dict[str, str] = {}
     for way in RETRACTIONS:
         runs = functools.partial(_c_run, rate, steps, way), functools.partial(_compiled_run, rate, steps, way)
-        works, missing = build_available(dict(zip((C_ROW, COMPILED_ROW), runs, strict=True)))
-        skipped |= missing
+        works, unavailable = build_available(dict(zip((C_ROW, COMPILED_ROW), runs, strict=True)))
+        skipped |= unavailable
         caption = f"{steps:,} steps of size {STEP} {way}, relaxing all the way (rate {rate:g}); one state kept."
         table, times = race_one_trajectory(caption, works, steps, rounds, C_ROW)
         tables.append(table)
@@ -56,13 +74,13 @@ def run(quick: bool) -> Report:
                 f"Over 300 steps {way} the trajectories of both differ by {max_difference_from_c(way=way):.0e}."
             )
     try:
-        table, against = _race_heyoka(rounds)
+        table, heyoka_ratio = _race_heyoka(rounds)
         tables.append(table)
     except UnavailableError as reason:
-        against, skipped["heyoka"] = None, str(reason)
+        heyoka_ratio, skipped["heyoka"] = None, str(reason)
     targets = [
         Target("a spin on its sphere, same scheme without charts, against C", 1.5, ratios["without charts"]),
-        Target(f"a spin on its sphere with an error of {TARGET_ERROR:g}, against heyoka", 1.0, against),
+        Target(f"a spin on its sphere with an error of {TARGET_ERROR:g}, against heyoka", 1.0, heyoka_ratio),
     ]
     return Report("A spin on its sphere", " ".join(text), tables, targets, skipped)
 
@@ -72,6 +90,7 @@ A spin with an easy axis in a tilted field, which heats a bath as it comes to re
 library as functions of the state and its space. Without charts the midpoint scheme runs in the space around the \
 sphere. In charts it is the paper's, with the midpoint map exp~: there *C* is written for this sphere, and needs the \
 energy's derivative along a geodesic, where the library takes the gradient of the energy in a chart."""
+"""Beginning of the report."""
 
 
 def _c_run(rate: float, steps: int, way: str) -> Callable:
@@ -83,31 +102,31 @@ def _compiled_run(rate: float, steps: int, way: str) -> Callable:
 
 
 def _race_heyoka(rounds: int) -> tuple[Table, float]:
-    """Runs to one time with the wanted error: the fewest steps of each method, heyoka's loosest tolerance."""
-    relaxing = spin_system(SLOW_RATE)
+    """Race runs of equal error: each method with the fewest steps, heyoka with the loosest tolerance."""
+    slow_system = spin_system(SLOW_RATE)
     equations = peers.equations_for_heyoka(functools.partial(spin_field, SLOW_RATE), len(X0))
     build = functools.partial(peers.heyoka_equations_run, equations, x0=X0, t_end=T_END)
     exact = build(EXACT_TOLERANCE).solve_end()
 
-    def missed(end) -> float:
+    def end_error(end) -> float:
         return float(np.abs(np.asarray(end) - exact).max())
 
     def ours(method: lt.OneStepMethod, steps: int) -> Callable[[], np.ndarray]:
         span, step = (0.0, T_END), T_END / steps
         return lambda: lt.integrate(
-            relaxing, X0, span, step, method, save_every=steps, engine="compiled", on_failure="return"
+            slow_system, X0, span, step, method, save_every=steps, engine="compiled", on_failure="return"
         ).x[-1]
 
-    tolerance = next(t for t in TOLERANCES if missed(build(t).solve_end()) <= TARGET_ERROR)
+    tolerance = next(t for t in TOLERANCES if end_error(build(t).solve_end()) <= TARGET_ERROR)
     works, settings = {"heyoka": build(tolerance).solve_end}, {"heyoka": f"tolerance {tolerance:.1e}"}
     for title, method in RACED_METHODS.items():
         steps = next(
-            n for n in (int(MIN_STEPS * 1.1**i) for i in range(40)) if missed(ours(method, n)()) <= TARGET_ERROR
+            n for n in (int(MIN_STEPS * 1.1**i) for i in range(40)) if end_error(ours(method, n)()) <= TARGET_ERROR
         )
         works[title], settings[title] = ours(method, steps), f"{steps} steps"
-    raced = race({title: _repeat(work) for title, work in works.items()}, rounds=rounds)
-    times = {title: outcome.cpu_seconds / RUNS_PER_TIMING for title, outcome in raced.items()}
-    rows = [[title, settings[title], missed(works[title]()), times[title]] for title in [*RACED_METHODS, "heyoka"]]
+    outcomes = race({title: _repeat(work) for title, work in works.items()}, rounds=rounds)
+    times = {title: outcome.cpu_seconds / RUNS_PER_TIMING for title, outcome in outcomes.items()}
+    rows = [[title, settings[title], end_error(works[title]()), times[title]] for title in [*RACED_METHODS, "heyoka"]]
     columns = {"": "text", "Setting": "text", "Error": "error", "Time": "seconds"}
     return Table(f"A run to t = {T_END:g}, from its call to its last state.", columns, rows), (
         min(times[title] for title in RACED_METHODS) / times["heyoka"]
@@ -115,20 +134,21 @@ def _race_heyoka(rounds: int) -> tuple[Table, float]:
 
 
 RACED_METHODS = {"RK8": lt.MetriplecticRungeKutta(8), "Taylor(12)": lt.MetriplecticTaylor(12)}
+"""Methods that are compared with heyoka."""
 
 MIN_STEPS = 1000
-"""Steps that are tried first; those that are longer end a run."""
+"""Number of steps that is tried first; with fewer, a run fails."""
 
 RUNS_PER_TIMING = 20
-"""Runs that are timed together: one takes a few milliseconds."""
+"""Number of runs that are timed together, since one takes a few milliseconds."""
 
 
 def _repeat(work: Callable) -> Callable:
-    def many():
+    def run_repeatedly():
         for _ in range(RUNS_PER_TIMING):
             work()
 
-    return many
+    return run_repeatedly
 
 
 def spin_energy(x):
@@ -136,10 +156,12 @@ def spin_energy(x):
 
 
 def spin_field(rate: float, x) -> jax.Array:
-    """The velocity of spin and entropy near the sphere, as other solvers are given it."""
+    """Return the velocity of spin and entropy near the sphere, as other solvers get it."""
     spin, slope = x[:3], jax.grad(spin_energy)(x)
-    raised = (spin @ spin) * slope[:3] - (spin @ slope[:3]) * spin
-    return jnp.append(jnp.cross(spin, slope[:3]) - rate * slope[3] * raised, rate * (slope[:3] @ raised))
+    tangential_slope = (spin @ spin) * slope[:3] - (spin @ slope[:3]) * spin
+    return jnp.append(
+        jnp.cross(spin, slope[:3]) - rate * slope[3] * tangential_slope, rate * (slope[:3] @ tangential_slope)
+    )
 
 
 def spin_system(rate: float) -> lt.MetriplecticSystem:
@@ -156,18 +178,20 @@ def c_program(rate: float, way: str) -> BodyProgram:
     return BodyProgram(C_SOURCES[way], [ANISOTROPY, *FIELD, rate])
 
 
-def library_run(rate: float, steps: int, every: int, engine: Engine, way: str) -> Callable[[], lt.Solution]:
+def library_run(rate: float, steps: int, save_every: int, engine: Engine, way: str) -> Callable[[], lt.Solution]:
     span, midpoint = (0.0, STEP * steps), lt.MetriplecticMidpoint(retraction=RETRACTIONS[way])
-    return functools.partial(lt.integrate, spin_system(rate), X0, span, STEP, midpoint, save_every=every, engine=engine)
+    return functools.partial(
+        lt.integrate, spin_system(rate), X0, span, STEP, midpoint, save_every=save_every, engine=engine
+    )
 
 
 def max_difference_from_c(way: str, rate: float = 0.03) -> float:
-    """Largest difference between the trajectories of C, at some rate, and of the library at 0.03, over 300 steps.
+    """Return the largest difference over 300 steps between C, at ``rate``, and the library at rate 0.03.
 
     Raises
     ------
     RuntimeError
-        As :func:`..contest.of_one_scheme`.
+        As for :func:`..contest.require_same_scheme`.
     """
     ours, (theirs, _) = (
         library_run(0.03, 300, 1, "compiled", way)().x[1:],

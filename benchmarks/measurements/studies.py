@@ -1,4 +1,4 @@
-"""What a study costs beside its runs: a million bodies, many chunks of little work, and workers of a cluster."""
+"""Overhead of a study: a million bodies, many small chunks, and workers of a cluster."""
 
 from __future__ import annotations
 
@@ -16,51 +16,65 @@ from ..machine import available_cores
 from ..report import Report, Table, Target
 from .memory import peak_resident_bytes
 
-X0, STEP, T_END, RELAXED_TOLERANCE = (1.0, 0.2, 0.3), 0.1, 40.0, 1e-8
+X0 = (1.0, 0.2, 0.3)
+"""Initial angular momentum."""
+STEP = 0.1
+"""Step size."""
+T_END = 40.0
+"""Maximum duration of a run."""
+RELAXED_TOLERANCE = 1e-8
+"""Relaxation rate at which a run ends."""
 METHOD = lt.MetriplecticRungeKutta(4)
-N_BODIES, N_CHUNKS, N_CLUSTER_BODIES = 1_000_000, 100_000, 200_000
+"""Method of all runs."""
+N_BODIES = 1_000_000
+"""Number of bodies of the large study."""
+N_CHUNKS = 100_000
+"""Number of chunks of one point."""
+N_CLUSTER_BODIES = 200_000
+"""Number of bodies on the cluster."""
 
 
 def run(quick: bool) -> Report:
-    """Three tables."""
-    bodies, chunks, shared = (2_000, 100, 500) if quick else (N_BODIES, N_CHUNKS, N_CLUSTER_BODIES)
-    alone = [process.run_child("studies", what, str(bodies)) for what in ("bare", "kept")]
-    share = alone[1]["seconds"] / alone[0]["seconds"] - 1.0
+    """Measure a large study, small chunks, and a cluster."""
+    bodies, chunks, n_cluster_bodies = (2_000, 100, 500) if quick else (N_BODIES, N_CHUNKS, N_CLUSTER_BODIES)
+    single_results = [process.run_child("studies", what, str(bodies)) for what in ("bare", "kept")]
+    overhead = single_results[1]["seconds"] / single_results[0]["seconds"] - 1.0
     columns = {"": "text", "Time": "seconds", "Peak memory": "gigabytes"}
     rows = [
         [name, a["seconds"], a["peak"]]
-        for name, a in zip(("`ensemble(until=lt.Relaxed(...))`", "`Study`, kept"), alone, strict=True)
+        for name, a in zip(("`ensemble(until=lt.Relaxed(...))`", "`Study`, kept"), single_results, strict=True)
     ]
-    first = Table(f"The relaxation times of {bodies:,} bodies, each in a process of its own.", columns, rows)
-    trivial = process.run_child("studies", "chunks", str(chunks))
+    time_table = Table(f"The relaxation times of {bodies:,} bodies, each in a process of its own.", columns, rows)
+    chunk_result = process.run_child("studies", "chunks", str(chunks))
     columns = {"Chunks": "count", "Time": "seconds", "A chunk": "seconds"}
-    second = Table(
+    chunk_table = Table(
         "Chunks of one point with one step: what a chunk costs.",
         columns,
-        [[chunks, trivial["seconds"], trivial["seconds"] / chunks]],
+        [[chunks, chunk_result["seconds"], chunk_result["seconds"] / chunks]],
     )
-    rows, one = [], None
+    rows, one_worker_seconds = [], None
     for workers in (1, 2, 4):
-        found = process.run_child("studies", "workers", str(shared), str(workers))
-        one = one or found["seconds"]
-        rows.append([workers, found["seconds"], one / found["seconds"]])
+        result = process.run_child("studies", "workers", str(n_cluster_bodies), str(workers))
+        one_worker_seconds = one_worker_seconds or result["seconds"]
+        rows.append([workers, result["seconds"], one_worker_seconds / result["seconds"]])
     columns = {"Workers": "count", "Time": "seconds", "Speed-up": "ratio"}
     caption = (
-        f"The relaxation times of {shared:,} bodies by workers of one thread on {available_cores()} cores, once they are there "
+        f"The relaxation times of {n_cluster_bodies:,} bodies by workers of one thread on {available_cores()} "
+        "cores, once they are there "
         "and have compiled."
     )
-    third = Table(caption, columns, rows)
+    worker_table = Table(caption, columns, rows)
     targets = [
-        Target("10⁶ relaxed bodies as a study: more than the ensemble takes", 0.15, share),
-        Target("10⁶ relaxed bodies as a study: memory", 2e9, alone[1]["peak"], "gigabytes"),
-        Target("10⁵ chunks of trivial work: a chunk", 5e-3, trivial["seconds"] / chunks, "seconds"),
+        Target("10⁶ relaxed bodies as a study: more than the ensemble takes", 0.15, overhead),
+        Target("10⁶ relaxed bodies as a study: memory", 2e9, single_results[1]["peak"], "gigabytes"),
+        Target("10⁵ chunks of trivial work: a chunk", 5e-3, chunk_result["seconds"] / chunks, "seconds"),
     ]
     text = "Bodies whose rates of dissipation are the axis of a study, until the entropy production has fallen to 1e-8."
-    return Report("Studies", text, [first, second, third], [] if quick else targets)
+    return Report("Studies", text, [time_table, chunk_table, worker_table], [] if quick else targets)
 
 
-def child(what: str, number: str, workers: str = "1") -> dict:
-    """The part that runs in a process of its own."""
+def child(part: str, number: str, workers: str = "1") -> dict:
+    """Run one part of the measurement in the child process."""
     count = int(number)
     works = {
         "bare": _time_ensemble,
@@ -68,7 +82,7 @@ def child(what: str, number: str, workers: str = "1") -> dict:
         "chunks": _time_small_chunks,
         "workers": lambda n: _time_cluster_study(n, int(workers)),
     }
-    seconds = works[what](count)
+    seconds = works[part](count)
     return {"seconds": seconds, "peak": peak_resident_bytes()}
 
 
@@ -90,10 +104,10 @@ def _study(count: int, folder: str, **changes) -> lt.Study:
 
 
 def _time_ensemble(count: int) -> float:
-    def timed(n: int) -> float:
+    def run_seconds(n: int) -> float:
         start = time.perf_counter()
         system = lt.models.rigid_body(rate=1.0)
-        found = lt.ensemble(
+        result = lt.ensemble(
             system,
             np.broadcast_to(X0, (n, 3)),
             (0.0, T_END),
@@ -103,11 +117,11 @@ def _time_ensemble(count: int) -> float:
             outputs="summary",
             until=lt.Relaxed(RELAXED_TOLERANCE),
         )
-        assert found.ok.all()
+        assert result.ok.all()
         return time.perf_counter() - start
 
-    timed(100)
-    return timed(count)
+    run_seconds(100)
+    return run_seconds(count)
 
 
 def _time_study(study: lt.Study, client=None) -> float:
@@ -118,8 +132,8 @@ def _time_study(study: lt.Study, client=None) -> float:
 
 
 def _time_stored_study(count: int, **changes) -> float:
-    with tempfile.TemporaryDirectory() as first, tempfile.TemporaryDirectory() as folder:
-        _time_study(_study(100, first, **changes))
+    with tempfile.TemporaryDirectory() as warmup_folder, tempfile.TemporaryDirectory() as folder:
+        _time_study(_study(100, warmup_folder, **changes))
         return _time_study(_study(count, folder, **changes))
 
 
@@ -132,6 +146,6 @@ def _time_cluster_study(count: int, workers: int) -> float:
 
     cluster = LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None)
     folders = tempfile.TemporaryDirectory(), tempfile.TemporaryDirectory()
-    with cluster, Client(cluster) as client, folders[0] as first, folders[1] as folder:
-        _time_study(_study(64 * workers, first, chunk=8), client)
+    with cluster, Client(cluster) as client, folders[0] as warmup_folder, folders[1] as folder:
+        _time_study(_study(64 * workers, warmup_folder, chunk=8), client)
         return _time_study(_study(count, folder, chunk=4096), client)

@@ -1,4 +1,4 @@
-"""A tumbling body, free or with a damped wheel, beside the programs that others use for it."""
+"""A tumbling body, free or with a damped wheel, against simulators of satellites and robots."""
 
 from __future__ import annotations
 
@@ -14,8 +14,13 @@ from ..simulators import MotionRecord, TumblingBody, basilisk_run, library_run, 
 from ..timing import race
 
 FREE_BODY = TumblingBody(np.array([3.0, 2.0, 1.0]))
+"""The body without a wheel."""
 DAMPED_BODY = TumblingBody(np.array([3.3, 2.0, 1.3]), wheel=0.3, damping=0.2)
-N_TIMES, EXACT_TOLERANCE = 100, 1e-13
+"""The body with a damped wheel."""
+N_TIMES = 100
+"""Number of recorded times."""
+EXACT_TOLERANCE = 1e-13
+"""Tolerance of DOP853 for the exact motion."""
 
 COLUMNS = {
     "": "text",
@@ -28,10 +33,11 @@ COLUMNS = {
     "Direction of L": "error",
     "Momentum in the body": "error",
 }
+"""Columns of the tables."""
 
 
 def contestants(body: TumblingBody, t_end: float) -> dict[str, tuple[str, float | None, Callable[[], Callable]]]:
-    """For each the setting, its step (None where it chooses), and what builds its work."""
+    """Return for each contestant the setting, its step (None if it chooses), and a function that builds its run."""
     gauss, midpoint = lt.MetriplecticGauss(3), lt.MetriplecticMidpoint()
     return {
         "this library, midpoint": ("step 0.01", 0.01, lambda: library_run(body, midpoint, 0.01, t_end, N_TIMES)),
@@ -45,52 +51,53 @@ def contestants(body: TumblingBody, t_end: float) -> dict[str, tuple[str, float 
 
 
 def run(quick: bool) -> Report:
-    """One table for the free body, one for the damped."""
+    """Compare all programs on the free and on the damped body."""
     t_end, rounds = (10.0, 1) if quick else (1000.0, 3)
     tables: list[Table] = []
     skipped: dict[str, str] = {}
-    worst = 0.0
+    max_drift = 0.0
     captions = {
         f"The free body, I = (3, 2, 1), to t = {t_end:g} s.": FREE_BODY,
         f"With a wheel about the middle axis that rubs in its bearing, to t = {t_end:g} s.": DAMPED_BODY,
     }
     for caption, body in captions.items():
         settings = contestants(body, t_end)
-        works, missing = build_available({name: build for name, (_, _, build) in settings.items()})
-        skipped |= missing
+        works, unavailable = build_available({name: build for name, (_, _, build) in settings.items()})
+        skipped |= unavailable
         exact = scipy_run(body, EXACT_TOLERANCE, t_end, N_TIMES)()
         rows: list[list[Any]] = []
         for name, outcome in race(works, rounds=rounds, max_seconds=8.0).items():
             (setting, step, _), record = settings[name], outcome.result
             steps = record.steps or round(t_end / (step or t_end))
             seconds = outcome.cpu_seconds if record.seconds is None else record.seconds
-            found = _record_errors(record, exact, exact.kinetic_energy if body.wheel else exact.kinetic_energy[:1])
-            rows.append([name, setting, seconds / steps, seconds, *found])
+            errors = _record_errors(record, exact, exact.kinetic_energy if body.wheel else exact.kinetic_energy[:1])
+            rows.append([name, setting, seconds / steps, seconds, *errors])
             if name.startswith("this library"):
-                worst = max(worst, *(drift for drift in found[1:4] if drift is not None))
+                max_drift = max(max_drift, *(drift for drift in errors[1:4] if drift is not None))
         tables.append(Table(caption, COLUMNS, rows))
     text = (
         "A body that starts about its middle axis, and the same with a damped wheel inside, which brings it to the "
         "spin about the axis of greatest inertia. Nothing acts from outside: the angular momentum L in space is "
         "constant, in size and in direction, and so is the energy with the heat of the bearing. The table has the "
         "largest changes of these at 100 times, relative to their sizes. The columns of the kinetic energy and of the "
-        f"momentum in the body are errors, against DOP853 at a tolerance of {EXACT_TOLERANCE:g}; the smallest of the momentum's "
+        f"momentum in the body are errors, against DOP853 at a tolerance of {EXACT_TOLERANCE:g}; the smallest of "
+        "the momentum's "
         "are its own. MuJoCo and Basilisk do not follow the heat. Times are of the processor; every row has the "
         "attitude too."
     )
-    targets = [Target("a tumbling body for 1000 s: momentum in space, energy with heat", 1e-12, worst, "error")]
+    targets = [Target("a tumbling body for 1000 s: momentum in space, energy with heat", 1e-12, max_drift, "error")]
     return Report("A tumbling body, beside MuJoCo and Basilisk", text, tables, targets, skipped)
 
 
 def _record_errors(record: MotionRecord, exact: MotionRecord, kinetic: np.ndarray) -> list[float | None]:
-    """Error of the kinetic energy, drift of the total one, of the size of L and of its direction, error of mu."""
-    size = np.linalg.norm(record.spatial_momentum, axis=1)
-    direction = record.spatial_momentum / size[:, None]
+    """Return the errors of kinetic and total energy, of norm and direction of L, and of mu."""
+    norm = np.linalg.norm(record.spatial_momentum, axis=1)
+    direction = record.spatial_momentum / norm[:, None]
     total = record.total_energy
     return [
         float(np.abs(record.kinetic_energy - kinetic).max() / kinetic[0]),
         None if total is None else float(np.abs(total - total[0]).max() / abs(exact.kinetic_energy[0])),
-        float(np.abs(size - size[0]).max() / size[0]),
+        float(np.abs(norm - norm[0]).max() / norm[0]),
         float(np.linalg.norm(direction - direction[0], axis=1).max()),
-        float(np.abs(record.momentum - exact.momentum).max() / size[0]),
+        float(np.abs(record.momentum - exact.momentum).max() / norm[0]),
     ]

@@ -1,4 +1,4 @@
-"""Time against error: the relaxed rigid body to a fixed time, by every method at several settings."""
+"""Time against error for the relaxed rigid body, with every method at several settings."""
 
 from __future__ import annotations
 
@@ -15,14 +15,23 @@ from ..problems import X0, body_parameters, quadratic_body
 from ..report import Report, Table, Target, build_available
 from ..timing import race
 
-RATE, T_END = 0.1, 100.0
-"""The body is half way to its rest at the end, where errors are taken."""
+RATE = 0.1
+"""Dissipation rate."""
+
+T_END = 100.0
+"""Duration of the run, at whose end the body has relaxed half way."""
 
 MIDPOINT_STEPS = (500, 1000, 2000, 5000, 10_000, 20_000, 50_000, 100_000)
+"""Numbers of steps of the midpoint scheme."""
 GAUSS_STEPS = (100, 200, 500, 1000, 2000)
-EXPLICIT_STEPS, TAYLOR_STEPS = (100, 150, 200, 250, 300, 400, 500, 700), (40, 50, 60, 70, 80, 100)
+"""Numbers of steps of Gauss methods."""
+EXPLICIT_STEPS = (100, 150, 200, 250, 300, 400, 500, 700)
+"""Numbers of steps of the explicit method."""
+TAYLOR_STEPS = (40, 50, 60, 70, 80, 100)
+"""Numbers of steps of the Taylor method."""
 
 TOLERANCES = tuple(10.0**-n for n in range(3, 14))
+"""Tolerances of the peers."""
 
 METHODS: dict[str, tuple[lt.OneStepMethod, tuple[int, ...]]] = {
     "midpoint": (lt.MetriplecticMidpoint(), MIDPOINT_STEPS),
@@ -30,7 +39,7 @@ METHODS: dict[str, tuple[lt.OneStepMethod, tuple[int, ...]]] = {
     "explicit, order 8": (lt.MetriplecticRungeKutta(8), EXPLICIT_STEPS),
     "Taylor, order 16": (lt.MetriplecticTaylor(16), TAYLOR_STEPS),
 }
-"""The library's methods and the numbers of steps to run each with. Another method is one more line."""
+"""The library's methods, with the numbers of steps to run; another method is one more line."""
 
 PEERS: dict[str, tuple[Callable[..., peers.PeerRun], tuple[float, ...]]] = {
     "SciPy DOP853": (peers.scipy_run, TOLERANCES),
@@ -38,15 +47,20 @@ PEERS: dict[str, tuple[Callable[..., peers.PeerRun], tuple[float, ...]]] = {
     "diffrax Dopri8": (lambda *arguments: peers.diffrax_run("Dopri8", *arguments), TOLERANCES),
     "heyoka Taylor": (peers.heyoka_run, (*TOLERANCES, 1e-15, 1e-18)),
 }
+"""Functions that build a peer's run, with tolerances."""
 
 TABLE_ERRORS = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
+"""Errors in the table of fastest times."""
 
-TARGET_ERRORS, CALL_ROW = (1e-10, 1e-12), "a call of one step"
-"""Errors at which explicit methods are compared with heyoka, and what their calls take beside the steps."""
+TARGET_ERRORS = (1e-10, 1e-12)
+"""Errors at which explicit methods are compared with heyoka."""
+
+CALL_ROW = "a call of one step"
+"""Row of a call of one step, whose time is subtracted."""
 
 
 def run(quick: bool) -> Report:
-    """Race every method at every setting; errors are relative to a reference of forty digits."""
+    """Race every method at every setting; errors are relative to a reference with forty digits."""
     builders: dict[tuple[str, str], Callable] = {}
     for name, (method, counts) in METHODS.items():
         if quick and name != "midpoint":
@@ -73,15 +87,16 @@ def run(quick: bool) -> Report:
     for (name, setting), outcome in outcomes.items():
         if setting == CALL_ROW:
             continue
-        state, kept = contestants[name, setting][1](outcome.result)
+        state, run_laws = contestants[name, setting][1](outcome.result)
         error = float(np.abs(state - exact).max() / np.abs(exact).max())
-        rows.append([name, setting, error, outcome.cpu_seconds, *kept.table_cells()])
+        rows.append([name, setting, error, outcome.cpu_seconds, *run_laws.table_cells()])
         series.setdefault(name, []).append([error, outcome.cpu_seconds])
     rows.sort(key=lambda row: list(series).index(row[0]))
     columns = {"": "text", "Setting": "text", "Error": "error", "Time": "seconds"} | laws.COLUMNS
     text = (
         f"The relaxed rigid body (rate {RATE}) from {X0} to t = {T_END:g}: the error of the last state against Taylor "
-        f"series of {reference.DECIMAL_DIGITS} digits. The times are the processor's, of whole calls from Python. For the "
+        f"series of {reference.DECIMAL_DIGITS} digits. The times are the processor's, of whole calls from Python. "
+        "For the "
         "peers the laws are taken over their own steps; nothing but accuracy keeps the laws there."
     )
     return Report(
@@ -95,31 +110,39 @@ def run(quick: bool) -> Report:
 
 
 def _explicit_targets(series: dict[str, list[list[float]]], calls: dict[str, float]) -> list[Target]:
-    """The best explicit method for each error: its steps against heyoka, and its whole call."""
+    """Return targets for the best explicit method at each error: its steps against heyoka, and its whole call."""
 
-    def fastest(name: str, wanted: float) -> float:
-        return min((seconds for error, seconds in series.get(name, []) if error <= wanted), default=math.inf)
+    def min_seconds(name: str, max_error: float) -> float:
+        return min((seconds for error, seconds in series.get(name, []) if error <= max_error), default=math.inf)
 
-    found = []
-    for wanted in TARGET_ERRORS:
-        whole, call = min((fastest(f"{name}, compiled engine", wanted), call) for name, call in calls.items())
-        work, heyoka = f"one body to t = {T_END:g} at {wanted:.0e}, explicit", fastest("heyoka Taylor", wanted)
-        steps = (whole - call) / heyoka if math.isfinite(heyoka) else None
-        found.append(Target(f"{work}: steps against heyoka", 1.3, steps))
-        found.append(Target(f"{work}: a whole call", 2e-4, whole, "seconds"))
-    return found
+    targets = []
+    for max_error in TARGET_ERRORS:
+        call_and_steps, call = min(
+            (min_seconds(f"{name}, compiled engine", max_error), call) for name, call in calls.items()
+        )
+        work, heyoka = (
+            f"one body to t = {T_END:g} at {max_error:.0e}, explicit",
+            min_seconds("heyoka Taylor", max_error),
+        )
+        steps = (call_and_steps - call) / heyoka if math.isfinite(heyoka) else None
+        targets.append(Target(f"{work}: steps against heyoka", 1.3, steps))
+        targets.append(Target(f"{work}: a whole call", 2e-4, call_and_steps, "seconds"))
+    return targets
 
 
 def _fastest_table(series: dict[str, list[list[float]]]) -> Table:
-    """The least time in which each method reaches an error."""
+    """Return a table of the least time in which each method reaches an error."""
     rows = [
         [
             name,
-            *(min((seconds for error, seconds in points if error <= wanted), default=None) for wanted in TABLE_ERRORS),
+            *(
+                min((seconds for error, seconds in points if error <= max_error), default=None)
+                for max_error in TABLE_ERRORS
+            ),
         ]
         for name, points in series.items()
     ]
-    columns = {"": "text"} | {f"≤ {wanted:.0e}": "seconds" for wanted in TABLE_ERRORS}
+    columns = {"": "text"} | {f"≤ {max_error:.0e}": "seconds" for max_error in TABLE_ERRORS}
     return Table("The least time in which an error was reached, over the settings tried.", columns, rows)
 
 
@@ -147,6 +170,6 @@ def _c_builder(steps):
 def _peer_builder(solver, tolerance):
     def build():
         run, system = solver(tolerance, X0, T_END, RATE), quadratic_body(RATE)
-        return run.end, lambda state: (state, laws.path_laws(run.path(), system))
+        return run.solve_end, lambda state: (state, laws.path_laws(run.solve_path(), system))
 
     return build

@@ -25,12 +25,12 @@ __dir__ = public_dir(__all__)
 
 
 class Term(diffrax.ODETerm):
-    """The vector field of a system as a term of diffrax, for its solvers and for :class:`PointSolver`.
+    """The vector field of a system as a term of diffrax, for its solvers and for :class:`Solver`.
 
     Parameters
     ----------
     system : System
-        Its parameters are leaves of the term: ``jax.grad`` and ``jax.vmap`` reach them.
+        Its parameters are leaves of the term, so ``jax.grad`` and ``jax.vmap`` apply to them.
     """
 
     system: System
@@ -40,7 +40,7 @@ class Term(diffrax.ODETerm):
         self.vector_field = _unbound_field
 
     def vf(self, t, y, args):
-        """The vector field at a state, shape (n,)."""
+        """Return the vector field at a state, shape (n,)."""
         return self.system.vector_field(y, t if self.system.is_driven else None)
 
 
@@ -49,7 +49,7 @@ def _unbound_field(t, y, args):
 
 
 class Solver(diffrax.AbstractAdaptiveSolver):
-    """A method of this library as a solver of diffrax: the laws hold at every step that diffrax accepts.
+    """A method of this library as a solver of diffrax; the laws hold at every step that diffrax accepts.
 
     Implicit steps are differentiated by the implicit function theorem, so reverse mode works with diffrax's default
     adjoint. Interpolation between steps is by cubic Hermite polynomials, outside of the laws.
@@ -69,38 +69,39 @@ class Solver(diffrax.AbstractAdaptiveSolver):
         self.method = DEFAULT_METHOD if method is None else method
 
     def order(self, terms) -> int:
-        """That of the method."""
+        """Return the order of the method."""
         return self.method.order
 
     def error_order(self, terms) -> int:
-        """The power of h that the estimate of the local error falls with."""
+        """Return the power of h with which the estimate of the local error decreases."""
         return self.order(terms) + 1
 
     def init(self, terms, t0, t1, y0, args) -> Any:
-        """What a run carries besides its state: the lost digits, and the slopes of the last two steps."""
+        """Return the initial carry of a run besides its state: the compensation and the slopes of the last two
+        steps."""
         del t0, t1, args
         system, method = self._system_and_method(terms)
         return initial_carry(system, method, y0)[1:]
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        """One step; a step whose equations are not solved is rejected, or ends the run, by diffrax's own rules."""
+        """Take one step; if its equations are not solved, diffrax rejects the step or ends the run."""
         system, method = self._system_and_method(terms)
-        h = getattr(terms, "direction", 1) * (t1 - t0)  # diffrax wraps a term to turn time around
-        compensation, k, before = solver_state
-        y1, *state = differentiable_step(system, method, (y0, compensation, k, before), h)
-        solved = jnp.isfinite(jnp.sum(y1))
+        h = getattr(terms, "direction", 1) * (t1 - t0)  # diffrax wraps a term to reverse time
+        compensation, k, previous_slopes = solver_state
+        y1, *state = differentiable_step(system, method, (y0, compensation, k, previous_slopes), h)
+        is_solved = jnp.isfinite(jnp.sum(y1))
         slopes = state[1]
         error = (
             method.error(system, y0, compensation, jnp.abs(h), slopes) if has_error_estimate(method) else jnp.zeros(())
         )
-        estimate = jax.lax.stop_gradient(jnp.full_like(y0, jnp.where(solved, error, jnp.inf)))
+        estimate = jax.lax.stop_gradient(jnp.full_like(y0, jnp.where(is_solved, error, jnp.inf)))
         field = system.vector_field
         dense = {"y0": y0, "y1": y1, "k": h * jnp.stack([field(y0), field(y1)])}
-        result = diffrax.RESULTS.where(solved, diffrax.RESULTS.successful, diffrax.RESULTS.nonlinear_divergence)
+        result = diffrax.RESULTS.where(is_solved, diffrax.RESULTS.successful, diffrax.RESULTS.nonlinear_divergence)
         return y1, estimate, dense, tuple(state), result
 
     def func(self, terms, t0, y0, args):
-        """The vector field."""
+        """Return the vector field."""
         return terms.vf(t0, y0, args)
 
     def _system_and_method(self, terms) -> tuple[System, OneStepMethod]:

@@ -1,4 +1,4 @@
-"""The call of SciPy's ``solve_ivp`` with a system instead of a function: ``lt.scipy.solve_ivp``."""
+"""SciPy's function ``solve_ivp`` for a system instead of a function: ``lt.scipy.solve_ivp``."""
 
 from __future__ import annotations
 
@@ -25,35 +25,35 @@ __all__ = ["OdeResult", "solve_ivp"]
 __dir__ = public_dir(__all__)
 
 SCIPY_STATUS = {"completed": 0, "event": 1}
-"""SciPy's numbers for how a run ended; -1 for every failure."""
+"""SciPy's status codes by status name; every other status is -1."""
 
 UNSUPPORTED_OPTIONS = {"jac", "jac_sparsity", "lband", "uband", "min_step"}
-"""Options of SciPy's solvers that have no place here: the methods take what they need from the system."""
+"""Options of SciPy's solvers that are refused, because the methods obtain this information from the system."""
 
 
 @dataclass(frozen=True)
 class OdeResult:
-    """What SciPy's ``solve_ivp`` returns, and our own solution.
+    """The result of :func:`solve_ivp`: the fields of SciPy's, and a :class:`Solution`.
 
     Attributes
     ----------
     t : ndarray, shape (times,)
     y : ndarray, shape (n, times)
-        States in columns, as SciPy has them.
+        States in columns, as in SciPy.
     sol : function from times, shape (m,), to states, shape (n, m); or None
-        Where ``dense_output`` was asked for: a step of the method to each time, so that the laws hold there.
+        With ``dense_output``: takes a step of the method to each time, so that the laws hold there.
     t_events, y_events : list of ndarray, or None
-        For each event function the times and the states, shape (k, n), of its zeros: ends of steps too.
+        For each event function the times and the states, shape (k, n), of its zeros, which are ends of steps too.
     nfev : int
         Evaluations of the vector field, by the stages and iterations of the steps.
     njev, nlu : int
         Iterations of Newton's method: each has a Jacobian matrix or reuses one.
     status : int
-        0 where the end was reached, 1 where a terminal event stopped the run, -1 where a step failed.
+        0 if the end was reached, 1 if a terminal event stopped the run, -1 if a step failed.
     message : str
     success : bool
     solution : Solution
-        With ``audit()``, energies and entropies.
+        The run with energies, entropies and ``audit()``.
     """
 
     t: np.ndarray
@@ -127,21 +127,20 @@ def solve_ivp(
         If an argument cannot be used. A step that fails does not raise: ``success`` is False, as in SciPy.
     """
     if not isinstance(fun, System):
-        raise InputError(
-            f"the first argument must be a system such as lt.LiePoissonSystem, not {type(fun).__name__}: "
-            "the laws are those of its energy and entropy"
-        )
+        raise InputError(f"fun must be a system such as lt.LiePoissonSystem, got {type(fun).__name__}")
     for name in options:
-        why = "the methods take it from the system" if name in UNSUPPORTED_OPTIONS else "solve_ivp has no such option"
-        raise InputError(f"leave out {name}: {why}")
+        reason = (
+            "the methods take it from the system" if name in UNSUPPORTED_OPTIONS else "solve_ivp has no such option"
+        )
+        raise InputError(f"leave out {name}: {reason}")
     functions = [] if events is None else [events] if callable(events) else list(events)
     if args is not None and not functions:
-        raise InputError("args are passed to the events, and there are none: the system has its parameters in itself")
+        raise InputError("args are passed to the events, but there are none. A system contains its parameters")
     start, end = _checked_span(t_span)
-    wanted = None if t_eval is None else _checked_times(t_eval, start, end)
+    saved_times = None if t_eval is None else _checked_times(t_eval, start, end)
     _check_first_step(first_step, end - start)
-    watch = EventSet(functions, _checked_args(args)) if functions else None
-    if math.isinf(end) and not (watch and watch.has_terminal):
+    event_set = EventSet(functions, _checked_args(args)) if functions else None
+    if math.isinf(end) and not (event_set and event_set.has_terminal):
         raise InputError("an infinite end needs an event that ends the run: set event.terminal = True, or a finite end")
     method = MetriplecticRungeKutta(order=8) if method is None else method
     step = Adaptive(
@@ -151,27 +150,27 @@ def solve_ivp(
         None if max_step == math.inf else max_step,
     )
     if end == start:
-        return _empty_span_result(fun, y0, start, method, wanted, dense_output, watch)
+        return _empty_span_result(fun, y0, start, method, saved_times, dense_output, event_set)
     solution = integrate(
         fun,
         y0,
         (start, end),
         step,
         method,
-        save_at=None if wanted is None else [start, *wanted, *([end] if math.isfinite(end) else [])],
-        until=watch,
+        save_at=None if saved_times is None else [start, *saved_times, *([end] if math.isfinite(end) else [])],
+        until=event_set,
         dense=dense_output,
         on_failure="return",
         progress=False,
     )
-    keep = np.ones(len(solution.t), bool) if wanted is None else np.isin(solution.t, wanted)
-    return _ode_result(solution, solution.t[keep], solution.x[keep], method, watch, dense_output)
+    is_saved = np.ones(len(solution.t), bool) if saved_times is None else np.isin(solution.t, saved_times)
+    return _ode_result(solution, solution.t[is_saved], solution.x[is_saved], method, event_set, dense_output)
 
 
 def _ode_result(
-    solution: Solution, t: np.ndarray, x: np.ndarray, method: OneStepMethod, watch: EventSet | None, dense: bool
+    solution: Solution, t: np.ndarray, x: np.ndarray, method: OneStepMethod, event_set: EventSet | None, dense: bool
 ) -> OdeResult:
-    """Return what SciPy would of a solution, with the states x, shape (times, n), that are asked for."""
+    """Return a solution in SciPy's form, with the requested states x, shape (times, n)."""
     stats, status = solution.stats, SCIPY_STATUS.get(str(solution.status.code), -1)
     iterations = stats.fixed_point_iterations + stats.newton_iterations
     shape = solution.x.shape[1:]
@@ -183,8 +182,8 @@ def _ode_result(
         t=t,
         y=x.T,
         sol=sol if dense else None,
-        t_events=None if watch is None else [np.array(times) for times in watch.event_times],
-        y_events=None if watch is None else [np.array(y).reshape(len(y), *shape) for y in watch.event_states],
+        t_events=None if event_set is None else [np.array(times) for times in event_set.event_times],
+        y_events=None if event_set is None else [np.array(y).reshape(len(y), *shape) for y in event_set.event_states],
         nfev=iterations * method.evaluations_per_iteration,
         njev=stats.newton_iterations,
         nlu=stats.newton_iterations,
@@ -200,16 +199,16 @@ def _empty_span_result(
     y0,
     t: float,
     method: OneStepMethod,
-    wanted: np.ndarray | None,
+    saved_times: np.ndarray | None,
     dense: bool,
-    watch: EventSet | None,
+    event_set: EventSet | None,
 ) -> OdeResult:
     """Return the result over a span of length zero: as in SciPy, the initial state at its start and at its end."""
     solution = solution_without_steps(fun, y0, t, method)
-    ended = watch is not None and watch.find_events_at_state(t, solution.x[0])
-    times = np.array([t, t]) if wanted is None else wanted
-    result = _ode_result(solution, times, np.repeat(solution.x, len(times), axis=0), method, watch, dense)
-    return replace(result, status=1, message="A termination event occurred.") if ended else result
+    is_terminated = event_set is not None and event_set.find_events_at_state(t, solution.x[0])
+    times = np.array([t, t]) if saved_times is None else saved_times
+    result = _ode_result(solution, times, np.repeat(solution.x, len(times), axis=0), method, event_set, dense)
+    return replace(result, status=1, message="A termination event occurred.") if is_terminated else result
 
 
 def _check_first_step(first_step: float | None, length: float) -> None:
@@ -221,14 +220,14 @@ def _check_first_step(first_step: float | None, length: float) -> None:
 
 
 MIN_RTOL = 100.0 * float(np.finfo(np.float64).eps)
-"""The least relative tolerance that an array may have, as in SciPy; smaller ones are raised to it."""
+"""Minimum relative tolerance in an array, as in SciPy; smaller values are raised to it."""
 
 
-def _scalar_tolerance(name: str, given, y0) -> float:
-    """Return the tolerance of all components: the smallest, where there is one for each."""
-    if np.ndim(given) == 0:
-        return given.item() if isinstance(given, np.ndarray) else given
-    values = np.asarray(given, dtype=np.float64)
+def _scalar_tolerance(name: str, tolerance, y0) -> float:
+    """Return a tolerance for all components: the smallest entry of an array."""
+    if np.ndim(tolerance) == 0:
+        return tolerance.item() if isinstance(tolerance, np.ndarray) else tolerance
+    values = np.asarray(tolerance, dtype=np.float64)
     if values.shape != np.shape(y0):
         raise InputError(f"{name} must be a number or an array of shape {np.shape(y0)}, as y0, got {values.shape}")
     if name == "rtol" and (values < MIN_RTOL).any():
@@ -241,14 +240,11 @@ def _checked_span(t_span) -> tuple[float, float]:
     try:
         start, end = map(float, t_span)
     except (TypeError, ValueError):
-        raise InputError(f"t_span is two numbers (start, end), not {t_span!r}") from None
+        raise InputError(f"t_span must be two numbers (start, end), got {t_span!r}") from None
     if math.isnan(start) or math.isnan(end) or math.isinf(start):
         raise InputError(f"t_span must start at a finite time, got ({start:g}, {end:g})")
     if end < start:
-        raise InputError(
-            f"t_span = ({start:g}, {end:g}) runs backwards, and time runs forwards here, since entropy grows: "
-            f"integrate over ({end:g}, {start:g})"
-        )
+        raise InputError(f"t_span = ({start:g}, {end:g}) runs backwards. Integrate over ({end:g}, {start:g}) instead")
     return start, end
 
 
@@ -265,4 +261,4 @@ def _checked_args(args) -> tuple:
     try:
         return (*args,)
     except TypeError:
-        raise InputError(f"args is a tuple, even of one: write args=({args!r},)") from None
+        raise InputError(f"args must be a tuple, even of one. Write args=({args!r},)") from None

@@ -1,7 +1,6 @@
-"""Systems as SymPy expressions, energies from SymPy, and problems written down for other solvers. SymPy is optional.
+"""Systems as SymPy expressions, energies from SymPy, and descriptions of problems for other solvers.
 
-The expressions are not typed twice: they are what the tracer of the compiled engine unrolls the system's own functions
-into.
+SymPy is optional. The expressions come from the tracer of the compiled engine, so no formula is written twice.
 """
 
 from __future__ import annotations
@@ -34,9 +33,10 @@ __all__ = ["Expressions", "describe", "expressions", "function", "write"]
 __dir__ = public_dir(__all__)
 
 PROBLEM_FORMAT = "liethermo-problem-1"
+"""Value of ``format`` in the description of a problem."""
 
 MAX_DENOMINATOR = 1000
-"""A number that is the double nearest to a fraction of such a denominator is written as the fraction."""
+"""Maximum denominator of the fractions by which floating-point numbers are replaced where the two are equal."""
 
 SYMPY_OPERATIONS: dict[str, Callable[..., Any]] = {
     "add": lambda a, b: a + b,
@@ -65,19 +65,17 @@ SYMPY_OPERATIONS: dict[str, Callable[..., Any]] = {
     **{name: getattr(sympy, name) for name in "asinh acosh atanh erf erfc sign floor".split()},
     **{name: getattr(sympy, name.capitalize()) for name in "eq ne lt le gt ge".split()},
 }
-"""What the scalar operations of a traced program are in SymPy."""
-
-
+"""SymPy counterpart of each scalar operation of a traced program."""
 JAX_SPECIAL_FUNCTIONS: dict[str, Callable[..., Any]] = {
     **{name: getattr(jax.scipy.special, name) for name in "erf erfc gamma polygamma".split()},
     "loggamma": jax.scipy.special.gammaln,
 }
-"""Functions of JAX that SymPy's printer would take from elsewhere, where they are none of traced arrays."""
+"""JAX functions that SymPy's printer would otherwise take from a module that cannot be traced."""
 
 
 @dataclass(frozen=True)
 class Expressions:
-    """A system in symbols.
+    """Energy, entropy, vector field and Casimirs of a system as SymPy expressions.
 
     Attributes
     ----------
@@ -97,45 +95,45 @@ class Expressions:
 
 
 def expressions(system: System, names: Sequence[str] | None = None) -> Expressions:
-    """Energy, entropy, vector field and Casimirs of a system as SymPy expressions of its state.
+    """Return energy, entropy, vector field and Casimirs of a system as SymPy expressions of its state.
 
-    Numbers that are fractions to the last digit become fractions. The laws can then be proved:
-    ``sympy.simplify(sum(dH * f))`` is zero.
+    Numbers equal to a simple fraction become fractions. The laws can then be proved: ``sympy.simplify(sum(dH * f))`` is
+    zero.
 
     Parameters
     ----------
     system : System
-        Whose functions can be unrolled; of an energy that depends on time take ``system.at_time(t)``.
+        A system whose functions can be traced; if its energy depends on time, use ``system.at_time(t)``.
     names : sequence of str, optional
-        Of the components; by default ``x1``, ``x2``, …, or the basis names of the algebra.
+        Names of the components; by default ``x1``, ``x2``, …, or the basis names of the algebra.
 
     Raises
     ------
     InputError
-        If the energy depends on time, or a function uses what has no expression.
+        If the energy depends on time, or a function contains an operation without an expression.
     """
     if system.is_driven:
-        raise InputError("the energy depends on time: take system.at_time(t), a system at one time")
+        raise InputError("the energy depends on time. Use system.at_time(t), the system at one time")
     algebra = system.lie_algebra
     basis_names = None if algebra is None else algebra.basis_names
     names = names or basis_names or [f"x{i + 1}" for i in range(system.dim)]
     variables = mf.sympy.symbols(system.dim, names)
 
-    def of(function: Callable) -> list[sympy.Expr]:
-        closed = jax.make_jaxpr(function)(jax.ShapeDtypeStruct((system.dim,), jnp.float64))
-        return _program_expressions(scalarize(closed), variables)
+    def to_expressions(function: Callable) -> list[sympy.Expr]:
+        jaxpr = jax.make_jaxpr(function)(jax.ShapeDtypeStruct((system.dim,), jnp.float64))
+        return _program_expressions(scalarize(jaxpr), variables)
 
     return Expressions(
         variables=variables,
-        energy=of(system.energy.value)[0],
-        entropy=None if system.entropy is None else of(system.entropy.value)[0],
-        field=tuple(of(system.vector_field)),
-        casimirs={name: of(casimir.value)[0] for name, casimir in system.casimirs().items()},
+        energy=to_expressions(system.energy.value)[0],
+        entropy=None if system.entropy is None else to_expressions(system.entropy.value)[0],
+        field=tuple(to_expressions(system.vector_field)),
+        casimirs={name: to_expressions(casimir.value)[0] for name, casimir in system.casimirs().items()},
     )
 
 
 def function(expression: Any, variables: Sequence[sympy.Symbol]) -> Callable:
-    """A SymPy expression as a function of the state, to be the energy or the entropy of a system.
+    """Return a SymPy expression as a function of the state, for the energy or the entropy of a system.
 
     Parameters
     ----------
@@ -145,7 +143,7 @@ def function(expression: Any, variables: Sequence[sympy.Symbol]) -> Callable:
 
     Returns
     -------
-    manifolds.Polynomial where it is one, else a function of one JAX array, shape (n,)
+    manifolds.Polynomial if the expression is a polynomial, else a function of one JAX array, shape (n,)
 
     Raises
     ------
@@ -153,35 +151,41 @@ def function(expression: Any, variables: Sequence[sympy.Symbol]) -> Callable:
         If the expression has other symbols, or a function without a counterpart in JAX.
     """
     expression, variables = sympy.sympify(expression), tuple(variables)
-    if others := expression.free_symbols - set(variables):
-        raise InputError(f"{', '.join(sorted(map(str, others)))} in {expression} is no component of the state")
+    if unknown_symbols := expression.free_symbols - set(variables):
+        raise InputError(
+            f"{', '.join(sorted(map(str, unknown_symbols)))} in {expression} is not a component of the state"
+        )
     if expression.is_polynomial(*variables):
         return mf.sympy.polynomial(expression, variables)
-    found = _jax_function(expression, variables)
-    if found is None:
-        parts = sympy.postorder_traversal(expression)
-        unknown = next(part for part in parts if part.args and _jax_function(part, variables) is None)
+    jax_function = _jax_function(expression, variables)
+    if jax_function is None:
+        subexpressions = sympy.postorder_traversal(expression)
+        unknown = next(
+            subexpression
+            for subexpression in subexpressions
+            if subexpression.args and _jax_function(subexpression, variables) is None
+        )
         raise InputError(
             f"{unknown.func.__name__} in {unknown} has no counterpart in JAX: write the function with jax.numpy"
         )
-    return found
+    return jax_function
 
 
 def _jax_function(expression: sympy.Basic, variables: tuple[sympy.Symbol, ...]) -> Callable | None:
-    """A function of one JAX array; None where a name of the expression is none of JAX."""
+    """Return the expression as a function of one JAX array, or None if JAX lacks one of its functions."""
     try:
-        compiled = sympy.lambdify(variables, expression, modules=[JAX_SPECIAL_FUNCTIONS, "jax"])
-        jax.eval_shape(lambda x: compiled(*x), jax.ShapeDtypeStruct((len(variables),), jnp.float64))
+        numeric_function = sympy.lambdify(variables, expression, modules=[JAX_SPECIAL_FUNCTIONS, "jax"])
+        jax.eval_shape(lambda x: numeric_function(*x), jax.ShapeDtypeStruct((len(variables),), jnp.float64))
     except (NameError, AttributeError, NotImplementedError, TypeError):
         return None
-    return lambda x: compiled(*x)
+    return lambda x: numeric_function(*x)
 
 
 def describe(system: System, x0, t_span: tuple[float, float], name: str = "problem") -> dict[str, Any]:
-    """A problem as JSON data that any solver can be tested against: expressions, constants and the state at the end.
+    """Return a problem as JSON data for tests of other solvers: expressions, constants and the final state.
 
-    The state at the end is computed twice, by SciPy's DOP853 and by collocation of order 12; as many digits are given
-    as they agree in. Expressions are written for SymPy and for Julia; indices count from 1.
+    The final state is computed twice, by SciPy's DOP853 and by collocation of order 12, and given to the digits in
+    which both agree. Expressions are written for SymPy and for Julia; indices count from 1.
 
     Parameters
     ----------
@@ -194,23 +198,23 @@ def describe(system: System, x0, t_span: tuple[float, float], name: str = "probl
     Returns
     -------
     dict
-        ``format``, ``name``, ``variables``, ``energy``, ``entropy``, ``casimirs``, ``field``, ``lie_algebra`` where
-        there is one, ``initial_state``, ``t_span`` and ``reference``.
+        ``format``, ``name``, ``variables``, ``energy``, ``entropy``, ``casimirs``, ``field``, ``initial_state``,
+        ``t_span``, ``reference``, and ``lie_algebra`` if the system has one.
 
     Raises
     ------
     InputError
         If the system has no expressions, or an argument cannot be used.
     """
-    found = expressions(system)
+    symbolic = expressions(system)
     problem = {
         "format": PROBLEM_FORMAT,
         "name": name,
-        "variables": [str(x) for x in found.variables],
-        "energy": _as_source_text(found.energy),
-        "entropy": None if found.entropy is None else _as_source_text(found.entropy),
-        "casimirs": {key: _as_source_text(value) for key, value in found.casimirs.items()},
-        "field": [_as_source_text(component) for component in found.field],
+        "variables": [str(x) for x in symbolic.variables],
+        "energy": _source_texts(symbolic.energy),
+        "entropy": None if symbolic.entropy is None else _source_texts(symbolic.entropy),
+        "casimirs": {key: _source_texts(value) for key, value in symbolic.casimirs.items()},
+        "field": [_source_texts(component) for component in symbolic.field],
         "initial_state": [float(value) for value in np.asarray(x0, dtype=np.float64)],
         "t_span": [float(t) for t in t_span],
         "reference": _reference_solution(system, x0, t_span),
@@ -229,7 +233,7 @@ def describe(system: System, x0, t_span: tuple[float, float], name: str = "probl
 
 
 def write(problem: dict[str, Any], path: str | os.PathLike) -> Path:
-    """Write what :func:`describe` returns as a JSON file.
+    """Write a problem, as returned by :func:`describe`, to a JSON file.
 
     Raises
     ------
@@ -241,38 +245,40 @@ def write(problem: dict[str, Any], path: str | os.PathLike) -> Path:
     try:
         disk.write_atomically(path, text.encode())
     except (OSError, ValueError) as error:
-        raise FileError(f"cannot write {path}: {disk.why_os_failed(error)}") from error
+        raise FileError(f"cannot write {path}: {disk.describe_os_error(error)}") from error
     return path
 
 
-def _as_source_text(expression: sympy.Expr) -> dict[str, str]:
+def _source_texts(expression: sympy.Expr) -> dict[str, str]:
     return {"sympy": str(expression), "julia": sympy.julia_code(expression)}
 
 
 def _reference_solution(system: System, x0, t_span: tuple[float, float]) -> dict[str, Any]:
-    length = t_span[1] - t_span[0]
-    by_scipy = integrate(system, x0, t_span, length, Reference(rtol=1e-13), progress=False).x[-1]
-    by_gauss = integrate(
-        system, x0, t_span, _accurate_step_size(system, x0, length), MetriplecticGauss(6), progress=False
+    """Return the final state, rounded to the digits in which two methods agree, and their largest difference."""
+    duration = t_span[1] - t_span[0]
+    x_dop853 = integrate(system, x0, t_span, duration, Reference(rtol=1e-13), progress=False).x[-1]
+    x_gauss = integrate(
+        system, x0, t_span, _accurate_step_size(system, x0, duration), MetriplecticGauss(6), progress=False
     ).x[-1]
-    apart = float(np.abs(by_scipy - by_gauss).max())
-    digits = int(np.clip(-np.log10(max(apart, 1e-16)), 1, 15))
-    return {"time": float(t_span[1]), "state": [round(float(x), digits) for x in by_gauss], "apart": apart}
+    difference = float(np.abs(x_dop853 - x_gauss).max())
+    digits = int(np.clip(-np.log10(max(difference, 1e-16)), 1, 15))
+    return {"time": float(t_span[1]), "state": [round(float(x), digits) for x in x_gauss], "apart": difference}
 
 
-def _accurate_step_size(system: System, x0, length: float) -> float:
-    """A step for collocation of order 12: a fifth of the time in which the state changes by its size."""
+def _accurate_step_size(system: System, x0, duration: float) -> float:
+    """Return a step for collocation of order 12: a fifth of the time in which the state changes by its own
+    magnitude."""
     x = np.asarray(x0, dtype=np.float64)
-    speed = float(np.abs(system.vector_field(system.state(x))).max())
-    return float(min(0.05 * length, 0.2 * max(np.abs(x).max(), 1e-3) / max(speed, 1e-300), 0.1))
+    max_rate = float(np.abs(system.vector_field(system.state(x))).max())
+    return float(min(0.05 * duration, 0.2 * max(np.abs(x).max(), 1e-3) / max(max_rate, 1e-300), 0.1))
 
 
 def _program_expressions(program: Program, variables: Sequence[sympy.Symbol]) -> list[sympy.Expr]:
-    """The outputs of a program, its single input standing for the variables."""
+    """Return the outputs of a traced program as expressions of the variables, its only input."""
     values: dict[Any, Any] = dict(zip(program.inputs[0], variables, strict=True))
 
     def value(a: Any) -> Any:
-        return values[a] if isinstance(a, str) else _as_sympy_number(a)
+        return values[a] if isinstance(a, str) else _to_sympy_number(a)
 
     for target, op, args in program.instructions:
         if op == "float":
@@ -285,11 +291,11 @@ def _program_expressions(program: Program, variables: Sequence[sympy.Symbol]) ->
 
 
 def _is_short(expression: Any) -> bool:
-    """Whether writing out the products of an expression keeps it short."""
+    """Return True if an expression has fewer than 400 operations, so that expanding its products keeps it short."""
     return sympy.count_ops(expression) < 400
 
 
-def _as_sympy_number(value: Any) -> Any:
+def _to_sympy_number(value: Any) -> Any:
     if isinstance(value, bool | np.bool_):
         return sympy.check_true if value else sympy.false
     number = float(value)

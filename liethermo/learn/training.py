@@ -439,7 +439,7 @@ def write_archive(path: Path, metadata: dict[str, Any], arrays: dict[str, Any]) 
     try:
         disk.write_atomically(path, buffer.getvalue())
     except (OSError, ValueError) as error:
-        raise FileError(f"cannot write {path!s:.200}: {disk.why_os_failed(error)}") from error
+        raise FileError(f"cannot write {path!s:.200}: {disk.describe_os_error(error)}") from error
 
 
 def read_archive(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

@@ -1,6 +1,6 @@
-"""Named systems, ready to run, each with its source and reference data.
+"""Ready-made systems, each with its source and reference data.
 
-A function ``model_solution`` beside a model, in its module, is the exact solution.
+A function ``model_solution`` in the module of a model returns the exact solution.
 """
 
 from __future__ import annotations

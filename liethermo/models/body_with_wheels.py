@@ -1,4 +1,4 @@
-"""A rigid body with damped wheels inside, which heat it as it comes to spin about one axis."""
+"""A rigid body with damped wheels inside, whose friction heats it until it spins about one axis."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def body_with_wheels(
     heat: float = 2.0,
     temperature: float = 1.0,
 ) -> EulerPoincareClosedSystem:
-    """A body whose three wheels, one about each principal axis, rub in their bearings and heat it.
+    """A body with three wheels, one about each principal axis, whose bearing friction heats it.
 
     ``l = sum I_i Omega_i^2 / 2 + sum J_i (Omega_i + w_i)^2 / 2 - C T_0 exp(S / C)`` on so(3) + R^3, ``f = -k w`` on the
     wheels alone, in the state (Omega, w, S). No friction acts on the rotation as a whole, so the spatial angular
@@ -63,13 +63,14 @@ def body_with_wheels(
 
 
 def body_with_wheels_rest(momentum, energy, inertia=(3.0, 2.0, 1.0), wheels=(0.3, 0.3, 0.3), heat=2.0) -> float:
-    """The temperature at the end, from the angular momentum's size and the total energy."""
+    """Return the final temperature, from the norm of the angular momentum and the total energy."""
     greatest = float(np.max(_principal_moments(inertia) + checked_positive(wheels, "wheels", 3)))
     return (float(energy) - float(momentum) ** 2 / (2 * greatest)) / heat
 
 
 def _principal_moments(inertia) -> jax.Array:
-    """Return the principal moments of the body; a tensor is refused, since the wheels stand along principal axes."""
+    """Return the principal moments of the body, shape (3,); a tensor is refused, since the wheels need principal
+    axes."""
     if np.shape(inertia) == (3, 3):
         raise InputError(
             "inertia must be three principal moments, since there is a wheel along each principal axis, got an array "

@@ -1,4 +1,4 @@
-"""One gas under a piston, pushed and heated from outside."""
+"""A gas under a piston, with external pressure and heating."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from .parameters import checked_positive
 
 
 class _GasEnergy(Module):
-    """Energy of the gas from (q, S)."""
+    """The internal energy of the gas as a function of (q, S)."""
 
     gas: IdealGas
     area: jax.Array
@@ -38,29 +38,29 @@ def cylinder(
     pressure=None,
     heat_power=None,
 ) -> SimpleClosedSystem:
-    """A gas in a cylinder below a piston at height q that rubs and so heats it.
+    """A gas in a cylinder below a piston at height q, whose friction heats the gas.
 
     ``L = m v^2 / 2 - U(S, A q)``, q > 0, ``F_fr = -lambda v``, ``F_ext = -P A``, in SI units and in the state
-    (q, v, S), or (q, v, S, W, Q, t) if anything comes from outside. ``m q'' = (P_gas - P) A - lambda q'``.
+    (q, v, S), or (q, v, S, W, Q, t) with external pressure or heating. ``m q'' = (P_gas - P) A - lambda q'``.
 
     Parameters
     ----------
     mass, area : float, > 0
-        Of the piston (kg, m**2).
+        Mass and area of the piston (kg, m**2).
     friction : float, >= 0
         lambda (kg / s).
     moles, height : float, > 0
-        Of the gas, which is monatomic; its entropy is counted from 300 K below the piston at that height (m).
+        Amount of the monatomic gas (mol), and the height of the piston (m) at which its entropy is 0 at 300 K.
     pressure : float, or function of (q, v, S) or (q, v, S, t) to a scalar; optional
-        P from outside (Pa).
+        External pressure P (Pa).
     heat_power : float, or function likewise; optional
-        Heat given to the gas per time (W).
+        External heating power of the gas (W).
     """
     n, m, A = checked_positive(moles, "moles"), checked_positive(mass, "mass"), checked_positive(area, "area")
     gas = IdealGas(n, A * checked_positive(height, "height"))
-    push = pressure
+    external_force = pressure
     if pressure is not None:
-        push = (
+        external_force = (
             _PressureForce(add_time_argument(pressure), A)
             if callable(pressure)
             else -A * check_numbers(pressure, "pressure", ())[None]
@@ -69,21 +69,22 @@ def cylinder(
         Kinetic(m[None]) - Function(_GasEnergy(gas, A)).on([0, 2]),
         3,
         friction=friction,
-        external=push,
+        external=external_force,
         heat_power=heat_power,
         validate=False,  # half of the normally distributed q lie below the bottom
     )
 
 
 def cylinder_rest(pressure, T, area: float = 0.01, moles: float = 1.0, height: float = 2.5) -> np.ndarray:
-    """The state (q, v, S) of rest under a pressure (Pa) at a temperature (K), shape (3,): ``P A q = n R T``."""
+    """Return the equilibrium state (q, v, S), shape (3,), under a pressure (Pa) at a temperature (K): ``P A q = n R
+    T``."""
     gas = IdealGas(jnp.asarray(moles), jnp.asarray(area * height))
     volume = moles * GAS_CONSTANT * T / pressure
     return np.array([volume / area, 0.0, gas.entropy(T, volume)], dtype=float)
 
 
 class _PressureForce(Module):
-    """``-P A``."""
+    """The external force ``-P A``, shape (1,)."""
 
     pressure: Callable
     area: jax.Array

@@ -1,4 +1,4 @@
-"""Closed forms of a body left to itself: the periods of its motion, and how fast friction inside damps its nutation."""
+"""Closed forms for a free body: the periods of its motion, and the damping of its nutation by internal friction."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from .inertia import EQUAL_MOMENTS_RTOL, are_tensors, principal_axes, principal_
 
 
 class Periods(NamedTuple):
-    """The periods of a free body, arrays of one shape.
+    """The periods of a free body, three arrays of equal shape.
 
     Attributes
     ----------
     rotation : ndarray
-        After which the angular velocity in body axes is what it was (time): infinite on the separatrix. Near the axis
-        of greatest inertia of a body with ``I_1 = I_2`` it is ``2 pi I_1 I_3 / (L_3 (I_3 - I_1))``.
+        Period (time) of the angular velocity in body axes; infinite on the separatrix. Near the axis of greatest
+        inertia of a body with ``I_1 = I_2`` it is ``2 pi I_1 I_3 / (L_3 (I_3 - I_1))``.
     precession : ndarray
-        The mean time (time) in which the axis that the body circles about turns once about the angular momentum in
-        space. It is ``2 pi I_1 / L`` of a body with two equal moments.
+        Mean time (time) in which the circled axis of the body turns once about the angular momentum in space. It is ``2
+        pi I_1 / L`` for a body with two equal moments.
     axis : ndarray of int
-        The number of that axis, of the greatest or of the least inertia, as they are given: 0, 1 or 2. If a tensor is
-        given, it is the number of a principal axis in ascending order of the moments, 0 or 2: see
+        Index of the circled axis, 0, 1 or 2 in the order of the given moments: the axis of the greatest or the least
+        inertia. For a tensor it is the index of a principal axis in ascending order of the moments, 0 or 2: see
         :func:`liethermo.bodies.principal_axes`.
     """
 
@@ -37,7 +37,8 @@ class Periods(NamedTuple):
 
 
 def periods(inertia, momentum, energy=None) -> Periods:
-    """The periods of a free body by elliptic integrals [Landau & Lifshitz, Mechanics §37; Samarasinha & A'Hearn 1991].
+    """Return the periods of a free body by elliptic integrals [Landau & Lifshitz, Mechanics §37; Samarasinha & A'Hearn
+    1991].
 
     With ``I_1 <= I_2 <= I_3`` and ``L**2 > 2 E I_2`` the angular momentum circles about the axis of ``I_3`` in body
     axes (short-axis mode), with ``L**2 < 2 E I_2`` about that of ``I_1`` (long-axis mode).
@@ -49,14 +50,14 @@ def periods(inertia, momentum, energy=None) -> Periods:
         axes have length 3 holds tensors where each block is symmetric and positive definite and its principal moments
         obey ``I_i <= I_j + I_k``; no three rigid bodies have the rows of such a block as their moments.
     momentum : array, shape (..., 3), or (...) beside an energy
-        Angular momentum in body axes, or its size L (mass * length**2 / time).
+        Angular momentum in body axes, or its norm L (mass * length**2 / time).
     energy : array, shape (...), optional
         Kinetic energy E (mass * length**2 / time**2); by default that of the momentum.
 
     Returns
     -------
     Periods
-        Of shape (...); both periods are those of a steady spin in the limit of small circles.
+        Arrays of shape (...); for a steady spin both periods are the limits for small circles.
 
     Raises
     ------
@@ -66,7 +67,7 @@ def periods(inertia, momentum, energy=None) -> Periods:
     moments, L = np.asarray(principal_moments(inertia)), np.asarray(momentum, dtype=float)
     if energy is None:
         if L.shape[-1:] != (3,):
-            raise InputError(f"a momentum without an energy has shape (..., 3), not {L.shape}")
+            raise InputError(f"without energy=, momentum must have shape (..., 3), got {L.shape}")
         if are_tensors(np.asarray(inertia)):
             L = np.einsum("...ji,...j->...i", principal_axes(inertia).axes, L)
         E, L = 0.5 * np.sum(L**2 / moments, axis=-1), np.linalg.norm(L, axis=-1)
@@ -76,32 +77,32 @@ def periods(inertia, momentum, energy=None) -> Periods:
     shape = np.broadcast_shapes(L.shape, E.shape, moments.shape[:-1])
     I1, I2, I3 = (np.broadcast_to(np.take_along_axis(moments, order, -1)[..., i], shape) for i in range(3))
     L, E = np.broadcast_to(L, shape), np.broadcast_to(E, shape)
-    square, rounding = L**2, 8 * np.finfo(float).eps
-    least, most = square / (2 * I3), square / (2 * I1)
-    fits = (least > 0.0) & (least * (1 - rounding) <= E) & (most * (1 + rounding) >= E)
-    if not fits.all():
-        i = np.unravel_index(int(np.argmin(fits)), shape)
+    L_squared, rounding = L**2, 8 * np.finfo(float).eps
+    min_energy, max_energy = L_squared / (2 * I3), L_squared / (2 * I1)
+    is_possible = (min_energy > 0.0) & (min_energy * (1 - rounding) <= E) & (max_energy * (1 + rounding) >= E)
+    if not is_possible.all():
+        i = np.unravel_index(int(np.argmin(is_possible)), shape)
         raise InputError(
-            f"a free body with the momentum {L[i]:g} and these moments of inertia has an energy from L**2 / (2 I_3) = "
-            f"{least[i]:g} to L**2 / (2 I_1) = {most[i]:g}, not {E[i]:g}"
+            f"the energy for the momentum {L[i]:g} must lie between L**2 / (2 I_3) = {min_energy[i]:g} and "
+            f"L**2 / (2 I_1) = {max_energy[i]:g}, got {E[i]:g}"
         )
-    short = square >= 2 * E * I2
-    a, c = np.where(short, I1, I3), np.where(short, I3, I1)  # c is that of the axis which is circled
+    is_short_axis = L_squared >= 2 * E * I2
+    a, c = np.where(is_short_axis, I1, I3), np.where(is_short_axis, I3, I1)  # c is the moment of the circled axis
     with np.errstate(divide="ignore", invalid="ignore"):
-        pace = (c - I2) * (square - 2 * E * a)
-        m = np.clip((I2 - a) * (2 * E * c - square) / pace, 0.0, 1.0)
+        circling_factor = (c - I2) * (L_squared - 2 * E * a)
+        m = np.clip((I2 - a) * (2 * E * c - L_squared) / circling_factor, 0.0, 1.0)
         K = scipy.special.ellipk(m)
-        rotation = 4 * K * np.sqrt(a * I2 * c / pace)
+        rotation = 4 * K * np.sqrt(a * I2 * c / circling_factor)
         n = -c * (I2 - a) / (a * (c - I2))
-        mean = 1 / c + (1 / a - 1 / c) * _elliptic_pi(n, m) / K
-    still = (pace <= 0.0) | np.isinf(K)  # a spin about an axis that is circled by none, or the way to one
-    rotation, mean = np.where(still, np.inf, rotation), np.where(still, 1 / I2, mean)
-    axis = np.where(short, order[..., 2], order[..., 0])
-    return Periods(rotation, 2 * np.pi / (L * mean), axis)
+        mean_rate = 1 / c + (1 / a - 1 / c) * _elliptic_pi(n, m) / K
+    is_aperiodic = (circling_factor <= 0.0) | np.isinf(K)  # a steady spin, or motion on the separatrix
+    rotation, mean_rate = np.where(is_aperiodic, np.inf, rotation), np.where(is_aperiodic, 1 / I2, mean_rate)
+    axis = np.where(is_short_axis, order[..., 2], order[..., 0])
+    return Periods(rotation, 2 * np.pi / (L * mean_rate), axis)
 
 
 def _elliptic_pi(n, m) -> np.ndarray:
-    """The complete elliptic integral of the third kind, by Carlson's forms [DLMF 19.25.2]."""
+    """Return the complete elliptic integral of the third kind, by Carlson's forms [DLMF 19.25.2]."""
     RF, RJ = scipy.special.elliprf, scipy.special.elliprj
     return RF(0.0, 1.0 - m, 1.0) + n / 3.0 * RJ(0.0, 1.0 - m, 1.0, 1.0 - n)
 
@@ -135,7 +136,7 @@ def rate_of(relaxation_time, inertia, momentum) -> jax.Array:
         Principal moments (mass * length**2), in any order, not all equal; or tensors of inertia, by the rule of
         :func:`periods`.
     momentum : float or array, > 0
-        The size L of the angular momentum (mass * length**2 / time).
+        The norm L of the angular momentum (mass * length**2 / time).
 
     Returns
     -------
@@ -148,24 +149,30 @@ def rate_of(relaxation_time, inertia, momentum) -> jax.Array:
     """
     moments = principal_moments(inertia)
     tau, L = check_numbers(relaxation_time, "a relaxation time"), check_numbers(momentum, "the size of a momentum")
-    for value, what in ((tau, "a relaxation time"), (L, "the size of a momentum")):
-        require_condition(value, lambda v: (v > 0.0) & (v < np.inf), what + " must be positive and finite, not {value}")
-    least, middle, greatest = jnp.moveaxis(jnp.sort(moments, axis=-1), -1, 0)
-    unequal = greatest - least > EQUAL_MOMENTS_RTOL * greatest
-    require_condition(unequal, lambda v: v, "a body with three equal moments has no nutation to relax")
-    is_rod = greatest - middle <= EQUAL_MOMENTS_RTOL * greatest
-    d1 = (greatest - least) / (greatest * least)
-    ratio = jnp.where(is_rod, 0.0, (greatest - middle) * least / ((greatest - least) * middle))  # d_2 / d_1
+    for value, label in ((tau, "a relaxation time"), (L, "the size of a momentum")):
+        require_condition(
+            value, lambda v: (v > 0.0) & (v < np.inf), label + " must be positive and finite, got {value}"
+        )
+    smallest_moment, middle_moment, greatest_moment = jnp.moveaxis(jnp.sort(moments, axis=-1), -1, 0)
+    is_unequal = greatest_moment - smallest_moment > EQUAL_MOMENTS_RTOL * greatest_moment
+    require_condition(is_unequal, lambda v: v, "a body with three equal moments has no nutation to relax")
+    is_rod = greatest_moment - middle_moment <= EQUAL_MOMENTS_RTOL * greatest_moment
+    d1 = (greatest_moment - smallest_moment) / (greatest_moment * smallest_moment)
+    ratio = jnp.where(
+        is_rod,
+        0.0,
+        (greatest_moment - middle_moment) * smallest_moment / ((greatest_moment - smallest_moment) * middle_moment),
+    )  # d_2 / d_1
     decay = 1.0 / (tau * L * d1)
     oscillates = decay * (1.0 - ratio) <= jnp.sqrt(jnp.where(ratio > 0.0, ratio, 1.0)) * (1.0 + ratio) * (ratio > 0.0)
-    weak = 2.0 * decay / (1.0 + ratio)
-    square = jnp.where(oscillates, 1.0, (decay * (1.0 - ratio)) ** 2 - 4.0 * ratio**2)  # sqrt has a derivative
-    strong = 2.0 * (decay**2 + ratio) / ((1.0 + ratio) * decay + jnp.sqrt(square))
-    return jnp.where(oscillates, weak, strong) / L
+    oscillating_rate = 2.0 * decay / (1.0 + ratio)
+    discriminant = jnp.where(oscillates, 1.0, (decay * (1.0 - ratio)) ** 2 - 4.0 * ratio**2)  # sqrt has a derivative
+    overdamped_rate = 2.0 * (decay**2 + ratio) / ((1.0 + ratio) * decay + jnp.sqrt(discriminant))
+    return jnp.where(oscillates, oscillating_rate, overdamped_rate) / L
 
 
 def damping_time(rigidity, quality, density, radius, spin, shape_factor=100.0) -> np.ndarray:
-    """The time in which inelastic friction damps the nutation of a solid body, ``A mu Q / (rho R**2 omega**3)``.
+    """Return the time in which inelastic friction damps the nutation of a solid body, ``A mu Q / (rho R**2 omega**3)``.
 
     The form is agreed upon, and follows from dimensions. The constant A depends on the shape and on who computed it:
     Burns & Safronov (1973) have about 100 for bodies that are nearly round and less for long ones; Efroimsky & Lazarian
@@ -179,7 +186,7 @@ def damping_time(rigidity, quality, density, radius, spin, shape_factor=100.0) -
     rigidity : float or array, > 0
         mu (pressure; Pa).
     quality : float or array, > 0
-        Q, by which strain energy is divided for the loss in a radian.
+        Q, the strain energy over the energy lost in a radian.
     density : float or array, > 0
         rho (mass / length**3; kg / m**3).
     radius : float or array, > 0
@@ -198,7 +205,7 @@ def damping_time(rigidity, quality, density, radius, spin, shape_factor=100.0) -
     ------
     InputError
     """
-    given = {
+    arguments = {
         "rigidity": rigidity,
         "quality": quality,
         "density": density,
@@ -206,7 +213,7 @@ def damping_time(rigidity, quality, density, radius, spin, shape_factor=100.0) -
         "spin": spin,
         "shape_factor": shape_factor,
     }
-    mu, Q, rho, R, omega, A = (np.asarray(value, dtype=float) for value in given.values())
-    for name, value in given.items():
-        require_condition(value, lambda v: (v > 0.0) & (v < np.inf), name + " must be positive and finite, not {value}")
+    mu, Q, rho, R, omega, A = (np.asarray(value, dtype=float) for value in arguments.values())
+    for name, value in arguments.items():
+        require_condition(value, lambda v: (v > 0.0) & (v < np.inf), name + " must be positive and finite, got {value}")
     return A * mu * Q / (rho * R**2 * omega**3)

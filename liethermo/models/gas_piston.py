@@ -19,7 +19,7 @@ from .parameters import checked_positive
 from .thermo_particles import ThermalEnergy
 
 GAS_CONSTANT = 8.31446261815324
-"""J / (K mol)."""
+"""Molar gas constant R, J / (K mol)."""
 
 
 class IdealGas(Module):
@@ -40,18 +40,18 @@ class IdealGas(Module):
     c: float = 1.5
 
     def energy(self, S, V):
-        """U (J) at an entropy (J / K) and a volume."""
+        """Return the energy U (J) at an entropy (J / K) and a volume (m**3)."""
         heat = self.c * self.moles * GAS_CONSTANT
         return heat * self.temperature * jnp.exp(S / heat) * (V / self.volume) ** (-1.0 / self.c)
 
     def entropy(self, T, V):
-        """S (J / K) at a temperature and a volume."""
+        """Return the entropy S (J / K) at a temperature (K) and a volume (m**3)."""
         nR = self.moles * GAS_CONSTANT
         return self.c * nR * jnp.log(T / self.temperature) + nR * jnp.log(V / self.volume)
 
 
 class _CylinderGasEnergy(Module):
-    """Energy of a gas left or right of the piston, from (q, S)."""
+    """The energy of a gas left or right of the piston as a function of (q, S)."""
 
     gas: IdealGas
     area: jax.Array
@@ -74,7 +74,7 @@ def gas_piston(
     conductance: Sequence[float] = (5.0, 5.0),
     friction: float = 20.0,
 ) -> ComposedSystem:
-    """Two gases in a cylinder with a piston that conducts heat and rubs.
+    """Two gases in a cylinder, separated by a piston with heat conduction and friction.
 
     ``H = p^2 / (2 m) + C exp(S_p / C) + U_l(S_l, A q) + U_r(S_r, A (L - q))``, 0 < q < L, in SI units, and in the state
     (S_l, q, p, S_p, S_r). It rests where the pressures agree, ``q = L n_l / (n_l + n_r)``, and all temperatures,
@@ -83,41 +83,42 @@ def gas_piston(
     Parameters
     ----------
     moles : two numbers > 0
-        Of the gases, monatomic (c = 3/2); their entropies are counted from 300 K and half the cylinder.
+        Amounts of the monatomic gases (c = 3/2); their entropies are 0 at 300 K in half of the cylinder.
     mass, area, length : float, > 0
-        Of the piston and the cylinder (kg, m**2, m).
+        Mass and area of the piston, length of the cylinder (kg, m**2, m).
     capacity : float, > 0
         Heat capacity C of the piston (J / K).
     conductance : two numbers >= 0
-        Between the piston and either gas (W / K).
+        Heat conductance between the piston and each gas (W / K).
     friction : float, >= 0
-        Of the piston on the cylinder, which heats the piston (kg / s).
+        Friction coefficient of the piston in the cylinder (kg / s); the friction heats the piston.
     """
     n = checked_positive(moles, "moles", 2)
     A, L, m = checked_positive(area, "area"), checked_positive(length, "length"), checked_positive(mass, "mass")
     gases = [
-        _CylinderGasEnergy(IdealGas(n_i, 0.5 * A * L), A, L, right) for n_i, right in zip(n, (False, True), strict=True)
+        _CylinderGasEnergy(IdealGas(n_i, 0.5 * A * L), A, L, is_right)
+        for n_i, is_right in zip(n, (False, True), strict=True)
     ]
     check_numbers(conductance, "conductance", (2,))
     piston = Kinetic((1.0 / m)[None]) + Function(ThermalEnergy(checked_positive(capacity, "capacity"))).on([2])
     return ComposedSystem(
         {"left gas": Subsystem(None, 1), "piston": Subsystem(piston, 3, friction), "right gas": Subsystem(None, 1)},
-        coupling=[Function(gas).on([1, place]) for gas, place in zip(gases, (0, 4), strict=True)],
+        coupling=[Function(gas).on([1, entropy_index]) for gas, entropy_index in zip(gases, (0, 4), strict=True)],
         conductance=[(0, 1, conductance[0]), (1, 2, conductance[1])],
-        connected=False,  # an adiabatic piston is meant
+        connected=False,  # allow an adiabatic piston
         validate=False,  # most normally distributed q lie outside the cylinder
     )
 
 
 def gas_piston_state(q, temperatures, moles=(1.0, 1.0), area=0.01, length=1.0, capacity=10.0, p=0.0) -> np.ndarray:
-    """The state with the piston at q and the temperatures (K) of left gas, piston and right gas, shape (5,)."""
-    left, right = (IdealGas(jnp.asarray(n), jnp.asarray(0.5 * area * length)) for n in moles)
+    """Return the state, shape (5,), with the piston at q and the temperatures (K) of left gas, piston and right gas."""
+    left_gas, right_gas = (IdealGas(jnp.asarray(n), jnp.asarray(0.5 * area * length)) for n in moles)
     T_left, T_piston, T_right = temperatures
-    S_left, S_right = left.entropy(T_left, area * q), right.entropy(T_right, area * (length - q))
+    S_left, S_right = left_gas.entropy(T_left, area * q), right_gas.entropy(T_right, area * (length - q))
     return np.array([S_left, q, p, capacity * np.log(T_piston), S_right], dtype=float)
 
 
 def gas_piston_equilibrium(energy, moles=(1.0, 1.0), length=1.0, capacity=10.0) -> tuple[float, float]:
-    """Where the piston rests, q (m), and the temperature of everything (K), at a total energy (J)."""
-    total = float(sum(moles))
-    return length * moles[0] / total, float(energy) / (1.5 * total * GAS_CONSTANT + capacity)
+    """Return the equilibrium position q (m) of the piston and the common temperature (K), at a total energy (J)."""
+    total_moles = float(sum(moles))
+    return length * moles[0] / total_moles, float(energy) / (1.5 * total_moles * GAS_CONSTANT + capacity)

@@ -1,4 +1,4 @@
-"""Heat on a grid of bodies."""
+"""Heat conduction on a grid of bodies."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ def heat_grid(shape: Sequence[int] = (32, 32), capacity: float = 1.0, conductanc
 
 
 def heat_grid_solution(t, temperatures, capacity: float = 1.0, conductance: float = 1.0) -> np.ndarray:
-    """The exact temperatures at a time, from those at t = 0, both in the shape of the grid: a sum of cosines."""
-    import scipy.fft  # here: every user of the library would wait for it
+    """Return the exact temperatures at a time from those at t = 0, in the shape of the grid, as a sum of cosines."""
+    import scipy.fft  # at the top, this would slow down the import of the library
 
     T = np.asarray(temperatures, dtype=float)
     rates = np.zeros(T.shape)
@@ -55,18 +55,18 @@ def heat_grid_solution(t, temperatures, capacity: float = 1.0, conductance: floa
 
 
 def grid_graph(shape: Sequence[int]) -> scipy.sparse.csr_array:
-    """The graph in which each node of a grid, in C order, is joined to its neighbours along the axes with weight 1."""
+    """Return the graph that joins each node of a grid, in C order, to its neighbours along the axes with weight 1."""
     sizes = _checked_shape(shape)
-    total = scipy.sparse.csr_array((math.prod(sizes), math.prod(sizes)))
+    graph = scipy.sparse.csr_array((math.prod(sizes), math.prod(sizes)))
     for axis, n in enumerate(sizes):
         line = scipy.sparse.diags_array([np.ones(n - 1)] * 2, offsets=[-1, 1], shape=(n, n))
-        before, after = math.prod(sizes[:axis]), math.prod(sizes[axis + 1 :])
-        inner = scipy.sparse.kron(line, scipy.sparse.eye_array(after))
-        total = total + scipy.sparse.kron(scipy.sparse.eye_array(before), inner)
-    return scipy.sparse.csr_array(total)
+        n_outer, n_inner = math.prod(sizes[:axis]), math.prod(sizes[axis + 1 :])
+        line_blocks = scipy.sparse.kron(line, scipy.sparse.eye_array(n_inner))
+        graph = graph + scipy.sparse.kron(scipy.sparse.eye_array(n_outer), line_blocks)
+    return scipy.sparse.csr_array(graph)
 
 
 def _checked_shape(shape: Sequence[int]) -> tuple[int, ...]:
     if not isinstance(shape, Sequence) or isinstance(shape, str) or len(shape) == 0:
-        raise InputError(f"shape is the number of nodes along each axis, such as (32, 32), not {shape!r}")
+        raise InputError(f"shape must be the number of nodes along each axis, such as (32, 32), got {shape!r}")
     return tuple(checked_integer(n, "each entry of shape") for n in shape)

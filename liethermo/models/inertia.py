@@ -1,4 +1,4 @@
-"""Moments and tensors of inertia: which of the two an array holds, and the principal axes of a tensor."""
+"""Moments and tensors of inertia: telling them apart, and the principal axes of a tensor."""
 
 from __future__ import annotations
 
@@ -65,16 +65,16 @@ def principal_axes(inertia) -> PrincipalAxes:
     """
     tensors = np.asarray(check_numbers(inertia, "inertia"), dtype=np.float64)
     if tensors.shape[-2:] != (3, 3):
-        raise InputError(f"a tensor of inertia has shape (..., 3, 3), not {tensors.shape}")
+        raise InputError(f"inertia must have shape (..., 3, 3), got {tensors.shape}")
     moments, axes = np.linalg.eigh(checked_tensors(tensors))
-    first = np.take_along_axis(axes, np.argmax(np.abs(axes) > 1e-8, axis=-2)[..., None, :], axis=-2)
-    axes = axes * np.where(first < 0.0, -1.0, 1.0)
+    leading_entries = np.take_along_axis(axes, np.argmax(np.abs(axes) > 1e-8, axis=-2)[..., None, :], axis=-2)
+    axes = axes * np.where(leading_entries < 0.0, -1.0, 1.0)
     axes[..., 2] *= np.linalg.det(axes)[..., None]
     return PrincipalAxes(moments, axes)
 
 
 def are_tensors(inertia) -> bool:
-    """Return whether an array of shape (..., 3) holds tensors of inertia, shape (..., 3, 3), rather than moments.
+    """Return True if an array of shape (..., 3) holds tensors of inertia, shape (..., 3, 3), rather than moments.
 
     Symmetric positive definite blocks whose principal moments obey ``I_i <= I_j + I_k`` are tensors. Their rows are
     then never the moments of three bodies. Proof: let the rows obey these inequalities. Then the trace is at most twice
@@ -111,16 +111,16 @@ def are_tensors(inertia) -> bool:
 
 
 def checked_tensors(tensors) -> np.ndarray:
-    """Return tensors of inertia, shape (..., 3, 3), made exactly symmetric, or refuse them."""
+    """Return tensors of inertia, shape (..., 3, 3), made exactly symmetric; invalid ones are refused."""
     blocks = np.asarray(tensors, dtype=np.float64)
     if not np.isfinite(blocks).all():
         raise InputError(f"a tensor of inertia must be finite, got {blocks.tolist()}")
     if not is_symmetric(blocks):
         raise InputError(f"a tensor of inertia must be symmetric, got {blocks.tolist()}")
     blocks = 0.5 * (blocks + blocks.swapaxes(-1, -2))
-    least = float(np.linalg.eigvalsh(blocks).min())
-    if least <= 0.0:
-        raise InputError(f"a tensor of inertia must be positive definite, got the principal moment {least:g}")
+    min_moment = float(np.linalg.eigvalsh(blocks).min())
+    if min_moment <= 0.0:
+        raise InputError(f"a tensor of inertia must be positive definite, got the principal moment {min_moment:g}")
     return blocks
 
 
@@ -128,10 +128,10 @@ def principal_moments(inertia) -> jax.Array:
     """Return principal moments, shape (..., 3), of moments in any order or of tensors (then in ascending order)."""
     array = check_numbers(inertia, "inertia")
     if array.shape[-1:] != (3,):
-        raise InputError(f"inertia has shape (..., 3), or (..., 3, 3) of tensors, not {array.shape}")
+        raise InputError(f"inertia must have shape (..., 3), or (..., 3, 3) for tensors, got {array.shape}")
     moments = jnp.linalg.eigvalsh(checked_tensors(array)) if are_tensors(array) else array
     require_condition(
-        moments, lambda m: (m > 0.0) & (m < np.inf), "moments of inertia must be positive and finite, not {value}"
+        moments, lambda m: (m > 0.0) & (m < np.inf), "moments of inertia must be positive and finite, got {value}"
     )
     return moments
 
@@ -146,12 +146,12 @@ def inverse_inertia(inertia) -> jax.Array:
 
 
 def is_symmetric(blocks: np.ndarray) -> bool:
-    """Return whether blocks of shape (..., 3, 3) are symmetric to rounding, each relative to its largest entry."""
+    """Return True if blocks of shape (..., 3, 3) are symmetric to rounding, each relative to its largest entry."""
     asymmetry = np.abs(blocks - blocks.swapaxes(-1, -2)).max(axis=(-2, -1))
     return bool((asymmetry <= SYMMETRY_RTOL * np.abs(blocks).max(axis=(-2, -1))).all())
 
 
 def satisfies_inequalities(moments: np.ndarray) -> bool:
-    """Return whether moments of shape (..., 3) obey ``I_i <= I_j + I_k``, as those of every rigid body do."""
-    largest = moments.max(axis=-1)
-    return bool((largest <= (moments.sum(axis=-1) - largest) * (1.0 + INEQUALITY_RTOL)).all())
+    """Return True if moments of shape (..., 3) obey ``I_i <= I_j + I_k``, as the moments of every rigid body do."""
+    max_moment = moments.max(axis=-1)
+    return bool((max_moment <= (moments.sum(axis=-1) - max_moment) * (1.0 + INEQUALITY_RTOL)).all())

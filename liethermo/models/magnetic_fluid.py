@@ -18,7 +18,7 @@ from .quantised_sphere import QuantisedSphere
 
 
 class MagneticEnergy(Energy):
-    """``gamma / 2 (tr W^H (-Delta)^{-1} W + tr B^H (-Delta) B)``: gamma times that of flow and magnetic field."""
+    """Gamma times the energy of flow and magnetic field, ``gamma / 2 (tr W^H (-Delta)^{-1} W + tr B^H (-Delta) B)``."""
 
     sphere: QuantisedSphere = eqx.field(static=True)
 
@@ -53,7 +53,7 @@ def magnetic_fluid(N: int, rate=0.0) -> LiePoissonSystem:
     ----------
     N : int, >= 2
     rate : float, >= 0
-        Of the decay, the inverse of a time.
+        Rate of the decay (1 / time).
 
     Returns
     -------
@@ -69,8 +69,8 @@ def magnetic_fluid(N: int, rate=0.0) -> LiePoissonSystem:
     sphere, rate = QuantisedSphere(N), checked_rate(rate)
     algebra = mf.magnetic_extension(sphere.algebra, by_brackets=True)
     # a concrete zero leaves the double bracket out
-    none = not isinstance(rate, jax.core.Tracer) and not float(rate)
+    is_undamped = not isinstance(rate, jax.core.Tracer) and not float(rate)
     # components of a motion of W are half of those of its matrix, and those of B have twice its dual ones
     metric = np.repeat([1.0, 0.25], sphere.algebra.dim)
-    dissipation: Dissipation | None = None if none else DoubleBracket(2.0 * sphere.gamma * rate, metric)
+    dissipation: Dissipation | None = None if is_undamped else DoubleBracket(2.0 * sphere.gamma * rate, metric)
     return LiePoissonSystem(algebra, MagneticEnergy(sphere), None, dissipation, validate=False)

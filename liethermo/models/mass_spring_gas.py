@@ -1,4 +1,4 @@
-"""A mass on a spring that rubs in an ideal gas, with its exact solution [GBY §5.2-5.3; Ferrari & Gruber 2010]."""
+"""A mass on a spring with friction in an ideal gas, with its exact solution [GBY §5.2-5.3; Ferrari & Gruber 2010]."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ CASES = {
 """The parameters of Cases 1 and 2 of the paper, for ``mass_spring_gas(**CASES[1], friction=...)``."""
 
 STARTS = {1: 0.3, 2: 0.1}
-"""Where the mass of either case starts, ``x_0 = x_1`` (m), at S_0 = 0; the step is 1e-3 s."""
+"""Initial positions ``x_0 = x_1`` (m) of both cases, with S_0 = 0; the paper's step is 1e-3 s."""
 
 
 class FixedVolumeGas(Module):
-    """``U(S) = c N R T_0 exp(S / (c N R))`` of an ideal gas in a fixed volume, S counted from T_0.
+    """The energy ``U(S) = c N R T_0 exp(S / (c N R))`` of an ideal gas in a fixed volume, with S = 0 at T_0.
 
     Attributes
     ----------
@@ -81,7 +81,7 @@ def mass_spring_gas_solution(
     temperature: float = 300.0,
     c: float = 1.5,
 ) -> np.ndarray:
-    """The exact states (x, v, S) at times t after x0, shape (..., 3), below, at and above critical damping.
+    """Return the exact states (x, v, S) at times t after x0, shape (..., 3), below, at and above critical damping.
 
     ``x = e^(-kappa t) (x_0 C + (v_0 + kappa x_0) D)`` with ``kappa = lambda / 2m``, ``omega^2 = k/m - kappa^2`` and
     ``C, D = cos(omega t), sin(omega t)/omega``, or ``1, t``, or the hyperbolic ones: (5.6) and its other branches. What
@@ -96,19 +96,19 @@ def mass_spring_gas_solution(
     """
     t, (x0, v0, S0), heat = np.asarray(t, dtype=float), np.asarray(x0, dtype=float), float(_heat_capacity(moles, c))
     kappa = friction / (2 * mass)
-    square = stiffness / mass - kappa**2
-    omega = np.sqrt(abs(square))
+    omega_squared = stiffness / mass - kappa**2
+    omega = np.sqrt(abs(omega_squared))
     if 4 * mass * stiffness > friction**2:
         C, D = np.exp(-kappa * t) * np.cos(omega * t), np.exp(-kappa * t) * np.sin(omega * t) / omega
     elif 4 * mass * stiffness == friction**2:
         C, D = np.exp(-kappa * t), t * np.exp(-kappa * t)
     else:  # e^(-kappa t) inside: cosh alone overflows
-        slow, fast = np.exp((omega - kappa) * t), np.exp(-2 * omega * t)
-        C, D = 0.5 * slow * (1 + fast), -0.5 * slow * np.expm1(-2 * omega * t) / omega
+        slow_decay, fast_decay = np.exp((omega - kappa) * t), np.exp(-2 * omega * t)
+        C, D = 0.5 * slow_decay * (1 + fast_decay), -0.5 * slow_decay * np.expm1(-2 * omega * t) / omega
     x = x0 * C + (v0 + kappa * x0) * D
     v = v0 * C - (kappa * v0 + stiffness / mass * x0) * D
-    lost = 0.5 * mass * (v0**2 - v**2) + 0.5 * stiffness * (x0**2 - x**2)
-    S = S0 + heat * np.log1p(lost / (heat * temperature * np.exp(S0 / heat)))
+    lost_energy = 0.5 * mass * (v0**2 - v**2) + 0.5 * stiffness * (x0**2 - x**2)
+    S = S0 + heat * np.log1p(lost_energy / (heat * temperature * np.exp(S0 / heat)))
     return np.stack([x, v, S], axis=-1)
 
 

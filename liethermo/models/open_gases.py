@@ -21,7 +21,8 @@ from .thermo_particles import ThermalEnergy
 
 
 class IdealMixture(Module):
-    """``U = sum_k N_k (c_k T + e_k)`` with ``S = sum_k N_k (c_k ln T + s_k - ln(N_k / V))``, Boltzmann's constant 1.
+    """A mixture of ideal gases, ``U = sum_k N_k (c_k T + e_k)``, ``S = sum_k N_k (c_k ln T + s_k - ln(N_k / V))``, k_B
+    = 1.
 
     So T is an explicit function of (S, N, V), ``mu_k = e_k + (c_k + 1) T - T (c_k ln T + s_k - ln(N_k / V))`` and
     ``P = sum_k N_k T / V``.
@@ -48,30 +49,30 @@ class IdealMixture(Module):
         return jnp.sum(N * (self.capacity * self.temperature(S, N, V) + self.energy))
 
     def entropy_at(self, T, N, V):
-        """S at a temperature."""
+        """Return the entropy S at a temperature."""
         return jnp.sum(N * (self.capacity * jnp.log(T) + self.entropy - jnp.log(N / V)))
 
     def equilibrium_constant(self, T, stoichiometry) -> jax.Array:
-        """``prod (N_k / V)^nu_k`` where ``nu . mu = 0``: the law of mass action."""
+        """Return ``prod (N_k / V)^nu_k`` at equilibrium, ``nu . mu = 0``: the law of mass action."""
         standard = self.energy + (self.capacity + 1.0) * T - T * (self.capacity * jnp.log(T) + self.entropy)
         return jnp.exp(-jnp.dot(jnp.asarray(stoichiometry), standard) / T)
 
 
 def _single_species_gas(heat_capacity) -> IdealMixture:
-    """One kind of particles, its energy and entropy counted from zero."""
+    """Return a gas of one species with zero energy and entropy constants."""
     return IdealMixture(checked_positive(heat_capacity, "heat_capacity")[None], jnp.zeros(1), jnp.zeros(1))
 
 
 class _TwoGasEnergy(Module):
-    """The energies of the gases left and right of a piston at q, in the volumes ``A q`` and ``A (L - q)``."""
+    """The energy of two gases left and right of a piston at q, in the volumes ``A q`` and ``A (L - q)``."""
 
     gas: IdealMixture
     area: jax.Array
     length: jax.Array
 
     def __call__(self, q, S, N):
-        left, right = self.area * q[0], self.area * (self.length - q[0])
-        return self.gas.internal_energy(S[0], N[:1], left) + self.gas.internal_energy(S[2], N[1:], right)
+        left_volume, right_volume = self.area * q[0], self.area * (self.length - q[0])
+        return self.gas.internal_energy(S[0], N[:1], left_volume) + self.gas.internal_energy(S[2], N[1:], right_volume)
 
 
 def porous_piston(
@@ -84,7 +85,7 @@ def porous_piston(
     capacity: float = 1.0,
     heat_capacity: float = 1.5,
 ) -> ComposedSystem:
-    """Two gases with a piston between them that lets particles through, conducts heat and rubs.
+    """Two gases separated by a porous piston, with flow of particles, heat conduction and friction.
 
     ``H = p^2 / (2 m) + C exp(S_p / C) + U(S_l, N_l, A q) + U(S_r, N_r, A (L - q))``, Boltzmann's constant 1, in the
     state (S_l, N_l, q, p, S_p, S_r, N_r). It rests where temperatures, pressures and chemical potentials agree, so at
@@ -95,14 +96,14 @@ def porous_piston(
     permeability : float, >= 0
         L of the :class:`liethermo.Membrane`.
     conductance : two floats, >= 0
-        Between the left gas and the piston, and between the piston and the right one.
+        Heat conductance between the left gas and the piston, and between the piston and the right gas.
     friction : float, >= 0
-        Of the piston (mass / time).
+        Friction coefficient of the piston (mass / time).
     mass, area, length : float, > 0
     capacity : float, > 0
         C, the heat capacity of the piston.
     heat_capacity : float, > 0
-        Of a particle, at constant volume.
+        Heat capacity of a particle at constant volume.
     """
     gas = _single_species_gas(heat_capacity)
     check_numbers(conductance, "conductance", (2,))
@@ -128,7 +129,7 @@ def porous_piston(
 def porous_piston_state(
     left: tuple[float, float], right: tuple[float, float], q: float = 1.0, T: float = 1.0, **parameters
 ) -> np.ndarray:
-    """The state of a porous piston at rest at q, at the temperature T itself.
+    """Return the state of a porous piston at rest at q, with the piston at temperature T.
 
     Parameters
     ----------
@@ -137,27 +138,27 @@ def porous_piston_state(
         Between 0 and the length.
     T : float, > 0
     **parameters
-        Those of :func:`porous_piston` that are not its defaults.
+        Parameters of :func:`porous_piston` that differ from its defaults.
     """
-    known = {name: parameter.default for name, parameter in inspect.signature(porous_piston).parameters.items()}
-    if unknown := [name for name in parameters if name not in known]:
-        raise InputError(f"porous_piston has no parameter {unknown[0]!r}: it has {', '.join(known)}")
+    defaults = {name: parameter.default for name, parameter in inspect.signature(porous_piston).parameters.items()}
+    if unknown := [name for name in parameters if name not in defaults]:
+        raise InputError(f"porous_piston has no parameter {unknown[0]!r}: it has {', '.join(defaults)}")
     area, length, capacity = (
-        checked_positive((known | parameters)[name], name) for name in ("area", "length", "capacity")
+        checked_positive((defaults | parameters)[name], name) for name in ("area", "length", "capacity")
     )
-    place = check_numbers(q, "q", ())
+    position = check_numbers(q, "q", ())
     require_condition(
-        place, lambda q: (q > 0.0) & (q < length), f"the piston is between 0 and {length:g}, not at {{value:g}}"
+        position, lambda q: (q > 0.0) & (q < length), f"q must be between 0 and {length:g}, got {{value:g}}"
     )
-    gas, state = _single_species_gas((known | parameters)["heat_capacity"]), []
-    for name, side, width in (("left", left, place), ("right", right, length - place)):
-        n, t = checked_positive(side, f"{name}, (particles, temperature),", 2)
+    gas, state = _single_species_gas((defaults | parameters)["heat_capacity"]), []
+    for name, particles_and_temperature, width in (("left", left, position), ("right", right, length - position)):
+        n, t = checked_positive(particles_and_temperature, f"{name}, (particles, temperature),", 2)
         state += [gas.entropy_at(t, n[None], area * width), n]
-    return np.array([*state[:2], place, 0.0, capacity * jnp.log(checked_positive(T, "T")), *state[2:]])
+    return np.array([*state[:2], position, 0.0, capacity * jnp.log(checked_positive(T, "T")), *state[2:]])
 
 
 class _VesselEnergy(Module):
-    """The energy of a mixture in a volume, from (S, N)."""
+    """The energy of a mixture in a fixed volume as a function of (S, N)."""
 
     gas: IdealMixture
     volume: jax.Array
@@ -184,7 +185,7 @@ def reaction_vessel(
     Parameters
     ----------
     stoichiometry : sequence of K floats
-        nu, negative for what is used up.
+        nu, negative for reactants.
     capacity, energy, entropy : sequences of K floats
         c_k > 0, e_k and s_k of :class:`IdealMixture`, Boltzmann's constant 1.
     volume : float, > 0

@@ -33,13 +33,13 @@ def damped_oscillator(mass: float = 1.0, stiffness: float = 1.0, friction: float
 
 
 def damped_oscillator_solution(t, x0, mass: float = 1.0, stiffness: float = 1.0, friction: float = 0.1) -> np.ndarray:
-    """The exact states at times t after x0 = (q, p, S), shape (..., 3), for any amount of damping."""
+    """Return the exact states at times t after x0 = (q, p, S), shape (..., 3), for any damping."""
     times, (q, p, S) = np.asarray(t, dtype=float), np.asarray(x0, dtype=float)
     rates = np.array([[0.0, 1.0 / mass], [-stiffness, -friction]])
-    moved = scipy.linalg.expm(times[..., None, None] * rates) @ np.array([q, p])
+    oscillation = scipy.linalg.expm(times[..., None, None] * rates) @ np.array([q, p])
 
-    def mechanical(q, p):
+    def mechanical_energy(q, p):
         return p**2 / (2 * mass) + stiffness * q**2 / 2
 
-    heat = (mechanical(q, p) - mechanical(moved[..., 0], moved[..., 1])) / friction
-    return np.concatenate([moved, (S + heat)[..., None]], axis=-1)
+    heat = (mechanical_energy(q, p) - mechanical_energy(oscillation[..., 0], oscillation[..., 1])) / friction
+    return np.concatenate([oscillation, (S + heat)[..., None]], axis=-1)

@@ -1,4 +1,4 @@
-"""Functions on the sphere as matrices: the quantised Laplacian, spherical harmonics, values on a grid.
+"""Functions on the sphere as matrices: the quantised Laplacian, spherical harmonics and values on a grid.
 
 A real function ``omega = sum a_lm Y_lm`` of degree below N is the anti-Hermitian matrix ``W = i sum a_lm T_lm``, where
 T_lm, with entries on the m-th diagonal alone, are orthonormal in ``tr(A^H B)`` [Hoppe 1989]. So norms agree,
@@ -28,14 +28,14 @@ from ..errors import InputError
 from .parameters import checked_integer
 
 TRACE_RTOL = 1e-12
-"""Trace of a vorticity, relative to its norm, that counts as rounding."""
+"""Largest trace of a vorticity, and largest Hermitian part, relative to its norm, that count as rounding."""
 
 
 @jax.tree_util.register_static
 class QuantisedSphere:
-    """The N by N matrices that stand for functions on the sphere, as states on the dual of su(N).
+    """The N by N matrices that represent functions on the sphere, as states on the dual of su(N).
 
-    A state mu is the vorticity matrix W by ``mu_a = Re tr(W^H e_a)``, e_a the basis of :func:`manifolds.su`.
+    A state mu represents the vorticity matrix W by ``mu_a = Re tr(W^H e_a)``, e_a the basis of :func:`manifolds.su`.
 
     Parameters
     ----------
@@ -44,9 +44,9 @@ class QuantisedSphere:
     Attributes
     ----------
     algebra : manifolds.MatrixAlgebra
-        su(N).
+        The algebra su(N).
     gamma : float
-        Of the bracket.
+        Factor of the bracket.
     """
 
     def __init__(self, N: int):
@@ -65,127 +65,133 @@ class QuantisedSphere:
     # -- the Laplacian ------------------------------------------------------------------------------------------------
 
     def laplacian(self, mu) -> jax.Array:
-        """The state of ``Delta W``, shape (..., N^2 - 1)."""
+        """Return the state of ``Delta W``, shape (..., N^2 - 1)."""
         return self._map_diagonals(mu, self._apply_tridiagonal)
 
     def inverse_laplacian(self, mu) -> jax.Array:
-        """The state of P with ``Delta P = W`` and no trace, shape (..., N^2 - 1)."""
+        """Return the state of the traceless P with ``Delta P = W``, shape (..., N^2 - 1)."""
         return self._map_diagonals(mu, self._solve_tridiagonal)
 
     def _map_diagonals(self, mu, function) -> jax.Array:
-        """A map of the diagonals above and with the main one, shape (N, 2, N): entry i of the m-th at [i, :, m]."""
-        reads, values, places, weights = self._diagonal_entries
+        """Apply a function to the main and upper diagonals, shape (N, 2, N): entry i of diagonal m at [i, :, m]."""
+        entry_sources, entry_factors, component_sources, component_factors = self._diagonal_entries
         tables = self.algebra.matrix_basis
         diagonal = tables.diagonal
         assert diagonal is not None
         mu = jnp.asarray(mu)
         main = (mu[..., diagonal.components] / tables.squared_norms[diagonal.components]) @ diagonal.coefficients.T
-        read = jnp.concatenate([mu, jnp.zeros((*mu.shape[:-1], 1)), main], axis=-1)
-        rows = function(read[..., reads] * values)
-        found = [rows.reshape(*rows.shape[:-3], -1), rows[..., diagonal.part, 0] @ diagonal.coefficients]
-        return jnp.concatenate(found, axis=-1)[..., places] * weights
+        sources = jnp.concatenate([mu, jnp.zeros((*mu.shape[:-1], 1)), main], axis=-1)
+        rows = function(sources[..., entry_sources] * entry_factors)
+        entries = [rows.reshape(*rows.shape[:-3], -1), rows[..., diagonal.part, 0] @ diagonal.coefficients]
+        return jnp.concatenate(entries, axis=-1)[..., component_sources] * component_factors
 
     @cached_property
     def _diagonal_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """The component in each entry [i, :, m], and its factor; the entry of each component, and the factor back.
+        """Index tables: the component and factor of each entry [i, :, m]; the entry and factor of each component.
 
         The entries of the diagonals below are those above with the sign of an anti-Hermitian matrix, so that they have
         the same products with the basis. What stands on the main diagonal follows the components, or the entries.
         """
         tables, N = self.algebra.matrix_basis, self.N
         i, part, m = np.indices((N, 2, N))
-        above = (m > 0) & (i + m < N)
-        place = i * N + np.minimum(i + m, N - 1)
-        reads = np.where(above, tables.entry_components[part, place], tables.dim).astype(np.int32)
-        values = np.where(above, tables.values[part, place], 0.0)
-        places, weights = np.zeros(tables.dim, dtype=np.int32), np.ones(tables.dim)
-        places[reads[above]], weights[reads[above]] = np.flatnonzero(above), 2.0 * values[above]
-        values /= np.append(tables.squared_norms, 1.0)[reads]
+        is_above = (m > 0) & (i + m < N)
+        flat_index = i * N + np.minimum(i + m, N - 1)
+        entry_sources = np.where(is_above, tables.entry_components[part, flat_index], tables.dim).astype(np.int32)
+        entry_factors = np.where(is_above, tables.values[part, flat_index], 0.0)
+        component_sources, component_factors = np.zeros(tables.dim, dtype=np.int32), np.ones(tables.dim)
+        component_sources[entry_sources[is_above]], component_factors[entry_sources[is_above]] = (
+            np.flatnonzero(is_above),
+            2.0 * entry_factors[is_above],
+        )
+        entry_factors /= np.append(tables.squared_norms, 1.0)[entry_sources]
         assert tables.diagonal is not None
-        places[tables.diagonal.components] = above.size + np.arange(len(tables.diagonal.components))
-        reads[:, tables.diagonal.part, 0], values[:, tables.diagonal.part, 0] = tables.dim + 1 + np.arange(N), 1.0
-        return reads, values, places, weights
+        component_sources[tables.diagonal.components] = is_above.size + np.arange(len(tables.diagonal.components))
+        entry_sources[:, tables.diagonal.part, 0], entry_factors[:, tables.diagonal.part, 0] = (
+            tables.dim + 1 + np.arange(N),
+            1.0,
+        )
+        return entry_sources, entry_factors, component_sources, component_factors
 
     def _apply_tridiagonal(self, rows) -> jax.Array:
-        main, beside = self._tridiagonal_coefficients
+        main, off_diagonal = self._tridiagonal_coefficients
         up = jnp.pad(rows[..., 1:, :, :], [(0, 0)] * (rows.ndim - 3) + [(0, 1), (0, 0), (0, 0)])
         down = jnp.pad(rows[..., :-1, :, :], [(0, 0)] * (rows.ndim - 3) + [(1, 0), (0, 0), (0, 0)])
-        before = np.pad(beside[:-1], [(1, 0), (0, 0)])
-        return -(main[:, None] * rows + beside[:, None] * up + before[:, None] * down)
+        lower_diagonal = np.pad(off_diagonal[:-1], [(1, 0), (0, 0)])
+        return -(main[:, None] * rows + off_diagonal[:, None] * up + lower_diagonal[:, None] * down)
 
     def _solve_tridiagonal(self, rows) -> jax.Array:
         ratio, inverse = self._ldl_factors
-        rows = jnp.moveaxis(-rows, -3, 0)  # along each diagonal step by step, all of them together
+        rows = jnp.moveaxis(-rows, -3, 0)  # the scans run along all diagonals at once
 
-        def eliminate(before, given):
-            row, factor = given
-            found = row - factor * before
-            return found, found
+        def eliminate(previous_row, row_and_factor):
+            row, factor = row_and_factor
+            reduced_row = row - factor * previous_row
+            return reduced_row, reduced_row
 
-        def substitute(after, given):
-            row, factor = given
-            found = row - factor * after
-            return found, found
+        def substitute(next_row, row_and_factor):
+            row, factor = row_and_factor
+            solved_row = row - factor * next_row
+            return solved_row, solved_row
 
         start = jnp.zeros(rows.shape[1:])
         _, rows = jax.lax.scan(eliminate, start, (rows, np.pad(ratio[:-1], [(1, 0), (0, 0)])))
-        scaled = rows * inverse.reshape(self.N, *[1] * (rows.ndim - 2), self.N)
-        _, rows = jax.lax.scan(substitute, start, (scaled, ratio), reverse=True)
+        scaled_rows = rows * inverse.reshape(self.N, *[1] * (rows.ndim - 2), self.N)
+        _, rows = jax.lax.scan(substitute, start, (scaled_rows, ratio), reverse=True)
         rows = jnp.moveaxis(rows, 0, -3)
         mean = jnp.mean(rows[..., 0], axis=-2, keepdims=True)  # the main diagonal is known up to a multiple of 1
         return rows.at[..., 0].add(-mean)
 
     @cached_property
     def _entry_mask(self) -> np.ndarray:
-        """Which entries [i, m] there are: ``i + m < N``."""
+        """The array that is 1 at the existing entries [i, m] of the diagonals, ``i + m < N``, and 0 elsewhere."""
         i, m = np.indices((self.N, self.N))
         return (i + m < self.N).astype(np.float64)
 
     @cached_property
     def _tridiagonal_coefficients(self) -> tuple[np.ndarray, np.ndarray]:
-        """Minus the Laplacian: the main diagonals, and what couples entry i to i + 1; shapes (N, N) as [i, m]."""
+        """Minus the Laplacian: its main diagonals, and the coupling of entry i to i + 1, shapes (N, N) as [i, m]."""
         N, s = self.N, (self.N - 1) / 2.0
         i, m = np.indices((N, N))
-        z = s - np.arange(N)  # of S_z
-        step = np.sqrt(np.arange(1.0, N + 1) * (N - np.arange(1.0, N + 1)))  # of S_+, the last one zero
+        z = s - np.arange(N)  # eigenvalues of S_z
+        step = np.sqrt(np.arange(1.0, N + 1) * (N - np.arange(1.0, N + 1)))  # entries of S_+, the last one zero
         j = np.minimum(i + m, N - 1)
         main = (2.0 * s * (s + 1.0) - 2.0 * z[i] * z[j]) * self._entry_mask
-        beside = -step[i] * step[j] * (i + m + 1 < N)
-        return main, beside
+        off_diagonal = -step[i] * step[j] * (i + m + 1 < N)
+        return main, off_diagonal
 
     @cached_property
     def _ldl_factors(self) -> tuple[np.ndarray, np.ndarray]:
-        """``L D L^T``: the entries below the diagonal of L, and those of 1 / D; zero outside."""
-        main, beside = self._tridiagonal_coefficients
+        """Factors ``L D L^T`` of minus the Laplacian: the subdiagonal of L and the entries of 1 / D, zero outside."""
+        main, off_diagonal = self._tridiagonal_coefficients
         inverse, ratio = np.zeros(main.shape), np.zeros(main.shape)
         pivot = main[0].copy()
         for i in range(self.N):
-            there = self._entry_mask[i] > 0.0
+            has_pivot = self._entry_mask[i] > 0.0
             if i == self.N - 1:
-                there = there & (np.arange(self.N) > 0)  # of the main diagonal, the last pivot is zero
-            inverse[i, there] = 1.0 / pivot[there]
-            ratio[i] = beside[i] * inverse[i]
+                has_pivot = has_pivot & (np.arange(self.N) > 0)  # the last pivot of the main diagonal is zero
+            inverse[i, has_pivot] = 1.0 / pivot[has_pivot]
+            ratio[i] = off_diagonal[i] * inverse[i]
             if i + 1 < self.N:
-                pivot = main[i + 1] - beside[i] * ratio[i]
+                pivot = main[i + 1] - off_diagonal[i] * ratio[i]
         return ratio, inverse
 
     # -- matrices and spherical harmonics -----------------------------------------------------------------------------
 
     def state(self, vorticity) -> jax.Array:
-        """The state of a vorticity matrix, shape (N, N), anti-Hermitian and without trace.
+        """Return the state of a vorticity matrix, shape (N, N), that is anti-Hermitian and traceless.
 
         Raises
         ------
         InputError
-            If it is not anti-Hermitian, or has a trace: the integral of vorticity over the sphere vanishes.
+            If the matrix is not anti-Hermitian, or has a trace: the integral of vorticity over the sphere vanishes.
         """
         W = np.asarray(vorticity)
         if W.shape != (self.N, self.N):
-            raise InputError(f"a vorticity matrix has shape ({self.N}, {self.N}), not {W.shape}")
-        size = max(float(np.linalg.norm(W)), np.finfo(float).tiny)
-        skew, trace = float(np.linalg.norm(W + adjoint(W))) / size, float(abs(np.trace(W))) / size
+            raise InputError(f"vorticity must have shape ({self.N}, {self.N}), got {W.shape}")
+        norm = max(float(np.linalg.norm(W)), np.finfo(float).tiny)
+        skew, trace = float(np.linalg.norm(W + adjoint(W))) / norm, float(abs(np.trace(W))) / norm
         if not skew <= TRACE_RTOL:
-            raise InputError(f"a vorticity matrix is anti-Hermitian, and this one is not, by {skew:.3g} of its norm")
+            raise InputError(f"vorticity must be anti-Hermitian, but W + W^H is {skew:.3g} of its norm")
         if not trace <= TRACE_RTOL:
             raise InputError(
                 f"the vorticity has a trace of {trace:.3g} of its norm: its integral over the sphere has to vanish. "
@@ -194,21 +200,23 @@ class QuantisedSphere:
         return self.algebra.from_dual_matrix(W)
 
     def matrix(self, mu) -> jax.Array:
-        """The vorticity matrix W of a state, shape (..., N, N)."""
+        """Return the vorticity matrix W of a state, shape (..., N, N)."""
         return self.algebra.dual_matrix(mu)
 
     def magnetic_state(self, vorticity, potential) -> jax.Array:
-        """The state of a :func:`magnetic_fluid` from vorticity and magnetic potential, each a state of this sphere."""
-        raised = self.algebra.matrix_basis.raise_index(jnp.asarray(potential))
-        return jnp.concatenate([jnp.asarray(vorticity), raised], axis=-1)
+        """Return the state of a :func:`magnetic_fluid` from vorticity and magnetic potential, each a state of this
+        sphere."""
+        dual_components = self.algebra.matrix_basis.raise_index(jnp.asarray(potential))
+        return jnp.concatenate([jnp.asarray(vorticity), dual_components], axis=-1)
 
     def magnetic_fields(self, x) -> tuple[jax.Array, jax.Array]:
-        """Vorticity and magnetic potential of states of a magnetic fluid: the inverse of :meth:`magnetic_state`."""
+        """Return vorticity and magnetic potential of states of a magnetic fluid: the inverse of
+        :meth:`magnetic_state`."""
         x, n = jnp.asarray(x), self.algebra.dim
         return x[..., :n], self.algebra.matrix_basis.lower_index(x[..., n:])
 
     def from_coefficients(self, a) -> jax.Array:
-        """The state of ``omega = sum_l a_l0 Y_l0 + sum_{m > 0} 2 Re(a_lm Y_lm)``, shape (N^2 - 1,).
+        """Return the state of ``omega = sum_l a_l0 Y_l0 + sum_{m > 0} 2 Re(a_lm Y_lm)``, shape (N^2 - 1,).
 
         Parameters
         ----------
@@ -223,20 +231,23 @@ class QuantisedSphere:
         """
         a = np.asarray(a, dtype=np.complex128)
         if a.ndim != 2 or a.shape[0] != a.shape[1] or not 1 <= len(a) <= self.N:
-            raise InputError(f"coefficients a[l, m] have shape (L + 1, L + 1) with L < {self.N}, not {a.shape}")
+            raise InputError(f"coefficients a[l, m] must have shape (L + 1, L + 1) with L < {self.N}, got {a.shape}")
         if a[0, 0] != 0.0:
-            raise InputError(f"the mean of a vorticity is zero, and so is a[0, 0], not {a[0, 0]}")
+            raise InputError(f"a[0, 0], the mean of the vorticity, must be 0, got {a[0, 0]}")
         if a[:, 0].imag.any():
-            raise InputError("the coefficients a[l, 0] of a real function are real")
+            raise InputError("the coefficients a[l, 0] of a real function must be real")
         W = np.zeros((self.N, self.N), dtype=np.complex128)
         for m in range(len(a)):
             vectors = self.harmonics(m, len(a) - 1)
-            on = np.arange(self.N - m)
-            W[on, on + m] = 1j * (vectors @ a[m:, m])
+            rows = np.arange(self.N - m)
+            W[rows, rows + m] = 1j * (vectors @ a[m:, m])
         return self.algebra.from_dual_matrix(W - adjoint(np.triu(W, 1)))
 
     def coefficients(self, mu, max_degree: int | None = None) -> np.ndarray:
-        """The coefficients of a state up to degree ``max_degree``, shape (most + 1, most + 1): see the inverse above."""
+        """Return the coefficients of a state up to degree L = ``max_degree``, shape (L + 1, L + 1).
+
+        This is the inverse of :meth:`from_coefficients`.
+        """
         L = self.N - 1 if max_degree is None else min(checked_integer(max_degree, "the largest degree"), self.N - 1)
         W, a = np.asarray(self.matrix(mu)), np.zeros((L + 1, L + 1), dtype=np.complex128)
         for m in range(L + 1):
@@ -244,11 +255,12 @@ class QuantisedSphere:
         return a
 
     def harmonics(self, m: int, max_degree: int) -> np.ndarray:
-        """The m-th diagonals of T_lm for l = m, …, most: orthonormal columns, shape (N - m, most - m + 1)."""
-        main, beside = self._tridiagonal_coefficients
-        size = self.N - m
+        """Return the m-th diagonals of T_lm for l = m, …, L = ``max_degree``: orthonormal columns, shape (N - m, L - m
+        + 1)."""
+        main, off_diagonal = self._tridiagonal_coefficients
+        length = self.N - m
         _, vectors = scipy.linalg.eigh_tridiagonal(
-            main[:size, m], beside[: size - 1, m], select="i", select_range=(0, max_degree - m)
+            main[:length, m], off_diagonal[: length - 1, m], select="i", select_range=(0, max_degree - m)
         )
         return (
             (-1.0) ** m
@@ -257,39 +269,41 @@ class QuantisedSphere:
         )
 
     def on_grid(self, mu, shape: tuple[int, int] = (128, 256), max_degree: int | None = None) -> np.ndarray:
-        """The function on a grid of colatitudes ``pi (i + 1/2) / shape[0]`` and longitudes ``2 pi j / shape[1]``."""
+        """Return the function at colatitudes ``pi (i + 1/2) / shape[0]`` and longitudes ``2 pi j / shape[1]``."""
         a = self.coefficients(mu, max_degree)
         theta = math.pi * (np.arange(shape[0]) + 0.5) / shape[0]
         waves = np.zeros((shape[0], shape[1]), dtype=np.complex128)
         for m in range(len(a)):
-            along = normalised_legendre(m, len(a) - 1, theta) @ a[m:, m]
-            waves[:, m % shape[1]] += along * (1.0 if m == 0 else 2.0)
+            profile = normalised_legendre(m, len(a) - 1, theta) @ a[m:, m]
+            waves[:, m % shape[1]] += profile * (1.0 if m == 0 else 2.0)
         return np.fft.ifft(waves, axis=1).real * shape[1]
 
     def random(self, seed: int, degrees: tuple[int, int], enstrophy: float = 1.0) -> jax.Array:
-        """A random vorticity of degrees l from the first to the last, of equal expected size, with that enstrophy."""
-        low, high = degrees
-        if not 1 <= low <= high < self.N:
-            raise InputError(f"degrees are from 1 to {self.N - 1}, not {degrees}")
+        """Return a random vorticity of the given enstrophy, with equal expected amplitudes in a range of degrees l."""
+        min_degree, max_degree = degrees
+        if not 1 <= min_degree <= max_degree < self.N:
+            raise InputError(f"degrees must be an increasing pair from 1 to {self.N - 1}, got {degrees}")
         random = np.random.default_rng(seed)
-        a = random.standard_normal((high + 1, high + 1)) + 1j * random.standard_normal((high + 1, high + 1))
+        a = random.standard_normal((max_degree + 1, max_degree + 1)) + 1j * random.standard_normal(
+            (max_degree + 1, max_degree + 1)
+        )
         l, m = np.indices(a.shape)
-        a = np.where((l >= low) & (m <= l), a, 0.0)
+        a = np.where((l >= min_degree) & (m <= l), a, 0.0)
         a[:, 0] = math.sqrt(2.0) * a[:, 0].real
         mu = self.from_coefficients(a)
         return mu * math.sqrt(enstrophy / float(jnp.sum(mu * mu)))
 
 
 def normalised_legendre(m: int, max_degree: int, theta: np.ndarray) -> np.ndarray:
-    """``Y_lm(theta, 0)`` for l = m, …, most, shape (thetas, most - m + 1), by the recurrence in l."""
+    """Return ``Y_lm(theta, 0)`` for l = m, …, L = ``max_degree``, shape (thetas, L - m + 1), by the recurrence in l."""
     x, sine = np.cos(theta), np.sin(theta)
     k = np.arange(1, m + 1)
-    size = 0.5 * np.log((2.0 * k + 1.0) / (2.0 * k)).sum() - 0.5 * math.log(4.0 * math.pi)
-    found = [(-1.0) ** m * np.exp(size + m * np.log(sine))]
-    before = np.zeros_like(x)
+    log_norm = 0.5 * np.log((2.0 * k + 1.0) / (2.0 * k)).sum() - 0.5 * math.log(4.0 * math.pi)
+    columns = [(-1.0) ** m * np.exp(log_norm + m * np.log(sine))]
+    previous_column = np.zeros_like(x)
     for l in range(m + 1, max_degree + 1):
         a = math.sqrt((4.0 * l * l - 1.0) / (l * l - m * m))
         b = math.sqrt(((l - 1.0) ** 2 - m * m) / (4.0 * (l - 1.0) ** 2 - 1.0)) if l > m + 1 else 0.0
-        before, new = found[-1], a * (x * found[-1] - b * before)
-        found.append(new)
-    return np.stack(found, axis=1)
+        previous_column, new_column = columns[-1], a * (x * columns[-1] - b * previous_column)
+        columns.append(new_column)
+    return np.stack(columns, axis=1)

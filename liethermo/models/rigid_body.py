@@ -20,11 +20,10 @@ from ..systems import LiePoissonSystem
 from .inertia import checked_tensors, inverse_inertia
 
 PUBLISHED_INERTIAS = ((10.0, 5.0, 1.0), (2.0, 1.0, 2.0 / 3.0))
-"""Inertias of published examples, the first of them the paper's, though no body has them."""
+"""Moments of published examples that no body can have, but that give no warning; the first is Morrison's."""
 
-
-POSITIVE_MOMENTS_TEXT = "moments of inertia are positive and finite, not {value}"
-"""Message to those who give others."""
+POSITIVE_MOMENTS_TEXT = "moments of inertia must be positive and finite, got {value}"
+"""Error message for moments of inertia that are not positive and finite."""
 
 
 class InertiaWarning(UserWarning):
@@ -55,7 +54,7 @@ def rigid_body(inertia: Sequence[float] = (10.0, 5.0, 1.0), rate: float = 1.0) -
     Warns
     -----
     InertiaWarning
-        Where no body has the inertias, other than the paper's.
+        If no body can have these moments of inertia, unless they are the paper's.
 
     Examples
     --------
@@ -81,19 +80,19 @@ def free_rigid_body(inertia: Sequence[float] = (2.0, 1.0, 2.0 / 3.0)) -> LiePois
 
 
 def checked_inertia(inertia) -> np.ndarray | jax.Array:
-    """Return moments of inertia, shape (3,), or a tensor, shape (3, 3), with a warning where no body has them.
+    """Return moments of inertia, shape (3,), or a tensor, shape (3, 3), and warn if no body can have them.
 
-    A tensor that is diagonal is returned as its moments.
+    A diagonal tensor is returned as its moments.
     """
-    checked = check_numbers(inertia, "inertia", (3,), (3, 3))
+    checked_array = check_numbers(inertia, "inertia", (3,), (3, 3))
     if is_traced(inertia):
-        if checked.ndim == 2:
+        if checked_array.ndim == 2:
             require_condition(
-                checked, _is_positive_definite, "a tensor of inertia must be positive definite, got {value}"
+                checked_array, _is_positive_definite, "a tensor of inertia must be positive definite, got {value}"
             )
         else:
-            require_condition(checked, _are_positive, POSITIVE_MOMENTS_TEXT)
-        return checked
+            require_condition(checked_array, _are_positive, POSITIVE_MOMENTS_TEXT)
+        return checked_array
     array = np.asarray(inertia, dtype=np.float64)
     if array.ndim == 2:
         array = checked_tensors(array)
@@ -103,11 +102,11 @@ def checked_inertia(inertia) -> np.ndarray | jax.Array:
         require_condition(array, _are_positive, POSITIVE_MOMENTS_TEXT)
     moments = array if array.ndim == 1 else np.linalg.eigvalsh(array)
     if tuple(moments.tolist()) not in PUBLISHED_INERTIAS:
-        largest, others = float(moments.max()), float(moments.sum() - moments.max())
-        if largest > others * (1 + 1e-12):
+        max_moment, rest_sum = float(moments.max()), float(moments.sum() - moments.max())
+        if max_moment > rest_sum * (1 + 1e-12):
             warn(
-                f"no rigid body has the moments of inertia {moments.tolist()}: the largest, {largest:g}, is more than "
-                f"the sum of the others, {others:g}. The equations hold all the same",
+                f"no rigid body has the moments of inertia {moments.tolist()}: the largest, {max_moment:g}, is more "
+                f"than the sum of the others, {rest_sum:g}. The equations hold all the same",
                 InertiaWarning,
             )
     return array

@@ -1,4 +1,4 @@
-"""Bodies with a part that turns inside about an axis fixed in them: damper wheel, ring damper, dual spin."""
+"""Bodies with a rotor about an axis fixed in them: damper wheel, ring damper, dual spin."""
 
 from __future__ import annotations
 
@@ -25,14 +25,15 @@ from .rigid_body import checked_inertia
 
 
 class BearingFriction(Dissipation):
-    """``p' = -k dH/dp`` of the momentum p of a rotor: the bearing rubs, and the angular momentum of the whole stays.
+    """Viscous friction ``p' = -k dH/dp`` in the bearing of a rotor of momentum p; the total angular momentum is
+    conserved.
 
     Parameters
     ----------
     friction : float, >= 0
         k.
     bath : Indices
-        The bath that it heats.
+        The bath that the friction heats.
     """
 
     friction: jax.Array
@@ -53,15 +54,15 @@ class BearingFriction(Dissipation):
         return jnp.zeros_like(dH)
 
     def factor(self, system, x, dH, dL):
-        times = lambda w: jnp.zeros_like(x).at[3].set(w[0])  # noqa: E731
-        return Factor(1, times, True, velocity=lambda w: jnp.zeros_like(x)).scale_by(self.friction)
+        momentum_rate = lambda w: jnp.zeros_like(x).at[3].set(w[0])  # noqa: E731
+        return Factor(1, momentum_rate, True, velocity=lambda w: jnp.zeros_like(x)).scale_by(self.friction)
 
 
 class RotorFriction(Dissipation):
     """Friction inside the rotor: the double bracket in the axes of the rotor.
 
-    ``L' = L × sigma, p' = a . (L × sigma)`` with ``sigma = rate L × (Omega + w a)``: what the rotor sees of the motion
-    of L is damped, and ``H' = -rate |L × (Omega + w a)|**2``. Friction inside the platform is that without a.
+    ``L' = L × sigma, p' = a . (L × sigma)`` with ``sigma = rate L × (Omega + w a)`` damps the motion of L in the
+    rotor's axes, and ``H' = -rate |L × (Omega + w a)|**2``. With a = 0 it is friction inside the platform.
 
     Parameters
     ----------
@@ -84,8 +85,8 @@ class RotorFriction(Dissipation):
         return self.bath
 
     def _momentum_rate(self, x, sigma) -> jax.Array:
-        turned = jnp.cross(x[:3], sigma)
-        return jnp.append(turned, jnp.dot(self.axis, turned))
+        torque = jnp.cross(x[:3], sigma)
+        return jnp.append(torque, jnp.dot(self.axis, torque))
 
     def force(self, system, x, dH, dS, dL):
         return self._momentum_rate(x, self.velocity(system, x, dH, dS, dL)[:3])
@@ -94,8 +95,8 @@ class RotorFriction(Dissipation):
         return jnp.append(self.rate * jnp.cross(x[:3], dH[:3] + dH[3] * self.axis), 0.0)
 
     def factor(self, system, x, dH, dL):
-        moved = lambda w: self._momentum_rate(x, w)  # noqa: E731
-        return Factor(3, moved, velocity=lambda w: jnp.append(w, 0.0)).scale_by(self.rate)
+        momentum_rate = lambda w: self._momentum_rate(x, w)  # noqa: E731
+        return Factor(3, momentum_rate, velocity=lambda w: jnp.append(w, 0.0)).scale_by(self.rate)
 
 
 def damper_wheel(
@@ -128,9 +129,9 @@ def damper_wheel(
     friction : float, >= 0
         k (N m s).
     capacity, temperature : float, > 0
-        Of the bath: C (J / K), and T_0 (K) at y = 0.
+        Heat capacity C (J / K) of the bath, and its temperature T_0 (K) at y = 0.
     attitude : bool
-        Whether runs have attitudes of the body, elements of SO(3).
+        If true, runs follow the attitude of the body, an element of SO(3).
 
     Raises
     ------
@@ -152,7 +153,7 @@ def ring_damper(
     temperature: float = 1.0,
     attitude: bool = True,
 ) -> LiePoissonSystem:
-    """A body with a ring full of a viscous liquid about an axis: a nutation damper [Carrier & Miles 1960].
+    """A body with a ring of viscous liquid about an axis: a nutation damper [Carrier & Miles 1960].
 
     The liquid turns in the ring as a wheel does, see :func:`damper_wheel`, with ``J = 2 pi**2 rho a**2 R**3`` and, in
     Poiseuille's flow, ``k = 16 pi**2 eta R**3``. That is for liquids so viscous that the profile of the flow follows
@@ -161,13 +162,13 @@ def ring_damper(
     Parameters
     ----------
     inertia, axis, capacity, temperature, attitude
-        As of :func:`damper_wheel`, the liquid in place of the wheel; ``axis`` is the normal of the ring.
+        As for :func:`damper_wheel`, with the liquid as the wheel; ``axis`` is the normal of the ring.
     radius, tube : float, > 0
         R of the ring and a of the tube (m), a thin one: a is far below R.
     density : float, > 0
         rho of the liquid (kg / m**3).
     viscosity : float, > 0
-        eta, the dynamic one (Pa s).
+        Dynamic viscosity eta (Pa s).
 
     Raises
     ------
@@ -191,14 +192,14 @@ def dual_spin(
     temperature: Sequence[float] | float = 1.0,
     attitude: bool = True,
 ) -> LiePoissonSystem:
-    """Two bodies on a common axis, each with friction inside: a satellite with dual spin [Likins 1967].
+    """Two bodies on a common axis, each with internal friction: a dual-spin satellite [Likins 1967].
 
     The platform carries body axes; the rotor, round about the axis a, turns by w relative to it. As in
     :func:`damper_wheel`, ``L = I Omega + J w a`` and ``p = J (a . Omega + w)``. Friction inside the platform damps
     what it sees of the motion of L, ``L × Omega``, and friction inside the rotor ``L × (Omega + w a)``: each is a
-    double bracket in axes of its own, so |L| and the angular momentum in space are constant, and each heats a bath of
-    its own. The bearing heats the platform. Where the rotor carries most of L along a, the spin about a is stable
-    though its moment is not the greatest, as long as the platform damps and the rotor hardly does.
+    double bracket in the axes of its part, so |L| and the angular momentum in space are constant, and each heats its
+    own bath. The bearing heats the platform. If the rotor carries most of L along a, the spin about a is stable
+    although its moment is not the greatest, as long as the platform damps much more than the rotor.
 
     Everything is in SI units, or in any other consistent ones. The state is (L, p, y of the platform, y of the rotor).
 
@@ -213,11 +214,11 @@ def dual_spin(
     friction : float, >= 0
         k of the bearing (N m s).
     platform_rate, rotor_rate : float, >= 0
-        Of the friction inside the two (s / (kg m**2)), as of :func:`tumbling_body`.
+        Rates of the internal friction of platform and rotor (s / (kg m**2)), as for :func:`tumbling_body`.
     capacity, temperature : float, > 0, or two
-        Of the baths, platform first: C (J / K), and T_0 (K) at y = 0.
+        Heat capacities C (J / K) of the baths, platform first, and their temperatures T_0 (K) at y = 0.
     attitude : bool
-        Whether runs have attitudes of the platform, elements of SO(3).
+        If true, runs follow the attitude of the platform, an element of SO(3).
 
     Raises
     ------
@@ -225,50 +226,52 @@ def dual_spin(
     """
     k, rates = checked_rate(friction), (checked_rate(platform_rate), checked_rate(rotor_rate))
 
-    def inside(a) -> list[Dissipation]:
-        none = jnp.zeros(3)
+    def make_dissipations(a) -> list[Dissipation]:
+        platform_axis = jnp.zeros(3)
         return [
             BearingFriction(k, Indices(0)),
-            RotorFriction(rates[0], none, Indices(0)),
+            RotorFriction(rates[0], platform_axis, Indices(0)),
             RotorFriction(rates[1], a, Indices(1)),
         ]
 
-    return _rotor_system(inertia, axis, rotor, inside, HeatBaths(capacity, temperature, number=2), attitude)
+    return _rotor_system(inertia, axis, rotor, make_dissipations, HeatBaths(capacity, temperature, number=2), attitude)
 
 
 def spin_temperature(momentum, energy, inertia, capacity=1.0, temperature=1.0) -> float:
-    """The temperature (K) at which a body left to itself has come to its spin, with one bath and parts at rest.
+    """Return the temperature (K) of an isolated body in its final spin, with one bath and parts at rest.
 
     Parameters
     ----------
     momentum : float
-        The size of the angular momentum (kg m**2 / s).
+        Norm of the angular momentum (kg m**2 / s).
     energy : float
-        The whole (J).
+        Total energy (J).
     inertia, capacity, temperature
-        As the models have them.
+        As for the models.
     """
     greatest = float(np.max(principal_moments(inertia)))
     return temperature + (float(energy) - float(momentum) ** 2 / (2.0 * greatest)) / capacity
 
 
-def _rotor_system(inertia, axis, rotor, inside, baths, attitude) -> LiePoissonSystem:
-    """``H = (L - p a) . B (L - p a) / 2 + p**2 / (2 J)``, ``B = (I - J a a^T)^-1``, on so(3) + R."""
+def _rotor_system(inertia, axis, rotor, make_dissipation, baths, attitude) -> LiePoissonSystem:
+    """Return the system ``H = (L - p a) . B (L - p a) / 2 + p**2 / (2 J)``, ``B = (I - J a a^T)^-1``, on so(3) + R."""
     inverse, J = inverse_inertia(checked_inertia(inertia)), checked_positive(rotor, "the moment of the rotor")
     inverse = jnp.diag(inverse) if inverse.ndim == 1 else inverse
     check_numbers(axis, "axis")
     direction = np.asarray(axis, dtype=float)
     if direction.shape != (3,) or not np.isfinite(direction).all() or not direction.any():
-        raise InputError(f"axis is a direction in body axes, three numbers that are not all zero, not {axis!r}")
+        raise InputError(f"axis must be a direction in body axes, three numbers that are not all zero, got {axis!r}")
     a = jnp.asarray(direction / np.linalg.norm(direction))
-    turned = inverse @ a
-    left = 1.0 - J * jnp.dot(a, turned)
+    inverse_times_axis = inverse @ a
+    inertia_fraction = 1.0 - J * jnp.dot(a, inverse_times_axis)
     require_condition(
-        left, lambda v: v > 0.0, "a rotor has less than the inertia of the whole about its axis: 1 - J/I is {value}"
+        inertia_fraction,
+        lambda v: v > 0.0,
+        "a rotor must have less than the inertia of the whole about its axis, got 1 - J/I = {value}",
     )
-    B = inverse + J / left * jnp.outer(turned, turned)
-    Ba = turned / left
+    B = inverse + J / inertia_fraction * jnp.outer(inverse_times_axis, inverse_times_axis)
+    Ba = inverse_times_axis / inertia_fraction
     A = jnp.block([[B, -Ba[:, None]], [-Ba[None], (1.0 / J + jnp.dot(a, Ba))[None, None]]])
     algebra = mf.direct_sum(mf.so(3), mf.abelian(1))
     group = mf.SO(3) if attitude else None
-    return LiePoissonSystem(algebra, Quadratic(A), dissipation=inside(a), group=group, baths=baths)
+    return LiePoissonSystem(algebra, Quadratic(A), dissipation=make_dissipation(a), group=group, baths=baths)

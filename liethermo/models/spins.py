@@ -1,4 +1,4 @@
-"""Spins: one that is switched by a field, and lattices of many."""
+"""A single spin in a field, and lattices of spins."""
 
 from __future__ import annotations
 
@@ -14,35 +14,37 @@ from ..systems import HeatBaths, SpinSystem
 
 
 def single_spin(field=1.0, rate=0.1, baths: HeatBaths | None = None) -> SpinSystem:
-    """A spin in a field B along the third axis, ``H = -B s_3``, which damping turns to it.
+    """A spin in a field B along the third axis, ``H = -B s_3``; damping turns it towards the field.
 
-    With |s| = 1 the motion is known: see :func:`single_spin_solution`. It takes the time
-    ``log(s' / s) / (rate B)`` from a polar angle to another, s the tangents of their halves: 'switching'.
+    With |s| = 1 the motion is known: see :func:`single_spin_solution`. Switching from one polar angle to another takes
+    the time ``log(s' / s) / (rate B)``, s the tangents of the half angles.
 
     Parameters
     ----------
     field : float
         B.
     rate : float, >= 0
-        Of :class:`liethermo.LandauLifshitz`.
+        Rate of :class:`liethermo.LandauLifshitz`.
     baths : HeatBaths, optional
-        What takes the heat; without, the energy falls.
+        Baths that absorb the heat; without them the energy falls.
     """
     return SpinSystem(1, zeeman(1, _third_axis_vector(field)), LandauLifshitz(rate), baths)
 
 
 def single_spin_solution(t, start, field: float = 1.0, rate: float = 0.1) -> np.ndarray:
-    """The exact spin at some times, shape (..., 3), from a unit vector at t = 0.
+    """Return the exact spin at some times, shape (..., 3), from a unit vector at t = 0.
 
     ``s_3 = tanh(rate B t + artanh s_3(0))``, and the rest turns by the angle ``B t`` [Landau & Lifshitz 1935].
     """
     t, s = np.asarray(t, dtype=float), np.asarray(start, dtype=float)
     growth = rate * field * t
-    # s_3(0) may be 1 to rounding: of tanh(a + b) and sech(a + b) without the artanh
+    # addition theorems of tanh and sech avoid artanh(s_3(0)), which overflows if s_3(0) rounds to 1
     third = (np.sinh(growth) + s[2] * np.cosh(growth)) / (np.cosh(growth) + s[2] * np.sinh(growth))
-    shrunk = 1.0 / (np.cosh(growth) + s[2] * np.sinh(growth))
+    transverse_factor = 1.0 / (np.cosh(growth) + s[2] * np.sinh(growth))
     c, d = np.cos(field * t), np.sin(field * t)
-    return np.stack([shrunk * (c * s[0] - d * s[1]), shrunk * (d * s[0] + c * s[1]), third], axis=-1)
+    return np.stack(
+        [transverse_factor * (c * s[0] - d * s[1]), transverse_factor * (d * s[0] + c * s[1]), third], axis=-1
+    )
 
 
 def spin_lattice(
@@ -73,15 +75,15 @@ def spin_lattice(
     dmi : array, list of edges, or None
         D: see :func:`liethermo.magnetism.dzyaloshinskii_moriya`.
     rate : float >= 0, or array of the shape of the sites
-        Of :class:`liethermo.LandauLifshitz`.
+        Rate of :class:`liethermo.LandauLifshitz`.
     baths : HeatBaths or bool
-        What takes the heat. True for one of the heat capacity of the sites together, at first of temperature 1; False
-        for none: the energy falls then.
+        True: one bath with a heat capacity equal to the number of sites and an initial temperature of 1. False: no
+        bath, so the energy falls.
     bath : array of int, of the shape of the sites, optional
-        Which bath each site heats.
+        Index of the bath that each site heats.
     periodic : bool or tuple of bool
     axis : array, shape (3,) or ``(*sites, 3)``
-        Of the anisotropy.
+        Axis of the anisotropy.
     """
     shape = lattice_shape(sites)
     terms: list[Energy] = [*exchange(shape, exchange_constant, periodic=periodic).terms]
@@ -92,13 +94,13 @@ def spin_lattice(
     if dmi is not None:
         terms += dzyaloshinskii_moriya(shape, dmi, periodic=periodic).terms
     if not isinstance(baths, HeatBaths | bool):
-        raise InputError(f"baths are lt.HeatBaths, True for one of the size of the lattice, or False, not {baths!r}")
-    heated = HeatBaths(capacity=float(np.prod(shape))) if baths is True else baths or None
-    return SpinSystem(shape, Sum(tuple(terms)), LandauLifshitz(rate, bath), heated)
+        raise InputError(f"baths must be lt.HeatBaths, True for one as large as the lattice, or False, got {baths!r}")
+    lattice_baths = HeatBaths(capacity=float(np.prod(shape))) if baths is True else baths or None
+    return SpinSystem(shape, Sum(tuple(terms)), LandauLifshitz(rate, bath), lattice_baths)
 
 
 def spin_wave_frequency(wave_number, exchange_constant: float = 1.0, anisotropy_constant: float = 0.0, field=0.0):
-    """The frequency of a small wave on a ring of spins along the third axis, ``2 J (1 - cos q) + 2 K + B``.
+    """Return the frequency of a small wave on a ring of spins along the third axis, ``2 J (1 - cos q) + 2 K + B``.
 
     The wave number q is an angle per site.
     """

@@ -18,12 +18,12 @@ from .parameters import checked_integer, checked_positive, checked_positive_vect
 
 
 def thermal_energy(x, capacity):
-    """Internal energy ``c exp(S / c)`` of the last component S of a state: c is the heat capacity."""
+    """Return the internal energy ``c exp(S / c)`` of the last component S of a state, with the heat capacity c."""
     return capacity * jnp.exp(x[-1] / capacity)
 
 
 class ThermalEnergy(Module):
-    """The same, of one body."""
+    """The internal energy ``c exp(S / c)`` of one body, from the last component S of its state."""
 
     capacity: jax.Array
 
@@ -50,7 +50,7 @@ def thermo_particles(capacities: Sequence[float] = (1.0, 1.0), conductance=1.0) 
 
 
 def thermo_particles_solution(t, temperatures, capacities=(1.0, 1.0), conductance=1.0) -> np.ndarray:
-    """The exact temperatures at times t, shape (..., N), from those at t = 0: a linear relaxation."""
+    """Return the exact temperatures at times t, shape (..., N), from those at t = 0, as a linear relaxation."""
     c, count = np.asarray(capacities, dtype=float), len(capacities)
     graph = graph_edges(conductance, count, "the conductance", tuple(map(str, range(count))))
     laplacian = np.zeros((count, count))
@@ -69,7 +69,7 @@ def moving_thermo_particles(
     conductance=1.0,
     dimension: int = 1,
 ) -> ComposedSystem:
-    """The same bodies, moving freely: ``H = sum p_a^2 / (2 m_a) + c_a exp(S_a / c_a)`` [SML Example 3].
+    """Freely moving bodies that exchange heat: ``H = sum p_a^2 / (2 m_a) + c_a exp(S_a / c_a)`` [SML Example 3].
 
     The motion is uniform and the heat flows as if at rest: momentum and kinetic energy are constant.
 
@@ -79,14 +79,16 @@ def moving_thermo_particles(
     capacities, conductance
         As for :func:`thermo_particles`.
     dimension : int
-        Of the space; the state is (q_1, p_1, S_1, q_2, …) with q_a and p_a of that many components.
+        Dimension of the space; the state is (q_1, p_1, S_1, q_2, …), q_a and p_a with ``dimension`` components.
     """
     bodies = _moving_bodies(masses, capacities, dimension, 0.0)
-    of_axis = np.eye(2 * dimension + 1)[dimension:-1]
-    total = {"momentum" if dimension == 1 else f"momentum {i + 1}": p for i, p in enumerate(of_axis)}
-    constants = {name: Quadratic(np.zeros(len(bodies) * len(p)), np.tile(p, len(bodies))) for name, p in total.items()}
+    axis_vectors = np.eye(2 * dimension + 1)[dimension:-1]
+    momentum_vectors = {"momentum" if dimension == 1 else f"momentum {i + 1}": p for i, p in enumerate(axis_vectors)}
+    constants = {
+        name: Quadratic(np.zeros(len(bodies) * len(p)), np.tile(p, len(bodies))) for name, p in momentum_vectors.items()
+    }
     inverse = 1.0 / checked_positive(masses, "masses", len(bodies))
-    constants["kinetic energy"] = Quadratic(jnp.outer(inverse, of_axis.sum(axis=0)).ravel())
+    constants["kinetic energy"] = Quadratic(jnp.outer(inverse, axis_vectors.sum(axis=0)).ravel())
     return ComposedSystem(bodies, conductance=conductance, momentum_maps=constants)
 
 
@@ -100,8 +102,8 @@ def thermo_springs(
 ) -> ComposedSystem:
     """Two bodies on a line, joined by a spring, exchange heat: ``V = k (q_1 - q_2)^2 / 2`` [SML Example 4].
 
-    Without friction the motion is as if cold, and the heat flows as if at rest. With drag the bodies stop oscillating
-    and share the heat. The total momentum is kept unless they rub on their surroundings.
+    Without friction, motion and heat flow are independent. With drag the bodies stop oscillating and share the heat.
+    The total momentum is conserved unless there is friction on the surroundings.
 
     Parameters
     ----------
@@ -110,14 +112,14 @@ def thermo_springs(
     friction, drag : float, >= 0
         Coefficients of linear friction of either body on its surroundings, and between the two (mass / time).
     """
-    k, free = checked_positive(stiffness, "stiffness"), isinstance(friction, float | int) and friction == 0.0
+    k, is_frictionless = checked_positive(stiffness, "stiffness"), isinstance(friction, float | int) and friction == 0.0
     return ComposedSystem(
         _moving_bodies(masses, capacities, 1, friction),
         coupling=Quadratic(k * np.array([[1.0, -1.0], [-1.0, 1.0]])).on([0, 3]),
         conductance=conductance,
         drag=drag,
-        connected=False,  # a conductance of zero is meant
-        momentum_maps={"momentum": Quadratic(np.zeros(6), [0.0, 1.0, 0.0, 0.0, 1.0, 0.0])} if free else {},
+        connected=False,  # allow a conductance of zero
+        momentum_maps={"momentum": Quadratic(np.zeros(6), [0.0, 1.0, 0.0, 0.0, 1.0, 0.0])} if is_frictionless else {},
     )
 
 

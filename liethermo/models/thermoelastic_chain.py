@@ -1,4 +1,4 @@
-"""Chains of bodies on thermoelastic springs: pendulums that heat and cool as they stretch."""
+"""Chains of bodies on thermoelastic springs: pendulums whose springs heat and cool as they stretch."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .parameters import checked_integer, checked_positive
 
 
 class Thermospring(Module):
-    """Energy ``e(r^2, S)`` of a spring of length r and entropy S [Romero 2009, §4].
+    """The energy ``e(r^2, S)`` of a spring of length r and entropy S [Romero 2009, §4].
 
     ``e = C u^2 / 2 + b T_0 u + c (T - T_0)`` with ``u = log(r / r_0)`` and ``T = T_0 exp((S - b u) / c)``: stretching
     cools a spring with b > 0, and heat makes it longer. The tension is ``(C u - b (T - T_0)) / r``.
@@ -45,12 +45,12 @@ class Thermospring(Module):
 
 
 def _first_spring_variables(y):
-    """The squared length of the first spring and its entropy, from (q_1, S_1)."""
+    """Return the squared length of the first spring and its entropy, shape (2,), from (q_1, S_1)."""
     return jnp.stack([jnp.sum(y[:-1] ** 2), y[-1]])
 
 
 def _spring_variables(y):
-    """Those of a spring between two bodies, from (q, q', S')."""
+    """Return the squared length and the entropy of a spring between two bodies, shape (2,), from (q, q', S')."""
     n = len(y) // 2
     return jnp.stack([jnp.sum((y[n : 2 * n] - y[:n]) ** 2), y[-1]])
 
@@ -72,24 +72,24 @@ def thermoelastic_chain(
     The a-th state is (q_a, p_a, S_a) with S_a the entropy of the spring that body a hangs on. With two bodies it is the
     double thermoelastic pendulum of Romero (2009) and of García Orden & Romero (2012). Stretching, temperature and the
     flow of heat act on each other, and the oscillation of the springs dies out. The springs enter by their squared
-    lengths, so that the angular momentum about the origin is kept exactly.
+    lengths, so that the angular momentum about the origin is conserved exactly.
 
     Parameters
     ----------
     bodies, dimension : int
         N, and the dimension of the space, 1 to 3.
     mass, capacity, length, temperature : float, > 0
-        Of each body, and of each spring: see :class:`Thermospring`.
+        Mass of each body; capacity, length and temperature of each spring: see :class:`Thermospring`.
     stiffness : float, > 0
     expansion : float
     conductance : float, >= 0
-        Between springs that meet (power / temperature).
+        Heat conductance between neighbouring springs (power / temperature).
     gravity : float
         Acceleration against the last axis; without it the angular momentum is constant, and audited.
     """
     N, n = checked_integer(bodies, "bodies"), checked_integer(dimension, "dimension")
     if n > 3:
-        raise InputError(f"dimension is 1, 2 or 3, not {n}")
+        raise InputError(f"dimension must be 1, 2 or 3, got {n}")
     spring = Thermospring(
         checked_positive(stiffness, "stiffness"),
         check_numbers(expansion, "expansion", ()),
@@ -99,32 +99,32 @@ def thermoelastic_chain(
     )
     m = checked_positive(mass, "mass")
     body: Energy = Kinetic(jnp.full(n, 1.0 / m))
-    g, heavy = check_numbers(gravity, "gravity", ()), not (isinstance(gravity, float | int) and gravity == 0.0)
-    if heavy:
+    g, has_gravity = check_numbers(gravity, "gravity", ()), not (isinstance(gravity, float | int) and gravity == 0.0)
+    if has_gravity:
         body = body + Quadratic(jnp.zeros(2 * n + 1), jnp.zeros(2 * n + 1).at[n - 1].set(m * g))
-    size = 2 * n + 1
-    q = size * np.arange(N)[:, None] + np.arange(n)
-    S = size * np.arange(1, N + 1)[:, None] - 1
+    state_size = 2 * n + 1
+    q = state_size * np.arange(N)[:, None] + np.arange(n)
+    S = state_size * np.arange(1, N + 1)[:, None] - 1
     springs: list[Energy] = [Function(spring).on(_first_spring_variables).on([*q[0], *S[0]])]
     if N > 1:
         springs.append(Each(Function(spring).on(_spring_variables), np.hstack([q[:-1], q[1:], S[1:]])))
     return ComposedSystem(
-        Copies(N, body, size, name="spring"),
+        Copies(N, body, state_size, name="spring"),
         coupling=springs,
         conductance=[(a, a + 1, conductance) for a in range(N - 1)],
-        connected=False,  # a conductance of zero is meant
-        momentum_maps={} if heavy else _angular_momentum(N, n),
+        connected=False,  # allow a conductance of zero
+        momentum_maps={} if has_gravity else _angular_momentum(N, n),
     )
 
 
 def _angular_momentum(N: int, n: int) -> dict[str, Energy]:
-    """``sum q x p``: one function for each pair of axes."""
-    size = 2 * n + 1
+    """Return the components of ``sum q x p`` by name, one for each pair of axes."""
+    state_size = 2 * n + 1
     maps: dict[str, Energy] = {}
     for i, j in zip(*np.triu_indices(n, 1), strict=True):
         A = np.zeros((4, 4))
-        for a, b, sign in (0, 3, 1.0), (1, 2, -1.0):  # of (q_i, q_j, p_i, p_j)
+        for a, b, sign in (0, 3, 1.0), (1, 2, -1.0):  # in the variables (q_i, q_j, p_i, p_j)
             A[a, b] = A[b, a] = sign
-        places = size * np.arange(N)[:, None] + np.array([i, j, n + i, n + j])
-        maps[f"angular momentum {'xyz'[i]}{'xyz'[j]}"] = Each(Quadratic(A), places)
+        indices = state_size * np.arange(N)[:, None] + np.array([i, j, n + i, n + j])
+        maps[f"angular momentum {'xyz'[i]}{'xyz'[j]}"] = Each(Quadratic(A), indices)
     return maps

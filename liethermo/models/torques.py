@@ -1,4 +1,5 @@
-"""Torques for ``lt.LiePoissonSystem(..., torque=...)``: their numbers are parameters, swept and differentiated.
+"""Torques for ``lt.LiePoissonSystem(..., torque=...)``; their numbers are parameters that can be varied and
+differentiated.
 
 Each is a function f(t, mu), or f(t, mu, attitude), to a dual vector of the shape of mu. An attitude is the matrix from
 body axes to axes in space, so ``attitude.T @ v`` has the components in the body of a vector v in space. Units are any
@@ -35,7 +36,7 @@ class ConstantInBody(Module):
     Parameters
     ----------
     moment : array, of the shape of mu
-        In body axes (N m, on so(3)).
+        Torque in body axes (N m, on so(3)).
     """
 
     moment: jax.Array
@@ -53,7 +54,7 @@ class ConstantInSpace(Module):
     Parameters
     ----------
     moment : array, shape (3,)
-        In axes in space (N m).
+        Torque in axes fixed in space (N m).
     """
 
     moment: jax.Array
@@ -66,7 +67,7 @@ class ConstantInSpace(Module):
 
 
 class GravityGradient(Module):
-    """The torque that the gravity of a centre has on a body on a circular orbit, ``3 (G M / r^3) n × I n``.
+    """The gravity-gradient torque on a body on a circular orbit, ``3 (G M / r^3) n × I n``.
 
     The unit vector n, in body axes, points to the centre, and ``G M / r^3`` is the square of the mean motion [Hughes,
     *Spacecraft Attitude Dynamics*, 1986, 8.1]. In space n turns in the plane of the orbit from ``towards``, where it is
@@ -96,15 +97,15 @@ class GravityGradient(Module):
         if not is_traced((self.towards, self.normal)):
             cosine = float(np.dot(self.towards, self.normal))
             if abs(cosine) > MAX_PERPENDICULAR_COSINE:
-                raise InputError(f"towards lies in the plane of the orbit, normal to it: their cosine is {cosine:.3g}")
+                raise InputError(f"towards and normal must be perpendicular, but their cosine is {cosine:.3g}")
 
     def __call__(self, t, mu, attitude):
         n = attitude.T @ self.to_centre(t)
-        turned = self.inertia * n if self.inertia.ndim == 1 else self.inertia @ n
-        return 3.0 * self.mean_motion**2 * jnp.cross(n, turned)
+        inertia_times_n = self.inertia * n if self.inertia.ndim == 1 else self.inertia @ n
+        return 3.0 * self.mean_motion**2 * jnp.cross(n, inertia_times_n)
 
     def to_centre(self, t) -> jax.Array:
-        """The direction to the centre at a time, in space, shape (3,)."""
+        """Return the direction to the centre at a time, in space, shape (3,)."""
         angle = self.mean_motion * t
         return jnp.cos(angle) * self.towards + jnp.sin(angle) * jnp.cross(self.normal, self.towards)
 
@@ -156,7 +157,7 @@ class Motor(Module):
 
 
 class Tabulated(Module):
-    """A torque in the body that a table gives, linear in t between its times, and zero before them and after.
+    """A torque in body axes from a table, linear in t between its times and zero outside.
 
     A step across a time of the table has an error of second order there, whatever the method: let steps end at these
     times by ``save_at=``. The laws hold all the same.
@@ -166,7 +167,7 @@ class Tabulated(Module):
     times : array, shape (m,)
         Increasing (s).
     moments : array, shape ``(m, *shape of mu)``
-        In body axes at these times (N m, on so(3)).
+        Torques in body axes at these times (N m, on so(3)).
     """
 
     times: jax.Array
@@ -176,21 +177,23 @@ class Tabulated(Module):
         self.times, self.moments = checked_finite(times, "times"), checked_finite(moments, "moments")
         if self.times.ndim != 1 or self.times.size < 2 or self.moments.shape[:1] != self.times.shape:
             raise InputError(
-                f"times has shape (m,), m at least 2, and moments m rows: not {self.times.shape} and "
+                f"times must have shape (m,) with m >= 2, and moments m rows, got {self.times.shape} and "
                 f"{self.moments.shape}"
             )
-        require_condition(
-            self.times, lambda t: t[1:] > t[:-1], "the times of a table increase, and these do not: {value}"
-        )
+        require_condition(self.times, lambda t: t[1:] > t[:-1], "the times of a table must increase, got {value}")
 
     def __call__(self, t, mu):
-        begun = jnp.where(t >= self.times, 1.0, 0.0)
-        now = begun[:-1] - begun[1:]  # one in the interval that t is in, zero in the others: no search
-        gone = (t - self.times[:-1]) / (self.times[1:] - self.times[:-1])
-        return jnp.tensordot(now * (1.0 - gone), self.moments[:-1], 1) + jnp.tensordot(now * gone, self.moments[1:], 1)
+        has_begun = jnp.where(t >= self.times, 1.0, 0.0)
+        in_interval = (
+            has_begun[:-1] - has_begun[1:]
+        )  # 1 in the interval that contains t, else 0, so that no search is needed
+        fraction = (t - self.times[:-1]) / (self.times[1:] - self.times[:-1])
+        return jnp.tensordot(in_interval * (1.0 - fraction), self.moments[:-1], 1) + jnp.tensordot(
+            in_interval * fraction, self.moments[1:], 1
+        )
 
 
 def _unit_vector(value, name: str) -> jax.Array:
     array = checked_finite(value, name, 3)
-    require_condition(array, lambda v: (v**2).sum() > 0.0, name + " is a direction, not {value}")
+    require_condition(array, lambda v: (v**2).sum() > 0.0, name + " must be a direction, not zero, got {value}")
     return array / jnp.sqrt(jnp.sum(array**2))

@@ -1,4 +1,4 @@
-"""A rigid body left to itself, with friction inside: it tumbles, warms, and ends in a spin."""
+"""An isolated rigid body with internal friction: it tumbles, warms, and ends in a steady spin."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def tumbling_body(
     temperature: float = 1.0,
     attitude: bool = True,
 ) -> LiePoissonSystem:
-    """A body left to itself, with friction inside that heats it: an asteroid, or a satellite without thrusters.
+    """An isolated body heated by internal friction: an asteroid, or a satellite without thrusters.
 
     ``mu' = mu × (xi + sigma)``, ``xi_i = mu_i / I_i``, ``sigma = rate mu × xi``, and ``T y' = rate |mu × xi|**2`` for
     the entropy y, of a body of heat capacity C and temperature ``T = T_0 exp(y / C)``. The energy
@@ -42,21 +42,21 @@ def tumbling_body(
         Principal moments of inertia, of which none is more than the sum of the others, or the tensor in body axes
         (kg m**2).
     relaxation_time : float, > 0
-        Time (s) in which small nutations fall by e, at the angular momentum given beside it. If the three moments
-        differ, the nutation oscillates, and its amplitude falls by e. If the two greatest are equal, as those of a rod,
-        the tangent of the angle from the flat spin falls by e. :func:`liethermo.bodies.growth_rate_at` says what holds for
-        nearly equal moments.
+        Time (s) in which small nutations decay by a factor e, at the angular momentum ``momentum``. If the three
+        moments differ, the nutation oscillates, and this is the decay of its amplitude. If the two greatest are equal,
+        as for a rod, the tangent of the angle from the flat spin decays so. For nearly equal moments see
+        :func:`liethermo.bodies.rate_of`.
     momentum : float, > 0, or three numbers
-        The size of the angular momentum, or that vector in body axes (kg m**2 / s), to tell a rate from a relaxation
-        time, which falls as ``1 / |mu|**2``. What the body starts with is the state that a run is given.
+        The norm of the angular momentum, or the vector in body axes (kg m**2 / s), at which the relaxation time holds,
+        since it is proportional to ``1 / |mu|**2``. The initial momentum of a run may differ.
     rate : float, >= 0
-        Of the friction (s / (kg m**2)), in place of the relaxation time and the momentum.
+        Rate of the friction (s / (kg m**2)), instead of the relaxation time and the momentum.
     capacity : float, > 0
         C (J / K).
     temperature : float, > 0
         T_0 (K), at y = 0.
     attitude : bool
-        Whether runs have attitudes, elements of SO(3) that take body axes to those of space.
+        If true, runs follow the attitude, an element of SO(3) that maps body axes to axes in space.
 
     Raises
     ------
@@ -66,7 +66,7 @@ def tumbling_body(
     Warns
     -----
     InertiaWarning
-        Where no body has the inertias.
+        If no body can have these moments of inertia.
 
     Examples
     --------
@@ -77,9 +77,9 @@ def tumbling_body(
     """
     moments = checked_inertia(inertia)
     if (rate is None) == (relaxation_time is None) or (momentum is None) != (relaxation_time is None):
-        given = {"relaxation_time": relaxation_time, "momentum": momentum, "rate": rate}
-        names = ", ".join(name for name, value in given.items() if value is not None) or "none of them"
-        raise InputError(f"give relaxation_time= with the momentum= that it belongs to, or rate=, not {names}")
+        arguments = {"relaxation_time": relaxation_time, "momentum": momentum, "rate": rate}
+        names = ", ".join(name for name, value in arguments.items() if value is not None) or "none of them"
+        raise InputError(f"give rate=, or relaxation_time= and momentum=, at which it holds; got {names}")
     friction = rate if relaxation_time is None else rate_of(relaxation_time, moments, _momentum_norm(momentum))
     return LiePoissonSystem(
         mf.so(3),
@@ -91,7 +91,7 @@ def tumbling_body(
 
 
 def _momentum_norm(momentum):
-    """The size of a momentum that is given as such, or as a vector."""
+    """Return the norm of a momentum, given as such or as a vector."""
     if np.shape(momentum) not in ((), (3,)):
-        raise InputError(f"momentum is one number, or three, not an array of shape {np.shape(momentum)}")
+        raise InputError(f"momentum must be one number, or three, got an array of shape {np.shape(momentum)}")
     return momentum if np.shape(momentum) == () else np.linalg.norm(momentum)

@@ -20,7 +20,8 @@ from .quantised_sphere import QuantisedSphere
 
 
 class KineticEnergy(Energy):
-    """``gamma / 2 tr(W^H (-Delta)^{-1} W)``: gamma times that of the fluid, ``- 1/2 integral omega psi``."""
+    """Gamma times the energy of the fluid, ``gamma / 2 tr(W^H (-Delta)^{-1} W)``; the fluid's is ``-1/2 integral omega
+    psi``."""
 
     sphere: QuantisedSphere = eqx.field(static=True)
 
@@ -57,9 +58,9 @@ def zeitlin(N: int, decay: Literal["enstrophy", "energy"] | None = None, rate=0.
     ----------
     N : int, >= 2
     decay : {"enstrophy", "energy"}, optional
-        What falls; nothing by default.
+        The function that decays; by default none.
     rate : float, >= 0
-        Of the decay: a time for "enstrophy", the inverse of one for "energy".
+        Rate of the decay, in units of time for "enstrophy" and 1 / time for "energy".
 
     Returns
     -------
@@ -74,7 +75,7 @@ def zeitlin(N: int, decay: Literal["enstrophy", "energy"] | None = None, rate=0.
     """
     sphere, rate = QuantisedSphere(N), checked_rate(rate)
     if decay not in (None, "enstrophy", "energy"):
-        raise InputError(f"what decays is 'enstrophy', 'energy' or None, not {decay!r}")
+        raise InputError(f"decay must be 'enstrophy', 'energy' or None, got {decay!r}")
     dissipation: Dissipation | None = None
     if decay == "enstrophy":  # -kappa is N on components, 2N on matrices
         dissipation = KillingDissipation(rate / (2.0 * sphere.N))
@@ -85,5 +86,5 @@ def zeitlin(N: int, decay: Literal["enstrophy", "energy"] | None = None, rate=0.
         KineticEnergy(sphere),
         Quadratic(np.full(sphere.algebra.dim, -2.0)),
         dissipation,
-        validate=False,  # its axioms are those of su(N) and of the two constructions; Jacobi takes O(N^6)
+        validate=False,  # the axioms hold by construction, and testing Jacobi would take O(N^6)
     )

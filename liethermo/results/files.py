@@ -145,7 +145,7 @@ def write_dataset(dataset: xarray.Dataset, path: str | os.PathLike) -> Path:
         disk.write_atomically(path, buffer.getbuffer())
     except (OSError, ValueError) as error:  # ValueError for an invalid path
         raise FileError(
-            f"cannot write {path!s:.200}: {disk.why_os_failed(error)}. The result in memory is unchanged"
+            f"cannot write {path!s:.200}: {disk.describe_os_error(error)}. The result in memory is unchanged"
         ) from error
     disk.remove_dead_parts(path.parent, path.name)
     return path
@@ -184,7 +184,7 @@ def read_dataset(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[s
     except OSError as error:
         if isinstance(error, FileError):
             raise
-        raise FileError(f"cannot read {path!s:.200}: {disk.why_os_failed(error)}") from error
+        raise FileError(f"cannot read {path!s:.200}: {disk.describe_os_error(error)}") from error
     try:
         series, attributes = _read_hdf5(path)
     except Exception as error:  # HDF5's readers raise a dozen kinds of errors for a broken file

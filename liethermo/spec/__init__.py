@@ -1,4 +1,4 @@
-"""Spec files: runs and studies described in TOML. Only the command line imports this."""
+"""Spec files: runs and studies described in TOML. Only the command line imports this package."""
 
 from .reading import Spec, read
 from .schema import FIGURES, Outputs, Run

@@ -1,4 +1,4 @@
-"""Tables of a spec file checked against the fields of a section or the signature of a function."""
+"""Validation of the tables of a spec file against a schema or the signature of a function."""
 
 from __future__ import annotations
 
@@ -21,63 +21,67 @@ SCHEMA_BY_TAG: dict[str, type] = {
     "sample": SampledAxis,
     "measure": MeasureTable,
 }
-
+"""Schema of each table alternative of a key, by its tag."""
 
 MAX_REPORTED_FAULTS = 100
-"""Faults of a section, reported one by one."""
+"""Maximum number of faults of a section that are listed; the others are counted."""
 
 
-def validate_table(key: str, schema: type, table, problems: list[str], taker: str) -> Any:
-    """The table in the types of the schema; or None, after noting what is wrong with it."""
+def validate_table(key: str, schema: type, table, problems: list[str], consumer: str) -> Any:
+    """Return the table converted to the types of the schema, or None after appending its faults to ``problems``."""
     try:
         return TypeAdapter(schema).validate_json(json.dumps(table), strict=True)
     except ValidationError as error:
-        found = error.errors()
-        problems += [_describe_fault(key, one, schema, taker) for one in found[:MAX_REPORTED_FAULTS]]
-        problems += [f"{key or 'the file'} has {len(found) - MAX_REPORTED_FAULTS} faults more"] * (
-            len(found) > MAX_REPORTED_FAULTS
+        faults = error.errors()
+        problems += [_describe_fault(key, fault, schema, consumer) for fault in faults[:MAX_REPORTED_FAULTS]]
+        problems += [f"{key or 'the file'} has {len(faults) - MAX_REPORTED_FAULTS} faults more"] * (
+            len(faults) > MAX_REPORTED_FAULTS
         )
         return None
 
 
-def _describe_fault(key: str, found: Mapping[str, Any], schema: type, taker: str) -> str:
-    """One error of pydantic's as a sentence that begins with the key."""
-    name = ".".join(filter(None, [key, *(str(part) for part in _untagged_location(found["loc"]))]))
+def _describe_fault(key: str, fault: Mapping[str, Any], schema: type, consumer: str) -> str:
+    """Return an error of pydantic as a sentence that begins with the key."""
+    name = ".".join(filter(None, [key, *(str(part) for part in _untagged_location(fault["loc"]))]))
     name = re.sub(r"\.(\d+)\b", r"[\1]", name)
-    if found["type"] == "extra_forbidden":
-        keys = _allowed_keys(schema, found["loc"])
-        return f"{name}: no such key{suggest_match(found['loc'][-1], keys)}; {taker} takes {', '.join(keys) or 'none'}"
-    if found["type"] == "missing":
-        field = getattr(schema, "model_fields", {}).get(found["loc"][-1])
-        return f"{name} is missing" + (f": {field.description}" if field else f"; {taker} needs it")
-    if found["type"] in ("model_type", "dict_type"):
-        return f"{name} = {format_value(found['input'])}: must be a section [{name}]"
-    message = re.sub(r"^Input should|^(List|Tuple) should", "must", found["msg"])
-    return f"{name} = {format_value(found['input'])}: {message}"
+    if fault["type"] == "extra_forbidden":
+        keys = _allowed_keys(schema, fault["loc"])
+        return (
+            f"{name}: no such key{suggest_match(fault['loc'][-1], keys)}; {consumer} takes {', '.join(keys) or 'none'}"
+        )
+    if fault["type"] == "missing":
+        field = getattr(schema, "model_fields", {}).get(fault["loc"][-1])
+        return f"{name} is missing" + (f": {field.description}" if field else f"; {consumer} needs it")
+    if fault["type"] in ("model_type", "dict_type"):
+        return f"{name} = {format_value(fault['input'])}: must be a section [{name}]"
+    message = re.sub(r"^Input should|^(List|Tuple) should", "must", fault["msg"])
+    return f"{name} = {format_value(fault['input'])}: {message}"
 
 
-UNION_TAGS = ("number", "table", "list", "points", "sample", "word", "measure")
-"""By which pydantic names the alternatives of a key in its errors."""
+UNION_TAG_NAMES = ("number", "table", "list", "points", "sample", "word", "measure")
+"""Tags of the alternatives of a key, which pydantic inserts into the locations of its errors."""
 
 
 def _untagged_location(parts: tuple) -> list:
-    """Where an error is, without the alternatives; those stand behind the key whose alternatives they are."""
-    return [part for i, part in enumerate(parts) if i == 0 or part not in UNION_TAGS]
+    """Return the location of an error without the tags of alternatives, which may follow any key but the first."""
+    return [part for i, part in enumerate(parts) if i == 0 or part not in UNION_TAG_NAMES]
 
 
-def _allowed_keys(schema: type, place: tuple) -> list[str]:
-    """The keys that the table has in which one was found that does not belong there."""
-    for part in place[:-1]:
+def _allowed_keys(schema: type, location: tuple) -> list[str]:
+    """Return the keys allowed in the table at which an unknown key was found."""
+    for part in location[:-1]:
         if isinstance(part, str) and part in SCHEMA_BY_TAG:
             schema = SCHEMA_BY_TAG[part]
         elif (field := getattr(schema, "model_fields", {}).get(part)) is not None:
-            nested = [kind for kind in (field.annotation, *get_args(field.annotation)) if hasattr(kind, "model_fields")]
-            schema = nested[0] if nested else schema
+            nested_models = [
+                kind for kind in (field.annotation, *get_args(field.annotation)) if hasattr(kind, "model_fields")
+            ]
+            schema = nested_models[0] if nested_models else schema
     return list(getattr(schema, "model_fields", None) or schema.__annotations__)
 
 
 def validate_arguments(key: str, function: Callable, table: dict, problems: list[str]) -> dict[str, Any] | None:
-    """The table as keyword arguments of a function, checked against its signature and annotations."""
+    """Return the table as keyword arguments of a function, validated by its signature and annotations."""
     try:
         hints = get_type_hints(function.__init__ if inspect.isclass(function) else function)
     except Exception:  # annotations with names that exist only for type checkers
@@ -86,8 +90,8 @@ def validate_arguments(key: str, function: Callable, table: dict, problems: list
     extra: Literal["allow", "forbid"] = "forbid"
     for name, parameter in inspect.signature(function).parameters.items():
         if parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY):
-            needed = Required if parameter.default is parameter.empty else NotRequired
-            fields[name] = needed[_toml_hint(hints.get(name, Any))]
+            requirement = Required if parameter.default is parameter.empty else NotRequired
+            fields[name] = requirement[_toml_hint(hints.get(name, Any))]
         elif parameter.kind is parameter.VAR_KEYWORD:
             extra = "allow"
     name = getattr(function, "__name__", "the function")
@@ -96,10 +100,10 @@ def validate_arguments(key: str, function: Callable, table: dict, problems: list
 
 
 def _toml_hint(hint) -> Any:
-    """The part of a type hint that a value from TOML can meet; Any where there is no such part, or more than one."""
+    """Return the alternative of a type hint that a TOML value can have; Any if there is not exactly one."""
     if get_origin(hint) in (Union, UnionType):
-        parts = [part for part in get_args(hint) if part is not NoneType and _is_toml_hint(part)]
-        return parts[0] if len(parts) == 1 else Any
+        alternatives = [part for part in get_args(hint) if part is not NoneType and _is_toml_hint(part)]
+        return alternatives[0] if len(alternatives) == 1 else Any
     return hint if _is_toml_hint(hint) else Any
 
 

@@ -1,4 +1,4 @@
-"""What is wrong with a spec file, in words that begin with the key."""
+"""Messages about the faults of a spec file, each beginning with the key."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ def validation_error(message: str) -> PydanticCustomError:
 
 
 def format_value(value) -> str:
-    """A value nearly as the file has it."""
+    """Return a value as JSON text, at most 60 characters long, which is nearly its TOML text."""
     text = json.dumps(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def format_table(key: str, table: Mapping[str, Any]) -> str:
-    """All that a table says, with the full keys."""
+    """Return all entries of a table as "key = value" with full keys."""
     return ", ".join(
         format_table(f"{key}.{name}", value)
         if isinstance(value, dict) and value
@@ -34,15 +34,15 @@ def format_table(key: str, table: Mapping[str, Any]) -> str:
 
 
 def suggest_match(word: str, options: Iterable[str]) -> str:
-    close = difflib.get_close_matches(word, options, n=1)
-    return f" (did you mean {close[0]}?)" if close else ""
+    matches = difflib.get_close_matches(word, options, n=1)
+    return f" (did you mean {matches[0]}?)" if matches else ""
 
 
 def describe_exception(error: Exception, function: Callable) -> str:
-    """What a function raised and, unless it is the library's own message, in which of its lines."""
+    """Return the error's text; for an error of user code also its type and the line of the function."""
     if type(error).__module__.split(".")[0] in ("liethermo", "manifolds"):
         return str(error)
-    own = inspect.getsourcefile(inspect.unwrap(function)) if inspect.isroutine(function) else None
-    lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == own]
-    where = f" ({Path(own).name}, line {lines[-1]})" if own and lines else ""
-    return f"{type(error).__name__}: {error}{where}"
+    source_file = inspect.getsourcefile(inspect.unwrap(function)) if inspect.isroutine(function) else None
+    lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == source_file]
+    location = f" ({Path(source_file).name}, line {lines[-1]})" if source_file and lines else ""
+    return f"{type(error).__name__}: {error}{location}"

@@ -1,4 +1,4 @@
-"""A spec file read, and checked as a whole before anything is computed."""
+"""Reading of a spec file, validated completely before anything is computed."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from .trust import import_function
 
 @dataclass(frozen=True)
 class Spec:
-    """A run, ready to start.
+    """A validated spec file: a run that is ready to start.
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class Spec:
     method : OneStepMethod or Reference
     run : Run
     outputs : Outputs
-    study : StudyOfFile, optional
+    study : StudySection, optional
     """
 
     path: Path
@@ -53,7 +53,7 @@ class Spec:
 
     @property
     def step(self) -> float | Adaptive:
-        """The step as :func:`liethermo.integrate` takes it."""
+        """The step as an argument of :func:`liethermo.integrate`."""
         step = self.run.step
         if isinstance(step, AdaptiveStep):
             return Adaptive(step.adaptive, step.atol, step.first, step.largest)
@@ -61,38 +61,42 @@ class Spec:
 
     @property
     def until(self) -> Relaxed | None:
-        """The event at which runs end."""
+        """The event that ends the runs, or None."""
         return None if self.run.until is None else Relaxed(self.run.until.relaxed)
 
     @property
     def model_arguments(self) -> dict[str, Any]:
-        """The arguments that the model takes, with their values in this file or their defaults."""
-        taken = inspect.signature(self.build).parameters.values()
-        defaults = {p.name: None if p.default is p.empty else p.default for p in taken if p.kind is not p.VAR_KEYWORD}
+        """All arguments of the model, with the values in this file or the defaults."""
+        signature_parameters = inspect.signature(self.build).parameters.values()
+        defaults = {
+            p.name: None if p.default is p.empty else p.default
+            for p in signature_parameters
+            if p.kind is not p.VAR_KEYWORD
+        }
         return {**defaults, **self.parameters}
 
     @property
     def summary(self) -> str:
-        """The run in a line."""
+        """Model, method, step and time span in one line."""
         start, end = self.run.t_span
         step = self.step if isinstance(self.step, Adaptive) else f"step {self.step:g}"
         return f"{self.model_name}, {self.method}, {step}, t = {start:g} to {end:g}"
 
     def build_system(self) -> System:
-        """The system, which the initial state has been seen to fit.
+        """Build the system, and check the initial state and the figures against it.
 
         Raises
         ------
         SpecError
-            If the system cannot be built from the parameters.
+            If the parameters, the initial state or a figure do not suit the system.
         AxiomError
-            If it is not metriplectic.
+            If the system is not metriplectic.
         """
         try:
             system = self.build(**self.parameters)
         except AxiomError:
             raise
-        except Exception as error:  # the function may be anyone's
+        except Exception as error:  # user code
             raise self._model_error(describe_exception(error, self.build)) from error
         if not isinstance(system, System):
             raise self._model_error(f"it returned {system!r:.60}, not a system such as lt.LiePoissonSystem")
@@ -110,34 +114,34 @@ class Spec:
         """The name of the model, or ``module:function``."""
         return self.table["model"].get("name") or self.table["model"]["function"]
 
-    def _model_error(self, why: str) -> SpecError:
-        return SpecError(self.path, [f"{format_table('model', self.table['model'])}: {why}"])
+    def _model_error(self, reason: str) -> SpecError:
+        return SpecError(self.path, [f"{format_table('model', self.table['model'])}: {reason}"])
 
 
 def read(
     path: str | os.PathLike,
     changes: Sequence[str] = (),
     allow: Sequence[str] = (),
-    tell: Callable[[str], object] | None = None,
+    report: Callable[[str], object] | None = None,
 ) -> Spec:
-    """Read a spec file and check everything but the system, which is left to :meth:`Spec.system`.
+    """Read a spec file and validate everything but the system, which :meth:`Spec.build_system` validates.
 
     Parameters
     ----------
     path : path
     changes : sequence of str
-        Texts "section.key=value" that take the place of what the file says, values as in TOML.
+        Texts "section.key=value" that override the file; values as in TOML.
     allow : sequence of str
-        Modules that the file may name besides those beside it: see :mod:`.trust`.
-    tell : function, optional
-        Told what will be imported, before it is.
+        Modules that the file may name although they are not beside it: see :mod:`.trust`.
+    report : function, optional
+        Called with a text that names each file or module before it is imported.
 
     Raises
     ------
     FileError
         If the file cannot be read.
     SpecError
-        With all that is wrong in it.
+        With all faults of the file.
     """
     path = Path(path)
     table = _parse_file(path)
@@ -145,22 +149,24 @@ def read(
     for change in changes:
         _apply_change(table, change, problems)
     validate_table("", SpecContents, table, problems, "a spec file")
-    needed = [name for name in SECTIONS if name != "study" or "study" in table]
-    found = {name: validate_table(name, SECTIONS[name], table.get(name, {}), problems, f"[{name}]") for name in needed}
-    model, run, method, outputs = (found[name] for name in ("model", "run", "method", "outputs"))
-    build: Any = model and _model_function(model, path.resolve().parent, allow, tell, problems)
+    section_names = [name for name in SECTIONS if name != "study" or "study" in table]
+    sections = {
+        name: validate_table(name, SECTIONS[name], table.get(name, {}), problems, f"[{name}]") for name in section_names
+    }
+    model, run, method, outputs = (sections[name] for name in ("model", "run", "method", "outputs"))
+    build: Any = model and _model_function(model, path.resolve().parent, allow, report, problems)
     parameters: Any = build and validate_arguments("model.parameters", build, model.parameters, problems)
     integrator = method and _build_method(method, problems)
     if problems:
         raise SpecError(path, problems)
-    return Spec(path, table, build, parameters, integrator, run, outputs, found.get("study"))
+    return Spec(path, table, build, parameters, integrator, run, outputs, sections.get("study"))
 
 
 MAX_SPEC_BYTES = 2**20
-"""Bytes of a spec file."""
+"""Maximum size of a spec file in bytes."""
 
 MAX_KEY_PARTS = 100
-"""Parts of a key."""
+"""Maximum number of parts of a dotted key."""
 
 
 def _parse_file(path: Path) -> dict[str, Any]:
@@ -183,18 +189,20 @@ def _parse_file(path: Path) -> dict[str, Any]:
 
 
 def _parse_toml(text: str) -> dict[str, Any]:
-    """TOML as JSON data; ValueError where it is not valid, or has parts inside parts without end."""
+    """Return TOML text as JSON data; raise ValueError if it is invalid or nested too deeply."""
     for number, line in enumerate(text.splitlines(), start=1):
         if line.partition("=")[0].count(".") > MAX_KEY_PARTS and not line.lstrip().startswith("#"):
             raise ValueError(f"a key of more than {MAX_KEY_PARTS} parts (at line {number})")
     try:
-        return json.loads(json.dumps(tomllib.loads(text), default=str))  # dates and times, which no key takes: texts
+        return json.loads(
+            json.dumps(tomllib.loads(text), default=str)
+        )  # dates and times become texts, which no key accepts
     except RecursionError:
         raise ValueError("it has lists or tables inside each other, too many") from None
 
 
 def _apply_change(table: dict[str, Any], change: str, problems: list[str]) -> None:
-    """Make one change to the content of a file."""
+    """Apply one ``--set`` option to the content of a file."""
     key, equals, text = change.partition("=")
     parts = key.strip().split(".")
     if not equals or not all(parts):
@@ -206,7 +214,7 @@ def _apply_change(table: dict[str, Any], change: str, problems: list[str]) -> No
     try:
         value = _parse_toml(f"value = {text}")["value"]
     except (ValueError, KeyError):
-        value = text.strip()  # a text without quotes, which a shell takes away
+        value = text.strip()  # a text whose quotes the shell has removed
     for part in parts[:-1]:
         table = table.setdefault(part, {})
         if not isinstance(table, dict):
@@ -216,14 +224,14 @@ def _apply_change(table: dict[str, Any], change: str, problems: list[str]) -> No
 
 
 def _model_function(
-    model: Model, folder: Path, allow: Sequence[str], tell: Callable[[str], object] | None, problems: list[str]
+    model: Model, folder: Path, allow: Sequence[str], report: Callable[[str], object] | None, problems: list[str]
 ) -> Callable[..., System] | None:
-    """The function that the section ``[model]`` names."""
+    """Return the function that the section ``[model]`` names, or None after appending a fault to ``problems``."""
     if model.name is not None and model.function is None:
         return getattr(models, model.name)
     if model.function is not None and model.name is None:
         try:
-            return import_function(model.function, folder, allow, tell)
+            return import_function(model.function, folder, allow, report)
         except InputError as error:
             problems.append(f"model.function = {format_value(model.function)}: {error}")
             return None
@@ -242,7 +250,9 @@ def _build_method(method: Method, problems: list[str]):
     try:
         return kind(**options)
     except (TypeError, ValueError) as error:
-        listed = set(re.findall(r"\w+", str(error))).difference(map(str, options.values()))  # what the message allows
-        hints = [suggest_match(value, listed) for value in options.values() if isinstance(value, str)]
+        allowed_words = set(re.findall(r"\w+", str(error))).difference(
+            map(str, options.values())
+        )  # words of the message without the given values
+        hints = [suggest_match(value, allowed_words) for value in options.values() if isinstance(value, str)]
         problems.append(f"{format_table('method', options)}: {error}{''.join(hints)}")
         return None

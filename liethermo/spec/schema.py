@@ -1,4 +1,4 @@
-"""What a spec file may say: its sections and their keys, with what each is."""
+"""Schema of spec files: the sections, their keys and descriptions."""
 
 from __future__ import annotations
 
@@ -13,21 +13,22 @@ from ..integrators import METHODS
 from .messages import format_value, suggest_match, validation_error
 
 FIGURES = ("momentum_sphere", "laws")
-FORMATS = ("png", "pdf", "svg")
+"""Names of the figures that ``liethermo run`` can draw."""
 
+FORMATS = ("png", "pdf", "svg")
+"""File formats of figures."""
 
 MAX_AXIS_VALUES = 10**7
-"""Values of an axis."""
+"""Maximum number of values of an axis."""
 
 
 def one_of(options: Iterable[str]) -> BeforeValidator:
-    allowed = list(options)
+    allowed_values = list(options)
 
     def check(value):
-        if value not in allowed:
-            raise validation_error(
-                f"must be one of {', '.join(map(format_value, allowed))}{suggest_match(str(value), allowed)}"
-            )
+        if value not in allowed_values:
+            hint = suggest_match(str(value), allowed_values)
+            raise validation_error(f"must be one of {', '.join(map(format_value, allowed_values))}{hint}")
         return value
 
     return BeforeValidator(check)
@@ -35,7 +36,7 @@ def one_of(options: Iterable[str]) -> BeforeValidator:
 
 def _require_increasing(span: tuple[float, float]) -> tuple[float, float]:
     if span[1] <= span[0]:
-        raise validation_error("must increase: time runs forwards, since entropy grows")
+        raise validation_error("must increase")
     return span
 
 
@@ -50,7 +51,7 @@ class Section(BaseModel):
 
 
 class SpecContents(Section):
-    """The whole file."""
+    """Top level of a spec file."""
 
     model: Any = None
     run: Any = None
@@ -60,29 +61,29 @@ class SpecContents(Section):
 
 
 class Model(Section):
-    """What is run: a model of the library, or a function of yours that returns a system."""
+    """The model: one of the library, or a user's function that returns a system."""
 
     name: Annotated[str, one_of(models.__all__)] | None = Field(
         None, description="a model of the library; `liethermo models` lists them"
     )
     function: str | None = Field(
         None,
-        description='in its place `"module:function"`, of a module beside the file, or of one that is allowed',
+        description='instead of a name: `"module:function"`, from a module beside the file or an allowed one',
     )
     parameters: dict[str, Any] = Field({}, description="the arguments of the model or the function")
 
 
 class AdaptiveStep(Section):
-    """Steps that the error chooses."""
+    """Adaptive steps, chosen by the estimated error."""
 
-    adaptive: FiniteFloat = Field(gt=0, description="the error wanted, relative to the state: `lt.Adaptive(rtol)`")
-    atol: FiniteFloat = Field(0.0, ge=0, description="the error that is allowed besides")
+    adaptive: FiniteFloat = Field(gt=0, description="the tolerance relative to the state: `lt.Adaptive(rtol)`")
+    atol: FiniteFloat = Field(0.0, ge=0, description="the absolute tolerance")
     first: FiniteFloat | None = Field(None, gt=0, description="the first step to try")
-    largest: FiniteFloat | None = Field(None, gt=0, description="no step is longer")
+    largest: FiniteFloat | None = Field(None, gt=0, description="the longest step")
 
 
 class StopCondition(Section):
-    """Where a run ends before its time."""
+    """Condition that ends a run early."""
 
     relaxed: FiniteFloat = Field(gt=0, description="the rate of relaxation below which the run ends: `lt.Relaxed(tol)`")
 
@@ -97,16 +98,16 @@ Step = Annotated[
 
 
 class Run(Section):
-    """The initial state, the span of time, and the steps."""
+    """Initial state, time span and steps."""
 
     initial: list[FiniteFloat] = Field(min_length=1, description="the state to start from, a list of numbers")
     t_span: Annotated[tuple[FiniteFloat, FiniteFloat], AfterValidator(_require_increasing)] = Field(
         description="start and end, for example [0.0, 100.0]"
     )
     step: Step = Field(description="the step size, a number greater than 0, or {adaptive = 1e-8}")
-    save_every: int = Field(1, ge=1, description="every n-th state is kept, n this number")
+    save_every: int = Field(1, ge=1, description="the number of steps between saved states")
     until: StopCondition | None = Field(
-        None, description="where the run ends before its time, for example {relaxed = 1e-8}"
+        None, description="a condition that ends the run early, for example {relaxed = 1e-8}"
     )
     attitude: list[list[FiniteFloat]] | None = Field(
         None, description="the element of the group at the start, a matrix, where the system has a group"
@@ -114,17 +115,17 @@ class Run(Section):
 
 
 class Method(BaseModel):
-    """The integrator; keys other than its name are its parameters."""
+    """The integrator; all keys other than its name are its parameters."""
 
     model_config = ConfigDict(extra="allow")  # the parameters of the method, checked by its signature
-    # options without a name are those of the midpoint scheme
+    # options without a name belong to the midpoint scheme
     name: Annotated[str, one_of(METHODS)] | None = Field(
         None, description=f"one of {', '.join(METHODS)}; the default is that of `integrate`"
     )
 
 
 class Outputs(Section):
-    """What `liethermo run` writes into its folder."""
+    """Files that `liethermo run` writes into its folder."""
 
     netcdf: Annotated[str, AfterValidator(_require_netcdf_name)] = Field(
         "solution.nc", description="the file of the solution"
@@ -134,11 +135,11 @@ class Outputs(Section):
 
 
 class EvenlySpacedAxis(Section):
-    """Values of an axis that lie evenly."""
+    """Evenly spaced values of an axis."""
 
     first: FiniteFloat = Field(description="the first value")
     last: FiniteFloat = Field(description="the last value")
-    points: int = Field(ge=1, le=MAX_AXIS_VALUES, description="how many")
+    points: int = Field(ge=1, le=MAX_AXIS_VALUES, description="the number of values")
     scale: Annotated[str, one_of(("linear", "log"))] = Field("linear", description="linear, or log")
 
 
@@ -147,13 +148,15 @@ class SampledAxis(Section):
 
     zip: dict[str, list[FiniteFloat]] | None = Field(None, description="equally many values of each parameter")
     latin_hypercube: int | None = Field(
-        None, ge=1, le=MAX_AXIS_VALUES, description="points of a Latin hypercube, with `ranges`"
+        None, ge=1, le=MAX_AXIS_VALUES, description="the number of points of a Latin hypercube, with `ranges`"
     )
-    sobol: int | None = Field(None, ge=1, le=MAX_AXIS_VALUES, description="points of a Sobol sequence, with `ranges`")
+    sobol: int | None = Field(
+        None, ge=1, le=MAX_AXIS_VALUES, description="the number of points of a Sobol sequence, with `ranges`"
+    )
     ranges: dict[str, list[FiniteFloat | str]] | None = Field(
-        None, description='of each parameter [low, high], or [low, high, "log"]'
+        None, description='[low, high] or [low, high, "log"] of each parameter'
     )
-    seed: int = Field(0, ge=0, description="of the sample")
+    seed: int = Field(0, ge=0, description="the seed of the sample")
 
 
 def _axis_tag(value: Any) -> str:
@@ -174,8 +177,8 @@ class MeasureTable(Section):
     relaxed: FiniteFloat | None = Field(
         None, gt=0, description="the time of relaxation to a rate below this, where the run ends: `lt.Relaxed(tol)`"
     )
-    at: list[FiniteFloat] | None = Field(None, min_length=1, description="values at these times")
-    what: str = Field("x", description="of which series: x, energy, entropy or attitude")
+    at: list[FiniteFloat] | None = Field(None, min_length=1, description="the times at which values are measured")
+    what: str = Field("x", description="the measured series: x, energy, entropy or attitude")
 
 
 def _measure_tag(value: Any) -> str:
@@ -188,7 +191,7 @@ MeasureEntry = Annotated[
 
 
 class StudySection(Section):
-    """What `liethermo study` runs: the axes, and what is kept of each point."""
+    """The parameter study that `liethermo study` runs: its axes and the measures of each point."""
 
     axes: dict[str, AxisEntry] = Field(
         min_length=1,
@@ -198,28 +201,29 @@ class StudySection(Section):
     measure: dict[str, MeasureEntry] = Field(
         {"final": "final"},
         min_length=1,
-        description='what is kept, by names of yours: `"final"`, `"relaxation_time"`, ..., {relaxed = 1e-8}, or '
+        description='the measures, by names that you choose: `"final"`, `"relaxation_time"`, ..., {relaxed = 1e-8}, or '
         '{at = [1.0, 2.0], what = "x"}',
     )
-    chunk: int | None = Field(None, ge=1, description="points of a chunk, about")
-    units: dict[str, str] = Field({}, description="of axes and measures")
+    chunk: int | None = Field(None, ge=1, description="the approximate number of points of a chunk")
+    units: dict[str, str] = Field({}, description="units of axes and measures")
     names: dict[str, str] = Field({}, description="long names of axes and measures")
-    figure: str | None = Field(None, description="the measure that is drawn; by default the first that can be")
+    figure: str | None = Field(None, description="the measure to draw; by default the first that can be drawn")
 
 
 SECTIONS = {"model": Model, "run": Run, "method": Method, "outputs": Outputs, "study": StudySection}
+"""Schema of each section of a spec file."""
 
 
 def list_spec_keys() -> list[tuple[str, str, str, str]]:
-    """Every key of a spec file with its section, its default and what it is, as the documentation lists them."""
+    """Return a row (section, key, default, description) for every key of a spec file, for the documentation."""
     tables = {"run.step": AdaptiveStep, "run.until": StopCondition, "study.axes.NAME": (EvenlySpacedAxis, SampledAxis)}
-    parts = [*SECTIONS.items(), *tables.items(), ("study.measure.NAME", MeasureTable)]
-    found = []
-    for section, schemas in parts:
+    sections = [*SECTIONS.items(), *tables.items(), ("study.measure.NAME", MeasureTable)]
+    rows = []
+    for section, schemas in sections:
         for schema in schemas if isinstance(schemas, tuple) else (schemas,):
             for name, field in schema.model_fields.items():
                 default = (
                     "needed" if field.is_required() else "" if field.default is None else format_value(field.default)
                 )
-                found.append((section, name, default, field.description or ""))
-    return found
+                rows.append((section, name, default, field.description or ""))
+    return rows

@@ -1,4 +1,4 @@
-"""The section ``[study]`` of a spec file as a study."""
+"""Conversion of the section ``[study]`` of a spec file to a :class:`.Study`."""
 
 from __future__ import annotations
 
@@ -23,63 +23,63 @@ from .reading import Spec
 from .schema import EvenlySpacedAxis, MeasureTable, SampledAxis
 
 INITIAL_STATE_KEY = "initial"
-"""The name of the initial state among the parameters of axes."""
+"""Name of the initial state among the parameters that an axis can vary."""
 
 
 @dataclass(frozen=True)
 class SystemBuilder:
-    """The function from a point to the system of a spec file with the parameters of the point."""
+    """Picklable function from the parameters of a point to the system of a spec file."""
 
     build: Callable[..., System]
     parameters: Mapping[str, Any]
     varied_names: tuple[str, ...]
 
     def __call__(self, point: Mapping[str, Any]) -> System:
-        found = copy.deepcopy(dict(self.parameters))
+        parameters = copy.deepcopy(dict(self.parameters))
         for name in self.varied_names:
-            _set_entry(found, name, point[name])
-        return self.build(**found)
+            _set_entry(parameters, name, point[name])
+        return self.build(**parameters)
 
 
 @dataclass(frozen=True)
 class InitialStateBuilder:
-    """The function from a point to its initial state."""
+    """Picklable function from the parameters of a point to its initial state, shape (n,)."""
 
     initial: tuple[float, ...]
     varied_names: tuple[str, ...]
 
     def __call__(self, point: Mapping[str, Any]):
-        found = {INITIAL_STATE_KEY: list(self.initial)}
+        table = {INITIAL_STATE_KEY: list(self.initial)}
         for name in self.varied_names:
-            _set_entry(found, name, point[name])
-        return jnp.stack([jnp.asarray(value, dtype=jnp.float64) for value in found[INITIAL_STATE_KEY]])
+            _set_entry(table, name, point[name])
+        return jnp.stack([jnp.asarray(value, dtype=jnp.float64) for value in table[INITIAL_STATE_KEY]])
 
 
 def _set_entry(table: dict[str, Any], name: str, value: Any) -> None:
-    """Set ``inertia[0]``, or ``rate``, in a table."""
-    whole, *index = _parse_entry_name(name)
+    """Set ``rate`` or an entry such as ``inertia[0]`` in a table, copying the lists on the way."""
+    key, *index = _parse_entry_name(name)
     if not index:
-        table[whole] = value
+        table[key] = value
         return
-    place = table[whole] = list(table[whole])
+    container = table[key] = list(table[key])
     for i in index[:-1]:
-        place[i] = list(place[i])
-        place = place[i]
-    place[index[-1]] = value
+        container[i] = list(container[i])
+        container = container[i]
+    container[index[-1]] = value
 
 
 def _parse_entry_name(name: str) -> list[Any]:
-    whole, *index = re.split(r"[\[\]]+", name.rstrip("]")) if "[" in name else [name]
-    return [whole, *map(int, index)]
+    key, *index = re.split(r"[\[\]]+", name.rstrip("]")) if "[" in name else [name]
+    return [key, *map(int, index)]
 
 
 def build_study(plan: Spec, store: str | os.PathLike) -> Study:
-    """The study that a spec file describes.
+    """Return the study that a spec file describes.
 
     Raises
     ------
     SpecError
-        With all that is wrong in the section.
+        With all faults of the section.
     """
     section = plan.study
     if section is None:
@@ -87,7 +87,7 @@ def build_study(plan: Spec, store: str | os.PathLike) -> Study:
     problems: list[str] = []
     axes = {name: _parse_axis(f"study.axes.{name}", axis, problems) for name, axis in section.axes.items()}
     measures = {
-        name: _parse_measure(f"study.measure.{name}", given, problems) for name, given in section.measure.items()
+        name: _parse_measure(f"study.measure.{name}", measure, problems) for name, measure in section.measure.items()
     }
     names = [
         name
@@ -98,17 +98,19 @@ def build_study(plan: Spec, store: str | os.PathLike) -> Study:
         _check_settable(name, plan, problems)
     if problems:
         raise SpecError(plan.path, problems)
-    own, start = (
+    parameter_names, state_names = (
         [n for n in names if (_parse_entry_name(n)[0] == INITIAL_STATE_KEY) == initial] for initial in (False, True)
     )
     initial = tuple(plan.run.initial)
-    entries = {_parse_entry_name(name)[0] for name in own if "[" in name}  # of arguments that may not be in the file
+    entries = {
+        _parse_entry_name(name)[0] for name in parameter_names if "[" in name
+    }  # defaults of the model that only an axis mentions
     parameters = {**{name: plan.model_arguments[name] for name in entries}, **plan.parameters}
     try:
         return Study(
-            SystemBuilder(plan.build, parameters, tuple(own)),
+            SystemBuilder(plan.build, parameters, tuple(parameter_names)),
             axes,
-            x0=InitialStateBuilder(initial, tuple(start)) if start else np.array(initial),
+            x0=InitialStateBuilder(initial, tuple(state_names)) if state_names else np.array(initial),
             t_span=plan.run.t_span,
             step=plan.step,
             method=plan.method,
@@ -126,59 +128,59 @@ def build_study(plan: Spec, store: str | os.PathLike) -> Study:
 
 
 def _parse_axis(key: str, axis: Any, problems: list[str]) -> Any:
-    """An axis as :class:`Study` takes it."""
+    """Return an axis as an argument of :class:`Study`, or None after appending a fault to ``problems``."""
     try:
         if isinstance(axis, EvenlySpacedAxis):
-            spread = np.geomspace if axis.scale == "log" else np.linspace
+            grid_function = np.geomspace if axis.scale == "log" else np.linspace
             if axis.scale == "log" and min(axis.first, axis.last) <= 0.0:
                 raise InputError("the values of a logarithmic axis are positive")
-            return spread(axis.first, axis.last, axis.points)
+            return grid_function(axis.first, axis.last, axis.points)
         if not isinstance(axis, SampledAxis):
             return axis
-        given = [name for name in ("zip", "latin_hypercube", "sobol") if getattr(axis, name) is not None]
-        if len(given) != 1:
+        sample_kinds = [name for name in ("zip", "latin_hypercube", "sobol") if getattr(axis, name) is not None]
+        if len(sample_kinds) != 1:
             raise InputError("must have one of zip, latin_hypercube and sobol, or first, last and points")
         if axis.zip is not None:
             return zipped(**axis.zip)
         sampler = sobol if axis.sobol is not None else latin_hypercube
-        return sampler(getattr(axis, given[0]), seed=axis.seed, **(axis.ranges or {}))
+        return sampler(getattr(axis, sample_kinds[0]), seed=axis.seed, **(axis.ranges or {}))
     except InputError as error:
         problems.append(f"{key}: {error}")
         return None
 
 
-def _parse_measure(key: str, given: Any, problems: list[str]) -> Any:
-    """A measure as :class:`Study` takes it."""
-    if not isinstance(given, MeasureTable):
-        return given
-    if (given.relaxed is None) == (given.at is None):
+def _parse_measure(key: str, measure: Any, problems: list[str]) -> Any:
+    """Return a measure as an argument of :class:`Study`, or None after appending a fault to ``problems``."""
+    if not isinstance(measure, MeasureTable):
+        return measure
+    if (measure.relaxed is None) == (measure.at is None):
         problems.append(f"{key}: must have one of relaxed and at")
         return None
     try:
-        return Relaxed(given.relaxed) if given.relaxed is not None else At(given.at, given.what)
+        return Relaxed(measure.relaxed) if measure.relaxed is not None else At(measure.at, measure.what)
     except InputError as error:
         problems.append(f"{key}: {error}")
         return None
 
 
 def _check_settable(name: str, plan: Spec, problems: list[str]) -> None:
-    """Whether a parameter of an axis can be set."""
+    """Append a fault to ``problems`` unless an axis can vary the parameter of this name."""
     if not re.fullmatch(r"\w+(\[\d{1,9}\])*", name):
         problems.append(
             f"study.axes: {format_value(name)} must be the name of a parameter, or an entry such as inertia[0]"
         )
         return
-    whole, *index = _parse_entry_name(name)
-    known = {**plan.model_arguments, INITIAL_STATE_KEY: list(plan.run.initial)}
-    if whole not in known:
-        options = [*known]
-        hint = suggest_match(whole, options)
-        problems.append(f"study.axes: {plan.model_name} has no parameter {whole}{hint}; it has {', '.join(options)}")
+    key, *index = _parse_entry_name(name)
+    arguments = {**plan.model_arguments, INITIAL_STATE_KEY: list(plan.run.initial)}
+    if key not in arguments:
+        options = [*arguments]
+        hint = suggest_match(key, options)
+        problems.append(f"study.axes: {plan.model_name} has no parameter {key}{hint}; it has {', '.join(options)}")
         return
-    value = known[whole]
+    value = arguments[key]
     for i in index:
         if not isinstance(value, list | tuple) or i >= len(value):
-            problems.append(f"study.axes: {name} is no entry of {whole} = {format_value(known[whole])}")
+            problems.append(f"study.axes: {name} is no entry of {key} = {format_value(arguments[key])}")
             return
         value = value[i]
     if isinstance(value, list | tuple):

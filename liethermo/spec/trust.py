@@ -1,7 +1,7 @@
-"""The functions that a spec file may name: those defined in a module beside it, or in one that its user allows.
+"""Import of the functions that a spec file may name, from a module beside it or one that the user allows.
 
-A spec file comes from anywhere. It cannot make a function of the standard library or of an installed package run, such
-as ``os:system`` with a command as its parameter: who writes one has to put code beside it, where its user can see it.
+A spec file may come from a stranger. It must not run a function of the standard library or of an installed package,
+such as ``os:system`` with a command as its parameter. Its author has to put code beside it, where the user can see it.
 """
 
 from __future__ import annotations
@@ -22,51 +22,55 @@ from .messages import suggest_match
 
 
 def import_function(
-    target: str, folder: Path, allow: Sequence[str] = (), tell: Callable[[str], object] | None = None
+    target: str, folder: Path, allow: Sequence[str] = (), report: Callable[[str], object] | None = None
 ) -> Callable[..., Any]:
-    """The function that ``module:function`` names.
+    """Import and return the function that ``module:function`` names.
 
     Parameters
     ----------
     folder : Path
-        That of the spec file.
+        Folder of the spec file.
     allow : sequence of str
-        Names of modules that may be found elsewhere.
-    tell : function, optional
-        Told what will be imported, before it is.
+        Names of modules that may be outside of the folder.
+    report : function, optional
+        Called with a text that names the file or module before it is imported.
 
     Raises
     ------
     InputError
-        If there is no such module or function, or it is not one that may be named.
+        If there is no such module or function, or it must not be named.
     """
     if not re.fullmatch(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*", target, re.ASCII):
         raise InputError('must be "module:function", such as "mysystem:build" for the function build in mysystem.py')
     name, function = target.split(":")
-    beside = folder.joinpath(*name.split("."))
-    file = next((path for path in (beside.with_suffix(".py"), beside / "__init__.py") if path.is_file()), None)
+    module_path = folder.joinpath(*name.split("."))
+    file = next(
+        (path for path in (module_path.with_suffix(".py"), module_path / "__init__.py") if path.is_file()), None
+    )
     if file is None and name not in allow:
         raise InputError(
             f"there is no {name.replace('.', '/')}.py beside the spec file, and what is elsewhere is imported only if "
             f"you allow it by name: --allow {name}"
         )
-    if tell is not None:
-        tell(f"imports {name}{'' if file is None else f' from {file}'}")
+    if report is not None:
+        report(f"imports {name}{'' if file is None else f' from {file}'}")
     try:
         module = _import_installed(name, folder) if file is None else _load_from_file(name, file, folder)
     except InputError:
         raise
     except Exception as error:
         raise InputError(f"importing {name!r} failed with {type(error).__name__}: {error}") from error
-    own = [key for key, value in vars(module).items() if _is_defined_in(value, module)]
-    if function not in own:
-        where = "is only imported there" if hasattr(module, function) else "is not there"
-        raise InputError(f"{name} defines no function {function!r}: it {where}{suggest_match(function, own)}")
+    defined_names = [key for key, value in vars(module).items() if _is_defined_in(value, module)]
+    if function not in defined_names:
+        explanation = "is only imported there" if hasattr(module, function) else "is not there"
+        raise InputError(
+            f"{name} defines no function {function!r}: it {explanation}{suggest_match(function, defined_names)}"
+        )
     return getattr(module, function)
 
 
 def _is_defined_in(value: Any, module: ModuleType) -> bool:
-    """Whether a module defines a function, and has it not from elsewhere."""
+    """Return True if a value is a function or class that the module defines itself."""
     return (inspect.isfunction(value) or inspect.isclass(value)) and value.__module__ == module.__name__
 
 
@@ -76,11 +80,11 @@ def _import_installed(name: str, folder: Path) -> ModuleType:
 
 
 def _load_from_file(name: str, file: Path, folder: Path) -> ModuleType:
-    """The module in a file; it is the one of this name."""
-    known = sys.modules.get(name)
-    if known is not None and getattr(known, "__file__", None) == str(file):
-        return known
-    if name not in _spec_module_names and (known is not None or _is_installed(name.partition(".")[0], folder)):
+    """Load the module of this name from a file, unless it has been loaded already."""
+    loaded_module = sys.modules.get(name)
+    if loaded_module is not None and getattr(loaded_module, "__file__", None) == str(file):
+        return loaded_module
+    if name not in _spec_module_names and (loaded_module is not None or _is_installed(name.partition(".")[0], folder)):
         raise InputError(f"there is another module {name!r}: call {file.name} something else")
     spec = importlib.util.spec_from_file_location(name, file)
     assert spec is not None
@@ -98,30 +102,34 @@ def _load_from_file(name: str, file: Path, folder: Path) -> ModuleType:
 
 
 def _is_installed(name: str, folder: Path) -> bool:
-    """Whether there is a module of this name elsewhere: one beside the spec would be taken for it from then on."""
-    before = list(sys.path)
-    sys.path[:] = [path for path in before if Path(path or ".").resolve() not in (folder, Path.cwd())]
+    """Return True if a module of this name exists elsewhere, which a file beside the spec would then shadow."""
+    original_path = list(sys.path)
+    sys.path[:] = [path for path in original_path if Path(path or ".").resolve() not in (folder, Path.cwd())]
     try:
-        found = importlib.util.find_spec(name)
-    except ValueError:  # of a module without a specification
+        module_spec = importlib.util.find_spec(name)
+    except ValueError:  # a loaded module without a specification
         return True
     finally:
-        sys.path[:] = before
-    return found is not None and not (found.origin and Path(found.origin).resolve().is_relative_to(folder))
+        sys.path[:] = original_path
+    return module_spec is not None and not (
+        module_spec.origin and Path(module_spec.origin).resolve().is_relative_to(folder)
+    )
 
 
 @contextlib.contextmanager
 def pickle_by_value(folder: Path) -> Iterator[None]:
-    """What is defined beside a spec is sent to the workers of a cluster as it is: they cannot import it."""
+    """Pickle modules beside the spec by value, since the workers of a cluster cannot import them."""
     import cloudpickle
 
-    own = [m for name, m in list(sys.modules.items()) if name in _spec_module_names or _module_folder(m) == folder]
-    for module in own:
+    local_modules = [
+        m for name, m in list(sys.modules.items()) if name in _spec_module_names or _module_folder(m) == folder
+    ]
+    for module in local_modules:
         cloudpickle.register_pickle_by_value(module)
     try:
         yield
     finally:
-        for module in own:
+        for module in local_modules:
             cloudpickle.unregister_pickle_by_value(module)
 
 
@@ -131,16 +139,16 @@ def _module_folder(module: ModuleType) -> Path | None:
 
 
 _spec_module_names: set[str] = set()
-"""Names of the modules that were beside spec files."""
+"""Names of the modules that were loaded from files beside a spec file."""
 
 
 @contextlib.contextmanager
 def _extended_import_path(*folders: Path) -> Iterator[None]:
-    """For the time of an import, and behind all that is installed: a file beside a spec shadows nothing."""
-    before = list(sys.path)
+    """Append folders to the import path during an import; appended last, their files shadow no installed module."""
+    original_path = list(sys.path)
     sys.path += [str(folder) for folder in folders if str(folder) not in sys.path]
     importlib.invalidate_caches()
     try:
         yield
     finally:
-        sys.path[:] = before
+        sys.path[:] = original_path

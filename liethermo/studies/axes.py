@@ -12,33 +12,35 @@ import numpy as np
 from ..errors import InputError
 
 RESERVED_NAMES = ("status", "message", "laws", "quantity", "zarr.json")
-"""Names of what every store of a study has."""
+"""Names of arrays and files that every store contains."""
 
 MAX_NAME_LENGTH = 100
-"""Characters of a name, which is that of a folder."""
+"""Maximum number of characters of a name; names become folder names in the store."""
 
 MAX_POINTS = 10**9
-"""Points of a study: each is a file's share, and a run."""
+"""Maximum number of points of a study."""
 
 
 def is_valid_name(name: Any) -> bool:
-    """Whether an axis, a parameter or a measure can be called so, and a folder of the store with it."""
-    plain = isinstance(name, str) and name.isprintable() and 0 < len(name) <= MAX_NAME_LENGTH
-    return plain and not name.startswith(("_", ".")) and not {"/", "\\"} & set(name) and name not in RESERVED_NAMES
+    """Return True if ``name`` can name an axis, a parameter or a measure, and a folder in the store."""
+    is_short_text = isinstance(name, str) and name.isprintable() and 0 < len(name) <= MAX_NAME_LENGTH
+    return (
+        is_short_text and not name.startswith(("_", ".")) and not {"/", "\\"} & set(name) and name not in RESERVED_NAMES
+    )
 
 
 @dataclass(frozen=True)
 class Zipped:
-    """Parameters that vary together along one axis: what :func:`zipped` and the samplers return.
+    """Parameters that vary together along one axis, as :func:`zipped` and the samplers return them.
 
     Attributes
     ----------
     columns : dict from str to ndarray, shape (m,)
-        The parameters.
+        Values of each parameter.
     states : ndarray, shape (m, n), or None
         Initial states along the axis.
     count : int
-        Of an axis that has neither.
+        Length of the axis if it has neither columns nor states.
     """
 
     columns: Mapping[str, np.ndarray]
@@ -52,46 +54,47 @@ class Zipped:
 
 
 def zipped(**columns) -> Zipped:
-    """Parameters that vary together along one axis of a :class:`Study`: ``axes={"pair": lt.zipped(a=..., b=...)}``.
+    """Return parameters that vary together along one axis of a :class:`Study`: ``axes={"pair": lt.zipped(a=...,
+    b=...)}``.
 
     Parameters
     ----------
     **columns : arrays, shape (m,)
-        By the names that the builder knows them by.
+        Values of each parameter, by the name that the builder uses.
 
     Raises
     ------
     InputError
         If their lengths differ.
     """
-    found = {name: _checked_column(name, values) for name, values in columns.items()}
-    lengths = {name: len(values) for name, values in found.items()}
-    if not found:
+    arrays = {name: _checked_column(name, values) for name, values in columns.items()}
+    lengths = {name: len(values) for name, values in arrays.items()}
+    if not arrays:
         raise InputError("zipped needs parameters: zipped(a=[1.0, 2.0], b=[3.0, 4.0])")
     if len(set(lengths.values())) > 1:
         counts = ", ".join(f"{name} has {length}" for name, length in lengths.items())
         raise InputError(f"parameters that vary together need equally many values: {counts}")
-    return Zipped(found)
+    return Zipped(arrays)
 
 
 def replicas(states) -> Zipped:
-    """An axis of initial states, ``axes={"replica": lt.replicas(states)}``, or of runs that noise alone sets apart.
+    """Return an axis of initial states, ``axes={"replica": lt.replicas(states)}``, or of repeated runs with noise.
 
     Parameters
     ----------
     states : array, shape (m, n), or int
-        The initial state of each replica; or, of a study with noise, how many there are, each with its own seed.
+        The initial state of each replica; in a study with noise, the number of replicas, each with its own seed.
 
     Raises
     ------
     InputError
-        If the states are not such an array of finite numbers.
+        If the states are not an array of finite numbers of this shape.
     """
     if np.ndim(states) == 0:
         return Zipped({}, count=_checked_count(states))
     array = np.asarray(states, dtype=np.float64)
     if array.ndim != 2 or not array.size:
-        raise InputError(f"replicas have initial states of shape (replicas, n), not {array.shape}")
+        raise InputError(f"states must have shape (replicas, n), got {array.shape}")
     if not np.isfinite(array).all():
         i = int(np.argwhere(~np.isfinite(array))[0, 0])
         raise InputError(f"the initial state of replica {i} is not finite: {array[i].tolist()}")
@@ -99,14 +102,15 @@ def replicas(states) -> Zipped:
 
 
 def latin_hypercube(count: int, *, seed: int, **ranges) -> Zipped:
-    """A Latin hypercube sample of parameters along one axis [scipy.stats.qmc.LatinHypercube].
+    """Return a Latin hypercube sample of parameters along one axis [scipy.stats.qmc.LatinHypercube].
 
     Parameters
     ----------
     count : int
+        Number of points.
     seed : int
     **ranges : (low, high) or (low, high, "log")
-        Of each parameter; with "log" its logarithm is spread evenly.
+        Range of each parameter; with "log" the logarithm is sampled evenly.
 
     Raises
     ------
@@ -121,14 +125,14 @@ def latin_hypercube(count: int, *, seed: int, **ranges) -> Zipped:
 
 
 def sobol(count: int, *, seed: int, **ranges) -> Zipped:
-    """A scrambled Sobol sequence of parameters along one axis [scipy.stats.qmc.Sobol].
+    """Return a scrambled Sobol sequence of parameters along one axis [scipy.stats.qmc.Sobol].
 
-    A longer sequence of the same seed begins with a shorter one, so that a study can be extended.
+    A longer sequence with an equal seed begins with the shorter one, so a study can be extended.
 
     Parameters
     ----------
     count : int
-        A power of two is best.
+        Number of points; a power of two is best.
     seed : int
     **ranges : (low, high) or (low, high, "log")
         As for :func:`latin_hypercube`.
@@ -140,20 +144,24 @@ def sobol(count: int, *, seed: int, **ranges) -> Zipped:
     """
     from scipy.stats import qmc
 
-    whole = max(_checked_count(count) - 1, 0).bit_length()
-    return _scale_sample(lambda d: qmc.Sobol(d, rng=np.random.default_rng(seed)).random_base2(whole)[:count], ranges)
+    log2_count = max(_checked_count(count) - 1, 0).bit_length()
+    return _scale_sample(
+        lambda d: qmc.Sobol(d, rng=np.random.default_rng(seed)).random_base2(log2_count)[:count], ranges
+    )
 
 
 def _scale_sample(draw, ranges: Mapping[str, Any]) -> Zipped:
     if not ranges:
         raise InputError("a sample needs the ranges of parameters: rate=(0.1, 10.0, 'log')")
-    for name, given in ranges.items():
-        if not (isinstance(given, tuple | list) and len(given) in (2, 3) and given[2:] in ((), [], ("log",), ["log"])):
-            raise InputError(f"the range of {name} is (low, high) or (low, high, 'log'), not {given!r}")
-        low, high = map(float, given[:2])
-        if not (np.isfinite([low, high]).all() and low < high and (len(given) == 2 or low > 0.0)):
+    for name, bounds in ranges.items():
+        if not (
+            isinstance(bounds, tuple | list) and len(bounds) in (2, 3) and bounds[2:] in ((), [], ("log",), ["log"])
+        ):
+            raise InputError(f"the range of {name} must be (low, high) or (low, high, 'log'), got {bounds!r}")
+        low, high = map(float, bounds[:2])
+        if not (np.isfinite([low, high]).all() and low < high and (len(bounds) == 2 or low > 0.0)):
             raise InputError(
-                f"the range of {name} must be finite and increasing, and positive with 'log': not {given!r}"
+                f"the range of {name} must be finite and increasing, and positive with 'log', got {bounds!r}"
             )
     unit = draw(len(ranges))
     columns = {}
@@ -164,38 +172,39 @@ def _scale_sample(draw, ranges: Mapping[str, Any]) -> Zipped:
 
 def _checked_count(count) -> int:
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
-        raise InputError(f"a sample has a positive number of points, not {count!r}")
+        raise InputError(f"the number of points must be a positive integer, got {count!r}")
     return int(count)
 
 
 def _checked_column(name: str, values) -> np.ndarray:
-    """Numbers or texts, shape (m,), m > 0."""
+    """Return the values as an array of finite numbers or texts, shape (m,), m > 0."""
     array = np.asarray(values)
     if array.dtype.kind == "U" and not all(isinstance(value, str) for value in np.asarray(values, dtype=object).flat):
-        raise InputError(f"the values of {name!r} are numbers or texts, not both")
+        raise InputError(f"the values of {name!r} must be either numbers or texts, got both")
     if array.ndim != 1 or array.dtype.kind not in "fiubU" or not len(array):
         raise InputError(
-            f"the values of {name!r} are a list of numbers or texts, not {array.dtype} of shape {array.shape}; "
-            "several numbers at once are lt.zipped(a=..., b=...)"
+            f"the values of {name!r} must be a list of numbers or texts, got {array.dtype} of shape {array.shape}. "
+            "For several numbers at once use lt.zipped(a=..., b=...)"
         )
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         i = int(np.flatnonzero(~np.isfinite(array))[0])
-        raise InputError(f"value {i} of {name!r} is {array[i]}: parameters are finite")
+        raise InputError(f"value {i} of {name!r} is {array[i]}, but parameters must be finite")
     return array.astype(np.float64) if array.dtype.kind == "f" else array
 
 
 @dataclass(frozen=True)
 class Axis:
-    """One axis.
+    """One axis of a study: its coordinate, the parameters and initial states along it.
 
     Attributes
     ----------
     name : str
     labels : ndarray, shape (m,)
-        The coordinate: the values of a parameter, or numbers from 0 on.
+        The coordinate: the values of a parameter, or the numbers 0, 1, ...
     columns : dict from str to ndarray, shape (m,)
-        The parameters that vary along it.
+        The parameters that vary along the axis.
     states : ndarray, shape (m, n), or None
+        Initial states along the axis.
     """
 
     name: str
@@ -204,28 +213,29 @@ class Axis:
     states: np.ndarray | None = None
 
     @classmethod
-    def from_values(cls, name: str, given) -> Axis:
-        if isinstance(given, Zipped):
-            return cls(name, np.arange(len(given)), given.columns, given.states)
-        values = _checked_column(name, given)
-        unique, first = np.unique(values, return_index=True)
+    def from_values(cls, name: str, source) -> Axis:
+        """Make an axis from the values that the user gives; a value that occurs twice is refused."""
+        if isinstance(source, Zipped):
+            return cls(name, np.arange(len(source)), source.columns, source.states)
+        values = _checked_column(name, source)
+        unique, first_indices = np.unique(values, return_index=True)
         if len(unique) < len(values):
-            i = int(np.setdiff1d(np.arange(len(values)), first)[0])
-            raise InputError(f"the axis {name!r} has {values[i]} more than once; replicas are an axis of their own")
+            i = int(np.setdiff1d(np.arange(len(values)), first_indices)[0])
+            raise InputError(f"the axis {name!r} has {values[i]} more than once. For repeated runs use lt.replicas")
         return cls(name, values, {name: values})
 
     def __len__(self) -> int:
         return len(self.labels)
 
-    def has_same_values(self, other: Axis) -> bool:
-        """Whether the places of another axis, of the same columns, have the same distinct numbers in its order."""
-        pairs = [(self.labels, other.labels), *((column, other.columns[n]) for n, column in self.columns.items())]
-        if self.states is not None or other.states is not None:
-            pairs.append((np.asarray(self.states), np.asarray(other.states)))
+    def has_same_values(self, axis: Axis) -> bool:
+        """Return True if another axis with equal column names has equal labels, columns and states, in order."""
+        pairs = [(self.labels, axis.labels), *((column, axis.columns[n]) for n, column in self.columns.items())]
+        if self.states is not None or axis.states is not None:
+            pairs.append((np.asarray(self.states), np.asarray(axis.states)))
         return all(np.array_equal(one, another) for one, another in pairs)
 
     def value_keys(self) -> list[tuple]:
-        """What tells the places along the axis apart; numbers that rounding alone tells apart are the same."""
+        """Return one hashable key per point of the axis, from its values rounded to 13 digits."""
         states = [] if self.states is None else [[tuple(map(_rounded_key, row)) for row in self.states.tolist()]]
         columns = [list(map(_rounded_key, column.tolist())) for column in self.columns.values()]
         return list(zip(*(columns + states or [self.labels.tolist()]), strict=True))
@@ -237,7 +247,7 @@ def _rounded_key(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class Axes:
-    """The axes of a study, in their order."""
+    """All axes of a study, in order; their product is the grid of points."""
 
     axes: tuple[Axis, ...]
     parameter_names: tuple[str, ...] = field(init=False)
@@ -245,29 +255,31 @@ class Axes:
     def __post_init__(self):
         names = [name for axis in self.axes for name in axis.columns]
         object.__setattr__(self, "parameter_names", tuple(names))
-        twice = [name for i, name in enumerate(names) if name in names[:i]]
-        also = [a.name for a in self.axes if a.name in names and a.name not in a.columns]
-        if twice or also:
+        duplicates = [name for i, name in enumerate(names) if name in names[:i]]
+        clashes = [a.name for a in self.axes if a.name in names and a.name not in a.columns]
+        if duplicates or clashes:
             raise InputError(
-                f"{(twice or also)[0]!r} stands for more than one thing among the axes and their parameters"
+                f"{(duplicates or clashes)[0]!r} stands for more than one thing among the axes and their parameters"
             )
 
     @classmethod
-    def from_mapping(cls, given: Mapping[str, Any]) -> Axes:
-        """From what :class:`Study` is given."""
-        if not isinstance(given, Mapping) or not given:
-            raise InputError(f'axes are a dict from names to values, such as {{"rate": [0.1, 1.0]}}, not {given!r:.60}')
-        for name, values in given.items():
-            for called in (name, *(values.columns if isinstance(values, Zipped) else ())):
-                if not is_valid_name(called):
-                    raise InputError(f"an axis cannot be called {called!r:.120}")
-        found = cls(tuple(Axis.from_values(name, values) for name, values in given.items()))
-        if found.size > MAX_POINTS:
-            shape = " x ".join(map(str, found.shape))
+    def from_mapping(cls, mapping: Mapping[str, Any]) -> Axes:
+        """Make the axes from the argument ``axes`` of :class:`Study`, and check it."""
+        if not isinstance(mapping, Mapping) or not mapping:
             raise InputError(
-                f"a study has at most {MAX_POINTS:.0e} points, and these axes have {shape}: sample them instead"
+                f'axes must be a dict from names to values, such as {{"rate": [0.1, 1.0]}}, got {mapping!r:.60}'
             )
-        return found
+        for name, values in mapping.items():
+            for key in (name, *(values.columns if isinstance(values, Zipped) else ())):
+                if not is_valid_name(key):
+                    raise InputError(f"an axis cannot be called {key!r:.120}")
+        axes = cls(tuple(Axis.from_values(name, values) for name, values in mapping.items()))
+        if axes.size > MAX_POINTS:
+            shape = " x ".join(map(str, axes.shape))
+            raise InputError(
+                f"a study has at most {MAX_POINTS:.0e} points, but these axes have {shape}. Use lt.sobol instead"
+            )
+        return axes
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -281,22 +293,23 @@ class Axes:
     def size(self) -> int:
         return math.prod(self.shape)
 
-    def parameters_at(self, places: tuple[np.ndarray, ...]) -> dict[str, np.ndarray]:
-        """The parameters at some points, whose places along each axis are given."""
+    def parameters_at(self, indices: tuple[np.ndarray, ...]) -> dict[str, np.ndarray]:
+        """Return the parameters at some points, arrays of shape (n_points,), from the points' indices along each
+        axis."""
         return {
-            name: column[i] for axis, i in zip(self.axes, places, strict=True) for name, column in axis.columns.items()
+            name: column[i] for axis, i in zip(self.axes, indices, strict=True) for name, column in axis.columns.items()
         }
 
-    def states_at(self, places: tuple[np.ndarray, ...]) -> np.ndarray | None:
-        """The initial states at some points, where an axis has some, shape (points, n)."""
+    def states_at(self, indices: tuple[np.ndarray, ...]) -> np.ndarray | None:
+        """Return the initial states at some points, shape (n_points, n), or None if no axis has states."""
         return next(
-            (axis.states[i] for axis, i in zip(self.axes, places, strict=True) if axis.states is not None), None
+            (axis.states[i] for axis, i in zip(self.axes, indices, strict=True) if axis.states is not None), None
         )
 
-    def describe_point(self, place: tuple[int, ...]) -> str:
-        """A point in words."""
+    def describe_point(self, index: tuple[int, ...]) -> str:
+        """Return the parameter values of a point as text, for messages."""
         return ", ".join(
             f"{name} = {column[i]:g}" if column.dtype.kind in "fiu" else f"{name} = {column[i]}"
-            for axis, i in zip(self.axes, place, strict=True)
+            for axis, i in zip(self.axes, index, strict=True)
             for name, column in (axis.columns or {axis.name: axis.labels}).items()
         )

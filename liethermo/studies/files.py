@@ -1,8 +1,8 @@
-"""The files of a store: arrays of Zarr v3 in a folder, every file written whole, every chunk with a checksum.
+"""Files of a store: Zarr v3 arrays in a folder, with atomic writes and a checksum in every chunk.
 
-The chunks are written here and not by the ``zarr`` package, whose writer is slow where they are small, and which
-reads a chunk that is missing as one of fill values. What is written is plain Zarr v3 with the codecs "bytes" or
-"vlen-utf8" and "crc32c", and ``zarr`` and ``xarray`` read it.
+The chunks are written here and not by the ``zarr`` package, which is slow for small chunks and reads a missing chunk as
+fill values. The files are plain Zarr v3 with the codecs "bytes" or "vlen-utf8" and "crc32c"; ``zarr`` and ``xarray``
+can read them.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from .. import disk
 from ..errors import FileError
 
 ZARR_DTYPES = ("int8", "int64", "float64", "complex128", "bool", "string")
-"""Types of Zarr that a store has."""
+"""Zarr data types that a store may contain."""
 
 MAX_CHUNK_VALUES = 2**27
-"""Numbers of a chunk."""
+"""Maximum number of values in a chunk, a limit on the memory that a foreign store can claim."""
 
 
 @dataclass(frozen=True)
 class ZarrArray:
-    """An array of a store.
+    """Metadata of one array of a store, with the encoding of its chunks.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class ZarrArray:
 
     @property
     def fill_value(self) -> Any:
-        """What stands for a value that is missing, as JSON."""
+        """The fill value of missing values, as JSON."""
         return {"float64": "NaN", "complex128": ["NaN", "NaN"], "int8": -1, "string": "", "bool": False}.get(
             self.dtype, 0
         )
@@ -69,8 +69,8 @@ class ZarrArray:
         return np.dtype(object if self.dtype == "string" else self.dtype).newbyteorder("<")
 
     def metadata(self) -> dict[str, Any]:
-        """As Zarr v3 has it."""
-        plain = {"name": "bytes", "configuration": {"endian": "little"}}
+        """Return the content of the array's ``zarr.json``."""
+        bytes_codec = {"name": "bytes", "configuration": {"endian": "little"}}
         return {
             "zarr_format": 3,
             "node_type": "array",
@@ -79,7 +79,7 @@ class ZarrArray:
             "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": list(self.chunks)}},
             "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
             "fill_value": self.fill_value,
-            "codecs": [{"name": "vlen-utf8"} if self.dtype == "string" else plain, {"name": "crc32c"}],
+            "codecs": [{"name": "vlen-utf8"} if self.dtype == "string" else bytes_codec, {"name": "crc32c"}],
             "attributes": self.attributes,
             "dimension_names": list(self.dims),
             "storage_transformers": [],
@@ -87,25 +87,26 @@ class ZarrArray:
 
     @classmethod
     def from_metadata(cls, name: str, metadata: dict[str, Any]) -> ZarrArray:
-        """From its metadata; ValueError, KeyError or TypeError where these are of another thing."""
+        """Make an array from its metadata; raise ValueError, KeyError or TypeError if a study cannot have written
+        them."""
         chunks, attributes = metadata["chunk_grid"]["configuration"]["chunk_shape"], metadata["attributes"]
         dims, shape, dtype = metadata["dimension_names"], metadata["shape"], metadata["data_type"]
-        sizes = [*shape, *chunks]
-        whole = all(type(n) is int and 0 <= n < 2**48 for n in sizes) and all(n > 0 for n in chunks)
-        if not (whole and len(shape) == len(chunks) == len(dims) and math.prod(chunks) <= MAX_CHUNK_VALUES):
+        lengths = [*shape, *chunks]
+        is_valid_shape = all(type(n) is int and 0 <= n < 2**48 for n in lengths) and all(n > 0 for n in chunks)
+        if not (is_valid_shape and len(shape) == len(chunks) == len(dims) and math.prod(chunks) <= MAX_CHUNK_VALUES):
             raise ValueError(f"the array {name!r} has shape {shape} in chunks {chunks}")
         if dtype not in ZARR_DTYPES or not isinstance(attributes, dict) or not all(isinstance(d, str) for d in dims):
             raise ValueError(f"the array {name!r} is none that a study writes")
         return cls(name, tuple(dims), tuple(shape), tuple(chunks), dtype, attributes)
 
     def chunk_path(self, index: Sequence[int]) -> str:
-        """The path of a chunk within the store."""
+        """Return the path of a chunk, relative to the store."""
         return "/".join([self.name, "c", *map(str, index)])
 
     # -- chunks ---------------------------------------------------------------------------------------------------
 
     def empty_chunk(self) -> np.ndarray:
-        """A chunk of fill values."""
+        """Return a chunk of fill values, shape ``chunks``."""
         if self.dtype == "string":
             return np.full(self.chunks, "", dtype=object)
         return np.full(
@@ -113,7 +114,7 @@ class ZarrArray:
         )
 
     def encode_chunk(self, block: np.ndarray) -> bytes:
-        """A chunk as it is in its file."""
+        """Return the bytes of a chunk's file: the encoded values and a CRC-32C checksum."""
         import google_crc32c
 
         data = (
@@ -124,7 +125,8 @@ class ZarrArray:
         return data + struct.pack("<I", google_crc32c.value(data))
 
     def decode_chunk(self, data: bytes) -> np.ndarray:
-        """A chunk from its file; ValueError or ``struct.error`` where it is damaged."""
+        """Return the values of a chunk from the bytes of its file; raise ValueError or ``struct.error`` if they are
+        damaged."""
         import google_crc32c
 
         content = data[:-4]
@@ -140,26 +142,29 @@ class ZarrArray:
 
 
 def _encode_texts(values: np.ndarray) -> bytes:
-    """As the codec "vlen-utf8" has them."""
-    encoded = [str(value).encode() for value in values]
-    return b"".join([struct.pack("<I", len(encoded)), *(struct.pack("<I", len(text)) + text for text in encoded)])
+    """Encode texts by the codec "vlen-utf8"."""
+    encoded_texts = [str(value).encode() for value in values]
+    return b"".join(
+        [struct.pack("<I", len(encoded_texts)), *(struct.pack("<I", len(text)) + text for text in encoded_texts)]
+    )
 
 
 def _decode_texts(data: bytes) -> Iterator[str]:
-    (count,), place = struct.unpack_from("<I", data), 4
+    """Yield the texts that the codec "vlen-utf8" has encoded."""
+    (count,), offset = struct.unpack_from("<I", data), 4
     if count > len(data) // 4:
         raise ValueError(f"it says that it has {count} texts")
     for _ in range(count):
-        (length,) = struct.unpack_from("<I", data, place)
-        yield data[place + 4 : place + 4 + length].decode()
-        place += 4 + length
+        (length,) = struct.unpack_from("<I", data, offset)
+        yield data[offset + 4 : offset + 4 + length].decode()
+        offset += 4 + length
 
 
 # -- files ------------------------------------------------------------------------------------------------------------
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Write a file; it appears whole or not at all.
+    """Write a file atomically: it appears complete or not at all.
 
     Raises
     ------
@@ -169,12 +174,12 @@ def write_file(path: Path, data: bytes) -> None:
     try:
         disk.write_atomically(path, data)
     except OSError as error:
-        kept = "What is done is kept; run the study again to go on"
-        raise FileError(f"cannot write {path}: {disk.why_os_failed(error)}. {kept}") from error
+        advice = "Finished chunks are saved; run the study again to continue"
+        raise FileError(f"cannot write {path}: {disk.describe_os_error(error)}. {advice}") from error
 
 
 class TemporaryFolder:
-    """A folder that is there as long as this object is."""
+    """A temporary folder that is deleted together with this object."""
 
     def __init__(self) -> None:
         self.path = Path(tempfile.mkdtemp(prefix="liethermo-study-"))
@@ -182,7 +187,7 @@ class TemporaryFolder:
 
 
 def read_plain_file(path: Path) -> bytes:
-    """The content of a plain file; a link is refused.
+    """Return the content of a regular file; links are refused.
 
     Raises
     ------
@@ -192,21 +197,21 @@ def read_plain_file(path: Path) -> bytes:
     try:
         with open(path, "rb", opener=_open_no_follow) as file:
             if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-                raise FileError(f"{path} is no file")
+                raise FileError(f"{path} is not a regular file")
             return file.read()
     except FileError:
         raise
     except OSError as error:
-        raise FileError(f"cannot read {path}: {disk.why_os_failed(error)}") from error
+        raise FileError(f"cannot read {path}: {disk.describe_os_error(error)}") from error
 
 
 def _open_no_follow(path: str, flags: int) -> int:
-    """Open no link, and do not wait for the other end of a pipe."""
+    """Open a file without following links and without waiting for the other end of a pipe."""
     return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
 
 
 def require_plain_files(root: Path) -> None:
-    """Raise FileError unless all in a store are files and folders: a link leads anywhere, and a pipe keeps waiting."""
+    """Raise FileError unless a store contains only files and folders: a link may lead outside, and a pipe may block."""
     folders = [os.fspath(root)]
     while folders:
         try:
@@ -220,15 +225,16 @@ def require_plain_files(root: Path) -> None:
         except FileError:
             raise
         except OSError as error:
-            raise FileError(f"cannot read {root}: {disk.why_os_failed(error)}") from error
+            raise FileError(f"cannot read {root}: {disk.describe_os_error(error)}") from error
 
 
 def write_json(path: Path, content: Any) -> None:
+    """Write JSON data to a file atomically."""
     write_file(path, json.dumps(content, indent=1, allow_nan=False).encode())
 
 
 def remove_parts(root: Path) -> None:
-    """Remove half-written files of killed runs: no other run works on the store."""
+    """Remove the partial files that killed runs have left; call it only while the store is locked."""
     for folder, _, files in os.walk(root):
         for name in files:
             if name.endswith(disk.PART_SUFFIX) and name.startswith("."):
@@ -239,23 +245,25 @@ def remove_parts(root: Path) -> None:
 # -- one run at a time ------------------------------------------------------------------------------------------------
 
 LOCK_FILE = ".lock"
+"""File in the store that a run locks, with its host, process id, start time and number of finished points."""
 
 
 @contextlib.contextmanager
 def lock_store(root: Path) -> Iterator[Callable[[int], None]]:
-    """Be the only run that works on a store; the operating system releases it however a run ends.
+    """Lock a store for one run; the operating system releases the lock when the process ends.
 
-    Yields a function that tells others how many points were done when the work began.
+    Yields a function ``record_run(n_done)`` that writes the run's host, process id, start time and number of finished
+    points for other processes.
 
     Raises
     ------
     FileError
-        If another run does.
+        If another run holds the lock.
     """
     try:
-        file = open(root / LOCK_FILE, "a+", opener=_open_no_follow)  # noqa: SIM115  (what follows has errors of its own)
+        file = open(root / LOCK_FILE, "a+", opener=_open_no_follow)  # noqa: SIM115  (the with block below handles other errors)
     except OSError as error:
-        raise FileError(f"cannot write into {root}: {disk.why_os_failed(error)}") from error
+        raise FileError(f"cannot write into {root}: {disk.describe_os_error(error)}") from error
     with file:
         try:
             if not _try_lock(file):
@@ -265,22 +273,26 @@ def lock_store(root: Path) -> Iterator[Callable[[int], None]]:
         except OSError as error:
             if isinstance(error, FileError):
                 raise
-            reason = disk.why_os_failed(error)
-            raise FileError(f"{root} cannot be locked ({reason}): two runs at once could not be told") from error
+            reason = disk.describe_os_error(error)
+            raise FileError(f"{root} cannot be locked ({reason}), so two runs at once would go unnoticed") from error
 
-        def tell(done: int) -> None:
-            now = {"host": socket.gethostname(), "pid": os.getpid(), "started": time.time(), "done": done}
-            with contextlib.suppress(OSError):  # a full disk shows where results are written
+        def record_run(n_done: int) -> None:
+            run_record = {"host": socket.gethostname(), "pid": os.getpid(), "started": time.time(), "done": n_done}
+            with contextlib.suppress(OSError):  # writing the results reports a full disk
                 file.truncate(0)
-                file.write(json.dumps(now))
+                file.write(json.dumps(run_record))
                 file.flush()
 
-        yield tell
+        yield record_run
 
 
-def _try_lock(file, tries: int = 5) -> bool:
-    """Whether the lock was free; somebody who looks whether it is holds it for a moment too."""
-    for _ in range(tries):
+def _try_lock(file, n_attempts: int = 5) -> bool:
+    """Try to lock a file, and return True if that succeeded.
+
+    A process that asks whether a run is active (:func:`active_run`) holds the lock for a moment, hence several
+    attempts.
+    """
+    for _ in range(n_attempts):
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             return True
@@ -290,13 +302,13 @@ def _try_lock(file, tries: int = 5) -> bool:
 
 
 def describe_lock_holder(root: Path) -> str:
-    """Who works on a store, in words."""
+    """Return the process id and host of the run that works on a store, as text."""
     run = active_run(root) or {}
     return f"process {run.get('pid', '?')} on {run.get('host', '?')}"
 
 
 def active_run(root: Path) -> dict[str, Any] | None:
-    """The run that works on a store now, as it has told; None where there is none."""
+    """Return the record of the run that works on a store, or None if there is no such run."""
     try:
         with open(root / LOCK_FILE, opener=_open_no_follow) as file:
             try:

@@ -1,4 +1,4 @@
-"""What makes a study the one that it is: by content, so that the same study is known again in another process."""
+"""Description of a study by content, so that another process recognises the store of an equal study."""
 
 from __future__ import annotations
 
@@ -16,101 +16,107 @@ import numpy as np
 from .solve import PointResults, PointSolver
 
 VALUE_RTOL = 1e-10
-"""Relative difference of numbers that another version of JAX may compute."""
+"""Relative difference up to which numbers count as equal, since JAX versions differ in rounding."""
 
 N_PROBE_STATES = 3
-"""States at which the motion of the system is looked at."""
+"""Number of sampled states, besides the initial state, at which the vector field is recorded."""
 
 
 def describe_study(solver: PointSolver, columns: PointResults, x0: np.ndarray) -> dict[str, Any]:
-    """A study as JSON data.
+    """Return a description of a study as JSON data.
 
     Parameters
     ----------
-    solver : Solver
-    columns : Columns
-        Of the example, which has been solved.
+    solver : PointSolver
+    columns : PointResults
+        Results of the example point.
     x0 : array, shape (n,)
-        Its initial state.
+        Initial state of the example point.
     """
     task, system = solver.task, solver.systems.example_system
     states = np.concatenate([x0[None], system.samples(N_PROBE_STATES, seed=1)])
     with np.errstate(all="ignore"):
-        probe = [_as_json_numbers(_system_at(system, task.t_span[0]).vector_field(x)) for x in states]
-        energies = [_as_json_numbers(system.energy.at_time(task.t_span[0]).value(x)) for x in states]
+        probe = [_to_json_numbers(_system_at(system, task.t_span[0]).vector_field(x)) for x in states]
+        energies = [_to_json_numbers(system.energy.at_time(task.t_span[0]).value(x)) for x in states]
     return {
         "versions": {name: metadata.version(name) for name in ("liethermo", "jax")},
         "system": f"{type(system).__name__}, {system.dim} components",
         "motion": probe,
         "energy": energies,
         "operations": _program_digest(solver),
-        "x0": _as_json_numbers(x0),
+        "x0": _to_json_numbers(x0),
         "t_span": list(map(float, task.t_span)),
         "step": _step_as_json(task.step),
         "method": repr(task.method),
         "until": _event_as_json(task.until),
         "noise": None if task.noise is None else task.noise.to_provenance(),
         "measures": {name: measure.description() for name, measure in task.measures.items()},
-        "values": {name: _as_json_numbers(columns.measures[name][0]) for name in task.measures},
+        "values": {name: _to_json_numbers(columns.measures[name][0]) for name in task.measures},
     }
 
 
-def provenance(described: Mapping[str, Any], engine: str) -> dict[str, Any]:
-    """Where the results come from, for people."""
-    chosen = {key: described[key] for key in ("system", "method", "step", "t_span", "until", "noise")}
+def provenance(description: Mapping[str, Any], engine: str) -> dict[str, Any]:
+    """Return the settings, versions and engine that produced the results, as attributes of the store."""
+    settings = {key: description[key] for key in ("system", "method", "step", "t_span", "until", "noise")}
     return {
-        **chosen,
-        **{f"{name}_version": version for name, version in described["versions"].items()},
+        **settings,
+        **{f"{name}_version": version for name, version in description["versions"].items()},
         "engine": engine,
     }
 
 
-def study_differences(mine: Mapping[str, Any], theirs: Mapping[str, Any]) -> list[str]:
-    """In what two studies differ, a line each; empty for the same study."""
-    same_versions = mine["versions"] == theirs["versions"]
-    found = [
-        f"{key} is {mine[key]!r:.120}, and {theirs.get(key)!r:.120} in the store"
+def study_differences(description: Mapping[str, Any], stored_description: Mapping[str, Any]) -> list[str]:
+    """Return the differences between a study and the stored one, one line each; empty if they are equal."""
+    same_versions = description["versions"] == stored_description["versions"]
+    differences = [
+        f"{key} is {description[key]!r:.120}, and {stored_description.get(key)!r:.120} in the store"
         for key in ("system", "t_span", "step", "method", "until", "noise", "measures")
-        if mine[key] != theirs.get(key)
+        if description[key] != stored_description.get(key)
     ]
-    if found:
-        return found
+    if differences:
+        return differences
     numbers = {
         "motion": "the vector field",
         "energy": "the energy",
         "x0": "the initial state",
     }
-    found += [_value_difference(what, mine[key], theirs[key]) for key, what in numbers.items()]
-    for name in set(mine["values"]) & set(theirs["values"]):
-        found.append(_value_difference(f"the measure {name!r}", mine["values"][name], theirs["values"][name]))
-    found = [line for line in found if line]
-    if not found and same_versions and mine["operations"] != theirs["operations"]:
-        found.append(
+    differences += [
+        _value_difference(label, description[key], stored_description[key]) for key, label in numbers.items()
+    ]
+    for name in set(description["values"]) & set(stored_description["values"]):
+        differences.append(
+            _value_difference(f"the measure {name!r}", description["values"][name], stored_description["values"][name])
+        )
+    differences = [line for line in differences if line]
+    if not differences and same_versions and description["operations"] != stored_description["operations"]:
+        differences.append(
             "the system has the same values at some states, and is computed by other operations than in the store: "
             "it differs elsewhere, or in rounding"
         )
-    return found
+    return differences
 
 
 def _system_at(system: Any, t: float) -> Any:
-    """A system as it is when a study begins, where its energy depends on time or a torque acts."""
+    """Return the system with its energy and torque evaluated at time t, and at the identity attitude if one is
+    needed."""
     return system.at_time(t, system.group.identity) if system.needs_attitude else system.at_time(t)
 
 
-def _value_difference(what: str, mine: list, theirs: list) -> str:
-    a, b = (np.asarray(values, dtype=np.float64).ravel() for values in (mine, theirs))
+def _value_difference(label: str, numbers: list, stored_values: list) -> str:
+    """Return a line that names the first differing number of two lists, or "" if all agree within ``VALUE_RTOL``."""
+    a, b = (np.asarray(values, dtype=np.float64).ravel() for values in (numbers, stored_values))
     if a.shape != b.shape:
-        return f"{what} has {a.size} numbers at the first point, and {b.size} in the store"
-    size = max(float(np.nanmax(np.abs(b), initial=0.0)), 1e-300)
-    unequal = ~((np.abs(a - b) <= VALUE_RTOL * size) | (a == b) | (np.isnan(a) & np.isnan(b)))
-    if not unequal.any():
+        return f"{label} has {a.size} numbers at the first point, and {b.size} in the store"
+    scale = max(float(np.nanmax(np.abs(b), initial=0.0)), 1e-300)
+    is_unequal = ~((np.abs(a - b) <= VALUE_RTOL * scale) | (a == b) | (np.isnan(a) & np.isnan(b)))
+    if not is_unequal.any():
         return ""
-    k = int(np.flatnonzero(unequal)[0])
-    return f"{what} is {a[k]:.15g} where the store has {b[k]:.15g} (at the first point)"
+    k = int(np.flatnonzero(is_unequal)[0])
+    return f"{label} is {a[k]:.15g} where the store has {b[k]:.15g} (at the first point)"
 
 
-def _as_json_numbers(values) -> list:
-    """As JSON, in which there is no NaN."""
+def _to_json_numbers(values) -> list:
+    """Return the values as a flat list of finite floats, with None for NaN and infinities, which JSON lacks."""
     array = np.asarray(values)
     if array.dtype.kind == "c":
         array = np.stack([array.real, array.imag], axis=-1)
@@ -128,30 +134,31 @@ def _event_as_json(until: Any) -> Any:
 
 
 ADDRESS_PATTERN = re.compile(r" at 0x[0-9a-f]+|\bid=\d+")
+"""Memory addresses in the text of a JAX program, which differ between processes."""
 
 
 def _program_digest(solver: PointSolver) -> str:
-    """A digest of the programs of the system and of the event, its parameters among their arguments where they are."""
+    """Return the SHA-256 digest of the JAX programs of the system and the event, and of their constants."""
     task, members = solver.task, solver.systems
     x = jax.ShapeDtypeStruct((members.example_system.dim,), np.float64)
 
     def laws(system, x):
         return system.energy.at_time(task.t_span[0]).value(x), _system_at(system, task.t_span[0]).vector_field(x)
 
-    found, numbers = [], []
+    jaxprs, constants = [], []
     if members.family is None or not task.parameter_names:
-        found.append(jax.make_jaxpr(lambda x: laws(members.example_system, x))(x))
+        jaxprs.append(jax.make_jaxpr(lambda x: laws(members.example_system, x))(x))
     else:
         family = members.family.with_builder_arrays([np.zeros(2) for _ in task.parameter_names])
         shapes = [jax.ShapeDtypeStruct(np.shape(value)[1:], np.float64) for value in family.parameter_arrays]
-        found.append(jax.make_jaxpr(lambda arrays, x: laws(family.form.rebuild(arrays), x))(shapes, x))
-        numbers = family.parameter_arrays[family.n_builder_arrays :]
+        jaxprs.append(jax.make_jaxpr(lambda arrays, x: laws(family.form.rebuild(arrays), x))(shapes, x))
+        constants = family.parameter_arrays[family.n_builder_arrays :]
     if callable(task.until):
-        found.append(jax.make_jaxpr(task.until)(x))
+        jaxprs.append(jax.make_jaxpr(task.until)(x))
     digest = hashlib.sha256()
-    for closed in found:
-        digest.update(ADDRESS_PATTERN.sub("", str(closed.jaxpr)).encode())
-        numbers += closed.consts
-    for number in numbers:
-        digest.update(np.asarray(number).tobytes())
+    for jaxpr in jaxprs:
+        digest.update(ADDRESS_PATTERN.sub("", str(jaxpr.jaxpr)).encode())
+        constants += jaxpr.consts
+    for constant in constants:
+        digest.update(np.asarray(constant).tobytes())
     return digest.hexdigest()

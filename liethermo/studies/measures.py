@@ -1,4 +1,4 @@
-"""What is kept of every point of a study."""
+"""Measures: the results that a study keeps of each point."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ NAMED_MEASURES = {
     "steps": "steps taken",
     "iterations": "iterations of the solver",
 }
-"""Measures that have a name of their own, and what they are."""
+"""Built-in measures by name, each with its description."""
 
 
 @dataclass(frozen=True)
 class At:
-    """The measure of values at given times: steps are made to end there.
+    """The measure of values at given times; steps are shortened to end there.
 
     Parameters
     ----------
@@ -48,40 +48,40 @@ class At:
     def __post_init__(self):
         times = np.asarray(self.times, dtype=np.float64)
         if times.ndim != 1 or not len(times) or not np.isfinite(times).all() or (np.diff(times) <= 0.0).any():
-            raise InputError(f"the times of a measure are finite and increase, and are not {self.times!r:.80}")
+            raise InputError(f"the times of lt.At must be finite and increasing, got {self.times!r:.80}")
         if self.what not in ("x", "energy", "entropy", "attitude"):
-            raise InputError(f"At keeps x, energy, entropy or attitude, not {self.what!r}")
+            raise InputError(f"what must be x, energy, entropy or attitude, got {self.what!r}")
         object.__setattr__(self, "times", tuple(times.tolist()))
 
 
 class Measure(ABC):
-    """One measure.
+    """Base class of the measures of a study.
 
     Attributes
     ----------
     needs_path : bool
-        Whether it needs the states along the run.
+        True if the measure needs the states along the run.
     """
 
     needs_path: ClassVar[bool] = False
 
     @property
     def needs_final_state(self) -> bool:
-        """Whether it needs the last state."""
+        """True if the measure needs the final state."""
         return False
 
     @abstractmethod
     def __call__(self, ensemble: Ensemble, count: int) -> tuple[np.ndarray, dict[int, str]]:
-        """Its values of at least the first ``count`` trajectories, and why it has none of some of them."""
+        """Return the values of at least the first ``count`` trajectories, and the reasons of failed ones by index."""
 
     @abstractmethod
     def description(self) -> str:
-        """What it is, in words that tell it from another."""
+        """Return a text that identifies the measure."""
 
 
 @dataclass(frozen=True)
 class EnsembleField(Measure):
-    """A field of an ensemble."""
+    """A measure that reads a field of the ensemble."""
 
     name: str
 
@@ -93,7 +93,7 @@ class EnsembleField(Measure):
         field = {"final": "x"}.get(self.name, self.name.removeprefix("final_"))
         values = getattr(ensemble, field)
         if values is None:
-            raise InputError(f"this system has no {field}, so that {self.name!r} is no measure of it")
+            raise InputError(f"the system has no {field}, so the measure {self.name!r} does not exist")
         return _final_values(values, ensemble) if self.name.startswith("final") or self.name == "work" else values, {}
 
     def description(self) -> str:
@@ -101,16 +101,16 @@ class EnsembleField(Measure):
 
 
 def _final_values(values: np.ndarray, ensemble: Ensemble) -> np.ndarray:
-    """The values where each trajectory ended."""
+    """Return the values at the last saved time of each trajectory."""
     if ensemble.energy.ndim == 1:
         return values
-    last = np.maximum(np.isfinite(ensemble.energy).sum(axis=1) - 1, 0)
-    return values[np.arange(len(values)), last]
+    last_index = np.maximum(np.isfinite(ensemble.energy).sum(axis=1) - 1, 0)
+    return values[np.arange(len(values)), last_index]
 
 
 @dataclass(frozen=True)
 class EventTime(Measure):
-    """When the event of the study happened; NaN where it did not."""
+    """A measure of the time of the study's event; NaN if the event did not occur."""
 
     event: str
 
@@ -123,7 +123,7 @@ class EventTime(Measure):
 
 @dataclass(frozen=True)
 class ValuesAtTimes(Measure):
-    """Values at given times."""
+    """A measure of values at given times."""
 
     at: At
 
@@ -133,8 +133,8 @@ class ValuesAtTimes(Measure):
         values = getattr(ensemble, self.at.what)
         if values is None:
             raise InputError(f"this system has no {self.at.what}")
-        places = [int(np.argmin(np.abs(ensemble.t - t))) for t in self.at.times]
-        return values[:, places], {}
+        indices = [int(np.argmin(np.abs(ensemble.t - t))) for t in self.at.times]
+        return values[:, indices], {}
 
     def description(self) -> str:
         return f"{self.at.what} at {list(self.at.times)}"
@@ -142,13 +142,14 @@ class ValuesAtTimes(Measure):
 
 @dataclass(frozen=True)
 class SolutionMeasure(Measure):
-    """A user's function of a solution, to a number or an array of a fixed shape.
+    """A measure computed by a user's function of a :class:`Solution`.
 
     Attributes
     ----------
     function : function
+        Returns a number, or an array of a fixed shape.
     example_value : ndarray, optional
-        What it returned at the first point that was run: of this shape and kind it is at all others, or has failed.
+        The value at the example point. A value of another shape, or complex where this is real, is a failure.
     """
 
     function: Callable
@@ -157,25 +158,25 @@ class SolutionMeasure(Measure):
     needs_path = True
 
     def __call__(self, ensemble: Ensemble, count: int) -> tuple[np.ndarray, dict[int, str]]:
-        found: dict[int, np.ndarray] = {}
+        values_by_index: dict[int, np.ndarray] = {}
         reasons: dict[int, str] = {}
-        like = self.example_value
+        example = self.example_value
         for i in range(count):
             try:
                 value = np.asarray(self.function(ensemble.member_solution(i)))
                 if value.dtype.kind not in "fiubc":
                     raise TypeError(f"it returned {value.dtype}, not numbers")
-                like = value if like is None else like
-                if value.shape != like.shape or (value.dtype.kind == "c") > (like.dtype.kind == "c"):
+                example = value if example is None else example
+                if value.shape != example.shape or (value.dtype.kind == "c") > (example.dtype.kind == "c"):
                     raise TypeError(
-                        f"it returned {_describe_array(value)}, and {_describe_array(like)} at the first point"
+                        f"it returned {_describe_array(value)}, but {_describe_array(example)} at the first point"
                     )
-                found[i] = value
-            except Exception as error:  # the function may be anyone's, and this is the status of one point
+                values_by_index[i] = value
+            except Exception as error:  # user code; its error becomes the status of this point
                 reasons[i] = f"{self._function_name} raised {type(error).__name__}: {error}"
-        like = np.asarray(np.nan) if like is None else like
-        values = np.full((len(ensemble), *like.shape), np.nan, dtype=np.result_type(np.float64, like))
-        for i, value in found.items():
+        example = np.asarray(np.nan) if example is None else example
+        values = np.full((len(ensemble), *example.shape), np.nan, dtype=np.result_type(np.float64, example))
+        for i, value in values_by_index.items():
             values[i] = value
         return values, reasons
 
@@ -191,42 +192,43 @@ def _describe_array(value: np.ndarray) -> str:
     return f"{'complex' if value.dtype.kind == 'c' else 'real'} numbers of shape {value.shape}"
 
 
-def parse_measures(given: Mapping[str, Any], until: Any) -> tuple[dict[str, Measure], Any]:
-    """The measures that :class:`Study` is given, by name, and the event at which its runs end.
+def parse_measures(specification: Mapping[str, Any], until: Any) -> tuple[dict[str, Measure], Any]:
+    """Return the measures of a :class:`Study` by name, and the event at which its runs end.
 
     Raises
     ------
     InputError
-        If one is none, or two of them want the runs to end at different events.
+        If a measure is invalid, or two of them end the runs at different events.
     """
-    if not isinstance(given, Mapping) or not given:
+    if not isinstance(specification, Mapping) or not specification:
         raise InputError(
-            f'measure is a dict such as {{"final": "final", "relaxed": lt.Relaxed(1e-8)}}, not {given!r:.60}'
+            'measure must be a dict such as {"final": "final", "relaxed": lt.Relaxed(1e-8)}, '
+            f"got {specification!r:.60}"
         )
-    found: dict[str, Measure] = {}
-    for name, measure in given.items():
+    measures: dict[str, Measure] = {}
+    for name, measure in specification.items():
         if isinstance(measure, Relaxed):
             if until is not None and until != measure:
                 raise InputError(f"the measure {name!r} ends each run at {measure}, but {until!r} is to end it too")
             until = measure
-    for name, measure in given.items():
+    for name, measure in specification.items():
         if not is_valid_name(name):
             raise InputError(f"a measure cannot be called {name!r:.120}")
         if isinstance(measure, Relaxed):
-            found[name] = EventTime(f"relaxation, to a rate below {measure.tol:g}")
+            measures[name] = EventTime(f"relaxation, to a rate below {measure.tol:g}")
         elif isinstance(measure, At):
-            found[name] = ValuesAtTimes(measure)
+            measures[name] = ValuesAtTimes(measure)
         elif isinstance(measure, str) and measure in NAMED_MEASURES:
-            found[name] = EnsembleField(measure)
+            measures[name] = EnsembleField(measure)
         elif measure == "event_time" and until is not None:
-            found[name] = EventTime("the event")
+            measures[name] = EventTime("the event")
         elif callable(measure):
-            found[name] = SolutionMeasure(measure)
+            measures[name] = SolutionMeasure(measure)
         else:
             raise InputError(
-                f"the measure {name!r} is lt.Relaxed(tol), lt.At(times), a function of a solution, or one of "
+                f"the measure {name!r} must be lt.Relaxed(tol), lt.At(times), a function of a solution, or one of "
                 f"{', '.join(NAMED_MEASURES)}"
                 + (", event_time" if until is not None else "")
-                + f"; not {measure!r:.60}"
+                + f", got {measure!r:.60}"
             )
-    return found, until
+    return measures, until

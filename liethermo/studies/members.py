@@ -1,4 +1,4 @@
-"""From the points of a study to systems and initial states, all at once where one program builds them."""
+"""Systems and initial states at the points of a study, built by one traced program if possible."""
 
 from __future__ import annotations
 
@@ -19,15 +19,17 @@ from ..runs.family import Family, named_parameters
 from ..systems import System
 
 FIXED_BATCH_SIZE = 8192
-"""Points that XLA's programs take at once, always as many: results must not depend on where in a batch a point is."""
+"""Points per call of a compiled program, constant so that results do not depend on the position in a batch."""
 
 UNKNOWN_PARAMETER_TEXT = "and no parameter of an axis is called so"
+"""Part of the error message by which an unknown parameter is recognised."""
 
 PointParameters = Mapping[str, np.ndarray]
+"""Parameters of several points: arrays of shape (n_points,) by name."""
 
 
 class AccessRecorder(dict):
-    """A dict that knows which of its entries have been looked at, and says which there are."""
+    """A dict that records which entries have been read, and names all entries in the error for a missing one."""
 
     def __init__(self, entries: Mapping[str, Any]):
         super().__init__(entries)
@@ -44,7 +46,7 @@ class AccessRecorder(dict):
         self.accessed_names.add(name)
         return super().get(name, default)
 
-    def __iter__(self):  # so that ** does not go round __getitem__
+    def __iter__(self):  # without it, ** would bypass __getitem__
         return super().__iter__()
 
     def keys(self):
@@ -60,29 +62,37 @@ class AccessRecorder(dict):
 
 
 def system_builder(build: System | Callable[[dict], System], parameters: tuple[str, ...]) -> Callable[[dict], System]:
-    """The function from a point to its system; of a system, one that changes its parameters.
+    """Return a function from the parameters of a point to its system.
+
+    If ``build`` is a system, the function replaces the named parameters in it.
 
     Raises
     ------
     InputError
-        If the system has no parameter of a name, or neither it nor a function was given.
+        If the system has no parameter of a name, or ``build`` is neither a system nor a function.
     """
     if not isinstance(build, System):
         if not callable(build):
-            raise InputError(f"a study takes a system, or a function that builds one, not {build!r:.60}")
+            raise InputError(f"build must be a system, or a function that returns one, got {build!r:.60}")
         return build
     leaves = {name: value.shape for name, value in named_parameters(build).items()}
-    places = {}
+    targets = {}
     for name in parameters:
         # the name of a leaf may end with an index too, such as numbers[0]
         entries = (re.fullmatch(re.escape(leaf) + r"((?:\[\d+\])*)", name) for leaf in leaves)
         matches = {entry.string[: entry.start(1)]: _parse_index(entry[1]) for entry in entries if entry is not None}
-        whole, index = next(((w, i) for w, i in matches.items() if len(i) == len(leaves[w])), (name, ()))
-        if whole not in leaves or len(index) != len(leaves[whole]) or any(map(int.__ge__, index, leaves[whole])):
-            known = ", ".join(leaf + "".join(f"[0..{m - 1}]" for m in shape) for leaf, shape in leaves.items())
-            raise InputError(f"the system has no parameter {name!r} that is one number; it has {known}")
-        places[name] = whole, index
-    return functools.partial(_with_parameters, build, places)
+        leaf_name, index = next(
+            ((candidate, i) for candidate, i in matches.items() if len(i) == len(leaves[candidate])), (name, ())
+        )
+        if (
+            leaf_name not in leaves
+            or len(index) != len(leaves[leaf_name])
+            or any(map(int.__ge__, index, leaves[leaf_name]))
+        ):
+            available = ", ".join(leaf + "".join(f"[0..{m - 1}]" for m in shape) for leaf, shape in leaves.items())
+            raise InputError(f"the system has no parameter {name!r} that is one number; it has {available}")
+        targets[name] = leaf_name, index
+    return functools.partial(_with_parameters, build, targets)
 
 
 def _parse_index(text: str) -> tuple[int, ...]:
@@ -90,36 +100,36 @@ def _parse_index(text: str) -> tuple[int, ...]:
 
 
 def _with_parameters(
-    system: System, places: Mapping[str, tuple[str, tuple[int, ...]]], point: Mapping[str, Any]
+    system: System, targets: Mapping[str, tuple[str, tuple[int, ...]]], point: Mapping[str, Any]
 ) -> System:
-    """The system with the parameters of a point."""
+    """Return the system with the parameters of a point; ``targets`` holds the leaf name and index of each parameter."""
     dynamic, static = eqx.partition(system, eqx.is_inexact_array)
     paths, structure = jax.tree_util.tree_flatten_with_path(dynamic)
     leaves = {jax.tree_util.keystr(path).removeprefix("."): leaf for path, leaf in paths}
-    for name, (whole, index) in places.items():
-        leaves[whole] = jnp.asarray(leaves[whole]).at[index].set(point[name])
+    for name, (leaf_name, index) in targets.items():
+        leaves[leaf_name] = jnp.asarray(leaves[leaf_name]).at[index].set(point[name])
     return eqx.combine(jax.tree_util.tree_unflatten(structure, list(leaves.values())), static)
 
 
 class StudySystems:
-    """The systems of a study.
+    """Systems at the points of a study.
 
     Parameters
     ----------
     build : function from the dict of a point to a System
     parameters : tuple of str
-        The entries of the dict.
-    example_system : dict
-        A point at which the system can be built. What a method looks at in a system it looks at in this one, for all.
+        Names of the entries of the dict.
+    example : dict
+        A point at which the system can be built. Properties that all systems share are read from this system.
 
     Attributes
     ----------
     example_system : System
     family : Family or None
-        Of all systems, where one traced program builds them. None where the builder has to see the values: a Python
-        ``if``, an integer, a text. Each point is then built by itself.
+        The family of all systems, if one traced program builds them. None if the builder needs the values, for example
+        in a Python ``if``, as an integer or as a text; each system is then built separately.
     why_no_family : str
-        Why there is no family.
+        The reason why there is no family.
     """
 
     def __init__(self, build: Callable[[dict], System], parameters: tuple[str, ...], example: Mapping[str, Any]):
@@ -128,79 +138,79 @@ class StudySystems:
         self.family: Family | None = None
         self.why_no_family = ""
         try:
-            given = {name: np.full(2, example[name], dtype=np.float64) for name in parameters}
+            example_columns = {name: np.full(2, example[name], dtype=np.float64) for name in parameters}
             family = (
-                Family.from_function(self._build_system, given)
-                if given
+                Family.from_function(self._build_system, example_columns)
+                if example_columns
                 else Family.from_arguments(self.example_system, None)
             )
-            if given:
+            if example_columns:
                 self._conditions = _ParameterConditions(self._build_system, parameters)
                 family = family.trace_builder()
             self.family = replace(family, example=self.example_system)
-        except Exception as error:  # whatever a builder does with a tracer; with numbers it will say what is wrong
+        except Exception as error:  # any error of a builder that cannot be traced; it is called with numbers instead
             self.why_no_family = f"{type(error).__name__}: {error}".partition("\n")[0]
 
     def _build_system(self, point: Mapping[str, Any]) -> System:
         return self._build(AccessRecorder(point))
 
     def system_at(self, point: Mapping[str, Any]) -> System:
-        """The system at a point, whose constructors check what they are given."""
-        system = self._build_system(as_python_values(point))
+        """Build the system at a point, with the checks of its constructors."""
+        system = self._build_system(to_python_values(point))
         if not isinstance(system, System):
-            raise InputError(f"the builder must return a system, not {type(system).__name__}")
+            raise InputError(f"the builder must return a system, got {type(system).__name__}")
         return system
 
-    def inadmissible_points(self, points: PointParameters, size: int) -> dict[int, str]:
-        """The points whose parameters are not admissible, and why; known where there is a family."""
-        return self._conditions(points, size) if self._parameters else {}
+    def inadmissible_points(self, points: PointParameters, n_points: int) -> dict[int, str]:
+        """Return the reason for each point whose parameters violate a condition, by index; needs a family."""
+        return self._conditions(points, n_points) if self._parameters else {}
 
-    def family_at(self, points: PointParameters, chosen: np.ndarray) -> Family:
-        """The family of some points."""
+    def family_at(self, points: PointParameters, indices: np.ndarray) -> Family:
+        """Return the family of the points at ``indices``."""
         assert self.family is not None
-        names = sorted(self._parameters)  # as JAX has dicts
-        return self.family.with_builder_arrays([np.asarray(points[name][chosen], dtype=np.float64) for name in names])
+        names = sorted(self._parameters)  # the order in which JAX flattens a dict
+        return self.family.with_builder_arrays([np.asarray(points[name][indices], dtype=np.float64) for name in names])
 
 
-def as_python_values(point: Mapping[str, Any]) -> dict[str, Any]:
-    """A point with Python's own numbers and texts."""
+def to_python_values(point: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the point with NumPy scalars converted to Python numbers and texts."""
     return {name: value.item() if isinstance(value, np.generic) else value for name, value in point.items()}
 
 
-def evaluate_in_batches(function: Callable, points: PointParameters, size: int) -> list[np.ndarray]:
-    """What a compiled function of points gives, lot by lot: its arrays one after another."""
-    found = []
-    for start in range(0, size, FIXED_BATCH_SIZE):
-        rows = np.minimum(np.arange(start, start + FIXED_BATCH_SIZE), size - 1)
-        lot = {name: np.asarray(values, dtype=np.float64)[rows] for name, values in points.items()}
-        found.append([np.asarray(array)[: size - start] for array in jax.tree_util.tree_leaves(function(lot))])
-    return [np.concatenate(parts) for parts in zip(*found, strict=True)]
+def evaluate_in_batches(function: Callable, points: PointParameters, n_points: int) -> list[np.ndarray]:
+    """Evaluate a compiled function at all points in batches of ``FIXED_BATCH_SIZE``; return its output arrays."""
+    batches = []
+    for start in range(0, n_points, FIXED_BATCH_SIZE):
+        rows = np.minimum(np.arange(start, start + FIXED_BATCH_SIZE), n_points - 1)
+        batch = {name: np.asarray(values, dtype=np.float64)[rows] for name, values in points.items()}
+        batches.append([np.asarray(array)[: n_points - start] for array in jax.tree_util.tree_leaves(function(batch))])
+    return [np.concatenate(columns) for columns in zip(*batches, strict=True)]
 
 
 class _ParameterConditions:
-    """The conditions that a builder states about its parameters, at any points."""
+    """The conditions that a builder imposes on its parameters, compiled for many points."""
 
     def __init__(self, build: Callable, parameters: tuple[str, ...]):
         self._messages: list[str] = []
 
         def conditions(point):
-            with collect_conditions() as noted:
+            with collect_conditions() as collected:
                 build(point)
-            self._messages = [condition.message for condition in noted]
-            return [(condition.holds, condition.value) for condition in noted]
+            self._messages = [condition.message for condition in collected]
+            return [(condition.holds, condition.value) for condition in collected]
 
         jax.eval_shape(conditions, {name: jax.ShapeDtypeStruct((), np.float64) for name in parameters})
         self._evaluate = jax.jit(jax.vmap(conditions))
 
-    def __call__(self, points: PointParameters, size: int) -> dict[int, str]:
+    def __call__(self, points: PointParameters, n_points: int) -> dict[int, str]:
         if not self._messages:
             return {}
-        found: dict[int, str] = {}
-        results = evaluate_in_batches(self._evaluate, points, size)
+        reasons: dict[int, str] = {}
+        results = evaluate_in_batches(self._evaluate, points, n_points)
         for k, message in enumerate(self._messages):
             for i in map(int, np.flatnonzero(~results[2 * k])):
-                found.setdefault(i, refusal_message(message, results[2 * k + 1][i]))
-        return found
+                reasons.setdefault(i, refusal_message(message, results[2 * k + 1][i]))
+        return reasons
 
 
 class PointwiseArrays:
@@ -210,46 +220,48 @@ class PointwiseArrays:
     ----------
     source : array, or function from the dict of a point to one
     parameters : tuple of str
-    what : str
-        For messages.
+    label : str
+        Name of the quantity, for messages.
     example : dict
-        A point: where one of its entries is a text, or there are none, the function is not traced.
+        A point. If it is empty or contains a text, the function is not traced.
     """
 
-    def __init__(self, given: Any, parameters: tuple[str, ...], what: str, example: Mapping[str, Any]):
-        self.source, self._parameters, self._label = given, parameters, what
+    def __init__(self, source: Any, parameters: tuple[str, ...], label: str, example: Mapping[str, Any]):
+        self.source, self._parameters, self._label = source, parameters, label
         self._evaluate_batch = None
-        if callable(given) and parameters and not any(isinstance(value, str) for value in example.values()):
+        if callable(source) and parameters and not any(isinstance(value, str) for value in example.values()):
             scalar = {name: jax.ShapeDtypeStruct((), np.float64) for name in parameters}
             try:
                 jax.eval_shape(self._evaluate_point, scalar)
                 self._evaluate_batch = jax.jit(jax.vmap(self._evaluate_point))
-            except Exception:  # NumPy, random numbers, texts: such a function is called with the numbers of each point
+            except Exception:  # functions that use NumPy, random numbers or texts are called point by point
                 pass
 
     def _evaluate_point(self, point):
         return jnp.asarray(self.source(AccessRecorder(point)))
 
-    def __call__(self, points: PointParameters, size: int) -> tuple[np.ndarray, dict[int, str]]:
-        """At some points, one row for each; and where there is none that can be used, and why."""
+    def __call__(self, points: PointParameters, n_points: int) -> tuple[np.ndarray, dict[int, str]]:
+        """Return the arrays at some points, shape (n_points, ...), and the reasons of failed points by index."""
         if not callable(self.source):
-            return np.broadcast_to(np.asarray(self.source), (size, *np.shape(self.source))), {}
+            return np.broadcast_to(np.asarray(self.source), (n_points, *np.shape(self.source))), {}
         if self._evaluate_batch is not None:
-            (rows,) = evaluate_in_batches(self._evaluate_batch, {name: points[name] for name in self._parameters}, size)
+            (rows,) = evaluate_in_batches(
+                self._evaluate_batch, {name: points[name] for name in self._parameters}, n_points
+            )
             return rows, {}
-        found: list[Any] = []
+        arrays: list[Any] = []
         reasons: dict[int, str] = {}
-        for i in range(size):
+        for i in range(n_points):
             try:
-                found.append(
-                    np.asarray(self.source(AccessRecorder(as_python_values({n: v[i] for n, v in points.items()}))))
+                arrays.append(
+                    np.asarray(self.source(AccessRecorder(to_python_values({n: v[i] for n, v in points.items()}))))
                 )
-            except Exception as error:  # the function may be anyone's, and this is the status of one point
+            except Exception as error:  # user code; its error becomes the status of this point
                 reasons[i] = f"{self._label} raised {type(error).__name__}: {error}"
-                found.append(None)
-        good = next((row for row in found if row is not None), np.zeros(0))
-        for i, row in enumerate(found):
-            if row is not None and row.shape != good.shape:
-                reasons[i] = f"{self._label} has shape {row.shape}, and {good.shape} at other points"
-        filled = [good if i in reasons else row for i, row in enumerate(found)]
-        return np.array(filled, dtype=np.float64), reasons
+                arrays.append(None)
+        example = next((row for row in arrays if row is not None), np.zeros(0))
+        for i, row in enumerate(arrays):
+            if row is not None and row.shape != example.shape:
+                reasons[i] = f"{self._label} has shape {row.shape}, but {example.shape} at other points"
+        rows_or_example = [example if i in reasons else row for i, row in enumerate(arrays)]
+        return np.array(rows_or_example, dtype=np.float64), reasons

@@ -1,4 +1,4 @@
-"""The chunks of a study done: here on all cores, or by the workers of a Dask cluster, which write their own."""
+"""Execution of the chunks of a study: in this process on all cores, or by the workers of a Dask cluster."""
 
 from __future__ import annotations
 
@@ -19,30 +19,29 @@ from .solve import NOT_COMPUTED, PointSolver, StudyTask, cached_solver
 from .store import StoreSurvey, StudyStore
 
 TARGET_PORTION_SECONDS = 2.0
-"""What is done between two looks at the clock, by one worker: chunks are taken together up to there."""
+"""Target duration in seconds of a portion, the chunks that a worker solves together."""
 
 MAX_POINTS_PER_PORTION = 65_536
-"""Points up to which chunks are taken together."""
+"""Maximum number of points in a portion."""
 
 MAX_PORTION_GROWTH = 4
-"""Factor by which so many more chunks are tried together."""
+"""Maximum factor by which the number of chunks grows from one portion to the next."""
 
 
 @dataclass(frozen=True)
 class ChunkTask:
-    """The points of a chunk that are to be done.
+    """The points of a chunk that have to be solved.
 
     Attributes
     ----------
     chunk_index : tuple of int
-        Of the chunk.
     is_partial : bool
-        Whether other points of the chunk are done.
+        True if other points of the chunk are finished and have to be preserved.
     point_indices : tuple of ndarray, shape (m,)
-        Along each axis.
+        Indices of the points along each axis.
     parameters : dict of ndarray, shape (m,)
-        The parameters there.
     states : ndarray, shape (m, n), or None
+        Initial states from an axis of replicas.
     """
 
     chunk_index: tuple[int, ...]
@@ -52,66 +51,69 @@ class ChunkTask:
     states: np.ndarray | None
 
     @classmethod
-    def from_chunk(cls, store: StudyStore, axes: Axes, number: int, keep: bool) -> ChunkTask:
+    def from_chunk(cls, store: StudyStore, axes: Axes, number: int, is_partial: bool) -> ChunkTask:
+        """Make the task of a chunk, given by its number; if it is partial, only of its missing points."""
         index = store.chunk_index(number)
-        wanted = store.read_chunk("status", index) == NOT_COMPUTED if keep else None
-        places = store.point_indices(index, wanted)
-        return cls(index, keep, places, axes.parameters_at(places), axes.states_at(places))
+        is_missing = store.read_chunk("status", index) == NOT_COMPUTED if is_partial else None
+        indices = store.point_indices(index, is_missing)
+        return cls(index, is_partial, indices, axes.parameters_at(indices), axes.states_at(indices))
 
     def __len__(self) -> int:
         return len(self.point_indices[0])
 
 
-def solve_chunks(solver: PointSolver, store: StudyStore, works: Sequence[ChunkTask]) -> tuple[int, float]:
-    """Solve the points of some chunks together, and write each chunk; how many they were, and the seconds taken."""
-    started = time.perf_counter()
-    names = works[0].parameters
-    points = {name: np.concatenate([work.parameters[name] for work in works]) for name in names}
-    states = None if works[0].states is None else np.concatenate([w.states for w in works if w.states is not None])
-    sizes = [len(work) for work in works]
+def solve_chunks(solver: PointSolver, store: StudyStore, tasks: Sequence[ChunkTask]) -> tuple[int, float]:
+    """Solve the points of several chunks together and write each chunk; return the number of points and the seconds."""
+    start_time = time.perf_counter()
+    names = tasks[0].parameters
+    points = {name: np.concatenate([task.parameters[name] for task in tasks]) for name in names}
+    states = (
+        None if tasks[0].states is None else np.concatenate([task.states for task in tasks if task.states is not None])
+    )
+    counts = [len(task) for task in tasks]
     noise, seeds = solver.task.noise, None
     if noise is not None:
         seeds = noise.grid_seeds(
-            [np.concatenate(column) for column in zip(*(work.point_indices for work in works), strict=True)]
+            [np.concatenate(column) for column in zip(*(task.point_indices for task in tasks), strict=True)]
         )
-    arrays = solver.solve(points, states, sum(sizes), seeds).as_arrays()
+    arrays = solver.solve(points, states, sum(counts), seeds).arrays_by_name()
     start = 0
-    for work, size in zip(works, sizes, strict=True):
-        own = {name: values[start : start + size] for name, values in arrays.items()}
-        store.write_chunk(work.chunk_index, work.point_indices, own, work.is_partial)
-        start += size
-    return sum(sizes), time.perf_counter() - started
+    for task, count in zip(tasks, counts, strict=True):
+        chunk_arrays = {name: values[start : start + count] for name, values in arrays.items()}
+        store.write_chunk(task.chunk_index, task.point_indices, chunk_arrays, task.is_partial)
+        start += count
+    return sum(counts), time.perf_counter() - start_time
 
 
 class _ChunkPortions:
-    """Chunks taken together, as many as take about :data:`TARGET_PORTION_SECONDS`."""
+    """Iterator over lists of chunks, each of which takes about :data:`TARGET_PORTION_SECONDS`."""
 
     def __init__(self, store: StudyStore, axes: Axes, survey: StoreSurvey):
         self._store, self._axes, self._remaining_chunks = store, axes, iter(survey.remaining_chunks)
         self._n_chunks = 1
-        chunk = int(np.prod(store.arrays["status"].chunks))
-        self._max_chunks = max(1, MAX_POINTS_PER_PORTION // chunk)
+        chunk_size = int(np.prod(store.arrays["status"].chunks))
+        self._max_chunks = max(1, MAX_POINTS_PER_PORTION // chunk_size)
 
     def __iter__(self) -> Iterator[list[ChunkTask]]:
         while True:
-            taken = list(itertools.islice(self._remaining_chunks, self._n_chunks))
-            if not taken:
+            chunks = list(itertools.islice(self._remaining_chunks, self._n_chunks))
+            if not chunks:
                 return
-            yield [ChunkTask.from_chunk(self._store, self._axes, number, keep) for number, keep in taken]
+            yield [ChunkTask.from_chunk(self._store, self._axes, number, is_partial) for number, is_partial in chunks]
 
-    def record_duration(self, chunks: int, seconds: float) -> None:
-        """Note how long some chunks took."""
-        wanted = int(chunks * TARGET_PORTION_SECONDS / max(seconds, 1e-9))
-        self._n_chunks = max(1, min(wanted, MAX_PORTION_GROWTH * self._n_chunks, self._max_chunks))
+    def record_duration(self, n_chunks: int, seconds: float) -> None:
+        """Adapt the number of chunks in a portion to the time that some chunks took."""
+        target_chunks = int(n_chunks * TARGET_PORTION_SECONDS / max(seconds, 1e-9))
+        self._n_chunks = max(1, min(target_chunks, MAX_PORTION_GROWTH * self._n_chunks, self._max_chunks))
 
 
 def run_locally(solver: PointSolver, store: StudyStore, axes: Axes, survey: StoreSurvey, bar: StudyProgressBar) -> None:
-    """Do the chunks in this process, on all its cores."""
+    """Solve the remaining chunks in this process, on all cores."""
     portions = _ChunkPortions(store, axes, survey)
-    for works in portions:
-        points, seconds = solve_chunks(solver, store, works)
-        portions.record_duration(len(works), seconds)
-        bar.advance(points)
+    for tasks in portions:
+        n_points, seconds = solve_chunks(solver, store, tasks)
+        portions.record_duration(len(tasks), seconds)
+        bar.advance(n_points)
 
 
 # -- on a cluster -----------------------------------------------------------------------------------------------------
@@ -120,31 +122,31 @@ def run_locally(solver: PointSolver, store: StudyStore, axes: Axes, survey: Stor
 def run_on_cluster(
     task: StudyTask, store: StudyStore, axes: Axes, survey: StoreSurvey, bar: StudyProgressBar, client: Any
 ) -> None:
-    """Do the chunks on the workers of a cluster, each of which writes its own.
+    """Solve the remaining chunks on the workers of a cluster, each of which writes its own chunks.
 
     Raises
     ------
     FileError
-        If a worker does not see the store.
+        If a worker cannot access the store.
     LiethermoError
-        If a portion of the chunks has been lost with several workers.
+        If several workers died while they solved a portion.
     """
     import cloudpickle
     from distributed import as_completed
     from distributed.scheduler import KilledWorker
 
-    packed = cloudpickle.dumps(task)
+    pickled_task = cloudpickle.dumps(task)
     portions = _ChunkPortions(store, axes, survey)
-    coming = iter(portions)
+    task_lists = iter(portions)
     running = as_completed()
     chunks: dict[str, int] = {}
 
     def submit() -> bool:
-        works = next(coming, None)
-        if works is None:
+        tasks = next(task_lists, None)
+        if tasks is None:
             return False
-        future = client.submit(_solve_on_worker, packed, str(store.root), works, pure=False)
-        chunks[future.key] = len(works)
+        future = client.submit(_solve_on_worker, pickled_task, str(store.root), tasks, pure=False)
+        chunks[future.key] = len(tasks)
         running.add(future)
         return True
 
@@ -153,18 +155,18 @@ def run_on_cluster(
             pass
         for future in running:
             try:
-                points, seconds = future.result()
+                n_points, seconds = future.result()
             except ImportError as error:
                 raise LiethermoError(
-                    f"a worker cannot import what builds the systems ({error}): install it where the workers run"
+                    f"a worker cannot import the module that builds the systems: {error}. Install it on the workers"
                 ) from error
             except KilledWorker as error:
                 raise LiethermoError(
-                    f"the workers that took the same {chunks[future.key]} chunks died, one after another: they may "
-                    f"lack memory; smaller chunks (chunk=...) need less. What is done is kept. {error}"
+                    f"several workers died while they solved {chunks[future.key]} chunks, perhaps for lack of memory. "
+                    f"Use smaller chunks (chunk=...). Finished chunks are saved. {error}"
                 ) from error
             portions.record_duration(chunks.pop(future.key), seconds)
-            bar.advance(points)
+            bar.advance(n_points)
             while running.count() < 2 * _n_cluster_threads(client) and submit():
                 pass
     finally:
@@ -175,12 +177,12 @@ def _n_cluster_threads(client: Any) -> int:
     return max(1, sum(client.nthreads().values()))
 
 
-def _solve_on_worker(packed: bytes, root: str, works: list[ChunkTask]) -> tuple[int, float]:
-    """What a worker does: every one of its threads has one such task, so that each ensemble takes one thread."""
+def _solve_on_worker(pickled_task: bytes, root: str, tasks: list[ChunkTask]) -> tuple[int, float]:
+    """Solve chunks on a worker, with one thread per ensemble because each thread of the worker runs a task."""
     if not Path(root).is_dir():
         raise FileError(f"this worker does not see {root}: the store must be in a folder that all machines share")
     token = MAX_THREADS.set(1)
     try:
-        return solve_chunks(cached_solver(packed), StudyStore.open(Path(root)), works)
+        return solve_chunks(cached_solver(pickled_task), StudyStore.open(Path(root)), tasks)
     finally:
         MAX_THREADS.reset(token)

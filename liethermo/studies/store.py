@@ -1,6 +1,6 @@
-"""The store of a study: a group of Zarr v3 that can be read at any time.
+"""The store of a study: a Zarr v3 group that can be read at any time.
 
-Each chunk of points has a file in each array. The file in ``status`` is written last: it marks the chunk as done.
+Each chunk of points has a file in each array. The file in ``status`` is written last and marks the chunk as finished.
 """
 
 from __future__ import annotations
@@ -29,22 +29,24 @@ from .solve import LAW_QUANTITIES, NOT_COMPUTED, STATUSES, SUCCESS_CODES
 from .store_metadata import MAX_CHUNKS, read_group, with_checksum
 
 STORE_FORMAT = "liethermo-study-1"
+"""Value of the attribute ``format`` of a store."""
 
-RERUN_ADVICE = "Run the study again: what is damaged is done again"
+RERUN_ADVICE = "Run the study again to compute the damaged parts anew"
+"""End of the error messages about damaged files."""
 
 
 @dataclass(frozen=True)
 class StoreSurvey:
-    """What a store has.
+    """Result of checking all files of a store.
 
     Attributes
     ----------
     remaining_chunks : list of (int, bool)
-        The chunks that are not done, and whether a part of them is.
+        Numbers of the unfinished chunks; True if some points of the chunk are finished.
     n_done : int
-        Points.
+        Number of finished points.
     damaged : tuple of str
-        Files that are missing or damaged, and so done again.
+        Files that are missing or damaged, so that their chunks are computed again.
     """
 
     remaining_chunks: list[tuple[int, bool]]
@@ -54,21 +56,21 @@ class StoreSurvey:
 
 @dataclass(frozen=True)
 class StudyStore:
-    """A store.
+    """A store, with the operations that read and write its chunks.
 
     Attributes
     ----------
     root : Path
-    arrays : dict of Array
+    arrays : dict of ZarrArray
     attributes : dict
-        Of the group; ``attributes["study"]`` describes the study.
+        Attributes of the group; ``attributes["study"]`` describes the study.
     """
 
     root: Path
     arrays: Mapping[str, ZarrArray]
     attributes: dict[str, Any] = field(default_factory=dict)
 
-    # -- making and opening ---------------------------------------------------------------------------------------
+    # -- create and open ------------------------------------------------------------------------------------------
 
     @classmethod
     def create(
@@ -80,26 +82,28 @@ class StudyStore:
         about: Mapping[str, Mapping[str, Any]],
         attributes: dict[str, Any],
     ) -> StudyStore:
-        """Make a store; it appears whole or not at all.
+        """Create a store atomically: it appears complete or not at all.
 
         Parameters
         ----------
         axes : Axes
         chunk : int
-            Points of a chunk, about.
+            Approximate number of points of a chunk.
         measures : dict from str to (shape, dtype)
-            Of what is kept of a point.
+            Shape and type of each measure at one point.
         about : dict from str to dict
             Attributes of the arrays.
         attributes : dict
-            Of the group.
+            Attributes of the group.
         """
         chunks = _chunk_shape(axes.shape, chunk)
-        if (number := math.prod(-(-m // c) for m, c in zip(axes.shape, chunks, strict=True))) > MAX_CHUNKS:
-            raise InputError(f"{axes.size} points in chunks of {chunk} are {number} files: give a larger chunk")
+        if (n_chunks := math.prod(-(-m // c) for m, c in zip(axes.shape, chunks, strict=True))) > MAX_CHUNKS:
+            raise InputError(
+                f"{axes.size} points in chunks of {chunk} need {n_chunks} files, which are too many. Use a larger chunk"
+            )
 
-        def array(name: str, more: Sequence[tuple[str, int]], dtype: str) -> ZarrArray:
-            dims, sizes = (tuple(part) for part in zip(*more, strict=True)) if more else ((), ())
+        def array(name: str, trailing_dims: Sequence[tuple[str, int]], dtype: str) -> ZarrArray:
+            dims, sizes = (tuple(part) for part in zip(*trailing_dims, strict=True)) if trailing_dims else ((), ())
             shape = axes.shape + sizes
             return ZarrArray(name, axes.names + dims, shape, chunks + sizes, dtype, dict(about.get(name, {})))
 
@@ -110,19 +114,19 @@ class StudyStore:
         arrays.append(ZarrArray("quantity", ("quantity",), (len(LAW_QUANTITIES),), (len(LAW_QUANTITIES),), "string"))
         coordinates = [array for array, _ in _coordinate_arrays(axes, about)]
         store = cls(root, {a.name: a for a in [*arrays, *coordinates]}, attributes)
-        part = root.with_name(disk.part_name(root.name))
+        partial_root = root.with_name(disk.part_name(root.name))
         try:
-            part.mkdir(parents=True)
-            made = replace(store, root=part)
-            made._write_metadata(axes)
-            os.rename(part, root)
+            partial_root.mkdir(parents=True)
+            partial_store = replace(store, root=partial_root)
+            partial_store._write_metadata(axes)
+            os.rename(partial_root, root)
         except OSError as error:
-            shutil.rmtree(part, ignore_errors=True)
-            if isinstance(error.__cause__, OSError):  # of a file in it
+            shutil.rmtree(partial_root, ignore_errors=True)
+            if isinstance(error.__cause__, OSError):  # a FileError of write_file
                 error = error.__cause__
-            if error.errno in (errno.ENOTEMPTY, errno.EEXIST):  # another run was faster
+            if error.errno in (errno.ENOTEMPTY, errno.EEXIST):  # another run has created the store
                 return cls.open(root)
-            raise FileError(f"cannot make the store {root}: {disk.why_os_failed(error)}") from error
+            raise FileError(f"cannot make the store {root}: {disk.describe_os_error(error)}") from error
         return store
 
     @classmethod
@@ -132,7 +136,7 @@ class StudyStore:
         Raises
         ------
         FileError
-            If there is none, or the folder is another thing.
+            If the folder does not exist or is not the store of a study.
         """
         if not root.exists():
             raise FileError(f"there is no store {root!s:.200}")
@@ -151,7 +155,7 @@ class StudyStore:
 
     @property
     def study_description(self) -> dict[str, Any]:
-        """What describes the study."""
+        """The description of the study, see :func:`.identity.describe_study`."""
         return self.attributes["study"]
 
     @property
@@ -159,7 +163,7 @@ class StudyStore:
         return list(self.attributes["measures"])
 
     def extend(self, axes: Axes) -> StudyStore:
-        """The store with longer axes, whose values begin with those that it has."""
+        """Return the store with longer axes; they must begin with the values of the present ones."""
         shape = axes.shape
         arrays = {
             name: replace(array, shape=shape + array.shape[len(shape) :]) if name in self.chunked_arrays else array
@@ -173,12 +177,12 @@ class StudyStore:
         return store
 
     def repaired_axes(self, axes: Axes) -> Axes:
-        """The axes of the store; where a file of its coordinates is lost or damaged, it is written again from these.
+        """Return the axes of the store, after writing lost or damaged coordinate files again from ``axes``.
 
         Raises
         ------
         FileError
-            If these are not in the order of the store: what was lost is not known then.
+            If a file is lost and ``axes`` differ from the axes of the store in values or order.
         """
         try:
             self._read_array("quantity")
@@ -192,50 +196,64 @@ class StudyStore:
         return self.read_axes()
 
     def _write_metadata(self, axes: Axes) -> None:
-        """Write the coordinates, then the metadata; those of the group last, which readers look at first."""
+        """Write the coordinates, then the metadata of the arrays, and finally the group's, which readers open first."""
         self.attributes["coordinates"] = _coordinates_checksum(axes)
         self._write_chunk_file("quantity", (0,), np.array(LAW_QUANTITIES, dtype=object))
         for array, values in _coordinate_arrays(axes, {}):
-            whole = self.arrays[array.name]
-            for index in np.ndindex(*_chunk_grid(whole)):
-                part = values[tuple(slice(i * c, (i + 1) * c) for i, c in zip(index, whole.chunks, strict=True))]
-                block = whole.empty_chunk()
-                block[tuple(map(slice, part.shape))] = part
+            stored_array = self.arrays[array.name]
+            for index in np.ndindex(*_chunk_grid(stored_array)):
+                chunk_values = values[
+                    tuple(slice(i * c, (i + 1) * c) for i, c in zip(index, stored_array.chunks, strict=True))
+                ]
+                block = stored_array.empty_chunk()
+                block[tuple(map(slice, chunk_values.shape))] = chunk_values
                 self._write_chunk_file(array.name, index, block)
         metadata = {name: array.metadata() for name, array in self.arrays.items()}
         for name, content in metadata.items():
             files.write_json(self.root / name / "zarr.json", content)
-        every = {"kind": "inline", "must_understand": False, "metadata": metadata}
-        group = {"zarr_format": 3, "node_type": "group", "attributes": self.attributes, "consolidated_metadata": every}
+        consolidated_metadata = {"kind": "inline", "must_understand": False, "metadata": metadata}
+        group = {
+            "zarr_format": 3,
+            "node_type": "group",
+            "attributes": self.attributes,
+            "consolidated_metadata": consolidated_metadata,
+        }
         files.write_json(self.root / "zarr.json", with_checksum(group))
 
     def read_axes(self) -> Axes:
-        """The axes, with the values that they have."""
-        found = []
+        """Return the axes of the store with their values."""
+        axes = []
         for name, columns in self.attributes["axes"].items():
-            states = f"{name}_state"
-            given = {column: self._read_array(column) for column in columns}
-            found.append(
-                Axis(name, self._read_array(name), given, self._read_array(states) if states in self.arrays else None)
+            state_array = f"{name}_state"
+            column_values = {column: self._read_array(column) for column in columns}
+            axes.append(
+                Axis(
+                    name,
+                    self._read_array(name),
+                    column_values,
+                    self._read_array(state_array) if state_array in self.arrays else None,
+                )
             )
-        return Axes(tuple(found))
+        return Axes(tuple(axes))
 
     def _read_array(self, name: str) -> np.ndarray:
+        """Return a whole array of the store."""
         array = self.arrays[name]
         values = np.empty(array.shape, dtype=array.numpy_dtype)
         for index in np.ndindex(*_chunk_grid(array)):
-            here = tuple(
+            slices = tuple(
                 slice(i * c, min((i + 1) * c, m)) for i, c, m in zip(index, array.chunks, array.shape, strict=True)
             )
             block = self._read_chunk_file(name, index)
-            values[here] = block[tuple(slice(0, s.stop - s.start) for s in here)]
+            values[slices] = block[tuple(slice(0, s.stop - s.start) for s in slices)]
         return values.astype(str) if array.dtype == "string" else values
 
     # -- chunks of points -------------------------------------------------------------------------------------------
 
     @property
     def chunked_arrays(self) -> list[str]:
-        """The arrays with a chunk of each chunk of points, the mark last."""
+        """Names of the arrays with one chunk per chunk of points; ``status``, which marks it as finished, is the
+        last."""
         return [*self.measure_names, "laws", "message", "status"]
 
     @property
@@ -244,7 +262,7 @@ class StudyStore:
 
     @property
     def chunk_grid(self) -> tuple[int, ...]:
-        """How many chunks there are along each axis."""
+        """Number of chunks along each axis."""
         return _chunk_grid(self.arrays["status"])
 
     @property
@@ -252,53 +270,57 @@ class StudyStore:
         return math.prod(self.shape)
 
     def chunk_index(self, number: int) -> tuple[int, ...]:
+        """Return the index of a chunk along each axis from its number."""
         return tuple(map(int, np.unravel_index(number, self.chunk_grid)))
 
     def chunk_bounds(self, index: Sequence[int]) -> tuple[tuple[int, int], ...]:
-        """Where a chunk begins and ends along each axis."""
+        """Return the first and one past the last index of a chunk along each axis."""
         status = self.arrays["status"]
         return tuple((i * c, min((i + 1) * c, m)) for i, c, m in zip(index, status.chunks, status.shape, strict=True))
 
-    def point_indices(self, index: Sequence[int], wanted: np.ndarray | None = None) -> tuple[np.ndarray, ...]:
-        """The places of the points of a chunk along the axes; of those wanted, where that is given."""
-        block = self.chunk_bounds(index)
-        inside = np.indices([stop - start for start, stop in block]).reshape(len(block), -1)
-        if wanted is not None:
-            inside = inside[:, wanted[tuple(slice(0, stop - start) for start, stop in block)].ravel()]
-        return tuple(place + start for place, (start, _) in zip(inside, block, strict=True))
+    def point_indices(self, index: Sequence[int], mask: np.ndarray | None = None) -> tuple[np.ndarray, ...]:
+        """Return the indices along each axis of the points of a chunk, restricted to ``mask`` if that is given."""
+        bounds = self.chunk_bounds(index)
+        local_indices = np.indices([stop - start for start, stop in bounds]).reshape(len(bounds), -1)
+        if mask is not None:
+            local_indices = local_indices[:, mask[tuple(slice(0, stop - start) for start, stop in bounds)].ravel()]
+        return tuple(local_index + start for local_index, (start, _) in zip(local_indices, bounds, strict=True))
 
     def write_chunk(
-        self, index: Sequence[int], places: tuple[np.ndarray, ...], arrays: Mapping[str, Any], keep: bool
+        self, index: Sequence[int], indices: tuple[np.ndarray, ...], arrays: Mapping[str, Any], is_partial: bool
     ) -> None:
-        """Write a chunk: values at some of its points, the others as they were where they are to be kept."""
-        inside = tuple(place - start for place, (start, _) in zip(places, self.chunk_bounds(index), strict=True))
+        """Write the values at some points of a chunk; its other points keep their values if the chunk is partial."""
+        local_indices = tuple(
+            axis_indices - start for axis_indices, (start, _) in zip(indices, self.chunk_bounds(index), strict=True)
+        )
         for name in self.chunked_arrays:
             block = (
                 self._read_chunk_file(name, index)
-                if keep and self._has_chunk(name, index)
+                if is_partial and self._has_chunk(name, index)
                 else self.arrays[name].empty_chunk()
             )
             if name in arrays:  # a measure has no values where no point could be run
-                block[inside] = arrays[name]
+                block[local_indices] = arrays[name]
             if name != "message" or (block != "").any():
                 self._write_chunk_file(name, index, block)
             elif self._has_chunk(name, index):  # a chunk without messages has no file of them
                 (self.root / self.arrays[name].chunk_path(index)).unlink()
 
     def read_chunk(self, name: str, index: Sequence[int]) -> np.ndarray:
-        """The values of an array at the points of a chunk, fill values where there are none."""
+        """Return the values of an array in a chunk; fill values if its file is missing."""
         block = self._read_chunk_file(name, index) if self._has_chunk(name, index) else self.arrays[name].empty_chunk()
-        inside = tuple(slice(0, stop - start) for start, stop in self.chunk_bounds(index))
-        return block[inside]
+        slices = tuple(slice(0, stop - start) for start, stop in self.chunk_bounds(index))
+        return block[slices]
 
     def _has_chunk(self, name: str, index: Sequence[int]) -> bool:
         return os.path.lexists(self.root / self.arrays[name].chunk_path(self._file_index(name, index)))
 
     def _file_index(self, name: str, index: Sequence[int]) -> tuple[int, ...]:
-        """The index of the chunk of an array that has more dimensions than the axes."""
+        """Return the index of a chunk in an array with more dimensions than the axes, padded with zeros."""
         return (*index, *(0 for _ in range(len(self.arrays[name].dims) - len(index))))
 
     def _read_chunk_file(self, name: str, index: Sequence[int]) -> np.ndarray:
+        """Read and check a chunk; raise FileError if it is missing or damaged."""
         path = self.root / self.arrays[name].chunk_path(self._file_index(name, index))
         try:
             block = self.arrays[name].decode_chunk(files.read_plain_file(path))
@@ -311,11 +333,11 @@ class StudyStore:
             raise FileError(f"{path} is damaged: {error}. {RERUN_ADVICE}") from error
 
     def require_chunk(self, name: str, index: tuple[int, ...]) -> None:
-        """Raise FileError where a chunk is damaged, or missing though the mark of its points is there."""
-        marked = name not in self.chunked_arrays or (
+        """Raise FileError if a chunk is damaged, or missing although its points are marked as finished."""
+        is_required = name not in self.chunked_arrays or (
             name != "message" and self._has_chunk("status", index[: len(self.shape)])
         )
-        if (marked and name != "status") or self._has_chunk(name, index):
+        if (is_required and name != "status") or self._has_chunk(name, index):
             self._read_chunk_file(name, index)
 
     def _write_chunk_file(self, name: str, index: Sequence[int], block: np.ndarray) -> None:
@@ -324,10 +346,10 @@ class StudyStore:
             self.arrays[name].encode_chunk(block),
         )
 
-    # -- what there is ------------------------------------------------------------------------------------------------
+    # -- survey -------------------------------------------------------------------------------------------------------
 
     def chunk_statuses(self) -> Iterator[tuple[int, np.ndarray | None]]:
-        """The number of each chunk and the status of its points; None where its mark is missing or damaged."""
+        """Yield the number of each chunk and the status of its points, or None if that file is missing or damaged."""
         for number in range(math.prod(self.chunk_grid)):
             index = self.chunk_index(number)
             try:
@@ -336,124 +358,132 @@ class StudyStore:
                 yield number, None
 
     def survey(self) -> StoreSurvey:
-        """Look at every file: what is done, what is not, what is damaged."""
-        todo: list[tuple[int, bool]] = []
-        damaged: list[str] = []
-        done = 0
+        """Check every file, and return the unfinished chunks, the number of finished points and the damaged files."""
+        remaining_chunks: list[tuple[int, bool]] = []
+        damaged_files: list[str] = []
+        n_done = 0
         for number, status in self.chunk_statuses():
             index = self.chunk_index(number)
             faults = [] if status is None else self._damaged_files(index, status)
             if status is None and self._has_chunk("status", index):
                 faults = [f"{self.arrays['status'].chunk_path(index)} is damaged"]
-            damaged += faults
+            damaged_files += faults
             if status is None or faults:
-                todo.append((number, False))
+                remaining_chunks.append((number, False))
                 continue
-            missing = int((status == NOT_COMPUTED).sum())
-            done += status.size - missing
-            if missing:
-                todo.append((number, True))
-        return StoreSurvey(todo, done, tuple(damaged))
+            n_missing = int((status == NOT_COMPUTED).sum())
+            n_done += status.size - n_missing
+            if n_missing:
+                remaining_chunks.append((number, True))
+        return StoreSurvey(remaining_chunks, n_done, tuple(damaged_files))
 
     def _damaged_files(self, index: tuple[int, ...], status: np.ndarray) -> list[str]:
-        """The files of a chunk that should be there and are not, or are damaged."""
-        silent = np.isin(status, (*SUCCESS_CODES, NOT_COMPUTED)).all()
-        found = []
+        """Return a line for each file of a finished chunk that is missing or damaged."""
+        has_no_messages = np.isin(status, (*SUCCESS_CODES, NOT_COMPUTED)).all()
+        faults = []
         for name in self.chunked_arrays[:-1]:
             path = self.arrays[name].chunk_path(self._file_index(name, index))
             if not (self.root / path).exists():
-                found += [] if name == "message" and silent else [f"{path} is missing"]
+                faults += [] if name == "message" and has_no_messages else [f"{path} is missing"]
                 continue
             try:
                 self._read_chunk_file(name, index)
             except FileError:
-                found.append(f"{path} is damaged")
-        return found
+                faults.append(f"{path} is damaged")
+        return faults
 
     def status_counts(self) -> dict[str, int]:
-        """How many points ended how; those that are not done are "missing"."""
+        """Return the number of points by status name; unfinished points are "missing"."""
         names = {number: name for name, number in STATUSES.items()}
-        found: dict[str, int] = {}
+        counts: dict[str, int] = {}
         for number, status in self.chunk_statuses():
             if status is None:
-                size = math.prod(stop - start for start, stop in self.chunk_bounds(self.chunk_index(number)))
-                found["missing"] = found.get("missing", 0) + size
+                n_points = math.prod(stop - start for start, stop in self.chunk_bounds(self.chunk_index(number)))
+                counts["missing"] = counts.get("missing", 0) + n_points
                 continue
             for code, count in zip(*np.unique(status, return_counts=True), strict=True):
-                found[names[int(code)]] = found.get(names[int(code)], 0) + int(count)
-        return found
+                counts[names[int(code)]] = counts.get(names[int(code)], 0) + int(count)
+        return counts
 
 
 def _coordinates_checksum(axes: Axes) -> str:
-    """A checksum of the coordinates, which their order belongs to."""
-    found = hashlib.sha256()
+    """Return the SHA-256 digest of the coordinates, in order."""
+    digest = hashlib.sha256()
     for array, values in _coordinate_arrays(axes, {}):
-        found.update(json.dumps([array.name, values.shape, values.tolist()]).encode())
-    return found.hexdigest()
+        digest.update(json.dumps([array.name, values.shape, values.tolist()]).encode())
+    return digest.hexdigest()
 
 
 def _component_dim_name(name: str, k: int, shape: tuple[int, ...]) -> str:
-    """The name of a dimension of a measure that is not an axis."""
+    """Return the name of dimension k of one measured value."""
     return f"{name}_component" if len(shape) == 1 else f"{name}_component_{k}"
 
 
-def _chunk_shape(shape: tuple[int, ...], points: int) -> tuple[int, ...]:
-    """The shape of a chunk of about so many points, whole along the last axes."""
-    found: list[int] = []
+def _chunk_shape(shape: tuple[int, ...], n_points: int) -> tuple[int, ...]:
+    """Return the shape of a chunk of about ``n_points`` points, filled along the last axes first."""
+    reversed_shape: list[int] = []
     for length in reversed(shape):
-        found.append(max(1, min(length, points)))
-        points //= found[-1]
-    return tuple(reversed(found))
+        reversed_shape.append(max(1, min(length, n_points)))
+        n_points //= reversed_shape[-1]
+    return tuple(reversed(reversed_shape))
 
 
 def _chunk_grid(array: ZarrArray) -> tuple[int, ...]:
+    """Return the number of chunks along each dimension of an array."""
     return tuple(-(-m // c) for m, c in zip(array.shape, array.chunks, strict=True))
 
 
 def _coordinate_arrays(axes: Axes, about: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[ZarrArray, np.ndarray]]:
-    """The coordinates of axes, with their values."""
+    """Yield the coordinate arrays of the axes, with their values."""
     for axis in axes.axes:
-        named = {axis.name: axis.labels, **axis.columns}
+        coordinates = {axis.name: axis.labels, **axis.columns}
         if axis.states is not None:
-            named[f"{axis.name}_state"] = axis.states
-        for name, values in named.items():
+            coordinates[f"{axis.name}_state"] = axis.states
+        for name, values in coordinates.items():
             dims = (axis.name, "component")[: values.ndim]
             dtype = {"U": "string", "b": "bool", "i": "int64", "u": "int64"}.get(values.dtype.kind, "float64")
             chunks = (max(64, 1 << (len(values) - 1).bit_length()), *values.shape[1:])
             yield ZarrArray(name, dims, values.shape, chunks, dtype, dict(about.get(name, {}))), values
 
 
-def match_axes(mine: Axes, theirs: Axes) -> Axes:
-    """My axes with their values in the order of a store: first those that it has, then the new ones.
+def match_axes(study_axes: Axes, stored_axes: Axes) -> Axes:
+    """Return the study's axes in the order of a store: first the values that it has, then the new ones.
 
     Raises
     ------
     InputError
-        If the axes are others, or mine lack values that the store has.
+        If the axes have other names, or lack values that the store has.
     """
-    if mine.names != theirs.names or [tuple(a.columns) for a in mine.axes] != [tuple(a.columns) for a in theirs.axes]:
-        names = [", ".join(f"{a.name} ({', '.join(a.columns)})" for a in axes.axes) for axes in (mine, theirs)]
-        raise InputError(f"the axes are {names[0]}, and those of the store {names[1]}")
-    found = []
-    for axis, other in zip(mine.axes, theirs.axes, strict=True):
-        if axis.has_same_values(other):  # what follows takes microseconds a value
-            found.append(axis)
+    if study_axes.names != stored_axes.names or [tuple(a.columns) for a in study_axes.axes] != [
+        tuple(a.columns) for a in stored_axes.axes
+    ]:
+        names = [
+            ", ".join(f"{a.name} ({', '.join(a.columns)})" for a in axes.axes) for axes in (study_axes, stored_axes)
+        ]
+        raise InputError(f"the axes are {names[0]}, but those of the store {names[1]}")
+    matched_axes = []
+    for axis, stored_axis in zip(study_axes.axes, stored_axes.axes, strict=True):
+        if axis.has_same_values(stored_axis):  # skip the search, which takes microseconds per value
+            matched_axes.append(axis)
             continue
-        free: dict[Any, list[int]] = {}
+        unmatched_indices: dict[Any, list[int]] = {}
         for i, row in enumerate(axis.value_keys()):
-            free.setdefault(row, []).append(i)
-        for i, row in enumerate(other.value_keys()):
-            if not free.get(row):
+            unmatched_indices.setdefault(row, []).append(i)
+        for i, row in enumerate(stored_axis.value_keys()):
+            if not unmatched_indices.get(row):
                 raise InputError(
                     f"the axis {axis.name!r} lacks {row[0] if len(row) == 1 else row!r}, which is value {i} in the "
-                    "store; an axis can be made longer, and keeps the values that it has"
+                    "store; an axis can be extended, but must keep its values"
                 )
-            free[row].pop(0)
-        new = sorted(itertools.chain.from_iterable(free.values()))
-        columns = {name: np.append(kept, axis.columns[name][new]) for name, kept in other.columns.items()}
-        labels = columns.get(axis.name, np.arange(len(other) + len(new)))
+            unmatched_indices[row].pop(0)
+        new_indices = sorted(itertools.chain.from_iterable(unmatched_indices.values()))
+        columns = {
+            name: np.append(stored_values, axis.columns[name][new_indices])
+            for name, stored_values in stored_axis.columns.items()
+        }
+        labels = columns.get(axis.name, np.arange(len(stored_axis) + len(new_indices)))
         states = None
-        if axis.states is not None and other.states is not None:
-            states = np.concatenate([other.states, axis.states[new]])
-        found.append(Axis(axis.name, labels, columns, states))
-    return Axes(tuple(found))
+        if axis.states is not None and stored_axis.states is not None:
+            states = np.concatenate([stored_axis.states, axis.states[new_indices]])
+        matched_axes.append(Axis(axis.name, labels, columns, states))
+    return Axes(tuple(matched_axes))

@@ -1,4 +1,4 @@
-"""What can be said of a study from its store alone, whoever runs it."""
+"""Status, results and audit of a study, read from its store alone."""
 
 from __future__ import annotations
 
@@ -24,51 +24,52 @@ if TYPE_CHECKING:
 
 
 def load_status(path: Any) -> StudyStatus:
-    """How far the study in a store is."""
+    """Return the status of the study in a store."""
     return store_status(StudyStore.open(Path(path)))
 
 
 def store_status(store: StudyStore) -> StudyStatus:
+    """Return the status of an open store."""
     counts, running = store.status_counts(), files.active_run(store.root)
-    done = store.n_points - counts.get("missing", 0)
-    left = None if running is None or "started" not in running else seconds_left(store.n_points, done, running)
-    return StudyStatus(store.n_points, done, counts, running, left)
+    n_done = store.n_points - counts.get("missing", 0)
+    time_left = None if running is None or "started" not in running else seconds_left(store.n_points, n_done, running)
+    return StudyStatus(store.n_points, n_done, counts, running, time_left)
 
 
 def load_study(path: Any) -> xarray.Dataset:
-    """The results in the store of a :class:`Study`, whoever runs it, read when they are looked at.
+    """Return the results in the store of a :class:`Study`, which may be running; values are read on access.
 
     Raises
     ------
     FileError
-        If there is no store, or it was changed; later, where a file is missing or damaged that is looked at.
+        If there is no store, or it was changed; on access, if a file is missing or damaged.
     """
     return open_results(Path(path), None)
 
 
 def open_results(path: Path, owner: object) -> xarray.Dataset:
-    """The results in a store; whatever is taken from them, and not read yet, holds the owner of the files."""
+    """Return the results in a store; arrays that have not been read yet keep ``owner`` alive."""
     store = StudyStore.open(path)
     import xarray
 
     from .reader import CheckedZarrReader
 
     try:
-        found = xarray.open_zarr(CheckedZarrReader(store, owner), consolidated=True, chunks=None)
+        dataset = xarray.open_zarr(CheckedZarrReader(store, owner), consolidated=True, chunks=None)
     except FileError:
         raise
-    except Exception as error:  # of a dozen kinds
+    except Exception as error:  # zarr and xarray raise many types
         raise FileError(f"{path} cannot be read: {error}") from error
-    return found.set_coords([name for name in store.arrays if name not in store.chunked_arrays])
+    return dataset.set_coords([name for name in store.arrays if name not in store.chunked_arrays])
 
 
 def audit_store(path: Any, **tolerances: float) -> Audit:
-    """The laws over the points of a store."""
-    accepted = Tolerances.with_defaults(**tolerances)
+    """Return an audit of all points of a store, each law by its worst point."""
+    accepted_tolerances = Tolerances.with_defaults(**tolerances)
     store = StudyStore.open(Path(path))
     axes, laws = store.read_axes(), dataclass_from_json(Laws, store.attributes["laws"])
-    worst: dict[str, AuditRow] = {}
-    least, drift, residual = math.inf, 0.0, 0.0
+    worst_rows: dict[str, AuditRow] = {}
+    min_entropy_increment, drift, residual = math.inf, 0.0, 0.0
     counts: dict[int, int] = {}
     for number, status in store.chunk_statuses():
         if status is None:
@@ -76,27 +77,40 @@ def audit_store(path: Any, **tolerances: float) -> Audit:
         for code, count in zip(*np.unique(status, return_counts=True), strict=True):
             counts[int(code)] = counts.get(int(code), 0) + int(count)
         index = store.chunk_index(number)
-        ended = np.isin(status, (*SUCCESS_CODES, LAW_BROKEN, MEASURE_FAILED)).ravel()
-        if not ended.any():
+        has_laws = np.isin(status, (*SUCCESS_CODES, LAW_BROKEN, MEASURE_FAILED)).ravel()
+        if not has_laws.any():
             continue
-        summary = LawSummary(status.ravel()[ended], store.read_chunk("laws", index).reshape(status.size, -1)[ended])
+        summary = LawSummary(
+            status.ravel()[has_laws], store.read_chunk("laws", index).reshape(status.size, -1)[has_laws]
+        )
         drift, residual = max(drift, summary.energy_drift.max()), max(residual, summary.residual.max())
-        least = min(least, float(np.nanmin(summary.least_entropy_increment, initial=math.inf)))
-        for law in evaluate_ensemble_laws(summary, laws, accepted, summary.energy_terms, summary.entropy_terms):
+        min_entropy_increment = min(
+            min_entropy_increment, float(np.nanmin(summary.least_entropy_increment, initial=math.inf))
+        )
+        for law in evaluate_ensemble_laws(
+            summary, laws, accepted_tolerances, summary.energy_terms, summary.entropy_terms
+        ):
             i = law.worst_member
             row = law.audit_row(i)
-            if law.law not in worst or _excess_over_tolerance(row) > _excess_over_tolerance(worst[law.law]):
-                place = tuple(int(p[np.flatnonzero(ended)[i]]) for p in store.point_indices(index))
-                worst[law.law] = dataclasses.replace(row, note=f"worst at {axes.describe_point(place)}")
-    rows = list(worst.values())
+            if law.law not in worst_rows or _excess_over_tolerance(row) > _excess_over_tolerance(worst_rows[law.law]):
+                point_index = tuple(int(p[np.flatnonzero(has_laws)[i]]) for p in store.point_indices(index))
+                worst_rows[law.law] = dataclasses.replace(row, note=f"worst at {axes.describe_point(point_index)}")
+    rows = list(worst_rows.values())
     for name, code in STATUSES.items():
         if code not in (*SUCCESS_CODES, NOT_COMPUTED) and counts.get(code):
             rows.append(AuditRow(f"points with status {name}", float(counts[code]), 0.0, False))
-    failed = sum(count for code, count in counts.items() if code not in (*SUCCESS_CODES, NOT_COMPUTED))
-    if not failed:
+    n_failed = sum(count for code, count in counts.items() if code not in (*SUCCESS_CODES, NOT_COMPUTED))
+    if not n_failed:
         rows.append(AuditRow("points that failed", 0.0, 0.0, True))
-    return Audit(drift, least if math.isfinite(least) else math.nan, math.nan, residual, tuple(rows))
+    return Audit(
+        drift,
+        min_entropy_increment if math.isfinite(min_entropy_increment) else math.nan,
+        math.nan,
+        residual,
+        tuple(rows),
+    )
 
 
 def _excess_over_tolerance(row: AuditRow) -> float:
+    """Return by how much the value of a row exceeds its tolerance."""
     return row.value - (row.tolerance or 0.0)

@@ -1,4 +1,4 @@
-"""``Study``: what a user describes, and what comes of it."""
+"""The class :class:`Study`: definition, runs and results of a parameter study."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from ..systems import System
 from . import files, identity
 from .axes import Axes, Zipped
 from .measures import At, Measure, SolutionMeasure, ValuesAtTimes, parse_measures
-from .members import UNKNOWN_PARAMETER_TEXT, AccessRecorder, as_python_values, system_builder
+from .members import UNKNOWN_PARAMETER_TEXT, AccessRecorder, system_builder, to_python_values
 from .progress import StudyProgressBar, StudyStatus
 from .running import run_locally, run_on_cluster
 from .solve import MEASURE_FAILED, STATUSES, PointResults, PointSolver, StudyTask, describe_error
@@ -38,22 +38,22 @@ if TYPE_CHECKING:
     import xarray
 
 TARGET_STEPS_PER_CHUNK = 20_000_000
-"""Steps of all points of a chunk, about: some seconds."""
+"""Target number of time steps in a chunk, which take some seconds."""
 
 MAX_POINTS_PER_CHUNK = 16_384
-"""Points of a chunk at most, unless asked for."""
+"""Maximum number of points in a chunk, unless ``chunk`` is given."""
 
 MAX_UNVECTORISED_CHUNK_POINTS = 64
-"""Points of a chunk at most where each is built by itself."""
+"""Maximum number of points in a chunk if each system is built separately."""
 
 MAX_CANDIDATE_POINTS = 256
-"""Points that are tried until one can be run, spread over all."""
+"""Maximum number of points, spread over the axes, that are tried as an example."""
 
 MAX_FAILED_EXAMPLES = 2
-"""Systems that are built and cannot be run, after which no more are tried."""
+"""Number of systems that are built but cannot be run after which the search for an example stops."""
 
 WARN_UNVECTORISED_POINTS = 1_000
-"""Points from which one is reason_of that each has to be built by itself."""
+"""Number of points above which the user is warned that each system is built separately."""
 
 
 class Study:
@@ -135,41 +135,46 @@ class Study:
     ):
         self._axes = Axes.from_mapping(axes)
         self._measures, until = parse_measures(measure, until)
-        taken = {*self._axes.names, *self._axes.parameter_names}
-        if both := taken & {*self._measures}:
-            raise InputError(f"{both.pop()!r} is a measure and an axis")
+        axis_names = {*self._axes.names, *self._axes.parameter_names}
+        if shared_names := axis_names & {*self._measures}:
+            raise InputError(f"{shared_names.pop()!r} is a measure and an axis")
         check_noise(noise)
         method = (DEFAULT_METHOD if noise is None else DEFAULT_NOISE_METHOD) if method is None else method
         if not isinstance(method, OneStepMethod):
-            raise InputError(f"the method must be an integrator such as lt.MetriplecticGauss(), not {method!r}")
+            raise InputError(f"the method must be an integrator such as lt.MetriplecticGauss(), got {method!r}")
         check_choice("engine", engine, ("auto", "array", "compiled"))
         if chunk is not None and (isinstance(chunk, bool) or not isinstance(chunk, int) or chunk < 1):
-            raise InputError(f"chunk must be a positive integer, not {chunk!r}")
+            raise InputError(f"chunk must be a positive integer, got {chunk!r}")
         sources = [*(["x0"] if x0 is not None else []), *(a.name for a in self._axes.axes if a.states is not None)]
         if not sources:
             raise InputError("x0 is missing: a state, or a function from the dict of a point to one")
         if len(sources) > 1:
-            raise InputError(f"initial states come from one place, not from {' and '.join(sources)}")
+            raise InputError(f"initial states are given more than once, by {' and '.join(sources)}. Keep one of them")
         times = sorted({t for m in self._measures.values() if isinstance(m, ValuesAtTimes) for t in m.at.times})
-        path = any(measure.needs_path for measure in self._measures.values())
-        table = make_schedule(t_span, step, 1)
-        if times and not (table.start <= times[0] and times[-1] <= table.end):
+        needs_path = any(measure.needs_path for measure in self._measures.values())
+        schedule = make_schedule(t_span, step, 1)
+        if times and not (schedule.start <= times[0] and times[-1] <= schedule.end):
             raise InputError(
-                f"the times of measures lie within t_span = {tuple(t_span)}, and {times[0]:g} to {times[-1]:g} do not"
+                f"the times of lt.At must lie within t_span = {tuple(t_span)}, got {times[0]:g} to {times[-1]:g}"
             )
-        every = any(m.needs_path and not isinstance(m, ValuesAtTimes) for m in self._measures.values())
-        off = [t for t in times if every and np.abs(table.saved_times - t).min() > 1e-9 * table.h]
-        if off:
-            raise InputError(f"beside a function of a solution lt.At takes times at which steps end, not {off[0]:g}")
-        save_at = tuple(times) if times and not every else None
-        saves = (len(times) if save_at else table.n_steps + 1) if path else 0
-        self._chunk_points, self._n_steps, self._n_saved = chunk, table.n_steps, saves
+        needs_all_steps = any(m.needs_path and not isinstance(m, ValuesAtTimes) for m in self._measures.values())
+        unreachable_times = [
+            t for t in times if needs_all_steps and np.abs(schedule.saved_times - t).min() > 1e-9 * schedule.h
+        ]
+        if unreachable_times:
+            raise InputError(
+                "with a function of a solution among the measures, the times of lt.At must be ends of steps, "
+                f"got {unreachable_times[0]:g}"
+            )
+        save_at = tuple(times) if times and not needs_all_steps else None
+        n_saved = (len(times) if save_at else schedule.n_steps + 1) if needs_path else 0
+        self._chunk_points, self._n_steps, self._n_saved = chunk, schedule.n_steps, n_saved
         self._array_attributes = {
             name: {k: v for k, v in (("units", (units or {}).get(name)), ("long_name", (names or {}).get(name))) if v}
-            for name in (*taken, *self._measures)
+            for name in (*axis_names, *self._measures)
         }
-        for name, what in self._measures.items():
-            self._array_attributes[name].setdefault("long_name", what.description())
+        for name, measure_object in self._measures.items():
+            self._array_attributes[name].setdefault("long_name", measure_object.description())
         unknown = [name for name in (*(units or {}), *(names or {})) if name not in self._array_attributes]
         if unknown:
             raise InputError(f"there is no axis, parameter or measure {unknown[0]!r} to name")
@@ -181,8 +186,8 @@ class Study:
         self.store = Path(store)
         parameters = self._axes.parameter_names
         self._task = StudyTask(
-            system_builder(build, parameters), parameters, x0, attitude, (table.start, table.end), step, method, until, engine,
-            self._measures, {}, save_at, saves, noise,
+            system_builder(build, parameters), parameters, x0, attitude, (schedule.start, schedule.end), step, method,
+            until, engine, self._measures, {}, save_at, n_saved, noise,
         )  # fmt: skip
         self._example: tuple[PointSolver, PointResults, np.ndarray] | None = None
         self._example_index: tuple[int, ...] = ()
@@ -191,42 +196,42 @@ class Study:
 
     @with_library_settings
     def run(self, client: object = None, *, progress: bool | None = None) -> StudyStatus:
-        """Do what is not done, and keep it: nothing is done twice.
+        """Solve the unfinished points and store their results.
 
         Parameters
         ----------
         client : dask.distributed.Client, optional
-            A cluster whose machines share the folder of the store. By default this machine, with all its cores.
+            A cluster whose machines share the folder of the store. By default, all cores of this machine are used.
         progress : bool, optional
-            Show a bar with the time left; by default on a terminal and in a notebook.
+            Show a bar with the remaining time; by default in a terminal and in a notebook.
 
         Returns
         -------
         StudyStatus
-            After Ctrl-C too: running again goes on from there.
+            Also after Ctrl-C; another call resumes the study.
 
         Raises
         ------
         InputError
-            If no point can be run, or the store is that of another study.
+            If no point can be run, or the store belongs to another study.
         FileError
             If the store cannot be read or written, or another run works on it.
         """
         store, axes = self._open_store()
-        interrupted = False
-        with files.lock_store(store.root) as tell:
-            store, axes = self._open_store()  # as another run may have left it
+        is_interrupted = False
+        with files.lock_store(store.root) as record_run:
+            store, axes = self._open_store()  # another run may have changed it before the lock was taken
             files.remove_parts(store.root)
             if store.shape != axes.shape:
                 store = store.extend(axes)
             survey = store.survey()
-            tell(survey.n_done)
+            record_run(survey.n_done)
             try:
                 with StudyProgressBar(store.n_points, survey.n_done, progress) as bar:
                     self._solve_remaining(store, axes, survey, bar, client)
             except KeyboardInterrupt:
-                interrupted = True
-        return dataclasses.replace(store_status(store), damaged=survey.damaged, interrupted=interrupted)
+                is_interrupted = True
+        return dataclasses.replace(store_status(store), damaged=survey.damaged, interrupted=is_interrupted)
 
     def _solve_remaining(
         self, store: StudyStore, axes: Axes, survey: StoreSurvey, bar: StudyProgressBar, client: Any
@@ -240,7 +245,7 @@ class Study:
             run_on_cluster(solver.task, store, axes, survey, bar, client)
 
     def status(self) -> StudyStatus:
-        """How far the study is, from its store: any process may ask, also while another runs it.
+        """Return the progress of the study from its store, also while another process runs it.
 
         Raises
         ------
@@ -253,50 +258,47 @@ class Study:
 
     @property
     def results(self) -> xarray.Dataset:
-        """The results so far: the axes are coordinates, ``status`` and ``message`` say how each point ended.
+        """The results so far, with the axes as coordinates; ``status`` and ``message`` say how each point ended.
 
-        Values are read from the files when they are looked at.
-
-        Raises
-        ------
-        FileError
-            If there is no store.
+        Values are read from the files on access.
         """
-        found = open_results(self.store, self._temporary_folder)
+        dataset = open_results(self.store, self._temporary_folder)
         store = StudyStore.open(self.store)
-        mine, theirs = self._axes, store.read_axes()
+        axes, stored_axes = self._axes, store.read_axes()
         order = {}
-        for axis, kept in zip(mine.axes, theirs.axes, strict=True):
-            if axis.name in axis.columns and len(axis) == len(kept):  # in the order of this study, not of the store
-                place = {row: i for i, row in enumerate(kept.value_keys())}
-                order[axis.name] = [place[row] for row in axis.value_keys()]
-        return found.isel(order) if order else found
+        for axis, stored_axis in zip(axes.axes, stored_axes.axes, strict=True):
+            if axis.name in axis.columns and len(axis) == len(
+                stored_axis
+            ):  # from the order of the store to that of this study
+                index_by_key = {row: i for i, row in enumerate(stored_axis.value_keys())}
+                order[axis.name] = [index_by_key[row] for row in axis.value_keys()]
+        return dataset.isel(order) if order else dataset
 
     def audit(self, **tolerances: float) -> Audit:
-        """The laws over all points that are done, each by the one that kept it worst; printing it gives a table.
+        """Audit the laws over all finished points, each law by its worst point; printing the result gives a table.
 
         Parameters
         ----------
         energy, entropy, casimirs, residual : float
-            What is accepted: see :class:`liethermo.results.audit.Tolerances`.
+            Tolerances: see :class:`liethermo.results.audit.Tolerances`.
 
         Raises
         ------
         FileError
             If there is no store.
         InputError
-            If there is no tolerance of a name, or it is negative.
+            If a tolerance has an unknown name, or is negative.
         """
         return audit_store(self.store, **tolerances)
 
-    # -- what it is -------------------------------------------------------------------------------------------------
+    # -- store and example ------------------------------------------------------------------------------------------
 
     def _open_store(self) -> tuple[StudyStore, Axes]:
-        """The store, made where there is none, and the axes in its order; refused where it is of another study."""
+        """Open or create the store, and return it with the axes in its order; a store of another study is refused."""
         if not self.store.exists() or (self.store.is_dir() and not any(self.store.iterdir())):
             solver, columns, x0 = self._solve_example()
-            described = {**identity.describe_study(solver, columns, x0), "place": list(self._example_index)}
-            about: dict[str, dict[str, Any]] = {
+            description = {**identity.describe_study(solver, columns, x0), "place": list(self._example_index)}
+            array_attributes: dict[str, dict[str, Any]] = {
                 **self._array_attributes,
                 "status": {
                     "long_name": "how the point ended",
@@ -310,9 +312,9 @@ class Study:
             assert laws is not None
             attributes = {
                 "format": STORE_FORMAT,
-                "title": f"study of {', '.join(self._axes.parameter_names)}: {described['system']}",
-                **identity.provenance(described, solver.engine),
-                "study": described,
+                "title": f"study of {', '.join(self._axes.parameter_names)}: {description['system']}",
+                **identity.provenance(description, solver.engine),
+                "study": description,
                 "laws": dataclasses.asdict(laws),
                 "measures": list(self._measures),
                 "axes": {axis.name: list(axis.columns) for axis in self._axes.axes},
@@ -322,51 +324,58 @@ class Study:
                 name: (values.shape[1:], "complex128" if values.dtype.kind == "c" else "float64")
                 for name, values in columns.measures.items()
             }
-            store = StudyStore.create(self.store, self._axes, self._points_per_chunk(solver), shapes, about, attributes)
+            store = StudyStore.create(
+                self.store, self._axes, self._points_per_chunk(solver), shapes, array_attributes, attributes
+            )
         else:
             store = StudyStore.open(self.store)
         try:
             axes = match_axes(self._axes, store.repaired_axes(self._axes))
             solver, columns, x0 = self._solve_example(axes, tuple(store.study_description["place"]))
-            lines = identity.study_differences(identity.describe_study(solver, columns, x0), store.study_description)
+            differences = identity.study_differences(
+                identity.describe_study(solver, columns, x0), store.study_description
+            )
         except InputError as error:
-            lines = [str(error)]
-        if lines:
+            differences = [str(error)]
+        if differences:
             head = f"{self.store} is the store of another study; take another name for this one:"
-            raise InputError("\n  ".join([head, *lines]))
+            raise InputError("\n  ".join([head, *differences]))
         return store, axes
 
     def _points_per_chunk(self, solver: PointSolver) -> int:
-        """Points of a chunk."""
+        """Return the number of points of a chunk for a new store."""
         if self._chunk_points is not None:
             return self._chunk_points
-        most = MAX_UNVECTORISED_CHUNK_POINTS if solver.systems.family is None else MAX_POINTS_PER_CHUNK
-        return max(1, min(most, max(64, TARGET_STEPS_PER_CHUNK // max(self._n_steps, 100))))
+        max_points = MAX_UNVECTORISED_CHUNK_POINTS if solver.systems.family is None else MAX_POINTS_PER_CHUNK
+        return max(1, min(max_points, max(64, TARGET_STEPS_PER_CHUNK // max(self._n_steps, 100))))
 
     def _solve_example(
-        self, axes: Axes | None = None, place: tuple[int, ...] = ()
+        self, axes: Axes | None = None, index: tuple[int, ...] = ()
     ) -> tuple[PointSolver, PointResults, np.ndarray]:
-        """The solver, and its example solved: the point at a place of some axes, or the first that can be run."""
+        """Return the solver, the example's results and its initial state.
+
+        The example is the point at ``index`` of the axes, or the first candidate that can be run.
+        """
         if self._example is not None and (
-            axes is None or self._example[0].task.example_point == _point_at(axes, place)[0]
+            axes is None or self._example[0].task.example_point == _point_at(axes, index)[0]
         ):
             return self._example
-        axes, places = (self._axes, self._candidate_indices()) if axes is None else (axes, [place])
-        first, failed = "", 0
-        for place in places:
-            seeds = None if self._task.noise is None else self._task.noise.grid_seeds([np.array([i]) for i in place])
-            why, built = self._try_point(*_point_at(axes, place), seeds)
-            if self._example is not None and not why:
-                self._example_index = place
+        axes, candidates = (self._axes, self._candidate_indices()) if axes is None else (axes, [index])
+        first_failure, n_failed = "", 0
+        for index in candidates:
+            seeds = None if self._task.noise is None else self._task.noise.grid_seeds([np.array([i]) for i in index])
+            reason, was_built = self._try_point(*_point_at(axes, index), seeds)
+            if self._example is not None and not reason:
+                self._example_index = index
                 return self._example
-            first = first or f"{axes.describe_point(place)}: {why}"
-            failed += built
-            if failed == MAX_FAILED_EXAMPLES:
+            first_failure = first_failure or f"{axes.describe_point(index)}: {reason}"
+            n_failed += was_built
+            if n_failed == MAX_FAILED_EXAMPLES:
                 break
-        raise InputError(f"no point of the study can be run; the first: {first}")
+        raise InputError(f"no point of the study can be run; the first: {first_failure}")
 
     def _candidate_indices(self) -> list[tuple[int, ...]]:
-        """Places spread over the axes, the first point first."""
+        """Return the indices of possible example points, spread over the axes and beginning with the first point."""
         size, shape = self._axes.size, self._axes.shape
         numbers = dict.fromkeys(int(size * _van_der_corput(k)) for k in range(MAX_CANDIDATE_POINTS))
         return [tuple(map(int, np.unravel_index(number, shape))) for number in numbers]
@@ -374,12 +383,12 @@ class Study:
     def _try_point(
         self, point: dict[str, Any], states: np.ndarray | None, seeds: np.ndarray | None
     ) -> tuple[str, bool]:
-        """Solve a point by itself; why it cannot be, or nothing, and whether its system was built."""
+        """Solve one point as the example; return the reason of a failure, or "", and True if its system was built."""
         self._example = None
         self._require_used_axes(point)
         try:
             solver = PointSolver(dataclasses.replace(self._task, example_point=point))
-        except Exception as error:  # the builder may be anyone's, and may raise at some points
+        except Exception as error:  # user code, which may raise at some points
             return describe_error(error), False
         columns = solver.solve({name: np.array([value]) for name, value in point.items()}, states, 1, seeds)
         if columns.status[0] in (StatusCode.INADMISSIBLE, MEASURE_FAILED):
@@ -388,53 +397,53 @@ class Study:
             name: _with_example_value(measure, columns.measures[name][0]) for name, measure in self._measures.items()
         }
         solver.task = dataclasses.replace(solver.task, measures=measures)
-        if solver.systems.family is not None:  # and not another engine for some of the chunks
+        if solver.systems.family is not None:  # use one engine for all chunks
             solver.task = dataclasses.replace(solver.task, engine=solver.engine)
         elif self._axes.size > WARN_UNVECTORISED_POINTS:
             warn(
-                f"the builder cannot be traced ({solver.systems.why_no_family}), so that each of {self._axes.size} points is "
-                "built by itself; written with jax.numpy and without Python's if, one program builds all"
+                f"the builder cannot be traced ({solver.systems.why_no_family}), so that each of {self._axes.size} "
+                "systems is built separately. Write it with jax.numpy and without Python's if, so that one program "
+                "builds all"
             )
         self._example = solver, columns, self._initial_state(solver, point, states)
         return "", True
 
     def _initial_state(self, solver: PointSolver, point: dict[str, Any], states: np.ndarray | None) -> np.ndarray:
-        given = self._task.x0
-        x0 = states[0] if states is not None else given(AccessRecorder(point)) if callable(given) else given
+        """Return the initial state of a point, shape (n,), checked by its system."""
+        source = self._task.x0
+        x0 = states[0] if states is not None else source(AccessRecorder(point)) if callable(source) else source
         return np.asarray(solver.systems.example_system.state(x0), dtype=np.float64)
 
     def _require_used_axes(self, point: dict[str, Any]) -> None:
-        """Refuse axes that are not used."""
-        watched = AccessRecorder(as_python_values(point))
+        """Raise InputError if an axis is used neither by the builder, nor by ``x0``, nor by ``attitude``."""
+        recorder = AccessRecorder(to_python_values(point))
         for function in filter(callable, (self._task.build, self._task.x0, self._task.attitude)):
             try:
-                function(watched)
+                function(recorder)
             except InputError as error:
                 if UNKNOWN_PARAMETER_TEXT in str(error):
                     raise
                 return
-            except Exception:  # reason_of as the reason of this point
+            except Exception:  # reported as the status of this point
                 return
-        unread = [name for name in self._axes.parameter_names if name not in watched.accessed_names]
+        unread = [name for name in self._axes.parameter_names if name not in recorder.accessed_names]
         if unread:
-            raise InputError(
-                f"{unread[0]!r} is looked at neither by the builder nor by x0; an axis of replicas is lt.replicas"
-            )
+            raise InputError(f"axis {unread[0]!r} is used by neither build nor x0. For repeated runs use lt.replicas")
 
 
 def _with_example_value(measure: Measure, value: np.ndarray) -> Measure:
-    """A measure that knows what it is at the first point."""
+    """Return the measure with its value at the example point, if it is a user's function."""
     return dataclasses.replace(measure, example_value=value) if isinstance(measure, SolutionMeasure) else measure
 
 
-def _point_at(axes: Axes, place: tuple[int, ...]) -> tuple[dict[str, Any], np.ndarray | None]:
-    """The point at a place, and its initial state, shape (1, n), where an axis brings one."""
-    rows = tuple(np.array([i]) for i in place)
-    return as_python_values({name: values[0] for name, values in axes.parameters_at(rows).items()}), axes.states_at(
-        rows
+def _point_at(axes: Axes, index: tuple[int, ...]) -> tuple[dict[str, Any], np.ndarray | None]:
+    """Return the parameters at an index, and the initial state, shape (1, n), if an axis has states."""
+    indices = tuple(np.array([i]) for i in index)
+    return to_python_values({name: values[0] for name, values in axes.parameters_at(indices).items()}), axes.states_at(
+        indices
     )
 
 
 def _van_der_corput(k: int) -> float:
-    """The k-th number of van der Corput's sequence: 0, 1/2, 1/4, 3/4, ..."""
+    """Return the k-th number of the van der Corput sequence: 0, 1/2, 1/4, 3/4, ..."""
     return sum((k >> bit & 1) / 2 ** (bit + 1) for bit in range(k.bit_length()))

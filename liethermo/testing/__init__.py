@@ -1,7 +1,7 @@
-"""The property suites of this package, for methods, dissipations and systems of one's own.
+"""Property suites for methods, dissipations and systems that users define.
 
-Each ``check_*`` puts an object through what every registered one goes through. It returns a report, or raises
-:class:`PropertyError` with the table of what was measured. Algebras, groups and spaces have theirs in
+Each ``check_*`` tests an object as the registered ones are tested. It returns a report, or raises
+:class:`PropertyError` with the table of measurements. The suites of algebras, groups and spaces are in
 :mod:`manifolds.testing`.
 """
 

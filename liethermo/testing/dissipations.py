@@ -1,4 +1,4 @@
-"""The suite of dissipations."""
+"""Property suite of dissipations."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from .runs import SUITE_METHODS, check_laws_along_run, default_step, random_star
 
 
 def check_dissipation(dissipation: Dissipation | System, algebra: mf.LieAlgebra | None = None, seed: int = 0) -> Report:
-    """The laws of a dissipation: for discrete gradients instead of gradients, at points, and along runs.
+    """Check the laws of a dissipation at random points, with arbitrary vectors for gradients, and along runs.
 
     Parameters
     ----------
     dissipation : Dissipation or System
-        One that acts on the dual of a Lie algebra, or a system that has it.
+        A dissipation on the dual of a Lie algebra, or a system that contains it.
     algebra : LieAlgebra, optional
-        Where it is tried, so(3) by default; with an energy that is not quadratic, and a quadratic Casimir for entropy.
+        The algebra of the test system, so(3) by default. Its energy is not quadratic, its entropy a quadratic Casimir.
 
     Raises
     ------
     PropertyError
-        If it does not keep what it states: its laws, the functions that it has to preserve.
+        If it violates a law that it states, or changes a function that it must preserve.
     """
     system = dissipation if isinstance(dissipation, System) else _test_system(dissipation, algebra or mf.so(3))
     if system.dissipation is None:
@@ -36,23 +36,23 @@ def check_dissipation(dissipation: Dissipation | System, algebra: mf.LieAlgebra 
     suite = Suite(f"{type(system.dissipation).__name__} in a {system.kind}")
     random = np.random.default_rng(seed)
     points = [x for x in system.samples(8, seed) if np.isfinite(np.asarray(system.vector_field(x))).all()]
-    acting, lost, made, size = system.dissipation, 0.0, 0.0, 0.0
+    tested, max_energy_rate, min_entropy_rate, max_force = system.dissipation, 0.0, 0.0, 0.0
     for x in points:
-        dH, dS, *dL = random.standard_normal((2 + len(acting.preserve), system.dim))
+        dH, dS, *dL = random.standard_normal((2 + len(tested.preserve), system.dim))
         if system.baths is not None and system.baths.has_positive_temperatures:
             dH[system.body_dim :] = np.abs(dH[system.body_dim :])  # no gradient has temperatures below zero
         force = np.asarray(
-            acting.force(system, jnp.asarray(x), jnp.asarray(dH), jnp.asarray(dS), tuple(map(jnp.asarray, dL)))
+            tested.force(system, jnp.asarray(x), jnp.asarray(dH), jnp.asarray(dS), tuple(map(jnp.asarray, dL)))
         )
         scale = float(np.linalg.norm(force))
-        lost = max(lost, float(abs(force @ dH) / max(scale * np.linalg.norm(dH), 1e-300)))
-        made = min(made, float((force @ dS) / max(scale * np.linalg.norm(dS), 1e-300)))
-        size = max(size, scale)
-    if acting.energy_law == "conserved" and system.space is None:
-        suite.check_small("any vector instead of grad H is in the kernel", lost, 1.0, 1e-12)
-    if acting.entropy_law == "nondecreasing" and acting.energy_law == "conserved" and system.space is None:
-        suite.check_small("the entropy cannot fall, whatever the vectors", min(made, 0.0), 1.0, 1e-12)
-    suite.check_true("it acts", size > 0.0)
+        max_energy_rate = max(max_energy_rate, float(abs(force @ dH) / max(scale * np.linalg.norm(dH), 1e-300)))
+        min_entropy_rate = min(min_entropy_rate, float((force @ dS) / max(scale * np.linalg.norm(dS), 1e-300)))
+        max_force = max(max_force, scale)
+    if tested.energy_law == "conserved" and system.space is None:
+        suite.check_small("any vector instead of grad H is in the kernel", max_energy_rate, 1.0, 1e-12)
+    if tested.entropy_law == "nondecreasing" and tested.energy_law == "conserved" and system.space is None:
+        suite.check_small("the entropy cannot fall, whatever the vectors", min(min_entropy_rate, 0.0), 1.0, 1e-12)
+    suite.check_true("it acts", max_force > 0.0)
     suite.rows += system.check(seed=seed).rows
     x0 = random_start(system, seed)
     h = default_step(system, x0)

@@ -1,4 +1,4 @@
-"""Whether a fluctuating system comes to the equilibrium that statistical mechanics has for it."""
+"""Check that a fluctuating system reaches the equilibrium of statistical mechanics."""
 
 from __future__ import annotations
 
@@ -21,15 +21,19 @@ from ..systems import System
 from ..tracing.interpret import evaluate_at_points
 
 MAX_STANDARD_ERRORS = 3.5
-"""Standard errors by which a moment may miss: one of 2,000 that are right misses by more."""
+"""Largest deviation of a moment in standard errors; one correct moment in 2,000 deviates more."""
 
-N_EXACT_SAMPLES, MIN_EFFECTIVE_SAMPLES = 100_000, 1_000
-"""Independent points of the exact measure, and as how many of equal weight they have to count at least."""
+N_EXACT_SAMPLES = 100_000
+"""Number of independent points of the exact measure."""
+
+MIN_EFFECTIVE_SAMPLES = 1_000
+"""Minimum effective sample size of the weighted points of the exact measure."""
 
 N_AVERAGED_STATES = 20
-"""States of each path that its means are over, in the second half of its time."""
+"""Number of states of each path, in the second half of its time span, that are averaged."""
 
 N_BISECTIONS = 60
+"""Number of bisections that locate a level on a ray, enough for all bits of a double."""
 
 
 class Samples(NamedTuple):
@@ -51,37 +55,37 @@ def check_equilibrium(
     errors: float = MAX_STANDARD_ERRORS,
     seed: int = 0,
 ) -> Report:
-    """Compare moments of many paths, in the second half of a span of time, with those of the exact measure.
+    """Compare moments of many paths, in the second half of a time span, with moments of the exact measure.
 
-    That is ``exp(S / k)`` on the level of the energy that x0 is on, or ``exp(-H / (k T))`` with a bath, on the level of
-    the Casimir that noise keeps, where it keeps one: found by independent points along random rays from the origin,
-    which a level has to meet once, with their statistical weights. Errors are those of the paths, which are
-    independent, and of the points.
+    The exact measure is ``exp(S / k)`` on the energy level of x0 or, with a bath, ``exp(-H / (k T))`` on the level of a
+    Casimir that the noise conserves, if there is one. It is sampled by weighted independent points on random rays from
+    the origin, which must meet the level once. The standard errors include those of the independent paths and of the
+    points.
 
     Parameters
     ----------
     system : System
     noise : Fluctuations
     x0 : array, shape (n,), or (paths, n)
-        Where paths start, all on one level.
+        Initial states of the paths, all on one level.
     time, step : float
-        The time has to be several times as long as the relaxation.
+        The time has to be several relaxation times.
     paths : int
     moments : dict of functions from a state to a number, optional
         By default the components, their squares, and the entropy or the energy.
     samples : Samples, optional
-        Points of the exact measure with their weights, where it is known in another way.
+        Points of the exact measure with their weights, if they are known from elsewhere.
     errors : float
-        Standard errors that a moment may miss by. The bias of a step is among what it misses.
+        Largest deviation of a moment in standard errors. It has to cover the bias of the step size too.
     seed : int
-        Of the points.
+        Seed of the points.
 
     Raises
     ------
     PropertyError
-        If a moment misses.
+        If a moment deviates more.
     ValueError
-        If the exact measure is not known, or not found.
+        If the exact measure is unknown or cannot be sampled.
     """
     suite = Suite(f"the equilibrium of a {system.kind}")
     report = noise.check(system)
@@ -90,67 +94,81 @@ def check_equilibrium(
         if check.axiom == MEASURE_ROW and check.residual > check.tolerance and samples is None:
             raise ValueError(f"the motion does not keep volume, so the measure is not known: give a density\n{report}")
     starts = np.broadcast_to(np.atleast_2d(np.asarray(x0, dtype=float)), (paths, system.dim))
-    every = max(1, round(time / step / (2 * N_AVERAGED_STATES)))
-    many = ensemble(system, starts, (0.0, time), step, noise=noise, outputs="trajectory", save_every=every)
-    suite.check_true("all paths end", many.ok.all(), f"{(~many.ok).sum()} do not" if not many.ok.all() else "")
-    suite.rows += [row for row in many.audit().rows if row.passed is not None]
-    assert many.x is not None
-    late = many.x[:, many.t >= 0.5 * time]
-    exact = Samples(*samples) if samples is not None else sample_exact_measure(system, noise, starts[0], late, seed)
-    weights = np.asarray(exact.weights) / np.sum(exact.weights)
-    effective = 1.0 / np.sum(weights**2)
-    if effective < MIN_EFFECTIVE_SAMPLES:
-        raise ValueError(f"the points of the exact measure count as {effective:.0f} alone: give samples of it")
+    save_every = max(1, round(time / step / (2 * N_AVERAGED_STATES)))
+    path_ensemble = ensemble(
+        system, starts, (0.0, time), step, noise=noise, outputs="trajectory", save_every=save_every
+    )
+    suite.check_true(
+        "all paths end",
+        path_ensemble.ok.all(),
+        f"{(~path_ensemble.ok).sum()} do not" if not path_ensemble.ok.all() else "",
+    )
+    suite.rows += [row for row in path_ensemble.audit().rows if row.passed is not None]
+    assert path_ensemble.x is not None
+    late_states = path_ensemble.x[:, path_ensemble.t >= 0.5 * time]
+    exact_samples = (
+        Samples(*samples) if samples is not None else sample_exact_measure(system, noise, starts[0], late_states, seed)
+    )
+    weights = np.asarray(exact_samples.weights) / np.sum(exact_samples.weights)
+    effective_count = 1.0 / np.sum(weights**2)
+    if effective_count < MIN_EFFECTIVE_SAMPLES:
+        raise ValueError(f"the points of the exact measure count as {effective_count:.0f} alone: give samples of it")
     for name, f in (_default_moments(system) if moments is None else moments).items():
         function = make_energy(f, f"moment {name!r}")
-        found = (
-            evaluate_at_points(energy_value, function, late.reshape(-1, system.dim))
-            .reshape(late.shape[:2])
+        path_means = (
+            evaluate_at_points(energy_value, function, late_states.reshape(-1, system.dim))
+            .reshape(late_states.shape[:2])
             .mean(axis=1)
         )
-        value = evaluate_at_points(energy_value, function, np.asarray(exact.points))
-        mean = float(weights @ value)
-        own = float(np.sqrt(weights**2 @ (value - mean) ** 2))
-        error = float(np.hypot(own, found.std(ddof=1) / np.sqrt(paths)))
-        away = abs(float(found.mean()) - mean)
-        if away <= 1e-12 * max(1.0, abs(mean)):  # what is constant has errors of rounding alone
-            away = 0.0
-        defect = away / error if error > 0.0 else np.inf if away else 0.0
-        note = f"{found.mean():.5g}, exactly {mean:.5g} +- {own:.1g}"
-        suite.rows.append(TableRow(f"<{name}> in standard errors", float(defect), errors, bool(defect <= errors), note))
+        sample_values = evaluate_at_points(energy_value, function, np.asarray(exact_samples.points))
+        exact_mean = float(weights @ sample_values)
+        sampling_error = float(np.sqrt(weights**2 @ (sample_values - exact_mean) ** 2))
+        standard_error = float(np.hypot(sampling_error, path_means.std(ddof=1) / np.sqrt(paths)))
+        difference = abs(float(path_means.mean()) - exact_mean)
+        if difference <= 1e-12 * max(1.0, abs(exact_mean)):  # a constant moment has only rounding errors
+            difference = 0.0
+        standard_score = difference / standard_error if standard_error > 0.0 else np.inf if difference else 0.0
+        note = f"{path_means.mean():.5g}, exactly {exact_mean:.5g} +- {sampling_error:.1g}"
+        suite.rows.append(
+            TableRow(
+                f"<{name}> in standard errors", float(standard_score), errors, bool(standard_score <= errors), note
+            )
+        )
     return suite.report()
 
 
-def sample_exact_measure(system: System, noise: Fluctuations, x0, near: np.ndarray, seed: int = 0) -> Samples:
-    """Independent points of the exact measure: see :func:`check_equilibrium`.
+def sample_exact_measure(system: System, noise: Fluctuations, x0, path_states: np.ndarray, seed: int = 0) -> Samples:
+    """Return independent weighted points of the exact measure: see :func:`check_equilibrium`.
 
     Parameters
     ----------
-    near : array, shape (..., n)
-        States of paths, whose covariance says where to look where no level bounds the measure.
+    path_states : array, shape (..., n)
+        States of paths; their covariance gives the proposal if no level bounds the measure.
 
     Raises
     ------
     ValueError
-        If several functions are kept, or rays do not meet a level once.
+        If several functions are conserved, or a ray does not meet a level exactly once.
     """
-    kept = {"the energy": system.energy} if system.energy_law == "conserved" else {}
-    untouched = noise_invariance(system)
-    kept |= {name: system.functions()[name] for name in sorted(system.first_integrals()) if untouched[name]}
-    if len(kept) > 1:
-        raise ValueError(f"motion and noise keep {', '.join(kept)}: for more than one give samples of the measure")
+    invariants = {"the energy": system.energy} if system.energy_law == "conserved" else {}
+    is_invariant = noise_invariance(system)
+    invariants |= {name: system.functions()[name] for name in sorted(system.first_integrals()) if is_invariant[name]}
+    if len(invariants) > 1:
+        raise ValueError(
+            f"motion and noise keep {', '.join(invariants)}: for more than one give samples of the measure"
+        )
     random, n = np.random.default_rng(seed), system.dim
     directions = random.standard_normal((N_EXACT_SAMPLES, n))
-    if not kept:
-        spread = np.linalg.cholesky(1.5 * np.cov(near.reshape(-1, n).T).reshape(n, n))
-        points, centre = directions @ spread.T, near.reshape(-1, n).mean(axis=0)
+    if not invariants:
+        covariance_root = np.linalg.cholesky(1.5 * np.cov(path_states.reshape(-1, n).T).reshape(n, n))
+        points, centre = directions @ covariance_root.T, path_states.reshape(-1, n).mean(axis=0)
         logs = _log_density(system, noise, points + centre) + 0.5 * np.sum(directions**2, axis=1)
         return Samples(points + centre, np.exp(logs - logs.max()))
-    (name, F), level = next(iter(kept.items())), jnp.asarray(x0, dtype=float)
+    (name, F), level = next(iter(invariants.items())), jnp.asarray(x0, dtype=float)
     curvature = np.asarray(jax.hessian(F.value)(jnp.zeros(n)))
-    lengths, axes = np.linalg.eigh(curvature)
-    shape = (axes / np.sqrt(lengths)) @ axes.T if lengths[0] > 1e-6 * lengths[-1] > 0.0 else np.eye(n)
-    directions = directions / np.linalg.norm(directions, axis=1, keepdims=True) @ shape.T
+    eigenvalues, axes = np.linalg.eigh(curvature)
+    level_shape = (axes / np.sqrt(eigenvalues)) @ axes.T if eigenvalues[0] > 1e-6 * eigenvalues[-1] > 0.0 else np.eye(n)
+    directions = directions / np.linalg.norm(directions, axis=1, keepdims=True) @ level_shape.T
     radius, slope = evaluate_at_points(_level_crossing_on_ray, (F, level), directions).T
     if not (np.isfinite(radius) & (slope > 0.0)).all():
         raise ValueError(f"rays from the origin do not meet the level of {name} once: give samples of the measure")
@@ -160,43 +178,45 @@ def sample_exact_measure(system: System, noise: Fluctuations, x0, near: np.ndarr
 
 
 def _level_crossing_on_ray(model: tuple[Energy, jax.Array], direction):
-    """How far along a ray the level of a function is, and its slope there; NaN where it is not met."""
+    """Return the distance to a level along a ray, and the function's outward slope there; NaN if it is not met."""
     F, x0 = model
     level, start = F.value(x0), F.value(jnp.zeros_like(x0))
 
-    def below(r):
+    def is_before_level(r):
         return (F.value(r * direction) - level) * (start - level) > 0.0
 
-    size = jnp.linalg.norm(x0) / jnp.linalg.norm(direction)
-    outside = jax.lax.fori_loop(0, 40, lambda _, r: jnp.where(below(r), 2.0 * r, r), size)
+    initial_radius = jnp.linalg.norm(x0) / jnp.linalg.norm(direction)
+    outer_radius = jax.lax.fori_loop(0, 40, lambda _, r: jnp.where(is_before_level(r), 2.0 * r, r), initial_radius)
 
-    def halved(_, ends):
-        low, high = ends
-        middle = 0.5 * (low + high)
-        inside = below(middle)
-        return jnp.where(inside, middle, low), jnp.where(inside, high, middle)
+    def bisect(_, ends):
+        inner_end, outer_end = ends
+        middle = 0.5 * (inner_end + outer_end)
+        is_inside = is_before_level(middle)
+        return jnp.where(is_inside, middle, inner_end), jnp.where(is_inside, outer_end, middle)
 
-    low, high = jax.lax.fori_loop(0, N_BISECTIONS, halved, (0.0 * outside, outside))
-    slope = jnp.dot(F.gradient(high * direction), direction) * jnp.sign(level - start)
-    return jnp.stack([jnp.where(below(outside), jnp.nan, 0.5 * (low + high)), slope])
+    inner_end, outer_end = jax.lax.fori_loop(0, N_BISECTIONS, bisect, (0.0 * outer_radius, outer_radius))
+    slope = jnp.dot(F.gradient(outer_end * direction), direction) * jnp.sign(level - start)
+    return jnp.stack([jnp.where(is_before_level(outer_radius), jnp.nan, 0.5 * (inner_end + outer_end)), slope])
 
 
 def _log_density(system: System, noise: Fluctuations, points: np.ndarray) -> np.ndarray:
-    """The logarithm of the density, up to a constant."""
-    found = np.zeros(len(points))
+    """Return the logarithm of the density at each point, up to a constant."""
+    log_density = np.zeros(len(points))
     if noise.temperature is not None:
-        found = found - evaluate_at_points(energy_value, system.energy, points) / (noise.boltzmann * noise.temperature)
+        log_density = log_density - evaluate_at_points(energy_value, system.energy, points) / (
+            noise.boltzmann * noise.temperature
+        )
     if system.entropy is not None:
-        found = found + evaluate_at_points(energy_value, system.entropy, points) / noise.boltzmann
+        log_density = log_density + evaluate_at_points(energy_value, system.entropy, points) / noise.boltzmann
     if noise.density is not None:
-        found = found + evaluate_at_points(energy_value, make_energy(noise.density, "the density"), points)
-    return found
+        log_density = log_density + evaluate_at_points(energy_value, make_energy(noise.density, "the density"), points)
+    return log_density
 
 
 def _default_moments(system: System) -> dict[str, Callable]:
-    found: dict[str, Callable] = {}
+    moments: dict[str, Callable] = {}
     for i in range(system.dim):
-        found |= {f"x{i + 1}": lambda x, i=i: x[i], f"x{i + 1}^2": lambda x, i=i: x[i] ** 2}
+        moments |= {f"x{i + 1}": lambda x, i=i: x[i], f"x{i + 1}^2": lambda x, i=i: x[i] ** 2}
     if system.entropy is not None:
-        return found | {"S": system.entropy}
-    return found | {"H": system.energy}
+        return moments | {"S": system.entropy}
+    return moments | {"H": system.energy}

@@ -1,4 +1,4 @@
-"""The systems that methods are tried on."""
+"""Test problems for methods."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from ..integrators.base import EVERY_SYSTEM
 from ..systems import EulerPoincareClosedSystem, LiePoissonSystem, MetriplecticSystem, SimpleClosedSystem, System
 
 Problem = tuple[System, object, float]
-"""A system, the state that it starts from, and the time that it runs."""
+"""A system, its initial state and the duration of the run."""
 
 
 def problems_for(method: OneStepMethod) -> dict[str, Problem]:
-    """What a method is tried on."""
+    """Return the test problems that a method accepts, by name."""
     if method.systems == EVERY_SYSTEM:
         return reference_problems()
-    found = {name: problem for name, problem in special_problems().items() if _accepts_system(method, problem[0])}
-    if not found:
-        raise InputError(f"{method} is for {method.systems}, and none of the suite's is one: give systems=...")
-    return found
+    problems = {name: problem for name, problem in special_problems().items() if _accepts_system(method, problem[0])}
+    if not problems:
+        raise InputError(f"{method} is for {method.systems}, but no test problem is one. Give systems=...")
+    return problems
 
 
 def _accepts_system(method: OneStepMethod, system: System) -> bool:
@@ -39,7 +39,7 @@ def _accepts_system(method: OneStepMethod, system: System) -> bool:
 
 
 def special_problems() -> dict[str, Problem]:
-    """Systems of their own kinds: a mechanical one that heats itself, isolated and driven, and a body with heat."""
+    """Return problems with special systems: mechanical with heat, isolated and driven, and a rigid body with heat."""
 
     def lagrangian(q, v, S):
         kinetic = 0.5 * (1.5 + jnp.sin(q[1])) * v[0] ** 2 + 0.6 * v[1] ** 2 + 0.05 * jnp.sum(v**4)
@@ -48,10 +48,10 @@ def special_problems() -> dict[str, Problem]:
     def friction(q, v, S):
         return -(0.2 + 0.1 * S**2) * v
 
-    def push(q, v, S, t):
+    def driving_force(q, v, S, t):
         return jnp.array([0.3 * jnp.cos(t), -0.2 * q[0]])
 
-    def reduced(xi, S):
+    def reduced_lagrangian(xi, S):
         moments = jnp.array([3.0, 2.0, 1.0])
         return 0.5 * jnp.sum(moments * xi**2) + 0.05 * jnp.dot(xi, xi) ** 2 - jnp.exp(S)
 
@@ -61,13 +61,17 @@ def special_problems() -> dict[str, Problem]:
     start = [0.4, -0.3, 0.5, 0.8, 0.2]
     return {
         "mechanical": (SimpleClosedSystem(lagrangian, 5, friction=friction), start, 1.0),
-        "driven": (SimpleClosedSystem(lagrangian, 5, friction, push), start, 1.0),
-        "body with heat": (EulerPoincareClosedSystem(mf.so(3), reduced, braking), [0.5, -0.3, 0.4, 0.1], 1.0),
+        "driven": (SimpleClosedSystem(lagrangian, 5, friction, driving_force), start, 1.0),
+        "body with heat": (
+            EulerPoincareClosedSystem(mf.so(3), reduced_lagrangian, braking),
+            [0.5, -0.3, 0.4, 0.1],
+            1.0,
+        ),
     }
 
 
 def reference_problems() -> dict[str, Problem]:
-    """A relaxing body, a semidirect product without friction, and a damped oscillator with a bath in R^3."""
+    """Return general problems: a relaxing body, a top with and without friction, and a damped oscillator in R^3."""
     moments = jnp.array([3.0, 2.0, 1.0])
 
     def body(m):

@@ -1,4 +1,4 @@
-"""The suite of systems."""
+"""Property suite of systems."""
 
 from __future__ import annotations
 
@@ -21,27 +21,29 @@ def check_system(
     methods: Sequence[OneStepMethod] = SUITE_METHODS,
     seed: int = 0,
 ) -> Report:
-    """The axioms of a system at random points, and its laws along a run of each method.
+    """Check the axioms of a system at random points, and its laws along a run of each method.
 
     Parameters
     ----------
     system : System
     x0 : array, optional
-        The state that runs start from; a random one by default.
+        Initial state of the runs; a random one by default.
     step : float, optional
-        By default the state moves by a hundredth of its size in a step.
+        By default a step moves the state by a hundredth of its norm.
     methods : sequence of OneStepMethod
 
     Raises
     ------
     PropertyError
-        If one of the properties does not hold.
+        If a property does not hold.
     """
     suite = Suite(system.kind)
     suite.rows += system.check(seed=seed).rows
     points = system.samples(3, seed)
-    field, again = (vector_field_at(s, points) for s in (system, rebuild_pytree(system)))
-    suite.check_true("field to the bit when taken apart and put together", np.array_equal(field, again, equal_nan=True))
+    field, rebuilt_field = (vector_field_at(s, points) for s in (system, rebuild_pytree(system)))
+    suite.check_true(
+        "field to the bit when taken apart and put together", np.array_equal(field, rebuilt_field, equal_nan=True)
+    )
     start = random_start(system, seed) if x0 is None else np.asarray(x0, dtype=np.float64)
     h = default_step(system, start) if step is None else step
     for method in methods:

@@ -1,4 +1,4 @@
-"""A system written down in another way: in other coordinates and units, with other functions, beside another."""
+"""Equivalent forms of a system: in other coordinates and units, with other functions, or as an uncoupled pair."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from ..systems import LiePoissonSystem, MetriplecticSystem, System
 
 @dataclass(frozen=True)
 class CoordinateChange:
-    """States ``y = A x`` at times ``time * t``, the energy and the entropy in other units.
+    """States ``y = A x`` at times ``time_unit * t``, with other units of energy and entropy.
 
     Attributes
     ----------
     matrix : ndarray, shape (n, n)
         A, invertible.
     time_unit, energy_unit, entropy_unit : float, > 0
-        What a unit of each becomes.
+        The value of one old unit in new units.
     """
 
     matrix: np.ndarray
@@ -38,22 +38,22 @@ class CoordinateChange:
     entropy_unit: float = 1.0
 
     def to_new(self, x) -> np.ndarray:
-        """States, shape (..., n), in the new coordinates."""
+        """Return states, shape (..., n), in the new coordinates."""
         return np.asarray(x) @ self.matrix.T
 
     def to_old(self, y) -> np.ndarray:
-        """The inverse of :meth:`there`."""
+        """Return states, shape (..., n), in the old coordinates."""
         return np.asarray(y) @ np.linalg.inv(self.matrix).T
 
     @property
     def uniform_factor(self) -> float | None:
-        """The factor, where A is a number times the identity."""
+        """The factor if A is a multiple of the identity, else None."""
         factor = float(self.matrix[0, 0])
         return factor if np.array_equal(self.matrix, factor * np.eye(len(self.matrix))) else None
 
 
 class _TransformedEnergy(Module):
-    """``factor * energy(B y)``."""
+    """The energy ``factor * energy(B y)``."""
 
     energy: Energy
     matrix: jax.Array
@@ -64,7 +64,7 @@ class _TransformedEnergy(Module):
 
 
 class _TransformedPoisson(PoissonBySharp):
-    """``A Pi(B y) A^T / (e tau)``, B the inverse of A."""
+    """The Poisson tensor ``A Pi(B y) A^T / (e tau)``, B the inverse of A."""
 
     original: mf.PoissonStructure
     matrix: jax.Array
@@ -80,12 +80,12 @@ class _TransformedPoisson(PoissonBySharp):
 
 
 class _TransformedDissipation(LiftedDissipation):
-    """The force of a dissipation in the new coordinates: gradients are taken back to the old ones."""
+    """A dissipation in the new coordinates, evaluated in the old ones."""
 
     system: System
     matrix: jax.Array
     inverse: jax.Array
-    units: jax.Array  # of time, energy, entropy
+    units: jax.Array  # new units of time, energy and entropy
 
     def lifted_geometry(self, system, x) -> LiftedGeometry:
         A = self.matrix
@@ -98,31 +98,31 @@ class _TransformedDissipation(LiftedDissipation):
         return super().generator_field(system, x, dH / self.units[1])
 
     def velocity(self, system, x, dH, dS, dL):
-        at, (_, energy, entropy) = self.lifted_geometry(system, x), self.units
-        given = at.lift_gradients(dH / energy, None if dS is None else dS / entropy, dL)
-        found = self.inner.velocity(at.system, at.x, *given)
-        return None if found is None else energy * (self.inverse.T @ found)
+        original, (_, energy, entropy) = self.lifted_geometry(system, x), self.units
+        gradients = original.lift_gradients(dH / energy, None if dS is None else dS / entropy, dL)
+        velocity = self.inner.velocity(original.system, original.x, *gradients)
+        return None if velocity is None else energy * (self.inverse.T @ velocity)
 
     def factor(self, system, x, dH, dL):
-        return None  # noise has units of its own
+        return None  # the amplitude of noise would scale differently
 
 
 def transform_system(system: System, change: CoordinateChange) -> System:
-    """The same motion in other coordinates and units, for a system on R^n.
+    """Return an equivalent system on R^n in other coordinates and units.
 
-    A Lie-Poisson system stays one, with its group: in units of the momentum and of time where the energy is measured in
-    units of their quotient, and in another basis of its algebra.
+    A Lie-Poisson system remains one in two cases: with its group if the momentum is scaled uniformly and the energy
+    unit is the momentum unit per time unit, and with another basis of its algebra if time and energy keep their units.
     """
     A, B = jnp.asarray(change.matrix), jnp.asarray(np.linalg.inv(change.matrix))
     time, energy, entropy = (jnp.asarray(unit) for unit in (change.time_unit, change.energy_unit, change.entropy_unit))
 
-    def moved(function: Energy, factor=1.0) -> Energy:
+    def transform(function: Energy, factor=1.0) -> Energy:
         return function.map_terms(lambda term: Function(_TransformedEnergy(term, B, jnp.asarray(factor))))
 
     units = jnp.stack([time, energy, entropy])
-    H, S = moved(system.energy, energy), None if system.entropy is None else moved(system.entropy, entropy)
-    friction = _TransformedDissipation.lift_terms(system.dissipation, moved, system, A, B, units)
-    maps = {name: moved(J) for name, J in system.momentum_maps.items()}
+    H, S = transform(system.energy, energy), None if system.entropy is None else transform(system.entropy, entropy)
+    friction = _TransformedDissipation.lift_terms(system.dissipation, transform, system, A, B, units)
+    maps = {name: transform(J) for name, J in system.momentum_maps.items()}
     if isinstance(system, LiePoissonSystem) and not system.sites:
         if change.uniform_factor is not None and change.energy_unit == change.uniform_factor / change.time_unit:
             parts = (system.algebra, system.group, system.reconstruction)
@@ -134,12 +134,12 @@ def transform_system(system: System, change: CoordinateChange) -> System:
             return LiePoissonSystem(g, H, S, friction, maps, validate=False)
     poisson = _TransformedPoisson(system.poisson, A, B, 1.0 / (energy * time))
     functions = system.functions()
-    maps |= {name: moved(functions[name]) for name in sorted(system.first_integrals()) if name not in maps}
+    maps |= {name: transform(functions[name]) for name in sorted(system.first_integrals()) if name not in maps}
     return MetriplecticSystem(poisson, H, S, friction, momentum_maps=maps, validate=False)
 
 
 def transform_structure_constants(constants: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """Structure constants where dual elements have the coordinates ``A mu``: the basis is then ``sum_i A_ai e_i``."""
+    """Return the structure constants in the basis ``sum_i A_ai e_i``, for dual coordinates ``A mu``."""
     C = np.einsum("ai,bj,ijk,kc->abc", matrix, matrix, np.asarray(constants), np.linalg.inv(matrix), optimize=True)
     return 0.5 * (C - C.swapaxes(0, 1))
 
@@ -156,54 +156,54 @@ class _ShiftedEnergy(Module):
 
 
 class _LocalFunction(Module):
-    """A function that is not a number away from some states, nor is its gradient."""
+    """A function that is NaN, as is its gradient, farther than ``radius`` from the given states."""
 
     energy: Energy
     states: jax.Array
     radius: jax.Array
-    negligible_factor: jax.Array  # too small to count, and no zero, whose products programs leave out
+    negligible_factor: jax.Array  # tiny, but not zero, because a compiler may drop products with zero
 
     def __call__(self, x):
-        away = jnp.min(jnp.sum(((x - self.states) / self.radius) ** 2, axis=1))
-        return self.energy.value(x) + self.negligible_factor * jnp.sqrt(1.0 - away)
+        squared_distance = jnp.min(jnp.sum(((x - self.states) / self.radius) ** 2, axis=1))
+        return self.energy.value(x) + self.negligible_factor * jnp.sqrt(1.0 - squared_distance)
 
 
 def add_constant(energy: Energy, constant: float) -> Energy:
-    """An energy with a constant added to its last term, as one writes it down."""
-    *others, last = energy.terms
-    if isinstance(last, Quadratic):
-        last = Quadratic(last.A, last.b, last.c + constant)
+    """Return the energy with a constant added to its last term."""
+    *leading_terms, last_term = energy.terms
+    if isinstance(last_term, Quadratic):
+        last_term = Quadratic(last_term.A, last_term.b, last_term.c + constant)
     else:
-        last = Function(_ShiftedEnergy(last, jnp.asarray(constant)), degree=last.degree)
-    return Sum((*others, last)) if others else last
+        last_term = Function(_ShiftedEnergy(last_term, jnp.asarray(constant)), degree=last_term.degree)
+    return Sum((*leading_terms, last_term)) if leading_terms else last_term
 
 
 def restrict_near_states(energy: Energy, states, radius: float) -> Energy:
-    """A function that is known within a radius of some states alone, shape (m, n)."""
+    """Return the function restricted to a radius around some states, shape (m, n); it is NaN elsewhere."""
     return Function(_LocalFunction(energy, jnp.asarray(states), jnp.asarray(radius), jnp.asarray(1e-300)))
 
 
-def as_closure(energy: Energy) -> Energy:
-    """A plain function whose parameters are numbers that it closes over."""
+def close_over_parameters(energy: Energy) -> Energy:
+    """Return the energy as plain functions that close over its parameters."""
     return energy.map_terms(lambda term: term if isinstance(term, Pullback) else Function(lambda x: term.value(x)))
 
 
 def replace_parts(system: System, **parts: Any) -> System:
-    """A system with other parts, named as its attributes are."""
+    """Return the system with other parts, given by attribute name."""
     names = list(parts)
-    found = eqx.tree_at(
+    changed = eqx.tree_at(
         lambda s: [getattr(s, name) for name in names], system, list(parts.values()), is_leaf=lambda part: part is None
     )
-    if "dissipation" in parts:  # the constructor of a system finds names for what its dissipation preserves
-        object.__setattr__(found, "preserved_labels", found._find_preserved_names() if found.preserved else None)
-    return found
+    if "dissipation" in parts:  # the constructor sets these names from the dissipation
+        object.__setattr__(changed, "preserved_labels", changed._find_preserved_names() if changed.preserved else None)
+    return changed
 
 
 # -- other dissipations ---------------------------------------------------------------------------------------------
 
 
 class _ScaledDissipation(LiftedDissipation):
-    """A share of a dissipation."""
+    """A fraction of a dissipation."""
 
     fraction: jax.Array
 
@@ -215,12 +215,12 @@ class _ScaledDissipation(LiftedDissipation):
         return None if B is None else B.scale_by(self.fraction)
 
     def velocity(self, system, x, dH, dS, dL):
-        found = self.inner.velocity(system, x, dH, dS, dL)
-        return None if found is None else self.fraction * found
+        velocity = self.inner.velocity(system, x, dH, dS, dL)
+        return None if velocity is None else self.fraction * velocity
 
 
 def split_in_halves(dissipation: Dissipation) -> Dissipation:
-    """The sum of two, each with half of the rate."""
+    """Return the dissipation as the sum of two with half of the rate each."""
     rate = getattr(dissipation, "rate", None)
     if isinstance(rate, jax.Array | np.ndarray | float):
         half = eqx.tree_at(lambda d: d.rate, dissipation, rate / 2)
@@ -230,7 +230,7 @@ def split_in_halves(dissipation: Dissipation) -> Dissipation:
     return DissipationSum((*half.terms, *half.terms))
 
 
-# -- two of them ------------------------------------------------------------------------------------------------------
+# -- pairs of systems -------------------------------------------------------------------------------------------------
 
 
 class _EmbeddedDissipation(LiftedDissipation):
@@ -239,30 +239,32 @@ class _EmbeddedDissipation(LiftedDissipation):
 
     def lifted_geometry(self, system, x) -> LiftedGeometry:
         n, i = self.system.dim, self.start
-        own = slice(i, i + n)
-        return LiftedGeometry(self.system, x[own], lambda alpha: alpha[own], lambda v: jnp.pad(v, (i, n - i)))
+        block = slice(i, i + n)
+        return LiftedGeometry(self.system, x[block], lambda alpha: alpha[block], lambda v: jnp.pad(v, (i, n - i)))
 
 
 class UncoupledPair(System):
-    """Two copies of a system that know nothing of each other, in the states (x, y)."""
+    """Two uncoupled copies of a system, with states (x, y)."""
 
     def __init__(self, system: System):
         n = system.dim
 
-        def on(i: int) -> Callable[[Energy], Energy]:
+        def restriction_to(i: int) -> Callable[[Energy], Energy]:
             return lambda energy: energy.on(range(i, i + n))
 
-        first, second, functions = on(0), on(n), system.functions()
-        parts: list[Dissipation] = []
-        for i, pulled in ((0, first), (n, second)):
-            own = _EmbeddedDissipation.lift_terms(system.dissipation, pulled, system, i)
-            parts += () if own is None else own.terms
+        restrict_first, restrict_second, functions = restriction_to(0), restriction_to(n), system.functions()
+        terms: list[Dissipation] = []
+        for i, restrict in ((0, restrict_first), (n, restrict_second)):
+            embedded = _EmbeddedDissipation.lift_terms(system.dissipation, restrict, system, i)
+            terms += () if embedded is None else embedded.terms
         self.dim, self.space, self.poisson = 2 * n, None, ProductPoisson(system.poisson, system.poisson)
-        self.energy = first(system.energy) + second(system.energy)
-        self.entropy = None if system.entropy is None else first(system.entropy) + second(system.entropy)
-        self.dissipation = DissipationSum(tuple(parts)) if parts else None
+        self.energy = restrict_first(system.energy) + restrict_second(system.energy)
+        self.entropy = (
+            None if system.entropy is None else restrict_first(system.entropy) + restrict_second(system.entropy)
+        )
+        self.dissipation = DissipationSum(tuple(terms)) if terms else None
         self.momentum_maps = {
             f"{name} of {which}": pulled(functions[name])
             for name in sorted(system.first_integrals())
-            for which, pulled in (("one", first), ("the other", second))
+            for which, pulled in (("one", restrict_first), ("the other", restrict_second))
         }

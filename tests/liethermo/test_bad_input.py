@@ -107,7 +107,7 @@ CASES = {
         lambda: M.gas_piston(conductance=(1.0, 1.0, 1.0)),
         r"conductance must have shape \(2,\), got",
     ),
-    "no mass": (lambda: M.porous_piston(mass=0), "mass must be positive and finite, not 0.0"),
+    "no mass": (lambda: M.porous_piston(mass=0), "mass must be positive and finite, got 0.0"),
     "mass": (lambda: M.porous_piston(mass="a"), "mass must be made of real numbers, got 'a'"),
     "None": (lambda: M.cylinder(mass=None), "mass must be made of real numbers, got None"),
     "inertia": (lambda: M.rigid_body("a"), "inertia must be made of real numbers, got 'a'"),

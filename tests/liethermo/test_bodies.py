@@ -136,7 +136,7 @@ def test_the_damping_time_of_a_solid_body():
     assert lt.bodies.damping_time(5e9, 100.0, 2500.0, np.array([1e3, 2e3]), 1e-4)[1] == pytest.approx(
         lt.bodies.damping_time(5e9, 100.0, 2500.0, 1e3, 1e-4) / 4
     )
-    with pytest.raises(lt.InputError, match=r"spin must be positive and finite, not 0\.0"):
+    with pytest.raises(lt.InputError, match=r"spin must be positive and finite, got 0\.0"):
         lt.bodies.damping_time(5e9, 100.0, 2500.0, 1e3, 0.0)
     rates = lt.bodies.rate_of(np.array([1.0, 2.0]), (1.0, 1.5, 2.0), 3.0)
     assert np.allclose(rates[0], 2 * rates[1])

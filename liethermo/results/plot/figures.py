@@ -46,5 +46,5 @@ def save_figure(figure: Figure, path: Path | None) -> Figure:
         try:
             disk.write_atomically(path, buffer.getbuffer())
         except (OSError, ValueError) as error:  # ValueError for an invalid path
-            raise FileError(f"cannot write {path}: {disk.why_os_failed(error)}") from error
+            raise FileError(f"cannot write {path}: {disk.describe_os_error(error)}") from error
     return figure

@@ -1,4 +1,4 @@
-"""diffrax runs our systems with its solvers and with ours."""
+"""diffrax runs systems of the library with its own solvers and with methods of the library."""
 
 from __future__ import annotations
 
@@ -48,25 +48,25 @@ def test_adaptive_steps_and_diffrax_own_solvers_agree():
 @pytest.mark.sampled("MetriplecticGauss(stages=2)", "MetriplecticRungeKutta(order=6)")
 @pytest.mark.parametrize("method", list(lt.registered_methods()), ids=str)
 def test_time_runs_backwards(method):
-    """To the order of the method, against SciPy; the energy stays, and the entropy falls by what it has risen."""
+    """Backward runs have the order of the method, against SciPy; energy is constant and the entropy falls."""
     system, solver, T = body(), lt.diffrax.Solver(method), 1.0
     field = jax.jit(lambda x: -system.vector_field(x))
     exact = solve_ivp(lambda _, x: np.asarray(field(x)), (0.0, T), X0, "DOP853", rtol=1e-13, atol=1e-15)
-    few = 8 if method.order < 4 else 3
+    n_coarse = 8 if method.order < 4 else 3
     ends = []
-    for n in (few, 2 * few):
+    for n in (n_coarse, 2 * n_coarse):
         run = diffrax.diffeqsolve(lt.diffrax.Term(system), solver, 0.0, -T, -T / n, X0, throw=False)
         assert run.result == diffrax.RESULTS.successful
         ends.append(run.ys[-1])
-    first, second = (float(np.abs(x - exact.y[:, -1]).max()) for x in ends)
-    assert second < 1e-12 or np.log2(first / second) > method.order - 0.4, (first, second)
+    coarse_error, fine_error = (float(np.abs(x - exact.y[:, -1]).max()) for x in ends)
+    assert fine_error < 1e-12 or np.log2(coarse_error / fine_error) > method.order - 0.4, (coarse_error, fine_error)
     assert float(system.energy(ends[1])) == pytest.approx(float(system.energy(X0)), rel=1e-14)
     assert float(system.entropy(ends[1])) < float(system.entropy(X0)) - 1e-3
 
 
 @pytest.mark.parametrize("method", [lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(6)], ids=str)
 def test_adaptive_steps_backwards_are_as_many_as_forwards(method):
-    """Of a motion that can be reversed: an error is a size, whichever way time runs."""
+    """A reversible motion takes about as many adaptive steps backwards as forwards."""
     system = lt.models.free_rigid_body((3.0, 2.0, 1.0))
     controller = diffrax.PIDController(rtol=1e-8, atol=1e-10)
 
@@ -76,10 +76,10 @@ def test_adaptive_steps_backwards_are_as_many_as_forwards(method):
             stepsize_controller=controller,
         )  # fmt: skip
 
-    there = run(X0, 0.0, 2.0)
-    back = run(there.ys[-1], 2.0, 0.0)
-    assert np.abs(back.ys[-1] - X0).max() < 1e-6
-    steps = [int(part.stats["num_steps"]) for part in (there, back)]
+    forward_run = run(X0, 0.0, 2.0)
+    backward_run = run(forward_run.ys[-1], 2.0, 0.0)
+    assert np.abs(backward_run.ys[-1] - X0).max() < 1e-6
+    steps = [int(part.stats["num_steps"]) for part in (forward_run, backward_run)]
     assert abs(steps[1] - steps[0]) <= 0.2 * steps[0] + 2, steps
 
 
@@ -91,8 +91,8 @@ def test_reverse_mode_through_diffrax_is_the_derivative_of_the_flow():
         )
         return run.ys[-1, 0]
 
-    by_flow = jax.grad(lambda rate: lt.flow(body(rate), X0, (0.0, 0.5), 0.1, lt.MetriplecticGauss(1))[0])(0.3)
-    assert jax.grad(end)(0.3) == pytest.approx(float(by_flow), rel=1e-10)
+    flow_derivative = jax.grad(lambda rate: lt.flow(body(rate), X0, (0.0, 0.5), 0.1, lt.MetriplecticGauss(1))[0])(0.3)
+    assert jax.grad(end)(0.3) == pytest.approx(float(flow_derivative), rel=1e-10)
 
 
 def test_a_step_that_cannot_be_solved_is_reported():
@@ -100,7 +100,7 @@ def test_a_step_that_cannot_be_solved_is_reported():
     assert run.result != diffrax.RESULTS.successful
 
 
-def test_what_depends_on_time_is_sent_elsewhere():
+def test_an_energy_that_depends_on_time_is_refused():
     driven = lt.LiePoissonSystem(
         lt.models.rigid_body().algebra, lt.TimeDependent(lambda x, t: (1.0 + 0.1 * jnp.sin(t)) * x @ x)
     )

@@ -1,4 +1,4 @@
-"""``lt.scipy.solve_ivp`` does what SciPy's does, and keeps the laws."""
+"""``lt.scipy.solve_ivp`` gives the results of SciPy's function, and conserves the laws."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ import manifolds as mf
 from liethermo.engines.choice import EngineWithFallback
 
 BODY = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.3)
-X0, SPAN = [0.1, 0.2, 1.0], (0.0, 8.0)
+X0 = [0.1, 0.2, 1.0]
+SPAN = (0.0, 8.0)
 
 
 @jax.jit
@@ -27,7 +28,7 @@ def field(t, y):
     return np.asarray(velocity(y))
 
 
-def test_it_agrees_with_scipy_and_keeps_the_laws():
+def test_solve_ivp_agrees_with_scipy_and_keeps_the_laws():
     times = [1.0, 2.5, 8.0]
     theirs = solve_ivp(field, SPAN, X0, "DOP853", times, rtol=1e-10, atol=1e-12)
     ours = lt.scipy.solve_ivp(BODY, SPAN, X0, t_eval=times, rtol=1e-10, atol=1e-12)
@@ -43,11 +44,11 @@ def test_it_agrees_with_scipy_and_keeps_the_laws():
     assert np.ptp(BODY.energy(theirs.y.T)) > 1e-13  # theirs drifts: there is something to keep
 
 
-def crossing(t, y):
+def crossing_event(t, y):
     return y[0] - y[1] + 0.1 * np.sin(t)
 
 
-def turning(t, y):
+def oscillating_event(t, y):
     return np.sin(3.0 * t) + y[2] - 1.0
 
 
@@ -57,25 +58,25 @@ def _event(function, **attributes):
     return copy
 
 
-def both(events, span=SPAN, rtol=1e-10, **settings):
-    """SciPy's answer and ours."""
+def solve_by_both(events, span=SPAN, rtol=1e-10, **settings):
+    """Return the results of SciPy and of the library."""
     settings = {"events": events, "rtol": rtol, "atol": rtol, **settings}
     return solve_ivp(field, span, X0, "DOP853", **settings), lt.scipy.solve_ivp(BODY, span, X0, **settings)
 
 
-def same_events(theirs, ours, tolerance=1e-8):
+def assert_same_events(theirs, ours, tolerance=1e-8):
     assert ours.status == theirs.status
     assert [len(times) for times in ours.t_events] == [len(times) for times in theirs.t_events]
     for name in ("t_events", "y_events"):
-        for one, other in zip(getattr(ours, name), getattr(theirs, name), strict=True):
-            assert np.abs(one - other.reshape(one.shape)).max(initial=0.0) < tolerance
+        for our_values, peer_values in zip(getattr(ours, name), getattr(theirs, name), strict=True):
+            assert np.abs(our_values - peer_values.reshape(our_values.shape)).max(initial=0.0) < tolerance
 
 
 @pytest.mark.parametrize("direction", [-1, 0, 1])
 def test_events_are_those_of_scipy(direction):
-    watched = [_event(f, direction=direction) for f in (crossing, turning)]
-    theirs, ours = both(watched, dense_output=True)
-    same_events(theirs, ours)
+    events = [_event(f, direction=direction) for f in (crossing_event, oscillating_event)]
+    theirs, ours = solve_by_both(events, dense_output=True)
+    assert_same_events(theirs, ours)
     assert len(ours.t_events[0]) + len(ours.t_events[1]) > 2
     assert ours.sol([1.0, 2.0]).shape == theirs.sol([1.0, 2.0]).shape == (3, 2)
     assert ours.sol(1.0).shape == (3,)
@@ -88,59 +89,61 @@ TIMES = np.linspace(*SPAN, 50)
 @pytest.mark.parametrize("method", [None, lt.MetriplecticGauss(3), lt.MetriplecticRungeKutta(4)], ids=str)
 @pytest.mark.parametrize("rtol", [1e-6, 1e-9])
 def test_events_are_zeros_and_as_accurate_as_asked_and_the_laws_hold_there(rtol, method):
-    exact = solve_ivp(field, SPAN, X0, "DOP853", events=crossing, rtol=3e-14, atol=1e-16).t_events[0]
-    ours = lt.scipy.solve_ivp(BODY, SPAN, X0, method, events=crossing, rtol=rtol, atol=rtol, dense_output=True)
+    exact = solve_ivp(field, SPAN, X0, "DOP853", events=crossing_event, rtol=3e-14, atol=1e-16).t_events[0]
+    ours = lt.scipy.solve_ivp(BODY, SPAN, X0, method, events=crossing_event, rtol=rtol, atol=rtol, dense_output=True)
     assert np.abs(ours.t_events[0] - exact).max() < 30.0 * rtol
-    assert max(abs(crossing(t, y)) for t, y in zip(ours.t_events[0], ours.y_events[0], strict=True)) < 2e-15
+    assert max(abs(crossing_event(t, y)) for t, y in zip(ours.t_events[0], ours.y_events[0], strict=True)) < 2e-15
     states = np.concatenate([ours.y_events[0], ours.sol(TIMES).T])
     assert np.ptp([*BODY.energy(states), ours.solution.energy[0]]) < 2e-15
 
 
 def test_several_zeros_in_a_step_are_found():
-    """Steps are up to half a radian long at this tolerance, and more than two zeros may be in one."""
-    theirs, ours = both(lambda t, y: np.sin(9.0 * t) + 0.1 * y[0], rtol=1e-6, max_step=0.05)
-    long = lt.scipy.solve_ivp(BODY, SPAN, X0, events=lambda t, y: np.sin(9.0 * t) + 0.1 * y[0], rtol=1e-6, atol=1e-6)
-    same_events(theirs, ours, 1e-5)
-    assert len(long.t) < len(theirs.t_events[0]) / 2
-    assert np.abs(long.t_events[0] - theirs.t_events[0]).max() < 1e-4
+    """At this tolerance a step spans up to half a radian and may contain more than two zeros."""
+    theirs, ours = solve_by_both(lambda t, y: np.sin(9.0 * t) + 0.1 * y[0], rtol=1e-6, max_step=0.05)
+    coarse_run = lt.scipy.solve_ivp(
+        BODY, SPAN, X0, events=lambda t, y: np.sin(9.0 * t) + 0.1 * y[0], rtol=1e-6, atol=1e-6
+    )
+    assert_same_events(theirs, ours, 1e-5)
+    assert len(coarse_run.t) < len(theirs.t_events[0]) / 2
+    assert np.abs(coarse_run.t_events[0] - theirs.t_events[0]).max() < 1e-4
 
 
 @pytest.mark.parametrize("terminal", [True, 2, 3])
 def test_terminal_events_end_the_run_at_their_zeros(terminal):
-    """Others are kept up to there; the last state is the event's."""
-    turned = lambda t, y: turning(t, y) - 0.01  # noqa: E731
-    theirs, ours = both([_event(turned, terminal=terminal), crossing], dense_output=True)
-    same_events(theirs, ours)
+    """Other events are kept up to the terminal one, whose state is the last."""
+    shifted_event = lambda t, y: oscillating_event(t, y) - 0.01  # noqa: E731
+    theirs, ours = solve_by_both([_event(shifted_event, terminal=terminal), crossing_event], dense_output=True)
+    assert_same_events(theirs, ours)
     assert (ours.status, ours.success, ours.message) == (1, True, "A termination event occurred.")
     assert len(ours.t_events[0]) == int(terminal)
     assert ours.t[-1] == ours.t_events[0][-1]
     assert np.array_equal(ours.y[:, -1], ours.y_events[0][-1])
-    assert abs(turned(ours.t[-1], ours.y[:, -1])) < 2e-15
+    assert abs(shifted_event(ours.t[-1], ours.y[:, -1])) < 2e-15
     assert ours.solution.audit().passed
     assert np.array_equal(ours.sol(ours.t[-1]), ours.y[:, -1])
 
 
 @pytest.mark.parametrize("terminal", [False, True])
 def test_events_at_both_ends(terminal):
-    """Exactly at the end, and at the start, as SciPy has them; an end of a step is passed once."""
+    """Zeros exactly at the end or at the start count as in SciPy, and an end of a step counts once."""
     for time in (SPAN[1], SPAN[0]):
-        theirs, ours = both(_event(lambda t, y, time=time: t - time, terminal=terminal))
-        same_events(theirs, ours)
+        theirs, ours = solve_by_both(_event(lambda t, y, time=time: t - time, terminal=terminal))
+        assert_same_events(theirs, ours)
         assert ours.t_events[0].tolist() == [time]
         assert ours.t[-1] == (time if terminal else SPAN[1])
-    kept = lt.scipy.solve_ivp(BODY, SPAN, X0, t_eval=[1.0, 3.0], events=lambda t, y: t - 3.0)
-    assert kept.t_events[0].tolist() == [3.0]
+    sampled_run = lt.scipy.solve_ivp(BODY, SPAN, X0, t_eval=[1.0, 3.0], events=lambda t, y: t - 3.0)
+    assert sampled_run.t_events[0].tolist() == [3.0]
 
 
 @pytest.mark.parametrize("width", [1e-6, 1e-3, 0.02, 0.5])
 def test_a_function_that_is_not_a_number_has_no_zero_there(width):
-    """Be the hole wider than steps or so narrow that the search alone meets it."""
+    """The NaN interval may be wider than the steps, or so narrow that only the search meets it."""
     ours = lt.scipy.solve_ivp(BODY, SPAN, X0, events=lambda t, y: np.nan if abs(t - 3.0) < width else t - 3.0)
     assert ours.success
     assert ours.t_events[0].size == 0
 
 
-def forced(t, y):
+def forced_oscillator(t, y):
     return [y[1], -y[0] + 0.1 * np.sin(2.0 * t)]
 
 
@@ -151,33 +154,34 @@ OSCILLATOR = lt.MetriplecticSystem(
 
 @pytest.mark.parametrize("direction", [-1, 0, 1])
 def test_events_in_the_first_step_of_a_driven_system(direction):
-    """Whatever the run looks at before its first step: an event in it, and zeros at the start."""
+    """Events in the first step and zeros at the start are found in a driven system."""
     functions = (lambda t, y: y[0] - 0.9995, lambda t, y: y[1], lambda t, y: y[0] - 1.0, lambda t, y: t)
     events = [_event(f, direction=direction) for f in functions]
     settings = {"events": events, "rtol": 1e-9, "atol": 1e-9}
     # in longer steps SciPy sees no event that is undone within a step
-    theirs = solve_ivp(forced, (0.0, 10.0), [1.0, 0.0], "DOP853", max_step=0.05, **settings)
+    theirs = solve_ivp(forced_oscillator, (0.0, 10.0), [1.0, 0.0], "DOP853", max_step=0.05, **settings)
     ours = lt.scipy.solve_ivp(OSCILLATOR, (0.0, 10.0), [1.0, 0.0], **settings)
     if direction <= 0:
         assert ours.t_events[0][0] < ours.t[1]
         assert ours.t_events[1][0] == ours.t_events[2][0] == 0.0
-    same_events(theirs, ours, 1e-6)
+    assert_same_events(theirs, ours, 1e-6)
 
 
 @pytest.mark.parametrize(
     "events", [lambda t, y: y[1] * 0.0, lambda t, y: min(t - 1.0, 0.0) if t else 0.0], ids=["zero", "nearly"]
 )
 def test_a_zero_at_the_start_is_a_zero_whatever_comes_next(events):
-    """As in SciPy, where it ends the run if it is terminal."""
+    """As in SciPy, a terminal event that is zero at the start ends the run."""
     settings = {"events": _event(events, terminal=True)}
-    theirs = solve_ivp(forced, (0.0, 10.0), [1.0, 0.0], **settings)
+    theirs = solve_ivp(forced_oscillator, (0.0, 10.0), [1.0, 0.0], **settings)
     ours = lt.scipy.solve_ivp(OSCILLATOR, (0.0, 10.0), [1.0, 0.0], **settings)
     assert ours.status == theirs.status == 1
     assert ours.t_events[0].tolist() == theirs.t_events[0].tolist() == [0.0]
 
 
 def test_every_change_of_sign_between_states_is_an_event():
-    """Near the middle axis, at this tolerance, parts of steps have to be divided: the corrections do not converge."""
+    """Near the middle axis, partial steps have to be divided at this tolerance, as their corrections do not
+    converge."""
     body = lt.models.free_rigid_body((3.0, 2.0, 1.0))
     ours = lt.scipy.solve_ivp(body, (0.0, 400.0), [1e-6, 1.0, 1e-6], events=lambda t, y: y[0], dense_output=True)
     changes = np.flatnonzero(np.diff(np.sign(ours.y[0])) != 0.0)
@@ -189,13 +193,13 @@ def test_every_change_of_sign_between_states_is_an_event():
 
 
 def test_a_state_that_cannot_be_found_is_a_failure_with_a_reason(monkeypatch):
-    """Where no part of a long step can be taken; the message's advice helps."""
+    """No partial step of a long step can be taken; following the message's advice helps."""
 
-    def part_of_step(self, state, h, found=EngineWithFallback.partial_step):
-        after = found(self, state, h)
-        return after if h < 0.05 else after._replace(status=np.int64(1))
+    def failing_partial_step(self, state, h, partial_step=EngineWithFallback.partial_step):
+        next_state = partial_step(self, state, h)
+        return next_state if h < 0.05 else next_state._replace(status=np.int64(1))
 
-    monkeypatch.setattr(EngineWithFallback, "part_of_step", part_of_step)
+    monkeypatch.setattr(EngineWithFallback, "partial_step", failing_partial_step)
     settings = {"events": lambda t, y: t - 3.0, "rtol": 1e-6}
     ours = lt.scipy.solve_ivp(BODY, SPAN, X0, **settings)
     assert (ours.success, ours.status, ours.t_events[0].size) == (False, -1, 0)
@@ -203,18 +207,18 @@ def test_a_state_that_cannot_be_found_is_a_failure_with_a_reason(monkeypatch):
     assert "not_converged" in ours.message
     assert ours.t[-1] < 3.0
     assert ours.solution.status.code == "not_converged"
-    advised = float(re.search(r"max_step=([0-9.e+-]+)", ours.message)[1])
+    max_step = float(re.search(r"max_step=([0-9.e+-]+)", ours.message)[1])
     for _ in range(5):
-        ours = lt.scipy.solve_ivp(BODY, SPAN, X0, max_step=advised, **settings)
+        ours = lt.scipy.solve_ivp(BODY, SPAN, X0, max_step=max_step, **settings)
         if ours.success:
             break
-        advised = float(re.search(r"max_step=([0-9.e+-]+)", ours.message)[1])
+        max_step = float(re.search(r"max_step=([0-9.e+-]+)", ours.message)[1])
     assert ours.success
     assert ours.t_events[0] == pytest.approx([3.0])
 
 
 def test_a_state_between_steps_that_cannot_be_found_is_an_error(monkeypatch):
-    monkeypatch.setattr(EngineWithFallback, "ends", lambda self, x, h: np.full_like(x, np.nan))
+    monkeypatch.setattr(EngineWithFallback, "step_ends", lambda self, x, h: np.full_like(x, np.nan))
     run = lt.integrate(BODY, X0, SPAN, 0.5, dense=True)
     assert np.array_equal(run(SPAN[1]), run.x[-1])
     with pytest.raises(lt.ConvergenceError, match=r"the state at t = 0\.75, between two steps, cannot be found"):
@@ -223,18 +227,18 @@ def test_a_state_between_steps_that_cannot_be_found_is_an_error(monkeypatch):
 
 @pytest.mark.parametrize("width", [1e-6, 0.5, 3.0])
 def test_the_message_says_where_a_function_is_not_a_number(width):
-    """A change of sign across it may be a zero, or none: what is not known is said."""
+    """A sign change across NaN values may or may not be a zero, so it is reported."""
     ours = lt.scipy.solve_ivp(BODY, SPAN, X0, events=lambda t, y: np.nan if abs(t - 3.0) < width else t - 3.0)
     assert "the event function is NaN between t = " in ours.message
-    kept = lt.scipy.solve_ivp(BODY, SPAN, X0, events=lambda t, y: np.nan if abs(t - 3.0) < width else t + 3.0)
-    assert "NaN" not in kept.message
+    same_sign_run = lt.scipy.solve_ivp(BODY, SPAN, X0, events=lambda t, y: np.nan if abs(t - 3.0) < width else t + 3.0)
+    assert "NaN" not in same_sign_run.message
 
 
 def test_arguments_of_scipy():
-    """Its limit of steps is infinite by default; what it passes to functions goes to the events."""
-    level = lambda t, y, c: crossing(t, y) - c  # noqa: E731
+    """An infinite maximum step is allowed, and ``args`` are passed to the events."""
+    level = lambda t, y, c: crossing_event(t, y) - c  # noqa: E731
     ours = lt.scipy.solve_ivp(BODY, SPAN, X0, events=level, args=(0.01,), vectorized=True, max_step=np.inf)
-    assert crossing(ours.t_events[0][0], ours.y_events[0][0]) == pytest.approx(0.01, abs=1e-15)
+    assert crossing_event(ours.t_events[0][0], ours.y_events[0][0]) == pytest.approx(0.01, abs=1e-15)
     assert lt.scipy.solve_ivp(BODY, SPAN, X0, t_eval=[0.0]).t.tolist() == [0.0]
     assert lt.scipy.solve_ivp(BODY, SPAN, X0, t_eval=[]).t.size == 0
 
@@ -248,22 +252,22 @@ def test_a_failure_is_told_as_scipy_tells_it():
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("arguments", "message"),
     [
         ({"fun": field}, "must be a system"),
         ({"t_eval": [2.0, 1.0]}, "increasing"),
         ({"t_eval": [1.0, 9.0]}, r"t_eval must be times of t_span = \(0, 8\), got 9"),
         ({"t_eval": [-1.0, 1.0]}, "got -1, outside of it"),
-        ({"t_span": (8.0, 0.0)}, "runs backwards, and time runs forwards here, since entropy grows"),
+        ({"t_span": (8.0, 0.0)}, "runs backwards"),
         ({"t_span": 3.0}, "two numbers"),
-        ({"args": (1.0,)}, "args are passed to the events, and there are none"),
-        ({"args": 1.0, "events": crossing}, r"write args=\(1.0,\)"),
-        ({"events": _event(crossing, terminal=-1)}, "terminal must be True or the number"),
+        ({"args": (1.0,)}, "args are passed to the events, but there are none"),
+        ({"args": 1.0, "events": crossing_event}, r"Write args=\(1.0,\)"),
+        ({"events": _event(crossing_event, terminal=-1)}, "terminal must be True or the number"),
         ({"jac": None}, "leave out jac: the methods take it from the system"),
         ({"rtoll": 1e-6}, "leave out rtoll: solve_ivp has no such option"),
         ({"max_step": -1.0}, "largest step"),
     ],
 )
-def test_bad_input_is_refused(given, message):
+def test_invalid_arguments_are_refused(arguments, message):
     with pytest.raises(lt.InputError, match=message):
-        lt.scipy.solve_ivp(**({"fun": BODY, "t_span": SPAN, "y0": X0} | given))
+        lt.scipy.solve_ivp(**({"fun": BODY, "t_span": SPAN, "y0": X0} | arguments))

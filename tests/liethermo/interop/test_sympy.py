@@ -1,4 +1,4 @@
-"""Systems in symbols: their laws proved, energies from SymPy, problems written down."""
+"""Systems as SymPy expressions: proofs of their laws, energies from SymPy, and descriptions of problems."""
 
 from __future__ import annotations
 
@@ -23,24 +23,28 @@ GENERAL = lt.LiePoissonSystem(
 
 
 def test_the_laws_are_proved_in_symbols():
-    found = lt.sympy.expressions(lt.models.rigid_body((3, 2, 1)))
-    rate = sum(sympy.diff(found.energy, x) * f for x, f in zip(found.variables, found.field, strict=True))
+    symbolic = lt.sympy.expressions(lt.models.rigid_body((3, 2, 1)))
+    rate = sum(sympy.diff(symbolic.energy, x) * f for x, f in zip(symbolic.variables, symbolic.field, strict=True))
     assert sympy.simplify(rate) == 0
-    production = sum(sympy.diff(found.entropy, x) * f for x, f in zip(found.variables, found.field, strict=True))
+    production = sum(
+        sympy.diff(symbolic.entropy, x) * f for x, f in zip(symbolic.variables, symbolic.field, strict=True)
+    )
     assert sympy.simplify(production) != 0
-    assert found.energy == sum(x**2 / sympy.Integer(2 * i) for x, i in zip(found.variables, (3, 2, 1), strict=True))
+    assert symbolic.energy == sum(
+        x**2 / sympy.Integer(2 * i) for x, i in zip(symbolic.variables, (3, 2, 1), strict=True)
+    )
 
 
 def test_expressions_have_the_values_of_the_functions():
-    found = lt.sympy.expressions(GENERAL, names=("a", "b", "c"))
-    assert [str(x) for x in found.variables] == ["a", "b", "c"]
+    symbolic = lt.sympy.expressions(GENERAL, names=("a", "b", "c"))
+    assert [str(x) for x in symbolic.variables] == ["a", "b", "c"]
     at = np.array([0.3, -0.4, 0.7])
-    numbers = dict(zip(found.variables, at, strict=True))
-    field = [float(f.subs(numbers)) for f in found.field]
+    numbers = dict(zip(symbolic.variables, at, strict=True))
+    field = [float(f.subs(numbers)) for f in symbolic.field]
     assert np.allclose(field, GENERAL.vector_field(jnp.array(at)), rtol=1e-13, atol=1e-15)
-    assert float(found.energy.subs(numbers)) == pytest.approx(float(GENERAL.energy.value(at)), rel=1e-14)
-    assert found.entropy is not None
-    assert float(found.entropy.subs(numbers)) == pytest.approx(float(GENERAL.entropy.value(at)), rel=1e-14)
+    assert float(symbolic.energy.subs(numbers)) == pytest.approx(float(GENERAL.energy.value(at)), rel=1e-14)
+    assert symbolic.entropy is not None
+    assert float(symbolic.entropy.subs(numbers)) == pytest.approx(float(GENERAL.entropy.value(at)), rel=1e-14)
 
 
 def test_an_energy_from_sympy_runs():
@@ -74,13 +78,13 @@ def test_a_function_that_jax_lacks_is_named(expression, name):
 def test_special_functions_are_those_of_jax():
     x, y = sympy.symbols("x y")
     f = lt.sympy.function(sympy.erf(x) + sympy.gamma(y) + sympy.loggamma(y), (x, y))
-    expected = math.erf(0.3) + math.gamma(1.7) + math.lgamma(1.7)
-    assert float(jax.jit(f)(jnp.array([0.3, 1.7]))) == pytest.approx(expected, rel=1e-14)
+    exact = math.erf(0.3) + math.gamma(1.7) + math.lgamma(1.7)
+    assert float(jax.jit(f)(jnp.array([0.3, 1.7]))) == pytest.approx(exact, rel=1e-14)
 
 
 def test_a_problem_written_down_is_the_problem(tmp_path):
     system, x0 = lt.models.rigid_body((3, 2, 1), rate=0.5), [0.1, 0.2, 1.0]
-    file = lt.sympy.write(lt.sympy.describe_point(system, x0, (0.0, 5.0), "relaxed body"), tmp_path / "body.json")
+    file = lt.sympy.write(lt.sympy.describe(system, x0, (0.0, 5.0), "relaxed body"), tmp_path / "body.json")
     problem = json.loads(file.read_text())
     assert problem["format"] == "liethermo-problem-1"
     assert [1, 2, 3, "1"] in problem["lie_algebra"]["structure_constants"]
@@ -97,7 +101,7 @@ def test_a_problem_written_down_is_the_problem(tmp_path):
     assert np.abs(run.y[:, -1] - problem["reference"]["state"]).max() < 1e-9
 
 
-def test_what_depends_on_time_has_expressions_at_one_time():
+def test_an_energy_that_depends_on_time_has_expressions_at_one_time():
     driven = lt.LiePoissonSystem(mf.so(3), lt.TimeDependent(lambda x, t: (1.0 + t) * x @ x / 2))
     with pytest.raises(lt.InputError, match="at_time"):
         lt.sympy.expressions(driven)

@@ -27,11 +27,11 @@ def test_a_fitted_system_is_studied_and_its_study_goes_on_with_the_one_from_the_
     assert first_study.run().ok
     assert first_study.audit().passed
     one = lt.integrate(fitted_system, x[1, 0], (0.0, 1.0), 0.1)
-    np.testing.assert_allclose(first_study.results.needs_final_state[1], one.x[-1], atol=1e-13)
+    np.testing.assert_allclose(first_study.results.final[1], one.x[-1], atol=1e-13)
     second = _study(
         loaded_system, starts, store=tmp_path / "store.zarr"
     )  # would be refused if it was of another system
-    np.testing.assert_array_equal(second.results.needs_final_state, first_study.results.needs_final_state)
+    np.testing.assert_array_equal(second.results.final, first_study.results.needs_final_state)
 
 
 def test_a_learned_number_is_an_axis():
@@ -42,5 +42,5 @@ def test_a_learned_number_is_an_axis():
     study = _study(fitted_system, {name: [fitted_value, fitted_value + 0.1]}, x0=x[0, 0])
     assert study.run().ok
     one = lt.integrate(fitted_system, x[0, 0], (0.0, 1.0), 0.1)
-    np.testing.assert_allclose(study.results.needs_final_state[0], one.x[-1], atol=1e-13)
-    assert np.abs(study.results.needs_final_state[1] - one.x[-1]).max() > 1e-3
+    np.testing.assert_allclose(study.results.final[0], one.x[-1], atol=1e-13)
+    assert np.abs(study.results.final[1] - one.x[-1]).max() > 1e-3

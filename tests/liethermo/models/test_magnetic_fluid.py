@@ -1,4 +1,4 @@
-"""A magnetic fluid on the sphere: its equations by matrices, waves along a uniform field, and what it keeps."""
+"""Magnetic fluids on the sphere: the equations in matrices, Alfvén waves, and conservation laws."""
 
 import math
 
@@ -28,35 +28,38 @@ def test_the_equations_are_the_documented_ones(rate):
         np.asarray(q.matrix(f)) for f in (vorticity, potential, q.inverse_laplacian(vorticity), q.laplacian(potential))
     )
     F, G = q.gamma * (bracket(P, W) + bracket(J, B)), q.gamma * bracket(P, B)
-    expected = F + rate * q.gamma * (bracket(W, F) + bracket(B, G)), G + rate * q.gamma * bracket(B, F)
+    expected_rates = F + rate * q.gamma * (bracket(W, F) + bracket(B, G)), G + rate * q.gamma * bracket(B, F)
     system = magnetic_fluid(8, rate)
-    for found, right in zip(q.magnetic_fields(system.vector_field(x)), expected, strict=True):
-        np.testing.assert_allclose(q.matrix(found), right, atol=1e-12 * np.abs(right).max())
+    for rate_of_change, expected_rate in zip(q.magnetic_fields(system.vector_field(x)), expected_rates, strict=True):
+        np.testing.assert_allclose(q.matrix(rate_of_change), expected_rate, atol=1e-12 * np.abs(expected_rate).max())
     energy = -q.gamma / 2 * (np.trace(P.conj().T @ W) + np.trace(B.conj().T @ J)).real
     assert float(system.energy(x)) == pytest.approx(energy, rel=1e-13)
 
 
 def test_waves_along_a_field_are_those_of_alfven():
-    """About ``theta = b cos`` the equations are linear: the frequency is ``m b sqrt(1 - 2 / l (l + 1))``."""
+    """Linearised about ``theta = b cos``, the waves have the frequency ``m b sqrt(1 - 2 / l (l + 1))``."""
     q, b, l, m = QuantisedSphere(7), 0.7, 4, 3
     a = np.zeros((l + 1, l + 1), dtype=complex)
     a[1, 0] = b * math.sqrt(4 * math.pi / 3)
     wave = np.zeros_like(a)
     wave[l, m] = 0.5 + 0.2j
-    still, function = jnp.zeros(q.algebra.dim), q.from_coefficients(wave)
-    rest = q.magnetic_state(still, q.from_coefficients(a))
+    zero_state, function = jnp.zeros(q.algebra.dim), q.from_coefficients(wave)
+    rest = q.magnetic_state(zero_state, q.from_coefficients(a))
     field = magnetic_fluid(7).vector_field
     assert np.abs(field(rest)).max() < 1e-12
-    _, of_vorticity = jax.jvp(field, (rest,), (q.magnetic_state(function, still),))
-    _, of_potential = jax.jvp(field, (rest,), (q.magnetic_state(still, function),))
+    _, vorticity_response = jax.jvp(field, (rest,), (q.magnetic_state(function, zero_state),))
+    _, potential_response = jax.jvp(field, (rest,), (q.magnetic_state(zero_state, function),))
     eigenvalue = l * (l + 1)
-    found = q.coefficients(q.magnetic_fields(of_vorticity)[1], l), q.coefficients(q.magnetic_fields(of_potential)[0], l)
-    np.testing.assert_allclose(found[0], 1j * m * b / eigenvalue * wave, atol=1e-13)
-    np.testing.assert_allclose(found[1], 1j * m * b * (eigenvalue - 2) * wave, atol=1e-12)
+    coefficients = (
+        q.coefficients(q.magnetic_fields(vorticity_response)[1], l),
+        q.coefficients(q.magnetic_fields(potential_response)[0], l),
+    )
+    np.testing.assert_allclose(coefficients[0], 1j * m * b / eigenvalue * wave, atol=1e-13)
+    np.testing.assert_allclose(coefficients[1], 1j * m * b * (eigenvalue - 2) * wave, atol=1e-12)
 
 
 def test_midpoints_keep_what_is_quadratic():
-    """Energy, cross helicity and the square of the potential; of the fourth Casimir, a cubic one, it is a control."""
+    """Energy, cross helicity and the square of the potential are conserved; cubic Casimirs are a control."""
     q = QuantisedSphere(6)
     run = lt.integrate(magnetic_fluid(6), start(q), (0.0, 0.5), 0.01, lt.MetriplecticMidpoint(), save_every=10)
     assert np.ptp(run.energy) <= 1e-14 * abs(run.energy[0])
@@ -100,6 +103,8 @@ def test_a_metric_may_be_a_diagonal():
         for G in (entries, np.diag(entries))
     ]
     np.testing.assert_allclose(fields[0].vector_field(x), fields[1].vector_field(x), rtol=1e-14)
-    for wrong, says in ((-entries, ">= 0"), (entries[:2], "3 components")):
-        with pytest.raises(lt.InputError, match=says):
-            lt.LiePoissonSystem(lt.models.free_rigid_body().algebra, lambda p: p[0], None, lt.DoubleBracket(0.3, wrong))
+    for invalid_metric, message in ((-entries, ">= 0"), (entries[:2], "3 components")):
+        with pytest.raises(lt.InputError, match=message):
+            lt.LiePoissonSystem(
+                lt.models.free_rigid_body().algebra, lambda p: p[0], None, lt.DoubleBracket(0.3, invalid_metric)
+            )

@@ -1,4 +1,4 @@
-"""Which rigid body is which: the controlled one of the catalogue, and bodies that are left to themselves."""
+"""The controlled rigid body of the catalogue, and isolated bodies."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ START = np.array([0.06, 0.1, 1.0])
 
 
 def test_the_relaxed_body_is_turned_by_a_torque_that_does_no_work():
-    """Morrison's body as the pages describe it: the kinetic energy is constant and |mu| grows."""
+    """The kinetic energy of Morrison's body is constant and |mu| grows."""
     body = lt.models.rigid_body(INERTIA, rate=0.2)
     states = np.random.default_rng(0).standard_normal((20, 3))
     omega = states / INERTIA
@@ -37,7 +37,7 @@ def test_the_momentum_in_space_of_the_relaxed_body_moves():
 
 
 def test_a_body_left_to_itself_keeps_its_momentum_and_loses_kinetic_energy():
-    """By the double bracket, which leaves the heat out; for wheels that rub, see the tests of ``LieVariational``."""
+    """The double bracket omits the heat; for wheels with friction see the tests of ``LieVariational``."""
     body = lt.LiePoissonSystem(mf.so(3), lt.Quadratic(1 / INERTIA), dissipation=lt.DoubleBracket(0.2))
     run = lt.integrate(body, START, (0.0, 200.0), 0.1)
     size = np.linalg.norm(run.x, axis=1)

@@ -1,4 +1,4 @@
-"""Bodies with a wheel, a ring or a rotor against DOP853 of the equations of Newton and Euler in velocities."""
+"""Bodies with a wheel, a ring or a rotor against DOP853 for the Newton-Euler equations in velocities."""
 
 import numpy as np
 import pytest
@@ -7,19 +7,24 @@ from scipy.integrate import solve_ivp
 import liethermo as lt
 from liethermo.models.rotors import spin_temperature
 
-INERTIA, AXIS, START = np.array([2.0, 1.6, 1.0]), np.array([0.1, 1.0, -0.3]), np.array([0.4, 0.3, 1.2])
+INERTIA = np.array([2.0, 1.6, 1.0])
+AXIS = np.array([0.1, 1.0, -0.3])
+START = np.array([0.4, 0.3, 1.2])
 
 
-def velocities(inertia, a, J, k, L, p, t_end, inside=lambda L, Omega, w: (np.zeros(3), 0.0)):
-    """(Omega, w) and the heat of the bearing: ``(L)' + Omega × L = 0`` and ``J (a . Omega + w)' = -k w``."""
+def velocities(inertia, a, J, k, L, p, t_end, internal_torque=lambda L, Omega, w: (np.zeros(3), 0.0)):
+    """Return the final (L, p) and the heat of the bearing, from ``L' + Omega × L = 0`` and ``J (a . Omega + w)' = -k
+    w``."""
     a = a / np.linalg.norm(a)
     mass = np.block([[np.diag(inertia), J * a[:, None]], [J * a[None], np.array([[J]])]])
 
     def f(t, s):
         Omega, w = s[:3], s[3]
         L = inertia * Omega + J * w * a
-        turning, along = inside(L, Omega, w)
-        return np.append(np.linalg.solve(mass, np.append(np.cross(L, Omega + turning), along - k * w)), k * w**2)
+        friction_rotation, axial_torque = internal_torque(L, Omega, w)
+        return np.append(
+            np.linalg.solve(mass, np.append(np.cross(L, Omega + friction_rotation), axial_torque - k * w)), k * w**2
+        )
 
     start = np.append(np.linalg.solve(mass, np.append(L, p)), 0.0)
     run = solve_ivp(f, (0.0, t_end), start, "DOP853", rtol=3e-14, atol=1e-15)
@@ -38,8 +43,8 @@ def test_a_nutation_damper_against_velocities(ring):
         J, k = 0.2, 0.15
         system = lt.models.damper_wheel(INERTIA, AXIS, J, k, capacity=2.0)
     run = lt.integrate(system, [*START, 0.1], (0.0, 20.0), 0.05, lt.MetriplecticGauss(3))
-    expected, heat = velocities(INERTIA, AXIS, J, k, START, 0.1, 20.0)
-    assert np.allclose(run.x[-1, :4], expected, rtol=0, atol=2e-9)
+    exact, heat = velocities(INERTIA, AXIS, J, k, START, 0.1, 20.0)
+    assert np.allclose(run.x[-1, :4], exact, rtol=0, atol=2e-9)
     assert 2.0 * (float(system.temperatures(run.x[-1])[0]) - 1.0) == pytest.approx(heat, abs=1e-9)
     audit = run.audit()
     assert audit.passed
@@ -74,7 +79,8 @@ def test_the_momentum_in_space_is_constant(system, method):
 
 
 def test_a_damper_wheel_brings_the_body_to_its_spin():
-    """About the axis of greatest inertia of the whole, the wheel at rest, as warm as the balance says."""
+    """The final state is a spin about the axis of greatest inertia, with the wheel at rest and the predicted
+    temperature."""
     system = lt.models.damper_wheel(INERTIA, AXIS, 0.2, 0.15, capacity=2.0, temperature=3.0, attitude=False)
     run = lt.integrate(system, [*START, 0.1], (0.0, 2000.0), 0.2)
     assert np.sin(lt.bodies.nutation(run)[-1]) < 1e-6
@@ -87,31 +93,34 @@ def test_dual_spin_against_velocities():
     inertia = np.array([1.1, 1.0, 0.6])
     system = lt.models.dual_spin(inertia, a, J, k, *rates, capacity=(2.0, 3.0))
 
-    def inside(L, Omega, w):
-        of_platform, of_rotor = (r * np.cross(L, v) for r, v in zip(rates, (Omega, Omega + w * a), strict=True))
-        return of_platform + of_rotor, a @ np.cross(L, of_rotor)
+    def internal_torque(L, Omega, w):
+        platform_rotation, rotor_rotation = (
+            r * np.cross(L, v) for r, v in zip(rates, (Omega, Omega + w * a), strict=True)
+        )
+        return platform_rotation + rotor_rotation, a @ np.cross(L, rotor_rotation)
 
     run = lt.integrate(system, [*START, 0.5], (0.0, 20.0), 0.05, lt.MetriplecticGauss(3))
-    expected, _ = velocities(inertia, a, J, k, START, 0.5, 20.0, inside)
-    assert np.allclose(run.x[-1, :4], expected, rtol=0, atol=2e-9)
+    exact, _ = velocities(inertia, a, J, k, START, 0.5, 20.0, internal_torque)
+    assert np.allclose(run.x[-1, :4], exact, rtol=0, atol=2e-9)
     assert run.audit().passed
     assert np.diff(run.x[:, 4:], axis=0).min() >= 0.0  # each is warmed
     assert np.ptp(np.linalg.norm(run.x[:, :3], axis=1)) < 4e-15
 
 
-@pytest.mark.parametrize(("damped", "ends"), [("platform_rate", 0.0), ("rotor_rate", 0.5 * np.pi)])
-def test_where_the_friction_is_decides_whether_a_slender_dual_spin_body_is_stable(damped, ends):
-    """A despun platform that damps keeps a rod's spin [Likins 1967]; a rotor that damps leaves it for the flat spin."""
-    system = lt.models.dual_spin((1.0, 1.0, 0.6), (0, 0, 1), 0.3, **{damped: 0.2})
+@pytest.mark.parametrize(("rate_name", "final_nutation"), [("platform_rate", 0.0), ("rotor_rate", 0.5 * np.pi)])
+def test_where_the_friction_is_decides_whether_a_slender_dual_spin_body_is_stable(rate_name, final_nutation):
+    """A damping platform keeps a rod's spin if it is despun [Likins 1967]; a damping rotor leaves it for the flat
+    spin."""
+    system = lt.models.dual_spin((1.0, 1.0, 0.6), (0, 0, 1), 0.3, **{rate_name: 0.2})
     L = np.array([0.2, 0.0, 1.0])  # the platform is nearly despun: p carries L along the axis
     run = lt.integrate(system, [*L, 1.0], (0.0, 300.0), 0.1)
     nutation = lt.bodies.nutation(run, (0, 0, 1))
     assert nutation[0] == pytest.approx(np.arctan(0.2))
-    assert (nutation[-1] < 1e-3) if ends == 0.0 else (nutation[-1] > 1.0)
+    assert (nutation[-1] < 1e-3) if final_nutation == 0.0 else (nutation[-1] > 1.0)
 
 
 @pytest.mark.parametrize(
-    ("make", "told"),
+    ("make", "message"),
     [
         (lambda: lt.models.damper_wheel(wheel=1.7), "less than the inertia of the whole"),
         (lambda: lt.models.damper_wheel(axis=(0, 0, 0)), "three numbers that are not all zero"),
@@ -121,7 +130,7 @@ def test_where_the_friction_is_decides_whether_a_slender_dual_spin_body_is_stabl
         (lambda: lt.models.dual_spin(rotor=-0.1), "must be positive"),
     ],
 )
-def test_what_is_refused(make, told):
-    with pytest.raises(lt.InputError, match=told) as error:
+def test_invalid_parameters_are_refused(make, message):
+    with pytest.raises(lt.InputError, match=message) as error:
         make()
     assert "\n" not in str(error.value)

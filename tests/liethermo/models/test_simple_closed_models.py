@@ -1,4 +1,4 @@
-"""The mass and spring in a gas, and the gas under a piston."""
+"""A mass on a spring in a gas, and a gas under a piston."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def _rate(system, x):
 @pytest.mark.parametrize("friction", FRICTIONS.values(), ids=FRICTIONS)
 @pytest.mark.parametrize("case", CASES)
 def test_the_exact_solution_solves_the_equations(case, friction):
-    """By eighth-order differences of it, in every regime of damping."""
+    """Eighth-order differences of the exact solution agree with the field, in every regime of damping."""
     system = lt.models.mass_spring_gas(**CASES[case], friction=friction)
     t, d = np.linspace(0.5, 9.5, 10), 0.02
 
@@ -38,16 +38,16 @@ def test_the_exact_solution_solves_the_equations(case, friction):
 
 
 def test_the_branches_of_damping_meet():
-    """Case 1 is critically damped at 10 kg/s exactly."""
+    """The solution is continuous at critical damping, which is 10 kg/s in Case 1."""
     t = np.linspace(0.0, 300.0, 50)
-    at = mass_spring_gas_solution(t, START, friction=10.0)
-    for beside in (10.0 * (1 - 1e-9), 10.0 * (1 + 1e-9)):
-        assert np.abs(mass_spring_gas_solution(t, START, friction=beside) - at).max() < 1e-8
+    critical = mass_spring_gas_solution(t, START, friction=10.0)
+    for nearby_friction in (10.0 * (1 - 1e-9), 10.0 * (1 + 1e-9)):
+        assert np.abs(mass_spring_gas_solution(t, START, friction=nearby_friction) - critical).max() < 1e-8
     assert np.isfinite(mass_spring_gas_solution(1e4, START, friction=1e3)).all()  # cosh alone overflows
 
 
 def test_the_heat_is_the_printed_one():
-    """f(t) after (5.8), for 4 k m > lambda^2."""
+    """The heat equals f(t) after (5.8), for 4 k m > lambda^2."""
     m, k, lam, (x0, v0, _), t = 5.0, 5.0, 2.0, START, np.linspace(0.0, 20.0, 9)
     root = np.sqrt(4 * k * m - lam**2)
     omega2 = root / m
@@ -68,26 +68,26 @@ def test_the_heat_is_the_printed_one():
 
 
 @pytest.mark.slow
-def test_a_gas_under_a_piston():
-    """It rests where its pressure is the one outside; pushed away it comes back, warmer."""
+def test_a_gas_under_a_piston_returns_to_equilibrium():
+    """The equilibrium has the external pressure; a displaced piston returns to it, warmer."""
     gas, rest = lt.models.cylinder(mass=20.0, friction=150.0, pressure=1e5), cylinder_rest(1e5, T=300.0)
     rate = evaluate_at_points(_rate, gas, np.asarray(gas.state(rest))[None])[0]
     assert np.abs(rate[:5]).max() < 1e-9  # the clock runs on
     assert float(gas.temperature(rest)) == pytest.approx(300.0, rel=1e-13)
     assert "temperature" not in gas.outside(gas.state(rest))
-    away = rest + np.array([0.5, 0.0, 0.0])
-    solution = lt.integrate(gas, away, (0.0, 10.0), 0.01, lt.VariationalIntegrator.symmetrised(), engine="array")
+    displaced = rest + np.array([0.5, 0.0, 0.0])
+    solution = lt.integrate(gas, displaced, (0.0, 10.0), 0.01, lt.VariationalIntegrator.symmetrised(), engine="array")
     end = solution.x[-1]
-    assert end[2] > away[2]
+    assert end[2] > displaced[2]
     assert np.abs(end[:3] - cylinder_rest(1e5, float(gas.temperature(end)))).max() < 1e-4
 
 
 def test_pressure_and_heat_may_depend_on_time():
     gas = lt.models.cylinder(pressure=lambda q, v, S, t: 1e5 * (1 + t), heat_power=lambda q, v, S: 10.0)
     rest = cylinder_rest(1e5, T=300.0)
-    early, late = (evaluate_at_points(_rate, gas, np.array([[*rest, 0.0, 0.0, t]]))[0] for t in (0.0, 1.0))
-    assert early[1] - late[1] == pytest.approx(1e5 * 0.01 / 1.0, rel=1e-9)
-    assert early[4] == 10.0
+    rate_at_0, rate_at_1 = (evaluate_at_points(_rate, gas, np.array([[*rest, 0.0, 0.0, t]]))[0] for t in (0.0, 1.0))
+    assert rate_at_0[1] - rate_at_1[1] == pytest.approx(1e5 * 0.01 / 1.0, rel=1e-9)
+    assert rate_at_0[4] == 10.0
 
 
 @pytest.mark.parametrize(
@@ -99,6 +99,6 @@ def test_pressure_and_heat_may_depend_on_time():
         (lambda: lt.models.cylinder(pressure=lambda q, v, S: v * np.ones(2)), "external force"),
     ],
 )
-def test_bad_parameters(build, words):
+def test_invalid_parameters_are_refused(build, words):
     with pytest.raises((lt.InputError, lt.FunctionError), match=words):
         build()

@@ -1,4 +1,4 @@
-"""The named thermodynamic models against their closed forms, and the figures of SML in numbers."""
+"""The thermodynamic models against their closed forms and the figures of SML."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,28 +23,28 @@ def run(system, x0, t, h, method=None):
 
 @pytest.mark.parametrize("friction", [0.1, 2.0, 5.0], ids=["under", "critical", "over"])
 def test_the_exact_oscillator(friction):
-    """It solves its equations and keeps its energy, however damped."""
+    """The exact solution satisfies the equations and conserves the energy, for any damping."""
     system, x0 = lt.models.damped_oscillator(2.0, 2.0, friction), [0.3, -1.0, 0.2]
     parameters = (2.0, 2.0, friction)
     t, dt = np.array([0.0, 0.7, 3.0]), 1e-5
-    x, later, before = (damped_oscillator_solution(t + s, x0, *parameters) for s in (0.0, dt, -dt))
+    x, x_after, x_before = (damped_oscillator_solution(t + s, x0, *parameters) for s in (0.0, dt, -dt))
     assert np.allclose(x[0], x0, rtol=0, atol=1e-15)
-    assert np.allclose((later - before) / (2 * dt), system.vector_field(x), rtol=0, atol=1e-8)
+    assert np.allclose((x_after - x_before) / (2 * dt), system.vector_field(x), rtol=0, atol=1e-8)
     assert np.ptp(np.asarray(system.energy(x))) < 1e-14
 
 
 def test_the_exact_relaxation():
-    """Three bodies in a row: it solves its equations, keeps the energy, and ends at the mean temperature."""
+    """The exact solution for three bodies in a row satisfies the equations, and ends at the mean temperature."""
     c, k, T0 = np.array([1.0, 2.0, 0.5]), [(0, 1, 0.7), (1, 2, 2.0)], np.array([3.0, 1.0, 2.0])
     system, t, dt = lt.models.thermo_particles(c, k), np.array([0.0, 0.5, 200.0]), 1e-5
-    T, later, before = (thermo_particles_solution(t + s, T0, c, k) for s in (0.0, dt, -dt))
+    T, T_after, T_before = (thermo_particles_solution(t + s, T0, c, k) for s in (0.0, dt, -dt))
     x = c * np.log(T)
     assert np.allclose(T[0], T0, rtol=1e-14)
     assert np.allclose(T[2], c @ T0 / c.sum(), rtol=1e-12)
     assert np.allclose(system.energy(x), c @ T0, rtol=1e-14)
     assert np.allclose(system.temperatures(x), T, rtol=1e-14)
     rates = np.asarray(system.vector_field(x)) * T / c  # T' = T S' / c
-    assert np.allclose((later - before) / (2 * dt), rates, rtol=0, atol=1e-8)
+    assert np.allclose((T_after - T_before) / (2 * dt), rates, rtol=0, atol=1e-8)
 
 
 def test_the_ideal_gas():
@@ -100,8 +100,8 @@ def test_figures_5_and_6():
         solution = lt.integrate(system, x1, (0.0, 80.0), h, method, engine="array")
         errors.append(np.abs(solution.x[:, 0] - damped_oscillator_solution(solution.t, x1)[:, 0]).max())
         if h == 0.1:
-            of_42 = [51.2478125, 50.3769]  # the formula, iterated by itself
-            assert solution.energy[[0, -1]] == pytest.approx(of_42, abs=1e-4)
+            energies_of_42 = [51.2478125, 50.3769]  # the formula, iterated by itself
+            assert solution.energy[[0, -1]] == pytest.approx(energies_of_42, abs=1e-4)
             assert np.ptp(solution.energy) > 0.5
     assert errors[0] == pytest.approx(0.07113, rel=1e-3)
     assert errors[1] / errors[2] == pytest.approx(2.0, abs=0.2)
@@ -121,8 +121,8 @@ def test_moving_particles():
     assert np.abs(P - [-1.0, 0.5]).max() < 1e-15
     assert np.abs(q[-1] - [1.2, 0.2]).max() < 1e-14
     assert np.abs(Q[-1] - [0.0, 1.0]).max() < 1e-14
-    at_rest = run(lt.models.thermo_particles((1.0, 3.0), 0.5), [0.1, 0.9], 4.0, 0.1)
-    assert np.abs(system.entropies(solution.x) - at_rest.x).max() < 1e-13
+    resting_run = run(lt.models.thermo_particles((1.0, 3.0), 0.5), [0.1, 0.9], 4.0, 0.1)
+    assert np.abs(system.entropies(solution.x) - resting_run.x).max() < 1e-13
 
 
 @pytest.mark.slow
@@ -132,19 +132,19 @@ def test_thermo_springs():
     cold = run(lt.models.thermo_springs(stiffness=2.0), x0, 10.0, 0.05)
     omega = 2 * np.arctan(0.05) / 0.05  # of the midpoint rule; 2 exactly
     assert np.abs(cold.x[:, 0] - np.cos(omega * cold.t)).max() < 1e-12
-    rubbed = lt.models.thermo_springs(stiffness=2.0, drag=1.0)
-    solution = run(rubbed, [1.0, 0.3, 0.0, -1.0, 0.3, 0.5], 40.0, 0.1)
+    with_drag = lt.models.thermo_springs(stiffness=2.0, drag=1.0)
+    solution = run(with_drag, [1.0, 0.3, 0.0, -1.0, 0.3, 0.5], 40.0, 0.1)
     assert np.abs(solution.casimirs["momentum"] - 0.6).max() < 1e-14
     assert "momentum" in solution.laws.unpromised  # kept all the same, as a momentum that is linear
-    T = np.asarray(rubbed.temperatures(solution.x[-1]))
+    T = np.asarray(with_drag.temperatures(solution.x[-1]))
     assert np.allclose(T, (solution.energy[0] - 0.3**2) / 2, rtol=1e-6)
     assert "momentum" not in lt.models.thermo_springs(friction=0.1).momentum_maps
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("moles", [(1.0, 2.0)])
-def test_gas_piston(moles):
-    """It comes to the equilibrium of the closed form: one pressure, one temperature."""
+def test_gas_piston_reaches_its_equilibrium(moles):
+    """The final state has the position and the temperature of the closed form."""
     system = lt.models.gas_piston(moles, mass=50.0, capacity=5.0, conductance=(50.0, 50.0), friction=400.0)
     x0 = gas_piston_state(0.5, (400.0, 300.0, 250.0), moles, capacity=5.0)
     assert np.allclose(system.temperatures(x0), [400.0, 300.0, 250.0], rtol=1e-14)

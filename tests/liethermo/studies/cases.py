@@ -1,4 +1,4 @@
-"""A small study that the tests share, and how its store is compared to the bit."""
+"""A small study shared by the tests, and a digest of all files of its store."""
 
 import hashlib
 from pathlib import Path
@@ -9,7 +9,7 @@ import liethermo as lt
 
 
 def body(p):
-    """A relaxing body; its rate may be one that is refused."""
+    """Return a relaxing body; a negative rate is refused."""
     return lt.models.rigid_body((1.0 + p["ratio"], 1.0, 0.8), p["rate"])
 
 
@@ -19,7 +19,7 @@ X0 = [0.1, 1.0, 0.1]
 
 
 def study(store=None, axes=None, **changes):
-    given = {
+    arguments = {
         "x0": X0,
         "t_span": (0.0, 4.0),
         "step": 0.1,
@@ -27,11 +27,11 @@ def study(store=None, axes=None, **changes):
         "chunk": 8,
         "store": store,
     } | changes
-    build = given.pop("build", body)
-    return lt.Study(build, {"rate": RATES, "ratio": RATIOS} if axes is None else axes, **given)
+    build = arguments.pop("build", body)
+    return lt.Study(build, {"rate": RATES, "ratio": RATIOS} if axes is None else axes, **arguments)
 
 
 def content(store) -> dict[str, str]:
-    """Every file of a store but its lock, as a digest."""
+    """Return a digest of every file of a store except its lock."""
     files = [path for path in Path(store).rglob("*") if path.is_file() and path.name != ".lock"]
     return {str(path.relative_to(store)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}

@@ -1,4 +1,4 @@
-"""Axes: grids, zipped parameters, samples, replicas; and what is none."""
+"""Axes: grids, zipped parameters, samples, replicas, and invalid arguments."""
 
 import numpy as np
 import pytest
@@ -33,9 +33,9 @@ def test_samples_lie_in_their_ranges_as_their_construction_says():
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("mapping", "message"),
     [
-        ({}, "axes are a dict"),
+        ({}, "axes must be a dict"),
         ({"a": []}, "of shape"),
         ({"a": [[1.0, 2.0]]}, "several numbers at once"),
         ({"a": [1.0, np.nan]}, "value 1 of 'a' is nan"),
@@ -43,12 +43,12 @@ def test_samples_lie_in_their_ranges_as_their_construction_says():
         ({"status": [1.0]}, "cannot be called 'status'"),
         ({"a/b": [1.0]}, "cannot be called"),
         ({"a": [1.0], "s": lt.zipped(a=[1.0])}, "'a' stands for more than one thing"),
-        ({"a": [None]}, "not object"),
+        ({"a": [None]}, "got object"),
     ],
 )
-def test_what_is_no_axis_is_refused(given, message):
+def test_invalid_axes_are_refused(mapping, message):
     with pytest.raises(lt.InputError, match=message):
-        Axes.from_mapping(given)
+        Axes.from_mapping(mapping)
 
 
 @pytest.mark.parametrize(
@@ -58,37 +58,37 @@ def test_what_is_no_axis_is_refused(given, message):
         (lambda: lt.zipped(), "needs parameters"),
         (lambda: lt.sobol(4, seed=0, a=(1.0, 0.0)), "the range of a must be finite and increasing"),
         (lambda: lt.latin_hypercube(4, seed=0, a=(0.0, 1.0, "log")), "positive with 'log'"),
-        (lambda: lt.latin_hypercube(4, seed=0, a=3.0), r"is \(low, high\)"),
-        (lambda: lt.latin_hypercube(0, seed=0, a=(0.0, 1.0)), "positive number of points"),
+        (lambda: lt.latin_hypercube(4, seed=0, a=3.0), r"must be \(low, high\)"),
+        (lambda: lt.latin_hypercube(0, seed=0, a=(0.0, 1.0)), "positive integer"),
         (lambda: lt.latin_hypercube(4, seed=0), "needs the ranges"),
         (lambda: lt.replicas([0.0, 1.0]), r"shape \(replicas, n\)"),
         (lambda: lt.replicas([[0.0, 1.0], [np.inf, 1.0]]), "replica 1 is not finite"),
     ],
 )
-def test_what_is_no_sample_is_refused(make, message):
+def test_invalid_samples_are_refused(make, message):
     with pytest.raises(lt.InputError, match=message):
         make()
 
 
 def test_longer_axes_match_the_order_of_a_store_and_its_rounding():
-    kept, longer = (
+    stored_axes, longer_axes = (
         Axes.from_mapping({"a": np.linspace(0.1, 0.7, 7)}),
         Axes.from_mapping({"a": np.linspace(0.1, 0.8, 8)[::-1]}),
     )
-    assert kept.axes[0].labels[2] != longer.axes[0].labels[5]  # 0.3 and its neighbour
-    found = match_axes(longer, kept).axes[0]
-    assert found.labels.tolist() == [*kept.axes[0].labels, 0.8]
+    assert stored_axes.axes[0].labels[2] != longer_axes.axes[0].labels[5]  # 0.3 and its neighbour
+    matched_axis = match_axes(longer_axes, stored_axes).axes[0]
+    assert matched_axis.labels.tolist() == [*stored_axes.axes[0].labels, 0.8]
     with pytest.raises(lt.InputError, match=r"the axis 'a' lacks 0\.1, which is value 0"):
-        match_axes(Axes.from_mapping({"a": [0.2, 0.3]}), kept)
+        match_axes(Axes.from_mapping({"a": [0.2, 0.3]}), stored_axes)
     with pytest.raises(lt.InputError, match=r"the axes are b \(b\)"):
-        match_axes(Axes.from_mapping({"b": [0.2]}), kept)
+        match_axes(Axes.from_mapping({"b": [0.2]}), stored_axes)
 
 
 def test_replicas_are_told_apart_by_their_states_and_may_be_alike():
     states = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    found = match_axes(
+    matched_axis = match_axes(
         Axes.from_mapping({"r": lt.replicas(states)}), Axes.from_mapping({"r": lt.replicas(states[1:])})
     ).axes[0]
-    assert np.array_equal(found.states, states[[1, 2, 0]])
+    assert np.array_equal(matched_axis.states, states[[1, 2, 0]])
     with pytest.raises(lt.InputError, match="lacks"):
         match_axes(Axes.from_mapping({"r": lt.replicas(states[1:])}), Axes.from_mapping({"r": lt.replicas(states[:2])}))

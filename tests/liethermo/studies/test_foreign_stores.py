@@ -1,4 +1,4 @@
-"""Stores that others have made, changed or damaged: nothing is written or read outside, and what is told is true."""
+"""Foreign, changed or damaged stores: nothing outside is read or written, and the reports are true."""
 
 import contextlib
 import json
@@ -33,51 +33,51 @@ def study(store, rates=(0.5, 1.0, 2.0, 4.0)):
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
+def original_store(tmp_path_factory):
     store = tmp_path_factory.mktemp("stores") / "made.zarr"
     study(store).run()
     return store
 
 
 @pytest.fixture
-def store(made, tmp_path):
-    return Path(shutil.copytree(made, tmp_path / "store.zarr"))
+def store(original_store, tmp_path):
+    return Path(shutil.copytree(original_store, tmp_path / "store.zarr"))
 
 
-def everything(store):
-    """All that can be asked of a store; the errors that it was answered with."""
-    asked = [
+def collect_errors(store):
+    """Call everything that reads a store, and return the messages of the errors."""
+    calls = [
         lambda: load_status(store),
         lambda: audit_store(store),
         lambda: load_study(store).load(),
         lambda: study(store).run(),
         lambda: study(store).results.load(),
     ]
-    told = []
-    for ask in asked:
+    messages = []
+    for call in calls:
         try:
-            ask()
+            call()
         except lt.LiethermoError as error:  # and no other
-            told.append(str(error))
-    return told
+            messages.append(str(error))
+    return messages
 
 
-def changed(store, change, seal=True):
-    """A store whose metadata somebody has changed who knows how they are sealed."""
+def change_metadata(store, change, seal=True):
+    """Change the metadata of a store, with a valid checksum if ``seal`` is true."""
     group = json.loads((store / "zarr.json").read_text())
     change(group)
     (store / "zarr.json").write_text(json.dumps(with_checksum(group) if seal else group))
     return store
 
 
-def renamed(name):
+def rename_measure(name):
     def change(group):
         attributes, arrays = group["attributes"], group["consolidated_metadata"]["metadata"]
         arrays[name] = arrays.pop("end")
         attributes["measures"] = [name, "tau"]
-        described = attributes["study"]
+        description = attributes["study"]
         for key in ("measures", "values"):
-            described[key] = {name: described[key]["end"], "tau": described[key]["tau"]}
+            description[key] = {name: description[key]["end"], "tau": description[key]["tau"]}
 
     return change
 
@@ -100,11 +100,11 @@ NAMES = [
 
 @pytest.mark.parametrize("name", NAMES, ids=[f"{name!r:.12}" for name in NAMES])
 def test_a_measure_cannot_have_the_name_of_a_place(store, name):
-    before = {path for path in store.parent.parent.rglob("*") if store not in path.parents}
-    told = everything(changed(store, renamed(name)))
-    assert len(told) == 5
-    assert all("nothing in it can be called" in text or "is a measure and an axis" in text for text in told)
-    assert {path for path in store.parent.parent.rglob("*") if store not in path.parents} == before
+    initial_files = {path for path in store.parent.parent.rglob("*") if store not in path.parents}
+    messages = collect_errors(change_metadata(store, rename_measure(name)))
+    assert len(messages) == 5
+    assert all("nothing in it can be called" in text or "is a measure and an axis" in text for text in messages)
+    assert {path for path in store.parent.parent.rglob("*") if store not in path.parents} == initial_files
     with pytest.raises(lt.InputError):
         lt.Study(
             lambda p: lt.models.rigid_body(rate=p["rate"]), {"rate": [1.0]}, x0=[0.1, 1.0, 0.1], t_span=(0.0, 1.0),
@@ -113,14 +113,14 @@ def test_a_measure_cannot_have_the_name_of_a_place(store, name):
 
 
 def test_the_measures_are_a_part_of_what_a_study_is(store):
-    told = everything(changed(store, renamed("other")))
-    assert any("is the store of another study" in text and "measures" in text for text in told)
+    messages = collect_errors(change_metadata(store, rename_measure("other")))
+    assert any("is the store of another study" in text and "measures" in text for text in messages)
 
 
-def of_array(name, **what):
+def set_in_array(name, **entries):
     def change(group):
         array = group["consolidated_metadata"]["metadata"][name]
-        for key, value in what.items():
+        for key, value in entries.items():
             if key == "chunks":
                 array["chunk_grid"]["configuration"]["chunk_shape"] = value
             elif value is None:
@@ -131,7 +131,7 @@ def of_array(name, **what):
     return change
 
 
-def of_group(*keys, value=None):
+def set_in_group(*keys, value=None):
     def change(group):
         for key in keys[:-1]:
             group = group[key]
@@ -144,69 +144,69 @@ def of_group(*keys, value=None):
 
 
 METADATA = {
-    "a chunk of zero": of_array("end", chunks=[0, 3]),
-    "a status of zero": of_array("status", chunks=[0]),
-    "huge": of_array("status", shape=[10**9], chunks=[10**9]),
-    "huge by huge": of_array("end", shape=[10**9, 10**9]),
-    "huge coordinates": of_array("rate", shape=[10**9]),
-    "a huge table of quantities": of_array("quantity", shape=[10**9]),
-    "no attributes": of_array("end", attributes=None),
-    "integers for numbers": of_array("end", data_type="int64"),
-    "other codecs": of_array("end", codecs=[]),
-    "another fill value": of_array("end", fill_value=5.0),
-    "another axis": of_array("end", dimension_names=["tau", "end_component"]),
-    "no study": of_group("attributes", "study"),
-    "no measures": of_group("attributes", "measures"),
-    "no values": of_group("attributes", "study", "values"),
-    "values of nothing": of_group("attributes", "study", "values", value=5),
-    "no versions": of_group("attributes", "study", "versions"),
-    "a motion in words": of_group("attributes", "study", "motion", value=["fast"]),
-    "laws of another kind": of_group("attributes", "laws", value={"energy": "perhaps"}),
+    "a chunk of zero": set_in_array("end", chunks=[0, 3]),
+    "a status of zero": set_in_array("status", chunks=[0]),
+    "huge": set_in_array("status", shape=[10**9], chunks=[10**9]),
+    "huge by huge": set_in_array("end", shape=[10**9, 10**9]),
+    "huge coordinates": set_in_array("rate", shape=[10**9]),
+    "a huge table of quantities": set_in_array("quantity", shape=[10**9]),
+    "no attributes": set_in_array("end", attributes=None),
+    "integers for numbers": set_in_array("end", data_type="int64"),
+    "other codecs": set_in_array("end", codecs=[]),
+    "another fill value": set_in_array("end", fill_value=5.0),
+    "another axis": set_in_array("end", dimension_names=["tau", "end_component"]),
+    "no study": set_in_group("attributes", "study"),
+    "no measures": set_in_group("attributes", "measures"),
+    "no values": set_in_group("attributes", "study", "values"),
+    "values of nothing": set_in_group("attributes", "study", "values", value=5),
+    "no versions": set_in_group("attributes", "study", "versions"),
+    "a motion in words": set_in_group("attributes", "study", "motion", value=["fast"]),
+    "laws of another kind": set_in_group("attributes", "laws", value={"energy": "perhaps"}),
 }
 
 
 @pytest.mark.parametrize("what", METADATA)
-def test_what_no_study_writes_is_refused(store, what):
-    told = everything(changed(store, METADATA[what]))
-    assert len(told) == 5
-    assert all("damaged or changed" in text and "\n" not in text for text in told)
+def test_metadata_that_no_study_writes_are_refused(store, what):
+    messages = collect_errors(change_metadata(store, METADATA[what]))
+    assert len(messages) == 5
+    assert all("damaged or changed" in text and "\n" not in text for text in messages)
 
 
 def test_metadata_have_a_checksum(store):
-    def retitled(group):
+    def change_title(group):
         group["attributes"]["title"] += "s"
 
-    assert everything(changed(store, retitled)) == []
-    assert len(everything(changed(store, retitled, seal=False))) == 5
+    assert collect_errors(change_metadata(store, change_title)) == []
+    assert len(collect_errors(change_metadata(store, change_title, seal=False))) == 5
     with pytest.warns(UserWarning, match="an earlier version"):
-        assert load_status(changed(store, of_group("attributes", CHECKSUM_ATTRIBUTE), seal=False)).complete
+        assert load_status(change_metadata(store, set_in_group("attributes", CHECKSUM_ATTRIBUTE), seal=False)).complete
 
 
-def link(path, target):
+def replace_by_link(path, target):
     os.rename(path, target)
     path.symlink_to(target)
 
 
-def pipe(path, _):
+def replace_by_pipe(path, _):
     path.unlink()
     os.mkfifo(path)
 
 
-@pytest.mark.parametrize("where", ["end/c", "end/c/0/0", "status/c/0", "rate/c/0", ".lock"])
-@pytest.mark.parametrize("planted", [link, pipe])
-def test_nothing_leads_out_of_a_store(store, tmp_path, where, planted):
-    if planted is pipe and where == "end/c":
+@pytest.mark.parametrize("file_name", ["end/c", "end/c/0/0", "status/c/0", "rate/c/0", ".lock"])
+@pytest.mark.parametrize("plant", [replace_by_link, replace_by_pipe])
+def test_nothing_leads_out_of_a_store(store, tmp_path, file_name, plant):
+    if plant is replace_by_pipe and file_name == "end/c":
         return
-    outside = tmp_path / "outside"
-    planted(store / where, outside)
-    before = {path: path.read_bytes() for path in tmp_path.rglob("outside*") if path.is_file()}
-    told = everything(store)
-    assert len(told) == 5
-    assert all("all in the store of a study are plain files" in text for text in told)
-    assert {path: path.read_bytes() for path in tmp_path.rglob("outside*") if path.is_file()} == before
+    target = tmp_path / "outside"
+    plant(store / file_name, target)
+    initial_contents = {path: path.read_bytes() for path in tmp_path.rglob("outside*") if path.is_file()}
+    messages = collect_errors(store)
+    assert len(messages) == 5
+    assert all("all in the store of a study are plain files" in text for text in messages)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("outside*") if path.is_file()} == initial_contents
 
 
-def test_a_status_that_there_is_not(store):
+def test_an_unknown_status_counts_as_damage(store):
     mark = np.array([77, 0], dtype=np.int8).tobytes()
     (store / "status/c/0").write_bytes(mark + struct.pack("<I", google_crc32c.value(mark)))
     assert load_status(store).done == 2
@@ -214,29 +214,29 @@ def test_a_status_that_there_is_not(store):
     with pytest.raises(lt.FileError, match="a status that there is not"):
         load_study(store).load()
     assert study(store).run().damaged == ("status/c/0 is damaged",)
-    assert everything(store) == []
+    assert collect_errors(store) == []
 
 
 @pytest.mark.parametrize("name", ["rate/c/0", "quantity/c/0"])
-@pytest.mark.parametrize("lost", [True, False])
-def test_coordinates_are_written_again_by_the_study_that_knows_them(store, made, name, lost):
-    whole = load_study(made).load()
-    (store / name).unlink() if lost else (store / name).write_bytes(b"")
+@pytest.mark.parametrize("is_deleted", [True, False])
+def test_coordinates_are_written_again_by_the_study_that_knows_them(store, original_store, name, is_deleted):
+    undamaged = load_study(original_store).load()
+    (store / name).unlink() if is_deleted else (store / name).write_bytes(b"")
     with pytest.raises(lt.FileError, match="Run the study again"):
         load_study(store).load()
     if name == "rate/c/0":
         with pytest.raises(lt.FileError, match="in their order"):
             study(store, (4.0, 2.0, 1.0, 0.5)).run()
     study(store).run()
-    assert load_study(store).load().identical(whole)
+    assert load_study(store).load().identical(undamaged)
 
 
-def test_what_is_missing_is_not_read_as_no_number(store):
+def test_a_missing_chunk_is_not_read_as_nan(store):
     (store / "tau/c/1").unlink()
-    found = load_study(store)
-    assert np.isfinite(found["tau"][:2].values).all()
+    dataset = load_study(store)
+    assert np.isfinite(dataset["tau"][:2].values).all()
     with pytest.raises(lt.FileError, match="tau/c/1"):
-        found["tau"].values  # noqa: B018
+        dataset["tau"].values  # noqa: B018
     assert study(store).run().damaged == ("tau/c/1 is missing",)
 
 
@@ -250,16 +250,16 @@ def test_a_damaged_chunk_is_told_on_the_command_line(store):
 
 
 def test_the_loser_of_a_race_for_a_store_is_told(tmp_path, monkeypatch):
-    path, rename, held = tmp_path / "store.zarr", os.rename, contextlib.ExitStack()
+    path, rename, locks = tmp_path / "store.zarr", os.rename, contextlib.ExitStack()
 
-    def late(source, target):
+    def rename_too_late(source, target):
         monkeypatch.undo()
         study(path).run()
-        held.enter_context(files.lock_store(path))(4)
+        locks.enter_context(files.lock_store(path))(4)
         rename(source, target)
 
-    monkeypatch.setattr(stores.os, "rename", late)
-    with held, pytest.raises(lt.FileError, match=f"another run works on .*: process {os.getpid()} on"):
+    monkeypatch.setattr(stores.os, "rename", rename_too_late)
+    with locks, pytest.raises(lt.FileError, match=f"another run works on .*: process {os.getpid()} on"):
         study(path).run()
     assert os.listdir(tmp_path) == ["store.zarr"]
     assert study(path).run().complete

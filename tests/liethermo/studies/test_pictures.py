@@ -1,4 +1,4 @@
-"""Pictures of studies: what is drawn where, and what cannot be drawn."""
+"""Pictures of studies: heat maps, lines, samples, and measures that cannot be drawn."""
 
 import matplotlib
 import matplotlib.pyplot as plt
@@ -11,14 +11,14 @@ from liethermo.studies.solve import STATUSES
 
 
 @pytest.fixture(autouse=True)
-def _no_screen():
+def _use_agg_backend():
     matplotlib.use("Agg")
     yield
     plt.close("all")
 
 
 def dataset(**changes):
-    """As a study has it, over a logarithmic and a linear axis."""
+    """Return a dataset as a study has it, over a logarithmic and a linear axis."""
     rate, ratio = np.geomspace(0.01, 1.0, 7), np.linspace(0.1, 0.5, 5)
     tau = 1.0 / rate[:, None] + ratio
     status = np.zeros((7, 5), dtype=np.int8)
@@ -41,11 +41,11 @@ def test_a_heat_map_has_the_values_hatched_failures_and_labels(tmp_path):
     figure = lt.plot.study(dataset())
     ax, bar = figure.axes
     (mesh,) = [c for c in ax.collections if isinstance(c, matplotlib.collections.QuadMesh)]
-    wanted = dataset().tau.to_numpy()
-    assert np.array_equal(np.ma.filled(mesh.get_array(), np.nan), wanted, equal_nan=True)
-    (hatched,) = [c for c in ax.collections if isinstance(c, matplotlib.collections.PatchCollection)]
-    assert hatched.get_hatch() == "////"
-    (box,) = [path.get_extents() for path in hatched.get_paths()]  # two neighbours in one
+    expected_values = dataset().tau.to_numpy()
+    assert np.array_equal(np.ma.filled(mesh.get_array(), np.nan), expected_values, equal_nan=True)
+    (failure_patches,) = [c for c in ax.collections if isinstance(c, matplotlib.collections.PatchCollection)]
+    assert failure_patches.get_hatch() == "////"
+    (box,) = [path.get_extents() for path in failure_patches.get_paths()]  # two neighbours in one
     np.testing.assert_allclose([box.x0, box.x1], [0.15, 0.35])
     assert ax.get_yscale() == "log"
     assert ax.get_xscale() == "linear"
@@ -56,8 +56,8 @@ def test_a_heat_map_has_the_values_hatched_failures_and_labels(tmp_path):
 
 
 def test_axes_in_any_order_are_drawn_in_theirs():
-    turned = dataset().isel(rate=[3, 0, 6, 1, 5, 2, 4])
-    meshes = [lt.plot.study(data).axes[0].collections[0].get_array() for data in (dataset(), turned)]
+    permuted = dataset().isel(rate=[3, 0, 6, 1, 5, 2, 4])
+    meshes = [lt.plot.study(data).axes[0].collections[0].get_array() for data in (dataset(), permuted)]
     assert np.ma.allequal(*meshes)
 
 
@@ -80,7 +80,7 @@ def test_classes_have_a_colour_each_and_samples_are_points():
     assert len(points.get_offsets()) == 32
 
 
-def test_what_cannot_be_drawn_is_said(tmp_path):
+def test_undrawable_measures_are_refused(tmp_path):
     with pytest.raises(lt.InputError, match="no measure 'sigma'; there are tau, final"):
         lt.plot.study(dataset(), "sigma")
     with pytest.raises(lt.InputError, match=r"final has rate \(7\), ratio \(5\), final_component \(3\): choose"):

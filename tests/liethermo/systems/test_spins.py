@@ -392,7 +392,7 @@ REFUSED = [
     (lambda: small(bath=np.array([0, 0])), "of the shape .3,. of the sites"),
     (lambda: lt.HeatBaths(-1.0), r"must be positive, not \[-1.0\]"),
     (lambda: lt.HeatBaths([1.0, 2.0]), r"1 baths is one number, or has shape \(1,\)"),
-    (lambda: small(baths=2.0), "baths are lt.HeatBaths, True"),
+    (lambda: small(baths=2.0), "baths must be lt.HeatBaths, True"),
     (
         lambda: lt.LiePoissonSystem(mf.so(3), lambda s: s[0] ** 2, dissipation=lt.LandauLifshitz()),
         "damps the spins of a SpinSystem",

@@ -1,4 +1,4 @@
-"""What must not change a result does not, on random systems with every method; and the suite finds what does."""
+"""The relations hold on random systems with every method, and the suite detects faults."""
 
 import functools
 
@@ -27,7 +27,7 @@ METHODS = {
     "explicit 8": lt.MetriplecticRungeKutta(8),
     "taylor": lt.MetriplecticTaylor(8),
 }
-QUICK = ("midpoint", "gauss 2", "explicit 4")
+FAST_METHODS = ("midpoint", "gauss 2", "explicit 4")
 SLOW_RELATIONS = ("diffrax", "side by side")
 
 
@@ -37,7 +37,7 @@ def system_of(g, name, seed):
 
 
 def oscillator():
-    """A bath takes the heat of a damped oscillator: a system that is no Lie-Poisson one."""
+    """Return a damped oscillator with a bath, which is no Lie-Poisson system."""
     tensor = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
 
     def friction(x):
@@ -50,30 +50,30 @@ def oscillator():
     return lt.MetriplecticSystem(tensor, energy, lambda x: x[2], lt.FrictionOperator(friction))
 
 
-def tumbling(scale=1.0, friction=0.05):
-    """A body whose energy falls, with its attitude."""
+def tumbling_body(scale=1.0, friction=0.05):
+    """Return a body with attitude whose energy falls."""
     inertia = scale * np.array([3.2, 3.0, 1.0])
     return lt.LiePoissonSystem(
         mf.so(3), lt.Quadratic(1 / inertia), dissipation=lt.DoubleBracket(friction / scale), group=mf.SO(3)
     )
 
 
-def relaxing():
-    """A gradient flow, which comes to rest."""
+def gradient_flow():
+    """Return a gradient flow, which comes to rest."""
     return lt.MetriplecticSystem(
         None, lambda x: 0.5 * jnp.sum(x * x) + 0.1 * x[0] ** 4, None, lt.Friction(), space=mf.Euclidean(2)
     )
 
 
-def with_preserved():
-    """A top whose friction is told to preserve the Casimir that is not its entropy."""
+def top_with_preserved_casimir():
+    """Return a top whose friction preserves the Casimir that is not its entropy."""
     g = mf.se(3)
-    other, entropy = sorted(g.casimirs(2), key=str, reverse=True)
+    preserved_casimir, entropy = sorted(g.casimirs(2), key=str, reverse=True)
 
     def energy(m):
         return 0.5 * jnp.sum(m[:3] ** 2 / jnp.array([3.0, 2.0, 1.0])) + 0.3 * jnp.sin(m[5]) + 0.1 * m[3] ** 2
 
-    return lt.LiePoissonSystem(g, energy, entropy, lt.ProjectedMetric(preserve=(other,), rate=0.2))
+    return lt.LiePoissonSystem(g, energy, entropy, lt.ProjectedMetric(preserve=(preserved_casimir,), rate=0.2))
 
 
 # -- all of them hold -----------------------------------------------------------------------------------------------
@@ -82,10 +82,12 @@ def with_preserved():
 @pytest.mark.parametrize(
     ("make", "x0", "method", "step", "time", "relations"),
     [
-        pytest.param(relaxing, [1.0, 0.7], "explicit 4", 0.1, 5.0, ["constant"], id="a constant, coming to rest"),
-        pytest.param(tumbling, [0.1, 0.2, 1.0], "midpoint", 0.1, 2000.0, ["units"], id="units of a body with attitude"),
+        pytest.param(gradient_flow, [1.0, 0.7], "explicit 4", 0.1, 5.0, ["constant"], id="a constant, coming to rest"),
         pytest.param(
-            with_preserved,
+            tumbling_body, [0.1, 0.2, 1.0], "midpoint", 0.1, 2000.0, ["units"], id="units of a body with attitude"
+        ),
+        pytest.param(
+            top_with_preserved_casimir,
             [0.4, -0.2, 0.7, 0.5, 0.3, 0.6],
             "midpoint",
             0.01,
@@ -97,7 +99,7 @@ def with_preserved():
         pytest.param(oscillator, [0.9, 0.3, 0.2], "explicit 4", 0.05, 2.0, ["diffrax"], id="backwards by diffrax"),
     ],
 )
-def test_what_once_did_not_hold(make, x0, method, step, time, relations):
+def test_relations_that_once_failed_hold(make, x0, method, step, time, relations):
     assert testing.check_relations(make(), METHODS[method], x0, step, relations=relations, time=time).passed
 
 
@@ -116,30 +118,30 @@ def runs(draw, methods, relations):
     return system, method, x0, step, relation, seed
 
 
-def holds(run):
+def assert_relation_holds(run):
     system, method, x0, step, relation, seed = run
     report = testing.check_relations(system, METHODS[method], x0, step, relations=[relation], seed=seed)
     assert report.passed
 
 
 @settings(max_examples=4)
-@given(runs(QUICK, [name for name in testing.RELATIONS if name not in SLOW_RELATIONS]))
+@given(runs(FAST_METHODS, [name for name in testing.RELATIONS if name not in SLOW_RELATIONS]))
 def test_relations_hold(run):
-    holds(run)
+    assert_relation_holds(run)
 
 
 @pytest.mark.slow
 @settings(max_examples=1_000)
 @given(runs(list(METHODS), list(testing.RELATIONS)))
 def test_relations_hold_for_many(run):
-    holds(run)
+    assert_relation_holds(run)
 
 
 # -- and are about something ------------------------------------------------------------------------------------------
 
 
 def test_another_basis_is_another_algebra():
-    """The motion in turned axes by independent formulas: ``mu' = mu x (I^-1 mu)`` there and back."""
+    """The motion in other axes agrees with the formula ``mu' = mu x (I^-1 mu)``, transformed there and back."""
     inertia = np.array([3.0, 2.0, 1.0])
     body = lt.LiePoissonSystem(mf.so(3), lt.Quadratic(1 / inertia))
     matrix = np.array([[2.0, 1.0, 0.0], [0.0, 1.0, -1.0], [0.5, 0.0, 1.0]])
@@ -153,24 +155,24 @@ def test_another_basis_is_another_algebra():
             np.testing.assert_allclose(matrix.T @ C[a, b], basis[a].T @ matrix[b], atol=1e-14)
 
 
-class Sized(lt.MetriplecticMidpoint):
-    """Control: something that is not small in every unit."""
+class ConstantAdded(lt.MetriplecticMidpoint):
+    """Control: a method with an absolute error, which is not small in every unit."""
 
     def slopes(self, system, x, compensation, h, k):
         return super().slopes(system, x, compensation, h, k) + 1e-6
 
 
-class Drifting(lt.MetriplecticMidpoint):
-    """Control: a step that depends on the value of the energy, so that a constant matters."""
+class EnergyDependent(lt.MetriplecticMidpoint):
+    """Control: a method whose step depends on the value of the energy, so that a constant matters."""
 
     def slopes(self, system, x, compensation, h, k):
         return super().slopes(system, x, compensation, h, k) * (1.0 + 1e-6 * jnp.tanh(system.energy.value(x)))
 
 
 CONTROLS = {
-    "units": (Sized(), lt.ProjectedMetric(rate=0.2)),
-    "constant": (Drifting(), lt.ProjectedMetric(rate=0.2)),
-    "reversal": (Sized(), None),
+    "units": (ConstantAdded(), lt.ProjectedMetric(rate=0.2)),
+    "constant": (EnergyDependent(), lt.ProjectedMetric(rate=0.2)),
+    "reversal": (ConstantAdded(), None),
 }
 
 
@@ -184,13 +186,13 @@ def test_a_fault_is_found(relation):
 
 
 class Remembering(fluctuating.StochasticMidpoint):
-    """Control: steps with noise that hand on what rounding has kept from the state."""
+    """Control: stochastic steps that carry the compensation, and so depend on more than the state."""
 
     carries_compensation = True
 
 
 def test_noise_that_repeats_is_found(monkeypatch):
-    """Controls: noise that is counted from the start of each call, and steps that depend on more than the state."""
+    """Controls: noise that restarts with each call, and steps that depend on more than the state."""
     body = lt.LiePoissonSystem(
         mf.so(3), lt.Quadratic(np.array([1.0, 2.0, 3.0])), lt.Quadratic(np.ones(3)), lt.KillingDissipation(0.2)
     )
@@ -200,34 +202,34 @@ def test_noise_that_repeats_is_found(monkeypatch):
         testing.check_relations(body, METHODS["midpoint"], [0.5, 0.8, 0.3], 0.02, **options)
 
     check(0)
-    with monkeypatch.context() as patched:
-        patched.setattr(StepSchedule, "reached", lambda self, steps: np.asarray(steps) * self.h)
+    with monkeypatch.context() as patch:
+        patch.setattr(StepSchedule, "times_after", lambda self, steps: np.asarray(steps) * self.h)
         with pytest.raises(testing.PropertyError, match=r"noise: .*FAILS"):
             check(1)
-    with monkeypatch.context() as patched:
-        patched.setattr(fluctuating, "Fluctuating", Remembering)
+    with monkeypatch.context() as patch:
+        patch.setattr(fluctuating, "StochasticMidpoint", Remembering)
         with pytest.raises(testing.PropertyError, match=r"noise: in parts .*FAILS"):
             check(2)
 
 
 @pytest.mark.parametrize("method", ["midpoint", "explicit 4"])
-def test_parts_of_what_depends_on_time(method):
-    """Parts start at their own times; a torque knows time and attitude."""
+def test_split_runs_of_driven_systems(method):
+    """Segments of a split run start at their own times; a torque depends on time and attitude."""
     driven = lt.LiePoissonSystem(mf.so(3), lambda s, t: -jnp.cos(t) * s[2], None, lt.DoubleBracket(0.5))
     assert testing.check_relations(driven, METHODS[method], [1.0, 0.3, 0.2], relations=["split", "noise"]).passed
-    pushed = lt.LiePoissonSystem(
+    torqued = lt.LiePoissonSystem(
         mf.so(3), lt.Quadratic([1.0, 2.0, 3.0]), torque=lambda t, mu, g: 0.3 * jnp.sin(t) * g[0], group=mf.SO(3)
     )
-    assert testing.check_relations(pushed, METHODS[method], [1.0, 0.3, 0.2], 0.05, relations=["split", "file"]).passed
+    assert testing.check_relations(torqued, METHODS[method], [1.0, 0.3, 0.2], 0.05, relations=["split", "file"]).passed
 
 
-def test_a_name_that_is_none():
+def test_an_unknown_relation_is_refused():
     with pytest.raises(lt.InputError, match="no relation 'unit'; there are constant, "):
         testing.check_relations(oscillator(), relations=["unit"])
 
 
 def test_a_run_that_fails_is_told():
-    """A fall into ``ln q``: the loaded run is the failed one to the bit, which is no evidence."""
-    falling = lt.MetriplecticSystem(mf.Canonical(1), lambda x: 0.5 * x[1] ** 2 + jnp.log(x[0]), validate=False)
+    """The motion falls into ``ln q``; equality with the loaded run is no evidence then."""
+    singular_system = lt.MetriplecticSystem(mf.Canonical(1), lambda x: 0.5 * x[1] ** 2 + jnp.log(x[0]), validate=False)
     with pytest.raises(testing.PropertyError, match=r"the run completes .*FAILS"):
-        testing.check_relations(falling, METHODS["explicit 4"], [0.1, -1.0], 0.02, relations=["file"])
+        testing.check_relations(singular_system, METHODS["explicit 4"], [0.1, -1.0], 0.02, relations=["file"])

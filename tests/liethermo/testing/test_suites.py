@@ -1,4 +1,4 @@
-"""The public suites: what the library has goes through, and broken objects do not."""
+"""The public suites pass for the library's own objects and fail for broken ones."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +9,7 @@ import manifolds as mf
 from liethermo import testing
 from tests.cases import slow
 
-TRIED = {
+TESTED_DISSIPATIONS = {
     "killing": lt.KillingDissipation(0.3),
     "projected": lt.ProjectedMetric(rate=0.2),
     "sum": lt.KillingDissipation(0.1) + lt.ProjectedMetric(rate=0.1),
@@ -24,9 +24,9 @@ def test_methods(method):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", list(TRIED))
+@pytest.mark.parametrize("name", list(TESTED_DISSIPATIONS))
 def test_dissipations(name):
-    assert testing.check_dissipation(TRIED[name]).passed
+    assert testing.check_dissipation(TESTED_DISSIPATIONS[name]).passed
 
 
 @pytest.mark.parametrize("name", ["rigid_body", *map(slow, ("damped_oscillator", "thermo_particles"))])
@@ -35,7 +35,7 @@ def test_systems(name):
 
 
 class Leaking(lt.ProjectedMetric):
-    """Control: half of the projection is left out, so that the energy is lost."""
+    """Control: a dissipation with an incomplete projection, which loses energy."""
 
     def force(self, system, x, dH, dS, dL):
         return super().force(system, x, dH, dS, dL) + 0.1 * dS
@@ -50,7 +50,7 @@ def test_a_dissipation_that_loses_energy():
 
 
 class Euler(lt.MetriplecticMidpoint):
-    """Control: the field at the start of the step, which is of first order and keeps nothing."""
+    """Control: Euler's method, of first order and without conservation laws."""
 
     def slopes(self, system, x, compensation, h, k):
         return system.vector_field(x)[None]
