@@ -20,7 +20,7 @@ inertia = (np.sum(edges**2) - edges**2) / 4
 system = lt.models.tumbling_body(inertia, rate=0.15)
 solution = lt.integrate(system, [0.02, 1.0, 0.02], (0.0, 60.0), 0.05)
 print(solution.audit())
-print(f"off the rotations by at most {float(mf.SO(3).defect(solution.attitude).max()):.0e}")
+print(f"largest distance from the rotations: {float(mf.SO(3).defect(solution.attitude).max()):.0e}")
 
 # %%
 # The momentum in space is constant, and the heat grows by the loss of kinetic energy.
@@ -28,7 +28,7 @@ print(f"off the rotations by at most {float(mf.SO(3).defect(solution.attitude).m
 momentum = solution.x[:, :3]
 in_space = np.einsum("tij,tj->ti", solution.attitude, momentum)
 kinetic = 0.5 * np.sum(momentum**2 / inertia, axis=1)
-print(f"the momentum in space moves by {np.abs(in_space - in_space[0]).max():.0e}")
+print(f"the momentum in space changes by {np.abs(in_space - in_space[0]).max():.0e}")
 print(f"kinetic energy from {kinetic[0]:.4f} to {kinetic[-1]:.4f}; the least that it can be: {0.5 / inertia.max():.4f}")
 print(f"angle from the shortest edge: {np.degrees(lt.bodies.nutation(solution)[[0, -1]]).round(1)} degrees")
 

@@ -29,7 +29,7 @@ def driven(first, last, time=2.0):
 
 
 # %%
-# A stroke returns the density matrices of its run, and the energies of the qubit along it.
+# A stroke returns the density matrices and the energies of the qubit along its run.
 
 
 def stroke(system, rho, time, frequency):

@@ -62,6 +62,6 @@ inertia = np.linspace(1.05, 1.88, 200)
 plt.plot(inertia, np.sqrt(2.0 * ENERGY / ((inertia - 1.0) ** -2 - 1.0)), "w--")
 
 # %%
-# The laws held in every one of the runs.
+# The laws hold in all runs.
 
 print(study.audit())
