@@ -19,13 +19,13 @@ from .parameters import checked_positive
 class _Lagrangian(Module):
     inertia: jax.Array
     wheels: jax.Array
-    heat_capacity: jax.Array
+    heat: jax.Array
     temperature: jax.Array
 
     def __call__(self, xi, S):
         body, wheel = xi[:3], xi[3:]
         kinetic = 0.5 * jnp.dot(self.inertia * body, body) + 0.5 * jnp.dot(self.wheels * (body + wheel), body + wheel)
-        return kinetic - self.heat_capacity * self.temperature * jnp.exp(S / self.heat_capacity)
+        return kinetic - self.heat * self.temperature * jnp.exp(S / self.heat)
 
 
 class _BearingFriction(Module):

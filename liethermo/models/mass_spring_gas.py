@@ -28,15 +28,15 @@ class FixedVolumeGas(Module):
 
     Attributes
     ----------
-    heat_capacity : heat capacity c N R (J / K)
+    heat : heat capacity c N R (J / K)
     temperature : T_0 (K)
     """
 
-    heat_capacity: jax.Array
+    heat: jax.Array
     temperature: jax.Array
 
     def __call__(self, y):
-        return self.heat_capacity * self.temperature * jnp.exp(y[0] / self.heat_capacity)
+        return self.heat * self.temperature * jnp.exp(y[0] / self.heat)
 
 
 def mass_spring_gas(
