@@ -187,7 +187,7 @@ def test_colours(seed):
 
 @pytest.mark.parametrize("widest", [1000, 0], ids=["factorised", "Krylov"])
 def test_inverses(widest, monkeypatch):
-    monkeypatch.setattr(linear, "WIDEST", widest)
+    monkeypatch.setattr(linear, "MAX_FRONT_WIDTH", widest)
     rng = np.random.default_rng(0)
     A = scipy.sparse.csc_array(scipy.sparse.eye_array(50) + 3.0 * grid_laplacian((5, 10)))
     x = rng.standard_normal(50)
@@ -229,7 +229,7 @@ def test_every_solver_solves_the_same_steps(monkeypatch):
     system, x0 = lt.models.heat_grid((5, 4)), np.log(np.random.default_rng(0).uniform(200.0, 400.0, 20))
     dense = lt.integrate(system, x0, (0.0, 10.0), 2.0, engine="array")
     factorised = lt.integrate(system, x0, (0.0, 10.0), 2.0, engine="sparse")
-    monkeypatch.setattr(linear, "WIDEST", 0)
+    monkeypatch.setattr(linear, "MAX_FRONT_WIDTH", 0)
     krylov = lt.integrate(system, x0, (0.0, 10.0), 2.0, engine="sparse")
     assert dense.stats.newton_iterations > 0
     assert krylov.stats.newton_iterations > 0

@@ -169,7 +169,7 @@ def test_the_measure_of_an_algebra_that_is_not_unimodular():
     report = BATH.check(LINEAR)
     assert report.passed
     assert report.rows[-1].residual > 0.1
-    assert "not known" in report.rows[-1].note
+    assert "unknown" in report.rows[-1].note
     report_with_density = lt.Fluctuations(1.0, seed=2, temperature=TEMPERATURE, density=weight).check(LINEAR)
     assert report_with_density.rows[-1].residual < 1e-10
     with pytest.raises(ValueError, match="give a density"):
