@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from ..functions.energy import Energy
 from ..functions.frames import MIN_SQUARED_NORM, vector_with_products
-from ..functions.gradients import DIFFERENCE_NOISE, EPS, MIN_GRADIENT_VARIATION, Gonzalez
+from ..functions.gradients import CURVATURE_SWITCH, DIFFERENCE_NOISE, EPS, MIN_GRADIENT_VARIATION, Gonzalez
 from ..functions.surface import Surface
 from ..systems import System
 
@@ -219,22 +219,31 @@ def project_onto_levels(
         """Return the part of the level residuals that rounding of function values explains, shape (laws,).
 
         In a short step the change of a function is a quadrature of its gradient, whose rounding vanishes with d: then
-        the values are not used and the result is zero.
+        the values are not used and the result is zero. :class:`Gonzalez` uses the values of a term wherever its
+        gradient is curved, however little it changes from one end to the other.
         """
-        value_scales = jnp.stack(
-            [sum((term.difference_rounding_scale(x) for term in f.terms), jnp.zeros(())) for f in functions]
-        )
-        end_gradients = [f.gradient(x + (compensation + d)) for f in functions]
-        gradient_changes = [
-            jnp.linalg.norm(end - start) for end, start in zip(end_gradients, start_gradients, strict=True)
-        ]
-        gradient_norms = [jnp.linalg.norm(start) for start in start_gradients]
-        varies = jnp.stack(gradient_changes) > MIN_GRADIENT_VARIATION * jnp.stack(gradient_norms)
-        return jnp.where(
-            varies | (jnp.linalg.norm(d) > MIN_GRADIENT_VARIATION * jnp.linalg.norm(x)),
-            VALUE_DIFFERENCE_RTOL * value_scales,
-            0.0,
-        )
+        begin = x + compensation
+        is_long = jnp.linalg.norm(d) > MIN_GRADIENT_VARIATION * jnp.linalg.norm(x)
+
+        def is_curved(term: Energy, start_gradient, end_gradient) -> jax.Array:
+            middle = term.gradient(begin + 0.5 * d)
+            second_difference = jnp.linalg.norm(start_gradient + end_gradient - 2.0 * middle)
+            return second_difference > CURVATURE_SWITCH * jnp.linalg.norm(middle)
+
+        def function_rounding(f: Energy, start_gradient) -> jax.Array:
+            end_gradient = f.gradient(begin + d)
+            change = jnp.linalg.norm(end_gradient - start_gradient)
+            uses_values = is_long | (change > MIN_GRADIENT_VARIATION * jnp.linalg.norm(start_gradient))
+            scale = jnp.zeros(())
+            for term in f.terms:
+                if not term.is_quadratic:
+                    ends = (start_gradient, end_gradient)
+                    if len(f.terms) > 1:
+                        ends = (term.gradient(begin), term.gradient(begin + d))
+                    scale += jnp.where(uses_values | is_curved(term, *ends), term.difference_rounding_scale(x), 0.0)
+            return VALUE_DIFFERENCE_RTOL * scale
+
+        return jnp.stack([function_rounding(f, start) for f, start in zip(functions, start_gradients, strict=True)])
 
     zero_residual = jnp.zeros(len(laws))
     start_d, start_correction = (jnp.zeros_like(d), -d) if leaf else (d, jnp.zeros_like(d))

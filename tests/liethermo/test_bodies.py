@@ -64,7 +64,7 @@ def test_periods_in_their_limits():
     assert periods.rotation.shape == periods.axis.shape == (2,)
     assert periods.axis.tolist() == [2, 0]
     for energy, momentum in ((7.0, 1.0), (0.1, 1.0)):
-        with pytest.raises(lt.InputError, match="the energy for the momentum .* must lie between") as error:
+        with pytest.raises(lt.InputError, match=r"the energy for the momentum .* must lie between") as error:
             lt.bodies.periods(ASYMMETRIC, momentum, energy)
         assert "\n" not in str(error.value)
 

@@ -75,6 +75,23 @@ def assert_no_drift(method, steps):
             assert np.abs(run.entropy / run.entropy[0] - 1.0).max() <= 2e-14
 
 
+def test_rounding_of_values_is_no_missed_level():
+    """The gradient of the entropy is curved more than it changes in a step, so steps use values of the entropy."""
+
+    def entropy(m):
+        C = jnp.dot(m, m)
+        return C + 0.5 * jnp.sin(C)
+
+    def energy(m):
+        return 0.03 * (0.5 * jnp.sum(m**2 / jnp.array([5.0, 4.0, 2.0])) + 0.1 * jnp.cos(m[2]))
+
+    system = lt.LiePoissonSystem(mf.so(3), energy, entropy, lt.ProjectedMetric(rate=100.0), validate=False)
+    method = lt.MetriplecticRungeKutta(4)
+    run = lt.integrate(system, [3.0, 3.0, 2.6], (0.0, 0.4), 0.002, method, engine="compiled")
+    assert np.ptp(run.energy) <= 4e-15 * run.energy[0]
+    assert (np.diff(run.entropy) > 0.0).all()
+
+
 @pytest.mark.sampled(1)
 @each_method
 def test_a_state_that_relaxes_goes_on_at_its_rate(method):
