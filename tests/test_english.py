@@ -1,4 +1,4 @@
-"""Pages, docstrings and messages follow the rules in ``docs/vale``; names and first sentences those of ``plain_names``."""
+"""Prose follows the rules in ``docs/vale``, whether Vale is installed or not; names follow those of ``plain_names``."""
 
 import ast
 import collections

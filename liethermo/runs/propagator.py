@@ -63,7 +63,7 @@ MAX_CACHED_PARAMETER_SETS = 32
 class Propagator:
     """A system, a method and a step, prepared once: for optimisers, samplers and control loops.
 
-    ``p(x0, t_span)`` is what :func:`integrate` returns, and ``p.final(x0, t_span)`` is the last state alone, which costs
+    ``p(x0, t_span)`` returns what :func:`integrate` returns. ``p.final(x0, t_span)`` returns the last state alone, in
     some ten microseconds beside the steps where the compiled engine takes steps of one size. A propagator may be called
     from several threads, and pickled.
 

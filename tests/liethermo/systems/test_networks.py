@@ -253,7 +253,9 @@ def test_the_sparse_engine_needs_a_sparsity():
     bodies = [lt.Subsystem(lambda x: jnp.exp(x[0]), 1) for _ in range(2)]
     coupled = lt.ComposedSystem(bodies, lt.Function(lambda y: y[0] ** 2).on(lambda x: x[:1] - x[1:]), 1.0)
     assert coupled.sparsity_pattern() is None
-    with pytest.raises(lt.InputError, match=r"does not know its sparsity\. Build the system as a ComposedSystem of lt\.Copies"):
+    with pytest.raises(
+        lt.InputError, match=r"does not know its sparsity\. Build the system as a ComposedSystem of lt\.Copies"
+    ):
         lt.integrate(coupled, [0.1, 0.2], (0.0, 1.0), 0.1, engine="sparse")
 
 

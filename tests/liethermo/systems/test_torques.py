@@ -149,7 +149,8 @@ def _without_push(system, x, dH):
 def test_an_impulse_of_another_collocation_breaks_its_row(monkeypatch):
     """Control: the impulse by the attitudes of the stages, which lie in the group, in place of the collocated ones."""
     monkeypatch.setattr(
-        "liethermo.integrators.reconstruction._collocation_stages", lambda X: jnp.broadcast_to(jnp.eye(X.shape[-1]), X.shape)
+        "liethermo.integrators.reconstruction._collocation_stages",
+        lambda X: jnp.broadcast_to(jnp.eye(X.shape[-1]), X.shape),
     )
     torque = lt.torques.ConstantInSpace([0.1, 0.2, -0.1002])
     system = lt.LiePoissonSystem(
