@@ -146,7 +146,7 @@ INTERNALS = frozenset(
     production_name project_tangent pullback pullback_to_chart raise_index rate_of_change record_initial
     reorder_components requested_invariants reshape_to_sites residual_jvp residual_weights
     resolve_invariants_near rounding_scale row_counts row_pointer samples scale_at_sites site_spins
-    solution_builder solved_part sparsity_pattern specific_residuals split_state stage_velocities start_blocks
+    solution_builder solved_subsystem sparsity_pattern specific_residuals split_state stage_velocities start_blocks
     state_array state_blocks state_time step_without_compensation surface system_without_span
     systems_at_test_times tangential_covector term_index test_states_per_scale to_user_solution to_user_state
     torque_arguments torque_free_components torque_invariant_casimirs torque_name torque_velocity

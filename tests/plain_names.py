@@ -75,7 +75,9 @@ def fault_of_name(name: str) -> str:
         return ""
     if len(words) == 1:
         return "participle" if is_participle(words[0]) else "ordinary word" if words[0] in ORDINARY_WORDS else ""
-    if words[0] in LEADING_PREPOSITIONS and words[0] != EXPLAINING:
+    if words[0] == EXPLAINING:
+        return ""
+    if words[0] in LEADING_PREPOSITIONS:
         return "leading preposition"
     if all(word in ORDINARY_WORDS | LEADING_PREPOSITIONS or is_participle(word) for word in words):
         return "no noun and no verb"

@@ -71,7 +71,7 @@ class Series:
         """Indices of all rows."""
         return np.arange(len(self.samples))
 
-    def without_transient(self) -> Series:
+    def drop_transient(self) -> Series:
         """Return the series without its beginning: a twentieth, or eight autocorrelation times if that is at most
         half."""
         n = len(self.samples)
@@ -151,7 +151,7 @@ def cumulant_crossing(a: Series, b: Series) -> tuple[float, float]:
 
 def join_runs(runs: list[Series]) -> Series:
     """Return runs under equal conditions as one series, each without its beginning."""
-    rows = np.concatenate([run.without_transient().samples for run in runs])
+    rows = np.concatenate([run.drop_transient().samples for run in runs])
     return replace(runs[0], steps=sum(run.steps for run in runs), samples=rows)
 
 

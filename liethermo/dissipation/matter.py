@@ -59,11 +59,11 @@ class MatterExchange(Dissipation):
         self.processes = tuple(processes)
 
     def force(self, system, x, dH, dS, dL):
-        z_dot, apply_fluxes = self._flux_directions(system, x, dH)
+        z_dot, apply_fluxes = self._force_and_flux_maps(system, x, dH)
         return apply_fluxes(self._coefficients(x) * z_dot(dS))
 
     def factor(self, system, x, dH, dL):
-        _, apply_fluxes = self._flux_directions(system, x, dH)
+        _, apply_fluxes = self._force_and_flux_maps(system, x, dH)
         root = jnp.sqrt(self._coefficients(x))
         return Factor(len(self.processes), lambda w: apply_fluxes(root * w))
 
@@ -73,7 +73,7 @@ class MatterExchange(Dissipation):
         L = jnp.stack([jnp.asarray(value) for value in coefficients])
         return jnp.where(L >= 0.0, L, jnp.nan)
 
-    def _flux_directions(self, system, x, dH) -> tuple[Callable, Callable]:
+    def _force_and_flux_maps(self, system, x, dH) -> tuple[Callable, Callable]:
         """Return two functions: dS to ``z . dS`` of each process, and fluxes to the sum of fluxes times z."""
         stoichiometry, heat_shares, entropy_transport = (
             np.array([getattr(e, name) for e in self.processes])

@@ -135,7 +135,7 @@ class ThermalJumps(Dissipation):
         return "conserved" if self.conserves_energy else None
 
     def bind_to(self, system):
-        structure, baths = require_density_structure(system, "ThermalJumps"), system.baths
+        structure, baths = get_density_structure(system, "ThermalJumps"), system.baths
         for i, V in enumerate(self.operators):
             if np.shape(V) != (structure.size,) * 2:
                 raise InputError(
@@ -344,7 +344,7 @@ class SteepestEntropyAscent(Dissipation):
         return tuple(f for f in self.functions if isinstance(f, Energy))
 
     def bind_to(self, system):
-        require_density_structure(system, "SteepestEntropyAscent")
+        get_density_structure(system, "SteepestEntropyAscent")
         return self
 
     def bind_to_structure(self, structure: mf.DensityMatrices) -> SteepestEntropyAscent:
@@ -395,7 +395,7 @@ class _Observable(eqx.Module):
         return jnp.dot(self.coordinates, x[: self.coordinates.shape[0]])
 
 
-def require_density_structure(system, name: str) -> mf.DensityMatrices:
+def get_density_structure(system, name: str) -> mf.DensityMatrices:
     """Return the structure of a system of density matrices; InputError for other systems."""
     structure = getattr(system, "structure", None)
     if not isinstance(structure, mf.DensityMatrices):

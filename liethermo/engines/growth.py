@@ -44,7 +44,7 @@ def arnoldi_hessenberg(system, method, x):
 
     Its eigenvalues approximate the extremal eigenvalues of the Jacobian.
     """
-    system, x = system.solved_part(x)
+    system, x = system.solved_subsystem(x)
     jacobian_product, n = _jacobian_product(system, x), x.shape[0]
     m = min(n, KRYLOV_DIM)
 

@@ -81,7 +81,7 @@ def _jvp_rule(primals, tangents, *, residual: Callable, structure, axes: tuple, 
         return k, jnp.zeros_like(k)
     leaves, active_tangents = primals[:-1], [tangents[i] for i in active]
 
-    def tangent_of_one(k, *arguments):
+    def solution_tangent(k, *arguments):
         leaves, active_tangents = list(arguments[: -len(active)]), arguments[-len(active) :]
 
         def active_residual(k, *values):
@@ -105,7 +105,7 @@ def _jvp_rule(primals, tangents, *, residual: Callable, structure, axes: tuple, 
         )
 
     levels = [(0, *axes_of_level[:-1], *(axes_of_level[i] for i in active)) for axes_of_level in axes]
-    return k, _nest_vmaps(tangent_of_one, levels)(k, *leaves, *active_tangents)
+    return k, _nest_vmaps(solution_tangent, levels)(k, *leaves, *active_tangents)
 
 
 _implicit_solution.def_impl(lambda *arguments, **rest: jax.jit(lambda *a: _evaluate(*a, **rest))(*arguments))

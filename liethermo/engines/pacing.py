@@ -133,7 +133,7 @@ def initial_adaptive_state(
 ) -> AdaptiveState:
     """Return the state of an adaptive run from x at time t to t + ``span_length``."""
     state, zero = initial_run_state(system, method, x), jnp.zeros(())
-    solved_system, components = system.solved_part(x)
+    solved_system, components = system.solved_subsystem(x)
     norm = jnp.max(jnp.abs(components))
     scale = jnp.where(norm > 0.0, norm, 1.0)
     relative_rate = jnp.max(jnp.abs(solved_system.vector_field(components))) / scale
@@ -173,7 +173,7 @@ def jacobian_probe_shape(system: System, method: OneStepMethod, control: StepCon
     if not control.adaptive:
         return 1, 1
     x = jax.ShapeDtypeStruct((system.dim,), jnp.float64)
-    return jax.eval_shape(lambda x: jacobian_probe(*system.solved_part(x)), x).shape
+    return jax.eval_shape(lambda x: jacobian_probe(*system.solved_subsystem(x)), x).shape
 
 
 def next_step(control: StepControl, adaptive_state: AdaptiveState) -> tuple[jax.Array, jax.Array]:
@@ -250,7 +250,7 @@ def accept_or_reject(
     is_accepted, next_step_size, code = is_solved, adaptive_state.next_step_size, new_state.status
     max_rate, optimal_step = adaptive_state.max_relative_rate, adaptive_state.optimal_step_size
     if control.adaptive:
-        x_before, x_after = (system.solved_part(x)[1] for x in (old_state.x, new_state.x))
+        x_before, x_after = (system.solved_subsystem(x)[1] for x in (old_state.x, new_state.x))
         norm = jnp.maximum(jnp.max(jnp.abs(x_before)), jnp.max(jnp.abs(x_after)))
         relative_change = jnp.max(jnp.abs(x_after - x_before)) / jnp.where(norm > 0.0, norm, 1.0)
         max_rate = jnp.maximum(max_rate, jnp.where(is_solved, relative_change / h, 0.0))
@@ -319,7 +319,9 @@ def accept_or_reject(
     )
     if not control.adaptive:
         return new_adaptive_state
-    limited_state = limit_by_growth_rate(method, new_adaptive_state, jacobian_probe(*system.solved_part(new_state.x)))
+    limited_state = limit_by_growth_rate(
+        method, new_adaptive_state, jacobian_probe(*system.solved_subsystem(new_state.x))
+    )
     new_adaptive_state = jax.tree_util.tree_map(select_if_running, limited_state, new_adaptive_state)
     is_exhausted = (n_attempts >= control.max_attempts) & (new_adaptive_state.state.status == StatusCode.COMPLETED)
     status = jnp.where(is_exhausted, StatusCode.STEP_LIMIT, new_adaptive_state.state.status).astype(

@@ -119,7 +119,7 @@ def solve_fixed_point(equations: StageEquations, options: SolverOptions = DEFAUL
 
 def slope_rounding_scale(system: System, x, options: SolverOptions = DEFAULT_OPTIONS) -> jax.Array:
     """Return the norm of the scales at which the components of the vector field at x are rounded."""
-    system, x = system.solved_part(x)
+    system, x = system.solved_subsystem(x)
     return options.norm_for_dim(x.size)(value_and_rounding_scale(system.vector_field, x)[1])
 
 
@@ -279,7 +279,7 @@ def explicit_slopes(
 ) -> StageSolution:
     """Return the slopes of an explicit step; it has converged if its end satisfies the constraints."""
     k = method.slopes(system, x, compensation, h, k)
-    x, zero_count = system.solved_part(x)[1], jnp.zeros((), dtype=jnp.int64)
+    x, zero_count = system.solved_subsystem(x)[1], jnp.zeros((), dtype=jnp.int64)
     norm = options.norm_for_dim(x.size)
     residual = norm(jnp.zeros_like(x).at[0].set(constraint_residual(k)))  # the residual is the length of a vector
     converged = residual <= options.projection_rtol * norm(k[0]) + options.projection_state_rtol * update_scale(

@@ -167,7 +167,7 @@ def stage_equations(
     map_function: Callable | None = None,
 ) -> StageEquations:
     """Return the stage equations of a step from x, with a guess extrapolated from the slopes of previous steps."""
-    components = system.solved_part(x)[1]
+    components = system.solved_subsystem(x)[1]
     norm = options.norm_for_dim(components.size)
     state_rate = norm(components) / jnp.abs(h)  # computed once per step
     return StageEquations(
@@ -201,7 +201,7 @@ def finish_step(
     failure_code = jnp.where(
         solution.converged | ~solution.is_finite, int(StatusCode.NON_FINITE), int(StatusCode.NOT_CONVERGED)
     )
-    components = system.solved_part(x)[1]
+    components = system.solved_subsystem(x)[1]
     residual_scale = jnp.maximum(options.norm_for_dim(components.size)(components), h * solution.slope_rounding)
     residual = h * solution.residual / jnp.where(residual_scale > options.tiny, residual_scale, 1.0)
     iterations = solution.fixed_point_iterations + solution.newton_iterations

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from ..errors import FunctionError, IndexOutOfRangeError, InputError
 from ..tracing.interpret import polynomial_degree
-from ..tracing.trace_errors import TRACE_ERRORS, explain_trace_error
+from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
 from ..tracing.traced import trace_callables_with_result
 from .energy import Energy, Function, Negative, Pullback, SpanLimitedEnergy, StateTimeEnergy, Sum
 
@@ -71,7 +71,7 @@ def check_energy(energy: Energy, dim: int, role: str, allow_time: bool = False) 
         if isinstance(error, IndexOutOfRangeError):
             raise error.with_function(f"{role}, a function of a state of shape ({dim},),") from None
         cure = "It must be written with jax.numpy and accept one array"
-        message = explain_trace_error(f"{role} could not be evaluated on a state of shape ({dim},)", error, cure)
+        message = trace_error_message(f"{role} could not be evaluated on a state of shape ({dim},)", error, cure)
         raise FunctionError(message) from error
     for term in energy.terms:
         term.check_components(dim, role)
@@ -123,7 +123,7 @@ def check_function_shape(
     except IndexOutOfRangeError as error:
         raise error.with_function(f"{what}, at {at},") from None
     except TRACE_ERRORS as error:
-        raise FunctionError(explain_trace_error(f"{what} could not be evaluated at {at}", error)) from error
+        raise FunctionError(trace_error_message(f"{what} could not be evaluated at {at}", error)) from error
     if result.shape not in shapes:
         expected_shapes = " or ".join(map(str, shapes))
         raise FunctionError(f"{what} must have shape {expected_shapes}, got {result.shape}")

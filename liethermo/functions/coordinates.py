@@ -15,7 +15,7 @@ from manifolds._pytree_module import Module
 
 from ..errors import FunctionError, InputError
 from ..tracing.interpret import evaluate_at_points
-from ..tracing.trace_errors import TRACE_ERRORS, explain_trace_error
+from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
 from .indices import Indices
 
 COORDINATE_TOLERANCE = 1e-10
@@ -59,7 +59,7 @@ def check_coordinates(coordinates: Callable, dim: int, role: str) -> None:
         )
     except TRACE_ERRORS as error:
         raise FunctionError(
-            explain_trace_error(f"the coordinates of a term of {role} could not be evaluated", error)
+            trace_error_message(f"the coordinates of a term of {role} could not be evaluated", error)
         ) from error
     if start.ndim != 2:
         raise FunctionError(f"the coordinates of a term of {role} must be a vector, got shape {start.shape[1:]}")

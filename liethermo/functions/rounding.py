@@ -136,7 +136,7 @@ def _perturb(value, number: int, amplitudes):
     if not jnp.issubdtype(jnp.result_type(value), jnp.inexact):
         return value
     shape = np.shape(value)[-1:]
-    pattern = _stored_pattern if math.prod(shape) <= MAX_STORED_PATTERN_LENGTH else _generated_pattern
+    pattern = _stored_pattern if math.prod(shape) <= MAX_STORED_PATTERN_LENGTH else _pseudorandom_numbers
     errors = [
         amplitude * pattern(shape, (number + PERTURBATION_SAMPLES * i) % PATTERNS_PER_SHAPE)
         for i, amplitude in enumerate(amplitudes)
@@ -151,7 +151,7 @@ def _stored_pattern(shape: tuple[int, ...], number: int) -> np.ndarray:
     return rng.uniform(0.5, 1.0, shape) * rng.choice([-1.0, 1.0], shape)
 
 
-def _generated_pattern(shape: tuple[int, ...], number: int) -> jax.Array:
+def _pseudorandom_numbers(shape: tuple[int, ...], number: int) -> jax.Array:
     """Return pseudorandom numbers of modulus 0.5 to 1, from the fractional part of a large multiple of a sine."""
     v = 43758.5453 * jnp.sin(12.9898 * jnp.arange(1.0, shape[0] + 1.0) + 78.233 * number)
     v = 2.0 * (v - jnp.floor(v)) - 1.0

@@ -117,7 +117,7 @@ class ConstraintSurface:
         return jnp.where(self.is_in_space(x), x, jnp.nan), compensation - self._correction_displacement(x, violation)
 
     def is_in_space(self, x) -> jax.Array:
-        """Return whether a state on the surface is in the space."""
+        """Return whether a state that satisfies the equations of the space satisfies its inequalities too."""
         return self.space._inside(self._point(x))
 
     def project_state(self, x) -> jax.Array:

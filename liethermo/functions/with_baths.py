@@ -79,14 +79,14 @@ class BodyBathsEnergy(Energy):
     def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
         arrays = x, d, jnp.zeros_like(x) + compensation
 
-        def component_gradient(energy: Energy, components: Components) -> jax.Array:
+        def discrete_gradient_of_part(energy: Energy, components: Components) -> jax.Array:
             if (
                 energy is self.body and energy.is_quadratic
             ):  # at the midpoint of the whole state, which other terms use too
                 return components(scheme.quadratic(Pullback(energy, components), *arrays))
             return sum_terms(term.discrete_gradient(scheme, *map(components, arrays)) for term in energy.terms)
 
-        return jnp.concatenate([component_gradient(*pair) for pair in self._energies_and_components])
+        return jnp.concatenate([discrete_gradient_of_part(*pair) for pair in self._energies_and_components])
 
     def stage_gradients(self, scheme, path: CollocationPath) -> jax.Array:
         def component_gradients(energy: Energy, components: Components) -> jax.Array:

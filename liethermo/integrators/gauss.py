@@ -138,7 +138,10 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
     def _map_functions(
         self, transform: Callable, held_names: tuple[str, ...], momentum_maps: tuple[int, ...] | None = None
     ):
-        """Return the method with transformed preserved functions, holding the system's functions of these names."""
+        """Return a copy with ``transform`` applied to its preserved functions.
+
+        The copy conserves the first integrals of the system in ``held_names`` too.
+        """
         return type(self)(
             self.number, tuple(map(transform, self.functions)), self.retraction, held_names, momentum_maps
         )
@@ -221,7 +224,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         return x + (compensation + h * (gauss_tableau(self.number).A @ k))
 
     def _energy_gradients(self, system: System, u, x, compensation, h, k) -> jax.Array:
-        """Return the discrete gradients of the energy at the stages u, shape (s, n)."""
+        """Return gradients of the energy at the stages u, shape (s, n), corrected so that their work is its change."""
         A, b, _ = gauss_tableau(self.number)
         symmetries = self._symmetry_directions(system, u)
         return stage_gradients(system.energy, x, compensation, h, k, A, b, kronrod_rule(self.number), symmetries)

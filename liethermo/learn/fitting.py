@@ -249,7 +249,7 @@ def fit(
     )
     path = None if checkpoint is None else Path(checkpoint)
     if path is not None and path.exists():
-        training_run.resume(path)
+        training_run.restore(path)
     training_run.run(seed, patience, path, progress)
     weights, refined = training_run.weights, None
     if (

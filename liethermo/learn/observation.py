@@ -17,7 +17,7 @@ from ..functions.arguments import required_argument_count
 from ..results.solution import Solution
 from ..systems import AttitudeSystem, System
 from ..tracing.index_check import result_shape
-from ..tracing.trace_errors import TRACE_ERRORS, explain_trace_error
+from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
 from .compile_options import fast_compile_options
 
 LEVENBERG_ITERATIONS = 30
@@ -124,7 +124,7 @@ def make_observation(system: System, observed: Sequence[int] | None, observe: Ca
         raise error.with_function(f"observe, at a state of shape ({system.dim},),") from None
     except TRACE_ERRORS as error:
         description = f"observe could not be evaluated on a state of shape ({system.dim},)"
-        raise FunctionError(explain_trace_error(description, error)) from error
+        raise FunctionError(trace_error_message(description, error)) from error
     if not jnp.issubdtype(output_shape.dtype, jnp.floating):
         raise FunctionError(f"observe must return real numbers, not {output_shape.dtype}")
     return Observation(observe, output_shape.shape, np.zeros(0, int), group, False)

@@ -271,10 +271,10 @@ def _normal_equations(params: ParameterVector, method: OneStepMethod, observatio
         return J.T @ J, J.T @ r, r @ r
 
     @functools.partial(jax.jit, compiler_options=fast_compile_options())
-    def all_equations(weights, *arrays):
+    def equations_of_trajectories(weights, *arrays):
         return jax.lax.map(functools.partial(run_equations, weights), arrays, batch_size=min(len(arrays[0]), 16))
 
-    return all_equations
+    return equations_of_trajectories
 
 
 def _add_prior(squares: np.ndarray, p: int, variance: float) -> np.ndarray:

@@ -349,8 +349,8 @@ class TrainingRun:
         arrays = {"weights": self.weights, "vector": self.vector, "best": self.best_vector}
         write_archive(path, metadata, arrays | {f"state_{i}": leaf for i, leaf in enumerate(leaves)})
 
-    def resume(self, path: Path) -> None:
-        """Resume from a checkpoint file.
+    def restore(self, path: Path) -> None:
+        """Restore the state of the fit from a checkpoint file, without training.
 
         Raises
         ------

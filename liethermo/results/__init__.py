@@ -1,1 +1,1 @@
-"""What a run returns: its series and how it ended, the audit of its laws, files and pictures."""
+"""Results of runs: time series and status, audits of the laws, files and pictures."""

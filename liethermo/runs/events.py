@@ -15,7 +15,7 @@ from manifolds._pytree_module import Module
 
 from ..errors import FunctionError, IndexOutOfRangeError, InputError
 from ..systems import System
-from ..tracing.trace_errors import TRACE_ERRORS, explain_trace_error
+from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
 from ..tracing.traced import trace_callables
 
 
@@ -87,7 +87,7 @@ class Event:
                 raise error.with_function(f"the event function, at a state of shape {user_state.shape},") from None
             except TRACE_ERRORS as error:
                 description = f"the event function could not be evaluated on a state of shape {user_state.shape}"
-                raise FunctionError(explain_trace_error(description, error)) from error
+                raise FunctionError(trace_error_message(description, error)) from error
         else:
             raise InputError(f"until must be lt.Relaxed(tol) or a function of the state, got {until!r}")
         x = jax.ShapeDtypeStruct((system.dim,), jnp.float64)

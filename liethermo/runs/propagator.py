@@ -182,7 +182,7 @@ class Propagator:
             )
         check_choice("on_failure", on_failure, ("raise", "return"))
         step, adaptive = self.step, isinstance(self.step, Adaptive)
-        system, method = self._prepared(x0)
+        system, method = self._prepare_run(x0)
         invariants_and_laws(system, method)  # refuses what the method cannot run
         if isinstance(method, Reference) and (dense or save_at is not None or until is not None):
             raise InputError(REFERENCE_STEPS)
@@ -193,7 +193,7 @@ class Propagator:
         run = Run(system, method, x, schedule, save_to, self.engine, self.noise, dense)
         with Progress((schedule.start, schedule.end), progress) as bar:
             if isinstance(method, Reference):
-                run.run_reference(bar)
+                run.run_with_scipy(bar)
             elif adaptive or until is not None:
                 run.run_with_step_control(bar, step if adaptive else schedule.h, until)
             else:
@@ -277,7 +277,7 @@ class Propagator:
             ),
         )
 
-    def _prepared(self, x0) -> tuple[System, Any]:
+    def _prepare_run(self, x0) -> tuple[System, Any]:
         """Return the system and the method as they are run from x0."""
         tolerance = self.step.tolerance if isinstance(self.step, Adaptive) else None
         return prepare_run(resolve_invariants(self.system, x0), self.method, self.noise, tolerance)

@@ -224,7 +224,7 @@ class Run:
 
     # -- SciPy --------------------------------------------------------------------------------------------------------
 
-    def run_reference(self, bar) -> None:
+    def run_with_scipy(self, bar) -> None:
         """Run SciPy's solver and save its states at the times of a run with fixed steps."""
         times = self.schedule.saved_times
         self.saved_energies_entropies = [self._energies_and_entropies(self.saved_states[0])]

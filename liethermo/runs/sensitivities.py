@@ -129,7 +129,7 @@ def state_derivatives(
     """
     x, compensation, k = path
     count, n, m = len(x), x.shape[1], k[0].size
-    parameters, initial_state = _differentiated_values(arguments, leaf_is_traced)
+    parameters, initial_state = _differentiated_parameters_and_state(arguments, leaf_is_traced)
     q, p = len(parameters), len(parameters) + len(initial_state)
     base_rows = np.concatenate([x, np.broadcast_to(parameters, (count, q)), k.reshape(count, m)], axis=1)
 
@@ -216,7 +216,9 @@ def _lower_order_rows(
     return rows
 
 
-def _differentiated_values(arguments: tuple, leaf_is_traced: Sequence[bool]) -> tuple[np.ndarray, np.ndarray]:
+def _differentiated_parameters_and_state(
+    arguments: tuple, leaf_is_traced: Sequence[bool]
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the parameters and the initial state that are differentiated by, one row each; empty if there are none."""
     leaves = jax.tree_util.tree_leaves(arguments)
     *parameters, initial_state = (

@@ -147,7 +147,7 @@ def _advance_to_end(
             return
         previous_state = outcome.state
         try:
-            attempts = adaptive_runs.attempt_records(
+            attempts = adaptive_runs.attempt_and_record(
                 int(min(attempts_per_call, max(1.0, max_steps - int(previous_state.step))))
             )
         except UnsupportedPrimitive as error:

@@ -15,7 +15,7 @@ from ..errors import FileError, LiethermoError
 from ..runs.ensemble import MAX_THREADS
 from .axes import Axes
 from .progress import StudyProgressBar
-from .solve import NOT_COMPUTED, PointSolver, StudyTask, cached_solver
+from .solve import EMPTY_POINT_STATUS, PointSolver, StudyTask, cached_solver
 from .store import StoreSurvey, StudyStore
 
 TARGET_PORTION_SECONDS = 2.0
@@ -54,7 +54,7 @@ class ChunkTask:
     def from_chunk(cls, store: StudyStore, axes: Axes, number: int, is_partial: bool) -> ChunkTask:
         """Make the task of a chunk, given by its number; if it is partial, only of its missing points."""
         index = store.chunk_index(number)
-        is_missing = store.read_chunk("status", index) == NOT_COMPUTED if is_partial else None
+        is_missing = store.read_chunk("status", index) == EMPTY_POINT_STATUS if is_partial else None
         indices = store.point_indices(index, is_missing)
         return cls(index, is_partial, indices, axes.parameters_at(indices), axes.states_at(indices))
 

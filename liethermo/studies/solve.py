@@ -30,13 +30,13 @@ LAW_BROKEN = 64
 MEASURE_FAILED = 65
 """Status of a point whose run succeeded but one of whose measures raised an error."""
 
-NOT_COMPUTED = -1
+EMPTY_POINT_STATUS = -1
 """Status of a point without results: the fill value of the status array."""
 
 STATUSES = {code.status_name: int(code) for code in RESULT_CODES if code != StatusCode.INTERRUPTED} | {
     "law_broken": LAW_BROKEN,
     "measure_failed": MEASURE_FAILED,
-    "missing": NOT_COMPUTED,
+    "missing": EMPTY_POINT_STATUS,
 }
 """Status names of a point and their codes in a store."""
 

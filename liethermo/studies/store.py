@@ -25,7 +25,7 @@ from ..errors import FileError, InputError
 from . import files
 from .axes import Axes, Axis
 from .files import ZarrArray
-from .solve import LAW_QUANTITIES, NOT_COMPUTED, STATUSES, SUCCESS_CODES
+from .solve import EMPTY_POINT_STATUS, LAW_QUANTITIES, STATUSES, SUCCESS_CODES
 from .store_metadata import MAX_CHUNKS, read_group, with_checksum
 
 STORE_FORMAT = "liethermo-study-1"
@@ -324,7 +324,7 @@ class StudyStore:
         path = self.root / self.arrays[name].chunk_path(self._file_index(name, index))
         try:
             block = self.arrays[name].decode_chunk(files.read_plain_file(path))
-            if name == "status" and not np.isin(block, (*STATUSES.values(), NOT_COMPUTED)).all():
+            if name == "status" and not np.isin(block, (*STATUSES.values(), EMPTY_POINT_STATUS)).all():
                 raise ValueError("it has a status that there is not")
             return block
         except FileError as error:
@@ -371,7 +371,7 @@ class StudyStore:
             if status is None or faults:
                 remaining_chunks.append((number, False))
                 continue
-            n_missing = int((status == NOT_COMPUTED).sum())
+            n_missing = int((status == EMPTY_POINT_STATUS).sum())
             n_done += status.size - n_missing
             if n_missing:
                 remaining_chunks.append((number, True))
@@ -379,7 +379,7 @@ class StudyStore:
 
     def _damaged_files(self, index: tuple[int, ...], status: np.ndarray) -> list[str]:
         """Return a line for each file of a finished chunk that is missing or damaged."""
-        has_no_messages = np.isin(status, (*SUCCESS_CODES, NOT_COMPUTED)).all()
+        has_no_messages = np.isin(status, (*SUCCESS_CODES, EMPTY_POINT_STATUS)).all()
         faults = []
         for name in self.chunked_arrays[:-1]:
             path = self.arrays[name].chunk_path(self._file_index(name, index))

@@ -16,7 +16,7 @@ from ..results.many import evaluate_ensemble_laws
 from ..results.status import Laws
 from . import files
 from .progress import StudyStatus, seconds_left
-from .solve import LAW_BROKEN, MEASURE_FAILED, NOT_COMPUTED, STATUSES, SUCCESS_CODES, LawSummary
+from .solve import EMPTY_POINT_STATUS, LAW_BROKEN, MEASURE_FAILED, STATUSES, SUCCESS_CODES, LawSummary
 from .store import StudyStore
 
 if TYPE_CHECKING:
@@ -97,9 +97,9 @@ def audit_store(path: Any, **tolerances: float) -> Audit:
                 worst_rows[law.law] = dataclasses.replace(row, note=f"worst at {axes.describe_point(point_index)}")
     rows = list(worst_rows.values())
     for name, code in STATUSES.items():
-        if code not in (*SUCCESS_CODES, NOT_COMPUTED) and counts.get(code):
+        if code not in (*SUCCESS_CODES, EMPTY_POINT_STATUS) and counts.get(code):
             rows.append(AuditRow(f"points with status {name}", float(counts[code]), 0.0, False))
-    n_failed = sum(count for code, count in counts.items() if code not in (*SUCCESS_CODES, NOT_COMPUTED))
+    n_failed = sum(count for code, count in counts.items() if code not in (*SUCCESS_CODES, EMPTY_POINT_STATUS))
     if not n_failed:
         rows.append(AuditRow("points that failed", 0.0, 0.0, True))
     return Audit(

@@ -110,7 +110,7 @@ class AttitudeSystem(System):
         """Return the body with its torque bound to the attitude of a state."""
         return self.body.bind_attitude(self.split_state(x)[1]) if isinstance(self.body, DrivenSystem) else self.body
 
-    def solved_part(self, x) -> tuple[System, jax.Array]:
+    def solved_subsystem(self, x) -> tuple[System, jax.Array]:
         return self.body_at_attitude(x), self.points(x)
 
     def spatial_action(self, g) -> jax.Array:

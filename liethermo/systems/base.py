@@ -316,7 +316,7 @@ class System(SystemInterface):
         """
         return self, x
 
-    def solved_part(self, x) -> tuple[System, jax.Array]:
+    def solved_subsystem(self, x) -> tuple[System, jax.Array]:
         """Return the sub-system and the part of a state that the equations of a step are solved for.
 
         Slopes and errors have its dimension. The other components follow from it, and have tolerances of their own.

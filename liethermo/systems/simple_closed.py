@@ -251,6 +251,6 @@ class FlattenedFunction(Module):
 
 
 def _check_flat_function(function, at: tuple[int, ...], shape: tuple[int, ...], what: str) -> Callable:
-    """As a function of (q, v, S, t), whose shape has been checked; q and v of shape ``at``, and flat in the result."""
+    """Check a function of (q, v, S, t), q and v of shape ``at``, and return it for flat q and v, with flat values."""
     checked = check_state_function(function, (at, at, ()), shape, what, f"(q, v, S), q and v of shape {at}")
     return checked if len(at) == 1 else FlattenedFunction(checked, at)

@@ -13,7 +13,7 @@ import manifolds as mf
 from ..errors import FunctionError, InputError
 from ..functions.arguments import required_argument_count
 from ..tracing.interpret import MAX_UNROLLED_DIM, vanishing_entries
-from ..tracing.trace_errors import TRACE_ERRORS, explain_trace_error
+from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
 from ..tracing.traced import TracedFunction, trace_callables_with_result
 
 
@@ -48,7 +48,7 @@ def check_torque(given: Any, algebra: mf.LieAlgebra, group: mf.MatrixGroup | Non
         torque, values = trace_callables_with_result(given, evaluate_terms, *shapes)
     except TRACE_ERRORS as error:
         what = f"the torque could not be evaluated on a momentum of shape {algebra.shape}"
-        raise FunctionError(explain_trace_error(what, error)) from error
+        raise FunctionError(trace_error_message(what, error)) from error
     for term, value in zip(terms, values, strict=True):
         if value.shape != algebra.shape or not jnp.issubdtype(value.dtype, jnp.floating):
             raise FunctionError(

@@ -47,11 +47,11 @@ def evaluate_at_points(function: Callable, model: Any, points: np.ndarray) -> An
     model : pytree
     points : array, shape (m, n)
     """
-    return point_evaluator(function, model, np.shape(points)[1])(points)
+    return batch_evaluator(function, model, np.shape(points)[1])(points)
 
 
 @memoize
-def point_evaluator(function: Callable, model: Any, dim: int) -> Callable[[np.ndarray], Any]:
+def batch_evaluator(function: Callable, model: Any, dim: int) -> Callable[[np.ndarray], Any]:
     """Unroll ``function(model, x)``, and return the map from points, shape (m, dim), to its values there."""
     if dim > MAX_UNROLLED_DIM:
         return lambda points: _evaluate_compiled(function, model, points)

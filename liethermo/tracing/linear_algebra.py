@@ -54,7 +54,7 @@ def _cached_call(*spec) -> LapackCall:
 def matrix_product(b, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return the product of two matrices, computed in a loop; a complex product is four real ones."""
     if not isinstance(b, ComplexBuilder):
-        (table_x, strides_x), (table_y, strides_y) = _matrix_table(b, x), _matrix_table(b, y)
+        (table_x, strides_x), (table_y, strides_y) = _table_and_strides(b, x), _table_and_strides(b, y)
         sizes = (*x.shape, y.shape[1])
         return scalar_array(
             b.emit_block(MatrixProduct(sizes, (strides_x, strides_y)), table_x, table_y), (x.shape[0], y.shape[1])
@@ -87,7 +87,7 @@ def input_table(b, x: np.ndarray) -> tuple[str, tuple[int, int]] | None:
     return None
 
 
-def _matrix_table(b, x: np.ndarray) -> tuple[str, tuple[int, int]]:
+def _table_and_strides(b, x: np.ndarray) -> tuple[str, tuple[int, int]]:
     return input_table(b, x) or (b.table(x.ravel().tolist()), (x.shape[1], 1))
 
 

@@ -251,7 +251,7 @@ def _linear_rule(recurrences: _Recurrences, eqn, values) -> list:
 
 
 def _higher_coefficient(value, coefficients):
-    """Return a coefficient above the first: the next one of ``coefficients`` for a series, zero for a constant."""
+    """Return a coefficient of order one or more: the next of the iterator ``coefficients``, or zero for a constant."""
     if isinstance(value, _SeriesIndex):
         return next(coefficients)
     return jnp.zeros_like(value) if jnp.issubdtype(jnp.result_type(value), jnp.inexact) else value

@@ -42,7 +42,7 @@ JAX_ERROR_REMEDIES = {
 """Cause and remedy for each error that JAX raises if a traced value is used as a number."""
 
 
-def explain_trace_error(subject: str, error: BaseException, cure: str = "") -> str:
+def trace_error_message(subject: str, error: BaseException, cure: str = "") -> str:
     """Return a message that says why a function could not be evaluated, and what to do.
 
     Parameters

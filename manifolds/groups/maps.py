@@ -14,8 +14,11 @@ from ..algebras.lie_algebra import LieAlgebra
 from ..matrices.exponential import CAYLEY_CONDITION_LIMIT, cayley_of, expm
 from ..matrices.linear import _one_norm, _square_root, determinant, max_abs_entry, solve, solve_near_identity
 
-_NODES, _WEIGHTS = (a[16:] for a in np.polynomial.legendre.leggauss(32))
-"""Gauss quadrature of even functions on [0, 1] in 16 nodes: half of the rule on [-1, 1]."""
+_NODES = np.polynomial.legendre.leggauss(32)[0][16:]
+"""Nodes of Gauss quadrature of even functions on [0, 1]: half of the rule with 32 nodes on [-1, 1]."""
+
+_WEIGHTS = np.polynomial.legendre.leggauss(32)[1][16:]
+"""Weights of this quadrature."""
 
 
 def exp(algebra: LieAlgebra, x) -> jax.Array:

@@ -336,13 +336,13 @@ def _callback(space: GeomstatsSpace, function: Callable, result_shape: tuple[int
     axes."""
     batch = arrays[0].shape[: arrays[0].ndim - len(space.shape)]
 
-    def on_host(*arrays):
+    def run_on_host(*arrays):
         host_batch = arrays[0].shape[: arrays[0].ndim - len(space.shape)]
         result = function(*(np.asarray(a).reshape(-1, *space.shape) for a in arrays))
         return result.reshape((*host_batch, *result_shape)).astype(dtype)
 
     return jax.pure_callback(
-        on_host, jax.ShapeDtypeStruct((*batch, *result_shape), dtype), *arrays, vmap_method="broadcast_all"
+        run_on_host, jax.ShapeDtypeStruct((*batch, *result_shape), dtype), *arrays, vmap_method="broadcast_all"
     )
 
 

@@ -134,7 +134,7 @@ class LiePoisson(PoissonStructure):
 
     def stages_on_leaf(self, x, alpha, A) -> jax.Array | None:
         """Return stage points on the leaf of x, by the stages A; None but for the matrices of u(n), su(n) and so(n)."""
-        skew_matrices = _skew_matrices(self.algebra)
+        skew_matrices = _unitary_basis_and_dual(self.algebra)
         if skew_matrices is None:
             return None
         basis, dual = skew_matrices
@@ -142,7 +142,7 @@ class LiePoisson(PoissonStructure):
         return jnp.einsum("sij,aji->sa", conjugates, basis).real
 
     def leaf_covector_rate(self, covector, alpha) -> jax.Array | None:
-        skew_matrices = _skew_matrices(self.algebra)
+        skew_matrices = _unitary_basis_and_dual(self.algebra)
         if skew_matrices is None:
             return None
         basis, dual = skew_matrices
@@ -151,7 +151,7 @@ class LiePoisson(PoissonStructure):
 
 
 @functools.lru_cache(maxsize=64)
-def _skew_matrices(algebra: LieAlgebra) -> tuple[np.ndarray, np.ndarray] | None:
+def _unitary_basis_and_dual(algebra: LieAlgebra) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the basis of all skew-Hermitian matrices of a size, or the traceless or the real ones, and its dual basis.
 
     None for other algebras: their groups are not all of the matrices that preserve a form.

@@ -11,7 +11,7 @@ from llvmlite import ir
 from ...tracing.builder import Block
 from ...tracing.calls import DeferredBlock, LapackCall, MatrixProduct
 from ...tracing.program import Routine, ScanLoop, WhileLoop
-from .lapack import lapack_kernel
+from .lapack import find_or_write_kernel
 
 INT32 = ir.IntType(32)
 
@@ -69,7 +69,7 @@ def _allocate_slots(writer: Any, kinds: Sequence[str], values: Sequence[ir.Value
     return slots
 
 
-def _array_reader(*arrays: Sequence[ir.Value]) -> Callable[[int, int], ir.Value]:
+def _argument_reader(*arrays: Sequence[ir.Value]) -> Callable[[int, int], ir.Value]:
     return lambda i, j: arrays[i][j]
 
 
@@ -88,14 +88,14 @@ def _write_while(writer: Any, loop: WhileLoop, args: Sequence[ir.Value]) -> Bloc
 
     def has_running_lane() -> ir.Value:
         carried = [build.load(slot) for slot in slots]
-        ((test,),) = writer.write_program(loop.test, _array_reader(constants, carried))
+        ((test,),) = writer.write_program(loop.test, _argument_reader(constants, carried))
         build.store(build.and_(build.load(running_lanes), writer.cast(test, "b")), running_lanes)
         return writer.has_true_lane(build.load(running_lanes))
 
     with writer.loop_while(has_running_lane):
         previous_values = [build.load(slot) for slot in slots]
         writer.active_lanes = build.load(running_lanes)
-        (new_values,) = writer.write_program(loop.body, _array_reader(constants, previous_values))
+        (new_values,) = writer.write_program(loop.body, _argument_reader(constants, previous_values))
         for slot, result_slot, kind, new_value in zip(slots, result_slots, loop.kinds, new_values, strict=True):
             value = writer.cast(new_value, kind)
             if writer.lanes > 1:
@@ -116,7 +116,7 @@ def _write_scan(writer: Any, loop: ScanLoop, args: Sequence[Any]) -> BlockResult
     with writer.loop_range(writer.int64(loop.length)) as count:
         i = build.sub(writer.int64(loop.length - 1), count) if loop.reverse else count
         carried, row = [build.load(slot) for slot in slots], [table.read(i) for table in tables]
-        new_carry, stacked_values = writer.write_program(loop.body, _array_reader(constants, carried, row))
+        new_carry, stacked_values = writer.write_program(loop.body, _argument_reader(constants, carried, row))
         for slot, kind, value in zip(slots, loop.carry_kinds, new_carry, strict=True):
             build.store(writer.cast(value, kind), slot)
         for table, kind, value in zip(stacked_tables, loop.stacked_kinds, stacked_values, strict=True):
@@ -221,7 +221,7 @@ class BlockResults:
         table, row = divmod(i - len(self.values), self.length)
         return self.tables[table].read(ir.Constant(ir.IntType(64), row))
 
-    def column(self, start: int) -> Table:
+    def table_at(self, start: int) -> Table:
         return self.tables[(start - len(self.values)) // self.length]
 
 
@@ -329,7 +329,7 @@ def _call_kernel(writer: Any, call: LapackCall, args: Sequence[ir.Value]) -> Blo
     inputs = Table(writer, writer.double_type, [writer.cast(a, "f") for a in args])
     results = Table(writer, writer.double_type, length=n_results)
     pointers = [build.bitcast(table.start, ir.DoubleType().as_pointer()) for table in (inputs, results)]
-    function = lapack_kernel(writer, call)
+    function = find_or_write_kernel(writer, call)
     with writer.loop_range(writer.int64(writer.lanes)) as lane:
         build.call(function, [build.gep(pointer, [lane]) for pointer in pointers])
     return BlockResults([], [results], n_results)

@@ -59,7 +59,7 @@ def bind_symbols() -> None:
         llvm.add_symbol(SYMBOL_PREFIX + symbol, pointer(capsule, name(capsule)))
 
 
-def lapack_kernel(writer: Any, call: LapackCall) -> ir.Function:
+def find_or_write_kernel(writer: Any, call: LapackCall) -> ir.Function:
     """Return the function ``kernel(inputs, outputs)`` that computes a LAPACK call for one lane.
 
     The arrays interleave the lanes: consecutive entries are ``writer.lanes`` numbers apart.

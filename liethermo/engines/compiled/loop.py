@@ -213,7 +213,7 @@ class _StepLoopWriter(ProgramWriter):
         build.ret(argument["count"])
 
     def write_begin(self) -> None:
-        """Write ``begin(p, blocks, count)``, which computes the initial state of a run from each x."""
+        """Write ``begin(p, blocks, count)``, which computes the initial engine state of each block from its x."""
         with self.loop_range(self.arguments["count"]) as i:
             self.select_block(i)
             self.load_rows([name for name in self.programs["begin"].arguments if name != "p"])

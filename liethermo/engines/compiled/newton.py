@@ -38,7 +38,7 @@ def compile_newton_solver(
     def row_pointer(row: int) -> ir.Value:
         return build.gep(block, [build.add(writer.int64(row * lanes), lane)])
 
-    def read(i: int, j: int) -> ir.Value:
+    def read_argument(i: int, j: int) -> ir.Value:
         if i:
             return build.load(row_pointer(first_row + j))
         return build.load(
@@ -53,7 +53,9 @@ def compile_newton_solver(
         start = build.gep(p, [writer.int64(entries[0])])
         return Table(writer, FLOAT64, start=start, length=len(entries), stride=entries.step)
 
-    for i, value in enumerate(itertools.chain.from_iterable(writer.write_as_doubles(program, read, find_table))):
+    for i, value in enumerate(
+        itertools.chain.from_iterable(writer.write_as_doubles(program, read_argument, find_table))
+    ):
         build.store(value, row_pointer(first_row + i))
     build.ret_void()
     return MachineCode(module)

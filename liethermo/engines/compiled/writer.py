@@ -360,7 +360,7 @@ class _ProgramEmitter:
                 if is_new_table
                 else None
             )
-            self.tables[target] = new_table or self.block_results[args[0]].column(int(args[1]))
+            self.tables[target] = new_table or self.block_results[args[0]].table_at(int(args[1]))
             return
         if op == "lookup":
             self.values[target] = self.operand(args[1]).gather(self.value(args[0]))

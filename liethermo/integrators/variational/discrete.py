@@ -213,7 +213,10 @@ class DiscreteSystem(Module):
         )
 
     def force(self, p0, pair: Pair) -> jax.Array:
-        """Return ``(p_1 - p_0) / h = (D_1 L_d + D_2 L_d + F^-_d + F^+_d) / h``, shape (n,), on a manifold along it."""
+        """Return ``(p_1 - p_0) / h = (D_1 L_d + D_2 L_d + F^-_d + F^+_d) / h``, shape (n,).
+
+        On a manifold it is the part tangent to the manifold.
+        """
         impulse_minus, impulse_plus = self.impulses(pair)
         force = jax.grad(self.action)(*pair) + (impulse_minus + impulse_plus)
         return force if self.curve is None else force - self.momentum_residual(p0, pair) / self.h

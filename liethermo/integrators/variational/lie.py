@@ -174,7 +174,10 @@ class _LieStep(NamedTuple):
         return jax.vmap(lambda eta: algebra.vee((identity - half) @ eta @ (identity + half)))(basis) @ mu
 
     def constraint_residual(self, y) -> jax.Array:
-        """Return ``T s + f . xi - P_H``, zero for a solution; NaN if the temperature is not positive."""
+        """Return the residual ``T s + f . xi - P_H`` of the entropy equation; NaN if the temperature T is not positive.
+
+        s is the entropy rate, f the friction, xi the velocity, and P_H the heat power.
+        """
         xi, S, t = self._midpoint(y)
         T = -jax.grad(self.system.lagrangian, argnums=1)(xi, S)
         power = jnp.dot(self.system.friction_force(xi, S, t), xi) - self.system.heating(xi, S, t)
