@@ -12,7 +12,8 @@ import manifolds as mf
 from liethermo.engines.codes import StatusCode
 
 BODY = lt.models.rigid_body()
-SPAN, STEP = (0.0, 6.0), 0.1
+SPAN = (0.0, 6.0)
+STEP = 0.1
 
 
 def states(number, seed=0):

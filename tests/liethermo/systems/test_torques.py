@@ -134,7 +134,7 @@ def test_work_by_another_gradient_breaks_the_ledger(monkeypatch):
     monkeypatch.setattr(
         lt.DrivenSystem,
         "field",
-        lambda self, x, dH, dS, dL=(): _without_push(self, x, dH) + self.dissipation.force(self, x, dH, dS, dL),
+        lambda self, x, dH, dS, dL=(): _reversible_field(self, x, dH) + self.dissipation.force(self, x, dH, dS, dL),
     )
     method = lt.MetriplecticMidpoint("mean_value")  # of which no program is known
     bad = lt.integrate(system, START, SPAN, 0.1, method, engine="array", on_failure="return")
@@ -142,7 +142,7 @@ def test_work_by_another_gradient_breaks_the_ledger(monkeypatch):
     assert not bad.audit().passed
 
 
-def _without_push(system, x, dH):
+def _reversible_field(system, x, dH):
     return system.poisson.sharp(x, dH)
 
 
