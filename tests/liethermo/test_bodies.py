@@ -203,7 +203,7 @@ TENSOR = ROTATION_MATRIX @ np.diag([2.0, 2.5, 3.0]) @ ROTATION_MATRIX.T
 
 
 def test_a_tensor_is_one_body():
-    """It was read as three bodies, and the answers looked plausible."""
+    """A tensor was read as three bodies, and the answers looked plausible."""
     mu = np.array([0.1, 0.2, 1.0])
     one, diagonal_periods = lt.bodies.periods(TENSOR, ROTATION_MATRIX @ mu), lt.bodies.periods((2.0, 2.5, 3.0), mu)
     assert one.rotation.shape == ()
@@ -261,7 +261,7 @@ def test_arrays_that_are_no_inertia(call, message):
 
 
 def test_models_take_tensors():
-    """The same motion in other axes: rows of states are turned, energies are equal."""
+    """A tensor gives the motion of its moments in other axes: rows of states are turned, energies are equal."""
     moments, mu = np.array([2.0, 2.5, 3.0]), np.array([0.1, 0.2, 1.0])
     axis = np.array([0.0, 1.0, 0.0])
     for make, further_state in (

@@ -229,7 +229,7 @@ def _attitudes(noise, seed=0):
 
 
 def test_the_first_states_show_the_attitudes_and_move_as_they_do():
-    """Of the body that made them, from any attitude: a spline is off by the noise over the distance of the times."""
+    """The matched states are those of the body: a spline alone is off by the noise over the distance of the times."""
     body = lt.models.tumbling_body((3.0, 2.0, 1.0), rate=0.08)
     (t, R), *_ = _attitudes(0.0)
     observation = make_observation(body, None, lambda x, R: R)

@@ -1,4 +1,4 @@
-"""What data determine; files."""
+"""Parameters that data determine; files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a fit says of itself: standard errors, whether data determine the numbers, whether it has converged."""
+"""The diagnostics of a fit: standard errors, whether data determine the numbers, whether it has converged."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_the_rate_and_its_error_are_those_of_least_squares():
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_friction_is_found_where_the_noise_is_not_given(seed):
-    """It was 0.28 and 0.10 for a true 0.15: splines through noisy data have its derivatives."""
+    """The friction was 0.28 and 0.10 for a true 0.15: splines through noisy data have its derivatives."""
     fitted_system = lt.learn.fit(spring(0.5), records(seed), positive=rate_of, **SHORT_FIT).training
     assert abs(fitted_system.values[0] - RATE) < 2.5 * fitted_system.standard_errors[0]
     assert fitted_system.standard_errors[0] < 0.002
@@ -96,7 +96,7 @@ def test_the_friction_is_found_where_the_noise_is_not_given(seed):
 
 
 def test_two_observed_components_determine_it_too():
-    """It was 0.184: the descent had not come to its end, and nothing said so."""
+    """The friction was 0.184: the descent had not come to its end, and nothing said so."""
     data = [(t, x[:, :2]) for t, x in records(0)]
     fitted_system = lt.learn.fit(
         spring(0.5), data, observed=[0, 1], positive=rate_of, noise=NOISE, shooting=100

@@ -1,4 +1,4 @@
-"""What is asked for is what comes: true errors of adaptive steps against the tolerance, over ten problems."""
+"""Adaptive steps reach the tolerance: true errors against it, over ten problems."""
 
 import numpy as np
 import pytest

@@ -84,7 +84,7 @@ def test_a_batch():
 
 
 def test_newton_is_compiled_where_a_step_needs_it(monkeypatch):
-    """It is two thirds of a program, and none of one for a derivative: that is of slopes which are known."""
+    """Newton's method is two thirds of a program, and not in that of a derivative, whose slopes are known."""
 
     class NewtonCompiled(Exception):
         pass
@@ -127,7 +127,7 @@ def system_with_closures(p, entropy=True):
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("entropy", [True, False], ids=["relaxing", "conservative"])
 def test_a_system_that_closes_over_tracers(entropy):
-    """It is built under every transformation, and is what it is with numbers in their place."""
+    """The system is built under every transformation, with the field that numbers in place of tracers give."""
 
     def speed(p):
         return system_with_closures(p, entropy).vector_field(X0)
@@ -293,7 +293,7 @@ def unrolled_system(p):
 
 @pytest.mark.slow
 def test_a_loop_of_unknown_length_in_an_energy():
-    """It has no derivative backwards in JAX; here its derivatives are taken forwards, whatever is asked for."""
+    """Such a loop has no derivative backwards in JAX; here its derivatives are taken forwards in every mode."""
     modes = jax.jacfwd, jax.jacrev
     for derivative in (lambda f: f, *modes, *(lambda f, a=a, b=b: a(b(f)) for a in modes for b in modes)):
         a, b = (
@@ -324,7 +324,7 @@ def test_a_flow_with_a_loop_of_unknown_length():
     ids=str,
 )
 def test_the_derivative_at_an_equilibrium(method):
-    """Where nothing moves quotients are 0/0: the Jacobian is that of differences, and near ``expm`` of the field's."""
+    """Quotients are 0/0 where nothing moves: the Jacobian is that of differences, and near ``expm`` of the field's."""
 
     def energy(m):
         return 0.5 * jnp.sum(m * m / jnp.array([3.0, 2.0, 1.0])) + 0.1 * m[0] ** 4
@@ -381,7 +381,7 @@ def test_derivatives_found_at_once(order, monkeypatch):
 
 
 def test_a_linearised_flow_in_another_program():
-    """What is known of it when it is linearised can be a part of any program."""
+    """The residuals of a linearised flow can be a part of any program."""
     x, v = X0, jnp.array([0.1, -0.2, 0.3])
     end = lambda x: lt.flow(body(PARAMETERS), x, (0.0, 0.3), 0.1)  # noqa: E731
     _, push = jax.linearize(end, x)

@@ -1,4 +1,4 @@
-"""What a member of a family conserves is a property of that member, whoever else is there and in whatever order."""
+"""The constants of a member of a family depend on that member alone, whatever the others and their order."""
 
 import jax
 import jax.numpy as jnp

@@ -123,7 +123,7 @@ def test_no_noise_is_the_run_without_to_the_bit(engine):
 
 
 def test_little_noise_is_nearly_the_run_without():
-    """Of the size of the square root of k."""
+    """The distance from the run without noise is proportional to the square root of k."""
     still = run(BODY, None, "compiled", method=lt.MetriplecticMidpoint()).x
     distances = [np.abs(run(BODY, lt.Fluctuations(k, 1), "compiled").x - still).max() for k in (1e-8, 1e-10, 1e-12)]
     assert np.allclose(np.array(distances[:-1]) / distances[1:], 10.0, rtol=0.01)

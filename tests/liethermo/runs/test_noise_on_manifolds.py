@@ -132,7 +132,7 @@ def spin_states(count):
 
 
 def states_near_the_level(count):
-    """Those of a thin shell: the measure of the level of H that its neighbours of other energy leave."""
+    """Return points of a thin shell about the level of H, whose thickness gives the measure, and weights exp(S)."""
     points = np.asarray(SPHERE.random(3, (40 * count,)))
     points = points[(np.abs(level(points.T) - level(START)) < 0.01) & (points[:, 2] > 0.0)]
     return points, np.exp(tilted_entropy(points.T))
@@ -253,7 +253,7 @@ def test_equilibria_with_the_volume_of_the_space(name):
 
 
 def test_noise_moves_a_state_far_on_a_surface_of_no_degree():
-    """Where the energy is least its gradient is no way to change it: noise has no law of the energy to hold."""
+    """The energy cannot be changed along its gradient where it is least: noise has no law of the energy to hold."""
     system, noise, samples, _ = CASES["ring"]
     ensemble = lt.ensemble(system, samples(100)[0], (0.0, 3.0), 0.02, noise=noise)
     assert ensemble.ok.all()

@@ -138,7 +138,7 @@ def test_a_driven_noisy_run_in_parts_is_the_run_to_rounding():
 
 
 def test_a_loop_of_short_noisy_runs_has_the_mean_of_equilibrium():
-    """Of 2,000 parts: <s3> = coth(1) - 1 for a spin in a field of one temperature."""
+    """The mean over 2,000 runs is <s3> = coth(1) - 1 for a spin in a field of one temperature."""
     system, noise = lt.models.single_spin(1.0, 0.5, baths=lt.HeatBaths(np.inf, 1.0)), lt.Fluctuations(seed=5)
     x, s3 = np.array([0.0, 0.0, 1.0, 0.0]), []
     for i in range(2000):

@@ -164,7 +164,7 @@ def test_attempts_together_are_attempts_one_by_one(monkeypatch):
 
 @pytest.mark.slow
 def test_the_array_engine_takes_over_amid_attempts_made_together(monkeypatch):
-    """Where Newton's method is first needed and cannot be compiled: no step before that is lost."""
+    """No step is lost that was taken before Newton's method was first needed and could not be compiled."""
 
     def run_with_engine(engine):
         step, method = lt.Adaptive(0.1, first=1e-3), lt.MetriplecticGauss(3)
@@ -386,7 +386,7 @@ def test_an_event_that_never_happens():
     ids=["always", "from some time on"],
 )
 def test_of_a_function_that_is_not_a_number_at_the_end_nothing_is_known(until, step):
-    """It may have been zero: that the event has not happened would be a guess."""
+    """The function may have been zero: that the event has not happened would be a guess."""
     solution = lt.integrate(BODY, X0, (0.0, 20.0), step, until=until)
     assert solution.x[-1, 1] < 0.995
     assert solution.event_time is None

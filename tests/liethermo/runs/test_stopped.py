@@ -1,4 +1,4 @@
-"""What stops a run from outside: what there is so far is kept, and the status says why it ended."""
+"""Runs that are stopped from outside keep the states saved so far, and the status says why they ended."""
 
 import multiprocessing
 import os

@@ -34,7 +34,7 @@ def body_with_torque(torque, **options):
 
 
 def solve_by_scipy(force, span, start=START):
-    """The same oscillator by DOP853, which evaluates nothing beyond the end either."""
+    """Solve for the forced oscillator by DOP853, which evaluates nothing beyond the end either."""
     return scipy.integrate.solve_ivp(
         lambda t, y: [y[1], -y[0] - force(t)], span, start, method="DOP853", rtol=1e-12, atol=1e-12
     ).y[:, -1]
@@ -154,7 +154,7 @@ def test_the_reference_solver():
 
 
 def test_times_are_sums_of_steps_rounded_once():
-    """Those of equal steps, of steps to times that are kept, and of adaptive steps, against rational numbers."""
+    """Times of equal steps, of steps to saved times, and of adaptive steps, against rational numbers."""
     body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
     start, h = 0.7, 0.1
     run = lt.integrate(body, [0.1, 0.2, 1.0], (start, 30.0), h)

@@ -329,7 +329,7 @@ def fields(system, points) -> np.ndarray:
 
 
 def discrete_errors(order: int, counts=(20, 40, 80)) -> np.ndarray:
-    """Of discrete Herglotz integrators on the sphere, in (q, p, S)."""
+    """Return the errors of discrete Herglotz integrators on the sphere, in (q, p, S)."""
     H = lambda q, p, S: 0.5 * p @ p / MASS + MASS * GRAVITY * q[2] + GAMMA * S  # noqa: E731
     case, mass = herglotz_pendulum(), np.repeat([1.0, MASS, 1.0], (3, 3, 1))
     system = lt.EvolutionSystem(H, space=mf.Sphere(2))

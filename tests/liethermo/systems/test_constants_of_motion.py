@@ -1,4 +1,4 @@
-"""Which functions a system conserves: what is declared, what is found out, and what cannot be known."""
+"""The functions that a system conserves: declared, found out, or undecidable."""
 
 import jax
 import jax.numpy as jnp
@@ -55,7 +55,7 @@ class Half(lt.Dissipation):
 
 
 def test_unknown_is_a_row_of_its_own():
-    """It is neither conserved nor not: the start is on the edge, where no derivative of the entropy exists."""
+    """The Casimir is neither conserved nor not: the start is on the edge, where the entropy has no derivative."""
     system = lt.LiePoissonSystem(mf.so(3), lambda m: 0.5 * m[2], lambda m: jnp.log(m[0] - 1e6), Half(), validate=False)
     (name,) = system.casimirs()
     assert system.undecided_functions() == {name}

@@ -18,7 +18,7 @@ RATE = 1.3
 SPAN = (0.5, 3.5)
 
 LAW = 3e-14
-"""Of ``H - W`` relative to H over 10^4 steps; 1.2e-14 seen."""
+"""Limit of the drift of ``H - W`` relative to H over 10^4 steps; 1.2e-14 seen."""
 
 SPIN_START = np.array([0.4, 0.7, -0.5])
 INERTIA = np.array([2.0, 1.0, 2 / 3])
@@ -44,7 +44,7 @@ def energy_in_rotating_field(mu, t):
 
 
 class Push(eqx.Module):
-    """Of a spring, with an amplitude that is a parameter."""
+    """Energy of a periodic force on a spring, with an amplitude that is a parameter."""
 
     amplitude: jax.Array
 
@@ -150,7 +150,7 @@ def test_the_law_over_ten_thousand_steps():
 
 
 def _slopes(model, z):
-    """Of a step of 0.3 from a state, followed by slopes to begin with, one after another."""
+    """Return the slopes of a step of 0.3 from z, a state followed by the initial slopes, one after another."""
     system, method = model
     y, k = z[: system.dim], z[system.dim :].reshape(method.stages, -1)
     return method.slopes(system, y, jnp.zeros_like(y), 0.3, k)
@@ -231,7 +231,7 @@ def test_adaptive_steps_events_dense_output_and_files(tmp_path, ends):
 
 
 def test_adaptive_steps_do_not_see_the_clock():
-    """The same steps, whenever the run starts: an error is relative to the user's state, not to the time."""
+    """The steps do not depend on the starting time: an error is relative to the user's state, not to the time."""
     period = 2.0 * np.pi / RATE
     starts = [0.5, 0.5 + 10_000 * period]
     runs = [
@@ -376,7 +376,7 @@ def test_contact_and_composed_systems():
 
 @pytest.mark.slow
 def test_an_euler_poincare_system_with_changing_inertia():
-    """The same field as of the Hamiltonian written by hand."""
+    """The field equals that of the Hamiltonian written by hand."""
 
     def growing_inertia(t):
         return INERTIA * (1.0 + 0.2 * jnp.sin(t))

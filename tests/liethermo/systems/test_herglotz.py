@@ -100,7 +100,7 @@ def test_the_legendre_transform_has_the_type_of_its_side():
 
 @pytest.mark.slow
 def test_closed_forms_stay_closed():
-    """What is known of L is known of E_L and of H: their entropy cannot fall, and no equation is solved for v."""
+    """E_L and H keep the form of L: their entropy cannot fall, and no equation is solved for v."""
     known = _system(lt.ThermodynamicHerglotz, LAGRANGIANS["kinetic minus potential"])
     assert known.entropy_law == known.hamiltonian_system().entropy_law == "nondecreasing"
     assert isinstance(_system(lt.ThermodynamicHerglotz, LAGRANGIANS["quadratic"]).energy, lt.Quadratic)
@@ -272,7 +272,7 @@ def quartic_start(S0) -> np.ndarray:
 
 
 def errors_of_order(order, S0) -> list:
-    """Of two runs of the quartic action, the second with half the step, against (12) by hand."""
+    """Return the errors of two runs of the quartic action, the second with half the step, against (12) by hand."""
 
     def rate(t, y):  # of quartic_action: L = v^2/2 + v^4/20 - q^4/4 - 0.3 S (1 + q/10)
         q, v, S = y

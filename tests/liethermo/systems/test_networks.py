@@ -126,7 +126,7 @@ def test_unusable_copies(make, words):
 
 @pytest.mark.slow
 def test_copies_are_subsystems():
-    """The same field as bodies given one by one; states in one array, names with numbers."""
+    """Copies have the field of bodies given one by one; states in one array, names with numbers."""
     c, m, R = np.array([1.0, 2.0, 0.5]), np.array([0.7, 1.1, 2.0]), np.array([[0.3], [0.0], [0.4]])
     stone = lt.Subsystem(lambda x: jnp.exp(x[0]), 1, name="stone")
     heat = [(0, 1, 0.5), (1, 2, 1.0), (2, 3, 2.0)]

@@ -83,7 +83,7 @@ def state(system, seed=0):
 
 @jax.jit
 def evaluate_functions(system, x, d, compensation, k):
-    """What a step asks of a system: numbers, and vectors."""
+    """Return the values that a step asks of a system: two numbers, the rounding scale, and vectors."""
     A, b, _ = gauss_tableau(2)
     energy = system.energy
     gradients = [

@@ -137,7 +137,7 @@ def test_the_generator_is_the_force_at_the_gradients(name):
 
 
 def test_the_entropy_has_a_discrete_gradient_in_closed_form():
-    """What it changes by is right to rounding relative to the step, however short that is."""
+    """The change of the entropy is right to rounding relative to the step, however short that is."""
     S = lt.VonNeumann()
     structure = mf.DensityMatrices(3)
     x, other = (structure.vector(random_density(3, seed)) for seed in (1, 2))
@@ -817,7 +817,7 @@ def test_a_coupling_that_does_not_commute_exchanges_energy_whatever_the_constant
 
 @pytest.mark.parametrize("spacing", [1.0, 0.1])
 def test_equal_differences_of_levels_are_one_frequency(spacing):
-    """Those of 0.1 n differ by rounding, by more so beside a constant; the coupling stays in one piece."""
+    """Distances of the levels 0.1 n differ by rounding, more so beside a constant; the coupling stays in one piece."""
     for c in (0.0, 1e8):
         H, V = np.diag(spacing * np.arange(12.0) + c), np.diag(np.sqrt(np.arange(1.0, 12.0)), 1)
         turned = np.linalg.qr(random_hermitian(12))[0]
@@ -994,7 +994,7 @@ def test_the_advice_for_a_pure_state_under_steepest_ascent_works():
 
 @pytest.mark.slow
 def test_steepest_ascent_ends_in_a_cold_state():
-    """Of little energy: eight levels, at a temperature of a fourteenth of their distance; and a run goes on there."""
+    """Eight levels reach a temperature of a fourteenth of their distance, and a run goes on there."""
     q = lt.QuantumSystem(np.diag(np.arange(8.0)), lt.SteepestEntropyAscent(1.0))
     start = np.diag([1.0 - 1e-6 - 6e-9, 1e-6, *[1e-9] * 6])
     for method in (lt.MetriplecticMidpoint(), lt.MetriplecticGauss(2)):
@@ -1023,7 +1023,7 @@ def test_a_ket_may_be_a_column():
 
 
 class HasFull:
-    """What QuTiP's operators have: their matrix by a method, a call, and no array."""
+    """A stand-in for QuTiP's operators, which have a method for their matrix, a call, and no array."""
 
     def __init__(self, matrix):
         self.matrix = matrix

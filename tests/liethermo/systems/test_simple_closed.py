@@ -20,7 +20,7 @@ each_system = pytest.mark.parametrize(
 
 
 def residuals(system, x):
-    """Of q' = v, of both equations (2.4), of E' = F_ext . v + P_H and S' = (P_H - F_fr . v)/T; the production."""
+    """Return residuals (q' = v, both equations (2.4), energy, ledger), E', and the production -F_fr . v / T."""
     n, rate = system.degrees_of_freedom, system.vector_field(x)
     q, v, S, t = system.parts(x)
     by_q, by_v, by_S = jax.grad(system.action, argnums=(0, 1, 2))(q, v, S)

@@ -437,7 +437,7 @@ class Unsaid(lt.LandauLifshitz):
 
 
 def test_what_noise_turns_a_step_solves_for_at_once():
-    """The same step, in a fraction of the iterations: without, the spin that is turned farthest decides."""
+    """A step takes a fraction of the iterations of the control, where the spin that is turned farthest decides."""
     sites, bath = (4, 4, 4), lt.HeatBaths(np.inf, 1.4)
     runs = []
     for kind in (lt.SpinSystem, IteratedRotation):

@@ -238,7 +238,7 @@ def test_a_poisson_tensor_that_is_none():
 
 @pytest.mark.parametrize("fits", [True, False], ids=["Poisson", "not"])
 def test_jacobi_of_many_components(fits):
-    """Of three functions: arrays of n^3 numbers are not formed."""
+    """The Jacobi identity is checked for three functions: arrays of n^3 numbers are not formed."""
     n = MAX_FULL_JACOBI_DIM + 5
 
     def tensor(x):
