@@ -98,7 +98,7 @@ def run_until(until, step, engine="compiled", order=8, noise_size=1e-13):
 @pytest.mark.parametrize("step", [lt.Adaptive(1e-8), 0.1])
 @pytest.mark.parametrize("order", [4, 6, 8])
 def test_the_edge_of_a_hole_is_no_event(order, engine, step):
-    """The run says that a zero in the hole can be neither found nor excluded: for holes of every size, on any processor."""
+    """The run says that a zero in the hole is neither found nor excluded: for holes of every size, on any processor."""
     for w in (1e-3, 0.01, 0.02, 0.05, 0.1, 0.3):
         solution = run_until(hole(w), step, engine, order)
         assert (solution.status.code, solution.event_time) == ("non_finite", None), w
