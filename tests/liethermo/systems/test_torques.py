@@ -18,7 +18,7 @@ SO3 = mf.SO(3)
 SPAN = (0.3, 5.3)
 
 LAW = 2e-15
-"""Limit of the drift of ``H + U - W`` and of momentum in space less impulse, relative, in 100 steps; at most 9e-16 seen."""
+"""Limit of the drift of ``H + U - W`` and of momentum in space less impulse, relative, in 100 steps; 9e-16 seen."""
 
 
 def rotating_field(t):
