@@ -20,7 +20,7 @@ def friction(q, v, S):
     return -(1.0 + q[1] ** 2) * R @ v
 
 
-def tangled(q, v, S):
+def coupled_lagrangian(q, v, S):
     """v, q and S all multiply each other: the momentum depends on S and the temperature on v."""
     kinetic = 0.5 * jnp.sum((1.5 + jnp.sin(q)) * v**2) * (1.0 + 0.1 * jnp.tanh(S)) + 0.05 * jnp.sum(v**4)
     return kinetic + 0.2 * q[0] * v[1] * jnp.cos(S) - internal_energy(q, S)
@@ -41,16 +41,16 @@ def heater(q, v, S, t):
 MECHANICAL = lt.Kinetic(mass) - lt.Potential(internal_energy)
 X0 = [0.4, -0.3, 0.5, 0.8, 0.2]
 
-ISOLATED = BuiltOnUse(
+ISOLATED_SYSTEMS = BuiltOnUse(
     {
         "mechanical": lambda: lt.SimpleClosedSystem(MECHANICAL, 5, friction=friction),
-        "tangled": lambda: lt.SimpleClosedSystem(tangled, 5, friction=cubic_friction, validate=False),
+        "tangled": lambda: lt.SimpleClosedSystem(coupled_lagrangian, 5, friction=cubic_friction, validate=False),
     }
 )
 OPEN = BuiltOnUse(
     {
         "mechanical": lambda: lt.SimpleClosedSystem(MECHANICAL, 5, friction, swirl, heater),
-        "tangled": lambda: lt.SimpleClosedSystem(tangled, 5, cubic_friction, swirl, heater, validate=False),
+        "tangled": lambda: lt.SimpleClosedSystem(coupled_lagrangian, 5, cubic_friction, swirl, heater, validate=False),
     }
 )
 SCHEMES = {

@@ -10,7 +10,9 @@ import liethermo as lt
 import manifolds as mf
 from liethermo.models.open_gases import porous_piston_state
 
-V, D, M = lt.VariationalIntegrator, lt.DiscreteHerglotz, lt.models
+V = lt.VariationalIntegrator
+D = lt.DiscreteHerglotz
+M = lt.models
 SO3 = mf.so(3)
 
 
@@ -47,7 +49,7 @@ def field():
     return lt.EvolutionSystem(lambda q, p, S: 0.5 * (p @ p + q @ q) + jnp.exp(S), 3)
 
 
-def composed(**arguments):
+def composed_system(**arguments):
     return lt.ComposedSystem(bodies(), **arguments)
 
 
@@ -63,25 +65,35 @@ def run(system, method):
     return lt.integrate(system, [1.0, 0.0, 0.0], (0.0, 0.2), 0.1, method)
 
 
-X, RUN = np.ones((2, 4)), np.ones((2, 3))
+X = np.ones((2, 4))
+RUN = np.ones((2, 3))
 
 CASES = {
     # conductances, membranes, reactions
-    "four": (lambda: composed(conductance=lambda a, b, c, d: 1.0), "between body 0 and body 1 could not be evaluated"),
+    "four": (
+        lambda: composed_system(conductance=lambda a, b, c, d: 1.0),
+        "between body 0 and body 1 could not be evaluated",
+    ),
     "text": (
-        lambda: composed(conductance=lambda a, b: "x"),
+        lambda: composed_system(conductance=lambda a, b: "x"),
         "between body 0 and body 1 could not be evaluated at .T_i",
     ),
-    "array": (lambda: composed(conductance=lambda a, b: jnp.ones(2)), r"must have shape \(\), got \(2,\)"),
-    "complex": (lambda: composed(conductance=lambda a, b: 1j * a), "must be real, got complex128"),
-    "empty edge": (lambda: composed(conductance=[()]), r"an edge must be \(i, j, weight\), got \(\)"),
-    "long edge": (lambda: composed(conductance=[(0, 1, 2, lambda a, b: a)]), r"an edge must be \(i, j, weight\)"),
-    "named edge": (lambda: composed(conductance=[("a", 1, lambda a, b: a)]), r"an edge must be \(i, j, weight\)"),
-    "half an edge": (lambda: composed(conductance=[(0.5, 1, 1.0)]), r"an edge must be \(i, j, weight\)"),
+    "array": (lambda: composed_system(conductance=lambda a, b: jnp.ones(2)), r"must have shape \(\), got \(2,\)"),
+    "complex": (lambda: composed_system(conductance=lambda a, b: 1j * a), "must be real, got complex128"),
+    "empty edge": (lambda: composed_system(conductance=[()]), r"an edge must be \(i, j, weight\), got \(\)"),
+    "long edge": (
+        lambda: composed_system(conductance=[(0, 1, 2, lambda a, b: a)]),
+        r"an edge must be \(i, j, weight\)",
+    ),
+    "named edge": (
+        lambda: composed_system(conductance=[("a", 1, lambda a, b: a)]),
+        r"an edge must be \(i, j, weight\)",
+    ),
+    "half an edge": (lambda: composed_system(conductance=[(0.5, 1, 1.0)]), r"an edge must be \(i, j, weight\)"),
     "no bodies": (lambda: lt.ComposedSystem(3), "body 0 must be an lt.Subsystem or lt.Copies, not int"),
     "texts": (lambda: lt.ComposedSystem(["a"]), "body 0 must be an lt.Subsystem or lt.Copies, not str"),
     "maps": (
-        lambda: composed(momentum_maps=3),
+        lambda: composed_system(momentum_maps=3),
         "momentum_maps are a dict of functions, or a sequence of them, not int",
     ),
     "parameters": (lambda: lt.Copies(2, lambda x, c: c * x[0], 1, "a"), "made of real numbers, got 'a'"),
@@ -147,7 +159,10 @@ CASES = {
         lambda: V("verlet").energies(oscillator(), RUN[0], 0.1),
         r"at least two states of a run, shape \(times, 3\), got",
     ),
-    "two states": (lambda: V("verlet").energies(composed(), RUN, 0.1), "needs an lt.SimpleClosedSystem, got a Comp"),
+    "two states": (
+        lambda: V("verlet").energies(composed_system(), RUN, 0.1),
+        "needs an lt.SimpleClosedSystem, got a Comp",
+    ),
     "no system": (lambda: V("verlet").energies(3, RUN, 0.1), "needs an lt.SimpleClosedSystem, got a int"),
     "start": (
         lambda: lt.LieVariational().attitudes(body(), X, 0.1, start=np.eye(2)),

@@ -16,7 +16,7 @@ from liethermo.models.rotors import spin_temperature
 ASYMMETRIC = np.array([1.0, 2.0, 3.0])
 
 
-def free(inertia, mu0, t_end, times=None, rate=0.0):
+def free_body_run(inertia, mu0, t_end, times=None, rate=0.0):
     """Momentum and attitude of a body, by DOP853: equations of their own, shape (12,)."""
     inertia = np.asarray(inertia)
 
@@ -38,7 +38,7 @@ def test_periods_against_an_integration(mu0, order):
     """After a period the momentum is back, and the axis has turned about L by its mean rate times the period."""
     inertia, mu0 = ASYMMETRIC[list(order)], np.array(mu0)[list(order)]
     periods = lt.bodies.periods(inertia, mu0)
-    run = free(inertia, mu0, float(periods.rotation))
+    run = free_body_run(inertia, mu0, float(periods.rotation))
     mu, g = run.y[:3, -1], run.y[3:, -1].reshape(3, 3)
     assert np.allclose(mu, mu0, rtol=0, atol=3e-12)
     rotation_vector = Rotation.from_matrix(g).as_rotvec()  # the whole turns about the momentum in space
@@ -152,7 +152,7 @@ def test_a_rod_comes_to_its_flat_spin_in_the_relaxation_time(inertia):
     long_axis = np.argmin(inertia)
     mu0 = L * np.roll([np.cos(0.1), np.sin(0.1), 0.0], long_axis)
     rate = float(lt.bodies.rate_of(tau, inertia, L))
-    run = free(inertia, mu0, 6 * tau, tau * np.arange(7), rate)
+    run = free_body_run(inertia, mu0, 6 * tau, tau * np.arange(7), rate)
     tangent = np.linalg.norm(np.delete(run.y[:3], long_axis, axis=0), axis=0) / run.y[long_axis]
     assert np.allclose(np.diff(np.log(tangent)), 1.0, rtol=0, atol=1e-9)
     body = lt.models.tumbling_body(inertia, relaxation_time=tau, momentum=L, attitude=False)
@@ -181,9 +181,9 @@ def test_nearly_equal_moments_with_strong_friction_fall_to_their_plane_in_the_re
     roots, modes = np.linalg.eig(linear)
     fast_mode = modes[:, np.argmin(roots)]  # -0.06 rad across the plane for each rad within it
     mu0 = np.array([L, *(1e-4 * L * fast_mode)])
-    run = free(inertia, mu0, 3 * tau, tau * np.arange(4), rate)
+    run = free_body_run(inertia, mu0, 3 * tau, tau * np.arange(4), rate)
     assert np.allclose(np.diff(np.log(np.abs(run.y[2]))), -1.0, rtol=0, atol=1e-4)
-    plane_run = free(inertia, L * np.array([np.cos(0.02), np.sin(0.02), 0.0]), rate / d2, [0, rate / d2], rate)
+    plane_run = free_body_run(inertia, L * np.array([np.cos(0.02), np.sin(0.02), 0.0]), rate / d2, [0, rate / d2], rate)
     assert np.log(plane_run.y[1, 0] / plane_run.y[1, -1]) == pytest.approx(1.0, abs=0.12)
 
 
@@ -198,19 +198,19 @@ def test_the_rate_has_derivatives_and_is_continuous_at_a_rod():
 
 # -- tensors of inertia ------------------------------------------------------------------------------------------------
 
-TURNED = Rotation.from_rotvec([0.4, -0.7, 1.1]).as_matrix()
-TENSOR = TURNED @ np.diag([2.0, 2.5, 3.0]) @ TURNED.T
+ROTATION_MATRIX = Rotation.from_rotvec([0.4, -0.7, 1.1]).as_matrix()
+TENSOR = ROTATION_MATRIX @ np.diag([2.0, 2.5, 3.0]) @ ROTATION_MATRIX.T
 
 
 def test_a_tensor_is_one_body():
-    """It was read as three bodies, and the answers looked plausible."""
+    """A tensor was read as three bodies, and the answers looked plausible."""
     mu = np.array([0.1, 0.2, 1.0])
-    one, diagonal_periods = lt.bodies.periods(TENSOR, TURNED @ mu), lt.bodies.periods((2.0, 2.5, 3.0), mu)
+    one, diagonal_periods = lt.bodies.periods(TENSOR, ROTATION_MATRIX @ mu), lt.bodies.periods((2.0, 2.5, 3.0), mu)
     assert one.rotation.shape == ()
     assert np.allclose([*one], [*diagonal_periods], rtol=1e-12)
     periods_of_energy = lt.bodies.periods(TENSOR, np.linalg.norm(mu), 0.5 * np.sum(mu**2 / [2.0, 2.5, 3.0]))
     assert np.allclose([*periods_of_energy], [*diagonal_periods], rtol=1e-12)
-    periods = lt.bodies.periods(np.stack([TENSOR, np.diag([1.0, 2.0, 2.5])]), np.stack([TURNED @ mu, mu]))
+    periods = lt.bodies.periods(np.stack([TENSOR, np.diag([1.0, 2.0, 2.5])]), np.stack([ROTATION_MATRIX @ mu, mu]))
     assert np.allclose(periods.rotation[0], diagonal_periods.rotation, rtol=1e-12)
     assert np.allclose(periods.rotation[1], lt.bodies.periods((1.0, 2.0, 2.5), mu).rotation, rtol=1e-12)
     assert float(lt.bodies.rate_of(3.0, TENSOR, 1.0)) == pytest.approx(float(lt.bodies.rate_of(3.0, (2, 2.5, 3), 1.0)))
@@ -261,7 +261,7 @@ def test_arrays_that_are_no_inertia(call, message):
 
 
 def test_models_take_tensors():
-    """The same motion in other axes: rows of states are turned, energies are equal."""
+    """A tensor gives the motion of its moments in other axes: rows of states are turned, energies are equal."""
     moments, mu = np.array([2.0, 2.5, 3.0]), np.array([0.1, 0.2, 1.0])
     axis = np.array([0.0, 1.0, 0.0])
     for make, further_state in (
@@ -271,12 +271,18 @@ def test_models_take_tensors():
         (lambda I, axis: lt.models.damper_wheel(I, axis), [0.1]),
         (lambda I, axis: lt.models.dual_spin(I, axis, platform_rate=0.1, rotor_rate=0.2), [0.1]),
     ):
-        one = lt.integrate(make(TENSOR, TURNED @ axis), [*(TURNED @ mu), *further_state], (0.0, 2.0), 0.1)
+        one = lt.integrate(
+            make(TENSOR, ROTATION_MATRIX @ axis), [*(ROTATION_MATRIX @ mu), *further_state], (0.0, 2.0), 0.1
+        )
         diagonal_run = lt.integrate(make(moments, axis), [*mu, *further_state], (0.0, 2.0), 0.1)
-        assert np.allclose(one.x[:, :3] @ TURNED, diagonal_run.x[:, :3], rtol=0, atol=1e-13)
+        assert np.allclose(one.x[:, :3] @ ROTATION_MATRIX, diagonal_run.x[:, :3], rtol=0, atol=1e-13)
         assert np.allclose(one.energy, diagonal_run.energy, rtol=1e-13)
     assert spin_temperature(1.0, 2.0, TENSOR) == pytest.approx(spin_temperature(1.0, 2.0, moments), rel=1e-14)
     diagonal = lt.models.free_rigid_body(np.diag(moments))
     assert np.array_equal(diagonal.energy.A, 1.0 / moments)
     gravity = lt.torques.GravityGradient(np.diag(moments), 1.0)
-    assert np.allclose(gravity(0.3, mu, TURNED), lt.torques.GravityGradient(moments, 1.0)(0.3, mu, TURNED), atol=1e-15)
+    assert np.allclose(
+        gravity(0.3, mu, ROTATION_MATRIX),
+        lt.torques.GravityGradient(moments, 1.0)(0.3, mu, ROTATION_MATRIX),
+        atol=1e-15,
+    )

@@ -10,7 +10,9 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 
-START, SPAN, STEP = np.array([0.1, 0.2, 1.0]), (0.0, 1.0), 0.1
+START = np.array([0.1, 0.2, 1.0])
+SPAN = (0.0, 1.0)
+STEP = 0.1
 
 
 def body(energy, **options):
@@ -46,7 +48,7 @@ def with_if(m):
     return m[1] ** 2
 
 
-def without_return(m):
+def function_without_return(m):
     m[0] ** 2
 
 
@@ -69,7 +71,7 @@ FUNCTIONS = {
         lambda m: jnp.array([1.0, 2.0, 3.0])[jnp.argmax(m)] * m @ m,
     ),
     "mask": (body, lambda m: jnp.sum(m[m > 0] ** 2), "jnp.where", lambda m: jnp.sum(jnp.where(m > 0, m, 0.0) ** 2)),
-    "return": (body, without_return, "returns None. Add the missing `return`", lambda m: m[0] ** 2),
+    "return": (body, function_without_return, "returns None. Add the missing `return`", lambda m: m[0] ** 2),
     "float32": (
         body,
         lambda m: jnp.sum(m.astype(jnp.float32) ** 2 * jnp.array([1.0, 2.0, 3.0])),
@@ -85,7 +87,7 @@ FUNCTIONS = {
     "torque without return": (torque_of, lambda t, m: None, "the torque.*returns None", lambda t, m: 0.1 * m),
     "friction": (friction_of, lambda m: np.outer(m, m), "friction operator K.*NumPy", lambda m: jnp.outer(m, m)),
     "event": (event_of, with_if, "the event function.*`if`", lambda m: jnp.where(m[0] > 0.0, m[0], m[1])),
-    "event without return": (event_of, without_return, "the event function.*returns None", lambda m: m[0]),
+    "event without return": (event_of, function_without_return, "the event function.*returns None", lambda m: m[0]),
     "several events": (event_of, lambda m: m, r"one number, got shape \(3,\).*jnp.min", lambda m: jnp.min(m)),
     "several events, their product": (event_of, lambda m: m - 0.15, "or the product", lambda m: jnp.prod(m - 0.15)),
     "Poisson tensor": (

@@ -10,7 +10,7 @@ import pytest
 import liethermo as lt
 from liethermo.models.mass_spring_gas import CASES, STARTS, mass_spring_gas_solution
 from liethermo.tracing.interpret import evaluate_at_points
-from tests.liethermo.closed_systems import ISOLATED, OPEN, SCHEMES, X0
+from tests.liethermo.closed_systems import ISOLATED_SYSTEMS, OPEN, SCHEMES, X0
 
 H = 1e-3
 TABLE = {  # largest |E - E_0| / E_0 over 5-20 thousand steps, for lambda = 0, 0.2, 5, 10
@@ -272,7 +272,7 @@ def test_orders_on_a_system_of_no_special_form(name):
 )
 def test_the_entropy_grows_at_every_step(name):
     """The entropy grows in coarse steps too, although the energy is not conserved."""
-    solution = _run(ISOLATED["mechanical"], ORDERS[name][0], X0, 60, 0.3, engine="compiled")
+    solution = _run(ISOLATED_SYSTEMS["mechanical"], ORDERS[name][0], X0, 60, 0.3, engine="compiled")
     assert solution.stats.least_entropy_increment > 0.0
     assert solution.energy.max() - solution.energy.min() > 1e-3  # the energy is not kept
 
@@ -284,7 +284,7 @@ def test_the_entropy_grows_at_every_step(name):
 @pytest.mark.parametrize("name", [pytest.param(n, marks=() if n == "scheme 2" else pytest.mark.slow) for n in SCHEMES])
 def test_two_ways_to_start(name):
     """From (q_0, q_1, S_0) the first step leads to q_1; from (q_0, v_0, S_0) it is exact: v_0 = L_v^-1(p_0)."""
-    method, system, h = SCHEMES[name], ISOLATED["tangled"], 0.05
+    method, system, h = SCHEMES[name], ISOLATED_SYSTEMS["tangled"], 0.05
     solution = _run(system, method, X0, 2, h, engine="compiled")
     state = method.state(system, solution.x[0, :2], solution.x[1, :2], X0[4], h)
     assert np.abs(state - X0).max() < 1e-12
@@ -293,7 +293,7 @@ def test_two_ways_to_start(name):
 
 
 def test_inconsistent_first_steps():
-    method, system = SCHEMES["scheme 2"], ISOLATED["mechanical"]
+    method, system = SCHEMES["scheme 2"], ISOLATED_SYSTEMS["mechanical"]
     with pytest.raises(lt.InputError, match=r"not on the discrete constraint: \|P_d\| = .* Leave S1 out"):
         method.state(system, [0.4, -0.3], [0.42, -0.28], 0.2, 0.05, S1=0.25)
     with pytest.raises(lt.InputError, match="shape"):

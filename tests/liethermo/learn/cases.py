@@ -13,8 +13,11 @@ import scipy.integrate
 import liethermo as lt
 import manifolds as mf
 
-STIFFNESS, GAMMA = 2.0, 0.3
-"""H = p^2/2 + k q^2/2 + exp(s), so T = exp(s); p' = -k q - gamma p, T s' = gamma p^2."""
+STIFFNESS = 2.0
+"""k of H = p^2/2 + k q^2/2 + exp(s), so T = exp(s); p' = -k q - gamma p, T s' = gamma p^2."""
+
+GAMMA = 0.3
+"""Friction coefficient gamma of these equations."""
 
 
 def _rates(t, x):

@@ -14,7 +14,7 @@ optax = pytest.importorskip("optax")
 STEPS = 200
 
 
-def _descended(optimiser, loss, start):
+def _minimise(optimiser, loss, start):
     def step(carry, _):
         x, state = carry
         value, slope = jax.value_and_grad(loss)(x)
@@ -39,8 +39,8 @@ def test_a_matrix_with_steep_and_flat_directions_is_found_sooner_than_by_adam():
 
     schedule = optax.cosine_decay_schedule(0.1, STEPS, alpha=0.01)
     start = np.r_[np.zeros(36), np.ones(3)]
-    x, soap_losses = _descended(soap_optimiser([(6, 6)], schedule), loss, start)
-    _, adam_losses = _descended(optax.adam(schedule), loss, start)
+    x, soap_losses = _minimise(soap_optimiser([(6, 6)], schedule), loss, start)
+    _, adam_losses = _minimise(optax.adam(schedule), loss, start)
     assert soap_losses[-1] < 0.2 * adam_losses[-1]  # 0.11
     assert np.abs(x[36:]).max() < 1e-2
 
@@ -52,7 +52,7 @@ def test_without_matrices_it_is_adam():
     def loss(x):
         return jnp.sum(jnp.array([1.0, 10.0, 100.0]) * x**2)
 
-    x, soap_losses = _descended(soap_optimiser([(2,)], schedule), loss, start)
-    adam_x, values = _descended(optax.adam(schedule, *ADAM_DECAYS), loss, start)
+    x, soap_losses = _minimise(soap_optimiser([(2,)], schedule), loss, start)
+    adam_x, values = _minimise(optax.adam(schedule, *ADAM_DECAYS), loss, start)
     np.testing.assert_allclose(soap_losses, values, rtol=1e-9)
     np.testing.assert_allclose(x, adam_x, atol=1e-12)

@@ -76,7 +76,7 @@ def test_the_same_twice_and_on_from_a_checkpoint(tmp_path, monkeypatch):
     system = cases.oscillator()
     whole_run = lt.learn.fit(system, (t, x), **how)
 
-    class Interrupted(training.Progress):
+    class InterruptedProgress(training.Progress):
         stop = np.inf
 
         def update(self, t):
@@ -84,9 +84,9 @@ def test_the_same_twice_and_on_from_a_checkpoint(tmp_path, monkeypatch):
                 raise KeyboardInterrupt
 
     path = tmp_path / "course.npz"
-    monkeypatch.setattr(training, "Progress", Interrupted)
+    monkeypatch.setattr(training, "Progress", InterruptedProgress)
     for stop in (100, 200, np.inf):  # in the matching, in the shooting, not at all
-        Interrupted.stop = stop
+        InterruptedProgress.stop = stop
         fitted_system = lt.learn.fit(system, (t, x), checkpoint=path, **how)
     assert "interrupted" not in fitted_system.training.ended.values()
     for a, b in zip(jax.tree_util.tree_leaves(whole_run), jax.tree_util.tree_leaves(fitted_system), strict=True):
@@ -152,7 +152,8 @@ def test_early_stopping_keeps_the_best():
     assert "no better for 2 looks" in fitted_system.training.ended["matching"]
 
 
-T, X = np.linspace(0.0, 1.0, 5), np.arange(15.0).reshape(5, 3)
+T = np.linspace(0.0, 1.0, 5)
+X = np.arange(15.0).reshape(5, 3)
 
 
 @pytest.mark.parametrize(
@@ -208,10 +209,10 @@ def test_what_is_no_system_is_refused():
 
 
 def test_a_loss_that_is_not_finite_is_an_error():
-    def undefined(x):
+    def square_root_of_position(x):
         return jnp.sqrt(x[0])
 
-    system = cases.oscillator(energy=lt.learn.Energy(cases.Spring(jnp.zeros(()))) + undefined)
+    system = cases.oscillator(energy=lt.learn.Energy(cases.Spring(jnp.zeros(()))) + square_root_of_position)
     t, x = cases.record()
     with pytest.raises(lt.InputError, match="the loss is nan after 50 steps, in the matching"):
         lt.learn.fit(system, (t, x), matching=50, shooting=0)
@@ -228,7 +229,7 @@ def _attitudes(noise, seed=0):
 
 
 def test_the_first_states_show_the_attitudes_and_move_as_they_do():
-    """Of the body that made them, from any attitude: a spline is off by the noise over the distance of the times."""
+    """The matched states are those of the body: a spline alone is off by the noise over the distance of the times."""
     body = lt.models.tumbling_body((3.0, 2.0, 1.0), rate=0.08)
     (t, R), *_ = _attitudes(0.0)
     observation = make_observation(body, None, lambda x, R: R)

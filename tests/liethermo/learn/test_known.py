@@ -1,4 +1,4 @@
-"""What data determine; files."""
+"""Parameters that data determine; files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from liethermo.learn import files, training
 from . import cases
 
 
-class Shifted(eqx.Module):
+class EnergyWithOffset(eqx.Module):
     """An energy a p^2/2 + b q^2/2 + c + exp(s): no motion tells c."""
 
     abc: jax.Array
@@ -25,7 +25,7 @@ class Shifted(eqx.Module):
 
 
 def test_a_constant_of_the_energy_is_not_determined():
-    system = cases.oscillator(energy=lt.learn.Energy(Shifted(jnp.array([1.0, 2.0, 3.0]))), friction=None)
+    system = cases.oscillator(energy=lt.learn.Energy(EnergyWithOffset(jnp.array([1.0, 2.0, 3.0]))), friction=None)
     x = np.random.default_rng(0).standard_normal((5, 3))
     determination = lt.learn.determined(system, lambda s: s.vector_field(x))
     assert determination.rank == 2

@@ -17,7 +17,7 @@ from . import cases
 LAWS = ("Pi skew", "Pi grad S = 0", "K symmetric", "K grad H = 0", "K >= 0", "energy law", "entropy law")
 
 
-def _failed(system):
+def _failed_axioms(system):
     return {row.axiom for row in system.check().rows if row.passed is False}
 
 
@@ -29,7 +29,7 @@ def test_the_laws_hold_before_training(construction, dim, failed_rows):
     """
     friction = lt.learn.Friction(dim, rank=2, construction=construction, width=4)
     system = lt.learn.Metriplectic(dim, friction=friction, width=4, seed=3)
-    assert _failed(system) == failed_rows
+    assert _failed_axioms(system) == failed_rows
     run = lt.integrate(system, [0.3, -0.2, 0.5, 0.1][:dim], (0.0, 4.0), 0.1, method=lt.MetriplecticGauss(1))
     assert np.ptp(run.energy) < 2e-14 * max(1.0, abs(run.energy[0]))
     assert (np.diff(run.entropy) > 0.0).all()
@@ -44,25 +44,25 @@ def test_known_tensors_are_poisson(poisson, dim):
     if dim == 2:  # a canonical tensor alone has no other entropy than a constant
         entropy = lambda x: 0.0 * x[0]  # noqa: E731
     system = lt.learn.Metriplectic(dim, entropy=entropy, poisson=poisson, width=8)
-    assert _failed(system) == set()
+    assert _failed_axioms(system) == set()
 
 
 def test_an_entropy_that_the_motion_would_change_is_refused():
     with pytest.raises(lt.CasimirError):
         lt.learn.Metriplectic(3, poisson=mf.Canonical(1), width=4)
     entropy = lt.learn.Entropy(1, width=4).on([2])
-    assert _failed(lt.learn.Metriplectic(3, entropy=entropy, poisson=mf.Canonical(1), width=4)) == set()
+    assert _failed_axioms(lt.learn.Metriplectic(3, entropy=entropy, poisson=mf.Canonical(1), width=4)) == set()
 
 
 def test_a_friction_off_another_energy_is_found():
     """The control: the kernel of the friction is that of the energy, not of any function."""
 
-    class Other(lt.learn.Friction):
+    class PermutedFriction(lt.learn.Friction):
         def force(self, system, x, dH, dS, dL):
             return super().force(system, x, jnp.roll(dH, 1), dS, dL)
 
-    system = lt.learn.Metriplectic(3, friction=Other(3, width=8), width=8)
-    assert {"K grad H = 0", "energy law"} <= _failed(system)
+    system = lt.learn.Metriplectic(3, friction=PermutedFriction(3, width=8), width=8)
+    assert {"K grad H = 0", "energy law"} <= _failed_axioms(system)
 
 
 def test_the_factor_is_that_of_the_friction():

@@ -1,4 +1,4 @@
-"""What a fit says of itself: standard errors, whether data determine the numbers, whether it has converged."""
+"""The diagnostics of a fit: standard errors, whether data determine the numbers, whether it has converged."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ from liethermo.learn.data import Trajectory, estimate_noise
 
 pytest.importorskip("optax")
 
-RATE, NOISE = 0.15, 0.02
+RATE = 0.15
+NOISE = 0.02
 STARTS = ((1.0, 0.0, 0.0), (-0.5, 1.0, 0.2), (0.3, -1.2, -0.1))
 TIMES = np.linspace(0.0, 8.0, 81)
-FEW = {"matching": 100, "shooting": 50}
+SHORT_FIT = {"matching": 100, "shooting": 50}
 
 
 def spring(rate):
@@ -55,18 +56,18 @@ def records(seed=0, noise=NOISE, starts=STARTS):
 def least_squares(data, noise=NOISE):
     """The rate and its standard error by SciPy, over the rate and all first states."""
 
-    def missed(v):
+    def weighted_residuals(v):
         runs = [run(start, v[0], t) for start, (t, _) in zip(v[1:].reshape(-1, 3), data, strict=True)]
         return np.concatenate([(x - y).ravel() for x, (_, y) in zip(runs, data, strict=True)]) / noise
 
-    result = scipy.optimize.least_squares(missed, np.concatenate([[0.2], *(x[0] for _, x in data)]))
+    result = scipy.optimize.least_squares(weighted_residuals, np.concatenate([[0.2], *(x[0] for _, x in data)]))
     variance = 2 * result.cost / (result.fun.size - result.x.size)
     return result.x[0], np.sqrt(np.linalg.inv(result.jac.T @ result.jac)[0, 0] * variance)
 
 
 def test_the_rate_and_its_error_are_those_of_least_squares():
     data = records(3)
-    fitted_system = lt.learn.fit(spring(0.5), data, positive=rate_of, noise=NOISE, validation=0, **FEW)
+    fitted_system = lt.learn.fit(spring(0.5), data, positive=rate_of, noise=NOISE, validation=0, **SHORT_FIT)
     rate, error = least_squares(data)
     result = fitted_system.training
     assert float(rate_of(fitted_system)) == pytest.approx(rate, abs=0.02 * error)
@@ -84,8 +85,8 @@ def test_the_rate_and_its_error_are_those_of_least_squares():
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_friction_is_found_where_the_noise_is_not_given(seed):
-    """It was 0.28 and 0.10 for a true 0.15: splines through noisy data have its derivatives."""
-    fitted_system = lt.learn.fit(spring(0.5), records(seed), positive=rate_of, **FEW).training
+    """The friction was 0.28 and 0.10 for a true 0.15: splines through noisy data have its derivatives."""
+    fitted_system = lt.learn.fit(spring(0.5), records(seed), positive=rate_of, **SHORT_FIT).training
     assert abs(fitted_system.values[0] - RATE) < 2.5 * fitted_system.standard_errors[0]
     assert fitted_system.standard_errors[0] < 0.002
     assert fitted_system.noise_is_estimated
@@ -95,7 +96,7 @@ def test_the_friction_is_found_where_the_noise_is_not_given(seed):
 
 
 def test_two_observed_components_determine_it_too():
-    """It was 0.184: the descent had not come to its end, and nothing said so."""
+    """The friction was 0.184: the descent had not come to its end, and nothing said so."""
     data = [(t, x[:, :2]) for t, x in records(0)]
     fitted_system = lt.learn.fit(
         spring(0.5), data, observed=[0, 1], positive=rate_of, noise=NOISE, shooting=100
@@ -123,13 +124,13 @@ def test_three_rows_do_not_determine_it():
     """0.43 came without a word."""
     data = [(t[:3], x[:3]) for t, x in records(1)[:1]]
     with pytest.warns(lt.learn.FitWarning, match=r"the data do not determine dissipation.part.rate = .* ± "):
-        fitted_system = lt.learn.fit(spring(0.5), data, positive=rate_of, **FEW)
+        fitted_system = lt.learn.fit(spring(0.5), data, positive=rate_of, **SHORT_FIT)
     result = fitted_system.training
     assert result.standard_errors[0] > 0.5 * result.values[0]
     assert "CAUTION: the data do not determine" in str(result)
 
 
-class Shifted(eqx.Module):
+class EnergyWithOffset(eqx.Module):
     """``p^2/2 + k q^2 + c``: no motion depends on c."""
 
     k: jax.Array
@@ -141,10 +142,10 @@ class Shifted(eqx.Module):
 
 def test_a_number_that_moves_nothing_is_called_so():
     friction = lt.Friction(np.diag([0.0, 1.0]), rate=RATE)
-    energy = lt.learn.Energy(Shifted(jnp.array(1.3), jnp.array(0.1)))
+    energy = lt.learn.Energy(EnergyWithOffset(jnp.array(1.3), jnp.array(0.1)))
     start = lt.MetriplecticSystem(mf.Canonical(1), energy, dissipation=friction, baths=lt.HeatBaths(1.0, 1.0))
     with pytest.warns(lt.learn.FitWarning, match=r"the data do not determine .*c = 0\.1 ± inf"):
-        fitted_system = lt.learn.fit(start, records(0), noise=NOISE, **FEW)
+        fitted_system = lt.learn.fit(start, records(0), noise=NOISE, **SHORT_FIT)
     result = fitted_system.training
     assert (result.rank, result.parameters) == (1, 2)
     assert np.isinf(result.condition)
@@ -156,7 +157,7 @@ def test_a_number_that_moves_nothing_is_called_so():
 def test_a_model_that_cannot_describe_the_data_is_called_so():
     data = [(t, x + 0.3 * np.sin(3.0 * t)[:, None]) for t, x in records(0)]
     with pytest.warns(lt.learn.FitWarning, match=r"times the noise: the model cannot describe the data"):
-        fitted_system = lt.learn.fit(spring(0.5), data, positive=rate_of, noise=NOISE, **FEW)
+        fitted_system = lt.learn.fit(spring(0.5), data, positive=rate_of, noise=NOISE, **SHORT_FIT)
     assert fitted_system.training.residual > 3.0
 
 
@@ -187,7 +188,7 @@ def test_data_without_noise_can_be_said_to_be_exact():
 def test_trajectories_of_any_lengths_and_attitudes():
     """The rest of a shorter trajectory is left out; what is not finite there does no harm."""
     data = [(t[: 81 - 20 * i], x[: 81 - 20 * i]) for i, (t, x) in enumerate(records(2))]
-    fitted_system = lt.learn.fit(spring(0.5), data, positive=rate_of, noise=NOISE, validation=0, **FEW).training
+    fitted_system = lt.learn.fit(spring(0.5), data, positive=rate_of, noise=NOISE, validation=0, **SHORT_FIT).training
     rate, error = least_squares(data)
     assert fitted_system.values[0] == pytest.approx(rate, abs=0.02 * error)
     assert fitted_system.standard_errors == pytest.approx([error], rel=0.02)
@@ -206,13 +207,13 @@ def test_fits_to_few_trajectories_spread_as_their_errors(number):
 
 def test_fits_that_are_all_equal_say_nothing():
     data = [(TIMES, run(STARTS[0], RATE))]
-    fits = lt.learn.several(lambda seed: spring(0.5), data, 2, positive=rate_of, validation=0, **FEW)
+    fits = lt.learn.several(lambda seed: spring(0.5), data, 2, positive=rate_of, validation=0, **SHORT_FIT)
     with pytest.warns(lt.learn.FitWarning, match=r"equal in all fits, so its deviation of 0 is no error"):
         fits.spread(lambda s: s.energy.value(jnp.zeros(3)))
 
 
 def test_the_findings_come_back_from_a_file(tmp_path):
-    fitted_system = lt.learn.fit(spring(0.5), records(0), positive=rate_of, **FEW)
+    fitted_system = lt.learn.fit(spring(0.5), records(0), positive=rate_of, **SHORT_FIT)
     path = lt.learn.save(fitted_system, tmp_path / "spring.npz")
     loaded_system = lt.learn.load(path, spring(1.0))
     assert str(loaded_system.training) == str(fitted_system.training)

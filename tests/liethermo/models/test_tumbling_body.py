@@ -6,7 +6,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from tests.liethermo.test_bodies import free
+from tests.liethermo.test_bodies import free_body_run
 
 ROUND = (1.0, 1.0, 1.6)
 START = np.array([0.8, 0.1, 0.6])
@@ -69,7 +69,9 @@ def test_both_laws_and_the_momentum_in_space_at_sizes_in_si(method, scale):
     kinetic = 0.5 * np.sum(run.x[:, :3] ** 2 / inertia, axis=1)
     heat = capacity * (body.temperatures(run.x)[:, 0] - 300.0)
     assert np.abs(kinetic + heat - energy).max() < 1e-13 * energy
-    reference = free(inertia / scale, mu0 / scale / omega, 40.0, rate=float(body.dissipation.part.rate) * scale * omega)
+    reference = free_body_run(
+        inertia / scale, mu0 / scale / omega, 40.0, rate=float(body.dissipation.part.rate) * scale * omega
+    )
     error = np.abs(run.x[-1, :3] / scale / omega - reference.y[:3, -1]).max()
     assert error < (3e-3 if method is METHODS["midpoint"] else 1e-7)
     assert np.allclose(run.attitude[-1], reference.y[3:, -1].reshape(3, 3), rtol=0, atol=3e-2 if error > 1e-6 else 1e-6)

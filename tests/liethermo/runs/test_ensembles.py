@@ -13,14 +13,14 @@ from liethermo.runs import batches
 
 BODY = lt.models.rigid_body()
 ENGINES = ("array", "compiled")
-COMPILED_ALONE = (pytest.param("array", marks=pytest.mark.slow), "compiled")
+ENGINE_CASES = (pytest.param("array", marks=pytest.mark.slow), "compiled")
 
 
 def states(number, dim=3, seed=0):
     return np.random.default_rng(seed).standard_normal((number, dim))
 
 
-@pytest.mark.parametrize("engine", COMPILED_ALONE)
+@pytest.mark.parametrize("engine", ENGINE_CASES)
 def test_each_is_the_trajectory_it_would_be_alone(engine):
     """37 trajectories leave lanes empty; 20.05 is no multiple of the step."""
     x0s = states(37)
@@ -115,7 +115,7 @@ def leaves_its_domain():
     return lt.LiePoissonSystem(mf.so(3), energy, entropy, dissipation, validate=False)
 
 
-@pytest.mark.parametrize("engine", COMPILED_ALONE)
+@pytest.mark.parametrize("engine", ENGINE_CASES)
 def test_a_failure_stays_where_it_is(engine):
     x0s = np.array([[0.3, 0.1, 0.1]] * 7 + [[0.001, 1.0, 0.001]] + [[0.2, 0.1, 0.3]] * 12)
     options = {"outputs": "trajectory", "save_every": 7, "engine": engine}

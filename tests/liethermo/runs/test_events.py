@@ -23,7 +23,7 @@ def two_levels_and_one(x):
     return two_levels(x) * (0.8 - x[1])
 
 
-FIRST = np.arccos(-0.8)
+FIRST_EVENT_TIME = np.arccos(-0.8)
 
 
 @pytest.mark.sampled(
@@ -38,7 +38,7 @@ def test_the_first_of_several_in_a_step_is_found(method, until, engine):
     """An even and an odd number of them; the longest steps are of three radians."""
     arguments = (0.0, 8.0), lt.Adaptive(1e-9), method
     solution = lt.integrate(OSCILLATOR, [1.0, 0.0], *arguments, until=until, engine=engine)
-    assert solution.event_time == pytest.approx(FIRST, abs=1e-7)
+    assert solution.event_time == pytest.approx(FIRST_EVENT_TIME, abs=1e-7)
     assert abs(solution.x[-1, 0] + 0.8) < 4e-16, "to rounding"
     assert solution.audit().passed
     ensemble = lt.ensemble(OSCILLATOR, [[1.0, 0.0], [0.5, 0.0]], *arguments, until=until, engine=engine)
@@ -50,7 +50,9 @@ def test_control_without_looks_a_later_one_is_taken_for_the_first(monkeypatch):
     monkeypatch.setattr(pacing, "event_check_fractions", lambda order: np.zeros(0))
     method = lt.MetriplecticTaylor(19)  # which nothing has been compiled for
     arguments = (0.0, 8.0), lt.Adaptive(1e-9), method
-    assert lt.integrate(OSCILLATOR, [1.0, 0.0], *arguments, until=two_levels_and_one).event_time > FIRST + 0.1
+    assert (
+        lt.integrate(OSCILLATOR, [1.0, 0.0], *arguments, until=two_levels_and_one).event_time > FIRST_EVENT_TIME + 0.1
+    )
 
 
 @pytest.mark.parametrize("method", [METHODS[1], pytest.param(METHODS[2], marks=pytest.mark.slow)], ids=str)
@@ -80,7 +82,7 @@ def hole(w):
     return lambda x: jnp.where(jnp.abs(x[0] - 0.5) < w, jnp.nan, x[0] - 0.5)
 
 
-def watched(until, step, engine="compiled", order=8, noise_size=1e-13):
+def run_until(until, step, engine="compiled", order=8, noise_size=1e-13):
     """Alone, and in an ensemble, whose program may round otherwise: by ``noise_size``, in the time."""
     arguments = (0.0, 3.0), step, lt.MetriplecticRungeKutta(order)
     solution = lt.integrate(OSCILLATOR, [1.0, 0.0], *arguments, until=until, engine=engine, on_failure="return")
@@ -96,9 +98,9 @@ def watched(until, step, engine="compiled", order=8, noise_size=1e-13):
 @pytest.mark.parametrize("step", [lt.Adaptive(1e-8), 0.1])
 @pytest.mark.parametrize("order", [4, 6, 8])
 def test_the_edge_of_a_hole_is_no_event(order, engine, step):
-    """Whether it is zero in the hole is not known, and the run says so: for holes of every size, on any processor."""
+    """The run says that a zero in the hole is neither found nor excluded: for holes of every size, on any processor."""
     for w in (1e-3, 0.01, 0.02, 0.05, 0.1, 0.3):
-        solution = watched(hole(w), step, engine, order)
+        solution = run_until(hole(w), step, engine, order)
         assert (solution.status.code, solution.event_time) == ("non_finite", None), w
         assert "the event function is NaN near" in solution.status.message
         assert solution.t[-1] == pytest.approx(HALF, abs=0.11 + 2 * w)
@@ -118,7 +120,7 @@ JUMPS = {
 @pytest.mark.parametrize("name", JUMPS)
 @pytest.mark.parametrize("step", [0.1, lt.Adaptive(1e-8)])
 def test_a_jump_is_no_event_and_the_run_goes_on(name, engine, step):
-    solution = watched(JUMPS[name], step, engine)
+    solution = run_until(JUMPS[name], step, engine)
     assert (solution.status.code, solution.event_time, solution.t[-1]) == ("completed", None, 3.0)
     assert "changed its sign 1 times without being zero, first at t = 1.0472" in solution.status.message
     assert solution.audit().passed
@@ -143,7 +145,7 @@ ZEROS = {
 @pytest.mark.parametrize("step", [0.1, lt.Adaptive(1e-8)])
 def test_a_zero_is_an_event_however_it_is_rounded(name, engine, step):
     until, exact = ZEROS[name]
-    solution = watched(until, step, engine, noise_size=3e-10 if name == "among large terms" else 1e-13)  # that of 1e6
+    solution = run_until(until, step, engine, noise_size=3e-10 if name == "among large terms" else 1e-13)  # that of 1e6
     assert solution.event_time == pytest.approx(exact, abs=1e-6 if name != "of no slope" else 1e-4)
     assert solution.audit().passed
 

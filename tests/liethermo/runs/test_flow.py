@@ -84,7 +84,7 @@ def test_a_batch():
 
 
 def test_newton_is_compiled_where_a_step_needs_it(monkeypatch):
-    """It is two thirds of a program, and none of one for a derivative: that is of slopes which are known."""
+    """Newton's method is two thirds of a program, and not in that of a derivative, whose slopes are known."""
 
     class NewtonCompiled(Exception):
         pass
@@ -113,7 +113,7 @@ def test_a_step_that_cannot_be_solved_gives_nan():
 # -- parameters in closures ------------------------------------------------------------------------------------------
 
 
-def closed(p, entropy=True):
+def system_with_closures(p, entropy=True):
     """p stands in closures alone, the energy's and, where there is one, the entropy's and the dissipation's."""
     return lt.LiePoissonSystem(
         mf.so(3),
@@ -127,10 +127,10 @@ def closed(p, entropy=True):
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("entropy", [True, False], ids=["relaxing", "conservative"])
 def test_a_system_that_closes_over_tracers(entropy):
-    """It is built under every transformation, and is what it is with numbers in their place."""
+    """The system is built under every transformation, with the field that numbers in place of tracers give."""
 
     def speed(p):
-        return closed(p, entropy).vector_field(X0)
+        return system_with_closures(p, entropy).vector_field(X0)
 
     p, d = jnp.array([0.3, 0.5]), jnp.array([1e-4, -2e-4])
     difference = 0.5 * (speed(p + d) - speed(p - d))
@@ -142,7 +142,7 @@ def test_a_system_that_closes_over_tracers(entropy):
     ):
         assert np.abs(derivative - difference).max() < 1e-10
     traced_systems = []
-    jax.eval_shape(lambda p: traced_systems.append(closed(p, entropy).energy.is_quadratic), p)
+    jax.eval_shape(lambda p: traced_systems.append(system_with_closures(p, entropy).energy.is_quadratic), p)
     assert traced_systems == [False]
 
 
@@ -152,7 +152,7 @@ def test_derivatives_by_parameters_in_a_closure(entropy):
     """Outside of jit, backwards; against differences of the flow."""
 
     def end(p):
-        return lt.flow(closed(p, entropy), X0, (0.0, 0.5), 0.1)[0]
+        return lt.flow(system_with_closures(p, entropy), X0, (0.0, 0.5), 0.1)[0]
 
     p, d = jnp.array([0.3, 0.5]), jnp.array([1e-5, -2e-5])
     difference = 0.5 * (end(p + d) - end(p - d))
@@ -162,7 +162,7 @@ def test_derivatives_by_parameters_in_a_closure(entropy):
 @pytest.mark.slow
 def test_closures_in_a_batch_and_in_jit():
     def end(p):
-        return lt.flow(closed(p), X0, (0.0, 0.5), 0.1)
+        return lt.flow(system_with_closures(p), X0, (0.0, 0.5), 0.1)
 
     p = jnp.array([[0.3, 0.5], [0.4, 0.6]])
     alone = jnp.stack([end(p[0]), end(p[1])])
@@ -261,7 +261,7 @@ def test_second_derivatives():
     """In every combination of modes, by state and by a parameter in a closure."""
 
     def end(y):
-        return lt.flow(closed(jnp.stack([y[3], 0.5])), y[:3], (0.0, 0.3), 0.1)[0]
+        return lt.flow(system_with_closures(jnp.stack([y[3], 0.5])), y[:3], (0.0, 0.3), 0.1)[0]
 
     y = jnp.append(X0, 0.3)
     forwards, backwards = jax.jacfwd, jax.jacrev
@@ -286,17 +286,19 @@ def looping(p):
     return lt.LiePoissonSystem(mf.so(3), energy, lt.Quadratic(np.ones(3)), lt.KillingDissipation(0.5))
 
 
-def unrolled(p):
+def unrolled_system(p):
     energy = lambda x: 0.5 * p**3 * x[0] ** 2 + jnp.cos(x[1])  # noqa: E731
     return lt.LiePoissonSystem(mf.so(3), energy, lt.Quadratic(np.ones(3)), lt.KillingDissipation(0.5))
 
 
 @pytest.mark.slow
 def test_a_loop_of_unknown_length_in_an_energy():
-    """It has no derivative backwards in JAX; here its derivatives are taken forwards, whatever is asked for."""
+    """Such a loop has no derivative backwards in JAX; here its derivatives are taken forwards in every mode."""
     modes = jax.jacfwd, jax.jacrev
     for derivative in (lambda f: f, *modes, *(lambda f, a=a, b=b: a(b(f)) for a in modes for b in modes)):
-        a, b = (derivative(lambda p, build=build: build(p).vector_field(X0))(1.2) for build in (looping, unrolled))
+        a, b = (
+            derivative(lambda p, build=build: build(p).vector_field(X0))(1.2) for build in (looping, unrolled_system)
+        )
         assert np.abs(a - b).max() < 1e-12
 
 
@@ -304,7 +306,7 @@ def test_a_loop_of_unknown_length_in_an_energy():
 def test_a_flow_with_a_loop_of_unknown_length():
     a, b = (
         jax.value_and_grad(lambda p, build=build: lt.flow(build(p), X0, (0.0, 0.3), 0.1)[0])(1.2)
-        for build in (looping, unrolled)
+        for build in (looping, unrolled_system)
     )
     assert np.abs(np.subtract(a, b)).max() < 1e-13
     solution = lt.integrate(looping(1.2), X0, (0.0, 0.3), 0.1, engine="array")
@@ -322,7 +324,7 @@ def test_a_flow_with_a_loop_of_unknown_length():
     ids=str,
 )
 def test_the_derivative_at_an_equilibrium(method):
-    """Where nothing moves quotients are 0/0: the Jacobian is that of differences, and near ``expm`` of the field's."""
+    """Quotients are 0/0 where nothing moves: the Jacobian is that of differences, and near ``expm`` of the field's."""
 
     def energy(m):
         return 0.5 * jnp.sum(m * m / jnp.array([3.0, 2.0, 1.0])) + 0.1 * m[0] ** 4
@@ -364,22 +366,22 @@ def test_derivatives_found_at_once(order, monkeypatch):
             nonlinear(jnp.append(y[3] * PARAMETERS[:3], 0.5)), y[:3], (0.0, 0.2), 0.1, lt.MetriplecticGauss(2)
         )
 
-    def derived(y):
+    def nth_derivative(y):
         derivative = end
         for _ in range(order):
             derivative = jax.jacfwd(derivative)
         return derivative(y)
 
     y = jnp.append(X0, 1.0)
-    derivatives = derived(y)
+    derivatives = nth_derivative(y)
     monkeypatch.setattr(flow_module, "MAX_FORWARD_DERIVATIVES", 0)
-    through = derived(y)
+    through = nth_derivative(y)
     assert np.abs(derivatives - through).max() < 1e-12 * np.abs(through).max()
     assert np.abs(through).max() > 1e-3
 
 
 def test_a_linearised_flow_in_another_program():
-    """What is known of it when it is linearised can be a part of any program."""
+    """The residuals of a linearised flow can be a part of any program."""
     x, v = X0, jnp.array([0.1, -0.2, 0.3])
     end = lambda x: lt.flow(body(PARAMETERS), x, (0.0, 0.3), 0.1)  # noqa: E731
     _, push = jax.linearize(end, x)

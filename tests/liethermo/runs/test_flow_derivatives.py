@@ -16,23 +16,25 @@ from tests.liethermo.integrators.test_convergence import METRIPLECTIC_METHODS, P
 METHODS = [m for m in lt.registered_methods() if isinstance(m, METRIPLECTIC_METHODS)]
 
 
-def by_differences(f, x, size=2e-3):
+def jacobian_by_differences(f, x, size=2e-3):
     """The Jacobian of f by central differences of sixth order."""
     weights = {1: 3 / 4, 2: -3 / 20, 3: 1 / 60}
 
-    def along(v):
+    def directional_derivative(v):
         return sum(w * (f(x + c * size * v) - f(x - c * size * v)) for c, w in weights.items()) / size
 
-    return np.stack([along(v) for v in np.eye(len(x))], axis=1)
+    return np.stack([directional_derivative(v) for v in np.eye(len(x))], axis=1)
 
 
 # -- along trajectories ------------------------------------------------------------------------------------------------
 
-PLAIN = [name for name in PROBLEMS if name != "spin with a bath"]  # its coordinates are bound to a sphere
+UNCONSTRAINED_PROBLEMS = [
+    name for name in PROBLEMS if name != "spin with a bath"
+]  # its coordinates are bound to a sphere
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", PLAIN)
+@pytest.mark.parametrize("name", UNCONSTRAINED_PROBLEMS)
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_along_trajectories(method, name):
     """Both modes are the derivative of the discrete flow, as its differences show."""
@@ -40,13 +42,14 @@ def test_along_trajectories(method, name):
     end = jax.jit(lambda x: lt.flow(system, x, (0.0, 3 * h), h, method))
     x = jnp.asarray(problem.start)
     derivative = jax.jit(jax.jacfwd(end))(x), jax.jit(jax.jacrev(end))(x)
-    expected = by_differences(lambda y: np.asarray(end(jnp.asarray(y))), np.asarray(problem.start))
+    expected = jacobian_by_differences(lambda y: np.asarray(end(jnp.asarray(y))), np.asarray(problem.start))
     for jacobian in derivative:
         assert np.abs(jacobian - expected).max() < 2e-10 * max(1.0, np.abs(expected).max())
 
 
 MOMENTS = tuple(map(Decimal, ("3", "2", "1")))
-QUARTIC, RATE = Decimal("0.25"), Decimal("0.5")
+QUARTIC = Decimal("0.25")
+RATE = Decimal("0.5")
 
 
 def midpoint_step(x, h):
@@ -143,7 +146,7 @@ def _pendulum():
     return lt.MetriplecticSystem(tensor, energy, entropy, lt.FrictionOperator(K), dim=3)
 
 
-def _lowered():
+def _lowered_body():
     def energy(m):
         return 0.5 * jnp.sum(m * m / jnp.array([3.0, 2.0, 1.0])) + 0.1 * m[0] ** 4 + 0.2 * m[0]
 
@@ -167,7 +170,7 @@ EQUILIBRIA = {
     "a sleeping top": (_sleeping_top, (0.0, 0.0, 1.5, 0.0, 0.0, 1.0)),
     "a pendulum below": (_pendulum, (0.0, 0.0, np.log(1.3))),
     "a pendulum above": (_pendulum, (np.pi, 0.0, np.log(1.3))),
-    "a body that was lowered": (_lowered, (-1.0, 0.0, 0.0)),
+    "a body that was lowered": (_lowered_body, (-1.0, 0.0, 0.0)),
     "two bodies of one temperature": (_two_bodies, (1.0, 2.0)),
 }
 
@@ -186,7 +189,7 @@ def test_at_equilibria(method, name):
     assert np.abs(system.vector_field(x)).max() < 1e-15
     end = jax.jit(lambda y: lt.flow(system, y, (0.0, h), h, method))
     derivative = np.asarray(jax.jit(jax.jacfwd(end))(x))
-    expected = by_differences(lambda y: np.asarray(end(jnp.asarray(y))), np.asarray(x))
+    expected = jacobian_by_differences(lambda y: np.asarray(end(jnp.asarray(y))), np.asarray(x))
     assert np.abs(jax.jit(jax.jacrev(end))(x) - derivative).max() < 1e-12
     linear = np.asarray(jax.jit(jax.jacfwd(system.vector_field))(x))
     correction_error = 0.1 * (h * np.abs(linear).max()) ** (method.order + 1) if method.explicit else 0.0

@@ -8,7 +8,8 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 
-GAUSS, EXPLICIT = lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(4)
+GAUSS = lt.MetriplecticGauss(2)
+EXPLICIT = lt.MetriplecticRungeKutta(4)
 
 
 def hill():

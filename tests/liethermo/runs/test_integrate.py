@@ -252,10 +252,10 @@ def test_ctrl_c_returns_what_exists(engine, monkeypatch):
 
 
 def test_ctrl_c_before_the_first_step(monkeypatch):
-    def interrupted(*arguments):
+    def raise_interrupt(*arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(array, "initial_run_state_program", interrupted)
+    monkeypatch.setattr(array, "initial_run_state_program", raise_interrupt)
     solution = lt.integrate(BODY, X0, (0.0, 1.0), 0.1, engine="array")
     assert (solution.status.code, solution.x.tolist(), solution.stats.steps) == ("interrupted", [X0], 0)
 

@@ -56,7 +56,7 @@ def test_the_energy_of_a_motion_that_goes_on(engine):
 @pytest.mark.slow
 @pytest.mark.parametrize("gradient", ["gonzalez", pytest.param("mean_value", marks=pytest.mark.slow)])
 def test_the_energy_in_long_steps(gradient):
-    """Where the difference of H is used at every step, it must not take back what steers it (the drift was 1e-13)."""
+    """The difference of H, used at every step, must not take back the correction of the drift (which was 1e-13)."""
     system, method = general_body(6.6e-6), lt.MetriplecticMidpoint(gradient)
     solution = lt.integrate(system, [0.3, 1.0, 0.2], (0.0, 3e5), 1.0, method, save_every=3000, engine="compiled")
     assert solution.audit(energy=8e-15).passed, str(solution.audit())

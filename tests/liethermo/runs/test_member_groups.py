@@ -1,4 +1,4 @@
-"""What a member of a family conserves is a property of that member, whoever else is there and in whatever order."""
+"""The constants of a member of a family depend on that member alone, whatever the others and their order."""
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,9 @@ from liethermo.engines.codes import StatusCode
 from liethermo.runs import member_groups
 from liethermo.runs.family import Family
 
-START, SPAN, STEP = np.array([0.4, 0.5, -0.3]), (0.0, 2.0), 0.1
+START = np.array([0.4, 0.5, -0.3])
+SPAN = (0.0, 2.0)
+STEP = 0.1
 ORDERS = ([0, 1, 2], [2, 0, 1], [1, 2, 0])
 METHODS = [
     lt.MetriplecticMidpoint(),
@@ -110,7 +112,7 @@ def test_a_flow_under_vmap(method):
 def test_a_control_one_verdict_for_all_is_found(monkeypatch):
     """Control: with what the first member conserves held for all, the relation of company fails."""
 
-    def of_first(family, method, states):
+    def group_like_first_member(family, method, states):
         first_verdicts = family.member(0)._find_invariants()
         facts = member_groups.InvariantFacts(None, first_verdicts)
         return [
@@ -123,7 +125,7 @@ def test_a_control_one_verdict_for_all_is_found(monkeypatch):
         mf.so(3), lt.Quadratic([1.0, 2.0, 3.0]), lambda m: jnp.log(1 + m @ m), lt.KillingDissipation(0.3)
     )
     assert lt.testing.check_relations(system, lt.MetriplecticGauss(1), START, 0.1, relations=["company"]).passed
-    monkeypatch.setattr("liethermo.runs.ensemble.group_members", of_first)
+    monkeypatch.setattr("liethermo.runs.ensemble.group_members", group_like_first_member)
     with pytest.raises(lt.testing.PropertyError, match="company"):
         lt.testing.check_relations(system, lt.MetriplecticGauss(1), START, 0.1, relations=["company"])
 
@@ -131,7 +133,7 @@ def test_a_control_one_verdict_for_all_is_found(monkeypatch):
 # -- what a method is asked to preserve -------------------------------------------------------------------------------
 
 
-def lopsided(p):
+def asymmetric_body(p):
     """Conserves ``m[2]`` where the energy is symmetric about the axis 3."""
     return lt.LiePoissonSystem(mf.so(3), lambda m: 0.5 * (m[0] ** 2 + p["b"] * m[1] ** 2) + m[2] ** 2)
 
@@ -139,11 +141,11 @@ def lopsided(p):
 @pytest.mark.parametrize("method", [lt.MetriplecticGauss, lt.MetriplecticRungeKutta])
 def test_what_a_member_does_not_conserve_is_not_held(method):
     holding = method(4, preserve=[lambda m: m[2]])
-    ensemble = lt.ensemble(lopsided, START, SPAN, STEP, holding, parameters={"b": np.array([1.0, 2.0, 1.0])})
+    ensemble = lt.ensemble(asymmetric_body, START, SPAN, STEP, holding, parameters={"b": np.array([1.0, 2.0, 1.0])})
     assert ensemble.status.tolist() == [StatusCode.COMPLETED, StatusCode.INADMISSIBLE, StatusCode.COMPLETED]
     assert "does not conserve the preserved function" in ensemble.reasons[1]
     assert np.abs(ensemble.x[[0, 2], 2] - START[2]).max() < 1e-15
-    ensemble = lt.ensemble(lopsided, START, SPAN, STEP, holding, parameters={"b": np.array([2.0, 1.0])})
+    ensemble = lt.ensemble(asymmetric_body, START, SPAN, STEP, holding, parameters={"b": np.array([2.0, 1.0])})
     assert ensemble.status.tolist() == [StatusCode.INADMISSIBLE, StatusCode.COMPLETED]
 
 
@@ -221,11 +223,11 @@ def test_groups_are_few_and_in_order():
 def test_an_interruption_stops_all_groups(monkeypatch):
     from liethermo.runs import ensemble as module
 
-    def interrupted(family, method, record, tally, paths=None):
+    def count_call(family, method, record, tally, paths=None):
         calls.append(len(record.x0))
 
     calls: list[int] = []
-    monkeypatch.setattr(module, "run_fixed_compiled", interrupted)
+    monkeypatch.setattr(module, "run_fixed_compiled", count_call)
     ensemble = lt.ensemble(body, START, SPAN, STEP, parameters={"a": A}, engine="compiled")
     assert calls == [1]
     assert ensemble.status.tolist() == [StatusCode.INTERRUPTED] * 3

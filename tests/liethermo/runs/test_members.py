@@ -12,7 +12,8 @@ import manifolds as mf
 from liethermo.engines.codes import StatusCode
 
 BODY = lt.models.rigid_body()
-SPAN, STEP = (0.0, 6.0), 0.1
+SPAN = (0.0, 6.0)
+STEP = 0.1
 
 
 def states(number, seed=0):
@@ -181,7 +182,7 @@ def test_states_that_are_none_stay_where_they_are():
 
 @pytest.mark.parametrize("engine", ["compiled", pytest.param("array", marks=pytest.mark.slow)])
 def test_save_at(engine):
-    """Where single runs step, and so what they keep."""
+    """Members take the steps of single runs, and save the same states."""
     times, x0s = [0.37, 1.0, 1.05, 3.3], states(9)
     ensemble = lt.ensemble(BODY, x0s, SPAN, STEP, save_at=times, engine=engine)
     assert ensemble.t.tolist() == [0.0, *times, 6.0]

@@ -19,7 +19,7 @@ WARM = np.log([0.5, 1.5])  # relaxes to T = 1, where both entropies vanish
 
 @pytest.mark.slow
 def test_the_size_at_which_a_function_is_rounded():
-    """That of the terms that cancel, not of what is left; and none where nothing is rounded."""
+    """The scale is that of the terms that cancel, not of their sum; and zero where nothing is rounded."""
     cases = [
         (lambda x: 1.0 - jnp.cos(x), 1e-9, 1.0),
         (lambda x: jnp.exp(x) - 1.0, 1e-12, 1.0),

@@ -18,7 +18,7 @@ from tests.cases import BuiltOnUse
 
 ENTROPY = lt.Quadratic(4.0 * np.ones(3))
 BODY = lt.LiePoissonSystem(mf.so(3), lt.Quadratic([1 / 3, 1 / 2, 1.0]), ENTROPY, lt.KillingDissipation(0.5))
-CURVED = lt.LiePoissonSystem(
+NONQUADRATIC_BODY = lt.LiePoissonSystem(
     mf.so(3),
     lambda m: 0.5 * jnp.sum(m * m * jnp.array([1 / 3, 1 / 2, 1.0])) + 0.3 * jnp.cos(2.0 * m[0]),
     ENTROPY,
@@ -39,7 +39,7 @@ def run(system, noise, engine, **arguments):
     ("system", "noise"),
     [
         pytest.param(BODY, NOISE, id="body", marks=pytest.mark.slow),
-        pytest.param(CURVED, NOISE, id="curved", marks=pytest.mark.slow),
+        pytest.param(NONQUADRATIC_BODY, NOISE, id="curved", marks=pytest.mark.slow),
         pytest.param(SPIN, BATH, id="spin"),
     ],
 )
@@ -123,7 +123,7 @@ def test_no_noise_is_the_run_without_to_the_bit(engine):
 
 
 def test_little_noise_is_nearly_the_run_without():
-    """Of the size of the square root of k."""
+    """The distance from the run without noise is proportional to the square root of k."""
     still = run(BODY, None, "compiled", method=lt.MetriplecticMidpoint()).x
     distances = [np.abs(run(BODY, lt.Fluctuations(k, 1), "compiled").x - still).max() for k in (1e-8, 1e-10, 1e-12)]
     assert np.allclose(np.array(distances[:-1]) / distances[1:], 10.0, rtol=0.01)
@@ -133,7 +133,9 @@ def test_little_noise_is_nearly_the_run_without():
 def test_a_lattice_needs_few_programs(monkeypatch):
     """One takes the steps, one begins a run, and the axioms have one: no size adds any, nor does another run."""
     trace_counts = []
-    monkeypatch.setattr(programs._ArrayFunction, "__call__", _counted(programs._ArrayFunction.__call__, trace_counts))
+    monkeypatch.setattr(
+        programs._ArrayFunction, "__call__", _record_calls(programs._ArrayFunction.__call__, trace_counts)
+    )
     sites = (3, 5, 4)
     magnet = lt.models.spin_lattice(sites, rate=1.0, baths=lt.HeatBaths(np.inf, 1.0))
     up = magnet.state(np.tile([0.0, 0.0, 1.0], (*sites, 1)))
@@ -146,12 +148,12 @@ def test_a_lattice_needs_few_programs(monkeypatch):
     assert sorted(programs_of_runs) == ["_compiled", "advance", "first_state"]
 
 
-def _counted(call, names: list):
-    def counted(self, dynamic):
+def _record_calls(call, names: list):
+    def recording_call(self, dynamic):
         names.append(self.__name__)
         return call(self, dynamic)
 
-    return counted
+    return recording_call
 
 
 def test_newton_where_the_fixed_point_is_too_far():
@@ -209,7 +211,7 @@ def test_unusable_noise(arguments, words):
         lt.Fluctuations(**arguments)
 
 
-class Crooked(lt.KillingDissipation):
+class WrongNoiseFactor(lt.KillingDissipation):
     """Control: a factor that is 10 % too large."""
 
     def factor(self, system, x, dH, dL):
@@ -217,7 +219,7 @@ class Crooked(lt.KillingDissipation):
 
     def bind_to(self, system):
         found = super().bind_to(system)
-        return Crooked(found.rate, found.form)
+        return WrongNoiseFactor(found.rate, found.form)
 
 
 @pytest.mark.parametrize(
@@ -227,7 +229,7 @@ class Crooked(lt.KillingDissipation):
         ({"dissipation": lt.EulerPoincareForce(jnp.sin)}, "EulerPoincareForce gives no factor"),
         ({"dissipation": lt.DissipationPotential(lt.CoulombFriction())}, "DissipationPotential gives no factor"),
         ({"dissipation": lt.DoubleBracket()}, "temperature of the bath"),
-        ({"dissipation": Crooked()}, "differs from K dS by a relative error of 0.2"),
+        ({"dissipation": WrongNoiseFactor()}, "differs from K dS by a relative error of 0.2"),
         ({"noise": lt.Fluctuations(temperature=1.0)}, "lowers the energy"),
         ({"noise": 1e-3}, "lt.Fluctuations"),
         ({"noise": lt.Fluctuations(seed=(1, 2))}, "2 seeds for 1"),
@@ -255,7 +257,7 @@ def test_noise_is_named_in_the_provenance():
 
 
 @dataclasses.dataclass
-class Summed:
+class CoarsenedPath:
     """The increments of a fine path, added up for longer steps."""
 
     fine: np.ndarray
@@ -269,7 +271,7 @@ class Summed:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("system", "noise"), [(BODY, NOISE), (CURVED, NOISE), (SPIN, BATH)], ids=["body", "curved", "spin"]
+    ("system", "noise"), [(BODY, NOISE), (NONQUADRATIC_BODY, NOISE), (SPIN, BATH)], ids=["body", "curved", "spin"]
 )
 def test_paths_converge_in_the_mean_square(system, noise):
     """To those of the same Brownian motion with shorter steps, with order 1/2 at least."""
@@ -278,7 +280,7 @@ def test_paths_converge_in_the_mean_square(system, noise):
     increments = np.sqrt(T / fine) * np.random.default_rng(0).standard_normal((paths, fine, noise_dimension(method)))
 
     def end(W, steps):
-        engine = EngineWithFallback(system, method, "compiled", steps, Summed(W, fine // steps))
+        engine = EngineWithFallback(system, method, "compiled", steps, CoarsenedPath(W, fine // steps))
         return np.asarray(engine.advance(engine.initial_run_state(START), T / steps, 1, steps)[0].x)
 
     exact = np.array([end(W, fine) for W in increments])
@@ -314,7 +316,7 @@ def _curved_form(n):
     return A @ A.T / n + np.eye(n)
 
 
-LONG = BuiltOnUse(
+LONG_RUNS = BuiltOnUse(
     {  # k, the step, and a body of each kind
         "so(3)": lambda: (1.0, 0.02, BODY, START),
         "se(3)": lambda: (
@@ -346,9 +348,9 @@ LONG = BuiltOnUse(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", LONG)
+@pytest.mark.parametrize("name", LONG_RUNS)
 def test_a_thousand_paths_of_ten_thousand_steps_keep_their_energy(name):
-    k, h, system, x0 = LONG[name]
+    k, h, system, x0 = LONG_RUNS[name]
     times = (0.0, 10_000 * h)
     x0 = np.tile(np.asarray(x0, dtype=float), (1000, 1))
     ensemble = lt.ensemble(

@@ -13,8 +13,10 @@ from tests.additions.group import AFFINE
 from tests.additions.space import Ring
 from tests.cases import BuiltOnUse
 
-SPHERE, T = mf.Sphere(2), 0.8
-BATH, NOISE = lt.Fluctuations(1.0, seed=1, temperature=T), lt.Fluctuations(1.0, seed=1)
+SPHERE = mf.Sphere(2)
+T = 0.8
+BATH = lt.Fluctuations(1.0, seed=1, temperature=T)
+NOISE = lt.Fluctuations(1.0, seed=1)
 A = np.array([[1.0, 0.2, 0.0], [0.0, 0.5, 0.0], [0.3, 0.0, -0.7]])
 
 
@@ -30,33 +32,35 @@ def level(x):
     return x[0] ** 2 + 2.0 * x[1] ** 2 + 3.5 * x[2] ** 2 + 0.2 * x[2]
 
 
-def tilted(x):
+def tilted_entropy(x):
     return 1.5 * x[0] + x[1] * x[2]
 
 
-def damped(space, energy, dissipation=None, poisson=None):
+def damped_system(space, energy, dissipation=None, poisson=None):
     return lt.MetriplecticSystem(poisson, energy, None, dissipation or lt.Friction(rate=0.5), space=space)
 
 
-def on_level(dissipation):
-    return lt.MetriplecticSystem(None, level, tilted, dissipation, space=SPHERE)
+def system_on_level(dissipation):
+    return lt.MetriplecticSystem(None, level, tilted_entropy, dissipation, space=SPHERE)
 
 
 @functools.cache
-def held():
-    return on_level(lt.ProjectedMetric(normalized=True, rate=0.5))
+def normalised_system_on_level():
+    return system_on_level(lt.ProjectedMetric(normalized=True, rate=0.5))
 
 
 @functools.cache
 def spin():
-    return damped(SPHERE, field, lt.DoubleBracket(0.5), spins)
+    return damped_system(SPHERE, field, lt.DoubleBracket(0.5), spins)
 
 
 START = np.array([0.6, 0.0, 0.8])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("system", "noise"), [(spin, BATH), (held, NOISE)], ids=["bath", "level"])
+@pytest.mark.parametrize(
+    ("system", "noise"), [(spin, BATH), (normalised_system_on_level, NOISE)], ids=["bath", "level"]
+)
 def test_paths_stay_on_the_space_and_on_their_level(system, noise):
     """By both engines the same."""
     array, compiled_run = (
@@ -89,14 +93,14 @@ def test_noise_and_motion_are_checked():
     report = BATH.check(spin())
     assert report.passed
     assert "no: the equilibrium measure" not in str(report)
-    shrinking = damped(SPHERE, field, poisson=lambda x: (1.0 + 0.5 * x[0]) * spins(x))  # a Poisson tensor too
+    shrinking = damped_system(SPHERE, field, poisson=lambda x: (1.0 + 0.5 * x[0]) * spins(x))  # a Poisson tensor too
     assert "no: the equilibrium measure" in str(BATH.check(shrinking))
     density = lt.Fluctuations(1.0, temperature=T, density=lambda x: -jnp.log(1.0 + 0.5 * x[0]))
     assert "no: the equilibrium measure" not in str(density.check(shrinking))
 
 
 def test_what_has_no_noise():
-    system_without_noise = on_level(lt.ProjectedMetric(np.diag([1.0, 2.0, 3.0])))
+    system_without_noise = system_on_level(lt.ProjectedMetric(np.diag([1.0, 2.0, 3.0])))
     with pytest.raises(lt.InputError, match=r"ProjectedMetric gives no factor .* on S\^2"):
         lt.integrate(system_without_noise, START, (0.0, 1.0), 0.1, noise=NOISE)
 
@@ -104,7 +108,7 @@ def test_what_has_no_noise():
 @pytest.mark.slow
 def test_a_driven_spin_in_a_bath():
     """The ledger has the work of the field; a density is one of the body's state."""
-    system = damped(SPHERE, lambda x, t: field(x) + 0.5 * x[0] * jnp.cos(3.0 * t), lt.DoubleBracket(0.5), spins)
+    system = damped_system(SPHERE, lambda x, t: field(x) + 0.5 * x[0] * jnp.cos(3.0 * t), lt.DoubleBracket(0.5), spins)
     noise = lt.Fluctuations(1.0, seed=1, temperature=T, density=lambda x: 0.1 * x[2])
     solution = lt.integrate(system, START, (0.0, 3.0), 0.05, noise=noise)
     assert solution.audit().passed, str(solution.audit())
@@ -128,10 +132,10 @@ def spin_states(count):
 
 
 def states_near_the_level(count):
-    """Those of a thin shell: the measure of the level of H that its neighbours of other energy leave."""
+    """Return points of a thin shell about the level of H, whose thickness gives the measure, and weights exp(S)."""
     points = np.asarray(SPHERE.random(3, (40 * count,)))
     points = points[(np.abs(level(points.T) - level(START)) < 0.01) & (points[:, 2] > 0.0)]
-    return points, np.exp(tilted(points.T))
+    return points, np.exp(tilted_entropy(points.T))
 
 
 def hyperbolic_points(count):
@@ -197,15 +201,40 @@ def _pair(x):
 CASES = BuiltOnUse(
     {
         "spin": lambda: (spin(), BATH, spin_states, START),
-        "rotations": lambda: (damped(mf.SpecialOrthogonal(3), lambda R: -jnp.sum(A * R)), BATH, rotations, np.eye(3)),
-        "frames": lambda: (damped(mf.Stiefel(3, 2), lambda R: -jnp.sum(A[:, :2] * R)), BATH, frames, np.eye(3)[:, :2]),
-        "hyperbolic": lambda: (damped(mf.Hyperbolic(2), _hyperbolic), BATH, hyperbolic_points, [1.0, 0.0, 0.0]),
-        "definite": lambda: (damped(mf.SPD(2), lambda x: _definite(x.ravel())), BATH, definite_matrices, np.eye(2)),
-        "affine": lambda: (damped(mf.GroupSpace(AFFINE), lambda x: _affine(x.ravel())), BATH, affine_maps, np.eye(2)),
-        "ring": lambda: (damped(Ring(), _ring), BATH, ring_points, None),
-        "product": lambda: (damped(PAIR, _pair), BATH, pairs, [0.6, 0.0, 0.8, 0.0]),
-        "level": lambda: (held(), NOISE, states_near_the_level, START),
-        "level, not normalised": lambda: (on_level(lt.ProjectedMetric(rate=0.1)), NOISE, states_near_the_level, START),
+        "rotations": lambda: (
+            damped_system(mf.SpecialOrthogonal(3), lambda R: -jnp.sum(A * R)),
+            BATH,
+            rotations,
+            np.eye(3),
+        ),
+        "frames": lambda: (
+            damped_system(mf.Stiefel(3, 2), lambda R: -jnp.sum(A[:, :2] * R)),
+            BATH,
+            frames,
+            np.eye(3)[:, :2],
+        ),
+        "hyperbolic": lambda: (damped_system(mf.Hyperbolic(2), _hyperbolic), BATH, hyperbolic_points, [1.0, 0.0, 0.0]),
+        "definite": lambda: (
+            damped_system(mf.SPD(2), lambda x: _definite(x.ravel())),
+            BATH,
+            definite_matrices,
+            np.eye(2),
+        ),
+        "affine": lambda: (
+            damped_system(mf.GroupSpace(AFFINE), lambda x: _affine(x.ravel())),
+            BATH,
+            affine_maps,
+            np.eye(2),
+        ),
+        "ring": lambda: (damped_system(Ring(), _ring), BATH, ring_points, None),
+        "product": lambda: (damped_system(PAIR, _pair), BATH, pairs, [0.6, 0.0, 0.8, 0.0]),
+        "level": lambda: (normalised_system_on_level(), NOISE, states_near_the_level, START),
+        "level, not normalised": lambda: (
+            system_on_level(lt.ProjectedMetric(rate=0.1)),
+            NOISE,
+            states_near_the_level,
+            START,
+        ),
     }
 )
 
@@ -224,7 +253,7 @@ def test_equilibria_with_the_volume_of_the_space(name):
 
 
 def test_noise_moves_a_state_far_on_a_surface_of_no_degree():
-    """Where the energy is least its gradient is no way to change it: noise has no law of the energy to hold."""
+    """The energy cannot be changed along its gradient where it is least: noise has no law of the energy to hold."""
     system, noise, samples, _ = CASES["ring"]
     ensemble = lt.ensemble(system, samples(100)[0], (0.0, 3.0), 0.02, noise=noise)
     assert ensemble.ok.all()
@@ -235,6 +264,6 @@ def test_noise_moves_a_state_far_on_a_surface_of_no_degree():
 
 @pytest.mark.slow
 def test_the_energy_is_exact_on_a_thousand_paths_of_ten_thousand_steps():
-    ensemble = lt.ensemble(held(), np.tile(START, (1000, 1)), (0.0, 200.0), 0.02, noise=NOISE)
+    ensemble = lt.ensemble(normalised_system_on_level(), np.tile(START, (1000, 1)), (0.0, 200.0), 0.02, noise=NOISE)
     assert ensemble.ok.all()
     assert ensemble.energy_drift.max() < 1e-13

@@ -30,7 +30,7 @@ def nonlinear():
     )
 
 
-def same(ensemble, other_ensemble, order=slice(None)):
+def assert_same_ensembles(ensemble, other_ensemble, order=slice(None)):
     """To the last bit."""
     for name in (
         "x",
@@ -91,12 +91,12 @@ def test_a_trajectory_does_not_depend_on_its_neighbours(engine, monkeypatch):
 
     default_run, order = run(np.arange(41)), np.random.default_rng(1).permutation(41)
     assert default_run.ok.all()
-    same(default_run, run(order), order)
-    same(default_run, run(np.arange(5)), slice(5))
+    assert_same_ensembles(default_run, run(order), order)
+    assert_same_ensembles(default_run, run(np.arange(5)), slice(5))
     monkeypatch.setattr(batches, "THREAD_BATCH_SIZE", 8)
     monkeypatch.setattr(paced, "ARRAY_BATCH_SIZE", 16)
     monkeypatch.setattr(paced, "ATTEMPTS_PER_CALL_RANGE", (1, 3))
-    same(default_run, run(np.arange(41)))
+    assert_same_ensembles(default_run, run(np.arange(41)))
 
 
 @pytest.mark.parametrize("engine", ENGINES)

@@ -21,7 +21,7 @@ START = [1.0, 0.3, 0.2]
 ARRAY = pytest.mark.slow
 
 
-def in_parts(system, x0, times, step, **options):
+def run_in_parts(system, x0, times, step, **options):
     """The last of some runs, each of which goes on from the end of the one before."""
     x, attitude, run = x0, options.pop("attitude", None), None
     for span in itertools.pairwise(times):
@@ -61,7 +61,7 @@ NOISY = BuiltOnUse(
 def test_a_noisy_run_in_parts_is_the_run_to_the_bit(name, engine):
     system, x0, noise, step, times = NOISY[name]
     whole_run = lt.integrate(system, x0, (times[0], times[-1]), step, noise=noise, engine=engine)
-    parts = in_parts(system, x0, times, step, noise=noise, engine=engine)
+    parts = run_in_parts(system, x0, times, step, noise=noise, engine=engine)
     assert np.array_equal(parts.x[-1], whole_run.x[-1])
     assert np.abs(np.diff(whole_run.x, axis=0)).max() > 0.1
     if whole_run.attitude is not None:
@@ -88,7 +88,7 @@ def test_a_noisy_run_on_a_surface_in_parts(case):
         ),
     }[case]()
     whole_run = lt.integrate(system, x0, (0.0, 1.0), 0.025, noise=noise)
-    assert np.array_equal(in_parts(system, x0, (0.0, 0.4, 1.0), 0.025, noise=noise).x[-1], whole_run.x[-1])
+    assert np.array_equal(run_in_parts(system, x0, (0.0, 0.4, 1.0), 0.025, noise=noise).x[-1], whole_run.x[-1])
 
 
 def test_a_noisy_run_goes_on_from_a_file(tmp_path):
@@ -131,11 +131,14 @@ def test_a_driven_noisy_run_in_parts_is_the_run_to_rounding():
     """The clock of a part is rounded when it starts; the noise is that of the run."""
     system = lt.LiePoissonSystem(mf.so(3), lambda s, t: -jnp.cos(t) * s[2], None, lt.DoubleBracket(0.5))
     whole_run = lt.integrate(system, START, (0.0, 13.1), 0.1, noise=BATH)
-    assert np.abs(in_parts(system, START, (0.0, 0.7, 1.3, 13.1), 0.1, noise=BATH).x[-1] - whole_run.x[-1]).max() < 1e-13
+    assert (
+        np.abs(run_in_parts(system, START, (0.0, 0.7, 1.3, 13.1), 0.1, noise=BATH).x[-1] - whole_run.x[-1]).max()
+        < 1e-13
+    )
 
 
 def test_a_loop_of_short_noisy_runs_has_the_mean_of_equilibrium():
-    """Of 2,000 parts: <s3> = coth(1) - 1 for a spin in a field of one temperature."""
+    """The mean over 2,000 runs is <s3> = coth(1) - 1 for a spin in a field of one temperature."""
     system, noise = lt.models.single_spin(1.0, 0.5, baths=lt.HeatBaths(np.inf, 1.0)), lt.Fluctuations(seed=5)
     x, s3 = np.array([0.0, 0.0, 1.0, 0.0]), []
     for i in range(2000):
@@ -278,7 +281,7 @@ def test_parts_that_end_within_a_step_have_noise_of_their_own():
 # -- without noise -----------------------------------------------------------------------------------------------------
 
 
-def pushed():
+def driven_body():
     """A body with a wheel's friction inside, heat, a torque that depends on time, and on the attitude."""
     return lt.LiePoissonSystem(
         mf.so(3),
@@ -290,7 +293,7 @@ def pushed():
     )
 
 
-PLAIN = BuiltOnUse(
+NOISELESS_CASES = BuiltOnUse(
     {  # a system, its start, and a method
         "body, Gauss": lambda: (body(), START, lt.MetriplecticGauss(2)),
         "body, midpoint": lambda: (body(), START, lt.MetriplecticMidpoint()),
@@ -305,8 +308,8 @@ PLAIN = BuiltOnUse(
         ),
         "drive, Gauss": lambda: (driven(), START, lt.MetriplecticGauss(2)),
         "drive, Runge-Kutta": lambda: (driven(), START, lt.MetriplecticRungeKutta(4)),
-        "torque, Gauss": lambda: (pushed(), START, lt.MetriplecticGauss(2)),
-        "torque, Runge-Kutta": lambda: (pushed(), START, lt.MetriplecticRungeKutta(4)),
+        "torque, Gauss": lambda: (driven_body(), START, lt.MetriplecticGauss(2)),
+        "torque, Runge-Kutta": lambda: (driven_body(), START, lt.MetriplecticRungeKutta(4)),
     }
 )
 
@@ -321,17 +324,17 @@ def driven():
 TIMES = (-0.4, 0.1, 1.3, 2.0, 6.0)
 
 
-@pytest.mark.parametrize("name", PLAIN)
+@pytest.mark.parametrize("name", NOISELESS_CASES)
 def test_a_run_in_parts_is_the_run_to_rounding(name):
     """With equal steps; a part starts at its own time, from the last state and attitude of the one before."""
-    system, x0, method = PLAIN[name]
+    system, x0, method = NOISELESS_CASES[name]
     whole_run = lt.integrate(system, x0, (TIMES[0], TIMES[-1]), 0.1, method)
-    parts = in_parts(system, x0, TIMES, 0.1, method=method)
+    parts = run_in_parts(system, x0, TIMES, 0.1, method=method)
     assert np.abs(parts.x[-1] - whole_run.x[-1]).max() < 1e-13
     assert np.allclose(parts.t, whole_run.t[24:], rtol=0.0, atol=1e-14)
     if whole_run.attitude is not None:
         assert np.abs(parts.attitude[-1] - whole_run.attitude[-1]).max() < 1e-13
-    shifted_run = in_parts(system, x0, tuple(t + 1.0 for t in TIMES), 0.1, method=method)
+    shifted_run = run_in_parts(system, x0, tuple(t + 1.0 for t in TIMES), 0.1, method=method)
     distance = np.abs(shifted_run.x[-1] - whole_run.x[-1]).max()
     assert distance > 1e-2 if system.is_driven else distance < 1e-12  # the control: times are absolute
 
@@ -339,7 +342,7 @@ def test_a_run_in_parts_is_the_run_to_rounding(name):
 @pytest.mark.parametrize("name", ["body, Gauss", "attitude, Runge-Kutta", "bath", "torque, Gauss"])
 def test_a_run_goes_on_from_a_file(name, tmp_path):
     """States, times and attitudes of a file are those of the run, so what goes on from them is, to the bit."""
-    system, x0, method = PLAIN[name]
+    system, x0, method = NOISELESS_CASES[name]
     half = lt.integrate(system, x0, (-0.4, 1.3), 0.1, method, save_to=tmp_path / "half.nc")
     loaded_run = lt.load(tmp_path / "half.nc")
     rests = [
@@ -366,11 +369,11 @@ def test_a_run_goes_on_from_a_file(name, tmp_path):
 )
 def test_adaptive_steps_in_parts_agree_to_their_tolerance(name):
     """Each part begins with a step that it has to find; a tenth of the tolerance brings both ten times nearer."""
-    system, x0, method = PLAIN[name]
+    system, x0, method = NOISELESS_CASES[name]
     distances = []
     for rtol in (1e-6, 1e-9):
         whole_run = lt.integrate(system, x0, (TIMES[0], TIMES[-1]), lt.Adaptive(rtol), method)
-        parts = in_parts(system, x0, TIMES, lt.Adaptive(rtol), method=method)
+        parts = run_in_parts(system, x0, TIMES, lt.Adaptive(rtol), method=method)
         distances.append(np.abs(parts.x[-1] - whole_run.x[-1]).max() / rtol)
     assert max(distances) < 30.0
 
@@ -380,7 +383,7 @@ def test_adaptive_steps_that_end_where_parts_do_are_those_of_parts():
     """A run that keeps its states at the ends of parts is the parts to a part of its tolerance."""
     whole_run = lt.integrate(driven(), START, (TIMES[0], TIMES[-1]), lt.Adaptive(1e-8), save_at=TIMES[1:])
     for i in range(1, len(TIMES)):
-        part = in_parts(driven(), START, TIMES[: i + 1], lt.Adaptive(1e-8))
+        part = run_in_parts(driven(), START, TIMES[: i + 1], lt.Adaptive(1e-8))
         assert np.abs(part.x[-1] - whole_run.x[np.searchsorted(whole_run.t, TIMES[i])]).max() < 1e-6
 
 

@@ -19,7 +19,7 @@ def body(p):
     return lt.LiePoissonSystem(mf.so(3), energy, lambda m: jnp.log(1.0 + p[1] * m @ m), lt.KillingDissipation(0.5))
 
 
-def on_the_sphere(p):
+def sphere_system(p):
     return lt.MetriplecticSystem(
         None,
         lambda x: p[0] * x[2] ** 3 + 0.5 * x[0] * x[1],
@@ -29,7 +29,7 @@ def on_the_sphere(p):
     )
 
 
-STARTS = {body: jnp.array([0.3, 1.0, 0.2]), on_the_sphere: jnp.array([0.6, 0.0, 0.8])}
+STARTS = {body: jnp.array([0.3, 1.0, 0.2]), sphere_system: jnp.array([0.6, 0.0, 0.8])}
 
 
 def both_ways(function, order, y):

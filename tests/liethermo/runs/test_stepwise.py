@@ -31,7 +31,8 @@ def nonlinear():
     )
 
 
-SYSTEM, START = nonlinear(), [0.8, 0.5, 0.9]
+SYSTEM = nonlinear()
+START = [0.8, 0.5, 0.9]
 
 
 @pytest.fixture(scope="module")
@@ -163,9 +164,9 @@ def test_attempts_together_are_attempts_one_by_one(monkeypatch):
 
 @pytest.mark.slow
 def test_the_array_engine_takes_over_amid_attempts_made_together(monkeypatch):
-    """Where Newton's method is first needed and cannot be compiled: no step before that is lost."""
+    """No step is lost that was taken before Newton's method was first needed and could not be compiled."""
 
-    def followed(engine):
+    def run_with_engine(engine):
         step, method = lt.Adaptive(0.1, first=1e-3), lt.MetriplecticGauss(3)
         return lt.integrate(lt.models.free_rigid_body(), [1.0, 0.02, 0.02], (0.0, 400.0), step, method, engine=engine)
 
@@ -175,10 +176,10 @@ def test_the_array_engine_takes_over_amid_attempts_made_together(monkeypatch):
         calls.append(1)
         raise UnsupportedPrimitive("newton", "in this test")
 
-    array_run = followed("array")
+    array_run = run_with_engine("array")
     monkeypatch.setattr(compiled.CompiledStepLoop, "_newton_address", solver)
     with pytest.warns(UserWarning, match="newton"):
-        parts = followed("auto")
+        parts = run_with_engine("auto")
     assert calls
     assert len(parts.t) == len(array_run.t) > 50
     assert np.abs(parts.x - array_run.x).max() < 1e-12  # 2e-13 seen: the engines round otherwise, and the time is long
@@ -385,7 +386,7 @@ def test_an_event_that_never_happens():
     ids=["always", "from some time on"],
 )
 def test_of_a_function_that_is_not_a_number_at_the_end_nothing_is_known(until, step):
-    """It may have been zero: that the event has not happened would be a guess."""
+    """The function may have been zero: that the event has not happened would be a guess."""
     solution = lt.integrate(BODY, X0, (0.0, 20.0), step, until=until)
     assert solution.x[-1, 1] < 0.995
     assert solution.event_time is None

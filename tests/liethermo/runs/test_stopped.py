@@ -1,4 +1,4 @@
-"""What stops a run from outside: what there is so far is kept, and the status says why it ended."""
+"""Runs that are stopped from outside keep the states saved so far, and the status says why they ended."""
 
 import multiprocessing
 import os
@@ -14,7 +14,8 @@ import manifolds as mf
 from liethermo.engines.choice import EngineWithFallback
 from liethermo.integrators import reference
 
-BODY, X0 = lt.models.rigid_body(), np.array([0.1, 1.0, 0.1])
+BODY = lt.models.rigid_body()
+X0 = np.array([0.1, 1.0, 0.1])
 
 
 @pytest.mark.parametrize(
@@ -28,13 +29,13 @@ BODY, X0 = lt.models.rigid_body(), np.array([0.1, 1.0, 0.1])
 def test_fixed_steps(monkeypatch, error, why):
     advance, calls = EngineWithFallback.advance, []
 
-    def stopped(self, *arguments):
+    def fail_third_advance(self, *arguments):
         calls.append(1)
         if len(calls) == 3:
             raise error
         return advance(self, *arguments)
 
-    monkeypatch.setattr(EngineWithFallback, "advance", stopped)
+    monkeypatch.setattr(EngineWithFallback, "advance", fail_third_advance)
     monkeypatch.setattr(EngineWithFallback, "max_saves_per_call", property(lambda self: 10))
     whole_run = lt.integrate(BODY, X0, (0.0, 5.0), 0.1, engine="array")
     assert whole_run.status.code == "interrupted"
@@ -49,23 +50,23 @@ def test_adaptive_steps(monkeypatch):
 
     append, calls = Run._save_steps, []
 
-    def stopped(self, *arguments):
+    def fail_second_append(self, *arguments):
         calls.append(1)
         if len(calls) == 2:
             raise MemoryError
         return append(self, *arguments)
 
-    monkeypatch.setattr(Run, "_save_steps", stopped)
+    monkeypatch.setattr(Run, "_save_steps", fail_second_append)
     solution = lt.integrate(BODY, X0, (0.0, 500.0), lt.Adaptive(1e-9))
     assert "no memory left" in solution.status.message
     assert 1 < len(solution.t) == len(solution.x) == len(solution.energy)
 
 
 def test_another_error_is_not_hidden(monkeypatch):
-    def broken(self, *arguments):
+    def raise_unknown_error(self, *arguments):
         raise jax.errors.JaxRuntimeError("INTERNAL: something else")
 
-    monkeypatch.setattr(EngineWithFallback, "advance", broken)
+    monkeypatch.setattr(EngineWithFallback, "advance", raise_unknown_error)
     with pytest.raises(jax.errors.JaxRuntimeError, match="something else"):
         lt.integrate(BODY, X0, (0.0, 5.0), 0.1)
 
@@ -73,13 +74,13 @@ def test_another_error_is_not_hidden(monkeypatch):
 def test_the_reference_solver(monkeypatch):
     field, calls = reference._vector_field, []
 
-    def stopped(*arguments):
+    def interrupt_field(*arguments):
         calls.append(1)
         if len(calls) == 200:
             raise KeyboardInterrupt
         return field(*arguments)
 
-    monkeypatch.setattr(reference, "_vector_field", stopped)
+    monkeypatch.setattr(reference, "_vector_field", interrupt_field)
     solution = lt.integrate(BODY, X0, (0.0, 50.0), 0.1, lt.Reference(1e-9))
     assert solution.status.code == "interrupted"
     assert "stopped by the user after t =" in solution.status.message
@@ -92,7 +93,7 @@ def test_the_reference_solver(monkeypatch):
 # -- processes that are forked ----------------------------------------------------------------------------------------
 
 
-FORKED = """
+FORKED_SCRIPT = """
 import multiprocessing, os, signal, sys
 import liethermo as lt
 body, x0 = lt.models.rigid_body(), [0.1, 1.0, 0.1]
@@ -112,7 +113,7 @@ assert os.waitpid(child, 0)[1] == 0
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
 def test_a_forked_process_does_not_wait_for_ever():
-    run = [sys.executable, "-W", "ignore", "-c", FORKED]
+    run = [sys.executable, "-W", "ignore", "-c", FORKED_SCRIPT]
     completed_process = subprocess.run(run, capture_output=True, text=True, check=False, timeout=120)
     assert completed_process.returncode == 0, completed_process.stderr
     assert completed_process.stdout.startswith("ForkError this process was forked after JAX had run")
@@ -120,10 +121,10 @@ def test_a_forked_process_does_not_wait_for_ever():
     assert issubclass(mf.ForkError, RuntimeError)
 
 
-def _of_child(rate: float) -> float:
+def _entropy_of_run(rate: float) -> float:
     return float(lt.integrate(lt.models.rigid_body(rate=rate), X0, (0.0, 1.0), 0.1).entropy[-1])
 
 
 def test_processes_of_their_own_are_no_fork():
     with multiprocessing.get_context("spawn").Pool(1) as pool:
-        assert pool.map(_of_child, [0.5]) == [_of_child(0.5)]
+        assert pool.map(_entropy_of_run, [0.5]) == [_entropy_of_run(0.5)]

@@ -21,26 +21,26 @@ def table(t, span=SPAN):
     return jnp.where((t >= span[0]) & (t <= span[1]), jnp.cos(t), jnp.nan)
 
 
-def forced(force=table, stiffness=1.0):
+def forced_oscillator(force=table, stiffness=1.0):
     """An oscillator in a force, whose energy is known in the span only."""
     return lt.MetriplecticSystem(
         poisson=mf.Canonical(1), energy=lambda x, t: 0.5 * (x[1] ** 2 + stiffness * x[0] ** 2) + force(t) * x[0], dim=2
     )
 
 
-def turned(torque, **options):
+def body_with_torque(torque, **options):
     energy = lambda m: 0.5 * (m[0] ** 2 + m[1] ** 2 / 2.0 + m[2] ** 2 / 3.0)  # noqa: E731
     return lt.LiePoissonSystem(mf.so(3), energy, torque=torque, **options)
 
 
-def by_scipy(force, span, start=START):
-    """The same oscillator by DOP853, which evaluates nothing beyond the end either."""
+def solve_by_scipy(force, span, start=START):
+    """Solve for the forced oscillator by DOP853, which evaluates nothing beyond the end either."""
     return scipy.integrate.solve_ivp(
         lambda t, y: [y[1], -y[0] - force(t)], span, start, method="DOP853", rtol=1e-12, atol=1e-12
     ).y[:, -1]
 
 
-EXACT = by_scipy(np.cos, SPAN)
+EXACT = solve_by_scipy(np.cos, SPAN)
 
 METHODS = [
     lt.MetriplecticMidpoint(),
@@ -55,7 +55,7 @@ METHODS = [
 @pytest.mark.parametrize("step", [STEP, lt.Adaptive(1e-6)], ids=["fixed", "adaptive"])
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_an_energy_that_is_known_in_the_span_only(method, step):
-    run = lt.integrate(forced(), START, SPAN, step, method)
+    run = lt.integrate(forced_oscillator(), START, SPAN, step, method)
     assert run.t[-1] == SPAN[1]
     assert np.abs(run.x[-1] - EXACT).max() < 1e-3
     assert np.isfinite(run.energy).all()
@@ -64,19 +64,19 @@ def test_an_energy_that_is_known_in_the_span_only(method, step):
 
 @pytest.mark.parametrize("step", [STEP, lt.Adaptive(1e-6)], ids=["fixed", "adaptive"])
 def test_on_the_array_engine(step):
-    run = lt.integrate(forced(), START, SPAN, step, lt.MetriplecticGauss(2), engine="array")
+    run = lt.integrate(forced_oscillator(), START, SPAN, step, lt.MetriplecticGauss(2), engine="array")
     assert np.abs(run.x[-1] - EXACT).max() < 1e-5
 
 
 def test_kept_states_dense_output_and_events():
     method = lt.MetriplecticGauss(2)
-    run = lt.integrate(forced(), START, SPAN, STEP, method, save_at=[0.2, 0.3])
+    run = lt.integrate(forced_oscillator(), START, SPAN, STEP, method, save_at=[0.2, 0.3])
     assert run.t.tolist() == [0.1, 0.2, 0.3, 0.4]
     assert np.isfinite(run.x).all()
-    dense = lt.integrate(forced(), START, SPAN, STEP, method, dense=True)
+    dense = lt.integrate(forced_oscillator(), START, SPAN, STEP, method, dense=True)
     assert np.array_equal(dense(SPAN[1]), dense.x[-1])
     assert np.isfinite(dense(np.nextafter(SPAN[1], 0.0))).all()
-    until = lt.integrate(forced(), START, SPAN, STEP, method, until=lambda x: x[1] + 5.0)
+    until = lt.integrate(forced_oscillator(), START, SPAN, STEP, method, until=lambda x: x[1] + 5.0)
     assert until.status.code == "completed"
     assert np.array_equal(until.x[-1], dense.x[-1])
 
@@ -88,21 +88,21 @@ def test_members_of_an_ensemble_are_single_runs_to_the_bit(step, engine):
     starts, stiffness = np.array([[1.0, 0.0], [0.5, 0.2], [-1.0, 2.0]]), np.array([1.0, 1.5, 0.5])
     method = lt.MetriplecticGauss(2)
     ensemble = lt.ensemble(
-        lambda p: forced(stiffness=p), starts, SPAN, step, method, parameters=stiffness, engine=engine
+        lambda p: forced_oscillator(stiffness=p), starts, SPAN, step, method, parameters=stiffness, engine=engine
     )
     assert ensemble.ok.all()
     for i, (x, k) in enumerate(zip(starts, stiffness, strict=True)):
-        one = lt.integrate(forced(stiffness=k), x, SPAN, step, method, engine=engine).x[-1]
+        one = lt.integrate(forced_oscillator(stiffness=k), x, SPAN, step, method, engine=engine).x[-1]
         # XLA compiles lanes and single runs by different instructions
         assert np.array_equal(ensemble.x[i], one) if engine == "compiled" else np.abs(ensemble.x[i] - one).max() < 1e-14
 
 
 def test_a_flow_and_its_derivative():
     def end(x):
-        return lt.flow(forced(), x, SPAN, STEP, lt.MetriplecticGauss(2))
+        return lt.flow(forced_oscillator(), x, SPAN, STEP, lt.MetriplecticGauss(2))
 
     assert np.abs(end(jnp.asarray(START)) - EXACT).max() < 1e-5
-    exact = by_scipy(lambda t: 0.0, SPAN), by_scipy(lambda t: 0.0, SPAN, [0.0, 1.0])  # it is linear
+    exact = solve_by_scipy(lambda t: 0.0, SPAN), solve_by_scipy(lambda t: 0.0, SPAN, [0.0, 1.0])  # it is linear
     assert np.abs(jax.jacfwd(end)(jnp.asarray(START)) - np.column_stack(exact)).max() < 1e-5
 
 
@@ -122,7 +122,7 @@ def test_a_torque_that_ends_as_a_root(method):
         atol=1e-12,
     )
     for step, tolerance in ((0.1, 3e-3), (lt.Adaptive(1e-5), 1e-3)):
-        run = lt.integrate(turned(torque), [0.4, 0.5, -0.3], (0.0, 0.3), step, method)
+        run = lt.integrate(body_with_torque(torque), [0.4, 0.5, -0.3], (0.0, 0.3), step, method)
         assert np.abs(run.x[-1] - exact.y[:, -1]).max() < tolerance
 
 
@@ -131,7 +131,7 @@ def test_a_torque_that_needs_the_attitude(method):
     def torque(t, mu, g):
         return g.T @ jnp.array([0.0, 0.2, 1.0]) * table(t, (0.0, 0.3))
 
-    run = lt.integrate(turned(torque, group=mf.SO(3)), [0.4, 0.5, -0.3], (0.0, 0.3), 0.1, method)
+    run = lt.integrate(body_with_torque(torque, group=mf.SO(3)), [0.4, 0.5, -0.3], (0.0, 0.3), 0.1, method)
     assert run.audit().passed
 
 
@@ -142,19 +142,19 @@ def test_an_energy_whose_power_is_infinite_at_the_end(stages):
     def force(t):
         return jnp.sqrt(0.3 - t)
 
-    exact = by_scipy(lambda t: np.sqrt(0.3 - t), (0.0, 0.3))
-    run = lt.integrate(forced(force), START, (0.0, 0.3), lt.Adaptive(1e-6), lt.MetriplecticGauss(stages))
+    exact = solve_by_scipy(lambda t: np.sqrt(0.3 - t), (0.0, 0.3))
+    run = lt.integrate(forced_oscillator(force), START, (0.0, 0.3), lt.Adaptive(1e-6), lt.MetriplecticGauss(stages))
     assert np.abs(run.x[-1] - exact).max() < 1e-4
 
 
 def test_the_reference_solver():
-    run = lt.integrate(forced(), START, SPAN, STEP, lt.Reference(1e-10))
+    run = lt.integrate(forced_oscillator(), START, SPAN, STEP, lt.Reference(1e-10))
     assert run.status.ok
     assert np.abs(run.x[-1] - EXACT).max() < 1e-8
 
 
 def test_times_are_sums_of_steps_rounded_once():
-    """Those of equal steps, of steps to times that are kept, and of adaptive steps, against rational numbers."""
+    """Times of equal steps, of steps to saved times, and of adaptive steps, against rational numbers."""
     body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
     start, h = 0.7, 0.1
     run = lt.integrate(body, [0.1, 0.2, 1.0], (start, 30.0), h)

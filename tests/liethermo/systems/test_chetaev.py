@@ -29,11 +29,11 @@ def eta(q, v, S):
 
 
 @functools.cache
-def tangled():
+def chetaev_system():
     return lt.ChetaevSystem(L, eta, 5, validate=False)
 
 
-def by_hand(t, y):
+def field_by_hand(t, y):
     """(14), written out."""
     q, v, S = y[:2], y[2:4], y[4]
     mass, T = np.array([[1.0 + 0.3 * q[0] ** 2, 0.2], [0.2, 1.0]]), 0.5 * np.exp(0.5 * S)
@@ -46,11 +46,11 @@ def by_hand(t, y):
 
 def test_the_equations_and_their_laws():
     points = np.random.default_rng(1).standard_normal((8, 5))
-    field = evaluate_at_points(lambda system, x: system.vector_field(x), tangled(), points)
-    expected = np.array([by_hand(0.0, x) for x in points])
+    field = evaluate_at_points(lambda system, x: system.vector_field(x), chetaev_system(), points)
+    expected = np.array([field_by_hand(0.0, x) for x in points])
     assert np.abs(field - expected).max() < 1e-12 * np.abs(expected).max()
-    assert (tangled().energy_law, tangled().entropy_law) == ("conserved", "nondecreasing")
-    assert tangled().check(points).passed
+    assert (chetaev_system().energy_law, chetaev_system().entropy_law) == ("conserved", "nondecreasing")
+    assert chetaev_system().check(points).passed
 
 
 def test_it_is_the_thermodynamic_herglotz_system_for_eta_L():
@@ -82,8 +82,8 @@ def test_it_is_the_thermodynamic_herglotz_system_for_eta_L():
     ids=str,
 )
 def test_methods_and_their_orders(method, order):
-    exact = solve_ivp(by_hand, (0.0, 2.0), X0, method="DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
-    runs = [lt.integrate(tangled(), X0, (0.0, 2.0), h, method) for h in (0.1, 0.05)]
+    exact = solve_ivp(field_by_hand, (0.0, 2.0), X0, method="DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
+    runs = [lt.integrate(chetaev_system(), X0, (0.0, 2.0), h, method) for h in (0.1, 0.05)]
     errors = [np.abs(run.x[-1] - exact).max() for run in runs]
     assert abs(np.log2(errors[0] / errors[1]) - order) < 0.2, errors
     assert np.diff(runs[0].entropy).min() > 0.0
@@ -94,12 +94,12 @@ def test_methods_and_their_orders(method, order):
 def test_a_form_of_the_entropy_rate():
     """``eta_q . v + eta_S S' = 0``, solved for S'."""
 
-    def of_rate(q, v, S, S_dot):
+    def form_with_entropy_rate(q, v, S, S_dot):
         return jnp.append(-v * (1.0 + 0.1 * S_dot**2), 1.0 + 0.2 * S_dot)
 
-    system = lt.ChetaevSystem(L, of_rate, 5, validate=False)
+    system = lt.ChetaevSystem(L, form_with_entropy_rate, 5, validate=False)
     rate = np.asarray(system.vector_field(X0))
-    form = np.asarray(of_rate(X0[:2], X0[2:4], X0[4], rate[4]))
+    form = np.asarray(form_with_entropy_rate(X0[:2], X0[2:4], X0[4], rate[4]))
     assert rate[4] > 0.3
     assert abs(form[:2] @ X0[2:4] + form[2] * rate[4]) < 1e-15
     assert abs(float(system.energy.gradient(X0) @ rate)) < 1e-15

@@ -225,7 +225,7 @@ class ConstantFactor(HeatConduction):
         return jnp.zeros_like(x).at[S[i]].add(self.conductance * T[j]).at[S[j]].add(-self.conductance * T[i])
 
 
-class AtTheMidpoint(HeatConduction):
+class MidpointTemperatures(HeatConduction):
     """Control: the heat of the discrete temperatures, divided by those at the midpoint."""
 
     def force(self, system, x, dH, dS, dL):
@@ -237,7 +237,7 @@ class AtTheMidpoint(HeatConduction):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("conduction", "energy", "entropy"),
-    [pytest.param(ConstantFactor, True, False, marks=pytest.mark.slow), (AtTheMidpoint, False, True)],
+    [pytest.param(ConstantFactor, True, False, marks=pytest.mark.slow), (MidpointTemperatures, False, True)],
 )
 def test_conduction_that_keeps_one_law_alone(conduction, energy, entropy):
     """Skewness without Fourier's factor keeps the energy only, its sign without skewness the entropy only."""
@@ -351,13 +351,13 @@ def test_fourier_factors_as_they_are_printed():
     """SML 6.2 by hand: K by the temperatures at the midpoint; the library's differ in the second order of the step."""
     x, h = np.log([1.0, 3.0]), 0.1
 
-    def printed(end):
+    def printed_residual(end):
         z = np.exp(0.5 * (x + end))
         T = (np.exp(end) - np.exp(x)) / (end - x)
         K = 1.0 / z[0] - 1.0 / z[1]
         return x + h * np.array([K * T[1], -K * T[0]]) - end
 
-    expected = scipy.optimize.root(printed, x + np.array([0.1, -0.05]), tol=1e-13).x
+    expected = scipy.optimize.root(printed_residual, x + np.array([0.1, -0.05]), tol=1e-13).x
     bodies = [lt.Subsystem(Warm(jnp.asarray(1.0)), 1) for _ in range(2)]
     ends = {}
     for conduction in ("midpoint", "discrete"):

@@ -15,7 +15,10 @@ import liethermo as lt
 import manifolds as mf
 from liethermo.tracing.interpret import evaluate_at_points
 
-GRAVITY, MASS, RATE, CAPACITY = 9.81, 1.3, 0.4, 5.0
+GRAVITY = 9.81
+MASS = 1.3
+RATE = 0.4
+CAPACITY = 5.0
 V = lt.VariationalIntegrator
 
 
@@ -37,7 +40,7 @@ class Case(NamedTuple):
     duration: float
 
 
-def solved(field: Callable, y0, duration: float) -> np.ndarray:
+def solve_by_scipy(field: Callable, y0, duration: float) -> np.ndarray:
     """SciPy, to its rounding."""
     return solve_ivp(field, (0.0, duration), y0, method="DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
 
@@ -45,7 +48,7 @@ def solved(field: Callable, y0, duration: float) -> np.ndarray:
 # -- a spherical pendulum whose friction depends on where it is -------------------------------------------------------
 
 
-def on_the_sphere(y) -> np.ndarray:
+def sphere_state(y) -> np.ndarray:
     theta, phi, w, u, S = y
     q = [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)]
     down = np.array([np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), -np.sin(theta)])
@@ -53,7 +56,7 @@ def on_the_sphere(y) -> np.ndarray:
     return np.concatenate([q, w * down + np.sin(theta) * u * round_, [S]])
 
 
-def in_angles(t, y):
+def pendulum_field(t, y):
     """``L = m (theta'^2 + sin^2 phi'^2) / 2 - m g cos theta``, and the heat."""
     theta, phi, w, u, S = y
     sin, cos = np.sin(theta), np.cos(theta)
@@ -72,13 +75,13 @@ def pendulum() -> Case:
     L = lambda q, v, S: 0.5 * MASS * v @ v - MASS * GRAVITY * q[2] - heat(S)  # noqa: E731
     system = lt.SimpleClosedSystem(L, friction=pendulum_friction, space=mf.Sphere(2))
     y0 = [2.0, 0.3, 0.2, 1.5, 0.1]
-    return Case(system, on_the_sphere(y0), on_the_sphere(solved(in_angles, y0, 2.0)), 2.0)
+    return Case(system, sphere_state(y0), sphere_state(solve_by_scipy(pendulum_field, y0, 2.0)), 2.0)
 
 
 # -- a motion of covariance matrices, geodesic but for a potential and friction ---------------------------------------
 
 
-def of_matrices(t, y):
+def covariance_field(t, y):
     """``q'' = v q^-1 v - q^2 - rate v``: geodesics of tr(q^-1 v q^-1 v), the potential tr q, friction."""
     q, v, S = y[:4].reshape(2, 2), y[4:8].reshape(2, 2), y[8]
     inverse = np.linalg.inv(q)
@@ -98,15 +101,16 @@ def covariances() -> Case:
 
     system = lt.SimpleClosedSystem(L, friction=friction, space=mf.SPD(2))
     x0 = np.array([1.0, 0.2, 0.2, 0.7, 0.3, 0.4, 0.4, -0.2, 0.1])
-    return Case(system, x0, solved(of_matrices, x0, 1.0), 1.0)
+    return Case(system, x0, solve_by_scipy(covariance_field, x0, 1.0), 1.0)
 
 
 # -- a heavy top with friction and a torque from outside, on SO(3) ----------------------------------------------------
 
-INERTIA, LEVER = np.array([1.0, 1.6, 2.1]), np.array([0.3, -0.2, 0.5])
+INERTIA = np.array([1.0, 1.6, 2.1])
+LEVER = np.array([0.3, -0.2, 0.5])
 
 
-def of_top(t, y):
+def top_field(t, y):
     """Euler's equations, the attitude and the ledger."""
     R, omega, S = y[:9].reshape(3, 3), y[9:12], y[12]
     down = R.T @ np.array([0.0, 0.0, -1.0])
@@ -140,7 +144,7 @@ def top() -> Case:
         R = y[:9].reshape(3, 3)
         return np.concatenate([y[:9], (R @ np.cross(np.eye(3), y[9:12])).ravel(), y[12:]])
 
-    return Case(system, state(y0), state(solved(of_top, y0, 1.0)), 1.0)
+    return Case(system, state(y0), state(solve_by_scipy(top_field, y0, 1.0)), 1.0)
 
 
 # -- two bodies, one on the hyperbolic plane and one on a line, with a spring between them ----------------------------
@@ -154,7 +158,7 @@ def hyperbolic_state(y) -> np.ndarray:
     return np.concatenate([q, w * out + np.sinh(r) * u * round_, [p, S]])
 
 
-def in_polar(t, y):
+def hyperbolic_field(t, y):
     """``L = (r'^2 + sinh^2 phi'^2 + z'^2) / 2 - (cosh r - z)^2 / 2``."""
     r, _, z, w, u, p, S = y
     pull = np.cosh(r) - z
@@ -165,7 +169,7 @@ def in_polar(t, y):
 
 
 @functools.cache
-def coupled() -> Case:
+def coupled_points() -> Case:
     def length(v):
         return -(v[0] ** 2) + v[1] ** 2 + v[2] ** 2
 
@@ -175,10 +179,10 @@ def coupled() -> Case:
     friction = lambda q, v, S: -RATE * v * jnp.array([-1.0, 1.0, 1.0, 0.0])  # noqa: E731
     system = lt.SimpleClosedSystem(L, friction=friction, space=mf.Hyperbolic(2) * mf.Euclidean(1))
     y0 = [0.8, 0.3, 0.5, 0.2, 0.6, 0.1, 0.1]
-    return Case(system, hyperbolic_state(y0), hyperbolic_state(solved(in_polar, y0, 1.0)), 1.0)
+    return Case(system, hyperbolic_state(y0), hyperbolic_state(solve_by_scipy(hyperbolic_field, y0, 1.0)), 1.0)
 
 
-CASES = {"pendulum": pendulum, "covariances": covariances, "top": top, "coupled": coupled}
+CASES = {"pendulum": pendulum, "covariances": covariances, "top": top, "coupled": coupled_points}
 
 
 def errors(case: Case, method, counts) -> tuple[np.ndarray, list]:
@@ -294,7 +298,7 @@ GAMMA = 0.7
 
 
 @functools.cache
-def constrained() -> lt.ChetaevSystem:
+def constrained_pendulum() -> lt.ChetaevSystem:
     """The pendulum by ``eta = T dS + F_fr dq``."""
     L = lambda q, v, S: 0.5 * MASS * v @ v - MASS * GRAVITY * q[2] - heat(S)  # noqa: E731
     form = lambda q, v, S: jnp.append(pendulum_friction(q, v, S), 300.0 * jnp.exp(S / CAPACITY))  # noqa: E731
@@ -305,7 +309,7 @@ def lagrangian(q, v, S):
     return 0.5 * MASS * v @ v - MASS * GRAVITY * q[2] - GAMMA * S
 
 
-def in_angles_by_herglotz(t, y):
+def herglotz_field(t, y):
     """(12): a friction ``L_v L_S = -GAMMA L_v``, and ``S' = v . L_v``."""
     theta, _, w, u, _ = y
     sin, cos = np.sin(theta), np.cos(theta)
@@ -314,10 +318,10 @@ def in_angles_by_herglotz(t, y):
 
 
 @functools.cache
-def by_herglotz() -> Case:
+def herglotz_pendulum() -> Case:
     y0 = [2.0, 0.3, 0.2, 1.5, 0.1]
     system = lt.ThermodynamicHerglotz(lagrangian, space=mf.Sphere(2))
-    return Case(system, on_the_sphere(y0), on_the_sphere(solved(in_angles_by_herglotz, y0, 1.0)), 1.0)
+    return Case(system, sphere_state(y0), sphere_state(solve_by_scipy(herglotz_field, y0, 1.0)), 1.0)
 
 
 def fields(system, points) -> np.ndarray:
@@ -325,9 +329,9 @@ def fields(system, points) -> np.ndarray:
 
 
 def discrete_errors(order: int, counts=(20, 40, 80)) -> np.ndarray:
-    """Of discrete Herglotz integrators on the sphere, in (q, p, S)."""
+    """Return the errors of discrete Herglotz integrators on the sphere, in (q, p, S)."""
     H = lambda q, p, S: 0.5 * p @ p / MASS + MASS * GRAVITY * q[2] + GAMMA * S  # noqa: E731
-    case, mass = by_herglotz(), np.repeat([1.0, MASS, 1.0], (3, 3, 1))
+    case, mass = herglotz_pendulum(), np.repeat([1.0, MASS, 1.0], (3, 3, 1))
     system = lt.EvolutionSystem(H, space=mf.Sphere(2))
     action = lambda q0, q1, S0, h: h * lagrangian(0.5 * (q0 + q1), (q1 - q0) / h, S0)  # noqa: E731
     method = lt.DiscreteHerglotz(action, order=order)
@@ -341,23 +345,23 @@ def test_a_one_form_on_the_sphere():
     """Its field is that of the friction; the law of its entropy is found at points of the sphere."""
     x = np.asarray(pendulum().system.samples(4))
     expected = fields(pendulum().system, x)
-    assert np.abs(fields(constrained(), x) - expected).max() < 1e-13 * np.abs(expected).max()
-    assert constrained().entropy_law == "nondecreasing"
+    assert np.abs(fields(constrained_pendulum(), x) - expected).max() < 1e-13 * np.abs(expected).max()
+    assert constrained_pendulum().entropy_law == "nondecreasing"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("method", "order"), [(lt.MetriplecticGauss(2), 4.0), (V.midpoint(), 2.0)], ids=str)
 def test_orders_of_a_one_form_on_the_sphere(method, order):
-    check(pendulum()._replace(system=constrained()), method, order, keeps_energy=order == 4.0)
+    check(pendulum()._replace(system=constrained_pendulum()), method, order, keeps_energy=order == 4.0)
 
 
 def test_herglotz_equations_on_the_sphere():
     """``v' = -g grad z - GAMMA v - |v|^2 q`` of both, ``S' = v . L_v`` of (12) and ``S' = L`` of (10)."""
-    x = by_herglotz().x0
+    x = herglotz_pendulum().x0
     q, v, S = x[:3], x[3:6], x[6]
     along = np.array([0.0, 0.0, -GRAVITY]) + GRAVITY * q[2] * q
     expected = np.concatenate([v, along - GAMMA * v - (v @ v) * q, [MASS * v @ v]])
-    assert np.abs(fields(by_herglotz().system, x[None]) - expected).max() < 1e-13 * np.abs(expected).max()
+    assert np.abs(fields(herglotz_pendulum().system, x[None]) - expected).max() < 1e-13 * np.abs(expected).max()
     contact = lt.Herglotz(lagrangian, space=mf.Sphere(2), validate=False)
     expected[-1] = lagrangian(q, v, S)
     assert np.abs(fields(contact, x[None]) - expected).max() < 1e-13 * np.abs(expected).max()
@@ -365,7 +369,7 @@ def test_herglotz_equations_on_the_sphere():
 
 @pytest.mark.slow
 def test_laws_and_order_of_herglotz_equations_on_the_sphere():
-    check(by_herglotz(), lt.MetriplecticGauss(2), 4.0, keeps_energy=True)
+    check(herglotz_pendulum(), lt.MetriplecticGauss(2), 4.0, keeps_energy=True)
 
 
 @pytest.mark.parametrize("order", [pytest.param(1, marks=pytest.mark.slow), 2, pytest.param(4, marks=pytest.mark.slow)])
@@ -402,7 +406,7 @@ def test_units():
         (lambda: run(lt.VariationalGauss(2)), r"VariationalGauss runs only on R\^n. On a manifold use"),
         (lambda: run(V(Lazy(0.5))), "no subclass"),
         (lambda: run(lt.DiscreteHerglotz(lambda q0, q1, S0, h: S0)), "got a SimpleClosedSystem"),
-        (lambda: by_herglotz().system.hamiltonian_system(), r"inverted on R\^n alone.*S\^2.*with space="),
+        (lambda: herglotz_pendulum().system.hamiltonian_system(), r"inverted on R\^n alone.*S\^2.*with space="),
         (
             lambda: run(V.midpoint(retraction=mf.retraction(mf.Sphere(3), "exp"))),
             r"belongs to S\^3, but the system is on S\^2",

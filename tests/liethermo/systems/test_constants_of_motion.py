@@ -1,4 +1,4 @@
-"""Which functions a system conserves: what is declared, what is found out, and what cannot be known."""
+"""The functions that a system conserves: declared, found out, or undecidable."""
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ EPS = np.finfo(float).eps
 CENTRE = np.array([3.0, 3.0, 3.0])
 
 
-def inside(x):
+def log_inside_ball(x):
     """Defined in a ball that random points do not meet; its derivative is finite outside too."""
     return jnp.log(1.0 - (x - CENTRE) @ (x - CENTRE))
 
@@ -23,18 +23,18 @@ def total(x):
     return jnp.sum(x)
 
 
-def in_a_ball(preserve=(total,), dissipation=None):
+def system_in_ball(preserve=(total,), dissipation=None):
     """Friction that keeps the sum."""
     dissipation = (
         lt.ProjectedMetric(preserve=preserve, rate=0.3, normalized=True) if dissipation is None else dissipation
     )
     energy = lambda x: x @ jnp.array([1.0, 2.0, 4.0])  # noqa: E731
-    return lt.MetriplecticSystem(None, energy, inside, dissipation, dim=3, validate=False)
+    return lt.MetriplecticSystem(None, energy, log_inside_ball, dissipation, dim=3, validate=False)
 
 
 def test_what_is_declared_is_held_where_nothing_can_be_evaluated():
-    system = in_a_ball()
-    assert not np.isfinite(inside(jnp.asarray(system.samples(8)[0])))
+    system = system_in_ball()
+    assert not np.isfinite(log_inside_ball(jnp.asarray(system.samples(8)[0])))
     assert system.first_integrals() == {"total"}
     assert system.conserves((lt.Function(total), lt.Function(lambda x: x[0] ** 2))) == [True, None]
     run = lt.integrate(system, [3.5, 2.7, 3.2], (0.0, 10.0), 0.1, lt.MetriplecticRungeKutta(4))
@@ -42,7 +42,7 @@ def test_what_is_declared_is_held_where_nothing_can_be_evaluated():
 
 
 def test_what_cannot_be_evaluated_is_found_out_near_states_that_are_given():
-    system, x0 = in_a_ball(), np.array([3.5, 2.7, 3.2])
+    system, x0 = system_in_ball(), np.array([3.5, 2.7, 3.2])
     square = lt.Function(lambda x: x[0] ** 2)
     assert system.conserves((lt.Function(total), square), near=x0) == [True, False]
 
@@ -55,7 +55,7 @@ class Half(lt.Dissipation):
 
 
 def test_unknown_is_a_row_of_its_own():
-    """It is neither conserved nor not: the start is on the edge, where no derivative of the entropy exists."""
+    """The Casimir is neither conserved nor not: the start is on the edge, where the entropy has no derivative."""
     system = lt.LiePoissonSystem(mf.so(3), lambda m: 0.5 * m[2], lambda m: jnp.log(m[0] - 1e6), Half(), validate=False)
     (name,) = system.casimirs()
     assert system.undecided_functions() == {name}
@@ -64,7 +64,7 @@ def test_unknown_is_a_row_of_its_own():
 
 
 def test_it_is_known_without_random_points_after_a_pytree_is_taken_apart():
-    system = in_a_ball()
+    system = system_in_ball()
     again = jax.tree_util.tree_unflatten(*reversed(jax.tree_util.tree_flatten(system)))
     assert again.preserved_names == system.preserved_names
     assert again.first_integrals() == system.first_integrals()
@@ -116,12 +116,12 @@ def test_a_linear_function_that_the_dissipation_preserves_is_kept_to_rounding(st
     def energy(x):
         return jnp.cos(3.0 * x[:3] @ x[3:]) + jnp.exp(x[0] ** 2 + x[1] ** 2) + 0.3 * (x[2] + x[5])
 
-    def about_the_axis(x):
+    def axial_momentum(x):
         return x[2] + x[5]
 
-    friction = lt.ProjectedMetric(preserve=about_the_axis, rate=0.05, normalized=True)
+    friction = lt.ProjectedMetric(preserve=axial_momentum, rate=0.05, normalized=True)
     algebra = mf.direct_sum(mf.so(3), mf.so(3))
     system = lt.LiePoissonSystem(algebra, energy, lambda x: -jnp.log(1.0 + x @ x * (x @ x)), friction, validate=False)
     run = lt.integrate(system, [0.3, 0.4, 0.5, -0.2, 0.6, 0.1], (0.0, 10.0), 0.2, lt.MetriplecticGauss(stages))
-    assert np.abs(run.casimirs["about_the_axis"] - 0.6).max() <= 1e-14
-    assert next(row for row in run.audit().rows if row.law == "drift of about_the_axis").passed
+    assert np.abs(run.casimirs["axial_momentum"] - 0.6).max() <= 1e-14
+    assert next(row for row in run.audit().rows if row.law == "drift of axial_momentum").passed

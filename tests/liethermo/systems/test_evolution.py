@@ -178,7 +178,7 @@ def closed_form_39(q, p, S, h, gamma):
 
 
 def thousand_steps() -> np.ndarray:
-    """Of (39) in extended precision, from (0, 10, 0)."""
+    """Return 1000 steps of (39) in extended precision, from (0, 10, 0)."""
     h = gamma = np.longdouble("0.1")
     expected = [tuple(map(np.longdouble, (0, 10, 0)))]
     for _ in range(1000):

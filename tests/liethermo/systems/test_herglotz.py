@@ -25,7 +25,7 @@ def warm(q, S):
     return 0.5 * q @ q * jnp.exp(-S / 5) + jnp.cos(jnp.sum(q)) + S
 
 
-def tangled(x):
+def coupled_lagrangian(x):
     """No kinetic minus potential energy: v, q and S all multiply each other."""
     q, v, S = x[:2], x[2:4], x[4]
     return 0.5 * jnp.sum((1.5 + jnp.sin(q)) * v**2) + 0.05 * jnp.sum(v**4) + 0.2 * q[0] * v[1] * jnp.cos(S) - q @ q - S
@@ -36,11 +36,15 @@ LAGRANGIANS = {
     "kinetic minus potential": lt.Kinetic(mass) - lt.Potential(warm),
     "constant mass": lt.Kinetic([[2.0, 0.3], [0.3, 1.5]]) - lt.Potential(warm),
     "quadratic": lt.Quadratic(A, [0.1, 0.2, -0.3, 0.4, -1.0], 0.7),
-    "tangled": tangled,
+    "tangled": coupled_lagrangian,
 }
-SLOW = ("constant mass", "kinetic minus potential")
+SLOW_LAGRANGIANS = ("constant mass", "kinetic minus potential")
 each_lagrangian = pytest.mark.parametrize(
-    "L", [pytest.param(L, id=name, marks=pytest.mark.slow if name in SLOW else ()) for name, L in LAGRANGIANS.items()]
+    "L",
+    [
+        pytest.param(L, id=name, marks=pytest.mark.slow if name in SLOW_LAGRANGIANS else ())
+        for name, L in LAGRANGIANS.items()
+    ],
 )
 
 
@@ -96,7 +100,7 @@ def test_the_legendre_transform_has_the_type_of_its_side():
 
 @pytest.mark.slow
 def test_closed_forms_stay_closed():
-    """What is known of L is known of E_L and of H: their entropy cannot fall, and no equation is solved for v."""
+    """E_L and H keep the form of L: their entropy cannot fall, and no equation is solved for v."""
     known = _system(lt.ThermodynamicHerglotz, LAGRANGIANS["kinetic minus potential"])
     assert known.entropy_law == known.hamiltonian_system().entropy_law == "nondecreasing"
     assert isinstance(_system(lt.ThermodynamicHerglotz, LAGRANGIANS["quadratic"]).energy, lt.Quadratic)
@@ -268,7 +272,7 @@ def quartic_start(S0) -> np.ndarray:
 
 
 def errors_of_order(order, S0) -> list:
-    """Of two runs of the quartic action, the second with half the step, against (12) by hand."""
+    """Return the errors of two runs of the quartic action, the second with half the step, against (12) by hand."""
 
     def rate(t, y):  # of quartic_action: L = v^2/2 + v^4/20 - q^4/4 - 0.3 S (1 + q/10)
         q, v, S = y

@@ -22,7 +22,7 @@ def start():
     return porous_piston_state((1.5, 1.2), (0.8, 0.7), 0.9)
 
 
-def mixed(T=0.8, jacket=1.5):
+def gas_state(T=0.8, jacket=1.5):
     N = jnp.array([1.0, 0.7, 0.1])
     return np.array([float(GAS.entropy_at(T, N, 1.0)), *N, 20.0 * np.log(jacket)])
 
@@ -74,7 +74,7 @@ def test_a_porous_piston_rests_at_equal_densities():
 
 def test_the_law_of_mass_action():
     """The densities at rest are those of K(T), which the model computes from standard potentials; atoms are counted."""
-    run = lt.integrate(vessel(), mixed(), (0.0, 300.0), 0.1)
+    run = lt.integrate(vessel(), gas_state(), (0.0, 300.0), 0.1)
     assert run.audit().passed
     end = run.x[-1]
     T = np.asarray(vessel().temperatures(end))

@@ -24,7 +24,7 @@ def warm(x, c):
     return c * jnp.exp(x[-1] / c)
 
 
-def moving(x, c, m):
+def cart_energy(x, c, m):
     """A body on a line, (q, p, S), of mass m and heat capacity c."""
     return 0.5 * x[1] ** 2 / m + warm(x, c)
 
@@ -43,7 +43,9 @@ def star_and_ring(n):
 def network(n=6, seed=0):
     """Bodies on a line with springs, friction, drag and heat; everything random."""
     rng = np.random.default_rng(seed)
-    bodies = lt.Copies(n, moving, 3, (rng.uniform(0.5, 2.0, n), rng.uniform(0.5, 2.0, n)), friction=rng.random((n, 1)))
+    bodies = lt.Copies(
+        n, cart_energy, 3, (rng.uniform(0.5, 2.0, n), rng.uniform(0.5, 2.0, n)), friction=rng.random((n, 1))
+    )
     i = 3 * np.arange(n - 1)
     springs = lt.Each(spring, np.stack([i, i + 3, i + 2], axis=1), rng.uniform(0.5, 2.0, n - 1))
     drag = [(0, 2, 0.3), (1, 4, 0.5)]
@@ -65,7 +67,7 @@ def assert_both_laws(solution, content=0.0):
 
 
 @eqx.filter_jit
-def all_of(energy, x, d, k):
+def value_and_gradients(energy, x, d, k):
     """Value, gradient and all discrete gradients."""
     A, b, _ = gauss_tableau(2)
     stages = stage_gradients(energy, x, 0.0 * x, 0.1, k, A, b)
@@ -84,7 +86,11 @@ def test_each_is_the_sum_of_its_summands(run):
     many = lt.Each(spring, places, k)
     apart = [lt.Function(lambda y, a=a: spring(y, a)).on(at) for at, a in zip(places, k, strict=True)]
     x, d, slopes = rng.standard_normal(6), 0.1 * rng.standard_normal(6), rng.standard_normal((2, 6))
-    for one, other in zip(all_of(many, x, d, slopes), all_of(sum(apart[1:], apart[0]), x, d, slopes), strict=True):
+    for one, other in zip(
+        value_and_gradients(many, x, d, slopes),
+        value_and_gradients(sum(apart[1:], apart[0]), x, d, slopes),
+        strict=True,
+    ):
         assert np.allclose(one, other, rtol=0, atol=1e-13)
 
 
@@ -120,12 +126,15 @@ def test_unusable_copies(make, words):
 
 @pytest.mark.slow
 def test_copies_are_subsystems():
-    """The same field as bodies given one by one; states in one array, names with numbers."""
+    """Copies have the field of bodies given one by one; states in one array, names with numbers."""
     c, m, R = np.array([1.0, 2.0, 0.5]), np.array([0.7, 1.1, 2.0]), np.array([[0.3], [0.0], [0.4]])
     stone = lt.Subsystem(lambda x: jnp.exp(x[0]), 1, name="stone")
     heat = [(0, 1, 0.5), (1, 2, 1.0), (2, 3, 2.0)]
-    many = lt.ComposedSystem([stone, lt.Copies(3, moving, 3, (c, m), R, "cart")], conductance=heat)
-    one = [lt.Subsystem(lambda x, c=c_a, m=m_a: moving(x, c, m), 3, R_a) for c_a, m_a, R_a in zip(c, m, R, strict=True)]
+    many = lt.ComposedSystem([stone, lt.Copies(3, cart_energy, 3, (c, m), R, "cart")], conductance=heat)
+    one = [
+        lt.Subsystem(lambda x, c=c_a, m=m_a: cart_energy(x, c, m), 3, R_a)
+        for c_a, m_a, R_a in zip(c, m, R, strict=True)
+    ]
     apart = lt.ComposedSystem([stone, *one], conductance=heat)
     x = 0.5 * np.random.default_rng(0).standard_normal((2, 10))
     assert np.allclose(many.vector_field(x), apart.vector_field(x), rtol=0, atol=1e-14)
@@ -136,7 +145,7 @@ def test_copies_are_subsystems():
         lt.Copies(2, lt.Kinetic([0.5]) + lt.Function(warm_of_one).on([2]), 3, friction="contact")
     )
     assert contact.entropy_law == "nondecreasing"
-    assert lt.ComposedSystem(lt.Copies(2, moving, 3, (c[:2], m[:2]), "contact")).entropy_law is None
+    assert lt.ComposedSystem(lt.Copies(2, cart_energy, 3, (c[:2], m[:2]), "contact")).entropy_law is None
 
 
 def warm_of_one(y):
@@ -358,20 +367,20 @@ def test_a_large_system_is_checked_without_its_matrices():
 CSV = "source,target,conductance\n0,1,1.5\n10,1,2\n"
 
 
-def written(tmp_path, text, name="graph.csv"):
+def write_file(tmp_path, text, name="graph.csv"):
     path = tmp_path / name
     path.write_text(text, encoding="utf-8")
     return path
 
 
 def test_a_csv_file(tmp_path):
-    graph = lt.read_graph(written(tmp_path, CSV))
+    graph = lt.read_graph(write_file(tmp_path, CSV))
     assert graph.names == ("0", "1", "10")
     assert graph.matrix.toarray().tolist() == [[0.0, 1.5, 0.0], [1.5, 0.0, 2.0], [0.0, 2.0, 0.0]]
     named = "a, source, target, w\n1, wall, air, 2\n2, window, air, 3\n"
-    graph = lt.read_graph(written(tmp_path, named), weight="w")
+    graph = lt.read_graph(write_file(tmp_path, named), weight="w")
     assert graph.names == ("wall", "air", "window")
-    ordered = lt.read_graph(written(tmp_path, named), weight="w", nodes=["air", "wall", "window"])
+    ordered = lt.read_graph(write_file(tmp_path, named), weight="w", nodes=["air", "wall", "window"])
     assert ordered.matrix.toarray()[0].tolist() == [0.0, 2.0, 3.0]
     assert len(ordered) == 3
     system = lt.models.thermo_particles(np.ones(3), ordered.matrix)
@@ -399,14 +408,14 @@ def test_a_csv_file(tmp_path):
 )
 def test_unusable_files(tmp_path, text, options, words):
     with pytest.raises(lt.InputError, match=words):
-        lt.read_graph(written(tmp_path, text), **options)
+        lt.read_graph(write_file(tmp_path, text), **options)
 
 
 def test_files_that_cannot_be_read(tmp_path):
     with pytest.raises(lt.FileError, match="there is no file"):
         lt.read_graph(tmp_path / "none.csv")
     with pytest.raises(lt.FileError, match=r"neither .csv nor .graphml"):
-        lt.read_graph(written(tmp_path, CSV, "graph.txt"))
+        lt.read_graph(write_file(tmp_path, CSV, "graph.txt"))
     (tmp_path / "binary.csv").write_bytes(b"source,target,conductance\n\xff\xfe,1,2\n")
     with pytest.raises(lt.FileError, match="cannot be read as CSV"):
         lt.read_graph(tmp_path / "binary.csv")
@@ -426,21 +435,21 @@ GRAPHML = """<?xml version="1.0" encoding="utf-8"?>
 def test_graphml_needs_networkx(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "networkx", None)
     with pytest.raises(lt.FileError, match=r"pip install networkx$"):
-        lt.read_graph(written(tmp_path, GRAPHML.replace("MORE", ""), "g.graphml"))
+        lt.read_graph(write_file(tmp_path, GRAPHML.replace("MORE", ""), "g.graphml"))
 
 
 def test_a_graphml_file(tmp_path):
-    graph = lt.read_graph(written(tmp_path, GRAPHML.replace("MORE", ""), "g.graphml"))
+    graph = lt.read_graph(write_file(tmp_path, GRAPHML.replace("MORE", ""), "g.graphml"))
     assert graph.names == ("wall", "air")
     assert graph.matrix.toarray().tolist() == [[0.0, 2.5], [2.5, 0.0]]
     more = '<edge source="air" target="window"><data key="k">1</data></edge>'
     with pytest.raises(lt.InputError, match="no node 'window' among the 2"):
-        lt.read_graph(written(tmp_path, GRAPHML.replace("MORE", more), "g.graphml"))
+        lt.read_graph(write_file(tmp_path, GRAPHML.replace("MORE", more), "g.graphml"))
     with pytest.raises(lt.FileError, match="cannot be read as GraphML"):
-        lt.read_graph(written(tmp_path, GRAPHML[:200], "g.graphml"))
+        lt.read_graph(write_file(tmp_path, GRAPHML[:200], "g.graphml"))
     bare = GRAPHML.replace("MORE", "").replace('<data key="k">2.5</data>', "")
     with pytest.raises(lt.InputError, match="the conductance is None, not a number"):
-        lt.read_graph(written(tmp_path, bare, "g.graphml"))
+        lt.read_graph(write_file(tmp_path, bare, "g.graphml"))
 
 
 def particles(conductance):

@@ -11,7 +11,7 @@ import manifolds as mf
 from tests.manifolds.spaces.test_own_spaces import HEISENBERG, Ellipsoid
 
 
-def on_the_group():
+def heisenberg_system():
     """Points [[1, a, c], [0, 1, b], [0, 0, 1]]; the left-invariant fields d/da and d/dc commute, and b is a Casimir."""
     bracket = np.zeros((9, 9))
     bracket[1, 2], bracket[2, 1] = 1.0, -1.0
@@ -26,7 +26,7 @@ def on_the_group():
 
 def test_a_system_on_a_group_of_ones_own():
     """The group stands for its space, and the axioms hold at random elements of it."""
-    system = on_the_group()
+    system = heisenberg_system()
     assert system.space == mf.GroupSpace(HEISENBERG)
     assert system.check().passed
 
@@ -42,7 +42,7 @@ def test_a_system_on_a_group_of_ones_own():
     ],
 )
 def test_a_group_of_ones_own_keeps_the_laws(method, retraction):
-    system = on_the_group()
+    system = heisenberg_system()
     start = np.array([[1.0, 0.7, -0.4], [0.0, 1.0, 0.1], [0.0, 0.0, 1.0]])
     how = method(1, retraction=retraction) if method is lt.MetriplecticGauss else method(retraction=retraction)
     run = lt.integrate(system, start, (0.0, 2.0), 0.1, how, engine="array")

@@ -82,8 +82,8 @@ def state(system, seed=0):
 
 
 @jax.jit
-def looked_at(system, x, d, compensation, k):
-    """What a step asks of a system: numbers, and vectors."""
+def evaluate_functions(system, x, d, compensation, k):
+    """Return the values that a step asks of a system: two numbers, the rounding scale, and vectors."""
     A, b, _ = gauss_tableau(2)
     energy = system.energy
     gradients = [
@@ -100,8 +100,8 @@ def test_functions_are_the_same(name):
     system = SYSTEMS[name]
     found, x = system.reorder_components(), state(system)
     d, compensation, k = (scale * jnp.asarray(RANDOM.standard_normal(shape)) for scale, shape in shapes(x.size))
-    one = looked_at(system, x, d, compensation, k)
-    other = looked_at(found.system, *map(found.reorder_state, (x, d, compensation, k)))
+    one = evaluate_functions(system, x, d, compensation, k)
+    other = evaluate_functions(found.system, *map(found.reorder_state, (x, d, compensation, k)))
     assert found.system.energy.is_quadratic == system.energy.is_quadratic
     np.testing.assert_allclose(other[0], one[0], rtol=1e-13, atol=1e-13)
     np.testing.assert_allclose(found.restore_state(other[2]), one[2], rtol=1e-12, atol=1e-13)
@@ -132,18 +132,18 @@ def test_steps_are_the_same(name, method):
         )
 
 
-LARGE = 400
+N_LARGE = 400
 
 
 def ring(**changes):
-    return lt.models.spin_lattice(LARGE, anisotropy_constant=0.1, rate=0.2, **changes)
+    return lt.models.spin_lattice(N_LARGE, anisotropy_constant=0.1, rate=0.2, **changes)
 
 
 @pytest.mark.parametrize("method", [METHODS[0], *METHODS[3:], lt.MetriplecticTaylor(4)], ids=str)
 @pytest.mark.sampled(1)
 def test_a_run_of_a_large_system_is_in_that_order_and_no_user_sees_it(method, monkeypatch):
     system = ring()
-    x0 = system.state(unit(LARGE))
+    x0 = system.state(unit(N_LARGE))
     assert x0.size > DEFAULT_OPTIONS.rms_norm_dim
     run = (system, x0, (0.0, 0.2), 0.05, method)
     found = lt.integrate(*run)
@@ -159,7 +159,7 @@ def test_levels_keep_their_places():
     """Levels of an explicit method are no components of a state."""
     system, method = ring(), lt.MetriplecticRungeKutta(4)
     own = method.on(system)
-    first = initial_run_state_program(system, own, jnp.asarray(system.state(unit(LARGE))))
+    first = initial_run_state_program(system, own, jnp.asarray(system.state(unit(N_LARGE))))
     _, _, inside, back = reorder_components(system, own, first)
     np.testing.assert_array_equal(inside.k[3], first.k[3])
     for name, value in first._asdict().items():
@@ -170,7 +170,7 @@ def test_levels_keep_their_places():
 def test_adaptive_steps_are_the_same(monkeypatch):
     def path():
         system = ring()
-        return lt.integrate(system, system.state(unit(LARGE)), (0.0, 0.2), lt.Adaptive(1e-6), METHODS[-1]).x[-1]
+        return lt.integrate(system, system.state(unit(N_LARGE)), (0.0, 0.2), lt.Adaptive(1e-6), METHODS[-1]).x[-1]
 
     found = path()
     monkeypatch.setattr(lt.SpinSystem, "reorder_components", lambda self: None)
@@ -184,7 +184,7 @@ def test_noise_is_that_of_sites_whatever_the_order(monkeypatch):
     def path():
         system = ring()
         noise = lt.Fluctuations(1e-3, seed=1)
-        return lt.integrate(system, system.state(unit(LARGE)), (0.0, 0.2), 0.05, noise=noise).x[-1]
+        return lt.integrate(system, system.state(unit(N_LARGE)), (0.0, 0.2), 0.05, noise=noise).x[-1]
 
     found = path()
     monkeypatch.setattr(lt.SpinSystem, "reorder_components", lambda self: None)
@@ -206,7 +206,7 @@ def test_a_scheme_that_takes_coordinates_in_their_order_keeps_it():
 @pytest.mark.slow
 def test_derivatives_go_through():
     system, method = ring(), lt.MetriplecticMidpoint()
-    x0, v = jnp.asarray(system.state(unit(LARGE))), jnp.asarray(RANDOM.standard_normal(3 * LARGE + 1))
+    x0, v = jnp.asarray(system.state(unit(N_LARGE))), jnp.asarray(RANDOM.standard_normal(3 * N_LARGE + 1))
 
     def end(x):
         return lt.flow(system, x, (0.0, 0.1), 0.05, method)
@@ -226,12 +226,12 @@ def test_what_has_no_other_order():
     assert driven.reorder_components() is None
     assert lt.models.rigid_body().reorder_components() is None
 
-    class Own(lt.LandauLifshitz):
+    class DoubledFriction(lt.LandauLifshitz):
         def force(self, system, x, dH, dS, dL):
             return 2.0 * super().force(system, x, dH, dS, dL)
 
-    mine = lt.SpinSystem(3, lt.magnetism.zeeman(3, (0.0, 0.0, 1.0)), Own(0.1))
-    assert type(mine.dissipation) is Own  # which may say something else of components
+    mine = lt.SpinSystem(3, lt.magnetism.zeeman(3, (0.0, 0.0, 1.0)), DoubledFriction(0.1))
+    assert type(mine.dissipation) is DoubledFriction  # which may say something else of components
     assert mine.reorder_components() is None
     once = lt.SpinSystem(3, lt.magnetism.zeeman(3, (0.0, 0.0, 1.0)), lt.LandauLifshitz(0.1))
     x, motion = state(mine), mine.poisson.sharp(state(mine), mine.energy.gradient(state(mine)))
@@ -248,7 +248,7 @@ def test_control_a_wrong_order_is_seen():
     """Steps from a state in the other order, taken for one that is not."""
     system = ring()
     found = system.reorder_components()
-    first = initial_run_state_program(system, lt.MetriplecticMidpoint(), jnp.asarray(system.state(unit(LARGE))))
+    first = initial_run_state_program(system, lt.MetriplecticMidpoint(), jnp.asarray(system.state(unit(N_LARGE))))
     right = array.advance(system, lt.MetriplecticMidpoint(), first, *map(jnp.asarray, (0.05, 1, 1)), 1)[0]
     wrong = first._replace(x=found.reorder_state(first.x))
     other = array.advance(system, lt.MetriplecticMidpoint(), wrong, *map(jnp.asarray, (0.05, 1, 1)), 1)[0]

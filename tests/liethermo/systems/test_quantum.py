@@ -14,10 +14,13 @@ import manifolds as mf
 from liethermo.functions.gradients import EPS
 
 LOWER = np.array([[0.0, 1.0], [0.0, 0.0]], dtype=complex)
-X, Y, Z = (np.array(m, dtype=complex) for m in ([[0, 1], [1, 0]], [[0, -1j], [1j, 0]], [[1, 0], [0, -1]]))
+X = np.array([[0, 1], [1, 0]], dtype=complex)
+Y = np.array([[0, -1j], [1j, 0]], dtype=complex)
+Z = np.array([[1, 0], [0, -1]], dtype=complex)
 QUBIT = np.diag([0.0, 1.3]).astype(complex)
 RHO = np.array([[0.3, 0.2 - 0.1j], [0.2 + 0.1j, 0.7]])
-T, RATE = 0.7, 0.2
+T = 0.7
+RATE = 0.2
 
 
 def infinite(temperature=T):
@@ -134,7 +137,7 @@ def test_the_generator_is_the_force_at_the_gradients(name):
 
 
 def test_the_entropy_has_a_discrete_gradient_in_closed_form():
-    """What it changes by is right to rounding relative to the step, however short that is."""
+    """The change of the entropy is right to rounding relative to the step, however short that is."""
     S = lt.VonNeumann()
     structure = mf.DensityMatrices(3)
     x, other = (structure.vector(random_density(3, seed)) for seed in (1, 2))
@@ -160,7 +163,7 @@ METHODS = {
 }
 
 
-def by_scipy(rho, capacity, t):
+def solve_by_scipy(rho, capacity, t):
     """A qubit in a finite bath, by a program of its own: the last state, as the matrix and the entropy of the bath."""
 
     def field(_, y):
@@ -182,7 +185,7 @@ def test_orders(name):
     method, order, steps = METHODS[name]
     q = lt.QuantumSystem(QUBIT, lt.ThermalJumps([(LOWER, RATE)]), baths=lt.HeatBaths(capacity=0.8, temperature=T))
     x0 = q.state(RHO)
-    rho, y = by_scipy(np.asarray(RHO, complex), 0.8, 2.4)
+    rho, y = solve_by_scipy(np.asarray(RHO, complex), 0.8, 2.4)
     exact = q.state(rho / np.trace(rho), entropies=[y])
     errors = [np.abs(lt.integrate(q, x0, (0.0, 2.4), h, method).x[-1] - exact).max() for h in steps]
     slopes = np.diff(np.log(errors)) / np.diff(np.log(steps))
@@ -210,7 +213,7 @@ def levels(n, couplings, baths=None):
 
 
 TWO = [lt.ThermalJumps([(FULL[:2, :2], RATE)]), lt.ThermalJumps([(FULL[1:, 1:], 0.1)], bath=1)]
-ALL = {
+QUANTUM_SYSTEMS = {
     "no dissipation": lambda: levels(3, None),
     "an infinite bath": lambda: levels(3, lt.ThermalJumps([(FULL, RATE)]), infinite()),
     "a finite bath": lambda: levels(2, TWO[0], lt.HeatBaths(capacity=0.8, temperature=T)),
@@ -229,19 +232,19 @@ STEPS = {
     "explicit": lt.MetriplecticRungeKutta(4),
     "Gauss": lt.MetriplecticGauss(2),
 }
-CROSSED = [
+SYSTEM_METHOD_PAIRS = [
     (name, by)
-    for name in ALL
+    for name in QUANTUM_SYSTEMS
     for by in STEPS
     if by != "Taylor" or not name.startswith("steepest")  # refused: no series of the entropy
 ]
 
 
 @pytest.mark.sampled("a finite bath-Taylor", "dephasing-midpoint", "unital noise-explicit")
-@pytest.mark.parametrize(("name", "by"), CROSSED)
+@pytest.mark.parametrize(("name", "by"), SYSTEM_METHOD_PAIRS)
 def test_every_dissipation_keeps_its_laws_by_every_method(name, by):
     """From random states; and from one next to a pure state, at which steps may be refused."""
-    q = ALL[name]()
+    q = QUANTUM_SYSTEMS[name]()
     size = q.structure.size
     pure = np.array([0.6, 0.8j, 0.0])[:size]
     states = [
@@ -607,7 +610,7 @@ def test_a_pure_state_is_refused_with_what_to_do():
     assert np.linalg.eigvalsh(q.density(q.state([0.0, 1.0], mixed=1e-6)))[0] == pytest.approx(5e-7)
 
 
-TURNED = [0.6, 0.8]
+PRECESSING_STATE = [0.6, 0.8]
 """A pure state that the Hamiltonian of the qubit turns."""
 
 
@@ -616,16 +619,18 @@ def test_a_pure_state_with_a_floor_is_refused_where_steps_would_be_wrong():
     floor = lt.VonNeumann(floor=1e-12)
     q = lt.QuantumSystem(QUBIT, lt.SteepestEntropyAscent(0.4), entropy=floor)
     with pytest.raises(lt.InputError, match=r"the Hamiltonian turns their eigenvectors.*mix it"):
-        lt.integrate(q, q.state(TURNED), (0.0, 1.0), 0.1)
+        lt.integrate(q, q.state(PRECESSING_STATE), (0.0, 1.0), 0.1)
     still = lt.integrate(q, q.state([1.0, 0.0]), (0.0, 1.0), 0.1)
     assert np.abs(q.density(still.x[-1]) - np.diag([1.0, 0.0])).max() <= 1e-15
     dephasing = lt.QuantumSystem(QUBIT, lt.ThermalJumps([(Z, 0.3)]), entropy=floor)
     with pytest.raises(lt.InputError, match=r"take lt\.MetriplecticRungeKutta"):
-        lt.integrate(dephasing, dephasing.state(TURNED), (0.0, 1.0), 0.1)
+        lt.integrate(dephasing, dephasing.state(PRECESSING_STATE), (0.0, 1.0), 0.1)
     for what in (lambda x: lt.flow(dephasing, x, (0.0, 1.0), 0.1), lambda x: lt.suggest_step(dephasing, x)):
         with pytest.raises(lt.InputError, match=r"cannot start at this x0.*take lt\.MetriplecticRungeKutta"):
-            what(dephasing.state(TURNED))
-    end = lt.integrate(dephasing, dephasing.state(TURNED), (0.0, 1.0), 0.1, lt.MetriplecticRungeKutta(8)).x[-1]
+            what(dephasing.state(PRECESSING_STATE))
+    end = lt.integrate(dephasing, dephasing.state(PRECESSING_STATE), (0.0, 1.0), 0.1, lt.MetriplecticRungeKutta(8)).x[
+        -1
+    ]
     assert abs(abs(dephasing.density(end)[0, 1]) - 0.48 * np.exp(-0.6)) <= 1e-11
 
 
@@ -635,7 +640,7 @@ def test_an_ensemble_refuses_what_a_single_run_refuses(driven):
     H = (lambda t: (1.0 + 0.1 * t) * QUBIT) if driven else QUBIT
     q = lt.QuantumSystem(H, lt.ThermalJumps([(Z, 0.3)]), entropy=lt.VonNeumann(floor=1e-12))
     x0s = np.stack([q.state(RHO)] * 5)
-    x0s[3] = q.state(TURNED)
+    x0s[3] = q.state(PRECESSING_STATE)
     many = lt.ensemble(q, x0s, (0.0, 0.2), 0.1)
     assert np.flatnonzero(~many.ok).tolist() == [3]
     assert many.message(3).startswith("trajectory 3: the run cannot start at this x0: its density matrix has")
@@ -644,7 +649,7 @@ def test_an_ensemble_refuses_what_a_single_run_refuses(driven):
     assert many.message(3) == f"trajectory 3: {one.value}"
     assert np.array_equal(many.x[4], lt.integrate(q, x0s[4], (0.0, 0.2), 0.1).x[-1])
     with pytest.raises(lt.InputError, match=r"trajectory 0: the run cannot start.*take lt\.MetriplecticRungeKutta"):
-        lt.ensemble(q, q.state(TURNED), (0.0, 0.2), 0.1)
+        lt.ensemble(q, q.state(PRECESSING_STATE), (0.0, 0.2), 0.1)
     assert lt.ensemble(q, x0s, (0.0, 0.2), 0.1, lt.MetriplecticRungeKutta(4)).ok.all()
 
 
@@ -707,7 +712,7 @@ def test_many_qubits_reach_the_gibbs_states_of_their_baths():
     assert np.abs(qubit().density(many.x) - gibbs).max() <= 1e-9
 
 
-WATCHED = {
+EVENT_CASES = {
     "midpoint": (lt.MetriplecticMidpoint(), 0.05, 1e-3),
     "explicit": (lt.MetriplecticRungeKutta(8), 0.05, 1e-12),
     "Taylor": (lt.MetriplecticTaylor(12), 0.25, 1e-12),
@@ -716,10 +721,10 @@ WATCHED = {
 
 
 @pytest.mark.sampled("explicit")
-@pytest.mark.parametrize("name", WATCHED)
+@pytest.mark.parametrize("name", EVENT_CASES)
 def test_a_run_stops_where_a_population_or_the_purity_has_a_value(name):
     """Beside the closed form of the population, which falls to 0.3, and the purity of the last state."""
-    (method, step, within), q = WATCHED[name], qubit()
+    (method, step, within), q = EVENT_CASES[name], qubit()
     start = np.array([[0.1, 0.1], [0.1, 0.9]])
     fast, rest = RATE * 2 * np.cosh(1.3 / (2 * T)), np.exp(-1.3 / T) / (1.0 + np.exp(-1.3 / T))
     time = np.log((0.9 - rest) / (0.3 - rest)) / fast
@@ -812,7 +817,7 @@ def test_a_coupling_that_does_not_commute_exchanges_energy_whatever_the_constant
 
 @pytest.mark.parametrize("spacing", [1.0, 0.1])
 def test_equal_differences_of_levels_are_one_frequency(spacing):
-    """Those of 0.1 n differ by rounding, by more so beside a constant; the coupling stays in one piece."""
+    """Distances of the levels 0.1 n differ by rounding, more so beside a constant; the coupling stays in one piece."""
     for c in (0.0, 1e8):
         H, V = np.diag(spacing * np.arange(12.0) + c), np.diag(np.sqrt(np.arange(1.0, 12.0)), 1)
         turned = np.linalg.qr(random_hermitian(12))[0]
@@ -934,7 +939,7 @@ def test_pure_states_run_by_methods_without_the_gradient_of_the_entropy(baths):
         )
         z = float(q.expectation(run.x[-1], Z))
         if baths == "a finite bath":
-            rho, _ = by_scipy(np.diag([0.0, 1.0]).astype(complex), 2.0, 2.0)
+            rho, _ = solve_by_scipy(np.diag([0.0, 1.0]).astype(complex), 2.0, 2.0)
             assert z == pytest.approx((rho[0, 0] - rho[1, 1]).real, abs=1e-11)
         else:
             assert z == pytest.approx(rest - (1.0 + rest) * np.exp(-2.0 * fast), abs=1e-11)
@@ -989,7 +994,7 @@ def test_the_advice_for_a_pure_state_under_steepest_ascent_works():
 
 @pytest.mark.slow
 def test_steepest_ascent_ends_in_a_cold_state():
-    """Of little energy: eight levels, at a temperature of a fourteenth of their distance; and a run goes on there."""
+    """Eight levels reach a temperature of a fourteenth of their distance, and a run goes on there."""
     q = lt.QuantumSystem(np.diag(np.arange(8.0)), lt.SteepestEntropyAscent(1.0))
     start = np.diag([1.0 - 1e-6 - 6e-9, 1e-6, *[1e-9] * 6])
     for method in (lt.MetriplecticMidpoint(), lt.MetriplecticGauss(2)):
@@ -1018,7 +1023,7 @@ def test_a_ket_may_be_a_column():
 
 
 class HasFull:
-    """What QuTiP's operators have: their matrix by a method, a call, and no array."""
+    """A stand-in for QuTiP's operators, which have a method for their matrix, a call, and no array."""
 
     def __init__(self, matrix):
         self.matrix = matrix

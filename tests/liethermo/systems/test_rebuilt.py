@@ -11,22 +11,22 @@ import manifolds as mf
 from liethermo.testing.runs import rebuild_pytree
 from liethermo.tracing.interpret import evaluate_at_points
 from tests.cases import DISSIPATIONS, build, slow
-from tests.liethermo.closed_systems import ISOLATED
+from tests.liethermo.closed_systems import ISOLATED_SYSTEMS
 from tests.liethermo.integrators.test_convergence import SYSTEMS
 
-NEEDED = {
+REQUIRED_ARGUMENTS = {
     "zeitlin": {"N": 4},
     "magnetic_fluid": {"N": 4},
     "tumbling_body": {"inertia": (3.0, 2.0, 1.5), "rate": 0.1},
 }
 
 
-def each_system():
+def system_builders():
     yield from ((f"so(3), {case.name}", lambda case=case: build(mf.so(3), case)) for case in DISSIPATIONS)
     yield from SYSTEMS.items()
-    yield from ((f"simple closed, {name}", lambda name=name: ISOLATED[name]) for name in ISOLATED)
+    yield from ((f"simple closed, {name}", lambda name=name: ISOLATED_SYSTEMS[name]) for name in ISOLATED_SYSTEMS)
     for name in sorted({*lt.models.__all__} - {"IdealMixture", "QuantisedSphere"}):  # which are no systems
-        yield f"model {name}", functools.partial(getattr(lt.models, name), **NEEDED.get(name, {}))
+        yield f"model {name}", functools.partial(getattr(lt.models, name), **REQUIRED_ARGUMENTS.get(name, {}))
 
 
 def _field(system, x):
@@ -34,7 +34,7 @@ def _field(system, x):
 
 
 @pytest.mark.sampled(2)
-@pytest.mark.parametrize("make", [pytest.param(make, id=name) for name, make in each_system()])
+@pytest.mark.parametrize("make", [pytest.param(make, id=name) for name, make in system_builders()])
 def test_fields_and_laws(make):
     system = make()
     again = rebuild_pytree(system)

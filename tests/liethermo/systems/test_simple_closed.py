@@ -10,9 +10,9 @@ import pytest
 import liethermo as lt
 from liethermo.tracing.interpret import evaluate_at_points
 from tests.cases import tolerance
-from tests.liethermo.closed_systems import ISOLATED, MECHANICAL, OPEN, X0, friction, swirl
+from tests.liethermo.closed_systems import ISOLATED_SYSTEMS, MECHANICAL, OPEN, X0, friction, swirl
 
-KINDS = {"isolated": ISOLATED, "open": OPEN}
+KINDS = {"isolated": ISOLATED_SYSTEMS, "open": OPEN}
 
 each_system = pytest.mark.parametrize(
     ("kind", "name"), [(kind, name) for kind in ("isolated", "open") for name in KINDS[kind]]
@@ -20,7 +20,7 @@ each_system = pytest.mark.parametrize(
 
 
 def residuals(system, x):
-    """Of q' = v, of both equations (2.4), of E' = F_ext . v + P_H and S' = (P_H - F_fr . v)/T; the production."""
+    """Return residuals (q' = v, both equations (2.4), energy, ledger), E', and the production -F_fr . v / T."""
     n, rate = system.degrees_of_freedom, system.vector_field(x)
     q, v, S, t = system.parts(x)
     by_q, by_v, by_S = jax.grad(system.action, argnums=(0, 1, 2))(q, v, S)
@@ -54,7 +54,7 @@ def test_the_equations_and_both_balances(kind, name):
 
 
 @functools.cache
-def small():
+def small_system():
     return lt.SimpleClosedSystem(
         lt.Quadratic([-1.0, 2.0, 0.0]) - lt.Function(lambda y: jnp.exp(y[0])).on([2]),
         3,
@@ -66,7 +66,7 @@ def small():
 
 @pytest.mark.slow
 def test_the_metriplectic_schemes_run_a_small_one_and_keep_its_laws():
-    _run_and_judge(small(), [0.4, 0.5, 0.2])
+    _run_and_judge(small_system(), [0.4, 0.5, 0.2])
 
 
 @pytest.mark.slow
@@ -85,7 +85,7 @@ def _run_and_judge(system, x0):
 
 
 def test_the_ledger_in_the_audit():
-    system = small()
+    system = small_system()
     solution = lt.integrate(system, [0.4, 0.5, 0.2], (0.0, 2.0), 0.05)
     work, heat = solution.casimirs["work received"], solution.casimirs["heat received"]
     assert min(abs(work[-1]), abs(heat[-1])) > 0.01
@@ -99,7 +99,7 @@ def test_the_ledger_in_the_audit():
 
 
 def test_a_ledger_is_written_and_read(tmp_path):
-    solution = lt.integrate(small(), [0.4, 0.5, 0.2], (0.0, 2.0), 0.05)
+    solution = lt.integrate(small_system(), [0.4, 0.5, 0.2], (0.0, 2.0), 0.05)
     again = lt.load(solution.save(tmp_path / "run.nc"))
     assert str(again.audit()) == str(solution.audit())
 

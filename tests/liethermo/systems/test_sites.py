@@ -29,11 +29,13 @@ def system(dissipation=None, algebra=G, **named):
 def test_user_functions_results_and_files_have_the_shape_of_the_sites(tmp_path):
     seen = []
 
-    def watched(s):
+    def recorded_exchange(s):
         seen.append(s.shape)
         return exchange(s)
 
-    made = lt.LiePoissonSystem(G, watched, entropy, momentum_maps={"m": lambda s: jnp.sum(s[..., 2])}, validate=False)
+    made = lt.LiePoissonSystem(
+        G, recorded_exchange, entropy, momentum_maps={"m": lambda s: jnp.sum(s[..., 2])}, validate=False
+    )
     assert set(seen) == {G.shape}
     run = {"t_span": (0.0, 0.3), "step": 0.1, "engine": "array"}
     solution = lt.integrate(made, STATE, until=lambda s: s[0, 0, 0] - 1e9, dense=True, **run)

@@ -18,7 +18,8 @@ SITES = (3, 4)
 COUNT = 12
 RANDOM = np.random.default_rng(7)
 SPINS = RANDOM.standard_normal((*SITES, 3))
-JS, DS = RANDOM.standard_normal(SITES), RANDOM.standard_normal((*SITES, 3))
+JS = RANDOM.standard_normal(SITES)
+DS = RANDOM.standard_normal((*SITES, 3))
 
 
 def unit(*sites, seed=0):
@@ -26,7 +27,7 @@ def unit(*sites, seed=0):
     return s / np.linalg.norm(s, axis=-1, keepdims=True)
 
 
-def over_pairs(s, offsets, closed, pair):
+def sum_over_pairs(s, offsets, closed, pair):
     """The sum of ``pair(site, s_i, s_j)`` over pairs of a site with the one ahead, as loops."""
     total = 0.0
     for site in np.ndindex(*SITES):
@@ -44,16 +45,16 @@ EDGES = [(int(i), int(j), float(MATRIX[i, j])) for i, j in zip(*np.nonzero(MATRI
 VECTORS = [(3, 1, (0.1, 0.2, -0.3)), (0, 11, (1.0, 0.0, 0.5))]
 
 
-def on_edges(s, edges, pair):
+def sum_over_edges(s, edges, pair):
     flat = s.reshape(-1, 3)
     return sum(pair(flat[i], flat[j], weight) for i, j, weight in edges)
 
 
-def aligned(a, b, J):
+def pair_exchange(a, b, J):
     return -J * jnp.dot(a, b)
 
 
-def turned(a, b, D):
+def pair_dmi(a, b, D):
     return jnp.dot(jnp.asarray(D), jnp.cross(a, b))
 
 
@@ -62,32 +63,32 @@ ENERGIES = BuiltOnUse(
     {
         "exchange": lambda: (
             mag.exchange(SITES, 0.7),
-            lambda s: over_pairs(s, NEAREST, (True, True), lambda site, a, b: -0.7 * a @ b),
+            lambda s: sum_over_pairs(s, NEAREST, (True, True), lambda site, a, b: -0.7 * a @ b),
         ),
         "open, of each pair": lambda: (
             mag.exchange(SITES, JS, periodic=(False, True)),
-            lambda s: over_pairs(s, NEAREST, (False, True), lambda site, a, b: -JS[site] * (a @ b)),
+            lambda s: sum_over_pairs(s, NEAREST, (False, True), lambda site, a, b: -JS[site] * (a @ b)),
         ),
         "diagonal neighbours": lambda: (
             mag.exchange(SITES, [JS, 2.0 * JS], neighbours=[(1, -1), (0, 2)]),
             lambda s: (
-                over_pairs(s, [(1, -1)], (True, True), lambda site, a, b: -JS[site] * (a @ b))
-                + over_pairs(s, [(0, 2)], (True, True), lambda site, a, b: -2.0 * JS[site] * (a @ b))
+                sum_over_pairs(s, [(1, -1)], (True, True), lambda site, a, b: -JS[site] * (a @ b))
+                + sum_over_pairs(s, [(0, 2)], (True, True), lambda site, a, b: -2.0 * JS[site] * (a @ b))
             ),
         ),
-        "matrix": lambda: (mag.exchange(COUNT, MATRIX + MATRIX.T), lambda s: on_edges(s, EDGES, aligned)),
+        "matrix": lambda: (mag.exchange(COUNT, MATRIX + MATRIX.T), lambda s: sum_over_edges(s, EDGES, pair_exchange)),
         "sparse": lambda: (
             mag.exchange(COUNT, scipy.sparse.csr_array(MATRIX + MATRIX.T)),
-            lambda s: on_edges(s, EDGES, aligned),
+            lambda s: sum_over_edges(s, EDGES, pair_exchange),
         ),
-        "edges": lambda: (mag.exchange(SITES, EDGES), lambda s: on_edges(s, EDGES, aligned)),
+        "edges": lambda: (mag.exchange(SITES, EDGES), lambda s: sum_over_edges(s, EDGES, pair_exchange)),
         "DMI": lambda: (
             mag.dzyaloshinskii_moriya(SITES, DS, periodic=False),
-            lambda s: over_pairs(s, NEAREST, (False, False), lambda site, a, b: turned(a, b, DS[site])),
+            lambda s: sum_over_pairs(s, NEAREST, (False, False), lambda site, a, b: pair_dmi(a, b, DS[site])),
         ),
         "DMI on edges": lambda: (
             mag.dzyaloshinskii_moriya(SITES, VECTORS),
-            lambda s: on_edges(s, VECTORS, turned),
+            lambda s: sum_over_edges(s, VECTORS, pair_dmi),
         ),
         "anisotropy": lambda: (
             mag.anisotropy(SITES, JS, DS),
@@ -120,23 +121,31 @@ def test_energies_are_the_sums_over_their_edges(name):
 
 
 D = 0.3
-IN_PLANE = [(0.0, D, 0.0), (-D, 0.0, 0.0)]
+PLANE_VECTORS = [(0.0, D, 0.0), (-D, 0.0, 0.0)]
 
 
 @pytest.mark.parametrize(
     "vectors",
-    [IN_PLANE, [(0, D, 0), (-D, 0, 0)], tuple(IN_PLANE), [list(v) for v in IN_PLANE], [np.array(v) for v in IN_PLANE]],
+    [
+        PLANE_VECTORS,
+        [(0, D, 0), (-D, 0, 0)],
+        tuple(PLANE_VECTORS),
+        [list(v) for v in PLANE_VECTORS],
+        [np.array(v) for v in PLANE_VECTORS],
+    ],
     ids=["tuples", "with integers", "tuple", "lists", "arrays"],
 )
 def test_a_vector_for_each_neighbour_is_no_list_of_edges(vectors):
     """``[(0, D, 0), (-D, 0, 0)]`` was read as the edges (0, D) and (-D, 0)."""
     energy = lt.models.spin_lattice(SITES, 0.0, dmi=vectors, baths=False).energy
-    given = {(1, 0): IN_PLANE[0], (0, 1): IN_PLANE[1]}
+    given = {(1, 0): PLANE_VECTORS[0], (0, 1): PLANE_VECTORS[1]}
 
-    def written(s):
-        return sum(over_pairs(s, [o], (True, True), lambda site, a, b, v=v: turned(a, b, v)) for o, v in given.items())
+    def energy_by_pairs(s):
+        return sum(
+            sum_over_pairs(s, [o], (True, True), lambda site, a, b, v=v: pair_dmi(a, b, v)) for o, v in given.items()
+        )
 
-    assert float(energy.value(SPINS.ravel())) == pytest.approx(float(written(SPINS)), abs=1e-13)
+    assert float(energy.value(SPINS.ravel())) == pytest.approx(float(energy_by_pairs(SPINS)), abs=1e-13)
 
 
 def test_a_list_of_integers_is_a_vector_for_the_neighbour():
@@ -168,7 +177,7 @@ def formula(x, sites, H_s, rate, ratio, capacity):
     return np.append((g * torque + r * np.cross(s, torque)).ravel(), np.sum(r * torque**2) / T)
 
 
-def small(**changes):
+def small_lattice(**changes):
     """Three spins with everything."""
     given = {"exchange_constant": 0.8, "anisotropy_constant": 0.3, "field": (0.2, 0.0, 0.5), "dmi": (0.1, 0.3, 0.0)}
     return lt.models.spin_lattice(3, rate=np.array([0.1, 0.5, 0.2]), **given | changes)
@@ -180,11 +189,11 @@ def test_damping_is_landau_and_lifshitz_s():
     system = lt.SpinSystem(3, energy, lt.LandauLifshitz(rate), lt.HeatBaths(2.0), ratio)
     x = np.append(unit(3).ravel(), 0.4)
 
-    def written(s):
+    def energy_by_hand(s):
         s = s.reshape(3, 3)
         return -0.8 * jnp.sum(s * jnp.roll(s, 1, 0)) - s.sum(0) @ jnp.array([0.2, 0.0, 0.5])
 
-    gradient = jax.grad(written)
+    gradient = jax.grad(energy_by_hand)
     expected = formula(x, (3,), lambda s: np.asarray(gradient(s)), rate, ratio, 2.0)
     np.testing.assert_allclose(system.vector_field(x), expected, atol=1e-14)
     assert system.check().passed
@@ -199,7 +208,7 @@ def test_damping_is_landau_and_lifshitz_s():
 
 
 def test_each_site_heats_its_own_bath():
-    system = small(baths=lt.HeatBaths([1.0, 2.0], [1.0, 3.0], number=2), bath=np.array([1, 0, 1]))
+    system = small_lattice(baths=lt.HeatBaths([1.0, 2.0], [1.0, 3.0], number=2), bath=np.array([1, 0, 1]))
     assert system.check().passed
     x = np.concatenate([unit(3).ravel(), [0.1, -0.2]])
     flow, gradient = np.asarray(system.vector_field(x)), np.asarray(system.energy.gradient(x))
@@ -212,7 +221,7 @@ def test_each_site_heats_its_own_bath():
 
 @pytest.mark.parametrize("baths", [True, lt.HeatBaths(number=2)])
 def test_the_force_is_that_of_its_factor_for_any_gradients(baths):
-    system = small(baths=baths, bath=None if baths is True else np.array([1, 0, 1]))
+    system = small_lattice(baths=baths, bath=None if baths is True else np.array([1, 0, 1]))
     x, dH, dS = RANDOM.standard_normal((3, system.dim))
     dH[system.body_dim :] = np.abs(dH[system.body_dim :])  # temperatures, which constant capacities have above zero
     B = system.dissipation.factor(system, x, jnp.asarray(dH), ())
@@ -223,13 +232,13 @@ def test_the_force_is_that_of_its_factor_for_any_gradients(baths):
 
 @pytest.mark.slow
 def test_the_suite_of_dissipations():
-    lt.testing.check_dissipation(small())
+    lt.testing.check_dissipation(small_lattice())
 
 
 @functools.cache
 def reference(t=1.0):
     """By SciPy from the formula, the gradient from JAX."""
-    system = small(baths=lt.HeatBaths(3.0))
+    system = small_lattice(baths=lt.HeatBaths(3.0))
     x = np.append(unit(3).ravel(), 0.0)
     gradient = jax.jit(lambda x: system.energy.gradient(x))
 
@@ -314,10 +323,10 @@ def test_a_small_wave_on_a_ring_has_the_frequency_of_its_length():
     assert solution.audit().passed
 
 
-BOTH = [lt.MetriplecticGauss(1), lt.MetriplecticRungeKutta(4)]
+ORDER_METHODS = [lt.MetriplecticGauss(1), lt.MetriplecticRungeKutta(4)]
 
 
-def damped(count, h, t, method, **given):
+def run_damped_lattice(count, h, t, method, **given):
     system = lt.models.spin_lattice(count, anisotropy_constant=0.1, **given)
     n = max(1, round(t / h))
     solution = lt.integrate(system, system.state(unit(count)), (0.0, n * h), h, method, save_every=n, engine="array")
@@ -329,22 +338,22 @@ def damped(count, h, t, method, **given):
 
 
 @pytest.mark.sampled("MetriplecticRungeKutta(order=4)")
-@pytest.mark.parametrize("method", BOTH, ids=str)
+@pytest.mark.parametrize("method", ORDER_METHODS, ids=str)
 def test_ten_thousand_damped_spins_with_a_bath(method):
-    damped(10_000, 0.1, 2.0, method)
+    run_damped_lattice(10_000, 0.1, 2.0, method)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", [*BOTH, lt.MetriplecticGauss(2)], ids=str)
+@pytest.mark.parametrize("method", [*ORDER_METHODS, lt.MetriplecticGauss(2)], ids=str)
 @pytest.mark.parametrize("h", [0.1, 0.03, 0.01, 0.003, 0.001])
 def test_ten_thousand_damped_spins_with_a_bath_at_every_step(method, h):
-    damped(10_000, h, 2.0, method)
+    run_damped_lattice(10_000, h, 2.0, method)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", BOTH, ids=str)
+@pytest.mark.parametrize("method", ORDER_METHODS, ids=str)
 def test_a_million_damped_spins(method):
-    damped(1_000_000, 0.1, 0.5, method)
+    run_damped_lattice(1_000_000, 0.1, 0.5, method)
 
 
 @pytest.mark.slow
@@ -358,7 +367,7 @@ def test_double_brackets_on_a_lattice_lower_the_energy_to_the_last_bit_of_the_le
 
 
 def test_control_a_correction_that_is_not_local_leaves_the_spheres(monkeypatch):
-    system = small()
+    system = small_lattice()
     monkeypatch.setattr(lt.SpinSystem, "surface", None)
     solution = lt.integrate(
         system, system.state(unit(3)), (0.0, 5.0), 0.25, lt.MetriplecticRungeKutta(6), engine="compiled"
@@ -367,10 +376,10 @@ def test_control_a_correction_that_is_not_local_leaves_the_spheres(monkeypatch):
 
 
 CHAIN = [(0, 1, 1.0), (1, 2, 1.0)]
-REFUSED = [
-    (lambda: small().state(np.zeros((3, 2))), r"spins in shape \(3, 3\), or all 10 components in one row"),
-    (lambda: small().state(np.zeros((4, 3))), r"spins in shape \(3, 3\)"),
-    (lambda: small().state(np.zeros(8)), "all 10 components"),
+REFUSED_CALLS = [
+    (lambda: small_lattice().state(np.zeros((3, 2))), r"spins in shape \(3, 3\), or all 10 components in one row"),
+    (lambda: small_lattice().state(np.zeros((4, 3))), r"spins in shape \(3, 3\)"),
+    (lambda: small_lattice().state(np.zeros(8)), "all 10 components"),
     (lambda: mag.exchange(3, [(0, 1, 1.0), (1, 3, 1.0)]), r"the edge \(1, 3\) must join two of the 3 parts"),
     (lambda: mag.exchange(3, np.triu(np.ones((3, 3)), 1)), "the exchange must be symmetric"),
     (lambda: mag.exchange(3, np.ones((3, 3))), "of site 0 with itself"),
@@ -388,11 +397,11 @@ REFUSED = [
     (lambda: lt.SpinSystem(3, mag.exchange(3), lt.LandauLifshitz(np.ones(4))), r"have the shape \(3,\) of the sites"),
     (lambda: lt.SpinSystem(3, mag.exchange(3), lt.LandauLifshitz(-1.0)), "must be >= 0"),
     (lambda: lt.LandauLifshitz([0.1, -0.2]), "must be >= 0, got -0.2"),
-    (lambda: small(bath=np.array([0, 0, 1])), "a dissipation heats bath 1, but there are 1 baths"),
-    (lambda: small(bath=np.array([0, 0])), "of the shape .3,. of the sites"),
+    (lambda: small_lattice(bath=np.array([0, 0, 1])), "a dissipation heats bath 1, but there are 1 baths"),
+    (lambda: small_lattice(bath=np.array([0, 0])), "of the shape .3,. of the sites"),
     (lambda: lt.HeatBaths(-1.0), r"must be positive, not \[-1.0\]"),
     (lambda: lt.HeatBaths([1.0, 2.0]), r"1 baths is one number, or has shape \(1,\)"),
-    (lambda: small(baths=2.0), "baths must be lt.HeatBaths, True"),
+    (lambda: small_lattice(baths=2.0), "baths must be lt.HeatBaths, True"),
     (
         lambda: lt.LiePoissonSystem(mf.so(3), lambda s: s[0] ** 2, dissipation=lt.LandauLifshitz()),
         "damps the spins of a SpinSystem",
@@ -400,7 +409,7 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("attempt", "says"), REFUSED)
+@pytest.mark.parametrize(("attempt", "says"), REFUSED_CALLS)
 def test_refusals(attempt, says):
     with pytest.raises(lt.InputError, match=says):
         attempt()
@@ -413,7 +422,7 @@ def test_ratios_and_sites_of_the_structure_are_checked():
     assert float(mf.Spins(2, 1, [1.0, 3.0]).jacobi_residual(RANDOM.standard_normal(7))) < 1e-14
 
 
-class Iterated(lt.SpinSystem):
+class IteratedRotation(lt.SpinSystem):
     """Control: what noise turns is left to the iteration."""
 
     def solve_rotation(self, angles, v):
@@ -428,10 +437,10 @@ class Unsaid(lt.LandauLifshitz):
 
 
 def test_what_noise_turns_a_step_solves_for_at_once():
-    """The same step, in a fraction of the iterations: without, the spin that is turned farthest decides."""
+    """A step takes a fraction of the iterations of the control, where the spin that is turned farthest decides."""
     sites, bath = (4, 4, 4), lt.HeatBaths(np.inf, 1.4)
     runs = []
-    for kind in (lt.SpinSystem, Iterated):
+    for kind in (lt.SpinSystem, IteratedRotation):
         system = kind(sites, lt.magnetism.exchange(sites, 1.0), lt.LandauLifshitz(2.0), bath)
         start = system.state(unit(*sites))
         runs.append(lt.integrate(system, start, (0.0, 0.05), 0.01, noise=lt.Fluctuations(1.0, 3), engine="array"))

@@ -177,10 +177,10 @@ def test_a_field_on_many_sites_makes_no_matrix():
     field = lt.MetriplecticSystem(mf.Canonical(n), lambda x: 0.5 * jnp.sum(x**2) + jnp.sum(x[:n] ** 4))
     assert np.isfinite(field.vector_field(np.ones(2 * n))).all()
     with pytest.raises(lt.FunctionError, match=rf"Pi\(x\) of a covector must have shape \({2 * n},\), got \({n},\)"):
-        lt.MetriplecticSystem(_Halved(n), lambda x: x @ x)
+        lt.MetriplecticSystem(_HalvedSharp(n), lambda x: x @ x)
 
 
-class _Halved(mf.Canonical):
+class _HalvedSharp(mf.Canonical):
     def sharp(self, x, alpha):
         return super().sharp(x, alpha)[::2]
 
@@ -204,13 +204,13 @@ def test_systems_are_pytrees_of_their_parameters():
     assert np.allclose(swept[2] - swept[1], swept[1] - swept[0], atol=1e-15)
     assert np.allclose(jax.jacfwd(field)(1.0), swept[1] - swept[0], atol=1e-15)
 
-    class Stretched(eqx.Module):
+    class QuarticEnergy(eqx.Module):
         stiffness: jax.Array
 
         def __call__(self, mu):
             return 0.5 * self.stiffness * jnp.sum(mu**4)
 
-    system = lt.LiePoissonSystem(mf.so(3), Stretched(jnp.asarray(2.0)), SPHERE)
+    system = lt.LiePoissonSystem(mf.so(3), QuarticEnergy(jnp.asarray(2.0)), SPHERE)
     assert any(leaf.shape == () and leaf == 2.0 for leaf in jax.tree_util.tree_leaves(system))
 
 
@@ -238,7 +238,7 @@ def test_a_poisson_tensor_that_is_none():
 
 @pytest.mark.parametrize("fits", [True, False], ids=["Poisson", "not"])
 def test_jacobi_of_many_components(fits):
-    """Of three functions: arrays of n^3 numbers are not formed."""
+    """The Jacobi identity is checked for three functions: arrays of n^3 numbers are not formed."""
     n = MAX_FULL_JACOBI_DIM + 5
 
     def tensor(x):

@@ -18,7 +18,7 @@ SO3 = mf.SO(3)
 SPAN = (0.3, 5.3)
 
 LAW = 2e-15
-"""Of ``H + U - W`` and of the momentum in space less the impulse, relative, over 100 steps; at most 9e-16 seen."""
+"""Limit of the drift of ``H + U - W`` and of momentum in space less impulse, relative, in 100 steps; 9e-16 seen."""
 
 
 def rotating_field(t):
@@ -134,7 +134,7 @@ def test_work_by_another_gradient_breaks_the_ledger(monkeypatch):
     monkeypatch.setattr(
         lt.DrivenSystem,
         "field",
-        lambda self, x, dH, dS, dL=(): _without_push(self, x, dH) + self.dissipation.force(self, x, dH, dS, dL),
+        lambda self, x, dH, dS, dL=(): _reversible_field(self, x, dH) + self.dissipation.force(self, x, dH, dS, dL),
     )
     method = lt.MetriplecticMidpoint("mean_value")  # of which no program is known
     bad = lt.integrate(system, START, SPAN, 0.1, method, engine="array", on_failure="return")
@@ -142,7 +142,7 @@ def test_work_by_another_gradient_breaks_the_ledger(monkeypatch):
     assert not bad.audit().passed
 
 
-def _without_push(system, x, dH):
+def _reversible_field(system, x, dH):
     return system.poisson.sharp(x, dH)
 
 
@@ -165,7 +165,7 @@ def test_an_impulse_of_another_collocation_breaks_its_row(monkeypatch):
 
 
 def from_all_sides(t, mu, attitude):
-    """It depends on all that a torque may depend on."""
+    """Return a torque that depends on time, momentum and attitude."""
     field = jnp.array([0.6, 0.3, 0.2]) + 0.4 * jnp.stack([jnp.cos(t), jnp.sin(t), 0.0 * t])
     return jnp.cross(jnp.array([0.5, -0.3, 0.8]), attitude.T @ field) + 0.1 * jnp.sin(attitude[0, 0] * mu)
 
@@ -200,7 +200,7 @@ STEPS = {2: (40, 80, 160), 4: (20, 40, 80), 6: (8, 12, 18), 8: (6, 9, 12)}
     ],
 )
 def test_orders_against_scipy(method, kind, exact):
-    """Of momentum, attitude, impulse and work."""
+    """Momentum, attitude, impulse and work converge with the order of the method."""
     system, errors = rubbing(from_all_sides, warm=False, reconstruction=kind), []
     for n in STEPS[method.order]:
         run = lt.integrate(system, START, (0.4, 2.4), 2.0 / n, method, save_every=n, engine="compiled")
@@ -262,7 +262,7 @@ def test_libration_under_gravity_gradient():
 
 
 def test_a_motor_drives_a_wheel():
-    """It turns the wheel and not the whole: |Pi| is constant, and the work is that of the motor against the wheel."""
+    """A motor turns the wheel and not the whole: |Pi| is constant, and the work is of the motor against the wheel."""
     wheel, power = 0.1, lambda t: 0.05 * jnp.sin(t)[None]
 
     def energy(mu):
@@ -341,7 +341,7 @@ def test_a_motor_against_scipy():
 
 
 def test_a_motor_beside_friction_in_the_bearing():
-    """What is conserved is decided at random points there, and the motor is no reason against it."""
+    """The conserved functions are decided at random points, and the motor is no reason against them."""
     system = with_a_wheel(
         INTERNAL["motor"], group=SO3, dissipation=lt.Friction([0.0, 0.0, 0.0, 0.02]), baths=lt.HeatBaths(2.0, 1.0)
     )
