@@ -146,7 +146,7 @@ def test_where_the_cumulants_of_two_lattices_are_equal():
     assert magnet.crossing_rows([a, b])[0][1:3] == [estimate, error]
     joined = magnet.join_runs([a, b])
     assert joined.steps == 2 * n
-    assert len(joined.samples) == len(a.drop_transient().rows) + len(b.drop_transient().rows)
+    assert len(joined.samples) == len(a.drop_transient().samples) + len(b.drop_transient().samples)
 
 
 @pytest.mark.sampled(1)

@@ -203,7 +203,7 @@ def test_a_thermospring():
         (lambda: lt.models.moving_thermo_particles(masses=(1.0,)), r"masses must have shape \(2,\), got \(1,\)"),
         (lambda: lt.models.thermo_springs(conductance=-1.0), ">= 0"),
         (lambda: lt.models.gas_piston(moles=(1.0, 0.0)), "moles must be positive"),
-        (lambda: lt.models.thermoelastic_chain(dimension=4), "1, 2 or 3, not 4"),
+        (lambda: lt.models.thermoelastic_chain(dimension=4), "1, 2 or 3, got 4"),
         (lambda: lt.models.thermoelastic_chain(bodies=0), "bodies must be an integer"),
     ],
 )

@@ -495,7 +495,7 @@ def test_what_the_user_asks_of_a_system():
         (lambda: lt.torques.GravityGradient(INERTIA, -1.0), "must be positive"),
         (lambda: lt.torques.GravityGradient(np.ones(4), 1.0), r"not \(4,\)"),
         (lambda: lt.torques.GravityGradient(INERTIA, 1.0, normal=(1.0, 0.0, 1.0)), "their cosine is"),
-        (lambda: lt.torques.GravityGradient(INERTIA, 1.0, normal=(0.0, 0.0, 0.0)), "is a direction"),
+        (lambda: lt.torques.GravityGradient(INERTIA, 1.0, normal=(0.0, 0.0, 0.0)), "must be a direction"),
         (lambda: lt.torques.Tabulated([0.0, 0.0], np.zeros((2, 3))), "increase"),
         (lambda: lt.torques.Tabulated([0.0, 1.0], np.zeros((3, 3))), "moments m rows"),
     ],
