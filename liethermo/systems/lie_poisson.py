@@ -267,9 +267,8 @@ def _resolve_reconstruction(algebra: mf.LieAlgebra, group, reconstruction: str |
     if reconstruction is None:
         reconstruction = _default_reconstruction(group)
     if reconstruction not in _RECONSTRUCTION_MAPS:
-        raise InputError(
-            f"the reconstruction must be one of {', '.join(map(repr, _RECONSTRUCTION_MAPS))}, got {reconstruction!r}"
-        )
+        choices = ", ".join(map(repr, _RECONSTRUCTION_MAPS))
+        raise InputError(f"the reconstruction must be one of {choices}, got {reconstruction!r}")
     group._require_map(_RECONSTRUCTION_MAPS[reconstruction])
     return reconstruction
 
