@@ -246,7 +246,7 @@ def test_interrupted(monkeypatch):
         ({"outputs": "trajectory"}, "needs save_at"),
         (
             {"system": lt.models.mass_spring_gas, "x0s": np.full(3, 0.5), "method": lt.VariationalGauss(2)},
-            "cannot be adaptive: what a variational scheme keeps",
+            "cannot be adaptive: a variational scheme conserves",
         ),
         ({"until": 3.0}, "until must be"),
         ({"until": lambda x: x}, "one number"),

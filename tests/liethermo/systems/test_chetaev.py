@@ -109,7 +109,7 @@ def test_a_form_of_the_entropy_rate():
     ("given", "error", "words"),
     [
         (3.0, lt.InputError, "a function"),
-        (lambda q, v, S: jnp.ones(5), lt.FunctionError, r"shape \(3,\) or \(2,\), not \(5,\)"),
+        (lambda q, v, S: jnp.ones(5), lt.FunctionError, r"shape \(3,\) or \(2,\), got \(5,\)"),
         (lambda q: q, lt.FunctionError, "could not be evaluated"),
     ],
 )

@@ -1049,7 +1049,7 @@ BAD = {
     "of term 1 of the Hamiltonian gives a real number": lambda q: lt.QuantumSystem([QUBIT, (X, lambda t: 1j * t)]),
     "the Hamiltonian, where it is a function, is one of the time": lambda q: lt.QuantumSystem(lambda: QUBIT),
     "is one of the time t alone: missing .* 's'": lambda q: lt.QuantumSystem([QUBIT, (X, lambda t, s: t)]),
-    r"V\[0\] that take the energy 1.3 .* = 3.39e\+27": lambda q: lt.QuantumSystem(
+    r"V\[0\] with the energy 1.3 .* = 3.39e\+27": lambda q: lt.QuantumSystem(
         QUBIT, lt.ThermalJumps([(LOWER, RATE)]), infinite(0.01)
     ),
     r"at T = 0.0001, .* = nan.*Give the rate as a function": lambda q: lt.QuantumSystem(

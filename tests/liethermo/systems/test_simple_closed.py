@@ -156,7 +156,7 @@ def test_friction_that_injects_energy():
         ({"friction": np.diag([1.0, -0.1])}, lt.IndefiniteError, "negative"),
         ({"friction": np.array([[0.1, 1.0], [0.5, 0.1]])}, lt.IndefiniteError, "negative"),
         ({"friction": np.ones(3)}, lt.InputError, "shape"),
-        ({"friction": lambda q, v, S: -v[:1]}, lt.FunctionError, r"shape \(2,\), not \(1,\)"),
+        ({"friction": lambda q, v, S: -v[:1]}, lt.FunctionError, r"shape \(2,\), got \(1,\)"),
         ({"external": lambda q, v, S: q[5] * jnp.ones(3)}, lt.FunctionError, "external force"),
         ({"external": lambda q: q}, lt.FunctionError, "external force could not be evaluated"),
         ({"heat_power": lambda q, v, S: v}, lt.FunctionError, "heat power"),

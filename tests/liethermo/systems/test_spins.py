@@ -404,7 +404,7 @@ REFUSED_CALLS = [
     (lambda: small_lattice(baths=2.0), "baths must be lt.HeatBaths, True"),
     (
         lambda: lt.LiePoissonSystem(mf.so(3), lambda s: s[0] ** 2, dissipation=lt.LandauLifshitz()),
-        "damps the spins of a SpinSystem",
+        "LandauLifshitz needs a SpinSystem",
     ),
 ]
 
