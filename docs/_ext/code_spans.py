@@ -312,7 +312,11 @@ def annotations_of(function: Callable) -> dict[str, Any]:
 
 def accepts(annotation: Any, value: Any) -> bool:
     try:
-        pydantic.TypeAdapter(annotation, config={"arbitrary_types_allowed": True}).validate_python(value)
+        adapter = pydantic.TypeAdapter(annotation, config={"arbitrary_types_allowed": True})
+    except pydantic.PydanticUserError:  # a dataclass, which has a configuration of its own
+        adapter = pydantic.TypeAdapter(annotation)
+    try:
+        adapter.validate_python(value)
     except pydantic.ValidationError:
         return False
     return True

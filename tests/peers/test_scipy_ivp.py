@@ -279,7 +279,7 @@ def test_args():
 
 
 def test_args_single_value():
-    with pytest.raises(ValueError, match=r"write args=\(-1,\)"):
+    with pytest.raises(ValueError, match=r"Write args=\(-1,\)"):
         solve_ivp(OSCILLATOR, (0, 0.1), [1, 0], events=lambda t, y, a: y[0] - a, args=-1)
 
 

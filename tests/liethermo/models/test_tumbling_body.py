@@ -160,7 +160,7 @@ def test_body_quantities_of_an_ensemble_are_those_of_its_members():
     assert lt.bodies.quaternions(final_states).shape == (2, 4)
     build = lambda I2: lt.models.tumbling_body((1.0, I2, 1.6), relaxation_time=10.0, momentum=1.0)  # noqa: E731
     mixed_inertias = lt.ensemble(build, START, (0.0, 1.0), 0.1, parameters=np.array([1.1, 1.2]))
-    with pytest.raises(lt.InputError, match="give axis="):
+    with pytest.raises(lt.InputError, match="Give axis="):
         lt.bodies.nutation(mixed_inertias)
     assert np.allclose(
         lt.bodies.nutation(mixed_inertias, (0, 0, 2)), [lt.bodies.nutation(run)[-1] for run in mixed_inertias]

@@ -83,7 +83,7 @@ def test_classes_have_a_colour_each_and_samples_are_points():
 def test_undrawable_measures_are_refused(tmp_path):
     with pytest.raises(lt.InputError, match="no measure 'sigma'; there are tau, final"):
         lt.plot.study(dataset(), "sigma")
-    with pytest.raises(lt.InputError, match=r"final has rate \(7\), ratio \(5\), final_component \(3\): choose"):
+    with pytest.raises(lt.InputError, match=r"final has rate \(7\), ratio \(5\), final_component \(3\)\. Choose"):
         lt.plot.study(dataset(), "final")
     with pytest.raises(lt.InputError, match="ends in none of them"):
         lt.plot.study(dataset(), path=tmp_path / "map.xyz")
