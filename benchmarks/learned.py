@@ -102,11 +102,11 @@ PROBLEMS = {
 """The two problems, by name."""
 
 
-def simulate_data(problem: Problem, quick: bool, seed: int = 0) -> np.ndarray:
+def simulate_data(problem: Problem, is_quick: bool, seed: int = 0) -> np.ndarray:
     """Return states to twice the training time, shape (trajectories, times, n)."""
     random, runs = np.random.default_rng(seed), []
     times = np.arange(round(2 * problem.t_end / problem.step) + 1) * problem.step
-    for _ in range(5 if quick else problem.n_trajectories):
+    for _ in range(5 if is_quick else problem.n_trajectories):
         x0 = problem.random_state(random)
         solution = scipy.integrate.solve_ivp(
             problem.vector_field, (0, times[-1]), x0, "LSODA", times, rtol=1e-10, atol=1e-10
@@ -128,15 +128,15 @@ def _law_errors(energy: np.ndarray, entropy: np.ndarray, energy_spread: float) -
     return [float(np.max(np.abs(energy - energy[0])) / energy_spread), float(np.diff(entropy).min())]
 
 
-def compare_models(problem: Problem, quick: bool) -> list[list]:
+def compare_models(problem: Problem, is_quick: bool) -> list[list]:
     """Return a row for each contestant, averaged over the seeds of weights and batches; for the laws the worst."""
-    x = simulate_data(problem, quick)
+    x = simulate_data(problem, is_quick)
     count = max(1, len(x) // 5)
     half = round(problem.t_end / problem.step) + 1
     test, train = x[:count], [Trajectory(np.arange(half) * problem.step, own[:half]) for own in x[count:]]
     scales = data_scales(train)
-    steps, width, seeds = (50, 8, 1) if quick else (problem.steps, 32, problem.n_seeds)
-    long_steps = round((2 if quick else LONG_RUN_FACTOR) * problem.t_end / problem.step)
+    steps, width, seeds = (50, 8, 1) if is_quick else (problem.steps, 32, problem.n_seeds)
+    long_steps = round((2 if is_quick else LONG_RUN_FACTOR) * problem.t_end / problem.step)
     rows = []
 
     def add_library_model(build: Callable[[int], Any], name: str) -> None:
@@ -214,7 +214,7 @@ def compare_models(problem: Problem, quick: bool) -> list[list]:
     return rows
 
 
-def problem_report(name: str, quick: bool) -> Report:
+def problem_report(name: str, is_quick: bool) -> Report:
     """Measure one of the problems."""
     p = PROBLEMS[name]
     columns = {"Model": "text", "Parameters": "count", "MSE to T": "error", "T to 2 T": "error", "MAE to T": "error"}
@@ -225,4 +225,4 @@ def problem_report(name: str, quick: bool) -> Report:
         "256 points. Means "
         f"over {p.n_seeds} seed{'s' if p.n_seeds > 1 else ''}."
     )
-    return Report(f"Learned: {p.title}", p.text, [Table(caption, columns, compare_models(p, quick))])
+    return Report(f"Learned: {p.title}", p.text, [Table(caption, columns, compare_models(p, is_quick))])

@@ -30,7 +30,7 @@ EXCLUSIVE_WRITE_FLAGS = (
 def write_atomically(path: Path, data: bytes | memoryview, mode: int = 0o666) -> None:
     """Write a file under a random name, then rename it, so that it appears complete or not at all.
 
-    The last of several writers wins. Partial files of killed processes remain until :func:`remove_dead_parts` is
+    The last of several writers wins. Partial files of killed processes remain until :func:`remove_abandoned_files` is
     called.
 
     Raises
@@ -38,46 +38,46 @@ def write_atomically(path: Path, data: bytes | memoryview, mode: int = 0o666) ->
     OSError
         If the file cannot be written; the partial file is removed.
     """
-    part = path.with_name(part_name(path.name))
+    partial_file = path.with_name(partial_file_name(path.name))
     if path.exists() and not path.is_file():
         raise OSError(errno.EEXIST, "what is there is no plain file")
     try:
         try:
-            handle = os.open(part, EXCLUSIVE_WRITE_FLAGS, mode)
+            handle = os.open(partial_file, EXCLUSIVE_WRITE_FLAGS, mode)
         except FileNotFoundError:
             path.parent.mkdir(parents=True, exist_ok=True)
-            handle = os.open(part, EXCLUSIVE_WRITE_FLAGS, mode)
+            handle = os.open(partial_file, EXCLUSIVE_WRITE_FLAGS, mode)
         with os.fdopen(handle, "wb") as file:
             file.write(data)
-        os.replace(part, path)
+        os.replace(partial_file, path)
     except BaseException:
         with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
+            partial_file.unlink(missing_ok=True)
         raise
 
 
-def part_name(name: str) -> str:
+def partial_file_name(name: str) -> str:
     """Return a name for a partial copy of the file or folder ``name``."""
     writer = f"{_name_digest(socket.gethostname(), 8)}.{os.getpid()}"
     return f".{_name_digest(name, 12)}.{writer}.{secrets.token_hex(8)}{PART_SUFFIX}"
 
 
-def remove_dead_parts(folder: Path, name: str) -> None:
+def remove_abandoned_files(folder: Path, name: str) -> None:
     """Remove the partial copies of a file or folder that dead processes have left."""
     with contextlib.suppress(OSError):
         for entry in folder.glob(f".{_name_digest(name, 12)}.*{PART_SUFFIX}"):
-            if is_dead(entry):
+            if is_abandoned(entry):
                 with contextlib.suppress(OSError):
                     entry.unlink()
 
 
-def is_dead(part: Path) -> bool:
+def is_abandoned(partial_file: Path) -> bool:
     """Return True if the process that wrote this partial file has ended."""
-    match = PART_NAME_PATTERN.fullmatch(part.name)
+    match = PART_NAME_PATTERN.fullmatch(partial_file.name)
     if match is None:
         return False
     if match[1] != _name_digest(socket.gethostname(), 8):
-        return time.time() - part.lstat().st_mtime > STALE_PART_SECONDS
+        return time.time() - partial_file.lstat().st_mtime > STALE_PART_SECONDS
     try:
         os.kill(int(match[2]), 0)
     except ProcessLookupError:

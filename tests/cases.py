@@ -240,7 +240,7 @@ REPRESENTATIVE = [mf.so(3), mf.se(3), mf.sl(2), mf.su(3)]
 """Compact, semidirect, noncompact and irrational algebras: enough for properties that do not depend on the algebra."""
 
 
-def slow(case):
+def slow_case(case):
     """Return a parameter of a test, or a set of parameters, marked for the slow tier."""
     import pytest
 

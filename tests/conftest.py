@@ -35,7 +35,7 @@ def pytest_addoption(parser):
     parser.addoption("--part", metavar="K/N", help="run the K-th of N parts of the selected tests")
 
 
-class Part:
+class SuitePart:
     """Plugin that keeps one of N parts of the selected tests: every N-th test, so that each part has cases of every
     test."""
 
@@ -58,7 +58,7 @@ class Part:
 @pytest.hookimpl(trylast=True)
 def pytest_configure(config):
     if config.option.part:
-        config.pluginmanager.register(Part(config.option.part))
+        config.pluginmanager.register(SuitePart(config.option.part))
     is_slow_tier = "slow" in (config.option.markexpr or "") and "not slow" not in config.option.markexpr
     hypothesis.settings.load_profile("liethermo-slow" if is_slow_tier else "liethermo")
     if not is_slow_tier:

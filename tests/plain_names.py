@@ -19,7 +19,9 @@ IRREGULAR_PARTICIPLES = frozenset(
     """.split()
 )
 
-NO_PARTICIPLES = frozenset("bed embed exceed feed indeed need proceed red seed shed speed succeed thread token".split())
+PARTICIPLE_LOOKALIKES = frozenset(
+    "bed embed exceed feed indeed need proceed red seed shed speed succeed thread token".split()
+)
 """Words that end like a participle and are none."""
 
 ORDINARY_WORDS = frozenset(
@@ -50,7 +52,7 @@ EMPTY_BEGINNING = re.compile(r"(?:How|It|Likewise|Of|That of|The others?|The sam
 """First words of a docstring whose sentence has no subject of its own."""
 
 
-class Named(NamedTuple):
+class NameCheck(NamedTuple):
     """A name or a docstring of the code, and the rule that it breaks ("" where it breaks none)."""
 
     kind: str
@@ -61,7 +63,9 @@ class Named(NamedTuple):
 
 
 def is_participle(word: str) -> bool:
-    return word in IRREGULAR_PARTICIPLES or (word.endswith("ed") and len(word) > 3 and word not in NO_PARTICIPLES)
+    return word in IRREGULAR_PARTICIPLES or (
+        word.endswith("ed") and len(word) > 3 and word not in PARTICIPLE_LOOKALIKES
+    )
 
 
 def words_of(name: str) -> list[str]:
@@ -89,34 +93,34 @@ def fault_of_docstring(text: str) -> str:
     return "no subject" if EMPTY_BEGINNING.match(text.strip()) else ""
 
 
-def names_in(path: Path) -> Iterator[Named]:
+def names_in(path: Path) -> Iterator[NameCheck]:
     """Yield the constants, definitions, locals and docstrings of a module."""
     tree = ast.parse(path.read_text())
     if text := ast.get_docstring(tree):
-        yield Named("docstring", path, 1, path.stem, fault_of_docstring(text))
+        yield NameCheck("docstring", path, 1, path.stem, fault_of_docstring(text))
     for node, following in zip(tree.body, [*tree.body, None][1:], strict=False):
         yield from _constants(path, node, following)
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             if not node.name.startswith("__"):
-                yield Named("definition", path, node.lineno, node.name, fault_of_name(node.name))
+                yield NameCheck("definition", path, node.lineno, node.name, fault_of_name(node.name))
             if text := ast.get_docstring(node):
-                yield Named("docstring", path, node.lineno, node.name, fault_of_docstring(text))
+                yield NameCheck("docstring", path, node.lineno, node.name, fault_of_docstring(text))
         if isinstance(node, ast.FunctionDef):
             names = {a.arg for a in ast.walk(node) if isinstance(a, ast.arg)}
             names |= {n.id for n in ast.walk(node) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
             for name in sorted(names):
-                yield Named("local", path, node.lineno, name, fault_of_name(name))
+                yield NameCheck("local", path, node.lineno, name, fault_of_name(name))
 
 
-def _constants(path: Path, node: ast.stmt, following: ast.stmt | None) -> Iterator[Named]:
+def _constants(path: Path, node: ast.stmt, following: ast.stmt | None) -> Iterator[NameCheck]:
     targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
     for target in targets:
         elements = target.elts if isinstance(target, ast.Tuple) else [target]
         constants = [e for e in elements if isinstance(e, ast.Name) and e.id.isupper()]
         for constant in constants:
             fault = "several constants in one statement" if len(constants) > 1 else fault_of_name(constant.id)
-            yield Named("constant", path, node.lineno, constant.id, fault)
+            yield NameCheck("constant", path, node.lineno, constant.id, fault)
     text = getattr(getattr(following, "value", None), "value", None)
     if targets and isinstance(text, str) and isinstance(targets[0], ast.Name):
-        yield Named("docstring", path, node.lineno, targets[0].id, fault_of_docstring(text))
+        yield NameCheck("docstring", path, node.lineno, targets[0].id, fault_of_docstring(text))

@@ -110,7 +110,7 @@ def test_the_statistics_of_the_magnet():
     time = magnet.integrated_autocorrelation(x)
     assert abs(time / ((1 + rho) / (2 * (1 - rho))) - 1.0) < 0.2  # 0.06 is its standard error
     rows = np.column_stack([x, x, np.zeros((n, 2))])
-    mean, error = magnet.with_error(lambda s, chosen: s.energy[chosen].mean(), _series(rows))
+    mean, error = magnet.with_error(lambda s, row_indices: s.energy[row_indices].mean(), _series(rows))
     assert 0.5 < error / np.sqrt(2 * time / n) < 1.5
     assert abs(mean) < 4 * error
 
@@ -144,9 +144,9 @@ def test_where_the_cumulants_of_two_lattices_are_equal():
     assert abs(estimate - crossing) < 4 * error < 0.4 * crossing
     assert np.abs(np.array(magnet.cumulant_crossing(b, a)) - (estimate, error)).max() < 1e-12
     assert magnet.crossing_rows([a, b])[0][1:3] == [estimate, error]
-    joined = magnet.join_runs([a, b])
-    assert joined.steps == 2 * n
-    assert len(joined.samples) == len(a.drop_transient().samples) + len(b.drop_transient().samples)
+    joined_rows = magnet.join_runs([a, b])
+    assert joined_rows.steps == 2 * n
+    assert len(joined_rows.samples) == len(a.drop_transient().samples) + len(b.drop_transient().samples)
 
 
 @pytest.mark.sampled(1)
@@ -265,7 +265,7 @@ def test_c_steers_the_energy():
 
 
 @pytest.mark.parametrize(
-    ("bound", "measured", "at_least", "verdict"),
+    ("limit", "measurement", "is_lower_bound", "verdict"),
     [
         (2.5, 2.4, False, "met"),
         (2.5, 2.6, False, "missed"),
@@ -275,8 +275,8 @@ def test_c_steers_the_energy():
         (2.5, float("nan"), False, "missed"),
     ],
 )
-def test_verdicts(bound, measured, at_least, verdict):
-    assert Target("work", bound, measured, at_least=at_least).verdict == verdict
+def test_verdicts(limit, measurement, is_lower_bound, verdict):
+    assert Target("work", limit, measurement, at_least=is_lower_bound).verdict == verdict
 
 
 def test_broken_laws_are_named():
@@ -299,12 +299,12 @@ def test_a_race_takes_turns():
 def test_the_tumbling_body_is_one_in_the_library_and_in_scipy(body):
     ours = simulators.library_run(body, MetriplecticGauss(3), 0.05, 5.0, 10)()
     exact = simulators.scipy_run(body, 1e-12, 5.0, 10)()
-    perturbed = simulators.scipy_run(dataclasses.replace(body, inertia=1.001 * body.inertia), 1e-12, 5.0, 10)()
+    perturbed_body = simulators.scipy_run(dataclasses.replace(body, inertia=1.001 * body.inertia), 1e-12, 5.0, 10)()
     assert np.abs(ours.momentum - exact.momentum).max() <= 1e-9  # measured: 6e-11
     assert np.abs(ours.spatial_momentum - exact.spatial_momentum).max() <= 1e-9
     assert ours.total_energy is not None
     assert np.ptp(ours.total_energy) <= 1e-14
-    assert np.abs(ours.momentum - perturbed.momentum).max() > 1e-4
+    assert np.abs(ours.momentum - perturbed_body.momentum).max() > 1e-4
 
 
 @pytest.mark.parametrize("body", [tumbling.FREE_BODY, tumbling.DAMPED_BODY], ids=["free", "damped"])

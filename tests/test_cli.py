@@ -338,7 +338,10 @@ REFUSALS = {
     ),
     "value of a parameter": (
         [MODEL, "parameters = {inertia = [1, 2]}", RUN],
-        ['model.name = "rigid_body", model.parameters.inertia = [1, 2]: inertia must have shape (3,) or (3, 3), got (2,)'],
+        [
+            'model.name = "rigid_body", model.parameters.inertia = [1, 2]: '
+            "inertia must have shape (3,) or (3, 3), got (2,)"
+        ],
     ),
     "method": (
         [MODEL, RUN, '[method]\nname = "Referense"'],
@@ -355,7 +358,10 @@ REFUSALS = {
         [MODEL, RUN, '[method]\ngradient = "gonzales"'],
         ["method.gradient = \"gonzales\": no discrete gradient 'gonzales'; the names are 'gonzalez', 'mean_value'"],
     ),
-    "rtol": ([MODEL, RUN, REFERENCE.replace("1e-6", "2")], ["method.rtol = 2.0: rtol must be between 0 and 1, got 2.0"]),
+    "rtol": (
+        [MODEL, RUN, REFERENCE.replace("1e-6", "2")],
+        ["method.rtol = 2.0: rtol must be between 0 and 1, got 2.0"],
+    ),
     "netcdf": ([MODEL, RUN, '[outputs]\nnetcdf = "a/b.nc"'], ['outputs.netcdf = "a/b.nc": must be a file name']),
     "figures": (
         [MODEL, RUN, '[outputs]\nfigures = ["law"]'],

@@ -14,7 +14,7 @@ import liethermo as lt
 from liethermo.spec import read
 from liethermo.spec.study import build_study
 from liethermo.studies.store_results import audit_store, load_status, load_study
-from tests.liethermo.results.test_files import rewritten
+from tests.liethermo.results.test_files import rewrite
 
 LIBRARY_ERRORS = (lt.LiethermoError, lt.FileError)
 """Errors by which a damaged file may be refused."""
@@ -59,9 +59,9 @@ def test_damaged_results_are_refused_or_unchanged(tmp_path, kind, count):
         path.write_bytes(damage_randomly(content, random))
         start = time.perf_counter()
         try:
-            loaded = lt.load(path)
-            assert np.array_equal(loaded.x, result.x)
-            assert np.array_equal(loaded.energy, result.energy)
+            loaded_result = lt.load(path)
+            assert np.array_equal(loaded_result.x, result.x)
+            assert np.array_equal(loaded_result.energy, result.energy)
         except lt.FileError:
             n_refused += 1
         assert time.perf_counter() - start < MAX_SECONDS
@@ -92,9 +92,9 @@ def test_changed_attributes_of_results_are_refused_or_harmless(tmp_path, count):
             file.attrs[name] = json.dumps(word)
 
         try:
-            loaded = lt.load(rewritten(path, change))
-            assert np.array_equal(loaded.x, solution.x)
-            str(loaded.audit())
+            loaded_result = lt.load(rewrite(path, change))
+            assert np.array_equal(loaded_result.x, solution.x)
+            str(loaded_result.audit())
         except lt.FileError:
             pass
 

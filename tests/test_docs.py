@@ -85,7 +85,7 @@ def test_an_example_runs_and_draws(example, scratch):
 def test_the_reference_lists_every_public_name(package):
     pages = [page.read_text() for page in (ROOT / "docs/reference").glob("api_*.md")]
     listed_names = [name for page in pages for name in re.findall(r"^ {3}([\w.]+)$", page, re.MULTILINE)]
-    assert sorted(set(package.__all__) - {part for name in listed_names for part in name.split(".")}) == []
+    assert sorted(set(package.__all__) - {word for name in listed_names for word in name.split(".")}) == []
 
 
 LINK = re.compile(
@@ -204,7 +204,8 @@ def test_python_in_code_font_that_is_wrong_is_found(code_spans, span, words):
 def test_what_is_no_python_is_left_alone(code_spans):
     for span in ("make bench", "liethermo --version", "docs/_build/html", "CITATION.cff", ".png", "rtol * max|x|"):
         assert not code_spans.check(span)
-    table = "| other | here |\n|---|---|\n| `Foreign(colour=3)` | `lt.Adaptive(rtol=1e-3)` |\n\n`step=0.1` {doc}`index`"
+    table = "| other | liethermo |\n|---|---|\n| `Foreign(colour=3)` | `lt.Adaptive(rtol=1e-3)` |\n\n"
+    table += "`step=0.1` {doc}`index`"
     assert code_spans.spans(table) == ["lt.Adaptive(rtol=1e-3)", "step=0.1"]
 
 
@@ -253,11 +254,13 @@ def _has_stages(stages: int) -> bool:
 
 
 NUMBER = r"(?:\d[\d.,]*|two|three|four|five|six|ten|twenty|fifty|a?\s?hundred|a?\s?thousand|many|several)(?: or more)?"
-PART = r"(?:half|(?:a|an|one|two) (?:third|half|quarter|fifth|tenth|twentieth|hundredth)s?|twice|\d+ (?:%|per cent))"
+FRACTION = (
+    r"(?:half|(?:a|an|one|two) (?:third|half|quarter|fifth|tenth|twentieth|hundredth)s?|twice|\d+ (?:%|per cent))"
+)
 SPEED = re.compile(
     rf"\d\s?(?:ns|µs|us|ms)\b|\b(?:nano|micro|milli)seconds?\b"
     rf"|\b(?:{NUMBER} times|twice)\s+(?:as\s+(?:fast|slow|cheap|dear)|faster|slower|cheaper)|\bspeed of C\b"
-    rf"|\b(?:takes?|took|costs?)\s+(?:some |about )?{PART}\b|\b{NUMBER} (?:seconds|minutes) a (?:step|call|run)"
+    rf"|\b(?:takes?|took|costs?)\s+(?:some |about )?{FRACTION}\b|\b{NUMBER} (?:seconds|minutes) a (?:step|call|run)"
     rf"|\btakes?\s+(?:a second|some seconds|a few seconds|{NUMBER} (?:seconds|minutes))",
     re.IGNORECASE,
 )
@@ -342,12 +345,12 @@ def _wrong_bodies(text: str) -> list[str]:
     The energy of the controlled body is constant, but a torque acts on it. A text with both kinds of bodies is left to
     its reader.
     """
-    only_controlled = CONTROLLED_BODY.search(text) and not OTHER_BODIES.search(text)
+    mentions_controlled_body = CONTROLLED_BODY.search(text) and not OTHER_BODIES.search(text)
     paragraphs = [re.sub(r"\s*\n(?:#|\s)*", " ", paragraph) for paragraph in re.split(r"\n\s*\n", text)]
     return [
         paragraph
         for paragraph in paragraphs
-        if INTERNAL_FRICTION.search(paragraph) and (only_controlled or CONSTANT_ENERGY.search(paragraph))
+        if INTERNAL_FRICTION.search(paragraph) and (mentions_controlled_body or CONSTANT_ENERGY.search(paragraph))
     ]
 
 
@@ -380,9 +383,9 @@ CITATION = re.compile(r"[\[(]([A-Z][^\[\]()`]*?\b(?:19|20)\d\d\b[^\[\]()`]*)[\])
 def _find_citations(text: str) -> list[tuple[str, str]]:
     """Return the names and years of the works that a text cites, such as ``(Holm and Janke 1993)``."""
     works = [work for citation in CITATION.findall(" ".join(text.split())) for work in citation.split(";")]
-    matches = [part for work in works if (part := re.match(r"\s*(\D+?),? ((?:19|20)\d\d)", work))]
+    matches = [match for work in works if (match := re.match(r"\s*(\D+?),? ((?:19|20)\d\d)", work))]
     names = re.compile(" and others| et al\\.|,? and |,? & |, ")
-    return [(name, part[2]) for part in matches for name in names.split(part[1]) if name]
+    return [(name, match[2]) for match in matches for name in names.split(match[1]) if name]
 
 
 def test_what_the_pages_cite_is_in_the_bibliography():

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from .plain_names import Named, fault_of_docstring, fault_of_name, names_in
+from .plain_names import NameCheck, fault_of_docstring, fault_of_name, names_in
 
 yaml = pytest.importorskip("yaml")
 
@@ -36,17 +36,17 @@ def paragraphs_of_module(text: str) -> Iterator[str]:
 
 
 def messages_of_module(text: str) -> Iterator[str]:
-    """What errors and warnings say, with an x for each value."""
+    """Yield the texts of errors and warnings, with an x for each value."""
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Call):
             name = getattr(node.func, "id", getattr(node.func, "attr", ""))
             if name.endswith(("Error", "Warning")) or name == "warn":
-                yield from (said for argument in node.args if (said := _said(argument)))
+                yield from (message for argument in node.args if (message := _message_text(argument)))
 
 
-def _said(node: ast.expr) -> str:
+def _message_text(node: ast.expr) -> str:
     if isinstance(node, ast.BinOp):
-        return _said(node.left) + _said(node.right)
+        return _message_text(node.left) + _message_text(node.right)
     if isinstance(node, ast.JoinedStr):
         return "".join(str(part.value) if isinstance(part, ast.Constant) else "x" for part in node.values)
     return node.value if isinstance(node, ast.Constant) and isinstance(node.value, str) else ""
@@ -60,16 +60,18 @@ KINDS = {
 
 
 def faults(paragraph: str) -> Iterator[str]:
-    plain = re.sub(r"\s+", " ", re.sub(r"``.*?``|`.*?`|\$.*?\$|\[[^\]]*\]", "x", paragraph, flags=re.DOTALL)).strip()
-    sentences = re.split(r"(?<=[.!?;:]) ", plain)
+    plain_text = re.sub(
+        r"\s+", " ", re.sub(r"``.*?``|`.*?`|\$.*?\$|\[[^\]]*\]", "x", paragraph, flags=re.DOTALL)
+    ).strip()
+    sentences = re.split(r"(?<=[.!?;:]) ", plain_text)
     for name, rule in RULES.items():
         if rule["extends"] == "substitution":
-            found = [word for word in rule["swap"] if re.search(rf"\b{word}\b", plain, re.IGNORECASE)]
+            faults_found = [word for word in rule["swap"] if re.search(rf"\b{word}\b", plain_text, re.IGNORECASE)]
         elif rule["extends"] == "existence":
-            found = [match.group() for raw in rule["raw"] for match in re.finditer(raw, plain)]
+            faults_found = [match.group() for raw in rule["raw"] for match in re.finditer(raw, plain_text)]
         else:
-            found = [s for s in sentences if len(re.findall(rule["token"], s)) > rule["max"]]
-        yield from (f"{name}: {fault!r} in {plain[:160]!r}" for fault in found)
+            faults_found = [s for s in sentences if len(re.findall(rule["token"], s)) > rule["max"]]
+        yield from (f"{name}: {fault!r} in {plain_text[:160]!r}" for fault in faults_found)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -77,8 +79,8 @@ def test_prose_follows_the_rules(kind):
     files, paragraphs = KINDS[kind]
     read = [(path, paragraph) for path in files for paragraph in paragraphs(path.read_text())]
     assert len(read) > 400
-    found = [f"{path.relative_to(ROOT)}: {fault}" for path, paragraph in read for fault in faults(paragraph)]
-    assert not found, "\n".join(found)
+    faults_found = [f"{path.relative_to(ROOT)}: {fault}" for path, paragraph in read for fault in faults(paragraph)]
+    assert not faults_found, "\n".join(faults_found)
 
 
 MANNER = (
@@ -146,26 +148,26 @@ MAX_LOCALS_PERCENT = 4.0
 
 
 @functools.cache
-def named(kind: str) -> tuple[Named, ...]:
+def names_of_kind(kind: str) -> tuple[NameCheck, ...]:
     return tuple(name for path in CODE for name in names_in(path) if name.kind == kind)
 
 
 @pytest.mark.parametrize("kind", ["constant", "definition"])
 def test_names_are_plain(kind):
-    assert len(named(kind)) > 400
-    faults = [n for n in named(kind) if n.fault and n.name not in PUBLIC_NAMES | DIGEST_NAMES]
+    assert len(names_of_kind(kind)) > 400
+    faults = [n for n in names_of_kind(kind) if n.fault and n.name not in PUBLIC_NAMES | DIGEST_NAMES]
     assert not faults, "\n".join(f"{n.path.relative_to(ROOT)}:{n.line}: {n.name}: {n.fault}" for n in faults)
 
 
 def test_docstrings_begin_with_a_subject_or_a_verb():
-    faults = [n for n in named("docstring") if n.fault]
+    faults = [n for n in names_of_kind("docstring") if n.fault]
     assert not faults, "\n".join(f"{n.path.relative_to(ROOT)}:{n.line}: {n.name}" for n in faults)
 
 
 def test_locals_are_plain_in_every_room():
     rooms = collections.defaultdict(collections.Counter)
-    for n in named("local"):
-        rooms["/".join(n.path.relative_to(ROOT).parts[:2])][bool(n.fault)] += 1
+    for n in names_of_kind("local"):
+        rooms["/".join(n.path.parent.relative_to(ROOT).parts[:2])][bool(n.fault)] += 1
     percents = {room: 100.0 * count[True] / count.total() for room, count in rooms.items() if count.total() > 50}
     assert {room: percent for room, percent in percents.items() if percent > MAX_LOCALS_PERCENT} == {}
 

@@ -20,8 +20,8 @@ def _table_names() -> tuple[set[str], set[str]]:
     """Return the names of the arguments and of the attributes that the table describes."""
     arguments, attributes = ARGUMENTS_PAGE.read_text().split("## Attributes")
     return tuple(  # type: ignore[return-value]
-        {name for row in re.findall(r"^\| (`.*?) \|", part, re.MULTILINE) for name in re.findall(r"`(\w+)`", row)}
-        for part in (arguments, attributes)
+        {name for row in re.findall(r"^\| (`.*?) \|", section, re.MULTILINE) for name in re.findall(r"`(\w+)`", row)}
+        for section in (arguments, attributes)
     )
 
 
@@ -163,7 +163,9 @@ def _description_faults(thing, doc: str) -> list[str]:
     return problems
 
 
-@pytest.mark.parametrize(("package", "name"), [pytest.param(*each, id=each[1]) for each in _main_names()])
+@pytest.mark.parametrize(
+    ("package", "name"), [pytest.param(*main_name, id=main_name[1]) for main_name in _main_names()]
+)
 def test_parameters_of_the_main_names_have_words_and_units(package, name):
     if name in WRITTEN_BY_THE_LIBRARY + CLASSES_WITHOUT_INIT:
         pytest.skip("nobody calls it")

@@ -79,7 +79,7 @@ def test_its_notebook_has_the_same(page_runner, tmp_path):
 
 def test_a_block_that_fails_and_a_picture_without_words_are_warnings(page_runner, tmp_path, monkeypatch):
     warnings = []
-    monkeypatch.setattr(page_runner.logger, "warning", lambda text, *more, **_: warnings.append(text % more))
+    monkeypatch.setattr(page_runner.logger, "warning", lambda text, *arguments, **_: warnings.append(text % arguments))
     build(page_runner, "```python\n1 / 0\n```\n", tmp_path)
     build(page_runner, PAGE.replace("<!-- picture: a line -->", ""), tmp_path)
     assert len(warnings) == 2
@@ -134,7 +134,7 @@ def test_pages_are_read_again_until_a_build_with_their_results_has_finished(page
 
 def test_what_fails_is_not_kept(page_runner, tmp_path, monkeypatch):
     warnings = []
-    monkeypatch.setattr(page_runner.logger, "warning", lambda text, *more, **_: warnings.append(text % more))
+    monkeypatch.setattr(page_runner.logger, "warning", lambda text, *arguments, **_: warnings.append(text % arguments))
     for _ in range(2):
         build(page_runner, "```python\n1 / 0\n```\n", tmp_path)
     assert len(warnings) == 2

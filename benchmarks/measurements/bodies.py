@@ -26,10 +26,10 @@ STEPS = 200
 """Number of steps of the ensembles."""
 
 
-def run(quick: bool) -> Report:
+def run(is_quick: bool) -> Report:
     """Measure bodies as one system, and as ensembles."""
     steps, rounds, coupled_counts, ensemble_counts = (
-        (2000, 1, (2,), (10,)) if quick else (200_000, 3, COUPLED_COUNTS, ENSEMBLE_COUNTS)
+        (2000, 1, (2,), (10,)) if is_quick else (200_000, 3, COUPLED_COUNTS, ENSEMBLE_COUNTS)
     )
     caption = (
         f"Bodies on the direct sum of so(3)s, as one system: runs of {steps:,} steps of size {growth.STEP}, each in a "
@@ -37,9 +37,9 @@ def run(quick: bool) -> Report:
     )
     one_system = growth.growth_table(caption, [f"bodies {n}" for n in coupled_counts], steps, rounds, "Bodies")
     rows: list[list] = []
-    skipped: dict[str, str] = {}
+    skip_reasons: dict[str, str] = {}
     for bodies in ensemble_counts:
-        row, skipped = _ensemble_row(bodies, rounds)
+        row, skip_reasons = _ensemble_row(bodies, rounds)
         rows.append(row)
     columns = {"Bodies": "count"} | dict.fromkeys(["Compiled", "Array", "C with SIMD"], "seconds")
     caption = (
@@ -48,16 +48,16 @@ def run(quick: bool) -> Report:
     )
     ensembles = Table(caption, columns | {"Compiled / C": "ratio"}, rows)
     text = f"Rigid bodies that do not interact, on {available_cores()} cores."
-    return Report("Number of bodies", text, [one_system, ensembles], skipped=skipped)
+    return Report("Number of bodies", text, [one_system, ensembles], skipped=skip_reasons)
 
 
 def _ensemble_row(bodies: int, rounds: int) -> tuple[list, dict[str, str]]:
     x0s, system = random_states(bodies), quadratic_body(RATE)
     engines = [e for e in growth.ENGINES if e == "compiled" or bodies <= MAX_ARRAY_BODIES]
     works: dict[str, Callable] = {e: library_ensemble(system, x0s, T_END, STEPS, e) for e in engines}
-    c_programs, skipped = build_available({"C": lambda: EnsembleProgram(body_parameters(RATE))})
+    c_programs, skip_reasons = build_available({"C": lambda: EnsembleProgram(body_parameters(RATE))})
     if "C" in c_programs:
         works["C"] = lambda: c_programs["C"].integrate(x0s, T_END / STEPS, STEPS, available_cores())
     times = {name: outcome.wall_seconds for name, outcome in race(works, rounds=rounds, max_seconds=5.0).items()}
     step_seconds = [times[name] / (bodies * STEPS) if name in times else None for name in ("compiled", "array", "C")]
-    return [bodies, *step_seconds, ratio(step_seconds[0], step_seconds[2])], skipped
+    return [bodies, *step_seconds, ratio(step_seconds[0], step_seconds[2])], skip_reasons

@@ -9,9 +9,9 @@ ALGEBRAS = [*(f"so {n}" for n in range(3, 9)), *(f"su {n}" for n in range(2, 6))
 """Algebras, named as in :func:`.growth.algebra_by_name`."""
 
 
-def run(quick: bool) -> Report:
+def run(is_quick: bool) -> Report:
     """Compile and time both engines on each algebra."""
-    steps, rounds, names = (2000, 1, ["so 3"]) if quick else (200_000, 3, ALGEBRAS)
+    steps, rounds, names = (2000, 1, ["so 3"]) if is_quick else (200_000, 3, ALGEBRAS)
     caption = (
         f"Runs of {steps:,} steps of size {growth.STEP}, each algebra in a new process on one core with an empty "
         "cache. *Compiling* is what the first call takes longer than later ones: tracing and compiling."

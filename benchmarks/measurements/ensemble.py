@@ -51,16 +51,16 @@ PEERS: dict[str, Callable] = {
 """Functions that build a peer's run."""
 
 
-def run(quick: bool) -> Report:
+def run(is_quick: bool) -> Report:
     """Compare each of the library's methods with C and the peers."""
-    bodies, rounds = (64, 1) if quick else (10_000, 5)
+    bodies, rounds = (64, 1) if is_quick else (10_000, 5)
     x0s = random_states(bodies)
-    exact = np.array([reference.exact_state(x0, RATE, T_END) for x0 in x0s[: 2 if quick else N_SAMPLED_BODIES]])
-    methods = {"midpoint": METHODS["midpoint"]} if quick else METHODS
+    exact = np.array([reference.exact_state(x0, RATE, T_END) for x0 in x0s[: 2 if is_quick else N_SAMPLED_BODIES]])
+    methods = {"midpoint": METHODS["midpoint"]} if is_quick else METHODS
     contests = {
         name: _race_method(name, method, steps, x0s, exact, rounds) for name, (method, steps) in methods.items()
     }
-    times, _, skipped = contests["midpoint"]
+    times, _, skip_reasons = contests["midpoint"]
     against_c = ratio(times[COMPILED_ROW], times.get(C_ROW))
     targets = [Target(f"{bodies:,} relaxed bodies, 200 steps, against C with SIMD", 1.7, against_c)]
     for name, (times, _, _) in contests.items():
@@ -84,7 +84,7 @@ def run(quick: bool) -> Report:
         "the loosest "
         "tolerance with which it is at least as accurate as the library's method."
     )
-    return Report("Many bodies", text, [table for _, table, _ in contests.values()], targets, skipped)
+    return Report("Many bodies", text, [table for _, table, _ in contests.values()], targets, skip_reasons)
 
 
 def _race_method(name: str, method: lt.OneStepMethod, steps: int, x0s: np.ndarray, exact: np.ndarray, rounds: int):
@@ -108,7 +108,7 @@ def _race_method(name: str, method: lt.OneStepMethod, steps: int, x0s: np.ndarra
             C_ROW: lambda: (_c_work(x0s, steps, available_cores()), f"{steps} steps"),
             f"{C_ROW}, one core": lambda: (_c_work(x0s, steps, 1), f"{steps} steps"),
         }
-    peer_works, skipped = build_available(builders)
+    peer_works, skip_reasons = build_available(builders)
     works |= {title: work for title, (work, _) in peer_works.items()}
     outcomes = race(works, rounds=rounds)
     times: dict[str, float] = {}
@@ -129,7 +129,7 @@ def _race_method(name: str, method: lt.OneStepMethod, steps: int, x0s: np.ndarra
     rows.sort(key=lambda row: row[3])
     columns = {"": "text", "Setting": "text", "Error": "error", "Time a body": "seconds", "Relative to C": "ratio"}
     caption = f"The library: {name}, {steps} steps; peers at its accuracy, whose laws are taken at the ends alone."
-    return times, Table(caption, columns | laws.COLUMNS, rows), skipped
+    return times, Table(caption, columns | laws.COLUMNS, rows), skip_reasons
 
 
 def _peer_work(build: Callable, x0s: np.ndarray, exact: np.ndarray, max_error: float) -> tuple[Callable, str]:

@@ -86,10 +86,12 @@ COLUMNS = {
 """Columns of the table of first trajectories."""
 
 
-def run(quick: bool) -> Report:
+def run(is_quick: bool) -> Report:
     """Run a user's script in new processes, with an empty cache and then with the cache that it left."""
     rounds, systems = (
-        (1, {"rigid body": BODY_CODE}) if quick else (3, {"rigid body": BODY_CODE, "plain functions": FUNCTIONS_CODE})
+        (1, {"rigid body": BODY_CODE})
+        if is_quick
+        else (3, {"rigid body": BODY_CODE, "plain functions": FUNCTIONS_CODE})
     )
     rows: list[list] = []
     totals: dict[tuple[str, str], float] = {}
@@ -111,13 +113,13 @@ def run(quick: bool) -> Report:
     for name, max_seconds in ("compiled engine, cold", 2.0), ("compiled engine, cached", 1.1):
         slowest_total = max(total for (_, which), total in totals.items() if which == name)
         targets.append(Target(f"first trajectory in a new process, {name}", max_seconds, slowest_total, "seconds"))
-    flows, flow_targets = _flow_table(quick)
+    flows, flow_targets = _flow_table(is_quick)
     targets += flow_targets
     text = "From the start of the Python process to the end of its first trajectory; the slower system counts."
     return Report("First trajectory", text, [table, flows], targets)
 
 
-def _flow_table(quick: bool) -> tuple[Table, list[Target]]:
+def _flow_table(is_quick: bool) -> tuple[Table, list[Target]]:
     """Return the times of `lt.flow` and its derivatives, each in a new process without a cache, and the targets."""
     columns = {
         "": "text",
@@ -128,8 +130,8 @@ def _flow_table(quick: bool) -> tuple[Table, list[Target]]:
     }
     rows: list[list] = []
     for name, system in FLOW_SYSTEMS.items():
-        for query, (expression, max_seconds) in list(FLOW_QUERIES.items())[: 1 if quick else None]:
-            for steps in (10, 1_000) if query in LONG_RUN_QUERIES and not quick else (10,):
+        for query, (expression, max_seconds) in list(FLOW_QUERIES.items())[: 1 if is_quick else None]:
+            for steps in (10, 1_000) if query in LONG_RUN_QUERIES and not is_quick else (10,):
                 with tempfile.TemporaryDirectory() as cache:
                     script = FLOW_SCRIPT.format(system=system, asked=expression, steps=steps)
                     first_seconds, call = json.loads(child.run_python("-c", script, cache=cache))

@@ -33,15 +33,15 @@ METHOD = lt.MetriplecticRungeKutta(4)
 """Method of the library."""
 
 
-def run(quick: bool) -> Report:
+def run(is_quick: bool) -> Report:
     """Time steps of the library and of the isospectral midpoint on matrices of growing size."""
-    sizes = (16, 20) if quick else (32, 64, 128, 256, 512)
+    sizes = (16, 20) if is_quick else (32, 64, 128, 256, 512)
     rows, targets = [], []
     for N in sizes:
-        steps, rounds = (2, 1) if quick else (max(4, 10_240 // N), 1 if N > 256 else 3)
+        steps, rounds = (2, 1) if is_quick else (max(4, 10_240 // N), 1 if N > 256 else 3)
         new_rows, ratio = process.run_child("fluids", "plain", str(N), str(steps), str(rounds), one_core=True)
         rows += new_rows
-        if not quick and N in (128, 256):
+        if not is_quick and N in (128, 256):
             targets.append(
                 Target(f"su({N}), one step with exact laws, against the isospectral step without", 1.0, ratio)
             )
@@ -65,15 +65,15 @@ def run(quick: bool) -> Report:
         "NumPy and machine code, without dissipation. The library takes steps of `MetriplecticRungeKutta(4)` with "
         "selective decay, the energy exact and the entropy never falling."
     )
-    magnetic, magnetic_targets = magnetic_tables(quick)
+    magnetic, magnetic_targets = magnetic_tables(is_quick)
     tables = [Table(caption, columns, rows), *magnetic]
     return Report("Large matrix algebras: a fluid on the sphere", text, tables, targets + magnetic_targets, {})
 
 
-def magnetic_tables(quick: bool) -> tuple[list[Table], list[Target]]:
+def magnetic_tables(is_quick: bool) -> tuple[list[Table], list[Target]]:
     """Return tables and targets: steps with and without a magnetic field, and the invariants in many steps."""
-    sizes = (12,) if quick else (64, 128, 256)
-    steps, rounds, long_steps = (4, 1, 20) if quick else (40, 3, LONG_RUN_STEPS)
+    sizes = (12,) if is_quick else (64, 128, 256)
+    steps, rounds, long_steps = (4, 1, 20) if is_quick else (40, 3, LONG_RUN_STEPS)
     rows, targets = [], []
     for N in sizes:
         results = process.run_child("fluids", "beside", str(N), str(steps), str(rounds), one_core=True)
@@ -85,7 +85,7 @@ def magnetic_tables(quick: bool) -> tuple[list[Table], list[Target]]:
         {"N": "count", "Without": "seconds", "With": "seconds", "Ratio": "ratio"},
         rows,
     )
-    invariant_rows, runs = [], [(12, 0.0)] if quick else [(64, 0.0), (64, MAGNETIC_RATE), (128, 0.0), (256, 0.0)]
+    invariant_rows, runs = [], [(12, 0.0)] if is_quick else [(64, 0.0), (64, MAGNETIC_RATE), (128, 0.0), (256, 0.0)]
     for N, rate in runs:
         results = process.run_child("fluids", "kept", str(N), str(long_steps), str(rate))
         invariant_rows.append([N, "ideal" if rate == 0.0 else "with friction", *results])

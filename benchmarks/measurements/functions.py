@@ -67,11 +67,11 @@ def function_body(function) -> lt.LiePoissonSystem:
     )
 
 
-def run(quick: bool) -> Report:
+def run(is_quick: bool) -> Report:
     """Race both engines on each function, and time the first answer of the compiled one, caches empty but for XLA's."""
-    steps, rounds = (200, 1) if quick else (2000, 3)
+    steps, rounds = (200, 1) if is_quick else (2000, 3)
     rows, targets, method = [], [], lt.MetriplecticMidpoint()
-    for name, function in list(FUNCTIONS.items())[: 2 if quick else None]:
+    for name, function in list(FUNCTIONS.items())[: 2 if is_quick else None]:
         system = function_body(function)
         start = time.monotonic()
         lt.integrate(system, INITIAL_STATE, (0.0, STEP_SIZE), STEP_SIZE, method, engine="compiled")

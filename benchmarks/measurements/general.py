@@ -23,12 +23,12 @@ COMPILED_ROW = "compiled engine"
 """Row of the compiled engine."""
 
 
-def run(quick: bool) -> Report:
+def run(is_quick: bool) -> Report:
     """Time a step of the midpoint scheme with Gonzalez's gradient."""
-    steps, rounds = (2000, 1) if quick else (300_000, 5)
+    steps, rounds = (2000, 1) if is_quick else (300_000, 5)
     rate = RATE_TIMES_DURATION / (STEP_SIZE * steps)
     system = general_body(rate)
-    works, skipped = build_available(
+    works, skip_reasons = build_available(
         {
             C_ROW: lambda: c_run(_c_program(rate), steps),
             TEXTBOOK_ROW: lambda: c_run(_c_program(rate, "-DTEXTBOOK"), steps),
@@ -51,7 +51,7 @@ def run(quick: bool) -> Report:
         )
     c_ratio = ratio(times[COMPILED_ROW], times.get(C_ROW))
     targets = [Target("general H and S, same scheme, against C with derivatives by hand", 1.3, c_ratio)]
-    return Report("A general energy and entropy", text, [table], targets, skipped)
+    return Report("A general energy and entropy", text, [table], targets, skip_reasons)
 
 
 def _c_program(rate: float, *options: str) -> BodyProgram:

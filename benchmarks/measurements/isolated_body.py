@@ -33,9 +33,9 @@ print(json.dumps([time.monotonic(), solution.audit().passed]))
 """Script of a user's first trajectory."""
 
 
-def run(quick: bool) -> Report:
+def run(is_quick: bool) -> Report:
     """Race the relaxed and the isolated body, and time the first trajectory with and without a cache."""
-    steps, rounds = (2000, 1) if quick else (300_000, 7)
+    steps, rounds = (2000, 1) if is_quick else (300_000, 7)
     rate = RATE_TIMES_DURATION / (STEP_SIZE * steps)
     bodies = {
         "relaxed body": lt.models.rigid_body(INERTIA, rate),
@@ -43,7 +43,7 @@ def run(quick: bool) -> Report:
         "isolated body, attitude": lt.models.tumbling_body(INERTIA, rate=rate),
     }
     rows, targets = [], []
-    for method in METHODS[: 1 if quick else None]:
+    for method in METHODS[: 1 if is_quick else None]:
         works = {
             name: lambda body=body, method=method: lt.integrate(
                 body, INITIAL_STATE, (0.0, STEP_SIZE * steps), STEP_SIZE, method, save_every=steps, engine="compiled"
@@ -65,12 +65,12 @@ def run(quick: bool) -> Report:
 
     script_rows, calls = (
         [],
-        ("MetriplecticMidpoint()",) if quick else ("MetriplecticMidpoint()", "MetriplecticRungeKutta(8)"),
+        ("MetriplecticMidpoint()",) if is_quick else ("MetriplecticMidpoint()", "MetriplecticRungeKutta(8)"),
     )
     for call in calls:
         script = RUN_SCRIPT.format(inertia=INERTIA, start=INITIAL_STATE, method=call)
         with tempfile.TemporaryDirectory() as cache:
-            cold_seconds, *cached_seconds = [_script_seconds(script, cache) for _ in range(2 if quick else 4)]
+            cold_seconds, *cached_seconds = [_script_seconds(script, cache) for _ in range(2 if is_quick else 4)]
         script_rows.append([call, cold_seconds, min(cached_seconds)])
         targets.append(Target(f"first trajectory with attitude, cached, {call}", 1.5, min(cached_seconds), "seconds"))
     calls_table = Table(

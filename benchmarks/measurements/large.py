@@ -50,9 +50,9 @@ C_ROW = "C, 1 threads"
 """Row of the C program."""
 
 
-def run(quick: bool) -> Report:
+def run(is_quick: bool) -> Report:
     """Measure functions and noise, each size in a process of its own."""
-    sizes, edges = ((1_000,), (4,)) if quick else (SIZES, EDGES)
+    sizes, edges = ((1_000,), (4,)) if is_quick else (SIZES, EDGES)
     seconds_by_size = {n: process.run_child("large", "functions", str(n)) for n in sizes}
     row_names = (PLAIN_ROW, HAND_WRITTEN_ROW, COLUMN_MAJOR_ROW, MODEL_ROW, C_ROW)
     rows = [[n, *(seconds_by_size[n].get(row_name) for row_name in row_names)] for n in sizes]
@@ -78,7 +78,7 @@ def run(quick: bool) -> Report:
     target_seconds = seconds_by_size[target_size]
     targets = [
         Target("a plain function on 10⁵ sites, a step against the scheme by hand in JAX, (n, 3)", 1.0,
-               None if quick else ratio(target_seconds[PLAIN_ROW], target_seconds[HAND_WRITTEN_ROW])),
+               None if is_quick else ratio(target_seconds[PLAIN_ROW], target_seconds[HAND_WRITTEN_ROW])),
         *(Target(f"noise on {n}³ spins, first answer", 5.0, noise[n]["first"], "seconds") for n in edges),
         *(Target(f"noise on {n}³ spins, a step against one without", 4.0, noise[n]["ratio"]) for n in edges),
     ]  # fmt: skip

@@ -45,9 +45,9 @@ THREADS = (1, 2)
 """Numbers of threads of the C program."""
 
 
-def run(quick: bool) -> Report:
+def run(is_quick: bool) -> Report:
     """Compare with C, and measure the growth with the number of spins."""
-    count, rounds = (1_000, 1) if quick else (N_SPINS, 5)
+    count, rounds = (1_000, 1) if is_quick else (N_SPINS, 5)
     system, x0 = spin_ring(count), random_spins(count)
 
     def theirs(threads: int, steps: int):
@@ -56,7 +56,7 @@ def run(quick: bool) -> Report:
     candidates = {
         f"C, {threads} threads": lambda threads=threads: functools.partial(theirs, threads) for threads in THREADS
     }
-    c_works, skipped = build_available(candidates)
+    c_works, skip_reasons = build_available(candidates)
     works = {name: functools.partial(work, LONG_STEPS) for name, work in c_works.items()}
     short_works = {(name, SHORT_STEPS): functools.partial(work, SHORT_STEPS) for name, work in c_works.items()}
     works["array engine"] = functools.partial(library_run, system, x0, LONG_STEPS)
@@ -93,11 +93,11 @@ def run(quick: bool) -> Report:
         text += (
             f" After {LONG_STEPS} steps the states differ by {require_same_scheme(float(difference), LONG_STEPS):.0e}."
         )
-    tables = [Table(caption, columns | laws.COLUMNS, rows), growth_table((1_000,) if quick else SIZES)]
+    tables = [Table(caption, columns | laws.COLUMNS, rows), growth_table((1_000,) if is_quick else SIZES)]
     c_row = f"C, {THREADS[-1]} threads"  # as many as the array engine may use
     time_ratio = ratio(seconds["array engine"], seconds.get(c_row))
     target = Target("10⁵ coupled spins on two cores, a step against C on both", 3.0, time_ratio)
-    return Report("Many spins", text, tables, [target], skipped)
+    return Report("Many spins", text, tables, [target], skip_reasons)
 
 
 def growth_table(sizes) -> Table:

@@ -72,11 +72,11 @@ def _fit_row(noise: float, window: int, steps: int) -> list:
     return [f"noise {noise:g} rad, {kind}", *errors, float(abs(friction / RATE - 1.0)), angle, *laws, training_seconds]
 
 
-def run(quick: bool) -> Report:
+def run(is_quick: bool) -> Report:
     kinds = [(1e-3, 20, 1500), (1e-3, 200, 1500), (1e-2, 20, 1500)]
     rows = []
-    for noise, window, steps in kinds[:1] if quick else kinds:
-        rows.append(_fit_row(noise, window, 50 if quick else steps))
+    for noise, window, steps in kinds[:1] if is_quick else kinds:
+        rows.append(_fit_row(noise, window, 50 if is_quick else steps))
         print(rows[-1], flush=True)
     errors = dict.fromkeys(["Error of I₁/I₃", "I₂/I₃", "Friction × I₃", "Angle to 2 T", "Energy drift"], "error")
     columns = {"Records": "text", **errors, "Least entropy increment": "error", "Training": "seconds"}

@@ -6,5 +6,5 @@ from .. import learned
 from ..report import Report
 
 
-def run(quick: bool) -> Report:
-    return learned.problem_report("gas", quick)
+def run(is_quick: bool) -> Report:
+    return learned.problem_report("gas", is_quick)

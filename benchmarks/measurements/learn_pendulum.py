@@ -6,5 +6,5 @@ from .. import learned
 from ..report import Report
 
 
-def run(quick: bool) -> Report:
-    return learned.problem_report("pendulum", quick)
+def run(is_quick: bool) -> Report:
+    return learned.problem_report("pendulum", is_quick)

@@ -115,7 +115,7 @@ def binder_cumulant(series: Series, rows) -> float:
 def with_error(quantity, series: Series) -> tuple[float, float]:
     """Return a quantity and its jackknife standard error."""
     return quantity(series, series.row_indices), float(
-        np.sqrt(jackknife_variance(lambda chosen: quantity(series, chosen), series))
+        np.sqrt(jackknife_variance(lambda row_indices: quantity(series, row_indices), series))
     )
 
 
@@ -181,10 +181,10 @@ MONTE_CARLO_ROW = "Monte Carlo"
 """Name of the series by Monte Carlo."""
 
 
-def run(quick: bool) -> Report:
+def run(is_quick: bool) -> Report:
     """Run lattices of several sizes at the transition and at temperatures around it."""
     runs: list[list[Series]] = []
-    sizes = {4: (1_000,), 6: (1_000, 1_000)} if quick else STEPS_BY_LENGTH
+    sizes = {4: (1_000,), 6: (1_000, 1_000)} if is_quick else STEPS_BY_LENGTH
     for seed, (length, steps) in enumerate(sizes.items(), start=21):
         runs.append(
             [noise_series(length, CRITICAL_TEMPERATURE, count, seed + 1000 * i) for i, count in enumerate(steps)]
@@ -194,7 +194,7 @@ def run(quick: bool) -> Report:
             [noise_series(length, T, int(share * steps[0]), 10 * seed + i)] for i, (T, share) in other_temperatures
         ]
     temperatures = sorted([CRITICAL_TEMPERATURE, *STEP_SHARE_BY_TEMPERATURE])
-    for length, sweeps in ({4: 200} if quick else SWEEPS_BY_LENGTH).items():
+    for length, sweeps in ({4: 200} if is_quick else SWEEPS_BY_LENGTH).items():
         chains = sample_heat_bath(length, temperatures, sweeps)
         runs += [
             [Series(MONTE_CARLO_ROW, length, T, sweeps, 1, rows)] for T, rows in zip(temperatures, chains, strict=True)

@@ -51,12 +51,12 @@ MAX_SMALL_DIM = 6
 """Dimension from which the first result may take twice as long."""
 
 
-def run(quick: bool) -> Report:
+def run(is_quick: bool) -> Report:
     """Measure each space in a process with an empty cache, and in another with the cache that it left."""
-    steps = 1_000 if quick else 100_000
+    steps = 1_000 if is_quick else 100_000
     euclidean = mf.Euclidean
     spaces = [space for space in mf.registered_spaces() if space.can_be_embedded and not isinstance(space, euclidean)]
-    spaces = spaces[:2] if quick else spaces
+    spaces = spaces[:2] if is_quick else spaces
     rows_by_space = {space.name: _space_rows(space, "around", steps) for space in spaces}
     chart_spaces = [space for space in spaces if space.name in RETRACTION_BY_SPACE]
     chart_rows = [
@@ -97,7 +97,7 @@ def run(quick: bool) -> Report:
         Table(caption, COLUMNS, rows),
         Table("Steps of order 4 without charts, and in those of `retraction=`.", COLUMNS, chart_rows),
     ]
-    rows_by_space, skipped = build_available({"pymanopt": pymanopt_rows})
+    rows_by_space, skip_reasons = build_available({"pymanopt": pymanopt_rows})
     if rows_by_space:
         columns = {
             "": "text",
@@ -111,7 +111,7 @@ def run(quick: bool) -> Report:
             "distance of both ends, and that of the end that is extrapolated to steps of size zero."
         )
         tables.append(Table(caption, columns, rows_by_space["pymanopt"]))
-    return Report("Systems on manifolds", text, tables, targets, skipped)
+    return Report("Systems on manifolds", text, tables, targets, skip_reasons)
 
 
 def _space_rows(space: mf.Space, way: str, steps: int) -> list[list]:

@@ -23,14 +23,14 @@ PROCESS_STATUS_FILE = Path("/proc/self/status")
 """File in which Linux reports the memory of a process."""
 
 
-def run(quick: bool) -> Report:
+def run(is_quick: bool) -> Report:
     """Measure ensembles of two sizes, each in a process of its own."""
-    sizes: tuple[int, ...] = (100,) if quick else (10_000, 1_000_000)
+    sizes: tuple[int, ...] = (100,) if is_quick else (10_000, 1_000_000)
     rows: list[list] = []
-    skipped: dict[str, str] = {}
+    skip_reasons: dict[str, str] = {}
     peak = None
     if not PROCESS_STATUS_FILE.is_file():
-        sizes, skipped = (), {"all": "this system does not tell a process its largest size"}
+        sizes, skip_reasons = (), {"all": "this system does not tell a process its largest size"}
     for bodies in sizes:
         results = process.run_child("memory", str(bodies))
         peak = results["peak"]
@@ -42,8 +42,8 @@ def run(quick: bool) -> Report:
         "The largest resident size of a process of its own: before the ensemble, with the packages loaded and the "
         "initial states made, and at its end."
     )
-    targets = [Target("10⁶ bodies, summaries only: memory", 2e9, None if quick else peak, "gigabytes")]
-    return Report("Memory", text, [table], targets, skipped)
+    targets = [Target("10⁶ bodies, summaries only: memory", 2e9, None if is_quick else peak, "gigabytes")]
+    return Report("Memory", text, [table], targets, skip_reasons)
 
 
 def child(bodies: str) -> dict:

@@ -30,9 +30,9 @@ GRAPHS = ("plane grid", "grid in space", "random, 4 neighbours")
 """Kinds of graphs."""
 
 
-def run(quick: bool) -> Report:
+def run(is_quick: bool) -> Report:
     """Measure all graphs, sizes and steps."""
-    graphs, sizes = (GRAPHS[:1], (100,)) if quick else (GRAPHS, SIZES)
+    graphs, sizes = (GRAPHS[:1], (100,)) if is_quick else (GRAPHS, SIZES)
     rows: list[list] = []
     seconds: dict[tuple[str, int, float], float] = {}
     for graph in graphs:

@@ -45,16 +45,16 @@ SYSTEMS: dict[str, tuple[Callable[[], lt.System], tuple[int, ...]]] = {
 """Systems, each with numbers of steps."""
 
 
-def run(quick: bool) -> Report:
+def run(is_quick: bool) -> Report:
     """Compare with heyoka on each system."""
     tables: list[Table] = []
-    skipped: dict[str, str] = {}
+    skip_reasons: dict[str, str] = {}
     for name, (build, counts) in SYSTEMS.items():
         table, unavailable = _race_heyoka(
-            name, build(), 64 if quick else 10_000, counts[:1] if quick else counts, quick
+            name, build(), 64 if is_quick else 10_000, counts[:1] if is_quick else counts, is_quick
         )
         tables.append(table)
-        skipped |= unavailable
+        skip_reasons |= unavailable
     text = (
         f"10,000 states of norm one to t = {T_END:g}, on {available_cores()} cores: explicit steps of order 8 and "
         "heyoka in "
@@ -63,16 +63,18 @@ def run(quick: bool) -> Report:
         "the loosest tolerance with "
         "which it is at least as accurate. heyoka's spin leaves its sphere by its error. There is no target."
     )
-    return Report("Other systems", text, tables, skipped=skipped)
+    return Report("Other systems", text, tables, skipped=skip_reasons)
 
 
-def _race_heyoka(name: str, system: lt.System, number: int, counts: tuple[int, ...], quick: bool) -> tuple[Table, dict]:
+def _race_heyoka(
+    name: str, system: lt.System, number: int, counts: tuple[int, ...], is_quick: bool
+) -> tuple[Table, dict]:
     random = np.random.default_rng(0).standard_normal((number, system.dim))
     if system.space is not None:
         random[:, 3] = 0.0  # of the bath
     x0s = random / np.linalg.norm(random, axis=1)[:, None]
     rows: list[list] = []
-    heyoka_work, skipped = build_available({"heyoka": lambda: _heyoka_builder(system, x0s[:N_SAMPLED_STATES])})
+    heyoka_work, skip_reasons = build_available({"heyoka": lambda: _heyoka_builder(system, x0s[:N_SAMPLED_STATES])})
     for steps in counts:
         ours = library_ensemble(system, x0s, T_END, steps, "compiled", METHOD)
         works, method_error = {"compiled engine": ours}, math.nan
@@ -80,7 +82,7 @@ def _race_heyoka(name: str, system: lt.System, number: int, counts: tuple[int, .
             build, exact = heyoka_work["heyoka"]
             method_error = max_relative_error(ours().x, exact)
             works["heyoka"], tolerance, heyoka_error = loosest_tolerance_work(build, x0s, exact, method_error)
-        outcomes = race(works, rounds=1 if quick else 5)
+        outcomes = race(works, rounds=1 if is_quick else 5)
         seconds = {title: outcome.wall_seconds / number for title, outcome in outcomes.items()}
         run_laws = ensemble_laws(outcomes["compiled engine"].result)
         rows.append(["compiled engine", f"{steps} steps", method_error, seconds["compiled engine"],
@@ -91,7 +93,7 @@ def _race_heyoka(name: str, system: lt.System, number: int, counts: tuple[int, .
                 ["heyoka", f"tolerance {tolerance:.1e}", heyoka_error, seconds["heyoka"], 1.0, *ends.table_cells()]
             )
     columns = {"": "text", "Setting": "text", "Error": "error", "Time a state": "seconds", "Relative": "ratio"}
-    return Table(f"{name}.", columns | laws.COLUMNS, rows), skipped
+    return Table(f"{name}.", columns | laws.COLUMNS, rows), skip_reasons
 
 
 def _heyoka_builder(system: lt.System, states: np.ndarray) -> tuple[Callable, np.ndarray]:

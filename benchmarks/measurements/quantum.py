@@ -108,9 +108,9 @@ def qubit_ensemble(number: int) -> tuple[lt.Ensemble, np.ndarray]:
     return result, np.abs(np.asarray(result.x)[:, : example_system.body_dim] - gibbs).max(axis=1)
 
 
-def _ensemble_table(quick: bool) -> Table:
-    number = 100 if quick else 100_000
-    outcome = race({"ours": lambda: qubit_ensemble(number)}, rounds=1 if quick else 3)["ours"]
+def _ensemble_table(is_quick: bool) -> Table:
+    number = 100 if is_quick else 100_000
+    outcome = race({"ours": lambda: qubit_ensemble(number)}, rounds=1 if is_quick else 3)["ours"]
     result, distance = outcome.result
     cells = [f"{number:,}", outcome.wall_seconds, outcome.wall_seconds / number, float(distance.max())]
     columns = {"Qubits": "text", "To the end": "seconds", "Time a qubit": "seconds", "Distance from Gibbs": "error"}
@@ -122,10 +122,10 @@ def _ensemble_table(quick: bool) -> Table:
     )
 
 
-def run(quick: bool) -> Report:
-    rows, rounds = [], 1 if quick else 5
+def run(is_quick: bool) -> Report:
+    rows, rounds = [], 1 if is_quick else 5
     small_cases, large_cases = ((2, 20, 2.5), (3, 20, 1.25), (4, 20, 1.25)), ((8, 16, 0.5), (16, 16, 0.25))
-    for levels, order, step in small_cases if quick else small_cases + large_cases:
+    for levels, order, step in small_cases if is_quick else small_cases + large_cases:
         q, rng = thermal_system(levels), np.random.default_rng(levels)
         root = rng.normal(size=(levels, levels)) + 1j * rng.normal(size=(levels, levels))
         rho = root @ root.conj().T / np.trace(root @ root.conj().T).real
@@ -162,4 +162,4 @@ def run(quick: bool) -> Report:
         rows,
     )
     text = "Levels in a bath of constant temperature, where the motion is Lindblad's equation. Processor times."
-    return Report("Density matrices", text, [table, _ensemble_table(quick)], [])
+    return Report("Density matrices", text, [table, _ensemble_table(is_quick)], [])

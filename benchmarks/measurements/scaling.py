@@ -84,14 +84,14 @@ SYSTEM_KINDS: dict[str, tuple[Callable, lt.OneStepMethod, float]] = {
 """Functions that make a system and a state with n sites, and the method and step, by kind."""
 
 
-def run(quick: bool) -> Report:
+def run(is_quick: bool) -> Report:
     """Measure every kind and size, each in a process of its own."""
     rows: list[list] = []
-    skipped: dict[str, str] = {}
+    skip_reasons: dict[str, str] = {}
     for kind in SYSTEM_KINDS:
-        for n in SIZES[:2] if quick else SIZES:
+        for n in SIZES[:2] if is_quick else SIZES:
             if reason := why_too_large(rows[-1] if rows and rows[-1][0] == kind else None):
-                skipped[f"{kind}, {n:,} sites"] = reason
+                skip_reasons[f"{kind}, {n:,} sites"] = reason
                 break
             results = process.run_child("scaling", kind, str(n))
             row = [kind, results["sites"], results["engine"], results["first"], results["step"] / results["sites"]]
@@ -112,7 +112,7 @@ def run(quick: bool) -> Report:
         Target(f"first answer with 10⁵ sites, {kind}", 5.0, next((r[3] for r in rows if r[0] == kind and
                0.9e5 < r[1] < 1.1e5), None), "seconds") for kind in SYSTEM_KINDS
     ]  # fmt: skip
-    return Report("Time and memory by size", text, [Table(caption, columns, rows)], targets, skipped)
+    return Report("Time and memory by size", text, [Table(caption, columns, rows)], targets, skip_reasons)
 
 
 def why_too_large(last_row: list | None) -> str:

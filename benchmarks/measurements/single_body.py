@@ -23,11 +23,11 @@ PLAIN_ROW = "compiled engine, plain functions"
 """Row of the compiled engine with plain functions."""
 
 
-def run(quick: bool) -> Report:
+def run(is_quick: bool) -> Report:
     """Time a step in a run that is long compared with the call, and the call of a short run."""
-    steps, rounds = (2000, 1) if quick else (1_000_000, 5)
+    steps, rounds = (2000, 1) if is_quick else (1_000_000, 5)
     rate = RATE_TIMES_DURATION / (STEP_SIZE * steps)
-    long_works, skipped = build_available(
+    long_works, skip_reasons = build_available(
         {
             C_ROW: lambda: c_run(_c_program(rate), steps),
             QUADRATIC_ROW: lambda: library_run(quadratic_body(rate), steps, "compiled"),
@@ -39,7 +39,7 @@ def run(quick: bool) -> Report:
     caption = f"A run of {steps:,} steps of size {STEP_SIZE}, relaxing all the way (rate {rate:g}); one state kept."
     table, times = race_one_trajectory(caption, long_works, steps, rounds, C_ROW)
 
-    short_steps = 100 if quick else 1000
+    short_steps = 100 if is_quick else 1000
     short_works, _ = build_available(
         {
             C_ROW: lambda: c_run(_c_program(1.0), short_steps, 1),
@@ -76,7 +76,7 @@ def run(quick: bool) -> Report:
             f"a call of {short_steps} steps that keeps every state, without the steps", 1.5e-4, call_seconds, "seconds"
         )
     )
-    return Report("One body", text, [table, calls], targets, skipped)
+    return Report("One body", text, [table, calls], targets, skip_reasons)
 
 
 def _c_program(rate: float) -> BodyProgram:

@@ -55,16 +55,16 @@ C_SOURCES = {"without charts": "spin_around.c", "in charts": "spin.c"}
 """C sources of both schemes."""
 
 
-def run(quick: bool) -> Report:
+def run(is_quick: bool) -> Report:
     """Time a step of the midpoint scheme in one thread, and runs of high order against heyoka."""
-    steps, rounds = (2000, 1) if quick else (100_000, 5)
+    steps, rounds = (2000, 1) if is_quick else (100_000, 5)
     rate, tables, text = RATE_TIMES_DURATION / (STEP * steps), [], [INTRODUCTION]
     ratios: dict[str, float | None] = {}
-    skipped: dict[str, str] = {}
+    skip_reasons: dict[str, str] = {}
     for way in RETRACTIONS:
         runs = functools.partial(_c_run, rate, steps, way), functools.partial(_compiled_run, rate, steps, way)
         works, unavailable = build_available(dict(zip((C_ROW, COMPILED_ROW), runs, strict=True)))
-        skipped |= unavailable
+        skip_reasons |= unavailable
         caption = f"{steps:,} steps of size {STEP} {way}, relaxing all the way (rate {rate:g}); one state kept."
         table, times = race_one_trajectory(caption, works, steps, rounds, C_ROW)
         tables.append(table)
@@ -77,12 +77,12 @@ def run(quick: bool) -> Report:
         table, heyoka_ratio = _race_heyoka(rounds)
         tables.append(table)
     except UnavailableError as reason:
-        heyoka_ratio, skipped["heyoka"] = None, str(reason)
+        heyoka_ratio, skip_reasons["heyoka"] = None, str(reason)
     targets = [
         Target("a spin on its sphere, same scheme without charts, against C", 1.5, ratios["without charts"]),
         Target(f"a spin on its sphere with an error of {TARGET_ERROR:g}, against heyoka", 1.0, heyoka_ratio),
     ]
-    return Report("A spin on its sphere", " ".join(text), tables, targets, skipped)
+    return Report("A spin on its sphere", " ".join(text), tables, targets, skip_reasons)
 
 
 INTRODUCTION = """\

@@ -34,9 +34,9 @@ N_CLUSTER_BODIES = 200_000
 """Number of bodies on the cluster."""
 
 
-def run(quick: bool) -> Report:
+def run(is_quick: bool) -> Report:
     """Measure a large study, small chunks, and a cluster."""
-    bodies, chunks, n_cluster_bodies = (2_000, 100, 500) if quick else (N_BODIES, N_CHUNKS, N_CLUSTER_BODIES)
+    bodies, chunks, n_cluster_bodies = (2_000, 100, 500) if is_quick else (N_BODIES, N_CHUNKS, N_CLUSTER_BODIES)
     single_results = [process.run_child("studies", what, str(bodies)) for what in ("bare", "kept")]
     overhead = single_results[1]["seconds"] / single_results[0]["seconds"] - 1.0
     columns = {"": "text", "Time": "seconds", "Peak memory": "gigabytes"}
@@ -70,7 +70,7 @@ def run(quick: bool) -> Report:
         Target("10⁵ chunks of trivial work: a chunk", 5e-3, chunk_result["seconds"] / chunks, "seconds"),
     ]
     text = "Bodies whose rates of dissipation are the axis of a study, until the entropy production has fallen to 1e-8."
-    return Report("Studies", text, [time_table, chunk_table, worker_table], [] if quick else targets)
+    return Report("Studies", text, [time_table, chunk_table, worker_table], [] if is_quick else targets)
 
 
 def child(part: str, number: str, workers: str = "1") -> dict:

@@ -50,11 +50,11 @@ def contestants(body: TumblingBody, t_end: float) -> dict[str, tuple[str, float 
     }
 
 
-def run(quick: bool) -> Report:
+def run(is_quick: bool) -> Report:
     """Compare all programs on the free and on the damped body."""
-    t_end, rounds = (10.0, 1) if quick else (1000.0, 3)
+    t_end, rounds = (10.0, 1) if is_quick else (1000.0, 3)
     tables: list[Table] = []
-    skipped: dict[str, str] = {}
+    skip_reasons: dict[str, str] = {}
     max_drift = 0.0
     captions = {
         f"The free body, I = (3, 2, 1), to t = {t_end:g} s.": FREE_BODY,
@@ -63,7 +63,7 @@ def run(quick: bool) -> Report:
     for caption, body in captions.items():
         settings = contestants(body, t_end)
         works, unavailable = build_available({name: build for name, (_, _, build) in settings.items()})
-        skipped |= unavailable
+        skip_reasons |= unavailable
         exact = scipy_run(body, EXACT_TOLERANCE, t_end, N_TIMES)()
         rows: list[list[Any]] = []
         for name, outcome in race(works, rounds=rounds, max_seconds=8.0).items():
@@ -86,7 +86,7 @@ def run(quick: bool) -> Report:
         "attitude too."
     )
     targets = [Target("a tumbling body for 1000 s: momentum in space, energy with heat", 1e-12, max_drift, "error")]
-    return Report("A tumbling body, beside MuJoCo and Basilisk", text, tables, targets, skipped)
+    return Report("A tumbling body, beside MuJoCo and Basilisk", text, tables, targets, skip_reasons)
 
 
 def _record_errors(record: MotionRecord, exact: MotionRecord, kinetic: np.ndarray) -> list[float | None]:

@@ -35,11 +35,11 @@ COMPILED_ROW = "compiled engine"
 """Row of the compiled engine."""
 
 
-def run(quick: bool) -> Report:
+def run(is_quick: bool) -> Report:
     """Time each scheme on Case 1 of the paper, with one saved state."""
-    steps, rounds = (2000, 1) if quick else (STEPS, 9)
+    steps, rounds = (2000, 1) if is_quick else (STEPS, 9)
     tables, targets, max_difference = [], [], 0.0
-    skipped: dict[str, str] = {}
+    skip_reasons: dict[str, str] = {}
     for number in SCHEMES:
         works, unavailable = build_available(
             {
@@ -56,7 +56,7 @@ def run(quick: bool) -> Report:
                 ratio(times[COMPILED_ROW], times.get(C_ROW)),
             )
         )
-        skipped |= unavailable
+        skip_reasons |= unavailable
         if C_ROW in works:
             max_difference = max(max_difference, max_difference_from_c(number))
     text = (
@@ -67,7 +67,7 @@ def run(quick: bool) -> Report:
     )
     if max_difference:
         text += f" Over 1000 steps the trajectories differ by {max_difference:.0e} at most."
-    return Report("Variational schemes", text, tables, targets, skipped)
+    return Report("Variational schemes", text, tables, targets, skip_reasons)
 
 
 def c_program(number: int) -> BodyProgram:

@@ -59,13 +59,13 @@ CALL_ROW = "a call of one step"
 """Row of a call of one step, whose time is subtracted."""
 
 
-def run(quick: bool) -> Report:
+def run(is_quick: bool) -> Report:
     """Race every method at every setting; errors are relative to a reference with forty digits."""
     builders: dict[tuple[str, str], Callable] = {}
     for name, (method, counts) in METHODS.items():
-        if quick and name != "midpoint":
+        if is_quick and name != "midpoint":
             continue
-        for steps in counts[:1] if quick else counts:
+        for steps in counts[:1] if is_quick else counts:
             builders |= {
                 (f"{name}, {engine} engine", f"{steps} steps"): _library_builder(method, steps, engine)
                 for engine in ("compiled", "array")
@@ -75,10 +75,10 @@ def run(quick: bool) -> Report:
         if method.explicit:
             builders[name, CALL_ROW] = _library_builder(method, 1, "compiled", T_END / counts[-1])
     for name, (solver, tolerances) in PEERS.items():
-        for tolerance in tolerances[:1] if quick else tolerances:
+        for tolerance in tolerances[:1] if is_quick else tolerances:
             builders[name, f"tolerance {tolerance:.0e}"] = _peer_builder(solver, tolerance)
-    contestants, skipped = build_available(builders)
-    outcomes = race({key: end for key, (end, _) in contestants.items()}, rounds=1 if quick else 5, max_seconds=2.0)
+    contestants, skip_reasons = build_available(builders)
+    outcomes = race({key: end for key, (end, _) in contestants.items()}, rounds=1 if is_quick else 5, max_seconds=2.0)
 
     exact = reference.exact_state(X0, RATE, T_END)
     rows: list[list] = []
@@ -103,8 +103,8 @@ def run(quick: bool) -> Report:
         "Work and precision",
         text,
         [_fastest_table(series), Table("Every run.", columns, rows)],
-        [] if quick else _explicit_targets(series, calls),
-        skipped={name: reason for (name, _), reason in skipped.items()},
+        [] if is_quick else _explicit_targets(series, calls),
+        skipped={name: reason for (name, _), reason in skip_reasons.items()},
         series=series,
     )
 

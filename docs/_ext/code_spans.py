@@ -28,7 +28,7 @@ NOT_PYTHON = re.compile(
 
 FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 SPAN = re.compile(r"(?<![`}])`([^`\n]+)`(?!`)")
-FOREIGN = re.compile(r"^\|[^|\n]*\| here \|\n(?:\|.*\n)+", re.MULTILINE)
+FOREIGN = re.compile(r"^\|[^|\n]*\| liethermo \|\n(?:\|.*\n)+", re.MULTILINE)
 """A table whose first column has the words of another package."""
 
 

@@ -348,7 +348,7 @@ class SteepestEntropyAscent(Dissipation):
         return self
 
     def bind_to_structure(self, structure: mf.DensityMatrices) -> SteepestEntropyAscent:
-        """Return this dissipation with its preserved functions as functions of state vectors."""
+        """Return this dissipation with its preserved functions as functions of the state vectors of ``structure``."""
         functions = []
         for i, f in enumerate(self.functions):
             if isinstance(f, Operator):

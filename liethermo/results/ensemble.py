@@ -191,9 +191,9 @@ class Ensemble(AuditableResult):
 
     def _member_index(self, i) -> int:
         if isinstance(i, bool) or not isinstance(i, int | np.integer):
-            raise InputError(f"a trajectory is chosen by a number, got {i!r}")
+            raise InputError(f"the index of a trajectory must be an integer, got {i!r}")
         if not -len(self) <= i < len(self):
-            raise IndexError(f"there is no trajectory {i}; the ensemble has {len(self)}")
+            raise IndexError(f"the index of a trajectory must be from {-len(self)} to {len(self) - 1}, got {i}")
         return int(i) % len(self)
 
     def message(self, i: int) -> str:

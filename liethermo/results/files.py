@@ -147,7 +147,7 @@ def write_dataset(dataset: xarray.Dataset, path: str | os.PathLike) -> Path:
         raise FileError(
             f"cannot write {path!s:.200}: {disk.describe_os_error(error)}. The result in memory is unchanged"
         ) from error
-    disk.remove_dead_parts(path.parent, path.name)
+    disk.remove_abandoned_files(path.parent, path.name)
     return path
 
 

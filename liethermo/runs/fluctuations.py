@@ -93,9 +93,9 @@ class Fluctuations:
         """List of the seeds: one for all trajectories, or one each."""
         return list(self.seed) if isinstance(self.seed, list | tuple | np.ndarray) else [self.seed]  # type: ignore[list-item]
 
-    def grid_seeds(self, places: Sequence[np.ndarray]) -> np.ndarray:
-        """Return a seed for each point of a grid, from its indices along the axes: see :class:`liethermo.Study`."""
-        return grid_seeds(self.seeds[0], places)
+    def grid_seeds(self, grid_indices: Sequence[np.ndarray]) -> np.ndarray:
+        """Return a seed for each point of a grid, shape (points,), from its ``grid_indices`` along the axes."""
+        return grid_seeds(self.seeds[0], grid_indices)
 
     def of(self, i: int) -> Fluctuations:
         """Return the noise of trajectory i of an ensemble."""

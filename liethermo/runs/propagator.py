@@ -63,9 +63,9 @@ MAX_CACHED_PARAMETER_SETS = 32
 class Propagator:
     """A system, a method and a step, prepared once: for optimisers, samplers and control loops.
 
-    ``p(x0, t_span)`` returns what :func:`integrate` returns. ``p.final(x0, t_span)`` returns the last state alone, in
-    some ten microseconds beside the steps where the compiled engine takes steps of one size. A propagator may be called
-    from several threads, and pickled.
+    ``p(x0, t_span)`` returns what :func:`integrate` returns. ``p.final(x0, t_span)`` returns the last state alone,
+    and goes straight to machine code where the compiled engine takes steps of one size. A propagator may be called from
+    several threads, and pickled.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ class Propagator:
             raise InputError(NOISY_STEPS)
         self.system, self.method, self.step, self.engine, self.noise = system, method, step, engine, noise
         self._variants: LRUCache[Propagator] = LRUCache(MAX_CACHED_PARAMETER_SETS)
-        self._local = threading.local()
+        self._thread_state = _ThreadState()
 
     def __getstate__(self) -> tuple:
         return self.system, self.method, self.step, self.engine, self.noise
@@ -284,9 +284,10 @@ class Propagator:
 
     def _final_state_calls(self) -> FinalStateCalls | None:
         """Return what computes final states in this thread by machine code, or None where it cannot."""
-        if not hasattr(self._local, "calls"):
-            self._local.calls = self._make_final_state_calls()
-        return self._local.calls
+        state = self._thread_state
+        if not state.is_prepared:
+            state.calls, state.is_prepared = self._make_final_state_calls(), True
+        return state.calls
 
     @with_library_settings
     def _make_final_state_calls(self) -> FinalStateCalls | None:
@@ -302,6 +303,13 @@ class Propagator:
         engine = EngineWithFallback(prepared, method, self.engine, 0)
         runner = engine.final_state_runner()
         return None if runner is None else FinalStateCalls(system, prepared, method, self.step, runner)
+
+
+class _ThreadState(threading.local):
+    """Final states by machine code in one thread: the buffers of a runner belong to one thread."""
+
+    is_prepared = False
+    calls: FinalStateCalls | None = None
 
 
 class FinalStateCalls:

@@ -114,7 +114,7 @@ class StudyStore:
         arrays.append(ZarrArray("quantity", ("quantity",), (len(LAW_QUANTITIES),), (len(LAW_QUANTITIES),), "string"))
         coordinates = [array for array, _ in _coordinate_arrays(axes, about)]
         store = cls(root, {a.name: a for a in [*arrays, *coordinates]}, attributes)
-        partial_root = root.with_name(disk.part_name(root.name))
+        partial_root = root.with_name(disk.partial_file_name(root.name))
         try:
             partial_root.mkdir(parents=True)
             partial_store = replace(store, root=partial_root)

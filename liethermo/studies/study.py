@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     import xarray
 
 TARGET_STEPS_PER_CHUNK = 20_000_000
-"""Target number of time steps in a chunk, which take some seconds."""
+"""Target number of time steps in a chunk: long beside the overhead of a chunk, short beside a study."""
 
 MAX_POINTS_PER_CHUNK = 16_384
 """Maximum number of points in a chunk, unless ``chunk`` is given."""

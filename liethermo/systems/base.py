@@ -336,7 +336,7 @@ class System(SystemInterface):
         return self.reshape_to_sites(solution)
 
     def reshape_to_sites(self, result: Any) -> Any:
-        """Return a solution or an ensemble with its states, shape (..., n), reshaped to (..., *sites, d)."""
+        """Return ``result``, a solution or an ensemble, with its states, shape (..., n), as arrays (..., *sites, d)."""
         if not self.sites:
             return result
         states = {name: value for name in result.state_fields if (value := getattr(result, name)) is not None}

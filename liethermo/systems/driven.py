@@ -202,7 +202,10 @@ class DrivenSystem(System):
     orbit_levels = forward_to("body")
 
     def conserves(self, functions, near=None):
-        """Return whether the body conserves each function; clock and work are left out, so that they set no scale."""
+        """Return whether the body conserves each function, tested at states ``near`` those given too.
+
+        Clock and work are left out, so that they set no scale.
+        """
         near = None if near is None else near[..., : self.body.dim]
         return self.body.conserves(tuple(_ClockFreeEnergy(f) for f in functions), near)
 

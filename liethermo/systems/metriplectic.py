@@ -113,7 +113,10 @@ class MetriplecticSystem(System):
         self._build(poisson, poisson.dim, energy, entropy, dissipation, momentum_maps, validate, space, baths)
 
     def local_system(self, x, is_centred: bool = False) -> tuple[System, jax.Array]:
-        """In the space around a manifold; where it has no equations, in the coordinates of its exponential map."""
+        """Return the embedded system and x, or the system in a chart of the exponential map and its origin.
+
+        With ``is_centred`` the local system is for use at x alone.
+        """
         if self.space is None:
             return self, x
         if self.space.can_be_embedded:

@@ -145,6 +145,8 @@ class SimpleClosedSystem(LedgerSystem, VelocityContactSystem):
         """``E = v·L_v - L``, without the ledger, shape (...)."""
         return jnp.vectorize(self.contact.energy, signature="(n)->()")(self._drop_ledger(x))
 
+    own_energy = mechanical_energy  # its name in 0.2
+
     def _drop_ledger(self, x) -> jax.Array:
         return self.state(x, batch=True)[..., : self.dim_without_ledger]
 

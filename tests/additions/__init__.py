@@ -1,1 +1,1 @@
-"""What a stranger adds, each in one file and from the documentation alone; the public suites judge it."""
+"""Extensions that a stranger writes, each in one file and from the documentation alone; the public suites judge it."""

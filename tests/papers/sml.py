@@ -34,7 +34,8 @@ herglotz = Tests("systems.test_herglotz")
 matter = Tests("systems.test_matter")
 
 POINTS = np.random.default_rng(0).standard_normal((5, 5))
-MASS, BENT = np.array([2.0, 0.7]), 0.3
+MASS = np.array([2.0, 0.7])
+BENT = 0.3
 
 
 def H(q, p, S):

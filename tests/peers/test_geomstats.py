@@ -18,7 +18,8 @@ from manifolds.matrices.spectral import spectral
 EXACT = 1e-14
 """Results of order one; at most 2e-15 seen."""
 
-LN_2, SINH_1 = np.log(2.0), np.sinh(1.0)
+LN_2 = np.log(2.0)
+SINH_1 = np.sinh(1.0)
 
 
 def max_abs(a) -> float:

@@ -15,7 +15,8 @@ import pytest
 
 import liethermo as lt
 
-SZ, SX = np.diag([1.0, -1.0]), np.array([[0.0, 1.0], [1.0, 0.0]])
+SZ = np.diag([1.0, -1.0])
+SX = np.array([[0.0, 1.0], [1.0, 0.0]])
 COLD = 1.0 / 50.0
 """Temperature of a bath, relative to the frequency of a jump, at which jumps upwards are rounding."""
 
@@ -49,7 +50,8 @@ class Qobj:
 
 # -- decay of a cavity: TestMESolveDecay -------------------------------------------------------------------------------
 
-LEVELS, KAPPA = 10, 0.2
+LEVELS = 10
+KAPPA = 0.2
 A = destroy(LEVELS)
 NUMBER = A.T @ A
 HAMILTONIANS = {

@@ -15,7 +15,8 @@ import scipy.integrate
 import liethermo as lt
 import manifolds as mf
 
-RTOL, ATOL = 1e-3, 1e-6
+RTOL = 1e-3
+ATOL = 1e-6
 
 METHODS = [
     lt.MetriplecticRungeKutta(4),

@@ -66,7 +66,7 @@ def write_code(name: str, code: bytes) -> None:
     if folder is not None:
         with contextlib.suppress(OSError):
             disk.write_atomically(folder / f"{name}.o", hashlib.sha256(code).digest() + code, mode=0o600)
-            disk.remove_dead_parts(folder, f"{name}.o")
+            disk.remove_abandoned_files(folder, f"{name}.o")
 
 
 def _trusted_folder() -> Path | None:

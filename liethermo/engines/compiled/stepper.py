@@ -139,8 +139,8 @@ class CompiledEngine:
 class FinalStateRunner:
     """Runs one trajectory at a time through a compiled loop of steps, in buffers that are allocated once.
 
-    A call costs a few microseconds beside the steps. The buffers are written in place, so each thread needs a runner
-    of its own.
+    A call copies the initial state and calls the machine code, no more. The buffers are written in place, so each
+    thread needs a runner of its own.
 
     Parameters
     ----------

@@ -15,7 +15,8 @@ from tests.cases import EPS
 
 seeds = st.integers(0, 10**6)
 for_each_gradient = pytest.mark.parametrize("gradient", DISCRETE_GRADIENTS.values(), ids=list(DISCRETE_GRADIENTS))
-DIM, N = 5, 2
+DIM = 5
+N = 2
 
 
 def distances(x):

@@ -19,7 +19,7 @@ from scipy.integrate import solve_ivp
 
 import liethermo as lt
 import manifolds as mf
-from tests.cases import slow
+from tests.cases import slow_case
 
 CANONICAL = np.block([[np.zeros((2, 2)), np.eye(2)], [-np.eye(2), np.zeros((2, 2))]])
 
@@ -284,7 +284,7 @@ def cases():
         for i, method in enumerate(methods_for(name)):
             runs_by_default = isinstance(method, lt.MetriplecticGauss) and (name, method.stages) in DEFAULT_GAUSS_CASES
             case = pytest.param(name, method, id=f"{name}-{method}-{i}")
-            yield case if runs_by_default and not method.functions else slow(case)
+            yield case if runs_by_default and not method.functions else slow_case(case)
 
 
 @pytest.mark.sampled(1)

@@ -510,7 +510,8 @@ def test_unknown_tolerances_are_named():
 # -- what has nothing to do -------------------------------------------------------------------------------------------
 
 UNITARY = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3, 2)) @ np.array([1.0, 1.0j]))[0]
-LEVELS, PHASES = ((UNITARY * values) @ UNITARY.conj().T for values in ([0.0, 1.0, 2.5], [1.0, -1.0, 0.3]))
+LEVELS = (UNITARY * [0.0, 1.0, 2.5]) @ UNITARY.conj().T
+PHASES = (UNITARY * [1.0, -1.0, 0.3]) @ UNITARY.conj().T
 LOWERING = np.diag([1.0, 1.0], 1)
 
 

@@ -113,9 +113,9 @@ def test_many_write_to_one_path(solution, tmp_path):
 def test_a_planted_link_is_not_written_through(solution, tmp_path, monkeypatch):
     link_target = tmp_path / "precious"
     link_target.write_text("mine")
-    part_name = disk.part_name("run.nc")
-    monkeypatch.setattr(disk, "part_name", lambda name: part_name)
-    (tmp_path / part_name).symlink_to(link_target)
+    partial_file_name = disk.partial_file_name("run.nc")
+    monkeypatch.setattr(disk, "part_name", lambda name: partial_file_name)
+    (tmp_path / partial_file_name).symlink_to(link_target)
     with pytest.raises(lt.FileError, match="cannot write"):
         solution.save(tmp_path / "run.nc")
     assert link_target.read_text() == "mine"
@@ -125,10 +125,10 @@ def test_parts_of_dead_processes_are_swept(solution, tmp_path):
     ended_process = subprocess.Popen([sys.executable, "-c", ""])
     ended_process.wait()
     live_part, dead_part = (
-        disk.part_name("run.nc"),
-        disk.part_name("run.nc").replace(f".{os.getpid()}.", f".{ended_process.pid}."),
+        disk.partial_file_name("run.nc"),
+        disk.partial_file_name("run.nc").replace(f".{os.getpid()}.", f".{ended_process.pid}."),
     )
-    other_file_part = disk.part_name("other.nc").replace(f".{os.getpid()}.", f".{ended_process.pid}.")
+    other_file_part = disk.partial_file_name("other.nc").replace(f".{os.getpid()}.", f".{ended_process.pid}.")
     for name in (live_part, dead_part, other_file_part):
         (tmp_path / name).write_bytes(b"half")
     solution.save(tmp_path / "run.nc")

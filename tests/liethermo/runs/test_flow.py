@@ -395,10 +395,10 @@ def test_a_linearised_flow_in_another_program():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"system": lambda x: x}, "takes a system.*not function"),
-        ({"method": "DOP853"}, "OneStepMethod.*not 'DOP853'"),
-        ({"method": lt.Reference()}, "OneStepMethod.*not Reference"),
-        ({"step": lt.Adaptive(1e-6)}, "steps of one size.*lt.integrate"),
+        ({"system": lambda x: x}, "needs a system.*got function"),
+        ({"method": "DOP853"}, "OneStepMethod.*got 'DOP853'"),
+        ({"method": lt.Reference()}, "OneStepMethod.*got Reference"),
+        ({"step": lt.Adaptive(1e-6)}, "needs a fixed step.*lt.integrate"),
     ],
     ids=["system", "name", "reference", "adaptive"],
 )
@@ -412,7 +412,7 @@ def test_times_are_not_differentiated():
         lambda: jax.grad(lambda h: lt.flow(body(PARAMETERS), X0, (0.0, 1.0), h)[0])(0.1),
         lambda: jax.jit(lambda T: lt.flow(body(PARAMETERS), X0, (0.0, T), 0.1))(1.0),
     ):
-        with pytest.raises(lt.InputError, match=r"not traced.*vector_field at the end"):
+        with pytest.raises(lt.InputError, match=r"got traced values.*vector_field at the end"):
             derivative()
 
 

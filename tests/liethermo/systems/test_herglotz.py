@@ -262,7 +262,7 @@ def test_discrete_herglotz_of_higher_order(order, S0):
     assert np.abs(solved_step(method, solved_step(method, x0, 0.1), -0.1) - x0).max() < 1e-13
     plain = lt.DiscreteHerglotz(quartic_action)
     assert np.abs(solved_step(plain, solved_step(plain, x0, 0.1), -0.1) - x0).max() > 1e-5
-    with pytest.raises(lt.InputError, match="order is 1, 2 or 4"):
+    with pytest.raises(lt.InputError, match="order must be 1, 2 or 4"):
         lt.DiscreteHerglotz(quartic_action, order=3)
 
 

@@ -1011,7 +1011,7 @@ def test_a_ket_may_be_a_column():
     wanted = q.state(np.outer(ket, ket.conj()))
     for given in (ket, ket[:, None], HasFull(ket[:, None])):
         assert np.abs(q.state(given) - wanted).max() <= 1e-16
-        assert np.abs(q.numbers(given) - wanted).max() <= 1e-16
+        assert np.abs(q.state_array(given) - wanted).max() <= 1e-16
     many = q.state(np.stack([ket[:, None], [[1.0], [0.0]]]))
     assert np.abs(many - np.stack([wanted, q.state([1.0, 0.0])])).max() <= 1e-16
     with pytest.raises(lt.InputError, match=r"the ket has the norm 2, not 1: divide it by that"):

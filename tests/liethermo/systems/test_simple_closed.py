@@ -22,8 +22,8 @@ each_system = pytest.mark.parametrize(
 def residuals(system, x):
     """Return residuals (q' = v, both equations (2.4), energy, ledger), E', and the production -F_fr . v / T."""
     n, rate = system.degrees_of_freedom, system.vector_field(x)
-    q, v, S, t = system.parts(x)
-    by_q, by_v, by_S = jax.grad(system.action, argnums=(0, 1, 2))(q, v, S)
+    q, v, S, t = system.split_state(x)
+    by_q, by_v, by_S = jax.grad(system.lagrangian_value, argnums=(0, 1, 2))(q, v, S)
     change = jax.jvp(system.momentum, (q, v, S), (rate[:n], rate[n : 2 * n], rate[2 * n]))[1]
     F, push, heat = (f(q, v, S, t) for f in (system.friction_force, system.external_force, system.heating))
     energy_rate = jax.jvp(system.mechanical_energy, (x,), (rate,))[1]
@@ -32,7 +32,7 @@ def residuals(system, x):
         "momentum": change - by_q - F - push,
         "heat": -by_S * rate[2 * n] - heat + F @ v,
         "energy balance": energy_rate - push @ v - heat,
-        "E": system.mechanical_energy(x) - (v @ by_v - system.action(q, v, S)),
+        "E": system.mechanical_energy(x) - (v @ by_v - system.lagrangian_value(q, v, S)),
         "energy law": jnp.dot(system.energy.gradient(x), rate),
     }
     if system.has_ledger:

@@ -285,7 +285,7 @@ def test_unusable_energies(energy, error, words):
         (lambda: lt.Quadratic(np.ones(2), np.ones(3)), "b must have shape"),
         (lambda: lt.models.rigid_body(inertia=(1.0, 2.0)), r"inertia must have shape \(3,\)"),
         (lambda: lt.models.rigid_body(inertia=(1.0, -2.0, 1.0)), "positive"),
-        (lambda: lt.models.rigid_body(rate=-1.0), "not -1.0"),
+        (lambda: lt.models.rigid_body(rate=-1.0), "got -1.0"),
     ],
 )
 def test_unusable_arguments(make, words):

@@ -7,7 +7,7 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo import testing
-from tests.cases import slow
+from tests.cases import slow_case
 
 TESTED_DISSIPATIONS = {
     "killing": lt.KillingDissipation(0.3),
@@ -29,7 +29,7 @@ def test_dissipations(name):
     assert testing.check_dissipation(TESTED_DISSIPATIONS[name]).passed
 
 
-@pytest.mark.parametrize("name", ["rigid_body", *map(slow, ("damped_oscillator", "thermo_particles"))])
+@pytest.mark.parametrize("name", ["rigid_body", *map(slow_case, ("damped_oscillator", "thermo_particles"))])
 def test_systems(name):
     assert testing.check_system(getattr(lt.models, name)()).passed
 

@@ -10,7 +10,8 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 
-SPAN, STEP = (0.0, 0.5), 0.1
+SPAN = (0.0, 0.5)
+STEP = 0.1
 MU = np.array([0.3, -0.4, 0.8])
 BODY = {"algebra": mf.so(3), "energy": lt.Quadratic([1.0, 2.0, 3.0])}
 

@@ -16,7 +16,7 @@ from manifolds.algebras import _null_space as linear
 from manifolds.algebras import polynomial_casimirs as module
 from manifolds.algebras.polynomial import Polynomial
 
-REGISTERED = list(mf.registered())
+ALGEBRAS = list(mf.registered())
 INVARIANCE_TOLERANCE = 1e-15
 """Largest |ad*_{grad F} mu| / (|grad F| |mu|) of a Casimir; the largest measured is 2e-16 (sl(3) and su(4), degree
 3)."""
@@ -109,7 +109,7 @@ def test_known_degrees_of_generators_which_are_independent(g, degrees):
 
 
 @pytest.mark.sampled(5)
-@pytest.mark.parametrize("g", REGISTERED, ids=lambda g: g.name)
+@pytest.mark.parametrize("g", ALGEBRAS, ids=lambda g: g.name)
 @pytest.mark.parametrize("degree", [1, 2, 3])
 def test_casimirs_are_invariant_and_perturbed_ones_are_not(g, degree):
     noncentral_index = int(np.abs(g.structure_constants).sum(axis=(1, 2)).argmax())

@@ -11,7 +11,7 @@ import manifolds as mf
 from manifolds.algebras import polynomial_casimirs as module
 from manifolds.algebras.catalogue import _OCTONIONS
 from manifolds.algebras.invariants import fundamental_invariants
-from tests.cases import slow
+from tests.cases import slow_case
 
 
 def unitary(n):
@@ -58,7 +58,7 @@ LARGE_ALGEBRAS = ("so(10)", "su(5) by constants", "sl(5) by constants")
 @pytest.mark.parametrize(
     "name",
     [
-        slow(pytest.param(name, id=f"{name}-")) if name in LARGE_ALGEBRAS else pytest.param(name, id=f"{name}-")
+        slow_case(pytest.param(name, id=f"{name}-")) if name in LARGE_ALGEBRAS else pytest.param(name, id=f"{name}-")
         for name in DEGREES
     ],
 )

@@ -8,7 +8,8 @@ import pytest
 
 import manifolds as mf
 
-S2, SO3 = mf.Sphere(2), mf.SpecialOrthogonal(3)
+S2 = mf.Sphere(2)
+SO3 = mf.SpecialOrthogonal(3)
 
 
 def is_close(a, b, tolerance=1e-14) -> bool:
