@@ -114,7 +114,7 @@ def test_a_planted_link_is_not_written_through(solution, tmp_path, monkeypatch):
     link_target = tmp_path / "precious"
     link_target.write_text("mine")
     partial_file_name = disk.partial_file_name("run.nc")
-    monkeypatch.setattr(disk, "part_name", lambda name: partial_file_name)
+    monkeypatch.setattr(disk, "partial_file_name", lambda name: partial_file_name)
     (tmp_path / partial_file_name).symlink_to(link_target)
     with pytest.raises(lt.FileError, match="cannot write"):
         solution.save(tmp_path / "run.nc")
