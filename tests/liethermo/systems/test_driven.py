@@ -160,7 +160,7 @@ def slopes(system, method, states, rates):
     """At some states, shape (m, n), with slopes, shape (m, stages, n), in a driven system with ``t' = 1``."""
     if system.is_driven:
         system = lt.DrivenSystem(system)
-        states = system.begin(states, 0.5, batch=True)
+        states = system.initial_state(states, 0.5, batch=True)
         rates = np.concatenate([rates, np.full((*rates.shape[:-1], 2), system.unit)], axis=-1)
     return evaluate_at_points(
         _slopes, (system, method), np.concatenate([states, rates.reshape(len(rates), -1)], axis=1)
