@@ -87,5 +87,5 @@ def test_undrawable_measures_are_refused(tmp_path):
         lt.plot.study(dataset(), "final")
     with pytest.raises(lt.InputError, match="ends in none of them"):
         lt.plot.study(dataset(), path=tmp_path / "map.xyz")
-    with pytest.raises(lt.InputError, match="not one of a study"):
+    with pytest.raises(lt.InputError, match="has no variable status"):
         lt.plot.study(dataset().drop_vars("status"))
