@@ -16,7 +16,7 @@ from ..tracing.programs import jit_program
 from .codes import FAILED_STEP_CODES, StatusCode
 from .rules import DEFAULT_OPTIONS, SolverOptions
 from .stages import keep_fixed_point_result
-from .stepping import State, initial_run_state, initial_run_state_program, reorder_components, take_step
+from .stepping import SavedStates, State, initial_run_state, initial_run_state_program, reorder_components, take_step
 
 
 @jit_program
@@ -145,6 +145,10 @@ class ArrayEngine:
             lambda s, *how: advance(self.system, self.method, s, *arguments, *how), state, save_every
         )
 
+    def start(self, x) -> EngineTrajectory:
+        """Return a trajectory that starts at x."""
+        return EngineTrajectory(self, self.initial_run_state(x))
+
     def step(self, state: State, h, noise=None) -> State:
         """Return the state after one step, or the old state with a failure status."""
         return self.advance(state, h, 1, 1, noise)[0]
@@ -163,6 +167,27 @@ class ArrayEngine:
             )
             ends[indices] = np.asarray(block_ends)
         return ends
+
+
+class EngineTrajectory:
+    """One trajectory of an engine that takes a state and returns a new one.
+
+    Attributes
+    ----------
+    state : State
+        The state reached so far.
+    """
+
+    def __init__(self, engine, state: State):
+        self._engine, self.state = engine, state
+
+    def advance(self, h: float, n_saves: int, steps_per_save: int, noise=None) -> SavedStates:
+        """Take ``n_saves * steps_per_save`` steps of size h, fewer if one fails, and return the saved states."""
+        self.state, (x, energy, entropy, is_reached) = self._engine.advance(
+            self.state, h, n_saves, steps_per_save, noise
+        )
+        n_reached = int(np.asarray(is_reached).sum())
+        return SavedStates(*(np.asarray(values)[:n_reached] for values in (x, energy, entropy)))
 
 
 STEP_ENDS_PER_CALL = 64

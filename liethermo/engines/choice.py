@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
 import jax
@@ -15,14 +15,14 @@ from ..errors import InputError
 from ..integrators import OneStepMethod
 from ..systems import System
 from ..tracing.scalarize import UnsupportedPrimitive
-from .array import ArrayEngine
+from .array import ArrayEngine, EngineTrajectory
 from .codes import StatusCode
 from .compiled.paced import CompiledAdaptiveRuns
-from .compiled.stepper import CompiledEngine, FinalStateRunner
+from .compiled.stepper import CompiledEngine, CompiledTrajectory
 from .paced import AdaptiveRuns, ArrayAdaptiveRuns, resume_on_array_engine, start_one
 from .pacing import StepControl
 from .sparse.newton import SparseEngine
-from .stepping import State
+from .stepping import SavedStates, State
 
 ENGINES = ("auto", "array", "compiled", "sparse")
 """Values of the option ``engine``."""
@@ -101,10 +101,36 @@ class EngineWithFallback:
         self._choose_engine(lambda compiled: compiled.n_operations)
         return self._call_with_fallback(lambda engine, _: engine.initial_run_state(x))
 
-    def final_state_runner(self) -> FinalStateRunner | None:
-        """Return a runner that returns final states alone; None if the compiled engine does not run the system."""
+    def start(self, x) -> Trajectory:
+        """Return a trajectory that starts at x, shape (n,); it ends the one that was started before."""
         self._choose_engine(lambda compiled: compiled.n_operations)
-        return self._engine.final_state_runner() if isinstance(self._engine, CompiledEngine) else None
+        return Trajectory(self, self._call_with_fallback(lambda engine, _: engine.start(x)))
+
+    def final_state(self, x, segments: Sequence[tuple[float, int]]) -> tuple[np.ndarray, float] | None:
+        """Return the last state and its status code: see :meth:`.stepper.CompiledTrajectory.final_state`.
+
+        The result is None if the compiled engine does not run the system.
+        """
+        if not self._is_engine_chosen:
+            self._choose_engine(lambda compiled: compiled.n_operations)
+        if not isinstance(self._engine, CompiledEngine):
+            return None
+        try:
+            return self._engine.trajectory.final_state(x, segments)
+        except UnsupportedPrimitive:
+            return None
+
+    def advance_trajectory(
+        self, trajectory: CompiledTrajectory | EngineTrajectory, h: float, n_saves: int, steps_per_save: int
+    ) -> tuple[CompiledTrajectory | EngineTrajectory, SavedStates]:
+        """Advance a trajectory of the engine; return it, or the one that replaces it, and the saved states."""
+        noise = None if self.noise is None else self._noise_increments(trajectory.state, n_saves * steps_per_save, h)
+        try:
+            return trajectory, trajectory.advance(h, n_saves, steps_per_save, noise)
+        except UnsupportedPrimitive as error:
+            self._fall_back(error)
+            trajectory = EngineTrajectory(self._engine, self._to_array_state(trajectory.state))
+            return trajectory, trajectory.advance(h, n_saves, steps_per_save, noise)
 
     def advance(self, state: State, h, saves: int, save_every: int) -> tuple[State, tuple]:
         noise = self._noise_increments(state, int(saves) * int(save_every), h)
@@ -215,16 +241,35 @@ class EngineWithFallback:
             return call(self._engine, state)
         except UnsupportedPrimitive as error:
             self._fall_back(error)
-            if state is not None:
-                template = self._engine.initial_run_state(jnp.asarray(state.x))
-                state = jax.tree_util.tree_map(lambda a, b: jnp.asarray(a, b.dtype), state, template)
-            return call(self._engine, state)
+            return call(self._engine, None if state is None else self._to_array_state(state))
+
+    def _to_array_state(self, state: State) -> State:
+        """Return a state of the compiled engine as one of the array engine."""
+        template = self._engine.initial_run_state(jnp.asarray(state.x))
+        return jax.tree_util.tree_map(lambda a, b: jnp.asarray(a, b.dtype), state, template)
 
     def _fall_back(self, error: UnsupportedPrimitive) -> None:
         if self.requested_engine != "auto":
             raise error
         warn_of_fallback(error)
         self._engine = ArrayEngine(self.system, self.method)
+
+
+class Trajectory:
+    """One trajectory of a run; the array engine takes it over if the compiled engine cannot go on."""
+
+    def __init__(self, engine: EngineWithFallback, trajectory: CompiledTrajectory | EngineTrajectory):
+        self._engine, self._trajectory = engine, trajectory
+
+    def advance(self, h: float, n_saves: int, steps_per_save: int) -> SavedStates:
+        """Take ``n_saves * steps_per_save`` steps of size h, fewer if one fails, and return the saved states."""
+        self._trajectory, saved_states = self._engine.advance_trajectory(self._trajectory, h, n_saves, steps_per_save)
+        return saved_states
+
+    @property
+    def state(self) -> State:
+        """The state reached so far."""
+        return self._trajectory.state
 
 
 def is_worth_compiling(system: System) -> bool:

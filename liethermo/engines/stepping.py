@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from ..functions.energy import Energy
 from ..integrators import OneStepMethod
@@ -52,6 +53,14 @@ class State(NamedTuple):
     energy_drift_correction: jax.Array  # shift of the next step's end along the energy gradient
     energy_sensitivity: jax.Array  # rounding scale of the energy, the largest over all steps
     entropy_sensitivity: jax.Array
+
+
+class SavedStates(NamedTuple):
+    """States that a call of an engine saves, of those saves that were reached."""
+
+    x: np.ndarray  # shape (saves, n)
+    energy: np.ndarray  # shape (saves,)
+    entropy: np.ndarray
 
 
 REPORTED_FIELDS = tuple(

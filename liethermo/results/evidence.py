@@ -142,7 +142,7 @@ class AuditableResult(SaveableResult):
         return Evidence() if self.evidence_source is None else self.evidence_source()
 
     def __getstate__(self) -> dict[str, Any]:  # a pickled copy has the evidence itself, not the function
-        return {**vars(self), "evidence": self.evidence, "evidence_source": None}
+        return {name: getattr(self, name) for name in vars(self)} | {"evidence": self.evidence, "evidence_source": None}
 
 
 class StepReplay(Protocol):

@@ -14,6 +14,7 @@ from manifolds._tables import html_grid
 
 from ..errors import InputError
 from .audit import Audit, Tolerances, audit_run
+from .deferred import deferred_fields
 from .evidence import AuditableResult, Evidence
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ from .sketch import svg_sketch
 from .status import Laws, Stats, Status
 
 
+@deferred_fields("casimirs", "provenance")
 @dataclass(frozen=True)
 class Solution(AuditableResult):
     """The result of a run: times, states, energy, entropy and conserved quantities.

@@ -14,13 +14,8 @@ from ..systems import System
 from .adaptive import Adaptive
 from .events import Relaxed
 from .fluctuations import Fluctuations
-from .preparation import (
-    checked_initial_state,
-    invariants_and_laws,
-    prepare_run,
-    refuse_tracers,
-    resolve_invariants,
-)
+from .preparation import refuse_tracers
+from .problem import Problem
 from .propagator import Propagator
 from .run import Run
 from .timetable import StepSchedule
@@ -151,16 +146,7 @@ def solution_without_steps(system: System, x0, t: float, method: OneStepMethod) 
     InputError
         If the method cannot start at x0.
     """
-    system, method = prepare_run(resolve_invariants(system, x0), method)
-    invariants_and_laws(system, method)
-    run = Run(
-        system,
-        method,
-        checked_initial_state(system, method, x0, t),
-        StepSchedule.zero_length(t),
-        None,
-        "auto",
-        dense=True,
-    )
+    problem = Problem.from_user(system, method, x0=x0)
+    run = Run(problem, problem.initial_state(x0, t), StepSchedule.zero_length(t), None, "auto", dense=True)
     run.take_no_step()
     return run.solution()

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import functools
+import time
+from collections.abc import Mapping
 from importlib import metadata
 from typing import Any
 
@@ -14,12 +16,14 @@ import numpy as np
 
 from ..engines.choice import EngineWithFallback
 from ..engines.codes import StatusCode
+from ..functions.energy import Energy
+from ..results.deferred import deferred
 from ..results.evidence import EvidenceCollector, StepReplay
 from ..results.solution import Solution
+from ..results.status import Laws
 from ..systems import System
 from ..tracing.interpret import evaluate_at_points
 from .adaptive import Adaptive
-from .preparation import invariants_and_laws
 
 
 def build_solution(
@@ -29,7 +33,8 @@ def build_solution(
     entropy: np.ndarray | None,
     step_sizes: np.ndarray,
     replay: StepReplay,
-    system_without_span: System | None = None,
+    laws: Laws,
+    invariants: Mapping[str, tuple[Energy, bool | None]],
     **fields,
 ) -> Solution:
     """Return the solution in the user's form from the states x, shape (times, n), of a run.
@@ -39,25 +44,27 @@ def build_solution(
     step_sizes : array, shape (times - 1,)
         Size of a step that the run took after each state.
     replay : StepReplay
-    system_without_span : System, optional
-        The system before it was limited to the span, whose laws are cached; by default ``system``.
+    laws : Laws
+    invariants : dict
+        Recorded functions, and whether the system conserves each of them: see :func:`invariants_and_laws`.
     **fields
         Further fields of :class:`Solution`.
     """
-    invariants, laws = invariants_and_laws(system if system_without_span is None else system_without_span, method)
     functions = {name: f for name, (f, _) in invariants.items()}
+    recorded_functions = {**functions, **system.ledger}
     solution = Solution(
         x=x,
         entropy=None if system.entropy is None else entropy,
-        casimirs={
-            name: evaluate_at_points(_function_value, function, x)
-            for name, function in {**functions, **system.ledger}.items()
-        },
+        casimirs=deferred(functools.partial(_series_of_functions, recorded_functions, x)),
         laws=laws,
         evidence_source=EvidenceCollector(system, method, functions, x, np.asarray(fields["t"]), step_sizes, replay),
         **fields,
     )
     return system.to_user_solution(solution)
+
+
+def _series_of_functions(functions: Mapping[str, Energy], x: np.ndarray) -> dict[str, np.ndarray]:
+    return {name: evaluate_at_points(_function_value, function, x) for name, function in functions.items()}
 
 
 def _function_value(function, x):
@@ -84,14 +91,25 @@ class EngineReplay:
 
 
 def run_provenance(
-    system: System, method: Any, step: float | Adaptive, span: tuple[float, float], save_every: int | None
+    system: System,
+    method: Any,
+    step: float | Adaptive,
+    span: tuple[float, float],
+    save_every: int | None,
+    end_time: float | None = None,
+    **entries,
 ) -> dict[str, Any]:
-    """Return the provenance of a run as JSON data: versions, date, method, step, span and system."""
+    """Return the provenance of a run as JSON data: versions, date, method, step, span and system, and more entries.
+
+    ``end_time`` is the time at which the run ended, in seconds as of ``time.time()``; by default now.
+    """
     algebra, group, inertia = system.lie_algebra, system.matrix_group, system.inertia
     return {
         "library": f"liethermo {_library_version()}",
         "jax": jax.__version__,
-        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "date": datetime.datetime.fromtimestamp(time.time() if end_time is None else end_time, datetime.UTC).isoformat(
+            timespec="seconds"
+        ),
         "method": str(method),
         "step": dataclasses.asdict(step) if isinstance(step, Adaptive) else step,
         "t_span": list(span),
@@ -102,6 +120,7 @@ def run_provenance(
         "inertia": None if inertia is None else inertia.tolist(),
         "dissipation": None if system.dissipation is None else type(system.dissipation).__name__,
         **({"torque": system.torque_name} if system.torque_name else {}),
+        **entries,
     }
 
 

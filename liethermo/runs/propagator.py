@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import functools
 import os
-import threading
 from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
@@ -13,32 +13,21 @@ import numpy as np
 
 from manifolds._precision import with_library_settings
 
-from ..engines.choice import ENGINES, EngineWithFallback
+from ..engines.choice import ENGINES
 from ..engines.codes import StatusCode
-from ..engines.compiled.stepper import FinalStateRunner
 from ..errors import ConvergenceError, FileError, InputError, NonFiniteError
 from ..integrators import DEFAULT_METHOD, OneStepMethod, Reference
 from ..results.ensemble import Ensemble
 from ..results.solution import Solution
 from ..systems import AttitudeSystem, System
-from ..systems.interface import SystemInterface
 from ..tracing.caching import LRUCache
 from .adaptive import Adaptive
 from .ensemble import ensemble
 from .events import Relaxed
 from .family import named_parameters
 from .fluctuations import DEFAULT_NOISE_METHOD, Fluctuations, check_noise
-from .preparation import (
-    check_choice,
-    checked_initial_state,
-    invariants_and_laws,
-    is_driven_run,
-    prepare_for_method,
-    prepare_run,
-    refuse_tracers,
-    resolve_invariants,
-    why_not_startable,
-)
+from .preparation import check_choice, refuse_tracers
+from .problem import Problem
 from .progress import Progress
 from .run import Run
 from .timetable import CHUNK_STEPS, ScheduleSegment, checked_span, checked_step, make_schedule
@@ -122,7 +111,7 @@ class Propagator:
             raise InputError(NOISY_STEPS)
         self.system, self.method, self.step, self.engine, self.noise = system, method, step, engine, noise
         self._variants: LRUCache[Propagator] = LRUCache(MAX_CACHED_PARAMETER_SETS)
-        self._thread_state = _ThreadState()
+        self._decided_problem: Problem | None = None
 
     def __getstate__(self) -> tuple:
         return self.system, self.method, self.step, self.engine, self.noise
@@ -182,17 +171,15 @@ class Propagator:
             )
         check_choice("on_failure", on_failure, ("raise", "return"))
         step, adaptive = self.step, isinstance(self.step, Adaptive)
-        system, method = self._prepare_run(x0)
-        invariants_and_laws(system, method)  # refuses what the method cannot run
-        if isinstance(method, Reference) and (dense or save_at is not None or until is not None):
+        problem = self._problem(x0)
+        if isinstance(self.method, Reference) and (dense or save_at is not None or until is not None):
             raise InputError(REFERENCE_STEPS)
         if self.noise is not None and (dense or until is not None):
             raise InputError(NOISY_STEPS)
         schedule = make_schedule(t_span, step, save_every, save_at, allow_infinite_end=adaptive and until is not None)
-        x = checked_initial_state(system, method, x0, schedule.start, attitude)
-        run = Run(system, method, x, schedule, save_to, self.engine, self.noise, dense)
+        run = Run(problem, problem.initial_state(x0, schedule.start, attitude), schedule, save_to, self.engine, dense)
         with Progress((schedule.start, schedule.end), progress) as bar:
-            if isinstance(method, Reference):
+            if isinstance(self.method, Reference):
                 run.run_with_scipy(bar)
             elif adaptive or until is not None:
                 run.run_with_step_control(bar, step if adaptive else schedule.h, until)
@@ -225,12 +212,8 @@ class Propagator:
         """
         if parameters:
             return self.with_parameters(parameters).final(x0, t_span)
-        fast = self._final_state_calls()
-        if fast is not None:
-            x = fast(x0, t_span)
-            if x is not None:
-                return x
-        return self(x0, t_span, save_every=CHUNK_STEPS).x[-1]
+        x = self._final_state_by_machine_code(x0, t_span)
+        return self(x0, t_span, save_every=CHUNK_STEPS).x[-1] if x is None else x
 
     def many(self, x0s, t_span: tuple[float, float], *, parameters=None, **options) -> Ensemble:
         """Return an ensemble of trajectories, as :func:`ensemble` does.
@@ -277,79 +260,42 @@ class Propagator:
             ),
         )
 
-    def _prepare_run(self, x0) -> tuple[System, Any]:
-        """Return the system and the method as they are run from x0."""
+    def _problem(self, x0=None) -> Problem:
+        """Return the problem of a run from x0; what the system conserves may be decided there."""
+        if self._decided_problem is not None:
+            return self._decided_problem
         tolerance = self.step.tolerance if isinstance(self.step, Adaptive) else None
-        return prepare_run(resolve_invariants(self.system, x0), self.method, self.noise, tolerance)
+        problem = Problem.from_user(self.system, self.method, self.noise, tolerance, x0)
+        if not self.system.undecided_functions():
+            self._decided_problem = problem
+        return problem
 
-    def _final_state_calls(self) -> FinalStateCalls | None:
-        """Return what computes final states in this thread by machine code, or None where it cannot."""
-        state = self._thread_state
-        if not state.is_prepared:
-            state.calls, state.is_prepared = self._make_final_state_calls(), True
-        return state.calls
-
-    @with_library_settings
-    def _make_final_state_calls(self) -> FinalStateCalls | None:
-        system = self.system
-        if isinstance(self.step, Adaptive) or self.noise is not None or isinstance(self.method, Reference):
+    def _final_state_by_machine_code(self, x0, t_span: tuple[float, float]) -> np.ndarray | None:
+        """Return the last state; None where a run has to compute it, or has to say why a step fails."""
+        problem = self._problem_of_final
+        if problem is None:
             return None
-        if system.undecided_functions():  # what is conserved may depend on the initial state
-            return None
-        prepared, method = prepare_for_method(system, self.method)
-        if is_driven_run(prepared) or isinstance(prepared, AttitudeSystem):
-            return None
-        invariants_and_laws(prepared, method)
-        engine = EngineWithFallback(prepared, method, self.engine, 0)
-        runner = engine.final_state_runner()
-        return None if runner is None else FinalStateCalls(system, prepared, method, self.step, runner)
-
-
-class _ThreadState(threading.local):
-    """Final states by machine code in one thread: the buffers of a runner belong to one thread."""
-
-    is_prepared = False
-    calls: FinalStateCalls | None = None
-
-
-class FinalStateCalls:
-    """Final states of one thread, by machine code and steps of one size.
-
-    Parameters
-    ----------
-    system : System
-        The system of the user.
-    prepared, method : System, OneStepMethod
-        The system and the method as they are run.
-    step : float
-    runner : FinalStateRunner
-    """
-
-    def __init__(self, system: System, prepared: System, method: OneStepMethod, step: float, runner: FinalStateRunner):
-        self._system, self._prepared, self._method = system, prepared, method
-        self._step, self._runner = step, runner
-        self._dim, self._shape = prepared.dim, system.shape if system.sites else (prepared.dim,)
-        kind = type(prepared)
-        self._starts_anywhere = system.space is None and (
-            kind.outside is SystemInterface.outside and kind.why_singular is SystemInterface.why_singular
-        )
-
-    def __call__(self, x0, t_span: tuple[float, float]) -> np.ndarray | None:
-        """Return the last state; None where a step fails, so that a run has to say why."""
         start, end = checked_span(t_span)
-        segment = ScheduleSegment.from_span(start, end, checked_step(self._step, start, end))
+        h = checked_step(self.step, start, end)
+        segment = ScheduleSegment.from_span(start, end, h)
         if segment.n_full_steps > CHUNK_STEPS:
             return None  # a run in portions, which Ctrl-C can stop
-        x, status = self._runner.run(self._initial_state(x0), segment.equal_steps(self._step))
-        return x.reshape(self._shape) if status == StatusCode.COMPLETED else None
+        engine = problem.engine(self.engine, problem.system, segment.n_steps)
+        result = engine.final_state(problem.initial_state(x0, start), segment.equal_steps(h))
+        if result is None or result[1] != StatusCode.COMPLETED:
+            return None
+        return result[0].reshape(problem.state_shape)
 
-    def _initial_state(self, x0) -> np.ndarray:
-        is_plain = type(x0) is np.ndarray and x0.dtype == np.float64 and x0.shape == (self._dim,)
-        if not (is_plain and self._starts_anywhere and np.isfinite(x0).all()):
-            x0 = self._prepared.state_array(x0)
-            if reason := why_not_startable(self._prepared, self._method, x0):
-                raise InputError(reason)
-        return x0
+    @functools.cached_property
+    @with_library_settings
+    def _problem_of_final(self) -> Problem | None:
+        """The problem whose final states machine code computes; None where every call is a run."""
+        if isinstance(self.step, Adaptive) or self.noise is not None or isinstance(self.method, Reference):
+            return None
+        if self.system.undecided_functions():  # what is conserved may depend on the initial state
+            return None
+        problem = self._problem()
+        return None if problem.is_driven or isinstance(problem.system, AttitudeSystem) else problem
 
 
 def replace_parameters(system: System, values: Mapping[str, np.ndarray]) -> System:

@@ -33,6 +33,7 @@ from ..systems import AttitudeSystem, DrivenSystem, System
 from ..tracing.interpret import evaluate_at_points
 from .ending import ensemble_failure_message
 from .family import Family
+from .preparation import invariants_and_laws
 from .presented import EngineReplay, build_solution
 from .timetable import StepSchedule
 
@@ -251,10 +252,13 @@ class MemberSolutionBuilder:
             x = record.trajectories[j, : len(member_solution.t), :-2]
         steps = np.minimum(np.diff(member_solution.t), record.quantities["first_step"][j])
         energy = member_solution.energy_balance
+        invariants, laws = invariants_and_laws(system, self.method)
         solution = build_solution(
             system,
             self.method,
             x,
+            laws=laws,
+            invariants=invariants,
             t=member_solution.t,
             energy=energy,
             entropy=member_solution.entropy,

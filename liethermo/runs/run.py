@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import time
 from collections.abc import Callable
@@ -12,12 +13,12 @@ import numpy as np
 
 from manifolds.errors import warn
 
-from ..engines.choice import EngineWithFallback
 from ..engines.codes import StatusCode
-from ..engines.stepping import energy_and_entropy_at
+from ..engines.stepping import SavedStates, energy_and_entropy_at
 from ..errors import FileError
 from ..integrators import Reference
 from ..integrators.fluctuating import noise_dimension
+from ..results.deferred import deferred
 from ..results.dense import DenseOutput
 from ..results.solution import Solution
 from ..results.status import Stats, Status
@@ -25,9 +26,9 @@ from ..tracing.interpret import evaluate_at_points
 from .adaptive import Adaptive, make_step_control
 from .ending import INTERRUPTING_ERRORS, adaptive_failure_status, final_status, interruption_reason, run_statistics
 from .events import Event
-from .fluctuations import Fluctuations, NoisePaths
-from .preparation import limit_to_span
+from .fluctuations import NoisePaths
 from .presented import EngineReplay, build_solution, run_provenance
+from .problem import Problem
 from .stepwise import MAX_STORED_VALUES, AcceptedSteps, advance_to_end
 from .timetable import StepSchedule
 from .watch import EventSet
@@ -47,19 +48,9 @@ ENDLESS_SPAN_LENGTH = 1.0
 class Run:
     """One run of ``integrate``: its engine, the states that it has saved, and its status."""
 
-    def __init__(
-        self,
-        system,
-        method,
-        x0,
-        schedule: StepSchedule,
-        save_to,
-        engine: str,
-        noise: Fluctuations | None = None,
-        dense: bool = False,
-    ):
-        self.system_without_span, self.system = system, limit_to_span(system, schedule.start, schedule.end)
-        self.method, self.schedule = method, schedule
+    def __init__(self, problem: Problem, x0, schedule: StepSchedule, save_to, engine: str, dense: bool = False):
+        self.problem, self.method, self.schedule = problem, problem.method, schedule
+        self.system = problem.system_in_span(schedule.start, schedule.end)
         self.save_to, self.start_wall_time = save_to, time.perf_counter()
         self.last_checkpoint_time = self.start_wall_time
         self.saved_times = [np.array([schedule.start])]
@@ -71,15 +62,14 @@ class Run:
         self.event_time: float | None = None
         self.all_states = [(self.saved_times[0], self.saved_states[0])] if dense else None  # for dense output
         self.taken_steps: list[np.ndarray] = []  # rows: step sizes, whether the state after the step is saved
-        self.noise = noise
         noise_increments: Callable | None = None
-        if noise is not None and (n_increments := noise_dimension(method)):
-            noise_paths = NoisePaths(noise, n_increments, np.zeros(1, dtype=int), schedule)
+        if problem.noise is not None and (n_increments := noise_dimension(self.method)):
+            noise_paths = NoisePaths(problem.noise, n_increments, np.zeros(1, dtype=int), schedule)
 
             def noise_increments(first_step: int, steps: int, h: float) -> np.ndarray:
                 return noise_paths.step_increments(slice(None), first_step, steps, h)[0]
 
-        self.engine = EngineWithFallback(self.system, method, engine, schedule.n_steps, noise_increments)
+        self.engine = problem.engine(engine, self.system, schedule.n_steps, noise_increments)
 
     @property
     def last_saved_time(self) -> float:
@@ -90,25 +80,29 @@ class Run:
 
     def run_fixed(self, bar) -> None:
         """Take all steps of the schedule, one engine call after another, until the end, a failure or Ctrl-C."""
-        state, interruption = None, ""
+        trajectory, interruption = None, ""
         try:
-            state = self.engine.initial_run_state(self.saved_states[0][0])
+            trajectory = self.engine.start(self.saved_states[0][0])
+            state = trajectory.state
             self.saved_energies_entropies = [np.array([[float(state.energy), float(state.entropy)]])]
             for h, n_saves, steps_per_save, keep in self.schedule.engine_calls(
                 max_saves=self.engine.max_saves_per_call, save_all=self.all_states is not None
             ):
-                state = self._advance_and_save(state, h, n_saves, steps_per_save, keep)
-                bar.update(float(self.schedule.times_after(np.asarray(int(state.step)))))
-                if int(state.status) != StatusCode.COMPLETED:
+                saved_states = trajectory.advance(h, n_saves, steps_per_save)
+                first_step, state = int(state.step), trajectory.state
+                self._save_states_of_call(saved_states, first_step, steps_per_save, keep)
+                if bar.is_shown:
+                    bar.update(float(self.schedule.times_after(np.asarray(int(state.step)))))
+                if state.status != StatusCode.COMPLETED:
                     break
                 self._checkpoint(state)
         except INTERRUPTING_ERRORS as error:
             interruption = interruption_reason(error)
-        if state is None:
+        if trajectory is None:
             self._set_interrupted_at_start(interruption)
             return
         step = int(state.step)
-        t, h = float(self.schedule.times_after(np.asarray(step))), self.schedule.step_size_after(step)
+        t, h = self.schedule.time_after(step), self.schedule.step_size_after(step)
         if t > self.last_saved_time:  # the run ended between two saved states
             self._save_states(
                 np.array([t]), np.asarray(state.x)[None], np.array([[float(state.energy), float(state.entropy)]])
@@ -203,19 +197,15 @@ class Run:
             steps.t[1:][selection], steps.x[selection], np.column_stack([steps.energy, steps.entropy])[selection]
         )
 
-    def _advance_and_save(self, state, h, n_saves, steps_per_save, keep: bool):
-        previous_step = int(state.step)
-        state, (x, energy, entropy, is_reached) = self.engine.advance(state, h, n_saves, steps_per_save)
-        n_reached = int(np.asarray(is_reached).sum())
-        steps, x = previous_step + steps_per_save * np.arange(1, n_reached + 1), np.asarray(x)[:n_reached]
-        times, energies_entropies = self.schedule.times_after(steps), np.column_stack([energy, entropy])[:n_reached]
+    def _save_states_of_call(self, saved: SavedStates, first_step: int, steps_per_save: int, keep: bool) -> None:
+        x, steps = saved.x, first_step + steps_per_save * np.arange(1, len(saved.x) + 1)
+        times, energies_entropies = self.schedule.times_after(steps), np.stack([saved.energy, saved.entropy], axis=1)
         if self.all_states is not None:
             self.all_states.append((times, x))
             is_saved = np.isin(steps, self.schedule.saved_step_counts)
             times, x, energies_entropies = times[is_saved], x[is_saved], energies_entropies[is_saved]
         if keep:
             self._save_states(times, x, energies_entropies)
-        return state
 
     def _save_states(self, times: np.ndarray, x: np.ndarray, energies_entropies: np.ndarray) -> None:
         self.saved_times.append(times)
@@ -261,10 +251,11 @@ class Run:
             entropy=entropy,
             step_sizes=self._longest_steps_between_saves(len(x) - 1),
             replay=EngineReplay(self.engine),
-            system_without_span=self.system_without_span,
+            laws=self.problem.laws,
+            invariants=self.problem.invariants,
             status=self.status or Status(StatusCode.INTERRUPTED, "still running", len(x) - 1, self.last_saved_time),
             stats=dataclasses.replace(self.stats, wall_time=time.perf_counter() - self.start_wall_time),
-            provenance=self._provenance(),
+            provenance=self._provenance(x[0]),
             event_time=self.event_time,
             dense=self._dense_output(),
         )
@@ -291,14 +282,19 @@ class Run:
                 warn(f"{error}. The run goes on")
             self.last_checkpoint_time = time.perf_counter()
 
-    def _provenance(self) -> dict[str, Any]:
-        return {
-            **run_provenance(
-                self.system, self.method, self.step, (self.schedule.start, self.schedule.end), self.schedule.save_every
-            ),
-            "engine": None if isinstance(self.method, Reference) else self.engine.name,
-            "noise": None if self.noise is None else self.noise.to_provenance(),
-            "x0": np.asarray(self.saved_states[0][0]).tolist()
-            if self.system.dim <= MAX_PROVENANCE_COMPONENTS
-            else None,
-        }
+    def _provenance(self, x0: np.ndarray) -> Any:
+        noise, schedule = self.problem.noise, self.schedule
+        return deferred(
+            functools.partial(
+                run_provenance,
+                self.system,
+                self.method,
+                self.step,
+                (schedule.start, schedule.end),
+                schedule.save_every,
+                end_time=time.time(),
+                engine=None if isinstance(self.method, Reference) else self.engine.name,
+                noise=None if noise is None else noise.to_provenance(),
+                x0=x0.tolist() if self.system.dim <= MAX_PROVENANCE_COMPONENTS else None,
+            )
+        )

@@ -186,6 +186,10 @@ class StepSchedule:
         """Times of the saved states."""
         return self.times_after(self.saved_step_counts)
 
+    def time_after(self, n_steps: int) -> float:
+        """Return the time after a number of steps."""
+        return self.end if n_steps >= self.n_steps else float(self.times_after(np.asarray(n_steps)))
+
     def times_after(self, steps: np.ndarray) -> np.ndarray:
         """Return the times after the given numbers of steps."""
         if len(self.segments) == 1:
@@ -246,8 +250,15 @@ def clip_times_to_span(times: np.ndarray, start: float, end: float, name: str) -
     return np.clip(times, start, end)
 
 
+MAX_SPLIT_STEP = 1e290
+"""Largest step whose products are computed in two parts, which overflow for larger ones."""
+
+
 def _time_after(start, steps, h: float) -> np.ndarray:
     """Return ``start + steps * h``, rounded once (Dekker's product and Knuth's sum)."""
+    if h > MAX_SPLIT_STEP:
+        with np.errstate(over="ignore", invalid="ignore"):
+            return start + np.asarray(steps, dtype=np.float64) * h
     steps, (h_high, h_low) = np.asarray(steps, dtype=np.float64), _veltkamp_split(np.float64(h))
     steps_high, steps_low = _veltkamp_split(steps)
     product = steps * h
@@ -255,15 +266,14 @@ def _time_after(start, steps, h: float) -> np.ndarray:
     total = start + product
     increment = total - start
     rounding_error = rounding_error + (start - (total - increment)) + (product - increment)
-    return np.where(np.isfinite(rounding_error), total + rounding_error, total)
+    return total + rounding_error
 
 
 def _veltkamp_split(a) -> tuple[np.ndarray, np.ndarray]:
     """Return two numbers of at most 26 bits whose sum is ``a`` (Veltkamp's splitting)."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        scaled_value = a * (2.0**27 + 1.0)
-        high_part = scaled_value - (scaled_value - a)
-        return high_part, a - high_part
+    scaled_value = a * (2.0**27 + 1.0)
+    high_part = scaled_value - (scaled_value - a)
+    return high_part, a - high_part
 
 
 def checked_span(span, allow_infinite_end: bool = False) -> tuple[float, float]:

@@ -37,7 +37,7 @@ from ..pacing import (
 from ..rules import DEFAULT_OPTIONS, SolverOptions
 from ..searching import EMPTY_BRACKET
 from ..stages import StageSolution, solve_newton
-from ..stepping import State, initial_run_state, stage_equations, take_step
+from ..stepping import SavedStates, State, initial_run_state, stage_equations, take_step
 from .form import ProgramStructure, flat_parameters
 from .loop import MAX_UNOPTIMISED_OPERATIONS, NEWTON_BUFFER, BlockLayout, CompiledLoops, NamedProgram, compile_step_loop
 from .machine_code import MachineCode
@@ -102,9 +102,15 @@ class CompiledEngine:
         """Number of scalar operations of a step."""
         return self._step_loop.n_operations
 
-    def final_state_runner(self) -> FinalStateRunner:
-        """Return a runner that returns final states alone, with buffers of its own; each thread needs one."""
-        return FinalStateRunner(self._step_loop, self._parameters)
+    @functools.cached_property
+    def trajectory(self) -> CompiledTrajectory:
+        """The only trajectory of this engine, in buffers that every run uses again."""
+        return CompiledTrajectory(self._step_loop, self._parameters)
+
+    def start(self, x) -> CompiledTrajectory:
+        """Return a trajectory that starts at x; it is written over the one that was started before."""
+        self.trajectory.start(x, self._planned_steps)
+        return self.trajectory
 
     def initial_run_state(self, x) -> State:
         return self._state_from_block(
@@ -136,11 +142,11 @@ class CompiledEngine:
         return self._step_loop.state_from_block(blocks)
 
 
-class FinalStateRunner:
-    """Runs one trajectory at a time through a compiled loop of steps, in buffers that are allocated once.
+class CompiledTrajectory:
+    """One trajectory in a compiled loop of steps, in buffers that are allocated once.
 
-    A call copies the initial state and calls the machine code, no more. The buffers are written in place, so each
-    thread needs a runner of its own.
+    A call calls the machine code and copies what is asked for, no more. The buffers are written in place, so each
+    thread needs a trajectory of its own.
 
     Parameters
     ----------
@@ -154,32 +160,74 @@ class FinalStateRunner:
         self._loop, self._parameters = step_loop, np.ascontiguousarray(parameters, dtype=np.float64)
         self._block = step_loop.make_blocks({"x": np.zeros((1, *step_loop.field_shape("x")))})
         rows = step_loop.block_rows(self._block)[0, :, 0]
-        self._x, self._status, self._h = (rows[step_loop.row_slice(name)] for name in ("x", "status", "h"))
-        self._n_done, self._saved = np.zeros(1, dtype=np.int64), np.empty(step_loop.n_saved_values)
-        arrays = self._parameters, self._block, self._n_done, self._saved, np.zeros(0)
-        self._arrays, self._addresses = arrays, [array.ctypes.data for array in arrays]
+        self._x, self._status, self._step, self._h = (
+            rows[step_loop.row_slice(name)] for name in ("x", "status", "step", "h")
+        )
+        self._n_saved_values, self._n_done = step_loop.n_saved_values, np.zeros(1, dtype=np.int64)
+        self._addresses = [array.ctypes.data for array in (self._parameters, self._block, self._n_done)]
 
-    def run(self, x0: np.ndarray, segments: Sequence[tuple[float, int]]) -> tuple[np.ndarray, float]:
-        """Take steps from a state, and return the last state, shape (n,), and its status code.
+    def start(self, x, planned_steps: int = 0) -> None:
+        """Start a trajectory at x, shape (n,); ``planned_steps`` decides on optimisation."""
+        begin, _ = self._loop.loop_functions(0, planned_steps)
+        self._status[0], self._x[:] = 0.0, x
+        begin(self._addresses[0], self._addresses[1], 1)
+
+    def advance(self, h: float, n_saves: int, steps_per_save: int, noise: np.ndarray | None = None) -> SavedStates:
+        """Take ``n_saves * steps_per_save`` steps of size h, fewer if one fails, and return the saved states.
+
+        Raises
+        ------
+        UnsupportedPrimitive
+            If a step needs Newton's method, which cannot be compiled; the trajectory is then as it was before.
+        """
+        first_step, block = self._step[0], self._block.copy()
+        out = np.empty((n_saves, self._n_saved_values))
+        try:
+            self._take_steps(h, n_saves, steps_per_save, noise, out)
+        except BaseException:  # an interrupt too: what is not saved was not taken
+            self._block[:] = block
+            raise
+        n_reached = int(self._step[0] - first_step) // steps_per_save
+        return SavedStates(out[:n_reached, :-2], out[:n_reached, -2], out[:n_reached, -1])
+
+    def final_state(self, x, segments: Sequence[tuple[float, int]]) -> tuple[np.ndarray, float]:
+        """Return the last state, shape (n,), and its status code, of a trajectory that starts at x.
 
         Parameters
         ----------
-        x0 : array, shape (n,)
+        x : array, shape (n,)
         segments : sequence of (h, n_steps)
             Step sizes, and how many steps of each size follow one another.
         """
-        parameters, block, n_done, saved, noise = self._addresses
-        begin, advance = self._loop.machine_functions(sum(n_steps for _, n_steps in segments))
-        self._status[0], self._x[:] = 0.0, x0
-        begin(parameters, block, 1)
-        newton = self._loop.newton_address(is_needed=False)
+        self.start(x, sum(n_steps for _, n_steps in segments))
+        out = np.empty(self._n_saved_values)
         for h, n_steps in segments:
-            self._h[0], self._n_done[0] = h, 0
-            while advance(parameters, block, n_done, 1, 1, n_steps, saved, n_steps, noise, newton) < 1:
-                newton = self._loop.newton_address(is_needed=True)
+            self._take_steps(h, 1, n_steps, None, out)
             if self._status[0]:
                 break
         return self._x.copy(), float(self._status[0])
+
+    @property
+    def state(self) -> State:
+        """The state reached so far, as a copy."""
+        return self._loop.state_from_block(self._block.copy())
+
+    def _take_steps(self, h: float, n_saves: int, steps_per_save: int, noise: np.ndarray | None, out) -> None:
+        n_steps = n_saves * steps_per_save
+        increments = self._loop.noise_by_block(None if noise is None else noise[None], 1, n_steps)
+        parameters, block, n_done = self._addresses
+        self._h[0], self._n_done[0] = h, 0
+        _, advance = self._loop.loop_functions(n_steps)
+        newton, out_address, noise_address = self._loop.newton_address(False), out.ctypes.data, increments.ctypes.data
+        while (
+            advance(parameters, block, n_done, 1, n_saves, steps_per_save, out_address, n_steps, noise_address, newton)
+            < 1
+        ):
+            newton = self._loop.newton_address(True)
+
+
+NO_INCREMENTS = np.zeros(0)
+"""Noise increments of a method without noise."""
 
 
 class CompiledStepLoop:
@@ -460,7 +508,7 @@ class CompiledStepLoop:
         steps_done = np.zeros(n_blocks, dtype=np.int64)
         saves, save_every = int(saves), int(save_every)
         arguments = [parameters.ctypes.data, blocks.ctypes.data, steps_done.ctypes.data, n_blocks, saves, save_every]
-        increments = self._noise_by_block(noise, n_blocks, saves * save_every)
+        increments = self.noise_by_block(noise, n_blocks, saves * save_every)
         arguments += [out.ctypes.data, saves * save_every, increments.ctypes.data]
         newton_address = self.newton_address(is_needed=False)
         _, advance = self._loops.loop_functions(n_blocks * saves * save_every)
@@ -482,19 +530,22 @@ class CompiledStepLoop:
         """Number of values of a trajectory at each save."""
         return sum(self._layout.row_counts[name] for name in self.saved_fields)
 
-    def _noise_by_block(self, noise: np.ndarray | None, n_blocks: int, n_steps: int) -> np.ndarray:
+    def noise_by_block(self, noise: np.ndarray | None, n_blocks: int, n_steps: int) -> np.ndarray:
         """Rearrange noise increments to the order of the loop, shape (blocks, steps, increments, lanes)."""
-        if noise is None or not self._shapes["dW"][0]:
-            return np.zeros((n_blocks, n_steps, self._shapes["dW"][0], self.lanes))
-        padded = np.zeros((n_blocks * self.lanes, n_steps, self._shapes["dW"][0]))
+        n_increments = self._shapes["dW"][0]
+        if not n_increments:
+            return NO_INCREMENTS
+        if noise is None:
+            return np.zeros((n_blocks, n_steps, n_increments, self.lanes))
+        padded = np.zeros((n_blocks * self.lanes, n_steps, n_increments))
         padded[: len(noise)] = noise
         return np.ascontiguousarray(padded.reshape(n_blocks, self.lanes, n_steps, -1).transpose(0, 2, 3, 1))
 
     # -- machine code -------------------------------------------------------------------------------------------------
 
-    def machine_functions(self, n_steps: int) -> Sequence[Callable]:
+    def loop_functions(self, n_steps: int, planned_steps: int = 0) -> Sequence[Callable]:
         """Return the functions ``begin`` and ``advance`` of the loop, optimised if many steps are taken in all."""
-        return self._loops.loop_functions(n_steps)
+        return self._loops.loop_functions(n_steps, planned_steps)
 
     def newton_address(self, is_needed: bool) -> int:
         """Return the address of Newton's method; 0 if it is not compiled yet and no step has needed it."""

@@ -20,6 +20,7 @@ from ...functions.rounding import value_and_rounding_scale
 from ...integrators import OneStepMethod
 from ...systems import System
 from ...tracing.programs import jit_program
+from ..array import EngineTrajectory
 from ..codes import StatusCode
 from ..rules import DEFAULT_OPTIONS
 from ..stages import IterationState, StageEquations, StageSolution, best_initial_guess, solve_fixed_point
@@ -80,6 +81,9 @@ class SparseEngine:
         x = np.array([np.asarray(s.x) for s in saved_states]).reshape(len(saved_states), self.system.dim)
         energy, entropy = (np.array([float(getattr(s, name)) for s in saved_states]) for name in ("energy", "entropy"))
         return state, (x, energy, entropy, np.ones(len(saved_states), dtype=bool))
+
+    def start(self, x) -> EngineTrajectory:
+        return EngineTrajectory(self, self.initial_run_state(x))
 
     def step_ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
         states = [

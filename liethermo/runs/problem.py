@@ -1,0 +1,137 @@
+"""``Problem``: what the user gave as it is run, with what all its runs share."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from ..engines.choice import MIN_STEPS_TO_COMPILE, EngineWithFallback
+from ..integrators import OneStepMethod, Reference
+from ..results.status import Laws
+from ..systems import AttitudeSystem, System
+from ..systems.interface import SystemInterface
+from ..tracing.caching import memoize
+from .fluctuations import Fluctuations
+from .preparation import (
+    checked_initial_state,
+    invariants_and_laws,
+    is_driven_run,
+    limit_to_span,
+    prepare_run,
+    resolve_invariants,
+)
+
+
+class Problem:
+    """A system and a method as they are run, with the laws and the engines of all their runs.
+
+    Attributes
+    ----------
+    system : System
+        The user's system with a clock, an attitude, and charts or an embedding, as far as it needs them.
+    method : OneStepMethod or Reference
+        The user's method, with noise and reconstruction as far as the system needs them.
+    noise : Fluctuations or None
+    invariants : dict
+        Functions recorded along a run, and whether the system conserves each of them.
+    laws : Laws
+    is_driven : bool
+        Whether functions of the system depend on time.
+    state_shape : tuple of int
+        Shape of a state: (n,), or (*sites, d).
+    """
+
+    def __init__(self, system: System, method: Any, noise: Fluctuations | None):
+        self.system, self.method, self.noise = system, method, noise
+        self.invariants: dict
+        self.laws: Laws
+        self.invariants, self.laws = invariants_and_laws(system, method)
+        self.is_driven = is_driven_run(system)
+        self._engines = _ThreadEngines()
+        self.state_shape = system.shape if system.sites else (system.dim,)
+        kind = type(system)
+        self._starts_anywhere = (
+            system.space is None
+            and kind.state_array is System.state_array
+            and not isinstance(system, AttitudeSystem)
+            and kind.outside is SystemInterface.outside
+            and kind.why_singular is SystemInterface.why_singular
+        )
+
+    @classmethod
+    def from_user(
+        cls,
+        system: System,
+        method: OneStepMethod | Reference,
+        noise: Fluctuations | None = None,
+        tolerance: float | None = None,
+        x0=None,
+    ) -> Problem:
+        """Return the problem of a system and a method, for a tolerance of adaptive steps or for fixed steps.
+
+        What the system conserves is decided at states near x0, if it is not decided by construction.
+
+        Raises
+        ------
+        InputError
+            If the method cannot run the system.
+        """
+        return _cached_problem(resolve_invariants(system, x0), method, noise, tolerance)
+
+    def initial_state(self, x0, t: float, attitude=None) -> np.ndarray | jax.Array:
+        """Return the initial state from the user's x0, shape (n,), after checking that a run can start there.
+
+        Raises
+        ------
+        InputError
+        """
+        is_plain = type(x0) is np.ndarray and x0.dtype == np.float64 and x0.shape == (self.system.dim,)
+        if is_plain and self._starts_anywhere and not self.is_driven and attitude is None and np.isfinite(x0).all():
+            return x0
+        return checked_initial_state(self.system, self.method, x0, t, attitude)
+
+    def system_in_span(self, start: float, end: float) -> System:
+        """Return the system with its functions of time evaluated within a span only."""
+        return limit_to_span(self.system, start, end) if self.is_driven else self.system
+
+    def engine(
+        self, requested_engine: str, system: System, planned_steps: int, noise_increments: Callable | None = None
+    ) -> EngineWithFallback:
+        """Return an engine for a run in this thread; runs share it unless it belongs to one span or one path.
+
+        Parameters
+        ----------
+        requested_engine : str
+            See :data:`..engines.choice.ENGINES`.
+        system : System
+            The system in the span of the run.
+        planned_steps : int
+            Number of steps that the run will take.
+        noise_increments : function, optional
+            See :class:`..engines.choice.EngineWithFallback`.
+        """
+        if self.is_driven or noise_increments is not None:
+            return EngineWithFallback(system, self.method, requested_engine, planned_steps, noise_increments)
+        key = requested_engine, planned_steps >= MIN_STEPS_TO_COMPILE
+        engine = self._engines.by_request.get(key)
+        if engine is None:
+            engine = self._engines.by_request[key] = EngineWithFallback(
+                system, self.method, requested_engine, planned_steps
+            )
+        return engine
+
+
+class _ThreadEngines(threading.local):
+    """Engines of one thread, whose buffers no other thread may use."""
+
+    def __init__(self):
+        self.by_request: dict[tuple[str, bool], EngineWithFallback] = {}
+
+
+@memoize
+def _cached_problem(system: System, method, noise: Fluctuations | None, tolerance: float | None) -> Problem:
+    return Problem(*prepare_run(system, method, noise, tolerance), noise)
