@@ -181,6 +181,10 @@ class EngineTrajectory:
     def __init__(self, engine, state: State):
         self._engine, self.state = engine, state
 
+    def read(self, name: str) -> float:
+        """Return a scalar field of the state reached so far."""
+        return float(getattr(self.state, name))
+
     def advance(self, h: float, n_saves: int, steps_per_save: int, noise=None) -> SavedStates:
         """Take ``n_saves * steps_per_save`` steps of size h, fewer if one fails, and return the saved states."""
         self.state, (x, energy, entropy, is_reached) = self._engine.advance(

@@ -266,6 +266,10 @@ class Trajectory:
         self._trajectory, saved_states = self._engine.advance_trajectory(self._trajectory, h, n_saves, steps_per_save)
         return saved_states
 
+    def read(self, name: str) -> float:
+        """Return a scalar field of the state reached so far, such as ``"energy"``."""
+        return self._trajectory.read(name)
+
     @property
     def state(self) -> State:
         """The state reached so far."""

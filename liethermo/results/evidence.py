@@ -169,8 +169,10 @@ class EvidenceCollector:
         Recorded functions besides energy and entropy.
     x : ndarray, shape (m, n)
         Saved states.
-    t, h : ndarray, shape (m,) and at most (m,)
-        Times of the states, and sizes of the steps that the run took from them.
+    t : ndarray, shape (m,)
+        Times of the states.
+    step_sizes : function without arguments to an array, shape at most (m,)
+        Sizes of the steps that the run took from the states.
     replay : StepReplay
     """
 
@@ -179,8 +181,13 @@ class EvidenceCollector:
     functions: Mapping[str, Energy]
     x: np.ndarray
     t: np.ndarray
-    h: np.ndarray
+    step_sizes: Callable[[], np.ndarray]
     replay: StepReplay
+
+    @functools.cached_property
+    def h(self) -> np.ndarray:
+        """Sizes of the steps that the run took from the states."""
+        return self.step_sizes()
 
     def __call__(self) -> Evidence:
         return self._evidence

@@ -63,11 +63,12 @@ def check_choice(name: str, value, choices: tuple[str, ...]) -> None:
 
 def resolve_invariants(system: System, x0) -> System:
     """Return the system with undecided conservation laws decided at states near x0."""
-    return system.resolve_invariants_near(x0) if _has_undecided_invariants(system) else system
+    return system.resolve_invariants_near(x0) if has_undecided_invariants(system) else system
 
 
 @memoize
-def _has_undecided_invariants(system: System) -> bool:
+def has_undecided_invariants(system: System) -> bool:
+    """Return whether what the system conserves has to be decided near the initial state of a run."""
     return not is_traced(system) and bool(system.undecided_functions())
 
 

@@ -6,7 +6,7 @@ import dataclasses
 import datetime
 import functools
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib import metadata
 from typing import Any
 
@@ -31,7 +31,7 @@ def build_solution(
     method,
     x: np.ndarray,
     entropy: np.ndarray | None,
-    step_sizes: np.ndarray,
+    step_sizes: Callable[[], np.ndarray],
     replay: StepReplay,
     laws: Laws,
     invariants: Mapping[str, tuple[Energy, bool | None]],
@@ -41,7 +41,7 @@ def build_solution(
 
     Parameters
     ----------
-    step_sizes : array, shape (times - 1,)
+    step_sizes : function without arguments to an array, shape (times - 1,)
         Size of a step that the run took after each state.
     replay : StepReplay
     laws : Laws

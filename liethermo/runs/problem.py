@@ -56,6 +56,7 @@ class Problem:
         kind = type(system)
         self._starts_anywhere = (
             system.space is None
+            and not self.is_driven
             and kind.state_array is System.state_array
             and not isinstance(system, AttitudeSystem)
             and kind.outside is SystemInterface.outside
@@ -89,9 +90,10 @@ class Problem:
         ------
         InputError
         """
-        is_plain = type(x0) is np.ndarray and x0.dtype == np.float64 and x0.shape == (self.system.dim,)
-        if is_plain and self._starts_anywhere and not self.is_driven and attitude is None and np.isfinite(x0).all():
-            return x0
+        if self._starts_anywhere and attitude is None and isinstance(x0, np.ndarray | list | tuple):
+            x = np.asarray(x0)
+            if x.dtype == np.float64 and x.shape == (self.system.dim,) and np.isfinite(x).all():
+                return x
         return checked_initial_state(self.system, self.method, x0, t, attitude)
 
     def system_in_span(self, start: float, end: float) -> System:

@@ -26,7 +26,7 @@ from .ensemble import ensemble
 from .events import Relaxed
 from .family import named_parameters
 from .fluctuations import DEFAULT_NOISE_METHOD, Fluctuations, check_noise
-from .preparation import check_choice, refuse_tracers
+from .preparation import check_choice, has_undecided_invariants, refuse_tracers
 from .problem import Problem
 from .progress import Progress
 from .run import Run
@@ -266,7 +266,7 @@ class Propagator:
             return self._decided_problem
         tolerance = self.step.tolerance if isinstance(self.step, Adaptive) else None
         problem = Problem.from_user(self.system, self.method, self.noise, tolerance, x0)
-        if not self.system.undecided_functions():
+        if not has_undecided_invariants(self.system):
             self._decided_problem = problem
         return problem
 
@@ -292,7 +292,7 @@ class Propagator:
         """The problem whose final states machine code computes; None where every call is a run."""
         if isinstance(self.step, Adaptive) or self.noise is not None or isinstance(self.method, Reference):
             return None
-        if self.system.undecided_functions():  # what is conserved may depend on the initial state
+        if has_undecided_invariants(self.system):  # what is conserved may depend on the initial state
             return None
         problem = self._problem()
         return None if problem.is_driven or isinstance(problem.system, AttitudeSystem) else problem

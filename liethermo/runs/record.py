@@ -262,7 +262,7 @@ class MemberSolutionBuilder:
             t=member_solution.t,
             energy=energy,
             entropy=member_solution.entropy,
-            step_sizes=steps,
+            step_sizes=lambda: steps,
             replay=EngineReplay(EngineWithFallback(system, self.method, "auto", 1)),
             status=member_solution.status,
             stats=member_solution.stats,

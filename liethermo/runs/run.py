@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ import numpy as np
 from manifolds.errors import warn
 
 from ..engines.codes import StatusCode
-from ..engines.stepping import SavedStates, energy_and_entropy_at
+from ..engines.stepping import SavedStates, State, energy_and_entropy_at
 from ..errors import FileError
 from ..integrators import Reference
 from ..integrators.fluctuating import noise_dimension
@@ -83,24 +83,25 @@ class Run:
         trajectory, interruption = None, ""
         try:
             trajectory = self.engine.start(self.saved_states[0][0])
-            state = trajectory.state
-            self.saved_energies_entropies = [np.array([[float(state.energy), float(state.entropy)]])]
+            self.saved_energies_entropies = [np.array([[trajectory.read("energy"), trajectory.read("entropy")]])]
+            n_steps = 0
             for h, n_saves, steps_per_save, keep in self.schedule.engine_calls(
                 max_saves=self.engine.max_saves_per_call, save_all=self.all_states is not None
             ):
                 saved_states = trajectory.advance(h, n_saves, steps_per_save)
-                first_step, state = int(state.step), trajectory.state
-                self._save_states_of_call(saved_states, first_step, steps_per_save, keep)
+                self._save_states_of_call(saved_states, n_steps, steps_per_save, keep)
+                n_steps = int(trajectory.read("step"))
                 if bar.is_shown:
-                    bar.update(float(self.schedule.times_after(np.asarray(int(state.step)))))
-                if state.status != StatusCode.COMPLETED:
+                    bar.update(self.schedule.time_after(n_steps))
+                if trajectory.read("status") != StatusCode.COMPLETED:
                     break
-                self._checkpoint(state)
+                self._checkpoint(lambda: trajectory.state)
         except INTERRUPTING_ERRORS as error:
             interruption = interruption_reason(error)
         if trajectory is None:
             self._set_interrupted_at_start(interruption)
             return
+        state = trajectory.state
         step = int(state.step)
         t, h = self.schedule.time_after(step), self.schedule.step_size_after(step)
         if t > self.last_saved_time:  # the run ended between two saved states
@@ -138,7 +139,7 @@ class Run:
             if self.all_states is not None:
                 self.all_states.append((ends, steps.x))
             bar.update(ends[-1])
-            self._checkpoint(steps.state_after)
+            self._checkpoint(lambda: steps.state_after)
 
         length = end - start if math.isfinite(end) else ENDLESS_SPAN_LENGTH
         control = make_step_control(step, self.method, end - start, event)
@@ -249,7 +250,7 @@ class Run:
             t=np.concatenate(self.saved_times),
             energy=energy,
             entropy=entropy,
-            step_sizes=self._longest_steps_between_saves(len(x) - 1),
+            step_sizes=functools.partial(_longest_steps, self.schedule, self.taken_steps, len(x) - 1),
             replay=EngineReplay(self.engine),
             laws=self.problem.laws,
             invariants=self.problem.invariants,
@@ -266,16 +267,10 @@ class Run:
         times, states = zip(*self.all_states, strict=True)
         return DenseOutput(np.concatenate(times), np.concatenate(states), self.engine.step_ends)
 
-    def _longest_steps_between_saves(self, n_intervals: int) -> np.ndarray:
-        """Return the longest step after each saved state, shape (n_intervals,)."""
-        if not self.taken_steps:
-            return self.schedule.longest_steps[:n_intervals]
-        h, is_saved = np.concatenate(self.taken_steps, axis=1)
-        return np.maximum.reduceat(h, np.flatnonzero(np.append(1.0, is_saved[:-1])))[:n_intervals]
-
-    def _checkpoint(self, state) -> None:
+    def _checkpoint(self, read_state: Callable[[], State]) -> None:
+        """Write the run so far to the file ``save_to``, if the last time was long ago."""
         if self.save_to is not None and time.perf_counter() - self.last_checkpoint_time > CHECKPOINT_SECONDS:
-            self.stats = run_statistics(state)
+            self.stats = run_statistics(read_state())
             try:
                 self.solution().save(self.save_to)
             except FileError as error:  # the disk may have space again at the end
@@ -298,3 +293,14 @@ class Run:
                 x0=x0.tolist() if self.system.dim <= MAX_PROVENANCE_COMPONENTS else None,
             )
         )
+
+
+def _longest_steps(schedule: StepSchedule, taken_steps: Sequence[np.ndarray], n_intervals: int) -> np.ndarray:
+    """Return the longest step after each saved state, shape (n_intervals,).
+
+    ``taken_steps`` has the sizes of adaptive steps, and whether the state after each is saved.
+    """
+    if not taken_steps:
+        return schedule.longest_steps[:n_intervals]
+    h, is_saved = np.concatenate(taken_steps, axis=1)
+    return np.maximum.reduceat(h, np.flatnonzero(np.append(1.0, is_saved[:-1])))[:n_intervals]

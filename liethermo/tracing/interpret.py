@@ -20,9 +20,10 @@ from manifolds._arrays import is_traced
 
 from .caching import LRUCache, fingerprint, memoize
 from .degrees import array_degree_bound
+from .index_check import check_indices
 from .programs import jit_unoptimised
 from .scalarize import UnsupportedPrimitive, scalarize
-from .traced import trace_callables
+from .traced import has_plain_functions, is_library_object, trace_callables
 
 MAX_INTERPRETED_INSTRUCTIONS = 30_000
 """Largest number of instructions of an interpreted program; a longer one is faster to compile."""
@@ -55,7 +56,8 @@ def batch_evaluator(function: Callable, model: Any, dim: int) -> Callable[[np.nd
     """Unroll ``function(model, x)``, and return the map from points, shape (m, dim), to its values there."""
     if dim > MAX_UNROLLED_DIM:
         return lambda points: _evaluate_compiled(function, model, points)
-    model = trace_callables(model, function, (dim,))
+    if has_plain_functions(model):
+        model = trace_callables(model, function, (dim,))
     leaves, model_key, rebuild = _split_parameters(model)
     values = [np.asarray(leaf, dtype=np.float64) for leaf in leaves]
     zero_pattern = tuple((value == 0.0).tobytes() for value in values)  # zeros shorten the program
@@ -65,6 +67,8 @@ def batch_evaluator(function: Callable, model: Any, dim: int) -> Callable[[np.nd
         closed_jaxpr, result_shapes = jax.make_jaxpr(lambda arrays, x: function(rebuild(arrays), x), return_shape=True)(
             shapes, jax.ShapeDtypeStruct((dim,), np.float64)
         )
+        if not is_library_object(model):
+            check_indices(closed_jaxpr)
         zeros = [np.where(value == 0.0, 0.0, np.nan) for value in values]
         return scalarize(
             closed_jaxpr, [*zeros, None], max_instructions=MAX_INTERPRETED_INSTRUCTIONS

@@ -173,7 +173,7 @@ def _forward_differentiable(function: Callable) -> Callable:
 
 def trace_function(function: Callable, *arguments) -> TracedFunction:
     """Trace a function of arrays of given shapes (``jax.ShapeDtypeStruct``); return it as a pytree of its numbers."""
-    is_library_code = _is_library_object(function)
+    is_library_code = is_library_object(function)
     name = getattr(function, "__name__", type(function).__name__)
 
     def evaluate(*values):  # a new function object: JAX caches traces by it, and globals that it reads may change
@@ -205,7 +205,7 @@ def _defining_module(function: Callable) -> str:
     return getattr(function, "__module__", None) or type(function).__module__
 
 
-def _is_library_object(function: Any) -> bool:
+def is_library_object(function: Any) -> bool:
     """Return whether a function, or the class of an object, is defined in this library."""
     return _defining_module(function).split(".")[0] in ("liethermo", "manifolds")
 
@@ -274,15 +274,20 @@ def _trace_with_recorders(leaves: list, structure, use: Callable, shapes, number
     return jax.tree_util.tree_unflatten(structure, traced_leaves), result_shapes
 
 
+def has_plain_functions(tree: Any, is_leaf: Callable | None = None) -> bool:
+    """Return whether a pytree has plain functions or Python floats among its leaves."""
+    leaves = jax.tree_util.tree_leaves(tree, is_leaf=is_leaf)
+    return any(is_plain_function(leaf) or type(leaf) is float for leaf in leaves)
+
+
 def trace_callables(tree: Any, use: Callable, *shapes: tuple[int, ...], is_leaf: Callable | None = None) -> Any:
     """Return a pytree with its plain functions traced, as :func:`trace_callables_with_result` does.
 
     A tree without plain functions and floats is returned unchanged; an object of the user's is checked for constant
     indices out of range.
     """
-    leaves = jax.tree_util.tree_leaves(tree, is_leaf=is_leaf)
-    if not any(is_plain_function(leaf) or type(leaf) is float for leaf in leaves):
-        if not _is_library_object(tree):
+    if not has_plain_functions(tree, is_leaf):
+        if not is_library_object(tree):
             _check_indices_of(tree, use, shapes)
         return tree
     return trace_callables_with_result(tree, use, *shapes, is_leaf=is_leaf)[0]

@@ -114,6 +114,8 @@ class CompiledLoops:
 
     def loop_functions(self, n_steps: int, planned_steps: int = 0) -> Sequence[Callable]:
         """Return ``begin`` and ``advance``, compiled for ``n_steps`` more steps now and ``planned_steps`` later."""
+        if self._loaded and not self._loaded[-1][0].skip_optimisation:
+            return self._loaded[-1][1:]
         with self._lock, report_compiler_faults():
             self._steps_so_far += n_steps
             skip_optimisation = (

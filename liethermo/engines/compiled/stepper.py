@@ -159,7 +159,7 @@ class CompiledTrajectory:
     def __init__(self, step_loop: CompiledStepLoop, parameters: np.ndarray):
         self._loop, self._parameters = step_loop, np.ascontiguousarray(parameters, dtype=np.float64)
         self._block = step_loop.make_blocks({"x": np.zeros((1, *step_loop.field_shape("x")))})
-        rows = step_loop.block_rows(self._block)[0, :, 0]
+        self._row = rows = step_loop.block_rows(self._block)[0, :, 0]
         self._x, self._status, self._step, self._h = (
             rows[step_loop.row_slice(name)] for name in ("x", "status", "step", "h")
         )
@@ -206,6 +206,10 @@ class CompiledTrajectory:
             if self._status[0]:
                 break
         return self._x.copy(), float(self._status[0])
+
+    def read(self, name: str) -> float:
+        """Return a scalar field of the state reached so far."""
+        return float(self._row[self._loop.row_slice(name).start])
 
     @property
     def state(self) -> State:
