@@ -276,7 +276,7 @@ class CoarsenedPath:
 def test_paths_converge_in_the_mean_square(system, noise):
     """To those of the same Brownian motion with shorter steps, with order 1/2 at least."""
     fine, T, paths = 4096, 1.0, 120
-    method, levels, errors = noise.on(system, lt.MetriplecticMidpoint()), (64, 128, 256, 512), []
+    method, levels, errors = noise.method_with_noise(system, lt.MetriplecticMidpoint()), (64, 128, 256, 512), []
     increments = np.sqrt(T / fine) * np.random.default_rng(0).standard_normal((paths, fine, noise_dimension(method)))
 
     def end(W, steps):

@@ -243,7 +243,7 @@ def test_conduction_that_keeps_one_law_alone(conduction, energy, entropy):
     """Skewness without Fourier's factor keeps the energy only, its sign without skewness the entropy only."""
     right = particles(conductance=0.3)
     part = right.dissipation
-    graph = Edges(np.array(part.first), np.array(part.second), part.conductance)
+    graph = Edges(np.array(part.first_bodies), np.array(part.second_bodies), part.conductance)
     wrong = eqx.tree_at(lambda s: s.dissipation, right, conduction(graph))
     solution = lt.integrate(wrong, np.log([2.0, 4.0]), (0.0, 5.0), 0.1, engine="array")
     assert (solution.audit().energy_drift < 1e-14) is energy
