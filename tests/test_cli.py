@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 import liethermo as lt
 from liethermo.cli import app
-from liethermo.engines.compiled.stepper import CompiledEngine
+from liethermo.engines.compiled.stepper import CompiledTrajectory
 from liethermo.integrators import METHODS
 from liethermo.spec import FIGURES
 
@@ -178,7 +178,7 @@ def test_a_run_that_stops_early_is_kept(folder):
 
 
 def test_ctrl_c_keeps_what_exists(folder, monkeypatch):
-    advance, calls = CompiledEngine.advance, []
+    advance, calls = CompiledTrajectory.advance, []
 
     def advance_once(*arguments):
         calls.append(arguments)
@@ -186,7 +186,7 @@ def test_ctrl_c_keeps_what_exists(folder, monkeypatch):
             raise KeyboardInterrupt
         return advance(*arguments)
 
-    monkeypatch.setattr(CompiledEngine, "advance", advance_once)
+    monkeypatch.setattr(CompiledTrajectory, "advance", advance_once)
     result = folder.call("run", folder.spec(MODEL, RUN.replace("2.0]", "500.0]"), OUTPUT_WITHOUT_FIGURES))
     assert result.exit_code == 1
     assert "stopped by the user" in result.stdout

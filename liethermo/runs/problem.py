@@ -90,7 +90,8 @@ class Problem:
         ------
         InputError
         """
-        if self._starts_anywhere and attitude is None and isinstance(x0, np.ndarray | list | tuple):
+        is_list = isinstance(x0, list | tuple) and all(type(component) is float for component in x0)
+        if self._starts_anywhere and attitude is None and (is_list or type(x0) is np.ndarray):
             x = np.asarray(x0)
             if x.dtype == np.float64 and x.shape == (self.system.dim,) and np.isfinite(x).all():
                 return x

@@ -27,7 +27,7 @@ X0 = np.array([0.1, 1.0, 0.1])
     ],
 )
 def test_fixed_steps(monkeypatch, error, why):
-    advance, calls = EngineWithFallback.advance, []
+    advance, calls = EngineWithFallback.advance_trajectory, []
 
     def fail_third_advance(self, *arguments):
         calls.append(1)
@@ -35,7 +35,7 @@ def test_fixed_steps(monkeypatch, error, why):
             raise error
         return advance(self, *arguments)
 
-    monkeypatch.setattr(EngineWithFallback, "advance", fail_third_advance)
+    monkeypatch.setattr(EngineWithFallback, "advance_trajectory", fail_third_advance)
     monkeypatch.setattr(EngineWithFallback, "max_saves_per_call", property(lambda self: 10))
     whole_run = lt.integrate(BODY, X0, (0.0, 5.0), 0.1, engine="array")
     assert whole_run.status.code == "interrupted"
@@ -66,7 +66,7 @@ def test_another_error_is_not_hidden(monkeypatch):
     def raise_unknown_error(self, *arguments):
         raise jax.errors.JaxRuntimeError("INTERNAL: something else")
 
-    monkeypatch.setattr(EngineWithFallback, "advance", raise_unknown_error)
+    monkeypatch.setattr(EngineWithFallback, "advance_trajectory", raise_unknown_error)
     with pytest.raises(jax.errors.JaxRuntimeError, match="something else"):
         lt.integrate(BODY, X0, (0.0, 5.0), 0.1)
 
