@@ -39,14 +39,14 @@ def parse_trajectories(data: Any, system: System, observation: Observation) -> l
     """
     trajectories = [
         _checked_trajectory(i, t, x, system, observation)
-        for i, (t, x) in enumerate(_time_state_pairs(data, observation))
+        for i, (t, x) in enumerate(_time_observation_pairs(data, observation))
     ]
     if not trajectories:
         raise InputError("there are no trajectories in the data")
     return trajectories
 
 
-def _time_state_pairs(data: Any, observation: Observation) -> list[tuple[Any, Any]]:
+def _time_observation_pairs(data: Any, observation: Observation) -> list[tuple[Any, Any]]:
     if isinstance(data, Solution):
         return [(data.t, observation.observe_solution(data))]
     if isinstance(data, tuple) and len(data) == 2 and _ndim_or_none(data[0]) == 1:
@@ -57,7 +57,7 @@ def _time_state_pairs(data: Any, observation: Observation) -> list[tuple[Any, An
             f"data must be a pair (t, x), t of shape (m,), x of shape (m, n) or (trajectories, m, n), a list of such "
             f"pairs, or solutions, got {type(data).__name__}"
         )
-    return [pair for item in data for pair in _time_state_pairs(item, observation)]
+    return [pair for item in data for pair in _time_observation_pairs(item, observation)]
 
 
 def _ndim_or_none(values: Any) -> int | None:
@@ -136,7 +136,7 @@ class DataScales(NamedTuple):
     time_scale: float
 
     def extend_to_states(self, indices: np.ndarray, states: np.ndarray) -> DataScales:
-        """Return scales of whole states, shape (m, n), of which the components ``indices`` are observed.
+        """Return the scales of full states: the data scales at ``indices``, those of ``states`` elsewhere.
 
         A component that does not vary has centre 0 and scale 1.
         """

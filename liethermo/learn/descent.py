@@ -51,8 +51,8 @@ def soap_optimiser(shapes: Sequence[tuple[int, ...]], rate: Callable) -> Any:
         if len(shape) == 2 and min(shape) > 1 and max(shape) <= MAX_PRECONDITIONED_DIM
     ]
 
-    def moment_decays(size: int) -> tuple[np.ndarray, np.ndarray]:
-        mean_decays, square_decays = (np.full(size, decay) for decay in ADAM_DECAYS)
+    def mean_and_square_decays(n_parameters: int) -> tuple[np.ndarray, np.ndarray]:
+        mean_decays, square_decays = (np.full(n_parameters, decay) for decay in ADAM_DECAYS)
         for indices, _ in matrices:
             mean_decays[indices] = square_decays[indices] = MEAN_DECAY
         return mean_decays, square_decays
@@ -69,7 +69,7 @@ def soap_optimiser(shapes: Sequence[tuple[int, ...]], rate: Callable) -> Any:
             [MEAN_DECAY * S + (1.0 - MEAN_DECAY) * P for (_, S), P in zip(pair, products, strict=True)]
             for pair, products in zip(sides, grams, strict=True)
         ]
-        mean_decays, square_decays = moment_decays(gradient.size)
+        mean_decays, square_decays = mean_and_square_decays(gradient.size)
         rotated_slope, mean = (
             _rotate_matrices(gradient, matrices, sides),
             mean_decays * mean + (1.0 - mean_decays) * gradient,
@@ -97,9 +97,9 @@ def _gram_matrices(G: jax.Array) -> tuple[jax.Array, jax.Array]:
     return G @ G.T, G.T @ G
 
 
-def _rotate_matrices(vector: jax.Array, matrices: Sequence, sides: Sequence) -> jax.Array:
-    """Replace each matrix G in a vector by ``Q^T G R``."""
-    for (indices, shape), ((Q, _), (R, _)) in zip(matrices, sides, strict=True):
+def _rotate_matrices(vector: jax.Array, matrix_slices: Sequence, basis_pairs: Sequence) -> jax.Array:
+    """Return a vector in which each weight-matrix block G is replaced by ``Q^T G R``, Q and R its eigenbases."""
+    for (indices, shape), ((Q, _), (R, _)) in zip(matrix_slices, basis_pairs, strict=True):
         vector = vector.at[indices].set((Q.T @ vector[indices].reshape(shape) @ R).ravel())
     return vector
 

@@ -21,8 +21,8 @@ from ..systems import System
 from . import losses
 from .data import Trajectory, cut_windows, data_scales, estimate_noise, parse_trajectories, spline_states_and_rates
 from .losses import Objective
-from .model import has_networks, scale_networks
-from .observation import default_states, make_observation, n_coordinates, states_matching_rates
+from .model import has_learned_parts, scale_networks
+from .observation import default_states, make_observation, n_displacement_coordinates, states_matching_rates
 from .refining import can_refine, pad_runs, refine_by_least_squares
 from .training import FitWarning, Phase, TrainingRun, fingerprint
 
@@ -159,7 +159,7 @@ def fit(
     if noise_is_estimated:
         sigma = estimate_noise(trajectories, data_scale.scale)
     smoothed_trajectories = [spline_states_and_rates(trajectory, sigma) for trajectory in trajectories]
-    if observation.is_full_state or has_networks(system):
+    if observation.is_full_state or has_learned_parts(system):
         starts = [default_states(observation, run, x) for x, _ in smoothed_trajectories]
     else:
         starts = states_matching_rates(observation, run, smoothed_trajectories, data_scale.scale, data_scale.time_scale)
@@ -185,7 +185,9 @@ def fit(
     search_units = state_scale.scale.copy()
     if sigma is not None and len(observation.component_indices):
         search_units[observation.component_indices] = sigma
-    search_units = np.concatenate([search_units, relative_noise * np.ones(n_coordinates(run) - system.dim)])
+    search_units = np.concatenate(
+        [search_units, relative_noise * np.ones(n_displacement_coordinates(run) - system.dim)]
+    )
     units = (
         data_scale.scale if sigma is None else sigma,
         search_units,
@@ -193,7 +195,7 @@ def fit(
     )
 
     def make_matching_objective(data: list) -> Objective:
-        return losses.trajectory_matching(params, [trajectory for trajectory, _ in data], sigma, state_scale)
+        return losses.trajectory_matching_objective(params, [trajectory for trajectory, _ in data], sigma, state_scale)
 
     def make_shooting_objective(data: list, finds_initial_states: bool) -> Objective:
         windows = cut_windows(
@@ -283,7 +285,14 @@ def fit(
 
 
 def _fitted_initial_states(
-    vector, params, train: list, window: int, finds_initial_states: bool, observation, run, search_units
+    fitted_vector,
+    params,
+    train: list,
+    window: int,
+    finds_initial_states: bool,
+    observation,
+    prepared_system,
+    search_units,
 ) -> np.ndarray:
     """Return the initial states of whole trajectories, shape (B, N), as fitted by the shooting."""
     starts = np.stack([states[0] for _, states in train])
@@ -293,11 +302,15 @@ def _fitted_initial_states(
         [trajectory for trajectory, _ in train], [states for _, states in train], window, finds_initial_states
     )
     displacements = (
-        np.asarray(vector)[params.initial_values.size :].reshape(len(windows.initial_states), -1)[windows.first_windows]
+        np.asarray(fitted_vector)[params.initial_values.size :].reshape(len(windows.initial_states), -1)[
+            windows.first_windows
+        ]
         * search_units
     )
     return np.asarray(
-        jax.vmap(lambda x, z: observation.displace(run, x, z))(jnp.asarray(starts), jnp.asarray(displacements))
+        jax.vmap(lambda x, z: observation.displace(prepared_system, x, z))(
+            jnp.asarray(starts), jnp.asarray(displacements)
+        )
     )
 
 

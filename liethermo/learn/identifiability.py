@@ -166,8 +166,7 @@ class Fits:
     def forecast(
         self, x0, t_span: tuple[float, float], step: float, method: OneStepMethod | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Integrate all systems; return times, mean states and standard deviations, shapes (times,), (times, n),
-        (times, n).
+        """Return times, mean states and standard deviations of the runs of all systems.
 
         The arguments are those of :func:`liethermo.integrate`.
         """
@@ -179,7 +178,7 @@ class Fits:
 def several(
     build: Callable[[int], T], data: Any, number: int = 5, *, seed: int = 0, resample: bool = True, **how
 ) -> Fits:
-    """Fit several systems from different initial weights to resampled data, which shows how far the fits agree.
+    """Return :class:`Fits`: several systems fitted to resampled data from different initial weights.
 
     With 8 trajectories or more, each fit draws as many with replacement (bootstrap). With fewer, draws are often equal.
     So each fit adds errors of the size of the noise, given or estimated, to the data, and the deviation of the fits is
@@ -243,8 +242,7 @@ def _noise_std(trajectories: list[Trajectory], noise) -> np.ndarray | None:
 def _draw_bootstrap_indices(
     count: int, random: np.random.Generator, previous_draws: set[tuple[int, ...]]
 ) -> np.ndarray:
-    """Draw ``count`` of ``count`` indices with replacement, a new draw if possible, and add it to
-    ``previous_draws``."""
+    """Return a bootstrap sample of ``count`` indices, new if possible, and add it to ``previous_draws``."""
     for _ in range(MAX_BOOTSTRAP_DRAWS):
         indices = random.integers(count, size=count)
         if tuple(sorted(indices.tolist())) not in previous_draws:

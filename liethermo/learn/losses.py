@@ -16,7 +16,7 @@ from ..runs.flow import differentiable_step, initial_carry
 from ..runs.preparation import prepare_for_method
 from ..systems import System
 from .data import DataScales, Trajectory, Windows, spline_states_and_rates
-from .model import tie_entropy
+from .model import copy_entropy_to_poisson
 from .networks import learned_mask
 from .observation import Observation
 from .parts import Poisson
@@ -67,7 +67,7 @@ def parameter_vector(system: System, also: Callable | None = None, positive: Cal
 
     def build_system(vector) -> System:
         logs, values = unravel(vector)
-        return tie_entropy(eqx.combine(jax.tree_util.tree_map(jnp.exp, logs), values, fixed_part))
+        return copy_entropy_to_poisson(eqx.combine(jax.tree_util.tree_map(jnp.exp, logs), values, fixed_part))
 
     shapes = tuple(np.shape(leaf) for leaf in jax.tree_util.tree_leaves(logs_and_values))
     count = sum(np.size(leaf) for leaf in jax.tree_util.tree_leaves(logs))
@@ -110,8 +110,8 @@ class Objective(NamedTuple):
     initial_free: np.ndarray
 
 
-def matching_objective(params: ParameterVector, x: np.ndarray, rates: np.ndarray, unit: np.ndarray) -> Objective:
-    """Return the mean square of the residual of ``x'`` against rates of change, in units of ``unit``, shape (n,).
+def matching_objective(params: ParameterVector, x: np.ndarray, rates: np.ndarray, rate_scale: np.ndarray) -> Objective:
+    """Return the objective whose loss is the mean square difference of the vector field and given rates.
 
     The residual is relative to the speed of the state. Otherwise the few fastest moments would dominate the loss, and
     the phase of a slow motion, in which errors accumulate, would not count.
@@ -120,16 +120,16 @@ def matching_objective(params: ParameterVector, x: np.ndarray, rates: np.ndarray
     def loss(vector, arrays, indices):
         points, rates = (values[indices] for values in arrays)
         field = jax.vmap(params.build_system(vector)._vector_field)(points)
-        speed = jnp.mean((rates / unit) ** 2, axis=1, keepdims=True)
-        return jnp.mean(((field - rates) / unit) ** 2 / (MEAN_SQUARE_RATE_FLOOR + speed))
+        speed = jnp.mean((rates / rate_scale) ** 2, axis=1, keepdims=True)
+        return jnp.mean(((field - rates) / rate_scale) ** 2 / (MEAN_SQUARE_RATE_FLOOR + speed))
 
     return Objective(loss, (jnp.asarray(x), jnp.asarray(rates)), len(x), np.zeros(0))
 
 
-def trajectory_matching(
+def trajectory_matching_objective(
     params: ParameterVector, data: list[Trajectory], noise: np.ndarray | None, scales: DataScales
 ) -> Objective:
-    """Return :func:`matching_objective` at the points of trajectories; splines give states and rates."""
+    """Return the objective of matching at the points of trajectories; splines give their states and rates."""
     smoothed_trajectories = [spline_states_and_rates(trajectory, noise) for trajectory in data]
     inner = [
         slice(1, -1) if len(x) > 8 else slice(None) for x, _ in smoothed_trajectories
@@ -150,7 +150,7 @@ def shooting_objective(
     substeps: int,
     finds_initial_states: bool,
 ) -> Objective:
-    """Return the mean square of the differences between short runs and the data at the ends of all intervals.
+    """Return the objective whose loss is the mean square difference of short runs and the data.
 
     With ``finds_initial_states`` the initial states of the runs are fitted too. Then the loss includes their
     differences to the data, and the gaps between the end of a run and the start of the next one.
@@ -170,11 +170,11 @@ def shooting_objective(
         run, begin, advance, state_of = differentiable_stepper(system, method, substeps, observation.group is not None)
 
         def run_window(x, h):
-            def interval(carry, h):
+            def advance_over_interval(carry, h):
                 carry = advance(carry, h)
                 return carry, state_of(carry)
 
-            return jax.lax.scan(interval, begin(x), h)[1]
+            return jax.lax.scan(advance_over_interval, begin(x), h)[1]
 
         def observe_states(states):
             return jax.vmap(lambda x: observation.observe(run, x))(states)
@@ -222,10 +222,10 @@ class DifferentiableStepper(NamedTuple):
 
 
 def differentiable_stepper(
-    system: System, method: OneStepMethod, substeps: int, attitude: bool = False
+    system: System, method: OneStepMethod, substeps: int, has_attitude: bool = False
 ) -> DifferentiableStepper:
-    """Return the differentiable stepper of a system and a method, with ``substeps`` steps per interval."""
-    prepared_system, method = prepare_for_method(system, method, None, attitude)
+    """Return a prepared system, and the functions that start, advance and read a differentiable run of it."""
+    prepared_system, method = prepare_for_method(system, method, None, has_attitude)
     inner = method.method if isinstance(method, WithAttitude) else method
     needs_no_compensation = isinstance(inner, MetriplecticRungeKutta) and prepared_system.surface is None
 

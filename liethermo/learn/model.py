@@ -82,19 +82,19 @@ class Metriplectic(MetriplecticSystem):
             friction = Friction(dim, rank, width=width, depth=depth, seed=4 * seed + 3)
         has_learned_tensor = isinstance(poisson, Poisson)  # but for the Jacobi identity
         super().__init__(poisson, energy, entropy, friction, dim=dim, validate=validate and not has_learned_tensor)
-        self.poisson = poisson_with_entropy(self.poisson, self.entropy)
+        self.poisson = fill_poisson_entropy(self.poisson, self.entropy)
 
 
-def poisson_with_entropy(poisson: mf.PoissonStructure, entropy: AnyEnergy | None) -> mf.PoissonStructure:
+def fill_poisson_entropy(poisson: mf.PoissonStructure, entropy: AnyEnergy | None) -> mf.PoissonStructure:
     """Return the structure with the system's entropy filled in, if it is a learned one that needs it."""
     if not isinstance(poisson, Poisson) or poisson.entropy is None:
         return poisson
     return eqx.tree_at(lambda p: p.entropy, poisson, entropy)
 
 
-def tie_entropy(system: T) -> T:
+def copy_entropy_to_poisson(system: T) -> T:
     """Return the system with the current weights of its entropy also in its Poisson structure."""
-    return eqx.tree_at(lambda s: s.poisson, system, poisson_with_entropy(system.poisson, system.entropy))
+    return eqx.tree_at(lambda s: s.poisson, system, fill_poisson_entropy(system.poisson, system.entropy))
 
 
 def scale_networks(system: T, scales: DataScales, points: np.ndarray) -> T:
@@ -117,13 +117,13 @@ def scale_networks(system: T, scales: DataScales, points: np.ndarray) -> T:
 
     energy = entropy = 1.0
     poisson = system.poisson
-    if not has_networks(system.energy):
+    if not has_learned_parts(system.energy):
         energy = mean_variation(system.energy)
-    elif not has_networks(poisson):
+    elif not has_learned_parts(poisson):
         tensor = jnp.mean(jnp.abs(jax.vmap(poisson.tensor)(x)), axis=0)
         max_entry = float(jnp.max(tensor / jnp.outer(s, s)))
         energy = 1.0 / (tau * max_entry) if max_entry > 0.0 else 1.0
-    if system.entropy is not None and not has_networks(system.entropy):
+    if system.entropy is not None and not has_learned_parts(system.entropy):
         entropy = mean_variation(system.entropy)
     entropy = entropy if entropy > 0.0 else 1.0
     energy = energy if energy > 0.0 else 1.0
@@ -137,13 +137,13 @@ def scale_networks(system: T, scales: DataScales, points: np.ndarray) -> T:
             return eqx.tree_at(lambda p: (p.function, p.metric), part, (inner, s**2))
         return part
 
-    def map_instances(kind, tree, change):
-        return jax.tree_util.tree_map(change, tree, is_leaf=lambda part: isinstance(part, kind))
+    def map_leaves(leaf_class, tree, change):
+        return jax.tree_util.tree_map(change, tree, is_leaf=lambda part: isinstance(part, leaf_class))
 
     parts: dict[str, Any] = {
         "energy": _fill_network_scales(system.energy, x, energy),
         "entropy": _fill_network_scales(system.entropy, x, entropy),
-        "dissipation": map_instances(Friction, system.dissipation, scale_friction),
+        "dissipation": map_leaves(Friction, system.dissipation, scale_friction),
     }
     if isinstance(poisson, Poisson):
         scaled_function = _fill_network_scales(poisson.function, x, pairs / (energy * tau))
@@ -154,26 +154,26 @@ def scale_networks(system: T, scales: DataScales, points: np.ndarray) -> T:
     scaled_system = eqx.tree_at(
         lambda m: [getattr(m, name) for name in present_names], system, [parts[name] for name in present_names]
     )
-    return tie_entropy(scaled_system)
+    return copy_entropy_to_poisson(scaled_system)
 
 
-def has_networks(tree: Any) -> bool:
+def has_learned_parts(tree: Any) -> bool:
     """Return True if a pytree has learned parts."""
     return any(jax.tree_util.tree_leaves(learned_mask(tree)))
 
 
-def _fill_network_scales(tree: Any, x: jax.Array, unit) -> Any:
+def _fill_network_scales(tree: Any, x: jax.Array, output_unit) -> Any:
     """Set the input scales of the networks in a pytree from points x, and their output unit, unless they are set
     already."""
 
-    def change(part):
+    def scale_part(part):
         if isinstance(part, Pullback):
-            inner = _fill_network_scales(part.term, jax.vmap(part.coordinates)(x), unit)
+            inner = _fill_network_scales(part.term, jax.vmap(part.coordinates)(x), output_unit)
             return eqx.tree_at(lambda p: p.term, part, inner)
         if not isinstance(part, Network) or not part.has_default_scales:
             return part
         spread = jnp.std(x, axis=0)
         spread = jnp.where(spread > 0.0, spread, 1.0)
-        return Network(jnp.mean(x, axis=0), spread, unit * part.output_scale, part.function)
+        return Network(jnp.mean(x, axis=0), spread, output_unit * part.output_scale, part.function)
 
-    return jax.tree_util.tree_map(change, tree, is_leaf=lambda part: isinstance(part, Pullback | Network))
+    return jax.tree_util.tree_map(scale_part, tree, is_leaf=lambda part: isinstance(part, Pullback | Network))

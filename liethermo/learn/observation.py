@@ -58,20 +58,20 @@ class Observation(NamedTuple):
     group: mf.MatrixGroup | None
     is_full_state: bool
 
-    def observe(self, run: System, state) -> jax.Array:
+    def observe(self, prepared_system: System, state) -> jax.Array:
         """Return the observation of a state of a run, as a flat array."""
-        parts = run.split_state(state) if isinstance(run, AttitudeSystem) else (state,)
+        parts = prepared_system.split_state(state) if isinstance(prepared_system, AttitudeSystem) else (state,)
         return jnp.ravel(jnp.asarray(self.function(*parts)))
 
-    def fingerprint_parts(self, run: System) -> list:
+    def fingerprint_parts(self, prepared_system: System) -> list:
         """Return the jaxpr and the constants of the observation, which identify it."""
-        jaxpr = jax.make_jaxpr(lambda state: self.observe(run, state))(
-            jnp.asarray(default_states(self, run, self.zero_observation)[0])
+        jaxpr = jax.make_jaxpr(lambda state: self.observe(prepared_system, state))(
+            jnp.asarray(default_states(self, prepared_system, self.zero_observations)[0])
         )
         return [str(jaxpr.jaxpr), *map(np.asarray, jaxpr.consts)]
 
     @property
-    def zero_observation(self) -> np.ndarray:
+    def zero_observations(self) -> np.ndarray:
         return np.zeros((1, int(np.prod(self.shape))))
 
     def observe_solution(self, solution: Solution) -> jax.Array:
@@ -88,13 +88,17 @@ class Observation(NamedTuple):
             raise InputError("observe needs an attitude, and a solution in the data has none")
         return jax.vmap(self.function)(jnp.asarray(solution.x), jnp.asarray(solution.attitude))
 
-    def displace(self, run: System, state, z) -> jax.Array:
+    def displace(self, prepared_system: System, state, z) -> jax.Array:
         """Return the state displaced by coordinates z: ``x + z``, and ``g exp(hat(z))`` with the remaining
         coordinates."""
-        if not isinstance(run, AttitudeSystem):
+        if not isinstance(prepared_system, AttitudeSystem):
             return state + z
-        (x, g), n, group = run.split_state(state), dim_without_attitude(run), run.group
-        return run.join_state(x + z[:n], g @ group.exp_map(group.algebra, z[n:]))
+        (x, g), n, group = (
+            prepared_system.split_state(state),
+            dim_without_attitude(prepared_system),
+            prepared_system.group,
+        )
+        return prepared_system.join_state(x + z[:n], g @ group.exp_map(group.algebra, z[n:]))
 
 
 def make_observation(system: System, observed: Sequence[int] | None, observe: Callable | None) -> Observation:
@@ -150,22 +154,24 @@ def _component_indices(observed: Sequence[int] | None, dim: int) -> np.ndarray:
     return indices
 
 
-def default_states(observation: Observation, run: System, observations: np.ndarray) -> np.ndarray:
+def default_states(observation: Observation, prepared_system: System, observations: np.ndarray) -> np.ndarray:
     """Return states of a run, shape (m, N): observed components, zeros elsewhere, and the identity as attitude."""
-    x = np.zeros((len(observations), dim_without_attitude(run)))
+    x = np.zeros((len(observations), dim_without_attitude(prepared_system)))
     if len(observation.component_indices):
         x[:, observation.component_indices] = observations
-    return np.asarray(run.initial_state(x, batch=True)) if isinstance(run, AttitudeSystem) else x
+    return (
+        np.asarray(prepared_system.initial_state(x, batch=True)) if isinstance(prepared_system, AttitudeSystem) else x
+    )
 
 
 def states_matching_rates(
     observation: Observation,
-    run: System,
+    prepared_system: System,
     data: list[tuple[np.ndarray, np.ndarray]],
     unit: np.ndarray,
     time_scale: float,
 ) -> list[np.ndarray]:
-    """Return states, shape (m, N), whose observations and their rates match trajectories, by least squares.
+    """Return the states of each trajectory, shape (m, N), whose observations and rates match the data.
 
     The search for each state starts from the one before it. The first search starts from several attitudes, because the
     identity may be far away.
@@ -179,28 +185,31 @@ def states_matching_rates(
     time_scale : float
         Time in which the observations change by their scales.
     """
-    zero, scale = jnp.zeros(n_coordinates(run)), np.tile(unit, 2)
+    zero, scale = jnp.zeros(n_displacement_coordinates(prepared_system)), np.tile(unit, 2)
 
-    def residual(z, base_state, y, v):
+    def residual(z, base_state, y, observed_rate):
         def observe(state):
-            return observation.observe(run, state)
+            return observation.observe(prepared_system, state)
 
         observed_values, rate = jax.jvp(
-            observe, (x := observation.displace(run, base_state, z),), (run._vector_field(x),)
+            observe, (x := observation.displace(prepared_system, base_state, z),), (prepared_system._vector_field(x),)
         )
-        return jnp.concatenate([observed_values - y, time_scale * (rate - v)]) / scale
+        return jnp.concatenate([observed_values - y, time_scale * (rate - observed_rate)]) / scale
 
-    def solve_state(state, y, v):
+    def solve_state(state, observed_values, observed_rate):
         def step(carry, _):
             state, damping = carry
-            r, J = residual(zero, state, y, v), jax.jacfwd(residual)(zero, state, y, v)
+            r, J = (
+                residual(zero, state, observed_values, observed_rate),
+                jax.jacfwd(residual)(zero, state, observed_values, observed_rate),
+            )
             square = J.T @ J
             weights = jnp.diag(square)
             weights = jnp.where(weights > 0.0, weights, 1.0)  # coordinates without effect do not move
             new_state = observation.displace(
-                run, state, -jnp.linalg.solve(square + damping * jnp.diag(weights), J.T @ r)
+                prepared_system, state, -jnp.linalg.solve(square + damping * jnp.diag(weights), J.T @ r)
             )
-            is_better = jnp.sum(residual(zero, new_state, y, v) ** 2) < jnp.sum(r**2)
+            is_better = jnp.sum(residual(zero, new_state, observed_values, observed_rate) ** 2) < jnp.sum(r**2)
             return (
                 jnp.where(is_better, new_state, state),
                 damping * jnp.where(is_better, DAMPING_DECREASE, DAMPING_INCREASE),
@@ -208,37 +217,45 @@ def states_matching_rates(
 
         return jax.lax.scan(step, (state, INITIAL_DAMPING), length=LEVENBERG_ITERATIONS)[0][0]
 
-    def solve_states_in_turn(start, y, v):
+    def solve_states_in_turn(start, observations, observation_rates):
         def step(state, observation_and_rate):
             state = solve_state(state, *observation_and_rate)
             return state, state
 
-        return jax.lax.scan(step, start, (y, v))[1]
+        return jax.lax.scan(step, start, (observations, observation_rates))[1]
 
     @functools.partial(jax.jit, compiler_options=fast_compile_options())
-    def solve_trajectory(starts, y, v):
-        first_states = jax.vmap(lambda state: solve_state(state, y[0], v[0]))(starts)
-        costs = jax.vmap(lambda state: jnp.sum(residual(zero, state, y[0], v[0]) ** 2))(first_states)
-        return solve_states_in_turn(first_states[jnp.argmin(costs)], y, v)
+    def solve_trajectory(initial_guesses, observations, observation_rates):
+        first_states = jax.vmap(lambda state: solve_state(state, observations[0], observation_rates[0]))(
+            initial_guesses
+        )
+        costs = jax.vmap(lambda state: jnp.sum(residual(zero, state, observations[0], observation_rates[0]) ** 2))(
+            first_states
+        )
+        return solve_states_in_turn(first_states[jnp.argmin(costs)], observations, observation_rates)
 
     random_displacements = np.random.default_rng(0).standard_normal((N_INITIAL_ATTITUDES, len(zero))) * (
-        np.arange(len(zero)) >= dim_without_attitude(run)
+        np.arange(len(zero)) >= dim_without_attitude(prepared_system)
     )
     random_displacements[0] = 0.0
     random_displacements = random_displacements[: 1 if observation.group is None else N_INITIAL_ATTITUDES]
     states = []
     for observations, rates in data:
-        start = jnp.asarray(default_states(observation, run, observations[:1])[0])
-        starts = jax.vmap(lambda z, start=start: observation.displace(run, start, z))(jnp.asarray(random_displacements))
+        start = jnp.asarray(default_states(observation, prepared_system, observations[:1])[0])
+        starts = jax.vmap(lambda z, start=start: observation.displace(prepared_system, start, z))(
+            jnp.asarray(random_displacements)
+        )
         states.append(np.asarray(solve_trajectory(starts, jnp.asarray(observations), jnp.asarray(rates))))
     return states
 
 
-def dim_without_attitude(run: System) -> int:
+def dim_without_attitude(prepared_system: System) -> int:
     """Return the number of state components without the attitude."""
-    return run.body.dim if isinstance(run, AttitudeSystem) else run.dim
+    return prepared_system.body.dim if isinstance(prepared_system, AttitudeSystem) else prepared_system.dim
 
 
-def n_coordinates(run: System) -> int:
+def n_displacement_coordinates(prepared_system: System) -> int:
     """Return the number of coordinates of :meth:`Observation.displace`."""
-    return dim_without_attitude(run) + (run.group.dim if isinstance(run, AttitudeSystem) else 0)
+    return dim_without_attitude(prepared_system) + (
+        prepared_system.group.dim if isinstance(prepared_system, AttitudeSystem) else 0
+    )

@@ -14,7 +14,7 @@ from .compile_options import fast_compile_options
 from .data import Trajectory
 from .losses import ParameterVector, differentiable_stepper
 from .networks import Perceptron
-from .observation import Observation, n_coordinates
+from .observation import Observation, n_displacement_coordinates
 
 MAX_PARAMETERS = 64
 """Largest number of learned parameters for a refinement; its cost grows with their number."""
@@ -105,7 +105,7 @@ class LeastSquaresResult(NamedTuple):
     iterations: int
 
 
-def can_refine(params: ParameterVector, system: Any, data: list[Trajectory], run, substeps: int) -> bool:
+def can_refine(params: ParameterVector, system: Any, data: list[Trajectory], prepared_system, substeps: int) -> bool:
     """Return True if least squares over whole trajectories are affordable and the parameters can be determined.
 
     The weights of a perceptron are not determined by its function.
@@ -114,14 +114,14 @@ def can_refine(params: ParameterVector, system: Any, data: list[Trajectory], run
     if any(map(_is_perceptron, jax.tree_util.tree_leaves(system, is_leaf=_is_perceptron))):
         return False
     steps = substeps * sum(len(t) - 1 for t, _ in data)
-    return count <= MAX_PARAMETERS and steps * (count + n_coordinates(run)) <= MAX_COLUMN_STEPS
+    return count <= MAX_PARAMETERS and steps * (count + n_displacement_coordinates(prepared_system)) <= MAX_COLUMN_STEPS
 
 
 def _is_perceptron(part: Any) -> bool:
     return isinstance(part, Perceptron)
 
 
-def pad_runs(data: list[Trajectory], starts: list[np.ndarray]) -> PaddedRuns:
+def pad_runs(data: list[Trajectory], initial_states: list[np.ndarray]) -> PaddedRuns:
     """Return trajectories and their initial states as arrays of one shape."""
     length = max(len(t) for t, _ in data)
     intervals, observations, is_observed = [], [], []
@@ -130,7 +130,7 @@ def pad_runs(data: list[Trajectory], starts: list[np.ndarray]) -> PaddedRuns:
         intervals.append(np.append(np.diff(t), np.full(n_missing, t[-1] - t[-2])))
         observations.append(np.concatenate([x, np.zeros((n_missing, x.shape[1]))]))
         is_observed.append(np.arange(length) < len(t))
-    arrays = np.stack(starts), np.stack(intervals), np.stack(observations), np.stack(is_observed)
+    arrays = np.stack(initial_states), np.stack(intervals), np.stack(observations), np.stack(is_observed)
     return PaddedRuns(*map(jnp.asarray, arrays))
 
 
@@ -159,7 +159,7 @@ def refine_by_least_squares(
     """
     evaluate = _normal_equations(params, method, observation, units, substeps)
     displace_states = jax.jit(
-        jax.vmap(lambda x, z: observation.displace(_run_system(params, method, substeps, observation), x, z))
+        jax.vmap(lambda x, z: observation.displace(_prepared_system(params, method, substeps, observation), x, z))
     )
     search_unit, is_training = np.asarray(units[1]), ~np.asarray(is_held_out)
     p = len(weights)
@@ -204,9 +204,9 @@ def refine_by_least_squares(
     schur, slope = _schur_complement(_add_prior(squares, p, variance), slopes, p, is_training)
     total = costs[is_training].sum()
     variance = total / degrees_of_freedom if degrees_of_freedom > 0 else np.nan
-    inverse, _, condition = _inverse_rank_condition(schur)
+    inverse, _, condition = _inverse_rank_and_condition(schur)
     weight_diagonal = np.diag(squares[is_training].sum(axis=0))[:p]  # with the first states known
-    without_prior, rank, _ = _inverse_rank_condition(
+    without_prior, rank, _ = _inverse_rank_and_condition(
         _schur_complement(squares, slopes, p, is_training)[0], weight_diagonal
     )
     if rank < p:  # the prior alone determines the rest
@@ -238,7 +238,7 @@ def _failed_result(weights) -> LeastSquaresResult:
     return LeastSquaresResult(np.asarray(weights), nan, 0, np.nan, np.nan, np.nan, np.nan, False, 0)
 
 
-def _run_system(params: ParameterVector, method: OneStepMethod, substeps: int, observation: Observation):
+def _prepared_system(params: ParameterVector, method: OneStepMethod, substeps: int, observation: Observation):
     return differentiable_stepper(
         params.build_system(jnp.asarray(params.initial_values)), method, substeps, observation.group is not None
     ).system
@@ -263,7 +263,7 @@ def _normal_equations(params: ParameterVector, method: OneStepMethod, observatio
         predictions = jax.vmap(lambda x: observation.observe(run, x))(states)
         return jnp.where(is_observed[:, None], (predictions - observations) / data_unit, 0.0).ravel()
 
-    def run_equations(weights, arrays):
+    def normal_equations_of_run(weights, arrays):
         def displaced_residuals(v):
             return residuals(weights + v[:p], v[p:], *arrays)
 
@@ -271,56 +271,67 @@ def _normal_equations(params: ParameterVector, method: OneStepMethod, observatio
         return J.T @ J, J.T @ r, r @ r
 
     @functools.partial(jax.jit, compiler_options=fast_compile_options())
-    def equations_of_trajectories(weights, *arrays):
-        return jax.lax.map(functools.partial(run_equations, weights), arrays, batch_size=min(len(arrays[0]), 16))
+    def normal_equations_of_runs(weights, *arrays):
+        return jax.lax.map(
+            functools.partial(normal_equations_of_run, weights), arrays, batch_size=min(len(arrays[0]), 16)
+        )
 
-    return equations_of_trajectories
-
-
-def _add_prior(squares: np.ndarray, p: int, variance: float) -> np.ndarray:
-    prior = np.where(np.arange(squares.shape[-1]) < p, 0.0, INITIAL_STATE_PRIOR * variance)
-    return squares + np.diag(prior)
+    return normal_equations_of_runs
 
 
-def _degrees_of_freedom(is_observed, k: int, initial_state_squares, is_selected, p: int) -> int:
+def _add_prior(normal_matrices: np.ndarray, n_weights: int, variance: float) -> np.ndarray:
+    prior = np.where(np.arange(normal_matrices.shape[-1]) < n_weights, 0.0, INITIAL_STATE_PRIOR * variance)
+    return normal_matrices + np.diag(prior)
+
+
+def _degrees_of_freedom(
+    is_observed, n_observed: int, initial_state_normal_matrices, is_selected, n_weights: int
+) -> int:
     """Return the number of observations minus the number of determined unknowns: weights, and parts of initial
     states."""
     n_determined = sum(
-        int((np.linalg.eigvalsh(square) > INITIAL_STATE_PRIOR).sum()) for square in initial_state_squares[is_selected]
+        int((np.linalg.eigvalsh(square) > INITIAL_STATE_PRIOR).sum())
+        for square in initial_state_normal_matrices[is_selected]
     )
-    return int(is_observed[is_selected].sum()) * k - p - n_determined
+    return int(is_observed[is_selected].sum()) * n_observed - n_weights - n_determined
 
 
-def _pseudo_inverse(square: np.ndarray, damping: float = 0.0) -> np.ndarray:
+def _pseudo_inverse(normal_matrix: np.ndarray, damping: float = 0.0) -> np.ndarray:
     """Return the inverse of a normal matrix with damped diagonal, restricted to the combinations that it determines."""
-    diagonal = np.diag(square)
+    diagonal = np.diag(normal_matrix)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-    scaled = square * np.outer(scale, scale) + damping * np.eye(len(square))
+    scaled = normal_matrix * np.outer(scale, scale) + damping * np.eye(len(normal_matrix))
     return np.linalg.pinv(scaled, rcond=SCHUR_RTOL, hermitian=True) * np.outer(scale, scale)
 
 
-def _schur_complement(squares, slopes, p: int, is_training, damping: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def _schur_complement(
+    normal_matrices, gradients, n_weights: int, is_training, damping: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the normal matrix and the gradient of the weights after eliminating the initial states of all runs."""
-    matrix, slope = np.zeros((p, p)), np.zeros(p)
-    for S, g in zip(squares[is_training], slopes[is_training], strict=True):
-        elimination = S[:p, p:] @ _pseudo_inverse(S[p:, p:], damping)
-        matrix += S[:p, :p] - elimination @ S[p:, :p]
-        slope += g[:p] - elimination @ g[p:]
+    matrix, slope = np.zeros((n_weights, n_weights)), np.zeros(n_weights)
+    for S, g in zip(normal_matrices[is_training], gradients[is_training], strict=True):
+        elimination = S[:n_weights, n_weights:] @ _pseudo_inverse(S[n_weights:, n_weights:], damping)
+        matrix += S[:n_weights, :n_weights] - elimination @ S[n_weights:, :n_weights]
+        slope += g[:n_weights] - elimination @ g[n_weights:]
     return 0.5 * (matrix + matrix.T), slope
 
 
-def _gauss_newton_step(squares, slopes, p: int, is_training, damping: float) -> tuple[np.ndarray, np.ndarray]:
+def _gauss_newton_step(
+    normal_matrices, gradients, n_weights: int, is_training, damping: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the damped Gauss-Newton step of the weights, shape (p,), and of the initial states, shape (B, c)."""
-    matrix, slope = _schur_complement(squares, slopes, p, is_training, damping)
+    matrix, slope = _schur_complement(normal_matrices, gradients, n_weights, is_training, damping)
     step = -_pseudo_inverse(matrix, damping) @ slope
     displacements = [
-        -_pseudo_inverse(S[p:, p:], damping) @ (g[p:] + S[p:, :p] @ step) if np.isfinite(S).all() else 0.0 * g[p:]
-        for S, g in zip(squares, slopes, strict=True)
+        -_pseudo_inverse(S[n_weights:, n_weights:], damping) @ (g[n_weights:] + S[n_weights:, :n_weights] @ step)
+        if np.isfinite(S).all()
+        else 0.0 * g[n_weights:]
+        for S, g in zip(normal_matrices, gradients, strict=True)
     ]
     return step, np.stack(displacements)
 
 
-def _inverse_rank_condition(schur: np.ndarray, diagonal: np.ndarray | None = None) -> tuple[np.ndarray, int, float]:
+def _inverse_rank_and_condition(schur: np.ndarray, diagonal: np.ndarray | None = None) -> tuple[np.ndarray, int, float]:
     """Return the inverse of a normal matrix, infinite where singular, its rank, and the condition number of its root.
 
     Parameters

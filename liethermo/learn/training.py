@@ -192,7 +192,7 @@ class Training:
                 held_out_text = "" if np.isnan(held_out_loss) else f", held out {held_out_loss:.2e}"
                 lines.append(
                     f"{name}: loss {self.loss[indices[0]]:.2e} to {last_loss:.2e}{held_out_text}; {ending}"
-                    f"{self._late_decrease(indices)}"
+                    f"{self._late_decrease_text(indices)}"
                 )
         if self.noise.size:
             min_noise, max_noise = float(self.noise.min()), float(self.noise.max())
@@ -220,7 +220,7 @@ class Training:
         ]
         return "\n".join([*lines, *(f"CAUTION: {problem}" for problem in self.problems)])
 
-    def _late_decrease(self, indices: np.ndarray) -> str:
+    def _late_decrease_text(self, indices: np.ndarray) -> str:
         """Return in words by how much the loss fell in the last fifth of the evaluations of a phase."""
         if len(indices) < 10:
             return ""
@@ -281,7 +281,7 @@ class TrainingRun:
     def _run_phase(self, phase: Phase, seed: int, patience: int | None, checkpoint: Path | None, bar: Progress) -> str:
         length = min(STEPS_PER_EVALUATION, phase.steps)
         blocks = -(-phase.steps // length)
-        descend, evaluate_held_out = _compile_programs(phase, self.optimiser)
+        descend, evaluate_held_out = _compile_descent_and_evaluation(phase, self.optimiser)
         previous_steps = sum(p.steps for p in self.phases[: self.phase_index])
         if (
             self.block_index == 0
@@ -396,7 +396,7 @@ def _make_optimiser(phase: Phase) -> Any:
     )
 
 
-def _compile_programs(phase: Phase, optimiser: Any) -> tuple[Callable, Callable]:
+def _compile_descent_and_evaluation(phase: Phase, optimiser: Any) -> tuple[Callable, Callable]:
     """Return compiled functions that take a block of steps, and that evaluate the held-out loss."""
 
     def train_step(carry, indices):

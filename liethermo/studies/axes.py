@@ -119,7 +119,7 @@ def latin_hypercube(count: int, *, seed: int, **ranges) -> Zipped:
     """
     from scipy.stats import qmc
 
-    return _scale_sample(
+    return _sample_from_ranges(
         lambda d: qmc.LatinHypercube(d, rng=np.random.default_rng(seed)).random(_checked_count(count)), ranges
     )
 
@@ -145,12 +145,12 @@ def sobol(count: int, *, seed: int, **ranges) -> Zipped:
     from scipy.stats import qmc
 
     log2_count = max(_checked_count(count) - 1, 0).bit_length()
-    return _scale_sample(
+    return _sample_from_ranges(
         lambda d: qmc.Sobol(d, rng=np.random.default_rng(seed)).random_base2(log2_count)[:count], ranges
     )
 
 
-def _scale_sample(draw, ranges: Mapping[str, Any]) -> Zipped:
+def _sample_from_ranges(draw_unit_sample, ranges: Mapping[str, Any]) -> Zipped:
     if not ranges:
         raise InputError("a sample needs the ranges of parameters: rate=(0.1, 10.0, 'log')")
     for name, bounds in ranges.items():
@@ -163,7 +163,7 @@ def _scale_sample(draw, ranges: Mapping[str, Any]) -> Zipped:
             raise InputError(
                 f"the range of {name} must be finite and increasing, and positive with 'log', got {bounds!r}"
             )
-    unit = draw(len(ranges))
+    unit = draw_unit_sample(len(ranges))
     columns = {}
     for u, (name, (low, high, *scale)) in zip(unit.T, ranges.items(), strict=True):
         columns[name] = low * (high / low) ** u if scale else low + (high - low) * u

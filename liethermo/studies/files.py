@@ -233,7 +233,7 @@ def write_json(path: Path, content: Any) -> None:
     write_file(path, json.dumps(content, indent=1, allow_nan=False).encode())
 
 
-def remove_parts(root: Path) -> None:
+def remove_partial_files(root: Path) -> None:
     """Remove the partial files that killed runs have left; call it only while the store is locked."""
     for folder, _, files in os.walk(root):
         for name in files:
@@ -289,7 +289,7 @@ def lock_store(root: Path) -> Iterator[Callable[[int], None]]:
 def _try_lock(file, n_attempts: int = 5) -> bool:
     """Try to lock a file, and return True if that succeeded.
 
-    A process that asks whether a run is active (:func:`active_run`) holds the lock for a moment, hence several
+    A process that asks whether a run is active (:func:`active_run_record`) holds the lock for a moment, hence several
     attempts.
     """
     for _ in range(n_attempts):
@@ -303,11 +303,11 @@ def _try_lock(file, n_attempts: int = 5) -> bool:
 
 def describe_lock_holder(root: Path) -> str:
     """Return the process id and host of the run that works on a store, as text."""
-    run = active_run(root) or {}
+    run = active_run_record(root) or {}
     return f"process {run.get('pid', '?')} on {run.get('host', '?')}"
 
 
-def active_run(root: Path) -> dict[str, Any] | None:
+def active_run_record(root: Path) -> dict[str, Any] | None:
     """Return the record of the run that works on a store, or None if there is no such run."""
     try:
         with open(root / LOCK_FILE, opener=_open_no_follow) as file:

@@ -22,13 +22,13 @@ N_PROBE_STATES = 3
 """Number of sampled states, besides the initial state, at which the vector field is recorded."""
 
 
-def describe_study(solver: PointSolver, columns: PointResults, x0: np.ndarray) -> dict[str, Any]:
+def study_as_json(solver: PointSolver, example_results: PointResults, x0: np.ndarray) -> dict[str, Any]:
     """Return a description of a study as JSON data.
 
     Parameters
     ----------
     solver : PointSolver
-    columns : PointResults
+    example_results : PointResults
         Results of the example point.
     x0 : array, shape (n,)
         Initial state of the example point.
@@ -36,7 +36,7 @@ def describe_study(solver: PointSolver, columns: PointResults, x0: np.ndarray) -
     task, system = solver.task, solver.systems.example_system
     states = np.concatenate([x0[None], system.samples(N_PROBE_STATES, seed=1)])
     with np.errstate(all="ignore"):
-        probe = [_to_json_numbers(_system_at(system, task.t_span[0]).vector_field(x)) for x in states]
+        probe = [_to_json_numbers(_system_at_time(system, task.t_span[0]).vector_field(x)) for x in states]
         energies = [_to_json_numbers(system.energy.at_time(task.t_span[0]).value(x)) for x in states]
     return {
         "versions": {name: metadata.version(name) for name in ("liethermo", "jax")},
@@ -51,7 +51,7 @@ def describe_study(solver: PointSolver, columns: PointResults, x0: np.ndarray) -
         "until": _event_as_json(task.until),
         "noise": None if task.noise is None else task.noise.to_provenance(),
         "measures": {name: measure.description() for name, measure in task.measures.items()},
-        "values": {name: _to_json_numbers(columns.measures[name][0]) for name in task.measures},
+        "values": {name: _to_json_numbers(example_results.measures[name][0]) for name in task.measures},
     }
 
 
@@ -81,11 +81,13 @@ def study_differences(description: Mapping[str, Any], stored_description: Mappin
         "x0": "the initial state",
     }
     differences += [
-        _value_difference(label, description[key], stored_description[key]) for key, label in numbers.items()
+        _value_difference_text(label, description[key], stored_description[key]) for key, label in numbers.items()
     ]
     for name in set(description["values"]) & set(stored_description["values"]):
         differences.append(
-            _value_difference(f"the measure {name!r}", description["values"][name], stored_description["values"][name])
+            _value_difference_text(
+                f"the measure {name!r}", description["values"][name], stored_description["values"][name]
+            )
         )
     differences = [line for line in differences if line]
     if not differences and same_versions and description["operations"] != stored_description["operations"]:
@@ -96,13 +98,13 @@ def study_differences(description: Mapping[str, Any], stored_description: Mappin
     return differences
 
 
-def _system_at(system: Any, t: float) -> Any:
+def _system_at_time(system: Any, t: float) -> Any:
     """Return the system with its energy and torque evaluated at time t, and at the identity attitude if one is
     needed."""
     return system.at_time(t, system.group.identity) if system.needs_attitude else system.at_time(t)
 
 
-def _value_difference(label: str, numbers: list, stored_values: list) -> str:
+def _value_difference_text(label: str, numbers: list, stored_values: list) -> str:
     """Return a line that names the first differing number of two lists, or "" if all agree within ``VALUE_RTOL``."""
     a, b = (np.asarray(values, dtype=np.float64).ravel() for values in (numbers, stored_values))
     if a.shape != b.shape:
@@ -142,16 +144,18 @@ def _program_digest(solver: PointSolver) -> str:
     task, members = solver.task, solver.systems
     x = jax.ShapeDtypeStruct((members.example_system.dim,), np.float64)
 
-    def laws(system, x):
-        return system.energy.at_time(task.t_span[0]).value(x), _system_at(system, task.t_span[0]).vector_field(x)
+    def energy_and_vector_field(system, x):
+        return system.energy.at_time(task.t_span[0]).value(x), _system_at_time(system, task.t_span[0]).vector_field(x)
 
     jaxprs, constants = [], []
     if members.family is None or not task.parameter_names:
-        jaxprs.append(jax.make_jaxpr(lambda x: laws(members.example_system, x))(x))
+        jaxprs.append(jax.make_jaxpr(lambda x: energy_and_vector_field(members.example_system, x))(x))
     else:
         family = members.family.with_builder_arrays([np.zeros(2) for _ in task.parameter_names])
         shapes = [jax.ShapeDtypeStruct(np.shape(value)[1:], np.float64) for value in family.parameter_arrays]
-        jaxprs.append(jax.make_jaxpr(lambda arrays, x: laws(family.form.rebuild(arrays), x))(shapes, x))
+        jaxprs.append(
+            jax.make_jaxpr(lambda arrays, x: energy_and_vector_field(family.form.rebuild(arrays), x))(shapes, x)
+        )
         constants = family.parameter_arrays[family.n_builder_arrays :]
     if callable(task.until):
         jaxprs.append(jax.make_jaxpr(task.until)(x))

@@ -192,7 +192,7 @@ def _describe_array(value: np.ndarray) -> str:
     return f"{'complex' if value.dtype.kind == 'c' else 'real'} numbers of shape {value.shape}"
 
 
-def parse_measures(specification: Mapping[str, Any], until: Any) -> tuple[dict[str, Measure], Any]:
+def parse_measures_and_event(specification: Mapping[str, Any], until: Any) -> tuple[dict[str, Measure], Any]:
     """Return the measures of a :class:`Study` by name, and the event at which its runs end.
 
     Raises

@@ -100,13 +100,16 @@ def _parse_index(text: str) -> tuple[int, ...]:
 
 
 def _with_parameters(
-    system: System, targets: Mapping[str, tuple[str, tuple[int, ...]]], point: Mapping[str, Any]
+    system: System, leaves_and_indices: Mapping[str, tuple[str, tuple[int, ...]]], point: Mapping[str, Any]
 ) -> System:
-    """Return the system with the parameters of a point; ``targets`` holds the leaf name and index of each parameter."""
+    """Return the system with the parameters of a point.
+
+    ``leaves_and_indices`` holds the name of a leaf and an index for each parameter.
+    """
     dynamic, static = eqx.partition(system, eqx.is_inexact_array)
     paths, structure = jax.tree_util.tree_flatten_with_path(dynamic)
     leaves = {jax.tree_util.keystr(path).removeprefix("."): leaf for path, leaf in paths}
-    for name, (leaf_name, index) in targets.items():
+    for name, (leaf_name, index) in leaves_and_indices.items():
         leaves[leaf_name] = jnp.asarray(leaves[leaf_name]).at[index].set(point[name])
     return eqx.combine(jax.tree_util.tree_unflatten(structure, list(leaves.values())), static)
 
@@ -193,14 +196,14 @@ class _ParameterConditions:
     def __init__(self, build: Callable, parameters: tuple[str, ...]):
         self._messages: list[str] = []
 
-        def conditions(point):
+        def evaluate_conditions(point):
             with collect_conditions() as collected:
                 build(point)
             self._messages = [condition.message for condition in collected]
             return [(condition.holds, condition.value) for condition in collected]
 
-        jax.eval_shape(conditions, {name: jax.ShapeDtypeStruct((), np.float64) for name in parameters})
-        self._evaluate = jax.jit(jax.vmap(conditions))
+        jax.eval_shape(evaluate_conditions, {name: jax.ShapeDtypeStruct((), np.float64) for name in parameters})
+        self._evaluate = jax.jit(jax.vmap(evaluate_conditions))
 
     def __call__(self, points: PointParameters, n_points: int) -> dict[int, str]:
         if not self._messages:

@@ -62,7 +62,7 @@ class ChunkTask:
         return len(self.point_indices[0])
 
 
-def solve_chunks(solver: PointSolver, store: StudyStore, tasks: Sequence[ChunkTask]) -> tuple[int, float]:
+def solve_and_write_chunks(solver: PointSolver, store: StudyStore, tasks: Sequence[ChunkTask]) -> tuple[int, float]:
     """Solve the points of several chunks together and write each chunk; return the number of points and the seconds."""
     start_time = time.perf_counter()
     names = tasks[0].parameters
@@ -101,7 +101,7 @@ class _ChunkPortions:
                 return
             yield [ChunkTask.from_chunk(self._store, self._axes, number, is_partial) for number, is_partial in chunks]
 
-    def record_duration(self, n_chunks: int, seconds: float) -> None:
+    def adapt_portion_size(self, n_chunks: int, seconds: float) -> None:
         """Adapt the number of chunks in a portion to the time that some chunks took."""
         target_chunks = int(n_chunks * TARGET_PORTION_SECONDS / max(seconds, 1e-9))
         self._n_chunks = max(1, min(target_chunks, MAX_PORTION_GROWTH * self._n_chunks, self._max_chunks))
@@ -111,8 +111,8 @@ def run_locally(solver: PointSolver, store: StudyStore, axes: Axes, survey: Stor
     """Solve the remaining chunks in this process, on all cores."""
     portions = _ChunkPortions(store, axes, survey)
     for tasks in portions:
-        n_points, seconds = solve_chunks(solver, store, tasks)
-        portions.record_duration(len(tasks), seconds)
+        n_points, seconds = solve_and_write_chunks(solver, store, tasks)
+        portions.adapt_portion_size(len(tasks), seconds)
         bar.advance(n_points)
 
 
@@ -141,17 +141,17 @@ def run_on_cluster(
     running = as_completed()
     chunks: dict[str, int] = {}
 
-    def submit() -> bool:
+    def submit_next_portion() -> bool:
         tasks = next(task_lists, None)
         if tasks is None:
             return False
-        future = client.submit(_solve_on_worker, pickled_task, str(store.root), tasks, pure=False)
+        future = client.submit(_solve_and_write_on_worker, pickled_task, str(store.root), tasks, pure=False)
         chunks[future.key] = len(tasks)
         running.add(future)
         return True
 
     try:
-        while running.count() < 2 * _n_cluster_threads(client) and submit():
+        while running.count() < 2 * _n_cluster_threads(client) and submit_next_portion():
             pass
         for future in running:
             try:
@@ -165,9 +165,9 @@ def run_on_cluster(
                     f"several workers died while they solved {chunks[future.key]} chunks, perhaps for lack of memory. "
                     f"Use smaller chunks (chunk=...). Finished chunks are saved. {error}"
                 ) from error
-            portions.record_duration(chunks.pop(future.key), seconds)
+            portions.adapt_portion_size(chunks.pop(future.key), seconds)
             bar.advance(n_points)
-            while running.count() < 2 * _n_cluster_threads(client) and submit():
+            while running.count() < 2 * _n_cluster_threads(client) and submit_next_portion():
                 pass
     finally:
         client.cancel(list(running.futures))
@@ -177,12 +177,12 @@ def _n_cluster_threads(client: Any) -> int:
     return max(1, sum(client.nthreads().values()))
 
 
-def _solve_on_worker(pickled_task: bytes, root: str, tasks: list[ChunkTask]) -> tuple[int, float]:
+def _solve_and_write_on_worker(pickled_task: bytes, root: str, tasks: list[ChunkTask]) -> tuple[int, float]:
     """Solve chunks on a worker, with one thread per ensemble because each thread of the worker runs a task."""
     if not Path(root).is_dir():
         raise FileError(f"this worker does not see {root}: the store must be in a folder that all machines share")
     token = MAX_THREADS.set(1)
     try:
-        return solve_chunks(cached_solver(pickled_task), StudyStore.open(Path(root)), tasks)
+        return solve_and_write_chunks(cached_solver(pickled_task), StudyStore.open(Path(root)), tasks)
     finally:
         MAX_THREADS.reset(token)

@@ -176,7 +176,7 @@ class PointSolver:
     # -- ensembles ------------------------------------------------------------------------------------------------
 
     def _solve_ensembles(self, points, x0s, attitudes, indices: np.ndarray, reasons: dict[int, str]) -> list:
-        """Return ensembles of the points with their indices; points that cannot be started get a reason."""
+        """Return pairs of point indices and their solved ensemble; points that cannot start get a reason."""
         ensembles = []
         for start in range(0, len(indices), batch_size := self._points_per_ensemble()):
             ensembles += self._solve_or_bisect(points, x0s, attitudes, indices[start : start + batch_size], reasons)
@@ -196,7 +196,7 @@ class PointSolver:
         )
 
     def _solve_or_bisect(self, points, x0s, attitudes, indices: np.ndarray, reasons: dict[int, str]) -> list:
-        """Solve the points at ``indices`` together; if that fails, solve each half separately."""
+        """Return pairs of point indices and solved ensemble, of ``indices`` together or, if that fails, of halves."""
         if not len(indices):
             return []
         try:
@@ -258,7 +258,7 @@ class PointSolver:
         for indices, (family, x0s, result) in ensembles:
             count = len(indices)
             self.laws, self.engine = result.laws, result.engine
-            summary, codes, texts = self._judge_laws(family, x0s, result)
+            summary, codes, texts = self._law_values_codes_and_messages(family, x0s, result)
             for name, measure in self.task.measures.items():
                 values, failures = measure(result, count)
                 values = np.where(_align_axes(np.isin(codes, (*SUCCESS_CODES, LAW_BROKEN)), values), values, np.nan)
@@ -274,7 +274,7 @@ class PointSolver:
                     message[indices[i]] = text
         return PointResults(status, message, laws, measures)
 
-    def _judge_laws(
+    def _law_values_codes_and_messages(
         self, family: Any, x0s: np.ndarray, result: Ensemble
     ) -> tuple[np.ndarray, np.ndarray, dict[int, str]]:
         """Return the law quantities of each trajectory, its status code, and its message by index."""
@@ -285,33 +285,35 @@ class PointSolver:
         texts = {int(i): result.message(int(i)).partition(": ")[2] for i in np.flatnonzero(~result.ok)}
         violations = self._broken_laws(result, columns)
         if len(violations):  # cancelling terms raise the tolerance, so their magnitudes are computed for the violations
-            for name, terms in self._term_magnitudes(family, x0s, violations).items():
+            for name, terms in self._rounding_scales_at_start(family, x0s, violations).items():
                 columns[f"{name}_terms"][list(violations)] = terms
             for i, text in self._broken_laws(result, columns).items():
                 codes[i], texts[i] = LAW_BROKEN, text
         return np.stack([columns[name] for name in LAW_QUANTITIES], axis=-1), codes, texts
 
-    def _broken_laws(self, result: Ensemble, columns: Mapping[str, np.ndarray]) -> dict[int, str]:
+    def _broken_laws(self, result: Ensemble, law_values: Mapping[str, np.ndarray]) -> dict[int, str]:
         """Return a message for each successful trajectory that violates a law, by index."""
-        terms = columns["energy_terms"], columns["entropy_terms"]
+        terms = law_values["energy_terms"], law_values["entropy_terms"]
         violations: dict[int, str] = {}
         for law in evaluate_ensemble_laws(result, result.laws, Tolerances(), *terms):
             for i in map(int, np.flatnonzero(law.is_violated & result.ok)):
                 violations.setdefault(i, f"{law.law} {law.values[i]:.3g}, allowed {law.limits[i]:.2g}")
         return violations
 
-    def _term_magnitudes(self, family: Any, x0s: np.ndarray, violations: Mapping[int, str]) -> dict[str, np.ndarray]:
+    def _rounding_scales_at_start(
+        self, family: Any, x0s: np.ndarray, violations: Mapping[int, str]
+    ) -> dict[str, np.ndarray]:
         """Return the magnitudes at which energy and entropy are rounded, at the start of the violating trajectories."""
         indices = np.array(list(violations))
         x = np.asarray(self.systems.example_system.state(x0s[indices], batch=True))
         if self.systems.example_system.energy.depends_on_time:
             return {}
         if isinstance(family, System):
-            magnitudes = evaluate_at_points(_system_term_magnitudes, family, x)
+            magnitudes = evaluate_at_points(_system_rounding_scales, family, x)
         else:
             p = family.parameter_matrix(slice(None), len(x0s))[indices]
             magnitudes = evaluate_at_points(
-                _family_term_magnitudes, (family.form, p.shape[1]), np.concatenate([p, x], axis=1)
+                _member_rounding_scales, (family.form, p.shape[1]), np.concatenate([p, x], axis=1)
             )
         return {
             name: np.nan_to_num(magnitudes[:, k]) for k, name in enumerate(("energy", "entropy")[: magnitudes.shape[1]])
@@ -323,12 +325,12 @@ def _align_axes(mask: np.ndarray, values: np.ndarray) -> np.ndarray:
     return mask.reshape(-1, *[1] * (values.ndim - 1))
 
 
-def _system_term_magnitudes(system: System, x):
+def _system_rounding_scales(system: System, x):
     return rounding_scales(energy_and_entropy(system), x)[1]
 
 
-def _family_term_magnitudes(model, parameters_and_state):
-    form, n_parameters = model
+def _member_rounding_scales(form_and_parameter_count, parameters_and_state):
+    form, n_parameters = form_and_parameter_count
     return rounding_scales(
         energy_and_entropy(form.build(parameters_and_state[:n_parameters])), parameters_and_state[n_parameters:]
     )[1]

@@ -26,7 +26,7 @@ from . import files
 from .axes import Axes, Axis
 from .files import ZarrArray
 from .solve import EMPTY_POINT_STATUS, LAW_QUANTITIES, STATUSES, SUCCESS_CODES
-from .store_metadata import MAX_CHUNKS, read_group, with_checksum
+from .store_metadata import MAX_CHUNKS, parse_group_metadata, with_checksum
 
 STORE_FORMAT = "liethermo-study-1"
 """Value of the attribute ``format`` of a store."""
@@ -79,7 +79,7 @@ class StudyStore:
         axes: Axes,
         chunk: int,
         measures: Mapping[str, tuple],
-        about: Mapping[str, Mapping[str, Any]],
+        array_attributes: Mapping[str, Mapping[str, Any]],
         attributes: dict[str, Any],
     ) -> StudyStore:
         """Create a store atomically: it appears complete or not at all.
@@ -91,7 +91,7 @@ class StudyStore:
             Approximate number of points of a chunk.
         measures : dict from str to (shape, dtype)
             Shape and type of each measure at one point.
-        about : dict from str to dict
+        array_attributes : dict from str to dict
             Attributes of the arrays.
         attributes : dict
             Attributes of the group.
@@ -105,14 +105,16 @@ class StudyStore:
         def array(name: str, trailing_dims: Sequence[tuple[str, int]], dtype: str) -> ZarrArray:
             dims, sizes = (tuple(part) for part in zip(*trailing_dims, strict=True)) if trailing_dims else ((), ())
             shape = axes.shape + sizes
-            return ZarrArray(name, axes.names + dims, shape, chunks + sizes, dtype, dict(about.get(name, {})))
+            return ZarrArray(
+                name, axes.names + dims, shape, chunks + sizes, dtype, dict(array_attributes.get(name, {}))
+            )
 
         arrays = [array("status", [], "int8"), array("message", [], "string")]
         arrays.append(array("laws", [("quantity", len(LAW_QUANTITIES))], "float64"))
         for name, (shape, dtype) in measures.items():
             arrays.append(array(name, [(_component_dim_name(name, k, shape), m) for k, m in enumerate(shape)], dtype))
         arrays.append(ZarrArray("quantity", ("quantity",), (len(LAW_QUANTITIES),), (len(LAW_QUANTITIES),), "string"))
-        coordinates = [array for array, _ in _coordinate_arrays(axes, about)]
+        coordinates = [array for array, _ in _coordinate_arrays(axes, array_attributes)]
         store = cls(root, {a.name: a for a in [*arrays, *coordinates]}, attributes)
         partial_root = root.with_name(disk.partial_file_name(root.name))
         try:
@@ -147,7 +149,7 @@ class StudyStore:
         except (FileError, ValueError, KeyError, TypeError, AssertionError, RecursionError) as error:
             raise FileError(f"{root} is a {kind}, but not the store of a study; take another name") from error
         try:
-            store = cls(root, *read_group(root, content))
+            store = cls(root, *parse_group_metadata(root, content))
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise FileError(f"{root} is the store of a study, but damaged or changed: {error}") from error
         files.require_plain_files(root)
@@ -155,7 +157,7 @@ class StudyStore:
 
     @property
     def study_description(self) -> dict[str, Any]:
-        """The description of the study, see :func:`.identity.describe_study`."""
+        """The description of the study, see :func:`.identity.study_as_json`."""
         return self.attributes["study"]
 
     @property
@@ -163,10 +165,10 @@ class StudyStore:
         return list(self.attributes["measures"])
 
     def extend(self, axes: Axes) -> StudyStore:
-        """Return the store with longer axes; they must begin with the values of the present ones."""
+        """Write metadata for longer axes, which begin with the present values, and return the extended store."""
         shape = axes.shape
         arrays = {
-            name: replace(array, shape=shape + array.shape[len(shape) :]) if name in self.chunked_arrays else array
+            name: replace(array, shape=shape + array.shape[len(shape) :]) if name in self.chunked_array_names else array
             for name, array in self.arrays.items()
         }
         about = {name: array.attributes for name, array in arrays.items()}
@@ -176,7 +178,7 @@ class StudyStore:
         store._write_metadata(axes)
         return store
 
-    def repaired_axes(self, axes: Axes) -> Axes:
+    def repair_axes(self, axes: Axes) -> Axes:
         """Return the axes of the store, after writing lost or damaged coordinate files again from ``axes``.
 
         Raises
@@ -251,7 +253,7 @@ class StudyStore:
     # -- chunks of points -------------------------------------------------------------------------------------------
 
     @property
-    def chunked_arrays(self) -> list[str]:
+    def chunked_array_names(self) -> list[str]:
         """Names of the arrays with one chunk per chunk of points; ``status``, which marks it as finished, is the
         last."""
         return [*self.measure_names, "laws", "message", "status"]
@@ -274,7 +276,7 @@ class StudyStore:
         return tuple(map(int, np.unravel_index(number, self.chunk_grid)))
 
     def chunk_bounds(self, index: Sequence[int]) -> tuple[tuple[int, int], ...]:
-        """Return the first and one past the last index of a chunk along each axis."""
+        """Return the range (start, stop) of the points of a chunk along each axis."""
         status = self.arrays["status"]
         return tuple((i * c, min((i + 1) * c, m)) for i, c, m in zip(index, status.chunks, status.shape, strict=True))
 
@@ -287,24 +289,29 @@ class StudyStore:
         return tuple(local_index + start for local_index, (start, _) in zip(local_indices, bounds, strict=True))
 
     def write_chunk(
-        self, index: Sequence[int], indices: tuple[np.ndarray, ...], arrays: Mapping[str, Any], is_partial: bool
+        self,
+        chunk_index: Sequence[int],
+        point_indices: tuple[np.ndarray, ...],
+        arrays: Mapping[str, Any],
+        is_partial: bool,
     ) -> None:
         """Write the values at some points of a chunk; its other points keep their values if the chunk is partial."""
         local_indices = tuple(
-            axis_indices - start for axis_indices, (start, _) in zip(indices, self.chunk_bounds(index), strict=True)
+            axis_indices - start
+            for axis_indices, (start, _) in zip(point_indices, self.chunk_bounds(chunk_index), strict=True)
         )
-        for name in self.chunked_arrays:
+        for name in self.chunked_array_names:
             block = (
-                self._read_chunk_file(name, index)
-                if is_partial and self._has_chunk(name, index)
+                self._read_chunk_file(name, chunk_index)
+                if is_partial and self._has_chunk(name, chunk_index)
                 else self.arrays[name].empty_chunk()
             )
             if name in arrays:  # a measure has no values where no point could be run
                 block[local_indices] = arrays[name]
             if name != "message" or (block != "").any():
-                self._write_chunk_file(name, index, block)
-            elif self._has_chunk(name, index):  # a chunk without messages has no file of them
-                (self.root / self.arrays[name].chunk_path(index)).unlink()
+                self._write_chunk_file(name, chunk_index, block)
+            elif self._has_chunk(name, chunk_index):  # a chunk without messages has no file of them
+                (self.root / self.arrays[name].chunk_path(chunk_index)).unlink()
 
     def read_chunk(self, name: str, index: Sequence[int]) -> np.ndarray:
         """Return the values of an array in a chunk; fill values if its file is missing."""
@@ -313,15 +320,15 @@ class StudyStore:
         return block[slices]
 
     def _has_chunk(self, name: str, index: Sequence[int]) -> bool:
-        return os.path.lexists(self.root / self.arrays[name].chunk_path(self._file_index(name, index)))
+        return os.path.lexists(self.root / self.arrays[name].chunk_path(self._padded_chunk_index(name, index)))
 
-    def _file_index(self, name: str, index: Sequence[int]) -> tuple[int, ...]:
+    def _padded_chunk_index(self, name: str, index: Sequence[int]) -> tuple[int, ...]:
         """Return the index of a chunk in an array with more dimensions than the axes, padded with zeros."""
         return (*index, *(0 for _ in range(len(self.arrays[name].dims) - len(index))))
 
     def _read_chunk_file(self, name: str, index: Sequence[int]) -> np.ndarray:
         """Read and check a chunk; raise FileError if it is missing or damaged."""
-        path = self.root / self.arrays[name].chunk_path(self._file_index(name, index))
+        path = self.root / self.arrays[name].chunk_path(self._padded_chunk_index(name, index))
         try:
             block = self.arrays[name].decode_chunk(files.read_plain_file(path))
             if name == "status" and not np.isin(block, (*STATUSES.values(), EMPTY_POINT_STATUS)).all():
@@ -334,7 +341,7 @@ class StudyStore:
 
     def require_chunk(self, name: str, index: tuple[int, ...]) -> None:
         """Raise FileError if a chunk is damaged, or missing although its points are marked as finished."""
-        is_required = name not in self.chunked_arrays or (
+        is_required = name not in self.chunked_array_names or (
             name != "message" and self._has_chunk("status", index[: len(self.shape)])
         )
         if (is_required and name != "status") or self._has_chunk(name, index):
@@ -342,7 +349,7 @@ class StudyStore:
 
     def _write_chunk_file(self, name: str, index: Sequence[int], block: np.ndarray) -> None:
         files.write_file(
-            self.root / self.arrays[name].chunk_path(self._file_index(name, index)),
+            self.root / self.arrays[name].chunk_path(self._padded_chunk_index(name, index)),
             self.arrays[name].encode_chunk(block),
         )
 
@@ -364,7 +371,7 @@ class StudyStore:
         n_done = 0
         for number, status in self.chunk_statuses():
             index = self.chunk_index(number)
-            faults = [] if status is None else self._damaged_files(index, status)
+            faults = [] if status is None else self._file_fault_texts(index, status)
             if status is None and self._has_chunk("status", index):
                 faults = [f"{self.arrays['status'].chunk_path(index)} is damaged"]
             damaged_files += faults
@@ -377,12 +384,12 @@ class StudyStore:
                 remaining_chunks.append((number, True))
         return StoreSurvey(remaining_chunks, n_done, tuple(damaged_files))
 
-    def _damaged_files(self, index: tuple[int, ...], status: np.ndarray) -> list[str]:
+    def _file_fault_texts(self, index: tuple[int, ...], status: np.ndarray) -> list[str]:
         """Return a line for each file of a finished chunk that is missing or damaged."""
         has_no_messages = np.isin(status, (*SUCCESS_CODES, EMPTY_POINT_STATUS)).all()
         faults = []
-        for name in self.chunked_arrays[:-1]:
-            path = self.arrays[name].chunk_path(self._file_index(name, index))
+        for name in self.chunked_array_names[:-1]:
+            path = self.arrays[name].chunk_path(self._padded_chunk_index(name, index))
             if not (self.root / path).exists():
                 faults += [] if name == "message" and has_no_messages else [f"{path} is missing"]
                 continue
@@ -433,7 +440,9 @@ def _chunk_grid(array: ZarrArray) -> tuple[int, ...]:
     return tuple(-(-m // c) for m, c in zip(array.shape, array.chunks, strict=True))
 
 
-def _coordinate_arrays(axes: Axes, about: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[ZarrArray, np.ndarray]]:
+def _coordinate_arrays(
+    axes: Axes, array_attributes: Mapping[str, Mapping[str, Any]]
+) -> Iterator[tuple[ZarrArray, np.ndarray]]:
     """Yield the coordinate arrays of the axes, with their values."""
     for axis in axes.axes:
         coordinates = {axis.name: axis.labels, **axis.columns}
@@ -443,10 +452,10 @@ def _coordinate_arrays(axes: Axes, about: Mapping[str, Mapping[str, Any]]) -> It
             dims = (axis.name, "component")[: values.ndim]
             dtype = {"U": "string", "b": "bool", "i": "int64", "u": "int64"}.get(values.dtype.kind, "float64")
             chunks = (max(64, 1 << (len(values) - 1).bit_length()), *values.shape[1:])
-            yield ZarrArray(name, dims, values.shape, chunks, dtype, dict(about.get(name, {}))), values
+            yield ZarrArray(name, dims, values.shape, chunks, dtype, dict(array_attributes.get(name, {}))), values
 
 
-def match_axes(study_axes: Axes, stored_axes: Axes) -> Axes:
+def axes_in_store_order(study_axes: Axes, stored_axes: Axes) -> Axes:
     """Return the study's axes in the order of a store: first the values that it has, then the new ones.
 
     Raises

@@ -29,15 +29,15 @@ REQUIRED_ARRAY_DTYPES = {"status": ("int8",), "message": ("string",), "laws": ("
 """Allowed data types of the arrays that every store contains."""
 
 
-def with_checksum(group: dict[str, Any]) -> dict[str, Any]:
+def with_checksum(group_metadata: dict[str, Any]) -> dict[str, Any]:
     """Return the metadata of a group with their digest among the attributes."""
-    attributes = {name: value for name, value in group["attributes"].items() if name != CHECKSUM_ATTRIBUTE}
-    group = {**group, "attributes": attributes}
-    digest = hashlib.sha256(json.dumps(group, sort_keys=True).encode()).hexdigest()
-    return {**group, "attributes": {**attributes, CHECKSUM_ATTRIBUTE: digest}}
+    attributes = {name: value for name, value in group_metadata["attributes"].items() if name != CHECKSUM_ATTRIBUTE}
+    group_metadata = {**group_metadata, "attributes": attributes}
+    digest = hashlib.sha256(json.dumps(group_metadata, sort_keys=True).encode()).hexdigest()
+    return {**group_metadata, "attributes": {**attributes, CHECKSUM_ATTRIBUTE: digest}}
 
 
-def read_group(root: Path, group: dict[str, Any]) -> tuple[dict[str, ZarrArray], dict[str, Any]]:
+def parse_group_metadata(root: Path, group_metadata: dict[str, Any]) -> tuple[dict[str, ZarrArray], dict[str, Any]]:
     """Return the arrays and the attributes of a group, from its metadata.
 
     Raises
@@ -50,13 +50,13 @@ def read_group(root: Path, group: dict[str, Any]) -> tuple[dict[str, ZarrArray],
     UserWarning
         If an earlier version wrote the metadata, without a checksum.
     """
-    attributes = group["attributes"]
+    attributes = group_metadata["attributes"]
     if CHECKSUM_ATTRIBUTE not in attributes:
         warn(f"{root} has no checksum of its metadata, as an earlier version made it: damage to them would not show")
-    elif attributes[CHECKSUM_ATTRIBUTE] != with_checksum(group)["attributes"][CHECKSUM_ATTRIBUTE]:
+    elif attributes[CHECKSUM_ATTRIBUTE] != with_checksum(group_metadata)["attributes"][CHECKSUM_ATTRIBUTE]:
         raise ValueError("its metadata do not have the checksum that they were written with")
     arrays = {}
-    for name, array_metadata in group["consolidated_metadata"]["metadata"].items():
+    for name, array_metadata in group_metadata["consolidated_metadata"]["metadata"].items():
         arrays[name] = ZarrArray.from_metadata(name, array_metadata)
         if arrays[name].metadata() != array_metadata:  # other readers use its codecs and fill values
             raise ValueError(f"the array {name!r} is none that a study writes")

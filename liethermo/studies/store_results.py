@@ -30,7 +30,7 @@ def load_status(path: Any) -> StudyStatus:
 
 def store_status(store: StudyStore) -> StudyStatus:
     """Return the status of an open store."""
-    counts, running = store.status_counts(), files.active_run(store.root)
+    counts, running = store.status_counts(), files.active_run_record(store.root)
     n_done = store.n_points - counts.get("missing", 0)
     time_left = None if running is None or "started" not in running else seconds_left(store.n_points, n_done, running)
     return StudyStatus(store.n_points, n_done, counts, running, time_left)
@@ -60,7 +60,7 @@ def open_results(path: Path, owner: object) -> xarray.Dataset:
         raise
     except Exception as error:  # zarr and xarray raise many types
         raise FileError(f"{path} cannot be read: {error}") from error
-    return dataset.set_coords([name for name in store.arrays if name not in store.chunked_arrays])
+    return dataset.set_coords([name for name in store.arrays if name not in store.chunked_array_names])
 
 
 def audit_store(path: Any, **tolerances: float) -> Audit:

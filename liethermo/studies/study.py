@@ -26,12 +26,12 @@ from ..runs.timetable import make_schedule
 from ..systems import System
 from . import files, identity
 from .axes import Axes, Zipped
-from .measures import At, Measure, SolutionMeasure, ValuesAtTimes, parse_measures
+from .measures import At, Measure, SolutionMeasure, ValuesAtTimes, parse_measures_and_event
 from .members import UNKNOWN_PARAMETER_TEXT, AccessRecorder, system_builder, to_python_values
 from .progress import StudyProgressBar, StudyStatus
 from .running import run_locally, run_on_cluster
 from .solve import MEASURE_FAILED, STATUSES, PointResults, PointSolver, StudyTask, describe_error
-from .store import STORE_FORMAT, StoreSurvey, StudyStore, match_axes
+from .store import STORE_FORMAT, StoreSurvey, StudyStore, axes_in_store_order
 from .store_results import audit_store, load_status, open_results, store_status
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ class Study:
         spec: Mapping[str, object] | None = None,
     ):
         self._axes = Axes.from_mapping(axes)
-        self._measures, until = parse_measures(measure, until)
+        self._measures, until = parse_measures_and_event(measure, until)
         axis_names = {*self._axes.names, *self._axes.parameter_names}
         if shared_names := axis_names & {*self._measures}:
             raise InputError(f"{shared_names.pop()!r} is a measure and an axis")
@@ -217,11 +217,11 @@ class Study:
         FileError
             If the store cannot be read or written, or another run works on it.
         """
-        store, axes = self._open_store()
+        store, axes = self._open_or_create_store()
         is_interrupted = False
         with files.lock_store(store.root) as record_run:
-            store, axes = self._open_store()  # another run may have changed it before the lock was taken
-            files.remove_parts(store.root)
+            store, axes = self._open_or_create_store()  # another run may have changed it before the lock was taken
+            files.remove_partial_files(store.root)
             if store.shape != axes.shape:
                 store = store.extend(axes)
             survey = store.survey()
@@ -293,11 +293,11 @@ class Study:
 
     # -- store and example ------------------------------------------------------------------------------------------
 
-    def _open_store(self) -> tuple[StudyStore, Axes]:
+    def _open_or_create_store(self) -> tuple[StudyStore, Axes]:
         """Open or create the store, and return it with the axes in its order; a store of another study is refused."""
         if not self.store.exists() or (self.store.is_dir() and not any(self.store.iterdir())):
             solver, columns, x0 = self._solve_example()
-            description = {**identity.describe_study(solver, columns, x0), "place": list(self._example_index)}
+            description = {**identity.study_as_json(solver, columns, x0), "place": list(self._example_index)}
             array_attributes: dict[str, dict[str, Any]] = {
                 **self._array_attributes,
                 "status": {
@@ -330,10 +330,10 @@ class Study:
         else:
             store = StudyStore.open(self.store)
         try:
-            axes = match_axes(self._axes, store.repaired_axes(self._axes))
+            axes = axes_in_store_order(self._axes, store.repair_axes(self._axes))
             solver, columns, x0 = self._solve_example(axes, tuple(store.study_description["place"]))
             differences = identity.study_differences(
-                identity.describe_study(solver, columns, x0), store.study_description
+                identity.study_as_json(solver, columns, x0), store.study_description
             )
         except InputError as error:
             differences = [str(error)]
@@ -357,14 +357,14 @@ class Study:
         The example is the point at ``index`` of the axes, or the first candidate that can be run.
         """
         if self._example is not None and (
-            axes is None or self._example[0].task.example_point == _point_at(axes, index)[0]
+            axes is None or self._example[0].task.example_point == _point_and_state_at(axes, index)[0]
         ):
             return self._example
         axes, candidates = (self._axes, self._candidate_indices()) if axes is None else (axes, [index])
         first_failure, n_failed = "", 0
         for index in candidates:
             seeds = None if self._task.noise is None else self._task.noise.grid_seeds([np.array([i]) for i in index])
-            reason, was_built = self._try_point(*_point_at(axes, index), seeds)
+            reason, was_built = self._try_as_example(*_point_and_state_at(axes, index), seeds)
             if self._example is not None and not reason:
                 self._example_index = index
                 return self._example
@@ -380,7 +380,7 @@ class Study:
         numbers = dict.fromkeys(int(size * _van_der_corput(k)) for k in range(MAX_CANDIDATE_POINTS))
         return [tuple(map(int, np.unravel_index(number, shape))) for number in numbers]
 
-    def _try_point(
+    def _try_as_example(
         self, point: dict[str, Any], states: np.ndarray | None, seeds: np.ndarray | None
     ) -> tuple[str, bool]:
         """Solve one point as the example; return the reason of a failure, or "", and True if its system was built."""
@@ -436,7 +436,7 @@ def _with_example_value(measure: Measure, value: np.ndarray) -> Measure:
     return dataclasses.replace(measure, example_value=value) if isinstance(measure, SolutionMeasure) else measure
 
 
-def _point_at(axes: Axes, index: tuple[int, ...]) -> tuple[dict[str, Any], np.ndarray | None]:
+def _point_and_state_at(axes: Axes, index: tuple[int, ...]) -> tuple[dict[str, Any], np.ndarray | None]:
     """Return the parameters at an index, and the initial state, shape (1, n), if an axis has states."""
     indices = tuple(np.array([i]) for i in index)
     return to_python_values({name: values[0] for name, values in axes.parameters_at(indices).items()}), axes.states_at(

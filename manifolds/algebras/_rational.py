@@ -70,7 +70,7 @@ MAX_DENSE_JACOBI_DIM = 12
 """Largest dimension in which the Jacobi identity is checked for all triples in one dense array."""
 
 
-def max_jacobi_residual(constants: np.ndarray) -> tuple[float, tuple[int, int, int]]:
+def max_jacobi_residual_and_triple(constants: np.ndarray) -> tuple[float, tuple[int, int, int]]:
     """Return the largest component of ``[[a,b],c] + [[b,c],a] + [[c,a],b]`` and its triple; exact for integers.
 
     The constants must be antisymmetric. Above MAX_DENSE_JACOBI_DIM sparse arrays of one element a at a time save

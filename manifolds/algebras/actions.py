@@ -44,7 +44,7 @@ class AdMatrixAction:
         return self.ad.T @ mu
 
 
-def nonzero_terms(constants: np.ndarray) -> tuple[tuple[int, int, int, float], ...] | None:
+def terms_to_unroll(constants: np.ndarray) -> tuple[tuple[int, int, int, float], ...] | None:
     """Return the nonzero structure constants as tuples (a, b, c, value); None if there are more than
     MAX_UNROLLED_TERMS."""
     indices = np.argwhere(constants)

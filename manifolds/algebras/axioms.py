@@ -11,7 +11,7 @@ from ..errors import (
     JacobiError,
     ShapeError,
 )
-from ._rational import RationalArray, max_jacobi_residual
+from ._rational import RationalArray, max_jacobi_residual_and_triple
 
 AXIOM_TOLERANCE = 1e-12
 """Largest relative residual of an axiom for constants that are not rational (rounding of a few products)."""
@@ -34,7 +34,7 @@ def checked_constants(values) -> np.ndarray:
     return array
 
 
-def constants_from_matrices(basis) -> tuple[np.ndarray, np.ndarray]:
+def constants_and_matrices(basis) -> tuple[np.ndarray, np.ndarray]:
     """Return the structure constants of the algebra that matrices span over the reals, and the matrices as an array.
 
     Raises the errors of :meth:`manifolds.LieAlgebra.from_matrices`.
@@ -85,19 +85,19 @@ def constants_from_matrices(basis) -> tuple[np.ndarray, np.ndarray]:
     constants = coordinates.T.reshape(dim, dim, dim)
     constants = (constants - constants.swapaxes(0, 1)) / 2
     scales = norms[:, None, None] * norms[:, None] / norms
-    return snap_to_fractions(constants, scales, columns, commutators), input_matrices
+    return scale_and_snap_to_fractions(constants, scales, columns, commutators), input_matrices
 
 
-def check_axioms(constants: np.ndarray, name: str, exact: RationalArray | None) -> None:
+def check_axioms(constants: np.ndarray, name: str, rational_constants: RationalArray | None) -> None:
     """Raise an error if antisymmetry or the Jacobi identity fails.
 
-    With ``exact`` the constants are its integer numerators, and the check is exact.
+    With ``rational_constants`` the constants are its integer numerators, and the check is exact.
     """
-    unit = 1.0 if exact is None else 1.0 / exact.denominator
-    check_text = "checked exactly" if exact is not None else "tolerance {:.1g}"
+    unit = 1.0 if rational_constants is None else 1.0 / rational_constants.denominator
+    check_text = "checked exactly" if rational_constants is not None else "tolerance {:.1g}"
     scale = float(np.abs(constants).max())
     symmetric_parts = np.abs(constants + constants.swapaxes(0, 1)).max(axis=2)
-    tolerance = 0.0 if exact is not None else AXIOM_TOLERANCE * scale
+    tolerance = 0.0 if rational_constants is not None else AXIOM_TOLERANCE * scale
     if symmetric_parts.max() > tolerance:
         a, b = (int(i) for i in np.unravel_index(symmetric_parts.argmax(), symmetric_parts.shape))
         raise AntisymmetryError(
@@ -107,8 +107,8 @@ def check_axioms(constants: np.ndarray, name: str, exact: RationalArray | None) 
             tolerance=tolerance,
             indices=(a, b),
         )
-    max_component, triple = max_jacobi_residual(constants)
-    tolerance = 0.0 if exact is not None else AXIOM_TOLERANCE * scale**2 * len(constants)
+    max_component, triple = max_jacobi_residual_and_triple(constants)
+    tolerance = 0.0 if rational_constants is not None else AXIOM_TOLERANCE * scale**2 * len(constants)
     if max_component > tolerance:
         residual = max_component * unit**2
         a, b, c = sorted(triple)
@@ -122,7 +122,7 @@ def check_axioms(constants: np.ndarray, name: str, exact: RationalArray | None) 
         )
 
 
-def snap_to_fractions(
+def scale_and_snap_to_fractions(
     constants: np.ndarray, scales: np.ndarray, columns: np.ndarray, commutators: np.ndarray
 ) -> np.ndarray:
     """Return ``constants * scales`` rounded to nearby fractions, if the commutators then hold at least as well.

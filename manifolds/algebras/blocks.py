@@ -139,9 +139,9 @@ class DirectSum(BracketAlgebra):
             start = stop
         return components
 
-    def _blockwise(self, method_name: str, *elements) -> jax.Array:
-        has_site_axes = any(self._flatten_element(x, what)[1] for x, what in elements)
-        argument_blocks = zip(*(self.split(x, what) for x, what in elements), strict=True)
+    def _blockwise(self, method_name: str, *named_elements) -> jax.Array:
+        has_site_axes = any(self._flatten_element(x, what)[1] for x, what in named_elements)
+        argument_blocks = zip(*(self.split(x, what) for x, what in named_elements), strict=True)
         results = [getattr(g, method_name)(*parts) for (g, _), parts in zip(self.blocks, argument_blocks, strict=True)]
         rows = [result.reshape(*result.shape[:-2], -1) for result in results]
         components = rows[0] if len(rows) == 1 else jnp.concatenate(rows, axis=-1)
@@ -219,7 +219,7 @@ class DirectSum(BracketAlgebra):
                 f"{self.dim} components; site_casimirs({degree}) evaluates those of all sites together"
             )
         return [
-            _casimir_of_block(F, start + i * g.dim, g.dim, self.dim)
+            _embed_casimir(F, start + i * g.dim, g.dim, self.dim)
             for g, count, start in self._blocks_with_starts()
             for i in range(count)
             for F in g.casimirs(degree)
@@ -248,7 +248,7 @@ class DirectSum(BracketAlgebra):
                     continue
                 for j in range(count):
                     named_casimirs.append(
-                        (f"{name} at {j + 1}{block_text}", _casimir_of_block(F, start + j * g.dim, g.dim, self.dim))
+                        (f"{name} at {j + 1}{block_text}", _embed_casimir(F, start + j * g.dim, g.dim, self.dim))
                     )
         return named_casimirs
 
@@ -266,8 +266,10 @@ class DirectSum(BracketAlgebra):
     def _build_by_constants(self) -> LieAlgebra:
         return direct_sum_by_constants([g for g, count in self.blocks for _ in range(count)])
 
-    def _block_diagonal_matrix(self, what: str, matrix_of_block: Callable[[LieAlgebra], np.ndarray]) -> np.ndarray:
-        self._check_matrix_memory(what)
+    def _block_diagonal_matrix(
+        self, matrix_name: str, matrix_of_block: Callable[[LieAlgebra], np.ndarray]
+    ) -> np.ndarray:
+        self._check_matrix_memory(matrix_name)
         return scipy.linalg.block_diag(*(block for g, count in self.blocks for block in [matrix_of_block(g)] * count))
 
 
@@ -347,12 +349,12 @@ class BlockCasimir:
         return f"{self.casimir} of components {self.start + 1} to {self.start + self.size}"
 
 
-def _casimir_of_block(F, start: int, size: int, dim: int) -> Polynomial | BlockCasimir:
-    if not isinstance(F, Polynomial):
-        return BlockCasimir(F, start, size, dim)
-    exponents = np.zeros((len(F.terms), dim), dtype=np.int64)
-    exponents[:, start : start + size] = F.exponents
-    return Polynomial(exponents, F.coefficients)
+def _embed_casimir(casimir, start: int, size: int, dim: int) -> Polynomial | BlockCasimir:
+    if not isinstance(casimir, Polynomial):
+        return BlockCasimir(casimir, start, size, dim)
+    exponents = np.zeros((len(casimir.terms), dim), dtype=np.int64)
+    exponents[:, start : start + size] = casimir.exponents
+    return Polynomial(exponents, casimir.coefficients)
 
 
 def direct_sum_by_constants(algebras: Sequence[LieAlgebra]) -> LieAlgebra:
@@ -377,10 +379,10 @@ def direct_sum_by_constants(algebras: Sequence[LieAlgebra]) -> LieAlgebra:
             ]
         )
     name = " + ".join(g.name for g in algebras)
-    return LieAlgebra(constants, name=name, basis=basis, basis_names=joined_names(*algebras))
+    return LieAlgebra(constants, name=name, basis=basis, basis_names=joined_basis_names(*algebras))
 
 
-def joined_names(*algebras: LieAlgebra) -> tuple[str, ...] | None:
+def joined_basis_names(*algebras: LieAlgebra) -> tuple[str, ...] | None:
     """Return the names of all basis elements in order; None if an algebra has none, or two names are equal."""
     names = [name for g in algebras for name in g.basis_names or ()]
     return tuple(names) if len(set(names)) == sum(g.dim for g in algebras) else None

@@ -54,7 +54,7 @@ class BracketAlgebra(LieAlgebra):
     structure_constants = forward_to("algebra_by_constants")
     rational_constants = forward_to("algebra_by_constants")
     basis = forward_to("algebra_by_constants")
-    _balanced_constants = forward_to("algebra_by_constants")
+    _balanced_constants_and_factors = forward_to("algebra_by_constants")
 
     def _check_matrix_memory(self, what: str) -> None:
         """Raise SizeError if a dim by dim matrix would not fit into memory."""

@@ -115,7 +115,7 @@ def su(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
     """
     n = checked_size(n, 2, "su(n)")
     data = ClassicalData(n - 1, (0, n * n - 1, 0), (2.0 * n, 0.0), True, tuple(range(2, n + 1)))
-    return _classical_algebra(f"su({n})", n, data, by_matrices, lambda: matrix_bases.unitary_basis(n, centre=False))
+    return _classical_algebra(f"su({n})", n, data, by_matrices, lambda: matrix_bases.unitary_basis(n, has_centre=False))
 
 
 @register((2,))
@@ -123,7 +123,7 @@ def u(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
     """Return u(n), the anti-Hermitian matrices: the basis of su(n), then the centre ``-i/2 sqrt(2/n) 1``."""
     n = checked_size(n, 1, "u(n)")
     data = ClassicalData(n, (0, n * n - 1, 1), (2.0 * n, 2.0), True, tuple(range(1, n + 1)))
-    return _classical_algebra(f"u({n})", n, data, by_matrices, lambda: matrix_bases.unitary_basis(n, centre=True))
+    return _classical_algebra(f"u({n})", n, data, by_matrices, lambda: matrix_bases.unitary_basis(n, has_centre=True))
 
 
 @register((2,), (3,))

@@ -185,13 +185,13 @@ def fundamental_invariants(g: AlgebraStructure) -> tuple[TracePolynomial | Polyn
     sources: list[_EquivariantSource] = []
     for source in _equivariant_sources(g):
         sources.append(source)
-        generators = _independent_invariants(g, sources)
+        generators = _complete_invariants(g, sources)
         if generators is not None:
             return generators
     return None
 
 
-def _independent_invariants(
+def _complete_invariants(
     g: AlgebraStructure, sources: list[_EquivariantSource]
 ) -> tuple[TracePolynomial | Polynomial, ...] | None:
     """Return independent invariants of the sources, if they are complete by number and degrees; else None."""

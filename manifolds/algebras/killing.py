@@ -38,7 +38,7 @@ def trilinear_form(algebra, form=None) -> np.ndarray:
     return np.einsum("ae,bde->abd", form, np.asarray(algebra.structure_constants))
 
 
-def row_space(rows: np.ndarray) -> np.ndarray:
+def row_space_basis(rows: np.ndarray) -> np.ndarray:
     """Return an orthonormal basis of the span of rows of size 1; singular values up to STRUCTURE_TOLERANCE are
     rounding."""
     _, singular_values, basis = np.linalg.svd(rows, full_matrices=False)
@@ -46,7 +46,7 @@ def row_space(rows: np.ndarray) -> np.ndarray:
 
 
 def cartan_involution_of(constants: np.ndarray, name: str) -> np.ndarray:
-    """Compute the Cartan involution by Newton's method for the inner product of least bracket norm.
+    """Return a Cartan involution, shape (dim, dim), from the inner product of least bracket norm.
 
     See :meth:`LieAlgebra.cartan_involution`.
     """

@@ -21,11 +21,11 @@ from .._names import checked_names
 from ..errors import LieAlgebraError
 from ._basis_scaling import STRUCTURE_TOLERANCE, balance_constants
 from ._rational import RationalArray, rational_array
-from .actions import Action, AdMatrixAction, Operator, nonzero_terms, unrolled_bracket
-from .axioms import check_axioms, checked_constants, constants_from_matrices, real_columns
+from .actions import Action, AdMatrixAction, Operator, terms_to_unroll, unrolled_bracket
+from .axioms import check_axioms, checked_constants, constants_and_matrices, real_columns
 from .casimirs import casimirs, leading_casimirs
 from .display import algebra_html
-from .killing import cartan_involution_of, killing_form_of, row_space
+from .killing import cartan_involution_of, killing_form_of, row_space_basis
 from .polynomial_casimirs import casimir_count
 
 
@@ -137,7 +137,7 @@ class LieAlgebra:
         ClosureError
             If the matrices are linearly dependent over the reals or a commutator leaves their span.
         """
-        constants, matrices = constants_from_matrices(basis)
+        constants, matrices = constants_and_matrices(basis)
         return cls(constants, name=name, basis=matrices, basis_names=basis_names)
 
     def with_basis_names(self, *names: str) -> LieAlgebra:
@@ -209,7 +209,7 @@ class LieAlgebra:
 
     def killing_signature(self) -> tuple[int, int, int]:
         """Return the numbers of positive, negative and zero eigenvalues of the Killing form, in any basis."""
-        eigenvalues = np.linalg.eigvalsh(killing_form_of(self._balanced_constants[0]))
+        eigenvalues = np.linalg.eigvalsh(killing_form_of(self._balanced_constants_and_factors[0]))
         positive, negative = (int((sign * eigenvalues > STRUCTURE_TOLERANCE).sum()) for sign in (1, -1))
         return positive, negative, self.dim - positive - negative
 
@@ -229,7 +229,7 @@ class LieAlgebra:
         matrix = square_matrices(X, basis.shape[-1], "X")
         entries = matrix.reshape(*matrix.shape[:-2], -1)
         entries = jnp.concatenate([entries.real, entries.imag], axis=-1)
-        components = jnp.einsum("ai,...i->...a", self._left_inverse, entries)
+        components = jnp.einsum("ai,...i->...a", self._basis_left_inverse, entries)
         if not is_traced(entries):
             residual = float(jnp.max(jnp.abs(components @ real_columns(basis).T - entries), initial=0.0))
             tolerance = 1e-8 * max(float(np.abs(basis).max()), float(jnp.max(jnp.abs(entries), initial=0.0)))
@@ -266,16 +266,16 @@ class LieAlgebra:
 
     def is_unimodular(self) -> bool:
         """Return True if ``tr ad_x = 0`` for every x."""
-        traces = np.einsum("abb->a", self._balanced_constants[0])
+        traces = np.einsum("abb->a", self._balanced_constants_and_factors[0])
         return bool(np.abs(traces).max() <= STRUCTURE_TOLERANCE)
 
     def derived_series(self) -> list[int]:
         """Return the dimensions of g, [g, g], [[g, g], [g, g]], … until they no longer fall."""
-        return self._ideal_series(lambda ideal: (ideal, ideal))
+        return self._ideal_series_dims(lambda ideal: (ideal, ideal))
 
     def lower_central_series(self) -> list[int]:
         """Return the dimensions of g, [g, g], [g, [g, g]], … until they no longer fall."""
-        return self._ideal_series(lambda ideal: (np.eye(self.dim), ideal))
+        return self._ideal_series_dims(lambda ideal: (np.eye(self.dim), ideal))
 
     def cartan_involution(self) -> np.ndarray:
         """Return a Cartan involution theta, shape (dim, dim), for which ``-kappa(x, theta y)`` is positive definite.
@@ -314,18 +314,20 @@ class LieAlgebra:
     def _batched_bracket(self, x, y) -> jax.Array:
         """Return the bracket for large batches, shape (..., dim)."""
         return (
-            self.bracket(x, y) if self._nonzero_terms is None else unrolled_bracket(self._nonzero_terms, x, y, self.dim)
+            self.bracket(x, y)
+            if self._terms_to_unroll is None
+            else unrolled_bracket(self._terms_to_unroll, x, y, self.dim)
         )
 
     def _batched_ad_star(self, x, mu) -> jax.Array:
         """Return the coadjoint operator for large batches, shape (..., dim)."""
-        if self._nonzero_terms is None:
+        if self._terms_to_unroll is None:
             return self.ad_star(x, mu)
-        return unrolled_bracket(tuple((a, c, b, value) for a, b, c, value in self._nonzero_terms), x, mu, self.dim)
+        return unrolled_bracket(tuple((a, c, b, value) for a, b, c, value in self._terms_to_unroll), x, mu, self.dim)
 
     @cached_property
-    def _nonzero_terms(self) -> tuple[tuple[int, int, int, float], ...] | None:
-        return nonzero_terms(self._constants)
+    def _terms_to_unroll(self) -> tuple[tuple[int, int, int, float], ...] | None:
+        return terms_to_unroll(self._constants)
 
     # -- Casimirs -----------------------------------------------------------------------------------------------
 
@@ -390,7 +392,7 @@ class LieAlgebra:
         return self.basis
 
     @cached_property
-    def _left_inverse(self) -> np.ndarray:
+    def _basis_left_inverse(self) -> np.ndarray:
         return np.linalg.pinv(real_columns(self._require_basis()))
 
     @cached_property
@@ -398,7 +400,7 @@ class LieAlgebra:
         return _read_only_copy(killing_form_of(self.structure_constants))
 
     @cached_property
-    def _balanced_constants(self) -> tuple[np.ndarray, np.ndarray]:
+    def _balanced_constants_and_factors(self) -> tuple[np.ndarray, np.ndarray]:
         """Constants in the basis scaled by factors, the largest of size 1, and the factors."""
         return balance_constants(self.structure_constants)
 
@@ -408,19 +410,19 @@ class LieAlgebra:
             raise LieAlgebraError(f"{self.name} is not semisimple, so it has no Cartan involution")
         if self.is_compact_type():
             return _read_only_copy(np.eye(self.dim))
-        constants, factors = self._balanced_constants
+        constants, factors = self._balanced_constants_and_factors
         theta = cartan_involution_of(constants, self.name) * factors[:, None] / factors
         rounded_theta = np.asarray(np.round(theta))
         return _read_only_copy(rounded_theta if np.abs(rounded_theta - theta).max() < 1e-10 else theta)
 
-    def _ideal_series(self, pair_to_bracket: Callable) -> list[int]:
+    def _ideal_series_dims(self, factors_of_ideal: Callable) -> list[int]:
         ideal, dims = np.eye(self.dim), [self.dim]
         while True:
-            left_factor, right_factor = pair_to_bracket(ideal)
+            left_factor, right_factor = factors_of_ideal(ideal)
             products = np.einsum(
-                "ia,jb,abc->ijc", left_factor, right_factor, self._balanced_constants[0], optimize=True
+                "ia,jb,abc->ijc", left_factor, right_factor, self._balanced_constants_and_factors[0], optimize=True
             )
-            ideal = row_space(products.reshape(-1, self.dim))
+            ideal = row_space_basis(products.reshape(-1, self.dim))
             if len(ideal) == dims[-1]:
                 return dims
             dims.append(len(ideal))

@@ -129,7 +129,7 @@ class MagneticExtension(BracketAlgebra):
 
     def casimir_count(self) -> int:
         g = self.algebra
-        return self.algebra_by_constants.casimir_count() if invariant_form(g) is None else 2 * g.casimir_count()
+        return self.algebra_by_constants.casimir_count() if invariant_form_map(g) is None else 2 * g.casimir_count()
 
     def casimirs(self, degree: int) -> list:
         """Return ``f(B)`` and ``<W, grad f(B)>`` for each Casimir f of g, where B is mapped to g* by the invariant
@@ -137,12 +137,12 @@ class MagneticExtension(BracketAlgebra):
 
         If no invariant form is known, return the Casimirs found from the structure constants.
         """
-        if invariant_form(self.algebra) is None:
+        if invariant_form_map(self.algebra) is None:
             return self.algebra_by_constants.casimirs(degree)
         return [F for _, F in self._extended_casimirs([(str(f), f) for f in self.algebra.casimirs(degree)])]
 
     def leading_casimirs(self) -> list[tuple[str, Callable]]:
-        if invariant_form(self.algebra) is None:
+        if invariant_form_map(self.algebra) is None:
             return [("<W, B>", CrossHelicity(self))]
         return self._extended_casimirs(self.algebra.leading_casimirs()[:MAX_FOLLOWED_CASIMIRS])
 
@@ -185,7 +185,7 @@ class _DoubledForm:
         return 2.0 * (self.form @ x)
 
 
-def invariant_form(g: LieAlgebra) -> Callable | None:
+def invariant_form_map(g: LieAlgebra) -> Callable | None:
     """Return a nondegenerate invariant form as a map from elements to dual vectors, shape (..., dim); None if unknown.
 
     Large matrix algebras have the trace form, other semisimple algebras the Killing form.
@@ -193,7 +193,7 @@ def invariant_form(g: LieAlgebra) -> Callable | None:
     if isinstance(g, MatrixAlgebra):
         return g.trace_covector
     if isinstance(g, DirectSum):
-        forms = [invariant_form(block) for block, _ in g.blocks]
+        forms = [invariant_form_map(block) for block, _ in g.blocks]
         return None if None in forms else lambda x: _apply_forms_blockwise(g, forms, x)
     if not g.is_semisimple():
         return None
@@ -258,6 +258,6 @@ class MomentumFieldCasimir(FieldCasimir):
 
 
 def _dual_of_field(extension: MagneticExtension, B) -> jax.Array:
-    form = invariant_form(extension.algebra)
+    form = invariant_form_map(extension.algebra)
     assert form is not None
     return form(B)

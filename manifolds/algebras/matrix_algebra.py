@@ -85,22 +85,24 @@ class MatrixAlgebra(BracketAlgebra):
 
     def bracket(self, x, y) -> jax.Array:
         x, y = self._element(x, "x"), self._element(y, "y")
-        return self._bracket(self.matrix_basis.matrix(x), self.matrix_basis.matrix(y))
+        return self._bracket_of_matrices(self.matrix_basis.matrix(x), self.matrix_basis.matrix(y))
 
     def ad_star(self, x, mu) -> jax.Array:
         x, mu = self._element(x, "x"), self._element(mu, "mu")
-        return self._ad_star(self.matrix_basis.matrix(x), mu)
+        return self._ad_star_of_matrix(self.matrix_basis.matrix(x), mu)
 
     def action(self, x) -> MatrixAction:
         return MatrixAction(self, self.matrix_basis.matrix(self._element(x, "x")))
 
-    def _bracket(self, X: MatrixParts, Y: MatrixParts) -> jax.Array:
-        return self.matrix_basis.raise_index(self._commutator(X, Y))
+    def _bracket_of_matrices(self, X: MatrixParts, Y: MatrixParts) -> jax.Array:
+        return self.matrix_basis.raise_index(self._commutator_inner_products(X, Y))
 
-    def _ad_star(self, X: MatrixParts, mu) -> jax.Array:
-        return self._commutator(_adjoint(X), self.matrix_basis.matrix(self.matrix_basis.raise_index(mu)))
+    def _ad_star_of_matrix(self, X: MatrixParts, mu) -> jax.Array:
+        return self._commutator_inner_products(
+            _conjugate_transpose(X), self.matrix_basis.matrix(self.matrix_basis.raise_index(mu))
+        )
 
-    def _commutator(self, X: MatrixParts, Y: MatrixParts) -> jax.Array:
+    def _commutator_inner_products(self, X: MatrixParts, Y: MatrixParts) -> jax.Array:
         """Return ``<[X, Y], e_a>`` for each a, shape (..., dim).
 
         For anti-Hermitian matrices ``[X, Y] = X Y - (X Y)^H``, and the two terms have equal products with each e_a.
@@ -155,11 +157,11 @@ class MatrixAlgebra(BracketAlgebra):
         return self.matrix_basis.inner_products(self._split_parts(square_matrices(M, self.matrix_size, "M")))
 
     def trace_covector(self, x) -> jax.Array:
-        """Return the covector ``Re tr(x .)`` of the invariant, nondegenerate trace form, shape (..., dim)."""
+        """Return the covector ``y -> Re tr(hat(x) hat(y))`` of x by the invariant trace form, shape (..., dim)."""
         x = self._element(x, "x")
         if self.classical_data.is_compact:
             return -self.matrix_basis.lower_index(x)
-        return self.matrix_basis.inner_products(_adjoint(self.matrix_basis.matrix(x)))
+        return self.matrix_basis.inner_products(_conjugate_transpose(self.matrix_basis.matrix(x)))
 
     def _split_parts(self, matrix) -> MatrixParts:
         return (matrix.real, matrix.imag)[: self.matrix_basis.parts]
@@ -192,7 +194,9 @@ class MatrixAlgebra(BracketAlgebra):
         X = self.matrix_basis.matrix(x)
         traces = [jnp.trace(part, axis1=-2, axis2=-1)[..., None, None] * np.eye(self.matrix_size) for part in X]
         return self.matrix_basis.inner_products(
-            tuple(c * a - d * sign * t for a, t, sign in zip(_adjoint(X), traces, (1.0, -1.0), strict=False))
+            tuple(
+                c * a - d * sign * t for a, t, sign in zip(_conjugate_transpose(X), traces, (1.0, -1.0), strict=False)
+            )
         )
 
     def killing_inner_product(self) -> Any:
@@ -207,7 +211,9 @@ class MatrixAlgebra(BracketAlgebra):
         if not self.is_semisimple():
             raise LieAlgebraError(f"{self.name} is not semisimple, so it has no Cartan involution")
         self._check_matrix_memory("the Cartan involution")
-        images = jax.vmap(lambda e: self._components(tuple(-a for a in _adjoint(self.matrix_basis.matrix(e)))))
+        images = jax.vmap(
+            lambda e: self._components(tuple(-a for a in _conjugate_transpose(self.matrix_basis.matrix(e))))
+        )
         return np.asarray(images(jnp.eye(self.dim)).T)
 
     def is_abelian(self) -> bool:
@@ -261,10 +267,10 @@ class MatrixAction:
         self.g, self.X = g, X
 
     def bracket(self, y) -> jax.Array:
-        return self.g._bracket(self.X, self.g.matrix_basis.matrix(y))
+        return self.g._bracket_of_matrices(self.X, self.g.matrix_basis.matrix(y))
 
     def ad_star(self, mu) -> jax.Array:
-        return self.g._ad_star(self.X, mu)
+        return self.g._ad_star_of_matrix(self.X, mu)
 
 
 @jax.tree_util.register_static
@@ -311,7 +317,7 @@ class MatrixTrace:
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _trace_of_power(n: int, hermitian: bool, M: MatrixParts) -> jax.Array:
     """Return ``Re tr(M**n)``, shape (..., N, N) to (...); its derivatives take as few products as the value."""
-    return _real_trace(_matrix_power(M, n - n // 2), _matrix_power(M, n // 2))
+    return _real_trace_of_product(_matrix_power(M, n - n // 2), _matrix_power(M, n // 2))
 
 
 @_trace_of_power.defjvp
@@ -323,17 +329,17 @@ def _trace_of_power_jvp(n: int, hermitian: bool, primals, tangents):
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _trace_of_power_times(n: int, hermitian: bool, M: MatrixParts, D: MatrixParts) -> jax.Array:
     """Return ``Re tr(M**n D)``."""
-    return _real_trace(_matrix_power(M, n), D)
+    return _real_trace_of_product(_matrix_power(M, n), D)
 
 
 @_trace_of_power_times.defjvp
 def _trace_of_power_times_jvp(n: int, hermitian: bool, primals, tangents):
-    """Sum ``Re tr(M**(n-1-i) D M**i dM)`` over i; for Hermitian matrices the terms of i and n-1-i are equal."""
+    """Return ``Re tr(M**n D)`` and its derivative along ``(dM, dD)``."""
     (M, D), (dM, dD) = primals, tangents
     derivative = _trace_of_power_times(n, hermitian, M, dD)
     for i in range(n if not hermitian else (n + 1) // 2):
         multiplicity = 2.0 if hermitian and 2 * i != n - 1 else 1.0
-        derivative = derivative + multiplicity * _real_trace(
+        derivative = derivative + multiplicity * _real_trace_of_product(
             _product(_product(_matrix_power(M, n - 1 - i), D), _matrix_power(M, i)), dM
         )
     return _trace_of_power_times(n, hermitian, M, D), derivative
@@ -347,7 +353,7 @@ def _matrix_power(M: MatrixParts, n: int) -> MatrixParts:
     return _product(_product(half, half), M if n % 2 else ())
 
 
-def _real_trace(X: MatrixParts, Y: MatrixParts) -> jax.Array:
+def _real_trace_of_product(X: MatrixParts, Y: MatrixParts) -> jax.Array:
     """Return ``Re tr(X Y)``."""
     if not (X and Y):
         return jnp.trace((X or Y)[0], axis1=-2, axis2=-1)
@@ -365,7 +371,7 @@ def _product(X: MatrixParts, Y: MatrixParts) -> MatrixParts:
     return real - imaginary, combined - real - imaginary
 
 
-def _adjoint(X: MatrixParts) -> MatrixParts:
+def _conjugate_transpose(X: MatrixParts) -> MatrixParts:
     return tuple(sign * jnp.swapaxes(part, -1, -2) for sign, part in zip((1.0, -1.0), X, strict=False))
 
 

@@ -177,7 +177,7 @@ class MatrixBasis:
 # -- bases of the classical algebras ----------------------------------------------------------------------------------
 
 
-def unitary_basis(n: int, centre: bool) -> MatrixBasis:
+def unitary_basis(n: int, has_centre: bool) -> MatrixBasis:
     """Return the basis ``-i lambda_a / 2`` of generalised Gell-Mann matrices; with the centre ``-i/2 sqrt(2/n) 1``
     last."""
     k, j = np.tril_indices(n, -1)
@@ -187,7 +187,7 @@ def unitary_basis(n: int, centre: bool) -> MatrixBasis:
         table[:m, m - 1], table[m, m - 1] = 1.0, -float(m)
         table[:, m - 1] *= -0.5 * math.sqrt(2.0 / (m * (m + 1)))
     components = k0 * k0 - 1 + 2 * k0
-    if centre:
+    if has_centre:
         components = np.append(components, n * n - 1)
         table = np.column_stack([table, np.full(n, -0.5 * math.sqrt(2.0 / n))])
     entries = EntryTable.concatenate(

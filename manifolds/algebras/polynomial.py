@@ -112,8 +112,12 @@ class Polynomial:
         """Return the partial derivatives by mu1, mu2, …"""
         return tuple(self._derivative(a) for a in range(self.dim))
 
-    def _derivative(self, a: int) -> Polynomial:
-        terms = [((*p[:a], p[a] - 1, *p[a + 1 :]), p[a] * c) for p, c in self.terms if p[a]]
+    def _derivative(self, component: int) -> Polynomial:
+        terms = [
+            ((*p[:component], p[component] - 1, *p[component + 1 :]), p[component] * c)
+            for p, c in self.terms
+            if p[component]
+        ]
         return self._with_terms(terms)
 
     # -- arithmetic -------------------------------------------------------------------------------------------------

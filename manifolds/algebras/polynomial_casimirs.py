@@ -48,11 +48,11 @@ def casimir_count(g: AlgebraStructure) -> int:
         If the constants cannot be made rational and the singular values show no clear gap.
     """
     random = np.random.default_rng(0)
-    fractions = _rational_form(g)[0].rational_constants
+    fractions = _rationally_scaled_algebra(g)[0].rational_constants
     ranks = []
     for draw in range(3):
         if fractions is None:
-            tensor = g._balanced_constants[0] @ random.standard_normal(g.dim)
+            tensor = g._balanced_constants_and_factors[0] @ random.standard_normal(g.dim)
             ranks.append(numerical_rank(np.linalg.svd(tensor, compute_uv=False), 1.0, g.name))
         else:
             p = large_prime(draw)
@@ -66,11 +66,13 @@ def new_casimirs(g: AlgebraStructure, degree: int) -> tuple[Polynomial, ...]:
     """Return the homogeneous polynomial Casimirs of this degree, modulo products of Casimirs of lower degree."""
     if casimir_count(g) == 0:
         return ()
-    scaled_algebra, squares = _rational_form(g)
+    scaled_algebra, squares = _rationally_scaled_algebra(g)
     if g.rational_constants is None and scaled_algebra.rational_constants is not None:
         return tuple(_from_root_scaled_basis(F, squares) for F in new_casimirs(scaled_algebra, degree))
-    if g.rational_constants is None and (scaled_algebra := _balanced_form(g)) != g:
-        return tuple(_from_scaled_basis(F, g._balanced_constants[1]) for F in new_casimirs(scaled_algebra, degree))
+    if g.rational_constants is None and (scaled_algebra := _balanced_algebra(g)) != g:
+        return tuple(
+            _from_scaled_basis(F, g._balanced_constants_and_factors[1]) for F in new_casimirs(scaled_algebra, degree)
+        )
     invariants = _homogeneous_casimirs(g, degree)
     lower_casimirs = [F for d in range(1, degree) for F in new_casimirs(g, d)]
     products = [dict(F.terms) for F in _products_of_degree(lower_casimirs, degree)]
@@ -106,7 +108,7 @@ def _homogeneous_casimirs(g: AlgebraStructure, degree: int) -> list[Polynomial]:
     factors, conditions = _invariance_conditions(constants[:, generators], degree)
     exponents = (factors[:, :, None] == np.arange(g.dim)).sum(axis=1)
     invariants = []
-    for columns in _coupled_blocks(conditions):
+    for columns in _coupled_column_groups(conditions):
         size_text = f"this basis of {g.name} couples {len(columns)} monomials of degree {degree}"
         _check_size(len(columns), MAX_BLOCK_SIZE, size_text)
         block = conditions[:, columns].tocsr()
@@ -129,7 +131,7 @@ class TooLargeError(LieAlgebraError):
 
 
 def _invariance_conditions(constants: np.ndarray, degree: int) -> tuple[np.ndarray, scipy.sparse.csc_array]:
-    """Stack the maps ``F -> sum_{a,c} C[a, b, c] mu_c dF/dmu_a`` on polynomials of one degree, for all b.
+    """Return the monomials of a degree, and the sparse matrix of the conditions that make them Casimirs.
 
     Returns the monomials as their sorted factors, shape (n, degree), in lexicographic order, and a sparse
     (b * n, n) array.
@@ -157,7 +159,7 @@ def _invariance_conditions(constants: np.ndarray, degree: int) -> tuple[np.ndarr
     return factors, conditions
 
 
-def _coupled_blocks(conditions: scipy.sparse.csc_array) -> list[np.ndarray]:
+def _coupled_column_groups(conditions: scipy.sparse.csc_array) -> list[np.ndarray]:
     """Partition the columns into groups that no condition couples: weight spaces, parities and the like."""
     pattern = conditions.astype(bool).astype(np.int64)
     _, block_of = scipy.sparse.csgraph.connected_components(pattern.T @ pattern, directed=False)
@@ -187,8 +189,8 @@ def _generating_set(constants: np.ndarray, modulus: int = 0, tolerance: float = 
 
 
 @lru_cache(maxsize=256)
-def _rational_form(g: AlgebraStructure) -> tuple[AlgebraStructure, tuple[int, ...]]:
-    """Return the algebra in a basis ``sqrt(r_a) e_a`` with rational constants, and the integers r_a; else g itself.
+def _rationally_scaled_algebra(g: AlgebraStructure) -> tuple[AlgebraStructure, tuple[int, ...]]:
+    """Return g in a basis ``sqrt(r_a) e_a`` with rational constants, and the integers r_a; else g and ones.
 
     The constants become ``C[a, b, c] sqrt(r_a r_b / r_c)``, hence ``C**2 r_a r_b r_c`` must be a square wherever C is
     not zero: for each prime a linear system modulo 2. For su(n) there is such a basis.
@@ -202,7 +204,9 @@ def _rational_form(g: AlgebraStructure) -> tuple[AlgebraStructure, tuple[int, ..
     are_square_roots = all(abs(s - v * v) < 4e-15 * s for v, s in zip(values, squares, strict=True))
     if not are_square_roots or max(squares) > 10**6:
         return identity_scaling
-    odd_primes = {s: _odd_primes(s.numerator) ^ _odd_primes(s.denominator) for s in set(squares)}
+    odd_primes = {
+        s: _primes_of_odd_exponent(s.numerator) ^ _primes_of_odd_exponent(s.denominator) for s in set(squares)
+    }
     primes = sorted(set().union(*odd_primes.values()))
     unknowns = np.eye(g.dim, dtype=np.int64)[np.array(entries)].sum(axis=1)
     knowns = np.array([[p in odd_primes[s] for p in primes] for s in squares], dtype=np.int64)
@@ -224,10 +228,10 @@ def _rational_form(g: AlgebraStructure) -> tuple[AlgebraStructure, tuple[int, ..
 
 
 @lru_cache(maxsize=256)
-def _balanced_form(g: AlgebraStructure) -> AlgebraStructure:
+def _balanced_algebra(g: AlgebraStructure) -> AlgebraStructure:
     """Return the algebra in the basis ``factors[a] e_a`` with balanced constants; g itself if they are balanced
     already."""
-    constants, factors = g._balanced_constants
+    constants, factors = g._balanced_constants_and_factors
     if np.abs(np.log(factors)).max() < 1e-12:
         return g
     try:
@@ -236,7 +240,7 @@ def _balanced_form(g: AlgebraStructure) -> AlgebraStructure:
         return g
 
 
-def _odd_primes(n: int) -> set[int]:
+def _primes_of_odd_exponent(n: int) -> set[int]:
     """Return the primes of odd exponent in n."""
     odd_primes: set[int] = set()
     p = 2
@@ -249,11 +253,11 @@ def _odd_primes(n: int) -> set[int]:
     return odd_primes
 
 
-def _from_root_scaled_basis(F: Polynomial, squares: tuple[int, ...]) -> Polynomial:
+def _from_root_scaled_basis(F: Polynomial, radicands: tuple[int, ...]) -> Polynomial:
     """Transform F from the basis ``sqrt(r_a) e_a`` to the basis e_a, with leading coefficient 1."""
     weights = []
     for power, c in F.terms:
-        scale: int = math.prod(r**e for r, e in zip(squares, power, strict=True))
+        scale: int = math.prod(r**e for r, e in zip(radicands, power, strict=True))
         weights.append(Fraction(c) * abs(Fraction(c)) * scale)
     roots = [math.copysign(math.sqrt(abs(w / weights[0])), w) for w in weights]
     return Polynomial(F.exponents, roots)

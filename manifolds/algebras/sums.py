@@ -11,8 +11,8 @@ from ..errors import (
     ShapeError,
 )
 from .axioms import AXIOM_TOLERANCE
-from .blocks import direct_sum_by_constants, joined_names, merged_direct_sum
-from .killing import row_space
+from .blocks import direct_sum_by_constants, joined_basis_names, merged_direct_sum
+from .killing import row_space_basis
 from .lie_algebra import LieAlgebra
 
 MAX_DIM_BY_CONSTANTS = 40
@@ -84,12 +84,12 @@ def semidirect_sum(g: LieAlgebra, representation, name: str | None = None, *, id
     constants[: g.dim, g.dim :, g.dim :] = rho.swapaxes(1, 2)  # [e_a, v_j] = rho(e_a) v_j
     constants[g.dim :, : g.dim, g.dim :] = -rho.swapaxes(1, 2).swapaxes(0, 1)
     if ideal is None:
-        return LieAlgebra(constants, name=name or f"{g.name} x R^{m}", basis=_affine_matrices(g, rho))
+        return LieAlgebra(constants, name=name or f"{g.name} x R^{m}", basis=_semidirect_sum_matrices(g, rho))
     _check_derivations(g, rho, ideal)
     constants[g.dim :, g.dim :, g.dim :] = ideal.structure_constants
-    total = LieAlgebra(constants, name=name or f"{g.name} x {ideal.name}", basis_names=joined_names(g, ideal))
-    adjoint = total._balanced_constants[0].reshape(dim, -1)
-    is_faithful = adjoint.any() and len(row_space(adjoint)) == dim
+    total = LieAlgebra(constants, name=name or f"{g.name} x {ideal.name}", basis_names=joined_basis_names(g, ideal))
+    adjoint = total._balanced_constants_and_factors[0].reshape(dim, -1)
+    is_faithful = adjoint.any() and len(row_space_basis(adjoint)) == dim
     return LieAlgebra(
         constants,
         name=total.name,
@@ -98,11 +98,13 @@ def semidirect_sum(g: LieAlgebra, representation, name: str | None = None, *, id
     )
 
 
-def _check_representation(g: LieAlgebra, rho: np.ndarray) -> None:
-    products = np.einsum("aij,bjk->abik", rho, rho)
-    defect = products - products.swapaxes(0, 1) - np.einsum("abc,cij->abij", g.structure_constants, rho)
+def _check_representation(g: LieAlgebra, representation_matrices: np.ndarray) -> None:
+    products = np.einsum("aij,bjk->abik", representation_matrices, representation_matrices)
+    defect = (
+        products - products.swapaxes(0, 1) - np.einsum("abc,cij->abij", g.structure_constants, representation_matrices)
+    )
     residuals = np.abs(defect).max(axis=(2, 3))
-    images = float(np.abs(g.structure_constants).max() * np.abs(rho).max())
+    images = float(np.abs(g.structure_constants).max() * np.abs(representation_matrices).max())
     tolerance = AXIOM_TOLERANCE * max(float(np.abs(products).max()), images)
     if residuals.max() > tolerance:
         a, b = np.unravel_index(residuals.argmax(), residuals.shape)
@@ -115,12 +117,14 @@ def _check_representation(g: LieAlgebra, rho: np.ndarray) -> None:
         )
 
 
-def _check_derivations(g: LieAlgebra, rho: np.ndarray, ideal: LieAlgebra) -> None:
+def _check_derivations(g: LieAlgebra, representation_matrices: np.ndarray, ideal: LieAlgebra) -> None:
     C = ideal.structure_constants
-    defect = np.einsum("ijk,alk->aijl", C, rho)  # D [u_i, u_j] - [D u_i, u_j] - [u_i, D u_j]
-    defect -= np.einsum("aki,kjl->aijl", rho, C) + np.einsum("akj,ikl->aijl", rho, C)
+    defect = np.einsum("ijk,alk->aijl", C, representation_matrices)  # D [u_i, u_j] - [D u_i, u_j] - [u_i, D u_j]
+    defect -= np.einsum("aki,kjl->aijl", representation_matrices, C) + np.einsum(
+        "akj,ikl->aijl", representation_matrices, C
+    )
     residuals = np.abs(defect).max(axis=3)
-    tolerance = AXIOM_TOLERANCE * float(np.abs(C).max() * np.abs(rho).max())
+    tolerance = AXIOM_TOLERANCE * float(np.abs(C).max() * np.abs(representation_matrices).max())
     if residuals.max() > tolerance:
         a, i, j = (int(index) for index in np.unravel_index(residuals.argmax(), residuals.shape))
         raise RepresentationError(
@@ -132,13 +136,13 @@ def _check_derivations(g: LieAlgebra, rho: np.ndarray, ideal: LieAlgebra) -> Non
         )
 
 
-def _affine_matrices(g: LieAlgebra, rho: np.ndarray) -> np.ndarray | None:
-    m, dim = rho.shape[1], g.dim + rho.shape[1]
+def _semidirect_sum_matrices(g: LieAlgebra, representation_matrices: np.ndarray) -> np.ndarray | None:
+    m, dim = representation_matrices.shape[1], g.dim + representation_matrices.shape[1]
     affine = np.zeros((dim, m + 1, m + 1))
-    affine[: g.dim, :m, :m] = rho
+    affine[: g.dim, :m, :m] = representation_matrices
     affine[np.arange(g.dim, dim), np.arange(m), m] = 1.0
-    norms = np.linalg.norm(rho, axis=(1, 2))
-    if norms.all() and len(row_space(rho.reshape(g.dim, -1) / norms[:, None])) == g.dim:
+    norms = np.linalg.norm(representation_matrices, axis=(1, 2))
+    if norms.all() and len(row_space_basis(representation_matrices.reshape(g.dim, -1) / norms[:, None])) == g.dim:
         return affine
     if g.basis is None:
         return None

@@ -6,7 +6,7 @@ from scipy.stats import qmc
 
 import liethermo as lt
 from liethermo.studies.axes import Axes
-from liethermo.studies.store import match_axes
+from liethermo.studies.store import axes_in_store_order
 
 
 def test_a_grid_has_every_combination_and_zipped_parameters_vary_together():
@@ -76,19 +76,21 @@ def test_longer_axes_match_the_order_of_a_store_and_its_rounding():
         Axes.from_mapping({"a": np.linspace(0.1, 0.8, 8)[::-1]}),
     )
     assert stored_axes.axes[0].labels[2] != longer_axes.axes[0].labels[5]  # 0.3 and its neighbour
-    matched_axis = match_axes(longer_axes, stored_axes).axes[0]
+    matched_axis = axes_in_store_order(longer_axes, stored_axes).axes[0]
     assert matched_axis.labels.tolist() == [*stored_axes.axes[0].labels, 0.8]
     with pytest.raises(lt.InputError, match=r"the axis 'a' lacks 0\.1, which is value 0"):
-        match_axes(Axes.from_mapping({"a": [0.2, 0.3]}), stored_axes)
+        axes_in_store_order(Axes.from_mapping({"a": [0.2, 0.3]}), stored_axes)
     with pytest.raises(lt.InputError, match=r"the axes are b \(b\)"):
-        match_axes(Axes.from_mapping({"b": [0.2]}), stored_axes)
+        axes_in_store_order(Axes.from_mapping({"b": [0.2]}), stored_axes)
 
 
 def test_replicas_are_told_apart_by_their_states_and_may_be_alike():
     states = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    matched_axis = match_axes(
+    matched_axis = axes_in_store_order(
         Axes.from_mapping({"r": lt.replicas(states)}), Axes.from_mapping({"r": lt.replicas(states[1:])})
     ).axes[0]
     assert np.array_equal(matched_axis.states, states[[1, 2, 0]])
     with pytest.raises(lt.InputError, match="lacks"):
-        match_axes(Axes.from_mapping({"r": lt.replicas(states[1:])}), Axes.from_mapping({"r": lt.replicas(states[:2])}))
+        axes_in_store_order(
+            Axes.from_mapping({"r": lt.replicas(states[1:])}), Axes.from_mapping({"r": lt.replicas(states[:2])})
+        )

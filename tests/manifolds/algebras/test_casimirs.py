@@ -220,7 +220,7 @@ def test_constants_that_are_not_rational():
     rotation, _ = np.linalg.qr(np.random.default_rng(1).standard_normal((6, 6)))
     constants = np.einsum("ai,bj,ijk,ck->abc", rotation, rotation, g.structure_constants, rotation)
     h = mf.LieAlgebra.from_structure_constants((constants - constants.swapaxes(0, 1)) / 2, name="rotated so(4)")
-    assert module._rational_form(h)[0].rational_constants is None
+    assert module._rationally_scaled_algebra(h)[0].rational_constants is None
     assert h.casimir_count() == 2
     F, G = h.casimirs(2)
     assert str(F).startswith("mu1**2 + ")
@@ -251,7 +251,7 @@ def test_square_roots_are_scaled_away(g):
     constants = np.einsum("a,b,abc,c->abc", scale, scale, g.structure_constants, 1 / scale)
     h = mf.LieAlgebra.from_structure_constants(constants, name="scaled")
     assert h.rational_constants is None
-    assert module._rational_form(h)[0].rational_constants is not None
+    assert module._rationally_scaled_algebra(h)[0].rational_constants is not None
     for degree in (1, 2, 3):
         for F, G in zip(casimirs(g, degree), casimirs(h, degree), strict=True):
             weights = np.prod(scale**G.exponents, axis=1)
