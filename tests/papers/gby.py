@@ -67,7 +67,7 @@ def ledger() -> Order:
 @row("GBY", "§2 on a group", '`EulerPoincareClosedSystem`, `LieVariational("exp")`', "SciPy at $10^{-13}$")
 def group_order() -> Order:
     x0 = np.array([0.5, 0.3, -0.4, 0.2])
-    exact = solve_with_scipy(on_groups.forced, np.append(x0, np.zeros(3)), 2.0)
+    exact = solve_with_scipy(on_groups.forced_field, np.append(x0, np.zeros(3)), 2.0)
     return order(on_groups.forced_system(), x0, 2.0, exact, lt.LieVariational("exp"), laws=False)
 
 
@@ -87,7 +87,7 @@ def recursions(name: str) -> Difference:
     """Compare 500 steps of Case 1 with the printed recursion, with friction 10 and a long step."""
     h, system, method = 0.05, lt.models.mass_spring_gas(**CASES[1], friction=10.0), variational.SCHEMES[name]
     run = lt.integrate(system, method.state(system, 0.3, 0.31, 0.0, h), (0.0, 500 * h), h, method)
-    x, S = variational._printed(name, 0.3, 0.31, 0.0, 500, 5.0, 5.0, 10.0, 1.5 * 8.31446261815324, 300.0, h)
+    x, S = variational.printed_recursion(name, 0.3, 0.31, 0.0, 500, 5.0, 5.0, 10.0, 1.5 * 8.31446261815324, 300.0, h)
     expected = np.stack([x, S], axis=1).astype(float)
     return relative_difference(run.x[:, [0, 2]] / np.abs(expected).max(axis=0), expected / np.abs(expected).max(axis=0))
 

@@ -125,8 +125,8 @@ def thermodynamic_field():
 
 @row("SML", "Def. 3.1, (13), (14)", "`ChetaevSystem` by `MetriplecticGauss(2)`", "SciPy at $10^{-13}$")
 def chetaev_order() -> Order:
-    exact = solve_with_scipy(chetaev.by_hand, chetaev.X0, 2.0)
-    return order(chetaev.tangled(), chetaev.X0, 2.0, exact, lt.MetriplecticGauss(2))
+    exact = solve_with_scipy(chetaev.field_by_hand, chetaev.X0, 2.0)
+    return order(chetaev.chetaev_system(), chetaev.X0, 2.0, exact, lt.MetriplecticGauss(2))
 
 
 @row("SML", "Prop. 3.3", "`ChetaevSystem` with $\\eta_L$ is `ThermodynamicHerglotz`", "the equations by hand")
@@ -141,7 +141,7 @@ def proposition_3_3():
 @row("SML", "Def. 3.1 on a manifold", "`ChetaevSystem(space=...)` on a sphere", "the pendulum's friction")
 def chetaev_on_a_sphere():
     x = configurations.pendulum().system.samples(4)
-    return relative_difference(fields(configurations.constrained(), x), fields(configurations.pendulum().system, x))
+    return relative_difference(fields(configurations.constrained_pendulum(), x), fields(configurations.pendulum().system, x))
 
 
 @row("SML", "Props. 4.1, 4.3", "the energy in 400 steps; no step loses entropy", "its first value")
@@ -307,7 +307,7 @@ def porous_piston() -> Order:
 
 @row("SML", "§7, reactions", "`models.reaction_vessel` at rest", "the law of mass action")
 def mass_action() -> Difference:
-    end = lt.integrate(matter.vessel(), matter.mixed(), (0.0, 300.0), 0.1).x[-1]
+    end = lt.integrate(matter.vessel(), matter.gas_state(), (0.0, 300.0), 0.1).x[-1]
     T = np.asarray(matter.vessel().temperatures(end))[0]
     c, e, s = np.array([1.5, 1.5, 2.5]), np.array([0.0, 0.0, -2.0]), np.array([0.0, 0.0, 0.5])
     standard = e + (c + 1.0) * T - T * (c * np.log(T) + s)

@@ -144,8 +144,8 @@ def test_a_lattice_needs_few_programs(monkeypatch):
             magnet, up, (0.0, 0.025 * steps), 0.025, noise=lt.Fluctuations(seed=seed), save_every=steps, engine="array"
         )
         assert run.stats.newton_iterations == 0
-    programs_of_runs = [name for name in trace_counts if name in ("advance", "first_state", "_compiled")]
-    assert sorted(programs_of_runs) == ["_compiled", "advance", "first_state"]
+    programs_of_runs = [name for name in trace_counts if name in ("advance", "initial_run_state", "_map_over_points")]
+    assert sorted(programs_of_runs) == ["_map_over_points", "advance", "initial_run_state"]
 
 
 def _record_calls(call, names: list):
