@@ -191,7 +191,7 @@ class EngineTrajectory:
             self.state, h, n_saves, steps_per_save, noise
         )
         n_reached = int(np.asarray(is_reached).sum())
-        return SavedStates(*(np.asarray(values)[:n_reached] for values in (x, energy, entropy)))
+        return SavedStates(np.asarray(x)[:n_reached], np.stack([energy, entropy], axis=-1)[:n_reached])
 
 
 STEP_ENDS_PER_CALL = 64

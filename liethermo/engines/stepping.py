@@ -59,8 +59,7 @@ class SavedStates(NamedTuple):
     """States that a call of an engine saves, of those saves that were reached."""
 
     x: np.ndarray  # shape (saves, n)
-    energy: np.ndarray  # shape (saves,)
-    entropy: np.ndarray
+    energy_and_entropy: np.ndarray  # shape (saves, 2)
 
 
 REPORTED_FIELDS = tuple(

@@ -200,7 +200,7 @@ class Run:
 
     def _save_states_of_call(self, saved: SavedStates, first_step: int, steps_per_save: int, keep: bool) -> None:
         x, steps = saved.x, first_step + steps_per_save * np.arange(1, len(saved.x) + 1)
-        times, energies_entropies = self.schedule.times_after(steps), np.stack([saved.energy, saved.entropy], axis=1)
+        times, energies_entropies = self.schedule.times_after(steps), saved.energy_and_entropy
         if self.all_states is not None:
             self.all_states.append((times, x))
             is_saved = np.isin(steps, self.schedule.saved_step_counts)

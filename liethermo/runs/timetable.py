@@ -193,9 +193,8 @@ class StepSchedule:
     def times_after(self, steps: np.ndarray) -> np.ndarray:
         """Return the times after the given numbers of steps."""
         if len(self.segments) == 1:
-            return np.where(
-                steps >= self.n_steps, self.end, np.minimum(_time_after(self.start, steps, self.h), self.end)
-            )
+            times = np.minimum(_time_after(self.start, steps, self.h), self.end)
+            return np.where(steps >= self.n_steps, self.end, times)
         segment_index = np.clip(
             np.searchsorted(self._steps_before_segments, steps, side="right") - 1, 0, len(self.segments) - 1
         )

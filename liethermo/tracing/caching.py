@@ -6,7 +6,7 @@ import functools
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -77,26 +77,62 @@ def memoize(function: Callable[..., Result]) -> Callable[..., Result]:
     identity_cache: LRUCache[tuple[tuple, Result]] = LRUCache(MAX_CACHED_RESULTS, MAX_CACHED_BYTES)
     content_cache: LRUCache[Result] = LRUCache(MAX_CACHED_RESULTS, MAX_CACHED_BYTES)
 
-    def find_by_content(arguments: tuple, n_bytes: int) -> Result:
-        content = fingerprint(arguments) if n_bytes <= MAX_COMPARED_BYTES else None
-        compute = functools.partial(function, *arguments)
-        return compute() if content is None else content_cache.get_or_compute(content, compute, n_bytes)
+    def find_by_content(arguments: tuple, contents: tuple[_Content, ...], n_bytes: int) -> Result:
+        compute, keys = functools.partial(function, *arguments), tuple(content.key for content in contents)
+        if n_bytes > MAX_COMPARED_BYTES or None in keys:
+            return compute()
+        return content_cache.get_or_compute(keys, compute, n_bytes)
 
     @functools.wraps(function)
     def call(*arguments) -> Result:
         entry = identity_cache.get(identities := tuple(map(id, arguments)))
         if entry is not None:
             return entry[1]
-        leaves = jax.tree_util.tree_leaves(arguments)
-        if any(isinstance(leaf, np.ndarray | jax.core.Tracer) for leaf in leaves):
+        contents = tuple(map(_content_of, arguments))
+        if any(content.is_changeable for content in contents):
             return function(*arguments)
-        n_bytes = sum(leaf.nbytes for leaf in leaves if eqx.is_array(leaf))
+        n_bytes = sum(content.n_bytes for content in contents)
         # the entry holds the arguments, so that no other object takes their id
         return identity_cache.get_or_compute(
-            identities, lambda: (arguments, find_by_content(arguments, n_bytes)), n_bytes
+            identities, lambda: (arguments, find_by_content(arguments, contents, n_bytes)), n_bytes
         )[1]
 
     return call
+
+
+class _Content(NamedTuple):
+    """Content of an argument of a cached function.
+
+    Attributes
+    ----------
+    key : hashable
+        Its :func:`fingerprint`; None if it has none, or is too large to be compared.
+    n_bytes : int
+        Size of its arrays.
+    is_changeable : bool
+        Whether it contains NumPy arrays, which can change in place, or tracers.
+    """
+
+    key: Hashable | None
+    n_bytes: int
+    is_changeable: bool
+
+
+_content_cache: LRUCache[tuple[Any, _Content]] = LRUCache(MAX_CACHED_RESULTS, MAX_CACHED_BYTES)
+
+
+def _content_of(argument: Any) -> _Content:
+    """Return the content of an argument, cached by its identity."""
+    entry = _content_cache.get(id(argument))
+    if entry is not None:
+        return entry[1]
+    leaves = jax.tree_util.tree_leaves(argument)
+    if any(isinstance(leaf, np.ndarray | jax.core.Tracer) for leaf in leaves):
+        return _Content(None, 0, is_changeable=True)
+    n_bytes = sum(leaf.nbytes for leaf in leaves if eqx.is_array(leaf))
+    content = _Content(fingerprint(argument) if n_bytes <= MAX_COMPARED_BYTES else None, n_bytes, is_changeable=False)
+    # the entry holds the argument, so that no other object takes its id
+    return _content_cache.get_or_compute(id(argument), lambda: (argument, content), n_bytes)[1]
 
 
 def fingerprint(tree: Any) -> Any:

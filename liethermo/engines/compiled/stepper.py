@@ -188,7 +188,7 @@ class CompiledTrajectory:
             self._block[:] = block
             raise
         n_reached = int(self._step[0] - first_step) // steps_per_save
-        return SavedStates(out[:n_reached, :-2], out[:n_reached, -2], out[:n_reached, -1])
+        return SavedStates(out[:n_reached, :-2], out[:n_reached, -2:])
 
     def final_state(self, x, segments: Sequence[tuple[float, int]]) -> tuple[np.ndarray, float]:
         """Return the last state, shape (n,), and its status code, of a trajectory that starts at x.
