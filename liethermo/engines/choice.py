@@ -71,6 +71,11 @@ class EngineWithFallback:
         Number of steps that the run will take.
     noise : function of (first, steps, h), optional
         Returns the increments of ``steps`` steps of size h from step ``first`` on, shape (steps, increments).
+
+    Attributes
+    ----------
+    has_fallen_back : bool
+        Whether the array engine has taken over.
     """
 
     def __init__(
@@ -88,6 +93,7 @@ class EngineWithFallback:
         self.noise = noise
         self._engine: Engine = ArrayEngine(system, method)
         self._is_engine_chosen = False
+        self.has_fallen_back = False
 
     @property
     def name(self) -> str:
@@ -252,6 +258,7 @@ class EngineWithFallback:
         if self.requested_engine != "auto":
             raise error
         warn_of_fallback(error)
+        self.has_fallen_back = True
         self._engine = ArrayEngine(self.system, self.method)
 
 

@@ -92,7 +92,9 @@ class ConstraintSurface:
 
         def newton_step(d) -> tuple[jax.Array, jax.Array]:
             change, end = self._constraint_change(x, compensation, d), x + (compensation + d)
-            constraint_error = jnp.max(jnp.abs(change) / (self.space._constraint_scales(self._point(end)) + TINY))
+            constraint_error = jnp.max(
+                jnp.abs(change) / (self.space._constraint_rounding_scales(self._point(end)) + TINY)
+            )
             return d - self._correction_displacement(end, change), constraint_error
 
         def iterate(carry, _):
@@ -108,7 +110,7 @@ class ConstraintSurface:
             return jnp.where(self.is_in_space(x), x, jnp.nan), compensation
         point = self._point(x)
         values, slopes = jax.jvp(self.space._constraints, (point,), (self._point(compensation),))
-        scale, violation = self.space._constraint_scales(point), values + slopes
+        scale, violation = self.space._constraint_rounding_scales(point), values + slopes
         violation = jnp.where(
             jnp.abs(violation) > MIN_CORRECTED_RTOL * scale,
             jnp.clip(violation, -MAX_CORRECTED_RTOL * scale, MAX_CORRECTED_RTOL * scale),
@@ -146,7 +148,9 @@ class ConstraintSurface:
         end = self._point(x + (compensation + d))
         difference = self.space._constraints(end) - self.space._constraints(self._point(x + compensation))
         return jnp.where(
-            jnp.abs(difference - change) > QUADRATURE_RTOL * self.space._constraint_scales(end), difference, change
+            jnp.abs(difference - change) > QUADRATURE_RTOL * self.space._constraint_rounding_scales(end),
+            difference,
+            change,
         )
 
     def _correction_displacement(self, x, c) -> jax.Array:

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from manifolds.groups.maps import central_part, from_adjoint_cayley, inverse_dexp
+from manifolds.groups.maps import central_part, components_from_ad_cayley, inverse_dexp
 from manifolds.matrices.linear import solve_near_identity
 
 from ..errors import InputError
@@ -253,7 +253,7 @@ class WithAttitude(MethodWrapper):
         if len(xi) == 1:
             return group.adjoint_cayley_map(algebra, xi[0])
         R = jnp.eye(algebra.dim) + _collocation_increment(algebra.ad(xi))
-        x = from_adjoint_cayley(algebra, R) + central_part(algebra, gauss_tableau(len(xi)).b @ xi)
+        x = components_from_ad_cayley(algebra, R) + central_part(algebra, gauss_tableau(len(xi)).b @ xi)
         return group.adjoint_cayley_map(algebra, x)
 
     def _algebra_slopes(self, algebra, xi) -> jax.Array:

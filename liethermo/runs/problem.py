@@ -121,7 +121,7 @@ class Problem:
             return EngineWithFallback(system, self.method, requested_engine, planned_steps, noise_increments)
         key = requested_engine, planned_steps >= MIN_STEPS_TO_COMPILE
         engine = self._engines.by_request.get(key)
-        if engine is None:
+        if engine is None or engine.has_fallen_back:  # the next run tries again, and warns again
             engine = self._engines.by_request[key] = EngineWithFallback(
                 system, self.method, requested_engine, planned_steps
             )

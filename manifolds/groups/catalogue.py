@@ -33,7 +33,7 @@ def SO(n: int) -> MatrixGroup:
     group = MatrixGroup(
         f"SO({n})",
         catalogue.so(n),
-        closed.unitary_defect,
+        closed.special_unitary_defect,
         adjoint,
         log_map=rotation_log,
         adjoint_cayley_map=None,
@@ -78,15 +78,15 @@ def SU(n: int) -> MatrixGroup:
     group = MatrixGroup(
         f"SU({n})",
         catalogue.su(n),
-        closed.unitary_defect,
+        closed.special_unitary_defect,
         adjoint,
-        restore_map=closed.restore_unitary,
-        equations=closed.unitary_equations,
+        restore_map=closed.restore_special_unitary,
+        equations=closed.special_unitary_equations,
     )
     if n == 2:
         group = replace(group, exp_map=closed.su2_exp, log_map=closed.su2_log)
         return replace(
-            group, inverse_cayley_map=closed.su2_inverse_cayley, adjoint_cayley_map=closed.plane_adjoint_cayley
+            group, inverse_cayley_map=closed.su2_inverse_cayley, adjoint_cayley_map=closed.gl2_adjoint_cayley
         )
     return replace(group, cayley_map=None, adjoint_cayley_map=None)
 
@@ -96,7 +96,7 @@ def SL(n: int) -> MatrixGroup:
     """Return the group of real matrices of determinant 1. The Cayley map exists for n = 2 only, where SL(2) = Sp(1)."""
     group = MatrixGroup(f"SL({n})", catalogue.sl(n), closed.unimodular_defect, restore_map=closed.restore_unimodular)
     if n == 2:
-        return replace(group, adjoint_cayley_map=closed.plane_adjoint_cayley, equations=closed.symplectic_equations)
+        return replace(group, adjoint_cayley_map=closed.gl2_adjoint_cayley, equations=closed.symplectic_equations)
     return replace(group, cayley_map=None, adjoint_cayley_map=None, equations=closed.unimodular_equations)
 
 
@@ -108,7 +108,7 @@ def Sp(n: int) -> MatrixGroup:
         catalogue.sp(n),
         closed.symplectic_defect,
         closed.symplectic_inverse,
-        adjoint_cayley_map=closed.plane_adjoint_cayley if n == 1 else None,
+        adjoint_cayley_map=closed.gl2_adjoint_cayley if n == 1 else None,
         restore_map=closed.restore_symplectic,
         equations=closed.symplectic_equations,
     )
@@ -122,7 +122,7 @@ def GL(n: int) -> MatrixGroup:
         f"GL({n})",
         catalogue.gl(n),
         closed.invertible_defect,
-        adjoint_cayley_map={1: maps.cayley, 2: closed.plane_adjoint_cayley}.get(n),
+        adjoint_cayley_map={1: maps.cayley, 2: closed.gl2_adjoint_cayley}.get(n),
     )
 
 

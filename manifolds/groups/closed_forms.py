@@ -19,7 +19,7 @@ from ..matrices.stumpff import HALF_TURN_MARGIN, _root_or_nan, _squared_length, 
 
 
 def so2_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
-    """Return ``cos(t) I + sin(t)/t X``."""
+    """Return the rotation of the plane by the angle x: ``cos(x) I + sin(x)/x X`` with X = hat(x)."""
     z = _squared_length(x)[..., None]
     return stumpff(0, z) * np.eye(2) + stumpff(1, z) * algebra.hat(x)
 
@@ -33,32 +33,32 @@ def so2_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
 
 
 def so3_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
-    """Return the rotation by Rodrigues' formula ``I + c1 X + c2 X^2``."""
+    """Return the rotation about x by the angle ``|x|``, by Rodrigues' formula with X = hat(x)."""
     z, X = _squared_length(x)[..., None], algebra.hat(x)
     return jnp.eye(3) + stumpff(1, z) * X + stumpff(2, z) * X @ X
 
 
 def so3_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
     """Return the rotation vector from the quaternion, accurate at every angle; half turns use :func:`leading_sign`."""
-    w, v = _quaternion(g)
+    w, v = _scaled_quaternion(g)
     sign = jnp.where(_rotation_angle(w, v) > math.pi - HALF_TURN_MARGIN, leading_sign(v), 1.0)
     return 2 * angle_over_sine(_squared_length(v), sign * w) * sign * v
 
 
 def so3_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
-    """Return ``I + (X + X^2/2) / (1 + |x|^2/4)``."""
+    """Return the rotation ``I + (X + X^2/2) / (1 + |x|^2/4)``, the Cayley map of X = hat(x)."""
     X = algebra.hat(x)[..., :3, :3]
     return jnp.eye(3) + (X + X @ X / 2) / (1.0 + _squared_length(x[..., :3])[..., None] / 4)
 
 
 def so3_inverse_cayley(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
-    """Return ``2 tan(a/2)`` times the axis, for the angle a: ``2 v / w`` of the quaternion (w, v)."""
-    w, v = _quaternion(g)
+    """Return the components x with ``cayley(x) = g``: ``2 tan(a/2)`` times the axis, for the rotation angle a."""
+    w, v = _scaled_quaternion(g)
     return jnp.where(_rotation_angle(w, v) <= math.pi - HALF_TURN_MARGIN, 2 * v / w, jnp.nan)
 
 
 def se3_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
-    """Return the rotation by Rodrigues' formula with the translation ``(I + c2 W + c3 W^2) u``."""
+    """Return the rigid motion of the twist x = (w, u): Rodrigues' rotation and translation, with W = hat(w)."""
     z, u = _squared_length(x[..., :3])[..., None], x[..., 3:, None]
     W = algebra.hat(x)[..., :3, :3]
     rotation = jnp.eye(3) + stumpff(1, z) * W + stumpff(2, z) * W @ W
@@ -66,7 +66,7 @@ def se3_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
 
 
 def rigid_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
-    """Return the logarithm w of the rotation and ``(I - W/2 + d W^2) t`` with W = hat(w), in the plane and in space.
+    """Return the twist of a rigid motion in the plane or in space: the components (w, u) of its logarithm.
 
     ``d = (1 - (a/2) cot(a/2)) / a^2`` for the angle a; in Stumpff functions of the half angle, d = (c2 - c3) / (4 c1):
     no cancellation.
@@ -81,26 +81,26 @@ def rigid_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
 
 
 def se3_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
-    """Return the Cayley map R of the rotation, with the translation ``(I - W/2)^-1 u = (R u + u) / 2``."""
+    """Return the rigid motion of the Cayley map: rotation R and translation ``(R u + u) / 2`` for x = (w, u)."""
     rotation, u = so3_cayley(algebra, x), x[..., 3:, None]
     return affine_matrix(rotation, 0.5 * (rotation @ u + u))
 
 
 def se3_inverse_cayley(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
-    """Return the inverse Cayley map of the rotation, and ``(I - W/2) t``."""
+    """Return the twist (w, u) with ``cayley((w, u)) = g``, u being ``(I - W/2) t`` for the translation t."""
     w, t = so3_inverse_cayley(algebra, g[..., :3, :3]), g[..., :3, 3]
     return jnp.concatenate([w, t - jnp.cross(w, t) / 2], axis=-1)
 
 
 def su2_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
-    """Return ``cos(|x|/2) I + sin(|x|/2) X / (|x|/2)``."""
+    """Return the SU(2) matrix ``cos(|x|/2) I + sin(|x|/2) X / (|x|/2)`` with X = hat(x)."""
     z = _squared_length(x)[..., None] / 4
     return stumpff(0, z) * np.eye(2) + stumpff(1, z) * algebra.hat(x)
 
 
 def su2_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
     """Return the rotation vector of length below 2 pi: g is the unit quaternion ``w - i v . sigma``."""
-    w, v = _unit_quaternion(g)
+    w, v = _su2_quaternion(g)
     return jnp.where(
         _rotation_angle(w, v) <= 2 * (math.pi - HALF_TURN_MARGIN),
         2 * angle_over_sine(_squared_length(v), w) * v,
@@ -109,15 +109,15 @@ def su2_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
 
 
 def su2_inverse_cayley(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
-    """Return ``4 tan(a/4)`` times the axis, for the angle a: ``4 v / (1 + w)`` of the unit quaternion (w, v)."""
-    w, v = _unit_quaternion(g)
+    """Return the components x with ``cayley(x) = g``: ``4 tan(a/4)`` times the axis, for the angle a of g."""
+    w, v = _su2_quaternion(g)
     square = jnp.where(w > 0, 1.0, _squared_length(v))
     x = 4 * v * jnp.where(w > 0, 1 / jnp.where(w > 0, 1 + w, 1.0), (1 - w) / square)  # 1 + w may cancel
     return jnp.where(_rotation_angle(w, v) <= 2 * (math.pi - HALF_TURN_MARGIN), x, jnp.nan)
 
 
-def plane_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
-    """Return ``(I + X) / sqrt(det(I + X))`` for a traceless 2 x 2 matrix X, times the exponential of half the trace.
+def gl2_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
+    """Return the 2 x 2 matrix g with ``Ad(g) = cay(ad x)``: for trace 0 ``(I + X) / sqrt(det(I + X))``, X = hat(x).
 
     X^2 is a number, so that both sides of ``Ad(g) = cay(ad x)`` turn, or boost, by the same angle. NaN where
     det(I + X) <= 0.
@@ -130,7 +130,7 @@ def plane_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
 
 
 def so4_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
-    """Return ``(I + P)(I + M) / (|I + P| |I + M|)``, P and M the self-dual and the anti-self-dual part of X."""
+    """Return the rotation g of R^4 with ``Ad(g) = cay(ad x)``, by the self-dual and anti-self-dual parts of hat(x)."""
     X, identity = algebra.hat(x), jnp.eye(4)
     rows = [[X[..., i, j] for j in range(4)] for i in range(4)]
     dual = jnp.zeros_like(X)
@@ -142,21 +142,20 @@ def so4_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
 
 
 def se3_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
-    """Return Cayley's rotation with the translation ``(u + w × u / 2) / (1 + |w|^2/4)``: Cayley's map of the dual
-    rotation."""
+    """Return the rigid motion g with ``Ad(g) = cay(ad x)``: the Cayley map of the dual rotation."""
     w, u = x[..., :3], x[..., 3:]
     translation = (u + jnp.cross(w, u) / 2) / (1.0 + _squared_length(w) / 4)
     return affine_matrix(so3_cayley(algebra, x), translation[..., None])
 
 
 def heisenberg_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
-    """Return ``I + X + X^2/2``, exact because X^3 = 0; for the same reason it is the Cayley map too."""
+    """Return the exponential ``I + X + X^2/2`` of X = hat(x), exact as X^3 = 0, and so the Cayley map too."""
     X = algebra.hat(x)
     return jnp.eye(X.shape[-1]) + X + X @ X / 2
 
 
 def heisenberg_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
-    """Return ``N - N^2/2`` with N = g - I."""
+    """Return the components of the logarithm ``N - N^2/2``, with N = g - I."""
     N = g - np.eye(g.shape[-1])
     return algebra.vee(N - N @ N / 2)
 
@@ -164,7 +163,7 @@ def heisenberg_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
 # -- distance from the group, relative to the size of g ---------------------------------------------------------
 
 
-def unitary_defect(g) -> jax.Array:
+def special_unitary_defect(g) -> jax.Array:
     """Return the distance of ``g^H g`` from I, or of ``det g`` from 1 if that is larger."""
     return jnp.maximum(max_abs_entry(adjoint(g) @ g - np.eye(g.shape[-1])), jnp.abs(determinant(g) - 1.0))
 
@@ -173,7 +172,7 @@ def rigid_defect(g) -> jax.Array:
     """Return the distance of the linear part from the rotations, or of the last row from (0, …, 0, 1) if that is
     larger."""
     last_row_residual = jnp.abs(g[..., -1, :] - np.eye(g.shape[-1])[-1]).max(axis=-1)
-    return jnp.maximum(unitary_defect(g[..., :-1, :-1]), last_row_residual)
+    return jnp.maximum(special_unitary_defect(g[..., :-1, :-1]), last_row_residual)
 
 
 def unimodular_defect(g) -> jax.Array:
@@ -186,20 +185,20 @@ def unimodular_defect(g) -> jax.Array:
 
 
 def symplectic_defect(g) -> jax.Array:
-    """Return the distance of ``-J g^T J g`` from I, relative to the squared size of g."""
+    """Return the distance of ``g^* g`` from I relative to the squared size of g, with ``g^* = -J g^T J``."""
     scale = jnp.maximum(max_abs_entry(g) ** 2, 1.0)
     return max_abs_entry(symplectic_inverse(g) @ g - np.eye(g.shape[-1])) / scale
 
 
 def invertible_defect(g) -> jax.Array:
-    """Return 0 on the group, which is open; infinity if the condition number shows that g is singular to rounding."""
+    """Return 0 for an invertible matrix; infinity if its condition number makes it singular to rounding."""
     condition = g.shape[-1] * max_abs_entry(g) * max_abs_entry(inverse(g))
     return jnp.where(condition * np.finfo(float).eps < 1.0, 0.0, jnp.inf)
 
 
 def heisenberg_defect(g) -> jax.Array:
     """Return the distance from I of the entries outside the first row and the last column."""
-    return max_abs_entry(jnp.where(_coordinate_entries(g), 0.0, g - np.eye(g.shape[-1])))
+    return max_abs_entry(jnp.where(_coordinate_mask(g), 0.0, g - np.eye(g.shape[-1])))
 
 
 # -- equations: they vanish on the group, and products from the right with its elements do not change them ----------
@@ -231,7 +230,7 @@ def unimodular_equations(g) -> jax.Array:
     return determinant(g)[..., None] - 1.0
 
 
-def unitary_equations(g) -> jax.Array:
+def special_unitary_equations(g) -> jax.Array:
     """Return independent real and imaginary parts of ``g g^H - I``, and the imaginary part of ``det g``."""
     n = g.shape[-1]
     residual = g @ adjoint(g) - np.eye(n)
@@ -243,20 +242,20 @@ def unitary_equations(g) -> jax.Array:
 
 
 def rigid_inverse(g) -> jax.Array:
-    """Return ``[[R^T, -R^T t], [0, 1]]``."""
+    """Return the inverse rigid motion ``[[R^T, -R^T t], [0, 1]]`` of the rotation R and translation t of g."""
     rotation_transpose = g[..., :-1, :-1].swapaxes(-1, -2)
     return affine_matrix(rotation_transpose, -rotation_transpose @ g[..., :-1, -1:])
 
 
 def symplectic_inverse(g) -> jax.Array:
-    """Return ``-J g^T J``."""
+    """Return the inverse ``-J g^T J`` of a symplectic matrix, with J = [[0, I], [-I, 0]]."""
     n = g.shape[-1] // 2
     J = np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(n))
     return -J @ g.swapaxes(-1, -2) @ J
 
 
 def heisenberg_inverse(g) -> jax.Array:
-    """Return ``I - N + N^2`` with N = g - I."""
+    """Return the inverse of g, ``I - N + N^2`` with N = g - I."""
     N = g - np.eye(g.shape[-1])
     return np.eye(g.shape[-1]) - N + N @ N
 
@@ -269,7 +268,7 @@ def return_unchanged(g) -> jax.Array:
     return g
 
 
-def restore_unitary(g) -> jax.Array:
+def restore_special_unitary(g) -> jax.Array:
     """Return g after one Newton step towards orthonormal rows and determinant 1."""
     return restore_unimodular(newton_schulz_step(g))
 
@@ -285,13 +284,13 @@ def restore_unimodular(g) -> jax.Array:
 
 
 def restore_symplectic(g) -> jax.Array:
-    """Return ``g (3 I - g^* g) / 2`` with ``g^* = -J g^T J``, which squares the distance of ``g^* g`` from I."""
+    """Return g after one Newton step towards the symplectic matrices: ``g (3 I - g^* g) / 2``, g^* = -J g^T J."""
     return 1.5 * g - 0.5 * g @ (symplectic_inverse(g) @ g)
 
 
 def restore_heisenberg(g) -> jax.Array:
     """Return g with the entries outside the first row and the last column replaced by those of I."""
-    return jnp.where(_coordinate_entries(g), g, np.eye(g.shape[-1]))
+    return jnp.where(_coordinate_mask(g), g, np.eye(g.shape[-1]))
 
 
 def affine_matrix(linear: jax.Array, translation: jax.Array) -> jax.Array:
@@ -304,14 +303,14 @@ def affine_matrix(linear: jax.Array, translation: jax.Array) -> jax.Array:
 # -- helpers ------------------------------------------------------------------------------------------------------
 
 
-def _coordinate_entries(g) -> np.ndarray:
+def _coordinate_mask(g) -> np.ndarray:
     """Return a mask of the entries that are coordinates of the Heisenberg group, shape (m, m)."""
     mask = np.zeros(g.shape[-2:], dtype=bool)
     mask[0, 1:] = mask[:-1, -1] = True
     return mask
 
 
-def _quaternion(g: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _scaled_quaternion(g: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the quaternion (w, v) of a rotation, w >= 0, with a norm between 1/2 and 4.
 
     ``4 q q^T`` is linear in the rotation; its row with the largest diagonal entry gives q without cancellation
@@ -330,7 +329,7 @@ def _quaternion(g: jax.Array) -> tuple[jax.Array, jax.Array]:
     return q[..., :1], q[..., 1:]
 
 
-def _unit_quaternion(g: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _su2_quaternion(g: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the unit quaternion (w, v) of ``g = w - i v . sigma`` in SU(2)."""
     a, b, c, d = g[..., 0, 0], g[..., 0, 1], g[..., 1, 0], g[..., 1, 1]
     w, v = (a + d).real / 2, jnp.stack([-(b + c).imag, (c - b).real, (d - a).imag], axis=-1) / 2
@@ -338,5 +337,5 @@ def _unit_quaternion(g: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def _rotation_angle(w: jax.Array, v: jax.Array) -> jax.Array:
-    """Return twice the angle of the quaternion (w, v), of any norm, shape (..., 1)."""
+    """Return the rotation angle ``2 atan2(|v|, w)`` of the quaternion (w, v), of any norm, shape (..., 1)."""
     return 2 * jnp.arctan2(jnp.sqrt(_squared_length(v)), w)

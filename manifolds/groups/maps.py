@@ -22,7 +22,7 @@ _WEIGHTS = np.polynomial.legendre.leggauss(32)[1][16:]
 
 
 def exp(algebra: LieAlgebra, x) -> jax.Array:
-    """Return ``expm(hat(x))``."""
+    """Return the exponential ``expm(hat(x))`` of components x, a matrix of the group."""
     return expm(algebra.hat(x))
 
 
@@ -37,8 +37,7 @@ def dexp(algebra: LieAlgebra, x) -> jax.Array:
 
 
 def inverse_dexp(algebra: LieAlgebra, x, v, order: int) -> jax.Array:
-    """Return ``dexp(x)^-1 v`` to the order of x: ``sum_j (-1)^j B_j / j! ad_x^j v``, j <= order, B_j Bernoulli's
-    numbers.
+    """Return ``dexp(x)^-1 v`` by its series in ``ad x``, truncated after the power ``order``.
 
     This is the rate x' for which ``exp(x)`` turns at the velocity v, ``d exp(x) / dt = exp(x) hat(v)``.
     """
@@ -50,7 +49,7 @@ def inverse_dexp(algebra: LieAlgebra, x, v, order: int) -> jax.Array:
     return total
 
 
-def _bernoulli(count: int) -> list[float]:
+def _bernoulli_numbers(count: int) -> list[float]:
     """Return the coefficients B_0 … B_(count - 1), Bernoulli's numbers."""
     numbers = [Fraction(1)]
     for m in range(1, count):
@@ -59,7 +58,7 @@ def _bernoulli(count: int) -> list[float]:
     return list(map(float, numbers))
 
 
-_BERNOULLI = _bernoulli(26)
+_BERNOULLI = _bernoulli_numbers(26)
 """Bernoulli's numbers up to the largest order of :func:`inverse_dexp`."""
 
 
@@ -69,7 +68,7 @@ def cayley(algebra: LieAlgebra, x) -> jax.Array:
 
 
 def inverse_cayley(algebra: LieAlgebra, g) -> jax.Array:
-    """Return ``2 (g + I)^-1 (g - I)`` in components, NaN where g + I is singular."""
+    """Return the components of ``2 (g + I)^-1 (g - I)``, NaN where g + I is singular to rounding."""
     identity = np.eye(g.shape[-1])
     x = algebra.vee(2 * solve(g + identity, g - identity))
     condition = max_abs_entry(g + identity) * max_abs_entry(identity - algebra.hat(x) / 2) / 2  # 2 (g + I)^-1 = I - X/2
@@ -77,13 +76,12 @@ def inverse_cayley(algebra: LieAlgebra, g) -> jax.Array:
 
 
 def adjoint_cayley(algebra: LieAlgebra, x) -> jax.Array:
-    """Return ``exp(y)`` with ``exp(ad y) = cay(ad x)``, for any algebra with such a y; x keeps its component in the
-    centre.
+    """Return the group element g with ``Ad(g) = cay(ad x)``, for any algebra that has one.
 
     ``ad y = 2 artanh(A/2) = int_0^1 A (I - t^2 A^2/4)^-1 dt`` with A = ad(x), by Gauss quadrature: right to rounding
     where the eigenvalues of A are imaginary and below 3, or real and below 1.5; to 1e-13 at 4, and to 1e-11 at 1.8.
     """
-    adjoint, identity = _adjoint_representation(algebra), np.eye(algebra.dim)
+    adjoint, identity = _adjoint_algebra(algebra), np.eye(algebra.dim)
     A = adjoint.hat(x)[..., None, :, :]
     values = solve_near_identity(
         identity - _NODES[:, None, None] ** 2 / 4 * (A @ A), A + jnp.zeros((len(_NODES), 1, 1))
@@ -91,21 +89,22 @@ def adjoint_cayley(algebra: LieAlgebra, x) -> jax.Array:
     return exp(algebra, adjoint.vee((_WEIGHTS[:, None, None] * values).sum(axis=-3)) + central_part(algebra, x))
 
 
-def from_adjoint_cayley(algebra: LieAlgebra, g) -> jax.Array:
-    """Return the components x, none in the centre, with ``cay(ad x) = g``, for a matrix g near I, shape (..., dim,
-    dim)."""
+def components_from_ad_cayley(algebra: LieAlgebra, ad_cayley_matrix) -> jax.Array:
+    """Return the components x, none in the centre, with ``cay(ad x)`` a given matrix near I."""
     identity = np.eye(algebra.dim)
-    return _adjoint_representation(algebra).vee(2 * solve_near_identity(g + identity, g - identity))
+    return _adjoint_algebra(algebra).vee(
+        2 * solve_near_identity(ad_cayley_matrix + identity, ad_cayley_matrix - identity)
+    )
 
 
 def central_part(algebra: LieAlgebra, x) -> jax.Array:
-    """Return the component of x in the centre of the algebra, without its orthogonal complement."""
-    adjoint = _adjoint_representation(algebra)
+    """Return the projection of x on the centre of the algebra, as components, shape (..., dim)."""
+    adjoint = _adjoint_algebra(algebra)
     return x - adjoint.vee(adjoint.hat(x))
 
 
 @cache
-def _adjoint_representation(algebra: LieAlgebra) -> LieAlgebra:
+def _adjoint_algebra(algebra: LieAlgebra) -> LieAlgebra:
     """Return the algebra with the matrices ad(e_a); its ``vee`` returns components with none in the centre."""
     constants = algebra.structure_constants
     return LieAlgebra(constants, name=f"ad({algebra.name})", basis=constants.swapaxes(1, 2))
@@ -135,7 +134,7 @@ def log(algebra: LieAlgebra, g) -> jax.Array:
         s, _, is_converged = state
         return is_converged & (_one_norm(s - identity) > 0.25)
 
-    def halve(state):
+    def take_square_root(state):
         s, halvings, is_converged = state
         root, _, success = _square_root(s)
         needs_root = is_far(state)
@@ -147,7 +146,7 @@ def log(algebra: LieAlgebra, g) -> jax.Array:
 
     log_scale = jnp.log(jnp.abs(determinant(g)))[..., None, None] / g.shape[-1]
     start = (g / jnp.exp(log_scale), jnp.zeros(batch), jnp.ones(batch, dtype=bool))
-    s, halvings, is_converged = jax.lax.while_loop(lambda state: is_far(state).any(), halve, start)
+    s, halvings, is_converged = jax.lax.while_loop(lambda state: is_far(state).any(), take_square_root, start)
     Z = solve(s + identity, s - identity)
     Z2, series = Z @ Z, jnp.zeros_like(g)
     for k in reversed(range(9)):  # |Z| < 1/7, so the first term left out is below rounding

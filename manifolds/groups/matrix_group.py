@@ -109,7 +109,7 @@ class MatrixGroup:
 
     def __post_init__(self) -> None:
         if getattr(self.defect, "__module__", "") != closed.__name__:  # those are known to take batches
-            object.__setattr__(self, "defect", _batch_defect(self.defect, self.name, self.algebra._require_basis()))
+            object.__setattr__(self, "defect", _batched_defect(self.defect, self.name, self.algebra._require_basis()))
 
     @property
     def dim(self) -> int:
@@ -386,8 +386,7 @@ class MatrixGroup:
         )
 
     def cayley_is_adjoint(self) -> bool:
-        """Return True if :meth:`cayley` is :meth:`adjoint_cayley`, that is ``Ad(cayley(x)) = cay(ad(x))``: SO(3) and
-        SE(2)."""
+        """Return True if :meth:`cayley` has ``Ad(cayley(x)) = cay(ad(x))``, as in SO(3) and SE(2)."""
         if self.cayley_map is None or self.cayley_map is self.adjoint_cayley_map or self in _catalogued_groups:
             return self.cayley_map is self.adjoint_cayley_map and self._is_map_in_group("cayley")
         return replace(self, adjoint_cayley_map=self.cayley_map)._is_map_in_group("adjoint_cayley")
@@ -434,7 +433,7 @@ class _BatchedFunction:
         return jnp.vectorize(self.function, signature="(m,n)->()")(g)
 
 
-def _batch_defect(defect: Callable, name: str, basis: np.ndarray) -> Callable:
+def _batched_defect(defect: Callable, name: str, basis: np.ndarray) -> Callable:
     """Return the defect of a group as a function of batches; LieAlgebraError if it maps no matrix to a number."""
 
     def shape(batch: tuple[int, ...]) -> tuple[int, ...] | None:
@@ -494,7 +493,10 @@ def _map_defect(group: MatrixGroup, kind: str) -> float:
     """Compute :meth:`MatrixGroup.map_defect` once for each group and map."""
     algebra, x = group.algebra, np.random.default_rng(0).standard_normal((4, group.dim))
     x /= np.linalg.norm(np.einsum("...a,aij->...ij", x, algebra._require_basis()), axis=(-2, -1))[:, None]
-    if kind == "adjoint_cayley" and not (residual := _automorphism_residual(algebra, x)) <= MAP_DEFECT_TOLERANCE:
+    if (
+        kind == "adjoint_cayley"
+        and not (residual := _ad_cayley_automorphism_residual(algebra, x)) <= MAP_DEFECT_TOLERANCE
+    ):
         return residual
     group_map = getattr(group, f"{kind}_map") or getattr(maps, kind)
 
@@ -513,7 +515,7 @@ def _map_defect(group: MatrixGroup, kind: str) -> float:
         return float(np.nan_to_num(np.asarray(residuals(x)), nan=np.inf).max())
 
 
-def _automorphism_residual(algebra: LieAlgebra, x: np.ndarray) -> float:
+def _ad_cayley_automorphism_residual(algebra: LieAlgebra, x: np.ndarray) -> float:
     """Return how far ``cay(ad x)`` is from preserving brackets, relative to its size; adjoint actions preserve them."""
     C, identity = algebra.structure_constants, np.eye(algebra.dim)
     ad = np.einsum("abc,...a->...cb", C, x)
@@ -529,8 +531,8 @@ def _principal_log(group: MatrixGroup, g):
 
 
 @_principal_log.defjvp
-def _log_derivative(group: MatrixGroup, primals, tangents):
-    """Solve ``dexp(x) x' = vee(g^-1 g')``, the derivative of ``exp(x) = g``."""
+def _log_jvp(group: MatrixGroup, primals, tangents):
+    """Return the logarithm and its derivative along ``tangents``, the solution of ``dexp(x) x' = vee(g^-1 g')``."""
     (g,), (dg,) = primals, tangents
     x = _principal_log(group, g)
     velocity = group.algebra.vee(group.inverse_map(g) @ dg)

@@ -17,21 +17,21 @@ SUBALGEBRA_TOLERANCE = 1e-10
 """Largest distance of a bracket of unit vectors from the subalgebra."""
 
 
-def subalgebra_basis(group: MatrixGroup, stabilizer) -> np.ndarray:
+def subalgebra_basis(group: MatrixGroup, spanning_matrices) -> np.ndarray:
     """Return orthonormal components of a basis of the subalgebra that matrices span, shape (k, dim of the group).
 
     Parameters
     ----------
     group : MatrixGroup
         The basis of its algebra must be orthogonal as matrices, all of one norm, as for so(n) and su(n).
-    stabilizer : array, shape (k, n, n)
+    spanning_matrices : array, shape (k, n, n)
 
     Raises
     ------
     ParameterError
         If the matrices are dependent, not in the algebra of the group, or do not span a subalgebra.
     """
-    basis, matrices = group.algebra._require_basis(), np.asarray(numeric_array(stabilizer, "stabilizer"))
+    basis, matrices = group.algebra._require_basis(), np.asarray(numeric_array(spanning_matrices, "stabilizer"))
     matrices = matrices.reshape(-1, *basis.shape[1:]) if matrices.size == 0 else matrices
     if matrices.shape[1:] != basis.shape[1:]:
         n = group.matrix_size
@@ -73,22 +73,24 @@ _MAX_NEWTON_STEPS = 30
 """Largest number of iterations of Newton's method."""
 
 
-def factor_element(group: MatrixGroup, m: np.ndarray, h: np.ndarray, element, reach: float):
-    """Solve ``exp(c m) exp(b h) = element`` for c and b by Newton's method; return c, shape (len(m),).
+def first_factor_coordinates(
+    group: MatrixGroup, horizontal_rows: np.ndarray, stabilizer_rows: np.ndarray, element, max_length: float
+):
+    """Return c, shape (k,), with ``exp(c horizontal_rows) exp(b stabilizer_rows) = element``, by Newton's method.
 
     Parameters
     ----------
-    m, h : array, shape (k, dim)
+    horizontal_rows, stabilizer_rows : array, shape (k, dim)
         Complements of each other in the algebra; h spans a subalgebra.
     element : array, shape (n, n)
         Element of the group.
-    reach : float
+    max_length : float
         Length that c must not reach; the result is NaN if it does, or if Newton's method does not converge.
     """
-    d = len(m)
+    d = len(horizontal_rows)
 
     def factors(z):
-        return [group.exp_map(group.algebra, part) for part in (z[:d] @ m, z[d:] @ h)]
+        return [group.exp_map(group.algebra, part) for part in (z[:d] @ horizontal_rows, z[d:] @ stabilizer_rows)]
 
     def residual(z, element):
         a, b = factors(z)
@@ -117,14 +119,14 @@ def factor_element(group: MatrixGroup, m: np.ndarray, h: np.ndarray, element, re
         is_unfinished = lambda state: (state[1] > 1e-8) & (state[2] < _MAX_NEWTON_STEPS)  # noqa: E731
         z, change, _ = jax.lax.while_loop(is_unfinished, newton_step, (start, jnp.inf, 0))
         is_solution = (
-            ((z[:d] ** 2).sum() < reach**2) & (change <= 1e-8) & (jnp.abs(residual(z, element)).max() <= 1e-10)
+            ((z[:d] ** 2).sum() < max_length**2) & (change <= 1e-8) & (jnp.abs(residual(z, element)).max() <= 1e-10)
         )
         return jnp.where(is_solution, z, jnp.nan)
 
     velocity = group.algebra.vee(element - group.inverse_map(element)) / 2.0
     z = jax.lax.custom_root(  # its derivatives follow from the implicit function theorem
         lambda z: residual_in_algebra(z, element),
-        jax.lax.stop_gradient(jnp.concatenate([m @ velocity, h @ velocity])),
+        jax.lax.stop_gradient(jnp.concatenate([horizontal_rows @ velocity, stabilizer_rows @ velocity])),
         newton_solve,
         lambda linear, b: solve(jax.jacfwd(linear)(jnp.zeros_like(b)), b[:, None])[:, 0],
     )

@@ -191,7 +191,7 @@ def spd_log(w, excess) -> jax.Array:
 
 
 @spd_log.defjvp
-def _log_derivative(primals, tangents):
+def _log_jvp(primals, tangents):
     x, dw = spd_log(*primals), tangents[0]
     values, vectors = eigh(jax.lax.stop_gradient(x))
     mean, half = (values[..., :, None] + values[..., None, :]) / 2, (values[..., :, None] - values[..., None, :]) / 2

@@ -104,7 +104,7 @@ class Retraction(ABC):
         """
         x, y = self.space._checked_point(x, "x"), self.space._checked_point(y, "y")
         z, v = run_kernel(self, "_base_and_vector", (), x, y)
-        self.space._raise_if_nan(v, len(self.space.shape), x, y, f"the inverse of {type(self).__name__}")
+        self.space._raise_if_not_finite(v, len(self.space.shape), x, y, f"the inverse of {type(self).__name__}")
         return z, v / h
 
     def reach(self, z, v, h=1.0) -> jax.Array:
@@ -122,7 +122,7 @@ class Retraction(ABC):
     def _reach(self, z, v): ...
 
     def _checked_step(self, z, v, h):
-        z, v = self.space._checked_vectors(z, "z", v=v)
+        z, v = self.space._checked_point_and_vectors(z, "z", v=v)
         return z, h * v
 
     def __repr__(self) -> str:
@@ -163,7 +163,7 @@ class Chart(Retraction):
 
     def differential(self, z, v, w) -> jax.Array:
         """Return the derivative of ``v -> point(z, v)`` along w, a tangent vector at ``point(z, v)``."""
-        return run_kernel(self, "_differential", (), *self.space._checked_vectors(z, "z", v=v, w=w))
+        return run_kernel(self, "_differential", (), *self.space._checked_point_and_vectors(z, "z", v=v, w=w))
 
     def carry(self, z, v, u) -> jax.Array:
         """Carry the tangent vector u from z to ``x = point(z, v)``, such that ``point(x, -carry(z, v, v))`` is z.
@@ -172,7 +172,7 @@ class Chart(Retraction):
         With
         ``w = carry(z, v, u)``, ``carry(x, -carry(z, v, v), w)`` is u again.
         """
-        return run_kernel(self, "_carry", (), *self.space._checked_vectors(z, "z", v=v, u=u))
+        return run_kernel(self, "_carry", (), *self.space._checked_point_and_vectors(z, "z", v=v, u=u))
 
     @abstractmethod
     def _point(self, z, v):

@@ -14,7 +14,7 @@ from ..errors import ComponentError, DomainError, OffManifoldError, ShapeError
 from ..groups.matrix_group import MEMBERSHIP_TOLERANCE
 from .maps import SpaceMaps
 
-__all__ = ["CUT_MARGIN", "MEMBERSHIP_TOLERANCE", "Space", "register", "register_operation", "registered_spaces"]
+__all__ = ["CUT_MARGIN", "MEMBERSHIP_TOLERANCE", "Space", "register", "register_result_class", "registered_spaces"]
 
 CUT_MARGIN = 1e-8
 """Smallest relative distance from the cut locus at which a logarithm is taken; below, rounding decides its
@@ -88,11 +88,11 @@ class Space(SpaceMaps):
             If x is off the space; the message names the residual and the tolerance. Not checked under tracing.
         ShapeError, ComponentError
         """
-        return self._checked_point(self.project(x) if project else self._point_array(x, "x"), "x", tolerance)
+        return self._checked_point(self.project(x) if project else self._ambient_array(x, "x"), "x", tolerance)
 
     def residual(self, x) -> jax.Array:
         """Return the distance from the space relative to the size of x, to the order of magnitude, shape (...)."""
-        return self._call_compiled("_residual", self._point_array(x, "x"))
+        return self._call_compiled("_residual", self._ambient_array(x, "x"))
 
     def belongs(self, x, tolerance: float = 1e-10) -> jax.Array:
         """Return True for each point with ``residual(x) <= tolerance``, shape (...)."""
@@ -106,7 +106,7 @@ class Space(SpaceMaps):
         DomainError
             If there is none, as for the centre of a sphere.
         """
-        x = self._point_array(x, "x")
+        x = self._ambient_array(x, "x")
         y = self._call_compiled("_project", x)
         if (index := self._first_nan_index(y, len(self.shape))) is not None:
             raise DomainError(f"{self.name}: no point of the space is nearest to x{format_index(index)}")
@@ -125,7 +125,7 @@ class Space(SpaceMaps):
 
     def to_vector(self, x) -> jax.Array:
         """Return points or tangent vectors as flat real arrays, shape (..., size): real parts, then imaginary parts."""
-        x = self._point_array(x, "x")
+        x = self._ambient_array(x, "x")
         rows = x.reshape(*x.shape[: x.ndim - len(self.shape)], -1)
         return rows if self.dtype.kind != "c" else jnp.concatenate([rows.real, rows.imag], axis=-1)
 
@@ -145,7 +145,7 @@ class Space(SpaceMaps):
     def project_tangent(self, x, w) -> jax.Array:
         """Return the tangent vector at x nearest to the ambient array w in the Euclidean norm, shape ``(...,
         *shape)``."""
-        return self._call_compiled("_project_tangent", self._checked_point(x, "x"), self._point_array(w, "w"))
+        return self._call_compiled("_project_tangent", self._checked_point(x, "x"), self._ambient_array(w, "w"))
 
     def random_tangent(self, key_or_seed, x, scale: float = 1.0) -> jax.Array:
         """Return random tangent vectors at x, with normal components of standard deviation ``scale`` in the frame."""
@@ -159,7 +159,7 @@ class Space(SpaceMaps):
 
     def coordinates(self, x, v) -> jax.Array:
         """Return the components of a tangent vector in :meth:`frame`, shape (..., dim)."""
-        return self._call_compiled("_coordinates", *self._checked_vectors(x, v=v))
+        return self._call_compiled("_coordinates", *self._checked_point_and_vectors(x, v=v))
 
     def from_coordinates(self, x, c) -> jax.Array:
         """Return the tangent vector at x with the components c, shape (..., dim), in :meth:`frame`."""
@@ -172,15 +172,15 @@ class Space(SpaceMaps):
 
     def inner(self, x, u, v) -> jax.Array:
         """Return the inner product of two tangent vectors at x, shape (...)."""
-        return self._call_compiled("_inner", *self._checked_vectors(x, u=u, v=v))
+        return self._call_compiled("_inner", *self._checked_point_and_vectors(x, u=u, v=v))
 
     def norm(self, x, v) -> jax.Array:
         """Return the length of a tangent vector, shape (...); its derivative at v = 0 is taken as 0."""
-        return self._call_compiled("_norm", *self._checked_vectors(x, v=v))
+        return self._call_compiled("_norm", *self._checked_point_and_vectors(x, v=v))
 
     def flat(self, x, v) -> jax.Array:
         """Return the covector ``w -> inner(x, v, w)``, as an ambient array, shape ``(..., *shape)``."""
-        return self._call_compiled("_flat", *self._checked_vectors(x, v=v))
+        return self._call_compiled("_flat", *self._checked_point_and_vectors(x, v=v))
 
     def sharp(self, x, alpha) -> jax.Array:
         """Return the tangent vector v with ``inner(x, v, w) = Re sum(alpha * w)`` for all w; dH gives the gradient of
@@ -192,7 +192,7 @@ class Space(SpaceMaps):
         alpha : array, shape ``(..., *shape)``
             An ambient covector; only its action on tangent vectors matters.
         """
-        return self._call_compiled("_sharp", self._checked_point(x, "x"), self._point_array(alpha, "alpha"))
+        return self._call_compiled("_sharp", self._checked_point(x, "x"), self._ambient_array(alpha, "alpha"))
 
     def isotropic(self, x, w) -> jax.Array:
         """Return the tangent vector ``R w``, with ``R R^T`` the inverse of the metric; normal numbers w give isotropic
@@ -232,7 +232,7 @@ class Space(SpaceMaps):
     def exp(self, x, v) -> jax.Array:
         """Return the point at time 1 of the geodesic from x with velocity v, shape ``(..., *shape)``: Riemannian
         exponential."""
-        return self._call_compiled("_exp", *self._checked_vectors(x, v=v))
+        return self._call_compiled("_exp", *self._checked_point_and_vectors(x, v=v))
 
     def log(self, x, y) -> jax.Array:
         """Return the v of least length with ``exp(x, v) = y``, a tangent vector at x: the Riemannian logarithm.
@@ -250,7 +250,7 @@ class Space(SpaceMaps):
         """
         x, y = self._checked_point(x, "x"), self._checked_point(y, "y")
         v = self._call_compiled("_log", x, y)
-        self._raise_if_nan(v, len(self.shape), x, y, "log")
+        self._raise_if_not_finite(v, len(self.shape), x, y, "log")
         return v
 
     def distance(self, x, y) -> jax.Array:
@@ -268,7 +268,7 @@ class Space(SpaceMaps):
         """
         x, y = self._checked_point(x, "x"), self._checked_point(y, "y")
         d = self._distance(x, y)
-        self._raise_if_nan(d, 0, x, y, "distance")
+        self._raise_if_not_finite(d, 0, x, y, "distance")
         return d
 
     def squared_distance(self, x, y) -> jax.Array:
@@ -281,7 +281,7 @@ class Space(SpaceMaps):
         """
         x, y = self._checked_point(x, "x"), self._checked_point(y, "y")
         square = self._squared_distance(x, y)
-        self._raise_if_nan(square, 0, x, y, "squared_distance")
+        self._raise_if_not_finite(square, 0, x, y, "squared_distance")
         return square
 
     def midpoint(self, x, y) -> jax.Array:
@@ -289,7 +289,7 @@ class Space(SpaceMaps):
         :meth:`log`."""
         x, y = self._checked_point(x, "x"), self._checked_point(y, "y")
         z = self._midpoint(x, y)
-        self._raise_if_nan(z, len(self.shape), x, y, "midpoint")
+        self._raise_if_not_finite(z, len(self.shape), x, y, "midpoint")
         return z
 
     def transport(self, x, v, u) -> jax.Array:
@@ -300,21 +300,20 @@ class Space(SpaceMaps):
         array, shape ``(..., *shape)``
             A tangent vector at ``exp(x, v)``. Inner products are kept.
         """
-        return self._call_compiled("_transport", *self._checked_vectors(x, v=v, u=u))
+        return self._call_compiled("_transport", *self._checked_point_and_vectors(x, v=v, u=u))
 
     def reach(self, x, v) -> jax.Array:
-        """Return the length of v over the injectivity radius, shape (...); below 1, ``log`` recovers v from ``exp(x,
-        v)``.
+        """Return the length of v divided by the injectivity radius; below 1, ``log`` recovers v from ``exp(x, v)``.
 
         It is defined under tracing too, where it tells if a step stays in the domain. In a product it is the largest
         over
         the factors.
         """
-        return self._call_compiled("_reach", *self._checked_vectors(x, v=v))
+        return self._call_compiled("_reach", *self._checked_point_and_vectors(x, v=v))
 
     # -- checks ---------------------------------------------------------------------------------------------------
 
-    def _point_array(self, x, label: str) -> jax.Array:
+    def _ambient_array(self, x, label: str) -> jax.Array:
         """Return ``x`` as an array with the shape and dtype of points."""
         array = jnp.asarray(numeric_array(x, label))
         if jnp.iscomplexobj(array) and self.dtype.kind != "c":
@@ -329,7 +328,7 @@ class Space(SpaceMaps):
         return array.astype(self.dtype)
 
     def _checked_point(self, x, label: str, tolerance: float = MEMBERSHIP_TOLERANCE) -> jax.Array:
-        x = self._point_array(x, label)
+        x = self._ambient_array(x, label)
         if is_traced(x):
             return x
         with jax.ensure_compile_time_eval():  # x may be a constant in a program being traced
@@ -348,11 +347,11 @@ class Space(SpaceMaps):
     def _why_off_space(self, x: np.ndarray, residual: float) -> str:
         return f"residual {residual:.3g}" if np.isfinite(x).all() else "residual nan, as it is not finite"
 
-    def _checked_vectors(self, x, name: str = "x", **vectors) -> list[jax.Array]:
+    def _checked_point_and_vectors(self, x, name: str = "x", **vectors) -> list[jax.Array]:
         """Return the point and the vectors, after checking that each vector is tangent at the point."""
         x, arrays = self._checked_point(x, name), []
         for label, v in vectors.items():
-            v = self._point_array(v, label)
+            v = self._ambient_array(v, label)
             if not is_traced(x, v):
                 self._check_tangent(x, name, v, label)
             arrays.append(v)
@@ -375,7 +374,7 @@ class Space(SpaceMaps):
         scale = jnp.maximum(jnp.abs(v).max(axis=axes, initial=0.0), 1.0)
         return jnp.abs(v - self._project_tangent(x, v)).max(axis=axes, initial=0.0) / scale
 
-    def _raise_if_nan(self, value, n_core_axes: int, x, y, map_name: str) -> None:
+    def _raise_if_not_finite(self, value, n_core_axes: int, x, y, map_name: str) -> None:
         if (index := self._first_nan_index(value, n_core_axes)) is not None:
             batch = value.shape[: value.ndim - n_core_axes]
             x, y = (np.asarray(jnp.broadcast_to(a, (*batch, *self.shape))[index]) for a in (x, y))
@@ -401,20 +400,20 @@ class Space(SpaceMaps):
         return self._power(self, count)
 
     _product: ClassVar[Callable[..., Space]]
-    """Class of products of spaces, set by :func:`register_operation`, since it is defined after this class."""
+    """Class of products of spaces, set by :func:`register_result_class`, since it is defined after this class."""
 
     _power: ClassVar[Callable[..., Space]]
-    """Class of powers of spaces, set by :func:`register_operation`, since it is defined after this class."""
+    """Class of powers of spaces, set by :func:`register_result_class`, since it is defined after this class."""
 
 
-def register_operation(operation: str) -> Callable[[type[Space]], type[Space]]:
+def register_result_class(operation: str) -> Callable[[type[Space]], type[Space]]:
     """Return a decorator that makes a class the result of an operation, ``"_product"`` or ``"_power"``, of spaces."""
 
-    def set_operation(space_class: type[Space]) -> type[Space]:
+    def set_result_class(space_class: type[Space]) -> type[Space]:
         setattr(Space, operation, space_class)
         return space_class
 
-    return set_operation
+    return set_result_class
 
 
 def random_key(key_or_seed):

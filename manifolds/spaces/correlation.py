@@ -60,19 +60,19 @@ class Correlation(PositiveDefinite):
     def _constraints(self, x):
         return self.to_vector(self._constraint_residual(x))
 
-    def _minimal_correction(self, x, c):
-        return self.from_vector(c)
+    def _minimal_correction(self, x, constraint_change):
+        return self.from_vector(constraint_change)
 
     _tangential_part = tangential_part_by_projection
 
-    def _constraint_scales(self, x):
+    def _constraint_rounding_scales(self, x):
         return self.to_vector(jnp.abs(x))
 
     @property
-    def _n_normals(self):
+    def _n_normal_numbers(self):
         return 2 * self.n**2
 
-    def _point_from_normals(self, w):
+    def _point_from_normal_numbers(self, w):
         rows = w.reshape(*w.shape[:-1], self.n, 2 * self.n)
         return self._project(rows @ rows.swapaxes(-1, -2))
 

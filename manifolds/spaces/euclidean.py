@@ -48,13 +48,13 @@ class Euclidean(Space):
     def _constraints(self, x):
         return jnp.zeros((*x.shape[: x.ndim - len(self.shape)], 0))
 
-    def _minimal_correction(self, x, c):
+    def _minimal_correction(self, x, constraint_change):
         return jnp.zeros_like(x)
 
     def _tangential_part(self, x, w):
         return w
 
-    def _constraint_scales(self, x):
+    def _constraint_rounding_scales(self, x):
         return self._constraints(x)
 
     def _project_tangent(self, x, w):

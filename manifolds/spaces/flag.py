@@ -53,5 +53,5 @@ class Flag(Homogeneous):
         ----------
         x : array, shape (..., n, n)
         """
-        frames = jnp.split(self._point_array(x, "x"), np.cumsum(self.steps)[:-1], axis=-1)
+        frames = jnp.split(self._ambient_array(x, "x"), np.cumsum(self.steps)[:-1], axis=-1)
         return jnp.stack([frame @ frame.swapaxes(-1, -2) for frame in frames], axis=-3)

@@ -68,7 +68,9 @@ def from_geomstats(space, injectivity_radius: float | None = None) -> GeomstatsS
         raise SpaceError(f"{_name(space)} has no metric: equip it with one, space.equip_with_metric(...)")
     if injectivity_radius is not None and not injectivity_radius > 0.0:
         raise ParameterError(f"injectivity_radius must be positive, got {injectivity_radius!r}")
-    bridge = GeomstatsSpace(space, _known_radius(space) if injectivity_radius is None else injectivity_radius)
+    bridge = GeomstatsSpace(
+        space, _constant_injectivity_radius(space) if injectivity_radius is None else injectivity_radius
+    )
     for kernel in ("exp", "log", "inner", "project_tangent"):
         bridge._require_kernel(kernel)
     return bridge
@@ -86,7 +88,7 @@ class GeomstatsSpace(Space):
     is_smooth = False
 
     def __init__(self, source, radius: float | None):
-        self.source, self._radius = source, radius
+        self.source, self._injectivity_radii = source, radius
         self.metric = type(source.metric).__name__
         self._available_kernels: set[str] = set()
 
@@ -114,8 +116,8 @@ class GeomstatsSpace(Space):
         return jnp.asarray(points, dtype=jnp.float64).reshape(*size, *self.shape)
 
     def injectivity_radius(self, x=None):
-        if self._radius is not None:
-            return self._radius
+        if self._injectivity_radii is not None:
+            return self._injectivity_radii
         x = self.source.random_point() if x is None else x
         return float(self._evaluate_on_host("radius", np.asarray(x, dtype=float)[None])[0])
 
@@ -147,14 +149,14 @@ class GeomstatsSpace(Space):
         return self._call_kernel("transport", x, v, u)
 
     def _flat(self, x, v):
-        """Return the inner products with the projected axes."""
+        """Return the covector of v: its inner products with the projected axes, shape ``(..., *shape)``."""
         x, v = self._with_frame_axis(x), self._with_frame_axis(v)
-        values = self._inner(x, v, self._project_tangent(x, self._axis_vectors))
+        values = self._inner(x, v, self._project_tangent(x, self._ambient_basis))
         return values.reshape(*values.shape[:-1], *self.shape)
 
     def _frame(self, x):
         """Return Gram-Schmidt vectors of the projections of ``dim`` axes, which are chosen for independence."""
-        axis_vectors = jnp.asarray(self._axis_vectors)[_independent_axes(self, x)]
+        axis_vectors = jnp.asarray(self._ambient_basis)[_independent_axes(self, x)]
         base = self._with_frame_axis(x)
         vectors = self._project_tangent(base, axis_vectors)
         left_vectors, right_vectors = jnp.expand_dims(vectors, -2 - len(self.shape)), self._with_frame_axis(vectors)
@@ -166,7 +168,7 @@ class GeomstatsSpace(Space):
         return self._inner(self._with_frame_axis(x), self._frame(x), self._with_frame_axis(v))
 
     def _reach(self, x, v):
-        radius = self._call_kernel("radius", x) if self._radius is None else self._radius
+        radius = self._call_kernel("radius", x) if self._injectivity_radii is None else self._injectivity_radii
         return self._norm(x, v) / radius
 
     def _why_no_log(self, x, y):
@@ -178,12 +180,12 @@ class GeomstatsSpace(Space):
     # -- calls to the host ----------------------------------------------------------------------------------------
 
     @property
-    def _axis_vectors(self) -> np.ndarray:
+    def _ambient_basis(self) -> np.ndarray:
         return np.eye(math.prod(self.shape)).reshape(-1, *self.shape)
 
     def _call_kernel(self, kernel: str, *arrays):
         self._require_kernel(kernel)
-        return _call_on_host(self, kernel, jnp.broadcast_arrays(*arrays))
+        return _call_kernel_on_host(self, kernel, jnp.broadcast_arrays(*arrays))
 
     def _require_kernel(self, kernel: str) -> None:
         """Raise SpaceError unless geomstats implements a kernel, tested at a random point."""
@@ -220,17 +222,17 @@ class GeomstatsSpace(Space):
     def _jacobian_on_host(self, kernel: str, *arrays: np.ndarray) -> np.ndarray:
         """Return derivatives by all entries of all arguments, shape (count, size of the result, number of entries)."""
         columns = [
-            self._derivative(kernel, arrays, k, np.broadcast_to(axis, arrays[k].shape))
+            self._derivative_along(kernel, arrays, k, np.broadcast_to(axis, arrays[k].shape))
             for k in range(len(arrays))
-            for axis in self._axis_vectors
+            for axis in self._ambient_basis
         ]
         return np.stack(columns, axis=-1)
 
-    def _derivative(self, kernel: str, arrays, k: int, direction: np.ndarray) -> np.ndarray:
+    def _derivative_along(self, kernel: str, arrays, argument_index: int, direction: np.ndarray) -> np.ndarray:
         """Return the derivative along a direction of the k-th argument, shape (count, size of the result)."""
-        kind, length = _KERNEL_SIGNATURES[kernel][0][k], np.ones(len(direction))
+        kind, length = _KERNEL_SIGNATURES[kernel][0][argument_index], np.ones(len(direction))
         if kind != "a":
-            x = arrays[k if kind == "p" else 0]
+            x = arrays[argument_index if kind == "p" else 0]
             direction = self._evaluate_on_host("project_tangent", x, direction)
             length = np.sqrt(np.maximum(self._evaluate_on_host("inner", x, direction, direction), 0.0))
         unit_direction = direction / np.where(length > 0.0, length, 1.0).reshape(-1, *(1,) * len(self.shape))
@@ -239,22 +241,26 @@ class GeomstatsSpace(Space):
             forward, backward = (
                 self._evaluate_on_host(
                     kernel,
-                    *self._displace_argument(kernel, arrays, k, sign * offset * _DIFFERENCE_STEP * unit_direction),
+                    *self._arguments_with_displaced(
+                        kernel, arrays, argument_index, sign * offset * _DIFFERENCE_STEP * unit_direction
+                    ),
                 )
                 for sign in (1, -1)
             )
             weighted_sum += weight * (forward - backward).reshape(weighted_sum.shape)
         return weighted_sum / _DIFFERENCE_STEP * length[:, None]
 
-    def _displace_argument(self, kernel: str, arrays, k: int, displacement: np.ndarray) -> list[np.ndarray]:
+    def _arguments_with_displaced(
+        self, kernel: str, arrays, argument_index: int, displacement: np.ndarray
+    ) -> list[np.ndarray]:
         """Return the arguments with the k-th displaced: a point along a geodesic, with its tangent vectors projected
         there."""
         kinds, displaced = _KERNEL_SIGNATURES[kernel][0], list(arrays)
-        if kinds[k] != "p":
-            displaced[k] = displaced[k] + displacement
+        if kinds[argument_index] != "p":
+            displaced[argument_index] = displaced[argument_index] + displacement
             return displaced
-        displaced[k] = self._evaluate_on_host("exp", displaced[k], displacement)
-        if k == 0:
+        displaced[argument_index] = self._evaluate_on_host("exp", displaced[argument_index], displacement)
+        if argument_index == 0:
             tangent_indices = [i for i, kind in enumerate(kinds) if kind == "v"]
             for i in tangent_indices:
                 displaced[i] = self._evaluate_on_host("project_tangent", displaced[0], displaced[i])
@@ -264,18 +270,18 @@ class GeomstatsSpace(Space):
 # -- kernels of geomstats, on arrays of shape (count, *shape) -----------------------------------------------------
 
 
-def _checked_log(space: GeomstatsSpace, x, y):
+def _log_or_nan(space: GeomstatsSpace, x, y):
     """Return the logarithm, NaN if it does not lead to y or is too long, since failing solvers return numbers too."""
     axes = tuple(range(1, x.ndim))
     v = np.array(space.source.metric.log(y, x), dtype=float)
     residual = np.abs(space.source.metric.exp(v, x) - y).max(axis=axes) / np.maximum(np.abs(y).max(axis=axes), 1.0)
     length = np.sqrt(space.source.metric.inner_product(v, v, x))
-    radius = _radius(space, x) if space._radius is None else space._radius
+    radius = _injectivity_radii(space, x) if space._injectivity_radii is None else space._injectivity_radii
     v[~((residual <= 1e-6) & (length < radius * (1.0 - CUT_MARGIN)))] = np.nan
     return v
 
 
-def _radius(space: GeomstatsSpace, x):
+def _injectivity_radii(space: GeomstatsSpace, x):
     """Return the injectivity radius at each point."""
     return np.array([float(np.squeeze(space.source.metric.injectivity_radius(point))) for point in x])
 
@@ -316,13 +322,13 @@ The kinds are p, a point, v, a vector tangent at the first point, and a, any arr
 
 _KERNELS: dict[str, Callable] = {
     "exp": lambda space, x, v: space.source.metric.exp(v, x),
-    "log": _checked_log,
+    "log": _log_or_nan,
     "transport": lambda space, x, v, u: space.source.metric.parallel_transport(u, x, direction=v),
     "project_tangent": lambda space, x, w: space.source.to_tangent(w, x),
     "project": lambda space, x: space.source.projection(x),
     "inner": lambda space, x, u, v: space.source.metric.inner_product(u, v, x),
     "distance": lambda space, x, y: space.source.metric.dist(x, y),
-    "radius": _radius,
+    "radius": _injectivity_radii,
     "residual": _residual,
 }
 r"""Implementation of each kernel on arrays of shape (count, \*shape)."""
@@ -331,7 +337,7 @@ r"""Implementation of each kernel on arrays of shape (count, \*shape)."""
 # -- callbacks ----------------------------------------------------------------------------------------------------
 
 
-def _callback(space: GeomstatsSpace, function: Callable, result_shape: tuple[int, ...], dtype, arrays):
+def _call_function_on_host(space: GeomstatsSpace, function: Callable, result_shape: tuple[int, ...], dtype, arrays):
     """Call ``function`` on the host, on arrays with one batch axis, from a JAX program with any number of batch
     axes."""
     batch = arrays[0].shape[: arrays[0].ndim - len(space.shape)]
@@ -347,14 +353,16 @@ def _callback(space: GeomstatsSpace, function: Callable, result_shape: tuple[int
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _call_on_host(space: GeomstatsSpace, kernel: str, arrays):
-    return _callback(space, partial(space._evaluate_on_host, kernel), space._result_shape(kernel), np.float64, arrays)
+def _call_kernel_on_host(space: GeomstatsSpace, kernel: str, arrays):
+    return _call_function_on_host(
+        space, partial(space._evaluate_on_host, kernel), space._result_shape(kernel), np.float64, arrays
+    )
 
 
-@_call_on_host.defjvp
-def _call_derivative(space: GeomstatsSpace, kernel: str, primals, tangents):
+@_call_kernel_on_host.defjvp
+def _call_kernel_on_host_jvp(space: GeomstatsSpace, kernel: str, primals, tangents):
     (arrays,), (array_tangents,) = primals, tangents
-    value = _call_on_host(space, kernel, arrays)
+    value = _call_kernel_on_host(space, kernel, arrays)
     jacobian = _jacobian(space, kernel, arrays)
     entries = jnp.concatenate(
         [array_tangent.reshape(*jacobian.shape[:-2], -1) for array_tangent in array_tangents], axis=-1
@@ -368,8 +376,8 @@ def _log(space: GeomstatsSpace, x, y):
 
 
 @_log.defjvp
-def _log_derivative(space: GeomstatsSpace, primals, tangents):
-    """Differentiate ``exp(x, v) = y``, because differences would blur a logarithm that is found by iteration.
+def _log_jvp(space: GeomstatsSpace, primals, tangents):
+    """Return the logarithm and its derivative along ``tangents``, by differentiating ``exp(x, v) = y``.
 
     As x moves by x', v moves with the tangent space, by D, and in it, by the combination of frame vectors that
     satisfies
@@ -397,7 +405,7 @@ def _log_derivative(space: GeomstatsSpace, primals, tangents):
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _jacobian(space: GeomstatsSpace, kernel: str, arrays):
     result_shape = (math.prod(space._result_shape(kernel)), len(arrays) * math.prod(space.shape))
-    return _callback(space, partial(space._jacobian_on_host, kernel), result_shape, np.float64, arrays)
+    return _call_function_on_host(space, partial(space._jacobian_on_host, kernel), result_shape, np.float64, arrays)
 
 
 @_jacobian.defjvp
@@ -409,7 +417,7 @@ def _refuse_second_derivative(space: GeomstatsSpace, kernel: str, primals, tange
 def _independent_axes(space: GeomstatsSpace, x):
     """Return the axes, shape (dim,), whose projections are the best basis of the tangent space at x: pivoted
     Gram-Schmidt."""
-    return _callback(space, partial(_pivot_axes, space), (space.dim,), np.int64, [x])
+    return _call_function_on_host(space, partial(_independent_axes_on_host, space), (space.dim,), np.int64, [x])
 
 
 @_independent_axes.defjvp
@@ -418,10 +426,10 @@ def _independent_axes_jvp(space: GeomstatsSpace, primals, tangents):
     return indices, np.zeros(indices.shape, jax.dtypes.float0)
 
 
-def _pivot_axes(space: GeomstatsSpace, x: np.ndarray) -> np.ndarray:
+def _independent_axes_on_host(space: GeomstatsSpace, x: np.ndarray) -> np.ndarray:
     rows = []
     for point in x:
-        axes = space._axis_vectors
+        axes = space._ambient_basis
         points = np.broadcast_to(point, axes.shape)
         vectors = space._evaluate_on_host("project_tangent", points, axes).reshape(len(axes), -1)
         indices: list[int] = []
@@ -433,8 +441,8 @@ def _pivot_axes(space: GeomstatsSpace, x: np.ndarray) -> np.ndarray:
     return np.array(rows).reshape(len(x), space.dim)
 
 
-def _known_radius(space) -> float | None:
-    """Return the injectivity radius if it is constant, infinity if geomstats does not know it, else None."""
+def _constant_injectivity_radius(space) -> float | None:
+    """Return the injectivity radius if it is constant, infinity if unknown, None if it varies with the point."""
     corrected_radii = {
         "BiInvariantMetric": math.pi,
         "SpecialEuclideanMatricesCanonicalLeftMetric": math.sqrt(2.0) * math.pi,

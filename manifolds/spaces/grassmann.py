@@ -16,7 +16,7 @@ from ..matrices.linear import max_abs_entry, orthonormal_complement, skew_matrix
 from ..matrices.spectral import spectral
 from ..matrices.symmetric import eigh, orthonormal_columns, polar, symmetrize
 from .base import CUT_MARGIN, Space, register
-from .maps import extended_squared_distance
+from .maps import squared_distance_with_cut_locus
 
 _MIN_EIGENVALUE_GAP = 1e-8
 """Smallest gap between the p largest eigenvalues and the others, relative to the largest, for a projection to exist."""
@@ -85,22 +85,22 @@ class Grassmann(Space):
         y = symmetrize(x)
         return self.to_vector(y @ y - y + (x - y))
 
-    def _correction(self, x, c):
-        """Return a displacement that changes the constraints by c.
+    def _correction(self, x, constraint_change):
+        """Return the least displacement at a projector x that changes the constraints by ``constraint_change``.
 
         A symmetric matrix that commutes with x changes ``x^2 - x`` by ``(2 x - 1)`` times itself.
         """
-        c = self.from_vector(c)
-        symmetric_part = symmetrize(c)
+        constraint_change = self.from_vector(constraint_change)
+        symmetric_part = symmetrize(constraint_change)
         product = x @ symmetric_part
-        return product + product.swapaxes(-1, -2) - symmetric_part + (c - symmetric_part)
+        return product + product.swapaxes(-1, -2) - symmetric_part + (constraint_change - symmetric_part)
 
     _minimal_correction = _correction
 
     def _tangential_part(self, x, w):
         return self._project_tangent(symmetrize(x), w)
 
-    def _constraint_scales(self, x):
+    def _constraint_rounding_scales(self, x):
         return self.to_vector(jnp.abs(x) @ jnp.abs(x) + jnp.abs(x))
 
     def _inside(self, x):
@@ -121,10 +121,10 @@ class Grassmann(Space):
         )
 
     @property
-    def _n_normals(self):
+    def _n_normal_numbers(self):
         return self.n * self.p
 
-    def _point_from_normals(self, w):
+    def _point_from_normal_numbers(self, w):
         return self.subspace(w.reshape(*w.shape[:-1], self.n, self.p))
 
     def _project_tangent(self, x, w):
@@ -134,13 +134,13 @@ class Grassmann(Space):
 
     def _frame(self, x):
         """Return rotations of each basis vector of the subspace into each one of its complement."""
-        basis = self._basis(x)
+        basis = self._adapted_basis(x)
         subspace_basis, complement_basis = basis[..., : self.p], basis[..., self.p :]
         vectors = jnp.einsum("...ia,...jb->...abij", subspace_basis, complement_basis)
         vectors = (vectors + vectors.swapaxes(-1, -2)) / math.sqrt(2.0)
         return vectors.reshape(*x.shape[:-2], self.dim, self.n, self.n)
 
-    def _basis(self, x):
+    def _adapted_basis(self, x):
         """Return an orthonormal basis of R^n that begins with one of the subspace, made of its longest projected
         axes."""
         remainder, columns = x, []
@@ -159,7 +159,7 @@ class Grassmann(Space):
         return math.comb(self.n, 2)
 
     def _isotropic(self, x, w):
-        """Sum the rotations of all planes, weighted by w."""
+        """Return the sum of the rotation fields of all coordinate planes at x, weighted by w: a tangent vector."""
         return _commutator(skew_matrix(w, self.n), x) / math.sqrt(2.0)
 
     def _inner(self, x, u, v):
@@ -187,21 +187,21 @@ class Grassmann(Space):
         With the principal angles t, their difference has the singular values ``2 sin(t/2)``: nothing cancels, for
         neighbours nor at a right angle [Zimmermann & Huper 2022].
         """
-        x_basis, y_basis = self._smooth_basis(x), self._smooth_basis(y)
+        x_basis, y_basis = self._smooth_subspace_basis(x), self._smooth_subspace_basis(y)
         step = y_basis @ polar(y_basis.swapaxes(-1, -2) @ x_basis) - x_basis
         square = 0.25 * step.swapaxes(-1, -2) @ step
         normal_step = step - x_basis @ (x_basis.swapaxes(-1, -2) @ step)  # its singular values are sin(t)
         half = normal_step @ spectral(_angle_over_sine, symmetrize(square)) @ x_basis.swapaxes(-1, -2)
         return half + half.swapaxes(-1, -2)
 
-    def _smooth_basis(self, x):
+    def _smooth_subspace_basis(self, x):
         """Return an orthonormal basis of the subspace, shape (..., n, p), that is a smooth function of x near this
         point."""
-        basis = jax.lax.stop_gradient(self._basis(x)[..., : self.p])
+        basis = jax.lax.stop_gradient(self._adapted_basis(x)[..., : self.p])
         return polar(x @ basis)
 
     def _squared_distance(self, x, y):
-        return extended_squared_distance(self, x, y)
+        return squared_distance_with_cut_locus(self, x, y)
 
     def _squared_distance_value(self, x, y):
         """Return the squared distance, also at right angles.
@@ -220,12 +220,14 @@ class Grassmann(Space):
         return "the subspaces have a right angle between them, and more than one geodesic leads from x to y"
 
 
-def _angle_over_sine(square):
+def _angle_over_sine(half_angle_sine_squared):
     """Return ``t / sin(t)`` for ``square = sin(t/2)^2``, by a series where that is small; NaN at a right angle."""
-    use_series = square < _MAX_SERIES_SINE_SQUARED
-    series = jnp.polyval(jnp.asarray(_ANGLE_OVER_SINE_SERIES), jnp.where(use_series, square, 0.0))
+    use_series = half_angle_sine_squared < _MAX_SERIES_SINE_SQUARED
+    series = jnp.polyval(jnp.asarray(_ANGLE_OVER_SINE_SERIES), jnp.where(use_series, half_angle_sine_squared, 0.0))
     sine_squared = jnp.where(
-        use_series, 0.25, jnp.where(square < 0.5 - 0.5 * (math.pi / 2 * CUT_MARGIN), square, jnp.nan)
+        use_series,
+        0.25,
+        jnp.where(half_angle_sine_squared < 0.5 - 0.5 * (math.pi / 2 * CUT_MARGIN), half_angle_sine_squared, jnp.nan),
     )
     cosine_squared = 1.0 - sine_squared
     return jnp.where(

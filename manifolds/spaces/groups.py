@@ -21,7 +21,7 @@ from ..groups.matrix_group import MEMBERSHIP_TOLERANCE, MatrixGroup, _log
 from ..matrices.linear import determinant, skew_matrix, solve, spectral_radius, symmetric_matrix
 from ..matrices.symmetric import orthogonal_images, orthonormal_columns, polar
 from .base import Space, register
-from .maps import extended_squared_distance, inner_by_coordinates, inner_by_flat, tangential_part_by_projection
+from .maps import inner_by_coordinates, inner_by_flat, squared_distance_with_cut_locus, tangential_part_by_projection
 
 _so, _su, _se = lru_cache(SO), lru_cache(SU), lru_cache(SE)
 
@@ -98,7 +98,7 @@ class GroupSpace(Space):
     def velocity(self, x, v) -> jax.Array:
         """Return the left-trivialised velocity: the ``xi`` in ``v = x hat(xi)``, components in the algebra, shape (...,
         dim)."""
-        return self._call_compiled("_velocity", *self._checked_vectors(x, v=v))
+        return self._call_compiled("_velocity", *self._checked_point_and_vectors(x, v=v))
 
     def from_velocity(self, x, xi) -> jax.Array:
         """Return ``x hat(xi)``, the inverse of :meth:`velocity`."""
@@ -179,10 +179,10 @@ class GroupSpace(Space):
         return jnp.where((self.group.defect(x) <= MEMBERSHIP_TOLERANCE)[..., None, None], x, jnp.nan)
 
     @property
-    def _n_normals(self):
+    def _n_normal_numbers(self):
         return self.dim
 
-    def _point_from_normals(self, w):
+    def _point_from_normal_numbers(self, w):
         return self.group.exp_map(self.group.algebra, 0.5 * w)
 
     def _project_tangent(self, x, w):
@@ -217,12 +217,12 @@ class GroupSpace(Space):
             brackets = np.asarray(self.group.algebra.bracket(axes[:, None], axes[None]))
         return np.linalg.solve(self._root, np.einsum("kaa->k", brackets))
 
-    def _divergence_terms(self, x, rows):
-        """Return the terms along left translations, and the divergences ``-tr ad_E`` of the left-invariant fields."""
-        translation_terms = super()._divergence_terms(x, rows)
+    def _divergence_terms(self, x, pair_with_field):
+        """Return the terms along left translations, and ``-tr ad_E`` unless the group is unimodular."""
+        translation_terms = super()._divergence_terms(x, pair_with_field)
         if self.group.algebra.is_unimodular():
             return translation_terms
-        field_terms = rows(x, self._flat(x, self._from_coordinates(x, -self._adjoint_traces)))
+        field_terms = pair_with_field(x, self._flat(x, self._from_coordinates(x, -self._adjoint_traces)))
         return jnp.concatenate([translation_terms, field_terms[None]])
 
     def _exp(self, x, v):
@@ -281,7 +281,7 @@ class BiInvariantSpace(GroupSpace):
         return Space._reach(self, x, v)
 
     def _squared_distance(self, x, y):
-        return extended_squared_distance(self, x, y)
+        return squared_distance_with_cut_locus(self, x, y)
 
     def _squared_distance_value(self, x, y):
         """Return the sum of the squared angles of the eigenvalues of ``x^-1 y``, defined at half turns too.
@@ -308,7 +308,7 @@ class BiInvariantSpace(GroupSpace):
         return jnp.where(total <= half_turns + 1.0, square, jnp.nan)
 
     def _transport(self, x, v, u):
-        """Return ``x m eta m`` with ``m = exp(xi/2)``: the velocity eta turns by Ad(m^-1)."""
+        """Return the transported vector ``x m eta m``, with ``m = exp(xi/2)``, v = x hat(xi) and u = x hat(eta)."""
         half = self.group.exp_map(self.group.algebra, 0.5 * self._velocity(x, v))
         return x @ half @ self._relative_element(x, u) @ half
 
@@ -343,16 +343,16 @@ class SpecialOrthogonal(BiInvariantSpace):
         return super()._squared_distance(x, y)
 
     @property
-    def _n_normals(self):
+    def _n_normal_numbers(self):
         return self.size
 
-    def _point_from_normals(self, w):
+    def _point_from_normal_numbers(self, w):
         return _random_rotation(self.from_vector(w))
 
-    def _correction(self, x, c):
-        return 0.5 * symmetric_matrix(c, self.n) @ x
+    def _correction(self, x, constraint_change):
+        return 0.5 * symmetric_matrix(constraint_change, self.n) @ x
 
-    def _constraint_scales(self, x):
+    def _constraint_rounding_scales(self, x):
         return 2.0 * (jnp.abs(x) @ jnp.abs(x).swapaxes(-1, -2))[..., *np.triu_indices(self.n)]
 
 
@@ -387,20 +387,20 @@ class SpecialUnitary(BiInvariantSpace):
         return x * jnp.exp(-1j * jnp.angle(determinant(x)) / self.n)[..., None, None]
 
     @property
-    def _n_normals(self):
+    def _n_normal_numbers(self):
         return self.size
 
-    def _point_from_normals(self, w):
+    def _point_from_normal_numbers(self, w):
         return self._scale_to_unit_determinant(orthonormal_columns(self.from_vector(w)))
 
-    def _correction(self, x, c):
+    def _correction(self, x, constraint_change):
         real_entries, imaginary_entries, phase = jnp.split(
-            c, np.cumsum([self.n * (self.n + 1) // 2, math.comb(self.n, 2)]), -1
+            constraint_change, np.cumsum([self.n * (self.n + 1) // 2, math.comb(self.n, 2)]), -1
         )
         hermitian = symmetric_matrix(real_entries, self.n) + 1j * skew_matrix(imaginary_entries, self.n)
         return 0.5 * hermitian @ x + (1j / self.n) * phase[..., None] * x
 
-    def _constraint_scales(self, x):
+    def _constraint_rounding_scales(self, x):
         products = 2.0 * jnp.abs(x) @ jnp.abs(x).swapaxes(-1, -2)
         upper = [products[..., *np.triu_indices(self.n, k)] for k in (0, 1)]
         return jnp.concatenate([*upper, jnp.full((*x.shape[:-2], 1), float(self.n))], axis=-1)
@@ -449,10 +449,10 @@ class SpecialEuclidean(GroupSpace):
         return affine_matrix(_nearest_rotation(x[..., :-1, :-1]), x[..., :-1, -1:])
 
     @property
-    def _n_normals(self):
+    def _n_normal_numbers(self):
         return self.n * (self.n + 1)
 
-    def _point_from_normals(self, w):
+    def _point_from_normal_numbers(self, w):
         rotation_normals, translation_normals = jnp.split(w, [self.n**2], axis=-1)
         rotation = _random_rotation(rotation_normals.reshape(*w.shape[:-1], self.n, self.n))
         return affine_matrix(rotation, self.length * translation_normals[..., None])
@@ -462,15 +462,17 @@ class SpecialEuclidean(GroupSpace):
 
     _tangential_part = tangential_part_by_projection
 
-    def _correction(self, x, c):
-        rotation_change, last_row_change = jnp.split(c, [self.n * (self.n + 1) // 2], axis=-1)
+    def _correction(self, x, constraint_change):
+        rotation_change, last_row_change = jnp.split(constraint_change, [self.n * (self.n + 1) // 2], axis=-1)
         top = self.rotations._correction(x[..., :-1, :-1], rotation_change)
         return jnp.concatenate(
             [jnp.pad(top, [(0, 0)] * (top.ndim - 1) + [(0, 1)]), last_row_change[..., None, :]], axis=-2
         )
 
-    def _constraint_scales(self, x):
-        return jnp.concatenate([self.rotations._constraint_scales(x[..., :-1, :-1]), jnp.abs(x[..., -1, :])], axis=-1)
+    def _constraint_rounding_scales(self, x):
+        return jnp.concatenate(
+            [self.rotations._constraint_rounding_scales(x[..., :-1, :-1]), jnp.abs(x[..., -1, :])], axis=-1
+        )
 
     def _frame(self, x):
         scale = np.where(np.arange(self.dim) < self.rotations.dim, 1.0, self.length)

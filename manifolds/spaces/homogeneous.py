@@ -13,7 +13,7 @@ import numpy as np
 from .._pytree_module import forward_to
 from ..errors import ParameterError, SpaceError
 from ..groups.matrix_group import MatrixGroup
-from ..groups.subgroups import factor_element, subalgebra_basis
+from ..groups.subgroups import first_factor_coordinates, subalgebra_basis
 from ..matrices.exponential import expm
 from .base import CUT_MARGIN, Space
 from .groups import BiInvariantSpace, SpecialOrthogonal, SpecialUnitary
@@ -92,14 +92,14 @@ class Homogeneous(Space):
         return math.pi / math.sqrt(2.0) if has_curvature_two else math.pi
 
     @cached_property
-    def _m(self) -> np.ndarray:
+    def _horizontal_rows(self) -> np.ndarray:
         """Orthonormal basis of the horizontal part of the algebra, in components, shape (dim, dim of the group)."""
         return np.array(self.horizontal_basis)
 
     @cached_property
-    def _h(self) -> np.ndarray:
+    def _stabilizer_rows(self) -> np.ndarray:
         """Orthonormal basis of the algebra of H, in components, shape (dim of H, dim of the group)."""
-        return np.linalg.svd(self._m, full_matrices=True)[2][self.dim :]
+        return np.linalg.svd(self._horizontal_rows, full_matrices=True)[2][self.dim :]
 
     # -- points of the group ------------------------------------------------------------------------------------------
 
@@ -108,10 +108,10 @@ class Homogeneous(Space):
     _constraints = forward_to("group_space")
     _correction = forward_to("group_space")
     _tangential_part = forward_to("group_space")
-    _constraint_scales = forward_to("group_space")
+    _constraint_rounding_scales = forward_to("group_space")
     _inside = forward_to("group_space")
-    _n_normals = forward_to("group_space")
-    _point_from_normals = forward_to("group_space")
+    _n_normal_numbers = forward_to("group_space")
+    _point_from_normal_numbers = forward_to("group_space")
 
     # -- horizontal vectors -------------------------------------------------------------------------------------------
 
@@ -119,13 +119,15 @@ class Homogeneous(Space):
         return self._from_coordinates(x, self._coordinates(x, w))
 
     def _coordinates(self, x, v):
-        return self.group_space._velocity(x, v) @ self._m.T
+        return self.group_space._velocity(x, v) @ self._horizontal_rows.T
 
     def _from_coordinates(self, x, c):
-        return self.group_space._from_velocity(x, c @ self._m)
+        return self.group_space._from_velocity(x, c @ self._horizontal_rows)
 
     def _frame(self, x):
-        return x[..., None, :, :] @ np.einsum("da,aij->dij", self._m, self.group_space.group.algebra._require_basis())
+        return x[..., None, :, :] @ np.einsum(
+            "da,aij->dij", self._horizontal_rows, self.group_space.group.algebra._require_basis()
+        )
 
     _inner = inner_by_coordinates
 
@@ -135,18 +137,28 @@ class Homogeneous(Space):
     _exp = forward_to("group_space")
 
     def _transport(self, x, v, u):
-        brackets = self._m @ self.group_space.group.algebra.ad(self.group_space._velocity(x, v)) @ self._m.T
+        brackets = (
+            self._horizontal_rows
+            @ self.group_space.group.algebra.ad(self.group_space._velocity(x, v))
+            @ self._horizontal_rows.T
+        )
         c = expm(-0.5 * brackets) @ self._coordinates(x, u)[..., None]
         return self._from_coordinates(self._exp(x, v), c[..., 0])
 
     def _log(self, x, y):
         pair = "(n,n),(n,n)->(d)"
-        return self._from_coordinates(x, jnp.vectorize(self._single_log, signature=pair)(x, y))
+        return self._from_coordinates(x, jnp.vectorize(self._single_log_coordinates, signature=pair)(x, y))
 
-    def _single_log(self, x, y):
+    def _single_log_coordinates(self, x, y):
         """Return the horizontal c with ``exp(c) exp(b) = x^-1 y`` for some b in the algebra of H."""
         reach = self.injectivity_radius() * (1.0 - CUT_MARGIN)
-        return factor_element(self.group_space.group, self._m, self._h, self.group_space._relative_element(x, y), reach)
+        return first_factor_coordinates(
+            self.group_space.group,
+            self._horizontal_rows,
+            self._stabilizer_rows,
+            self.group_space._relative_element(x, y),
+            reach,
+        )
 
 
 def _group_space_of(group) -> BiInvariantSpace:

@@ -61,12 +61,12 @@ class Hyperbolic(Space):
     def _inside(self, x):
         return x[..., 0] > 0.0
 
-    def _minimal_correction(self, x, c):
-        return c * _lower_index(x) / (x**2).sum(axis=-1, keepdims=True)
+    def _minimal_correction(self, x, constraint_change):
+        return constraint_change * _lower_index(x) / (x**2).sum(axis=-1, keepdims=True)
 
     _tangential_part = tangential_part_by_projection
 
-    def _constraint_scales(self, x):
+    def _constraint_rounding_scales(self, x):
         return (x**2).sum(axis=-1, keepdims=True)
 
     def _project_tangent(self, x, w):

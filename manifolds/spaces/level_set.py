@@ -148,7 +148,7 @@ class LevelSet(Space):
             A point, and a tangent vector there.
         steps : int
         """
-        x, v = self._checked_vectors(x, v=v)
+        x, v = self._checked_point_and_vectors(x, v=v)
         end = self._call_compiled("_geodesic", x, v, static=(checked_size(steps, 1, "geodesic", "steps"),))
         if not bool(jnp.isfinite(end).all()):
             raise DomainError(f"{self.name}: the geodesic could not be followed with {steps} steps: take more")

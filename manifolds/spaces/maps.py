@@ -70,16 +70,16 @@ class SpaceMaps(ABC):
         return jnp.abs(x - y).max(axis=self._axes) / jnp.maximum(jnp.abs(y).max(axis=self._axes), 1.0)
 
     @property
-    def _n_normals(self) -> int | None:
+    def _n_normal_numbers(self) -> int | None:
         """Number of normal numbers from which a random point is made, None if it is drawn otherwise."""
         return self.size if type(self)._random is SpaceMaps._random else None
 
-    def _point_from_normals(self, w):
+    def _point_from_normal_numbers(self, w):
         """Return a random point made of normal numbers, shape (..., normals)."""
         return self._project(self.from_vector(w))
 
     def _random(self, key, size):
-        return self._point_from_normals(jax.random.normal(key, (*size, self._n_normals or 0)))
+        return self._point_from_normal_numbers(jax.random.normal(key, (*size, self._n_normal_numbers or 0)))
 
     def _tangent_basis(self, x):
         """Return a basis of the tangent space, orthonormal as flat arrays, shape (..., dim, size).
@@ -169,26 +169,26 @@ class SpaceMaps(ABC):
         """True if the metric is known to be that of the ambient arrays."""
         return type(self)._inner is SpaceMaps._inner
 
-    def _divergence_terms(self, x, rows):
+    def _divergence_terms(self, x, pair_with_field):
         """Return ``<E_i, nabla_{E_i} X>`` over a frame E, shape (dim, ...): the divergence of X is the sum over i.
 
         ``rows(y, alpha)`` returns the product of a covector alpha at y with the field X, or with each of several
         fields.
         """
 
-        def rows_along_geodesic(t, e):
+        def pairing_along_geodesic(t, e):
             y = self._exp(x, t * e)
-            return rows(y, self._flat(y, self._transport(x, t * e, e)))
+            return pair_with_field(y, self._flat(y, self._transport(x, t * e, e)))
 
-        def rows_along_line(t, e):  # the metric being that of the arrays around
-            return rows(self._project(x + t * e), e.conj())
+        def pairing_along_line(t, e):  # the metric being that of the arrays around
+            return pair_with_field(self._project(x + t * e), e.conj())
 
         if not (self.has_geodesics or self._has_induced_metric):
             raise SpaceError(
                 f"{self.name} has no geodesics, along which divergences are computed. Implement _exp, _log and "
                 "_transport"
             )
-        rows_along = rows_along_geodesic if self.has_geodesics else rows_along_line
+        rows_along = pairing_along_geodesic if self.has_geodesics else pairing_along_line
         frame = jnp.moveaxis(self._frame(x), -1 - len(self.shape), 0)
         return jax.vmap(lambda e: jax.jvp(lambda t: rows_along(t, e), (0.0,), (1.0,))[1])(frame)
 
@@ -250,28 +250,27 @@ class SpaceMaps(ABC):
         axes = np.eye(values.shape[-1])
         return jax.vmap(lambda e: pullback(jnp.broadcast_to(e, values.shape))[0], out_axes=-2)(axes)
 
-    def _minimal_correction(self, x, c):
-        """Return the least displacement at x that changes the constraints by c, shape (..., m)."""
+    def _minimal_correction(self, x, constraint_change):
+        """Return the least displacement at x that changes the constraints by ``constraint_change``, shape (..., m)."""
         if not self._has_equations:
-            return self.from_vector(c)
+            return self.from_vector(constraint_change)
         rows = self._constraint_jacobian(x)
-        weights = solve_near_identity(rows @ rows.swapaxes(-1, -2), c[..., None])
+        weights = solve_near_identity(rows @ rows.swapaxes(-1, -2), constraint_change[..., None])
         return self.from_vector((weights * rows).sum(axis=-2))
 
-    def _correction(self, x, c):
-        """Return a displacement that changes the constraints by c, shape (..., m), at a point x; near it, by about as
-        much."""
-        return self._minimal_correction(x, c)
+    def _correction(self, x, constraint_change):
+        """Return a displacement that changes the constraints by ``constraint_change``, exactly if x is a point."""
+        return self._minimal_correction(x, constraint_change)
 
     def _tangential_part(self, x, w):
-        """Return w minus the displacement that would change the constraints at x."""
+        """Return the component of w that leaves the constraints at x unchanged; x may be near the space, not on it."""
         if not self._has_equations:
             return self._project_tangent(x, w)
         x, w = jnp.broadcast_arrays(x, w)
         return w - self._minimal_correction(x, jax.jvp(self._constraints, (x,), (w,))[1])
 
-    def _constraint_scales(self, x):
-        """Return the sizes at which the constraints are rounded at x, shape (..., m)."""
+    def _constraint_rounding_scales(self, x):
+        """Return the sizes of the terms of the constraints at x, by which rounding scales, shape (..., m)."""
         if not self._has_equations:
             return jnp.abs(self.to_vector(x))
         return (jnp.abs(self._constraint_jacobian(x)) * jnp.abs(self.to_vector(x))[..., None, :]).sum(axis=-1)
@@ -279,8 +278,7 @@ class SpaceMaps(ABC):
     # Maps of the retractions other than the Riemannian one, on spaces that have them.
 
     def _euclidean_reach(self, x, v):
-        """Return the length of v over that up to which ``x + v`` stays in the space, an open set of arrays, for
-        certain."""
+        """Return the length of v relative to a bound below which ``x + v`` surely stays in the space, an open set."""
         raise SpaceError(f"{self.name} is not an open set of arrays: x + v leaves it")
 
     def _group_exp(self, x, v):
@@ -342,12 +340,12 @@ class SpaceMaps(ABC):
         """Return ``v`` with an axis of length 1 for the vectors of a frame."""
         return jnp.expand_dims(v, -1 - len(self.shape))
 
-    def _call_compiled(self, kernel: str, *arrays, static: tuple = ()):
+    def _call_compiled(self, method_name: str, *arrays, static: tuple = ()):
         is_small = sum(np.size(array) for array in arrays) + np.prod(static) * self.size <= MAX_UNOPTIMIZED_SIZE
         skip_optimization = is_small and not any(
             is_traced(array) for array in arrays
         )  # a part of another program has no options
-        return (run_kernel_unoptimized if skip_optimization else run_kernel)(self, kernel, static, *arrays)
+        return (run_kernel_unoptimized if skip_optimization else run_kernel)(self, method_name, static, *arrays)
 
 
 MAX_UNOPTIMIZED_SIZE = 10_000
@@ -357,13 +355,13 @@ Up to it compilation takes longer than the run, as long as the kernel is called 
 """
 
 
-def _call_kernel(space: SpaceMaps, kernel: str, static: tuple, *arrays) -> Any:
-    return getattr(space, kernel)(*arrays, *static)
+def _call_method(space: SpaceMaps, method_name: str, static: tuple, *arrays) -> Any:
+    return getattr(space, method_name)(*arrays, *static)
 
 
-run_kernel = jax.jit(_call_kernel, static_argnums=(0, 1, 2))
+run_kernel = jax.jit(_call_method, static_argnums=(0, 1, 2))
 run_kernel_unoptimized = jax.jit(
-    _call_kernel, static_argnums=(0, 1, 2), compiler_options={"xla_backend_optimization_level": 0}
+    _call_method, static_argnums=(0, 1, 2), compiler_options={"xla_backend_optimization_level": 0}
 )
 
 
@@ -398,7 +396,7 @@ def _safe_sqrt_jvp(primals, tangents):
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def extended_squared_distance(space: Any, x, y):
+def squared_distance_with_cut_locus(space: Any, x, y):
     """Return the squared distance from ``_squared_distance_value``, defined at the cut locus too.
 
     Derivatives follow from the logarithm; at the cut locus they are NaN.
@@ -406,9 +404,9 @@ def extended_squared_distance(space: Any, x, y):
     return space._squared_distance_value(x, y)
 
 
-@extended_squared_distance.defjvp
+@squared_distance_with_cut_locus.defjvp
 def _extended_squared_distance_jvp(space, primals, tangents):
-    return extended_squared_distance(space, *primals), jax.jvp(
+    return squared_distance_with_cut_locus(space, *primals), jax.jvp(
         partial(SpaceMaps._squared_distance, space), primals, tangents
     )[1]
 

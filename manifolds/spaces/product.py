@@ -12,13 +12,13 @@ import numpy as np
 from .._pytree_module import forward_to
 from .._sizes import checked_size
 from ..errors import SpaceError
-from .base import Space, random_key, register, register_operation
+from .base import Space, random_key, register, register_result_class
 from .euclidean import Euclidean
 from .groups import SpecialOrthogonal
 from .sphere import Sphere
 
 
-@register_operation("_product")
+@register_result_class("_product")
 @jax.tree_util.register_static
 @dataclass(frozen=True, init=False, repr=False)
 class Product(Space):
@@ -58,7 +58,7 @@ class Product(Space):
 
     def split(self, x) -> list[jax.Array]:
         """Return the components of a point or tangent vector, each an array of its factor's shape."""
-        x, points, start = self._point_array(x, "x"), [], 0
+        x, points, start = self._ambient_array(x, "x"), [], 0
         for factor in self.factors:
             size = math.prod(factor.shape)
             point = x[..., start : start + size].reshape(*x.shape[:-1], *factor.shape)
@@ -68,7 +68,7 @@ class Product(Space):
 
     def join(self, *parts) -> jax.Array:
         """Return the flat array of ``parts``, a point of each factor: the inverse of :meth:`split`."""
-        arrays = [factor._point_array(part, "part") for factor, part in zip(self.factors, parts, strict=True)]
+        arrays = [factor._ambient_array(part, "part") for factor, part in zip(self.factors, parts, strict=True)]
         rows = [a.reshape(*a.shape[: a.ndim - len(f.shape)], -1) for f, a in zip(self.factors, arrays, strict=True)]
         batch = jnp.broadcast_shapes(*(row.shape[:-1] for row in rows))
         return jnp.concatenate([jnp.broadcast_to(row, (*batch, row.shape[-1])) for row in rows], axis=-1)
@@ -104,14 +104,14 @@ class Product(Space):
         return self.random(key, size)
 
     @property
-    def _n_normals(self):
-        numbers = [factor._n_normals for factor in self.factors]
+    def _n_normal_numbers(self):
+        numbers = [factor._n_normal_numbers for factor in self.factors]
         return None if None in numbers else sum(n for n in numbers if n is not None)
 
-    def _point_from_normals(self, w):
-        ends = np.cumsum([factor._n_normals or 0 for factor in self.factors])[:-1]
+    def _point_from_normal_numbers(self, w):
+        ends = np.cumsum([factor._n_normal_numbers or 0 for factor in self.factors])[:-1]
         pairs = zip(self.factors, jnp.split(w, ends, axis=-1), strict=True)
-        return self.join(*(factor._point_from_normals(factor_normals) for factor, factor_normals in pairs))
+        return self.join(*(factor._point_from_normal_numbers(factor_normals) for factor, factor_normals in pairs))
 
     def _restore(self, x):
         return self._apply_and_join("_restore", x)
@@ -132,8 +132,8 @@ class Product(Space):
     def _constraints(self, x):
         return self._apply_and_concatenate("_constraints", x)
 
-    def _constraint_scales(self, x):
-        return self._apply_and_concatenate("_constraint_scales", x)
+    def _constraint_rounding_scales(self, x):
+        return self._apply_and_concatenate("_constraint_rounding_scales", x)
 
     def _apply_and_concatenate(self, method_name: str, *arrays):
         """Call a method of every factor on its components; concatenate the results, shape (..., m)."""
@@ -141,17 +141,20 @@ class Product(Space):
         batch = jnp.broadcast_shapes(*(c.shape[:-1] for c in values))
         return jnp.concatenate([jnp.broadcast_to(c, (*batch, c.shape[-1])) for c in values], axis=-1)
 
-    def _minimal_correction(self, x, c):
-        return self._apply_to_constraint_parts("_minimal_correction", x, c)
+    def _minimal_correction(self, x, constraint_change):
+        return self._apply_to_constraint_parts("_minimal_correction", x, constraint_change)
 
-    def _correction(self, x, c):
-        return self._apply_to_constraint_parts("_correction", x, c)
+    def _correction(self, x, constraint_change):
+        return self._apply_to_constraint_parts("_correction", x, constraint_change)
 
-    def _apply_to_constraint_parts(self, method_name: str, x, c):
+    def _apply_to_constraint_parts(self, method_name: str, x, constraint_change):
         """Call a method of every factor on its point and its constraints; join the results."""
         points = self.split(x)
-        sizes = [c.shape[-1] for c in jax.eval_shape(lambda x: self._apply_to_factors("_constraints", x), x)]
-        triples = zip(self.factors, points, jnp.split(c, np.cumsum(sizes)[:-1], axis=-1), strict=True)
+        sizes = [
+            constraint_change.shape[-1]
+            for constraint_change in jax.eval_shape(lambda x: self._apply_to_factors("_constraints", x), x)
+        ]
+        triples = zip(self.factors, points, jnp.split(constraint_change, np.cumsum(sizes)[:-1], axis=-1), strict=True)
         return self.join(*(getattr(factor, method_name)(point, component) for factor, point, component in triples))
 
     def _tangential_part(self, x, w):
@@ -252,7 +255,7 @@ class Product(Space):
         raise AssertionError("the logarithm is defined in every factor")
 
 
-@register_operation("_power")
+@register_result_class("_power")
 @jax.tree_util.register_static
 @dataclass(frozen=True, repr=False)
 class Power(Space):
@@ -287,7 +290,7 @@ class Power(Space):
     def injectivity_radius(self, x=None):
         if x is None:
             return self.base.injectivity_radius()
-        return min(self.base.injectivity_radius(point) for point in self._point_array(x, "x"))
+        return min(self.base.injectivity_radius(point) for point in self._ambient_array(x, "x"))
 
     def _residual(self, x):
         return self.base._residual(x).max(axis=-1)
@@ -305,11 +308,11 @@ class Power(Space):
         return self.base.is_quotient
 
     @property
-    def _n_normals(self):
-        return None if self.base._n_normals is None else self.count * self.base._n_normals
+    def _n_normal_numbers(self):
+        return None if self.base._n_normal_numbers is None else self.count * self.base._n_normal_numbers
 
-    def _point_from_normals(self, w):
-        return self.base._point_from_normals(w.reshape(*w.shape[:-1], self.count, -1))
+    def _point_from_normal_numbers(self, w):
+        return self.base._point_from_normal_numbers(w.reshape(*w.shape[:-1], self.count, -1))
 
     _restore = forward_to("base")
     _project_tangent = forward_to("base")
@@ -319,18 +322,18 @@ class Power(Space):
     def _constraints(self, x):
         return self._join_copies(self.base._constraints(x))
 
-    def _constraint_scales(self, x):
-        return self._join_copies(self.base._constraint_scales(x))
+    def _constraint_rounding_scales(self, x):
+        return self._join_copies(self.base._constraint_rounding_scales(x))
 
     @staticmethod
     def _join_copies(c):
         return c.reshape(*c.shape[:-2], -1)
 
-    def _minimal_correction(self, x, c):
-        return self.base._minimal_correction(x, self._split_copies(c))
+    def _minimal_correction(self, x, constraint_change):
+        return self.base._minimal_correction(x, self._split_copies(constraint_change))
 
-    def _correction(self, x, c):
-        return self.base._correction(x, self._split_copies(c))
+    def _correction(self, x, constraint_change):
+        return self.base._correction(x, self._split_copies(constraint_change))
 
     def _split_copies(self, c):
         return c.reshape(*c.shape[:-1], self.count, c.shape[-1] // self.count)

@@ -69,13 +69,13 @@ class Sphere(Space):
     def _constraints(self, x):
         return 0.5 * (_dot(x, x) - 1.0)
 
-    def _minimal_correction(self, x, c):
-        return c * x / _dot(x, x)
+    def _minimal_correction(self, x, constraint_change):
+        return constraint_change * x / _dot(x, x)
 
     def _tangential_part(self, x, w):
         return w - _dot(x, w) / _dot(x, x) * x
 
-    def _constraint_scales(self, x):
+    def _constraint_rounding_scales(self, x):
         return _dot(x, x)
 
     def _project_tangent(self, x, w):
@@ -89,7 +89,7 @@ class Sphere(Space):
         return math.comb(self.n + 1, 2)
 
     def _isotropic(self, x, w):
-        """Sum the rotations of all planes, weighted by w."""
+        """Return the sum of the rotation fields of all coordinate planes at x, weighted by w: a tangent vector."""
         return (skew_matrix(w, self.n + 1) @ x[..., None])[..., 0]
 
     def _inner(self, x, u, v):

@@ -82,13 +82,13 @@ class Stiefel(Space):
         residual = _transpose_matrix(x) @ x - np.eye(self.p)
         return residual[..., *np.triu_indices(self.p)]
 
-    def _minimal_correction(self, x, c):
+    def _minimal_correction(self, x, constraint_change):
         if self.p > 2:
-            return super()._minimal_correction(x, c)
-        return x @ solve_lyapunov(_transpose_matrix(x) @ x, symmetric_matrix(c, self.p))
+            return super()._minimal_correction(x, constraint_change)
+        return x @ solve_lyapunov(_transpose_matrix(x) @ x, symmetric_matrix(constraint_change, self.p))
 
-    def _correction(self, x, c):
-        return 0.5 * x @ symmetric_matrix(c, self.p)
+    def _correction(self, x, constraint_change):
+        return 0.5 * x @ symmetric_matrix(constraint_change, self.p)
 
     def _tangential_part(self, x, w):
         if self.p > 2:
@@ -96,10 +96,10 @@ class Stiefel(Space):
         product = _transpose_matrix(x) @ w
         return w - x @ solve_lyapunov(_transpose_matrix(x) @ x, product + _transpose_matrix(product))
 
-    def _constraint_scales(self, x):
+    def _constraint_rounding_scales(self, x):
         return 2.0 * (_transpose_matrix(jnp.abs(x)) @ jnp.abs(x))[..., *np.triu_indices(self.p)]
 
-    def _point_from_normals(self, w):
+    def _point_from_normal_numbers(self, w):
         return orthonormal_columns(self.from_vector(w))
 
     def _project_tangent(self, x, w):
@@ -121,7 +121,7 @@ class Stiefel(Space):
         return math.comb(self.n, 2)
 
     def _isotropic(self, x, w):
-        """Sum the rotations of all planes, weighted by w."""
+        """Return the sum of the rotation fields of all coordinate planes at x, weighted by w: a tangent vector."""
         return skew_matrix(w, self.n) @ x
 
     _inner = inner_by_flat

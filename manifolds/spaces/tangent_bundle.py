@@ -58,13 +58,12 @@ class TangentBundle(Space):
     _has_equations = forward_to("base")
 
     def tangential_part(self, q, w) -> jax.Array:
-        """Return the component along Q of an array w at a point q of it, all of them flat, shape (n,)."""
+        """Return the projection of the flat array w on the tangent space at the flat point q, shape (n,)."""
         base = self.base
         return base.to_vector(base._tangential_part(base.from_vector(q), base.from_vector(w)))
 
     def tangent_matrices(self, x) -> tuple[jax.Array, jax.Array]:
-        """Return the matrices P and N, shape (n, n), of the tangent vectors ``(P a, P b + N P a)`` at the flat point
-        (q, v).
+        """Return matrices P and N, shape (n, n), for which ``(P a, P b + N P a)`` are tangent vectors at flat (q, v).
 
         P is the projector along Q. Moving q takes v out of the tangent space: ``N q'`` is the component of v' across Q
         that
@@ -91,10 +90,10 @@ class TangentBundle(Space):
         q, v = self._position_and_vector(x)
         return jnp.concatenate([self.base._constraints(q), self._constraint_rates(q, v)], axis=-1)
 
-    def _minimal_correction(self, x, c):
+    def _minimal_correction(self, x, constraint_change):
         if self._has_equations:
-            return super()._minimal_correction(x, c)
-        return self.from_vector(c)
+            return super()._minimal_correction(x, constraint_change)
+        return self.from_vector(constraint_change)
 
     def _inside(self, x):
         return self.base._inside(self._position_and_vector(x)[0])

@@ -141,7 +141,9 @@ def proposition_3_3():
 @row("SML", "Def. 3.1 on a manifold", "`ChetaevSystem(space=...)` on a sphere", "the pendulum's friction")
 def chetaev_on_a_sphere():
     x = configurations.pendulum().system.samples(4)
-    return relative_difference(fields(configurations.constrained_pendulum(), x), fields(configurations.pendulum().system, x))
+    return relative_difference(
+        fields(configurations.constrained_pendulum(), x), fields(configurations.pendulum().system, x)
+    )
 
 
 @row("SML", "Props. 4.1, 4.3", "the energy in 400 steps; no step loses entropy", "its first value")

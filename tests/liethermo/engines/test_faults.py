@@ -9,6 +9,7 @@ import liethermo as lt
 import manifolds as mf
 from liethermo.engines.choice import CompiledEngineWarning
 from liethermo.engines.compiled.writer import ProgramWriter
+from liethermo.runs import problem
 from liethermo.tracing import scalarize
 from liethermo.tracing.builder import Builder
 from liethermo.tracing.primitives import UNROLLING_RULES
@@ -63,6 +64,7 @@ def fresh_programs(monkeypatch):
     """Empty the caches of programs."""
     monkeypatch.setattr("liethermo.engines.compiled.stepper._step_loop_cache", lt.tracing.caching.LRUCache(4))
     monkeypatch.setattr("liethermo.tracing.interpret._unrolled_cache", lt.tracing.caching.LRUCache(4))
+    monkeypatch.setattr("liethermo.runs.problem._cached_problem", problem._cached_problem.__wrapped__)
 
 
 def raising(*arguments, **keywords):
