@@ -22,7 +22,7 @@ class Computation:
     function: Callable[[], Any]
 
 
-def deferred(function: Callable[[], Any]) -> Any:
+def defer(function: Callable[[], Any]) -> Any:
     """Return a value for a deferred field: ``function()`` is called at the first use of the field."""
     return Computation(function)
 
@@ -46,7 +46,7 @@ class _DeferredField:
 
 
 def deferred_fields(*names: str) -> Callable[[Class], Class]:
-    """Decorate a dataclass: the values of these fields may be given by :func:`deferred`."""
+    """Decorate a dataclass: the values of these fields may be given by :func:`defer`."""
 
     def add_descriptors(cls: Class) -> Class:
         for name in names:

@@ -17,7 +17,7 @@ import numpy as np
 from ..engines.choice import EngineWithFallback
 from ..engines.codes import StatusCode
 from ..functions.energy import Energy
-from ..results.deferred import deferred
+from ..results.deferred import defer
 from ..results.evidence import EvidenceCollector, StepReplay
 from ..results.solution import Solution
 from ..results.status import Laws
@@ -55,7 +55,7 @@ def build_solution(
     solution = Solution(
         x=x,
         entropy=None if system.entropy is None else entropy,
-        casimirs=deferred(functools.partial(_series_of_functions, recorded_functions, x)),
+        casimirs=defer(functools.partial(_series_of_functions, recorded_functions, x)),
         laws=laws,
         evidence_source=EvidenceCollector(system, method, functions, x, np.asarray(fields["t"]), step_sizes, replay),
         **fields,

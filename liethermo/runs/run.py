@@ -18,7 +18,7 @@ from ..engines.stepping import SavedStates, State, energy_and_entropy_at
 from ..errors import FileError
 from ..integrators import Reference
 from ..integrators.fluctuating import noise_dimension
-from ..results.deferred import deferred
+from ..results.deferred import defer
 from ..results.dense import DenseOutput
 from ..results.solution import Solution
 from ..results.status import Stats, Status
@@ -279,7 +279,7 @@ class Run:
 
     def _provenance(self, x0: np.ndarray) -> Any:
         noise, schedule = self.problem.noise, self.schedule
-        return deferred(
+        return defer(
             functools.partial(
                 run_provenance,
                 self.system,

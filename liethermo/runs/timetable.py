@@ -187,7 +187,7 @@ class StepSchedule:
         return self.times_after(self.saved_step_counts)
 
     def time_after(self, n_steps: int) -> float:
-        """Return the time after a number of steps."""
+        """Return the time after ``n_steps`` steps."""
         return self.end if n_steps >= self.n_steps else float(self.times_after(np.asarray(n_steps)))
 
     def times_after(self, steps: np.ndarray) -> np.ndarray:

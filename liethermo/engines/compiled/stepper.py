@@ -145,8 +145,7 @@ class CompiledEngine:
 class CompiledTrajectory:
     """One trajectory in a compiled loop of steps, in buffers that are allocated once.
 
-    A call calls the machine code and copies what is asked for, no more. The buffers are written in place, so each
-    thread needs a trajectory of its own.
+    The buffers are written in place by the machine code, so each thread needs a trajectory of its own.
 
     Parameters
     ----------
@@ -230,7 +229,7 @@ class CompiledTrajectory:
             newton = self._loop.newton_address(True)
 
 
-NO_INCREMENTS = np.zeros(0)
+EMPTY_INCREMENTS = np.zeros(0)
 """Noise increments of a method without noise."""
 
 
@@ -538,7 +537,7 @@ class CompiledStepLoop:
         """Rearrange noise increments to the order of the loop, shape (blocks, steps, increments, lanes)."""
         n_increments = self._shapes["dW"][0]
         if not n_increments:
-            return NO_INCREMENTS
+            return EMPTY_INCREMENTS
         if noise is None:
             return np.zeros((n_blocks, n_steps, n_increments, self.lanes))
         padded = np.zeros((n_blocks * self.lanes, n_steps, n_increments))
