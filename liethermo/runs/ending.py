@@ -45,13 +45,15 @@ BLOW_UP_ADVICE = "No step helps there: does the energy have a lower bound, and d
 """Advice at the end of messages about unbounded growth."""
 
 
-def run_statistics(state: State) -> Stats:
+def run_statistics(state: State, wall_time: float, n_rejected: int = 0) -> Stats:
     """Return the work counters and extreme values of an engine state."""
     has_steps = int(state.step) > 0
     return Stats(
         steps=int(state.step),
         fixed_point_iterations=int(state.fixed_point_iterations),
         newton_iterations=int(state.newton_iterations),
+        rejected=n_rejected,
+        wall_time=wall_time,
         most_iterations=int(state.most_iterations),
         worst_residual=float(state.worst_residual),
         energy_range=(float(state.smallest_energy), float(state.largest_energy)) if has_steps else None,

@@ -30,7 +30,7 @@ from .preparation import check_choice, has_undecided_invariants, refuse_tracers
 from .problem import Problem
 from .progress import Progress
 from .run import Run
-from .timetable import CHUNK_STEPS, ScheduleSegment, checked_span, checked_step, make_schedule
+from .timetable import CHUNK_STEPS, ScheduleSegment, StepSchedule, checked_span, checked_step, make_schedule
 from .watch import EventSet
 
 CONVERGENCE_FAILURES = tuple(
@@ -47,6 +47,13 @@ NOISY_STEPS = "noise= needs fixed steps and cannot be combined with Adaptive, un
 
 MAX_CACHED_PARAMETER_SETS = 32
 """Sets of parameters whose prepared propagators are held in memory, those last used."""
+
+
+MAX_CACHED_SCHEDULES = 32
+"""Schedules of steps that are held in memory, those last used."""
+
+MAX_CACHED_SCHEDULE_STEPS = 10_000
+"""Largest number of steps of a schedule that is held in memory."""
 
 
 class Propagator:
@@ -112,6 +119,7 @@ class Propagator:
         self.system, self.method, self.step, self.engine, self.noise = system, method, step, engine, noise
         self._variants: LRUCache[Propagator] = LRUCache(MAX_CACHED_PARAMETER_SETS)
         self._decided_problem: Problem | None = None
+        self._schedules: LRUCache[StepSchedule] = LRUCache(MAX_CACHED_SCHEDULES)
 
     def __getstate__(self) -> tuple:
         return self.system, self.method, self.step, self.engine, self.noise
@@ -176,7 +184,7 @@ class Propagator:
             raise InputError(REFERENCE_STEPS)
         if self.noise is not None and (dense or until is not None):
             raise InputError(NOISY_STEPS)
-        schedule = make_schedule(t_span, step, save_every, save_at, allow_infinite_end=adaptive and until is not None)
+        schedule = self._schedule(t_span, save_every, save_at, allow_infinite_end=adaptive and until is not None)
         run = Run(problem, problem.initial_state(x0, schedule.start, attitude), schedule, save_to, self.engine, dense)
         with Progress((schedule.start, schedule.end), progress) as bar:
             if isinstance(self.method, Reference):
@@ -269,6 +277,18 @@ class Propagator:
         if not has_undecided_invariants(self.system):
             self._decided_problem = problem
         return problem
+
+    def _schedule(self, t_span, save_every: int, save_at, allow_infinite_end: bool) -> StepSchedule:
+        """Return the schedule of a run; short ones that were used last are held in memory."""
+        if save_at is not None or allow_infinite_end or type(save_every) is not int:
+            return make_schedule(t_span, self.step, save_every, save_at, allow_infinite_end)
+        key = *checked_span(t_span), save_every
+        schedule = self._schedules.get(key)
+        if schedule is None:
+            schedule = make_schedule(key[:2], self.step, save_every)
+            if schedule.n_steps <= MAX_CACHED_SCHEDULE_STEPS:
+                self._schedules.get_or_compute(key, lambda: schedule)
+        return schedule
 
     def _final_state_by_machine_code(self, x0, t_span: tuple[float, float]) -> np.ndarray | None:
         """Return the last state; None where a run has to compute it, or has to say why a step fails."""

@@ -55,6 +55,7 @@ class Run:
         self.last_checkpoint_time = self.start_wall_time
         self.saved_times = [np.array([schedule.start])]
         self.saved_states = [np.asarray(x0)[None]]
+        self.n_saved = 1
         self.saved_energies_entropies: list[np.ndarray] = []  # shapes (saved states, 2)
         self.status: Status | None = None
         self.stats = Stats()
@@ -75,6 +76,10 @@ class Run:
     def last_saved_time(self) -> float:
         """Time of the last saved state."""
         return next(float(times[-1]) for times in reversed(self.saved_times) if len(times))
+
+    def _wall_time(self) -> float:
+        """Return the seconds since the run began."""
+        return time.perf_counter() - self.start_wall_time
 
     # -- the library's own methods ----------------------------------------------------------------------------------
 
@@ -108,7 +113,8 @@ class Run:
             self._save_states(
                 np.array([t]), np.asarray(state.x)[None], np.array([[float(state.energy), float(state.entropy)]])
             )
-        self.stats, self.status = run_statistics(state), final_status(self.engine, state, t, h, interruption)
+        self.stats = run_statistics(state, self._wall_time())
+        self.status = final_status(self.engine, state, t, h, interruption)
 
     def _set_interrupted_at_start(self, reason: str) -> None:
         self.saved_energies_entropies = [self._energies_and_entropies(self.saved_states[0])]
@@ -157,7 +163,7 @@ class Run:
             self._save_steps(unsaved_steps, slice(-1, None))
         self.event_time = outcome.event_time
         state, t = outcome.state, self.last_saved_time
-        self.stats = dataclasses.replace(run_statistics(state), rejected=outcome.n_rejected)
+        self.stats = run_statistics(state, self._wall_time(), outcome.n_rejected)
         steps = int(state.step)
         if isinstance(step, Adaptive) and (
             outcome.underflow_step_size is not None or outcome.exhausted_limit in ("steps", "memory")
@@ -199,16 +205,18 @@ class Run:
         )
 
     def _save_states_of_call(self, saved: SavedStates, first_step: int, steps_per_save: int, keep: bool) -> None:
-        x, steps = saved.x, first_step + steps_per_save * np.arange(1, len(saved.x) + 1)
-        times, energies_entropies = self.schedule.times_after(steps), saved.energy_and_entropy
         if self.all_states is not None:
-            self.all_states.append((times, x))
+            steps = first_step + steps_per_save * np.arange(1, len(saved.x) + 1)
+            times = self.schedule.times_after(steps)
+            self.all_states.append((times, saved.x))
             is_saved = np.isin(steps, self.schedule.saved_step_counts)
-            times, x, energies_entropies = times[is_saved], x[is_saved], energies_entropies[is_saved]
-        if keep:
-            self._save_states(times, x, energies_entropies)
+            self._save_states(times[is_saved], saved.x[is_saved], saved.energy_and_entropy[is_saved])
+        elif keep:
+            times = self.schedule.saved_times[self.n_saved : self.n_saved + len(saved.x)]
+            self._save_states(times, saved.x, saved.energy_and_entropy)
 
     def _save_states(self, times: np.ndarray, x: np.ndarray, energies_entropies: np.ndarray) -> None:
+        self.n_saved += len(times)
         self.saved_times.append(times)
         self.saved_states.append(x)
         self.saved_energies_entropies.append(energies_entropies)
@@ -222,7 +230,7 @@ class Run:
         x, n_evaluations, message, was_interrupted = self.method.trajectory(self.system, self.saved_states[0][0], times)
         self.saved_times, self.saved_states = [times[: len(x)]], [x]
         self.saved_energies_entropies = [self._energies_and_entropies(x)]
-        self.stats = Stats(steps=len(x) - 1, fixed_point_iterations=n_evaluations)
+        self.stats = Stats(steps=len(x) - 1, fixed_point_iterations=n_evaluations, wall_time=self._wall_time())
         t = self.last_saved_time
         bar.update(t)
         if was_interrupted:
@@ -255,7 +263,7 @@ class Run:
             laws=self.problem.laws,
             invariants=self.problem.invariants,
             status=self.status or Status(StatusCode.INTERRUPTED, "still running", len(x) - 1, self.last_saved_time),
-            stats=dataclasses.replace(self.stats, wall_time=time.perf_counter() - self.start_wall_time),
+            stats=self.stats,
             provenance=self._provenance(x[0]),
             event_time=self.event_time,
             dense=self._dense_output(),
@@ -270,7 +278,7 @@ class Run:
     def _checkpoint(self, read_state: Callable[[], State]) -> None:
         """Write the run so far to the file ``save_to``, if the last time was long ago."""
         if self.save_to is not None and time.perf_counter() - self.last_checkpoint_time > CHECKPOINT_SECONDS:
-            self.stats = run_statistics(read_state())
+            self.stats = run_statistics(read_state(), self._wall_time())
             try:
                 self.solution().save(self.save_to)
             except FileError as error:  # the disk may have space again at the end

@@ -181,7 +181,7 @@ class StepSchedule:
         """Number of steps before each segment; the total is the last entry."""
         return np.cumsum([0, *(segment.n_steps for segment in self.segments)])
 
-    @property
+    @functools.cached_property
     def saved_times(self) -> np.ndarray:
         """Times of the saved states."""
         return self.times_after(self.saved_step_counts)
