@@ -1,5 +1,6 @@
 """A prepared propagator returns what ``integrate`` and ``ensemble`` return, to the bit."""
 
+import dataclasses
 import pickle
 from concurrent.futures import ThreadPoolExecutor
 
@@ -9,6 +10,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
+from liethermo.engines.choice import CompiledEngineWarning
 
 SPAN = (0.0, 1.3)
 STEP = 0.25
@@ -189,3 +191,39 @@ def test_a_step_that_fails_raises_what_integrate_raises():
 def test_bad_arguments(call, message):
     with pytest.raises(lt.InputError, match=message):
         call()
+
+
+def test_what_a_solution_computes_later_is_what_it_would_have_computed_at_once():
+    """Casimirs and provenance are computed at their first use, once, and a pickled copy has them."""
+    propagator = lt.Propagator(rigid_body(), lt.MetriplecticGauss(2), STEP)
+    solution, read_first = propagator(MU, SPAN), propagator(MU, SPAN)
+    assert read_first.casimirs is read_first.casimirs
+    copy = pickle.loads(pickle.dumps(solution))
+    for name, series in read_first.casimirs.items():
+        assert np.array_equal(copy.casimirs[name], series)
+        assert np.array_equal(solution.casimirs[name], series)
+    entries = {name: value for name, value in read_first.provenance.items() if name != "date"}
+    assert {name: value for name, value in copy.provenance.items() if name != "date"} == entries
+    assert dataclasses.replace(solution, t=solution.t + 1.0).provenance["step"] == STEP
+
+
+def test_runs_of_one_problem_do_not_share_what_they_return():
+    propagator = lt.Propagator(rigid_body(), lt.MetriplecticGauss(2), STEP)
+    first = propagator(MU, SPAN)
+    x, t, final_state = first.x.copy(), first.t.copy(), propagator.final(MU, SPAN).copy()
+    second = propagator(-2.0 * np.asarray(MU), SPAN)
+    second.t[:], second.x[:] = 0.0, 0.0
+    assert np.array_equal(first.x, x)
+    assert np.array_equal(propagator(MU, SPAN).t, t)
+    assert np.array_equal(propagator.final(MU, SPAN), final_state)
+    assert first.audit().passed
+
+
+def test_a_run_that_fell_back_is_told_each_time():
+    """The array engine takes over in every run of such a system, and every run says so."""
+    unsupported = lambda m: jnp.sum(jnp.array([1.0, 2.0, 3.0]) * m**2) / 2 + 0.0 * jnp.sum(jnp.fft.fft(m).real)  # noqa: E731
+    system = lt.LiePoissonSystem(mf.so(3), unsupported)
+    propagator = lt.Propagator(system, lt.MetriplecticMidpoint(), STEP)
+    for _ in range(2):
+        with pytest.warns(CompiledEngineWarning, match="array engine"):
+            assert propagator(MU, SPAN).provenance["engine"] == "array"
