@@ -131,13 +131,13 @@ INTERNALS = frozenset(
     accessed_names across added_momentum algebra_by_constants as_provenance balance_entries base_step
     bind_attitude bind_to bind_to_structure block_results body_at_attitude body_dim can_be_embedded
     can_transport_attitude can_unroll carries_compensation check_components clock_components component_scales
-    consecutive_increments constant_names continuous_factor couplings decompose difference_quotient
+    consecutive_increments constant_names factor_at_state couplings decompose difference_quotient
     difference_rounding_scale dim_without_ledger displace divergence_terms dot_at_sites drop_baths drop_torque
     energy_of_vectors evaluate_batch evaluations_per_iteration external_torque field_and_law_rates
     first_velocity_index forces_and_power freeze_at functions_for_naming general generator_field grid_seeds
     has_impulse has_ledger has_matrix_functions has_poisson_by_construction heating_sites impulse_names initial
     initial_compensation initial_run_state initial_state input_residuals intervals invariant_names
-    invariant_verdicts invariants_by_construction is_hidden is_noiseless is_order_independent
+    invariant_verdicts invariants_by_construction is_hidden is_noiseless is_coordinate_order_independent
     is_projection_trivial is_smooth is_torque_free isotropic_size isotropic_vector jackknife_blocks
     jacobian_probe join_state ledger ledger_rates local_system lower_index make_blocks map_defect
     mechanical_energy member_stats member_status method_with_noise midpoint_gradients momentum_jacobians

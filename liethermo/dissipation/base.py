@@ -74,7 +74,7 @@ class Dissipation(Module):
 
     @property
     def terms(self) -> tuple[Dissipation, ...]:
-        """The summands, or this dissipation alone."""
+        """Return the summands, or this dissipation alone."""
         return (self,)
 
     @property
@@ -87,7 +87,8 @@ class Dissipation(Module):
 
     @property
     def can_drive_baths(self) -> bool:
-        """True if it acts on a state followed by bath entropies when the body has no entropy of its own."""
+        """True if its states are those of the body followed by bath entropies; the body has then no entropy of its
+        own."""
         return False
 
     def bind_to(self, system: Geometry) -> Dissipation:
@@ -95,7 +96,8 @@ class Dissipation(Module):
         return self
 
     def input_residuals(self, system: Geometry, x) -> dict[str, jax.Array]:
-        """Return residuals at x of conditions on the user's input, relative to the terms that cancel, by name."""
+        """Return, by name, how far the user's functions miss their conditions at x, relative to the terms that
+        cancel."""
         return {}
 
     @abstractmethod
@@ -114,7 +116,7 @@ class Dissipation(Module):
 
     @property
     def heated_bath_index(self) -> Indices | None:
-        """The number of the bath that takes the heat, or one number for each site; None for the first bath."""
+        """The number of the bath that takes the heat, one for each site where sites differ; None for the first bath."""
         return None
 
     @property
@@ -130,7 +132,7 @@ class Dissipation(Module):
         raise NotImplementedError(f"{type(self).__name__} has no such form")
 
     def velocity(self, system: Geometry, x, dH, dS, dL) -> jax.Array | None:
-        """Return sigma, shape (n,), if the construction has the force ``Pi(x) sigma``; otherwise None.
+        """Return the covector sigma, shape (n,), with the force ``Pi(x) sigma``; None if the construction has none.
 
         On a Lie algebra the force is ``ad*_sigma x``, for example internal friction of a body, which carries the
         momentum along its coadjoint orbit by the additional velocity sigma. An attitude that follows sigma too
@@ -148,27 +150,27 @@ class Dissipation(Module):
         return None
 
     def divergence(self, system: Geometry, x) -> jax.Array:
-        """Return the divergence of every column of the factor at the gradients of the functions, shape (columns,).
+        """Return the divergence of each column of the factor B at x, shape (columns,).
 
         It is computed by differentiation, except where the construction makes it vanish.
         """
-        B = self.continuous_factor(system, x)
+        B = self.factor_at_state(system, x)
         assert B is not None
         return jnp.zeros(B.size) if B.solenoidal else jnp.sum(self.divergence_terms(system, x), axis=0)
 
     def divergence_terms(self, system: Geometry, x) -> jax.Array:
         """Return the terms, shape (n, columns), whose sum over the first axis is the divergence of each column."""
-        return system.divergence_terms(x, lambda y, alpha: self.continuous_factor(system, y).transpose_times(alpha))  # type: ignore[union-attr]
+        return system.divergence_terms(x, lambda y, alpha: self.factor_at_state(system, y).transpose_times(alpha))  # type: ignore[union-attr]
 
-    def continuous_factor(self, system: Geometry, x) -> Factor | None:
-        """Return the factor for the gradients of the functions at x."""
+    def factor_at_state(self, system: Geometry, x) -> Factor | None:
+        """Return the factor B at x, by the exact gradients of the energy and of the preserved functions; or None."""
         return self.factor(system, x, system.energy.gradient(x), tuple(L.gradient(x) for L in self.preserve))
 
-    def added_momentum(self, dH, turned) -> jax.Array | None:
-        """Return F if the force is ``ad*_dH F``, as in forced Euler-Poincaré equations [BFM 3.2]; otherwise None.
+    def added_momentum(self, dH, bracket_dH_dS) -> jax.Array | None:
+        """Return the covector F, shape (n,), if the force is ``ad*_dH F`` (forced Euler-Poincaré); otherwise None.
 
-        ``turned`` is ``[dH, dS]``. F is added to the momentum of the motion, ``x' = ad*_dH (x + F)``: one coadjoint
-        action instead of two.
+        ``bracket_dH_dS`` is ``[dH, dS]``. F is added to the momentum of the motion, ``x' = ad*_dH (x + F)``: one
+        coadjoint action instead of two.
         """
         return None
 
@@ -228,7 +230,7 @@ class DissipationSum(Dissipation):
         return DissipationSum(tuple(part.bind_to(system) for part in self.parts))
 
     def force(self, system, x, dH, dS, dL):
-        return sum(term.force(system, x, dH, dS, dL_part) for term, dL_part in terms_with_preserved(self, dL))
+        return sum(term.force(system, x, dH, dS, dL_part) for term, dL_part in terms_with_preserved_values(self, dL))
 
     @property
     def has_generator(self) -> bool:
@@ -238,7 +240,7 @@ class DissipationSum(Dissipation):
         return sum(part.generator_field(system, x, dH) for part in self.parts)
 
     def factor(self, system, x, dH, dL):
-        factors = [term.factor(system, x, dH, dL_part) for term, dL_part in terms_with_preserved(self, dL)]
+        factors = [term.factor(system, x, dH, dL_part) for term, dL_part in terms_with_preserved_values(self, dL)]
         known_factors = [B for B in factors if B is not None]
         return concatenate_factors(known_factors) if len(known_factors) == len(factors) else None
 
@@ -266,7 +268,9 @@ def sum_dissipations(dissipations: Dissipation | Sequence[Dissipation] | None) -
     return functools.reduce(operator.add, dissipations)
 
 
-def terms_with_preserved(dissipation: Dissipation, values: Sequence[T]) -> Iterator[tuple[Dissipation, tuple[T, ...]]]:
+def terms_with_preserved_values(
+    dissipation: Dissipation, values: Sequence[T]
+) -> Iterator[tuple[Dissipation, tuple[T, ...]]]:
     """Yield each summand with its portion of ``values``, which belong to the functions in ``dissipation.preserve``."""
     start = 0
     for term in dissipation.terms:
@@ -298,7 +302,7 @@ class LiftedGeometry(NamedTuple):
     lower: Callable
     preserves_solenoidal: bool = False
 
-    def lift_gradients(self, dH, dS, dL) -> tuple:
+    def inner_gradients(self, dH, dS, dL) -> tuple:
         """Return the inner gradients; dS may be None."""
         return self.lift(dH), None if dS is None else self.lift(dS), tuple(map(self.lift, dL))
 
@@ -327,7 +331,7 @@ class LiftedDissipation(Dissipation):
 
     def force(self, system, x, dH, dS, dL):
         geometry = self.lifted_geometry(system, x)
-        return geometry.lower(self.inner.force(geometry.system, geometry.x, *geometry.lift_gradients(dH, dS, dL)))
+        return geometry.lower(self.inner.force(geometry.system, geometry.x, *geometry.inner_gradients(dH, dS, dL)))
 
     has_generator = forward_to("inner")
 

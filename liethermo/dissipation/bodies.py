@@ -111,31 +111,31 @@ class LinearFriction(Dissipation):
     body_index: int | None = eqx.field(static=True, default=None)
 
     def force(self, system, x, dH, dS, dL):
-        p, S, R, v, T = self._friction_data(system, x, dH)
-        return self._apply_directions(x, p, S, v, T, _apply_form(R, (v * dS[S] - T * dS[p]) / T))
+        p, S, R, v, T = self._indices_form_velocities_temperatures(system, x, dH)
+        return self._force_of_flux(x, p, S, v, T, _apply_form(R, (v * dS[S] - T * dS[p]) / T))
 
     def factor(self, system, x, dH, dL):
-        p, S, R, v, T = self._friction_data(system, x, dH)
+        p, S, R, v, T = self._indices_form_velocities_temperatures(system, x, dH)
         matrix_root = semidefinite_root if callable(self.R) else semidefinite_factor
         root = jnp.sqrt(R) if jnp.ndim(R) < 2 else matrix_root(R)
-        return Factor(len(p), lambda w: self._apply_directions(x, p, S, v, T, _apply_form(root, w) / jnp.sqrt(T)))
+        return Factor(len(p), lambda w: self._force_of_flux(x, p, S, v, T, _apply_form(root, w) / jnp.sqrt(T)))
 
     @staticmethod
-    def _apply_directions(x, p, S, v, T, flux) -> jax.Array:
+    def _force_of_flux(x, p, S, v, T, flux) -> jax.Array:
         return jnp.zeros_like(x).at[p].add(-T * flux).at[S].add(v * flux)
 
-    def _friction_data(self, system, x, dH):
+    def _indices_form_velocities_temperatures(self, system, x, dH):
         """Return the indices of momenta and entropies, R, the velocities and the temperatures: (p, S, R, v, T)."""
         indices = _state_indices(system)
         numbers = (
             np.arange(len(indices.p)) if self.body_index is None else np.flatnonzero(indices.owner == self.body_index)
         )
-        R = self.R(x[_body_components(indices, numbers)]) if callable(self.R) else self.R
+        R = self.R(x[_body_component_indices(indices, numbers)]) if callable(self.R) else self.R
         p, S = indices.p[numbers], indices.S[indices.owner[numbers]]
         return p, S, R, dH[p], _nan_unless_positive(dH[S])
 
     def couplings(self, system):
-        return _block_pattern(_state_indices(system), system.dim)
+        return _same_body_pattern(_state_indices(system), system.dim)
 
 
 class Drag(Dissipation):
@@ -160,31 +160,31 @@ class Drag(Dissipation):
         self.coefficient = graph.weight
 
     def force(self, system, x, dH, dS, dL):
-        (p_i, p_j, S_i, S_j), (T_i, T_j, w), weight, apply_directions = self._edge_data(system, x, dH)
+        (p_i, p_j, S_i, S_j), (T_i, T_j, w), weight, force_of_flux = self._edge_indices_values_weights(system, x, dH)
         z_dot_dS = dS[p_j] - dS[p_i] + 0.5 * w * (dS[S_i] / T_i + dS[S_j] / T_j)
-        return apply_directions(weight * z_dot_dS)
+        return force_of_flux(weight * z_dot_dS)
 
     def factor(self, system, x, dH, dL):
-        _, _, weight, apply_directions = self._edge_data(system, x, dH)
-        return Factor(len(weight), lambda w: apply_directions(jnp.sqrt(weight) * w))
+        _, _, weight, force_of_flux = self._edge_indices_values_weights(system, x, dH)
+        return Factor(len(weight), lambda w: force_of_flux(jnp.sqrt(weight) * w))
 
-    def _edge_data(self, system, x, dH):
+    def _edge_indices_values_weights(self, system, x, dH):
         """Return indices (p_i, p_j, S_i, S_j), values (T_i, T_j, v_i - v_j), ``c / theta``, and flux -> ``flux z``."""
         indices = _state_indices(system)
-        i, j, edge = _momentum_pairs(self.first_bodies, self.second_bodies, indices)
+        i, j, edge = _momentum_and_edge_numbers(self.first_bodies, self.second_bodies, indices)
         S_i, S_j, p_i, p_j = indices.S[indices.owner[i]], indices.S[indices.owner[j]], indices.p[i], indices.p[j]
         T_i, T_j, w = _nan_unless_positive(dH[S_i]), _nan_unless_positive(dH[S_j]), dH[p_i] - dH[p_j]
 
-        def apply_directions(flux):
+        def force_of_flux(flux):
             force = jnp.zeros_like(x).at[S_i].add(0.5 * w * flux / T_i).at[S_j].add(0.5 * w * flux / T_j)
             return force.at[p_i].add(-flux).at[p_j].add(flux)
 
         weight = self.coefficient[edge] * (2.0 * T_i * T_j / (T_i + T_j))
-        return (p_i, p_j, S_i, S_j), (T_i, T_j, w), weight, apply_directions
+        return (p_i, p_j, S_i, S_j), (T_i, T_j, w), weight, force_of_flux
 
     def couplings(self, system):
         indices = _state_indices(system)
-        i, j, _ = _momentum_pairs(self.first_bodies, self.second_bodies, indices)
+        i, j, _ = _momentum_and_edge_numbers(self.first_bodies, self.second_bodies, indices)
         S_i, S_j = indices.S[indices.owner[i]], indices.S[indices.owner[j]]
         return clique_pattern(np.stack([indices.p[i], S_i, indices.p[j], S_j], axis=1), system.dim)
 
@@ -216,7 +216,7 @@ class ContactFriction(SkewFriction):
         return jnp.zeros_like(x).at[p].add(-x[p] * dH[S]).at[S].add(x[p] * dH[p])
 
     def couplings(self, system):
-        return _block_pattern(_state_indices(system), system.dim)
+        return _same_body_pattern(_state_indices(system), system.dim)
 
 
 # -- helpers ----------------------------------------------------------------------------------------------------------
@@ -235,13 +235,15 @@ def _apply_form(R, v):
     return R * v if jnp.ndim(R) < 2 else R @ v
 
 
-def _body_components(indices: StateIndices, numbers: np.ndarray) -> np.ndarray:
+def _body_component_indices(indices: StateIndices, momentum_numbers: np.ndarray) -> np.ndarray:
     """Return the indices of all state components of the body with these momenta."""
-    return np.concatenate([indices.q[numbers], indices.p[numbers], indices.S[indices.owner[numbers[:1]]]])
+    return np.concatenate(
+        [indices.q[momentum_numbers], indices.p[momentum_numbers], indices.S[indices.owner[momentum_numbers[:1]]]]
+    )
 
 
-def _momentum_pairs(first_bodies: Indices, second_bodies: Indices, indices: StateIndices):
-    """Return, for each edge and component, the numbers of the two momenta and of the edge."""
+def _momentum_and_edge_numbers(first_bodies: Indices, second_bodies: Indices, indices: StateIndices):
+    """Return three index arrays, an entry for each edge and component: first momentum, second momentum, edge."""
     i, j = np.asarray(first_bodies), np.asarray(second_bodies)
     starts = np.searchsorted(indices.owner, np.arange(len(indices.S)))
     counts = np.bincount(indices.owner, minlength=len(indices.S))[i]
@@ -250,7 +252,7 @@ def _momentum_pairs(first_bodies: Indices, second_bodies: Indices, indices: Stat
     return starts[i][edge] + offsets, starts[j][edge] + offsets, edge
 
 
-def _block_pattern(indices: StateIndices, dim: int) -> scipy.sparse.csr_array:
+def _same_body_pattern(indices: StateIndices, dim: int) -> scipy.sparse.csr_array:
     """Return the pattern in which the components of a body depend on each other, and on no other body."""
     starts = np.concatenate([[0], indices.S[:-1] + 1])
     body = np.repeat(np.arange(len(starts)), indices.S + 1 - starts)

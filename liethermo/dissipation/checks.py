@@ -10,8 +10,8 @@ import manifolds as mf
 from manifolds.matrices.blocks import BlockDiagonal, Diagonal
 
 from ..errors import IndefiniteError, InputError
-from ..functions.checks import check_function_shape
-from ..functions.conditions import check_numbers, require_condition
+from ..functions.checks import traced_function_and_shape
+from ..functions.conditions import checked_numbers, require_condition
 from ..functions.indices import Indices
 from .geometry import Geometry
 
@@ -22,7 +22,7 @@ NEGATIVE_EIGENVALUE_MESSAGE = (
 
 
 def evaluate_form(form, x):
-    """Return a form at the state x: a constant unchanged, or a function evaluated."""
+    """Return the matrix of a form at the state x: a constant is returned unchanged, a function is evaluated."""
     return jnp.asarray(form(x)) if callable(form) else form
 
 
@@ -40,7 +40,7 @@ def state_shape_dtype(dim: int):
 
 def checked_rate(rate) -> jax.Array:
     """Return a rate as one nonnegative number (or a traced one)."""
-    array = check_numbers(rate, "a rate", ())
+    array = checked_numbers(rate, "a rate", ())
     require_condition(
         array,
         lambda rate: rate >= 0.0,
@@ -51,14 +51,14 @@ def checked_rate(rate) -> jax.Array:
 
 def checked_rates(rates) -> jax.Array:
     """Return a rate, or one for each site, as an array of nonnegative numbers (or traced ones)."""
-    array = check_numbers(rates, "a rate")
+    array = checked_numbers(rates, "a rate")
     if not isinstance(array, jax.core.Tracer) and not np.all(np.asarray(array) >= 0.0):
         min_rate = float(np.asarray(array).min())
         raise InputError(f"a dissipation rate must be >= 0, got {min_rate}: a negative rate would lower the entropy")
     return array
 
 
-def checked_bath(bath) -> Indices | None:
+def checked_bath_indices(bath) -> Indices | None:
     """Return the number of a bath, or one for each site; the system later checks that the baths exist."""
     if bath is None or isinstance(bath, Indices):
         return bath
@@ -82,7 +82,7 @@ def checked_semidefinite(form, what: str, symmetric: bool = True) -> jax.Array:
 
     Without ``symmetric`` only its symmetric part has to be semidefinite.
     """
-    matrix = check_numbers(form, what)
+    matrix = checked_numbers(form, what)
     if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
         raise InputError(f"{what} must be a square matrix, got shape {matrix.shape}")
     if isinstance(matrix, jax.core.Tracer):
@@ -109,7 +109,7 @@ def checked_semidefinite(form, what: str, symmetric: bool = True) -> jax.Array:
     return matrix
 
 
-def check_matrix(form, dim: int, what: str) -> None:
+def check_form_shape(form, dim: int, what: str) -> None:
     """Raise InputError unless a form, or the value of a form that depends on the state, has shape (dim, dim)."""
     if isinstance(form, BlockDiagonal):
         return
@@ -118,7 +118,7 @@ def check_matrix(form, dim: int, what: str) -> None:
             raise InputError(f"{what} has {form.entries.size} entries, and a state has {dim} components")
         return
     if callable(form):
-        check_function_shape(form, [(dim,)], [(dim, dim)], what, f"a state of shape ({dim},)")
+        traced_function_and_shape(form, [(dim,)], [(dim, dim)], what, f"a state of shape ({dim},)")
     elif form.shape != (dim, dim):
         raise InputError(
             f"{what} must be a ({dim}, {dim}) matrix for a state of {dim} components, not shape {form.shape}"

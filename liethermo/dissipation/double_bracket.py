@@ -10,10 +10,10 @@ import numpy as np
 
 from manifolds.matrices.blocks import Diagonal
 
-from ..functions.conditions import check_numbers, require_condition
+from ..functions.conditions import checked_numbers, require_condition
 from ..functions.indices import Indices
 from .base import Dissipation
-from .checks import check_matrix, checked_bath, checked_rate, checked_semidefinite, repeat_over_sites
+from .checks import check_form_shape, checked_bath_indices, checked_rate, checked_semidefinite, repeat_over_sites
 from .factor import Factor, form_root
 
 
@@ -51,7 +51,7 @@ class DoubleBracket(Dissipation):
 
     def __init__(self, rate=1.0, metric=None, bath=None):
         self.rate = checked_rate(rate)
-        self.bath = checked_bath(bath)
+        self.bath = checked_bath_indices(bath)
         self.metric = None if metric is None else _checked_metric(metric)
 
     energy_law = "nonincreasing"
@@ -63,7 +63,7 @@ class DoubleBracket(Dissipation):
         if self.metric is None:
             return self
         metric = repeat_over_sites(self.metric, system)
-        check_matrix(metric, system.dim, "the metric")
+        check_form_shape(metric, system.dim, "the metric")
         return self if metric is self.metric else eqx.tree_at(lambda d: d.metric, self, metric)
 
     @property
@@ -77,7 +77,7 @@ class DoubleBracket(Dissipation):
         return self.rate * self._bracket_velocity(system, x, dH)
 
     def _bracket_velocity(self, system, x, dH) -> jax.Array:
-        """Return ``(Pi dH)^♯``."""
+        """Return sigma = ``(Pi dH)^♯``, shape (n,), by the metric; the force is ``rate * Pi sigma``."""
         motion = system.poisson.sharp(x, dH)
         return system.lower_index(x, motion) if self.metric is None else self.metric @ motion
 
@@ -97,6 +97,6 @@ class DoubleBracket(Dissipation):
 def _checked_metric(metric) -> Any:
     if np.ndim(metric) != 1:
         return checked_semidefinite(metric, "the metric")
-    entries = check_numbers(metric, "the metric")
+    entries = checked_numbers(metric, "the metric")
     require_condition(entries, lambda entries: entries >= 0.0, "the diagonal of the metric must be >= 0, got {value}")
     return Diagonal(entries)

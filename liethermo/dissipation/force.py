@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from manifolds._pytree_module import Module
 
-from ..functions.checks import check_function_shape
+from ..functions.checks import traced_function_and_shape
 from .base import Dissipation
 from .checks import require_algebra
 
@@ -33,7 +33,7 @@ class EulerPoincareForce(Dissipation):
 
     def bind_to(self, system):
         require_algebra(system, "EulerPoincareForce")
-        check_function_shape(
+        traced_function_and_shape(
             self.F, [system.shape], [system.shape], "the force F", f"a velocity of shape {system.shape}"
         )
         return dataclasses.replace(self, F=_FlattenedMap(self.F, system.shape)) if system.sites else self

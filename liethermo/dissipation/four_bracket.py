@@ -12,10 +12,10 @@ from manifolds.matrices.linear import skew_matrix
 from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
 
 from ..errors import IndefiniteError, InputError
-from ..functions.checks import check_function_shape
-from ..functions.conditions import check_numbers
+from ..functions.checks import traced_function_and_shape
+from ..functions.conditions import checked_numbers
 from .base import Dissipation
-from .checks import check_matrix, checked_semidefinite, evaluate_form
+from .checks import check_form_shape, checked_semidefinite, evaluate_form
 from .factor import Factor
 from .inner_product import InnerProductDissipation, KillingDissipation
 
@@ -43,7 +43,7 @@ class FourBracket(Dissipation):
 
     def __init__(self, tensor):
         if not callable(tensor):
-            tensor = check_numbers(tensor, "a 4-bracket")
+            tensor = checked_numbers(tensor, "a 4-bracket")
             if tensor.ndim != 4 or len(set(tensor.shape)) != 1:
                 raise InputError(f"a 4-bracket must have shape (n, n, n, n), got {tensor.shape}")
             _check_curvature_symmetries(tensor)
@@ -51,7 +51,7 @@ class FourBracket(Dissipation):
 
     @staticmethod
     def kulkarni_nomizu(sigma, mu) -> Dissipation:
-        """4-bracket ``sigma ∧ mu`` of two symmetric semidefinite forms on covectors, constant or functions of x.
+        """Return the 4-bracket ``sigma ∧ mu`` of two semidefinite forms on covectors, constants or functions of x.
 
         ``K(a, b) = sigma(a, b) mu(h, h) - sigma(a, h) mu(h, b) + mu(a, b) sigma(h, h) - mu(a, h) sigma(h, b)``, h = dH.
         With sigma = G/2 and mu = G it is the projected metric (BFM 2.2) of G.
@@ -60,13 +60,13 @@ class FourBracket(Dissipation):
 
     @staticmethod
     def lie_algebra(form=None) -> Dissipation:
-        """4-bracket ``𝒦([dF, dK], [dG, dN])`` of an inner product 𝒦 on g (by default that of KillingDissipation)."""
+        """Return the 4-bracket ``𝒦([dF, dK], [dG, dN])`` of an inner product 𝒦 on g, by default the Killing one."""
         return KillingDissipation() if form is None else InnerProductDissipation(form)
 
     def bind_to(self, system):
         n = system.dim
         if callable(self.tensor):
-            check_function_shape(self.tensor, [(n,)], [(n,) * 4], "the 4-bracket", f"a state of shape ({n},)")
+            traced_function_and_shape(self.tensor, [(n,)], [(n,) * 4], "the 4-bracket", f"a state of shape ({n},)")
         elif self.tensor.shape != (n,) * 4:
             raise InputError(f"the 4-bracket has shape {self.tensor.shape}, but the state has {n} components")
         return self
@@ -75,7 +75,7 @@ class FourBracket(Dissipation):
         return jnp.einsum("ijkl,j,k,l->i", evaluate_form(self.tensor, x), dH, dS, dH)
 
     def factor(self, system, x, dH, dL):
-        """Return the columns ``A dH``, where ``R = sum A (x) A``: R must be semidefinite on pairs of covectors."""
+        """Return the factor with the columns ``A dH``, where ``R = sum A (x) A``: R must be semidefinite on pairs."""
         i, j = np.triu_indices(system.dim, 1)
         form = evaluate_form(self.tensor, x)[i, j][:, i, j]
         _check_semidefinite_on_pairs(form)
@@ -98,8 +98,8 @@ class KulkarniNomizu(Dissipation):
         self.mu = mu if callable(mu) else checked_semidefinite(mu, "the form mu")
 
     def bind_to(self, system):
-        check_matrix(self.sigma, system.dim, "the form sigma")
-        check_matrix(self.mu, system.dim, "the form mu")
+        check_form_shape(self.sigma, system.dim, "the form sigma")
+        check_form_shape(self.mu, system.dim, "the form mu")
         return self
 
     def force(self, system, x, dH, dS, dL):
@@ -110,7 +110,7 @@ class KulkarniNomizu(Dissipation):
         return from_sigma + from_mu
 
     def factor(self, system, x, dH, dL):
-        """Return the columns ``(m_j . dH) s_i - (s_i . dH) m_j``, of divergence zero for constant forms."""
+        """Return the factor with a column ``(m_j . dH) s_i - (s_i . dH) m_j`` for each pair of columns of the roots."""
         n, constant = system.dim, not (callable(self.sigma) or callable(self.mu))
         s, m = (
             semidefinite_root(form(x)) if callable(form) else semidefinite_factor(form)

@@ -12,7 +12,14 @@ from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
 
 from ..functions.indices import Indices
 from .base import Dissipation
-from .checks import check_matrix, checked_bath, checked_rate, checked_semidefinite, evaluate_form, reject_rate_as_form
+from .checks import (
+    check_form_shape,
+    checked_bath_indices,
+    checked_rate,
+    checked_semidefinite,
+    evaluate_form,
+    reject_rate_as_form,
+)
 from .factor import Factor
 
 
@@ -46,7 +53,7 @@ class Friction(Dissipation):
             D = checked_semidefinite(np.diag(D) if np.ndim(D) == 1 else D, "the friction D")
         self.D = D
         self.rate = checked_rate(rate)
-        self.bath = checked_bath(bath)
+        self.bath = checked_bath_indices(bath)
 
     energy_law = "nonincreasing"
     entropy_law = None
@@ -54,7 +61,7 @@ class Friction(Dissipation):
 
     def bind_to(self, system):
         if self.D is not None:
-            check_matrix(self.D, system.dim, "the friction D")
+            check_form_shape(self.D, system.dim, "the friction D")
         return self
 
     @property

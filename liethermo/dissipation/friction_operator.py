@@ -13,7 +13,7 @@ from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
 
 from ..errors import InputError
 from .base import Dissipation
-from .checks import check_matrix, checked_rate, checked_semidefinite, evaluate_form, reject_rate_as_form
+from .checks import check_form_shape, checked_rate, checked_semidefinite, evaluate_form, reject_rate_as_form
 from .factor import Factor
 
 FRICTION_KERNEL_CHECK = "K grad H = 0, as given"
@@ -69,7 +69,7 @@ class FrictionOperator(Dissipation):
     can_drive_baths = True
 
     def bind_to(self, system):
-        check_matrix(self.K, system.dim, "the friction operator K")
+        check_form_shape(self.K, system.dim, "the friction operator K")
         return self
 
     def input_residuals(self, system, x):
@@ -87,7 +87,8 @@ class FrictionOperator(Dissipation):
         return self.rate * (image - jnp.dot(dH, image) * direction)
 
     def factor(self, system, x, dH, dL):
-        """Return the projected root: the symmetric root of K(x), or a Cholesky factor of a constant K."""
+        """Return the factor ``P^T B`` with ``B B^T = K``: B is the symmetric root of K(x), or Cholesky for constant
+        K."""
         root = semidefinite_root(self.K(x)) if callable(self.K) else semidefinite_factor(self.K)
         direction = self._projection_direction(system, x, dH)
 

@@ -49,7 +49,7 @@ class Geometry(Module):
 
     @property
     def sites(self) -> tuple[int, ...]:
-        """The lattice of sites of a system of many equal parts, whose states have the shape ``(*sites, d)``."""
+        """Shape of the lattice of sites, whose states have the shape ``(*sites, d)``; () for a system without sites."""
         return ()
 
     @property
@@ -59,7 +59,7 @@ class Geometry(Module):
 
     @property
     def heating_sites(self) -> tuple[int, ...]:
-        """The sites that may each heat a bath of their own."""
+        """Shape of the lattice of the sites that may each heat a bath of their own; () if there are none."""
         return self.sites
 
     @property
@@ -100,11 +100,11 @@ class Geometry(Module):
 
     @property
     def isotropic_size(self) -> int:
-        """Number of components of the argument w of :meth:`isotropic_vector`."""
+        """Number of independent Gaussian numbers w in an isotropic random vector: see :meth:`isotropic_vector`."""
         return self.dim if self.space is None else self.space.isotropic_size
 
     def isotropic_vector(self, x, w) -> jax.Array:
-        """Return ``R w`` with ``R R^T`` the inverse of the metric of the space, shape (n,); w itself on R^n."""
+        """Return the tangent vector ``R w``, shape (n,), with ``R R^T`` the inverse of the metric; w itself on R^n."""
         return w if self.space is None else self.space.to_vector(self.space._isotropic(self.points(x), w))
 
     def scale_at_sites(self, values, v) -> jax.Array:
@@ -117,15 +117,17 @@ class Geometry(Module):
         """Return ``alpha . v`` at each site, shape (sites,)."""
         return jnp.sum((alpha * v).reshape(math.prod(self.sites), -1), axis=1)
 
-    def divergence_terms(self, x, rows) -> jax.Array:
-        """Return the terms whose sum over the first axis is the divergence of vector fields.
+    def divergence_terms(self, x, contract_fields) -> jax.Array:
+        """Return the terms, shape (n, fields), whose sum over the first axis is the divergence of each vector field.
 
         ``rows(y, alpha)`` is the product of a covector alpha at y with the field, or with each of several fields.
         """
         if self.space is None:
-            return jax.vmap(lambda e: jax.jvp(lambda y: rows(y, e), (x,), (e,))[1])(jnp.eye(x.shape[0]))
+            return jax.vmap(lambda e: jax.jvp(lambda y: contract_fields(y, e), (x,), (e,))[1])(jnp.eye(x.shape[0]))
         vector = self.space.to_vector
-        return self.space._divergence_terms(self.points(x), lambda y, alpha: rows(vector(y), vector(alpha.conj())))
+        return self.space._divergence_terms(
+            self.points(x), lambda y, alpha: contract_fields(vector(y), vector(alpha.conj()))
+        )
 
 
 @subprogram

@@ -50,23 +50,27 @@ class Heating(LiftedDissipation):
 
     def force(self, system, x, dH, dS, dL):
         body, n = system.drop_baths(), system.body_dim
-        force = self.inner.force(body, x[:n], self._force_gradient(body, dH, dS, n), None, tuple(L[:n] for L in dL))
-        return self._join_with_entropies(body, force, dH, n)
+        force = self.inner.force(
+            body, x[:n], self._effective_energy_gradient(body, dH, dS, n), None, tuple(L[:n] for L in dL)
+        )
+        return self._append_entropy_rates(body, force, dH, n)
 
     def velocity(self, system, x, dH, dS, dL):
         body, n = system.drop_baths(), system.body_dim
-        return self.inner.velocity(body, x[:n], self._force_gradient(body, dH, dS, n), None, tuple(L[:n] for L in dL))
+        return self.inner.velocity(
+            body, x[:n], self._effective_energy_gradient(body, dH, dS, n), None, tuple(L[:n] for L in dL)
+        )
 
     def factor(self, system, x, dH, dL):
         body, n = system.drop_baths(), system.body_dim
         B = self.inner.factor(body, x[:n], dH[:n], tuple(L[:n] for L in dL))
         if B is None:
             return None
-        T = self._values_at_sites(dH[n:])
+        T = self._bath_values_at_sites(dH[n:])
         scale = sqrt_or_zero(self.temperature_signs(dH[n:]) * T)
 
         def times(w):
-            return self._join_with_entropies(body, body.scale_at_sites(scale, B.times(w)), dH, n)
+            return self._append_entropy_rates(body, body.scale_at_sites(scale, B.times(w)), dH, n)
 
         velocity_map = B.velocity
         velocity = None if velocity_map is None else lambda w: body.scale_at_sites(scale, velocity_map(w))
@@ -74,23 +78,23 @@ class Heating(LiftedDissipation):
         return B._replace(times=times, velocity=velocity, spin_coefficients=spin_coefficients, solenoidal=False)
 
     def divergence(self, system, x):
-        """Return ``sqrt(T) div B0 + T' B0^T dH / (2 T^3/2)``, with T' the derivative of T by y, without a matrix."""
+        """Return the divergence of each column of B, ``sqrt(T) div B0 + T' B0^T dH / (2 T^3/2)``, T' = dT/dy."""
         body, n = system.drop_baths(), system.body_dim
         dH, dL = system.energy.gradient(x), tuple(L.gradient(x) for L in self.preserve)
         B = self.inner.factor(body, x[:n], dH[:n], tuple(L[:n] for L in dL))
         assert B is not None
         if self.has_site_baths and not B.solenoidal:  # each site has a temperature of its own
             return super().divergence(system, x)
-        T = jnp.abs(self._values_at_sites(dH[n:]))
+        T = jnp.abs(self._bath_values_at_sites(dH[n:]))
         body_divergence = jnp.zeros(B.size) if B.solenoidal else jnp.sqrt(T) * self.inner.divergence(body, x[:n])
         slopes = temperature_slopes(system.energy, x, n)
         if slopes is None:
             return body_divergence
-        ratio = jnp.where(T > 0.0, 0.5 * self._values_at_sites(slopes) / jnp.where(T > 0.0, T, 1.0) ** 1.5, 0.0)
+        ratio = jnp.where(T > 0.0, 0.5 * self._bath_values_at_sites(slopes) / jnp.where(T > 0.0, T, 1.0) ** 1.5, 0.0)
         return body_divergence + B.transpose_times(body.scale_at_sites(ratio, dH[:n]))
 
     def lifted_geometry(self, system, x) -> LiftedGeometry:
-        return _body_geometry(system, x)
+        return _body_inner_geometry(system, x)
 
     @property
     def has_site_baths(self) -> bool:
@@ -98,14 +102,14 @@ class Heating(LiftedDissipation):
         return bool(self.bath.shape)
 
     def temperature_signs(self, T) -> jax.Array:
-        """Return the signs of the temperatures, shape () or (sites,).
+        """Return 1 or -1 for the temperature of the bath, shape (), or of the bath of each site, shape (sites,).
 
         No temperature changes its sign in any state, so the sign is a constant; ``jnp.sign`` would have no Taylor
         series.
         """
         if self.has_positive_temperatures:
             return jnp.ones(np.shape(self.bath)).ravel() if self.has_site_baths else jnp.ones(())
-        return jnp.where(self._values_at_sites(T) < 0.0, -1.0, 1.0)
+        return jnp.where(self._bath_values_at_sites(T) < 0.0, -1.0, 1.0)
 
     def entropy_rates(self, energy_loss, T) -> jax.Array:
         """Return the growth rates of the bath entropies, shape (m,), from the energy lost, shape () or (sites,)."""
@@ -113,33 +117,39 @@ class Heating(LiftedDissipation):
             return jax.ops.segment_sum(energy_loss, np.asarray(self.bath).ravel(), len(T)) / T
         return jnp.where(np.arange(len(T)) == int(np.asarray(self.bath)), energy_loss / T, 0.0)
 
-    def _force_gradient(self, body: Geometry, dH, dS, n: int) -> jax.Array:
+    def _effective_energy_gradient(self, body: Geometry, dH, dS, body_dim: int) -> jax.Array:
         """Return the gradient that replaces dH in the force on the body, shape (n,): dH for the bath entropy."""
-        T, dS_y, sign = self._values_at_sites(dH[n:]), self._values_at_sites(dS[n:]), self.temperature_signs(dH[n:])
-        return body.scale_at_sites(sign, body.scale_at_sites(dS_y, dH[:n]) - body.scale_at_sites(T, dS[:n]))
+        T, dS_y, sign = (
+            self._bath_values_at_sites(dH[body_dim:]),
+            self._bath_values_at_sites(dS[body_dim:]),
+            self.temperature_signs(dH[body_dim:]),
+        )
+        return body.scale_at_sites(
+            sign, body.scale_at_sites(dS_y, dH[:body_dim]) - body.scale_at_sites(T, dS[:body_dim])
+        )
 
-    def _values_at_sites(self, values) -> jax.Array:
+    def _bath_values_at_sites(self, values) -> jax.Array:
         """Return values of baths, shape (m,), at the sites that heat them, shape () or (sites,)."""
         return values[np.asarray(self.bath).ravel()] if self.has_site_baths else values[int(np.asarray(self.bath))]
 
-    def _join_with_entropies(self, body: Geometry, v, dH, n: int) -> jax.Array:
+    def _append_entropy_rates(self, body: Geometry, v, dH, body_dim: int) -> jax.Array:
         """Return the velocity v of the body, shape (n,), followed by the entropy rates from the energy it loses."""
-        energy_gain = body.dot_at_sites(dH[:n], v) if self.has_site_baths else jnp.dot(dH[:n], v)
-        return jnp.concatenate([v, self.entropy_rates(-energy_gain, dH[n:])])
+        energy_gain = body.dot_at_sites(dH[:body_dim], v) if self.has_site_baths else jnp.dot(dH[:body_dim], v)
+        return jnp.concatenate([v, self.entropy_rates(-energy_gain, dH[body_dim:])])
 
 
 class HeatlessDissipation(LiftedDissipation):
     """A dissipation of a body that produces no heat, in a system with baths."""
 
     def lifted_geometry(self, system, x) -> LiftedGeometry:
-        return _body_geometry(system, x)
+        return _body_inner_geometry(system, x)
 
     def velocity(self, system, x, dH, dS, dL):
-        geometry = _body_geometry(system, x)
-        return self.inner.velocity(geometry.system, geometry.x, *geometry.lift_gradients(dH, dS, dL))
+        geometry = _body_inner_geometry(system, x)
+        return self.inner.velocity(geometry.system, geometry.x, *geometry.inner_gradients(dH, dS, dL))
 
 
-def _body_geometry(system: Geometry, x) -> LiftedGeometry:
+def _body_inner_geometry(system: Geometry, x) -> LiftedGeometry:
     n = system.body_dim
     return LiftedGeometry(
         system.drop_baths(),

@@ -26,7 +26,10 @@ class BracketDissipation(Dissipation):
         return g.ad_star(dH, self.added_momentum(dH, g.bracket(dH, dS)))
 
     def rate_of_change(self, system, x, dH, dS, dL, gradient):
-        """Return ``F . [dH, gradient]``; for the entropy, the bracket is the same one that F is made of."""
+        """Return the rate ``F . [dH, gradient]`` of a function with this gradient, from one bracket for both uses.
+
+        [dH, gradient]``; for the entropy, the bracket is the same one that F is made of.
+        """
         action = system.algebra.action(dH)
         return action.bracket(gradient) @ self.added_momentum(dH, action.bracket(dS))
 
@@ -147,6 +150,9 @@ class KillingDissipation(BracketDissipation):
 
 
 def _bracket_factor(system, dH, form) -> Factor | None:
-    """Return the factor of ``ad*_dH 𝒦 ad_dH``. C is skew in a, b: ``div ad*_dH F = C[a, b, c] H_ab F_c`` vanishes."""
+    """Return the factor of ``ad*_dH 𝒦 ad_dH``, whose columns have divergence zero; None if 𝒦 has no known root.
+
+    C is skew in a, b: ``div ad*_dH F = C[a, b, c] H_ab F_c`` vanishes.
+    """
     root, g = form_root(form), system.algebra
     return None if root is None else Factor(g.dim, lambda w: g.ad_star(dH, root @ w), solenoidal=True)

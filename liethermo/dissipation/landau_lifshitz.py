@@ -17,11 +17,11 @@ from manifolds.structures.spins import (
 )
 
 from ..errors import InputError
-from ..functions.conditions import check_numbers
+from ..functions.conditions import checked_numbers
 from ..functions.frames import sqrt_or_zero
 from ..functions.indices import Indices
 from .base import Dissipation
-from .checks import checked_bath, checked_rate, checked_rates
+from .checks import checked_bath_indices, checked_rate, checked_rates
 from .factor import Factor
 
 
@@ -52,14 +52,14 @@ class LandauLifshitz(Dissipation):
     bath: Indices | None = eqx.field(static=True)
 
     def __init__(self, rate=1.0, bath=None):
-        array = check_numbers(rate, "a rate")
+        array = checked_numbers(rate, "a rate")
         self.rate = checked_rate(array) if array.shape == () else checked_rates(array)
-        self.bath = checked_bath(bath)
+        self.bath = checked_bath_indices(bath)
 
     @staticmethod
     def gilbert(alpha, ratio=1.0) -> tuple[jax.Array, jax.Array]:
-        """Return Landau and Lifshitz' gyromagnetic ratio and rate for the alpha and ratio of Gilbert's form."""
-        alpha, ratio = check_numbers(alpha, "alpha"), check_numbers(ratio, "ratio")
+        """Return the pair (ratio, rate) of Landau and Lifshitz' form, from the alpha and ratio of Gilbert's form."""
+        alpha, ratio = checked_numbers(alpha, "alpha"), checked_numbers(ratio, "ratio")
         return ratio / (1.0 + alpha**2), alpha * ratio / (1.0 + alpha**2)
 
     energy_law = "nonincreasing"
@@ -84,10 +84,10 @@ class LandauLifshitz(Dissipation):
         return self.bath
 
     def force(self, system, x, dH, dS, dL):
-        force, _ = self.damping_force(system.poisson, x, dH)
+        force, _ = self.damping_force_and_energy_loss(system.poisson, x, dH)
         return system.poisson.join_state(force, jnp.zeros(0))
 
-    def damping_force(
+    def damping_force_and_energy_loss(
         self, spins: Spins, x, dH, sign=1.0, per_site: bool = False
     ) -> tuple[VectorComponents, jax.Array]:
         """Return the force components on ``spins``, times a sign, and the rate at which the energy falls.

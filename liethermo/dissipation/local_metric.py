@@ -60,7 +60,8 @@ class LocalProjectedMetric(Dissipation):
         return (self.rate[..., None] * (square[..., None] * Gb - overlap[..., None] * Ga)).ravel()
 
     def factor(self, system, x, dH, dL):
-        """Return, at each site, all ``(l_j . dH) l_i - (l_i . dH) l_j``, i < j, for the columns l of a root of G."""
+        """Return the factor with columns ``(l_j . dH) l_i - (l_i . dH) l_j``, i < j, at each site, l columns of a
+        root."""
         d, count = system.shape[-1], math.prod(system.sites)
         L = jnp.eye(d) if self.cometric is None else semidefinite_factor(self.cometric)
         rates = jnp.broadcast_to(self.rate, system.sites or ()).reshape(count, 1)

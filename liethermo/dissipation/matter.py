@@ -59,22 +59,22 @@ class MatterExchange(Dissipation):
         self.processes = tuple(processes)
 
     def force(self, system, x, dH, dS, dL):
-        z_dot, apply_fluxes = self._force_and_flux_maps(system, x, dH)
-        return apply_fluxes(self._coefficients(x) * z_dot(dS))
+        z_dot, apply_fluxes = self._affinity_and_velocity_maps(system, x, dH)
+        return apply_fluxes(self._flux_coefficients(x) * z_dot(dS))
 
     def factor(self, system, x, dH, dL):
-        _, apply_fluxes = self._force_and_flux_maps(system, x, dH)
-        root = jnp.sqrt(self._coefficients(x))
+        _, apply_fluxes = self._affinity_and_velocity_maps(system, x, dH)
+        root = jnp.sqrt(self._flux_coefficients(x))
         return Factor(len(self.processes), lambda w: apply_fluxes(root * w))
 
-    def _coefficients(self, x) -> jax.Array:
+    def _flux_coefficients(self, x) -> jax.Array:
         """Return L of each process; NaN where it is negative: the step is then rejected."""
         coefficients = [e.coefficient(x) if callable(e.coefficient) else e.coefficient for e in self.processes]
         L = jnp.stack([jnp.asarray(value) for value in coefficients])
         return jnp.where(L >= 0.0, L, jnp.nan)
 
-    def _force_and_flux_maps(self, system, x, dH) -> tuple[Callable, Callable]:
-        """Return two functions: dS to ``z . dS`` of each process, and fluxes to the sum of fluxes times z."""
+    def _affinity_and_velocity_maps(self, system, x, dH) -> tuple[Callable, Callable]:
+        """Return two functions: from dS to ``z_e . dS`` of each process, and from fluxes to ``sum_e flux_e z_e``."""
         stoichiometry, heat_shares, entropy_transport = (
             np.array([getattr(e, name) for e in self.processes])
             for name in ("stoichiometry", "heat_shares", "entropy_transport")
@@ -92,9 +92,9 @@ class MatterExchange(Dissipation):
         )
 
 
-def conserved_numbers(processes: Sequence[Process], count: int) -> np.ndarray:
+def conserved_number_combinations(processes: Sequence[Process], n_particle_numbers: int) -> np.ndarray:
     """Return combinations of particle numbers that no process changes, shape (combinations, count), row-reduced."""
-    rows = np.array([e.stoichiometry for e in processes]).reshape(-1, count)
+    rows = np.array([e.stoichiometry for e in processes]).reshape(-1, n_particle_numbers)
     _, singular, basis = np.linalg.svd(rows, full_matrices=True)
     rank = int((singular > 1e-12 * max(1.0, singular.max(initial=0.0))).sum())
     kernel, _ = row_echelon(basis[rank:], tolerance=1e-9)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..errors import InputError
-from .base import Dissipation, terms_with_preserved
+from .base import Dissipation, terms_with_preserved_values
 from .factor import Factor
 from .geometry import Geometry
 
@@ -26,7 +26,7 @@ FACTOR_DIVERGENCE_CHECK = "div B = 0, as stated"
 def terms_with_factors(
     dissipation: Dissipation, system: Geometry, x, dH, dL: Sequence
 ) -> list[tuple[Dissipation, Factor]]:
-    """Return each summand with its factor at the given gradients.
+    """Return each summand that has noise, with its factor at the given gradients.
 
     Raises
     ------
@@ -34,7 +34,7 @@ def terms_with_factors(
         If a summand has no factor.
     """
     result = []
-    for term, dL_part in _noisy_terms(dissipation, dL):
+    for term, dL_part in _noisy_terms_with_values(dissipation, dL):
         B = term.factor(system, x, dH, dL_part)
         if B is None:
             space_text = "" if system.space is None else f" on {system.space.name}"
@@ -46,19 +46,21 @@ def terms_with_factors(
     return result
 
 
-def factor_divergence(dissipation: Dissipation, system: Geometry, x) -> jax.Array:
+def factor_divergences(dissipation: Dissipation, system: Geometry, x) -> jax.Array:
     """Return the divergence of every column of the factors, at the gradients of the functions, shape (columns,)."""
-    return jnp.concatenate([jnp.zeros(0), *(term.divergence(system, x) for term, _ in _noisy_terms(dissipation))])
+    return jnp.concatenate(
+        [jnp.zeros(0), *(term.divergence(system, x) for term, _ in _noisy_terms_with_values(dissipation))]
+    )
 
 
-def terms_with_continuous_factors(dissipation: Dissipation, system: Geometry, x) -> list[tuple[Dissipation, Factor]]:
-    """Return each summand with its factor at the gradients of the functions."""
+def terms_with_factors_at_state(dissipation: Dissipation, system: Geometry, x) -> list[tuple[Dissipation, Factor]]:
+    """Return each summand that has noise, with its factor by the exact gradients of all functions at x."""
     dL = [L.gradient(x) for L in dissipation.preserve]
     return terms_with_factors(dissipation, system, x, system.energy.gradient(x), dL)
 
 
 def factor_residuals(dissipation: Dissipation, system: Geometry, x) -> dict[str, jax.Array]:
-    """Return the largest residual at x of each property of the factors, relative to the terms that cancel, by name."""
+    """Return, by name, how far the factors miss each of their properties at x, relative to the terms that cancel."""
     dH = system.energy.gradient(x)
     (generic,) = generic_covectors(x.shape[0], 1)
     residuals: dict[str, list[jax.Array]] = {
@@ -66,8 +68,10 @@ def factor_residuals(dissipation: Dissipation, system: Geometry, x) -> dict[str,
         FACTOR_KERNEL_CHECK: [],
         FACTOR_DIVERGENCE_CHECK: [],
     }
-    terms = terms_with_continuous_factors(dissipation, system, x)
-    for (term, B), (_, functions) in zip(terms, _noisy_terms(dissipation, dissipation.preserve), strict=True):
+    terms = terms_with_factors_at_state(dissipation, system, x)
+    for (term, B), (_, functions) in zip(
+        terms, _noisy_terms_with_values(dissipation, dissipation.preserve), strict=True
+    ):
         dL, conserves_energy = tuple(L.gradient(x) for L in functions), term.energy_law == "conserved"
         force = term.force(system, x, dH, generic, dL)
         square = B.times(B.transpose_times(generic)) if conserves_energy else -B.times(B.transpose_times(dH))
@@ -91,9 +95,11 @@ def generic_covectors(n: int, number: int) -> jax.Array:
     return jnp.asarray(np.random.default_rng(20_241).standard_normal((number, n)))
 
 
-def _noisy_terms(dissipation: Dissipation, values: Sequence | None = None) -> list[tuple[Dissipation, tuple]]:
+def _noisy_terms_with_values(
+    dissipation: Dissipation, values: Sequence | None = None
+) -> list[tuple[Dissipation, tuple]]:
     """Return the summands that can have noise, each with its portion of ``values``, by default its functions."""
-    terms = terms_with_preserved(dissipation, dissipation.preserve if values is None else values)
+    terms = terms_with_preserved_values(dissipation, dissipation.preserve if values is None else values)
     return [(term, term_values) for term, term_values in terms if not term.is_noiseless]
 
 

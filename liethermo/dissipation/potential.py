@@ -14,7 +14,7 @@ from manifolds.matrices.stumpff import hyperbolic_stumpff
 
 from ..errors import FunctionError, InputError
 from ..functions.arguments import required_argument_count
-from ..functions.conditions import check_numbers
+from ..functions.conditions import checked_numbers
 from ..tracing.index_check import result_shape
 from .base import Dissipation
 from .checks import state_shape_dtype
@@ -85,7 +85,7 @@ class DissipationPotential(Dissipation):
     def bind_to(self, system):
         bound_potential = eqx.tree_at(lambda d: d.of, self, self.of.bind_to(system))
         shape = result_shape(
-            lambda x: bound_potential.psi_at_state(x)(jnp.zeros(bound_potential._continuous_factor(system, x).size)),
+            lambda x: bound_potential.psi_at_state(x)(jnp.zeros(bound_potential._base_factor_at_state(system, x).size)),
             state_shape_dtype(system.dim),
         )
         if shape.shape != ():
@@ -99,7 +99,7 @@ class DissipationPotential(Dissipation):
     def input_residuals(self, system, x):
         """Return the decrease of the slope between two forces, and the slope at zero force, both relative, by name."""
         slope = jax.grad(self.psi_at_state(x))
-        size = self._continuous_factor(system, x).size
+        size = self._base_factor_at_state(system, x).size
         pairs = np.random.default_rng(0).standard_normal((CONVEXITY_PAIRS, 2, size))
         pairs = np.concatenate([scale * pairs for scale in CONVEXITY_FORCE_SCALES])
 
@@ -117,13 +117,13 @@ class DissipationPotential(Dissipation):
         }
 
     def force(self, system, x, dH, dS, dL):
-        B = self._require_factor(system, x, dH, dL)
+        B = self._base_factor(system, x, dH, dL)
         return B.times(jax.grad(self.psi_at_state(x))(B.transpose_times(dS)))
 
-    def _continuous_factor(self, system, x) -> Factor:
-        return self._require_factor(system, x, system.energy.gradient(x), tuple(L.gradient(x) for L in self.preserve))
+    def _base_factor_at_state(self, system, x) -> Factor:
+        return self._base_factor(system, x, system.energy.gradient(x), tuple(L.gradient(x) for L in self.preserve))
 
-    def _require_factor(self, system, x, dH, dL) -> Factor:
+    def _base_factor(self, system, x, dH, dL) -> Factor:
         B = self.of.factor(system, x, dH, dL)
         if B is None:
             space_text = "" if system.space is None else f" on {system.space.name}"
@@ -144,7 +144,7 @@ class NamedPotential(Module):
     def __call__(self, f):
         return jnp.sum(self.value_of_square(f * f)) if self.each else self.value_of_square(jnp.dot(f, f))
 
-    def value_of_square(self, q):
+    def value_of_square(self, squared_force):
         """Return the potential as a function of the square of a force."""
         raise NotImplementedError
 
@@ -168,8 +168,8 @@ class CoulombFriction(NamedPotential):
 
     def __init__(self, strength=1.0, width=1e-2, *, each: bool = False):
         self.strength, self.width = (
-            _checked_number(strength, "the strength", True),
-            _checked_number(width, "the width", False),
+            _checked_nonnegative_number(strength, "the strength", True),
+            _checked_nonnegative_number(width, "the width", False),
         )
         self.each = bool(each)
 
@@ -196,12 +196,12 @@ class PowerLawFriction(NamedPotential):
     width: jax.Array
 
     def __init__(self, exponent, strength=1.0, width=0.0, *, each: bool = False):
-        self.exponent = _checked_number(exponent, "the exponent", False)
+        self.exponent = _checked_nonnegative_number(exponent, "the exponent", False)
         if not isinstance(self.exponent, jax.core.Tracer) and not float(self.exponent) > 1.0:
             raise InputError(f"the exponent of a power law must be > 1, got {float(self.exponent):g}")
         self.strength, self.width = (
-            _checked_number(strength, "the strength", True),
-            _checked_number(width, "the width", True),
+            _checked_nonnegative_number(strength, "the strength", True),
+            _checked_nonnegative_number(width, "the width", True),
         )
         self.each = bool(each)
 
@@ -229,15 +229,18 @@ class ActivatedFriction(NamedPotential):
     scale: jax.Array
 
     def __init__(self, rate=1.0, scale=1.0, *, each: bool = False):
-        self.rate, self.scale = _checked_number(rate, "the rate", True), _checked_number(scale, "the scale", False)
+        self.rate, self.scale = (
+            _checked_nonnegative_number(rate, "the rate", True),
+            _checked_nonnegative_number(scale, "the scale", False),
+        )
         self.each = bool(each)
 
     def value_of_square(self, q):
         return self.rate * q * hyperbolic_stumpff(2, q / self.scale**2)
 
 
-def _checked_number(value, what: str, allow_zero: bool) -> jax.Array:
-    number = check_numbers(value, what, ())
+def _checked_nonnegative_number(value, what: str, allow_zero: bool) -> jax.Array:
+    number = checked_numbers(value, what, ())
     if not isinstance(number, jax.core.Tracer) and not (float(number) >= 0.0 if allow_zero else float(number) > 0.0):
         raise InputError(f"{what} must be {'>=' if allow_zero else '>'} 0, got {float(number):g}")
     return number

@@ -13,7 +13,7 @@ from manifolds.errors import warn
 from manifolds.matrices.linear import skew_matrix
 from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
 
-from ..functions.checks import mark_polynomial_degrees
+from ..functions.checks import with_polynomial_degrees
 from ..functions.energy import Energy, make_energy
 from ..functions.frames import gram_schmidt
 from .base import Dissipation
@@ -90,7 +90,7 @@ class ProjectedMetric(Dissipation):
         return eqx.tree_at(
             lambda d: d.functions,
             self,
-            tuple(mark_polynomial_degrees(L, system.dim) for L in self.functions),
+            tuple(with_polynomial_degrees(L, system.dim) for L in self.functions),
         )
 
     def force(self, system, x, dH, dS, dL):
@@ -104,11 +104,11 @@ class ProjectedMetric(Dissipation):
             )  # subtract first: near an equilibrium the difference of images would lose digits
             return self.rate * (square * image - jnp.dot(image, dH) * GdH)
         frame = gram_schmidt((dH, *dL), metric_map=raise_index)
-        projection = frame.project_off_images(raise_index(frame.project_off(dS)))
+        projection = frame.project_off_transposed(raise_index(frame.project_off(dS)))
         return self.rate * (projection if self.normalized else math.prod(frame.squared_norms) * projection)
 
     def factor(self, system, x, dH, dL):
-        """Return ``P^T L`` with ``L L^T = G``; for the energy alone all ``(l_j . dH) l_i - (l_i . dH) l_j``, i < j.
+        """Return the factor ``P^T L`` with ``L L^T = G``; for the energy alone one column for each pair i < j.
 
         The divergence of the latter is zero if G is constant.
         """
@@ -128,10 +128,10 @@ class ProjectedMetric(Dissipation):
             return Factor(math.comb(n, 2), times, solenoidal=not callable(self.cometric)).scale_by(self.rate)
         return self._projected_factor(system, x, dH, dL, n, lambda w: root @ w)
 
-    def _projected_factor(self, system, x, dH, dL, n_columns: int, root: Callable) -> Factor:
+    def _projected_factor(self, system, x, dH, dL, n_columns: int, root_times: Callable) -> Factor:
         frame = gram_schmidt((dH, *dL), metric_map=self._cometric_map(system, x))
         rate = self.rate if self.normalized else self.rate * math.prod(frame.squared_norms)
-        return Factor(n_columns, lambda w: frame.project_off_images(root(w))).scale_by(rate)
+        return Factor(n_columns, lambda w: frame.project_off_transposed(root_times(w))).scale_by(rate)
 
     def _cometric_map(self, system, x):
         G = evaluate_form(self.cometric, x)

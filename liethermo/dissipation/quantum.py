@@ -119,7 +119,9 @@ class ThermalJumps(Dissipation):
             raise InputError("couplings must be a list of pairs (V, rate), such as [(V, 0.1)]")
         if isinstance(bath, bool) or not isinstance(bath, int) or bath < 0:
             raise InputError(f"bath must be the number of a bath, from 0, got {bath!r}")
-        self.operators = tuple(Operator(checked_matrix(V, f"the coupling V[{i}]")) for i, (V, _) in enumerate(pairs))
+        self.operators = tuple(
+            Operator(checked_square_matrix(V, f"the coupling V[{i}]")) for i, (V, _) in enumerate(pairs)
+        )
         for i, V in enumerate(self.operators):
             if not np.asarray(V).any():
                 raise InputError(f"the coupling V[{i}] is zero. Leave it out")
@@ -159,7 +161,7 @@ class ThermalJumps(Dissipation):
                 jumps=jumps, jump_frame=None, is_isolated=True, conserves_energy=conserves_energy
             )
         vectors = _common_eigenvectors(hamiltonians)
-        jumps_by_coupling = [_split_coupling(V, i, hamiltonians, vectors) for i, V in enumerate(self.operators)]
+        jumps_by_coupling = [_jumps_of_coupling(V, i, hamiltonians, vectors) for i, V in enumerate(self.operators)]
         frame = None if np.array_equal(vectors, np.eye(structure.size)) else Operator(vectors)
         jumps = tuple(itertools.chain.from_iterable(jumps_by_coupling))
         levels = np.diag(adjoint(vectors) @ _subtract_common_energy(hamiltonians[0]) @ vectors).real
@@ -205,27 +207,27 @@ class ThermalJumps(Dissipation):
             commutators = commutators - (dS[n + self.bath] * H_commutators - omega[:, None, None] * V) / T
         boltzmann_factors = jnp.exp(shift)[:, None, None]
         image = rho @ V / boltzmann_factors - boltzmann_factors * (V @ rho) + log_mean(logs, shift, commutators)
-        drho = jnp.sum(_commutator(V_adjoint, image * self._jump_strengths(omega, T)[:, None, None]), axis=0)
-        return self._append_bath_entropy(system, dH, T, drho)  # the adjoints add the adjoint
+        drho = jnp.sum(_commutator(V_adjoint, image * self._weighted_jump_rates(omega, T)[:, None, None]), axis=0)
+        return self._append_bath_entropy_rates(system, dH, T, drho)  # the adjoints add the adjoint
 
     has_generator = True
 
     def generator_field(self, system, x, dH):
-        """Return Lindblad's equation, and the entropy rate of the bath."""
+        """Return the force as Lindblad's equation, without a logarithm, followed by the bath entropy rates."""
         structure, n = system.structure, system.body_dim
         rho, omega = self._to_jump_frame(structure.matrix(x[:n])), self._jump_frequencies(structure, dH[:n])
         T = jnp.asarray(jnp.inf) if self.is_isolated else dH[n + self.bath]
-        strengths, boltzmann_factors = self._jump_strengths(omega, T), jnp.exp(omega / (2.0 * T))
+        strengths, boltzmann_factors = self._weighted_jump_rates(omega, T), jnp.exp(omega / (2.0 * T))
         rates = jnp.concatenate([strengths * boltzmann_factors, strengths / boltzmann_factors])
         # the Hermitian part, taken later, has both terms of the loss
-        drho = _apply_jumps(self.jumps, rates, rho) - jnp.tensordot(rates, _adjoint_products(self.jumps), 1) @ rho
-        return self._append_bath_entropy(system, dH, T, drho)
+        drho = _jump_gain(self.jumps, rates, rho) - jnp.tensordot(rates, _adjoint_products(self.jumps), 1) @ rho
+        return self._append_bath_entropy_rates(system, dH, T, drho)
 
     def _check_rates(self, system) -> None:
         """Raise InputError if double precision cannot represent the rates at the first temperature of the bath."""
         n, dH = system.body_dim, system.energy.gradient(jnp.zeros(system.dim))
         omega, T = self._jump_frequencies(system.structure, dH[:n]), dH[n + self.bath]
-        strengths, energies = self._jump_strengths(omega, T), np.abs(np.asarray(omega))
+        strengths, energies = self._weighted_jump_rates(omega, T), np.abs(np.asarray(omega))
         rates = np.asarray(strengths * jnp.exp(jnp.abs(omega) / (2.0 * T)))
         for jump, rate, w in zip(self.jumps, rates, energies, strict=True):
             if w > -2.0 * np.log(EPS) * T and not rate * EPS <= w:  # the exponential is to blame, not the rate
@@ -275,7 +277,7 @@ class ThermalJumps(Dissipation):
         vectors = np.asarray(self.jump_frame).T
         return structure.vector(vectors[:, :, None] * vectors[:, None, :].conj()) @ dH
 
-    def _append_bath_entropy(self, system, dH, T, drho) -> jax.Array:
+    def _append_bath_entropy_rates(self, system, dH, T, drho) -> jax.Array:
         """Return the coordinates of ``drho``, given in the frame of the jumps, followed by the bath entropy rates."""
         structure, n = system.structure, system.body_dim
         force = structure.vector(self._from_jump_frame(drho))
@@ -301,7 +303,7 @@ class ThermalJumps(Dissipation):
         H = self._to_jump_frame(structure.matrix(dH))
         return rate + jnp.sum(((1.0 - np.eye(size)) * H.conj() * drho).real)
 
-    def _jump_strengths(self, omega, T) -> jax.Array:
+    def _weighted_jump_rates(self, omega, T) -> jax.Array:
         """Return the rate of each jump at its omega and T, times its weight, shape (jumps,)."""
         rates = [self.rates[jump.coupling_index] for jump in self.jumps]
         return jnp.stack(
@@ -348,7 +350,7 @@ class SteepestEntropyAscent(Dissipation):
         return self
 
     def bind_to_structure(self, structure: mf.DensityMatrices) -> SteepestEntropyAscent:
-        """Return this dissipation with its preserved functions as functions of the state vectors of ``structure``."""
+        """Return this dissipation with its preserved functions made functions of the state vectors of ``structure``."""
         functions = []
         for i, f in enumerate(self.functions):
             if isinstance(f, Operator):
@@ -365,17 +367,18 @@ class SteepestEntropyAscent(Dissipation):
         return bound_ascent
 
     def force(self, system, x, dH, dS, dL):
-        frame, apply_metric = self._constraint_frame(system, x, dH, dL)
-        force = frame.project_off_images(apply_metric(frame.project_off(dS[: system.body_dim])))
+        frame, apply_metric = self._constraint_frame_and_metric_map(system, x, dH, dL)
+        force = frame.project_off_transposed(apply_metric(frame.project_off(dS[: system.body_dim])))
         return jnp.pad(self.rate * force, (0, system.dim - system.body_dim))
 
     def ascent_direction(self, system, x, dH, dS, dL) -> jax.Array:
         """Return ``P dS``, shape (N^2,): the gradient of the entropy without its components along preserved ones."""
-        frame, _ = self._constraint_frame(system, x, dH, dL)
+        frame, _ = self._constraint_frame_and_metric_map(system, x, dH, dL)
         return frame.project_off(dS[: system.body_dim])
 
-    def _constraint_frame(self, system, x, dH, dL) -> tuple[OrthonormalFrame, Callable]:
-        """Return the frame of the preserved gradients, orthogonal for L, and the map L."""
+    def _constraint_frame_and_metric_map(self, system, x, dH, dL) -> tuple[OrthonormalFrame, Callable]:
+        """Return the frame of the preserved gradients, orthonormal in the metric L, and the map alpha -> ``L
+        alpha``."""
         structure, n = system.structure, system.body_dim
         rho = positive_part(structure.matrix(x[:n]))  # a negative eigenvalue would fall ever faster
 
@@ -403,7 +406,7 @@ def get_density_structure(system, name: str) -> mf.DensityMatrices:
     return structure
 
 
-def checked_matrix(matrix, what: str) -> np.ndarray:
+def checked_square_matrix(matrix, what: str) -> np.ndarray:
     """Return a square complex matrix, from an array or from the ``full()`` of a ``Qobj``."""
     array = np.asarray(matrix.full() if isinstance(matrix, HasMatrix) else matrix)
     if array.dtype.kind not in "fiuc" or array.ndim != 2 or array.shape[0] != array.shape[1] or not array.size:
@@ -417,7 +420,7 @@ def checked_matrix(matrix, what: str) -> np.ndarray:
 
 def checked_hermitian(matrix, what: str) -> np.ndarray:
     """Return a matrix, made exactly Hermitian; InputError if it is not Hermitian to rounding."""
-    array = checked_matrix(matrix, what)
+    array = checked_square_matrix(matrix, what)
     residual, scale = float(np.abs(array - adjoint(array)).max()), float(np.abs(array).max())
     if residual > 1e-12 * scale:
         raise InputError(
@@ -467,9 +470,9 @@ def _adjoint_products(jumps: tuple[Jump, ...]) -> np.ndarray:
     return adjoint(matrices) @ matrices
 
 
-def _apply_jumps(jumps: tuple[Jump, ...], rates, rho) -> jax.Array:
-    """Return ``sum rate V rho V^H`` over the jumps and then their adjoints."""
-    table = _jump_table(jumps)
+def _jump_gain(jumps: tuple[Jump, ...], rates, rho) -> jax.Array:
+    """Return the gain term ``sum rate V rho V^H`` of Lindblad's equation, over the jumps and then their adjoints."""
+    table = _jump_gain_table(jumps)
     if table is None:
         matrices = _operators_and_adjoints(jumps)
         return jnp.sum((rates[:, None, None] * matrices) @ rho @ adjoint(matrices), axis=0)
@@ -478,7 +481,7 @@ def _apply_jumps(jumps: tuple[Jump, ...], rates, rho) -> jax.Array:
 
 
 @functools.lru_cache(maxsize=64)
-def _jump_table(jumps: tuple[Jump, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+def _jump_gain_table(jumps: tuple[Jump, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Return, for each entry of ``sum V rho V^H``, the jump numbers, the entries of rho and the factors of its terms.
 
     None if products of matrices need fewer operations, as for a few full matrices.
@@ -532,7 +535,7 @@ def _subtract_common_energy(H: np.ndarray) -> np.ndarray:
     return H - choose_reference_level(np.diag(H).real) * np.eye(len(H))
 
 
-def energy_rounding(H: np.ndarray) -> float:
+def level_gap_rounding(H: np.ndarray) -> float:
     """Return the largest rounding difference between two equal differences of levels."""
     return ENERGY_RTOL * (1 if _is_diagonal(H) else len(H)) * float(np.linalg.norm(H, 2))
 
@@ -544,18 +547,18 @@ def _is_commuting(H: np.ndarray, V: np.ndarray) -> bool:
     return bool(np.abs(_commutator(H, V)).max() <= ENERGY_RTOL * len(H) * products.max())
 
 
-def _split_coupling(
+def _jumps_of_coupling(
     operator: Operator, coupling_index: int, hamiltonians: Sequence[np.ndarray], frame: np.ndarray
 ) -> list[Jump]:
-    """Split a coupling into eigenoperators of ``[H, .]`` at all times; for a Hermitian one, up to adjoints.
+    """Return the jumps of a coupling: its eigenoperators of ``[H, .]``, if Hermitian one of each adjoint pair.
 
     The entries of an eigenoperator have the same difference of levels, in the frame, under each of the Hamiltonians.
     """
     V = np.asarray(operator)
     V_framed = adjoint(frame) @ V @ frame
     framed_hamiltonians = [adjoint(frame) @ _subtract_common_energy(H) @ frame for H in hamiltonians]
-    tolerances = [energy_rounding(H) for H in hamiltonians]
-    entries = np.nonzero(np.abs(V_framed) > _entry_rounding(V_framed, frame, framed_hamiltonians, tolerances))
+    tolerances = [level_gap_rounding(H) for H in hamiltonians]
+    entries = np.nonzero(np.abs(V_framed) > _entry_rounding_bounds(V_framed, frame, framed_hamiltonians, tolerances))
     gaps = np.stack([np.diag(H).real[entries[1]] - np.diag(H).real[entries[0]] for H in framed_hamiltonians])
     labels = np.stack(
         [_cluster_labels(*gaps_and_tolerance) for gaps_and_tolerance in zip(gaps, tolerances, strict=True)]
@@ -580,7 +583,7 @@ def _split_coupling(
     return jumps
 
 
-def _entry_rounding(
+def _entry_rounding_bounds(
     V_framed: np.ndarray, frame: np.ndarray, framed_hamiltonians: Sequence[np.ndarray], tolerances: Sequence[float]
 ) -> np.ndarray | float:
     """Return the bound, shape (N, N), below which entries of a matrix in the frame may be rounding; 0 for the axes.

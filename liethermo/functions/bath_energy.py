@@ -89,7 +89,7 @@ def make_bath_energy(capacity: jax.Array, temperature: jax.Array) -> BathEnergy 
 def _exponential_and_quotient(z) -> tuple[jax.Array, jax.Array]:
     """Return ``exp(z)`` and ``(exp(z) - 1) / z``, elementwise; by their series if all z are small, as within a step."""
 
-    def series() -> tuple[jax.Array, jax.Array]:
+    def both_by_series() -> tuple[jax.Array, jax.Array]:
         """Sum the series by pairs of terms, which the processor can compute in parallel."""
         terms, power = [jnp.full_like(z, 1.0 / math.factorial(n)) for n in range(1, 9)], z
         while len(terms) > 1:
@@ -97,8 +97,8 @@ def _exponential_and_quotient(z) -> tuple[jax.Array, jax.Array]:
             power = power * power
         return 1.0 + z * terms[0], terms[0]
 
-    def quotient() -> tuple[jax.Array, jax.Array]:
+    def both_by_expm1() -> tuple[jax.Array, jax.Array]:
         is_zero = z == 0.0
         return jnp.exp(z), jnp.where(is_zero, 1.0, jnp.expm1(z) / jnp.where(is_zero, 1.0, z))
 
-    return jax.lax.cond(jnp.max(jnp.abs(z)) <= MAX_SERIES_ARGUMENT, series, quotient)
+    return jax.lax.cond(jnp.max(jnp.abs(z)) <= MAX_SERIES_ARGUMENT, both_by_series, both_by_expm1)

@@ -16,21 +16,21 @@ from ..tracing.traced import trace_callables_with_result
 from .energy import Energy, Function, Negative, Pullback, SpanLimitedEnergy, StateTimeEnergy, Sum
 
 
-def mark_polynomial_degrees(energy: Energy, dim: int) -> Energy:
-    """Return an energy with the degrees of its plain functions set if they are written as polynomials."""
+def with_polynomial_degrees(energy: Energy, dim: int) -> Energy:
+    """Return an energy in which each plain function that is written as a polynomial has its degree set."""
     if isinstance(energy, Sum):
-        return Sum(tuple(mark_polynomial_degrees(term, dim) for term in energy.summands))
+        return Sum(tuple(with_polynomial_degrees(term, dim) for term in energy.summands))
     if isinstance(energy, Negative):
-        return Negative(mark_polynomial_degrees(energy.term, dim))
+        return Negative(with_polynomial_degrees(energy.term, dim))
     if isinstance(energy, StateTimeEnergy):
-        return StateTimeEnergy(mark_polynomial_degrees(energy.energy, dim))
+        return StateTimeEnergy(with_polynomial_degrees(energy.energy, dim))
     if isinstance(energy, SpanLimitedEnergy):
-        inner_energy = mark_polynomial_degrees(energy.energy, dim)
+        inner_energy = with_polynomial_degrees(energy.energy, dim)
         # a polynomial is defined at every time
         return inner_energy if inner_energy.is_quadratic else SpanLimitedEnergy(inner_energy, energy.span)
     if isinstance(energy, Pullback):
         (inner_dim,) = jax.eval_shape(energy.coordinates, jax.ShapeDtypeStruct((dim,), jnp.float64)).shape
-        return eqx.tree_at(lambda e: e.term, energy, mark_polynomial_degrees(energy.term, inner_dim))
+        return eqx.tree_at(lambda e: e.term, energy, with_polynomial_degrees(energy.term, inner_dim))
     if isinstance(energy, Function) and energy.degree == math.inf:
         degree = polynomial_degree(energy_value, energy, dim)
         return energy if degree == math.inf else Function(energy.function, degree)
@@ -45,7 +45,7 @@ def energy_value(energy: Energy, x) -> jax.Array:
     return energy.value(x)
 
 
-def check_energy(energy: Energy, dim: int, role: str, allow_time: bool = False) -> Energy:
+def checked_energy(energy: Energy, dim: int, role: str, allow_time: bool = False) -> Energy:
     """Return the energy with its plain functions traced, so that closures that differ only in numbers are equal.
 
     With ``allow_time`` the energy may depend on time.
@@ -85,47 +85,52 @@ def check_energy(energy: Energy, dim: int, role: str, allow_time: bool = False) 
 
 
 def trace_energies(tree, dim: int, role: str | None = None):
-    """Return a pytree with its energies checked by :func:`check_energy`; an energy that occurs twice stays one object.
+    """Return a pytree with its energies checked by :func:`checked_energy`; an energy that occurs twice stays one
+    object.
 
     Without a role, an energy that fails the check is left unchanged.
     """
     checked_energies: dict[int, Energy] = {}
 
-    def check_once(node):
+    def checked_node(node):
         if not isinstance(node, Energy):
             return node
         if id(node) not in checked_energies:
             try:
-                checked_energies[id(node)] = check_energy(node, dim, role or "a function")
+                checked_energies[id(node)] = checked_energy(node, dim, role or "a function")
             except (FunctionError, InputError):
                 if role is not None:
                     raise
                 checked_energies[id(node)] = node
         return checked_energies[id(node)]
 
-    return jax.tree_util.tree_map(check_once, tree, is_leaf=lambda node: isinstance(node, Energy))
+    return jax.tree_util.tree_map(checked_node, tree, is_leaf=lambda node: isinstance(node, Energy))
 
 
-def check_function_shape(
-    function: Callable, arguments: Sequence[tuple[int, ...]], shapes: Sequence[tuple[int, ...]], what: str, at: str
+def traced_function_and_shape(
+    function: Callable,
+    argument_shapes: Sequence[tuple[int, ...]],
+    allowed_shapes: Sequence[tuple[int, ...]],
+    what: str,
+    at: str,
 ) -> tuple[Callable, tuple[int, ...]]:
     """Return a traced function of arrays of given shapes, and the shape of its result; ``at`` names its arguments.
 
     Raises
     ------
     FunctionError
-        Unless the result is real and has one of ``shapes``.
+        Unless the result is real and has one of ``allowed_shapes``.
     """
     try:
         function, result = trace_callables_with_result(
-            function, lambda function, *a: jnp.asarray(function(*a)), *arguments
+            function, lambda function, *a: jnp.asarray(function(*a)), *argument_shapes
         )
     except IndexOutOfRangeError as error:
         raise error.with_function(f"{what}, at {at},") from None
     except TRACE_ERRORS as error:
         raise FunctionError(trace_error_message(f"{what} could not be evaluated at {at}", error)) from error
-    if result.shape not in shapes:
-        expected_shapes = " or ".join(map(str, shapes))
+    if result.shape not in allowed_shapes:
+        expected_shapes = " or ".join(map(str, allowed_shapes))
         raise FunctionError(f"{what} must have shape {expected_shapes}, got {result.shape}")
     if jnp.iscomplexobj(result):
         raise FunctionError(f"{what} must be real, got {result.dtype}. Take the real part if that is meant")

@@ -48,14 +48,14 @@ def collect_conditions() -> Iterator[list[TracedCondition]]:
         _collected_conditions.reset(token)
 
 
-def require_condition(value, test: Callable, message: str) -> None:
+def require_condition(value, test: Callable, template: str) -> None:
     """Raise InputError unless a test is true for all entries of a value; record the test of a traced value.
 
     Parameters
     ----------
     value : array
     test : function from an array to an array of truth values
-    message : str
+    template : str
         The message, with a placeholder ``{value}`` for the value as a list.
 
     Raises
@@ -64,12 +64,12 @@ def require_condition(value, test: Callable, message: str) -> None:
     """
     if is_traced(value):
         if (conditions := _collected_conditions.get()) is not None:
-            conditions.append(TracedCondition(jnp.all(test(value)), value, message))
+            conditions.append(TracedCondition(jnp.all(test(value)), value, template))
     elif not bool(np.all(test(np.asarray(value)))):
-        raise InputError(refusal_message(message, value))
+        raise InputError(refusal_message(template, value))
 
 
-def check_numbers(value, what: str, *shapes: tuple[int, ...]) -> jax.Array:
+def checked_numbers(value, what: str, *shapes: tuple[int, ...]) -> jax.Array:
     """Return a user's numbers as an array of float64; check its shape if shapes are given.
 
     Raises
@@ -92,6 +92,6 @@ def check_numbers(value, what: str, *shapes: tuple[int, ...]) -> jax.Array:
     return array
 
 
-def refusal_message(message: str, value) -> str:
+def refusal_message(template: str, value) -> str:
     """Return the message of a condition with the value inserted."""
-    return message.format(value=np.asarray(value).tolist())
+    return template.format(value=np.asarray(value).tolist())

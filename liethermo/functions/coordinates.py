@@ -55,7 +55,7 @@ def check_coordinates(coordinates: Callable, dim: int, role: str) -> None:
         return
     try:
         start, end, step = evaluate_at_points(
-            _coordinate_increments, coordinates, np.random.default_rng(0).standard_normal((1, 2 * dim))
+            _coordinates_at_ends_and_increment, coordinates, np.random.default_rng(0).standard_normal((1, 2 * dim))
         )
     except TRACE_ERRORS as error:
         raise FunctionError(
@@ -73,7 +73,7 @@ def check_coordinates(coordinates: Callable, dim: int, role: str) -> None:
         )
 
 
-def _coordinate_increments(coordinates: Callable, ends):
+def _coordinates_at_ends_and_increment(coordinates: Callable, ends):
     """Return the coordinates of two states, and the difference that a quadratic map would give."""
     x, d = jnp.split(ends, 2)
     return coordinates(x), coordinates(x + d), jax.jvp(coordinates, (x + 0.5 * d,), (d,))[1]

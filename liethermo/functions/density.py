@@ -109,7 +109,7 @@ class LogPlusOne(mf.ScalarFunction):
             is_above = x > self._tangent_threshold
             return jnp.where(is_above, -math.factorial(order - 1) * (-1.0 / jnp.where(is_above, x, 1.0)) ** order, 0.0)
         value = jnp.log(jnp.maximum(x, self._tangent_threshold)) + 1.0
-        return _nan_outside_cone(x, self, jnp.where(x > self.floor, value, 0.0) if self.floor else value)
+        return _nan_if_negative(x, self, jnp.where(x > self.floor, value, 0.0) if self.floor else value)
 
     def width(self, x):
         return jnp.abs(x - self._tangent_threshold)
@@ -145,7 +145,7 @@ class EntropyIntegrand(mf.ScalarFunction):
             if self.floor
             else x * jnp.log(clipped_x) + (x - clipped_x)
         )
-        return _nan_outside_cone(x, self, value)
+        return _nan_if_negative(x, self, value)
 
     def width(self, x):
         return jnp.abs(x - self._tangent_threshold)
@@ -159,7 +159,7 @@ class EntropyIntegrand(mf.ScalarFunction):
         quotient_above = jnp.log(jnp.maximum(upper, self._tangent_threshold)) + log_quotient
         quotient_across = (self.derivative(upper, 0) - self.derivative(lower, 0)) / safe_gap
         # the derivative is constant below the threshold, so it is the quotient
-        quotient_below = _nan_outside_cone(lower, self, self.derivative_function.derivative(upper, 0))
+        quotient_below = _nan_if_negative(lower, self, self.derivative_function.derivative(upper, 0))
         return jnp.where(
             lower > self._tangent_threshold,
             quotient_above,
@@ -175,7 +175,7 @@ class EntropyIntegrand(mf.ScalarFunction):
         return LogPlusOne(self.floor, self.negative_limit)
 
 
-def _nan_outside_cone(p, function: LogPlusOne | EntropyIntegrand, value) -> jax.Array:
+def _nan_if_negative(p, function: LogPlusOne | EntropyIntegrand, value) -> jax.Array:
     """Return the value of a function of an eigenvalue p, or NaN if p is negative beyond its limit and floor."""
     return jnp.where(p < -max(function.floor, function.negative_limit), jnp.nan, value)
 
@@ -247,7 +247,7 @@ class MeanEnergy(Linear):
 
 
 def choose_reference_level(levels: np.ndarray) -> float:
-    """Return the lower one of the two levels nearest to each other, so that their difference loses no digit.
+    """Return the lower of the two nearest levels as the zero of energy: their difference then loses no digit.
 
     It grows by c if all levels, shape (N,), do.
     """
@@ -255,9 +255,11 @@ def choose_reference_level(levels: np.ndarray) -> float:
     return float(sorted_levels[0 if len(sorted_levels) == 1 else np.argmin(np.diff(sorted_levels))])
 
 
-def subtract_level(b, level) -> jax.Array:
+def subtract_level(hamiltonian_coordinates, level) -> jax.Array:
     """Return the coordinates of H - level, from those of H, shape (N^2,), and a number."""
-    return b - level * np.where(np.arange(b.shape[-1]) < math.isqrt(b.shape[-1]), 1.0, 0.0)
+    return hamiltonian_coordinates - level * np.where(
+        np.arange(hamiltonian_coordinates.shape[-1]) < math.isqrt(hamiltonian_coordinates.shape[-1]), 1.0, 0.0
+    )
 
 
 class ExpectationValue(Module):

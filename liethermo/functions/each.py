@@ -14,8 +14,8 @@ import scipy
 from ..errors import FunctionError, InputError
 from ..tracing.interpret import polynomial_degree
 from ..tracing.traced import trace_callables
-from .checks import check_energy, mark_polynomial_degrees
-from .conditions import check_numbers
+from .checks import checked_energy, with_polynomial_degrees
+from .conditions import checked_numbers
 from .energy import Energy, Function, float64_array
 from .indices import Indices, clique_pattern
 from .path import CollocationPath
@@ -50,8 +50,8 @@ class Each(Energy):
     degree: float = eqx.field(static=True, default=math.inf)
 
     def __init__(self, phi, places, *parameters):
-        self.places = places if isinstance(places, Indices) else _check_places(places)
-        self.parameters = tuple(check_numbers(a, "a parameter") for a in parameters)
+        self.places = places if isinstance(places, Indices) else _checked_places(places)
+        self.parameters = tuple(checked_numbers(a, "a parameter") for a in parameters)
         m, r = self.places.shape
         for a in self.parameters:
             if a.shape[:1] != (m,):
@@ -63,13 +63,13 @@ class Each(Energy):
                 raise InputError(
                     "parameters need a function phi(y, *parameters), got an Energy, which is equal at every place"
                 )
-            self.phi = mark_polynomial_degrees(check_energy(phi, r, "the energy at a place"), r)
+            self.phi = with_polynomial_degrees(checked_energy(phi, r, "the energy at a place"), r)
             self.degree = self.phi.degree
             return
         if not callable(phi):
             raise FunctionError(f"phi must be a function or an Energy, got {type(phi).__name__}")
         zero_parameters = tuple(jnp.zeros(a.shape[1:]) for a in self.parameters)
-        check_energy(Function(lambda y: phi(y, *zero_parameters)), r, "the function at a place")
+        checked_energy(Function(lambda y: phi(y, *zero_parameters)), r, "the function at a place")
         self.phi = trace_callables(phi, lambda phi, *a: phi(*a), (r,), *(a.shape for a in zero_parameters))
         self.degree = polynomial_degree(_summand_value, (self.phi, zero_parameters), r)
 
@@ -92,14 +92,16 @@ class Each(Energy):
         return self._scatter_gradients(gradients, x.shape[0])
 
     def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
-        def summand_gradient(y, step, offset, *a):
-            return self._summand(a).discrete_gradient(scheme, y, step, offset)
+        def summand_discrete_gradient(y, step, summand_compensation, *a):
+            return self._summand(a).discrete_gradient(scheme, y, step, summand_compensation)
 
         y, step, offset = map(self._gather_components, (x, d, jnp.zeros_like(x) + compensation))
-        return self._scatter_gradients(jax.vmap(summand_gradient)(y, step, offset, *self.parameters), x.shape[0])
+        return self._scatter_gradients(
+            jax.vmap(summand_discrete_gradient)(y, step, offset, *self.parameters), x.shape[0]
+        )
 
     def stage_gradients(self, scheme, path) -> jax.Array:
-        def summand_gradients(summand_path: CollocationPath, *a):
+        def summand_stage_gradients(summand_path: CollocationPath, *a):
             return self._summand(a).stage_gradients(scheme, summand_path)
 
         compensation = jnp.zeros_like(path.start) + path.compensation
@@ -110,7 +112,7 @@ class Each(Energy):
         symmetry_axis = None if path.symmetries is None else 2
         axes = CollocationPath(0, 0, 0, 1, 1, kronrod_axis, symmetry_axis, None, None, None)  # type: ignore[arg-type]
         mapped_axes = axes, *(0 for _ in self.parameters)
-        gradients = jax.vmap(summand_gradients, in_axes=mapped_axes, out_axes=1)(summand_paths, *self.parameters)
+        gradients = jax.vmap(summand_stage_gradients, in_axes=mapped_axes, out_axes=1)(summand_paths, *self.parameters)
         return jax.vmap(lambda g: self._scatter_gradients(g, path.start.shape[0]))(gradients)
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array:
@@ -141,12 +143,12 @@ class Each(Energy):
         return jnp.zeros(n).at[np.asarray(self.places)].add(gradients)
 
 
-def _summand_value(model, y):
-    phi, parameters = model
+def _summand_value(phi_and_parameters, y):
+    phi, parameters = phi_and_parameters
     return jnp.asarray(phi(y, *parameters))
 
 
-def _check_places(places) -> Indices:
+def _checked_places(places) -> Indices:
     indices = np.asarray(places)
     if indices.ndim != 2 or indices.dtype.kind not in "iu" or 0 in indices.shape:
         raise InputError(

@@ -31,14 +31,14 @@ class Edges(NamedTuple):
     weight: jax.Array
 
 
-def graph_edges(graph, nodes: int, what: str, names: Sequence[str], allow_negative: bool = False) -> Edges:
+def graph_edges(graph, n_nodes: int, what: str, names: Sequence[str], allow_negative: bool = False) -> Edges:
     """Return the edges of a symmetric graph, without those of weight zero.
 
     Parameters
     ----------
     graph : array, shape (nodes, nodes), or SciPy sparse matrix; or sequence of (i, j, weight), each pair once; or a
         number for the one edge of two nodes
-    nodes : int
+    n_nodes : int
     what : str
         Name of the weights, for messages.
     names : sequence of str
@@ -51,9 +51,9 @@ def graph_edges(graph, nodes: int, what: str, names: Sequence[str], allow_negati
     InputError
     """
     if isinstance(graph, jax.core.Tracer):  # a matrix that is swept or differentiated keeps all its edges
-        first, second = np.triu_indices(nodes, 1)
+        first, second = np.triu_indices(n_nodes, 1)
         return Edges(first, second, graph if graph.ndim == 0 else graph[first, second])
-    first, second, weight = _edge_arrays(graph, nodes, what)
+    first, second, weight = _edge_arrays(graph, n_nodes, what)
     if isinstance(weight, jax.Array):  # some weights are tracers
         return Edges(first, second, weight)
     for e in np.flatnonzero((first == second) & (weight != 0.0))[:1]:
@@ -69,9 +69,9 @@ def graph_edges(graph, nodes: int, what: str, names: Sequence[str], allow_negati
     return Edges(first[is_nonzero], second[is_nonzero], jnp.asarray(weight[is_nonzero]))
 
 
-def connected_components(graph: Edges, nodes: int) -> np.ndarray:
+def connected_component_labels(graph: Edges, n_nodes: int) -> np.ndarray:
     """Return the number of the connected component of each node, shape (nodes,)."""
-    matrix = scipy.sparse.coo_array((np.ones(len(graph.first)), (graph.first, graph.second)), (nodes, nodes))
+    matrix = scipy.sparse.coo_array((np.ones(len(graph.first)), (graph.first, graph.second)), (n_nodes, n_nodes))
     return scipy.sparse.csgraph.connected_components(matrix, directed=False)[1]
 
 

@@ -31,7 +31,7 @@ from .arguments import (
     StateTimeFunction,
     required_argument_count,
 )
-from .conditions import check_numbers
+from .conditions import checked_numbers
 from .coordinates import ComponentMap, Components, check_coordinates
 from .indices import clique_pattern, sparsity_pattern, union_pattern
 from .path import CollocationPath, DiscreteGradientScheme
@@ -77,7 +77,7 @@ class Energy(Module):
         return _gradient(self, x) if x.size < MIN_BUFFERED_DIM else _evaluate_buffered(lambda x: _gradient(self, x), x)
 
     def sensitivity(self, x) -> jax.Array:
-        """Return ``|grad f(x)| |x|``, the scale of rounding errors that come from x; of a sum, the sum over its terms.
+        """Return the scale ``|grad f(x)| |x|`` of the errors that rounding of x causes; for a sum, added over terms.
 
         One rounding of the state changes f by eps times this scale, whatever the value of f is: ``log |x|^2`` has the
         sensitivity 2 where it vanishes, and a constant that is added to f has none. Every drift is judged relative to
@@ -86,7 +86,7 @@ class Energy(Module):
         return jax.lax.stop_gradient(jnp.linalg.norm(self.gradient(x)) * jnp.linalg.norm(x))
 
     def rounding_scale(self, x) -> jax.Array:
-        """Return the scale at which the value at x is rounded: that of the largest terms inside, even if they cancel.
+        """Return the size of the largest terms inside the value at x, to whose eps it is rounded even if they cancel.
 
         Near q = 0 the value of ``1 - cos q`` consists of rounding at the scale 1.
         """
@@ -98,7 +98,7 @@ class Energy(Module):
 
     @property
     def terms(self) -> tuple[Energy, ...]:
-        """The summands, none of which is a sum."""
+        """Return the summands, none of which is a sum."""
         return (self,)
 
     @property
@@ -108,7 +108,10 @@ class Energy(Module):
 
     @property
     def degree(self) -> float:
-        """Upper bound of the degree as a polynomial; infinity if none is known. Quadratures of low degree are exact."""
+        """Upper bound of the degree as a polynomial, infinity if none is known.
+
+        Quadratures of low degree are exact.
+        """
         return 2.0 if self.is_quadratic else math.inf
 
     def discrete_gradient(self, scheme: DiscreteGradientScheme, x, d, compensation) -> jax.Array:
@@ -154,9 +157,9 @@ class Energy(Module):
         """
         return self.map_terms(lambda term: Pullback(term, coordinates))
 
-    def map_terms(self, change: Callable[[Energy], Energy]) -> Energy:
-        """Return the sum of ``change(term)`` over the terms, where ``change`` maps a term to an energy."""
-        return Sum.of([change(term) for term in self.terms])
+    def map_terms(self, transform: Callable[[Energy], Energy]) -> Energy:
+        """Return the sum of ``change(term)`` over the terms, where ``transform`` maps a term to an energy."""
+        return Sum.of([transform(term) for term in self.terms])
 
     @property
     def depends_on_time(self) -> bool:
@@ -168,7 +171,7 @@ class Energy(Module):
         return self
 
     def with_time(self) -> Energy:
-        """Return an energy that depends on time as a function of the state with the time appended, shape (n + 1,)."""
+        """Return a time-dependent energy as one of the state with the time appended, shape (n + 1,)."""
         raise NotImplementedError(f"{type(self).__name__} does not depend on time")
 
     @with_library_settings
@@ -225,9 +228,9 @@ class Quadratic(Energy):
     c: jax.Array
 
     def __init__(self, A, b=None, c=0.0):
-        self.A = check_numbers(A, "A of a quadratic function")
-        self.b = None if b is None else check_numbers(b, "b of a quadratic function")
-        self.c = check_numbers(c, "c of a quadratic function", ())
+        self.A = checked_numbers(A, "A of a quadratic function")
+        self.b = None if b is None else checked_numbers(b, "b of a quadratic function")
+        self.c = checked_numbers(c, "c of a quadratic function", ())
         if self.A.ndim not in (1, 2) or len(set(self.A.shape)) != 1:
             raise InputError(f"A must have shape (n, n), or (n,) for a diagonal matrix, got {self.A.shape}")
         if self.b is not None and self.b.shape != self.A.shape[:1]:
@@ -385,15 +388,15 @@ class StateTimeEnergy(Energy):
             values = jax.vmap(lambda y, t: self.value(jnp.append(y, t)))(states, times)
             return 0.5 * (values[0] + values[1])
 
-        def mean_by_state(y):
+        def mean_over_end_times(y):
             return mean(jnp.stack([y, y]), ends[:, -1])
 
-        def mean_by_time(t):
+        def mean_over_end_states(t):
             return mean(ends[:, :-1], jnp.concatenate([t, t]))
 
-        state_gradient = scheme.general(Function(mean_by_state), x[:-1], d[:-1], compensation[:-1])
+        state_gradient = scheme.general(Function(mean_over_end_times), x[:-1], d[:-1], compensation[:-1])
         return jnp.concatenate(
-            [state_gradient, scheme.general(Function(mean_by_time), x[-1:], d[-1:], compensation[-1:])]
+            [state_gradient, scheme.general(Function(mean_over_end_states), x[-1:], d[-1:], compensation[-1:])]
         )
 
     def stage_gradients(self, scheme, path) -> jax.Array:
@@ -401,7 +404,7 @@ class StateTimeEnergy(Energy):
 
 
 def _squared_gradient_weights(gradients) -> jax.Array:
-    """Return sums of squared gradients, shape (s, m): that by the state for each component, then that by time."""
+    """Return weights of components, shape (m,): the squared gradient by state for each, then that by time."""
     scale = jnp.max(jnp.abs(gradients))
     squares = jnp.sum((gradients / jnp.where(scale > 0.0, scale, 1.0)) ** 2, axis=0)
     return jnp.append(jnp.full(gradients.shape[1] - 1, jnp.sum(squares[:-1])), squares[-1])
@@ -462,7 +465,7 @@ class Pullback(Energy):
         return gradient
 
     def stage_gradients(self, scheme, path) -> jax.Array:
-        path, pull_back = path.map_coordinates(self.coordinates)
+        path, pull_back = path.path_and_pullback_in(self.coordinates)
         return pull_back(self.term.stage_gradients(scheme, path))
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array | None:

@@ -37,10 +37,10 @@ class OrthonormalFrame(NamedTuple):
 
     def project_off(self, v) -> jax.Array:
         """Return v without its component in the span."""
-        return self._orthogonalize(v)[0]
+        return self._residual_and_coefficients(v)[0]
 
-    def project_off_images(self, v) -> jax.Array:
-        """Return an image without its component in the span of the images, ``P^T v`` if :meth:`project_off` is P."""
+    def project_off_transposed(self, v) -> jax.Array:
+        """Return ``P^T v``, P the projector of :meth:`project_off`: an image without its component in their span."""
         for e, image in zip(self.unit_vectors, self.images, strict=True):
             v = v - jnp.dot(e, v) * image
         return v
@@ -49,11 +49,11 @@ class OrthonormalFrame(NamedTuple):
         """Return w, shape (m,), for which ``sum_l w_l vectors[l]`` is the component of v in the span."""
         return sum_terms(jnp.dot(e, v) * c for e, c in zip(self.unit_vectors, self.combinations, strict=True))
 
-    def vector_with_products(self, products) -> jax.Array:
+    def vector_with_inner_products(self, products) -> jax.Array:
         """Return the vector in the span, shape (n,), that has given inner products with the given vectors."""
         return sum_terms(jnp.dot(c, products) * e for e, c in zip(self.unit_vectors, self.combinations, strict=True))
 
-    def _orthogonalize(self, v) -> tuple[jax.Array, list[jax.Array]]:
+    def _residual_and_coefficients(self, v) -> tuple[jax.Array, list[jax.Array]]:
         """Return v without its component in the span, and its coefficients in the unit vectors."""
         coefficients: list[jax.Array] = [jnp.zeros(())] * len(self.unit_vectors)
         for _ in range(2):  # the second pass removes what rounding left of the first
@@ -77,7 +77,7 @@ def gram_schmidt(
     image_of = metric_map or (lambda v: v)
     frame, reference_frame = OrthonormalFrame([], [], [], []), OrthonormalFrame([], [], [], [])
     for j, vector in enumerate(vectors):
-        residual, coefficients = frame._orthogonalize(vector)
+        residual, coefficients = frame._residual_and_coefficients(vector)
         image = image_of(residual)
         squared_norm = jnp.dot(image, residual)
         if reference_vectors is None:
@@ -104,17 +104,17 @@ def gram_schmidt(
     return frame
 
 
-def vector_with_products(
+def vector_with_inner_products(
     directions: Sequence[jax.Array],
     products: jax.Array,
-    passes: int = 1,
+    n_passes: int = 1,
     is_usable: Callable[[jax.Array], jax.Array] | None = None,
 ) -> jax.Array:
     """Return the vector in the span of some directions, shape (n,), that has given inner products with them.
 
-    The result is ``gram_schmidt(directions).vector_with_products(products)``, but computed in one pass and without
-    square roots, for an iteration that corrects rounding errors. A direction that depends on previous ones, as at an
-    equilibrium, is skipped. A second pass is for directions that are nearly parallel, as in units in which one
+    The result is ``gram_schmidt(directions).vector_with_inner_products(products)``, but computed in one pass and
+    without square roots, for an iteration that corrects rounding errors. A direction that depends on previous ones, as
+    at an equilibrium, is skipped. A second pass is for directions that are nearly parallel, as in units in which one
     component is much larger than another.
 
     An increment along a direction for which ``is_usable`` is false is skipped; the product with this direction is then
@@ -124,7 +124,7 @@ def vector_with_products(
     units: list[tuple[jax.Array, jax.Array]] = []
     for v, product in zip(directions, products, strict=True):
         residual = v
-        for pass_index in range(passes):
+        for pass_index in range(n_passes):
             for unit, squared_norm in units:
                 residual = residual - (jnp.dot(residual if pass_index else v, unit) / squared_norm) * unit
         squared_norm = jnp.dot(residual, residual)

@@ -72,7 +72,7 @@ class DiscreteGradient(Module):
         return 2
 
     @property
-    def is_order_independent(self) -> bool:
+    def is_coordinate_order_independent(self) -> bool:
         """True if the result does not depend on the order of the coordinates."""
         return False
 
@@ -80,7 +80,7 @@ class DiscreteGradient(Module):
         return sum_terms(term.discrete_gradient(self, x, d, compensation) for term in energy.terms)
 
     def quadratic(self, term: Energy, x, d, compensation) -> jax.Array:
-        """Return the gradient at the midpoint, which is exact for quadratic functions."""
+        """Return the discrete gradient of a quadratic term, the exact gradient at the midpoint."""
         return term.gradient(x + (compensation + 0.5 * d))
 
     @abstractmethod
@@ -106,7 +106,7 @@ class Gonzalez(DiscreteGradient):
     noisy: float = eqx.field(static=True, default=MAX_DIFFERENCE_NOISE)
     across: bool = eqx.field(static=True, default=False)
 
-    is_order_independent = True
+    is_coordinate_order_independent = True
 
     def general(self, term: Energy, x, d, compensation) -> jax.Array:
         g_start, g_middle, g_end = jax.vmap(lambda c: term.gradient(x + (compensation + c * d)))(_GAUSS_NODES_3)
@@ -115,7 +115,7 @@ class Gonzalez(DiscreteGradient):
         if term.degree <= 2 * len(_GAUSS_NODES_3):
             return g_middle + _safe_divide((5 / 18) * jnp.dot(second_difference, d), jnp.dot(d, d)) * d
         prediction = jnp.dot(g_middle, d) + (5 / 18) * jnp.dot(second_difference, d)
-        difference = _value_difference(term, x, d, compensation, g_middle)
+        difference = _value_difference_and_rounding_scale(term, x, d, compensation, g_middle)
         gradient_norm, state_norm, step_norm = (jnp.linalg.norm(v) for v in (g_middle, x, d))
         curvature = jnp.linalg.norm(second_difference) * step_norm if self.across else jnp.dot(second_difference, d)
         defect = _gated_defect(
@@ -133,7 +133,7 @@ class MeanValue(DiscreteGradient):
 
     nodes: int = eqx.field(static=True, default=5)
 
-    is_order_independent = True
+    is_coordinate_order_independent = True
 
     def __check_init__(self):
         if not isinstance(self.nodes, int) or self.nodes < 1:
@@ -144,7 +144,7 @@ class MeanValue(DiscreteGradient):
         mean = jnp.asarray(weights) @ jax.vmap(lambda c: term.gradient(x + (compensation + c * d)))(points)
         if term.degree <= 2 * self.nodes:
             return mean
-        difference = _value_difference(term, x, d, compensation, mean)
+        difference = _value_difference_and_rounding_scale(term, x, d, compensation, mean)
         rounding = jnp.linalg.norm(mean) * jnp.linalg.norm(x)
         defect = _gated_defect(*difference, jnp.dot(mean, d), rounding, 0.0, 1.0)
         return mean + _safe_divide(defect, jnp.dot(d, d)) * d
@@ -184,11 +184,11 @@ class CoordinateIncrement(DiscreteGradient):
         corners = x + jnp.tril(jnp.ones((n + 1, n)), -1) * d  # corner i has the first i coordinates of x + d
         values = _values_at_points(term, corners)
 
-        def slopes(corner, direction, step):  # of H along the edge at a corner, and |grad H|
+        def slopes_and_gradient_norm(corner, direction, step):  # of H along the edge at a corner, and |grad H|
             gradients = jax.vmap(lambda c: term.gradient(corner + c * step * direction))(_GAUSS_NODES_3)
             return gradients @ direction, jnp.linalg.norm(gradients[1])
 
-        edge_slopes, gradient_norms = jax.vmap(slopes)(corners[:-1], jnp.eye(n), d)
+        edge_slopes, gradient_norms = jax.vmap(slopes_and_gradient_norm)(corners[:-1], jnp.eye(n), d)
         second_differences = edge_slopes[:, 0] + edge_slopes[:, 2] - 2.0 * edge_slopes[:, 1]
         mean = edge_slopes[:, 1] + (5 / 18) * second_differences
         rounding_scales = _value_rounding_scale(values[1:], values[:-1], term.rounding_scale(x))
@@ -321,7 +321,7 @@ class CorrectionDirection(NamedTuple):
 
     @classmethod
     def of(cls, k, b, weights=None, symmetries=None) -> CorrectionDirection:
-        """Return ``d = W k``, W diagonal with the weights, orthogonal to the symmetries, shape (s, r, m)."""
+        """Return the direction ``d = W k``, W diagonal, without components along the symmetries, shape (s, r, m)."""
         scale = jnp.ones(()) if weights is None else sqrt_or_zero(weights)
         weighted_slopes = projection = scale * k
         if symmetries is not None:
@@ -377,7 +377,7 @@ def correct_gradients(
     quadrature_correction=0.0,
     gradient_variation=0.0,
 ) -> jax.Array:
-    """Return ``gradients + alpha d``, shape (s, n), with ``h sum_i b_i (.)_i . k_i`` the change of the function.
+    """Return the gradients plus ``alpha d``, shape (s, n), so that their quadrature is the change of the function.
 
     ``quadrature_correction`` is the difference of a better quadrature from that of the gradients;
     ``gradient_variation`` is the largest distance of gradients between the stages from the mean at the stages.
@@ -416,7 +416,7 @@ def _values_at_points(term: Energy, points) -> jax.Array:
     return jax.vmap(term.value)(points)
 
 
-def _value_difference(term: Energy, x, d, compensation, gradient) -> tuple[jax.Array, jax.Array]:
+def _value_difference_and_rounding_scale(term: Energy, x, d, compensation, gradient) -> tuple[jax.Array, jax.Array]:
     """Return ``H(y + d) - H(y)``, y = x + compensation, and the scale at which it is rounded.
 
     The values are taken where steps begin and end, so that their rounding cancels from step to step; ``gradient``,
@@ -480,8 +480,8 @@ def _safe_divide(numerator, denominator):
     return jnp.where(is_usable, numerator / jnp.where(is_usable, denominator, 1.0), 0.0)
 
 
-def _gauss_rule(nodes: int) -> tuple[np.ndarray, np.ndarray]:
-    points, weights = np.polynomial.legendre.leggauss(nodes)
+def _gauss_rule(n_nodes: int) -> tuple[np.ndarray, np.ndarray]:
+    points, weights = np.polynomial.legendre.leggauss(n_nodes)
     return (points + 1.0) / 2.0, weights / 2.0
 
 

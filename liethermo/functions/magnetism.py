@@ -35,7 +35,7 @@ from manifolds.structures.spins import (
 )
 
 from ..errors import InputError
-from .conditions import check_numbers
+from .conditions import checked_numbers
 from .each import Each
 from .edges import graph_edges
 from .energy import Energy, Sum
@@ -72,7 +72,7 @@ def exchange(sites, strength=1.0, neighbours=None, periodic=True) -> Energy:
     shape = lattice_shape(sites)
     if neighbours is None and _is_graph(strength, shape):
         return _graph_exchange(shape, strength)
-    return _lattice_energy(shape, strength, None, neighbours, periodic, "an exchange constant")
+    return _lattice_bond_energy(shape, strength, None, neighbours, periodic, "an exchange constant")
 
 
 def dzyaloshinskii_moriya(sites, vectors, neighbours=None, periodic=True) -> Energy:
@@ -97,9 +97,9 @@ def dzyaloshinskii_moriya(sites, vectors, neighbours=None, periodic=True) -> Ene
     """
     shape = lattice_shape(sites)
     if neighbours is None and _is_edge_list(vectors) and all(np.ndim(edge[2]) == 1 for edge in vectors):
-        ends, D = _directed_edges(vectors, math.prod(shape))
-        return Each(_antisymmetric_bond, _bond_indices(ends[:, 0], ends[:, 1]), D)
-    return _lattice_energy(shape, None, vectors, neighbours, periodic, "a Dzyaloshinskii-Moriya vector")
+        ends, D = _checked_edges_and_vectors(vectors, math.prod(shape))
+        return Each(_antisymmetric_bond_energy, _bond_indices(ends[:, 0], ends[:, 1]), D)
+    return _lattice_bond_energy(shape, None, vectors, neighbours, periodic, "a Dzyaloshinskii-Moriya vector")
 
 
 def anisotropy(sites, strength=1.0, axis=(0.0, 0.0, 1.0)) -> Energy:
@@ -122,8 +122,8 @@ def anisotropy(sites, strength=1.0, axis=(0.0, 0.0, 1.0)) -> Energy:
     InputError
     """
     shape = lattice_shape(sites)
-    K = _site_values(strength, shape, (), "an anisotropy constant")
-    n = _site_values(axis, shape, (3,), "an axis")
+    K = _checked_site_values(strength, shape, (), "an anisotropy constant")
+    n = _checked_site_values(axis, shape, (3,), "an axis")
     if not is_traced((K, n)) and not (np.count_nonzero(np.asarray(n), axis=-1) > 1).any():  # every axis is x, y or z
         return SiteEnergy(shape, -2.0 * K[..., None] * n**2, None, None)
     return SiteEnergy(shape, -2.0 * K, None, n)
@@ -149,7 +149,7 @@ def zeeman(sites, field, moment=1.0) -> Energy:
     InputError
     """
     shape = lattice_shape(sites)
-    B, moment = _site_values(field, shape, (3,), "a field"), _site_values(moment, shape, (), "a moment")
+    B, moment = _checked_site_values(field, shape, (3,), "a field"), _checked_site_values(moment, shape, (), "a moment")
     return SiteEnergy(shape, None, -moment[..., None] * B, None)
 
 
@@ -304,10 +304,10 @@ def check_spin_count(sites: tuple[int, ...], dim: int, role: str) -> None:
         raise InputError(f"{role} has a term of {count} spins, so the state needs {3 * count} components, got {dim}")
 
 
-def _lattice_energy(shape, strength, vectors, neighbours, periodic, what: str) -> Energy:
+def _lattice_bond_energy(shape, strength, vectors, neighbours, periodic, what: str) -> Energy:
     axes = len(shape)
     offsets = np.eye(axes, dtype=int).tolist() if neighbours is None else neighbours
-    offsets = [_check_offset(offset, axes) for offset in offsets]
+    offsets = [_checked_offset(offset, axes) for offset in offsets]
     if any(opposite in offsets for opposite in ([-o for o in offset] for offset in offsets)):
         raise InputError(f"the neighbours {offsets} name a pair twice. Give one of each two opposite offsets")
     periodic_axes = (periodic,) * axes if isinstance(periodic, bool) else tuple(periodic)
@@ -322,8 +322,8 @@ def _lattice_energy(shape, strength, vectors, neighbours, periodic, what: str) -
     tail = () if vectors is None else (3,)
     terms = []
     for offset, offset_coupling in zip(offsets, couplings, strict=True):
-        value = _site_values(offset_coupling, shape, tail, what)
-        has_neighbour = _has_neighbour(shape, offset, periodic_axes)
+        value = _checked_site_values(offset_coupling, shape, tail, what)
+        has_neighbour = _neighbour_mask(shape, offset, periodic_axes)
         if not has_neighbour.all():  # no pairs across the border
             value = jnp.where(has_neighbour.reshape(*shape, *(1 for _ in tail)), value, 0.0)
         terms.append(
@@ -334,14 +334,14 @@ def _lattice_energy(shape, strength, vectors, neighbours, periodic, what: str) -
     return Sum.of(terms)
 
 
-def _check_offset(offset, axes: int) -> list[int]:
+def _checked_offset(offset, axes: int) -> list[int]:
     components = [offset] if np.ndim(offset) == 0 else list(offset)
     if len(components) != axes or any(int(o) != o for o in components) or not any(components):
         raise InputError(f"a neighbour must be an offset of {axes} integers, not all zero, got {offset!r}")
     return [int(o) for o in components]
 
 
-def _has_neighbour(shape, offset, periodic_axes) -> np.ndarray:
+def _neighbour_mask(shape, offset, periodic_axes) -> np.ndarray:
     """Return which sites have a neighbour at an offset, as an array of the shape of the sites."""
     has_neighbour = np.ones(shape, dtype=bool)
     for axis, (n, shift, is_periodic) in enumerate(zip(shape, offset, periodic_axes, strict=True)):
@@ -353,9 +353,9 @@ def _has_neighbour(shape, offset, periodic_axes) -> np.ndarray:
     return has_neighbour
 
 
-def _site_values(value, shape, tail: tuple[int, ...], what: str) -> jax.Array:
-    """Check a value that is given once for all sites, or for each site, and return it as an array."""
-    array = check_numbers(value, what)
+def _checked_site_values(value, shape, tail: tuple[int, ...], what: str) -> jax.Array:
+    """Return a value, given once or for each site, as an array; InputError unless its shape fits and it is finite."""
+    array = checked_numbers(value, what)
     if array.shape not in (tail, (*shape, *tail)):
         expected_shapes = f"{tail} or {(*shape, *tail)}" if tail else f"() or {shape}"
         raise InputError(f"{what} must have shape {expected_shapes}, got {array.shape}")
@@ -392,7 +392,7 @@ def _graph_exchange(shape, graph) -> Energy:
     edges = graph_edges(graph, count, "the exchange", _SiteNames(), allow_negative=True)
     if len(edges.first) == 0:
         raise InputError("the graph of an exchange has no edges")
-    return Each(_exchange_bond, _bond_indices(edges.first, edges.second), edges.weight)
+    return Each(_exchange_bond_energy, _bond_indices(edges.first, edges.second), edges.weight)
 
 
 class _SiteNames(Sequence):
@@ -405,7 +405,7 @@ class _SiteNames(Sequence):
         return 0
 
 
-def _directed_edges(edges, count: int) -> tuple[np.ndarray, jax.Array]:
+def _checked_edges_and_vectors(edges, count: int) -> tuple[np.ndarray, jax.Array]:
     for i, j, _ in edges:
         if not (0 <= i < count and 0 <= j < count):
             raise InputError(f"the edge ({i}, {j}) must join two of the {count} sites, which are numbered from 0")
@@ -426,9 +426,9 @@ def _bond_indices(first, second) -> np.ndarray:
     return (3 * ends[:, :, None] + np.arange(3)).reshape(len(ends), 6)
 
 
-def _exchange_bond(y, J):
+def _exchange_bond_energy(y, J):
     return -J * jnp.dot(y[:3], y[3:])
 
 
-def _antisymmetric_bond(y, D):
+def _antisymmetric_bond_energy(y, D):
     return jnp.dot(D, cross(y[:3], y[3:]))

@@ -40,21 +40,23 @@ class Kinetic(Energy):
         return not callable(self.G)
 
     def at(self, q) -> jax.Array:
-        """Return ``G(q)``, shape (n, n) or (n,)."""
+        """Return the matrix ``G(q)`` of the kinetic energy at q, shape (n, n), or its diagonal, shape (n,)."""
         return jnp.asarray(self.G(q)) if callable(self.G) else self.G
 
     def value(self, x) -> jax.Array:
-        q, p = _split_state(x)
+        q, p = _positions_and_momenta(x)
         return 0.5 * jnp.dot(p, _apply_metric(self.at(q), p))
 
     def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
-        (q, p), (dq, dp), (compensation_q, compensation_p) = map(_split_state, (x, d, jnp.zeros_like(x) + compensation))
+        (q, p), (dq, dp), (compensation_q, compensation_p) = map(
+            _positions_and_momenta, (x, d, jnp.zeros_like(x) + compensation)
+        )
         p_middle, zeros = p + (compensation_p + 0.5 * dp), jnp.zeros(len(x) - 2 * len(p))
         if not callable(self.G):
             return jnp.concatenate([jnp.zeros_like(q), _apply_metric(self.G, p_middle), zeros])
         p_start, p_end = p + compensation_p, p + (compensation_p + dp)
 
-        def mean(q):  # of the kinetic energy at q, over both ends in p
+        def mean_kinetic_energy(q):  # of the kinetic energy at q, over both ends in p
             G = self.at(q)
             return 0.25 * (jnp.dot(p_start, _apply_metric(G, p_start)) + jnp.dot(p_end, _apply_metric(G, p_end)))
 
@@ -62,7 +64,9 @@ class Kinetic(Energy):
             _apply_metric(self.at(q + compensation_q), p_middle)
             + _apply_metric(self.at(q + (compensation_q + dq)), p_middle)
         )
-        return jnp.concatenate([scheme.general(Function(mean), q, dq, compensation_q), p_gradient, zeros])
+        return jnp.concatenate(
+            [scheme.general(Function(mean_kinetic_energy), q, dq, compensation_q), p_gradient, zeros]
+        )
 
     def stage_gradients(self, scheme, path) -> jax.Array:
         dim = len(path.start)
@@ -103,7 +107,9 @@ def is_mechanical(energy: Energy, dim: int, space: mf.Space | None = None) -> bo
     if is_traced(energy):
         return False
     points = np.random.default_rng(0).standard_normal((4, dim))
-    projectors = None if space is None else evaluate_at_points(_projector, space, points[:, : space.size])
+    projectors = (
+        None if space is None else evaluate_at_points(_tangent_projector_matrix, space, points[:, : space.size])
+    )
     return all(
         _is_kinetic(term, points, projectors) or is_independent_of_momenta(term, points) for term in energy.terms
     )
@@ -129,7 +135,7 @@ def _is_kinetic(term: Energy, points: np.ndarray, projectors: np.ndarray | None)
         return _is_semidefinite(evaluate_at_points(_metric, term, points), projectors)
     if not term.is_quadratic:
         return False
-    slope, hessian = evaluate_at_points(_momentum_derivatives, term, np.zeros_like(points[:1]))
+    slope, hessian = evaluate_at_points(_gradient_and_hessian_by_momenta, term, np.zeros_like(points[:1]))
     mixed_block = np.delete(hessian, np.s_[n : 2 * n], axis=-1)
     return not slope.any() and not mixed_block.any() and _is_semidefinite(hessian[..., n : 2 * n], projectors)
 
@@ -141,18 +147,18 @@ def _is_semidefinite(G: np.ndarray, projectors: np.ndarray | None) -> bool:
     return bool(eigenvalues.min() >= -1e-14 * np.abs(eigenvalues).max())
 
 
-def _projector(space: mf.Space, q):
+def _tangent_projector_matrix(space: mf.Space, q):
     point = space.from_vector(q)
     project = lambda w: space.to_vector(space._tangential_part(point, space.from_vector(w)))  # noqa: E731
     return jax.vmap(project, out_axes=1)(jnp.eye(space.size))
 
 
 def _metric(term: Kinetic, x):
-    G = term.at(_split_state(x)[0])
+    G = term.at(_positions_and_momenta(x)[0])
     return jnp.diag(G) if G.ndim == 1 else G
 
 
-def _momentum_derivatives(term: Energy, x):
+def _gradient_and_hessian_by_momenta(term: Energy, x):
     n = len(x) // 2
     return term.gradient(x)[n : 2 * n], jax.jacfwd(term.gradient)(x)[n : 2 * n]
 
@@ -161,7 +167,7 @@ def _jacobian(term: Pullback, x):
     return jax.jacfwd(term.coordinates)(x)
 
 
-def _split_state(x):
+def _positions_and_momenta(x):
     n = len(x) // 2
     return x[:n], x[n : 2 * n]
 

@@ -28,10 +28,10 @@ def energy_of_vectors(energy: Energy, space: mf.Space | None) -> Energy:
     """Return an energy of the points of a space as one of their vectors; an lt.Quadratic is returned unchanged."""
     if space is None or space.shape == (space.size,):
         return energy
-    return energy.map_terms(lambda term: _term_of_vectors(term, space))
+    return energy.map_terms(lambda term: _term_on_state_vectors(term, space))
 
 
-def _term_of_vectors(term: Energy, space: mf.Space) -> Energy:
+def _term_on_state_vectors(term: Energy, space: mf.Space) -> Energy:
     if isinstance(term, TimeDependent):
         return TimeDependent(_PointTimeFunction(term.function, space))
     return term if isinstance(term, Quadratic) else PointEnergy(term, space)
@@ -48,7 +48,7 @@ class _PointTimeFunction(Module):
 
 
 def flatten_site_functions(tree, shape: tuple[int, ...]):
-    """Replace the plain functions of states of this shape in a pytree by functions of flat states, shape (n,).
+    """Return a pytree whose plain functions of states of this shape are made functions of flat states, shape (n,).
 
     Energies of other classes and Casimirs of algebras are functions of flat states already.
     """

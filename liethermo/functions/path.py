@@ -56,8 +56,8 @@ class CollocationPath(NamedTuple):
     b: np.ndarray
     kronrod: KronrodRule | None
 
-    def map_coordinates(self, coordinates: Callable) -> tuple[CollocationPath, Callable]:
-        """Return the path in coordinates at most quadratic in these, and the pullback of covectors at the stages."""
+    def path_and_pullback_in(self, coordinates: Callable) -> tuple[CollocationPath, Callable]:
+        """Return the path in at most quadratic coordinates y(x), and the pullback of covectors at its stages to x."""
 
         def push_forward(x, d):
             return jax.jvp(coordinates, (x,), (d,))

@@ -19,13 +19,13 @@ from .magnetism import SpinEnergy, flatten_covectors, lattice_spins
 from .with_baths import BodyBathsEnergy
 
 
-def to_planes(x, count: int) -> jax.Array:
-    """Reorder states that begin with ``count`` spins site by site, shape (..., n), component by component."""
+def to_component_order(x, count: int) -> jax.Array:
+    """Return states, shape (..., n), whose first ``count`` spins are reordered component by component."""
     return _transpose_spins(x, (count, 3))
 
 
-def to_sites(x, count: int) -> jax.Array:
-    """Reorder states that begin with ``count`` spins component by component, shape (..., n), site by site."""
+def to_site_order(x, count: int) -> jax.Array:
+    """Return states, shape (..., n), whose first ``count`` spins are reordered site by site."""
     return _transpose_spins(x, (3, count))
 
 
@@ -36,7 +36,7 @@ def _transpose_spins(x, shape: tuple[int, int]) -> jax.Array:
     return spins if n_spin_components == x.shape[-1] else jnp.concatenate([spins, x[..., n_spin_components:]], axis=-1)
 
 
-def planar_energy(energy: Energy, count: int) -> Energy:
+def energy_in_component_order(energy: Energy, count: int) -> Energy:
     """Return a function of states ordered site by site as a function of states ordered component by component."""
     terms: list[Energy] = []
     spin_energies: list[SpinEnergy] = []
@@ -52,9 +52,9 @@ def planar_energy(energy: Energy, count: int) -> Energy:
 
 def _planar_term(term: Energy, count: int) -> Energy:
     if isinstance(term, BodyBathsEnergy):
-        return BodyBathsEnergy(planar_energy(term.body, count), term.baths, term.body_dim, term.dim)
+        return BodyBathsEnergy(energy_in_component_order(term.body, count), term.baths, term.body_dim, term.dim)
     if isinstance(term, Negative):
-        return Negative(planar_energy(term.term, count))
+        return Negative(energy_in_component_order(term.term, count))
     return Pullback(term, SiteOrder(count))
 
 
@@ -66,17 +66,17 @@ class PlanarSpinEnergy(Energy):
     is_quadratic = True
 
     def value(self, x) -> jax.Array:
-        spins = self._padded_spins(x)
+        spins = self._padded_spins_by_shape(x)
         return sum((energy.lattice_value(spins[energy.sites]) for energy in self.spin_energies), jnp.zeros(()))
 
     def gradient(self, x) -> jax.Array:
-        spins = self._padded_spins(x)
+        spins = self._padded_spins_by_shape(x)
         total, *other_gradients = (energy.lattice_gradients(spins[energy.sites]) for energy in self.spin_energies)
         for gradient in other_gradients:
             total = add_vectors(total, reshape_vectors(gradient, total[0].shape))
         return flatten_covectors(total, x, planar=True)
 
-    def _padded_spins(self, x) -> dict[tuple[int, ...], PaddedLattice]:
+    def _padded_spins_by_shape(self, x) -> dict[tuple[int, ...], PaddedLattice]:
         """Return the spins on the lattice of each energy, by the shape of the lattice."""
         sites = {energy.sites for energy in self.spin_energies}
         return {
@@ -87,7 +87,7 @@ class PlanarSpinEnergy(Energy):
         }
 
     def sensitivity(self, x) -> jax.Array:
-        spins, total = self._padded_spins(x), jnp.zeros(())
+        spins, total = self._padded_spins_by_shape(x), jnp.zeros(())
         for energy in self.spin_energies:
             site_spins, gradients = spins[energy.sites].site_spins, energy.lattice_gradients(spins[energy.sites])
             total = total + jnp.sqrt(sum_of_dots(gradients, gradients) * sum_of_dots(site_spins, site_spins))
@@ -111,4 +111,4 @@ class SiteOrder(ComponentMap):
     count: int = eqx.field(static=True)
 
     def __call__(self, x):
-        return to_sites(x, self.count)
+        return to_site_order(x, self.count)

@@ -98,7 +98,7 @@ def propagated_rounding_scale(function: Callable, x, scales) -> jax.Array:
 
 
 def _evaluate_perturbed(jaxpr: Jaxpr, constants, arguments, numbers: Iterator[int], amplitudes) -> list:
-    """Evaluate a jaxpr with the result of each equation perturbed, by the given relative amplitudes."""
+    """Return the results of a jaxpr in which the result of each equation is perturbed, by relative amplitudes."""
     values = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *arguments], strict=True))
     for equation in jaxpr.eqns:
         inputs = [v.val if isinstance(v, Literal) else values[v] for v in equation.invars]
@@ -136,7 +136,7 @@ def _perturb(value, number: int, amplitudes):
     if not jnp.issubdtype(jnp.result_type(value), jnp.inexact):
         return value
     shape = np.shape(value)[-1:]
-    pattern = _stored_pattern if math.prod(shape) <= MAX_STORED_PATTERN_LENGTH else _pseudorandom_numbers
+    pattern = _stored_random_numbers if math.prod(shape) <= MAX_STORED_PATTERN_LENGTH else _pseudorandom_numbers
     errors = [
         amplitude * pattern(shape, (number + PERTURBATION_SAMPLES * i) % PATTERNS_PER_SHAPE)
         for i, amplitude in enumerate(amplitudes)
@@ -145,7 +145,7 @@ def _perturb(value, number: int, amplitudes):
 
 
 @functools.cache
-def _stored_pattern(shape: tuple[int, ...], number: int) -> np.ndarray:
+def _stored_random_numbers(shape: tuple[int, ...], number: int) -> np.ndarray:
     """Return random numbers of modulus 0.5 to 1 and random sign."""
     rng = np.random.default_rng(number)
     return rng.uniform(0.5, 1.0, shape) * rng.choice([-1.0, 1.0], shape)

@@ -45,7 +45,7 @@ class Spheres:
 
     def project_direction(self, x, v) -> jax.Array:
         """Return v, shape (n,), without its radial components at x."""
-        s, vectors = self._vectors(x), self._vectors(v)
+        s, vectors = self._leading_vectors(x), self._leading_vectors(v)
         return self._replace_vectors(
             v, add_vectors(vectors, scale_vectors(-_safe_quotient(dot_vectors(s, vectors), dot_vectors(s, s)), s))
         )
@@ -55,7 +55,7 @@ class Spheres:
 
         The correction is computed from the changes of the squares, not from their values, so its error shrinks with d.
         """
-        start, step = self._vectors(x + compensation), self._vectors(d)
+        start, step = self._leading_vectors(x + compensation), self._leading_vectors(d)
         end = add_vectors(start, step)
         shrinkage = _safe_quotient(dot_vectors(step, add_vectors(start, end)), dot_vectors(end, end))
         root = jnp.sqrt(jnp.maximum(1.0 - shrinkage, 0.0))
@@ -65,7 +65,7 @@ class Spheres:
         """Return the state unchanged: the sum of the squares is corrected with the other first integrals."""
         return x, compensation
 
-    def _vectors(self, v) -> VectorComponents:
+    def _leading_vectors(self, v) -> VectorComponents:
         return spins_from_state(v, self.count, self.planar)
 
     def _replace_vectors(self, v, vectors: VectorComponents) -> jax.Array:

@@ -56,7 +56,8 @@ class Surface(Protocol):
         ...
 
     def correct_rounding(self, x, compensation) -> tuple[jax.Array, jax.Array]:
-        """Return the state x + compensation after a step, with rounding errors corrected; NaN outside of the domain."""
+        """Return the pair (state, compensation) with rounding errors corrected after a step; NaN outside of the
+        domain."""
         ...
 
 
@@ -86,11 +87,12 @@ class ConstraintSurface:
         return v
 
     def project_displacement(self, x, compensation, d) -> tuple[jax.Array, jax.Array]:
-        """Project by Newton's method, from the change of the constraints along d, so that the error shrinks with d."""
+        """Return the displacement projected by Newton's method, and the distance by which it still misses the
+        surface."""
         if _constraint_count(self.space) == 0:
             return d, jnp.zeros(())
 
-        def newton_step(d) -> tuple[jax.Array, jax.Array]:
+        def newton_step_and_error(d) -> tuple[jax.Array, jax.Array]:
             change, end = self._constraint_change(x, compensation, d), x + (compensation + d)
             constraint_error = jnp.max(
                 jnp.abs(change) / (self.space._constraint_rounding_scales(self._point(end)) + TINY)
@@ -98,10 +100,12 @@ class ConstraintSurface:
             return d - self._correction_displacement(end, change), constraint_error
 
         def iterate(carry, _):
-            return jax.lax.cond(carry[1] <= CONSTRAINT_RTOL, lambda: carry, lambda: newton_step(carry[0])), None
+            return jax.lax.cond(
+                carry[1] <= CONSTRAINT_RTOL, lambda: carry, lambda: newton_step_and_error(carry[0])
+            ), None
 
         if _constraint_degree(self.space) <= 1:
-            return newton_step(d)[0], jnp.zeros(())
+            return newton_step_and_error(d)[0], jnp.zeros(())
         (d, constraint_error), _ = jax.lax.scan(iterate, (d, jnp.asarray(jnp.inf)), length=MAX_NEWTON_STEPS)
         return d, jnp.where(constraint_error <= CONSTRAINT_RTOL, 0.0, constraint_error) * jnp.linalg.norm(x)
 
@@ -189,9 +193,9 @@ def _constraint_degree(space: mf.Space) -> float:
     """Return the degree of the constraints as polynomials, or infinity."""
     if _constraint_count(space) == 0:
         return 0
-    return polynomial_degree(_combine_constraints, space, space.size)
+    return polynomial_degree(_weighted_constraint_sum, space, space.size)
 
 
-def _combine_constraints(space: mf.Space, x):
+def _weighted_constraint_sum(space: mf.Space, x):
     values = space._constraints(space.from_vector(x))
     return jnp.sum(values * jnp.cos(jnp.arange(1.0, values.shape[-1] + 1.0)))

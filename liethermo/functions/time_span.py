@@ -11,7 +11,7 @@ from manifolds._pytree_module import Module
 
 
 class TimeSpan(Module):
-    """The start and end time of a run, infinite until a run sets them: see :func:`limit_times`.
+    """The start and end time of a run, infinite until a run sets them: see :func:`set_time_span`.
 
     The sum of the steps of a run may exceed the end of the span by a rounding: 0.1 + 0.1 + 0.1 > 0.3. A table or a root
     that ends with the span is not defined there.
@@ -45,12 +45,12 @@ def _clip(t, start, end) -> jax.Array:
 
 
 @_clip.defjvp
-def _derivative_of_clip(primals, tangents):
+def _clip_jvp(primals, tangents):
     """Return the clipped time and its tangent: the derivative by t is 1 outside too, where t lies by rounding."""
     return _clip(*primals), tangents[0]
 
 
-def limit_times(tree, start: float, end: float):
+def set_time_span(tree, start: float, end: float):
     """Return a pytree, such as a system, whose functions of time are evaluated within a span only."""
     span = TimeSpan(start, end)
 

@@ -79,21 +79,21 @@ class BodyBathsEnergy(Energy):
     def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
         arrays = x, d, jnp.zeros_like(x) + compensation
 
-        def discrete_gradient_of_part(energy: Energy, components: Components) -> jax.Array:
+        def energy_discrete_gradient(energy: Energy, components: Components) -> jax.Array:
             if (
                 energy is self.body and energy.is_quadratic
             ):  # at the midpoint of the whole state, which other terms use too
                 return components(scheme.quadratic(Pullback(energy, components), *arrays))
             return sum_terms(term.discrete_gradient(scheme, *map(components, arrays)) for term in energy.terms)
 
-        return jnp.concatenate([discrete_gradient_of_part(*pair) for pair in self._energies_and_components])
+        return jnp.concatenate([energy_discrete_gradient(*pair) for pair in self._energies_and_components])
 
     def stage_gradients(self, scheme, path: CollocationPath) -> jax.Array:
-        def component_gradients(energy: Energy, components: Components) -> jax.Array:
-            component_path, _ = path.map_coordinates(components)
+        def energy_stage_gradients(energy: Energy, components: Components) -> jax.Array:
+            component_path, _ = path.path_and_pullback_in(components)
             return sum_terms(term.stage_gradients(scheme, component_path) for term in energy.terms)
 
-        return jnp.concatenate([component_gradients(*pair) for pair in self._energies_and_components], axis=1)
+        return jnp.concatenate([energy_stage_gradients(*pair) for pair in self._energies_and_components], axis=1)
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
         body, baths = self.body.couplings(self.body_dim), self.baths.couplings(dim - self.body_dim)

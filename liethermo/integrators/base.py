@@ -16,7 +16,7 @@ from manifolds._pytree_module import Module, forward_to
 from manifolds.retractions.charts import RETRACTIONS
 
 from ..errors import InputError
-from ..functions.conditions import check_numbers, require_condition
+from ..functions.conditions import checked_numbers, require_condition
 from ..functions.energy import Energy
 from ..functions.gradients import EPS, DiscreteGradient, two_sum
 from ..functions.rounding import value_and_rounding_scale
@@ -285,7 +285,7 @@ def event_check_fractions(order: int) -> np.ndarray:
 def is_permutation_equivariant(method: OneStepMethod) -> bool:
     """Return True if a step does not depend on the order of the components, as it does with some discrete gradients."""
     parts = jax.tree_util.tree_leaves(method, is_leaf=lambda part: isinstance(part, DiscreteGradient))
-    return all(part.is_order_independent for part in parts if isinstance(part, DiscreteGradient))
+    return all(part.is_coordinate_order_independent for part in parts if isinstance(part, DiscreteGradient))
 
 
 def has_error_estimate(method) -> bool:
@@ -317,7 +317,7 @@ def kind_name(system) -> str:
 
 def checked_step_size(h) -> jax.Array:
     """Return the step size of a run as a finite scalar that is not zero."""
-    h = check_numbers(h, "the step h", ())
+    h = checked_numbers(h, "the step h", ())
     require_condition(
         h, lambda h: (abs(h) > 0.0) & (abs(h) < np.inf), "the step h must be finite and not zero, got {value}"
     )

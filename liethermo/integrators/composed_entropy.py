@@ -43,7 +43,7 @@ def composed_entropy_gradients(
         y = x
         for _ in range(CASIMIR_NEWTON_STEPS):
             residual = casimir_changes - jnp.stack([C.value(y) - C.value(x) for C in casimirs])
-            y = y + casimir_frame(y).vector_with_products(residual)
+            y = y + casimir_frame(y).vector_with_inner_products(residual)
         return casimir_frame(y).coefficients(S.gradient(y))
 
     coefficients = jax.vmap(entropy_coefficients)(h * (A @ rates))

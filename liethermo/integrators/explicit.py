@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 import manifolds as mf
 
-from ..dissipation.base import terms_with_preserved
+from ..dissipation.base import terms_with_preserved_values
 from ..errors import InputError
 from ..functions.energy import Energy
 from ..functions.gradients import EPS
@@ -342,7 +342,7 @@ class ExplicitMethod(TransportingMethod):
             return system.field(x, dH, jnp.zeros_like(x)), jnp.zeros(len(laws))
         dS = jnp.zeros_like(x) if system.entropy is None else system.entropy.gradient(x)
         dL = tuple(L.gradient(x) for L in system.preserved)
-        terms = list(terms_with_preserved(system.dissipation, dL))
+        terms = list(terms_with_preserved_values(system.dissipation, dL))
 
         def dissipation_rate(law: Law) -> jax.Array:
             """Return the rate by dissipation alone: near rest the motion would add rounding noise."""

@@ -14,11 +14,11 @@ from manifolds._pytree_module import forward_to
 from ..dissipation.factor import Factor, concatenate_factors
 from ..dissipation.noise import (
     FACTOR_SQUARE_CHECK,
-    factor_divergence,
+    factor_divergences,
     factor_residuals,
     generic_covectors,
-    terms_with_continuous_factors,
     terms_with_factors,
+    terms_with_factors_at_state,
 )
 from ..errors import InputError
 from ..functions.energy import Energy
@@ -113,14 +113,14 @@ class StochasticMidpoint(MethodWrapper, TransportingMethod):
     def can_transport_attitude(self, system: System) -> bool:
         assert system.dissipation is not None
         point = jnp.asarray(system.samples(1)[0])
-        return all(B.velocity is not None for _, B in terms_with_continuous_factors(system.dissipation, system, point))
+        return all(B.velocity is not None for _, B in terms_with_factors_at_state(system.dissipation, system, point))
 
     def _factors_and_inputs(self, system: System, z, dH, dL, h) -> list[tuple[Factor, jax.Array]]:
         """Return the factor of each summand with the vector, drift plus noise, that it is applied to."""
         assert system.dissipation is not None
         terms = terms_with_factors(system.dissipation, system, z, dH, dL)
         split_indices = np.cumsum([B.size for _, B in terms])[:-1]
-        drift = factor_divergence(system.dissipation, system, z)
+        drift = factor_divergences(system.dissipation, system, z)
         if self.log_density is not None:
             drift = drift + concatenate_factors([B for _, B in terms]).transpose_times(self.log_density.gradient(z))
         factors_and_inputs = []
@@ -209,7 +209,7 @@ def _count_factor_columns(system: System) -> int:
     assert system.dissipation is not None
     dissipation, point = system.dissipation, jnp.asarray(system.samples(1)[0])
     column_blocks = jax.eval_shape(
-        lambda x: [jnp.zeros(B.size) for _, B in terms_with_continuous_factors(dissipation, system, x)], point
+        lambda x: [jnp.zeros(B.size) for _, B in terms_with_factors_at_state(dissipation, system, x)], point
     )
     return sum(block.shape[0] for block in column_blocks)
 
@@ -251,7 +251,7 @@ def _sampled_noise_tests(system: System) -> tuple[np.ndarray, dict[str, tuple[np
 def _noise_tests(system: System, x):
     """Return the residual of ``B B^T = K``, and for each function the pair (change by noise, scale of that change)."""
     assert system.dissipation is not None
-    B = concatenate_factors([B for _, B in terms_with_continuous_factors(system.dissipation, system, x)])
+    B = concatenate_factors([B for _, B in terms_with_factors_at_state(system.dissipation, system, x)])
     # The scale is the largest product with generic covectors, which none of the columns is orthogonal to.
     max_product = jnp.max(
         jnp.stack([jnp.max(jnp.abs(B.transpose_times(covector))) for covector in generic_covectors(x.shape[0], 2)])

@@ -16,7 +16,7 @@ import numpy as np
 import manifolds as mf
 from manifolds._arrays import is_traced
 
-from ..dissipation.base import Dissipation, terms_with_preserved
+from ..dissipation.base import Dissipation, terms_with_preserved_values
 from ..errors import InputError
 from ..functions.energy import Energy
 from ..functions.frames import gram_schmidt
@@ -235,7 +235,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         slope = self._conservative_slope(system, u, dH, gradients_by_name)
         keys_and_names = tuple(zip(system.preserved_by_name(), system.preserved_names, strict=True))
         for term, preserved_keys in (
-            () if system.dissipation is None else terms_with_preserved(system.dissipation, keys_and_names)
+            () if system.dissipation is None else terms_with_preserved_values(system.dissipation, keys_and_names)
         ):
             slope = slope + self._dissipative_slope(term, preserved_keys, system, u, dH, dS, gradients_by_name)
         return slope
@@ -306,7 +306,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
     def can_transport_attitude(self, system: System) -> bool:
         """Return True if nothing is projected off the slopes."""
         names = system.preserved_names
-        terms = () if system.dissipation is None else terms_with_preserved(system.dissipation, names)
+        terms = () if system.dissipation is None else terms_with_preserved_values(system.dissipation, names)
         has_only_quadratics = all(
             C.is_quadratic for C in (self._held_functions(system) | _entropy_arguments(system)).values()
         )

@@ -16,8 +16,8 @@ from manifolds.matrices.linear import solve
 
 from ..errors import InputError
 from ..functions.arguments import required_argument_count
-from ..functions.checks import check_function_shape
-from ..functions.conditions import check_numbers
+from ..functions.checks import traced_function_and_shape
+from ..functions.conditions import checked_numbers
 from ..functions.energy import Energy, make_energy
 from ..functions.surface import ConstraintSurface
 from ..systems import EmbeddedSystem, EvolutionSystem, System
@@ -126,10 +126,10 @@ class DiscreteHerglotz(OneStepMethod):
 
     def state(self, q0, q1, S0, h) -> jax.Array:
         """Return the state (q_1, p_1, S_1) after a known first step, shape (2n + 1,), from which a run can start."""
-        q0 = jnp.atleast_1d(check_numbers(q0, "q0"))
+        q0 = jnp.atleast_1d(checked_numbers(q0, "q0"))
         q1, S0, h = (
-            jnp.atleast_1d(check_numbers(q1, "q1", q0.shape, ())),
-            check_numbers(S0, "S0", ()),
+            jnp.atleast_1d(checked_numbers(q1, "q1", q0.shape, ())),
+            checked_numbers(S0, "S0", ()),
             checked_step_size(h),
         )
         self._check_action(q0.shape)
@@ -147,7 +147,7 @@ class DiscreteHerglotz(OneStepMethod):
     def _check_action(self, shape: tuple[int, ...]) -> None:
         """Raise FunctionError unless the action of a step, at positions of this shape, is a number."""
         arguments_text = f"(q_0, q_1, S_0, h), q_0 and q_1 of shape {shape}"
-        check_function_shape(
+        traced_function_and_shape(
             self.discrete_lagrangian, [shape, shape, (), ()], [()], "the discrete Lagrangian", arguments_text
         )
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from ..functions.energy import Energy
-from ..functions.frames import MIN_SQUARED_NORM, vector_with_products
+from ..functions.frames import MIN_SQUARED_NORM, vector_with_inner_products
 from ..functions.gradients import CURVATURE_SWITCH, DIFFERENCE_NOISE, EPS, MIN_GRADIENT_VARIATION, Gonzalez
 from ..functions.surface import Surface
 from ..systems import System
@@ -294,7 +294,7 @@ def level_correction(
     is_usable: Callable[[jax.Array], jax.Array] | None = None,
 ) -> jax.Array:
     """Return the vector in the span of the directions with the given products with them, as far as it is usable."""
-    return vector_with_products(directions, changes, min(len(system.state_blocks), 2), is_usable)
+    return vector_with_inner_products(directions, changes, min(len(system.state_blocks), 2), is_usable)
 
 
 def correction_displacement(system: System, x, correction, leaf: bool = False) -> jax.Array:

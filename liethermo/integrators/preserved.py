@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..errors import InputError
-from ..functions.checks import check_energy, mark_polynomial_degrees
+from ..functions.checks import checked_energy, with_polynomial_degrees
 from ..functions.energy import Energy, function_name, make_energy
 from ..systems import System
 
@@ -22,8 +22,8 @@ def preserved_functions(preserve) -> tuple[Energy, ...]:
 
 def function_on_states(system: System, C: Energy) -> Energy:
     """Return a preserved function as a function of the state vectors of a system."""
-    C = check_energy(system.energy_of_vectors(C), system.dim, "a preserved function")
-    return mark_polynomial_degrees(C, system.dim) if system.space is None else C
+    C = checked_energy(system.energy_of_vectors(C), system.dim, "a preserved function")
+    return with_polynomial_degrees(C, system.dim) if system.space is None else C
 
 
 def check_preserved(system: System, functions: Sequence[Energy]) -> None:

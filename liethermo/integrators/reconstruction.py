@@ -12,7 +12,7 @@ from manifolds.groups.maps import central_part, components_from_ad_cayley, inver
 from manifolds.matrices.linear import solve_near_identity
 
 from ..errors import InputError
-from ..functions.frames import vector_with_products
+from ..functions.frames import vector_with_inner_products
 from ..functions.gradients import two_sum
 from ..systems import MOMENTUM_LESS_IMPULSE, SPATIAL_MOMENTUM, AttitudeSystem, DrivenSystem, TurningSystem
 from .base import MethodWrapper, TransportingMethod, pullback_method
@@ -329,7 +329,7 @@ def _project_onto_orbit(momenta, p, mu) -> jax.Array:
     for _ in range(MAX_NEWTON_ITERATIONS):
         momentum = jnp.concatenate([p, mu[n:]])
         residual = jnp.stack([C.value(mu) - C.value(momentum) for C in casimirs])
-        p = p + vector_with_products([C.gradient(momentum)[:n] for C in casimirs], residual)
+        p = p + vector_with_inner_products([C.gradient(momentum)[:n] for C in casimirs], residual)
     return scale * p
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import manifolds as mf
 
 from ..errors import InputError
-from ..functions.frames import vector_with_products
+from ..functions.frames import vector_with_inner_products
 from ..systems import System
 from .base import register
 from .explicit import ExplicitMethod, StepRow, UncorrectedStep
@@ -120,7 +120,9 @@ class MetriplecticRungeKutta(ExplicitMethod):
         end_points, functions = jnp.stack([x, end]), [law.function for law in laws]
         values, gradients = zip(*(jax.vmap(jax.value_and_grad(f.value))(end_points) for f in functions), strict=True)
         residuals = h * (t.b @ changes) - jnp.stack([end_value - start_value for start_value, end_value in values])
-        return end + vector_with_products([system.raise_index(end, gradient) for _, gradient in gradients], residuals)
+        return end + vector_with_inner_products(
+            [system.raise_index(end, gradient) for _, gradient in gradients], residuals
+        )
 
     def _stage_slopes(self, rates: Callable, x, compensation, h) -> tuple[jax.Array, jax.Array]:
         """Return the field at the stages, shape (s, n), and the rates of the functions of the laws, shape (s, laws)."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from manifolds._pytree_module import Module
 
-from ..functions.conditions import check_numbers
+from ..functions.conditions import checked_numbers
 from ..functions.energy import Function
 from ..functions.mechanics import Kinetic
 from ..systems import SimpleClosedSystem
@@ -63,7 +63,7 @@ def cylinder(
         external_force = (
             _PressureForce(add_time_argument(pressure), A)
             if callable(pressure)
-            else -A * check_numbers(pressure, "pressure", ())[None]
+            else -A * checked_numbers(pressure, "pressure", ())[None]
         )
     return SimpleClosedSystem(
         Kinetic(m[None]) - Function(_GasEnergy(gas, A)).on([0, 2]),

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.special
 
 from ..errors import InputError
-from ..functions.conditions import check_numbers, require_condition
+from ..functions.conditions import checked_numbers, require_condition
 from .inertia import EQUAL_MOMENTS_RTOL, are_tensors, principal_axes, principal_moments
 
 
@@ -148,7 +148,7 @@ def rate_of(relaxation_time, inertia, momentum) -> jax.Array:
     InputError
     """
     moments = principal_moments(inertia)
-    tau, L = check_numbers(relaxation_time, "a relaxation time"), check_numbers(momentum, "the size of a momentum")
+    tau, L = checked_numbers(relaxation_time, "a relaxation time"), checked_numbers(momentum, "the size of a momentum")
     for value, label in ((tau, "a relaxation time"), (L, "the size of a momentum")):
         require_condition(
             value, lambda v: (v > 0.0) & (v < np.inf), label + " must be positive and finite, got {value}"

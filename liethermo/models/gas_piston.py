@@ -11,7 +11,7 @@ import numpy as np
 
 from manifolds._pytree_module import Module
 
-from ..functions.conditions import check_numbers
+from ..functions.conditions import checked_numbers
 from ..functions.energy import Function
 from ..functions.mechanics import Kinetic
 from ..systems import ComposedSystem, Subsystem
@@ -99,7 +99,7 @@ def gas_piston(
         _CylinderGasEnergy(IdealGas(n_i, 0.5 * A * L), A, L, is_right)
         for n_i, is_right in zip(n, (False, True), strict=True)
     ]
-    check_numbers(conductance, "conductance", (2,))
+    checked_numbers(conductance, "conductance", (2,))
     piston = Kinetic((1.0 / m)[None]) + Function(ThermalEnergy(checked_positive(capacity, "capacity"))).on([2])
     return ComposedSystem(
         {"left gas": Subsystem(None, 1), "piston": Subsystem(piston, 3, friction), "right gas": Subsystem(None, 1)},

@@ -11,7 +11,7 @@ import numpy as np
 from manifolds._arrays import is_traced
 
 from ..errors import InputError
-from ..functions.conditions import check_numbers, require_condition
+from ..functions.conditions import checked_numbers, require_condition
 
 SYMMETRY_RTOL = 1e-9
 """Largest asymmetry of a tensor of inertia, relative to its largest entry."""
@@ -63,7 +63,7 @@ def principal_axes(inertia) -> PrincipalAxes:
     >>> np.allclose(moments, [2.0, 2.0, 3.0]), np.allclose(np.abs(axes[:, 2]), [0.0, 0.5**0.5, 0.5**0.5])
     (True, True)
     """
-    tensors = np.asarray(check_numbers(inertia, "inertia"), dtype=np.float64)
+    tensors = np.asarray(checked_numbers(inertia, "inertia"), dtype=np.float64)
     if tensors.shape[-2:] != (3, 3):
         raise InputError(f"inertia must have shape (..., 3, 3), got {tensors.shape}")
     moments, axes = np.linalg.eigh(checked_tensors(tensors))
@@ -126,7 +126,7 @@ def checked_tensors(tensors) -> np.ndarray:
 
 def principal_moments(inertia) -> jax.Array:
     """Return principal moments, shape (..., 3), of moments in any order or of tensors (then in ascending order)."""
-    array = check_numbers(inertia, "inertia")
+    array = checked_numbers(inertia, "inertia")
     if array.shape[-1:] != (3,):
         raise InputError(f"inertia must have shape (..., 3), or (..., 3, 3) for tensors, got {array.shape}")
     moments = jnp.linalg.eigvalsh(checked_tensors(array)) if are_tensors(array) else array

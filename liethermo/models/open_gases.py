@@ -12,7 +12,7 @@ import numpy as np
 from manifolds._pytree_module import Module
 
 from ..errors import InputError
-from ..functions.conditions import check_numbers, require_condition
+from ..functions.conditions import checked_numbers, require_condition
 from ..functions.energy import Function
 from ..functions.mechanics import Kinetic
 from ..systems import ComposedSystem, Membrane, Reaction, Subsystem
@@ -106,7 +106,7 @@ def porous_piston(
         Heat capacity of a particle at constant volume.
     """
     gas = _single_species_gas(heat_capacity)
-    check_numbers(conductance, "conductance", (2,))
+    checked_numbers(conductance, "conductance", (2,))
     bodies = {
         "left": Subsystem(None, 2, species=1),
         "piston": Subsystem(
@@ -146,7 +146,7 @@ def porous_piston_state(
     area, length, capacity = (
         checked_positive((defaults | parameters)[name], name) for name in ("area", "length", "capacity")
     )
-    position = check_numbers(q, "q", ())
+    position = checked_numbers(q, "q", ())
     require_condition(
         position, lambda q: (q > 0.0) & (q < length), f"q must be between 0 and {length:g}, got {{value:g}}"
     )

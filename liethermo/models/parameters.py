@@ -6,26 +6,26 @@ import jax
 import jax.numpy as jnp
 
 from ..errors import InputError
-from ..functions.conditions import check_numbers, require_condition
+from ..functions.conditions import checked_numbers, require_condition
 
 
 def checked_positive(value, name: str, count: int | None = None) -> jax.Array:
     """Return a positive number, or ``count`` of them, as an array; traced values are returned as they are."""
-    array = check_numbers(value, name, () if count is None else (count,))
+    array = checked_numbers(value, name, () if count is None else (count,))
     require_condition(array, lambda a: (a > 0.0) & (a < jnp.inf), name + " must be positive and finite, got {value}")
     return array
 
 
 def checked_finite(value, name: str, count: int | None = None) -> jax.Array:
     """Return finite numbers as an array, of shape (count,) if ``count`` is given."""
-    array = check_numbers(value, name, *(() if count is None else ((count,),)))
+    array = checked_numbers(value, name, *(() if count is None else ((count,),)))
     require_condition(array, lambda a: abs(a) < jnp.inf, name + " must be finite, got {value}")
     return array
 
 
 def checked_positive_vector(value, name: str) -> jax.Array:
     """Return at least one positive number as an array of shape (m,)."""
-    count = check_numbers(value, name).size
+    count = checked_numbers(value, name).size
     return checked_positive(value, name, max(count, 1))
 
 

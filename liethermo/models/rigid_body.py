@@ -14,7 +14,7 @@ from manifolds.errors import warn
 
 from ..dissipation.checks import checked_rate
 from ..dissipation.inner_product import KillingDissipation
-from ..functions.conditions import check_numbers, require_condition
+from ..functions.conditions import checked_numbers, require_condition
 from ..functions.energy import Quadratic
 from ..systems import LiePoissonSystem
 from .inertia import checked_tensors, inverse_inertia
@@ -84,7 +84,7 @@ def checked_inertia(inertia) -> np.ndarray | jax.Array:
 
     A diagonal tensor is returned as its moments.
     """
-    checked_array = check_numbers(inertia, "inertia", (3,), (3, 3))
+    checked_array = checked_numbers(inertia, "inertia", (3,), (3, 3))
     if is_traced(inertia):
         if checked_array.ndim == 2:
             require_condition(

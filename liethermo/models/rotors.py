@@ -15,7 +15,7 @@ from ..dissipation.base import Dissipation
 from ..dissipation.checks import checked_rate
 from ..dissipation.factor import Factor
 from ..errors import InputError
-from ..functions.conditions import check_numbers, require_condition
+from ..functions.conditions import checked_numbers, require_condition
 from ..functions.energy import Quadratic
 from ..functions.indices import Indices
 from ..systems import HeatBaths, LiePoissonSystem
@@ -257,7 +257,7 @@ def _rotor_system(inertia, axis, rotor, make_dissipation, baths, attitude) -> Li
     """Return the system ``H = (L - p a) . B (L - p a) / 2 + p**2 / (2 J)``, ``B = (I - J a a^T)^-1``, on so(3) + R."""
     inverse, J = inverse_inertia(checked_inertia(inertia)), checked_positive(rotor, "the moment of the rotor")
     inverse = jnp.diag(inverse) if inverse.ndim == 1 else inverse
-    check_numbers(axis, "axis")
+    checked_numbers(axis, "axis")
     direction = np.asarray(axis, dtype=float)
     if direction.shape != (3,) or not np.isfinite(direction).all() or not direction.any():
         raise InputError(f"axis must be a direction in body axes, three numbers that are not all zero, got {axis!r}")

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..dissipation.landau_lifshitz import LandauLifshitz
 from ..errors import InputError
-from ..functions.conditions import check_numbers
+from ..functions.conditions import checked_numbers
 from ..functions.energy import Energy, Sum
 from ..functions.magnetism import anisotropy, dzyaloshinskii_moriya, exchange, lattice_shape, zeeman
 from ..systems import HeatBaths, SpinSystem
@@ -108,4 +108,4 @@ def spin_wave_frequency(wave_number, exchange_constant: float = 1.0, anisotropy_
 
 
 def _third_axis_vector(field):
-    return jnp.stack([jnp.zeros(()), jnp.zeros(()), check_numbers(field, "the field", ())])
+    return jnp.stack([jnp.zeros(()), jnp.zeros(()), checked_numbers(field, "the field", ())])

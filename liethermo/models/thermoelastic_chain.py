@@ -9,7 +9,7 @@ import numpy as np
 from manifolds._pytree_module import Module
 
 from ..errors import InputError
-from ..functions.conditions import check_numbers
+from ..functions.conditions import checked_numbers
 from ..functions.each import Each
 from ..functions.energy import Energy, Function, Quadratic
 from ..functions.mechanics import Kinetic
@@ -92,14 +92,14 @@ def thermoelastic_chain(
         raise InputError(f"dimension must be 1, 2 or 3, got {n}")
     spring = Thermospring(
         checked_positive(stiffness, "stiffness"),
-        check_numbers(expansion, "expansion", ()),
+        checked_numbers(expansion, "expansion", ()),
         checked_positive(capacity, "capacity"),
         checked_positive(length, "length"),
         checked_positive(temperature, "temperature"),
     )
     m = checked_positive(mass, "mass")
     body: Energy = Kinetic(jnp.full(n, 1.0 / m))
-    g, has_gravity = check_numbers(gravity, "gravity", ()), not (isinstance(gravity, float | int) and gravity == 0.0)
+    g, has_gravity = checked_numbers(gravity, "gravity", ()), not (isinstance(gravity, float | int) and gravity == 0.0)
     if has_gravity:
         body = body + Quadratic(jnp.zeros(2 * n + 1), jnp.zeros(2 * n + 1).at[n - 1].set(m * g))
     state_size = 2 * n + 1

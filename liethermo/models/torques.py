@@ -19,7 +19,7 @@ from manifolds._names import public_dir
 from manifolds._pytree_module import Module
 
 from ..errors import InputError
-from ..functions.conditions import check_numbers, require_condition
+from ..functions.conditions import checked_numbers, require_condition
 from .inertia import checked_tensors
 from .parameters import checked_finite, checked_positive
 
@@ -89,7 +89,7 @@ class GravityGradient(Module):
     normal: jax.Array
 
     def __init__(self, inertia, mean_motion, towards=(1.0, 0.0, 0.0), normal=(0.0, 0.0, 1.0)):
-        self.inertia = check_numbers(inertia, "inertia", (3,), (3, 3))
+        self.inertia = checked_numbers(inertia, "inertia", (3,), (3, 3))
         if self.inertia.ndim == 2 and not is_traced(inertia):
             self.inertia = jnp.asarray(checked_tensors(self.inertia))
         self.mean_motion = checked_positive(mean_motion, "mean_motion")

@@ -13,7 +13,7 @@ from manifolds._arrays import is_traced
 
 from ..errors import InputError
 from ..functions.checks import trace_energies
-from ..functions.time_span import limit_times
+from ..functions.time_span import set_time_span
 from ..integrators import OneStepMethod, WithAttitude
 from ..integrators.base import pullback_method
 from ..integrators.fluctuating import noise_dimension
@@ -170,16 +170,16 @@ def limit_to_span(system: System, start: float, end: float) -> System:
     if not is_driven_run(system):
         return system
     if is_traced(system):
-        return limit_times(system, start, end)
+        return set_time_span(system, start, end)
     # the value holds the system, so that its id stays its own
-    return _limited_systems.get_or_compute((id(system), start, end), lambda: (system, limit_times(system, start, end)))[
-        1
-    ]
+    return _limited_systems.get_or_compute(
+        (id(system), start, end), lambda: (system, set_time_span(system, start, end))
+    )[1]
 
 
 def limit_family_to_span(family: Family, system: System, start: float, end: float) -> Family:
     """Return the family with each member limited to a span; ``system`` is one of the members."""
-    return family.map_members_with_numbers(limit_times, start, end) if is_driven_run(system) else family
+    return family.map_members_with_numbers(set_time_span, start, end) if is_driven_run(system) else family
 
 
 def is_driven_run(system: System) -> bool:

@@ -17,10 +17,10 @@ from manifolds._arrays import is_traced, real_array
 from manifolds._precision import with_library_settings
 from manifolds.structures.poisson import ProductPoisson
 
-from ..dissipation.base import Dissipation, sum_dissipations, terms_with_preserved
+from ..dissipation.base import Dissipation, sum_dissipations, terms_with_preserved_values
 from ..dissipation.heating import couple_to_baths
 from ..errors import AxiomError, CasimirError, InputError
-from ..functions.checks import check_energy, mark_polynomial_degrees, trace_energies
+from ..functions.checks import checked_energy, trace_energies, with_polynomial_degrees
 from ..functions.energy import Energy, function_name, make_energy
 from ..functions.on_spaces import energy_of_vectors, flatten_site_functions
 from ..functions.with_baths import BodyBathsEnergy
@@ -100,22 +100,24 @@ class System(SystemInterface):
             raise InputError(f"baths are lt.HeatBaths(...), not {type(baths).__name__}")
         self.dim, self.space = dim, space
         self.poisson = trace_callables(poisson, lambda poisson, x: poisson.sharp(x, x), (dim,))
-        self.energy = check_energy(
+        self.energy = checked_energy(
             self.energy_of_vectors(make_energy(energy, "the energy")), dim, "the energy", allow_time=True
         )
         self.entropy = None
         if entropy is not None:
-            self.entropy = check_energy(self.energy_of_vectors(make_energy(entropy, "the entropy")), dim, "the entropy")
+            self.entropy = checked_energy(
+                self.energy_of_vectors(make_energy(entropy, "the entropy")), dim, "the entropy"
+            )
         momentum_maps = name_momentum_maps(momentum_maps)
         roles = {name: f"momentum map {name!r}" for name in momentum_maps}
         self.momentum_maps = {
-            name: check_energy(self.energy_of_vectors(make_energy(J, roles[name])), dim, roles[name])
+            name: checked_energy(self.energy_of_vectors(make_energy(J, roles[name])), dim, roles[name])
             for name, J in momentum_maps.items()
         }
         if space is None:  # in a chart no function is quadratic
-            self.energy = mark_polynomial_degrees(self.energy, dim)
-            self.entropy = None if self.entropy is None else mark_polynomial_degrees(self.entropy, dim)
-            self.momentum_maps = {name: mark_polynomial_degrees(J, dim) for name, J in self.momentum_maps.items()}
+            self.energy = with_polynomial_degrees(self.energy, dim)
+            self.entropy = None if self.entropy is None else with_polynomial_degrees(self.entropy, dim)
+            self.momentum_maps = {name: with_polynomial_degrees(J, dim) for name, J in self.momentum_maps.items()}
         dissipation = sum_dissipations(dissipation)
         bath_terms: tuple[Dissipation, ...] = ()
         if dissipation is not None and self.entropy is None:
@@ -266,7 +268,7 @@ class System(SystemInterface):
 
     def _dissipation_velocities(self, x, dH, dS, dL) -> list[jax.Array | None]:
         """Return the velocity of each dissipation; None for a dissipation that acts as a torque."""
-        terms = () if self.dissipation is None else terms_with_preserved(self.dissipation, dL)
+        terms = () if self.dissipation is None else terms_with_preserved_values(self.dissipation, dL)
         return [term.velocity(self, x, dH, dS, term_dL) for term, term_dL in terms]
 
     # -- time -------------------------------------------------------------------------------------------------------

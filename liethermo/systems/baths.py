@@ -17,7 +17,7 @@ from manifolds.structures.poisson import ProductPoisson
 
 from ..errors import InputError
 from ..functions.bath_energy import BathEnergy, ReservoirEnergy, make_bath_energy
-from ..functions.conditions import check_numbers
+from ..functions.conditions import checked_numbers
 from ..functions.each import Each
 from ..functions.energy import Energy
 
@@ -96,7 +96,7 @@ def _check_positive(value, what: str, number: int, infinite: bool) -> jax.Array:
     # numbers stay numbers while JAX traces a family of systems
     evaluation = contextlib.nullcontext() if is_traced(value) else jax.ensure_compile_time_eval()
     with evaluation:
-        array = check_numbers(value, f"the {what} of baths")
+        array = checked_numbers(value, f"the {what} of baths")
         array = jnp.broadcast_to(array, (number,)) if array.ndim == 0 else array
     if array.shape != (number,):
         raise InputError(f"the {what} of {number} baths is one number, or has shape ({number},), not {array.shape}")

@@ -18,7 +18,7 @@ from manifolds._pytree_module import Module
 from ..dissipation.base import LawName
 from ..errors import InputError
 from ..functions.arguments import LastArgumentIgnored, required_argument_count
-from ..functions.checks import check_function_shape
+from ..functions.checks import traced_function_and_shape
 from ..tracing.interpret import evaluate_at_points
 from .herglotz import random_states
 from .ledger import ForcesAndHeat
@@ -124,7 +124,7 @@ class SemibasicForm(Module):
         function = eta if is_implicit else LastArgumentIgnored(eta)
         function = function if len(shape) == 1 else FlattenedFunction(function, shape)
         arguments = f"(q, v, S), q and v of shape {shape}"
-        function, result_shape = check_function_shape(
+        function, result_shape = traced_function_and_shape(
             function, ((n,), (n,), (), ()), ((n + 1,), (n,)), "eta", arguments
         )
         return cls(function if result_shape == (n + 1,) else _UnitEntropyForm(function), is_implicit)

@@ -16,7 +16,7 @@ from manifolds.structures.poisson import PoissonBySharp, ProductPoisson
 
 from ..dissipation.base import LawName, LiftedDissipation, LiftedGeometry, SkewFriction
 from ..errors import InputError
-from ..functions.checks import mark_polynomial_degrees
+from ..functions.checks import with_polynomial_degrees
 from ..functions.coordinates import ComponentMap
 from ..functions.energy import ChartEnergy, Energy, Linear, Pullback, Quadratic, StateTimeEnergy, Sum
 from ..functions.time_span import TimeSpan
@@ -68,7 +68,7 @@ class DrivenSystem(System):
             raise InputError(f"an energy that depends on time is for real spaces, and {body.space.name} is complex")
         self.poisson = ProductPoisson(body.poisson, _ClockPoisson(unit))
         energy = Sum((*map(self._extend_term, body.energy.terms), _NegativeWork(unit)))
-        self.energy = energy if self.space is not None else mark_polynomial_degrees(energy, self.dim)
+        self.energy = energy if self.space is not None else with_polynomial_degrees(energy, self.dim)
         self.entropy = None if body.entropy is None else self._extend_from_body(body.entropy)
         self.momentum_maps = {name: self._extend_from_body(J) for name, J in body.momentum_maps.items()}
         self.dissipation = _BodyDissipation.lift_terms(body.dissipation, self._extend_from_body)

@@ -20,7 +20,7 @@ from manifolds._pytree_module import forward_to
 from manifolds.structures.poisson import PoissonBySharp
 
 from ..dissipation.base import LiftedDissipation, LiftedGeometry
-from ..functions.checks import mark_polynomial_degrees
+from ..functions.checks import with_polynomial_degrees
 from ..functions.energy import Energy
 from ..functions.surface import ConstraintSurface
 from ..tracing.interpret import evaluate_at_points
@@ -53,8 +53,8 @@ class EmbeddedSystem(System):
     def __init__(self, manifold: System, is_tangent: bool = False, is_projection_trivial: bool = False):
         self.manifold, self.is_tangent, self.is_projection_trivial = manifold, is_tangent, is_projection_trivial
         self.dim, self.space, self.baths = manifold.dim, None, manifold.baths
-        self.energy = mark_polynomial_degrees(manifold.energy, self.dim)
-        self.entropy = None if manifold.entropy is None else mark_polynomial_degrees(manifold.entropy, self.dim)
+        self.energy = with_polynomial_degrees(manifold.energy, self.dim)
+        self.entropy = None if manifold.entropy is None else with_polynomial_degrees(manifold.entropy, self.dim)
         needs_no_projection = is_tangent or isinstance(manifold.poisson, mf.NoPoisson)
         self.poisson = manifold.poisson if needs_no_projection else _TangentPoisson(manifold)
         self.dissipation = _TangentDissipation.lift_terms(
@@ -64,7 +64,7 @@ class EmbeddedSystem(System):
         self.preserved_labels, self.invariant_verdicts = manifold.preserved_labels, manifold.invariant_verdicts
 
     def _mark_polynomial_degrees(self, energy: Energy) -> Energy:
-        return mark_polynomial_degrees(energy, self.dim)
+        return with_polynomial_degrees(energy, self.dim)
 
     kind = forward_to("manifold")
 
@@ -164,7 +164,7 @@ class _TangentDissipation(LiftedDissipation):
 @subprogram
 def _tangent_force(force: _TangentDissipation, x, dH, dS, dL) -> jax.Array:
     geometry = force.lifted_geometry(force.manifold, x)
-    velocity = force.inner.force(geometry.system, geometry.x, *geometry.lift_gradients(dH, dS, dL))
+    velocity = force.inner.force(geometry.system, geometry.x, *geometry.inner_gradients(dH, dS, dL))
     return velocity if force.is_projection_trivial else geometry.lower(velocity)
 
 

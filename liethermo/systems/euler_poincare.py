@@ -17,7 +17,7 @@ from manifolds.matrices.linear import solve
 from ..dissipation.base import Dissipation, sum_dissipations
 from ..dissipation.force import EulerPoincareForce
 from ..errors import InputError
-from ..functions.checks import check_energy
+from ..functions.checks import checked_energy
 from ..functions.energy import Energy, Quadratic, TimeDependent, make_energy
 from .lie_poisson import LiePoissonSystem
 
@@ -87,7 +87,7 @@ class EulerPoincareSystem(LiePoissonSystem):
         reconstruction: str | None = None,
     ):
         energy = make_energy(lagrangian, "the Lagrangian")
-        self.lagrangian = check_energy(energy, algebra.dim, "the Lagrangian", allow_time=True)
+        self.lagrangian = checked_energy(energy, algebra.dim, "the Lagrangian", allow_time=True)
         if force is not None:
             force_term = EulerPoincareForce(force)
             dissipation = sum_dissipations(dissipation)

@@ -16,7 +16,7 @@ from manifolds.matrices.linear import solve
 from manifolds.structures.poisson import PoissonBySharp, ProductPoisson
 
 from ..errors import InputError
-from ..functions.checks import check_energy, mark_polynomial_degrees
+from ..functions.checks import checked_energy, with_polynomial_degrees
 from ..functions.energy import Energy, Function, make_energy
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.traced import trace_callables
@@ -83,7 +83,7 @@ class EulerPoincareClosedSystem(LedgerSystem):
         if not isinstance(algebra, mf.LieAlgebra):
             raise InputError(f"the algebra is a manifolds.LieAlgebra, such as mf.so(3), not {type(algebra).__name__}")
         n, at = algebra.dim, "(xi, S)"
-        check_energy(make_energy(lambda x: lagrangian(x[:n], x[n]), "the Lagrangian"), n + 1, "the Lagrangian")
+        checked_energy(make_energy(lambda x: lagrangian(x[:n], x[n]), "the Lagrangian"), n + 1, "the Lagrangian")
         lagrangian = trace_callables(lagrangian, lambda lagrangian, *a: lagrangian(*a), (n,), ())
         self.algebra, self.lagrangian = algebra, lagrangian
         if friction is None or callable(friction):
@@ -99,7 +99,7 @@ class EulerPoincareClosedSystem(LedgerSystem):
             None if heat_power is None else check_state_function(heat_power, ((n,), ()), (), "the heat power", at)
         )
         casimirs = {
-            name: mark_polynomial_degrees(Function(MomentumFunction(make_energy(C, "a Casimir"), lagrangian)), n + 1)
+            name: with_polynomial_degrees(Function(MomentumFunction(make_energy(C, "a Casimir"), lagrangian)), n + 1)
             for name, C in algebra.leading_casimirs()
         }
         self.momentum_casimirs = {name: C.on(range(n + 1)) if self.has_ledger else C for name, C in casimirs.items()}
@@ -110,7 +110,7 @@ class EulerPoincareClosedSystem(LedgerSystem):
                 raise InputError("the Lagrangian is singular: its Hessian in xi has no inverse")
         terms = (self.friction, self.external, self.heat_power)
         forces = None if terms == (None, None, None) else ForcesAndHeat(*terms)
-        energy = mark_polynomial_degrees(ReducedEnergy(lagrangian), n + 1)
+        energy = with_polynomial_degrees(ReducedEnergy(lagrangian), n + 1)
         poisson, total_dim, energy = self._append_ledger(structure, n + 1, energy)
         self._build(poisson, total_dim, energy, entropy_component(total_dim, n), forces, momentum_maps, validate)
 

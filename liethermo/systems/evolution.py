@@ -15,7 +15,7 @@ from manifolds._pytree_module import Module
 from ..dissipation.base import LawName, SkewFriction
 from ..errors import InputError
 from ..functions.arguments import required_argument_count
-from ..functions.checks import check_energy, mark_polynomial_degrees
+from ..functions.checks import checked_energy, with_polynomial_degrees
 from ..functions.energy import Energy, Quadratic, make_energy
 from ..functions.mechanics import is_mechanical
 from .base import System
@@ -131,8 +131,8 @@ class EvolutionSystem(ContactManifoldSystem):
     ):
         dim = state_dim(dim, space)
         energy = make_energy(join_arguments(energy, space), "the energy")
-        energy = check_energy(energy, dim, "the energy", allow_time=True)
-        friction = LiouvilleFriction(is_mechanical(mark_polynomial_degrees(energy, dim), dim, space))
+        energy = checked_energy(energy, dim, "the energy", allow_time=True)
+        friction = LiouvilleFriction(is_mechanical(with_polynomial_degrees(energy, dim), dim, space))
         entropy, states = entropy_component(dim), state_space(space)
         self._build(canonical_structure(dim, space), dim, energy, entropy, friction, momentum_maps, validate, states)
 

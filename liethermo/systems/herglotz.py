@@ -17,7 +17,7 @@ from manifolds.matrices.linear import inverse
 
 from ..dissipation.base import Dissipation
 from ..errors import InputError
-from ..functions.checks import check_energy, mark_polynomial_degrees
+from ..functions.checks import checked_energy, with_polynomial_degrees
 from ..functions.energy import Energy, Quadratic, make_energy
 from ..functions.mechanics import Kinetic, is_independent_of_momenta, is_mechanical
 from ..tracing.interpret import evaluate_at_points
@@ -61,7 +61,7 @@ class VelocityContactSystem(ContactManifoldSystem):
             raise InputError("the dimension of the state (q, v, S) is not known: give dim=2n+1 beside the Lagrangian")
         dim = state_dim(dim, space)
         n = n_degrees_of_freedom(dim)
-        self.lagrangian = L = mark_polynomial_degrees(check_energy(L, dim, "the Lagrangian"), dim)
+        self.lagrangian = L = with_polynomial_degrees(checked_energy(L, dim, "the Lagrangian"), dim)
         contact = mf.LagrangianContact(_EnergyValue(L), n, tangent_bundle_of(space))
         _require_regular(contact)
         return mf.Cosymplectic(contact), dim, _lagrangian_energy(L, dim)

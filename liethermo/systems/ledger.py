@@ -18,8 +18,8 @@ from ..dissipation.base import LawName, SkewFriction
 from ..dissipation.checks import checked_semidefinite
 from ..errors import InputError
 from ..functions.arguments import ConstantFunction, LastArgumentIgnored, required_argument_count
-from ..functions.checks import check_function_shape
-from ..functions.conditions import check_numbers, require_condition
+from ..functions.checks import traced_function_and_shape
+from ..functions.conditions import checked_numbers, require_condition
 from ..functions.energy import Energy, Quadratic
 from .base import System
 
@@ -145,7 +145,7 @@ def linear_friction(coefficient, n: int, what: str) -> LinearFriction:
     InputError
         If R has another shape, or the force would inject energy.
     """
-    R = check_numbers(coefficient, what)
+    R = checked_numbers(coefficient, what)
     R = jnp.full(n, R) if R.ndim == 0 else R
     if R.shape not in ((n,), (n, n)):
         raise InputError(f"{what} has shape (), ({n},) or ({n}, {n}), not {R.shape}")
@@ -180,5 +180,5 @@ def check_state_function(
     if callable(function):
         function = add_time_argument(function, len(parts))
     else:
-        function = ConstantFunction(check_numbers(function, what))
-    return check_function_shape(function, (*parts, ()), [shape], what, at)[0]
+        function = ConstantFunction(checked_numbers(function, what))
+    return traced_function_and_shape(function, (*parts, ()), [shape], what, at)[0]

@@ -17,7 +17,7 @@ from manifolds._arrays import is_traced
 
 from ..dissipation.base import Dissipation
 from ..errors import InputError
-from ..functions.checks import check_energy, mark_polynomial_degrees
+from ..functions.checks import checked_energy, with_polynomial_degrees
 from ..functions.energy import Energy, make_energy
 from ..tracing.caching import memoize
 from ..tracing.interpret import evaluate_at_points
@@ -327,8 +327,8 @@ def _leading_casimirs(algebra: mf.LieAlgebra, names: tuple[str, ...] | None) -> 
     casimirs: dict[str, Energy] = {}
     with jax.ensure_compile_time_eval():  # the cache outlives any trace
         for name, casimir in algebra.leading_casimirs():
-            function = check_energy(make_energy(casimir, "a Casimir"), algebra.dim, "a Casimir")
-            casimirs[name] = mark_polynomial_degrees(function, algebra.dim)
+            function = checked_energy(make_energy(casimir, "a Casimir"), algebra.dim, "a Casimir")
+            casimirs[name] = with_polynomial_degrees(function, algebra.dim)
     return casimirs
 
 

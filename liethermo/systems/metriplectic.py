@@ -11,7 +11,7 @@ import manifolds as mf
 
 from ..dissipation.base import Dissipation
 from ..errors import InputError
-from ..functions.checks import check_function_shape
+from ..functions.checks import traced_function_and_shape
 from .base import System
 from .baths import HeatBaths
 from .chart import ChartSystem
@@ -104,12 +104,12 @@ class MetriplecticSystem(System):
             raise InputError(f"dim is {dim}, but the Poisson structure has {poisson.dim} coordinates")
         dim = poisson.dim
         if dim <= MAX_MATRIX_DIM:
-            check_function_shape(
+            traced_function_and_shape(
                 poisson.tensor, [(dim,)], [(dim, dim)], "the Poisson tensor", f"a state of shape ({dim},)"
             )
         else:
             at = f"a state and a covector of shape ({dim},)"
-            check_function_shape(poisson.sharp, [(dim,), (dim,)], [(dim,)], "Pi(x) of a covector", at)
+            traced_function_and_shape(poisson.sharp, [(dim,), (dim,)], [(dim,)], "Pi(x) of a covector", at)
         self._build(poisson, poisson.dim, energy, entropy, dissipation, momentum_maps, validate, space, baths)
 
     def local_system(self, x, is_centred: bool = False) -> tuple[System, jax.Array]:

@@ -21,8 +21,8 @@ from ..dissipation.quantum import (
     SteepestEntropyAscent,
     ThermalJumps,
     checked_hermitian,
-    checked_matrix,
-    energy_rounding,
+    checked_square_matrix,
+    level_gap_rounding,
 )
 from ..errors import InputError
 from ..functions.bath_energy import BathEnergy, ReservoirEnergy
@@ -321,7 +321,9 @@ class QuantumSystem(System):
         complement = np.eye(len(rho)) - kernel @ adjoint(kernel)
         p = np.linalg.eigvalsh(rho)
         smallest = p[p > self._zero_eigenvalue_limit].min()
-        return any(np.abs(complement @ H @ kernel).max() > energy_rounding(H) / smallest for H in self.hamiltonians())
+        return any(
+            np.abs(complement @ H @ kernel).max() > level_gap_rounding(H) / smallest for H in self.hamiltonians()
+        )
 
     def _equilibrium_population(self, x: np.ndarray, kernel: np.ndarray) -> float:
         """Estimate the largest population of a state in a kernel, shape (N, r), at the end of steepest ascent.
@@ -470,7 +472,7 @@ def _hamiltonian_energy(hamiltonian) -> tuple[int, Energy]:
     if isinstance(hamiltonian, jax.core.Tracer):
         structure = mf.DensityMatrices(hamiltonian.shape[-1])
         return structure.size, MeanEnergy(structure.vector(hamiltonian), jnp.min(jnp.diag(hamiltonian).real))
-    H = checked_hermitian(checked_matrix(hamiltonian, "the Hamiltonian"), "the Hamiltonian")
+    H = checked_hermitian(checked_square_matrix(hamiltonian, "the Hamiltonian"), "the Hamiltonian")
     with jax.ensure_compile_time_eval():  # numbers, while a family of systems is traced
         b = jnp.asarray(mf.DensityMatrices(len(H)).vector(H))
         reference = jnp.asarray(choose_reference_level(np.diag(H).real))

@@ -22,7 +22,7 @@ from ..errors import InputError
 from ..functions.energy import Energy
 from ..functions.magnetism import lattice_shape
 from ..functions.on_spaces import flatten_site_functions
-from ..functions.planes import interaction_range, planar_energy, to_planes, to_sites
+from ..functions.planes import energy_in_component_order, interaction_range, to_component_order, to_site_order
 from ..functions.spheres import HalfSumOfSquares, Spheres
 from .base import ReorderedSystem, System
 from .baths import HeatBaths, poisson_with_baths
@@ -86,10 +86,10 @@ class SpinSystem(System):
         if damping is None or spins is None:
             return super().field(x, dH, dS, dL)
         if heating is None:
-            force, _ = damping.damping_force(spins, x, dH)
+            force, _ = damping.damping_force_and_energy_loss(spins, x, dH)
             entropy_rates = jnp.zeros(0)
         else:  # the entropy is that of the baths
-            force, lost_power = damping.damping_force(
+            force, lost_power = damping.damping_force_and_energy_loss(
                 spins, x, dH, heating.temperature_signs(dH[n:]), heating.has_site_baths
             )
             entropy_rates = heating.entropy_rates(lost_power, dH[n:])
@@ -156,7 +156,9 @@ class SpinSystem(System):
         count = spins.count
         planar = mf.Spins(spins.sites, 0, spins.ratio, interaction_range(self.energy, spins.sites))
         poisson = planar if self.baths is None else poisson_with_baths(planar, self.baths.number)
-        maps = (functools.partial(f, count=count) for f in (to_planes, to_sites, planar_energy))
+        maps = (
+            functools.partial(f, count=count) for f in (to_component_order, to_site_order, energy_in_component_order)
+        )
         reorder, restore, pullback = maps
         functions = [pullback(f) for f in (self.energy, *self.momentum_maps.values())]
         system = eqx.tree_at(lambda s: [s.poisson, s.energy, *s.momentum_maps.values()], self, [poisson, *functions])

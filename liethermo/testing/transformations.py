@@ -99,7 +99,7 @@ class _TransformedDissipation(LiftedDissipation):
 
     def velocity(self, system, x, dH, dS, dL):
         original, (_, energy, entropy) = self.lifted_geometry(system, x), self.units
-        gradients = original.lift_gradients(dH / energy, None if dS is None else dS / entropy, dL)
+        gradients = original.inner_gradients(dH / energy, None if dS is None else dS / entropy, dL)
         velocity = self.inner.velocity(original.system, original.x, *gradients)
         return None if velocity is None else energy * (self.inverse.T @ velocity)
 

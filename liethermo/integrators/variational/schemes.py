@@ -14,7 +14,7 @@ import numpy as np
 import manifolds as mf
 
 from ...errors import InputError
-from ...functions.conditions import check_numbers
+from ...functions.conditions import checked_numbers
 from ...systems import ComposedSystem, EmbeddedSystem, SimpleClosedSystem, System
 from ...tracing.programs import jit_program
 from ..base import (
@@ -253,14 +253,14 @@ class VariationalIntegrator(OneStepMethod):
         space = system.configurations
         if space is not None:
             q0, q1 = (space.to_vector(space.point(q)) for q in (q0, q1))
-        q0, q1 = jnp.atleast_1d(check_numbers(q0, "q0")), jnp.atleast_1d(check_numbers(q1, "q1"))
+        q0, q1 = jnp.atleast_1d(checked_numbers(q0, "q0")), jnp.atleast_1d(checked_numbers(q1, "q1"))
         if not q0.shape == q1.shape == (system.degrees_of_freedom,):
             raise InputError(f"q0 and q1 must have shape ({system.degrees_of_freedom},), got {q0.shape} and {q1.shape}")
         discrete, S0 = (
-            self.discrete_system(system, checked_step_size(h), check_numbers(t, "t", ())),
-            check_numbers(S0, "S0", ()),
+            self.discrete_system(system, checked_step_size(h), checked_numbers(t, "t", ())),
+            checked_numbers(S0, "S0", ()),
         )
-        S1_used = discrete.solve_constraint(q0, q1, S0) if S1 is None else check_numbers(S1, "S1", ())
+        S1_used = discrete.solve_constraint(q0, q1, S0) if S1 is None else checked_numbers(S1, "S1", ())
         residual, scale = (float(a) for a in _constraint_residual(discrete, q0, q1, S0, S1_used))
         if not residual <= CONSTRAINT_TOLERANCE * scale:
             raise InputError(

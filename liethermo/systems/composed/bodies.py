@@ -13,8 +13,8 @@ from manifolds._pytree_module import Module
 
 from ...dissipation.checks import checked_semidefinite
 from ...errors import InputError
-from ...functions.checks import check_energy, check_function_shape, mark_polynomial_degrees
-from ...functions.conditions import check_numbers, require_condition
+from ...functions.checks import checked_energy, traced_function_and_shape, with_polynomial_degrees
+from ...functions.conditions import checked_numbers, require_condition
 from ...functions.each import Each
 from ...functions.energy import Energy, Quadratic, make_energy
 
@@ -56,7 +56,9 @@ class Subsystem(Module):
             )
         self.dim, self.name = dim, name
         energy = Quadratic(jnp.zeros(dim)) if energy is None else make_energy(energy, "the energy of a subsystem")
-        self.energy = mark_polynomial_degrees(check_energy(energy, dim, f"the energy of {name or 'a subsystem'}"), dim)
+        self.energy = with_polynomial_degrees(
+            checked_energy(energy, dim, f"the energy of {name or 'a subsystem'}"), dim
+        )
         self.friction = _check_friction(friction, dim - species, name or "a subsystem")
 
     @property
@@ -109,7 +111,7 @@ class Copies(Module):
         self.count, self.dim, self.name = count, dim, name
         self.energy = Quadratic(jnp.zeros(dim)) if energy is None else energy
         given = parameters if isinstance(parameters, tuple) else (parameters,)
-        self.parameters = tuple(check_numbers(a, f"the parameters of {name or 'the bodies'}") for a in given)
+        self.parameters = tuple(checked_numbers(a, f"the parameters of {name or 'the bodies'}") for a in given)
         self.energy_in_state(0)  # checked there
         self.friction = _check_copies_friction(friction, count, dim, name or "the bodies")
 
@@ -168,8 +170,8 @@ def _check_friction(friction, dim: int, name: str):
         return friction
     if callable(friction):
         shapes, at = ((), (n,), (n, n)), f"a state of shape ({dim},)"
-        return check_function_shape(friction, [(dim,)], shapes, f"friction of {name}", at)[0]
-    R = check_numbers(friction, f"friction of {name}", (), (n,), (n, n))
+        return traced_function_and_shape(friction, [(dim,)], shapes, f"friction of {name}", at)[0]
+    R = checked_numbers(friction, f"friction of {name}", (), (n,), (n, n))
     R = jnp.full(n, R) if R.ndim == 0 else R
     if R.ndim == 2:
         return checked_semidefinite(R, f"the friction of {name}")
@@ -179,7 +181,7 @@ def _check_friction(friction, dim: int, name: str):
 def _check_copies_friction(friction, count: int, dim: int, name: str):
     if friction is None or isinstance(friction, str):
         return _check_friction(friction, dim, name)
-    n, R = dim // 2, check_numbers(friction, f"friction of {name}")
+    n, R = dim // 2, checked_numbers(friction, f"friction of {name}")
     if n == 0 or R.shape not in ((), (n,), (count, n)):
         raise InputError(
             f"friction of {name}, {count} with {n} momenta each, has shape (), ({n},) or ({count}, {n}), not {R.shape}"

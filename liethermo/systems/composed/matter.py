@@ -15,8 +15,8 @@ from manifolds.structures.extended import ParticleIndices
 
 from ...dissipation.matter import Process
 from ...errors import InputError
-from ...functions.checks import check_function_shape
-from ...functions.conditions import check_numbers, require_condition
+from ...functions.checks import traced_function_and_shape
+from ...functions.conditions import checked_numbers, require_condition
 
 
 class Membrane(Module):
@@ -51,7 +51,7 @@ class Membrane(Module):
         if not (isinstance(pair, tuple) and len(pair) == 2 and all(type(kind) is int for kind in pair)):
             raise InputError(f"the species of a membrane are a whole number, or a pair of them, not {species!r}")
         self.species = pair
-        self.carries = check_numbers(carries, "the entropy that a particle carries", ())
+        self.carries = checked_numbers(carries, "the entropy that a particle carries", ())
         require_condition(
             self.carries, lambda s: abs(s) < np.inf, "the entropy that a particle carries is finite, not {value}"
         )
@@ -91,7 +91,7 @@ class Reaction(Module):
 
     def __init__(self, body, stoichiometry: Sequence[float], rate):
         self.body, self.rate = body, _check_coefficient(rate, "the rate of a reaction")
-        numbers = check_numbers(stoichiometry, "the stoichiometry of a reaction")
+        numbers = checked_numbers(stoichiometry, "the stoichiometry of a reaction")
         if numbers.ndim != 1 or not (np.isfinite(numbers).all() and np.any(numbers)):
             raise InputError(f"the stoichiometry of a reaction is a row of finite numbers, not {numbers.tolist()}")
         self.stoichiometry = tuple(numbers.tolist())
@@ -115,7 +115,7 @@ class Reaction(Module):
 def _check_coefficient(coefficient, what: str) -> jax.Array | Callable:
     if callable(coefficient):
         return coefficient
-    value = check_numbers(coefficient, what, ())
+    value = checked_numbers(coefficient, what, ())
     require_condition(value, lambda L: (L >= 0.0) & (np.inf > L), what + " must be >= 0 and finite, not {value}")
     return value
 
@@ -124,7 +124,7 @@ def _check_state_function(coefficient, dim: int, what: str) -> jax.Array | Calla
     """Return a coefficient; a function is checked on states of shape (dim,)."""
     if not callable(coefficient):
         return coefficient
-    return check_function_shape(coefficient, [(dim,)], [()], what, f"a state of shape ({dim},)")[0]
+    return traced_function_and_shape(coefficient, [(dim,)], [()], what, f"a state of shape ({dim},)")[0]
 
 
 def _body_index(body, names: Sequence[str]) -> int:

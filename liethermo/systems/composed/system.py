@@ -18,11 +18,11 @@ from manifolds.structures.extended import StateIndices
 
 from ...dissipation.base import Dissipation
 from ...dissipation.bodies import ContactFriction, Drag, HeatConduction, LinearFriction
-from ...dissipation.matter import MatterExchange, Process, conserved_numbers
+from ...dissipation.matter import MatterExchange, Process, conserved_number_combinations
 from ...errors import InputError
 from ...functions.arguments import ConstantFunction, LastArgumentIgnored, required_argument_count
-from ...functions.checks import check_energy, check_function_shape
-from ...functions.edges import Edges, connected_components, graph_edges
+from ...functions.checks import checked_energy, traced_function_and_shape
+from ...functions.edges import Edges, connected_component_labels, graph_edges
 from ...functions.energy import Energy, Function, Quadratic, TimeDependent
 from ...functions.indices import pattern_of_matrix, sparsity_pattern, union_pattern
 from ...functions.mechanics import is_independent_of, is_mechanical
@@ -116,7 +116,7 @@ class ComposedSystem(System):
             for name in ("degrees_of_freedom", "species")
         )
         structure = mf.ExtendedPhaseSpace(dofs, kinds if any(kinds) else ())
-        energy = check_energy(self._total_energy(structure, coupling), structure.dim, "the energy", allow_time=True)
+        energy = checked_energy(self._total_energy(structure, coupling), structure.dim, "the energy", allow_time=True)
         entropy = entropy_component(structure.dim, structure.state_indices.S)
         dissipation = self._make_dissipation(structure, energy, conductance, drag, connected, conduction)
         exchanges = [*(membranes if isinstance(membranes, list | tuple) else [membranes])]
@@ -336,7 +336,7 @@ def _particle_invariants(structure: mf.ExtendedPhaseSpace, processes: Sequence[P
     """Return the sums of particle numbers that no process changes, by name."""
     N = structure.particle_indices.N
     invariants: dict[str, Energy] = {}
-    for i, weights in enumerate(conserved_numbers(processes, len(N)) if len(N) else ()):
+    for i, weights in enumerate(conserved_number_combinations(processes, len(N)) if len(N) else ()):
         b = np.zeros(structure.dim)
         b[N] = weights
         invariants[f"particles {i + 1}"] = Quadratic(jnp.zeros(structure.dim), b)
@@ -364,7 +364,7 @@ def _conduction_laws(graph: Edges, functions, dim: int, names: tuple[str, ...]) 
     for i, j, k in functions:
         law = k if required_argument_count(k) == 3 else LastArgumentIgnored(k)
         what = f"the conductance between {names[int(i)]} and {names[int(j)]}"
-        law, _ = check_function_shape(law, ((), (), (dim,)), [()], what, "(T_i, T_j), or (T_i, T_j, x)")
+        law, _ = traced_function_and_shape(law, ((), (), (dim,)), [()], what, "(T_i, T_j), or (T_i, T_j, x)")
         laws[min(i, j), max(i, j)] = law if i < j else _SwappedLaw(law)
     edges = zip(graph.first.tolist(), graph.second.tolist(), graph.weight, strict=True)
     return tuple(laws.get((i, j), ConstantFunction(weight)) for i, j, weight in edges)
@@ -380,7 +380,7 @@ class _SwappedLaw(Module):
 
 
 def _require_connected(graph: Edges, names: tuple[str, ...]) -> None:
-    labels = connected_components(graph, len(names))
+    labels = connected_component_labels(graph, len(names))
     if labels.max() > 0:
         examples = [" and ".join(np.array(names)[labels == i][:2]) for i in (0, 1)]
         raise InputError(

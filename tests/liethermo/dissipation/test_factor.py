@@ -7,7 +7,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.dissipation.noise import factor_divergence, terms_with_factors
+from liethermo.dissipation.noise import factor_divergences, terms_with_factors
 from liethermo.models.gas_piston import gas_piston_state
 from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
 from tests.cases import DISSIPATIONS, build, state_of
@@ -47,7 +47,7 @@ def measure_factors(system, x, dH, dS, dL):
     return (
         jnp.linalg.norm(product - force) / scale,
         jnp.max(jnp.abs(kernel)),
-        factor_divergence(system.dissipation, system, x) - traces,
+        factor_divergences(system.dissipation, system, x) - traces,
     )
 
 
@@ -152,4 +152,4 @@ def test_divergences_of_heating_systems(make):
         assert product < 1e-13
     assert np.abs(defect).max() < 1e-12
     if system.baths is not None:
-        assert np.abs(factor_divergence(system.dissipation, system, x)).max() > 1e-3
+        assert np.abs(factor_divergences(system.dissipation, system, x)).max() > 1e-3

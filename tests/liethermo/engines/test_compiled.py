@@ -19,6 +19,7 @@ from liethermo.engines.codes import StatusCode
 from liethermo.engines.compiled import machine_code
 from liethermo.engines.compiled.stepper import CompiledEngine, CompiledStepLoop
 from liethermo.engines.rules import SolverOptions
+from liethermo.runs import problem
 from tests.cases import DISSIPATIONS, build, state_of
 from tests.liethermo import random_systems
 from tests.machine_code import copy_at_offset
@@ -149,6 +150,7 @@ def test_rules_of_large_systems_in_machine_code():
 
 
 def test_what_takes_minutes_to_compile_is_said(monkeypatch):
+    monkeypatch.setattr(problem, "_cached_problem", problem._cached_problem.__wrapped__)  # no engine of another test
     monkeypatch.setattr("liethermo.engines.choice.SLOW_COMPILE_OPERATIONS", 2)
     with pytest.warns(CompiledEngineWarning, match=r"takes minutes to compile\. Leave out engine"):
         lt.integrate(BODY, X0, (0.0, 1.0), 0.1, engine="compiled")
@@ -291,6 +293,7 @@ def test_newtons_method_that_cannot_be_compiled(adaptive):
 
 
 def test_auto_compiles_small_systems_and_long_runs(monkeypatch):
+    monkeypatch.setattr(problem, "_cached_problem", problem._cached_problem.__wrapped__)  # no engine of another test
     chosen_engine = lambda: lt.integrate(BODY, X0, (0.0, 1.0), 0.1).provenance["engine"]  # noqa: E731
     assert chosen_engine() == "compiled"
     monkeypatch.setattr("liethermo.engines.choice.MAX_AUTO_COMPILED_OPERATIONS", 2)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import liethermo as lt
-from liethermo.functions.checks import mark_polynomial_degrees
+from liethermo.functions.checks import with_polynomial_degrees
 from liethermo.functions.energy import make_energy
 from liethermo.functions.gradients import DISCRETE_GRADIENTS, stage_gradients
 from liethermo.integrators.tableaus import gauss_tableau, kronrod_rule
@@ -171,7 +171,7 @@ def test_change_of_a_polynomial_is_computed_without_its_values(degree):
     def change(degree_claim=None, constant=0.0):
         energy = make_energy(lambda x: x[0] ** degree + x[0] * x[1] ** (degree - 1) + constant, "H")
         energy = (
-            mark_polynomial_degrees(energy, 2) if degree_claim is None else lt.Function(energy.function, degree_claim)
+            with_polynomial_degrees(energy, 2) if degree_claim is None else lt.Function(energy.function, degree_claim)
         )
         assert energy.degree == (degree_claim or degree)
         return float(DISCRETE_GRADIENTS["gonzalez"](energy, x, d) @ d)

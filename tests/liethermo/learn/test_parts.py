@@ -70,7 +70,7 @@ def test_the_factor_is_that_of_the_friction():
     x = jnp.array([0.3, -0.2, 0.5])
     columns = system.dissipation.factor_columns(x, system.energy.gradient(x))
     np.testing.assert_allclose(columns @ columns.T, system.friction_matrix(x), atol=1e-14)
-    factor = system.dissipation.continuous_factor(system, x)
+    factor = system.dissipation.factor_at_state(system, x)
     np.testing.assert_allclose(factor.times(jnp.array([1.0, -2.0])), columns @ np.array([1.0, -2.0]), atol=1e-15)
 
 

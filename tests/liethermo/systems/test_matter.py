@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import liethermo as lt
-from liethermo.dissipation.matter import Process, conserved_numbers
+from liethermo.dissipation.matter import Process, conserved_number_combinations
 from liethermo.models.open_gases import porous_piston_state
 
 piston, vessel = functools.cache(lt.models.porous_piston), functools.cache(lt.models.reaction_vessel)
@@ -132,9 +132,9 @@ def test_numbers_that_no_process_changes():
         Process(nu, (1.0,), (0.0,), jnp.zeros(()), jnp.ones(()))
         for nu in ((-2.0, 1.0, 0.0, 0.0), (0.0, -1.0, -1.0, 1.0))
     ]
-    found = conserved_numbers(processes, 4)
+    found = conserved_number_combinations(processes, 4)
     assert np.allclose(found, [[1.0, 2.0, 0.0, 2.0], [0.0, 0.0, 1.0, 1.0]])
-    assert np.allclose(conserved_numbers([], 2), np.eye(2))
+    assert np.allclose(conserved_number_combinations([], 2), np.eye(2))
 
 
 @functools.cache

@@ -13,7 +13,7 @@ from liethermo.engines import array
 from liethermo.engines.rules import DEFAULT_OPTIONS
 from liethermo.engines.stepping import initial_run_state_program, reorder_components, take_step
 from liethermo.functions.gradients import DISCRETE_GRADIENTS, stage_gradients
-from liethermo.functions.planes import to_planes, to_sites
+from liethermo.functions.planes import to_component_order, to_site_order
 from liethermo.integrators.base import pullback_method
 from liethermo.integrators.tableaus import gauss_tableau, kronrod_rule
 from tests.cases import BuiltOnUse
@@ -87,7 +87,9 @@ def evaluate_functions(system, x, d, compensation, k):
     A, b, _ = gauss_tableau(2)
     energy = system.energy
     gradients = [
-        scheme(energy, x, d, compensation) for scheme in DISCRETE_GRADIENTS.values() if scheme.is_order_independent
+        scheme(energy, x, d, compensation)
+        for scheme in DISCRETE_GRADIENTS.values()
+        if scheme.is_coordinate_order_independent
     ]
     stages = stage_gradients(energy, x, compensation, 0.1, k, A, b, kronrod_rule(2))
     vectors = jnp.stack([energy.gradient(x), system.vector_field(x), *gradients, *stages])
@@ -240,8 +242,8 @@ def test_what_has_no_other_order():
 
 def test_the_two_orders():
     x = np.arange(14.0)
-    assert to_planes(x, 4).tolist() == [0, 3, 6, 9, 1, 4, 7, 10, 2, 5, 8, 11, 12, 13]
-    np.testing.assert_array_equal(to_sites(to_planes(np.stack([x, -x]), 4), 4), [x, -x])
+    assert to_component_order(x, 4).tolist() == [0, 3, 6, 9, 1, 4, 7, 10, 2, 5, 8, 11, 12, 13]
+    np.testing.assert_array_equal(to_site_order(to_component_order(np.stack([x, -x]), 4), 4), [x, -x])
 
 
 def test_control_a_wrong_order_is_seen():
