@@ -294,13 +294,13 @@ def _dask_client(address: str | None, folder: Path) -> Iterator[Any]:
     from distributed import Client
 
     from .errors import FileError
-    from .spec.trust import pickle_by_value
+    from .spec.trust import pickling_by_value
 
     try:
         client = Client(address, timeout=20)
     except (OSError, ValueError) as error:
         raise FileError(f"there is no Dask scheduler at {address}: {error}") from error
-    with client, pickle_by_value(folder):
+    with client, pickling_by_value(folder):
         yield client
 
 

@@ -38,7 +38,7 @@ class EulerPoincareForce(Dissipation):
         )
         return dataclasses.replace(self, F=_FlattenedMap(self.F, system.shape)) if system.sites else self
 
-    def added_momentum(self, dH, turned):
+    def added_momentum(self, dH, bracket_dH_dS):
         return self.F(dH)
 
     def force(self, system, x, dH, dS, dL):

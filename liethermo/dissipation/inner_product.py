@@ -75,8 +75,8 @@ class InnerProductDissipation(BracketDissipation):
         require_algebra(system, "InnerProductDissipation", K)
         return self if K is self.K else eqx.tree_at(lambda d: d.K, self, K)
 
-    def added_momentum(self, dH, turned):
-        return self.K @ turned
+    def added_momentum(self, dH, bracket_dH_dS):
+        return self.K @ bracket_dH_dS
 
     def factor(self, system, x, dH, dL):
         return _bracket_factor(system, dH, self.K)
@@ -141,8 +141,8 @@ class KillingDissipation(BracketDissipation):
             )
         return dataclasses.replace(self, form=jnp.asarray(form) if isinstance(form, np.ndarray) else form)
 
-    def added_momentum(self, dH, turned):
-        return self.rate * (self.form @ turned)
+    def added_momentum(self, dH, bracket_dH_dS):
+        return self.rate * (self.form @ bracket_dH_dS)
 
     def factor(self, system, x, dH, dL):
         factor = _bracket_factor(system, dH, self.form)

@@ -15,7 +15,7 @@ from manifolds.matrices.stumpff import hyperbolic_stumpff
 from ..errors import FunctionError, InputError
 from ..functions.arguments import required_argument_count
 from ..functions.conditions import checked_numbers
-from ..tracing.index_check import result_shape
+from ..tracing.index_check import checked_result_shapes
 from .base import Dissipation
 from .checks import state_shape_dtype
 from .factor import Factor
@@ -84,7 +84,7 @@ class DissipationPotential(Dissipation):
 
     def bind_to(self, system):
         bound_potential = eqx.tree_at(lambda d: d.of, self, self.of.bind_to(system))
-        shape = result_shape(
+        shape = checked_result_shapes(
             lambda x: bound_potential.psi_at_state(x)(jnp.zeros(bound_potential._base_factor_at_state(system, x).size)),
             state_shape_dtype(system.dim),
         )

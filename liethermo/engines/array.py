@@ -12,14 +12,14 @@ import numpy as np
 from ..integrators import OneStepMethod
 from ..integrators.fluctuating import set_noise_increments
 from ..systems import System
-from ..tracing.programs import jit_program
+from ..tracing.programs import jit_cached
 from .codes import FAILED_STEP_CODES, StatusCode
 from .rules import DEFAULT_OPTIONS, SolverOptions
 from .stages import keep_fixed_point_result
 from .stepping import SavedStates, State, initial_run_state, initial_run_state_program, reorder_components, take_step
 
 
-@jit_program
+@jit_cached
 def advance(
     system: System,
     method: OneStepMethod,
@@ -198,7 +198,7 @@ STEP_ENDS_PER_CALL = 64
 """Number of single steps in one call of ``ArrayEngine.step_ends``."""
 
 
-@jit_program
+@jit_cached
 def _step_ends_program(system: System, method: OneStepMethod, x, h, options: SolverOptions):
     def end_of_step(inputs):
         x_start, step_size = inputs

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..systems import System
-from ..tracing.programs import jit_program
+from ..tracing.programs import jit_cached
 
 DENSE_JACOBIAN_DIM = 8
 """Largest dimension for which the whole Jacobian matrix of the vector field is computed after every step."""
@@ -38,7 +38,7 @@ def jacobian_probe(system: System, x) -> jax.Array:
     return jax.lax.scan(power_step, _unit_vector(_generic_vector(n)), length=POWER_ITERATIONS)[1]
 
 
-@jit_program
+@jit_cached
 def arnoldi_hessenberg(system, method, x):
     """Return the Hessenberg matrix of Arnoldi's method, shape (m, m), for the Jacobian of the vector field at x.
 

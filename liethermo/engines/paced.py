@@ -13,7 +13,7 @@ from ..functions.rounding import propagated_rounding_scale
 from ..integrators import OneStepMethod
 from ..systems import System
 from ..tracing.interpret import evaluate_at_points
-from ..tracing.programs import jit_program
+from ..tracing.programs import jit_cached
 from . import searching
 from .array import LazyNewton
 from .codes import StatusCode
@@ -157,7 +157,7 @@ def start_batch(
     )
 
 
-@jit_program
+@jit_cached
 def _start_batch_program(structure, parameters, axes, method, control, x, t, stop_time, span_length):
     def start_member(p, x):
         return initial_adaptive_state(structure.rebuild(p), method, control, x, t, stop_time, span_length)
@@ -165,7 +165,7 @@ def _start_batch_program(structure, parameters, axes, method, control, x, t, sto
     return jax.vmap(start_member, in_axes=(axes, 0))(parameters, x)
 
 
-@jit_program
+@jit_cached
 def _advance_batch_program(structure, parameters, axes, method, control, adaptive_states, max_attempts, newton: bool):
     def advance_member(p, adaptive_state):
         return advance_adaptive(

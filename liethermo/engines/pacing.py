@@ -22,7 +22,7 @@ from manifolds._pytree_module import Module
 from ..integrators import OneStepMethod
 from ..integrators.base import event_check_fractions
 from ..systems import System
-from ..tracing.programs import jit_program
+from ..tracing.programs import jit_cached
 from . import searching
 from .codes import StatusCode
 from .growth import DENSE_JACOBIAN_DIM, arnoldi_hessenberg, jacobian_probe
@@ -565,14 +565,14 @@ def growth_rate_at(system: System, method: OneStepMethod, x) -> float:
 # -- programs ---------------------------------------------------------------------------------------------------------
 
 
-@jit_program
+@jit_cached
 def initial_adaptive_state_program(
     system: System, method: OneStepMethod, control: StepControl, x, t, stop_time, span_length
 ) -> AdaptiveState:
     return initial_adaptive_state(system, method, control, x, t, stop_time, span_length)
 
 
-@jit_program
+@jit_cached
 def advance_adaptive(
     system: System,
     method: OneStepMethod,
@@ -627,11 +627,11 @@ def advance_adaptive_with(
     return adaptive_state
 
 
-@jit_program
+@jit_cached
 def _next_step_program(control, adaptive_state):
     return next_step(control, adaptive_state)
 
 
-@jit_program
+@jit_cached
 def _accept_or_reject_program(system, method, control, adaptive_state, h, time_after, new_state):
     return accept_or_reject(system, method, control, adaptive_state, h, time_after, new_state)

@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 
 from ..errors import FunctionError, IndexOutOfRangeError, InputError
-from ..tracing.interpret import polynomial_degree
+from ..tracing.interpret import polynomial_degree_bound
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
-from ..tracing.traced import trace_callables_with_result
+from ..tracing.traced import trace_callables_and_result_shapes
 from .energy import Energy, Function, Negative, Pullback, SpanLimitedEnergy, StateTimeEnergy, Sum
 
 
@@ -32,7 +32,7 @@ def with_polynomial_degrees(energy: Energy, dim: int) -> Energy:
         (inner_dim,) = jax.eval_shape(energy.coordinates, jax.ShapeDtypeStruct((dim,), jnp.float64)).shape
         return eqx.tree_at(lambda e: e.term, energy, with_polynomial_degrees(energy.term, inner_dim))
     if isinstance(energy, Function) and energy.degree == math.inf:
-        degree = polynomial_degree(energy_value, energy, dim)
+        degree = polynomial_degree_bound(energy_value, energy, dim)
         return energy if degree == math.inf else Function(energy.function, degree)
     return energy
 
@@ -62,7 +62,7 @@ def checked_energy(energy: Energy, dim: int, role: str, allow_time: bool = False
             "on time"
         )
     try:
-        energy, result = trace_callables_with_result(
+        energy, result = trace_callables_and_result_shapes(
             energy, lambda energy, x, t: energy.at_time(t).value(x), (dim,), ()
         )
     except TRACE_ERRORS as error:
@@ -122,7 +122,7 @@ def traced_function_and_shape(
         Unless the result is real and has one of ``allowed_shapes``.
     """
     try:
-        function, result = trace_callables_with_result(
+        function, result = trace_callables_and_result_shapes(
             function, lambda function, *a: jnp.asarray(function(*a)), *argument_shapes
         )
     except IndexOutOfRangeError as error:

@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 
 from ..errors import FunctionError, InputError
-from ..tracing.interpret import polynomial_degree
+from ..tracing.interpret import polynomial_degree_bound
 from ..tracing.traced import trace_callables
 from .checks import checked_energy, with_polynomial_degrees
 from .conditions import checked_numbers
@@ -71,7 +71,7 @@ class Each(Energy):
         zero_parameters = tuple(jnp.zeros(a.shape[1:]) for a in self.parameters)
         checked_energy(Function(lambda y: phi(y, *zero_parameters)), r, "the function at a place")
         self.phi = trace_callables(phi, lambda phi, *a: phi(*a), (r,), *(a.shape for a in zero_parameters))
-        self.degree = polynomial_degree(_summand_value, (self.phi, zero_parameters), r)
+        self.degree = polynomial_degree_bound(_summand_value, (self.phi, zero_parameters), r)
 
     @property
     def terms(self) -> tuple[Energy, ...]:

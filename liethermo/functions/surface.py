@@ -12,7 +12,7 @@ import numpy as np
 
 import manifolds as mf
 
-from ..tracing.interpret import polynomial_degree
+from ..tracing.interpret import polynomial_degree_bound
 
 EPS = float(np.finfo(np.float64).eps)
 """Spacing of float64 numbers at 1."""
@@ -193,7 +193,7 @@ def _constraint_degree(space: mf.Space) -> float:
     """Return the degree of the constraints as polynomials, or infinity."""
     if _constraint_count(space) == 0:
         return 0
-    return polynomial_degree(_weighted_constraint_sum, space, space.size)
+    return polynomial_degree_bound(_weighted_constraint_sum, space, space.size)
 
 
 def _weighted_constraint_sum(space: mf.Space, x):

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..systems import System
-from ..tracing.programs import jit_program
+from ..tracing.programs import jit_cached
 
 
 @dataclass(frozen=True)
@@ -85,6 +85,6 @@ class Reference:
         return f"Reference(rtol={self.rtol:g}, scheme={self.scheme})"
 
 
-@jit_program
+@jit_cached
 def _vector_field(system: System, x):
     return system.vector_field(x)

@@ -13,7 +13,7 @@ import manifolds as mf
 
 from ..errors import InputError
 from ..systems import System
-from ..tracing.taylor import TaylorSeriesError, check_taylor_series, taylor_coefficients
+from ..tracing.taylor import TaylorSeriesError, check_taylor_series, increment_taylor_coefficients
 from .base import OneStepMethod, register
 from .charts import resolve_retraction
 from .explicit import ExplicitMethod, StepRow, UncorrectedStep
@@ -140,7 +140,7 @@ class MetriplecticTaylor(ExplicitMethod):
     def base_step(self, rates: Callable, skip_law_rates: bool, x, compensation, h) -> UncorrectedStep:
         nodes, b = self._lobatto_rule
         powers = np.arange(1.0, self.order + 1.0)
-        c = taylor_coefficients(
+        c = increment_taylor_coefficients(
             lambda y: rates(y)[0], x, h, self.order
         )  # compensation is left out: in a chart x is its centre, exactly
         points = jnp.concatenate([x[None], x + (compensation + nodes[1:, None] ** powers @ c)])

@@ -16,7 +16,7 @@ from ..errors import FunctionError, IndexOutOfRangeError, InputError
 from ..functions.arguments import required_argument_count
 from ..results.solution import Solution
 from ..systems import AttitudeSystem, System
-from ..tracing.index_check import result_shape
+from ..tracing.index_check import checked_result_shapes
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
 from .compile_options import fast_compile_options
 
@@ -123,7 +123,7 @@ def make_observation(system: System, observed: Sequence[int] | None, observe: Ca
         raise InputError("observe needs an attitude. Give the system a group, such as group=mf.SO(3)")
     parts = [jnp.zeros(system.dim)] if group is None else [jnp.zeros(system.dim), group.identity]
     try:
-        output_shape = result_shape(lambda *parts: jnp.asarray(observe(*parts)), *parts)
+        output_shape = checked_result_shapes(lambda *parts: jnp.asarray(observe(*parts)), *parts)
     except IndexOutOfRangeError as error:
         raise error.with_function(f"observe, at a state of shape ({system.dim},),") from None
     except TRACE_ERRORS as error:

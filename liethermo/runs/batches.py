@@ -23,7 +23,7 @@ from ..engines.pacing import StepControl
 from ..engines.rules import DEFAULT_OPTIONS
 from ..engines.stepping import REPORTED_FIELDS, State, initial_run_state_program
 from ..integrators import OneStepMethod
-from ..tracing.programs import jit_program
+from ..tracing.programs import jit_cached
 from .family import Family
 from .fluctuations import NoisePaths
 from .record import EnsembleRecord
@@ -287,7 +287,7 @@ def replay_array(family: Family, method: OneStepMethod, x: np.ndarray, h: np.nda
     return {name: np.asarray(value) for name, value in state._asdict().items()}, np.concatenate(chunks, axis=1)
 
 
-@jit_program
+@jit_cached
 def begin_vmapped(form, parameters, axes, method, x):
     """Return the engine states of a batch of trajectories at their initial states x."""
     return jax.vmap(lambda p, x: initial_run_state_program(form.rebuild(p), method, x), in_axes=(axes, 0))(
@@ -334,7 +334,7 @@ def advance_batch(
     return state, np.concatenate([x, energy[..., None], entropy[..., None]], axis=-1)
 
 
-@jit_program
+@jit_cached
 def advance_vmapped(
     form, parameters, axes, method, state, h, n_saves, steps_per_save, capacity: int, noise, newton: bool, first_steps
 ):

@@ -27,7 +27,7 @@ from ..engines.stepping import (
 from ..errors import InputError
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..systems import System
-from ..tracing.programs import jit_program, jit_unoptimised
+from ..tracing.programs import jit_cached, jit_unoptimised
 from .adaptive import Adaptive
 from .preparation import checked_initial_state, initial_state, limit_to_span, prepare_for_method
 from .sensitivities import state_derivatives
@@ -115,7 +115,7 @@ def flow(
     is_differentiated = not method.explicit and is_traced(arguments)
     values = _stop_gradients(arguments) if is_differentiated else arguments
     newton = method.explicit or is_traced(values)
-    compile_program = jit_unoptimised if schedule.n_steps * x.size <= MAX_UNOPTIMISED_WORK else jit_program
+    compile_program = jit_unoptimised if schedule.n_steps * x.size <= MAX_UNOPTIMISED_WORK else jit_cached
     path, steps = compile_program(_compute_path)(values, step_sizes, save_counts, newton, is_differentiated, final_only)
     if not newton and not np.isfinite(np.asarray(path)[-1]).all():  # compile Newton's method only if a step needs it
         path, steps = compile_program(_compute_path)(
@@ -130,9 +130,9 @@ def flow(
             derivatives = _saved_path_derivatives(
                 values, leaf_is_traced, order, step_sizes, save_counts, steps, final_only
             )
-            path = jit_program(_attach_derivatives)(path, derivatives, traced_leaves, _stop_gradients(traced_leaves))
+            path = jit_cached(_attach_derivatives)(path, derivatives, traced_leaves, _stop_gradients(traced_leaves))
         else:
-            path = jit_program(_recompute_path)(*arguments, step_sizes, steps, final_only)
+            path = jit_cached(_recompute_path)(*arguments, step_sizes, steps, final_only)
     path = path if path.shape[-1] == n else path[..., :n]
     return user_system.points(path) if user_system.space is None else path
 

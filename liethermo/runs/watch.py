@@ -19,7 +19,7 @@ from ..errors import InputError
 from ..integrators import OneStepMethod
 from ..integrators.base import event_check_fractions
 from ..systems import System
-from ..tracing.programs import jit_program
+from ..tracing.programs import jit_cached
 
 
 class EventSet:
@@ -285,6 +285,6 @@ def _terminal_count(function: Any) -> int | None:
     return int(terminal)
 
 
-@jit_program
+@jit_cached
 def _displaced_states(system: System, method: OneStepMethod, x, v):
     return jax.vmap(lambda v: method.displace(system, x, v))(v)

@@ -27,13 +27,13 @@ MAX_REPORTED_FAULTS = 100
 """Maximum number of faults of a section that are listed; the others are counted."""
 
 
-def validate_table(key: str, schema: type, table, problems: list[str], consumer: str) -> Any:
+def validate_table(key: str, schema: type, table, problems: list[str], reader_name: str) -> Any:
     """Return the table converted to the types of the schema, or None after appending its faults to ``problems``."""
     try:
         return TypeAdapter(schema).validate_json(json.dumps(table), strict=True)
     except ValidationError as error:
         faults = error.errors()
-        problems += [_describe_fault(key, fault, schema, consumer) for fault in faults[:MAX_REPORTED_FAULTS]]
+        problems += [_describe_fault(key, fault, schema, reader_name) for fault in faults[:MAX_REPORTED_FAULTS]]
         problems += [f"{key or 'the file'} has {len(faults) - MAX_REPORTED_FAULTS} faults more"] * (
             len(faults) > MAX_REPORTED_FAULTS
         )
@@ -91,7 +91,7 @@ def validate_arguments(key: str, function: Callable, table: dict, problems: list
     for name, parameter in inspect.signature(function).parameters.items():
         if parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY):
             requirement = Required if parameter.default is parameter.empty else NotRequired
-            fields[name] = requirement[_toml_hint(hints.get(name, Any))]
+            fields[name] = requirement[_toml_value_type(hints.get(name, Any))]
         elif parameter.kind is parameter.VAR_KEYWORD:
             extra = "allow"
     name = getattr(function, "__name__", "the function")
@@ -99,15 +99,15 @@ def validate_arguments(key: str, function: Callable, table: dict, problems: list
     return validate_table(key, schema, table, problems, name)
 
 
-def _toml_hint(hint) -> Any:
+def _toml_value_type(hint) -> Any:
     """Return the alternative of a type hint that a TOML value can have; Any if there is not exactly one."""
     if get_origin(hint) in (Union, UnionType):
-        alternatives = [part for part in get_args(hint) if part is not NoneType and _is_toml_hint(part)]
+        alternatives = [part for part in get_args(hint) if part is not NoneType and _is_toml_value_type(part)]
         return alternatives[0] if len(alternatives) == 1 else Any
-    return hint if _is_toml_hint(hint) else Any
+    return hint if _is_toml_value_type(hint) else Any
 
 
-def _is_toml_hint(hint) -> bool:
+def _is_toml_value_type(hint) -> bool:
     if get_origin(hint) in (list, tuple, Sequence, dict, Mapping):
-        return all(part is Ellipsis or _is_toml_hint(part) for part in get_args(hint))
+        return all(part is Ellipsis or _is_toml_value_type(part) for part in get_args(hint))
     return get_origin(hint) is Literal or hint in (bool, int, float, str, list, tuple, dict, Any)

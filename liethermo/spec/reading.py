@@ -224,14 +224,18 @@ def _apply_change(table: dict[str, Any], change: str, problems: list[str]) -> No
 
 
 def _model_function(
-    model: Model, folder: Path, allow: Sequence[str], report: Callable[[str], object] | None, problems: list[str]
+    model: Model,
+    folder: Path,
+    allowed_modules: Sequence[str],
+    report: Callable[[str], object] | None,
+    problems: list[str],
 ) -> Callable[..., System] | None:
     """Return the function that the section ``[model]`` names, or None after appending a fault to ``problems``."""
     if model.name is not None and model.function is None:
         return getattr(models, model.name)
     if model.function is not None and model.name is None:
         try:
-            return import_function(model.function, folder, allow, report)
+            return import_function(model.function, folder, allowed_modules, report)
         except InputError as error:
             problems.append(f"model.function = {format_value(model.function)}: {error}")
             return None

@@ -22,7 +22,7 @@ MAX_AXIS_VALUES = 10**7
 """Maximum number of values of an axis."""
 
 
-def one_of(options: Iterable[str]) -> BeforeValidator:
+def one_of_validator(options: Iterable[str]) -> BeforeValidator:
     allowed_values = list(options)
 
     def check(value):
@@ -63,7 +63,7 @@ class SpecContents(Section):
 class Model(Section):
     """The model: one of the library, or a user's function that returns a system."""
 
-    name: Annotated[str, one_of(models.__all__)] | None = Field(
+    name: Annotated[str, one_of_validator(models.__all__)] | None = Field(
         None, description="a model of the library; `liethermo models` lists them"
     )
     function: str | None = Field(
@@ -119,7 +119,7 @@ class Method(BaseModel):
 
     model_config = ConfigDict(extra="allow")  # the parameters of the method, checked by its signature
     # options without a name belong to the midpoint scheme
-    name: Annotated[str, one_of(METHODS)] | None = Field(
+    name: Annotated[str, one_of_validator(METHODS)] | None = Field(
         None, description=f"one of {', '.join(METHODS)}; the default is that of `integrate`"
     )
 
@@ -130,8 +130,10 @@ class Outputs(Section):
     netcdf: Annotated[str, AfterValidator(_require_netcdf_name)] = Field(
         "solution.nc", description="the file of the solution"
     )
-    figures: list[Annotated[str, one_of(FIGURES)]] = Field(["laws"], description=f"some of {', '.join(FIGURES)}")
-    figure_format: Annotated[str, one_of(FORMATS)] = Field("png", description=f"one of {', '.join(FORMATS)}")
+    figures: list[Annotated[str, one_of_validator(FIGURES)]] = Field(
+        ["laws"], description=f"some of {', '.join(FIGURES)}"
+    )
+    figure_format: Annotated[str, one_of_validator(FORMATS)] = Field("png", description=f"one of {', '.join(FORMATS)}")
 
 
 class EvenlySpacedAxis(Section):
@@ -140,7 +142,7 @@ class EvenlySpacedAxis(Section):
     first: FiniteFloat = Field(description="the first value")
     last: FiniteFloat = Field(description="the last value")
     points: int = Field(ge=1, le=MAX_AXIS_VALUES, description="the number of values")
-    scale: Annotated[str, one_of(("linear", "log"))] = Field("linear", description="linear, or log")
+    scale: Annotated[str, one_of_validator(("linear", "log"))] = Field("linear", description="linear, or log")
 
 
 class SampledAxis(Section):

@@ -73,7 +73,7 @@ def _parse_entry_name(name: str) -> list[Any]:
     return [key, *map(int, index)]
 
 
-def build_study(plan: Spec, store: str | os.PathLike) -> Study:
+def build_study(spec: Spec, store: str | os.PathLike) -> Study:
     """Return the study that a spec file describes.
 
     Raises
@@ -81,9 +81,9 @@ def build_study(plan: Spec, store: str | os.PathLike) -> Study:
     SpecError
         With all faults of the section.
     """
-    section = plan.study
+    section = spec.study
     if section is None:
-        raise SpecError(plan.path, ["study is missing: a section [study] with axes"])
+        raise SpecError(spec.path, ["study is missing: a section [study] with axes"])
     problems: list[str] = []
     axes = {name: _parse_axis(f"study.axes.{name}", axis, problems) for name, axis in section.axes.items()}
     measures = {
@@ -95,36 +95,36 @@ def build_study(plan: Spec, store: str | os.PathLike) -> Study:
         for name in (values.columns if isinstance(values, Zipped) and values.columns else [axis])
     ]
     for name in names:
-        _check_settable(name, plan, problems)
+        _report_if_not_settable(name, spec, problems)
     if problems:
-        raise SpecError(plan.path, problems)
+        raise SpecError(spec.path, problems)
     parameter_names, state_names = (
         [n for n in names if (_parse_entry_name(n)[0] == INITIAL_STATE_KEY) == initial] for initial in (False, True)
     )
-    initial = tuple(plan.run.initial)
+    initial = tuple(spec.run.initial)
     entries = {
         _parse_entry_name(name)[0] for name in parameter_names if "[" in name
     }  # defaults of the model that only an axis mentions
-    parameters = {**{name: plan.model_arguments[name] for name in entries}, **plan.parameters}
+    parameters = {**{name: spec.model_arguments[name] for name in entries}, **spec.parameters}
     try:
         return Study(
-            SystemBuilder(plan.build, parameters, tuple(parameter_names)),
+            SystemBuilder(spec.build, parameters, tuple(parameter_names)),
             axes,
             x0=InitialStateBuilder(initial, tuple(state_names)) if state_names else np.array(initial),
-            t_span=plan.run.t_span,
-            step=plan.step,
-            method=plan.method,
+            t_span=spec.run.t_span,
+            step=spec.step,
+            method=spec.method,
             measure=measures,
             store=store,
-            until=plan.until,
-            attitude=None if plan.run.attitude is None else np.array(plan.run.attitude),
+            until=spec.until,
+            attitude=None if spec.run.attitude is None else np.array(spec.run.attitude),
             chunk=section.chunk,
             units=section.units,
             names=section.names,
-            spec=plan.table,
+            spec=spec.table,
         )
     except InputError as error:
-        raise SpecError(plan.path, [f"study: {error}"]) from error
+        raise SpecError(spec.path, [f"study: {error}"]) from error
 
 
 def _parse_axis(key: str, axis: Any, problems: list[str]) -> Any:
@@ -163,7 +163,7 @@ def _parse_measure(key: str, measure: Any, problems: list[str]) -> Any:
         return None
 
 
-def _check_settable(name: str, plan: Spec, problems: list[str]) -> None:
+def _report_if_not_settable(name: str, plan: Spec, problems: list[str]) -> None:
     """Append a fault to ``problems`` unless an axis can vary the parameter of this name."""
     if not re.fullmatch(r"\w+(\[\d{1,9}\])*", name):
         problems.append(

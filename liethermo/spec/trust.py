@@ -22,7 +22,7 @@ from .messages import suggest_match
 
 
 def import_function(
-    target: str, folder: Path, allow: Sequence[str] = (), report: Callable[[str], object] | None = None
+    target: str, folder: Path, allowed_modules: Sequence[str] = (), report: Callable[[str], object] | None = None
 ) -> Callable[..., Any]:
     """Import and return the function that ``module:function`` names.
 
@@ -30,7 +30,7 @@ def import_function(
     ----------
     folder : Path
         Folder of the spec file.
-    allow : sequence of str
+    allowed_modules : sequence of str
         Names of modules that may be outside of the folder.
     report : function, optional
         Called with a text that names the file or module before it is imported.
@@ -47,7 +47,7 @@ def import_function(
     file = next(
         (path for path in (module_path.with_suffix(".py"), module_path / "__init__.py") if path.is_file()), None
     )
-    if file is None and name not in allow:
+    if file is None and name not in allowed_modules:
         raise InputError(
             f"there is no {name.replace('.', '/')}.py beside the spec file, and what is elsewhere is imported only if "
             f"you allow it by name: --allow {name}"
@@ -55,7 +55,7 @@ def import_function(
     if report is not None:
         report(f"imports {name}{'' if file is None else f' from {file}'}")
     try:
-        module = _import_installed(name, folder) if file is None else _load_from_file(name, file, folder)
+        module = _import_by_name(name, folder) if file is None else _load_from_file(name, file, folder)
     except InputError:
         raise
     except Exception as error:
@@ -74,7 +74,7 @@ def _is_defined_in(value: Any, module: ModuleType) -> bool:
     return (inspect.isfunction(value) or inspect.isclass(value)) and value.__module__ == module.__name__
 
 
-def _import_installed(name: str, folder: Path) -> ModuleType:
+def _import_by_name(name: str, folder: Path) -> ModuleType:
     with _extended_import_path(Path.cwd(), folder):
         return importlib.import_module(name)
 
@@ -84,7 +84,9 @@ def _load_from_file(name: str, file: Path, folder: Path) -> ModuleType:
     loaded_module = sys.modules.get(name)
     if loaded_module is not None and getattr(loaded_module, "__file__", None) == str(file):
         return loaded_module
-    if name not in _spec_module_names and (loaded_module is not None or _is_installed(name.partition(".")[0], folder)):
+    if name not in _spec_module_names and (
+        loaded_module is not None or _exists_elsewhere(name.partition(".")[0], folder)
+    ):
         raise InputError(f"there is another module {name!r}: call {file.name} something else")
     spec = importlib.util.spec_from_file_location(name, file)
     assert spec is not None
@@ -101,7 +103,7 @@ def _load_from_file(name: str, file: Path, folder: Path) -> ModuleType:
     return module
 
 
-def _is_installed(name: str, folder: Path) -> bool:
+def _exists_elsewhere(name: str, folder: Path) -> bool:
     """Return True if a module of this name exists elsewhere, which a file beside the spec would then shadow."""
     original_path = list(sys.path)
     sys.path[:] = [path for path in original_path if Path(path or ".").resolve() not in (folder, Path.cwd())]
@@ -117,7 +119,7 @@ def _is_installed(name: str, folder: Path) -> bool:
 
 
 @contextlib.contextmanager
-def pickle_by_value(folder: Path) -> Iterator[None]:
+def pickling_by_value(folder: Path) -> Iterator[None]:
     """Pickle modules beside the spec by value, since the workers of a cluster cannot import them."""
     import cloudpickle
 

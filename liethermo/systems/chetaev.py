@@ -124,10 +124,10 @@ class SemibasicForm(Module):
         function = eta if is_implicit else LastArgumentIgnored(eta)
         function = function if len(shape) == 1 else FlattenedFunction(function, shape)
         arguments = f"(q, v, S), q and v of shape {shape}"
-        function, result_shape = traced_function_and_shape(
+        function, checked_result_shapes = traced_function_and_shape(
             function, ((n,), (n,), (), ()), ((n + 1,), (n,)), "eta", arguments
         )
-        return cls(function if result_shape == (n + 1,) else _UnitEntropyForm(function), is_implicit)
+        return cls(function if checked_result_shapes == (n + 1,) else _UnitEntropyForm(function), is_implicit)
 
     def entropy_rate(self, q, v, S) -> jax.Array:
         """Return S' with ``eta_q . v + eta_S S' = 0``; NaN if Newton's method finds none."""

@@ -21,7 +21,7 @@ from ..functions.checks import checked_energy, with_polynomial_degrees
 from ..functions.energy import Energy, Quadratic, make_energy
 from ..functions.mechanics import Kinetic, is_independent_of_momenta, is_mechanical
 from ..tracing.interpret import evaluate_at_points
-from ..tracing.programs import jit_program
+from ..tracing.programs import jit_cached
 from .euler_poincare import are_all_singular, inverse_gradient
 from .evolution import (
     ContactManifoldSystem,
@@ -231,7 +231,7 @@ def _legendre_hamiltonian(L: Energy, dim: int) -> Energy:
     return LegendreTransform(L)
 
 
-@jit_program
+@jit_cached
 def _hamiltonian_of_quadratic(L: Quadratic) -> Quadratic:
     """Return ``H = (p - B r - c) . W^-1 (p - B r - c) / 2 - L(r)``, r = (q, S), where ``L_v = W v + B r + c``."""
     dim = L.A.shape[0]

@@ -12,9 +12,9 @@ import manifolds as mf
 
 from ..errors import FunctionError, InputError
 from ..functions.arguments import required_argument_count
-from ..tracing.interpret import MAX_UNROLLED_DIM, vanishing_entries
+from ..tracing.interpret import MAX_UNROLLED_DIM, vanishing_entry_indices
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
-from ..tracing.traced import TracedFunction, trace_callables_with_result
+from ..tracing.traced import TracedFunction, trace_callables_and_result_shapes
 
 
 def check_torque(given: Any, algebra: mf.LieAlgebra, group: mf.MatrixGroup | None) -> tuple[Any, tuple[bool, ...]]:
@@ -45,7 +45,7 @@ def check_torque(given: Any, algebra: mf.LieAlgebra, group: mf.MatrixGroup | Non
 
     given = terms if isinstance(given, list) else given
     try:
-        torque, values = trace_callables_with_result(given, evaluate_terms, *shapes)
+        torque, values = trace_callables_and_result_shapes(given, evaluate_terms, *shapes)
     except TRACE_ERRORS as error:
         what = f"the torque could not be evaluated on a momentum of shape {algebra.shape}"
         raise FunctionError(trace_error_message(what, error)) from error
@@ -75,7 +75,7 @@ def torque_free_components(
     shape = () if group is None else group.identity.shape
     complex_group = group is not None and jnp.iscomplexobj(group.identity)
     shapes = ((), algebra.shape, *((shape,) * (2 if complex_group else 1)))
-    return tuple(sorted(vanishing_entries(_torque_of_model, (torque, needs), *shapes)))
+    return tuple(sorted(vanishing_entry_indices(_torque_of_model, (torque, needs), *shapes)))
 
 
 def _torque_of_model(model: tuple, t, mu, *attitude) -> jax.Array:

@@ -169,7 +169,7 @@ def sample_exact_measure(system: System, noise: Fluctuations, x0, path_states: n
     eigenvalues, axes = np.linalg.eigh(curvature)
     level_shape = (axes / np.sqrt(eigenvalues)) @ axes.T if eigenvalues[0] > 1e-6 * eigenvalues[-1] > 0.0 else np.eye(n)
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True) @ level_shape.T
-    radius, slope = evaluate_at_points(_level_crossing_on_ray, (F, level), directions).T
+    radius, slope = evaluate_at_points(_level_distance_and_slope, (F, level), directions).T
     if not (np.isfinite(radius) & (slope > 0.0)).all():
         raise ValueError(f"rays from the origin do not meet the level of {name} once: give samples of the measure")
     points = radius[:, None] * directions
@@ -177,9 +177,9 @@ def sample_exact_measure(system: System, noise: Fluctuations, x0, path_states: n
     return Samples(points, np.exp(logs - logs.max()))
 
 
-def _level_crossing_on_ray(model: tuple[Energy, jax.Array], direction):
+def _level_distance_and_slope(function_and_level_state: tuple[Energy, jax.Array], direction):
     """Return the distance to a level along a ray, and the function's outward slope there; NaN if it is not met."""
-    F, x0 = model
+    F, x0 = function_and_level_state
     level, start = F.value(x0), F.value(jnp.zeros_like(x0))
 
     def is_before_level(r):

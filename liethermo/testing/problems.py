@@ -23,8 +23,10 @@ Problem = tuple[System, object, float]
 def problems_for(method: OneStepMethod) -> dict[str, Problem]:
     """Return the test problems that a method accepts, by name."""
     if method.systems == EVERY_SYSTEM:
-        return reference_problems()
-    problems = {name: problem for name, problem in special_problems().items() if _accepts_system(method, problem[0])}
+        return general_problems()
+    problems = {
+        name: problem for name, problem in closed_system_problems().items() if _accepts_system(method, problem[0])
+    }
     if not problems:
         raise InputError(f"{method} is for {method.systems}, but no test problem is one. Give systems=...")
     return problems
@@ -38,7 +40,7 @@ def _accepts_system(method: OneStepMethod, system: System) -> bool:
     return True
 
 
-def special_problems() -> dict[str, Problem]:
+def closed_system_problems() -> dict[str, Problem]:
     """Return problems with special systems: mechanical with heat, isolated and driven, and a rigid body with heat."""
 
     def lagrangian(q, v, S):
@@ -70,7 +72,7 @@ def special_problems() -> dict[str, Problem]:
     }
 
 
-def reference_problems() -> dict[str, Problem]:
+def general_problems() -> dict[str, Problem]:
     """Return general problems: a relaxing body, a top with and without friction, and a damped oscillator in R^3."""
     moments = jnp.array([3.0, 2.0, 1.0])
 

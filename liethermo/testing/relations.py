@@ -203,7 +203,7 @@ def check_energy_shift(case: RelationCase) -> SkipReason:
     return None
 
 
-def check_local_entropy(case: RelationCase) -> SkipReason:
+def check_entropy_near_motion(case: RelationCase) -> SkipReason:
     """Check that the values of the entropy far from the motion do not matter."""
     system = case.system
     if system.entropy is None or system.space is not None or system.sites:
@@ -221,7 +221,7 @@ def check_local_entropy(case: RelationCase) -> SkipReason:
     return None
 
 
-def check_closure(case: RelationCase) -> SkipReason:
+def check_closed_over_parameters(case: RelationCase) -> SkipReason:
     """Check that parameters may be leaves of a system or constants in a closure."""
     if case.system.is_driven or case.system.space is not None:
         return "the energy is no plain function of the state"
@@ -231,7 +231,7 @@ def check_closure(case: RelationCase) -> SkipReason:
     return None
 
 
-def check_split_rate(case: RelationCase) -> SkipReason:
+def check_halved_dissipation(case: RelationCase) -> SkipReason:
     """Check that a dissipation may be split into two with half of the rate each."""
     if case.system.dissipation is None:
         return "there is no dissipation"
@@ -249,8 +249,8 @@ def check_split_rate(case: RelationCase) -> SkipReason:
 # -- coordinates and units ------------------------------------------------------------------------------------------
 
 
-def why_not_vectors(case: RelationCase) -> SkipReason:
-    """Return the reason why the state cannot be transformed linearly, or None."""
+def why_not_linear_states(case: RelationCase) -> SkipReason:
+    """Return why linear maps of the states do not apply to a case, as a text, or None if they do."""
     system = case.system
     if system.is_driven or system.space is not None or system.sites:
         return "states are no vectors of R^n whose functions depend on them alone"
@@ -259,7 +259,7 @@ def why_not_vectors(case: RelationCase) -> SkipReason:
 
 def check_units(case: RelationCase) -> SkipReason:
     """Check that units of state, time, energy and entropy do not matter."""
-    if reason := why_not_vectors(case):
+    if reason := why_not_linear_states(case):
         return reason
     for state, time in UNIT_FACTORS:
         change = CoordinateChange(state * np.eye(case.system.dim), time, state / time, state**0.5)
@@ -275,9 +275,11 @@ def check_units(case: RelationCase) -> SkipReason:
     return None
 
 
-def _step_in_units(step: Adaptive, state: float, time: float) -> Adaptive:
-    step_limits = {name: value * time for name in ("first", "largest") if (value := getattr(step, name)) is not None}
-    return replace(step, atol=step.atol * state, **step_limits)
+def _step_in_units(step: Adaptive, state_factor: float, time_factor: float) -> Adaptive:
+    step_limits = {
+        name: value * time_factor for name in ("first", "largest") if (value := getattr(step, name)) is not None
+    }
+    return replace(step, atol=step.atol * state_factor, **step_limits)
 
 
 def check_component_order(case: RelationCase) -> SkipReason:
@@ -295,7 +297,7 @@ def check_rotated_axes(case: RelationCase) -> SkipReason:
 
 
 def _check_linear_map(case: RelationCase, description: str, matrix: np.ndarray, same_steps: bool) -> SkipReason:
-    if reason := why_not_vectors(case):
+    if reason := why_not_linear_states(case):
         return reason
     if case.system.matrix_group is not None:
         return "the attitude is of a group with a basis of its own"
@@ -315,7 +317,7 @@ def _check_linear_map(case: RelationCase, description: str, matrix: np.ndarray, 
 
 def check_uncoupled_pair(case: RelationCase) -> SkipReason:
     """Check that two uncoupled copies of a system move like single ones."""
-    if reason := why_not_vectors(case):
+    if reason := why_not_linear_states(case):
         return reason
     n, second_start = case.system.dim, nearby_state(case)
     pair = case.run(UncoupledPair(case.system), np.concatenate([case.x0, second_start]))
@@ -446,7 +448,7 @@ def check_ensemble(case: RelationCase) -> SkipReason:
     return None
 
 
-def check_family(case: RelationCase) -> SkipReason:
+def check_family_members(case: RelationCase) -> SkipReason:
     """Check that the parameters and order of other members do not change a member of a family, to the bit.
 
     The other members have the parameters of the system made equal, partly zero, and of opposite sign.
@@ -462,12 +464,12 @@ def check_family(case: RelationCase) -> SkipReason:
     base_index = int(np.flatnonzero(values == value[entry])[0])
     span = (0.0, case.time)
 
-    def state_in_family(order: list[int]) -> np.ndarray:
+    def final_state_in_family(order: list[int]) -> np.ndarray:
         members = {name: row[order] for name, row in rows.items()}
         family_run = ensemble(case.system, case.x0, span, case.step, case.method, parameters=members, progress=False)
         return final_state(family_run, order.index(0))
 
-    def state_in_study(order: np.ndarray) -> np.ndarray:
+    def final_state_in_study(order: np.ndarray) -> np.ndarray:
         points = {path: values[order]}
         study = Study(
             case.system, points, x0=case.x0, t_span=span, step=case.step, method=case.method, measure={"x": "final"}
@@ -477,15 +479,15 @@ def check_family(case: RelationCase) -> SkipReason:
 
     single_run = ensemble(case.system, case.x0[None], span, case.step, case.method, progress=False)
     case.compare_states(
-        "in company", state_in_family([0, 1, 2, 3]), final_state(single_run, 0), case.rounding_tolerance
+        "in company", final_state_in_family([0, 1, 2, 3]), final_state(single_run, 0), case.rounding_tolerance
     )
-    reference_state = state_in_family([0, 1, 2, 3])
+    reference_state = final_state_in_family([0, 1, 2, 3])
     for order in ([1, 2, 3, 0], [3, 1, 0, 2], [2, 0]):
-        case.compare_states(f"in the order {order}", state_in_family(order), reference_state, 0.0)
+        case.compare_states(f"in the order {order}", final_state_in_family(order), reference_state, 0.0)
     forwards = np.arange(len(values))
-    reference_state = state_in_study(forwards)
+    reference_state = final_state_in_study(forwards)
     case.compare_states("in a study", reference_state, final_state(single_run, 0), case.rounding_tolerance)
-    case.compare_states("in a study backwards", state_in_study(forwards[::-1]), reference_state, 0.0)
+    case.compare_states("in a study backwards", final_state_in_study(forwards[::-1]), reference_state, 0.0)
     return None
 
 
@@ -498,7 +500,7 @@ def degenerate_parameters(value: np.ndarray) -> list[np.ndarray]:
 
 
 def final_state(result: Ensemble, i: int) -> np.ndarray:
-    """The final state of a trajectory, shape (n,), as an array to compare; zeros if it was not started."""
+    """Return the final state of one trajectory of an ensemble, shape (n,); zeros if it was not started."""
     assert result.x is not None
     return np.nan_to_num(result.x[i]).ravel()
 
@@ -527,7 +529,7 @@ def check_study(case: RelationCase) -> SkipReason:
 
 
 def check_saved_run(case: RelationCase) -> SkipReason:
-    """A loaded run equals the saved one."""
+    """Check that a loaded run equals the saved one, and that both can be continued alike."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "run.nc"
         case.base_run.save(path)
@@ -561,18 +563,18 @@ def check_scipy(case: RelationCase) -> SkipReason:
         return "the method has no estimate of its error"
     step = case.step if isinstance(case.step, Adaptive) else Adaptive(1e-8)
 
-    def solve(**options):
+    def run_solve_ivp(**options):
         span = (0.0, case.time)
         return solve_ivp(case.system, span, case.x0, case.method, rtol=step.rtol, atol=step.atol, **options)
 
     own_run = case.run(step=step)
-    case.compare_states("solve_ivp", solve().y[:, -1], own_run.x[-1], case.rounding_tolerance)
+    case.compare_states("solve_ivp", run_solve_ivp().y[:, -1], own_run.x[-1], case.rounding_tolerance)
     i = int(np.argmax(np.abs(own_run.x[-1] - own_run.x[0])))
     crossing = _LevelCrossing(i, float(0.5 * (own_run.x[0, i] + own_run.x[-1, i])))
     if crossing.level == own_run.x[0, i]:
         return None
     event_run = case.run(step=step, until=lambda x: x[i] - crossing.level)
-    peer_result = solve(events=crossing)
+    peer_result = run_solve_ivp(events=crossing)
     both_found = peer_result.status == 1 and event_run.event_time is not None
     case.suite.check_true(f"{case.name}: both find the event", both_found, peer_result.message)
     if both_found:
@@ -608,7 +610,7 @@ def check_diffrax(case: RelationCase) -> SkipReason:
 
     term, solver, h = Term(case.system), Solver(case.method), case.step
 
-    def solve(start: float, end: float, step: float, x):
+    def final_state_and_success(start: float, end: float, step: float, x):
         control = peer.ConstantStepSize()
         run = peer.diffeqsolve(
             term, solver, start, end, step, x, stepsize_controller=control, max_steps=100_000, throw=False
@@ -616,10 +618,10 @@ def check_diffrax(case: RelationCase) -> SkipReason:
         assert run.ys is not None
         return run.ys[-1], bool(run.result == peer.RESULTS.successful)
 
-    x, ok = solve(0.0, case.time, h, case.x0)
+    x, ok = final_state_and_success(0.0, case.time, h, case.x0)
     case.suite.check_true(f"{case.name}: diffeqsolve succeeds", ok)
     case.compare_states("diffeqsolve", x, case.base_run.x[-1], case.rounding_tolerance)
-    x, ok = solve(case.time, 0.0, -h, x)
+    x, ok = final_state_and_success(case.time, 0.0, -h, x)
     case.suite.check_true(f"{case.name}: backwards it succeeds", ok)
     case.compare_states("there and back", x, case.x0, 2.0 * case.resolution_tolerance)
     return None
@@ -627,9 +629,9 @@ def check_diffrax(case: RelationCase) -> SkipReason:
 
 RELATIONS: dict[str, Callable[[RelationCase], SkipReason]] = {
     "constant": check_energy_shift,
-    "domain": check_local_entropy,
-    "closure": check_closure,
-    "shares": check_split_rate,
+    "domain": check_entropy_near_motion,
+    "closure": check_closed_over_parameters,
+    "shares": check_halved_dissipation,
     "units": check_units,
     "order": check_component_order,
     "axes": check_rotated_axes,
@@ -639,7 +641,7 @@ RELATIONS: dict[str, Callable[[RelationCase], SkipReason]] = {
     "noise": check_split_noise,
     "engines": check_engines,
     "ensemble": check_ensemble,
-    "company": check_family,
+    "company": check_family_members,
     "study": check_study,
     "file": check_saved_run,
     "scipy": check_scipy,

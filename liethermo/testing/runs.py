@@ -34,18 +34,18 @@ def rebuild_pytree(tree):
 def random_start(system: System, seed: int) -> np.ndarray:
     """Return a random state inside the domain of the system, shape (n,)."""
     for x in system.samples(20, seed):
-        if not system.outside(jnp.asarray(x)) and np.isfinite(_field_at_start(system, x)).all():
+        if not system.outside(jnp.asarray(x)) and np.isfinite(_field_at_time_zero(system, x)).all():
             return np.asarray(x)
     raise ValueError(f"none of 20 random states is inside the domain of this {system.kind}: give x0")
 
 
 def default_step(system: System, x0) -> float:
     """Return a step in which the state moves by a hundredth of its norm."""
-    field_norm, norm = (float(np.linalg.norm(np.asarray(v))) for v in (_field_at_start(system, x0), x0))
+    field_norm, norm = (float(np.linalg.norm(np.asarray(v))) for v in (_field_at_time_zero(system, x0), x0))
     return 0.01 * max(norm, 1e-3) / field_norm if field_norm > 0.0 else 0.01
 
 
-def _field_at_start(system: System, x) -> np.ndarray:
+def _field_at_time_zero(system: System, x) -> np.ndarray:
     """Return the vector field at a state, at time 0 if it depends on time."""
     return np.asarray(system.vector_field(x, 0.0) if system.is_driven else system.vector_field(x))
 

@@ -22,7 +22,7 @@ from ..systems import LiePoissonSystem, MetriplecticSystem, System
 
 @dataclass(frozen=True)
 class CoordinateChange:
-    """States ``y = A x`` at times ``time_unit * t``, with other units of energy and entropy.
+    """A change to states ``y = A x`` at times ``time_unit * t``, with other units of energy and entropy.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class CoordinateChange:
 
     @property
     def uniform_factor(self) -> float | None:
-        """The factor if A is a multiple of the identity, else None."""
+        """The number c if the matrix is c times the identity, else None."""
         factor = float(self.matrix[0, 0])
         return factor if np.array_equal(self.matrix, factor * np.eye(len(self.matrix))) else None
 

@@ -1,7 +1,7 @@
 """Move the instructions that only one side of a branch needs into that side, so that they can be jumped over.
 
 A scalar program computes both sides of every ``lax.cond`` and then selects one, which is right wherever it runs. The
-writer of machine code calls :func:`nest_branches` to move the instructions of one side behind a jump.
+writer of machine code calls :func:`instructions_in_branches` to move the instructions of one side behind a jump.
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ class Branch(NamedTuple):
     choices: list[Instruction]
 
 
-def nest_branches(program: Program, min_instructions: int = MIN_BRANCH_COST) -> list[Instruction | Branch]:
-    """Return the instructions of a program in an order of evaluation, with those of one side inside its branch.
+def instructions_in_branches(program: Program, min_side_cost: int = MIN_BRANCH_COST) -> list[Instruction | Branch]:
+    """Return the instructions in order of evaluation, those that only one side of a branch needs inside it.
 
     Parameters
     ----------
     program : Program
-    min_instructions : int
+    min_side_cost : int
         Smallest cost of a side, in instructions. A cheaper side is computed before the choice.
     """
     tests = {instruction.target for instruction in program.instructions if instruction.op == "branch"}
@@ -65,7 +65,7 @@ def nest_branches(program: Program, min_instructions: int = MIN_BRANCH_COST) -> 
                 MIN_BRANCH_COST if instruction.op in COSTLY_OPERATIONS or isinstance(instruction.op, Block) else 1
             )
     for target, guard in guards.items():
-        while guard and costs[guard] < min_instructions:
+        while guard and costs[guard] < min_side_cost:
             guard = guard[:-1]
         guards[target] = guard
     return _order_by_dependence(program.instructions, guards, 0)
@@ -134,7 +134,7 @@ def _order_by_dependence(
             else:
                 order[stack.pop()] = None
 
-    def group_item(name: str) -> Instruction | Branch:
+    def instruction_or_branch(name: str) -> Instruction | Branch:
         if name not in inner_tests:
             return groups[name][0]
         sides: dict[Guard, list[Instruction]] = {((name, True),): [], ((name, False),): [], (): []}
@@ -148,4 +148,4 @@ def _order_by_dependence(
         )
         return Branch(test, ordered_sides, [i for i in common_items if i is not test])
 
-    return [group_item(name) for name in order]
+    return [instruction_or_branch(name) for name in order]

@@ -237,7 +237,7 @@ class Builder:
     def op(self, op: str | Block, *args: Scalar) -> Any:
         """Return the result of an operation; only fold constants and merge equal expressions."""
         if not any(type(a) is str for a in args):
-            return fold_constants(op, *args)
+            return evaluate_on_numbers(op, *args)
         if op in COMMUTATIVE:
             args = tuple(sorted(args, key=str))
         return self._emit(op, *args)
@@ -278,13 +278,15 @@ class Builder:
                 return self._emit("column", block_result, start, len(entries))
         return self._emit("table", *entries)
 
-    def input_indices(self, entries: Sequence[Scalar]) -> list[tuple[int, int]] | None:
+    def input_positions_or_none(self, entries: Sequence[Scalar]) -> list[tuple[int, int]] | None:
         """Return the (array, entry) indices of scalars among the inputs of the outermost program.
 
         The result is None if a scalar is not an input.
         """
         if self.enclosing is not None:
-            return self.enclosing.builder.input_indices([self.enclosing.outer_scalars.get(a, 0.0) for a in entries])
+            return self.enclosing.builder.input_positions_or_none(
+                [self.enclosing.outer_scalars.get(a, 0.0) for a in entries]
+            )
         if not all(type(a) is str and a[0] == "x" for a in entries):
             return None
         return [
@@ -337,20 +339,20 @@ class Builder:
             return b
         if b == 1:
             return a
-        return self._extract_signs(self.mul, "mul", a, b)
+        return self._result_with_sign_outside(self.mul, "mul", a, b)
 
     def div(self, a, b):
         if type(a) is not str and type(b) is not str:
-            return fold_constants("div", a, b)
+            return evaluate_on_numbers("div", a, b)
         if a == 0:
             return abs(a)
         if b == 1:
             return a
-        return self._extract_signs(self.div, "div", a, b)
+        return self._result_with_sign_outside(self.div, "div", a, b)
 
-    def _extract_signs(self, method, op, a, b):
-        """Return a product or quotient, with minus signs moved outside."""
-        for x, result in (a, lambda y: method(y, b)), (b, lambda y: method(a, y)):
+    def _result_with_sign_outside(self, simplify, op, a, b):
+        """Return a product or quotient of two scalars, with their minus signs applied to the result."""
+        for x, result in (a, lambda y: simplify(y, b)), (b, lambda y: simplify(a, y)):
             opposite = self._negated_operand.get(x) if type(x) is str else -x if x < 0 else None
             if opposite is not None:
                 return self.neg(result(opposite))
@@ -427,7 +429,7 @@ class Builder:
         return result
 
 
-def fold_constants(op: str | Block, *args: Scalar) -> Any:
+def evaluate_on_numbers(op: str | Block, *args: Scalar) -> Any:
     """Evaluate an operation on numbers by IEEE arithmetic, without exceptions."""
     with np.errstate(all="ignore"):
         value = implementation(op)(*(np.float64(a) if type(a) is float else a for a in args))
@@ -477,8 +479,8 @@ def elementwise(function: Callable[..., Any], *arrays: np.ndarray) -> np.ndarray
     return scalar_array(list(map(function, *(x.ravel().tolist() for x in arrays))), arrays[0].shape)
 
 
-def entries_along(x: np.ndarray, axes) -> tuple[list[list[Scalar]], tuple[int, ...]]:
-    """Return the entries along some axes, one row for each index of the other axes, and the shape of the other axes."""
+def rows_along_axes(x: np.ndarray, axes) -> tuple[list[list[Scalar]], tuple[int, ...]]:
+    """Return a list of entries along some axes for each index of the other axes, and the shape of the other axes."""
     remaining_axes = [i for i in range(x.ndim) if i not in axes]
     shape = tuple(x.shape[i] for i in remaining_axes)
     n_entries = math.prod(x.shape[i] for i in axes)

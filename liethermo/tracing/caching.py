@@ -77,7 +77,7 @@ def memoize(function: Callable[..., Result]) -> Callable[..., Result]:
     identity_cache: LRUCache[tuple[tuple, Result]] = LRUCache(MAX_CACHED_RESULTS, MAX_CACHED_BYTES)
     content_cache: LRUCache[Result] = LRUCache(MAX_CACHED_RESULTS, MAX_CACHED_BYTES)
 
-    def find_by_content(arguments: tuple, contents: tuple[_Content, ...], n_bytes: int) -> Result:
+    def get_or_compute_by_content(arguments: tuple, contents: tuple[_Content, ...], n_bytes: int) -> Result:
         compute, keys = functools.partial(function, *arguments), tuple(content.key for content in contents)
         if n_bytes > MAX_COMPARED_BYTES or None in keys:
             return compute()
@@ -94,7 +94,7 @@ def memoize(function: Callable[..., Result]) -> Callable[..., Result]:
         n_bytes = sum(content.n_bytes for content in contents)
         # the entry holds the arguments, so that no other object takes their id
         return identity_cache.get_or_compute(
-            identities, lambda: (arguments, find_by_content(arguments, contents, n_bytes)), n_bytes
+            identities, lambda: (arguments, get_or_compute_by_content(arguments, contents, n_bytes)), n_bytes
         )[1]
 
     return call

@@ -44,7 +44,7 @@ class LapackCall(Block):
 
     @property
     def result_specs(self) -> list[tuple[tuple[int, ...], bool]]:
-        """Shape of each result, and whether it is real even for complex arguments."""
+        """The shape of each result, and True if it is real even for complex arguments."""
         return LAPACK_FUNCTIONS[self.name].result_specs(*self.sizes)
 
     def entry_counts(self, specs) -> list[int]:
@@ -168,9 +168,9 @@ def _svd(sizes, a) -> tuple[np.ndarray, ...]:
     return s, u, v
 
 
-def _svd_result_specs(m: int, n: int, full: int) -> list[tuple[tuple[int, ...], bool]]:
+def _svd_result_specs(m: int, n: int, full_matrices: int) -> list[tuple[tuple[int, ...], bool]]:
     k = min(m, n)
-    return [((k,), True), ((m, m if full else k), False), ((n if full else k, n), False)]
+    return [((k,), True), ((m, m if full_matrices else k), False), ((n if full_matrices else k, n), False)]
 
 
 LAPACK_FUNCTIONS = {

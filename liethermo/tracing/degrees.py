@@ -47,25 +47,28 @@ def _output_degrees(jaxpr: Jaxpr, input_degrees: Sequence[float]) -> list[float]
     return [degree(atom) for atom in jaxpr.outvars]
 
 
-def _equation_degrees(equation, degrees: list[float]) -> list[float]:
+def _equation_degrees(equation, argument_degrees: list[float]) -> list[float]:
     """Return the degrees of the results of one equation: one degree for all results, or one for each."""
     name, parameters = equation.primitive.name, equation.params
     if name in DEGREE_PRESERVING:
-        return [max(degrees)]
+        return [max(argument_degrees)]
     if name in PRODUCT_PRIMITIVES:
-        return [sum(degrees)]
+        return [sum(argument_degrees)]
     if name in INDEXED_PRIMITIVES:
-        entry_degrees, index_degrees = degrees[: INDEXED_PRIMITIVES[name]], degrees[INDEXED_PRIMITIVES[name] :]
+        entry_degrees, index_degrees = (
+            argument_degrees[: INDEXED_PRIMITIVES[name]],
+            argument_degrees[INDEXED_PRIMITIVES[name] :],
+        )
         return [math.inf if any(index_degrees) else max(entry_degrees)]
-    if name == "div" and not degrees[1]:
-        return [degrees[0]]
+    if name == "div" and not argument_degrees[1]:
+        return [argument_degrees[0]]
     if name == "square":
-        return [2.0 * degrees[0]]
+        return [2.0 * argument_degrees[0]]
     if name == "integer_pow" and parameters["y"] >= 0:
-        return [parameters["y"] * degrees[0]]
-    if name == "select_n" and not degrees[0]:
-        return [max(degrees[1:])]
+        return [parameters["y"] * argument_degrees[0]]
+    if name == "select_n" and not argument_degrees[0]:
+        return [max(argument_degrees[1:])]
     if name in CALL_PRIMITIVES:
         inner = parameters.get("jaxpr", parameters.get("call_jaxpr"))
-        return _output_degrees(inner.jaxpr if isinstance(inner, ClosedJaxpr) else inner, degrees)
+        return _output_degrees(inner.jaxpr if isinstance(inner, ClosedJaxpr) else inner, argument_degrees)
     return [math.inf]

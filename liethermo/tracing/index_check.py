@@ -44,19 +44,23 @@ def check_indices(closed_jaxpr: ClosedJaxpr) -> None:
     sites do not have.
     """
     table_errors: list[IndexOutOfRangeError] = []
-    _check_jaxpr(closed_jaxpr.jaxpr, closed_jaxpr.consts, [None] * len(closed_jaxpr.jaxpr.invars), table_errors)
+    _check_and_evaluate_indices(
+        closed_jaxpr.jaxpr, closed_jaxpr.consts, [None] * len(closed_jaxpr.jaxpr.invars), table_errors
+    )
     if table_errors and _uses_out_of_range_entries(closed_jaxpr):
         raise table_errors[0]
 
 
-def result_shape(function: Callable, *arguments) -> Any:
-    """Return ``jax.eval_shape`` of a function of arrays, after checking its indices."""
+def checked_result_shapes(function: Callable, *arguments) -> Any:
+    """Return the shapes of the results of a function, as ``jax.eval_shape`` does, after checking its indices."""
     closed_jaxpr, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
     check_indices(closed_jaxpr)
     return shapes
 
 
-def _check_jaxpr(jaxpr: Jaxpr, consts: Sequence, arguments: Sequence, table_errors: list[IndexOutOfRangeError]) -> list:
+def _check_and_evaluate_indices(
+    jaxpr: Jaxpr, consts: Sequence, arguments: Sequence, table_errors: list[IndexOutOfRangeError]
+) -> list:
     """Check a jaxpr; return the constant integers among its results as arrays, None for each other result.
 
     The arguments have the form of the results. A single wrong index raises an error; the error of a wrong index in a
@@ -72,13 +76,13 @@ def _check_jaxpr(jaxpr: Jaxpr, consts: Sequence, arguments: Sequence, table_erro
     for eqn in jaxpr.eqns:
         name, values = eqn.primitive.name, [read(v) for v in eqn.invars]
         if name in INDEX_ACCESSES:
-            for index, axis_length in _find_out_of_range(eqn, values):
+            for index, axis_length in _invalid_indices(eqn, values):
                 error = IndexOutOfRangeError(index, axis_length, user_source_line(eqn))
                 if name != "gather" or eqn.invars[1].aval.size == eqn.invars[1].aval.shape[-1]:
                     raise error
                 table_errors.append(error)
         elif name in CALL_PRIMITIVES.split():
-            results = _check_jaxpr(*_called_jaxpr(eqn), values, table_errors)
+            results = _check_and_evaluate_indices(*_called_jaxpr_and_constants(eqn), values, table_errors)
             constants.update(zip(eqn.outvars, results, strict=True))
         elif name == "cond":
             branches, branch_index = eqn.params["branches"], values[0]
@@ -86,18 +90,20 @@ def _check_jaxpr(jaxpr: Jaxpr, consts: Sequence, arguments: Sequence, table_erro
                 branches if branch_index is None else [branches[int(np.clip(branch_index, 0, len(branches) - 1))]]
             )
             for branch in possible_branches:
-                _check_jaxpr(branch.jaxpr, branch.consts, values[1:], table_errors)
+                _check_and_evaluate_indices(branch.jaxpr, branch.consts, values[1:], table_errors)
         elif (
             name in INDEX_OPERATIONS and eqn.outvars[0].aval.size <= MAX_INDICES and all(v is not None for v in values)
         ):
             constants[eqn.outvars[0]] = _constant_indices(np.asarray(INDEX_OPERATIONS[name](eqn.params, *values)))
         else:
             for inner in jaxprs_in_params(eqn.params):
-                _check_jaxpr(inner, [None] * len(inner.constvars), [None] * len(inner.invars), table_errors)
+                _check_and_evaluate_indices(
+                    inner, [None] * len(inner.constvars), [None] * len(inner.invars), table_errors
+                )
     return [read(v) for v in jaxpr.outvars]
 
 
-def _called_jaxpr(eqn) -> tuple[Jaxpr, Sequence]:
+def _called_jaxpr_and_constants(eqn) -> tuple[Jaxpr, Sequence]:
     """Return the jaxpr that an equation calls, and its constants."""
     inner = eqn.params.get("jaxpr", eqn.params.get("call_jaxpr"))
     return (inner.jaxpr, inner.consts) if isinstance(inner, ClosedJaxpr) else (inner, ())
@@ -125,7 +131,7 @@ def _evaluate_with_nan_reads(jaxpr: Jaxpr, consts: Sequence, arguments: Sequence
     for eqn in jaxpr.eqns:
         values, name = list(map(read, eqn.invars)), eqn.primitive.name
         if name in CALL_PRIMITIVES.split():
-            results = _evaluate_with_nan_reads(*_called_jaxpr(eqn), values)
+            results = _evaluate_with_nan_reads(*_called_jaxpr_and_constants(eqn), values)
         else:
             params = eqn.params
             if name == "gather" and is_silently_clamped(eqn) and jnp.issubdtype(eqn.invars[0].aval.dtype, jnp.inexact):
@@ -142,9 +148,9 @@ def _constant_indices(value: Any) -> np.ndarray | None:
     return np.asarray(value) if math.prod(np.shape(value)) <= MAX_INDICES else None
 
 
-def _find_out_of_range(eqn, values: Sequence) -> Iterator[tuple[int, int]]:
-    """Yield each index of an access that is out of range, as the user wrote it, with the length of its axis."""
-    for axis, starts, window in INDEX_ACCESSES[eqn.primitive.name](eqn, values):
+def _invalid_indices(eqn, constant_inputs: Sequence) -> Iterator[tuple[int, int]]:
+    """Yield each constant index that is out of range, as the user wrote it, with the length of its axis."""
+    for axis, starts, window in INDEX_ACCESSES[eqn.primitive.name](eqn, constant_inputs):
         axis_length = eqn.invars[0].aval.shape[axis]
         for start in np.unique(starts).tolist():
             if start < 0:
@@ -153,16 +159,16 @@ def _find_out_of_range(eqn, values: Sequence) -> Iterator[tuple[int, int]]:
                 yield start if window == 1 else max(start, axis_length), axis_length
 
 
-def _dynamic_slice_accesses(eqn, values):
-    yield from _slice_accesses(values[1:], eqn.params["slice_sizes"])
+def _dynamic_slice_accesses(eqn, constant_inputs):
+    yield from _slice_accesses(constant_inputs[1:], eqn.params["slice_sizes"])
 
 
-def _dynamic_update_accesses(eqn, values):
-    yield from _slice_accesses(values[2:], eqn.invars[1].aval.shape)
+def _dynamic_update_accesses(eqn, constant_inputs):
+    yield from _slice_accesses(constant_inputs[2:], eqn.invars[1].aval.shape)
 
 
-def _slice_accesses(values, windows):
-    yield from ((axis, s, w) for axis, (s, w) in enumerate(zip(values, windows, strict=True)) if s is not None)
+def _slice_accesses(starts, window_lengths):
+    yield from ((axis, s, w) for axis, (s, w) in enumerate(zip(starts, window_lengths, strict=True)) if s is not None)
 
 
 def is_silently_clamped(eqn) -> bool:
@@ -175,23 +181,25 @@ def is_silently_clamped(eqn) -> bool:
     return mode == ScatterMode.PROMISE_IN_BOUNDS or (mode == ScatterMode.CLIP and not dropped_axes)
 
 
-def _gather_accesses(eqn, values):
+def _gather_accesses(eqn, constant_inputs):
     if is_silently_clamped(eqn):
-        yield from _index_columns(values[1], eqn.params["dimension_numbers"].start_index_map, eqn.params["slice_sizes"])
+        yield from _accesses_by_axis(
+            constant_inputs[1], eqn.params["dimension_numbers"].start_index_map, eqn.params["slice_sizes"]
+        )
 
 
-def _scatter_accesses(eqn, values):
+def _scatter_accesses(eqn, constant_inputs):
     numbers = eqn.params["dimension_numbers"]
     if is_silently_clamped(eqn):
         unit_axes = {*numbers.inserted_window_dims, *numbers.operand_batching_dims}
         updates = iter([eqn.invars[2].aval.shape[i] for i in numbers.update_window_dims])
         windows = [1 if i in unit_axes else next(updates) for i in range(eqn.invars[0].aval.ndim)]
-        yield from _index_columns(values[1], numbers.scatter_dims_to_operand_dims, windows)
+        yield from _accesses_by_axis(constant_inputs[1], numbers.scatter_dims_to_operand_dims, windows)
 
 
-def _index_columns(indices, axes, windows):
+def _accesses_by_axis(indices, axes, window_lengths):
     if indices is not None and indices.size:
-        yield from ((int(axis), indices[..., i], int(windows[axis])) for i, axis in enumerate(axes))
+        yield from ((int(axis), indices[..., i], int(window_lengths[axis])) for i, axis in enumerate(axes))
 
 
 INDEX_ACCESSES = {

@@ -13,8 +13,10 @@ from .builder import LimitExceededError, Scalar, elementwise, scalar_array
 Index = tuple[int, ...]
 
 
-def _candidate_windows(b, shape: Index, starts: Sequence[Scalar], sizes: Index) -> tuple[Scalar, list[tuple]]:
-    """Return all windows that one with these starts may be, and the number of the window that applies at run time.
+def _window_number_and_candidates(
+    b, shape: Index, starts: Sequence[Scalar], sizes: Index
+) -> tuple[Scalar, list[tuple]]:
+    """Return the run-time number of the window with these starts, and the windows that it counts.
 
     A window that sticks out of the array is moved inside.
     """
@@ -47,18 +49,18 @@ def _is_window_inside(b, shape: Index, starts: Sequence[Scalar], sizes: Index) -
 
 def read_window(b, x: np.ndarray, starts: Sequence[Scalar], sizes: Index) -> np.ndarray:
     """Return the entries in a window, shape ``sizes`` (``dynamic_slice``)."""
-    window_number, windows = _candidate_windows(b.real, x.shape, starts, sizes)
+    window_number, windows = _window_number_and_candidates(b.real, x.shape, starts, sizes)
     if len(windows) == 1:
         return x[windows[0]]
     entries = zip(*(x[window].ravel().tolist() for window in windows), strict=True)
     return scalar_array([b.pick(window_number, candidates) for candidates in entries], sizes)
 
 
-def update_window(
+def update_window_in_place(
     b, x: np.ndarray, starts: Sequence[Scalar], sizes: Index, change: Callable, condition: Scalar = True
 ) -> None:
     """Change the entries in a window to ``change(old)`` where the condition holds."""
-    window_number, windows = _candidate_windows(b.real, x.shape, starts, sizes)
+    window_number, windows = _window_number_and_candidates(b.real, x.shape, starts, sizes)
     for i, window in enumerate(windows):
         is_hit = b.real.op("and", condition, b.real.op("eq", window_number, i)) if len(windows) > 1 else condition
         x[window] = _select_array(b, is_hit, change(x[window]), x[window])
@@ -68,8 +70,8 @@ def _select_array(b, test: Scalar, x: np.ndarray, fallback) -> np.ndarray:
     return x if test is True else elementwise(lambda a, c: b.select(test, a, c), x, fallback)
 
 
-def _window_starts(
-    b, shape: Index, window_axes: Sequence[int], indices: np.ndarray, axes, batching, rank: int
+def _window_indices_and_starts(
+    b, shape: Index, window_axes: Sequence[int], indices: np.ndarray, axes, paired_batch_axes, rank: int
 ) -> Iterator:
     """Yield the index of each window in an array of this shape, whose own axes are ``window_axes``, and its starts."""
     batch = [range(n) if i not in window_axes else [slice(None)] for i, n in enumerate(shape)]
@@ -80,7 +82,7 @@ def _window_starts(
         start: list[Scalar] = [0] * rank
         for axis, i in zip(axes, indices[batch_index], strict=True):
             start[axis] = i
-        for axis, batch_axis in zip(*batching, strict=True):
+        for axis, batch_axis in zip(*paired_batch_axes, strict=True):
             start[axis] = batch_index[batch_axis]
         yield index, start
 
@@ -95,7 +97,9 @@ def gather(b, eqn, x: np.ndarray, indices: np.ndarray, fill_value: Scalar) -> np
     fills = eqn.params["mode"] == jax.lax.GatherScatterMode.FILL_OR_DROP
     batching = numbers.operand_batching_dims, numbers.start_indices_batching_dims
     window_shape, axes = [n for i, n in enumerate(sizes) if i not in dropped_axes], numbers.start_index_map
-    for index, start in _window_starts(b, result.shape, numbers.offset_dims, indices, axes, batching, x.ndim):
+    for index, start in _window_indices_and_starts(
+        b, result.shape, numbers.offset_dims, indices, axes, batching, x.ndim
+    ):
         window = read_window(b, x, start, sizes)
         is_inside = _is_window_inside(b.real, x.shape, start, sizes) if fills else True
         result[index] = _select_array(b, is_inside, window, fill_value).reshape(window_shape)[
@@ -121,8 +125,8 @@ def scatter(b, eqn, x: np.ndarray, indices: np.ndarray, updates: np.ndarray, com
     if not updates.size:
         return result
     axes = numbers.scatter_dims_to_operand_dims
-    for index, start in _window_starts(b, updates.shape, window_axes, indices, axes, batching, x.ndim):
+    for index, start in _window_indices_and_starts(b, updates.shape, window_axes, indices, axes, batching, x.ndim):
         new = updates[(*index, ...)].reshape(sizes)
         condition = True if clips else _is_window_inside(b.real, x.shape, start, sizes)  # updates outside are dropped
-        update_window(b, result, start, sizes, lambda old, new=new: elementwise(combine, old, new), condition)
+        update_window_in_place(b, result, start, sizes, lambda old, new=new: elementwise(combine, old, new), condition)
     return result

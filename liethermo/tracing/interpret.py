@@ -38,45 +38,47 @@ MAX_DEGREE_INSTRUCTIONS = 8_000
 """Largest number of instructions unrolled to find a degree; then :func:`array_degree_bound` gives a looser bound."""
 
 
-def evaluate_at_points(function: Callable, model: Any, points: np.ndarray) -> Any:
+def evaluate_at_points(function: Callable, pytree: Any, points: np.ndarray) -> Any:
     """Return ``function(model, x)`` for each x of ``points``, shape (m, n), as arrays whose first axis is the points.
 
     Parameters
     ----------
     function : function from a pytree and an array, shape (n,), to a pytree of float64 arrays
         It must not be a closure made anew for each call, because compiled versions are cached by its identity.
-    model : pytree
+    pytree : pytree
     points : array, shape (m, n)
     """
-    return batch_evaluator(function, model, np.shape(points)[1])(points)
+    return batch_evaluator(function, pytree, np.shape(points)[1])(points)
 
 
 @memoize
-def batch_evaluator(function: Callable, model: Any, dim: int) -> Callable[[np.ndarray], Any]:
+def batch_evaluator(function: Callable, pytree: Any, dim: int) -> Callable[[np.ndarray], Any]:
     """Unroll ``function(model, x)``, and return the map from points, shape (m, dim), to its values there."""
     if dim > MAX_UNROLLED_DIM:
-        return lambda points: _evaluate_compiled(function, model, points)
-    if has_plain_functions(model):
-        model = trace_callables(model, function, (dim,))
-    leaves, model_key, rebuild = _split_parameters(model)
+        return lambda points: _evaluate_compiled(function, pytree, points)
+    if has_plain_functions(pytree):
+        pytree = trace_callables(pytree, function, (dim,))
+    leaves, model_key, rebuild = _parameters_key_and_rebuilder(pytree)
     values = [np.asarray(leaf, dtype=np.float64) for leaf in leaves]
     zero_pattern = tuple((value == 0.0).tobytes() for value in values)  # zeros shorten the program
 
-    def unroll():
+    def unrolled_program_and_structure():
         shapes = [jax.ShapeDtypeStruct(value.shape, np.float64) for value in values]
         closed_jaxpr, result_shapes = jax.make_jaxpr(lambda arrays, x: function(rebuild(arrays), x), return_shape=True)(
             shapes, jax.ShapeDtypeStruct((dim,), np.float64)
         )
-        if not is_library_object(model):
+        if not is_library_object(pytree):
             check_indices(closed_jaxpr)
         zeros = [np.where(value == 0.0, 0.0, np.nan) for value in values]
         return scalarize(
             closed_jaxpr, [*zeros, None], max_instructions=MAX_INTERPRETED_INSTRUCTIONS
         ), jax.tree_util.tree_structure(result_shapes)
 
-    program_and_structure = _cached_result("program", (function, model_key, zero_pattern, dim), unroll)
+    program_and_structure = _cached_result_or_none(
+        "program", (function, model_key, zero_pattern, dim), unrolled_program_and_structure
+    )
     if program_and_structure is None:
-        return lambda points: _evaluate_compiled(function, model, points)
+        return lambda points: _evaluate_compiled(function, pytree, points)
     program, structure = program_and_structure
 
     def evaluate_chunk(points):
@@ -90,18 +92,18 @@ def batch_evaluator(function: Callable, model: Any, dim: int) -> Callable[[np.nd
                 np.concatenate(chunk_results) for chunk_results in zip(*map(evaluate_chunk, chunks), strict=True)
             ]
         except Exception:  # a fault of the interpreter; XLA is slower but right
-            return _evaluate_compiled(function, model, points)
+            return _evaluate_compiled(function, pytree, points)
         return jax.tree_util.tree_unflatten(structure, results)
 
     return evaluate
 
 
-def polynomial_degree(function: Callable, model: Any, dim: int) -> float:
+def polynomial_degree_bound(function: Callable, pytree: Any, dim: int) -> float:
     """Return an upper bound of the degree of ``function(model, x)`` in x, shape (dim,), for any parameters.
 
     The bound is infinite if the function is not written as a polynomial. The arrays of the model are the parameters.
     """
-    leaves, model_key, rebuild = _split_parameters(model)
+    leaves, model_key, rebuild = _parameters_key_and_rebuilder(pytree)
 
     def degree() -> float:
         shapes = [jax.ShapeDtypeStruct(np.shape(leaf), np.float64) for leaf in leaves]
@@ -116,16 +118,16 @@ def polynomial_degree(function: Callable, model: Any, dim: int) -> float:
             except UnsupportedPrimitive:
                 return array_degree_bound(closed_jaxpr, len(leaves))
 
-    return _cached_result("degree", (function, model_key, dim), degree)
+    return _cached_result_or_none("degree", (function, model_key, dim), degree)
 
 
-def vanishing_entries(function: Callable, model: Any, *shapes: tuple[int, ...]) -> frozenset[int]:
-    """Return the entries of ``function(model, *arrays)`` that are zero for any parameters and any arrays.
+def vanishing_entry_indices(function: Callable, pytree: Any, *shapes: tuple[int, ...]) -> frozenset[int]:
+    """Return the indices of the entries of ``function(model, *arrays)`` that are zero for any values of arrays.
 
     The arrays of the model are the parameters. Entries are counted in row-major order. The result is empty for a
     function that cannot be unrolled or that closes over a tracer.
     """
-    leaves, model_key, rebuild = _split_parameters(model)
+    leaves, model_key, rebuild = _parameters_key_and_rebuilder(pytree)
 
     def entries() -> frozenset[int]:
         arrays = [jax.ShapeDtypeStruct(shape, np.float64) for shape in (*map(np.shape, leaves), *shapes)]
@@ -136,12 +138,12 @@ def vanishing_entries(function: Callable, model: Any, *shapes: tuple[int, ...]) 
             (values,) = scalarize(closed_jaxpr, max_instructions=MAX_DEGREE_INSTRUCTIONS).outputs
         return frozenset(i for i, value in enumerate(values) if type(value) is not str and value == 0.0)
 
-    return _cached_result("zeros", (function, model_key, shapes), entries) or frozenset()
+    return _cached_result_or_none("zeros", (function, model_key, shapes), entries) or frozenset()
 
 
-def _split_parameters(model: Any) -> tuple[list, Any, Callable]:
+def _parameters_key_and_rebuilder(pytree: Any) -> tuple[list, Any, Callable]:
     """Return the parameters of a model (its float64 arrays), a key of all else, and a function that rebuilds it."""
-    dynamic, static = eqx.partition(model, _is_parameter)
+    dynamic, static = eqx.partition(pytree, _is_parameter)
     leaves, structure = jax.tree_util.tree_flatten(dynamic)
     model_key = fingerprint(static), structure, tuple(np.shape(leaf) for leaf in leaves)
     return leaves, model_key, lambda arrays: eqx.combine(jax.tree_util.tree_unflatten(structure, arrays), static)
@@ -154,7 +156,7 @@ def _is_parameter(leaf) -> bool:
 _unrolled_cache: LRUCache[Any] = LRUCache(128)
 
 
-def _cached_result(kind: str, key: tuple, compute: Callable) -> Any:
+def _cached_result_or_none(result_name: str, key: tuple, compute: Callable) -> Any:
     """Return ``compute()``, cached by a function and a model key; None if the function cannot be unrolled."""
 
     def compute_or_none():
@@ -164,20 +166,24 @@ def _cached_result(kind: str, key: tuple, compute: Callable) -> Any:
             return None
 
     _, model_key, *_ = key
-    return compute_or_none() if model_key[0] is None else _unrolled_cache.get_or_compute((kind, key), compute_or_none)
+    return (
+        compute_or_none()
+        if model_key[0] is None
+        else _unrolled_cache.get_or_compute((result_name, key), compute_or_none)
+    )
 
 
-def _evaluate_compiled(function: Callable, model: Any, points: np.ndarray) -> Any:
+def _evaluate_compiled(function: Callable, pytree: Any, points: np.ndarray) -> Any:
     # another function may be being traced; without one, compile-time evaluation would compile each constant
     is_tracing = is_traced(jnp.zeros(()))
     with jax.ensure_compile_time_eval() if is_tracing else contextlib.nullcontext():
-        return jax.tree_util.tree_map(np.asarray, _map_over_points(function, model, jnp.asarray(points)))
+        return jax.tree_util.tree_map(np.asarray, _map_over_points(function, pytree, jnp.asarray(points)))
 
 
 @jit_unoptimised
-def _map_over_points(function, model, points):
+def _map_over_points(function, pytree, points):
     def evaluate_point(x):
-        return function(model, x)
+        return function(pytree, x)
 
     # products of many large matrices at once are slower than one after another
     return (

@@ -35,7 +35,7 @@ class ConstantLifter:
     def lift_jaxpr(self, closed_jaxpr: ClosedJaxpr) -> tuple[Jaxpr, list, tuple]:
         """Return the jaxpr, its remaining constants, and its numbers: all scalars in one array, then the arrays."""
         body = _LiftedBody(self)
-        body.append_jaxpr(closed_jaxpr.jaxpr, closed_jaxpr.consts, closed_jaxpr.jaxpr.invars)
+        body.append_and_set_outputs(closed_jaxpr.jaxpr, closed_jaxpr.consts, closed_jaxpr.jaxpr.invars)
         used_vars = {a for eqn in body.equations for a in eqn.invars if type(a) is Var} | {
             a for a in body.outputs if type(a) is Var
         }
@@ -60,7 +60,7 @@ class ConstantLifter:
         """Return the jaxpr of a loop or branch with its numbers as first arguments, and these numbers."""
         body = _LiftedBody(self)
         argument_vars = [Var(v.aval) for v in closed_jaxpr.jaxpr.invars]
-        body.append_jaxpr(closed_jaxpr.jaxpr, closed_jaxpr.consts, argument_vars)
+        body.append_and_set_outputs(closed_jaxpr.jaxpr, closed_jaxpr.consts, argument_vars)
         invars = [v for v, _ in body.numbers] + argument_vars
         jaxpr = Jaxpr(
             list(body.constants),
@@ -85,7 +85,7 @@ class _LiftedBody:
         # variables that do not depend on the arguments: a number, or (equation, index of its output)
         self._argument_free: dict[Var, Any] = {}
 
-    def append_jaxpr(self, jaxpr: Jaxpr, consts: Sequence, arguments: Sequence) -> None:
+    def append_and_set_outputs(self, jaxpr: Jaxpr, consts: Sequence, arguments: Sequence) -> None:
         env: dict[Var, Any] = dict(zip(jaxpr.invars, arguments, strict=True))
         self.outputs = self._append_equations(jaxpr, consts, env)
 
@@ -113,7 +113,7 @@ class _LiftedBody:
                 )
                 env.update(zip(eqn.outvars, results, strict=True))
                 continue
-            constant_values = self._constant_outputs(eqn, inputs)
+            constant_values = self._folded_outputs_or_none(eqn, inputs)
             if constant_values is not None:
                 for var, value in zip(eqn.outvars, constant_values, strict=True):
                     inexact = _is_inexact(var.aval)
@@ -142,10 +142,10 @@ class _LiftedBody:
         self.constants[var] = self._argument_free[var] = value
         return var
 
-    def _lift_or_keep(self, var: Var, value, is_formula_input: bool):
+    def _lift_or_keep(self, var: Var, value, must_stay_constant: bool):
         if isinstance(value, jax.core.Tracer):
             return self._lift_number(value, var.aval)
-        if getattr(var.aval, "dtype", None) == np.float64 and not is_formula_input:
+        if getattr(var.aval, "dtype", None) == np.float64 and not must_stay_constant:
             return self._lift_number(value if isinstance(value, jax.Array) else np.asarray(value), var.aval)
         return self._keep_constant(Var(var.aval), value)
 
@@ -166,7 +166,7 @@ class _LiftedBody:
         else:
             if not self.lifter.has_while_loop:
                 self.lifter.has_while_loop = any(_has_while_loop(p) for p in params.values())
-            formula_index = _formula_input_index(name, inputs)
+            formula_index = _literal_input_index(name, inputs)
             inputs = [a if i == formula_index else self._lift_literals([a])[0] for i, a in enumerate(inputs)]
         return inputs, params
 
@@ -194,12 +194,12 @@ class _LiftedBody:
 
     # -- constant folding -----------------------------------------------------------------------------------------
 
-    def _constant_outputs(self, eqn: JaxprEqn, inputs: list) -> list | None:
-        """Return the outputs of an equation that depend on numbers only and belong to the operations, or None.
+    def _folded_outputs_or_none(self, eqn: JaxprEqn, inputs: list) -> list | None:
+        """Return the values of outputs that are integers, truth values or tables made from known numbers, or None.
 
         These are truth values and integers, and tables that are made from large arrays: a table is stored as a whole.
         """
-        makes_table = all(map(_is_table, eqn.outvars)) and any(
+        makes_table = all(map(_is_large_float64, eqn.outvars)) and any(
             math.prod(a.aval.shape) > MAX_INLINE_NUMBERS for a in inputs
         )
         if eqn.effects or (all(_is_inexact(v.aval) for v in eqn.outvars) and not makes_table):
@@ -232,12 +232,12 @@ def _expm_substitute(eqn: JaxprEqn) -> ClosedJaxpr | None:
     if eqn.params.get("name") != "expm" or len(eqn.invars) != 1:
         return None
     aval: Any = eqn.invars[0].aval
-    jax_key, substitute = _expm_jaxprs(jax.ShapeDtypeStruct(aval.shape, aval.dtype))
+    jax_key, substitute = _expm_key_and_substitute(jax.ShapeDtypeStruct(aval.shape, aval.dtype))
     return substitute if jax_key is not None and content_key(eqn.params["jaxpr"]) == jax_key else None
 
 
 @functools.lru_cache(maxsize=64)
-def _expm_jaxprs(shape) -> tuple[Hashable, ClosedJaxpr | None]:
+def _expm_key_and_substitute(shape) -> tuple[Hashable, ClosedJaxpr | None]:
     """Return a key of JAX's matrix exponential of an array and the jaxpr of the library's; None if no key is found."""
     outer = jax.make_jaxpr(jax.scipy.linalg.expm)(shape)
     expm_equations = [eqn for eqn in outer.eqns if eqn.params.get("name") == "expm"]
@@ -262,7 +262,7 @@ def _is_inexact(aval) -> bool:
     return dtype is not None and jnp.issubdtype(dtype, jnp.inexact)
 
 
-def _is_table(var: Var) -> bool:
+def _is_large_float64(var: Var) -> bool:
     aval: Any = var.aval
     return getattr(aval, "dtype", None) == np.float64 and aval.size > MAX_INLINE_NUMBERS
 
@@ -278,7 +278,7 @@ FORMULA_INPUTS = {"pow": (1, 2.0), "polygamma": (0, 1.0)}
 """Input that selects the formula of a primitive, and a factor; it stays a constant if their product is an integer."""
 
 
-def _formula_input_index(name: str, inputs: list) -> int | None:
+def _literal_input_index(name: str, inputs: list) -> int | None:
     """Return the index of the input that must stay a literal, or None."""
     index, factor = FORMULA_INPUTS.get(name, (0, 0.0))
     is_literal = factor and isinstance(inputs[index], Literal)

@@ -51,7 +51,7 @@ def _cached_call(*spec) -> LapackCall:
     return LapackCall(*spec)
 
 
-def matrix_product(b, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def matrix_product_by_loop(b, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return the product of two matrices, computed in a loop; a complex product is four real ones."""
     if not isinstance(b, ComplexBuilder):
         (table_x, strides_x), (table_y, strides_y) = _table_and_strides(b, x), _table_and_strides(b, y)
@@ -62,18 +62,18 @@ def matrix_product(b, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     (a, c), (d, e) = (
         [elementwise(lambda v, k=k: getattr(as_complex_pair(v), k), m) for k in ("re", "im")] for m in (x, y)
     )
-    ad, ce, ae, cd = (matrix_product(b.real, *factors) for factors in ((a, d), (c, e), (a, e), (c, d)))
+    ad, ce, ae, cd = (matrix_product_by_loop(b.real, *factors) for factors in ((a, d), (c, e), (a, e), (c, d)))
     return elementwise(ComplexPair, elementwise(b.real.sub, ad, ce), elementwise(b.real.add, ae, cd))
 
 
-def input_table(b, x: np.ndarray) -> tuple[str, tuple[int, int]] | None:
+def input_table_and_strides(b, x: np.ndarray) -> tuple[str, tuple[int, int]] | None:
     """Return the table of a matrix, or of its transpose, that is an input of the program, without a copy.
 
     The result is the name of the table and the distances in it between neighbouring rows and between neighbouring
     columns. It is None if the matrix is not an input.
     """
     names = x.ravel().tolist()
-    positions = b.input_indices(names)
+    positions = b.input_positions_or_none(names)
     if positions is None or len({array_index for array_index, _ in positions}) > 1:
         return None
     entry_indices = np.array([entry_index for _, entry_index in positions]).reshape(x.shape)
@@ -88,7 +88,7 @@ def input_table(b, x: np.ndarray) -> tuple[str, tuple[int, int]] | None:
 
 
 def _table_and_strides(b, x: np.ndarray) -> tuple[str, tuple[int, int]]:
-    return input_table(b, x) or (b.table(x.ravel().tolist()), (x.shape[1], 1))
+    return input_table_and_strides(b, x) or (b.table(x.ravel().tolist()), (x.shape[1], 1))
 
 
 def _map_matrices(b, eqn, x: np.ndarray, function) -> list[np.ndarray]:
@@ -112,7 +112,7 @@ def eigh(b, eqn, a):
     return _map_matrices(b, eqn, a, eigh_of_matrix)
 
 
-def _swap_rows(b, x: np.ndarray, k: int, pivot: Scalar) -> np.ndarray:
+def _with_swapped_rows(b, x: np.ndarray, k: int, pivot: Scalar) -> np.ndarray:
     """Return a matrix with row k and row ``pivot`` exchanged, where ``pivot >= k``."""
     x, row_k, candidate_rows = x.copy(), x[k].copy(), x[k:].copy()
     for j in range(x.shape[1]):
@@ -134,7 +134,7 @@ def _unrolled_lu(b, a: np.ndarray) -> tuple[np.ndarray, list[Scalar]]:
         for i, modulus in enumerate(moduli[1:], k + 1):
             is_larger = r.op("gt", modulus, max_modulus)
             max_modulus, pivot_index = r.select(is_larger, modulus, max_modulus), r.select(is_larger, i, pivot_index)
-        a = _swap_rows(b, a, k, pivot_index)
+        a = _with_swapped_rows(b, a, k, pivot_index)
         pivots.append(pivot_index)
         for i in range(k + 1, len(a)):
             factor = b.div(a[i, k], a[k, k])
@@ -158,7 +158,7 @@ def lu(b, eqn, a):
             pivots = [r.op("truncate", p) for p in pivot_values.tolist()]
         order = constant_array(np.arange(m)[:, None])
         for k, pivot in enumerate(pivots):
-            order = _swap_rows(r, order, k, pivot)
+            order = _with_swapped_rows(r, order, k, pivot)
         return factors, scalar_array(pivots, (len(pivots),)), order[:, 0]
 
     return _map_matrices(b, eqn, a, lu_of_matrix)
@@ -348,7 +348,7 @@ ZETA_DIRECT_TERMS = 10
 
 
 def zeta(b, s: Scalar, q: Scalar) -> Scalar:
-    """Return Hurwitz's ``sum_k (q + k)^-s`` by the formula of Euler and Maclaurin, term by term as XLA computes it.
+    """Return Hurwitz's zeta function ``sum_k (q + k)^-s`` by the Euler-Maclaurin formula, as XLA computes it.
 
     The formula holds for q < 0 and an integer s too, but the series is inaccurate unless ``q + 10`` is well above zero.
     """
@@ -403,7 +403,7 @@ def incomplete_gamma_rule(op: str):
 
 
 def polygamma(b, eqn, order, x):
-    """Return the derivative of ``digamma`` of a constant order."""
+    """Return the polygamma function: the derivative of ``digamma`` whose order is a known constant."""
 
     def polygamma_of(m, v):
         if type(m) is str:

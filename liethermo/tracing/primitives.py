@@ -20,7 +20,7 @@ from .builder import (
     as_complex_pair,
     constant_array,
     elementwise,
-    entries_along,
+    rows_along_axes,
     scalar_array,
 )
 from .calls import DeferredBlock
@@ -33,7 +33,7 @@ def _dtype(eqn, argument: int = 0) -> np.dtype:
     return eqn.invars[argument].aval.dtype
 
 
-def _numeric_rule(method: str) -> Rule:
+def _builder_method_rule(method: str) -> Rule:
     """Return the rule that applies a method of the builder to numbers."""
 
     def rule(b, eqn, *arrays):
@@ -73,7 +73,7 @@ def _identity(b, eqn, *arrays):
     return list(arrays)
 
 
-def _deferred_rule(b, eqn, *arrays):
+def _emit_deferred_block(b, eqn, *arrays):
     avals = [var.aval for var in eqn.outvars]
     results = b.emit_block(DeferredBlock(scalar_kinds(avals)), *flatten_scalars(arrays))
     return unflatten_scalars(iter(results), avals)
@@ -82,7 +82,7 @@ def _deferred_rule(b, eqn, *arrays):
 def _divide(b, eqn, x, y):
     if _dtype(eqn).kind in "iu":
         return _operation_rule("quotient")(b, eqn, x, y)
-    return _numeric_rule("div")(b, eqn, x, y)
+    return _builder_method_rule("div")(b, eqn, x, y)
 
 
 def _remainder(b, eqn, x, y):
@@ -151,7 +151,7 @@ def convert_dtype(b, x: np.ndarray, source: np.dtype, target: np.dtype) -> np.nd
 
 def _reduction_rule(combine: Callable[..., Scalar], start: Scalar | None = None) -> Rule:
     def rule(b, eqn, x):
-        rows, shape = entries_along(x, eqn.params["axes"])
+        rows, shape = rows_along_axes(x, eqn.params["axes"])
         if start is None and not all(rows):
             raise NotImplementedError("over an empty axis")
         empty: Any = 0.0 if start is None else constant_array(start, _dtype(eqn)).item()
@@ -160,11 +160,11 @@ def _reduction_rule(combine: Callable[..., Scalar], start: Scalar | None = None)
     return rule
 
 
-def _builder_method(name: str) -> Callable[..., Scalar]:
+def _method_combination(name: str) -> Callable[..., Scalar]:
     return lambda b, u, v: getattr(b, name)(u, v)
 
 
-def _builder_operation(op: str) -> Callable[..., Scalar]:
+def _operation_combination(op: str) -> Callable[..., Scalar]:
     return lambda b, u, v: b.op(op, u, v)
 
 
@@ -180,7 +180,7 @@ def _arg_extremum_rule(comparison: str) -> Rule:
         return index
 
     def rule(b, eqn, x):
-        rows, shape = entries_along(x, eqn.params["axes"])
+        rows, shape = rows_along_axes(x, eqn.params["axes"])
         return scalar_array([first_extremum_index(b, row) for row in rows], shape)
 
     return rule
@@ -189,7 +189,7 @@ def _arg_extremum_rule(comparison: str) -> Rule:
 def _cumulative_rule(combine: Callable[..., Scalar]) -> Rule:
     def rule(b, eqn, x):
         axis, step = eqn.params["axis"], -1 if eqn.params["reverse"] else 1
-        rows, shape = entries_along(x, (axis,))
+        rows, shape = rows_along_axes(x, (axis,))
         sums = [list(itertools.accumulate(row[::step], lambda u, v: combine(b, u, v)))[::step] for row in rows]
         return np.moveaxis(scalar_array([a for row in sums for a in row], (*shape, x.shape[axis])), -1, axis)
 
@@ -229,7 +229,7 @@ def _needs_loop(b, rows: np.ndarray, columns: np.ndarray) -> bool:
         return n_products > MAX_UNROLLED_OUTER_PRODUCTS
     if n_products > MAX_UNROLLED_PRODUCTS or n_products <= MAX_UNROLLED_INPUT_PRODUCTS:
         return n_products > MAX_UNROLLED_PRODUCTS
-    return any(min(x.shape) > 1 and algebra.input_table(b, x) is not None for x in (rows, columns))
+    return any(min(x.shape) > 1 and algebra.input_table_and_strides(b, x) is not None for x in (rows, columns))
 
 
 def _dot_general(b, eqn, x, y):
@@ -243,7 +243,7 @@ def _dot_general(b, eqn, x, y):
     dtype = eqn.outvars[0].aval.dtype
     lhs, rhs = (convert_dtype(b, operand, _dtype(eqn, i), dtype) for i, operand in enumerate((lhs, rhs)))
     if dtype.kind == "b":
-        logical_and = _builder_operation("and")
+        logical_and = _operation_combination("and")
         return scalar_array(
             [
                 reduce(lambda u, v: b.op("or", u, v), map(lambda u, v: logical_and(b, u, v), row, column), False)
@@ -257,7 +257,7 @@ def _dot_general(b, eqn, x, y):
         # skip zeros, such as those of structure constants
         sparse = [[(k, a) for k, a in enumerate(row) if not _is_zero(a)] for row in rows.tolist()]
         if dtype.kind in "fc" and _needs_loop(b, rows, columns):
-            result += algebra.matrix_product(b, rows, columns.T).ravel().tolist()
+            result += algebra.matrix_product_by_loop(b, rows, columns.T).ravel().tolist()
             continue
         for entries, column in itertools.product(sparse, columns.tolist()):
             result.append(reduce(b.add, (b.mul(a, column[k]) for k, a in entries), zero))
@@ -296,7 +296,7 @@ def _dynamic_slice(b, eqn, x, *starts):
 
 def _dynamic_update_slice(b, eqn, x, update, *starts):
     result = x.copy()
-    indexing.update_window(b, result, [i.item() for i in starts], update.shape, lambda old: update)
+    indexing.update_window_in_place(b, result, [i.item() for i in starts], update.shape, lambda old: update)
     return result
 
 
@@ -338,11 +338,11 @@ def _scatter_rule(combine: Callable[..., Scalar]) -> Rule:
 
 
 UNROLLING_RULES: dict[str, Rule] = {
-    **{name: _numeric_rule(name) for name in ("add", "sub", "mul", "neg", "logistic")},
+    **{name: _builder_method_rule(name) for name in ("add", "sub", "mul", "neg", "logistic")},
     "max": _extremum_rule("max", "or"),
     "min": _extremum_rule("min", "and"),
     "pow": _power,
-    "add_any": _numeric_rule("add"),
+    "add_any": _builder_method_rule("add"),
     "div": _divide,
     "rem": _remainder,
     "square": lambda b, eqn, x: elementwise(b.mul, x, x),
@@ -355,18 +355,18 @@ UNROLLING_RULES: dict[str, Rule] = {
     "select_n": _select,
     "convert_element_type": _convert,
     **dict.fromkeys(("stop_gradient", "copy", "copy_p", "name", "optimization_barrier"), _identity),
-    "reduce_sum": _reduction_rule(_builder_method("add"), 0),
-    "reduce_prod": _reduction_rule(_builder_method("mul"), 1),
-    "reduce_max": _reduction_rule(_builder_method("max")),
-    "reduce_min": _reduction_rule(_builder_method("min")),
-    "reduce_and": _reduction_rule(_builder_operation("and"), True),
-    "reduce_or": _reduction_rule(_builder_operation("or"), False),
+    "reduce_sum": _reduction_rule(_method_combination("add"), 0),
+    "reduce_prod": _reduction_rule(_method_combination("mul"), 1),
+    "reduce_max": _reduction_rule(_method_combination("max")),
+    "reduce_min": _reduction_rule(_method_combination("min")),
+    "reduce_and": _reduction_rule(_operation_combination("and"), True),
+    "reduce_or": _reduction_rule(_operation_combination("or"), False),
     "argmax": _arg_extremum_rule("gt"),
     "argmin": _arg_extremum_rule("lt"),
-    "cumsum": _cumulative_rule(_builder_method("add")),
-    "cumprod": _cumulative_rule(_builder_method("mul")),
-    "cummax": _cumulative_rule(_builder_method("max")),
-    "cummin": _cumulative_rule(_builder_method("min")),
+    "cumsum": _cumulative_rule(_method_combination("add")),
+    "cumprod": _cumulative_rule(_method_combination("mul")),
+    "cummax": _cumulative_rule(_method_combination("max")),
+    "cummin": _cumulative_rule(_method_combination("min")),
     "dot_general": _dot_general,
     "broadcast_in_dim": _rearrangement_rule(broadcast),
     "reshape": _rearrangement_rule(reshape),
@@ -386,17 +386,17 @@ UNROLLING_RULES: dict[str, Rule] = {
     "dynamic_slice": _dynamic_slice,
     "dynamic_update_slice": _dynamic_update_slice,
     "gather": _gather,
-    "scatter-add": _scatter_rule(_builder_method("add")),
-    "scatter-sub": _scatter_rule(_builder_method("sub")),
-    "scatter-mul": _scatter_rule(_builder_method("mul")),
-    "scatter-min": _scatter_rule(_builder_method("min")),
-    "scatter-max": _scatter_rule(_builder_method("max")),
+    "scatter-add": _scatter_rule(_method_combination("add")),
+    "scatter-sub": _scatter_rule(_method_combination("sub")),
+    "scatter-mul": _scatter_rule(_method_combination("mul")),
+    "scatter-min": _scatter_rule(_method_combination("min")),
+    "scatter-max": _scatter_rule(_method_combination("max")),
     "real": lambda b, eqn, x: elementwise(lambda a: as_complex_pair(a).re, x),
     "imag": lambda b, eqn, x: elementwise(lambda a: as_complex_pair(a).im, x),
     "conj": lambda b, eqn, x: elementwise(b.conj, x),
     "complex": lambda b, eqn, x, y: elementwise(ComplexPair, x, y),
     "eigh": algebra.eigh,
-    "deferred": _deferred_rule,
+    "deferred": _emit_deferred_block,
     "inverse": algebra.inverse,
     "lu": algebra.lu,
     "qr": algebra.qr,

@@ -116,19 +116,19 @@ class Program:
             initial_values.append(value)
             return len(initial_values) - 1
 
-        def read(args) -> list[int]:
+        def slots_of(args) -> list[int]:
             return [slots[a] if type(a) is str else new_slot(a) for a in args]
 
         slots.update((name, new_slot()) for names in self.inputs for name in names)
-        input_slots, instructions = [read(names) for names in self.inputs], []
+        input_slots, instructions = [slots_of(names) for names in self.inputs], []
         for i, (target, op, args) in enumerate(self.instructions):
-            argument_slots = read(args)
+            argument_slots = slots_of(args)
             free_slots += [slots[a] for a in set(args) if type(a) is str and last_use[a] == i]
             slots[target] = free_slots.pop() if free_slots else new_slot()
             instructions.append((implementation(op), slots[target], argument_slots))
             if target not in last_use:
                 free_slots.append(slots[target])
-        output_slots = [read(entries) for entries in self.outputs]
+        output_slots = [slots_of(entries) for entries in self.outputs]
         return _InterpretationPlan(input_slots, initial_values, instructions, output_slots)
 
     def degree(self, input_index: int) -> float:
@@ -139,10 +139,10 @@ class Program:
         input_index : int
             Index of the input array.
         """
-        return self._propagate_degrees(dict.fromkeys(self.inputs[input_index], 1))
+        return self._output_degree_bound(dict.fromkeys(self.inputs[input_index], 1))
 
-    def _propagate_degrees(self, degrees: dict[Scalar, float]) -> float:
-        """Return the largest degree of an output, from the degrees of some inputs; the other inputs have degree 0."""
+    def _output_degree_bound(self, degrees: dict[Scalar, float]) -> float:
+        """Return the largest degree of an output; add the degree of each instruction to ``degrees``."""
         for target, op, args in self.instructions:
             argument_degrees = [degrees.get(a, 0) for a in args]
             if op in ("add", "sub", "neg", "table", "item", "column"):
@@ -150,7 +150,7 @@ class Program:
             elif op == "mul" or isinstance(op, MatrixProduct):
                 degrees[target] = sum(argument_degrees)
             elif isinstance(op, Routine):
-                degrees[target] = op.program._propagate_degrees(
+                degrees[target] = op.program._output_degree_bound(
                     dict(zip(op.program.inputs[0], argument_degrees, strict=True))
                 )
             elif op == "div" and not argument_degrees[1]:
@@ -159,18 +159,17 @@ class Program:
                 degrees[target] = math.inf if any(argument_degrees) else 0
         return max((degrees.get(a, 0) for entries in self.outputs for a in entries), default=0)
 
-    def factor_constants(self, varying: Sequence[int]) -> Program:
-        """Return an equivalent program that multiplies ``(v a) b`` as ``v (a b)`` if a and b do not depend on some
-        inputs.
+    def regroup_constant_factors(self, varying_inputs: Sequence[int]) -> Program:
+        """Return an equivalent program that multiplies constant factors first: ``(v a) b`` becomes ``v (a b)``.
 
         A loop that changes only these inputs then computes ``a b`` once.
 
         Parameters
         ----------
-        varying : sequence of int
+        varying_inputs : sequence of int
             Indices of these inputs.
         """
-        dependent: set[Scalar] = {name for i in varying for name in self.inputs[i]}
+        dependent: set[Scalar] = {name for i in varying_inputs for name in self.inputs[i]}
         products: dict[Scalar, tuple[Scalar, Scalar]] = {}
         factors: dict[tuple[Scalar, Scalar], str] = {}
         instructions: list[Instruction] = []
@@ -300,7 +299,7 @@ class Routine(Block):
 # -- dead code --------------------------------------------------------------------------------------------------------
 
 
-def eliminate_dead_code(
+def live_instructions_and_new_names(
     instructions: Sequence[Instruction], results: Sequence[Scalar]
 ) -> tuple[tuple[Instruction, ...], dict[Scalar, str]]:
     """Return the instructions that the results depend on, each as late as its first use allows, and their new names.

@@ -36,7 +36,7 @@ UNOPTIMISED_XLA_OPTIONS = {"xla_backend_optimization_level": 0, "xla_cpu_use_fus
 """Options for a program that runs once or twice: optimising it, or fusing its loops, takes longer than it saves."""
 
 
-def jit_program(function: FunctionT) -> FunctionT:
+def jit_cached(function: FunctionT) -> FunctionT:
     """Decorator: compile a function of pytrees; arrays are its arguments, and other leaves are part of the program."""
     return _jit_with_options(function, None)
 
@@ -78,9 +78,9 @@ def _jit_with_options(function: FunctionT, options: dict | None) -> FunctionT:
     return call  # type: ignore[return-value]
 
 
-def _is_being_traced(dynamic: tuple) -> bool:
+def _is_being_traced(arrays: tuple) -> bool:
     """Return whether a call belongs to a program that is being traced, whose own options apply."""
-    return is_traced(dynamic, jnp.zeros(()))
+    return is_traced(arrays, jnp.zeros(()))
 
 
 def _strip_weak_type(array):

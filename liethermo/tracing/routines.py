@@ -14,7 +14,7 @@ from .caching import LRUCache
 from .calls import MatrixProduct
 from .complex_numbers import flatten_scalars, scalar_kinds, unflatten_scalars
 from .primitives import MAX_UNROLLED_INPUT_PRODUCTS
-from .program import Program, Routine, eliminate_dead_code
+from .program import Program, Routine, live_instructions_and_new_names
 
 MIN_ROUTINE_PRODUCTS = 2
 """Smallest number of products of matrices, as loops, for which a function becomes a routine."""
@@ -39,7 +39,7 @@ def has_matrix_products(jaxpr) -> bool:
     return False
 
 
-def call_as_routine(
+def call_routine_or_unroll(
     b: Builder, unroll: Callable, closed_jaxpr: ClosedJaxpr, arguments: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
     """Return the results of a function, computed by a routine if it is long enough, and unrolled otherwise.
@@ -53,7 +53,7 @@ def call_as_routine(
         Unrolls a jaxpr: :func:`.scalarize._unroll_jaxpr`.
     """
     scalars = flatten_scalars(arguments)
-    input_positions = [b.input_indices(x.ravel().tolist()) if x.ndim > 1 else None for x in arguments]
+    input_positions = [b.input_positions_or_none(x.ravel().tolist()) if x.ndim > 1 else None for x in arguments]
     integer_values = [a if type(a) in (int, bool) else None for a in scalars]
     key = (
         id(closed_jaxpr),
@@ -112,7 +112,7 @@ class _RoutineCall:
             )
         )
         computed_results = [a for a in results if type(a) is str and a not in argument_indices]
-        instructions, new_names = eliminate_dead_code(inner_builder.instructions, computed_results)
+        instructions, new_names = live_instructions_and_new_names(inner_builder.instructions, computed_results)
         blocks = [i.op for i in instructions if isinstance(i.op, MatrixProduct | Routine)]
         if (
             len(instructions) <= MIN_ROUTINE_INSTRUCTIONS

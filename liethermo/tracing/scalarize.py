@@ -25,8 +25,8 @@ from . import indexing
 from .builder import Builder, EnclosingScope, LimitExceededError, Scalar, constant_array, elementwise, scalar_array
 from .complex_numbers import ComplexBuilder, flatten_scalars, scalar_kinds, unflatten_scalars
 from .primitives import SUPPORTED_PARAMETERS, UNROLLING_RULES
-from .program import Program, ScanLoop, WhileLoop, eliminate_dead_code
-from .routines import MIN_ROUTINE_INSTRUCTIONS, call_as_routine, has_matrix_products
+from .program import Program, ScanLoop, WhileLoop, live_instructions_and_new_names
+from .routines import MIN_ROUTINE_INSTRUCTIONS, call_routine_or_unroll, has_matrix_products
 
 MAX_INSTRUCTIONS = 200_000
 """Largest number of instructions of a program: far more than compile in reasonable time."""
@@ -134,7 +134,9 @@ def scalarize(
 
 def _collect_program(b: Builder, inputs: Sequence, outputs: Sequence[Sequence[Scalar]], shapes: Sequence) -> Program:
     """Return the program of a builder, without instructions that the outputs do not need."""
-    instructions, new_names = eliminate_dead_code(b.instructions, [a for entries in outputs for a in entries])
+    instructions, new_names = live_instructions_and_new_names(
+        b.instructions, [a for entries in outputs for a in entries]
+    )
     return Program(
         tuple(map(tuple, inputs)),
         instructions,
@@ -154,7 +156,7 @@ def _unroll_jaxpr(b: Builder, jaxpr, consts, arguments: Sequence[np.ndarray]) ->
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
         try:
-            is_complex = _check_equation(eqn)
+            is_complex = _check_and_return_is_complex(eqn)
             control_rule = CONTROL_FLOW_RULES.get(name)
             eqn_builder = ComplexBuilder(b) if is_complex and control_rule is None else b
             outputs = (control_rule or UNROLLING_RULES.get(name) or _refuse_primitive)(
@@ -188,7 +190,7 @@ def _refuse_primitive(b, eqn, *arguments):
     raise NotImplementedError
 
 
-def _check_equation(eqn) -> bool:
+def _check_and_return_is_complex(eqn) -> bool:
     """Refuse parameters and dtypes that the rules do not handle; return whether the equation has complex numbers."""
     if eqn.primitive.name in UNROLLING_RULES:
         for name, value in eqn.params.items():
@@ -262,11 +264,11 @@ def _unroll_call(b, inner, arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
     if not isinstance(inner, ClosedJaxpr):
         return _unroll_jaxpr(b, inner, (), arguments)
     if has_matrix_products(inner.jaxpr):
-        return call_as_routine(b, _unroll_jaxpr, inner, arguments)
+        return call_routine_or_unroll(b, _unroll_jaxpr, inner, arguments)
     return _unroll_jaxpr(b, inner.jaxpr, inner.consts, arguments)
 
 
-def _matrix_function_chain(b, eqn, *arguments):
+def _divided_difference_chain(b, eqn, *arguments):
     """Unroll a chain of divided differences of a matrix function, by routines that all chains share."""
     (out_aval,), rank = (var.aval for var in eqn.outvars), arguments[0].ndim - 2
     function, slots = eqn.params["function"], eqn.params["slots"]
@@ -278,8 +280,8 @@ def _matrix_function_chain(b, eqn, *arguments):
         decomposition_avals: list = []
         # equal matrices are decomposed once, because equal calls merge
         for x, aval in zip(operands[:n_matrices], avals, strict=False):
-            closed_jaxpr = _traced_jaxpr(_prepare_chain_matrix, function, aval)
-            decompositions += call_as_routine(b, _unroll_jaxpr, closed_jaxpr, [x])
+            closed_jaxpr = _traced_jaxpr(_decompose_for_chain, function, aval)
+            decompositions += call_routine_or_unroll(b, _unroll_jaxpr, closed_jaxpr, [x])
             decomposition_avals += closed_jaxpr.out_avals
         closed_jaxpr = _traced_jaxpr(
             _apply_chain,
@@ -287,27 +289,29 @@ def _matrix_function_chain(b, eqn, *arguments):
             *decomposition_avals,
             *avals[n_matrices:],
         )
-        (result[index],) = call_as_routine(b, _unroll_jaxpr, closed_jaxpr, [*decompositions, *operands[n_matrices:]])
+        (result[index],) = call_routine_or_unroll(
+            b, _unroll_jaxpr, closed_jaxpr, [*decompositions, *operands[n_matrices:]]
+        )
     return result
 
 
-def _prepare_chain_matrix(function: chains.MatrixFunction, a):
+def _decompose_for_chain(function: chains.MatrixFunction, a):
     """Decompose a matrix for the chains of a function."""
     return function.decompose(a, unrolled=True)
 
 
-def _apply_chain(chain: tuple[chains.MatrixFunction, tuple[int, ...], int], *arguments):
-    """Evaluate a chain of a function at some slots, from decomposed matrices of ``n_arrays`` arrays each."""
-    function, slots, n_arrays = chain
+def _apply_chain(function_slots_and_count: tuple[chains.MatrixFunction, tuple[int, ...], int], *arguments):
+    """Return a chain of divided differences of a matrix function, from the decompositions of its matrices."""
+    function, slots, n_arrays = function_slots_and_count
     end = len(arguments) - len(slots)
     decompositions = [arguments[i : i + n_arrays] for i in range(0, end, n_arrays)]
     return (function.chain(decompositions, slots, arguments[end], arguments[end + 1 :], unrolled=True),)
 
 
 @functools.lru_cache(maxsize=256)
-def _traced_jaxpr(function, argument, *avals) -> ClosedJaxpr:
+def _traced_jaxpr(function, static_argument, *avals) -> ClosedJaxpr:
     """Return the jaxpr of a function with a static argument; equal functions give one object, and so one routine."""
-    return jax.make_jaxpr(functools.partial(function, argument))(*avals)
+    return jax.make_jaxpr(functools.partial(function, static_argument))(*avals)
 
 
 def _linear_solve(b, eqn, *arguments):
@@ -353,8 +357,8 @@ class _LoopScope(EnclosingScope):
         body_builder = Builder(self.builder.max_instructions, self)
         return body_builder, _unroll_jaxpr(body_builder, closed_jaxpr.jaxpr, closed_jaxpr.consts, arguments)
 
-    def variables_read(self, builders: Sequence[Builder], results: Sequence[Scalar]) -> dict[Scalar, str]:
-        """Return the outer scalars that these programs and results read; discarded passes may have read more."""
+    def outer_scalars_read(self, builders: Sequence[Builder], results: Sequence[Scalar]) -> dict[Scalar, str]:
+        """Return the names inside of the outer scalars that these instructions and results read, by outer scalar."""
         names = {*results, *(a for b in builders for i in b.instructions for a in i.args)}
         return {a: name for a, name in self.inner_names.items() if name in names}
 
@@ -370,7 +374,7 @@ class _LoopCarry:
     def arrays(self) -> list[np.ndarray]:
         return unflatten_scalars(iter(self.entries), self.avals)
 
-    def release_changed(self, results: Sequence[np.ndarray]) -> str:
+    def release_changed_constants(self, results: Sequence[np.ndarray]) -> str:
         """Make the constants that a pass has changed variables; return their kinds, "" if nothing has changed."""
         changed_indices = [
             i
@@ -421,7 +425,7 @@ def _while_loop(b, eqn, *arguments):
                 )
                 for x, old, aval in zip(results, carry.arrays, carry.avals, strict=True)
             ]
-        if not carry.release_changed(results):
+        if not carry.release_changed_constants(results):
             break
     is_running: Scalar = False
     for lane_test in test_values.ravel().tolist():
@@ -429,13 +433,13 @@ def _while_loop(b, eqn, *arguments):
     if is_running is False:
         return list(arguments[carry_start:])
     next_carry = flatten_scalars(results)
-    variables = scope.variables_read((test_builder, body_builder), [is_running, *next_carry])
+    variables = scope.outer_scalars_read((test_builder, body_builder), [is_running, *next_carry])
     inputs = [variables.values(), [carry.entries[i] for i in carry.variable_indices]]
     loop = WhileLoop(
         _collect_program(test_builder, inputs, [[is_running]], [()]),
         _collect_program(
             body_builder, inputs, [[next_carry[i] for i in carry.variable_indices]], [(len(carry.variable_indices),)]
-        ).factor_constants([1]),
+        ).regroup_constant_factors([1]),
         carry.kinds,
     )
     return carry.final_arrays(b.emit_block(loop, *variables, *(carry.start[i] for i in carry.variable_indices)))
@@ -463,7 +467,9 @@ def _scan(b, eqn, *arguments):
     params = eqn.params
     inner, n_consts, carry_end = params["jaxpr"], params["num_consts"], params["num_consts"] + params["num_carry"]
     if params["length"] > 2:
-        loop_results = _scan_as_loop(b, eqn, arguments[:n_consts], arguments[n_consts:carry_end], arguments[carry_end:])
+        loop_results = _scan_as_loop_if_long(
+            b, eqn, arguments[:n_consts], arguments[n_consts:carry_end], arguments[carry_end:]
+        )
         if loop_results is not None:
             return loop_results
     carry, tables = list(arguments[n_consts:carry_end]), arguments[carry_end:]
@@ -484,20 +490,20 @@ def _scan(b, eqn, *arguments):
     return carry + stacked_outputs
 
 
-def _scan_as_loop(b, eqn, constants, start, slices) -> list[np.ndarray] | None:
+def _scan_as_loop_if_long(b, eqn, constants, carry_start, row_tables) -> list[np.ndarray] | None:
     """Build the block of a loop of known length; return None if the loop is short enough to be unrolled."""
     length, closed_jaxpr, avals = eqn.params["length"], eqn.params["jaxpr"], [var.aval for var in eqn.invars]
-    n_consts, carry_end = len(constants), len(constants) + len(start)
-    scope, carry = _LoopScope(b), _LoopCarry(start, avals[n_consts:carry_end])
+    n_consts, carry_end = len(constants), len(constants) + len(carry_start)
+    scope, carry = _LoopScope(b), _LoopCarry(carry_start, avals[n_consts:carry_end])
     loop_constants = scope.import_arrays(constants, avals[:n_consts])
     row_avals = [aval.update(shape=aval.shape[1:]) for aval in avals[carry_end:]]
-    columns = list(zip(*(flatten_scalars([x[i, ...] for x in slices]) for i in range(length)), strict=True))
+    columns = list(zip(*(flatten_scalars([x[i, ...] for x in row_tables]) for i in range(length)), strict=True))
     names = [f"x2_{j}" for j in range(len(columns))]
     row = unflatten_scalars(iter(names), row_avals)
     passes_agree = not columns
     while True:
         pass_builder, results = scope.unroll_body(closed_jaxpr, [*loop_constants, *carry.arrays, *row])
-        if not (changed_kinds := carry.release_changed(results[: len(start)])):
+        if not (changed_kinds := carry.release_changed_constants(results[: len(carry_start)])):
             break
         passes_agree = passes_agree and "i" not in changed_kinds
     if passes_agree or length > MAX_SHORT_LOOP_PASSES:
@@ -513,10 +519,10 @@ def _scan_as_loop(b, eqn, constants, start, slices) -> list[np.ndarray] | None:
             return None
     variable_indices, next_carry, row_results = (
         carry.variable_indices,
-        flatten_scalars(results[: len(start)]),
-        flatten_scalars(results[len(start) :]),
+        flatten_scalars(results[: len(carry_start)]),
+        flatten_scalars(results[len(carry_start) :]),
     )
-    variables = scope.variables_read([pass_builder], [*next_carry, *row_results])
+    variables = scope.outer_scalars_read([pass_builder], [*next_carry, *row_results])
     inputs = [variables.values(), [carry.entries[i] for i in variable_indices], names]
     body = _collect_program(
         pass_builder,
@@ -524,7 +530,7 @@ def _scan_as_loop(b, eqn, constants, start, slices) -> list[np.ndarray] | None:
         [[next_carry[i] for i in variable_indices], row_results],
         [(len(variable_indices),), (len(row_results),)],
     )
-    row_output_avals = [var.aval for var in closed_jaxpr.jaxpr.outvars[len(start) :]]
+    row_output_avals = [var.aval for var in closed_jaxpr.jaxpr.outvars[len(carry_start) :]]
     loop = ScanLoop(length, eqn.params["reverse"], body, carry.kinds, scalar_kinds(row_output_avals))
     tables = [b.table(column) for column in columns]
     loop_results = b.emit_block(loop, *variables, *(carry.start[i] for i in variable_indices), *tables)
@@ -535,7 +541,7 @@ def _scan_as_loop(b, eqn, constants, start, slices) -> list[np.ndarray] | None:
     ]
     stacked_outputs = [
         scalar_array([a for row in row_arrays for a in row[k].ravel().tolist()], var.aval.shape)
-        for k, var in enumerate(eqn.outvars[len(start) :])
+        for k, var in enumerate(eqn.outvars[len(carry_start) :])
     ]
     return carry.final_arrays(loop_results[: len(variable_indices)]) + stacked_outputs
 
@@ -557,7 +563,7 @@ CALL_PRIMITIVES = "jit pjit call closed_call core_call custom_jvp_call custom_vj
 CONTROL_FLOW_RULES = {
     **dict.fromkeys(CALL_PRIMITIVES.split(), _call),
     "custom_linear_solve": _linear_solve,
-    chains.chain_p.name: _matrix_function_chain,
+    chains.chain_p.name: _divided_difference_chain,
     "cond": _cond,
     "scan": _scan,
     "scatter": _scatter,

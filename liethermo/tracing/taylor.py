@@ -50,7 +50,7 @@ def check_taylor_series(function: Callable, x) -> None:
     jax.eval_shape(lambda x: _Recurrences(function, x).evaluation_order and (), jnp.zeros_like(x))
 
 
-def taylor_coefficients(field: Callable, x, h, order: int) -> jax.Array:
+def increment_taylor_coefficients(field: Callable, x, h, order: int) -> jax.Array:
     """Return the coefficients ``c_1 ... c_order``, shape (order, n), of ``x(h s) = x + c_1 s + c_2 s^2 + ...``.
 
     This x(h s) is the solution of ``x' = field(x)`` that begins at x, shape (n,). The coefficients are computed one
@@ -66,13 +66,13 @@ def taylor_coefficients(field: Callable, x, h, order: int) -> jax.Array:
         return jnp.zeros((order, *x.shape)).at[0].set(h * recurrences.constant)
     histories = {
         i: _store_coefficient(jnp.zeros((order, *start.shape), start.dtype), start, 0)
-        for i, start in recurrences.history_starts()
+        for i, start in recurrences.indexed_history_starts()
     }
 
     def coefficient(carry, numbers):
         histories, rate = carry
         n, n_float = numbers
-        rate, histories = recurrences.next_coefficient(n, n_float, rate / n_float, histories)
+        rate, histories = recurrences.next_coefficient_and_histories(n, n_float, rate / n_float, histories)
         return (histories, h * rate), carry[1] / n_float
 
     numbers = np.arange(1, order), np.arange(1.0, order)
@@ -135,7 +135,9 @@ class _Recurrences:
         self.constant = result
         self.evaluation_order = [] if self.result is None else self._topological_order(self.result)
 
-    def next_coefficient(self, n, n_float, argument_coefficient, histories: dict) -> tuple[jax.Array, dict]:
+    def next_coefficient_and_histories(
+        self, n, n_float, argument_coefficient, histories: dict
+    ) -> tuple[jax.Array, dict]:
         """Return coefficient n of the result from that of the argument, and the histories with coefficients n added."""
         coefficients: dict[int, Any] = {}
         histories = dict(histories)
@@ -156,7 +158,7 @@ class _Recurrences:
         assert self.result is not None
         return coefficients[self.result], histories
 
-    def history_starts(self):
+    def indexed_history_starts(self):
         """Return the index and coefficient 0 of each term whose history is needed."""
         indices = sorted({i for term_index in self.evaluation_order for i in self.terms[term_index].history_terms})
         return [(i, self.terms[i].start) for i in indices]
@@ -193,7 +195,7 @@ class _Recurrences:
         return isinstance(value, _SeriesIndex) and self.terms[value.term_index].starts_at_zero
 
     def inline(self, function: Callable, values: Sequence) -> list:
-        """Apply a function from arrays to a list of arrays to values that are constants or series."""
+        """Return the results of a function, as a list, for arguments that are constants or series."""
         avals = [jax.ShapeDtypeStruct(np.shape(a), jnp.result_type(a)) for a in map(self.initial_value, values)]
         closed_jaxpr = jax.make_jaxpr(function)(*avals)
         return self.evaluate_jaxpr(closed_jaxpr.jaxpr, closed_jaxpr.consts, values)
@@ -218,7 +220,7 @@ class _Recurrences:
             ):
                 results = _evaluate_equation(eqn, map(self.initial_value, arguments))  # tests use the initial values
             else:
-                results = SERIES_RULES.get(name, _refuse_series)(self, eqn, arguments)
+                results = SERIES_RULES.get(name, _start_only_rule)(self, eqn, arguments)
             env.update(zip(eqn.outvars, results, strict=True))
         return [read(v) for v in jaxpr.outvars]
 
@@ -226,8 +228,8 @@ class _Recurrences:
 # -- rules: rule(recurrences, equation, values) -> list of results ----------------------------------------------------
 
 
-def _refuse_series(recurrences: _Recurrences, eqn, values) -> list:
-    """Return terms with only a start, which suffices for tests; any other use raises TaylorSeriesError."""
+def _start_only_rule(recurrences: _Recurrences, eqn, values) -> list:
+    """Return terms that have a start but no rule, which suffices for tests; other uses raise TaylorSeriesError."""
     return [
         recurrences.add_term(start, None, refusal=(eqn.primitive.name, user_source_line(eqn)))
         for start in _evaluate_equation(eqn, map(recurrences.initial_value, values))
@@ -240,7 +242,7 @@ def _linear_rule(recurrences: _Recurrences, eqn, values) -> list:
 
     def rule(n, n_float, current, history, output_number):
         coefficients = iter(current)
-        arguments = [_higher_coefficient(value, coefficients) for value in values]
+        arguments = [_next_coefficient_or_zero(value, coefficients) for value in values]
         return _evaluate_equation(eqn, arguments)[output_number]
 
     starts_at_zero = all(recurrences.terms[i].starts_at_zero for i in series_indices)
@@ -250,7 +252,7 @@ def _linear_rule(recurrences: _Recurrences, eqn, values) -> list:
     ]
 
 
-def _higher_coefficient(value, coefficients):
+def _next_coefficient_or_zero(value, coefficients):
     """Return a coefficient of order one or more: the next of the iterator ``coefficients``, or zero for a constant."""
     if isinstance(value, _SeriesIndex):
         return next(coefficients)
@@ -324,18 +326,18 @@ def _linear_solve_rule(recurrences: _Recurrences, eqn, values) -> list:
     lengths, jaxprs = eqn.params["const_lengths"], eqn.params["jaxprs"]
     constants, right_sides = list(values[: sum(lengths)]), values[sum(lengths) :]
     if len(right_sides) > 1:
-        return _refuse_series(recurrences, eqn, values)
+        return _start_only_rule(recurrences, eqn, values)
     (b,), starts = right_sides, [recurrences.initial_value(value) for value in constants]
     shape = np.shape(recurrences.initial_value(b))
     basis = np.eye(int(np.prod(shape)))
 
-    def columns(*matvec_constants):
+    def matrix_columns(*matvec_constants):
         product = jaxpr_as_fun(jaxprs.matvec)
         return [
             jax.vmap(lambda basis_vector: product(*matvec_constants, basis_vector.reshape(shape))[0].ravel())(basis)
         ]
 
-    (matrix,) = recurrences.inline(columns, values[: lengths.matvec])
+    (matrix,) = recurrences.inline(matrix_columns, values[: lengths.matvec])
     if not isinstance(matrix, _SeriesIndex):
         return _linear_rule(recurrences, eqn, values)  # linear in b; the other values are constants of the other jaxprs
 
@@ -408,12 +410,12 @@ def _power_rule(recurrences: _Recurrences, eqn, values) -> list:
     else:  # the exponent is a parameter
         exponents, integers = p, list(range(MAX_INTEGER_PARAMETER + 1))
 
-    def select_power(x, result):
+    def replace_integer_powers(x, result):
         for n in integers:
             result = jnp.where(exponents == n, _power_by_squaring(x, n), result)
         return [result]
 
-    return recurrences.inline(select_power, [a, *_derivative_rule(recurrences, eqn, values)])
+    return recurrences.inline(replace_integer_powers, [a, *_derivative_rule(recurrences, eqn, values)])
 
 
 def _is_small_constant(value) -> bool:
@@ -439,7 +441,7 @@ def _euler_derivative(recurrences: _Recurrences, a: _SeriesIndex) -> _SeriesInde
 
 
 def _power_derivative(recurrences: _Recurrences, y: _SeriesIndex, a, p) -> list:
-    """Return ``D y = y (p D a / a + log(a) D p)``; JAX's rule contains another power, and so on without end."""
+    """Return the Euler derivative ``D y = y (p D a / a + log(a) D p)`` of ``y = a**p``."""
     if not isinstance(p, _SeriesIndex):
         return recurrences.inline(
             lambda y, a, p, da: [y * (p * (da / a))], [y, a, p, _euler_derivative(recurrences, a)]
@@ -452,7 +454,7 @@ def _power_derivative(recurrences: _Recurrences, y: _SeriesIndex, a, p) -> list:
     return recurrences.inline(lambda y, a, p, da, dp: [y * (p * (da / a) + jnp.log(a) * dp)], [y, a, p, *rates])
 
 
-def _rewriting_rule(function: Callable) -> Callable:
+def _make_rewriting_rule(function: Callable) -> Callable:
     """Return the rule that writes a primitive in terms of others: ``function(parameters, *arguments)``."""
     return lambda recurrences, eqn, values: recurrences.inline(lambda *a: [function(eqn.params, *a)], values)
 
@@ -461,16 +463,16 @@ def _integer_power_expression(params, x):
     return _power_by_squaring(x, params["y"])
 
 
-def _power_by_squaring(x, y: int):
+def _power_by_squaring(x, exponent: int):
     def power(n: int):
         if n == 1:
             return x
         half = power(n // 2)
         return half * half * x if n % 2 else half * half
 
-    if y == 0:
+    if exponent == 0:
         return jnp.ones_like(x)
-    return power(y) if y > 0 else 1.0 / power(-y)
+    return power(exponent) if exponent > 0 else 1.0 / power(-exponent)
 
 
 def _call_rule(recurrences: _Recurrences, eqn, values) -> list:
@@ -484,12 +486,12 @@ def _cond_rule(recurrences: _Recurrences, eqn, values) -> list:
     branch_index, *values = values
     results = [recurrences.evaluate_jaxpr(branch.jaxpr, branch.consts, values) for branch in eqn.params["branches"]]
 
-    def choice(index, *cases):
+    def selected_case(index, *cases):
         index = jnp.clip(jnp.asarray(index, dtype=jnp.int32), 0, len(cases) - 1)
         return [jax.lax.select_n(index, *cases)]
 
     return [
-        recurrences.inline(choice, [recurrences.initial_value(branch_index), *cases])[0]
+        recurrences.inline(selected_case, [recurrences.initial_value(branch_index), *cases])[0]
         for cases in zip(*results, strict=True)
     ]
 
@@ -540,8 +542,8 @@ SERIES_RULES: dict[str, Callable] = {
     **dict.fromkeys(LINEAR_PRIMITIVES.split(), _linear_rule),
     **dict.fromkeys(("mul", "dot_general", "conv_general_dilated"), _bilinear_rule),
     **dict.fromkeys(DERIVATIVE_PRIMITIVES.split(), _derivative_rule),
-    "square": _rewriting_rule(lambda params, x: x * x),
-    "integer_pow": _rewriting_rule(_integer_power_expression),
+    "square": _make_rewriting_rule(lambda params, x: x * x),
+    "integer_pow": _make_rewriting_rule(_integer_power_expression),
     "pow": _power_rule,
     "div": _division_rule,
     "custom_linear_solve": _linear_solve_rule,

@@ -57,14 +57,14 @@ def trace_error_message(subject: str, error: BaseException, cure: str = "") -> s
     for kind, (cause, remedy) in JAX_ERROR_REMEDIES.items():
         if isinstance(error, kind):
             jax_message = str(error).splitlines()[0].rstrip(".")
-            return f"{subject}: {cause}{_user_line(error)}. {remedy}. JAX reports: {jax_message}"
+            return f"{subject}: {cause}{_user_line_in_parentheses(error)}. {remedy}. JAX reports: {jax_message}"
     if isinstance(error, FunctionError):
         return f"{subject}: {error}"
     message = f"{subject}: {type(error).__name__}: {error}".rstrip(".")
     return f"{message}. {cure}" if cure else message
 
 
-def _user_line(error: BaseException) -> str:
+def _user_line_in_parentheses(error: BaseException) -> str:
     """Return the line of the user's code that raised an error, in parentheses, or ""."""
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
         if is_user_file(Path(frame.filename)):

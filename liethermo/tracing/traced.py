@@ -112,7 +112,7 @@ class TracedFunction(Module):
                 f"got {', '.join(str(np.shape(a)) for a in arrays)}"
             )
         values = [*self.numbers, *(a.astype(b.dtype) for a, b in zip(arrays, expected_avals, strict=True))]
-        run = _run_with_while_loop if self.program.has_while_loop else _run_program
+        run = _run_forward_differentiable if self.program.has_while_loop else _run_program
         return jax.tree_util.tree_unflatten(self.program.result_structure, run(self.program, values))
 
 
@@ -122,7 +122,7 @@ def _run_program(program: TracedProgram, values: Sequence) -> list:
     return jaxpr_as_fun(program.closed_jaxpr)(*scalars, *arrays)
 
 
-def _run_with_while_loop(program: TracedProgram, values: Sequence) -> list:
+def _run_forward_differentiable(program: TracedProgram, values: Sequence) -> list:
     return _forward_differentiable(lambda *values: _run_program(program, values))(*values)
 
 
@@ -210,10 +210,12 @@ def is_library_object(function: Any) -> bool:
     return _defining_module(function).split(".")[0] in ("liethermo", "manifolds")
 
 
-def _check_indices_of(tree: Any, use: Callable, shapes: Sequence[tuple[int, ...]]) -> None:
+def _check_indices_of(tree: Any, example_use: Callable, shapes: Sequence[tuple[int, ...]]) -> None:
     """Check the constant indices in a user's object, if it can be traced; otherwise its later use reports the error."""
     try:
-        closed_jaxpr = jax.make_jaxpr(lambda *a: use(tree, *a))(*(jax.ShapeDtypeStruct(s, jnp.float64) for s in shapes))
+        closed_jaxpr = jax.make_jaxpr(lambda *a: example_use(tree, *a))(
+            *(jax.ShapeDtypeStruct(s, jnp.float64) for s in shapes)
+        )
     except Exception:
         return
     check_indices(closed_jaxpr)
@@ -224,10 +226,10 @@ def is_plain_function(leaf) -> bool:
     return callable(leaf) and not isinstance(leaf, type | eqx.Module | jax.Array | np.ndarray)
 
 
-def trace_callables_with_result(
-    tree: Any, use: Callable, *shapes: tuple[int, ...], is_leaf: Callable | None = None
+def trace_callables_and_result_shapes(
+    tree: Any, example_use: Callable, *shapes: tuple[int, ...], is_leaf: Callable | None = None
 ) -> tuple[Any, Any]:
-    """Return a pytree with its plain functions traced, and the shapes of the result of ``use``.
+    """Return a pytree with its plain functions traced, and the shapes of the result of ``example_use``.
 
     Python floats among its leaves, such as fields of an ``equinox.Module`` that is used as a function, become arrays
     unless Python needs their values.
@@ -235,7 +237,7 @@ def trace_callables_with_result(
     Parameters
     ----------
     tree : pytree
-    use : function from such a pytree and arrays
+    example_use : function from such a pytree and arrays
         Calls the functions as they will be called later; it is traced to find the shapes of their arguments.
     *shapes : tuple of int
         Shapes of the arrays.
@@ -245,14 +247,17 @@ def trace_callables_with_result(
     leaves, structure = jax.tree_util.tree_flatten(tree, is_leaf=is_leaf)
     if any(type(leaf) is float for leaf in leaves):
         try:
-            return _trace_with_recorders(leaves, structure, use, shapes, float)
+            return _trace_with_recorders(leaves, structure, example_use, shapes, float)
         except (TypeError, ValueError, AttributeError):  # an error that does not come from the arrays is raised below
             pass
-    return _trace_with_recorders(leaves, structure, use, shapes, None)
+    return _trace_with_recorders(leaves, structure, example_use, shapes, None)
 
 
-def _trace_with_recorders(leaves: list, structure, use: Callable, shapes, number_type: type | None) -> tuple[Any, Any]:
-    """Trace ``use`` with recorders in place of plain functions, and arrays in place of leaves of ``number_type``."""
+def _trace_with_recorders(
+    leaves: list, structure, example_use: Callable, shapes, number_type: type | None
+) -> tuple[Any, Any]:
+    """Trace ``example_use`` with recorders in place of plain functions, and arrays in place of leaves of
+    ``number_type``."""
     recorders = {id(leaf): _CallRecorder(leaf) for leaf in leaves if is_plain_function(leaf)}
     number_indices = [i for i, leaf in enumerate(leaves) if type(leaf) is number_type]
 
@@ -260,7 +265,7 @@ def _trace_with_recorders(leaves: list, structure, use: Callable, shapes, number
         recorded_leaves = [recorders.get(id(leaf), leaf) for leaf in leaves]
         for i, value in zip(number_indices, numbers, strict=True):
             recorded_leaves[i] = value
-        return use(jax.tree_util.tree_unflatten(structure, recorded_leaves), *arguments)
+        return example_use(jax.tree_util.tree_unflatten(structure, recorded_leaves), *arguments)
 
     scalar, arguments = jax.ShapeDtypeStruct((), jnp.float64), [jax.ShapeDtypeStruct(s, jnp.float64) for s in shapes]
     closed_jaxpr, result_shapes = jax.make_jaxpr(use_leaves, return_shape=True)(
@@ -280,17 +285,17 @@ def has_plain_functions(tree: Any, is_leaf: Callable | None = None) -> bool:
     return any(is_plain_function(leaf) or type(leaf) is float for leaf in leaves)
 
 
-def trace_callables(tree: Any, use: Callable, *shapes: tuple[int, ...], is_leaf: Callable | None = None) -> Any:
-    """Return a pytree with its plain functions traced, as :func:`trace_callables_with_result` does.
+def trace_callables(tree: Any, example_use: Callable, *shapes: tuple[int, ...], is_leaf: Callable | None = None) -> Any:
+    """Return a pytree with its plain functions traced, as :func:`trace_callables_and_result_shapes` does.
 
     A tree without plain functions and floats is returned unchanged; an object of the user's is checked for constant
     indices out of range.
     """
     if not has_plain_functions(tree, is_leaf):
         if not is_library_object(tree):
-            _check_indices_of(tree, use, shapes)
+            _check_indices_of(tree, example_use, shapes)
         return tree
-    return trace_callables_with_result(tree, use, *shapes, is_leaf=is_leaf)[0]
+    return trace_callables_and_result_shapes(tree, example_use, *shapes, is_leaf=is_leaf)[0]
 
 
 class _CallRecorder:

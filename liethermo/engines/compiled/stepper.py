@@ -302,7 +302,7 @@ class CompiledStepLoop:
         )
         if method.explicit:
             variable_inputs = [i for i, a in enumerate(step_program.arguments) if a not in ("p", "h")]
-            step_program = step_program._replace(program=step_program.program.factor_constants(variable_inputs))
+            step_program = step_program._replace(program=step_program.program.regroup_constant_factors(variable_inputs))
         initial_program = self._trace_program(self.initial_fields, ("p", "x", *self.initial_inputs), self.field_names)
         self._programs = {"step": step_program, "begin": initial_program}
         buffer_size = (

@@ -19,7 +19,7 @@ import numpy as np
 from ...functions.rounding import value_and_rounding_scale
 from ...integrators import OneStepMethod
 from ...systems import System
-from ...tracing.programs import jit_program
+from ...tracing.programs import jit_cached
 from ..array import EngineTrajectory
 from ..codes import StatusCode
 from ..rules import DEFAULT_OPTIONS
@@ -192,7 +192,7 @@ class SparseEngine:
 # -- on the device ----------------------------------------------------------------------------------------------------
 
 
-@jit_program
+@jit_cached
 def _solve_fixed_point_program(system: System, method: OneStepMethod, state: State, h) -> StageSolution:
     return solve_fixed_point(_stage_equations(system, method, state, h), SPARSE_SOLVER_OPTIONS)
 
@@ -203,7 +203,7 @@ def _stage_equations(system: System, method: OneStepMethod, state: State, h) -> 
     )
 
 
-@jit_program
+@jit_cached
 def _finish_step_program(system: System, method: OneStepMethod, state: State, h, solution: StageSolution) -> State:
     return finish_step(system, method, state, h, solution, SPARSE_SOLVER_OPTIONS)
 
@@ -222,19 +222,19 @@ def _weighted_equations(system: System, method: OneStepMethod, state: State, h):
     return residual, guess, scale
 
 
-@jit_program
+@jit_cached
 def _weighted_residual(system: System, method: OneStepMethod, state: State, h, k) -> tuple[Any, Any]:
     residual, _, scale = _weighted_equations(system, method, state, h)
     return residual(k), scale(k)
 
 
-@jit_program
+@jit_cached
 def _residual_rounding(system: System, method: OneStepMethod, x) -> Any:
     """Return the scale at which the weighted residual is rounded."""
     return jnp.max(value_and_rounding_scale(lambda x: system.residual_weights(x) * system.vector_field(x), x)[1])
 
 
-@jit_program
+@jit_cached
 def _best_guess_program(system: System, method: OneStepMethod, state: State, h):
     """Return the predicted slopes, or zero slopes if their residual is smaller, with residual and scale."""
     residual_function, guess, scale = _weighted_equations(system, method, state, h)
@@ -242,13 +242,13 @@ def _best_guess_program(system: System, method: OneStepMethod, state: State, h):
     return k, residual, scale(k)
 
 
-@jit_program
+@jit_cached
 def _residual_jvp(system: System, method: OneStepMethod, state: State, h, k, seed):
     residual = _weighted_equations(system, method, state, h)[0]
     return jax.jvp(residual, (k,), (jnp.asarray(seed),))[1]
 
 
-@jit_program
+@jit_cached
 def _residual_vjp(system: System, method: OneStepMethod, state: State, h, k, seed):
     residual = _weighted_equations(system, method, state, h)[0]
     return jax.vjp(residual, k)[1](jnp.asarray(seed))[0]

@@ -11,8 +11,8 @@ from manifolds.matrices.linear import solve
 
 from ...functions.surface import ConstraintSurface
 from ...systems import SimpleClosedSystem
-from ...tracing.interpret import polynomial_degree
-from ...tracing.programs import jit_program
+from ...tracing.interpret import polynomial_degree_bound
+from ...tracing.programs import jit_cached
 from .discrete import DiscreteSystem, Pair
 
 
@@ -21,8 +21,8 @@ def newton_step(discrete: DiscreteSystem, v0, p0, guess: Pair) -> tuple[jax.Arra
     n, (q0, V, S0, s) = len(guess.V), guess
     mass = mass_scale(discrete.system, q0, v0, S0)
     is_affine = discrete.curve is None and (
-        polynomial_degree(_motion_residual_of_V, (discrete, p0, guess), n) <= 1
-        and polynomial_degree(_motion_residual_of_s, (discrete, p0, guess), 1) == 0
+        polynomial_degree_bound(_motion_residual_of_V, (discrete, p0, guess), n) <= 1
+        and polynomial_degree_bound(_motion_residual_of_s, (discrete, p0, guess), 1) == 0
     )
     if is_affine:
         A, residual = _jacobian_and_value(
@@ -37,7 +37,7 @@ def newton_step(discrete: DiscreteSystem, v0, p0, guess: Pair) -> tuple[jax.Arra
 
         ((A, B), (C, D)), (residual, constraint_value) = _jacobian_and_value(motion_and_constraint, V, s)
         V = V - solve(A - jnp.outer(B, C) / D, (residual - B * (constraint_value / D))[:, None])[:, 0]
-    s = jnp.zeros(()) if polynomial_degree(_constraint_residual_of_s, (discrete, p0, guess), 1) <= 1 else s
+    s = jnp.zeros(()) if polynomial_degree_bound(_constraint_residual_of_s, (discrete, p0, guess), 1) <= 1 else s
     slope, constraint_value = _jacobian_and_value(lambda s: discrete.constraint_residual(Pair(q0, V, S0, s)), s)
     return V, s - constraint_value / slope
 
@@ -74,7 +74,7 @@ def velocity_slope(system: SimpleClosedSystem, start, end, force, h) -> jax.Arra
         ``slope`` is a guess of the result.
     """
     (_, v0, _, p0), (q1, slope, S1) = start, end
-    affine = polynomial_degree(_momentum_of_v, (system, q1, S1), len(v0)) <= 1
+    affine = polynomial_degree_bound(_momentum_of_v, (system, q1, S1), len(v0)) <= 1
     slope = jnp.zeros_like(v0) if affine else slope
     W, p = _jacobian_and_value(lambda v: system.momentum(q1, v, S1), v0 + h * slope)
     W, residual = _restrict_to_tangents(system, q1, v0 + h * slope, W, (p - p0) / h - force, h)
@@ -108,7 +108,7 @@ def _momentum_of_v(model, v):
     return system.momentum(q, v, S)
 
 
-@jit_program
+@jit_cached
 def velocity_from_momentum(system: SimpleClosedSystem, q, S, p, v):
     """Return v with ``L_v(q, v, S) = p``, near a guess; NaN if Newton's method does not converge."""
 

@@ -18,7 +18,7 @@ from manifolds.matrices.linear import solve
 from ...errors import InputError
 from ...functions.conditions import require_condition
 from ...systems import EulerPoincareClosedSystem, System
-from ...tracing.programs import jit_program
+from ...tracing.programs import jit_cached
 from ..base import WHY_FIXED_VARIATIONAL_STEP, OneStepMethod, checked_run_states, checked_step_size, kind_name, register
 
 NEWTON_STEPS = 20
@@ -189,7 +189,7 @@ class _LieStep(NamedTuple):
         return jnp.dot(self.system.external_force(*middle), y[:-1]), self.system.heating(*middle)
 
 
-@jit_program
+@jit_cached
 def _group_increments(method: LieVariational, system: EulerPoincareClosedSystem, x, h):
     """Return ``tau(h xi_k)`` of every step, with xi_k from the momentum before it, shape (steps, m, m)."""
     tau = cayley if method.tau == "cayley" else exp

@@ -16,7 +16,7 @@ import manifolds as mf
 from ...errors import InputError
 from ...functions.conditions import checked_numbers
 from ...systems import ComposedSystem, EmbeddedSystem, SimpleClosedSystem, System
-from ...tracing.programs import jit_program
+from ...tracing.programs import jit_cached
 from ..base import (
     WHY_FIXED_VARIATIONAL_STEP,
     OneStepMethod,
@@ -372,7 +372,7 @@ def _is_symmetric_set(maps: tuple[FiniteDifference, ...]) -> bool:
     return Counter(maps) == Counter(map.reversed_map() for map in maps)
 
 
-@jit_program
+@jit_cached
 def _constraint_residual(discrete: DiscreteSystem, q0, q1, S0, S1):
     """Return ``h |P_d|``, and the sum of the heat and the work that it is the difference of."""
     pair = discrete.pair(q0, q1, S0, S1)
@@ -381,7 +381,7 @@ def _constraint_residual(discrete: DiscreteSystem, q0, q1, S0, S1):
     return discrete.h * jnp.abs(residual), discrete.h * (heat + jnp.abs(residual - slope * pair.s)) + 1e-300
 
 
-@jit_program
+@jit_cached
 def _step_energies(method: VariationalIntegrator, system: SimpleClosedSystem, h, start_states, end_states):
     def step_energy(x, y):
         (q0, _, S0, t), (q1, _, S1, _) = system.split_state(x), system.split_state(y)
@@ -391,7 +391,7 @@ def _step_energies(method: VariationalIntegrator, system: SimpleClosedSystem, h,
     return jax.vmap(step_energy)(start_states, end_states)
 
 
-@jit_program
+@jit_cached
 def _regularity_matrix(discrete: DiscreteSystem, q0, q1, S0, S1):
     return discrete.regularity_matrix(q0, q1, S0, S1)
 

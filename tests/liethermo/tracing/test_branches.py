@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax import lax
 
-from liethermo.tracing.branches import MIN_BRANCH_COST, Branch, nest_branches
+from liethermo.tracing.branches import MIN_BRANCH_COST, Branch, instructions_in_branches
 from tests.liethermo.tracing.test_scalarize import program_of
 from tests.machine_code import compile_program
 
@@ -35,7 +35,7 @@ def instructions_with_depth(items, depth: int = 0):
 
 def checked_branches(program, **options):
     """Nest the branches of a program; assert that every instruction occurs once and after its arguments."""
-    items = nest_branches(program, **options)
+    items = instructions_in_branches(program, **options)
     order = [instruction for instruction, _ in instructions_with_depth(items)]
     assert sorted(order) == sorted(program.instructions)
     defined_names = {name for names in program.inputs for name in names}
@@ -118,9 +118,9 @@ def test_consecutive_branches_are_not_nested():
 def test_cheap_sides_and_where_make_no_branch():
     short_program = program_of(lambda x: lax.cond(x > 0.0, lambda x: x * 2.0, lambda x: x / 3.0, x), np.array(1.0))
     assert not branches(checked_branches(short_program))
-    assert branches(checked_branches(short_program, min_instructions=1))
+    assert branches(checked_branches(short_program, min_side_cost=1))
     choice = program_of(lambda x: jnp.where(x > 0.0, long_polynomial(x, 0.9), x), np.array(1.0))
-    assert not branches(checked_branches(choice, min_instructions=1))
+    assert not branches(checked_branches(choice, min_side_cost=1))
 
 
 def test_equal_branches_merge():

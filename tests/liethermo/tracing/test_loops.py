@@ -167,7 +167,7 @@ def test_programs_are_unloaded_beyond_the_cache_size(monkeypatch):
     """Different programs are kept up to a bounded number."""
     monkeypatch.setattr(programs, "_program_cache", LRUCache(2))
 
-    @programs.jit_program
+    @programs.jit_cached
     def power(x, n: int):
         return x**n
 

@@ -960,7 +960,7 @@ def test_constant_factors_are_multiplied_first():
         return b * (a * x) + 0.5 * (a * x) * b, x * (x * a)
 
     program = scalarize(jax.make_jaxpr(f)(*[jax.ShapeDtypeStruct((), jnp.float64)] * 3))
-    factored_program = program.factor_constants([2])
+    factored_program = program.regroup_constant_factors([2])
     values = 1.3, -0.7, 2.1
     for value, factored_value in zip(program.evaluate(*values), factored_program.evaluate(*values), strict=True):
         assert np.abs(value - factored_value) < 4e-16 * np.abs(value)
@@ -969,6 +969,6 @@ def test_constant_factors_are_multiplied_first():
     assert factors
     assert all(x not in args for args in factors)
     assert sum(x in i.args for i in factored_program.instructions) > sum(x in i.args for i in program.instructions)
-    assert program.factor_constants([0, 1, 2]).operation_counts == program.operation_counts, (
+    assert program.regroup_constant_factors([0, 1, 2]).operation_counts == program.operation_counts, (
         "nothing to take out where all of them change"
     )
