@@ -90,7 +90,7 @@ class Geometry(Module):
         """Return the covector of a tangent vector by the metric of the space: the inverse of :meth:`raise_index`."""
         if self.space is None:
             return v
-        return self.space.to_vector(self.space._flat(self.points(x), self.points(v)).conj())
+        return self.space.to_vector(self.space._metric_covector(self.points(x), self.points(v)).conj())
 
     def project_tangent(self, x, w) -> jax.Array:
         """Return the tangent vector nearest to an array, shape (n,); the array itself on R^n."""

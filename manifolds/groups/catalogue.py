@@ -42,12 +42,12 @@ def SO(n: int) -> MatrixGroup:
     )
     if n == 2:
         return replace(
-            group, exp_map=closed.so2_exp, log_map=closed.so2_log, adjoint_cayley_map=maps.cayley
+            group, exp_map=closed.exp_so2, log_map=closed.log_so2, adjoint_cayley_map=maps.cayley
         )  # abelian: any map will do
     if n == 3:
-        group = replace(group, exp_map=closed.so3_exp, log_map=closed.so3_log, adjoint_cayley_map=closed.so3_cayley)
-        return replace(group, cayley_map=closed.so3_cayley, inverse_cayley_map=closed.so3_inverse_cayley)
-    return replace(group, adjoint_cayley_map=closed.so4_adjoint_cayley) if n == 4 else group
+        group = replace(group, exp_map=closed.exp_so3, log_map=closed.log_so3, adjoint_cayley_map=closed.cayley_so3)
+        return replace(group, cayley_map=closed.cayley_so3, inverse_cayley_map=closed.inverse_cayley_so3)
+    return replace(group, adjoint_cayley_map=closed.adjoint_cayley_so4) if n == 4 else group
 
 
 @register((2,), (3,))
@@ -63,12 +63,12 @@ def SE(n: int) -> MatrixGroup:
         equations=closed.rigid_equations,
     )
     if n == 2:
-        return replace(group, log_map=closed.rigid_log)
+        return replace(group, log_map=closed.log_rigid)
     if n == 3:
         group = replace(
-            group, exp_map=closed.se3_exp, log_map=closed.rigid_log, adjoint_cayley_map=closed.se3_adjoint_cayley
+            group, exp_map=closed.exp_se3, log_map=closed.log_rigid, adjoint_cayley_map=closed.adjoint_cayley_se3
         )
-        return replace(group, cayley_map=closed.se3_cayley, inverse_cayley_map=closed.se3_inverse_cayley)
+        return replace(group, cayley_map=closed.cayley_se3, inverse_cayley_map=closed.inverse_cayley_se3)
     return group
 
 
@@ -84,9 +84,9 @@ def SU(n: int) -> MatrixGroup:
         equations=closed.special_unitary_equations,
     )
     if n == 2:
-        group = replace(group, exp_map=closed.su2_exp, log_map=closed.su2_log)
+        group = replace(group, exp_map=closed.exp_su2, log_map=closed.log_su2)
         return replace(
-            group, inverse_cayley_map=closed.su2_inverse_cayley, adjoint_cayley_map=closed.gl2_adjoint_cayley
+            group, inverse_cayley_map=closed.inverse_cayley_su2, adjoint_cayley_map=closed.adjoint_cayley_gl2
         )
     return replace(group, cayley_map=None, adjoint_cayley_map=None)
 
@@ -96,7 +96,7 @@ def SL(n: int) -> MatrixGroup:
     """Return the group of real matrices of determinant 1. The Cayley map exists for n = 2 only, where SL(2) = Sp(1)."""
     group = MatrixGroup(f"SL({n})", catalogue.sl(n), closed.unimodular_defect, restore_map=closed.restore_unimodular)
     if n == 2:
-        return replace(group, adjoint_cayley_map=closed.gl2_adjoint_cayley, equations=closed.symplectic_equations)
+        return replace(group, adjoint_cayley_map=closed.adjoint_cayley_gl2, equations=closed.symplectic_equations)
     return replace(group, cayley_map=None, adjoint_cayley_map=None, equations=closed.unimodular_equations)
 
 
@@ -108,7 +108,7 @@ def Sp(n: int) -> MatrixGroup:
         catalogue.sp(n),
         closed.symplectic_defect,
         closed.symplectic_inverse,
-        adjoint_cayley_map=closed.gl2_adjoint_cayley if n == 1 else None,
+        adjoint_cayley_map=closed.adjoint_cayley_gl2 if n == 1 else None,
         restore_map=closed.restore_symplectic,
         equations=closed.symplectic_equations,
     )
@@ -122,7 +122,7 @@ def GL(n: int) -> MatrixGroup:
         f"GL({n})",
         catalogue.gl(n),
         closed.invertible_defect,
-        adjoint_cayley_map={1: maps.cayley, 2: closed.gl2_adjoint_cayley}.get(n),
+        adjoint_cayley_map={1: maps.cayley, 2: closed.adjoint_cayley_gl2}.get(n),
     )
 
 
@@ -134,10 +134,10 @@ def Heisenberg(n: int = 1) -> MatrixGroup:
         catalogue.heisenberg(n),
         closed.heisenberg_defect,
         closed.heisenberg_inverse,
-        closed.heisenberg_exp,
-        closed.heisenberg_log,
-        closed.heisenberg_exp,
-        closed.heisenberg_log,
-        closed.heisenberg_exp,
+        closed.exp_heisenberg,
+        closed.log_heisenberg,
+        closed.exp_heisenberg,
+        closed.log_heisenberg,
+        closed.exp_heisenberg,
         closed.restore_heisenberg,
     )

@@ -18,13 +18,13 @@ from ..matrices.linear import adjoint, determinant, inverse, max_abs_entry, newt
 from ..matrices.stumpff import HALF_TURN_MARGIN, _root_or_nan, _squared_length, angle_over_sine, leading_sign, stumpff
 
 
-def so2_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
+def exp_so2(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """Return the rotation of the plane by the angle x: ``cos(x) I + sin(x)/x X`` with X = hat(x)."""
     z = _squared_length(x)[..., None]
     return stumpff(0, z) * np.eye(2) + stumpff(1, z) * algebra.hat(x)
 
 
-def so2_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
+def log_so2(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
     """Return the angle from its sine and cosine, between -pi + HALF_TURN_MARGIN and pi + HALF_TURN_MARGIN."""
     sine, cosine = ((g - g.swapaxes(-1, -2)) / 2)[..., 0, 1:2], (g[..., :1, 0] + g[..., 1:2, 1]) / 2
     angle = jnp.arctan2(sine, cosine)
@@ -32,32 +32,32 @@ def so2_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
     return jnp.where(cosine < 0, angle, angle_over_sine(sine**2, cosine) * sine)
 
 
-def so3_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
+def exp_so3(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """Return the rotation about x by the angle ``|x|``, by Rodrigues' formula with X = hat(x)."""
     z, X = _squared_length(x)[..., None], algebra.hat(x)
     return jnp.eye(3) + stumpff(1, z) * X + stumpff(2, z) * X @ X
 
 
-def so3_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
+def log_so3(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
     """Return the rotation vector from the quaternion, accurate at every angle; half turns use :func:`leading_sign`."""
     w, v = _scaled_quaternion(g)
     sign = jnp.where(_rotation_angle(w, v) > math.pi - HALF_TURN_MARGIN, leading_sign(v), 1.0)
     return 2 * angle_over_sine(_squared_length(v), sign * w) * sign * v
 
 
-def so3_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
+def cayley_so3(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """Return the rotation ``I + (X + X^2/2) / (1 + |x|^2/4)``, the Cayley map of X = hat(x)."""
     X = algebra.hat(x)[..., :3, :3]
     return jnp.eye(3) + (X + X @ X / 2) / (1.0 + _squared_length(x[..., :3])[..., None] / 4)
 
 
-def so3_inverse_cayley(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
+def inverse_cayley_so3(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
     """Return the components x with ``cayley(x) = g``: ``2 tan(a/2)`` times the axis, for the rotation angle a."""
     w, v = _scaled_quaternion(g)
     return jnp.where(_rotation_angle(w, v) <= math.pi - HALF_TURN_MARGIN, 2 * v / w, jnp.nan)
 
 
-def se3_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
+def exp_se3(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """Return the rigid motion of the twist x = (w, u): Rodrigues' rotation and translation, with W = hat(w)."""
     z, u = _squared_length(x[..., :3])[..., None], x[..., 3:, None]
     W = algebra.hat(x)[..., :3, :3]
@@ -65,14 +65,14 @@ def se3_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     return affine_matrix(rotation, u + W @ (stumpff(2, z) * u + stumpff(3, z) * W @ u))
 
 
-def rigid_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
+def log_rigid(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
     """Return the twist of a rigid motion in the plane or in space: the components (w, u) of its logarithm.
 
     ``d = (1 - (a/2) cot(a/2)) / a^2`` for the angle a; in Stumpff functions of the half angle, d = (c2 - c3) / (4 c1):
     no cancellation.
     """
     rotation, t = g[..., :-1, :-1], g[..., :-1, -1:]
-    w = (so2_log if t.shape[-2] == 2 else so3_log)(algebra, rotation)
+    w = (log_so2 if t.shape[-2] == 2 else log_so3)(algebra, rotation)
     W = algebra.hat(jnp.concatenate([w, jnp.zeros_like(t[..., 0])], axis=-1))[..., :-1, :-1]
     z = _squared_length(w)[..., None] / 4
     d = (stumpff(2, z) - stumpff(3, z)) / (4 * stumpff(1, z))
@@ -80,25 +80,25 @@ def rigid_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
     return jnp.concatenate([w, u[..., 0]], axis=-1)
 
 
-def se3_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
+def cayley_se3(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """Return the rigid motion of the Cayley map: rotation R and translation ``(R u + u) / 2`` for x = (w, u)."""
-    rotation, u = so3_cayley(algebra, x), x[..., 3:, None]
+    rotation, u = cayley_so3(algebra, x), x[..., 3:, None]
     return affine_matrix(rotation, 0.5 * (rotation @ u + u))
 
 
-def se3_inverse_cayley(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
+def inverse_cayley_se3(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
     """Return the twist (w, u) with ``cayley((w, u)) = g``, u being ``(I - W/2) t`` for the translation t."""
-    w, t = so3_inverse_cayley(algebra, g[..., :3, :3]), g[..., :3, 3]
+    w, t = inverse_cayley_so3(algebra, g[..., :3, :3]), g[..., :3, 3]
     return jnp.concatenate([w, t - jnp.cross(w, t) / 2], axis=-1)
 
 
-def su2_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
+def exp_su2(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """Return the SU(2) matrix ``cos(|x|/2) I + sin(|x|/2) X / (|x|/2)`` with X = hat(x)."""
     z = _squared_length(x)[..., None] / 4
     return stumpff(0, z) * np.eye(2) + stumpff(1, z) * algebra.hat(x)
 
 
-def su2_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
+def log_su2(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
     """Return the rotation vector of length below 2 pi: g is the unit quaternion ``w - i v . sigma``."""
     w, v = _su2_quaternion(g)
     return jnp.where(
@@ -108,7 +108,7 @@ def su2_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
     )
 
 
-def su2_inverse_cayley(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
+def inverse_cayley_su2(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
     """Return the components x with ``cayley(x) = g``: ``4 tan(a/4)`` times the axis, for the angle a of g."""
     w, v = _su2_quaternion(g)
     square = jnp.where(w > 0, 1.0, _squared_length(v))
@@ -116,7 +116,7 @@ def su2_inverse_cayley(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
     return jnp.where(_rotation_angle(w, v) <= 2 * (math.pi - HALF_TURN_MARGIN), x, jnp.nan)
 
 
-def gl2_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
+def adjoint_cayley_gl2(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """Return the 2 x 2 matrix g with ``Ad(g) = cay(ad x)``: for trace 0 ``(I + X) / sqrt(det(I + X))``, X = hat(x).
 
     X^2 is a number, so that both sides of ``Ad(g) = cay(ad x)`` turn, or boost, by the same angle. NaN where
@@ -129,7 +129,7 @@ def gl2_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     return jnp.exp(half) * (identity + X) / _root_or_nan(1.0 + square)
 
 
-def so4_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
+def adjoint_cayley_so4(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """Return the rotation g of R^4 with ``Ad(g) = cay(ad x)``, by the self-dual and anti-self-dual parts of hat(x)."""
     X, identity = algebra.hat(x), jnp.eye(4)
     rows = [[X[..., i, j] for j in range(4)] for i in range(4)]
@@ -141,20 +141,20 @@ def so4_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     return (factors[0] / norms[0]) @ (factors[1] / norms[1])
 
 
-def se3_adjoint_cayley(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
+def adjoint_cayley_se3(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """Return the rigid motion g with ``Ad(g) = cay(ad x)``: the Cayley map of the dual rotation."""
     w, u = x[..., :3], x[..., 3:]
     translation = (u + jnp.cross(w, u) / 2) / (1.0 + _squared_length(w) / 4)
-    return affine_matrix(so3_cayley(algebra, x), translation[..., None])
+    return affine_matrix(cayley_so3(algebra, x), translation[..., None])
 
 
-def heisenberg_exp(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
+def exp_heisenberg(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """Return the exponential ``I + X + X^2/2`` of X = hat(x), exact as X^3 = 0, and so the Cayley map too."""
     X = algebra.hat(x)
     return jnp.eye(X.shape[-1]) + X + X @ X / 2
 
 
-def heisenberg_log(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
+def log_heisenberg(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
     """Return the components of the logarithm ``N - N^2/2``, with N = g - I."""
     N = g - np.eye(g.shape[-1])
     return algebra.vee(N - N @ N / 2)

@@ -110,7 +110,7 @@ class _ChartCoordinates(Coordinates):
         inverse_jacobian = inverse(jnp.moveaxis(columns, 0, -1))  # of the derivative, in the frames of both ends
 
         def lift(alpha):
-            return space._flat(
+            return space._metric_covector(
                 x, space._from_coordinates(x, (inverse_jacobian.swapaxes(-1, -2) @ alpha[..., None])[..., 0])
             )
 
@@ -118,7 +118,7 @@ class _ChartCoordinates(Coordinates):
 
     def centre(self):
         space = self.chart.space
-        return Place(self.z, lambda alpha: space._flat(self.z, self.vector(alpha)), self.components)
+        return Place(self.z, lambda alpha: space._metric_covector(self.z, self.vector(alpha)), self.components)
 
 
 class _ProductCoordinates(Coordinates):

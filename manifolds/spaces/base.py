@@ -180,7 +180,7 @@ class Space(SpaceMaps):
 
     def flat(self, x, v) -> jax.Array:
         """Return the covector ``w -> inner(x, v, w)``, as an ambient array, shape ``(..., *shape)``."""
-        return self._call_compiled("_flat", *self._checked_point_and_vectors(x, v=v))
+        return self._call_compiled("_metric_covector", *self._checked_point_and_vectors(x, v=v))
 
     def sharp(self, x, alpha) -> jax.Array:
         """Return the tangent vector v with ``inner(x, v, w) = Re sum(alpha * w)`` for all w; dH gives the gradient of

@@ -105,7 +105,7 @@ class Correlation(PositiveDefinite):
 
     _inner = inner_by_coordinates
 
-    def _flat(self, x, v):
+    def _metric_covector(self, x, v):
         c = self._coordinates(x, v)
         return symmetrize(jax.vjp(self._chart, jnp.broadcast_to(x, (*c.shape[:-1], *self.shape)))[1](c)[0])
 

@@ -148,7 +148,7 @@ class GeomstatsSpace(Space):
     def _transport(self, x, v, u):
         return self._call_kernel("transport", x, v, u)
 
-    def _flat(self, x, v):
+    def _metric_covector(self, x, v):
         """Return the covector of v: its inner products with the projected axes, shape ``(..., *shape)``."""
         x, v = self._with_frame_axis(x), self._with_frame_axis(v)
         values = self._inner(x, v, self._project_tangent(x, self._ambient_basis))
@@ -397,7 +397,7 @@ def _log_jvp(space: GeomstatsSpace, primals, tangents):
     remainder = to_rows(dy) - jnp.einsum(
         "...ij,...j->...i", exp_jacobian[..., :size], dx
     )  # exp projects its argument, hence no D
-    dual = to_rows(space._flat(space._with_frame_axis(y), space._frame(y)))
+    dual = to_rows(space._metric_covector(space._with_frame_axis(y), space._frame(y)))
     matrix = jnp.einsum("...bi,...ai->...ba", dual, exp_of_frame)
     c = solve(matrix, jnp.einsum("...bi,...i->...b", dual, remainder)[..., None])[..., 0]
     dv = jnp.einsum("...ij,...j->...i", projection_jacobian[..., :size], dx).reshape(v.shape)

@@ -165,7 +165,7 @@ class Grassmann(Space):
     def _inner(self, x, u, v):
         return self._pair(u, v)
 
-    def _flat(self, x, v):
+    def _metric_covector(self, x, v):
         return v
 
     def _sharp(self, x, alpha):

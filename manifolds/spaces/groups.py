@@ -222,7 +222,7 @@ class GroupSpace(Space):
         translation_terms = super()._divergence_terms(x, pair_with_field)
         if self.group.algebra.is_unimodular():
             return translation_terms
-        field_terms = pair_with_field(x, self._flat(x, self._from_coordinates(x, -self._adjoint_traces)))
+        field_terms = pair_with_field(x, self._metric_covector(x, self._from_coordinates(x, -self._adjoint_traces)))
         return jnp.concatenate([translation_terms, field_terms[None]])
 
     def _exp(self, x, v):
@@ -273,7 +273,7 @@ class BiInvariantSpace(GroupSpace):
 
     _inner = inner_by_flat
 
-    def _flat(self, x, v):
+    def _metric_covector(self, x, v):
         basis = self.group.algebra._require_basis()
         return v.conj() / (np.abs(basis[0]) ** 2).sum()  # orthogonal matrices, all of this norm
 
@@ -486,8 +486,8 @@ class SpecialEuclidean(GroupSpace):
 
     _inner = inner_by_flat
 
-    def _flat(self, x, v):
-        return self._map_blocks(self.rotations._flat, lambda x, v: v / self.length**2, x, v)
+    def _metric_covector(self, x, v):
+        return self._map_blocks(self.rotations._metric_covector, lambda x, v: v / self.length**2, x, v)
 
     def _exp(self, x, v):
         y = self._map_blocks(self.rotations._exp, lambda x, v: x + v, x, v)

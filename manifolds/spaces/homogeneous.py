@@ -131,8 +131,8 @@ class Homogeneous(Space):
 
     _inner = inner_by_coordinates
 
-    def _flat(self, x, v):
-        return self.group_space._flat(x, self._project_tangent(x, v))
+    def _metric_covector(self, x, v):
+        return self.group_space._metric_covector(x, self._project_tangent(x, v))
 
     _exp = forward_to("group_space")
 

@@ -87,7 +87,7 @@ class Hyperbolic(Space):
 
     _inner = inner_by_coordinates
 
-    def _flat(self, x, v):
+    def _metric_covector(self, x, v):
         return _lower_index(v)
 
     def _sharp(self, x, alpha):

@@ -194,7 +194,7 @@ class LevelSet(Space):
 
     _inner = inner_by_flat
 
-    def _flat(self, x, v):
+    def _metric_covector(self, x, v):
         if self.form is None:
             return v + jnp.zeros_like(x)
         return self.from_vector((self._metric_at(x) @ self.to_vector(v)[..., None])[..., 0])
@@ -234,7 +234,7 @@ class LevelSet(Space):
                 lambda y, a, b, c, d: y + (a + 2.0 * b + 2.0 * c + d) / (6.0 * steps), state, a, b, c, d
             )
 
-        return self._project(jax.lax.fori_loop(0, steps, step, (x, self._flat(x, v)))[0])
+        return self._project(jax.lax.fori_loop(0, steps, step, (x, self._metric_covector(x, v)))[0])
 
     def _why_off_space(self, x, residual):
         if (

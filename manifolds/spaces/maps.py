@@ -118,7 +118,7 @@ class SpaceMaps(ABC):
     def _inner(self, x, u, v):
         return self._pair(u.conj(), v + jnp.zeros_like(x))
 
-    def _flat(self, x, v):
+    def _metric_covector(self, x, v):
         x, v = jnp.broadcast_arrays(x, v)
         return jax.grad(lambda w: self._inner(x, v, w).sum())(jnp.zeros_like(v))
 
@@ -141,7 +141,7 @@ class SpaceMaps(ABC):
         return self._exp(x, v)  # raises
 
     def _coordinates(self, x, v):
-        return self._pair(self._frame(x), self._with_frame_axis(self._flat(x, v)))
+        return self._pair(self._frame(x), self._with_frame_axis(self._metric_covector(x, v)))
 
     def _from_coordinates(self, x, c):
         weights = c.reshape(*c.shape, *(1,) * len(self.shape))
@@ -178,7 +178,7 @@ class SpaceMaps(ABC):
 
         def pairing_along_geodesic(t, e):
             y = self._exp(x, t * e)
-            return pair_with_field(y, self._flat(y, self._transport(x, t * e, e)))
+            return pair_with_field(y, self._metric_covector(y, self._transport(x, t * e, e)))
 
         def pairing_along_line(t, e):  # the metric being that of the arrays around
             return pair_with_field(self._project(x + t * e), e.conj())
@@ -415,8 +415,8 @@ def _extended_squared_distance_jvp(space, primals, tangents):
 
 
 def inner_by_flat(self: SpaceMaps, x, u, v):
-    """Return the inner product by :meth:`SpaceMaps._flat`."""
-    return self._pair(self._flat(x, u), v)
+    """Return the inner product by :meth:`SpaceMaps._metric_covector`."""
+    return self._pair(self._metric_covector(x, u), v)
 
 
 def inner_by_coordinates(self: SpaceMaps, x, u, v):

@@ -190,8 +190,8 @@ class Product(Space):
     def _inner(self, x, u, v):
         return sum(self._apply_to_factors("_inner", x, u, v))
 
-    def _flat(self, x, v):
-        return self._apply_and_join("_flat", x, v)
+    def _metric_covector(self, x, v):
+        return self._apply_and_join("_metric_covector", x, v)
 
     def _sharp(self, x, alpha):
         return self._apply_and_join("_sharp", x, alpha)
@@ -365,7 +365,7 @@ class Power(Space):
     def _inner(self, x, u, v):
         return self.base._inner(x, u, v).sum(axis=-1)
 
-    _flat = forward_to("base")
+    _metric_covector = forward_to("base")
     _sharp = forward_to("base")
     _exp = forward_to("base")
     _log = forward_to("base")

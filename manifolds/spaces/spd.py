@@ -89,7 +89,7 @@ class SPD(PositiveDefinite):
         inverse_factor = self._inverse_factor(x)
         return self._pair(_congruence(inverse_factor, u), _congruence(inverse_factor, v))
 
-    def _flat(self, x, v):
+    def _metric_covector(self, x, v):
         inverse_factor = self._inverse_factor(x)
         return _congruence(inverse_factor.swapaxes(-1, -2), _congruence(inverse_factor, v))
 

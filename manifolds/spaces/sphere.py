@@ -95,7 +95,7 @@ class Sphere(Space):
     def _inner(self, x, u, v):
         return (u * v).sum(axis=-1)
 
-    def _flat(self, x, v):
+    def _metric_covector(self, x, v):
         return v
 
     def _sharp(self, x, alpha):

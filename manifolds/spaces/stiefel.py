@@ -126,7 +126,7 @@ class Stiefel(Space):
 
     _inner = inner_by_flat
 
-    def _flat(self, x, v):
+    def _metric_covector(self, x, v):
         return v - 0.5 * x @ (_transpose_matrix(x) @ v)
 
     def _sharp(self, x, alpha):

@@ -114,7 +114,7 @@ class TangentBundle(Space):
     def _sharp(self, x, alpha):
         return self._project_tangent(x, alpha)
 
-    def _flat(self, x, v):
+    def _metric_covector(self, x, v):
         return v + jnp.zeros_like(x)
 
     # -- helpers ------------------------------------------------------------------------------------------------------
