@@ -2,6 +2,7 @@
 
 MEASUREMENT_NAMES = (
     "single_body",
+    "calls",
     "isolated_body",
     "general",
     "functions",
