@@ -15,7 +15,7 @@ import numpy as np
 import liethermo as lt
 import manifolds as mf
 from liethermo.engines.choice import EngineWithFallback
-from liethermo.runs.preparation import prepare_run
+from liethermo.runs.preparation import prepare_system_and_method
 
 from .. import child as process
 from ..report import Report, Table, Target
@@ -153,7 +153,7 @@ def child(kind: str, n: str) -> dict:
     seconds = min(
         seconds, _processor_seconds(functools.partial(steps, long_steps)) - short_seconds
     )  # Newton's method is compiled where needed
-    engine = EngineWithFallback(*prepare_run(system, method), "auto", long_steps)
+    engine = EngineWithFallback(*prepare_system_and_method(system, method), "auto", long_steps)
     engine.initial_run_state(jnp.asarray(x0))
     return {
         "sites": len(np.ravel(x0)) // {"a field": 2, "spins": 3}.get(kind, 1) + (kind == "su(N)"),

@@ -139,7 +139,7 @@ class ArrayEngine:
             jnp.asarray(save_every),
             self.max_saves_per_call,
             self.options,
-            padded_increments(noise),
+            pad_noise_increments(noise),
         )
         return self._lazy_newton.advance(
             lambda s, *how: advance(self.system, self.method, s, *arguments, *how), state, save_every
@@ -208,7 +208,7 @@ def _step_ends_program(system: System, method: OneStepMethod, x, h, options: Sol
     return jax.lax.map(end_of_step, (x, h))
 
 
-def padded_increments(noise) -> jax.Array | None:
+def pad_noise_increments(noise) -> jax.Array | None:
     """Return noise increments zero-padded to a power of two of steps: few shapes, few programs.
 
     Short calls share one program: padding up to :data:`MAX_SAVED_VALUES_PER_CALL` increments costs nothing.

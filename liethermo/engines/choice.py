@@ -19,7 +19,7 @@ from .array import ArrayEngine, EngineTrajectory
 from .codes import StatusCode
 from .compiled.paced import CompiledAdaptiveRuns
 from .compiled.stepper import CompiledEngine, CompiledTrajectory
-from .paced import AdaptiveRuns, ArrayAdaptiveRuns, resume_on_array_engine, start_one
+from .paced import AdaptiveRuns, ArrayAdaptiveRuns, resume_on_array_engine, start_adaptive_run
 from .pacing import StepControl
 from .sparse.newton import SparseEngine
 from .stepping import SavedStates, State
@@ -190,7 +190,7 @@ class EngineWithFallback:
                     step_loop, parameters, parameters, np.asarray(x, dtype=np.float64)[None], t, stop_time, span_length
                 )
             step = engine.step if isinstance(engine, SparseEngine) else None
-            return start_one(self.system, self.method, control, x, t, stop_time, span_length, step)
+            return start_adaptive_run(self.system, self.method, control, x, t, stop_time, span_length, step)
 
         return self._call_with_fallback(start_on_engine)
 

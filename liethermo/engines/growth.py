@@ -35,7 +35,7 @@ def jacobian_probe(system: System, x) -> jax.Array:
         v = jacobian_product(v)
         return _unit_vector(v), v
 
-    return jax.lax.scan(power_step, _unit_vector(_generic_vector(n)), length=POWER_ITERATIONS)[1]
+    return jax.lax.scan(power_step, _unit_vector(_fixed_random_vector(n)), length=POWER_ITERATIONS)[1]
 
 
 @jit_cached
@@ -56,7 +56,7 @@ def arnoldi_hessenberg(system, method, x):
         # in an invariant subspace the remainder vanishes: continue outside of it
         is_invariant = remainder_norm <= 1e-10 * jnp.linalg.norm(v)
         remainder_norm = jnp.where(is_invariant, 0.0, remainder_norm)
-        remainder = jnp.where(is_invariant, jnp.roll(_generic_vector(n), i + 1), remainder)
+        remainder = jnp.where(is_invariant, jnp.roll(_fixed_random_vector(n), i + 1), remainder)
         matrix = matrix.at[:m, i].set(coefficients[:m]).at[i + 1, i].set(remainder_norm)
         return (basis.at[i + 1].set(_unit_vector(orthogonalise(basis, _unit_vector(remainder))[1])), matrix), None
 
@@ -66,7 +66,7 @@ def arnoldi_hessenberg(system, method, x):
         correction = basis @ v  # the second pass removes the rounding errors of the first
         return coefficients + correction, v - correction @ basis
 
-    initial_basis = jnp.zeros((m + 1, n)).at[0].set(_unit_vector(_generic_vector(n)))
+    initial_basis = jnp.zeros((m + 1, n)).at[0].set(_unit_vector(_fixed_random_vector(n)))
     (_, matrix), _ = jax.lax.scan(arnoldi_step, (initial_basis, jnp.zeros((m + 1, m))), jnp.arange(m))
     return matrix[:m]
 
@@ -76,7 +76,7 @@ def _jacobian_product(system: System, x) -> Callable:
     return lambda v: system.project_tangent(x, jax.jvp(system.vector_field, (x,), (system.project_tangent(x, v),))[1])
 
 
-def _generic_vector(n: int) -> np.ndarray:
+def _fixed_random_vector(n: int) -> np.ndarray:
     """Return a fixed random vector, which has a component along every eigenvector."""
     return np.random.default_rng(0).standard_normal(n)
 

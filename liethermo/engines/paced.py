@@ -93,7 +93,7 @@ AdaptiveRuns: TypeAlias = ArrayAdaptiveRuns | CompiledAdaptiveRuns
 """Adaptive runs that advance together, each as it would alone; the attempts of a single one can be recorded."""
 
 
-def start_one(
+def start_adaptive_run(
     system: System,
     method: OneStepMethod,
     control: StepControl,
@@ -124,7 +124,7 @@ def resume_on_array_engine(
     system: System, method: OneStepMethod, control: StepControl, previous_run: AdaptiveRuns
 ) -> ArrayAdaptiveRuns:
     """Return an array run that resumes the only trajectory of ``previous_run`` from its current state."""
-    run = start_one(
+    run = start_adaptive_run(
         system, method, control, *(previous_run.read(name)[0] for name in ("x", "t", "stop_time", "stop_time"))
     )
     for name in (*State._fields, *AdaptiveState._fields[1:]):
@@ -132,7 +132,7 @@ def resume_on_array_engine(
     return run
 
 
-def start_batch(
+def start_adaptive_runs(
     structure: ProgramStructure,
     parameters,
     axes,

@@ -176,9 +176,9 @@ def jacobian_probe_shape(system: System, method: OneStepMethod, control: StepCon
     return jax.eval_shape(lambda x: jacobian_probe(*system.solved_subsystem(x)), x).shape
 
 
-def next_step(control: StepControl, adaptive_state: AdaptiveState) -> tuple[jax.Array, jax.Array]:
+def next_step_size_and_end(control: StepControl, adaptive_state: AdaptiveState) -> tuple[jax.Array, jax.Array]:
     """Return the size of the next step, a full step or a trial step of an event search, and the time after it."""
-    h, time_after = next_full_step(control, adaptive_state)
+    h, time_after = next_full_step_size_and_end(control, adaptive_state)
     if control.event_function is None:
         return h, time_after
     bracket = searching.RootBracket(*adaptive_state.root_bracket)
@@ -187,7 +187,7 @@ def next_step(control: StepControl, adaptive_state: AdaptiveState) -> tuple[jax.
     return jnp.where(bracket.step_size > 0.0, trial_step, h), jnp.where(bracket.step_size > 0.0, trial_time, time_after)
 
 
-def next_full_step(control: StepControl, adaptive_state: AdaptiveState) -> tuple[jax.Array, jax.Array]:
+def next_full_step_size_and_end(control: StepControl, adaptive_state: AdaptiveState) -> tuple[jax.Array, jax.Array]:
     """Return the size of the next full step and the time after it; none ends just before a stop time."""
     if control.adaptive:
         remaining = adaptive_state.stop_time - adaptive_state.t
@@ -223,7 +223,7 @@ def attempt_step(
     newton_fallback=None,
 ) -> AdaptiveState:
     """Return the adaptive state after one attempted step; ``newton_fallback`` as for :func:`.stepping.take_step`."""
-    h, time_after = next_step(control, adaptive_state)
+    h, time_after = next_step_size_and_end(control, adaptive_state)
     return accept_or_reject(
         system,
         method,
@@ -629,7 +629,7 @@ def advance_adaptive_with(
 
 @jit_cached
 def _next_step_program(control, adaptive_state):
-    return next_step(control, adaptive_state)
+    return next_step_size_and_end(control, adaptive_state)
 
 
 @jit_cached

@@ -89,7 +89,7 @@ class IterationState(NamedTuple):
             is_small |= residual_norm <= options.plateau_rtol * slope_rounding
         return (self.update <= options.update_floor * scale) | ((self.n_stalled >= 2) & is_small)
 
-    def converged_and_continue(self, scale, options: SolverOptions) -> tuple[jax.Array, jax.Array]:
+    def has_converged_and_continues(self, scale, options: SolverOptions) -> tuple[jax.Array, jax.Array]:
         """Return whether a fixed-point iteration has converged, and whether it goes on."""
         is_slow = (
             (self.n_iterations >= 3)
@@ -108,7 +108,7 @@ def solve_fixed_point(equations: StageEquations, options: SolverOptions = DEFAUL
 
     def iterate(carry):
         s = carry[0].next_state(equations.slopes(carry[0].k), options)
-        return s, *s.converged_and_continue(equations.scale(s.k), options)
+        return s, *s.has_converged_and_continues(equations.scale(s.k), options)
 
     initial_carry = IterationState.initial(equations.guess), jnp.asarray(False), jnp.asarray(True)
     s, converged, _ = jax.lax.while_loop(lambda carry: carry[2], iterate, initial_carry)

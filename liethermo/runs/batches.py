@@ -237,7 +237,7 @@ def run_fixed_array(
         n_members = min(batch_size, n_trajectories - start)
         members = padded_member_indices(start, start + n_members, record.x0.shape[1])
         batch_arguments = family.form, *family.vmap_arguments(members), method
-        state = initial_state = begin_vmapped(*batch_arguments, jnp.asarray(record.x0[members]))
+        state = initial_state = initial_run_states_vmapped(*batch_arguments, jnp.asarray(record.x0[members]))
         initial = {name: np.asarray(value) for name, value in initial_state._asdict().items()}
         record.record_initial(members, initial["x"], initial["energy"], initial["entropy"])
         first_step, first_save = 0, 1
@@ -246,7 +246,7 @@ def run_fixed_array(
                 increments = (
                     None
                     if noise is None
-                    else array.padded_increments(
+                    else array.pad_noise_increments(
                         noise.step_increments(members, first_step, n_saves * steps_per_save, h)
                     )
                 )
@@ -278,7 +278,7 @@ REPLAY_STEPS_PER_CALL = 32
 def replay_array(family: Family, method: OneStepMethod, x: np.ndarray, h: np.ndarray, steps: int = 1) -> ReplayedSteps:
     """Take ``steps`` steps of size h[i] with each member i of a small family, on the array engine."""
     batch_arguments, lazy_newton = (family.form, *family.vmap_arguments(slice(None)), method), array.LazyNewton(method)
-    state, chunks = begin_vmapped(*batch_arguments, jnp.asarray(x)), []
+    state, chunks = initial_run_states_vmapped(*batch_arguments, jnp.asarray(x)), []
     for n_done in range(0, steps, REPLAY_STEPS_PER_CALL):
         state, saved_states = advance_batch(
             lazy_newton, batch_arguments, state, h, min(REPLAY_STEPS_PER_CALL, steps - n_done), 1, REPLAY_STEPS_PER_CALL
@@ -288,7 +288,7 @@ def replay_array(family: Family, method: OneStepMethod, x: np.ndarray, h: np.nda
 
 
 @jit_cached
-def begin_vmapped(form, parameters, axes, method, x):
+def initial_run_states_vmapped(form, parameters, axes, method, x):
     """Return the engine states of a batch of trajectories at their initial states x."""
     return jax.vmap(lambda p, x: initial_run_state_program(form.rebuild(p), method, x), in_axes=(axes, 0))(
         parameters, x

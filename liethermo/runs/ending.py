@@ -110,25 +110,25 @@ def blow_up_message(x: np.ndarray, x0: np.ndarray, velocity: np.ndarray, time_el
     norm = np.abs(x).max()
     if norm > BLOW_UP_SIZE or (
         norm > MIN_GROWTH_TO_REPORT * np.abs(x0).max()
-        and _doubles_within(x, velocity, BLOW_UP_TIME_FRACTION * time_elapsed)
+        and _does_norm_double_within(x, velocity, BLOW_UP_TIME_FRACTION * time_elapsed)
     ):
         return f"the state grows without bound: |x| = {norm:.3g} at t = {t:g}. {BLOW_UP_ADVICE}"
     return ""
 
 
-def _doubles_within(x: np.ndarray, velocity: np.ndarray, time: float) -> bool:
+def _does_norm_double_within(x: np.ndarray, velocity: np.ndarray, time: float) -> bool:
     """Return True if a state moves outwards so fast that its norm doubles within a time."""
     norm = np.abs(x).max()
     with np.errstate(all="ignore"):
         return bool(np.abs(velocity).max() * time > norm > 0.0 and np.dot(x / norm, velocity) > 0.0)
 
 
-def _blow_up_by_shorter_steps(engine: EngineWithFallback, state, t: float, h: float) -> str:
+def _blow_up_text_from_shorter_steps(engine: EngineWithFallback, state, t: float, h: float) -> str:
     """Retry a failed step of size h with shorter steps; return a message if they show unbounded growth, otherwise
     ""."""
     x, probe_time, probe_step_size = np.asarray(state.x), 0.0, h / 8.0
     norm, velocity = np.abs(x).max(), vector_field_at(engine.system, x[None])[0]
-    if not _doubles_within(x, velocity, BLOW_UP_HORIZON_STEPS * h):
+    if not _does_norm_double_within(x, velocity, BLOW_UP_HORIZON_STEPS * h):
         return ""
     while probe_time < BLOW_UP_HORIZON_STEPS * h and probe_step_size > h / 8.0**8 and t + probe_step_size > t:
         previous_step = int(state.step)
@@ -159,7 +159,7 @@ def ensemble_failure_message(
     if text := blow_up_message(x, x0, velocity, time_elapsed if np.isnan(h) else 0.0, t):
         return text
     initial_norm, norm = np.abs(x0).max(), np.abs(x).max()
-    if _doubles_within(x, velocity, BLOW_UP_HORIZON_STEPS * h) and norm > MIN_GROWTH_TO_REPORT * initial_norm:
+    if _does_norm_double_within(x, velocity, BLOW_UP_HORIZON_STEPS * h) and norm > MIN_GROWTH_TO_REPORT * initial_norm:
         text = f"|x| has grown from {initial_norm:.3g} to {norm:.3g} at t = {t:g}, and doubles in a few steps"
         return f"{text}: if it grows without bound, no step helps; otherwise try a smaller one"
     return ""
@@ -187,7 +187,7 @@ def final_status(engine: EngineWithFallback, state, t: float, h: float, interrup
         return Status(StatusCode.COMPLETED, f"reached t = {t:g} in {step} steps", step, t, residual)
     step_text = f"step {step + 1}, from t = {t:g} with h = {h:g}"
     x = np.asarray(state.x)
-    if text := blow_up_message(x, x, np.zeros_like(x), 0.0, t) or _blow_up_by_shorter_steps(engine, state, t, h):
+    if text := blow_up_message(x, x, np.zeros_like(x), 0.0, t) or _blow_up_text_from_shorter_steps(engine, state, t, h):
         return Status(StatusCode(code), f"{step_text}, could not be taken: {text}", step, t, residual)
     if code == StatusCode.NOT_CONVERGED and engine.method.explicit:
         message = (

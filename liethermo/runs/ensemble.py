@@ -24,14 +24,14 @@ from .batches import MAX_THREADS, ProgressCounter, replay_array, replay_compiled
 from .events import Event, Relaxed
 from .family import Family, broadcast_size, error_message_of
 from .fluctuations import DEFAULT_NOISE_METHOD, Fluctuations, NoisePaths, check_noise
-from .member_groups import common_inertia, group_members, members_outside_domain
+from .member_groups import common_inertia, group_members_by_invariants, members_outside_domain
 from .paced import AdaptiveEnsembleRun
 from .preparation import (
     check_choice,
     initial_state,
     limit_family_to_span,
     limit_to_span,
-    prepare_run,
+    prepare_system_and_method,
     promised_laws,
     refuse_tracers,
     resolve_invariants,
@@ -159,7 +159,7 @@ def ensemble(
     )
     inertia = common_inertia(family)
     provenance["inertia"] = None if inertia is None else inertia.tolist()
-    groups, refusal_reasons = group_members(family, method, states)
+    groups, refusal_reasons = group_members_by_invariants(family, method, states)
     reasons = dict(reasons) | {int(started_numbers[i]): text for i, text in refusal_reasons.items()}
     subsets: list[Subset] = []
     with Progress((0, len(started_numbers)), progress, "{:.0f} trajectories") as bar:
@@ -231,7 +231,7 @@ class _EnsembleOptions(NamedTuple):
         step, schedule, noise = self.step, self.schedule, self.noise
         member = resolve_invariants(family.member(0), states)
         tolerance = step.tolerance if isinstance(step, Adaptive) else None
-        member, method = prepare_run(member, self.method, noise, tolerance)
+        member, method = prepare_system_and_method(member, self.method, noise, tolerance)
         family = wrap_family(family, member)
         states = np.asarray(initial_state(member, states, schedule.start, attitude, batch=True))
         method.check(member)
@@ -324,7 +324,7 @@ def _checked_initial_states(family: Family, x0s, n_attitudes: int) -> tuple[np.n
         raise InputError(x0_reasons[0])
     reasons = dict(family.refusal_reasons) | x0_reasons
     if family.size > 1 and family.example is None:
-        reasons = family.rejected_members(lambda i: family.axiom_violation(i, states[i]), reasons)
+        reasons = family.rejection_reasons(lambda i: family.axiom_violation_text(i, states[i]), reasons)
     if len(reasons) == n_trajectories:
         raise InputError(f"no trajectory can be started; trajectory 0: {reasons[0]}")
     return states, reasons
@@ -335,7 +335,7 @@ def _unstartable_members(family: Family, member: System, method: OneStepMethod, 
     reasons = _bisect_invalid_rows(lambda rows: why_not_startable(member, method, states[rows]), len(states))
     if not any(family.has_member_axis):
         return reasons
-    suspects = {*reasons, *family.extreme_members(), *members_outside_domain(family, states)}
+    suspects = {*reasons, *family.members_with_extreme_parameters(), *members_outside_domain(family, states)}
     member_reasons = {i: why_not_startable(family.member(i), method, states[i]) for i in sorted(suspects)}
     return {i: text for i, text in member_reasons.items() if text}
 

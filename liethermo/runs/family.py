@@ -79,7 +79,7 @@ class Family:
             raise InputError("a function that builds systems needs parameters=..., one set for each trajectory")
         family = cls.from_function(system, parameters)
         # constructors of systems check their arguments, but a traced program does not
-        refusal_reasons = family.rejected_members(lambda i: error_message_of(lambda: family.member(i)))
+        refusal_reasons = family.rejection_reasons(lambda i: error_message_of(lambda: family.member(i)))
         return replace(family.trace_builder(), refusal_reasons=refusal_reasons)
 
     @classmethod
@@ -225,7 +225,7 @@ class Family:
         """The member that is reported for all: the example if there is one, otherwise the first."""
         return self.member(0) if self.example is None else self.example
 
-    def extreme_members(self) -> list[int]:
+    def members_with_extreme_parameters(self) -> list[int]:
         """Return members with the smallest and largest parameters, which are the likeliest to be out of range."""
         indices = {0: None}
         for value in self.parameter_arrays:
@@ -233,7 +233,7 @@ class Family:
             indices |= dict.fromkeys(int(i) for i in (*rows.argmin(axis=0), *rows.argmax(axis=0)))
         return list(indices)[:MAX_CHECKED_MEMBERS]
 
-    def rejected_members(
+    def rejection_reasons(
         self, reason: Callable[[int], str], known_reasons: Mapping[int, str] | None = None
     ) -> dict[int, str]:
         """Return the members that cannot be run, with the reasons.
@@ -252,11 +252,13 @@ class Family:
         InputError
             If all members are rejected, or the first :data:`MAX_FAILED_MEMBERS` that are tried.
         """
-        reasons = dict(known_reasons or {}) | self._members_with_nan()
+        reasons = dict(known_reasons or {}) | self._reasons_of_members_with_nan()
         candidates, tried_reasons = np.setdiff1d(np.arange(self.size), list(reasons)), dict[int, str]()
         while candidates.size:
             new_members = [
-                i for i in map(int, candidates[self.select(candidates).extreme_members()]) if i not in tried_reasons
+                i
+                for i in map(int, candidates[self.select(candidates).members_with_extreme_parameters()])
+                if i not in tried_reasons
             ]
             tried_reasons |= {i: reason(i) for i in new_members}
             failures = {i: tried_reasons[i] for i in new_members if tried_reasons[i]}
@@ -269,7 +271,7 @@ class Family:
             raise InputError(f"no trajectory can be started; trajectory {first_member}: {reasons[first_member]}")
         return reasons
 
-    def axiom_violation(self, i: int, x: np.ndarray) -> str:
+    def axiom_violation_text(self, i: int, x: np.ndarray) -> str:
         """Return the report or error of the axiom check of member i at x, or "" if it passes."""
         report = None
 
@@ -279,7 +281,7 @@ class Family:
 
         return error_message_of(check) or ("" if report is None or report.passed else str(report))
 
-    def _members_with_nan(self) -> dict[int, str]:
+    def _reasons_of_members_with_nan(self) -> dict[int, str]:
         """Return the members that have NaN among their parameters, with a reason."""
         is_nan = np.zeros(self.size, dtype=bool)
         # a NaN that all members share may be a constant of a function, such as a table beyond its ends

@@ -154,7 +154,7 @@ class Fluctuations:
     ) -> np.ndarray:
         """Return increments of the Wiener processes in steps of one length, shape (trajectories, steps, count).
 
-        They depend on the seed, the trajectory, the start and the length of each step alone: see :func:`step_cells`.
+        They depend on the seed, the trajectory, the start and the length of each step alone (:func:`step_time_codes`).
 
         Parameters
         ----------
@@ -173,7 +173,7 @@ class Fluctuations:
             seeds, numbers = np.array(self.seeds), trajectories + self.first
         else:
             seeds, numbers = np.asarray(self.seeds)[trajectories], np.full(len(trajectories), self.first)
-        halvings, cells = step_cells(starts, length, step)
+        halvings, cells = step_time_codes(starts, length, step)
         high_words, low_words = split_words(cells)
         values = np.empty((len(trajectories), len(cells), count))
         for high_word in np.unique(high_words):
@@ -191,7 +191,7 @@ as possible from all simple fractions. In a run that starts at a simple fraction
 of a cell, where rounding would decide between two cells."""
 
 
-def step_cells(starts, length: float, step: float) -> tuple[int, np.ndarray]:
+def step_time_codes(starts, length: float, step: float) -> tuple[int, np.ndarray]:
     """Return integers that identify steps by their times: one for their length, and one for each start, shape (steps,).
 
     Times are counted in units of the ``step`` of the run. If the run starts at a multiple of it, the starts are

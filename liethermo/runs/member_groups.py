@@ -55,7 +55,7 @@ class InvariantFacts(NamedTuple):
     invariant_verdicts: InvariantVerdicts
 
 
-def with_invariant_facts(system: System, facts: InvariantFacts) -> System:
+def attach_invariant_facts(system: System, facts: InvariantFacts) -> System:
     """Return a copy of the system that has these facts as attributes."""
     system = copy(system)
     for name, value in facts._asdict().items():
@@ -78,7 +78,7 @@ class MemberGroup(NamedTuple):
     family: Family
 
 
-def group_members(
+def group_members_by_invariants(
     family: Family, method: OneStepMethod, states: np.ndarray
 ) -> tuple[list[MemberGroup], dict[int, str]]:
     """Return the groups of members that conserve the same functions, and the members that the method cannot run.
@@ -119,7 +119,7 @@ def group_members(
             facts = members.invariant_facts(
                 *np.split(row[: multiples.shape[1] + known_verdicts.shape[1]], [multiples.shape[1]])
             )
-            groups.append(MemberGroup(indices, family.select(indices).annotate_members(with_invariant_facts, facts)))
+            groups.append(MemberGroup(indices, family.select(indices).annotate_members(attach_invariant_facts, facts)))
     return sorted(groups, key=lambda group: int(group.indices[0])), refusal_reasons
 
 

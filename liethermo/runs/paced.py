@@ -9,7 +9,7 @@ import numpy as np
 
 from ..engines.codes import StatusCode
 from ..engines.compiled.paced import CompiledAdaptiveRuns
-from ..engines.paced import AdaptiveRuns, PauseHandler, start_batch
+from ..engines.paced import AdaptiveRuns, PauseHandler, start_adaptive_runs
 from ..engines.pacing import StepControl
 from ..engines.stepping import REPORTED_FIELDS
 from ..integrators import OneStepMethod
@@ -93,7 +93,7 @@ class AdaptiveEnsembleRun:
             members = padded_member_indices(start, min(start + ARRAY_BATCH_SIZE, n_members), self.record.x0.shape[1])
             parameters, axes = self.family.vmap_arguments(members)
             batch_arguments = self.family.form, parameters, axes, self.method, self.control
-            adaptive_runs = start_batch(*batch_arguments, self.record.x0[members], *self._start_stop_length)
+            adaptive_runs = start_adaptive_runs(*batch_arguments, self.record.x0[members], *self._start_stop_length)
             self._advance_to_end(adaptive_runs, members, None, lambda: self.interrupted)
 
     def _advance_to_end(

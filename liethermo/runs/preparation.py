@@ -73,7 +73,7 @@ def has_undecided_invariants(system: System) -> bool:
 
 
 @memoize
-def prepare_run(
+def prepare_system_and_method(
     system: System, method, noise: Fluctuations | None = None, tolerance: float | None = None
 ) -> tuple[System, Any]:
     """Return the system and the method as they are run, for a tolerance of adaptive steps or for fixed steps.

@@ -21,7 +21,7 @@ from .preparation import (
     invariants_and_laws,
     is_driven_run,
     limit_to_span,
-    prepare_run,
+    prepare_system_and_method,
     resolve_invariants,
 )
 
@@ -137,4 +137,4 @@ class _ThreadEngines(threading.local):
 
 @memoize
 def _cached_problem(system: System, method, noise: Fluctuations | None, tolerance: float | None) -> Problem:
-    return Problem(*prepare_run(system, method, noise, tolerance), noise)
+    return Problem(*prepare_system_and_method(system, method, noise, tolerance), noise)

@@ -158,7 +158,7 @@ class EnsembleRecord:
         self._explain_failures(members, final["x"], status, end_time)
         if self.x is not None:
             self.x[members] = final["x"]
-        if (driven := driven_system(self.member)) is not None:
+        if (driven := driven_system_or_none(self.member)) is not None:
             self.work[members] = driven.work(final["x"][..., : driven.dim])
 
     def _explain_failures(
@@ -210,7 +210,7 @@ class EnsembleRecord:
             x0, attitude0 = map(np.asarray, self.member.split_state(x0))
             if x is not None:
                 x, attitude = map(np.asarray, self.member.split_state(x))
-        if (driven := driven_system(self.member)) is not None:
+        if (driven := driven_system_or_none(self.member)) is not None:
             work = self.work if self.trajectories is None else np.asarray(driven.work(x))
             x, x0, energy = None if x is None else x[..., :-2], x0[..., :-2], energy + work
         result = Ensemble(
@@ -364,7 +364,7 @@ class EnsembleEvidenceCollector:
         return np.asarray(self.member.points(x)).reshape(len(x), -1)
 
 
-def driven_system(system: System) -> DrivenSystem | None:
+def driven_system_or_none(system: System) -> DrivenSystem | None:
     """Return the part of a prepared system that records external work, or None."""
     body = system.body if isinstance(system, AttitudeSystem) else system
     return body if isinstance(body, DrivenSystem) else None

@@ -38,7 +38,7 @@ def cache_folder() -> Path | None:
         return None
 
 
-def read_code(name: str) -> bytes | None:
+def read_machine_code(name: str) -> bytes | None:
     """Return the machine code written under ``name``; None if it is missing, damaged, or may be another user's."""
     folder = _trusted_folder()
     if folder is None:
@@ -60,7 +60,7 @@ def read_code(name: str) -> bytes | None:
     return code if code and checksum == hashlib.sha256(code).digest() else None
 
 
-def write_code(name: str, code: bytes) -> None:
+def write_machine_code(name: str, code: bytes) -> None:
     """Write machine code to the cache under ``name``, if there is a folder that can be used."""
     folder = _trusted_folder()
     if folder is not None:

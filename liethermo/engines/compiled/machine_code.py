@@ -40,12 +40,12 @@ class MachineCode:
                 name = hashlib.sha256(f"{_host_target()[-1]} {self.skip_optimisation}\n{text}".encode()).hexdigest()[
                     :32
                 ]
-                object_file = _object_file(kept.read_code(name))
+                object_file = _object_file(kept.read_machine_code(name))
                 if object_file is not None:
                     break
             else:
                 code = _compile_module(text, skip_optimisation)
-                kept.write_code(name, code)
+                kept.write_machine_code(name, code)
                 object_file = _object_file(code)
             self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _target_machine())
             self._engine.add_object_file(object_file)

@@ -208,7 +208,7 @@ def _finish_step_program(system: System, method: OneStepMethod, state: State, h,
     return finish_step(system, method, state, h, solution, SPARSE_SOLVER_OPTIONS)
 
 
-def _weighted_equations(system: System, method: OneStepMethod, state: State, h):
+def _weighted_residual_guess_and_scale(system: System, method: OneStepMethod, state: State, h):
     """Return the residual ``w (slopes(k) - k)`` as a function of k, a guess of k, and the scale of updates.
 
     With the weights w of :meth:`liethermo.System.residual_weights` a stiff step is nearest to linear.
@@ -224,7 +224,7 @@ def _weighted_equations(system: System, method: OneStepMethod, state: State, h):
 
 @jit_cached
 def _weighted_residual(system: System, method: OneStepMethod, state: State, h, k) -> tuple[Any, Any]:
-    residual, _, scale = _weighted_equations(system, method, state, h)
+    residual, _, scale = _weighted_residual_guess_and_scale(system, method, state, h)
     return residual(k), scale(k)
 
 
@@ -237,18 +237,18 @@ def _residual_rounding(system: System, method: OneStepMethod, x) -> Any:
 @jit_cached
 def _best_guess_program(system: System, method: OneStepMethod, state: State, h):
     """Return the predicted slopes, or zero slopes if their residual is smaller, with residual and scale."""
-    residual_function, guess, scale = _weighted_equations(system, method, state, h)
+    residual_function, guess, scale = _weighted_residual_guess_and_scale(system, method, state, h)
     k, residual = best_initial_guess(residual_function, guess)
     return k, residual, scale(k)
 
 
 @jit_cached
 def _residual_jvp(system: System, method: OneStepMethod, state: State, h, k, seed):
-    residual = _weighted_equations(system, method, state, h)[0]
+    residual = _weighted_residual_guess_and_scale(system, method, state, h)[0]
     return jax.jvp(residual, (k,), (jnp.asarray(seed),))[1]
 
 
 @jit_cached
 def _residual_vjp(system: System, method: OneStepMethod, state: State, h, k, seed):
-    residual = _weighted_equations(system, method, state, h)[0]
+    residual = _weighted_residual_guess_and_scale(system, method, state, h)[0]
     return jax.vjp(residual, k)[1](jnp.asarray(seed))[0]

@@ -15,7 +15,7 @@ from liethermo.engines.krylov import solve_krylov
 from liethermo.engines.rules import DEFAULT_OPTIONS
 from liethermo.engines.stages import IterationState, StageEquations, solve_stages
 from liethermo.engines.stepping import initial_run_state_program
-from liethermo.runs.preparation import checked_initial_state, prepare_run
+from liethermo.runs.preparation import checked_initial_state, prepare_system_and_method
 
 N_SPINS = 5_000
 """Number of spins of the large ring."""
@@ -133,7 +133,7 @@ def test_steps_before_newtons_method_is_needed_are_not_taken_again(monkeypatch):
         return advance(system, method, state, *arguments)
 
     monkeypatch.setattr(array, "advance", recording_advance)
-    system, method = prepare_run(body, lt.MetriplecticMidpoint())
+    system, method = prepare_system_and_method(body, lt.MetriplecticMidpoint())
     engine = array.ArrayEngine(system, method)
     start = engine.initial_run_state(checked_initial_state(system, method, [0.1, 0.1, 0.1], 0.0))
     lazy_state, lazy_saves = engine.advance(start, 0.5, 10, 4)
@@ -231,7 +231,7 @@ def test_one_of_many_components_is_solved_like_the_others(strength, length):
     spins = np.random.default_rng(0).standard_normal((n, 3))
     spins[0] = 0.6 * length, 0.0, 0.8 * length
     inputs = lt.LiePoissonSystem(mf.power(mf.so(3), n), energy), lt.MetriplecticMidpoint()
-    system, method = prepare_run(*inputs)
+    system, method = prepare_system_and_method(*inputs)
     assert system.dim > DEFAULT_OPTIONS.rms_norm_dim
     engine = array.ArrayEngine(system, method)
     state = engine.initial_run_state(jnp.asarray(spins.ravel()))

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.runs.preparation import prepare_run
+from liethermo.runs.preparation import prepare_system_and_method
 from tests.manifolds.spaces.test_own_spaces import Ellipsoid
 
 RK4 = lt.MetriplecticRungeKutta(4)
@@ -119,11 +119,11 @@ def test_with_charts_and_without(name):
 def test_the_embedded_system_runs_unless_a_retraction_is_given():
     """Without a retraction a spin runs without chart and projection; with a retraction it runs in charts."""
     spin = lt.MetriplecticSystem(mf.LiePoisson(mf.so(3)), lambda s: s[0] ** 4 + s[1] ** 2, space=mf.Sphere(2))
-    system, method = prepare_run(spin, GAUSS)
+    system, method = prepare_system_and_method(spin, GAUSS)
     assert type(system).__name__ == "EmbeddedSystem"
     assert system.is_tangent
     assert method == GAUSS
-    chart_run = prepare_run(spin, lt.MetriplecticGauss(2, retraction="exp"))
+    chart_run = prepare_system_and_method(spin, lt.MetriplecticGauss(2, retraction="exp"))
     assert chart_run[0] is spin
     assert isinstance(chart_run[1], lt.InCharts)
 
@@ -133,7 +133,7 @@ def test_the_embedded_system_runs_unless_a_retraction_is_given():
         return jnp.array([[0, -c, b], [c, 0, -a], [-b, a, 0]])
 
     not_tangent = lt.MetriplecticSystem(tensor, lambda s: s[0] ** 4 + s[1] ** 2, space=mf.Sphere(2))
-    assert not prepare_run(not_tangent, GAUSS)[0].is_tangent
+    assert not prepare_system_and_method(not_tangent, GAUSS)[0].is_tangent
     x0 = np.array([0.6, 0.64, 0.48])
     ends = [lt.integrate(s, x0, (0.0, 1.0), 0.01, GAUSS).x[-1] for s in (spin, not_tangent)]
     assert np.abs(ends[0] - ends[1]).max() < 1e-6

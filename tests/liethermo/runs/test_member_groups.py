@@ -117,7 +117,7 @@ def test_a_control_one_verdict_for_all_is_found(monkeypatch):
         facts = member_groups.InvariantFacts(None, first_verdicts)
         return [
             member_groups.MemberGroup(
-                np.arange(len(states)), family.annotate_members(member_groups.with_invariant_facts, facts)
+                np.arange(len(states)), family.annotate_members(member_groups.attach_invariant_facts, facts)
             )
         ], {}
 
@@ -125,7 +125,7 @@ def test_a_control_one_verdict_for_all_is_found(monkeypatch):
         mf.so(3), lt.Quadratic([1.0, 2.0, 3.0]), lambda m: jnp.log(1 + m @ m), lt.KillingDissipation(0.3)
     )
     assert lt.testing.check_relations(system, lt.MetriplecticGauss(1), START, 0.1, relations=["company"]).passed
-    monkeypatch.setattr("liethermo.runs.ensemble.group_members", group_like_first_member)
+    monkeypatch.setattr("liethermo.runs.ensemble.group_members_by_invariants", group_like_first_member)
     with pytest.raises(lt.testing.PropertyError, match="company"):
         lt.testing.check_relations(system, lt.MetriplecticGauss(1), START, 0.1, relations=["company"])
 
@@ -212,7 +212,9 @@ def test_one_inertia_only_if_all_have_it():
 def test_groups_are_few_and_in_order():
     values = np.array([2.0, 1.0, 0.5, 1.0, 3.0])
     family = Family.from_arguments(body, {"a": values})
-    groups, refusal_reasons = member_groups.group_members(family, lt.MetriplecticMidpoint(), np.tile(START, (5, 1)))
+    groups, refusal_reasons = member_groups.group_members_by_invariants(
+        family, lt.MetriplecticMidpoint(), np.tile(START, (5, 1))
+    )
     assert [group.indices.tolist() for group in groups] == [[0, 2, 4], [1, 3]]
     assert refusal_reasons == {}
     names = [group.family.member(0).invariant_verdicts.conserved_names for group in groups]

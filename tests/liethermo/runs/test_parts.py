@@ -8,7 +8,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.runs.fluctuations import step_cells, step_code
+from liethermo.runs.fluctuations import step_code, step_time_codes
 from liethermo.runs.timetable import ScheduleSegment
 from tests.cases import BuiltOnUse
 
@@ -181,10 +181,10 @@ def test_steps_at_times_that_are_rounded_otherwise_have_the_same_names(step, off
         product_times = start + n * step
         sum_times = np.cumsum(np.append(start, np.full(1999, step)))
         shifted_times = (start + 700 * step) + (n - 700) * step
-        product_cells = step_cells(product_times, step, step)
+        product_cells = step_time_codes(product_times, step, step)
         for times in (sum_times, shifted_times, (first_step + offset + n) * step):
-            assert step_cells(times, step, step)[0] == product_cells[0]
-            assert np.array_equal(step_cells(times, step, step)[1], product_cells[1])
+            assert step_time_codes(times, step, step)[0] == product_cells[0]
+            assert np.array_equal(step_time_codes(times, step, step)[1], product_cells[1])
         assert (np.diff(product_cells[1]) == 64).all()
 
 
@@ -215,7 +215,7 @@ def test_no_two_steps_of_a_path_have_the_same_name():
     starts = -3.0 + np.append(0.0, np.cumsum(lengths)[:-1])
     names = set()
     for start, length in zip(starts, lengths, strict=True):
-        halvings, cells = step_cells(np.array([start]), length, 0.1)
+        halvings, cells = step_time_codes(np.array([start]), length, 0.1)
         names.add((halvings, int(cells[0])))
     assert len(names) == len(lengths)
 
