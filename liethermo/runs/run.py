@@ -96,8 +96,7 @@ class Run:
                 saved_states = trajectory.advance(h, n_saves, steps_per_save)
                 self._save_states_of_call(saved_states, n_steps, steps_per_save, keep)
                 n_steps = int(trajectory.read("step"))
-                if bar.is_shown:
-                    bar.update(self.schedule.time_after(n_steps))
+                bar.update(self.schedule.time_after(n_steps))
                 if trajectory.read("status") != StatusCode.COMPLETED:
                     break
                 self._checkpoint(lambda: trajectory.state)
