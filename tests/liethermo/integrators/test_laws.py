@@ -13,7 +13,7 @@ from tests.cases import (
     build,
     combinations,
     energy_of,
-    slow,
+    slow_case,
     state_of,
     tolerance,
 )
@@ -70,7 +70,9 @@ bianchi('V'), bianchi('VI', h=-0.5), bianchi('VII', h=1)"""
 
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(
-    "g", [g if g.name in DEFAULT_ALGEBRAS else slow(g) for g in ALGEBRAS if g.casimir_count() > 0], ids=lambda g: g.name
+    "g",
+    [g if g.name in DEFAULT_ALGEBRAS else slow_case(g) for g in ALGEBRAS if g.casimir_count() > 0],
+    ids=lambda g: g.name,
 )
 def test_every_algebra(g):
     system = build(g, next(case for case in DISSIPATIONS if case.name == "projected"))
@@ -78,7 +80,7 @@ def test_every_algebra(g):
 
 
 @pytest.mark.sampled(3)
-@pytest.mark.parametrize(("g", "case"), [*combinations([mf.so(3)]), *map(slow, combinations([mf.se(3)]))])
+@pytest.mark.parametrize(("g", "case"), [*combinations([mf.so(3)]), *map(slow_case, combinations([mf.se(3)]))])
 def test_every_dissipation(g, case):
     system = build(g, case)
     for seed in range(3):
@@ -88,7 +90,7 @@ def test_every_dissipation(g, case):
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("method", METHOD_PARAMS)
 @pytest.mark.parametrize(
-    "name", ["killing", "projected_preserve", *map(slow, ["friction_operator", "double_bracket", "force"])]
+    "name", ["killing", "projected_preserve", *map(slow_case, ["friction_operator", "double_bracket", "force"])]
 )
 def test_every_method(method, name):
     g = mf.sl(2)

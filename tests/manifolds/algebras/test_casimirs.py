@@ -317,7 +317,7 @@ def test_too_many_monomials_are_refused_with_their_number(monkeypatch):
 def test_rational_null_space(data):
     rows, columns = data.draw(st.integers(0, 5)), data.draw(st.integers(1, 6))
     p = linear.large_prime(0)
-    entry = st.one_of_validator(st.integers(-3, 3), st.integers(-(2**40), 2**40), st.sampled_from([p, -2 * p]))
+    entry = st.one_of(st.integers(-3, 3), st.integers(-(2**40), 2**40), st.sampled_from([p, -2 * p]))
     matrix = np.array([[data.draw(entry) for _ in range(columns)] for _ in range(rows)], dtype=np.int64)
     matrix = matrix.reshape(rows, columns)
     basis = linear.rational_null_space(matrix)
@@ -339,7 +339,7 @@ def test_primes():
 
 
 x, y, z = (Polynomial([row], [1]) for row in np.eye(3, dtype=int).tolist())
-coefficients = st.one_of_validator(st.integers(-9, 9), st.fractions(-3, 3, max_denominator=7), st.floats(-4, 4))
+coefficients = st.one_of(st.integers(-9, 9), st.fractions(-3, 3, max_denominator=7), st.floats(-4, 4))
 polynomials = st.lists(st.tuples(st.tuples(*[st.integers(0, 3)] * 3), coefficients), max_size=5).map(
     lambda terms: Polynomial(np.array([p for p, _ in terms], dtype=int).reshape(-1, 3), [c for _, c in terms])
 )
