@@ -28,6 +28,12 @@ from .traced import has_plain_functions, is_library_object, trace_callables
 MAX_INTERPRETED_INSTRUCTIONS = 30_000
 """Largest number of instructions of an interpreted program; a longer one is faster to compile."""
 
+MAX_DENSE_OPERATIONS = 1_000_000
+"""Largest number of operations, those on zeros included, of a function that is unrolled.
+
+Zeros shorten an unrolled program, to a fifteenth for su(4); above this limit none was short enough to be interpreted.
+"""
+
 POINTS_PER_CHUNK = 1_000
 """Number of points evaluated together; their intermediate values stay in the processor's cache."""
 
@@ -69,6 +75,8 @@ def batch_evaluator(function: Callable, pytree: Any, dim: int) -> Callable[[np.n
         )
         if not is_library_object(pytree):
             check_indices(closed_jaxpr)
+        if count_dense_operations(closed_jaxpr.jaxpr) > MAX_DENSE_OPERATIONS:
+            raise UnsupportedPrimitive(function.__name__, "", "within the size limit", too_large=True)
         zeros = [np.where(value == 0.0, 0.0, np.nan) for value in values]
         return scalarize(
             closed_jaxpr, [*zeros, None], max_instructions=MAX_INTERPRETED_INSTRUCTIONS
@@ -96,6 +104,32 @@ def batch_evaluator(function: Callable, pytree: Any, dim: int) -> Callable[[np.n
         return jax.tree_util.tree_unflatten(structure, results)
 
     return evaluate
+
+
+DATA_MOVEMENT = frozenset(
+    "reshape broadcast_in_dim squeeze transpose slice dynamic_slice concatenate gather pad rev copy iota "
+    "convert_element_type".split()
+)
+"""Primitives without arithmetic."""
+
+
+def count_dense_operations(jaxpr) -> int:
+    """Return the number of scalar operations of a jaxpr; one pass of a loop of unknown length is counted."""
+    total = 0
+    for equation in jaxpr.eqns:
+        parameters = (value if isinstance(value, tuple | list) else [value] for value in equation.params.values())
+        inner_jaxprs = [
+            jaxpr for values in parameters for v in values if hasattr(jaxpr := getattr(v, "jaxpr", v), "eqns")
+        ]
+        if inner_jaxprs:
+            total += equation.params.get("length", 1) * sum(map(count_dense_operations, inner_jaxprs))
+        elif equation.primitive.name == "dot_general":
+            contracted_axes = equation.params["dimension_numbers"][0][0]
+            n_products = math.prod(equation.invars[0].aval.shape[axis] for axis in contracted_axes)
+            total += n_products * math.prod(equation.outvars[0].aval.shape)
+        elif equation.primitive.name not in DATA_MOVEMENT:
+            total += max(math.prod(v.aval.shape) for v in (*equation.invars, *equation.outvars))
+    return total
 
 
 def polynomial_degree_bound(function: Callable, pytree: Any, dim: int) -> float:

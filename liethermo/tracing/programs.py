@@ -1,23 +1,31 @@
 """A cache of programs compiled by XLA, found by their content; the least recently used are unloaded.
 
 A compiled program takes several hundred memory maps of the 65,530 that Linux grants a process, and ``jax.jit`` keeps
-thousands of programs.
+thousands of programs. Programs that take long to compile are also kept on disk, for other processes
+(:mod:`.code_cache`).
 """
 
 from __future__ import annotations
 
 import functools
+import hashlib
+import os
+import time
+import zlib
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jaxlib
 import numpy as np
+from jax.experimental import serialize_executable
 
 from manifolds._arrays import is_traced
 
 from .caching import LRUCache
+from .code_cache import host_processor, read_machine_code, write_machine_code
 
 MAX_CACHED_PROGRAMS = 48
 """Largest number of compiled programs in memory; each takes at most 500 memory maps."""
@@ -70,10 +78,12 @@ def _jit_with_options(function: FunctionT, options: dict | None) -> FunctionT:
     @functools.wraps(function)
     def call(*arguments):
         array_function, dynamic, key = _split_arguments(function, arguments)
-        compiler_options = None if options is None or _is_being_traced(dynamic) else options
-        return _program_cache.get_or_compute(
-            (key, compiler_options is None), lambda: jax.jit(array_function, compiler_options=compiler_options)
-        )(dynamic)
+        is_part_of_program = _is_being_traced(dynamic)
+        program = _program_cache.get_or_compute(
+            (key, is_part_of_program),
+            lambda: jax.jit(array_function) if is_part_of_program else _compile(array_function, dynamic, options),
+        )
+        return program(dynamic)
 
     return call  # type: ignore[return-value]
 
@@ -81,6 +91,62 @@ def _jit_with_options(function: FunctionT, options: dict | None) -> FunctionT:
 def _is_being_traced(arrays: tuple) -> bool:
     """Return whether a call belongs to a program that is being traced, whose own options apply."""
     return is_traced(arrays, jnp.zeros(()))
+
+
+# -- programs on disk -------------------------------------------------------------------------------------------------
+
+
+MIN_STORED_COMPILE_SECONDS = 0.1
+"""Shortest time in seconds of a compilation whose result is written to disk."""
+
+
+def _compile(function: Callable, arguments: tuple, options: dict | None) -> Callable:
+    """Return the program of a function of arrays, from the cache on disk or compiled by XLA.
+
+    The cache is found by the text of the program, so it never returns the program of another function. Programs that
+    call Python, or that run on accelerators or on several devices, are not cached, nor any if JAX's own cache is on:
+    a program that comes from there cannot be written again.
+    """
+    jitted = jax.jit(function, compiler_options=options)
+    devices = jax.devices()
+    if len(devices) > 1 or devices[0].platform != "cpu" or getattr(jax.config, "jax_compilation_cache_dir"):  # noqa: B009
+        return jitted
+    lowered = jitted.lower(arguments)
+    text = lowered.as_text()
+    if "callback" in text:
+        return lowered.compile()
+    name = hashlib.sha256(f"{_compiler_identity()} {options}\n{text}".encode()).hexdigest()[:32]
+    if (program := _stored_program(name, lowered)) is not None:
+        return program
+    start = time.perf_counter()
+    compiled = lowered.compile()
+    if time.perf_counter() - start >= MIN_STORED_COMPILE_SECONDS:
+        write_machine_code(name, zlib.compress(serialize_executable.serialize(compiled)[0], 1), XLA_SUFFIX)
+    return compiled
+
+
+XLA_SUFFIX = ".xla"
+"""Suffix of the files of programs that XLA compiled."""
+
+
+def _stored_program(name: str, lowered: Any) -> Callable | None:
+    """Return the program written to disk under ``name``; None if there is none that can be loaded."""
+    code = read_machine_code(name, XLA_SUFFIX)
+    if code is None:
+        return None
+    trees = lowered.in_tree, lowered.out_tree
+    try:
+        return serialize_executable.deserialize_and_load(zlib.decompress(code), *trees)
+    except Exception:  # of any kind, from XLA's and JAX's insides: the program is compiled again
+        return None
+
+
+@functools.cache
+def _compiler_identity() -> str:
+    """Return a text that identifies this machine and its compiler; XLA divides work among the cores it sees."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    flags = os.environ.get("XLA_FLAGS", "")
+    return f"{host_processor()} {cores} {jax.__version__} {jaxlib.__version__} {flags}"
 
 
 def _strip_weak_type(array):

@@ -12,7 +12,8 @@ import threading
 import llvmlite.binding as llvm
 from llvmlite import ir
 
-from . import kept, lapack
+from ...tracing import code_cache
+from . import lapack
 
 
 class MachineCode:
@@ -40,12 +41,12 @@ class MachineCode:
                 name = hashlib.sha256(f"{_host_target()[-1]} {self.skip_optimisation}\n{text}".encode()).hexdigest()[
                     :32
                 ]
-                object_file = _object_file(kept.read_machine_code(name))
+                object_file = _object_file(code_cache.read_machine_code(name))
                 if object_file is not None:
                     break
             else:
                 code = _compile_module(text, skip_optimisation)
-                kept.write_machine_code(name, code)
+                code_cache.write_machine_code(name, code)
                 object_file = _object_file(code)
             self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _target_machine())
             self._engine.add_object_file(object_file)
@@ -71,9 +72,9 @@ def _host_target() -> tuple[llvm.Target, str, str, str]:
     math_library = ctypes.util.find_library("m")
     if math_library:
         llvm.load_library_permanently(math_library)
-    triple, cpu_variable = llvm.get_process_triple(), os.environ.get("LIETHERMO_CPU", "")
-    cpu = cpu_variable or llvm.get_host_cpu_name()
-    features = "" if cpu_variable else llvm.get_host_cpu_features().flatten()
+    triple, cpu, features = code_cache.host_processor()
+    if cpu_variable := os.environ.get("LIETHERMO_CPU", ""):
+        cpu, features = cpu_variable, ""
     version = ".".join(map(str, llvm.llvm_version_info))
     return llvm.Target.from_triple(triple), cpu, features, f"{triple} {cpu} {features} {version}"
 

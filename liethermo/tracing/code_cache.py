@@ -1,4 +1,4 @@
-"""Cache of machine code on disk, in files and folders that only this user can have written."""
+"""Cache of machine code on disk, of LLVM and of XLA, in files and folders that only this user can have written."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 
 from manifolds.errors import warn
 
-from ... import disk
+from .. import disk
 
 
 class CacheWarning(UserWarning):
@@ -38,20 +38,28 @@ def cache_folder() -> Path | None:
         return None
 
 
-def read_machine_code(name: str) -> bytes | None:
+@functools.cache
+def host_processor() -> tuple[str, str, str]:
+    """Return the LLVM names of this machine: target triple, CPU and features."""
+    import llvmlite.binding as llvm
+
+    return llvm.get_process_triple(), llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+
+
+def read_machine_code(name: str, suffix: str = ".o") -> bytes | None:
     """Return the machine code written under ``name``; None if it is missing, damaged, or may be another user's."""
     folder = _trusted_folder()
     if folder is None:
         return None
     try:
         with open(
-            folder / f"{name}.o", "rb", opener=lambda path, flags: os.open(path, flags | SAFE_OPEN_FLAGS)
+            folder / f"{name}{suffix}", "rb", opener=lambda path, flags: os.open(path, flags | SAFE_OPEN_FLAGS)
         ) as file:
             file_status = os.fstat(file.fileno())
             if not stat.S_ISREG(file_status.st_mode) or file_status.st_size > MAX_FILE_BYTES:
                 return None
             if reason := _why_untrusted(file_status):
-                _warn_untrusted(str(folder / f"{name}.o"), reason)
+                _warn_untrusted(str(folder / f"{name}{suffix}"), reason)
                 return None
             content = file.read()
     except (OSError, ValueError):
@@ -60,13 +68,13 @@ def read_machine_code(name: str) -> bytes | None:
     return code if code and checksum == hashlib.sha256(code).digest() else None
 
 
-def write_machine_code(name: str, code: bytes) -> None:
+def write_machine_code(name: str, code: bytes, suffix: str = ".o") -> None:
     """Write machine code to the cache under ``name``, if there is a folder that can be used."""
     folder = _trusted_folder()
     if folder is not None:
         with contextlib.suppress(OSError):
-            disk.write_atomically(folder / f"{name}.o", hashlib.sha256(code).digest() + code, mode=0o600)
-            disk.remove_abandoned_files(folder, f"{name}.o")
+            disk.write_atomically(folder / f"{name}{suffix}", hashlib.sha256(code).digest() + code, mode=0o600)
+            disk.remove_abandoned_files(folder, f"{name}{suffix}")
 
 
 def _trusted_folder() -> Path | None:
