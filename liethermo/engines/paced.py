@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,6 @@ from ..integrators import OneStepMethod
 from ..systems import System
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.programs import jit_cached
-from . import searching
 from .array import LazyNewton
 from .codes import StatusCode
 from .compiled.form import ProgramStructure
@@ -179,12 +178,52 @@ EVENT_ZERO_ULPS = 2.0**10
 """Largest event value, in roundings of the event function, that counts as zero."""
 
 
-def _event_rounding(model: tuple[System, Any], x) -> jax.Array:
-    """Return the rounding error scale of the event function at x, including the rounding of x itself."""
-    system, event_function = model
+def _event_rounding(model: tuple[System, Any], time_and_state) -> jax.Array:
+    """Return the rounding error scale of an event function at (t, x), including the rounding of x itself."""
+    (system, event_function), t, x = model, time_and_state[0], time_and_state[1:]
     return propagated_rounding_scale(
-        lambda y: event_function(system, y), x, jnp.maximum(jnp.abs(x), system.component_scales(x))
+        lambda y: event_function(system, t, y), x, jnp.maximum(jnp.abs(x), system.component_scales(x))
     )
+
+
+DIFFERENCE_STEP = 1e-6
+"""Relative step of the differences of an event function that cannot be traced."""
+
+
+def _rounding_by_differences(model: tuple[System, Any], time_and_state: np.ndarray) -> float:
+    """Return the rounding error scale of an event function that cannot be traced, by that of x alone."""
+    (system, event_function), t, x = model, time_and_state[0], time_and_state[1:]
+    scales, directions = np.maximum(np.abs(x), system.component_scales(x)), np.random.default_rng(0)
+    derivatives = []
+    for _ in range(4):
+        h = DIFFERENCE_STEP * scales * directions.choice([-1.0, 1.0], len(x))
+        ends = [float(event_function(system, t, jnp.asarray(x + s * h))) for s in (1.0, -1.0)]
+        derivatives.append(abs(ends[0] - ends[1]) / (2.0 * DIFFERENCE_STEP))
+    return max(derivatives)
+
+
+class EventRules(NamedTuple):
+    """Rules for the zeros of event functions.
+
+    Attributes
+    ----------
+    terminal_counts : tuple of int or None
+        For each function the number of zeros that ends the run; None if it never ends the run.
+    counts_jumps : tuple of bool
+        For each function whether a change of sign without a zero is an event too.
+    """
+
+    terminal_counts: tuple[int | None, ...] = ()
+    counts_jumps: tuple[bool, ...] = ()
+
+
+class EventOccurrence(NamedTuple):
+    """Event of one trajectory: its index, the number of the event function, the time, and the state, shape (n,)."""
+
+    trajectory: int
+    function: int
+    t: float
+    x: np.ndarray
 
 
 # -- pauses -----------------------------------------------------------------------------------------------------------
@@ -201,11 +240,16 @@ class PauseHandler:
     stop_times : array
         Times at which steps have to end, increasing; the last is the end of the span.
     system_of : function from the index of a trajectory to its system
+    rules : EventRules
 
     Attributes
     ----------
-    sign_jumps : list of float
-        Times at which the event function changed its sign without being zero.
+    occurrences : list of EventOccurrence
+        Events since the list was last emptied.
+    sign_jumps : list of (int, float)
+        Numbers of event functions that changed their sign without being zero, and the times.
+    undefined_ends : list of (int, float)
+        Numbers of event functions that were NaN between opposite signs, and the times at which they are numbers again.
     """
 
     def __init__(
@@ -215,13 +259,22 @@ class PauseHandler:
         method: OneStepMethod,
         stop_times: np.ndarray,
         system_of: Callable,
+        rules: EventRules,
     ):
         self.adaptive_runs = adaptive_runs
         self.control = control
         self.method = method
         self.stop_times = stop_times
         self.system_of = system_of
-        self.sign_jumps: list[float] = []
+        self.rules = rules
+        self.occurrences: list[EventOccurrence] = []
+        self.sign_jumps: list[tuple[int, float]] = []
+        self.undefined_ends: list[tuple[int, float]] = []
+        self._event_counts = np.zeros((len(adaptive_runs.read("t")), len(rules.counts_jumps)), dtype=int)
+
+    def keep_only(self, indices: np.ndarray) -> None:
+        """Drop all trajectories except the chosen ones, after the runs have dropped them."""
+        self._event_counts = self._event_counts[indices]
 
     def paused_indices(self, reason: int) -> np.ndarray:
         """Return the indices of the trajectories that pause for ``reason``."""
@@ -230,36 +283,60 @@ class PauseHandler:
     def confirm_events(self) -> None:
         """Decide for each trajectory paused at a sign change whether it is an event: a zero, to rounding.
 
-        A trajectory at a jump or a pole resumes after it, as after a stop. If the function is NaN between the two
-        signs, it is unknown whether the event happens, and the run ends. If only falls are events, a jump is an event
-        too.
+        The run ends at the last zero that it waits for. Otherwise it resumes, as it does after a jump or a pole. If a
+        function is NaN between the two signs, it is unknown whether the event happens, and the run ends, unless jumps
+        count as events.
         """
         runs, indices = self.adaptive_runs, self.paused_indices(StatusCode.PAUSED_AT_EVENT)
         if not indices.size:
             return
-        value = runs.read("root_bracket", indices)[:, searching.LAST_VALUE_INDEX]
-        value_before = runs.read("event_value", indices)
-        is_zero = (
-            np.isfinite(value) if self.control.falling_only else self._is_zero_to_rounding(indices, value, value_before)
-        )
-        runs.write("status", indices[is_zero], StatusCode.EVENT)
-        is_unknown = ~is_zero & ~np.isfinite(value_before)
-        runs.write("status", indices[is_unknown], StatusCode.NON_FINITE)
-        is_jump = ~is_zero & ~is_unknown
-        indices, t = indices[is_jump], runs.read("t", indices[is_jump])
-        if indices.size:
-            self.sign_jumps += t.tolist()
-            runs.write("event_value", indices, -value_before[is_jump])
-            runs.write("last_stop_time", indices, t)
-            runs.write("steps_at_last_stop", indices, runs.read("step", indices))
-            runs.write(
-                "status",
-                indices,
-                np.where(t >= runs.read("stop_time", indices), StatusCode.PAUSED_AT_STOP, StatusCode.COMPLETED),
-            )
+        values_before = runs.read("event_values", indices)
+        values = runs.read("root_bracket", indices)[:, -values_before.shape[1] :]
+        t, status = runs.read("t", indices), np.full(len(indices), StatusCode.COMPLETED)
+        has_changed = self._has_changed_sign(values_before, values)
+        for k, counts_jumps in enumerate(self.rules.counts_jumps):
+            rows = np.flatnonzero(has_changed[:, k])
+            is_known, before, after = np.isfinite(values_before[rows, k]), values_before[rows, k], values[rows, k]
+            is_zero = is_known & (counts_jumps | self._is_zero_to_rounding(indices[rows], k, after, before))
+            self.sign_jumps += [(k, time) for time in t[rows[is_known & ~is_zero]].tolist()]
+            if counts_jumps:
+                self.undefined_ends += [(k, time) for time in t[rows[~is_known]].tolist()]
+            else:
+                status[rows[~is_known]] = StatusCode.NON_FINITE
+            for row in rows[is_zero]:
+                trajectory = int(indices[row])
+                x = runs.read("x", indices[row : row + 1])[0]
+                self.occurrences.append(EventOccurrence(trajectory, k, float(t[row]), x))
+                self._event_counts[trajectory, k] += 1
+                if self._event_counts[trajectory, k] == self.rules.terminal_counts[k]:
+                    status[row] = StatusCode.EVENT
+        resumes = status == StatusCode.COMPLETED
+        status[resumes & (t >= runs.read("stop_time", indices))] = StatusCode.PAUSED_AT_STOP
+        runs.write("status", indices, status)
+        signed_values = np.where(has_changed, -np.sign(values_before) * np.fmin(np.abs(values_before), 1e300), values)
+        next_values = np.where(np.isnan(signed_values), values_before, signed_values)
+        if not resumes.any():
+            return
+        runs.write("event_values", indices[resumes], next_values[resumes])
+        if not self.control.adaptive:  # the steps go on to the times at which they would have ended
+            start, step = runs.read("last_stop_time", indices), float(self.control.first_step)
+            n_done = np.floor((t - start) / step * (1 + 1e-12))
+            runs.write("steps_at_last_stop", indices[resumes], (runs.read("step", indices) - n_done)[resumes])
 
-    def _is_zero_to_rounding(self, indices: np.ndarray, value: np.ndarray, value_before: np.ndarray) -> np.ndarray:
-        """Return whether event values are zero, to rounding, given the values at the start of the steps.
+    def _has_changed_sign(self, values_before: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Return which functions have changed their sign at a pause, shape (trajectories, functions).
+
+        At least one has: the one that is nearest to its zero may still have the sign before.
+        """
+        is_in_direction = np.asarray(self.control.event_directions) * np.sign(values_before) <= 0.0
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ratios = values / np.where(np.isinf(values_before), np.sign(values_before), values_before)
+        can_change = (values_before != 0.0) & is_in_direction & ~np.isnan(ratios)
+        ratios = np.where(can_change, ratios, np.inf)
+        return can_change & ((ratios <= 0.0) | (ratios == ratios.min(axis=1, keepdims=True)))
+
+    def _is_zero_to_rounding(self, indices: np.ndarray, k: int, value: np.ndarray, value_before: np.ndarray):
+        """Return whether values of event function k are zero, to rounding, given those at the start of the steps.
 
         A value is zero if it is negligible relative to the value before. Otherwise it is compared with the rounding of
         the function, except near a pole, where the value has grown and its rounding is as large as the value.
@@ -269,8 +346,13 @@ class PauseHandler:
         for group in self._group_by_system(
             indices[~is_zero & np.isfinite(magnitude) & (magnitude <= EVENT_ZERO_ULPS * value_before)]
         ):
-            in_group, model = np.isin(indices, group), (self.system_of(int(group[0])), self.control.event_function)
-            rounding_scales = evaluate_at_points(_event_rounding, model, self.adaptive_runs.read("x", group))
+            in_group, model = np.isin(indices, group), (self.system_of(int(group[0])), self.control.event_functions[k])
+            times_and_states = np.column_stack([self.adaptive_runs.read(name, group) for name in ("t", "x")])
+            rounding_scales = (
+                np.array([_rounding_by_differences(model, row) for row in times_and_states])
+                if model[1].calls_python
+                else evaluate_at_points(_event_rounding, model, times_and_states)
+            )
             is_zero[in_group] = magnitude[in_group] <= EVENT_ZERO_ULPS * EPS * np.where(
                 np.isnan(rounding_scales), np.inf, rounding_scales
             )

@@ -81,10 +81,10 @@ class StepControl(Module):
     ----------
     rtol, atol, first_step, max_step, min_step, max_attempts : array, shape ()
         Tolerances; the first step size, 0 to estimate it; the largest and smallest step size; the number of attempts.
-    event_function : pytree
-        The function ``(system, x)`` whose sign changes are events, or None.
-    falling_only : bool
-        Whether only changes from positive to negative are events.
+    event_functions : tuple of pytrees
+        Functions ``(system, t, x)`` whose sign changes are events.
+    event_directions : tuple of int
+        For each function 1 if only its rises are events, -1 if only its falls, or 0.
     adaptive : bool
         If false, all steps have the size ``first_step``, except those that end at a stop time.
     """
@@ -95,16 +95,24 @@ class StepControl(Module):
     max_step: jax.Array | np.ndarray
     min_step: jax.Array | np.ndarray
     max_attempts: jax.Array | np.ndarray
-    event_function: Any
-    falling_only: bool = eqx.field(static=True)
+    event_functions: tuple[Any, ...]
+    event_directions: tuple[int, ...] = eqx.field(static=True)
     adaptive: bool = eqx.field(static=True)
 
     def allowed_error(self, scale) -> jax.Array:
         """Return the error allowed for a state of norm ``scale``."""
         return self.atol + self.rtol * scale
 
-    def event_value(self, system: System, x) -> jax.Array:
-        return jnp.zeros(()) if self.event_function is None else self.event_function(system, x)
+    @property
+    def event_shape(self) -> tuple[int]:
+        """Shape of an array with one number for each event function; without functions it has one entry."""
+        return (max(1, len(self.event_functions)),)
+
+    def event_values(self, system: System, t, x) -> jax.Array:
+        """Return the values of the event functions, shape ``event_shape``."""
+        if not self.event_functions:
+            return jnp.zeros(self.event_shape)
+        return jnp.stack([function(system, t, x) for function in self.event_functions])
 
 
 class AdaptiveState(NamedTuple):
@@ -121,11 +129,11 @@ class AdaptiveState(NamedTuple):
     n_attempts: jax.Array
     n_rejected: jax.Array
     last_attempt_status: jax.Array
-    event_value: jax.Array  # of the event function; where that is NaN, infinity with its last known sign
+    event_values: jax.Array  # of the event functions; where one is NaN, infinity with its last known sign
     max_relative_rate: jax.Array  # largest rate of change of the state so far, relative to its norm
     growth_rate: jax.Array  # largest growth rate when it was last computed; NaN if it must be computed
     jacobian_probe: jax.Array  # probe of the Jacobian when the growth rate was last computed
-    root_bracket: jax.Array  # bracket of an event in a step: the fields of a searching.RootBracket
+    root_bracket: jax.Array  # search for the first event in a step: see searching.search_array
 
 
 def initial_adaptive_state(
@@ -159,11 +167,11 @@ def initial_adaptive_state(
         n_attempts=zero,
         n_rejected=zero,
         last_attempt_status=zero,
-        event_value=control.event_value(system, x),
+        event_values=control.event_values(system, t, x),
         max_relative_rate=relative_rate,
         growth_rate=zero,
         jacobian_probe=jnp.full_like(probe, jnp.nan),
-        root_bracket=jnp.asarray(searching.EMPTY_BRACKET),
+        root_bracket=jnp.zeros(searching.search_shape(control.event_shape)),
     )
     return limit_by_growth_rate(method, adaptive_state, probe) if control.adaptive else adaptive_state
 
@@ -179,9 +187,9 @@ def jacobian_probe_shape(system: System, method: OneStepMethod, control: StepCon
 def next_step_size_and_end(control: StepControl, adaptive_state: AdaptiveState) -> tuple[jax.Array, jax.Array]:
     """Return the size of the next step, a full step or a trial step of an event search, and the time after it."""
     h, time_after = next_full_step_size_and_end(control, adaptive_state)
-    if control.event_function is None:
+    if not control.event_functions:
         return h, time_after
-    bracket = searching.RootBracket(*adaptive_state.root_bracket)
+    bracket, _ = searching.split_search(adaptive_state.root_bracket)
     trial_step = bracket.trial_fraction * bracket.step_size
     trial_time = jnp.minimum(adaptive_state.t + trial_step, adaptive_state.stop_time)
     return jnp.where(bracket.step_size > 0.0, trial_step, h), jnp.where(bracket.step_size > 0.0, trial_time, time_after)
@@ -200,18 +208,21 @@ def next_full_step_size_and_end(control: StepControl, adaptive_state: AdaptiveSt
         time_after = jnp.where(reaches_stop, adaptive_state.stop_time, adaptive_state.t + h)
         # the step as the difference of the rounded times, so that their rounding errors do not accumulate
         return jnp.where(reaches_stop | ~(time_after > adaptive_state.t), h, time_after - adaptive_state.t), time_after
-    # the same steps as runs.timetable
+    # the same steps as runs.timetable; after an event the next one is shorter
     interval = adaptive_state.stop_time - adaptive_state.last_stop_time
-    n_done = adaptive_state.state.step - adaptive_state.steps_at_last_stop
-    n_full = jnp.floor(interval / adaptive_state.next_step_size * (1 + 1e-12))
-    remainder = adaptive_state.stop_time - (adaptive_state.last_stop_time + n_full * adaptive_state.next_step_size)
+    step, n_done = adaptive_state.next_step_size, adaptive_state.state.step - adaptive_state.steps_at_last_stop
+    n_full = jnp.floor(interval / step * (1 + 1e-12))
+    remainder = adaptive_state.stop_time - (adaptive_state.last_stop_time + n_full * step)
     has_remainder = remainder > 1e-12 * interval
     reaches_stop = n_done + 1.0 >= jnp.where(has_remainder, n_full + 1.0, n_full)
-    return jnp.where(n_done < n_full, adaptive_state.next_step_size, remainder), jnp.where(
-        reaches_stop,
-        adaptive_state.stop_time,
-        adaptive_state.last_stop_time + (n_done + 1.0) * adaptive_state.next_step_size,
+    time_after = jnp.where(
+        reaches_stop, adaptive_state.stop_time, adaptive_state.last_stop_time + (n_done + 1.0) * step
     )
+    if not control.event_functions:
+        return jnp.where(n_done < n_full, step, remainder), time_after
+    is_after_event = adaptive_state.t != adaptive_state.last_stop_time + n_done * step
+    h = jnp.where(is_after_event, time_after - adaptive_state.t, jnp.where(n_done < n_full, step, remainder))
+    return h, time_after
 
 
 def attempt_step(
@@ -281,16 +292,16 @@ def accept_or_reject(
     outcome = AttemptOutcome(
         is_accepted=is_accepted,
         is_at_event=jnp.zeros((), dtype=bool),
-        event_value=adaptive_state.event_value,
+        event_values=adaptive_state.event_values,
         time_after=time_after,
         next_step_size=next_step_size,
         status=code,
         n_rejected=1.0 * ~is_accepted,
         root_bracket=adaptive_state.root_bracket,
     )
-    if control.event_function is not None:
+    if control.event_functions:
         outcome = apply_event_detection(system, method, control, adaptive_state, h, new_state, outcome)
-    is_accepted, is_at_event, event_value, time_after, next_step_size, code, n_rejected, root_bracket = outcome
+    is_accepted, is_at_event, event_values, time_after, next_step_size, code, n_rejected, root_bracket = outcome
     continues = is_accepted & ~is_at_event
 
     def select_if_running(new_value, old_value):
@@ -311,7 +322,7 @@ def accept_or_reject(
         n_attempts=n_attempts,
         n_rejected=adaptive_state.n_rejected + n_rejected,
         last_attempt_status=attempt_status,
-        event_value=select_if_running(event_value, adaptive_state.event_value),
+        event_values=select_if_running(event_values, adaptive_state.event_values),
         max_relative_rate=select_if_running(max_rate, adaptive_state.max_relative_rate),
         growth_rate=adaptive_state.growth_rate,
         jacobian_probe=adaptive_state.jacobian_probe,
@@ -337,8 +348,8 @@ class AttemptOutcome(NamedTuple):
     """Outcome of an attempted step."""
 
     is_accepted: jax.Array  # whether the new state is accepted
-    is_at_event: jax.Array  # whether a sign change of the event function is at the time after
-    event_value: jax.Array
+    is_at_event: jax.Array  # whether the first sign change of an event function is at the time after
+    event_values: jax.Array
     time_after: jax.Array  # time at the end of the attempt
     next_step_size: jax.Array
     status: jax.Array  # the run continues (COMPLETED), pauses or fails
@@ -355,29 +366,30 @@ def apply_event_detection(
     new_state: State,
     outcome: AttemptOutcome,
 ) -> AttemptOutcome:
-    """Return the outcome of an attempt, corrected for sign changes of the event function.
+    """Return the outcome of an attempt, corrected for sign changes of the event functions.
 
-    A step in which the event happens starts a search among steps from the same state, so the event is as accurate as
-    the method, and the laws hold there. If the dense output shows that the sign change is undone within the step, a
-    shorter step is tried first, and likewise if a trial step fails although the full step did not. A step may end where
-    the event function is NaN. A search that starts there assumes the previous value, so it ends where the function is a
-    number again. The value at the end of a search is stored by :func:`.searching.empty_bracket_with_value`.
+    A step in which events happen starts a search for the first of them among steps from the same state, so the event is
+    as accurate as the method, and the laws hold there. If the dense output shows that a sign change is undone within
+    the step, a shorter step is tried first, and likewise if a trial step fails although the full step did not. A step
+    may end where an event function is NaN. A search that starts there assumes the previous value, so it ends where the
+    function is a number again. The values at the end of a search are stored beside the empty bracket.
     """
-    value, bracket = control.event_value(system, new_state.x), searching.RootBracket(*adaptive_state.root_bracket)
-    signed_value = jnp.where(
-        jnp.isnan(value) & jnp.isinf(adaptive_state.event_value), adaptive_state.event_value, value
-    )
+    values_before, values = adaptive_state.event_values, control.event_values(system, outcome.time_after, new_state.x)
+    bracket, _ = searching.split_search(adaptive_state.root_bracket)
+    signed_values = jnp.where(jnp.isnan(values) & jnp.isinf(values_before), values_before, values)
+    first_value = searching.first_event_value(control.event_directions, values_before, signed_values)
     is_searching = bracket.step_size > 0.0
-    is_solved = (new_state.status == StatusCode.COMPLETED) & ~jnp.isnan(signed_value)
-    starts_search = outcome.is_accepted & is_event_crossing(control, adaptive_state.event_value, value) & ~is_searching
+    is_solved = (new_state.status == StatusCode.COMPLETED) & ~jnp.isnan(first_value)
+    has_event = jnp.any(are_event_crossings(control, values_before, values))
+    starts_search = outcome.is_accepted & has_event & ~is_searching
     is_shortened, first_fraction = jnp.zeros((), dtype=bool), jnp.ones(())
     if control.adaptive:
         first_fraction, is_undone = first_sign_change_in_step(
-            system, method, control, adaptive_state, h * new_state.k, value
+            system, method, control, adaptive_state, h, new_state.k, values
         )
         is_shortened = outcome.is_accepted & is_undone & ~is_searching
         starts_search = starts_search & ~is_shortened
-    next_bracket, is_root = searching.narrow_bracket(bracket, signed_value)
+    next_bracket, is_root = searching.narrow_bracket(bracket, first_value)
     ends_at_root = is_searching & is_solved & is_root
     ends_at_start = is_searching & is_solved & ~is_root & (next_bracket.trial_fraction <= 4.0 * EPS)
     time_advances = outcome.time_after > adaptive_state.t
@@ -402,57 +414,64 @@ def apply_event_detection(
             jnp.where(new_state.status == StatusCode.COMPLETED, StatusCode.NON_FINITE, new_state.status),
             status,
         )
-    initial_bracket = jnp.stack(searching.bracket_from_step(h, adaptive_state.event_value, value))
-    event_bracket = searching.empty_bracket_with_value(
-        jnp.where(ends_at_start, adaptive_state.event_value, jnp.where(time_advances, signed_value, 0.0))
+    initial_bracket = searching.bracket_from_step(
+        h, *searching.first_event_ends(control.event_directions, values_before, values)
     )
-    updated_bracket = jnp.where(
-        is_searching & ~has_failed,
-        jnp.where(is_at_event, jnp.stack(event_bracket), jnp.stack(next_bracket)),
-        searching.EMPTY_BRACKET,
+    end_values = jnp.where(ends_at_start, values_before, jnp.where(time_advances, signed_values, 0.0))
+    updated_search = jnp.where(
+        is_searching & ~has_failed & ~is_at_event,
+        searching.search_array(next_bracket, jnp.zeros_like(values)),
+        searching.search_array(searching.EMPTY_BRACKET, jnp.where(is_at_event, end_values, 0.0)),
     )
     return AttemptOutcome(
         is_accepted=jnp.where(
             is_searching, ends_at_root & time_advances, outcome.is_accepted & ~is_shortened & ~starts_search
         ),
         is_at_event=is_at_event,
-        event_value=jnp.where(jnp.isnan(value), jnp.inf * adaptive_state.event_value, value),
+        event_values=jnp.where(jnp.isnan(values), jnp.inf * values_before, values),
         time_after=jnp.where(
             ends_at_start, adaptive_state.t + next_bracket.trial_fraction * bracket.step_size, outcome.time_after
         ),
         next_step_size=next_step_size,
         status=status,
         n_rejected=jnp.where(is_searching, 1.0 * has_failed, jnp.where(is_shortened, 1.0, outcome.n_rejected)),
-        root_bracket=jnp.where(starts_search, initial_bracket, updated_bracket),
+        root_bracket=jnp.where(
+            starts_search, searching.search_array(initial_bracket, jnp.zeros_like(values)), updated_search
+        ),
     )
 
 
-def is_event_crossing(control: StepControl, value_before, value_after) -> jax.Array:
-    """Return whether the event function changes its sign between two values in the direction of the event."""
-    is_falling = (value_before > 0.0) & (value_after <= 0.0)
-    return is_falling if control.falling_only else is_falling | ((value_before < 0.0) & (value_after >= 0.0))
+def are_event_crossings(control: StepControl, values_before, values_after) -> jax.Array:
+    """Return whether each event function changes its sign between two values in the direction of its events."""
+    directions = np.asarray(control.event_directions)
+    is_falling = (values_before > 0.0) & (values_after <= 0.0) & (directions <= 0)
+    return is_falling | ((values_before < 0.0) & (values_after >= 0.0) & (directions >= 0))
 
 
 def first_sign_change_in_step(
-    system: System, method: OneStepMethod, control: StepControl, adaptive_state: AdaptiveState, increments, end_value
-):
-    """Return the fraction of the first sign change in a step, and whether a later one undoes it.
+    system: System, method: OneStepMethod, control: StepControl, adaptive_state: AdaptiveState, h, slopes, end_values
+) -> tuple[jax.Array, jax.Array]:
+    """Return the fraction of the first sign change in a step that a later one undoes, and whether there is one.
 
     A NaN at the end of the step also undoes a sign change.
     """
+    fractions, increments = event_check_fractions(method.order), h * slopes
 
-    def value_at(weights) -> jax.Array:
-        return control.event_value(system, method.displace(system, adaptive_state.state.x, weights @ increments))
+    def values_at(theta, weights) -> jax.Array:
+        x = method.displace(system, adaptive_state.state.x, weights @ increments)
+        return control.event_values(system, adaptive_state.t + theta * h, x)
 
-    fraction, has_changed, is_undone = jnp.ones(()), jnp.zeros((), dtype=bool), jnp.zeros((), dtype=bool)
-    fractions = event_check_fractions(method.order)
-    values = jax.vmap(value_at)(jnp.asarray(method.weights(fractions))) if len(fractions) else ()
-    for theta, value in zip([*fractions, 1.0], [*values, end_value], strict=True):
-        is_opposite = adaptive_state.event_value * value < 0.0
-        is_undone = is_undone | (has_changed & (adaptive_state.event_value * value > 0.0))
+    shape, values_before = end_values.shape, adaptive_state.event_values
+    fraction, has_changed, is_undone = jnp.ones(shape), jnp.zeros(shape, dtype=bool), jnp.zeros(shape, dtype=bool)
+    weights = jnp.asarray(method.weights(fractions))
+    values = jax.vmap(values_at)(jnp.asarray(fractions), weights) if len(fractions) else ()
+    for theta, values_there in zip([*fractions, 1.0], [*values, end_values], strict=True):
+        is_undone = is_undone | (has_changed & (values_before * values_there > 0.0))
+        is_opposite = values_before * values_there < 0.0
         fraction = jnp.where(is_opposite & ~has_changed, theta, fraction)
         has_changed = has_changed | is_opposite
-    return fraction, is_undone | (has_changed & jnp.isnan(end_value))
+    is_undone = is_undone | (has_changed & jnp.isnan(end_values))
+    return jnp.min(jnp.where(is_undone, fraction, 1.0)), jnp.any(is_undone)
 
 
 # -- choice of the step size ------------------------------------------------------------------------------------------

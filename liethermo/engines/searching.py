@@ -1,8 +1,12 @@
-"""Location of a root of the event function within a step, one evaluation per attempt [Chandrupatla 1997]."""
+"""Location of the first zero of the event functions within a step, one evaluation per attempt [Chandrupatla 1997].
+
+With several event functions the search is for the zero of their minimum, each divided by its value at the start of the
+step: it is 1 there, and first zero where the first of them is.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -34,11 +38,50 @@ class RootBracket(NamedTuple):
     fc: jax.Array
 
 
-EMPTY_BRACKET = np.zeros(len(RootBracket._fields))
-"""Bracket without a root, as an array of the fields of :class:`RootBracket`."""
+EMPTY_BRACKET = RootBracket(*np.zeros(len(RootBracket._fields)))
+"""Bracket without a root."""
 
-LAST_VALUE_INDEX = RootBracket._fields.index("fa")
-"""Index of the latest function value in a bracket as an array."""
+
+def search_shape(event_shape: tuple[int]) -> tuple[int]:
+    """Return the shape of :func:`search_array`."""
+    return (len(RootBracket._fields) + event_shape[0],)
+
+
+def search_array(bracket: RootBracket, end_values) -> jax.Array:
+    """Return the fields of a bracket, followed by the event values where the search ended, in one array."""
+    return jnp.concatenate([jnp.stack([jnp.zeros(()) + value for value in bracket]), end_values])
+
+
+def split_search(array) -> tuple[RootBracket, Any]:
+    """Return the bracket and the event values where the search ended, from the array of both."""
+    n_fields = len(RootBracket._fields)
+    return RootBracket(*array[:n_fields]), array[n_fields:]
+
+
+def first_event_value(directions: tuple[int, ...], values_before, values) -> jax.Array:
+    """Return the function whose first zero in a step is the first event, from the event values at a point of the step.
+
+    It is the only event function, or the minimum of them, each divided by its value at the start of the step. Functions
+    that are zero or unknown there have no event in the step, nor have those whose events are in the other direction.
+    """
+    if len(directions) == 1:
+        return values[0]
+    can_cross = (
+        (values_before != 0.0) & ~jnp.isnan(values_before) & (np.asarray(directions) * jnp.sign(values_before) <= 0.0)
+    )
+    scale = jnp.where(jnp.isinf(values_before), jnp.sign(values_before), jnp.where(can_cross, values_before, 1.0))
+    return jnp.min(jnp.where(can_cross, values / scale, 1.0))
+
+
+def first_event_ends(directions: tuple[int, ...], values_before, values_after) -> tuple[jax.Array, jax.Array]:
+    """Return :func:`first_event_value` at the start and at the end of a step in which an event happens.
+
+    Functions that are NaN at the end are left out.
+    """
+    if len(directions) == 1:
+        return values_before[0], values_after[0]
+    values_after = jnp.where(jnp.isnan(values_after), values_before, values_after)
+    return jnp.ones(()), first_event_value(directions, values_before, values_after)
 
 
 def bracket_from_step(step_size, value_before, value_after) -> RootBracket:
@@ -67,11 +110,6 @@ def narrow_bracket(bracket: RootBracket, value) -> tuple[RootBracket, jax.Array]
     return _select_bracket(
         is_converged, _last_trial_bracket(bracket.step_size, best_fraction), new_bracket
     ), is_converged & (best_fraction == t)
-
-
-def empty_bracket_with_value(value) -> RootBracket:
-    """Return an empty bracket whose ``fa`` holds the event value where the search ended."""
-    return RootBracket(*jnp.asarray(EMPTY_BRACKET))._replace(fa=jnp.zeros(()) + value)
 
 
 def _last_trial_bracket(step_size, fraction) -> RootBracket:

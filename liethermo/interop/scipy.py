@@ -16,9 +16,9 @@ from ..errors import InputError
 from ..integrators import MetriplecticRungeKutta, OneStepMethod
 from ..results.solution import Solution
 from ..runs.adaptive import Adaptive
+from ..runs.events import EventSpecification
 from ..runs.integrate import integrate, solution_without_steps
 from ..runs.timetable import clip_times_to_span
-from ..runs.watch import EventSet
 from ..systems import System
 
 __all__ = ["OdeResult", "solve_ivp"]
@@ -139,8 +139,9 @@ def solve_ivp(
     start, end = _checked_span(t_span)
     saved_times = None if t_eval is None else _checked_times(t_eval, start, end)
     _check_first_step(first_step, end - start)
-    event_set = EventSet(functions, _checked_args(args)) if functions else None
-    if math.isinf(end) and not (event_set and event_set.has_terminal):
+    arguments = _checked_args(args)
+    is_terminal = any(getattr(function, "terminal", False) for function in functions)
+    if math.isinf(end) and not is_terminal:
         raise InputError("an infinite end needs an event that ends the run: set event.terminal = True, or a finite end")
     method = MetriplecticRungeKutta(order=8) if method is None else method
     step = Adaptive(
@@ -149,8 +150,11 @@ def solve_ivp(
         first_step,
         None if max_step == math.inf else max_step,
     )
-    if end == start:
-        return _empty_span_result(fun, y0, start, method, saved_times, dense_output, event_set)
+    initial_zeros = [
+        _is_initial_event(function, arguments, fun, (start, end), y0, step, method) for function in functions
+    ]
+    if end == start or any(map(_ends_at_start, functions, initial_zeros)):
+        return _empty_span_result(fun, y0, start, method, saved_times, dense_output, functions, initial_zeros)
     solution = integrate(
         fun,
         y0,
@@ -158,32 +162,41 @@ def solve_ivp(
         step,
         method,
         save_at=None if saved_times is None else [start, *saved_times, *([end] if math.isfinite(end) else [])],
-        until=event_set,
+        until=EventSpecification(functions, arguments, initial_zeros) if functions else None,
         dense=dense_output,
         on_failure="return",
         progress=False,
     )
     is_saved = np.ones(len(solution.t), bool) if saved_times is None else np.isin(solution.t, saved_times)
-    return _ode_result(solution, solution.t[is_saved], solution.x[is_saved], method, event_set, dense_output)
+    return _ode_result(solution, solution.t[is_saved], solution.x[is_saved], method, initial_zeros, dense_output)
 
 
 def _ode_result(
-    solution: Solution, t: np.ndarray, x: np.ndarray, method: OneStepMethod, event_set: EventSet | None, dense: bool
+    solution: Solution, t: np.ndarray, x: np.ndarray, method: OneStepMethod, initial_zeros: list[bool], dense: bool
 ) -> OdeResult:
-    """Return a solution in SciPy's form, with the requested states x, shape (times, n)."""
+    """Return a solution in SciPy's form, with the requested states x, shape (times, n).
+
+    ``initial_zeros`` says of each event function whether it has an event at the start, which the run does not look for.
+    """
     stats, status = solution.stats, SCIPY_STATUS.get(str(solution.status.code), -1)
     iterations = stats.fixed_point_iterations + stats.newton_iterations
-    shape = solution.x.shape[1:]
 
     def sol(t):
         return np.moveaxis(solution(t), -1, 0)
 
+    events = solution.events or [None] * len(initial_zeros)
+    no_events = np.empty(0), np.empty((0, *solution.x.shape[1:]))
+    t_events, y_events = [], []
+    for is_zero, series in zip(initial_zeros, events, strict=True):
+        times, states = no_events if series is None else (series.t, series.x)
+        t_events.append(np.append(solution.t[: int(is_zero)], times))
+        y_events.append(np.append(solution.x[: int(is_zero)], states, axis=0))
     return OdeResult(
         t=t,
         y=x.T,
         sol=sol if dense else None,
-        t_events=None if event_set is None else [np.array(times) for times in event_set.event_times],
-        y_events=None if event_set is None else [np.array(y).reshape(len(y), *shape) for y in event_set.event_states],
+        t_events=t_events or None,
+        y_events=y_events or None,
         nfev=iterations * method.evaluations_per_iteration,
         njev=stats.newton_iterations,
         nlu=stats.newton_iterations,
@@ -194,6 +207,36 @@ def _ode_result(
     )
 
 
+FIRST_STRETCH = 1e-4
+"""Part of the span after which the sign of an event function that is zero at the start is evaluated."""
+
+
+def _is_initial_event(
+    function: Callable,
+    arguments: tuple,
+    fun: System,
+    span: tuple[float, float],
+    y0,
+    step: Adaptive,
+    method: OneStepMethod,
+) -> bool:
+    """Return whether an event function has an event at the start of a run: it is zero, and leaves in its direction."""
+    (start, end), x = span, np.asarray(fun.state(y0)).reshape(np.shape(y0))
+    direction = getattr(function, "direction", 0) or 0
+    if float(function(start, x, *arguments)) != 0.0:
+        return False
+    if direction == 0 or end == start:
+        return True
+    longest = FIRST_STRETCH * (end - start) if math.isfinite(end) else 1.0
+    length = min(longest, step.first or math.inf, step.largest or math.inf)
+    stretch = integrate(fun, y0, (start, start + length), step, method, on_failure="return", progress=False)
+    return direction * float(function(stretch.t[-1], stretch.x[-1], *arguments)) >= 0.0
+
+
+def _ends_at_start(function: Callable, is_zero: bool) -> bool:
+    return is_zero and getattr(function, "terminal", False) == 1
+
+
 def _empty_span_result(
     fun: System,
     y0,
@@ -201,13 +244,14 @@ def _empty_span_result(
     method: OneStepMethod,
     saved_times: np.ndarray | None,
     dense: bool,
-    event_set: EventSet | None,
+    functions: list[Callable],
+    initial_zeros: list[bool],
 ) -> OdeResult:
-    """Return the result over a span of length zero: as in SciPy, the initial state at its start and at its end."""
+    """Return the result of a run without steps: as in SciPy, the initial state at its start and at its end."""
     solution = solution_without_steps(fun, y0, t, method)
-    is_terminated = event_set is not None and event_set.find_events_at_state(t, solution.x[0])
-    times = np.array([t, t]) if saved_times is None else saved_times
-    result = _ode_result(solution, times, np.repeat(solution.x, len(times), axis=0), method, event_set, dense)
+    times = np.array([t, t]) if saved_times is None else saved_times[saved_times <= t]
+    result = _ode_result(solution, times, np.repeat(solution.x, len(times), axis=0), method, initial_zeros, dense)
+    is_terminated = any(map(_ends_at_start, functions, initial_zeros))
     return replace(result, status=1, message="A termination event occurred.") if is_terminated else result
 
 

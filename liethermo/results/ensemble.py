@@ -15,6 +15,7 @@ from manifolds._tables import html_grid
 from ..engines.codes import STATUS_NAMES, StatusCode
 from ..errors import InputError
 from .audit import FAILED_TRAJECTORIES_ROW, Audit, AuditRow, Tolerances, accuracy_row, coverage_text
+from .events import Events
 from .evidence import AuditableResult, Evidence, merge_evidence
 from .files import (
     ENSEMBLE_FORMAT,
@@ -108,6 +109,9 @@ class Ensemble(AuditableResult):
     work : ndarray, shape (B,) or (B, times), or None
         Work done on the system from outside, if its energy depends on time; the drift and the increments of the energy
         are then those of the energy less the work.
+    events : Events
+        The events of each function of ``until``: ``e.events[k]`` has times ``t``, states ``x`` and numbers
+        ``trajectory``.
     reasons : mapping from int to str
         Why trajectories are inadmissible, or have failed if that is known.
     provenance : dict
@@ -144,6 +148,7 @@ class Ensemble(AuditableResult):
     attitude: np.ndarray | None = None
     attitude0: np.ndarray | None = None
     work: np.ndarray | None = None
+    events: Events = field(default_factory=Events)
     reasons: Mapping[int, str] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
     evidence_source: Callable[[], Evidence] | None = field(default=None, repr=False, compare=False)
@@ -260,6 +265,7 @@ class Ensemble(AuditableResult):
             provenance={**self.provenance, "trajectory": i, "x0": self.x0[i].tolist()},
             attitude=attitude,
             event_time=float(self.end_time[i]) if self.status[i] == StatusCode.EVENT else None,
+            events=self.events.select_trajectory(i),
             evidence_source=lambda: evidence,
         )
 
@@ -351,6 +357,7 @@ class Ensemble(AuditableResult):
         for name, dims in (("attitude", series_dims), ("attitude0", ("trajectory",))):
             if (value := getattr(self, name)) is not None:
                 variables[name] = ((*dims, "row", "column", "part"), split_complex(value))
+        variables |= self.events.dataset_variables()
         variables["status_text"] = ("trajectory", np.array([STATUS_NAMES[code] for code in self.status], dtype=object))
         is_failed = ~self.ok
         messages = [self.message(i) if is_failed[i] else "" for i in range(len(self))]
@@ -403,6 +410,7 @@ class Ensemble(AuditableResult):
             wall_time=float(attributes["wall_time"]),
             reasons={int(i): str(text) for i, text in reasons.items()},
             provenance=provenance,
+            events=Events.from_dataset(series),
             evidence_source=lambda: evidence,
         )
 
@@ -489,6 +497,7 @@ def join_subsets(subsets: Sequence[Subset], n_trajectories: int, **fields: Any) 
         **joined_fields,
         laws=laws,
         engine=engine,
+        events=Events.join((subset.trajectory_numbers, subset.ensemble.events) for subset in subsets),
         evidence_source=None
         if None in evidence_sources
         else lambda: merge_evidence(

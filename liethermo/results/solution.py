@@ -15,6 +15,7 @@ from manifolds._tables import html_grid
 from ..errors import InputError
 from .audit import Audit, Tolerances, audit_run
 from .deferred import deferred_fields
+from .events import Events
 from .evidence import AuditableResult, Evidence
 
 if TYPE_CHECKING:
@@ -55,6 +56,8 @@ class Solution(AuditableResult):
         Library version, method, step, system, date, spec: JSON data.
     event_time : float or None
         Time of the event of ``integrate(until=...)``.
+    events : Events
+        The events of each function of ``until``: ``solution.events[k]`` has times ``t`` and states ``x``.
     dense : DenseOutput or None
         The states between the steps (``integrate(dense=True)``); not written to files.
     attitude : ndarray, shape (times, m, m), or None
@@ -82,6 +85,7 @@ class Solution(AuditableResult):
     laws: Laws
     provenance: dict[str, Any] = field(default_factory=dict)
     event_time: float | None = None
+    events: Events = field(default_factory=Events)
     dense: DenseOutput | None = None
     attitude: np.ndarray | None = None
     evidence_source: Callable[[], Evidence] | None = field(default=None, repr=False, compare=False)
@@ -158,6 +162,7 @@ class Solution(AuditableResult):
             ("invariant_name", "time"),
             np.array(list(self.casimirs.values())).reshape(len(self.casimirs), len(self.t)),
         )
+        variables |= self.events.dataset_variables()
         coordinates = {"time": self.t, "invariant_name": np.array(list(self.casimirs), dtype=object)}
         attributes = {
             "format": SOLUTION_FORMAT,
@@ -220,6 +225,7 @@ class Solution(AuditableResult):
             laws=dataclass_from_json(Laws, json_data["laws"]),
             provenance=json_data["provenance"],
             event_time=event_time,
+            events=Events.from_dataset(series),
             attitude=attitude,
             evidence_source=lambda: evidence,
         )

@@ -11,7 +11,7 @@ from ..engines.pacing import StepControl
 from ..errors import InputError
 from ..integrators import OneStepMethod
 from ..integrators.base import has_error_estimate
-from .events import Event
+from .events import EventSet
 
 MIN_STEP_FRACTION = 1e-14
 """Smallest step size, as a fraction of the span."""
@@ -76,8 +76,10 @@ class Adaptive:
         return self.rtol or self.atol
 
 
-def make_step_control(step: float | Adaptive, method: OneStepMethod, length: float, event: Event | None) -> StepControl:
-    """Return the step control of a run over a span of some length, with the event function that it monitors.
+def make_step_control(
+    step: float | Adaptive, method: OneStepMethod, length: float, events: EventSet | None
+) -> StepControl:
+    """Return the step control of a run over a span of some length, with the event functions that it monitors.
 
     Raises
     ------
@@ -93,8 +95,6 @@ def make_step_control(step: float | Adaptive, method: OneStepMethod, length: flo
         numbers += [min_step, step.most_steps]
     else:
         numbers = [0.0, 0.0, step, math.inf, min_step, math.inf]
-    event_function, falling_only = (None, False) if event is None else (event.function, event.falling_only)
+    functions, directions = ((), ()) if events is None else (events.functions, events.directions)
     rtol, atol, first_step, max_step, min_step_array, max_attempts = (np.asarray(float(number)) for number in numbers)
-    return StepControl(
-        rtol, atol, first_step, max_step, min_step_array, max_attempts, event_function, falling_only, adaptive
-    )
+    return StepControl(rtol, atol, first_step, max_step, min_step_array, max_attempts, functions, directions, adaptive)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -103,6 +105,43 @@ def adaptive_failure_status(
         text += "its equations are still not solved, so no step size helps: check that the functions are smooth and "
         text += "finite near that state"
     return Status(StatusCode.STEP_UNDERFLOW, text, steps, t, residual)
+
+
+def event_status(outcome, names: Sequence[str], t: float) -> Status:
+    """Return the status of a run that ended at an event, or where an event function is NaN, at time t."""
+    steps, residual = int(outcome.state.step), float(outcome.state.residual)
+    if outcome.event_time is not None:
+        name = names[outcome.events[-1].function]
+        return Status(StatusCode.EVENT, f"{name}: reached at t = {t:.15g} in {steps} steps", steps, t, residual)
+    name = names[outcome.undefined_events[0] if outcome.undefined_events else 0]
+    text = (
+        f"{name} is NaN near t = {t:g} between values of opposite sign, so its zero cannot be located. Define it there"
+    )
+    return Status(StatusCode.NON_FINITE, text, steps, t, residual)
+
+
+def event_remarks(outcome, names: Sequence[str], terminal_counts: Sequence[int | None]) -> str:
+    """Return what a message says of the events of a run that reached its end."""
+    text = ""
+    for k, name in enumerate(names):
+        jumps, n_events = [t for j, t in outcome.sign_jumps if j == k], sum(e.function == k for e in outcome.events)
+        undefined_ends = [t for j, t in outcome.undefined_ends if j == k]
+        if undefined_ends:
+            repeats = f" (and {len(undefined_ends) - 1} times more)" if len(undefined_ends) > 1 else ""
+            text += f"; {name} is NaN before t = {undefined_ends[0]:g}, between opposite signs{repeats}: no event is "
+            text += "reported there. Define it between these times"
+        elif terminal_counts[k] is None:
+            continue
+        elif k in outcome.undefined_events:
+            text += f"; whether the event ({name}) happened is unknown, because the function is NaN at the end. Define "
+            text += "it for all states of the run"
+        elif n_events:
+            text += f"; the event ({name}) happened {n_events} times"
+        else:
+            text += f"; the event ({name}) did not happen"
+            if jumps:
+                text += f": it changed its sign {len(jumps)} times without being zero, first at t = {jumps[0]:g}"
+    return text
 
 
 def blow_up_message(x: np.ndarray, x0: np.ndarray, velocity: np.ndarray, time_elapsed: float, t: float) -> str:

@@ -17,11 +17,12 @@ from ..errors import InputError
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..integrators.fluctuating import noise_dimension
 from ..results.ensemble import Ensemble, Subset, join_subsets
+from ..results.events import Events
 from ..systems import System
 from ..tracing.scalarize import UnsupportedPrimitive
 from .adaptive import Adaptive, make_step_control
 from .batches import MAX_THREADS, ProgressCounter, replay_array, replay_compiled, run_fixed_array, run_fixed_compiled
-from .events import Event, Relaxed
+from .events import EventSet, Until, collect_events
 from .family import Family, broadcast_size, error_message_of
 from .fluctuations import DEFAULT_NOISE_METHOD, Fluctuations, NoisePaths, check_noise
 from .member_groups import common_inertia, group_members_by_invariants, members_outside_domain
@@ -65,7 +66,7 @@ def ensemble(
     outputs: Literal["final", "trajectory", "summary"] | None = None,
     save_every: int = 1,
     save_at=None,
-    until: Relaxed | Callable | None = None,
+    until: Until | None = None,
     engine: Literal["auto", "array", "compiled"] = "auto",
     attitude=None,
     progress: bool | None = None,
@@ -87,7 +88,7 @@ def ensemble(
     t_span, step, method, save_every, save_at, until
         As for :func:`integrate`, times in the unit of time of the system. With ``lt.Adaptive(rtol, atol)`` every
         trajectory has its own steps, the same as in a single run, and with ``until`` its own end: ``e.end_time`` and
-        ``e.event_time``.
+        ``e.event_time``; ``e.events`` has the events of all.
     parameters : optional
         One set for each trajectory, in the units of the system: arrays whose first axis is that of the trajectories.
         For a function, its argument (an array, a dict of arrays, …). For a system, a dict from the names of its
@@ -257,22 +258,23 @@ class _EnsembleOptions(NamedTuple):
         record = EnsembleRecord(
             family, member, states, schedule, self.outputs, np.nan if tolerance is not None else schedule.h
         )
-        event = None if self.until is None else Event(self.until, member)
-        has_step_control = tolerance is not None or event is not None
-        control = make_step_control(step, method, schedule.end - schedule.start, event) if has_step_control else None
+        events = None if self.until is None else EventSet(self.until, member, schedule.start, states[0])
+        has_step_control = tolerance is not None or events is not None
+        control = make_step_control(step, method, schedule.end - schedule.start, events) if has_step_control else None
 
         def run_with_engine(engine: str, progress_counter: ProgressCounter) -> None:
             if is_interrupted:
                 return
             if control is not None:
-                adaptive_run = AdaptiveEnsembleRun(family, method, control, record, progress_counter)
+                adaptive_run = AdaptiveEnsembleRun(family, method, control, record, progress_counter, events)
                 (adaptive_run.run_compiled if engine == "compiled" else adaptive_run.run_array)()
             else:
                 (run_fixed_compiled if engine == "compiled" else run_fixed_array)(
                     family, method, record, progress_counter, noise_paths
                 )
 
-        prefers_compiled = self.engine == "auto" and is_worth_compiling(member)
+        calls_python = events is not None and events.calls_python
+        prefers_compiled = self.engine == "auto" and is_worth_compiling(member) and not calls_python
         engine_name = "compiled" if self.engine == "compiled" or prefers_compiled else "array"
         if engine_name == "compiled":
             try:
@@ -298,6 +300,7 @@ class _EnsembleOptions(NamedTuple):
             if noise_dimension(method)
             else EnsembleEvidenceCollector(record, method, replay, n_equal_steps),
             solution_builder=MemberSolutionBuilder(record, method, trajectory_numbers),
+            events=Events() if events is None else collect_events(member, events.names, record.events),
         )
         return Subset(trajectory_numbers, result), reasons | {
             int(trajectory_numbers[j]): text for j, text in record.failure_reasons.items()

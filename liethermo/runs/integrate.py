@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from typing import Literal
 
 from manifolds._precision import with_library_settings
@@ -12,14 +11,13 @@ from ..integrators import OneStepMethod, Reference
 from ..results.solution import Solution
 from ..systems import System
 from .adaptive import Adaptive
-from .events import Relaxed
+from .events import Until
 from .fluctuations import Fluctuations
 from .preparation import refuse_tracers
 from .problem import Problem
 from .propagator import Propagator
 from .run import Run
 from .timetable import StepSchedule
-from .watch import EventSet
 
 
 @with_library_settings
@@ -33,7 +31,7 @@ def integrate(
     *,
     save_every: int = 1,
     save_at=None,
-    until: Relaxed | Callable | EventSet | None = None,
+    until: Until | None = None,
     dense: bool = False,
     engine: Literal["auto", "array", "compiled", "sparse"] = "auto",
     on_failure: Literal["raise", "return"] = "raise",
@@ -65,13 +63,17 @@ def integrate(
     save_at : array of times, optional
         Keep the states at these times (in the unit of ``t_span``), and the last. Steps end there, so the laws hold
         there too.
-    until : Relaxed or function from a state, shape (n,), to a scalar, optional
-        Stop at an event. ``lt.Relaxed(tol)`` is the event that the rate of entropy production, or of the fall of the
-        energy, is below ``tol``. A function, in any unit, has its event where it is zero and changes its sign; a step
-        ends there, to rounding. ``solution.event_time`` and the status show whether it happened. A jump or a pole is
-        not a zero: a step ends there, the run goes on, and the status says so. If the function is NaN between two
-        signs, the run ends with the status "non_finite". Steps of given size are examined at their ends, adaptive
-        steps also between them.
+    until : Relaxed, function, or a list of them, optional
+        Events. ``lt.Relaxed(tol)`` stops the run when the rate of entropy production, or of the fall of the energy, is
+        below ``tol``. A function of (x) or (t, x) that returns a number, in any unit, has its event where it is zero
+        and changes its sign. Arguments named ``t``, ``attitude``, ``parameters`` and ``system`` are the time, the
+        element of the group, a dict of the parameters of the system by name, and the system. The attribute
+        ``terminal`` of a function is True (by default; its first event ends the run), False, or the number of events
+        that ends the run; ``direction`` is 1 if only rises count, -1 if only falls do. A step ends at each event, to
+        rounding; ``solution.events`` has their times and states, ``solution.event_time`` the time of the last. A jump
+        or a pole is not a zero: a step ends there, the run goes on, and the status says so. If a function is NaN
+        between two signs, the run ends with the status "non_finite". Steps of given size are examined at their ends,
+        adaptive steps also between them.
     dense : bool
         Keep all states, so that ``solution(t)`` is known at any time, by a step from the last state before t.
     engine : {"auto", "array", "compiled", "sparse"}

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..engines.codes import StatusCode
 from ..engines.compiled.paced import CompiledAdaptiveRuns
-from ..engines.paced import AdaptiveRuns, PauseHandler, start_adaptive_runs
+from ..engines.paced import AdaptiveRuns, EventRules, PauseHandler, start_adaptive_runs
 from ..engines.pacing import StepControl
 from ..engines.stepping import REPORTED_FIELDS
 from ..integrators import OneStepMethod
@@ -21,6 +21,7 @@ from .batches import (
     padded_member_indices,
     run_in_threads,
 )
+from .events import EventSet
 from .family import Family
 from .record import EnsembleRecord
 
@@ -42,6 +43,8 @@ class AdaptiveEnsembleRun:
     control : StepControl
     record : EnsembleRecord
     progress_counter : ProgressCounter
+    events : EventSet, optional
+        The events whose functions the control has.
     """
 
     def __init__(
@@ -51,6 +54,7 @@ class AdaptiveEnsembleRun:
         control: StepControl,
         record: EnsembleRecord,
         progress_counter: ProgressCounter,
+        events: EventSet | None = None,
     ):
         self.family, self.method, self.control, self.record, self.progress_counter = (
             family,
@@ -59,6 +63,7 @@ class AdaptiveEnsembleRun:
             record,
             progress_counter,
         )
+        self.events = events
         self.interrupted = False
         self.stop_times = record.schedule.stop_times
 
@@ -113,8 +118,14 @@ class AdaptiveEnsembleRun:
             Returns True if the user has interrupted the run.
         """
         record = self.record
+        rules = EventRules() if self.events is None else self.events.rules
         pause_handler = PauseHandler(
-            adaptive_runs, self.control, self.method, self.stop_times, lambda i: self.family.member(int(members[i]))
+            adaptive_runs,
+            self.control,
+            self.method,
+            self.stop_times,
+            lambda i: self.family.member(int(members[i])),
+            rules,
         )
         initial = {name: adaptive_runs.read(name).copy() for name in RECORDED_INITIAL_FIELDS}
         record.record_initial(members, initial["x"], initial["energy"], initial["entropy"])
@@ -138,6 +149,10 @@ class AdaptiveEnsembleRun:
             while is_running.any() and not is_stopped():
                 adaptive_runs.advance(int(np.clip(TARGET_ATTEMPTS_PER_CALL // len(members), *ATTEMPTS_PER_CALL_RANGE)))
                 pause_handler.confirm_events()
+                if self.events is not None:
+                    self.events.raise_error()
+                    record.store_events(pause_handler.occurrences, members)
+                    pause_handler.occurrences.clear()
                 stopped_indices = pause_handler.paused_indices(StatusCode.PAUSED_AT_STOP)
                 if stopped_indices.size:
                     columns = [
@@ -169,6 +184,7 @@ class AdaptiveEnsembleRun:
                 if keep_only is not None and 2 * is_running.sum() <= len(members) and is_running.any():
                     running_indices = np.flatnonzero(is_running)
                     keep_only(running_indices)
+                    pause_handler.keep_only(running_indices)
                     members, is_running = members[running_indices], is_running[running_indices]
                     initial = {name: values[running_indices] for name, values in initial.items()}
         except KeyboardInterrupt:

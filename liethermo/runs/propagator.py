@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import equinox as eqx
@@ -23,7 +23,7 @@ from ..systems import AttitudeSystem, System
 from ..tracing.caching import LRUCache
 from .adaptive import Adaptive
 from .ensemble import ensemble
-from .events import Relaxed
+from .events import Until
 from .family import named_parameters
 from .fluctuations import DEFAULT_NOISE_METHOD, Fluctuations, check_noise
 from .preparation import check_choice, has_undecided_invariants, refuse_tracers
@@ -31,7 +31,6 @@ from .problem import Problem
 from .progress import Progress
 from .run import Run
 from .timetable import CHUNK_STEPS, ScheduleSegment, StepSchedule, checked_span, checked_step, make_schedule
-from .watch import EventSet
 
 CONVERGENCE_FAILURES = tuple(
     code.status_name for code in (StatusCode.NOT_CONVERGED, StatusCode.STEP_UNDERFLOW, StatusCode.STEP_LIMIT)
@@ -143,7 +142,7 @@ class Propagator:
         parameters: Mapping[str, Any] | None = None,
         save_every: int = 1,
         save_at=None,
-        until: Relaxed | Callable | EventSet | None = None,
+        until: Until | None = None,
         dense: bool = False,
         on_failure: Literal["raise", "return"] = "raise",
         progress: bool | None = False,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 from ..engines.choice import EngineWithFallback
 from ..engines.codes import StatusCode
 from ..engines.compiled.form import ProgramStructure
+from ..engines.paced import EventOccurrence
 from ..engines.stepping import relaxation_functional
 from ..integrators import OneStepMethod
 from ..results.audit import RoundingScale
@@ -91,6 +92,7 @@ class EnsembleRecord:
         )
         self.work = np.empty(n_members)
         self.failure_reasons: dict[int, str] = {}
+        self.events: list[EventOccurrence] = []  # with the indices of trajectories in this record
 
     def record_initial(self, members: MemberSelection, x: np.ndarray, energy: np.ndarray, entropy: np.ndarray) -> None:
         """Store the initial states with energy and entropy, if trajectories are saved."""
@@ -106,6 +108,13 @@ class EnsembleRecord:
         """Store states with energy and entropy, shape (members, n + 2), each at its saved time t."""
         if self.trajectories is not None:
             self.trajectories[members, np.searchsorted(self.saved_times, t)] = states
+
+    def store_events(self, occurrences: Sequence[EventOccurrence], members: np.ndarray) -> None:
+        """Store events of trajectories whose indices in this record are ``members[trajectory]``."""
+        for event in occurrences:
+            member = int(members[event.trajectory])
+            if event.trajectory == 0 or members[event.trajectory - 1] != member:  # no copy that fills a padded batch
+                self.events.append(event._replace(trajectory=member))
 
     def finish_fixed_step_members(
         self, members: MemberSelection, initial: Mapping[str, np.ndarray], final: Mapping[str, np.ndarray]
@@ -268,6 +277,7 @@ class MemberSolutionBuilder:
             stats=member_solution.stats,
             provenance=member_solution.provenance,
             event_time=member_solution.event_time,
+            events=member_solution.events,
         )
         inertia = None if system.inertia is None else system.inertia.tolist()
         return replace(solution, provenance={**member_solution.provenance, "inertia": inertia})

@@ -20,18 +20,26 @@ from ..integrators import Reference
 from ..integrators.fluctuating import noise_dimension
 from ..results.deferred import defer
 from ..results.dense import DenseOutput
+from ..results.events import Events
 from ..results.solution import Solution
 from ..results.status import Stats, Status
 from ..tracing.interpret import evaluate_at_points
 from .adaptive import Adaptive, make_step_control
-from .ending import INTERRUPTING_ERRORS, adaptive_failure_status, final_status, interruption_reason, run_statistics
-from .events import Event
+from .ending import (
+    INTERRUPTING_ERRORS,
+    adaptive_failure_status,
+    event_remarks,
+    event_status,
+    final_status,
+    interruption_reason,
+    run_statistics,
+)
+from .events import EventSet, collect_events
 from .fluctuations import NoisePaths
 from .presented import EngineReplay, build_solution, run_provenance
 from .problem import Problem
 from .stepwise import MAX_STORED_VALUES, AcceptedSteps, advance_to_end
 from .timetable import StepSchedule
-from .watch import EventSet
 
 MAX_PROVENANCE_COMPONENTS = 1_000
 """Largest number of components of an initial state that the provenance lists; attributes of a file are limited in
@@ -61,6 +69,7 @@ class Run:
         self.stats = Stats()
         self.step: float | Adaptive = schedule.h
         self.event_time: float | None = None
+        self.events: Events = Events()
         self.all_states = [(self.saved_times[0], self.saved_states[0])] if dense else None  # for dense output
         self.taken_steps: list[np.ndarray] = []  # rows: step sizes, whether the state after the step is saved
         noise_increments: Callable | None = None
@@ -129,15 +138,17 @@ class Run:
     def run_with_step_control(self, bar, step: float | Adaptive, until) -> None:
         """Take adaptive steps, or steps of a given size with events; every step is examined."""
         start, end, save_every = self.schedule.start, self.schedule.end, self.schedule.save_every or 1
-        saves_at_stops, event_set = self.schedule.save_every is None, until if isinstance(until, EventSet) else None
-        stops = self.schedule.stop_times
-        event = None if until is None or event_set else Event(until, self.system)
+        saves_at_stops, stops = self.schedule.save_every is None, self.schedule.stop_times
+        events = None if until is None else EventSet(until, self.system, start, self.saved_states[0][0])
+        if events is not None and events.calls_python and self.engine.requested_engine == "auto":
+            self.engine = self.problem.engine("array", self.system, 0)  # machine code does not call Python
         self.step, unsaved_steps = step, None
 
         def save_steps(steps: AcceptedSteps):
             nonlocal unsaved_steps
             ends = steps.t[1:]
             is_saved = np.isin(ends, stops) if saves_at_stops else steps.step_counts % save_every == 0
+            is_saved[-1] &= not steps.ends_at_event or ends[-1] in stops
             self._save_steps(steps, is_saved)
             self.taken_steps.append(np.stack([steps.h, is_saved]))
             unsaved_steps = None if is_saved[-1] else steps
@@ -147,7 +158,7 @@ class Run:
             self._checkpoint(lambda: steps.state_after)
 
         length = end - start if math.isfinite(end) else ENDLESS_SPAN_LENGTH
-        control = make_step_control(step, self.method, end - start, event)
+        control = make_step_control(step, self.method, end - start, events)
         try:
             adaptive_runs = self.engine.start_adaptive(control, self.saved_states[0][0], start, float(stops[0]), length)
         except INTERRUPTING_ERRORS as error:
@@ -157,45 +168,27 @@ class Run:
         self.saved_energies_entropies = [np.array([[float(state.energy), float(state.entropy)]])]
         values_per_step = self.system.dim * ((0 if saves_at_stops else 1) / save_every + (self.all_states is not None))
         max_steps = MAX_STORED_VALUES / max(values_per_step, 1e-9)
-        outcome = advance_to_end(self.engine, adaptive_runs, control, stops, save_steps, max_steps, event_set)
+        outcome = advance_to_end(self.engine, adaptive_runs, control, stops, save_steps, max_steps, events)
         if unsaved_steps is not None:
             self._save_steps(unsaved_steps, slice(-1, None))
         self.event_time = outcome.event_time
+        if events is not None:
+            self.events = collect_events(self.system, events.names, outcome.events)
         state, t = outcome.state, self.last_saved_time
         self.stats = run_statistics(state, self._wall_time(), outcome.n_rejected)
-        steps = int(state.step)
         if isinstance(step, Adaptive) and (
             outcome.underflow_step_size is not None or outcome.exhausted_limit in ("steps", "memory")
         ):
             self.status = adaptive_failure_status(
                 self.system, self.method, np.asarray(self.saved_states[0][0]), outcome, step, (start, end), t
             )
-        elif outcome.unknown_state_error is not None:
-            self.status = Status(
-                outcome.unknown_state_error.code, str(outcome.unknown_state_error), steps, t, float(state.residual)
-            )
-        elif event is not None and outcome.exhausted_limit:
-            text = f"{event.name} is NaN near t = {t:g} between values of opposite sign, so its zero cannot be "
-            text += "located. Define it there"
-            self.status = Status(StatusCode.NON_FINITE, text, steps, t, float(state.residual))
-        elif outcome.event_time is not None:
-            text = f"{EventSet.name if event is None else event.name}: reached at t = {t:.15g} in {steps} steps"
-            self.status = Status(StatusCode.EVENT, text, steps, t, float(state.residual))
+        elif events is not None and (outcome.exhausted_limit or outcome.event_time is not None):
+            self.status = event_status(outcome, events.names, t)
         else:
             h = step if isinstance(step, float) else float("nan")
             self.status = final_status(self.engine, state, t, h, outcome.interruption)
-            if event_set and event_set.why_undefined and self.status.ok:
-                self.status = dataclasses.replace(
-                    self.status, message=f"{self.status.message}; {event_set.why_undefined}"
-                )
-            if event is not None and self.status.ok:
-                text = f"{self.status.message}; the event ({event.name}) did not happen"
-                if outcome.sign_jumps:
-                    text += f": it changed its sign {len(outcome.sign_jumps)} times without being zero, first at t = "
-                    text += f"{outcome.sign_jumps[0]:g}"
-                if outcome.is_event_undefined:
-                    text = f"{self.status.message}; whether the event ({event.name}) happened is unknown, because the "
-                    text += "function is NaN at the end. Define it for all states of the run"
+            if events is not None and self.status.ok:
+                text = self.status.message + event_remarks(outcome, events.names, events.rules.terminal_counts)
                 self.status = dataclasses.replace(self.status, message=text)
 
     def _save_steps(self, steps: AcceptedSteps, selection: np.ndarray | slice) -> None:
@@ -265,6 +258,7 @@ class Run:
             stats=self.stats,
             provenance=self._provenance(x[0]),
             event_time=self.event_time,
+            events=self.events,
             dense=self._dense_output(),
         )
 

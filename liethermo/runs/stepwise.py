@@ -1,11 +1,10 @@
 """Runs that examine every step: adaptive steps, events, outputs at given times, dense output.
 
-An engine takes the steps. This module stops them at given times and locates events. The laws hold in every step.
+An engine takes the steps, and locates events. This module stops them at given times. The laws hold in every step.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -14,12 +13,12 @@ import numpy as np
 
 from ..engines.choice import EngineWithFallback
 from ..engines.codes import StatusCode
-from ..engines.paced import AdaptiveRuns, PauseHandler
+from ..engines.paced import AdaptiveRuns, EventOccurrence, EventRules, PauseHandler
 from ..engines.pacing import ATTEMPT_FIELDS, StepControl
 from ..engines.stepping import State
 from ..tracing.scalarize import UnsupportedPrimitive
 from .ending import INTERRUPTING_ERRORS, interruption_reason
-from .watch import EventSet, UnknownStateError
+from .events import EventSet
 
 ATTEMPTS_PER_CALL = 64
 """Number of attempted steps between two checks of an adaptive run."""
@@ -37,10 +36,11 @@ class RunOutcome:
     event_time: float | None = None
     underflow_step_size: float | None = None
     interruption: str = ""
-    sign_jumps: list[float] = field(default_factory=list)  # times at which the event function jumps across zero
-    is_event_undefined: bool = False  # the event function is NaN at the end
-    unknown_state_error: UnknownStateError | None = None  # a state inside a step could not be computed
-    exhausted_limit: str = ""  # "steps" or "memory"; "sight" if the event function is NaN
+    events: list[EventOccurrence] = field(default_factory=list)
+    sign_jumps: list[tuple[int, float]] = field(default_factory=list)  # event functions that jump across zero, times
+    undefined_ends: list[tuple[int, float]] = field(default_factory=list)  # see PauseHandler
+    undefined_events: list[int] = field(default_factory=list)  # numbers of event functions that are NaN at the end
+    exhausted_limit: str = ""  # "steps" or "memory"; "sight" if an event function is NaN
 
 
 class AcceptedSteps(NamedTuple):
@@ -54,9 +54,11 @@ class AcceptedSteps(NamedTuple):
     x : array, shape (m, n)
         States after the steps, with ``energy`` and ``entropy``, shape (m,).
     step_counts : array, shape (m,)
-        Number of steps of the run up to and including each.
-    state_before, state_after : State
-        Engine states before the first step and after the last.
+        Number of steps of the run up to and including each, without those that end at an event.
+    ends_at_event : bool
+        Whether the last step ends at an event.
+    state_after : State
+        Engine state after the last step.
     """
 
     t: np.ndarray
@@ -65,7 +67,7 @@ class AcceptedSteps(NamedTuple):
     energy: np.ndarray
     entropy: np.ndarray
     step_counts: np.ndarray
-    state_before: State
+    ends_at_event: bool
     state_after: State
 
 
@@ -94,22 +96,14 @@ def advance_to_end(
     max_steps : float
         Number of steps that fit into memory.
     events : EventSet, optional
-        Examines each step and may end the run in it.
+        The events whose functions the control has.
     attempts_per_call : int
         Largest number of attempted steps between two checks.
     """
     outcome = RunOutcome(_clear_pause_status(adaptive_runs.state()))
     try:
         _advance_to_end(
-            engine,
-            adaptive_runs,
-            control,
-            outcome,
-            stops,
-            step_callback,
-            max_steps,
-            events,
-            1 if events else attempts_per_call,
+            engine, adaptive_runs, control, outcome, stops, step_callback, max_steps, events, attempts_per_call
         )
     except INTERRUPTING_ERRORS as error:
         outcome.interruption = interruption_reason(error)
@@ -124,11 +118,13 @@ def _advance_to_end(
     stops,
     step_callback,
     max_steps,
-    event_set: EventSet | None,
+    events: EventSet | None,
     attempts_per_call: int,
 ) -> None:
-    pause_handler = PauseHandler(adaptive_runs, control, engine.method, stops, lambda i: engine.system)
-    outcome.sign_jumps = pause_handler.sign_jumps
+    rules = EventRules() if events is None else events.rules
+    pause_handler = PauseHandler(adaptive_runs, control, engine.method, stops, lambda i: engine.system, rules)
+    outcome.events, outcome.sign_jumps = pause_handler.occurrences, pause_handler.sign_jumps
+    outcome.undefined_ends, n_event_steps = pause_handler.undefined_ends, 0
 
     def scalar(name: str) -> float:
         return float(adaptive_runs.read(name)[0])
@@ -137,7 +133,9 @@ def _advance_to_end(
         pause_handler.confirm_events()
         pause_handler.resume_paused()
         code, t = int(scalar("status")), scalar("t")
-        outcome.is_event_undefined = not math.isfinite(scalar("event_value"))
+        if events is not None:
+            events.raise_error()
+            outcome.undefined_events = np.flatnonzero(~np.isfinite(adaptive_runs.read("event_values")[0])).tolist()
         if code == StatusCode.EVENT:
             outcome.event_time = t
         if code != StatusCode.COMPLETED:
@@ -158,26 +156,11 @@ def _advance_to_end(
         is_accepted = np.diff(attempts["step"], prepend=int(previous_state.step)) > 0
         if is_accepted.any():
             x, energy, entropy, step_counts, end_times, h = (attempts[name][is_accepted] for name in ATTEMPT_FIELDS)
-            try:
-                event = (
-                    event_set.find_events(engine, t, h[0], end_times[0], previous_state, outcome.state)
-                    if event_set
-                    else None
-                )
-            except UnknownStateError as error:
-                outcome.state, outcome.unknown_state_error = previous_state, error
-                return
-            if event:
-                outcome.event_time, event_step_size, event_state = event
-                outcome.state = previous_state if event_state is None else event_state
-                if event_state is not None:
-                    step_callback(_single_step(t, outcome.event_time, event_step_size, previous_state, event_state))
-                return
-            step_callback(
-                AcceptedSteps(
-                    np.append(t, end_times), h, x, energy, entropy, step_counts, previous_state, outcome.state
-                )
-            )
+            ends_at_event = bool(scalar("status") == StatusCode.PAUSED_AT_EVENT and is_accepted[-1])
+            step_counts = step_counts - n_event_steps
+            n_event_steps += ends_at_event
+            t_of_steps = np.append(t, end_times)
+            step_callback(AcceptedSteps(t_of_steps, h, x, energy, entropy, step_counts, ends_at_event, outcome.state))
     if code == StatusCode.STEP_LIMIT:
         outcome.exhausted_limit = "steps"
     elif code == StatusCode.STEP_UNDERFLOW:
@@ -193,8 +176,3 @@ def _advance_to_end(
 def _clear_pause_status(state: State) -> State:
     """Return the state of a running trajectory without the code of a pause."""
     return state._replace(status=np.int64(0))  # type: ignore[arg-type]
-
-
-def _single_step(t: float, end: float, h: float, state_before: State, state_after: State) -> AcceptedSteps:
-    x, energy, entropy, step_counts = (np.asarray(getattr(state_after, name))[None] for name in ATTEMPT_FIELDS[:4])
-    return AcceptedSteps(np.array([t, end]), np.array([h]), x, energy, entropy, step_counts, state_before, state_after)

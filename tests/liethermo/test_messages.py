@@ -86,10 +86,14 @@ FUNCTIONS = {
     ),
     "torque without return": (torque_of, lambda t, m: None, "the torque.*returns None", lambda t, m: 0.1 * m),
     "friction": (friction_of, lambda m: np.outer(m, m), "friction operator K.*NumPy", lambda m: jnp.outer(m, m)),
-    "event": (event_of, with_if, "the event function.*`if`", lambda m: jnp.where(m[0] > 0.0, m[0], m[1])),
     "event without return": (event_of, function_without_return, "the event function.*returns None", lambda m: m[0]),
-    "several events": (event_of, lambda m: m, r"one number, got shape \(3,\).*jnp.min", lambda m: jnp.min(m)),
-    "several events, their product": (event_of, lambda m: m - 0.15, "or the product", lambda m: jnp.prod(m - 0.15)),
+    "several events": (event_of, lambda m: m, r"one number, got shape \(3,\)", lambda m: jnp.min(m)),
+    "several events, their product": (
+        event_of,
+        lambda m: m - 0.15,
+        "a list of functions",
+        lambda m: jnp.prod(m - 0.15),
+    ),
     "Poisson tensor": (
         tensor_of,
         lambda x: np.array([[0.0, x[0]], [-x[0], 0.0]]),

@@ -57,7 +57,8 @@ class CompiledAdaptiveRuns:
 
     def write(self, name: str, indices: np.ndarray, values) -> None:
         block, lane = np.divmod(indices, self.step_loop.lanes)
-        self.step_loop.block_rows(self.blocks, name)[block, :, lane] = np.broadcast_to(values, indices.shape)[:, None]
+        values = np.reshape(values, (len(indices), -1)) if np.ndim(values) else values
+        self.step_loop.block_rows(self.blocks, name)[block, :, lane] = values
 
     def _lane_values(self, indices: np.ndarray, name: str | None = None) -> np.ndarray:
         """Return a field of the chosen trajectories, or all their rows, shape (trajectories, rows)."""

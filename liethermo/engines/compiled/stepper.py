@@ -35,7 +35,7 @@ from ..pacing import (
     jacobian_probe_shape,
 )
 from ..rules import DEFAULT_OPTIONS, SolverOptions
-from ..searching import EMPTY_BRACKET
+from ..searching import search_shape
 from ..stages import StageSolution, solve_newton
 from ..stepping import SavedStates, State, initial_run_state, stage_equations, take_step
 from .form import ProgramStructure, flat_parameters
@@ -295,7 +295,8 @@ class CompiledStepLoop:
         if control is not None:
             self._shapes |= {
                 "jacobian_probe": jacobian_probe_shape(system, method, control),
-                "root_bracket": EMPTY_BRACKET.shape,
+                "event_values": control.event_shape,
+                "root_bracket": search_shape(control.event_shape),
             }
         step_program = self._trace_program(
             self.fields_after_step, (*self.step_inputs, *self.field_names), self.field_names

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -104,7 +102,8 @@ def test_several_zeros_in_a_step_are_found():
         BODY, SPAN, X0, events=lambda t, y: np.sin(9.0 * t) + 0.1 * y[0], rtol=1e-6, atol=1e-6
     )
     assert_same_events(theirs, ours, 1e-5)
-    assert len(coarse_run.t) < len(theirs.t_events[0]) / 2
+    run_without_events = lt.scipy.solve_ivp(BODY, SPAN, X0, rtol=1e-6, atol=1e-6)
+    assert len(run_without_events.t) < len(theirs.t_events[0]) / 2
     assert np.abs(coarse_run.t_events[0] - theirs.t_events[0]).max() < 1e-4
 
 
@@ -179,42 +178,21 @@ def test_a_zero_at_the_start_is_a_zero_whatever_comes_next(events):
     assert ours.t_events[0].tolist() == theirs.t_events[0].tolist() == [0.0]
 
 
-def test_every_change_of_sign_between_states_is_an_event():
-    """Near the middle axis, partial steps have to be divided at this tolerance, as their corrections do not
-    converge."""
-    body = lt.models.free_rigid_body((3.0, 2.0, 1.0))
-    ours = lt.scipy.solve_ivp(body, (0.0, 400.0), [1e-6, 1.0, 1e-6], events=lambda t, y: y[0], dense_output=True)
-    changes = np.flatnonzero(np.diff(np.sign(ours.y[0])) != 0.0)
-    assert len(changes) > 3
-    assert len(ours.t_events[0]) == len(changes)
-    assert ((ours.t[changes] <= ours.t_events[0]) & (ours.t_events[0] <= ours.t[changes + 1])).all()
-    assert np.isfinite(ours.sol(np.linspace(*ours.t[changes[0] :][:2], 9))).all()
-    assert np.ptp(np.linalg.norm(ours.y_events[0], axis=1)) < 1e-13  # roundings of 67 steps
+def test_events_of_a_body_near_its_middle_axis():
+    """Partial steps of long steps do not converge there at a loose tolerance; shorter ones do."""
+    body, x0 = lt.models.free_rigid_body((3.0, 2.0, 1.0)), [1e-6, 1.0, 1e-6]
 
+    def field_of_body(t, m):
+        return np.cross(m, m / np.array([3.0, 2.0, 1.0]))
 
-def test_a_state_that_cannot_be_found_is_a_failure_with_a_reason(monkeypatch):
-    """No partial step of a long step can be taken; following the message's advice helps."""
-
-    def failing_partial_step(self, state, h, partial_step=EngineWithFallback.partial_step):
-        next_state = partial_step(self, state, h)
-        return next_state if h < 0.05 else next_state._replace(status=np.int64(1))
-
-    monkeypatch.setattr(EngineWithFallback, "partial_step", failing_partial_step)
-    settings = {"events": lambda t, y: t - 3.0, "rtol": 1e-6}
-    ours = lt.scipy.solve_ivp(BODY, SPAN, X0, **settings)
-    assert (ours.success, ours.status, ours.t_events[0].size) == (False, -1, 0)
-    assert "whether an event happens in the step from t = " in ours.message
-    assert "not_converged" in ours.message
-    assert ours.t[-1] < 3.0
-    assert ours.solution.status.code == "not_converged"
-    max_step = float(re.search(r"max_step=([0-9.e+-]+)", ours.message)[1])
-    for _ in range(5):
-        ours = lt.scipy.solve_ivp(BODY, SPAN, X0, max_step=max_step, **settings)
-        if ours.success:
-            break
-        max_step = float(re.search(r"max_step=([0-9.e+-]+)", ours.message)[1])
-    assert ours.success
-    assert ours.t_events[0] == pytest.approx([3.0])
+    first = lambda t, y: y[0]  # noqa: E731
+    exact = solve_ivp(field_of_body, (0.0, 400.0), x0, "DOP853", rtol=3e-14, atol=1e-20, events=first).t_events[0]
+    for rtol in (1e-3, 1e-6):
+        ours = lt.scipy.solve_ivp(body, (0.0, 400.0), x0, events=first, dense_output=True, rtol=rtol, atol=1e-3 * rtol)
+        assert len(ours.t_events[0]) == len(exact) == 3
+        assert np.abs(ours.t_events[0] / exact - 1.0).max() < max(0.2 * rtol**0.5, 1e-3)
+        assert np.abs(ours.y_events[0][:, 0]).max() < 1e-16
+        assert np.ptp(np.linalg.norm(ours.y_events[0], axis=1)) < 1e-13
 
 
 def test_a_state_between_steps_that_cannot_be_found_is_an_error(monkeypatch):
@@ -229,7 +207,7 @@ def test_a_state_between_steps_that_cannot_be_found_is_an_error(monkeypatch):
 def test_the_message_says_where_a_function_is_not_a_number(width):
     """A sign change across NaN values may or may not be a zero, so it is reported."""
     ours = lt.scipy.solve_ivp(BODY, SPAN, X0, events=lambda t, y: np.nan if abs(t - 3.0) < width else t - 3.0)
-    assert "the event function is NaN between t = " in ours.message
+    assert "the event function is NaN before t = " in ours.message
     same_sign_run = lt.scipy.solve_ivp(BODY, SPAN, X0, events=lambda t, y: np.nan if abs(t - 3.0) < width else t + 3.0)
     assert "NaN" not in same_sign_run.message
 

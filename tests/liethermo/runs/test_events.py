@@ -1,5 +1,7 @@
 """Events within steps: the first of several is found, and what is undone before the step ends is seen."""
 
+import math
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -234,3 +236,166 @@ def test_what_does_not_relax_has_no_relaxed_state():
     free = lt.LiePoissonSystem(mf.so(3), lt.Quadratic([0.3, 0.5, 1.0]))
     with pytest.raises(lt.InputError, match="produces entropy or loses energy"):
         lt.integrate(free, [1.0, 0.3, 0.5], (0.0, 1.0), 0.1, until=lt.Relaxed(1e-8))
+
+
+# -- several events, of the time, the attitude and the parameters -----------------------------------------------------
+
+
+def with_attributes(function, **attributes):
+    vars(function).update(attributes)
+    return function
+
+
+def level(t, x):
+    return x[0] - 0.5
+
+
+def sine(t, x):
+    return 1e3 * np.sin(t) + 0.0 * x[1]
+
+
+def velocity(x):
+    return x[1]
+
+
+TURN = 2.0 * np.pi
+
+
+@pytest.mark.parametrize("engine", ["compiled", pytest.param("array", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("step", [lt.Adaptive(1e-10), 0.1], ids=str)
+def test_several_events_beside_their_exact_times(step, engine):
+    """Terminal ones and others, with directions and counts, alone and in an ensemble whose members turn alike."""
+    events = [
+        with_attributes(lambda t, x: level(t, x), terminal=False),
+        with_attributes(lambda t, x: sine(t, x), terminal=2, direction=1),
+        with_attributes(lambda x: velocity(x) - 0.1, terminal=False, direction=-1),
+    ]
+    exact = [
+        [np.arccos(0.5), TURN - np.arccos(0.5), TURN + np.arccos(0.5), 2 * TURN - np.arccos(0.5)],
+        [TURN, 2 * TURN],
+        [TURN - np.arcsin(0.1), 2 * TURN - np.arcsin(0.1)],
+    ]
+    arguments = (0.0, 20.0), step, lt.MetriplecticRungeKutta(8)
+    solution = lt.integrate(OSCILLATOR, [1.0, 0.0], *arguments, until=events, engine=engine)
+    assert solution.event_time == solution.t[-1] == solution.events[1].t[-1]
+    assert solution.audit().passed
+    for series, times in zip(solution.events, exact, strict=True):
+        assert series.t == pytest.approx(times, abs=1e-8)
+        assert np.abs(np.linalg.norm(series.x, axis=1) - 1.0).max() < 1e-15
+    assert np.abs(solution.events[0].x[:, 0] - 0.5).max() < 2e-16
+    x0s = [[np.cos(a), -np.sin(a)] for a in (0.0, 0.0, 0.3)]
+    many = lt.ensemble(OSCILLATOR, x0s, *arguments, until=events, engine=engine)
+    assert many.event_time == pytest.approx([2 * TURN] * 3, abs=1e-8)
+    for k, series in enumerate(many.events):
+        assert series.t[series.trajectory == 1] == pytest.approx(solution.events[k].t, abs=1e-12)
+    assert many[2].events[0].t == pytest.approx(np.array(exact[0]) - 0.3, abs=1e-8)
+    assert many[2].events.times[1] == pytest.approx(exact[1], abs=1e-8)
+
+
+def test_events_without_end_leave_the_saved_states_of_fixed_steps():
+    """The run goes on to the times of its steps, and saves every fifth of them."""
+    event = with_attributes(lambda x: x[0] - 0.3, terminal=False)
+    arguments = OSCILLATOR, [1.0, 0.0], (0.0, 10.05), 0.1, lt.MetriplecticGauss(3)
+    plain = lt.integrate(*arguments, save_every=5)
+    solution = lt.integrate(*arguments, save_every=5, until=event)
+    assert np.array_equal(plain.t, solution.t)
+    assert np.abs(plain.x - solution.x).max() < 1e-9
+    assert len(solution.events[0].t) == 3
+    assert solution.stats.steps == plain.stats.steps + 3
+    assert solution.audit().passed
+
+
+def test_simultaneous_events_and_events_in_any_order():
+    """Two functions with one zero, in units that differ; the order of the functions decides nothing."""
+    first = with_attributes(lambda t, x: t - 1.25, terminal=False)
+    second = with_attributes(lambda x: 1e-12 * (x[0] - np.cos(1.25)), terminal=False)
+    third = with_attributes(lambda x: 1e12 * (x[0] - np.cos(1.2499999)), terminal=False)
+    arguments = OSCILLATOR, [1.0, 0.0], (0.0, 3.0), lt.Adaptive(1e-12), lt.MetriplecticRungeKutta(8)
+    for order in ([first, second, third], [third, second, first]):
+        times = {events.name: events.t for events in lt.integrate(*arguments, until=order).events}
+        assert sorted(len(t) for t in times.values()) == [1, 1, 1]
+        assert sorted(t[0] for t in times.values()) == pytest.approx([1.2499999, 1.25, 1.25], abs=1e-10)
+
+
+RIGID = lt.LiePoissonSystem(
+    mf.so(3),
+    lambda p: 0.5 * jnp.sum(p * p / jnp.array([3.0, 2.0, 1.0])),
+    lambda p: 0.5 * p @ p,
+    lt.KillingDissipation(0.1),
+    group=mf.SO(3),
+)
+
+
+def test_events_of_attitude_parameters_and_system():
+    arguments = [0.5, 0.9, 1.0], (0.0, 20.0), lt.Adaptive(1e-10), lt.MetriplecticRungeKutta(8)
+    run = lt.integrate(RIGID, *arguments, until=lambda x, attitude: attitude[2, 2] - 0.3)
+    assert run.attitude[-1, 2, 2] == pytest.approx(0.3, abs=1e-15)
+    rates = np.array([0.1, 0.2, 0.3])
+    threshold = lambda x, parameters: x[0] - parameters["dissipation.rate"]  # noqa: E731
+    many = lt.ensemble(RIGID, *arguments, parameters={"dissipation.rate": rates}, until=threshold)
+    is_event = np.isfinite(many.event_time)
+    assert is_event.any()
+    assert many.x[is_event, 0] == pytest.approx(rates[is_event], abs=1e-15)
+    alone = lt.integrate(RIGID, *arguments, until=threshold)
+    assert alone.event_time == pytest.approx(many.event_time[0], abs=1e-12)
+    level_of_entropy = lt.integrate(RIGID, *arguments, until=lambda x, system: system.entropy(x) - 1.2)
+    assert level_of_entropy.entropy[-1] == pytest.approx(1.2, abs=1e-14)
+    with pytest.raises(lt.InputError, match="asks for the attitude, and this system has none"):
+        lt.integrate(OSCILLATOR, [1.0, 0.0], (0.0, 1.0), 0.1, until=lambda x, attitude: x[0])
+
+
+def test_functions_of_numpy_and_of_python():
+    """The functions that jax.numpy has are traced; others are called by the array engine, in runs and in ensembles."""
+
+    def python_event(t, x):
+        return math.sin(t) - 0.5 if t > 0.1 else -1.0
+
+    numpy_event = lambda t, x: np.linalg.norm(x) * np.sin(t) - np.minimum(0.5, 1.0)  # noqa: E731
+    for step in (lt.Adaptive(1e-9), 0.1):
+        arguments = (0.0, 3.0), step, lt.MetriplecticRungeKutta(8)
+        for event, engine in ((numpy_event, "compiled"), (python_event, "array")):
+            run = lt.integrate(OSCILLATOR, [1.0, 0.0], *arguments, until=event)
+            assert run.provenance["engine"] == engine
+            assert run.event_time == pytest.approx(np.pi / 6, abs=1e-13)
+            many = lt.ensemble(OSCILLATOR, [[1.0, 0.0], [0.0, 1.0]], *arguments, until=event)
+            assert many.engine == engine
+            assert many.event_time == pytest.approx([np.pi / 6] * 2, abs=1e-13)
+
+
+def test_an_exception_of_an_event_function_is_the_users_own():
+    def fails_later(t, x):
+        if t > 1.0:
+            raise KeyError("no such table")
+        return -1.0
+
+    for call in (lt.integrate, lt.ensemble):
+        with pytest.raises(KeyError, match="no such table"):
+            call(OSCILLATOR, [1.0, 0.0], (0.0, 3.0), 0.1, until=fails_later)
+
+
+@pytest.mark.parametrize(
+    ("until", "message"),
+    [
+        ([], "an event at least"),
+        ([lambda a, b, c: 0.0], r"has the arguments \(x\) or \(t, x\)"),
+        ([lambda x: x[0], 3.0], r"lt\.Relaxed\(tol\) or a function"),
+        (with_attributes(lambda x: x[0], terminal=-1), "terminal must be True or the number"),
+    ],
+)
+def test_events_that_cannot_be_used(until, message):
+    with pytest.raises(lt.InputError, match=message):
+        lt.integrate(OSCILLATOR, [1.0, 0.0], (0.0, 1.0), 0.1, until=until)
+
+
+def test_files_have_the_events(tmp_path):
+    event = with_attributes(lambda x: x[0], terminal=2)
+    arguments = (0.0, 9.0), 0.1, lt.MetriplecticRungeKutta(8)
+    run = lt.integrate(OSCILLATOR, [1.0, 0.0], *arguments, until=[event])
+    many = lt.ensemble(OSCILLATOR, [[1.0, 0.0], [2.0, 0.0]], *arguments, until=event)
+    for result in (run, many):
+        (series,), (loaded,) = result.events, lt.load(result.save(tmp_path / "run.nc")).events
+        assert loaded.name == series.name
+        for values, loaded_values in zip(series[1:], loaded[1:], strict=True):
+            assert np.array_equal(values, loaded_values)
+            assert len(values) in (2, 4)
+    assert lt.load(lt.integrate(OSCILLATOR, [1.0, 0.0], (0.0, 1.0), 0.1).save(tmp_path / "plain.nc")).events == ()

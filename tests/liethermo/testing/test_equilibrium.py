@@ -104,7 +104,7 @@ OVERSCALED_SPIN = lt.LiePoissonSystem(mf.so(3), SPIN.energy, None, OverscaledNoi
 @pytest.mark.slow
 def test_the_wrong_noise_is_found(monkeypatch):
     """Incorrect noise is refused; without the check it leads to another equilibrium."""
-    with pytest.raises(lt.InputError, match=r"misses K dS by 0.2"):
+    with pytest.raises(lt.InputError, match=r"differs from K dS by a relative error of 0.2"):
         lt.integrate(OVERSCALED_SPIN, UP, (0.0, 1.0), 0.1, noise=BATH)
     monkeypatch.setattr(fluctuating, "FACTOR_RTOL", 1.0)
     with pytest.raises(PropertyError, match="standard errors"):
