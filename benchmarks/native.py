@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from liethermo.engines.rules import DEFAULT_OPTIONS
+from liethermo.engines.solver_options import DEFAULT_OPTIONS
 
 from .report import UnavailableError
 

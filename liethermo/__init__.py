@@ -71,8 +71,8 @@ from .runs.adaptive import Adaptive
 from .runs.ensemble import ensemble
 from .runs.events import Relaxed
 from .runs.flow import flow
-from .runs.fluctuations import Fluctuations
 from .runs.integrate import integrate
+from .runs.noise import Fluctuations
 from .runs.propagator import Propagator
 from .runs.suggest import MethodSuggestion, suggest_method, suggest_step
 from .studies.axes import Zipped, latin_hypercube, replicas, sobol, zipped

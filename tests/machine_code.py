@@ -6,9 +6,9 @@ import itertools
 import numpy as np
 from llvmlite import ir
 
-from liethermo.engines.compiled.blocks import Table
+from liethermo.engines.compiled.llvm_writer import FLOAT64, INT64, ProgramWriter
+from liethermo.engines.compiled.loops_and_calls import Table
 from liethermo.engines.compiled.machine_code import MachineCode
-from liethermo.engines.compiled.writer import FLOAT64, INT64, ProgramWriter
 from liethermo.tracing.scalarize import Program
 
 RUN_SIGNATURE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)

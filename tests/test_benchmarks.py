@@ -24,8 +24,8 @@ from benchmarks.problems import X0, body_parameters, general_body, general_param
 from benchmarks.report import Report, Table, Target, UnavailableError
 from benchmarks.timing import race
 from liethermo import MetriplecticGauss
-from liethermo.engines.codes import StatusCode
-from liethermo.engines.rules import DEFAULT_OPTIONS
+from liethermo.engines.solver_options import DEFAULT_OPTIONS
+from liethermo.engines.status_codes import StatusCode
 
 ROOT = Path(__file__).resolve().parent.parent
 

@@ -1,4 +1,4 @@
-/* When to stop iterating, and when to steer the energy: the rules come from liethermo/engines/rules.py, as definitions
+/* When to stop iterating, and when to steer the energy: the rules come from liethermo/engines/solver_options.py, as definitions
    on the command line. */
 
 #ifndef RULES_H

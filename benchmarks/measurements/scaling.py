@@ -14,7 +14,7 @@ import numpy as np
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engines.choice import EngineWithFallback
+from liethermo.engines.select_engine import EngineWithFallback
 from liethermo.runs.preparation import prepare_system_and_method
 
 from .. import child as process

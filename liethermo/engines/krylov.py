@@ -7,7 +7,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from .rules import SolverOptions
+from .solver_options import SolverOptions
 
 
 def solve_krylov(matvec: Callable, b: jax.Array, options: SolverOptions) -> jax.Array:

@@ -18,7 +18,7 @@ from ..results.solution import Solution
 from ..runs.adaptive import Adaptive
 from ..runs.events import EventSpecification
 from ..runs.integrate import integrate, solution_without_steps
-from ..runs.timetable import clip_times_to_span
+from ..runs.schedule import clip_times_to_span
 from ..systems import System
 
 __all__ = ["OdeResult", "solve_ivp"]

@@ -9,12 +9,12 @@ import numpy as np
 
 from manifolds._tables import TableRow, Tabular
 
-from ..engines.codes import StatusCode
+from ..engines.status_codes import StatusCode
 from ..errors import InputError
 from ..functions.gradients import EPS
 
 if TYPE_CHECKING:
-    from .evidence import Evidence
+    from .audit_evidence import Evidence
     from .status import Laws, Stats, Status
 
 

@@ -12,12 +12,13 @@ import numpy as np
 from manifolds._precision import with_library_settings
 from manifolds._tables import html_grid
 
-from ..engines.codes import STATUS_NAMES, StatusCode
+from ..engines.status_codes import STATUS_NAMES, StatusCode
 from ..errors import InputError
 from .audit import FAILED_TRAJECTORIES_ROW, Audit, AuditRow, Tolerances, accuracy_row, coverage_text
+from .audit_evidence import AuditableResult, Evidence, merge_evidence
+from .ensemble_laws import evaluate_ensemble_laws
 from .events import Events
-from .evidence import AuditableResult, Evidence, merge_evidence
-from .files import (
+from .netcdf import (
     ENSEMBLE_FORMAT,
     array_of_shape,
     build_dataset,
@@ -26,7 +27,6 @@ from .files import (
     split_complex,
     state_axis_names,
 )
-from .many import evaluate_ensemble_laws
 from .solution import Solution
 from .status import Laws, Stats, Status
 

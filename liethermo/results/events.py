@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .files import array_of_shape, state_axis_names
+from .netcdf import array_of_shape, state_axis_names
 
 
 class EventSeries(NamedTuple):

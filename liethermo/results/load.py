@@ -6,7 +6,7 @@ import os
 
 from ..errors import FileError
 from .ensemble import Ensemble
-from .files import ENSEMBLE_FORMAT, read_dataset
+from .netcdf import ENSEMBLE_FORMAT, read_dataset
 from .solution import Solution
 
 

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
 from ..models.inertia import EQUAL_MOMENTS_RTOL
-from .evidence import AuditableResult
+from .audit_evidence import AuditableResult
 
 
 def quaternions(solution: AuditableResult) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -14,15 +14,14 @@ from manifolds._tables import html_grid
 
 from ..errors import InputError
 from .audit import Audit, Tolerances, audit_run
-from .deferred import deferred_fields
+from .audit_evidence import AuditableResult, Evidence
 from .events import Events
-from .evidence import AuditableResult, Evidence
 
 if TYPE_CHECKING:
     import xarray
 
-    from .dense import DenseOutput
-from .files import (
+    from .dense_output import DenseOutput
+from .netcdf import (
     SOLUTION_FORMAT,
     array_of_shape,
     build_dataset,
@@ -34,6 +33,55 @@ from .files import (
 from .orientation import orientation_series
 from .sketch import svg_sketch
 from .status import Laws, Stats, Status
+
+Class = TypeVar("Class", bound=type)
+
+
+@dataclass(frozen=True, eq=False)
+class Computation:
+    """Value of a deferred field that is not computed yet.
+
+    Attributes
+    ----------
+    function : function without arguments
+        Returns the value; it is called once.
+    """
+
+    function: Callable[[], Any]
+
+
+def defer(function: Callable[[], Any]) -> Any:
+    """Return a value for a deferred field: ``function()`` is called at the first use of the field."""
+    return Computation(function)
+
+
+class _DeferredField:
+    """Descriptor of a field whose value may be a :class:`Computation`."""
+
+    def __init__(self, name: str):
+        self._name = name
+
+    def __get__(self, instance: Any, owner: type | None = None) -> Any:
+        if instance is None:
+            return self
+        value = vars(instance)[self._name]
+        if isinstance(value, Computation):
+            value = vars(instance)[self._name] = value.function()
+        return value
+
+    def __set__(self, instance: Any, value: Any) -> None:
+        vars(instance)[self._name] = value
+
+
+def deferred_fields(*names: str) -> Callable[[Class], Class]:
+    """Decorate a dataclass: the values of these fields may be given by :func:`defer`."""
+
+    def add_descriptors(cls: Class) -> Class:
+        for name in names:
+            setattr(cls, name, _DeferredField(name))
+        return cls
+
+    return add_descriptors
 
 
 @deferred_fields("casimirs", "provenance")

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..engines.codes import STATUS_NAMES, StatusCode
+from ..engines.status_codes import STATUS_NAMES, StatusCode
 from ..errors import InputError
+
+OK_NAMES = tuple(STATUS_NAMES[code] for code in (StatusCode.COMPLETED, StatusCode.EVENT))
+"""Names of the status codes of runs that ended as they should."""
 
 
 @dataclass(frozen=True)
@@ -16,7 +19,7 @@ class Status:
     ----------
     code : {"completed", "event", "not_converged", "non_finite", "step_underflow", "step_limit", "interrupted", \
 "reference_failed", "inadmissible"}
-        Given by name or as a :class:`liethermo.engines.codes.StatusCode`.
+        Given by name or as a :class:`liethermo.engines.status_codes.StatusCode`.
     message : str
         A full sentence: what happened, where, and what to try.
     step : int
@@ -34,13 +37,13 @@ class Status:
     residual: float = 0.0
 
     def __post_init__(self):
-        object.__setattr__(self, "code", self.code.status_name if isinstance(self.code, StatusCode) else self.code)
+        object.__setattr__(self, "code", STATUS_NAMES[self.code] if isinstance(self.code, StatusCode) else self.code)
         if self.code not in STATUS_NAMES:
             raise InputError(f"no status {self.code!r}; there are {', '.join(STATUS_NAMES)}")
 
     @property
     def ok(self) -> bool:
-        return self.code in (StatusCode.COMPLETED.status_name, StatusCode.EVENT.status_name)
+        return self.code in OK_NAMES
 
     def __str__(self) -> str:
         return f"{self.code}: {self.message}"

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..engines.pacing import StepControl
+from ..engines.step_control import StepControl
 from ..errors import InputError
 from ..integrators import OneStepMethod
 from ..integrators.base import has_error_estimate

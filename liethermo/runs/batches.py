@@ -15,19 +15,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..engines import array
-from ..engines.choice import MAX_COMPILED_DIM
-from ..engines.compiled.form import flat_parameters
-from ..engines.compiled.stepper import cached_step_loop
-from ..engines.pacing import StepControl
-from ..engines.rules import DEFAULT_OPTIONS
-from ..engines.stepping import REPORTED_FIELDS, State, initial_run_state_program
+from ..engines import array_engine
+from ..engines.compiled.parameters import flat_parameters
+from ..engines.compiled.step_loop import cached_step_loop
+from ..engines.select_engine import MAX_COMPILED_DIM
+from ..engines.solver_options import DEFAULT_OPTIONS
+from ..engines.step import REPORTED_FIELDS, State, initial_run_state_program
+from ..engines.step_control import StepControl
 from ..integrators import OneStepMethod
 from ..tracing.programs import jit_cached
-from .family import Family
-from .fluctuations import NoisePaths
+from .noise import NoisePaths
 from .record import EnsembleRecord
-from .timetable import CHUNK_STEPS
+from .schedule import CHUNK_STEPS
+from .system_family import Family
 
 LANES_PER_BLOCK = 8
 """Number of trajectories in a block of the compiled engine: one AVX-512 vector, or two of AVX2."""
@@ -44,7 +44,7 @@ ARRAY_MAX_SAVED_VALUES = 2**26
 
 RECORDED_INITIAL_FIELDS = ("x", "energy", "entropy")
 """Fields of the initial engine states that a record needs; of final states it needs
-:data:`.stepping.REPORTED_FIELDS`."""
+:data:`.step.REPORTED_FIELDS`."""
 
 
 class ProgressCounter:
@@ -228,11 +228,12 @@ def run_fixed_array(
 ) -> None:
     """Run all trajectories with fixed steps on the array engine, a vmapped program per batch, and fill the record."""
     n_trajectories, schedule, is_interrupted = len(record.x0), record.schedule, False
-    batch_size, lazy_newton = min(ARRAY_BATCH_SIZE, n_trajectories), array.LazyNewton(method)
+    batch_size, lazy_newton = min(ARRAY_BATCH_SIZE, n_trajectories), array_engine.LazyNewton(method)
     max_steps = (
         CHUNK_STEPS if noise is None else max(1, CHUNK_STEPS * 16 // batch_size)
     )  # bounded memory for the increments
-    max_saves = max(1, min(array.MAX_SAVES_PER_CALL, ARRAY_MAX_SAVED_VALUES // (batch_size * record.x0.shape[1])))
+    values_per_save = batch_size * record.x0.shape[1]
+    max_saves = max(1, min(array_engine.MAX_SAVES_PER_CALL, ARRAY_MAX_SAVED_VALUES // values_per_save))
     for start in range(0, n_trajectories, batch_size):
         n_members = min(batch_size, n_trajectories - start)
         members = padded_member_indices(start, start + n_members, record.x0.shape[1])
@@ -246,7 +247,7 @@ def run_fixed_array(
                 increments = (
                     None
                     if noise is None
-                    else array.pad_noise_increments(
+                    else array_engine.pad_noise_increments(
                         noise.step_increments(members, first_step, n_saves * steps_per_save, h)
                     )
                 )
@@ -277,7 +278,8 @@ REPLAY_STEPS_PER_CALL = 32
 
 def replay_array(family: Family, method: OneStepMethod, x: np.ndarray, h: np.ndarray, steps: int = 1) -> ReplayedSteps:
     """Take ``steps`` steps of size h[i] with each member i of a small family, on the array engine."""
-    batch_arguments, lazy_newton = (family.form, *family.vmap_arguments(slice(None)), method), array.LazyNewton(method)
+    batch_arguments = family.form, *family.vmap_arguments(slice(None)), method
+    lazy_newton = array_engine.LazyNewton(method)
     state, chunks = initial_run_states_vmapped(*batch_arguments, jnp.asarray(x)), []
     for n_done in range(0, steps, REPLAY_STEPS_PER_CALL):
         state, saved_states = advance_batch(
@@ -296,7 +298,7 @@ def initial_run_states_vmapped(form, parameters, axes, method, x):
 
 
 def advance_batch(
-    lazy_newton: array.LazyNewton,
+    lazy_newton: array_engine.LazyNewton,
     batch_arguments: tuple,
     state: State,
     h,
@@ -339,7 +341,7 @@ def advance_vmapped(
     form, parameters, axes, method, state, h, n_saves, steps_per_save, capacity: int, noise, newton: bool, first_steps
 ):
     def one(p, state, h, noise, first_step):
-        return array.advance(
+        return array_engine.advance(
             form.rebuild(p),
             method,
             state,

@@ -11,8 +11,8 @@ import numpy as np
 
 from manifolds._precision import with_library_settings
 
-from ..engines.choice import is_worth_compiling, warn_of_fallback
-from ..engines.codes import StatusCode
+from ..engines.select_engine import is_worth_compiling, warn_of_fallback
+from ..engines.status_codes import StatusCode
 from ..errors import InputError
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..integrators.fluctuating import noise_dimension
@@ -23,9 +23,8 @@ from ..tracing.scalarize import UnsupportedPrimitive
 from .adaptive import Adaptive, make_step_control
 from .batches import MAX_THREADS, ProgressCounter, replay_array, replay_compiled, run_fixed_array, run_fixed_compiled
 from .events import EventSet, Until, collect_events
-from .family import Family, broadcast_size, error_message_of
-from .fluctuations import DEFAULT_NOISE_METHOD, Fluctuations, NoisePaths, check_noise
 from .member_groups import common_inertia, group_members_by_invariants, members_outside_domain
+from .noise import DEFAULT_NOISE_METHOD, Fluctuations, NoisePaths, check_noise
 from .paced import AdaptiveEnsembleRun
 from .preparation import (
     check_choice,
@@ -39,10 +38,11 @@ from .preparation import (
     why_not_startable,
     wrap_family,
 )
-from .presented import run_provenance
 from .progress import Progress
 from .record import EnsembleEvidenceCollector, EnsembleRecord, MemberSolutionBuilder
-from .timetable import StepSchedule, make_schedule
+from .schedule import StepSchedule, make_schedule
+from .solution_builder import run_provenance
+from .system_family import Family, broadcast_size, error_message_of
 
 __all__ = ["MAX_THREADS", "Ensemble", "ensemble"]
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from manifolds._pytree_module import Module
 
-from ..engines.paced import EventOccurrence, EventRules
+from ..engines.adaptive_runs import EventOccurrence, EventRules
 from ..errors import FunctionError, IndexOutOfRangeError, InputError
 from ..results.events import Events, EventSeries
 from ..systems import AttitudeSystem, DrivenSystem, EmbeddedSystem, System

@@ -15,9 +15,9 @@ from jax.flatten_util import ravel_pytree
 from manifolds._arrays import is_traced
 from manifolds._precision import with_library_settings
 
-from ..engines import implicit
-from ..engines.stages import StageEquations, StageSolution, explicit_slopes, solve_fixed_point, solve_stages
-from ..engines.stepping import (
+from ..engines.implicit_differentiation import implicit_solution
+from ..engines.stage_solver import StageEquations, StageSolution, explicit_slopes, solve_fixed_point, solve_stages
+from ..engines.step import (
     apply_drift_correction,
     can_correct_energy_drift,
     end_of_step,
@@ -29,9 +29,9 @@ from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..systems import System
 from ..tracing.programs import jit_cached, jit_unoptimised
 from .adaptive import Adaptive
+from .flow_derivatives import state_derivatives
 from .preparation import checked_initial_state, initial_state, limit_to_span, prepare_for_method
-from .sensitivities import state_derivatives
-from .timetable import StepSchedule
+from .schedule import StepSchedule
 
 
 @with_library_settings
@@ -329,4 +329,4 @@ def _solve_stages_implicitly(
         system, method, x, compensation, h = eqx.combine(dynamic, static)
         return solve(stage_equations(system, method, x, compensation, h, guess, guess)._replace(guess=guess))
 
-    return implicit.implicit_solution(solution, lambda dynamic, k: slopes(dynamic, k) - k, dynamic, guess)
+    return implicit_solution(solution, lambda dynamic, k: slopes(dynamic, k) - k, dynamic, guess)

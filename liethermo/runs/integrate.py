@@ -12,12 +12,12 @@ from ..results.solution import Solution
 from ..systems import System
 from .adaptive import Adaptive
 from .events import Until
-from .fluctuations import Fluctuations
+from .noise import Fluctuations
 from .preparation import refuse_tracers
 from .problem import Problem
 from .propagator import Propagator
 from .run import Run
-from .timetable import StepSchedule
+from .schedule import StepSchedule
 
 
 @with_library_settings

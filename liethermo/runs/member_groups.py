@@ -25,7 +25,7 @@ from ..systems.baths import HeatBaths
 from ..systems.conservation import judge_conservation, rates_of_change
 from ..systems.interface import InvariantVerdicts
 from ..tracing.interpret import evaluate_at_points
-from .family import Family
+from .system_family import Family
 
 MAX_VALUES_PER_CALL = 2**21
 """Largest number of parameters and state components, summed over all points of one evaluation, which bounds memory."""

@@ -7,11 +7,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..engines.codes import StatusCode
-from ..engines.compiled.paced import CompiledAdaptiveRuns
-from ..engines.paced import AdaptiveRuns, EventRules, PauseHandler, start_adaptive_runs
-from ..engines.pacing import StepControl
-from ..engines.stepping import REPORTED_FIELDS
+from ..engines.adaptive_runs import AdaptiveRuns, EventRules, PauseHandler, start_adaptive_runs
+from ..engines.compiled.adaptive_runs import CompiledAdaptiveRuns
+from ..engines.status_codes import StatusCode
+from ..engines.step import REPORTED_FIELDS
+from ..engines.step_control import StepControl
 from ..integrators import OneStepMethod
 from .batches import (
     ARRAY_BATCH_SIZE,
@@ -22,8 +22,8 @@ from .batches import (
     run_in_threads,
 )
 from .events import EventSet
-from .family import Family
 from .record import EnsembleRecord
+from .system_family import Family
 
 ATTEMPTS_PER_CALL_RANGE = (16, 2048)
 """Smallest and largest number of attempted steps per engine call; paused trajectories wait until the call ends."""

@@ -28,8 +28,8 @@ from ..systems import (
     make_autonomous,
 )
 from ..tracing.caching import LRUCache, memoize
-from .family import Family
-from .fluctuations import Fluctuations
+from .noise import Fluctuations
+from .system_family import Family
 
 Result = TypeVar("Result")
 

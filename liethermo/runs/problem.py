@@ -9,13 +9,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from ..engines.choice import MIN_STEPS_TO_COMPILE, EngineWithFallback
+from ..engines.select_engine import MIN_STEPS_TO_COMPILE, EngineWithFallback
 from ..integrators import OneStepMethod, Reference
-from ..results.status import Laws
 from ..systems import AttitudeSystem, System
 from ..systems.interface import SystemInterface
 from ..tracing.caching import memoize
-from .fluctuations import Fluctuations
+from .noise import Fluctuations
 from .preparation import (
     checked_initial_state,
     invariants_and_laws,
@@ -24,6 +23,7 @@ from .preparation import (
     prepare_system_and_method,
     resolve_invariants,
 )
+from .solution_builder import RecordedFunctions
 
 
 class Problem:
@@ -36,8 +36,7 @@ class Problem:
     method : OneStepMethod or Reference
         The user's method, with noise and reconstruction as far as the system needs them.
     noise : Fluctuations or None
-    invariants : dict
-        Functions recorded along a run, and whether the system conserves each of them.
+    functions : RecordedFunctions
     laws : Laws
     is_driven : bool
         Whether functions of the system depend on time.
@@ -47,9 +46,8 @@ class Problem:
 
     def __init__(self, system: System, method: Any, noise: Fluctuations | None):
         self.system, self.method, self.noise = system, method, noise
-        self.invariants: dict
-        self.laws: Laws
-        self.invariants, self.laws = invariants_and_laws(system, method)
+        invariants, self.laws = invariants_and_laws(system, method)
+        self.functions = RecordedFunctions.from_system(system, invariants)
         self.is_driven = is_driven_run(system)
         self._engines = _ThreadEngines()
         self.state_shape = system.shape if system.sites else (system.dim,)
@@ -109,13 +107,13 @@ class Problem:
         Parameters
         ----------
         requested_engine : str
-            See :data:`..engines.choice.ENGINES`.
+            See :data:`..engines.select_engine.ENGINES`.
         system : System
             The system in the span of the run.
         planned_steps : int
             Number of steps that the run will take.
         noise_increments : function, optional
-            See :class:`..engines.choice.EngineWithFallback`.
+            See :class:`..engines.select_engine.EngineWithFallback`.
         """
         if self.is_driven or noise_increments is not None:
             return EngineWithFallback(system, self.method, requested_engine, planned_steps, noise_increments)

@@ -13,8 +13,8 @@ import numpy as np
 
 from manifolds._precision import with_library_settings
 
-from ..engines.choice import ENGINES
-from ..engines.codes import StatusCode
+from ..engines.select_engine import ENGINES
+from ..engines.status_codes import StatusCode
 from ..errors import ConvergenceError, FileError, InputError, NonFiniteError
 from ..integrators import DEFAULT_METHOD, OneStepMethod, Reference
 from ..results.ensemble import Ensemble
@@ -24,13 +24,13 @@ from ..tracing.caching import LRUCache
 from .adaptive import Adaptive
 from .ensemble import ensemble
 from .events import Until
-from .family import named_parameters
-from .fluctuations import DEFAULT_NOISE_METHOD, Fluctuations, check_noise
+from .noise import DEFAULT_NOISE_METHOD, Fluctuations, check_noise
 from .preparation import check_choice, has_undecided_invariants, refuse_tracers
 from .problem import Problem
 from .progress import Progress
 from .run import Run
-from .timetable import CHUNK_STEPS, ScheduleSegment, StepSchedule, checked_span, checked_step, make_schedule
+from .schedule import CHUNK_STEPS, ScheduleSegment, StepSchedule, checked_span, checked_step, make_schedule
+from .system_family import named_parameters
 
 CONVERGENCE_FAILURES = tuple(
     code.status_name for code in (StatusCode.NOT_CONVERGED, StatusCode.STEP_UNDERFLOW, StatusCode.STEP_LIMIT)
@@ -101,7 +101,8 @@ class Propagator:
         engine: Literal["auto", "array", "compiled", "sparse"] = "auto",
         noise: Fluctuations | None = None,
     ):
-        check_noise(noise)
+        if noise is not None:
+            check_noise(noise)
         if method is None:
             method = DEFAULT_METHOD if noise is None else DEFAULT_NOISE_METHOD
         if not isinstance(method, OneStepMethod | Reference):

@@ -8,15 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from ..engines.choice import EngineWithFallback
-from ..engines.codes import StatusCode
-from ..engines.compiled.form import ProgramStructure
-from ..engines.paced import EventOccurrence
-from ..engines.stepping import relaxation_functional
+from ..engines.adaptive_runs import EventOccurrence
+from ..engines.compiled.parameters import ProgramStructure
+from ..engines.select_engine import EngineWithFallback
+from ..engines.status_codes import StatusCode
+from ..engines.step import relaxation_functional
 from ..integrators import OneStepMethod
 from ..results.audit import RoundingScale
-from ..results.ensemble import Ensemble
-from ..results.evidence import (
+from ..results.audit_evidence import (
     MAX_LOCAL_ERROR_STEPS,
     MIN_MOTION_FRACTION,
     MIN_RELATIVE_MOTION,
@@ -28,15 +27,16 @@ from ..results.evidence import (
     rounding_scales,
     select_worst_steps,
 )
-from ..results.looking import MAX_SAMPLED_VALUES, REPLAY_COST_RATIO, StepSample
+from ..results.ensemble import Ensemble
 from ..results.solution import Solution
+from ..results.step_sampling import MAX_SAMPLED_VALUES, REPLAY_COST_RATIO, StepSample
 from ..systems import AttitudeSystem, DrivenSystem, System
 from ..tracing.interpret import evaluate_at_points
-from .ending import ensemble_failure_message
-from .family import Family
 from .preparation import invariants_and_laws
-from .presented import EngineReplay, build_solution
-from .timetable import StepSchedule
+from .schedule import StepSchedule
+from .solution_builder import EngineReplay, RecordedFunctions, build_solution
+from .system_family import Family
+from .termination import ensemble_failure_message
 
 RECORDED_QUANTITIES = (
     "energy entropy energy_drift largest_energy_increment least_entropy_increment entropy_scale relaxation_time "
@@ -124,7 +124,7 @@ class EnsembleRecord:
         Parameters
         ----------
         initial, final : mapping of arrays
-            Fields of :class:`liethermo.engines.stepping.State`.
+            Fields of :class:`liethermo.engines.step.State`.
         """
         steps = final["step"].astype(np.int64)
         status = np.where((final["status"] == 0) & (steps < self.n_steps), StatusCode.INTERRUPTED, final["status"])
@@ -267,7 +267,7 @@ class MemberSolutionBuilder:
             self.method,
             x,
             laws=laws,
-            invariants=invariants,
+            functions=RecordedFunctions.from_system(system, invariants),
             t=member_solution.t,
             energy=energy,
             entropy=member_solution.entropy,

@@ -13,19 +13,24 @@ import numpy as np
 
 from manifolds.errors import warn
 
-from ..engines.codes import StatusCode
-from ..engines.stepping import SavedStates, State, energy_and_entropy_at
+from ..engines.status_codes import StatusCode
+from ..engines.step import SavedStates, State, energy_and_entropy_at
 from ..errors import FileError
 from ..integrators import Reference
 from ..integrators.fluctuating import noise_dimension
-from ..results.deferred import defer
-from ..results.dense import DenseOutput
+from ..results.dense_output import DenseOutput
 from ..results.events import Events
-from ..results.solution import Solution
+from ..results.solution import Solution, defer
 from ..results.status import Stats, Status
 from ..tracing.interpret import evaluate_at_points
 from .adaptive import Adaptive, make_step_control
-from .ending import (
+from .events import EventSet, collect_events
+from .noise import NoisePaths
+from .problem import Problem
+from .schedule import StepSchedule
+from .solution_builder import EngineReplay, build_solution, run_provenance
+from .stepwise import MAX_STORED_VALUES, AcceptedSteps, advance_to_end
+from .termination import (
     INTERRUPTING_ERRORS,
     adaptive_failure_status,
     event_remarks,
@@ -34,12 +39,6 @@ from .ending import (
     interruption_reason,
     run_statistics,
 )
-from .events import EventSet, collect_events
-from .fluctuations import NoisePaths
-from .presented import EngineReplay, build_solution, run_provenance
-from .problem import Problem
-from .stepwise import MAX_STORED_VALUES, AcceptedSteps, advance_to_end
-from .timetable import StepSchedule
 
 MAX_PROVENANCE_COMPONENTS = 1_000
 """Largest number of components of an initial state that the provenance lists; attributes of a file are limited in
@@ -253,7 +252,7 @@ class Run:
             step_sizes=functools.partial(_longest_steps, self.schedule, self.taken_steps, len(x) - 1),
             replay=EngineReplay(self.engine),
             laws=self.problem.laws,
-            invariants=self.problem.invariants,
+            functions=self.problem.functions,
             status=self.status or Status(StatusCode.INTERRUPTED, "still running", len(x) - 1, self.last_saved_time),
             stats=self.stats,
             provenance=self._provenance(x[0]),

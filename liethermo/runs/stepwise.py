@@ -11,14 +11,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..engines.choice import EngineWithFallback
-from ..engines.codes import StatusCode
-from ..engines.paced import AdaptiveRuns, EventOccurrence, EventRules, PauseHandler
-from ..engines.pacing import ATTEMPT_FIELDS, StepControl
-from ..engines.stepping import State
+from ..engines.adaptive_runs import AdaptiveRuns, EventOccurrence, EventRules, PauseHandler
+from ..engines.select_engine import EngineWithFallback
+from ..engines.status_codes import StatusCode
+from ..engines.step import State
+from ..engines.step_control import ATTEMPT_FIELDS, StepControl
 from ..tracing.scalarize import UnsupportedPrimitive
-from .ending import INTERRUPTING_ERRORS, interruption_reason
 from .events import EventSet
+from .termination import INTERRUPTING_ERRORS, interruption_reason
 
 ATTEMPTS_PER_CALL = 64
 """Number of attempted steps between two checks of an adaptive run."""

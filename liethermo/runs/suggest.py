@@ -11,8 +11,8 @@ import numpy as np
 
 from manifolds._precision import with_library_settings
 
-from ..engines.choice import EngineWithFallback
-from ..engines.pacing import DEADBAND, growth_rate_at
+from ..engines.select_engine import EngineWithFallback
+from ..engines.step_control import DEADBAND, growth_rate_at
 from ..errors import InputError, LiethermoError
 from ..integrators import DEFAULT_METHOD, MetriplecticGauss, MetriplecticRungeKutta, MetriplecticTaylor, OneStepMethod
 from ..integrators.taylor import order_for_tolerance

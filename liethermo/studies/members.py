@@ -15,7 +15,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..functions.conditions import collect_conditions, refusal_message
-from ..runs.family import Family, named_parameters
+from ..runs.system_family import Family, named_parameters
 from ..systems import System
 
 FIXED_BATCH_SIZE = 8192

@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from ..engines.codes import RESULT_CODES, StatusCode
+from ..engines.status_codes import RESULT_CODES, StatusCode
 from ..integrators import OneStepMethod
 from ..results.audit import Tolerances
+from ..results.audit_evidence import energy_and_entropy, rounding_scales
 from ..results.ensemble import Ensemble
-from ..results.evidence import energy_and_entropy, rounding_scales
-from ..results.many import evaluate_ensemble_laws
+from ..results.ensemble_laws import evaluate_ensemble_laws
 from ..results.status import Laws
 from ..runs.ensemble import ensemble
-from ..runs.fluctuations import Fluctuations
+from ..runs.noise import Fluctuations
 from ..systems import System
 from ..tracing.caching import LRUCache
 from ..tracing.interpret import evaluate_at_points

@@ -13,7 +13,7 @@ import numpy as np
 
 from manifolds.errors import warn
 
-from ..results.files import dataclass_from_json
+from ..results.netcdf import dataclass_from_json
 from ..results.status import Laws
 from .axes import MAX_POINTS, is_valid_name
 from .files import ZarrArray

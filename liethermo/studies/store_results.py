@@ -11,8 +11,8 @@ import numpy as np
 
 from ..errors import FileError
 from ..results.audit import Audit, AuditRow, Tolerances
-from ..results.files import dataclass_from_json
-from ..results.many import evaluate_ensemble_laws
+from ..results.ensemble_laws import evaluate_ensemble_laws
+from ..results.netcdf import dataclass_from_json
 from ..results.status import Laws
 from . import files
 from .progress import StudyStatus, seconds_left

@@ -14,15 +14,15 @@ import numpy.typing as npt
 from manifolds._precision import with_library_settings
 from manifolds.errors import warn
 
-from ..engines.codes import StatusCode
+from ..engines.status_codes import StatusCode
 from ..errors import InputError
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..results.audit import Audit
 from ..runs.adaptive import Adaptive
 from ..runs.events import Relaxed
-from ..runs.fluctuations import DEFAULT_NOISE_METHOD, Fluctuations, check_noise
+from ..runs.noise import DEFAULT_NOISE_METHOD, Fluctuations, check_noise
 from ..runs.preparation import check_choice
-from ..runs.timetable import make_schedule
+from ..runs.schedule import make_schedule
 from ..systems import System
 from . import files, identity
 from .axes import Axes, Zipped

@@ -16,7 +16,7 @@ from ..functions.checks import energy_value
 from ..functions.energy import Energy, make_energy
 from ..integrators.fluctuating import noise_invariance
 from ..runs.ensemble import ensemble
-from ..runs.fluctuations import MEASURE_ROW, Fluctuations
+from ..runs.noise import MEASURE_ROW, Fluctuations
 from ..systems import System
 from ..tracing.interpret import evaluate_at_points
 

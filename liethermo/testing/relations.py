@@ -21,7 +21,7 @@ import numpy as np
 
 from manifolds.testing import Report, Suite
 
-from ..engines.choice import is_worth_compiling
+from ..engines.select_engine import is_worth_compiling
 from ..errors import InputError
 from ..functions.energy import Pullback
 from ..functions.gradients import EPS
@@ -32,9 +32,9 @@ from ..results.load import load
 from ..results.solution import Solution
 from ..runs.adaptive import Adaptive
 from ..runs.ensemble import Ensemble, ensemble
-from ..runs.family import named_parameters
-from ..runs.fluctuations import Fluctuations
 from ..runs.integrate import integrate
+from ..runs.noise import Fluctuations
+from ..runs.system_family import named_parameters
 from ..studies.axes import replicas
 from ..studies.study import Study
 from ..systems import LiePoissonSystem, System

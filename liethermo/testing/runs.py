@@ -10,7 +10,7 @@ import numpy as np
 
 from manifolds.testing import Suite
 
-from ..engines.choice import is_worth_compiling
+from ..engines.select_engine import is_worth_compiling
 from ..integrators import MetriplecticGauss, MetriplecticMidpoint, OneStepMethod
 from ..results.audit import ACCURACY_ROW, INEXACT_LAW_NOTE, STEPS_TAKEN_ROW
 from ..results.solution import Solution

@@ -9,7 +9,7 @@ import numpy as np
 from manifolds.testing import Report, Suite
 
 from ..integrators import OneStepMethod
-from ..results.looking import vector_field_at
+from ..results.step_sampling import vector_field_at
 from ..systems import System
 from .runs import SUITE_METHODS, check_laws_along_run, default_step, random_start, rebuild_pytree
 

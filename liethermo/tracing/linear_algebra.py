@@ -165,7 +165,7 @@ def lu(b, eqn, a):
 
 
 def inverse(b, eqn, a):
-    """Unroll the primitive ``inverse`` of :mod:`liethermo.engines.stages`, which Newton's method calls."""
+    """Unroll the primitive ``inverse`` of :mod:`liethermo.engines.stage_solver`, which Newton's method calls."""
     return _map_matrices(b, eqn, a, lambda x: call_lapack(b, "inverse", (len(x),), x))
 
 

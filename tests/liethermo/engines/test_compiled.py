@@ -13,12 +13,12 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engines import array
-from liethermo.engines.choice import CompiledEngineWarning
-from liethermo.engines.codes import StatusCode
+from liethermo.engines import array_engine
 from liethermo.engines.compiled import machine_code
-from liethermo.engines.compiled.stepper import CompiledEngine, CompiledStepLoop
-from liethermo.engines.rules import SolverOptions
+from liethermo.engines.compiled.step_loop import CompiledEngine, CompiledStepLoop
+from liethermo.engines.select_engine import CompiledEngineWarning
+from liethermo.engines.solver_options import SolverOptions
+from liethermo.engines.status_codes import StatusCode
 from liethermo.runs import problem
 from tests.cases import DISSIPATIONS, build, state_of
 from tests.liethermo import random_systems
@@ -116,7 +116,7 @@ def test_failures_are_the_same():
 def test_every_engine_goes_by_the_rules_it_is_given():
     system = lt.LiePoissonSystem(mf.so(3), lambda p: jnp.sum(p**4), lt.Quadratic(np.ones(3)), lt.KillingDissipation())
     x0, method = np.array([0.8, 0.5, 0.9]), lt.MetriplecticGauss(1)
-    for engine in (CompiledEngine, array.ArrayEngine):
+    for engine in (CompiledEngine, array_engine.ArrayEngine):
         limited_engine = engine(system, method, SolverOptions(max_fixed_point_iterations=1, max_newton_iterations=1))
         state = limited_engine.step(limited_engine.initial_run_state(x0), 0.1)
         assert int(state.status) == StatusCode.NOT_CONVERGED
@@ -151,7 +151,7 @@ def test_rules_of_large_systems_in_machine_code():
 
 def test_what_takes_minutes_to_compile_is_said(monkeypatch):
     monkeypatch.setattr(problem, "_cached_problem", problem._cached_problem.__wrapped__)  # no engine of another test
-    monkeypatch.setattr("liethermo.engines.choice.SLOW_COMPILE_OPERATIONS", 2)
+    monkeypatch.setattr("liethermo.engines.select_engine.SLOW_COMPILE_OPERATIONS", 2)
     with pytest.warns(CompiledEngineWarning, match=r"takes minutes to compile\. Leave out engine"):
         lt.integrate(BODY, X0, (0.0, 1.0), 0.1, engine="compiled")
     with warnings.catch_warnings():
@@ -296,11 +296,11 @@ def test_auto_compiles_small_systems_and_long_runs(monkeypatch):
     monkeypatch.setattr(problem, "_cached_problem", problem._cached_problem.__wrapped__)  # no engine of another test
     chosen_engine = lambda: lt.integrate(BODY, X0, (0.0, 1.0), 0.1).provenance["engine"]  # noqa: E731
     assert chosen_engine() == "compiled"
-    monkeypatch.setattr("liethermo.engines.choice.MAX_AUTO_COMPILED_OPERATIONS", 2)
+    monkeypatch.setattr("liethermo.engines.select_engine.MAX_AUTO_COMPILED_OPERATIONS", 2)
     assert chosen_engine() == "array"
-    monkeypatch.setattr("liethermo.engines.choice.MIN_STEPS_TO_COMPILE", 5)
+    monkeypatch.setattr("liethermo.engines.select_engine.MIN_STEPS_TO_COMPILE", 5)
     assert chosen_engine() == "compiled"
-    monkeypatch.setattr("liethermo.engines.choice.MAX_COMPILED_DIM", 2)
+    monkeypatch.setattr("liethermo.engines.select_engine.MAX_COMPILED_DIM", 2)
     assert chosen_engine() == "array"
 
 

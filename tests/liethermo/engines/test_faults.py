@@ -7,8 +7,8 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engines.choice import CompiledEngineWarning
-from liethermo.engines.compiled.writer import ProgramWriter
+from liethermo.engines.compiled.llvm_writer import ProgramWriter
+from liethermo.engines.select_engine import CompiledEngineWarning
 from liethermo.runs import problem
 from liethermo.tracing import scalarize
 from liethermo.tracing.builder import Builder
@@ -62,7 +62,7 @@ def sine(m):
 @pytest.fixture
 def fresh_programs(monkeypatch):
     """Empty the caches of programs."""
-    monkeypatch.setattr("liethermo.engines.compiled.stepper._step_loop_cache", lt.tracing.caching.LRUCache(4))
+    monkeypatch.setattr("liethermo.engines.compiled.step_loop._step_loop_cache", lt.tracing.caching.LRUCache(4))
     monkeypatch.setattr("liethermo.tracing.interpret._unrolled_cache", lt.tracing.caching.LRUCache(4))
     monkeypatch.setattr("liethermo.runs.problem._cached_problem", problem._cached_problem.__wrapped__)
 
@@ -76,7 +76,7 @@ FAULTS = {
     "scalar compiler": lambda patch: patch.setattr(scalarize, "_collect_program", raising),
     "builder": lambda patch: patch.setattr(Builder, "mul", raising),
     "writer": lambda patch: patch.setattr(ProgramWriter, "write_operation", raising),
-    "LLVM": lambda patch: patch.setattr("liethermo.engines.compiled.loop.MachineCode", raising),
+    "LLVM": lambda patch: patch.setattr("liethermo.engines.compiled.loop_codegen.MachineCode", raising),
 }
 """Patches that raise an error in a part of the compiler."""
 
@@ -109,7 +109,7 @@ def test_a_fault_where_a_run_has_a_pace(options, monkeypatch, fresh_programs):
 def test_a_fault_in_newtons_method(monkeypatch, fresh_programs):
     """A fault while Newton's method is compiled, at the first step that needs it: the array engine resumes the run."""
     system = lt.LiePoissonSystem(mf.so(3), sine)
-    monkeypatch.setattr("liethermo.engines.compiled.stepper.compile_newton_solver", raising)
+    monkeypatch.setattr("liethermo.engines.compiled.step_loop.compile_newton_solver", raising)
     with pytest.warns(CompiledEngineWarning, match="nobody has seen this yet"):
         solution = lt.integrate(system, 3.0 * X0, (0.0, 4.0), 0.4, lt.MetriplecticMidpoint())
     assert solution.stats.newton_iterations > 0

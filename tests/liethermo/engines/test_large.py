@@ -10,11 +10,11 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.dissipation.base import Dissipation
-from liethermo.engines import array
+from liethermo.engines import array_engine
 from liethermo.engines.krylov import solve_krylov
-from liethermo.engines.rules import DEFAULT_OPTIONS
-from liethermo.engines.stages import IterationState, StageEquations, solve_stages
-from liethermo.engines.stepping import initial_run_state_program
+from liethermo.engines.solver_options import DEFAULT_OPTIONS
+from liethermo.engines.stage_solver import IterationState, StageEquations, solve_stages
+from liethermo.engines.step import initial_run_state_program
 from liethermo.runs.preparation import checked_initial_state, prepare_system_and_method
 
 N_SPINS = 5_000
@@ -110,11 +110,11 @@ def test_newtons_method_is_compiled_when_a_step_needs_it():
     """A run that compiles Newton's method late equals one that could use it from the start."""
     system = lt.models.rigid_body(inertia=(10, 5, 1), rate=200.0)
     for h, needs_newton in ((1e-3, False), (0.5, True)):
-        engine = array.ArrayEngine(system, lt.MetriplecticMidpoint())
+        engine = array_engine.ArrayEngine(system, lt.MetriplecticMidpoint())
         start = engine.initial_run_state(jnp.array([0.1, 1.0, 0.1]))
         lazy_state, lazy_saves = engine.advance(start, h, 4, 2)
         assert engine._lazy_newton.has_newton is needs_newton
-        state, saves = array.advance(
+        state, saves = array_engine.advance(
             system, engine.method, start, *map(jnp.asarray, (h, 4, 2)), engine.max_saves_per_call
         )
         assert int(lazy_state.step) == int(state.step) == 8
@@ -126,15 +126,15 @@ def test_steps_before_newtons_method_is_needed_are_not_taken_again(monkeypatch):
     body = lt.LiePoissonSystem(
         mf.so(3), lambda p: 0.5 * p @ (p / jnp.array([3.0, 2.0, 1.0])), torque=lambda t, mu: jnp.array([0.5, 0.4, 0.3])
     )
-    calls, advance = [], array.advance
+    calls, advance = [], array_engine.advance
 
     def recording_advance(system, method, state, *arguments):
         calls.append((int(state.step), arguments[-2]))
         return advance(system, method, state, *arguments)
 
-    monkeypatch.setattr(array, "advance", recording_advance)
+    monkeypatch.setattr(array_engine, "advance", recording_advance)
     system, method = prepare_system_and_method(body, lt.MetriplecticMidpoint())
-    engine = array.ArrayEngine(system, method)
+    engine = array_engine.ArrayEngine(system, method)
     start = engine.initial_run_state(checked_initial_state(system, method, [0.1, 0.1, 0.1], 0.0))
     lazy_state, lazy_saves = engine.advance(start, 0.5, 10, 4)
     assert calls[0] == (0, False)
@@ -201,7 +201,7 @@ def test_the_work_does_not_depend_on_how_many_copies_there_are():
         system, x = ring(400 * copies, 3.0), np.append(np.tile(spins, copies), 0.0)
         method = lt.MetriplecticGauss(1).on(system)
         state = initial_run_state_program(system, method, x)
-        new_state = array.ArrayEngine(system, method).step(state, 0.2)
+        new_state = array_engine.ArrayEngine(system, method).step(state, 0.2)
         assert int(new_state.status) == 0
         counts.append((int(new_state.fixed_point_iterations), int(new_state.newton_iterations)))
     assert counts[0][1] > 0
@@ -233,7 +233,7 @@ def test_one_of_many_components_is_solved_like_the_others(strength, length):
     inputs = lt.LiePoissonSystem(mf.power(mf.so(3), n), energy), lt.MetriplecticMidpoint()
     system, method = prepare_system_and_method(*inputs)
     assert system.dim > DEFAULT_OPTIONS.rms_norm_dim
-    engine = array.ArrayEngine(system, method)
+    engine = array_engine.ArrayEngine(system, method)
     state = engine.initial_run_state(jnp.asarray(spins.ravel()))
     for _ in range(10):
         previous_state, state = state, engine.step(state, h)

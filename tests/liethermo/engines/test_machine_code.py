@@ -15,8 +15,8 @@ from llvmlite import binding as llvm
 from llvmlite import ir
 
 from liethermo.engines.compiled import machine_code
+from liethermo.engines.compiled.llvm_writer import FLOAT64, ProgramWriter
 from liethermo.engines.compiled.machine_code import MachineCode
-from liethermo.engines.compiled.writer import FLOAT64, ProgramWriter
 from liethermo.tracing.builder import BOOLEAN_OPERATIONS, COMPARISONS, OPERATIONS, Instruction
 from liethermo.tracing.program import Program
 from liethermo.tracing.scalarize import UnsupportedPrimitive, scalarize

@@ -8,7 +8,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engines.stepping import initial_run_state, take_step
+from liethermo.engines.step import initial_run_state, take_step
 from liethermo.integrators.lobatto import ExplicitTableau, lobatto_tableau, tree_vectors
 from tests.liethermo.integrators.test_orders import NONLINEAR
 

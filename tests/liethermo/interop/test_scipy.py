@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engines.choice import EngineWithFallback
+from liethermo.engines.select_engine import EngineWithFallback
 
 BODY = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.3)
 X0 = [0.1, 0.2, 1.0]

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 import liethermo as lt
 import manifolds as mf
 from liethermo.cli import app
-from liethermo.results import looking
+from liethermo.results import step_sampling
 
 BODY = lt.models.rigid_body()
 X0 = [0.001, 1.0, 0.001]
@@ -216,7 +216,7 @@ def test_the_audit_finds_a_step_through_a_barrier(save_every):
 @pytest.mark.parametrize("save_every", [1, 40])
 def test_the_verdict_says_how_many_steps_were_looked_at(monkeypatch, save_every):
     """The verdict tells the number of checked steps, which are those where the motion is fastest."""
-    monkeypatch.setattr(looking, "MAX_SAMPLED_VALUES", 3_000)
+    monkeypatch.setattr(step_sampling, "MAX_SAMPLED_VALUES", 3_000)
     system, orbit = lt.MetriplecticSystem(mf.Canonical(2), KEPLER), 2 * np.pi
     coarse_run = lt.integrate(
         system, apocentre(0.9), (0.0, 4 * orbit), orbit / 451, lt.MetriplecticMidpoint(), save_every=save_every

@@ -14,7 +14,7 @@ import pytest
 
 import liethermo as lt
 from liethermo import disk
-from liethermo.results import files
+from liethermo.results import netcdf
 from liethermo.runs import run
 
 
@@ -25,12 +25,12 @@ def solution():
 
 def rewrite(path: Path, change) -> Path:
     """Change a file and give it a valid checksum; return its path."""
-    path.write_bytes(path.read_bytes()[: -len(files.CHECKSUM_TAG) - 64])
+    path.write_bytes(path.read_bytes()[: -len(netcdf.CHECKSUM_TAG) - 64])
     with h5py.File(path, "r+") as file:
         change(file)
-    series, attributes = files._read_hdf5(path)
+    series, attributes = netcdf._read_hdf5(path)
     with h5py.File(path, "r+") as file:
-        file.attrs["sha256"] = files.checksum(series, attributes)
+        file.attrs["sha256"] = netcdf.checksum(series, attributes)
     return path
 
 
@@ -182,7 +182,7 @@ def test_what_is_no_result_is_refused(change_name, solution, tmp_path):
 @pytest.mark.parametrize("link", [h5py.ExternalLink("other.nc", "/x"), h5py.SoftLink("/x")])
 def test_links_are_not_followed(link, solution, tmp_path):
     path = solution.save(tmp_path / "run.nc")
-    path.write_bytes(path.read_bytes()[: -len(files.CHECKSUM_TAG) - 64])
+    path.write_bytes(path.read_bytes()[: -len(netcdf.CHECKSUM_TAG) - 64])
     with h5py.File(path, "r+") as file:
         file["more"] = link
     with pytest.raises(lt.FileError, match="is a link to another place"):
@@ -191,7 +191,7 @@ def test_links_are_not_followed(link, solution, tmp_path):
 
 def test_an_array_that_the_file_cannot_hold_is_not_made(solution, tmp_path):
     path = solution.save(tmp_path / "run.nc")
-    path.write_bytes(path.read_bytes()[: -len(files.CHECKSUM_TAG) - 64])
+    path.write_bytes(path.read_bytes()[: -len(netcdf.CHECKSUM_TAG) - 64])
     with h5py.File(path, "r+") as file:
         file.create_dataset("more", shape=(10**6, 10**6), chunks=(1000, 1000), dtype="f8")
     limits = resource.getrlimit(resource.RLIMIT_AS)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import liethermo as lt
-from liethermo.engines.codes import RESULT_CODES
+from liethermo.engines.status_codes import RESULT_CODES
 
 X0 = [0.001, 1.0, 0.001]
 

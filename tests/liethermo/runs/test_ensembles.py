@@ -8,7 +8,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engines.codes import STATUS_NAMES
+from liethermo.engines.status_codes import STATUS_NAMES
 from liethermo.runs import batches
 
 BODY = lt.models.rigid_body()

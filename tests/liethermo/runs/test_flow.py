@@ -11,7 +11,7 @@ import scipy.optimize
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engines import implicit
+from liethermo.engines.implicit_differentiation import implicit_solution
 from liethermo.runs import flow as flow_module
 
 X0 = jnp.array([0.3, 1.0, 0.2])
@@ -225,9 +225,7 @@ def root(p, x):
         p, x = parameters
         return y + 0.5 * p * jnp.sin(y) - x
 
-    return jax.lax.scan(lambda x, _: (implicit.implicit_solution(solve, misfit, (p, x), x), None), x[None], length=3)[
-        0
-    ][0]
+    return jax.lax.scan(lambda x, _: (implicit_solution(solve, misfit, (p, x), x), None), x[None], length=3)[0][0]
 
 
 @pytest.mark.slow
@@ -245,9 +243,7 @@ def test_implicit_functions_have_derivatives_of_derivatives():
         found = [jax.jit(jax.vmap(f, (None, 0)))(p, x) for f in (slopes, outer(slopes, 1))]
         assert np.abs(found[0] - y_first).max() < 1e-12
         assert np.abs(found[1] - second).max() < 1e-12
-    guess_derivative = jax.grad(
-        lambda guess: implicit.implicit_solution(lambda p, guess: p, lambda p, y: y - p, p, guess)
-    )(0.0)
+    guess_derivative = jax.grad(lambda guess: implicit_solution(lambda p, guess: p, lambda p, y: y - p, p, guess))(0.0)
     assert guess_derivative == 0.0
     second_derivatives = (
         jax.jit(jax.jacrev(jax.jacrev(root, 0), 0))(p, x[0]),

@@ -11,9 +11,9 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engines import array
-from liethermo.engines.codes import StatusCode
-from liethermo.engines.rules import DEFAULT_OPTIONS, SolverOptions
+from liethermo.engines import array_engine
+from liethermo.engines.solver_options import DEFAULT_OPTIONS, SolverOptions
+from liethermo.engines.status_codes import StatusCode
 from liethermo.runs.progress import Progress
 from tests.cases import EPS
 
@@ -50,7 +50,7 @@ def test_save_every(every):
 
 def test_chunks_do_not_show(monkeypatch):
     whole_run = lt.integrate(BODY, X0, (0.0, 30.0), 0.1)
-    monkeypatch.setattr(array, "MAX_SAVES_PER_CALL", 16)
+    monkeypatch.setattr(array_engine, "MAX_SAVES_PER_CALL", 16)
     pieces = lt.integrate(BODY, X0, (0.0, 30.0), 0.1)
     assert np.array_equal(whole_run.x, pieces.x)
 
@@ -137,9 +137,9 @@ def test_a_step_too_large_names_step_time_residual_and_advice():
 def test_no_smaller_step_is_advised_where_none_helps(monkeypatch):
     """The message says what was tried: with too few iterations shorter steps cannot be solved either."""
     hasty = functools.partial(
-        array.ArrayEngine, options=SolverOptions(max_fixed_point_iterations=1, max_newton_iterations=1)
+        array_engine.ArrayEngine, options=SolverOptions(max_fixed_point_iterations=1, max_newton_iterations=1)
     )
-    monkeypatch.setattr("liethermo.engines.choice.ArrayEngine", hasty)
+    monkeypatch.setattr("liethermo.engines.select_engine.ArrayEngine", hasty)
     system = lt.LiePoissonSystem(mf.so(3), lambda p: jnp.sum(p**4), lt.Quadratic(np.ones(3)), lt.KillingDissipation())
     solution = lt.integrate(system, [0.8, 0.5, 0.9], (0.0, 1.0), 0.25, on_failure="return", engine="array")
     assert solution.status.code == "not_converged"
@@ -170,7 +170,7 @@ def test_huge_steps_solve_their_equation(h, x0):
 def test_one_iteration_is_not_enough_and_says_so(method):
     """Control for dropped statuses: with a single iteration allowed every implicit method must report failure."""
     system = lt.LiePoissonSystem(mf.so(3), lambda p: jnp.sum(p**4), lt.Quadratic(np.ones(3)), lt.KillingDissipation())
-    engine = array.ArrayEngine(
+    engine = array_engine.ArrayEngine(
         system, method.on(system), SolverOptions(max_fixed_point_iterations=1, max_newton_iterations=1)
     )
     state, _ = engine.advance(engine.initial_run_state(jnp.array([0.8, 0.5, 0.9])), 0.01, 10, 1)
@@ -255,7 +255,7 @@ def test_ctrl_c_before_the_first_step(monkeypatch):
     def raise_interrupt(*arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(array, "initial_run_state_program", raise_interrupt)
+    monkeypatch.setattr(array_engine, "initial_run_state_program", raise_interrupt)
     solution = lt.integrate(BODY, X0, (0.0, 1.0), 0.1, engine="array")
     assert (solution.status.code, solution.x.tolist(), solution.stats.steps) == ("interrupted", [X0], 0)
 

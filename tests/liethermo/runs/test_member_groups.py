@@ -8,9 +8,9 @@ from scipy.integrate import solve_ivp
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engines.codes import StatusCode
+from liethermo.engines.status_codes import StatusCode
 from liethermo.runs import member_groups
-from liethermo.runs.family import Family
+from liethermo.runs.system_family import Family
 
 START = np.array([0.4, 0.5, -0.3])
 SPAN = (0.0, 2.0)

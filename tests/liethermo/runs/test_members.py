@@ -9,7 +9,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engines.codes import StatusCode
+from liethermo.engines.status_codes import StatusCode
 
 BODY = lt.models.rigid_body()
 SPAN = (0.0, 6.0)

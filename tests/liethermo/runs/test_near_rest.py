@@ -8,7 +8,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engines.stages import slope_rounding_scale
+from liethermo.engines.stage_solver import slope_rounding_scale
 from liethermo.functions.rounding import value_and_rounding_scale
 from liethermo.models.thermo_particles import thermo_particles_solution
 from tests.cases import slow_case

@@ -9,7 +9,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engines.choice import EngineWithFallback
+from liethermo.engines.select_engine import EngineWithFallback
 from liethermo.integrators.fluctuating import noise_dimension, set_noise_increments
 from liethermo.models.gas_piston import gas_piston_state
 from liethermo.runs.threefry import threefry

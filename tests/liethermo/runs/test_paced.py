@@ -6,7 +6,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engines.codes import StatusCode
+from liethermo.engines.status_codes import StatusCode
 from liethermo.runs import batches, paced
 
 BODY = lt.models.rigid_body()
@@ -234,7 +234,7 @@ def test_interrupted(monkeypatch):
     def interrupt(*args):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("liethermo.engines.paced._advance_batch_program", interrupt)
+    monkeypatch.setattr("liethermo.engines.adaptive_runs._advance_batch_program", interrupt)
     ensemble = lt.ensemble(BODY, states(3), SPAN, lt.Adaptive(1e-6), METHOD, engine="array")
     assert ensemble.status.tolist() == [StatusCode.INTERRUPTED] * 3
     assert not ensemble.steps.any()

@@ -8,8 +8,8 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.runs.fluctuations import step_code, step_time_codes
-from liethermo.runs.timetable import ScheduleSegment
+from liethermo.runs.noise import step_code, step_time_codes
+from liethermo.runs.schedule import ScheduleSegment
 from tests.cases import BuiltOnUse
 
 ENTROPY = lt.Quadratic(4.0 * np.ones(3))

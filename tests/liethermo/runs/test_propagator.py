@@ -10,7 +10,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engines.choice import CompiledEngineWarning
+from liethermo.engines.select_engine import CompiledEngineWarning
 
 SPAN = (0.0, 1.3)
 STEP = 0.25

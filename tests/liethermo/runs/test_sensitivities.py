@@ -7,7 +7,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.runs.sensitivities import _inverse_or_nan
+from liethermo.runs.flow_derivatives import _inverse_or_nan
 from tests.liethermo.runs.test_flow_derivatives import METHODS
 
 IMPLICIT = [method for method in METHODS if not method.explicit]

@@ -10,10 +10,10 @@ from scipy.integrate import solve_ivp
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engines import array
-from liethermo.engines.compiled import stepper as compiled
-from liethermo.engines.growth import arnoldi_hessenberg
-from liethermo.engines.pacing import step_size_after_acceptance, step_size_after_rejection
+from liethermo.engines import array_engine
+from liethermo.engines.compiled import step_loop as compiled
+from liethermo.engines.growth_rate import arnoldi_hessenberg
+from liethermo.engines.step_control import step_size_after_acceptance, step_size_after_rejection
 from liethermo.runs import stepwise
 from liethermo.tracing.scalarize import UnsupportedPrimitive
 
@@ -74,7 +74,7 @@ def test_the_estimate_of_the_local_error(stages, h):
     It is a vector that turns, and nearly vanishes where its parts cancel.
     """
     method, exact = lt.MetriplecticGauss(stages), lt.MetriplecticGauss(5)
-    engines = [array.ArrayEngine(SYSTEM, m) for m in (method, exact)]
+    engines = [array_engine.ArrayEngine(SYSTEM, m) for m in (method, exact)]
     ratios = []
     for x in lt.integrate(SYSTEM, START, (0.0, 20.0), 0.5, engine="array").x:
         new, right = (f.step(f.initial_run_state(x), h) for f in engines)

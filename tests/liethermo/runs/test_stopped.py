@@ -11,7 +11,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engines.choice import EngineWithFallback
+from liethermo.engines.select_engine import EngineWithFallback
 from liethermo.integrators import reference
 
 BODY = lt.models.rigid_body()

@@ -9,9 +9,9 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engines import array
-from liethermo.engines.rules import DEFAULT_OPTIONS
-from liethermo.engines.stepping import initial_run_state_program, reorder_components, take_step
+from liethermo.engines import array_engine
+from liethermo.engines.solver_options import DEFAULT_OPTIONS
+from liethermo.engines.step import initial_run_state_program, reorder_components, take_step
 from liethermo.functions.gradients import DISCRETE_GRADIENTS, stage_gradients
 from liethermo.functions.planes import to_component_order, to_site_order
 from liethermo.integrators.base import pullback_method
@@ -251,7 +251,7 @@ def test_control_a_wrong_order_is_seen():
     system = ring()
     found = system.reorder_components()
     first = initial_run_state_program(system, lt.MetriplecticMidpoint(), jnp.asarray(system.state(unit(N_LARGE))))
-    right = array.advance(system, lt.MetriplecticMidpoint(), first, *map(jnp.asarray, (0.05, 1, 1)), 1)[0]
+    right = array_engine.advance(system, lt.MetriplecticMidpoint(), first, *map(jnp.asarray, (0.05, 1, 1)), 1)[0]
     wrong = first._replace(x=found.reorder_state(first.x))
-    other = array.advance(system, lt.MetriplecticMidpoint(), wrong, *map(jnp.asarray, (0.05, 1, 1)), 1)[0]
+    other = array_engine.advance(system, lt.MetriplecticMidpoint(), wrong, *map(jnp.asarray, (0.05, 1, 1)), 1)[0]
     assert np.abs(right.x - found.restore_state(other.x)).max() > 1e-3

@@ -13,7 +13,7 @@ import manifolds as mf
 from liethermo import testing
 from liethermo.integrators import fluctuating
 from liethermo.integrators.base import has_error_estimate
-from liethermo.runs.timetable import StepSchedule
+from liethermo.runs.schedule import StepSchedule
 from liethermo.testing.transformations import CoordinateChange, transform_structure_constants, transform_system
 from tests.cases import DISSIPATIONS, REPRESENTATIVE, build, state_of
 

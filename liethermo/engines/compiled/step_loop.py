@@ -24,9 +24,13 @@ from ...systems import System
 from ...tracing.caching import LRUCache
 from ...tracing.calls import deferred_p
 from ...tracing.scalarize import report_compiler_faults, scalarize
-from ..array import max_saves_per_call
-from ..codes import StatusCode
-from ..pacing import (
+from ..array_engine import max_saves_per_call
+from ..root_bracket import search_shape
+from ..solver_options import DEFAULT_OPTIONS, SolverOptions
+from ..stage_solver import StageSolution, solve_newton
+from ..status_codes import StatusCode
+from ..step import SavedStates, State, initial_run_state, stage_equations, take_step
+from ..step_control import (
     ATTEMPT_FIELDS,
     AdaptiveState,
     StepControl,
@@ -34,14 +38,17 @@ from ..pacing import (
     initial_adaptive_state,
     jacobian_probe_shape,
 )
-from ..rules import DEFAULT_OPTIONS, SolverOptions
-from ..searching import search_shape
-from ..stages import StageSolution, solve_newton
-from ..stepping import SavedStates, State, initial_run_state, stage_equations, take_step
-from .form import ProgramStructure, flat_parameters
-from .loop import MAX_UNOPTIMISED_OPERATIONS, NEWTON_BUFFER, BlockLayout, CompiledLoops, NamedProgram, compile_step_loop
+from .loop_codegen import (
+    MAX_UNOPTIMISED_OPERATIONS,
+    NEWTON_BUFFER,
+    BlockLayout,
+    CompiledLoops,
+    NamedProgram,
+    compile_step_loop,
+)
 from .machine_code import MachineCode
-from .newton import compile_newton_solver
+from .newton_codegen import compile_newton_solver
+from .parameters import ProgramStructure, flat_parameters
 
 STATE_FIELDS = State._fields
 """Fields of a state."""
@@ -65,7 +72,7 @@ NEWTON_INPUTS = NewtonInputs._fields
 """Names of the inputs of the Newton fallback."""
 
 NEWTON_OUTPUTS = ("converged", "is_finite", "residual", "newton_iterations", "slope_rounding", "k")
-"""Fields of :class:`..stages.StageSolution` that the Newton fallback replaces."""
+"""Fields of :class:`..stage_solver.StageSolution` that the Newton fallback replaces."""
 
 
 class CompiledEngine:
@@ -360,7 +367,7 @@ class CompiledStepLoop:
         return *adaptive_state.state, *adaptive_state[1:]
 
     def _newton_fallback(self, dW) -> Callable:
-        """Return the fallback for :func:`..stepping.take_step`: a program compiled at its first use."""
+        """Return the fallback for :func:`..step.take_step`: a program compiled at its first use."""
 
         def bind_deferred_newton(fixed_point_result: StageSolution, *stage_inputs) -> StageSolution:
             initial_outputs = [1.0 * getattr(fixed_point_result, name) for name in NEWTON_OUTPUTS]

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .rules import EPS
+from .solver_options import EPS
 
 
 class RootBracket(NamedTuple):

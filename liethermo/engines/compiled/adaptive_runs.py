@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from ...tracing.scalarize import UnsupportedPrimitive
-from ..stepping import State
-from .stepper import CompiledStepLoop
+from ..step import State
+from .step_loop import CompiledStepLoop
 
 
 class CompiledAdaptiveRuns:
-    """Adaptive runs of trajectories in lanes, the counterpart of :class:`..paced.ArrayAdaptiveRuns`.
+    """Adaptive runs of trajectories in lanes, the counterpart of :class:`..adaptive_runs.ArrayAdaptiveRuns`.
 
     Parameters
     ----------
@@ -20,7 +20,7 @@ class CompiledAdaptiveRuns:
     parameters : array, shape (p,) or (trajectories, p)
     x : array, shape (trajectories, n)
     t, stop_time, span_length : float
-        See :func:`..pacing.initial_adaptive_state`.
+        See :func:`..step_control.initial_adaptive_state`.
     """
 
     def __init__(

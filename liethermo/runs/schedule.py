@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..engines.array import MAX_SAVES_PER_CALL
+from ..engines.array_engine import MAX_SAVES_PER_CALL
 from ..errors import InputError
 from ..functions.gradients import EPS
 from .adaptive import Adaptive

@@ -3,7 +3,7 @@
 An adaptive run carries an :class:`AdaptiveState`. One attempt takes a step, estimates its error, and chooses the size
 of the next step. The run pauses when the host has to act: at a stop time, if the growth rate must be computed, and at a
 possible event. A step in which the event function changes its sign is repeated with shorter sizes, until it ends at
-the sign change: at a zero, which is an event, or at a jump (:meth:`.paced.PauseHandler.confirm_events`).
+the sign change: at a zero, which is an event, or at a jump (:meth:`.adaptive_runs.PauseHandler.confirm_events`).
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from ..integrators import OneStepMethod
 from ..integrators.base import event_check_fractions
 from ..systems import System
 from ..tracing.programs import jit_cached
-from . import searching
-from .codes import StatusCode
-from .growth import DENSE_JACOBIAN_DIM, arnoldi_hessenberg, jacobian_probe
-from .rules import DEFAULT_OPTIONS, EPS, SolverOptions
-from .stages import keep_fixed_point_result
-from .stepping import State, initial_run_state, take_step
+from . import root_bracket
+from .growth_rate import DENSE_JACOBIAN_DIM, arnoldi_hessenberg, jacobian_probe
+from .solver_options import DEFAULT_OPTIONS, EPS, SolverOptions
+from .stage_solver import keep_fixed_point_result
+from .status_codes import StatusCode
+from .step import State, initial_run_state, take_step
 
 MAX_FACTOR_IMPLICIT = 3.0
 """Largest ratio of consecutive step sizes of an implicit method; beyond it the predicted stages are worthless."""
@@ -133,7 +133,7 @@ class AdaptiveState(NamedTuple):
     max_relative_rate: jax.Array  # largest rate of change of the state so far, relative to its norm
     growth_rate: jax.Array  # largest growth rate when it was last computed; NaN if it must be computed
     jacobian_probe: jax.Array  # probe of the Jacobian when the growth rate was last computed
-    root_bracket: jax.Array  # search for the first event in a step: see searching.search_array
+    root_bracket: jax.Array  # search for the first event in a step: see root_bracket.search_array
 
 
 def initial_adaptive_state(
@@ -171,7 +171,7 @@ def initial_adaptive_state(
         max_relative_rate=relative_rate,
         growth_rate=zero,
         jacobian_probe=jnp.full_like(probe, jnp.nan),
-        root_bracket=jnp.zeros(searching.search_shape(control.event_shape)),
+        root_bracket=jnp.zeros(root_bracket.search_shape(control.event_shape)),
     )
     return limit_by_growth_rate(method, adaptive_state, probe) if control.adaptive else adaptive_state
 
@@ -189,7 +189,7 @@ def next_step_size_and_end(control: StepControl, adaptive_state: AdaptiveState) 
     h, time_after = next_full_step_size_and_end(control, adaptive_state)
     if not control.event_functions:
         return h, time_after
-    bracket, _ = searching.split_search(adaptive_state.root_bracket)
+    bracket, _ = root_bracket.split_search(adaptive_state.root_bracket)
     trial_step = bracket.trial_fraction * bracket.step_size
     trial_time = jnp.minimum(adaptive_state.t + trial_step, adaptive_state.stop_time)
     return jnp.where(bracket.step_size > 0.0, trial_step, h), jnp.where(bracket.step_size > 0.0, trial_time, time_after)
@@ -208,7 +208,7 @@ def next_full_step_size_and_end(control: StepControl, adaptive_state: AdaptiveSt
         time_after = jnp.where(reaches_stop, adaptive_state.stop_time, adaptive_state.t + h)
         # the step as the difference of the rounded times, so that their rounding errors do not accumulate
         return jnp.where(reaches_stop | ~(time_after > adaptive_state.t), h, time_after - adaptive_state.t), time_after
-    # the same steps as runs.timetable; after an event the next one is shorter
+    # the same steps as runs.schedule; after an event the next one is shorter
     interval = adaptive_state.stop_time - adaptive_state.last_stop_time
     step, n_done = adaptive_state.next_step_size, adaptive_state.state.step - adaptive_state.steps_at_last_stop
     n_full = jnp.floor(interval / step * (1 + 1e-12))
@@ -233,7 +233,7 @@ def attempt_step(
     options: SolverOptions = DEFAULT_OPTIONS,
     newton_fallback=None,
 ) -> AdaptiveState:
-    """Return the adaptive state after one attempted step; ``newton_fallback`` as for :func:`.stepping.take_step`."""
+    """Return the adaptive state after one attempted step; ``newton_fallback`` as for :func:`.step.take_step`."""
     h, time_after = next_step_size_and_end(control, adaptive_state)
     return accept_or_reject(
         system,
@@ -375,9 +375,9 @@ def apply_event_detection(
     function is a number again. The values at the end of a search are stored beside the empty bracket.
     """
     values_before, values = adaptive_state.event_values, control.event_values(system, outcome.time_after, new_state.x)
-    bracket, _ = searching.split_search(adaptive_state.root_bracket)
+    bracket, _ = root_bracket.split_search(adaptive_state.root_bracket)
     signed_values = jnp.where(jnp.isnan(values) & jnp.isinf(values_before), values_before, values)
-    first_value = searching.first_event_value(control.event_directions, values_before, signed_values)
+    first_value = root_bracket.first_event_value(control.event_directions, values_before, signed_values)
     is_searching = bracket.step_size > 0.0
     is_solved = (new_state.status == StatusCode.COMPLETED) & ~jnp.isnan(first_value)
     has_event = jnp.any(are_event_crossings(control, values_before, values))
@@ -389,7 +389,7 @@ def apply_event_detection(
         )
         is_shortened = outcome.is_accepted & is_undone & ~is_searching
         starts_search = starts_search & ~is_shortened
-    next_bracket, is_root = searching.narrow_bracket(bracket, first_value)
+    next_bracket, is_root = root_bracket.narrow_bracket(bracket, first_value)
     ends_at_root = is_searching & is_solved & is_root
     ends_at_start = is_searching & is_solved & ~is_root & (next_bracket.trial_fraction <= 4.0 * EPS)
     time_advances = outcome.time_after > adaptive_state.t
@@ -414,14 +414,14 @@ def apply_event_detection(
             jnp.where(new_state.status == StatusCode.COMPLETED, StatusCode.NON_FINITE, new_state.status),
             status,
         )
-    initial_bracket = searching.bracket_from_step(
-        h, *searching.first_event_ends(control.event_directions, values_before, values)
+    initial_bracket = root_bracket.bracket_from_step(
+        h, *root_bracket.first_event_ends(control.event_directions, values_before, values)
     )
     end_values = jnp.where(ends_at_start, values_before, jnp.where(time_advances, signed_values, 0.0))
     updated_search = jnp.where(
         is_searching & ~has_failed & ~is_at_event,
-        searching.search_array(next_bracket, jnp.zeros_like(values)),
-        searching.search_array(searching.EMPTY_BRACKET, jnp.where(is_at_event, end_values, 0.0)),
+        root_bracket.search_array(next_bracket, jnp.zeros_like(values)),
+        root_bracket.search_array(root_bracket.EMPTY_BRACKET, jnp.where(is_at_event, end_values, 0.0)),
     )
     return AttemptOutcome(
         is_accepted=jnp.where(
@@ -436,7 +436,7 @@ def apply_event_detection(
         status=status,
         n_rejected=jnp.where(is_searching, 1.0 * has_failed, jnp.where(is_shortened, 1.0, outcome.n_rejected)),
         root_bracket=jnp.where(
-            starts_search, searching.search_array(initial_bracket, jnp.zeros_like(values)), updated_search
+            starts_search, root_bracket.search_array(initial_bracket, jnp.zeros_like(values)), updated_search
         ),
     )
 
@@ -527,7 +527,7 @@ def max_growth_per_step(method: OneStepMethod) -> float:
 def limit_by_growth_rate(method: OneStepMethod, adaptive_state: AdaptiveState, probe) -> AdaptiveState:
     """Return the adaptive state with its next step limited by the growth rate; pause if that rate is unknown.
 
-    ``probe`` is the Jacobian probe at the state: see :func:`.growth.jacobian_probe`.
+    ``probe`` is the Jacobian probe at the state: see :func:`.growth_rate.jacobian_probe`.
     """
     is_short = ~(
         (max_growth_per_step(method) < spectral_radius_bound(probe) * adaptive_state.next_step_size)

@@ -20,12 +20,12 @@ from ...functions.rounding import value_and_rounding_scale
 from ...integrators import OneStepMethod
 from ...systems import System
 from ...tracing.programs import jit_cached
-from ..array import EngineTrajectory
-from ..codes import StatusCode
-from ..rules import DEFAULT_OPTIONS
-from ..stages import IterationState, StageEquations, StageSolution, best_initial_guess, solve_fixed_point
-from ..stepping import State, finish_step, initial_run_state_program, stage_equations
-from .linear import JacobianCompression, SparseInverse
+from ..array_engine import EngineTrajectory
+from ..solver_options import DEFAULT_OPTIONS
+from ..stage_solver import IterationState, StageEquations, StageSolution, best_initial_guess, solve_fixed_point
+from ..status_codes import StatusCode
+from ..step import State, finish_step, initial_run_state_program, stage_equations
+from .colouring_and_lu import JacobianCompression, SparseInverse
 
 SPARSE_SOLVER_OPTIONS = replace(
     DEFAULT_OPTIONS,

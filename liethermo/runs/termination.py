@@ -8,13 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..engines.choice import EngineWithFallback
-from ..engines.codes import StatusCode
-from ..engines.rules import DEFAULT_OPTIONS
-from ..engines.stepping import State
+from ..engines.select_engine import EngineWithFallback
+from ..engines.solver_options import DEFAULT_OPTIONS
+from ..engines.status_codes import StatusCode
+from ..engines.step import State
 from ..integrators import OneStepMethod
-from ..results.looking import vector_field_at
 from ..results.status import Stats, Status
+from ..results.step_sampling import vector_field_at
 from ..systems import System
 from .adaptive import Adaptive
 

@@ -15,9 +15,8 @@ from ..integrators.base import is_permutation_equivariant, pullback_method
 from ..integrators.explicit import StepRow
 from ..systems import System
 from ..tracing.programs import jit_unoptimised
-from .codes import StatusCode
-from .rules import DEFAULT_OPTIONS, EPS, SolverOptions
-from .stages import (
+from .solver_options import DEFAULT_OPTIONS, EPS, SolverOptions
+from .stage_solver import (
     StageEquations,
     StageSolution,
     explicit_slopes,
@@ -26,6 +25,7 @@ from .stages import (
     solve_fixed_point,
     solve_stages,
 )
+from .status_codes import StatusCode
 
 
 class State(NamedTuple):

@@ -22,8 +22,8 @@ from ..integrators.fluctuating import noise_dimension
 from ..systems import System
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.scalarize import UnsupportedPrimitive
-from .files import SaveableResult
-from .looking import StepSample, hermite_defect, sample_steps, vector_field_at
+from .netcdf import SaveableResult
+from .step_sampling import StepSample, hermite_defect, sample_steps, vector_field_at
 
 MAX_SENSITIVITY_STATES = 256
 """Largest number of states of a run at which the sensitivities of its functions are evaluated."""
@@ -405,7 +405,7 @@ def select_worst_steps(steps: StepSample, field: Callable, min_motion, count: in
     Parameters
     ----------
     field
-        As for :func:`.looking.hermite_defect`.
+        As for :func:`.step_sampling.hermite_defect`.
     min_motion : float or array, shape (m,)
         Smallest length relative to which the defect of a step is taken.
     """

@@ -23,7 +23,7 @@ from ..integrators import OneStepMethod
 from ..integrators.explicit import constraint_residual
 from ..systems import System
 from .krylov import solve_krylov
-from .rules import DEFAULT_OPTIONS, SolverOptions
+from .solver_options import DEFAULT_OPTIONS, SolverOptions
 
 
 class StageSolution(NamedTuple):

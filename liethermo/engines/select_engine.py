@@ -15,14 +15,14 @@ from ..errors import InputError
 from ..integrators import OneStepMethod
 from ..systems import System
 from ..tracing.scalarize import UnsupportedPrimitive
-from .array import ArrayEngine, EngineTrajectory
-from .codes import StatusCode
-from .compiled.paced import CompiledAdaptiveRuns
-from .compiled.stepper import CompiledEngine, CompiledTrajectory
-from .paced import AdaptiveRuns, ArrayAdaptiveRuns, resume_on_array_engine, start_adaptive_run
-from .pacing import StepControl
-from .sparse.newton import SparseEngine
-from .stepping import SavedStates, State
+from .adaptive_runs import AdaptiveRuns, ArrayAdaptiveRuns, resume_on_array_engine, start_adaptive_run
+from .array_engine import ArrayEngine, EngineTrajectory
+from .compiled.adaptive_runs import CompiledAdaptiveRuns
+from .compiled.step_loop import CompiledEngine, CompiledTrajectory
+from .sparse.engine import SparseEngine
+from .status_codes import StatusCode
+from .step import SavedStates, State
+from .step_control import StepControl
 
 ENGINES = ("auto", "array", "compiled", "sparse")
 """Values of the option ``engine``."""
@@ -113,7 +113,7 @@ class EngineWithFallback:
         return Trajectory(self, self._call_with_fallback(lambda engine, _: engine.start(x)))
 
     def final_state(self, x, segments: Sequence[tuple[float, int]]) -> tuple[np.ndarray, float] | None:
-        """Return the last state and its status code: see :meth:`.stepper.CompiledTrajectory.final_state`.
+        """Return the last state and its status code: see :meth:`.step_loop.CompiledTrajectory.final_state`.
 
         The result is None if the compiled engine does not run the system.
         """
@@ -180,7 +180,7 @@ class EngineWithFallback:
         return None if self.noise is None else self.noise(int(state.step), steps, h)
 
     def start_adaptive(self, control: StepControl, x, t: float, stop_time: float, span_length: float) -> AdaptiveRuns:
-        """Start an adaptive run at x at time t; see :func:`.pacing.initial_adaptive_state`."""
+        """Start an adaptive run at x at time t; see :func:`.step_control.initial_adaptive_state`."""
         self._choose_engine(lambda compiled: compiled.adaptive_step_loop(control)[0].n_operations)
 
         def start_on_engine(engine: Engine, _) -> AdaptiveRuns:

@@ -20,9 +20,9 @@ from llvmlite import ir
 
 from ...tracing.program import Program
 from ...tracing.scalarize import report_compiler_faults
-from .blocks import Table
+from .llvm_writer import FLOAT64, INT64, ProgramWriter
+from .loops_and_calls import Table
 from .machine_code import MachineCode
-from .writer import FLOAT64, INT64, ProgramWriter
 
 BYTE_POINTER = ir.IntType(8).as_pointer()
 FLOAT64_POINTER = FLOAT64.as_pointer()

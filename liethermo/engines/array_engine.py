@@ -13,10 +13,10 @@ from ..integrators import OneStepMethod
 from ..integrators.fluctuating import set_noise_increments
 from ..systems import System
 from ..tracing.programs import jit_cached
-from .codes import FAILED_STEP_CODES, StatusCode
-from .rules import DEFAULT_OPTIONS, SolverOptions
-from .stages import keep_fixed_point_result
-from .stepping import SavedStates, State, initial_run_state, initial_run_state_program, reorder_components, take_step
+from .solver_options import DEFAULT_OPTIONS, SolverOptions
+from .stage_solver import keep_fixed_point_result
+from .status_codes import FAILED_STEP_CODES, StatusCode
+from .step import SavedStates, State, initial_run_state, initial_run_state_program, reorder_components, take_step
 
 
 @jit_cached

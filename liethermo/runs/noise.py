@@ -19,8 +19,8 @@ from ..integrators.fluctuating import add_noise
 from ..systems import System
 from ..systems.check import AXIOM_TOLERANCE, CheckReport, CheckRow
 from ..tracing.interpret import evaluate_at_points
+from .schedule import StepSchedule
 from .threefry import derive_key, grid_seeds, normal_numbers, split_words
-from .timetable import StepSchedule
 
 MAX_STANDARD_DEVIATIONS = 6.0
 """Largest absolute value of a normal random number, so that the equation of a step keeps a solution. One number in 5e8

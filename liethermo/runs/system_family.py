@@ -13,7 +13,7 @@ import numpy as np
 
 from manifolds import ManifoldsError
 
-from ..engines.compiled.form import ProgramStructure, parameter_arrays
+from ..engines.compiled.parameters import ProgramStructure, parameter_arrays
 from ..errors import InputError, LiethermoError
 from ..systems import System
 from ..tracing.caching import fingerprint

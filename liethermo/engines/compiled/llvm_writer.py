@@ -14,9 +14,9 @@ from ...tracing.branches import Branch, instructions_in_branches
 from ...tracing.builder import Block, Instruction, Scalar
 from ...tracing.program import Program
 from ...tracing.scalarize import UnsupportedPrimitive
-from .blocks import BlockResults, Table, make_table, select_entry, write_block
 from .exponential import write_exponential
 from .lapack import SPECIAL_FUNCTIONS, declare_symbol
+from .loops_and_calls import BlockResults, Table, make_table, select_entry, write_block
 
 FLOAT64 = ir.DoubleType()
 BOOL = ir.IntType(1)

@@ -14,12 +14,14 @@ from ..integrators import OneStepMethod
 from ..systems import System
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.programs import jit_cached
-from .array import LazyNewton
-from .codes import StatusCode
-from .compiled.form import ProgramStructure
-from .compiled.paced import CompiledAdaptiveRuns
-from .growth import DENSE_JACOBIAN_DIM
-from .pacing import (
+from .array_engine import LazyNewton
+from .compiled.adaptive_runs import CompiledAdaptiveRuns
+from .compiled.parameters import ProgramStructure
+from .growth_rate import DENSE_JACOBIAN_DIM
+from .solver_options import DEFAULT_OPTIONS, EPS
+from .status_codes import StatusCode
+from .step import State
+from .step_control import (
     ATTEMPT_FIELDS,
     AdaptiveState,
     StepControl,
@@ -31,8 +33,6 @@ from .pacing import (
     max_growth_per_step,
     max_growth_rates,
 )
-from .rules import DEFAULT_OPTIONS, EPS
-from .stepping import State
 
 
 class ArrayAdaptiveRuns:
@@ -44,7 +44,7 @@ class ArrayAdaptiveRuns:
     adaptive_state : AdaptiveState
         State of one trajectory, or of several along a leading axis.
     advance : function of (adaptive_state, max_attempts, with_newton) to an AdaptiveState
-        See :func:`.pacing.advance_adaptive`.
+        See :func:`.step_control.advance_adaptive`.
     is_single : bool
         Whether there is only one trajectory, without the leading axis.
     """

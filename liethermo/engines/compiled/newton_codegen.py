@@ -8,10 +8,10 @@ import numpy as np
 from llvmlite import ir
 
 from ...tracing.program import Program
-from .blocks import Table
-from .loop import FLOAT64_POINTER, NEWTON_BUFFER, BlockLayout
+from .llvm_writer import FLOAT64, INT64, ProgramWriter
+from .loop_codegen import FLOAT64_POINTER, NEWTON_BUFFER, BlockLayout
+from .loops_and_calls import Table
 from .machine_code import MachineCode
-from .writer import FLOAT64, INT64, ProgramWriter
 
 
 def compile_newton_solver(
@@ -22,8 +22,8 @@ def compile_newton_solver(
     Parameters
     ----------
     program : Program
-        :func:`..stages.solve_newton`, of the parameters p and the rows :data:`.loop.NEWTON_BUFFER`; the results
-        overwrite the first of these rows.
+        :func:`..stage_solver.solve_newton`, of the parameters p and the rows :data:`.loop_codegen.NEWTON_BUFFER`; the
+        results overwrite the first of these rows.
     layout : BlockLayout
     is_per_trajectory : array of bool, shape (p,)
         Parameters that lie in the block; the others are common to all trajectories.

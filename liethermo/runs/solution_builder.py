@@ -8,22 +8,46 @@ import functools
 import time
 from collections.abc import Callable, Mapping
 from importlib import metadata
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..engines.choice import EngineWithFallback
-from ..engines.codes import StatusCode
+from ..engines.select_engine import EngineWithFallback
+from ..engines.status_codes import StatusCode
 from ..functions.energy import Energy
-from ..results.deferred import defer
-from ..results.evidence import EvidenceCollector, StepReplay
-from ..results.solution import Solution
+from ..results.audit_evidence import EvidenceCollector, StepReplay
+from ..results.solution import Solution, defer
 from ..results.status import Laws
 from ..systems import System
 from ..tracing.interpret import evaluate_at_points
 from .adaptive import Adaptive
+
+
+class RecordedFunctions(NamedTuple):
+    """The functions that are recorded along the runs of a system.
+
+    Attributes
+    ----------
+    invariants : dict
+        Functions that the system may conserve, by name.
+    of_series : dict
+        These and the entries of the ledger, whose values along a run belong to its solution.
+    has_user_states : bool
+        Whether states of a run have the form that the user sees.
+    """
+
+    invariants: dict[str, Energy]
+    of_series: dict[str, Energy]
+    has_user_states: bool
+
+    @classmethod
+    def from_system(cls, system: System, invariants: Mapping[str, tuple[Energy, bool | None]]) -> RecordedFunctions:
+        """Return the recorded functions, with invariants as :func:`.preparation.invariants_and_laws` returns them."""
+        functions = {name: f for name, (f, _) in invariants.items()}
+        has_user_states = type(system).to_user_solution is System.to_user_solution and not system.sites
+        return cls(functions, {**functions, **system.ledger}, has_user_states)
 
 
 def build_solution(
@@ -34,7 +58,7 @@ def build_solution(
     step_sizes: Callable[[], np.ndarray],
     replay: StepReplay,
     laws: Laws,
-    invariants: Mapping[str, tuple[Energy, bool | None]],
+    functions: RecordedFunctions,
     **fields,
 ) -> Solution:
     """Return the solution in the user's form from the states x, shape (times, n), of a run.
@@ -45,22 +69,21 @@ def build_solution(
         Size of a step that the run took after each state.
     replay : StepReplay
     laws : Laws
-    invariants : dict
-        Recorded functions, and whether the system conserves each of them: see :func:`invariants_and_laws`.
+    functions : RecordedFunctions
     **fields
         Further fields of :class:`Solution`.
     """
-    functions = {name: f for name, (f, _) in invariants.items()}
-    recorded_functions = {**functions, **system.ledger}
     solution = Solution(
         x=x,
         entropy=None if system.entropy is None else entropy,
-        casimirs=defer(functools.partial(_series_of_functions, recorded_functions, x)),
+        casimirs=defer(functools.partial(_series_of_functions, functions.of_series, x)),
         laws=laws,
-        evidence_source=EvidenceCollector(system, method, functions, x, np.asarray(fields["t"]), step_sizes, replay),
+        evidence_source=EvidenceCollector(
+            system, method, functions.invariants, x, np.asarray(fields["t"]), step_sizes, replay
+        ),
         **fields,
     )
-    return system.to_user_solution(solution)
+    return solution if functions.has_user_states else system.to_user_solution(solution)
 
 
 def _series_of_functions(functions: Mapping[str, Energy], x: np.ndarray) -> dict[str, np.ndarray]:
