@@ -15,7 +15,7 @@ from ..systems import System
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.programs import jit_cached
 from .array_engine import LazyNewton
-from .compiled.adaptive_runs import CompiledAdaptiveRuns
+from .compiled.lanes import CompiledAdaptiveRuns
 from .compiled.parameters import ProgramStructure
 from .growth_rate import DENSE_JACOBIAN_DIM
 from .solver_options import DEFAULT_OPTIONS, EPS

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -219,3 +219,73 @@ def pad_noise_increments(noise) -> jax.Array | None:
     short_call_steps = MAX_SAVED_VALUES_PER_CALL // max(1, math.prod(members) * n_increments)
     n_missing = (1 << max(0, max(steps, short_call_steps) - 1).bit_length()) - steps
     return jnp.asarray(np.pad(noise, [(0, 0)] * (noise.ndim - 2) + [(0, n_missing), (0, 0)]))
+
+
+class ArrayBatch:
+    """Trajectories of a family in one vmapped program, with steps of given sizes.
+
+    Parameters
+    ----------
+    structure : ProgramStructure
+    parameters, axes : list
+        Parameters of the systems, and their axes for ``jax.vmap``.
+    method : OneStepMethod
+    x : array, shape (trajectories, n)
+    min_capacity : int
+        Smallest number of saves for which a program is compiled: few capacities, few programs.
+    """
+
+    def __init__(self, structure, parameters, axes, method: OneStepMethod, x: np.ndarray, min_capacity: int = 1):
+        self._arguments, self._min_capacity = (structure, parameters, axes, method), min_capacity
+        self._state = _initial_states_of_batch(*self._arguments, jnp.asarray(x))
+        self._lazy_newton, self._n_trajectories = LazyNewton(method), len(x)
+
+    def advance(self, h, n_saves: int, steps_per_save: int, noise=None) -> np.ndarray:
+        """Take ``n_saves * steps_per_save`` steps; return states, energies and entropies, shape (B, n_saves, n + 2).
+
+        The step sizes h are one number, or one for each trajectory.
+        """
+        capacity = 1 << (max(n_saves, self._min_capacity) - 1).bit_length()
+        step_sizes = jnp.asarray(np.broadcast_to(np.asarray(h, dtype=np.float64), (self._n_trajectories,)))
+        arguments = jnp.asarray(n_saves), jnp.asarray(steps_per_save), capacity, pad_noise_increments(noise)
+        self._state, saved_fields = self._lazy_newton.advance(
+            lambda state, *how: _advance_batch(*self._arguments, state, step_sizes, *arguments, *how),
+            self._state,
+            steps_per_save,
+        )
+        x, energy, entropy = (np.asarray(values)[:, :n_saves] for values in saved_fields[:3])
+        return np.concatenate([x, energy[..., None], entropy[..., None]], axis=-1)
+
+    def read(self, names: Sequence[str] = State._fields) -> dict[str, np.ndarray]:
+        """Return fields of the trajectories by name, by default of all fields."""
+        return {name: np.asarray(getattr(self._state, name)) for name in names}
+
+
+@jit_cached
+def _initial_states_of_batch(structure, parameters, axes, method, x) -> State:
+    def initial_state_of_one(p, x):
+        return initial_run_state_program(structure.rebuild(p), method, x)
+
+    return jax.vmap(initial_state_of_one, in_axes=(axes, 0))(parameters, x)
+
+
+@jit_cached
+def _advance_batch(
+    structure,
+    parameters,
+    axes,
+    method,
+    state,
+    h,
+    n_saves,
+    steps_per_save,
+    capacity: int,
+    noise,
+    newton: bool,
+    first_steps,
+):
+    def advance_one(p, state, h, noise, first_step):
+        arguments = h, n_saves, steps_per_save, capacity, DEFAULT_OPTIONS, noise, newton, first_step
+        return advance(structure.rebuild(p), method, state, *arguments)
+
+    return jax.vmap(advance_one, in_axes=(axes, 0, 0, 0, 0))(parameters, state, h, noise, first_steps)

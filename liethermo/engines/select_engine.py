@@ -17,7 +17,7 @@ from ..systems import System
 from ..tracing.scalarize import UnsupportedPrimitive
 from .adaptive_runs import AdaptiveRuns, ArrayAdaptiveRuns, resume_on_array_engine, start_adaptive_run
 from .array_engine import ArrayEngine, EngineTrajectory
-from .compiled.adaptive_runs import CompiledAdaptiveRuns
+from .compiled.lanes import CompiledAdaptiveRuns
 from .compiled.step_loop import CompiledEngine, CompiledTrajectory
 from .sparse.engine import SparseEngine
 from .status_codes import StatusCode
@@ -268,8 +268,11 @@ class Trajectory:
     def __init__(self, engine: EngineWithFallback, trajectory: CompiledTrajectory | EngineTrajectory):
         self._engine, self._trajectory = engine, trajectory
 
-    def advance(self, h: float, n_saves: int, steps_per_save: int) -> SavedStates:
-        """Take ``n_saves * steps_per_save`` steps of size h, fewer if one fails, and return the saved states."""
+    def advance(self, h: float, n_saves: int, steps_per_save: int, noise: None = None) -> SavedStates:
+        """Take ``n_saves * steps_per_save`` steps of size h, fewer if one fails, and return the saved states.
+
+        The engine has the noise itself.
+        """
         self._trajectory, saved_states = self._engine.advance_trajectory(self._trajectory, h, n_saves, steps_per_save)
         return saved_states
 

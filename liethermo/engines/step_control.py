@@ -3,7 +3,7 @@
 An adaptive run carries an :class:`AdaptiveState`. One attempt takes a step, estimates its error, and chooses the size
 of the next step. The run pauses when the host has to act: at a stop time, if the growth rate must be computed, and at a
 possible event. A step in which the event function changes its sign is repeated with shorter sizes, until it ends at
-the sign change: at a zero, which is an event, or at a jump (:meth:`.adaptive_runs.PauseHandler.confirm_events`).
+the sign change: at a zero, which is an event, or at a jump (:meth:`.lanes.PauseHandler.confirm_events`).
 """
 
 from __future__ import annotations

@@ -21,11 +21,11 @@ from ..results.events import Events
 from ..systems import System
 from ..tracing.scalarize import UnsupportedPrimitive
 from .adaptive import Adaptive, make_step_control
-from .batches import MAX_THREADS, ProgressCounter, replay_array, replay_compiled, run_fixed_array, run_fixed_compiled
+from .adaptive_ensemble import AdaptiveEnsembleRun
+from .ensemble_lanes import MAX_THREADS, FixedEnsembleRun, ProgressCounter, replay_steps
 from .events import EventSet, Until, collect_events
 from .member_groups import common_inertia, group_members_by_invariants, members_outside_domain
 from .noise import DEFAULT_NOISE_METHOD, Fluctuations, NoisePaths, check_noise
-from .paced import AdaptiveEnsembleRun
 from .preparation import (
     check_choice,
     initial_state,
@@ -265,13 +265,12 @@ class _EnsembleOptions(NamedTuple):
         def run_with_engine(engine: str, progress_counter: ProgressCounter) -> None:
             if is_interrupted:
                 return
-            if control is not None:
-                adaptive_run = AdaptiveEnsembleRun(family, method, control, record, progress_counter, events)
-                (adaptive_run.run_compiled if engine == "compiled" else adaptive_run.run_array)()
-            else:
-                (run_fixed_compiled if engine == "compiled" else run_fixed_array)(
-                    family, method, record, progress_counter, noise_paths
-                )
+            run = (
+                FixedEnsembleRun(family, method, record, progress_counter, noise_paths)
+                if control is None
+                else AdaptiveEnsembleRun(family, method, control, record, progress_counter, events)
+            )
+            (run.run_compiled if engine == "compiled" else run.run_array)()
 
         calls_python = events is not None and events.calls_python
         prefers_compiled = self.engine == "auto" and is_worth_compiling(member) and not calls_python
@@ -287,9 +286,8 @@ class _EnsembleOptions(NamedTuple):
         if engine_name == "array":
             run_with_engine(engine_name, ProgressCounter(report))
         record.set_unfinished_to_nan()
-        replay, max_replayed_steps = (
-            (replay_compiled, schedule.n_steps) if engine_name == "compiled" else (replay_array, MAX_REPLAYED_STEPS)
-        )
+        max_replayed_steps = schedule.n_steps if engine_name == "compiled" else MAX_REPLAYED_STEPS
+        replay = functools.partial(replay_steps, engine_name)
         n_equal_steps = 1 if tolerance is not None else min(schedule.segments[0].n_full_steps, max_replayed_steps)
         result = record.to_ensemble(
             reasons={},

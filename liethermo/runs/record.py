@@ -292,7 +292,7 @@ class EnsembleEvidenceCollector:
     Parameters
     ----------
     replay : function of (family, method, x, h, steps)
-        :func:`.batches.replay_compiled` or :func:`.batches.replay_array`.
+        :func:`.ensemble_lanes.replay_steps` on an engine.
     n_equal_steps : int
         Number of equal steps at the start of the run.
     """

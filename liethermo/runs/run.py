@@ -24,12 +24,13 @@ from ..results.solution import Solution, defer
 from ..results.status import Stats, Status
 from ..tracing.interpret import evaluate_at_points
 from .adaptive import Adaptive, make_step_control
+from .adaptive_run import MAX_STORED_VALUES, AcceptedSteps, advance_to_end
+from .driver import drive_fixed
 from .events import EventSet, collect_events
 from .noise import NoisePaths
 from .problem import Problem
-from .schedule import StepSchedule
+from .schedule import EngineCall, StepSchedule
 from .solution_builder import EngineReplay, build_solution, run_provenance
-from .stepwise import MAX_STORED_VALUES, AcceptedSteps, advance_to_end
 from .termination import (
     INTERRUPTING_ERRORS,
     adaptive_failure_status,
@@ -97,17 +98,19 @@ class Run:
         try:
             trajectory = self.engine.start(self.saved_states[0][0])
             self.saved_energies_entropies = [np.array([[trajectory.read("energy"), trajectory.read("entropy")]])]
-            n_steps = 0
-            for h, n_saves, steps_per_save, keep in self.schedule.engine_calls(
-                max_saves=self.engine.max_saves_per_call, save_all=self.all_states is not None
-            ):
-                saved_states = trajectory.advance(h, n_saves, steps_per_save)
-                self._save_states_of_call(saved_states, n_steps, steps_per_save, keep)
-                n_steps = int(trajectory.read("step"))
-                bar.update(self.schedule.time_after(n_steps))
+
+            def record_call(call: EngineCall, first_step: int, saved_states: SavedStates) -> bool:
+                self._save_states_of_call(saved_states, first_step, call.steps_per_save, call.keep)
+                bar.update(self.schedule.time_after(int(trajectory.read("step"))))
                 if trajectory.read("status") != StatusCode.COMPLETED:
-                    break
+                    return False
                 self._checkpoint(lambda: trajectory.state)
+                return True
+
+            calls = self.schedule.engine_calls(
+                max_saves=self.engine.max_saves_per_call, save_all=self.all_states is not None
+            )
+            drive_fixed(trajectory, calls, record_call)
         except INTERRUPTING_ERRORS as error:
             interruption = interruption_reason(error)
         if trajectory is None:

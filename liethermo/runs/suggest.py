@@ -18,8 +18,8 @@ from ..integrators import DEFAULT_METHOD, MetriplecticGauss, MetriplecticRungeKu
 from ..integrators.taylor import order_for_tolerance
 from ..systems import System
 from .adaptive import Adaptive, make_step_control
+from .adaptive_run import AcceptedSteps, RunOutcome, advance_to_end
 from .preparation import checked_initial_state, prepare_for_method
-from .stepwise import AcceptedSteps, RunOutcome, advance_to_end
 
 
 @with_library_settings

@@ -9,7 +9,6 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.engines.status_codes import STATUS_NAMES
-from liethermo.runs import batches
 
 BODY = lt.models.rigid_body()
 ENGINES = ("array", "compiled")
@@ -183,7 +182,7 @@ def test_interrupted(monkeypatch):
     def interrupt(*args):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(batches, "advance_vmapped", interrupt)
+    monkeypatch.setattr("liethermo.engines.array_engine._advance_batch", interrupt)
     ensemble = lt.ensemble(BODY, states(3), (0.0, 1.0), 0.1, engine="array")
     assert [STATUS_NAMES[code] for code in ensemble.status] == ["interrupted"] * 3
     assert not ensemble.steps.any()

@@ -223,13 +223,13 @@ def test_groups_are_few_and_in_order():
 
 
 def test_an_interruption_stops_all_groups(monkeypatch):
-    from liethermo.runs import ensemble as module
+    from liethermo.runs.ensemble_lanes import FixedEnsembleRun
 
-    def count_call(family, method, record, tally, paths=None):
-        calls.append(len(record.x0))
+    def count_call(run):
+        calls.append(len(run.record.x0))
 
     calls: list[int] = []
-    monkeypatch.setattr(module, "run_fixed_compiled", count_call)
+    monkeypatch.setattr(FixedEnsembleRun, "run_compiled", count_call)
     ensemble = lt.ensemble(body, START, SPAN, STEP, parameters={"a": A}, engine="compiled")
     assert calls == [1]
     assert ensemble.status.tolist() == [StatusCode.INTERRUPTED] * 3

@@ -121,5 +121,5 @@ def test_one_program_serves_all_calls(method, monkeypatch):
         for step, options in ((h, {}), (h, {"save_at": [0.33, 0.5]}), (lt.Adaptive(1e-5 * span), {})):
             lt.ensemble(body, np.tile(x0, (8, 1)), (0.0, span), step, method, engine="array", **options)
     names = {array_function.__name__ for array_function in traces}
-    assert {"advance", "advance_adaptive", "advance_vmapped", "_advance_batch_program"} <= names
+    assert {"advance", "advance_adaptive", "_advance_batch", "_advance_batch_program"} <= names
     assert not [array_function.__name__ for array_function, count in traces.items() if count > 1]

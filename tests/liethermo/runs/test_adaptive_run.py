@@ -14,7 +14,7 @@ from liethermo.engines import array_engine
 from liethermo.engines.compiled import step_loop as compiled
 from liethermo.engines.growth_rate import arnoldi_hessenberg
 from liethermo.engines.step_control import step_size_after_acceptance, step_size_after_rejection
-from liethermo.runs import stepwise
+from liethermo.runs import adaptive_run
 from liethermo.tracing.scalarize import UnsupportedPrimitive
 
 BODY = lt.models.rigid_body()
@@ -153,7 +153,7 @@ def test_attempts_together_are_attempts_one_by_one(monkeypatch):
         return lt.integrate(SYSTEM, START, (0.0, 20.0), step, method, engine="compiled")
 
     default_run = run()
-    monkeypatch.setattr(stepwise, "ATTEMPTS_PER_CALL", 1)
+    monkeypatch.setattr(adaptive_run, "ATTEMPTS_PER_CALL", 1)
     single = run()
     assert default_run.stats.steps > 100
     assert default_run.stats.rejected > 0

@@ -1,6 +1,8 @@
-"""Adaptive runs in the compiled engine."""
+"""Trajectories in the lanes of a compiled loop, with steps of given sizes or adaptive ones."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -9,8 +11,36 @@ from ..step import State
 from .step_loop import CompiledStepLoop
 
 
+class CompiledBatch:
+    """Trajectories in lanes with steps of given sizes, the counterpart of :class:`..array_engine.ArrayBatch`.
+
+    Parameters
+    ----------
+    step_loop : CompiledStepLoop
+    first_parameters : array, shape (p,)
+        Parameters of one trajectory: of its system and the method.
+    parameters : array, shape (p,) or (trajectories, p)
+    x : array, shape (trajectories, n)
+    """
+
+    def __init__(self, step_loop: CompiledStepLoop, first_parameters, parameters, x: np.ndarray):
+        self._loop, self._first_parameters, self._n_trajectories = step_loop, first_parameters, len(x)
+        self._blocks = step_loop.start_blocks(parameters, x)
+
+    def advance(self, h, n_saves: int, steps_per_save: int, noise=None) -> np.ndarray:
+        """Take ``n_saves * steps_per_save`` steps; return states, energies and entropies, shape (B, n_saves, n + 2)."""
+        sizes = np.resize(h, len(self._blocks) * self._loop.lanes) if np.ndim(h) else h
+        saved = self._loop.run(self._first_parameters, self._blocks, sizes, n_saves, steps_per_save, noise)
+        return np.asarray(saved)[: self._n_trajectories]
+
+    def read(self, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+        """Return copies of fields of the trajectories by name, by default of all fields."""
+        fields = self._loop.read_fields(self._blocks, names)
+        return {name: values[: self._n_trajectories].copy("K") for name, values in fields.items()}
+
+
 class CompiledAdaptiveRuns:
-    """Adaptive runs of trajectories in lanes, the counterpart of :class:`..adaptive_runs.ArrayAdaptiveRuns`.
+    """Adaptive runs of trajectories in lanes, the counterpart of :class:`..lanes.ArrayAdaptiveRuns`.
 
     Parameters
     ----------

@@ -7,7 +7,7 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.engines.status_codes import StatusCode
-from liethermo.runs import batches, paced
+from liethermo.runs import adaptive_ensemble, ensemble_lanes
 
 BODY = lt.models.rigid_body()
 METHOD = lt.MetriplecticRungeKutta(6)
@@ -93,9 +93,9 @@ def test_a_trajectory_does_not_depend_on_its_neighbours(engine, monkeypatch):
     assert default_run.ok.all()
     assert_same_ensembles(default_run, run(order), order)
     assert_same_ensembles(default_run, run(np.arange(5)), slice(5))
-    monkeypatch.setattr(batches, "THREAD_BATCH_SIZE", 8)
-    monkeypatch.setattr(paced, "ARRAY_BATCH_SIZE", 16)
-    monkeypatch.setattr(paced, "ATTEMPTS_PER_CALL_RANGE", (1, 3))
+    monkeypatch.setattr(ensemble_lanes, "THREAD_BATCH_SIZE", 8)
+    monkeypatch.setattr(adaptive_ensemble, "ARRAY_BATCH_SIZE", 16)
+    monkeypatch.setattr(adaptive_ensemble, "ATTEMPTS_PER_CALL_RANGE", (1, 3))
     assert_same_ensembles(default_run, run(np.arange(41)))
 
 

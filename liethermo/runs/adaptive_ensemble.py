@@ -1,0 +1,217 @@
+"""Ensembles with adaptive steps or events: each trajectory takes the steps that it would take alone."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+import numpy as np
+
+from ..engines.adaptive_runs import AdaptiveRuns, EventRules, PauseHandler, start_adaptive_runs
+from ..engines.compiled.lanes import CompiledAdaptiveRuns
+from ..engines.status_codes import StatusCode
+from ..engines.step import REPORTED_FIELDS
+from ..engines.step_control import StepControl
+from ..integrators import OneStepMethod
+from ..systems import System
+from .driver import drive_adaptive
+from .ensemble_lanes import (
+    ARRAY_BATCH_SIZE,
+    RECORDED_INITIAL_FIELDS,
+    LaneParameters,
+    ProgressCounter,
+    padded_member_indices,
+    run_in_threads,
+)
+from .events import EventSet
+from .record import EnsembleRecord
+from .system_family import Family
+
+ATTEMPTS_PER_CALL_RANGE = (16, 2048)
+"""Smallest and largest number of attempted steps per engine call; paused trajectories wait until the call ends."""
+
+TARGET_ATTEMPTS_PER_CALL = 2**15
+"""Target number of attempted steps per engine call, summed over trajectories and clipped to
+``ATTEMPTS_PER_CALL_RANGE``."""
+
+
+RUNNING_CODES = (StatusCode.COMPLETED, StatusCode.PAUSED_AT_STOP, StatusCode.PAUSED_FOR_GROWTH_RATE)
+"""Status codes of trajectories that go on."""
+
+
+class AdaptiveEnsembleRun:
+    """Run of an ensemble with adaptive steps or events.
+
+    Parameters
+    ----------
+    family : Family
+    method : OneStepMethod
+    control : StepControl
+    record : EnsembleRecord
+    progress_counter : ProgressCounter
+    events : EventSet, optional
+        The events whose functions the control has.
+    """
+
+    def __init__(
+        self,
+        family: Family,
+        method: OneStepMethod,
+        control: StepControl,
+        record: EnsembleRecord,
+        progress_counter: ProgressCounter,
+        events: EventSet | None = None,
+    ):
+        self.family, self.method, self.control, self.record, self.progress_counter = (
+            family,
+            method,
+            control,
+            record,
+            progress_counter,
+        )
+        self.events = events
+        self.interrupted = False
+        self.stop_times = record.schedule.stop_times
+
+    @property
+    def _start_stop_length(self) -> tuple[float, float, float]:
+        schedule = self.record.schedule
+        return schedule.start, float(self.stop_times[0]), schedule.end - schedule.start
+
+    def run_compiled(self) -> None:
+        """Run all trajectories in SIMD lanes over threads; finished ones free their lanes."""
+        lanes, n_members = LaneParameters(self.family, self.method, self.control), len(self.record.x0)
+
+        def work(members: slice, stop: threading.Event) -> None:
+            parameters = lanes.parameters(members, members.stop - members.start)
+            adaptive_runs = CompiledAdaptiveRuns(
+                lanes.step_loop,
+                lanes.first_lane_parameters,
+                parameters,
+                self.record.x0[members],
+                *self._start_stop_length,
+            )
+            self._advance_to_end(
+                adaptive_runs, np.arange(members.start, members.stop), adaptive_runs.keep_only, stop.is_set
+            )
+
+        run_in_threads(work, n_members)
+
+    def run_array(self) -> None:
+        """Run all trajectories on the array engine, one vmapped program per batch."""
+        n_members = len(self.record.x0)
+        for start in range(0, n_members, ARRAY_BATCH_SIZE):
+            members = padded_member_indices(start, min(start + ARRAY_BATCH_SIZE, n_members), self.record.x0.shape[1])
+            parameters, axes = self.family.vmap_arguments(members)
+            batch_arguments = self.family.form, parameters, axes, self.method, self.control
+            adaptive_runs = start_adaptive_runs(*batch_arguments, self.record.x0[members], *self._start_stop_length)
+            self._advance_to_end(adaptive_runs, members, None, lambda: self.interrupted)
+
+    def _advance_to_end(
+        self,
+        adaptive_runs: AdaptiveRuns,
+        members: np.ndarray,
+        keep_only: Callable | None,
+        is_stopped: Callable[[], bool],
+    ) -> None:
+        """Advance the trajectories with these member indices until all have ended, and fill the record.
+
+        Parameters
+        ----------
+        keep_only : function of indices, or None
+            Removes all other trajectories from the batch.
+        is_stopped : function
+            Returns True if the user has interrupted the run.
+        """
+        recorder = _BatchRecorder(self, adaptive_runs, members, keep_only, is_stopped)
+        try:
+            drive_adaptive(recorder.pause_handler, recorder)
+        except KeyboardInterrupt:
+            self.interrupted = True
+        recorder.record_interrupted()
+
+
+class _BatchRecorder:
+    """Recorder of the trajectories of an ensemble that advance together.
+
+    Parameters
+    ----------
+    run : AdaptiveEnsembleRun
+    adaptive_runs : AdaptiveRuns
+    members : array of int
+        Numbers of the trajectories in the ensemble.
+    keep_only, is_stopped
+        See :meth:`AdaptiveEnsembleRun._advance_to_end`.
+    """
+
+    def __init__(
+        self,
+        run: AdaptiveEnsembleRun,
+        adaptive_runs: AdaptiveRuns,
+        members: np.ndarray,
+        keep_only: Callable | None,
+        is_stopped: Callable[[], bool],
+    ):
+        self.run, self.runs, self.members = run, adaptive_runs, members
+        self.record, self.keep_only, self.is_stopped = run.record, keep_only, is_stopped
+        rules = EventRules() if run.events is None else run.events.rules
+        self.pause_handler = PauseHandler(
+            adaptive_runs, run.control, run.method, run.stop_times, self._system_of, rules
+        )
+        self.initial = {name: adaptive_runs.read(name).copy() for name in RECORDED_INITIAL_FIELDS}
+        self.record.record_initial(members, self.initial["x"], self.initial["energy"], self.initial["entropy"])
+        self.is_running = np.ones(len(members), dtype=bool)
+        self._is_first_attempt = True
+
+    def _system_of(self, i: int) -> System:
+        return self.run.family.member(int(self.members[i]))
+
+    def continues(self) -> bool:
+        return bool(self.is_running.any()) and not self.is_stopped()
+
+    def attempt(self) -> None:
+        if self._is_first_attempt:
+            schedule = self.record.schedule
+            first_steps = np.minimum(self.runs.read("next_step_size"), schedule.end - schedule.start)
+            self.record.quantities["first_step"][self.members] = first_steps
+            self._is_first_attempt = False
+        self.runs.advance(int(np.clip(TARGET_ATTEMPTS_PER_CALL // len(self.members), *ATTEMPTS_PER_CALL_RANGE)))
+
+    def record_pauses(self) -> None:
+        handler, runs = self.pause_handler, self.runs
+        if self.run.events is not None:
+            self.run.events.raise_error()
+            self.record.store_events(handler.occurrences, self.members)
+            handler.occurrences.clear()
+        indices = handler.paused_indices(StatusCode.PAUSED_AT_STOP)
+        if indices.size:
+            columns = [runs.read("x", indices), *(runs.read(n, indices)[:, None] for n in ("energy", "entropy"))]
+            self.record.store_states_at(self.members[indices], runs.read("t", indices), np.hstack(columns))
+
+    def record_ends(self) -> None:
+        status = self.runs.read("status")
+        indices = np.flatnonzero(self.is_running & ~np.isin(status, RUNNING_CODES))
+        if indices.size:
+            reached_end = status[indices] == StatusCode.REACHED_END
+            self._finish(indices, np.where(reached_end, StatusCode.COMPLETED, status[indices]))
+        self.is_running[indices] = False
+        self.run.progress_counter.add(np.unique(self.members[indices]).size)
+        if self.keep_only is not None and 2 * self.is_running.sum() <= len(self.members) and self.is_running.any():
+            running = np.flatnonzero(self.is_running)
+            self.keep_only(running)
+            self.pause_handler.keep_only(running)
+            self.members, self.is_running = self.members[running], self.is_running[running]
+            self.initial = {name: values[running] for name, values in self.initial.items()}
+
+    def record_interrupted(self) -> None:
+        """Record the trajectories that go on, as interrupted."""
+        indices = np.flatnonzero(self.is_running)
+        if indices.size:
+            self._finish(indices, np.full(indices.size, StatusCode.INTERRUPTED))
+
+    def _finish(self, indices: np.ndarray, status: np.ndarray) -> None:
+        runs, members = self.runs, self.members[indices]
+        initial = {name: values[indices] for name, values in self.initial.items()}
+        final = {name: runs.read(name, indices) for name in REPORTED_FIELDS}
+        self.record.finish_members(members, initial, final, status, runs.read("t", indices))
+        self.record.rejected[members] = runs.read("n_rejected", indices)
