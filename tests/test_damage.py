@@ -14,7 +14,7 @@ import liethermo as lt
 from liethermo.spec import read
 from liethermo.spec.study import build_study
 from liethermo.studies.store_results import audit_store, load_status, load_study
-from tests.liethermo.results.test_files import rewrite
+from tests.liethermo.results.test_netcdf import rewrite
 
 LIBRARY_ERRORS = (lt.LiethermoError, lt.FileError)
 """Errors by which a damaged file may be refused."""

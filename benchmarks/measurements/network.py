@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse
 
 import liethermo as lt
-from liethermo.models.heat_grid import grid_graph
+from liethermo.models.heat_grid import grid_adjacency_matrix
 
 from .. import child as process
 from .. import laws
@@ -112,4 +112,4 @@ def _make_graph(kind: str, nodes: int) -> scipy.sparse.csr_array:
         graph.eliminate_zeros()
         return graph
     axes = 2 if kind == "plane grid" else 3
-    return grid_graph((round(nodes ** (1 / axes)),) * axes)
+    return grid_adjacency_matrix((round(nodes ** (1 / axes)),) * axes)

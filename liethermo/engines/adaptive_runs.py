@@ -27,11 +27,11 @@ from .step_control import (
     StepControl,
     advance_adaptive,
     advance_adaptive_with,
-    growth_rate_at,
     initial_adaptive_state,
     initial_adaptive_state_program,
-    max_growth_per_step,
+    largest_growth_rate_by_arnoldi,
     max_growth_rates,
+    max_step_times_growth_rate,
 )
 
 
@@ -384,19 +384,24 @@ class PauseHandler:
             return
         without_rate = waiting[np.isnan(runs.read("growth_rate", waiting))]
         if without_rate.size:
-            self._update_growth_rates(without_rate)
+            self._update_growth_rates_and_step_sizes(without_rate)
         is_exhausted = runs.read("n_attempts", waiting) >= float(self.control.max_attempts)
         runs.write("status", waiting, np.where(is_exhausted, StatusCode.STEP_LIMIT, StatusCode.COMPLETED))
 
-    def _update_growth_rates(self, indices: np.ndarray) -> None:
+    def _update_growth_rates_and_step_sizes(self, indices: np.ndarray) -> None:
         probes, runs = self.adaptive_runs.read("jacobian_probe", indices), self.adaptive_runs
         if probes.shape[2] <= DENSE_JACOBIAN_DIM:
             rates = max_growth_rates(probes)
         else:
             x = runs.read("x", indices)
-            rates = np.array([growth_rate_at(self.system_of(int(i)), self.method, x[j]) for j, i in enumerate(indices)])
+            rates = np.array(
+                [
+                    largest_growth_rate_by_arnoldi(self.system_of(int(i)), self.method, x[j])
+                    for j, i in enumerate(indices)
+                ]
+            )
         max_steps = np.divide(
-            max_growth_per_step(self.method), rates, out=np.full(len(rates), np.inf), where=rates > 0.0
+            max_step_times_growth_rate(self.method), rates, out=np.full(len(rates), np.inf), where=rates > 0.0
         )
         runs.write("growth_rate", indices, rates)
         runs.write("next_step_size", indices, np.minimum(runs.read("next_step_size", indices), max_steps))

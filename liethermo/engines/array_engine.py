@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..integrators import OneStepMethod
-from ..integrators.fluctuating import set_noise_increments
+from ..integrators.fluctuating import with_noise_increments
 from ..systems import System
 from ..tracing.programs import jit_cached
 from .solver_options import DEFAULT_OPTIONS, SolverOptions
@@ -46,7 +46,7 @@ def advance(
     system, method, state, restore_order = reorder_components(system, method, state, options)
 
     def step(s: State) -> State:
-        driven_method = method if noise is None else set_noise_increments(method, noise[s.step - first_step])
+        driven_method = method if noise is None else with_noise_increments(method, noise[s.step - first_step])
         return take_step(system, driven_method, s, h, options, newton_fallback)
 
     def advance_to_save(index, carry: tuple[State, tuple]):

@@ -36,7 +36,7 @@ def implicit_solution(solve: Callable, residual: Callable, parameters: Any, gues
 _implicit_solution = Primitive("solution")
 
 
-def _evaluate(*arguments, solve: Callable, residual: Callable, structure, axes: tuple) -> jax.Array:
+def _run_solver(*arguments, solve: Callable, residual: Callable, structure, axes: tuple) -> jax.Array:
     """Run the solver; ``axes`` holds the argument axes of each enclosing ``vmap``, innermost first."""
     del residual
 
@@ -58,12 +58,12 @@ def _abstract_eval(*arguments, axes: tuple, **_):
     sizes = []
     for axes_of_level in reversed(axes):
         sizes.append(next(a.shape[axis] for a, axis in zip(arguments, axes_of_level, strict=True) if axis is not None))
-        arguments = tuple(_drop_axis(a, axis) for a, axis in zip(arguments, axes_of_level, strict=True))
+        arguments = tuple(_shape_without_axis(a, axis) for a, axis in zip(arguments, axes_of_level, strict=True))
         shape = arguments[-1].shape
     return jax.core.ShapedArray((*sizes, *shape), guess.dtype)
 
 
-def _drop_axis(a, axis: int | None):
+def _shape_without_axis(a, axis: int | None):
     """Return the shape of an argument inside ``vmap``."""
     if axis is None:
         return a
@@ -108,8 +108,8 @@ def _jvp_rule(primals, tangents, *, residual: Callable, structure, axes: tuple, 
     return k, _nest_vmaps(solution_tangent, levels)(k, *leaves, *active_tangents)
 
 
-_implicit_solution.def_impl(lambda *arguments, **rest: jax.jit(lambda *a: _evaluate(*a, **rest))(*arguments))
+_implicit_solution.def_impl(lambda *arguments, **rest: jax.jit(lambda *a: _run_solver(*a, **rest))(*arguments))
 _implicit_solution.def_abstract_eval(_abstract_eval)
 batching.primitive_batchers[_implicit_solution] = _batching_rule
 ad.primitive_jvps[_implicit_solution] = _jvp_rule
-mlir.register_lowering(_implicit_solution, mlir.lower_fun(_evaluate, multiple_results=False))
+mlir.register_lowering(_implicit_solution, mlir.lower_fun(_run_solver, multiple_results=False))

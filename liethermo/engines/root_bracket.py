@@ -90,7 +90,7 @@ def bracket_from_step(step_size, value_before, value_after) -> RootBracket:
     bracket = RootBracket(
         zero + step_size, 0.5 * one, zero, zero + value_before, one, zero + value_after, zero, zero + value_before
     )
-    return _select_bracket(value_after == 0.0, _last_trial_bracket(step_size, one), bracket)
+    return _select_bracket(value_after == 0.0, _bracket_for_final_trial(step_size, one), bracket)
 
 
 def narrow_bracket(bracket: RootBracket, value) -> tuple[RootBracket, jax.Array]:
@@ -103,27 +103,27 @@ def narrow_bracket(bracket: RootBracket, value) -> tuple[RootBracket, jax.Array]
     best_fraction = jnp.where((jnp.abs(value) < jnp.abs(f_opposite)) | (value == 0.0), t, opposite)
     width, tolerance = jnp.abs(opposite - t), 4.0 * EPS * jnp.abs(best_fraction) + 1e-300
     is_converged = (width <= tolerance) | (value == 0.0)
-    next_fraction = t + _next_trial_fraction(
+    next_fraction = t + _next_fraction_between_a_and_b(
         t, opposite, c, value, f_opposite, fc, 0.5 * tolerance / jnp.maximum(width, tolerance)
     ) * (opposite - t)
     new_bracket = RootBracket(bracket.step_size, next_fraction, t, value, opposite, f_opposite, c, fc)
     return _select_bracket(
-        is_converged, _last_trial_bracket(bracket.step_size, best_fraction), new_bracket
+        is_converged, _bracket_for_final_trial(bracket.step_size, best_fraction), new_bracket
     ), is_converged & (best_fraction == t)
 
 
-def _last_trial_bracket(step_size, fraction) -> RootBracket:
+def _bracket_for_final_trial(step_size, fraction) -> RootBracket:
     """Return a bracket that is evaluated once more, at ``fraction``, and then closed."""
     infinite, fraction = jnp.full((), jnp.inf), jnp.zeros(()) + fraction
     return RootBracket(jnp.zeros(()) + step_size, fraction, fraction, infinite, fraction, infinite, fraction, infinite)
 
 
-def _next_trial_fraction(a, b, c, fa, fb, fc, margin) -> jax.Array:
+def _next_fraction_between_a_and_b(a, b, c, fa, fb, fc, min_fraction) -> jax.Array:
     """Return the next trial fraction between a and b: by inverse quadratic interpolation, or halfway."""
     xi, phi = (a - b) / (c - b), (fa - fb) / (fc - fb)
     is_safe = (phi**2 < xi) & ((1.0 - phi) ** 2 < 1.0 - xi)
     t = fa / (fb - fa) * fc / (fb - fc) + (c - a) / (b - a) * fa / (fc - fa) * fb / (fc - fb)
-    return jnp.clip(jnp.where(is_safe & jnp.isfinite(t), t, 0.5), margin, 1.0 - margin)
+    return jnp.clip(jnp.where(is_safe & jnp.isfinite(t), t, 0.5), min_fraction, 1.0 - min_fraction)
 
 
 def _select_bracket(condition, if_true: RootBracket, if_false: RootBracket) -> RootBracket:

@@ -194,7 +194,7 @@ class EngineWithFallback:
 
         return self._call_with_fallback(start_on_engine)
 
-    def fall_back_adaptive(
+    def resume_adaptive_on_array_engine(
         self, error: UnsupportedPrimitive, control: StepControl, adaptive_runs: AdaptiveRuns
     ) -> ArrayAdaptiveRuns:
         """Continue an adaptive run on the array engine after the compiled engine raised UnsupportedPrimitive."""

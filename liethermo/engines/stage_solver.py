@@ -64,7 +64,7 @@ class IterationState(NamedTuple):
         infinite, zero_count = jnp.asarray(jnp.inf), jnp.zeros((), dtype=jnp.int64)
         return cls(k, infinite, infinite, zero_count, infinite, jnp.zeros(()), zero_count)
 
-    def next_state(self, k, options: SolverOptions) -> IterationState:
+    def after_update(self, k, options: SolverOptions) -> IterationState:
         update = options.norm_for_dim(k.shape[-1])(k - self.k)
         earlier_update = jnp.where(self.n_iterations > 1, self.previous_update, 0.0)
         n_stalled = jnp.where(update < options.stall_ratio * self.smallest_update, 0, self.n_stalled + 1)
@@ -107,7 +107,7 @@ def solve_fixed_point(equations: StageEquations, options: SolverOptions = DEFAUL
     """Solve the stage equations by fixed-point iteration, which is given up if it converges slowly."""
 
     def iterate(carry):
-        s = carry[0].next_state(equations.slopes(carry[0].k), options)
+        s = carry[0].after_update(equations.slopes(carry[0].k), options)
         return s, *s.has_converged_and_continues(equations.scale(s.k), options)
 
     initial_carry = IterationState.initial(equations.guess), jnp.asarray(False), jnp.asarray(True)
@@ -168,12 +168,14 @@ def solve_newton(
     def is_unsolved(s: IterationState, residual):
         return jnp.logical_not(is_solved) & ~s.is_at_plateau(scale(s.k), options, norm(residual), slope_rounding)
 
-    def damp_newton_step(k, step, residual_norm, plateau_update, is_damped):
-        """Return k minus the step, halved until the residual decreases (not at the plateau), and the residual."""
+    def damp_newton_step(k, step, residual_norm, smallest_step_norm, is_damped):
+        """Return k minus the (halved) step, the residual there, and whether the step is a full one."""
 
         def needs_halving(carry):
             factor, residual = carry
-            can_halve = is_damped & (factor > 0.5**options.max_newton_halvings) & (factor * norm(step) > plateau_update)
+            can_halve = (
+                is_damped & (factor > 0.5**options.max_newton_halvings) & (factor * norm(step) > smallest_step_norm)
+            )
             return (factor > 1.0) | (~(jnp.linalg.norm(residual) < residual_norm) & can_halve)
 
         def halve_step(carry):
@@ -199,7 +201,7 @@ def solve_newton(
                 options.plateau_rtol * scale(inner.k),
                 is_damped,
             )
-            inner = inner.next_state(k, options)
+            inner = inner.after_update(k, options)
             return inner, residual, jnp.where(is_full_step, inner.n_iterations - n_previous, options.max_jacobian_reuse)
 
         def can_reuse_jacobian(carry):
@@ -220,7 +222,7 @@ def solve_newton(
         s, residual, is_damped = carry
         return is_unsolved(s, residual) & ~(is_damped & has_failed(s, is_damped))
 
-    initial_k, initial_residual = best_initial_guess(evaluate_residual, guess)
+    initial_k, initial_residual = best_guess_and_residual(evaluate_residual, guess)
     s, residual, _ = jax.lax.while_loop(
         is_unfinished, newton_cycle, (IterationState.initial(initial_k), initial_residual, jnp.asarray(False))
     )
@@ -231,7 +233,7 @@ def solve_newton(
     )
 
 
-def best_initial_guess(residual_function: Callable, guess: jax.Array) -> tuple[jax.Array, jax.Array]:
+def best_guess_and_residual(residual_function: Callable, guess: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the guess, or zero slopes if their residual is smaller, and the residual there.
 
     Far from a solution Newton's method may wander.
@@ -274,7 +276,7 @@ batching.primitive_batchers[_inverse] = _inverse_batching_rule
 mlir.register_lowering(_inverse, mlir.lower_fun(jnp.linalg.inv, multiple_results=False))
 
 
-def explicit_slopes(
+def explicit_stage_solution(
     system: System, method: OneStepMethod, x, compensation, h, k, options: SolverOptions = DEFAULT_OPTIONS
 ) -> StageSolution:
     """Return the slopes of an explicit step; it has converged if its end satisfies the constraints."""
@@ -288,7 +290,7 @@ def explicit_slopes(
     return StageSolution(k, converged, jnp.isfinite(residual), residual, zero_count + 1, zero_count, jnp.zeros(()))
 
 
-def make_newton_solve(
+def make_newton_lineariser(
     system: System,
     method: OneStepMethod,
     x,

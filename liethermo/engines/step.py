@@ -19,8 +19,8 @@ from .solver_options import DEFAULT_OPTIONS, EPS, SolverOptions
 from .stage_solver import (
     StageEquations,
     StageSolution,
-    explicit_slopes,
-    make_newton_solve,
+    explicit_stage_solution,
+    make_newton_lineariser,
     slope_rounding_scale,
     solve_fixed_point,
     solve_stages,
@@ -48,7 +48,7 @@ class State(NamedTuple):
     smallest_energy: jax.Array
     least_entropy_increment: jax.Array
     largest_energy_increment: jax.Array
-    relaxation_integral: jax.Array  # time integral of relaxation_functional()
+    relaxation_integral: jax.Array  # time integral of energy_or_entropy_that_relaxes()
     first_energy: jax.Array
     energy_drift_correction: jax.Array  # shift of the next step's end along the energy gradient
     energy_sensitivity: jax.Array  # rounding scale of the energy, the largest over all steps
@@ -153,7 +153,7 @@ def take_step(
         state = state._replace(compensation=compensation_from_state(system, method, state.x, state.compensation))
     stage_inputs = state.x, state.compensation, h, state.k, state.previous_slopes
     if method.explicit:
-        solution = explicit_slopes(system, method, *stage_inputs[:4], options)
+        solution = explicit_stage_solution(system, method, *stage_inputs[:4], options)
     elif newton_fallback is None:
         solution = solve_stages(stage_equations(system, method, *stage_inputs, options), options)
     else:
@@ -182,7 +182,7 @@ def stage_equations(
         slopes=lambda k: method.slopes(system, x, compensation, h, k),
         guess=method.predict(k, previous_slopes),
         scale=lambda k: state_rate + norm(k) + options.tiny,
-        newton_solve_at=make_newton_solve(system, method, x, compensation, h, options, map_function),
+        newton_solve_at=make_newton_lineariser(system, method, x, compensation, h, options, map_function),
         slope_rounding=lambda: slope_rounding_scale(system, x, options),
     )
 
@@ -203,7 +203,7 @@ def finish_step(
     if not method.carries_compensation:  # the next step computes its own, as the first step of a run does
         new_compensation = system.clock_components(new_compensation)
     elif can_correct_energy_drift(system, method):  # by the error of the last step: no step waits for its own energy
-        new_compensation = apply_drift_correction(system, new_x, new_compensation, correction)
+        new_compensation = compensation_after_drift_correction(system, new_x, new_compensation, correction)
         correction = energy_drift_correction(system, new_x, new_compensation, energy, state.first_energy)
     is_taken = solution.converged & jnp.isfinite(end.finite_check)
     failure_code = jnp.where(
@@ -214,7 +214,8 @@ def finish_step(
     residual = h * solution.residual / jnp.where(residual_scale > options.tiny, residual_scale, 1.0)
     iterations = solution.fixed_point_iterations + solution.newton_iterations
     mean_functional = 0.5 * (
-        relaxation_functional(system, state.energy, state.entropy) + relaxation_functional(system, energy, entropy)
+        energy_or_entropy_that_relaxes(system, state.energy, state.entropy)
+        + energy_or_entropy_that_relaxes(system, energy, entropy)
     )
 
     new_state = State(
@@ -279,10 +280,10 @@ def energy_drift_correction(system: System, x, compensation, energy, first_energ
     above a few roundings of H itself is corrected, far below the rounding of the state. If H contains a large constant,
     discrete gradients leave out defects below the rounding of that constant: then up to one such rounding is corrected.
     """
-    return drift_correction(system, system.energy, x, compensation, energy, first_energy)
+    return drift_correction_multiplier(system, system.energy, x, compensation, energy, first_energy)
 
 
-def drift_correction(system: System, function: Energy, x, compensation, value, level) -> jax.Array:
+def drift_correction_multiplier(system: System, function: Energy, x, compensation, value, level) -> jax.Array:
     """Return the multiple of the gradient of a function that shifts x so that its value comes nearer to ``level``.
 
     The shift is at most ``eps |x| / 4``, and zero unless value and level differ by more than a few roundings.
@@ -297,14 +298,14 @@ def drift_correction(system: System, function: Energy, x, compensation, value, l
 
 
 LEVEL_SPACING_ULPS = 32.0
-"""Spacing of the levels of :func:`nearest_level`, in roundings of the function.
+"""Spacing of the levels of :func:`round_to_nearest_level`, in roundings of the function.
 
 A value that is off by half of the spacing may go to the next level. In 1e6 steps rounding does not accumulate so far,
-since :func:`drift_correction` removes it. With half of this spacing it does, and the energy drifts by 6e-14.
+since :func:`drift_correction_multiplier` removes it. With half of this spacing it does, and the energy drifts by 6e-14.
 """
 
 
-def nearest_level(value, sensitivity) -> jax.Array:
+def round_to_nearest_level(value, sensitivity) -> jax.Array:
     """Return the multiple of 16 to 32 roundings of a function with this sensitivity that is nearest to ``value``.
 
     A run that knows only its present state is held on these levels: a value near a level stays there.
@@ -323,13 +324,13 @@ def compensation_from_state(system: System, method: OneStepMethod, x, clock_comp
     functions = [C for name, C in system.functions().items() if name in method.invariant_names]
     for function in [*([system.energy] if can_correct_energy_drift(system, method) else []), *functions]:
         value, gradient = function.value(x), function.gradient(x)
-        level = nearest_level(value, jnp.maximum(jnp.abs(value), function.sensitivity(x)))
-        amount = drift_correction(system, function, x, compensation, value, level)
+        level = round_to_nearest_level(value, jnp.maximum(jnp.abs(value), function.sensitivity(x)))
+        amount = drift_correction_multiplier(system, function, x, compensation, value, level)
         compensation = compensation - amount * system.raise_index(x, gradient)
     return compensation
 
 
-def apply_drift_correction(system: System, x, compensation, amount) -> jax.Array:
+def compensation_after_drift_correction(system: System, x, compensation, amount) -> jax.Array:
     """Return the compensation of a state shifted by ``-amount`` along the gradient of the energy."""
     return compensation - amount * system.raise_index(x, system.energy.gradient(x))
 
@@ -346,6 +347,6 @@ def rounding_sensitivities(system: System, x) -> tuple[jax.Array, jax.Array]:
     return system.energy.sensitivity(x), entropy
 
 
-def relaxation_functional(system: System, energy, entropy):
+def energy_or_entropy_that_relaxes(system: System, energy, entropy):
     """Return the value whose approach to equilibrium is timed: the energy under a double bracket, else the entropy."""
     return energy if system.energy_law == "nonincreasing" else entropy

@@ -173,7 +173,7 @@ def initial_adaptive_state(
         jacobian_probe=jnp.full_like(probe, jnp.nan),
         root_bracket=jnp.zeros(root_bracket.search_shape(control.event_shape)),
     )
-    return limit_by_growth_rate(method, adaptive_state, probe) if control.adaptive else adaptive_state
+    return limit_next_step_by_growth_rate(method, adaptive_state, probe) if control.adaptive else adaptive_state
 
 
 def jacobian_probe_shape(system: System, method: OneStepMethod, control: StepControl) -> tuple[int, ...]:
@@ -330,7 +330,7 @@ def accept_or_reject(
     )
     if not control.adaptive:
         return new_adaptive_state
-    limited_state = limit_by_growth_rate(
+    limited_state = limit_next_step_by_growth_rate(
         method, new_adaptive_state, jacobian_probe(*system.solved_subsystem(new_state.x))
     )
     new_adaptive_state = jax.tree_util.tree_map(select_if_running, limited_state, new_adaptive_state)
@@ -512,7 +512,7 @@ def step_size_after_rejection(error, h, power) -> jax.Array:
 # -- growth rates -----------------------------------------------------------------------------------------------------
 
 
-def max_growth_per_step(method: OneStepMethod) -> float:
+def max_step_times_growth_rate(method: OneStepMethod) -> float:
     """Return the largest product of step size and growth rate at which growth is accurate to :data:`GROWTH_RATE_RTOL`.
 
     A step of a one-step method multiplies the solution of a linear equation of rate r by R(h r), instead of exp(h r).
@@ -524,13 +524,13 @@ def max_growth_per_step(method: OneStepMethod) -> float:
     return (GROWTH_RATE_RTOL * pade_constant) ** (0.5 / s)  # ln R(z) / z = 1 +- z^2s / pade_constant + ...
 
 
-def limit_by_growth_rate(method: OneStepMethod, adaptive_state: AdaptiveState, probe) -> AdaptiveState:
+def limit_next_step_by_growth_rate(method: OneStepMethod, adaptive_state: AdaptiveState, probe) -> AdaptiveState:
     """Return the adaptive state with its next step limited by the growth rate; pause if that rate is unknown.
 
     ``probe`` is the Jacobian probe at the state: see :func:`.growth_rate.jacobian_probe`.
     """
     is_short = ~(
-        (max_growth_per_step(method) < spectral_radius_bound(probe) * adaptive_state.next_step_size)
+        (max_step_times_growth_rate(method) < spectral_radius_bound(probe) * adaptive_state.next_step_size)
         & jnp.isfinite(spectral_radius_bound(probe))
     )
     is_unchanged = frobenius_norm(probe - adaptive_state.jacobian_probe) <= JACOBIAN_CHANGE_RTOL * frobenius_norm(
@@ -538,7 +538,8 @@ def limit_by_growth_rate(method: OneStepMethod, adaptive_state: AdaptiveState, p
     )
     limit = jnp.where(
         adaptive_state.growth_rate > 0.0,
-        max_growth_per_step(method) / jnp.where(adaptive_state.growth_rate > 0.0, adaptive_state.growth_rate, 1.0),
+        max_step_times_growth_rate(method)
+        / jnp.where(adaptive_state.growth_rate > 0.0, adaptive_state.growth_rate, 1.0),
         jnp.inf,
     )
     needs_rate = ~is_short & ~is_unchanged
@@ -576,7 +577,7 @@ def max_growth_rates(matrices: np.ndarray) -> np.ndarray:
     return np.where(rates.real > MIN_GROWTH_TO_FREQUENCY * np.abs(rates), np.abs(rates), 0.0).max(axis=-1, initial=0.0)
 
 
-def growth_rate_at(system: System, method: OneStepMethod, x) -> float:
+def largest_growth_rate_by_arnoldi(system: System, method: OneStepMethod, x) -> float:
     """Return the largest growth rate at x by Arnoldi's method, for more than DENSE_JACOBIAN_DIM components."""
     return float(max_growth_rates(np.asarray(arnoldi_hessenberg(system, method, jnp.asarray(x)))))
 
@@ -617,12 +618,12 @@ def advance_adaptive(
 
     def attempt_once(carry):
         adaptive_state, n_attempts = carry
-        next_state = attempt_step(system, method, control, adaptive_state, options, newton_fallback)
+        after_update = attempt_step(system, method, control, adaptive_state, options, newton_fallback)
         if not newton:
-            is_solved = next_state.last_attempt_status == StatusCode.COMPLETED
-            unsolved_state = adaptive_state._replace(last_attempt_status=next_state.last_attempt_status)
-            next_state = jax.tree_util.tree_map(lambda a, b: jnp.where(is_solved, a, b), next_state, unsolved_state)
-        return next_state, n_attempts + 1
+            is_solved = after_update.last_attempt_status == StatusCode.COMPLETED
+            unsolved_state = adaptive_state._replace(last_attempt_status=after_update.last_attempt_status)
+            after_update = jax.tree_util.tree_map(lambda a, b: jnp.where(is_solved, a, b), after_update, unsolved_state)
+        return after_update, n_attempts + 1
 
     return jax.lax.while_loop(continues, attempt_once, (adaptive_state, jnp.zeros((), dtype=jnp.int64)))[0]
 

@@ -294,13 +294,13 @@ def has_error_estimate(method) -> bool:
     return overrides_error and (not isinstance(method, MethodWrapper) or has_error_estimate(method.method))
 
 
-def pullback_method(method: OneStepMethod, local) -> OneStepMethod:
-    """Return the method with its own functions pulled back to the coordinates of ``local``, a chart or a reordering."""
+def pullback_method(method: OneStepMethod, local_system) -> OneStepMethod:
+    """Return the method with its own functions pulled back to a chart or a reordering."""
 
-    def pullback_part(part):
-        return local.pullback(part) if isinstance(part, Energy) else part
+    def pullback_if_energy(node):
+        return local_system.pullback(node) if isinstance(node, Energy) else node
 
-    return jax.tree_util.tree_map(pullback_part, method, is_leaf=lambda part: isinstance(part, Energy))
+    return jax.tree_util.tree_map(pullback_if_energy, method, is_leaf=lambda part: isinstance(part, Energy))
 
 
 def checked_stages(stages) -> int:
@@ -310,9 +310,9 @@ def checked_stages(stages) -> int:
     return stages
 
 
-def kind_name(system) -> str:
+def kind_or_class_name(value) -> str:
     """Return the kind of a system, or the class name of any other object."""
-    return system.kind if isinstance(system, System) else type(system).__name__
+    return value.kind if isinstance(value, System) else type(value).__name__
 
 
 def checked_step_size(h) -> jax.Array:
@@ -336,16 +336,16 @@ SLOPE_ROUNDING_FACTOR = 30.0
 """Rounding errors, in units of the rounding of the field, by which solved slopes may differ from the field."""
 
 
-def generator_residual_jvp(system: System, stages_of_slopes: Callable, k) -> Callable:
-    """Return :meth:`OneStepMethod.residual_jvp` for the field in its form without the entropy, at the given stages.
+def generator_residual_jvp(system: System, slopes_to_stage_states: Callable, k) -> Callable:
+    """Return :meth:`OneStepMethod.residual_jvp` for the field without the entropy, at the stages of the slopes.
 
     The slopes differ from that field only by the corrections of their gradients, which are of the order of the method.
     Its derivative contains no eigenvectors.
     """
-    return jax.linearize(lambda k: jax.vmap(system.generator_field)(stages_of_slopes(k)) - k, k)[1]
+    return jax.linearize(lambda k: jax.vmap(system.generator_field)(slopes_to_stage_states(k)) - k, k)[1]
 
 
-def collocation_error(system: System, x, compensation, h, k) -> jax.Array:
+def collocation_error_estimate(system: System, x, compensation, h, k) -> jax.Array:
     """Estimate the local error, O(h^{2s+1}), of collocation at s Gauss nodes from the residual of its polynomial u.
 
     The residual ``f(x) - u'(0)`` at the start is O(h^s) relative to the speed [Hairer & Wanner 1996, IV.8]. The method
@@ -369,7 +369,7 @@ def register(*methods: OneStepMethod) -> None:
 
 
 def registered_methods(special: bool = False) -> Iterator[OneStepMethod]:
-    """Yield the registered instances.
+    """Yield the registered one-step methods, one instance for each variant that the test suite runs.
 
     Parameters
     ----------

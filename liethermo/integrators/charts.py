@@ -14,7 +14,7 @@ import manifolds as mf
 from ..errors import InputError
 from ..functions.gradients import EPS
 from ..systems import ChartSystem, System
-from .base import MethodWrapper, OneStepMethod, collocation_error, pullback_method
+from .base import MethodWrapper, OneStepMethod, collocation_error_estimate, pullback_method
 
 
 class InCharts(MethodWrapper):
@@ -70,9 +70,9 @@ class InCharts(MethodWrapper):
         """
         scales, residual = system.component_scales(k), self.slopes(system, x, compensation, h, k) - k
 
-        def difference_quotient(d):
-            step_size = EPS**0.5 / jnp.max(jnp.abs(d) / scales)
-            k_shifted = k + step_size * d
+        def difference_quotient(direction):
+            step_size = EPS**0.5 / jnp.max(jnp.abs(direction) / scales)
+            k_shifted = k + step_size * direction
             return (self.slopes(system, x, compensation, h, k_shifted) - k_shifted - residual) / step_size
 
         return difference_quotient
@@ -81,7 +81,7 @@ class InCharts(MethodWrapper):
         return (
             self.method.error(system, x, compensation, h, k)
             if self.explicit
-            else collocation_error(system, x, compensation, h, k)
+            else collocation_error_estimate(system, x, compensation, h, k)
         )
 
     def why_step_failed(self, system: System, x, k, h) -> str:
@@ -101,7 +101,7 @@ class InCharts(MethodWrapper):
         return self.retraction._reach(point, self.retraction.space._project_tangent(point, system.points(v)))
 
     def _chart_step(self, system: System, x, compensation, h, k) -> _ChartStep:
-        """Return the step in coordinates around z."""
+        """Return the step in coordinates around its base point: local system, method, start, slopes and map back."""
         chart, space, start, x = self.retraction.chart, self.retraction.space, x, system.points(x)
         vectors = space.from_vector(k)
         coordinates_x = mf.coordinates_around(chart, x)
@@ -127,11 +127,11 @@ class InCharts(MethodWrapper):
         half_at_z = chart._carry(x, half, half)
         coordinates_z = mf.coordinates_around(chart, z)
 
-        def components_at_z(c):
-            return coordinates_z.components(chart._carry(x, half, coordinates_x.vector(c)))
+        def components_at_z(components_at_x):
+            return coordinates_z.components(chart._carry(x, half, coordinates_x.vector(components_at_x)))
 
-        def push_forward_from_z(c):
-            return space.to_vector(chart._carry(z, -half_at_z, coordinates_z.vector(c)))
+        def push_forward_from_z(slope_components):
+            return space.to_vector(chart._carry(z, -half_at_z, coordinates_z.vector(slope_components)))
 
         local = ChartSystem(system, coordinates_z, coordinates_z.centre() if self.stages == 1 else None, start)
         k_chart = jax.vmap(components_at_z)(k_chart)
@@ -166,7 +166,7 @@ class _ChartStep(NamedTuple):
 
 
 def wrap_in_charts(
-    method: OneStepMethod, system: System, retraction: str | mf.Retraction | None, default: str
+    method: OneStepMethod, system: System, retraction: str | mf.Retraction | None, default_retraction_name: str
 ) -> OneStepMethod:
     """Return the method as it runs on the system: itself on R^n, wrapped in charts on a manifold.
 
@@ -182,7 +182,7 @@ def wrap_in_charts(
             raise InputError("retraction= needs a system on a manifold, and this one is on R^n. Leave retraction= out")
         return method
     if retraction is None:
-        retraction = default if system.space.has_geodesics else "projection"
+        retraction = default_retraction_name if system.space.has_geodesics else "projection"
     return InCharts(method, resolve_retraction(system.space, retraction))
 
 

@@ -179,7 +179,7 @@ class ExplicitMethod(TransportingMethod):
         return system.has_all_casimirs and casimirs_are_held and orbit_dim - len(casimirs) <= 2
 
     def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
-        method_on_states = self._map_functions(
+        method_on_states = self._with_transformed_functions(
             lambda C: function_on_states(system, C), tuple(sorted(system.first_integrals()))
         )
         method = wrap_in_charts(method_on_states, system, self.retraction, "exp")
@@ -192,7 +192,7 @@ class ExplicitMethod(TransportingMethod):
     def requested_invariants(self, system: System) -> tuple[Energy, ...]:
         return tuple(function_on_states(system, C) for C in self.functions)
 
-    def _map_functions(self, transform: Callable, held_names: tuple[str, ...]) -> Self:
+    def _with_transformed_functions(self, transform: Callable, held_names: tuple[str, ...]) -> Self:
         """Return the method with transformed preserved functions, holding the system's functions of these names."""
         return type(self)(self.number, tuple(map(transform, self.functions)), self.retraction, held_names)
 
@@ -205,7 +205,7 @@ class ExplicitMethod(TransportingMethod):
         check_preserved(system, self.functions)
 
     def start(self, system: System, x) -> jax.Array:
-        laws = self._laws(system, self._can_follow_leaf(system))
+        laws = self._laws(system, self._can_follow_symplectic_leaf(system))
         levels = jnp.stack([law.function.value(x) for law in laws])[: _max_stored_levels(system)]
         levels = jnp.concatenate([levels, jnp.zeros(x.shape[0] - levels.shape[0])])
         return (
@@ -221,7 +221,7 @@ class ExplicitMethod(TransportingMethod):
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
         """Return the rows of :class:`StepRow`; of the k passed in, only the initial levels are used."""
         leaf, n, skip_law_rates = (
-            self._can_follow_leaf(system),
+            self._can_follow_symplectic_leaf(system),
             x.shape[0],
             system.has_generator or system.dissipation is None,
         )
@@ -241,11 +241,11 @@ class ExplicitMethod(TransportingMethod):
         if leaf:
             d, error, interpolation_rows = d[n:], error[:n], interpolation_rows[:, :n]
         if not isinstance(system, ChartSystem):  # in charts the initial levels are new at every step
-            changes = changes + self._drift_correction(
+            changes = changes + self._drift_correction_changes(
                 system, laws, start_gradients, x, compensation, k[StepRow.INITIAL_LEVELS], leaf
             )
 
-        def project_onto(laws: list[Law]) -> tuple[jax.Array, jax.Array]:
+        def displacement_on_levels_and_residual(laws: list[Law]) -> tuple[jax.Array, jax.Array]:
             selection = slice(len(laws))
             return project_onto_levels(
                 system,
@@ -260,15 +260,15 @@ class ExplicitMethod(TransportingMethod):
             )
 
         d, residual = (
-            self._project_conserved_first(laws, x, compensation, project_onto)
+            self._project_conserved_first(laws, x, compensation, displacement_on_levels_and_residual)
             if system.has_generator
-            else project_onto(laws)
+            else displacement_on_levels_and_residual(laws)
         )
         return jnp.stack(
             [d / h, error, jnp.broadcast_to(residual / h, x.shape), k[StepRow.INITIAL_LEVELS], *interpolation_rows]
         )
 
-    def _drift_correction(
+    def _drift_correction_changes(
         self, system: System, laws: list[Law], gradients: list, x, compensation, levels, leaf: bool
     ) -> jax.Array:
         """Return the changes of the conserved functions, shape (laws,), back to the levels at the start of the run.
@@ -296,20 +296,20 @@ class ExplicitMethod(TransportingMethod):
             ]
         )
 
-        def is_small_displacement(v) -> jax.Array:
-            displacement = correction_displacement(system, x, v, leaf)
+        def gives_small_displacement(correction) -> jax.Array:
+            displacement = correction_displacement(system, x, correction, leaf)
             is_small = [
                 jnp.linalg.norm(displacement[b]) <= MAX_CORRECTION_DISPLACEMENT * jnp.linalg.norm(x[b])
                 for b in system.state_blocks
             ]
             return jnp.stack(is_small).all()
 
-        def limited_changes() -> jax.Array:
+        def achievable_changes() -> jax.Array:
             directions = correction_directions(system, x, gradients, leaf)
-            correction = level_correction(system, directions, drifts, is_small_displacement)
+            correction = level_correction(system, directions, drifts, gives_small_displacement)
             return jnp.stack([jnp.dot(v, correction) for v in directions])
 
-        return jax.lax.stop_gradient(jax.lax.cond((drifts != 0.0).any(), limited_changes, lambda: drifts))
+        return jax.lax.stop_gradient(jax.lax.cond((drifts != 0.0).any(), achievable_changes, lambda: drifts))
 
     def _project_conserved_first(
         self, laws: list[Law], x, compensation, project: Callable
@@ -330,7 +330,7 @@ class ExplicitMethod(TransportingMethod):
         return jax.lax.cond(has_right_sign.all(), lambda: projection, lambda: project(laws))
 
     def field_and_law_rates(self, system: System, laws: list[Law], x) -> tuple[jax.Array, jax.Array]:
-        """Return the field at a stage, shape (n,), and the rates of the laws' functions, with the sign of each law.
+        """Return the field at a stage, shape (n,), and the rate of each law's function, without any wrong sign.
 
         If the field has a form without the entropy, the rates are not needed and zero.
         """
@@ -344,7 +344,7 @@ class ExplicitMethod(TransportingMethod):
         dL = tuple(L.gradient(x) for L in system.preserved)
         terms = list(terms_with_preserved_values(system.dissipation, dL))
 
-        def dissipation_rate(law: Law) -> jax.Array:
+        def rate_by_dissipation(law: Law) -> jax.Array:
             """Return the rate by dissipation alone: near rest the motion would add rounding noise."""
             if law.sign == 0.0:
                 return jnp.zeros(())
@@ -352,9 +352,9 @@ class ExplicitMethod(TransportingMethod):
             rate = sum(term.rate_of_change(system, x, dH, dS, dL_term, gradient) for term, dL_term in terms)
             return law.sign * jnp.maximum(law.sign * rate, 0.0)
 
-        return system.field(x, dH, dS, dL), jnp.stack([dissipation_rate(law) for law in laws])
+        return system.field(x, dH, dS, dL), jnp.stack([rate_by_dissipation(law) for law in laws])
 
-    def _can_follow_leaf(self, system: System) -> bool:
+    def _can_follow_symplectic_leaf(self, system: System) -> bool:
         """Return True if a step can follow the symplectic leaf, on which all Casimirs are constant.
 
         This requires a structure that knows its leaves, and a Casimir that is not quadratic: the gradients of such

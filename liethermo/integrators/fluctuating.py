@@ -139,12 +139,12 @@ class StochasticMidpoint(MethodWrapper, TransportingMethod):
         return jnp.zeros_like(k)
 
     def preserves_function(self, system: System, name: str) -> bool:
-        return self.method.preserves_function(system, name) and noise_invariance(system)[name]
+        return self.method.preserves_function(system, name) and noise_invariance_by_name(system)[name]
 
     def check(self, system: System) -> None:
         """Raise InputError if the dissipation has no noise that belongs to it."""
         self.method.check(system)
-        residual = np.nanmax(_sampled_noise_tests(system)[0], initial=0.0)
+        residual = np.nanmax(_noise_residuals_and_changes_at_samples(system)[0], initial=0.0)
         if not residual <= FACTOR_RTOL:
             raise InputError(
                 f"B B^T does not equal the friction matrix K: B B^T dS differs from K dS by a relative error of "
@@ -156,7 +156,7 @@ class StochasticMidpoint(MethodWrapper, TransportingMethod):
 
 
 def _noise_amplitude(B: Factor, thermal_energy, h) -> jax.Array:
-    """Return ``sqrt(2 k)`` (with k T for k), enlarged where the noise rotates spins, shape () or (columns,).
+    """Return the factor of the noise increments, ``sqrt(2 k)`` or ``sqrt(2 k T)``, enlarged where they rotate spins.
 
     A midpoint step with the angles w rotates a spin by ``2 atan(|w| / 2)``, less than |w|, and its friction is smaller
     too. In a weak field the spin then has the temperature of exact noise of variance ``s (1 - s / 4 + 3 s^2 / 8 -
@@ -170,10 +170,10 @@ def _noise_amplitude(B: Factor, thermal_energy, h) -> jax.Array:
     return jnp.repeat(amplitude, 3) if amplitude.ndim else amplitude
 
 
-def add_noise(
+def stochastic_method(
     system: System, method: OneStepMethod, boltzmann, temperature, log_density: Energy | None
 ) -> StochasticMidpoint:
-    """Return the method for the system with its fluctuations.
+    """Return the stochastic midpoint method that adds the fluctuations of the system to the steps of ``method``.
 
     Raises
     ------
@@ -221,7 +221,7 @@ def noise_dimension(method: OneStepMethod) -> int:
     )
 
 
-def set_noise_increments(method: OneStepMethod, dW) -> OneStepMethod:
+def with_noise_increments(method: OneStepMethod, dW) -> OneStepMethod:
     """Return the method for one step with the increments dW, shape (noise_dimension,)."""
 
     def with_increments(node):
@@ -230,25 +230,27 @@ def set_noise_increments(method: OneStepMethod, dW) -> OneStepMethod:
     return jax.tree_util.tree_map(with_increments, method, is_leaf=_is_stochastic)
 
 
-def _is_stochastic(part) -> bool:
-    return isinstance(part, StochasticMidpoint)
+def _is_stochastic(node) -> bool:
+    return isinstance(node, StochasticMidpoint)
 
 
-def noise_invariance(system: System) -> dict[str, bool]:
+def noise_invariance_by_name(system: System) -> dict[str, bool]:
     """Return, for each function of a system, True if noise leaves it constant: ``B^T grad f = 0`` at random points."""
     is_invariant = {}
-    for name, (change, scale) in _sampled_noise_tests(system)[1].items():
+    for name, (change, scale) in _noise_residuals_and_changes_at_samples(system)[1].items():
         is_finite = np.isfinite(change)
         is_invariant[name] = bool(is_finite.any() and (change[is_finite] <= FACTOR_RTOL * scale[is_finite]).all())
     return is_invariant
 
 
 @memoize
-def _sampled_noise_tests(system: System) -> tuple[np.ndarray, dict[str, tuple[np.ndarray, np.ndarray]]]:
-    return evaluate_at_points(_noise_tests, system, system.samples(4))
+def _noise_residuals_and_changes_at_samples(
+    system: System,
+) -> tuple[np.ndarray, dict[str, tuple[np.ndarray, np.ndarray]]]:
+    return evaluate_at_points(_noise_residuals_and_changes, system, system.samples(4))
 
 
-def _noise_tests(system: System, x):
+def _noise_residuals_and_changes(system: System, x):
     """Return the residual of ``B B^T = K``, and for each function the pair (change by noise, scale of that change)."""
     assert system.dissipation is not None
     B = concatenate_factors([B for _, B in terms_with_factors_at_state(system.dissipation, system, x)])

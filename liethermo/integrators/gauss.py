@@ -30,7 +30,7 @@ from .base import (
     TransportingMethod,
     apply_increment,
     checked_stages,
-    collocation_error,
+    collocation_error_estimate,
     generator_residual_jvp,
     register,
 )
@@ -124,18 +124,18 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         self.moving = moving
 
     def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
-        held_names = tuple(sorted(name for name in system.first_integrals() if self._is_held(system, name)))
-        method = self._map_functions(lambda C: function_on_states(system, C), held_names)
+        held_names = tuple(sorted(name for name in system.first_integrals() if self._is_held_by_default(system, name)))
+        method = self._with_transformed_functions(lambda C: function_on_states(system, C), held_names)
         if self.functions and not is_traced((system, method)):
             residuals = evaluate_at_points(casimir_residuals, (system, method.functions), system.samples(4))
             momentum_maps = tuple(int(i) for i in np.flatnonzero(is_momentum_map(residuals)))
-            method = method._map_functions(lambda C: C, held_names, momentum_maps)
+            method = method._with_transformed_functions(lambda C: C, held_names, momentum_maps)
         return wrap_in_charts(method, system, self.retraction, "exp")
 
     def requested_invariants(self, system: System) -> tuple[Energy, ...]:
         return tuple(function_on_states(system, C) for C in self.functions)
 
-    def _map_functions(
+    def _with_transformed_functions(
         self, transform: Callable, held_names: tuple[str, ...], momentum_maps: tuple[int, ...] | None = None
     ):
         """Return a copy with ``transform`` applied to its preserved functions.
@@ -164,20 +164,20 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
     # -- the stage equations ------------------------------------------------------------------------------------------
 
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
-        leaf_slopes = self._leaf_slopes(system, x, compensation, h, k)
+        leaf_slopes = self._symplectic_leaf_slopes(system, x, compensation, h, k)
         if leaf_slopes is not None:
             return leaf_slopes
         return jax.vmap(lambda *stage: self._stage_slope(system, *stage))(
-            *self._stage_gradients(system, x, compensation, h, k)
+            *self._stages_and_gradients(system, x, compensation, h, k)
         )
 
-    def _leaf_slopes(self, system: System, x, compensation, h, k) -> jax.Array | None:
+    def _symplectic_leaf_slopes(self, system: System, x, compensation, h, k) -> jax.Array | None:
         """Return the slopes along the symplectic leaf through x, shape (s, n), or None if the structure knows no leaf.
 
         This is for motions without dissipation whose held functions are all Casimirs.
         """
         functions = self._held_functions(system) | _entropy_arguments(system)
-        casimirs = functions.keys() <= {ENTROPY_KEY, *self._held_casimir_names(system)}
+        casimirs = functions.keys() <= {ENTROPY_KEY, *self._casimir_names(system)}
         if system.dissipation is not None or not casimirs or all(C.is_quadratic for C in functions.values()):
             return None
         dH = self._energy_gradients(system, self._stage_states(x, compensation, h, k), x, compensation, h, k)
@@ -190,9 +190,9 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         def velocity(u, dH, dS, gradients_by_name):
             return system.transport(u, dH, dS, tuple(gradients_by_name[name].discrete for name in names))
 
-        return jax.vmap(velocity)(*self._stage_gradients(system, x, compensation, h, k))
+        return jax.vmap(velocity)(*self._stages_and_gradients(system, x, compensation, h, k))
 
-    def _stage_gradients(self, system: System, x, compensation, h, k) -> tuple:
+    def _stages_and_gradients(self, system: System, x, compensation, h, k) -> tuple:
         """Return the stages, shape (s, n), the step's gradients dH and dS there, and the other gradients by name."""
         A, b, _ = gauss_tableau(self.number)
         u = self._stage_states(x, compensation, h, k)
@@ -246,7 +246,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         if all(C.is_quadratic for C in functions.values()):
             return system.poisson.sharp(u, dH)
         gradients = [gradients_by_name[name] for name in functions]
-        if functions.keys() <= {ENTROPY_KEY, *self._held_casimir_names(system)}:
+        if functions.keys() <= {ENTROPY_KEY, *self._casimir_names(system)}:
             project_off = _gradient_projector(system, u, gradients, n_components=system.body_dim)
             return project_off(system.poisson.sharp(u, project_off(dH)))
         energy = StageGradients(dH, system.energy.gradient(u))
@@ -271,7 +271,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         """
         dL, functions = (
             tuple(gradients_by_name[key].discrete for key, _ in preserved_keys),
-            self._functions_to_project(term, {name for _, name in preserved_keys}, system),
+            self._functions_to_project_off(term, {name for _, name in preserved_keys}, system),
         )
         if not functions:
             return term.force(system, u, dH, dS, dL)
@@ -286,13 +286,15 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         project_off = _gradient_projector(system, u, gradients)
         return project_off(term.force(system, u, dH, project_off(dS), dL))
 
-    def _functions_to_project(self, term: Dissipation, preserved_names: set[str], system: System) -> dict[str, Energy]:
+    def _functions_to_project_off(
+        self, term: Dissipation, preserved_names: set[str], system: System
+    ) -> dict[str, Energy]:
         """Return the functions, by name, that a dissipation has to keep; empty if it keeps all by construction."""
         functions = self._held_functions(system) | (
             _entropy_arguments(system) if term.energy_law == "nonincreasing" else {}
         )
         gradients_are_exact = system.energy.is_quadratic and (system.entropy is None or system.entropy.is_quadratic)
-        casimirs = {ENTROPY_KEY, *self._held_casimir_names(system)} if term.preserves_casimirs else set()
+        casimirs = {ENTROPY_KEY, *self._casimir_names(system)} if term.preserves_casimirs else set()
 
         def is_kept_by_construction(name: str, C: Energy) -> bool:
             return name in preserved_names or (C.is_quadratic and (gradients_are_exact or name in casimirs))
@@ -304,21 +306,23 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         )
 
     def can_transport_attitude(self, system: System) -> bool:
-        """Return True if nothing is projected off the slopes."""
+        """Return True if an attitude can follow the steps exactly, as it can if nothing is projected off the slopes."""
         names = system.preserved_names
         terms = () if system.dissipation is None else terms_with_preserved_values(system.dissipation, names)
         has_only_quadratics = all(
             C.is_quadratic for C in (self._held_functions(system) | _entropy_arguments(system)).values()
         )
         return has_only_quadratics and not any(
-            self._functions_to_project(term, set(term_names), system) for term, term_names in terms
+            self._functions_to_project_off(term, set(term_names), system) for term, term_names in terms
         )
 
     def preserves_function(self, system: System, name: str) -> bool:
         is_known_invariant = name in system.casimirs() or name in system.preserved_names
-        return self._is_held(system, name) if is_known_invariant else super().preserves_function(system, name)
+        return (
+            self._is_held_by_default(system, name) if is_known_invariant else super().preserves_function(system, name)
+        )
 
-    def _is_held(self, system: System, name: str) -> bool:
+    def _is_held_by_default(self, system: System, name: str) -> bool:
         """Return True for functions held without request: Casimirs, and those that the dissipation preserves.
 
         A skew friction is not projected, and keeps only quadratic functions by itself.
@@ -339,8 +343,8 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
             self, system, x, compensation, self.increment(h, k), tuple(self._held_functions(system).values())
         )
 
-    def _held_casimir_names(self, system: System) -> set[str]:
-        """Return the names of the Casimirs among the held functions."""
+    def _casimir_names(self, system: System) -> set[str]:
+        """Return the names of all known Casimirs: of the system, and among the functions of ``preserve``."""
         user_indices = range(len(self.functions)) if self.moving is not None else ()
         return {*system.casimirs(), *(f"given {i + 1}" for i in user_indices if i not in (self.moving or ()))}
 
@@ -348,7 +352,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         """Return the directions ``Pi grad J`` at the stages for quadratic momentum maps J, shape (s, r, n)."""
         if system.energy.is_quadratic:
             return None
-        casimirs = self._held_casimir_names(system)
+        casimirs = self._casimir_names(system)
         maps = [J for name, J in self._held_functions(system).items() if J.is_quadratic and name not in casimirs]
         if not maps:
             return None
@@ -361,7 +365,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         return generator_residual_jvp(system, lambda k: self._stage_states(x, compensation, h, k), k)
 
     def error(self, system: System, x, compensation, h, k) -> jax.Array:
-        return collocation_error(system, x, compensation, h, k)
+        return collocation_error_estimate(system, x, compensation, h, k)
 
     def __str__(self) -> str:
         suffix = f", preserve={len(self.functions)} functions" if self.functions else ""

@@ -138,7 +138,7 @@ class DiscreteHerglotz(OneStepMethod):
 
     def check(self, system: System) -> None:
         """Raise InputError unless the state has the form (q, p, S)."""
-        system = _manifold_system(system)
+        system = _unembedded_system(system)
         if not isinstance(system, EvolutionSystem):
             raise InputError(f"DiscreteHerglotz needs an lt.EvolutionSystem, got a {system.kind}")
         space = system.configurations
@@ -159,7 +159,7 @@ class DiscreteHerglotz(OneStepMethod):
         return np.array([share for share, _ in SUBSTEPS[self.composed]])
 
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
-        system = _manifold_system(system)
+        system = _unembedded_system(system)
         assert isinstance(system, EvolutionSystem)
         space, y, slopes, n = system.configurations, x + compensation, [], len(x) // 2
         action = self.discrete_lagrangian if space is None else _ActionOfPoints(self.discrete_lagrangian, space)
@@ -210,9 +210,9 @@ def _adjoint_slope(action: Callable, contact: mf.SplitContact, y, h, guess) -> j
     return jnp.concatenate([velocity, (p1 - p) / h, jnp.dot(velocity, p)[None]])
 
 
-def _newton_velocity(residual: Callable, contact: mf.SplitContact, q, h, velocity) -> jax.Array:
+def _newton_velocity(residual: Callable, contact: mf.SplitContact, q, h, velocity_guess) -> jax.Array:
     """Return the velocity after one Newton step for ``residual(q + h velocity) = 0``, on a manifold along it."""
-    A, residual_value = h * jax.jacfwd(residual)(q + h * velocity), residual(q + h * velocity)
+    A, residual_value = h * jax.jacfwd(residual)(q + h * velocity_guess), residual(q + h * velocity_guess)
     if isinstance(contact.bundle, mf.TangentBundle):
         surface, mass = ConstraintSurface(contact.bundle.base, tangent=True), jnp.max(jnp.abs(A))
 
@@ -221,12 +221,12 @@ def _newton_velocity(residual: Callable, contact: mf.SplitContact, q, h, velocit
 
         A = jax.vmap(lambda column: contact.tangential_part(q, column), in_axes=1, out_axes=1)(A) + jax.jacfwd(
             distance_from_manifold
-        )(velocity)
-        residual_value = contact.tangential_part(q, residual_value) + distance_from_manifold(velocity)
-    return velocity - solve(A, residual_value[:, None])[:, 0]
+        )(velocity_guess)
+        residual_value = contact.tangential_part(q, residual_value) + distance_from_manifold(velocity_guess)
+    return velocity_guess - solve(A, residual_value[:, None])[:, 0]
 
 
-def _manifold_system(system: System) -> System:
+def _unembedded_system(system: System) -> System:
     return system.manifold if isinstance(system, EmbeddedSystem) else system
 
 

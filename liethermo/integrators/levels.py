@@ -105,12 +105,12 @@ def project_onto_levels(
     signs = jnp.asarray([law.sign for law in laws])
     functions, blocks = [law.function for law in laws], system.state_blocks
 
-    def corrected_displacement(s: ProjectionState) -> tuple[jax.Array, jax.Array]:
+    def corrected_displacement_and_residual(s: ProjectionState) -> tuple[jax.Array, jax.Array]:
         d = s.d + correction_displacement(system, x + (compensation + s.d), s.correction, leaf)
         return (d, jnp.zeros(())) if surface is None else surface.project_displacement(x, compensation, d)
 
-    def mean_gradient(f: Energy, d, start_gradient, end_gradient) -> jax.Array:
-        """Return a discrete gradient; for a polynomial a mean of gradients, including those at both ends."""
+    def change_gradient(f: Energy, d, start_gradient, end_gradient) -> jax.Array:
+        """Return the discrete gradient of f along d; for a polynomial by a quadrature with gradients at both ends."""
         mean = 0.5 * (start_gradient + end_gradient)
         if f.degree > SIMPSON_DEGREE:
             return discrete_gradient(f, x, d, compensation)
@@ -118,20 +118,20 @@ def project_onto_levels(
 
     def level_residuals(d, end_gradients) -> jax.Array:
         gradients = [
-            mean_gradient(f, d, *end_pair)
+            change_gradient(f, d, *end_pair)
             for f, *end_pair in zip(functions, start_gradients, end_gradients, strict=True)
         ]
         return target_changes - jnp.stack([jnp.dot(gradient, d) for gradient in gradients])
 
     def apply_correction(s: ProjectionState) -> tuple[ProjectionState, list]:
         """Apply the correction, and return the state with its new residuals and the gradients there."""
-        d, surface_residual = corrected_displacement(s)
+        d, surface_residual = corrected_displacement_and_residual(s)
         end_gradients = [f.gradient(x + (compensation + d)) for f in functions]
         return s._replace(
             d=d, surface_residual=surface_residual, level_residual=level_residuals(d, end_gradients)
         ), end_gradients
 
-    def release_entropy_change(s: ProjectionState) -> ProjectionState:
+    def drop_monotone_residuals(s: ProjectionState) -> ProjectionState:
         """Drop the residual of functions that rise or fall, unless they change with the wrong sign."""
         actual_changes, rounding = (
             target_changes - s.level_residual,
@@ -175,7 +175,7 @@ def project_onto_levels(
         is_small = jnp.abs(s.level_residual) <= EPS * s.direction_lengths * jnp.linalg.norm(s.d)
         return (s.surface_residual == 0.0) & (is_small | (s.direction_lengths <= VANISHED_LENGTH)).all()
 
-    def iterate(carry, iteration):
+    def correct_unless_finished(carry, iteration):
         """Apply the next correction; later ones are relaxed, and the last one is along conserved functions only."""
         s, is_finished = carry
         is_relaxed, is_last = (
@@ -194,7 +194,7 @@ def project_onto_levels(
             current, end_gradients = apply_correction(current)
             current = current._replace(
                 level_residual=jnp.where(
-                    is_relaxed, release_entropy_change(current).level_residual, current.level_residual
+                    is_relaxed, drop_monotone_residuals(current).level_residual, current.level_residual
                 )
             )
             direction_mask = (signs == 0.0) | ~is_relaxed | ((current.level_residual != 0.0) & ~is_last)
@@ -213,9 +213,9 @@ def project_onto_levels(
 
     def is_within_tolerance(s: ProjectionState) -> jax.Array:
         tolerance = LEVEL_RTOL_OF_STEP * jnp.linalg.norm(s.d) + LEVEL_RTOL_OF_STATE * jnp.linalg.norm(x)
-        return s.surface_residual + residual_length(s, value_rounding(s.d)) <= tolerance
+        return s.surface_residual + residual_length(s, level_residual_rounding(s.d)) <= tolerance
 
-    def value_rounding(d) -> jax.Array:
+    def level_residual_rounding(d) -> jax.Array:
         """Return the part of the level residuals that rounding of function values explains, shape (laws,).
 
         In a short step the change of a function is a quadrature of its gradient, whose rounding vanishes with d: then
@@ -258,14 +258,16 @@ def project_onto_levels(
     can_be_released = n_conserved < len(laws) and (n_conserved > 0 or surface is not None)
     n_iterations = max_corrections - 1 + (MAX_RELAXED_ITERATIONS + 1 if can_be_released else 0)
 
-    def iterate_further() -> tuple[ProjectionState, jax.Array]:
+    def correct_further() -> tuple[ProjectionState, jax.Array]:
         s_further, _ = jax.lax.scan(
-            iterate, (with_next_correction(s, last_gradients), has_converged), jnp.arange(n_iterations)
+            correct_unless_finished, (with_next_correction(s, last_gradients), has_converged), jnp.arange(n_iterations)
         )[0]
         return s_further, is_converged(s_further)
 
-    s, has_converged = jax.lax.cond(has_converged, lambda: (s, has_converged), iterate_further)
-    rounding = jax.lax.cond(has_converged, lambda: jnp.zeros_like(s.level_residual), lambda: value_rounding(s.d))
+    s, has_converged = jax.lax.cond(has_converged, lambda: (s, has_converged), correct_further)
+    rounding = jax.lax.cond(
+        has_converged, lambda: jnp.zeros_like(s.level_residual), lambda: level_residual_rounding(s.d)
+    )
     return s.d, s.surface_residual + residual_length(s, rounding)
 
 
@@ -275,12 +277,12 @@ def correction_directions(system: System, x, gradients: Sequence[jax.Array], lea
     With ``leaf`` they are directions of the covectors that carry the state along its leaf.
     """
     if leaf:
-        gradients = [_leaf_direction(system, x, gradient) for gradient in gradients]
+        gradients = [_symplectic_leaf_direction(system, x, gradient) for gradient in gradients]
     directions, surface = [system.raise_index(x, gradient) for gradient in gradients], system.surface
     return directions if surface is None else [surface.project_direction(x, v) for v in directions]
 
 
-def _leaf_direction(system: System, x, gradient) -> jax.Array:
+def _symplectic_leaf_direction(system: System, x, gradient) -> jax.Array:
     """Return ``Pi(x) gradient``, shape (n,); zero if it is only rounding, as at a state at rest on its leaf."""
     direction, n = system.poisson.sharp(x, gradient), system.body_dim  # a clock and work have other units
     is_at_rest = jnp.linalg.norm(direction[:n]) <= REST_RTOL * jnp.linalg.norm(x[:n]) * jnp.linalg.norm(gradient[:n])
@@ -293,12 +295,15 @@ def level_correction(
     changes: jax.Array,
     is_usable: Callable[[jax.Array], jax.Array] | None = None,
 ) -> jax.Array:
-    """Return the vector in the span of the directions with the given products with them, as far as it is usable."""
+    """Return the vector in the span of the directions whose inner products with them are the given changes."""
     return vector_with_inner_products(directions, changes, min(len(system.state_blocks), 2), is_usable)
 
 
 def correction_displacement(system: System, x, correction, leaf: bool = False) -> jax.Array:
-    """Return the displacement of x by a correction; along a leaf ``dH . Pi K = -(Pi dH) . K`` gives the sign of K."""
+    """Return the displacement of x by a correction: the correction itself, or along a leaf that of its covector.
+
+    Pi K = -(Pi dH) . K`` gives the sign of K.
+    """
     return system.poisson.leaf_displacement(x, -correction) if leaf else correction
 
 

@@ -56,7 +56,7 @@ def _legendre_value(m: int, x) -> np.ndarray:
 def lobatto_tableau(order: int) -> ExplicitTableau:
     """Return the tableau of order 4 [Kutta 1901], 6 [Butcher 1964] or 8 [Cooper & Verner 1972]."""
     A, b = {4: _kutta_coefficients, 6: _butcher_coefficients, 8: _cooper_verner_coefficients}[order]()
-    d, q = _error_weights(A, order)
+    d, q = _error_weights_and_order(A, order)
     powers = [np.ones(len(b))]
     for _ in range(order):
         powers.append(A @ powers[-1])  # A^n 1: for a linear equation, order n + 1 means b . A^n 1 = 1 / (n + 1)!
@@ -66,9 +66,9 @@ def lobatto_tableau(order: int) -> ExplicitTableau:
     return ExplicitTableau(A, b, d, q, order_residual / linear_response ** (order / q))
 
 
-def _error_weights(A: np.ndarray, order: int) -> tuple[np.ndarray, int]:
-    """Return weights d orthogonal to every rooted tree of at most q nodes, and q, the largest with nonzero weights."""
-    vectors, weights_and_order = tree_vectors(A, order - 1), None
+def _error_weights_and_order(A: np.ndarray, order: int) -> tuple[np.ndarray, int]:
+    """Return the weights of the error estimate and their order q: they vanish on rooted trees of at most q nodes."""
+    vectors, weights_and_order = rooted_tree_vectors(A, order - 1), None
     for q in range(order - 1, 0, -1):
         conditions = np.array([v for n in range(1, q + 1) for v in vectors[n]])
         _, singular_values, right_vectors = np.linalg.svd(conditions)
@@ -82,7 +82,7 @@ def _error_weights(A: np.ndarray, order: int) -> tuple[np.ndarray, int]:
     return weights_and_order
 
 
-def tree_vectors(A: np.ndarray, order: int) -> dict[int, list[np.ndarray]]:
+def rooted_tree_vectors(A: np.ndarray, order: int) -> dict[int, list[np.ndarray]]:
     """Return, for each number of nodes up to ``order``, the stage vectors of the rooted trees with that many nodes.
 
     The vector of a tree is the product of ``A v`` over its branches, with v the vectors of the branches. A method has

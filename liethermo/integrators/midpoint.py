@@ -12,7 +12,7 @@ from manifolds._pytree_module import forward_to
 
 from ..functions.gradients import DiscreteGradient, get_discrete_gradient
 from ..systems import System
-from .base import OneStepMethod, TransportingMethod, collocation_error, generator_residual_jvp, register
+from .base import OneStepMethod, TransportingMethod, collocation_error_estimate, generator_residual_jvp, register
 from .charts import wrap_in_charts
 
 
@@ -91,7 +91,7 @@ class MetriplecticMidpoint(TransportingMethod):
         return generator_residual_jvp(system, lambda k: x + (compensation + 0.5 * h * k), k)
 
     def error(self, system: System, x, compensation, h, k) -> jax.Array:
-        return collocation_error(system, x, compensation, h, k)
+        return collocation_error_estimate(system, x, compensation, h, k)
 
     def increment(self, h, k) -> jax.Array:
         return h * k[0]

@@ -49,9 +49,9 @@ CASIMIR_RTOL = 1e-10
 """Largest ``|Pi grad C|`` of a Casimir, relative to the image of a generic covector of the same length."""
 
 
-def casimir_residuals(model: tuple[System, tuple[Energy, ...]], x) -> jax.Array:
+def casimir_residuals(system_and_functions: tuple[System, tuple[Energy, ...]], x) -> jax.Array:
     """Return ``|Pi grad C|`` of each function at x, relative to ``|Pi v|`` of another covector v of that length."""
-    system, functions = model
+    system, functions = system_and_functions
     system = system.freeze_at(x)
     residuals = []
     for C in functions:

@@ -142,7 +142,7 @@ class WithAttitude(MethodWrapper):
             * self._transporting_method.stage_velocities(system.body, mu, mu_compensation, h, k)[:, : system.group.dim]
         )
         p, p_compensation = (
-            self._update_spatial_momentum(system, x, compensation, h, k, xi) if system.has_impulse else (None, None)
+            self._next_spatial_momentum(system, x, compensation, h, k, xi) if system.has_impulse else (None, None)
         )
         if self.kind == "cayley":
             dg = (g + g_compensation) @ _collocation_increment(system.group.algebra.hat(xi))
@@ -188,11 +188,13 @@ class WithAttitude(MethodWrapper):
         end = method.step_without_compensation(local, local.local_coordinates(x), h)
         return system.join_state(system.points(end), g @ group.exp_map(group.algebra, local.angles(end)))
 
-    def _attitude_increment(self, group, xi) -> jax.Array:
+    def _attitude_increment(self, group, stage_angles) -> jax.Array:
         """Return the group element that rotates the attitude, for angles h xi at the stages, shape (stages, dim)."""
         if self.kind == "coadjoint":
-            return self._coadjoint_increment(group, xi)
-        return group.exp_map(group.algebra, gauss_tableau(len(xi)).b @ self._algebra_slopes(group.algebra, xi))
+            return self._coadjoint_increment(group, stage_angles)
+        return group.exp_map(
+            group.algebra, gauss_tableau(len(stage_angles)).b @ self._algebra_slopes(group.algebra, stage_angles)
+        )
 
     def _stage_attitudes(self, system: AttitudeSystem, x, compensation, h, k) -> jax.Array:
         """Return the attitudes at which the torques of the stages are evaluated, shape (stages, m, m)."""
@@ -226,15 +228,15 @@ class WithAttitude(MethodWrapper):
         attitudes = self._stage_attitudes(system, x, compensation, h, k)
         return jax.vmap(lambda g, state: body.bind_attitude(g).external_torque(state))(attitudes, states)
 
-    def _update_spatial_momentum(
-        self, system: AttitudeSystem, x, compensation, h, k, xi
+    def _next_spatial_momentum(
+        self, system: AttitudeSystem, x, compensation, h, k, stage_angles
     ) -> tuple[jax.Array, jax.Array]:
         """Return the spatial momentum after the impulse of the step, and its compensation."""
         torques = self._stage_torques(system, x, compensation, h, k)[:, : system.group.dim]
-        actions = _collocation_stages(-system.group.algebra.ad(xi).swapaxes(-1, -2)).swapaxes(
+        actions = _collocation_stages(-system.group.algebra.ad(stage_angles).swapaxes(-1, -2)).swapaxes(
             -1, -2
         )  # Ad(inverse(g)), relative
-        impulse = h * jnp.einsum("i,ia,iab->b", gauss_tableau(len(xi)).b, torques, actions)
+        impulse = h * jnp.einsum("i,ia,iab->b", gauss_tableau(len(stage_angles)).b, torques, actions)
         spatial_impulse = impulse @ system.spatial_action(system.split_state(x)[1])
         return two_sum(system.spatial_impulse(x), system.spatial_impulse(compensation) + spatial_impulse)
 
@@ -244,26 +246,30 @@ class WithAttitude(MethodWrapper):
         return system.join_state(mu + system.points(v), g, system.spatial_impulse(x))
 
     @staticmethod
-    def _coadjoint_increment(group, xi) -> jax.Array:
+    def _coadjoint_increment(group, stage_angles) -> jax.Array:
         """Return the group element whose adjoint action is that of the step, for angles h xi, shape (stages, dim).
 
         If the end of the collocation is no adjoint action, the nearest one is used, to the order of the method.
         """
         algebra = group.algebra
-        if len(xi) == 1:
-            return group.adjoint_cayley_map(algebra, xi[0])
-        R = jnp.eye(algebra.dim) + _collocation_increment(algebra.ad(xi))
-        x = components_from_ad_cayley(algebra, R) + central_part(algebra, gauss_tableau(len(xi)).b @ xi)
+        if len(stage_angles) == 1:
+            return group.adjoint_cayley_map(algebra, stage_angles[0])
+        R = jnp.eye(algebra.dim) + _collocation_increment(algebra.ad(stage_angles))
+        x = components_from_ad_cayley(algebra, R) + central_part(
+            algebra, gauss_tableau(len(stage_angles)).b @ stage_angles
+        )
         return group.adjoint_cayley_map(algebra, x)
 
-    def _algebra_slopes(self, algebra, xi) -> jax.Array:
-        """Return h theta' at the stages of collocation in the algebra, shape (stages, dim).
+    def _algebra_slopes(self, algebra, stage_angles) -> jax.Array:
+        """Return h times the stage slopes of collocation in the algebra, for angles h xi, shape (stages, dim).
 
         Each sweep of the iteration gains a power of h; there is one more sweep than the order needs.
         """
-        tableau, k = gauss_tableau(len(xi)), xi
-        for _ in range(2 * len(xi) - 1 if len(xi) > 1 else 0):  # with one stage k is xi, which commutes with itself
-            k = inverse_dexp(algebra, tableau.A @ k, xi, self.order)
+        tableau, k = gauss_tableau(len(stage_angles)), stage_angles
+        for _ in range(
+            2 * len(stage_angles) - 1 if len(stage_angles) > 1 else 0
+        ):  # with one stage k is xi, which commutes with itself
+            k = inverse_dexp(algebra, tableau.A @ k, stage_angles, self.order)
         return k
 
     def __str__(self) -> str:
@@ -277,18 +283,20 @@ A rotation by 0.5 in a step leaves a residual of 1e-11; a rotation by 0.2 leaves
 """
 
 
-def _collocation_increment(X) -> jax.Array:
+def _collocation_increment(stage_generators) -> jax.Array:
     """Return ``G - I`` at the end of Gauss collocation of ``G' = G X`` on [0, 1] from I, for X of shape (s, m, m)."""
-    return jnp.einsum("j,jab,jbc->ac", gauss_tableau(len(X)).b, _collocation_stages(X), X)
+    return jnp.einsum(
+        "j,jab,jbc->ac", gauss_tableau(len(stage_generators)).b, _collocation_stages(stage_generators), stage_generators
+    )
 
 
-def _collocation_stages(X) -> jax.Array:
+def _collocation_stages(stage_generators) -> jax.Array:
     """Return the stages G_i of Gauss collocation of ``G' = G X`` on [0, 1] from I, shape (s, m, m).
 
     They are solved for their transposes, ``G_i^T = I + sum_j A_ij X_j^T G_j^T``.
     """
-    (stages, m), tableau = X.shape[:2], gauss_tableau(len(X))
-    X_transposed = X.swapaxes(-1, -2)
+    (stages, m), tableau = stage_generators.shape[:2], gauss_tableau(len(stage_generators))
+    X_transposed = stage_generators.swapaxes(-1, -2)
     implicit = jnp.einsum("ij,jab->iajb", tableau.A, X_transposed).reshape(stages * m, stages * m)
     start = jnp.tile(jnp.eye(m), (stages, 1))
     G = solve_near_identity(jnp.eye(stages * m) - implicit, start).reshape(stages, m, m)
@@ -320,12 +328,12 @@ A Newton step leaves this fraction of the residual, or its square. It is also th
 step is taken."""
 
 
-def _project_onto_orbit(momenta, p, mu) -> jax.Array:
-    """Return the dual vector of the group near p with the Casimirs of the state mu; other momenta are unchanged."""
+def _project_onto_orbit(momentum_system, p, mu) -> jax.Array:
+    """Return the momentum near p with the Casimirs of the state mu; momenta of internal parts are unchanged."""
     n = len(p)
     scale = jnp.max(jnp.abs(mu[:n]))
-    scale, casimirs = jnp.where(scale > 0.0, scale, 1.0), momenta.momentum_casimirs().values()
-    p, mu = p / scale, mu[: momenta.algebra.dim] / scale
+    scale, casimirs = jnp.where(scale > 0.0, scale, 1.0), momentum_system.momentum_casimirs().values()
+    p, mu = p / scale, mu[: momentum_system.algebra.dim] / scale
     for _ in range(MAX_NEWTON_ITERATIONS):
         momentum = jnp.concatenate([p, mu[n:]])
         residual = jnp.stack([C.value(mu) - C.value(momentum) for C in casimirs])
@@ -333,17 +341,19 @@ def _project_onto_orbit(momenta, p, mu) -> jax.Array:
     return scale * p
 
 
-def _align_attitude(group, g, p, target) -> jax.Array:
-    """Return the group element near g whose coadjoint action gives the spatial momentum ``target``, on the same orbit.
+def _align_attitude(group, g, spatial_momentum, body_momentum) -> jax.Array:
+    """Return the group element near g whose coadjoint action takes ``spatial_momentum`` to ``body_momentum``.
 
     Newton's method solves ``ad*_eta m = target - m`` for the least eta, where m is p seen from g [Marquardt 1963].
     """
-    algebra, scale = group.algebra, jnp.max(jnp.abs(target))
-    p, target = (v / jnp.where(scale > 0.0, scale, 1.0) for v in (p, target))
+    algebra, scale = group.algebra, jnp.max(jnp.abs(body_momentum))
+    spatial_momentum, body_momentum = (
+        v / jnp.where(scale > 0.0, scale, 1.0) for v in (spatial_momentum, body_momentum)
+    )
 
     def newton_step(iteration: int, g) -> jax.Array:
-        m = group.Ad_star(g, p)
-        residual, orbit_tangents = target - m, algebra.ad_star(jnp.eye(algebra.dim), m)
+        m = group.Ad_star(g, spatial_momentum)
+        residual, orbit_tangents = body_momentum - m, algebra.ad_star(jnp.eye(algebra.dim), m)
         square = orbit_tangents @ orbit_tangents.T
         max_diagonal = jnp.max(jnp.diagonal(square))
         damping = jnp.where(

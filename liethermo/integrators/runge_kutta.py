@@ -87,7 +87,7 @@ class MetriplecticRungeKutta(ExplicitMethod):
 
     def base_step(self, rates: Callable, skip_law_rates: bool, x, compensation, h) -> UncorrectedStep:
         t = self.tableau
-        slopes, changes = self._stage_slopes(rates, x, compensation, h)
+        slopes, changes = self._stage_slopes_and_law_rates(rates, x, compensation, h)
         ends = jnp.stack([slopes[0], slopes[-1]])
         return UncorrectedStep(h * (t.b @ slopes), h * (t.b @ changes), jnp.asarray(t.error_weights) @ slopes, ends)
 
@@ -113,7 +113,7 @@ class MetriplecticRungeKutta(ExplicitMethod):
             ]  # they come last
             return field, jnp.asarray(changes)
 
-        slopes, changes = self._stage_slopes(field_and_law_rates, x, 0.0, h)
+        slopes, changes = self._stage_slopes_and_law_rates(field_and_law_rates, x, 0.0, h)
         end = x + h * (t.b @ slopes)
         if not laws:
             return end
@@ -124,13 +124,13 @@ class MetriplecticRungeKutta(ExplicitMethod):
             [system.raise_index(end, gradient) for _, gradient in gradients], residuals
         )
 
-    def _stage_slopes(self, rates: Callable, x, compensation, h) -> tuple[jax.Array, jax.Array]:
+    def _stage_slopes_and_law_rates(self, rates: Callable, x, compensation, h) -> tuple[jax.Array, jax.Array]:
         """Return the field at the stages, shape (s, n), and the rates of the functions of the laws, shape (s, laws)."""
         t = self.tableau
         s = len(t.b)
 
-        def stage(slopes, row):
-            i, weights = row
+        def stage(slopes, index_and_weights):
+            i, weights = index_and_weights
             slope, changes = rates(x + (compensation + h * (weights @ slopes)))
             return jax.lax.dynamic_update_index_in_dim(slopes, slope, i, 0), changes
 

@@ -30,14 +30,14 @@ class GaussTableau(NamedTuple):
 @functools.cache
 def gauss_tableau(stages: int) -> GaussTableau:
     """Return the tableau of s Gauss nodes, each entry rounded once from extended precision."""
-    A, b, c = _extended_tableau(stages)
+    A, b, c = _extended_precision_tableau(stages)
     return GaussTableau(*(np.asarray(a, dtype=np.float64) for a in (A, b, c)))
 
 
 @functools.cache
 def extrapolation_matrix(stages: int) -> np.ndarray:
     """Return the matrix, shape (s, s), that extrapolates the stage slopes to the next step by their polynomial."""
-    return _lagrange_values(stages, 1 + _extended_tableau(stages)[2]).astype(np.float64)
+    return _lagrange_values(stages, 1 + _extended_precision_tableau(stages)[2]).astype(np.float64)
 
 
 @functools.cache
@@ -55,7 +55,7 @@ def interpolation_weights(stages: int, theta) -> np.ndarray:
 
 @functools.cache
 def kronrod_rule(stages: int) -> KronrodRule | None:
-    """Return the Kronrod rule for 1 stage (1 + 2 nodes, degree 5) or 2 stages (2 + 3, degree 7), otherwise None."""
+    """Return the Kronrod rule of 1 Gauss node (1 + 2 nodes, degree 5) or 2 (2 + 3, degree 7); None for more."""
     if stages > 2:
         return None
     if stages == 1:
@@ -68,7 +68,7 @@ def kronrod_rule(stages: int) -> KronrodRule | None:
     return KronrodRule(interpolation_weights(stages, theta), slopes, np.array(b), np.array(change))
 
 
-def _extended_tableau(stages: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _extended_precision_tableau(stages: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     x, b = _gauss_rule(stages)
     return _legendre_integrals(_legendre_values(stages, x)) @ _lagrange_coefficients(stages), b, (1 + x) / 2
 

@@ -11,7 +11,7 @@ import scipy.special
 
 from ..errors import InputError
 from ..functions.conditions import checked_numbers, require_condition
-from .inertia import EQUAL_MOMENTS_RTOL, are_tensors, principal_axes, principal_moments
+from .inertia import EQUAL_MOMENTS_RTOL, are_inertia_tensors, principal_axes, principal_moments
 
 
 class Periods(NamedTuple):
@@ -68,7 +68,7 @@ def periods(inertia, momentum, energy=None) -> Periods:
     if energy is None:
         if L.shape[-1:] != (3,):
             raise InputError(f"without energy=, momentum must have shape (..., 3), got {L.shape}")
-        if are_tensors(np.asarray(inertia)):
+        if are_inertia_tensors(np.asarray(inertia)):
             L = np.einsum("...ji,...j->...i", principal_axes(inertia).axes, L)
         E, L = 0.5 * np.sum(L**2 / moments, axis=-1), np.linalg.norm(L, axis=-1)
     else:
@@ -108,7 +108,7 @@ def _elliptic_pi(n, m) -> np.ndarray:
 
 
 def rate_of(relaxation_time, inertia, momentum) -> jax.Array:
-    """Return the rate of friction inside a body whose small nutations fall by e in the relaxation time.
+    """Return the rate of internal friction of a body whose small nutations decay by a factor e in the given time.
 
     The friction is that of ``x' = Pi dH + rate Pi Pi dH``. With ``I_1 <= I_2 <= I_3``, ``d_i = 1/I_i - 1/I_3`` and
     ``r = rate L**2``, small nutations from the spin about the axis 3 obey a linear equation with the trace

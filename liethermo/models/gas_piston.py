@@ -23,7 +23,7 @@ GAS_CONSTANT = 8.31446261815324
 
 
 class IdealGas(Module):
-    """``U(S, V) = U_0 exp(S / (c n R)) (V / V_0)^(-1/c)`` with ``U_0 = c n R T_0``: S is counted from (T_0, V_0).
+    """An ideal gas of energy ``U(S, V) = U_0 exp(S / (c n R)) (V / V_0)^(-1/c)``, ``U_0 = c n R T_0``.
 
     ``T = U / (c n R)``, ``P = n R T / V``.
 

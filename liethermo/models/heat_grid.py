@@ -36,7 +36,7 @@ def heat_grid(shape: Sequence[int] = (32, 32), capacity: float = 1.0, conductanc
     sizes = _checked_shape(shape)
     c, k = checked_positive(capacity, "capacity"), checked_positive(conductance, "conductance")
     nodes = math.prod(sizes)
-    graph = grid_graph(sizes)
+    graph = grid_adjacency_matrix(sizes)
     pairs = zip(*scipy.sparse.triu(graph).nonzero(), strict=True)
     edges = [(i, j, k) for i, j in pairs] if is_traced(k) else float(k) * graph
     return ComposedSystem(Copies(nodes, thermal_energy, 1, jnp.broadcast_to(c, nodes), name="node"), conductance=edges)
@@ -54,8 +54,8 @@ def heat_grid_solution(t, temperatures, capacity: float = 1.0, conductance: floa
     return scipy.fft.idctn(np.exp(-conductance / capacity * rates * t) * scipy.fft.dctn(T))
 
 
-def grid_graph(shape: Sequence[int]) -> scipy.sparse.csr_array:
-    """Return the graph that joins each node of a grid, in C order, to its neighbours along the axes with weight 1."""
+def grid_adjacency_matrix(shape: Sequence[int]) -> scipy.sparse.csr_array:
+    """Return the sparse adjacency matrix of a grid, its nodes in C order; neighbours along the axes have weight 1."""
     sizes = _checked_shape(shape)
     graph = scipy.sparse.csr_array((math.prod(sizes), math.prod(sizes)))
     for axis, n in enumerate(sizes):

@@ -66,14 +66,14 @@ def principal_axes(inertia) -> PrincipalAxes:
     tensors = np.asarray(checked_numbers(inertia, "inertia"), dtype=np.float64)
     if tensors.shape[-2:] != (3, 3):
         raise InputError(f"inertia must have shape (..., 3, 3), got {tensors.shape}")
-    moments, axes = np.linalg.eigh(checked_tensors(tensors))
+    moments, axes = np.linalg.eigh(checked_inertia_tensors(tensors))
     leading_entries = np.take_along_axis(axes, np.argmax(np.abs(axes) > 1e-8, axis=-2)[..., None, :], axis=-2)
     axes = axes * np.where(leading_entries < 0.0, -1.0, 1.0)
     axes[..., 2] *= np.linalg.det(axes)[..., None]
     return PrincipalAxes(moments, axes)
 
 
-def are_tensors(inertia) -> bool:
+def are_inertia_tensors(inertia) -> bool:
     """Return True if an array of shape (..., 3) holds tensors of inertia, shape (..., 3, 3), rather than moments.
 
     Symmetric positive definite blocks whose principal moments obey ``I_i <= I_j + I_k`` are tensors. Their rows are
@@ -98,9 +98,9 @@ def are_tensors(inertia) -> bool:
         return False
     principal = np.linalg.eigvalsh(blocks)
     is_positive_definite = bool((principal > 0.0).all())
-    if is_positive_definite and satisfies_inequalities(principal):
+    if is_positive_definite and satisfies_triangle_inequalities(principal):
         return True
-    if (blocks > 0.0).all() and (not is_positive_definite or satisfies_inequalities(blocks)):
+    if (blocks > 0.0).all() and (not is_positive_definite or satisfies_triangle_inequalities(blocks)):
         return False
     if is_positive_definite and (blocks > 0.0).all():
         raise InputError(
@@ -110,7 +110,7 @@ def are_tensors(inertia) -> bool:
     return True
 
 
-def checked_tensors(tensors) -> np.ndarray:
+def checked_inertia_tensors(tensors) -> np.ndarray:
     """Return tensors of inertia, shape (..., 3, 3), made exactly symmetric; invalid ones are refused."""
     blocks = np.asarray(tensors, dtype=np.float64)
     if not np.isfinite(blocks).all():
@@ -129,7 +129,7 @@ def principal_moments(inertia) -> jax.Array:
     array = checked_numbers(inertia, "inertia")
     if array.shape[-1:] != (3,):
         raise InputError(f"inertia must have shape (..., 3), or (..., 3, 3) for tensors, got {array.shape}")
-    moments = jnp.linalg.eigvalsh(checked_tensors(array)) if are_tensors(array) else array
+    moments = jnp.linalg.eigvalsh(checked_inertia_tensors(array)) if are_inertia_tensors(array) else array
     require_condition(
         moments, lambda m: (m > 0.0) & (m < np.inf), "moments of inertia must be positive and finite, got {value}"
     )
@@ -137,7 +137,7 @@ def principal_moments(inertia) -> jax.Array:
 
 
 def inverse_inertia(inertia) -> jax.Array:
-    """Return the inverse of moments of inertia, shape (3,), or of a tensor, shape (3, 3)."""
+    """Return the inverse of a tensor of inertia, shape (3, 3), or of each of three moments, shape (3,)."""
     inertia = jnp.asarray(inertia)
     if inertia.ndim == 1:
         return 1.0 / inertia
@@ -151,7 +151,7 @@ def is_symmetric(blocks: np.ndarray) -> bool:
     return bool((asymmetry <= SYMMETRY_RTOL * np.abs(blocks).max(axis=(-2, -1))).all())
 
 
-def satisfies_inequalities(moments: np.ndarray) -> bool:
+def satisfies_triangle_inequalities(moments: np.ndarray) -> bool:
     """Return True if moments of shape (..., 3) obey ``I_i <= I_j + I_k``, as the moments of every rigid body do."""
     max_moment = moments.max(axis=-1)
     return bool((max_moment <= (moments.sum(axis=-1) - max_moment) * (1.0 + INEQUALITY_RTOL)).all())

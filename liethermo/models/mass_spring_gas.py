@@ -48,7 +48,7 @@ def mass_spring_gas(
     c: float = 1.5,
     external=None,
 ) -> SimpleClosedSystem:
-    """``L = m v^2 / 2 - k x^2 / 2 - U(S)``, ``F_fr = -lambda v``: friction heats the gas [GBY 5.5].
+    """A mass on a spring in an ideal gas, which its friction heats: ``L = m v^2 / 2 - k x^2 / 2 - U(S)`` [GBY 5.5].
 
     ``m x'' = -k x - lambda x' + F_ext``, ``T S' = lambda x'^2``, in SI units and in the state (x, v, S), S counted
     from the temperature T_0. Without an external force :func:`mass_spring_gas_solution` is the exact solution. The

@@ -53,7 +53,7 @@ class IdealMixture(Module):
         return jnp.sum(N * (self.capacity * jnp.log(T) + self.entropy - jnp.log(N / V)))
 
     def equilibrium_constant(self, T, stoichiometry) -> jax.Array:
-        """Return ``prod (N_k / V)^nu_k`` at equilibrium, ``nu . mu = 0``: the law of mass action."""
+        """Return the equilibrium constant of densities at T, ``prod (N_k / V)^nu_k`` where ``nu . mu = 0``."""
         standard = self.energy + (self.capacity + 1.0) * T - T * (self.capacity * jnp.log(T) + self.entropy)
         return jnp.exp(-jnp.dot(jnp.asarray(stoichiometry), standard) / T)
 

@@ -74,7 +74,7 @@ class QuantisedSphere:
 
     def _map_diagonals(self, mu, function) -> jax.Array:
         """Apply a function to the main and upper diagonals, shape (N, 2, N): entry i of diagonal m at [i, :, m]."""
-        entry_sources, entry_factors, component_sources, component_factors = self._diagonal_entries
+        entry_sources, entry_factors, component_sources, component_factors = self._diagonal_index_tables
         tables = self.algebra.matrix_basis
         diagonal = tables.diagonal
         assert diagonal is not None
@@ -86,7 +86,7 @@ class QuantisedSphere:
         return jnp.concatenate(entries, axis=-1)[..., component_sources] * component_factors
 
     @cached_property
-    def _diagonal_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def _diagonal_index_tables(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Index tables: the component and factor of each entry [i, :, m]; the entry and factor of each component.
 
         The entries of the diagonals below are those above with the sign of an anti-Hermitian matrix, so that they have
@@ -149,7 +149,7 @@ class QuantisedSphere:
 
     @cached_property
     def _tridiagonal_coefficients(self) -> tuple[np.ndarray, np.ndarray]:
-        """Minus the Laplacian: its main diagonals, and the coupling of entry i to i + 1, shapes (N, N) as [i, m]."""
+        """Return the diagonal and the coupling of entry i to i + 1 of minus the Laplacian, shapes (N, N) as [i, m]."""
         N, s = self.N, (self.N - 1) / 2.0
         i, m = np.indices((N, N))
         z = s - np.arange(N)  # eigenvalues of S_z
@@ -210,8 +210,7 @@ class QuantisedSphere:
         return jnp.concatenate([jnp.asarray(vorticity), dual_components], axis=-1)
 
     def magnetic_fields(self, x) -> tuple[jax.Array, jax.Array]:
-        """Return vorticity and magnetic potential of states of a magnetic fluid: the inverse of
-        :meth:`magnetic_state`."""
+        """Return the states of vorticity and magnetic potential of a magnetic fluid, from its state."""
         x, n = jnp.asarray(x), self.algebra.dim
         return x[..., :n], self.algebra.matrix_basis.lower_index(x[..., n:])
 
@@ -255,8 +254,7 @@ class QuantisedSphere:
         return a
 
     def harmonics(self, m: int, max_degree: int) -> np.ndarray:
-        """Return the m-th diagonals of T_lm for l = m, …, L = ``max_degree``: orthonormal columns, shape (N - m, L - m
-        + 1)."""
+        """Return the m-th diagonals of the matrix harmonics T_lm, l = m, …, ``max_degree``, as orthonormal columns."""
         main, off_diagonal = self._tridiagonal_coefficients
         length = self.N - m
         _, vectors = scipy.linalg.eigh_tridiagonal(
@@ -269,17 +267,17 @@ class QuantisedSphere:
         )
 
     def on_grid(self, mu, shape: tuple[int, int] = (128, 256), max_degree: int | None = None) -> np.ndarray:
-        """Return the function at colatitudes ``pi (i + 1/2) / shape[0]`` and longitudes ``2 pi j / shape[1]``."""
+        """Return the values of the function on a grid of colatitudes and longitudes, in the given shape."""
         a = self.coefficients(mu, max_degree)
         theta = math.pi * (np.arange(shape[0]) + 0.5) / shape[0]
         waves = np.zeros((shape[0], shape[1]), dtype=np.complex128)
         for m in range(len(a)):
-            profile = normalised_legendre(m, len(a) - 1, theta) @ a[m:, m]
+            profile = normalised_associated_legendre(m, len(a) - 1, theta) @ a[m:, m]
             waves[:, m % shape[1]] += profile * (1.0 if m == 0 else 2.0)
         return np.fft.ifft(waves, axis=1).real * shape[1]
 
     def random(self, seed: int, degrees: tuple[int, int], enstrophy: float = 1.0) -> jax.Array:
-        """Return a random vorticity of the given enstrophy, with equal expected amplitudes in a range of degrees l."""
+        """Return the state of a random vorticity of given enstrophy, with equal expected amplitudes in a range of l."""
         min_degree, max_degree = degrees
         if not 1 <= min_degree <= max_degree < self.N:
             raise InputError(f"degrees must be an increasing pair from 1 to {self.N - 1}, got {degrees}")
@@ -294,7 +292,7 @@ class QuantisedSphere:
         return mu * math.sqrt(enstrophy / float(jnp.sum(mu * mu)))
 
 
-def normalised_legendre(m: int, max_degree: int, theta: np.ndarray) -> np.ndarray:
+def normalised_associated_legendre(m: int, max_degree: int, theta: np.ndarray) -> np.ndarray:
     """Return ``Y_lm(theta, 0)`` for l = m, …, L = ``max_degree``, shape (thetas, L - m + 1), by the recurrence in l."""
     x, sine = np.cos(theta), np.sin(theta)
     k = np.arange(1, m + 1)

@@ -17,7 +17,7 @@ from ..dissipation.inner_product import KillingDissipation
 from ..functions.conditions import checked_numbers, require_condition
 from ..functions.energy import Quadratic
 from ..systems import LiePoissonSystem
-from .inertia import checked_tensors, inverse_inertia
+from .inertia import checked_inertia_tensors, inverse_inertia
 
 PUBLISHED_INERTIAS = ((10.0, 5.0, 1.0), (2.0, 1.0, 2.0 / 3.0))
 """Moments of published examples that no body can have, but that give no warning; the first is Morrison's."""
@@ -95,7 +95,7 @@ def checked_inertia(inertia) -> np.ndarray | jax.Array:
         return checked_array
     array = np.asarray(inertia, dtype=np.float64)
     if array.ndim == 2:
-        array = checked_tensors(array)
+        array = checked_inertia_tensors(array)
         if not (array - np.diag(np.diag(array))).any():
             array = np.diag(array).copy()
     else:

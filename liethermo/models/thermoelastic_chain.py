@@ -113,11 +113,11 @@ def thermoelastic_chain(
         coupling=springs,
         conductance=[(a, a + 1, conductance) for a in range(N - 1)],
         connected=False,  # allow a conductance of zero
-        momentum_maps={} if has_gravity else _angular_momentum(N, n),
+        momentum_maps={} if has_gravity else _angular_momenta_by_name(N, n),
     )
 
 
-def _angular_momentum(N: int, n: int) -> dict[str, Energy]:
+def _angular_momenta_by_name(N: int, n: int) -> dict[str, Energy]:
     """Return the components of ``sum q x p`` by name, one for each pair of axes."""
     state_size = 2 * n + 1
     maps: dict[str, Energy] = {}

@@ -20,7 +20,7 @@ from manifolds._pytree_module import Module
 
 from ..errors import InputError
 from ..functions.conditions import checked_numbers, require_condition
-from .inertia import checked_tensors
+from .inertia import checked_inertia_tensors
 from .parameters import checked_finite, checked_positive
 
 __all__ = ["ConstantInBody", "ConstantInSpace", "GravityGradient", "Magnetic", "Motor", "Tabulated"]
@@ -91,7 +91,7 @@ class GravityGradient(Module):
     def __init__(self, inertia, mean_motion, towards=(1.0, 0.0, 0.0), normal=(0.0, 0.0, 1.0)):
         self.inertia = checked_numbers(inertia, "inertia", (3,), (3, 3))
         if self.inertia.ndim == 2 and not is_traced(inertia):
-            self.inertia = jnp.asarray(checked_tensors(self.inertia))
+            self.inertia = jnp.asarray(checked_inertia_tensors(self.inertia))
         self.mean_motion = checked_positive(mean_motion, "mean_motion")
         self.towards, self.normal = _unit_vector(towards, "towards"), _unit_vector(normal, "normal")
         if not is_traced((self.towards, self.normal)):
@@ -105,7 +105,7 @@ class GravityGradient(Module):
         return 3.0 * self.mean_motion**2 * jnp.cross(n, inertia_times_n)
 
     def to_centre(self, t) -> jax.Array:
-        """Return the direction to the centre at a time, in space, shape (3,)."""
+        """Return the unit vector to the centre of the orbit at time t, in axes fixed in space, shape (3,)."""
         angle = self.mean_motion * t
         return jnp.cos(angle) * self.towards + jnp.sin(angle) * jnp.cross(self.normal, self.towards)
 

@@ -91,7 +91,7 @@ def tumbling_body(
 
 
 def _momentum_norm(momentum):
-    """Return the norm of a momentum, given as such or as a vector."""
+    """Return the norm of an angular momentum, given as the norm itself or as a vector of shape (3,)."""
     if np.shape(momentum) not in ((), (3,)):
         raise InputError(f"momentum must be one number, or three, got an array of shape {np.shape(momentum)}")
     return momentum if np.shape(momentum) == () else np.linalg.norm(momentum)

@@ -20,8 +20,7 @@ from .quantised_sphere import QuantisedSphere
 
 
 class KineticEnergy(Energy):
-    """Gamma times the energy of the fluid, ``gamma / 2 tr(W^H (-Delta)^{-1} W)``; the fluid's is ``-1/2 integral omega
-    psi``."""
+    """The kinetic energy of a fluid on the sphere times gamma, ``gamma / 2 tr(W^H (-Delta)^{-1} W)``."""
 
     sphere: QuantisedSphere = eqx.field(static=True)
 

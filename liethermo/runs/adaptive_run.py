@@ -156,7 +156,7 @@ class _SingleRecorder:
                 int(min(self.attempts_per_call, max(1.0, self.max_steps - first_step)))
             )
         except UnsupportedPrimitive as error:
-            self.runs = self.engine.fall_back_adaptive(error, self.control, self.runs)
+            self.runs = self.engine.resume_adaptive_on_array_engine(error, self.control, self.runs)
             self.pause_handler.adaptive_runs = self.runs
             return
         outcome.n_rejected = int(self._scalar("n_rejected"))

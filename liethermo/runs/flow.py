@@ -16,10 +16,16 @@ from manifolds._arrays import is_traced
 from manifolds._precision import with_library_settings
 
 from ..engines.implicit_differentiation import implicit_solution
-from ..engines.stage_solver import StageEquations, StageSolution, explicit_slopes, solve_fixed_point, solve_stages
+from ..engines.stage_solver import (
+    StageEquations,
+    StageSolution,
+    explicit_stage_solution,
+    solve_fixed_point,
+    solve_stages,
+)
 from ..engines.step import (
-    apply_drift_correction,
     can_correct_energy_drift,
+    compensation_after_drift_correction,
     end_of_step,
     energy_drift_correction,
     stage_equations,
@@ -301,12 +307,12 @@ def differentiable_step(
     """Return the carry after a step that JAX can differentiate; NaN if its equations cannot be solved."""
     x, compensation, k, older_k = carry
     if method.explicit:
-        new_k = _slopes_or_nan(explicit_slopes(system, method, x, compensation, h, k))
+        new_k = _slopes_or_nan(explicit_stage_solution(system, method, x, compensation, h, k))
     else:
         new_k = _solve_stages_implicitly(system, method, x, compensation, h, method.predict(k, older_k), solve)
     new_x, new_compensation, energy, *_ = end_of_step(system, method, x, compensation, h, new_k)
     if can_correct_energy_drift(system, method):
-        new_compensation = apply_drift_correction(
+        new_compensation = compensation_after_drift_correction(
             system,
             new_x,
             new_compensation,

@@ -15,7 +15,7 @@ from ..dissipation.noise import factor_residuals
 from ..errors import InputError
 from ..functions.energy import Energy, make_energy
 from ..integrators import MetriplecticMidpoint, OneStepMethod
-from ..integrators.fluctuating import add_noise
+from ..integrators.fluctuating import stochastic_method
 from ..systems import System
 from ..systems.check import AXIOM_TOLERANCE, CheckReport, CheckRow
 from ..tracing.interpret import evaluate_at_points
@@ -138,7 +138,7 @@ class Fluctuations:
         if not self.boltzmann:
             return method
         density = None if self.density is None else make_energy(self.density, "the density")
-        return add_noise(system, method, self.boltzmann, self.temperature, density)
+        return stochastic_method(system, method, self.boltzmann, self.temperature, density)
 
     def consecutive_increments(
         self, increments: int, members: np.ndarray, first: int, steps: int, h: float

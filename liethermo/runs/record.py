@@ -12,7 +12,7 @@ from ..engines.adaptive_runs import EventOccurrence
 from ..engines.compiled.parameters import ProgramStructure
 from ..engines.select_engine import EngineWithFallback
 from ..engines.status_codes import StatusCode
-from ..engines.step import relaxation_functional
+from ..engines.step import energy_or_entropy_that_relaxes
 from ..integrators import OneStepMethod
 from ..results.audit import RoundingScale
 from ..results.audit_evidence import (
@@ -156,7 +156,7 @@ class EnsembleRecord:
         quantities["residual"][members] = final["residual"]
         quantities["end_time"][members] = end_time
         start, end = (
-            np.asarray(relaxation_functional(self.member, f["energy"], f["entropy"])) for f in (initial, final)
+            np.asarray(energy_or_entropy_that_relaxes(self.member, f["energy"], f["entropy"])) for f in (initial, final)
         )
         change = np.where(np.abs(end - start) > 1e-12 * np.abs(end), end - start, np.nan)
         quantities["relaxation_time"][members] = (

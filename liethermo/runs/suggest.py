@@ -12,7 +12,7 @@ import numpy as np
 from manifolds._precision import with_library_settings
 
 from ..engines.select_engine import EngineWithFallback
-from ..engines.step_control import DEADBAND, growth_rate_at
+from ..engines.step_control import DEADBAND, largest_growth_rate_by_arnoldi
 from ..errors import InputError, LiethermoError
 from ..integrators import DEFAULT_METHOD, MetriplecticGauss, MetriplecticRungeKutta, MetriplecticTaylor, OneStepMethod
 from ..integrators.taylor import order_for_tolerance
@@ -187,7 +187,7 @@ def _try_method(system: System, x0, rtol: float, method: OneStepMethod, t0: floa
         engine, rate = EngineWithFallback(system, prepared_method, "auto", 1), max_rate / max(norm, 1e-300)
         if (
             run_trial(rate).underflow_step_size is not None
-            and (growth := growth_rate_at(system, prepared_method, x)) > rate
+            and (growth := largest_growth_rate_by_arnoldi(system, prepared_method, x)) > rate
         ):
             run_trial(growth)  # near an equilibrium, steps resolve the growth rate and not the slow motion
     if len(step_sizes) < 2:

@@ -203,13 +203,13 @@ class _ParameterConditions:
             return [(condition.holds, condition.value) for condition in collected]
 
         jax.eval_shape(evaluate_conditions, {name: jax.ShapeDtypeStruct((), np.float64) for name in parameters})
-        self._evaluate = jax.jit(jax.vmap(evaluate_conditions))
+        self._run_solver = jax.jit(jax.vmap(evaluate_conditions))
 
     def __call__(self, points: PointParameters, n_points: int) -> dict[int, str]:
         if not self._messages:
             return {}
         reasons: dict[int, str] = {}
-        results = evaluate_in_batches(self._evaluate, points, n_points)
+        results = evaluate_in_batches(self._run_solver, points, n_points)
         for k, message in enumerate(self._messages):
             for i in map(int, np.flatnonzero(~results[2 * k])):
                 reasons.setdefault(i, refusal_message(message, results[2 * k + 1][i]))

@@ -14,7 +14,7 @@ from manifolds.testing import Report, Suite
 
 from ..functions.checks import energy_value
 from ..functions.energy import Energy, make_energy
-from ..integrators.fluctuating import noise_invariance
+from ..integrators.fluctuating import noise_invariance_by_name
 from ..runs.ensemble import ensemble
 from ..runs.noise import MEASURE_ROW, Fluctuations
 from ..systems import System
@@ -151,7 +151,7 @@ def sample_exact_measure(system: System, noise: Fluctuations, x0, path_states: n
         If several functions are conserved, or a ray does not meet a level exactly once.
     """
     invariants = {"the energy": system.energy} if system.energy_law == "conserved" else {}
-    is_invariant = noise_invariance(system)
+    is_invariant = noise_invariance_by_name(system)
     invariants |= {name: system.functions()[name] for name in sorted(system.first_integrals()) if is_invariant[name]}
     if len(invariants) > 1:
         raise ValueError(

@@ -90,7 +90,7 @@ class _KernelWriter:
         all_finite = build.alloca(ir.IntType(1))
         build.store(ir.Constant(ir.IntType(1), 1), all_finite)
         for i in self._loop(total):
-            value = build.load(self._lane_entry(self.input_pointer, i))
+            value = build.load(self._lane_entry_pointer(self.input_pointer, i))
             difference = build.fsub(value, value)  # NaN for infinity
             is_finite = build.fcmp_ordered("==", difference, ir.Constant(FLOAT64, 0.0))
             build.store(build.and_(build.load(all_finite), is_finite), all_finite)
@@ -107,14 +107,14 @@ class _KernelWriter:
         a, w = self._copy_input(0, n, n), self._allocate_doubles(n)
         is_complex, work_size = self.call.is_complex, 34 * n  # workspace of a blocked reduction to tridiagonal form
         arguments = [
-            self._char_argument("V"),
-            self._char_argument("L"),
-            self._integer_argument(n),
+            self._pointer_to_char("V"),
+            self._pointer_to_char("L"),
+            self._pointer_to_integer(n),
             a,
-            self._integer_argument(n),
+            self._pointer_to_integer(n),
             w,
         ]
-        arguments += [self._allocate_doubles(work_size * self.parts_per_entry), self._integer_argument(work_size)]
+        arguments += [self._allocate_doubles(work_size * self.parts_per_entry), self._pointer_to_integer(work_size)]
         arguments += [self._allocate_doubles(3 * n)] if is_complex else []
 
         def write_results() -> None:
@@ -130,10 +130,10 @@ class _KernelWriter:
         self._call_routine(
             routine,
             [
-                self._integer_argument(m),
-                self._integer_argument(n),
+                self._pointer_to_integer(m),
+                self._pointer_to_integer(n),
                 a,
-                self._integer_argument(m),
+                self._pointer_to_integer(m),
                 pivots,
                 self._allocate_integers(1),
             ],
@@ -141,12 +141,12 @@ class _KernelWriter:
         self._copy_output(0, a, m, n)
         for i in self._loop(n_pivots):  # LAPACK counts from 1
             pivot_index = self.builder.sub(self.builder.load(self.builder.gep(pivots, [i])), ir.Constant(INT32, 1))
-            self.builder.store(self.builder.sitofp(pivot_index, FLOAT64), self._output_entry(1, i))
+            self.builder.store(self.builder.sitofp(pivot_index, FLOAT64), self._output_entry_pointer(1, i))
 
     def _inverse(self, n: int) -> None:
         is_complex = self.call.is_complex
         a = self._copy_input(0, n, n)
-        rows = self._integer_argument(n)
+        rows = self._pointer_to_integer(n)
         pivots = self._allocate_integers(n)
         work_size = 64 * n
         factorise_arguments = [rows, rows, a, rows, pivots]
@@ -158,7 +158,7 @@ class _KernelWriter:
                 rows,
                 pivots,
                 self._allocate_doubles(work_size * self.parts_per_entry),
-                self._integer_argument(work_size),
+                self._pointer_to_integer(work_size),
             ]
             self._call_with_info(
                 "zgetri" if is_complex else "dgetri", invert_arguments, lambda: self._copy_output(0, a, n, n)
@@ -172,16 +172,16 @@ class _KernelWriter:
         tau = self._allocate_doubles(n_reflectors * self.parts_per_entry)
         work_size = 64 * width
         work = self._allocate_doubles(work_size * self.parts_per_entry)
-        rows = self._integer_argument(m)
+        rows = self._pointer_to_integer(m)
         info = self._allocate_integers(1)
         factorise_arguments = [
             rows,
-            self._integer_argument(n),
+            self._pointer_to_integer(n),
             a,
             rows,
             tau,
             work,
-            self._integer_argument(work_size),
+            self._pointer_to_integer(work_size),
             info,
         ]
         self._call_routine("zgeqrf" if is_complex else "dgeqrf", factorise_arguments)
@@ -189,21 +189,21 @@ class _KernelWriter:
         build = self.builder
         for j in self._loop(n):
             for i in self._loop(columns):
-                source = self._matrix_entry(a, i, j, m)
+                source = self._matrix_entry_pointer(a, i, j, m)
                 for part in range(self.parts_per_entry):
                     value = build.load(build.gep(source, [ir.Constant(INT64, part)]))
                     is_upper = build.icmp_signed("<=", i, j)
-                    target = build.gep(self._matrix_entry(r, i, j, columns), [ir.Constant(INT64, part)])
+                    target = build.gep(self._matrix_entry_pointer(r, i, j, columns), [ir.Constant(INT64, part)])
                     build.store(build.select(is_upper, value, ir.Constant(FLOAT64, 0.0)), target)
         form_q_arguments = [
             rows,
-            self._integer_argument(columns),
-            self._integer_argument(n_reflectors),
+            self._pointer_to_integer(columns),
+            self._pointer_to_integer(n_reflectors),
             a,
             rows,
             tau,
             work,
-            self._integer_argument(work_size),
+            self._pointer_to_integer(work_size),
             info,
         ]
         self._call_routine("zungqr" if is_complex else "dorgqr", form_q_arguments)
@@ -218,15 +218,15 @@ class _KernelWriter:
         v = self._allocate_doubles(n_right * n * self.parts_per_entry)
         work_size = 8 * max_dim * max_dim + 64 * max_dim
         arguments = [
-            self._char_argument("A" if full else "S"),
-            self._integer_argument(m),
-            self._integer_argument(n),
+            self._pointer_to_char("A" if full else "S"),
+            self._pointer_to_integer(m),
+            self._pointer_to_integer(n),
             a,
-            self._integer_argument(m),
+            self._pointer_to_integer(m),
             s,
         ]
-        arguments += [u, self._integer_argument(m), v, self._integer_argument(n_right)]
-        arguments += [self._allocate_doubles(work_size * self.parts_per_entry), self._integer_argument(work_size)]
+        arguments += [u, self._pointer_to_integer(m), v, self._pointer_to_integer(n_right)]
+        arguments += [self._allocate_doubles(work_size * self.parts_per_entry), self._pointer_to_integer(work_size)]
         if is_complex:
             arguments.append(self._allocate_doubles(8 * max_dim * max_dim + 8 * max_dim))
         arguments.append(self._allocate_integers(8 * n_singular))
@@ -240,15 +240,15 @@ class _KernelWriter:
 
     # -- arrays -------------------------------------------------------------------------------------------------------
 
-    def _lane_entry(self, base: ir.Value, i: ir.Value) -> ir.Value:
+    def _lane_entry_pointer(self, base: ir.Value, i: ir.Value) -> ir.Value:
         return self.builder.gep(base, [self.builder.mul(i, ir.Constant(INT64, self.writer.lanes))])
 
-    def _output_entry(self, result_index: int, i: ir.Value) -> ir.Value:
+    def _output_entry_pointer(self, result_index: int, i: ir.Value) -> ir.Value:
         """Return the pointer to entry i of a result."""
         start = sum(self.call.entry_counts(self.call.result_specs)[:result_index])
-        return self._lane_entry(self.output_pointer, self.builder.add(i, ir.Constant(INT64, start)))
+        return self._lane_entry_pointer(self.output_pointer, self.builder.add(i, ir.Constant(INT64, start)))
 
-    def _matrix_entry(self, a: ir.Value, i: ir.Value, j: ir.Value, rows: int) -> ir.Value:
+    def _matrix_entry_pointer(self, a: ir.Value, i: ir.Value, j: ir.Value, rows: int) -> ir.Value:
         build = self.builder
         offset = build.add(build.mul(j, ir.Constant(INT64, rows)), i)
         return build.gep(a, [build.mul(offset, ir.Constant(INT64, self.parts_per_entry))])
@@ -260,10 +260,10 @@ class _KernelWriter:
             for j in self._loop(n):
                 offset = build.add(build.mul(i, ir.Constant(INT64, n)), j)
                 for part in range(self.parts_per_entry):
-                    source = self._lane_entry(
+                    source = self._lane_entry_pointer(
                         self.input_pointer, build.add(offset, ir.Constant(INT64, start + part * m * n))
                     )
-                    target = build.gep(self._matrix_entry(a, i, j, m), [ir.Constant(INT64, part)])
+                    target = build.gep(self._matrix_entry_pointer(a, i, j, m), [ir.Constant(INT64, part)])
                     build.store(build.load(source), target)
         return a
 
@@ -273,18 +273,19 @@ class _KernelWriter:
             for j in self._loop(n):
                 offset = build.add(build.mul(i, ir.Constant(INT64, n)), j)
                 for part in range(self.parts_per_entry):
-                    value = build.load(build.gep(self._matrix_entry(a, i, j, m), [ir.Constant(INT64, part)]))
+                    value = build.load(build.gep(self._matrix_entry_pointer(a, i, j, m), [ir.Constant(INT64, part)]))
                     build.store(
-                        value, self._output_entry(result_index, build.add(offset, ir.Constant(INT64, part * m * n)))
+                        value,
+                        self._output_entry_pointer(result_index, build.add(offset, ir.Constant(INT64, part * m * n))),
                     )
 
     def _copy_output_vector(self, result_index: int, w: ir.Value, n: int) -> None:
         for i in self._loop(n):
-            self.builder.store(self.builder.load(self.builder.gep(w, [i])), self._output_entry(result_index, i))
+            self.builder.store(self.builder.load(self.builder.gep(w, [i])), self._output_entry_pointer(result_index, i))
 
     def _write_nan(self) -> None:
         for i in self._loop(len(self.call.kinds)):
-            self.builder.store(ir.Constant(FLOAT64, math.nan), self._lane_entry(self.output_pointer, i))
+            self.builder.store(ir.Constant(FLOAT64, math.nan), self._lane_entry_pointer(self.output_pointer, i))
 
     # -- what LAPACK is told ------------------------------------------------------------------------------------------
 
@@ -298,12 +299,12 @@ class _KernelWriter:
     def _allocate_integers(self, count: int) -> ir.Value:
         return self._allocate(INT32, count)
 
-    def _integer_argument(self, value: int) -> ir.Value:
+    def _pointer_to_integer(self, value: int) -> ir.Value:
         pointer = self._allocate_integers(1)
         self.builder.store(ir.Constant(INT32, value), pointer)
         return pointer
 
-    def _char_argument(self, letter: str) -> ir.Value:
+    def _pointer_to_char(self, letter: str) -> ir.Value:
         pointer = self._allocate(INT8, 1)
         self.builder.store(ir.Constant(INT8, ord(letter)), pointer)
         return pointer

@@ -204,7 +204,7 @@ class _StepLoopWriter(ProgramWriter):
             ):
                 self.load_noise_increments(build.add(build.mul(i, total_steps), build.load(steps_done)))
                 self.active_lanes = is_running()
-                self.run_program("step")
+                self.write_program_and_store_results("step")
                 self.active_lanes = None
                 build.store(build.add(build.load(steps_done), self.int64(1)), steps_done)
                 with build.if_then(
@@ -219,7 +219,7 @@ class _StepLoopWriter(ProgramWriter):
         with self.loop_range(self.arguments["count"]) as i:
             self.select_block(i)
             self.load_rows([name for name in self.programs["begin"].arguments if name != "p"])
-            self.run_program("begin")
+            self.write_program_and_store_results("begin")
             self.store_rows([name for name in self.state_names if name in self.programs["begin"].results])
         self.builder.ret_void()
 
@@ -272,7 +272,7 @@ class _StepLoopWriter(ProgramWriter):
 
     # -- rows and slots -----------------------------------------------------------------------------------------------
 
-    def run_program(self, name: str) -> None:
+    def write_program_and_store_results(self, name: str) -> None:
         """Run a program; in the active lanes its results replace the old values."""
         named_program, build, active_lanes = self.programs[name], self.builder, self.active_lanes
 

@@ -221,8 +221,8 @@ class BlockResults:
         table, row = divmod(i - len(self.values), self.length)
         return self.tables[table].read(ir.Constant(ir.IntType(64), row))
 
-    def table_at(self, start: int) -> Table:
-        return self.tables[(start - len(self.values)) // self.length]
+    def table_at(self, first_result_index: int) -> Table:
+        return self.tables[(first_result_index - len(self.values)) // self.length]
 
 
 def make_table(writer: Any, values: Sequence[ir.Value]) -> Table:
@@ -240,12 +240,12 @@ def _call_routine(writer: Any, routine: Routine, args: Sequence[Any]) -> BlockRe
     results = Table(writer, writer.double_type, length=n_results)
     signature = repr((routine, *((i, a.signature) for i, a in tables.items())))
     name = "routine_" + hashlib.sha256(signature.encode()).hexdigest()[:16]
-    function = build.module.globals.get(name) or _routine_function(writer, routine, name, tables)
+    function = build.module.globals.get(name) or _write_routine_function(writer, routine, name, tables)
     build.call(function, [inputs.start, results.start, *(a.start for a in tables.values())])
     return BlockResults([], [results], n_results)
 
 
-def _routine_function(writer: Any, routine: Routine, name: str, tables: Mapping[int, Table]) -> ir.Function:
+def _write_routine_function(writer: Any, routine: Routine, name: str, tables: Mapping[int, Table]) -> ir.Function:
     argument_types = [writer.double_type.as_pointer()] * 2 + [a.start.type for a in tables.values()]
     function, function_writer = writer.new_function(name, argument_types)
     build, (inputs, results, *starts) = function_writer.builder, function.args
@@ -275,12 +275,12 @@ def _write_product(writer: Any, block: MatrixProduct, args: Sequence[Table]) -> 
     product = Table(writer, writer.double_type, length=m * n)
     signature = repr((block.sizes, block.strides, *(a.signature for a in args)))
     name = "product_" + hashlib.sha256(signature.encode()).hexdigest()[:16]
-    function = build.module.globals.get(name) or _product_function(writer, block, args, name)
+    function = build.module.globals.get(name) or _write_product_function(writer, block, args, name)
     build.call(function, [*(a.start for a in args), product.start])
     return BlockResults([], [product], m * n)
 
 
-def _product_function(writer: Any, block: MatrixProduct, tables: Sequence[Table], name: str) -> ir.Function:
+def _write_product_function(writer: Any, block: MatrixProduct, tables: Sequence[Table], name: str) -> ir.Function:
     m, k, n = block.sizes
     function, function_writer = writer.new_function(
         name, [*(a.start.type for a in tables), writer.double_type.as_pointer()]

@@ -38,17 +38,17 @@ class MachineCode:
             lapack.bind_symbols()
         with _lock:
             for self.skip_optimisation in (False, True) if skip_optimisation else (False,):
-                name = hashlib.sha256(f"{_host_target()[-1]} {self.skip_optimisation}\n{text}".encode()).hexdigest()[
-                    :32
-                ]
-                object_file = _object_file(code_cache.read_machine_code(name))
+                name = hashlib.sha256(
+                    f"{_host_target_cpu_features_and_text()[-1]} {self.skip_optimisation}\n{text}".encode()
+                ).hexdigest()[:32]
+                object_file = _parse_object_file(code_cache.read_machine_code(name))
                 if object_file is not None:
                     break
             else:
                 code = _compile_module(text, skip_optimisation)
                 code_cache.write_machine_code(name, code)
-                object_file = _object_file(code)
-            self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _target_machine())
+                object_file = _parse_object_file(code)
+            self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _new_target_machine())
             self._engine.add_object_file(object_file)
             self._engine.finalize_object()
 
@@ -61,7 +61,7 @@ _lock = threading.Lock()
 
 
 @functools.cache
-def _host_target() -> tuple[llvm.Target, str, str, str]:
+def _host_target_cpu_features_and_text() -> tuple[llvm.Target, str, str, str]:
     """Return the LLVM target, CPU and features of this machine, and a text that identifies them and the LLVM version.
 
     ``$LIETHERMO_CPU`` selects another CPU whose instructions this machine supports, by its LLVM name, such as
@@ -79,13 +79,13 @@ def _host_target() -> tuple[llvm.Target, str, str, str]:
     return llvm.Target.from_triple(triple), cpu, features, f"{triple} {cpu} {features} {version}"
 
 
-def _target_machine(skip_optimisation: bool = False) -> llvm.TargetMachine:
+def _new_target_machine(skip_optimisation: bool = False) -> llvm.TargetMachine:
     """Return an LLVM compiler for this machine; an engine created with it owns it."""
-    target, cpu, features, _ = _host_target()
+    target, cpu, features, _ = _host_target_cpu_features_and_text()
     return target.create_target_machine(cpu, features, opt=0 if skip_optimisation else 3, jit=True, reloc="pic")
 
 
-def _object_file(code: bytes | None) -> llvm.ObjectFileRef | None:
+def _parse_object_file(code: bytes | None) -> llvm.ObjectFileRef | None:
     """Return the code as an object file for the linker; None if it is no valid object file, which would crash LLVM."""
     if code is None or not (code.startswith(OBJECT_FILE_MAGICS) or _is_valid_elf(code)):
         return None
@@ -121,7 +121,7 @@ SHT_NOBITS = 8
 
 
 def _compile_module(text: str, skip_optimisation: bool) -> bytes:
-    module, target = llvm.parse_assembly(text), _target_machine(skip_optimisation)
+    module, target = llvm.parse_assembly(text), _new_target_machine(skip_optimisation)
     module.verify()
     if skip_optimisation:
         return target.emit_object(module)

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ...integrators import OneStepMethod
-from ...integrators.fluctuating import noise_dimension, set_noise_increments
+from ...integrators.fluctuating import noise_dimension, with_noise_increments
 from ...systems import System
 from ...tracing.caching import LRUCache
 from ...tracing.calls import deferred_p
@@ -358,7 +358,7 @@ class CompiledStepLoop:
         if not control:
             h, *fields = inputs
             return take_step(
-                system, set_noise_increments(method, dW), State(*fields), h, self._options, self._newton_fallback(dW)
+                system, with_noise_increments(method, dW), State(*fields), h, self._options, self._newton_fallback(dW)
             )
         previous_state = AdaptiveState(State(*inputs[: len(STATE_FIELDS)]), *inputs[len(STATE_FIELDS) :])
         adaptive_state = attempt_step(
@@ -388,7 +388,7 @@ class CompiledStepLoop:
         inputs = NewtonInputs(*arrays[len(NEWTON_OUTPUTS) :])
         equations = stage_equations(
             system,
-            set_noise_increments(method, inputs.dW),
+            with_noise_increments(method, inputs.dW),
             inputs.x,
             inputs.compensation,
             inputs.h,

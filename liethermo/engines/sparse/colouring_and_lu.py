@@ -60,7 +60,7 @@ class JacobianCompression:
 
     @property
     def n_derivatives(self) -> int:
-        """Number of derivatives that one Jacobian matrix takes."""
+        """Return the number of directional derivatives (jvp and vjp) that one Jacobian matrix takes."""
         return self.stages * (len(self._colour_entries) + len(self.dense_rows))
 
     def assemble_jacobian(self, jvp: Callable, vjp: Callable) -> scipy.sparse.csc_array:

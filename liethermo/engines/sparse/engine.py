@@ -22,7 +22,7 @@ from ...systems import System
 from ...tracing.programs import jit_cached
 from ..array_engine import EngineTrajectory
 from ..solver_options import DEFAULT_OPTIONS
-from ..stage_solver import IterationState, StageEquations, StageSolution, best_initial_guess, solve_fixed_point
+from ..stage_solver import IterationState, StageEquations, StageSolution, best_guess_and_residual, solve_fixed_point
 from ..status_codes import StatusCode
 from ..step import State, finish_step, initial_run_state_program, stage_equations
 from .colouring_and_lu import JacobianCompression, SparseInverse
@@ -104,7 +104,7 @@ class SparseEngine:
     # -- Newton's method ------------------------------------------------------------------------------------------
 
     def _solve_newton(self, state: State, h, n_fixed_point: int) -> StageSolution:
-        k, residual, scale = _best_guess_program(self.system, self.method, state, h)
+        k, residual, scale = _best_guess_residual_and_scale(self.system, self.method, state, h)
         s, needs_jacobian = IterationState.initial(k), float(h) != self._factored_step_size
         slope_rounding = jnp.zeros(())
         while (
@@ -126,7 +126,7 @@ class SparseEngine:
             )
             if newton_step is None and needs_jacobian:
                 s = s._replace(n_stalled=jnp.asarray(2))  # no damped step decreases the residual
-                slope_rounding = _residual_rounding(self.system, self.method, state.x)
+                slope_rounding = _residual_rounding_scale(self.system, self.method, state.x)
                 break
             needs_jacobian = newton_step is None
             if newton_step is not None:
@@ -135,7 +135,7 @@ class SparseEngine:
                     s.update > SPARSE_SOLVER_OPTIONS.jacobian_contraction_limit * s.previous_update
                 ) and float(s.update) > SPARSE_SOLVER_OPTIONS.plateau_rtol * float(scale)
             if int(s.n_stalled) >= 2 and not slope_rounding and not bool(s.is_at_plateau(scale, SPARSE_SOLVER_OPTIONS)):
-                slope_rounding = _residual_rounding(self.system, self.method, state.x)
+                slope_rounding = _residual_rounding_scale(self.system, self.method, state.x)
         is_finite = bool(jnp.isfinite(residual).all())
         return StageSolution(
             k=s.k,
@@ -164,24 +164,24 @@ class SparseEngine:
         norm = float(jnp.linalg.norm(residual))
         for _ in range(max_trials):
             k = s.k - step
-            new_residual, new_scale = _weighted_residual(self.system, self.method, state, h, k)
+            new_residual, new_scale = _weighted_residual_and_scale(self.system, self.method, state, h, k)
             new_norm = float(jnp.linalg.norm(new_residual))
             is_rounding = float(np.abs(step).max()) <= SPARSE_SOLVER_OPTIONS.plateau_rtol * float(scale)
             if new_norm < norm or (is_rounding and np.isfinite(new_norm)):
-                return s.next_state(k, SPARSE_SOLVER_OPTIONS), new_residual, new_scale
+                return s.after_update(k, SPARSE_SOLVER_OPTIONS), new_residual, new_scale
             step = 0.5 * step
         return None
 
     def _jacobian_inverse(self, state, h, k) -> SparseInverse | None:
-        """Return the inverse of the Jacobian matrix of the residual; None if it is singular or not finite."""
+        """Return the solver of the weighted Newton equations at k; None if its matrix is singular."""
         if self._compression is None:
             self._compression = JacobianCompression(self._pattern, self.method.stages)
 
         def jvp(seed):
-            return _residual_jvp(self.system, self.method, state, h, k, seed)
+            return _weighted_residual_jvp(self.system, self.method, state, h, k, seed)
 
         def vjp(seed):
-            return _residual_vjp(self.system, self.method, state, h, k, seed)
+            return _weighted_residual_vjp(self.system, self.method, state, h, k, seed)
 
         try:
             return SparseInverse(self._compression.assemble_jacobian(jvp, vjp), self._compression.front_width)
@@ -223,32 +223,32 @@ def _weighted_residual_guess_and_scale(system: System, method: OneStepMethod, st
 
 
 @jit_cached
-def _weighted_residual(system: System, method: OneStepMethod, state: State, h, k) -> tuple[Any, Any]:
+def _weighted_residual_and_scale(system: System, method: OneStepMethod, state: State, h, k) -> tuple[Any, Any]:
     residual, _, scale = _weighted_residual_guess_and_scale(system, method, state, h)
     return residual(k), scale(k)
 
 
 @jit_cached
-def _residual_rounding(system: System, method: OneStepMethod, x) -> Any:
+def _residual_rounding_scale(system: System, method: OneStepMethod, x) -> Any:
     """Return the scale at which the weighted residual is rounded."""
     return jnp.max(value_and_rounding_scale(lambda x: system.residual_weights(x) * system.vector_field(x), x)[1])
 
 
 @jit_cached
-def _best_guess_program(system: System, method: OneStepMethod, state: State, h):
+def _best_guess_residual_and_scale(system: System, method: OneStepMethod, state: State, h):
     """Return the predicted slopes, or zero slopes if their residual is smaller, with residual and scale."""
     residual_function, guess, scale = _weighted_residual_guess_and_scale(system, method, state, h)
-    k, residual = best_initial_guess(residual_function, guess)
+    k, residual = best_guess_and_residual(residual_function, guess)
     return k, residual, scale(k)
 
 
 @jit_cached
-def _residual_jvp(system: System, method: OneStepMethod, state: State, h, k, seed):
+def _weighted_residual_jvp(system: System, method: OneStepMethod, state: State, h, k, seed):
     residual = _weighted_residual_guess_and_scale(system, method, state, h)[0]
     return jax.jvp(residual, (k,), (jnp.asarray(seed),))[1]
 
 
 @jit_cached
-def _residual_vjp(system: System, method: OneStepMethod, state: State, h, k, seed):
+def _weighted_residual_vjp(system: System, method: OneStepMethod, state: State, h, k, seed):
     residual = _weighted_residual_guess_and_scale(system, method, state, h)[0]
     return jax.vjp(residual, k)[1](jnp.asarray(seed))[0]

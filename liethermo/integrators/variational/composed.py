@@ -42,11 +42,11 @@ class ComposedVariational(MethodWrapper):
         assert isinstance(system, ComposedSystem)
         maps = self.maps
         if len(maps) == 1:
-            return system.vector_field(x + (compensation + h * map_fractions(system, maps[0]) * k[0]))[None]
+            return system.vector_field(x + (compensation + h * component_step_fractions(system, maps[0]) * k[0]))[None]
         (q, p, S, _), total = system.poisson.state_indices, sum(map.weight for map in maps)
         map_weights, end_fractions = [map.weight / total for map in maps], [1.0 - map.alpha for map in maps]
 
-        def mean(values) -> jax.Array:
+        def weighted_mean(values) -> jax.Array:
             return (
                 sum(part * value for part, value in zip(map_weights[1:], values[1:], strict=True))
                 + map_weights[0] * values[0]
@@ -54,11 +54,12 @@ class ComposedVariational(MethodWrapper):
 
         # the points of the maps, each with its own momentum
         displacements = [
-            (h * map_fractions(system, map) * k[0]).at[p].set(h * row[p]) for map, row in zip(maps, k[1:], strict=True)
+            (h * component_step_fractions(system, map) * k[0]).at[p].set(h * row[p])
+            for map, row in zip(maps, k[1:], strict=True)
         ]
         points = [x + (compensation + d) for d in displacements]
         gradients = [system.energy.gradient(point) for point in points]
-        temperatures = mean([dH[S] for dH in gradients])
+        temperatures = weighted_mean([dH[S] for dH in gradients])
         dS = jnp.zeros_like(x).at[S].set(1.0)
         rates = []
         for point, dH in zip(points, gradients, strict=True):
@@ -66,15 +67,15 @@ class ComposedVariational(MethodWrapper):
             if system.dissipation is not None:  # with the mean temperatures at all points
                 rate = rate + system.dissipation.force(system, point, dH.at[S].set(temperatures), dS, ())
             rates.append(rate)
-        step = mean(rates)
+        step = weighted_mean(rates)
         if not len(p):
             return jnp.concatenate([step[None], jnp.zeros_like(k[1:])])
         mass_matrices = [inverse(_momentum_hessian(system, point, p)) for point in points]
-        momentum_gap = mean(
+        momentum_gap = weighted_mean(
             [share * rate[p] - row[p] for share, rate, row in zip(end_fractions, rates, k[1:], strict=True)]
         )
-        momentum_velocity = mean([M @ dH[p] for M, dH in zip(mass_matrices, gradients, strict=True)])
-        V = inverse(mean(mass_matrices)) @ (h * momentum_gap + momentum_velocity)
+        momentum_velocity = weighted_mean([M @ dH[p] for M, dH in zip(mass_matrices, gradients, strict=True)])
+        V = inverse(weighted_mean(mass_matrices)) @ (h * momentum_gap + momentum_velocity)
         rows = [
             jnp.zeros_like(x).at[p].set(row[p] + M @ (V - dH[p]) / h)
             for row, M, dH in zip(k[1:], mass_matrices, gradients, strict=True)
@@ -92,7 +93,7 @@ class ComposedVariational(MethodWrapper):
         return np.multiply.outer(np.asarray(theta, dtype=float), np.eye(self.stages)[0])
 
 
-def map_fractions(system: ComposedSystem, map: FiniteDifference) -> np.ndarray:
+def component_step_fractions(system: ComposedSystem, map: FiniteDifference) -> np.ndarray:
     """Return, for each component of a composed system, the fraction of the step at which the map evaluates it."""
     q, p, _, _ = system.poisson.state_indices
     fractions = np.full(system.dim, map.beta)

@@ -157,7 +157,7 @@ class DiscreteSystem(Module):
 
     # -- in difference quotients, per unit of time ------------------------------------------------------------------
 
-    def _map_points(self, maps, pair: Pair) -> Iterator[MapPoint]:
+    def _points_of_maps(self, maps, pair: Pair) -> Iterator[MapPoint]:
         total = sum(map.weight for map in maps)
         for map in maps:
             q, v = self._position_and_velocity(map, pair.q0, pair.V)
@@ -179,13 +179,13 @@ class DiscreteSystem(Module):
 
     def action(self, q0, V, S0, s) -> jax.Array:
         """Return ``L_d / h``."""
-        points = self._map_points(self.lagrangian_maps, Pair(q0, V, S0, s))
+        points = self._points_of_maps(self.lagrangian_maps, Pair(q0, V, S0, s))
         return _sum_arrays([p.weight * self.system.lagrangian_value(p.q, p.v, p.S) for p in points])
 
     def impulses(self, pair: Pair, friction: bool = True, external: bool = True) -> tuple[jax.Array, jax.Array]:
         """Return ``F^-_d / h`` and ``F^+_d / h``, shape (n,) each."""
         impulse_minus = impulse_plus = jnp.zeros_like(pair.V)
-        for p in self._map_points(self.force_maps, pair):
+        for p in self._points_of_maps(self.force_maps, pair):
             F = jnp.zeros_like(p.v)
             F = F + self.system.friction_force(*p[2:]) if friction else F
             F = F + self.system.external_force(*p[2:]) if external else F
@@ -222,9 +222,9 @@ class DiscreteSystem(Module):
         return force if self.curve is None else force - self.momentum_residual(p0, pair) / self.h
 
     def constraint_residual(self, pair: Pair) -> jax.Array:
-        """Return ``-P_d``, the mean of ``T s + F_fr . v - P_H``; NaN if a temperature is not positive [GBY 3.9]."""
+        """Return the residual of the constraint, the mean of ``T s + F_fr . v - P_H``; NaN if T <= 0 [GBY 3.9]."""
         total = jnp.zeros(())
-        for p in self._map_points(self.constraint_maps, pair):
+        for p in self._points_of_maps(self.constraint_maps, pair):
             T = -jax.grad(self.system.lagrangian_value, argnums=2)(p.q, p.v, p.S)
             power = jnp.dot(self.system.friction_force(*p[2:]), p.v) - self.system.heating(*p[2:])
             total = total + p.weight * (jnp.where(T > 0.0, T, jnp.nan) * pair.s + power)
@@ -234,14 +234,14 @@ class DiscreteSystem(Module):
         """Return the work and the heat received from outside, per unit of time."""
         impulse_minus, impulse_plus = self.impulses(pair, friction=False)
         heat = _sum_arrays(
-            [p.weight * self.system.heating(*p[2:]) for p in self._map_points(self.constraint_maps, pair)]
+            [p.weight * self.system.heating(*p[2:]) for p in self._points_of_maps(self.constraint_maps, pair)]
         )
         return jnp.dot(impulse_minus + impulse_plus, pair.V), heat
 
     def energy(self, pair: Pair) -> jax.Array:
         """Return ``E = v . L_v - L``, the mean over the points of the discrete Lagrangian."""
         energy = self.system.contact.energy
-        points = self._map_points(self.lagrangian_maps, pair)
+        points = self._points_of_maps(self.lagrangian_maps, pair)
         return _sum_arrays([p.weight * energy(jnp.concatenate([p.q, p.v, p.S[None]])) for p in points])
 
     # -- as in the paper ----------------------------------------------------------------------------------------------
@@ -254,7 +254,7 @@ class DiscreteSystem(Module):
         return self.h * self.action(*self.pair(q0, q1, S0, S1))
 
     def forces(self, q0, q1, S0, S1, friction: bool = True, external: bool = True) -> tuple[jax.Array, jax.Array]:
-        """Return ``F^-_d`` and ``F^+_d``, shape (n,) each [GBY Definition 3.2]."""
+        """Return the discrete forces ``F^-_d`` and ``F^+_d``, impulses of shape (n,) each [GBY Definition 3.2]."""
         impulse_minus, impulse_plus = self.impulses(self.pair(q0, q1, S0, S1), friction, external)
         return self.h * impulse_minus, self.h * impulse_plus
 
@@ -272,10 +272,10 @@ class DiscreteSystem(Module):
     def regularity_matrix(self, q0, q1, S0, S1) -> jax.Array:
         """Return the matrix (3.13), shape (n + 1, n + 1): if it is invertible, q_1 and S_1 determine the step."""
 
-        def equations(q1, S1):
+        def momentum_and_constraint(q1, S1):
             return -self.momenta(q0, q1, S0, S1)[0], self.constraint(q0, q1, S0, S1)
 
-        (A, B), (C, D) = jax.jacfwd(equations, argnums=(0, 1))(q1, S1)
+        (A, B), (C, D) = jax.jacfwd(momentum_and_constraint, argnums=(0, 1))(q1, S1)
         return jnp.block([[A, B[:, None]], [C[None], D[None, None]]])
 
     def reduced_matrix(self, q0, q1, S0, S1) -> jax.Array:
@@ -283,7 +283,7 @@ class DiscreteSystem(Module):
         matrix = self.regularity_matrix(q0, q1, S0, S1)
         return matrix[:-1, :-1] - jnp.outer(matrix[:-1, -1], matrix[-1, :-1]) / matrix[-1, -1]
 
-    def solve_constraint(self, q0, q1, S0, steps: int = 12) -> jax.Array:
+    def end_entropy_on_constraint(self, q0, q1, S0, steps: int = 12) -> jax.Array:
         """Return S_1 with ``P_d(q_0, q_1, S_0, S_1) = 0`` after ``steps`` Newton steps; differentiable."""
         V = (q1 - q0) / self.h
 

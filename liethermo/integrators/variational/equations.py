@@ -16,10 +16,10 @@ from ...tracing.programs import jit_cached
 from .discrete import DiscreteSystem, Pair
 
 
-def newton_step(discrete: DiscreteSystem, v0, p0, guess: Pair) -> tuple[jax.Array, jax.Array]:
+def newton_step(discrete: DiscreteSystem, start_velocity, p0, guess: Pair) -> tuple[jax.Array, jax.Array]:
     """Return V and s after one step of Newton's method for (3.12) from a guess; from zero if one step is exact."""
     n, (q0, V, S0, s) = len(guess.V), guess
-    mass = mass_scale(discrete.system, q0, v0, S0)
+    mass = mass_scale(discrete.system, q0, start_velocity, S0)
     is_affine = discrete.curve is None and (
         polynomial_degree_bound(_motion_residual_of_V, (discrete, p0, guess), n) <= 1
         and polynomial_degree_bound(_motion_residual_of_s, (discrete, p0, guess), 1) == 0
@@ -42,30 +42,32 @@ def newton_step(discrete: DiscreteSystem, v0, p0, guess: Pair) -> tuple[jax.Arra
     return V, s - constraint_value / slope
 
 
-def _jacobian_and_value(function: Callable, *at):
+def _jacobian_and_value(function: Callable, *arguments):
     """Return the derivatives of a function by all of its arguments, and its value."""
     return jax.jacfwd(
-        lambda *a: (lambda y: (y, y))(function(*a)), argnums=tuple(range(len(at))) if len(at) > 1 else 0, has_aux=True
-    )(*at)
+        lambda *a: (lambda y: (y, y))(function(*a)),
+        argnums=tuple(range(len(arguments))) if len(arguments) > 1 else 0,
+        has_aux=True,
+    )(*arguments)
 
 
-def _motion_residual_of_V(model, V):
-    discrete, p0, guess = model
+def _motion_residual_of_V(fixed_arguments, V):
+    discrete, p0, guess = fixed_arguments
     return discrete.motion_residual(p0, guess._replace(V=V))
 
 
-def _motion_residual_of_s(model, s):
-    discrete, p0, guess = model
+def _motion_residual_of_s(fixed_arguments, s):
+    discrete, p0, guess = fixed_arguments
     return discrete.motion_residual(p0, guess._replace(s=s[0]))
 
 
-def _constraint_residual_of_s(model, s):
-    discrete, _, guess = model
+def _constraint_residual_of_s(fixed_arguments, s):
+    discrete, _, guess = fixed_arguments
     return discrete.constraint_residual(guess._replace(s=s[0]))
 
 
 def velocity_slope(system: SimpleClosedSystem, start, end, force, h) -> jax.Array:
-    """Return ``(v_1 - v_0)/h`` with ``L_v(q_1, v_1, S_1) = p_0 + h force``, after one step of Newton's method.
+    """Return the slope ``(v_1 - v_0)/h`` of the velocity with the momentum ``p_0 + h force``, by one Newton step.
 
     Parameters
     ----------
@@ -81,12 +83,14 @@ def velocity_slope(system: SimpleClosedSystem, start, end, force, h) -> jax.Arra
     return slope - solve(W, residual[:, None])[:, 0]
 
 
-def _restrict_to_tangents(system: SimpleClosedSystem, q, v, W, residual, h=1.0) -> tuple[jax.Array, jax.Array]:
+def _restrict_to_tangents(
+    system: SimpleClosedSystem, q, v, mass_matrix, residual, h=1.0
+) -> tuple[jax.Array, jax.Array]:
     """Restrict the matrix and the residual (over h) of an equation for a momentum to velocities v tangent to Q."""
     space = system.configurations
     if space is None:
-        return W, residual
-    surface, mass = ConstraintSurface(space, tangent=True), jnp.max(jnp.abs(W))
+        return mass_matrix, residual
+    surface, mass = ConstraintSurface(space, tangent=True), jnp.max(jnp.abs(mass_matrix))
 
     def normal_residual(w):
         return surface._correction_displacement(
@@ -94,22 +98,22 @@ def _restrict_to_tangents(system: SimpleClosedSystem, q, v, W, residual, h=1.0) 
         )
 
     tangent_columns = jax.vmap(lambda w: system.tangential_part(q, w), in_axes=1, out_axes=1)
-    W = tangent_columns(W) + mass * jax.vmap(normal_residual, out_axes=1)(jnp.eye(len(v)))
-    return W, system.tangential_part(q, residual) + mass / h * normal_residual(v)
+    mass_matrix = tangent_columns(mass_matrix) + mass * jax.vmap(normal_residual, out_axes=1)(jnp.eye(len(v)))
+    return mass_matrix, system.tangential_part(q, residual) + mass / h * normal_residual(v)
 
 
 def mass_scale(system: SimpleClosedSystem, q, v, S) -> jax.Array:
-    """Return the size of ``L_vv``, shape ()."""
+    """Return the largest entry of the mass matrix ``L_vv`` by absolute value, shape ()."""
     return jnp.max(jnp.abs(jax.jacfwd(system.momentum, argnums=1)(q, v, S)))
 
 
-def _momentum_of_v(model, v):
-    system, q, S = model
+def _momentum_of_v(fixed_arguments, v):
+    system, q, S = fixed_arguments
     return system.momentum(q, v, S)
 
 
 @jit_cached
-def velocity_from_momentum(system: SimpleClosedSystem, q, S, p, v):
+def velocity_from_momentum(system: SimpleClosedSystem, q, S, p, velocity_guess):
     """Return v with ``L_v(q, v, S) = p``, near a guess; NaN if Newton's method does not converge."""
 
     def newton(_, v):
@@ -117,6 +121,6 @@ def velocity_from_momentum(system: SimpleClosedSystem, q, S, p, v):
         W, residual = _restrict_to_tangents(system, q, v, W, momentum - p)
         return v - solve(W, residual[:, None])[:, 0]
 
-    v = jax.lax.fori_loop(0, 20, newton, v)
-    max_residual = jnp.max(jnp.abs(system.tangential_part(q, system.momentum(q, v, S) - p)))
-    return jnp.where(max_residual <= 1e-12 * (1.0 + jnp.max(jnp.abs(p))), v, jnp.nan)
+    velocity_guess = jax.lax.fori_loop(0, 20, newton, velocity_guess)
+    max_residual = jnp.max(jnp.abs(system.tangential_part(q, system.momentum(q, velocity_guess, S) - p)))
+    return jnp.where(max_residual <= 1e-12 * (1.0 + jnp.max(jnp.abs(p))), velocity_guess, jnp.nan)

@@ -19,7 +19,14 @@ from ...errors import InputError
 from ...functions.conditions import require_condition
 from ...systems import EulerPoincareClosedSystem, System
 from ...tracing.programs import jit_cached
-from ..base import WHY_FIXED_VARIATIONAL_STEP, OneStepMethod, checked_run_states, checked_step_size, kind_name, register
+from ..base import (
+    WHY_FIXED_VARIATIONAL_STEP,
+    OneStepMethod,
+    checked_run_states,
+    checked_step_size,
+    kind_or_class_name,
+    register,
+)
 
 NEWTON_STEPS = 20
 """Newton steps for the velocities between the states of a finished run."""
@@ -73,7 +80,9 @@ class LieVariational(OneStepMethod):
     def check(self, system: System) -> None:
         """Raise InputError if the system has the wrong kind, or its algebra has no group by the Cayley map."""
         if not isinstance(system, EulerPoincareClosedSystem):
-            raise InputError(f"LieVariational needs an lt.EulerPoincareClosedSystem, got a {kind_name(system)}")
+            raise InputError(
+                f"LieVariational needs an lt.EulerPoincareClosedSystem, got a {kind_or_class_name(system)}"
+            )
         algebra = system.algebra
         if self.tau == "exp":
             return
@@ -160,11 +169,11 @@ class _LieStep(NamedTuple):
         xi, S, t = self._midpoint(y)
         force = self.system.friction_force(xi, S, t) + self.system.external_force(xi, S, t)
         mu, impulse = self.system.momentum(xi, S), 0.5 * self.h * force
-        mu_start, mu_end = (self._apply_dtau_inverse(sign * self.h * xi, mu) for sign in (1.0, -1.0))
+        mu_start, mu_end = (self._apply_dtau_inverse_transpose(sign * self.h * xi, mu) for sign in (1.0, -1.0))
         return mu_start - impulse, mu_end + impulse
 
-    def _apply_dtau_inverse(self, xi, mu) -> jax.Array:
-        """Return ``(dtau^-1_xi)* mu`` with the derivative trivialised on the right; for -xi on the left."""
+    def _apply_dtau_inverse_transpose(self, xi, mu) -> jax.Array:
+        """Return the transpose of ``dtau^-1_xi`` applied to mu, trivialised on the right; for -xi on the left."""
         algebra = self.system.algebra
         if self.tau == "exp":
             return solve(dexp(algebra, -xi).T, mu[:, None])[:, 0]

@@ -23,7 +23,7 @@ from ..base import (
     apply_increment,
     checked_run_states,
     checked_step_size,
-    kind_name,
+    kind_or_class_name,
     register,
 )
 from ..charts import resolve_retraction
@@ -107,7 +107,7 @@ class VariationalIntegrator(OneStepMethod):
 
     @classmethod
     def verlet(cls, retraction: str | mf.Retraction | None = None) -> VariationalIntegrator:
-        """Scheme 1: evaluate at (q_k, S_k); order 1, explicit for quadratic kinetic energy and linear friction.
+        """Return scheme 1, of order 1, evaluated at (q_k, S_k): explicit for quadratic kinetic energy, linear friction.
 
         ``retraction`` has the curves on a manifold.
         """
@@ -115,7 +115,7 @@ class VariationalIntegrator(OneStepMethod):
 
     @classmethod
     def midpoint(cls, alpha: float = 0.5, retraction: str | mf.Retraction | None = None) -> VariationalIntegrator:
-        """Scheme 2: evaluate at ``(1 - alpha) (q_k, S_k) + alpha (q_k+1, S_k+1)``; order 2 for alpha = 1/2, else 1.
+        """Return scheme 2, evaluated between both ends at the fraction alpha: order 2 for alpha = 1/2, else 1.
 
         ``retraction`` has the curves on a manifold.
         """
@@ -123,7 +123,7 @@ class VariationalIntegrator(OneStepMethod):
 
     @classmethod
     def symmetrised(cls, retraction: str | mf.Retraction | None = None) -> VariationalIntegrator:
-        """Scheme 3: the mean of both ends; order 2.
+        """Return scheme 3, of order 2, which takes the mean of the values at both ends.
 
         ``retraction`` has the curves on a manifold.
         """
@@ -168,11 +168,11 @@ class VariationalIntegrator(OneStepMethod):
                 f"retraction= needs a manifold of positions, and this {system.kind} has none. Leave retraction= out"
             )
         elif isinstance(system, ComposedSystem):
-            self._check_bodies(system)
+            self._check_maps_for_bodies(system)
         else:
             require_simple_closed(system, "VariationalIntegrator")
 
-    def _check_bodies(self, system: ComposedSystem) -> None:
+    def _check_maps_for_bodies(self, system: ComposedSystem) -> None:
         if not (self.phi == self.forces == self.constraint):
             raise InputError(f"for several bodies the maps of forces and constraint must be phi, and {self} has others")
         if any(type(map) is not FiniteDifference for map in self.phi):
@@ -193,7 +193,7 @@ class VariationalIntegrator(OneStepMethod):
         )
 
     def discrete_system(self, system: SimpleClosedSystem, h, t=0.0) -> DiscreteSystem:
-        """Return L_d, F_d and P_d of a step of size h from the time t."""
+        """Return the discrete system of a step of size h from the time t: its Lagrangian, forces and constraint."""
         curve = self.curve(system)
         return DiscreteSystem(system, self.phi, self.forces, self.constraint, jnp.asarray(h), jnp.asarray(t), curve)
 
@@ -260,7 +260,7 @@ class VariationalIntegrator(OneStepMethod):
             self.discrete_system(system, checked_step_size(h), checked_numbers(t, "t", ())),
             checked_numbers(S0, "S0", ()),
         )
-        S1_used = discrete.solve_constraint(q0, q1, S0) if S1 is None else checked_numbers(S1, "S1", ())
+        S1_used = discrete.end_entropy_on_constraint(q0, q1, S0) if S1 is None else checked_numbers(S1, "S1", ())
         residual, scale = (float(a) for a in _constraint_residual(discrete, q0, q1, S0, S1_used))
         if not residual <= CONSTRAINT_TOLERANCE * scale:
             raise InputError(
@@ -280,7 +280,7 @@ class VariationalIntegrator(OneStepMethod):
         return np.concatenate([q0, v0, S0[None], ledger])
 
     def energies(self, system: SimpleClosedSystem, x, h: float) -> np.ndarray:
-        """Return ``E = v·L_v - L`` at the scheme's own points between consecutive states, as in the paper.
+        """Return the energies ``v·L_v - L`` between consecutive states, at the points of the scheme, as in the paper.
 
         Parameters
         ----------
@@ -346,7 +346,7 @@ def require_simple_closed(system: System, name: str) -> None:
             f"{name} runs only on R^n. On a manifold use lt.VariationalIntegrator or a metriplectic method"
         )
     if not isinstance(system, SimpleClosedSystem):
-        raise InputError(f"{name} needs an lt.SimpleClosedSystem, got a {kind_name(system)}")
+        raise InputError(f"{name} needs an lt.SimpleClosedSystem, got a {kind_or_class_name(system)}")
 
 
 SCHEMES: dict[str, tuple[FiniteDifference, ...]] = {
@@ -374,7 +374,7 @@ def _is_symmetric_set(maps: tuple[FiniteDifference, ...]) -> bool:
 
 @jit_cached
 def _constraint_residual(discrete: DiscreteSystem, q0, q1, S0, S1):
-    """Return ``h |P_d|``, and the sum of the heat and the work that it is the difference of."""
+    """Return the size of the constraint residual, and its scale: the heat plus the work of the step."""
     pair = discrete.pair(q0, q1, S0, S1)
     residual, slope = jax.jvp(lambda s: discrete.constraint_residual(pair._replace(s=s)), (pair.s,), (jnp.ones(()),))
     heat = jnp.abs(slope * pair.s)

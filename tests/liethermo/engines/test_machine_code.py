@@ -229,13 +229,13 @@ def test_code_is_made_for_the_processor_that_is_named(tmp_path, monkeypatch):
     try:
         for cpu in ("x86-64", "x86-64-v2"):
             monkeypatch.setenv("LIETHERMO_CPU", cpu)
-            machine_code._host_target.cache_clear()
+            machine_code._host_target_cpu_features_and_text.cache_clear()
             for _ in range(2):
                 assert compiled(program, 8)(np.ones((8, 2)))[0].tolist() == [[4.75, 4.75]] * 8
-            assert "ymm" not in machine_code._target_machine().emit_assembly(llvm.parse_assembly(VECTOR_ADD_IR))
+            assert "ymm" not in machine_code._new_target_machine().emit_assembly(llvm.parse_assembly(VECTOR_ADD_IR))
     finally:
         monkeypatch.delenv("LIETHERMO_CPU")
-        machine_code._host_target.cache_clear()
+        machine_code._host_target_cpu_features_and_text.cache_clear()
     assert len(compilations) == len(list(tmp_path.glob("*.o"))) == 2
 
 

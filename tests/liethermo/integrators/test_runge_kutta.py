@@ -9,7 +9,7 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.engines.step import initial_run_state, take_step
-from liethermo.integrators.lobatto import ExplicitTableau, lobatto_tableau, tree_vectors
+from liethermo.integrators.lobatto import ExplicitTableau, lobatto_tableau, rooted_tree_vectors
 from tests.liethermo.integrators.test_orders import NONLINEAR
 
 RK = lt.MetriplecticRungeKutta
@@ -72,7 +72,7 @@ def test_order_conditions(order, stages):
             assert b @ vector == pytest.approx(1.0 / gamma, rel=1e-12)
             if n <= q:
                 assert abs(d @ vector) < 1e-14
-    assert max(abs(d @ v) for v in tree_vectors(A, q + 1)[q + 1]) > 1e-3
+    assert max(abs(d @ v) for v in rooted_tree_vectors(A, q + 1)[q + 1]) > 1e-3
 
 
 @pytest.mark.parametrize("order", ORDERS)

@@ -41,7 +41,7 @@ def implicit_root(residual, y):
 @eqx.filter_jit
 def slopes_of_two_steps(discrete, z):
     """Return s of the first pair, and the difference quotients of the second, without derivatives."""
-    r = z[:2], z[2:4], z[4], discrete.solve_constraint(z[:2], z[2:4], z[4])
+    r = z[:2], z[2:4], z[4], discrete.end_entropy_on_constraint(z[:2], z[2:4], z[4])
     _, q2, S1, S2 = discrete.flow(*r)
     return (r[3] - r[2])[None] / H, jnp.append(q2 - r[1], S2 - S1) / H
 

@@ -10,7 +10,7 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.engines.select_engine import EngineWithFallback
-from liethermo.integrators.fluctuating import noise_dimension, set_noise_increments
+from liethermo.integrators.fluctuating import noise_dimension, with_noise_increments
 from liethermo.models.gas_piston import gas_piston_state
 from liethermo.runs.threefry import threefry
 from liethermo.tracing import programs
@@ -381,7 +381,7 @@ def test_heat_of_a_bath_is_what_the_energy_changes_by():
         heat = jnp.dot(
             dH,
             0.05
-            * (set_noise_increments(noisy, dW).slopes(system, x, compensation, 0.05, d[None] / 0.05)[0] - velocity),
+            * (with_noise_increments(noisy, dW).slopes(system, x, compensation, 0.05, d[None] / 0.05)[0] - velocity),
         )
         return heat - (system.energy.value(new) - system.energy.value(x)), jnp.dot(dH, velocity)
 

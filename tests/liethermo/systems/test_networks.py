@@ -14,7 +14,7 @@ import liethermo as lt
 from liethermo.engines.sparse import colouring_and_lu
 from liethermo.functions.gradients import DISCRETE_GRADIENTS, stage_gradients
 from liethermo.integrators.tableaus import gauss_tableau
-from liethermo.models.heat_grid import grid_graph, heat_grid_solution
+from liethermo.models.heat_grid import grid_adjacency_matrix, heat_grid_solution
 from tests.cases import tolerance
 
 seeds = st.integers(0, 10**6)
@@ -189,7 +189,9 @@ def test_colours(seed):
     for i in set(range(40)) - set(compression.dense_rows.tolist()):
         colours = compression.colours[pattern.indices[pattern.indptr[i] : pattern.indptr[i + 1]]]
         assert len(set(colours)) == len(colours)
-    grid = colouring_and_lu.JacobianCompression(scipy.sparse.csr_array(grid_graph((9, 9)) + scipy.sparse.eye_array(81)))
+    grid = colouring_and_lu.JacobianCompression(
+        scipy.sparse.csr_array(grid_adjacency_matrix((9, 9)) + scipy.sparse.eye_array(81))
+    )
     assert grid.n_derivatives <= 9
     assert grid.front_width == 9
 
@@ -213,7 +215,7 @@ def test_a_singular_matrix():
 
 
 def grid_laplacian(shape):
-    graph = grid_graph(shape)
+    graph = grid_adjacency_matrix(shape)
     return scipy.sparse.diags_array(graph.sum(axis=1)) - graph
 
 
@@ -273,7 +275,7 @@ def test_a_step_that_is_refused():
     """T = S: where a step finds no positive temperatures the run stops, with the trajectory so far and a reason."""
     n = 5
     bodies = lt.Copies(n, lambda x: 0.5 * x[0] ** 2, 1, name="odd")
-    system = lt.ComposedSystem(bodies, conductance=grid_graph((n,)), validate=False)
+    system = lt.ComposedSystem(bodies, conductance=grid_adjacency_matrix((n,)), validate=False)
     x0 = np.array([1.0, 0.01, 0.01, 0.01, 0.01])
     solution = lt.integrate(system, x0, (0.0, 40.0), 4.0, on_failure="return", engine="sparse")
     assert not solution.status.ok
@@ -459,9 +461,9 @@ def particles(conductance):
 def test_a_network_that_falls_apart():
     with pytest.raises(lt.InputError, match=r"3 parts that exchange no heat.*node 0 and node 1.*connected=False"):
         particles([(0, 1, 1.0), (2, 3, 1.0), (4, 5, 1.0)])
-    lopsided = grid_graph((6,)).tolil()
+    lopsided = grid_adjacency_matrix((6,)).tolil()
     lopsided[0, 1] = 2.0
     with pytest.raises(lt.InputError, match=r"must be symmetric.*by 1"):
         particles(lopsided.tocsr())
     with pytest.raises(lt.InputError, match="between node 0 and node 1 must be finite and >= 0, got -1"):
-        particles(-1.0 * grid_graph((6,)))
+        particles(-1.0 * grid_adjacency_matrix((6,)))
