@@ -64,7 +64,7 @@ class IterationState(NamedTuple):
         infinite, zero_count = jnp.asarray(jnp.inf), jnp.zeros((), dtype=jnp.int64)
         return cls(k, infinite, infinite, zero_count, infinite, jnp.zeros(()), zero_count)
 
-    def after_update(self, k, options: SolverOptions) -> IterationState:
+    def next_state(self, k, options: SolverOptions) -> IterationState:
         update = options.norm_for_dim(k.shape[-1])(k - self.k)
         earlier_update = jnp.where(self.n_iterations > 1, self.previous_update, 0.0)
         n_stalled = jnp.where(update < options.stall_ratio * self.smallest_update, 0, self.n_stalled + 1)
@@ -107,7 +107,7 @@ def solve_fixed_point(equations: StageEquations, options: SolverOptions = DEFAUL
     """Solve the stage equations by fixed-point iteration, which is given up if it converges slowly."""
 
     def iterate(carry):
-        s = carry[0].after_update(equations.slopes(carry[0].k), options)
+        s = carry[0].next_state(equations.slopes(carry[0].k), options)
         return s, *s.has_converged_and_continues(equations.scale(s.k), options)
 
     initial_carry = IterationState.initial(equations.guess), jnp.asarray(False), jnp.asarray(True)
@@ -201,7 +201,7 @@ def solve_newton(
                 options.plateau_rtol * scale(inner.k),
                 is_damped,
             )
-            inner = inner.after_update(k, options)
+            inner = inner.next_state(k, options)
             return inner, residual, jnp.where(is_full_step, inner.n_iterations - n_previous, options.max_jacobian_reuse)
 
         def can_reuse_jacobian(carry):

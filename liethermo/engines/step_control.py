@@ -618,12 +618,12 @@ def advance_adaptive(
 
     def attempt_once(carry):
         adaptive_state, n_attempts = carry
-        after_update = attempt_step(system, method, control, adaptive_state, options, newton_fallback)
+        next_state = attempt_step(system, method, control, adaptive_state, options, newton_fallback)
         if not newton:
-            is_solved = after_update.last_attempt_status == StatusCode.COMPLETED
-            unsolved_state = adaptive_state._replace(last_attempt_status=after_update.last_attempt_status)
-            after_update = jax.tree_util.tree_map(lambda a, b: jnp.where(is_solved, a, b), after_update, unsolved_state)
-        return after_update, n_attempts + 1
+            is_solved = next_state.last_attempt_status == StatusCode.COMPLETED
+            unsolved_state = adaptive_state._replace(last_attempt_status=next_state.last_attempt_status)
+            next_state = jax.tree_util.tree_map(lambda a, b: jnp.where(is_solved, a, b), next_state, unsolved_state)
+        return next_state, n_attempts + 1
 
     return jax.lax.while_loop(continues, attempt_once, (adaptive_state, jnp.zeros((), dtype=jnp.int64)))[0]
 

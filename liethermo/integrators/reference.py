@@ -48,7 +48,7 @@ class Reference:
             raise InputError(f"scheme must be DOP853, RK45, RK23, Radau, BDF or LSODA, got {self.scheme!r}")
 
     def trajectory(self, system: System, x0: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, int, str, bool]:
-        """Return the states that SciPy reaches, the field evaluations, a message, and True if it was interrupted.
+        """Return the states at the times, the number of evaluations, a message, and whether the run was interrupted.
 
         The message is "" on success; Ctrl-C returns the states up to that time.
         """

@@ -168,7 +168,7 @@ class SparseEngine:
             new_norm = float(jnp.linalg.norm(new_residual))
             is_rounding = float(np.abs(step).max()) <= SPARSE_SOLVER_OPTIONS.plateau_rtol * float(scale)
             if new_norm < norm or (is_rounding and np.isfinite(new_norm)):
-                return s.after_update(k, SPARSE_SOLVER_OPTIONS), new_residual, new_scale
+                return s.next_state(k, SPARSE_SOLVER_OPTIONS), new_residual, new_scale
             step = 0.5 * step
         return None
 
