@@ -112,19 +112,17 @@ class EngineWithFallback:
         self._choose_engine(lambda compiled: compiled.n_operations)
         return Trajectory(self, self._call_with_fallback(lambda engine, _: engine.start(x)))
 
-    def final_state(self, x, segments: Sequence[tuple[float, int]]) -> tuple[np.ndarray, float] | None:
-        """Return the last state and its status code: see :meth:`.step_loop.CompiledTrajectory.final_state`.
+    def final_state_function(
+        self, segments: Sequence[tuple[float, int]]
+    ) -> Callable[[np.ndarray], np.ndarray | None] | None:
+        """Return a function of initial states: see :meth:`.step_loop.CompiledTrajectory.final_state_function`.
 
         The result is None if the compiled engine does not run the system.
         """
-        if not self._is_engine_chosen:
-            self._choose_engine(lambda compiled: compiled.n_operations)
+        self._choose_engine(lambda compiled: compiled.n_operations)
         if not isinstance(self._engine, CompiledEngine):
             return None
-        try:
-            return self._engine.trajectory.final_state(x, segments)
-        except UnsupportedPrimitive:
-            return None
+        return self._engine.trajectory.final_state_function(segments)
 
     def advance_trajectory(
         self, trajectory: CompiledTrajectory | EngineTrajectory, h: float, n_saves: int, steps_per_save: int

@@ -42,6 +42,8 @@ class Problem:
         Whether functions of the system depend on time.
     state_shape : tuple of int
         Shape of a state: (n,), or (*sites, d).
+    starts_anywhere : bool
+        Whether every finite array of shape (n,) is an initial state.
     """
 
     def __init__(self, system: System, method: Any, noise: Fluctuations | None):
@@ -52,7 +54,7 @@ class Problem:
         self._engines = _ThreadEngines()
         self.state_shape = system.shape if system.sites else (system.dim,)
         kind = type(system)
-        self._starts_anywhere = (
+        self.starts_anywhere = (
             system.space is None
             and not self.is_driven
             and kind.state_array is System.state_array
@@ -89,7 +91,7 @@ class Problem:
         InputError
         """
         is_list = isinstance(x0, list | tuple) and all(type(component) is float for component in x0)
-        if self._starts_anywhere and attitude is None and (is_list or type(x0) is np.ndarray):
+        if self.starts_anywhere and attitude is None and (is_list or type(x0) is np.ndarray):
             x = np.asarray(x0)
             if x.dtype == np.float64 and x.shape == (self.system.dim,) and np.isfinite(x).all():
                 return x

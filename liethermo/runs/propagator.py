@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Mapping
+import threading
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import equinox as eqx
@@ -120,6 +121,7 @@ class Propagator:
         self._variants: LRUCache[Propagator] = LRUCache(MAX_CACHED_PARAMETER_SETS)
         self._decided_problem: Problem | None = None
         self._schedules: LRUCache[StepSchedule] = LRUCache(MAX_CACHED_SCHEDULES)
+        self._thread = _ThreadFunctions()
 
     def __getstate__(self) -> tuple:
         return self.system, self.method, self.step, self.engine, self.noise
@@ -220,8 +222,13 @@ class Propagator:
         """
         if parameters:
             return self.with_parameters(parameters).final(x0, t_span)
-        x = self._final_state_by_machine_code(x0, t_span)
-        return self(x0, t_span, save_every=CHUNK_STEPS).x[-1] if x is None else x
+        functions = self._thread.final_functions
+        function = functions.get(t_span) if type(t_span) is tuple else None
+        if function is None:
+            function = self._final_state_function(t_span)
+        if function is not None and (x := function(x0)) is not None:
+            return x
+        return self(x0, t_span, save_every=CHUNK_STEPS).x[-1]
 
     def many(self, x0s, t_span: tuple[float, float], *, parameters=None, **options) -> Ensemble:
         """Return an ensemble of trajectories, as :func:`ensemble` does.
@@ -290,8 +297,12 @@ class Propagator:
                 self._schedules.get_or_compute(key, lambda: schedule)
         return schedule
 
-    def _final_state_by_machine_code(self, x0, t_span: tuple[float, float]) -> np.ndarray | None:
-        """Return the last state; None where a run has to compute it, or has to say why a step fails."""
+    def _final_state_function(self, t_span: tuple[float, float]) -> Callable[[Any], np.ndarray | None] | None:
+        """Return the function from x0 to the last state of runs over a span, which machine code computes.
+
+        It is held in memory for this thread. The result is None where a run has to compute the last state, and that of
+        the function where a run has to say why a step fails.
+        """
         problem = self._problem_of_final
         if problem is None:
             return None
@@ -300,11 +311,24 @@ class Propagator:
         segment = ScheduleSegment.from_span(start, end, h)
         if segment.n_full_steps > CHUNK_STEPS:
             return None  # a run in portions, which Ctrl-C can stop
-        engine = problem.engine(self.engine, problem.system, segment.n_steps)
-        result = engine.final_state(problem.initial_state(x0, start), segment.equal_steps(h))
-        if result is None or result[1] != StatusCode.COMPLETED:
+        compute = problem.engine(self.engine, problem.system, segment.n_steps).final_state_function(
+            segment.equal_steps(h)
+        )
+        if compute is None:
             return None
-        return result[0].reshape(problem.state_shape)
+        state_shape, flat_shape, starts_anywhere = problem.state_shape, (problem.system.dim,), problem.starts_anywhere
+
+        def final_state(x0) -> np.ndarray | None:
+            is_state = starts_anywhere and type(x0) is np.ndarray and x0.dtype == np.float64 and x0.shape == flat_shape
+            x = compute(x0 if is_state else np.asarray(problem.initial_state(x0, start)))
+            return x if x is None or state_shape == flat_shape else x.reshape(state_shape)
+
+        functions = self._thread.final_functions
+        if type(t_span) is tuple:
+            if len(functions) >= MAX_CACHED_SCHEDULES:
+                functions.clear()
+            functions[t_span] = final_state
+        return final_state
 
     @functools.cached_property
     @with_library_settings
@@ -316,6 +340,13 @@ class Propagator:
             return None
         problem = self._problem()
         return None if problem.is_driven or isinstance(problem.system, AttitudeSystem) else problem
+
+
+class _ThreadFunctions(threading.local):
+    """Functions that compute final states over spans, in the buffers of one thread."""
+
+    def __init__(self):
+        self.final_functions: dict[tuple[float, float], Callable[[Any], np.ndarray | None]] = {}
 
 
 def replace_parameters(system: System, values: Mapping[str, np.ndarray]) -> System:

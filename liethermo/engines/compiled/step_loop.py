@@ -196,22 +196,39 @@ class CompiledTrajectory:
         n_reached = int(self._step[0] - first_step) // steps_per_save
         return SavedStates(out[:n_reached, :-2], out[:n_reached, -2:])
 
-    def final_state(self, x, segments: Sequence[tuple[float, int]]) -> tuple[np.ndarray, float]:
-        """Return the last state, shape (n,), and its status code, of a trajectory that starts at x.
+    def final_state_function(self, segments: Sequence[tuple[float, int]]) -> Callable[[np.ndarray], np.ndarray | None]:
+        """Return the function from an initial state to the final state, shape (n,), in a few microseconds.
+
+        Its result is None if a step fails, or needs Newton's method for the first time. A call overwrites this
+        trajectory.
 
         Parameters
         ----------
-        x : array, shape (n,)
         segments : sequence of (h, n_steps)
             Step sizes, and how many steps of each size follow one another.
         """
-        self.start(x, sum(n_steps for _, n_steps in segments))
-        out = np.empty(self._n_saved_values)
-        for h, n_steps in segments:
-            self._take_steps(h, 1, n_steps, None, out)
-            if self._status[0]:
-                break
-        return self._x.copy(), float(self._status[0])
+        saved, segments = np.empty(self._n_saved_values), tuple(segments)
+        n_total, loop = sum(n_steps for _, n_steps in segments), self._loop
+        increments = [loop.noise_by_block(None, 1, n_steps) for _, n_steps in segments]
+        calls = [(h, n, noise.ctypes.data) for (h, n), noise in zip(segments, increments, strict=True)]
+        (parameters, block, n_done), saved_address = self._addresses, saved.ctypes.data
+        x_row, status, h_row, steps_done = self._x, self._status, self._h, self._n_done
+
+        def final_state(x: np.ndarray) -> np.ndarray | None:
+            begin, advance = loop.loop_functions(n_total)
+            status[0], x_row[:] = 0.0, x
+            begin(parameters, block, 1)
+            for h, n_steps, noise in calls:
+                h_row[0], steps_done[0] = h, 0
+                newton = loop.newton_address(False)
+                if advance(parameters, block, n_done, 1, 1, n_steps, saved_address, n_steps, noise, newton) < 1:
+                    return None
+                if status[0]:
+                    return None
+            return x_row.copy()
+
+        final_state.buffers = saved, increments  # type: ignore[attr-defined]  # whose addresses it has
+        return final_state
 
     def read(self, name: str) -> float:
         """Return a scalar field of the state reached so far."""
