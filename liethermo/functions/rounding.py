@@ -104,7 +104,7 @@ def _evaluate_perturbed(jaxpr: Jaxpr, constants, arguments, numbers: Iterator[in
         inputs = [v.val if isinstance(v, Literal) else values[v] for v in equation.invars]
         name, parameters = equation.primitive.name, equation.params
         inner = next((parameters[key] for key in JAXPR_PARAMETERS if key in parameters), None)
-        if inner is not None and name not in CONTROL_PRIMITIVES and isinstance(inner, ClosedJaxpr):
+        if isinstance(inner, ClosedJaxpr) and name not in CONTROL_PRIMITIVES and not _is_iteration(equation):
             if _is_routine_call(equation):
                 routine = jax.jit(
                     lambda inputs, amplitudes, i=inner: _evaluate_perturbed(
@@ -129,6 +129,16 @@ def _evaluate_perturbed(jaxpr: Jaxpr, constants, arguments, numbers: Iterator[in
 def _is_routine_call(equation) -> bool:
     """Return whether an equation calls a function with products of matrices, which is a routine in machine code."""
     return equation.primitive.name in ("jit", "pjit") and has_matrix_products(equation.params["jaxpr"].jaxpr)
+
+
+def _is_iteration(equation) -> bool:
+    """Return whether an equation calls a function that iterates, as functions of matrices do.
+
+    Perturbed iterations do not converge to rounding, and such functions then return NaN.
+    """
+    if equation.primitive.name != "custom_jvp_call":
+        return False
+    return any(inner.primitive.name in ("scan", "while") for inner in equation.params["call_jaxpr"].jaxpr.eqns)
 
 
 def _perturb(value, number: int, amplitudes):

@@ -49,6 +49,9 @@ SIMPSON_DEGREE = 4
 VALUE_DIFFERENCE_RTOL = 16.0 * EPS
 """Error of a difference of two function values, relative to their rounding scale: a few roundings of both."""
 
+PRODUCT_RTOL = 4.0 * EPS
+"""Error of the product of a gradient with a step, relative to their lengths: a few roundings of its terms."""
+
 VANISHED_LENGTH = math.sqrt(MIN_SQUARED_NORM)
 """Length below which a direction counts as zero."""
 
@@ -216,9 +219,10 @@ def project_onto_levels(
         return s.surface_residual + residual_length(s, level_residual_rounding(s.d)) <= tolerance
 
     def level_residual_rounding(d) -> jax.Array:
-        """Return the part of the level residuals that rounding of function values explains, shape (laws,).
+        """Return the part of the level residuals that rounding of functions explains, shape (laws,).
 
-        In a short step the change of a function is a quadrature of its gradient, whose rounding vanishes with d: then
+        On a surface the product of a gradient with d is rounded at the scale of both lengths, although the part of the
+        gradient along the surface, in whose direction d is corrected, vanishes near rest. In a short step the change of a function is a quadrature of its gradient, whose rounding vanishes with d: then
         the values are not used and the result is zero. :class:`Gonzalez` uses the values of a term wherever its
         gradient is curved, however little it changes from one end to the other.
         """
@@ -241,7 +245,11 @@ def project_onto_levels(
                     if len(f.terms) > 1:
                         ends = (term.gradient(begin), term.gradient(begin + d))
                     scale += jnp.where(uses_values | is_curved(term, *ends), term.difference_rounding_scale(x), 0.0)
-            return VALUE_DIFFERENCE_RTOL * scale
+            rounding = VALUE_DIFFERENCE_RTOL * scale
+            if surface is not None:
+                products = sum(jnp.linalg.norm(start_gradient[b]) * jnp.linalg.norm(d[b]) for b in blocks)
+                rounding += PRODUCT_RTOL * products
+            return rounding
 
         return jnp.stack([function_rounding(f, start) for f, start in zip(functions, start_gradients, strict=True)])
 
