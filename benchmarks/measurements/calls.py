@@ -20,8 +20,11 @@ SPAN = (0.0, 1.0)
 STEP_SIZE = 0.5
 """Size of a step: a run takes two."""
 
-INERTIA, RATE = (3.0, 2.0, 1.0), 0.2
-"""Moments of inertia and rate of friction of the body."""
+INERTIA = (3.0, 2.0, 1.0)
+"""Moments of inertia of the body."""
+
+RATE = 0.2
+"""Rate of its friction."""
 
 BODY_SPAN = (0.0, 10.0)
 """Time span of a run beside heyoka."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from typing import ClassVar
@@ -30,6 +31,21 @@ EVERY_SYSTEM = "every system"
 """Value of :attr:`OneStepMethod.systems` for a method without restrictions."""
 
 
+class Guarantee(enum.StrEnum):
+    """A property that a method keeps to rounding at every step; a member is equal to its value.
+
+    ``ENERGY`` is the law of the energy, ``ENTROPY_LAW`` that of every entropy, ``ENTROPY_LAW_QUADRATIC`` that of
+    quadratic ones; ``CASIMIRS`` are the known Casimirs that are conserved, ``QUADRATIC_CASIMIRS`` the quadratic ones,
+    if the dissipation preserves them by construction.
+    """
+
+    ENERGY = "energy"
+    ENTROPY_LAW = "entropy_law"
+    ENTROPY_LAW_QUADRATIC = "entropy_law_quadratic"
+    CASIMIRS = "casimirs"
+    QUADRATIC_CASIMIRS = "quadratic_casimirs"
+
+
 class OneStepMethod(Module):
     """A one-step method: slopes ``k``, shape (stages, n), with ``k = slopes(system, x, compensation, h, k)``.
 
@@ -43,9 +59,7 @@ class OneStepMethod(Module):
     ----------
     order : int
     preserves : frozenset of str
-        Guarantees that hold to rounding at every step: ``"energy"`` (its law), ``"entropy_law"`` (for every entropy),
-        ``"entropy_law_quadratic"`` (for a quadratic entropy), ``"casimirs"`` (the known Casimirs that are conserved)
-        and ``"quadratic_casimirs"`` (quadratic Casimirs, if the dissipation preserves them by construction).
+        Guarantees that hold to rounding at every step, by their names: see :class:`Guarantee`.
     stages : int
     systems : str
         The systems that the method is for, in words; :meth:`check` refuses others.
@@ -61,6 +75,10 @@ class OneStepMethod(Module):
         if not isinstance(retraction, mf.Retraction | None) and retraction not in tuple(RETRACTIONS):
             names = ", ".join(map(repr, RETRACTIONS))
             raise InputError(f"retraction must be a manifolds.Retraction or one of {names}, got {retraction!r}")
+        unknown = sorted(set(self.preserves) - set(Guarantee))
+        if unknown:
+            names = ", ".join(map(repr, map(str, Guarantee)))
+            raise InputError(f"preserves of {type(self).__name__} has {unknown[0]!r}; a method may preserve {names}")
 
     # -- every method gives -------------------------------------------------------------------------------------------
 

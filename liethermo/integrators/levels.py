@@ -222,9 +222,11 @@ def project_onto_levels(
         """Return the part of the level residuals that rounding of functions explains, shape (laws,).
 
         On a surface the product of a gradient with d is rounded at the scale of both lengths, although the part of the
-        gradient along the surface, in whose direction d is corrected, vanishes near rest. In a short step the change of a function is a quadrature of its gradient, whose rounding vanishes with d: then
-        the values are not used and the result is zero. :class:`Gonzalez` uses the values of a term wherever its
-        gradient is curved, however little it changes from one end to the other.
+        gradient along the surface, in whose direction d is corrected, vanishes near rest.
+
+        In a short step the change of a function is a quadrature of its gradient, whose rounding vanishes with d: then
+        the values are not used. :class:`Gonzalez` uses the values of a term wherever its gradient is curved, however
+        little it changes from one end to the other.
         """
         begin = x + compensation
         is_long = jnp.linalg.norm(d) > MIN_GRADIENT_VARIATION * jnp.linalg.norm(x)

@@ -11,7 +11,7 @@ import numpy as np
 
 from manifolds._arrays import is_traced
 
-from ..errors import InputError
+from ..errors import FunctionError, InputError
 from ..functions.checks import trace_energies
 from ..functions.time_span import set_time_span
 from ..integrators import OneStepMethod, WithAttitude
@@ -28,6 +28,8 @@ from ..systems import (
     make_autonomous,
 )
 from ..tracing.caching import LRUCache, memoize
+from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
+from ..tracing.traced import is_library_object
 from .noise import Fluctuations
 from .system_family import Family
 
@@ -198,8 +200,35 @@ def invariants_and_laws(system: System, method) -> tuple[dict, Laws]:
     """
     if isinstance(method, OneStepMethod):
         method.check(system)
+        if not is_library_object(method):
+            check_shapes_of_method(system, method)
     invariants = system.invariants()
     return invariants, promised_laws(system, method, invariants)
+
+
+def check_shapes_of_method(system: System, method: OneStepMethod) -> None:
+    """Trace one step of a user's method, as the engines will, and check the shapes of its slopes and of its increment.
+
+    Raises
+    ------
+    FunctionError
+        If a member cannot be traced, at the line of the method, or returns another shape.
+    """
+    x, h = jax.ShapeDtypeStruct((system.dim,), np.float64), jax.ShapeDtypeStruct((), np.float64)
+    k = jax.ShapeDtypeStruct((method.stages, system.dim), np.float64)
+    members: dict[str, tuple[Callable, tuple, tuple[int, ...]]] = {
+        "slopes": (lambda x, h, k: method.slopes(system, x, 0.0 * x, h, k), (x, h, k), k.shape),
+        "increment": (method.increment, (h, k), x.shape),
+    }
+    for name, (function, arguments, shape) in members.items():
+        try:
+            result = jax.eval_shape(function, *arguments)
+        except TRACE_ERRORS as error:
+            description = f"{name} of {type(method).__name__} could not be traced"
+            raise FunctionError(trace_error_message(description, error)) from error
+        if getattr(result, "shape", None) != shape:
+            got = getattr(result, "shape", type(result).__name__)
+            raise FunctionError(f"{name} of {type(method).__name__} must return an array of shape {shape}, got {got}")
 
 
 def promised_laws(system: System, method, invariants) -> Laws:

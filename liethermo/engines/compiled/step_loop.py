@@ -197,7 +197,7 @@ class CompiledTrajectory:
         return SavedStates(out[:n_reached, :-2], out[:n_reached, -2:])
 
     def final_state_function(self, segments: Sequence[tuple[float, int]]) -> Callable[[np.ndarray], np.ndarray | None]:
-        """Return the function from an initial state to the final state, shape (n,), in a few microseconds.
+        """Return the function from an initial state to the final state, shape (n,), with little work besides the steps.
 
         Its result is None if a step fails, or needs Newton's method for the first time. A call overwrites this
         trajectory.
