@@ -46,7 +46,7 @@ class Branching(Midpoint):
         return super().slopes(system, x, compensation, h, k)
 
 
-class NoReturn(Midpoint):
+class MissingReturn(Midpoint):
     def increment(self, h, k):
         pass
 
@@ -64,7 +64,7 @@ def test_a_method_of_the_guide_runs_in_every_engine():
         (FlatSlopes, r"slopes of FlatSlopes must return an array of shape \(1, 3\), got \(3,\)"),
         (StackedIncrement, r"increment of StackedIncrement must return an array of shape \(3,\), got \(1, 3\)"),
         (Branching, r"slopes of Branching could not be traced: .*`if`.*test_own_method.py:\d+, in slopes"),
-        (NoReturn, "increment of NoReturn must return an array .* got NoneType"),
+        (MissingReturn, "increment of MissingReturn must return an array .* got NoneType"),
     ],
 )
 def test_what_a_method_states_and_returns_is_checked(method, message):
