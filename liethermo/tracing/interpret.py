@@ -15,6 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr
 
 from manifolds._arrays import is_traced
 
@@ -119,7 +120,10 @@ def count_dense_operations(jaxpr) -> int:
     for equation in jaxpr.eqns:
         parameters = (value if isinstance(value, tuple | list) else [value] for value in equation.params.values())
         inner_jaxprs = [
-            jaxpr for values in parameters for v in values if hasattr(jaxpr := getattr(v, "jaxpr", v), "eqns")
+            v.jaxpr if isinstance(v, ClosedJaxpr) else v
+            for values in parameters
+            for v in values
+            if isinstance(v, ClosedJaxpr | Jaxpr)
         ]
         if inner_jaxprs:
             total += equation.params.get("length", 1) * sum(map(count_dense_operations, inner_jaxprs))
