@@ -24,6 +24,9 @@ NEGATIVE_EIGENVALUE_LIMIT = 1e-12
 SMALLEST_EIGENVALUE = 1e-40
 """Eigenvalue below which the entropy is continued by its tangent, which bounds its gradient by 92."""
 
+REST_RTOL = 4.0 * float(np.finfo(np.float64).eps)
+"""Length of a step, relative to the state, below which it is rounding: its gradients are not corrected along it."""
+
 
 class VonNeumann(Energy):
     """The entropy ``-tr(rho ln rho)`` of a density matrix; its gradient is ``-ln rho - 1`` (k_B = 1).
@@ -80,8 +83,8 @@ class VonNeumann(Energy):
         gradients = jax.vmap(self.gradient)(path.points)
         change = jnp.dot(self.discrete_gradient(scheme, path.start, path.step, path.compensation), path.step)
         defect, squared_norm = change - h * (b @ jnp.sum(gradients * k, axis=1)), h * (b @ jnp.sum(k * k, axis=1))
-        is_zero = squared_norm < jnp.finfo(jnp.float64).tiny
-        return gradients + jnp.where(is_zero, 0.0, defect / jnp.where(is_zero, 1.0, squared_norm)) * k
+        is_at_rest = h * squared_norm <= (REST_RTOL**2) * jnp.sum(path.start * path.start)
+        return gradients + jnp.where(is_at_rest, 0.0, defect / jnp.where(is_at_rest, 1.0, squared_norm)) * k
 
 
 class IsolatedVonNeumann(VonNeumann):

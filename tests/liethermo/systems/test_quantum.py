@@ -884,7 +884,7 @@ def test_a_ladder_relaxes_to_a_cold_state(by, temperature, turned):
     assert again.status.ok
 
 
-@pytest.mark.sampled("explicit", "midpoint")
+@pytest.mark.sampled("explicit", "midpoint", "Gauss")
 @pytest.mark.parametrize("by", COLD)
 def test_a_cold_state_of_gibbs_is_at_rest(by):
     q, _, H = ladder(0.1, np.linalg.qr(random_hermitian(8))[0])
