@@ -77,7 +77,7 @@ def slowness_by_update(updates, rate):
     iteration, slowness = IterationState.initial(k), []
     for update in updates:
         k = k + update
-        iteration = iteration.after_update(k, DEFAULT_OPTIONS)
+        iteration = iteration.next_state(k, DEFAULT_OPTIONS)
         slowness.append(bool(iteration.is_slower_than(rate)))
     return slowness
 
