@@ -45,6 +45,7 @@ from .functions.each import Each
 from .functions.energy import Energy, Function, Quadratic, TimeDependent
 from .functions.gradients import CoordinateIncrement, DiscreteGradient, Gonzalez, MeanValue
 from .functions.mechanics import Kinetic, Potential
+from .functions.piecewise import PiecewiseConstant
 from .integrators import (
     DiscreteHerglotz,
     FiniteDifference,
@@ -172,6 +173,7 @@ __all__ = [
     "MetriplecticTaylor",
     "NonFiniteError",
     "OneStepMethod",
+    "PiecewiseConstant",
     "Potential",
     "PowerLawFriction",
     "ProjectedMetric",

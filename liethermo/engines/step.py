@@ -135,6 +135,18 @@ def reorder_components(
     )
 
 
+def start_step(system: System, state: State) -> tuple[System, State]:
+    """Return the system and the state with which a step starts.
+
+    They differ from those given only in a run with breaks, at which functions of time jump.
+    """
+    step_system = system.at_step_start(state.x)
+    if system.energy_jumps:  # the energy of the state before the jump is that at the end of the last step
+        jump = step_system.energy.value(state.x) - state.energy
+        state = state._replace(x=system.add_jump_of_energy(state.x, jump))
+    return step_system, state
+
+
 def take_step(
     system: System,
     method: OneStepMethod,
@@ -148,6 +160,7 @@ def take_step(
     An engine that has Newton's method elsewhere passes ``newton_fallback(fixed_point_result, x, compensation, h, k,
     previous_slopes)``, which replaces it.
     """
+    system, state = start_step(system, state)
     system, method, state, restore_order = reorder_components(system, method, state, options)
     if not method.carries_compensation:
         state = state._replace(compensation=compensation_from_state(system, method, state.x, state.compensation))

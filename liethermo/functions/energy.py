@@ -36,7 +36,7 @@ from .coordinates import ComponentMap, Components, check_coordinates
 from .indices import clique_pattern, sparsity_pattern, union_pattern
 from .path import CollocationPath, DiscreteGradientScheme
 from .rounding import value_and_rounding_scale
-from .time_span import TimeSpan
+from .time_span import FunctionWithBreaks, TimeSpan, checked_breaks, declared_breaks
 
 
 @subprogram
@@ -311,7 +311,7 @@ class Function(Energy):
         return jnp.asarray(self.function(x))
 
 
-class TimeDependent(Energy):
+class TimeDependent(Energy, FunctionWithBreaks):
     """An energy ``H(x, t)`` that depends on time, such as that of a rotating field or a moving piston.
 
     A plain function of two arguments is taken as such an energy wherever a system expects one. This class declares any
@@ -322,11 +322,18 @@ class TimeDependent(Energy):
     ----------
     function : function from x, shape (n,), and t, shape (), to a scalar
         The function may be an ``equinox.Module``, whose arrays are then parameters of the system.
+    breaks : sequence of float
+        Times at which the function jumps or has a kink; the steps of a run end there.
     """
 
     function: Callable
+    breaks: tuple[float, ...] = eqx.field(static=True, default=(), converter=checked_breaks)
 
     depends_on_time = True
+
+    @property
+    def break_times(self) -> tuple[float, ...]:
+        return (*self.breaks, *declared_breaks(self.function))
 
     def at_time(self, t) -> Energy:
         return Function(FixedTimeFunction(self.function, jnp.asarray(t, dtype=jnp.float64)))
@@ -338,7 +345,7 @@ class TimeDependent(Energy):
         raise InputError("this energy depends on time, so its value needs a time. Call energy(x, t)")
 
     def __neg__(self) -> Energy:
-        return TimeDependent(NegatedFunction(self.function))
+        return TimeDependent(NegatedFunction(self.function), self.breaks)
 
 
 class SpanLimitedEnergy(Energy):

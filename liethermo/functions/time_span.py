@@ -1,6 +1,9 @@
-"""The time span of a run: functions of time are evaluated only at times within it."""
+"""The time span of a run, and the times within it at which functions of time jump."""
 
 from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +11,11 @@ import numpy as np
 
 from manifolds._arrays import is_traced
 from manifolds._pytree_module import Module
+
+from ..errors import InputError
+
+BREAK_RTOL = 8.0 * float(np.finfo(np.float64).eps)
+"""Largest rounding of the times of a run, relative to the largest: a step starts at a break if it starts so near."""
 
 
 class TimeSpan(Module):
@@ -19,20 +27,44 @@ class TimeSpan(Module):
     Attributes
     ----------
     start, end : array, shape ()
+    breaks : array, shape (m,)
+        Times in the span at which functions of time jump; steps end there. It has shape (0,) if there are none.
     """
 
     start: jax.Array
     end: jax.Array
+    breaks: jax.Array
 
-    def __init__(self, start: float = -np.inf, end: float = np.inf):
-        self.start, self.end = _time_scalar(start), _time_scalar(end)
+    def __init__(self, start=-np.inf, end=np.inf, breaks=()):
+        self.start, self.end, self.breaks = (_time_array(t) for t in (start, end, breaks))
+
+    def interval_at(self, t) -> TimeSpan:
+        """Return the interval between two breaks in which a step lies that starts at time t, shape ().
+
+        The interval ends a rounding before a break, and starts a rounding after one. So a function that jumps at the
+        break has one of its two limits there, whether it is defined with ``t >= time`` or with ``t > time``.
+        """
+        tolerance = self._break_tolerance
+        is_past = self.breaks <= t + tolerance
+        start = jnp.max(jnp.where(is_past, self.breaks + tolerance, self.start))
+        end = jnp.min(jnp.where(is_past, self.end, self.breaks - tolerance))
+        return TimeSpan(start, end)
+
+    def starts_at_break(self, t) -> jax.Array:
+        """Return whether a step that starts at time t, shape (), starts at a break."""
+        return jnp.any(jnp.abs(self.breaks - t) <= self._break_tolerance)
+
+    @property
+    def _break_tolerance(self) -> jax.Array:
+        largest_time = jnp.maximum(jnp.abs(self.start), jnp.max(jnp.abs(self.breaks)))
+        return BREAK_RTOL * largest_time
 
     def clip(self, t) -> jax.Array:
         """Return the times t, shape (...), clipped to the span."""
         return _clip(t, self.start, self.end)
 
 
-def _time_scalar(t) -> jax.Array:
+def _time_array(t) -> jax.Array:
     if is_traced(t):
         return t
     with jax.ensure_compile_time_eval():  # a number, even where something else is traced
@@ -50,11 +82,56 @@ def _clip_jvp(primals, tangents):
     return _clip(*primals), tangents[0]
 
 
-def set_time_span(tree, start: float, end: float):
-    """Return a pytree, such as a system, whose functions of time are evaluated within a span only."""
-    span = TimeSpan(start, end)
+def set_time_span(tree, start: float, end: float, *breaks: float):
+    """Return a pytree, such as a system, whose functions of time are evaluated within a span only.
 
-    def limit(node):
+    Parameters
+    ----------
+    tree : pytree
+    start, end : float
+    *breaks : float
+        Times within the span at which functions of time jump.
+    """
+    times = jnp.stack([_time_array(t) for t in breaks]) if breaks else ()
+    return replace_time_span(tree, TimeSpan(start, end, times))
+
+
+def replace_time_span(tree, span: TimeSpan):
+    """Return a pytree with another span in every place."""
+
+    def replace_span(node):
         return span if isinstance(node, TimeSpan) else node
 
-    return jax.tree_util.tree_map(limit, tree, is_leaf=lambda node: isinstance(node, TimeSpan))
+    return jax.tree_util.tree_map(replace_span, tree, is_leaf=lambda node: isinstance(node, TimeSpan))
+
+
+class FunctionWithBreaks(Module):
+    """Base class of functions of time that jump at known times, where the steps of a run end by themselves."""
+
+    @property
+    @abstractmethod
+    def break_times(self) -> tuple[float, ...]:
+        """Times at which the function jumps."""
+
+
+def declared_breaks(tree: Any) -> tuple[float, ...]:
+    """Return the times at which functions of time in a pytree, such as a system, say that they jump."""
+    nodes = jax.tree_util.tree_leaves(tree, is_leaf=lambda node: isinstance(node, FunctionWithBreaks))
+    return tuple(sorted({t for node in nodes if isinstance(node, FunctionWithBreaks) for t in node.break_times}))
+
+
+def checked_breaks(breaks) -> tuple[float, ...]:
+    """Return the increasing times at which functions of time jump.
+
+    Raises
+    ------
+    InputError
+        Unless they are finite times.
+    """
+    try:
+        times = np.asarray(breaks, dtype=np.float64)
+    except (TypeError, ValueError):
+        times = np.array(np.nan)
+    if times.ndim != 1 or not np.isfinite(times).all():
+        raise InputError(f"breaks must be a list of finite times, got {breaks!r:.60}")
+    return tuple(np.unique(times).tolist())

@@ -3,9 +3,30 @@
 from __future__ import annotations
 
 import functools
+import math
 from typing import NamedTuple
 
 import numpy as np
+
+
+class ErrorEstimate(NamedTuple):
+    """Estimate of the local error of a step of length l, ``scale l (|E| / l)^(p / q)`` with ``E = h sum_i d_i k_i``.
+
+    Here p is the order of the method, and E is O(h^(q + 1)).
+
+    Attributes
+    ----------
+    weights : ndarray, shape (s,)
+        The weights d.
+    order : int
+        The exponent q.
+    scale : float
+        The factor with which the estimate is right as h -> 0.
+    """
+
+    weights: np.ndarray
+    order: int
+    scale: float
 
 
 class ExplicitTableau(NamedTuple):
@@ -14,21 +35,21 @@ class ExplicitTableau(NamedTuple):
     Attributes
     ----------
     A, b : ndarray, shapes (s, s) and (s,)
-    error_weights : ndarray, shape (s,)
-        Weights d for which ``E = h sum_i d_i k_i`` is O(h^(q + 1)).
-    error_order : int
-        The exponent q.
-    error_scale : float
-        The local error of a step of length l is ``scale l (|E| / l)^(p / q)``, where p is the order: right for a linear
-        equation as h -> 0.
+    error_estimate : ErrorEstimate
+        Estimate that is right for a linear equation x' = a x.
+    quadrature_error_estimate : ErrorEstimate or None
+        Estimate that is right for a quadrature x' = f(t); None if the other one responds to it. At orders 6 and 8 the
+        other one does not: its weights add up to zero at each node.
     """
 
     A: np.ndarray
     b: np.ndarray
-    error_weights: np.ndarray
-    error_order: int
-    error_scale: float
+    error_estimate: ErrorEstimate
+    quadrature_error_estimate: ErrorEstimate | None
 
+
+RESPONSE_RTOL = 1e-8
+"""Response of error weights to the vector of a tree that counts as none, relative to the vector."""
 
 LOBATTO_ORDERS = (4, 6, 8)
 """Orders for which there is a tableau."""
@@ -56,30 +77,41 @@ def _legendre_value(m: int, x) -> np.ndarray:
 def lobatto_tableau(order: int) -> ExplicitTableau:
     """Return the tableau of order 4 [Kutta 1901], 6 [Butcher 1964] or 8 [Cooper & Verner 1972]."""
     A, b = {4: _kutta_coefficients, 6: _butcher_coefficients, 8: _cooper_verner_coefficients}[order]()
-    d, q = _error_weights_and_order(A, order)
+    nodes = A.sum(axis=1)
     powers = [np.ones(len(b))]
     for _ in range(order):
         powers.append(A @ powers[-1])  # A^n 1: for a linear equation, order n + 1 means b . A^n 1 = 1 / (n + 1)!
-    order_residual = abs(1.0 / np.prod(np.arange(1.0, order + 2)) - b @ powers[order])
-    linear_response = abs(d @ powers[q])
-    assert linear_response > 0.0
-    return ExplicitTableau(A, b, d, q, order_residual / linear_response ** (order / q))
+    # c^n / n!: for a quadrature, order n + 1 means b . c^n / n! = 1 / (n + 1)!
+    monomials = [nodes**n / math.factorial(n) for n in range(order + 1)]
+    estimate = _error_estimate(A, b, order, powers)
+    responds_to_quadrature = abs(estimate.weights @ monomials[estimate.order]) > RESPONSE_RTOL
+    return ExplicitTableau(A, b, estimate, None if responds_to_quadrature else _error_estimate(A, b, order, monomials))
 
 
-def _error_weights_and_order(A: np.ndarray, order: int) -> tuple[np.ndarray, int]:
-    """Return the weights of the error estimate and their order q: they vanish on rooted trees of at most q nodes."""
-    vectors, weights_and_order = rooted_tree_vectors(A, order - 1), None
+def _error_estimate(A: np.ndarray, b: np.ndarray, order: int, tree_vectors: list[np.ndarray]) -> ErrorEstimate:
+    """Return the error estimate that is right for equations whose step has only the rooted trees of some vectors.
+
+    ``tree_vectors[q]`` is the stage vector of the tree with q + 1 nodes. The weights vanish on all rooted trees of at
+    most q nodes, with the largest possible q.
+    """
+    weights, q = _error_weights_and_order(A, order, tree_vectors)
+    residual = abs(1.0 / math.factorial(order + 1) - b @ tree_vectors[order])
+    response = abs(weights @ tree_vectors[q])
+    assert response > 0.0
+    return ErrorEstimate(weights, q, residual / response ** (order / q))
+
+
+def _error_weights_and_order(A: np.ndarray, order: int, tree_vectors: list[np.ndarray]) -> tuple[np.ndarray, int]:
+    """Return the weights of an error estimate and their order q: they vanish on rooted trees of at most q nodes."""
+    vectors = rooted_tree_vectors(A, order - 1)
     for q in range(order - 1, 0, -1):
         conditions = np.array([v for n in range(1, q + 1) for v in vectors[n]])
         _, singular_values, right_vectors = np.linalg.svd(conditions)
         null_space = right_vectors[np.sum(singular_values > 1e-10 * singular_values[0]) :]
-        power = np.linalg.matrix_power(A, q) @ np.ones(len(A))
-        response = null_space @ power  # choose the weights with the largest response to a linear equation
-        if np.linalg.norm(response) > 1e-8 * np.linalg.norm(power):
-            weights_and_order = response @ null_space / np.linalg.norm(response), q
-            break
-    assert weights_and_order is not None
-    return weights_and_order
+        response = null_space @ tree_vectors[q]  # choose the weights with the largest response
+        if np.linalg.norm(response) > RESPONSE_RTOL * np.linalg.norm(tree_vectors[q]):
+            return response @ null_space / np.linalg.norm(response), q
+    raise AssertionError("every tableau has an error estimate of order 1")
 
 
 def rooted_tree_vectors(A: np.ndarray, order: int) -> dict[int, list[np.ndarray]]:

@@ -15,13 +15,16 @@ from ..functions.frames import vector_with_inner_products
 from ..systems import System
 from .base import register
 from .explicit import ExplicitMethod, StepRow, UncorrectedStep
-from .lobatto import LOBATTO_ORDERS, ExplicitTableau, lobatto_tableau
+from .lobatto import LOBATTO_ORDERS, ErrorEstimate, ExplicitTableau, lobatto_tableau
 
 START_SLOPE_ROW = StepRow.FIRST_METHOD_ROW
 """Row of ``k`` that holds the slope at the start of a step."""
 
 END_SLOPE_ROW = StepRow.FIRST_METHOD_ROW + 1
 """Row of ``k`` that holds the slope of the last stage, at the end of a step."""
+
+QUADRATURE_ERROR_ROW = StepRow.FIRST_METHOD_ROW + 2
+"""Row of ``k`` that holds the estimate of the error of a quadrature, over h."""
 
 
 class MetriplecticRungeKutta(ExplicitMethod):
@@ -75,7 +78,7 @@ class MetriplecticRungeKutta(ExplicitMethod):
             raise InputError(f"order must be 4, 6 or 8, got {order!r}")
         super().__init__(order, preserve, retraction, held)
 
-    stages = END_SLOPE_ROW + 1
+    stages = QUADRATURE_ERROR_ROW + 1
 
     @property
     def evaluations_per_iteration(self) -> int:
@@ -88,8 +91,12 @@ class MetriplecticRungeKutta(ExplicitMethod):
     def base_step(self, rates: Callable, skip_law_rates: bool, x, compensation, h) -> UncorrectedStep:
         t = self.tableau
         slopes, changes = self._stage_slopes_and_law_rates(rates, x, compensation, h)
-        ends = jnp.stack([slopes[0], slopes[-1]])
-        return UncorrectedStep(h * (t.b @ slopes), h * (t.b @ changes), jnp.asarray(t.error_weights) @ slopes, ends)
+        error, quadrature_error = (
+            jnp.zeros_like(x) if estimate is None else jnp.asarray(estimate.weights) @ slopes
+            for estimate in (t.error_estimate, t.quadrature_error_estimate)
+        )
+        rows = jnp.stack([slopes[0], slopes[-1], quadrature_error])
+        return UncorrectedStep(h * (t.b @ slopes), h * (t.b @ changes), error, rows)
 
     def step_without_compensation(self, system: System, x, h) -> jax.Array:
         """Return the state after a step with one correction and no compensation, for derivatives by parameters.
@@ -146,14 +153,18 @@ class MetriplecticRungeKutta(ExplicitMethod):
         return row_weights
 
     def error(self, system: System, x, compensation, h, k) -> jax.Array:
-        """Estimate the error with the weights of :class:`.lobatto.ExplicitTableau`."""
-        t = self.tableau
-        error_size, step_length = h * jnp.max(jnp.abs(k[StepRow.ERROR])), h * jnp.max(jnp.abs(k[StepRow.MEAN_SLOPE]))
-        return (
-            t.error_scale
-            * step_length
-            * (error_size / jnp.where(step_length > 0.0, step_length, 1.0)) ** (self.order / t.error_order)
-        )
+        """Return the larger one of the two estimates of :class:`.lobatto.ExplicitTableau`."""
+        t, step_length = self.tableau, h * jnp.max(jnp.abs(k[StepRow.MEAN_SLOPE]))
+
+        def estimated_error(estimate: ErrorEstimate, row: int) -> jax.Array:
+            error_size = h * jnp.max(jnp.abs(system.error_of_step(x, k[row], k[StepRow.MEAN_SLOPE])))
+            ratio = error_size / jnp.where(step_length > 0.0, step_length, 1.0)
+            return estimate.scale * step_length * ratio ** (self.order / estimate.order)
+
+        error = estimated_error(t.error_estimate, StepRow.ERROR)
+        if t.quadrature_error_estimate is None:
+            return error
+        return jnp.maximum(error, estimated_error(t.quadrature_error_estimate, QUADRATURE_ERROR_ROW))
 
 
 register(*map(MetriplecticRungeKutta, LOBATTO_ORDERS))

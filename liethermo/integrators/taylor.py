@@ -163,7 +163,7 @@ class MetriplecticTaylor(ExplicitMethod):
         The first term left out of X' is p + 1 times that of X, so the estimate is right to a factor that tends to 1. It
         also detects a condition (``jnp.where``) whose value has changed inside the step.
         """
-        return h * jnp.max(jnp.abs(k[StepRow.ERROR]))
+        return h * jnp.max(jnp.abs(system.error_of_step(x, k[StepRow.ERROR], k[StepRow.MEAN_SLOPE])))
 
 
 register(*map(MetriplecticTaylor, (6, 12, 20)))

@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from ..errors import InputError
+from ..functions.time_span import declared_breaks
 from ..integrators import MetriplecticRungeKutta, OneStepMethod, WithAttitude
 from ..runs.flow import differentiable_step, initial_carry
 from ..runs.preparation import prepare_for_method
@@ -224,7 +226,18 @@ class DifferentiableStepper(NamedTuple):
 def differentiable_stepper(
     system: System, method: OneStepMethod, substeps: int, has_attitude: bool = False
 ) -> DifferentiableStepper:
-    """Return a prepared system, and the functions that start, advance and read a differentiable run of it."""
+    """Return a prepared system, and the functions that start, advance and read a differentiable run of it.
+
+    Raises
+    ------
+    InputError
+        If functions of time of the system jump: the steps end at the times of the data.
+    """
+    if breaks := declared_breaks(system):
+        raise InputError(
+            f"the system has functions of time that jump, at t = {breaks[0]:g} and other times, where the steps of a "
+            "fit do not end. Use functions of time that are continuous"
+        )
     prepared_system, method = prepare_for_method(system, method, None, has_attitude)
     inner = method.method if isinstance(method, WithAttitude) else method
     needs_no_compensation = isinstance(inner, MetriplecticRungeKutta) and prepared_system.surface is None

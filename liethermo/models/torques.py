@@ -20,10 +20,19 @@ from manifolds._pytree_module import Module
 
 from ..errors import InputError
 from ..functions.conditions import checked_numbers, require_condition
+from ..functions.piecewise import PiecewiseConstant as FunctionPiecewiseConstant
 from .inertia import checked_inertia_tensors
 from .parameters import checked_finite, checked_positive
 
-__all__ = ["ConstantInBody", "ConstantInSpace", "GravityGradient", "Magnetic", "Motor", "Tabulated"]
+__all__ = [
+    "ConstantInBody",
+    "ConstantInSpace",
+    "GravityGradient",
+    "Magnetic",
+    "Motor",
+    "PiecewiseConstant",
+    "Tabulated",
+]
 __dir__ = public_dir(__all__)
 
 MAX_PERPENDICULAR_COSINE = 1e-8
@@ -156,11 +165,42 @@ class Motor(Module):
         return jnp.concatenate([jnp.zeros(mu.shape[0] - moment.shape[0]), moment])
 
 
+class PiecewiseConstant(Module):
+    """Torques in body axes that are constant between given times and zero outside, such as the pulses of thrusters.
+
+    The steps of a run end at these times by themselves. A step that ends there sees the torque from before, the next
+    one that from after.
+
+    Parameters
+    ----------
+    times : sequence of float, length m
+        Increasing times at which the torque jumps (s).
+    torques : array, shape ``(m - 1, *shape of mu)``
+        Torques in body axes between two of the times (N m, on so(3)).
+
+    Examples
+    --------
+    >>> pulses = lt.torques.PiecewiseConstant([2.0, 2.5, 7.0], [(0.0, 0.0, 0.1), (0.2, 0.0, 0.0)])
+    >>> body = lt.LiePoissonSystem(mf.so(3), lt.Quadratic([1.0, 0.5, 0.4]), torque=pulses)
+    >>> solution = lt.integrate(body, [0.1, 0.0, 1.0], (0.0, 10.0), lt.Adaptive(1e-9), lt.MetriplecticRungeKutta(8))
+    >>> bool(np.isin([2.0, 2.5, 7.0], solution.t).all())
+    True
+    """
+
+    torque: FunctionPiecewiseConstant
+
+    def __init__(self, times, torques):
+        self.torque = FunctionPiecewiseConstant(times, torques)
+
+    def __call__(self, t, mu):
+        return self.torque(t)
+
+
 class Tabulated(Module):
     """A torque in body axes from a table, linear in t between its times and zero outside.
 
     A step across a time of the table has an error of second order there, whatever the method: let steps end at these
-    times by ``save_at=``. The laws hold all the same.
+    times by ``breaks=``. The laws hold all the same.
 
     Parameters
     ----------

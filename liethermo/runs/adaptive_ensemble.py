@@ -184,6 +184,7 @@ class _BatchRecorder:
             self.record.store_events(handler.occurrences, self.members)
             handler.occurrences.clear()
         indices = handler.paused_indices(StatusCode.PAUSED_AT_STOP)
+        indices = indices[np.isin(runs.read("t", indices), self.record.schedule.saved_stop_times)]
         if indices.size:
             columns = [runs.read("x", indices), *(runs.read(n, indices)[:, None] for n in ("energy", "entropy"))]
             self.record.store_states_at(self.members[indices], runs.read("t", indices), np.hstack(columns))

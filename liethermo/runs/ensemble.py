@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -14,6 +14,7 @@ from manifolds._precision import with_library_settings
 from ..engines.select_engine import is_worth_compiling, warn_of_fallback
 from ..engines.status_codes import StatusCode
 from ..errors import InputError
+from ..functions.time_span import checked_breaks, declared_breaks
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..integrators.fluctuating import noise_dimension
 from ..results.ensemble import Ensemble, Subset, join_subsets
@@ -29,6 +30,7 @@ from .noise import DEFAULT_NOISE_METHOD, Fluctuations, NoisePaths, check_noise
 from .preparation import (
     check_choice,
     initial_state,
+    is_driven_run,
     limit_family_to_span,
     limit_to_span,
     prepare_system_and_method,
@@ -43,6 +45,7 @@ from .record import EnsembleEvidenceCollector, EnsembleRecord, MemberSolutionBui
 from .schedule import StepSchedule, make_schedule
 from .solution_builder import run_provenance
 from .system_family import Family, broadcast_size, error_message_of
+from .time_features import schedule_around_features
 
 __all__ = ["MAX_THREADS", "Ensemble", "ensemble"]
 
@@ -71,6 +74,7 @@ def ensemble(
     attitude=None,
     progress: bool | None = None,
     noise: Fluctuations | None = None,
+    breaks: Sequence[float] = (),
 ) -> Ensemble:
     """Integrate many trajectories of one system, or of a family of systems.
 
@@ -105,6 +109,8 @@ def ensemble(
         Show a progress bar; by default where the standard error is a terminal.
     noise : Fluctuations, optional
         As for :func:`integrate`. Every trajectory has noise of its own, by its number and the times of its steps.
+    breaks : sequence of float
+        As for :func:`integrate`, for all trajectories.
 
     Returns
     -------
@@ -140,9 +146,11 @@ def ensemble(
         raise InputError(
             "noise= needs fixed steps and cannot be combined with Adaptive or until. Give the step as a number"
         )
-    schedule = make_schedule(t_span, step, save_every if outputs == "trajectory" and save_at is None else None, save_at)
-
     family = Family.from_arguments(system, parameters)
+    breaks = *checked_breaks(breaks), *declared_breaks(family.representative)
+    save_every_step = save_every if outputs == "trajectory" and save_at is None else None
+    schedule = make_schedule(t_span, step, save_every_step, save_at, breaks=breaks)
+
     states, reasons = _checked_initial_states(family, x0s, len(attitude) if np.ndim(attitude) == 3 else 1)
     check_noise(noise, len(states))
     n_trajectories = len(states)
@@ -236,7 +244,7 @@ class _EnsembleOptions(NamedTuple):
         family = wrap_family(family, member)
         states = np.asarray(initial_state(member, states, schedule.start, attitude, batch=True))
         method.check(member)
-        span = schedule.start, schedule.end
+        span = schedule.start, schedule.end, *schedule.breaks
         family, member = limit_family_to_span(family, member, *span), limit_to_span(member, *span)
         reasons = {
             int(trajectory_numbers[i]): text for i, text in _unstartable_members(family, member, method, states).items()
@@ -250,6 +258,13 @@ class _EnsembleOptions(NamedTuple):
             )
             if not len(trajectory_numbers):
                 return None, reasons
+        if is_driven_run(member):
+            members = family.members_with_extreme_parameters()[: len(states)]
+            systems = [limit_to_span(family.member(i), *span) for i in members]
+            schedule = schedule_around_features(schedule, systems, states[members], step)
+            if schedule is not self.schedule:
+                span = schedule.start, schedule.end, *schedule.breaks
+                family, member = limit_family_to_span(family, member, *span), limit_to_span(member, *span)
         noise_paths = (
             None
             if noise is None or not noise_dimension(method)

@@ -31,13 +31,14 @@ from ..engines.step import (
     stage_equations,
 )
 from ..errors import InputError
+from ..functions.time_span import checked_breaks, declared_breaks
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..systems import System
 from ..tracing.programs import jit_cached, jit_unoptimised
 from .adaptive import Adaptive
 from .flow_derivatives import state_derivatives
 from .preparation import checked_initial_state, initial_state, limit_to_span, prepare_for_method
-from .schedule import StepSchedule
+from .schedule import make_schedule
 
 
 @with_library_settings
@@ -49,6 +50,7 @@ def flow(
     method: OneStepMethod | None = None,
     save_every: int | None = None,
     attitude=None,
+    breaks: Sequence[float] = (),
 ) -> jax.Array:
     """Return the final state of the flow from x0, a differentiable function of x0 and the parameters of the system.
 
@@ -78,6 +80,8 @@ def flow(
     attitude : array, shape (m, m), optional
         The initial attitude (dimensionless), if a torque depends on it; the identity by default. The function returns
         momenta only.
+    breaks : sequence of float
+        As for :func:`integrate`.
 
     Returns
     -------
@@ -100,10 +104,10 @@ def flow(
     """
     method = DEFAULT_METHOD if method is None else method
     _check_arguments(system, t_span, step, method)
-    x, schedule = system.state(x0), StepSchedule(t_span, step, save_every)
+    x, schedule = system.state(x0), make_schedule(t_span, step, save_every, breaks=(*checked_breaks(breaks), *declared_breaks(system)))
     n, user_system = system.dim, system
     system, method = prepare_for_method(system, method, None, attitude is not None)
-    system = limit_to_span(system, schedule.start, schedule.end)
+    system = limit_to_span(system, schedule.start, schedule.end, *schedule.breaks)
     initial_arguments = x, schedule.start, attitude
     # the values of a traced state are unknown, so it cannot be checked
     x = jnp.asarray(
@@ -264,8 +268,9 @@ def _recompute_path(system: System, method: OneStepMethod, x, step_sizes, steps:
 
         def step(x, solved_step, h=step_sizes[i]):
             _, compensation, k = solved_step
-            k = _implicit_slopes(system, method, x, compensation, h, k)
-            return method.move(system, x, compensation, h, k)[0], None
+            step_system = system.at_step_start(x)
+            k = _implicit_slopes(step_system, method, x, compensation, h, k)
+            return method.move(step_system, x, compensation, h, k)[0], None
 
         def save(x, solved_steps, step=step):
             x, _ = jax.lax.scan(step, x, solved_steps)
@@ -306,6 +311,7 @@ def differentiable_step(
 ) -> tuple[jax.Array, ...]:
     """Return the carry after a step that JAX can differentiate; NaN if its equations cannot be solved."""
     x, compensation, k, older_k = carry
+    system = system.at_step_start(x)
     if method.explicit:
         new_k = _slopes_or_nan(explicit_stage_solution(system, method, x, compensation, h, k))
     else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from typing import Literal
 
 from manifolds._precision import with_library_settings
@@ -39,6 +40,7 @@ def integrate(
     save_to: str | os.PathLike | None = None,
     attitude=None,
     noise: Fluctuations | None = None,
+    breaks: Sequence[float] = (),
 ) -> Solution:
     """Integrate a system from a state over a span of time.
 
@@ -94,6 +96,11 @@ def integrate(
     noise : Fluctuations, optional
         ``lt.Fluctuations(boltzmann, seed)``, the noise that belongs to the dissipation. The method is then
         ``MetriplecticMidpoint``, which is the default, with steps of one size.
+    breaks : sequence of float
+        Times (in the unit of ``t_span``) at which the energy or the torque, as a function of time, jumps or has a
+        kink. A step ends at each break inside the span. It sees the limits of these functions from before the break,
+        and the next step those from after. A jump of the energy is work. Ready torques with jumps, such as
+        ``lt.torques.PiecewiseConstant``, state their breaks themselves.
 
     Returns
     -------
@@ -136,6 +143,7 @@ def integrate(
         progress=progress,
         save_to=save_to,
         attitude=attitude,
+        breaks=breaks,
     )
 
 

@@ -164,24 +164,25 @@ MAX_LIMITED_SYSTEMS = 64
 _limited_systems: LRUCache[tuple[System, System]] = LRUCache(MAX_LIMITED_SYSTEMS)
 
 
-def limit_to_span(system: System, start: float, end: float) -> System:
+def limit_to_span(system: System, start: float, end: float, *breaks: float) -> System:
     """Return the prepared system with its functions of time evaluated only at times from ``start`` to ``end``.
 
-    Equal arguments return the same object, so that cached results are shared.
+    At the ``breaks`` within the span functions of time may jump. Equal arguments return the same object, so that cached
+    results are shared.
     """
     if not is_driven_run(system):
         return system
     if is_traced(system):
-        return set_time_span(system, start, end)
+        return set_time_span(system, start, end, *breaks)
     # the value holds the system, so that its id stays its own
     return _limited_systems.get_or_compute(
-        (id(system), start, end), lambda: (system, set_time_span(system, start, end))
+        (id(system), start, end, breaks), lambda: (system, set_time_span(system, start, end, *breaks))
     )[1]
 
 
-def limit_family_to_span(family: Family, system: System, start: float, end: float) -> Family:
+def limit_family_to_span(family: Family, system: System, start: float, end: float, *breaks: float) -> Family:
     """Return the family with each member limited to a span; ``system`` is one of the members."""
-    return family.map_members_with_numbers(set_time_span, start, end) if is_driven_run(system) else family
+    return family.map_members_with_numbers(set_time_span, start, end, *breaks) if is_driven_run(system) else family
 
 
 def is_driven_run(system: System) -> bool:

@@ -23,6 +23,7 @@ from .preparation import (
     prepare_system_and_method,
     resolve_invariants,
 )
+from .schedule import StepSchedule
 from .solution_builder import RecordedFunctions
 
 
@@ -97,9 +98,10 @@ class Problem:
                 return x
         return checked_initial_state(self.system, self.method, x0, t, attitude)
 
-    def system_in_span(self, start: float, end: float) -> System:
-        """Return the system with its functions of time evaluated within a span only."""
-        return limit_to_span(self.system, start, end) if self.is_driven else self.system
+    def system_in_span(self, schedule: StepSchedule) -> System:
+        """Return the system with its functions of time evaluated within the span of a schedule only."""
+        span = schedule.start, schedule.end, *schedule.breaks
+        return limit_to_span(self.system, *span) if self.is_driven else self.system
 
     def engine(
         self, requested_engine: str, system: System, planned_steps: int, noise_increments: Callable | None = None

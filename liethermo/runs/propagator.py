@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import os
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import equinox as eqx
@@ -17,6 +17,7 @@ from manifolds._precision import with_library_settings
 from ..engines.select_engine import ENGINES
 from ..engines.status_codes import StatusCode
 from ..errors import ConvergenceError, FileError, InputError, NonFiniteError
+from ..functions.time_span import checked_breaks, declared_breaks
 from ..integrators import DEFAULT_METHOD, OneStepMethod, Reference
 from ..results.ensemble import Ensemble
 from ..results.solution import Solution
@@ -32,6 +33,7 @@ from .progress import Progress
 from .run import Run
 from .schedule import CHUNK_STEPS, ScheduleSegment, StepSchedule, checked_span, checked_step, make_schedule
 from .system_family import named_parameters
+from .time_features import schedule_around_features
 
 CONVERGENCE_FAILURES = tuple(
     code.status_name for code in (StatusCode.NOT_CONVERGED, StatusCode.STEP_UNDERFLOW, StatusCode.STEP_LIMIT)
@@ -151,12 +153,13 @@ class Propagator:
         progress: bool | None = False,
         save_to: str | os.PathLike | None = None,
         attitude=None,
+        breaks: Sequence[float] = (),
     ) -> Solution:
         """Return the solution from a state over a span of time.
 
         Parameters
         ----------
-        x0, t_span, save_every, save_at, until, dense, on_failure, progress, save_to, attitude
+        x0, t_span, save_every, save_at, until, dense, on_failure, progress, save_to, attitude, breaks
             As for :func:`integrate`; without a progress bar by default.
         parameters : dict from str to array, optional
             New values of parameters of the system, by their names, such as ``{"dissipation.rate": 0.1}``.
@@ -178,6 +181,7 @@ class Propagator:
                 progress=progress,
                 save_to=save_to,
                 attitude=attitude,
+                breaks=breaks,
             )
         check_choice("on_failure", on_failure, ("raise", "return"))
         step, adaptive = self.step, isinstance(self.step, Adaptive)
@@ -186,8 +190,13 @@ class Propagator:
             raise InputError(REFERENCE_STEPS)
         if self.noise is not None and (dense or until is not None):
             raise InputError(NOISY_STEPS)
-        schedule = self._schedule(t_span, save_every, save_at, allow_infinite_end=adaptive and until is not None)
-        run = Run(problem, problem.initial_state(x0, schedule.start, attitude), schedule, save_to, self.engine, dense)
+        breaks = *checked_breaks(breaks), *(self._declared_breaks if problem.is_driven else ())
+        allow_infinite_end = adaptive and until is not None
+        schedule = self._schedule(t_span, save_every, save_at, allow_infinite_end, breaks)
+        x = problem.initial_state(x0, schedule.start, attitude)
+        if problem.is_driven and isinstance(self.method, OneStepMethod):
+            schedule = schedule_around_features(schedule, [problem.system_in_span(schedule)], [x], step)
+        run = Run(problem, x, schedule, save_to, self.engine, dense)
         with Progress((schedule.start, schedule.end), progress) as bar:
             if isinstance(self.method, Reference):
                 run.run_with_scipy(bar)
@@ -285,10 +294,15 @@ class Propagator:
             self._decided_problem = problem
         return problem
 
-    def _schedule(self, t_span, save_every: int, save_at, allow_infinite_end: bool) -> StepSchedule:
+    @functools.cached_property
+    def _declared_breaks(self) -> tuple[float, ...]:
+        """Times at which functions of time of the system say that they jump."""
+        return declared_breaks(self.system)
+
+    def _schedule(self, t_span, save_every: int, save_at, allow_infinite_end: bool, breaks: tuple) -> StepSchedule:
         """Return the schedule of a run; short ones that were used last are held in memory."""
-        if save_at is not None or allow_infinite_end or type(save_every) is not int:
-            return make_schedule(t_span, self.step, save_every, save_at, allow_infinite_end)
+        if save_at is not None or allow_infinite_end or breaks or type(save_every) is not int:
+            return make_schedule(t_span, self.step, save_every, save_at, allow_infinite_end, breaks)
         key = *checked_span(t_span), save_every
         schedule = self._schedules.get(key)
         if schedule is None:

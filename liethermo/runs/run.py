@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import math
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from manifolds.errors import warn
@@ -58,7 +60,7 @@ class Run:
 
     def __init__(self, problem: Problem, x0, schedule: StepSchedule, save_to, engine: str, dense: bool = False):
         self.problem, self.method, self.schedule = problem, problem.method, schedule
-        self.system = problem.system_in_span(schedule.start, schedule.end)
+        self.system = problem.system_in_span(schedule)
         self.save_to, self.start_wall_time = save_to, time.perf_counter()
         self.last_checkpoint_time = self.start_wall_time
         self.saved_times = [np.array([schedule.start])]
@@ -141,6 +143,7 @@ class Run:
         """Take adaptive steps, or steps of a given size with events; every step is examined."""
         start, end, save_every = self.schedule.start, self.schedule.end, self.schedule.save_every or 1
         saves_at_stops, stops = self.schedule.save_every is None, self.schedule.stop_times
+        saved_stops = self.schedule.saved_stop_times
         events = None if until is None else EventSet(until, self.system, start, self.saved_states[0][0])
         if events is not None and events.calls_python and self.engine.requested_engine == "auto":
             self.engine = self.problem.engine("array", self.system, 0)  # machine code does not call Python
@@ -149,8 +152,10 @@ class Run:
         def save_steps(steps: AcceptedSteps):
             nonlocal unsaved_steps
             ends = steps.t[1:]
-            is_saved = np.isin(ends, stops) if saves_at_stops else steps.step_counts % save_every == 0
-            is_saved[-1] &= not steps.ends_at_event or ends[-1] in stops
+            is_saved = np.isin(ends, saved_stops)
+            if not saves_at_stops:
+                is_saved |= steps.step_counts % save_every == 0
+            is_saved[-1] &= not steps.ends_at_event or ends[-1] in saved_stops
             self._save_steps(steps, is_saved)
             self.taken_steps.append(np.stack([steps.h, is_saved]))
             unsaved_steps = None if is_saved[-1] else steps
@@ -221,7 +226,7 @@ class Run:
         """Run SciPy's solver and save its states at the times of a run with fixed steps."""
         times = self.schedule.saved_times
         self.saved_energies_entropies = [self._energies_and_entropies(self.saved_states[0])]
-        x, n_evaluations, message, was_interrupted = self.method.trajectory(self.system, self.saved_states[0][0], times)
+        x, n_evaluations, message, was_interrupted = self._scipy_states_between_breaks(times)
         self.saved_times, self.saved_states = [times[: len(x)]], [x]
         self.saved_energies_entropies = [self._energies_and_entropies(x)]
         self.stats = Stats(steps=len(x) - 1, fixed_point_iterations=n_evaluations, wall_time=self._wall_time())
@@ -235,6 +240,21 @@ class Run:
             self.status = Status(StatusCode.REFERENCE_FAILED, text, len(x) - 1, t)
         else:
             self.status = Status(StatusCode.COMPLETED, f"reached t = {t:g}", len(x) - 1, t)
+
+    def _scipy_states_between_breaks(self, times: np.ndarray) -> tuple[np.ndarray, int, str, bool]:
+        """Return what :meth:`liethermo.Reference.trajectory` returns; the solver starts again at each break."""
+        break_indices = np.searchsorted(times, self.schedule.breaks)
+        x, n_evaluations, previous_system = self.saved_states[0], 0, None
+        for first, last in itertools.pairwise([0, *break_indices.tolist(), len(times) - 1]):
+            system = self.system.at_step_start(x[-1])
+            if previous_system is not None and self.system.energy_jumps:
+                jump = system.energy.value(x[-1]) - previous_system.energy.value(x[-1])
+                x[-1] = self.system.add_jump_of_energy(jnp.asarray(x[-1]), jump)
+            states, n, message, was_interrupted = self.method.trajectory(system, x[-1], times[first : last + 1])
+            x, n_evaluations, previous_system = np.concatenate([x, states[1:]]), n_evaluations + n, system
+            if message or was_interrupted or len(states) <= last - first:
+                break
+        return x, n_evaluations, message, was_interrupted
 
     def _energies_and_entropies(self, x: np.ndarray) -> np.ndarray:
         return np.stack(evaluate_at_points(energy_and_entropy_at, self.system, x), axis=1)
@@ -294,6 +314,7 @@ class Run:
                 engine=None if isinstance(self.method, Reference) else self.engine.name,
                 noise=None if noise is None else noise.to_provenance(),
                 x0=x0.tolist() if self.system.dim <= MAX_PROVENANCE_COMPONENTS else None,
+                **({"breaks": list(schedule.breaks)} if schedule.breaks else {}),
             )
         )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +13,7 @@ import numpy as np
 from ..engines.array_engine import MAX_SAVES_PER_CALL
 from ..errors import InputError
 from ..functions.gradients import EPS
+from ..functions.time_span import checked_breaks
 from .adaptive import Adaptive
 
 CHUNK_STEPS = 100_000
@@ -26,24 +27,25 @@ multiples of a step."""
 
 class ScheduleSegment(NamedTuple):
     """Equal steps from ``start`` to ``end``, and a last one of size ``last_step_size`` if the equal steps do not reach
-    the end."""
+    the end. ``saves_end`` says whether the state at the end is saved."""
 
     start: float
     end: float
     n_full_steps: int
     last_step_size: float
+    saves_end: bool = True
 
     @classmethod
-    def from_span(cls, start: float, end: float, h: float) -> ScheduleSegment:
+    def from_span(cls, start: float, end: float, h: float, saves_end: bool = True) -> ScheduleSegment:
         if math.isinf(h):
-            return cls(start, end, 0, end - start)
+            return cls(start, end, 0, end - start, saves_end)
         # The tolerance keeps 0.1 * 1000 from asking for a thousand-and-first step of 1e-14, and 1024.9 - 1024.8 from
         # asking for a second one: the times themselves are rounded.
         rounding = min(TIME_TOLERANCE_ULPS * EPS * max(abs(start), abs(end)), 0.01 * h)
         tolerance = max(1e-12 * (end - start), rounding)
         n_full_steps = math.floor((end - start + tolerance) / h)
         last_step_size = end - (start + n_full_steps * h)
-        return cls(start, end, n_full_steps, last_step_size if last_step_size > tolerance else 0.0)
+        return cls(start, end, n_full_steps, last_step_size if last_step_size > tolerance else 0.0, saves_end)
 
     @property
     def n_steps(self) -> int:
@@ -77,16 +79,21 @@ class StepSchedule:
     span : (float, float)
     step : float
     save_every : int or None
-        Save every ``save_every``-th state and the last; with None save only the states at the stops.
-    stop_times : array, optional
-        Times at which steps end; the last is the end of the span. By default the end of the span is the only stop.
+        Save every ``save_every``-th state between two stops, and the states at the stops; with None save only the
+        states at the times ``save_at``.
+    save_at : array, optional
+        Times to save, increasing, the last of which is the end of the span; the end alone by default.
     allow_infinite_end : bool
         Allow an infinite end, for adaptive steps.
+    breaks : sequence of float
+        Increasing times inside the span at which functions of time jump: steps end there too.
 
     Attributes
     ----------
     start, end, h : float
+    breaks : tuple of float
     segments : list of ScheduleSegment
+        One for each stop: each time to save, and each break.
     n_steps : int
         Number of steps of all segments.
 
@@ -97,7 +104,13 @@ class StepSchedule:
     """
 
     def __init__(
-        self, span, step, save_every: int | None, stop_times: np.ndarray | None = None, allow_infinite_end: bool = False
+        self,
+        span,
+        step,
+        save_every: int | None,
+        save_at: np.ndarray | None = None,
+        allow_infinite_end: bool = False,
+        breaks: Sequence[float] = (),
     ):
         self.start, self.end = checked_span(span, allow_infinite_end)
         self.h = math.inf if math.isinf(self.end) else checked_step(step, self.start, self.end)
@@ -105,11 +118,13 @@ class StepSchedule:
             isinstance(save_every, bool) or not isinstance(save_every, int) or save_every < 1
         ):
             raise InputError(f"save_every must be a positive integer, got {save_every!r}")
-        stops = [self.end] if stop_times is None else [float(t) for t in stop_times if t > self.start]
-        self.save_every, self.segments = (
-            save_every,
-            [ScheduleSegment.from_span(*ends, self.h) for ends in itertools.pairwise([self.start, *stops])],
-        )
+        saved_stops = {self.end} if save_at is None else {float(t) for t in save_at if t > self.start}
+        stops = sorted({*saved_stops, *breaks})
+        self.save_every, self.breaks = save_every, tuple(breaks)
+        self.segments = [
+            ScheduleSegment.from_span(*ends, self.h, save_every is not None or ends[1] in saved_stops)
+            for ends in itertools.pairwise([self.start, *stops])
+        ]
         self.n_steps = sum(segment.n_steps for segment in self.segments)
 
     @classmethod
@@ -117,8 +132,16 @@ class StepSchedule:
         """Return the schedule of a span of length zero at time t; it has no step."""
         schedule = cls.__new__(cls)
         schedule.start = schedule.end = t
-        schedule.h, schedule.save_every, schedule.segments, schedule.n_steps = 0.0, None, [], 0
+        schedule.h, schedule.save_every, schedule.segments, schedule.n_steps, schedule.breaks = 0.0, None, [], 0, ()
         return schedule
+
+    def with_more_breaks(self, breaks: Sequence[float]) -> StepSchedule:
+        """Return the schedule with more breaks, inside the span."""
+        if not breaks:
+            return self
+        save_at = self.saved_stop_times if self.save_every is None else None
+        all_breaks = sorted({*self.breaks, *breaks})
+        return StepSchedule((self.start, self.end), self.h, self.save_every, save_at, breaks=all_breaks)
 
     def engine_calls(
         self, max_steps: int = CHUNK_STEPS, max_saves: int = MAX_SAVES_PER_CALL, save_all: bool = False
@@ -140,14 +163,21 @@ class StepSchedule:
                     else max(1, min(max_saves, max_steps // steps_per_save, n_remaining // steps_per_save))
                 )
                 n_done += n_saves * steps_per_save
-                yield EngineCall(self.h, n_saves, steps_per_save, save_every is not None or n_done >= segment.n_steps)
+                is_end = n_done >= segment.n_steps
+                keep = save_every is not None or (is_end and segment.saves_end)
+                yield EngineCall(self.h, n_saves, steps_per_save, keep)
             if segment.last_step_size:
-                yield EngineCall(segment.last_step_size, 1, 1, True)
+                yield EngineCall(segment.last_step_size, 1, 1, segment.saves_end)
 
     @property
     def stop_times(self) -> np.ndarray:
         """Times at which steps must end, in increasing order; the last is the end of the span."""
         return np.array([segment.end for segment in self.segments])
+
+    @property
+    def saved_stop_times(self) -> np.ndarray:
+        """Those of :attr:`stop_times` whose states are saved."""
+        return np.array([segment.end for segment in self.segments if segment.saves_end])
 
     def step_size_after(self, n_steps: int) -> float:
         """Return the size of the step that follows the first ``n_steps`` steps; at the end, the size of the last
@@ -161,20 +191,38 @@ class StepSchedule:
     @property
     def longest_steps(self) -> np.ndarray:
         """The longest step after each saved state, shape (saved states - 1,)."""
-        step_sizes = [self.h if segment.n_full_steps else segment.last_step_size for segment in self.segments]
-        return (
-            np.array(step_sizes) if self.save_every is None else np.full(len(self.saved_step_counts) - 1, step_sizes[0])
-        )
+        n_full_steps, last_step_sizes = self._full_steps_and_last_step_sizes
+        full_steps_before_segments = np.cumsum([0, *n_full_steps])
+        segment_index = self._segment_of_step(self.saved_step_counts)
+        steps_in_segment = self.saved_step_counts - self._steps_before_segments[segment_index]
+        n_full = full_steps_before_segments[segment_index] + np.minimum(steps_in_segment, n_full_steps[segment_index])
+        longest_last_steps = np.maximum.reduceat(last_step_sizes, segment_index[:-1])
+        return np.where(np.diff(n_full) > 0, self.h, longest_last_steps)
 
     @functools.cached_property
     def saved_step_counts(self) -> np.ndarray:
         """Numbers of steps after which states are saved, from 0 (the start) to ``n_steps``."""
-        if self.save_every is None:
-            return self._steps_before_segments
-        counts = np.arange(0, self.segments[0].n_full_steps + 1, self.save_every)
-        return np.append(
-            counts, [n for n in sorted({self.segments[0].n_full_steps, self.n_steps}) if n > counts[-1]]
-        ).astype(int)
+        counts = [np.zeros(1, dtype=int)]
+        for first_step, segment in zip(self._steps_before_segments, self.segments, strict=False):
+            if self.save_every is not None:
+                counts.append(first_step + np.arange(0, segment.n_full_steps + 1, self.save_every))
+                counts.append(np.array([first_step + segment.n_full_steps]))
+            if segment.saves_end:
+                counts.append(np.array([first_step + segment.n_steps]))
+        return np.unique(np.concatenate(counts))
+
+    @functools.cached_property
+    def _full_steps_and_last_step_sizes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Number of full steps of each segment, and the size of its last step."""
+        return (
+            np.array([segment.n_full_steps for segment in self.segments]),
+            np.array([segment.last_step_size for segment in self.segments]),
+        )
+
+    def _segment_of_step(self, steps: np.ndarray) -> np.ndarray:
+        """Return the indices of the segments to which the steps after the given numbers of steps belong."""
+        index = np.searchsorted(self._steps_before_segments, steps, side="right") - 1
+        return np.clip(index, 0, len(self.segments) - 1)
 
     @functools.cached_property
     def _steps_before_segments(self) -> np.ndarray:
@@ -195,9 +243,7 @@ class StepSchedule:
         if len(self.segments) == 1:
             times = np.minimum(_time_after(self.start, steps, self.h), self.end)
             return np.where(steps >= self.n_steps, self.end, times)
-        segment_index = np.clip(
-            np.searchsorted(self._steps_before_segments, steps, side="right") - 1, 0, len(self.segments) - 1
-        )
+        segment_index = self._segment_of_step(steps)
         starts, ends = (
             np.array([getattr(segment, name) for segment in self.segments])[segment_index] for name in ("start", "end")
         )
@@ -210,26 +256,39 @@ class StepSchedule:
 
 
 def make_schedule(
-    span, step: float | Adaptive, save_every: int | None, save_at=None, allow_infinite_end: bool = False
+    span,
+    step: float | Adaptive,
+    save_every: int | None,
+    save_at=None,
+    allow_infinite_end: bool = False,
+    breaks: Sequence[float] = (),
 ) -> StepSchedule:
     """Return the schedule of a run; an adaptive run has one nominal step, as long as the span.
 
-    With ``save_at`` the steps end at these times, and only the states there are saved.
+    With ``save_at`` the steps end at these times, and only the states there are saved. Steps end at the ``breaks`` that
+    lie inside the span.
     """
     start, end = checked_span(span, allow_infinite_end)
     step_size = end - start if isinstance(step, Adaptive) else step
-    schedule = StepSchedule((start, end), step_size, save_every, allow_infinite_end=allow_infinite_end)
+    breaks_inside = tuple(t for t in checked_breaks(breaks) if start < t < end)
+    schedule = StepSchedule(
+        (start, end), step_size, save_every, allow_infinite_end=allow_infinite_end, breaks=breaks_inside
+    )
     if save_at is None:
         return schedule
-    return StepSchedule((start, end), step_size, None, _stop_times(save_at, start, end), allow_infinite_end)
+    save_times = _save_times(save_at, start, end, breaks_inside)
+    return StepSchedule((start, end), step_size, None, save_times, allow_infinite_end, breaks_inside)
 
 
-def _stop_times(save_at, start: float, end: float) -> np.ndarray:
-    """Return the sorted times of ``save_at`` and the end of the span."""
+def _save_times(save_at, start: float, end: float, breaks: tuple[float, ...]) -> np.ndarray:
+    """Return the sorted times of ``save_at`` and the end of the span; times at a break, to rounding, are the break."""
     times = np.atleast_1d(np.asarray(save_at, dtype=np.float64))
     if times.ndim != 1 or not np.isfinite(times).all() or times.size == 0:
         raise InputError(f"save_at must be a list of times, got {save_at!r}")
-    return np.unique([*clip_times_to_span(times, start, end, "save_at"), end])
+    times = clip_times_to_span(times, start, end, "save_at")
+    for t in breaks:
+        times = np.where(np.abs(times - t) <= TIME_TOLERANCE_ULPS * EPS * max(abs(start), abs(t)), t, times)
+    return np.unique([*times, end])
 
 
 def clip_times_to_span(times: np.ndarray, start: float, end: float, name: str) -> np.ndarray:

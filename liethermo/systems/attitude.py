@@ -18,6 +18,7 @@ from manifolds.groups import maps
 from ..dissipation.base import LiftedDissipation, LiftedGeometry
 from ..errors import InputError
 from ..functions.energy import Energy, Linear
+from ..functions.time_span import replace_time_span
 from ..tracing.interpret import evaluate_at_points
 from .base import System
 from .driven import DrivenSystem
@@ -99,6 +100,18 @@ class AttitudeSystem(System):
         entries = g[..., None, :, :] if self._n_real_parts == 1 else jnp.stack([g.real, g.imag], axis=-3)
         impulse = [] if p is None else [p]
         return jnp.concatenate([mu, entries.reshape(*mu.shape[:-1], -1), *impulse], axis=-1)
+
+    def at_step_start(self, x) -> AttitudeSystem:
+        body = self.body
+        if not (isinstance(body, DrivenSystem) and body.span.breaks.size):
+            return self
+        return replace_time_span(self, body.span.interval_at(body.time(self.points(x))))
+
+    energy_jumps = forward_to("body")
+
+    def add_jump_of_energy(self, x, amount):
+        n = self.body.dim
+        return jnp.concatenate([self.body.add_jump_of_energy(x[:n], amount), x[n:]])
 
     def clock_components(self, v):
         mu, g = self.split_state(v)

@@ -329,6 +329,30 @@ class System(SystemInterface):
         """Return this system with its components in the order that is fastest for large states; None if it has none."""
         return None
 
+    def at_step_start(self, x) -> System:
+        """Return the system for a step that starts at x, shape (n,).
+
+        Functions of time that jump at the end of this step have their limits from before, and those that jump at its
+        start their limits from after.
+        """
+        return self
+
+    @property
+    def energy_jumps(self) -> bool:
+        """Whether the energy may jump at a break of the span."""
+        return False
+
+    def add_jump_of_energy(self, x, amount) -> jax.Array:
+        """Return x, shape (n,), with a jump of the energy added to the work if a step from x starts at a break."""
+        return x
+
+    def error_of_step(self, x, error, mean_slope) -> jax.Array:
+        """Return the error of a step from x, over its size, with the error of the work as one of the state, shape (n,).
+
+        A step that is corrected onto the level of the energy less the work moves the state by the error of the work.
+        """
+        return error
+
     def clock_components(self, v) -> jax.Array:
         """Return v, shape (n,), with zeros in all components but those that only count: a clock, and the work done."""
         return jnp.zeros_like(v)

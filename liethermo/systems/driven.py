@@ -19,7 +19,7 @@ from ..errors import InputError
 from ..functions.checks import with_polynomial_degrees
 from ..functions.coordinates import ComponentMap
 from ..functions.energy import ChartEnergy, Energy, Linear, Pullback, Quadratic, StateTimeEnergy, Sum
-from ..functions.time_span import TimeSpan
+from ..functions.time_span import TimeSpan, replace_time_span
 from .base import System
 
 CLOCK_UNIT = 2.0**-100
@@ -38,6 +38,9 @@ class DrivenSystem(System):
 
     A torque tau does work, ``x' = ... + tau``, ``W' = dH/dt + dH . tau``. It acts by a skew bracket of x and W with the
     energy, so it conserves ``H - W`` for every gradient, continuous or discrete.
+
+    Functions of time may jump at the breaks of the span. There a step ends, which sees the limit from before, and the
+    next one sees the limit from after [:meth:`at_step_start`]. A jump of H at a fixed state is work.
 
     A state consists of the state of the body, t and W, in units of ``unit``. :func:`liethermo.integrate` builds it from
     a system whose energy depends on time, or on which a torque acts.
@@ -98,6 +101,27 @@ class DrivenSystem(System):
     def time(self, x) -> jax.Array:
         """Return the time t of states, shape (...), clipped to the span of the run."""
         return self.span.clip(x[..., -2] / self.unit)
+
+    def at_step_start(self, x) -> DrivenSystem:
+        if not self.span.breaks.size:
+            return self
+        return replace_time_span(self, self.span.interval_at(self.time(x)))
+
+    @property
+    def energy_jumps(self) -> bool:
+        return bool(self.span.breaks.size) and self.body.energy.depends_on_time
+
+    def add_jump_of_energy(self, x, amount):
+        return x.at[-1].add(jnp.where(self.span.starts_at_break(self.time(x)), self.unit * amount, 0.0))
+
+    def error_of_step(self, x, error, mean_slope):
+        gradient_norm = jnp.linalg.norm(self.energy.gradient(x)[:-2])
+        speed = jnp.linalg.norm(mean_slope[:-2])
+        # the mean gradient along the step, which is not zero where the body starts from rest
+        mean_gradient = jnp.abs(mean_slope[-1]) / (self.unit * jnp.where(speed > 0.0, speed, jnp.inf))
+        gradient_norm = jnp.maximum(gradient_norm, mean_gradient)
+        displacement = error[-1] / (self.unit * jnp.where(gradient_norm > 0.0, gradient_norm, jnp.inf))
+        return error.at[-1].set(displacement)
 
     def work(self, x) -> jax.Array:
         """Return the work W of states, shape (...)."""

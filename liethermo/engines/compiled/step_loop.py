@@ -404,7 +404,7 @@ class CompiledStepLoop:
         arrays = [packed[end - math.prod(shape) : end].reshape(shape) for end, shape in zip(ends, shapes, strict=True)]
         inputs = NewtonInputs(*arrays[len(NEWTON_OUTPUTS) :])
         equations = stage_equations(
-            system,
+            system.at_step_start(inputs.x),
             with_noise_increments(method, inputs.dW),
             inputs.x,
             inputs.compensation,

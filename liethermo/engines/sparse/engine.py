@@ -24,7 +24,7 @@ from ..array_engine import EngineTrajectory
 from ..solver_options import DEFAULT_OPTIONS
 from ..stage_solver import IterationState, StageEquations, StageSolution, best_guess_and_residual, solve_fixed_point
 from ..status_codes import StatusCode
-from ..step import State, finish_step, initial_run_state_program, stage_equations
+from ..step import State, finish_step, initial_run_state_program, stage_equations, start_step
 from .colouring_and_lu import JacobianCompression, SparseInverse
 
 SPARSE_SOLVER_OPTIONS = replace(
@@ -198,6 +198,7 @@ def _solve_fixed_point_program(system: System, method: OneStepMethod, state: Sta
 
 
 def _stage_equations(system: System, method: OneStepMethod, state: State, h) -> StageEquations:
+    system, state = start_step(system, state)
     return stage_equations(
         system, method, state.x, state.compensation, h, state.k, state.previous_slopes, SPARSE_SOLVER_OPTIONS
     )
@@ -205,6 +206,7 @@ def _stage_equations(system: System, method: OneStepMethod, state: State, h) -> 
 
 @jit_cached
 def _finish_step_program(system: System, method: OneStepMethod, state: State, h, solution: StageSolution) -> State:
+    system, state = start_step(system, state)
     return finish_step(system, method, state, h, solution, SPARSE_SOLVER_OPTIONS)
 
 
