@@ -140,7 +140,7 @@ def start_step(system: System, state: State) -> tuple[System, State]:
 
     They differ from those given only in a run with breaks, at which functions of time jump.
     """
-    step_system = system.at_step_start(state.x)
+    step_system = system.system_of_step(state.x)
     if system.energy_jumps:  # the energy of the state before the jump is that at the end of the last step
         jump = step_system.energy.value(state.x) - state.energy
         state = state._replace(x=system.add_jump_of_energy(state.x, jump))

@@ -270,7 +270,7 @@ def accept_or_reject(
             control.allowed_error(norm) * jnp.minimum(time_fraction, 1.0),
             MIN_RELATIVE_ERROR * norm + DEFAULT_OPTIONS.tiny,
         )
-        error = method.error(system.at_step_start(old_state.x), old_state.x, old_state.compensation, h, new_state.k)
+        error = method.error(system.system_of_step(old_state.x), old_state.x, old_state.compensation, h, new_state.k)
         error = error / allowed_error
         error = jnp.where(is_solved, error, jnp.inf)
         is_accepted = error <= 1.0

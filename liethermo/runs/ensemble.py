@@ -110,7 +110,7 @@ def ensemble(
     noise : Fluctuations, optional
         As for :func:`integrate`. Every trajectory has noise of its own, by its number and the times of its steps.
     breaks : sequence of float
-        As for :func:`integrate`, for all trajectories.
+        Times (in the unit of ``t_span``) at which functions of time jump; see :func:`integrate`.
 
     Returns
     -------

@@ -81,7 +81,7 @@ def flow(
         The initial attitude (dimensionless), if a torque depends on it; the identity by default. The function returns
         momenta only.
     breaks : sequence of float
-        As for :func:`integrate`.
+        Times (in the unit of ``t_span``) at which functions of time jump; see :func:`integrate`.
 
     Returns
     -------
@@ -104,7 +104,8 @@ def flow(
     """
     method = DEFAULT_METHOD if method is None else method
     _check_arguments(system, t_span, step, method)
-    x, schedule = system.state(x0), make_schedule(t_span, step, save_every, breaks=(*checked_breaks(breaks), *declared_breaks(system)))
+    all_breaks = *checked_breaks(breaks), *declared_breaks(system)
+    x, schedule = system.state(x0), make_schedule(t_span, step, save_every, breaks=all_breaks)
     n, user_system = system.dim, system
     system, method = prepare_for_method(system, method, None, attitude is not None)
     system = limit_to_span(system, schedule.start, schedule.end, *schedule.breaks)
@@ -268,7 +269,7 @@ def _recompute_path(system: System, method: OneStepMethod, x, step_sizes, steps:
 
         def step(x, solved_step, h=step_sizes[i]):
             _, compensation, k = solved_step
-            step_system = system.at_step_start(x)
+            step_system = system.system_of_step(x)
             k = _implicit_slopes(step_system, method, x, compensation, h, k)
             return method.move(step_system, x, compensation, h, k)[0], None
 
@@ -311,7 +312,7 @@ def differentiable_step(
 ) -> tuple[jax.Array, ...]:
     """Return the carry after a step that JAX can differentiate; NaN if its equations cannot be solved."""
     x, compensation, k, older_k = carry
-    system = system.at_step_start(x)
+    system = system.system_of_step(x)
     if method.explicit:
         new_k = _slopes_or_nan(explicit_stage_solution(system, method, x, compensation, h, k))
     else:

@@ -66,7 +66,7 @@ class _StepFunction(eqx.Module):
             for leaf, is_parameter in zip(other_leaves, self.is_differentiated[:-1], strict=True)
         ]
         system, method, _ = jax.tree_util.tree_unflatten(structure, [*other_leaves, x])
-        return system.at_step_start(z[:n]), method, z[:n], z[len(z) - m :].reshape(self.slopes_shape)
+        return system.system_of_step(z[:n]), method, z[:n], z[len(z) - m :].reshape(self.slopes_shape)
 
     def __call__(self, h, compensation, z) -> jax.Array:
         """Return the residual of the stage equations, followed by the next state."""

@@ -246,7 +246,7 @@ class Run:
         break_indices = np.searchsorted(times, self.schedule.breaks)
         x, n_evaluations, previous_system = self.saved_states[0], 0, None
         for first, last in itertools.pairwise([0, *break_indices.tolist(), len(times) - 1]):
-            system = self.system.at_step_start(x[-1])
+            system = self.system.system_of_step(x[-1])
             if previous_system is not None and self.system.energy_jumps:
                 jump = system.energy.value(x[-1]) - previous_system.energy.value(x[-1])
                 x[-1] = self.system.add_jump_of_energy(jnp.asarray(x[-1]), jump)

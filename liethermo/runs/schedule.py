@@ -176,7 +176,7 @@ class StepSchedule:
 
     @property
     def saved_stop_times(self) -> np.ndarray:
-        """Those of :attr:`stop_times` whose states are saved."""
+        """Times at which steps must end and states are saved, in increasing order."""
         return np.array([segment.end for segment in self.segments if segment.saves_end])
 
     def step_size_after(self, n_steps: int) -> float:

@@ -1,4 +1,4 @@
-"""Features of functions of time, such as pulses, that steps may jump over if nobody declares them."""
+"""Features of functions of time, such as pulses, that are not declared and that steps may jump over."""
 
 from __future__ import annotations
 

@@ -101,7 +101,7 @@ class AttitudeSystem(System):
         impulse = [] if p is None else [p]
         return jnp.concatenate([mu, entries.reshape(*mu.shape[:-1], -1), *impulse], axis=-1)
 
-    def at_step_start(self, x) -> AttitudeSystem:
+    def system_of_step(self, x) -> AttitudeSystem:
         body = self.body
         if not (isinstance(body, DrivenSystem) and body.span.breaks.size):
             return self

