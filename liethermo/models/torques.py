@@ -20,7 +20,7 @@ from manifolds._pytree_module import Module
 
 from ..errors import InputError
 from ..functions.conditions import checked_numbers, require_condition
-from ..functions.piecewise import PiecewiseConstant as FunctionPiecewiseConstant
+from ..functions.piecewise_constant import PiecewiseConstant as FunctionPiecewiseConstant
 from .inertia import checked_inertia_tensors
 from .parameters import checked_finite, checked_positive
 

@@ -22,6 +22,9 @@ N_SAMPLED_INTERVALS = 4096
 MAX_SAMPLED_VALUES = 2**22
 """Largest number of values that are compared, which bounds time and memory for large systems."""
 
+MIN_SAMPLED_INTERVALS = 256
+"""Smallest number of intervals that is worth a look: systems that are too large for it are not examined."""
+
 FEATURE_CHANGE = 0.1
 """Change within an interval, as a fraction of the range over the span, that makes a feature."""
 
@@ -92,7 +95,7 @@ def undeclared_features(system: System, x: np.ndarray, schedule: StepSchedule) -
     schedule : StepSchedule
     """
     n_intervals = min(N_SAMPLED_INTERVALS, MAX_SAMPLED_VALUES // (2 * system.dim))
-    if not np.isfinite(schedule.end) or n_intervals < 2:
+    if not np.isfinite(schedule.end) or n_intervals < MIN_SAMPLED_INTERVALS:
         return []
     times = np.linspace(schedule.start, schedule.end, n_intervals + 1)
     values = _values_at_times(system, x, times)
