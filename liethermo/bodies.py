@@ -9,11 +9,18 @@ from manifolds._names import public_dir
 
 from .models.free_motion import Periods, damping_time, periods, rate_of
 from .models.inertia import PrincipalAxes, principal_axes
+from .models.jointed_bodies import JointedBodies, Tree
+from .models.joints import Hinge, Slider, Universal
 from .results.orientation import nutation, precession, quaternions, spin
 
 __all__ = [
+    "Hinge",
+    "JointedBodies",
     "Periods",
     "PrincipalAxes",
+    "Slider",
+    "Tree",
+    "Universal",
     "damping_time",
     "nutation",
     "periods",

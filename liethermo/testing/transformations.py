@@ -123,7 +123,7 @@ def transform_system(system: System, change: CoordinateChange) -> System:
     H, S = transform(system.energy, energy), None if system.entropy is None else transform(system.entropy, entropy)
     friction = _TransformedDissipation.lift_terms(system.dissipation, transform, system, A, B, units)
     maps = {name: transform(J) for name, J in system.momentum_maps.items()}
-    if isinstance(system, LiePoissonSystem) and not system.sites:
+    if isinstance(system, LiePoissonSystem) and system.dim == system.algebra.dim and not system.sites:
         if change.uniform_factor is not None and change.energy_unit == change.uniform_factor / change.time_unit:
             parts = (system.algebra, system.group, system.reconstruction)
             return LiePoissonSystem(parts[0], H, S, friction, maps, False, *parts[1:])

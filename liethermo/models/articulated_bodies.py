@@ -1,0 +1,362 @@
+"""Mechanics of a tree of rigid bodies with joints of one degree of freedom: mass matrix, kinetic energy, velocities.
+
+Everything is expressed in axes of the base. A spatial velocity is ``V = (omega, v)``, with v the velocity of the point
+of a body that coincides with the origin of the base; a spatial momentum is (angular momentum about that origin, linear
+momentum). With screws S_i of the joints and inertias I_j, shape (6, 6), the kinetic energy is ``sum_j V_j . I_j V_j /
+2`` with ``V_j = V_parent + S_j q_j'`` [Featherstone, *Rigid Body Dynamics Algorithms*, 2008, chapters 2, 6 and 7].
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from manifolds._pytree_module import Module
+
+from ..dissipation.base import Dissipation
+from ..dissipation.factor import Factor
+from ..functions.energy import Energy, float64_array
+from ..functions.indices import Indices
+
+
+class Poses(NamedTuple):
+    """Rotations and positions of the links of a tree, in axes of the base.
+
+    Attributes
+    ----------
+    rotations : list of array, shape (3, 3)
+        Rotation from axes of each link to axes of the base.
+    positions : list of array, shape (3,)
+        Origin of each link, from the origin of the base.
+    screws : list of array, shape (6,)
+        Screw of the joint that moves each link but the base.
+    """
+
+    rotations: list[jax.Array]
+    positions: list[jax.Array]
+    screws: list[jax.Array]
+
+
+class Motion(NamedTuple):
+    """Velocities of a tree for given momenta, with the forces of the kinetic energy.
+
+    Attributes
+    ----------
+    energy : array, shape ()
+        Kinetic energy.
+    angular_velocity : array, shape (3,)
+        Angular velocity of the base.
+    joint_rates : array, shape (k,)
+    joint_gradient : array, shape (k,)
+        Derivative of the kinetic energy by the joint coordinates at constant momenta.
+    """
+
+    energy: jax.Array
+    angular_velocity: jax.Array
+    joint_rates: jax.Array
+    joint_gradient: jax.Array
+
+
+class ArticulatedBodies(Module):
+    """A tree of rigid bodies: link 0 is the base, and joint i moves link i + 1 against its parent.
+
+    A link without a body stands between two joints that act at one place. The axes of all links are parallel if all
+    joint coordinates are zero.
+
+    Attributes
+    ----------
+    masses : array, shape (m,)
+        Masses of the bodies (mass).
+    centres : array, shape (m, 3)
+        Centres of mass in axes of the link, from its origin (length).
+    inertias : array, shape (m, 3, 3)
+        Tensors of inertia about the centre of mass, in axes of the link (mass * length**2).
+    places : array, shape (k, 3)
+        Origin of each moved link in its parent if the joint coordinate is zero (length).
+    axes : array, shape (k, 3)
+        Unit vector of the axis of each joint, in axes of the parent.
+    body_links : tuple of int
+        Link of each body.
+    parents : tuple of int
+        Parent of each moved link; it has a smaller index than the link.
+    slides : tuple of bool
+        True for a joint that moves its link along the axis, False for one that turns it about the axis.
+    """
+
+    masses: jax.Array
+    centres: jax.Array
+    inertias: jax.Array
+    places: jax.Array
+    axes: jax.Array
+    body_links: tuple[int, ...] = eqx.field(static=True)
+    parents: tuple[int, ...] = eqx.field(static=True)
+    slides: tuple[bool, ...] = eqx.field(static=True)
+
+    @property
+    def n_joints(self) -> int:
+        """Number of joint coordinates, k."""
+        return len(self.parents)
+
+    def poses(self, q) -> Poses:
+        """Return rotations and positions of all links and the screws of the joints, for joint coordinates q."""
+        rotations, positions, screws = [jnp.eye(3)], [jnp.zeros(3)], []
+        for i, (parent, slides) in enumerate(zip(self.parents, self.slides, strict=True)):
+            R, axis = rotations[parent], rotations[parent] @ self.axes[i]
+            position = positions[parent] + R @ self.places[i]
+            if slides:
+                screws.append(jnp.concatenate([jnp.zeros(3), axis]))
+                position = position + q[i] * axis
+            else:
+                screws.append(jnp.concatenate([axis, jnp.cross(position, axis)]))
+                R = R @ _rotation(self.axes[i], q[i])
+            rotations.append(R)
+            positions.append(position)
+        return Poses(rotations, positions, screws)
+
+    def spatial_inertias(self, poses: Poses) -> list[jax.Array | None]:
+        """Return the spatial inertia of each link, shape (6, 6); None for a link without a body."""
+        inertias: list[jax.Array | None] = [None] * (self.n_joints + 1)
+        for body, link in enumerate(self.body_links):
+            R, mass = poses.rotations[link], self.masses[body]
+            centre = _cross_matrix(poses.positions[link] + R @ self.centres[body])
+            coupling = mass * centre
+            rotational = R @ self.inertias[body] @ R.T - coupling @ centre
+            inertias[link] = jnp.block([[rotational, coupling], [-coupling, mass * jnp.eye(3)]])
+        return inertias
+
+    def mass_matrix(self, q) -> jax.Array:
+        """Return M(q), shape (3 + k, 3 + k), for which the kinetic energy is ``(Omega, q') . M(q) (Omega, q') / 2``.
+
+        The linear momentum is zero. M is the matrix of a free base by the composite-body recursion, with the linear
+        velocity eliminated by a Schur complement, whose pivot is the total mass.
+        """
+        k, poses = self.n_joints, self.poses(q)
+        composites = self.spatial_inertias(poses)
+        base_columns, M = [jnp.zeros(6)] * k, jnp.zeros((k, k))
+        for i in reversed(range(k)):
+            momentum = composites[i + 1] @ poses.screws[i]
+            ancestor = i
+            while ancestor >= 0:
+                entry = jnp.dot(poses.screws[ancestor], momentum)
+                M = M.at[i, ancestor].set(entry).at[ancestor, i].set(entry)
+                ancestor = self.parents[ancestor] - 1
+            base_columns[i] = momentum
+            _add_to(composites, self.parents[i], composites[i + 1])
+        columns = jnp.stack(base_columns, axis=1)
+        locked = composites[0]
+        angular = jnp.concatenate([locked[:3, :3], columns[:3]], axis=1)
+        joints = jnp.concatenate([columns[:3].T, M], axis=1)
+        linear = jnp.concatenate([locked[3:, :3], columns[3:]], axis=1)
+        return jnp.concatenate([angular, joints]) - linear.T @ linear / jnp.sum(self.masses)
+
+    def pivots(self, q) -> jax.Array:
+        """Return the inertia that each joint moves if all joints beyond it are free, shape (k,)."""
+        return jnp.stack([joint.pivot for joint in self._eliminate(q, jnp.zeros(3), jnp.zeros(self.n_joints))[1]])
+
+    def kinetic_energy(self, Pi, q, p) -> jax.Array:
+        """Return the kinetic energy ``(Pi, p) . M(q)^-1 (Pi, p) / 2`` by the articulated-body recursion, O(k)."""
+        _, joints, base = self._eliminate(q, Pi, p)
+        return 0.5 * sum(joint.impulse**2 / joint.pivot for joint in [*joints, *base])
+
+    def motion(self, Pi, q, p) -> Motion:
+        """Return the velocities for an angular momentum Pi and joint momenta p, O(k); see :class:`Motion`.
+
+        At constant momenta the kinetic energy has the derivative ``h_i . (S_i × V_i)`` by q_i, h_i the momentum of all
+        bodies that joint i moves: minus its derivative at constant velocities, which is that of the screw S_i as seen
+        from these bodies.
+        """
+        poses, joints, base = self._eliminate(q, Pi, p)
+        V = jnp.zeros(6)
+        for step, unit in zip(reversed(base), reversed(_BASE_SCREWS), strict=True):
+            V = V + (step.impulse - jnp.dot(step.column, V)) / step.pivot * unit
+        velocities, rates = [V], []
+        for joint, parent, screw in zip(joints, self.parents, poses.screws, strict=True):
+            rate = (joint.impulse - jnp.dot(joint.column, velocities[parent])) / joint.pivot
+            rates.append(rate)
+            velocities.append(velocities[parent] + rate * screw)
+        inertias = self.spatial_inertias(poses)
+        momenta: list[jax.Array | None] = [
+            None if inertia is None else inertia @ velocity
+            for inertia, velocity in zip(inertias, velocities, strict=True)
+        ]
+        gradient = [jnp.zeros(())] * self.n_joints
+        for i in reversed(range(self.n_joints)):
+            gradient[i] = jnp.dot(momenta[i + 1], _motion_cross(poses.screws[i], velocities[i + 1]))
+            _add_to(momenta, self.parents[i], momenta[i + 1])
+        energy = 0.5 * sum(joint.impulse**2 / joint.pivot for joint in [*joints, *base])
+        return Motion(energy, V[:3], jnp.stack(rates), jnp.stack(gradient))
+
+    def _eliminate(self, q, Pi, p) -> tuple[Poses, list[_Elimination], list[_Elimination]]:
+        """Eliminate the joint rates from the leaves to the base, then the velocity of the base.
+
+        ``T(V, q') - p . q'`` is minimal at the rates ``q_i' = (u_i - U_i . V_parent) / D_i``, and the rest of the tree
+        then sees the articulated inertia ``I - U U^T / D`` and the bias ``U u / D``. The linear momentum is zero, so
+        the angular momentum is the same about every point.
+        """
+        poses = self.poses(q)
+        inertias = self.spatial_inertias(poses)
+        biases: list[jax.Array | None] = [None] * (self.n_joints + 1)
+        joints: list[_Elimination] = []
+        for i in reversed(range(self.n_joints)):
+            joint = _Elimination.of(inertias[i + 1], biases[i + 1], poses.screws[i], p[i])
+            joints.append(joint)
+            _add_to(inertias, self.parents[i], joint.reduced_inertia(inertias[i + 1]))
+            _add_to(biases, self.parents[i], joint.bias(biases[i + 1]))
+        base: list[_Elimination] = []
+        inertia, bias = inertias[0], biases[0]
+        for unit, momentum in zip(_BASE_SCREWS, [0.0, 0.0, 0.0, *Pi], strict=True):
+            step = _Elimination.of(inertia, bias, unit, momentum)
+            base.append(step)
+            inertia, bias = step.reduced_inertia(inertia), step.bias(bias)
+        return poses, joints[::-1], base
+
+
+_BASE_SCREWS = [*np.eye(6)[3:], *np.eye(6)[:3]]
+"""Screws of the free base: the translations first, whose momenta are zero."""
+
+
+class _Elimination(NamedTuple):
+    """One velocity, eliminated from a quadratic function of spatial velocities.
+
+    Attributes
+    ----------
+    column : array, shape (6,)
+        U, the articulated inertia times the screw.
+    pivot : array, shape ()
+        D, the screw times U.
+    impulse : array, shape ()
+        u, the momentum of the joint less the bias along the screw.
+    """
+
+    column: jax.Array
+    pivot: jax.Array
+    impulse: jax.Array
+
+    @classmethod
+    def of(cls, inertia, bias, screw, momentum) -> _Elimination:
+        """Return the elimination of the velocity along a screw that has a given momentum."""
+        column = inertia @ screw
+        return cls(column, jnp.dot(screw, column), momentum if bias is None else momentum - jnp.dot(screw, bias))
+
+    def reduced_inertia(self, inertia) -> jax.Array:
+        """Return the articulated inertia without the eliminated velocity, shape (6, 6)."""
+        return inertia - jnp.outer(self.column, self.column / self.pivot)
+
+    def bias(self, bias) -> jax.Array:
+        """Return the bias that the rest of the tree sees, shape (6,)."""
+        bias_of_joint = self.column * (self.impulse / self.pivot)
+        return bias_of_joint if bias is None else bias + bias_of_joint
+
+
+def _add_to(arrays: list[jax.Array | None], index: int, value) -> None:
+    """Add a value to an entry of a list, in place; None stands for zero."""
+    entry = arrays[index]
+    arrays[index] = value if entry is None else entry + value
+
+
+def _cross_matrix(v) -> jax.Array:
+    """Return the matrix of ``v ×``, shape (3, 3)."""
+    zero = jnp.zeros_like(v[0])
+    return jnp.array([[zero, -v[2], v[1]], [v[2], zero, -v[0]], [-v[1], v[0], zero]])
+
+
+def _rotation(axis, angle) -> jax.Array:
+    """Return the rotation by an angle about a unit vector, shape (3, 3), by Rodrigues' formula."""
+    s, half = jnp.sin(angle), jnp.sin(0.5 * angle)
+    # 1 - cos as a square, which keeps its digits at small angles
+    return (1.0 - 2.0 * half**2) * jnp.eye(3) + s * _cross_matrix(axis) + 2.0 * half**2 * jnp.outer(axis, axis)
+
+
+def _motion_cross(V, W) -> jax.Array:
+    """Return the rate of a spatial velocity W that is fixed in a body which moves with V, shape (6,)."""
+    return jnp.concatenate([jnp.cross(V[:3], W[:3]), jnp.cross(V[:3], W[3:]) + jnp.cross(V[3:], W[:3])])
+
+
+class KineticEnergy(Energy):
+    """The kinetic energy ``(Pi, p) . M(q)^-1 (Pi, p) / 2`` of a tree with the state (Pi, q, p).
+
+    Attributes
+    ----------
+    mechanism : ArticulatedBodies
+    """
+
+    mechanism: ArticulatedBodies
+
+    def split_state(self, x) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Return angular momentum, joint coordinates and joint momenta, shapes (3,), (k,) and (k,)."""
+        k = self.mechanism.n_joints
+        return x[:3], x[3 : 3 + k], x[3 + k : 3 + 2 * k]
+
+    def value(self, x) -> jax.Array:
+        return self.mechanism.kinetic_energy(*self.split_state(x))
+
+    def gradient(self, x) -> jax.Array:
+        motion = self.mechanism.motion(*self.split_state(float64_array(x)))
+        return jnp.concatenate([motion.angular_velocity, motion.joint_gradient, motion.joint_rates])
+
+
+class JointSprings(Energy):
+    """The energy ``sum k_i (q_i - r_i)**2 / 2`` of springs in the joints.
+
+    Attributes
+    ----------
+    stiffness : array, shape (k,)
+        Torque per angle of hinges, force per length of sliders.
+    rest : array, shape (k,)
+        Joint coordinates r at which the springs are relaxed.
+    """
+
+    stiffness: jax.Array
+    rest: jax.Array
+
+    is_quadratic = True
+
+    def value(self, x) -> jax.Array:
+        k = self.stiffness.shape[0]
+        return 0.5 * jnp.sum(self.stiffness * (x[3 : 3 + k] - self.rest) ** 2)
+
+    def gradient(self, x) -> jax.Array:
+        k = self.stiffness.shape[0]
+        force = self.stiffness * (x[3 : 3 + k] - self.rest)
+        return jnp.concatenate([jnp.zeros(3), force, jnp.zeros(k)])
+
+
+class JointDamping(Dissipation):
+    """Viscous dampers in the joints, ``p_i' = -c_i q_i'``; they change no momentum of the whole.
+
+    Attributes
+    ----------
+    coefficients : array, shape (k,), >= 0
+        c: torque per angular velocity of hinges, force per velocity of sliders.
+    """
+
+    coefficients: jax.Array
+
+    energy_law = "nonincreasing"
+    entropy_law = None
+    needs_entropy = False
+    preserves_casimirs = True
+
+    @property
+    def heated_bath_index(self):
+        return Indices(0)
+
+    def _append_to_zeros(self, rates) -> jax.Array:
+        return jnp.concatenate([jnp.zeros(3 + self.coefficients.shape[0]), rates])
+
+    def force(self, system, x, dH, dS, dL):
+        k = self.coefficients.shape[0]
+        return self._append_to_zeros(-self.coefficients * dH[3 + k : 3 + 2 * k])
+
+    def velocity(self, system, x, dH, dS, dL):
+        return jnp.zeros_like(dH)
+
+    def factor(self, system, x, dH, dL):
+        root = jnp.sqrt(self.coefficients)
+        return Factor(
+            root.shape[0], lambda w: self._append_to_zeros(root * w), True, velocity=lambda w: jnp.zeros_like(x)
+        )
