@@ -28,10 +28,11 @@ from .casimirs import DEFAULT_MAX_DEGREE, casimirs, casimirs_up_to, leading_casi
 from .display import algebra_html
 from .killing import cartan_involution_of, killing_form_of, row_space_basis
 from .polynomial_casimirs import casimir_count
+from .structure_methods import StructureMethods, constants_in_basis
 
 
 @jax.tree_util.register_static
-class LieAlgebra:
+class LieAlgebra(StructureMethods):
     """A real Lie algebra with a chosen basis.
 
     Build one with :meth:`from_structure_constants`, :meth:`from_matrices`, or a name of the catalogue
@@ -196,6 +197,35 @@ class LieAlgebra:
         algebra = copy(self)
         algebra.basis_names = checked_names(names, self.dim)
         return algebra
+
+    def change_of_basis(self, P, *, name: str | None = None, basis_names=None) -> LieAlgebra:
+        """Return the algebra in the basis ``sum_b P[a, b] e_b``: the rows of P are its elements in this basis.
+
+        Components of elements become ``P^-T x``, those of mu ``P mu``. Fractions stay exact.
+
+        Parameters
+        ----------
+        P : array of int, Fraction or float, shape (dim, dim)
+        name : str, optional
+            By default the name of this algebra.
+        basis_names : sequence of dim str, optional
+
+        Raises
+        ------
+        ShapeError
+            If P is not a real matrix of this shape.
+        LieAlgebraError
+            If the rows of P are linearly dependent.
+
+        Examples
+        --------
+        >>> g = mf.heisenberg(1).change_of_basis([[1, 0, 0], [0, 1, 0], [0, 0, 2]])
+        >>> print(g.bracket([1.0, 0.0, 0.0], [0.0, 1.0, 0.0]))
+        [0.  0.  0.5]
+        """
+        constants, _ = constants_in_basis(self, P)
+        basis = None if self.basis is None else np.tensordot(np.asarray(P, dtype=np.float64), self.basis, axes=(1, 0))
+        return LieAlgebra(constants, name=name or self.name, basis=basis, basis_names=basis_names)
 
     # -- the operations -----------------------------------------------------------------------------------------
 
