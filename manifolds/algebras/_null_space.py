@@ -98,7 +98,7 @@ def numerical_rank(singular_values: np.ndarray, scale: float, name: str) -> int:
     ambiguous_values = singular_values[(singular_values > threshold) & (singular_values < RANK_GAP * threshold)]
     if ambiguous_values.size:
         raise LieAlgebraError(
-            f"{name}: the rank of the conditions on a Casimir is not clear, since there is a singular value of "
+            f"{name}: the rank of the linear conditions is not clear, since there is a singular value of "
             f"{ambiguous_values[0]:.1e} (zero is below {threshold:.0e}, nonzero above {RANK_GAP * threshold:.0e}); "
             "rescale the basis so that the structure constants are of similar size, or give them as fractions",
             residual=float(ambiguous_values[0]),

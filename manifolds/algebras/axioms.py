@@ -88,11 +88,14 @@ def constants_and_matrices(basis) -> tuple[np.ndarray, np.ndarray]:
     return scale_and_snap_to_fractions(constants, scales, columns, commutators), input_matrices
 
 
-def check_axioms(constants: np.ndarray, name: str, rational_constants: RationalArray | None) -> None:
-    """Raise an error if antisymmetry or the Jacobi identity fails.
+def check_axioms(
+    constants: np.ndarray, name: str, rational_constants: RationalArray | None, basis_names: tuple[str, ...] | None
+) -> None:
+    """Raise an error if antisymmetry or the Jacobi identity fails; the message has the names of the basis elements.
 
     With ``rational_constants`` the constants are its integer numerators, and the check is exact.
     """
+    labels = basis_names or tuple(f"e{a + 1}" for a in range(len(constants)))
     unit = 1.0 if rational_constants is None else 1.0 / rational_constants.denominator
     check_text = "checked exactly" if rational_constants is not None else "tolerance {:.1g}"
     scale = float(np.abs(constants).max())
@@ -101,7 +104,7 @@ def check_axioms(constants: np.ndarray, name: str, rational_constants: RationalA
     if symmetric_parts.max() > tolerance:
         a, b = (int(i) for i in np.unravel_index(symmetric_parts.argmax(), symmetric_parts.shape))
         raise AntisymmetryError(
-            f"{name}: [e{a + 1}, e{b + 1}] + [e{b + 1}, e{a + 1}] has a component of size "
+            f"{name}: [{labels[a]}, {labels[b]}] + [{labels[b]}, {labels[a]}] has a component of size "
             f"{symmetric_parts.max() * unit:.3g} ({check_text.format(tolerance)}); set C[b, a, :] = -C[a, b, :]",
             residual=float(symmetric_parts.max() * unit),
             tolerance=tolerance,
@@ -113,8 +116,8 @@ def check_axioms(constants: np.ndarray, name: str, rational_constants: RationalA
         residual = max_component * unit**2
         a, b, c = sorted(triple)
         raise JacobiError(
-            f"{name}: the Jacobi identity fails for (e{a + 1}, e{b + 1}, e{c + 1}): "
-            f"[[e{a + 1}, e{b + 1}], e{c + 1}] + cyclic has a component of size {residual:.3g} "
+            f"{name}: the Jacobi identity fails for ({labels[a]}, {labels[b]}, {labels[c]}): "
+            f"[[{labels[a]}, {labels[b]}], {labels[c]}] + cyclic has a component of size {residual:.3g} "
             f"({check_text.format(tolerance)})",
             residual=residual,
             tolerance=tolerance,

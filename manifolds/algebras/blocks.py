@@ -204,7 +204,7 @@ class DirectSum(BracketAlgebra):
     def casimir_count(self) -> int:
         return sum(count * g.casimir_count() for g, count in self.blocks)
 
-    def casimirs(self, degree: int) -> list:
+    def _casimirs_of_degree(self, degree: int) -> list:
         """Return the Casimirs of each block in turn, as functions of the full mu.
 
         Raises

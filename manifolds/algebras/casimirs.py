@@ -23,6 +23,9 @@ from .structure import AlgebraStructure
 MAX_LEADING_MONOMIALS = 400
 """Largest number of monomials of a degree in which leading Casimirs are searched for (a second's work)."""
 
+DEFAULT_MAX_DEGREE = 4
+"""Largest degree of the Casimirs that ``casimirs()`` returns without arguments: a second's work up to dimension 10."""
+
 
 class NoPolynomialCasimirWarning(UserWarning):
     """Issued when an algebra has Casimirs but no polynomial one was found."""
@@ -84,6 +87,16 @@ def casimirs(g: AlgebraStructure, degree: int) -> list[Polynomial | TracePolynom
             NoPolynomialCasimirWarning,
         )
     return casimir_list
+
+
+def casimirs_up_to(g: AlgebraStructure, max_degree: int) -> list:
+    """Return the polynomial Casimirs of degrees 1 to ``max_degree``; the warning of :func:`casimirs` comes once."""
+    if isinstance(max_degree, bool) or not isinstance(max_degree, int | np.integer) or max_degree < 1:
+        raise ParameterError(f"max_degree must be an integer >= 1, not {max_degree!r}")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NoPolynomialCasimirWarning)
+        lower_casimirs = [F for degree in range(1, int(max_degree)) for F in g.casimirs(degree)]
+    return lower_casimirs + g.casimirs(int(max_degree))
 
 
 def leading_casimirs(g: AlgebraStructure) -> list[tuple[str, Callable]]:

@@ -18,19 +18,21 @@ import numpy as np
 
 from .._arrays import is_traced, real_components, square_matrices
 from .._names import checked_names
-from ..errors import LieAlgebraError
+from ..errors import LieAlgebraError, ParameterError
 from ._basis_scaling import STRUCTURE_TOLERANCE, balance_constants
 from ._rational import RationalArray, rational_array
 from .actions import Action, AdMatrixAction, Operator, terms_to_unroll, unrolled_bracket
 from .axioms import check_axioms, checked_constants, constants_and_matrices, real_columns
-from .casimirs import casimirs, leading_casimirs
+from .bracket_table import constants_and_names
+from .casimirs import DEFAULT_MAX_DEGREE, casimirs, casimirs_up_to, leading_casimirs
 from .display import algebra_html
 from .killing import cartan_involution_of, killing_form_of, row_space_basis
 from .polynomial_casimirs import casimir_count
+from .structure_methods import StructureMethods, constants_in_basis
 
 
 @jax.tree_util.register_static
-class LieAlgebra:
+class LieAlgebra(StructureMethods):
     """A real Lie algebra with a chosen basis.
 
     Build one with :meth:`from_structure_constants`, :meth:`from_matrices`, or a name of the catalogue
@@ -81,7 +83,7 @@ class LieAlgebra:
         self.name = name
         self._basis: np.ndarray | None = None if basis is None else _read_only_copy(np.asarray(basis))
         self.basis_names = None if basis_names is None else checked_names(basis_names, self.dim)
-        check_axioms(self._constants if fractions is None else fractions.numerator, name, fractions)
+        check_axioms(self._constants if fractions is None else fractions.numerator, name, fractions, self.basis_names)
 
     @property
     def structure_constants(self) -> np.ndarray:
@@ -140,6 +142,40 @@ class LieAlgebra:
         constants, matrices = constants_and_matrices(basis)
         return cls(constants, name=name, basis=matrices, basis_names=basis_names)
 
+    @classmethod
+    def from_brackets(cls, brackets, *, name: str = "g", basis=None) -> LieAlgebra:
+        """Return the algebra with the given brackets of named basis elements; all other brackets are zero.
+
+        Antisymmetry fills in the opposite brackets.
+
+        Parameters
+        ----------
+        brackets : dict
+            The brackets by pairs of names. A value is a name, such as ``"e3"`` or ``"-e3"``, a dictionary from names to
+            coefficients (int, Fraction or float), or 0.
+        name : str
+        basis : sequence of str, optional
+            The names of all basis elements, each an identifier, in their order. By default the names that occur,
+            ordered by their numbers if they are ``e1``, ``e2``, …, and otherwise as they occur.
+
+        Raises
+        ------
+        ParameterError, ComponentError
+            If a name is not in ``basis``, or a value is no combination of names.
+        AntisymmetryError
+            If two entries contradict each other.
+        JacobiError
+            If the Jacobi identity fails; the message names the three elements.
+
+        Examples
+        --------
+        >>> g = mf.LieAlgebra.from_brackets({("e2", "e4"): "e1", ("e3", "e4"): {"e2": 1}}, name="A4,1")
+        >>> print(*g.casimirs(max_degree=2), sep=", ")
+        e1, 2*e1*e3 - e2**2
+        """
+        constants, names = constants_and_names(brackets, basis)
+        return cls(constants, name=name, basis_names=names)
+
     def with_basis_names(self, *names: str) -> LieAlgebra:
         """Return an equal algebra whose basis elements have names.
 
@@ -161,6 +197,35 @@ class LieAlgebra:
         algebra = copy(self)
         algebra.basis_names = checked_names(names, self.dim)
         return algebra
+
+    def change_of_basis(self, P, *, name: str | None = None, basis_names=None) -> LieAlgebra:
+        """Return the algebra in the basis ``sum_b P[a, b] e_b``: the rows of P are its elements in this basis.
+
+        Components of elements become ``P^-T x``, those of mu ``P mu``. Fractions stay exact.
+
+        Parameters
+        ----------
+        P : array of int, Fraction or float, shape (dim, dim)
+        name : str, optional
+            By default the name of this algebra.
+        basis_names : sequence of dim str, optional
+
+        Raises
+        ------
+        ShapeError
+            If P is not a real matrix of this shape.
+        LieAlgebraError
+            If the rows of P are linearly dependent.
+
+        Examples
+        --------
+        >>> g = mf.heisenberg(1).change_of_basis([[1, 0, 0], [0, 1, 0], [0, 0, 2]])
+        >>> print(g.bracket([1.0, 0.0, 0.0], [0.0, 1.0, 0.0]))
+        [0.  0.  0.5]
+        """
+        constants, _ = constants_in_basis(self, P)
+        basis = None if self.basis is None else np.tensordot(np.asarray(P, dtype=np.float64), self.basis, axes=(1, 0))
+        return LieAlgebra(constants, name=name or self.name, basis=basis, basis_names=basis_names)
 
     # -- the operations -----------------------------------------------------------------------------------------
 
@@ -338,15 +403,32 @@ class LieAlgebra:
         """
         return casimir_count(self)
 
-    def casimirs(self, degree: int):
-        """Return all homogeneous polynomial Casimirs of this degree, modulo products of Casimirs of lower degree.
+    def casimirs(self, degree: int | None = None, *, max_degree: int | None = None) -> list:
+        """Return homogeneous polynomial Casimirs, modulo products of Casimirs of lower degree.
 
         The list holds :class:`manifolds.Polynomial`, callable on ``mu`` and printing as ``mu1**2 + mu2**2 + mu3**2``;
-        the
-        coefficients are exact when the structure constants are rational. It holds :class:`manifolds.TracePolynomial` if
-        there
-        are too many monomials and the algebra is semisimple or reductive.
+        the coefficients are exact when the structure constants are rational. It holds
+        :class:`manifolds.TracePolynomial` if there are too many monomials and the algebra is semisimple or reductive.
+
+        Parameters
+        ----------
+        degree : int, optional
+            The degree of all Casimirs that are returned.
+        max_degree : int, optional
+            Return the Casimirs of all degrees from 1 to this one instead, by default to 4.
+
+        Raises
+        ------
+        ParameterError
+            If both ``degree`` and ``max_degree`` are given, or one is no positive integer.
         """
+        if degree is not None and max_degree is not None:
+            raise ParameterError("casimirs takes degree or max_degree, not both; give one of them")
+        if degree is not None:
+            return self._casimirs_of_degree(degree)
+        return casimirs_up_to(self, DEFAULT_MAX_DEGREE if max_degree is None else max_degree)
+
+    def _casimirs_of_degree(self, degree: int) -> list:
         polynomials = casimirs(self, degree)
         return polynomials if self.basis_names is None else [F.with_names(*self.basis_names) for F in polynomials]
 

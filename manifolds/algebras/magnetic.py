@@ -131,7 +131,7 @@ class MagneticExtension(BracketAlgebra):
         g = self.algebra
         return self.algebra_by_constants.casimir_count() if invariant_form_map(g) is None else 2 * g.casimir_count()
 
-    def casimirs(self, degree: int) -> list:
+    def _casimirs_of_degree(self, degree: int) -> list:
         """Return ``f(B)`` and ``<W, grad f(B)>`` for each Casimir f of g, where B is mapped to g* by the invariant
         form.
 

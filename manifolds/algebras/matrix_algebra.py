@@ -234,7 +234,7 @@ class MatrixAlgebra(BracketAlgebra):
     def casimir_count(self) -> int:
         return self.classical_data.rank
 
-    def casimirs(self, degree: int) -> list:
+    def _casimirs_of_degree(self, degree: int) -> list:
         """Return the trace of a power of the matrix of mu, if it is independent of the traces of lower degree.
 
         Raises

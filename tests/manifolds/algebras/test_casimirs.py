@@ -295,7 +295,7 @@ def test_an_empty_answer_that_hides_nothing_gives_no_warning(g, degree):
         assert g.casimirs(degree) == []
 
 
-@pytest.mark.parametrize("degree", [0, -1, 1.5, 2.0, True, "2", None])
+@pytest.mark.parametrize("degree", [0, -1, 1.5, 2.0, True, "2"])
 def test_degrees_that_are_refused(degree):
     with pytest.raises(mf.ParameterError, match="integer >= 1"):
         mf.so(3).casimirs(degree)

@@ -1,0 +1,96 @@
+"""Structure constants from a table of brackets between named basis elements."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from fractions import Fraction
+from numbers import Rational, Real
+
+import numpy as np
+
+from .._names import checked_names
+from ..errors import AntisymmetryError, ComponentError, ParameterError
+
+Combination = dict[str, Fraction | float]
+"""A linear combination of basis elements: the coefficient of each name."""
+
+
+def constants_and_names(brackets: Mapping, basis: Iterable[str] | None) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return the structure constants of a table of brackets, and the names of the basis elements.
+
+    The parameters and errors are those of :meth:`manifolds.LieAlgebra.from_brackets`.
+    """
+    table = _checked_table(brackets)
+    names = _basis_names(table) if basis is None else tuple(basis)
+    names = checked_names(names, len(names))
+    index = {name: position for position, name in enumerate(names)}
+    for pair, combination in table.items():
+        for name in (*pair, *combination):
+            if name not in index:
+                raise ParameterError(
+                    f"the bracket of {pair} has the element {name!r}, which is not in basis={names!r}; add it there"
+                )
+    constants = np.full((len(names),) * 3, Fraction(0), dtype=object)
+    for (first, second), combination in table.items():
+        for name, coefficient in combination.items():
+            constants[index[first], index[second], index[name]] = coefficient
+            constants[index[second], index[first], index[name]] = -coefficient
+    return constants, names
+
+
+def _checked_table(brackets: Mapping) -> dict[tuple[str, str], Combination]:
+    """Return the brackets as combinations, after checking that no two entries contradict each other."""
+    if not isinstance(brackets, Mapping):
+        raise ParameterError(
+            "brackets must be a dictionary such as {('e1', 'e2'): 'e3'}, not an object of the type "
+            f"{type(brackets).__name__}"
+        )
+    table: dict[tuple[str, str], Combination] = {}
+    for pair, value in brackets.items():
+        if not isinstance(pair, tuple) or len(pair) != 2 or not all(isinstance(name, str) for name in pair):
+            raise ParameterError(f"a bracket needs a pair of names such as ('e1', 'e2'), not {pair!r}")
+        first, second = pair
+        combination = _combination(value, pair)
+        if first == second and combination:
+            raise AntisymmetryError(f"[{first}, {first}] must be zero, got {value!r}; remove this entry")
+        opposite = table.get((second, first))
+        if first != second and opposite is not None and opposite != {n: -c for n, c in combination.items()}:
+            raise AntisymmetryError(
+                f"[{second}, {first}] = {brackets[second, first]!r} contradicts [{first}, {second}] = {value!r}: one "
+                "must be minus the other; give one of the two only"
+            )
+        if opposite is None:
+            table[pair] = combination
+    return table
+
+
+def _combination(value, pair: tuple[str, str]) -> Combination:
+    """Return the value of a bracket, a name or a dictionary or 0, without its zero coefficients."""
+    if isinstance(value, str):
+        return {value.removeprefix("-").strip(): Fraction(-1 if value.startswith("-") else 1)}
+    if isinstance(value, Real) and value == 0:
+        return {}
+    if not isinstance(value, Mapping) or not all(isinstance(name, str) for name in value):
+        raise ComponentError(
+            f"the bracket of {pair} must be a name such as 'e3', a dictionary such as {{'e3': 2}}, or 0, not {value!r}"
+        )
+    for name, coefficient in value.items():
+        if isinstance(coefficient, bool) or not isinstance(coefficient, Real) or not np.isfinite(float(coefficient)):
+            raise ComponentError(
+                f"the coefficient of {name!r} in the bracket of {pair} must be a finite real number, not "
+                f"{coefficient!r}"
+            )
+    return {name: Fraction(c) if isinstance(c, Rational) else float(c) for name, c in value.items() if c != 0}
+
+
+def _basis_names(table: Mapping[tuple[str, str], Combination]) -> list[str]:
+    """Return all names of a table: by their numbers if all are one letter string with a number, else as they come."""
+    names = list(dict.fromkeys(name for pair, combination in table.items() for name in (*pair, *combination)))
+    if not names:
+        raise ParameterError("brackets has no elements; give basis=('e1', 'e2', …) for an abelian algebra")
+    numbered_names = [re.fullmatch(r"(.*?)(\d+)", name) for name in names]
+    matches = [match for match in numbered_names if match is not None]
+    if len(matches) == len(names) and len({match[1] for match in matches}) == 1:
+        return [match[0] for match in sorted(matches, key=lambda match: int(match[2]))]
+    return names
