@@ -7,6 +7,8 @@ open axes the spins are padded with zeros to twice the length; along periodic ax
 
 from __future__ import annotations
 
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -19,7 +21,7 @@ from manifolds.structures.spins import VectorComponents, sum_of_dots
 from ...errors import InputError
 from ..conditions import checked_numbers
 from ..energy import Energy
-from .ewald import COMPONENTS, dipole_tensor, ewald_kernel
+from .ewald import COMPONENTS, dipole_tensor, ewald_kernel, transform_axes
 from .lattices import Lattice
 from .spin_energy import SpinEnergy, check_finite, checked_site_values
 
@@ -62,7 +64,7 @@ def dipoles(positions, moment=1.0, strength=1.0, boundary: str = "tin foil") -> 
     if isinstance(positions, Lattice):
         moments = checked_site_values(moment, positions.sites, (), "a moment")
         kernel = lattice_kernel(positions, boundary)
-        return ConvolutionEnergy(positions.sites, len(positions.cells), kernel, moments, strength)
+        return kernel_energy(positions.sites, len(positions.cells), kernel, moments, strength)
     r = np.asarray(check_finite(checked_numbers(positions, "positions of dipoles"), "positions of dipoles"))
     if r.ndim != 2 or r.shape[1] != 3:
         raise InputError(f"positions of dipoles must have shape (N, 3), got {r.shape}")
@@ -74,6 +76,19 @@ def dipoles(positions, moment=1.0, strength=1.0, boundary: str = "tin foil") -> 
     matrix = jnp.asarray(np.swapaxes(tensors, 1, 2).reshape(3 * len(r), 3 * len(r)))
     scale = jnp.repeat(jnp.broadcast_to(moments, (len(r),)), 3)
     return DipoleMatrix((len(r),), strength * scale[:, None] * matrix * scale)
+
+
+MAX_MATRIX_SITES = 16
+"""Number of sites up to which a lattice has a matrix of all pairs: the compiled engine has no Fourier transforms."""
+
+
+def kernel_energy(sites: tuple[int, ...], axes: int, kernel: FourierKernel, moments, strength) -> Energy:
+    """Return the energy of a kernel, by Fourier transforms or, for a few sites, by a matrix."""
+    by_transforms = ConvolutionEnergy(sites, axes, kernel, moments, strength)
+    count = math.prod(sites)
+    if count > MAX_MATRIX_SITES:
+        return by_transforms
+    return DipoleMatrix(sites, jax.vmap(by_transforms.gradient)(jnp.eye(3 * count)))
 
 
 class DipoleMatrix(SpinEnergy):
@@ -90,8 +105,8 @@ class DipoleMatrix(SpinEnergy):
         return 0.5 * sum_of_dots(self.lattice_gradients(spins), spins.site_spins)
 
     def lattice_gradients(self, spins: PeriodicSpins) -> VectorComponents:
-        gradient = (self.matrix @ jnp.stack(spins.site_spins, axis=-1).reshape(-1)).reshape(-1, 3)
-        return gradient[:, 0], gradient[:, 1], gradient[:, 2]
+        gradient = (self.matrix @ jnp.stack(spins.site_spins, axis=-1).reshape(-1)).reshape(*self.sites, 3)
+        return gradient[..., 0], gradient[..., 1], gradient[..., 2]
 
     def multiple(self, factor) -> Energy:
         return DipoleMatrix(self.sites, factor * self.matrix)
@@ -151,7 +166,7 @@ class FourierKernel(Module):
     @classmethod
     def from_tensors(cls, tensors: np.ndarray, cells: tuple[int, ...]) -> FourierKernel:
         """Return the kernel of real tensors, shape (6, atoms, atoms, *padded cells)."""
-        axes = tuple(range(3, tensors.ndim))
+        axes = [3 + axis for axis in transform_axes(tensors.shape[3:])]
         return cls.from_transform(np.fft.rfftn(tensors, axes=axes), cells, tensors.shape[3:])
 
     @classmethod
@@ -163,15 +178,13 @@ class FourierKernel(Module):
 
     def convolve(self, s) -> jax.Array:
         """Return ``sum_j T(r_i - r_j) s_j``, for s of shape (3, atoms, *cells)."""
-        axes = tuple(range(2, s.ndim))
-        modes = jnp.fft.rfftn(s, self.padded_cells, axes=axes)
+        axes = transform_axes(self.padded_cells)
+        lengths, array_axes = [self.padded_cells[axis] for axis in axes], [2 + axis for axis in axes]
+        modes = jnp.fft.rfftn(s, lengths, axes=array_axes)
         fields = jnp.stack(
-            [
-                sum(jnp.sum(self.transform[PAIR_INDEX[i][j]] * modes[j][None], axis=1) for j in range(3))
-                for i in range(3)
-            ]
+            [sum(jnp.sum(self.transform[PAIR_INDEX[i][j]] * modes[j], axis=1) for j in range(3)) for i in range(3)]
         )
-        result = jnp.fft.irfftn(fields, self.padded_cells, axes=axes)
+        result = jnp.fft.irfftn(fields, lengths, axes=array_axes)
         return result[(slice(None), slice(None), *(slice(n) for n in self.cells))]
 
 

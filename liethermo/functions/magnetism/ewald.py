@@ -42,7 +42,7 @@ def dipole_tensor(r: np.ndarray) -> np.ndarray:
 
 
 def ewald_kernel(lattice: Lattice, padded: tuple[int, ...], splitting: float = SPLITTING) -> np.ndarray:
-    """Return the Fourier transform of the tensors of a lattice, images included, as ``numpy.fft.rfftn`` stores it.
+    """Return the Fourier transform of the tensors of a lattice, images included, along :func:`transform_axes`.
 
     Parameters
     ----------
@@ -56,15 +56,20 @@ def ewald_kernel(lattice: Lattice, padded: tuple[int, ...], splitting: float = S
 
     Returns
     -------
-    array, shape (6, atoms, atoms, ..., n // 2 + 1), complex
-        The components xx, xy, xz, yy, yz, zz; the atoms a and b of ``r_a - r_b``.
+    array, shape (6, atoms, atoms, ...), complex
+        The components xx, xy, xz, yy, yz, zz; the atoms a and b of ``r_a - r_b``; the wave vectors.
     """
     periodic = [axis for axis, is_periodic in enumerate(lattice.periodic) if is_periodic]
     volume = _span_volume(lattice.vectors[periodic])
     eta = splitting / volume ** (1.0 / len(periodic))
     short = _short_tensors(lattice, padded, eta)
-    transform = np.fft.rfftn(short, axes=range(3, short.ndim))
+    transform = np.fft.rfftn(short, axes=[3 + axis for axis in transform_axes(padded)])
     return transform + _long_transform(lattice, padded, periodic, volume, eta)
+
+
+def transform_axes(padded: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the axes of a lattice that are longer than 1; a real transform halves the last of them."""
+    return tuple(axis for axis, n in enumerate(padded) if n > 1) or (len(padded) - 1,)
 
 
 def _span_volume(vectors: np.ndarray) -> float:
@@ -112,10 +117,10 @@ def _long_transform(lattice: Lattice, padded, periodic: list[int], volume: float
     vectors = lattice.vectors[periodic]
     reciprocal = 2.0 * np.pi * np.linalg.pinv(vectors).T
     projector = np.linalg.pinv(vectors) @ vectors  # on the span of the periodic axes
-    last_is_periodic = periodic[-1] == axes - 1
-    shape = list(padded)
-    if last_is_periodic:
-        shape[-1] = padded[-1] // 2 + 1
+    half_axis, shape = transform_axes(padded)[-1], list(padded)
+    is_half = half_axis in periodic
+    if is_half:
+        shape[half_axis] = padded[half_axis] // 2 + 1
     # wave vectors and translations along open axes on a grid of all axes
     grid = np.indices(shape)
     fractions = [np.fft.fftfreq(padded[axis])[grid[axis] % padded[axis]] for axis in periodic]
@@ -142,7 +147,7 @@ def _long_transform(lattice: Lattice, padded, periodic: list[int], volume: float
                 result[component, a, b][is_near] += phases * tensors[component]
     open_axes = [3 + axis for axis in range(axes) if axis not in periodic]
     result = np.fft.fftn(result, axes=open_axes) if open_axes else result
-    return result if last_is_periodic else result[..., : padded[-1] // 2 + 1]
+    return result if is_half else np.take(result, range(padded[half_axis] // 2 + 1), axis=3 + half_axis)
 
 
 def _smooth_tensors(Q, across, projector, p: int, volume: float, eta: float) -> np.ndarray:
