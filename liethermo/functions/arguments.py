@@ -66,6 +66,16 @@ class NegatedFunction(Module):
         return -jnp.asarray(self.function(x, t))
 
 
+class MultipleFunction(Module):
+    """A function of the state and the time, times a number."""
+
+    function: Callable
+    factor: jax.Array
+
+    def __call__(self, x, t):
+        return self.factor * jnp.asarray(self.function(x, t))
+
+
 class CoordinatesWithTime(Module):
     """Coordinates of a state, with the time appended to the state and to the coordinates."""
 

@@ -13,7 +13,7 @@ from ..errors import FunctionError, IndexOutOfRangeError, InputError
 from ..tracing.interpret import polynomial_degree_bound
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
 from ..tracing.traced import trace_callables_and_result_shapes
-from .energy import Energy, Function, Negative, Pullback, SpanLimitedEnergy, StateTimeEnergy, Sum
+from .energy import Energy, Function, Multiple, Negative, Pullback, SpanLimitedEnergy, StateTimeEnergy, Sum
 
 
 def with_polynomial_degrees(energy: Energy, dim: int) -> Energy:
@@ -22,6 +22,8 @@ def with_polynomial_degrees(energy: Energy, dim: int) -> Energy:
         return Sum(tuple(with_polynomial_degrees(term, dim) for term in energy.summands))
     if isinstance(energy, Negative):
         return Negative(with_polynomial_degrees(energy.term, dim))
+    if isinstance(energy, Multiple):
+        return Multiple(with_polynomial_degrees(energy.term, dim), energy.factor)
     if isinstance(energy, StateTimeEnergy):
         return StateTimeEnergy(with_polynomial_degrees(energy.energy, dim))
     if isinstance(energy, SpanLimitedEnergy):

@@ -27,6 +27,7 @@ from ..tracing.programs import subprogram
 from .arguments import (
     CoordinatesWithTime,
     FixedTimeFunction,
+    MultipleFunction,
     NegatedFunction,
     StateTimeFunction,
     required_argument_count,
@@ -61,7 +62,7 @@ MAX_CLIQUE_COMPONENTS = 2_000
 
 
 class Energy(Module):
-    """A real function of the state with a gradient; energies add with ``+`` and subtract with ``-``.
+    """A real function of the state with a gradient; energies add with ``+``, subtract with ``-``, and scale with ``*``.
 
     Calling an energy evaluates it, from shape (..., n) to shape (...); an energy that depends on time also takes a
     time, shape (...).
@@ -196,6 +197,21 @@ class Energy(Module):
     def __rsub__(self, other) -> Energy:
         return -self + other
 
+    __array_ufunc__ = None  # a number of NumPy times an energy is an energy
+
+    def __mul__(self, factor) -> Energy:
+        factor = checked_numbers(factor, "the factor of an energy", ())
+        return self.map_terms(lambda term: term.multiple(factor))
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, divisor) -> Energy:
+        return self * (1.0 / checked_numbers(divisor, "the divisor of an energy", ()))
+
+    def multiple(self, factor) -> Energy:
+        """Return a term times a number, the factor, shape ()."""
+        return Multiple(self, factor)
+
 
 def float64_array(x) -> jax.Array:
     """Return a state, which may be a list or integers, as an array of float64."""
@@ -264,6 +280,9 @@ class Quadratic(Energy):
             return None
         indices = np.nonzero(np.asarray(self.A))
         return sparsity_pattern(indices[0], indices[-1], dim)
+
+    def multiple(self, factor) -> Energy:
+        return Quadratic(factor * self.A, None if self.b is None else factor * self.b, factor * self.c)
 
     def __neg__(self) -> Energy:
         return Quadratic(-self.A, None if self.b is None else -self.b, -self.c)
@@ -343,6 +362,9 @@ class TimeDependent(Energy, FunctionWithBreaks):
 
     def value(self, x) -> jax.Array:
         raise InputError("this energy depends on time, so its value needs a time. Call energy(x, t)")
+
+    def multiple(self, factor) -> Energy:
+        return TimeDependent(MultipleFunction(self.function, factor))
 
     def __neg__(self) -> Energy:
         return TimeDependent(NegatedFunction(self.function), self.breaks)
@@ -491,6 +513,9 @@ class Pullback(Energy):
     def with_time(self) -> Energy:
         return Pullback(self.term.with_time(), CoordinatesWithTime(self.coordinates))
 
+    def multiple(self, factor) -> Energy:
+        return Pullback(self.term.multiple(factor), self.coordinates)
+
     def __neg__(self) -> Energy:
         return Pullback(-self.term, self.coordinates)
 
@@ -521,6 +546,37 @@ class Negative(Energy):
 
     def __neg__(self) -> Energy:
         return self.term
+
+
+class Multiple(Energy):
+    """A term times a number, shape ()."""
+
+    term: Energy
+    factor: jax.Array
+
+    is_quadratic = forward_to("term")
+    degree = forward_to("term")
+
+    def value(self, x) -> jax.Array:
+        return self.factor * self.term.value(x)
+
+    def gradient(self, x) -> jax.Array:
+        return self.factor * self.term.gradient(x)
+
+    def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
+        return self.factor * self.term.discrete_gradient(scheme, x, d, compensation)
+
+    def stage_gradients(self, scheme, path) -> jax.Array:
+        return self.factor * self.term.stage_gradients(scheme, path)
+
+    couplings = forward_to("term")
+    check_components = forward_to("term")
+
+    def multiple(self, factor) -> Energy:
+        return Multiple(self.term, factor * self.factor)
+
+    def __neg__(self) -> Energy:
+        return Multiple(self.term, -self.factor)
 
 
 class Sum(Energy):
@@ -570,12 +626,14 @@ def function_name(energy: Energy) -> str:
 
 
 def make_energy(function, role: str) -> Energy:
-    """Return an :class:`Energy` from an energy, a Casimir polynomial (quadratic if possible) or a function.
+    """Return an :class:`Energy` from an energy, a list of energies, a Casimir polynomial or a function.
 
-    A function that needs two arguments is a function of the state and the time.
+    A polynomial becomes quadratic if possible. A function that needs two arguments is one of the state and the time.
     """
     if isinstance(function, Energy):
         return function
+    if isinstance(function, list) and function and all(isinstance(term, Energy) for term in function):
+        return Sum(tuple(part for term in function for part in term.terms))
     if isinstance(function, mf.Polynomial) and function.degree <= 2:
         return quadratic_from_polynomial(function)
     if callable(function):

@@ -11,7 +11,7 @@ import jax
 import manifolds as mf
 from manifolds._pytree_module import Module
 
-from .energy import Energy, Function, Negative, Quadratic, Sum, TimeDependent
+from .energy import Energy, Function, Multiple, Negative, Quadratic, Sum, TimeDependent
 
 
 class PointEnergy(Energy):
@@ -66,6 +66,8 @@ def _flatten_site_energy(energy: Energy, shape: tuple[int, ...]) -> Energy:
         return Sum(tuple(_flatten_site_energy(term, shape) for term in energy.summands))
     if isinstance(energy, Negative):
         return Negative(_flatten_site_energy(energy.term, shape))
+    if isinstance(energy, Multiple):
+        return Multiple(_flatten_site_energy(energy.term, shape), energy.factor)
     if isinstance(energy, Function | TimeDependent):
         is_flat = getattr(energy.function, "dim", None) == math.prod(shape)  # a Casimir of the whole algebra
         return energy if is_flat else type(energy)(_FlattenedFunction(energy.function, shape))

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 from manifolds.structures.spins import PaddedLattice, add_vectors, reshape_vectors, sum_of_dots
 
 from .coordinates import ComponentMap
-from .energy import Energy, Negative, Pullback, Sum
-from .magnetism import SpinEnergy, flatten_covectors, lattice_spins
+from .energy import Energy, Multiple, Negative, Pullback, Sum
+from .magnetism.spin_energy import SpinEnergy, flatten_covectors, lattice_spins
 from .with_baths import BodyBathsEnergy
 
 
@@ -42,7 +42,10 @@ def energy_in_component_order(energy: Energy, count: int) -> Energy:
     spin_energies: list[SpinEnergy] = []
     for term in energy.terms:
         if isinstance(term, SpinEnergy) and math.prod(term.sites) == count:
-            spin_energies.append(term)
+            if term.is_quadratic:
+                spin_energies.append(term)
+            else:  # each term has a discrete gradient of its own
+                terms.append(PlanarSpinEnergy((term,)))
         else:
             terms.append(_planar_term(term, count))
     if spin_energies:
@@ -55,6 +58,8 @@ def _planar_term(term: Energy, count: int) -> Energy:
         return BodyBathsEnergy(energy_in_component_order(term.body, count), term.baths, term.body_dim, term.dim)
     if isinstance(term, Negative):
         return Negative(energy_in_component_order(term.term, count))
+    if isinstance(term, Multiple):
+        return Multiple(energy_in_component_order(term.term, count), term.factor)
     return Pullback(term, SiteOrder(count))
 
 
@@ -63,7 +68,13 @@ class PlanarSpinEnergy(Energy):
 
     spin_energies: tuple[SpinEnergy, ...]
 
-    is_quadratic = True
+    @property
+    def is_quadratic(self) -> bool:
+        return all(energy.is_quadratic for energy in self.spin_energies)
+
+    @property
+    def degree(self) -> float:
+        return max(energy.degree for energy in self.spin_energies)
 
     def value(self, x) -> jax.Array:
         spins = self._padded_spins_by_shape(x)

@@ -13,6 +13,7 @@ from .gas_piston import gas_piston
 from .heat_grid import heat_grid
 from .magnetic_fluid import magnetic_fluid
 from .mass_spring_gas import mass_spring_gas
+from .micromagnet import micromagnet
 from .open_gases import IdealMixture, porous_piston, reaction_vessel
 from .oscillator import damped_oscillator
 from .quantised_sphere import QuantisedSphere
@@ -37,6 +38,7 @@ __all__ = [
     "heat_grid",
     "magnetic_fluid",
     "mass_spring_gas",
+    "micromagnet",
     "moving_thermo_particles",
     "porous_piston",
     "reaction_vessel",

@@ -9,7 +9,8 @@ from ..dissipation.landau_lifshitz import LandauLifshitz
 from ..errors import InputError
 from ..functions.conditions import checked_numbers
 from ..functions.energy import Energy, Sum
-from ..functions.magnetism import anisotropy, dzyaloshinskii_moriya, exchange, lattice_shape, zeeman
+from ..functions.magnetism import anisotropy, dzyaloshinskii_moriya, exchange, zeeman
+from ..functions.magnetism.spin_energy import lattice_shape
 from ..systems import HeatBaths, SpinSystem
 
 

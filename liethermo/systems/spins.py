@@ -20,7 +20,7 @@ from ..dissipation.heating import Heating
 from ..dissipation.landau_lifshitz import LandauLifshitz
 from ..errors import InputError
 from ..functions.energy import Energy
-from ..functions.magnetism import lattice_shape
+from ..functions.magnetism.spin_energy import lattice_shape
 from ..functions.on_spaces import flatten_site_functions
 from ..functions.planes import energy_in_component_order, interaction_range, to_component_order, to_site_order
 from ..functions.spheres import HalfSumOfSquares, Spheres

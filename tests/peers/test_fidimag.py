@@ -48,7 +48,8 @@ def test_exch_2d():
 
 def test_exch_2d_pbc2d():
     """Two sites along y are neighbours twice."""
-    field = field_of(mag.exchange((3, 2, 1), 1.0, periodic=(True, True, False)), index_spins(3, 2, 1))
+    energy = mag.exchange((3, 2, 1), 1.0, periodic=(True, True, False), images=True)
+    field = field_of(energy, index_spins(3, 2, 1))
     np.testing.assert_array_equal(field[..., 0].ravel(), [3, 3, 4, 4, 5, 5])
     np.testing.assert_array_equal(field[..., 1].ravel(), [2, 2, 2, 2, 2, 2])
     np.testing.assert_array_equal(field[..., 2], 0.0)

@@ -1,0 +1,67 @@
+"""Energies of spins, lattices, and the quantities that are measured in magnets."""
+
+from manifolds._names import public_dir
+
+from .bond_terms import biquadratic, exchange_tensor
+from .correlations import StructureFactor, dynamic_structure_factor, structure_factor, topological_charge
+from .dipoles import dipoles
+from .grid_terms import dzyaloshinskii_moriya, exchange
+from .lattices import Bonds, Lattice, lattice
+from .micromagnetics import (
+    continuum_antisymmetric_exchange,
+    continuum_exchange,
+    demagnetisation,
+    demagnetising_factors,
+    mesh,
+)
+from .ovf import VectorField, read_ovf, write_ovf
+from .relaxation import HysteresisLoop, Minimum, hysteresis_loop, minimise
+from .site_terms import (
+    anisotropy,
+    cubic_anisotropy,
+    polynomial_anisotropy,
+    stevens_anisotropy,
+    uniaxial_anisotropy,
+    zeeman,
+)
+from .spin_waves import spin_temperature, spin_wave_frequencies
+from .units import SpinDynamics, Units, units
+
+__all__ = [
+    "Bonds",
+    "HysteresisLoop",
+    "Lattice",
+    "Minimum",
+    "SpinDynamics",
+    "StructureFactor",
+    "Units",
+    "VectorField",
+    "anisotropy",
+    "biquadratic",
+    "continuum_antisymmetric_exchange",
+    "continuum_exchange",
+    "cubic_anisotropy",
+    "demagnetisation",
+    "demagnetising_factors",
+    "dipoles",
+    "dynamic_structure_factor",
+    "dzyaloshinskii_moriya",
+    "exchange",
+    "exchange_tensor",
+    "hysteresis_loop",
+    "lattice",
+    "mesh",
+    "minimise",
+    "polynomial_anisotropy",
+    "read_ovf",
+    "spin_temperature",
+    "spin_wave_frequencies",
+    "stevens_anisotropy",
+    "structure_factor",
+    "topological_charge",
+    "uniaxial_anisotropy",
+    "units",
+    "write_ovf",
+    "zeeman",
+]
+__dir__ = public_dir(__all__)

@@ -1,0 +1,351 @@
+"""Energies of the bonds of a crystal: exchange by shell, exchange tensors, antisymmetric and biquadratic exchange."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy
+
+from manifolds.structures.spins import Lattice as PeriodicSpins
+from manifolds.structures.spins import (
+    VectorComponents,
+    add_vectors,
+    dot_vectors,
+    scale_vectors,
+    sum_of_dots,
+)
+
+from ...errors import InputError
+from ..conditions import checked_numbers
+from ..energy import Energy, Sum
+from ..indices import clique_pattern
+from .lattices import Bonds, Lattice
+from .spin_energy import SpinEnergy, bond_indices, check_finite
+
+
+def exchange_tensor(bonds, tensors) -> Energy:
+    """Return the bilinear exchange ``-sum s_i . J_ij s_j`` with a matrix J_ij for each bond; each pair counts once.
+
+    The matrix has a symmetric part, which is an anisotropic exchange, and an antisymmetric part. A
+    Dzyaloshinskii-Moriya vector D is the matrix J with ``J_xy = -J_yx = -D_z``, and cyclic permutations.
+
+    Parameters
+    ----------
+    bonds : Lattice or Bonds
+        Nearest neighbours of a lattice, or bonds such as ``lattice.shell(2)``; s_i is the first end of a bond.
+    tensors : array, shape (3, 3), (m, 3, 3) or ``(m, *cells, 3, 3)``
+        J_ij (energy): one for all bonds, one for each of the m bonds of a cell, or one for each bond of every cell.
+
+    Returns
+    -------
+    Energy
+
+    Raises
+    ------
+    InputError
+
+    Examples
+    --------
+    >>> chain = lt.magnetism.lattice("chain", 8)
+    >>> ising = lt.magnetism.exchange_tensor(chain, np.diag([0.0, 0.0, 1.0]))
+    >>> float(ising(np.tile([0.0, 0.0, 1.0], 8)))
+    -8.0
+    """
+    return _bond_matrix_energy(_as_bonds(bonds), tensors, -1.0, "an exchange tensor")
+
+
+def biquadratic(bonds, strength=1.0) -> Energy:
+    """Return the biquadratic exchange ``-sum B_ij (s_i . s_j)^2``: B > 0 aligns neighbours parallel or antiparallel.
+
+    Parameters
+    ----------
+    bonds : Lattice or Bonds
+        Nearest neighbours of a lattice, or bonds such as ``lattice.shell(2)``.
+    strength : float, or array, shape (m,) or ``(m, *cells)``
+        B_ij (energy); each pair counts once.
+
+    Returns
+    -------
+    Energy
+
+    Raises
+    ------
+    InputError
+    """
+    bonds = _as_bonds(bonds)
+    values = _bond_values(bonds, strength, (), "a biquadratic constant")
+    lattice = bonds.lattice
+    return BiquadraticEnergy(lattice.sites, lattice.cells, _bond_rows(bonds), tuple(values))
+
+
+def crystal_exchange(target: Lattice | Bonds, strength) -> Energy:
+    """Return the Heisenberg exchange of bonds, or of shells of a lattice; see ``magnetism.exchange``."""
+    if isinstance(target, Bonds):
+        return _scalar_exchange(target, strength)
+    if isinstance(strength, Mapping):
+        if not strength:
+            raise InputError("a mapping from shells to exchange constants must not be empty")
+        return Sum.of([_scalar_exchange(target.shell(number), J) for number, J in strength.items()])
+    if isinstance(strength, list | tuple):
+        if not strength:
+            raise InputError("a list of exchange constants, one for each shell, must not be empty")
+        shells = target.shells(len(strength))
+        return Sum.of([_scalar_exchange(shell, J) for shell, J in zip(shells, strength, strict=True)])
+    return _scalar_exchange(target.shell(1), strength)
+
+
+def _scalar_exchange(bonds: Bonds, strength) -> Energy:
+    bonds.check_pairs()
+    value = check_finite(checked_numbers(strength, "an exchange constant"), "an exchange constant")
+    cells = bonds.lattice.cells
+    if not value.ndim and all(bonds.presence(k).all() for k in range(len(bonds))):
+        return CrystalExchange(bonds.lattice.sites, cells, _bond_rows(bonds), value)
+    J = _bond_values(bonds, strength, (), "an exchange constant")
+    return CrystalExchange(bonds.lattice.sites, cells, _bond_rows(bonds), tuple(J))
+
+
+def crystal_antisymmetric_exchange(target: Lattice | Bonds, vectors) -> Energy:
+    """Return the Dzyaloshinskii-Moriya interaction of bonds; see ``magnetism.dzyaloshinskii_moriya``."""
+    what = "a Dzyaloshinskii-Moriya vector"
+    bonds, D = _as_bonds(target), checked_numbers(vectors, what)
+    if D.shape[-1:] != (3,):
+        raise InputError(f"{what} must have shape (3,), (m, 3) or (m, *cells, 3), got {D.shape}")
+    # D . (u x v) = u . A v
+    zero = jnp.zeros_like(D[..., 0])
+    rows = [[zero, D[..., 2], -D[..., 1]], [-D[..., 2], zero, D[..., 0]], [D[..., 1], -D[..., 0], zero]]
+    return _bond_matrix_energy(bonds, jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2), 1.0, what)
+
+
+def refuse_grid_arguments(neighbours, periodic, images: bool) -> None:
+    """Raise InputError if arguments of simple lattices are given for a lattice that has its own."""
+    if neighbours is not None or periodic is not True or images:
+        raise InputError(
+            "neighbours=, periodic= and images= belong to sites given as integers. Give them to lt.magnetism.lattice, "
+            "and bonds such as lattice.shell(2) in place of neighbours="
+        )
+
+
+def _as_bonds(target) -> Bonds:
+    if not isinstance(target, Lattice | Bonds):
+        raise InputError(f"bonds must be those of lt.magnetism.lattice, or a lattice, got {type(target).__name__}")
+    bonds = target.shell(1) if isinstance(target, Lattice) else target
+    bonds.check_pairs()
+    return bonds
+
+
+def _bond_rows(bonds: Bonds) -> tuple[tuple[int, ...], ...]:
+    rows = np.column_stack([bonds.first, bonds.second, bonds.offsets]).tolist()
+    return tuple(map(tuple, rows))
+
+
+def _bond_values(bonds: Bonds, value, tail: tuple[int, ...], what: str) -> list[jax.Array]:
+    """Return the values of each bond: of shape ``tail``, or ``(*cells, *tail)`` where they vary, 0 without a bond."""
+    array = check_finite(checked_numbers(value, what), what)
+    count, cells = len(bonds), bonds.lattice.cells
+    shapes = tail, (count, *tail), (count, *cells, *tail)
+    if array.shape not in shapes:
+        raise InputError(f"{what} of {count} bonds must have shape {' or '.join(map(str, shapes))}, got {array.shape}")
+    values = []
+    for number in range(count):
+        bond_value = array if array.shape == tail else array[number]
+        presence = bonds.presence(number)
+        if not presence.all():
+            bond_value = jnp.where(presence.reshape(*cells, *(1 for _ in tail)), bond_value, 0.0)
+        values.append(bond_value)
+    return values
+
+
+def _bond_matrix_energy(bonds: Bonds, matrices, sign: float, what: str) -> Energy:
+    values = _bond_values(bonds, matrices, (3, 3), what)
+    lattice = bonds.lattice
+    return BondMatrixEnergy(lattice.sites, lattice.cells, _bond_rows(bonds), tuple(sign * value for value in values))
+
+
+class CrystalBondEnergy(SpinEnergy):
+    """An energy of the bonds of a crystal.
+
+    Attributes
+    ----------
+    cells : tuple of int
+    rows : tuple of tuples of int
+        Atoms of both ends and offset of the cell of the second, for each bond of a cell.
+    """
+
+    cells: tuple[int, ...] = eqx.field(static=True)
+    rows: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+
+    @property
+    def interaction_range(self) -> tuple[int, ...]:
+        ranges = np.abs(np.array([row[2:] for row in self.rows])).max(axis=0).tolist()
+        return (*ranges, *(0,) * (len(self.sites) - len(self.cells)))
+
+    @property
+    def _has_basis(self) -> bool:
+        return len(self.sites) > len(self.cells)
+
+    def _atom(self, spins: VectorComponents, atom: int) -> VectorComponents:
+        """Return the spins of one atom of the cells, shape of the cells."""
+        if not self._has_basis:
+            return spins
+        a, b, c = (component[..., atom] for component in spins)
+        return a, b, c
+
+    def _shifted_atom(self, shifted: dict, spins: PeriodicSpins, atom: int, offset) -> VectorComponents:
+        """Return for each cell the spin of an atom of the cell at an offset; ``shifted`` caches shifted lattices."""
+        offset = tuple(offset)
+        if offset not in shifted:
+            shifted[offset] = (
+                spins.at((*offset, *(0,) * (len(self.sites) - len(self.cells)))) if any(offset) else (spins.site_spins)
+            )
+        return self._atom(shifted[offset], atom)
+
+    def _join_atoms(self, gradients: dict[int, VectorComponents]) -> VectorComponents:
+        """Return vectors on the sites from those of each atom, shape of the cells."""
+        if not self._has_basis:
+            return gradients[0]
+        zero = jnp.zeros(self.cells)
+        atoms = [gradients.get(atom, (zero, zero, zero)) for atom in range(self.sites[-1])]
+        a, b, c = (jnp.stack([vectors[axis] for vectors in atoms], axis=-1) for axis in range(3))
+        return a, b, c
+
+    def _roll(self, value, offset, tail: int = 0):
+        """Return values of cells, moved to the cell of the second end of a bond."""
+        return value if value.ndim == tail else jnp.roll(value, offset, axis=tuple(range(len(self.cells))))
+
+    def couplings(self, dim: int) -> scipy.sparse.csr_array:
+        atoms = self.sites[-1] if self._has_basis else 1
+        numbers = np.arange(int(np.prod(self.cells))).reshape(self.cells)
+        members = []
+        for a, b, *offset in self.rows:
+            ends = np.roll(numbers, [-o for o in offset], axis=tuple(range(len(self.cells))))
+            members.append(bond_indices(numbers.ravel() * atoms + a, ends.ravel() * atoms + b))
+        return clique_pattern(np.concatenate(members), dim)
+
+
+class CrystalExchange(CrystalBondEnergy):
+    """Heisenberg exchange of the bonds of a crystal.
+
+    Attributes
+    ----------
+    J : array, shape (), or tuple of arrays, each of shape () or that of the cells
+        One constant for all bonds, or one for each.
+    """
+
+    J: jax.Array | tuple[jax.Array, ...]
+
+    def lattice_value(self, spins: PeriodicSpins) -> jax.Array:
+        shifted: dict = {}
+        total: dict[int, VectorComponents] = {}
+        for number, (a, b, *offset) in enumerate(self.rows):
+            neighbour = self._shifted_atom(shifted, spins, b, offset)
+            _accumulate(total, a, scale_vectors(self.J[number], neighbour) if isinstance(self.J, tuple) else neighbour)
+        energy = sum(
+            (sum_of_dots(self._atom(spins.site_spins, a), vectors) for a, vectors in total.items()), jnp.zeros(())
+        )
+        return -energy if isinstance(self.J, tuple) else -self.J * energy
+
+    def lattice_gradients(self, spins: PeriodicSpins) -> VectorComponents:
+        shifted: dict = {}
+        total: dict[int, VectorComponents] = {}
+        for number, (a, b, *offset) in enumerate(self.rows):
+            ahead = self._shifted_atom(shifted, spins, b, offset)
+            behind = self._shifted_atom(shifted, spins, a, [-o for o in offset])
+            if isinstance(self.J, tuple):
+                J = self.J[number]
+                ahead, behind = scale_vectors(J, ahead), scale_vectors(self._roll(J, offset), behind)
+            _accumulate(total, a, ahead)
+            _accumulate(total, b, behind)
+        return scale_vectors(-1.0 if isinstance(self.J, tuple) else -self.J, self._join_atoms(total))
+
+    def multiple(self, factor) -> Energy:
+        J = tuple(factor * value for value in self.J) if isinstance(self.J, tuple) else factor * self.J
+        return CrystalExchange(self.sites, self.cells, self.rows, J)
+
+
+class BondMatrixEnergy(CrystalBondEnergy):
+    """The energy ``sum s_i . M_ij s_j`` over the bonds of a crystal.
+
+    Attributes
+    ----------
+    matrices : tuple of arrays, shape (3, 3) or ``(*cells, 3, 3)``
+        M of each bond.
+    """
+
+    matrices: tuple[jax.Array, ...]
+
+    def lattice_value(self, spins: PeriodicSpins) -> jax.Array:
+        shifted: dict = {}
+        energy = jnp.zeros(())
+        for M, (a, b, *offset) in zip(self.matrices, self.rows, strict=True):
+            neighbour = _matrix_times(M, self._shifted_atom(shifted, spins, b, offset))
+            energy = energy + sum_of_dots(self._atom(spins.site_spins, a), neighbour)
+        return energy
+
+    def lattice_gradients(self, spins: PeriodicSpins) -> VectorComponents:
+        shifted: dict = {}
+        total: dict[int, VectorComponents] = {}
+        for M, (a, b, *offset) in zip(self.matrices, self.rows, strict=True):
+            transpose = jnp.swapaxes(self._roll(M, offset, 2), -1, -2)
+            _accumulate(total, a, _matrix_times(M, self._shifted_atom(shifted, spins, b, offset)))
+            behind = self._shifted_atom(shifted, spins, a, [-o for o in offset])
+            _accumulate(total, b, _matrix_times(transpose, behind))
+        return self._join_atoms(total)
+
+    def multiple(self, factor) -> Energy:
+        return BondMatrixEnergy(self.sites, self.cells, self.rows, tuple(factor * M for M in self.matrices))
+
+
+class BiquadraticEnergy(CrystalBondEnergy):
+    """The energy ``-sum B_ij (s_i . s_j)^2`` over the bonds of a crystal.
+
+    Attributes
+    ----------
+    B : tuple of arrays, each of shape () or that of the cells
+    """
+
+    B: tuple[jax.Array, ...]
+
+    @property
+    def is_quadratic(self) -> bool:
+        return False
+
+    @property
+    def degree(self) -> float:
+        return 4.0
+
+    def lattice_value(self, spins: PeriodicSpins) -> jax.Array:
+        shifted: dict = {}
+        energy = jnp.zeros(())
+        for B, (a, b, *offset) in zip(self.B, self.rows, strict=True):
+            cosine = dot_vectors(self._atom(spins.site_spins, a), self._shifted_atom(shifted, spins, b, offset))
+            energy = energy - jnp.sum(B * cosine**2)
+        return energy
+
+    def lattice_gradients(self, spins: PeriodicSpins) -> VectorComponents:
+        shifted: dict = {}
+        total: dict[int, VectorComponents] = {}
+        for B, (a, b, *offset) in zip(self.B, self.rows, strict=True):
+            first, second = self._atom(spins.site_spins, a), self._atom(spins.site_spins, b)
+            ahead = self._shifted_atom(shifted, spins, b, offset)
+            behind = self._shifted_atom(shifted, spins, a, [-o for o in offset])
+            _accumulate(total, a, scale_vectors(-2.0 * B * dot_vectors(first, ahead), ahead))
+            B_behind = self._roll(B, offset)
+            _accumulate(total, b, scale_vectors(-2.0 * B_behind * dot_vectors(second, behind), behind))
+        return self._join_atoms(total)
+
+    def multiple(self, factor) -> Energy:
+        return BiquadraticEnergy(self.sites, self.cells, self.rows, tuple(factor * B for B in self.B))
+
+
+def _accumulate(total: dict[int, VectorComponents], atom: int, vectors: VectorComponents) -> None:
+    total[atom] = add_vectors(total[atom], vectors) if atom in total else vectors
+
+
+def _matrix_times(M, v: VectorComponents) -> VectorComponents:
+    """Return the product of matrices, shape (..., 3, 3), with vectors by components."""
+    a, b, c = (M[..., i, 0] * v[0] + M[..., i, 1] * v[1] + M[..., i, 2] * v[2] for i in range(3))
+    return a, b, c

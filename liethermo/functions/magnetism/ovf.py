@@ -1,0 +1,222 @@
+"""Files of vector fields of OOMMF and mumax3, OVF 1.0 and 2.0, in text and binary."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ...errors import FileError, InputError
+
+CHECK_VALUES = {4: 1234567.0, 8: 123456789012345.0}
+"""First number of binary data, by its bytes, which shows the order of the bytes."""
+
+HEADER_BYTES = 65_536
+"""Bytes in which the header of a file must end."""
+
+
+class VectorField(NamedTuple):
+    """A field on a rectangular mesh.
+
+    Attributes
+    ----------
+    values : array, shape (nx, ny, nz, components)
+        Values in the cells, multiplied by the factor of the file.
+    size : tuple of three floats
+        Edges of a cell (metres, or the unit of the file).
+    origin : tuple of three floats
+        Middle of the first cell.
+    title : str
+    unit : str
+        Unit of the values.
+    length_unit : str
+    """
+
+    values: np.ndarray
+    size: tuple[float, float, float]
+    origin: tuple[float, float, float]
+    title: str = ""
+    unit: str = ""
+    length_unit: str = "m"
+
+
+def read_ovf(path) -> VectorField:
+    """Return the field of a file in OOMMF's vector field format, OVF 1.0 or 2.0, as mumax3 and OOMMF write it.
+
+    Text and binary files with 4 and 8 bytes are read. The order of axes is x, y, z, as of the spins on a :func:`mesh`.
+
+    Parameters
+    ----------
+    path : str or path
+
+    Returns
+    -------
+    VectorField
+
+    Raises
+    ------
+    FileError
+        If the file is no rectangular OVF file, or is damaged.
+    """
+    name = os.fspath(path)
+    try:
+        content = Path(name).read_bytes()
+    except OSError as error:
+        raise FileError(f"{name} could not be read: {error}") from error
+    version, header, kind, start = _parse_header(content, name)
+    if header.get("meshtype", "rectangular").lower() != "rectangular":
+        raise FileError(f"{name} has an irregular mesh. Only rectangular meshes are read")
+    try:
+        nodes = tuple(int(header[f"{axis}nodes"]) for axis in "xyz")
+        size = float(header["xstepsize"]), float(header["ystepsize"]), float(header["zstepsize"])
+        origin = float(header["xbase"]), float(header["ybase"]), float(header["zbase"])
+        dim = int(header["valuedim"]) if version == 2 else 3
+        factor = float(header.get("valuemultiplier", 1.0)) if version == 1 else 1.0
+    except (KeyError, ValueError) as error:
+        raise FileError(f"{name} has no valid header: the entry {error} is missing or no number") from error
+    if min(*nodes, dim) < 1:
+        raise FileError(f"{name} must have positive numbers of cells and components, got {nodes} and {dim}")
+    count = int(np.prod(nodes)) * dim
+    data = _read_data(content, start, kind, version, count, name)
+    values = factor * data.reshape(*nodes[::-1], dim).transpose(2, 1, 0, 3)
+    unit = header.get("valueunits", "").split(" ")[0] if version == 2 else header.get("valueunit", "")
+    title, length_unit = header.get("title", ""), header.get("meshunit", "m")
+    return VectorField(np.ascontiguousarray(values), size, origin, title, unit, length_unit)
+
+
+def write_ovf(
+    path,
+    values,
+    size,
+    representation: str = "binary 8",
+    version: int = 2,
+    title: str = "m",
+    unit: str = "1",
+    origin=None,
+) -> None:
+    """Write a field to a file in OOMMF's vector field format, which OOMMF, mumax3 and Ubermag read.
+
+    Parameters
+    ----------
+    path : str or path
+    values : array, shape (nx, ny, nz, components)
+        Such as ``system.spins(x)``; three components for version 1.
+    size : float, or tuple of three floats
+        Edges of a cell (metres).
+    representation : str
+        "text", "binary 4" or "binary 8": numbers of 17 digits, or of 4 or 8 bytes.
+    version : int
+        1 or 2.
+    title, unit : str
+        The title, and the unit of the values.
+    origin : tuple of three floats, optional
+        Middle of the first cell; half a cell from the corner (0, 0, 0) by default.
+
+    Raises
+    ------
+    InputError, FileError
+    """
+    array = np.asarray(values, dtype=float)
+    edges = np.broadcast_to(np.asarray(size, dtype=float), (3,)) if np.shape(size) in ((), (3,)) else np.zeros(3)
+    if array.ndim != 4 or (version == 1 and array.shape[3] != 3):
+        raise InputError(f"values of an OVF file must have shape (nx, ny, nz, 3), got {array.shape}")
+    if not (edges > 0.0).all():
+        raise InputError(f"size must be one or three positive edges of a cell, got {size}")
+    if version not in (1, 2):
+        raise InputError(f"version must be 1 or 2, got {version!r}")
+    kinds = {"text": "Text", "binary 4": "Binary 4", "binary 8": "Binary 8"}
+    if representation not in kinds:
+        raise InputError(f'representation must be "text", "binary 4" or "binary 8", got {representation!r}')
+    base = edges / 2.0 if origin is None else np.asarray(origin, dtype=float)
+    if any("\n" in text for text in (title, unit)):
+        raise InputError("title and unit must be single lines")
+    lines = _header_lines(array, edges, base, version, title, unit)
+    kind = kinds[representation]
+    flat = array.transpose(2, 1, 0, 3).reshape(-1, array.shape[3])
+    if kind == "Text":
+        body = "".join(" ".join(f"{v:.17g}" for v in row) + "\n" for row in flat.tolist()).encode()
+    else:
+        width = int(kind[-1])
+        dtype = np.dtype(f"{'<' if version == 2 else '>'}f{width}")
+        body = np.concatenate([[CHECK_VALUES[width]], flat.ravel()]).astype(dtype).tobytes() + b"\n"
+    head = "".join(f"# {line}\n" for line in [*lines, f"Begin: Data {kind}"])
+    tail = f"# End: Data {kind}\n# End: Segment\n"
+    try:
+        Path(os.fspath(path)).write_bytes(head.encode() + body + tail.encode())
+    except OSError as error:
+        raise FileError(f"{os.fspath(path)} could not be written: {error}") from error
+
+
+def _header_lines(array: np.ndarray, edges, base, version: int, title: str, unit: str) -> list[str]:
+    nodes, dim = array.shape[:3], array.shape[3]
+    first = "OOMMF OVF 2.0" if version == 2 else "OOMMF: rectangular mesh v1.0"
+    lines = [first, "Segment count: 1", "Begin: Segment", "Begin: Header", f"Title: {title}"]
+    lines += ["meshtype: rectangular", "meshunit: m"]
+    low, high = base - edges / 2.0, base + (np.array(nodes) - 0.5) * edges
+    for axis, a, b, c, e, n in zip("xyz", low, high, base, edges, nodes, strict=True):
+        lines += [f"{axis}min: {a:.17g}", f"{axis}max: {b:.17g}", f"{axis}base: {c:.17g}"]
+        lines += [f"{axis}nodes: {n}", f"{axis}stepsize: {e:.17g}"]
+    if version == 2:
+        labels = " ".join(f"m_{axis}" for axis in ("xyz" if dim == 3 else map(str, range(dim))))
+        lines += [f"valuedim: {dim}", f"valuelabels: {labels}", "valueunits: " + " ".join([unit or "1"] * dim)]
+    else:
+        lengths = np.linalg.norm(array, axis=-1)
+        lines += [f"valueunit: {unit or 1}", "valuemultiplier: 1"]
+        lines += [f"ValueRangeMinMag: {lengths.min():.17g}", f"ValueRangeMaxMag: {lengths.max():.17g}"]
+    return [*lines, "End: Header"]
+
+
+def _parse_header(content: bytes, name: str) -> tuple[int, dict[str, str], str, int]:
+    """Return the version, the entries of the header, the kind of the data, and where they begin."""
+    header: dict[str, str] = {}
+    position, version = 0, 0
+    while position < min(len(content), HEADER_BYTES):
+        end = content.find(b"\n", position)
+        end = len(content) if end < 0 else end
+        line = content[position:end].decode("latin-1").strip()
+        position = end + 1
+        if not version:
+            version = _version_of_line(line, name)
+            continue
+        text = line.lstrip("#").split("##")[0].strip()
+        key, _, value = text.partition(":")
+        key = key.strip().lower().replace(" ", "")
+        if key == "begin" and value.strip().lower().startswith("data"):
+            return version, header, " ".join(value.lower().split()[1:]), position
+        header.setdefault(key, value.strip())
+    raise FileError(f"{name} has no data: the line '# Begin: Data' is missing")
+
+
+def _version_of_line(line: str, name: str) -> int:
+    text = line.lstrip("# ").lower()
+    if text.startswith("oommf"):
+        if text.endswith("2.0"):
+            return 2
+        if "v1.0" in text or text.endswith("1.0") or "v0.99" in text:
+            return 1
+    raise FileError(f"{name} is no OVF file of version 1.0 or 2.0: its first line is {line[:60]!r}")
+
+
+def _read_data(content: bytes, start: int, kind: str, version: int, count: int, name: str) -> np.ndarray:
+    if kind == "text":
+        end = content.find(b"#", start)
+        words = content[start : end if end >= 0 else len(content)].split()
+        try:
+            numbers = np.array(words, dtype=float)
+        except ValueError as error:
+            raise FileError(f"{name} has data that are no numbers: {error}") from error
+        if len(numbers) != count:
+            raise FileError(f"{name} must have {count} numbers, got {len(numbers)}. The file is not complete")
+        return numbers
+    if kind not in ("binary 4", "binary 8"):
+        raise FileError(f"{name} has data of the kind {kind!r}. Text, binary 4 and binary 8 are read")
+    width = int(kind[-1])
+    if len(content) < start + width * (count + 1):
+        raise FileError(f"{name} is not complete: it must have {count} numbers of {width} bytes")
+    for order in "<>" if version == 2 else "><":
+        numbers = np.frombuffer(content, dtype=np.dtype(f"{order}f{width}"), count=count + 1, offset=start)
+        if numbers[0] == CHECK_VALUES[width]:
+            return numbers[1:].astype(float)
+    raise FileError(f"{name} is damaged: its data do not begin with the number {CHECK_VALUES[width]:.0f}")

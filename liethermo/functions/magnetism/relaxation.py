@@ -1,0 +1,234 @@
+"""Minima of the energy of spins, and hysteresis loops as sequences of minima."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from manifolds._precision import with_library_settings
+
+from ...errors import ConvergenceError, InputError
+from ..conditions import checked_numbers
+from ..energy import Energy, Sum, make_energy
+from .site_terms import zeeman
+
+MAX_ROTATION = 0.3
+"""Largest angle (radian) by which a spin turns in a step, so that a descent stays in its valley."""
+
+SUFFICIENT_DECREASE = 1e-4
+"""Fraction of the predicted decrease of the energy that a step must reach [Armijo 1966]."""
+
+ENERGY_ROUNDING = 1e-14
+"""Increase of the energy, relative to its terms, that is rounding: the torque shrinks further when the energy rests."""
+
+
+class Minimum(NamedTuple):
+    """A minimum of the energy of spins.
+
+    Attributes
+    ----------
+    spins : array, shape ``(*sites, 3)``
+    energy : float
+    torque : float
+        Largest ``|s_i x grad_i H|``, relative to the largest ``|grad_i H|`` of a spin of the length of s_i.
+    steps : int
+    """
+
+    spins: np.ndarray
+    energy: float
+    torque: float
+    steps: int
+
+
+@with_library_settings
+def minimise(energy, spins, tolerance: float = 1e-8, max_steps: int = 100_000) -> Minimum:
+    """Return a minimum of the energy of spins of constant lengths, by steepest descent with adaptive steps.
+
+    Each step rotates every spin towards its field, by the step sizes of Barzilai & Borwein 1988 with a line search that
+    never lets the energy grow [Exl et al. 2014, which mumax3 uses]. The descent follows a valley: it finds the minimum
+    next to the start, not the lowest one.
+
+    Parameters
+    ----------
+    energy : Energy, list of energies, or function from the spins, shape ``(*sites, 3)``, to a scalar
+    spins : array, shape ``(*sites, 3)``
+        The start; its lengths are kept.
+    tolerance : float
+        The descent ends when no torque ``|s x grad H|`` exceeds this fraction of the largest gradient.
+    max_steps : int
+        Largest number of steps.
+
+    Returns
+    -------
+    Minimum
+
+    Raises
+    ------
+    InputError
+    ConvergenceError
+        If the torque is not small after ``max_steps`` steps.
+
+    Examples
+    --------
+    >>> energy = lt.magnetism.zeeman(1, (0.0, 0.0, 2.0))
+    >>> round(lt.magnetism.minimise(energy, [[1.0, 0.0, 0.0]]).energy, 9)
+    -2.0
+    """
+    start = checked_numbers(spins, "spins")
+    if start.ndim < 2 or start.shape[-1] != 3 or not bool(jnp.isfinite(start).all()):
+        raise InputError(f"spins must be finite numbers of shape (*sites, 3), got {start.shape}")
+    lengths = jnp.linalg.norm(start, axis=-1, keepdims=True)
+    if not bool((lengths > 0.0).all()):
+        raise InputError("every spin must have a length greater than 0")
+    if isinstance(energy, Energy | list):
+        function, is_flat = make_energy(energy, "the energy"), True
+    else:
+        function, is_flat = make_energy(energy, "the energy"), False
+    result = _descend(function, is_flat, start / lengths, lengths, jnp.asarray(tolerance), jnp.asarray(max_steps))
+    unit_vectors, value, torque, steps = jax.device_get(result)
+    if not torque <= tolerance:
+        raise ConvergenceError(
+            f"after {int(steps)} steps the torque is {float(torque):.3g} of the largest gradient, not below "
+            f"{tolerance:g}. Use more max_steps or a larger tolerance",
+            None,
+        )
+    return Minimum(unit_vectors * np.asarray(lengths), float(value), float(torque), int(steps))
+
+
+class _Descent(NamedTuple):
+    """State of a descent: unit vectors, energy, tangential gradient, torque, step size, number of attempts."""
+
+    u: jax.Array
+    value: jax.Array
+    slope: jax.Array
+    torque: jax.Array
+    step: jax.Array
+    attempts: jax.Array
+
+
+@eqx.filter_jit
+def _descend(energy: Energy, is_flat: bool, u, lengths, tolerance, max_steps):
+    def value_and_slope(u):
+        s = u * lengths
+        x = s.reshape(-1) if is_flat else s
+        gradient = lengths * (energy.gradient(x) if is_flat else jax.grad(energy.value)(x)).reshape(u.shape)
+        slope = gradient - jnp.sum(gradient * u, axis=-1, keepdims=True) * u
+        torque = jnp.max(jnp.linalg.norm(slope, axis=-1))
+        scale = jnp.max(jnp.linalg.norm(gradient, axis=-1))
+        return energy.value(x), slope, torque / jnp.where(scale > 0.0, scale, 1.0), scale
+
+    def rotate(u, slope, step):
+        # u' = ((4 - a^2) u - 4 step slope) / (4 + a^2), a = step |slope|: a rotation by 2 atan(a / 2)
+        square = step**2 * jnp.sum(slope**2, axis=-1, keepdims=True)
+        return ((4.0 - square) * u - 4.0 * step * slope) / (4.0 + square)
+
+    def limit(step, slope):
+        return jnp.minimum(step, MAX_ROTATION / jnp.maximum(jnp.max(jnp.linalg.norm(slope, axis=-1)), 1e-300))
+
+    def attempt(state: _Descent) -> _Descent:
+        u = rotate(state.u, state.slope, state.step)
+        u = u / jnp.linalg.norm(u, axis=-1, keepdims=True)
+        value, slope, torque, scale = value_and_slope(u)
+        decrease = SUFFICIENT_DECREASE * state.step * jnp.sum(state.slope**2)
+        rounding = ENERGY_ROUNDING * (jnp.abs(state.value) + scale * jnp.sqrt(u.size / 3.0))
+        is_accepted = value <= state.value - decrease + rounding
+        du, dslope = u - state.u, slope - state.slope
+        curvature = jnp.sum(du * dslope)
+        long_step = jnp.sum(du**2) / jnp.where(curvature > 0.0, curvature, 1.0)
+        short_step = curvature / jnp.maximum(jnp.sum(dslope**2), 1e-300)
+        next_step = jnp.where(
+            curvature > 0.0, jnp.where(state.attempts % 2 == 0, long_step, short_step), 2.0 * state.step
+        )
+        accepted = _Descent(u, value, slope, torque, limit(next_step, slope), state.attempts + 1)
+        rejected = state._replace(step=0.25 * state.step, attempts=state.attempts + 1)
+        return jax.tree_util.tree_map(lambda a, b: jnp.where(is_accepted, a, b), accepted, rejected)
+
+    value, slope, torque, scale = value_and_slope(u)
+    first_step = limit(1.0 / jnp.where(scale > 0.0, scale, 1.0), slope)
+    start = _Descent(u, value, slope, torque, first_step, jnp.zeros((), dtype=int))
+    end = jax.lax.while_loop(lambda s: (s.torque > tolerance) & (s.attempts < max_steps), attempt, start)
+    return end.u, end.value, end.torque, end.attempts
+
+
+class HysteresisLoop(NamedTuple):
+    """Minima of the energy at a sequence of fields.
+
+    Attributes
+    ----------
+    fields : array, shape (n, 3)
+    magnetisation : array, shape (n, 3)
+        Mean of the spins, weighted with their moments relative to the mean moment.
+    spins : array, shape ``(n, *sites, 3)``
+    energies : array, shape (n,)
+        Energies, with that in the field.
+    """
+
+    fields: np.ndarray
+    magnetisation: np.ndarray
+    spins: np.ndarray
+    energies: np.ndarray
+
+
+def hysteresis_loop(
+    energy,
+    spins,
+    fields,
+    moment=1.0,
+    tolerance: float = 1e-8,
+    max_steps: int = 100_000,
+    perturbation: float = 1e-5,
+    seed: int = 0,
+) -> HysteresisLoop:
+    """Return the minima of the energy at a sequence of fields, each followed from the last one.
+
+    Parameters
+    ----------
+    energy : Energy or list of energies
+        Of the spins without the field.
+    spins : array, shape ``(*sites, 3)``
+        The start.
+    fields : array, shape (n, 3)
+        Fields in their order, such as ``np.linspace(1, -1, 41)[:, None] * [0, 0, 1]``.
+    moment : float, or array of the shape of the sites
+        Moments in the Zeeman energy.
+    tolerance, max_steps
+        See :func:`minimise`.
+    perturbation : float
+        Size of random rotations (radian) before each descent. Without them a spin exactly opposite to its field stays
+        there, although the state is unstable.
+    seed : int
+        Seed of the rotations.
+
+    Returns
+    -------
+    HysteresisLoop
+
+    Raises
+    ------
+    InputError, ConvergenceError
+    """
+    terms = make_energy(energy, "the energy")
+    state = np.asarray(checked_numbers(spins, "spins"))
+    values = np.asarray(checked_numbers(fields, "fields"))
+    if values.ndim != 2 or values.shape[1] != 3 or not len(values):
+        raise InputError(f"fields must have shape (n, 3), got {values.shape}")
+    random = np.random.default_rng(seed)
+    weights = np.broadcast_to(np.asarray(moment, dtype=float), state.shape[:-1])
+    weights = weights / weights.mean()
+    minima = []
+    for field in values:
+        lengths = np.linalg.norm(state, axis=-1, keepdims=True)
+        state = state + perturbation * lengths * random.standard_normal(state.shape)
+        state = state * lengths / np.linalg.norm(state, axis=-1, keepdims=True)
+        total = Sum((*terms.terms, zeeman(state.shape[:-1], field, moment)))
+        minimum = minimise(total, state, tolerance, max_steps)
+        state = np.asarray(minimum.spins)
+        minima.append(minimum)
+    loop_spins = np.stack([minimum.spins for minimum in minima])
+    axes = tuple(range(1, loop_spins.ndim - 1))
+    mean = np.mean(weights[..., None] * loop_spins, axis=axes)
+    return HysteresisLoop(values, mean, loop_spins, np.array([minimum.energy for minimum in minima]))

@@ -1,0 +1,118 @@
+"""Base class of the energies of spins on a lattice, and checks of their parameters."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from manifolds._arrays import is_traced
+from manifolds.structures.spins import (
+    Lattice as PeriodicSpins,
+)
+from manifolds.structures.spins import (
+    VectorComponents,
+    reshape_vectors,
+    spins_from_state,
+    state_from_spins,
+)
+
+from ...errors import InputError
+from ..conditions import checked_numbers
+from ..energy import Energy
+from .lattices import Lattice
+
+
+class SpinEnergy(Energy):
+    """A polynomial energy of spins on a lattice, computed component by component on arrays of the shape of the sites.
+
+    Attributes
+    ----------
+    sites : tuple of int
+    interaction_range : tuple of int
+        Largest distance, along each axis, of two spins that interact.
+    """
+
+    sites: tuple[int, ...] = eqx.field(static=True)
+
+    @property
+    def interaction_range(self) -> tuple[int, ...]:
+        return (0,) * len(self.sites)
+
+    @abstractmethod
+    def lattice_value(self, spins: PeriodicSpins) -> jax.Array:
+        """Return the energy of the spins, shape ()."""
+
+    @abstractmethod
+    def lattice_gradients(self, spins: PeriodicSpins) -> VectorComponents:
+        """Return the gradients by the spins."""
+
+    @property
+    def is_quadratic(self) -> bool:
+        return True
+
+    def __neg__(self) -> Energy:
+        return self.multiple(-1.0)
+
+    def value(self, x) -> jax.Array:
+        return self.lattice_value(PeriodicSpins(lattice_spins(x, self.sites)))
+
+    def gradient(self, x) -> jax.Array:
+        return flatten_covectors(self.lattice_gradients(PeriodicSpins(lattice_spins(x, self.sites))), x)
+
+    def check_components(self, dim: int, role: str) -> None:
+        check_spin_count(self.sites, dim, role)
+
+
+def lattice_spins(x, sites: tuple[int, ...], planar: bool = False) -> VectorComponents:
+    """Return the components of the spins of a state, each of the shape of the sites."""
+    return reshape_vectors(spins_from_state(x, math.prod(sites), planar), sites)
+
+
+def flatten_covectors(covectors: VectorComponents, x, planar: bool = False) -> jax.Array:
+    """Return covectors of the spins as one covector of the state x."""
+    return state_from_spins(reshape_vectors(covectors, (-1,)), jnp.zeros(x.size - 3 * covectors[0].size), planar)
+
+
+def lattice_shape(sites) -> tuple[int, ...]:
+    """Return the shape of a lattice as a tuple; an integer becomes a tuple of one entry."""
+    if isinstance(sites, Lattice):
+        return sites.sites
+    shape = tuple(sites) if isinstance(sites, tuple | list) else (sites,)
+    is_valid = all(isinstance(n, int | np.integer) and not isinstance(n, bool) and n >= 1 for n in shape)
+    if not shape or not is_valid:
+        raise InputError(f"sites must be a positive integer, or a tuple for a lattice such as (64, 64), got {sites!r}")
+    return tuple(int(n) for n in shape)
+
+
+def check_spin_count(sites: tuple[int, ...], dim: int, role: str) -> None:
+    """Raise InputError if a state has fewer components than the spins of a term."""
+    count = math.prod(sites)
+    if 3 * count > dim:
+        raise InputError(f"{role} has a term of {count} spins, so the state needs {3 * count} components, got {dim}")
+
+
+def checked_site_values(value, shape, tail: tuple[int, ...], what: str) -> jax.Array:
+    """Return a value, given once or for each site, as an array; InputError unless its shape fits and it is finite."""
+    array = checked_numbers(value, what)
+    if array.shape not in (tail, (*shape, *tail)):
+        expected_shapes = f"{tail} or {(*shape, *tail)}" if tail else f"() or {shape}"
+        raise InputError(f"{what} must have shape {expected_shapes}, got {array.shape}")
+    return check_finite(array, what)
+
+
+def check_finite(array: jax.Array, what: str) -> jax.Array:
+    """Return an array; raise InputError unless its numbers are finite."""
+    if not is_traced(array) and not np.isfinite(np.asarray(array)).all():
+        raise InputError(f"{what} must be finite, got {np.asarray(array).tolist()}")
+    return array
+
+
+def bond_indices(first, second) -> np.ndarray:
+    """Return the indices of the components of two spins, shape (edges, 6)."""
+    ends = np.stack([first, second], axis=1)
+    return (3 * ends[:, :, None] + np.arange(3)).reshape(len(ends), 6)

@@ -1,0 +1,241 @@
+"""Small motions about a state of rest: frequencies of spin waves, and the temperature of spins."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from manifolds._precision import with_library_settings
+
+from ...errors import InputError
+from ..conditions import checked_numbers
+from ..energy import Energy, make_energy
+from .lattices import Lattice
+from .spin_energy import lattice_shape
+
+REST_TOLERANCE = 1e-5
+"""Largest torque of a state of rest, relative to the largest gradient."""
+
+
+@with_library_settings
+def spin_wave_frequencies(
+    energy, lattice: Lattice, spins, wave_vectors, ratio=1.0, magnetic_cell: Sequence[int] | None = None
+) -> np.ndarray:
+    """Return the angular frequencies of small waves about a state of rest, by linear response.
+
+    The motion ``s' = ratio s x grad H`` is linearised about a periodic state. The matrix of a wave vector is the
+    Fourier transform of the second derivatives of the energy, so any energy will do. Wave vectors between those of the
+    lattice need interactions that are shorter than half of the lattice.
+
+    Parameters
+    ----------
+    energy : Energy or list of energies
+        Of the spins of a periodic lattice.
+    lattice : Lattice
+    spins : array, shape ``(*sites, 3)``
+        A state of rest, such as the spins of :func:`minimise`.
+    wave_vectors : array, shape (..., 3)
+        Wave vectors (1 / length).
+    ratio : float
+        Ratio of the precession; ``gamma / mu`` for unit vectors.
+    magnetic_cell : sequence of int, optional
+        Number of cells of the lattice, along each vector, that the state repeats after; one by default.
+
+    Returns
+    -------
+    array, shape (..., modes)
+        Angular frequencies (radian / time) in ascending order, one for each spin of the magnetic cell. A frequency is
+        NaN where the state is unstable.
+
+    Raises
+    ------
+    InputError
+        If the state is no state of rest, or does not repeat.
+
+    Examples
+    --------
+    >>> chain = lt.magnetism.lattice("chain", 8)
+    >>> up = np.tile([0.0, 0.0, 1.0], (8, 1))
+    >>> q = [(0.5 * np.pi, 0.0, 0.0)]
+    >>> lt.magnetism.spin_wave_frequencies(lt.magnetism.exchange(chain, 1.0), chain, up, q).round(6).tolist()
+    [[2.0]]
+    """
+    function = make_energy(energy, "the energy")
+    s = np.asarray(checked_numbers(spins, "spins", (*lattice.sites, 3)))
+    q = np.asarray(checked_numbers(wave_vectors, "wave vectors"))
+    if q.shape[-1:] != (3,):
+        raise InputError(f"wave vectors must have shape (..., 3), got {q.shape}")
+    repeat = (1,) * len(lattice.cells) if magnetic_cell is None else tuple(magnetic_cell)
+    if len(repeat) != len(lattice.cells) or any(n % m for n, m in zip(lattice.cells, repeat, strict=True)):
+        raise InputError(f"magnetic_cell must divide the cells {lattice.cells}, got {repeat}")
+    _check_repeats(s, lattice, repeat)
+    gradient = np.asarray(function.gradient(s.ravel())).reshape(-1, 3)
+    flat = s.reshape(-1, 3)
+    torques = np.linalg.norm(np.cross(flat, gradient), axis=1) / np.linalg.norm(flat, axis=1)
+    if torques.max() > REST_TOLERANCE * max(np.linalg.norm(gradient, axis=1).max(), 1e-300):
+        raise InputError(
+            "spins must be a state of rest, but their torques do not vanish. Use lt.magnetism.minimise first"
+        )
+    numbers, members, offsets = _cell_members(lattice, repeat)
+    frames = np.empty((len(flat), 2, 3))
+    frames[numbers] = _local_frames(flat[members])
+    lengths = np.linalg.norm(flat[members], axis=1)
+    rows = _hessian_rows(function, flat, members, frames)
+    radial_slopes = np.sum(gradient[members] * flat[members], axis=1) / lengths**2
+    count = len(members)
+    for k, i in enumerate(members):  # a spin moves on a sphere, whose curvature adds the slope along the spin
+        rows[2 * k : 2 * k + 2, i] -= radial_slopes[k] * np.eye(2)
+    positions = offsets @ lattice.vectors
+    rotation = np.kron(np.diag(ratio * lengths), [[0.0, -1.0], [1.0, 0.0]])
+    frequencies = []
+    for wave in q.reshape(-1, 3):
+        phases = np.exp(1j * positions @ wave)
+        blocks = np.einsum("rcms,c->rms", rows[:, numbers], phases)
+        values = np.linalg.eigvals(1j * rotation @ blocks.reshape(2 * count, 2 * count))
+        frequencies.append(_positive_frequencies(values, count))
+    return np.stack(frequencies).reshape(*q.shape[:-1], count)
+
+
+def _positive_frequencies(values: np.ndarray, count: int) -> np.ndarray:
+    """Return the larger half of the eigenvalues, which are real for a stable state."""
+    scale = max(np.abs(values).max(), 1e-300)
+    real = np.where(np.abs(values.imag) <= IMAGINARY_TOLERANCE * scale, values.real, np.nan)
+    upper = np.sort(real)[-count:] if np.isnan(real).any() else np.sort(real)[count:]
+    return np.where(np.abs(upper) <= IMAGINARY_TOLERANCE * scale, np.abs(upper), upper)
+
+
+IMAGINARY_TOLERANCE = 1e-6
+"""Imaginary part, relative to the largest frequency, that is rounding: a double zero splits by the root of rounding."""
+
+
+def _check_repeats(s: np.ndarray, lattice: Lattice, repeat: tuple[int, ...]) -> None:
+    if not all(lattice.periodic):
+        raise InputError("waves need a lattice that is periodic along every axis")
+    for axis, m in enumerate(repeat):
+        if np.abs(np.roll(s, m, axis=axis) - s).max() > REST_TOLERANCE * np.abs(s).max():
+            raise InputError(
+                f"the spins do not repeat after {m} cells along axis {axis}. Give magnetic_cell= with the period"
+            )
+
+
+def _cell_members(lattice: Lattice, repeat: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return sites by magnetic cell and member, shape (cells, members), those of the first cell, and offsets of cells.
+
+    Offsets are of least length, with the signs of a periodic lattice.
+    """
+    atoms = len(lattice.basis)
+    axes = len(repeat)
+    numbers = np.arange(lattice.site_count).reshape(*lattice.cells, atoms)
+    counts = tuple(n // m for n, m in zip(lattice.cells, repeat, strict=True))
+    split = numbers.reshape(*(length for pair in zip(counts, repeat, strict=True) for length in pair), atoms)
+    ordered = split.transpose(*range(0, 2 * axes, 2), *range(1, 2 * axes, 2), 2 * axes)
+    table = ordered.reshape(math.prod(counts), -1)
+    grids = np.meshgrid(
+        *(np.rint(np.fft.fftfreq(n, 1.0 / n)) * m for n, m in zip(counts, repeat, strict=True)), indexing="ij"
+    )
+    offsets = np.stack(grids, axis=-1).reshape(-1, axes)
+    return table, table[0], offsets
+
+
+def _local_frames(spins: np.ndarray) -> np.ndarray:
+    """Return two unit vectors across each spin, right-handed with it, shape (n, 2, 3)."""
+    e3 = spins / np.linalg.norm(spins, axis=1, keepdims=True)
+    helper = np.eye(3)[np.argmin(np.abs(e3), axis=1)]
+    e1 = np.cross(helper, e3)
+    e1 = e1 / np.linalg.norm(e1, axis=1, keepdims=True)
+    return np.stack([e1, np.cross(e3, e1)], axis=1)
+
+
+def _hessian_rows(energy: Energy, spins: np.ndarray, members: np.ndarray, frames: np.ndarray) -> np.ndarray:
+    """Return second derivatives along the local axes, of the members by all sites, shape (2 members, n, 2)."""
+    n = len(spins)
+    directions = np.zeros((2 * len(members), n, 3))
+    for k, i in enumerate(members):
+        directions[2 * k : 2 * k + 2, i] = frames[i]
+    x = jnp.asarray(spins.ravel())
+
+    def hessian_product(v):
+        return jax.jvp(energy.gradient, (x,), (v,))[1]
+
+    products = jax.lax.map(hessian_product, jnp.asarray(directions.reshape(len(directions), -1)))
+    return np.einsum("rnc,ntc->rnt", np.asarray(products).reshape(len(directions), n, 3), frames)
+
+
+MAX_EXACT_SITES = 500
+"""Number of spins up to which the Laplacian of the energy is computed exactly, by three products for each."""
+
+TRACE_PROBES = 64
+"""Random vectors that estimate the Laplacian of the energy of more spins [Hutchinson 1990]."""
+
+
+@with_library_settings
+def spin_temperature(energy, spins, sites) -> float:
+    """Return the temperature k T (energy) that fits states of spins, the ratio of two means.
+
+    In equilibrium the mean of ``sum |s_i x grad_i H|^2 / |s_i|^2`` is kT times the mean of the Laplacian of H on the
+    spheres of the spins. For bilinear energies that is ``kT = sum |s_i x B_i|^2 / 2 sum s_i . B_i`` with B = -grad H
+    [Rugh 1997; Nurdin & Schotte 2000]; here anisotropies of any order are included. A state of N spins determines T to
+    about N^{-1/2}. If there are more than 500 spins, 64 random vectors estimate the Laplacian with a smaller error.
+
+    Parameters
+    ----------
+    energy : Energy or list of energies
+    spins : array, shape ``(..., *sites, 3)``
+        One state, or samples of equilibrium, over which numerator and denominator are averaged.
+    sites : int, tuple of int or Lattice
+
+    Returns
+    -------
+    float
+
+    Raises
+    ------
+    InputError
+        If the shape is wrong, or the Laplacian is not positive, as in states of negative temperature.
+    """
+    function, shape = make_energy(energy, "the energy"), (*lattice_shape(sites), 3)
+    s = np.asarray(checked_numbers(spins, "spins"))
+    if s.shape[-len(shape) :] != shape:
+        raise InputError(f"spins must have shape (..., {', '.join(map(str, shape))}), got {s.shape}")
+    samples = jnp.asarray(s.reshape(-1, math.prod(shape)))
+    count = samples.shape[1] // 3
+    probes = (
+        None if count <= MAX_EXACT_SITES else np.random.default_rng(0).choice([-1.0, 1.0], (TRACE_PROBES, 3 * count))
+    )
+    numerator, denominator = 0.0, 0.0
+    for x in samples:
+        squares, laplacian = _temperature_sums(function, x, probes)
+        numerator, denominator = numerator + float(squares), denominator + float(laplacian)
+    if not denominator > 0.0:
+        raise InputError(
+            "the Laplacian of the energy is not positive, so the states have no positive temperature. Give samples of "
+            "equilibrium"
+        )
+    return numerator / denominator
+
+
+@eqx.filter_jit
+def _temperature_sums(energy: Energy, x, probes) -> tuple[jax.Array, jax.Array]:
+    """Return the sums of squared tangential gradients and of Laplacians on the spheres."""
+    s, g = x.reshape(-1, 3), energy.gradient(x).reshape(-1, 3)
+    squares = jnp.sum(s * s, axis=1)
+    radial_slopes = jnp.sum(s * g, axis=1) / squares
+    tangential = g - radial_slopes[:, None] * s
+
+    def project(v):
+        v = v.reshape(-1, 3)
+        return (v - (jnp.sum(v * s, axis=1) / squares)[:, None] * s).reshape(-1)
+
+    def quadratic_form(v):
+        return jnp.dot(project(v), jax.jvp(energy.gradient, (x,), (project(v),))[1])
+
+    if probes is None:
+        forms = jnp.sum(jax.lax.map(lambda i: quadratic_form(jnp.zeros_like(x).at[i].set(1.0)), jnp.arange(x.size)))
+    else:
+        forms = jnp.mean(jax.lax.map(quadratic_form, probes))
+    return jnp.sum(tangential**2), forms - 2.0 * jnp.sum(radial_slopes)
