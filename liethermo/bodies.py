@@ -1,6 +1,7 @@
-"""Rigid bodies: their orientation during a run, the periods of their free motion, and the time to reach a spin.
+"""Rigid bodies: attitudes and rates in and out, the periods of their free motion, and the time to reach a spin.
 
-Units are SI or any other consistent ones; angles are in radians.
+Units are SI or any other consistent ones; angles are in radians, unless ``degrees=True`` is given. Attitudes map body
+axes to axes in space [:doc:`/reference/conventions`].
 """
 
 from __future__ import annotations
@@ -9,18 +10,24 @@ from manifolds._names import public_dir
 
 from .models.free_motion import Periods, damping_time, periods, rate_of
 from .models.inertia import PrincipalAxes, principal_axes
-from .results.orientation import nutation, precession, quaternions, spin
+from .results.orientation import angular_velocity, euler_angles, nutation, precession, quaternions, rotation, spin
+from .systems.rotations import AttitudeWarning, attitude
 
 __all__ = [
+    "AttitudeWarning",
     "Periods",
     "PrincipalAxes",
+    "angular_velocity",
+    "attitude",
     "damping_time",
+    "euler_angles",
     "nutation",
     "periods",
     "precession",
     "principal_axes",
     "quaternions",
     "rate_of",
+    "rotation",
     "spin",
 ]
 __dir__ = public_dir(__all__)

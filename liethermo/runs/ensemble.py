@@ -19,6 +19,7 @@ from ..integrators.fluctuating import noise_dimension
 from ..results.ensemble import Ensemble, Subset, join_subsets
 from ..results.events import Events
 from ..systems import System
+from ..systems.rotations import attitude_array
 from ..tracing.scalarize import UnsupportedPrimitive
 from .adaptive import Adaptive, make_step_control
 from .adaptive_ensemble import AdaptiveEnsembleRun
@@ -99,7 +100,7 @@ def ensemble(
     engine : {"auto", "array", "compiled"}
         SIMD lanes over all cores for small systems ("compiled"), or ``vmap`` for any ("array"). "auto" compiles what
         can be compiled, unless JAX has an accelerator.
-    attitude : array, shape (m, m) or (B, m, m), optional
+    attitude : array, shape (m, m) or (B, m, m), or scipy.spatial.transform.Rotation; optional
         As for :func:`integrate` (dimensionless); one for all, or one each.
     progress : bool, optional
         Show a progress bar; by default where the standard error is a terminal.
@@ -143,6 +144,7 @@ def ensemble(
     schedule = make_schedule(t_span, step, save_every if outputs == "trajectory" and save_at is None else None, save_at)
 
     family = Family.from_arguments(system, parameters)
+    attitude = attitude_array(attitude, None)
     states, reasons = _checked_initial_states(family, x0s, len(attitude) if np.ndim(attitude) == 3 else 1)
     check_noise(noise, len(states))
     n_trajectories = len(states)

@@ -23,6 +23,7 @@ from ..tracing.caching import memoize
 from ..tracing.interpret import evaluate_at_points
 from .base import TEST_TIMES, System
 from .baths import BathEntropy, HeatBaths
+from .body_states import checked_velocity, entropies_of_temperatures, momentum_of_velocity
 from .torque import check_torque, evaluate_torque, torque_free_components, torque_name
 
 
@@ -156,6 +157,74 @@ class LiePoissonSystem(System):
             return None
         energy = self.drop_baths().energy
         return _inertia_tensor(energy, self.algebra.dim) if energy.is_quadratic else None
+
+    @property
+    def has_angular_velocity(self) -> bool:
+        return len(self.algebra.shape) == 1 and _begins_with_rotations(self.algebra)
+
+    def angular_velocity_at(self, x):
+        return self.energy.gradient(x)[:3]
+
+    def state(
+        self, x=None, batch: bool = False, *, angular_velocity=None, rotor_rates=None, temperature=None, t=None
+    ) -> jax.Array:
+        """Return ``x`` as a state of this system, or the state of a rigid body with an angular velocity.
+
+        Parameters
+        ----------
+        x : array, shape (n,), or (..., n) with ``batch``; optional
+            See :meth:`System.state`.
+        batch : bool
+            Whether leading axes are several states.
+        angular_velocity : array, shape (3,), or (..., 3) with ``batch``; optional
+            Omega in body axes (rad / time), instead of x. The momentum is the one at which ``dH/dmu = (Omega, w)``.
+        rotor_rates : array, shape (k,), or (..., k) with ``batch``; optional
+            w, the rates of rotors relative to the body (rad / time), or the other velocities of the algebra; zero by
+            default.
+        temperature : float, or array, shape (baths,); optional
+            Temperatures of the baths; by default those at zero entropy.
+        t : float, optional
+            The time, if the energy depends on it.
+
+        Raises
+        ------
+        InputError
+            If neither or both of x and the angular velocity are given, or no state has these values.
+
+        Examples
+        --------
+        >>> body = lt.models.tumbling_body((3.0, 2.0, 1.0), rate=0.1)
+        >>> body.state(angular_velocity=(0.1, 0.2, 0.3), temperature=1.0).tolist()
+        [0.30000000000000004, 0.4, 0.3, 0.0]
+        """
+        if angular_velocity is None:
+            if x is None or rotor_rates is not None or temperature is not None:
+                raise InputError("state needs x, or angular_velocity= with rotor_rates= and temperature= as wanted")
+            return super().state(x, batch)
+        if x is not None:
+            raise InputError("state needs x or angular_velocity=, got both")
+        if not self.has_angular_velocity:
+            raise InputError(f"a system on {self.algebra.name} has no angular velocity: give its momentum")
+        if temperature is not None and self.baths is None:
+            raise InputError("temperature= is for a system with baths: give it baths=lt.HeatBaths(...)")
+        velocity = checked_velocity(angular_velocity, rotor_rates, self.algebra.dim, batch)
+        momentum = self.momentum_of_velocity(velocity, t)
+        if temperature is not None:
+            assert self.baths is not None
+            y = entropies_of_temperatures(self.baths, temperature)
+            shape = jnp.broadcast_shapes(momentum.shape[:-1], y.shape[:-1])
+            parts = (jnp.broadcast_to(part, (*shape, part.shape[-1])) for part in (momentum, y))
+            momentum = jnp.concatenate([*parts], axis=-1)
+        return super().state(momentum, batch)
+
+    def momentum_of_velocity(self, xi, t=None) -> jax.Array:
+        """Return the momentum mu with ``dH/dmu = xi``, shape (..., algebra.dim), at the time t if H depends on it."""
+        energy = self.drop_baths().energy
+        if energy.depends_on_time:
+            if t is None:
+                raise InputError("the energy depends on time: give the time t= of the state")
+            energy = energy.at_time(t)
+        return momentum_of_velocity(energy, jnp.asarray(xi))
 
     # -- the torque -----------------------------------------------------------------------------------------------
 
@@ -315,6 +384,15 @@ def _gradient_and_hessian(energy: Energy, x) -> tuple[jax.Array, jax.Array]:
 def _is_body_algebra(algebra: mf.LieAlgebra) -> bool:
     """Return whether the algebra is so(3), or its direct sum with an abelian algebra of internal parts."""
     return algebra.dim >= 3 and _extends_algebra(mf.so(3), algebra)
+
+
+@functools.lru_cache(maxsize=64)
+def _begins_with_rotations(algebra: mf.LieAlgebra) -> bool:
+    """Return whether the first three basis elements are those of so(3), as in se(3) and in sums with so(3)."""
+    if algebra.dim < 3 or not algebra.name.startswith(("so(3)", "se(3)")):
+        return False
+    constants = np.asarray(algebra.structure_constants)[:3, :3]
+    return bool(np.allclose(constants[..., :3], mf.so(3).structure_constants) and not constants[..., 3:].any())
 
 
 MAX_BODY_DIM = 64
