@@ -26,6 +26,7 @@ from .body_states import checked_velocity
 from .euler_poincare import are_all_singular
 from .evolution import entropy_component
 from .ledger import ForcesAndHeat, LedgerSystem, check_state_function, linear_friction
+from .torque import begins_with_rotations
 
 
 class EulerPoincareClosedSystem(LedgerSystem):
@@ -205,7 +206,7 @@ class EulerPoincareClosedSystem(LedgerSystem):
 
     @property
     def has_angular_velocity(self) -> bool:
-        return self.algebra.name.startswith("so(3)") and len(self.algebra.shape) == 1
+        return begins_with_rotations(self.algebra)
 
     def angular_velocity_at(self, x):
         return x[:3]

@@ -24,7 +24,15 @@ from ..tracing.interpret import evaluate_at_points
 from .base import TEST_TIMES, System
 from .baths import BathEntropy, HeatBaths
 from .body_states import checked_velocity, entropies_of_temperatures, momentum_of_velocity
-from .torque import check_torque, evaluate_torque, torque_free_components, torque_name
+from .torque import (
+    MAX_ARGUMENTS,
+    MIN_ARGUMENTS,
+    begins_with_rotations,
+    check_torque,
+    evaluate_torque,
+    torque_free_components,
+    torque_name,
+)
 
 
 class LiePoissonSystem(System):
@@ -61,8 +69,9 @@ class LiePoissonSystem(System):
         The baths that take the heat of a dissipation that lowers the energy (energy of H, entropies in energy /
         temperature). A state is then mu, in one row, followed by the entropies of the baths. If these are left out of
         a state, they are zero.
-    torque : function of t, shape (), and mu, and of the attitude, shape (m, m), where it needs three; or a list of them
+    torque : function of (t, mu), (t, mu, attitude) or (t, mu, attitude, velocity), or a list of them; optional
         An external torque, ``mu' = ad*_xi mu + torque``: a dual vector of the shape of mu (energy, if xi is 1 / time).
+        The attitude has shape (m, m); the velocity is ``dH/dmu``, of the shape of mu, for torques such as drag.
         It does the work W, ``W' = xi . torque``, and the energy less the work is constant. With a group it also has an
         impulse, the momentum in space that it has transferred. The arrays of an ``equinox.Module`` are parameters,
         such as ``"torque.moment"``. With a torque, Casimirs are not constant, and momentum maps must be conserved by
@@ -100,7 +109,7 @@ class LiePoissonSystem(System):
     reconstruction: str | None = eqx.field(static=True)
     torque: Any
     torque_arguments: tuple[jax.Array, jax.Array | None] | None
-    torques_need_attitude: tuple[bool, ...] = eqx.field(static=True)
+    torque_argument_counts: tuple[int, ...] = eqx.field(static=True)
     torque_free_components: tuple[int, ...] = eqx.field(static=True)
 
     @property
@@ -128,9 +137,9 @@ class LiePoissonSystem(System):
             raise InputError(f"the algebra must be a manifolds.LieAlgebra, not {type(algebra).__name__}")
         self.algebra = algebra
         self.group, self.reconstruction = group, _resolve_reconstruction(algebra, group, reconstruction)
-        self.torque, self.torques_need_attitude = check_torque(torque, algebra, group)
+        self.torque, self.torque_argument_counts = check_torque(torque, algebra, group)
         self.torque_free_components = (
-            () if torque is None else torque_free_components(self.torque, self.torques_need_attitude, algebra, group)
+            () if torque is None else torque_free_components(self.torque, self.torque_argument_counts, algebra, group)
         )
         self.torque_arguments = None
         poisson = mf.LiePoisson(algebra)
@@ -160,7 +169,7 @@ class LiePoissonSystem(System):
 
     @property
     def has_angular_velocity(self) -> bool:
-        return len(self.algebra.shape) == 1 and _begins_with_rotations(self.algebra)
+        return begins_with_rotations(self.algebra)
 
     def angular_velocity_at(self, x):
         return self.energy.gradient(x)[:3]
@@ -245,7 +254,7 @@ class LiePoissonSystem(System):
 
     @property
     def needs_attitude(self) -> bool:
-        return any(self.torques_need_attitude)
+        return max(self.torque_argument_counts, default=0) > MIN_ARGUMENTS
 
     @property
     def is_driven(self) -> bool:
@@ -281,8 +290,10 @@ class LiePoissonSystem(System):
         if attitude is not None:  # without it XLA crashes on products of many such matrices with vectors
             attitude = jax.lax.optimization_barrier(attitude)
         n = self.algebra.dim
-        mu = x[:n].reshape(self.algebra.shape)
-        torque = evaluate_torque(self.torque, self.torques_need_attitude, t, mu, attitude)
+        mu, counts = x[:n].reshape(self.algebra.shape), self.torque_argument_counts
+        needs_velocity = max(counts) == MAX_ARGUMENTS
+        velocity = self.energy.gradient(x)[:n].reshape(self.algebra.shape) if needs_velocity else None
+        torque = evaluate_torque(self.torque, counts, t, mu, attitude, velocity)
         return jnp.pad(torque.ravel(), (0, self.dim - n))
 
     def drop_torque(self):
@@ -291,7 +302,7 @@ class LiePoissonSystem(System):
         system = copy(self)
         for name, value in {
             "torque": None,
-            "torques_need_attitude": (),
+            "torque_argument_counts": (),
             "torque_free_components": (),
             "torque_arguments": None,
         }.items():
@@ -384,15 +395,6 @@ def _gradient_and_hessian(energy: Energy, x) -> tuple[jax.Array, jax.Array]:
 def _is_body_algebra(algebra: mf.LieAlgebra) -> bool:
     """Return whether the algebra is so(3), or its direct sum with an abelian algebra of internal parts."""
     return algebra.dim >= 3 and _extends_algebra(mf.so(3), algebra)
-
-
-@functools.lru_cache(maxsize=64)
-def _begins_with_rotations(algebra: mf.LieAlgebra) -> bool:
-    """Return whether the first three basis elements are those of so(3), as in se(3) and in sums with so(3)."""
-    if algebra.dim < 3 or not algebra.name.startswith(("so(3)", "se(3)")):
-        return False
-    constants = np.asarray(algebra.structure_constants)[:3, :3]
-    return bool(np.allclose(constants[..., :3], mf.so(3).structure_constants) and not constants[..., 3:].any())
 
 
 MAX_BODY_DIM = 64
