@@ -1,6 +1,7 @@
-"""Rigid bodies: their orientation during a run, the periods of their free motion, and the time to reach a spin.
+"""Rigid bodies: attitudes and rates in and out, the periods of their free motion, and the time to reach a spin.
 
-Units are SI or any other consistent ones; angles are in radians.
+Units are SI or any other consistent ones; angles are in radians, unless ``degrees=True`` is given. Attitudes map body
+axes to axes in space [:doc:`/reference/conventions`].
 """
 
 from __future__ import annotations
@@ -11,9 +12,11 @@ from .models.free_motion import Periods, damping_time, periods, rate_of
 from .models.inertia import PrincipalAxes, principal_axes
 from .models.jointed_bodies import JointedBodies, Tree
 from .models.joints import Hinge, Slider, Universal
-from .results.orientation import nutation, precession, quaternions, spin
+from .results.orientation import angular_velocity, euler_angles, nutation, precession, quaternions, rotation, spin
+from .systems.rotations import AttitudeWarning, attitude
 
 __all__ = [
+    "AttitudeWarning",
     "Hinge",
     "JointedBodies",
     "Periods",
@@ -21,13 +24,17 @@ __all__ = [
     "Slider",
     "Tree",
     "Universal",
+    "angular_velocity",
+    "attitude",
     "damping_time",
+    "euler_angles",
     "nutation",
     "periods",
     "precession",
     "principal_axes",
     "quaternions",
     "rate_of",
+    "rotation",
     "spin",
 ]
 __dir__ = public_dir(__all__)

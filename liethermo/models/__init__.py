@@ -18,7 +18,7 @@ from .open_gases import IdealMixture, porous_piston, reaction_vessel
 from .oscillator import damped_oscillator
 from .quantised_sphere import QuantisedSphere
 from .rigid_body import free_rigid_body, rigid_body
-from .rotors import damper_wheel, dual_spin, ring_damper
+from .rotors import damper_wheel, dual_spin, reaction_wheels, ring_damper
 from .spins import single_spin, spin_lattice
 from .thermo_particles import moving_thermo_particles, thermo_particles, thermo_springs
 from .thermoelastic_chain import thermoelastic_chain
@@ -42,6 +42,7 @@ __all__ = [
     "moving_thermo_particles",
     "porous_piston",
     "reaction_vessel",
+    "reaction_wheels",
     "rigid_body",
     "ring_damper",
     "single_spin",

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +15,7 @@ from manifolds._pytree_module import Module
 
 from ..errors import InputError
 from ..systems import EulerPoincareClosedSystem
+from ..systems.torque import MIN_ARGUMENTS, check_torque, evaluate_torque, torque_name
 from .parameters import checked_positive
 
 
@@ -35,12 +38,24 @@ class _BearingFriction(Module):
         return jnp.concatenate([jnp.zeros(3), -self.friction * xi[3:]])
 
 
+class _TorqueOfMomentum(Module):
+    """An external force that is a torque at the time and the momentum ``l_xi``."""
+
+    lagrangian: _Lagrangian
+    torque: Any
+    counts: tuple[int, ...] = eqx.field(static=True)
+
+    def __call__(self, xi, S, t):
+        return evaluate_torque(self.torque, self.counts, t, jax.grad(self.lagrangian)(xi, S), None, xi)
+
+
 def body_with_wheels(
     inertia: Sequence[float] = (3.0, 2.0, 1.0),
     wheels: Sequence[float] = (0.3, 0.3, 0.3),
     friction: float = 0.2,
     heat: float = 2.0,
     temperature: float = 1.0,
+    torque=None,
 ) -> EulerPoincareClosedSystem:
     """A body with three wheels, one about each principal axis, whose bearing friction heats it.
 
@@ -55,11 +70,29 @@ def body_with_wheels(
         I of the body, J of the wheels (mass * length**2).
     friction, heat, temperature : float, > 0
         k (mass * length**2 / time), the heat capacity C, and T_0.
+    torque : torque of (t, mu), or a list of them; optional
+        Torques from outside and of motors on the wheels, where mu is ``l_xi``, the angular momentum of the whole and
+        those of the wheels: see :mod:`liethermo.torques`. The state then has the work, the heat and the time behind S.
+        For torques that depend on the attitude see :func:`reaction_wheels`.
+
+    Raises
+    ------
+    InputError
     """
     body, wheel = _principal_moments(inertia), checked_positive(wheels, "wheels", 3)
     lagrangian = _Lagrangian(body, wheel, checked_positive(heat, "heat"), checked_positive(temperature, "temperature"))
     algebra = mf.direct_sum(mf.so(3), mf.abelian(3))
-    return EulerPoincareClosedSystem(algebra, lagrangian, _BearingFriction(checked_positive(friction, "friction")))
+    external = None
+    if torque is not None:
+        torque, counts = check_torque(torque, algebra, mf.SO(3))
+        if max(counts) > MIN_ARGUMENTS:
+            raise InputError(
+                f"body_with_wheels follows no attitude, but its torque {torque_name(torque)} needs it. Use "
+                "lt.models.reaction_wheels, a body with wheels and an attitude"
+            )
+        external = _TorqueOfMomentum(lagrangian, torque, counts)
+    bearing = _BearingFriction(checked_positive(friction, "friction"))
+    return EulerPoincareClosedSystem(algebra, lagrangian, bearing, external=external)
 
 
 def body_with_wheels_rest(momentum, energy, inertia=(3.0, 2.0, 1.0), wheels=(0.3, 0.3, 0.3), heat=2.0) -> float:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from manifolds._arrays import is_traced
+from manifolds.errors import warn
 
 from ..errors import InputError
 from ..functions.conditions import checked_numbers, require_condition
@@ -21,6 +22,19 @@ INEQUALITY_RTOL = 1e-9
 
 EQUAL_MOMENTS_RTOL = 1e-9
 """Difference of two moments of inertia, relative to the greatest, up to which they count as equal."""
+
+PUBLISHED_INERTIAS = ((10.0, 5.0, 1.0), (2.0, 1.0, 2.0 / 3.0))
+"""Moments of published examples that no body can have, but that give no warning; the first is Morrison's."""
+
+POSITIVE_MOMENTS_TEXT = "moments of inertia must be positive and finite, got {value}"
+"""Error message for moments of inertia that are not positive and finite."""
+
+ROD_RTOL = 1e-14
+"""Least principal moment of a tensor, relative to the greatest, that counts as the zero of a slender rod."""
+
+
+class InertiaWarning(UserWarning):
+    """Moments of inertia that no rigid body has."""
 
 
 class PrincipalAxes(NamedTuple):
@@ -38,6 +52,78 @@ class PrincipalAxes(NamedTuple):
 
     moments: np.ndarray
     axes: np.ndarray
+
+
+def checked_inertia(inertia, allow_rod: bool = False) -> np.ndarray | jax.Array:
+    """Return moments of inertia, shape (3,), or a tensor, shape (3, 3), of one body, and warn if no body can have them.
+
+    A diagonal tensor is returned as its moments.
+
+    Parameters
+    ----------
+    inertia : array, shape (3,) or (3, 3)
+    allow_rod : bool
+        Whether the moments (0, J, J) of a slender rod, in any order, are allowed.
+
+    Raises
+    ------
+    InputError
+        If the shape is another, a tensor is not symmetric, or a moment is not positive.
+
+    Warns
+    -----
+    InertiaWarning
+        If a moment exceeds the sum of the other two.
+    """
+    checked_array = checked_numbers(inertia, "inertia", (3,), (3, 3))
+    if is_traced(inertia):
+        moments = jnp.linalg.eigvalsh(checked_array) if checked_array.ndim == 2 else checked_array
+        is_allowed = _are_nonnegative if allow_rod else _are_positive
+        require_condition(moments, is_allowed, POSITIVE_MOMENTS_TEXT)
+        return checked_array
+    array = np.asarray(inertia, dtype=np.float64)
+    if array.ndim == 2:
+        array = checked_inertia_tensors(array, allow_rod)
+        if not (array - np.diag(np.diag(array))).any():
+            array = np.diag(array).copy()
+    moments = array if array.ndim == 1 else np.linalg.eigvalsh(array)
+    if allow_rod and np.isfinite(moments).all() and is_rod(moments):
+        return array
+    require_condition(moments, _are_positive, POSITIVE_MOMENTS_TEXT)
+    warn_of_impossible_moments(moments)
+    return array
+
+
+def warn_of_impossible_moments(moments: np.ndarray) -> None:
+    """Warn if no rigid body has the first of the moments, shape (..., 3), that break the triangle inequalities."""
+    rows = moments.reshape(-1, 3)
+    max_moments = rows.max(axis=-1)
+    is_impossible = max_moments > (rows.sum(axis=-1) - max_moments) * (1.0 + INEQUALITY_RTOL)
+    if not is_impossible.any():
+        return
+    row = rows[int(np.argmax(is_impossible))]
+    if tuple(row.tolist()) in PUBLISHED_INERTIAS:
+        return
+    max_moment = float(row.max())
+    warn(
+        f"no rigid body has the moments of inertia {row.tolist()}: the largest, {max_moment:g}, is more than the sum "
+        f"of the others, {float(row.sum()) - max_moment:g}. The equations hold all the same",
+        InertiaWarning,
+    )
+
+
+def is_rod(moments: np.ndarray) -> bool:
+    """Return whether moments, shape (3,), are those of a slender rod: one is zero and the others are equal."""
+    least, middle, greatest = np.sort(moments).tolist()
+    return abs(least) <= ROD_RTOL * greatest and greatest - middle <= EQUAL_MOMENTS_RTOL * greatest
+
+
+def _are_positive(moments):
+    return (moments > 0.0) & (moments < np.inf)
+
+
+def _are_nonnegative(moments):
+    return (moments >= 0.0) & (moments < np.inf)
 
 
 def principal_axes(inertia) -> PrincipalAxes:
@@ -67,6 +153,7 @@ def principal_axes(inertia) -> PrincipalAxes:
     if tensors.shape[-2:] != (3, 3):
         raise InputError(f"inertia must have shape (..., 3, 3), got {tensors.shape}")
     moments, axes = np.linalg.eigh(checked_inertia_tensors(tensors))
+    warn_of_impossible_moments(moments)
     leading_entries = np.take_along_axis(axes, np.argmax(np.abs(axes) > 1e-8, axis=-2)[..., None, :], axis=-2)
     axes = axes * np.where(leading_entries < 0.0, -1.0, 1.0)
     axes[..., 2] *= np.linalg.det(axes)[..., None]
@@ -110,7 +197,7 @@ def are_inertia_tensors(inertia) -> bool:
     return True
 
 
-def checked_inertia_tensors(tensors) -> np.ndarray:
+def checked_inertia_tensors(tensors, allow_rod: bool = False) -> np.ndarray:
     """Return tensors of inertia, shape (..., 3, 3), made exactly symmetric; invalid ones are refused."""
     blocks = np.asarray(tensors, dtype=np.float64)
     if not np.isfinite(blocks).all():
@@ -118,7 +205,10 @@ def checked_inertia_tensors(tensors) -> np.ndarray:
     if not is_symmetric(blocks):
         raise InputError(f"a tensor of inertia must be symmetric, got {blocks.tolist()}")
     blocks = 0.5 * (blocks + blocks.swapaxes(-1, -2))
-    min_moment = float(np.linalg.eigvalsh(blocks).min())
+    principal = np.linalg.eigvalsh(blocks)
+    min_moment = float(principal.min())
+    if allow_rod and blocks.ndim == 2 and is_rod(principal):
+        return blocks
     if min_moment <= 0.0:
         raise InputError(f"a tensor of inertia must be positive definite, got the principal moment {min_moment:g}")
     return blocks
@@ -133,14 +223,25 @@ def principal_moments(inertia) -> jax.Array:
     require_condition(
         moments, lambda m: (m > 0.0) & (m < np.inf), "moments of inertia must be positive and finite, got {value}"
     )
+    if not is_traced(moments):
+        warn_of_impossible_moments(np.asarray(moments))
     return moments
 
 
 def inverse_inertia(inertia) -> jax.Array:
-    """Return the inverse of a tensor of inertia, shape (3, 3), or of each of three moments, shape (3,)."""
+    """Return the inverse of a tensor of inertia, shape (3, 3), or of each of three moments, shape (3,).
+
+    About the axis of a slender rod, where the moment is zero, the inverse is zero: the rod does not turn about it.
+    """
     inertia = jnp.asarray(inertia)
     if inertia.ndim == 1:
-        return 1.0 / inertia
+        is_zero = inertia == 0.0
+        return jnp.where(is_zero, 0.0, 1.0 / jnp.where(is_zero, 1.0, inertia))
+    if not is_traced(inertia):
+        moments, axes = np.linalg.eigh(np.asarray(inertia))
+        if is_rod(moments):
+            inverse_moments = np.append(0.0, 1.0 / moments[1:])
+            return jnp.asarray(axes * inverse_moments @ axes.T)
     inverse = jnp.linalg.inv(inertia)
     return 0.5 * (inverse + inverse.T)
 

@@ -647,9 +647,7 @@ def _layout(base: _Body, moved: list[_Body]) -> _Layout:
         jnp.stack([coordinate.stiffness for coordinate in coordinates]),
         jnp.stack([coordinate.rest for coordinate in coordinates]),
     )
-    return _Layout(
-        mechanism, springs, jnp.stack([coordinate.damping for coordinate in coordinates]), joint_ranges
-    )
+    return _Layout(mechanism, springs, jnp.stack([coordinate.damping for coordinate in coordinates]), joint_ranges)
 
 
 def _check_pivots(mechanism: ArticulatedBodies, joint_ranges: list[tuple[str, int, int]]) -> None:

@@ -17,21 +17,21 @@ from ..dissipation.factor import Factor
 from ..errors import InputError
 from ..functions.conditions import checked_numbers, require_condition
 from ..functions.energy import Quadratic
+from ..functions.frames import sqrt_or_zero
 from ..functions.indices import Indices
 from ..systems import HeatBaths, LiePoissonSystem
-from .inertia import inverse_inertia, principal_moments
+from .inertia import checked_inertia, inverse_inertia, principal_moments
 from .parameters import checked_positive
-from .rigid_body import checked_inertia
 
 
 class BearingFriction(Dissipation):
-    """Viscous friction ``p' = -k dH/dp`` in the bearing of a rotor of momentum p; the total angular momentum is
+    """Viscous friction ``p_i' = -k_i dH/dp_i`` in the bearings of rotors of momenta p; the total angular momentum is
     conserved.
 
     Parameters
     ----------
-    friction : float, >= 0
-        k.
+    friction : float, or array, shape (rotors,), >= 0
+        k, of one rotor or of each.
     bath : Indices
         The bath that the friction heats.
     """
@@ -47,15 +47,26 @@ class BearingFriction(Dissipation):
     def heated_bath_index(self):
         return self.bath
 
+    @property
+    def _n_rotors(self) -> int:
+        return self.friction.size
+
     def force(self, system, x, dH, dS, dL):
-        return jnp.zeros_like(x).at[3].set(-self.friction * dH[3])
+        rates = dH[3 : 3 + self._n_rotors]
+        return jnp.zeros_like(x).at[3 : 3 + self._n_rotors].set(-self.friction * rates)
 
     def velocity(self, system, x, dH, dS, dL):
         return jnp.zeros_like(dH)
 
     def factor(self, system, x, dH, dL):
-        momentum_rate = lambda w: jnp.zeros_like(x).at[3].set(w[0])  # noqa: E731
-        return Factor(1, momentum_rate, True, velocity=lambda w: jnp.zeros_like(x)).scale_by(self.friction)
+        n = self._n_rotors
+        zero_velocity = lambda w: jnp.zeros_like(x)  # noqa: E731
+        if self.friction.ndim == 0:
+            momentum_rate = lambda w: jnp.zeros_like(x).at[3].set(w[0])  # noqa: E731
+            return Factor(1, momentum_rate, True, velocity=zero_velocity).scale_by(self.friction)
+        roots = sqrt_or_zero(self.friction)
+        momentum_rates = lambda w: jnp.zeros_like(x).at[3 : 3 + n].set(roots * w)  # noqa: E731
+        return Factor(n, momentum_rates, True, velocity=zero_velocity)
 
 
 class RotorFriction(Dissipation):
@@ -107,6 +118,7 @@ def damper_wheel(
     capacity: float = 1.0,
     temperature: float = 1.0,
     attitude: bool = True,
+    torque=None,
 ) -> LiePoissonSystem:
     """A body with a wheel whose bearing is viscous, the simplest nutation damper [Hughes 1986, Likins 1967].
 
@@ -132,6 +144,8 @@ def damper_wheel(
         Heat capacity C (J / K) of the bath, and its temperature T_0 (K) at y = 0.
     attitude : bool
         If true, runs follow the attitude of the body, an element of SO(3).
+    torque : torque, or a list of them; optional
+        Torques (N m) on the body from outside, and of motors on the wheel: see :mod:`liethermo.torques`.
 
     Raises
     ------
@@ -139,7 +153,7 @@ def damper_wheel(
         If the body without the wheel had an inertia that is not positive, or another parameter cannot be used.
     """
     k, baths = checked_rate(friction), HeatBaths(capacity, temperature)
-    return _rotor_system(inertia, axis, wheel, lambda a: BearingFriction(k, Indices(0)), baths, attitude)
+    return _rotor_system(inertia, axis, wheel, lambda a: BearingFriction(k, Indices(0)), baths, attitude, torque)
 
 
 def ring_damper(
@@ -152,6 +166,7 @@ def ring_damper(
     capacity: float = 1.0,
     temperature: float = 1.0,
     attitude: bool = True,
+    torque=None,
 ) -> LiePoissonSystem:
     """A body with a ring of viscous liquid about an axis: a nutation damper [Carrier & Miles 1960].
 
@@ -161,7 +176,7 @@ def ring_damper(
 
     Parameters
     ----------
-    inertia, axis, capacity, temperature, attitude
+    inertia, axis, capacity, temperature, attitude, torque
         As for :func:`damper_wheel`, with the liquid as the wheel; ``axis`` is the normal of the ring.
     radius, tube : float, > 0
         R of the ring and a of the tube (m), a thin one: a is far below R.
@@ -178,7 +193,7 @@ def ring_damper(
     J = 2.0 * np.pi**2 * checked_positive(density, "density") * a**2 * R**3
     k = 16.0 * np.pi**2 * checked_positive(viscosity, "viscosity") * R**3
     baths = HeatBaths(capacity, temperature)
-    return _rotor_system(inertia, axis, J, lambda a: BearingFriction(k, Indices(0)), baths, attitude)
+    return _rotor_system(inertia, axis, J, lambda a: BearingFriction(k, Indices(0)), baths, attitude, torque)
 
 
 def dual_spin(
@@ -191,6 +206,7 @@ def dual_spin(
     capacity: Sequence[float] | float = 1.0,
     temperature: Sequence[float] | float = 1.0,
     attitude: bool = True,
+    torque=None,
 ) -> LiePoissonSystem:
     """Two bodies on a common axis, each with internal friction: a dual-spin satellite [Likins 1967].
 
@@ -219,6 +235,8 @@ def dual_spin(
         Heat capacities C (J / K) of the baths, platform first, and their temperatures T_0 (K) at y = 0.
     attitude : bool
         If true, runs follow the attitude of the platform, an element of SO(3).
+    torque : torque, or a list of them; optional
+        Torques (N m) on the platform from outside, and of a motor between the parts: see :mod:`liethermo.torques`.
 
     Raises
     ------
@@ -234,7 +252,64 @@ def dual_spin(
             RotorFriction(rates[1], a, Indices(1)),
         ]
 
-    return _rotor_system(inertia, axis, rotor, make_dissipations, HeatBaths(capacity, temperature, number=2), attitude)
+    baths = HeatBaths(capacity, temperature, number=2)
+    return _rotor_system(inertia, axis, rotor, make_dissipations, baths, attitude, torque)
+
+
+def reaction_wheels(
+    inertia: Sequence[float] = (3.0, 2.0, 1.5),
+    axes: Sequence[Sequence[float]] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+    wheels: Sequence[float] | float = 0.1,
+    friction: Sequence[float] | float = 0.0,
+    capacity: float = 1.0,
+    temperature: float = 1.0,
+    attitude: bool = True,
+    torque=None,
+) -> LiePoissonSystem:
+    """A body with any number of wheels about axes of any directions, driven by motors and slowed by bearings.
+
+    ``L' = L × Omega + tau, p_i' = u_i - k_i w_i``, with the angular momentum ``L = I Omega + sum J_i w_i a_i`` of the
+    whole in body axes and that of each wheel about its axis, ``p_i = J_i (a_i . Omega + w_i)``. The motors are a
+    ``lt.torques.Motor(u)`` among the torques. Bearing friction heats a bath. See :func:`damper_wheel`.
+
+    Everything is in SI units, or in any other consistent ones. The state is (L, p_1, ..., p_k, y).
+
+    Parameters
+    ----------
+    inertia : three positive numbers, or array of shape (3, 3)
+        Principal moments I of the whole, or its tensor in body axes, the wheels held fast (kg m**2).
+    axes : array, shape (k, 3)
+        Directions a_i of the axes of the wheels in body axes, of any length.
+    wheels : float, or k numbers, > 0
+        J_i, the moments of the wheels about their axes (kg m**2), a part of I.
+    friction : float, or k numbers, >= 0
+        k_i of the bearings (N m s).
+    capacity, temperature : float, > 0
+        Heat capacity C (J / K) of the bath, and its temperature T_0 (K) at y = 0.
+    attitude : bool
+        If true, runs follow the attitude of the body, an element of SO(3).
+    torque : torque, or a list of them; optional
+        Torques (N m) on the body from outside, and of the motors of the wheels: see :mod:`liethermo.torques`.
+
+    Raises
+    ------
+    InputError
+        If the body without the wheels had an inertia that is not positive, or another parameter cannot be used.
+
+    Examples
+    --------
+    >>> motors = lt.torques.Motor([0.01, 0.0, 0.0])
+    >>> body = lt.models.reaction_wheels(torque=motors)
+    >>> run = lt.integrate(body, body.state(angular_velocity=(0.0, 0.0, 0.0)), (0.0, 10.0), 0.1)
+    >>> bool(lt.bodies.angular_velocity(run)[-1, 0] < 0.0), float(abs(run.x[-1, :3]).max()) < 1e-15
+    (True, True)
+    """
+    directions = jnp.atleast_2d(checked_numbers(axes, "axes"))
+    n = directions.shape[0]
+    k = jnp.broadcast_to(checked_numbers(friction, "friction", (), (n,)), (n,))
+    require_condition(k, lambda v: (v >= 0.0) & (v < jnp.inf), "friction must be >= 0 and finite, got {value}")
+    baths = HeatBaths(capacity, temperature)
+    return _rotor_system(inertia, axes, wheels, lambda a: BearingFriction(k, Indices(0)), baths, attitude, torque)
 
 
 def spin_temperature(momentum, energy, inertia, capacity=1.0, temperature=1.0) -> float:
@@ -253,25 +328,42 @@ def spin_temperature(momentum, energy, inertia, capacity=1.0, temperature=1.0) -
     return temperature + (float(energy) - float(momentum) ** 2 / (2.0 * greatest)) / capacity
 
 
-def _rotor_system(inertia, axis, rotor, make_dissipation, baths, attitude) -> LiePoissonSystem:
-    """Return the system ``H = (L - p a) . B (L - p a) / 2 + p**2 / (2 J)``, ``B = (I - J a a^T)^-1``, on so(3) + R."""
-    inverse, J = inverse_inertia(checked_inertia(inertia)), checked_positive(rotor, "the moment of the rotor")
+def _rotor_system(inertia, axes, rotors, make_dissipation, baths, attitude, torque) -> LiePoissonSystem:
+    """Return the system ``H = (L - sum p_i a_i) . B (L - sum p_i a_i) / 2 + sum p_i**2 / (2 J_i)`` on so(3) + R^k.
+
+    ``B = (I - sum J_i a_i a_i^T)^-1``, by the formula of Woodbury. ``make_dissipation`` is called with the axis of the
+    first rotor.
+    """
+    inverse = inverse_inertia(checked_inertia(inertia, allow_rod=True))
     inverse = jnp.diag(inverse) if inverse.ndim == 1 else inverse
-    checked_numbers(axis, "axis")
-    direction = np.asarray(axis, dtype=float)
-    if direction.shape != (3,) or not np.isfinite(direction).all() or not direction.any():
-        raise InputError(f"axis must be a direction in body axes, three numbers that are not all zero, got {axis!r}")
-    a = jnp.asarray(direction / np.linalg.norm(direction))
-    inverse_times_axis = inverse @ a
-    inertia_fraction = 1.0 - J * jnp.dot(a, inverse_times_axis)
+    a = _unit_axes(axes)  # as columns
+    n = a.shape[1]
+    J = jnp.broadcast_to(checked_numbers(rotors, "the moment of the rotor", (), (n,)), (n,))
+    J = checked_positive(J, "the moment of the rotor", n)
+    inverse_times_axes = inverse @ a
+    inertia_fractions = jnp.eye(n) - jnp.sqrt(J)[:, None] * (a.T @ inverse_times_axes) * jnp.sqrt(J)
     require_condition(
-        inertia_fraction,
+        1.0 - J * jnp.sum(a * inverse_times_axes, axis=0) if n == 1 else jnp.linalg.eigvalsh(inertia_fractions),
         lambda v: v > 0.0,
         "a rotor must have less than the inertia of the whole about its axis, got 1 - J/I = {value}",
     )
-    B = inverse + J / inertia_fraction * jnp.outer(inverse_times_axis, inverse_times_axis)
-    Ba = inverse_times_axis / inertia_fraction
-    A = jnp.block([[B, -Ba[:, None]], [-Ba[None], (1.0 / J + jnp.dot(a, Ba))[None, None]]])
-    algebra = mf.direct_sum(mf.so(3), mf.abelian(1))
+    Ba = inverse_times_axes @ jnp.linalg.inv(jnp.eye(n) - J[:, None] * (a.T @ inverse_times_axes))
+    B = inverse + Ba * J @ inverse_times_axes.T
+    B = 0.5 * (B + B.T)
+    rotor_block = jnp.diag(1.0 / J) + a.T @ Ba
+    A = jnp.block([[B, -Ba], [-Ba.T, 0.5 * (rotor_block + rotor_block.T)]])
+    algebra = mf.direct_sum(mf.so(3), mf.abelian(n))
     group = mf.SO(3) if attitude else None
-    return LiePoissonSystem(algebra, Quadratic(A), dissipation=make_dissipation(a), group=group, baths=baths)
+    dissipation = make_dissipation(a[:, 0])
+    return LiePoissonSystem(algebra, Quadratic(A), dissipation=dissipation, group=group, baths=baths, torque=torque)
+
+
+def _unit_axes(axes) -> jax.Array:
+    """Return directions, shape (3,) or (k, 3), as unit vectors in columns, shape (3, k)."""
+    checked_numbers(axes, "axis")
+    directions = np.atleast_2d(np.asarray(axes, dtype=float))
+    if directions.ndim != 2 or directions.shape[1] != 3 or not np.isfinite(directions).all():
+        raise InputError(f"axis must be a direction in body axes, three numbers that are not all zero, got {axes!r}")
+    if not directions.any(axis=1).all():
+        raise InputError(f"axis must be a direction in body axes, three numbers that are not all zero, got {axes!r}")
+    return jnp.asarray((directions / np.linalg.norm(directions, axis=1, keepdims=True)).T)

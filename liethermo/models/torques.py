@@ -1,14 +1,16 @@
-"""Torques for ``lt.LiePoissonSystem(..., torque=...)``; their numbers are parameters that can be varied and
-differentiated.
+"""Torques for ``torque=`` of systems and models; their numbers are parameters that can be varied and differentiated.
 
-Each is a function f(t, mu), or f(t, mu, attitude), to a dual vector of the shape of mu. An attitude is the matrix from
-body axes to axes in space, so ``attitude.T @ v`` has the components in the body of a vector v in space. Units are any
-consistent ones, such as those of the SI, which are named here.
+Each is a function f(t, mu), f(t, mu, attitude) or f(t, mu, attitude, velocity), to a dual vector of the shape of mu. An
+attitude is the matrix from body axes to axes in space, so ``attitude.T @ v`` has the components in the body of a vector
+v in space; the velocity is ``dH/dmu``, which begins with the angular velocity in body axes. On a rigid body a torque of
+three components acts on the first three of mu, the angular momentum of the body with all that it carries: wheels,
+dampers and rotors feel it through the body. Units are any consistent ones, such as those of the SI, named here.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,23 +22,33 @@ from manifolds._pytree_module import Module
 
 from ..errors import InputError
 from ..functions.conditions import checked_numbers, require_condition
+from ..functions.piecewise import Table, TableKind
 from ..functions.piecewise_constant import PiecewiseConstant as FunctionPiecewiseConstant
-from .inertia import checked_inertia_tensors
+from .inertia import checked_inertia
+from .orbits import DipoleField, Orbit, checked_eccentricity, checked_perpendicular, direction_and_distance, unit_vector
 from .parameters import checked_finite, checked_positive
 
 __all__ = [
+    "BDot",
     "ConstantInBody",
     "ConstantInSpace",
+    "DipoleField",
     "GravityGradient",
     "Magnetic",
     "Motor",
+    "Orbit",
     "PiecewiseConstant",
+    "RayleighDrag",
+    "SolarPressurePlates",
+    "SolarPressureSphere",
+    "Table",
     "Tabulated",
+    "Thrusters",
 ]
 __dir__ = public_dir(__all__)
 
-MAX_PERPENDICULAR_COSINE = 1e-8
-"""Largest cosine of two directions that count as perpendicular."""
+SOLAR_PRESSURE = 4.56e-6
+"""Pressure of sunlight on a black surface at one astronomical unit from the sun (N / m^2)."""
 
 
 class ConstantInBody(Module):
@@ -44,7 +56,7 @@ class ConstantInBody(Module):
 
     Parameters
     ----------
-    moment : array, of the shape of mu
+    moment : array, of the shape of mu; or of shape (3,) on a rigid body
         Torque in body axes (N m, on so(3)).
     """
 
@@ -76,47 +88,70 @@ class ConstantInSpace(Module):
 
 
 class GravityGradient(Module):
-    """The gravity-gradient torque on a body on a circular orbit, ``3 (G M / r^3) n × I n``.
+    """The gravity-gradient torque on a body on a Kepler orbit, ``3 (G M / r^3) n × I n``.
 
-    The unit vector n, in body axes, points to the centre, and ``G M / r^3`` is the square of the mean motion [Hughes,
-    *Spacecraft Attitude Dynamics*, 1986, 8.1]. In space n turns in the plane of the orbit from ``towards``, where it is
-    at t = 0. Its sign does not matter.
+    The unit vector n, in body axes, points to the centre, and ``G M / r^3`` is the square of the mean motion on a
+    circular orbit, and ``(a / r)**3`` times it on an ellipse [Hughes, *Spacecraft Attitude Dynamics*, 1986, 8.1]. In
+    space n turns in the plane of the orbit from ``towards``, where it is at t = 0. Its sign does not matter.
 
     Parameters
     ----------
     inertia : array, shape (3,) or (3, 3)
-        Principal moments of inertia, or the tensor, in body axes (kg m^2).
-    mean_motion : float, > 0
-        Angular velocity of the orbit, ``sqrt(G M / r^3)`` (rad/s).
+        Principal moments of inertia of the body with all that it carries, or the tensor, in body axes (kg m^2).
+    mean_motion : float, > 0, or an Orbit
+        Mean angular velocity of the orbit, ``sqrt(G M / a^3)`` (rad/s); or the orbit, which has all the rest.
     towards, normal : array, shape (3,)
         Directions in space, of any length: to the centre at t = 0, and of the angular momentum of the orbit.
+    eccentricity : float, 0 <= e < 1, optional
+        By default the orbit is circular.
+    anomaly : float
+        True anomaly at t = 0 (rad).
     """
 
     inertia: jax.Array
     mean_motion: jax.Array
     towards: jax.Array
     normal: jax.Array
+    eccentricity: jax.Array | None
+    anomaly: jax.Array | None
 
-    def __init__(self, inertia, mean_motion, towards=(1.0, 0.0, 0.0), normal=(0.0, 0.0, 1.0)):
-        self.inertia = checked_numbers(inertia, "inertia", (3,), (3, 3))
-        if self.inertia.ndim == 2 and not is_traced(inertia):
-            self.inertia = jnp.asarray(checked_inertia_tensors(self.inertia))
+    def __init__(
+        self,
+        inertia,
+        mean_motion,
+        towards=(1.0, 0.0, 0.0),
+        normal=(0.0, 0.0, 1.0),
+        eccentricity=None,
+        anomaly=0.0,
+    ):
+        self.inertia = jnp.asarray(checked_inertia(inertia, allow_rod=True))
+        if isinstance(mean_motion, Orbit):
+            orbit = mean_motion
+            self.mean_motion, self.eccentricity, self.anomaly = orbit.mean_motion, orbit.eccentricity, orbit.anomaly
+            self.towards, self.normal = orbit.towards, orbit.normal
+            return
         self.mean_motion = checked_positive(mean_motion, "mean_motion")
-        self.towards, self.normal = _unit_vector(towards, "towards"), _unit_vector(normal, "normal")
-        if not is_traced((self.towards, self.normal)):
-            cosine = float(np.dot(self.towards, self.normal))
-            if abs(cosine) > MAX_PERPENDICULAR_COSINE:
-                raise InputError(f"towards and normal must be perpendicular, but their cosine is {cosine:.3g}")
+        self.towards, self.normal = checked_perpendicular(towards, normal)
+        self.eccentricity = self.anomaly = None
+        if eccentricity is not None:
+            self.eccentricity, self.anomaly = checked_eccentricity(eccentricity), checked_finite(anomaly, "anomaly")
 
     def __call__(self, t, mu, attitude):
-        n = attitude.T @ self.to_centre(t)
+        direction, distance = self._direction_and_distance(t)
+        n = attitude.T @ direction
         inertia_times_n = self.inertia * n if self.inertia.ndim == 1 else self.inertia @ n
-        return 3.0 * self.mean_motion**2 * jnp.cross(n, inertia_times_n)
+        return 3.0 * self.mean_motion**2 / distance**3 * jnp.cross(n, inertia_times_n)
 
     def to_centre(self, t) -> jax.Array:
         """Return the unit vector to the centre of the orbit at time t, in axes fixed in space, shape (3,)."""
+        return self._direction_and_distance(t)[0]
+
+    def _direction_and_distance(self, t) -> tuple[jax.Array, Any]:
+        """Return the unit vector to the centre, shape (3,), and the distance r / a from it."""
+        if self.eccentricity is not None:
+            return direction_and_distance(self, t)
         angle = self.mean_motion * t
-        return jnp.cos(angle) * self.towards + jnp.sin(angle) * jnp.cross(self.normal, self.towards)
+        return jnp.cos(angle) * self.towards + jnp.sin(angle) * jnp.cross(self.normal, self.towards), 1.0
 
 
 class Magnetic(Module):
@@ -127,7 +162,7 @@ class Magnetic(Module):
     dipole : array, shape (3,)
         m, in body axes (A m^2).
     field : array, shape (3,), or function from t to one
-        B, in axes in space (T).
+        B, in axes in space (T), such as a :class:`DipoleField` along an orbit, or a :class:`Table`.
     """
 
     dipole: jax.Array
@@ -140,6 +175,208 @@ class Magnetic(Module):
     def __call__(self, t, mu, attitude):
         field = self.field(t) if callable(self.field) else self.field
         return jnp.cross(self.dipole, attitude.T @ field)
+
+
+class BDot(Module):
+    """The torque of magnetic coils that are driven by the rate of the field in the body, ``m = -k dB/dt``.
+
+    ``tau = m × B``, with ``dB/dt = g^T B'(t) - Omega × B`` in body axes [Stickler & Alfriend, J. Spacecraft 13 (1976)
+    282]. In a field that is constant in space, ``tau = -k |B|^2`` times the part of Omega normal to B: a torque from
+    outside that takes energy from the body. The work of the ledger falls by this energy, and energy less work is
+    constant. The heat is that of the coils and of the source of the field, which are no part of the system.
+
+    Parameters
+    ----------
+    gain : float, >= 0, or array, shape (3,)
+        k, of all coils or of the coils along the body axes (A m^2 s / T).
+    field : array, shape (3,), or function from t to one that JAX can differentiate
+        B, in axes in space (T).
+    """
+
+    gain: jax.Array
+    field: jax.Array | Callable
+
+    def __init__(self, gain, field):
+        self.gain = checked_numbers(gain, "gain", (), (3,))
+        require_condition(self.gain, lambda k: (k >= 0.0) & (k < jnp.inf), "gain must be >= 0 and finite, got {value}")
+        self.field = field if callable(field) else checked_finite(field, "field", 3)
+
+    def __call__(self, t, mu, attitude, velocity):
+        if callable(self.field):
+            field, rate = jax.jvp(self.field, (t,), (jnp.ones_like(t),))
+        else:
+            field, rate = self.field, jnp.zeros(3)
+        field_in_body = attitude.T @ field
+        dipole = -self.gain * (attitude.T @ rate - jnp.cross(velocity[:3], field_in_body))
+        return jnp.cross(dipole, field_in_body)
+
+
+class RayleighDrag(Module):
+    """The drag of a thin gas on a turning body in Rayleigh's form, ``-C (Omega - Omega_gas)``.
+
+    It is linear in the angular velocity of the body relative to the gas around it. For a convex body of size d in free
+    molecular flow C is of the size ``rho V d**4`` (density rho, orbital velocity V). The torque is one from outside:
+    the work of the ledger has the energy that it takes.
+
+    Parameters
+    ----------
+    coefficient : float, or array of shape (3,), or (3, 3) symmetric positive semidefinite
+        C, in body axes (N m s).
+    gas : array, shape (3,)
+        Angular velocity of the gas in axes in space (rad/s), such as that of the rotating atmosphere.
+    """
+
+    coefficient: jax.Array
+    gas: jax.Array
+
+    def __init__(self, coefficient, gas=(0.0, 0.0, 0.0)):
+        self.coefficient = checked_numbers(coefficient, "coefficient", (), (3,), (3, 3))
+        if self.coefficient.ndim == 2 and not is_traced(coefficient):
+            C = np.asarray(self.coefficient)
+            if not np.array_equal(C, C.T) or np.linalg.eigvalsh(C)[0] < -1e-12 * np.abs(C).max():
+                raise InputError(f"coefficient must be symmetric and positive semidefinite, got {C.tolist()}")
+        else:
+            require_condition(
+                self.coefficient, lambda c: (c >= 0.0) & (c < jnp.inf), "coefficient must be >= 0, got {value}"
+            )
+        self.gas = checked_finite(gas, "gas", 3)
+
+    def __call__(self, t, mu, attitude, velocity):
+        relative = velocity[:3] - attitude.T @ self.gas
+        C = self.coefficient
+        return -(C @ relative if C.ndim == 2 else C * relative)
+
+
+class SolarPressurePlates(Module):
+    """The torque of sunlight on flat plates, ``sum_i c_i × F_i``.
+
+    ``F = -P A cos(theta) ((1 - s) u + 2 (s cos(theta) + d / 3) n)`` on a plate that the sun lights from the side of its
+    normal n, with ``cos(theta) = n . u > 0``, and zero on others [Markley & Crassidis, *Fundamentals of Spacecraft
+    Attitude Determination and Control*, 2014, 3.167]. No plate shades another.
+
+    Parameters
+    ----------
+    areas : array, shape (k,), > 0
+        A (m^2).
+    normals : array, shape (k, 3)
+        n in body axes, of any length, to the outside.
+    centres : array, shape (k, 3)
+        c, the centres of the plates relative to the centre of mass, in body axes (m).
+    specular, diffuse : float or array, shape (k,)
+        Fractions s and d of the light that are reflected, at most 1 together; the rest is absorbed.
+    sun : array, shape (3,), or function from t to one
+        Direction u from the body to the sun, in axes in space, of any length.
+    pressure : float, or function from t to one
+        P (N / m^2); a function that is zero in the shadow of the planet has an eclipse.
+    """
+
+    areas: jax.Array
+    normals: jax.Array
+    centres: jax.Array
+    specular: jax.Array
+    diffuse: jax.Array
+    sun: jax.Array | Callable
+    pressure: jax.Array | Callable
+
+    def __init__(
+        self, areas, normals, centres, specular=0.0, diffuse=0.0, sun=(1.0, 0.0, 0.0), pressure=SOLAR_PRESSURE
+    ):
+        areas = jnp.atleast_1d(checked_numbers(areas, "areas"))
+        self.areas = checked_positive(areas, "areas", areas.size)
+        n, shape = self.areas.size, (self.areas.size, 3)
+        normals = jnp.atleast_2d(checked_numbers(normals, "normals"))
+        self.centres = jnp.atleast_2d(checked_finite(centres, "centres"))
+        if normals.shape != shape or self.centres.shape != shape:
+            raise InputError(f"normals and centres must have shape {shape}, got {normals.shape}, {self.centres.shape}")
+        lengths = jnp.linalg.norm(normals, axis=1, keepdims=True)
+        require_condition(lengths, lambda v: (v > 0.0) & (v < jnp.inf), "normals must not be zero, got lengths {value}")
+        self.normals = normals / lengths
+        self.specular, self.diffuse = (
+            jnp.broadcast_to(checked_numbers(value, name, (), (n,)), (n,))
+            for name, value in {"specular": specular, "diffuse": diffuse}.items()
+        )
+        require_condition(
+            jnp.stack([self.specular, self.diffuse, 1.0 - self.specular - self.diffuse]),
+            lambda v: v >= -1e-12,
+            "specular and diffuse must be fractions with a sum of at most 1; [specular, diffuse, rest] = {value}",
+        )
+        self.sun = sun if callable(sun) else unit_vector(sun, "sun")
+        self.pressure = pressure if callable(pressure) else checked_numbers(pressure, "pressure", ())
+
+    def __call__(self, t, mu, attitude):
+        u = attitude.T @ _direction(self.sun, t)
+        cosine = jnp.maximum(self.normals @ u, 0.0)
+        along_normal = 2.0 * (self.specular * cosine + self.diffuse / 3.0)
+        unit_forces = (1.0 - self.specular)[:, None] * u + along_normal[:, None] * self.normals
+        forces = -_value(self.pressure, t) * (self.areas * cosine)[:, None] * unit_forces
+        return jnp.sum(jnp.cross(self.centres, forces), axis=0)
+
+
+class SolarPressureSphere(Module):
+    """The torque of sunlight on a sphere whose centre of pressure is off the centre of mass, ``-P C A c × u``.
+
+    Parameters
+    ----------
+    area : float, > 0
+        A, the cross-section (m^2).
+    centre : array, shape (3,)
+        c, the centre of pressure relative to the centre of mass, in body axes (m).
+    sun : array, shape (3,), or function from t to one
+        Direction u from the body to the sun, in axes in space, of any length.
+    coefficient : float
+        C, from 1 for a body that absorbs light to 1.44 for one that scatters it.
+    pressure : float, or function from t to one
+        P (N / m^2).
+    """
+
+    area: jax.Array
+    centre: jax.Array
+    sun: jax.Array | Callable
+    coefficient: jax.Array
+    pressure: jax.Array | Callable
+
+    def __init__(self, area, centre, sun=(1.0, 0.0, 0.0), coefficient=1.0, pressure=SOLAR_PRESSURE):
+        self.area, self.centre = checked_positive(area, "area"), checked_finite(centre, "centre", 3)
+        self.sun = sun if callable(sun) else unit_vector(sun, "sun")
+        self.coefficient = checked_positive(coefficient, "coefficient")
+        self.pressure = pressure if callable(pressure) else checked_numbers(pressure, "pressure", ())
+
+    def __call__(self, t, mu, attitude):
+        force = -_value(self.pressure, t) * self.coefficient * self.area * (attitude.T @ _direction(self.sun, t))
+        return jnp.cross(self.centre, force)
+
+
+class Thrusters(Module):
+    """The torque of thrusters that are fixed in the body, ``sum_i u_i(t) r_i × F_i``.
+
+    Parameters
+    ----------
+    positions : array, shape (k, 3)
+        r, relative to the centre of mass, in body axes (m).
+    forces : array, shape (k, 3)
+        F, the forces on the body at full thrust, in body axes (N): opposite to the jets.
+    levels : array, shape (k,), or function from t to one
+        u, the thrust as a part of full thrust; all are on by default.
+    """
+
+    positions: jax.Array
+    forces: jax.Array
+    levels: jax.Array | Callable
+
+    def __init__(self, positions, forces, levels=None):
+        self.positions = jnp.atleast_2d(checked_finite(positions, "positions"))
+        self.forces = jnp.atleast_2d(checked_finite(forces, "forces"))
+        n = len(self.positions)
+        if self.positions.shape != (n, 3) or self.forces.shape != (n, 3):
+            raise InputError(
+                f"positions and forces must have shape (k, 3), got {self.positions.shape} and {self.forces.shape}"
+            )
+        levels = jnp.ones(n) if levels is None else levels
+        self.levels = levels if callable(levels) else checked_finite(jnp.atleast_1d(levels), "levels", n)
+
+    def __call__(self, t, mu):
+        moments = jnp.cross(self.positions, self.forces)
+        return jnp.atleast_1d(_value(self.levels, t)) @ moments
 
 
 class Motor(Module):
@@ -197,43 +434,43 @@ class PiecewiseConstant(Module):
 
 
 class Tabulated(Module):
-    """A torque in body axes from a table, linear in t between its times and zero outside.
+    """A torque in body axes from a table, linear or cubic in t between its times and zero outside.
 
-    A step across a time of the table has an error of second order there, whatever the method: let steps end at these
-    times by ``breaks=``. The laws hold all the same.
+    A step across a time of a linear table has an error of second order there, whatever the method: let steps end at
+    these times by ``breaks=``. The laws hold all the same. See :class:`Table`.
 
     Parameters
     ----------
-    times : array, shape (m,)
-        Increasing (s).
-    moments : array, shape ``(m, *shape of mu)``
-        Torques in body axes at these times (N m, on so(3)).
+    times : array, shape (m,), or a spline of SciPy
+        Increasing (s); of a spline such as ``CubicSpline`` the polynomials are taken.
+    moments : array, shape ``(m, *shape of mu)``, or (m, 3) on a rigid body
+        Torques in body axes at these times (N m, on so(3)); not with a spline.
+    kind : {"linear", "cubic"}
+        Interpolation between the times.
     """
 
     times: jax.Array
-    moments: jax.Array
+    moments: jax.Array | None
+    coefficients: jax.Array | None
 
-    def __init__(self, times, moments):
-        self.times, self.moments = checked_finite(times, "times"), checked_finite(moments, "moments")
-        if self.times.ndim != 1 or self.times.size < 2 or self.moments.shape[:1] != self.times.shape:
-            raise InputError(
-                f"times must have shape (m,) with m >= 2, and moments m rows, got {self.times.shape} and "
-                f"{self.moments.shape}"
-            )
-        require_condition(self.times, lambda t: t[1:] > t[:-1], "the times of a table must increase, got {value}")
+    def __init__(self, times, moments=None, kind: TableKind = "linear"):
+        if moments is None and not callable(times):
+            raise InputError("a table needs times and moments, or a spline of SciPy alone")
+        table = Table(times, moments, kind, name="moments")
+        self.times, self.moments, self.coefficients = table.times, table.values, table.coefficients
 
     def __call__(self, t, mu):
-        has_begun = jnp.where(t >= self.times, 1.0, 0.0)
-        in_interval = (
-            has_begun[:-1] - has_begun[1:]
-        )  # 1 in the interval that contains t, else 0, so that no search is needed
-        fraction = (t - self.times[:-1]) / (self.times[1:] - self.times[:-1])
-        return jnp.tensordot(in_interval * (1.0 - fraction), self.moments[:-1], 1) + jnp.tensordot(
-            in_interval * fraction, self.moments[1:], 1
-        )
+        return Table.from_parts(self.times, self.moments, self.coefficients)(t)
 
 
-def _unit_vector(value, name: str) -> jax.Array:
-    array = checked_finite(value, name, 3)
-    require_condition(array, lambda v: (v**2).sum() > 0.0, name + " must be a direction, not zero, got {value}")
-    return array / jnp.sqrt(jnp.sum(array**2))
+def _value(quantity, t) -> jax.Array:
+    """Return a number, or a function of time at the time t."""
+    return quantity(t) if callable(quantity) else quantity
+
+
+def _direction(quantity, t) -> jax.Array:
+    """Return a unit vector: a constant one, or that of a function of time."""
+    if not callable(quantity):
+        return quantity
+    vector = quantity(t)
+    return vector / jnp.sqrt(jnp.sum(vector**2))

@@ -13,8 +13,7 @@ from ..errors import InputError
 from ..functions.energy import Quadratic
 from ..systems import HeatBaths, LiePoissonSystem
 from .free_motion import rate_of
-from .inertia import inverse_inertia
-from .rigid_body import checked_inertia
+from .inertia import checked_inertia, inverse_inertia
 
 
 def tumbling_body(
@@ -25,6 +24,7 @@ def tumbling_body(
     capacity: float = 1.0,
     temperature: float = 1.0,
     attitude: bool = True,
+    torque=None,
 ) -> LiePoissonSystem:
     """An isolated body heated by internal friction: an asteroid, or a satellite without thrusters.
 
@@ -40,7 +40,7 @@ def tumbling_body(
     ----------
     inertia : three positive numbers, or array of shape (3, 3)
         Principal moments of inertia, of which none is more than the sum of the others, or the tensor in body axes
-        (kg m**2).
+        (kg m**2); (0, J, J) for a slender rod, whose momentum has no component along its axis.
     relaxation_time : float, > 0
         Time (s) in which small nutations decay by a factor e, at the angular momentum ``momentum``. If the three
         moments differ, the nutation oscillates, and this is the decay of its amplitude. If the two greatest are equal,
@@ -57,6 +57,8 @@ def tumbling_body(
         T_0 (K), at y = 0.
     attitude : bool
         If true, runs follow the attitude, an element of SO(3) that maps body axes to axes in space.
+    torque : torque, or a list of them; optional
+        External torques (kg m**2 / s**2): see :mod:`liethermo.torques`. The body is then not isolated.
 
     Raises
     ------
@@ -75,7 +77,7 @@ def tumbling_body(
     >>> run.audit().passed, run.attitude.shape
     (True, (1001, 3, 3))
     """
-    moments = checked_inertia(inertia)
+    moments = checked_inertia(inertia, allow_rod=True)
     if (rate is None) == (relaxation_time is None) or (momentum is None) != (relaxation_time is None):
         arguments = {"relaxation_time": relaxation_time, "momentum": momentum, "rate": rate}
         names = ", ".join(name for name, value in arguments.items() if value is not None) or "none of them"
@@ -87,6 +89,7 @@ def tumbling_body(
         dissipation=DoubleBracket(friction),
         group=mf.SO(3) if attitude else None,
         baths=HeatBaths(capacity, temperature),
+        torque=torque,
     )
 
 

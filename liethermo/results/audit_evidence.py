@@ -135,6 +135,7 @@ class AuditableResult(SaveableResult):
     attitude: np.ndarray | None
     provenance: dict[str, Any]
     evidence_source: Callable[[], Evidence] | None
+    angular_velocity_source: Callable[[], np.ndarray] | None
 
     @functools.cached_property
     def evidence(self) -> Evidence:
@@ -142,7 +143,11 @@ class AuditableResult(SaveableResult):
         return Evidence() if self.evidence_source is None else self.evidence_source()
 
     def __getstate__(self) -> dict[str, Any]:  # a pickled copy has the evidence itself, not the function
-        return {name: getattr(self, name) for name in vars(self)} | {"evidence": self.evidence, "evidence_source": None}
+        fields = {name: getattr(self, name) for name in vars(self)}
+        fields |= {"evidence": self.evidence, "evidence_source": None}
+        if self.angular_velocity_source is not None:
+            fields["angular_velocity_source"] = functools.partial(np.copy, self.angular_velocity_source())
+        return fields
 
 
 class StepReplay(Protocol):

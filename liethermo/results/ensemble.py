@@ -27,6 +27,7 @@ from .netcdf import (
     split_complex,
     state_axis_names,
 )
+from .orientation import array_source, orientation_variables
 from .solution import Solution
 from .status import Laws, Stats, Status
 
@@ -152,6 +153,7 @@ class Ensemble(AuditableResult):
     reasons: Mapping[int, str] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
     evidence_source: Callable[[], Evidence] | None = field(default=None, repr=False, compare=False)
+    angular_velocity_source: Callable[[], np.ndarray] | None = field(default=None, repr=False, compare=False)
     solution_builder: Callable[[Ensemble, int], Solution] | None = field(default=None, repr=False, compare=False)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -267,7 +269,12 @@ class Ensemble(AuditableResult):
             event_time=float(self.end_time[i]) if self.status[i] == StatusCode.EVENT else None,
             events=self.events.select_trajectory(i),
             evidence_source=lambda: evidence,
+            angular_velocity_source=self._member_angular_velocity_source(i, is_reached) if has_time_series else None,
         )
+
+    def _member_angular_velocity_source(self, i: int, is_reached: np.ndarray) -> Callable[[], np.ndarray] | None:
+        source = self.angular_velocity_source
+        return None if source is None else lambda: source()[i][is_reached]
 
     def _initial_entropy(self, i: int) -> float:
         assert self.entropy is not None
@@ -357,6 +364,7 @@ class Ensemble(AuditableResult):
         for name, dims in (("attitude", series_dims), ("attitude0", ("trajectory",))):
             if (value := getattr(self, name)) is not None:
                 variables[name] = ((*dims, "row", "column", "part"), split_complex(value))
+        variables |= orientation_variables(self, series_dims)
         variables |= self.events.dataset_variables()
         variables["status_text"] = ("trajectory", np.array([STATUS_NAMES[code] for code in self.status], dtype=object))
         is_failed = ~self.ok
@@ -412,6 +420,7 @@ class Ensemble(AuditableResult):
             provenance=provenance,
             events=Events.from_dataset(series),
             evidence_source=lambda: evidence,
+            angular_velocity_source=array_source(series, "angular_velocity"),
         )
 
 
@@ -503,6 +512,23 @@ def join_subsets(subsets: Sequence[Subset], n_trajectories: int, **fields: Any) 
         else lambda: merge_evidence(
             [evidence_source() for evidence_source in evidence_sources if evidence_source is not None]
         ),
+        angular_velocity_source=_join_angular_velocities(subsets, n_trajectories),
         solution_builder=build_solution,
         **fields,
     )
+
+
+def _join_angular_velocities(subsets: Sequence[Subset], n_trajectories: int) -> Callable[[], np.ndarray] | None:
+    """Return the function that computes the angular velocities of all trajectories; None if the bodies have none."""
+    sources = [(subset.trajectory_numbers, subset.ensemble.angular_velocity_source) for subset in subsets]
+    if any(source is None for _, source in sources):
+        return None
+
+    def compute() -> np.ndarray:
+        parts = [(numbers, source()) for numbers, source in sources if source is not None]
+        joined = np.full((n_trajectories, *parts[0][1].shape[1:]), np.nan)
+        for numbers, values in parts:
+            joined[numbers] = values
+        return joined
+
+    return compute

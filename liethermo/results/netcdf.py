@@ -63,10 +63,28 @@ LONG_NAMES = {
     "nutation": "angle from the axis of greatest inertia to the angular momentum",
     "precession": "angle by which that axis has turned about the angular momentum in space",
     "spin": "angle by which the body has turned about that axis",
+    "angular_velocity": "angular velocity of the body, in body axes",
     "invariant_name": "names of the recorded functions",
     "invariant": "Casimirs, momentum maps, preserved functions and what comes from outside",
 }
 """Long name of each variable in a file."""
+
+CONVENTIONS = {
+    "attitude": "of SO(3): the matrix from body axes to axes in space, v_space = g v_body",
+    "quaternion": "components (x, y, z, w), scalar last, Hamilton's product; maps body axes to axes in space",
+    "angular_velocity": "components (x, y, z) in body axes, dH/dPi",
+}
+"""Convention of each variable that needs one, written as its attribute ``comment``."""
+
+DEFAULT_UNITS = {"quaternion": "1", "nutation": "rad", "precession": "rad", "spin": "rad"}
+"""Units of variables that do not depend on those of the system."""
+
+
+def unit_of_variable(name: str, units: Mapping[str, str]) -> str | None:
+    """Return the unit of a variable for the units that a user gives; None if it is unknown."""
+    if name == "angular_velocity" and "time" in units:
+        return units.get(name, f"rad/{units['time']}")
+    return units.get(name, DEFAULT_UNITS.get(name))
 
 
 def state_axis_names(axes: int) -> list[str]:
@@ -95,8 +113,9 @@ def build_dataset(
     for name, variable in dataset.variables.items():
         variable_attributes = {
             "long_name": LONG_NAMES.get(str(name), str(name).replace("_", " ")),
-            "units": units.get(str(name)),
+            "units": unit_of_variable(str(name), units),
             "law": laws_by_variable.get(str(name)),
+            "comment": CONVENTIONS.get(str(name)),
         }
         variable.attrs.update({key: text for key, text in variable_attributes.items() if text is not None})
     content = {str(name): values.to_numpy() for name, values in dataset.variables.items()}

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import functools
+import warnings
+from collections.abc import Callable, Mapping
+from typing import Literal
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
 from ..models.inertia import EQUAL_MOMENTS_RTOL
+from ..systems.rotations import checked_sequence
 from .audit_evidence import AuditableResult
 
+ROTATION_GROUPS = ("SO(3)", "SE(3)")
+"""Groups whose elements begin with a rotation matrix in their first three rows and columns."""
 
-def quaternions(solution: AuditableResult) -> np.ndarray:
-    """Return the attitudes as unit quaternions (x, y, z, w), scalar last, which map body axes to spatial axes.
+
+def quaternions(solution: AuditableResult, scalar: Literal["last", "first"] = "last") -> np.ndarray:
+    """Return the attitudes as unit quaternions, by default (x, y, z, w), which map body axes to spatial axes.
 
     The first one has ``w >= 0``, and each later one has the sign that is nearer to the one before. So they are
     continuous, as long as the body turns by less than half a turn between the saved times.
@@ -19,7 +28,9 @@ def quaternions(solution: AuditableResult) -> np.ndarray:
     Parameters
     ----------
     solution : Solution, or Ensemble
-        A result of a body with attitudes in SO(3).
+        A result of a body with attitudes in SO(3), or in SE(3), of which the rotations are taken.
+    scalar : {"last", "first"}
+        Place of the real part: (x, y, z, w) as in SciPy, or (w, x, y, z).
 
     Returns
     -------
@@ -30,6 +41,8 @@ def quaternions(solution: AuditableResult) -> np.ndarray:
     InputError
         If it has no such attitudes.
     """
+    if scalar not in ("last", "first"):
+        raise InputError(f"scalar must be 'last', for (x, y, z, w), or 'first', for (w, x, y, z), got {scalar!r}")
     g = _attitudes(solution)
     has_times = _is_time_series(solution)
     is_finite = np.isfinite(g).all(axis=(-2, -1), keepdims=True)
@@ -39,7 +52,107 @@ def quaternions(solution: AuditableResult) -> np.ndarray:
         is_opposite = np.sum(q[..., 1:, :] * q[..., :-1, :], axis=-1) < 0.0
         signs = np.cumprod(np.where(is_opposite, -1.0, 1.0), axis=-1)
         q[..., 1:, :] *= signs[..., None]
-    return np.where(is_finite[..., 0], q, np.nan)
+    q = np.where(is_finite[..., 0], q, np.nan)
+    return q if scalar == "last" else np.roll(q, 1, axis=-1)
+
+
+def rotation(solution: AuditableResult) -> Rotation:
+    """Return the attitudes as a ``scipy.spatial.transform.Rotation``, one for each time.
+
+    ``rotation(solution).apply(v)`` has the components in space of vectors v in body axes; ``.inv()`` maps back.
+
+    Parameters
+    ----------
+    solution : Solution, or Ensemble
+        As for :func:`quaternions`. The rotations of an ensemble of trajectories have the shape (B, times).
+
+    Returns
+    -------
+    scipy.spatial.transform.Rotation
+
+    Raises
+    ------
+    InputError
+        If it has no such attitudes, or some of them are not known because trajectories have ended early.
+    """
+    g = _attitudes(solution)
+    if not np.isfinite(g).all():
+        raise InputError("some trajectories have ended early, so not all attitudes are known: take rotation(e[i])")
+    return Rotation.from_matrix(g)
+
+
+def euler_angles(solution: AuditableResult, sequence: str = "zyx", degrees: bool = False) -> np.ndarray:
+    """Return Euler angles of the attitudes, as ``scipy.spatial.transform.Rotation.as_euler`` has them.
+
+    Parameters
+    ----------
+    solution : Solution, or Ensemble
+        As for :func:`quaternions`.
+    sequence : str
+        Three of x, y, z: upper-case letters for turns about the axes of the body ("ZYX" is yaw, pitch, roll),
+        lower-case letters for turns about axes fixed in space.
+    degrees : bool
+        If true, the angles are in degrees.
+
+    Returns
+    -------
+    ndarray, shape (times, 3), or (B, times, 3) of an ensemble of trajectories, (B, 3) of one of final states
+        Angles (rad, or degrees) in the order of the letters. The first and the last are from -pi to pi, the middle one
+        from -pi/2 to pi/2, or from 0 to pi if the first and last letter are the same. In gimbal lock, where only the
+        sum or difference of two angles is defined, the last is 0.
+
+    Raises
+    ------
+    InputError
+        If it has no such attitudes, or the sequence is not of three letters.
+    """
+    if len(checked_sequence(sequence)) != 3:
+        raise InputError(f"sequence must have three letters, got {sequence!r}")
+    g = _attitudes(solution)
+    is_finite = np.isfinite(g).all(axis=(-2, -1), keepdims=True)
+    rotations = Rotation.from_matrix(np.where(is_finite, g, np.eye(3)).reshape(-1, 3, 3))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Gimbal lock")  # the docstring says what is returned there
+        angles = rotations.as_euler(sequence, degrees=degrees).reshape(*g.shape[:-2], 3)
+    return np.where(is_finite[..., 0], angles, np.nan)
+
+
+def angular_velocity(
+    solution: AuditableResult, frame: Literal["body", "space"] = "body", degrees: bool = False
+) -> np.ndarray:
+    """Return the angular velocity of the rigid body in a system, ``Omega = dH/dPi``.
+
+    With rotors, wheels or dampers inside it is the angular velocity of the body that carries them. A body with internal
+    friction as a double bracket turns by ``Omega + sigma``, where sigma is the small velocity of its internal motion.
+
+    Parameters
+    ----------
+    solution : Solution, or Ensemble
+        A result of a body on so(3), with or without internal parts, or on se(3).
+    frame : {"body", "space"}
+        Axes of the components: axes of the body, or axes fixed in space, which need attitudes.
+    degrees : bool
+        If true, the unit is degrees / time instead of rad / time.
+
+    Returns
+    -------
+    ndarray, shape (times, 3), or (B, times, 3) of an ensemble of trajectories, (B, 3) of one of final states
+
+    Raises
+    ------
+    InputError
+        If the system has no rigid body, no states were kept, or the frame is "space" without attitudes.
+    """
+    if frame not in ("body", "space"):
+        raise InputError(f"frame must be 'body' or 'space', got {frame!r}")
+    if solution.x is None:
+        raise InputError('no states were kept: run the ensemble with outputs="final" or "trajectory"')
+    if solution.angular_velocity_source is None:
+        raise InputError("the result has no angular velocity: its system contains no rigid body on so(3) or se(3)")
+    omega = solution.angular_velocity_source()
+    if frame == "space":
+        omega = np.einsum("...ij,...j->...i", _attitudes(solution), omega)
+    return np.rad2deg(omega) if degrees else omega
 
 
 def nutation(solution: AuditableResult, axis=None) -> np.ndarray:
@@ -126,9 +239,31 @@ def precession(solution: AuditableResult, axis=None) -> np.ndarray:
     return _unwrap_in_time(solution, angle)
 
 
+def orientation_variables(solution: AuditableResult, dims: tuple[str, ...]) -> dict[str, tuple]:
+    """Return the variables of a dataset that describe the orientation of a body, and its angular velocity.
+
+    Parameters
+    ----------
+    dims : tuple of str
+        Names of the axes before the components.
+    """
+    variables = {
+        name: ((*dims, "quaternion_component")[: values.ndim], values)
+        for name, values in orientation_series(solution).items()
+    }
+    if solution.angular_velocity_source is not None and solution.x is not None:
+        variables["angular_velocity"] = ((*dims, "axis"), solution.angular_velocity_source())
+    return variables
+
+
+def array_source(series: Mapping[str, np.ndarray], name: str) -> Callable[[], np.ndarray] | None:
+    """Return the function that copies an array of a dataset; None if the dataset has none of this name."""
+    return functools.partial(np.copy, series[name]) if name in series else None
+
+
 def orientation_series(solution: AuditableResult) -> dict[str, np.ndarray]:
-    """Return all known series of the orientation of a body by name; empty without attitudes."""
-    if not _has_rotations(solution):
+    """Return all known series of the orientation of a body by name; empty without attitudes in SO(3)."""
+    if solution.attitude is None or solution.provenance.get("group") != "SO(3)":
         return {}
     series = {"quaternion": quaternions(solution)}
     if _inertia(solution) is not None:
@@ -136,17 +271,12 @@ def orientation_series(solution: AuditableResult) -> dict[str, np.ndarray]:
     return series
 
 
-def _has_rotations(solution: AuditableResult) -> bool:
-    """Return whether the result has attitudes in SO(3)."""
-    return solution.attitude is not None and solution.provenance.get("group") == "SO(3)"
-
-
 def _attitudes(solution: AuditableResult) -> np.ndarray:
     if solution.attitude is None:
         raise InputError("there are no attitudes: give the system a group, such as group=mf.SO(3), and keep states")
-    if not _has_rotations(solution):
-        raise InputError(f"the attitudes must be in SO(3), got {solution.provenance.get('group')}")
-    return solution.attitude
+    if solution.provenance.get("group") not in ROTATION_GROUPS:
+        raise InputError(f"the attitudes must be in SO(3) or SE(3), got {solution.provenance.get('group')}")
+    return solution.attitude[..., :3, :3]
 
 
 def _momenta(solution: AuditableResult) -> np.ndarray:

@@ -30,7 +30,7 @@ from .netcdf import (
     split_complex,
     state_axis_names,
 )
-from .orientation import orientation_series
+from .orientation import array_source, orientation_variables
 from .sketch import svg_sketch
 from .status import Laws, Stats, Status
 
@@ -137,6 +137,7 @@ class Solution(AuditableResult):
     dense: DenseOutput | None = None
     attitude: np.ndarray | None = None
     evidence_source: Callable[[], Evidence] | None = field(default=None, repr=False, compare=False)
+    angular_velocity_source: Callable[[], np.ndarray] | None = field(default=None, repr=False, compare=False)
 
     @with_library_settings
     def __call__(self, t) -> np.ndarray:
@@ -186,7 +187,8 @@ class Solution(AuditableResult):
         """Return an ``xarray.Dataset`` with coordinate ``time`` and all series; the rest is in attributes (JSON).
 
         Each variable has a long name, energy and entropy also the law that the system promises of them. A body with
-        attitudes has its ``quaternion``, ``nutation``, ``precession`` and ``spin`` too [:mod:`liethermo.bodies`].
+        attitudes has its ``quaternion``, ``nutation``, ``precession`` and ``spin`` too [:mod:`liethermo.bodies`], and
+        every rigid body its ``angular_velocity`` in body axes; the attribute ``comment`` states the convention.
 
         Parameters
         ----------
@@ -204,8 +206,7 @@ class Solution(AuditableResult):
         variables: dict[str, Any] = {"x": (("time", *state_axis_names(self.x.ndim - 1)), self.x), **series}
         if self.attitude is not None:
             variables["attitude"] = (("time", "row", "column", "part"), split_complex(self.attitude))
-            for name, values in orientation_series(self).items():
-                variables[name] = (("time", "quaternion_component")[: values.ndim], values)
+        variables |= orientation_variables(self, ("time",))
         variables["invariant"] = (
             ("invariant_name", "time"),
             np.array(list(self.casimirs.values())).reshape(len(self.casimirs), len(self.t)),
@@ -276,4 +277,5 @@ class Solution(AuditableResult):
             events=Events.from_dataset(series),
             attitude=attitude,
             evidence_source=lambda: evidence,
+            angular_velocity_source=array_source(series, "angular_velocity"),
         )

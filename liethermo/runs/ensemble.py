@@ -20,6 +20,7 @@ from ..integrators.fluctuating import noise_dimension
 from ..results.ensemble import Ensemble, Subset, join_subsets
 from ..results.events import Events
 from ..systems import System
+from ..systems.rotations import attitude_array
 from ..tracing.scalarize import UnsupportedPrimitive
 from .adaptive import Adaptive, make_step_control
 from .adaptive_ensemble import AdaptiveEnsembleRun
@@ -103,7 +104,7 @@ def ensemble(
     engine : {"auto", "array", "compiled"}
         SIMD lanes over all cores for small systems ("compiled"), or ``vmap`` for any ("array"). "auto" compiles what
         can be compiled, unless JAX has an accelerator.
-    attitude : array, shape (m, m) or (B, m, m), optional
+    attitude : array, shape (m, m) or (B, m, m), or scipy.spatial.transform.Rotation; optional
         As for :func:`integrate` (dimensionless); one for all, or one each.
     progress : bool, optional
         Show a progress bar; by default where the standard error is a terminal.
@@ -150,7 +151,7 @@ def ensemble(
     breaks = *checked_breaks(breaks), *declared_breaks(family.representative)
     save_every_step = save_every if outputs == "trajectory" and save_at is None else None
     schedule = make_schedule(t_span, step, save_every_step, save_at, breaks=breaks)
-
+    attitude = attitude_array(attitude, None)
     states, reasons = _checked_initial_states(family, x0s, len(attitude) if np.ndim(attitude) == 3 else 1)
     check_noise(noise, len(states))
     n_trajectories = len(states)

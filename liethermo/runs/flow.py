@@ -77,7 +77,7 @@ def flow(
         The integrator; by default ``MetriplecticGauss(1)``, of order 2.
     save_every : int, optional
         Return the first state, the states of every ``save_every``-th step, and the last.
-    attitude : array, shape (m, m), optional
+    attitude : array, shape (m, m), or scipy.spatial.transform.Rotation; optional
         The initial attitude (dimensionless), if a torque depends on it; the identity by default. The function returns
         momenta only.
     breaks : sequence of float

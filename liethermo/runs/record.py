@@ -34,7 +34,7 @@ from ..systems import AttitudeSystem, DrivenSystem, System
 from ..tracing.interpret import evaluate_at_points
 from .preparation import invariants_and_laws
 from .schedule import StepSchedule
-from .solution_builder import EngineReplay, RecordedFunctions, build_solution
+from .solution_builder import EngineReplay, RecordedFunctions, angular_velocities, build_solution
 from .system_family import Family
 from .termination import ensemble_failure_message
 
@@ -235,10 +235,22 @@ class EnsembleRecord:
             attitude=attitude,
             attitude0=attitude0,
             work=work,
+            angular_velocity_source=self._angular_velocity_source(),
             **quantities,
             **fields,
         )
         return self.member.reshape_to_sites(result)
+
+    def _angular_velocity_source(self) -> Callable[[], np.ndarray] | None:
+        """Return the function that computes the angular velocities, trajectories first; None without a rigid body."""
+        x = self.x if self.trajectories is None else self.trajectories[..., :-2]
+        return None if x is None or not self.member.has_angular_velocity else lambda: self._angular_velocities(x)
+
+    def _angular_velocities(self, x: np.ndarray) -> np.ndarray:
+        if not any(self.family.has_member_axis):
+            return angular_velocities(self.member, x)
+        return np.stack([angular_velocities(self.family.member(i), np.atleast_2d(x[i])).reshape(*x[i].shape[:-1], 3)
+                         for i in range(len(x))])  # fmt: skip
 
 
 class MemberSolutionBuilder:

@@ -81,9 +81,22 @@ def build_solution(
         evidence_source=EvidenceCollector(
             system, method, functions.invariants, x, np.asarray(fields["t"]), step_sizes, replay
         ),
+        angular_velocity_source=functools.partial(angular_velocities, system, x)
+        if system.has_angular_velocity
+        else None,
         **fields,
     )
     return solution if functions.has_user_states else system.to_user_solution(solution)
+
+
+def angular_velocities(system: System, x: np.ndarray) -> np.ndarray:
+    """Return the angular velocities of a rigid body in body axes at states of a prepared system, shape (..., 3)."""
+    rows = np.asarray(x).reshape(-1, x.shape[-1])
+    return np.asarray(evaluate_at_points(_angular_velocity, system, rows)).reshape(*x.shape[:-1], 3)
+
+
+def _angular_velocity(system: System, x):
+    return system.angular_velocity_at(x)
 
 
 def _series_of_functions(functions: Mapping[str, Energy], x: np.ndarray) -> dict[str, np.ndarray]:

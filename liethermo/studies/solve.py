@@ -19,6 +19,7 @@ from ..results.status import Laws
 from ..runs.ensemble import ensemble
 from ..runs.noise import Fluctuations
 from ..systems import System
+from ..systems.rotations import attitude_array
 from ..tracing.caching import LRUCache
 from ..tracing.interpret import evaluate_at_points
 from .measures import Measure
@@ -143,7 +144,9 @@ class PointSolver:
         self._attitude = (
             None
             if task.attitude is None
-            else PointwiseArrays(task.attitude, task.parameter_names, "attitude", task.example_point)
+            else PointwiseArrays(
+                attitude_array(task.attitude, None), task.parameter_names, "attitude", task.example_point
+            )
         )
         needs_path = any(measure.needs_path for measure in task.measures.values())
         needs_final_state = any(measure.needs_final_state for measure in task.measures.values())

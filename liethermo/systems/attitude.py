@@ -23,6 +23,7 @@ from ..tracing.interpret import evaluate_at_points
 from .base import System
 from .driven import DrivenSystem
 from .lie_poisson import LiePoissonSystem
+from .rotations import attitude_array
 
 SPATIAL_MOMENTUM = "momentum in space"
 """Name of the constant of the motion ``Ad_star(inverse(g), mu)``."""
@@ -138,6 +139,7 @@ class AttitudeSystem(System):
         InputError
             If the attitude is not in the group.
         """
+        attitude = attitude_array(attitude, self.group)
         g = self.group.identity if attitude is None else self.group._element(attitude, "attitude")
         if not is_traced(g):
             with jax.ensure_compile_time_eval():  # JAX may be tracing something else
@@ -219,6 +221,10 @@ class AttitudeSystem(System):
         return float(np.abs(momenta - momenta[0]).max()) / (scale if scale > 0.0 else 1.0)
 
     inertia = forward_to("momentum_system")
+    has_angular_velocity = forward_to("body")
+
+    def angular_velocity_at(self, x):
+        return self.body.angular_velocity_at(self.points(x))
 
     @property
     def constant_names(self):

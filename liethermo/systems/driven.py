@@ -162,6 +162,11 @@ class DrivenSystem(System):
     def transport(self, x, dH, dS, dL=()):
         return self._body_at_state(x).transport(*_restrict_to_body(x, dH, dS, dL))
 
+    has_angular_velocity = forward_to("body")
+
+    def angular_velocity_at(self, x):
+        return self._body_at_state(x).angular_velocity_at(x[:-2])
+
     is_torque_free = forward_to("body")
     body_dim = forward_to("body")
     torque_name = forward_to("body")

@@ -17,12 +17,16 @@ from manifolds.structures.poisson import PoissonBySharp, ProductPoisson
 
 from ..errors import InputError
 from ..functions.checks import checked_energy, with_polynomial_degrees
+from ..functions.conditions import require_condition
 from ..functions.energy import Energy, Function, make_energy
+from ..functions.inverse_gradient import inverse_gradient
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.traced import trace_callables
+from .body_states import checked_velocity
 from .euler_poincare import are_all_singular
 from .evolution import entropy_component
 from .ledger import ForcesAndHeat, LedgerSystem, check_state_function, linear_friction
+from .torque import begins_with_rotations
 
 
 class EulerPoincareClosedSystem(LedgerSystem):
@@ -114,6 +118,54 @@ class EulerPoincareClosedSystem(LedgerSystem):
         poisson, total_dim, energy = self._append_ledger(structure, n + 1, energy)
         self._build(poisson, total_dim, energy, entropy_component(total_dim, n), forces, momentum_maps, validate)
 
+    def state(
+        self, x=None, batch: bool = False, *, angular_velocity=None, rotor_rates=None, temperature=None
+    ) -> jax.Array:
+        """Return ``x`` as a state of this system, or the state of a body with an angular velocity and a temperature.
+
+        Parameters
+        ----------
+        x : array, shape (n,), or (..., n) with ``batch``; optional
+            See :meth:`System.state`.
+        batch : bool
+            Whether leading axes are several states.
+        angular_velocity : array, shape (3,), or (..., 3) with ``batch``; optional
+            Omega in body axes (rad / time), instead of x.
+        rotor_rates : array, shape (k,), or (..., k) with ``batch``; optional
+            The other velocities, such as those of wheels relative to the body (rad / time); zero by default.
+        temperature : float, optional
+            Temperature ``-l_S``, from which Newton's method finds S; by default ``S = 0``.
+
+        Raises
+        ------
+        InputError
+            If neither or both of x and the angular velocity are given, or no state has these values.
+        """
+        if angular_velocity is None:
+            if x is None or rotor_rates is not None or temperature is not None:
+                raise InputError("state needs x, or angular_velocity= with rotor_rates= and temperature= as wanted")
+            return super().state(x, batch)
+        if x is not None:
+            raise InputError("state needs x or angular_velocity=, got both")
+        if not self.has_angular_velocity:
+            raise InputError(f"a system on {self.algebra.name} has no angular velocity: give its velocity xi")
+        xi = checked_velocity(angular_velocity, rotor_rates, self.algebra.dim, batch)
+        if temperature is None:
+            S = jnp.zeros((*xi.shape[:-1], 1))
+        else:
+            S = jnp.vectorize(self._entropy_at_temperature, signature="(n),()->(m)")(xi, jnp.asarray(temperature))
+            require_condition(
+                S,
+                lambda v: abs(v) < jnp.inf,
+                "no entropy belongs to this temperature: Newton's method ended at {value}",
+            )
+        return super().state(jnp.concatenate([xi, S], axis=-1), batch)
+
+    def _entropy_at_temperature(self, xi, temperature) -> jax.Array:
+        """Return the entropy, shape (1,), at which ``-l_S`` is a temperature."""
+        energy = Function(lambda y: -self.lagrangian(xi, y[0]))
+        return inverse_gradient(energy, jnp.reshape(temperature, 1))
+
     def split_state(self, x) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Return xi, S and t of one state; t = 0 if the state has no ledger."""
         n = self.algebra.dim
@@ -151,6 +203,13 @@ class EulerPoincareClosedSystem(LedgerSystem):
         del T
         _, S, t = self.split_state(x)
         return self.friction_force(v, S, t), self.external_force(v, S, t), self.heating(v, S, t)
+
+    @property
+    def has_angular_velocity(self) -> bool:
+        return begins_with_rotations(self.algebra)
+
+    def angular_velocity_at(self, x):
+        return x[:3]
 
     def temperature(self, x) -> jax.Array:
         """Return the temperature ``T = -l_S`` at states, shape (...)."""

@@ -19,10 +19,11 @@ from ..dissipation.base import Dissipation
 from ..errors import InputError
 from ..functions.checks import checked_energy, with_polynomial_degrees
 from ..functions.energy import Energy, Quadratic, make_energy
+from ..functions.inverse_gradient import inverse_gradient
 from ..functions.mechanics import Kinetic, is_independent_of_momenta, is_mechanical
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.programs import jit_cached
-from .euler_poincare import are_all_singular, inverse_gradient
+from .euler_poincare import are_all_singular
 from .evolution import (
     ContactManifoldSystem,
     ContactSystem,

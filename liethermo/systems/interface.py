@@ -13,6 +13,7 @@ import scipy
 
 from ..dissipation.base import Dissipation, LawName
 from ..dissipation.geometry import Geometry
+from ..errors import InputError
 from ..functions.energy import Energy
 from ..functions.surface import Surface
 from .baths import HeatBaths
@@ -68,6 +69,15 @@ class SystemInterface(Geometry):
         All internal parts count as fixed. None if the system is no such body, or the tensor is not known.
         """
         return None
+
+    @property
+    def has_angular_velocity(self) -> bool:
+        """True if the system contains a rigid body, whose angular velocity :meth:`angular_velocity_at` returns."""
+        return False
+
+    def angular_velocity_at(self, x) -> jax.Array:
+        """Return the angular velocity of the rigid body in body axes, shape (3,), at a state x, shape (n,)."""
+        raise InputError("the system contains no rigid body, so it has no angular velocity")
 
     # -- dynamics -----------------------------------------------------------------------------------------------------
 

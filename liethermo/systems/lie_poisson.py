@@ -23,7 +23,16 @@ from ..tracing.caching import memoize
 from ..tracing.interpret import evaluate_at_points
 from .base import TEST_TIMES, System
 from .baths import BathEntropy, HeatBaths
-from .torque import check_torque, evaluate_torque, torque_free_components, torque_name
+from .body_states import checked_velocity, entropies_of_temperatures, momentum_of_velocity
+from .torque import (
+    MAX_ARGUMENTS,
+    MIN_ARGUMENTS,
+    begins_with_rotations,
+    check_torque,
+    evaluate_torque,
+    torque_free_components,
+    torque_name,
+)
 
 
 class LiePoissonSystem(System):
@@ -60,8 +69,9 @@ class LiePoissonSystem(System):
         The baths that take the heat of a dissipation that lowers the energy (energy of H, entropies in energy /
         temperature). A state is then mu, in one row, followed by the entropies of the baths. If these are left out of
         a state, they are zero.
-    torque : function of t, shape (), and mu, and of the attitude, shape (m, m), where it needs three; or a list of them
+    torque : function of (t, mu), (t, mu, attitude) or (t, mu, attitude, velocity), or a list of them; optional
         An external torque, ``mu' = ad*_xi mu + torque``: a dual vector of the shape of mu (energy, if xi is 1 / time).
+        The attitude has shape (m, m); the velocity is ``dH/dmu``, of the shape of mu, for torques such as drag.
         It does the work W, ``W' = xi . torque``, and the energy less the work is constant. With a group it also has an
         impulse, the momentum in space that it has transferred. The arrays of an ``equinox.Module`` are parameters,
         such as ``"torque.moment"``. With a torque, Casimirs are not constant, and momentum maps must be conserved by
@@ -99,7 +109,7 @@ class LiePoissonSystem(System):
     reconstruction: str | None = eqx.field(static=True)
     torque: Any
     torque_arguments: tuple[jax.Array, jax.Array | None] | None
-    torques_need_attitude: tuple[bool, ...] = eqx.field(static=True)
+    torque_argument_counts: tuple[int, ...] = eqx.field(static=True)
     torque_free_components: tuple[int, ...] = eqx.field(static=True)
 
     @property
@@ -127,9 +137,9 @@ class LiePoissonSystem(System):
             raise InputError(f"the algebra must be a manifolds.LieAlgebra, not {type(algebra).__name__}")
         self.algebra = algebra
         self.group, self.reconstruction = group, _resolve_reconstruction(algebra, group, reconstruction)
-        self.torque, self.torques_need_attitude = check_torque(torque, algebra, group)
+        self.torque, self.torque_argument_counts = check_torque(torque, algebra, group)
         self.torque_free_components = (
-            () if torque is None else torque_free_components(self.torque, self.torques_need_attitude, algebra, group)
+            () if torque is None else torque_free_components(self.torque, self.torque_argument_counts, algebra, group)
         )
         self.torque_arguments = None
         poisson = mf.LiePoisson(algebra)
@@ -157,6 +167,74 @@ class LiePoissonSystem(System):
         energy = self.drop_baths().energy
         return _inertia_tensor(energy, self.algebra.dim) if energy.is_quadratic else None
 
+    @property
+    def has_angular_velocity(self) -> bool:
+        return begins_with_rotations(self.algebra)
+
+    def angular_velocity_at(self, x):
+        return self.energy.gradient(x)[:3]
+
+    def state(
+        self, x=None, batch: bool = False, *, angular_velocity=None, rotor_rates=None, temperature=None, t=None
+    ) -> jax.Array:
+        """Return ``x`` as a state of this system, or the state of a rigid body with an angular velocity.
+
+        Parameters
+        ----------
+        x : array, shape (n,), or (..., n) with ``batch``; optional
+            See :meth:`System.state`.
+        batch : bool
+            Whether leading axes are several states.
+        angular_velocity : array, shape (3,), or (..., 3) with ``batch``; optional
+            Omega in body axes (rad / time), instead of x. The momentum is the one at which ``dH/dmu = (Omega, w)``.
+        rotor_rates : array, shape (k,), or (..., k) with ``batch``; optional
+            w, the rates of rotors relative to the body (rad / time), or the other velocities of the algebra; zero by
+            default.
+        temperature : float, or array, shape (baths,); optional
+            Temperatures of the baths; by default those at zero entropy.
+        t : float, optional
+            The time, if the energy depends on it.
+
+        Raises
+        ------
+        InputError
+            If neither or both of x and the angular velocity are given, or no state has these values.
+
+        Examples
+        --------
+        >>> body = lt.models.tumbling_body((3.0, 2.0, 1.0), rate=0.1)
+        >>> body.state(angular_velocity=(0.1, 0.2, 0.3), temperature=1.0).tolist()
+        [0.30000000000000004, 0.4, 0.3, 0.0]
+        """
+        if angular_velocity is None:
+            if x is None or rotor_rates is not None or temperature is not None:
+                raise InputError("state needs x, or angular_velocity= with rotor_rates= and temperature= as wanted")
+            return super().state(x, batch)
+        if x is not None:
+            raise InputError("state needs x or angular_velocity=, got both")
+        if not self.has_angular_velocity:
+            raise InputError(f"a system on {self.algebra.name} has no angular velocity: give its momentum")
+        if temperature is not None and self.baths is None:
+            raise InputError("temperature= is for a system with baths: give it baths=lt.HeatBaths(...)")
+        velocity = checked_velocity(angular_velocity, rotor_rates, self.algebra.dim, batch)
+        momentum = self.momentum_of_velocity(velocity, t)
+        if temperature is not None:
+            assert self.baths is not None
+            y = entropies_of_temperatures(self.baths, temperature)
+            shape = jnp.broadcast_shapes(momentum.shape[:-1], y.shape[:-1])
+            parts = (jnp.broadcast_to(part, (*shape, part.shape[-1])) for part in (momentum, y))
+            momentum = jnp.concatenate([*parts], axis=-1)
+        return super().state(momentum, batch)
+
+    def momentum_of_velocity(self, xi, t=None) -> jax.Array:
+        """Return the momentum mu with ``dH/dmu = xi``, shape (..., algebra.dim), at the time t if H depends on it."""
+        energy = self.drop_baths().energy
+        if energy.depends_on_time:
+            if t is None:
+                raise InputError("the energy depends on time: give the time t= of the state")
+            energy = energy.at_time(t)
+        return momentum_of_velocity(energy, jnp.asarray(xi))
+
     # -- the torque -----------------------------------------------------------------------------------------------
 
     @property
@@ -176,7 +254,7 @@ class LiePoissonSystem(System):
 
     @property
     def needs_attitude(self) -> bool:
-        return any(self.torques_need_attitude)
+        return max(self.torque_argument_counts, default=0) > MIN_ARGUMENTS
 
     @property
     def is_driven(self) -> bool:
@@ -212,8 +290,10 @@ class LiePoissonSystem(System):
         if attitude is not None:  # without it XLA crashes on products of many such matrices with vectors
             attitude = jax.lax.optimization_barrier(attitude)
         n = self.algebra.dim
-        mu = x[:n].reshape(self.algebra.shape)
-        torque = evaluate_torque(self.torque, self.torques_need_attitude, t, mu, attitude)
+        mu, counts = x[:n].reshape(self.algebra.shape), self.torque_argument_counts
+        needs_velocity = max(counts) == MAX_ARGUMENTS
+        velocity = self.energy.gradient(x)[:n].reshape(self.algebra.shape) if needs_velocity else None
+        torque = evaluate_torque(self.torque, counts, t, mu, attitude, velocity)
         return jnp.pad(torque.ravel(), (0, self.dim - n))
 
     def drop_torque(self):
@@ -222,7 +302,7 @@ class LiePoissonSystem(System):
         system = copy(self)
         for name, value in {
             "torque": None,
-            "torques_need_attitude": (),
+            "torque_argument_counts": (),
             "torque_free_components": (),
             "torque_arguments": None,
         }.items():

@@ -2,46 +2,47 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 import manifolds as mf
 
 from ..errors import FunctionError, InputError
 from ..functions.arguments import required_argument_count
+from ..functions.piecewise import SPLINES
 from ..tracing.interpret import MAX_UNROLLED_DIM, vanishing_entry_indices
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
 from ..tracing.traced import TracedFunction, trace_callables_and_result_shapes
 
 
-def check_torque(given: Any, algebra: mf.LieAlgebra, group: mf.MatrixGroup | None) -> tuple[Any, tuple[bool, ...]]:
-    """Return a checked torque with its plain functions traced, and which of its terms need the attitude.
+def check_torque(given: Any, algebra: mf.LieAlgebra, group: mf.MatrixGroup | None) -> tuple[Any, tuple[int, ...]]:
+    """Return a checked torque with its plain functions traced, and the number of arguments of each of its terms.
 
     Raises
     ------
     InputError, FunctionError
-        If it is no function of t and mu, or of t, mu and the attitude, to a dual vector; or if there is no attitude.
+        If it is no function of (t, mu), (t, mu, attitude) or (t, mu, attitude, velocity) to a dual vector; or if there
+        is no attitude.
     """
     if given is None:
         return None, ()
     terms = _torque_terms(given)
     if not terms:
         raise InputError("torque is an empty list: a system without a torque is given None")
-    needs = tuple(map(_needs_attitude, terms))
-    if any(needs) and group is None:
-        name = torque_name(terms[needs.index(True)])
+    counts = tuple(map(_argument_count, terms))
+    if max(counts) > MIN_ARGUMENTS and group is None:
+        name = torque_name(next(term for term, n in zip(terms, counts, strict=True) if n > MIN_ARGUMENTS))
         raise InputError(f"the torque {name} depends on the attitude: give the system a group, such as group=mf.SO(3)")
-    shape = () if group is None else group.identity.shape
-    # real and imaginary parts of complex groups are separate arguments: functions are traced for real arrays
-    complex_group = group is not None and jnp.iscomplexobj(group.identity)
-    shapes = ((), algebra.shape, *((shape,) * (2 if complex_group else 1)))
+    shapes = _argument_shapes(algebra, group)
 
-    def evaluate_terms(torque, t, mu, *g):
+    def evaluate_terms(torque, t, mu, velocity, *g):
         attitude = g[0] if len(g) == 1 else g[0] + 1j * g[1]
-        return [jnp.asarray(value) for value in _evaluate_terms(torque, needs, t, mu, attitude)]
+        return [jnp.asarray(value) for value in _evaluate_terms(torque, counts, t, mu, attitude, velocity)]
 
     given = terms if isinstance(given, list) else given
     try:
@@ -50,21 +51,43 @@ def check_torque(given: Any, algebra: mf.LieAlgebra, group: mf.MatrixGroup | Non
         what = f"the torque could not be evaluated on a momentum of shape {algebra.shape}"
         raise FunctionError(trace_error_message(what, error)) from error
     for term, value in zip(terms, values, strict=True):
-        if value.shape != algebra.shape or not jnp.issubdtype(value.dtype, jnp.floating):
+        acts_on_body = value.shape == (3,) and begins_with_rotations(algebra)
+        if (value.shape != algebra.shape and not acts_on_body) or not jnp.issubdtype(value.dtype, jnp.floating):
             raise FunctionError(
                 f"the torque {torque_name(term)} must return real numbers of shape {algebra.shape}, as the momentum "
                 f"has, not {value.dtype} of shape {value.shape}"
             )
-    return torque, needs
+    return torque, counts
 
 
-def evaluate_torque(torque: Any, needs: tuple[bool, ...], t, mu, attitude) -> jax.Array:
-    """Return the sum of the terms of a torque, with the shape of mu."""
-    return sum(_evaluate_terms(torque, needs, t, mu, attitude), jnp.zeros_like(mu))
+def _argument_shapes(algebra: mf.LieAlgebra, group: mf.MatrixGroup | None) -> tuple[tuple[int, ...], ...]:
+    """Return the shapes of t, mu, the velocity, and the attitude as one real array, or two of a complex group."""
+    shape = () if group is None else group.identity.shape
+    # real and imaginary parts of complex groups are separate arguments: functions are traced for real arrays
+    complex_group = group is not None and jnp.iscomplexobj(group.identity)
+    return ((), algebra.shape, algebra.shape, *((shape,) * (2 if complex_group else 1)))
+
+
+def evaluate_torque(torque: Any, counts: tuple[int, ...], t, mu, attitude, velocity) -> jax.Array:
+    """Return the sum of the terms of a torque, with the shape of mu; three components act on the first three of mu."""
+    total = jnp.zeros_like(mu)
+    for term in _evaluate_terms(torque, counts, t, mu, attitude, velocity):
+        term = jnp.asarray(term)
+        total = total + (term if term.shape == mu.shape else jnp.concatenate([term, jnp.zeros(mu.shape[0] - 3)]))
+    return total
+
+
+@functools.lru_cache(maxsize=64)
+def begins_with_rotations(algebra: mf.LieAlgebra) -> bool:
+    """Return whether the first three basis elements are those of so(3), as in se(3) and in sums with so(3)."""
+    if len(algebra.shape) != 1 or algebra.dim < 3 or not algebra.name.startswith(("so(3)", "se(3)")):
+        return False
+    constants = np.asarray(algebra.structure_constants)[:3, :3]
+    return bool(np.allclose(constants[..., :3], mf.so(3).structure_constants) and not constants[..., 3:].any())
 
 
 def torque_free_components(
-    torque: Any, needs: tuple[bool, ...], algebra: mf.LieAlgebra, group: mf.MatrixGroup | None
+    torque: Any, counts: tuple[int, ...], algebra: mf.LieAlgebra, group: mf.MatrixGroup | None
 ) -> tuple[int, ...]:
     """Return the components of the momentum on which a torque does not act, whatever its parameters.
 
@@ -72,16 +95,14 @@ def torque_free_components(
     """
     if algebra.dim > MAX_UNROLLED_DIM:
         return ()
-    shape = () if group is None else group.identity.shape
-    complex_group = group is not None and jnp.iscomplexobj(group.identity)
-    shapes = ((), algebra.shape, *((shape,) * (2 if complex_group else 1)))
-    return tuple(sorted(vanishing_entry_indices(_torque_of_model, (torque, needs), *shapes)))
+    shapes = _argument_shapes(algebra, group)
+    return tuple(sorted(vanishing_entry_indices(_torque_of_model, (torque, counts), *shapes)))
 
 
-def _torque_of_model(model: tuple, t, mu, *attitude) -> jax.Array:
-    torque, needs = model
+def _torque_of_model(model: tuple, t, mu, velocity, *attitude) -> jax.Array:
+    torque, counts = model
     g = attitude[0] if len(attitude) == 1 else attitude[0] + 1j * attitude[1]
-    return evaluate_torque(torque, needs, t, mu, g)
+    return evaluate_torque(torque, counts, t, mu, g, velocity)
 
 
 def torque_name(torque: Any) -> str:
@@ -95,21 +116,32 @@ def _torque_terms(torque: Any) -> tuple[Callable, ...]:
     return tuple(torque) if isinstance(torque, list | tuple) else (torque,)
 
 
-def _evaluate_terms(torque: Any, needs: tuple[bool, ...], t, mu, attitude) -> list:
-    terms = zip(_torque_terms(torque), needs, strict=True)
-    return [term(t, mu, attitude) if needs_attitude else term(t, mu) for term, needs_attitude in terms]
+def _evaluate_terms(torque: Any, counts: tuple[int, ...], t, mu, attitude, velocity) -> list:
+    terms, arguments = zip(_torque_terms(torque), counts, strict=True), (t, mu, attitude, velocity)
+    return [term(*arguments[:count]) for term, count in terms]
 
 
-def _needs_attitude(term: Any) -> bool:
+MIN_ARGUMENTS = 2
+"""Smallest number of arguments of a torque: t and mu."""
+
+MAX_ARGUMENTS = 4
+"""Largest number of arguments of a torque: after t and mu the attitude, then the velocity ``dH/dmu``."""
+
+
+def _argument_count(term: Any) -> int:
     if not callable(term):
         raise InputError(
             "a torque is a function of t and mu, or of t, mu and the attitude, such as "
             f"lt.torques.ConstantInBody([0.0, 0.0, 1.0]), not {type(term).__name__}"
         )
-    count = len(term.program.argument_avals) if isinstance(term, TracedFunction) else required_argument_count(term)
-    if count not in (2, 3):
+    if isinstance(term, SPLINES):
         raise InputError(
-            f"a torque is a function of t and mu, or of t, mu and the attitude, and {torque_name(term)} needs "
-            f"{'an unknown number of' if count is None else count} arguments"
+            f"a spline is a table of a torque: write lt.torques.Tabulated(spline), not {torque_name(term)}"
         )
-    return count == 3
+    count = len(term.program.argument_avals) if isinstance(term, TracedFunction) else required_argument_count(term)
+    if count is None or not MIN_ARGUMENTS <= count <= MAX_ARGUMENTS:
+        raise InputError(
+            f"a torque is a function of t and mu, or of t, mu and the attitude, or of these and the velocity dH/dmu, "
+            f"and {torque_name(term)} needs {'an unknown number of' if count is None else count} arguments"
+        )
+    return count

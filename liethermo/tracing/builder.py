@@ -206,6 +206,39 @@ class EnclosingScope:
         return name
 
 
+MAX_TABLE_STRIDE = 256
+"""Largest distance in memory that is tried between the entries of a table of which only one is not fixed."""
+
+
+def restore_fixed_inputs(entries: Sequence[Scalar], fixed_inputs: Sequence[np.ndarray | None]) -> Sequence[Scalar]:
+    """Return the entries of a table with fixed inputs named again, if all are then equidistant in an input array.
+
+    A table of that kind is read where the array lies, without a copy. An input that is fixed to a number has this
+    number at run time too, so the names stand for equal values.
+    """
+    named = [(k, a) for k, a in enumerate(entries) if type(a) is str]
+    if not named or len(named) == len(entries) or not all(a[0] == "x" for _, a in named):
+        return entries
+    positions = [(k, *map(int, a[1:].split("_"))) for k, a in named]
+    first_index, array_index, first_position = positions[0]
+    fixed = fixed_inputs[array_index] if array_index < len(fixed_inputs) else None
+    if fixed is None or any(i != array_index for _, i, _ in positions):
+        return entries
+    if len(positions) > 1:
+        stride, remainder = divmod(positions[1][2] - first_position, positions[1][0] - first_index)
+        strides = [stride] if not remainder and stride > 0 else []
+    else:
+        strides = [*range(1, MAX_TABLE_STRIDE + 1)]
+    wanted = np.array([np.nan if type(a) is str else a for a in entries], dtype=np.float64)
+    for stride in strides:
+        source = first_position + stride * (np.arange(len(entries)) - first_index)
+        if source[0] < 0 or source[-1] >= fixed.size or any(source[k] != j for k, _, j in positions):
+            continue
+        if np.array_equal(fixed[source], wanted, equal_nan=True):
+            return [f"x{array_index}_{j}" for j in source]
+    return entries
+
+
 class Builder:
     """Collects instructions; each method returns the scalar that holds its result.
 
@@ -219,10 +252,17 @@ class Builder:
         Largest number of instructions that the builder may collect.
     enclosing : EnclosingScope, optional
         Scope around a program inside a loop or a routine.
+
+    Attributes
+    ----------
+    fixed_inputs : tuple
+        The numbers that fix entries of each input array, flat, NaN for entries that are known at run time only; None
+        for an array without such numbers.
     """
 
     def __init__(self, max_instructions: int, enclosing: EnclosingScope | None = None):
         self.max_instructions, self.enclosing = max_instructions, enclosing
+        self.fixed_inputs: tuple[np.ndarray | None, ...] = ()
         self.instructions: list[Instruction] = []
         self._emitted: dict[tuple[str | Block, ...], str] = {}
         self._negated_operand: dict[Scalar, str] = {}  # b, by the name of a = -b
@@ -276,7 +316,7 @@ class Builder:
                 self._defining_instruction(a) == (a, "item", (block_result, start + i)) for i, a in enumerate(entries)
             ):
                 return self._emit("column", block_result, start, len(entries))
-        return self._emit("table", *entries)
+        return self._emit("table", *restore_fixed_inputs(entries, self.fixed_inputs))
 
     def input_positions_or_none(self, entries: Sequence[Scalar]) -> list[tuple[int, int]] | None:
         """Return the (array, entry) indices of scalars among the inputs of the outermost program.

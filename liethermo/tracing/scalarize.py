@@ -126,6 +126,7 @@ def scalarize(
             else [n if v != v else v for n, v in zip(names, fixed_entries.ravel().tolist(), strict=True)]
         )
         inputs.append(tuple(names))
+        builder.fixed_inputs += (None if fixed_entries is None else fixed_entries.ravel(),)
         arguments.append(scalar_array(entries, var.aval.shape))
     results = _unroll_jaxpr(builder, closed_jaxpr.jaxpr, closed_jaxpr.consts, arguments)
     outputs = [x.ravel().tolist() for x in results]
