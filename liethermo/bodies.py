@@ -10,8 +10,9 @@ from manifolds._names import public_dir
 
 from .models.free_motion import Periods, damping_time, periods, rate_of
 from .models.inertia import PrincipalAxes, principal_axes
-from .models.jointed_bodies import JointedBodies, Tree
+from .models.jointed_bodies import JointedBodies
 from .models.joints import Hinge, Slider, Universal
+from .models.tree import Tree
 from .results.orientation import angular_velocity, euler_angles, nutation, precession, quaternions, rotation, spin
 from .systems.rotations import AttitudeWarning, attitude
 

@@ -19,8 +19,9 @@ from manifolds._pytree_module import Module
 
 from ..dissipation.base import Dissipation
 from ..dissipation.factor import Factor
-from ..functions.energy import Energy, float64_array
+from ..functions.energy import Energy, Pullback, float64_array
 from ..functions.indices import Indices
+from ..tracing.programs import subprogram
 
 
 class Poses(NamedTuple):
@@ -117,9 +118,9 @@ class ArticulatedBodies(Module):
             positions.append(position)
         return Poses(rotations, positions, screws)
 
-    def spatial_inertias(self, poses: Poses) -> list[jax.Array | None]:
-        """Return the spatial inertia of each link, shape (6, 6); None for a link without a body."""
-        inertias: list[jax.Array | None] = [None] * (self.n_joints + 1)
+    def spatial_inertias(self, poses: Poses) -> list[jax.Array]:
+        """Return the spatial inertia of each link, shape (6, 6); zero for a link without a body."""
+        inertias = [jnp.zeros((6, 6))] * (self.n_joints + 1)
         for body, link in enumerate(self.body_links):
             R, mass = poses.rotations[link], self.masses[body]
             centre = _cross_matrix(poses.positions[link] + R @ self.centres[body])
@@ -145,13 +146,23 @@ class ArticulatedBodies(Module):
                 M = M.at[i, ancestor].set(entry).at[ancestor, i].set(entry)
                 ancestor = self.parents[ancestor] - 1
             base_columns[i] = momentum
-            _add_to(composites, self.parents[i], composites[i + 1])
+            composites[self.parents[i]] += composites[i + 1]
         columns = jnp.stack(base_columns, axis=1)
         locked = composites[0]
         angular = jnp.concatenate([locked[:3, :3], columns[:3]], axis=1)
         joints = jnp.concatenate([columns[:3].T, M], axis=1)
         linear = jnp.concatenate([locked[3:, :3], columns[3:]], axis=1)
         return jnp.concatenate([angular, joints]) - linear.T @ linear / jnp.sum(self.masses)
+
+    def momentum_scale(self, Pi, q, p) -> jax.Array:
+        """Return the size of the terms whose sum is the angular momentum, shape (): ``sqrt(2 T J)``.
+
+        T is the kinetic energy, and J the trace of the locked inertia about the origin of the base. The terms of a tree
+        without angular momentum cancel.
+        """
+        inertias = self.spatial_inertias(self.poses(q))
+        locked = sum(jnp.trace(inertia[:3, :3]) for inertia in inertias)
+        return jnp.sqrt(2.0 * self.kinetic_energy(Pi, q, p) * locked)
 
     def pivots(self, q) -> jax.Array:
         """Return the inertia that each joint moves if all joints beyond it are free, shape (k,)."""
@@ -160,7 +171,7 @@ class ArticulatedBodies(Module):
     def kinetic_energy(self, Pi, q, p) -> jax.Array:
         """Return the kinetic energy ``(Pi, p) . M(q)^-1 (Pi, p) / 2`` by the articulated-body recursion, O(k)."""
         _, joints, base = self._eliminate(q, Pi, p)
-        return 0.5 * sum(joint.impulse**2 / joint.pivot for joint in [*joints, *base])
+        return _sum_of_squares(joints, base)
 
     def motion(self, Pi, q, p) -> Motion:
         """Return the velocities for an angular momentum Pi and joint momenta p, O(k); see :class:`Motion`.
@@ -179,15 +190,12 @@ class ArticulatedBodies(Module):
             rates.append(rate)
             velocities.append(velocities[parent] + rate * screw)
         inertias = self.spatial_inertias(poses)
-        momenta: list[jax.Array | None] = [
-            None if inertia is None else inertia @ velocity
-            for inertia, velocity in zip(inertias, velocities, strict=True)
-        ]
+        momenta = [inertia @ velocity for inertia, velocity in zip(inertias, velocities, strict=True)]
         gradient = [jnp.zeros(())] * self.n_joints
         for i in reversed(range(self.n_joints)):
             gradient[i] = jnp.dot(momenta[i + 1], _motion_cross(poses.screws[i], velocities[i + 1]))
-            _add_to(momenta, self.parents[i], momenta[i + 1])
-        energy = 0.5 * sum(joint.impulse**2 / joint.pivot for joint in [*joints, *base])
+            momenta[self.parents[i]] += momenta[i + 1]
+        energy = _sum_of_squares(joints, base)
         return Motion(energy, V[:3], jnp.stack(rates), jnp.stack(gradient))
 
     def _eliminate(self, q, Pi, p) -> tuple[Poses, list[_Elimination], list[_Elimination]]:
@@ -199,17 +207,17 @@ class ArticulatedBodies(Module):
         """
         poses = self.poses(q)
         inertias = self.spatial_inertias(poses)
-        biases: list[jax.Array | None] = [None] * (self.n_joints + 1)
+        biases = [jnp.zeros(6)] * (self.n_joints + 1)
         joints: list[_Elimination] = []
         for i in reversed(range(self.n_joints)):
-            joint = _Elimination.of(inertias[i + 1], biases[i + 1], poses.screws[i], p[i])
+            joint = _Elimination.from_inertia(inertias[i + 1], biases[i + 1], poses.screws[i], p[i])
             joints.append(joint)
-            _add_to(inertias, self.parents[i], joint.reduced_inertia(inertias[i + 1]))
-            _add_to(biases, self.parents[i], joint.bias(biases[i + 1]))
+            inertias[self.parents[i]] += joint.reduced_inertia(inertias[i + 1])
+            biases[self.parents[i]] += joint.bias(biases[i + 1])
         base: list[_Elimination] = []
         inertia, bias = inertias[0], biases[0]
         for unit, momentum in zip(_BASE_SCREWS, [0.0, 0.0, 0.0, *Pi], strict=True):
-            step = _Elimination.of(inertia, bias, unit, momentum)
+            step = _Elimination.from_inertia(inertia, bias, unit, momentum)
             base.append(step)
             inertia, bias = step.reduced_inertia(inertia), step.bias(bias)
         return poses, joints[::-1], base
@@ -237,10 +245,10 @@ class _Elimination(NamedTuple):
     impulse: jax.Array
 
     @classmethod
-    def of(cls, inertia, bias, screw, momentum) -> _Elimination:
+    def from_inertia(cls, inertia, bias, screw, momentum) -> _Elimination:
         """Return the elimination of the velocity along a screw that has a given momentum."""
         column = inertia @ screw
-        return cls(column, jnp.dot(screw, column), momentum if bias is None else momentum - jnp.dot(screw, bias))
+        return cls(column, jnp.dot(screw, column), momentum - jnp.dot(screw, bias))
 
     def reduced_inertia(self, inertia) -> jax.Array:
         """Return the articulated inertia without the eliminated velocity, shape (6, 6)."""
@@ -248,14 +256,12 @@ class _Elimination(NamedTuple):
 
     def bias(self, bias) -> jax.Array:
         """Return the bias that the rest of the tree sees, shape (6,)."""
-        bias_of_joint = self.column * (self.impulse / self.pivot)
-        return bias_of_joint if bias is None else bias + bias_of_joint
+        return bias + self.column * (self.impulse / self.pivot)
 
 
-def _add_to(arrays: list[jax.Array | None], index: int, value) -> None:
-    """Add a value to an entry of a list, in place; None stands for zero."""
-    entry = arrays[index]
-    arrays[index] = value if entry is None else entry + value
+def _sum_of_squares(joints: list[_Elimination], base: list[_Elimination]) -> jax.Array:
+    """Return the kinetic energy, a sum of squares: one for each eliminated velocity."""
+    return 0.5 * jnp.sum(jnp.stack([step.impulse**2 / step.pivot for step in [*joints, *base]]))
 
 
 def _cross_matrix(v) -> jax.Array:
@@ -291,12 +297,44 @@ class KineticEnergy(Energy):
         k = self.mechanism.n_joints
         return x[:3], x[3 : 3 + k], x[3 + k : 3 + 2 * k]
 
+    def momentum_scale(self, x) -> jax.Array:
+        """Return :meth:`ArticulatedBodies.momentum_scale` of a state."""
+        return self.mechanism.momentum_scale(*self.split_state(x))
+
     def value(self, x) -> jax.Array:
-        return self.mechanism.kinetic_energy(*self.split_state(x))
+        return _kinetic_energy(self, x)
 
     def gradient(self, x) -> jax.Array:
-        motion = self.mechanism.motion(*self.split_state(float64_array(x)))
-        return jnp.concatenate([motion.angular_velocity, motion.joint_gradient, motion.joint_rates])
+        return _kinetic_gradient(self, float64_array(x))
+
+
+@subprogram
+def _kinetic_energy(kinetic: KineticEnergy, x) -> jax.Array:
+    return kinetic.mechanism.kinetic_energy(*kinetic.split_state(x))
+
+
+@subprogram
+def _kinetic_gradient(kinetic: KineticEnergy, x) -> jax.Array:
+    motion = kinetic.mechanism.motion(*kinetic.split_state(x))
+    return jnp.concatenate([motion.angular_velocity, motion.joint_gradient, motion.joint_rates])
+
+
+class SquaredMomentum(Pullback):
+    """The squared angular momentum of a tree, a Casimir, whose rounding is that of the terms of the momentum.
+
+    Attributes
+    ----------
+    kinetic : KineticEnergy
+    """
+
+    kinetic: KineticEnergy
+
+    def __init__(self, term: Energy, kinetic: KineticEnergy):
+        super().__init__(term, range(3))
+        self.kinetic = kinetic
+
+    def sensitivity(self, x) -> jax.Array:
+        return jnp.maximum(super().sensitivity(x), self.kinetic.momentum_scale(x) ** 2)
 
 
 class JointSprings(Energy):

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..errors import InputError
 from ..functions.conditions import checked_numbers, require_condition
 from .parameters import checked_finite
 

@@ -145,7 +145,7 @@ def _urdf_link(name: str, link: Element, joint: Element | None) -> LinkRecord:
     covered = {"parent", "child", "origin", "axis", "dynamics"}
     _refuse_children(joint, f"joint {joint_name!r}", covered, {"limit", "calibration", "safety_controller"})
     rotation, origin = _urdf_origin(joint)
-    joints = ()
+    joints: tuple[JointRecord, ...] = ()
     if kind != "fixed":
         axis, dynamics = joint.find("axis"), joint.find("dynamics")
         direction = np.array([1.0, 0.0, 0.0]) if axis is None else _numbers(axis, "xyz", 3)
@@ -324,7 +324,7 @@ class _Group:
     def record(self, joint: Joint | None) -> BodyRecord:
         """Return the body: the sum of its links."""
         total = sum(self.masses)
-        centre = sum(m * c for m, c in zip(self.masses, self.centres, strict=True)) / total
+        centre = np.asarray(self.masses) @ np.asarray(self.centres) / total
         inertia = np.zeros((3, 3))
         for m, c, J in zip(self.masses, self.centres, self.inertias, strict=True):
             r = c - centre

@@ -137,6 +137,20 @@ class AuditableResult(SaveableResult):
     evidence_source: Callable[[], Evidence] | None
     angular_velocity_source: Callable[[], np.ndarray] | None
 
+    @property
+    def joints(self) -> dict[str, np.ndarray]:
+        """Joint coordinates by the name of the body (rad, or length), of a tree of jointed bodies; else empty.
+
+        Each has the shape of the times, (times,), or (times, 2) for a universal joint; in an ensemble trajectories are
+        first.
+        """
+        if self.x is None:
+            return {}
+        return {
+            name: self.x[..., start] if end - start == 1 else self.x[..., start:end]
+            for name, (start, end) in self.provenance.get("joints", {}).items()
+        }
+
     @functools.cached_property
     def evidence(self) -> Evidence:
         """Data that an audit needs besides the series; computed at its first use."""

@@ -222,6 +222,7 @@ class AttitudeSystem(System):
 
     inertia = forward_to("momentum_system")
     has_angular_velocity = forward_to("body")
+    joint_ranges = forward_to("body")
 
     def angular_velocity_at(self, x):
         return self.body.angular_velocity_at(self.points(x))
@@ -301,7 +302,8 @@ def _spatial_momentum_and_scale(system: AttitudeSystem, x) -> tuple[jax.Array, j
     (state, g), p = system.split_state(x), system.spatial_impulse(x)
     mu, action = state[: system.group.dim], system.spatial_action(g)
     momentum = mu @ action
-    return momentum - p if system.has_impulse else momentum, jnp.max(jnp.abs(mu) @ jnp.abs(action))
+    scale = jnp.maximum(jnp.max(jnp.abs(mu) @ jnp.abs(action)), system.body.momentum_scale(state))
+    return momentum - p if system.has_impulse else momentum, scale
 
 
 ANGLE_UNIT = 2.0**-300

@@ -163,6 +163,10 @@ class DrivenSystem(System):
         return self._body_at_state(x).transport(*_restrict_to_body(x, dH, dS, dL))
 
     has_angular_velocity = forward_to("body")
+    joint_ranges = forward_to("body")
+
+    def momentum_scale(self, x):
+        return self.body.momentum_scale(x[:-2])
 
     def angular_velocity_at(self, x):
         return self._body_at_state(x).angular_velocity_at(x[:-2])

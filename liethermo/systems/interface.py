@@ -70,6 +70,15 @@ class SystemInterface(Geometry):
         """
         return None
 
+    def momentum_scale(self, x) -> jax.Array:
+        """Return the size of terms that cancel in the momentum at x, shape (); zero if there are none."""
+        return jnp.zeros(())
+
+    @property
+    def joint_ranges(self) -> tuple[tuple[str, int, int], ...]:
+        """Names of bodies with a joint, and the first and the last but one index of its coordinates in a state."""
+        return ()
+
     @property
     def has_angular_velocity(self) -> bool:
         """True if the system contains a rigid body, whose angular velocity :meth:`angular_velocity_at` returns."""

@@ -1,0 +1,415 @@
+"""Trees of jointed rigid bodies, which build :class:`.jointed_bodies.JointedBodies`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from manifolds._arrays import is_traced
+
+from ..errors import FunctionError, InputError
+from ..functions.conditions import checked_numbers
+from ..systems import HeatBaths
+from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
+from ..tracing.traced import trace_callables_and_result_shapes
+from .articulated_bodies import ArticulatedBodies, JointSprings
+from .inertia import INEQUALITY_RTOL, is_symmetric
+from .jointed_bodies import JointedBodies, JointMotors
+from .joints import Joint, JointCoordinate
+from .parameters import checked_finite, checked_positive
+from .tree_files import BodyRecord, read_mjcf, read_urdf
+
+MIN_PIVOT_FRACTION = 1e-12
+"""Least inertia that a joint moves, relative to that of the whole tree, below which it counts as zero.
+
+A pivot is a difference of inertias of the whole, so rounding alone leaves about 1e-16 of it."""
+
+TEST_ANGLES_SEED = 0
+"""Seed of the joint coordinates at which a tree is tested for joints that move no inertia."""
+
+
+class _Body(NamedTuple):
+    """A rigid body of a tree."""
+
+    name: str
+    mass: jax.Array
+    centre: jax.Array
+    inertia: jax.Array
+    parent: str | None
+    joint: Joint | None
+
+
+class Tree:
+    """A tree of rigid bodies that are joined by hinges, sliders and universal joints, free in space.
+
+    The axes of all bodies are parallel to those of the base if all joint coordinates are zero, and the origin of a body
+    is at its joint. Units are SI or any other consistent ones.
+
+    Examples
+    --------
+    A satellite with a panel on a hinge with a spring and a damper:
+
+    >>> tree = lt.bodies.Tree()
+    >>> bus = tree.add("bus", mass=10.0, inertia=(3.0, 2.0, 1.5))
+    >>> hinge = lt.bodies.Hinge(at=(0.5, 0.1, 0.0), axis=(0.0, 1.0, 0.0), stiffness=4.0, damping=0.3)
+    >>> panel = tree.add("panel", mass=2.0, centre=(0.8, 0.0, 0.1), inertia=(0.05, 0.4, 0.42), parent=bus, joint=hinge)
+    >>> system = tree.system(baths=lt.HeatBaths(capacity=50.0, temperature=300.0))
+    >>> x0 = system.state(angular_velocity=(0.3, 0.1, 0.8), joints={"panel": 0.4})
+    >>> solution = lt.integrate(system, x0, (0.0, 10.0), 0.05, lt.MetriplecticGauss(2))
+    >>> solution.audit().passed, solution.joints["panel"].shape
+    (True, (201,))
+    """
+
+    def __init__(self) -> None:
+        self._bodies: dict[str, _Body] = {}
+
+    def add(
+        self,
+        name: str,
+        mass,
+        centre=(0.0, 0.0, 0.0),
+        inertia=(0.0, 0.0, 0.0),
+        parent: str | None = None,
+        joint: Joint | None = None,
+    ) -> str:
+        """Add a body; the first one is the base, and each later one needs a parent and a joint.
+
+        Parameters
+        ----------
+        name : str
+            Name of the body, and of its joint.
+        mass : float, > 0
+            Mass (kg).
+        centre : array, shape (3,)
+            Centre of mass in axes of the body, from its origin (m).
+        inertia : array, shape (3,) or (3, 3)
+            Moments of inertia, or the symmetric tensor, about the centre of mass in axes of the body (kg m**2). Zero is
+            a point mass, and (0, J, J) a slender rod.
+        parent : str
+            Name of a body that was added before.
+        joint : Hinge, Slider or Universal
+            The joint between the parent and this body.
+
+        Returns
+        -------
+        str
+            The name, to be the parent of other bodies.
+
+        Raises
+        ------
+        InputError
+            If the name exists, the parent does not, or no rigid body has this mass and inertia.
+        """
+        if not isinstance(name, str) or not name:
+            raise InputError(f"the name of a body must be a text that is not empty, got {name!r}")
+        if name in self._bodies:
+            raise InputError(f"there is a body {name!r} already. Give each body another name")
+        if not self._bodies and (parent is not None or joint is not None):
+            raise InputError(f"{name!r} is the first body, so it is the base, which has no parent and no joint")
+        if self._bodies:
+            if parent is None or joint is None:
+                missing = "a parent" if parent is None else "a joint"
+                raise InputError(f"{name!r} needs {missing}: only the first body, {self.base!r}, is free")
+            if parent not in self._bodies:
+                names = ", ".join(map(repr, self._bodies))
+                raise InputError(
+                    f"the parent {parent!r} of {name!r} is unknown. Add bodies from the base outwards, without loops; "
+                    f"the tree has {names}"
+                )
+            if not isinstance(joint, Joint):
+                raise InputError(
+                    f"the joint of {name!r} must be lt.bodies.Hinge, Slider or Universal, got {type(joint).__name__}"
+                )
+        self._bodies[name] = _Body(
+            name,
+            checked_positive(mass, f"the mass of {name!r}"),
+            checked_finite(centre, f"the centre of {name!r}", 3),
+            _checked_body_inertia(inertia, name),
+            parent,
+            joint,
+        )
+        return name
+
+    @property
+    def base(self) -> str:
+        """Name of the base."""
+        if not self._bodies:
+            raise InputError("the tree has no bodies: add a base first")
+        return next(iter(self._bodies))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all bodies, the base first."""
+        return tuple(self._bodies)
+
+    def system(
+        self,
+        baths: HeatBaths | None = None,
+        torque: Any = None,
+        motors: Mapping[str, Any] | None = None,
+        gravity: Any = None,
+        attitude: bool = True,
+    ) -> JointedBodies:
+        """Return the equations of motion of the tree.
+
+        Parameters
+        ----------
+        baths : HeatBaths, optional
+            The bath that the dampers of the joints heat. Without one their heat is lost, and the energy falls.
+        torque : function of t and Pi, or of t, Pi and the attitude, or a list of them; optional
+            External torque on the whole about its centre of mass, in axes of the base, shape (3,): see
+            :mod:`liethermo.torques`.
+        motors : dict of float or of function from t, optional
+            Torques of motors by the name of the body, as ``motor`` of a joint, which they replace.
+        gravity : optional
+            Must be None. In a uniform field the centre of mass of a free tree falls, and attitude and joints move as
+            without gravity; a gradient of gravity acts by ``torque``.
+        attitude : bool
+            If true, runs follow the attitude of the base, an element of SO(3).
+
+        Raises
+        ------
+        InputError
+            If the tree has no joint, a joint moves no inertia, or a motor belongs to no joint.
+        """
+        if gravity is not None:
+            raise InputError(
+                "gravity= is not available, since a free tree has no position. In a uniform field attitude and joints "
+                "move as without it; for its gradient use torque=lt.torques.GravityGradient(...)"
+            )
+        base = self._bodies[self.base]
+        moved = [body for body in self._bodies.values() if body.joint is not None]
+        if not moved:
+            raise InputError(
+                f"the tree has one body, {base.name!r}, and no joint. Add bodies, or use lt.LiePoissonSystem with "
+                "lt.Quadratic for one rigid body"
+            )
+        layout = _layout(base, moved)
+        indices = tuple((name, 3 + start, 3 + end) for name, start, end in layout.joint_ranges)
+        if not is_traced(layout.mechanism):
+            _check_pivots(layout.mechanism, layout.joint_ranges)
+        joint_motors = _joint_motors(moved, motors, layout)
+        return JointedBodies(
+            layout.mechanism, layout.springs, layout.damping, indices, baths, torque, joint_motors, attitude
+        )
+
+    @classmethod
+    def from_urdf(cls, source: str | os.PathLike) -> Tree:
+        """Return the tree of a URDF file: a free base, and revolute, continuous, prismatic and fixed joints.
+
+        ``damping`` of a joint is taken over; limits of position, effort and velocity, shapes and materials do not act.
+        Bodies at fixed joints are merged with their parents.
+
+        Parameters
+        ----------
+        source : str or path
+            A file, or the text of one.
+
+        Raises
+        ------
+        InputError
+            If an element, a type of joint or a value is not covered.
+        FileError
+            If the file cannot be read.
+
+        Examples
+        --------
+        >>> tree = lt.bodies.Tree.from_urdf('''<robot name="pair">
+        ...   <link name="bus"><inertial><mass value="10"/>
+        ...     <inertia ixx="3" iyy="2" izz="1.5" ixy="0" ixz="0" iyz="0"/></inertial></link>
+        ...   <link name="panel"><inertial><origin xyz="0.8 0 0"/><mass value="2"/>
+        ...     <inertia ixx="0.05" iyy="0.4" izz="0.42" ixy="0" ixz="0" iyz="0"/></inertial></link>
+        ...   <joint name="hinge" type="continuous"><parent link="bus"/><child link="panel"/>
+        ...     <origin xyz="0.5 0 0"/><axis xyz="0 1 0"/><dynamics damping="0.3"/></joint>
+        ... </robot>''')
+        >>> tree.names
+        ('bus', 'panel')
+        """
+        return _tree_of(cls, read_urdf(source))
+
+    @classmethod
+    def from_mjcf(cls, source: str | os.PathLike) -> Tree:
+        """Return the tree of an MJCF file of MuJoCo: one free body with hinges and slides.
+
+        Masses and inertias are those of ``inertial`` elements. ``damping``, ``stiffness``, ``springref`` and
+        ``armature="0"`` of a joint are covered; gravity must be zero.
+
+        Parameters
+        ----------
+        source : str or path
+            A file, or the text of one.
+
+        Raises
+        ------
+        InputError
+            If an element, an attribute or a value is not covered.
+        FileError
+            If the file cannot be read.
+
+        Examples
+        --------
+        >>> tree = lt.bodies.Tree.from_mjcf('''<mujoco><option gravity="0 0 0"/><worldbody>
+        ...   <body name="bus"><freejoint/><inertial pos="0 0 0" mass="10" diaginertia="3 2 1.5"/>
+        ...     <body name="panel" pos="0.5 0 0"><joint type="hinge" axis="0 1 0" damping="0.3"/>
+        ...       <inertial pos="0.8 0 0" mass="2" diaginertia="0.05 0.4 0.42"/></body></body>
+        ... </worldbody></mujoco>''')
+        >>> tree.names
+        ('bus', 'panel')
+        """
+        return _tree_of(cls, read_mjcf(source))
+
+
+def _tree_of(cls: type[Tree], records: Sequence[BodyRecord]) -> Tree:
+    """Return a tree with the bodies of a file."""
+    tree = cls()
+    for record in records:
+        tree.add(*record)
+    return tree
+
+
+def _checked_body_inertia(inertia, name: str) -> jax.Array:
+    """Return the tensor of inertia of a rigid body, shape (3, 3); points and slender rods are allowed.
+
+    Raises
+    ------
+    InputError
+        If a tensor is not symmetric, a moment is negative, or one is more than the sum of the other two.
+    """
+    what = f"the inertia of {name!r}"
+    array = checked_finite(checked_numbers(inertia, what, (3,), (3, 3)), what)
+    if is_traced(array):
+        return jnp.diag(array) if array.ndim == 1 else 0.5 * (array + array.T)
+    tensor = np.diag(array) if array.ndim == 1 else np.asarray(array)
+    if not is_symmetric(tensor):
+        raise InputError(f"{what} must be a symmetric tensor, got {tensor.tolist()}")
+    tensor = 0.5 * (tensor + tensor.T)
+    moments = np.linalg.eigvalsh(tensor)
+    rounding = INEQUALITY_RTOL * abs(moments).max()
+    if moments[0] < -rounding:
+        raise InputError(f"{what} must have principal moments >= 0, got {moments.tolist()}")
+    if moments[2] > moments[0] + moments[1] + rounding:
+        raise InputError(
+            f"no rigid body has {what}: its largest principal moment, {moments[2]:g}, is more than the sum of the "
+            f"others, {moments[0] + moments[1]:g}. Check that it is about the centre of mass"
+        )
+    return jnp.asarray(tensor)
+
+
+class _Layout(NamedTuple):
+    """Arrays of a tree.
+
+    Attributes
+    ----------
+    mechanism : ArticulatedBodies
+    springs : JointSprings
+    damping : array, shape (k,)
+    joint_ranges : list of (str, int, int)
+        Name of each moved body, and the range of its joint coordinates.
+    """
+
+    mechanism: ArticulatedBodies
+    springs: JointSprings
+    damping: jax.Array
+    joint_ranges: list[tuple[str, int, int]]
+
+
+def _layout(base: _Body, moved: list[_Body]) -> _Layout:
+    """Return the arrays of a tree; each coordinate of a joint moves a link, the last one that of the body."""
+    link_of = {base.name: 0}
+    parents: list[int] = []
+    places: list[jax.Array] = []
+    joint_ranges: list[tuple[str, int, int]] = []
+    coordinates: list[JointCoordinate] = []
+    for body in moved:
+        assert body.joint is not None
+        assert body.parent is not None
+        link, place = link_of[body.parent], body.joint.at
+        for coordinate in body.joint.coordinates:
+            parents.append(link)
+            places.append(place)
+            coordinates.append(coordinate)
+            link, place = len(parents), jnp.zeros(3)
+        link_of[body.name] = link
+        joint_ranges.append((body.name, link - body.joint.size, link))
+    bodies = [base, *moved]
+    mechanism = ArticulatedBodies(
+        jnp.stack([body.mass for body in bodies]),
+        jnp.stack([body.centre for body in bodies]),
+        jnp.stack([body.inertia for body in bodies]),
+        jnp.stack(places),
+        jnp.stack([coordinate.axis for coordinate in coordinates]),
+        tuple(link_of[body.name] for body in bodies),
+        tuple(parents),
+        tuple(coordinate.slides for coordinate in coordinates),
+    )
+    springs = JointSprings(
+        jnp.stack([coordinate.stiffness for coordinate in coordinates]),
+        jnp.stack([coordinate.rest for coordinate in coordinates]),
+    )
+    return _Layout(mechanism, springs, jnp.stack([coordinate.damping for coordinate in coordinates]), joint_ranges)
+
+
+def _check_pivots(mechanism: ArticulatedBodies, joint_ranges: list[tuple[str, int, int]]) -> None:
+    """Raise InputError if a joint moves no inertia, or the whole has none about an axis, at a random configuration."""
+    q = np.random.default_rng(TEST_ANGLES_SEED).uniform(0.5, 1.0, mechanism.n_joints)
+    with jax.ensure_compile_time_eval():
+        pivots, M = np.asarray(mechanism.pivots(q)), np.asarray(mechanism.mass_matrix(q))
+    scales = np.diagonal(M)[3:]
+    inertia_scale = np.diagonal(M)[:3].max()
+    for name, start, end in joint_ranges:
+        for i in range(start, end):
+            scale = np.sum(mechanism.masses) if mechanism.slides[i] else max(scales[i], inertia_scale)
+            if not pivots[i] > MIN_PIVOT_FRACTION * scale:
+                raise InputError(
+                    f"the joint of {name!r} moves no inertia, so its motion is undefined: give the body an inertia, or "
+                    "a centre of mass off the axis"
+                )
+    moments = np.linalg.eigvalsh(M[:3, :3] - M[:3, 3:] @ np.linalg.solve(M[3:, 3:], M[3:, :3]))
+    if not moments[0] > MIN_PIVOT_FRACTION * inertia_scale:
+        raise InputError(
+            "the tree has no inertia about an axis if its joints are free, so its motion is undefined: give the base "
+            "an inertia"
+        )
+
+
+def _joint_motors(moved: list[_Body], given: Mapping[str, Any] | None, layout: _Layout) -> JointMotors | None:
+    """Return the motors of a tree, checked and traced; None if there is none."""
+    if not isinstance(given, Mapping | None):
+        raise InputError(f"motors must be a dict by the names of bodies, got {type(given).__name__}")
+    names = [body.name for body in moved]
+    if unknown := [name for name in given or {} if name not in names]:
+        raise InputError(f"no joint moves {', '.join(map(repr, unknown))}. The joints move {', '.join(names)}")
+    by_name = {body.name: body.joint.motor for body in moved if body.joint is not None} | dict(given or {})
+    functions, indices, driven = [], [], []
+    for name, start, end in layout.joint_ranges:
+        if (motor := by_name[name]) is None:
+            continue
+        size, what = end - start, f"the motor of {name!r}"
+        if callable(motor):
+            motor, shape = _traced_motor(motor, what)
+        else:
+            motor = checked_finite(np.atleast_1d(motor) if not is_traced(motor) else motor, what)
+            shape = motor.shape
+        if shape not in ((size,), *([()] if size == 1 else [])):
+            wanted = "one number" if size == 1 else f"an array of shape ({size},)"
+            raise FunctionError(f"{what} must give {wanted}, got shape {shape}")
+        functions.append(motor)
+        indices.append(tuple(range(start, end)))
+        driven.append(name)
+    if not functions:
+        return None
+    return JointMotors(tuple(functions), tuple(indices), layout.mechanism.n_joints, tuple(driven))
+
+
+def _traced_motor(motor: Callable, what: str) -> tuple[Any, tuple[int, ...]]:
+    """Return a function of the time with plain functions traced, and the shape of its result."""
+    try:
+        traced, result = trace_callables_and_result_shapes(motor, lambda function, t: jnp.asarray(function(t)), ())
+    except TRACE_ERRORS as error:
+        raise FunctionError(trace_error_message(f"{what} could not be evaluated at a time", error)) from error
+    return traced, result.shape
