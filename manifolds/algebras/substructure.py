@@ -6,6 +6,7 @@ Every function takes the structure constants in a form in which linear algebra i
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -173,7 +174,7 @@ def levi_subalgebra(work: WorkingConstants) -> tuple[np.ndarray, np.ndarray]:
     brackets = products(rows, rows, work.constants).reshape(-1, work.dim)
     levi_constants = coordinates(rows @ modulo_radical.T, brackets @ modulo_radical.T).reshape(n, n, n)
     layers = derived_ideals(work, solvable_ideal)
-    for layer, next_layer in zip(layers[:-1], layers[1:], strict=True):
+    for layer, next_layer in itertools.pairwise(layers):
         functionals = null_space(next_layer, work.name) if len(next_layer) else work.whole_space
         directions = complement(next_layer, layer, work.name)
         m = len(directions)
