@@ -24,7 +24,7 @@ from ._rational import RationalArray, rational_array
 from .actions import Action, AdMatrixAction, Operator, terms_to_unroll, unrolled_bracket
 from .axioms import check_axioms, checked_constants, constants_and_matrices, real_columns
 from .bracket_table import constants_and_names
-from .casimirs import DEFAULT_MAX_DEGREE, casimirs, casimirs_up_to, leading_casimirs
+from .casimirs import DEFAULT_MAX_DEGREE, casimirs, casimirs_up_to, check_invariant, leading_casimirs
 from .display import algebra_html
 from .killing import cartan_involution_of, killing_form_of, row_space_basis
 from .polynomial_casimirs import casimir_count
@@ -72,6 +72,9 @@ class LieAlgebra(StructureMethods):
     >>> print(*g.casimirs(degree=2))
     mu2**2 + mu3**2
     """
+
+    invariants: tuple[Callable, ...] = ()
+    """Casimirs given by :meth:`with_invariants`."""
 
     def __init__(self, structure_constants, *, name: str = "g", basis=None, basis_names=None):
         constants = checked_constants(structure_constants)
@@ -175,6 +178,35 @@ class LieAlgebra(StructureMethods):
         """
         constants, names = constants_and_names(brackets, basis)
         return cls(constants, name=name, basis_names=names)
+
+    def with_invariants(self, *functions: Callable) -> LieAlgebra:
+        """Return an algebra that carries Casimirs beside its polynomial ones: rational or logarithmic, for example.
+
+        Systems on the algebra follow them as they follow polynomial Casimirs. Each is checked at random points: ad* of
+        its gradient must vanish.
+
+        Parameters
+        ----------
+        *functions : callable
+            Functions of mu, shape (dim,), by JAX, such as a :class:`manifolds.Formula`. They must be hashable.
+
+        Raises
+        ------
+        LieAlgebraError
+            If a function is no Casimir.
+
+        Examples
+        --------
+        >>> g = mf.bianchi("V").with_invariants(mf.Formula("y / z", ("x", "y", "z")))
+        >>> [name for name, _ in g.leading_casimirs()]
+        ['y / z']
+        """
+        for function in functions:
+            check_invariant(self, function)
+        algebra = copy(self)
+        algebra.__dict__.pop("_key", None)
+        algebra.invariants = (*self.invariants, *functions)
+        return algebra
 
     def with_basis_names(self, *names: str) -> LieAlgebra:
         """Return an equal algebra whose basis elements have names.
@@ -460,7 +492,7 @@ class LieAlgebra(StructureMethods):
     @cached_property
     def _key(self):
         basis = () if self.basis is None else (self.basis.shape, self.basis.tobytes())
-        return self.dim, self.structure_constants.tobytes(), basis
+        return self.dim, self.structure_constants.tobytes(), basis, self.invariants
 
     def _element(self, x, what: str) -> jax.Array:
         return real_components(x, self.dim, what)
