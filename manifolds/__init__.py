@@ -13,6 +13,7 @@ from .algebras.casimirs import NoPolynomialCasimirWarning
 from .algebras.catalogue import abelian, aff, bianchi, g2, galilei, gl, heisenberg, registered, se, sl, so, sp, su, u
 from .algebras.formula import Formula
 from .algebras.invariants import TracePolynomial
+from .algebras.isomorphism_type import IsomorphismType
 from .algebras.killing import trilinear_form
 from .algebras.lie_algebra import LieAlgebra
 from .algebras.magnetic import MagneticExtension, magnetic_extension
@@ -124,6 +125,7 @@ __all__ = [
     "Heisenberg",
     "Homogeneous",
     "Hyperbolic",
+    "IsomorphismType",
     "JacobiError",
     "LagrangianContact",
     "LevelSet",

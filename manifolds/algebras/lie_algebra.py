@@ -400,6 +400,26 @@ class LieAlgebra(StructureMethods):
         form = -self.killing_form() @ self.cartan_involution()
         return (form + form.T) / 2
 
+    def isomorphism_type(self):
+        """Return the isomorphism type of the algebra over the reals: names of the list of Patera et al. (1976).
+
+        The algebra may be the sum of any number of indecomposable ones of dimension up to 5. See
+        :func:`manifolds.patera` for the names and :class:`manifolds.IsomorphismType` for the result. Parameters are
+        those of one representative of each type. Where rounding leaves a choice, and above dimension 5, the result is
+        unknown, with the reason.
+
+        Examples
+        --------
+        >>> print(mf.direct_sum(mf.so(3), mf.abelian(2)).isomorphism_type())
+        A3,9 + 2 A1
+        >>> mf.bianchi("VI", h=-0.25).isomorphism_type().name
+        'A3,5^a'
+        """
+        return self._isomorphism_type(self)
+
+    _isomorphism_type: ClassVar[Callable]
+    """Classification, set by :mod:`manifolds.algebras.isomorphism_type`, which is imported after this module."""
+
     # -- many copies ----------------------------------------------------------------------------------------------
 
     def __pow__(self, sites) -> LieAlgebra:
