@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 
 import numpy as np
 
@@ -31,10 +32,7 @@ def solvable_type(work: WorkingConstants, nilradical: np.ndarray) -> Summand:
         return ("A4,12", ())
     if len(outside) == 2 and work.dim == 5:
         matrices = [_action(work, x, nilradical, derived).astype(np.float64) for x in outside]
-        if len(derived):
-            is_complex = any(block.is_complex for block in jordan_blocks(_generic_sum(matrices)))
-            return ("A5,37" if is_complex else "A5,36", ())
-        return _plane_on_abelian(matrices)
+        return _first_clear_type(matrices, _plane_on_heisenberg if len(derived) else _plane_on_abelian)
     raise LieAlgebraError(f"{work.name} has a solvable summand with a nilradical of dimension {len(nilradical)}")
 
 
@@ -125,9 +123,7 @@ def _rotation_and_lines(pair: JordanBlock, real: list[JordanBlock]) -> Summand:
     candidates_13 = []
     for value, other in (values, values[::-1]):
         if abs(value) > abs(other) * (1.0 - 1e-9):
-            candidates_13.append(
-                (ratio_or_zero(other, value), ratio_or_zero(re, value), abs(ratio_or_zero(im, value)))
-            )
+            candidates_13.append((ratio_or_zero(other, value), ratio_or_zero(re, value), abs(ratio_or_zero(im, value))))
     a, p, s = max(candidates_13)
     return _named("A5,13", a=a, p=p, s=s)
 
@@ -231,15 +227,30 @@ def _line_on_engel(work: WorkingConstants, nil, derived, x: np.ndarray) -> Summa
 # -- an abelian nilradical of codimension two --------------------------------------------------------------------
 
 
-def _generic_sum(matrices: list[np.ndarray]) -> np.ndarray:
+GENERIC_ANGLES = (0.61, 1.93, 2.71, 1.17)
+"""Angles of the combinations of two matrices that are tried until all decisions are clear."""
+
+
+def _first_clear_type(
+    matrices: list[np.ndarray], recognise: Callable[[list[np.ndarray], np.ndarray], Summand]
+) -> Summand:
+    """Return the type that a function finds from two matrices and a generic combination of them."""
     first, second = (matrix / (np.abs(matrix).max() or 1.0) for matrix in matrices)
-    return 0.8191 * first + 0.5736 * second
+    reasons = []
+    for angle in GENERIC_ANGLES:
+        try:
+            return recognise([first, second], np.cos(angle) * first + np.sin(angle) * second)
+        except UnclearError as error:
+            reasons.append(error)
+    raise reasons[0]
 
 
-def _plane_on_abelian(matrices: list[np.ndarray]) -> Summand:
+def _plane_on_heisenberg(matrices: list[np.ndarray], generic: np.ndarray) -> Summand:
+    return ("A5,37" if any(block.is_complex for block in jordan_blocks(generic)) else "A5,36", ())
+
+
+def _plane_on_abelian(matrices: list[np.ndarray], generic: np.ndarray) -> Summand:
     """Return A5,33, A5,34, A5,35, A5,38 or A5,39: two commuting matrices that act on R^3, rows being images."""
-    matrices = [matrix / (np.abs(matrix).max() or 1.0) for matrix in matrices]
-    generic = _generic_sum(matrices)
     blocks = jordan_blocks(generic)
     if _sizes(blocks) == (2, 1) and not any(block.is_complex for block in blocks):
         return _shear_and_line(matrices, generic, blocks)

@@ -1,8 +1,8 @@
 """The isomorphism type of a real Lie algebra of dimension up to 5, in the names of Patera et al. (1976).
 
-An algebra is split into indecomposable summands: abelian ones by its centre, others by idempotents of its centroid. Each
-summand is then recognised by its radical, its nilradical and the Jordan blocks of the elements outside of it. No basis
-enters these, so isomorphic algebras have one type.
+An algebra is split into indecomposable summands: abelian ones by its centre, others by idempotents of its centroid.
+Each summand is then recognised by its radical, its nilradical and the Jordan blocks of the elements outside of it. No
+basis enters these, so isomorphic algebras have one type.
 """
 
 from __future__ import annotations
@@ -34,6 +34,9 @@ from .sums import direct_sum
 
 MAX_TYPE_DIM = 5
 """Largest dimension of an indecomposable summand that has a name in the list."""
+
+CONSTANT_ROUNDING = 1e-11
+"""Constants of a summand below this are rounding, in an orthonormal basis of an algebra with constants up to 1."""
 
 
 @dataclass(frozen=True)
@@ -120,8 +123,8 @@ def _restricted(work: WorkingConstants, rows: np.ndarray) -> WorkingConstants:
     brackets = products(rows, rows, work.constants).reshape(-1, work.dim)
     constants = coordinates(rows, brackets).reshape((len(rows),) * 3) if len(rows) else np.zeros((0, 0, 0))
     if not is_exact(constants):
-        size = float(np.abs(constants).max(initial=0.0)) or 1.0
-        constants = np.where(np.abs(constants) < 1e-12 * size, 0.0, constants / size)
+        constants = np.where(np.abs(constants) < CONSTANT_ROUNDING, 0.0, constants)
+        constants = constants / (float(np.abs(constants).max(initial=0.0)) or 1.0)
     return WorkingConstants(constants, np.ones(len(rows)), work.name)
 
 
@@ -156,7 +159,9 @@ def _parts_by_centroid(work: WorkingConstants) -> list[WorkingConstants]:
             equations.append(block.reshape(n, n * n))
     basis = null_space(np.vstack(equations), work.name)
     random = np.random.default_rng(0)
-    weights = random.integers(-99, 100, len(basis)).astype(object) if is_exact(basis) else random.standard_normal(len(basis))
+    weights = (
+        random.integers(-99, 100, len(basis)).astype(object) if is_exact(basis) else random.standard_normal(len(basis))
+    )
     phi = (weights @ basis).reshape(n, n)
     eigenvalues = distinct_eigenvalues(phi)
     if len(eigenvalues) == 1:

@@ -7,7 +7,7 @@ Conventions: ``[e_a, e_b] = sum_c C[a, b, c] e_c``; the pairing of g* with g is 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from copy import copy
 from functools import cached_property
 from typing import ClassVar
@@ -203,6 +203,9 @@ class LieAlgebra(StructureMethods):
         """
         for function in functions:
             check_invariant(self, function)
+        return self._carry_invariants(functions)
+
+    def _carry_invariants(self, functions: Iterable[Callable]) -> LieAlgebra:
         algebra = copy(self)
         algebra.__dict__.pop("_key", None)
         algebra.invariants = (*self.invariants, *functions)

@@ -8,14 +8,14 @@ one with an angle in it, a function of it that has one value stands here.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 from ..errors import ParameterError
 from .formula import Formula, fill_in_parameters, is_integer_ratio
 from .lie_algebra import LieAlgebra
 
-Brackets = dict[tuple[int, int], dict[int, float]]
+Brackets = Mapping[tuple[int, int], Mapping[int, float]]
 Parameters = dict[str, float]
 
 
@@ -98,10 +98,10 @@ def patera(name: str, **parameters: float) -> LieAlgebra:
     numbers = {p: float(v) for p, v in parameters.items()}
     formulas = [Formula(fill_in_parameters(text, numbers), names) for text in entry.invariants(**parameters)]
     label = name + (f"({', '.join(f'{p}={parameters[p]:g}' for p in entry.parameters)})" if parameters else "")
-    return LieAlgebra.from_brackets(table, name=label, basis=names).with_invariants(*formulas)
+    return LieAlgebra.from_brackets(table, name=label, basis=names)._carry_invariants(formulas)
 
 
-def _line(**images: dict[int, float]) -> Brackets:
+def _line(**images: Mapping[int, float]) -> dict[tuple[int, int], Mapping[int, float]]:
     """Return the brackets ``[e_i, e_n]`` of one element with an ideal; the keywords are ``e1_5={2: …}``."""
     return {(int(key[1]), int(key[3])): image for key, image in images.items()}
 
@@ -145,8 +145,8 @@ def _dilation_and_rotation(a: float, b: float) -> tuple[str, ...]:
     return (f"(e2*cos({angle})+e3*sin({angle}))/sqrt(e2**2+e3**2)",)
 
 
-_HEISENBERG: Brackets = {(2, 3): {1: 1}}
-_ENGEL: Brackets = {(2, 4): {1: 1}, (3, 4): {2: 1}}
+_HEISENBERG: dict[tuple[int, int], Mapping[int, float]] = {(2, 3): {1: 1}}
+_ENGEL: dict[tuple[int, int], Mapping[int, float]] = {(2, 4): {1: 1}, (3, 4): {2: 1}}
 _CHAIN_2 = "(e2**2-2*e1*e3)"
 _CHAIN_3 = "(e2**3+3*e1**2*e4-3*e1*e2*e3)"
 _SPIRAL = "log(e1**2+e2**2)/(2*{a})"
@@ -207,9 +207,7 @@ CATALOGUE: dict[str, CatalogueEntry] = {
         lambda a, b: a != 0 and b >= 0,
         "a != 0, b >= 0",
     ),
-    "A4,7": CatalogueEntry(
-        _constant(_HEISENBERG | _line(e1_4={1: 2}, e2_4={2: 1}, e3_4={2: 1, 3: 1})), _list()
-    ),
+    "A4,7": CatalogueEntry(_constant(_HEISENBERG | _line(e1_4={1: 2}, e2_4={2: 1}, e3_4={2: 1, 3: 1})), _list()),
     "A4,8": CatalogueEntry(_constant(_HEISENBERG | _line(e2_4={2: 1}, e3_4={3: -1})), _list("e1", "e2*e3-e1*e4")),
     "A4,9": CatalogueEntry(
         lambda b: _HEISENBERG | _line(e1_4={1: 1 + b}, e2_4={2: 1}, e3_4={3: b}),
@@ -228,9 +226,7 @@ CATALOGUE: dict[str, CatalogueEntry] = {
         lambda a: a > 0,
         "a > 0",
     ),
-    "A4,12": CatalogueEntry(
-        _constant({(1, 3): {1: 1}, (2, 3): {2: 1}, (1, 4): {2: -1}, (2, 4): {1: 1}}), _list()
-    ),
+    "A4,12": CatalogueEntry(_constant({(1, 3): {1: 1}, (2, 3): {2: 1}, (1, 4): {2: -1}, (2, 4): {1: 1}}), _list()),
     "A5,1": CatalogueEntry(_constant(_line(e3_5={1: 1}, e4_5={2: 1})), _list("e1", "e2", "e2*e3-e1*e4")),
     "A5,2": CatalogueEntry(
         _constant(_line(e2_5={1: 1}, e3_5={2: 1}, e4_5={3: 1})), _list("e1", "e2**2-2*e1*e3", _CHAIN_3)
@@ -240,9 +236,7 @@ CATALOGUE: dict[str, CatalogueEntry] = {
     ),
     "A5,4": CatalogueEntry(_constant({(2, 4): {1: 1}, (3, 5): {1: 1}}), _list("e1")),
     "A5,5": CatalogueEntry(_constant({(3, 4): {1: 1}, (2, 5): {1: 1}, (3, 5): {2: 1}}), _list("e1")),
-    "A5,6": CatalogueEntry(
-        _constant({(3, 4): {1: 1}, (2, 5): {1: 1}, (3, 5): {2: 1}, (4, 5): {3: 1}}), _list("e1")
-    ),
+    "A5,6": CatalogueEntry(_constant({(3, 4): {1: 1}, (2, 5): {1: 1}, (3, 5): {2: 1}, (4, 5): {3: 1}}), _list("e1")),
     "A5,7": CatalogueEntry(
         lambda a, b, c: _line(e1_5={1: 1}, e2_5={2: a}, e3_5={3: b}, e4_5={4: c}),
         _list("e2*abs(e1)**(-{a})", "e3*abs(e1)**(-{b})", "e4*abs(e1)**(-{c})"),
@@ -389,9 +383,7 @@ CATALOGUE: dict[str, CatalogueEntry] = {
         _list("e1*abs(e4)**(-{a})"),
         ("a",),
     ),
-    "A5,29": CatalogueEntry(
-        _constant({(2, 4): {1: 1}} | _line(e1_5={1: 1}, e2_5={2: 1}, e4_5={3: 1})), _list("e3")
-    ),
+    "A5,29": CatalogueEntry(_constant({(2, 4): {1: 1}} | _line(e1_5={1: 1}, e2_5={2: 1}, e4_5={3: 1})), _list("e3")),
     "A5,30": CatalogueEntry(
         lambda a: _ENGEL | _line(e1_5={1: a + 1}, e2_5={2: a}, e3_5={3: a - 1}, e4_5={4: 1}),
         _list(f"abs{_CHAIN_2}**({{a}}+1)*abs(e1)**(-2*{{a}})"),
@@ -437,9 +429,7 @@ CATALOGUE: dict[str, CatalogueEntry] = {
         _list("e5+e2*e3/e1"),
     ),
     "A5,37": CatalogueEntry(
-        _constant(
-            _HEISENBERG | {(1, 4): {1: 2}, (2, 4): {2: 1}, (3, 4): {3: 1}, (2, 5): {3: -1}, (3, 5): {2: 1}}
-        ),
+        _constant(_HEISENBERG | {(1, 4): {1: 2}, (2, 4): {2: 1}, (3, 4): {3: 1}, (2, 5): {3: -1}, (3, 5): {2: 1}}),
         _list("e5+(e2**2+e3**2)/(2*e1)"),
     ),
     "A5,38": CatalogueEntry(_constant({(1, 4): {1: 1}, (2, 5): {2: 1}, (4, 5): {3: 1}}), _list("e3")),
