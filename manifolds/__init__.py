@@ -11,11 +11,14 @@ from ._names import public_dir
 from .algebras.blocks import DirectSum, power
 from .algebras.casimirs import NoPolynomialCasimirWarning
 from .algebras.catalogue import abelian, aff, bianchi, g2, galilei, gl, heisenberg, registered, se, sl, so, sp, su, u
+from .algebras.formula import Formula
 from .algebras.invariants import TracePolynomial
+from .algebras.isomorphism_type import IsomorphismType
 from .algebras.killing import trilinear_form
 from .algebras.lie_algebra import LieAlgebra
 from .algebras.magnetic import MagneticExtension, magnetic_extension
 from .algebras.matrix_algebra import MatrixAlgebra, MatrixTrace
+from .algebras.patera import patera
 from .algebras.polynomial import Polynomial
 from .algebras.sums import direct_sum, semidirect_sum
 from .errors import (
@@ -114,6 +117,7 @@ __all__ = [
     "ExtendedPhaseSpace",
     "Flag",
     "ForkError",
+    "Formula",
     "GeomstatsSpace",
     "Grassmann",
     "GroupRetraction",
@@ -121,6 +125,7 @@ __all__ = [
     "Heisenberg",
     "Homogeneous",
     "Hyperbolic",
+    "IsomorphismType",
     "JacobiError",
     "LagrangianContact",
     "LevelSet",
@@ -178,6 +183,7 @@ __all__ = [
     "gl",
     "heisenberg",
     "magnetic_extension",
+    "patera",
     "power",
     "registered",
     "registered_groups",

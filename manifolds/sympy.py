@@ -14,6 +14,7 @@ import numpy as np
 import sympy
 
 from ._names import component_names, public_dir
+from .algebras.formula import Formula
 from .algebras.lie_algebra import LieAlgebra
 from .algebras.polynomial import Polynomial
 from .errors import ComponentError, ShapeError
@@ -29,12 +30,12 @@ def symbols(dim: int, names: Sequence[str] | None = None) -> tuple[sympy.Symbol,
     )
 
 
-def expression(polynomial: Polynomial, variables: Sequence[sympy.Symbol] | None = None) -> sympy.Expr:
-    """Return a polynomial as a SymPy expression; fractions stay exact.
+def expression(polynomial: Polynomial | Formula, variables: Sequence[sympy.Symbol] | None = None) -> sympy.Expr:
+    """Return a polynomial or a formula as a SymPy expression; fractions stay exact.
 
     Parameters
     ----------
-    polynomial : Polynomial
+    polynomial : Polynomial or Formula
         A Casimir, for example; expand a ``TracePolynomial`` by its ``expanded()`` first.
     variables : sequence of dim symbols, optional
         By default the symbols of :func:`symbols`, with the names of the polynomial.
@@ -47,6 +48,9 @@ def expression(polynomial: Polynomial, variables: Sequence[sympy.Symbol] | None 
     generators = symbols(polynomial.dim, polynomial.names) if variables is None else tuple(variables)
     if len(generators) != polynomial.dim:
         raise ShapeError(f"a polynomial in {polynomial.dim} variables needs as many symbols, not {len(generators)}")
+    if isinstance(polynomial, Formula):
+        meanings = dict(zip(polynomial.names, generators, strict=True)) | {"abs": sympy.Abs}
+        return sympy.sympify(polynomial.text, locals=meanings)
     return sympy.Add(
         *(
             _number(coefficient) * sympy.Mul(*(x**e for x, e in zip(generators, power, strict=True)))

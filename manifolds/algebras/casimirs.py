@@ -12,9 +12,12 @@ import math
 import warnings
 from collections.abc import Callable
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from ..errors import ParameterError, warn
+from ..errors import LieAlgebraError, ParameterError, warn
+from .formula import Formula
 from .invariants import TracePolynomial, fundamental_invariants
 from .polynomial import Polynomial
 from .polynomial_casimirs import TooLargeError, casimir_count, new_casimirs
@@ -112,4 +115,42 @@ def leading_casimirs(g: AlgebraStructure) -> list[tuple[str, Callable]]:
         for i, casimir in enumerate(polynomials):
             text = str(casimir)
             named_casimirs.append((text if len(text) <= 60 else f"Casimir {i + 1} of degree {degree}", casimir))
-    return named_casimirs
+    return named_casimirs + _independent_invariants(g, [F for _, F in named_casimirs], count)
+
+
+def _independent_invariants(g: AlgebraStructure, polynomials: list, count: int) -> list[tuple[str, Callable]]:
+    """Return the invariants given with the algebra that are independent of the polynomials at a random point."""
+    functions, named_invariants = list(polynomials), list[tuple[str, Callable]]()
+    mu = np.random.default_rng(0).standard_normal(g.dim)
+    for i, invariant in enumerate(g.invariants):
+        if len(functions) >= count:
+            break
+        with jax.ensure_compile_time_eval():
+            gradients = np.array([jax.grad(F)(jnp.asarray(mu)) for F in (*functions, invariant)])
+        gradients /= np.linalg.norm(gradients, axis=1, keepdims=True)
+        if np.linalg.matrix_rank(gradients, tol=1e-9) > len(functions):
+            functions.append(invariant)
+            text = str(invariant)
+            label = text if isinstance(invariant, Formula) and len(text) <= 60 else f"invariant {i + 1}"
+            named_invariants.append((label, invariant))
+    return named_invariants
+
+
+INVARIANT_TOLERANCE = 1e-9
+"""Largest relative size of ``ad* mu`` of the gradient of a function that counts as a Casimir: rounding of powers."""
+
+
+def check_invariant(g: AlgebraStructure, function: Callable) -> None:
+    """Raise LieAlgebraError if ``ad*_{grad F(mu)} mu`` does not vanish at random points."""
+    for mu in np.random.default_rng(1).standard_normal((4, g.dim)):
+        gradient = np.asarray(jax.grad(function)(jnp.asarray(mu)))
+        scale = np.linalg.norm(gradient) * np.linalg.norm(mu) * max(1.0, float(np.abs(g.structure_constants).max()))
+        residual = float(np.linalg.norm(np.asarray(g.ad_star(gradient, mu))))
+        if not residual <= INVARIANT_TOLERANCE * scale:
+            raise LieAlgebraError(
+                f"{function} is no Casimir of {g.name}: at mu = {np.round(mu, 3).tolist()}, ad* mu of its gradient has "
+                f"the size {residual:.3g}, not 0 (tolerance {INVARIANT_TOLERANCE * scale:.1g}); check the signs, and "
+                "that it is finite there",
+                residual=residual,
+                tolerance=INVARIANT_TOLERANCE * scale,
+            )

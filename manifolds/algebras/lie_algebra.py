@@ -7,7 +7,7 @@ Conventions: ``[e_a, e_b] = sum_c C[a, b, c] e_c``; the pairing of g* with g is 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from copy import copy
 from functools import cached_property
 from typing import ClassVar
@@ -24,7 +24,7 @@ from ._rational import RationalArray, rational_array
 from .actions import Action, AdMatrixAction, Operator, terms_to_unroll, unrolled_bracket
 from .axioms import check_axioms, checked_constants, constants_and_matrices, real_columns
 from .bracket_table import constants_and_names
-from .casimirs import DEFAULT_MAX_DEGREE, casimirs, casimirs_up_to, leading_casimirs
+from .casimirs import DEFAULT_MAX_DEGREE, casimirs, casimirs_up_to, check_invariant, leading_casimirs
 from .display import algebra_html
 from .killing import cartan_involution_of, killing_form_of, row_space_basis
 from .polynomial_casimirs import casimir_count
@@ -72,6 +72,9 @@ class LieAlgebra(StructureMethods):
     >>> print(*g.casimirs(degree=2))
     mu2**2 + mu3**2
     """
+
+    invariants: tuple[Callable, ...] = ()
+    """Casimirs given by :meth:`with_invariants`."""
 
     def __init__(self, structure_constants, *, name: str = "g", basis=None, basis_names=None):
         constants = checked_constants(structure_constants)
@@ -175,6 +178,38 @@ class LieAlgebra(StructureMethods):
         """
         constants, names = constants_and_names(brackets, basis)
         return cls(constants, name=name, basis_names=names)
+
+    def with_invariants(self, *functions: Callable) -> LieAlgebra:
+        """Return an algebra that carries Casimirs beside its polynomial ones: rational or logarithmic, for example.
+
+        Systems on the algebra follow them as they follow polynomial Casimirs. Each is checked at random points: ad* of
+        its gradient must vanish.
+
+        Parameters
+        ----------
+        *functions : callable
+            Functions of mu, shape (dim,), by JAX, such as a :class:`manifolds.Formula`. They must be hashable.
+
+        Raises
+        ------
+        LieAlgebraError
+            If a function is no Casimir.
+
+        Examples
+        --------
+        >>> g = mf.bianchi("V").with_invariants(mf.Formula("y / z", ("x", "y", "z")))
+        >>> [name for name, _ in g.leading_casimirs()]
+        ['y / z']
+        """
+        for function in functions:
+            check_invariant(self, function)
+        return self._carry_invariants(functions)
+
+    def _carry_invariants(self, functions: Iterable[Callable]) -> LieAlgebra:
+        algebra = copy(self)
+        algebra.__dict__.pop("_key", None)
+        algebra.invariants = (*self.invariants, *functions)
+        return algebra
 
     def with_basis_names(self, *names: str) -> LieAlgebra:
         """Return an equal algebra whose basis elements have names.
@@ -368,6 +403,26 @@ class LieAlgebra(StructureMethods):
         form = -self.killing_form() @ self.cartan_involution()
         return (form + form.T) / 2
 
+    def isomorphism_type(self):
+        """Return the isomorphism type of the algebra over the reals: names of the list of Patera et al. (1976).
+
+        The algebra may be the sum of any number of indecomposable ones of dimension up to 5. See
+        :func:`manifolds.patera` for the names and :class:`manifolds.IsomorphismType` for the result. Parameters are
+        those of one representative of each type. Where rounding leaves a choice, and above dimension 5, the result is
+        unknown, with the reason.
+
+        Examples
+        --------
+        >>> print(mf.direct_sum(mf.so(3), mf.abelian(2)).isomorphism_type())
+        A3,9 + 2 A1
+        >>> mf.bianchi("VI", h=-0.25).isomorphism_type().name
+        'A3,5^a'
+        """
+        return self._isomorphism_type(self)
+
+    _isomorphism_type: ClassVar[Callable]
+    """Classification, set by :mod:`manifolds.algebras.isomorphism_type`, which is imported after this module."""
+
     # -- many copies ----------------------------------------------------------------------------------------------
 
     def __pow__(self, sites) -> LieAlgebra:
@@ -460,7 +515,7 @@ class LieAlgebra(StructureMethods):
     @cached_property
     def _key(self):
         basis = () if self.basis is None else (self.basis.shape, self.basis.tobytes())
-        return self.dim, self.structure_constants.tobytes(), basis
+        return self.dim, self.structure_constants.tobytes(), basis, self.invariants
 
     def _element(self, x, what: str) -> jax.Array:
         return real_components(x, self.dim, what)

@@ -1,0 +1,303 @@
+"""Names and parameters of indecomposable solvable algebras of dimension 3 to 5, by their nilradical."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+
+import numpy as np
+
+from ..errors import LieAlgebraError
+from ._jordan import JordanBlock, UnclearError, is_zero, jordan_blocks, ratio_or_zero
+from ._subspaces import complement, coordinates, intersection, null_space, products, row_space
+from .substructure import WorkingConstants, centralizer
+
+Summand = tuple[str, tuple[tuple[str, float], ...]]
+"""Name of an algebra of the list, and the values of its parameters."""
+
+
+def solvable_type(work: WorkingConstants, nilradical: np.ndarray) -> Summand:
+    """Return the type of an indecomposable solvable algebra that is not nilpotent."""
+    outside = complement(nilradical, work.whole_space, work.name)
+    derived = work.span_of_brackets(nilradical, nilradical)
+    if len(outside) == 1:
+        if not len(derived):
+            return _line_on_abelian(jordan_blocks(_action(work, outside[0], nilradical, derived)))
+        if work.dim == 4:
+            return _line_on_heisenberg(jordan_blocks(_action(work, outside[0], nilradical, derived)))
+        if len(derived) == 2:
+            return _line_on_engel(work, nilradical, derived, outside[0])
+        return _line_on_heisenberg_and_line(work, nilradical, derived, outside[0])
+    if len(outside) == 2 and work.dim == 4:
+        return ("A4,12", ())
+    if len(outside) == 2 and work.dim == 5:
+        matrices = [_action(work, x, nilradical, derived).astype(np.float64) for x in outside]
+        return _first_clear_type(matrices, _plane_on_heisenberg if len(derived) else _plane_on_abelian)
+    raise LieAlgebraError(f"{work.name} has a solvable summand with a nilradical of dimension {len(nilradical)}")
+
+
+def _action(work: WorkingConstants, x: np.ndarray, ideal: np.ndarray, quotient: np.ndarray) -> np.ndarray:
+    """Return the matrix, rows being images, of ``y -> [y, x]`` on an ideal modulo a smaller ideal."""
+    representatives = complement(quotient, ideal, work.name)
+    images = products(representatives, x[None], work.constants)[:, 0]
+    basis = np.vstack([representatives, row_space(quotient, work.name)])
+    return coordinates(basis, images)[:, : len(representatives)]
+
+
+def _named(name: str, **parameters: float) -> Summand:
+    return (name, tuple((key, float(value)) for key, value in parameters.items()))
+
+
+def _sizes(blocks: list[JordanBlock]) -> tuple[int, ...]:
+    return tuple(sorted((block.size for block in blocks), reverse=True))
+
+
+def _scale(blocks: list[JordanBlock]) -> float:
+    return max(abs(block.eigenvalue) for block in blocks)
+
+
+def _largest_first(values: list[float]) -> tuple[float, ...]:
+    """Return real values divided by one of largest size, without it: the descending list that is largest."""
+    top = max(map(abs, values))
+    candidates = []
+    for i, value in enumerate(values):
+        if abs(value) > top * (1.0 - 1e-9):
+            others = [ratio_or_zero(other, value) for j, other in enumerate(values) if j != i]
+            candidates.append(tuple(sorted(others, reverse=True)))
+    return max(candidates)
+
+
+# -- an abelian nilradical of codimension one --------------------------------------------------------------------
+
+
+def _line_on_abelian(blocks: list[JordanBlock]) -> Summand:
+    real = [block for block in blocks if not block.is_complex]
+    pairs = [block for block in blocks if block.is_complex]
+    if pairs and not real:
+        return _rotations(pairs)
+    if pairs:
+        return _rotation_and_lines(pairs[0], real)
+    scale = _scale(blocks)
+    values = [block.eigenvalue.real for block in real]
+    sizes = tuple(block.size for block in real)
+    if set(sizes) == {1}:
+        return _diagonal(_largest_first(values))
+    head = values[0]
+    if len(values) == 1:
+        return ({2: "A3,2", 3: "A4,4", 4: "A5,12"}[sizes[0]], ())
+    if sizes == (2, 2):
+        return _named("A5,15", a=_largest_first(values)[0])
+    if is_zero(head, scale):
+        if sizes == (2, 1, 1):
+            return _named("A5,8", c=_largest_first(values[1:])[0])
+        return ({2: "A4,3", 3: "A5,10"}[sizes[0]], ())
+    others = sorted((ratio_or_zero(value, head) for value in values[1:]), reverse=True)
+    if sizes == (2, 1):
+        return _named("A4,2", a=others[0])
+    if sizes == (3, 1):
+        return _named("A5,11", c=others[0])
+    return _named("A5,9", b=others[0], c=others[1])
+
+
+def _diagonal(ratios: tuple[float, ...]) -> Summand:
+    if len(ratios) == 1:
+        if is_zero(ratios[0] - 1.0):
+            return ("A3,3", ())
+        return ("A3,4", ()) if is_zero(ratios[0] + 1.0) else _named("A3,5", a=ratios[0])
+    names = "ab" if len(ratios) == 2 else "abc"
+    return _named("A4,5" if len(ratios) == 2 else "A5,7", **dict(zip(names, ratios, strict=True)))
+
+
+def _rotation_and_lines(pair: JordanBlock, real: list[JordanBlock]) -> Summand:
+    re, im = pair.eigenvalue.real, pair.eigenvalue.imag
+    values = [block.eigenvalue.real for block in real]
+    if len(values) == 1 and real[0].size == 1:
+        candidates = [(ratio_or_zero(re, sign * im), ratio_or_zero(values[0], sign * im)) for sign in (1, -1)]
+        b, a = max(candidates)
+        return _named("A4,6", a=a, b=b)
+    if len(values) == 1:
+        scale = max(abs(pair.eigenvalue), abs(values[0]))
+        if is_zero(values[0], scale):
+            return _named("A5,14", p=abs(ratio_or_zero(re, im)))
+        return _named("A5,16", p=ratio_or_zero(re, values[0]), s=abs(ratio_or_zero(im, values[0])))
+    candidates_13 = []
+    for value, other in (values, values[::-1]):
+        if abs(value) > abs(other) * (1.0 - 1e-9):
+            candidates_13.append((ratio_or_zero(other, value), ratio_or_zero(re, value), abs(ratio_or_zero(im, value))))
+    a, p, s = max(candidates_13)
+    return _named("A5,13", a=a, p=p, s=s)
+
+
+def _rotations(pairs: list[JordanBlock]) -> Summand:
+    if len(pairs) == 1 and pairs[0].size == 2:
+        return _named("A5,18", p=abs(ratio_or_zero(pairs[0].eigenvalue.real, pairs[0].eigenvalue.imag)))
+    if len(pairs) == 1:
+        p = abs(ratio_or_zero(pairs[0].eigenvalue.real, pairs[0].eigenvalue.imag))
+        return ("A3,6", ()) if is_zero(p) else _named("A3,7", a=p)
+    candidates = []
+    for first, second in (pairs, pairs[::-1]):
+        z, w = first.eigenvalue, second.eigenvalue
+        if z.imag > w.imag * (1.0 - 1e-9):
+            for sign in (1, -1):
+                scale = sign * z.imag
+                candidates.append(
+                    (ratio_or_zero(z.real, scale), ratio_or_zero(w.real, scale), ratio_or_zero(w.imag, z.imag))
+                )
+    p, q, s = max(candidates)
+    return _named("A5,17", p=p, q=q, s=s)
+
+
+# -- a Heisenberg nilradical, or one of its sums with a line ----------------------------------------------------
+
+
+def _line_on_heisenberg(blocks: list[JordanBlock]) -> Summand:
+    if blocks[0].size == 2:
+        return ("A4,7", ())
+    if blocks[0].is_complex:
+        a = abs(ratio_or_zero(blocks[0].eigenvalue.real, blocks[0].eigenvalue.imag))
+        return ("A4,10", ()) if is_zero(a) else _named("A4,11", a=a)
+    b = _largest_first([block.eigenvalue.real for block in blocks])[0]
+    return ("A4,8", ()) if is_zero(b + 1.0) else _named("A4,9", b=b)
+
+
+def _line_on_heisenberg_and_line(work: WorkingConstants, nil, derived, x: np.ndarray) -> Summand:
+    """Return one of A5,19 to A5,29, where x acts on ``nil``, the sum of a Heisenberg algebra and a line."""
+    inner_centre = row_space(_centre_of_ideal(work, nil), work.name)
+    plane = jordan_blocks(_action(work, x, nil, inner_centre))
+    with_line = jordan_blocks(_action(work, x, nil, derived))
+    centre_blocks = jordan_blocks(_action(work, x, inner_centre, derived[:0]))
+    line = float(_action(work, x, inner_centre, derived)[0, 0])
+    trace = float(_action(work, x, derived, derived[:0])[0, 0])
+    line_moves_centre = centre_blocks[0].size == 2
+    plane_moves_line = len(with_line) < len(plane) + 1
+    if plane[0].is_complex:
+        z = plane[0].eigenvalue
+        p, b = max((ratio_or_zero(z.real, sign * z.imag), ratio_or_zero(line, sign * z.imag)) for sign in (1, -1))
+        return _named("A5,26", p=p, eps=1) if line_moves_centre else _named("A5,25", b=b, p=p)
+    scale = max(_scale(plane), abs(line))
+    if plane[0].size == 2:
+        value = plane[0].eigenvalue.real
+        if is_zero(value, scale):
+            return ("A5,22", ())
+        if plane_moves_line:
+            return ("A5,21", ())
+        return _named("A5,24", eps=1) if line_moves_centre else _named("A5,23", b=ratio_or_zero(line, value))
+    if plane_moves_line:
+        if is_zero(line, scale):
+            return ("A5,29", ())
+        return ("A5,27", ()) if line_moves_centre else _named("A5,28", a=ratio_or_zero(trace, line))
+    values = [block.eigenvalue.real for block in plane]
+    top = max(map(abs, values))
+    candidates = [
+        (ratio_or_zero(trace, value), ratio_or_zero(line, value)) for value in values if abs(value) > top * (1.0 - 1e-9)
+    ]
+    a, b = max(candidates)
+    return _named("A5,20", a=a) if line_moves_centre else _named("A5,19", a=a, b=b)
+
+
+def _centre_of_ideal(work: WorkingConstants, ideal: np.ndarray) -> np.ndarray:
+    """Return rows that span the centre of an ideal."""
+    from_inside = products(ideal, ideal, work.constants).reshape(len(ideal), -1)
+    return null_space(from_inside.T, work.name) @ ideal
+
+
+# -- the nilradical A4,1 ---------------------------------------------------------------------------------------------
+
+
+def _line_on_engel(work: WorkingConstants, nil, derived, x: np.ndarray) -> Summand:
+    """Return one of A5,30 to A5,32, where x acts on ``nil``, which is of type A4,1."""
+    commutant = centralizer(work, derived)
+    rows = intersection(commutant, nil, work.name)
+    last = float(_action(work, x, nil, rows)[0, 0])
+    third = float(_action(work, x, rows, derived)[0, 0])
+    blocks = jordan_blocks(_action(work, x, nil, derived))
+    if not is_zero(last, max(abs(last), abs(third))):
+        if blocks[0].size == 2:
+            return ("A5,31", ())
+        return _named("A5,30", a=ratio_or_zero(third, last) + 1.0)
+    motion = _action(work, x, rows, derived[:0]).astype(np.float64) / third
+    shift = _action(work, complement(rows, nil, work.name)[0], rows, derived[:0]).astype(np.float64)
+    shift = shift / np.linalg.norm(shift @ shift) ** 0.5
+    square = shift @ shift
+    design = np.stack([shift.ravel(), square.ravel()], axis=1)
+    weights, *_ = np.linalg.lstsq(design, (motion - np.eye(3)).ravel(), rcond=None)
+    return _named("A5,32", a=0.0 if is_zero(weights[1], max(1.0, float(np.abs(motion).max()))) else np.sign(weights[1]))
+
+
+# -- an abelian nilradical of codimension two --------------------------------------------------------------------
+
+
+GENERIC_ANGLES = (0.61, 1.93, 2.71, 1.17)
+"""Angles of the combinations of two matrices that are tried until all decisions are clear."""
+
+
+def _first_clear_type(
+    matrices: list[np.ndarray], recognise: Callable[[list[np.ndarray], np.ndarray], Summand]
+) -> Summand:
+    """Return the type that a function finds from two matrices and a generic combination of them."""
+    first, second = (matrix / (np.abs(matrix).max() or 1.0) for matrix in matrices)
+    reasons = []
+    for angle in GENERIC_ANGLES:
+        try:
+            return recognise([first, second], np.cos(angle) * first + np.sin(angle) * second)
+        except UnclearError as error:
+            reasons.append(error)
+    raise reasons[0]
+
+
+def _plane_on_heisenberg(matrices: list[np.ndarray], generic: np.ndarray) -> Summand:
+    return ("A5,37" if any(block.is_complex for block in jordan_blocks(generic)) else "A5,36", ())
+
+
+def _plane_on_abelian(matrices: list[np.ndarray], generic: np.ndarray) -> Summand:
+    """Return A5,33, A5,34, A5,35, A5,38 or A5,39: two commuting matrices that act on R^3, rows being images."""
+    blocks = jordan_blocks(generic)
+    if _sizes(blocks) == (2, 1) and not any(block.is_complex for block in blocks):
+        return _shear_and_line(matrices, generic, blocks)
+    eigenvalues, vectors = np.linalg.eig(generic)
+    inverse = np.linalg.inv(vectors)
+    weights = np.array([np.diag(inverse @ matrix @ vectors) for matrix in matrices]).T  # of each eigenvector
+    if not any(block.is_complex for block in blocks):
+        weights = weights.real
+        if any(is_zero(float(np.abs(weight).max())) for weight in weights):
+            return ("A5,38", ())
+        candidates = []
+        for i, j, k in itertools.permutations(range(3)):
+            basis = weights[[i, j]]
+            if abs(np.linalg.det(basis)) > 1e-7:
+                b, a = np.linalg.solve(basis.T, weights[k])
+                candidates.append((ratio_or_zero(a, 1.0), ratio_or_zero(b, 1.0)))
+        a, b = min(candidates, key=lambda pair: (round(abs(pair[0]) + abs(pair[1]), 9), -pair[0], -pair[1]))
+        return _named("A5,33", a=a, b=b)
+    pair = int(np.argmax(eigenvalues.imag))
+    line = weights[int(np.argmin(np.abs(eigenvalues.imag)))].real
+    if is_zero(float(np.abs(line).max())):
+        return ("A5,39", ())
+    parts = np.array([weights[pair].real, weights[pair].imag])
+    if abs(np.linalg.det(parts)) < 1e-7:
+        raise UnclearError("the dilation and the rotation of a plane are nearly dependent")
+    b, a = np.linalg.solve(parts.T, line)
+    return _named("A5,35", a=abs(ratio_or_zero(a, 1.0)), b=ratio_or_zero(b, 1.0))
+
+
+def _shear_and_line(matrices: list[np.ndarray], generic: np.ndarray, blocks: list[JordanBlock]) -> Summand:
+    """Return A5,34: one plane is sheared, and a line scaled."""
+    double = next(block.eigenvalue.real for block in blocks if block.size == 2)
+    single = next(block.eigenvalue.real for block in blocks if block.size == 1)
+    identity = np.eye(3)
+    nilpotent = (generic - double * identity) @ (generic - single * identity)  # a multiple of the shear
+    on_plane = np.linalg.matrix_power(generic - double * identity, 2) / (single - double) ** 2  # projects on the line
+    plane = identity - on_plane
+    line_weights = np.array([np.trace(on_plane @ matrix) for matrix in matrices])
+    plane_weights = np.array([np.trace(plane @ matrix) / 2.0 for matrix in matrices])
+    shear = np.array(
+        [
+            np.sum(nilpotent * (matrix @ plane - weight * plane)) / np.sum(nilpotent**2)
+            for matrix, weight in zip(matrices, plane_weights, strict=True)
+        ]
+    )
+    conditions = np.array([shear / np.abs(shear).max(), plane_weights])
+    if abs(np.linalg.det(conditions)) < 1e-7:
+        raise UnclearError("the shear and the dilation of a plane are nearly dependent")
+    a = line_weights @ np.linalg.solve(conditions, [0.0, 1.0])
+    return _named("A5,34", a=ratio_or_zero(float(a), 1.0))
