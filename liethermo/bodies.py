@@ -10,10 +10,12 @@ from manifolds._names import public_dir
 
 from .models.free_motion import Periods, damping_time, periods, rate_of
 from .models.inertia import PrincipalAxes, principal_axes
+from .results.attitude_files import AttitudeHistory, read_csv, write_csv
 from .results.orientation import angular_velocity, euler_angles, nutation, precession, quaternions, rotation, spin
 from .systems.rotations import AttitudeWarning, attitude
 
 __all__ = [
+    "AttitudeHistory",
     "AttitudeWarning",
     "Periods",
     "PrincipalAxes",
@@ -27,7 +29,9 @@ __all__ = [
     "principal_axes",
     "quaternions",
     "rate_of",
+    "read_csv",
     "rotation",
     "spin",
+    "write_csv",
 ]
 __dir__ = public_dir(__all__)
