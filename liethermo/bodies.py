@@ -13,10 +13,12 @@ from .models.inertia import PrincipalAxes, principal_axes
 from .models.jointed_bodies import JointedBodies
 from .models.joints import Hinge, Slider, Universal
 from .models.tree import Tree
+from .results.attitude_files import AttitudeHistory, read_csv, write_csv
 from .results.orientation import angular_velocity, euler_angles, nutation, precession, quaternions, rotation, spin
 from .systems.rotations import AttitudeWarning, attitude
 
 __all__ = [
+    "AttitudeHistory",
     "AttitudeWarning",
     "Hinge",
     "JointedBodies",
@@ -35,7 +37,9 @@ __all__ = [
     "principal_axes",
     "quaternions",
     "rate_of",
+    "read_csv",
     "rotation",
     "spin",
+    "write_csv",
 ]
 __dir__ = public_dir(__all__)

@@ -16,6 +16,7 @@ from manifolds._pytree_module import Module
 from ..errors import InputError
 from ..systems import EulerPoincareClosedSystem
 from ..systems.torque import MIN_ARGUMENTS, check_torque, evaluate_torque, torque_name
+from .inertia import checked_inertia
 from .parameters import checked_positive
 
 
@@ -27,7 +28,8 @@ class _Lagrangian(Module):
 
     def __call__(self, xi, S):
         body, wheel = xi[:3], xi[3:]
-        kinetic = 0.5 * jnp.dot(self.inertia * body, body) + 0.5 * jnp.dot(self.wheels * (body + wheel), body + wheel)
+        momentum = self.inertia @ body if self.inertia.ndim == 2 else self.inertia * body
+        kinetic = 0.5 * jnp.dot(momentum, body) + 0.5 * jnp.dot(self.wheels * (body + wheel), body + wheel)
         return kinetic - self.heat * self.temperature * jnp.exp(S / self.heat)
 
 
@@ -57,7 +59,7 @@ def body_with_wheels(
     temperature: float = 1.0,
     torque=None,
 ) -> EulerPoincareClosedSystem:
-    """A body with three wheels, one about each principal axis, whose bearing friction heats it.
+    """A body with three wheels, one about each body axis, whose bearing friction heats it.
 
     ``l = sum I_i Omega_i^2 / 2 + sum J_i (Omega_i + w_i)^2 / 2 - C T_0 exp(S / C)`` on so(3) + R^3, ``f = -k w`` on the
     wheels alone, in the state (Omega, w, S). No friction acts on the rotation as a whole, so the spatial angular
@@ -66,8 +68,10 @@ def body_with_wheels(
 
     Parameters
     ----------
-    inertia, wheels : three numbers, > 0
-        I of the body, J of the wheels (mass * length**2).
+    inertia : three positive numbers, or array of shape (3, 3)
+        Principal moments I of the body without its wheels, or its tensor in body axes (mass * length**2).
+    wheels : three numbers, > 0
+        J of the wheels, one about each body axis (mass * length**2).
     friction, heat, temperature : float, > 0
         k (mass * length**2 / time), the heat capacity C, and T_0.
     torque : torque of (t, mu), or a list of them; optional
@@ -79,7 +83,7 @@ def body_with_wheels(
     ------
     InputError
     """
-    body, wheel = _principal_moments(inertia), checked_positive(wheels, "wheels", 3)
+    body, wheel = jnp.asarray(checked_inertia(inertia)), checked_positive(wheels, "wheels", 3)
     lagrangian = _Lagrangian(body, wheel, checked_positive(heat, "heat"), checked_positive(temperature, "temperature"))
     algebra = mf.direct_sum(mf.so(3), mf.abelian(3))
     external = None
@@ -97,16 +101,6 @@ def body_with_wheels(
 
 def body_with_wheels_rest(momentum, energy, inertia=(3.0, 2.0, 1.0), wheels=(0.3, 0.3, 0.3), heat=2.0) -> float:
     """Return the final temperature, from the norm of the angular momentum and the total energy."""
-    greatest = float(np.max(_principal_moments(inertia) + checked_positive(wheels, "wheels", 3)))
+    body, wheel = np.asarray(checked_inertia(inertia)), np.asarray(checked_positive(wheels, "wheels", 3))
+    greatest = float(np.linalg.eigvalsh((np.diag(body) if body.ndim == 1 else body) + np.diag(wheel))[-1])
     return (float(energy) - float(momentum) ** 2 / (2 * greatest)) / heat
-
-
-def _principal_moments(inertia) -> jax.Array:
-    """Return the principal moments of the body, shape (3,); a tensor is refused, since the wheels need principal
-    axes."""
-    if np.shape(inertia) == (3, 3):
-        raise InputError(
-            "inertia must be three principal moments, since there is a wheel along each principal axis, got an array "
-            "of shape (3, 3): give liethermo.bodies.principal_axes(inertia).moments"
-        )
-    return checked_positive(inertia, "inertia", 3)

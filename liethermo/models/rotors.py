@@ -20,7 +20,7 @@ from ..functions.energy import Quadratic
 from ..functions.frames import sqrt_or_zero
 from ..functions.indices import Indices
 from ..systems import HeatBaths, LiePoissonSystem
-from .inertia import checked_inertia, inverse_inertia, principal_moments
+from .inertia import checked_inertia, inverse_inertia
 from .parameters import checked_positive
 
 
@@ -324,7 +324,8 @@ def spin_temperature(momentum, energy, inertia, capacity=1.0, temperature=1.0) -
     inertia, capacity, temperature
         As for the models.
     """
-    greatest = float(np.max(principal_moments(inertia)))
+    moments = np.asarray(checked_inertia(inertia))
+    greatest = float(moments.max() if moments.ndim == 1 else np.linalg.eigvalsh(moments)[-1])
     return temperature + (float(energy) - float(momentum) ** 2 / (2.0 * greatest)) / capacity
 
 

@@ -15,6 +15,7 @@ from manifolds import ManifoldsError
 
 from ..engines.compiled.parameters import ProgramStructure, parameter_arrays
 from ..errors import InputError, LiethermoError
+from ..models.inertia import are_inertia_tensors
 from ..systems import System
 from ..tracing.caching import fingerprint
 from ..tracing.traced import TracedFunction, trace_function
@@ -102,6 +103,11 @@ class Family:
             if values[name].ndim == 0 or values[name].shape[1:] != leaves[name].shape:
                 expected_shape = ", ".join(["trajectories", *map(str, leaves[name].shape)])
                 raise InputError(f"the values of {name} must have shape ({expected_shape}), got {values[name].shape}")
+            if name.endswith("inertia") and leaves[name].shape == (3,) and are_inertia_tensors(values[name]):
+                raise InputError(
+                    f"the values of {name} are the tensor of inertia of one body, but three sets of principal moments "
+                    "are expected. Give the moments of each trajectory as a row, or a system with a tensor"
+                )
         return cls(ProgramStructure.from_module(system), list(values.values()), None if parameters else system)
 
     @classmethod

@@ -1,0 +1,82 @@
+"""Histories of attitudes in CSV files: round trips, and files of others."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import liethermo as lt
+
+
+@pytest.fixture(scope="module")
+def run():
+    body = lt.models.tumbling_body((3.0, 2.0, 1.0), rate=0.05)
+    start = Rotation.from_rotvec(np.pi * np.array([0.6, 0.0, 0.8]))  # half a turn, where the scalar part is zero
+    x0 = body.state(angular_velocity=(0.3, 0.2, 1.0))
+    return lt.integrate(body, x0, (0.0, 8.0), 0.25, lt.MetriplecticGauss(2), attitude=start)
+
+
+@pytest.mark.parametrize("scalar", ["last", "first"])
+@pytest.mark.parametrize("degrees", [False, True])
+def test_what_is_written_is_read_back(run, tmp_path, degrees, scalar):
+    path = lt.bodies.write_csv(tmp_path / "run.csv", run, degrees=degrees, scalar=scalar)
+    header = path.read_text().splitlines()[0].split(",")
+    assert header[1] == ("q_x" if scalar == "last" else "q_w")
+    assert header[-1] == f"omega_z [{'deg' if degrees else 'rad'}/s]"
+    history = lt.bodies.read_csv(path)
+    assert np.array_equal(history.t, run.t)
+    assert np.abs(history.attitude - run.attitude).max() < 2e-15
+    assert np.abs(history.angular_velocity - lt.bodies.angular_velocity(run)).max() < 4e-16
+    table = np.loadtxt(path, delimiter=",", skiprows=1)
+    q = table[:, 1:5] if scalar == "last" else np.roll(table[:, 1:5], -1, axis=1)
+    assert (Rotation.from_quat(q) * Rotation.from_matrix(run.attitude).inv()).magnitude().max() < 2e-15
+    # a run goes on from a row of the file
+    body = lt.models.tumbling_body((3.0, 2.0, 1.0), rate=0.05)
+    x0 = body.state(angular_velocity=history.angular_velocity[4])
+    rest = lt.integrate(body, x0, (1.0, 8.0), 0.25, lt.MetriplecticGauss(2), attitude=history.attitude[4])
+    assert np.abs(rest.attitude[-1] - run.attitude[-1]).max() < 1e-13
+
+
+def test_columns_are_found_by_their_names(tmp_path):
+    path = tmp_path / "other.csv"
+    path.write_text("mode, q_w ,q_x,q_y,q_z,t [s]\n3,0.7071,0,0,0.7071,10.5\n3,1,0,0,0,11\n")
+    history = lt.bodies.read_csv(path)
+    assert history.angular_velocity is None
+    assert history.t.tolist() == [10.5, 11.0]
+    expected = Rotation.from_euler("z", [[90.0], [0.0]], degrees=True)
+    assert (history.rotation * expected.inv()).magnitude().max() < 1e-15
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "no table"),
+        ("t,q_x,q_y,q_z,q_w\n", "at least one line"),
+        ("t,q_x,q_y,q_z\n0,0,0,1\n", "no column 'q_w'"),
+        ("t,q_x,q_y,q_z,q_w\n0,0,0,0,a\n", "no table of numbers"),
+        ("t,q_x,q_y,q_z,q_w\n0,0,0,0,1,2\n", "numbers in each line"),
+        ("t,q_x,q_y,q_z,q_w\n0,0,0,0,1\n0,0,0,2,1\n", "norm 2.23607 in line 3"),
+        ("t,q_x,q_y,q_z,q_w\n0,0,0,0,nan\n", "norm nan in line 2"),
+        ("t [min],q_x,q_y,q_z,q_w\n0,0,0,0,1\n", "'min'"),
+        ("t,q_x,q_y,q_z,q_w,omega_x\n0,0,0,0,1,2\n", "no column 'omega_y'"),
+        ("t,q_x,q_y,q_z,q_w,omega_x [rpm],omega_y,omega_z\n0,0,0,0,1,2,0,0\n", "'rpm'"),
+    ],
+)
+def test_bad_files_are_refused(tmp_path, text, message):
+    path = tmp_path / "bad.csv"
+    path.write_text(text)
+    with pytest.raises(lt.FileError, match=message):
+        lt.bodies.read_csv(path)
+
+
+def test_what_cannot_be_written(run, tmp_path):
+    with pytest.raises(lt.FileError, match="could not be written"):
+        lt.bodies.write_csv(tmp_path / "missing" / "run.csv", run)
+    with pytest.raises(lt.FileError, match="could not be read"):
+        lt.bodies.read_csv(tmp_path / "missing.csv")
+    body = lt.models.tumbling_body((3.0, 2.0, 1.0), rate=0.05)
+    many = lt.ensemble(body, np.ones((2, 3)), (0.0, 0.5), 0.25, outputs="trajectory")
+    with pytest.raises(lt.InputError, match=r"write_csv\(path, e\[i\]\)"):
+        lt.bodies.write_csv(tmp_path / "many.csv", many)
+    lt.bodies.write_csv(tmp_path / "one.csv", many[1])
+    with pytest.raises(lt.InputError, match="no attitudes"):
+        lt.bodies.write_csv(tmp_path / "x.csv", lt.integrate(lt.models.rigid_body(), [1.0, 0, 0], (0.0, 0.1), 0.1))
