@@ -280,6 +280,10 @@ class QuantumSystem(System):
             return x
         return np.concatenate([x, rng.standard_normal((count, self.baths.number)) * self.baths.scale], axis=-1)
 
+    def resting_guess(self) -> np.ndarray:
+        """Return the completely mixed state, with baths at entropy zero."""
+        return np.asarray(self.state(np.eye(self.structure.size) / self.structure.size))
+
     def outside(self, x) -> str:
         if is_traced(self):
             return ""
