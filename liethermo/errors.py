@@ -91,7 +91,7 @@ class IntegrationError(LiethermoError, ArithmeticError):
 
 
 class ConvergenceError(IntegrationError):
-    """The implicit equations of a step could not be solved."""
+    """Equations could not be solved: those of an implicit step, or of a steady state."""
 
 
 class NonFiniteError(IntegrationError):

@@ -19,6 +19,7 @@ from manifolds.matrices.linear import adjoint
 from manifolds.matrices.spectral import log_mean
 
 from ..errors import InputError
+from ..functions.bath_energy import BathEnergy, ReservoirEnergy
 from ..functions.density import DensityMatrixFunction, choose_reference_level, matrix_logarithm, positive_part
 from ..functions.energy import Energy, Function
 from ..functions.frames import OrthonormalFrame, gram_schmidt
@@ -170,7 +171,7 @@ class ThermalJumps(Dissipation):
             jumps=jumps, jump_frame=frame, level_order=order, is_driven=driven, is_isolated=False, conserves_energy=True
         )
         if not is_traced((self.rates, baths)):
-            bound_jumps._check_rates(system.systems_at_test_times()[0] if system.is_driven else system)
+            bound_jumps._check_rates(system, hamiltonians[0])
         return bound_jumps
 
     def _replace_fields(self, **fields) -> ThermalJumps:
@@ -223,17 +224,29 @@ class ThermalJumps(Dissipation):
         drho = _jump_gain(self.jumps, rates, rho) - jnp.tensordot(rates, _adjoint_products(self.jumps), 1) @ rho
         return self._append_bath_entropy_rates(system, dH, T, drho)
 
-    def _check_rates(self, system) -> None:
-        """Raise InputError if double precision cannot represent the rates at the first temperature of the bath."""
-        n, dH = system.body_dim, system.energy.gradient(jnp.zeros(system.dim))
-        omega, T = self._jump_frequencies(system.structure, dH[:n]), dH[n + self.bath]
-        strengths, energies = self._weighted_jump_rates(omega, T), np.abs(np.asarray(omega))
-        rates = np.asarray(strengths * jnp.exp(jnp.abs(omega) / (2.0 * T)))
-        for jump, rate, w in zip(self.jumps, rates, energies, strict=True):
-            if w > -2.0 * np.log(EPS) * T and not rate * EPS <= w:  # the exponential is to blame, not the rate
+    def _check_rates(self, system, H: np.ndarray) -> None:
+        """Raise InputError if double precision cannot represent the rates at the first temperature of the bath.
+
+        It is computed by NumPy: JAX would compile a program for each operation.
+        """
+        energy = system.baths.energy
+        if isinstance(energy, BathEnergy | ReservoirEnergy):
+            T = float(np.asarray(energy.temperature)[self.bath])
+        else:
+            T = float(energy.gradient(jnp.zeros(system.baths.number))[self.bath])
+        levels = np.diag(self._to_jump_frame(_subtract_common_energy(H))).real
+        for jump in self.jumps:
+            weights = np.abs(np.asarray(jump.operator)) ** 2
+            omega = float(np.sum(weights * (levels[None, :] - levels[:, None])) / np.sum(weights))
+            rate, w = self.rates[jump.coupling_index], abs(omega)
+            with np.errstate(over="ignore", invalid="ignore"):
+                strength = jump.weight * np.asarray(rate(omega, T) if callable(rate) else rate, dtype=np.float64)
+                exact_rate = float(strength * np.exp(np.float64(w) / (2.0 * T)))
+            # the exponential is to blame, not the rate
+            if w > -2.0 * np.log(EPS) * T and not exact_rate * EPS <= w:
                 raise InputError(
                     f"jumps of V[{jump.coupling_index}] with the energy {w:.3g} have, at T = {T:.3g}, "
-                    f"rate * exp(omega / 2T) = {rate:.3g}, too large for double precision. Give the rate as a "
+                    f"rate * exp(omega / 2T) = {exact_rate:.3g}, too large for double precision. Give the rate as a "
                     "function, such as lambda omega, T: g * jnp.exp(-omega / (2 * T)), or a higher temperature"
                 )
 

@@ -37,6 +37,7 @@ from ..systems import System
 from ..tracing.programs import jit_cached, jit_unoptimised
 from .adaptive import Adaptive
 from .flow_derivatives import state_derivatives
+from .flow_times import checked_save_times, states_at_times, system_with_parameters
 from .preparation import checked_initial_state, initial_state, limit_to_span, prepare_for_method
 from .schedule import make_schedule
 
@@ -50,6 +51,8 @@ def flow(
     method: OneStepMethod | None = None,
     save_every: int | None = None,
     attitude=None,
+    save_at=None,
+    parameters=None,
     breaks: Sequence[float] = (),
 ) -> jax.Array:
     """Return the final state of the flow from x0, a differentiable function of x0 and the parameters of the system.
@@ -65,7 +68,7 @@ def flow(
 
     Parameters
     ----------
-    system : System
+    system : System, or function from parameters to a System
         The system. Its functions fix the units.
     x0 : array, shape (n,)
         The initial state, in the units of the system.
@@ -80,13 +83,21 @@ def flow(
     attitude : array, shape (m, m), or scipy.spatial.transform.Rotation; optional
         The initial attitude (dimensionless), if a torque depends on it; the identity by default. The function returns
         momenta only.
+    save_at : array, shape (times,), optional
+        Times in t_span (in the unit of time of the system), in any order, traced or not. The state at such a time is
+        the end of one more step, from the last state before it. So it has the order of the method, and the steps of
+        the run do not depend on these times. At a traced time outside of t_span the state is NaN.
+    parameters : dict from names to arrays, or pytree, optional
+        Values of parameters of the system by name, such as ``{"dissipation.rate": 0.2}``, in its units, with the
+        shapes that they have in the system. If ``system`` is a function, its argument.
     breaks : sequence of float
         Times (in the unit of ``t_span``) at which functions of time jump; see :func:`integrate`.
 
     Returns
     -------
     array, shape (n,), or (times, n)
-        The final state, the one at the end of t_span; with ``save_every`` states at several times, the final one last.
+        The final state, the one at the end of t_span; with ``save_every`` states at several times, the final one last;
+        with ``save_at`` the states at these times.
         ``(*sites, d)`` instead of n, of a system on sites. NaN from where a step could not be solved: inside a
         compiled function nothing can be raised.
 
@@ -101,11 +112,20 @@ def flow(
     ...     return lt.flow(lt.models.rigid_body(rate=rate), jnp.array([0.1, 1.0, 0.1]), (0.0, 1.0), 0.1)
     >>> jax.jacfwd(end)(0.5).shape
     (3,)
+    >>> times = jnp.array([0.13, 0.5, 0.77])
+    >>> body = lt.models.rigid_body()
+    >>> lt.flow(body, [0.1, 1.0, 0.1], (0.0, 1.0), 0.1, save_at=times, parameters={"dissipation.rate": 0.5}).shape
+    (3, 3)
     """
     method = DEFAULT_METHOD if method is None else method
+    system = system_with_parameters(system, parameters)
     _check_arguments(system, t_span, step, method)
+    if save_at is not None and save_every is not None:
+        raise InputError("flow takes save_at or save_every, got both. Remove one of them")
+    save_every = 1 if save_at is not None else save_every
     all_breaks = *checked_breaks(breaks), *declared_breaks(system)
     x, schedule = system.state(x0), make_schedule(t_span, step, save_every, breaks=all_breaks)
+    times = None if save_at is None else checked_save_times(save_at, schedule)
     n, user_system = system.dim, system
     system, method = prepare_for_method(system, method, None, attitude is not None)
     system = limit_to_span(system, schedule.start, schedule.end, *schedule.breaks)
@@ -144,8 +164,31 @@ def flow(
             path = jit_cached(_attach_derivatives)(path, derivatives, traced_leaves, _stop_gradients(traced_leaves))
         else:
             path = jit_cached(_recompute_path)(*arguments, step_sizes, steps, final_only)
+    if times is not None:
+        path = _path_at_times((system, method), path, schedule, times, compile_program)
     path = path if path.shape[-1] == n else path[..., :n]
     return user_system.points(path) if user_system.space is None else path
+
+
+def _path_at_times(system_and_method, path, schedule: StepSchedule, times, compile_program: Callable) -> jax.Array:
+    """Return the states at times from those at the ends of all steps; Newton's method runs if a step needs it."""
+    arguments = *system_and_method, path, schedule.saved_times, times
+    span, program = (schedule.start, schedule.end), compile_program(_states_at_times)
+    if system_and_method[1].explicit or is_traced(arguments):
+        return program(*arguments, span, True)
+    states = program(*arguments, span, False)
+    if np.isfinite(np.asarray(states)).all():
+        return states
+    return program(*arguments, span, True)
+
+
+def _states_at_times(system, method, path, grid, times, span: tuple[float, float], newton: bool) -> jax.Array:
+    solve = solve_or_nan if newton else fixed_point_or_nan
+
+    def end_state(system, method, x, h):
+        return differentiable_step(system, method, initial_carry(system, method, x), h, solve)[0]
+
+    return states_at_times(system, method, path, grid, times, span, end_state)
 
 
 def _check_arguments(system, t_span, step, method) -> None:

@@ -10,11 +10,13 @@ from .composed.matter import Membrane, Reaction
 from .composed.system import ComposedSystem
 from .driven import DrivenSystem, make_autonomous
 from .embedded import EmbeddedSystem, embed_in_arrays
+from .equilibria import Equilibria, Equilibrium, equilibria, steady_state
 from .euler_poincare import EulerPoincareSystem, Legendre
 from .euler_poincare_closed import EulerPoincareClosedSystem
 from .evolution import ContactSystem, EvolutionSystem
 from .herglotz import Herglotz, ThermodynamicHerglotz
 from .lie_poisson import LiePoissonSystem
+from .linearisation import Linearisation, Stability, linearise
 from .metriplectic import MetriplecticSystem
 from .quantum import QuantumSystem
 from .simple_closed import SimpleClosedSystem
@@ -31,6 +33,8 @@ __all__ = [
     "Copies",
     "DrivenSystem",
     "EmbeddedSystem",
+    "Equilibria",
+    "Equilibrium",
     "EulerPoincareClosedSystem",
     "EulerPoincareSystem",
     "EvolutionSystem",
@@ -38,17 +42,22 @@ __all__ = [
     "Herglotz",
     "Legendre",
     "LiePoissonSystem",
+    "Linearisation",
     "Membrane",
     "MetriplecticSystem",
     "QuantumSystem",
     "Reaction",
     "SimpleClosedSystem",
     "SpinSystem",
+    "Stability",
     "Subsystem",
     "System",
     "ThermodynamicHerglotz",
     "TurningSystem",
     "embed_in_arrays",
+    "equilibria",
+    "linearise",
     "make_autonomous",
     "momentum_system_of",
+    "steady_state",
 ]

@@ -125,6 +125,12 @@ class SystemInterface(Geometry):
             states[..., self.body_dim :] *= min(1.0, 1.0 / scale) * self.baths.scale  # keeps temperatures finite
         return states
 
+    def resting_guess(self) -> np.ndarray:
+        """Return a state from which a steady state is looked for, shape (n,): a random one, baths at entropy zero."""
+        x = np.array(self.samples(1)[0])
+        x[self.body_dim :] = 0.0
+        return x
+
     def outside(self, x) -> str:
         """Explain why a state lies outside the domain of the system; "" if it lies inside.
 

@@ -280,6 +280,10 @@ class QuantumSystem(System):
             return x
         return np.concatenate([x, rng.standard_normal((count, self.baths.number)) * self.baths.scale], axis=-1)
 
+    def resting_guess(self) -> np.ndarray:
+        """Return the completely mixed state, with baths at entropy zero."""
+        return np.asarray(self.state(np.eye(self.structure.size) / self.structure.size))
+
     def outside(self, x) -> str:
         if is_traced(self):
             return ""
@@ -397,11 +401,16 @@ class QuantumSystem(System):
 
     def hamiltonians(self) -> list[np.ndarray]:
         """Return the Hamiltonian, at each test time if it depends on time."""
-        n, energies = self.body_dim, [s.energy for s in (self.systems_at_test_times() if self.is_driven else [self])]
+        energies = [s.energy for s in (self.systems_at_test_times() if self.is_driven else [self])]
         energies = [E.body if isinstance(E, BodyBathsEnergy) else E for E in energies]  # temperatures may be traced
+        return [self._hamiltonian_of(E) for E in energies]
+
+    def _hamiltonian_of(self, energy: Energy) -> np.ndarray:
+        if isinstance(energy, MeanEnergy):  # without a call of JAX, which would compile a program
+            return np.asarray(self.structure.matrix(np.asarray(energy.b)))
         with jax.ensure_compile_time_eval():
-            origin, one = jnp.zeros(n), np.eye(self.structure.size)
-            return [np.asarray(self.structure.matrix(E.gradient(origin)) + E.value(origin) * one) for E in energies]
+            origin, one = jnp.zeros(self.body_dim), np.eye(self.structure.size)
+            return np.asarray(self.structure.matrix(energy.gradient(origin)) + energy.value(origin) * one)
 
     def casimirs(self) -> dict[str, Energy]:
         """Return the trace, and without dissipation the purity too."""

@@ -1,0 +1,442 @@
+"""``equilibria`` and ``steady_state``: states at rest, on a leaf or of a driven or open system."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from manifolds._precision import with_library_settings
+
+from ..errors import ConvergenceError, InputError
+from ..functions.energy import Energy
+from ..tracing.interpret import evaluate_at_points
+from .base import System
+from .linearisation import (
+    FieldDerivatives,
+    Linearisation,
+    Stability,
+    conserved_functions,
+    counter_components,
+    derivatives_at,
+    field_derivatives,
+    frozen_system,
+    linearise_at,
+    retract,
+    values_of,
+)
+
+RESIDUAL_RTOL = 1e-11
+"""Largest velocity of an equilibrium, relative to the Jacobian times the norm of the state. Newton's method ends at
+about 1e-15, and at 1e-12 where the Jacobian is ill-conditioned."""
+
+LEVEL_RTOL = 1e-10
+"""Largest difference of a conserved function from its value on the leaf, relative to its gradient times the state."""
+
+SAME_STATE_RTOL = 1e-6
+"""Distance of two equilibria, relative to the norm of the reference state, below which they count as one."""
+
+MAX_ITERATIONS = 200
+"""Largest number of Levenberg-Marquardt steps from a starting point."""
+
+MAX_DAMPING = 1e12
+"""Damping at which a search gives up: its steps are then rounding."""
+
+PATIENCE = 12
+"""Number of rejected steps in a row after which a search counts as stalled."""
+
+MAX_TRANSIENT_STEPS = 400
+"""Largest number of implicit Euler steps of growing size towards a steady state."""
+
+PRINTED_ZERO = 1e-12
+"""Size of a component, relative to the largest one, below which it is printed as zero."""
+
+STEP_GROWTH_LIMIT = 10.0
+"""Largest factor between two steps of the transient. The factor itself is the ratio of the last two velocities."""
+
+
+@dataclass(frozen=True, eq=False)
+class Equilibrium:
+    """A state at rest, with its linear motion.
+
+    Attributes
+    ----------
+    x : array, shape (n,)
+        The state.
+    residual : float
+        Norm of the vector field there, relative to the Jacobian times the norm of the state.
+    levels : dict of float
+        Values of the conserved functions, the energy among them.
+    linearisation : Linearisation
+        The linear motion on the leaf.
+    bath_heat : array, shape (baths,)
+        Heat that flows into each bath (energy / time); zero at thermal equilibrium.
+    """
+
+    x: np.ndarray
+    residual: float
+    levels: dict[str, float]
+    linearisation: Linearisation
+    bath_heat: np.ndarray
+
+    @property
+    def stability(self) -> Stability:
+        """Stability on the leaf."""
+        return self.linearisation.stability
+
+    @property
+    def stable(self) -> bool | None:
+        """True if it is stable on its leaf, False if not; None if that is not decided."""
+        return self.linearisation.stable
+
+    def __str__(self) -> str:
+        levels = ", ".join(f"{name} = {value:.6g}" for name, value in self.levels.items())
+        x = np.where(np.abs(self.x) > PRINTED_ZERO * np.abs(self.x).max(initial=0.0), self.x, 0.0)
+        return f"{np.array2string(x, precision=6)}  {self.stability}, residual {self.residual:.1e}; {levels}"
+
+
+@dataclass(frozen=True, eq=False)
+class Equilibria(Sequence):
+    """A list of equilibria, sorted by stability and then by energy, as :func:`equilibria` returns it.
+
+    Attributes
+    ----------
+    members : tuple of Equilibrium
+    level_names : tuple of str
+        The functions whose values are those of the reference state.
+    n_starts, n_converged : int
+        Number of starting points, and of those from which an equilibrium was reached.
+    """
+
+    members: tuple[Equilibrium, ...]
+    level_names: tuple[str, ...]
+    n_starts: int
+    n_converged: int
+
+    def __len__(self) -> int:
+        return len(self.members)
+
+    def __iter__(self) -> Iterator[Equilibrium]:
+        return iter(self.members)
+
+    def __getitem__(self, index):
+        return self.members[index]
+
+    @property
+    def x(self) -> np.ndarray:
+        """The states, shape (equilibria, n)."""
+        return np.array([member.x for member in self.members])
+
+    @property
+    def stable(self) -> list[bool | None]:
+        """Verdict on each one: True if it is stable on its leaf, False if not, None if that is not decided."""
+        return [member.stable for member in self.members]
+
+    def __str__(self) -> str:
+        levels = f" with the reference's {', '.join(self.level_names)}" if self.level_names else ""
+        head = f"{len(self)} equilibria{levels}, from {self.n_converged} of {self.n_starts} starting points"
+        return "\n".join([head, *map(str, self.members)])
+
+
+@with_library_settings
+def equilibria(
+    system: System,
+    reference=None,
+    starts=None,
+    levels: Sequence[str] | None = None,
+    count: int = 32,
+    seed: int = 0,
+    t: float | None = None,
+) -> Equilibria:
+    """Return the equilibria of a system that a search finds on the leaf of a reference state.
+
+    The search solves ``x' = 0`` together with the values of the conserved functions by the Levenberg-Marquardt method,
+    from each starting point. It finds stable and unstable equilibria. A search from random points does not prove that
+    there is no other one.
+
+    The leaf is that of the Casimirs and the other functions that the dissipation conserves. The energy belongs to them
+    if there is a dissipation that conserves it; without a dissipation, the equilibria of a leaf have different
+    energies. A momentum map is not fixed, because a symmetry moves equilibria to others with the value of the map.
+
+    Parameters
+    ----------
+    system : System
+        The system; its functions fix the units.
+    reference : array, shape (n,), optional
+        A state on the leaf, in the units of the system. Without it no level is fixed, and equilibria near the starting
+        points are found.
+    starts : array, shape (m, n), optional
+        Starting points, in the units of the system; by default random states with the norm of the reference, and the
+        reference.
+    levels : sequence of str, optional
+        Names, without a unit, of the functions that are fixed instead, among the conserved functions and ``"energy"``.
+    count, seed : int
+        Number and seed of the random starting points (dimensionless).
+    t : float, optional
+        The time, in the unit of the system, at which a system that depends on time is frozen.
+
+    Returns
+    -------
+    Equilibria
+
+    Raises
+    ------
+    InputError
+
+    Examples
+    --------
+    >>> body = lt.models.free_rigid_body((3.0, 2.0, 1.0))
+    >>> rest = lt.equilibria(body, [0.0, 0.6, 0.8])
+    >>> len(rest), sorted(map(str, rest.stable))
+    (6, ['False', 'False', 'True', 'True', 'True', 'True'])
+    """
+    system = frozen_system(system, t)
+    anchor = None if reference is None else np.asarray(system.state(reference))
+    points = _starting_points(system, anchor, starts, count, seed)
+    conserved = conserved_functions(system, points[0])
+    names = _level_names(system, conserved, levels) if anchor is not None else ()
+    fixed = {name: conserved[name] for name in names}
+    targets = None if anchor is None else values_of(tuple(fixed.values()), anchor[None])[0]
+    search = _Search(system, tuple(fixed.values()), targets, counter_components(system))
+    scale = float(np.linalg.norm(points[0] if anchor is None else anchor)) or 1.0
+    states = search.solve(points, scale)
+    members = [_equilibrium(system, x, scale) for x in _distinct(states, SAME_STATE_RTOL * scale)]
+    order = list(Stability)
+    members.sort(key=lambda member: (order.index(member.stability), member.levels["energy"]))
+    return Equilibria(tuple(members), names, len(points), len(states))
+
+
+@with_library_settings
+def steady_state(system: System, x0=None, t: float | None = None) -> Equilibrium:
+    """Return the steady state that a driven or open system approaches from x0.
+
+    A state at rest of the whole motion: torques, drives, and baths that keep their temperatures included. Implicit
+    Euler steps of growing size follow the motion from x0 [Kelley & Keyes 1998], and Newton's method ends the search
+    with the values that the conserved functions have at x0. The entropies of baths of constant temperature may grow:
+    ``bath_heat`` says how much heat each bath receives.
+
+    Parameters
+    ----------
+    system : System
+        The system; its functions fix the units. A system that depends on time periodically has no state at rest, and
+        is refused unless ``t`` is given.
+    x0 : array, shape (n,), optional
+        The initial state, in the units of the system; by default a random one, and the completely mixed state of a
+        quantum system.
+    t : float, optional
+        The time, in the unit of the system, at which a system that depends on time is frozen.
+
+    Returns
+    -------
+    Equilibrium
+
+    Raises
+    ------
+    ConvergenceError
+        If the motion from x0 does not come to rest.
+    InputError
+        If the energy or a torque depends on time and t is missing.
+
+    Examples
+    --------
+    A qubit between a hot and a cold bath carries heat from one to the other:
+
+    >>> lower = np.array([[0, 1], [0, 0]])
+    >>> baths = lt.HeatBaths(capacity=np.inf, temperature=[0.5, 2.0], number=2)
+    >>> jumps = [lt.ThermalJumps([(lower, 0.1)], bath=0), lt.ThermalJumps([(lower, 0.1)], bath=1)]
+    >>> qubit = lt.QuantumSystem(np.diag([0.0, 1.0]), jumps, baths=baths)
+    >>> rest = lt.steady_state(qubit)
+    >>> rest.stable, bool(rest.bath_heat[0] > 0.0), bool(abs(rest.bath_heat.sum()) < 1e-14)
+    (True, True, True)
+    """
+    system = frozen_system(system, t)
+    x = np.asarray(system.resting_guess() if x0 is None else system.state(x0))
+    conserved = conserved_functions(system, x)
+    functions = tuple(conserved.values())
+    search = _Search(system, functions, values_of(functions, x[None])[0], counter_components(system))
+    scale = float(np.linalg.norm(x)) or 1.0
+    states = search.solve(search.follow_transient(x, scale)[None], scale)
+    if not len(states):
+        raise ConvergenceError(
+            f"the motion of this {system.kind} from x0 does not come to rest: it may oscillate, grow, or have no "
+            "steady state. Give another x0, or look for unstable ones with lt.equilibria(system)",
+            None,
+        )
+    return _equilibrium(system, states[0], scale)
+
+
+def _equilibrium(system: System, x: np.ndarray, scale: float) -> Equilibrium:
+    derivatives, functions = derivatives_at(system, x)
+    linearisation = linearise_at(system, x, derivatives, functions, scale)
+    velocity = derivatives.velocity.copy()
+    velocity[counter_components(system)] = 0.0
+    norm = float(np.linalg.norm(derivatives.jacobian))
+    levels = dict(zip(functions, derivatives.values.tolist(), strict=True))
+    levels["energy"] = float(values_of((system.energy,), x[None])[0, 0])
+    m = system.dim - system.body_dim
+    heat = np.zeros(m)
+    if m:
+        heat = np.asarray(system.temperatures(x)) * derivatives.velocity[system.body_dim :]
+    residual = float(np.linalg.norm(velocity)) / (norm * scale or 1.0)
+    return Equilibrium(x, residual, levels, linearisation, heat)
+
+
+def _starting_points(system: System, anchor: np.ndarray | None, starts, count: int, seed: int) -> np.ndarray:
+    if starts is not None:
+        return np.atleast_2d(np.asarray(system.state(starts, batch=True)))
+    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+        raise InputError(f"count must be a positive number of starting points, got {count!r}")
+    size = 1.0 if anchor is None else float(np.linalg.norm(anchor)) / np.sqrt(system.dim) or 1.0
+    points = system.samples(count, seed, size)
+    return points if anchor is None else np.concatenate([anchor[None], points])
+
+
+def _level_names(system: System, conserved: dict[str, Energy], levels: Sequence[str] | None) -> tuple[str, ...]:
+    """Return the names of the functions that are fixed on the leaf."""
+    if levels is None:
+        variable = set(system.momentum_maps) | (set() if system.dissipation is not None else {"energy"})
+        return tuple(name for name in conserved if name not in variable)
+    names = (levels,) if isinstance(levels, str) else tuple(levels)
+    if unknown := [name for name in names if name not in conserved]:
+        known = ", ".join(map(repr, conserved)) or "no function"
+        raise InputError(f"levels names {unknown[0]!r}, but this {system.kind} conserves {known}")
+    return names
+
+
+def _distinct(states: np.ndarray, distance: float) -> list[np.ndarray]:
+    """Return one of each group of states that are nearer to each other than a distance."""
+    groups: list[np.ndarray] = []
+    for x in states:
+        if not any(np.linalg.norm(x - y) <= distance for y in groups):
+            groups.append(x)
+    return groups
+
+
+class _Search(NamedTuple):
+    """The equations of an equilibrium: velocity zero, and conserved functions at given values.
+
+    Attributes
+    ----------
+    system : System
+    functions : tuple of Energy
+    targets : array, shape (functions,), or None
+    counters : array of int
+        Components that are not part of the equations.
+    """
+
+    system: System
+    functions: tuple[Energy, ...]
+    targets: np.ndarray | None
+    counters: np.ndarray
+
+    def evaluate(self, points: np.ndarray) -> FieldDerivatives:
+        """Return velocities and functions with their derivatives, the counters left out; the first axis is points."""
+        derivatives = evaluate_at_points(field_derivatives, (self.system, self.functions), points)
+        if not self.counters.size:
+            return FieldDerivatives(*derivatives)
+        velocity, values, jacobian, gradients, frame = (np.array(a) for a in derivatives)
+        velocity[:, self.counters], jacobian[:, self.counters] = 0.0, 0.0
+        return FieldDerivatives(velocity, values, jacobian, gradients, frame)
+
+    def solve(self, points: np.ndarray, scale: float) -> np.ndarray:
+        """Return the equilibria reached from the points, shape (converged, n), by Levenberg-Marquardt steps."""
+        states, damping = points.copy(), np.full(len(points), 1e-3)
+        current = self.evaluate(states)
+        weights = self._row_weights(current, scale)
+        residuals, matrices = self._equations(current, weights)
+        costs = np.linalg.norm(residuals, axis=1)
+        rejected = np.zeros(len(points), dtype=int)
+        active = np.isfinite(costs)
+        for _ in range(MAX_ITERATIONS):
+            use = np.flatnonzero(active)
+            if not use.size:
+                break
+            steps = np.array([_damped_step(matrices[i], residuals[i], damping[i]) for i in use])
+            trials = self._move(states[use], steps, current.frame[use])
+            evaluated = self.evaluate(trials)
+            new_residuals, new_matrices = self._equations(evaluated, weights)
+            new_costs = np.linalg.norm(new_residuals, axis=1)
+            better = new_costs < costs[use]  # False for NaN
+            chosen, other = use[better], use[~better]
+            states[chosen], costs[chosen] = trials[better], new_costs[better]
+            residuals[chosen], matrices[chosen] = new_residuals[better], new_matrices[better]
+            for old, new in zip(current, evaluated, strict=True):
+                old[chosen] = new[better]
+            damping[chosen] = np.maximum(damping[chosen] * 0.1, 1e-30)
+            damping[other] *= 10.0
+            rejected[chosen], rejected[other] = 0, rejected[other] + 1
+            active[(rejected > PATIENCE) | (damping > MAX_DAMPING) | (costs == 0.0)] = False
+        accepted = np.isfinite(costs) & self._is_at_rest(current, scale) & self._is_on_leaf(current, scale)
+        accepted &= np.array([not self.system.outside(x) for x in states], dtype=bool)
+        return states[accepted]
+
+    def follow_transient(self, x: np.ndarray, scale: float) -> np.ndarray:
+        """Return the state that implicit Euler steps of growing size lead to from x, shape (n,)."""
+        current = self.evaluate(x[None])
+        speed = np.linalg.norm(current.velocity)
+        norm = np.linalg.norm(current.jacobian)
+        step = 0.1 / norm if norm > 0.0 else 0.1 * scale / (speed or 1.0)
+        for _ in range(MAX_TRANSIENT_STEPS):
+            velocity, jacobian, frame = current.velocity[0], current.jacobian[0], current.frame[0]
+            if not speed > RESIDUAL_RTOL * np.linalg.norm(jacobian) * scale:
+                break
+            to_coordinates = np.linalg.pinv(frame.T) if self.system.space is not None else np.eye(len(frame))
+            matrix = np.eye(len(frame)) / step - to_coordinates @ jacobian
+            displacement = np.linalg.lstsq(matrix, to_coordinates @ velocity, rcond=None)[0]
+            trial = self._move(x[None], displacement[None], current.frame)
+            evaluated = self.evaluate(trial)
+            new_speed = np.linalg.norm(evaluated.velocity)
+            if not np.isfinite(new_speed) or self.system.outside(trial[0]) or new_speed > STEP_GROWTH_LIMIT * speed:
+                step *= 0.25
+                continue
+            step *= float(np.clip(speed / new_speed if new_speed > 0.0 else np.inf, 0.5, STEP_GROWTH_LIMIT))
+            x, current, speed = trial[0], evaluated, new_speed
+        return x
+
+    def _move(self, states: np.ndarray, steps: np.ndarray, frames: np.ndarray) -> np.ndarray:
+        displacements = np.einsum("bm,bmn->bn", steps, frames)
+        if self.system.space is None:
+            return states + displacements
+        moved = evaluate_at_points(_retract_pair, self.system, np.concatenate([states, displacements], axis=1))
+        return np.asarray(moved)
+
+    def _row_weights(self, current: FieldDerivatives, scale: float) -> np.ndarray:
+        """Return factors that make velocities and functions dimensionless, shape (n + functions,)."""
+        jacobian_norm = np.nanmedian(np.linalg.norm(current.jacobian, axis=(1, 2)))
+        gradient_norms = np.nanmedian(np.linalg.norm(current.gradients, axis=2), axis=0)
+        velocity_weight = np.full(current.velocity.shape[1], 1.0 / (jacobian_norm * scale or 1.0))
+        return np.concatenate([velocity_weight, 1.0 / np.where(gradient_norms > 0.0, gradient_norms * scale, 1.0)])
+
+    def _equations(self, current: FieldDerivatives, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return residuals, shape (points, equations), and their derivatives, shape (points, equations, m)."""
+        if self.targets is None:
+            weights = weights[: current.velocity.shape[1]]
+            return current.velocity * weights, current.jacobian * weights[:, None]
+        residuals = np.concatenate([current.velocity, current.values - self.targets], axis=1)
+        matrices = np.concatenate([current.jacobian, current.gradients], axis=1)
+        return residuals * weights, matrices * weights[:, None]
+
+    def _is_at_rest(self, current: FieldDerivatives, scale: float) -> np.ndarray:
+        norms = np.linalg.norm(current.jacobian, axis=(1, 2))
+        return np.linalg.norm(current.velocity, axis=1) <= RESIDUAL_RTOL * norms * scale
+
+    def _is_on_leaf(self, current: FieldDerivatives, scale: float) -> np.ndarray:
+        if self.targets is None or not self.functions:
+            return np.ones(len(current.velocity), dtype=bool)
+        sizes = np.linalg.norm(current.gradients, axis=2) * scale + np.abs(self.targets)
+        return (np.abs(current.values - self.targets) <= LEVEL_RTOL * sizes).all(axis=1)
+
+
+def _damped_step(matrix: np.ndarray, residual: np.ndarray, damping: float) -> np.ndarray:
+    """Return the Levenberg-Marquardt step of least norm."""
+    rows = np.concatenate([matrix, np.sqrt(damping) * np.eye(matrix.shape[1])])
+    right_side = np.concatenate([-residual, np.zeros(matrix.shape[1])])
+    return np.linalg.lstsq(rows, right_side, rcond=None)[0]
+
+
+def _retract_pair(system: System, state_and_displacement) -> jax.Array:
+    n = system.dim
+    return retract(system, state_and_displacement[:n], state_and_displacement[n:])
