@@ -39,7 +39,7 @@ from .adaptive import Adaptive
 from .flow_derivatives import state_derivatives
 from .flow_times import checked_save_times, states_at_times, system_with_parameters
 from .preparation import checked_initial_state, initial_state, limit_to_span, prepare_for_method
-from .schedule import make_schedule
+from .schedule import StepSchedule, make_schedule
 
 
 @with_library_settings
