@@ -119,7 +119,7 @@ def read_urdf(source: str | os.PathLike) -> list[BodyRecord]:
         names += [child for child, joint in joint_of.items() if _attribute(_child(joint, "parent"), "link") == name]
     if len(records) < len(links):
         rest = sorted(set(links) - {record.name for record in records})
-        raise InputError(f"the links {', '.join(rest)} are in a loop of joints, which is no tree")
+        raise InputError(f"the links {', '.join(rest)} are in a loop of joints, so they are not a tree")
     return _assemble(records)
 
 
