@@ -1,0 +1,87 @@
+"""Lindblad's equation with any jump operators, without a promise about energy and entropy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from manifolds.matrices.linear import adjoint
+
+from ..errors import InputError
+from .base import Dissipation
+from .checks import checked_rate
+from .quantum import Operator, checked_square_matrix, get_density_structure
+
+
+class LindbladJumps(Dissipation):
+    """Lindblad's equation with any jump operators: ``sum rate (V rho V^H - {V^H V, rho} / 2)`` [Lindblad 1976].
+
+    The operators need not belong to a bath: measurement, pumping, and the local dissipation of a part of a coupled
+    system have this form. No law of the energy or the entropy is promised, and an audit says so. The trace is exact.
+    The equation keeps the density matrix positive. A run keeps it positive up to the error of its steps, and ends where
+    an eigenvalue is below -1e-6. For a bath with a temperature use :class:`ThermalJumps`, which obeys both laws.
+
+    A collapse operator of QuTiP is ``sqrt(rate) * V``. The adjoint of V is a jump of its own, with its own rate.
+
+    Parameters
+    ----------
+    couplings : list of (V, rate)
+        V is a dimensionless matrix, shape (N, N), or a ``Qobj``. The rate is a number >= 0 (1 / time).
+
+    Raises
+    ------
+    InputError
+        If a matrix or a rate cannot be used.
+
+    Examples
+    --------
+    >>> lower = np.array([[0, 1], [0, 0]])
+    >>> qubit = lt.QuantumSystem(np.diag([0.0, 1.0]), lt.LindbladJumps([(lower, 0.2)]))
+    >>> run = lt.integrate(qubit, qubit.state([0.0, 1.0]), (0.0, 5.0), 0.1, lt.MetriplecticGauss(3))
+    >>> excited = qubit.density(run.x[-1])[1, 1].real
+    >>> bool(abs(excited - np.exp(-0.2 * 5.0)) < 1e-10)
+    True
+    """
+
+    operators: tuple[Operator, ...] = eqx.field(static=True)
+    rates: tuple[Any, ...]
+
+    energy_law = None
+    entropy_law = None
+    is_symmetric = False
+    is_noiseless = True
+    needs_entropy = False
+    has_generator = True
+
+    def __init__(self, couplings: Sequence[tuple[Any, Any]]):
+        pairs = list(couplings)
+        if not pairs or not all(isinstance(pair, tuple | list) and len(pair) == 2 for pair in pairs):
+            raise InputError("couplings must be a list of pairs (V, rate), such as [(V, 0.1)]")
+        self.operators = tuple(
+            Operator(checked_square_matrix(V, f"the jump operator V[{i}]")) for i, (V, _) in enumerate(pairs)
+        )
+        self.rates = tuple(checked_rate(rate) for _, rate in pairs)
+
+    def bind_to(self, system):
+        size = get_density_structure(system, "LindbladJumps").size
+        for i, V in enumerate(self.operators):
+            if np.shape(V) != (size, size):
+                raise InputError(
+                    f"the jump operator V[{i}] has shape {np.shape(V)}, but the Hamiltonian has shape ({size}, {size})"
+                )
+        return self
+
+    def force(self, system, x, dH, dS, dL):
+        return self.generator_field(system, x, dH)
+
+    def generator_field(self, system, x, dH):
+        structure, n = system.structure, system.body_dim
+        rho, rates = structure.matrix(x[:n]), jnp.stack(list(self.rates))
+        V = np.stack([np.asarray(operator) for operator in self.operators])
+        gain = jnp.sum(rates[:, None, None] * (V @ rho @ adjoint(V)), axis=0)
+        loss = jnp.tensordot(rates, jnp.asarray(adjoint(V) @ V), 1) @ rho  # its Hermitian part is the anticommutator
+        return jnp.pad(structure.vector(gain - loss), (0, system.dim - n))
