@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -30,7 +30,9 @@ class LindbladJumps(Dissipation):
     Parameters
     ----------
     couplings : list of (V, rate)
-        V is a dimensionless matrix, shape (N, N), or a ``Qobj``. The rate is a number >= 0 (1 / time).
+        V is a dimensionless matrix, shape (N, N), or a ``Qobj``. The rate is a number >= 0 (1 / time), or a function of
+        the time t to one. A rate that becomes negative is not refused, but the motion may then leave the density
+        matrices.
 
     Raises
     ------
@@ -64,7 +66,14 @@ class LindbladJumps(Dissipation):
         self.operators = tuple(
             Operator(checked_square_matrix(V, f"the jump operator V[{i}]")) for i, (V, _) in enumerate(pairs)
         )
-        self.rates = tuple(checked_rate(rate) for _, rate in pairs)
+        self.rates = tuple(
+            _checked_function(rate, i) if callable(rate) else checked_rate(rate) for i, (_, rate) in enumerate(pairs)
+        )
+
+    @property
+    def depends_on_time(self) -> bool:
+        """True if a rate is a function of time."""
+        return any(callable(rate) for rate in self.rates)
 
     def bind_to(self, system):
         size = get_density_structure(system, "LindbladJumps").size
@@ -80,8 +89,21 @@ class LindbladJumps(Dissipation):
 
     def generator_field(self, system, x, dH):
         structure, n = system.structure, system.body_dim
-        rho, rates = structure.matrix(x[:n]), jnp.stack(list(self.rates))
+        if self.depends_on_time and system.time is None:
+            raise InputError("a rate of LindbladJumps depends on time: take system.at_time(t)")
+        rates = jnp.stack([jnp.asarray(rate(system.time)) if callable(rate) else rate for rate in self.rates])
+        rho = structure.matrix(x[:n])
         V = np.stack([np.asarray(operator) for operator in self.operators])
         gain = jnp.sum(rates[:, None, None] * (V @ rho @ adjoint(V)), axis=0)
         loss = jnp.tensordot(rates, jnp.asarray(adjoint(V) @ V), 1) @ rho  # its Hermitian part is the anticommutator
         return jnp.pad(structure.vector(gain - loss), (0, system.dim - n))
+
+
+def _checked_function(rate: Callable, i: int) -> Callable:
+    """Return a rate as a function of time, tested at t = 0."""
+    try:
+        value = rate(0.0)
+    except TypeError as error:
+        raise InputError(f"the rate of V[{i}] must be a number, or a function of the time t: {error}") from None
+    checked_rate(value)
+    return rate

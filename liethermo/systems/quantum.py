@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import copy
 
 import equinox as eqx
 import jax
@@ -90,6 +91,8 @@ class QuantumSystem(System):
     structure : manifolds.DensityMatrices
     floor : float
         Eigenvalues of rho up to this have no part in the entropy.
+    time : array, shape (), or None
+        The time at which rates that depend on it are taken: see :meth:`at_time`.
 
     Examples
     --------
@@ -105,6 +108,7 @@ class QuantumSystem(System):
     parts: tuple[int, ...] = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
     floor: float = eqx.field(static=True)
+    time: jax.Array | None
 
     def __init__(
         self,
@@ -119,6 +123,7 @@ class QuantumSystem(System):
     ):
         if not isinstance(baths, HeatBaths | None):
             raise InputError(f"baths are lt.HeatBaths(...), not {type(baths).__name__}")
+        self.time = None
         size, energy = hamiltonian_energy(hamiltonian, times)
         self.structure = structure = mf.DensityMatrices(size)
         self.parts, self.names = _check_parts(parts, names, size)
@@ -142,6 +147,28 @@ class QuantumSystem(System):
         self._build(poisson, n + m, energy, total_entropy, terms or None, {}, validate)
         if not self.preserved:  # preserved observables are tested instead
             self.invariant_verdicts = InvariantVerdicts(frozenset(self.casimirs()), frozenset())
+
+    # -- time ---------------------------------------------------------------------------------------------------------
+
+    @property
+    def is_driven(self) -> bool:
+        """True if the Hamiltonian or a rate depends on time."""
+        if super().is_driven or self.time is not None or self.dissipation is None:
+            return super().is_driven
+        return any(isinstance(term, LindbladJumps) and term.depends_on_time for term in self.dissipation.terms)
+
+    def at_time(self, t) -> System:
+        """Return the system with its Hamiltonian and its rates frozen at the time t."""
+        if not self.is_driven:
+            return self
+        frozen = copy(super().at_time(t))
+        object.__setattr__(frozen, "time", jnp.asarray(t, dtype=jnp.float64))
+        return frozen
+
+    def _trace_dissipation(self, dissipation: Dissipation) -> Dissipation:
+        frozen = copy(self)  # rates are functions of time, which no state contains
+        object.__setattr__(frozen, "time", jnp.zeros(()))
+        return super(QuantumSystem, frozen)._trace_dissipation(dissipation)
 
     # -- states -------------------------------------------------------------------------------------------------------
 

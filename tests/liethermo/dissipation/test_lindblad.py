@@ -89,6 +89,27 @@ def test_a_drive_in_qutips_form_is_that_of_dop853():
         np.testing.assert_allclose(system.density(run.x[-1]).ravel(), expected, atol=1e-9)
 
 
+def test_rates_that_depend_on_time_are_those_of_dop853():
+    H = 0.5 * SZ + 0.3 * SX
+    system = lt.QuantumSystem(H, lt.LindbladJumps([(LOWER, lambda t: 0.2 * (1 + jnp.sin(t))), (SZ, 0.05)]))
+
+    def field(t, v):
+        return liouvillian(H, [(LOWER, 0.2 * (1 + np.sin(t))), (SZ, 0.05)]) @ v
+
+    expected = scipy.integrate.solve_ivp(
+        field, (0.0, 4.0), RHO.ravel().astype(complex), method="DOP853", rtol=1e-12, atol=1e-13
+    ).y[:, -1]
+    run = lt.integrate(system, system.state(RHO), (0.0, 4.0), 0.02, METHOD)
+    np.testing.assert_allclose(system.density(run.x[-1]).ravel(), expected, atol=1e-9)
+    assert run.audit().passed
+    velocity = np.asarray(system.structure.matrix(system.vector_field(system.state(RHO), 1.0)))
+    np.testing.assert_allclose(velocity.ravel(), field(1.0, RHO.ravel()), atol=1e-14)
+    with pytest.raises(lt.InputError, match="rate of the dissipation of this QuantumSystem depends on time"):
+        system.steady_state()
+    with pytest.raises(lt.InputError, match="function of the time t"):
+        lt.LindbladJumps([(LOWER, lambda omega, T: 1.0)])
+
+
 @pytest.mark.parametrize(
     ("coefficient", "times", "words"),
     [
