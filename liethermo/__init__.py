@@ -21,6 +21,7 @@ from .dissipation.friction import Friction
 from .dissipation.friction_operator import FrictionOperator
 from .dissipation.inner_product import InnerProductDissipation, KillingDissipation
 from .dissipation.landau_lifshitz import LandauLifshitz
+from .dissipation.lindblad import LindbladJumps
 from .dissipation.local_metric import LocalProjectedMetric
 from .dissipation.potential import ActivatedFriction, CoulombFriction, DissipationPotential, PowerLawFriction
 from .dissipation.projected_metric import GlobalRateWarning, ProjectedMetric
@@ -171,6 +172,7 @@ __all__ = [
     "LiePoissonSystem",
     "LieVariational",
     "LiethermoError",
+    "LindbladJumps",
     "Linearisation",
     "LocalProjectedMetric",
     "MeanValue",

@@ -589,7 +589,8 @@ def _jumps_of_coupling(
             if not np.abs(_commutator(H, part) + omega * part).max() <= len(H) * tolerance * np.abs(part).max():
                 raise InputError(
                     f"the coupling V[{coupling_index}] cannot be split into components with [H, V] = -omega V, "
-                    "since the eigenvectors of the Hamiltonian depend on time. Only its eigenvalues may"
+                    "since the eigenvectors of the Hamiltonian depend on time. Only its eigenvalues may. For a "
+                    "weak drive use lt.LindbladJumps with the jumps of the undriven system"
                 )
         part = part if sign >= 0.0 else adjoint(part)  # both act, and rates are evaluated at a positive omega
         jumps.append(Jump(Operator(part), coupling_index, 0.5 if is_hermitian and sign == 0.0 else 1.0))

@@ -152,7 +152,9 @@ def _why_not_autonomous(system: System) -> str:
     scale = np.abs(velocities).max()
     if np.abs(velocities - velocities[0]).max() <= EPS * 64 * scale:
         return ""
-    what = "the energy" if system.energy.depends_on_time else f"the torque {system.torque_name}"
+    what = "a rate of the dissipation"
+    if system.energy.depends_on_time or system.torque_name:
+        what = "the energy" if system.energy.depends_on_time else f"the torque {system.torque_name}"
     return f"{what} of this {system.kind} depends on time"
 
 

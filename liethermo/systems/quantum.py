@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Sequence
+from copy import copy
 
 import equinox as eqx
 import jax
@@ -16,34 +16,37 @@ from manifolds._arrays import is_traced
 from manifolds.matrices.linear import adjoint
 
 from ..dissipation.base import Dissipation, sum_dissipations
+from ..dissipation.lindblad import LindbladJumps
 from ..dissipation.quantum import (
     HasMatrix,
     SteepestEntropyAscent,
     ThermalJumps,
     checked_hermitian,
-    checked_square_matrix,
     level_gap_rounding,
 )
 from ..errors import InputError
 from ..functions.bath_energy import BathEnergy, ReservoirEnergy
 from ..functions.density import (
     NEGATIVE_EIGENVALUE_LIMIT,
-    ExpectationValue,
     IsolatedVonNeumann,
     MeanEnergy,
-    ModulatedExpectationValue,
     VonNeumann,
-    choose_reference_level,
 )
-from ..functions.energy import Energy, Quadratic, Sum, TimeDependent
+from ..functions.energy import Energy, Quadratic, Sum
 from ..functions.gradients import EPS
 from ..functions.with_baths import BodyBathsEnergy
-from .base import TEST_TIMES, System
+from .base import System
 from .baths import BathEntropy, HeatBaths, poisson_with_baths
+from .equilibria import Equilibrium, steady_state
+from .hamiltonian import hamiltonian_energy
 from .interface import InvariantVerdicts
 
 DENSITY_MATRIX_TOLERANCE = 1e-12
 """Largest difference of a trace from one, and of a density matrix from its adjoint, that is accepted as input."""
+
+LINDBLAD_EIGENVALUE_LIMIT = 1e-6
+"""Largest modulus of a negative eigenvalue under Lindblad's equation alone, whose steps have errors of their order. The
+equation is linear, so that a small negative eigenvalue does no harm; a larger one is an error that a user would see."""
 
 ZERO_EIGENVALUE_PER_LEVEL = 8.0 * EPS
 """Largest eigenvalue of a density matrix that is zero to rounding, divided by the number of levels."""
@@ -60,9 +63,10 @@ class QuantumSystem(System):
     ----------
     hamiltonian : array, shape (N, N), function from t to one, or list of terms
         H, Hermitian (energy; hbar = 1, so the unit of time is 1 / energy). It may be a ``Qobj`` of QuTiP. A term is a
-        matrix, or a pair of a matrix and a real function of t: ``[H0, (H1, f)]`` is ``H0 + f(t) H1``.
-    dissipation : ThermalJumps, SteepestEntropyAscent, or a list of them; optional
-        The part of the motion that produces entropy.
+        matrix, or a pair of a matrix and a real function of t: ``[H0, [H1, f]]`` is ``H0 + f(t) H1``, as in QuTiP. The
+        function may be an array of its values at ``times``. A string is not evaluated.
+    dissipation : ThermalJumps, SteepestEntropyAscent, LindbladJumps, or a list of them; optional
+        The part of the motion that produces entropy, or Lindblad's equation without such a promise.
     baths : HeatBaths, optional
         The baths with which jumps exchange heat (k_B = 1, so temperatures are energies and entropies dimensionless).
         ``HeatBaths(capacity=np.inf, temperature=T)`` keeps its temperature.
@@ -74,6 +78,9 @@ class QuantumSystem(System):
         The names of these factors.
     validate : bool
         Test the axioms at a few random points. They hold by form, whatever matrices are given.
+    times : array, shape (points,), optional
+        Increasing times (1 / energy) of the values of coefficients that are arrays, between which a cubic spline
+        interpolates.
 
     Raises
     ------
@@ -84,6 +91,8 @@ class QuantumSystem(System):
     structure : manifolds.DensityMatrices
     floor : float
         Eigenvalues of rho up to this have no part in the entropy.
+    time : array, shape (), or None
+        The time at which rates that depend on it are taken: see :meth:`at_time`.
 
     Examples
     --------
@@ -99,6 +108,7 @@ class QuantumSystem(System):
     parts: tuple[int, ...] = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
     floor: float = eqx.field(static=True)
+    time: jax.Array | None
 
     def __init__(
         self,
@@ -109,17 +119,21 @@ class QuantumSystem(System):
         parts: Sequence[int] | None = None,
         names: Sequence[str] = (),
         validate: bool = False,
+        times=None,
     ):
         if not isinstance(baths, HeatBaths | None):
             raise InputError(f"baths are lt.HeatBaths(...), not {type(baths).__name__}")
-        size, energy = _hamiltonian_energy(hamiltonian)
+        self.time = None
+        size, energy = hamiltonian_energy(hamiltonian, times)
         self.structure = structure = mf.DensityMatrices(size)
         self.parts, self.names = _check_parts(parts, names, size)
         entropy = VonNeumann() if entropy is None else entropy
         if not isinstance(entropy, VonNeumann):
             raise InputError(f"the entropy of a density matrix is lt.VonNeumann(...), not {type(entropy).__name__}")
         self.floor = entropy.floor
-        entropy = IsolatedVonNeumann(self.floor) if sum_dissipations(dissipation) is None else entropy
+        total = sum_dissipations(dissipation)
+        if total is None or all(isinstance(term, LindbladJumps) for term in total.terms):
+            entropy = IsolatedVonNeumann(self.floor)  # the motion does not depend on it
         terms = [_bind_to_density(term, structure) for term in _dissipation_terms(dissipation)]
         if baths is not None and not any(isinstance(term, ThermalJumps) for term in terms):
             raise InputError("baths exchange heat by lt.ThermalJumps, and there are none: leave out baths=")
@@ -134,6 +148,28 @@ class QuantumSystem(System):
         if not self.preserved:  # preserved observables are tested instead
             self.invariant_verdicts = InvariantVerdicts(frozenset(self.casimirs()), frozenset())
 
+    # -- time ---------------------------------------------------------------------------------------------------------
+
+    @property
+    def is_driven(self) -> bool:
+        """True if the Hamiltonian or a rate depends on time."""
+        if super().is_driven or self.time is not None or self.dissipation is None:
+            return super().is_driven
+        return any(isinstance(term, LindbladJumps) and term.depends_on_time for term in self.dissipation.terms)
+
+    def at_time(self, t) -> System:
+        """Return the system with its Hamiltonian and its rates frozen at the time t."""
+        if not self.is_driven:
+            return self
+        frozen = copy(super().at_time(t))
+        object.__setattr__(frozen, "time", jnp.asarray(t, dtype=jnp.float64))
+        return frozen
+
+    def _trace_dissipation(self, dissipation: Dissipation) -> Dissipation:
+        frozen = copy(self)  # rates are functions of time, which no state contains
+        object.__setattr__(frozen, "time", jnp.zeros(()))
+        return super(QuantumSystem, frozen)._trace_dissipation(dissipation)
+
     # -- states -------------------------------------------------------------------------------------------------------
 
     def state(self, rho, batch: bool = False, entropies=None, mixed: float = 0.0) -> jax.Array:
@@ -142,7 +178,8 @@ class QuantumSystem(System):
         Parameters
         ----------
         rho : array, shape (..., N, N), or a state already
-            Hermitian, positive, of trace one. Or the amplitudes of a pure state, shape (N,) or (..., N, 1).
+            Hermitian, positive, of trace one. Or the amplitudes of a pure state, shape (N,) or (..., N, 1). A ``Qobj``
+            of QuTiP may be a ket, a bra, an operator or a stacked operator.
         batch : bool
             Whether states that are given as such may be several.
         entropies : array, shape (..., number of baths), optional
@@ -173,9 +210,9 @@ class QuantumSystem(System):
         return super().state_array(x, batch)
 
     def _is_ket(self, x) -> bool:
-        """Return whether x has the shape of the amplitudes of one pure state, with more than one level."""
+        """Return whether x has the shape of a ket, a bra or a stacked operator, with more than one level."""
         size = self.structure.size
-        return size > 1 and np.shape(x) in ((size,), (size, 1))
+        return size > 1 and np.shape(x) in ((size,), (size, 1), (1, size), (size**2, 1))
 
     def _is_matrix(self, x, batch: bool) -> bool:
         """Return whether x has the shape of a density matrix; of several with ``batch`` and more than one level."""
@@ -239,6 +276,10 @@ class QuantumSystem(System):
             raise InputError(f"a density matrix is an array of numbers, not of {rho.dtype}")
         if not np.isfinite(rho).all():
             raise InputError("the density matrix is not finite")
+        if size > 1 and rho.shape == (1, size):  # a bra
+            rho = adjoint(rho)
+        if size > 1 and rho.shape == (size**2, 1):  # an operator as QuTiP stacks it, by columns
+            rho = rho.reshape(size, size).T
         if rho.shape == (size,) or (size > 1 and rho.shape[-2:] == (size, 1)):
             rho = self._density_of_kets(rho[:, None] if rho.ndim == 1 else rho)
         if rho.shape[-2:] != (size, size):
@@ -293,7 +334,9 @@ class QuantumSystem(System):
         if not abs(trace - 1.0) <= 1e-9:
             return f"the trace of its density matrix is {trace:.12g}, not 1"
         min_eigenvalue = np.linalg.eigvalsh(rho)[:, 0].min()
-        if self.dissipation is not None and min_eigenvalue < -max(self.floor, NEGATIVE_EIGENVALUE_LIMIT):
+        needs_logarithm = self._has_dissipation(ThermalJumps) or self._has_dissipation(SteepestEntropyAscent)
+        limit = max(self.floor, NEGATIVE_EIGENVALUE_LIMIT if needs_logarithm else LINDBLAD_EIGENVALUE_LIMIT)
+        if self.dissipation is not None and min_eigenvalue < -limit:
             return (
                 f"its density matrix has the eigenvalue {min_eigenvalue:.3g}, outside the cone of positive matrices: "
                 "a shorter step stays inside"
@@ -397,6 +440,44 @@ class QuantumSystem(System):
 
     has_matrix_functions = True
 
+    # -- heat ---------------------------------------------------------------------------------------------------------
+
+    def heat_currents(self, x, t=None) -> jax.Array:
+        """Return the heat that flows from each bath into the system, shape (..., baths) (energy / time).
+
+        It is ``-T y'`` with the temperature T and the entropy y of a bath. At a steady state the currents and the power
+        of the drive add up to zero.
+
+        Parameters
+        ----------
+        x : array, shape (..., n)
+        t : float or array, shape (...), optional
+            The time, if the Hamiltonian depends on it.
+        """
+        if self.baths is None:
+            raise InputError("this system has no baths: give it baths=lt.HeatBaths(...) and lt.ThermalJumps")
+        return -self.temperatures(x) * self.vector_field(x, t)[..., self.body_dim :]
+
+    def entropy_production(self, x, t=None) -> jax.Array:
+        """Return the rate of growth of the entropy of system and baths, shape (...), at states x and the time t.
+
+        It is >= 0 under thermal jumps: ``dS/dt - sum (heat current / temperature)``. At a steady state only the baths
+        contribute. Under :class:`liethermo.LindbladJumps` it is the rate of the entropy of rho, of either sign.
+        """
+        return super().entropy_production(x, t)
+
+    def steady_state(self, x0=None, t: float | None = None) -> Equilibrium:
+        """Return the steady state that the system approaches from x0: see :func:`liethermo.steady_state`.
+
+        Parameters
+        ----------
+        x0 : array, shape (n,), or a density matrix, shape (N, N); optional
+            By default the completely mixed state.
+        t : float, optional
+            The time at which a Hamiltonian that depends on time is frozen.
+        """
+        return steady_state(self, x0, t)
+
     # -- laws ---------------------------------------------------------------------------------------------------------
 
     def hamiltonians(self) -> list[np.ndarray]:
@@ -465,96 +546,14 @@ class QuantumSystem(System):
         return self.hamiltonians()[0]
 
 
-def _hamiltonian_energy(hamiltonian) -> tuple[int, Energy]:
-    """Return the number of levels of a Hamiltonian, and the energy ``tr(rho H)`` as a function of coordinates."""
-    if isinstance(hamiltonian, list | tuple) and any(map(_is_hamiltonian_term, hamiltonian)):
-        return _energy_of_terms(hamiltonian)
-    if callable(hamiltonian) and not isinstance(hamiltonian, HasMatrix):
-        matrices = [
-            checked_hermitian(_value_at_time(hamiltonian, t, "the Hamiltonian"), f"the Hamiltonian at t = {t:.3g}")
-            for t in TEST_TIMES
-        ]
-        structure = mf.DensityMatrices(len(matrices[0]))
-        with jax.ensure_compile_time_eval():  # a number, while a family of systems is traced
-            lowest = jnp.asarray(np.diag(matrices[0]).real.min())
-        return structure.size, TimeDependent(ExpectationValue(hamiltonian, structure, lowest))
-    if isinstance(hamiltonian, jax.core.Tracer):
-        structure = mf.DensityMatrices(hamiltonian.shape[-1])
-        return structure.size, MeanEnergy(structure.vector(hamiltonian), jnp.min(jnp.diag(hamiltonian).real))
-    H = checked_hermitian(checked_square_matrix(hamiltonian, "the Hamiltonian"), "the Hamiltonian")
-    with jax.ensure_compile_time_eval():  # numbers, while a family of systems is traced
-        b = jnp.asarray(mf.DensityMatrices(len(H)).vector(H))
-        reference = jnp.asarray(choose_reference_level(np.diag(H).real))
-    return len(H), MeanEnergy(b, reference)
-
-
-def _value_at_time(function, t: float, what: str):
-    """Return the value of a function of time at t.
-
-    Raises
-    ------
-    InputError
-        If the function does not accept one argument.
-    """
-    try:
-        inspect.signature(function).bind(t)
-    except TypeError as error:
-        raise InputError(f"{what}, where it is a function, is one of the time t alone: {error}") from None
-    except ValueError:  # the signature is not known
-        pass
-    return function(t)
-
-
-def _is_hamiltonian_term(term) -> bool:
-    """Return whether a term of a list is a matrix, or begins with one, and is not a row of numbers."""
-    if isinstance(term, list | tuple):
-        return bool(term) and (isinstance(term[0], list | tuple) or _is_hamiltonian_term(term[0]))
-    return isinstance(term, HasMatrix) or np.ndim(term) == 2
-
-
-def _energy_of_terms(terms: Sequence) -> tuple[int, Energy]:
-    """Return the number of levels and the energy of a Hamiltonian ``[H0, (H1, f), ...]``, ``H0 + f(t) H1 + ...``."""
-    constant: list[np.ndarray] = []
-    modulated: list[np.ndarray] = []
-    functions = []
-    for i, term in enumerate(terms):
-        is_pair = isinstance(term, list | tuple) and len(term) == 2 and callable(term[1])
-        H, f = term if is_pair else (term, None)
-        if isinstance(H, list | tuple) and H and _is_hamiltonian_term(H[0]):
-            raise InputError(f"term {i} of the Hamiltonian is a matrix, or a pair of a matrix and a function of t")
-        H = checked_hermitian(H, f"term {i} of the Hamiltonian")
-        if H.shape != (first_matrix := (constant + modulated + [H])[0]).shape:
-            raise InputError(f"term {i} of the Hamiltonian has shape {H.shape}, and another one {first_matrix.shape}")
-        if f is None:
-            constant.append(H)
-            continue
-        value = _value_at_time(f, TEST_TIMES[0], f"the second of term {i} of the Hamiltonian")
-        if np.shape(value) or jnp.result_type(value).kind not in "fiu":
-            raise InputError(f"the function of term {i} of the Hamiltonian gives a real number, not {value!r}")
-        modulated.append(H)
-        functions.append(f)
-    structure = mf.DensityMatrices(len(H))
-    with jax.ensure_compile_time_eval():  # numbers, while a family of systems is traced
-        matrices = (sum(constant, np.zeros_like(H)), *modulated)
-        static, *rows = (jnp.asarray(structure.vector(a)) for a in matrices)
-        reference = jnp.asarray(choose_reference_level(np.asarray(static)[: structure.size]))
-    if not modulated:
-        return structure.size, MeanEnergy(static, reference)
-    initial = static
-    for f, row in zip(functions, rows, strict=True):
-        initial = initial + f(TEST_TIMES[0]) * row
-    lowest = jnp.min(initial[: structure.size])  # works for traced functions too
-    return structure.size, TimeDependent(ModulatedExpectationValue(static, tuple(rows), tuple(functions), lowest))
-
-
 def _dissipation_terms(dissipation) -> tuple[Dissipation, ...]:
     total = sum_dissipations(dissipation)
     terms = () if total is None else total.terms
     for term in terms:
-        if not isinstance(term, ThermalJumps | SteepestEntropyAscent):
+        if not isinstance(term, ThermalJumps | SteepestEntropyAscent | LindbladJumps):
             raise InputError(
-                f"the dissipation of density matrices is lt.ThermalJumps or lt.SteepestEntropyAscent, not "
-                f"{type(term).__name__}"
+                f"the dissipation of density matrices is lt.ThermalJumps, lt.SteepestEntropyAscent or "
+                f"lt.LindbladJumps, not {type(term).__name__}"
             )
     return terms
 

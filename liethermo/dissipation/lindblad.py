@@ -1,0 +1,109 @@
+"""Lindblad's equation with any jump operators, without a promise about energy and entropy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from manifolds.matrices.linear import adjoint
+
+from ..errors import InputError
+from .base import Dissipation
+from .checks import checked_rate
+from .quantum import Operator, checked_square_matrix, get_density_structure
+
+
+class LindbladJumps(Dissipation):
+    """Lindblad's equation with any jump operators: ``sum rate (V rho V^H - {V^H V, rho} / 2)`` [Lindblad 1976].
+
+    The operators need not belong to a bath: measurement, pumping, and the local dissipation of a part of a coupled
+    system have this form. No law of the energy or the entropy is promised, and an audit says so. The trace is exact.
+    The equation keeps the density matrix positive. A run keeps it positive up to the error of its steps, and ends where
+    an eigenvalue is below -1e-6. For a bath with a temperature use :class:`ThermalJumps`, which obeys both laws.
+
+    A collapse operator of QuTiP is ``sqrt(rate) * V``. The adjoint of V is a jump of its own, with its own rate.
+
+    Parameters
+    ----------
+    couplings : list of (V, rate)
+        V is a dimensionless matrix, shape (N, N), or a ``Qobj``. The rate is a number >= 0 (1 / time), or a function of
+        the time t to one. A rate that becomes negative is not refused, but the motion may then leave the density
+        matrices.
+
+    Raises
+    ------
+    InputError
+        If a matrix or a rate cannot be used.
+
+    Examples
+    --------
+    >>> lower = np.array([[0, 1], [0, 0]])
+    >>> qubit = lt.QuantumSystem(np.diag([0.0, 1.0]), lt.LindbladJumps([(lower, 0.2)]))
+    >>> run = lt.integrate(qubit, qubit.state([0.0, 1.0]), (0.0, 5.0), 0.1, lt.MetriplecticGauss(3))
+    >>> excited = qubit.density(run.x[-1])[1, 1].real
+    >>> bool(abs(excited - np.exp(-0.2 * 5.0)) < 1e-10)
+    True
+    """
+
+    operators: tuple[Operator, ...] = eqx.field(static=True)
+    rates: tuple[Any, ...]
+
+    energy_law = None
+    entropy_law = None
+    is_symmetric = False
+    is_noiseless = True
+    needs_entropy = False
+    has_generator = True
+
+    def __init__(self, couplings: Sequence[tuple[Any, Any]]):
+        pairs = list(couplings)
+        if not pairs or not all(isinstance(pair, tuple | list) and len(pair) == 2 for pair in pairs):
+            raise InputError("couplings must be a list of pairs (V, rate), such as [(V, 0.1)]")
+        self.operators = tuple(
+            Operator(checked_square_matrix(V, f"the jump operator V[{i}]")) for i, (V, _) in enumerate(pairs)
+        )
+        self.rates = tuple(
+            _checked_function(rate, i) if callable(rate) else checked_rate(rate) for i, (_, rate) in enumerate(pairs)
+        )
+
+    @property
+    def depends_on_time(self) -> bool:
+        """True if a rate is a function of time."""
+        return any(callable(rate) for rate in self.rates)
+
+    def bind_to(self, system):
+        size = get_density_structure(system, "LindbladJumps").size
+        for i, V in enumerate(self.operators):
+            if np.shape(V) != (size, size):
+                raise InputError(
+                    f"the jump operator V[{i}] has shape {np.shape(V)}, but the Hamiltonian has shape ({size}, {size})"
+                )
+        return self
+
+    def force(self, system, x, dH, dS, dL):
+        return self.generator_field(system, x, dH)
+
+    def generator_field(self, system, x, dH):
+        structure, n = system.structure, system.body_dim
+        if self.depends_on_time and system.time is None:
+            raise InputError("a rate of LindbladJumps depends on time: take system.at_time(t)")
+        rates = jnp.stack([jnp.asarray(rate(system.time)) if callable(rate) else rate for rate in self.rates])
+        rho = structure.matrix(x[:n])
+        V = np.stack([np.asarray(operator) for operator in self.operators])
+        gain = jnp.sum(rates[:, None, None] * (V @ rho @ adjoint(V)), axis=0)
+        loss = jnp.tensordot(rates, jnp.asarray(adjoint(V) @ V), 1) @ rho  # its Hermitian part is the anticommutator
+        return jnp.pad(structure.vector(gain - loss), (0, system.dim - n))
+
+
+def _checked_function(rate: Callable, i: int) -> Callable:
+    """Return a rate as a function of time, tested at t = 0."""
+    try:
+        value = rate(0.0)
+    except TypeError as error:
+        raise InputError(f"the rate of V[{i}] must be a number, or a function of the time t: {error}") from None
+    checked_rate(value)
+    return rate

@@ -1,0 +1,196 @@
+"""Lindblad's equation with any jumps, beside optical Bloch equations, superoperators of SciPy, and QuTiP."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy
+
+import liethermo as lt
+
+LOWER = np.array([[0.0, 1.0], [0.0, 0.0]])
+SX = np.array([[0.0, 1.0], [1.0, 0.0]])
+SZ = np.diag([1.0, -1.0])
+RHO = np.array([[0.6, 0.2 - 0.1j], [0.2 + 0.1j, 0.4]])
+METHOD = lt.MetriplecticGauss(3)
+
+
+class FakeQobj:
+    """An operator with the ``full()`` of QuTiP's ``Qobj``."""
+
+    def __init__(self, matrix):
+        self.matrix = np.asarray(matrix, dtype=complex)
+
+    def full(self):
+        return self.matrix
+
+
+def liouvillian(H, jumps) -> np.ndarray:
+    """Return Lindblad's generator on row-major ``vec(rho)``, from its definition."""
+    one = np.eye(len(H))
+    L = -1j * (np.kron(H, one) - np.kron(one, H.T))
+    for V, rate in jumps:
+        square = V.conj().T @ V
+        L = L + rate * (np.kron(V, V.conj()) - 0.5 * np.kron(square, one) - 0.5 * np.kron(one, square.T))
+    return L
+
+
+def test_a_damped_driven_qubit_obeys_the_optical_bloch_equations():
+    """In the rotating frame: ``H = -delta sz / 2 + Omega sx / 2``, decay at the rate gamma from level 1 to level 0."""
+    delta, Omega, gamma = 0.4, 0.9, 0.3
+    qubit = lt.QuantumSystem(-0.5 * delta * SZ + 0.5 * Omega * SX, lt.LindbladJumps([(LOWER, gamma)]))
+    # r' = B x r - (gamma / 2, gamma / 2, gamma) r + (0, 0, gamma), with B = (Omega, 0, -delta)
+    M = np.array([[-gamma / 2, delta, 0.0], [-delta, -gamma / 2, -Omega], [0.0, Omega, -gamma]])
+    rest = -np.linalg.solve(M, [0.0, 0.0, gamma])
+    saturation = 2 * Omega**2 / (gamma**2 + 4 * delta**2)
+    np.testing.assert_allclose((1 - rest[2]) / 2, 0.5 * saturation / (1 + saturation), rtol=1e-12)  # textbook form
+    state = qubit.steady_state()
+    np.testing.assert_allclose(qubit.bloch(state.x), rest, atol=1e-14)
+    np.testing.assert_allclose(
+        np.sort_complex(state.linearisation.eigenvalues), np.sort_complex(np.linalg.eigvals(M)), atol=1e-13
+    )
+    run = lt.integrate(qubit, qubit.state(RHO), (0.0, 10.0), 0.05, METHOD)
+    r0 = np.asarray(qubit.bloch(qubit.state(RHO)))
+    expected = rest + scipy.linalg.expm(10.0 * M) @ (r0 - rest)
+    np.testing.assert_allclose(qubit.bloch(run.x[-1]), expected, atol=1e-9)
+
+
+def test_the_motion_is_that_of_the_exponential_of_its_superoperator():
+    rng = np.random.default_rng(0)
+    a = rng.standard_normal((3, 3, 3)) + 1j * rng.standard_normal((3, 3, 3))
+    H, jumps = a[0] + a[0].conj().T, [(a[1], 0.1), (a[2], 0.05)]
+    rho = np.diag([0.5, 0.3, 0.2]).astype(complex)
+    system = lt.QuantumSystem(FakeQobj(H), lt.LindbladJumps([(FakeQobj(V), rate) for V, rate in jumps]))
+    run = lt.integrate(system, system.state(rho), (0.0, 2.0), 0.01, METHOD)
+    expected = (scipy.linalg.expm(2.0 * liouvillian(H, jumps)) @ rho.ravel()).reshape(3, 3)
+    np.testing.assert_allclose(system.density(run.x[-1]), expected, atol=1e-9)
+    audit = run.audit()
+    assert audit.passed
+    assert str(audit).count("no law promised") == 2
+    assert abs(np.trace(system.density(run.x[-1])) - 1.0) < 1e-14
+
+
+def test_a_drive_in_qutips_form_is_that_of_dop853():
+    """``[H0, [H1, f]]`` with a function, and with an array of its values."""
+    omega, Omega, gamma = 2.0, 0.5, 0.2
+    H0, H1, times = 0.5 * omega * SZ, Omega * SX, np.linspace(0.0, 5.0, 2001)
+    jumps = [(LOWER, gamma)]
+
+    def field(t, v):
+        return liouvillian(H0 + np.cos(omega * t) * H1, jumps) @ v
+
+    expected = scipy.integrate.solve_ivp(
+        field, (0.0, 5.0), RHO.ravel().astype(complex), method="DOP853", rtol=1e-12, atol=1e-13
+    ).y[:, -1]
+    dissipation = lt.LindbladJumps(jumps)
+    driven = lt.QuantumSystem([H0, [H1, lambda t: jnp.cos(omega * t)]], dissipation)
+    tabulated = lt.QuantumSystem([H0, [H1, np.cos(omega * times)]], dissipation, times=times)
+    for system in (driven, tabulated):
+        run = lt.integrate(system, system.state(RHO), (0.0, 5.0), 0.02, METHOD)
+        np.testing.assert_allclose(system.density(run.x[-1]).ravel(), expected, atol=1e-9)
+
+
+def test_rates_that_depend_on_time_are_those_of_dop853():
+    H = 0.5 * SZ + 0.3 * SX
+    system = lt.QuantumSystem(H, lt.LindbladJumps([(LOWER, lambda t: 0.2 * (1 + jnp.sin(t))), (SZ, 0.05)]))
+
+    def field(t, v):
+        return liouvillian(H, [(LOWER, 0.2 * (1 + np.sin(t))), (SZ, 0.05)]) @ v
+
+    expected = scipy.integrate.solve_ivp(
+        field, (0.0, 4.0), RHO.ravel().astype(complex), method="DOP853", rtol=1e-12, atol=1e-13
+    ).y[:, -1]
+    run = lt.integrate(system, system.state(RHO), (0.0, 4.0), 0.02, METHOD)
+    np.testing.assert_allclose(system.density(run.x[-1]).ravel(), expected, atol=1e-9)
+    assert run.audit().passed
+    velocity = np.asarray(system.structure.matrix(system.vector_field(system.state(RHO), 1.0)))
+    np.testing.assert_allclose(velocity.ravel(), field(1.0, RHO.ravel()), atol=1e-14)
+    with pytest.raises(lt.InputError, match="rate of the dissipation of this QuantumSystem depends on time"):
+        system.steady_state()
+    with pytest.raises(lt.InputError, match="function of the time t"):
+        lt.LindbladJumps([(LOWER, lambda omega, T: 1.0)])
+
+
+@pytest.mark.parametrize(
+    ("coefficient", "times", "words"),
+    [
+        ("cos(w*t)", None, "string 'cos"),
+        (np.ones(5), None, "needs times="),
+        (np.ones(5), np.arange(4.0), "one for each value"),
+        (np.cos, np.arange(4.0), "Remove times="),
+    ],
+)
+def test_coefficients_that_do_not_fit_are_refused(coefficient, times, words):
+    with pytest.raises(lt.InputError, match=words):
+        lt.QuantumSystem([SZ, [SX, coefficient]], times=times)
+
+
+def test_states_of_every_shape():
+    system, ket = lt.QuantumSystem(SZ), np.array([0.6, 0.8j])
+    rho = np.outer(ket, ket.conj())
+    for state in (ket, ket[:, None], ket.conj()[None], rho.T.reshape(4, 1), rho):
+        np.testing.assert_allclose(system.density(system.state(FakeQobj(state))), rho, atol=1e-15)
+        np.testing.assert_allclose(system.density(system.state_array(FakeQobj(state))), rho, atol=1e-15)
+
+
+def test_jumps_that_do_not_fit_are_refused():
+    with pytest.raises(lt.InputError, match="shape"):
+        lt.QuantumSystem(SZ, lt.LindbladJumps([(np.eye(3), 0.1)]))
+    with pytest.raises(lt.InputError, match="list of pairs"):
+        lt.LindbladJumps([LOWER])
+
+
+def test_heat_currents_balance_at_rest_and_produce_entropy():
+    T = np.array([0.5, 2.0])
+    jumps = [lt.ThermalJumps([(LOWER, 0.1)], bath=i) for i in range(2)]
+    qubit = lt.QuantumSystem(np.diag([0.0, 1.3]), jumps, baths=lt.HeatBaths(np.inf, T, 2))
+    x = qubit.steady_state().x
+    currents = np.asarray(qubit.heat_currents(x))
+    assert currents[1] > 0.0  # from the hot bath
+    np.testing.assert_allclose(currents.sum(), 0.0, atol=1e-15)
+    np.testing.assert_allclose(qubit.entropy_production(x), -np.sum(currents / T), rtol=1e-12)
+
+
+def coupled_qubits(g: float):
+    """Return two qubits between two baths with local and with global dissipation, and the local jumps."""
+    H = np.kron(np.diag([0.0, 1.0]), np.eye(2)) + np.kron(np.eye(2), np.diag([0.0, 1.0]))
+    H = H + g * (np.kron(LOWER, LOWER.T) + np.kron(LOWER.T, LOWER))
+    couplings, T, rate = (np.kron(LOWER, np.eye(2)), np.kron(np.eye(2), LOWER)), (2.0, 0.5), 0.01
+    jumps = [lt.ThermalJumps([(V, rate)], bath=i) for i, V in enumerate(couplings)]
+    whole = lt.QuantumSystem(H, jumps, baths=lt.HeatBaths(np.inf, T, 2), parts=(2, 2))
+    pairs = [[(V, rate * np.exp(0.5 / t)), (V.T, rate * np.exp(-0.5 / t))] for V, t in zip(couplings, T, strict=True)]
+    part = lt.QuantumSystem(H, lt.LindbladJumps([pair for bath in pairs for pair in bath]), parts=(2, 2))
+    return H, whole, part, pairs
+
+
+def current_of(H, rho, pairs) -> float:
+    """Return ``tr(H D(rho))`` of the jumps of one bath."""
+    D = liouvillian(np.zeros_like(H), pairs)
+    return np.trace(H @ (D @ rho.ravel()).reshape(H.shape)).real
+
+
+def test_local_and_global_dissipation_differ_where_the_coupling_is_weak():
+    """Local currents vanish with ``g^2``; global ones do not [Levy & Kosloff 2014; Hofer et al. 2017]."""
+    for g in (0.1, 1e-3):
+        H, whole, part, pairs = coupled_qubits(g)
+        global_current = float(whole.heat_currents(whole.steady_state().x)[0])
+        rho = np.asarray(part.density(part.steady_state().x))
+        L = liouvillian(H, [pair for bath in pairs for pair in bath])
+        _, _, vectors = np.linalg.svd(L)
+        kernel = vectors[-1].conj().reshape(4, 4)
+        np.testing.assert_allclose(rho, kernel / np.trace(kernel), atol=1e-12)
+        local_current = current_of(H, rho, pairs[0])
+        if g == 0.1:
+            assert abs(local_current / global_current - 1.0) < 0.1
+        else:
+            assert local_current < 0.05 * global_current
+
+
+def test_qutip_agrees():
+    qutip = pytest.importorskip("qutip")
+    H, jumps, times = SZ + 0.3 * SX, [(LOWER, 0.2)], np.linspace(0.0, 3.0, 4)
+    c_ops = [np.sqrt(rate) * qutip.Qobj(V) for V, rate in jumps]
+    options = {"atol": 1e-12, "rtol": 1e-11}
+    result = qutip.mesolve(qutip.Qobj(H), qutip.Qobj(RHO), times, c_ops, options=options)
+    system = lt.QuantumSystem(qutip.Qobj(H), lt.LindbladJumps(jumps))
+    run = lt.integrate(system, system.state(qutip.Qobj(RHO)), (0.0, 3.0), 0.02, METHOD)
+    np.testing.assert_allclose(system.density(run.x[-1]), result.states[-1].full(), atol=1e-9)
