@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from copy import copy
 
 import equinox as eqx
 import jax
@@ -13,7 +14,7 @@ import numpy as np
 
 import manifolds as mf
 from manifolds.structures.poisson import ProductPoisson
-from manifolds.structures.spins import add_vectors, cross_vectors, dot_vectors, scale_vectors, split_vectors
+from manifolds.structures.spins import add_vectors, cross, cross_vectors, dot_vectors, scale_vectors, split_vectors
 
 from ..dissipation.base import Dissipation
 from ..dissipation.heating import Heating
@@ -21,11 +22,13 @@ from ..dissipation.landau_lifshitz import LandauLifshitz
 from ..errors import InputError
 from ..functions.energy import Energy
 from ..functions.magnetism.spin_energy import lattice_shape
+from ..functions.magnetism.spin_torques import check_spin_torque
 from ..functions.on_spaces import flatten_site_functions
 from ..functions.planes import energy_in_component_order, interaction_range, to_component_order, to_site_order
 from ..functions.spheres import HalfSumOfSquares, Spheres
 from .base import ReorderedSystem, System
 from .baths import HeatBaths, poisson_with_baths
+from .torque import torque_name
 
 SPIN_LENGTHS_NAME = "sum |s|^2 / 2"
 
@@ -50,6 +53,9 @@ class SpinSystem(System):
     momentum_maps : dict of functions, or a sequence of them
         Of s, shape ``(*sites, 3)``.
     validate : bool
+    torque : function w of t, shape (), and s, shape ``(*sites, 3)``; or a list of them; optional
+        Torques ``s x w`` (w in 1 / time) from outside, such as ``lt.magnetism.Slonczewski``. Each |s_i| stays constant.
+        The torque does the work W, ``W' = sum grad_i H . (s_i x w_i)``, and the energy less the work is constant.
 
     Raises
     ------
@@ -57,6 +63,8 @@ class SpinSystem(System):
     """
 
     lattice: tuple[int, ...] = eqx.field(static=True)
+    torque: tuple[Callable, ...] | None
+    torque_time: jax.Array | None
 
     def __init__(
         self,
@@ -67,8 +75,11 @@ class SpinSystem(System):
         ratio=1.0,
         momentum_maps=(),
         validate: bool = True,
+        torque=None,
     ):
         self.lattice = lattice_shape(sites)
+        self.torque = None if torque is None else check_spin_torque(torque, self.lattice)
+        self.torque_time = None
         poisson = mf.Spins(self.lattice, ratio=ratio)
         self._build(poisson, poisson.dim, energy, None, dissipation, momentum_maps, validate, baths=baths)
 
@@ -81,6 +92,9 @@ class SpinSystem(System):
 
     def field(self, x, dH, dS, dL=()):
         """Return the vector field; precession and damping of the spins are added before they are stored in a state."""
+        torque = self.external_torque(x)
+        if torque is not None:
+            return self.drop_torque().field(x, dH, dS, dL) + torque
         damping, heating = _split_damping(self.dissipation)
         spins, n = self._spin_structure, self.body_dim
         if damping is None or spins is None:
@@ -94,6 +108,50 @@ class SpinSystem(System):
             )
             entropy_rates = heating.entropy_rates(lost_power, dH[n:])
         return spins.join_state(add_vectors(spins.precession_rates(x, dH), force), entropy_rates)
+
+    # -- the torque -----------------------------------------------------------------------------------------------
+
+    @property
+    def torque_name(self) -> str:
+        return "" if self.torque is None else torque_name(self.torque)
+
+    @property
+    def torque_invariant_casimirs(self) -> frozenset[str]:
+        return frozenset(self.casimirs())  # a torque s x w keeps every length
+
+    @property
+    def is_driven(self) -> bool:
+        return super().is_driven or (self.torque is not None and self.torque_time is None)
+
+    def at_time(self, t):
+        system = super().at_time(t)
+        if self.torque is None:
+            return system
+        system = copy(system)
+        object.__setattr__(system, "torque_time", jnp.asarray(t, dtype=jnp.float64))
+        return system
+
+    def external_torque(self, x):
+        if self.torque is None:
+            return None
+        if self.torque_time is None:
+            raise InputError(f"the torque {self.torque_name} is known at a time: take system.at_time(t)")
+        s = x[: self.body_dim].reshape(*self.lattice, 3)
+        total = sum((term(self.torque_time, s) for term in self.torque), jnp.zeros(3))
+        torque = cross(s, jnp.broadcast_to(total, s.shape))
+        return jnp.pad(torque.reshape(-1), (0, self.dim - self.body_dim))
+
+    def drop_torque(self):
+        if self.torque is None:
+            return self
+        system = copy(self)
+        for name in ("torque", "torque_time"):
+            object.__setattr__(system, name, None)
+        return system
+
+    @property
+    def is_torque_free(self) -> bool:
+        return self.torque is None and super().is_torque_free
 
     def scale_at_sites(self, values, v) -> jax.Array:
         """Return a vector v multiplied by ``values``, one for each site or one for all."""

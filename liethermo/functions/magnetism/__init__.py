@@ -24,6 +24,7 @@ from .site_terms import (
     uniaxial_anisotropy,
     zeeman,
 )
+from .spin_torques import Slonczewski, SpinOrbit, ZhangLi
 from .spin_waves import spin_temperature, spin_wave_frequencies
 from .units import SpinDynamics, Units, units
 
@@ -32,10 +33,13 @@ __all__ = [
     "HysteresisLoop",
     "Lattice",
     "Minimum",
+    "Slonczewski",
     "SpinDynamics",
+    "SpinOrbit",
     "StructureFactor",
     "Units",
     "VectorField",
+    "ZhangLi",
     "anisotropy",
     "biquadratic",
     "continuum_antisymmetric_exchange",

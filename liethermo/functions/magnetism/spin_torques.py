@@ -1,0 +1,174 @@
+"""Torques on spins by currents: spin transfer after Slonczewski and after Zhang and Li, and spin-orbit torques.
+
+Every torque has the form ``tau_i = s_i x w_i(t, s)``, so the lengths of the spins stay constant. Its work is that of
+``-grad H``: ``W' = sum grad_i H . tau_i``, which a run accounts for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from manifolds._pytree_module import Module
+from manifolds.structures.spins import cross
+
+from ...errors import FunctionError, InputError
+from ...tracing.trace_errors import TRACE_ERRORS, trace_error_message
+from ...tracing.traced import trace_callables_and_result_shapes
+from ..arguments import required_argument_count
+from ..conditions import checked_numbers
+from .lattices import Lattice
+
+
+class Slonczewski(Module):
+    """Spin-transfer torque of a perpendicular current, ``a s x (s x p) + b s x p`` [Slonczewski 1996].
+
+    It is an argument ``torque`` of ``lt.SpinSystem``.
+
+    Parameters
+    ----------
+    polarisation : array, shape (3,) or ``(*sites, 3)``
+        p, a unit vector.
+    damping_like, field_like : float, array of the shape of the sites, or function of the time
+        a and b (1 / time), beside Landau and Lifshitz' form. The damping-like torque turns spins towards p if a < 0.
+    """
+
+    polarisation: jax.Array
+    damping_like: jax.Array | Callable
+    field_like: jax.Array | Callable
+
+    def __init__(self, polarisation, damping_like=0.0, field_like=0.0):
+        self.polarisation = checked_numbers(polarisation, "a polarisation")
+        if self.polarisation.shape[-1:] != (3,):
+            raise InputError(f"a polarisation must have shape (3,) or (*sites, 3), got {self.polarisation.shape}")
+        self.damping_like = _checked_amplitude(damping_like)
+        self.field_like = _checked_amplitude(field_like)
+
+    def __call__(self, t, s):
+        a, b = _amplitude(self.damping_like, t), _amplitude(self.field_like, t)
+        return a * cross(s, self.polarisation) + b * self.polarisation
+
+
+class SpinOrbit(Slonczewski):
+    """Spin-orbit torque of a current in the plane, with the polarisation ``normal x current`` [Manchon et al. 2019].
+
+    Parameters
+    ----------
+    current : array, shape (3,)
+        Direction of the current.
+    damping_like, field_like : float, array of the shape of the sites, or function of the time
+        Amplitudes (1 / time) of ``s x (s x p)`` and of ``s x p``, as of :class:`Slonczewski`.
+    normal : array, shape (3,)
+        Normal of the interface, from the heavy metal to the magnet.
+    """
+
+    def __init__(self, current, damping_like=0.0, field_like=0.0, normal=(0.0, 0.0, 1.0)):
+        p = np.cross(np.asarray(normal, dtype=float), np.asarray(current, dtype=float))
+        length = np.linalg.norm(p)
+        if not length > 0.0:
+            raise InputError("the current of a spin-orbit torque must not be parallel to the normal")
+        super().__init__(p / length, damping_like, field_like)
+
+
+class ZhangLi(Module):
+    """Spin-transfer torque of a current along a texture, ``-(u . grad) s + beta s x (u . grad) s`` [Zhang & Li 2004].
+
+    The spins are unit vectors. The derivative is a central difference, and one-sided at open borders.
+
+    Parameters
+    ----------
+    cells : Lattice
+        A mesh with rectangular cells.
+    velocity : array, shape (3,)
+        u (length / time), the drift velocity of the electrons times their polarisation.
+    beta : float
+        Degree of non-adiabaticity.
+    alpha : float
+        Gilbert's damping constant, if the torque belongs to Gilbert's form: u is then multiplied by
+        ``(1 + alpha beta) / (1 + alpha^2)``, and beta is replaced by ``(beta - alpha) / (1 + alpha beta)``, as the
+        solution of Gilbert's equation for s' requires. 0 for a torque beside Landau and Lifshitz' form.
+
+    Raises
+    ------
+    InputError
+    """
+
+    velocity: jax.Array
+    beta: jax.Array
+    edges: tuple[float, ...] = eqx.field(static=True)
+    periodic: tuple[bool, ...] = eqx.field(static=True)
+
+    def __init__(self, cells: Lattice, velocity, beta=0.0, alpha=0.0):
+        if not isinstance(cells, Lattice) or len(cells.basis) != 1 or cells.vectors.shape != (3, 3):
+            raise InputError("cells must be those of lt.magnetism.mesh")
+        self.edges = tuple(float(edge) for edge in np.diag(cells.vectors))
+        if not np.array_equal(cells.vectors, np.diag(self.edges)):
+            raise InputError("cells must be rectangular, as those of lt.magnetism.mesh")
+        self.periodic = cells.periodic
+        u = checked_numbers(velocity, "a velocity", (3,))
+        b, a = checked_numbers(beta, "beta", ()), checked_numbers(alpha, "alpha", ())
+        self.velocity = u * (1.0 + a * b) / (1.0 + a**2)
+        self.beta = (b - a) / (1.0 + a * b)
+
+    def __call__(self, t, s):
+        derivative = jnp.zeros_like(s)
+        for axis, (edge, is_periodic) in enumerate(zip(self.edges, self.periodic, strict=True)):
+            if s.shape[axis] > 1:
+                derivative = derivative + self.velocity[axis] * _central_difference(s, axis, edge, is_periodic)
+        return cross(s, derivative) + self.beta * derivative
+
+
+def _central_difference(s, axis: int, edge: float, is_periodic: bool) -> jax.Array:
+    ahead, behind = jnp.roll(s, -1, axis), jnp.roll(s, 1, axis)
+    if is_periodic:
+        return (ahead - behind) / (2.0 * edge)
+    index = np.arange(s.shape[axis]).reshape([-1 if a == axis else 1 for a in range(s.ndim)])
+    is_first, is_last = index == 0, index == s.shape[axis] - 1
+    spacing = jnp.where(is_first | is_last, edge, 2.0 * edge)
+    return (jnp.where(is_last, s, ahead) - jnp.where(is_first, s, behind)) / spacing
+
+
+def _checked_amplitude(value):
+    return value if callable(value) else checked_numbers(value, "the amplitude of a torque")
+
+
+def _amplitude(value, t) -> jax.Array:
+    amplitude = jnp.asarray(value(t) if callable(value) else value)
+    return amplitude[..., None] if amplitude.ndim else amplitude
+
+
+def check_spin_torque(torque, sites: tuple[int, ...]) -> tuple[Callable, ...]:
+    """Return a checked tuple of functions w(t, s) of torques ``s x w``.
+
+    Raises
+    ------
+    InputError, FunctionError
+    """
+    terms = tuple(torque) if isinstance(torque, list | tuple) else (torque,)
+    for term in terms:
+        if not callable(term) or required_argument_count(term) != 2:
+            raise InputError(
+                "a torque on spins must be a function w of t and s, such as lt.magnetism.Slonczewski, which acts as "
+                f"s x w, got {type(term).__name__}"
+            )
+    shape = (*sites, 3)
+
+    def evaluate_terms(functions, t, s):
+        return [jnp.asarray(function(t, s)) for function in functions]
+
+    try:
+        functions, values = trace_callables_and_result_shapes(terms, evaluate_terms, (), shape)
+    except TRACE_ERRORS as error:
+        what = f"the torque could not be evaluated on spins of shape {shape}"
+        raise FunctionError(trace_error_message(what, error)) from error
+    for value in values:
+        if value.shape not in (shape, (3,)) or not jnp.issubdtype(value.dtype, jnp.floating):
+            raise FunctionError(
+                f"a torque on spins must return real numbers of shape {shape} or (3,), got {value.dtype} of shape "
+                f"{value.shape}"
+            )
+    return functions

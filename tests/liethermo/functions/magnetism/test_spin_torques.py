@@ -1,0 +1,70 @@
+"""Torques of currents beside closed forms, with their work in the ledger."""
+
+import numpy as np
+import pytest
+
+import liethermo as lt
+
+mag = lt.magnetism
+METHODS = [lt.MetriplecticMidpoint(), lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(4)]
+
+
+@pytest.mark.parametrize("method", METHODS, ids=str)
+def test_a_spin_in_a_current_has_its_closed_form_and_its_work(method):
+    """``z' = (rate B - a) (1 - z^2)``; work is the gain of energy and heat, to rounding."""
+    a, b, rate, B = 0.3, 0.2, 0.1, 1.0
+    torque = mag.Slonczewski((0.0, 0.0, 1.0), a, b)
+    system = lt.SpinSystem(1, mag.zeeman(1, (0, 0, B)), lt.LandauLifshitz(rate), lt.HeatBaths(2.0), torque=torque)
+    run = lt.integrate(system, system.state([[0.6, 0.0, 0.8]]), (0.0, 10.0), 0.02, method)
+    z = np.tanh((rate * B - a) * run.t + np.arctanh(0.8))
+    np.testing.assert_allclose(run.x[:, 2], z, atol=3e-4 if method is METHODS[0] else 1e-8)
+    np.testing.assert_allclose(np.linalg.norm(run.x[:, :3], axis=1), 1.0, atol=4e-16)
+    work = np.asarray(run.casimirs["work"])
+    np.testing.assert_allclose(run.energy - run.energy[0], work, atol=1e-14)
+    power = B * a * (1.0 - z**2)  # -B z' of the torque
+    by_trapezes = np.concatenate([[0.0], np.cumsum(0.5 * (power[1:] + power[:-1]) * np.diff(run.t))])
+    np.testing.assert_allclose(work, by_trapezes, atol=5e-4)
+    assert (np.diff(run.entropy) > 0.0).all()
+    phase = np.unwrap(np.arctan2(run.x[:, 1], run.x[:, 0]))
+    np.testing.assert_allclose(phase, (B - b) * run.t, atol=3e-3)
+
+
+def test_a_wall_moves_with_the_electrons_if_alpha_is_beta():
+    """Gilbert's equation with beta = alpha carries a rigid texture with the velocity u [Barnes & Maekawa 2005]."""
+    count, alpha, u = 120, 0.2, 0.8
+    box = mag.mesh((count, 1, 1), 0.5)
+    energy = mag.continuum_exchange(box, 1.0) + mag.anisotropy(box, 0.125)
+    width = 1.0 / np.sqrt(1.0)  # A = 1, K = K V / V = 1
+    x = box.positions[:, 0, 0, 0]
+    start = np.zeros((count, 1, 1, 3))
+    start[:, 0, 0, 2], start[:, 0, 0, 0] = np.tanh((x - 20.0) / width), 1.0 / np.cosh((x - 20.0) / width)
+    ratio, rate = lt.LandauLifshitz.gilbert(alpha, 8.0)
+    torque = mag.ZhangLi(box, (u, 0.0, 0.0), alpha, alpha)
+    system = lt.SpinSystem(box, energy, lt.LandauLifshitz(rate), ratio=ratio, torque=torque)
+    rest = mag.minimise(energy, start, 1e-8).spins
+    run = lt.integrate(system, system.state(rest), (0.0, 10.0), 0.02, lt.MetriplecticRungeKutta(4), save_every=500)
+    positions = [np.interp(0.0, system.spins(s)[:, 0, 0, 2], x) for s in run.x]
+    # central differences on cells of half a wall width are short by some per cent
+    assert positions[-1] - positions[0] == pytest.approx(10.0 * u, rel=0.05)
+
+
+def test_directions_and_amplitudes():
+    spin_orbit = mag.SpinOrbit((2.0, 0.0, 0.0), -0.1, lambda t: 0.5 * t)
+    s = np.array([[0.0, 0.6, 0.8], [0.0, 0.0, 1.0]])
+    np.testing.assert_allclose(spin_orbit.polarisation, [0.0, 1.0, 0.0])
+    expected = -0.1 * np.cross(s, [0.0, 1.0, 0.0]) + 1.0 * np.array([0.0, 1.0, 0.0])
+    np.testing.assert_allclose(spin_orbit(2.0, s), expected)
+    by_site = mag.Slonczewski((0.0, 0.0, 1.0), np.array([1.0, 2.0]))
+    np.testing.assert_allclose(by_site(0.0, s), np.array([[1.0], [2.0]]) * np.cross(s, [0.0, 0.0, 1.0]))
+
+
+def test_bad_torques_are_refused():
+    energy = mag.zeeman(2, (0.0, 0.0, 1.0))
+    with pytest.raises(lt.LiethermoError, match="must be a function w of t and s"):
+        lt.SpinSystem(2, energy, torque=1.0)
+    with pytest.raises(lt.LiethermoError, match=r"must return real numbers of shape \(2, 3\) or \(3,\)"):
+        lt.SpinSystem(2, energy, torque=lambda t, s: s[:, 0])
+    with pytest.raises(lt.LiethermoError, match="parallel to the normal"):
+        mag.SpinOrbit((0.0, 0.0, 1.0), 1.0)
+    with pytest.raises(lt.LiethermoError, match=r"lt\.magnetism\.mesh"):
+        mag.ZhangLi(mag.lattice("bcc", 3), (1.0, 0.0, 0.0))
