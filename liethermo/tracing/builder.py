@@ -89,6 +89,10 @@ def _wrap_integer(a, bits: int, is_signed: bool):
 
 def _take_clipped(index, *entries):
     """Return the entry at an index, which counts from zero; an index out of range is clipped."""
+    if all(type(entry) is not np.ndarray or (entry.ndim == 1 and entry.strides == (0,)) for entry in entries):
+        # parameters are the same at all points: arrays without a stride
+        table = np.array([entry if type(entry) is not np.ndarray else entry[0] for entry in entries])
+        return table[np.clip(np.asarray(index, dtype=np.int64), 0, len(entries) - 1)]
     index, *values = np.broadcast_arrays(np.clip(np.asarray(index, dtype=np.int64), 0, len(entries) - 1), *entries)
     return np.take_along_axis(np.stack(values), index[None], 0)[0][()]
 
@@ -206,6 +210,9 @@ class EnclosingScope:
         return name
 
 
+TABLE_MARK = "table"
+"""First of the two results of :meth:`Builder.prepare_pick` that stand for a table; no scalar has this name."""
+
 MAX_TABLE_STRIDE = 256
 """Largest distance in memory that is tried between the entries of a table of which only one is not fixed."""
 
@@ -258,11 +265,15 @@ class Builder:
     fixed_inputs : tuple
         The numbers that fix entries of each input array, flat, NaN for entries that are known at run time only; None
         for an array without such numbers.
+    prepared_windows : dict
+        For arrays that have been read at run-time indices, the array and the entries of its windows, prepared by
+        :meth:`prepare_pick`: many reads of one table are prepared once.
     """
 
     def __init__(self, max_instructions: int, enclosing: EnclosingScope | None = None):
         self.max_instructions, self.enclosing = max_instructions, enclosing
         self.fixed_inputs: tuple[np.ndarray | None, ...] = ()
+        self.prepared_windows: dict[tuple, tuple[np.ndarray, list[tuple[Scalar, ...]]]] = {}
         self.instructions: list[Instruction] = []
         self._emitted: dict[tuple[str | Block, ...], str] = {}
         self._negated_operand: dict[Scalar, str] = {}  # b, by the name of a = -b
@@ -435,14 +446,21 @@ class Builder:
         """Return the entry at an index, which counts from zero; an index out of range is clipped."""
         if type(index) is not str:
             return entries[min(max(index, 0), len(entries) - 1)]
-        are_equal = all(type(a) is type(entries[0]) and repr(a) == repr(entries[0]) for a in entries)
-        if are_equal:
-            return entries[0]
-        return (
-            self.op("pick", index, *entries)
-            if len(entries) <= MAX_SELECT_ENTRIES
-            else self.op("lookup", index, self.table(entries))
-        )
+        return self.pick_prepared(index, self.prepare_pick(entries))
+
+    def prepare_pick(self, entries: Sequence[Scalar]) -> tuple[Scalar, ...]:
+        """Return the one entry that all entries equal, a few entries, or :data:`TABLE_MARK` and the name of a table."""
+        if all(type(a) is type(entries[0]) and repr(a) == repr(entries[0]) for a in entries):
+            return (entries[0],)
+        return tuple(entries) if len(entries) <= MAX_SELECT_ENTRIES else (TABLE_MARK, self.table(entries))
+
+    def pick_prepared(self, index: str, prepared: tuple[Scalar, ...]) -> Scalar:
+        """Return the entry at a run-time index among entries from :meth:`prepare_pick`."""
+        if len(prepared) == 1:
+            return prepared[0]
+        if prepared[0] == TABLE_MARK:
+            return self.op("lookup", index, prepared[1])
+        return self.op("pick", index, *prepared)
 
     def conj(self, a):
         """Return the complex conjugate of a real scalar, which is the scalar."""

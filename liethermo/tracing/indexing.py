@@ -20,18 +20,25 @@ def _window_number_and_candidates(
 
     A window that sticks out of the array is moved inside.
     """
+    return _window_number(b, shape, starts, sizes), _candidate_windows(shape, starts, sizes)
+
+
+def _window_number(b, shape: Index, starts: Sequence[Scalar], sizes: Index) -> Scalar:
     window_number: Scalar = 0
-    ranges = []
     for s, n, m in zip(starts, shape, sizes, strict=True):
         if type(s) is str:
             window_number = b.add(b.mul(window_number, n - m + 1), b.min(b.max(s, 0), n - m))
-            ranges.append(range(n - m + 1))
-        else:
-            fixed_start = min(max(int(s), 0), n - m)
-            ranges.append(range(fixed_start, fixed_start + 1))
+    return window_number
+
+
+def _candidate_windows(shape: Index, starts: Sequence[Scalar], sizes: Index) -> list[tuple]:
+    ranges = []
+    for s, n, m in zip(starts, shape, sizes, strict=True):
+        fixed_start = None if type(s) is str else min(max(int(s), 0), n - m)
+        ranges.append(range(n - m + 1) if fixed_start is None else range(fixed_start, fixed_start + 1))
     corners = itertools.product(*ranges)
     # the ellipsis makes the result an array even without axes
-    return window_number, [(*(slice(i, i + m) for i, m in zip(corner, sizes, strict=True)), ...) for corner in corners]
+    return [(*(slice(i, i + m) for i, m in zip(corner, sizes, strict=True)), ...) for corner in corners]
 
 
 def _is_window_inside(b, shape: Index, starts: Sequence[Scalar], sizes: Index) -> Scalar:
@@ -49,11 +56,28 @@ def _is_window_inside(b, shape: Index, starts: Sequence[Scalar], sizes: Index) -
 
 def read_window(b, x: np.ndarray, starts: Sequence[Scalar], sizes: Index) -> np.ndarray:
     """Return the entries in a window, shape ``sizes`` (``dynamic_slice``)."""
+    if b is b.real and any(type(s) is str for s in starts):
+        return _read_real_window(b, x, starts, sizes)
     window_number, windows = _window_number_and_candidates(b.real, x.shape, starts, sizes)
     if len(windows) == 1:
         return x[windows[0]]
     entries = zip(*(x[window].ravel().tolist() for window in windows), strict=True)
     return scalar_array([b.pick(window_number, candidates) for candidates in entries], sizes)
+
+
+def _read_real_window(b, x: np.ndarray, starts: Sequence[Scalar], sizes: Index) -> np.ndarray:
+    """Return the real entries in a window at run-time indices; what many reads of an array share is prepared once."""
+    window_number = _window_number(b, x.shape, starts, sizes)
+    key = id(x), tuple(sizes), tuple(None if type(s) is str else int(s) for s in starts)
+    if key not in b.prepared_windows:
+        windows = _candidate_windows(x.shape, starts, sizes)
+        columns = zip(*(x[window].ravel().tolist() for window in windows), strict=True)
+        prepared = [b.prepare_pick(column) for column in columns]
+        b.prepared_windows[key] = x, prepared  # the array is held, so that its id remains its own
+    prepared = b.prepared_windows[key][1]
+    if type(window_number) is not str:  # each axis has one place
+        return scalar_array([candidates[0] for candidates in prepared], sizes)
+    return scalar_array([b.pick_prepared(window_number, candidates) for candidates in prepared], sizes)
 
 
 def update_window_in_place(

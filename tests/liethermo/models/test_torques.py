@@ -317,6 +317,18 @@ def test_the_program_of_a_long_table_is_short():
     assert counts[1] < counts[0] + 300  # eight more halvings for each stage
 
 
+def test_a_long_table_with_zeros_is_read_alike_by_both_engines():
+    """Zeros among the parameters are compiled in, but not those of a table, which is read from memory."""
+    times = np.linspace(0.0, END, 301)
+    moments = np.stack(
+        [np.maximum(np.sin(times), 0.0), 0.0 * times, np.where(np.arange(301) == 150, 0.01, 0.0)], axis=1
+    )
+    ends = [run(T.Tabulated(times, moments), False, engine=engine)[1].x[-1] for engine in ("array", "compiled")]
+    assert np.abs(ends[0] - ends[1]).max() < 1e-13
+    _, omega, _ = reference(lambda t, g, omega: [np.interp(t, times, column) for column in moments.T], False)
+    assert np.abs(ends[1] - INERTIA @ omega).max() < 1e-4  # kinks inside of steps
+
+
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", [lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(4), lt.MetriplecticTaylor(8)])
 def test_engines_agree_on_tables(method):
