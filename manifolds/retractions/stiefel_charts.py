@@ -99,7 +99,7 @@ class StiefelCayleyRetraction(_StiefelChart):
     ``2 x (I + z^T x)^-1 + 2 z (I + x^T z)^-1 - 2 z`` [Zhu & Sato 2020].
     """
 
-    space: Space
+    space: Stiefel
 
     order = 2
 
