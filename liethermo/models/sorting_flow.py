@@ -57,7 +57,7 @@ def sorting_flow(target, rate=1.0) -> LiePoissonSystem:
     ):
         raise InputError(f"target must be an array of at least 2 different finite numbers, got {target!r}")
     algebra = mf.u(len(entries))
-    gradient = np.asarray(algebra.vee(-1j * np.diag(entries)))
+    gradient = algebra.vee(-1j * np.diag(entries))
     return LiePoissonSystem(
         algebra, Linear(gradient), dissipation=DoubleBracket(checked_rate(rate), 1.0 / _squared_norms(algebra))
     )
@@ -107,6 +107,7 @@ def hermitian_matrix(x) -> jax.Array:
 
 def _squared_norms(algebra: mf.LieAlgebra) -> np.ndarray:
     """Return ``tr(e_a^H e_a)`` of each basis element of u(n), which are orthogonal."""
-    gram = np.einsum("aij,bij->ab", algebra.basis.conj(), algebra.basis).real
+    basis = algebra._require_basis()
+    gram = np.einsum("aij,bij->ab", basis.conj(), basis).real
     assert np.allclose(gram, np.diag(np.diag(gram))), "the basis of u(n) is orthogonal"
     return np.diag(gram)
