@@ -53,6 +53,7 @@ from .retractions.charts import (
 )
 from .retractions.coordinates import Coordinates, Place, coordinates_around
 from .retractions.retraction import Chart, Retraction
+from .retractions.stiefel_charts import PolarRetraction, QRRetraction, StiefelCayleyRetraction
 from .spaces import (
     SPD,
     Correlation,
@@ -147,11 +148,13 @@ __all__ = [
     "PoissonMap",
     "PoissonStructure",
     "PoissonTensor",
+    "PolarRetraction",
     "Polynomial",
     "Power",
     "PrecisionError",
     "Product",
     "ProjectionRetraction",
+    "QRRetraction",
     "RepresentationError",
     "Retraction",
     "RiemannianRetraction",
@@ -168,6 +171,7 @@ __all__ = [
     "Spins",
     "SplitContact",
     "Stiefel",
+    "StiefelCayleyRetraction",
     "TangentBundle",
     "TracePolynomial",
     "abelian",

@@ -19,6 +19,7 @@ from .oscillator import damped_oscillator
 from .quantised_sphere import QuantisedSphere
 from .rigid_body import free_rigid_body, rigid_body
 from .rotors import damper_wheel, dual_spin, reaction_wheels, ring_damper
+from .sorting_flow import hermitian_matrix, hermitian_state, sorting_flow, toda_flow
 from .spins import single_spin, spin_lattice
 from .thermo_particles import moving_thermo_particles, thermo_particles, thermo_springs
 from .thermoelastic_chain import thermoelastic_chain
@@ -36,6 +37,8 @@ __all__ = [
     "free_rigid_body",
     "gas_piston",
     "heat_grid",
+    "hermitian_matrix",
+    "hermitian_state",
     "magnetic_fluid",
     "mass_spring_gas",
     "micromagnet",
@@ -46,10 +49,12 @@ __all__ = [
     "rigid_body",
     "ring_damper",
     "single_spin",
+    "sorting_flow",
     "spin_lattice",
     "thermo_particles",
     "thermo_springs",
     "thermoelastic_chain",
+    "toda_flow",
     "tumbling_body",
     "zeitlin",
 ]

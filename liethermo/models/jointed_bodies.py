@@ -21,6 +21,7 @@ from ..errors import InputError
 from ..functions.energy import Energy, Sum
 from ..systems import HeatBaths, LiePoissonSystem
 from ..systems.torque import check_torque, torque_free_components
+from ..tracing.programs import jit_unoptimised
 from .articulated_bodies import ArticulatedBodies, JointDamping, JointSprings, KineticEnergy, Motion, SquaredMomentum
 from .parameters import checked_finite
 
@@ -100,7 +101,9 @@ class JointedBodies(LiePoissonSystem):
             energy = Sum((energy, springs))
         dissipation = JointDamping(damping) if is_traced(damping) or np.asarray(damping).any() else None
         poisson = ProductPoisson(mf.LiePoisson(algebra), mf.Canonical(k))
-        self._build(poisson, 3 + 2 * k, energy, None, dissipation, (), True, baths=baths)
+        self._build(
+            poisson, 3 + 2 * k, energy, None, dissipation, (), False, baths=baths
+        )  # the axioms hold for every tree
 
     # -- the motor torques --------------------------------------------------------------------------------------------
 
@@ -178,7 +181,8 @@ class JointedBodies(LiePoissonSystem):
         q = jnp.asarray(q, dtype=jnp.float64)
         if q.shape[-1:] != (self.mechanism.n_joints,):
             raise InputError(f"q must have shape (..., {self.mechanism.n_joints}), got {q.shape}")
-        return jnp.vectorize(self.mechanism.mass_matrix, signature="(k)->(m,m)")(q)
+        matrices = _mass_matrices(self.mechanism, q.reshape(-1, q.shape[-1]))
+        return matrices.reshape(*q.shape[:-1], *matrices.shape[1:])
 
     def angular_velocity(self, x) -> jax.Array:
         """Return the angular velocity of the base in its axes, shape (..., 3) (rad/s), at states x, shape (..., n)."""
@@ -195,8 +199,7 @@ class JointedBodies(LiePoissonSystem):
     @with_library_settings
     def _motion(self, x) -> Motion:
         x = self.state(x, batch=True)
-        kinetic = KineticEnergy(self.mechanism)
-        flat = jax.vmap(lambda y: self.mechanism.motion(*kinetic.split_state(y)))(x.reshape(-1, self.dim))
+        flat = _motions(self.mechanism, x.reshape(-1, self.dim))
         return Motion(*(part.reshape(*x.shape[:-1], *part.shape[1:]) for part in flat))
 
     # -- states -------------------------------------------------------------------------------------------------------
@@ -290,6 +293,17 @@ class JointedBodies(LiePoissonSystem):
         except ValueError:
             raise InputError(f"the entries of {argument} have different lengths") from None
         return jnp.concatenate([jnp.broadcast_to(c, (*shape, c.shape[-1])) for c in columns], axis=-1)
+
+
+@jit_unoptimised
+def _mass_matrices(mechanism: ArticulatedBodies, q) -> jax.Array:
+    return jax.vmap(mechanism.mass_matrix)(q)
+
+
+@jit_unoptimised
+def _motions(mechanism: ArticulatedBodies, x) -> Motion:
+    kinetic = KineticEnergy(mechanism)
+    return jax.vmap(lambda y: mechanism.motion(*kinetic.split_state(y)))(x)
 
 
 def _entries(values, start: int, end: int):

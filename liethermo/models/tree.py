@@ -15,6 +15,7 @@ from manifolds._arrays import is_traced
 from ..errors import FunctionError, InputError
 from ..functions.conditions import checked_numbers
 from ..systems import HeatBaths
+from ..tracing.programs import jit_unoptimised
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
 from ..tracing.traced import trace_callables_and_result_shapes
 from .articulated_bodies import ArticulatedBodies, JointSprings
@@ -354,11 +355,16 @@ def _layout(base: _Body, moved: list[_Body]) -> _Layout:
     return _Layout(mechanism, springs, jnp.stack([coordinate.damping for coordinate in coordinates]), joint_ranges)
 
 
+@jit_unoptimised
+def _pivots_and_mass_matrix(mechanism: ArticulatedBodies, q) -> tuple[jax.Array, jax.Array]:
+    return mechanism.pivots(q), mechanism.mass_matrix(q)
+
+
 def _check_pivots(mechanism: ArticulatedBodies, joint_ranges: list[tuple[str, int, int]]) -> None:
     """Raise InputError if a joint moves no inertia, or the whole has none about an axis, at a random configuration."""
     q = np.random.default_rng(TEST_ANGLES_SEED).uniform(0.5, 1.0, mechanism.n_joints)
     with jax.ensure_compile_time_eval():
-        pivots, M = np.asarray(mechanism.pivots(q)), np.asarray(mechanism.mass_matrix(q))
+        pivots, M = map(np.asarray, _pivots_and_mass_matrix(mechanism, jnp.asarray(q)))
     scales = np.diagonal(M)[3:]
     inertia_scale = np.diagonal(M)[:3].max()
     for name, start, end in joint_ranges:

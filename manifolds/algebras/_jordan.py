@@ -40,7 +40,7 @@ def is_zero(value: float, scale: float = 1.0) -> bool:
     """Return whether a number is zero relative to a scale; raise UnclearError in the gap between the tolerances."""
     size = abs(value) / scale
     if ZERO_TOLERANCE < size < NONZERO_TOLERANCE:
-        raise UnclearError(f"a number of relative size {size:.1e} may be zero or rounding")
+        raise UnclearError(f"a value of relative size {size:.1e} may be zero or rounding")
     return size <= ZERO_TOLERANCE
 
 

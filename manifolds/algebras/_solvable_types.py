@@ -44,7 +44,7 @@ def _action(work: WorkingConstants, x: np.ndarray, ideal: np.ndarray, quotient: 
     return coordinates(basis, images)[:, : len(representatives)]
 
 
-def _named(name: str, **parameters: float) -> Summand:
+def _make_summand(name: str, **parameters: float) -> Summand:
     return (name, tuple((key, float(value)) for key, value in parameters.items()))
 
 
@@ -56,7 +56,7 @@ def _scale(blocks: list[JordanBlock]) -> float:
     return max(abs(block.eigenvalue) for block in blocks)
 
 
-def _largest_first(values: list[float]) -> tuple[float, ...]:
+def _normalize_by_largest(values: list[float]) -> tuple[float, ...]:
     """Return real values divided by one of largest size, without it: the descending list that is largest."""
     top = max(map(abs, values))
     candidates = []
@@ -81,31 +81,31 @@ def _line_on_abelian(blocks: list[JordanBlock]) -> Summand:
     values = [block.eigenvalue.real for block in real]
     sizes = tuple(block.size for block in real)
     if set(sizes) == {1}:
-        return _diagonal(_largest_first(values))
+        return _diagonal(_normalize_by_largest(values))
     head = values[0]
     if len(values) == 1:
         return ({2: "A3,2", 3: "A4,4", 4: "A5,12"}[sizes[0]], ())
     if sizes == (2, 2):
-        return _named("A5,15", a=_largest_first(values)[0])
+        return _make_summand("A5,15", a=_normalize_by_largest(values)[0])
     if is_zero(head, scale):
         if sizes == (2, 1, 1):
-            return _named("A5,8", c=_largest_first(values[1:])[0])
+            return _make_summand("A5,8", c=_normalize_by_largest(values[1:])[0])
         return ({2: "A4,3", 3: "A5,10"}[sizes[0]], ())
     others = sorted((ratio_or_zero(value, head) for value in values[1:]), reverse=True)
     if sizes == (2, 1):
-        return _named("A4,2", a=others[0])
+        return _make_summand("A4,2", a=others[0])
     if sizes == (3, 1):
-        return _named("A5,11", c=others[0])
-    return _named("A5,9", b=others[0], c=others[1])
+        return _make_summand("A5,11", c=others[0])
+    return _make_summand("A5,9", b=others[0], c=others[1])
 
 
 def _diagonal(ratios: tuple[float, ...]) -> Summand:
     if len(ratios) == 1:
         if is_zero(ratios[0] - 1.0):
             return ("A3,3", ())
-        return ("A3,4", ()) if is_zero(ratios[0] + 1.0) else _named("A3,5", a=ratios[0])
+        return ("A3,4", ()) if is_zero(ratios[0] + 1.0) else _make_summand("A3,5", a=ratios[0])
     names = "ab" if len(ratios) == 2 else "abc"
-    return _named("A4,5" if len(ratios) == 2 else "A5,7", **dict(zip(names, ratios, strict=True)))
+    return _make_summand("A4,5" if len(ratios) == 2 else "A5,7", **dict(zip(names, ratios, strict=True)))
 
 
 def _rotation_and_lines(pair: JordanBlock, real: list[JordanBlock]) -> Summand:
@@ -114,26 +114,26 @@ def _rotation_and_lines(pair: JordanBlock, real: list[JordanBlock]) -> Summand:
     if len(values) == 1 and real[0].size == 1:
         candidates = [(ratio_or_zero(re, sign * im), ratio_or_zero(values[0], sign * im)) for sign in (1, -1)]
         b, a = max(candidates)
-        return _named("A4,6", a=a, b=b)
+        return _make_summand("A4,6", a=a, b=b)
     if len(values) == 1:
         scale = max(abs(pair.eigenvalue), abs(values[0]))
         if is_zero(values[0], scale):
-            return _named("A5,14", p=abs(ratio_or_zero(re, im)))
-        return _named("A5,16", p=ratio_or_zero(re, values[0]), s=abs(ratio_or_zero(im, values[0])))
+            return _make_summand("A5,14", p=abs(ratio_or_zero(re, im)))
+        return _make_summand("A5,16", p=ratio_or_zero(re, values[0]), s=abs(ratio_or_zero(im, values[0])))
     candidates_13 = []
     for value, other in (values, values[::-1]):
         if abs(value) > abs(other) * (1.0 - 1e-9):
             candidates_13.append((ratio_or_zero(other, value), ratio_or_zero(re, value), abs(ratio_or_zero(im, value))))
     a, p, s = max(candidates_13)
-    return _named("A5,13", a=a, p=p, s=s)
+    return _make_summand("A5,13", a=a, p=p, s=s)
 
 
 def _rotations(pairs: list[JordanBlock]) -> Summand:
     if len(pairs) == 1 and pairs[0].size == 2:
-        return _named("A5,18", p=abs(ratio_or_zero(pairs[0].eigenvalue.real, pairs[0].eigenvalue.imag)))
+        return _make_summand("A5,18", p=abs(ratio_or_zero(pairs[0].eigenvalue.real, pairs[0].eigenvalue.imag)))
     if len(pairs) == 1:
         p = abs(ratio_or_zero(pairs[0].eigenvalue.real, pairs[0].eigenvalue.imag))
-        return ("A3,6", ()) if is_zero(p) else _named("A3,7", a=p)
+        return ("A3,6", ()) if is_zero(p) else _make_summand("A3,7", a=p)
     candidates = []
     for first, second in (pairs, pairs[::-1]):
         z, w = first.eigenvalue, second.eigenvalue
@@ -144,7 +144,7 @@ def _rotations(pairs: list[JordanBlock]) -> Summand:
                     (ratio_or_zero(z.real, scale), ratio_or_zero(w.real, scale), ratio_or_zero(w.imag, z.imag))
                 )
     p, q, s = max(candidates)
-    return _named("A5,17", p=p, q=q, s=s)
+    return _make_summand("A5,17", p=p, q=q, s=s)
 
 
 # -- a Heisenberg nilradical, or one of its sums with a line ----------------------------------------------------
@@ -155,9 +155,9 @@ def _line_on_heisenberg(blocks: list[JordanBlock]) -> Summand:
         return ("A4,7", ())
     if blocks[0].is_complex:
         a = abs(ratio_or_zero(blocks[0].eigenvalue.real, blocks[0].eigenvalue.imag))
-        return ("A4,10", ()) if is_zero(a) else _named("A4,11", a=a)
-    b = _largest_first([block.eigenvalue.real for block in blocks])[0]
-    return ("A4,8", ()) if is_zero(b + 1.0) else _named("A4,9", b=b)
+        return ("A4,10", ()) if is_zero(a) else _make_summand("A4,11", a=a)
+    b = _normalize_by_largest([block.eigenvalue.real for block in blocks])[0]
+    return ("A4,8", ()) if is_zero(b + 1.0) else _make_summand("A4,9", b=b)
 
 
 def _line_on_heisenberg_and_line(work: WorkingConstants, nil, derived, x: np.ndarray) -> Summand:
@@ -173,7 +173,7 @@ def _line_on_heisenberg_and_line(work: WorkingConstants, nil, derived, x: np.nda
     if plane[0].is_complex:
         z = plane[0].eigenvalue
         p, b = max((ratio_or_zero(z.real, sign * z.imag), ratio_or_zero(line, sign * z.imag)) for sign in (1, -1))
-        return _named("A5,26", p=p, eps=1) if line_moves_centre else _named("A5,25", b=b, p=p)
+        return _make_summand("A5,26", p=p, eps=1) if line_moves_centre else _make_summand("A5,25", b=b, p=p)
     scale = max(_scale(plane), abs(line))
     if plane[0].size == 2:
         value = plane[0].eigenvalue.real
@@ -181,18 +181,20 @@ def _line_on_heisenberg_and_line(work: WorkingConstants, nil, derived, x: np.nda
             return ("A5,22", ())
         if plane_moves_line:
             return ("A5,21", ())
-        return _named("A5,24", eps=1) if line_moves_centre else _named("A5,23", b=ratio_or_zero(line, value))
+        return (
+            _make_summand("A5,24", eps=1) if line_moves_centre else _make_summand("A5,23", b=ratio_or_zero(line, value))
+        )
     if plane_moves_line:
         if is_zero(line, scale):
             return ("A5,29", ())
-        return ("A5,27", ()) if line_moves_centre else _named("A5,28", a=ratio_or_zero(trace, line))
+        return ("A5,27", ()) if line_moves_centre else _make_summand("A5,28", a=ratio_or_zero(trace, line))
     values = [block.eigenvalue.real for block in plane]
     top = max(map(abs, values))
     candidates = [
         (ratio_or_zero(trace, value), ratio_or_zero(line, value)) for value in values if abs(value) > top * (1.0 - 1e-9)
     ]
     a, b = max(candidates)
-    return _named("A5,20", a=a) if line_moves_centre else _named("A5,19", a=a, b=b)
+    return _make_summand("A5,20", a=a) if line_moves_centre else _make_summand("A5,19", a=a, b=b)
 
 
 def _centre_of_ideal(work: WorkingConstants, ideal: np.ndarray) -> np.ndarray:
@@ -214,14 +216,16 @@ def _line_on_engel(work: WorkingConstants, nil, derived, x: np.ndarray) -> Summa
     if not is_zero(last, max(abs(last), abs(third))):
         if blocks[0].size == 2:
             return ("A5,31", ())
-        return _named("A5,30", a=ratio_or_zero(third, last) + 1.0)
+        return _make_summand("A5,30", a=ratio_or_zero(third, last) + 1.0)
     motion = _action(work, x, rows, derived[:0]).astype(np.float64) / third
     shift = _action(work, complement(rows, nil, work.name)[0], rows, derived[:0]).astype(np.float64)
     shift = shift / np.linalg.norm(shift @ shift) ** 0.5
     square = shift @ shift
     design = np.stack([shift.ravel(), square.ravel()], axis=1)
     weights, *_ = np.linalg.lstsq(design, (motion - np.eye(3)).ravel(), rcond=None)
-    return _named("A5,32", a=0.0 if is_zero(weights[1], max(1.0, float(np.abs(motion).max()))) else np.sign(weights[1]))
+    return _make_summand(
+        "A5,32", a=0.0 if is_zero(weights[1], max(1.0, float(np.abs(motion).max()))) else np.sign(weights[1])
+    )
 
 
 # -- an abelian nilradical of codimension two --------------------------------------------------------------------
@@ -268,7 +272,7 @@ def _plane_on_abelian(matrices: list[np.ndarray], generic: np.ndarray) -> Summan
                 b, a = np.linalg.solve(basis.T, weights[k])
                 candidates.append((ratio_or_zero(a, 1.0), ratio_or_zero(b, 1.0)))
         a, b = min(candidates, key=lambda pair: (round(abs(pair[0]) + abs(pair[1]), 9), -pair[0], -pair[1]))
-        return _named("A5,33", a=a, b=b)
+        return _make_summand("A5,33", a=a, b=b)
     pair = int(np.argmax(eigenvalues.imag))
     line = weights[int(np.argmin(np.abs(eigenvalues.imag)))].real
     if is_zero(float(np.abs(line).max())):
@@ -277,7 +281,7 @@ def _plane_on_abelian(matrices: list[np.ndarray], generic: np.ndarray) -> Summan
     if abs(np.linalg.det(parts)) < 1e-7:
         raise UnclearError("the dilation and the rotation of a plane are nearly dependent")
     b, a = np.linalg.solve(parts.T, line)
-    return _named("A5,35", a=abs(ratio_or_zero(a, 1.0)), b=ratio_or_zero(b, 1.0))
+    return _make_summand("A5,35", a=abs(ratio_or_zero(a, 1.0)), b=ratio_or_zero(b, 1.0))
 
 
 def _shear_and_line(matrices: list[np.ndarray], generic: np.ndarray, blocks: list[JordanBlock]) -> Summand:
@@ -300,4 +304,4 @@ def _shear_and_line(matrices: list[np.ndarray], generic: np.ndarray, blocks: lis
     if abs(np.linalg.det(conditions)) < 1e-7:
         raise UnclearError("the shear and the dilation of a plane are nearly dependent")
     a = line_weights @ np.linalg.solve(conditions, [0.0, 1.0])
-    return _named("A5,34", a=ratio_or_zero(float(a), 1.0))
+    return _make_summand("A5,34", a=ratio_or_zero(float(a), 1.0))

@@ -379,7 +379,14 @@ def direct_sum_by_constants(algebras: Sequence[LieAlgebra]) -> LieAlgebra:
             ]
         )
     name = " + ".join(g.name for g in algebras)
-    return LieAlgebra(constants, name=name, basis=basis, basis_names=joined_basis_names(*algebras))
+    total = LieAlgebra(constants, name=name, basis=basis, basis_names=joined_basis_names(*algebras))
+    starts = np.cumsum([0, *(g.dim for g in algebras)])
+    invariants = [
+        _embed_casimir(F, int(start), g.dim, dim)
+        for g, start in zip(algebras, starts, strict=False)
+        for F in g.invariants
+    ]
+    return total._carry_invariants(invariants) if invariants else total
 
 
 def joined_basis_names(*algebras: LieAlgebra) -> tuple[str, ...] | None:

@@ -118,7 +118,7 @@ def isomorphism_type(g: LieAlgebra) -> IsomorphismType:
     return IsomorphismType(tuple(sorted(summands, key=lambda summand: (-order[summand[0]], summand[1]))))
 
 
-def _restricted(work: WorkingConstants, rows: np.ndarray) -> WorkingConstants:
+def _restrict_to_rows(work: WorkingConstants, rows: np.ndarray) -> WorkingConstants:
     """Return the constants of a subalgebra in the basis of independent rows."""
     brackets = products(rows, rows, work.constants).reshape(-1, work.dim)
     constants = coordinates(rows, brackets).reshape((len(rows),) * 3) if len(rows) else np.zeros((0, 0, 0))
@@ -133,13 +133,13 @@ def _indecomposable_parts(work: WorkingConstants) -> list[WorkingConstants]:
     central, derived = centre(work), derived_ideals(work)
     brackets = derived[1] if len(derived) > 1 else derived[0]
     abelian = complement(intersection(central, brackets, work.name), central, work.name)
-    lines = [_restricted(work, row[None]) for row in abelian]
+    lines = [_restrict_to_rows(work, row[None]) for row in abelian]
     if len(abelian) == work.dim:
         return lines
     if len(abelian):
         both = row_space(np.vstack([brackets, abelian]), work.name)
         rest = complement(both, work.whole_space, work.name)
-        work = _restricted(work, row_space(np.vstack([brackets, rest]), work.name))
+        work = _restrict_to_rows(work, row_space(np.vstack([brackets, rest]), work.name))
     return _parts_by_centroid(work) + lines
 
 
@@ -173,7 +173,7 @@ def _parts_by_centroid(work: WorkingConstants) -> list[WorkingConstants]:
         factor = (values - eigenvalue * np.eye(n)) / scale
         real_factor = factor.real if eigenvalue.imag == 0.0 else (factor @ factor.conj()).real
         rows = null_space(np.linalg.matrix_power(real_factor, multiplicity), work.name)
-        parts += _parts_by_centroid(_restricted(float_work, rows))
+        parts += _parts_by_centroid(_restrict_to_rows(float_work, rows))
     return parts
 
 

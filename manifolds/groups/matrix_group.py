@@ -27,6 +27,8 @@ from ..matrices.linear import inverse, max_abs_entry, solve
 from ..matrices.stumpff import HALF_TURN_MARGIN
 from . import closed_forms as closed
 from . import maps
+from .defining_equations import fields_from_equations
+from .products import product_fields
 
 MEMBERSHIP_TOLERANCE = 1e-8
 """Largest distance of a matrix from the group, relative to its size, at which its logarithm is taken."""
@@ -110,6 +112,41 @@ class MatrixGroup:
     def __post_init__(self) -> None:
         if getattr(self.defect, "__module__", "") != closed.__name__:  # those are known to take batches
             object.__setattr__(self, "defect", _batched_defect(self.defect, self.name, self.algebra._require_basis()))
+
+    @classmethod
+    def from_equations(cls, f: Callable, n: int, name: str = "G") -> MatrixGroup:
+        """Return the group of real matrices that solve ``f(A) = 0`` near the identity.
+
+        Its algebra is the kernel of the derivative of f at the identity.
+
+        Parameters
+        ----------
+        f : callable
+            Function of one matrix by jax.numpy, shape (n, n), to an array of any shape. Equations may depend on each
+            other.
+        n : int
+            The size of the matrices.
+        name : str
+
+        Raises
+        ------
+        ParameterError
+            If f does not vanish at the identity, has no derivative there, or no other solutions nearby.
+        ClosureError
+            If the kernel is no algebra, or exponentials of its elements are no solutions.
+
+        Examples
+        --------
+        >>> boost = jnp.diag(jnp.array([1.0, 1.0, -1.0]))
+        >>> lorentz = mf.MatrixGroup.from_equations(lambda A: A.T @ boost @ A - boost, 3, name="O(2,1)")
+        >>> print(lorentz.dim, lorentz.algebra.isomorphism_type())
+        3 A3,8
+        """
+        return cls(**fields_from_equations(f, n, name))
+
+    def __mul__(self, other: MatrixGroup) -> MatrixGroup:
+        """Return the product of two groups, whose matrices are block diagonal; its algebra is the direct sum."""
+        return MatrixGroup(**product_fields(self, other)) if isinstance(other, MatrixGroup) else NotImplemented
 
     @property
     def dim(self) -> int:

@@ -15,7 +15,9 @@ from ..groups.matrix_group import MEMBERSHIP_TOLERANCE, MatrixGroup
 from ..matrices.linear import solve
 from ..spaces import GroupSpace
 from ..spaces.base import Space
+from ..spaces.stiefel import Stiefel
 from .retraction import Chart, Retraction
+from .stiefel_charts import PolarRetraction, QRRetraction, StiefelCayleyRetraction
 
 
 @jax.tree_util.register_static
@@ -206,7 +208,9 @@ RETRACTIONS: dict[str, Callable[[Space], Retraction]] = {
     "exp": RiemannianRetraction,
     "euclidean": EuclideanRetraction,
     "group_exp": GroupRetraction,
-    "cayley": CayleyRetraction,
+    "cayley": lambda space: StiefelCayleyRetraction(space) if isinstance(space, Stiefel) else CayleyRetraction(space),
+    "qr": QRRetraction,
+    "polar": PolarRetraction,
     "projection": ProjectionRetraction,
     "midpoint_euclidean": lambda space: MidpointRetraction(EuclideanRetraction(space)),
     "midpoint_group_exp": lambda space: MidpointRetraction(GroupRetraction(space)),
@@ -224,7 +228,8 @@ def retraction(space: Space | MatrixGroup, kind: str = "midpoint") -> Retraction
         A group stands for ``GroupSpace(group)``.
     kind : str
         ``"midpoint"`` is the paper's (4.8), with the Riemannian chart. ``"exp"``, ``"euclidean"``, ``"group_exp"``,
-        ``"cayley"`` and ``"projection"`` have their base point at the start of the step; ``"midpoint_euclidean"``,
+        ``"cayley"`` and ``"projection"`` have their base point at the start of the step, and so do ``"qr"`` and
+        ``"polar"`` of Stiefel manifolds; ``"midpoint_euclidean"``,
         ``"midpoint_group_exp"`` and ``"midpoint_cayley"`` have it in the middle.
 
     Raises

@@ -4,8 +4,9 @@ from manifolds._names import public_dir
 
 from .along_time import laws
 from .fields import sphere_field
+from .projections import invariants, projection
 from .studies import study
 from .surfaces import momentum_sphere
 
-__all__ = ["laws", "momentum_sphere", "sphere_field", "study"]
+__all__ = ["invariants", "laws", "momentum_sphere", "projection", "sphere_field", "study"]
 __dir__ = public_dir(__all__)

@@ -49,7 +49,7 @@ def members(name):
             yield mf.patera(name, **parameters)
 
 
-def in_bases(g, count=1):
+def change_bases(g, count=1):
     random = np.random.default_rng(g.dim)
     yield g
     for _ in range(count):
@@ -59,7 +59,7 @@ def in_bases(g, count=1):
 
 
 def check_type(g, family):
-    types = [h.isomorphism_type() for h in in_bases(g)]
+    types = [h.isomorphism_type() for h in change_bases(g)]
     for t in types:
         assert t.is_known, t
         assert t.name.split("^")[0] == family, (g.name, str(t))
@@ -126,7 +126,7 @@ def test_special_parameters_are_recognised(name, parameters):
     ids=lambda value: value if isinstance(value, str) else value.name,
 )
 def test_types_of_known_algebras(g, text):
-    for h in in_bases(g):
+    for h in change_bases(g):
         assert str(h.isomorphism_type()) == text
 
 

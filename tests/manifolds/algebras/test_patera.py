@@ -12,7 +12,7 @@ sympy = pytest.importorskip("sympy")
 VALUES = {"a": 0.5, "b": 0.4, "c": -0.3, "p": 0.7, "q": 0.2, "s": 0.6, "eps": 1.0}
 """Generic values, allowed in every family."""
 
-PUBLISHED = {
+LITERATURE_INVARIANTS = {
     # invariants of Patera, Sharp, Winternitz & Zassenhaus (1976), tables I and II, in their own form
     "A3,1": ["e1"],
     "A3,2": ["e1*exp(-e2/e1)"],
@@ -69,21 +69,21 @@ def symbols(dim):
     return sympy.symbols(f"e1:{dim + 1}", real=True)
 
 
-@pytest.mark.parametrize("name", PUBLISHED)
+@pytest.mark.parametrize("name", LITERATURE_INVARIANTS)
 def test_published_invariants_are_annihilated_and_complete(name):
     g, variables = member(name), symbols(int(name[1]))
     numbers = {sympy.Symbol(p): v for p, v in VALUES.items()}
     point = np.random.default_rng(1).uniform(0.3, 1.2, g.dim)
     gradients = []
     meanings = {str(x): x for x in variables}
-    for text in PUBLISHED[name]:
+    for text in LITERATURE_INVARIANTS[name]:
         expression = sympy.sympify(text, locals=meanings).subs(numbers)
         residual, size = coadjoint_derivatives(g, expression, variables, point)
         assert np.abs(residual).max() <= 1e-12 * max(1.0, size), text
         values = dict(zip(variables, point, strict=True))
         gradients.append([complex(sympy.diff(expression, x).subs(values)) for x in variables])
     rank = np.linalg.matrix_rank(np.array(gradients)) if gradients else 0
-    assert rank == len(PUBLISHED[name]) == g.index()
+    assert rank == len(LITERATURE_INVARIANTS[name]) == g.index()
     # the functions that the algebra carries depend on these
     for invariant in g.invariants:
         own = np.asarray(jax.grad(invariant)(point))

@@ -35,7 +35,7 @@ def dimensions(g):
     return len(g.centre()), len(g.derivations()), len(g.radical()), len(g.nilradical()), g.index()
 
 
-def in_random_basis(g, seed=0, exact=True):
+def change_basis_at_random(g, seed=0, exact=True):
     random = np.random.default_rng(seed)
     if not exact:
         return g.change_of_basis(random.standard_normal((g.dim, g.dim)) + 2.0 * np.eye(g.dim))
@@ -59,7 +59,7 @@ def test_dimensions_are_those_of_the_literature(g):
 @pytest.mark.parametrize("g", [g for g in DIMENSIONS if g.dim < 8], ids=lambda g: g.name)
 @pytest.mark.parametrize("exact", [True, False])
 def test_dimensions_do_not_depend_on_the_basis(g, exact):
-    other = in_random_basis(g, exact=exact)
+    other = change_basis_at_random(g, exact=exact)
     assert (other.rational_constants is not None) == exact or g.is_abelian()
     assert dimensions(other) == DIMENSIONS[g]
     assert [len(rows) for rows in other.derived_ideals()] == g.derived_series()
@@ -69,7 +69,7 @@ def test_dimensions_do_not_depend_on_the_basis(g, exact):
 @pytest.mark.parametrize("exact", [True, False])
 @pytest.mark.parametrize("g", [mf.se(3), mf.aff(2), POINCARE, mf.galilei(3)], ids=lambda g: g.name)
 def test_levi_subalgebra_is_a_semisimple_complement_of_the_radical(g, exact):
-    other = in_random_basis(g, 1, exact)
+    other = change_basis_at_random(g, 1, exact)
     levi, radical = other.levi_decomposition()
     assert np.linalg.matrix_rank(np.vstack([levi, radical])) == g.dim
     brackets = np.asarray(other.bracket(levi[:, None], levi))
@@ -84,7 +84,7 @@ def test_levi_subalgebra_is_a_semisimple_complement_of_the_radical(g, exact):
 
 
 def test_exact_rows_are_integers_and_annihilate_exactly():
-    g = in_random_basis(mf.galilei(2), 3)
+    g = change_basis_at_random(mf.galilei(2), 3)
     for rows in (g.radical(), g.nilradical(), *g.derived_ideals()):
         assert np.array_equal(rows, np.round(rows))
     for D in g.derivations():
@@ -94,7 +94,7 @@ def test_exact_rows_are_integers_and_annihilate_exactly():
 
 
 def test_centre_commutes_and_derived_ideals_contain_the_brackets():
-    g = in_random_basis(mf.direct_sum(mf.heisenberg(1), mf.aff(1), mf.abelian(1)), 4)
+    g = change_basis_at_random(mf.direct_sum(mf.heisenberg(1), mf.aff(1), mf.abelian(1)), 4)
     centre = g.centre()
     assert len(centre) == 2
     assert not np.asarray(g.bracket(centre[:, None], np.eye(g.dim))).any()

@@ -1,0 +1,149 @@
+"""Trees read from URDF and MJCF beside the same trees built by hand, and the elements that are refused."""
+
+import numpy as np
+import pytest
+
+import liethermo as lt
+
+URDF = """<?xml version="1.0"?>
+<robot name="satellite">
+  <material name="grey"><color rgba="0.5 0.5 0.5 1"/></material>
+  <link name="bus">
+    <visual><geometry><box size="1 1 1"/></geometry></visual>
+    <inertial><mass value="10"/><inertia ixx="3" iyy="2" izz="1.5" ixy="0" ixz="0" iyz="0"/></inertial>
+  </link>
+  <link name="yoke"><inertial><origin xyz="0.1 0 0"/><mass value="0.5"/>
+    <inertia ixx="0.01" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <link name="panel">
+    <inertial><origin xyz="0.8 0 0" rpy="0 0 1.5707963267948966"/><mass value="2"/>
+      <inertia ixx="0.05" iyy="0.4" izz="0.42" ixy="0.01" ixz="0" iyz="0"/></inertial>
+  </link>
+  <link name="mass"><inertial><mass value="0.3"/>
+    <inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="fixed" type="fixed"><parent link="bus"/><child link="yoke"/>
+    <origin xyz="0.5 0 0" rpy="1.5707963267948966 0 0"/></joint>
+  <joint name="hinge" type="revolute"><parent link="yoke"/><child link="panel"/><origin xyz="0.2 0 0"/>
+    <axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/><dynamics damping="0.3"/></joint>
+  <joint name="rail" type="prismatic"><parent link="panel"/><child link="mass"/><origin xyz="1 0 0"/>
+    <axis xyz="0 1 0"/></joint>
+</robot>"""
+
+MJCF = """<mujoco model="satellite">
+  <compiler angle="radian"/>
+  <option gravity="0 0 -9.81" timestep="0.001"/>
+  <default><joint damping="0.3"/></default>
+  <worldbody>
+    <light pos="0 0 3"/>
+    <body name="bus" pos="0 0 2"><freejoint/>
+      <inertial pos="0 0 0" mass="10" diaginertia="3 2 1.5"/>
+      <geom type="box" size="1 1 1"/>
+      <body name="panel" pos="0.5 0.1 0" quat="0.7071067811865476 0.7071067811865476 0 0">
+        <joint type="hinge" axis="0 0 -1" pos="0.1 0 0" stiffness="4" springref="0.2"/>
+        <inertial pos="0.8 0 0" mass="2" fullinertia="0.05 0.4 0.42 0.01 0 0"/>
+        <body name="tip" pos="1.5 0 0">
+          <joint axis="1 0 0" damping="0"/><joint axis="0 1 0" damping="0.1"/>
+          <inertial pos="0 0 0.3" mass="1" diaginertia="0.01 0.03 0.03"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>"""
+
+
+def assert_equal_motion(read, built, names):
+    """The two trees have the same vector field at a random state."""
+    rng = np.random.default_rng(0)
+    a, b = (tree.system(attitude=False) for tree in (read, built))
+    assert [name for name, _, _ in a.joint_indices] == [name for name, _, _ in b.joint_indices] == names
+    x = rng.standard_normal(a.dim)
+    field = b.vector_field(x)
+    assert np.allclose(a.vector_field(x), field, rtol=0, atol=1e-12 * np.abs(field).max())
+    assert float(a.energy(x)) == pytest.approx(float(b.energy(x)), rel=1e-13)
+
+
+def test_a_urdf_file_is_the_tree_built_by_hand(tmp_path):
+    tree = lt.bodies.Tree()
+    mass, centre = 10.5, np.array([0.5 * 0.6 / 10.5, 0.0, 0.0])
+    rest = lambda r: r @ r * np.eye(3) - np.outer(r, r)  # noqa: E731
+    # the axes of the yoke are turned by 90 degrees about x, which swaps equal moments
+    inertia = np.diag([3.0, 2.0, 1.5]) + 10.0 * rest(centre) + np.diag([0.01, 0.02, 0.02])
+    inertia = inertia + 0.5 * rest(np.array([0.6, 0.0, 0.0]) - centre)
+    tree.add("bus", mass, centre, inertia)
+    turn = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
+    quarter = turn @ np.array([[0.0, -1.0, 0], [1.0, 0, 0], [0, 0, 1.0]])
+    tensor = quarter @ np.array([[0.05, 0.01, 0], [0.01, 0.4, 0], [0, 0, 0.42]]) @ quarter.T
+    hinge = lt.bodies.Hinge((0.7, 0, 0), (0, -1, 0), damping=0.3)
+    tree.add("panel", 2.0, (0.8, 0, 0), tensor, "bus", hinge)
+    tree.add("mass", 0.3, parent="panel", joint=lt.bodies.Slider((1, 0, 0), (0, 0, 1)))
+    assert_equal_motion(lt.bodies.Tree.from_urdf(URDF), tree, ["panel", "mass"])
+    path = tmp_path / "satellite.urdf"
+    path.write_text(URDF)
+    assert lt.bodies.Tree.from_urdf(path).names == ("bus", "panel", "mass")
+
+
+def test_an_mjcf_file_is_the_tree_built_by_hand():
+    tree = lt.bodies.Tree()
+    tree.add("bus", 10.0, inertia=(3.0, 2.0, 1.5))
+    turn = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
+    tensor = turn @ np.array([[0.05, 0.01, 0], [0.01, 0.4, 0], [0, 0, 0.42]]) @ turn.T
+    hinge = lt.bodies.Hinge((0.6, 0.1, 0), (0, 1, 0), stiffness=4.0, damping=0.3, rest_angle=0.2)
+    tree.add("panel", 2.0, (0.7, 0, 0), tensor, "bus", hinge)
+    joint = lt.bodies.Universal((1.4, 0, 0), [(1, 0, 0), (0, 0, 1)], damping=(0.0, 0.1))
+    tree.add("tip", 1.0, turn @ [0, 0, 0.3], (0.01, 0.03, 0.03), "panel", joint)
+    assert_equal_motion(lt.bodies.Tree.from_mjcf(MJCF), tree, ["panel", "tip"])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (URDF.replace('type="revolute"', 'type="floating"'), "'floating', which is not covered"),
+        (URDF.replace("</robot>", "<gazebo/></robot>"), "the element 'gazebo' in robot"),
+        (URDF.replace('<child link="panel"/>', '<child link="bus"/>'), "a loop"),
+        (URDF.replace('<dynamics damping="0.3"/>', '<dynamics friction="0.3"/>'), "friction='0.3'"),
+        (URDF.replace('<mass value="2"/>', '<mass value="0"/>'), "an inertia and no mass"),
+        (URDF.replace("<axis xyz", "<axis ixyz"), "needs the attribute 'xyz'"),
+        (URDF.replace('<parent link="yoke"/>', '<parent link="arm"/>'), "the link 'arm'"),
+        (URDF.replace("</robot>", ""), "no well-formed XML"),
+        ("<mujoco/>", "the root element 'robot'"),
+    ],
+)  # fmt: skip
+def test_urdf_that_is_not_covered_is_refused(text, message):
+    with pytest.raises(lt.InputError, match=message):
+        lt.bodies.Tree.from_urdf(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (MJCF.replace('type="hinge"', 'type="ball"'), "'ball', which is not covered"),
+        (MJCF.replace("</mujoco>", "<equality/></mujoco>"), "the element 'equality' in mujoco"),
+        (MJCF.replace('stiffness="4"', 'armature="4"'), "armature='4'"),
+        (MJCF.replace('stiffness="4"', 'class="big"'), "the attribute 'class'"),
+        (MJCF.replace("<freejoint/>", ""), "needs a freejoint"),
+        (MJCF.replace('timestep="0.001"', 'viscosity="0.1"'), "viscosity='0.1'"),
+        (MJCF.replace('pos="0.8 0 0" mass', 'pos="0.8 0" mass'), "must be 3 finite numbers"),
+        (MJCF.replace('<joint axis="1 0 0" damping="0"/>', '<joint type="slide" axis="1 0 0"/>'), "slide and hinge"),
+    ],
+)
+def test_mjcf_that_is_not_covered_is_refused(text, message):
+    with pytest.raises(lt.InputError, match=message):
+        lt.bodies.Tree.from_mjcf(text)
+
+
+def test_a_file_that_does_not_exist():
+    with pytest.raises(lt.FileError, match="cannot read the URDF file"):
+        lt.bodies.Tree.from_urdf("no such file.urdf")
+
+
+def test_a_massless_link_between_two_hinges_is_a_universal_joint():
+    text = URDF.replace("</robot>", """
+      <link name="cross"/><link name="dish"><inertial><origin xyz="0 0 0.2"/><mass value="1"/>
+        <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+      <joint name="a" type="continuous"><parent link="bus"/><child link="cross"/><origin xyz="0 0 0.5"/>
+        <axis xyz="1 0 0"/></joint>
+      <joint name="b" type="continuous"><parent link="cross"/><child link="dish"/><axis xyz="0 1 0"/></joint>
+    </robot>""")  # fmt: skip
+    system = lt.bodies.Tree.from_urdf(text).system()
+    assert {name: end - start for name, start, end in system.joint_indices} == {"panel": 1, "mass": 1, "dish": 2}
+    with pytest.raises(lt.InputError, match="the body 'cross' has no mass"):
+        lt.bodies.Tree.from_urdf(text.replace('<child link="dish"/>', '<child link="dish"/><origin xyz="0 0 0.1"/>'))
