@@ -28,7 +28,7 @@ from .casimirs import DEFAULT_MAX_DEGREE, casimirs, casimirs_up_to, check_invari
 from .display import algebra_html
 from .killing import cartan_involution_of, killing_form_of, row_space_basis
 from .polynomial_casimirs import casimir_count
-from .structure_methods import StructureMethods, constants_in_basis
+from .structure_methods import CasimirInBasis, StructureMethods, constants_in_basis
 
 
 @jax.tree_util.register_static
@@ -258,9 +258,11 @@ class LieAlgebra(StructureMethods):
         >>> print(g.bracket([1.0, 0.0, 0.0], [0.0, 1.0, 0.0]))
         [0.  0.  0.5]
         """
-        constants, _ = constants_in_basis(self, P)
+        constants, inverse = constants_in_basis(self, P)
+        rows = tuple(map(tuple, inverse.astype(np.float64).tolist()))
         basis = None if self.basis is None else np.tensordot(np.asarray(P, dtype=np.float64), self.basis, axes=(1, 0))
-        return LieAlgebra(constants, name=name or self.name, basis=basis, basis_names=basis_names)
+        algebra = LieAlgebra(constants, name=name or self.name, basis=basis, basis_names=basis_names)
+        return algebra._carry_invariants(CasimirInBasis(F, rows) for F in self.invariants)
 
     # -- the operations -----------------------------------------------------------------------------------------
 

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from fractions import Fraction
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ..errors import LieAlgebraError, ShapeError
@@ -138,6 +142,28 @@ class StructureMethods:
         if scale == 0.0:
             return 0
         return numerical_rank(np.linalg.svd(tensor / scale, compute_uv=False), 1.0, self.name)
+
+
+@dataclass(frozen=True)
+class CasimirInBasis:
+    """A Casimir as a function of the components of mu in another basis.
+
+    Attributes
+    ----------
+    casimir : callable
+    rows : tuple of tuple of float
+        The matrix from the new components of mu to the old ones.
+    """
+
+    casimir: Callable
+    rows: tuple[tuple[float, ...], ...]
+
+    def __call__(self, mu) -> jax.Array:
+        """Return the value at ``mu``, shape (..., dim) -> (...)."""
+        return self.casimir(jnp.asarray(mu) @ np.array(self.rows).T)
+
+    def __str__(self) -> str:
+        return f"{self.casimir} in another basis"
 
 
 def constants_in_basis(g: AlgebraStructure, rows) -> tuple[np.ndarray, np.ndarray]:

@@ -82,7 +82,7 @@ def product_fields(first: Any, second: Any) -> dict[str, Any]:
     groups = (first, second)
     algebras = tuple(group.algebra for group in groups)
 
-    def of_components(kind: str) -> BlockMap | None:
+    def maps_of_components(kind: str) -> BlockMap | None:
         maps = tuple({"cayley": g.cayley_map, "adjoint_cayley": g.adjoint_cayley_map}[kind] for g in groups)
         return None if None in maps else BlockMap(maps, algebras, takes_components=True)
 
@@ -94,11 +94,11 @@ def product_fields(first: Any, second: Any) -> dict[str, Any]:
         "inverse_map": MatrixBlockMap(tuple(group.inverse_map for group in groups), algebras),
         "exp_map": BlockMap(tuple(group.exp_map for group in groups), algebras, takes_components=True),
         "log_map": BlockMap(tuple(group.log_map for group in groups), algebras, gives_components=True),
-        "cayley_map": of_components("cayley"),
+        "cayley_map": maps_of_components("cayley"),
         "inverse_cayley_map": BlockMap(
             tuple(group.inverse_cayley_map for group in groups), algebras, gives_components=True
         ),
-        "adjoint_cayley_map": of_components("adjoint_cayley"),
+        "adjoint_cayley_map": maps_of_components("adjoint_cayley"),
         "restore_map": MatrixBlockMap(tuple(group.restore_map for group in groups), algebras),
         "equations": None if None in equations else BlockEquations(equations, algebras),
     }

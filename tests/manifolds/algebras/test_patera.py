@@ -105,6 +105,19 @@ def test_carried_invariants_are_casimirs_by_symbolic_derivatives(name):
         np.testing.assert_allclose(float(invariant(point)), by_sympy, rtol=1e-13)
 
 
+def test_a_change_of_basis_carries_the_invariants():
+    g, P = (
+        member("A5,16"),
+        np.array([[1, 1, 0, 0, 0], [0, 1, 0, 2, 0], [0, 0, 1, 0, 0], [1, 0, 0, 1, 0], [0, 0, 1, 0, 1]]),
+    )
+    other, mu = g.change_of_basis(P), np.linspace(0.3, 1.1, 5)
+    assert len(other.leading_casimirs()) == other.index() == 3
+    for F, G in zip(g.invariants, other.invariants, strict=True):
+        np.testing.assert_allclose(G(P @ mu), F(mu), rtol=1e-13)
+        assert np.abs(other.ad_star(jax.grad(G)(P @ mu), P @ mu)).max() < 1e-12
+    assert g.change_of_basis(P) == other
+
+
 def test_wrong_sign_is_no_casimir():
     """Control: the check of an invariant refuses the invariants of the algebra with another sign."""
     with pytest.raises(mf.LieAlgebraError, match=r"e1\*exp\(e2/e1\) is no Casimir of A3,2"):
