@@ -135,8 +135,8 @@ def _coefficient_function(coefficient, times, i: int) -> Callable:
     values = np.asarray(coefficient)
     if values.dtype.kind not in "fiu" or values.ndim != 1:
         raise InputError(
-            f"the coefficient of term {i} of the Hamiltonian must be a function of t or an array of real numbers, "
-            f"got {type(coefficient).__name__}"
+            f"term {i} of the Hamiltonian is a matrix, or a pair of a matrix and a function of t, or of a matrix and "
+            f"an array of real numbers; its second entry is of type {type(coefficient).__name__}"
         )
     if times is None:
         raise InputError(f"the coefficient of term {i} of the Hamiltonian is an array, so it needs times=")

@@ -552,8 +552,8 @@ def _dissipation_terms(dissipation) -> tuple[Dissipation, ...]:
     for term in terms:
         if not isinstance(term, ThermalJumps | SteepestEntropyAscent | LindbladJumps):
             raise InputError(
-                f"the dissipation of density matrices is lt.ThermalJumps, lt.SteepestEntropyAscent or "
-                f"lt.LindbladJumps, not {type(term).__name__}"
+                f"the dissipation of density matrices is lt.ThermalJumps or lt.SteepestEntropyAscent, or "
+                f"lt.LindbladJumps without these laws, not {type(term).__name__}"
             )
     return terms
 
