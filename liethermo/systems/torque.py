@@ -79,11 +79,16 @@ def evaluate_torque(torque: Any, counts: tuple[int, ...], t, mu, attitude, veloc
 
 @functools.lru_cache(maxsize=64)
 def begins_with_rotations(algebra: mf.LieAlgebra) -> bool:
-    """Return whether the first three basis elements are those of so(3), as in se(3) and in sums with so(3)."""
-    if len(algebra.shape) != 1 or algebra.dim < 3 or not algebra.name.startswith(("so(3)", "se(3)")):
+    """Return whether the first three basis elements are rotations, and the others an ideal, as in se(3) and in sums.
+
+    The first three components of a velocity are then the angular velocity of a body, whatever it carries.
+    """
+    if len(algebra.shape) != 1 or not 3 <= algebra.dim <= MAX_UNROLLED_DIM:
         return False
-    constants = np.asarray(algebra.structure_constants)[:3, :3]
-    return bool(np.allclose(constants[..., :3], mf.so(3).structure_constants) and not constants[..., 3:].any())
+    constants = np.asarray(algebra.structure_constants)  # [e_a, e_b] = sum_c constants[a, b, c] e_c
+    rotations = constants[:3, :3]
+    is_subalgebra = np.allclose(rotations[..., :3], mf.so(3).structure_constants) and not rotations[..., 3:].any()
+    return bool(is_subalgebra and not constants[:, 3:, :3].any())
 
 
 def torque_free_components(
