@@ -190,9 +190,10 @@ class Propagator:
             raise InputError(REFERENCE_STEPS)
         if self.noise is not None and (dense or until is not None):
             raise InputError(NOISY_STEPS)
-        breaks = *checked_breaks(breaks), *(self._declared_breaks if problem.is_driven else ())
+        given_breaks = checked_breaks(breaks) if np.size(breaks) else ()
+        all_breaks = *given_breaks, *(self._declared_breaks if problem.is_driven else ())
         allow_infinite_end = adaptive and until is not None
-        schedule = self._schedule(t_span, save_every, save_at, allow_infinite_end, breaks)
+        schedule = self._schedule(t_span, save_every, save_at, allow_infinite_end, all_breaks)
         x = problem.initial_state(x0, schedule.start, attitude)
         if problem.is_driven and isinstance(self.method, OneStepMethod):
             schedule = schedule_around_features(schedule, [problem.system_in_span(schedule)], [x], step)

@@ -270,7 +270,7 @@ def make_schedule(
     """
     start, end = checked_span(span, allow_infinite_end)
     step_size = end - start if isinstance(step, Adaptive) else step
-    breaks_inside = tuple(t for t in checked_breaks(breaks) if start < t < end)
+    breaks_inside = tuple(t for t in checked_breaks(breaks) if start < t < end) if breaks else ()
     schedule = StepSchedule(
         (start, end), step_size, save_every, allow_infinite_end=allow_infinite_end, breaks=breaks_inside
     )

@@ -36,18 +36,21 @@ class RecordedFunctions(NamedTuple):
         These and the entries of the ledger, whose values along a run belong to its solution.
     has_user_states : bool
         Whether states of a run have the form that the user sees.
+    has_angular_velocity : bool
+        Whether the system contains a rigid body.
     """
 
     invariants: dict[str, Energy]
     of_series: dict[str, Energy]
     has_user_states: bool
+    has_angular_velocity: bool
 
     @classmethod
     def from_system(cls, system: System, invariants: Mapping[str, tuple[Energy, bool | None]]) -> RecordedFunctions:
         """Return the recorded functions, with invariants as :func:`.preparation.invariants_and_laws` returns them."""
         functions = {name: f for name, (f, _) in invariants.items()}
         has_user_states = type(system).to_user_solution is System.to_user_solution and not system.sites
-        return cls(functions, {**functions, **system.ledger}, has_user_states)
+        return cls(functions, {**functions, **system.ledger}, has_user_states, system.has_angular_velocity)
 
 
 def build_solution(
@@ -82,7 +85,7 @@ def build_solution(
             system, method, functions.invariants, x, np.asarray(fields["t"]), step_sizes, replay
         ),
         angular_velocity_source=functools.partial(angular_velocities, system, x)
-        if system.has_angular_velocity
+        if functions.has_angular_velocity
         else None,
         **fields,
     )
