@@ -296,18 +296,28 @@ def energy_drift_correction(system: System, x, compensation, energy, first_energ
     return drift_correction_multiplier(system, system.energy, x, compensation, energy, first_energy)
 
 
+MAX_DRIFT_DISPLACEMENT = 1e-10
+"""Largest displacement by a drift correction, relative to the state; larger ones are skipped.
+
+Where a driven body comes to rest, the gradient of its energy vanishes and the work does not: the rounding of the work
+would move the body by any amount."""
+
+
 def drift_correction_multiplier(system: System, function: Energy, x, compensation, value, level) -> jax.Array:
     """Return the multiple of the gradient of a function that shifts x so that its value comes nearer to ``level``.
 
-    The shift is at most ``eps |x| / 4``, and zero unless value and level differ by more than a few roundings.
+    The shift is about ``eps |x| / 4`` at most, and zero unless value and level differ by more than a few roundings.
     """
     gradient = function.gradient(x)
     error = (value - level) + jnp.dot(gradient, compensation)
     value, sensitivity = jnp.abs(level), function.sensitivity(x)
     max_shift = EPS * jnp.maximum(0.25 * sensitivity, value - DEFAULT_OPTIONS.large_offset_ratio * sensitivity)
     amount = jnp.where(jnp.abs(error) > DEFAULT_OPTIONS.drift_threshold * jnp.maximum(value, sensitivity), error, 0.0)
-    squared_norm = jnp.dot(gradient, system.raise_index(x, gradient))
-    return jnp.clip(amount, -max_shift, max_shift) / jnp.where(squared_norm > 0.0, squared_norm, 1.0)
+    direction = system.raise_index(x, gradient)
+    squared_norm = jnp.dot(gradient, direction)
+    multiplier = jnp.clip(amount, -max_shift, max_shift) / jnp.where(squared_norm > 0.0, squared_norm, 1.0)
+    displacement = jnp.abs(multiplier) * jnp.max(jnp.abs(direction))
+    return jnp.where(displacement <= MAX_DRIFT_DISPLACEMENT * jnp.max(jnp.abs(x)), multiplier, 0.0)
 
 
 LEVEL_SPACING_ULPS = 32.0
