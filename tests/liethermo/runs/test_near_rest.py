@@ -133,3 +133,14 @@ def test_terms_that_cancel_in_the_energy(method):
         solution = lt.integrate(system, x0, (0.0, 10.0), h, method)
         assert solution.audit().passed, f"\n{solution.audit()}"
         assert np.abs(solution.x[-1] / x0[1] - swing).max() < (1e-6 if method.order == 4 else 0.01)
+
+
+@pytest.mark.parametrize(("stages", "max_error"), [(2, 1e-6), (3, 1e-10)])
+def test_a_driven_body_that_comes_to_rest_stays_where_its_torque_leaves_it(stages, max_error):
+    """``L' = sin t`` from rest: at t = 2 pi the energy is zero and the work, rounded, is not."""
+    body = lt.LiePoissonSystem(
+        mf.so(3), lt.Quadratic([1.0, 0.5, 0.4]), torque=lambda t, m: jnp.stack([0.0, 0.0, 1.0]) * jnp.sin(t)
+    )
+    solution = lt.integrate(body, [0.0, 0.0, 0.0], (0.0, 4.0 * np.pi), np.pi / 20.0, lt.MetriplecticGauss(stages))
+    assert np.abs(solution.x[:, 2] - (1.0 - np.cos(solution.t))).max() < max_error
+    assert solution.audit().passed
