@@ -87,7 +87,8 @@ def refusals(folder, *parts, changes=()):
         ("", "study.axes is missing: by parameters of the model"),
         (
             "axes.rat = [1.0]",
-            "study.axes: rigid_body has no parameter rat (did you mean rate?); it has inertia, rate, initial",
+            "study.axes: rigid_body has no parameter rat (did you mean rate?); it has inertia, rate, attitude, torque, "
+            "initial",
         ),
         ('axes."inertia[3]" = [1.0]', "study.axes: inertia[3] is no entry of inertia = [2.0, 1.5, 1.0]"),
         ("axes.inertia = [1.0]", "study.axes: inertia = [2.0, 1.5, 1.0] is a list; an axis is one entry of it"),

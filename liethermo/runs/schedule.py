@@ -143,6 +143,13 @@ class StepSchedule:
         all_breaks = sorted({*self.breaks, *breaks})
         return StepSchedule((self.start, self.end), self.h, self.save_every, save_at, breaks=all_breaks)
 
+    def ends_step_at(self, t: float) -> bool:
+        """Return whether a full step ends at a time inside the span, to rounding."""
+        segment = next(segment for segment in self.segments if t <= segment.end)
+        n_steps = round((t - segment.start) / self.h)
+        rounding = TIME_TOLERANCE_ULPS * EPS * max(abs(self.start), abs(self.end))
+        return 0 < n_steps <= segment.n_full_steps and abs(segment.start + n_steps * self.h - t) <= rounding
+
     def engine_calls(
         self, max_steps: int = CHUNK_STEPS, max_saves: int = MAX_SAVES_PER_CALL, save_all: bool = False
     ) -> Iterator[EngineCall]:
@@ -191,6 +198,8 @@ class StepSchedule:
     @property
     def longest_steps(self) -> np.ndarray:
         """The longest step after each saved state, shape (saved states - 1,)."""
+        if not self.segments:
+            return np.zeros(0)
         n_full_steps, last_step_sizes = self._full_steps_and_last_step_sizes
         full_steps_before_segments = np.cumsum([0, *n_full_steps])
         segment_index = self._segment_of_step(self.saved_step_counts)

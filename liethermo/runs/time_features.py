@@ -56,7 +56,9 @@ class TimeFeature(NamedTuple):
 def schedule_around_features(
     schedule: StepSchedule, systems: Sequence[System], states: Iterable, step: float | Adaptive
 ) -> StepSchedule:
-    """Return a schedule in which no adaptive step jumps over a feature; steps of given size are not changed.
+    """Return a schedule in which no adaptive step jumps over a feature; steps of given size keep their ends.
+
+    Jumps are breaks if they are all at the ends of steps, unless that changes which states are saved.
 
     Parameters
     ----------
@@ -76,6 +78,9 @@ def schedule_around_features(
     if isinstance(step, Adaptive):
         edges = {t for feature in features for t in feature if schedule.start < t < schedule.end}
         return schedule.with_more_breaks(sorted(edges))
+    jumps = sorted({feature.start for feature in features if feature.is_jump})
+    if schedule.save_every in (None, 1) and all(schedule.ends_step_at(t) for t in jumps):
+        schedule, features = schedule.with_more_breaks(jumps), [f for f in features if not f.is_jump]
     warn_of_skipped_features(features, schedule.h)
     return schedule
 
