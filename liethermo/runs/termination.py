@@ -37,6 +37,9 @@ BLOW_UP_RATE_FACTOR = 10.0
 """Smallest increase of the relative growth rate over this time. A state that leaves an equilibrium grows at a constant
 rate, which ends."""
 
+MAX_PROBE_CALLS = 2_000
+"""Largest number of calls of an engine in the search for unbounded growth, a few tenths of a second."""
+
 PROBE_STEPS_PER_CALL = 16
 """Number of shorter steps in one call of the engine."""
 
@@ -169,7 +172,9 @@ def _blow_up_text_from_shorter_steps(engine: EngineWithFallback, state, t: float
     norm, velocity = np.abs(x).max(), vector_field_at(engine.system, x[None])[0]
     if not _does_norm_double_within(x, velocity, BLOW_UP_HORIZON_STEPS * h):
         return ""
-    while probe_time < BLOW_UP_HORIZON_STEPS * h and probe_step_size > h / 8.0**8 and t + probe_step_size > t:
+    for _ in range(MAX_PROBE_CALLS):
+        if not (probe_time < BLOW_UP_HORIZON_STEPS * h and probe_step_size > h / 8.0**8 and t + probe_step_size > t):
+            break
         previous_step = int(state.step)
         state = engine.advance(
             state._replace(status=jnp.zeros_like(jnp.asarray(state.status))), probe_step_size, 1, PROBE_STEPS_PER_CALL
