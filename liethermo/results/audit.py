@@ -291,7 +291,7 @@ def audit_run(solution: AuditedRun, tolerances: Tolerances) -> Audit:
         rows.append(_judged_row("attitude in group", stats.attitude_residual, tolerances.attitude))
     if stats.spatial_momentum_change is not None:
         rows.append(_spatial_momentum_row(stats.spatial_momentum_change, laws, tolerances))
-    rows += _step_rows(evidence, tolerances)
+    rows += _accuracy_and_consistency_rows(evidence, tolerances)
     status = solution.status  # a run stopped by its user is short, but breaks no law
     has_failed = not status.ok and status.code != StatusCode.INTERRUPTED.status_name
     rows.append(
@@ -360,7 +360,7 @@ def _entropy_row(solution: AuditedRun, tolerances: Tolerances) -> tuple[float, A
     )
 
 
-def _step_rows(evidence: Evidence, tolerances: Tolerances) -> list[AuditRow]:
+def _accuracy_and_consistency_rows(evidence: Evidence, tolerances: Tolerances) -> list[AuditRow]:
     """Return the rows of accuracy and consistency."""
     rows, inconsistency = [accuracy_row(evidence, tolerances)], evidence.inconsistency
     if inconsistency is not None:

@@ -75,7 +75,7 @@ class _StepFunction(eqx.Module):
         return jnp.concatenate([residual.ravel(), method.move(system, x, compensation, h, k)[0]])
 
 
-def _directional_derivative(step: _StepFunction, point) -> jax.Array:
+def _mixed_directional_derivative(step: _StepFunction, point) -> jax.Array:
     """Return the derivative of a step along ``step.order`` directions, by nested forward mode.
 
     Rows of the point are z and k and their derivatives; the row of a subset of directions is the one whose number has
@@ -149,7 +149,7 @@ def state_derivatives(
                 n_sets, axis=1
             )
             points = np.concatenate([begin, rows(chunk).reshape(*begin.shape[:2], -1)], axis=2)
-            values = evaluate_at_points(_directional_derivative, step, points.reshape(-1, points.shape[-1]))
+            values = evaluate_at_points(_mixed_directional_derivative, step, points.reshape(-1, points.shape[-1]))
             derivatives[chunk] = values.reshape(*begin.shape[:2], m + n)
         return derivatives[..., :m].swapaxes(1, 2), derivatives[..., m:].swapaxes(1, 2)
 

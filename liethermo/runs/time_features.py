@@ -103,7 +103,7 @@ def undeclared_features(system: System, x: np.ndarray, schedule: StepSchedule) -
     if not np.isfinite(schedule.end) or n_intervals < MIN_SAMPLED_INTERVALS:
         return []
     times = np.linspace(schedule.start, schedule.end, n_intervals + 1)
-    values = _values_at_times(system, x, times)
+    values = _gradient_and_torque_at_times(system, x, times)
     if not np.isfinite(values).all():
         return []
     scale = np.ptp(values, axis=0)
@@ -126,7 +126,7 @@ def undeclared_features(system: System, x: np.ndarray, schedule: StepSchedule) -
     return features
 
 
-def _values_at_times(system: System, x: np.ndarray, times: np.ndarray) -> np.ndarray:
+def _gradient_and_torque_at_times(system: System, x: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Return the gradient of the energy and the torque at a state at several times, shape (times, values)."""
     driven = system.body if isinstance(system, AttitudeSystem) else system
     assert isinstance(driven, DrivenSystem)
@@ -139,7 +139,7 @@ def _locate_jump(system: System, x: np.ndarray, scale: np.ndarray, start: float,
     """Return the first time after a jump in an interval, or None if the functions change continuously there."""
     while True:
         times = np.unique(np.linspace(start, end, N_PARTS + 1))
-        values = _values_at_times(system, x, times)
+        values = _gradient_and_torque_at_times(system, x, times)
         changes = (np.abs(np.diff(values, axis=0)) / scale).max(axis=1)
         part = int(np.argmax(changes))
         if not changes[part] > JUMP_FRACTION * change:

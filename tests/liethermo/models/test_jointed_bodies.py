@@ -77,7 +77,7 @@ def momentum_in_space(solution):
         pytest.param(lt.MetriplecticMidpoint(), 0.02, 2, marks=pytest.mark.slow),
         pytest.param(lt.MetriplecticGauss(2), 0.05, 4, marks=pytest.mark.slow),
         pytest.param(lt.MetriplecticRungeKutta(4), 0.02, 4, marks=pytest.mark.slow),
-        pytest.param(lt.MetriplecticRungeKutta(8), 0.2, 8, marks=pytest.mark.slow),
+        pytest.param(lt.MetriplecticRungeKutta(8), 0.1, 8, marks=pytest.mark.slow),
     ],
     ids=str,
 )
@@ -193,7 +193,7 @@ def test_chain_of_ten_bodies_for_a_long_time():
     system = tree_of(links, names).system()
     joints = dict(zip(names[1:], 0.1 * np.arange(9), strict=True))
     x0 = system.state(angular_velocity=ANGULAR_VELOCITY, joints=joints)
-    run = lt.integrate(system, x0, (0.0, 1000.0), 0.05, lt.MetriplecticGauss(2), save_every=100)
+    run = lt.integrate(system, x0, (0.0, 100.0), 0.1, lt.MetriplecticGauss(2), save_every=10)
     momentum = momentum_in_space(run)
     assert np.abs(momentum - momentum[0]).max() < 1e-11
     assert np.ptp(run.energy) < 1e-12
