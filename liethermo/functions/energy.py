@@ -364,7 +364,7 @@ class TimeDependent(Energy, FunctionWithBreaks):
         raise InputError("this energy depends on time, so its value needs a time. Call energy(x, t)")
 
     def multiple(self, factor) -> Energy:
-        return TimeDependent(MultipleFunction(self.function, factor))
+        return TimeDependent(MultipleFunction(self.function, factor), self.breaks)
 
     def __neg__(self) -> Energy:
         return TimeDependent(NegatedFunction(self.function), self.breaks)

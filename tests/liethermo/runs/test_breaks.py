@@ -188,6 +188,13 @@ def test_energy_states_its_breaks(switched_reference):
         assert np.abs(solution.x[-1] - switched_reference[0]).max() < 2e-8
 
 
+def test_multiples_of_an_energy_keep_its_breaks():
+    drive = lt.TimeDependent(lambda m, t: jnp.where(t >= 1.0, m[0], 0.0), breaks=[1.0])
+    for energy in (2.0 * drive, -drive, drive / 3.0):
+        system = lt.LiePoissonSystem(mf.so(3), lt.Quadratic(1.0 / INERTIA) + energy)
+        assert 1.0 in lt.integrate(system, X0, (0.0, 1.7), 0.3).t
+
+
 # -- features that nobody declares ----------------------------------------------------------------------------------
 
 
@@ -235,7 +242,8 @@ def test_smooth_drives_have_no_features():
         system = lt.LiePoissonSystem(
             mf.so(3), lambda m, t, drive=drive: 0.5 * jnp.sum(m**2 / INERTIA) + drive(t) * m[0]
         )
-        lt.integrate(system, X0, (0.0, 30.0), 0.25)  # no warning
+        solution = lt.integrate(system, X0, (0.0, 30.0), 0.25)  # no warning, which would be an error
+        np.testing.assert_array_equal(solution.t, 0.25 * np.arange(121))
 
 
 # -- errors of quadratures ----------------------------------------------------------------------------------------
