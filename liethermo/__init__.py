@@ -46,7 +46,7 @@ from .functions.each import Each
 from .functions.energy import Energy, Function, Quadratic, TimeDependent
 from .functions.gradients import CoordinateIncrement, DiscreteGradient, Gonzalez, MeanValue
 from .functions.mechanics import Kinetic, Potential
-from .functions.piecewise_constant import PiecewiseConstant
+from .functions.piecewise import PiecewiseConstant
 from .integrators import (
     DiscreteHerglotz,
     FiniteDifference,

@@ -135,16 +135,22 @@ def reorder_components(
     )
 
 
-def start_step(system: System, state: State) -> tuple[System, State]:
-    """Return the system and the state with which a step starts.
+def start_step(system: System, x, energy_before) -> tuple[System, jax.Array]:
+    """Return the system and the state vector with which a step from x starts.
 
     They differ from those given only in a run with breaks, at which functions of time jump.
+
+    Parameters
+    ----------
+    system : System
+    x : array, shape (n,)
+    energy_before : array, shape ()
+        The energy at the end of the last step, before a jump.
     """
-    step_system = system.system_of_step(state.x)
-    if system.energy_jumps:  # the energy of the state before the jump is that at the end of the last step
-        jump = step_system.energy.value(state.x) - state.energy
-        state = state._replace(x=system.add_jump_of_energy(state.x, jump))
-    return step_system, state
+    step_system = system.system_of_step(x)
+    if system.energy_jumps:
+        x = system.add_jump_of_energy(x, step_system.energy.value(x) - energy_before)
+    return step_system, x
 
 
 def take_step(
@@ -160,7 +166,8 @@ def take_step(
     An engine that has Newton's method elsewhere passes ``newton_fallback(fixed_point_result, x, compensation, h, k,
     previous_slopes)``, which replaces it.
     """
-    system, state = start_step(system, state)
+    system, x = start_step(system, state.x, state.energy)
+    state = state._replace(x=x)
     system, method, state, restore_order = reorder_components(system, method, state, options)
     if not method.carries_compensation:
         state = state._replace(compensation=compensation_from_state(system, method, state.x, state.compensation))

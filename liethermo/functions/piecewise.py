@@ -1,29 +1,85 @@
-"""Functions of time from tables: polynomials between given times, found by bisection."""
+"""Functions of time from tables: constants or polynomials between given times, found by bisection."""
 
 from __future__ import annotations
 
+import functools
 import math
+import sys
 from typing import Any, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.interpolate
+import scipy  # its module of splines is loaded where one is used
 
 from manifolds._pytree_module import Module
 
 from ..errors import InputError
 from .conditions import checked_numbers, require_condition
+from .time_span import FunctionWithBreaks, checked_breaks
 
 TableKind = Literal["linear", "cubic"]
 """Interpolation of a table: straight lines, or a cubic spline with two continuous derivatives."""
 
-SPLINES_WITH_AXIS = (scipy.interpolate.PPoly, scipy.interpolate.BPoly, scipy.interpolate.BSpline)
-"""Splines of SciPy whose values may be arrays, with the times along any axis."""
 
-SPLINES = (*SPLINES_WITH_AXIS, scipy.interpolate.UnivariateSpline)
-"""Splines of SciPy that are functions of one number, from which a table can be made."""
+def is_spline(value: Any) -> bool:
+    """Return whether a value is a spline of SciPy, a function of one number from which a table can be made."""
+    if "scipy.interpolate" not in sys.modules:  # then there is none
+        return False
+    return isinstance(value, (*_splines_with_axis(), scipy.interpolate.UnivariateSpline))
+
+
+@functools.cache
+def _splines_with_axis() -> tuple[Any, ...]:
+    """Return the splines of SciPy whose values may be arrays, with the times along any axis."""
+    return scipy.interpolate.PPoly, scipy.interpolate.BPoly, scipy.interpolate.BSpline
+
+
+class PiecewiseConstant(FunctionWithBreaks):
+    """A function of time that is constant between given times and zero outside, such as a train of pulses.
+
+    At a time where it jumps it has its value from after the jump. The steps of a run end at these times.
+
+    Parameters
+    ----------
+    times : sequence of float, length m
+        Increasing times of the jumps. They are no parameters of a system: they decide where steps end.
+    values : array, shape (m - 1, ...)
+        The values between two of the times.
+
+    Raises
+    ------
+    InputError
+        If the times do not increase, or there is not one value for each interval.
+
+    Examples
+    --------
+    >>> pulses = lt.PiecewiseConstant([2.0, 2.5, 7.0], [1.0, -1.0])
+    >>> [float(pulses(t)) for t in (1.0, 2.0, 3.0, 7.0)]
+    [0.0, 1.0, -1.0, 0.0]
+    """
+
+    times: tuple[float, ...] = eqx.field(static=True)
+    values: jax.Array
+
+    def __init__(self, times, values):
+        self.times, self.values = checked_breaks(times), checked_numbers(values, "values")
+        if self.times != tuple(np.asarray(times, dtype=np.float64)) or self.values.shape[:1] != (len(self.times) - 1,):
+            raise InputError(
+                "PiecewiseConstant needs increasing times and one value for each interval between two of them, got "
+                f"{len(times)} times and values of shape {self.values.shape}"
+            )
+
+    @property
+    def break_times(self) -> tuple[float, ...]:
+        return self.times
+
+    def __call__(self, t) -> jax.Array:
+        if not self.values.shape[0]:
+            return jnp.zeros(self.values.shape[1:])
+        value = jnp.asarray(self.values)[interval_index(jnp.asarray(self.times), t)]
+        return jnp.where((t >= self.times[0]) & (t < self.times[-1]), value, jnp.zeros_like(value))
 
 
 class Table(Module):
@@ -114,11 +170,37 @@ class Table(Module):
             value = (1.0 - fraction) * values[i] + fraction * values[i + 1]
         else:
             assert self.coefficients is not None
-            rows = jnp.asarray(self.coefficients)[i]
-            value = rows[-1]
-            for j in range(rows.shape[0] - 2, -1, -1):
-                value = value * (t - start) + rows[j]
+            value = _polynomial_value(jnp.asarray(self.coefficients)[i], t - start)
         return jnp.where((t >= times[0]) & (t <= times[n_intervals]), value, jnp.zeros(self.shape))
+
+
+class ContinuedSpline(Module):
+    """The polynomials of a spline of SciPy; the first and the last of them continue outside of its interval.
+
+    Attributes
+    ----------
+    times : array, shape (m,)
+    coefficients : array, shape (m - 1, order, ...)
+        Coefficients of ``(t - times[i])**j`` in each interval.
+    """
+
+    times: jax.Array
+    coefficients: jax.Array
+
+    def __init__(self, spline: Any):
+        self.times, self.coefficients = _pieces_of_spline(spline)
+
+    def __call__(self, t) -> jax.Array:
+        i = interval_index(self.times, t)
+        return _polynomial_value(self.coefficients[i], t - self.times[i])
+
+
+def _polynomial_value(coefficients: jax.Array, s) -> jax.Array:
+    """Return ``sum_j coefficients[j] s**j`` by Horner's scheme."""
+    value = coefficients[-1]
+    for j in range(coefficients.shape[0] - 2, -1, -1):
+        value = value * s + coefficients[j]
+    return value
 
 
 def interval_index(times: jax.Array, t) -> jax.Array:
@@ -136,7 +218,7 @@ def interval_index(times: jax.Array, t) -> jax.Array:
 
 def _pieces_of_spline(spline: Any) -> tuple[jax.Array, jax.Array]:
     """Return the times, shape (m,), and the ascending coefficients, shape (m - 1, order, ...), of a SciPy spline."""
-    axis = spline.axis if isinstance(spline, SPLINES_WITH_AXIS) else 0
+    axis = spline.axis if isinstance(spline, _splines_with_axis()) else 0
     if axis != 0:
         raise InputError(f"a spline must interpolate along axis 0, got axis {axis}")
     if isinstance(spline, scipy.interpolate.BPoly):
@@ -159,7 +241,7 @@ def _pieces_of_spline(spline: Any) -> tuple[jax.Array, jax.Array]:
     return jnp.asarray(times), jnp.asarray(np.moveaxis(coefficients[::-1], 0, 1).astype(float))
 
 
-def _bspline_on_its_interval(spline: scipy.interpolate.BSpline) -> scipy.interpolate.PPoly:
+def _bspline_on_its_interval(spline: Any) -> Any:
     """Return the polynomials of a B-spline between its first and its last knot that counts."""
     start, end = spline.t[spline.k], spline.t[-spline.k - 1]
     breakpoints = np.unique(spline.t[(spline.t >= start) & (spline.t <= end)])

@@ -20,7 +20,6 @@ from manifolds.structures.poisson import ProductPoisson
 from ..errors import InputError
 from ..functions.energy import Energy, Sum
 from ..systems import HeatBaths, LiePoissonSystem
-from ..systems.torque import check_torque, torque_free_components
 from ..tracing.programs import jit_unoptimised
 from .articulated_bodies import ArticulatedBodies, JointDamping, JointSprings, KineticEnergy, Motion, SquaredMomentum
 from .parameters import checked_finite
@@ -89,21 +88,15 @@ class JointedBodies(LiePoissonSystem):
         self.algebra, self.group, self.reconstruction = algebra, None, None
         if attitude:
             self.group, self.reconstruction = mf.SO(3), "coadjoint"
-        self.torque, self.torque_argument_counts = check_torque(torque, algebra, self.group)
-        self.torque_free_components = (
-            ()
-            if torque is None
-            else torque_free_components(self.torque, self.torque_argument_counts, algebra, self.group)
-        )
-        self.torque_arguments, self.motors, self.joint_indices = None, motors, joint_indices
+        self._set_torque(torque)
+        self.motors, self.joint_indices = motors, joint_indices
         energy: Energy = KineticEnergy(mechanism)
         if is_traced(springs.stiffness) or np.asarray(springs.stiffness).any():
             energy = Sum((energy, springs))
         dissipation = JointDamping(damping) if is_traced(damping) or np.asarray(damping).any() else None
         poisson = ProductPoisson(mf.LiePoisson(algebra), mf.Canonical(k))
-        self._build(
-            poisson, 3 + 2 * k, energy, None, dissipation, (), False, baths=baths
-        )  # the axioms hold for every tree
+        validate = False  # the axioms hold for every tree
+        self._build(poisson, 3 + 2 * k, energy, None, dissipation, (), validate, baths=baths)
 
     # -- the motor torques --------------------------------------------------------------------------------------------
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -13,13 +13,12 @@ import numpy as np
 from manifolds._arrays import is_traced
 
 from ..errors import FunctionError, InputError
+from ..functions.checks import traced_function_and_shape
 from ..functions.conditions import checked_numbers
 from ..systems import HeatBaths
 from ..tracing.programs import jit_unoptimised
-from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
-from ..tracing.traced import trace_callables_and_result_shapes
 from .articulated_bodies import ArticulatedBodies, JointSprings
-from .inertia import INEQUALITY_RTOL, is_symmetric
+from .inertia import INEQUALITY_RTOL, is_symmetric, satisfies_triangle_inequalities
 from .jointed_bodies import JointedBodies, JointMotors
 from .joints import Joint, JointCoordinate
 from .parameters import checked_finite, checked_positive
@@ -290,10 +289,9 @@ def _checked_body_inertia(inertia, name: str) -> jax.Array:
         raise InputError(f"{what} must be a symmetric tensor, got {tensor.tolist()}")
     tensor = 0.5 * (tensor + tensor.T)
     moments = np.linalg.eigvalsh(tensor)
-    rounding = INEQUALITY_RTOL * abs(moments).max()
-    if moments[0] < -rounding:
+    if moments[0] < -INEQUALITY_RTOL * abs(moments).max():
         raise InputError(f"{what} must have principal moments >= 0, got {moments.tolist()}")
-    if moments[2] > moments[0] + moments[1] + rounding:
+    if not satisfies_triangle_inequalities(moments):
         raise InputError(
             f"no rigid body has {what}: its largest principal moment, {moments[2]:g}, is more than the sum of the "
             f"others, {moments[0] + moments[1]:g}. Check that it is about the centre of mass"
@@ -396,26 +394,17 @@ def _joint_motors(moved: list[_Body], given: Mapping[str, Any] | None, layout: _
         if (motor := by_name[name]) is None:
             continue
         size, what = end - start, f"the motor of {name!r}"
+        allowed_shapes = ((size,), ()) if size == 1 else ((size,),)
         if callable(motor):
-            motor, shape = _traced_motor(motor, what)
+            motor, _ = traced_function_and_shape(motor, [()], allowed_shapes, what, "a time t")
         else:
             motor = checked_finite(np.atleast_1d(motor) if not is_traced(motor) else motor, what)
-            shape = motor.shape
-        if shape not in ((size,), *([()] if size == 1 else [])):
-            wanted = "one number" if size == 1 else f"an array of shape ({size},)"
-            raise FunctionError(f"{what} must give {wanted}, got shape {shape}")
+            if motor.shape not in allowed_shapes:
+                wanted = "one number" if size == 1 else f"an array of shape ({size},)"
+                raise FunctionError(f"{what} must give {wanted}, got shape {motor.shape}")
         functions.append(motor)
         indices.append(tuple(range(start, end)))
         driven.append(name)
     if not functions:
         return None
     return JointMotors(tuple(functions), tuple(indices), layout.mechanism.n_joints, tuple(driven))
-
-
-def _traced_motor(motor: Callable, what: str) -> tuple[Any, tuple[int, ...]]:
-    """Return a function of the time with plain functions traced, and the shape of its result."""
-    try:
-        traced, result = trace_callables_and_result_shapes(motor, lambda function, t: jnp.asarray(function(t)), ())
-    except TRACE_ERRORS as error:
-        raise FunctionError(trace_error_message(f"{what} could not be evaluated at a time", error)) from error
-    return traced, result.shape

@@ -14,7 +14,7 @@ from manifolds._precision import with_library_settings
 from ..engines.select_engine import is_worth_compiling, warn_of_fallback
 from ..engines.status_codes import StatusCode
 from ..errors import InputError
-from ..functions.time_span import checked_breaks, declared_breaks
+from ..functions.time_span import declared_breaks
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..integrators.fluctuating import noise_dimension
 from ..results.ensemble import Ensemble, Subset, join_subsets
@@ -148,9 +148,9 @@ def ensemble(
             "noise= needs fixed steps and cannot be combined with Adaptive or until. Give the step as a number"
         )
     family = Family.from_arguments(system, parameters)
-    breaks = *checked_breaks(breaks), *declared_breaks(family.representative)
     save_every_step = save_every if outputs == "trajectory" and save_at is None else None
-    schedule = make_schedule(t_span, step, save_every_step, save_at, breaks=breaks)
+    declared = declared_breaks(family.representative)
+    schedule = make_schedule(t_span, step, save_every_step, save_at, breaks=breaks, declared_breaks=declared)
     attitude = attitude_array(attitude, None)
     states, reasons = _checked_initial_states(family, x0s, len(attitude) if np.ndim(attitude) == 3 else 1)
     check_noise(noise, len(states))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,12 +10,11 @@ import numpy as np
 
 from manifolds._arrays import is_traced
 
-from ..engines.compiled.parameters import ProgramStructure
 from ..errors import InputError
 from ..integrators import OneStepMethod
 from ..systems import System
 from .schedule import StepSchedule, clip_times_to_span
-from .system_family import named_parameters
+from .system_family import replace_parameters
 
 
 def system_with_parameters(system, parameters) -> System:
@@ -38,15 +36,7 @@ def system_with_parameters(system, parameters) -> System:
             "parameters of a system must be a dict by the names of its parameters. For parameters of another form, "
             "give a function of them that builds the system"
         )
-    leaves: dict[str, Any] = dict(named_parameters(system))
-    for name, value in parameters.items():
-        if name not in leaves:
-            raise InputError(f"the system has no parameter {name!r}; its parameters are {', '.join(leaves)}")
-        array = jnp.asarray(value, dtype=jnp.float64)
-        if array.shape != np.shape(leaves[name]):
-            raise InputError(f"parameter {name} must have the shape {np.shape(leaves[name])}, got {array.shape}")
-        leaves[name] = array
-    return ProgramStructure.from_module(system).rebuild(list(leaves.values()))
+    return replace_parameters(system, parameters)
 
 
 def checked_save_times(save_at, schedule: StepSchedule) -> jax.Array | np.ndarray:

@@ -8,8 +8,6 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
-import equinox as eqx
-import jax
 import numpy as np
 
 from manifolds._precision import with_library_settings
@@ -17,7 +15,7 @@ from manifolds._precision import with_library_settings
 from ..engines.select_engine import ENGINES
 from ..engines.status_codes import StatusCode
 from ..errors import ConvergenceError, FileError, InputError, NonFiniteError
-from ..functions.time_span import checked_breaks, declared_breaks
+from ..functions.time_span import declared_breaks
 from ..integrators import DEFAULT_METHOD, OneStepMethod, Reference
 from ..results.ensemble import Ensemble
 from ..results.solution import Solution
@@ -32,7 +30,7 @@ from .problem import Problem
 from .progress import Progress
 from .run import Run
 from .schedule import CHUNK_STEPS, ScheduleSegment, StepSchedule, checked_span, checked_step, make_schedule
-from .system_family import named_parameters
+from .system_family import replace_parameters
 from .time_features import schedule_around_features
 
 CONVERGENCE_FAILURES = tuple(
@@ -190,10 +188,9 @@ class Propagator:
             raise InputError(REFERENCE_STEPS)
         if self.noise is not None and (dense or until is not None):
             raise InputError(NOISY_STEPS)
-        given_breaks = checked_breaks(breaks) if np.size(breaks) else ()
-        all_breaks = *given_breaks, *(self._declared_breaks if problem.is_driven else ())
+        declared = self._declared_breaks if problem.is_driven else ()
         allow_infinite_end = adaptive and until is not None
-        schedule = self._schedule(t_span, save_every, save_at, allow_infinite_end, all_breaks)
+        schedule = self._schedule(t_span, save_every, save_at, allow_infinite_end, breaks, declared)
         x = problem.initial_state(x0, schedule.start, attitude)
         if problem.is_driven and isinstance(self.method, OneStepMethod):
             schedule = schedule_around_features(schedule, [problem.system_in_span(schedule)], [x], step)
@@ -300,10 +297,12 @@ class Propagator:
         """Times at which functions of time of the system say that they jump."""
         return declared_breaks(self.system)
 
-    def _schedule(self, t_span, save_every: int, save_at, allow_infinite_end: bool, breaks: tuple) -> StepSchedule:
+    def _schedule(
+        self, t_span, save_every: int, save_at, allow_infinite_end: bool, breaks, declared: tuple[float, ...]
+    ) -> StepSchedule:
         """Return the schedule of a run; short ones that were used last are held in memory."""
-        if save_at is not None or allow_infinite_end or breaks or type(save_every) is not int:
-            return make_schedule(t_span, self.step, save_every, save_at, allow_infinite_end, breaks)
+        if save_at is not None or allow_infinite_end or np.size(breaks) or declared or type(save_every) is not int:
+            return make_schedule(t_span, self.step, save_every, save_at, allow_infinite_end, breaks, declared)
         key = *checked_span(t_span), save_every
         schedule = self._schedules.get(key)
         if schedule is None:
@@ -362,28 +361,6 @@ class _ThreadFunctions(threading.local):
 
     def __init__(self):
         self.final_functions: dict[tuple[float, float], Callable[[Any], np.ndarray | None]] = {}
-
-
-def replace_parameters(system: System, values: Mapping[str, np.ndarray]) -> System:
-    """Return a system with new values of some of its parameters, by the names of :func:`named_parameters`.
-
-    Raises
-    ------
-    InputError
-        If the system has no parameter of a name, or a value has another shape.
-    """
-    leaves = named_parameters(system)
-    for name, value in values.items():
-        if name not in leaves:
-            raise InputError(f"the system has no parameter {name!r}; its parameters are {', '.join(leaves)}")
-        if value.shape != leaves[name].shape:
-            raise InputError(f"{name} must have shape {leaves[name].shape}, got {value.shape}")
-    dynamic, static = eqx.partition(system, eqx.is_inexact_array)
-    arrays, structure = jax.tree_util.tree_flatten(dynamic)
-    new = [
-        jax.numpy.asarray(values[name]) if name in values else array for name, array in zip(leaves, arrays, strict=True)
-    ]
-    return eqx.combine(jax.tree_util.tree_unflatten(structure, new), static)
 
 
 def raise_failure(solution: Solution) -> None:

@@ -249,8 +249,7 @@ class EnsembleRecord:
     def _angular_velocities(self, x: np.ndarray) -> np.ndarray:
         if not any(self.family.has_member_axis):
             return angular_velocities(self.member, x)
-        return np.stack([angular_velocities(self.family.member(i), np.atleast_2d(x[i])).reshape(*x[i].shape[:-1], 3)
-                         for i in range(len(x))])  # fmt: skip
+        return np.stack([angular_velocities(self.family.member(i), states) for i, states in enumerate(x)])
 
 
 class MemberSolutionBuilder:

@@ -16,7 +16,7 @@ import numpy as np
 from manifolds.errors import warn
 
 from ..engines.status_codes import StatusCode
-from ..engines.step import SavedStates, State, energy_and_entropy_at
+from ..engines.step import SavedStates, State, energy_and_entropy_at, start_step
 from ..errors import FileError
 from ..integrators import Reference
 from ..integrators.fluctuating import noise_dimension
@@ -244,16 +244,14 @@ class Run:
     def _scipy_states_between_breaks(self, times: np.ndarray) -> tuple[np.ndarray, int, str, bool]:
         """Return what :meth:`liethermo.Reference.trajectory` returns; the solver starts again at each break."""
         break_indices = np.searchsorted(times, self.schedule.breaks)
-        x, n_evaluations, previous_system = self.saved_states[0], 0, None
+        x, n_evaluations, energy = np.array(self.saved_states[0]), 0, self.saved_energies_entropies[0][0, 0]
         for first, last in itertools.pairwise([0, *break_indices.tolist(), len(times) - 1]):
-            system = self.system.system_of_step(x[-1])
-            if previous_system is not None and self.system.energy_jumps:
-                jump = system.energy.value(x[-1]) - previous_system.energy.value(x[-1])
-                x[-1] = self.system.add_jump_of_energy(jnp.asarray(x[-1]), jump)
+            system, x[-1] = start_step(self.system, jnp.asarray(x[-1]), energy)
             states, n, message, was_interrupted = self.method.trajectory(system, x[-1], times[first : last + 1])
-            x, n_evaluations, previous_system = np.concatenate([x, states[1:]]), n_evaluations + n, system
+            x, n_evaluations = np.concatenate([x, states[1:]]), n_evaluations + n
             if message or was_interrupted or len(states) <= last - first:
                 break
+            energy = system.energy.value(x[-1]) if self.system.energy_jumps else energy
         return x, n_evaluations, message, was_interrupted
 
     def _energies_and_entropies(self, x: np.ndarray) -> np.ndarray:

@@ -271,15 +271,17 @@ def make_schedule(
     save_at=None,
     allow_infinite_end: bool = False,
     breaks: Sequence[float] = (),
+    declared_breaks: Sequence[float] = (),
 ) -> StepSchedule:
     """Return the schedule of a run; an adaptive run has one nominal step, as long as the span.
 
-    With ``save_at`` the steps end at these times, and only the states there are saved. Steps end at the ``breaks`` that
-    lie inside the span.
+    With ``save_at`` the steps end at these times, and only the states there are saved. Steps end at the user's
+    ``breaks`` and at those that the system declares, as far as they lie inside the span.
     """
     start, end = checked_span(span, allow_infinite_end)
     step_size = end - start if isinstance(step, Adaptive) else step
-    breaks_inside = tuple(t for t in checked_breaks(breaks) if start < t < end) if breaks else ()
+    all_breaks = {*(checked_breaks(breaks) if np.size(breaks) else ()), *declared_breaks}
+    breaks_inside = tuple(sorted(t for t in all_breaks if start < t < end))
     schedule = StepSchedule(
         (start, end), step_size, save_every, allow_infinite_end=allow_infinite_end, breaks=breaks_inside
     )

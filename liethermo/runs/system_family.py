@@ -97,8 +97,7 @@ class Family:
         leaves = named_parameters(system)
         values = {name: leaf[None] for name, leaf in leaves.items()}
         for name, value in parameters.items():
-            if name not in leaves:
-                raise InputError(f"the system has no parameter {name!r}; its parameters are {', '.join(leaves)}")
+            _check_parameter_name(name, leaves)
             values[name] = np.asarray(value, dtype=np.float64)
             if values[name].ndim == 0 or values[name].shape[1:] != leaves[name].shape:
                 expected_shape = ", ".join(["trajectories", *map(str, leaves[name].shape)])
@@ -329,6 +328,31 @@ def named_parameters(system: System) -> dict[str, np.ndarray]:
     """Return the parameters of a system by name, such as ``dissipation.rate``."""
     paths, _ = jax.tree_util.tree_flatten_with_path(eqx.filter(system, eqx.is_inexact_array))
     return {jax.tree_util.keystr(path).removeprefix("."): np.asarray(leaf) for path, leaf in paths}
+
+
+def replace_parameters(system: System, values: Mapping[str, Any]) -> System:
+    """Return a system with new values of some of its parameters, traced or not, by the names of
+    :func:`named_parameters`.
+
+    Raises
+    ------
+    InputError
+        If the system has no parameter of a name, or a value has another shape.
+    """
+    leaves: dict[str, Any] = dict(named_parameters(system))
+    for name, value in values.items():
+        _check_parameter_name(name, leaves)
+        array = jnp.asarray(value, dtype=jnp.float64)
+        if array.shape != np.shape(leaves[name]):
+            raise InputError(f"{name} must have shape {np.shape(leaves[name])}, got {array.shape}")
+        leaves[name] = array
+    return ProgramStructure.from_module(system).rebuild(list(leaves.values()))
+
+
+def _check_parameter_name(name: str, leaves: Mapping[str, Any]) -> None:
+    """Raise InputError unless a system with these parameters has one of a name."""
+    if name not in leaves:
+        raise InputError(f"the system has no parameter {name!r}; its parameters are {', '.join(leaves)}")
 
 
 def broadcast_size(*sizes: int) -> int:

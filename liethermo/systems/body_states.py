@@ -22,6 +22,36 @@ TEMPERATURE_RTOL = 1e-9
 """Relative difference up to which a temperature counts as that of a bath whose temperature cannot change."""
 
 
+def is_given_by_velocity(system, x, angular_velocity, instead: str, **details) -> bool:
+    """Return whether a state is given by an angular velocity, and not by x.
+
+    Parameters
+    ----------
+    system : LiePoissonSystem or EulerPoincareClosedSystem
+    x, angular_velocity
+        What the user gave, or None.
+    instead : str
+        What to give for a system without an angular velocity.
+    **details
+        Arguments that belong to an angular velocity, or None.
+
+    Raises
+    ------
+    InputError
+        If neither or both are given, or the system has no angular velocity.
+    """
+    if angular_velocity is None:
+        if x is None or any(value is not None for value in details.values()):
+            names = " and ".join(f"{name}=" for name in details)
+            raise InputError(f"state needs x, or angular_velocity= with {names} as wanted")
+        return False
+    if x is not None:
+        raise InputError("state needs x or angular_velocity=, got both")
+    if not system.has_angular_velocity:
+        raise InputError(f"a system on {system.algebra.name} has no angular velocity: give its {instead}")
+    return True
+
+
 def checked_velocity(angular_velocity, rotor_rates, dim: int, batch: bool) -> jax.Array:
     """Return the velocity (Omega, w), shape (..., dim), of an angular velocity and the rates of rotors."""
     omega = checked_numbers(angular_velocity, "angular_velocity")

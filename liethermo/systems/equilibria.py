@@ -15,6 +15,7 @@ from ..errors import ConvergenceError, InputError
 from ..functions.energy import Energy
 from ..tracing.interpret import evaluate_at_points
 from .base import System
+from .leaf_stability import retract
 from .linearisation import (
     FieldDerivatives,
     Linearisation,
@@ -25,7 +26,6 @@ from .linearisation import (
     field_derivatives,
     frozen_system,
     linearise_at,
-    retract,
     values_of,
 )
 

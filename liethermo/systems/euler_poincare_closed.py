@@ -22,7 +22,7 @@ from ..functions.energy import Energy, Function, make_energy
 from ..functions.inverse_gradient import inverse_gradient
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.traced import trace_callables
-from .body_states import checked_velocity
+from .body_states import checked_velocity, is_given_by_velocity
 from .euler_poincare import are_all_singular
 from .evolution import entropy_component
 from .ledger import ForcesAndHeat, LedgerSystem, check_state_function, linear_friction
@@ -141,14 +141,9 @@ class EulerPoincareClosedSystem(LedgerSystem):
         InputError
             If neither or both of x and the angular velocity are given, or no state has these values.
         """
-        if angular_velocity is None:
-            if x is None or rotor_rates is not None or temperature is not None:
-                raise InputError("state needs x, or angular_velocity= with rotor_rates= and temperature= as wanted")
+        details = {"rotor_rates": rotor_rates, "temperature": temperature}
+        if not is_given_by_velocity(self, x, angular_velocity, "velocity xi", **details):
             return super().state(x, batch)
-        if x is not None:
-            raise InputError("state needs x or angular_velocity=, got both")
-        if not self.has_angular_velocity:
-            raise InputError(f"a system on {self.algebra.name} has no angular velocity: give its velocity xi")
         xi = checked_velocity(angular_velocity, rotor_rates, self.algebra.dim, batch)
         if temperature is None:
             S = jnp.zeros((*xi.shape[:-1], 1))

@@ -11,12 +11,12 @@ import numpy as np
 import scipy
 
 import manifolds as mf
-from manifolds._pytree_module import Module
 
 from ..dissipation.quantum import HasMatrix, checked_hermitian, checked_square_matrix
 from ..errors import InputError
 from ..functions.density import ExpectationValue, MeanEnergy, ModulatedExpectationValue, choose_reference_level
 from ..functions.energy import Energy, TimeDependent
+from ..functions.piecewise import ContinuedSpline
 from .base import TEST_TIMES
 
 
@@ -89,7 +89,7 @@ def _energy_of_terms(terms: Sequence, times) -> tuple[int, Energy]:
             raise InputError(f"the function of term {i} of the Hamiltonian gives a real number, not {value!r}")
         modulated.append(H)
         functions.append(f)
-    if times is not None and not any(isinstance(f, CubicSpline) for f in functions):
+    if times is not None and not any(isinstance(f, ContinuedSpline) for f in functions):
         raise InputError("times= belongs to coefficients that are arrays, and the Hamiltonian has none. Remove times=")
     structure = mf.DensityMatrices(len(H))
     with jax.ensure_compile_time_eval():  # numbers, while a family of systems is traced
@@ -103,26 +103,6 @@ def _energy_of_terms(terms: Sequence, times) -> tuple[int, Energy]:
         initial = initial + f(TEST_TIMES[0]) * row
     lowest = jnp.min(initial[: structure.size])  # works for traced functions too
     return structure.size, TimeDependent(ModulatedExpectationValue(static, tuple(rows), tuple(functions), lowest))
-
-
-class CubicSpline(Module):
-    """A coefficient of a Hamiltonian that is given by its values at some times, as QuTiP interpolates it.
-
-    Attributes
-    ----------
-    times : array, shape (points,)
-    coefficients : array, shape (4, points - 1)
-        Those of the cubic between two times, the highest power first. Outside of the times the cubics continue.
-    """
-
-    times: jax.Array
-    coefficients: jax.Array
-
-    def __call__(self, t) -> jax.Array:
-        i = jnp.clip(jnp.searchsorted(self.times, t, side="right") - 1, 0, self.coefficients.shape[1] - 1)
-        a, b, c, d = self.coefficients[:, i]
-        s = t - self.times[i]
-        return ((a * s + b) * s + c) * s + d
 
 
 def _coefficient_function(coefficient, times, i: int) -> Callable:
@@ -146,4 +126,4 @@ def _coefficient_function(coefficient, times, i: int) -> Callable:
             f"times must be at least 4 increasing numbers, one for each value of a coefficient, got the shapes "
             f"{knots.shape} and {values.shape}"
         )
-    return CubicSpline(jnp.asarray(knots), jnp.asarray(scipy.interpolate.CubicSpline(knots, values).c))
+    return ContinuedSpline(scipy.interpolate.CubicSpline(knots, values))  # as QuTiP interpolates it

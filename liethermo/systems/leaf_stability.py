@@ -27,6 +27,13 @@ SEARCH_SEEDS = (0, 1, 2, 3)
 """Seeds of the initial combinations of the search; the smallest eigenvalue is concave, so few are needed."""
 
 
+def retract(system: System, x, v) -> jax.Array:
+    """Return the state that a displacement v, shape (n,), leads to, moved onto the state space."""
+    if system.space is None:
+        return x + v
+    return system.space.to_vector(system.space._project(system.points(x + v)))
+
+
 def has_definite_integral(
     system: System, x: np.ndarray, frame: np.ndarray, leaf_basis: np.ndarray, functions: dict[str, Energy]
 ) -> bool:
@@ -106,9 +113,7 @@ def _second_order(system_terms_frame: tuple, x) -> tuple[jax.Array, jax.Array]:
     system, terms, frame = system_terms_frame
 
     def values_near(coordinates):
-        y = x + coordinates @ frame
-        if system.space is not None:
-            y = system.space.to_vector(system.space._project(system.points(y)))
+        y = retract(system, x, coordinates @ frame)
         return jnp.stack([term.value(y) for term in terms])
 
     zero = jnp.zeros(frame.shape[0])

@@ -23,7 +23,7 @@ from ..tracing.caching import memoize
 from ..tracing.interpret import evaluate_at_points
 from .base import TEST_TIMES, System
 from .baths import BathEntropy, HeatBaths
-from .body_states import checked_velocity, entropies_of_temperatures, momentum_of_velocity
+from .body_states import checked_velocity, entropies_of_temperatures, is_given_by_velocity, momentum_of_velocity
 from .torque import (
     MAX_ARGUMENTS,
     MIN_ARGUMENTS,
@@ -137,11 +137,7 @@ class LiePoissonSystem(System):
             raise InputError(f"the algebra must be a manifolds.LieAlgebra, not {type(algebra).__name__}")
         self.algebra = algebra
         self.group, self.reconstruction = group, _resolve_reconstruction(algebra, group, reconstruction)
-        self.torque, self.torque_argument_counts = check_torque(torque, algebra, group)
-        self.torque_free_components = (
-            () if torque is None else torque_free_components(self.torque, self.torque_argument_counts, algebra, group)
-        )
-        self.torque_arguments = None
+        self._set_torque(torque)
         poisson = mf.LiePoisson(algebra)
         self._build(poisson, algebra.dim, energy, entropy, dissipation, momentum_maps, validate, baths=baths)
 
@@ -206,14 +202,9 @@ class LiePoissonSystem(System):
         >>> body.state(angular_velocity=(0.1, 0.2, 0.3), temperature=1.0).tolist()
         [0.30000000000000004, 0.4, 0.3, 0.0]
         """
-        if angular_velocity is None:
-            if x is None or rotor_rates is not None or temperature is not None:
-                raise InputError("state needs x, or angular_velocity= with rotor_rates= and temperature= as wanted")
+        details = {"rotor_rates": rotor_rates, "temperature": temperature}
+        if not is_given_by_velocity(self, x, angular_velocity, "momentum", **details):
             return super().state(x, batch)
-        if x is not None:
-            raise InputError("state needs x or angular_velocity=, got both")
-        if not self.has_angular_velocity:
-            raise InputError(f"a system on {self.algebra.name} has no angular velocity: give its momentum")
         if temperature is not None and self.baths is None:
             raise InputError("temperature= is for a system with baths: give it baths=lt.HeatBaths(...)")
         velocity = checked_velocity(angular_velocity, rotor_rates, self.algebra.dim, batch)
@@ -236,6 +227,15 @@ class LiePoissonSystem(System):
         return momentum_of_velocity(energy, jnp.asarray(xi))
 
     # -- the torque -----------------------------------------------------------------------------------------------
+
+    def _set_torque(self, torque) -> None:
+        """Set the fields of the torque of a system with an algebra and a group."""
+        self.torque, self.torque_argument_counts = check_torque(torque, self.algebra, self.group)
+        self.torque_free_components = ()
+        if torque is not None:
+            model = self.torque, self.torque_argument_counts
+            self.torque_free_components = torque_free_components(*model, self.algebra, self.group)
+        self.torque_arguments = None
 
     @property
     def torque_name(self) -> str:

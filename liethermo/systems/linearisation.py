@@ -21,7 +21,7 @@ from ..functions.energy import Energy
 from ..functions.gradients import EPS
 from ..tracing.interpret import evaluate_at_points
 from .base import System
-from .leaf_stability import has_definite_integral
+from .leaf_stability import has_definite_integral, retract
 
 REST_RTOL = 1e-7
 """Largest velocity at an equilibrium, relative to the Jacobian times the norm of the state. An equilibrium with six
@@ -81,13 +81,6 @@ def tangent_frame(system: System, x) -> jax.Array:
     if system.space is None:
         return jnp.eye(system.dim)
     return system.space.to_vector(system.space._frame(system.points(x)))
-
-
-def retract(system: System, x, v) -> jax.Array:
-    """Return the state that a displacement v, shape (n,), leads to, moved onto the state space."""
-    if system.space is None:
-        return x + v
-    return system.space.to_vector(system.space._project(system.points(x + v)))
 
 
 def field_derivatives(system_and_functions: tuple[System, tuple[Energy, ...]], x) -> FieldDerivatives:

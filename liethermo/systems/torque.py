@@ -14,7 +14,7 @@ import manifolds as mf
 
 from ..errors import FunctionError, InputError
 from ..functions.arguments import required_argument_count
-from ..functions.piecewise import SPLINES
+from ..functions.piecewise import is_spline
 from ..tracing.interpret import MAX_UNROLLED_DIM, vanishing_entry_indices
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
 from ..tracing.traced import TracedFunction, trace_callables_and_result_shapes
@@ -139,7 +139,7 @@ def _argument_count(term: Any) -> int:
             "a torque is a function of t and mu, or of t, mu and the attitude, such as "
             f"lt.torques.ConstantInBody([0.0, 0.0, 1.0]), not {type(term).__name__}"
         )
-    if isinstance(term, SPLINES):
+    if is_spline(term):
         raise InputError(
             f"a spline is a table of a torque: write lt.torques.Tabulated(spline), not {torque_name(term)}"
         )

@@ -198,16 +198,16 @@ def _solve_fixed_point_program(system: System, method: OneStepMethod, state: Sta
 
 
 def _stage_equations(system: System, method: OneStepMethod, state: State, h) -> StageEquations:
-    system, state = start_step(system, state)
+    system, x = start_step(system, state.x, state.energy)
     return stage_equations(
-        system, method, state.x, state.compensation, h, state.k, state.previous_slopes, SPARSE_SOLVER_OPTIONS
+        system, method, x, state.compensation, h, state.k, state.previous_slopes, SPARSE_SOLVER_OPTIONS
     )
 
 
 @jit_cached
 def _finish_step_program(system: System, method: OneStepMethod, state: State, h, solution: StageSolution) -> State:
-    system, state = start_step(system, state)
-    return finish_step(system, method, state, h, solution, SPARSE_SOLVER_OPTIONS)
+    system, x = start_step(system, state.x, state.energy)
+    return finish_step(system, method, state._replace(x=x), h, solution, SPARSE_SOLVER_OPTIONS)
 
 
 def _weighted_residual_guess_and_scale(system: System, method: OneStepMethod, state: State, h):
