@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import manifolds as mf
 from manifolds._arrays import is_traced
 from manifolds._pytree_module import Module
 
@@ -134,14 +135,7 @@ class DipoleField(Module):
 
 def rotate(vector, angle) -> jax.Array:
     """Return a vector rotated by a rotation vector, shape (3,), whose derivatives exist at zero."""
-    square = jnp.dot(angle, angle)
-    is_small = square < 1e-6  # where the series is exact to rounding
-    safe_norm = jnp.sqrt(jnp.where(is_small, 1.0, square))
-    sine = jnp.where(is_small, 1.0 - square / 6.0 + square**2 / 120.0, jnp.sin(safe_norm) / safe_norm)
-    half = jnp.sin(0.5 * safe_norm) / safe_norm
-    versine = jnp.where(is_small, 0.5 - square / 24.0 + square**2 / 720.0, 2.0 * half**2)
-    first = jnp.cross(angle, vector)
-    return vector + sine * first + versine * jnp.cross(angle, first)
+    return mf.SO(3).exp(angle) @ vector
 
 
 def checked_eccentricity(value) -> jax.Array:

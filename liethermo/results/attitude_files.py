@@ -83,13 +83,11 @@ def write_csv(
     FileError
         If the file cannot be written.
     """
-    q = quaternions(solution)
+    q = quaternions(solution, scalar)
     if q.shape != (*np.shape(solution.t), 4):
         raise InputError("a file has one history: write each trajectory of an ensemble, write_csv(path, e[i])")
-    order = [0, 1, 2, 3] if scalar == "last" else [3, 0, 1, 2]
-    if scalar not in ("last", "first"):
-        raise InputError(f"scalar must be 'last', for (x, y, z, w), or 'first', for (w, x, y, z), got {scalar!r}")
-    names, columns = ["t [s]", *(QUATERNION_COLUMNS[i] for i in order)], [np.asarray(solution.t)[:, None], q[:, order]]
+    quaternion_names = QUATERNION_COLUMNS if scalar == "last" else np.roll(QUATERNION_COLUMNS, 1).tolist()
+    names, columns = ["t [s]", *quaternion_names], [np.asarray(solution.t)[:, None], q]
     if solution.angular_velocity_source is not None:
         unit = "deg/s" if degrees else "rad/s"
         names += [f"{name} [{unit}]" for name in RATE_COLUMNS]

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
 from ..models.inertia import EQUAL_MOMENTS_RTOL
-from ..systems.rotations import checked_sequence
+from ..systems.rotations import check_scalar_place, checked_sequence
 from .audit_evidence import AuditableResult
 
 ROTATION_GROUPS = ("SO(3)", "SE(3)")
@@ -41,8 +41,7 @@ def quaternions(solution: AuditableResult, scalar: Literal["last", "first"] = "l
     InputError
         If it has no such attitudes.
     """
-    if scalar not in ("last", "first"):
-        raise InputError(f"scalar must be 'last', for (x, y, z, w), or 'first', for (w, x, y, z), got {scalar!r}")
+    check_scalar_place(scalar)
     g = _attitudes(solution)
     has_times = _is_time_series(solution)
     is_finite = np.isfinite(g).all(axis=(-2, -1), keepdims=True)

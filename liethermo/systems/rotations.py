@@ -164,9 +164,14 @@ def _nearest_rotations(matrices: np.ndarray) -> np.ndarray:
     return U @ Vt
 
 
-def _matrices_of_quaternions(quaternion, scalar: str) -> np.ndarray | jax.Array:
+def check_scalar_place(scalar: str) -> None:
+    """Raise InputError unless the place of the real part of a quaternion is "last" or "first"."""
     if scalar not in ("last", "first"):
         raise InputError(f"scalar must be 'last', for (x, y, z, w), or 'first', for (w, x, y, z), got {scalar!r}")
+
+
+def _matrices_of_quaternions(quaternion, scalar: str) -> np.ndarray | jax.Array:
+    check_scalar_place(scalar)
     q: Any = checked_numbers(quaternion, "a quaternion")
     if q.shape[-1:] != (4,):
         raise InputError(f"a quaternion must have shape (..., 4), got {q.shape}")
