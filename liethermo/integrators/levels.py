@@ -58,6 +58,19 @@ VANISHED_LENGTH = math.sqrt(MIN_SQUARED_NORM)
 REST_RTOL = 8.0 * EPS
 """Largest ``|Pi(x) dH|``, relative to |x| |dH|, that is rounding: no step along the leaf then changes H."""
 
+MIN_MEAN_GRADIENT = 0.5
+"""Smallest length of the mean gradient of a step, relative to the gradient at its start.
+
+Where a driven body comes to rest, the gradient at the end of the step vanishes, and the change is rounded as before.
+"""
+
+MAX_WORK_RTOL = 1e-2
+"""Largest correction of the work of a step at whose end a driven body is at rest, relative to the change of the energy.
+
+There the level of the energy less the work may have no point: the state cannot lose more energy than it has. The error
+of the work, of the order of the method, is then taken from the work.
+"""
+
 CHANGE_GRADIENT = Gonzalez(GRADIENT_NOISE_RTOL, across=True)
 """The discrete gradient that gives the change of a function in a step."""
 
@@ -104,13 +117,27 @@ def project_onto_levels(
     then wander, and miss all levels by rounding of one sign. So the amount by which a function rises or falls is left
     open there: it changes as the others determine, or not at all if that change has the wrong sign.
     """
-    discrete_gradient, surface = CHANGE_GRADIENT, system.surface
+    discrete_gradient, surface, work_direction = CHANGE_GRADIENT, system.surface, system.work_direction
     signs = jnp.asarray([law.sign for law in laws])
     functions, blocks = [law.function for law in laws], system.state_blocks
 
     def corrected_displacement_and_residual(s: ProjectionState) -> tuple[jax.Array, jax.Array]:
         d = s.d + correction_displacement(system, x + (compensation + s.d), s.correction, leaf)
         return (d, jnp.zeros(())) if surface is None else surface.project_displacement(x, compensation, d)
+
+    def largest_changes(change_vectors, d) -> jax.Array:
+        """Return the largest change of each function in a displacement with the length of d in each block."""
+        return jnp.stack([sum(jnp.linalg.norm(v[b]) * jnp.linalg.norm(d[b]) for b in blocks) for v in change_vectors])
+
+    def start_changes(d) -> jax.Array:
+        """Return :func:`largest_changes` with the gradients at the start of the step."""
+        begin = x + compensation
+        vectors = (
+            [system.raise_index(begin, v) for v in start_gradients]
+            if leaf
+            else correction_directions(system, begin, start_gradients)
+        )
+        return largest_changes(vectors, d)
 
     def change_gradient(f: Energy, d, start_gradient, end_gradient) -> jax.Array:
         """Return the discrete gradient of f along d; for a polynomial by a quadrature with gradients at both ends."""
@@ -161,9 +188,7 @@ def project_onto_levels(
             lengths = jnp.stack([jnp.linalg.norm(v) for v in change_vectors])
         else:
             step_length = jnp.linalg.norm(s.d)
-            max_changes = jnp.stack(
-                [sum(jnp.linalg.norm(v[b]) * jnp.linalg.norm(s.d[b]) for b in blocks) for v in change_vectors]
-            )
+            max_changes = largest_changes(change_vectors, s.d)
             products = jnp.abs(jnp.stack(change_vectors) @ jnp.stack(change_vectors).T)
             squares = jnp.diagonal(products)
             rounding_ratios = products / jnp.where(
@@ -172,7 +197,26 @@ def project_onto_levels(
             lengths = (rounding_ratios @ max_changes) * (1.0 / jnp.where(step_length > 0.0, step_length, 1.0))
         if direction_mask is not None:
             directions = [jnp.where(direction_mask[i], v, 0.0) for i, v in enumerate(directions)]
-        return s._replace(direction_lengths=lengths, correction=level_correction(system, directions, s.level_residual))
+        if work_direction is None:
+            correction = level_correction(system, directions, s.level_residual)
+        else:
+            start_lengths = start_changes(s.d) / jnp.maximum(jnp.linalg.norm(s.d), VANISHED_LENGTH)
+            is_unreachable = is_level_unreachable(s, largest_changes(change_vectors, s.d))
+            lengths = jnp.maximum(lengths, MIN_MEAN_GRADIENT * start_lengths)
+            work = s.level_residual * jnp.stack([jnp.dot(v, work_direction) for v in end_gradients])
+            correction = level_correction(system, directions, jnp.where(is_unreachable, 0.0, s.level_residual))
+            correction += jnp.sum(jnp.where(is_unreachable, work, 0.0)) * work_direction
+        return s._replace(direction_lengths=lengths, correction=correction)
+
+    def is_level_unreachable(s: ProjectionState, end_changes) -> jax.Array:
+        """Return for each function, shape (laws,), whether a driven body comes to rest before it reaches the level.
+
+        The gradient of a function then nearly vanishes at the end of the step, and Newton's correction of the residual
+        would be longer than half of the distance to the rest. A step that is too long for its residual is no such step.
+        """
+        changes, residual = start_changes(s.d), jnp.abs(s.level_residual)
+        is_out_of_reach = 4.0 * residual * changes > end_changes**2
+        return (end_changes < MIN_MEAN_GRADIENT * changes) & is_out_of_reach & (residual <= MAX_WORK_RTOL * changes)
 
     def is_converged(s: ProjectionState) -> jax.Array:
         is_small = jnp.abs(s.level_residual) <= EPS * s.direction_lengths * jnp.linalg.norm(s.d)

@@ -114,6 +114,11 @@ class AttitudeSystem(System):
         n = self.body.dim
         return jnp.concatenate([self.body.add_jump_of_energy(x[:n], amount), x[n:]])
 
+    @property
+    def work_direction(self):
+        work = self.body.work_direction
+        return None if work is None else jnp.concatenate([work, jnp.zeros(self.dim - self.body.dim)])
+
     def clock_components(self, v):
         mu, g = self.split_state(v)
         return self.join_state(

@@ -357,6 +357,11 @@ class System(SystemInterface):
         """
         return x
 
+    @property
+    def work_direction(self) -> jax.Array | None:
+        """Return the displacement, shape (n,), that adds one unit to the work done; None if states contain no work."""
+        return None
+
     def error_of_step(self, x, error, mean_slope) -> jax.Array:
         """Return the error of a step from x, over its size, with the error of the work as one of the state, shape (n,).
 

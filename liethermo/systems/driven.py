@@ -114,6 +114,10 @@ class DrivenSystem(System):
     def add_jump_of_energy(self, x, amount):
         return x.at[-1].add(jnp.where(self.span.starts_at_break(self.time(x)), self.unit * amount, 0.0))
 
+    @property
+    def work_direction(self):
+        return jnp.zeros(self.dim).at[-1].set(self.unit)
+
     def error_of_step(self, x, error, mean_slope):
         gradient_norm = jnp.linalg.norm(self.energy.gradient(x)[:-2])
         speed = jnp.linalg.norm(mean_slope[:-2])
