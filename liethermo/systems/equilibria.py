@@ -158,8 +158,8 @@ def equilibria(
     there is no other one.
 
     The leaf is that of the Casimirs and the other functions that the dissipation conserves. The energy belongs to them
-    if there is a dissipation that conserves it; without a dissipation, the equilibria of a leaf have different
-    energies. A momentum map is not fixed, because a symmetry moves equilibria to others with the value of the map.
+    if there is a dissipation that conserves it; without a dissipation, or at a rate of zero, the equilibria of a leaf
+    have different energies. A momentum map is not fixed, because a symmetry moves equilibria to others with the value of the map.
 
     Parameters
     ----------
@@ -197,7 +197,7 @@ def equilibria(
     anchor = None if reference is None else np.asarray(system.state(reference))
     points = _starting_points(system, anchor, starts, count, seed)
     conserved = conserved_functions(system, points[0])
-    names = _level_names(system, conserved, levels) if anchor is not None else ()
+    names = _level_names(system, conserved, levels, points) if anchor is not None else ()
     fixed = {name: conserved[name] for name in names}
     targets = None if anchor is None else values_of(tuple(fixed.values()), anchor[None])[0]
     search = _Search(system, tuple(fixed.values()), targets, counter_components(system))
@@ -294,16 +294,27 @@ def _starting_points(system: System, anchor: np.ndarray | None, starts, count: i
     return points if anchor is None else np.concatenate([anchor[None], points])
 
 
-def _level_names(system: System, conserved: dict[str, Energy], levels: Sequence[str] | None) -> tuple[str, ...]:
-    """Return the names of the functions that are fixed on the leaf."""
+def _level_names(
+    system: System, conserved: dict[str, Energy], levels: Sequence[str] | None, points: np.ndarray
+) -> tuple[str, ...]:
+    """Return the names of the functions that are fixed on the leaf of the first of some points, shape (points, n)."""
     if levels is None:
-        variable = set(system.momentum_maps) | (set() if system.dissipation is not None else {"energy"})
+        variable = set(system.momentum_maps) | (set() if _is_damped(system, points) else {"energy"})
         return tuple(name for name in conserved if name not in variable)
     names = (levels,) if isinstance(levels, str) else tuple(levels)
     if unknown := [name for name in names if name not in conserved]:
         known = ", ".join(map(repr, conserved)) or "no function"
         raise InputError(f"levels names {unknown[0]!r}, but this {system.kind} conserves {known}")
     return names
+
+
+def _is_damped(system: System, points: np.ndarray) -> bool:
+    """Return whether the dissipation moves some of the points, shape (points, n); one whose rate is zero does not."""
+    return system.dissipation is not None and bool(np.any(evaluate_at_points(_dissipative_velocity, system, points)))
+
+
+def _dissipative_velocity(system: System, x):
+    return system.vector_field(x) - system.poisson.sharp(x, system.energy.gradient(x))
 
 
 def _distinct(states: np.ndarray, distance: float) -> list[np.ndarray]:

@@ -68,12 +68,28 @@ def has_definite_integral(
     scales = np.maximum(np.linalg.norm(gradients, axis=1), np.linalg.norm(variations, axis=(1, 2)))
     scales = np.where(scales > 0.0, scales, 1.0)
     gradients, variations = gradients / scales[:, None], variations / scales[:, None, None]
+    # a monotone function that depends on conserved ones only widens the search
+    return any(
+        _has_definite_combination(gradients[:n_terms], variations[:n_terms], len(functions))
+        for n_terms in dict.fromkeys((len(functions), len(terms)))
+        if n_terms
+    )
+
+
+def _has_definite_combination(gradients: np.ndarray, variations: np.ndarray, n_conserved: int) -> bool:
+    """Return whether a combination without a gradient, of functions with these gradients, is definite.
+
+    Parameters
+    ----------
+    gradients : array, shape (terms, m)
+    variations : array, shape (terms, p, p)
+    n_conserved : int
+        Number of the first terms, whose coefficients may have any sign.
+    """
     _, singular_values, vectors = np.linalg.svd(gradients.T, full_matrices=True)
     rank = int(np.sum(singular_values > CRITICAL_RTOL))
     combinations = vectors[rank:]  # coefficients whose total gradient vanishes
-    if not len(combinations):
-        return False
-    return _is_definite_for_some(combinations, variations, len(functions))
+    return bool(len(combinations)) and _is_definite_for_some(combinations, variations, n_conserved)
 
 
 def _is_definite_for_some(combinations: np.ndarray, variations: np.ndarray, n_conserved: int) -> bool:

@@ -59,6 +59,16 @@ def test_all_equilibria_of_a_leaf_are_found():
     assert rest.stable == [True] * 4 + [False] * 2
 
 
+def test_a_rate_of_zero_is_no_dissipation():
+    """The energy is a level only where a dissipation acts: else each spin of the leaf has its own."""
+    undamped = lt.models.rigid_body(MOMENTS, rate=0.0)
+    rest = lt.equilibria(undamped, [0.0, 0.6, 0.8])
+    assert rest.stable == [True] * 4 + [False] * 2
+    motion = lt.linearise(undamped, [0.8, 0.0, 0.0])
+    np.testing.assert_allclose(motion.frequencies, body_frequency(0, 0.8).real, rtol=1e-14)
+    assert len(lt.equilibria(lt.models.rigid_body(MOMENTS, rate=0.1), [0.0, 0.6, 0.8])) == 6
+
+
 def test_a_relaxed_body_has_the_equilibria_of_its_energy():
     rest = lt.equilibria(lt.models.rigid_body(MOMENTS, rate=0.3), [0.1, 0.9, 0.2])
     energy = 0.5 * np.sum(np.array([0.1, 0.9, 0.2]) ** 2 / MOMENTS)
