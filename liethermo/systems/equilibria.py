@@ -159,7 +159,8 @@ def equilibria(
 
     The leaf is that of the Casimirs and the other functions that the dissipation conserves. The energy belongs to them
     if there is a dissipation that conserves it; without a dissipation, or at a rate of zero, the equilibria of a leaf
-    have different energies. A momentum map is not fixed, because a symmetry moves equilibria to others with the value of the map.
+    have different energies. A momentum map is not fixed, because a symmetry moves equilibria to others with the value
+    of the map.
 
     Parameters
     ----------
