@@ -366,7 +366,7 @@ class _Search(NamedTuple):
             use = np.flatnonzero(active)
             if not use.size:
                 break
-            steps = np.array([_damped_step(matrices[i], residuals[i], damping[i]) for i in use])
+            steps = scale * np.array([_damped_step(scale * matrices[i], residuals[i], damping[i]) for i in use])
             trials = self._move(states[use], steps, current.frame[use])
             evaluated = self.evaluate(trials)
             new_residuals, new_matrices = self._equations(evaluated, weights)

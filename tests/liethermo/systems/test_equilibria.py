@@ -59,6 +59,22 @@ def test_all_equilibria_of_a_leaf_are_found():
     assert rest.stable == [True] * 4 + [False] * 2
 
 
+@pytest.mark.parametrize("unit", [1e-20, 1.0, 1e20])
+def test_the_unit_of_momentum_does_not_matter(unit):
+    """Momenta, energies and rates in other units have the same equilibria, with the same stability."""
+    system = lt.LiePoissonSystem(
+        mf.so(3),
+        lambda m: 0.5 * unit * jnp.sum((m / unit) ** 2 / MOMENTS),
+        lambda m: unit * jnp.log(1.0 + (m / unit) @ (m / unit)),
+        lt.KillingDissipation(0.3 * unit),
+    )
+    start = np.array([0.4, 0.5, -0.3])
+    rest = lt.equilibria(system, unit * start)
+    assert rest.stable == [True] * 2 + [False] * 4
+    spin = np.sqrt(MOMENTS[0] * np.sum(start**2 / MOMENTS))  # the energy is kept, and all in the slowest rotation
+    np.testing.assert_allclose(np.abs(rest.x[:2] / unit).max(axis=1), spin, rtol=1e-12)
+
+
 def test_a_rate_of_zero_is_no_dissipation():
     """The energy is a level only where a dissipation acts: else each spin of the leaf has its own."""
     undamped = lt.models.rigid_body(MOMENTS, rate=0.0)
