@@ -126,10 +126,15 @@ def checked_breaks(breaks) -> tuple[float, ...]:
     Raises
     ------
     InputError
-        Unless they are finite times.
+        Unless they are finite times that depend on no parameter.
     """
     try:
         times = np.asarray(breaks, dtype=np.float64)
+    except jax.errors.TracerArrayConversionError as error:
+        raise InputError(
+            "the times at which a function jumps must be the same for all trajectories of an ensemble, because their "
+            "steps end there; got times that depend on the parameters. Run each trajectory with lt.integrate"
+        ) from error
     except (TypeError, ValueError):
         times = np.array(np.nan)
     if times.ndim != 1 or not np.isfinite(times).all():

@@ -276,3 +276,15 @@ def test_bad_tables_are_refused():
         lt.PiecewiseConstant([1.0, 0.5], [1.0])
     with pytest.raises(lt.InputError, match="one value"):
         lt.torques.PiecewiseConstant([1.0, 2.0], TORQUES)
+
+
+def test_breaks_that_depend_on_the_parameters_of_an_ensemble_are_refused():
+    def build(delay):
+        pulse = lt.torques.PiecewiseConstant(times=[1.03 + delay, 2.07 + delay], torques=[(0.0, 0.0, 0.5)])
+        return lt.models.rigid_body((1.0, 2.0, 3.0), torque=pulse)
+
+    delays = np.array([0.0, 0.31])
+    with pytest.raises(lt.InputError, match=r"Run each trajectory with lt\.integrate"):
+        lt.ensemble(build, [0.1, 0.2, 0.3], (0.0, 3.0), 0.1, parameters=delays)
+    for delay in delays:
+        assert lt.integrate(build(delay), [0.1, 0.2, 0.3], (0.0, 3.0), 0.1).status.ok
