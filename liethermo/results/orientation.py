@@ -271,8 +271,13 @@ def orientation_series(solution: AuditableResult) -> dict[str, np.ndarray]:
 
 
 def _attitudes(solution: AuditableResult) -> np.ndarray:
+    if not isinstance(solution, AuditableResult):
+        raise InputError(f"attitudes are those of a solution or an ensemble, got {solution!r:.60}")
     if solution.attitude is None:
-        raise InputError("there are no attitudes: give the system a group, such as group=mf.SO(3), and keep states")
+        raise InputError(
+            "there are no attitudes: give the system a group, such as group=mf.SO(3), or a model of a body attitude=True, "
+            "and keep states"
+        )
     if solution.provenance.get("group") not in ROTATION_GROUPS:
         raise InputError(f"the attitudes must be in SO(3) or SE(3), got {solution.provenance.get('group')}")
     return solution.attitude[..., :3, :3]

@@ -13,8 +13,8 @@ from manifolds._arrays import is_traced
 from ..errors import InputError
 from ..integrators import OneStepMethod
 from ..systems import System
+from .named_parameters import replace_parameters
 from .schedule import StepSchedule, clip_times_to_span
-from .system_family import replace_parameters
 
 
 def system_with_parameters(system, parameters) -> System:

@@ -24,13 +24,13 @@ from ..tracing.caching import LRUCache
 from .adaptive import Adaptive
 from .ensemble import ensemble
 from .events import Until
+from .named_parameters import replace_parameters
 from .noise import DEFAULT_NOISE_METHOD, Fluctuations, check_noise
 from .preparation import check_choice, has_undecided_invariants, refuse_tracers
 from .problem import Problem
 from .progress import Progress
 from .run import Run
 from .schedule import CHUNK_STEPS, ScheduleSegment, StepSchedule, checked_span, checked_step, make_schedule
-from .system_family import replace_parameters
 from .time_features import schedule_around_features
 
 CONVERGENCE_FAILURES = tuple(

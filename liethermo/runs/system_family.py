@@ -19,6 +19,7 @@ from ..models.inertia import are_inertia_tensors
 from ..systems import System
 from ..tracing.caching import fingerprint
 from ..tracing.traced import TracedFunction, trace_function
+from .named_parameters import arrays_with_members, find_parameter
 
 MAX_CHECKED_MEMBERS = 8
 """Largest number of members that are built and checked one by one at a time."""
@@ -94,20 +95,15 @@ class Family:
                 "parameters of a system must be a dict from names to arrays. "
                 "For parameters of another form, give a function that builds the system"
             )
-        leaves = named_parameters(system)
-        values = {name: leaf[None] for name, leaf in leaves.items()}
-        for name, value in parameters.items():
-            _check_parameter_name(name, leaves)
-            values[name] = np.asarray(value, dtype=np.float64)
-            if values[name].ndim == 0 or values[name].shape[1:] != leaves[name].shape:
-                expected_shape = ", ".join(["trajectories", *map(str, leaves[name].shape)])
-                raise InputError(f"the values of {name} must have shape ({expected_shape}), got {values[name].shape}")
-            if name.endswith("inertia") and leaves[name].shape == (3,) and are_inertia_tensors(values[name]):
+        for name, values in parameters.items():
+            has_moments = name.endswith("inertia") and find_parameter(system, name).value.shape == (3,)
+            if has_moments and are_inertia_tensors(values):
                 raise InputError(
                     f"the values of {name} are the tensor of inertia of one body, but three sets of principal moments "
                     "are expected. Give the moments of each trajectory as a row, or a system with a tensor"
                 )
-        return cls(ProgramStructure.from_module(system), list(values.values()), None if parameters else system)
+        arrays = arrays_with_members(system, parameters)
+        return cls(ProgramStructure.from_module(system), arrays, None if parameters else system)
 
     @classmethod
     def from_function(cls, build: Callable, parameters) -> Family:
@@ -322,37 +318,6 @@ class Family:
             jnp.asarray(value[members] if has_axis else value[0]) for value, has_axis in self._arrays_with_axis_flags
         ]
         return arrays, [0 if has_axis else None for has_axis in self.has_member_axis]
-
-
-def named_parameters(system: System) -> dict[str, np.ndarray]:
-    """Return the parameters of a system by name, such as ``dissipation.rate``."""
-    paths, _ = jax.tree_util.tree_flatten_with_path(eqx.filter(system, eqx.is_inexact_array))
-    return {jax.tree_util.keystr(path).removeprefix("."): np.asarray(leaf) for path, leaf in paths}
-
-
-def replace_parameters(system: System, values: Mapping[str, Any]) -> System:
-    """Return a system with new values of some of its parameters, traced or not, by the names of
-    :func:`named_parameters`.
-
-    Raises
-    ------
-    InputError
-        If the system has no parameter of a name, or a value has another shape.
-    """
-    leaves: dict[str, Any] = dict(named_parameters(system))
-    for name, value in values.items():
-        _check_parameter_name(name, leaves)
-        array = jnp.asarray(value, dtype=jnp.float64)
-        if array.shape != np.shape(leaves[name]):
-            raise InputError(f"{name} must have shape {np.shape(leaves[name])}, got {array.shape}")
-        leaves[name] = array
-    return ProgramStructure.from_module(system).rebuild(list(leaves.values()))
-
-
-def _check_parameter_name(name: str, leaves: Mapping[str, Any]) -> None:
-    """Raise InputError unless a system with these parameters has one of a name."""
-    if name not in leaves:
-        raise InputError(f"the system has no parameter {name!r}; its parameters are {', '.join(leaves)}")
 
 
 def broadcast_size(*sizes: int) -> int:

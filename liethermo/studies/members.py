@@ -8,14 +8,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ..errors import InputError
 from ..functions.conditions import collect_conditions, refusal_message
-from ..runs.system_family import Family, named_parameters
+from ..runs.named_parameters import find_parameter, lookup_parameter, named_parameters, replace_parameters
+from ..runs.system_family import Family
 from ..systems import System
 
 FIXED_BATCH_SIZE = 8192
@@ -23,6 +23,9 @@ FIXED_BATCH_SIZE = 8192
 
 UNKNOWN_PARAMETER_TEXT = "and no parameter of an axis is called so"
 """Part of the error message by which an unknown parameter is recognised."""
+
+TRAILING_INDICES = re.compile(r"(\[\d+\])*$")
+"""The indices of an entry at the end of its name."""
 
 PointParameters = Mapping[str, np.ndarray]
 """Parameters of several points: arrays of shape (n_points,) by name."""
@@ -75,43 +78,39 @@ def system_builder(build: System | Callable[[dict], System], parameters: tuple[s
         if not callable(build):
             raise InputError(f"build must be a system, or a function that returns one, got {build!r:.60}")
         return build
-    leaves = {name: value.shape for name, value in named_parameters(build).items()}
-    targets = {}
-    for name in parameters:
-        # the name of a leaf may end with an index too, such as numbers[0]
-        entries = (re.fullmatch(re.escape(leaf) + r"((?:\[\d+\])*)", name) for leaf in leaves)
-        matches = {entry.string[: entry.start(1)]: _parse_index(entry[1]) for entry in entries if entry is not None}
-        leaf_name, index = next(
-            ((candidate, i) for candidate, i in matches.items() if len(i) == len(leaves[candidate])), (name, ())
-        )
-        if (
-            leaf_name not in leaves
-            or len(index) != len(leaves[leaf_name])
-            or any(map(int.__ge__, index, leaves[leaf_name]))
-        ):
-            available = ", ".join(leaf + "".join(f"[0..{m - 1}]" for m in shape) for leaf, shape in leaves.items())
-            raise InputError(f"the system has no parameter {name!r} that is one number; it has {available}")
-        targets[name] = leaf_name, index
-    return functools.partial(_with_parameters, build, targets)
+    return functools.partial(_with_entries, build, {name: _parameter_entry(build, name) for name in parameters})
 
 
-def _parse_index(text: str) -> tuple[int, ...]:
-    return tuple(map(int, re.findall(r"\d+", text)))
+def _parameter_entry(system: System, name: str) -> tuple[str, tuple[int, ...]]:
+    """Return the name of a parameter and the index of one entry of it, from a name such as ``energy.inertia[0]``.
 
-
-def _with_parameters(
-    system: System, leaves_and_indices: Mapping[str, tuple[str, tuple[int, ...]]], point: Mapping[str, Any]
-) -> System:
-    """Return the system with the parameters of a point.
-
-    ``leaves_and_indices`` holds the name of a leaf and an index for each parameter.
+    Raises
+    ------
+    InputError
+        If the system has no such entry.
     """
-    dynamic, static = eqx.partition(system, eqx.is_inexact_array)
-    paths, structure = jax.tree_util.tree_flatten_with_path(dynamic)
-    leaves = {jax.tree_util.keystr(path).removeprefix("."): leaf for path, leaf in paths}
-    for name, (leaf_name, index) in leaves_and_indices.items():
-        leaves[leaf_name] = jnp.asarray(leaves[leaf_name]).at[index].set(point[name])
-    return eqx.combine(jax.tree_util.tree_unflatten(structure, list(leaves.values())), static)
+    indices = TRAILING_INDICES.search(name)
+    assert indices is not None
+    index_starts = [indices.start() + match.start() for match in re.finditer(r"\[", indices[0])]
+    for end in (*index_starts, len(name)):  # the name itself may end with an index, such as parts[0]
+        parameter, index = lookup_parameter(system, name[:end]), tuple(map(int, re.findall(r"\d+", name[end:])))
+        shape = () if parameter is None else parameter.value.shape
+        if parameter is not None and len(index) == len(shape) and all(map(int.__lt__, index, shape)):
+            return name[:end], index
+    shapes = {name: value.shape for name, value in named_parameters(system).items()}
+    available = ", ".join(name + "".join(f"[0..{m - 1}]" for m in shape) for name, shape in shapes.items())
+    raise InputError(f"the system has no parameter {name!r} that is one number; it has {available}")
+
+
+def _with_entries(
+    system: System, entries: Mapping[str, tuple[str, tuple[int, ...]]], point: Mapping[str, Any]
+) -> System:
+    """Return the system with the entries of its parameters, given by names and indices, that a point has."""
+    values: dict[str, Any] = {}
+    for axis_name, (name, index) in entries.items():
+        value = values[name] if name in values else jnp.asarray(find_parameter(system, name).value)
+        values[name] = value.at[index].set(point[axis_name])
+    return replace_parameters(system, values)
 
 
 class StudySystems:

@@ -33,8 +33,8 @@ from ..results.solution import Solution
 from ..runs.adaptive import Adaptive
 from ..runs.ensemble import Ensemble, ensemble
 from ..runs.integrate import integrate
+from ..runs.named_parameters import named_parameters
 from ..runs.noise import Fluctuations
-from ..runs.system_family import named_parameters
 from ..studies.axes import replicas
 from ..studies.study import Study
 from ..systems import LiePoissonSystem, System

@@ -134,6 +134,7 @@ def test_events_at_both_ends(terminal):
     assert sampled_run.t_events[0].tolist() == [3.0]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("width", [1e-6, 1e-3, 0.02, 0.5])
 def test_a_function_that_is_not_a_number_has_no_zero_there(width):
     """The NaN interval may be wider than the steps, or so narrow that only the search meets it."""
@@ -151,6 +152,7 @@ OSCILLATOR = lt.MetriplecticSystem(
 )
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("direction", [-1, 0, 1])
 def test_events_in_the_first_step_of_a_driven_system(direction):
     """Events in the first step and zeros at the start are found in a driven system."""

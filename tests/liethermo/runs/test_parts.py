@@ -171,6 +171,7 @@ def test_energy_and_casimirs_of_noisy_runs_do_not_drift(name):
 # -- the names of steps ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(12)
 @pytest.mark.parametrize("step", [0.1, 1e-3, 0.05, 1 / 3, 0.7, 1e6 / 7])
 @pytest.mark.parametrize("offset", [0.0, 0.5, 0.25, 1 / 3, 0.1, 0.3, 1 / 128, 3 / 1024])
 def test_steps_at_times_that_are_rounded_otherwise_have_the_same_names(step, offset):
@@ -324,6 +325,7 @@ def driven():
 TIMES = (-0.4, 0.1, 1.3, 2.0, 6.0)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", NOISELESS_CASES)
 def test_a_run_in_parts_is_the_run_to_rounding(name):
     """With equal steps; a part starts at its own time, from the last state and attitude of the one before."""

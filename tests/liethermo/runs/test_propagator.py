@@ -62,6 +62,7 @@ def start_of(system, x0):
     return system.state(x0) if system.sites else x0
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("name", SYSTEMS)
 @pytest.mark.parametrize("method", METHODS.values(), ids=METHODS.keys())
 def test_final_state_equals_that_of_integrate(name, method):

@@ -51,7 +51,7 @@ METHODS = [
 ]
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("step", [STEP, lt.Adaptive(1e-6)], ids=["fixed", "adaptive"])
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_an_energy_that_is_known_in_the_span_only(method, step):
@@ -106,6 +106,7 @@ def test_a_flow_and_its_derivative():
     assert np.abs(jax.jacfwd(end)(jnp.asarray(START)) - np.column_stack(exact)).max() < 1e-5
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "method", [lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(8), lt.MetriplecticTaylor(8)], ids=str
 )

@@ -455,7 +455,7 @@ def meeting(size, gap):
 GAPS = [0.0, 1e-12, 1e-8, 1e-4, 0.3]
 
 
-@pytest.mark.parametrize("size", [2, 3, *(pytest.param(n, marks=pytest.mark.slow) for n in (4, 8))])
+@pytest.mark.parametrize("size", [2, *(pytest.param(n, marks=pytest.mark.slow) for n in (3, 4, 8))])
 @pytest.mark.parametrize(
     "method",
     [
@@ -634,7 +634,7 @@ def test_a_pure_state_with_a_floor_is_refused_where_steps_would_be_wrong():
     assert abs(abs(dephasing.density(end)[0, 1]) - 0.48 * np.exp(-0.6)) <= 1e-11
 
 
-@pytest.mark.parametrize("driven", [False, True])
+@pytest.mark.parametrize("driven", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_an_ensemble_refuses_what_a_single_run_refuses(driven):
     """Each trajectory by itself, and by the method too: stages without the gradient start there."""
     H = (lambda t: (1.0 + 0.1 * t) * QUBIT) if driven else QUBIT
@@ -720,7 +720,7 @@ EVENT_CASES = {
 }
 
 
-@pytest.mark.sampled("explicit")
+@pytest.mark.sampled("midpoint")
 @pytest.mark.parametrize("name", EVENT_CASES)
 def test_a_run_stops_where_a_population_or_the_purity_has_a_value(name):
     """Beside the closed form of the population, which falls to 0.3, and the purity of the last state."""
@@ -751,7 +751,7 @@ def test_a_run_stops_where_a_population_or_the_purity_has_a_value(name):
 SHIFTED_METHODS = [lt.MetriplecticRungeKutta(4), lt.MetriplecticMidpoint(), lt.MetriplecticGauss(2)]
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("coupling", [LOWER, X], ids=["lowering", "Hermitian"])
 @pytest.mark.parametrize("method", SHIFTED_METHODS, ids=str)
 def test_two_levels_relax_beside_a_third_one_far_below(method, coupling):
@@ -884,7 +884,7 @@ def test_a_ladder_relaxes_to_a_cold_state(by, temperature, turned):
     assert again.status.ok
 
 
-@pytest.mark.sampled("explicit", "midpoint", "Gauss")
+@pytest.mark.sampled("midpoint")
 @pytest.mark.parametrize("by", COLD)
 def test_a_cold_state_of_gibbs_is_at_rest(by):
     q, _, H = ladder(0.1, np.linalg.qr(random_hermitian(8))[0])
@@ -950,7 +950,12 @@ def test_pure_states_run_by_methods_without_the_gradient_of_the_entropy(baths):
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     "method",
-    [lt.MetriplecticMidpoint(), lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(8), lt.MetriplecticTaylor(12)],
+    [
+        lt.MetriplecticMidpoint(),
+        lt.MetriplecticGauss(2),
+        lt.MetriplecticRungeKutta(8),
+        pytest.param(lt.MetriplecticTaylor(12), marks=pytest.mark.slow),
+    ],
     ids=str,
 )
 def test_an_isolated_system_runs_from_pure_states(method):
@@ -975,6 +980,7 @@ def test_products_keep_the_floor_of_parts_with_baths():
     assert run.audit().passed
 
 
+@pytest.mark.slow
 def test_the_advice_for_a_pure_state_under_steepest_ascent_works():
     """A floor where the state stays as pure as it is; to mix it where the Hamiltonian turns it."""
     q = lt.QuantumSystem(np.diag([0.0, 1.0, 2.5]), lt.SteepestEntropyAscent(0.4))

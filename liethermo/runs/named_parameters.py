@@ -1,0 +1,199 @@
+"""Parameters of a system by name: their values, and systems with other values."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..engines.compiled.parameters import ProgramStructure, parameter_arrays
+from ..errors import InputError
+from ..functions.energy import Quadratic
+from ..systems import System
+from ..tracing.caching import memoize
+
+WRAPPER_FIELDS = frozenset({"body", "part", "term", "function", "phi", "contact", "first"})
+"""Fields of the objects of a system that hold the object of the user, and are left out of names."""
+
+DERIVED_FIELDS = frozenset({"momentum_maps", "momentum_casimirs", "subsystems"})
+"""Fields of a system that follow from others. Their arrays have no names, but those of a Lagrangian in them."""
+
+
+class NamedParameter(NamedTuple):
+    """A parameter of a system.
+
+    Attributes
+    ----------
+    value : ndarray
+    leaves : tuple of int
+        Numbers of the arrays of the system that hold it, in the order of :func:`parameter_arrays`.
+    is_inverse : bool
+        Whether these arrays hold the inverse: those of an energy with moments of inertia do.
+    """
+
+    value: np.ndarray
+    leaves: tuple[int, ...]
+    is_inverse: bool = False
+
+    def to_leaf(self, value):
+        """Return the entry of the arrays for a value of the parameter, or for several along the first axis."""
+        if not self.is_inverse:
+            return value
+        return 1.0 / value if np.shape(self.value) == (3,) else jnp.linalg.inv(value)
+
+
+def named_parameters(system: System) -> dict[str, np.ndarray]:
+    """Return the parameters of a system by name, such as ``dissipation.rate``.
+
+    The names are those of the user's objects, whether or not the system has baths, a clock or an attitude. What is kept
+    in several places, such as the capacity of a bath, is one parameter. A rigid body has ``energy.inertia``.
+    """
+    return {name: parameter.value for name, parameter in _parameter_tables(system)[0].items()}
+
+
+def replace_parameters(system: System, values: Mapping[str, Any]) -> System:
+    """Return a system with new values of some of its parameters, traced or not, by name.
+
+    Raises
+    ------
+    InputError
+        If the system has no parameter of a name, or a value has another shape.
+    """
+    leaves: list[Any] = list(parameter_arrays(system))
+    replaced: dict[int, str] = {}
+    for name, value in values.items():
+        parameter = find_parameter(system, name)
+        array = jnp.asarray(value, dtype=jnp.float64)
+        if array.shape != parameter.value.shape:
+            raise InputError(f"{name} must have shape {parameter.value.shape}, got {array.shape}")
+        _check_given_once(replaced, name, parameter)
+        for i in parameter.leaves:
+            leaves[i] = parameter.to_leaf(array)
+    return ProgramStructure.from_module(system).rebuild(leaves)
+
+
+def arrays_with_members(system: System, values: Mapping[str, Any]) -> list[np.ndarray]:
+    """Return the arrays of a family of systems, members along the first axis, from values of some parameters by name.
+
+    Arrays that all members share have a first axis of length 1.
+
+    Raises
+    ------
+    InputError
+        If the system has no parameter of a name, or values have another shape.
+    """
+    leaves = [array[None] for array in parameter_arrays(system)]
+    replaced: dict[int, str] = {}
+    for name, value in values.items():
+        parameter, array = find_parameter(system, name), np.asarray(value, dtype=np.float64)
+        if array.ndim == 0 or array.shape[1:] != parameter.value.shape:
+            expected_shape = ", ".join(["trajectories", *map(str, parameter.value.shape)])
+            raise InputError(f"the values of {name} must have shape ({expected_shape}), got {array.shape}")
+        _check_given_once(replaced, name, parameter)
+        for i in parameter.leaves:
+            leaves[i] = np.asarray(parameter.to_leaf(array))
+    return leaves
+
+
+def find_parameter(system: System, name: str) -> NamedParameter:
+    """Return the parameter that :func:`lookup_parameter` finds.
+
+    Raises
+    ------
+    InputError
+        If there is none; the message lists the names.
+    """
+    parameter = lookup_parameter(system, name)
+    if parameter is None:
+        names = ", ".join(named_parameters(system))
+        raise InputError(
+            f"the system has no parameter {name!r}; its parameters are {names}. For others, give a function that "
+            "builds the system"
+        )
+    return parameter
+
+
+def lookup_parameter(system: System, name: str) -> NamedParameter | None:
+    """Return the parameter with a name, or with the path of one of its arrays in the system; None if there is none."""
+    by_name, by_path = _parameter_tables(system)
+    return by_name.get(name) or by_path.get(name)
+
+
+def _check_given_once(replaced: dict[int, str], name: str, parameter: NamedParameter) -> None:
+    """Raise InputError if the parameter was given before under another name, and note its name otherwise."""
+    for i in parameter.leaves:
+        if i in replaced:
+            raise InputError(f"{name} and {replaced[i]} are the same parameter. Give one of them")
+        replaced[i] = name
+
+
+@memoize
+def _parameter_tables(system: System) -> tuple[dict[str, NamedParameter], dict[str, NamedParameter]]:
+    """Return the parameters of a system by name, and by the paths of their arrays."""
+    flat, _ = jax.tree_util.tree_flatten_with_path(eqx.filter(system, eqx.is_inexact_array))
+    fields = [[jax.tree_util.keystr((key,)).removeprefix(".") for key in path] for path, _ in flat]
+    paths = [jax.tree_util.keystr(path).removeprefix(".") for path, _ in flat]
+    arrays, has_derived_energy = parameter_arrays(system), _has_derived_energy(fields)
+    leaves_by_name: dict[str, list[int]] = {}
+    for i, path_fields in enumerate(fields):
+        is_of_lagrangian = "lagrangian" in path_fields
+        is_derived = path_fields[0] in DERIVED_FIELDS and not is_of_lagrangian
+        if has_derived_energy:
+            is_derived |= is_of_lagrangian or path_fields[0] == "energy"
+        if arrays[i].size and not is_derived:
+            leaves_by_name.setdefault(_public_name(path_fields), []).append(i)
+    by_name: dict[str, NamedParameter] = {}
+    for name, leaves in leaves_by_name.items():
+        value = arrays[leaves[0]]
+        if all(np.array_equal(arrays[i], value, equal_nan=True) for i in leaves):
+            by_name[name] = NamedParameter(value, tuple(leaves))
+        else:  # different parameters, whose paths differ in the fields of wrappers only
+            by_name |= {paths[i]: NamedParameter(arrays[i], (i,)) for i in leaves}
+    by_path = {paths[i]: parameter for parameter in by_name.values() for i in parameter.leaves}
+    return _with_inertia(system, by_name, by_path), by_path
+
+
+def _has_derived_energy(fields: list[list[str]]) -> bool:
+    """Return whether the energy was computed from the Lagrangian of a system, so that neither can be set alone."""
+    has_lagrangian = any(path[0] == "lagrangian" for path in fields)
+    return has_lagrangian and not any(path[0] == "energy" and "lagrangian" in path for path in fields)
+
+
+def _public_name(fields: list[str]) -> str:
+    """Return the name of an array of a system from the fields of its path."""
+    if "lagrangian" in fields:
+        fields = fields[len(fields) - 1 - fields[::-1].index("lagrangian") :]
+    elif fields[:2] in (["energy", "baths"], ["baths", "energy"]):
+        # a bath of infinite capacity has the linear energy T S
+        fields = ["baths", *("temperature" if field == "b" else field for field in fields[2:])]
+    elif fields[0] == "friction":
+        fields = ["dissipation", *fields]
+    name = previous = fields[0]
+    for field in (*(f for f in fields[1:-1] if f not in WRAPPER_FIELDS), *fields[1:][-1:]):
+        if field != previous:  # not the friction of a friction
+            name += field if field.startswith("[") else f".{field}"
+        previous = field
+    return name
+
+
+def _with_inertia(
+    system: System, by_name: dict[str, NamedParameter], by_path: dict[str, NamedParameter]
+) -> dict[str, NamedParameter]:
+    """Return the parameters with ``energy.inertia`` in place of the matrix of the energy of a rigid body.
+
+    The matrix keeps its name as a path.
+    """
+    matrix = by_name.get("energy.A")
+    if matrix is None or matrix.value.shape not in ((3,), (3, 3)) or system.inertia is None:
+        return by_name
+    body = system.drop_baths()
+    if not isinstance(body.energy, Quadratic) or body.dim != 3:
+        return by_name
+    by_path["energy.A"] = matrix
+    inverse = 1.0 / matrix.value if matrix.value.ndim == 1 else np.linalg.inv(matrix.value)
+    inertia = NamedParameter(inverse, matrix.leaves, is_inverse=True)
+    return {"energy.inertia": inertia, **{name: p for name, p in by_name.items() if name != "energy.A"}}

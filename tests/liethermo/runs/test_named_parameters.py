@@ -1,0 +1,171 @@
+"""Names of the parameters of systems, and systems with other values of them."""
+
+import inspect
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liethermo as lt
+import manifolds as mf
+from liethermo.runs.named_parameters import named_parameters, replace_parameters
+
+MOMENTS = np.array([3.0, 2.0, 1.0])
+START = [0.1, 0.5, 0.6]
+SPAN = (0.0, 5.0)
+
+
+def body_with_bath(moments=MOMENTS, rate=0.1, capacity=2.0, temperature=1.0) -> lt.System:
+    bath = lt.HeatBaths(capacity, temperature)
+    return lt.LiePoissonSystem(mf.so(3), energy_of(moments), dissipation=lt.DoubleBracket(rate), baths=bath)
+
+
+def energy_of(moments) -> lt.Energy:
+    return lt.Quadratic(1.0 / moments if np.ndim(moments) == 1 else np.linalg.inv(moments))
+
+
+def last_state(system) -> np.ndarray:
+    return lt.integrate(system, system.state([*START, 0.0][: system.dim]), SPAN, 0.1).x[-1]
+
+
+def model_functions() -> list[str]:
+    """Return the names of the functions for ready systems whose arguments all have defaults."""
+    functions = {name: getattr(lt.models, name) for name in lt.models.__all__}
+    return sorted(
+        name
+        for name, function in functions.items()
+        if inspect.isfunction(function)
+        and all(argument.default is not argument.empty for argument in inspect.signature(function).parameters.values())
+    )
+
+
+def model(name: str) -> lt.System:
+    system = getattr(lt.models, name)()
+    if not isinstance(system, lt.System):
+        pytest.skip("no system")
+    return system
+
+
+# -- names --------------------------------------------------------------------------------------------------------
+
+
+def test_names_do_not_depend_on_a_bath():
+    free = lt.LiePoissonSystem(mf.so(3), energy_of(MOMENTS), dissipation=lt.DoubleBracket(0.1))
+    assert set(named_parameters(free)) == {"energy.inertia", "energy.c", "dissipation.rate"}
+    assert set(named_parameters(body_with_bath())) - set(named_parameters(free)) == {
+        "baths.capacity",
+        "baths.temperature",
+    }
+    assert "baths.temperature" in named_parameters(body_with_bath(capacity=np.inf))
+
+
+def test_names_do_not_depend_on_a_torque_or_an_attitude():
+    plain = lt.models.rigid_body()
+    turned = lt.models.rigid_body(attitude=True, torque=lambda t, m: -0.1 * m)
+    names = {name for name in named_parameters(turned) if not name.startswith("torque")}
+    assert names == set(named_parameters(plain))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", model_functions())
+def test_names_of_models_have_no_wrappers(name):
+    for parameter in named_parameters(model(name)):
+        fields = set(parameter.replace("[", ".[").split("."))
+        assert not fields & {"body", "part", "term", "function", "phi", "poisson.first", "momentum_maps", "subsystems"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", model_functions())
+def test_every_parameter_of_a_model_keeps_the_laws_and_has_an_effect(name):
+    """A parameter that is kept in several places changes in all of them: else energy or entropy would break."""
+    system = model(name)
+    x = jnp.asarray(system.samples(3, seed=1))
+
+    def functions_of(system) -> list[np.ndarray]:
+        values = [system.vector_field(x), *(system.energy.value(y) for y in x)]
+        values += [] if system.baths is None else [system.temperatures(x)]
+        return [np.asarray(value) for value in values]
+
+    for parameter, value in named_parameters(system).items():
+        if parameter.startswith(("dissipation", "baths", "lagrangian")) or parameter.endswith("inertia"):
+            changed = replace_parameters(system, {parameter: 1.03 * value})
+            assert changed.check().passed, parameter
+            pairs = zip(functions_of(system), functions_of(changed), strict=True)
+            has_no_size = parameter.endswith("axis") or not np.any(value)  # a direction, or zero
+            assert any(not np.array_equal(old, new) for old, new in pairs) or has_no_size, parameter
+
+
+# -- values -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "arguments"),
+    [
+        ("baths.capacity", [5.0], {"capacity": 5.0}),
+        ("baths.temperature", [1.5], {"temperature": 1.5}),
+        ("dissipation.rate", 0.3, {"rate": 0.3}),
+        ("energy.inertia", [3.0, 2.5, 1.5], {"moments": np.array([3.0, 2.5, 1.5])}),
+    ],
+)
+def test_a_parameter_by_name_is_that_of_the_constructor(name, value, arguments):
+    system, expected = body_with_bath(), last_state(body_with_bath(**arguments))
+    start = system.state([*START, 0.0])
+    assert not np.array_equal(last_state(system), expected)
+    np.testing.assert_array_equal(last_state(replace_parameters(system, {name: value})), expected)
+    propagator = lt.Propagator(system, None, 0.1)
+    np.testing.assert_array_equal(propagator.final(start, SPAN, parameters={name: value}), expected)
+    many = lt.ensemble(system, start, SPAN, 0.1, parameters={name: np.array([value, value])})
+    np.testing.assert_allclose(many.x, np.stack([expected, expected]), rtol=1e-14)
+    flow = lt.flow(system, start, SPAN, 0.1, parameters={name: jnp.asarray(value)})
+    np.testing.assert_allclose(flow, expected, rtol=1e-13)
+
+
+def test_a_tensor_of_inertia_is_a_parameter():
+    tensor = np.array([[3.0, 0.2, 0.0], [0.2, 2.0, 0.1], [0.0, 0.1, 1.5]])
+    system = body_with_bath(moments=np.diag(MOMENTS) + 0.1)
+    np.testing.assert_allclose(named_parameters(system)["energy.inertia"], np.diag(MOMENTS) + 0.1, rtol=1e-15)
+    changed = replace_parameters(system, {"energy.inertia": tensor})
+    np.testing.assert_allclose(last_state(changed), last_state(body_with_bath(moments=tensor)), rtol=1e-13)
+
+
+def test_paths_of_arrays_are_names_too():
+    system = body_with_bath()
+    for path in ("dissipation.part.rate", "dissipation.rate"):
+        assert float(replace_parameters(system, {path: 0.3}).dissipation.part.rate) == 0.3
+    changed = replace_parameters(system, {"energy.body.A": 1.0 / np.array([3.0, 2.5, 1.5])})
+    np.testing.assert_array_equal(named_parameters(changed)["energy.inertia"], [3.0, 2.5, 1.5])
+
+
+def test_entries_of_a_parameter_are_axes_of_a_study(tmp_path):
+    study = lt.Study(
+        body_with_bath(),
+        {"energy.inertia[1]": [2.0, 2.5], "baths.capacity[0]": [2.0, 5.0]},
+        x0=[*START, 0.0],
+        t_span=SPAN,
+        step=0.1,
+        measure={"x": "final"},
+    )
+    study.run(progress=False)
+    for i, moment in enumerate([2.0, 2.5]):
+        for j, capacity in enumerate([2.0, 5.0]):
+            system = body_with_bath(moments=np.array([3.0, moment, 1.0]), capacity=capacity)
+            np.testing.assert_allclose(study.results.x.values[i, j], last_state(system), rtol=1e-13)
+
+
+# -- bad input ----------------------------------------------------------------------------------------------------
+
+
+def test_two_names_of_one_parameter_are_refused():
+    values = {"energy.inertia": MOMENTS, "energy.body.A": 1.0 / MOMENTS}
+    with pytest.raises(lt.InputError, match=r"are the same parameter\. Give one of them"):
+        replace_parameters(body_with_bath(), values)
+
+
+def test_an_unknown_name_lists_those_that_there_are():
+    with pytest.raises(lt.InputError, match=r"no parameter 'rate'; .*baths\.capacity.*a function that builds"):
+        replace_parameters(body_with_bath(), {"rate": 0.1})
+
+
+def test_a_lagrangian_that_the_energy_was_computed_from_is_no_parameter():
+    with pytest.raises(lt.InputError, match="a function that builds the system"):
+        replace_parameters(lt.models.mass_spring_gas(), {"lagrangian.summands[0].A": np.ones(3)})
