@@ -6,6 +6,7 @@ import ast
 import importlib
 import re
 import runpy
+import tomllib
 from pathlib import Path
 
 import matplotlib
@@ -87,6 +88,24 @@ def test_the_reference_lists_every_public_name(package):
     pages = [page.read_text() for page in (ROOT / "docs/reference").glob("api_*.md")]
     listed_names = [name for page in pages for name in re.findall(r"^ {3}([\w.]+)$", page, re.MULTILINE)]
     assert sorted(set(package.__all__) - {word for name in listed_names for word in name.split(".")}) == []
+
+
+def test_the_page_of_errors_has_every_class_with_its_built_in():
+    """Each class of errors and warnings has a row, and the page names its nearest base that a user can catch."""
+    rows = [
+        [re.findall(r"\w+(?:Error|Warning)", cell) for cell in row.split("|")[1:3]]
+        for row in (ROOT / "docs/howto/errors.md").read_text().splitlines()
+        if row.startswith("| `")
+    ]
+    bases = {name: also for names, also in rows for name in names}
+    for package in (liethermo, manifolds):
+        for name in package.__all__:
+            thing = getattr(package, name)
+            if isinstance(thing, type) and issubclass(thing, Exception) and thing.__bases__ != (Exception,):
+                assert name in bases, f"docs/howto/errors.md has no row for {name}"
+                if not issubclass(thing, Warning):
+                    parents = {base.__name__ for base in thing.__bases__} - {"LiethermoError", "ManifoldsError"}
+                    assert set(bases[name]) == parents, name
 
 
 LINK = re.compile(
@@ -202,6 +221,49 @@ def test_blocks_that_are_not_executed_are_right(code_spans):
 def test_python_in_code_font_that_is_wrong_is_found(code_spans, span, words):
     with pytest.raises(code_spans.SpanError, match=words):
         code_spans.check(span)
+
+
+LOST_PARAGRAPH = re.compile(r"(?<=[.:;)`])  +(?=\S)|(?<=\S) ##+ \w")
+"""Two blanks where a paragraph began, or a heading within a line."""
+
+
+def test_no_paragraph_is_lost_in_a_line():
+    pages = [*PAGES, ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.md"]
+    lines = [(page, line) for page in pages for line in _words(page).splitlines() if not line.lstrip().startswith("|")]
+    assert len(lines) > 2000
+    assert [f"{_name(page)}: {line}" for page, line in lines if LOST_PARAGRAPH.search(line)] == []
+
+
+@pytest.mark.parametrize("line", ["One ends.  Another begins.", "A text. ## A measurement"])
+def test_a_lost_paragraph_is_found(line):
+    assert LOST_PARAGRAPH.search(line)
+
+
+MAX_COLUMNS = 88
+"""Columns of a line of code that a page of the site shows without a scroll bar."""
+
+
+def test_code_is_not_wider_than_a_page():
+    pages = [page for page in PAGES if page.parent.parent == ROOT / "docs" and page.name not in PAGES_NOT_WRAPPED]
+    assert len(pages) > 50
+    wide = [
+        f"{_name(page)}: {line}"
+        for page in pages
+        for block in re.findall(
+            r"^```(?:python|py|sh|bash|toml|text)\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL
+        )
+        for line in block.splitlines()
+        if len(line) > MAX_COLUMNS
+    ]
+    assert wide == []
+
+
+PAGES_NOT_WRAPPED = {
+    name
+    for settings in (ROOT / "docs").glob("*/ruff.toml")
+    for name in tomllib.loads(settings.read_text()).get("extend-exclude", ())
+}
+"""Pages whose code the formatter does not wrap yet."""
 
 
 def test_what_is_no_python_is_left_alone(code_spans):
