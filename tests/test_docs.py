@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import builtins
 import importlib
 import re
 import runpy
@@ -186,6 +187,11 @@ def test_python_in_code_font_is_right(code_spans):
                 errors.append(f"{_name(page)}: {span}: {error}")
     assert errors == []
     assert n_checked > 400
+
+
+def test_an_attribute_without_its_value_is_checked_whatever_ran_before(code_spans, monkeypatch):
+    monkeypatch.setattr(builtins, "_", 2.0, raising=False)  # as doctest leaves it
+    code_spans.check(".solution")  # an attribute that some class has
 
 
 def test_blocks_that_are_not_executed_are_right(code_spans):
