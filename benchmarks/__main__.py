@@ -25,7 +25,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--quick", action="store_true", help="see that everything runs; the figures mean nothing")
     parser.add_argument("--out", type=Path, default=RESULT_FOLDER, help="folder for the results")
     parser.add_argument("--kept", action="store_true", help="measure nothing: write the page from what is kept")
-    parser.add_argument("--page", type=Path, help="write this page, and that of every run, from what is kept")
+    parser.add_argument("--page", type=Path, help="write this page, and benchmarks/runs.md, from what is kept")
     options = parser.parse_args(arguments)
     unknown = set(options.names) - set(MEASUREMENT_NAMES)
     if unknown:

@@ -1,8 +1,9 @@
-"""The two documentation pages, made from the results saved as JSON: wins and losses, and every run."""
+"""The page of the site with wins and losses, and the file of every run, made from the results saved as JSON."""
 
 from __future__ import annotations
 
 import json
+import os
 from collections import Counter
 from pathlib import Path
 
@@ -10,8 +11,8 @@ from . import first_page
 from .measurements import MEASUREMENT_NAMES
 from .report import Report, Table, Target, targets_table
 
-RUNS_PAGE = "benchmarks_runs"
-"""Name of the page with every run."""
+RUNS_FILE = Path(__file__).parent / "runs.md"
+"""File with every run, which the site does not show."""
 
 INTRODUCTION = """\
 # Benchmarks
@@ -22,29 +23,30 @@ How fast this library is beside other programs, and where it loses. Bars to the 
 """
 """Beginning of the main page."""
 
-METHODOLOGY = f"""\
+METHODOLOGY = """\
 ## How it was measured
 
 Contestants take turns, and the best time of each counts. Both times of a row come from one run on one machine. Work in
 one thread is timed by the clock of the processor; where threads or processes are compared, the clock on the wall is
 used. *Equal accuracy* means that the other program has the loosest tolerance with which it is at least as accurate.
 *Laws* compares the drift of the energy and the least increment of the entropy in a step with the tolerances of the
-tests. {{missed}}. {{{{doc}}}}`{RUNS_PAGE}` has the machine, the targets and the figures of every run. `make bench` measures
-everything anew and writes both pages; the programs are in `benchmarks/`."""  # noqa: E501
+tests. {missed}. The file `benchmarks/runs.md` has the machine, the targets and the figures of every run. `make bench`
+measures everything anew and writes this page and that file; the programs are in `benchmarks/`."""
 """Section of the main page on the measurements."""
 
 RUNS_INTRODUCTION = """\
 # Benchmarks: every run
 
-The figures behind {doc}`benchmarks`: the machine, the targets, and each measurement with all of its rows. Contestants
-take turns, and the best time of each counts; ratios are between times of one run. The load average says how far to
-trust times by the clock on the wall. *Laws* compares the relative drift of the energy and the least increment of the
-entropy in a step, relative to its maximum, with the tolerances of the tests."""
-"""Beginning of the page with every run."""
+The figures behind the page of benchmarks (`docs/reference/benchmarks.md`): the machine, the targets, and each
+measurement with all of its rows. Contestants take turns, and the best time of each counts; ratios are between times of
+one run. The load average says how far to trust times by the clock on the wall. *Laws* compares the relative drift of
+the energy and the least increment of the entropy in a step, relative to its maximum, with the tolerances of the
+tests."""
+"""Beginning of the file with every run."""
 
 
-def write_pages(results: Path, page: Path) -> None:
-    """Write both pages and their figures from all results in the folder; the second page is placed beside the first.
+def write_pages(results: Path, page: Path, runs: Path = RUNS_FILE) -> None:
+    """Write the page with its figures, and the file of every run, from all results in the folder.
 
     Raises
     ------
@@ -55,6 +57,7 @@ def write_pages(results: Path, page: Path) -> None:
     result_files = [result for file in files if not (result := json.loads(file.read_text()))["quick"]]
     if not result_files:
         raise ValueError(f"{results} holds no results; run the measurements first")
+    figures = os.path.relpath(page.parent, runs.parent)
     reports = {result["name"]: Report.from_dict(result["report"]) for result in result_files}
     targets = [target for report in reports.values() for target in report.targets]
     from .figures import draw_magnet, draw_time_ratios, draw_work_precision
@@ -70,18 +73,17 @@ def write_pages(results: Path, page: Path) -> None:
     parts = [RUNS_INTRODUCTION, machines, _target_section(targets)]
     full_reports = [name for names in first_page.FULL_REPORT_THEMES.values() for name in names]
     for name, report in reports.items():
-        parts.append(
-            f"## {report.title}\n\nOn the page {{doc}}`benchmarks`." if name in full_reports else report.markdown()
-        )
+        parts.append(f"## {report.title}\n\nOn the page of benchmarks." if name in full_reports else report.markdown())
         if name in differing:
             parts.append(f"Measured elsewhere: {differing[name]}.")
         if report.series:
             draw_work_precision(report.series, figure := page.parent / f"{name}.svg")
-            parts.append(f"![Time against error]({figure.name})")
+            parts.append(f"![Time against error]({figures}/{figure.name})")
         if name == "magnet":
             draw_magnet(report.tables[0], page.parent / "magnet.svg")
-            parts.append("![Magnetisation, specific heat and Binder's cumulant against the temperature](magnet.svg)")
-    _write_page(page.parent / f"{RUNS_PAGE}.md", parts)
+            words = "Magnetisation, specific heat and Binder's cumulant against the temperature"
+            parts.append(f"![{words}]({figures}/magnet.svg)")
+    _write_page(runs, parts)
 
 
 def _write_page(page: Path, parts: list[str]) -> None:

@@ -60,24 +60,25 @@ def test_the_driver_on_a_bare_machine(bare_machine, tmp_path, capsys):
     assert rows["SciPy DOP853"][-1] == "broken: energy"
 
     with pytest.raises(ValueError, match="holds no results"):  # quick ones do not count
-        page.write_pages(tmp_path, tmp_path / "page.md")
+        page.write_pages(tmp_path, tmp_path / "page.md", tmp_path / "runs.md")
     result["quick"] = False
     (tmp_path / "work_precision.json").write_text(json.dumps(result))
-    page.write_pages(tmp_path, tmp_path / "page.md")
-    assert "| midpoint, array engine | 500 steps |" in (tmp_path / "benchmarks_runs.md").read_text()
+    page.write_pages(tmp_path, tmp_path / "page.md", tmp_path / "runs.md")
+    assert "| midpoint, array engine | 500 steps |" in (tmp_path / "runs.md").read_text()
     assert (tmp_path / "work_precision.svg").read_text().count("SciPy DOP853") == 1
 
 
-PAGES = ROOT / "docs" / "reference"
+MAIN_PAGE = Path("docs/reference/benchmarks.md")
+RUNS = Path("benchmarks/runs.md")
 
 
 def test_both_pages_are_those_of_the_kept_results(tmp_path):
-    page.write_pages(RESULT_FOLDER, tmp_path / "benchmarks.md")
-    for name in ("benchmarks.md", "benchmarks_runs.md"):
-        assert (tmp_path / name).read_text() == (PAGES / name).read_text(), (
-            f"{name}: python -m benchmarks --kept --page"
-        )
-    main_page = (tmp_path / "benchmarks.md").read_text()
+    for path in (MAIN_PAGE, RUNS):
+        (tmp_path / path).parent.mkdir(parents=True)
+    page.write_pages(RESULT_FOLDER, tmp_path / MAIN_PAGE, tmp_path / RUNS)
+    for path in (MAIN_PAGE, RUNS):
+        assert (tmp_path / path).read_text() == (ROOT / path).read_text(), f"{path}: python -m benchmarks --kept --page"
+    main_page = (tmp_path / MAIN_PAGE).read_text()
     assert len(main_page.split()) <= 3500
     assert (
         main_page.index("![") < main_page.index("\n- **") < main_page.index("\n| ")

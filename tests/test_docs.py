@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import ast
+import builtins
 import importlib
 import re
 import runpy
+import tomllib
 from pathlib import Path
 
 import matplotlib
@@ -44,7 +46,8 @@ SLOW_PAGES = (
     *("on_manifolds", "own_space", "friction_heat_work", "own_algebra", "heat_friction", "learn"),
     *("studies", "own_method", "coming_from", "choose_method", "own_loop", "exact_laws", "errors"),
     *("asteroid_wobble", "real_bodies", "qubit_and_bath", "events", "derivatives", "ensembles", "audits"),
-    *("geometer", "relaxation", "spins", "fluids", "quantum", "learning", "learn_own_data", "method_author"),
+    *("geometer", "relaxation", "magnets", "fluids", "quantum", "learning", "learn_own_data", "method_author"),
+    *("install", "spacecraft", "torques"),
 )
 """Pages that compile many programs: they run in the slow tier."""
 
@@ -88,6 +91,24 @@ def test_the_reference_lists_every_public_name(package):
     assert sorted(set(package.__all__) - {word for name in listed_names for word in name.split(".")}) == []
 
 
+def test_the_page_of_errors_has_every_class_with_its_built_in():
+    """Each class of errors and warnings has a row, and the page names its nearest base that a user can catch."""
+    rows = [
+        [re.findall(r"\w+(?:Error|Warning)", cell) for cell in row.split("|")[1:3]]
+        for row in (ROOT / "docs/howto/errors.md").read_text().splitlines()
+        if row.startswith("| `")
+    ]
+    bases = {name: also for names, also in rows for name in names}
+    for package in (liethermo, manifolds):
+        for name in package.__all__:
+            thing = getattr(package, name)
+            if isinstance(thing, type) and issubclass(thing, Exception) and thing.__bases__ != (Exception,):
+                assert name in bases, f"docs/howto/errors.md has no row for {name}"
+                if not issubclass(thing, Warning):
+                    parents = {base.__name__ for base in thing.__bases__} - {"LiethermoError", "ManifoldsError"}
+                    assert set(bases[name]) == parents, name
+
+
 LINK = re.compile(
     r"(?<!`)\[[^\]]*\]\(([^)\s]+)\)|\{(?:doc|download)\}`(?:[^`<]*<)?([^`>]+)>?`|^:link: (\S+)$", re.MULTILINE
 )
@@ -107,7 +128,7 @@ def test_links_of_a_page_lead_somewhere(page):
     dead_links = [
         target
         for target in local
-        if target != "../gallery/index"  # made by the build
+        if target not in ("gallery/index", "../gallery/index")  # made by the build
         and not target.startswith("generated/")  # likewise
         and not any((page.parent / f"{target}{suffix}").is_file() for suffix in ("", ".md"))
     ]
@@ -147,6 +168,8 @@ def test_a_name_that_does_not_exist_is_found(code_links):
     assert code_links.resolve("lt.integrate(...)") == "liethermo.integrate"
     assert code_links.resolve("LieAlgebra") == "manifolds.LieAlgebra"
     assert code_links.resolve("step") is None
+    assert code_links.resolve("u") is None  # a tangent vector
+    assert code_links.resolve("mf.u") == code_links.resolve("u(n)") == "manifolds.u"
     with pytest.raises(AttributeError, match="integrat"):
         code_links.resolve("lt.integrat")
 
@@ -164,6 +187,11 @@ def test_python_in_code_font_is_right(code_spans):
                 errors.append(f"{_name(page)}: {span}: {error}")
     assert errors == []
     assert n_checked > 400
+
+
+def test_an_attribute_without_its_value_is_checked_whatever_ran_before(code_spans, monkeypatch):
+    monkeypatch.setattr(builtins, "_", 2.0, raising=False)  # as doctest leaves it
+    code_spans.check(".solution")  # an attribute that some class has
 
 
 def test_blocks_that_are_not_executed_are_right(code_spans):
@@ -199,6 +227,49 @@ def test_blocks_that_are_not_executed_are_right(code_spans):
 def test_python_in_code_font_that_is_wrong_is_found(code_spans, span, words):
     with pytest.raises(code_spans.SpanError, match=words):
         code_spans.check(span)
+
+
+LOST_PARAGRAPH = re.compile(r"(?<=[.:;)`])  +(?=\S)|(?<=\S) ##+ \w")
+"""Two blanks where a paragraph began, or a heading within a line."""
+
+
+def test_no_paragraph_is_lost_in_a_line():
+    pages = [*PAGES, ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.md"]
+    lines = [(page, line) for page in pages for line in _words(page).splitlines() if not line.lstrip().startswith("|")]
+    assert len(lines) > 2000
+    assert [f"{_name(page)}: {line}" for page, line in lines if LOST_PARAGRAPH.search(line)] == []
+
+
+@pytest.mark.parametrize("line", ["One ends.  Another begins.", "A text. ## A measurement"])
+def test_a_lost_paragraph_is_found(line):
+    assert LOST_PARAGRAPH.search(line)
+
+
+MAX_COLUMNS = 88
+"""Columns of a line of code that a page of the site shows without a scroll bar."""
+
+
+def test_code_is_not_wider_than_a_page():
+    pages = [page for page in PAGES if page.parent.parent == ROOT / "docs" and page.name not in PAGES_NOT_WRAPPED]
+    assert len(pages) > 50
+    wide = [
+        f"{_name(page)}: {line}"
+        for page in pages
+        for block in re.findall(
+            r"^```(?:python|py|sh|bash|toml|text)\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL
+        )
+        for line in block.splitlines()
+        if len(line) > MAX_COLUMNS
+    ]
+    assert wide == []
+
+
+PAGES_NOT_WRAPPED = {
+    name
+    for settings in (ROOT / "docs").glob("*/ruff.toml")
+    for name in tomllib.loads(settings.read_text()).get("extend-exclude", ())
+}
+"""Pages whose code the formatter does not wrap yet."""
 
 
 def test_what_is_no_python_is_left_alone(code_spans):
@@ -281,7 +352,7 @@ def _figures_of_speed(path: Path) -> list[str]:
 def test_figures_of_speed_are_on_the_pages_of_benchmarks_alone():
     """Only the pages of benchmarks, which the measurements write, have figures of speed: elsewhere they would get
     stale."""
-    benchmarks = [ROOT / f"docs/reference/{name}.md" for name in ("benchmarks", "benchmarks_runs")]
+    benchmarks = [ROOT / "docs/reference/benchmarks.md", ROOT / "benchmarks/runs.md"]
     assert all(len(_figures_of_speed(page)) > 50 for page in benchmarks)
     ours = [path for path in TEXT_FILES if path not in benchmarks and not path.is_relative_to(ROOT / "examples")]
     texts = [*ours, ROOT / "CHANGELOG.md"]

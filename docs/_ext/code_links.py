@@ -18,7 +18,9 @@ import manifolds
 logger = logging.getLogger(__name__)
 
 PREFIXES = {"lt": liethermo, "liethermo": liethermo, "mf": manifolds, "manifolds": manifolds}
-NAME = re.compile(r"(?:(lt|mf|liethermo|manifolds)\.)?([A-Za-z_][\w.]*?)(?:\(.*\))?")
+NAME = re.compile(r"(?:(lt|mf|liethermo|manifolds)\.)?([A-Za-z_][\w.]*?)(\(.*\))?")
+MIN_LENGTH_WITHOUT_PREFIX = 2
+"""Shorter words without prefix and parentheses are symbols: `u` is a tangent vector, and `mf.u(n)` an algebra."""
 
 
 def resolve(text: str) -> str | None:
@@ -32,7 +34,9 @@ def resolve(text: str) -> str | None:
     match = NAME.fullmatch(text)
     if match is None:
         return None
-    prefix, rest = match.groups()
+    prefix, rest, call = match.groups()
+    if not prefix and not call and len(rest) < MIN_LENGTH_WITHOUT_PREFIX:
+        return None
     for package in [PREFIXES[prefix]] if prefix else (liethermo, manifolds):
         if prefix or (rest.partition(".")[0] in package.__all__ and not hasattr(builtins, rest)):
             found: Any = package

@@ -24,8 +24,22 @@ energy = lt.Quadratic([1.0, 0.5, 0.2])
 a, b = np.meshgrid(np.linspace(-1, 1, 61), np.linspace(-1, 1, 121), indexing="ij")
 cos, sin = np.cos(np.pi * b), np.sin(np.pi * b)
 surfaces = [
-    (mf.so(3), 2, np.array([np.cos(np.pi / 2 * a) * cos, np.cos(np.pi / 2 * a) * sin, np.sin(np.pi / 2 * a)])),
-    (mf.bianchi("VIII"), 2, np.array([np.cosh(1.2 * a) * cos, np.cosh(1.2 * a) * sin, np.sinh(1.2 * a)])),
+    (
+        mf.so(3),
+        2,
+        np.array(
+            [
+                np.cos(np.pi / 2 * a) * cos,
+                np.cos(np.pi / 2 * a) * sin,
+                np.sin(np.pi / 2 * a),
+            ]
+        ),
+    ),
+    (
+        mf.bianchi("VIII"),
+        2,
+        np.array([np.cosh(1.2 * a) * cos, np.cosh(1.2 * a) * sin, np.sinh(1.2 * a)]),
+    ),
     (mf.se(2), 2, np.array([1.5 * a, cos, sin])),
     (mf.heisenberg(1), 1, np.array([1.2 * b, 1.7 * a, np.ones_like(a)])),
 ]
@@ -36,28 +50,59 @@ surfaces = [
 
 
 def draw(ax, g, casimir, surface):
-    """The surface with motions that start along the line a = 0 and along the line b = 1/2."""
-    ax.set(proj_type="ortho", title=f"{g.name}\n${casimir}$ = 1".replace("**", "^").replace("mu", r"\mu_"))
+    """Draw the surface and motions that start on the lines a = 0 and b = 1/2."""
+    ax.set(
+        proj_type="ortho",
+        title=f"{g.name}\n${casimir}$ = 1".replace("**", "^").replace("mu", r"\mu_"),
+    )
     ax.view_init(elev=25, azim=55)
     ax.computed_zorder = False
-    style = {"color": "white", "linewidth": 0, "antialiased": False, "lightsource": LightSource(55, 50)}
+    style = {
+        "color": "white",
+        "linewidth": 0,
+        "antialiased": False,
+        "lightsource": LightSource(55, 50),
+    }
     ax.plot_surface(*surface, rstride=1, cstride=1, **style)
     azimuth, elevation = np.radians([ax.azim, ax.elev])
-    eye = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    eye = [
+        np.cos(elevation) * np.cos(azimuth),
+        np.cos(elevation) * np.sin(azimuth),
+        np.sin(elevation),
+    ]
     system = lt.LiePoissonSystem(g, energy, entropy=casimir)
-    for i, j in [(30, 64), (30, 70), (30, 76), (30, 82), (30, 88), (36, 90), (41, 90), (46, 90), (52, 90)]:
+    for i, j in [
+        (30, 64),
+        (30, 70),
+        (30, 76),
+        (30, 82),
+        (30, 88),
+        (36, 90),
+        (41, 90),
+        (46, 90),
+        (52, 90),
+    ]:
         solution = lt.integrate(system, surface[:, i, j], t_span=(0.0, 30.0), step=0.05)
         assert np.ptp(solution.entropy) < 1e-13
         color = plt.get_cmap("viridis")(1.2 * solution.energy[0])
         near = (jax.vmap(jax.grad(casimir))(solution.x) @ np.array(eye) > 0.0)[:, None]
         ax.plot(*np.where(near, solution.x, np.nan).T, color=color)
         ax.plot(*np.where(near, np.nan, solution.x).T, color=color, alpha=0.2)
-    ax.set(xlabel=r"$\mu_1$", ylabel=r"$\mu_2$", zlabel=r"$\mu_3$", xticks=[], yticks=[], zticks=[])
+    ax.set(
+        xlabel=r"$\mu_1$",
+        ylabel=r"$\mu_2$",
+        zlabel=r"$\mu_3$",
+        xticks=[],
+        yticks=[],
+        zticks=[],
+    )
     ax.set_aspect("equal")
     for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
         axis.labelpad = -12
 
 
-figure, axes = plt.subplots(2, 2, figsize=(7.5, 7.5), layout="constrained", subplot_kw={"projection": "3d"})
+figure, axes = plt.subplots(
+    2, 2, figsize=(7.5, 7.5), layout="constrained", subplot_kw={"projection": "3d"}
+)
 for ax, (g, degree, surface) in zip(axes.flat, surfaces, strict=True):
     draw(ax, g, *g.casimirs(degree), surface)

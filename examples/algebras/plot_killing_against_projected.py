@@ -14,11 +14,18 @@ import manifolds as mf
 
 
 def bodies(g, inertia):
-    """The body of these inertias on a compact algebra, with either dissipation; S is the quadratic Casimir."""
-    rate = -1.0 / g.killing_form()[0, 0]  # makes -rate * kappa the dot product in these bases
-    dissipations = {"Killing": lt.KillingDissipation(rate), "projected": lt.ProjectedMetric()}
+    """Return the body with either dissipation; S is the quadratic Casimir."""
+    rate = (
+        -1.0 / g.killing_form()[0, 0]
+    )  # makes -rate * kappa the dot product in these bases
+    dissipations = {
+        "Killing": lt.KillingDissipation(rate),
+        "projected": lt.ProjectedMetric(),
+    }
     return {
-        name: lt.LiePoissonSystem(g, lt.Quadratic(1 / inertia), lt.Quadratic(np.ones(g.dim)), dissipation)
+        name: lt.LiePoissonSystem(
+            g, lt.Quadratic(1 / inertia), lt.Quadratic(np.ones(g.dim)), dissipation
+        )
         for name, dissipation in dissipations.items()
     }
 
@@ -31,7 +38,9 @@ for g in mf.so(3), mf.su(3):
     inertia = np.linspace(1.0, 3.0, g.dim)
     pair = bodies(g, inertia)
     mu = random.standard_normal((100, g.dim))
-    difference = np.abs(pair["Killing"].vector_field(mu) - pair["projected"].vector_field(mu)).max()
+    difference = np.abs(
+        pair["Killing"].vector_field(mu) - pair["projected"].vector_field(mu)
+    ).max()
     print(f"{g.name}: the vector fields differ by {difference:.1e} at most")
 
 # %%
@@ -41,10 +50,15 @@ for g in mf.so(3), mf.su(3):
 # be parallel. The projected metric rests only where :math:`\Omega` is parallel to :math:`\mu`.
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(8.0, 3.6), layout="constrained")
-styles = {"Killing": {"color": "#0072B2"}, "projected": {"color": "#E69F00", "linestyle": "--"}}
+styles = {
+    "Killing": {"color": "#0072B2"},
+    "projected": {"color": "#E69F00", "linestyle": "--"},
+}
 mu = random.standard_normal(g.dim)
 for name, body in pair.items():
-    solution = lt.integrate(body, mu / np.linalg.norm(mu), t_span=(0.0, 400.0), step=0.1)
+    solution = lt.integrate(
+        body, mu / np.linalg.norm(mu), t_span=(0.0, 400.0), step=0.1
+    )
     print(f"{name}:\n{solution.audit()}\n")
     largest = inertia.max() * solution.energy[0]
     free_motion = np.linalg.norm(g.ad_star(solution.x / inertia, solution.x), axis=-1)

@@ -17,7 +17,10 @@ C = np.zeros((4, 4, 4))
 C[J, Q, P], C[J, P, Q], C[Q, P, Z] = 1, -1, 1
 g = mf.LieAlgebra.from_structure_constants(C - C.swapaxes(0, 1), name="oscillator")
 
-print(f"{g}: solvable {g.is_solvable()}, nilpotent {g.is_nilpotent()}, unimodular {g.is_unimodular()}")
+print(
+    f"{g}: solvable {g.is_solvable()}, nilpotent {g.is_nilpotent()}, unimodular"
+    f" {g.is_unimodular()}"
+)
 
 # %%
 # The library checks the axioms, and exactly for rational constants. In this wrong version Z is not central:
@@ -50,8 +53,14 @@ print(solution.audit())
 # %%
 
 figure, ax = plt.subplots(layout="constrained")
-for component, name, color in zip(solution.x.T, "JQPZ", ("#0072B2", "#E69F00", "#009E73", "0.5"), strict=True):
+for component, name, color in zip(
+    solution.x.T, "JQPZ", ("#0072B2", "#E69F00", "#009E73", "0.5"), strict=True
+):
     ax.plot(solution.t, component, color=color, label=name)
-ax.set(xlabel="time", ylabel=r"components of $\mu$", title="Relaxation on the oscillator algebra")
+ax.set(
+    xlabel="time",
+    ylabel=r"components of $\mu$",
+    title="Relaxation on the oscillator algebra",
+)
 ax.legend(frameon=False, ncols=4, loc="lower right")
 ax.spines[["top", "right"]].set_visible(False)

@@ -20,7 +20,10 @@ inertia = (np.sum(edges**2) - edges**2) / 4
 system = lt.models.tumbling_body(inertia, rate=0.15)
 solution = lt.integrate(system, [0.02, 1.0, 0.02], (0.0, 60.0), 0.05)
 print(solution.audit())
-print(f"largest distance from the rotations: {float(mf.SO(3).defect(solution.attitude).max()):.0e}")
+print(
+    "largest distance from the rotations:"
+    f" {float(mf.SO(3).defect(solution.attitude).max()):.0e}"
+)
 
 # %%
 # The momentum in space is constant, and the heat grows by the loss of kinetic energy.
@@ -29,16 +32,31 @@ momentum = solution.x[:, :3]
 in_space = np.einsum("tij,tj->ti", solution.attitude, momentum)
 kinetic = 0.5 * np.sum(momentum**2 / inertia, axis=1)
 print(f"the momentum in space changes by {np.abs(in_space - in_space[0]).max():.0e}")
-print(f"kinetic energy from {kinetic[0]:.4f} to {kinetic[-1]:.4f}; the least that it can be: {0.5 / inertia.max():.4f}")
-print(f"angle from the shortest edge: {np.degrees(lt.bodies.nutation(solution)[[0, -1]]).round(1)} degrees")
+print(
+    f"kinetic energy from {kinetic[0]:.4f} to {kinetic[-1]:.4f}; the least that it can"
+    f" be: {0.5 / inertia.max():.4f}"
+)
+print(
+    "angle from the shortest edge:"
+    f" {np.degrees(lt.bodies.nutation(solution)[[0, -1]]).round(1)} degrees"
+)
 
 # %%
 # The box seen from outside, and its angular momentum. The momentum is fixed, and the box turns about it. At first the
 # middle edge is along the momentum, in the end the shortest edge. The initial state decides which end of that edge is
 # ahead.
 
-corners = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]) * edges / 2
-faces = [[0, 1, 3, 2], [4, 5, 7, 6], [0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5]]
+corners = (
+    np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]) * edges / 2
+)
+faces = [
+    [0, 1, 3, 2],
+    [4, 5, 7, 6],
+    [0, 1, 5, 4],
+    [2, 3, 7, 6],
+    [0, 2, 6, 4],
+    [1, 3, 7, 5],
+]
 colors = ["#0072B2", "#0072B2", "#E69F00", "#E69F00", "#009E73", "#009E73"]
 
 figure = plt.figure(figsize=(10, 6), layout="constrained")
@@ -47,8 +65,18 @@ for place, moment in enumerate(times):
     i = int(np.argmin(np.abs(solution.t - moment)))
     ax = figure.add_subplot(3, 4, place + 1, projection="3d", computed_zorder=False)
     box = corners @ solution.attitude[i].T
-    ax.add_collection3d(Poly3DCollection(box[faces], facecolors=colors, edgecolors="white", alpha=0.95))
-    ax.quiver(0, 0, 0, *(1.5 * in_space[i] / np.linalg.norm(in_space[i])), color="#D55E00", lw=2, zorder=9)
+    ax.add_collection3d(
+        Poly3DCollection(box[faces], facecolors=colors, edgecolors="white", alpha=0.95)
+    )
+    ax.quiver(
+        0,
+        0,
+        0,
+        *(1.5 * in_space[i] / np.linalg.norm(in_space[i])),
+        color="#D55E00",
+        lw=2,
+        zorder=9,
+    )
     limits = (-1.1, 1.1)
     ax.set(xlim=limits, ylim=limits, zlim=limits, title=f"t = {solution.t[i]:.0f}")
     ax.set_box_aspect((1, 1, 1), zoom=0.85)

@@ -16,11 +16,16 @@ import manifolds as mf
 
 moments = np.array([3.0, 2.0, 1.0])
 body = lt.LiePoissonSystem(
-    mf.so(3), lt.Quadratic(1 / moments), lt.Quadratic(4 * np.ones(3)), lt.KillingDissipation(0.5)
+    mf.so(3),
+    lt.Quadratic(1 / moments),
+    lt.Quadratic(4 * np.ones(3)),
+    lt.KillingDissipation(0.5),
 )
 start = np.tile([0.0, 0.0, 1.0], (2000, 1))
 noise = lt.Fluctuations(boltzmann=1.0, seed=0)
-bodies = lt.ensemble(body, start, (0.0, 8.0), 0.05, noise=noise, outputs="trajectory", save_every=4)
+bodies = lt.ensemble(
+    body, start, (0.0, 8.0), 0.05, noise=noise, outputs="trajectory", save_every=4
+)
 print(bodies.audit())
 
 # %%
@@ -38,8 +43,18 @@ for path in bodies.x[:3]:
 left.set(xlabel="time", ylabel="momentum along the first axis", title="Three bodies")
 bins = np.linspace(-np.sqrt(3), np.sqrt(3), 41)
 right.hist(late[:, 0], bins, density=True, color="#56B4E9", label="2,000 bodies")
-right.hist(points[:, 0], bins, weights=weights, density=True, histtype="step", color="k", label="exp(S / k)")
-right.set(xlabel="momentum along the first axis", title="Either end of the axis is as good")
+right.hist(
+    points[:, 0],
+    bins,
+    weights=weights,
+    density=True,
+    histtype="step",
+    color="k",
+    label="exp(S / k)",
+)
+right.set(
+    xlabel="momentum along the first axis", title="Either end of the axis is as good"
+)
 right.legend(frameon=False)
 for ax in (left, right):
     ax.spines[["top", "right"]].set_visible(False)

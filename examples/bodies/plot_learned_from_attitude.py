@@ -29,11 +29,15 @@ run = lt.integrate(body, START, (0.0, 20.0), 0.1, method)
 # The record: attitudes with errors of 1e-4 radians, and the angular velocities of a spline through them.
 
 random = np.random.default_rng(0)
-seen = Rotation.from_matrix(run.attitude) * Rotation.from_rotvec(1e-4 * random.standard_normal((len(run.t), 3)))
+seen = Rotation.from_matrix(run.attitude) * Rotation.from_rotvec(
+    1e-4 * random.standard_normal((len(run.t), 3))
+)
 spline = RotationSpline(run.t, seen)
 turned = seen.as_matrix()
 h = 1e-4  # the velocity in body axes, by a difference of the spline
-velocity = (spline(run.t[2:-2] - h).inv() * spline(run.t[2:-2] + h)).as_rotvec() / (2 * h)
+velocity = (spline(run.t[2:-2] - h).inv() * spline(run.t[2:-2] + h)).as_rotvec() / (
+    2 * h
+)
 
 # %%
 # The motion of a body with other numbers. The unknowns are the logarithms of four numbers, and :math:`\pi`, of length
@@ -52,12 +56,17 @@ def missed(unknown):
         x = jnp.append(mu, 0.0)
         return own.transport(x, own.energy.gradient(x), own.entropy.gradient(x))
 
-    return (jax.vmap(transport)(jnp.einsum("tij,i->tj", turned[2:-2], pi)) - velocity).ravel()
+    return (
+        jax.vmap(transport)(jnp.einsum("tij,i->tj", turned[2:-2], pi)) - velocity
+    ).ravel()
 
 
 jacobian = jax.jit(jax.jacfwd(missed))
 starts = [np.r_[np.zeros(4), axis] for axis in (*np.eye(3), *-np.eye(3))]
-fits = [least_squares(lambda u: np.asarray(missed(u)), u, lambda u: np.asarray(jacobian(u))) for u in starts]
+fits = [
+    least_squares(lambda u: np.asarray(missed(u)), u, lambda u: np.asarray(jacobian(u)))
+    for u in starts
+]
 best = min(fits, key=lambda fit: fit.cost)
 scale = np.linalg.norm(START)
 inertia, rate = np.exp(best.x[:3]) * scale, np.exp(best.x[3]) / scale
@@ -75,7 +84,12 @@ print(forecast.audit())
 
 figure, axes = plt.subplots(figsize=(7, 3.2), layout="constrained")
 axes.plot(true.t, np.degrees(lt.bodies.nutation(true)), "k", label="true")
-axes.plot(forecast.t, np.degrees(lt.bodies.nutation(forecast)), "--", label="from the attitudes of the first third")
+axes.plot(
+    forecast.t,
+    np.degrees(lt.bodies.nutation(forecast)),
+    "--",
+    label="from the attitudes of the first third",
+)
 axes.axvspan(0.0, 20.0, alpha=0.1)
 axes.set(xlabel="time", ylabel="nutation (degrees)")
 axes.legend()

@@ -32,7 +32,9 @@ def momenta(parameters):
 # The record: the true motion and noise.
 
 noise = 0.02
-record = momenta(TRUE) + noise * np.random.default_rng(0).standard_normal(momenta(TRUE).shape)
+record = momenta(TRUE) + noise * np.random.default_rng(0).standard_normal(
+    momenta(TRUE).shape
+)
 
 # %%
 # The fit, from a guess that is wrong by up to a factor of two. Logarithms keep the parameters positive.
@@ -45,7 +47,9 @@ fit = least_squares(
 )
 found = np.exp(fit.x)
 deviation = found * noise * np.sqrt(np.diag(np.linalg.inv(fit.jac.T @ fit.jac)))
-for name, value, error, truth in zip(("I1", "I2", "I3", "rate"), found, deviation, TRUE, strict=True):
+for name, value, error, truth in zip(
+    ("I1", "I2", "I3", "rate"), found, deviation, TRUE, strict=True
+):
     print(f"{name:>4} = {value:7.4f} ± {error:.4f}   (true {truth:g})")
 
 # %%
@@ -54,6 +58,8 @@ figure, axes = plt.subplots(figsize=(7, 3.6), layout="constrained")
 for i, colour in enumerate(("tab:blue", "tab:orange", "tab:green")):
     axes.plot(times, record[:, i], ".", color=colour, markersize=3, alpha=0.6)
     axes.plot(times, momenta(found)[:, i], color=colour, label=f"$\\Pi_{i + 1}$")
-axes.set(xlabel="time", ylabel="momentum", title="Record (dots) and fitted motion (lines)")
+axes.set(
+    xlabel="time", ylabel="momentum", title="Record (dots) and fitted motion (lines)"
+)
 axes.legend(ncol=3, loc="lower right")
 plt.show()

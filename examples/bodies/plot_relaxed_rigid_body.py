@@ -21,7 +21,10 @@ print(solution.audit())
 # %%
 # At a given energy H the entropy is largest on the axis of greatest inertia, where it is ``max(inertia) * H``.
 
-print(f"entropy reached: {solution.entropy[-1]:.6f}, largest possible: {max(inertia) * solution.energy[0]:.6f}")
+print(
+    f"entropy reached: {solution.entropy[-1]:.6f}, largest possible:"
+    f" {max(inertia) * solution.energy[0]:.6f}"
+)
 
 # %%
 # The body starts next to its middle axis, where the curves of constant entropy cross. It leaves along one of them. From

@@ -19,7 +19,15 @@ N = 20
 system = lt.models.zeitlin(N, decay="enstrophy", rate=0.3)
 sphere = lt.models.QuantisedSphere(N)
 start = sphere.random(seed=3, degrees=(2, 8), enstrophy=40.0)
-solution = lt.integrate(system, start, (0.0, 60.0), 0.04, lt.MetriplecticRungeKutta(4), save_every=125, engine="array")
+solution = lt.integrate(
+    system,
+    start,
+    (0.0, 60.0),
+    0.04,
+    lt.MetriplecticRungeKutta(4),
+    save_every=125,
+    engine="array",
+)
 print(solution.audit())
 
 # %%
@@ -30,7 +38,9 @@ figure = plt.figure(figsize=(10, 3), layout="constrained")
 shown = (0, 2, len(solution.t) - 1)
 for place, i in enumerate(shown, start=1):
     ax = figure.add_subplot(1, 3, place, projection="mollweide")
-    lt.plot.sphere_field(sphere.on_grid(solution.x[i]), ax=ax, title=f"t = {solution.t[i]:g}")
+    lt.plot.sphere_field(
+        sphere.on_grid(solution.x[i]), ax=ax, title=f"t = {solution.t[i]:g}"
+    )
 
 # %%
 # Every point of the sphere has a vorticity and a stream function. At the start they make a cloud, at the end a curve.
@@ -38,8 +48,10 @@ for place, i in enumerate(shown, start=1):
 
 
 def scatter_of_levels(mu):
-    """Spread of the vorticity among points of nearly one stream function, relative to that among all points."""
-    omega, psi = (sphere.on_grid(f, (40, 80)).ravel() for f in (mu, sphere.inverse_laplacian(mu)))
+    """Return the relative scatter of the vorticity at equal stream function."""
+    omega, psi = (
+        sphere.on_grid(f, (40, 80)).ravel() for f in (mu, sphere.inverse_laplacian(mu))
+    )
     order = np.argsort(psi)
     bins = np.array_split(omega[order], 60)
     return np.sqrt(np.mean([np.var(b) for b in bins]) / np.var(omega))
@@ -48,14 +60,22 @@ def scatter_of_levels(mu):
 figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
 for ax, i in zip(axes, (0, -1), strict=True):
     mu = solution.x[i]
-    psi, omega = (sphere.on_grid(f, (40, 80)).ravel() for f in (sphere.inverse_laplacian(mu), mu))
+    psi, omega = (
+        sphere.on_grid(f, (40, 80)).ravel() for f in (sphere.inverse_laplacian(mu), mu)
+    )
     ax.plot(psi, omega, ".", ms=1)
     ax.set(xlabel="stream function", ylabel="vorticity", title=f"t = {solution.t[i]:g}")
-print("spread about a curve:", *(f"{scatter_of_levels(solution.x[i]):.1e}" for i in (0, -1)))
+print(
+    "spread about a curve:",
+    *(f"{scatter_of_levels(solution.x[i]):.1e}" for i in (0, -1)),
+)
 
 # %%
 # The energy to rounding, and the enstrophy.
 
 energy, enstrophy = solution.energy, -solution.entropy
-print(f"energy drift {np.abs(energy / energy[0] - 1).max():.0e}, enstrophy {enstrophy[0]:.3g} to {enstrophy[-1]:.3g}")
+print(
+    f"energy drift {np.abs(energy / energy[0] - 1).max():.0e}, enstrophy"
+    f" {enstrophy[0]:.3g} to {enstrophy[-1]:.3g}"
+)
 plt.show()

@@ -26,17 +26,24 @@ print(solution.audit())
 
 exact = damped_oscillator_solution(solution.t, x0)
 error = solution.x - exact
-print(f"largest errors: q {np.abs(error[:, 0]).max():.3f}, S {np.abs(error[:, 2]).max():.3f} of {exact[-1, 2]:.0f}")
+print(
+    f"largest errors: q {np.abs(error[:, 0]).max():.3f}, S"
+    f" {np.abs(error[:, 2]).max():.3f} of {exact[-1, 2]:.0f}"
+)
 
 # %%
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(8.0, 3.4), layout="constrained")
 left.plot(solution.t, exact[:, 0], color="0.6", label="exact")
-left.plot(solution.t, solution.x[:, 0], ".", color="#0072B2", markersize=3, label="h = 0.1")
+left.plot(
+    solution.t, solution.x[:, 0], ".", color="#0072B2", markersize=3, label="h = 0.1"
+)
 left.set(xlabel="time", ylabel="q", title="Figure 1: position")
 left.legend(frameon=False)
 right.plot(solution.t, error[:, 2], color="#D55E00")
 right.axhline(0.0, color="0.8", linewidth=0.8, zorder=0)
-right.set(xlabel="time", ylabel=r"$S_k - S(t_k)$", title="Figure 2: error of the entropy")
+right.set(
+    xlabel="time", ylabel=r"$S_k - S(t_k)$", title="Figure 2: error of the entropy"
+)
 for ax in (left, right):
     ax.spines[["top", "right"]].set_visible(False)

@@ -29,14 +29,18 @@ print(f"temperatures {np.round(found, 4)} (equilibrium {temperature:.4f})")
 # %%
 
 T = np.asarray(piston.temperatures(solution.x))
-figure, (left, middle, right) = plt.subplots(1, 3, figsize=(10.0, 3.2), layout="constrained")
+figure, (left, middle, right) = plt.subplots(
+    1, 3, figsize=(10.0, 3.2), layout="constrained"
+)
 early = solution.t <= 1.5
 left.plot(solution.t[early], solution.x[early, 1], color="#0072B2")
 left.set(xlabel="time (s)", title="position (m), at first")
 middle.plot(solution.t, solution.x[:, 1], color="#0072B2")
 middle.axhline(position, color="0.7", linewidth=0.8)
 middle.set(xlabel="time (s)", title="position (m)")
-for name, series, color in zip(piston.names, T.T, ("#D55E00", "0.5", "#0072B2"), strict=True):
+for name, series, color in zip(
+    piston.names, T.T, ("#D55E00", "0.5", "#0072B2"), strict=True
+):
     right.plot(solution.t, series, color=color, label=name)
 right.axhline(temperature, color="0.7", linewidth=0.8)
 right.set(xlabel="time (s)", title="temperatures (K)")

@@ -25,38 +25,52 @@ colors = dict(zip(schemes, ("#D55E00", "#0072B2", "#009E73"), strict=True))
 
 
 def study(case):
-    """Runs and relative energy errors, the energy at each scheme's own points as in the paper."""
+    """Return runs and relative energy errors at the points of each scheme."""
     runs = {}
     for friction in frictions:
         system = lt.models.mass_spring_gas(**CASES[case], friction=friction)
         for name, method in schemes.items():
-            x0 = method.state(system, STARTS[case], STARTS[case], S0=0.0, h=h)  # from two positions, as in the paper
+            x0 = method.state(
+                system, STARTS[case], STARTS[case], S0=0.0, h=h
+            )  # from two positions, as in the paper
             solution = lt.integrate(system, x0, (0.0, steps * h), h, method)
             E = method.energies(system, solution.x, h)
             runs[friction, name] = solution, np.abs(E / E[0] - 1)
             rises, error = np.diff(solution.x[:, 2]), runs[friction, name][1]
             print(
-                f"friction {friction:4}: {name} energy error {error.max():.1e}, in the end {error[-1000:].max():.1e}, "
+                f"friction {friction:4}: {name} energy error {error.max():.1e}, in the"
+                f" end {error[-1000:].max():.1e}, "
                 f"entropy up by {rises.min():.1e} or more a step"
             )
     return runs
 
 
 def draw(case, runs):
-    _, axes = plt.subplots(4, len(frictions), figsize=(11.0, 8.5), sharey="row", layout="constrained")
+    _, axes = plt.subplots(
+        4, len(frictions), figsize=(11.0, 8.5), sharey="row", layout="constrained"
+    )
     for column, friction in zip(axes.T, frictions, strict=True):
         system = lt.models.mass_spring_gas(**CASES[case], friction=friction)
         end = steps * h if friction < 1 else 20.0
         t = np.linspace(0.0, end, 1000)
-        exact = mass_spring_gas_solution(t, runs[friction, "scheme 2"][0].x[0], **CASES[case], friction=friction)
-        for ax, series in zip(column, (exact[:, 0], exact[:, 2], None, system.temperature(exact) - 300), strict=True):
+        exact = mass_spring_gas_solution(
+            t, runs[friction, "scheme 2"][0].x[0], **CASES[case], friction=friction
+        )
+        for ax, series in zip(
+            column,
+            (exact[:, 0], exact[:, 2], None, system.temperature(exact) - 300),
+            strict=True,
+        ):
             if series is not None:
                 ax.plot(t, series, color="0.75", linewidth=3, label="exact")
             ax.spines[["top", "right"]].set_visible(False)
         for name, color in colors.items():
             solution, error = runs[friction, name]
             seen = slice(0, int(end / h), 200)
-            x, line = solution.x[seen], {"color": color, "linewidth": 0.8, "label": name}
+            x, line = (
+                solution.x[seen],
+                {"color": color, "linewidth": 0.8, "label": name},
+            )
             column[0].plot(solution.t[seen], x[:, 0], **line)
             column[1].plot(solution.t[seen], x[:, 2], **line)
             column[2].semilogy(solution.t[1:-1:50], error[1::50] + 1e-17, **line)
@@ -65,7 +79,14 @@ def draw(case, runs):
         column[2].set(ylim=(1e-16, 1e-6))
         column[3].set(xlabel="time (s)")
     for ax, label in zip(
-        axes[:, 0], ("position (m)", "entropy (J/K)", "relative energy error", "temperature - 300 K"), strict=True
+        axes[:, 0],
+        (
+            "position (m)",
+            "entropy (J/K)",
+            "relative energy error",
+            "temperature - 300 K",
+        ),
+        strict=True,
     ):
         ax.set(ylabel=label)
     axes[3, 0].legend(frameon=False, fontsize="small")

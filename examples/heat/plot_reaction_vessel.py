@@ -24,7 +24,13 @@ gas, volume = vessel.subsystems[0].energy.function.gas, 1.0
 
 def state(T, numbers):
     """All at one temperature; the jacket has U = C exp(S / C) with C = 20."""
-    return np.array([float(gas.entropy_at(T, np.asarray(numbers), volume)), *numbers, 20.0 * np.log(T)])
+    return np.array(
+        [
+            float(gas.entropy_at(T, np.asarray(numbers), volume)),
+            *numbers,
+            20.0 * np.log(T),
+        ]
+    )
 
 
 # %%
@@ -33,13 +39,16 @@ def state(T, numbers):
 _, (left, right) = plt.subplots(1, 2, figsize=(9.0, 3.6), layout="constrained")
 found = []
 for T in (0.4, 0.6, 0.9, 1.3, 2.0):
-    run = lt.integrate(vessel, state(T, (1.0, 1.0, 0.01)), (0.0, 300.0), 0.05, lt.MetriplecticGauss(2))
+    run = lt.integrate(
+        vessel, state(T, (1.0, 1.0, 0.01)), (0.0, 300.0), 0.05, lt.MetriplecticGauss(2)
+    )
     A, B, C = vessel.numbers_of_particles(run.x[-1]) / volume
     end = float(vessel.temperatures(run.x[-1])[0])
     K = float(gas.equilibrium_constant(end, nu))
     found.append((end, C / (A * B)))
     print(
-        f"from T = {T}: ends at {end:.4f}, n_C / (n_A n_B) = {C / (A * B):.12g}, K(T) = {K:.12g}; "
+        f"from T = {T}: ends at {end:.4f}, n_C / (n_A n_B) = {C / (A * B):.12g}, K(T)"
+        f" = {K:.12g}; "
         f"energy to {np.ptp(run.energy) / abs(run.energy[0]):.0e}, "
         f"least rise of the entropy {np.diff(run.entropy).min():.0e}"
     )
@@ -47,7 +56,13 @@ for T in (0.4, 0.6, 0.9, 1.3, 2.0):
 left.set(xlabel="time", ylabel="particles of C", xlim=(0.0, 60.0))
 left.legend(frameon=False)
 T = np.linspace(0.3, 2.3, 200)
-right.semilogy(T, [float(gas.equilibrium_constant(t, nu)) for t in T], color="0.7", linewidth=3, label="mass action")
+right.semilogy(
+    T,
+    [float(gas.equilibrium_constant(t, nu)) for t in T],
+    color="0.7",
+    linewidth=3,
+    label="mass action",
+)
 right.semilogy(*zip(*found, strict=True), "o", label="runs, in the end")
 right.set(xlabel="temperature", ylabel="$n_C / (n_A n_B)$")
 right.legend(frameon=False)

@@ -44,15 +44,23 @@ def in_angles(t, y):
 
 def on_sphere(y):
     theta, phi, w, u, S = y
-    q = np.array([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
-    down = np.array([np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), -np.sin(theta)])
+    q = np.array(
+        [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)]
+    )
+    down = np.array(
+        [np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), -np.sin(theta)]
+    )
     v = w * down + np.sin(theta) * u * np.array([-np.sin(phi), np.cos(phi), 0.0])
     return np.concatenate([q, v, [S]])
 
 
 y0, end = [1.9, 0.0, 0.0, 2.5, 0.0], 4.0
 x0 = on_sphere(y0)
-reference = on_sphere(solve_ivp(in_angles, (0.0, end), y0, method="DOP853", rtol=1e-13, atol=1e-13).y[:, -1])
+reference = on_sphere(
+    solve_ivp(in_angles, (0.0, end), y0, method="DOP853", rtol=1e-13, atol=1e-13).y[
+        :, -1
+    ]
+)
 
 # %%
 # The variational schemes keep the sphere to rounding, and the second law, but not the energy. The metriplectic methods
@@ -75,7 +83,8 @@ for name, method in methods.items():
         f"{name:20} order {np.log2(errors[name][-2] / errors[name][-1]):.2f}, "
         f"energy to {np.ptp(runs[0].energy) / np.abs(runs[0].energy).max():.0e}, "
         f"least rise of the entropy {np.diff(runs[0].entropy).min():.0e}, "
-        f"off the sphere {max(np.abs((q**2).sum(1) - 1).max(), np.abs((q * v).sum(1)).max()):.0e}"
+        "off the sphere"
+        f" {max(np.abs((q**2).sum(1) - 1).max(), np.abs((q * v).sum(1)).max()):.0e}"
     )
 
 # %%

@@ -31,11 +31,21 @@ print(f"largest error on the way: {np.abs(temperatures - exact).max():.3f}")
 
 early = solution.t <= 5.0
 figure, (left, right) = plt.subplots(1, 2, figsize=(8.0, 3.4), layout="constrained")
-left.plot(solution.t[early], solution.entropy[early] - solution.entropy[0], ".-", color="#009E73", markersize=4)
+left.plot(
+    solution.t[early],
+    solution.entropy[early] - solution.entropy[0],
+    ".-",
+    color="#009E73",
+    markersize=4,
+)
 left.set(xlabel="time", ylabel="growth of $S_a + S_b$", title="Figure 3: total entropy")
-for T, curve, name, color in zip(temperatures.T, exact.T, "ab", ("#0072B2", "#D55E00"), strict=True):
+for T, curve, name, color in zip(
+    temperatures.T, exact.T, "ab", ("#0072B2", "#D55E00"), strict=True
+):
     right.plot(solution.t[early], curve[early], color="0.6", linewidth=1)
-    right.plot(solution.t[early], T[early], ".", color=color, markersize=4, label=f"$T_{name}$")
+    right.plot(
+        solution.t[early], T[early], ".", color=color, markersize=4, label=f"$T_{name}$"
+    )
 right.set(xlabel="time", title="Figure 4: temperatures (lines: exact)")
 right.legend(frameon=False)
 for ax in (left, right):

@@ -12,9 +12,16 @@ import numpy as np
 
 import liethermo as lt
 
-chain = lt.models.thermoelastic_chain(bodies=2, dimension=2, stiffness=20.0, expansion=2.0, conductance=1.0)
-first, second = [1.2, 0.0, 0.0, 2.0, 0.0], [2.6, 0.2, -0.5, 3.0, 0.0]  # q, p and S of each
-solution = lt.integrate(chain, first + second, t_span=(0.0, 60.0), step=0.02, method=lt.MetriplecticGauss(2))
+chain = lt.models.thermoelastic_chain(
+    bodies=2, dimension=2, stiffness=20.0, expansion=2.0, conductance=1.0
+)
+first, second = (
+    [1.2, 0.0, 0.0, 2.0, 0.0],
+    [2.6, 0.2, -0.5, 3.0, 0.0],
+)  # q, p and S of each
+solution = lt.integrate(
+    chain, first + second, t_span=(0.0, 60.0), step=0.02, method=lt.MetriplecticGauss(2)
+)
 
 # %%
 # Both laws hold at every step. The energy of a spring enters by its squared length, a quadratic function of the state,
@@ -24,11 +31,19 @@ print(solution.audit())
 
 # %%
 
-lengths = [np.linalg.norm(a, axis=1) for a in (solution.x[:, :2], solution.x[:, 5:7] - solution.x[:, :2])]
+lengths = [
+    np.linalg.norm(a, axis=1)
+    for a in (solution.x[:, :2], solution.x[:, 5:7] - solution.x[:, :2])
+]
 temperatures = np.asarray(chain.temperatures(solution.x))
-figure, (left, middle, right) = plt.subplots(1, 3, figsize=(10.0, 3.4), layout="constrained")
+figure, (left, middle, right) = plt.subplots(
+    1, 3, figsize=(10.0, 3.4), layout="constrained"
+)
 late = solution.t > 55.0
-for q, color, name in ((solution.x[:, :2], "#0072B2", "first"), (solution.x[:, 5:7], "#E69F00", "second")):
+for q, color, name in (
+    (solution.x[:, :2], "#0072B2", "first"),
+    (solution.x[:, 5:7], "#E69F00", "second"),
+):
     left.plot(*q[~late].T, color=color, linewidth=0.5, alpha=0.4)
     left.plot(*q[late].T, color=color, label=name)
 left.set(aspect="equal", title="paths, the last five units dark", xticks=[], yticks=[])

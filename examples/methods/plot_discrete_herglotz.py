@@ -18,10 +18,15 @@ gamma, h = 0.1, 0.1
 
 def action(q0, q1, S0, h):
     """Of one step, by the midpoint rule [SML Example 7]."""
-    return (q1 - q0) @ (q1 - q0) / (2 * h) - h * (q1 + q0) @ (q1 + q0) / 8 - h * gamma * S0
+    return (
+        (q1 - q0) @ (q1 - q0) / (2 * h) - h * (q1 + q0) @ (q1 + q0) / 8 - h * gamma * S0
+    )
 
 
-oscillator, herglotz = lt.models.damped_oscillator(friction=gamma), lt.DiscreteHerglotz(action)
+oscillator, herglotz = (
+    lt.models.damped_oscillator(friction=gamma),
+    lt.DiscreteHerglotz(action),
+)
 
 # %%
 # The paper starts from two positions. The state after them has the momentum that belongs to the action.
@@ -42,11 +47,22 @@ print(variational.audit())
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(8.0, 3.4), layout="constrained")
 left.plot(variational.t, exact[:, 0], color="0.6", label="exact")
-left.plot(variational.t, variational.x[:, 0], ".", color="#0072B2", markersize=3, label="discrete Herglotz")
+left.plot(
+    variational.t,
+    variational.x[:, 0],
+    ".",
+    color="#0072B2",
+    markersize=3,
+    label="discrete Herglotz",
+)
 left.set(xlabel="time", ylabel="q", title="Figure 5: position")
 left.legend(frameon=False)
-right.plot(variational.t, variational.energy, color="#0072B2", label="discrete Herglotz")
-right.plot(metriplectic.t, metriplectic.energy, color="#E69F00", label="metriplectic midpoint")
+right.plot(
+    variational.t, variational.energy, color="#0072B2", label="discrete Herglotz"
+)
+right.plot(
+    metriplectic.t, metriplectic.energy, color="#E69F00", label="metriplectic midpoint"
+)
 right.set(xlabel="time", ylabel="H", title="Figure 6: energy")
 right.legend(frameon=False)
 for ax in (left, right):

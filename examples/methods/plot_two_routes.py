@@ -15,7 +15,9 @@ from liethermo.models.gas_piston import gas_piston_state
 
 piston = lt.models.gas_piston(friction=5.0, conductance=(2.0, 2.0))
 x0, end = gas_piston_state(0.35, (300.0, 320.0, 290.0)), 0.1
-reference = lt.integrate(piston, x0, (0.0, end), end / 6400, lt.MetriplecticGauss(3)).x[-1]
+reference = lt.integrate(piston, x0, (0.0, end), end / 6400, lt.MetriplecticGauss(3)).x[
+    -1
+]
 size = np.abs(reference)
 
 routes = {
@@ -25,14 +27,17 @@ routes = {
     "metriplectic midpoint": lt.MetriplecticMidpoint(),
     "metriplectic Gauss, order 4": lt.MetriplecticGauss(2),
 }
-counts = np.array([400, 800, 1600, 3200])  # in longer steps the two leading errors of scheme 1 cancel in part
+counts = np.array(
+    [400, 800, 1600, 3200]
+)  # in longer steps the two leading errors of scheme 1 cancel in part
 _, (left, right) = plt.subplots(1, 2, figsize=(9.5, 3.8), layout="constrained")
 for name, method in routes.items():
     runs = [lt.integrate(piston, x0, (0.0, end), end / n, method) for n in counts]
     errors = [np.max(np.abs(run.x[-1] - reference) / size) for run in runs]
     drift = np.abs(runs[0].energy / runs[0].energy[0] - 1.0)
     print(
-        f"{name:28} order {np.log2(errors[-2] / errors[-1]):.2f}, energy to {drift.max():.0e}, "
+        f"{name:28} order {np.log2(errors[-2] / errors[-1]):.2f}, energy to"
+        f" {drift.max():.0e}, "
         f"least rise of the entropy {np.diff(runs[0].entropy).min():.0e} J/K"
     )
     left.loglog(end / counts, errors, "o-", label=name, markersize=3, linewidth=1.0)

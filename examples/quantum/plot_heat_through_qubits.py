@@ -18,10 +18,14 @@ lower = np.array([[0, 1], [0, 0]])
 
 def part(temperature, name):
     bath = lt.HeatBaths(capacity=2.0, temperature=temperature)
-    return lt.QuantumSystem(H, lt.ThermalJumps([(lower, 0.2)]), baths=bath, names=[name])
+    return lt.QuantumSystem(
+        H, lt.ThermalJumps([(lower, 0.2)]), baths=bath, names=[name]
+    )
 
 
-pair = (part(2.0, "hot") * part(0.5, "cold")).coupled(0.1 * (np.kron(lower, lower.T) + np.kron(lower.T, lower)))
+pair = (part(2.0, "hot") * part(0.5, "cold")).coupled(
+    0.1 * (np.kron(lower, lower.T) + np.kron(lower.T, lower))
+)
 start = np.kron(np.diag([0.6, 0.4]), np.diag([0.9, 0.1]))
 solution = lt.integrate(pair, pair.state(start), (0.0, 150.0), 0.25)
 print(solution.audit())

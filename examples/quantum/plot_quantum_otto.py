@@ -21,7 +21,9 @@ cold, hot = 0.4, 1.6
 
 def in_touch(frequency, temperature):
     bath = lt.HeatBaths(capacity=np.inf, temperature=temperature)
-    return lt.QuantumSystem(frequency * excited, lt.ThermalJumps([(lower, 0.3)]), baths=bath)
+    return lt.QuantumSystem(
+        frequency * excited, lt.ThermalJumps([(lower, 0.3)]), baths=bath
+    )
 
 
 def driven(first, last, time=2.0):
@@ -52,20 +54,47 @@ for _ in range(4):
     for system, time, frequency in parts:
         rhos, energy = stroke(system, rho, time, frequency)
         cycles.append(
-            (np.broadcast_to(frequency(np.linspace(0.0, time, len(energy))), energy.shape), rhos[:, 1, 1].real)
+            (
+                np.broadcast_to(
+                    frequency(np.linspace(0.0, time, len(energy))), energy.shape
+                ),
+                rhos[:, 1, 1].real,
+            )
         )
         changes.append(energy[-1] - energy[0])
         rho = rhos[-1]
     taken, out = changes[0], -(changes[1] + changes[3])
     figures.append(out / taken)
-    print(f"heat from the hot bath {taken:.5f}, work {out:.5f}, efficiency {out / taken:.6f}")
+    print(
+        f"heat from the hot bath {taken:.5f}, work {out:.5f}, efficiency"
+        f" {out / taken:.6f}"
+    )
 print(f"in theory {1 - low / high:.6f}, Carnot {1 - cold / hot:.6f}")
 
 # %%
+# The last of the four cycles is drawn in full colour, with an arrow on each stroke.
 
 figure, axes = plt.subplots(figsize=(5.0, 3.6), layout="constrained")
 for i, (frequency, population) in enumerate(cycles):
-    axes.plot(frequency, population, color=("#D55E00", "k", "#0072B2", "k")[i % 4], alpha=0.3 + 0.7 * (i >= 12))
-axes.set(xlabel="frequency", ylabel="population of the excited level", title="red: hot bath, blue: cold bath")
+    axes.plot(
+        frequency,
+        population,
+        color=("#D55E00", "k", "#0072B2", "k")[i % 4],
+        alpha=0.3 + 0.7 * (i >= 12),
+    )
+    if i >= 12:
+        way = np.abs(frequency - frequency[0]) + np.abs(population - population[0])
+        k = np.searchsorted(way, 0.5 * way[-1])
+        axes.annotate(
+            "",
+            (frequency[k], population[k]),
+            (frequency[k - 1], population[k - 1]),
+            arrowprops={"arrowstyle": "-|>", "color": "0.2", "mutation_scale": 14},
+        )
+axes.set(
+    xlabel="frequency",
+    ylabel="population of the excited level",
+    title="red: hot bath, blue: cold bath",
+)
 axes.spines[["top", "right"]].set_visible(False)
 plt.show()

@@ -25,7 +25,7 @@ def chain_energy(x):
 
 
 def turn(x, alpha):
-    """``s_i x alpha_i``, and nothing for the bath: the Poisson structure, without its large matrix."""
+    """Apply the Poisson structure: ``s_i x alpha_i``, and zero for the bath."""
     s, a = (y[:-1].reshape(count, 3) for y in (x, alpha))
     return jnp.append(jnp.cross(s, a).ravel(), 0.0)
 
@@ -51,14 +51,24 @@ assert np.asarray(spins.belongs(solution.x[:, :-1].reshape(-1, count, 3))).all()
 # Domains form, up and down the easy axis, and their walls move until they meet.
 
 s = solution.x[:, :-1].reshape(-1, count, 3)
-figure, (top, bottom) = plt.subplots(2, 1, figsize=(8, 6), height_ratios=(2, 1), sharex=True, layout="constrained")
+figure, (top, bottom) = plt.subplots(
+    2, 1, figsize=(8, 6), height_ratios=(2, 1), sharex=True, layout="constrained"
+)
 image = top.imshow(
-    s[..., 2].T, extent=(0, solution.t[-1], 0, count), aspect="auto", origin="lower", cmap="RdBu", vmin=-1, vmax=1
+    s[..., 2].T,
+    extent=(0, solution.t[-1], 0, count),
+    aspect="auto",
+    origin="lower",
+    cmap="RdBu",
+    vmin=-1,
+    vmax=1,
 )
 figure.colorbar(image, ax=top, label="$s_3$")
 top.set(ylabel="spin", title="A ring of spins, damped")
 heat = capacity * (np.exp(solution.entropy / capacity) - 1)
-bottom.plot(solution.t, solution.energy - capacity - heat, color="#0072B2", label="of the chain")
+bottom.plot(
+    solution.t, solution.energy - capacity - heat, color="#0072B2", label="of the chain"
+)
 bottom.plot(solution.t, heat, color="#D55E00", label="heat in the bath")
 bottom.set(xlabel="time", ylabel="energy")
 bottom.legend(frameon=False)

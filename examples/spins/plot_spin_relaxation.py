@@ -24,7 +24,9 @@ def spin_energy(s):
 
 
 system = lt.MetriplecticSystem(
-    poisson=mf.LiePoisson(mf.direct_sum(mf.so(3), mf.abelian(1))),  # the bath has no motion of its own
+    poisson=mf.LiePoisson(
+        mf.direct_sum(mf.so(3), mf.abelian(1))
+    ),  # the bath has no motion of its own
     energy=lambda x: spin_energy(x) + jnp.exp(x[3]),
     entropy=lambda x: x[3],
     dissipation=lt.ProjectedMetric(rate=0.03),  # of the metric of the space
@@ -39,7 +41,10 @@ print(system.check())
 start = np.array([np.sin(1.45), 0.0, np.cos(1.45), 0.0])
 solution = lt.integrate(system, start, (0.0, 60.0), 0.1, lt.MetriplecticGauss(2))
 print(solution.audit())
-print(f"off the sphere by at most {np.abs(np.linalg.norm(solution.x[:, :3], axis=1) - 1).max():.0e}")
+print(
+    "off the sphere by at most"
+    f" {np.abs(np.linalg.norm(solution.x[:, :3], axis=1) - 1).max():.0e}"
+)
 
 # %%
 
@@ -49,12 +54,24 @@ ax.view_init(35, 20)
 u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 120), np.linspace(0, np.pi, 60))
 sphere = np.stack([np.sin(v) * np.cos(u), np.sin(v) * np.sin(u), np.cos(v)], axis=-1)
 energies = np.asarray(spin_energy(sphere))
-shade = plt.get_cmap("Blues_r")(0.2 + 0.8 * (energies - energies.min()) / np.ptp(energies))
-ax.plot_surface(*np.moveaxis(sphere, -1, 0), facecolors=shade, rstride=1, cstride=1, shade=False)
+shade = plt.get_cmap("Blues_r")(
+    0.2 + 0.8 * (energies - energies.min()) / np.ptp(energies)
+)
+ax.plot_surface(
+    *np.moveaxis(sphere, -1, 0), facecolors=shade, rstride=1, cstride=1, shade=False
+)
 elevation, azimuth = np.radians([35, 20])
-eye = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+eye = np.array(
+    [
+        np.cos(elevation) * np.cos(azimuth),
+        np.cos(elevation) * np.sin(azimuth),
+        np.sin(elevation),
+    ]
+)
 spins = np.asarray(solution.x[:, :3])
-seen = np.where((spins @ eye > 0)[:, None], spins, np.nan)  # not what is behind the sphere
+seen = np.where(
+    (spins @ eye > 0)[:, None], spins, np.nan
+)  # not what is behind the sphere
 ax.plot(*seen.T, color="#D55E00", lw=1.0)
 ax.scatter(*spins[-1], color="#D55E00", s=30, depthshade=False)
 ax.set_box_aspect((1, 1, 1), zoom=1.4)
@@ -63,7 +80,11 @@ ax.set_axis_off()
 
 right = figure.add_subplot(1, 2, 2)
 spin, bath = np.asarray(spin_energy(solution.x)), np.exp(solution.x[:, 3])
-for series, name, color in ((spin, "spin", "#0072B2"), (bath, "bath", "#D55E00"), (spin + bath, "sum", "0.3")):
+for series, name, color in (
+    (spin, "spin", "#0072B2"),
+    (bath, "bath", "#D55E00"),
+    (spin + bath, "sum", "0.3"),
+):
     right.plot(solution.t, series, color=color, label=name)
 right.set(xlabel="time", ylabel="energy", title="What the spin loses the bath gains")
 right.legend(frameon=False, loc="upper right", bbox_to_anchor=(1.0, 0.9))

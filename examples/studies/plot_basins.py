@@ -29,14 +29,26 @@ body = lt.LiePoissonSystem(mf.so(3), energy, dissipation=lt.DoubleBracket(rate=0
 
 
 def start(point):
-    latitude, longitude = jnp.radians(point["latitude"]), jnp.radians(point["longitude"])
+    latitude, longitude = (
+        jnp.radians(point["latitude"]),
+        jnp.radians(point["longitude"]),
+    )
     equatorial = jnp.cos(latitude)
-    return jnp.stack([equatorial * jnp.cos(longitude), equatorial * jnp.sin(longitude), jnp.sin(latitude)])
+    return jnp.stack(
+        [
+            equatorial * jnp.cos(longitude),
+            equatorial * jnp.sin(longitude),
+            jnp.sin(latitude),
+        ]
+    )
 
 
 study = lt.Study(
     lambda point: body,
-    {"latitude": np.linspace(-88.5, 88.5, 60), "longitude": np.linspace(-178.5, 178.5, 120)},
+    {
+        "latitude": np.linspace(-88.5, 88.5, 60),
+        "longitude": np.linspace(-178.5, 178.5, 120),
+    },
     x0=start,
     t_span=(0.0, 150.0),
     step=0.5,

@@ -26,8 +26,8 @@ STEPS, WINDOW, CAPACITY, START = 32_768, 200, 10.0, 0.3  # the gas has U = C exp
 def spring(p, pressure=0.0, force=0.0):
     """A mass on a spring, in units of time in which each step has the size 1.
 
-    The step is in parts of the time in which the spring turns by a radian, the friction in parts of the critical one,
-    and the force, of half the frequency of the spring, in parts of the first pull of the spring.
+    The step is in parts of a radian of the spring, the friction in parts of the
+    critical one, and the force, of half the frequency, in parts of the first pull.
     """
     h, k, C = p["step"] / jnp.sqrt(p["stiffness"]), p["stiffness"], CAPACITY
 
@@ -36,8 +36,18 @@ def spring(p, pressure=0.0, force=0.0):
         return 0.5 * v @ v / h**2 - 0.5 * k * q @ q - gas
 
     rate = 2.0 * p["friction"] * jnp.sqrt(k) / h
-    drive = (lambda q, v, S, t: force * k * START * jnp.cos(0.5 * p["step"] * t)[None]) if force else None
-    return lt.SimpleClosedSystem(lagrangian, 3, friction=lambda q, v, S: -rate * v, external=drive, validate=False)
+    drive = (
+        (lambda q, v, S, t: force * k * START * jnp.cos(0.5 * p["step"] * t)[None])
+        if force
+        else None
+    )
+    return lt.SimpleClosedSystem(
+        lagrangian,
+        3,
+        friction=lambda q, v, S: -rate * v,
+        external=drive,
+        validate=False,
+    )
 
 
 KINDS = {
@@ -46,7 +56,10 @@ KINDS = {
     "beside, driven": lambda p: spring(p, force=0.1),
     "against, driven": lambda p: spring(p, pressure=2.0 / 3.0, force=0.1),
 }
-SCHEMES = {"scheme 2": lt.VariationalIntegrator.midpoint(), "scheme 3": lt.VariationalIntegrator.symmetrised()}
+SCHEMES = {
+    "scheme 2": lt.VariationalIntegrator.midpoint(),
+    "scheme 3": lt.VariationalIntegrator.symmetrised(),
+}
 AXES = {
     "step": [0.05, 0.1, 0.2],  # times the frequency of the spring
     "stiffness": [3.0, 30.0],  # the first energy is 0.014 and 0.14 of that of the gas
@@ -66,7 +79,11 @@ for kind, build in KINDS.items():
             t_span=(0.0, float(STEPS)),
             step=1.0,
             method=scheme,
-            measure={"energy": lt.At(times, "energy"), "rise": "least_entropy_increment", "made": "entropy_change"},
+            measure={
+                "energy": lt.At(times, "energy"),
+                "rise": "least_entropy_increment",
+                "made": "entropy_change",
+            },
         )
         print(kind, name, study.run())
         found[kind, name] = study.results
@@ -78,9 +95,12 @@ stiffness = np.array(AXES["stiffness"])
 
 
 def left(results):
-    """Errors left after the three windows, in parts of the first mechanical energy: shape (*axes, 3)."""
+    """Return the relative errors after the three windows, shape (*axes, 3)."""
     energy = results.energy.values
-    windows = energy[..., 1:].reshape(*energy.shape[:-1], 3, WINDOW).mean(axis=-1) - energy[..., :1]
+    windows = (
+        energy[..., 1:].reshape(*energy.shape[:-1], 3, WINDOW).mean(axis=-1)
+        - energy[..., :1]
+    )
     return windows / (0.5 * stiffness[:, None, None] * START**2)
 
 
@@ -89,18 +109,31 @@ for ax, kind in zip(axes, KINDS, strict=True):
     for name, marker in zip(SCHEMES, "os", strict=True):
         errors = left(found[kind, name])
         rises = found[kind, name].rise.values
-        print(f"{kind}, {name}: the entropy rises by {np.nanmin(rises):.0e} or more in each step")
-        for i, (step, color) in enumerate(zip(AXES["step"], ("#0072B2", "#009E73", "#D55E00"), strict=True)):
+        print(
+            f"{kind}, {name}: the entropy rises by {np.nanmin(rises):.0e} or more in"
+            " each step"
+        )
+        for i, (step, color) in enumerate(
+            zip(AXES["step"], ("#0072B2", "#009E73", "#D55E00"), strict=True)
+        ):
             seen = np.abs(errors[i, -1, 1:, -1])
             filled = color if marker == "o" else "none"
             ax.loglog(
-                AXES["friction"][1:], seen, marker, color=color, markerfacecolor=filled, label=f"{name}, step {step:g}"
+                AXES["friction"][1:],
+                seen,
+                marker,
+                color=color,
+                markerfacecolor=filled,
+                label=f"{name}, step {step:g}",
             )
             quarter, whole = errors[i, -1, :, 1], errors[i, -1, :, 2]
             with np.errstate(invalid="ignore", divide="ignore"):
                 growth = whole / quarter
             print(f"  step {step:4}: left", *(f"{e:9.1e}" for e in whole))
-            print("    over that after a quarter of the time", *(f"{g:6.2f}" for g in growth))
+            print(
+                "    over that after a quarter of the time",
+                *(f"{g:6.2f}" for g in growth),
+            )
     ax.set(title=f"spring {kind}", xlabel="friction, parts of critical")
     ax.spines[["top", "right"]].set_visible(False)
 axes[0].set(ylabel="error of the energy that is left")

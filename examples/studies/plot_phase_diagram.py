@@ -19,7 +19,7 @@ ENERGY = 0.5
 
 
 def gyrostat(point):
-    """Moments of inertia (I, 0.9, 1): the energy of the body turning with the momentum that the wheel leaves to it."""
+    """Return the energy of the body with the moments of inertia (I, 0.9, 1)."""
     inverse = jnp.stack([1.0 / point["inertia"], 1.0 / 0.9, 1.0])
     wheel = jnp.stack([0.0, 0.0, point["wheel"]])
     return lt.LiePoissonSystem(
@@ -34,7 +34,10 @@ def start(point):
     """A momentum of the same energy at every point, between all axes."""
     inverse = jnp.stack([1.0 / point["inertia"], 1.0 / 0.9, 1.0])
     direction = jnp.array([0.6, 0.3, 0.2])
-    a, b = (inverse * direction**2).sum() / 2, inverse[2] * point["wheel"] * direction[2]
+    a, b = (
+        (inverse * direction**2).sum() / 2,
+        inverse[2] * point["wheel"] * direction[2],
+    )
     return direction * (b + jnp.sqrt(b * b + 4.0 * a * ENERGY)) / (2.0 * a)
 
 
@@ -55,7 +58,9 @@ print(study.run())
 
 results = study.results
 final = results.final
-tilt = np.sqrt(1.0 - final.isel(final_component=2) ** 2 / (final**2).sum("final_component"))
+tilt = np.sqrt(
+    1.0 - final.isel(final_component=2) ** 2 / (final**2).sum("final_component")
+)
 tilt.attrs["long_name"] = "tilt of the momentum from the axis of the wheel"
 lt.plot.study(results.assign(tilt=tilt), "tilt", contours=0)
 inertia = np.linspace(1.05, 1.88, 200)

@@ -17,7 +17,9 @@ import liethermo as lt
 
 
 def body(point):
-    return lt.models.tumbling_body((1.0, point["ratio"], 0.5), rate=point["rate"], capacity=100.0, attitude=False)
+    return lt.models.tumbling_body(
+        (1.0, point["ratio"], 0.5), rate=point["rate"], capacity=100.0, attitude=False
+    )
 
 
 study = lt.Study(
@@ -27,7 +29,10 @@ study = lt.Study(
     t_span=(0.0, 800.0),
     step=0.2,
     measure={"tau": "relaxation_time"},
-    names={"ratio": "middle moment of inertia, of the greatest", "rate": "rate of friction"},
+    names={
+        "ratio": "middle moment of inertia, of the greatest",
+        "rate": "rate of friction",
+    },
 )
 print(study.run())
 
@@ -42,6 +47,12 @@ lt.plot.study(study.results)
 # least. The spots in the picture are bodies that come near their middle axis, where the motion is slow.
 
 tau = study.results.tau
-print(f"tau * rate, for the least and the largest rate: {(tau * tau.rate)[25, [0, -1]].values.round(2)}")
-print(f"and for the least and the largest middle moment: {(tau * tau.rate)[[0, -1], 0].values.round(2)}")
+print(
+    "tau * rate, for the least and the largest rate:"
+    f" {(tau * tau.rate)[25, [0, -1]].values.round(2)}"
+)
+print(
+    "and for the least and the largest middle moment:"
+    f" {(tau * tau.rate)[[0, -1], 0].values.round(2)}"
+)
 print(study.audit())

@@ -389,7 +389,7 @@ def _make_optimiser(phase: Phase) -> Any:
     try:
         import optax
     except ImportError:
-        raise InputError("lt.learn.fit needs optax: pip install 'liethermo[learn]'") from None
+        raise InputError("lt.learn.fit needs optax, which is not installed: pip install optax") from None
     schedule = optax.cosine_decay_schedule(phase.rate, phase.steps, alpha=0.01)
     return optax.apply_if_finite(
         soap_optimiser(phase.array_shapes, schedule), max_consecutive_errors=10 * STEPS_PER_EVALUATION

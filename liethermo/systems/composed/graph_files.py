@@ -39,7 +39,7 @@ def read_graph(path: str | os.PathLike, weight: str = "conductance", nodes: Sequ
 
     A ``.csv`` file has a line for each edge, each pair once, and column titles in its first line: ``source``,
     ``target`` and the weight. A ``.graphml`` file declares its nodes, and its edges carry the weight as an attribute;
-    networkx reads it (``pip install networkx``, or ``pip install ".[graphs]"`` in the repository).
+    networkx reads it (``pip install networkx``).
 
     Parameters
     ----------

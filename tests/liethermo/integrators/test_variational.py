@@ -115,7 +115,7 @@ def test_a_run_solves_3_12(kind, name):
 
 
 def test_the_matrix_of_regularity():
-    """The matrices are (5.2)-(5.4) for the mass and spring, with the signs of (3.13): docs/reference/misprints.md."""
+    """The matrices are (5.2)-(5.4) for the mass and spring, with the signs of (3.13): see *Misprints* in the docs."""
     m, k, lam, h, heat = 5.0, 5.0, 10.0, 0.1, 1.5 * 8.31446261815324
     system = lt.models.mass_spring_gas(m, k, lam)
     x0, x1, S0, S1 = 0.3, 0.35, 0.1, 0.2
