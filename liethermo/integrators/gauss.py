@@ -22,7 +22,7 @@ from ..functions.energy import Energy
 from ..functions.frames import gram_schmidt
 from ..functions.gradients import stage_gradients
 from ..systems import System
-from ..systems.base import stack_gradients
+from ..systems.invariants import preserved_by_name, preserved_names, stack_gradients
 from ..tracing.interpret import evaluate_at_points
 from .base import (
     GaussMethod,
@@ -185,7 +185,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         return None if points is None else jax.vmap(system.poisson.sharp)(points, dH)
 
     def stage_velocities(self, system: System, x, compensation, h, k) -> jax.Array:
-        names = tuple(system.preserved_by_name())
+        names = tuple(preserved_by_name(system))
 
         def velocity(u, dH, dS, gradients_by_name):
             return system.transport(u, dH, dS, tuple(gradients_by_name[name].discrete for name in names))
@@ -209,7 +209,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         dH = self._energy_gradients(system, u, x, compensation, h, k)
         gradients_by_name = {
             name: gradients_of_function(C)
-            for name, C in (self._held_functions(system) | entropy_arguments | system.preserved_by_name()).items()
+            for name, C in (self._held_functions(system) | entropy_arguments | preserved_by_name(system)).items()
         }
         if S is None:
             dS = jnp.zeros_like(k)
@@ -233,7 +233,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         """Return ``Pi_d dH + K_d dS`` at one stage."""
         system = system.freeze_at(u)
         slope = self._conservative_slope(system, u, dH, gradients_by_name)
-        keys_and_names = tuple(zip(system.preserved_by_name(), system.preserved_names, strict=True))
+        keys_and_names = tuple(zip(preserved_by_name(system), preserved_names(system), strict=True))
         for term, preserved_keys in (
             () if system.dissipation is None else terms_with_preserved_values(system.dissipation, keys_and_names)
         ):
@@ -307,7 +307,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
 
     def can_transport_attitude(self, system: System) -> bool:
         """Return True if an attitude can follow the steps exactly, as it can if nothing is projected off the slopes."""
-        names = system.preserved_names
+        names = preserved_names(system)
         terms = () if system.dissipation is None else terms_with_preserved_values(system.dissipation, names)
         has_only_quadratics = all(
             C.is_quadratic for C in (self._held_functions(system) | _entropy_arguments(system)).values()
@@ -317,7 +317,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         )
 
     def preserves_function(self, system: System, name: str) -> bool:
-        is_known_invariant = name in system.casimirs() or name in system.preserved_names
+        is_known_invariant = name in system.casimirs() or name in preserved_names(system)
         return (
             self._is_held_by_default(system, name) if is_known_invariant else super().preserves_function(system, name)
         )
@@ -327,7 +327,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
 
         A skew friction is not projected, and keeps only quadratic functions by itself.
         """
-        if name not in system.casimirs() and name not in system.preserved_names:
+        if name not in system.casimirs() and name not in preserved_names(system):
             return False
         is_projected = system.dissipation is None or system.dissipation.is_symmetric
         return is_projected or system.functions()[name].is_quadratic

@@ -12,6 +12,7 @@ from ..errors import InputError
 from ..functions.checks import checked_energy, with_polynomial_degrees
 from ..functions.energy import Energy, function_name, make_energy
 from ..systems import System
+from ..systems.invariants import conserves
 
 
 def preserved_functions(preserve) -> tuple[Energy, ...]:
@@ -31,7 +32,7 @@ def check_preserved(system: System, functions: Sequence[Energy]) -> None:
 
     A function that cannot be tested, for example outside the domain of an entropy, counts as conserved.
     """
-    for C, is_conserved in zip(functions, system.conserves(tuple(functions)), strict=True):
+    for C, is_conserved in zip(functions, conserves(system, tuple(functions)), strict=True):
         if is_conserved is False:
             raise InputError(why_not_preserved(C))
 

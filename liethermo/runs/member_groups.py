@@ -20,10 +20,21 @@ import numpy as np
 from ..integrators import OneStepMethod
 from ..integrators.preserved import casimir_residuals, is_momentum_map, why_not_preserved
 from ..systems import System
-from ..systems.base import first_multiple_indices, stack_gradients
 from ..systems.baths import HeatBaths
 from ..systems.conservation import judge_conservation, rates_of_change
 from ..systems.interface import InvariantVerdicts
+from ..systems.invariants import (
+    first_multiple_indices,
+    functions_for_naming,
+    invariants_by_construction,
+    n_random_states,
+    names_from_multiples,
+    random_states,
+    stack_gradients,
+    states_near,
+    systems_at_test_times,
+    undecided_functions,
+)
 from ..tracing.interpret import evaluate_at_points
 from .system_family import Family
 
@@ -96,7 +107,7 @@ def group_members_by_invariants(
     all_members, member = np.arange(len(states)), family.representative
     if member.invariant_verdicts is not None:
         return [MemberGroup(all_members, family)], {}
-    if not any(family.has_member_axis) and not member.undecided_functions():
+    if not any(family.has_member_axis) and not undecided_functions(member):
         return [MemberGroup(all_members, family)], {}
     members = _MemberFunctions(family, member, method, states)
     if not (members.casimirs or member.preserved or members.requested_functions):
@@ -163,7 +174,7 @@ class _MemberFunctions:
     def __init__(self, family: Family, member: System, method: OneStepMethod, states: np.ndarray):
         self.family, self.member, self.states = family, member, states
         self.requested_functions = method.requested_invariants(member)
-        self.casimirs = tuple(name for name in member.casimirs() if name not in member.invariants_by_construction())
+        self.casimirs = tuple(name for name in member.casimirs() if name not in invariants_by_construction(member))
 
     # -- facts --------------------------------------------------------------------------------------------------------
 
@@ -173,8 +184,8 @@ class _MemberFunctions:
         count = len(self.member.preserved)
         if not count:
             return np.zeros((len(self.states), 0), dtype=int)
-        points = self.member.test_states(2)
-        values_per_member = len(points) * len(self.member.functions_for_naming()) * self.member.dim
+        points = random_states(self.member, 2)
+        values_per_member = len(points) * len(functions_for_naming(self.member)) * self.member.dim
         return self._evaluate_in_batches(
             lambda rows: first_multiple_indices(
                 self._evaluate_at(_gradients_for_naming, rows, self._points_per_member(points, rows)), count
@@ -217,12 +228,12 @@ class _MemberFunctions:
     def invariant_facts(self, multiples: np.ndarray, verdict_row: np.ndarray) -> InvariantFacts:
         """Return the facts of one member from its rows of indices and verdicts."""
         member = self.member
-        names = member.names_from_multiples(multiples.tolist())
+        names = names_from_multiples(member, multiples.tolist())
         truth_values = {VERDICT_UNKNOWN: None, VERDICT_NOT_CONSERVED: False, VERDICT_CONSERVED: True}
         verdicts: dict[str, bool | None] = {}
         for name, verdict in zip((*names, *self.casimirs), np.roll(verdict_row, len(names)).tolist(), strict=True):
             verdicts[name] = truth_values[verdict]  # a Casimir overwrites a preserved function of the same name
-        verdicts |= dict.fromkeys(member.invariants_by_construction(), True)
+        verdicts |= dict.fromkeys(invariants_by_construction(member), True)
         return InvariantFacts(
             names if names else member.preserved_labels, InvariantVerdicts.from_verdicts(verdicts, names)
         )
@@ -230,12 +241,12 @@ class _MemberFunctions:
     # -- verdicts -----------------------------------------------------------------------------------------------------
 
     def _judge_functions(self, rates: Callable, count: int, functions: tuple, use_nearby_states: bool) -> np.ndarray:
-        """Return verdicts on functions of each member, shape (B, count), by the rules of :meth:`.System.conserves`.
+        """Return verdicts on functions of each member, shape (B, count), by the rules of :func:`.conserves`.
 
         With ``use_nearby_states``, states near the initial state are tried where random states leave a function
         undecided.
         """
-        times = range(len(self.member.systems_at_test_times())) if self.member.is_driven else (None,)
+        times = range(len(systems_at_test_times(self.member))) if self.member.is_driven else (None,)
         verdicts_at_times = np.stack(
             [self._judge_functions_at_time(rates, count, functions, time, use_nearby_states) for time in times]
         )
@@ -263,15 +274,15 @@ class _MemberFunctions:
                 is_defined[rows] |= result[:, 0]
                 is_violated[rows] |= result[:, 1]
 
-        random = member.test_states(member.test_states_per_scale)
+        random = random_states(member, n_random_states(member))
         for points in (random[:1], random[1:]):  # one state is enough to see that a function is not conserved
             open_members = np.flatnonzero(~is_violated.all(axis=1))
             try_states(open_members, functools.partial(self._points_per_member, points), len(points))
         if use_nearby_states:
             open_members = np.flatnonzero(~(is_defined | is_violated).all(axis=1))
-            n_states = len(member.states_near(self.states[0]))
+            n_states = len(states_near(member, self.states[0]))
             try_states(
-                open_members, lambda rows: np.stack([member.states_near(x) for x in self.states[rows]]), n_states
+                open_members, lambda rows: np.stack([states_near(member, x) for x in self.states[rows]]), n_states
             )
         return np.where(is_violated, VERDICT_NOT_CONSERVED, np.where(is_defined, VERDICT_CONSERVED, VERDICT_UNKNOWN))
 
@@ -318,13 +329,13 @@ class _MemberFunctions:
 def _member_and_state(form, p: int, row, time: int | None = None) -> tuple[System, jnp.ndarray]:
     """Return the member and the state that a row holds; a driven member at its test time number ``time``."""
     system = form.build(row[:p])
-    return (system if time is None else system.systems_at_test_times()[time]), row[p:]
+    return (system if time is None else systems_at_test_times(system)[time]), row[p:]
 
 
 def _gradients_for_naming(model, row):
     form, p = model
     system, x = _member_and_state(form, p, row)
-    return stack_gradients(system.functions_for_naming(), x)
+    return stack_gradients(functions_for_naming(system), x)
 
 
 def _casimir_and_preserved_rates(model, row):

@@ -27,6 +27,7 @@ from ..systems import (
     embed_in_arrays,
     make_autonomous,
 )
+from ..systems.invariants import recorded_invariants, resolve_invariants_near, undecided_functions
 from ..tracing.caching import LRUCache, memoize
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
 from ..tracing.traced import is_library_object
@@ -65,13 +66,13 @@ def check_choice(name: str, value, choices: tuple[str, ...]) -> None:
 
 def resolve_invariants(system: System, x0) -> System:
     """Return the system with undecided conservation laws decided at states near x0."""
-    return system.resolve_invariants_near(x0) if has_undecided_invariants(system) else system
+    return resolve_invariants_near(system, system.state_array(x0, True)) if has_undecided_invariants(system) else system
 
 
 @memoize
 def has_undecided_invariants(system: System) -> bool:
     """Return whether what the system conserves has to be decided near the initial state of a run."""
-    return not is_traced(system) and bool(system.undecided_functions())
+    return not is_traced(system) and bool(undecided_functions(system))
 
 
 @memoize
@@ -203,8 +204,8 @@ def invariants_and_laws(system: System, method) -> tuple[dict, Laws]:
         method.check(system)
         if not is_library_object(method):
             check_shapes_of_method(system, method)
-    invariants = system.invariants()
-    return invariants, promised_laws(system, method, invariants)
+    recorded = recorded_invariants(system)
+    return recorded, promised_laws(system, method, recorded)
 
 
 def check_shapes_of_method(system: System, method: OneStepMethod) -> None:

@@ -257,11 +257,9 @@ class AttitudeSystem(System):
         n, m = self.body.dim, self.dim - (self.group.dim if self.has_impulse else 0)
         return *_body_blocks(self.body), slice(n, m), *([slice(m, None)] if m < self.dim else [])
 
-    def invariants(self):
-        return {
-            name: (self._extend_from_momentum(J), is_conserved)
-            for name, (J, is_conserved) in self.body.invariants().items()
-        }
+    @property
+    def inner(self) -> System:
+        return self.body
 
     def _vector_field(self, x):
         (mu, g), body = self.split_state(x), self.body_at_attitude(x)

@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,32 +20,14 @@ from ..dissipation.base import Dissipation, sum_dissipations, terms_with_preserv
 from ..dissipation.heating import couple_to_baths
 from ..errors import AxiomError, CasimirError, InputError
 from ..functions.checks import checked_energy, trace_energies, with_polynomial_degrees
-from ..functions.energy import Energy, function_name, make_energy
+from ..functions.energy import Energy, make_energy
 from ..functions.on_spaces import energy_of_vectors, flatten_site_functions
 from ..functions.with_baths import BodyBathsEnergy
-from ..tracing.caching import memoize
-from ..tracing.interpret import evaluate_at_points
 from ..tracing.traced import trace_callables
 from .baths import BathEntropy, HeatBaths, poisson_with_baths
 from .check import AXIOM_TOLERANCE, CheckReport, check_system
-from .conservation import is_proportional, judge_conservation, rates_of_change
-from .interface import InvariantVerdicts, SystemInterface
-
-TEST_STATE_SCALES = (1.0, 1e-4, 1e4)
-"""Scales of the random states at which it is tested which functions a system conserves."""
-
-LARGE_STATE_DIM = 2_000
-"""Number of state components above which one random state of each scale is tested."""
-
-N_NEARBY_STATES = 4
-"""Number of initial states near which conservation is tested too."""
-
-NEARBY_RADII = (0.3, 0.1, 0.03, 0.01, 1e-3, 1e-4)
-"""Distances of the tested states from an initial state, relative to its norm."""
-
-
-TEST_TIMES = (0.0, 0.7310585786300049, -1.618033988749895)
-"""Times at which conservation is tested if the energy depends on time."""
+from .interface import SystemInterface
+from .invariants import find_invariants, find_preserved_names, named_functions
 
 
 class ReorderedSystem(NamedTuple):
@@ -138,7 +119,7 @@ class System(SystemInterface):
         if baths is not None:
             self._attach_baths(baths, bath_terms)
         if self.preserved and not is_traced(self):
-            self.preserved_labels = self._find_preserved_names()
+            self.preserved_labels = find_preserved_names(self)
         if validate and not is_traced(self):
             self._validate()
 
@@ -149,10 +130,12 @@ class System(SystemInterface):
     def _attach_baths(self, baths: HeatBaths, bath_terms: tuple[Dissipation, ...] = ()) -> None:
         """Append baths to this system, in place; the dissipations ``bath_terms`` act on the extended states."""
         body, n, m = copy(self), self.dim, baths.number
+
+        def extend(energy: Energy) -> Energy:
+            return energy.on(range(n))
+
         if self.dissipation is not None or not bath_terms:
-            self.dissipation = couple_to_baths(
-                self.dissipation, body, m, baths.has_positive_temperatures, self._extend_from_body
-            )
+            self.dissipation = couple_to_baths(self.dissipation, body, m, baths.has_positive_temperatures, extend)
         if body.space is not None and body.space.dtype.kind == "c":
             raise InputError(f"baths are for real spaces, and {body.space.name} is complex")
         self.baths, self.dim = baths, n + m
@@ -160,8 +143,8 @@ class System(SystemInterface):
         self.poisson = poisson_with_baths(body.poisson, m)
         self.energy = BodyBathsEnergy(body.energy, baths.energy, n, self.dim)
         heat = BathEntropy(m)
-        self.entropy = heat if body.entropy is None else self._extend_from_body(body.entropy) + heat
-        self.momentum_maps = {name: self._extend_from_body(J) for name, J in body.momentum_maps.items()}
+        self.entropy = heat if body.entropy is None else extend(body.entropy) + heat
+        self.momentum_maps = {name: extend(J) for name, J in body.momentum_maps.items()}
         if bath_terms:
             bound_terms = tuple(self._bind_dissipation(term) for term in bath_terms)
             self.dissipation = sum_dissipations([d for d in (self.dissipation, *bound_terms) if d is not None])
@@ -181,10 +164,6 @@ class System(SystemInterface):
         for name, value in attributes.items():
             object.__setattr__(body, name, value)
         return body
-
-    def _extend_from_body(self, energy: Energy) -> Energy:
-        """Return a function of states with baths from a function of states of the body."""
-        return energy.on(range(self.body_dim))
 
     @with_library_settings
     def temperatures(self, x) -> jax.Array:
@@ -272,19 +251,6 @@ class System(SystemInterface):
         return [term.velocity(self, x, dH, dS, term_dL) for term, term_dL in terms]
 
     # -- time -------------------------------------------------------------------------------------------------------
-
-    @property
-    def is_driven(self) -> bool:
-        """True if the energy depends on time, or a torque acts, so that work is done from outside."""
-        return self.energy.depends_on_time
-
-    def at_time(self, t) -> System:
-        """Return the system with its energy frozen at the time t; itself if it does not depend on time."""
-        return eqx.tree_at(lambda system: system.energy, self, self.energy.at_time(t)) if self.is_driven else self
-
-    def systems_at_test_times(self) -> list[System]:
-        """Return the system frozen at each of :data:`TEST_TIMES`."""
-        return [self.at_time(t) for t in TEST_TIMES]
 
     @with_library_settings
     def evaluate_batch(self, function: Callable, x, t, result_signature: str) -> jax.Array:
@@ -397,58 +363,9 @@ class System(SystemInterface):
 
     # -- functions and laws -------------------------------------------------------------------------------------------
 
-    @property
-    def preserved(self) -> tuple[Energy, ...]:
-        """Functions that the dissipation, or one of its summands, has to preserve beside the energy."""
-        return () if self.dissipation is None else self.dissipation.preserve
-
     def functions(self) -> dict[str, Energy]:
         """Return momentum maps, functions that the dissipation preserves, and Casimirs, by name, each quantity once."""
-        casimirs, preserved = self.casimirs(), dict[str, Energy]()
-        for name, L in zip(self.preserved_names, self.preserved, strict=True):
-            if name not in self.momentum_maps and name not in preserved:
-                preserved[name] = L
-        return self.momentum_maps | preserved | casimirs
-
-    @property
-    def preserved_names(self) -> tuple[str, ...]:
-        """Names of the functions :attr:`preserved` among :meth:`functions`."""
-        return tuple(self.preserved_by_name()) if self.preserved_labels is None else self.preserved_labels
-
-    def preserved_by_name(self) -> dict[str, Energy]:
-        """Return the functions :attr:`preserved` by numbered names."""
-        return {f"preserved {i + 1}": L for i, L in enumerate(self.preserved)}
-
-    def _find_preserved_names(self) -> tuple[str, ...]:
-        """Return names of the preserved functions: of the map or Casimir that each is a multiple of, or new ones."""
-        functions = self.functions_for_naming()
-        gradients = evaluate_at_points(stack_gradients, functions, self.test_states(2))  # shape (points, functions, n)
-        return self.names_from_multiples(first_multiple_indices(gradients, len(self.preserved)).tolist())
-
-    def functions_for_naming(self) -> tuple[Energy, ...]:
-        """Return momentum maps and Casimirs, followed by the preserved functions, which may be multiples of them."""
-        return (*(self.momentum_maps | self.casimirs()).values(), *self.preserved)
-
-    def test_states(self, count: int) -> np.ndarray:
-        """Return random states at which functions are compared, ``count`` of each of :data:`TEST_STATE_SCALES`."""
-        return np.concatenate([self.samples(count, seed, scale) for seed, scale in enumerate(TEST_STATE_SCALES)])
-
-    def names_from_multiples(self, multiples: Sequence[int]) -> tuple[str, ...]:
-        """Return the name of each preserved function: that of the function it is a multiple of, or its own.
-
-        Parameters
-        ----------
-        multiples : sequence of int
-            For each preserved function, the index in :meth:`functions_for_naming` of an earlier function of which it is
-            a multiple; -1 if there is none.
-        """
-        names, reserved = list(self.momentum_maps | self.casimirs()), {"energy", "entropy"}
-        n_named = len(names)
-        for multiple, (fallback, L) in zip(multiples, self.preserved_by_name().items(), strict=True):
-            name = function_name(L)
-            usable = name.isidentifier() and name not in {*names, *reserved}
-            names.append(names[multiple] if multiple >= 0 else name if usable else fallback)
-        return tuple(names[n_named:])
+        return named_functions(self)
 
     @with_library_settings
     def first_integrals(self) -> frozenset[str]:
@@ -459,104 +376,7 @@ class System(SystemInterface):
         construction implies conservation, the function is tested at random states; it is left out while JAX traces the
         system. If the test cannot decide, a function that the dissipation has to preserve counts as conserved.
         """
-        return self._find_invariants().conserved_names
-
-    @with_library_settings
-    def undecided_functions(self) -> frozenset[str]:
-        """Return the names of the functions for which the test of conservation could not decide.
-
-        The vector field could be evaluated at none of the test states, for example because the entropy is defined for
-        few states.
-        """
-        return self._find_invariants(include_declared=False).undecided_names
-
-    def resolve_invariants_near(self, x) -> System:
-        """Return this system with the undecided functions tested near states in its domain.
-
-        Parameters
-        ----------
-        x : array, shape (n,) or (m, n)
-        """
-        if self.invariant_verdicts is not None or is_traced(self) or not self.undecided_functions():
-            return self
-        resolved = copy(self)
-        verdicts = self._find_invariants(near=np.asarray(self.state(x, batch=True)))
-        object.__setattr__(resolved, "invariant_verdicts", verdicts)
-        return resolved
-
-    def _find_invariants(self, near=None, include_declared: bool = True) -> InvariantVerdicts:
-        """Return which functions are conserved; ``include_declared`` adds preserved ones unless a test refutes them."""
-        if self.invariant_verdicts is not None:
-            return self.invariant_verdicts
-        verdicts = _memoized_verdicts(self) if near is None else self._conservation_verdicts(near)
-        return InvariantVerdicts.from_verdicts(verdicts, self.preserved_names if include_declared else ())
-
-    def _conservation_verdicts(self, near=None) -> dict[str, bool | None]:
-        """Return whether each function is conserved, by construction or by a test; None if undecided."""
-        claimed, torque_free = self.invariants_by_construction(), self.torque_invariant_casimirs
-        unclaimed = {name: f for name, f in self.functions().items() if name not in claimed}
-        # a test says nothing of functions that a torque changes: the torque may be zero at the tested times only
-        testable = {name: f for name, f in unclaimed.items() if not self.torque_name or name in torque_free}
-        with jax.ensure_compile_time_eval():  # JAX may be tracing something else
-            verdicts = [False] * len(testable) if is_traced(self) else self.conserves(tuple(testable.values()), near)
-        tested = dict(zip(testable, verdicts, strict=True))
-        return dict.fromkeys(unclaimed, False) | tested | dict.fromkeys(claimed, True)
-
-    def invariants_by_construction(self) -> frozenset[str]:
-        """Return the names of the functions that are conserved by construction and need no test."""
-        by_form = self.dissipation is None or self.dissipation.preserves_casimirs
-        return frozenset({*self.momentum_maps, *(self.torque_invariant_casimirs if by_form else ())})
-
-    def invariants(self) -> dict[str, tuple[Energy, bool | None]]:
-        """Return functions to record along a run, by name, each with whether it is conserved; None if not known."""
-        verdicts = self._find_invariants()
-        return {
-            name: (function, None if name in verdicts.undecided_names else name in verdicts.conserved_names)
-            for name, function in self.functions().items()
-        }
-
-    def conserves(self, functions: tuple[Energy, ...], near: np.ndarray | None = None) -> list[bool | None]:
-        """Return whether each function is constant along the vector field, at random states of several scales.
-
-        The motion and every dissipation must each conserve the function, relative to their own size, however slow a
-        dissipation is; otherwise their changes must cancel.
-
-        Parameters
-        ----------
-        near : array, shape (n,) or (m, n), optional
-            States inside the domain: states near them are tested too.
-
-        Returns
-        -------
-        list of bool or None
-            None if the rate of change could be evaluated at no state.
-        """
-        if not functions:
-            return []
-        if self.is_driven:
-            by_time = [system.conserves(functions, near) for system in self.systems_at_test_times()]
-            return [False if False in v else None if None in v else True for v in zip(*by_time, strict=True)]
-        points = self.test_states(self.test_states_per_scale)
-        if near is not None:
-            points = np.concatenate([points, self.states_near(near)])
-        rates = evaluate_at_points(rates_of_change, (self, functions), points)
-        is_defined, is_conserved = judge_conservation(rates)  # shapes (points, functions)
-        by_function = zip(is_defined.T, is_conserved.T, strict=True)
-        return [bool(conserved[defined].all()) if defined.any() else None for defined, conserved in by_function]
-
-    @property
-    def test_states_per_scale(self) -> int:
-        """Number of random states of each scale at which conservation is tested."""
-        return 4 if self.dim <= LARGE_STATE_DIM else 1
-
-    def states_near(self, x) -> np.ndarray:
-        """Return a few of the states x, shape (m, n), and on R^n states around them at decreasing distances."""
-        x = np.reshape(np.asarray(x), (-1, self.dim))[:N_NEARBY_STATES]
-        if self.space is not None:
-            return x
-        random = np.random.default_rng(0).standard_normal((len(NEARBY_RADII), *x.shape))
-        lengths = np.linalg.norm(x, axis=1, keepdims=True) / np.sqrt(self.dim)
-        return np.concatenate([x, *(x + radius * lengths * w for radius, w in zip(NEARBY_RADII, random, strict=True))])
+        return find_invariants(self).conserved_names
 
     # -- checks ---------------------------------------------------------------------------------------------------
 
@@ -678,36 +498,6 @@ def _drop_last_factor(space: mf.Space) -> mf.Space:
     assert isinstance(space, mf.Product)
     first, *others = space.factors[:-1]
     return mf.Product(first, *others) if others else first
-
-
-@memoize
-def _memoized_verdicts(system: System) -> dict[str, bool | None]:
-    return system._conservation_verdicts()
-
-
-def stack_gradients(functions: tuple[Energy, ...], x) -> jax.Array:
-    """Return the gradients of several functions at a state, shape (functions, n)."""
-    return jnp.stack([f.gradient(x) for f in functions])
-
-
-def first_multiple_indices(gradients: np.ndarray, count: int) -> np.ndarray:
-    """Return for each of the last ``count`` functions the first one before it of which it is a multiple, or -1.
-
-    Parameters
-    ----------
-    gradients : array, shape (..., points, functions, n)
-
-    Returns
-    -------
-    array of int, shape (..., count)
-    """
-    total = gradients.shape[-2]
-    multiples = np.full((*gradients.shape[:-3], count), -1)
-    for k, i in enumerate(range(total - count, total)):
-        for j in reversed(range(i)):
-            alike = is_proportional(gradients[..., i, :], gradients[..., j, :])
-            multiples[..., k] = np.where(alike, j, multiples[..., k])
-    return multiples
 
 
 def name_momentum_maps(given) -> dict[str, Any]:

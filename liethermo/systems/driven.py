@@ -72,9 +72,9 @@ class DrivenSystem(System):
         self.poisson = ProductPoisson(body.poisson, _ClockPoisson(unit))
         energy = Sum((*map(self._extend_term, body.energy.terms), _NegativeWork(unit)))
         self.energy = energy if self.space is not None else with_polynomial_degrees(energy, self.dim)
-        self.entropy = None if body.entropy is None else self._extend_from_body(body.entropy)
-        self.momentum_maps = {name: self._extend_from_body(J) for name, J in body.momentum_maps.items()}
-        self.dissipation = _BodyDissipation.lift_terms(body.dissipation, self._extend_from_body)
+        self.entropy = None if body.entropy is None else self._extend(body.entropy)
+        self.momentum_maps = {name: self._extend(J) for name, J in body.momentum_maps.items()}
+        self.dissipation = _BodyDissipation.lift_terms(body.dissipation, self._extend)
         if body.torque_name:
             torque = _TorqueForce("conserved" if body.entropy_law is not None or body.entropy is None else None)
             self.dissipation = torque if self.dissipation is None else self.dissipation + torque
@@ -222,29 +222,25 @@ class DrivenSystem(System):
 
     # -- functions ----------------------------------------------------------------------------------------------------
 
-    def pullback(self, energy: Energy) -> Energy:
-        return self._extend_from_body(self.body.energy_of_vectors(energy))
+    @property
+    def inner(self) -> System:
+        return self.body
 
-    def _extend_from_body(self, energy: Energy) -> Energy:
+    def pullback(self, energy: Energy) -> Energy:
+        return self._extend(self.body.energy_of_vectors(energy))
+
+    def _extend(self, energy: Energy) -> Energy:
         return energy.on(range(self.body.dim))
 
     def _extend_term(self, term: Energy) -> Energy:
         clock = _ClockMap(self.body.dim, self.unit)
-        return _TimedEnergy(term.with_time(), clock) if term.depends_on_time else self._extend_from_body(term)
+        return _TimedEnergy(term.with_time(), clock) if term.depends_on_time else self._extend(term)
 
     def casimirs(self):
-        return {name: self._extend_from_body(C) for name, C in self.body.casimirs().items()}
+        return {name: self._extend(C) for name, C in self.body.casimirs().items()}
 
     has_all_casimirs = forward_to("body")
     orbit_levels = forward_to("body")
-
-    def conserves(self, functions, near=None):
-        """Return whether the body conserves each function, tested at states ``near`` those given too.
-
-        Clock and work are left out, so that they set no scale.
-        """
-        near = None if near is None else near[..., : self.body.dim]
-        return self.body.conserves(tuple(_ClockFreeEnergy(f) for f in functions), near)
 
     @property
     def ledger(self):
@@ -265,15 +261,6 @@ class DrivenSystem(System):
         return body.to_user_solution(body_solution)
 
     reshape_to_sites = forward_to("body")
-
-
-class _ClockFreeEnergy(Energy):
-    """A function of the state of the body, from a function of states with clock and work that depends on neither."""
-
-    energy: Energy
-
-    def value(self, x) -> jax.Array:
-        return self.energy.value(jnp.concatenate([x, jnp.zeros(2)]))
 
 
 class _ClockPoisson(PoissonBySharp):

@@ -112,7 +112,7 @@ class EmbeddedSystem(System):
 
     # -- dynamics -----------------------------------------------------------------------------------------------------
 
-    def at_time(self, t) -> System:
+    def at_time(self, t, attitude=None) -> EmbeddedSystem:
         return EmbeddedSystem(self.manifold.at_time(t), *self.projection_flags) if self.is_driven else self
 
     def raise_index(self, x, alpha):

@@ -65,7 +65,7 @@ class EulerPoincareSystem(LiePoissonSystem):
     algebra : manifolds.LieAlgebra
     lagrangian : function from xi, shape (dim,), to a scalar, or an Energy
         Its Hessian must be invertible (regular Lagrangian). It may depend on time, as a second argument.
-    entropy, dissipation, momentum_maps, validate, group, reconstruction
+    entropy, dissipation, momentum_maps, validate, group, reconstruction, torque
         As for :class:`LiePoissonSystem`; functions of mu.
     force : function from xi to a covector, optional
         F of (3.2): conserves the energy whatever it is. For a force that raises an entropy use ``dissipation``.
@@ -84,6 +84,7 @@ class EulerPoincareSystem(LiePoissonSystem):
         validate: bool = True,
         group: mf.MatrixGroup | None = None,
         reconstruction: str | None = None,
+        torque=None,
     ):
         energy = make_energy(lagrangian, "the Lagrangian")
         self.lagrangian = checked_energy(energy, algebra.dim, "the Lagrangian", allow_time=True)
@@ -92,18 +93,20 @@ class EulerPoincareSystem(LiePoissonSystem):
             dissipation = sum_dissipations(dissipation)
             dissipation = force_term if dissipation is None else dissipation + force_term
         energy = _legendre_hamiltonian(self.lagrangian, algebra.dim)
-        super().__init__(algebra, energy, entropy, dissipation, momentum_maps, validate, group, reconstruction)
+        super().__init__(
+            algebra, energy, entropy, dissipation, momentum_maps, validate, group, reconstruction, torque=torque
+        )
 
     @property
     def can_unroll(self) -> bool:
         return isinstance(self.energy, Quadratic)  # the others iterate
 
     def at_time(self, t, attitude=None) -> EulerPoincareSystem:
-        del attitude  # of a torque, which it has none of
-        if not self.is_driven:
-            return self
+        system = super().at_time(t, attitude)
+        if not self.lagrangian.depends_on_time:
+            return system
         lagrangian = self.lagrangian.at_time(t)
-        return eqx.tree_at(lambda s: (s.lagrangian, s.energy), self, (lagrangian, Legendre(lagrangian)))
+        return eqx.tree_at(lambda s: (s.lagrangian, s.energy), system, (lagrangian, Legendre(lagrangian)))
 
     def velocity(self, mu, t=None) -> jax.Array:
         """xi = dH/dmu at a state or batch of states, shape (..., dim); at a time, where the Lagrangian needs one."""

@@ -17,7 +17,7 @@ from ..errors import InputError
 from ..functions.density import ExpectationValue, MeanEnergy, ModulatedExpectationValue, choose_reference_level
 from ..functions.energy import Energy, TimeDependent
 from ..functions.piecewise import ContinuedSpline
-from .base import TEST_TIMES
+from .invariants import TEST_TIMES
 
 
 def hamiltonian_energy(hamiltonian, times=None) -> tuple[int, Energy]:

@@ -88,6 +88,11 @@ class SystemInterface(Geometry):
         """Return the angular velocity of the rigid body in body axes, shape (3,), at a state x, shape (n,)."""
         raise InputError("the system contains no rigid body, so it has no angular velocity")
 
+    @property
+    def inner(self) -> SystemInterface | None:
+        """The system whose states begin those of this one, and whose functions are conserved; None without one."""
+        return None
+
     # -- dynamics -----------------------------------------------------------------------------------------------------
 
     def field(self, x, dH, dS, dL=()) -> jax.Array:
@@ -160,6 +165,19 @@ class SystemInterface(Geometry):
     # -- what acts from outside ---------------------------------------------------------------------------------------
 
     @property
+    def is_driven(self) -> bool:
+        """True if the energy depends on time, or a torque acts, so that work is done from outside."""
+        return self.energy.depends_on_time
+
+    def at_time(self, t, attitude=None) -> Self:
+        """Return the system with its energy and its torque frozen at the time t; itself if none depends on time.
+
+        A torque may need an attitude too, shape (m, m).
+        """
+        del attitude  # without a torque
+        return eqx.tree_at(lambda system: system.energy, self, self.energy.at_time(t)) if self.is_driven else self
+
+    @property
     def torque_name(self) -> str:
         """Name of the external torque; "" if none acts."""
         return ""
@@ -188,6 +206,11 @@ class SystemInterface(Geometry):
         return self
 
     # -- laws ---------------------------------------------------------------------------------------------------------
+
+    @property
+    def preserved(self) -> tuple[Energy, ...]:
+        """Functions that the dissipation, or one of its summands, has to preserve beside the energy."""
+        return () if self.dissipation is None else self.dissipation.preserve
 
     @property
     def energy_law(self) -> LawName | None:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from copy import copy
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -21,21 +19,20 @@ from ..functions.checks import checked_energy, with_polynomial_degrees
 from ..functions.energy import Energy, make_energy
 from ..tracing.caching import memoize
 from ..tracing.interpret import evaluate_at_points
-from .base import TEST_TIMES, System
 from .baths import BathEntropy, HeatBaths
 from .body_states import checked_velocity, entropies_of_temperatures, is_given_by_velocity, momentum_of_velocity
 from .torque import (
     MAX_ARGUMENTS,
     MIN_ARGUMENTS,
+    TorqueSystem,
     begins_with_rotations,
     check_torque,
     evaluate_torque,
     torque_free_components,
-    torque_name,
 )
 
 
-class LiePoissonSystem(System):
+class LiePoissonSystem(TorqueSystem):
     """``mu' = ad*_{grad H} mu + K grad S`` on g* [BFM 3.1, §3].
 
     On copies of an algebra, ``g ** sites``, a state is an array of shape ``(*sites, g.dim)``, in functions and in
@@ -107,8 +104,6 @@ class LiePoissonSystem(System):
     algebra: mf.LieAlgebra = eqx.field(static=True)
     group: mf.MatrixGroup | None = eqx.field(static=True)
     reconstruction: str | None = eqx.field(static=True)
-    torque: Any
-    torque_arguments: tuple[jax.Array, jax.Array | None] | None
     torque_argument_counts: tuple[int, ...] = eqx.field(static=True)
     torque_free_components: tuple[int, ...] = eqx.field(static=True)
 
@@ -145,13 +140,10 @@ class LiePoissonSystem(System):
     def sites(self) -> tuple[int, ...]:
         return () if self.baths is not None else self.algebra.shape[:-1]
 
-    def field(self, x, dH, dS, dL=()):
-        """Return ``ad*_dH (x + F) + force``, with all forces that are coadjoint actions computed by one action."""
-        torque = self.external_torque(x)
-        if torque is not None:
-            return self.drop_torque().field(x, dH, dS, dL) + torque
+    def _field_without_torque(self, x, dH, dS, dL):
+        # all forces that are coadjoint actions are computed by one action, ad*_dH (x + F)
         if self.dissipation is None or self.dissipation.added_momentum(dH, jnp.zeros_like(dH)) is None:
-            return super().field(x, dH, dS, dL)
+            return super()._field_without_torque(x, dH, dS, dL)
         action = self.algebra.action(dH)
         bracket = jnp.zeros_like(dH) if dS is None else action.bracket(dS)
         return action.ad_star(x + self.dissipation.added_momentum(dH, bracket))
@@ -238,10 +230,6 @@ class LiePoissonSystem(System):
         self.torque_arguments = None
 
     @property
-    def torque_name(self) -> str:
-        return "" if self.torque is None else torque_name(self.torque)
-
-    @property
     def has_impulse(self) -> bool:
         n_momenta = self.algebra.dim if self.group is None else self.group.dim
         return self.torque is not None and not set(range(n_momenta)) <= set(self.torque_free_components)
@@ -254,60 +242,16 @@ class LiePoissonSystem(System):
 
     @property
     def needs_attitude(self) -> bool:
-        return max(self.torque_argument_counts, default=0) > MIN_ARGUMENTS
+        return self.torque is not None and max(self.torque_argument_counts) > MIN_ARGUMENTS
 
-    @property
-    def is_driven(self) -> bool:
-        return super().is_driven or (self.torque is not None and self.torque_arguments is None)
-
-    def at_time(self, t, attitude=None):
-        """Return the system with energy and torque at a time; a torque may need the attitude too, shape (m, m)."""
-        system = super().at_time(t)
-        if self.torque is None:
-            return system
-        system = copy(system)
-        arguments = jnp.asarray(t, dtype=jnp.float64), None if attitude is None else jnp.asarray(attitude)
-        object.__setattr__(system, "torque_arguments", arguments)
-        return system
-
-    def systems_at_test_times(self):
-        if not self.needs_attitude:
-            return super().systems_at_test_times()
-        assert self.group is not None
-        attitudes = self.group.random(0, (len(TEST_TIMES),), scale=1.0)
-        return [self.at_time(t, attitude) for t, attitude in zip(TEST_TIMES, attitudes, strict=True)]
-
-    def external_torque(self, x):
-        if self.torque is None:
-            return None
-        t, attitude = (None, None) if self.torque_arguments is None else self.torque_arguments
-        if t is None or (attitude is None and self.needs_attitude):
-            what = "time" if not self.needs_attitude else "time and the attitude"
-            raise InputError(
-                f"the torque {self.torque_name} is known at a {what}: take system.at_time(t"
-                f"{', attitude' if self.needs_attitude else ''})"
-            )
+    def _torque_at(self, x, t, attitude):
         if attitude is not None:  # without it XLA crashes on products of many such matrices with vectors
             attitude = jax.lax.optimization_barrier(attitude)
         n = self.algebra.dim
         mu, counts = x[:n].reshape(self.algebra.shape), self.torque_argument_counts
         needs_velocity = max(counts) == MAX_ARGUMENTS
         velocity = self.energy.gradient(x)[:n].reshape(self.algebra.shape) if needs_velocity else None
-        torque = evaluate_torque(self.torque, counts, t, mu, attitude, velocity)
-        return jnp.pad(torque.ravel(), (0, self.dim - n))
-
-    def drop_torque(self):
-        if self.torque is None:
-            return self
-        system = copy(self)
-        for name, value in {
-            "torque": None,
-            "torque_argument_counts": (),
-            "torque_free_components": (),
-            "torque_arguments": None,
-        }.items():
-            object.__setattr__(system, name, value)
-        return system
+        return evaluate_torque(self.torque, counts, t, mu, attitude, velocity).ravel()
 
     @property
     def entropy_law(self):
@@ -317,7 +261,7 @@ class LiePoissonSystem(System):
 
     def casimirs(self) -> dict[str, Energy]:
         casimirs = self.momentum_casimirs()
-        return casimirs if self.baths is None else {name: self._extend_from_body(C) for name, C in casimirs.items()}
+        return casimirs if self.baths is None else {name: C.on(range(self.body_dim)) for name, C in casimirs.items()}
 
     def momentum_casimirs(self) -> dict[str, Energy]:
         """Return the known Casimirs as functions of mu alone, by name."""

@@ -21,6 +21,7 @@ from ..functions.energy import Energy
 from ..functions.gradients import EPS
 from ..tracing.interpret import evaluate_at_points
 from .base import System
+from .invariants import resolve_invariants_near, systems_at_test_times
 from .leaf_stability import has_definite_integral, retract
 
 REST_RTOL = 1e-7
@@ -141,7 +142,7 @@ def frozen_system(system: System, t: float | None) -> System:
 def _why_not_autonomous(system: System) -> str:
     """Explain which part of a driven system changes with time; "" if none does at the test times."""
     points = system.samples(3)
-    velocities = np.stack([evaluate_at_points(_velocity, s, points) for s in system.systems_at_test_times()])
+    velocities = np.stack([evaluate_at_points(_velocity, s, points) for s in systems_at_test_times(system)])
     scale = np.abs(velocities).max()
     if np.abs(velocities - velocities[0]).max() <= EPS * 64 * scale:
         return ""
@@ -160,7 +161,7 @@ def conserved_functions(system: System, x) -> dict[str, Energy]:
 
     Functions of the entropies of baths of constant temperature are left out.
     """
-    system = system.resolve_invariants_near(x)
+    system = resolve_invariants_near(system, system.state_array(x, batch=True))
     functions = system.functions()
     conserved = {name: g for name, g in functions.items() if name in system.first_integrals()}
     if system.energy_law == "conserved" and not system.torque_name:

@@ -40,6 +40,7 @@ from .baths import BathEntropy, HeatBaths, poisson_with_baths
 from .equilibria import Equilibrium, steady_state
 from .hamiltonian import hamiltonian_energy
 from .interface import InvariantVerdicts
+from .invariants import systems_at_test_times
 
 DENSITY_MATRIX_TOLERANCE = 1e-12
 """Largest difference of a trace from one, and of a density matrix from its adjoint, that is accepted as input."""
@@ -157,8 +158,8 @@ class QuantumSystem(System):
             return super().is_driven
         return any(isinstance(term, LindbladJumps) and term.depends_on_time for term in self.dissipation.terms)
 
-    def at_time(self, t) -> System:
-        """Return the system with its Hamiltonian and its rates frozen at the time t."""
+    def at_time(self, t, attitude=None) -> QuantumSystem:
+        """Return the system with its Hamiltonian and its rates frozen at the time t; an attitude plays no part."""
         if not self.is_driven:
             return self
         frozen = copy(super().at_time(t))
@@ -482,7 +483,7 @@ class QuantumSystem(System):
 
     def hamiltonians(self) -> list[np.ndarray]:
         """Return the Hamiltonian, at each test time if it depends on time."""
-        energies = [s.energy for s in (self.systems_at_test_times() if self.is_driven else [self])]
+        energies = [s.energy for s in (systems_at_test_times(self) if self.is_driven else [self])]
         energies = [E.body if isinstance(E, BodyBathsEnergy) else E for E in energies]  # temperatures may be traced
         return [self._hamiltonian_of(E) for E in energies]
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
-from copy import copy
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -26,14 +25,14 @@ from ..functions.magnetism.spin_torques import check_spin_torque
 from ..functions.on_spaces import flatten_site_functions
 from ..functions.planes import energy_in_component_order, interaction_range, to_component_order, to_site_order
 from ..functions.spheres import HalfSumOfSquares, Spheres
-from .base import ReorderedSystem, System
+from .base import ReorderedSystem
 from .baths import HeatBaths, poisson_with_baths
-from .torque import torque_name
+from .torque import TorqueSystem
 
 SPIN_LENGTHS_NAME = "sum |s|^2 / 2"
 
 
-class SpinSystem(System):
+class SpinSystem(TorqueSystem):
     """``s_i' = gamma_i s_i x grad_i H`` at every site, damped, alone or with baths of their own entropies.
 
     A state is ``(s_1, s_2, …, y_1, …, y_m)`` in one row: the spins site by site in C order, then the entropy of each
@@ -63,8 +62,6 @@ class SpinSystem(System):
     """
 
     lattice: tuple[int, ...] = eqx.field(static=True)
-    torque: tuple[Callable, ...] | None
-    torque_time: jax.Array | None
 
     def __init__(
         self,
@@ -79,7 +76,7 @@ class SpinSystem(System):
     ):
         self.lattice = lattice_shape(sites)
         self.torque = None if torque is None else check_spin_torque(torque, self.lattice)
-        self.torque_time = None
+        self.torque_arguments = None
         poisson = mf.Spins(self.lattice, ratio=ratio)
         self._build(poisson, poisson.dim, energy, None, dissipation, momentum_maps, validate, baths=baths)
 
@@ -90,15 +87,12 @@ class SpinSystem(System):
     def heating_sites(self) -> tuple[int, ...]:
         return self.lattice
 
-    def field(self, x, dH, dS, dL=()):
-        """Return the vector field; precession and damping of the spins are added before they are stored in a state."""
-        torque = self.external_torque(x)
-        if torque is not None:
-            return self.drop_torque().field(x, dH, dS, dL) + torque
+    def _field_without_torque(self, x, dH, dS, dL):
+        # precession and damping of the spins are added before they are stored in a state
         damping, heating = _split_damping(self.dissipation)
         spins, n = self._spin_structure, self.body_dim
         if damping is None or spins is None:
-            return super().field(x, dH, dS, dL)
+            return super()._field_without_torque(x, dH, dS, dL)
         if heating is None:
             force, _ = damping.damping_force_and_energy_loss(spins, x, dH)
             entropy_rates = jnp.zeros(0)
@@ -112,42 +106,13 @@ class SpinSystem(System):
     # -- the torque -----------------------------------------------------------------------------------------------
 
     @property
-    def torque_name(self) -> str:
-        return "" if self.torque is None else torque_name(self.torque)
-
-    @property
     def torque_invariant_casimirs(self) -> frozenset[str]:
         return frozenset(self.casimirs())  # a torque s x w keeps every length
 
-    @property
-    def is_driven(self) -> bool:
-        return super().is_driven or (self.torque is not None and self.torque_time is None)
-
-    def at_time(self, t):
-        system = super().at_time(t)
-        if self.torque is None:
-            return system
-        system = copy(system)
-        object.__setattr__(system, "torque_time", jnp.asarray(t, dtype=jnp.float64))
-        return system
-
-    def external_torque(self, x):
-        if self.torque is None:
-            return None
-        if self.torque_time is None:
-            raise InputError(f"the torque {self.torque_name} is known at a time: take system.at_time(t)")
+    def _torque_at(self, x, t, attitude):
         s = x[: self.body_dim].reshape(*self.lattice, 3)
-        total = sum((term(self.torque_time, s) for term in self.torque), jnp.zeros(3))
-        torque = cross(s, jnp.broadcast_to(total, s.shape))
-        return jnp.pad(torque.reshape(-1), (0, self.dim - self.body_dim))
-
-    def drop_torque(self):
-        if self.torque is None:
-            return self
-        system = copy(self)
-        for name in ("torque", "torque_time"):
-            object.__setattr__(system, name, None)
-        return system
+        total = sum((term(t, s) for term in self.torque), jnp.zeros(3))
+        return cross(s, jnp.broadcast_to(total, s.shape)).reshape(-1)
 
     @property
     def is_torque_free(self) -> bool:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import functools
+from abc import abstractmethod
 from collections.abc import Callable
+from copy import copy
 from typing import Any
 
 import jax
@@ -18,6 +20,72 @@ from ..functions.piecewise import is_spline
 from ..tracing.interpret import MAX_UNROLLED_DIM, vanishing_entry_indices
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
 from ..tracing.traced import TracedFunction, trace_callables_and_result_shapes
+from .base import System
+
+
+class TorqueSystem(System):
+    """A system on which a torque may act from outside, known at a time and perhaps at an attitude.
+
+    Attributes
+    ----------
+    torque : function, tuple or list of functions, or None
+    torque_arguments : (t, attitude) or None
+        Where the torque is taken: see :meth:`at_time`.
+    """
+
+    torque: Any
+    torque_arguments: tuple[jax.Array, jax.Array | None] | None
+
+    @property
+    def torque_name(self) -> str:
+        return "" if self.torque is None else torque_name(self.torque)
+
+    @property
+    def is_driven(self) -> bool:
+        return super().is_driven or (self.torque is not None and self.torque_arguments is None)
+
+    def at_time(self, t, attitude=None):
+        system = super().at_time(t)
+        if self.torque is None:
+            return system
+        system = copy(system)
+        arguments = jnp.asarray(t, dtype=jnp.float64), None if attitude is None else jnp.asarray(attitude)
+        object.__setattr__(system, "torque_arguments", arguments)
+        return system
+
+    def drop_torque(self):
+        if self.torque is None:
+            return self
+        system = copy(self)
+        for name in ("torque", "torque_arguments"):
+            object.__setattr__(system, name, None)
+        return system
+
+    def external_torque(self, x):
+        if self.torque is None:
+            return None
+        t, attitude = (None, None) if self.torque_arguments is None else self.torque_arguments
+        if t is None or (attitude is None and self.needs_attitude):
+            what = "time" if not self.needs_attitude else "time and the attitude"
+            raise InputError(
+                f"the torque {self.torque_name} is known at a {what}: take system.at_time(t"
+                f"{', attitude' if self.needs_attitude else ''})"
+            )
+        torque = self._torque_at(x, t, attitude)
+        return jnp.pad(torque, (0, self.dim - len(torque)))
+
+    @abstractmethod
+    def _torque_at(self, x, t, attitude) -> jax.Array:
+        """Return the torque, shape (m,), on the first m components of a state."""
+
+    def field(self, x, dH, dS, dL=()):
+        """Return the vector field, the torque added to that of the system without it."""
+        torque = self.external_torque(x)
+        field = self.drop_torque()._field_without_torque(x, dH, dS, dL)
+        return field if torque is None else field + torque
+
+    def _field_without_torque(self, x, dH, dS, dL) -> jax.Array:
+        return super().field(x, dH, dS, dL)
 
 
 def check_torque(given: Any, algebra: mf.LieAlgebra, group: mf.MatrixGroup | None) -> tuple[Any, tuple[int, ...]]:

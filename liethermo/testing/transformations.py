@@ -18,6 +18,7 @@ from manifolds.structures.poisson import PoissonBySharp, ProductPoisson
 from ..dissipation.base import Dissipation, DissipationSum, LiftedDissipation, LiftedGeometry
 from ..functions.energy import Energy, Function, Pullback, Quadratic, Sum
 from ..systems import LiePoissonSystem, MetriplecticSystem, System
+from ..systems.invariants import find_preserved_names
 
 
 @dataclass(frozen=True)
@@ -195,7 +196,7 @@ def replace_parts(system: System, **parts: Any) -> System:
         lambda s: [getattr(s, name) for name in names], system, list(parts.values()), is_leaf=lambda part: part is None
     )
     if "dissipation" in parts:  # the constructor sets these names from the dissipation
-        object.__setattr__(changed, "preserved_labels", changed._find_preserved_names() if changed.preserved else None)
+        object.__setattr__(changed, "preserved_labels", find_preserved_names(changed) if changed.preserved else None)
     return changed
 
 

@@ -16,6 +16,7 @@ from mpl_toolkits.mplot3d import Axes3D
 from ...errors import InputError
 from ...functions.gradients import EPS
 from ...systems import System
+from ...systems.invariants import recorded_invariants
 from ..solution import Solution
 from .figures import BLUE, DPI, GREEN, ORANGE, RED, checked_figure_path, save_figure
 
@@ -119,7 +120,7 @@ def invariants(solution: Solution, system: System, path: str | os.PathLike | Non
     """
     path = checked_figure_path(path)
     functions: dict[str, Callable] = {"energy": system.energy}
-    functions |= {name: function for name, (function, _) in system.invariants().items()}
+    functions |= {name: function for name, (function, _) in recorded_invariants(system).items()}
     figure, ax = plt.subplots(figsize=(6.4, 3.6), dpi=DPI, layout="constrained")
     for i, (name, function) in enumerate(functions.items()):
         values = np.asarray(jax.vmap(lambda x, f=function: f(x))(jnp.asarray(solution.x)))

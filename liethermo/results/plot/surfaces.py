@@ -22,6 +22,7 @@ from scipy.ndimage import map_coordinates
 
 from ...errors import InputError
 from ...systems import System
+from ...systems.invariants import recorded_invariants
 from ..solution import Solution
 from .figures import BLUE, DPI, GREY, ORANGE, checked_figure_path, save_figure
 
@@ -156,7 +157,9 @@ def _conserved_and_changing(solution: Solution, system: System | None) -> tuple[
         energy = _vectorize_in_blocks(_restrict_to_body(system.energy, system))
         # the entropy of baths is no function of the body
         body_entropy = system.entropy if system.body_dim == system.dim else None
-        function = body_entropy or next((J for J, is_conserved in system.invariants().values() if is_conserved), None)
+        function = body_entropy or next(
+            (J for J, is_conserved in recorded_invariants(system).values() if is_conserved), None
+        )
         entropy = None if function is None else _vectorize_in_blocks(_restrict_to_body(function, system))
     else:
         energy = _fit_quadric(solution.x) if solution.laws.energy == "conserved" else None

@@ -14,6 +14,7 @@ import liethermo as lt
 import manifolds as mf
 from liethermo.cli import app
 from liethermo.results import step_sampling
+from liethermo.systems.invariants import conserves
 
 BODY = lt.models.rigid_body()
 X0 = [0.001, 1.0, 0.001]
@@ -482,9 +483,9 @@ def test_slow_friction_is_friction_still(rate, scale):
     quadratic = lt.Quadratic(np.ones(3))
     for dissipation in (lt.KillingDissipation(rate), lt.ProjectedMetric(rate=rate)):
         system = lt.LiePoissonSystem(mf.so(3), lt.Quadratic(np.array([1.0, 2.0, 5.0]) / scale), quadratic, dissipation)
-        assert system.conserves((quadratic, system.energy)) == [False, True]
+        assert conserves(system, (quadratic, system.energy)) == [False, True]
     free_system = lt.LiePoissonSystem(mf.so(3), lt.Quadratic(np.array([1.0, 2.0, 5.0]) / scale))
-    assert free_system.conserves((quadratic, lt.Quadratic(np.zeros(3), b=[0.0, 0.0, 1.0]))) == [True, False]
+    assert conserves(free_system, (quadratic, lt.Quadratic(np.zeros(3), b=[0.0, 0.0, 1.0]))) == [True, False]
 
 
 def test_large_states_of_a_slow_body():

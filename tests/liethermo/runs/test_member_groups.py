@@ -11,6 +11,7 @@ import manifolds as mf
 from liethermo.engines.status_codes import StatusCode
 from liethermo.runs import member_groups
 from liethermo.runs.system_family import Family
+from liethermo.systems.invariants import find_invariants
 
 START = np.array([0.4, 0.5, -0.3])
 SPAN = (0.0, 2.0)
@@ -113,7 +114,7 @@ def test_a_control_one_verdict_for_all_is_found(monkeypatch):
     """Control: with what the first member conserves held for all, the relation of company fails."""
 
     def group_like_first_member(family, method, states):
-        first_verdicts = family.member(0)._find_invariants()
+        first_verdicts = find_invariants(family.member(0))
         facts = member_groups.InvariantFacts(None, first_verdicts)
         return [
             member_groups.MemberGroup(

@@ -527,3 +527,32 @@ def test_noise_beside_a_torque():
     assert run.audit().passed
     assert run.audit().energy_drift <= LAW
     assert row(run, "drift of momentum in space less the impulse").value <= LAW
+
+
+@pytest.mark.parametrize("amplitude", [0.0, pytest.param(0.2, marks=pytest.mark.slow)])
+def test_euler_poincare_system_with_a_torque(amplitude):
+    """Compare a Lagrangian, fixed or dependent on time, under a torque with a velocity, with SciPy."""
+    moments = np.array([3.0, 2.0, 1.0])
+
+    def lagrangian(xi, t):
+        return 0.5 * jnp.sum(moments * (1.0 + amplitude * jnp.cos(t)) * xi**2)
+
+    def torque(t, mu, attitude, xi):
+        return attitude.T @ jnp.array([0.1 * jnp.sin(t), 0.2, 0.0]) - 0.1 * xi
+
+    given = lagrangian if amplitude else lt.Quadratic(moments)
+    system = lt.EulerPoincareSystem(mf.so(3), given, torque=torque, group=SO3)
+    run = lt.integrate(system, START, (0.0, 2.0), 0.02, lt.MetriplecticGauss(2))
+
+    def field(t, y):
+        mu, g = y[:3], y[3:].reshape(3, 3)
+        xi = mu / (moments * (1.0 + amplitude * np.cos(t)))
+        hat = np.array([[0.0, -xi[2], xi[1]], [xi[2], 0.0, -xi[0]], [-xi[1], xi[0], 0.0]])
+        tau = g.T @ np.array([0.1 * np.sin(t), 0.2, 0.0]) - 0.1 * xi
+        return np.concatenate([np.cross(mu, xi) + tau, (g @ hat).ravel()])
+
+    exact = solve_ivp(field, (0.0, 2.0), [*START, *np.eye(3).ravel()], "DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+    assert np.abs(run.x[-1] - exact[:3]).max() < 1e-8
+    assert np.abs(run.attitude[-1].ravel() - exact[3:]).max() < 1e-8
+    assert run.audit().passed
+    assert abs(np.linalg.norm(run.x[-1]) - np.linalg.norm(START)) > 0.01  # the torque changes |mu|, a Casimir
