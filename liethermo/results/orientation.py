@@ -275,8 +275,8 @@ def _attitudes(solution: AuditableResult) -> np.ndarray:
         raise InputError(f"attitudes are those of a solution or an ensemble, got {solution!r:.60}")
     if solution.attitude is None:
         raise InputError(
-            "there are no attitudes: give the system a group, such as group=mf.SO(3), or a model of a body attitude=True, "
-            "and keep states"
+            "there are no attitudes: give the system a group, such as group=mf.SO(3), or a model of a body "
+            "attitude=True, and keep states"
         )
     if solution.provenance.get("group") not in ROTATION_GROUPS:
         raise InputError(f"the attitudes must be in SO(3) or SE(3), got {solution.provenance.get('group')}")
