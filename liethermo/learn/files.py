@@ -25,7 +25,7 @@ MODEL_FORMAT = "liethermo-learned-1"
 CURVE_FIELDS = ("step", "phase", "loss", "validation")
 """Arrays of the record of a fit, in every file."""
 
-ESTIMATE_FIELDS = ("values", "standard_errors", "covariance", "noise")
+ESTIMATE_FIELDS = ("values", "standard_errors", "covariance", "noise", "initial_states")
 """Arrays of the record of a fit that files of older versions do not have."""
 
 JSON_FIELDS = (

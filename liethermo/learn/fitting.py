@@ -249,6 +249,7 @@ def fit(
             relative_noise * np.concatenate([state_scale.scale, attitude_units]),
         )
 
+    shape = len(training_data), model.dim
     can_be_refined = can_refine(params, model, trajectories, run, n_substeps)
     if not matching and not shooting:
         if not can_be_refined:
@@ -271,7 +272,7 @@ def fit(
         least_squares = fit_by_least_squares(problem, sigma, is_estimated, substeps)
         refined, sigma, weights = least_squares.result, least_squares.noise, least_squares.result.weights
         training = empty_training(params.initial_values.size, time.perf_counter() - start_time)
-        return _with_record(params, weights, training.with_estimates(params, refined, sigma, noise_is_estimated))
+        return _with_record(params, weights, training.with_estimates(params, refined, sigma, noise_is_estimated, shape))
     units = units_for(sigma)
 
     def make_matching_objective(data: list) -> Objective:
@@ -357,7 +358,9 @@ def fit(
         )
         weights = refined_or_none.weights
     training = training_run.training_record(time.perf_counter() - start_time)
-    return _with_record(params, weights, training.with_estimates(params, refined_or_none, sigma, noise_is_estimated))
+    return _with_record(
+        params, weights, training.with_estimates(params, refined_or_none, sigma, noise_is_estimated, shape)
+    )
 
 
 def parameters_to_fit(system: Any, parameters: Any, also: Any, positive: Any) -> tuple[System, Any, Callable]:

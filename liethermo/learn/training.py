@@ -122,6 +122,8 @@ class Training:
     noise_is_estimated : bool
     degrees_of_freedom : int
         Number of observations minus the number of determined unknowns of the least squares.
+    initial_states : ndarray, shape (trajectories, n)
+        Fitted states at the first times of the trajectories that are not held out, in order.
     is_positive : tuple of bool, of length p
         True for parameters that the fit keeps positive.
     """
@@ -146,12 +148,24 @@ class Training:
     noise: np.ndarray = field(default_factory=lambda: np.zeros(0))
     noise_is_estimated: bool = False
     degrees_of_freedom: int = 0
+    initial_states: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     is_positive: tuple[bool, ...] = ()
 
     def with_estimates(
-        self, params: ParameterVector, refined: LeastSquaresResult | None, noise, noise_is_estimated: bool
+        self,
+        params: ParameterVector,
+        refined: LeastSquaresResult | None,
+        noise,
+        noise_is_estimated: bool,
+        shape: tuple[int, int],
     ) -> Training:
-        """Return the record with the results of a least-squares refinement, and the noise."""
+        """Return the record with the results of a least-squares refinement, and the noise.
+
+        Parameters
+        ----------
+        shape : (int, int)
+            Number of trajectories that are not held out, which come first, and of components of a state.
+        """
         sigma = np.zeros(0) if noise is None else np.asarray(noise)
         record = replace(self, noise=sigma, noise_is_estimated=noise_is_estimated)
         if refined is None:
@@ -174,6 +188,7 @@ class Training:
             gradient=refined.gradient_norm,
             converged=refined.converged,
             degrees_of_freedom=refined.degrees_of_freedom,
+            initial_states=np.asarray(refined.states)[: shape[0], 0, : shape[1]],
             is_positive=tuple(map(bool, params.is_log)),
             ended=self.ended | {LEAST_SQUARES: f"after {refined.iterations} iterations"},
         )

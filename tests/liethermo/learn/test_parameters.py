@@ -193,6 +193,7 @@ def test_parameters_of_a_system_have_their_names():
     assert ratio == pytest.approx(1 / 3, rel=1e-5)
     assert 0.0 <= error < 1e-3
     assert fitted_system.check().passed
+    np.testing.assert_allclose(fitted_system.training.initial_states, [[0.5, 1.0, 0.7]], rtol=1e-6)
 
 
 def test_a_scale_that_no_angular_velocity_shows_is_called_so():
