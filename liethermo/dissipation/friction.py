@@ -6,8 +6,10 @@ from collections.abc import Callable
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
+from manifolds._arrays import is_traced
 from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
 
 from ..functions.indices import Indices
@@ -50,7 +52,9 @@ class Friction(Dissipation):
     def __init__(self, D=None, rate=1.0, bath=None):
         reject_rate_as_form(D, self, "the friction D")
         if D is not None and not callable(D):
-            D = checked_semidefinite(np.diag(D) if np.ndim(D) == 1 else D, "the friction D")
+            D = jnp.asarray(D) if is_traced(D) else D
+            diagonal = jnp.diag if is_traced(D) else np.diag
+            D = checked_semidefinite(diagonal(D) if np.ndim(D) == 1 else D, "the friction D")
         self.D = D
         self.rate = checked_rate(rate)
         self.bath = checked_bath_indices(bath)

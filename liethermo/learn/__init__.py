@@ -8,9 +8,11 @@ from .identifiability import Determined, Fits, determined, several
 from .model import Metriplectic
 from .networks import Learned
 from .parts import Energy, Entropy, Friction, Poisson
-from .training import FitWarning, Training
+from .records import Records, Trajectory, read_data
+from .training import ConfidenceInterval, FitWarning, Training
 
 __all__ = [
+    "ConfidenceInterval",
     "Determined",
     "Energy",
     "Entropy",
@@ -20,10 +22,13 @@ __all__ = [
     "Learned",
     "Metriplectic",
     "Poisson",
+    "Records",
     "Training",
+    "Trajectory",
     "determined",
     "fit",
     "load",
+    "read_data",
     "save",
     "several",
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,52 +12,65 @@ from ..errors import InputError
 from ..results.solution import Solution
 from ..systems import System
 from .observation import Observation
+from .records import Records, Trajectory, is_table, read_data
 
 SPLINE_DEGREE = 5
 """Degree of the splines through the data, whose derivatives are then of order 5."""
 
 
-class Trajectory(NamedTuple):
-    """Times, shape (m,), and the observations at these times, shape (m, ...)."""
-
-    t: np.ndarray
-    x: np.ndarray
-
-    @property
-    def flat_trajectory(self) -> Trajectory:
-        """The trajectory with each observation as a row of numbers, shape (m, k)."""
-        return Trajectory(self.t, self.x.reshape(len(self.t), -1))
-
-
-def parse_trajectories(data: Any, system: System, observation: Observation) -> list[Trajectory]:
-    """Return the trajectories in the user's data: a pair of times and observations, a list of pairs, or solutions.
+def parse_trajectories(
+    data: Any, system: System, observation: Observation, parameters: Mapping[str, Any] | None = None
+) -> list[Trajectory]:
+    """Return the trajectories in the user's data: pairs of times and observations, solutions, or a table with names.
 
     Raises
     ------
     InputError
         If data are missing, not finite, or of the wrong shape.
     """
+    if is_table(data):
+        data = read_data(data, columns=observation.names or None)
+    if isinstance(data, Records):
+        data = _columns_of_observation(data, observation)
     trajectories = [
         _checked_trajectory(i, t, x, system, observation)
-        for i, (t, x) in enumerate(_time_observation_pairs(data, observation))
+        for i, (t, x) in enumerate(_time_observation_pairs(data, observation, parameters))
     ]
     if not trajectories:
         raise InputError("there are no trajectories in the data")
     return trajectories
 
 
-def _time_observation_pairs(data: Any, observation: Observation) -> list[tuple[Any, Any]]:
+def _columns_of_observation(records: Records, observation: Observation) -> list[Trajectory]:
+    """Return the columns of a table that are observed, by their names, or all of them in order if there are no names.
+
+    Raises
+    ------
+    InputError
+        If a column is missing, or the number of columns is not that of the observation.
+    """
+    records = records.select(observation.names) if observation.names else records
+    count = int(np.prod(observation.shape))
+    if len(records.names) != count:
+        raise InputError(
+            f"the data have {len(records.names)} columns ({', '.join(records.names)}), but {count} are observed. "
+            f"Choose {count} with lt.learn.read_data(..., columns=[...]), or return a dict by their names from observe"
+        )
+    return [Trajectory(t, x.reshape(len(t), *observation.shape)) for t, x in records]
+
+
+def _time_observation_pairs(data: Any, observation: Observation, parameters) -> list[tuple[Any, Any]]:
     if isinstance(data, Solution):
-        return [(data.t, observation.observe_solution(data))]
+        return [(data.t, observation.observe_solution(data, parameters))]
     if isinstance(data, tuple) and len(data) == 2 and _ndim_or_none(data[0]) == 1:
         t, x = data
         return [(t, x) for x in np.asarray(x)] if _ndim_or_none(x) == 2 + len(observation.shape) else [(t, x)]
     if not isinstance(data, Sequence) or isinstance(data, str):
         raise InputError(
-            f"data must be a pair (t, x), t of shape (m,), x of shape (m, n) or (trajectories, m, n), a list of such "
-            f"pairs, or solutions, got {type(data).__name__}"
+            "data must be a pair (t, x), t of shape (m,), x of shape (m, n) or (trajectories, m, n), a list of such "
+            f"pairs, solutions, or a table that lt.learn.read_data reads, got {type(data).__name__}"
         )
-    return [pair for item in data for pair in _time_observation_pairs(item, observation)]
+    return [pair for item in data for pair in _time_observation_pairs(item, observation, parameters)]
 
 
 def _ndim_or_none(values: Any) -> int | None:
@@ -88,24 +101,25 @@ def _checked_trajectory(number: int, t, x, system: System, observation: Observat
         )
     if x.ndim == 0 or len(x) != len(t):
         raise InputError(f"{name_of_trajectory} has {len(t)} times and {len(x) if x.ndim else 'no'} states")
-    for name, values in (("time", t), ("state", x)):
-        non_finite_indices = np.argwhere(~np.isfinite(values))
-        if len(non_finite_indices):
-            component_text = (
-                f"component {', '.join(map(str, non_finite_indices[0][1:]))} of " if values.ndim > 1 else ""
-            )
-            row = int(non_finite_indices[0][0])
+    for name, values, is_invalid in (("time", t, ~np.isfinite(t)), ("state", x, np.isinf(x))):
+        if is_invalid.any():
+            index = tuple(map(int, np.argwhere(is_invalid)[0]))
+            component_text = f"component {', '.join(map(str, index[1:]))} of " if values.ndim > 1 else ""
             raise InputError(
-                f"{name_of_trajectory}: {component_text}{name} {row} is {values[tuple(non_finite_indices[0])]}. "
-                "Leave out this row"
+                f"{name_of_trajectory}: {component_text}{name} {index[0]} is {values[index]}. Leave out this row"
+                + (", or write NaN for a missing value" if values is x else "")
             )
     decreasing_indices = np.flatnonzero(np.diff(t) <= 0.0)
     if len(decreasing_indices):
         i = int(decreasing_indices[0])
-        raise InputError(f"{name_of_trajectory}: times must grow, but time {i + 1} is {t[i + 1]:g} after {t[i]:g}")
+        raise InputError(
+            f"{name_of_trajectory}: times must grow, but time {i + 1} is {t[i + 1]:g} after {t[i]:g}. "
+            "Sort the rows by time, without repeated times; several trajectories are a list of pairs (t, x)"
+        )
+    is_missing = np.isnan(x)
     if observation.is_full_state:
         try:
-            x = np.asarray(system.state_array(x, batch=True))
+            x = np.asarray(system.state_array(np.where(is_missing, 0.0, x) if is_missing.any() else x, batch=True))
         except InputError as error:
             raise type(error)(f"{name_of_trajectory}: {error}") from None
     elif x.shape != (len(t), *observation.shape):
@@ -117,7 +131,28 @@ def _checked_trajectory(number: int, t, x, system: System, observation: Observat
         raise InputError(
             f"{name_of_trajectory} has observations of shape {x.shape}, but {expected_text} at {len(t)} times"
         )
+    if is_missing.any():
+        if is_missing.shape != x.shape:
+            raise InputError(f"{name_of_trajectory} has missing values, which need states of shape ({system.dim},)")
+        x = np.where(is_missing, np.nan, x)
+        if is_missing.all(axis=0).any():
+            component = ", ".join(map(str, np.argwhere(is_missing.all(axis=0))[0]))
+            raise InputError(
+                f"{name_of_trajectory}: component {component} has no values, only NaN. Name the measured components "
+                "with observed="
+            )
+        has_value = ~is_missing.reshape(len(t), -1).all(axis=1)
+        t, x = t[has_value], x[has_value]
+        if len(t) < 2:
+            raise InputError(f"{name_of_trajectory} has 1 time with values, at least 2 are needed. Leave it out")
     return Trajectory(t, x)
+
+
+def _column_values(trajectory: Trajectory, k: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the times and the values of a component without the missing ones."""
+    values = trajectory.x[:, k]
+    is_present = np.isfinite(values)
+    return trajectory.t[is_present], values[is_present]
 
 
 class DataScales(NamedTuple):
@@ -148,15 +183,22 @@ class DataScales(NamedTuple):
 
 def data_scales(data: list[Trajectory]) -> DataScales:
     """Return the mean and standard deviation of all trajectories together, and the time scale of their changes."""
-    x = np.concatenate([trajectory.x for trajectory in data])
-    rates = np.concatenate([np.diff(x, axis=0) / np.diff(t)[:, None] for t, x in data])
-    centre, scale = x.mean(axis=0), x.std(axis=0)
+    columns = [[_column_values(trajectory, k) for trajectory in data] for k in range(data[0].x.shape[1])]
+    values = [np.concatenate([y for _, y in column]) for column in columns]
+    centre, scale = np.array([y.mean() for y in values]), np.array([y.std() for y in values])
     scale = np.where(scale > 1e-12 * np.abs(centre), scale, np.where(centre != 0.0, np.abs(centre), 1.0))
-    speed = np.sqrt(np.mean((rates / scale) ** 2, axis=0))
+    rates = [np.concatenate([np.zeros(0), *(np.diff(y) / np.diff(t) for t, y in column)]) for column in columns]
+    speed = np.array([np.sqrt(np.mean((r / s) ** 2)) if r.size else 0.0 for r, s in zip(rates, scale, strict=True)])
     positive_speeds = speed[speed > 0.0]
     if not len(positive_speeds):
         raise InputError("nothing moves in the data: all states of each trajectory are equal")
     return DataScales(centre, scale, 1.0 / float(np.median(positive_speeds)))
+
+
+def smooth_time_scale(rates: list[np.ndarray], scales: DataScales) -> float:
+    """Return the time in which the fastest number changes by its scale, from smooth rates of change, shape (m, k)."""
+    speed = np.sqrt(np.mean((np.concatenate(rates) / scales.scale) ** 2, axis=0))
+    return 1.0 / float(np.max(speed)) if (speed > 0.0).any() else scales.time_scale
 
 
 def spline_states_and_rates(trajectory: Trajectory, noise: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
@@ -165,6 +207,8 @@ def spline_states_and_rates(trajectory: Trajectory, noise: np.ndarray | None) ->
     Without noise the spline interpolates; with noise, standard deviations of shape (k,), it smooths by as much.
     """
     t, x = trajectory
+    if np.isnan(x).any():
+        return _splines_with_missing_values(trajectory, noise)
     start, length = t[0], t[-1] - t[0]
     u, degree = (t - start) / length, min(SPLINE_DEGREE, len(t) - 1)
     if noise is None or degree < SPLINE_DEGREE:
@@ -175,6 +219,23 @@ def spline_states_and_rates(trajectory: Trajectory, noise: np.ndarray | None) ->
         for y, sigma in zip(x.T, noise, strict=True)
     ]
     return np.stack([f(u) for f in columns], axis=1), np.stack([f.derivative()(u) for f in columns], axis=1) / length
+
+
+def _splines_with_missing_values(trajectory: Trajectory, noise: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """Return states and rates by a spline through the values of each component, constant before and after them."""
+    states, rates = np.empty_like(trajectory.x), np.zeros_like(trajectory.x)
+    for k in range(trajectory.x.shape[1]):
+        t, y = _column_values(trajectory, k)
+        if len(t) == 1:
+            states[:, k] = y[0]
+            continue
+        column = Trajectory(t, y[:, None])
+        values, slopes = spline_states_and_rates(column, None if noise is None else noise[k : k + 1])
+        spline = scipy.interpolate.CubicHermiteSpline(t, values[:, 0], slopes[:, 0])
+        is_inside = (trajectory.t >= t[0]) & (trajectory.t <= t[-1])
+        states[:, k] = spline(np.clip(trajectory.t, t[0], t[-1]))
+        rates[is_inside, k] = spline.derivative()(trajectory.t[is_inside])
+    return states, rates
 
 
 DIFFERENCE_ORDERS = (2, 3, 4, 5, 6)
@@ -198,21 +259,33 @@ def estimate_noise(data: list[Trajectory], scale: np.ndarray) -> np.ndarray | No
     Divided differences of a smooth motion decrease with their order. Those of independent errors, with weights of norm
     one, do not.
     """
-    order = DIFFERENCE_ORDERS[-1]
-    if sum(max(len(t) - order, 0) for t, _ in data) < MIN_DIFFERENCES:
-        return None
-    levels = np.stack([_divided_difference_std(data, d) for d in DIFFERENCE_ORDERS])
-    is_noise = (levels[-1] > NOISE_PLATEAU_RATIO * levels[-3]) & (levels[-1] > MIN_RELATIVE_NOISE * scale)
-    if not is_noise.any():
-        return None
-    std = np.where(is_noise, levels[-3:].mean(axis=0), levels.min(axis=0))
-    return np.maximum(std, MIN_RELATIVE_NOISE * scale)
+    std, is_noise = noise_levels(data, scale)
+    return std if is_noise.any() else None
 
 
-def _divided_difference_std(data: list[Trajectory], order: int) -> np.ndarray:
-    """Return the standard deviation of normalised divided differences, shape (k,), by their median."""
+def noise_levels(data: list[Trajectory], scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return an upper bound of the errors of each component, shape (k,), and whether they are noise, shape (k,).
+
+    The bound is the standard deviation of the errors where they are noise.
+    """
+    levels = np.array([_difference_levels([_column_values(tr, k) for tr in data]) for k in range(len(scale))])
+    is_noise = (levels[:, -1] > NOISE_PLATEAU_RATIO * levels[:, -3]) & (levels[:, -1] > MIN_RELATIVE_NOISE * scale)
+    std = np.where(is_noise, levels[:, -3:].mean(axis=1), levels.min(axis=1))
+    return np.maximum(std, MIN_RELATIVE_NOISE * scale), is_noise
+
+
+def _difference_levels(column: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """Return the standard deviation of normalised divided differences of each order, by their median; zeros if there
+    are too few."""
+    if sum(max(len(t) - DIFFERENCE_ORDERS[-1], 0) for t, _ in column) < MIN_DIFFERENCES:
+        return np.zeros(len(DIFFERENCE_ORDERS))
+    return np.array([_divided_difference_std(column, order) for order in DIFFERENCE_ORDERS])
+
+
+def _divided_difference_std(column: list[tuple[np.ndarray, np.ndarray]], order: int) -> float:
+    """Return the standard deviation of normalised divided differences by their median."""
     differences = []
-    for t, x in data:
+    for t, y in column:
         if len(t) <= order:
             continue
         times = np.lib.stride_tricks.sliding_window_view(t, order + 1)
@@ -220,10 +293,8 @@ def _divided_difference_std(data: list[Trajectory], order: int) -> np.ndarray:
         gaps = times[:, :, None] - times[:, None, :] + np.eye(order + 1)
         weights = 1.0 / np.prod(gaps, axis=2)
         weights /= np.linalg.norm(weights, axis=1, keepdims=True)
-        differences.append(
-            np.einsum("wj,wkj->wk", weights, np.lib.stride_tricks.sliding_window_view(x, order + 1, axis=0))
-        )
-    return np.median(np.abs(np.concatenate(differences)), axis=0) / MEDIAN_ABS_NORMAL
+        differences.append(np.sum(weights * np.lib.stride_tricks.sliding_window_view(y, order + 1), axis=1))
+    return float(np.median(np.abs(np.concatenate(differences)))) / MEDIAN_ABS_NORMAL
 
 
 MEDIAN_ABS_NORMAL = 0.6744897501960817
@@ -240,7 +311,9 @@ class Windows(NamedTuple):
     intervals : array, shape (windows, m)
         Lengths of the time intervals.
     observations : array, shape (windows, m + 1, k)
-        Observations at the start and at the ends of the intervals.
+        Observations at the start and at the ends of the intervals, NaN where one is missing.
+    times : array, shape (windows, m + 1)
+        Times of the observations.
     next_window : array of int, shape (windows,)
         Index of the window that starts where this one ends; -1 if there is none.
     first_windows : array of int, shape (trajectories,)
@@ -250,6 +323,7 @@ class Windows(NamedTuple):
     initial_states: np.ndarray
     intervals: np.ndarray
     observations: np.ndarray
+    times: np.ndarray
     next_window: np.ndarray
     first_windows: np.ndarray
 
@@ -258,7 +332,7 @@ def cut_windows(data: list[Trajectory], states: list[np.ndarray], length: int, i
     """Cut trajectories into windows of ``length`` intervals: consecutive ones if ``is_disjoint``, else one from each
     point."""
     length = min(length, *(len(t) - 1 for t, _ in data))
-    initial_states, intervals, observations = [], [], []
+    initial_states, intervals, observations, times = [], [], [], []
     next_window: list[int] = []
     first_windows = []
     for (t, x), trajectory_states in zip(data, states, strict=True):
@@ -272,11 +346,13 @@ def cut_windows(data: list[Trajectory], states: list[np.ndarray], length: int, i
             initial_states.append(trajectory_states[i])
             intervals.append(np.diff(t[i : i + length + 1]))
             observations.append(x[i : i + length + 1])
+            times.append(t[i : i + length + 1])
             next_window.append(len(next_window) + 1 if has_next else -1)
     return Windows(
         np.stack(initial_states),
         np.stack(intervals),
         np.stack(observations),
+        np.stack(times),
         np.array(next_window),
         np.array(first_windows),
     )

@@ -25,12 +25,12 @@ MODEL_FORMAT = "liethermo-learned-1"
 CURVE_FIELDS = ("step", "phase", "loss", "validation")
 """Arrays of the record of a fit, in every file."""
 
-ESTIMATE_FIELDS = ("values", "standard_errors", "covariance", "noise")
+ESTIMATE_FIELDS = ("values", "standard_errors", "covariance", "noise", "initial_states")
 """Arrays of the record of a fit that files of older versions do not have."""
 
 JSON_FIELDS = (
     *("parameters", "seconds", "ended", "names", "rank", "condition", "residual", "held_out", "gradient"),
-    *("converged", "noise_is_estimated"),
+    *("converged", "noise_is_estimated", "degrees_of_freedom", "is_positive"),
 )
 """Other fields of the record of a fit, stored in the JSON of the file."""
 
@@ -105,7 +105,8 @@ def load(path: str | os.PathLike, system: T) -> T:
             curves = {name: arrays[name] for name in CURVE_FIELDS} | {
                 n: arrays[n] for n in ESTIMATE_FIELDS if n in arrays
             }
-            training_fields = metadata["training"] | {"names": tuple(metadata["training"].get("names", ()))}
+            sequences = {name: tuple(metadata["training"].get(name, ())) for name in ("names", "is_positive")}
+            training_fields = metadata["training"] | sequences
             training = Training(**curves, **training_fields)  # type: ignore[arg-type]
         except (KeyError, TypeError) as error:
             raise FileError(f"{path!s:.200} has a record of its fit that is damaged ({error!s:.100})") from None

@@ -6,30 +6,43 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from manifolds._precision import with_library_settings
-from manifolds.errors import warn
+from manifolds.errors import ManifoldsError, warn
 
-from ..errors import InputError
+from ..errors import InputError, LiethermoError
 from ..integrators import MetriplecticRungeKutta, OneStepMethod
 from ..systems import System
 from . import losses
-from .data import Trajectory, cut_windows, data_scales, estimate_noise, parse_trajectories, spline_states_and_rates
+from .data import (
+    Trajectory,
+    cut_windows,
+    data_scales,
+    noise_levels,
+    parse_trajectories,
+    smooth_time_scale,
+    spline_states_and_rates,
+)
+from .least_squares import LeastSquaresProblem, fit_by_least_squares
 from .losses import Objective
 from .model import has_learned_parts, scale_networks
 from .observation import default_states, make_observation, n_displacement_coordinates, states_matching_rates
-from .refining import can_refine, pad_runs, refine_by_least_squares
-from .training import FitWarning, Phase, TrainingRun, fingerprint
+from .parameters import build_checked, initial_parameters, named_parameter_vector
+from .refining import MAX_PARAMETERS, RunModel, can_refine, pad_runs, refine_by_least_squares, whole_trajectories
+from .training import FitWarning, Phase, Training, TrainingRun, empty_training, fingerprint
 
 T = TypeVar("T", bound=System)
 
 BATCH_SIZES = {"matching": 256, "shooting": 32}
 """Default batch sizes: points of an iteration of the matching, and short runs of one of the shooting."""
+
+DEFAULT_ITERATIONS = {"matching": 2000, "shooting": 500}
+"""Default numbers of iterations of a fit without ``parameters=``."""
 
 SHOOTING_RATE_FACTOR = 0.3
 """Learning rate of the shooting, relative to that of the matching before it."""
@@ -37,15 +50,16 @@ SHOOTING_RATE_FACTOR = 0.3
 
 @with_library_settings
 def fit(
-    system: T,
+    system: T | Callable[[dict[str, Any]], T],
     data: Any,
     *,
-    matching: int = 2000,
-    shooting: int = 500,
+    parameters: Any = None,
+    matching: int | None = None,
+    shooting: int | None = None,
     rate: float = 1e-2,
     batch: int | None = None,
     window: int = 4,
-    substeps: int = 1,
+    substeps: int | None = None,
     method: OneStepMethod | None = None,
     noise: float | Sequence[float] | None = None,
     observed: Sequence[int] | None = None,
@@ -54,66 +68,83 @@ def fit(
     patience: int | None = None,
     seed: int = 0,
     also: Callable[[T], Any] | None = None,
-    positive: Callable[[T], Any] | None = None,
+    positive: Callable[[T], Any] | Sequence[str] | str | bool | None = None,
     checkpoint: str | os.PathLike | None = None,
     progress: bool | None = None,
 ) -> T:
-    """Return a copy of a system whose learned parts are fitted to trajectories.
+    """Return a copy of a system whose parameters or learned parts are fitted to trajectories.
 
-    The first phase matches the vector field to the derivatives of splines through the data. The second phase matches
-    the states at the ends of short runs from the data (multiple shooting), whose steps obey both discrete laws. Both
-    minimise by SOAP [Vyas et al. 2025], which is Adam in the eigenvectors of each layer's gradients, with a learning
-    rate that falls along a cosine. Equal arguments give equal results.
+    With ``parameters=`` a few numbers are fitted by least squares over whole trajectories, by the Levenberg-Marquardt
+    method with derivatives of the discrete flow. The initial states are fitted too. The first runs are short and then
+    grow (multiple shooting), so a guess that is wrong by tens of per cent does no harm. The steps are halved until the
+    parameters no longer depend on them. The result has standard errors, a covariance, the number of combinations that
+    the data determine, and whether the iteration has converged: see :class:`Training`. The standard errors assume that
+    the errors of the data are independent, and that the model can describe the data.
 
-    If at most 64 parameters are learned, none of them in networks of this module, a third phase follows: least squares
-    over whole trajectories by the Levenberg-Marquardt method, which fits the initial states too. It gives standard
-    errors of the parameters, the number of their combinations that the data determine, and whether the iteration has
-    converged: see :class:`Training`. The standard errors assume that the errors of the data are independent, and that
-    the model can describe the data.
+    Without ``parameters=`` the fit learns networks and marked parts. The first phase matches the vector field to the
+    derivatives of splines through the data. The second phase matches the states at the ends of short runs from the data
+    (multiple shooting), whose steps obey both discrete laws. Both minimise by SOAP [Vyas et al. 2025], which is Adam in
+    the eigenvectors of each layer's gradients, with a learning rate that falls along a cosine. If at most 64 numbers
+    are learned, none of them in networks of this module, the same least squares over whole trajectories follow. Equal
+    arguments give equal results.
 
     Parameters
     ----------
-    system : System
+    system : System, or function from a dict of parameters to a System
         Any system, such as :class:`Metriplectic`, in the units of the data. The fit learns its marked parts: the
         networks of this module are marked. The energy may not depend on time, and a torque is refused.
-    data : pair (t, x), list of them, or solutions
+    data : pair (t, x), list of them, solutions, or a table
         Times of shape (m,) at any spacing, and states of shape (m, n); or (trajectories, m, n) at the same times. They
-        are in the units of the system; the fit scales them by their spread.
+        are in the units of the system; the fit scales them by their spread. NaN is a missing value.
+
+        A table is a path of a CSV file, a DataFrame, a dataset of xarray, a dict of arrays, or the result of
+        :func:`read_data`, which has options. Columns are matched to a dict that ``observe`` returns, by name, or in
+        order. Units in their labels are converted to SI units.
+    parameters : dict from names to initial values, or sequence of names, optional
+        The numbers to fit, in the units of the system: arguments of the function ``system``; or parameters of a system,
+        such as ``["dissipation.rate", "energy.A"]``, from the values that it has.
     matching, shooting : int
-        Numbers of iterations of the two parts. If not all components are observed, there is no matching.
+        Numbers of iterations of the two parts, 2000 and 500 without ``parameters=``, else 0. If not all components are
+        observed, there is no matching. If both are 0, there are least squares only.
     rate : float
         Learning rate in the matching (dimensionless); the shooting uses 0.3 of it.
     batch : int, optional
         Points, or short runs, of one iteration: 256 and 32 by default.
     window : int
-        Intervals of a short run.
-    substeps : int
-        Steps of a run between two times of the data.
+        Intervals of a short run of the shooting.
+    substeps : int, optional
+        Steps of a run between two times of the data. By default one; with least squares only, as many as needed.
     method : OneStepMethod
         The method of the runs; by default ``MetriplecticRungeKutta(4)``, with one correction a step.
     noise : float, or array, shape (n,), optional
-        Standard deviation of the errors of the data (in their units), one number or one for each number observed.
-        Splines then smooth the data, losses are relative to it, and the fit also finds the initial states of the short
-        runs. By default it is estimated from the data, by differences that a motion does not have; errors below a
-        thousandth of the spread of the data are left out of account. 0 says that the data are exact.
+        Standard deviation of the errors of the data, one number or one for each number observed, in the units of the
+        system: in SI units for a table with units. Splines then smooth the data, losses are relative to it, and the fit
+        also finds the initial states of the short runs. By default it is estimated from the data, by differences that a
+        motion does not have; errors below a thousandth of the spread of the data are left out of account. Least squares
+        only take it from the residuals, where the differences do not show it. 0 says that the data are exact.
     observed : sequence of int, optional
         Indices of the components that were measured; the data then have shape (m, len(observed)).
-    observe : function of x, shape (n,), or of x and the attitude, shape (m, m); optional
-        What was measured, an array of any shape, in place of ``observed``: ``lambda x, R: R`` for attitudes. The data
-        then have shape (m, ...), in the units of what it returns; solutions are observed by it.
+    observe : function, optional
+        What was measured, in place of ``observed``: an array of any shape, or a dict from names of columns to numbers
+        or arrays, in the units of the data. It is a function of x, shape (n,), or of x and the attitude, shape (m, m):
+        ``lambda x, R: R`` for attitudes. With ``parameters=`` it is a function of (x), (x, parameters) or
+        (t, x, parameters), where parameters are a dict of those that are fitted; an argument that is called ``R`` or
+        ``attitude`` is the attitude. Solutions are observed by it.
 
         If states are not observed in full, the fit finds the initial ones: only the laws determine them. A system
         without networks begins with those that move as the data do. One with networks begins with zeros.
     validation : float, optional
         Fraction of the trajectories that is held out (of a single trajectory the end). The fit returns the weights that
-        do best there. By default a fifth, and 0 if not all components are observed.
+        do best there. By default a fifth, and 0 if not all components are observed, or with least squares only.
     patience : int, optional
         A part of the fit ends after this number of evaluations without improvement; there is one every 50 iterations.
     seed : int
         The seed of the batches and of the held-out data.
-    also, positive : function from a system to its arrays, optional
-        Further parameters to fit, such as ``also=lambda s: s.energy.A``. Those of ``positive``, such as
-        ``lambda s: s.dissipation.rate``, stay positive. They keep the units of the system.
+    also : function from a system to its arrays, optional
+        Further parameters to fit, such as ``also=lambda s: s.energy.A``, with the descent.
+    positive : bool, names, or function from a system to its arrays, optional
+        Of ``parameters=`` those that stay positive, True for all. Without ``parameters=`` further parameters to fit
+        that stay positive, such as ``lambda s: s.dissipation.rate``. They keep the units of the system.
     checkpoint : path, optional
         A file with the progress after each evaluation. If it exists, the fit continues from it, to the same result.
     progress : bool, optional
@@ -135,64 +166,114 @@ def fit(
     InputError
         If an argument or the data cannot be used, or nothing is learned, or the loss is not finite.
     FileError
-        If the checkpoint is of another fit, or cannot be written.
+        If the checkpoint is of another fit or cannot be written, or a table cannot be read.
+
+    Examples
+    --------
+    The friction of a spinning body, from its momenta at five times:
+
+    >>> body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
+    >>> run = lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 2.0), 0.1, save_every=4)
+    >>> guess = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.3)
+    >>> found = lt.learn.fit(guess, run, parameters=["dissipation.rate"], positive=True)
+    >>> float(found.dissipation.rate / body.dissipation.rate).__round__(5)
+    1.0
     """
     start_time = time.perf_counter()
-    if not isinstance(system, System):
-        raise InputError(f"fit needs a system such as lt.learn.Metriplectic(4), got {type(system).__name__}")
     if not isinstance(method, OneStepMethod | None):
         raise InputError(f"method must be a OneStepMethod such as lt.MetriplecticRungeKutta(4), got {method!r}")
     if not (_is_real_number(rate) and 0.0 < rate < np.inf):
         raise InputError(f"rate must be a positive number, got {rate!r}")
+    matching = DEFAULT_ITERATIONS["matching"] * (parameters is None) if matching is None else matching
+    shooting = DEFAULT_ITERATIONS["shooting"] * (parameters is None) if shooting is None else shooting
     counts = {"matching": matching, "shooting": shooting, "batch": batch, "window": window, "substeps": substeps}
     for name, value in {**counts, "patience": patience, "seed": seed}.items():
-        _check_count(name, value, 0 if name in BATCH_SIZES or name == "seed" else 1, name in ("batch", "patience"))
-    if system.is_driven:
+        optional = name in ("batch", "patience", "substeps")
+        _check_count(name, value, 0 if name in BATCH_SIZES or name == "seed" else 1, optional)
+    model, values, make_params = parameters_to_fit(system, parameters, also, positive)
+    if model.is_driven:
         raise InputError("fit needs a system without torques, whose energy does not depend on time")
-    observation = make_observation(system, observed, observe)
+    observation = make_observation(model, observed, observe, values)
     method = MetriplecticRungeKutta(4) if method is None else method
-    run = losses.differentiable_stepper(system, method, substeps, observation.group is not None).system
-    trajectories = [trajectory.flat_trajectory for trajectory in parse_trajectories(data, system, observation)]
+    n_substeps = 1 if substeps is None else substeps
+    run = losses.differentiable_stepper(model, method, n_substeps, observation.group is not None).system
+    trajectories = [trajectory.flat_trajectory for trajectory in parse_trajectories(data, model, observation, values)]
     data_scale = data_scales(trajectories)
     sigma = checked_noise(noise, data_scale.scale.size)
     noise_is_estimated = noise is None
+    is_estimated = None
     if noise_is_estimated:
-        sigma = estimate_noise(trajectories, data_scale.scale)
+        std, is_estimated = noise_levels(trajectories, data_scale.scale)
+        sigma = std if is_estimated.any() else None
     smoothed_trajectories = [spline_states_and_rates(trajectory, sigma) for trajectory in trajectories]
-    if observation.is_full_state or has_learned_parts(system):
+    if observation.is_full_state or has_learned_parts(model):
         starts = [default_states(observation, run, x) for x, _ in smoothed_trajectories]
     else:
-        starts = states_matching_rates(observation, run, smoothed_trajectories, data_scale.scale, data_scale.time_scale)
+        times_and_smoothed = [
+            (t, *smoothed) for (t, _), smoothed in zip(trajectories, smoothed_trajectories, strict=True)
+        ]
+        starts = states_matching_rates(
+            observation, run, times_and_smoothed, data_scale.scale, data_scale.time_scale, values
+        )
     states = np.concatenate(starts)
-    state_scale = data_scale.extend_to_states(observation.component_indices, states[:, : system.dim])
-    system = scale_networks(system, state_scale, states[:, : system.dim])
-    if not observation.is_full_state and validation:
+    state_scale = data_scale.extend_to_states(observation.component_indices, states[:, : model.dim])
+    model = scale_networks(model, state_scale, states[:, : model.dim])
+    if not observation.is_full_state and validation and matching + shooting:
         raise InputError(
             "validation= cannot be combined with observed= or observe=: the initial values of unobserved components "
             "are unknown"
         )
-    params = losses.parameter_vector(system, also, positive)
+    params = make_params(model)
     if not params.initial_values.size:
         raise InputError(
-            "the system has nothing to learn. Give it parts of lt.learn, or name parameters with also= or positive="
+            "the system has nothing to learn. Give it parts of lt.learn, or name parameters with parameters=, also= or "
+            "positive="
         )
-    held_out_fraction = (0.2 if observation.is_full_state else 0.0) if validation is None else validation
+    default_fraction = 0.2 if observation.is_full_state and matching + shooting else 0.0
+    held_out_fraction = default_fraction if validation is None else validation
     training_data, held_out_data = _split_held_out(
         list(zip(trajectories, starts, strict=True)), held_out_fraction, seed
     )
-    relative_noise = 1.0 if sigma is None else float(np.sqrt(np.mean((sigma / data_scale.scale) ** 2)))
-    attitude_units = np.ones(run.dim - system.dim)  # the numbers of an attitude
-    search_units = state_scale.scale.copy()
-    if sigma is not None and len(observation.component_indices):
-        search_units[observation.component_indices] = sigma
-    search_units = np.concatenate(
-        [search_units, relative_noise * np.ones(n_displacement_coordinates(run) - system.dim)]
-    )
-    units = (
-        data_scale.scale if sigma is None else sigma,
-        search_units,
-        relative_noise * np.concatenate([state_scale.scale, attitude_units]),
-    )
+
+    def units_for(sigma: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the units of the observations, of the search for initial states, and of gaps between runs."""
+        relative_noise = 1.0 if sigma is None else float(np.sqrt(np.mean((sigma / data_scale.scale) ** 2)))
+        search_units = state_scale.scale.copy()
+        if sigma is not None and len(observation.component_indices):
+            search_units[observation.component_indices] = sigma
+        attitude_search_units = relative_noise * np.ones(n_displacement_coordinates(run) - model.dim)
+        attitude_units = np.ones(run.dim - model.dim)  # the numbers of an attitude
+        return (
+            data_scale.scale if sigma is None else sigma,
+            np.concatenate([search_units, attitude_search_units]),
+            relative_noise * np.concatenate([state_scale.scale, attitude_units]),
+        )
+
+    shape = len(training_data), model.dim
+    can_be_refined = can_refine(params, model, trajectories, run, n_substeps)
+    if not matching and not shooting:
+        if not can_be_refined:
+            raise InputError(
+                f"least squares alone need at most {MAX_PARAMETERS} parameters, none of them in a network, and not too "
+                "many data. Give more than 0 iterations of the matching or the shooting"
+            )
+        if checkpoint is not None:
+            raise InputError("checkpoint= is for the matching and the shooting, which have no iterations. Remove it")
+        rates = [rates for _, rates in smoothed_trajectories]
+        problem = LeastSquaresProblem(
+            params,
+            method,
+            observation,
+            training_data,
+            held_out_data,
+            lambda sigma: units_for(sigma)[:2],
+            smooth_time_scale(rates, data_scale),
+        )
+        least_squares = fit_by_least_squares(problem, sigma, is_estimated, substeps)
+        refined, sigma, weights = least_squares.result, least_squares.noise, least_squares.result.weights
+        training = empty_training(params.initial_values.size, time.perf_counter() - start_time)
+        return _with_record(params, weights, training.with_estimates(params, refined, sigma, noise_is_estimated, shape))
+    units = units_for(sigma)
 
     def make_matching_objective(data: list) -> Objective:
         return losses.trajectory_matching_objective(params, [trajectory for trajectory, _ in data], sigma, state_scale)
@@ -201,7 +282,7 @@ def fit(
         windows = cut_windows(
             [trajectory for trajectory, _ in data], [params for _, params in data], window, finds_initial_states
         )
-        return losses.shooting_objective(params, method, windows, observation, units, substeps, finds_initial_states)
+        return losses.shooting_objective(params, method, windows, observation, units, n_substeps, finds_initial_states)
 
     phases = []
     if matching and observation.is_full_state:
@@ -232,10 +313,12 @@ def fit(
                 params.array_shapes,
             )
         )
-    settings = (matching, shooting, rate, batch, window, substeps, method, held_out_fraction, patience, seed)
+    settings = (matching, shooting, rate, batch, window, n_substeps, method, held_out_fraction, patience, seed)
     if not phases:
-        phase_text = "matching" if observation.is_full_state else "shooting, because the state is observed in part"
-        raise InputError(f"fit has no iterations. Give more than 0 of the {phase_text}")
+        raise InputError(
+            "fit has no iterations, because the matching needs states that are observed in full. Give more than 0 of "
+            "the shooting"
+        )
     data_arrays = [values for trajectory in trajectories for values in trajectory]
     training_run = TrainingRun(
         phases,
@@ -245,7 +328,7 @@ def fit(
             params.initial_values,
             sigma,
             observation.component_indices,
-            *observation.fingerprint_parts(run),
+            *observation.fingerprint_parts(run, values),
             repr(settings),
         ),
     )
@@ -253,13 +336,9 @@ def fit(
     if path is not None and path.exists():
         training_run.restore(path)
     training_run.run(seed, patience, path, progress)
-    weights, refined = training_run.weights, None
-    if (
-        shooting
-        and can_refine(params, system, trajectories, run, substeps)
-        and "interrupted" not in training_run.ended.values()
-    ):
-        initial_states = _fitted_initial_states(
+    weights, refined_or_none = training_run.weights, None
+    if shooting and can_be_refined and "interrupted" not in training_run.ended.values():
+        first_states = _fitted_initial_states(
             training_run.best_vector,
             params,
             training_data,
@@ -267,17 +346,65 @@ def fit(
             finds_initial_states,
             observation,
             run,
-            search_units,
+            units[1],
         )
-        trajectories_and_held_out = [pair[0] for pair in (*training_data, *held_out_data)]
-        runs = pad_runs(trajectories_and_held_out, [*initial_states, *(states[0] for _, states in held_out_data)])
-        is_held_out = np.arange(len(trajectories_and_held_out)) >= len(training_data)
-        refined = refine_by_least_squares(params, weights, method, runs, is_held_out, observation, units[:2], substeps)
-        weights = refined.weights
-    fitted = cast(T, params.build_system(jnp.asarray(weights)))
-    training = training_run.training_record(time.perf_counter() - start_time).with_estimates(
-        params, refined, sigma, noise_is_estimated
+        pairs = [*training_data, *held_out_data]
+        runs = pad_runs([trajectory for trajectory, _ in pairs], [states for _, states in pairs])
+        runs.states[: len(first_states), 0] = first_states
+        is_held_out = np.arange(len(pairs)) >= len(training_data)
+        run_model = RunModel(params, method, observation)
+        refined_or_none = refine_by_least_squares(
+            run_model, weights, runs, whole_trajectories(runs), is_held_out, units[:2], n_substeps
+        )
+        weights = refined_or_none.weights
+    training = training_run.training_record(time.perf_counter() - start_time)
+    return _with_record(
+        params, weights, training.with_estimates(params, refined_or_none, sigma, noise_is_estimated, shape)
     )
+
+
+def parameters_to_fit(system: Any, parameters: Any, also: Any, positive: Any) -> tuple[System, Any, Callable]:
+    """Return the system to fit, the initial values of its named parameters or None, and a function from a system like
+    it to the vector of its parameters.
+
+    Raises
+    ------
+    InputError
+        If the arguments do not choose parameters of a system.
+    """
+    if parameters is None:
+        if not isinstance(system, System):
+            hint = ". A function that builds systems needs parameters=" if callable(system) else ""
+            raise InputError(f"fit needs a system such as lt.learn.Metriplectic(4), got {type(system).__name__}{hint}")
+        if positive is not None and not callable(positive):
+            raise InputError(f"positive must be a function of the system if parameters= is not given, got {positive!r}")
+        return system, None, lambda system: losses.parameter_vector(system, also, positive)
+    if also is not None:
+        raise InputError("also= and parameters= cannot be combined. Name all parameters to fit in parameters=")
+    values = initial_parameters(system, parameters)
+    example_system = build_checked(system, values)
+    if has_learned_parts(example_system):
+        raise InputError("parameters= are for systems without parts of lt.learn. Fit networks with also= and positive=")
+    return example_system, values, lambda _: named_parameter_vector(system, values, positive)
+
+
+def _with_record(params: losses.ParameterVector, weights: np.ndarray, training: Training) -> Any:
+    """Return the fitted system with the record of the fit, and warn of its problems.
+
+    Raises
+    ------
+    InputError
+        If there is no system with the fitted parameters, such as one with a negative friction.
+    """
+    try:
+        fitted = params.build_system(jnp.asarray(weights))
+    except (LiethermoError, ManifoldsError) as error:
+        values = np.where(params.is_log, np.exp(weights), weights)
+        text = ", ".join(f"{name} = {value:.3g}" for name, value in zip(params.names, values, strict=True))
+        raise InputError(
+            f"the least squares end at {text}, with which no system can be built: {error}. Keep such parameters "
+            "positive with positive=, or begin with other initial values"
+        ) from error
     object.__setattr__(fitted, "training", training)
     for problem in training.problems:
         warn(problem, FitWarning)

@@ -19,7 +19,7 @@ from ..runs.integrate import integrate
 from ..systems import System
 from . import losses
 from .data import Trajectory, data_scales, estimate_noise, parse_trajectories
-from .fitting import checked_noise, fit
+from .fitting import checked_noise, fit, parameters_to_fit
 from .observation import make_observation
 from .training import FitWarning
 
@@ -209,9 +209,9 @@ def several(
     previous_draws: set[tuple[int, ...]] = set()
     for fit_seed in range(seed, seed + number):
         system, random = build(fit_seed), np.random.default_rng(fit_seed)
-        trajectories = parse_trajectories(
-            data, system, make_observation(system, how.get("observed"), how.get("observe"))
-        )
+        example, values, _ = parameters_to_fit(system, how.get("parameters"), how.get("also"), how.get("positive"))
+        observation = make_observation(example, how.get("observed"), how.get("observe"), values)
+        trajectories = parse_trajectories(data, example, observation, values)
         sigma = (
             _noise_std(trajectories, how.get("noise"))
             if resample and len(trajectories) < MIN_BOOTSTRAP_TRAJECTORIES

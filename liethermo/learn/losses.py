@@ -20,7 +20,7 @@ from ..systems import System
 from .data import DataScales, Trajectory, Windows, spline_states_and_rates
 from .model import copy_entropy_to_poisson
 from .networks import learned_mask
-from .observation import Observation
+from .observation import Observation, entry_names
 from .parts import Poisson
 
 MEAN_SQUARE_RATE_FLOOR = 0.1
@@ -42,6 +42,7 @@ class ParameterVector(NamedTuple):
         Name of each number in the system: ``"dissipation.rate"``, ``"energy.A[0]"``.
     is_log : array of bool, shape (p,)
         True for logarithms.
+    parameters_of : function from such a vector to the parameters that an observation depends on, a dict or None
     """
 
     initial_values: np.ndarray
@@ -49,6 +50,7 @@ class ParameterVector(NamedTuple):
     build_system: Callable[[Any], Any]
     names: tuple[str, ...] = ()
     is_log: np.ndarray = np.zeros(0, bool)
+    parameters_of: Callable[[Any], dict[str, Any] | None] = lambda vector: None
 
 
 def parameter_vector(system: System, also: Callable | None = None, positive: Callable | None = None) -> ParameterVector:
@@ -77,20 +79,15 @@ def parameter_vector(system: System, also: Callable | None = None, positive: Cal
         np.asarray(initial_values),
         shapes,
         build_system,
-        _entry_names(logs_and_values),
+        _leaf_entry_names(logs_and_values),
         np.arange(initial_values.size) < count,
     )
 
 
-def _entry_names(trees: tuple) -> tuple[str, ...]:
+def _leaf_entry_names(trees: tuple) -> tuple[str, ...]:
     """Return the name of each number in some trees, such as ``energy.A[0]``, in order."""
-    names: list[str] = []
-    for tree in trees:
-        for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
-            name = jax.tree_util.keystr(path).lstrip(".")
-            shape = np.shape(leaf)
-            names += [name + (f"[{', '.join(map(str, i))}]" if shape else "") for i in np.ndindex(shape)]
-    return tuple(names)
+    leaves = [leaf for tree in trees for leaf in jax.tree_util.tree_leaves_with_path(tree)]
+    return tuple(name for path, leaf in leaves for name in entry_names({jax.tree_util.keystr(path).lstrip("."): leaf}))
 
 
 class Objective(NamedTuple):
@@ -167,8 +164,8 @@ def shooting_objective(
     count, length = windows.intervals.shape
 
     def loss(vector, arrays, indices):
-        initial_guess, intervals, observations, next_window = arrays
-        system = params.build_system(vector[:p])
+        initial_guess, intervals, observations, times, next_window = arrays
+        system, values = params.build_system(vector[:p]), params.parameters_of(vector[:p])
         run, begin, advance, state_of = differentiable_stepper(system, method, substeps, observation.group is not None)
 
         def run_window(x, h):
@@ -178,8 +175,14 @@ def shooting_objective(
 
             return jax.lax.scan(advance_over_interval, begin(x), h)[1]
 
-        def observe_states(states):
-            return jax.vmap(lambda x: observation.observe(run, x))(states)
+        def squares(states, i, j):
+            """Return the mean square of the residuals of states at times j of the windows i, without missing values."""
+            predictions = jax.vmap(lambda x, t: observation.observe(run, x, t, values))
+            predictions = predictions if states.ndim == 2 else jax.vmap(predictions)
+            values_of_windows = observations[i, j]
+            residuals = (predictions(states, times[i, j]) - jnp.nan_to_num(values_of_windows)) / data_unit
+            is_present = ~jnp.isnan(values_of_windows)
+            return jnp.sum(jnp.where(is_present, residuals, 0.0) ** 2) / jnp.maximum(jnp.sum(is_present), 1)
 
         displacements = vector[p:].reshape(count, -1) * search_unit if finds_initial_states else None
 
@@ -192,18 +195,18 @@ def shooting_objective(
 
         start_states = initial_states(indices)
         path = jax.vmap(run_window)(start_states, intervals[indices])
-        path_loss = jnp.mean(((jax.vmap(observe_states)(path) - observations[indices, 1:]) / data_unit) ** 2)
+        path_loss = squares(path, indices, slice(1, None))
         if displacements is None:
             return path_loss
-        initial_loss = jnp.mean(((observe_states(start_states) - observations[indices, 0]) / data_unit) ** 2) / length
+        initial_loss = squares(start_states, indices, 0) / length
         next_indices = next_window[indices]
         gaps = jnp.where(next_indices[:, None] >= 0, (path[:, -1] - initial_states(next_indices)) / gap_unit, 0.0)
         return path_loss + initial_loss + jnp.mean(gaps**2)
 
-    arrays = tuple(
-        map(jnp.asarray, (windows.initial_states, windows.intervals, windows.observations, windows.next_window))
+    arrays = windows.initial_states, windows.intervals, windows.observations, windows.times, windows.next_window
+    return Objective(
+        loss, tuple(map(jnp.asarray, arrays)), count, np.zeros(count * search_unit.size if finds_initial_states else 0)
     )
-    return Objective(loss, arrays, count, np.zeros(count * search_unit.size if finds_initial_states else 0))
 
 
 class DifferentiableStepper(NamedTuple):
@@ -224,9 +227,11 @@ class DifferentiableStepper(NamedTuple):
 
 
 def differentiable_stepper(
-    system: System, method: OneStepMethod, substeps: int, has_attitude: bool = False
+    system: System, method: OneStepMethod, substeps: int | jax.Array, has_attitude: bool = False
 ) -> DifferentiableStepper:
     """Return a prepared system, and the functions that start, advance and read a differentiable run of it.
+
+    A traced number of substeps permits derivatives in forward mode only.
 
     Raises
     ------
@@ -248,6 +253,8 @@ def differentiable_stepper(
         return differentiable_step(prepared_system, method, carry, h)
 
     def advance(carry, h):
+        if isinstance(substeps, jax.Array):
+            return jax.lax.fori_loop(0, substeps, lambda _, carry: step(carry, h / substeps), carry)
         if substeps == 1:
             return step(carry, h)
         return jax.lax.scan(lambda carry, _: (step(carry, h / substeps), None), carry, length=substeps)[0]

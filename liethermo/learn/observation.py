@@ -1,10 +1,11 @@
-"""Observations of a state: all components, some components, or a function of the state and the attitude."""
+"""Observations: all components of a state, some of them, or a function of state, attitude, time and parameters."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -41,7 +42,7 @@ class Observation(NamedTuple):
 
     Attributes
     ----------
-    function : function of x, shape (n,), or of x and the attitude, shape (m, m)
+    function : function of x, shape (n,), the attitude, shape (m, m), or None, the time, and the parameters
     shape : tuple of int
         Shape of one observation.
     component_indices : array of int
@@ -50,6 +51,8 @@ class Observation(NamedTuple):
         Group of the observed attitude.
     is_full_state : bool
         True if the whole state is observed, in the form of the system.
+    names : tuple of str
+        Names of the observed numbers; empty if they have none.
     """
 
     function: Callable
@@ -57,16 +60,19 @@ class Observation(NamedTuple):
     component_indices: np.ndarray
     group: mf.MatrixGroup | None
     is_full_state: bool
+    names: tuple[str, ...] = ()
 
-    def observe(self, prepared_system: System, state) -> jax.Array:
-        """Return the observation of a state of a run, as a flat array."""
-        parts = prepared_system.split_state(state) if isinstance(prepared_system, AttitudeSystem) else (state,)
-        return jnp.ravel(jnp.asarray(self.function(*parts)))
+    def observe(self, prepared_system: System, state, t, parameters) -> jax.Array:
+        """Return the observation of a state of a run at a time, as a flat array."""
+        x, attitude = (
+            prepared_system.split_state(state) if isinstance(prepared_system, AttitudeSystem) else (state, None)
+        )
+        return jnp.ravel(self.function(x, attitude, t, parameters))
 
-    def fingerprint_parts(self, prepared_system: System) -> list:
+    def fingerprint_parts(self, prepared_system: System, parameters) -> list:
         """Return the jaxpr and the constants of the observation, which identify it."""
-        jaxpr = jax.make_jaxpr(lambda state: self.observe(prepared_system, state))(
-            jnp.asarray(default_states(self, prepared_system, self.zero_observations)[0])
+        jaxpr = jax.make_jaxpr(lambda state, t: self.observe(prepared_system, state, t, parameters))(
+            jnp.asarray(default_states(self, prepared_system, self.zero_observations)[0]), jnp.zeros(())
         )
         return [str(jaxpr.jaxpr), *map(np.asarray, jaxpr.consts)]
 
@@ -74,7 +80,7 @@ class Observation(NamedTuple):
     def zero_observations(self) -> np.ndarray:
         return np.zeros((1, int(np.prod(self.shape))))
 
-    def observe_solution(self, solution: Solution) -> jax.Array:
+    def observe_solution(self, solution: Solution, parameters) -> jax.Array:
         """Return the observations along a solution, shape (m, ...).
 
         Raises
@@ -82,11 +88,12 @@ class Observation(NamedTuple):
         InputError
             If attitudes are observed and the solution has none.
         """
+        x, t = jnp.asarray(solution.x), jnp.asarray(solution.t)
         if self.group is None:
-            return jax.vmap(self.function)(jnp.asarray(solution.x))
+            return jax.vmap(lambda x, t: self.function(x, None, t, parameters))(x, t)
         if solution.attitude is None:
             raise InputError("observe needs an attitude, and a solution in the data has none")
-        return jax.vmap(self.function)(jnp.asarray(solution.x), jnp.asarray(solution.attitude))
+        return jax.vmap(lambda x, R, t: self.function(x, R, t, parameters))(x, jnp.asarray(solution.attitude), t)
 
     def displace(self, prepared_system: System, state, z) -> jax.Array:
         """Return the state displaced by coordinates z: ``x + z``, and ``g exp(hat(z))`` with the remaining
@@ -101,8 +108,18 @@ class Observation(NamedTuple):
         return prepared_system.join_state(x + z[:n], g @ group.exp_map(group.algebra, z[n:]))
 
 
-def make_observation(system: System, observed: Sequence[int] | None, observe: Callable | None) -> Observation:
+def make_observation(
+    system: System,
+    observed: Sequence[int] | None,
+    observe: Callable | None,
+    parameters: Mapping[str, Any] | None = None,
+) -> Observation:
     """Return the observation that the arguments ``observed`` and ``observe`` of a fit describe.
+
+    Parameters
+    ----------
+    parameters : dict of arrays, optional
+        Parameters of the fit, which ``observe`` may depend on.
 
     Raises
     ------
@@ -110,28 +127,93 @@ def make_observation(system: System, observed: Sequence[int] | None, observe: Ca
     """
     if observe is None:
         indices = _component_indices(observed, system.dim)
-        return Observation(lambda x: x[indices], (len(indices),), indices, None, observed is None)
+        return Observation(lambda x, *arguments: x[indices], (len(indices),), indices, None, observed is None)
     if observed is not None:
         raise InputError("observed= and observe= cannot be combined. Give component numbers or a function of the state")
-    n_arguments = required_argument_count(observe) if callable(observe) else 0
-    if n_arguments not in (1, 2):
+    kinds = _argument_kinds(observe, parameters is not None)
+    group = system.matrix_group if "attitude" in kinds else None
+    if "attitude" in kinds and group is None:
         raise InputError(
-            "observe must be a function of the state, or of the state and the attitude, such as lambda x, R: R"
+            "observe needs an attitude. Give the system a group, such as group=mf.SO(3); or, for a function of state "
+            "and parameters, give parameters="
         )
-    group = system.matrix_group if n_arguments == 2 else None
-    if n_arguments == 2 and group is None:
-        raise InputError("observe needs an attitude. Give the system a group, such as group=mf.SO(3)")
-    parts = [jnp.zeros(system.dim)] if group is None else [jnp.zeros(system.dim), group.identity]
+
+    def function(x, attitude, t, parameters):
+        values = {"x": x, "attitude": attitude, "t": t, "parameters": parameters}
+        return _as_array(observe(*(values[kind] for kind in kinds)))
+
+    zero_state = jnp.zeros(system.dim), None if group is None else group.identity, jnp.zeros(())
+    names: list[str] = []
     try:
-        output_shape = checked_result_shapes(lambda *parts: jnp.asarray(observe(*parts)), *parts)
+
+        def evaluate(*arrays):
+            parts = dict(zip(("x", "attitude", "t", "parameters"), arrays, strict=True))
+            result = observe(*(parts[kind] for kind in kinds))
+            names[:] = list(entry_names(result)) if isinstance(result, Mapping) else []
+            return _as_array(result)
+
+        output_shape = checked_result_shapes(evaluate, *zero_state, parameters)
     except IndexOutOfRangeError as error:
         raise error.with_function(f"observe, at a state of shape ({system.dim},),") from None
+    except KeyError as error:
+        names_text = ", ".join(parameters or {})
+        raise InputError(f"observe uses the parameter {error}, but the parameters are {names_text}") from None
     except TRACE_ERRORS as error:
         description = f"observe could not be evaluated on a state of shape ({system.dim},)"
         raise FunctionError(trace_error_message(description, error)) from error
     if not jnp.issubdtype(output_shape.dtype, jnp.floating):
         raise FunctionError(f"observe must return real numbers, not {output_shape.dtype}")
-    return Observation(observe, output_shape.shape, np.zeros(0, int), group, False)
+    return Observation(function, output_shape.shape, np.zeros(0, int), group, False, tuple(names))
+
+
+ATTITUDE_NAMES = ("R", "attitude")
+"""Names of an argument of ``observe`` that is the attitude, where a fit has parameters."""
+
+
+def _argument_kinds(observe: Any, has_parameters: bool) -> tuple[str, ...]:
+    """Return what each argument of ``observe`` is: ``"x"``, ``"attitude"``, ``"t"`` or ``"parameters"``.
+
+    Raises
+    ------
+    InputError
+    """
+    count = required_argument_count(observe) if callable(observe) else 0
+    if not has_parameters:
+        if count not in (1, 2):
+            raise InputError(
+                "observe must be a function of the state, or of the state and the attitude, such as lambda x, R: R; "
+                "with parameters= also of (x, parameters) or (t, x, parameters)"
+            )
+        return ("x", "attitude")[:count]
+    kinds: dict[int, tuple[str, ...]] = {1: ("x",), 2: ("x", "parameters"), 3: ("t", "x", "parameters")}
+    names = list(inspect.signature(observe).parameters)[:count] if count else []
+    positions = [i for i, name in enumerate(names) if name in ATTITUDE_NAMES]
+    remaining = (count or 0) - len(positions)
+    if remaining not in kinds or len(positions) > 1:
+        raise InputError(
+            "observe must be a function of (x), (x, parameters) or (t, x, parameters), and of the attitude if one of "
+            f"these is called R; got {observe!r}"
+        )
+    result = list(kinds[remaining])
+    for i in positions:
+        result.insert(i, "attitude")
+    return tuple(result)
+
+
+def _as_array(result: Any) -> jax.Array:
+    """Return an observation as an array; a dict of observed numbers by name as the numbers in a row."""
+    if isinstance(result, Mapping):
+        return jnp.concatenate([jnp.ravel(jnp.asarray(value, dtype=jnp.float64)) for value in result.values()])
+    return jnp.asarray(result)
+
+
+def entry_names(arrays: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the name of each number in a dict of arrays: ``omega[0]`` for the entries of an array, in order."""
+    return tuple(
+        str(name) + (f"[{', '.join(map(str, index))}]" if np.ndim(value) else "")
+        for name, value in arrays.items()
+        for index in np.ndindex(np.shape(value))
+    )
 
 
 def _component_indices(observed: Sequence[int] | None, dim: int) -> np.ndarray:
@@ -167,9 +249,10 @@ def default_states(observation: Observation, prepared_system: System, observatio
 def states_matching_rates(
     observation: Observation,
     prepared_system: System,
-    data: list[tuple[np.ndarray, np.ndarray]],
+    data: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
     unit: np.ndarray,
     time_scale: float,
+    parameters: Mapping[str, Any] | None,
 ) -> list[np.ndarray]:
     """Return the states of each trajectory, shape (m, N), whose observations and rates match the data.
 
@@ -178,38 +261,36 @@ def states_matching_rates(
 
     Parameters
     ----------
-    data : list of pairs of arrays, shape (m, k)
-        Observations and their rates of change.
+    data : list of three arrays each, shapes (m,), (m, k) and (m, k)
+        Times, observations and their rates of change.
     unit : array, shape (k,)
         Scales of the observations.
     time_scale : float
         Time in which the observations change by their scales.
+    parameters : dict of arrays or None
+        Parameters on which the observations depend.
     """
     zero, scale = jnp.zeros(n_displacement_coordinates(prepared_system)), np.tile(unit, 2)
 
-    def residual(z, base_state, y, observed_rate):
-        def observe(state):
-            return observation.observe(prepared_system, state)
+    def residual(z, base_state, t, y, observed_rate):
+        def observe(state, t):
+            return observation.observe(prepared_system, state, t, parameters)
 
-        observed_values, rate = jax.jvp(
-            observe, (x := observation.displace(prepared_system, base_state, z),), (prepared_system._vector_field(x),)
-        )
+        x = observation.displace(prepared_system, base_state, z)
+        observed_values, rate = jax.jvp(observe, (x, t), (prepared_system._vector_field(x), jnp.ones_like(t)))
         return jnp.concatenate([observed_values - y, time_scale * (rate - observed_rate)]) / scale
 
-    def solve_state(state, observed_values, observed_rate):
+    def solve_state(state, *data_at_time):
         def step(carry, _):
             state, damping = carry
-            r, J = (
-                residual(zero, state, observed_values, observed_rate),
-                jax.jacfwd(residual)(zero, state, observed_values, observed_rate),
-            )
+            r, J = residual(zero, state, *data_at_time), jax.jacfwd(residual)(zero, state, *data_at_time)
             square = J.T @ J
             weights = jnp.diag(square)
             weights = jnp.where(weights > 0.0, weights, 1.0)  # coordinates without effect do not move
             new_state = observation.displace(
                 prepared_system, state, -jnp.linalg.solve(square + damping * jnp.diag(weights), J.T @ r)
             )
-            is_better = jnp.sum(residual(zero, new_state, observed_values, observed_rate) ** 2) < jnp.sum(r**2)
+            is_better = jnp.sum(residual(zero, new_state, *data_at_time) ** 2) < jnp.sum(r**2)
             return (
                 jnp.where(is_better, new_state, state),
                 damping * jnp.where(is_better, DAMPING_DECREASE, DAMPING_INCREASE),
@@ -217,22 +298,19 @@ def states_matching_rates(
 
         return jax.lax.scan(step, (state, INITIAL_DAMPING), length=LEVENBERG_ITERATIONS)[0][0]
 
-    def solve_states_in_turn(start, observations, observation_rates):
-        def step(state, observation_and_rate):
-            state = solve_state(state, *observation_and_rate)
+    def solve_states_in_turn(start, data_of_trajectory):
+        def step(state, data_at_time):
+            state = solve_state(state, *data_at_time)
             return state, state
 
-        return jax.lax.scan(step, start, (observations, observation_rates))[1]
+        return jax.lax.scan(step, start, data_of_trajectory)[1]
 
     @functools.partial(jax.jit, compiler_options=fast_compile_options())
-    def solve_trajectory(initial_guesses, observations, observation_rates):
-        first_states = jax.vmap(lambda state: solve_state(state, observations[0], observation_rates[0]))(
-            initial_guesses
-        )
-        costs = jax.vmap(lambda state: jnp.sum(residual(zero, state, observations[0], observation_rates[0]) ** 2))(
-            first_states
-        )
-        return solve_states_in_turn(first_states[jnp.argmin(costs)], observations, observation_rates)
+    def solve_trajectory(initial_guesses, *data_of_trajectory):
+        first = [values[0] for values in data_of_trajectory]
+        first_states = jax.vmap(lambda state: solve_state(state, *first))(initial_guesses)
+        costs = jax.vmap(lambda state: jnp.sum(residual(zero, state, *first) ** 2))(first_states)
+        return solve_states_in_turn(first_states[jnp.argmin(costs)], data_of_trajectory)
 
     random_displacements = np.random.default_rng(0).standard_normal((N_INITIAL_ATTITUDES, len(zero))) * (
         np.arange(len(zero)) >= dim_without_attitude(prepared_system)
@@ -240,12 +318,12 @@ def states_matching_rates(
     random_displacements[0] = 0.0
     random_displacements = random_displacements[: 1 if observation.group is None else N_INITIAL_ATTITUDES]
     states = []
-    for observations, rates in data:
+    for t, observations, rates in data:
         start = jnp.asarray(default_states(observation, prepared_system, observations[:1])[0])
         starts = jax.vmap(lambda z, start=start: observation.displace(prepared_system, start, z))(
             jnp.asarray(random_displacements)
         )
-        states.append(np.asarray(solve_trajectory(starts, jnp.asarray(observations), jnp.asarray(rates))))
+        states.append(np.asarray(solve_trajectory(starts, *map(jnp.asarray, (t, observations, rates)))))
     return states
 
 

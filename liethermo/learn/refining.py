@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -28,6 +27,9 @@ MAX_ITERATIONS = 60
 NEWTON_STEP_TOLERANCE = 1e-2
 """Newton step of the learned parameters, in standard errors, below which the iteration has converged."""
 
+EXACT_RTOL = 1e-7
+"""Residual, relative to the data, below which the data count as described exactly: rounding in single precision."""
+
 SCHUR_RTOL = 1e-12
 """Eigenvalue of the normal matrix, scaled to a unit diagonal, below which a combination is undetermined."""
 
@@ -38,6 +40,9 @@ unobserved entropy, would move without bounds. It acts on steps and errors, not 
 
 MAX_LOG_STEP = 2.0
 """Largest change of the logarithm of a parameter in one iteration."""
+
+MAX_LOG_DECREASE = 25.0
+"""Decrease of the logarithm of a parameter at which the iteration stops: the data want it to be zero or negative."""
 
 INITIAL_DAMPING = 1e-3
 """Damping of the first iteration, relative to the diagonal of the normal matrix."""
@@ -57,19 +62,43 @@ class PaddedRuns(NamedTuple):
 
     Attributes
     ----------
-    initial_states : array, shape (B, N)
-        Initial states of the runs.
+    states : array, shape (B, m + 1, N)
+        Guesses of the states at all times; a run starts from those at the starts of its pieces.
     intervals : array, shape (B, m)
         Time intervals; after the end of a trajectory its last interval is repeated.
     observations : array, shape (B, m + 1, k)
-        Observations, zeros after the end.
-    is_observed : array of bool, shape (B, m + 1)
+        Observations, zeros where a value is missing and after the end.
+    is_observed : array of bool, shape (B, m + 1, k)
+    times : array, shape (B, m + 1)
     """
 
-    initial_states: jax.Array
-    intervals: jax.Array
-    observations: jax.Array
-    is_observed: jax.Array
+    states: np.ndarray
+    intervals: np.ndarray
+    observations: np.ndarray
+    is_observed: np.ndarray
+    times: np.ndarray
+
+
+class Piece(NamedTuple):
+    """Consecutive times of a trajectory that one run from an initial state of its own describes.
+
+    Attributes
+    ----------
+    run : int
+        Index of the trajectory.
+    start, stop : int
+        Index of the first time, and of the first time after the piece.
+    """
+
+    run: int
+    start: int
+    stop: int
+
+
+def whole_trajectories(runs: PaddedRuns) -> list[Piece]:
+    """Return one piece for each trajectory."""
+    n_runs, n_times = runs.times.shape
+    return [Piece(i, 0, n_times) for i in range(n_runs)]
 
 
 class LeastSquaresResult(NamedTuple):
@@ -92,6 +121,12 @@ class LeastSquaresResult(NamedTuple):
         Norm of the derivative of ln(loss) by the weights.
     converged : bool
     iterations : int
+    degrees_of_freedom : int
+        Number of observations minus the number of determined unknowns.
+    states : array, shape (B, m + 1, N)
+        The states of the runs, fitted at the starts of the pieces.
+    mean_squares : array, shape (k,)
+        Mean square of the residuals of each observed number, by degrees of freedom, in the units of the fit.
     """
 
     weights: np.ndarray
@@ -103,6 +138,9 @@ class LeastSquaresResult(NamedTuple):
     gradient_norm: float
     converged: bool
     iterations: int
+    degrees_of_freedom: int
+    states: np.ndarray
+    mean_squares: np.ndarray
 
 
 def can_refine(params: ParameterVector, system: Any, data: list[Trajectory], prepared_system, substeps: int) -> bool:
@@ -121,86 +159,216 @@ def _is_perceptron(part: Any) -> bool:
     return isinstance(part, Perceptron)
 
 
-def pad_runs(data: list[Trajectory], initial_states: list[np.ndarray]) -> PaddedRuns:
-    """Return trajectories and their initial states as arrays of one shape."""
+def pad_runs(data: list[Trajectory], states: list[np.ndarray]) -> PaddedRuns:
+    """Return trajectories and guesses of their states, shape (m, N), as arrays of one shape."""
     length = max(len(t) for t, _ in data)
-    intervals, observations, is_observed = [], [], []
-    for t, x in data:
+    rows = []
+    for (t, x), trajectory_states in zip(data, states, strict=True):
         n_missing = length - len(t)
-        intervals.append(np.append(np.diff(t), np.full(n_missing, t[-1] - t[-2])))
-        observations.append(np.concatenate([x, np.zeros((n_missing, x.shape[1]))]))
-        is_observed.append(np.arange(length) < len(t))
-    arrays = np.stack(initial_states), np.stack(intervals), np.stack(observations), np.stack(is_observed)
-    return PaddedRuns(*map(jnp.asarray, arrays))
+        intervals = np.append(np.diff(t), np.full(n_missing, t[-1] - t[-2]))
+        rows.append(
+            (
+                np.concatenate([trajectory_states, np.repeat(trajectory_states[-1:], n_missing, axis=0)]),
+                intervals,
+                np.concatenate([np.nan_to_num(x), np.zeros((n_missing, x.shape[1]))]),
+                np.concatenate([~np.isnan(x), np.zeros((n_missing, x.shape[1]), bool)]),
+                np.concatenate([t, t[-1] + intervals[-1] * np.arange(1, n_missing + 1)]),
+            )
+        )
+    return PaddedRuns(*map(np.stack, zip(*rows, strict=True)))
+
+
+class RunModel:
+    """The observations of runs and their derivatives, in one compiled program for all pieces and steps.
+
+    Parameters
+    ----------
+    params : ParameterVector
+    method : OneStepMethod
+    observation : Observation
+    """
+
+    def __init__(self, params: ParameterVector, method: OneStepMethod, observation: Observation):
+        self.params, self.method, self.observation = params, method, observation
+        initial_weights = jnp.asarray(params.initial_values)
+        system = self._stepper(initial_weights, 1).system
+        self.n_coordinates = n_displacement_coordinates(system)
+        self._evaluate = jax.jit(self._predictions_of_runs, compiler_options=fast_compile_options())
+        self._displace = jax.jit(
+            jax.vmap(lambda x, z: observation.displace(self._stepper(initial_weights, 1).system, x, z))
+        )
+
+    def _stepper(self, weights, substeps):
+        has_attitude = self.observation.group is not None
+        return differentiable_stepper(self.params.build_system(weights), self.method, substeps, has_attitude)
+
+    def displace(self, states: np.ndarray, displacements: np.ndarray) -> np.ndarray:
+        """Return states displaced by coordinates, one row each."""
+        return np.asarray(self._displace(jnp.asarray(states), jnp.asarray(displacements)))
+
+    def predict(
+        self, weights: np.ndarray, runs: PaddedRuns, states: np.ndarray, pieces: list[Piece], substeps: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the observations of runs, shape (B, m + 1, k), and their derivatives by the weights and by the
+        displacement of the initial state of their own piece, shape (B, m + 1, k, p + c)."""
+        is_start = np.zeros(runs.times.shape, bool)
+        for piece in pieces:
+            is_start[piece.run, piece.start] = True
+        arrays = states, is_start, runs.intervals, runs.times
+        values, derivatives = self._evaluate(jnp.asarray(weights), substeps, *map(jnp.asarray, arrays))
+        return np.asarray(values), np.asarray(derivatives)
+
+    def _predictions(self, weights, z, substeps, states, is_start, intervals, times):
+        run, init, advance, get_state = self._stepper(weights, substeps)
+        values = self.params.parameters_of(weights)
+
+        def next_carry(carry, slot):
+            h, state, starts_here, t = slot
+            fresh = init(self.observation.displace(run, state, z))
+            carry = jax.tree_util.tree_map(lambda a, b: jnp.where(starts_here, a, b), fresh, advance(carry, h))
+            return carry, self.observation.observe(run, get_state(carry), t, values)
+
+        first = init(self.observation.displace(run, states[0], z))
+        first_observation = self.observation.observe(run, get_state(first), times[0], values)
+        slots = intervals, states[1:], is_start[1:], times[1:]
+        return jnp.concatenate([first_observation[None], jax.lax.scan(next_carry, first, slots)[1]])
+
+    def _predictions_of_runs(self, weights, substeps, *arrays):
+        p = weights.size
+
+        def value_and_derivative(arrays):
+            def predict_from(v):
+                predictions = self._predictions(weights + v[:p], v[p:], substeps, *arrays)
+                return predictions, predictions
+
+            derivative, value = jax.jacfwd(predict_from, has_aux=True)(jnp.zeros(p + self.n_coordinates))
+            return value, derivative
+
+        return jax.lax.map(value_and_derivative, arrays, batch_size=min(len(arrays[0]), 16))
+
+
+class NormalEquations(NamedTuple):
+    """``J^T J``, ``J^T r`` and the squares of the residuals r of each piece, the weights first.
+
+    Attributes
+    ----------
+    squares : array, shape (pieces, p + c, p + c)
+    slopes : array, shape (pieces, p + c)
+    column_costs : array, shape (pieces, k)
+    """
+
+    squares: np.ndarray
+    slopes: np.ndarray
+    column_costs: np.ndarray
+
+    @property
+    def costs(self) -> np.ndarray:
+        """Sum of the squares of each piece, shape (pieces,)."""
+        return self.column_costs.sum(axis=1)
+
+    @property
+    def is_finite(self) -> np.ndarray:
+        """True for pieces whose residuals and derivatives are finite, shape (pieces,)."""
+        return np.isfinite(self.costs) & np.isfinite(self.squares).all(axis=(1, 2))
+
+
+def _normal_equations(
+    predictions: np.ndarray, derivatives: np.ndarray, runs: PaddedRuns, pieces: list[Piece], units
+) -> NormalEquations:
+    data_unit, search_unit = units
+    n_weights = derivatives.shape[-1] - len(search_unit)
+    column_scale = np.append(np.ones(n_weights), search_unit)
+    equations = []
+    for i, start, stop in pieces:
+        is_observed = runs.is_observed[i, start:stop]
+        rows = slice(start, stop)
+        r = np.where(is_observed, (predictions[i, rows] - runs.observations[i, rows]) / data_unit, 0.0)
+        J = np.where(is_observed[..., None], derivatives[i, rows] * column_scale / data_unit[:, None], 0.0)
+        J = J.reshape(-1, len(column_scale))
+        with np.errstate(invalid="ignore", over="ignore"):  # runs that leave the domain are refused by their costs
+            equations.append((J.T @ J, J.T @ r.ravel(), np.sum(r**2, axis=0)))
+    return NormalEquations(*map(np.stack, zip(*equations, strict=True)))
 
 
 def refine_by_least_squares(
-    params: ParameterVector,
+    model: RunModel,
     weights: np.ndarray,
-    method: OneStepMethod,
     runs: PaddedRuns,
+    pieces: list[Piece],
     is_held_out: np.ndarray,
-    observation: Observation,
     units: tuple[np.ndarray, np.ndarray],
     substeps: int,
+    tolerance: float = NEWTON_STEP_TOLERANCE,
+    max_iterations: int = MAX_ITERATIONS,
 ) -> LeastSquaresResult:
-    """Minimise the squared residuals of whole runs over the weights and the initial states.
+    """Minimise the squared residuals of runs over the weights and the initial states.
 
-    The method is Levenberg-Marquardt. Each initial state affects one run only, so the normal equations of the weights
+    The method is Levenberg-Marquardt. Each initial state affects one piece only, so the normal equations of the weights
     are a Schur complement. Initial states of held-out trajectories are fitted too, without effect on the weights.
 
     Parameters
     ----------
+    model : RunModel
     weights : array, shape (p,)
         Initial weights.
+    runs : PaddedRuns
+    pieces : list of Piece
+        Parts of the trajectories that have an initial state of their own; :func:`whole_trajectories` for long runs.
     is_held_out : array of bool, shape (B,)
     units : two arrays, shapes (k,), (coordinates of a state,)
         Units of the observations, and of the search for initial states.
+    tolerance : float
+        Newton step of the weights, in standard errors, below which the iteration has converged.
     """
-    evaluate = _normal_equations(params, method, observation, units, substeps)
-    displace_states = jax.jit(
-        jax.vmap(lambda x, z: observation.displace(_prepared_system(params, method, substeps, observation), x, z))
-    )
-    search_unit, is_training = np.asarray(units[1]), ~np.asarray(is_held_out)
-    p = len(weights)
-    point = np.asarray(weights, dtype=np.float64), runs.initial_states
-    squares, slopes, costs = map(np.asarray, evaluate(jnp.asarray(point[0]), point[1], *runs[1:]))
-    if not np.isfinite(costs[is_training]).all():
-        return _failed_result(weights)
+    search_unit = np.asarray(units[1])
+    piece_run = np.array([piece.run for piece in pieces])
+    starts = piece_run, np.array([piece.start for piece in pieces])
+    is_training = ~np.asarray(is_held_out)[piece_run]
+    counts = np.array([runs.is_observed[i, start:stop].sum() for i, start, stop in pieces])
+    p, is_log = len(weights), model.params.is_log
+
+    def evaluate(weights, states) -> NormalEquations:
+        return _normal_equations(*model.predict(weights, runs, states, pieces, substeps), runs, pieces, units)
+
+    weights, states = np.asarray(weights, dtype=np.float64), np.asarray(runs.states)
+    initial_weights = model.params.initial_values
+    equations = evaluate(weights, states)
+    if not equations.is_finite[is_training].all():
+        return _failed_result(weights, runs)
     damping, converged, iterations = INITIAL_DAMPING, False, 0
-    degrees_of_freedom = _degrees_of_freedom(
-        np.asarray(runs.is_observed), runs.observations.shape[-1], squares[:, p:, p:], is_training, p
-    )
-    variance = costs[is_training].sum() / max(degrees_of_freedom, 1)
-    while iterations < MAX_ITERATIONS and damping < MAX_DAMPING:
-        squares_with_prior = _add_prior(squares, p, variance)
-        schur, _ = _schur_complement(squares_with_prior, slopes, p, is_training)
-        newton, _ = _gauss_newton_step(squares_with_prior, slopes, p, is_training, 0.0)
+    degrees_of_freedom = _degrees_of_freedom(counts, equations.squares[:, p:, p:], is_training, p)
+    variance = equations.costs[is_training].sum() / max(degrees_of_freedom, 1)
+    exact_variance = EXACT_RTOL**2 * np.mean((runs.observations / units[0]) ** 2)
+    while iterations < max_iterations and damping < MAX_DAMPING:
+        squares_with_prior = _add_prior(equations.squares, p, variance)
+        schur, _ = _schur_complement(squares_with_prior, equations.slopes, p, is_training)
+        newton = _gauss_newton_step(squares_with_prior, equations.slopes, p, is_training, 0.0)
         newton_step_norm = np.sqrt(max(newton @ schur @ newton, 0.0) / variance) if variance > 0.0 else 0.0
-        converged = bool(newton_step_norm <= NEWTON_STEP_TOLERANCE)
-        if converged and iterations > 0:
+        converged = bool(newton_step_norm <= tolerance or variance <= exact_variance)
+        vanishes = (initial_weights - weights)[is_log].max(initial=0.0) > MAX_LOG_DECREASE
+        if (converged and iterations > 0) or vanishes:
             break
         iterations += 1
-        step, displacements = _gauss_newton_step(squares_with_prior, slopes, p, is_training, damping)
-        log_step_ratio = np.abs(step[params.is_log]).max(initial=0.0) / MAX_LOG_STEP
-        step, displacements = step / max(log_step_ratio, 1.0), displacements / max(log_step_ratio, 1.0)
-        new_point = point[0] + step, displace_states(point[1], jnp.asarray(displacements * search_unit))
-        new_equations = tuple(map(np.asarray, evaluate(jnp.asarray(new_point[0]), new_point[1], *runs[1:])))
-        if (
-            np.isfinite(new_equations[2][is_training]).all()
-            and new_equations[2][is_training].sum() <= costs[is_training].sum()
-        ):
-            is_invalid = (
-                ~np.isfinite(new_equations[2]) & ~is_training
-            )  # runs held out that leave the domain stay as they were
-            new_point = new_point[0], jnp.where(is_invalid[:, None], point[1], new_point[1])
-            point, (squares, slopes, costs) = new_point, new_equations
-            variance = costs[is_training].sum() / max(degrees_of_freedom, 1)
+        step = _gauss_newton_step(squares_with_prior, equations.slopes, p, is_training, damping)
+        step[is_log] = np.clip(step[is_log], -MAX_LOG_STEP, MAX_LOG_STEP)
+        displacements = _displacements(squares_with_prior, equations.slopes, step, damping)
+        new_weights, new_states = weights + step, states.copy()
+        new_states[starts] = model.displace(states[starts], displacements * search_unit)
+        new_equations = evaluate(new_weights, new_states)
+        new_costs, costs = new_equations.costs, equations.costs
+        is_finite = new_equations.is_finite
+        if is_finite[is_training].all() and new_costs[is_training].sum() <= costs[is_training].sum():
+            is_invalid = ~is_finite & ~is_training  # runs held out that leave the domain stay as they were
+            invalid_starts = tuple(index[is_invalid] for index in starts)
+            new_states[invalid_starts] = states[invalid_starts]
+            weights, states, equations = new_weights, new_states, new_equations
+            variance = new_costs[is_training].sum() / max(degrees_of_freedom, 1)
             damping *= DAMPING_DECREASE
         elif converged:  # nothing but rounding is left
             break
         else:
             damping *= DAMPING_INCREASE
+    squares, slopes, costs = equations.squares, equations.slopes, equations.costs
     schur, slope = _schur_complement(_add_prior(squares, p, variance), slopes, p, is_training)
     total = costs[is_training].sum()
     variance = total / degrees_of_freedom if degrees_of_freedom > 0 else np.nan
@@ -212,16 +380,15 @@ def refine_by_least_squares(
     if rank < p:  # the prior alone determines the rest
         inverse, condition = np.where(np.isinf(without_prior), np.inf, inverse), np.inf
     held_out_residual = np.nan
-    if not is_training.all() and np.isfinite(costs[~is_training]).all():
-        held_out_freedom = _degrees_of_freedom(
-            np.asarray(runs.is_observed), runs.observations.shape[-1], squares[:, p:, p:], ~is_training, 0
-        )
+    if not is_training.all() and equations.is_finite[~is_training].all():
+        held_out_freedom = _degrees_of_freedom(counts, squares[:, p:, p:], ~is_training, 0)
         held_out_residual = np.sqrt(costs[~is_training].sum() / held_out_freedom) if held_out_freedom > 0 else np.nan
     gradient = 2.0 * float(np.linalg.norm(slope)) / total if total > 0.0 else 0.0
     with np.errstate(invalid="ignore"):
         covariance = inverse * variance
+    is_training_run = ~np.asarray(is_held_out)
     return LeastSquaresResult(
-        point[0],
+        weights,
         covariance,
         rank,
         condition,
@@ -230,53 +397,25 @@ def refine_by_least_squares(
         gradient,
         converged,
         iterations,
+        degrees_of_freedom,
+        states,
+        _mean_squares(equations.column_costs[is_training], runs.is_observed[is_training_run], degrees_of_freedom),
     )
 
 
-def _failed_result(weights) -> LeastSquaresResult:
-    nan = np.full((len(weights),) * 2, np.nan)
-    return LeastSquaresResult(np.asarray(weights), nan, 0, np.nan, np.nan, np.nan, np.nan, False, 0)
+def _mean_squares(column_costs: np.ndarray, is_observed: np.ndarray, degrees_of_freedom: int) -> np.ndarray:
+    """Return the mean square residual of each observed number; the unknowns count for all numbers alike."""
+    counts = is_observed.sum(axis=(0, 1))
+    share = degrees_of_freedom / counts.sum() if degrees_of_freedom > 0 else np.nan
+    return column_costs.sum(axis=0) / (np.maximum(counts, 1) * share)
 
 
-def _prepared_system(params: ParameterVector, method: OneStepMethod, substeps: int, observation: Observation):
-    return differentiable_stepper(
-        params.build_system(jnp.asarray(params.initial_values)), method, substeps, observation.group is not None
-    ).system
-
-
-def _normal_equations(params: ParameterVector, method: OneStepMethod, observation: Observation, units, substeps: int):
-    """Return a function from weights and runs to ``J^T J``, ``J^T r`` and ``r . r`` of each run, weights first."""
-    data_unit, search_unit = map(jnp.asarray, units)
-    p, c = params.initial_values.size, len(search_unit)
-
-    def residuals(weights, z, start, intervals, observations, is_observed):
-        run, begin, advance, state_of = differentiable_stepper(
-            params.build_system(weights), method, substeps, observation.group is not None
-        )
-
-        def interval(carry, h):
-            carry = advance(carry, h)
-            return carry, state_of(carry)
-
-        initial_state = observation.displace(run, start, z * search_unit)
-        states = jnp.concatenate([initial_state[None], jax.lax.scan(interval, begin(initial_state), intervals)[1]])
-        predictions = jax.vmap(lambda x: observation.observe(run, x))(states)
-        return jnp.where(is_observed[:, None], (predictions - observations) / data_unit, 0.0).ravel()
-
-    def normal_equations_of_run(weights, arrays):
-        def displaced_residuals(v):
-            return residuals(weights + v[:p], v[p:], *arrays)
-
-        r, J = displaced_residuals(jnp.zeros(p + c)), jax.jacfwd(displaced_residuals)(jnp.zeros(p + c))
-        return J.T @ J, J.T @ r, r @ r
-
-    @functools.partial(jax.jit, compiler_options=fast_compile_options())
-    def normal_equations_of_runs(weights, *arrays):
-        return jax.lax.map(
-            functools.partial(normal_equations_of_run, weights), arrays, batch_size=min(len(arrays[0]), 16)
-        )
-
-    return normal_equations_of_runs
+def _failed_result(weights, runs: PaddedRuns) -> LeastSquaresResult:
+    nan, start = np.full((len(weights),) * 2, np.nan), np.asarray(runs.states)
+    nan_squares = np.full(runs.observations.shape[-1], np.nan)
+    return LeastSquaresResult(
+        np.asarray(weights), nan, 0, np.nan, np.nan, np.nan, np.nan, False, 0, 0, start, nan_squares
+    )
 
 
 def _add_prior(normal_matrices: np.ndarray, n_weights: int, variance: float) -> np.ndarray:
@@ -284,16 +423,14 @@ def _add_prior(normal_matrices: np.ndarray, n_weights: int, variance: float) -> 
     return normal_matrices + np.diag(prior)
 
 
-def _degrees_of_freedom(
-    is_observed, n_observed: int, initial_state_normal_matrices, is_selected, n_weights: int
-) -> int:
+def _degrees_of_freedom(counts, initial_state_normal_matrices, is_selected, n_weights: int) -> int:
     """Return the number of observations minus the number of determined unknowns: weights, and parts of initial
     states."""
     n_determined = sum(
         int((np.linalg.eigvalsh(square) > INITIAL_STATE_PRIOR).sum())
         for square in initial_state_normal_matrices[is_selected]
     )
-    return int(is_observed[is_selected].sum()) * n_observed - n_weights - n_determined
+    return int(counts[is_selected].sum()) - n_weights - n_determined
 
 
 def _pseudo_inverse(normal_matrix: np.ndarray, damping: float = 0.0) -> np.ndarray:
@@ -316,19 +453,20 @@ def _schur_complement(
     return 0.5 * (matrix + matrix.T), slope
 
 
-def _gauss_newton_step(
-    normal_matrices, gradients, n_weights: int, is_training, damping: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the damped Gauss-Newton step of the weights, shape (p,), and of the initial states, shape (B, c)."""
+def _gauss_newton_step(normal_matrices, gradients, n_weights: int, is_training, damping: float) -> np.ndarray:
+    """Return the damped Gauss-Newton step of the weights, shape (p,)."""
     matrix, slope = _schur_complement(normal_matrices, gradients, n_weights, is_training, damping)
-    step = -_pseudo_inverse(matrix, damping) @ slope
+    return -_pseudo_inverse(matrix, damping) @ slope
+
+
+def _displacements(normal_matrices, gradients, step: np.ndarray, damping: float) -> np.ndarray:
+    """Return the damped Gauss-Newton step of the initial states for a step of the weights, shape (pieces, c)."""
+    p = len(step)
     displacements = [
-        -_pseudo_inverse(S[n_weights:, n_weights:], damping) @ (g[n_weights:] + S[n_weights:, :n_weights] @ step)
-        if np.isfinite(S).all()
-        else 0.0 * g[n_weights:]
+        -_pseudo_inverse(S[p:, p:], damping) @ (g[p:] + S[p:, :p] @ step) if np.isfinite(S).all() else 0.0 * g[p:]
         for S, g in zip(normal_matrices, gradients, strict=True)
     ]
-    return step, np.stack(displacements)
+    return np.stack(displacements)
 
 
 def _inverse_rank_and_condition(schur: np.ndarray, diagonal: np.ndarray | None = None) -> tuple[np.ndarray, int, float]:

@@ -8,11 +8,12 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.stats
 
 from .. import disk
 from ..errors import FileError, InputError
@@ -62,6 +63,18 @@ class FitWarning(UserWarning):
     """Warning: a fit has not converged, or the data do not determine its parameters."""
 
 
+class ConfidenceInterval(NamedTuple):
+    """Ends of the confidence intervals of parameters.
+
+    Attributes
+    ----------
+    low, high : ndarray, shape (p,)
+    """
+
+    low: np.ndarray
+    high: np.ndarray
+
+
 @dataclass(frozen=True)
 class Training:
     """The record of a fit.
@@ -107,6 +120,12 @@ class Training:
     noise : ndarray, shape (k,)
         Standard deviations of the errors of the data, given or estimated; empty if the data count as exact.
     noise_is_estimated : bool
+    degrees_of_freedom : int
+        Number of observations minus the number of determined unknowns of the least squares.
+    initial_states : ndarray, shape (trajectories, n)
+        Fitted states at the first times of the trajectories that are not held out, in order.
+    is_positive : tuple of bool, of length p
+        True for parameters that the fit keeps positive.
     """
 
     step: np.ndarray
@@ -128,11 +147,25 @@ class Training:
     converged: bool | None = None
     noise: np.ndarray = field(default_factory=lambda: np.zeros(0))
     noise_is_estimated: bool = False
+    degrees_of_freedom: int = 0
+    initial_states: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    is_positive: tuple[bool, ...] = ()
 
     def with_estimates(
-        self, params: ParameterVector, refined: LeastSquaresResult | None, noise, noise_is_estimated: bool
+        self,
+        params: ParameterVector,
+        refined: LeastSquaresResult | None,
+        noise,
+        noise_is_estimated: bool,
+        shape: tuple[int, int],
     ) -> Training:
-        """Return the record with the results of a least-squares refinement, and the noise."""
+        """Return the record with the results of a least-squares refinement, and the noise.
+
+        Parameters
+        ----------
+        shape : (int, int)
+            Number of trajectories that are not held out, which come first, and of components of a state.
+        """
         sigma = np.zeros(0) if noise is None else np.asarray(noise)
         record = replace(self, noise=sigma, noise_is_estimated=noise_is_estimated)
         if refined is None:
@@ -154,8 +187,69 @@ class Training:
             held_out=refined.held_out_residual,
             gradient=refined.gradient_norm,
             converged=refined.converged,
+            degrees_of_freedom=refined.degrees_of_freedom,
+            initial_states=np.asarray(refined.states)[: shape[0], 0, : shape[1]],
+            is_positive=tuple(map(bool, params.is_log)),
             ended=self.ended | {LEAST_SQUARES: f"after {refined.iterations} iterations"},
         )
+
+    def confidence_interval(self, confidence_level: float = 0.95) -> ConfidenceInterval:
+        """Return intervals that contain the true parameters with a given probability each.
+
+        They come from Student's distribution for the estimates, or for their logarithms if parameters stay positive. An
+        interval is infinite for a parameter that the data do not determine.
+
+        Parameters
+        ----------
+        confidence_level : float, between 0 and 1
+
+        Raises
+        ------
+        InputError
+            If the level is out of range, or the fit has no standard errors.
+        """
+        if not 0.0 < confidence_level < 1.0:
+            raise InputError(f"confidence_level must be between 0 and 1, got {confidence_level!r}")
+        self._check_has_estimates()
+        quantile = scipy.stats.t.ppf(0.5 + 0.5 * confidence_level, max(self.degrees_of_freedom, 1))
+        half_width = quantile * self.standard_errors
+        is_positive = np.array(self.is_positive or [False] * len(self.names))
+        safe_values = np.where(is_positive, self.values, 1.0)
+        with np.errstate(over="ignore"):
+            ratio = np.exp(np.where(is_positive, half_width, 0.0) / safe_values)
+        return ConfidenceInterval(
+            np.where(is_positive, safe_values / ratio, self.values - half_width),
+            np.where(is_positive, safe_values * ratio, self.values + half_width),
+        )
+
+    def estimate(self, quantity: Callable[[jax.Array], Any]) -> tuple[np.ndarray, np.ndarray]:
+        """Return a quantity that depends on the parameters, and its standard error by linear propagation.
+
+        Parameters
+        ----------
+        quantity : function from the parameters, shape (p,), in the order of ``names``, to an array
+            Such as ``lambda v: v[0] / v[2]``, written with jax.numpy.
+
+        Raises
+        ------
+        InputError
+            If the fit has no standard errors.
+        """
+        self._check_has_estimates()
+        values = jnp.asarray(self.values)
+        jacobian = np.asarray(jax.jacfwd(lambda v: jnp.asarray(quantity(v)))(values))
+        is_known = np.isfinite(self.standard_errors)
+        covariance = np.where(np.outer(is_known, is_known), self.covariance, 0.0)
+        variance = np.einsum("...i,ij,...j->...", jacobian, covariance, jacobian)
+        needs_unknown = (jacobian[..., ~is_known] != 0.0).any(axis=-1)
+        return np.asarray(quantity(values)), np.where(needs_unknown, np.inf, np.sqrt(np.maximum(variance, 0.0)))
+
+    def _check_has_estimates(self) -> None:
+        if not len(self.names):
+            raise InputError(
+                "the fit has no standard errors: it has networks, more than 64 parameters, or shooting=0. Fit few "
+                "numbers with parameters="
+            )
 
     @property
     def problems(self) -> list[str]:
@@ -164,7 +258,8 @@ class Training:
         if self.converged is False:
             messages.append(
                 "the fit has not converged: its least squares could not be made smaller, or are not finite. Begin "
-                "nearer to the data, or give more iterations, as shooting=2000"
+                "with other initial values, or give more iterations, as shooting=2000. If a positive parameter "
+                "tends to 0, leave it out of the fit"
             )
         undetermined = [
             f"{name} = {value:.3g} ± {error:.2g}"
@@ -184,7 +279,8 @@ class Training:
         return messages
 
     def __str__(self) -> str:
-        lines = [f"{self.parameters} parameters, {self.seconds:.1f} s"]
+        plural = "" if self.parameters == 1 else "s"
+        lines = [f"{self.parameters} parameter{plural}, {self.seconds:.1f} s"]
         for name, ending in self.ended.items():
             indices = np.flatnonzero(self.phase == name)
             if len(indices):
@@ -230,6 +326,12 @@ class Training:
             if earlier_loss > 0.0
             else ""
         )
+
+
+def empty_training(n_parameters: int, seconds: float) -> Training:
+    """Return the record of a fit without a descent."""
+    nothing = np.zeros(0)
+    return Training(np.zeros(0, int), np.zeros(0, str), nothing, nothing, n_parameters, seconds)
 
 
 class TrainingRun:

@@ -159,7 +159,7 @@ X = np.arange(15.0).reshape(5, 3)
 @pytest.mark.parametrize(
     ("data", "how", "words"),
     [
-        ((T, np.where(np.arange(15).reshape(5, 3) == 7, np.nan, X)), {}, "component 1 of state 2 is nan"),
+        ((T, np.where(np.arange(15).reshape(5, 3) == 7, np.inf, X)), {}, "component 1 of state 2 is inf"),
         ((T[:1], X[:1]), {}, "1 point: at least 2"),
         ((T[[0, 2, 1, 3, 4]], X), {}, "times must grow, but time 2 is 0.25 after 0.5"),
         ((T, X[:4]), {}, "5 times and 4 states"),
@@ -170,10 +170,10 @@ X = np.arange(15.0).reshape(5, 3)
         ((T, X), {"noise": -1.0}, "positive standard deviation"),
         ((T, X), {"matching": -1}, "matching must be an integer >= 0"),
         ((T, X), {"validation": 1.0}, "fraction from 0 to below 1"),
-        ({"t": T}, {}, "pair"),
+        ({"t": T}, {}, "no columns besides the times"),
+        (5, {}, "pair"),
         ([], {}, "no trajectories"),
-        ("records.csv", {}, "pair"),
-        ((T, X), {"matching": 0, "shooting": 0}, "fit has no iterations"),
+        ("records.csv", {}, "there is no file records.csv"),
         ((T, X[:, :2]), {"observed": [0, 1], "shooting": 0}, "of the shooting"),
         ([[]], {}, "no trajectories"),
         ((T, 5.0), {}, "5 times and no states"),
@@ -192,7 +192,7 @@ X = np.arange(15.0).reshape(5, 3)
     ],
 )
 def test_bad_data_has_an_error_of_one_line(data, how, words):
-    with pytest.raises((lt.InputError, lt.FunctionError), match=words) as raised:
+    with pytest.raises((lt.InputError, lt.FunctionError, lt.FileError), match=words) as raised:
         lt.learn.fit(cases.oscillator(), data, **how)
     assert "\n" not in str(raised.value)
 
@@ -235,7 +235,7 @@ def test_the_first_states_show_the_attitudes_and_move_as_they_do():
     observation = make_observation(body, None, lambda x, R: R)
     run = differentiable_stepper(body, lt.MetriplecticRungeKutta(4), 1, True)[0]
     smoothed_data = spline_states_and_rates(Trajectory(t, R.reshape(-1, 9)), None)
-    states = states_matching_rates(observation, run, [smoothed_data], np.ones(9), 1.0)[0]
+    states = states_matching_rates(observation, run, [(t, *smoothed_data)], np.ones(9), 1.0, None)[0]
     true = lt.integrate(body, np.random.default_rng(0).standard_normal(3), (0.0, 8.0), 0.05, save_every=4)
     np.testing.assert_allclose(states[:, 4:], R.reshape(-1, 9), atol=2e-3)  # splines are worst at their ends: 4e-4
     np.testing.assert_allclose(states[5:-5, :3], true.x[5:-5, :3], atol=2e-2)
