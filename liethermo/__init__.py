@@ -12,6 +12,7 @@ import manifolds  # noqa: F401  (switches 64-bit mode on before anything is trac
 from manifolds._names import public_dir
 
 from . import bodies, models, testing
+from .dissipation.adiabatic import AdiabaticJumps
 from .dissipation.base import Dissipation
 from .dissipation.double_bracket import DoubleBracket
 from .dissipation.factor import Factor
@@ -25,7 +26,8 @@ from .dissipation.lindblad import LindbladJumps
 from .dissipation.local_metric import LocalProjectedMetric
 from .dissipation.potential import ActivatedFriction, CoulombFriction, DissipationPotential, PowerLawFriction
 from .dissipation.projected_metric import GlobalRateWarning, ProjectedMetric
-from .dissipation.quantum import SteepestEntropyAscent, ThermalJumps
+from .dissipation.quantum import ThermalJumps
+from .dissipation.steepest_ascent import SteepestEntropyAscent
 from .errors import (
     AxiomError,
     CasimirError,
@@ -51,6 +53,7 @@ from .integrators import (
     DiscreteHerglotz,
     FiniteDifference,
     InCharts,
+    KrausMethod,
     LieVariational,
     MetriplecticGauss,
     MetriplecticMidpoint,
@@ -118,6 +121,7 @@ from .systems.composed.graph_files import Graph, read_graph
 __all__ = [
     "ActivatedFriction",
     "Adaptive",
+    "AdiabaticJumps",
     "At",
     "AttitudeSystem",
     "Audit",
@@ -168,6 +172,7 @@ __all__ = [
     "IntegrationError",
     "KillingDissipation",
     "Kinetic",
+    "KrausMethod",
     "LandauLifshitz",
     "LiePoissonSystem",
     "LieVariational",

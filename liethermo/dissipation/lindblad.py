@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -14,7 +15,7 @@ from manifolds.matrices.linear import adjoint
 from ..errors import InputError
 from .base import Dissipation
 from .checks import checked_rate
-from .quantum import Operator, checked_square_matrix, get_density_structure
+from .operators import Operator, checked_square_matrix, get_density_structure
 
 
 class LindbladJumps(Dissipation):
@@ -89,14 +90,20 @@ class LindbladJumps(Dissipation):
 
     def generator_field(self, system, x, dH):
         structure, n = system.structure, system.body_dim
-        if self.depends_on_time and system.time is None:
-            raise InputError("a rate of LindbladJumps depends on time: take system.at_time(t)")
-        rates = jnp.stack([jnp.asarray(rate(system.time)) if callable(rate) else rate for rate in self.rates])
-        rho = structure.matrix(x[:n])
-        V = np.stack([np.asarray(operator) for operator in self.operators])
+        rates, rho, V = self.rates_at(system.time), structure.matrix(x[:n]), self.stacked_operators()
         gain = jnp.sum(rates[:, None, None] * (V @ rho @ adjoint(V)), axis=0)
         loss = jnp.tensordot(rates, jnp.asarray(adjoint(V) @ V), 1) @ rho  # its Hermitian part is the anticommutator
         return jnp.pad(structure.vector(gain - loss), (0, system.dim - n))
+
+    def rates_at(self, time) -> jax.Array:
+        """Return the rates at a time, shape (jumps,); the time may be None if they do not depend on it."""
+        if self.depends_on_time and time is None:
+            raise InputError("a rate of LindbladJumps depends on time: take system.at_time(t)")
+        return jnp.stack([jnp.asarray(rate(time)) if callable(rate) else rate for rate in self.rates])
+
+    def stacked_operators(self) -> np.ndarray:
+        """Return the jump operators, shape (jumps, N, N)."""
+        return np.stack([np.asarray(operator) for operator in self.operators])
 
 
 def _checked_function(rate: Callable, i: int) -> Callable:

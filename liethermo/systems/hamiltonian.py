@@ -12,7 +12,7 @@ import scipy
 
 import manifolds as mf
 
-from ..dissipation.quantum import HasMatrix, checked_hermitian, checked_square_matrix
+from ..dissipation.operators import HasMatrix, checked_hermitian, checked_square_matrix
 from ..errors import InputError
 from ..functions.density import ExpectationValue, MeanEnergy, ModulatedExpectationValue, choose_reference_level
 from ..functions.energy import Energy, TimeDependent
