@@ -79,6 +79,7 @@ from .runs.flow import flow
 from .runs.integrate import integrate
 from .runs.noise import Fluctuations
 from .runs.propagator import Propagator
+from .runs.steady_cycle import SteadyCycle, steady_cycle
 from .runs.suggest import MethodSuggestion, suggest_method, suggest_step
 from .studies.axes import Zipped, latin_hypercube, replicas, sobol, zipped
 from .studies.measures import At
@@ -106,6 +107,7 @@ from .systems import (
     MetriplecticSystem,
     QuantumSystem,
     Reaction,
+    RotatingFrame,
     SimpleClosedSystem,
     SpinSystem,
     Stability,
@@ -200,6 +202,7 @@ __all__ = [
     "Reaction",
     "Reference",
     "Relaxed",
+    "RotatingFrame",
     "SimpleClosedSystem",
     "Solution",
     "SpecError",
@@ -207,6 +210,7 @@ __all__ = [
     "Stability",
     "Stats",
     "Status",
+    "SteadyCycle",
     "SteepestEntropyAscent",
     "Study",
     "StudyStatus",
@@ -237,6 +241,7 @@ __all__ = [
     "registered_methods",
     "replicas",
     "sobol",
+    "steady_cycle",
     "steady_state",
     "suggest_method",
     "suggest_step",

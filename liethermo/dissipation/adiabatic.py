@@ -126,7 +126,7 @@ class AdiabaticJumps(ThermalJumps):
             if not (diagonals > ENERGY_RTOL * len(V) * np.abs(V).max()).any():
                 continue
             with jax.ensure_compile_time_eval():
-                value = float(self.rate_at(i, jnp.zeros(()), jnp.ones(()), jnp.zeros(())))
+                value = float(self._rate_at(i, jnp.zeros(()), jnp.ones(()), jnp.zeros(())))
             if not np.isfinite(value):
                 raise InputError(
                     f"the rate of V[{i}] at omega = 0 is {value}, and V[{i}] has a component of this frequency. Give a "
@@ -158,14 +158,6 @@ class AdiabaticJumps(ThermalJumps):
         drho = jnp.sum(rates * (V @ rho @ adjoint(V)), axis=0) - jnp.sum(rates * (adjoint(V) @ V), axis=0) @ rho
         return self._with_bath_entropy(system, T, levels, vectors, drho)
 
-    def frequencies_and_rates(self, system, x) -> tuple[jax.Array, jax.Array]:
-        """Return the frequencies of the jumps of a frozen system at x, shape (jumps,), and their rates downwards."""
-        dH = system.energy.gradient(x)
-        T = dH[system.body_dim + self.bath]
-        jumps = self._jumps_at(system, dH, T)
-        squares = jnp.max(jnp.sum(jnp.abs(jumps.operators) ** 2, axis=-2), axis=-1)
-        return jumps.frequencies, jumps.rates * squares * jnp.exp(jumps.frequencies / (2.0 * T))
-
     def _jumps_at(self, system, dH, T) -> InstantaneousJumps:
         structure = system.structure
         levels, vectors = ordered_eigenvectors(structure.matrix(dH[: system.body_dim]))
@@ -185,7 +177,7 @@ class AdiabaticJumps(ThermalJumps):
                 is_zero = jnp.max(jnp.abs(components), axis=(-2, -1)) <= rounding
                 weights = np.where((np.arange(len(masks)) == 0) & is_self_adjoint, 0.5, 1.0)[use]
                 used_omega = jnp.where(is_zero, 1.0, omega[use])
-                component_rates = jnp.stack([self.rate_at(i, w, T, system.time) for w in used_omega])
+                component_rates = jnp.stack([self._rate_at(i, w, T, system.time) for w in used_omega])
                 operators.append(jnp.where(is_zero[:, None, None], 0.0, components))
                 frequencies.append(omega[use])
                 rates.append(weights * component_rates)

@@ -329,12 +329,12 @@ class ThermalJumps(Dissipation):
         """Return the rate of each jump at its omega and T, times its weight, shape (jumps,)."""
         return jnp.stack(
             [
-                jump.weight * self.rate_at(jump.coupling_index, omega[i], T, system.time)
+                jump.weight * self._rate_at(jump.coupling_index, omega[i], T, system.time)
                 for i, jump in enumerate(self.jumps)
             ]
         )
 
-    def rate_at(self, i: int, omega, T, time) -> jax.Array:
+    def _rate_at(self, i: int, omega, T, time) -> jax.Array:
         """Return the rate of the coupling i at a frequency and a temperature, shape (); ``time`` may be None."""
         rate = self.rates[i]
         if i in self.timed_rates:

@@ -113,7 +113,7 @@ class KrausMethod(OneStepMethod):
         body, n, clock_time = _quantum_body(system), _quantum_body(system).body_dim, None
         if isinstance(system, DrivenSystem):
             clock_time = system.time(x)
-        channel = _Channel.over_step(system, body.structure, clock_time, h, self.number)
+        channel = _Channel.build(system, body.structure, clock_time, h, self.number)
         middle, end = channel.apply(x[:n])
         d = end - x[:n]
         if isinstance(system, DrivenSystem):
@@ -157,7 +157,7 @@ class _Channel(NamedTuple):
     propagators: dict
 
     @classmethod
-    def over_step(cls, system: System, structure: mf.DensityMatrices, time, h, order: int) -> _Channel:
+    def build(cls, system: System, structure: mf.DensityMatrices, time, h, order: int) -> _Channel:
         """Return the map of a step of size h from a time, which is None if nothing depends on it."""
         body = _quantum_body(system)
         fractions = (0.0, 0.25, 0.5, 1.0)
@@ -173,15 +173,15 @@ class _Channel(NamedTuple):
         def rates(c) -> jax.Array:
             return jnp.concatenate([term.rates_at(frozen[c].time) for term in terms])
 
-        def no_jump_generator(c) -> jax.Array:
+        def decay_generator(c) -> jax.Array:
             H = structure.matrix(frozen[c].energy.gradient(jnp.zeros(body.dim))[: structure.dim])
             return -1j * H - 0.5 * jnp.tensordot(rates(c), jnp.asarray(losses), 1)
 
         intervals = [(0.0, 1.0)] if order == 2 else [(0.0, 0.25), (0.25, 0.5), (0.0, 0.5), (0.5, 1.0), (0.0, 1.0)]
         if time is None:
-            exponents = [(end - start) * h * no_jump_generator(0.0) for start, end in intervals]
+            exponents = [(end - start) * h * decay_generator(0.0) for start, end in intervals]
         else:
-            ends_and_middle = no_jump_generator(0.0), no_jump_generator(0.5), no_jump_generator(1.0)
+            ends_and_middle = decay_generator(0.0), decay_generator(0.5), decay_generator(1.0)
             exponents = _magnus_exponents(*ends_and_middle, h, intervals)
         propagators = dict(zip(intervals, expm(jnp.stack(exponents)), strict=True))
         return cls(structure, order, h, operators, rates, propagators)

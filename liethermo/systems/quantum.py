@@ -184,7 +184,7 @@ class QuantumSystem(System):
         ----------
         rho : array, shape (..., N, N), or a state already
             Hermitian, positive, of trace one. Or the amplitudes of a pure state, shape (N,) or (..., N, 1). A ``Qobj``
-            of QuTiP may be a ket, a bra, an operator or a stacked operator.
+            of QuTiP may be a ket, a bra, an operator, or a stacked operator or its adjoint.
         batch : bool
             Whether states that are given as such may be several.
         entropies : array, shape (..., number of baths), optional
@@ -196,7 +196,7 @@ class QuantumSystem(System):
         ------
         InputError
         """
-        rho = rho.full() if isinstance(rho, HasMatrix) else rho
+        rho = self._array_of(rho)
         if isinstance(rho, jax.core.Tracer) or (np.shape(rho)[-1:] == (self.dim,) and not self._is_matrix(rho, batch)):
             return super().state(rho, batch)
         matrices = self._check_density(np.asarray(rho), mixed)
@@ -209,10 +209,17 @@ class QuantumSystem(System):
 
     def state_array(self, x, batch: bool = False):
         """Return the state x; a matrix or a ket becomes the state with every bath at entropy zero."""
-        x = x.full() if isinstance(x, HasMatrix) else x
+        x = self._array_of(x)
         if not isinstance(x, jax.core.Tracer) and (self._is_matrix(x, batch) or self._is_ket(x)):
             x = np.asarray(self.state(x))
         return super().state_array(x, batch)
+
+    def _array_of(self, x):
+        """Return the array of a ``Qobj``, with the adjoint of a stacked operator made a stacked operator."""
+        if not isinstance(x, HasMatrix):
+            return x
+        array = np.asarray(x.full())  # an array of shape (1, N^2) that is no Qobj is a batch of one state
+        return adjoint(array) if array.shape == (1, self.structure.size**2) and self.structure.size > 1 else array
 
     def _is_ket(self, x) -> bool:
         """Return whether x has the shape of a ket, a bra or a stacked operator, with more than one level."""

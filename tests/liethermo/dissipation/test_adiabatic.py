@@ -12,7 +12,8 @@ SX = np.array([[0.0, 1.0], [1.0, 0.0]])
 SY = np.array([[0.0, -1.0j], [1.0j, 0.0]])
 SZ = np.diag([1.0, -1.0])
 RHO = np.array([[0.6, 0.2 - 0.1j], [0.2 + 0.1j, 0.4]])
-T, RATE = 0.6, 0.2
+T = 0.6
+RATE = 0.2
 COUPLING = SY + 0.3 * SX
 TERMS = [(SZ, lambda t: 0.5 * jnp.cos(0.1 * t)), (SX, lambda t: 0.5 * (1.0 + 0.1 * t) * jnp.sin(0.1 * t))]
 

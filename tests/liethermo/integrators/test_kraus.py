@@ -9,14 +9,15 @@ import scipy.linalg
 import liethermo as lt
 from tests.liethermo.dissipation.test_lindblad import LOWER, SX, SZ, liouvillian
 
-H, JUMPS = 0.5 * SZ + 0.6 * SX, [(LOWER, 0.4), (SZ, 0.1)]
-EXCITED = np.diag([0.0, 1.0]).astype(complex)
+H = 0.5 * SZ + 0.6 * SX
+JUMPS = [(LOWER, 0.4), (SZ, 0.1)]
+UPPER_LEVEL = np.diag([0.0, 1.0]).astype(complex)
 
 
 def observed_orders(system, expected, steps, order):
     errors = []
     for step in steps:
-        run = lt.integrate(system, EXCITED, (0.0, 4.0), step, lt.KrausMethod(order))
+        run = lt.integrate(system, UPPER_LEVEL, (0.0, 4.0), step, lt.KrausMethod(order))
         errors.append(np.abs(system.density(run.x[-1]) - expected).max())
     return np.log2(np.array(errors[:-1]) / errors[1:])
 
@@ -24,7 +25,7 @@ def observed_orders(system, expected, steps, order):
 @pytest.mark.parametrize("order", [2, 4])
 def test_order_with_a_constant_generator(order):
     system = lt.QuantumSystem(H, lt.LindbladJumps(JUMPS))
-    expected = (scipy.linalg.expm(4 * liouvillian(H, JUMPS)) @ EXCITED.ravel()).reshape(2, 2)
+    expected = (scipy.linalg.expm(4 * liouvillian(H, JUMPS)) @ UPPER_LEVEL.ravel()).reshape(2, 2)
     orders = observed_orders(system, expected, (0.4, 0.2, 0.1), order)
     assert (orders > order - 0.2).all()
 
@@ -42,11 +43,11 @@ def test_order_with_a_drive_and_rates_that_depend_on_time(order):
         return np.append(liouvillian(0.5 * SZ + 0.8 * np.cos(1.1 * t) * SX, rates) @ y[:4], power)
 
     expected = scipy.integrate.solve_ivp(
-        field, (0.0, 4.0), np.append(EXCITED.ravel(), 0.0), method="DOP853", rtol=1e-12, atol=1e-13
+        field, (0.0, 4.0), np.append(UPPER_LEVEL.ravel(), 0.0), method="DOP853", rtol=1e-12, atol=1e-13
     ).y[:, -1]
     orders = observed_orders(system, expected[:4].reshape(2, 2), (0.2, 0.1, 0.05), order)
     assert (orders > order - 0.25).all()
-    run = lt.integrate(system, EXCITED, (0.0, 4.0), 0.1, lt.KrausMethod(order))
+    run = lt.integrate(system, UPPER_LEVEL, (0.0, 4.0), 0.1, lt.KrausMethod(order))
     np.testing.assert_allclose(run.casimirs["work"][-1], expected[4].real, atol={2: 2e-4, 4: 2e-7}[order])
 
 
@@ -69,7 +70,7 @@ def test_every_step_is_a_channel(order, step):
 def test_a_method_that_is_no_channel_leaves_the_cone():
     """Control: a Gauss step as long as that; the run stops, or its audit promises nothing."""
     system = lt.QuantumSystem(H, lt.LindbladJumps([(LOWER, 4.0)]))
-    run = lt.integrate(system, EXCITED, (0.0, 8.0), 2.0, lt.MetriplecticGauss(1), on_failure="return")
+    run = lt.integrate(system, UPPER_LEVEL, (0.0, 8.0), 2.0, lt.MetriplecticGauss(1), on_failure="return")
     assert np.linalg.eigvalsh(system.density(run.x)).min() < -1e-3
     row = next(row for row in run.audit().rows if row.law == "least eigenvalue of rho")
     assert row.passed is None
