@@ -12,6 +12,7 @@ import manifolds  # noqa: F401  (switches 64-bit mode on before anything is trac
 from manifolds._names import public_dir
 
 from . import bodies, models, testing
+from .dissipation.adiabatic import AdiabaticJumps
 from .dissipation.base import Dissipation
 from .dissipation.double_bracket import DoubleBracket
 from .dissipation.factor import Factor
@@ -25,7 +26,8 @@ from .dissipation.lindblad import LindbladJumps
 from .dissipation.local_metric import LocalProjectedMetric
 from .dissipation.potential import ActivatedFriction, CoulombFriction, DissipationPotential, PowerLawFriction
 from .dissipation.projected_metric import GlobalRateWarning, ProjectedMetric
-from .dissipation.quantum import SteepestEntropyAscent, ThermalJumps
+from .dissipation.quantum import ThermalJumps
+from .dissipation.steepest_ascent import SteepestEntropyAscent
 from .errors import (
     AxiomError,
     CasimirError,
@@ -51,6 +53,7 @@ from .integrators import (
     DiscreteHerglotz,
     FiniteDifference,
     InCharts,
+    KrausMethod,
     LieVariational,
     MetriplecticGauss,
     MetriplecticMidpoint,
@@ -76,6 +79,7 @@ from .runs.flow import flow
 from .runs.integrate import integrate
 from .runs.noise import Fluctuations
 from .runs.propagator import Propagator
+from .runs.steady_cycle import SteadyCycle, steady_cycle
 from .runs.suggest import MethodSuggestion, suggest_method, suggest_step
 from .studies.axes import Zipped, latin_hypercube, replicas, sobol, zipped
 from .studies.measures import At
@@ -103,6 +107,7 @@ from .systems import (
     MetriplecticSystem,
     QuantumSystem,
     Reaction,
+    RotatingFrame,
     SimpleClosedSystem,
     SpinSystem,
     Stability,
@@ -118,6 +123,7 @@ from .systems.composed.graph_files import Graph, read_graph
 __all__ = [
     "ActivatedFriction",
     "Adaptive",
+    "AdiabaticJumps",
     "At",
     "AttitudeSystem",
     "Audit",
@@ -168,6 +174,7 @@ __all__ = [
     "IntegrationError",
     "KillingDissipation",
     "Kinetic",
+    "KrausMethod",
     "LandauLifshitz",
     "LiePoissonSystem",
     "LieVariational",
@@ -195,6 +202,7 @@ __all__ = [
     "Reaction",
     "Reference",
     "Relaxed",
+    "RotatingFrame",
     "SimpleClosedSystem",
     "Solution",
     "SpecError",
@@ -202,6 +210,7 @@ __all__ = [
     "Stability",
     "Stats",
     "Status",
+    "SteadyCycle",
     "SteepestEntropyAscent",
     "Study",
     "StudyStatus",
@@ -232,6 +241,7 @@ __all__ = [
     "registered_methods",
     "replicas",
     "sobol",
+    "steady_cycle",
     "steady_state",
     "suggest_method",
     "suggest_step",

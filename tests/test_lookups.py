@@ -50,7 +50,7 @@ OURS = {
         "rate",
     ): "of any dissipation that a case has; another way is taken without it",
     ("liethermo/functions/on_spaces.py", "dim"): "of a Casimir, which may be any function that knows its dimension",
-    ("liethermo/dissipation/quantum.py", "structure"): "refused, with a message, where there is none",
+    ("liethermo/dissipation/operators.py", "structure"): "refused, with a message, where there is none",
     ("manifolds/algebras/killing.py", "killing_form"): "refused, with a message, where there is none",
 }
 

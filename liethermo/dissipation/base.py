@@ -86,6 +86,11 @@ class Dissipation(Module):
         return True
 
     @property
+    def depends_on_time(self) -> bool:
+        """True if the force depends on the time other than by the gradients, as by a rate that is a function of it."""
+        return False
+
+    @property
     def can_drive_baths(self) -> bool:
         """True if its states are those of the body followed by bath entropies; the body has then no entropy of its
         own."""
@@ -225,6 +230,10 @@ class DissipationSum(Dissipation):
     @property
     def needs_entropy(self) -> bool:
         return any(part.needs_entropy for part in self.parts)
+
+    @property
+    def depends_on_time(self) -> bool:
+        return any(part.depends_on_time for part in self.parts)
 
     def bind_to(self, system: Geometry) -> Dissipation:
         return DissipationSum(tuple(part.bind_to(system) for part in self.parts))

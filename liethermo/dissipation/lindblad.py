@@ -6,15 +6,17 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
+from manifolds._pytree_module import Module
 from manifolds.matrices.linear import adjoint
 
 from ..errors import InputError
 from .base import Dissipation
 from .checks import checked_rate
-from .quantum import Operator, checked_square_matrix, get_density_structure
+from .operators import Operator, checked_square_matrix, get_density_structure
 
 
 class LindbladJumps(Dissipation):
@@ -25,7 +27,8 @@ class LindbladJumps(Dissipation):
     The equation keeps the density matrix positive. A run keeps it positive up to the error of its steps, and ends where
     an eigenvalue is below -1e-6. For a bath with a temperature use :class:`ThermalJumps`, which obeys both laws.
 
-    A collapse operator of QuTiP is ``sqrt(rate) * V``. The adjoint of V is a jump of its own, with its own rate.
+    A collapse operator of QuTiP is ``sqrt(rate) * V``: see :meth:`from_collapse_operators`. The adjoint of V is a jump
+    of its own, with its own rate. :class:`KrausMethod` keeps the density matrix positive to rounding.
 
     Parameters
     ----------
@@ -70,6 +73,35 @@ class LindbladJumps(Dissipation):
             _checked_function(rate, i) if callable(rate) else checked_rate(rate) for i, (_, rate) in enumerate(pairs)
         )
 
+    @classmethod
+    def from_collapse_operators(cls, operators: Sequence[Any]) -> LindbladJumps:
+        """Return the jumps of a list of collapse operators, ``c_ops`` of QuTiP.
+
+        Parameters
+        ----------
+        operators : list of C, or of [C, f]
+            C is a matrix, shape (N, N), or a ``Qobj``, of the unit ``1 / sqrt(time)``: the rate is part of it. With a
+            real function f of the time t the operator is ``f(t) C``. A string is not evaluated.
+
+        Examples
+        --------
+        >>> lower = np.array([[0, 1], [0, 0]])
+        >>> jumps = lt.LindbladJumps.from_collapse_operators([np.sqrt(0.2) * lower])
+        >>> qubit = lt.QuantumSystem(np.diag([0.0, 1.0]), jumps)
+        """
+        couplings = []
+        for i, operator in enumerate(operators):
+            is_pair = isinstance(operator, list | tuple) and len(operator) == 2 and np.ndim(operator[0]) != 1
+            matrix, factor = operator if is_pair else (operator, None)
+            if factor is not None and not callable(factor):
+                kind = f"the string {factor!r}, which is not evaluated" if isinstance(factor, str) else repr(factor)
+                raise InputError(
+                    f"the factor of collapse operator {i} must be a function of t, such as lambda t: jnp.sqrt(1 + t), "
+                    f"got {kind}"
+                )
+            couplings.append((matrix, 1.0 if factor is None else _SquaredFactor(factor)))
+        return cls(couplings)
+
     @property
     def depends_on_time(self) -> bool:
         """True if a rate is a function of time."""
@@ -89,14 +121,29 @@ class LindbladJumps(Dissipation):
 
     def generator_field(self, system, x, dH):
         structure, n = system.structure, system.body_dim
-        if self.depends_on_time and system.time is None:
-            raise InputError("a rate of LindbladJumps depends on time: take system.at_time(t)")
-        rates = jnp.stack([jnp.asarray(rate(system.time)) if callable(rate) else rate for rate in self.rates])
-        rho = structure.matrix(x[:n])
-        V = np.stack([np.asarray(operator) for operator in self.operators])
+        rates, rho, V = self.rates_at(system.time), structure.matrix(x[:n]), self.stacked_operators()
         gain = jnp.sum(rates[:, None, None] * (V @ rho @ adjoint(V)), axis=0)
         loss = jnp.tensordot(rates, jnp.asarray(adjoint(V) @ V), 1) @ rho  # its Hermitian part is the anticommutator
         return jnp.pad(structure.vector(gain - loss), (0, system.dim - n))
+
+    def rates_at(self, time) -> jax.Array:
+        """Return the rates at a time, shape (jumps,); the time may be None if they do not depend on it."""
+        if self.depends_on_time and time is None:
+            raise InputError("a rate of LindbladJumps depends on time: take system.at_time(t)")
+        return jnp.stack([jnp.asarray(rate(time)) if callable(rate) else rate for rate in self.rates])
+
+    def stacked_operators(self) -> np.ndarray:
+        """Return the jump operators, shape (jumps, N, N)."""
+        return np.stack([np.asarray(operator) for operator in self.operators])
+
+
+class _SquaredFactor(Module):
+    """The rate of a collapse operator with a factor that depends on time."""
+
+    factor: Callable
+
+    def __call__(self, t):
+        return jnp.asarray(self.factor(t)) ** 2
 
 
 def _checked_function(rate: Callable, i: int) -> Callable:

@@ -1,4 +1,4 @@
-"""Open quantum systems: jumps that exchange heat with baths, and steepest entropy ascent."""
+"""Jumps of open quantum systems that exchange heat with baths."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import itertools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,31 +19,25 @@ from manifolds.matrices.linear import adjoint
 from manifolds.matrices.spectral import log_mean
 
 from ..errors import InputError
+from ..functions.arguments import required_argument_count
 from ..functions.bath_energy import BathEnergy, ReservoirEnergy
-from ..functions.density import DensityMatrixFunction, choose_reference_level, matrix_logarithm, positive_part
-from ..functions.energy import Energy, Function
-from ..functions.frames import OrthonormalFrame, gram_schmidt
+from ..functions.density import matrix_logarithm
 from ..functions.gradients import EPS
-from ..functions.indices import StaticArray
 from ..functions.with_baths import BodyBathsEnergy
 from .base import Dissipation
 from .checks import checked_rate
-
-ENERGY_RTOL = 8.0 * EPS
-"""Error of an energy, relative to the largest one; times the number of levels if energies are eigenvalues."""
-
-
-@runtime_checkable
-class HasMatrix(Protocol):
-    """An operator, such as a ``Qobj`` of QuTiP, whose matrix is returned by ``full()``."""
-
-    def full(self) -> np.ndarray: ...
-
-
-class Operator(StaticArray):
-    """A complex matrix as a static field of a module."""
-
-    dtype = complex
+from .operators import (
+    ENERGY_RTOL,
+    Operator,
+    checked_square_matrix,
+    commutator,
+    get_density_structure,
+    is_commuting,
+    is_diagonal,
+    is_hermitian,
+    level_gap_rounding,
+    subtract_common_energy,
+)
 
 
 class Jump(NamedTuple):
@@ -72,7 +66,8 @@ class ThermalJumps(Dissipation):
     friction is ``K = sum (rate / 2) B* L B`` over the components and their adjoints. ``K dE = 0`` and ``K >= 0`` by
     form, for discrete gradients too: the energy of system and bath is constant and the entropy cannot fall. While T is
     constant the motion is Lindblad's equation with detailed balance: jumps V at the rate ``rate * exp(omega / 2T)`` and
-    V^H at ``rate * exp(-omega / 2T)``. The Hamiltonian may depend on time if its eigenvectors do not.
+    V^H at ``rate * exp(-omega / 2T)``. The Hamiltonian may depend on time if its eigenvectors do not; otherwise use
+    :class:`AdiabaticJumps`.
 
     In a system without baths the jumps exchange no heat. This is the limit of infinite temperature: the identity is at
     rest (the noise is unital), and the entropy cannot fall. The energy is constant if every V commutes with H, as in
@@ -83,8 +78,8 @@ class ThermalJumps(Dissipation):
     couplings : list of (V, rate)
         V is a dimensionless matrix, shape (N, N). A Hermitian V acts once, any other together with its adjoint. The
         rate is a number >= 0 (1 / time), or a function of omega >= 0 and T, such as ``g / (2 sinh(omega / 2T))`` for a
-        bath of bosons. If a Hamiltonian that depends on time changes the sign of omega, the rate has to be even in
-        omega.
+        bath of bosons, or of omega, T and the time t: a coupling ``c(t) V`` has the rate ``c(t)^2 * rate``. If a
+        Hamiltonian that depends on time changes the sign of omega, the rate has to be even in omega.
     bath : int
         The number of the bath, from 0.
 
@@ -111,6 +106,7 @@ class ThermalJumps(Dissipation):
     jump_frame: Operator | None = eqx.field(static=True)
     level_order: tuple[int, ...] = eqx.field(static=True)
     is_driven: bool = eqx.field(static=True)
+    timed_rates: tuple[int, ...] = eqx.field(static=True)
     is_isolated: bool = eqx.field(static=True)
     conserves_energy: bool = eqx.field(static=True)
 
@@ -130,6 +126,7 @@ class ThermalJumps(Dissipation):
             _checked_rate_function(rate, i) if callable(rate) else checked_rate(rate)
             for i, (_, rate) in enumerate(pairs)
         )
+        self.timed_rates = tuple(i for i, rate in enumerate(self.rates) if _takes_time(rate))
         self.bath, self.jumps, self.jump_frame, self.level_order, self.is_driven = bath, (), None, (), False
         self.is_isolated, self.conserves_energy = False, True
 
@@ -137,18 +134,12 @@ class ThermalJumps(Dissipation):
     def energy_law(self):
         return "conserved" if self.conserves_energy else None
 
+    @property
+    def depends_on_time(self) -> bool:
+        return bool(self.timed_rates)
+
     def bind_to(self, system):
-        structure, baths = get_density_structure(system, "ThermalJumps"), system.baths
-        for i, V in enumerate(self.operators):
-            if np.shape(V) != (structure.size,) * 2:
-                raise InputError(
-                    f"the coupling V[{i}] has shape {np.shape(V)}, but the Hamiltonian has shape ({structure.size}, "
-                    f"{structure.size})"
-                )
-        if baths is not None and self.bath >= baths.number:
-            raise InputError(
-                f"ThermalJumps exchange heat with bath {self.bath}, but there are {baths.number} baths, numbered from 0"
-            )
+        structure, baths = self._checked_structure(system), system.baths
         if is_traced(system.energy.body if isinstance(system.energy, BodyBathsEnergy) else system.energy):
             raise InputError(
                 "ThermalJumps need the eigenvectors of the Hamiltonian, so it must not be a traced value. Build a "
@@ -156,8 +147,8 @@ class ThermalJumps(Dissipation):
             )
         hamiltonians = system.hamiltonians()
         if baths is None:
-            jumps = tuple(Jump(V, i, 0.5 if _is_hermitian(V) else 1.0) for i, V in enumerate(self.operators))
-            conserves_energy = all(_is_commuting(H, V) for H in hamiltonians for V in map(np.asarray, self.operators))
+            jumps = tuple(Jump(V, i, 0.5 if is_hermitian(V) else 1.0) for i, V in enumerate(self.operators))
+            conserves_energy = all(is_commuting(H, V) for H in hamiltonians for V in map(np.asarray, self.operators))
             return self._replace_fields(
                 jumps=jumps, jump_frame=None, is_isolated=True, conserves_energy=conserves_energy
             )
@@ -165,7 +156,7 @@ class ThermalJumps(Dissipation):
         jumps_by_coupling = [_jumps_of_coupling(V, i, hamiltonians, vectors) for i, V in enumerate(self.operators)]
         frame = None if np.array_equal(vectors, np.eye(structure.size)) else Operator(vectors)
         jumps = tuple(itertools.chain.from_iterable(jumps_by_coupling))
-        levels = np.diag(adjoint(vectors) @ _subtract_common_energy(hamiltonians[0]) @ vectors).real
+        levels = np.diag(adjoint(vectors) @ subtract_common_energy(hamiltonians[0]) @ vectors).real
         order, driven = tuple(int(i) for i in np.argsort(levels)), system.is_driven
         bound_jumps = self._replace_fields(
             jumps=jumps, jump_frame=frame, level_order=order, is_driven=driven, is_isolated=False, conserves_energy=True
@@ -174,9 +165,25 @@ class ThermalJumps(Dissipation):
             bound_jumps._check_rates(system, hamiltonians[0])
         return bound_jumps
 
-    def _replace_fields(self, **fields) -> ThermalJumps:
+    def _checked_structure(self, system) -> mf.DensityMatrices:
+        """Return the structure of a system, after a check that the couplings and the bath fit it."""
+        name = type(self).__name__
+        structure, baths = get_density_structure(system, name), system.baths
+        for i, V in enumerate(self.operators):
+            if np.shape(V) != (structure.size,) * 2:
+                raise InputError(
+                    f"the coupling V[{i}] has shape {np.shape(V)}, but the Hamiltonian has shape ({structure.size}, "
+                    f"{structure.size})"
+                )
+        if baths is not None and self.bath >= baths.number:
+            raise InputError(
+                f"{name} exchange heat with bath {self.bath}, but there are {baths.number} baths, numbered from 0"
+            )
+        return structure
+
+    def _replace_fields(self, **fields):
         """Return a copy with some fields replaced."""
-        copy = object.__new__(ThermalJumps)
+        copy = object.__new__(type(self))
         for field in dataclasses.fields(self):
             object.__setattr__(copy, field.name, fields.get(field.name, getattr(self, field.name)))
         return copy
@@ -200,15 +207,16 @@ class ThermalJumps(Dissipation):
             self._jump_frequencies(structure, dH[:n]),
         )
         T = jnp.asarray(jnp.inf) if self.is_isolated else dH[n + self.bath]
-        shift, commutators = omega / (2.0 * T), _commutator(V, A + logs)
+        bath_terms = None
         if not self.is_isolated:
             # Differences of levels lose no digits; the off-diagonal entries of H are mostly zero.
             levels, off_diagonal = self._energy_levels(structure, dH[:n]), 1.0 - np.eye(structure.size)
-            H_commutators = V * (levels[None, :] - levels[:, None]) + _commutator(V, H * off_diagonal)
-            commutators = commutators - (dS[n + self.bath] * H_commutators - omega[:, None, None] * V) / T
-        boltzmann_factors = jnp.exp(shift)[:, None, None]
-        image = rho @ V / boltzmann_factors - boltzmann_factors * (V @ rho) + log_mean(logs, shift, commutators)
-        drho = jnp.sum(_commutator(V_adjoint, image * self._weighted_jump_rates(omega, T)[:, None, None]), axis=0)
+            H_commutators = V * (levels[None, :] - levels[:, None]) + commutator(V, H * off_diagonal)
+            bath_terms = (dS[n + self.bath] * H_commutators - omega[:, None, None] * V) / T
+        image = friction_image(rho, logs, A, V, omega / (2.0 * T), bath_terms)
+        drho = jnp.sum(
+            commutator(V_adjoint, image * self._weighted_jump_rates(system, omega, T)[:, None, None]), axis=0
+        )
         return self._append_bath_entropy_rates(system, dH, T, drho)  # the adjoints add the adjoint
 
     has_generator = True
@@ -218,7 +226,7 @@ class ThermalJumps(Dissipation):
         structure, n = system.structure, system.body_dim
         rho, omega = self._to_jump_frame(structure.matrix(x[:n])), self._jump_frequencies(structure, dH[:n])
         T = jnp.asarray(jnp.inf) if self.is_isolated else dH[n + self.bath]
-        strengths, boltzmann_factors = self._weighted_jump_rates(omega, T), jnp.exp(omega / (2.0 * T))
+        strengths, boltzmann_factors = self._weighted_jump_rates(system, omega, T), jnp.exp(omega / (2.0 * T))
         rates = jnp.concatenate([strengths * boltzmann_factors, strengths / boltzmann_factors])
         # the Hermitian part, taken later, has both terms of the loss
         drho = _jump_gain(self.jumps, rates, rho) - jnp.tensordot(rates, _adjoint_products(self.jumps), 1) @ rho
@@ -234,13 +242,14 @@ class ThermalJumps(Dissipation):
             T = float(np.asarray(energy.temperature)[self.bath])
         else:
             T = float(energy.gradient(jnp.zeros(system.baths.number))[self.bath])
-        levels = np.diag(self._to_jump_frame(_subtract_common_energy(H))).real
+        levels = np.diag(self._to_jump_frame(subtract_common_energy(H))).real
         for jump in self.jumps:
             weights = np.abs(np.asarray(jump.operator)) ** 2
             omega = float(np.sum(weights * (levels[None, :] - levels[:, None])) / np.sum(weights))
             rate, w = self.rates[jump.coupling_index], abs(omega)
             with np.errstate(over="ignore", invalid="ignore"):
-                strength = jump.weight * np.asarray(rate(omega, T) if callable(rate) else rate, dtype=np.float64)
+                arguments = (omega, T, 0.0)[: 3 if jump.coupling_index in self.timed_rates else 2]
+                strength = jump.weight * np.asarray(rate(*arguments) if callable(rate) else rate, dtype=np.float64)
                 exact_rate = float(strength * np.exp(np.float64(w) / (2.0 * T)))
             # the exponential is to blame, not the rate
             if w > -2.0 * np.log(EPS) * T and not exact_rate * EPS <= w:
@@ -280,7 +289,7 @@ class ThermalJumps(Dissipation):
         squares = np.sum(weights, axis=(-2, -1))
         k, j = np.nonzero(np.sum(weights * off_diagonal, axis=0))
         omega = (weights[:, k, j] / squares[:, None]) @ (levels[j] - levels[k])
-        rest = off_diagonal * _commutator(adjoint(operators), operators) / squares[:, None, None]
+        rest = off_diagonal * commutator(adjoint(operators), operators) / squares[:, None, None]
         return omega + structure.vector(self._from_jump_frame(rest)) @ dH if rest.any() else omega
 
     def _energy_levels(self, structure: mf.DensityMatrices, dH) -> jax.Array:
@@ -316,135 +325,23 @@ class ThermalJumps(Dissipation):
         H = self._to_jump_frame(structure.matrix(dH))
         return rate + jnp.sum(((1.0 - np.eye(size)) * H.conj() * drho).real)
 
-    def _weighted_jump_rates(self, omega, T) -> jax.Array:
+    def _weighted_jump_rates(self, system, omega, T) -> jax.Array:
         """Return the rate of each jump at its omega and T, times its weight, shape (jumps,)."""
-        rates = [self.rates[jump.coupling_index] for jump in self.jumps]
         return jnp.stack(
             [
-                jump.weight * jnp.asarray(rate(omega[i], T) if callable(rate) else rate)
-                for i, (jump, rate) in enumerate(zip(self.jumps, rates, strict=True))
+                jump.weight * self._rate_at(jump.coupling_index, omega[i], T, system.time)
+                for i, jump in enumerate(self.jumps)
             ]
         )
 
-
-class SteepestEntropyAscent(Dissipation):
-    """Steepest entropy ascent of an isolated quantum system [Beretta 1984].
-
-    ``K = rate P^T L P`` with the metric ``L A = (rho A + A rho) / 2`` and P the projector, orthogonal for L, off the
-    energy, the trace and the other preserved functions. An eigenvalue of rho that is zero stays zero. So a state keeps
-    its rank, and a pure state moves by the Hamiltonian alone. For such states use ``lt.VonNeumann(floor=...)`` and
-    ``lt.MetriplecticMidpoint``, which keeps the rank to rounding; other methods keep it to their order. A run does not
-    start if the Hamiltonian rotates the eigenvectors of the eigenvalue zero, as for most pure states: the error of a
-    step would grow there.
-
-    Parameters
-    ----------
-    rate : float, >= 0
-        The rate gamma of the ascent (1 / time).
-    preserve : list of matrices, shape (N, N), or of functions from rho, shape (N, N), to a scalar; optional
-        Observables ``tr(rho A)``, or other functions, that are conserved.
-    """
-
-    rate: jax.Array
-    functions: tuple[Any, ...]
-
-    def __init__(self, rate=1.0, preserve=()):
-        self.rate = checked_rate(rate)
-        self.functions = tuple(
-            f if callable(f) else Operator(checked_hermitian(f, f"preserve[{i}]")) for i, f in enumerate(preserve)
-        )
-
-    @property
-    def preserve(self) -> tuple[Energy, ...]:
-        return tuple(f for f in self.functions if isinstance(f, Energy))
-
-    def bind_to(self, system):
-        get_density_structure(system, "SteepestEntropyAscent")
-        return self
-
-    def bind_to_structure(self, structure: mf.DensityMatrices) -> SteepestEntropyAscent:
-        """Return this dissipation with its preserved functions made functions of the state vectors of ``structure``."""
-        functions = []
-        for i, f in enumerate(self.functions):
-            if isinstance(f, Operator):
-                if np.shape(f) != (structure.size,) * 2:
-                    raise InputError(
-                        f"preserve[{i}] has shape {np.shape(f)}, and the Hamiltonian that of {structure.size}"
-                    )
-                f = Function(_Observable(jnp.asarray(structure.vector(np.asarray(f)))))
-            elif not isinstance(f, Energy):
-                f = Function(DensityMatrixFunction(f, structure))
-            functions.append(f)
-        bound_ascent = SteepestEntropyAscent(self.rate)
-        object.__setattr__(bound_ascent, "functions", tuple(functions))
-        return bound_ascent
-
-    def force(self, system, x, dH, dS, dL):
-        frame, apply_metric = self._constraint_frame_and_metric_map(system, x, dH, dL)
-        force = frame.project_off_transposed(apply_metric(frame.project_off(dS[: system.body_dim])))
-        return jnp.pad(self.rate * force, (0, system.dim - system.body_dim))
-
-    def ascent_direction(self, system, x, dH, dS, dL) -> jax.Array:
-        """Return ``P dS``, shape (N^2,): the gradient of the entropy without its components along preserved ones."""
-        frame, _ = self._constraint_frame_and_metric_map(system, x, dH, dL)
-        return frame.project_off(dS[: system.body_dim])
-
-    def _constraint_frame_and_metric_map(self, system, x, dH, dL) -> tuple[OrthonormalFrame, Callable]:
-        """Return the frame of the preserved gradients, orthonormal in the metric L, and the map alpha -> ``L
-        alpha``."""
-        structure, n = system.structure, system.body_dim
-        rho = positive_part(structure.matrix(x[:n]))  # a negative eigenvalue would fall ever faster
-
-        def apply_metric(alpha):  # the Hermitian part of rho A has both terms
-            return structure.vector(rho @ structure.matrix(alpha))
-
-        one = jnp.asarray(np.where(np.arange(n) < structure.size, 1.0, 0.0))
-        return gram_schmidt((one, dH[:n], *(L[:n] for L in dL)), metric_map=apply_metric), apply_metric
-
-
-class _Observable(eqx.Module):
-    """The observable ``tr(rho A)`` of a state whose first coordinates are those of rho."""
-
-    coordinates: jax.Array
-
-    def __call__(self, x):
-        return jnp.dot(self.coordinates, x[: self.coordinates.shape[0]])
-
-
-def get_density_structure(system, name: str) -> mf.DensityMatrices:
-    """Return the structure of a system of density matrices; InputError for other systems."""
-    structure = getattr(system, "structure", None)
-    if not isinstance(structure, mf.DensityMatrices):
-        raise InputError(f"{name} needs density matrices. Use it in an lt.QuantumSystem")
-    return structure
-
-
-def checked_square_matrix(matrix, what: str) -> np.ndarray:
-    """Return a square complex matrix, from an array or from the ``full()`` of a ``Qobj``."""
-    array = np.asarray(matrix.full() if isinstance(matrix, HasMatrix) else matrix)
-    if array.dtype.kind not in "fiuc" or array.ndim != 2 or array.shape[0] != array.shape[1] or not array.size:
-        raise InputError(
-            f"{what} must be a square matrix of numbers, got an array of {array.dtype}, shape {array.shape}"
-        )
-    if not np.isfinite(array).all():
-        raise InputError(f"{what} is not finite")
-    return array.astype(complex)
-
-
-def checked_hermitian(matrix, what: str) -> np.ndarray:
-    """Return a matrix, made exactly Hermitian; InputError if it is not Hermitian to rounding."""
-    array = checked_square_matrix(matrix, what)
-    residual, scale = float(np.abs(array - adjoint(array)).max()), float(np.abs(array).max())
-    if residual > 1e-12 * scale:
-        raise InputError(
-            f"{what} is not Hermitian: it differs from its adjoint by {residual:.3g}. Its Hermitian part is "
-            "(A + A.conj().T) / 2"
-        )
-    return (array + adjoint(array)) / 2
-
-
-def _commutator(a, b):
-    return a @ b - b @ a
+    def _rate_at(self, i: int, omega, T, time) -> jax.Array:
+        """Return the rate of the coupling i at a frequency and a temperature, shape (); ``time`` may be None."""
+        rate = self.rates[i]
+        if i in self.timed_rates:
+            if time is None:
+                raise InputError(f"the rate of V[{i}] depends on time: take system.at_time(t)")
+            return jnp.asarray(rate(omega, T, time))
+        return jnp.asarray(rate(omega, T) if callable(rate) else rate)
 
 
 GENERIC_WEIGHTS = (1.0, 0.7548776662466927, 0.5698402909980532)
@@ -455,13 +352,32 @@ def _common_eigenvectors(hamiltonians: Sequence[np.ndarray]) -> np.ndarray:
     """Return the common eigenvectors of Hamiltonians that commute; for diagonal matrices the axes."""
     scales = [np.abs(H).max() for H in hamiltonians]
     # There may be fewer Hamiltonians than weights.
-    triples = zip(GENERIC_WEIGHTS, map(_subtract_common_energy, hamiltonians), scales, strict=False)
+    triples = zip(GENERIC_WEIGHTS, map(subtract_common_energy, hamiltonians), scales, strict=False)
     H = sum((w * H / (scale or 1.0) for w, H, scale in triples), np.zeros_like(hamiltonians[0]))
-    return np.eye(len(H)) if _is_diagonal(H) else np.linalg.eigh(H)[1]
+    return np.eye(len(H)) if is_diagonal(H) else np.linalg.eigh(H)[1]
 
 
-def _is_diagonal(H: np.ndarray) -> bool:
-    return not (H - np.diag(np.diag(H))).any()
+def friction_image(rho, logs, A, V, shift, bath_terms) -> jax.Array:
+    """Return ``L B`` of jumps at a covector, shape (jumps, N, N), in a frame in which all matrices are given.
+
+    The logarithm of rho is taken out of the gradient A of the entropy: without A - (-ln rho) and ``bath_terms`` the
+    result is that of Lindblad's equation.
+
+    Parameters
+    ----------
+    rho, logs, A : array, shape (N, N)
+        The density matrix, its logarithm, and the gradient of the entropy of rho.
+    V : array, shape (jumps, N, N)
+    shift : array, shape (jumps,)
+        ``omega / 2T``.
+    bath_terms : array, shape (jumps, N, N), or None
+        ``(dS_bath [V, H] - omega V) / T``.
+    """
+    commutators = commutator(V, A + logs)
+    if bath_terms is not None:
+        commutators = commutators - bath_terms
+    boltzmann_factors = jnp.exp(shift)[:, None, None]
+    return rho @ V / boltzmann_factors - boltzmann_factors * (V @ rho) + log_mean(logs, shift, commutators)
 
 
 def _stack_operators(jumps: tuple[Jump, ...]) -> np.ndarray:
@@ -525,10 +441,10 @@ def _jump_gain_table(jumps: tuple[Jump, ...]) -> tuple[np.ndarray, np.ndarray, n
 
 
 def _checked_rate_function(rate: Callable, i: int) -> Callable:
-    """Return a rate function of omega and T, tested at omega = T = 1."""
-    what = f"the rate of V[{i}] is a number, or a function of omega and T to a number >= 0"
+    """Return a rate function of omega and T, or of omega, T and t, tested at omega = T = 1 and t = 0."""
+    what = f"the rate of V[{i}] is a number, or a function of omega and T, or of omega, T and t, to a number >= 0"
     try:
-        value = rate(1.0, 1.0)
+        value = rate(*(1.0, 1.0, 0.0)[: 3 if _takes_time(rate) else 2])
     except TypeError as error:
         raise InputError(f"{what}: {error}") from None
     if np.shape(value) or jnp.result_type(value).kind not in "fiu":
@@ -538,26 +454,9 @@ def _checked_rate_function(rate: Callable, i: int) -> Callable:
     return rate
 
 
-def _is_hermitian(V) -> bool:
-    V = np.asarray(V)
-    return bool(np.abs(V - adjoint(V)).max() <= 1e-12 * np.abs(V).max())
-
-
-def _subtract_common_energy(H: np.ndarray) -> np.ndarray:
-    """Return a Hamiltonian less the energy that all levels have in common."""
-    return H - choose_reference_level(np.diag(H).real) * np.eye(len(H))
-
-
-def level_gap_rounding(H: np.ndarray) -> float:
-    """Return the largest rounding difference between two equal differences of levels."""
-    return ENERGY_RTOL * (1 if _is_diagonal(H) else len(H)) * float(np.linalg.norm(H, 2))
-
-
-def _is_commuting(H: np.ndarray, V: np.ndarray) -> bool:
-    """Return True if two matrices commute to rounding; a constant added to H makes no difference."""
-    H = _subtract_common_energy(H)
-    products = np.abs(H) @ np.abs(V) + np.abs(V) @ np.abs(H)
-    return bool(np.abs(_commutator(H, V)).max() <= ENERGY_RTOL * len(H) * products.max())
+def _takes_time(rate) -> bool:
+    """Return whether a rate is a function of omega, T and the time."""
+    return callable(rate) and required_argument_count(rate) == 3
 
 
 def _jumps_of_coupling(
@@ -569,31 +468,32 @@ def _jumps_of_coupling(
     """
     V = np.asarray(operator)
     V_framed = adjoint(frame) @ V @ frame
-    framed_hamiltonians = [adjoint(frame) @ _subtract_common_energy(H) @ frame for H in hamiltonians]
+    framed_hamiltonians = [adjoint(frame) @ subtract_common_energy(H) @ frame for H in hamiltonians]
     tolerances = [level_gap_rounding(H) for H in hamiltonians]
     entries = np.nonzero(np.abs(V_framed) > _entry_rounding_bounds(V_framed, frame, framed_hamiltonians, tolerances))
     gaps = np.stack([np.diag(H).real[entries[1]] - np.diag(H).real[entries[0]] for H in framed_hamiltonians])
     labels = np.stack(
-        [_cluster_labels(*gaps_and_tolerance) for gaps_and_tolerance in zip(gaps, tolerances, strict=True)]
+        [cluster_labels(*gaps_and_tolerance) for gaps_and_tolerance in zip(gaps, tolerances, strict=True)]
     )
-    is_hermitian, jumps = _is_hermitian(V), []
+    is_self_adjoint, jumps = is_hermitian(V), []
     for label in np.unique(labels, axis=1).T:
         is_member = (labels == label[:, None]).all(axis=0)
         omegas = gaps[:, is_member].mean(axis=1)
         sign = next((np.sign(w) for w, limit in zip(omegas, tolerances, strict=True) if abs(w) > limit), 0.0)
-        if is_hermitian and sign < 0.0:
+        if is_self_adjoint and sign < 0.0:
             continue
         part = np.zeros_like(V_framed)
         part[entries[0][is_member], entries[1][is_member]] = V_framed[entries][is_member]
         for H, omega, tolerance in zip(framed_hamiltonians, omegas, tolerances, strict=True):
-            if not np.abs(_commutator(H, part) + omega * part).max() <= len(H) * tolerance * np.abs(part).max():
+            if not np.abs(commutator(H, part) + omega * part).max() <= len(H) * tolerance * np.abs(part).max():
                 raise InputError(
                     f"the coupling V[{coupling_index}] cannot be split into components with [H, V] = -omega V, "
-                    "since the eigenvectors of the Hamiltonian depend on time. Only its eigenvalues may. For a "
-                    "weak drive use lt.LindbladJumps with the jumps of the undriven system"
+                    "since the eigenvectors of the Hamiltonian depend on time. Only its eigenvalues may. For a slow "
+                    "drive use lt.AdiabaticJumps, for a weak one lt.LindbladJumps with the jumps of the undriven "
+                    "system"
                 )
         part = part if sign >= 0.0 else adjoint(part)  # both act, and rates are evaluated at a positive omega
-        jumps.append(Jump(Operator(part), coupling_index, 0.5 if is_hermitian and sign == 0.0 else 1.0))
+        jumps.append(Jump(Operator(part), coupling_index, 0.5 if is_self_adjoint and sign == 0.0 else 1.0))
     return jumps
 
 
@@ -604,7 +504,7 @@ def _entry_rounding_bounds(
 
     An eigenvector contains another one by the rounding of the energies, relative to their difference.
     """
-    if _is_diagonal(frame):
+    if is_diagonal(frame):
         return 0.0
     sizes = np.abs(V_framed)
     rotation_bounds = np.ones_like(sizes)
@@ -616,7 +516,7 @@ def _entry_rounding_bounds(
     return ENERGY_RTOL * len(sizes) * sizes.max() + rotation_bounds @ sizes + sizes @ rotation_bounds
 
 
-def _cluster_labels(numbers: np.ndarray, tolerance: float) -> np.ndarray:
+def cluster_labels(numbers: np.ndarray, tolerance: float) -> np.ndarray:
     """Return the cluster of each number; a new cluster begins more than ``tolerance`` above the start of the last."""
     labels, cluster_start, label = np.empty(len(numbers), int), -np.inf, -1
     for i in np.argsort(numbers):

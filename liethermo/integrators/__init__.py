@@ -4,6 +4,7 @@ from .base import OneStepMethod, registered_methods
 from .charts import InCharts
 from .gauss import MetriplecticGauss
 from .herglotz import DiscreteHerglotz
+from .kraus import KrausMethod
 from .midpoint import MetriplecticMidpoint
 from .reconstruction import WithAttitude
 from .reference import Reference
@@ -29,6 +30,7 @@ __all__ = [
     "DiscreteSystem",
     "FiniteDifference",
     "InCharts",
+    "KrausMethod",
     "LieVariational",
     "MetriplecticGauss",
     "MetriplecticMidpoint",

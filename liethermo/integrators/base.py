@@ -36,7 +36,7 @@ class Guarantee(enum.StrEnum):
 
     ``ENERGY`` is the law of the energy, ``ENTROPY_LAW`` that of every entropy, ``ENTROPY_LAW_QUADRATIC`` that of
     quadratic ones; ``CASIMIRS`` are the known Casimirs that are conserved, ``QUADRATIC_CASIMIRS`` the quadratic ones,
-    if the dissipation preserves them by construction.
+    if the dissipation preserves them by construction. ``POSITIVITY`` says that a density matrix stays positive.
     """
 
     ENERGY = "energy"
@@ -44,6 +44,7 @@ class Guarantee(enum.StrEnum):
     ENTROPY_LAW_QUADRATIC = "entropy_law_quadratic"
     CASIMIRS = "casimirs"
     QUADRATIC_CASIMIRS = "quadratic_casimirs"
+    POSITIVITY = "positivity"
 
 
 class OneStepMethod(Module):

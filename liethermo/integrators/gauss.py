@@ -205,7 +205,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
                 stage_gradients(C, x, compensation, h, k, A, b, kronrod_rule(self.number)), continuous
             )
 
-        S, entropy_arguments = system.entropy, _entropy_arguments(system)
+        S, entropy_arguments = _entropy_with_a_law(system), _entropy_arguments(system)
         dH = self._energy_gradients(system, u, x, compensation, h, k)
         gradients_by_name = {
             name: gradients_of_function(C)
@@ -388,11 +388,22 @@ def _entropy_arguments(system: System) -> dict[str, Energy]:
 
     A quadratic entropy stands for itself too.
     """
-    if system.entropy is None:
+    S = _entropy_with_a_law(system)
+    if S is None:
         return {}
-    if system.entropy.is_quadratic or not system.has_all_casimirs:
-        return {ENTROPY_KEY: system.entropy}
+    if S.is_quadratic or not system.has_all_casimirs:
+        return {ENTROPY_KEY: S}
     return system.casimirs()
+
+
+def _entropy_with_a_law(system: System) -> Energy | None:
+    """Return the entropy of a system; None if it has no law and no part in the motion, as under Lindblad jumps.
+
+    A projection of the motion off its gradient would then only lower the order, where that gradient is infinite.
+    """
+    dissipation = system.dissipation
+    has_no_part = dissipation is not None and dissipation.has_generator and not dissipation.needs_entropy
+    return None if has_no_part and system.entropy_law is None else system.entropy
 
 
 def _gradient_projector(

@@ -95,8 +95,17 @@ class Tolerances:
         return cls(**tolerances)
 
 
+@dataclass(frozen=True)
 class AuditRow(TableRow):
-    """A row of an audit: law, measured value, tolerance, and verdict (None if nothing is promised)."""
+    """A row of an audit: law, measured value, tolerance, and verdict (None if nothing is promised).
+
+    Attributes
+    ----------
+    concerns_model : bool
+        True if the row judges the validity of the equations, and not the run.
+    """
+
+    concerns_model: bool = False
 
     @property
     def law(self) -> str:
@@ -118,6 +127,9 @@ STEPS_TAKEN_ROW = "steps taken"
 
 FAILED_TRAJECTORIES_ROW = "trajectories that failed"
 """Name of the row that counts the trajectories of an ensemble that did not reach their end."""
+
+OUTSIDE_MODEL_VERDICT = "; THE EQUATIONS ARE USED WHERE THEY ARE NOT VALID"
+"""End of the verdict of an audit in which a condition of the model does not hold."""
 
 LAW_FAILURE_VERDICT = "A LAW FAILS"
 """Verdict of an audit in which a law is violated."""
@@ -169,7 +181,8 @@ class Audit(Tabular):
 
     @property
     def passed(self) -> bool:
-        return all(row.passed is not False for row in self.rows if row.law != ACCURACY_ROW)
+        judged_rows = [row for row in self.rows if row.law != ACCURACY_ROW and not row.concerns_model]
+        return all(row.passed is not False for row in judged_rows)
 
     @property
     def resolved(self) -> bool | None:
@@ -178,7 +191,12 @@ class Audit(Tabular):
     @property
     def verdict(self) -> str:
         """Summary of the audit in one line."""
-        violated_rows = {row.law for row in self.rows if row.passed is False}
+        is_outside = any(row.passed is False and row.concerns_model for row in self.rows)
+        return self._verdict_on_run + (OUTSIDE_MODEL_VERDICT if is_outside else "")
+
+    @property
+    def _verdict_on_run(self) -> str:
+        violated_rows = {row.law for row in self.rows if row.passed is False and not row.concerns_model}
         if violated_rows - {ACCURACY_ROW, CONSISTENCY_ROW, STEPS_TAKEN_ROW, FAILED_TRAJECTORIES_ROW}:
             return LAW_FAILURE_VERDICT
         if STEPS_TAKEN_ROW in violated_rows:
@@ -291,6 +309,7 @@ def audit_run(solution: AuditedRun, tolerances: Tolerances) -> Audit:
         rows.append(_judged_row("attitude in group", stats.attitude_residual, tolerances.attitude))
     if stats.spatial_momentum_change is not None:
         rows.append(_spatial_momentum_row(stats.spatial_momentum_change, laws, tolerances))
+    rows += [AuditRow(c.name, c.value, c.limit, c.holds, c.note, c.concerns_model) for c in evidence.conditions]
     rows += _accuracy_and_consistency_rows(evidence, tolerances)
     status = solution.status  # a run stopped by its user is short, but breaks no law
     has_failed = not status.ok and status.code != StatusCode.INTERRUPTED.status_name

@@ -20,6 +20,7 @@ from ..functions.rounding import value_and_rounding_scale
 from ..integrators import OneStepMethod
 from ..integrators.fluctuating import noise_dimension
 from ..systems import System
+from ..systems.conditions import RunCondition
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.scalarize import UnsupportedPrimitive
 from .netcdf import SaveableResult
@@ -91,6 +92,8 @@ class Evidence:
     inconsistency : float or None
         Largest distance between the slope of a step and the vector field, relative to the field, that remains as the
         step gets shorter.
+    conditions : tuple of RunCondition
+        Conditions beside the laws, such as the positivity of a density matrix.
     """
 
     energy: float | None = None
@@ -101,6 +104,7 @@ class Evidence:
     error_time: float | None = None
     looked: int | None = None
     inconsistency: float | None = None
+    conditions: tuple[RunCondition, ...] = ()
 
     def __post_init__(self):
         if (self.local_error is None) != (self.error_time is None):
@@ -215,11 +219,16 @@ class EvidenceCollector:
     def _evidence(self) -> Evidence:
         functions = [*energy_and_entropy(self.system), *self.functions.values()]
         names = [*("energy", "entropy")[: len(functions) - len(self.functions)], *self.functions]
-        sampled_x = self.x[evenly_spaced_indices(len(self.x), MAX_SENSITIVITY_STATES)]
+        sample_indices = evenly_spaced_indices(len(self.x), MAX_SENSITIVITY_STATES)
+        sampled_x = self.x[sample_indices]
         sensitivities, terms = evaluate_at_points(rounding_scales, tuple(functions), sampled_x)
         sensitivity_by_name = dict(zip(names, _column_maxima(sensitivities), strict=True))
         energy, entropy = sensitivity_by_name.pop("energy"), sensitivity_by_name.pop("entropy", None)
-        evidence = Evidence(energy, entropy, sensitivity_by_name, dict(zip(names, _column_maxima(terms), strict=True)))
+        conditions = self.system.run_conditions(
+            sampled_x, np.asarray(self.t)[sample_indices], frozenset(self.method.preserves)
+        )
+        term_scales = dict(zip(names, _column_maxima(terms), strict=True))
+        evidence = Evidence(energy, entropy, sensitivity_by_name, term_scales, conditions=conditions)
         # a short step of a stochastic method shows only its noise
         if not isinstance(self.method, OneStepMethod) or noise_dimension(self.method):
             return evidence

@@ -19,6 +19,7 @@ from .lie_poisson import LiePoissonSystem
 from .linearisation import Linearisation, Stability, linearise
 from .metriplectic import MetriplecticSystem
 from .quantum import QuantumSystem
+from .rotating_frame import RotatingFrame
 from .simple_closed import SimpleClosedSystem
 from .spins import SpinSystem
 
@@ -47,6 +48,7 @@ __all__ = [
     "MetriplecticSystem",
     "QuantumSystem",
     "Reaction",
+    "RotatingFrame",
     "SimpleClosedSystem",
     "SpinSystem",
     "Stability",

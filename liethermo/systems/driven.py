@@ -144,6 +144,9 @@ class DrivenSystem(System):
     def why_singular(self, x) -> str:
         return self._body_at_first_time(x).why_singular(x[..., :-2])
 
+    def run_conditions(self, x, t, guarantees):
+        return self.body.run_conditions(x[:, :-2], t, guarantees)
+
     def _body_at_first_time(self, x) -> System:
         """Return the body at the time of the first of several states, given by numbers."""
         t = float(np.reshape(x, (-1, self.dim))[0, -2]) / self.unit

@@ -223,7 +223,7 @@ def steady_state(system: System, x0=None, t: float | None = None) -> Equilibrium
     ----------
     system : System
         The system; its functions fix the units. A system that depends on time periodically has no state at rest, and
-        is refused unless ``t`` is given.
+        is refused unless ``t`` is given: see :func:`steady_cycle`.
     x0 : array, shape (n,), optional
         The initial state, in the units of the system; by default a random one, and the completely mixed state of a
         quantum system.

@@ -12,7 +12,7 @@ import scipy
 
 import manifolds as mf
 
-from ..dissipation.quantum import HasMatrix, checked_hermitian, checked_square_matrix
+from ..dissipation.operators import HasMatrix, checked_hermitian, checked_square_matrix
 from ..errors import InputError
 from ..functions.density import ExpectationValue, MeanEnergy, ModulatedExpectationValue, choose_reference_level
 from ..functions.energy import Energy, TimeDependent
@@ -25,6 +25,11 @@ def hamiltonian_energy(hamiltonian, times=None) -> tuple[int, Energy]:
     if isinstance(hamiltonian, list | tuple) and any(map(_is_hamiltonian_term, hamiltonian)):
         return _energy_of_terms(hamiltonian, times)
     if callable(hamiltonian) and not isinstance(hamiltonian, HasMatrix):
+        if isinstance(_value_at_time(hamiltonian, TEST_TIMES[0], "the Hamiltonian"), HasMatrix):
+            raise InputError(
+                f"the Hamiltonian is a {type(hamiltonian).__name__} that returns a Qobj, which JAX cannot trace. Give "
+                "its terms, [H0, [H1, f]], with a function f of jax.numpy, or with an array of its values and times="
+            )
         matrices = [
             checked_hermitian(_value_at_time(hamiltonian, t, "the Hamiltonian"), f"the Hamiltonian at t = {t:.3g}")
             for t in TEST_TIMES

@@ -17,6 +17,7 @@ from ..errors import InputError
 from ..functions.energy import Energy
 from ..functions.surface import Surface
 from .baths import HeatBaths
+from .conditions import RunCondition
 
 
 class InvariantVerdicts(NamedTuple):
@@ -157,6 +158,20 @@ class SystemInterface(Geometry):
         For several states, shape (..., n), the text is about one of them.
         """
         return ""
+
+    def run_conditions(self, x: np.ndarray, t: np.ndarray, guarantees: frozenset[str]) -> tuple[RunCondition, ...]:
+        """Return conditions of a run beside its laws, for the rows of an audit.
+
+        Parameters
+        ----------
+        x : array, shape (m, n)
+            States of the run.
+        t : array, shape (m,)
+            Their times.
+        guarantees : frozenset of str
+            What the method keeps to rounding: see :class:`liethermo.integrators.base.Guarantee`.
+        """
+        return ()
 
     def specific_residuals(self, x) -> dict[str, jax.Array]:
         """Return residuals at x, by name, of axioms of this kind of system alone, relative to the terms that cancel."""

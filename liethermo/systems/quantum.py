@@ -15,15 +15,12 @@ import manifolds as mf
 from manifolds._arrays import is_traced
 from manifolds.matrices.linear import adjoint
 
+from ..dissipation.adiabatic import ADIABATIC_LIMIT, AdiabaticJumps, adiabatic_parameter
 from ..dissipation.base import Dissipation, sum_dissipations
 from ..dissipation.lindblad import LindbladJumps
-from ..dissipation.quantum import (
-    HasMatrix,
-    SteepestEntropyAscent,
-    ThermalJumps,
-    checked_hermitian,
-    level_gap_rounding,
-)
+from ..dissipation.operators import HasMatrix, checked_hermitian, level_gap_rounding
+from ..dissipation.quantum import ThermalJumps
+from ..dissipation.steepest_ascent import SteepestEntropyAscent
 from ..errors import InputError
 from ..functions.bath_energy import BathEnergy, ReservoirEnergy
 from ..functions.density import (
@@ -37,6 +34,7 @@ from ..functions.gradients import EPS
 from ..functions.with_baths import BodyBathsEnergy
 from .base import System
 from .baths import BathEntropy, HeatBaths, poisson_with_baths
+from .conditions import RunCondition
 from .equilibria import Equilibrium, steady_state
 from .hamiltonian import hamiltonian_energy
 from .interface import InvariantVerdicts
@@ -51,6 +49,13 @@ equation is linear, so that a small negative eigenvalue does no harm; a larger o
 
 ZERO_EIGENVALUE_PER_LEVEL = 8.0 * EPS
 """Largest eigenvalue of a density matrix that is zero to rounding, divided by the number of levels."""
+
+
+POSITIVITY_ROW = "least eigenvalue of rho"
+"""Name of the row of an audit that shows whether density matrices are positive."""
+
+ADIABATIC_ROW = "adiabatic parameter"
+"""Name of the row of an audit that judges whether a drive is slow beside the level distances."""
 
 
 class QuantumSystem(System):
@@ -154,9 +159,9 @@ class QuantumSystem(System):
     @property
     def is_driven(self) -> bool:
         """True if the Hamiltonian or a rate depends on time."""
-        if super().is_driven or self.time is not None or self.dissipation is None:
-            return super().is_driven
-        return any(isinstance(term, LindbladJumps) and term.depends_on_time for term in self.dissipation.terms)
+        return super().is_driven or (
+            self.time is None and self.dissipation is not None and self.dissipation.depends_on_time
+        )
 
     def at_time(self, t, attitude=None) -> QuantumSystem:
         """Return the system with its Hamiltonian and its rates frozen at the time t; an attitude plays no part."""
@@ -180,7 +185,7 @@ class QuantumSystem(System):
         ----------
         rho : array, shape (..., N, N), or a state already
             Hermitian, positive, of trace one. Or the amplitudes of a pure state, shape (N,) or (..., N, 1). A ``Qobj``
-            of QuTiP may be a ket, a bra, an operator or a stacked operator.
+            of QuTiP may be a ket, a bra, an operator, or a stacked operator or its adjoint.
         batch : bool
             Whether states that are given as such may be several.
         entropies : array, shape (..., number of baths), optional
@@ -192,7 +197,7 @@ class QuantumSystem(System):
         ------
         InputError
         """
-        rho = rho.full() if isinstance(rho, HasMatrix) else rho
+        rho = self._array_of(rho)
         if isinstance(rho, jax.core.Tracer) or (np.shape(rho)[-1:] == (self.dim,) and not self._is_matrix(rho, batch)):
             return super().state(rho, batch)
         matrices = self._check_density(np.asarray(rho), mixed)
@@ -205,10 +210,17 @@ class QuantumSystem(System):
 
     def state_array(self, x, batch: bool = False):
         """Return the state x; a matrix or a ket becomes the state with every bath at entropy zero."""
-        x = x.full() if isinstance(x, HasMatrix) else x
+        x = self._array_of(x)
         if not isinstance(x, jax.core.Tracer) and (self._is_matrix(x, batch) or self._is_ket(x)):
             x = np.asarray(self.state(x))
         return super().state_array(x, batch)
+
+    def _array_of(self, x):
+        """Return the array of a ``Qobj``, with the adjoint of a stacked operator made a stacked operator."""
+        if not isinstance(x, HasMatrix):
+            return x
+        array = np.asarray(x.full())  # an array of shape (1, N^2) that is no Qobj is a batch of one state
+        return adjoint(array) if array.shape == (1, self.structure.size**2) and self.structure.size > 1 else array
 
     def _is_ket(self, x) -> bool:
         """Return whether x has the shape of a ket, a bra or a stacked operator, with more than one level."""
@@ -344,6 +356,24 @@ class QuantumSystem(System):
             )
         return self._why_rank_grows(np.atleast_2d(x), rho) if self._has_dissipation(SteepestEntropyAscent) else ""
 
+    def run_conditions(self, x, t, guarantees):
+        rho = self._density_matrices(x)
+        smallest = float(np.linalg.eigvalsh(rho)[:, 0].min())
+        conditions = []
+        if self._has_dissipation(LindbladJumps):
+            note = "the method keeps the density matrix positive only to the error of its steps"
+            row = RunCondition(POSITIVITY_ROW, smallest, note=note)
+            if "positivity" in guarantees:
+                limit = -NEGATIVE_EIGENVALUE_LIMIT
+                row = RunCondition(POSITIVITY_ROW, smallest, limit, smallest >= limit)
+            conditions.append(row)
+        if self._has_dissipation(AdiabaticJumps):
+            parameter = float(np.max(np.asarray(self.adiabatic_parameter(np.unique(t)))))
+            is_slow = parameter <= ADIABATIC_LIMIT
+            note = "" if is_slow else "the drive is too fast for jumps between the levels of the moment"
+            conditions.append(RunCondition(ADIABATIC_ROW, parameter, ADIABATIC_LIMIT, is_slow, note, True))
+        return tuple(conditions)
+
     def _why_rank_grows(self, x: np.ndarray, rho: np.ndarray) -> str:
         """Explain why eigenvalues zero would not stay zero under steepest ascent; "" if they do."""
         kernels = self._kernels(rho)
@@ -478,6 +508,44 @@ class QuantumSystem(System):
             The time at which a Hamiltonian that depends on time is frozen.
         """
         return steady_state(self, x0, t)
+
+    def power(self, x, t=None) -> jax.Array:
+        """Return the power of the drive, ``tr(rho dH/dt)``, shape (...) (energy / time): work received by the system.
+
+        Parameters
+        ----------
+        x : array, shape (..., n)
+        t : float or array, shape (...), optional
+            The time, if the Hamiltonian depends on it.
+        """
+        if not self.is_driven or t is None:
+            return self.evaluate_batch(lambda system, y: jnp.zeros(()), x, t, "()")
+
+        def power_at(y, time):
+            return jax.jvp(lambda s: jnp.dot(self._hamiltonian_at(s), y[: self.body_dim]), (time,), (jnp.ones(()),))[1]
+
+        evaluate = jnp.vectorize(power_at, signature="(n),()->()")
+        return evaluate(self.state(x, batch=True), jnp.asarray(t, dtype=jnp.float64))
+
+    def adiabatic_parameter(self, t) -> jax.Array:
+        """Return ``max |<a| dH/dt |b>| / (E_a - E_b)^2`` over pairs of levels, shape (...) (dimensionless).
+
+        Jumps between instantaneous levels (:class:`liethermo.AdiabaticJumps`) are valid where it is much smaller than
+        one. Pairs of levels that the drive does not mix do not count.
+
+        Parameters
+        ----------
+        t : float or array, shape (...)
+            Times.
+        """
+        times = jnp.asarray(t, dtype=jnp.float64)
+        if not self.energy.depends_on_time:
+            return jnp.zeros(times.shape)
+        return jnp.vectorize(lambda s: adiabatic_parameter(self.structure, self._hamiltonian_at, s))(times)
+
+    def _hamiltonian_at(self, t) -> jax.Array:
+        """Return the coordinates of the Hamiltonian at a time, shape (N^2,), less a constant."""
+        return self.energy.at_time(t).gradient(jnp.zeros(self.dim))[: self.body_dim]
 
     # -- laws ---------------------------------------------------------------------------------------------------------
 

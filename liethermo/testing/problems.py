@@ -9,12 +9,20 @@ import manifolds as mf
 
 from ..dissipation.friction_operator import FrictionOperator
 from ..dissipation.inner_product import KillingDissipation
+from ..dissipation.lindblad import LindbladJumps
 from ..dissipation.projected_metric import ProjectedMetric
 from ..errors import InputError
 from ..functions.energy import Quadratic
 from ..integrators import OneStepMethod
 from ..integrators.base import EVERY_SYSTEM
-from ..systems import EulerPoincareClosedSystem, LiePoissonSystem, MetriplecticSystem, SimpleClosedSystem, System
+from ..systems import (
+    EulerPoincareClosedSystem,
+    LiePoissonSystem,
+    MetriplecticSystem,
+    QuantumSystem,
+    SimpleClosedSystem,
+    System,
+)
 
 Problem = tuple[System, object, float]
 """A system, its initial state and the duration of the run."""
@@ -25,7 +33,9 @@ def problems_for(method: OneStepMethod) -> dict[str, Problem]:
     if method.systems == EVERY_SYSTEM:
         return general_problems()
     problems = {
-        name: problem for name, problem in closed_system_problems().items() if _accepts_system(method, problem[0])
+        name: problem
+        for name, problem in (closed_system_problems() | density_matrix_problems()).items()
+        if _accepts_system(method, problem[0])
     }
     if not problems:
         raise InputError(f"{method} is for {method.systems}, but no test problem is one. Give systems=...")
@@ -69,6 +79,19 @@ def closed_system_problems() -> dict[str, Problem]:
             [0.5, -0.3, 0.4, 0.1],
             1.0,
         ),
+    }
+
+
+def density_matrix_problems() -> dict[str, Problem]:
+    """Return open quantum systems: three levels with two jumps, and a driven qubit from its ground state."""
+    lower, sx = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0, 1.0], [1.0, 0.0]])
+    H = np.array([[0.0, 0.3, 0.1j], [0.3, 0.8, 0.2], [-0.1j, 0.2, 1.5]])
+    levels = QuantumSystem(H, LindbladJumps([(np.eye(3, k=1), 0.4), (np.diag([0.0, 1.0, -1.0]), 0.2)]))
+    drive = [np.diag([0.0, 1.0]), [sx, lambda t: 0.6 * jnp.cos(1.3 * t)]]
+    qubit = QuantumSystem(drive, LindbladJumps([(lower, lambda t: 0.3 + 0.2 * jnp.sin(t))]))
+    return {
+        "three levels": (levels, levels.state(np.diag([0.2, 0.3, 0.5])), 2.0),
+        "driven qubit": (qubit, qubit.state([1.0, 0.0]), 2.0),
     }
 
 

@@ -146,3 +146,38 @@ def _eigenvectors(a) -> tuple[jax.Array, jax.Array]:
         vectors, values = jax.lax.linalg.eigh(a, symmetrize_input=False, sort_eigenvalues=False)
         return values, vectors
     return eigh(a)
+
+
+DEGENERACY_RTOL = 64.0 * float(np.finfo(np.float64).eps)
+"""Difference of two eigenvalues, relative to the norm of the matrix, up to which they count as equal in derivatives."""
+
+
+@jax.custom_jvp
+def ordered_eigenvectors(a) -> tuple[jax.Array, jax.Array]:
+    """Return the eigenvalues of a Hermitian matrix in increasing order, shape (n,), and eigenvectors as columns.
+
+    Derivatives are those of quantities that do not depend on the phases of the eigenvectors, nor on the basis of an
+    eigenspace of more than one dimension. The eigenvectors of equal eigenvalues are not turned into each other.
+
+    Parameters
+    ----------
+    a : array, shape (n, n)
+    """
+    values, vectors = _eigenvectors(a)
+    if a.shape[-1] > MAX_JACOBI_ROWS:  # LAPACK sorts them
+        return values, vectors
+    index = np.arange(a.shape[-1])
+    is_before = (values[:, None] < values) | ((values[:, None] == values) & (index[:, None] < index))
+    places = (jnp.sum(is_before, axis=0)[:, None] == index).astype(values.dtype)  # a permutation matrix
+    return values @ places, vectors @ places
+
+
+@ordered_eigenvectors.defjvp
+def _eigenvector_derivative(primals, tangents):
+    (a,), (da,) = primals, tangents
+    values, vectors = ordered_eigenvectors(a)
+    inner = adjoint(vectors) @ ((da + adjoint(da)) / 2) @ vectors
+    gaps = values - values[:, None]
+    is_equal = jnp.abs(gaps) <= DEGENERACY_RTOL * jnp.max(jnp.abs(values))
+    rotation = jnp.where(is_equal, 0.0, inner / jnp.where(is_equal, 1.0, gaps))
+    return (values, vectors), (jnp.diagonal(inner).real, vectors @ rotation)

@@ -213,7 +213,7 @@ class _LevelSurface:
     def __init__(self, function: PointFunction, point: np.ndarray, size: float):
         self.function, self.level, self.extent = function, float(function(point)), size
         self.radii = np.append(0.0, np.geomspace(0.01 * size, 10.0 * size, 60))
-        meetings = self._ray_crossings(_sphere_grid(16, 32)).sum(axis=0)
+        meetings = self._ray_crossings(sphere_grid(16, 32)).sum(axis=0)
         self.is_simple, self.is_closed = bool(meetings.max() == 1), bool((meetings == 1).all())
 
     def intersect_rays(self, directions: np.ndarray) -> np.ndarray:
@@ -258,7 +258,7 @@ class _Scene:
         if not surface.is_closed:
             self.draw_sections(function, 0, GREY, label)
             return
-        self.solid, self.mesh = surface, surface.intersect_rays(_sphere_grid(96, 192))
+        self.solid, self.mesh = surface, surface.intersect_rays(sphere_grid(96, 192))
         normals = np.cross(np.gradient(self.mesh, axis=0), np.gradient(self.mesh, axis=1))
         normals[[0, -1]] = normals[[1, -2]]  # the normals vanish at the poles of the mesh
         normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
@@ -337,7 +337,7 @@ def _draw_trajectory(solution: Solution, scene: _Scene) -> None:
     scene.ax.figure.colorbar(ScalarMappable(scale, TIME_COLORMAP), ax=scene.ax, **bar)
 
 
-def _sphere_grid(rows: int, columns: int) -> np.ndarray:
+def sphere_grid(rows: int, columns: int) -> np.ndarray:
     """Return unit vectors by latitude and longitude, shape (rows + 1, columns + 1, 3)."""
     theta, phi = np.meshgrid(np.linspace(0, np.pi, rows + 1), np.linspace(0, 2 * np.pi, columns + 1), indexing="ij")
     return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)

@@ -89,6 +89,31 @@ def test_a_drive_in_qutips_form_is_that_of_dop853():
         np.testing.assert_allclose(system.density(run.x[-1]).ravel(), expected, atol=1e-9)
 
 
+def test_a_pure_state_does_not_lower_the_order():
+    """From the ground state, where the gradient of the entropy is infinite, at order 6, beside ``mesolve``.
+
+    Bloch vector by QuTiP 5.3.1, ``mesolve(H, rho, [0, 6], [sqrt(0.25) * lower])``, solver dop853 at 1e-12.
+    """
+    drive = [-SZ, [0.6 * SX, lambda t: jnp.cos(1.7 * t)]]
+    qubit = lt.QuantumSystem(drive, lt.LindbladJumps([(LOWER, 0.25)]))
+    expected = [0.48273702972652954, -0.4089103911923284, 0.13632498568856344]
+    errors = []
+    for step in (0.1, 0.05):
+        run = lt.integrate(qubit, [1.0, 0.0], (0.0, 6.0), step, METHOD)
+        errors.append(np.abs(np.asarray(qubit.bloch(run.x[-1])) - expected).max())
+    assert errors[1] < 1e-9
+    assert errors[0] / errors[1] > 2**5.5
+
+
+def test_a_rate_that_depends_on_time_is_that_of_mesolve():
+    """``[lower, lambda t: sqrt(0.3 * (1 + sin(t) / 2))]`` of QuTiP 5.3.1, at t = 4."""
+    rate = lambda t: 0.3 * (1.0 + 0.5 * jnp.sin(t))  # noqa: E731
+    qubit = lt.QuantumSystem(-SZ + 0.3 * SX, lt.LindbladJumps([(LOWER, rate)]))
+    run = lt.integrate(qubit, [1.0, 0.0], (0.0, 4.0), 0.05, METHOD)
+    expected = [-0.3410013963251303, -0.1323242925144413, 0.9287665574252146]
+    np.testing.assert_allclose(qubit.bloch(run.x[-1]), expected, atol=1e-9)
+
+
 def test_rates_that_depend_on_time_are_those_of_dop853():
     H = 0.5 * SZ + 0.3 * SX
     system = lt.QuantumSystem(H, lt.LindbladJumps([(LOWER, lambda t: 0.2 * (1 + jnp.sin(t))), (SZ, 0.05)]))
@@ -127,9 +152,27 @@ def test_coefficients_that_do_not_fit_are_refused(coefficient, times, words):
 def test_states_of_every_shape():
     system, ket = lt.QuantumSystem(SZ), np.array([0.6, 0.8j])
     rho = np.outer(ket, ket.conj())
-    for state in (ket, ket[:, None], ket.conj()[None], rho.T.reshape(4, 1), rho):
+    for state in (ket, ket[:, None], ket.conj()[None], rho.T.reshape(4, 1), rho.T.reshape(1, 4).conj(), rho):
         np.testing.assert_allclose(system.density(system.state(FakeQobj(state))), rho, atol=1e-15)
         np.testing.assert_allclose(system.density(system.state_array(FakeQobj(state))), rho, atol=1e-15)
+
+
+def test_collapse_operators_contain_their_rates():
+    """``c_ops`` of QuTiP: ``sqrt(rate) V``, or ``[V, f]`` with the rate ``f(t)^2``."""
+    jumps = lt.LindbladJumps.from_collapse_operators(
+        [FakeQobj(np.sqrt(0.2) * LOWER), [FakeQobj(SZ), lambda t: jnp.sqrt(0.1 * (1 + t))]]
+    )
+    system, same = (lt.QuantumSystem(SX, d) for d in (jumps, lt.LindbladJumps([(LOWER, 0.2), (SZ, 0.3)])))
+    x = system.state(RHO)
+    np.testing.assert_allclose(system.vector_field(x, 2.0), same.vector_field(x), atol=1e-15)
+    with pytest.raises(lt.InputError, match=r"string 'sqrt\(t\)', which is not evaluated"):
+        lt.LindbladJumps.from_collapse_operators([[LOWER, "sqrt(t)"]])
+
+
+def test_a_function_that_returns_operators_is_refused():
+    """As ``QobjEvo`` does; the advice names the form that is read."""
+    with pytest.raises(lt.InputError, match=r"returns a Qobj, which JAX cannot trace. Give its terms, \[H0"):
+        lt.QuantumSystem(lambda t: FakeQobj(np.cos(t) * SX))
 
 
 def test_jumps_that_do_not_fit_are_refused():

@@ -17,7 +17,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 import liethermo as lt
 import manifolds as mf
 from liethermo.results.plot.figures import BLUE, GREEN, GREY, RED
-from liethermo.results.plot.surfaces import _fit_quadric, _LevelSurface, _sphere_grid
+from liethermo.results.plot.surfaces import _fit_quadric, _LevelSurface, sphere_grid
 
 MIN_FIGURE_BYTES = 5_000
 """Size in bytes that every figure exceeds; an empty one is smaller."""
@@ -180,7 +180,7 @@ def test_momentum_sphere_of_a_loaded_solution(body, relaxed_solution, tmp_path):
 
 def test_the_energy_surface_is_found_from_the_states(body, relaxed_solution):
     surface_points = _LevelSurface(_fit_quadric(relaxed_solution.x), relaxed_solution.x[0], 1.0).intersect_rays(
-        _sphere_grid(8, 16)
+        sphere_grid(8, 16)
     )
     np.testing.assert_allclose(body.energy(surface_points), relaxed_solution.energy[0], rtol=1e-9)
 
@@ -319,3 +319,21 @@ def test_momentum_sphere_of_a_body_with_a_bath():
     assert np.ptp(solution.energy) < 1e-14
     with pytest.raises(lt.InputError, match="If the others are the entropies of baths, pass the system too"):
         lt.plot.momentum_sphere(solution)
+
+
+def test_bloch_ball_of_a_run_and_of_states(tmp_path):
+    """The curve is the Bloch vectors of the run, and its last point is marked."""
+    lower = np.array([[0.0, 1.0], [0.0, 0.0]])
+    qubit = lt.QuantumSystem(np.diag([0.0, 1.0]), lt.LindbladJumps([(lower, 0.2)]))
+    run = lt.integrate(qubit, [0.6, 0.8], (0.0, 5.0), 0.1)
+    figure = lt.plot.bloch_ball(run, qubit, labels=("g", "e"))
+    curves = [np.stack(line.get_data_3d()) for line in figure.axes[0].lines]
+    assert any(c.shape == (3, 51) and np.allclose(c, np.asarray(qubit.bloch(run.x)).T) for c in curves)
+    plt.close(figure)
+    path = tmp_path / "ball.png"
+    lt.plot.bloch_ball(np.stack([run.x, run.x]), qubit, path=path)  # several trajectories
+    assert path.stat().st_size > 10_000
+    with pytest.raises(lt.InputError, match=r"shows states of an lt\.QuantumSystem"):
+        lt.plot.bloch_ball(run, lt.models.rigid_body())
+    with pytest.raises(lt.InputError, match='projection="3d"'):
+        lt.plot.bloch_ball(run, qubit, ax=plt.figure().add_subplot())

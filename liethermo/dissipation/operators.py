@@ -1,0 +1,93 @@
+"""Operators of density matrices: matrices as users give them, checked, and the differences of their levels."""
+
+from __future__ import annotations
+
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+import manifolds as mf
+from manifolds.matrices.linear import adjoint
+
+from ..errors import InputError
+from ..functions.density import choose_reference_level
+from ..functions.gradients import EPS
+from ..functions.indices import StaticArray
+
+ENERGY_RTOL = 8.0 * EPS
+"""Error of an energy, relative to the largest one; times the number of levels if energies are eigenvalues."""
+
+
+@runtime_checkable
+class HasMatrix(Protocol):
+    """An operator, such as a ``Qobj`` of QuTiP, whose matrix is returned by ``full()``."""
+
+    def full(self) -> np.ndarray: ...
+
+
+class Operator(StaticArray):
+    """A complex matrix as a static field of a module."""
+
+    dtype = complex
+
+
+def get_density_structure(system, name: str) -> mf.DensityMatrices:
+    """Return the structure of a system of density matrices; InputError for other systems."""
+    structure = getattr(system, "structure", None)
+    if not isinstance(structure, mf.DensityMatrices):
+        raise InputError(f"{name} needs density matrices. Use it in an lt.QuantumSystem")
+    return structure
+
+
+def checked_square_matrix(matrix, what: str) -> np.ndarray:
+    """Return a square complex matrix, from an array or from the ``full()`` of a ``Qobj``."""
+    array = np.asarray(matrix.full() if isinstance(matrix, HasMatrix) else matrix)
+    if array.dtype.kind not in "fiuc" or array.ndim != 2 or array.shape[0] != array.shape[1] or not array.size:
+        raise InputError(
+            f"{what} must be a square matrix of numbers, got an array of {array.dtype}, shape {array.shape}"
+        )
+    if not np.isfinite(array).all():
+        raise InputError(f"{what} is not finite")
+    return array.astype(complex)
+
+
+def checked_hermitian(matrix, what: str) -> np.ndarray:
+    """Return a matrix, made exactly Hermitian; InputError if it is not Hermitian to rounding."""
+    array = checked_square_matrix(matrix, what)
+    residual, scale = float(np.abs(array - adjoint(array)).max()), float(np.abs(array).max())
+    if residual > 1e-12 * scale:
+        raise InputError(
+            f"{what} is not Hermitian: it differs from its adjoint by {residual:.3g}. Its Hermitian part is "
+            "(A + A.conj().T) / 2"
+        )
+    return (array + adjoint(array)) / 2
+
+
+def commutator(a, b):
+    return a @ b - b @ a
+
+
+def is_diagonal(H: np.ndarray) -> bool:
+    return not (H - np.diag(np.diag(H))).any()
+
+
+def is_hermitian(V) -> bool:
+    V = np.asarray(V)
+    return bool(np.abs(V - adjoint(V)).max() <= 1e-12 * np.abs(V).max())
+
+
+def subtract_common_energy(H: np.ndarray) -> np.ndarray:
+    """Return a Hamiltonian less the energy that all levels have in common."""
+    return H - choose_reference_level(np.diag(H).real) * np.eye(len(H))
+
+
+def level_gap_rounding(H: np.ndarray) -> float:
+    """Return the largest rounding difference between two equal differences of levels."""
+    return ENERGY_RTOL * (1 if is_diagonal(H) else len(H)) * float(np.linalg.norm(H, 2))
+
+
+def is_commuting(H: np.ndarray, V: np.ndarray) -> bool:
+    """Return True if two matrices commute to rounding; a constant added to H makes no difference."""
+    H = subtract_common_energy(H)
+    products = np.abs(H) @ np.abs(V) + np.abs(V) @ np.abs(H)
+    return bool(np.abs(commutator(H, V)).max() <= ENERGY_RTOL * len(H) * products.max())

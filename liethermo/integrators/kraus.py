@@ -1,0 +1,268 @@
+"""Steps of Lindblad's equation that are quantum channels: completely positive, and exact in the trace."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import manifolds as mf
+from manifolds.matrices.exponential import expm
+from manifolds.matrices.linear import adjoint
+
+from ..dissipation.lindblad import LindbladJumps
+from ..errors import InputError
+from ..systems import DrivenSystem, QuantumSystem, System
+from .base import OneStepMethod, kind_or_class_name, register
+from .explicit import StepRow
+
+KRAUS_ORDERS = (2, 4)
+"""Orders of :class:`KrausMethod`."""
+
+START_SLOPE_ROW = StepRow.FIRST_METHOD_ROW
+"""Row of ``k`` that holds the slope at the start of a step."""
+
+END_SLOPE_ROW = StepRow.FIRST_METHOD_ROW + 1
+"""Row of ``k`` that holds the slope at the end of a step."""
+
+SIMPSON_WEIGHTS = np.array([1.0, 4.0, 1.0]) / 6.0
+"""Weights of Simpson's rule at the start, the middle and the end of an interval; all are positive."""
+
+
+class KrausMethod(OneStepMethod):
+    """Steps of Lindblad's equation that are quantum channels, for any step size [Cao & Lu 2025].
+
+    Duhamel's formula writes the state as an integral over the time of the last jump,
+
+        rho(t) = W(t, 0) rho W(t, 0)^H + integral_0^t W(t, s) (sum_j rate_j V_j rho(s) V_j^H) W(t, s)^H ds,
+
+    with the exponential W of the motion without jumps, ``W' = (-i H - sum_j rate_j V_j^H V_j / 2) W``. The integral is
+    replaced by a quadrature with positive weights, and rho(s) at its nodes by the formula of the order below. The
+    result is a sum ``sum A rho A^H``, a completely positive map of rho, with ``sum A^H A = S = 1 + O(h^(p+1))``. The
+    step applies it to ``S^-1/2 rho S^-1/2``. So every step is completely positive and conserves the trace, whatever its
+    size is. Trace and positivity hold to rounding, also for pure states. Other methods keep positivity to their order.
+
+    H and the rates may depend on time. W has the order of the method by Magnus' expansion, and is exact if they do not.
+    So a fast precession with slow jumps needs no short steps. A step costs 1 (order 2) or 5 (order 4) exponentials of
+    an N x N matrix, and twice 2 or 9 sums over the jumps.
+
+    Parameters
+    ----------
+    order : int
+        2 or 4.
+
+    Examples
+    --------
+    >>> lower = np.array([[0, 1], [0, 0]])
+    >>> qubit = lt.QuantumSystem(np.diag([0.0, 1.0]), lt.LindbladJumps([(lower, 0.2)]))
+    >>> run = lt.integrate(qubit, qubit.state([0.0, 1.0]), (0.0, 60.0), 6.0, lt.KrausMethod(4))
+    >>> bool(np.linalg.eigvalsh(qubit.density(run.x)).min() > -1e-15), run.audit().passed
+    (True, True)
+    """
+
+    systems: ClassVar[str] = "quantum systems with Lindblad jumps"
+
+    number: int = eqx.field(static=True)
+
+    def __init__(self, order: int = 4):
+        if type(order) is not int or order not in KRAUS_ORDERS:
+            raise InputError(f"order must be 2 or 4, got {order!r}")
+        self.number = order
+
+    def __str__(self) -> str:
+        return f"KrausMethod(order={self.number})"
+
+    @property
+    def order(self) -> int:
+        return self.number
+
+    stages = END_SLOPE_ROW + 1
+    explicit = True
+    preserves = frozenset({"positivity"})
+
+    @property
+    def evaluations_per_iteration(self) -> int:
+        """Number of sums over the jumps, those for the completeness relation included."""
+        return 4 if self.number == 2 else 18
+
+    def preserves_function(self, system: System, name: str) -> bool:
+        return name == "tr(rho)"
+
+    def check(self, system: System) -> None:
+        """Raise InputError unless the system is a QuantumSystem with LindbladJumps and no other dissipation."""
+        body = system.body if isinstance(system, DrivenSystem) else system
+        if not isinstance(body, QuantumSystem):
+            raise InputError(f"KrausMethod needs an lt.QuantumSystem, got a {kind_or_class_name(body)}")
+        terms = () if body.dissipation is None else body.dissipation.terms
+        if not terms or not all(isinstance(term, LindbladJumps) for term in terms):
+            raise InputError(
+                "KrausMethod needs lt.LindbladJumps and no other dissipation. For lt.ThermalJumps use "
+                "lt.MetriplecticGauss, which keeps the laws of the energy and the entropy"
+            )
+
+    def start(self, system: System, x) -> jax.Array:
+        return jnp.zeros((self.stages, x.shape[0])).at[StepRow.MEAN_SLOPE].set(system.vector_field(x))
+
+    def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
+        """Return the rows of :class:`.explicit.StepRow`, followed by the slopes at both ends."""
+        x = x + compensation
+        body, n, clock_time = _quantum_body(system), _quantum_body(system).body_dim, None
+        if isinstance(system, DrivenSystem):
+            clock_time = system.time(x)
+        channel = _Channel.build(system, body.structure, clock_time, h, self.number)
+        middle, end = channel.apply(x[:n])
+        d = end - x[:n]
+        if isinstance(system, DrivenSystem):
+            d = jnp.concatenate([d, _clock_and_work(system, x, h, middle, end)])
+        field = jax.vmap(system.vector_field)(jnp.stack([x, x + d]))
+        zero = jnp.zeros_like(x)
+        return jnp.stack([d / h, zero, zero, k[StepRow.INITIAL_LEVELS], *field])
+
+    def increment(self, h, k) -> jax.Array:
+        return h * k[StepRow.MEAN_SLOPE]
+
+    def weights(self, theta) -> np.ndarray:
+        """Return the weights of the cubic through both ends and their slopes; its error in the step is O(h^4)."""
+        theta = np.asarray(theta, dtype=np.float64)
+        row_weights = np.zeros((*theta.shape, self.stages))
+        row_weights[..., StepRow.MEAN_SLOPE] = theta**2 * (3.0 - 2.0 * theta)
+        row_weights[..., START_SLOPE_ROW] = theta * (1.0 - theta) ** 2
+        row_weights[..., END_SLOPE_ROW] = theta**2 * (theta - 1.0)
+        return row_weights
+
+
+class _Channel(NamedTuple):
+    """The completely positive map of a step.
+
+    Attributes
+    ----------
+    structure : manifolds.DensityMatrices
+    order : int
+    h : array, shape ()
+    operators : array, shape (jumps, N, N)
+    rates : function from a fraction of the step to the rates, shape (jumps,)
+    propagators : dict from (start, end), as fractions of the step, to arrays, shape (N, N)
+        W between these times.
+    """
+
+    structure: mf.DensityMatrices
+    order: int
+    h: jax.Array
+    operators: np.ndarray
+    rates: Callable
+    propagators: dict
+
+    @classmethod
+    def build(cls, system: System, structure: mf.DensityMatrices, time, h, order: int) -> _Channel:
+        """Return the map of a step of size h from a time, which is None if nothing depends on it."""
+        body = _quantum_body(system)
+        fractions = (0.0, 0.25, 0.5, 1.0)
+        frozen = dict.fromkeys(fractions, body)
+        if time is not None:
+            assert isinstance(system, DrivenSystem)
+            frozen = {c: _quantum_body(body.at_time(system.span.clip(time + c * h))) for c in fractions}
+        assert body.dissipation is not None
+        terms = [term for term in body.dissipation.terms if isinstance(term, LindbladJumps)]
+        operators = np.concatenate([term.stacked_operators() for term in terms])
+        losses = adjoint(operators) @ operators
+
+        def rates(c) -> jax.Array:
+            return jnp.concatenate([term.rates_at(frozen[c].time) for term in terms])
+
+        def decay_generator(c) -> jax.Array:
+            H = structure.matrix(frozen[c].energy.gradient(jnp.zeros(body.dim))[: structure.dim])
+            return -1j * H - 0.5 * jnp.tensordot(rates(c), jnp.asarray(losses), 1)
+
+        intervals = [(0.0, 1.0)] if order == 2 else [(0.0, 0.25), (0.25, 0.5), (0.0, 0.5), (0.5, 1.0), (0.0, 1.0)]
+        if time is None:
+            exponents = [(end - start) * h * decay_generator(0.0) for start, end in intervals]
+        else:
+            ends_and_middle = decay_generator(0.0), decay_generator(0.5), decay_generator(1.0)
+            exponents = _magnus_exponents(*ends_and_middle, h, intervals)
+        propagators = dict(zip(intervals, expm(jnp.stack(exponents)), strict=True))
+        return cls(structure, order, h, operators, rates, propagators)
+
+    def apply(self, x) -> tuple[jax.Array, jax.Array]:
+        """Return the state in the middle of the step and at its end, shape (N^2,) each, from that at its start."""
+        identity = self.structure.matrix(
+            jax.grad(lambda y: jnp.trace(self._map(self.structure.matrix(y))[1]).real)(jnp.zeros_like(x))
+        )
+        root = mf.spectral(_inverse_root, identity)
+        middle, end = self._map(root @ self.structure.matrix(x) @ root)
+        return self.structure.vector(middle), self.structure.vector(end)
+
+    def _map(self, rho) -> tuple[jax.Array, jax.Array]:
+        """Return the middle and the end of a step before it is completed; by the trapezoidal rule for order 2."""
+        first_gain = self._gain(0.0, rho)
+
+        def second_order(c):  # the trapezoidal rule, with the state of order 1 at its end
+            W, step = self.propagators[0.0, c], c * self.h
+            without, gain = _conjugate(W, rho), _conjugate(W, first_gain)
+            return without + 0.5 * step * (gain + self._gain(c, without + step * gain))
+
+        if self.order == 2:
+            end = second_order(1.0)
+            return 0.5 * (rho + end), end
+
+        def simpson(c, gain_in_the_middle, gain_at_the_end):
+            whole, second_half = self.propagators[0.0, c], self.propagators[0.5 * c, c]
+            gains = _conjugate(whole, first_gain), _conjugate(second_half, gain_in_the_middle), gain_at_the_end
+            return _conjugate(whole, rho) + c * self.h * sum(
+                weight * gain for weight, gain in zip(SIMPSON_WEIGHTS, gains, strict=True)
+            )
+
+        quarter, half, end = (second_order(c) for c in (0.25, 0.5, 1.0))
+        half_gain = self._gain(0.5, half)
+        third_order_half = simpson(0.5, self._gain(0.25, quarter), half_gain)
+        third_order_end = simpson(1.0, half_gain, self._gain(1.0, end))
+        return third_order_half, simpson(1.0, self._gain(0.5, third_order_half), self._gain(1.0, third_order_end))
+
+    def _gain(self, c: float, rho) -> jax.Array:
+        """Return ``sum rate V rho V^H`` at a fraction of the step."""
+        V = self.operators
+        return jnp.sum(self.rates(c)[:, None, None] * (V @ rho @ adjoint(V)), axis=0)
+
+
+def _conjugate(W, rho) -> jax.Array:
+    return W @ rho @ adjoint(W)
+
+
+def _inverse_root(p):
+    return 1.0 / jnp.sqrt(p)
+
+
+def _magnus_exponents(J0, J, J1, h, intervals) -> list[jax.Array]:
+    """Return the exponents of W over parts of a step, of order 4, from ``-i H - ...`` at its start, middle and end.
+
+    The matrix is a quadratic polynomial of the time [Blanes et al. 2009].
+    """
+    slope, curvature = J1 - J0, 2.0 * (J0 - 2.0 * J + J1)
+    commutator = slope @ J - J @ slope
+    exponents = []
+    for start, end in intervals:
+        a, b, length = start - 0.5, end - 0.5, end - start
+        integral = length * J + (b**2 - a**2) / 2.0 * slope + (b**3 - a**3) / 3.0 * curvature
+        exponents.append(h * integral + h**2 * length**3 / 12.0 * commutator)
+    return exponents
+
+
+def _quantum_body(system: System) -> QuantumSystem:
+    body = system.body if isinstance(system, DrivenSystem) else system
+    assert isinstance(body, QuantumSystem)
+    return body
+
+
+def _clock_and_work(system: DrivenSystem, x, h, middle, end) -> jax.Array:
+    """Return the displacements of clock and work over a step, by Simpson's rule for the power."""
+    states = jnp.stack([x[:-2], middle, end])
+    times = x[-2] + jnp.array([0.0, 0.5, 1.0]) * h * system.unit
+    points = jnp.concatenate([states, times[:, None], jnp.zeros((3, 1))], axis=1)
+    powers = jax.vmap(system.energy.gradient)(points)[:, -2]
+    return jnp.stack([h * system.unit, h * system.unit**2 * jnp.dot(SIMPSON_WEIGHTS, powers)])
+
+
+register(*map(KrausMethod, KRAUS_ORDERS))
