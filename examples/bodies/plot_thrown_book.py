@@ -32,10 +32,19 @@ def euler(t, omega):
     return [(b - c) / a * y * z, (c - a) / b * z * x, (a - b) / c * x * y]
 
 
-omega = solve_ivp(euler, (0.0, 2.0), [0.05, 11.0, 0.1], "DOP853", t, rtol=1e-11, atol=1e-12).y.T
+omega = solve_ivp(
+    euler, (0.0, 2.0), [0.05, 11.0, 0.1], "DOP853", t, rtol=1e-11, atol=1e-12
+).y.T
 readings = np.degrees(omega) + random.standard_normal(omega.shape)
 header = "time [ms],gx [deg/s],gy [deg/s],gz [deg/s]"
-np.savetxt("throw.csv", np.column_stack([1e3 * t, readings]), fmt="%.3f", delimiter=",", header=header, comments="")
+np.savetxt(
+    "throw.csv",
+    np.column_stack([1e3 * t, readings]),
+    fmt="%.3f",
+    delimiter=",",
+    header=header,
+    comments="",
+)
 
 # %%
 # The fit needs a function that builds the body, one that returns what the sensor shows, and a guess of the two ratios.
@@ -51,14 +60,18 @@ def gyroscope(x, p):
 
 
 guess = {"I1/I2": 0.7, "I3/I2": 1.2}
-found = lt.learn.fit(body, "throw.csv", parameters=guess, positive=True, observe=gyroscope)
+found = lt.learn.fit(
+    body, "throw.csv", parameters=guess, positive=True, observe=gyroscope
+)
 print(found.training)
 
 # %%
 # The true ratios lie in the intervals of 95 %.
 
 interval = found.training.confidence_interval(0.95)
-for name, low, high, true in zip(found.training.names, *interval, (a / b, c / b), strict=True):
+for name, low, high, true in zip(
+    found.training.names, *interval, (a / b, c / b), strict=True
+):
     print(f"{name}: {low:.4f} to {high:.4f}, true {true:.4f}")
 
 # %%
@@ -66,13 +79,26 @@ for name, low, high, true in zip(found.training.names, *interval, (a / b, c / b)
 table = lt.learn.read_data("throw.csv")[0]
 x0 = found.training.initial_states[0]
 times = np.linspace(table.t[0], table.t[-1], 400)
-fitted = np.asarray(lt.flow(found, x0, (times[0], times[-1]), 0.005, lt.MetriplecticGauss(2), save_at=times))
+fitted = np.asarray(
+    lt.flow(
+        found, x0, (times[0], times[-1]), 0.005, lt.MetriplecticGauss(2), save_at=times
+    )
+)
 inertia = 1.0 / np.asarray(found.energy.A)
 figure, axes = plt.subplots(figsize=(7, 3.4), layout="constrained")
 for i, colour in enumerate(("tab:blue", "tab:orange", "tab:green")):
     axes.plot(table.t, np.degrees(table.x[:, i]), ".", color=colour, markersize=4)
-    axes.plot(times, np.degrees(fitted[:, i] / inertia[i]), color=colour, label=rf"$\omega_{i + 1}$")
-axes.set(xlabel="time (s)", ylabel="angular velocity (deg/s)", title="Readings (dots) and the fitted motion (lines)")
+    axes.plot(
+        times,
+        np.degrees(fitted[:, i] / inertia[i]),
+        color=colour,
+        label=rf"$\omega_{i + 1}$",
+    )
+axes.set(
+    xlabel="time (s)",
+    ylabel="angular velocity (deg/s)",
+    title="Readings (dots) and the fitted motion (lines)",
+)
 axes.legend(ncol=3, loc="lower right")
 plt.show()
 

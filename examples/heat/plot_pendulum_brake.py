@@ -32,10 +32,16 @@ t = np.sort(random.uniform(0.0, 20.0, 300))
 
 def motion(t, state):
     q, v, _ = state
-    return [v, -GRAVITY / LENGTH * np.sin(q) - DAMPING / (MASS * LENGTH**2) * v, DAMPING * v**2 / CAPACITY]
+    return [
+        v,
+        -GRAVITY / LENGTH * np.sin(q) - DAMPING / (MASS * LENGTH**2) * v,
+        DAMPING * v**2 / CAPACITY,
+    ]
 
 
-q, v, T = solve_ivp(motion, (0.0, 20.0), [1.2, 0.0, ROOM], "DOP853", t, rtol=1e-11, atol=1e-12).y
+q, v, T = solve_ivp(
+    motion, (0.0, 20.0), [1.2, 0.0, ROOM], "DOP853", t, rtol=1e-11, atol=1e-12
+).y
 angle = np.degrees(q) + 0.3 * random.standard_normal(len(t))
 temperature = T - 273.15 + 0.01 * random.standard_normal(len(t))
 temperature[np.arange(len(t)) % 10 != 0] = np.nan
@@ -47,10 +53,17 @@ table = {"time [s]": t, "angle [deg]": angle, "temperature [degC]": temperature}
 
 def pendulum(p):
     def energy(x):
-        return x[1] ** 2 / (2 * MASS * LENGTH**2) - MASS * GRAVITY * LENGTH * jnp.cos(x[0])
+        return x[1] ** 2 / (2 * MASS * LENGTH**2) - MASS * GRAVITY * LENGTH * jnp.cos(
+            x[0]
+        )
 
     brake = lt.HeatBaths(p["capacity"], ROOM)
-    return lt.MetriplecticSystem(mf.Canonical(1), energy, dissipation=lt.Friction([0.0, p["damping"]]), baths=brake)
+    return lt.MetriplecticSystem(
+        mf.Canonical(1),
+        energy,
+        dissipation=lt.Friction([0.0, p["damping"]]),
+        baths=brake,
+    )
 
 
 def sensors(x, p):
@@ -61,22 +74,36 @@ guess = {"damping": 0.01, "capacity": 1.0}
 found = lt.learn.fit(pendulum, table, parameters=guess, positive=True, observe=sensors)
 print(found.training)
 interval = found.training.confidence_interval(0.95)
-for name, low, high, true in zip(found.training.names, *interval, (DAMPING, CAPACITY), strict=True):
+for name, low, high, true in zip(
+    found.training.names, *interval, (DAMPING, CAPACITY), strict=True
+):
     print(f"{name}: {low:.3g} to {high:.3g}, true {true:.3g}")
 
 # %%
 # The fitted system is an ordinary one. Its run conserves the energy to rounding, and its entropy never falls.
 
-run = lt.integrate(found, found.training.initial_states[0], (t[0], t[-1]), 0.02, lt.MetriplecticGauss(2))
+run = lt.integrate(
+    found,
+    found.training.initial_states[0],
+    (t[0], t[-1]),
+    0.02,
+    lt.MetriplecticGauss(2),
+)
 print(run.audit())
 
 # %%
 
-figure, (above, below) = plt.subplots(2, figsize=(7, 4.4), sharex=True, layout="constrained")
+figure, (above, below) = plt.subplots(
+    2, figsize=(7, 4.4), sharex=True, layout="constrained"
+)
 above.plot(t, angle, ".", color="tab:gray", markersize=4)
 above.plot(run.t, np.degrees(run.x[:, 0]), color="tab:blue", linewidth=0.8)
 above.set(ylabel="angle (degrees)")
 below.plot(t, temperature, ".", color="tab:gray")
-below.plot(run.t, ROOM * np.exp(run.x[:, 2] / np.asarray(found.training.values[1])) - 273.15, color="tab:orange")
+below.plot(
+    run.t,
+    ROOM * np.exp(run.x[:, 2] / np.asarray(found.training.values[1])) - 273.15,
+    color="tab:orange",
+)
 below.set(xlabel="time (s)", ylabel="temperature (°C)")
 plt.show()

@@ -102,7 +102,7 @@ def fit(
         order. Units in their labels are converted to SI units.
     parameters : dict from names to initial values, or sequence of names, optional
         The numbers to fit, in the units of the system: arguments of the function ``system``; or parameters of a system,
-        such as ``["dissipation.rate", "energy.A"]``, from the values that it has.
+        such as ``["dissipation.rate", "energy.inertia"]``, from the values that it has.
     matching, shooting : int
         Numbers of iterations of the two parts, 2000 and 500 without ``parameters=``, else 0. If not all components are
         observed, there is no matching. If both are 0, there are least squares only.

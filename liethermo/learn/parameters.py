@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 
 from ..errors import FunctionError, InputError
 from ..runs.flow_times import system_with_parameters
-from ..runs.system_family import named_parameters
+from ..runs.named_parameters import find_parameter
 from ..systems import System
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
 from .losses import ParameterVector
@@ -33,15 +33,10 @@ def initial_parameters(system: System | Callable, parameters: Any) -> dict[str, 
         If names or values cannot be used.
     """
     if isinstance(system, System) and not isinstance(parameters, Mapping):
-        known_values = named_parameters(system)
         names = _list_of_names(parameters)
         if names is None:
             raise InputError(f"parameters must be names, or a dict from names to initial values, got {parameters!r}")
-        if unknown := [name for name in names if name not in known_values]:
-            raise InputError(
-                f"the system has no parameter {unknown[0]!r}; its parameters are {', '.join(known_values)}"
-            )
-        parameters = {name: known_values[name] for name in names}
+        parameters = {name: find_parameter(system, name).value for name in names}
     if not isinstance(parameters, Mapping) or not all(isinstance(name, str) for name in parameters):
         raise InputError(
             "a function that builds a system needs parameters=, a dict from names to initial values, got "

@@ -36,7 +36,10 @@ from .system_family import Family
 
 Result = TypeVar("Result")
 
-MISSING_GROUP_MESSAGE = "an attitude is for a system with a group: give LiePoissonSystem one, such as group=mf.SO(3), or a model attitude=True"
+MISSING_GROUP_MESSAGE = (
+    "an attitude is for a system with a group: give LiePoissonSystem one, such as group=mf.SO(3), or a model of a body "
+    "attitude=True"
+)
 """Error message for an attitude of a system without a group."""
 
 
