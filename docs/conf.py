@@ -109,7 +109,7 @@ html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_js_files = ["turning.js", "momentum_sphere.js", "sphere_field.js", "tumbling_rod.js"]
 html_show_sourcelink = False
-html_search_scorer = "search_scorer.js"  # lists of everything come last
+html_search_scorer = str(HERE / "search_scorer.js")  # lists of everything come last
 html_theme_options = {
     "logo": {"text": "liethermo"},
     "header_links_before_dropdown": 6,

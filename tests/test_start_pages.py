@@ -81,3 +81,10 @@ def test_keywords_are_single_words():
     wrong = {page.stem: word for page in PAGES for word in _keywords(page.read_text()) if re.search(r"[\s-]", word)}
     assert wrong == {}
     assert sum(bool(_keywords(page.read_text())) for page in PAGES) > 30
+
+
+def test_the_search_lists_last_pages_that_exist():
+    last = re.findall(r'^  "([\w/]+)",$', (DOCS / "search_scorer.js").read_text(), re.MULTILINE)
+    assert {"reference/changelog", "reference/bibliography", "reference/benchmarks"} <= set(last)
+    assert all((DOCS / f"{page}.md").is_file() for page in last)
+    assert 'str(HERE / "search_scorer.js")' in (DOCS / "conf.py").read_text()  # Sphinx reads it from anywhere
