@@ -287,6 +287,10 @@ BAD = {
         lambda: fit_spring((TIMES, spring_record()), observe=lambda x, p: x[0] + p["offset"]),
         "observe uses the parameter 'offset', but the parameters are stiffness, drag",
     ),
+    "arguments in another order": (
+        lambda: fit_spring((TIMES, spring_record()), observe=lambda p, x: x[0] * p["drag"]),
+        "observe uses the parameter 0, but the parameters are stiffness, drag. Its arguments are (x, parameters)",
+    ),
     "four arguments": (
         lambda: fit_spring((TIMES, spring_record()), observe=lambda a, b, c, d: a),
         "a function of (x), (x, parameters) or (t, x, parameters)",
@@ -361,6 +365,13 @@ def problems_of(*arguments, **how):
         warnings.simplefilter("always")
         fitted_system = fit_spring(*arguments, **how)
     return fitted_system.training, " ".join(str(warning.message) for warning in messages)
+
+
+def test_smooth_data_that_the_model_cannot_describe_are_called_so():
+    """A motion with another force has no noise, which could hide that it is another one."""
+    result, text = problems_of((TIMES, spring_record() + 0.2 * np.sin(TIMES) ** 2))
+    assert "times the noise: the model cannot describe the data" in text
+    assert result.residual > 2.0
 
 
 def test_few_data_give_a_warning():
