@@ -112,6 +112,9 @@ SYNONYMS = {
 AMBIGUOUS = {"C": "degC", "F": "degF", "M": "mol/m^3", "D": "day", "G": "g0"}
 """Names that several units share, with the unit that a table of measurements probably means."""
 
+MIN_WORD_LENGTH = 3
+"""Smallest length of a name whose capital letters do not matter: ``RPM`` is ``rpm``, but ``Mg`` is not ``mg``."""
+
 FACTOR_PATTERN = re.compile(r"([^\d\s*/^.·-][^\s*/^.·\d-]*0?|1)(?:(?:\^|\*\*)?\(?([+-]?\d+)\)?)?")
 """One unit of a product, with an exponent: ``s``, ``s^2``, ``s**-2`` or ``s-2``."""
 
@@ -148,11 +151,20 @@ def parse_unit(name: str) -> Unit:
 def _simple_unit(name: str) -> tuple[float, dict[str, int]] | None:
     """Return the factor and the exponents of a unit without exponent; None if it is not known."""
     name = SYNONYMS.get(name, name)
+    if len(name) >= MIN_WORD_LENGTH and name.lower() != name:  # RPM and Kelvin
+        lower_case_unit = _simple_unit(name.lower())
+        if name not in OTHER_UNITS and lower_case_unit is not None and _prefixed_unit(name) is None:
+            return lower_case_unit
     if name in OTHER_UNITS:
         return OTHER_UNITS[name]
     if "/" in name:
         unit = parse_unit(name)
         return unit.factor, dict(unit.dimension)
+    return _prefixed_unit(name)
+
+
+def _prefixed_unit(name: str) -> tuple[float, dict[str, int]] | None:
+    """Return the factor and the exponents of an SI unit with a prefix; None if it is not known."""
     for prefix, factor in PREFIXES.items():
         if name.startswith(prefix) and (exponents := SI_UNITS.get(name[len(prefix) :])) is not None:
             return factor * (1e-3 if name.endswith("g") else 1.0), exponents

@@ -1,4 +1,4 @@
-"""Fit systems with neural networks to data; both laws hold by construction before, during and after training."""
+"""Fit parameters and neural networks of systems to data; both laws hold by construction before, during and after."""
 
 from manifolds._names import public_dir
 

@@ -28,10 +28,6 @@ def parse_trajectories(
     InputError
         If data are missing, not finite, or of the wrong shape.
     """
-    if is_table(data):
-        data = read_data(data, columns=observation.names or None)
-    if isinstance(data, Records):
-        data = _columns_of_observation(data, observation)
     trajectories = [
         _checked_trajectory(i, t, x, system, observation)
         for i, (t, x) in enumerate(_time_observation_pairs(data, observation, parameters))
@@ -60,6 +56,10 @@ def _columns_of_observation(records: Records, observation: Observation) -> list[
 
 
 def _time_observation_pairs(data: Any, observation: Observation, parameters) -> list[tuple[Any, Any]]:
+    if is_table(data):
+        data = read_data(data, columns=observation.names or None)
+    if isinstance(data, Records):
+        return list(_columns_of_observation(data, observation))
     if isinstance(data, Solution):
         return [(data.t, observation.observe_solution(data, parameters))]
     if isinstance(data, tuple) and len(data) == 2 and _ndim_or_none(data[0]) == 1:
@@ -259,19 +259,34 @@ def estimate_noise(data: list[Trajectory], scale: np.ndarray) -> np.ndarray | No
     Divided differences of a smooth motion decrease with their order. Those of independent errors, with weights of norm
     one, do not.
     """
-    std, is_noise = noise_levels(data, scale)
-    return std if is_noise.any() else None
+    levels = noise_levels(data, scale)
+    return levels.std if levels.is_noise.any() else None
 
 
-def noise_levels(data: list[Trajectory], scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return an upper bound of the errors of each component, shape (k,), and whether they are noise, shape (k,).
+class NoiseLevels(NamedTuple):
+    """Errors of each component of the data, as their differences show them.
 
-    The bound is the standard deviation of the errors where they are noise.
+    Attributes
+    ----------
+    std : array, shape (k,)
+        Standard deviation of the errors where they are noise, else an upper bound.
+    is_noise : array of bool, shape (k,)
+        True if the differences show noise.
+    is_bound : array of bool, shape (k,)
+        True if there are enough differences, so that ``std`` holds.
     """
+
+    std: np.ndarray
+    is_noise: np.ndarray
+    is_bound: np.ndarray
+
+
+def noise_levels(data: list[Trajectory], scale: np.ndarray) -> NoiseLevels:
+    """Return the standard deviations of the errors of each component, or upper bounds of them."""
     levels = np.array([_difference_levels([_column_values(tr, k) for tr in data]) for k in range(len(scale))])
     is_noise = (levels[:, -1] > NOISE_PLATEAU_RATIO * levels[:, -3]) & (levels[:, -1] > MIN_RELATIVE_NOISE * scale)
     std = np.where(is_noise, levels[:, -3:].mean(axis=1), levels.min(axis=1))
-    return np.maximum(std, MIN_RELATIVE_NOISE * scale), is_noise
+    return NoiseLevels(np.maximum(std, MIN_RELATIVE_NOISE * scale), is_noise, levels.any(axis=1))
 
 
 def _difference_levels(column: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:

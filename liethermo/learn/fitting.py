@@ -201,10 +201,10 @@ def fit(
     data_scale = data_scales(trajectories)
     sigma = checked_noise(noise, data_scale.scale.size)
     noise_is_estimated = noise is None
-    is_estimated = None
+    levels = None
     if noise_is_estimated:
-        std, is_estimated = noise_levels(trajectories, data_scale.scale)
-        sigma = std if is_estimated.any() else None
+        levels = noise_levels(trajectories, data_scale.scale)
+        sigma = levels.std if levels.is_noise.any() else None
     smoothed_trajectories = [spline_states_and_rates(trajectory, sigma) for trajectory in trajectories]
     if observation.is_full_state or has_learned_parts(model):
         starts = [default_states(observation, run, x) for x, _ in smoothed_trajectories]
@@ -269,7 +269,7 @@ def fit(
             lambda sigma: units_for(sigma)[:2],
             smooth_time_scale(rates, data_scale),
         )
-        least_squares = fit_by_least_squares(problem, sigma, is_estimated, substeps)
+        least_squares = fit_by_least_squares(problem, sigma, levels, substeps)
         refined, sigma, weights = least_squares.result, least_squares.noise, least_squares.result.weights
         training = empty_training(params.initial_values.size, time.perf_counter() - start_time)
         return _with_record(params, weights, training.with_estimates(params, refined, sigma, noise_is_estimated, shape))

@@ -11,7 +11,7 @@ import numpy as np
 from manifolds.errors import warn
 
 from ..integrators import OneStepMethod
-from .data import Trajectory
+from .data import NoiseLevels, Trajectory
 from .losses import ParameterVector
 from .observation import Observation
 from .refining import (
@@ -99,7 +99,7 @@ class LeastSquaresProblem(NamedTuple):
 
 
 def fit_by_least_squares(
-    problem: LeastSquaresProblem, noise: np.ndarray | None, is_estimated: np.ndarray | None, substeps: int | None
+    problem: LeastSquaresProblem, noise: np.ndarray | None, levels: NoiseLevels | None, substeps: int | None
 ) -> LeastSquaresFit:
     """Fit parameters to trajectories from their initial values, without a descent before.
 
@@ -112,8 +112,8 @@ def fit_by_least_squares(
     ----------
     noise : array, shape (k,), or None
         Standard deviations of the errors of the data, given or estimated from their differences.
-    is_estimated : array of bool, shape (k,), or None
-        For which numbers the differences of the data show noise; None if the noise is given.
+    levels : NoiseLevels, optional
+        The noise that the differences of the data show, unless it is given.
     substeps : int, optional
         Steps between two data.
     """
@@ -157,9 +157,9 @@ def fit_by_least_squares(
                 FitWarning,
             )
             break
-    difference_noise, n_observed = noise, np.maximum(runs.is_observed.sum(axis=(0, 1)), 1)
+    n_observed = np.maximum(runs.is_observed.sum(axis=(0, 1)), 1)
     data_size = np.sqrt((runs.observations**2).sum(axis=(0, 1)) / n_observed)
-    for _ in range(0 if is_estimated is None else MAX_REWEIGHTINGS):
+    for _ in range(0 if levels is None else MAX_REWEIGHTINGS):
         new_noise = units[0] * np.sqrt(result.mean_squares)
         if not (new_noise > EXACT_RTOL * data_size).all():  # NaN too
             break
@@ -168,9 +168,8 @@ def fit_by_least_squares(
             break
         noise, units = new_noise, problem.units_for(new_noise)
         result = refine(result.weights, result.states, whole_runs, units, n_substeps)
-    if is_estimated is not None and noise is not None and difference_noise is not None and is_estimated.any():
-        ratio = np.average((noise / difference_noise) ** 2, weights=n_observed * is_estimated)
-        result = result._replace(residual=float(np.sqrt(ratio)))
+    if levels is not None and noise is not None:
+        result = result._replace(residual=_residual_to_noise(noise, levels, n_observed))
     return LeastSquaresFit(result._replace(iterations=n_iterations), noise)
 
 
@@ -196,6 +195,18 @@ def _pieces_of_length(runs: PaddedRuns, length: int) -> list[Piece]:
             starts.pop()
         pieces += [Piece(i, start, stop) for start, stop in itertools.pairwise([*starts, n_times])]
     return pieces
+
+
+def _residual_to_noise(residuals: np.ndarray, levels: NoiseLevels, counts: np.ndarray) -> float:
+    """Return residuals relative to the noise that differences of the data show; 1 if they show nothing against it.
+
+    Where the differences show no noise but bound it, residuals below the bound count as noise.
+    """
+    ratio = residuals / levels.std
+    ratio = np.where(levels.is_noise, ratio, np.maximum(ratio, 1.0))
+    if not levels.is_bound.any():
+        return 1.0
+    return float(np.sqrt(np.average(ratio**2, weights=counts * levels.is_bound)))
 
 
 def _is_negligible(shift: np.ndarray, result: LeastSquaresResult, is_log: np.ndarray) -> bool:

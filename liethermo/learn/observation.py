@@ -157,9 +157,13 @@ def make_observation(
         raise error.with_function(f"observe, at a state of shape ({system.dim},),") from None
     except KeyError as error:
         names_text = ", ".join(parameters or {})
-        raise InputError(f"observe uses the parameter {error}, but the parameters are {names_text}") from None
+        order_text = f". Its arguments are ({', '.join(kinds)})" if len(kinds) > 1 else ""
+        raise InputError(
+            f"observe uses the parameter {error}, but the parameters are {names_text}{order_text}"
+        ) from None
     except TRACE_ERRORS as error:
-        description = f"observe could not be evaluated on a state of shape ({system.dim},)"
+        arguments_text = f" as a function of ({', '.join(kinds)})" if parameters is not None else ""
+        description = f"observe could not be evaluated on a state of shape ({system.dim},){arguments_text}"
         raise FunctionError(trace_error_message(description, error)) from error
     if not jnp.issubdtype(output_shape.dtype, jnp.floating):
         raise FunctionError(f"observe must return real numbers, not {output_shape.dtype}")

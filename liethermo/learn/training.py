@@ -58,6 +58,9 @@ MAX_RELATIVE_STANDARD_ERROR = 0.5
 MAX_RESIDUAL_TO_NOISE = 1.5
 """Residual, relative to the noise, above which the model does not describe the data."""
 
+NOISE_ESTIMATE_ERROR = 1.5
+"""Standard error of an estimate of the noise from n differences, times the root of n, relative to the noise."""
+
 
 class FitWarning(UserWarning):
     """Warning: a fit has not converged, or the data do not determine its parameters."""
@@ -271,7 +274,11 @@ class Training:
                 f"the data do not determine {', '.join(undetermined)}: give more data, or leave known numbers out of "
                 "the fit"
             )
-        if self.noise.size and self.residual > MAX_RESIDUAL_TO_NOISE:
+        max_residual = MAX_RESIDUAL_TO_NOISE
+        if self.noise.size and self.noise_is_estimated:  # two standard errors above the noise that was estimated
+            n_differences = max(self.degrees_of_freedom / self.noise.size, 1.0)
+            max_residual *= 1.0 + 2.0 * NOISE_ESTIMATE_ERROR / np.sqrt(n_differences)
+        if self.noise.size and self.residual > max_residual:
             messages.append(
                 f"the residuals of the runs are {self.residual:.2g} times the noise: the model cannot describe the "
                 "data, its steps are too long (substeps=), or the noise is larger (noise=)"

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import FileError, InputError
 from ..systems.rotations import rotation_matrices
+from ..units import parse_unit, split_label
 from .audit_evidence import AuditableResult
 from .orientation import angular_velocity, quaternions
 
@@ -20,9 +21,6 @@ QUATERNION_COLUMNS = ("q_x", "q_y", "q_z", "q_w")
 
 RATE_COLUMNS = tuple(f"omega_{axis}" for axis in "xyz")
 """Names of the columns of the angular velocity in body axes, before their unit."""
-
-RATE_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
-"""Units of angular velocities in files, with the factor to rad/s."""
 
 NORM_TOLERANCE = 1e-3
 """Largest difference from 1 of the norm of a quaternion in a file: numbers with three digits are normalised."""
@@ -107,8 +105,8 @@ def read_csv(path: str | os.PathLike) -> AttitudeHistory:
     """Read attitudes and angular velocities from a CSV file with named columns.
 
     The columns are found by their names, in any order: ``t``, ``q_x, q_y, q_z, q_w``, and as far as there are any
-    ``omega_x, omega_y, omega_z``, whose unit follows in brackets, rad/s or deg/s (without one rad/s). Other columns are
-    left out. Quaternions are normalised.
+    ``omega_x, omega_y, omega_z``. Their units follow in brackets, such as ms, deg/s or rpm; without one they are s and
+    rad/s. Other columns are left out. Quaternions are normalised.
 
     Parameters
     ----------
@@ -134,7 +132,7 @@ def read_csv(path: str | os.PathLike) -> AttitudeHistory:
         raise FileError(f"{path} is no table of numbers with a line of names: {error}") from error
     if values.ndim != 2 or values.shape[1] != len(header):
         raise FileError(f"{path} must have {len(header)} numbers in each line after the names, and at least one line")
-    columns = [_name_and_unit(name) for name in header]
+    columns = [split_label(name) for name in header]
     names = [name for name, _ in columns]
     missing = [name for name in ("t", *QUATERNION_COLUMNS) if name not in names]
     rate_names = [name for name in RATE_COLUMNS if name in names]
@@ -143,8 +141,7 @@ def read_csv(path: str | os.PathLike) -> AttitudeHistory:
     if missing:
         raise FileError(f"{path} has no column {missing[0]!r}; its columns are {', '.join(header)}")
     units = dict(columns)
-    if units["t"] not in ("", "s"):
-        raise FileError(f"{path} has times in {units['t']!r}: convert them to s")
+    time_factor = _factor_to_si(path, "times", units["t"], "s")
     q = values[:, [names.index(name) for name in QUATERNION_COLUMNS]]
     norms = np.linalg.norm(q, axis=1)
     if not (np.abs(norms - 1.0) <= NORM_TOLERANCE).all():
@@ -153,15 +150,23 @@ def read_csv(path: str | os.PathLike) -> AttitudeHistory:
     attitude = rotation_matrices(Rotation.from_quat(q))
     rates = None
     if rate_names:
-        unknown = [units[name] for name in RATE_COLUMNS if units[name] not in ("", *RATE_UNITS)]
-        if unknown:
-            raise FileError(f"{path} has angular velocities in {unknown[0]!r}; known units are rad/s and deg/s")
-        factors = np.array([RATE_UNITS[units[name] or "rad/s"] for name in RATE_COLUMNS])
-        rates = values[:, [names.index(name) for name in RATE_COLUMNS]] * factors
-    return AttitudeHistory(values[:, names.index("t")], np.asarray(attitude), rates)
+        factors = [_factor_to_si(path, "angular velocities", units[name], "rad/s") for name in RATE_COLUMNS]
+        rates = values[:, [names.index(name) for name in RATE_COLUMNS]] * np.array(factors)
+    return AttitudeHistory(time_factor * values[:, names.index("t")], np.asarray(attitude), rates)
 
 
-def _name_and_unit(label: str) -> tuple[str, str]:
-    """Return the name and the unit of a column, "" without one: ``omega_x [deg/s]`` is in deg/s."""
-    name, _, rest = label.strip().partition("[")
-    return name.strip(), rest.rstrip("] ").strip()
+def _factor_to_si(path: Path, quantity: str, name: str, si_unit: str) -> float:
+    """Return the factor from a unit, by default the SI unit, to the SI unit of a quantity in a file.
+
+    Raises
+    ------
+    FileError
+        If the unit is not known, or is one of another quantity.
+    """
+    try:
+        unit = parse_unit(name or si_unit)
+    except InputError as error:
+        raise FileError(f"{path} has {quantity} in {name!r}: {error}") from None
+    if unit.dimension != parse_unit(si_unit).dimension:
+        raise FileError(f"{path} has {quantity} in {name!r}. Convert them to {si_unit}")
+    return unit.factor

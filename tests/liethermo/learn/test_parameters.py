@@ -14,6 +14,8 @@ import scipy.stats
 
 import liethermo as lt
 import manifolds as mf
+from liethermo.learn.data import parse_trajectories
+from liethermo.learn.observation import make_observation
 
 from . import sensors
 
@@ -169,16 +171,45 @@ def test_an_observation_may_depend_on_the_time():
     np.testing.assert_allclose(fitted_system.training.values, [2.0, 0.3, 0.5, 0.2], rtol=1e-4)
 
 
-def test_missing_values_have_no_effect():
-    """Values that are missing change nothing if the others are exact; a wrong number in their place would."""
+def records_with_missing_positions():
     positions = np.stack([spring_record(), spring_record((0.0, 1.0))])
     positions[0, 5:9], positions[1, ::3] = np.nan, np.nan
-    fitted_system = fit_spring([(TIMES, x) for x in positions])
+    return positions
+
+
+def test_missing_values_have_no_effect():
+    fitted_system = fit_spring([(TIMES, x) for x in records_with_missing_positions()], substeps=2)
     np.testing.assert_allclose(fitted_system.training.values, [2.0, 0.3], rtol=1e-4)
-    positions[0, 5:9] = 0.0
-    with pytest.warns(lt.learn.FitWarning):
-        wrong_fit = fit_spring([(TIMES, x) for x in positions], noise=1e-3)
-    assert np.abs(wrong_fit.training.values - [2.0, 0.3]).max() > 1e-2
+
+
+@pytest.mark.slow
+def test_control_zeros_in_place_of_missing_values_have_an_effect():
+    positions = np.nan_to_num(records_with_missing_positions())
+    result, text = problems_of([(TIMES, x) for x in positions], noise=1e-3)
+    assert "times the noise" in text
+    assert np.abs(result.values - [2.0, 0.3]).max() > 1e-2
+
+
+@pytest.mark.slow
+def test_descents_leave_missing_values_out():
+    """The losses of the matching and the shooting are finite, and the least squares end at the numbers."""
+    start = [1.0, 0.0, 0.0]
+    states = lt.integrate(spring(TRUE_SPRING), start, (0.0, 4.0), 0.1, lt.MetriplecticRungeKutta(6)).x.copy()
+    states[::4, 0], states[1::7, 2] = np.nan, np.nan
+    how = {"matching": 50, "shooting": 20, "noise": 1e-3, "validation": 0, "observe": None}
+    result = fit_spring((TIMES, states), **how).training
+    assert np.isfinite(result.loss).all()
+    np.testing.assert_allclose(result.values, [2.0, 0.3], rtol=1e-3)
+
+
+@pytest.mark.slow
+def test_trajectories_may_be_held_out():
+    random = np.random.default_rng(0)
+    records = [spring_record(start) for start in ((1.0, 0.0), (0.0, 1.0), (-0.7, 0.5))]
+    data = [(TIMES, x + 0.01 * random.standard_normal(len(TIMES))) for x in records]
+    result = fit_spring(data, validation=0.34, noise=0.01, substeps=1).training
+    assert result.held_out == pytest.approx(1.0, abs=0.4)
+    assert result.initial_states.shape == (2, 3)
 
 
 def test_parameters_of_a_system_have_their_names():
@@ -211,9 +242,12 @@ def test_a_scale_that_no_angular_velocity_shows_is_called_so():
     assert np.isinf(fitted_system.training.confidence_interval().high).all()
 
 
+@pytest.mark.slow
 def test_intervals_are_those_of_students_distribution():
     positions = spring_record() + 0.01 * np.random.default_rng(0).standard_normal(len(TIMES))
     unbounded_fit = fit_spring((TIMES, positions), positive=None, noise=0.01).training
+    with pytest.raises(lt.InputError, match="confidence_level must be between 0 and 1, got 95"):
+        unbounded_fit.confidence_interval(95)
     low, high = unbounded_fit.confidence_interval(0.9)
     quantile = scipy.stats.t.ppf(0.95, unbounded_fit.degrees_of_freedom)
     assert (
@@ -227,6 +261,7 @@ def test_intervals_are_those_of_students_distribution():
     np.testing.assert_allclose(low * high, positive_fit.values**2, rtol=1e-12)  # symmetric in the logarithm
 
 
+@pytest.mark.slow
 def test_a_frame_and_its_arrays_give_one_fit():
     """Columns are found by the names in the observation, whatever their order; others are left out."""
     table = sensors.thrown_book(2, **SHORT_MOTION)
@@ -287,6 +322,10 @@ BAD = {
         lambda: fit_spring((TIMES, spring_record()), observe=lambda x, p: x[0] + p["offset"]),
         "observe uses the parameter 'offset', but the parameters are stiffness, drag",
     ),
+    "arguments in another order": (
+        lambda: fit_spring((TIMES, spring_record()), observe=lambda p, x: x[0] * p["drag"]),
+        "observe uses the parameter 0, but the parameters are stiffness, drag. Its arguments are (x, parameters)",
+    ),
     "four arguments": (
         lambda: fit_spring((TIMES, spring_record()), observe=lambda a, b, c, d: a),
         "a function of (x), (x, parameters) or (t, x, parameters)",
@@ -310,10 +349,6 @@ BAD = {
     "one value": (
         lambda: fit_spring((TIMES, np.where(TIMES == 0.0, 1.0, np.nan))),
         "has 1 time with values, at least 2 are needed",
-    ),
-    "a level": (
-        lambda: fit_spring((TIMES, spring_record())).training.confidence_interval(95),
-        "confidence_level must be between 0 and 1, got 95",
     ),
 }
 
@@ -340,13 +375,13 @@ def test_a_function_that_needs_numbers_is_refused():
 
 
 def test_the_advice_about_columns_works():
-    table = {"t": TIMES, "a": spring_record(), "b": TIMES}
-    fitted_system = fit_spring(lt.learn.read_data(table, columns=["a"]))
-    np.testing.assert_allclose(fitted_system.training.values, [2.0, 0.3], rtol=1e-4)
-    name_fit = fit_spring(table, observe=lambda x: {"a": x[0]})
-    np.testing.assert_allclose(name_fit.training.values, [2.0, 0.3], rtol=1e-4)
+    table, system = {"t": TIMES, "a": spring_record(), "b": TIMES}, spring(TRUE_SPRING)
+    for data, observe in ((lt.learn.read_data(table, columns=["a"]), position), (table, lambda x: {"a": x[0]})):
+        (trajectory,) = parse_trajectories(data, system, make_observation(system, None, observe))
+        np.testing.assert_array_equal(trajectory.x.ravel(), spring_record())
 
 
+@pytest.mark.slow
 def test_fits_with_new_errors_spread_as_the_standard_error():
     data = TIMES, spring_record() + 0.01 * np.random.default_rng(0).standard_normal(len(TIMES))
     how = {"parameters": SPRING_GUESS, "positive": True, "observe": position, "noise": 0.01, "substeps": 1}
@@ -363,6 +398,14 @@ def problems_of(*arguments, **how):
     return fitted_system.training, " ".join(str(warning.message) for warning in messages)
 
 
+def test_smooth_data_that_the_model_cannot_describe_are_called_so():
+    """A motion with another force has no noise, which could hide that it is another one."""
+    result, text = problems_of((TIMES, spring_record() + 0.5 * np.sin(TIMES) ** 2))
+    assert "times the noise: the model cannot describe the data" in text
+    assert result.residual > 3.0
+
+
+@pytest.mark.slow
 def test_few_data_give_a_warning():
     data = TIMES[:5], spring_record()[:5] + 0.01 * np.sin(40.0 * TIMES[:5])
     result, text = problems_of(data, noise=0.01)  # the least squares have no drag

@@ -8,6 +8,8 @@ import pytest
 import xarray
 
 import liethermo as lt
+from liethermo.learn.data import parse_trajectories
+from liethermo.learn.observation import make_observation
 
 T = np.array([0.0, 0.01, 0.025, 0.04])
 ANGLES = np.array([10.0, 20.0, np.nan, 40.0])
@@ -188,6 +190,15 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path):
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(lt.FileError, match="could not be read as a table"):
         lt.learn.read_data(path)
+
+
+def test_tables_in_a_list_are_several_trajectories():
+    body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
+    observation = make_observation(body, None, lambda x: {"a": x[0], "b": x[2]})
+    tables = [pandas.DataFrame({"t": T, "b [deg]": ANGLES, "a": HEIGHTS}), {"time": T[:2], "a": T[:2], "b": T[:2]}]
+    first, second = parse_trajectories(tables, body, observation)
+    np.testing.assert_array_equal(first.x, np.column_stack([HEIGHTS, np.radians(ANGLES)]))
+    np.testing.assert_array_equal(second.x, np.column_stack([T[:2], T[:2]]))
 
 
 def test_the_advice_of_errors_works():

@@ -56,9 +56,10 @@ def test_columns_are_found_by_their_names(tmp_path):
         ("t,q_x,q_y,q_z,q_w\n0,0,0,0,1,2\n", "numbers in each line"),
         ("t,q_x,q_y,q_z,q_w\n0,0,0,0,1\n0,0,0,2,1\n", "norm 2.23607 in line 3"),
         ("t,q_x,q_y,q_z,q_w\n0,0,0,0,nan\n", "norm nan in line 2"),
-        ("t [min],q_x,q_y,q_z,q_w\n0,0,0,0,1\n", "'min'"),
+        ("t [deg],q_x,q_y,q_z,q_w\n0,0,0,0,1\n", "in 'deg'. Convert them to s"),
         ("t,q_x,q_y,q_z,q_w,omega_x\n0,0,0,0,1,2\n", "no column 'omega_y'"),
-        ("t,q_x,q_y,q_z,q_w,omega_x [rpm],omega_y,omega_z\n0,0,0,0,1,2,0,0\n", "'rpm'"),
+        ("t,q_x,q_y,q_z,q_w,omega_x [rpx],omega_y,omega_z\n0,0,0,0,1,2,0,0\n", "in 'rpx': unknown unit"),
+        ("t,q_x,q_y,q_z,q_w,omega_x [m],omega_y,omega_z\n0,0,0,0,1,2,0,0\n", "in 'm'. Convert them to rad/s"),
     ],
 )
 def test_bad_files_are_refused(tmp_path, text, message):
@@ -66,6 +67,14 @@ def test_bad_files_are_refused(tmp_path, text, message):
     path.write_text(text)
     with pytest.raises(lt.FileError, match=message):
         lt.bodies.read_csv(path)
+
+
+def test_units_of_times_and_angular_velocities_are_converted(tmp_path):
+    path = tmp_path / "units.csv"
+    path.write_text("t [ms],q_x,q_y,q_z,q_w,omega_x [rpm],omega_y [deg/s],omega_z\n250,0,0,0,1,60,180,2\n")
+    history = lt.bodies.read_csv(path)
+    np.testing.assert_allclose(history.t, [0.25], rtol=1e-15)
+    np.testing.assert_allclose(history.angular_velocity, [[2 * np.pi, np.pi, 2.0]], rtol=1e-15)
 
 
 def test_what_cannot_be_written(run, tmp_path):
