@@ -16,7 +16,7 @@ from manifolds.matrices.linear import adjoint
 from ..errors import InputError
 from .base import Dissipation
 from .checks import checked_rate
-from .operators import Operator, checked_square_matrix, get_density_structure
+from .operators import Operator, checked_hermitian, checked_square_matrix, get_density_structure
 
 
 class LindbladJumps(Dissipation):
@@ -125,6 +125,28 @@ class LindbladJumps(Dissipation):
         gain = jnp.sum(rates[:, None, None] * (V @ rho @ adjoint(V)), axis=0)
         loss = jnp.tensordot(rates, jnp.asarray(adjoint(V) @ V), 1) @ rho  # its Hermitian part is the anticommutator
         return jnp.pad(structure.vector(gain - loss), (0, system.dim - n))
+
+    def current(self, rho, observable, t: float = 0.0) -> jax.Array:
+        """Return ``tr(A D(rho))``, shape (...): the rate at which these jumps change the mean of an observable A.
+
+        With A = H it is the energy that flows in through the jumps of one bath, as the local approach defines heat.
+
+        Parameters
+        ----------
+        rho : array, shape (..., N, N)
+            Density matrices.
+        observable : array, shape (N, N)
+            A, Hermitian.
+        t : float
+            The time, if a rate depends on it.
+        """
+        A, V = checked_hermitian(observable, "the observable"), self.stacked_operators()
+        if A.shape != V.shape[1:]:
+            raise InputError(f"the observable has shape {A.shape}, and the jump operators {V.shape[1:]}")
+        squares = adjoint(V) @ V
+        dual = adjoint(V) @ A @ V - 0.5 * (squares @ A + A @ squares)  # the adjoint map of each jump
+        total = jnp.tensordot(self.rates_at(jnp.asarray(t, dtype=jnp.float64)), jnp.asarray(dual), 1)
+        return jnp.einsum("ij,...ji->...", total, jnp.asarray(rho)).real
 
     def rates_at(self, time) -> jax.Array:
         """Return the rates at a time, shape (jumps,); the time may be None if they do not depend on it."""

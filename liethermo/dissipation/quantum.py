@@ -241,7 +241,7 @@ class ThermalJumps(Dissipation):
         if isinstance(energy, BathEnergy | ReservoirEnergy):
             T = float(np.asarray(energy.temperature)[self.bath])
         else:
-            T = float(energy.gradient(jnp.zeros(system.baths.number))[self.bath])
+            T = float(energy.at_time(0.0).gradient(jnp.zeros(system.baths.number))[self.bath])
         levels = np.diag(self._to_jump_frame(subtract_common_energy(H))).real
         for jump in self.jumps:
             weights = np.abs(np.asarray(jump.operator)) ** 2

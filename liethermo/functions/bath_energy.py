@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
 
 from manifolds._arrays import is_traced
+from manifolds._pytree_module import Module
 
-from .energy import Energy, Linear
+from .energy import Energy, Linear, TimeDependent
 from .indices import sparsity_pattern
 
 MAX_SERIES_ARGUMENT = 1 / 32
@@ -77,6 +80,37 @@ class ReservoirEnergy(Linear):
     @property
     def capacity(self) -> jax.Array:
         return jnp.full_like(self.b, jnp.inf)
+
+
+class TimedReservoirEnergy(TimeDependent):
+    """The energy ``sum_b T_b(t) y_b`` of baths of infinite capacity, whose temperatures an agent outside changes.
+
+    The work ``sum_b dT_b/dt y_b`` is what the agent does on the baths because of the entropy that they have received.
+    """
+
+    def temperature_at(self, t) -> jax.Array:
+        """Return the temperatures at a time, shape (m,)."""
+        assert isinstance(self.function, ReservoirEnergyFunction)
+        return self.function.temperatures(t)
+
+
+class ReservoirEnergyFunction(Module):
+    """The function ``sum_b T_b(t) y_b`` of the entropies y and the time t.
+
+    Attributes
+    ----------
+    temperature : function from t to a scalar, or to an array, shape (number,)
+    number : int
+    """
+
+    temperature: Callable
+    number: int = eqx.field(static=True)
+
+    def temperatures(self, t) -> jax.Array:
+        return jnp.broadcast_to(jnp.asarray(self.temperature(t), dtype=jnp.float64), (self.number,))
+
+    def __call__(self, y, t):
+        return jnp.dot(self.temperatures(t), y)
 
 
 def make_bath_energy(capacity: jax.Array, temperature: jax.Array) -> BathEnergy | ReservoirEnergy:

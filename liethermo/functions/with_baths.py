@@ -7,9 +7,7 @@ import jax
 import jax.numpy as jnp
 import scipy
 
-from manifolds._pytree_module import forward_to
-
-from .bath_energy import ReservoirEnergy
+from .bath_energy import ReservoirEnergy, TimedReservoirEnergy
 from .coordinates import Components
 from .energy import Energy, Pullback
 from .frames import sum_terms
@@ -27,7 +25,7 @@ class BodyBathsEnergy(Energy):
     body : Energy
         Energy of the first ``body_dim`` components. It may depend on time.
     baths : Energy
-        Energy of the other components.
+        Energy of the other components. It may depend on time too.
     body_dim, dim : int
         Number of components of the body, and of the state.
     """
@@ -48,10 +46,12 @@ class BodyBathsEnergy(Energy):
     def is_quadratic(self) -> bool:
         return self.body.is_quadratic and self.baths.is_quadratic
 
-    depends_on_time = forward_to("body")
+    @property
+    def depends_on_time(self) -> bool:
+        return self.body.depends_on_time or self.baths.depends_on_time
 
     def at_time(self, t) -> Energy:
-        return BodyBathsEnergy(self.body.at_time(t), self.baths, self.body_dim, self.dim)
+        return BodyBathsEnergy(self.body.at_time(t), self.baths.at_time(t), self.body_dim, self.dim)
 
     @property
     def _energies_and_components(self) -> tuple[tuple[Energy, Components], ...]:
@@ -117,7 +117,7 @@ def temperature_slopes(energy: Energy, x, body_dim: int) -> jax.Array | None:
     """
     if not isinstance(energy, BodyBathsEnergy):
         return jax.jvp(energy.gradient, (x,), (jnp.zeros_like(x).at[body_dim:].set(1.0),))[1][body_dim:]
-    if isinstance(energy.baths, ReservoirEnergy):
+    if isinstance(energy.baths, ReservoirEnergy | TimedReservoirEnergy):
         return None
     y = x[body_dim:]
     return jax.jvp(energy.baths.gradient, (y,), (jnp.ones_like(y),))[1]

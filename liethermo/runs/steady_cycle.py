@@ -9,6 +9,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.integrate
 import scipy.linalg
 
 from manifolds._precision import with_library_settings
@@ -56,7 +57,8 @@ class SteadyCycle:
         Floquet multipliers: by these factors small deviations change in one period, the largest first. Directions in
         which conserved functions change, and the counters of heat, are left out.
     work : float
-        Work that the system receives in a period (energy); negative for an engine.
+        Work that the system receives in a period (energy); negative for an engine. The work on baths whose temperature
+        depends on time is not part of it.
     heat : array, shape (baths,)
         Heat that flows from each bath into the system in a period (energy).
     solution : Solution
@@ -189,18 +191,30 @@ def steady_cycle(
         )
     solution = propagator(x, span, breaks=tuple(breaks))
     multipliers = np.linalg.eigvals(tangents.T @ monodromy @ tangents)
-    heat = np.zeros(system.dim - system.body_dim)
-    if len(heat):
-        heat = -np.asarray(system.temperatures(x)) * (solution.x[-1] - solution.x[0])[system.body_dim :]
+    heat, work = _heat_and_work(system, solution)
     return SteadyCycle(
         x,
         float(period),
         distances[-1],
         multipliers[np.argsort(-np.abs(multipliers))],
-        float(solution.casimirs["work"][-1] - solution.casimirs["work"][0]),
+        work,
         heat,
         solution,
     )
+
+
+def _heat_and_work(system: System, solution: Solution) -> tuple[np.ndarray, float]:
+    """Return the heat that flows from each bath into the system over a cycle, and the work that the system receives."""
+    work = float(solution.casimirs["work"][-1] - solution.casimirs["work"][0])
+    if system.baths is None:
+        return np.zeros(0), work
+    if not system.baths.energy.depends_on_time:
+        entropies = (solution.x[-1] - solution.x[0])[system.body_dim :]
+        return -np.asarray(system.temperatures(solution.x[0])) * entropies, work
+    velocities = np.asarray(system.vector_field(solution.x, solution.t))[:, system.body_dim :]
+    currents = -np.asarray(system.temperatures(solution.x, solution.t)) * velocities
+    heat = scipy.integrate.simpson(currents, x=solution.t, axis=0)
+    return heat, -float(heat.sum())  # the ledger also has the work of the agent that changes the temperatures
 
 
 def _check_periodicity(system: System, period: float, start: float) -> None:

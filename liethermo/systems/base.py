@@ -166,12 +166,26 @@ class System(SystemInterface):
         return body
 
     @with_library_settings
-    def temperatures(self, x) -> jax.Array:
-        """Return the temperatures of the baths, shape (..., number of baths), for states of shape (..., n)."""
+    def temperatures(self, x, t=None) -> jax.Array:
+        """Return the temperatures of the baths, shape (..., baths), for states of shape (..., n).
+
+        Parameters
+        ----------
+        x : array, shape (..., n)
+        t : float or array, shape (...), optional
+            The times of the states, if the temperatures depend on it.
+        """
         if self.baths is None:
             raise InputError("this system has no baths: give it baths=lt.HeatBaths(...)")
-        entropies = jnp.asarray(x)[..., self.body_dim :]
-        return jnp.vectorize(self.baths.energy.gradient, signature="(m)->(m)")(entropies)
+        entropies, energy = jnp.asarray(x)[..., self.body_dim :], self.baths.energy
+        if isinstance(self.energy, BodyBathsEnergy):  # which may be frozen at a time
+            energy = self.energy.baths
+        if not energy.depends_on_time:
+            return jnp.vectorize(energy.gradient, signature="(m)->(m)")(entropies)
+        if t is None:
+            raise InputError("the temperatures of the baths depend on time: give the time beside the state")
+        gradient = jnp.vectorize(lambda y, t: energy.at_time(t).gradient(y), signature="(m),()->(m)")
+        return gradient(entropies, jnp.asarray(t, dtype=jnp.float64))
 
     def energy_of_vectors(self, energy: Energy) -> Energy:
         """Return a function of flat states from a function of states in the shape that users see."""

@@ -16,7 +16,13 @@ from manifolds._pytree_module import Module
 from manifolds.structures.poisson import ProductPoisson
 
 from ..errors import InputError
-from ..functions.bath_energy import BathEnergy, ReservoirEnergy, make_bath_energy
+from ..functions.bath_energy import (
+    BathEnergy,
+    ReservoirEnergy,
+    ReservoirEnergyFunction,
+    TimedReservoirEnergy,
+    make_bath_energy,
+)
 from ..functions.conditions import checked_numbers
 from ..functions.each import Each
 from ..functions.energy import Energy
@@ -34,7 +40,9 @@ class HeatBaths(Module):
     ----------
     capacity, temperature : float > 0, or array, shape (number,)
         C (energy / temperature) and T (temperature, at y = 0), in any consistent units. A bath of infinite capacity
-        keeps its temperature, ``U = T y``.
+        keeps its temperature, ``U = T y``. If all capacities are infinite, the temperature may be a function of the
+        time t that returns one number, or an array, shape (number,). The ledger then contains the work ``dT/dt y`` of
+        the agent that changes it; without an exchange of heat it is zero.
     number : int
         The number of baths.
     energy : function from y, a scalar, to a scalar, optional
@@ -67,7 +75,9 @@ class HeatBaths(Module):
         if isinstance(number, bool) or not isinstance(number, int) or number < 1:
             raise InputError(f"the number of baths is a positive integer, not {number!r}")
         self.number = number
-        if energy is None:
+        if energy is None and callable(temperature):
+            self.energy = _timed_reservoirs(capacity, temperature, number)
+        elif energy is None:
             parameters = {"capacity": capacity, "temperature": temperature}
             self.energy = make_bath_energy(
                 *(_check_positive(value, what, number, what == "capacity") for what, value in parameters.items())
@@ -78,7 +88,7 @@ class HeatBaths(Module):
     @property
     def has_positive_temperatures(self) -> bool:
         """True if the temperatures are positive in every state by construction."""
-        return isinstance(self.energy, BathEnergy | ReservoirEnergy)
+        return isinstance(self.energy, BathEnergy | ReservoirEnergy | TimedReservoirEnergy)
 
     @property
     def scale(self) -> np.ndarray | float:
@@ -90,6 +100,27 @@ class HeatBaths(Module):
         if not isinstance(self.energy, BathEnergy):  # any scale suits a bath of constant temperature
             return jnp.ones(self.number)
         return jnp.where(jnp.isfinite(self.energy.capacity), self.energy.capacity, 1.0)
+
+
+def _timed_reservoirs(capacity, temperature: Callable, number: int) -> TimedReservoirEnergy:
+    """Return the energy of baths whose temperature is a function of time, after a test of the function at t = 0."""
+    if not np.isinf(np.asarray(capacity)).all():
+        raise InputError(
+            f"a temperature that is a function of time belongs to baths of infinite capacity, got {capacity!r}: the "
+            "temperature of a finite bath follows from the heat that it receives. Give capacity=np.inf"
+        )
+    function = ReservoirEnergyFunction(temperature, number)
+    try:
+        with jax.ensure_compile_time_eval():
+            values = np.asarray(function.temperatures(jnp.zeros(())))
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"the temperature of {number} baths must be a function of the time t to one number, or to an array of "
+            f"shape ({number},): {error}"
+        ) from None
+    if not (np.isfinite(values).all() and (values > 0.0).all()):
+        raise InputError(f"the temperature of a bath must be positive and finite, got {values.tolist()} at t = 0")
+    return TimedReservoirEnergy(function)
 
 
 def _check_positive(value, what: str, number: int, infinite: bool) -> jax.Array:

@@ -22,7 +22,6 @@ from ..dissipation.operators import HasMatrix, checked_hermitian, level_gap_roun
 from ..dissipation.quantum import ThermalJumps
 from ..dissipation.steepest_ascent import SteepestEntropyAscent
 from ..errors import InputError
-from ..functions.bath_energy import BathEnergy, ReservoirEnergy
 from ..functions.density import (
     NEGATIVE_EIGENVALUE_LIMIT,
     IsolatedVonNeumann,
@@ -35,13 +34,11 @@ from ..functions.with_baths import BodyBathsEnergy
 from .base import System
 from .baths import BathEntropy, HeatBaths, poisson_with_baths
 from .conditions import RunCondition
+from .density_states import checked_density_matrices, checked_parts, join_baths, tensor_with_identity
 from .equilibria import Equilibrium, steady_state
 from .hamiltonian import hamiltonian_energy
 from .interface import InvariantVerdicts
 from .invariants import systems_at_test_times
-
-DENSITY_MATRIX_TOLERANCE = 1e-12
-"""Largest difference of a trace from one, and of a density matrix from its adjoint, that is accepted as input."""
 
 LINDBLAD_EIGENVALUE_LIMIT = 1e-6
 """Largest modulus of a negative eigenvalue under Lindblad's equation alone, whose steps have errors of their order. The
@@ -132,7 +129,7 @@ class QuantumSystem(System):
         self.time = None
         size, energy = hamiltonian_energy(hamiltonian, times)
         self.structure = structure = mf.DensityMatrices(size)
-        self.parts, self.names = _check_parts(parts, names, size)
+        self.parts, self.names = checked_parts(parts, names, size)
         entropy = VonNeumann() if entropy is None else entropy
         if not isinstance(entropy, VonNeumann):
             raise InputError(f"the entropy of a density matrix is lt.VonNeumann(...), not {type(entropy).__name__}")
@@ -200,7 +197,7 @@ class QuantumSystem(System):
         rho = self._array_of(rho)
         if isinstance(rho, jax.core.Tracer) or (np.shape(rho)[-1:] == (self.dim,) and not self._is_matrix(rho, batch)):
             return super().state(rho, batch)
-        matrices = self._check_density(np.asarray(rho), mixed)
+        matrices = checked_density_matrices(np.asarray(rho), self.structure.size, mixed)
         front, m = matrices.shape[:-2], self.dim - self.body_dim
         y = np.zeros((*front, m)) if entropies is None else np.asarray(entropies, dtype=np.float64)
         if y.shape[-1:] != (m,):
@@ -282,46 +279,6 @@ class QuantumSystem(System):
             raise InputError(f"a Bloch vector belongs to a qubit, and part {part!r} has {rho.shape[-1]} levels")
         coherence = rho[..., 0, 1]
         return jnp.stack([2.0 * coherence.real, -2.0 * coherence.imag, (rho[..., 0, 0] - rho[..., 1, 1]).real], axis=-1)
-
-    def _check_density(self, rho: np.ndarray, mixed: float) -> np.ndarray:
-        size = self.structure.size
-        if rho.dtype.kind not in "fiuc":
-            raise InputError(f"a density matrix is an array of numbers, not of {rho.dtype}")
-        if not np.isfinite(rho).all():
-            raise InputError("the density matrix is not finite")
-        if size > 1 and rho.shape == (1, size):  # a bra
-            rho = adjoint(rho)
-        if size > 1 and rho.shape == (size**2, 1):  # an operator as QuTiP stacks it, by columns
-            rho = rho.reshape(size, size).T
-        if rho.shape == (size,) or (size > 1 and rho.shape[-2:] == (size, 1)):
-            rho = self._density_of_kets(rho[:, None] if rho.ndim == 1 else rho)
-        if rho.shape[-2:] != (size, size):
-            raise InputError(
-                f"a density matrix of this system has shape ({size}, {size}), not {rho.shape}; a ket has the shape "
-                f"({size},) or ({size}, 1)"
-            )
-        asymmetry = float(np.abs(rho - adjoint(rho)).max())
-        if asymmetry > DENSITY_MATRIX_TOLERANCE:
-            raise InputError(f"the density matrix is not Hermitian: it differs from its adjoint by {asymmetry:.3g}")
-        trace = np.trace(rho, axis1=-2, axis2=-1).real
-        wrong_trace = float(trace.ravel()[np.argmax(np.abs(trace - 1.0))])
-        if abs(wrong_trace - 1.0) > DENSITY_MATRIX_TOLERANCE:
-            raise InputError(f"the density matrix has the trace {wrong_trace:.15g}, not 1: divide it by that")
-        min_eigenvalue = float(np.linalg.eigvalsh(rho)[..., 0].min())
-        if min_eigenvalue < -NEGATIVE_EIGENVALUE_LIMIT:
-            raise InputError(f"the density matrix is not positive: its least eigenvalue is {min_eigenvalue:.3g}")
-        if not isinstance(mixed, int | float | np.number) or not 0.0 <= mixed <= 1.0:
-            raise InputError(f"mixed is a share of the identity, from 0 to 1, not {mixed!r}")
-        return (1.0 - mixed) * rho + mixed * np.eye(size) / size
-
-    def _density_of_kets(self, ket: np.ndarray) -> np.ndarray:
-        """Return the density matrices, shape (..., N, N), of pure states, shape (..., N, 1)."""
-        norms = np.linalg.norm(ket, axis=-2)
-        wrong_norm = float(norms.ravel()[np.argmax(np.abs(norms - 1.0))])
-        if abs(wrong_norm - 1.0) > DENSITY_MATRIX_TOLERANCE:
-            raise InputError(f"the ket has the norm {wrong_norm:.15g}, not 1: divide it by that")
-        ket = ket / norms[..., None]
-        return ket @ adjoint(ket)
 
     def samples(self, count: int, seed: int = 0, scale: float = 1.0) -> np.ndarray:
         """Return ``count`` random states: density matrices of Ginibre's ensemble, and entropies of baths."""
@@ -487,7 +444,7 @@ class QuantumSystem(System):
         """
         if self.baths is None:
             raise InputError("this system has no baths: give it baths=lt.HeatBaths(...) and lt.ThermalJumps")
-        return -self.temperatures(x) * self.vector_field(x, t)[..., self.body_dim :]
+        return -self.temperatures(x, t) * self.vector_field(x, t)[..., self.body_dim :]
 
     def entropy_production(self, x, t=None) -> jax.Array:
         """Return the rate of growth of the entropy of system and baths, shape (...), at states x and the time t.
@@ -584,17 +541,17 @@ class QuantumSystem(System):
                     raise InputError(
                         f"{type(term).__name__} of a part is none of a product: give it to the product as a whole"
                     )
-                operators = [_tensor_with_identity(np.asarray(V), k, sizes) for V in term.operators]
+                operators = [tensor_with_identity(np.asarray(V), k, sizes) for V in term.operators]
                 terms.append(term.replace_operators(operators, term.bath + offset))
             offset += 0 if s.baths is None else s.baths.number
         if (self.baths is None) != (other.baths is None) and all(s.dissipation is not None for s in systems):
             raise InputError("jumps of one part have a bath and those of the other none: give both, or neither, baths")
         H = [s._constant_hamiltonian() for s in systems]
-        total_H = _tensor_with_identity(H[0], 0, sizes) + _tensor_with_identity(H[1], 1, sizes)
+        total_H = tensor_with_identity(H[0], 0, sizes) + tensor_with_identity(H[1], 1, sizes)
         parts = self.parts + other.parts
         names = self.names + other.names if len(self.names + other.names) == len(parts) else ()
         names = names if len(set(names)) == len(names) else ()
-        baths, floor = _join_baths(self.baths, other.baths), max(self.floor, other.floor)
+        baths, floor = join_baths(self.baths, other.baths), max(self.floor, other.floor)
         return QuantumSystem(total_H, terms or None, baths, VonNeumann(floor), parts, names)
 
     def coupled(self, interaction) -> QuantumSystem:
@@ -629,30 +586,3 @@ def _dissipation_terms(dissipation) -> tuple[Dissipation, ...]:
 
 def _bind_to_density(term: Dissipation, structure: mf.DensityMatrices) -> Dissipation:
     return term.bind_to_structure(structure) if isinstance(term, SteepestEntropyAscent) else term
-
-
-def _check_parts(parts, names, size: int) -> tuple[tuple[int, ...], tuple[str, ...]]:
-    parts = (size,) if parts is None else tuple(int(n) for n in parts)
-    if math.prod(parts) != size or min(parts) < 1:
-        raise InputError(f"the parts have the sizes {parts}, whose product is not {size}")
-    names = tuple(names)
-    if names and (len(names) != len(parts) or len(set(names)) != len(names)):
-        raise InputError(f"there are {len(parts)} parts, each with a name of its own, not {names!r}")
-    return parts, names
-
-
-def _tensor_with_identity(matrix: np.ndarray, k: int, sizes: Sequence[int]) -> np.ndarray:
-    """Return an operator of the k-th of two systems as an operator of their product."""
-    return np.kron(matrix, np.eye(sizes[1])) if k == 0 else np.kron(np.eye(sizes[0]), matrix)
-
-
-def _join_baths(a: HeatBaths | None, b: HeatBaths | None) -> HeatBaths | None:
-    if a is None or b is None:
-        return a or b
-    kinds = BathEnergy | ReservoirEnergy
-    if not isinstance(a.energy, kinds) or not isinstance(b.energy, kinds):
-        raise InputError("baths of a product have constant capacities: build the product with baths of its own")
-    capacity, temperature = (
-        jnp.concatenate([getattr(a.energy, name), getattr(b.energy, name)]) for name in ("capacity", "temperature")
-    )
-    return HeatBaths(capacity, temperature, a.number + b.number)
