@@ -25,6 +25,7 @@ from ..functions.with_baths import BodyBathsEnergy
 from ..tracing.traced import trace_callables
 from .baths import BathEntropy, HeatBaths, poisson_with_baths
 from .check import AXIOM_TOLERANCE, CheckReport, check_system, require_axioms
+from .conservation import project_covector
 from .interface import SystemInterface
 from .invariants import find_invariants, find_preserved_names, named_functions
 from .states import checked_state_array, evaluate_batch, reshape_to_sites
@@ -324,9 +325,7 @@ class System(SystemInterface):
             return self.generator_field(x)
         dS = jnp.zeros_like(x) if self.entropy is None else self.entropy.gradient(x)
         gradients = self.energy.gradient(x), dS, *(L.gradient(x) for L in self.preserved)
-        dH, dS, *dL = (
-            alpha if self.space is None else self.lower_index(x, self.raise_index(x, alpha)) for alpha in gradients
-        )
+        dH, dS, *dL = (project_covector(self, x, alpha) for alpha in gradients)
         return self.field(x, dH, dS, tuple(dL))
 
 

@@ -112,14 +112,14 @@ class EulerPoincareSystem(LiePoissonSystem):
 
     def velocity(self, mu, t=None) -> jax.Array:
         """xi = dH/dmu at a state or batch of states, shape (..., dim); at a time, where the Lagrangian needs one."""
-        return evaluate_batch(self, lambda system, mu: system.energy.gradient(mu), mu, t, "(n)")
+        return evaluate_batch(self.drop_torque(), lambda system, mu: system.energy.gradient(mu), mu, t, "(n)")
 
     def momentum_of_velocity(self, xi, t=None):
         return self.momentum(xi, t)
 
     def momentum(self, xi, t=None) -> jax.Array:
         """mu = dl/dxi, shape (..., dim); likewise."""
-        return evaluate_batch(self, lambda system, xi: system.lagrangian.gradient(xi), xi, t, "(n)")
+        return evaluate_batch(self.drop_torque(), lambda system, xi: system.lagrangian.gradient(xi), xi, t, "(n)")
 
 
 class _TimedLegendre(Module):

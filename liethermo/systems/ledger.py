@@ -135,7 +135,7 @@ class LedgerSystem(System):
     # -- the functions, at one point ----------------------------------------------------------------------------------
 
     def friction_force(self, *arguments) -> jax.Array:
-        """Return the friction at (q, v, S, t), or at (xi, S, t), shape (n,); t may be left out of (xi, S)."""
+        """Return the friction at (q, v, S, t), or at (xi, S, t), shape (n,); t is 0 by default."""
         return self._force(self.friction, arguments)
 
     def external_force(self, *arguments) -> jax.Array:
@@ -144,12 +144,20 @@ class LedgerSystem(System):
 
     def heating(self, *arguments) -> jax.Array:
         """Return the heat power P_H at the arguments of :meth:`friction_force`."""
-        return jnp.zeros(()) if self.heat_power is None else jnp.asarray(self.heat_power(*_with_time(arguments)))
+        return jnp.zeros(()) if self.heat_power is None else jnp.asarray(self.heat_power(*self._with_time(arguments)))
 
     def _force(self, function: Callable | None, arguments: tuple) -> jax.Array:
         if function is None:
             return jnp.zeros_like(arguments[0])
-        return self.tangential_part(arguments[0], jnp.asarray(function(*_with_time(arguments))))
+        return self.tangential_part(arguments[0], jnp.asarray(function(*self._with_time(arguments))))
+
+    def _with_time(self, arguments: tuple) -> tuple:
+        """Return the arguments of a force, with t = 0 if it is left out."""
+        names = "(q, v, S, t)" if self.first_velocity_index else "(xi, S, t)"
+        count = names.count(",") + 1
+        if len(arguments) not in (count - 1, count):
+            raise InputError(f"forces and heat are functions of {names}, and {len(arguments)} arguments were given")
+        return arguments if len(arguments) == count else (*arguments, 0.0)
 
     def friction_at(self, arguments: tuple, T) -> jax.Array:
         """Return the friction at ``arguments``, those of :meth:`friction_force`, and at a temperature T, shape (n,)."""
@@ -191,11 +199,6 @@ class LedgerSystem(System):
 
 def _temperature(system: LedgerSystem, x):
     return system.temperature(x)
-
-
-def _with_time(arguments: tuple) -> tuple:
-    """Return the arguments (xi, S) of a function with t = 0 appended; others unchanged."""
-    return (*arguments, 0.0) if len(arguments) == 2 else arguments
 
 
 class ForcesAndHeat(SkewFriction):

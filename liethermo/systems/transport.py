@@ -17,7 +17,8 @@ def dissipation_velocities(system: SystemInterface, x, dH, dS, dL) -> list[jax.A
 
 def is_torque_free(system: SystemInterface) -> bool:
     """Return whether ``x' = Pi(x) transport``, so that on a Lie algebra the momentum in space is constant."""
-    system = system if system.inner is None else system.inner
+    while system.inner is not None:
+        system = system.inner
     answers: list[bool] = []
 
     def record_answer(x):
