@@ -132,26 +132,23 @@ INTERNALS = frozenset(
     accessed_names across added_momentum algebra_by_constants as_provenance balance_entries base_step
     bind_attitude bind_to bind_to_structure block_results body_at_attitude body_dim can_be_embedded
     can_transport_attitude can_unroll carries_compensation check_components clock_components component_scales
-    consecutive_increments constant_names factor_at_state couplings decompose difference_quotient
-    difference_rounding_scale dim_without_ledger displace divergence_terms dot_at_sites drop_baths drop_torque
-    energy_of_vectors evaluate_batch evaluations_per_iteration external_torque field_and_law_rates
-    first_velocity_index forces_and_power freeze_at general generator_field grid_seeds
-    has_impulse has_ledger has_matrix_functions has_poisson_by_construction heating_sites impulse_names initial
-    initial_compensation initial_run_state initial_state inner input_residuals intervals invariant_names
-    invariant_verdicts is_hidden is_noiseless is_coordinate_order_independent
-    is_projection_trivial is_smooth is_torque_free isotropic_size isotropic_vector jackknife_blocks
-    jacobian_probe join_state ledger ledger_rates local_system lower_index make_blocks map_defect
-    mechanical_energy member_stats member_status method_with_noise midpoint_gradients momentum_jacobians
-    momentum_system needs_attitude noisy nonnegative orbit_levels outer_scalars
-    precession_rates predict preserved_labels preserves_function
-    production_name project_tangent pullback pullback_to_chart raise_index rate_of_change record_initial
-    reorder_components requested_invariants reshape_to_sites residual_jvp residual_weights
-    rounding_scale row_counts row_pointer samples scale_at_sites site_spins
-    solution_builder solved_subsystem sparsity_pattern specific_residuals split_state stage_velocities start_blocks
-    state_array state_blocks state_time step_without_compensation surface system_without_span
-    tangential_covector term_index to_user_solution to_user_state
-    torque_arguments torque_free_components torque_invariant_casimirs torque_name torque_velocity
-    torques_need_attitude trajectory_numbers transport user_state user_state_at uses_charts
+    consecutive_increments constant_names couplings decompose difference_quotient difference_rounding_scale
+    dim_without_ledger displace dissipation_keeps_casimirs dissipations divergence_terms dot_at_sites drop_baths
+    drop_ledger drop_torque energy_of_vectors entropy_gradient evaluations_per_iteration extend external_torque
+    factor_at_state field_and_law_rates first_velocity_index freeze_at friction_at general generator_field
+    grid_seeds has_impulse has_ledger has_matrix_functions has_poisson_by_construction heating_sites
+    impulse_names initial initial_compensation initial_run_state initial_state inner inner_arguments inner_at
+    input_residuals intervals invariant_names invariant_verdicts is_coordinate_order_independent is_hidden
+    is_noiseless is_projection_trivial is_smooth jackknife_blocks jacobian_probe join_state ledger ledger_rates
+    local_system lower_index make_blocks map_defect mechanical_energy member_stats member_status
+    method_with_noise midpoint_gradients momentum_jacobians momentum_system needs_attitude noisy nonnegative
+    orbit_levels outer_scalars precession_rates predict preserved_labels preserves_function production_name
+    pullback pullback_to_chart raise_index rate_of_change record_initial requested_invariants residual_jvp
+    residual_weights rounding_scale row_counts row_pointer samples scale_at_sites site_spins solution_builder
+    solved_subsystem sparsity_pattern specific_residuals split_state stage_velocities start_blocks state_array
+    state_blocks step_without_compensation surface system_without_span temperature_at term_index
+    to_user_solution to_user_state torque_arguments torque_free_components torque_invariant_casimirs torque_name
+    torque_velocity torques_need_attitude trajectory_numbers transport user_state user_state_at uses_charts
     value_type why_singular why_step_failed
     """.split()
 )

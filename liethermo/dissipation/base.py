@@ -14,6 +14,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from typing import Literal, NamedTuple, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import scipy
@@ -24,7 +25,7 @@ from ..errors import InputError
 from ..functions.energy import Energy
 from ..functions.indices import Indices, union_pattern
 from .factor import Factor, concatenate_factors
-from .geometry import Geometry
+from .geometry import Geometry, divergence_terms_of_fields
 
 LawName = Literal["conserved", "nondecreasing", "nonincreasing"]
 """Name of the law of a function: how a construction lets it change."""
@@ -165,7 +166,13 @@ class Dissipation(Module):
 
     def divergence_terms(self, system: Geometry, x) -> jax.Array:
         """Return the terms, shape (n, columns), whose sum over the first axis is the divergence of each column."""
-        return system.divergence_terms(x, lambda y, alpha: self.factor_at_state(system, y).transpose_times(alpha))  # type: ignore[union-attr]
+
+        def contract_columns(y, alpha) -> jax.Array:
+            B = self.factor_at_state(system, y)
+            assert B is not None
+            return B.transpose_times(alpha)
+
+        return divergence_terms_of_fields(system, x, contract_columns)
 
     def factor_at_state(self, system: Geometry, x) -> Factor | None:
         """Return the factor B at x, by the exact gradients of the energy and of the preserved functions; or None."""
@@ -239,7 +246,9 @@ class DissipationSum(Dissipation):
         return DissipationSum(tuple(part.bind_to(system) for part in self.parts))
 
     def force(self, system, x, dH, dS, dL):
-        return sum(term.force(system, x, dH, dS, dL_part) for term, dL_part in terms_with_preserved_values(self, dL))
+        return sum(
+            term.force(system, x, dH, dS, dL_part) for term, dL_part in terms_with_preserved_values(self.parts, dL)
+        )
 
     @property
     def has_generator(self) -> bool:
@@ -249,9 +258,14 @@ class DissipationSum(Dissipation):
         return sum(part.generator_field(system, x, dH) for part in self.parts)
 
     def factor(self, system, x, dH, dL):
-        factors = [term.factor(system, x, dH, dL_part) for term, dL_part in terms_with_preserved_values(self, dL)]
+        factors = [term.factor(system, x, dH, dL_part) for term, dL_part in terms_with_preserved_values(self.parts, dL)]
         known_factors = [B for B in factors if B is not None]
         return concatenate_factors(known_factors) if len(known_factors) == len(factors) else None
+
+
+def nondecreasing_if(is_known: bool) -> LawName | None:
+    """Return the law of an entropy that is known not to decrease, or None."""
+    return "nondecreasing" if is_known else None
 
 
 def sum_dissipations(dissipations: Dissipation | Sequence[Dissipation] | None) -> Dissipation | None:
@@ -278,11 +292,11 @@ def sum_dissipations(dissipations: Dissipation | Sequence[Dissipation] | None) -
 
 
 def terms_with_preserved_values(
-    dissipation: Dissipation, values: Sequence[T]
+    terms: Sequence[Dissipation], values: Sequence[T]
 ) -> Iterator[tuple[Dissipation, tuple[T, ...]]]:
-    """Yield each summand with its portion of ``values``, which belong to the functions in ``dissipation.preserve``."""
+    """Yield each summand with its portion of ``values``, which belong to the functions that they preserve, in order."""
     start = 0
-    for term in dissipation.terms:
+    for term in terms:
         end = start + len(term.preserve)
         yield term, tuple(values[start:end])
         start = end
@@ -310,6 +324,12 @@ class LiftedGeometry(NamedTuple):
     lift: Callable
     lower: Callable
     preserves_solenoidal: bool = False
+
+    @classmethod
+    def from_leading_components(cls, system: Geometry, x, n: int) -> LiftedGeometry:
+        """Return the geometry of an inner system whose states are the first n components of the outer ones."""
+        n_extra = len(x) - n
+        return cls(system, x[:n], lambda alpha: alpha[:n], lambda v: jnp.pad(v, (0, n_extra)), True)
 
     def inner_gradients(self, dH, dS, dL) -> tuple:
         """Return the inner gradients; dS may be None."""
@@ -383,7 +403,42 @@ class LiftedDissipation(Dissipation):
 
 
 class SkewFriction(Dissipation):
-    """Base of friction that heats by a skew bracket with the energy, so that the energy is conserved [SML 6]."""
+    """Base of friction that heats by a skew bracket with the energy, so that the energy is conserved [SML 6].
+
+    Attributes
+    ----------
+    law : str or None
+        The law of the entropy.
+    """
+
+    law: LawName | None = eqx.field(static=True, kw_only=True, default=None)
+
+    @property
+    def entropy_law(self) -> LawName | None:
+        return self.law
 
     needs_entropy = False
     is_symmetric = False
+
+
+class Damping(Dissipation):
+    """Base of dissipations that lower the energy of a body; the baths of a system take the heat.
+
+    Attributes
+    ----------
+    bath : Indices or None
+        The number of the bath that takes the heat, one for each site where sites differ; None for the first bath.
+    """
+
+    bath: Indices | None = eqx.field(static=True, kw_only=True, default=None)
+
+    energy_law = "nonincreasing"
+    needs_entropy = False
+
+    @property
+    def entropy_law(self) -> LawName | None:
+        return None
+
+    @property
+    def heated_bath_index(self):
+        return self.bath

@@ -198,16 +198,11 @@ class ContactFriction(SkewFriction):
     Parameters
     ----------
     body_indices : tuple of int
-    is_nondecreasing : bool
-        True if the energies are known to have that form.
+    law : {"nondecreasing"}, optional
+        Law of the entropy, if the energies are known to have that form.
     """
 
     body_indices: tuple[int, ...] = eqx.field(static=True)
-    is_nondecreasing: bool = eqx.field(static=True, default=False)
-
-    @property
-    def entropy_law(self) -> LawName | None:
-        return "nondecreasing" if self.is_nondecreasing else None
 
     def force(self, system, x, dH, dS, dL):
         indices = _state_indices(system)

@@ -11,13 +11,13 @@ import numpy as np
 from manifolds.matrices.blocks import Diagonal
 
 from ..functions.conditions import checked_numbers, require_condition
-from ..functions.indices import Indices
-from .base import Dissipation
+from .base import Damping
 from .checks import check_form_shape, checked_bath_indices, checked_rate, checked_semidefinite, repeat_over_sites
 from .factor import Factor, form_root
+from .geometry import isotropic_size, isotropic_vector
 
 
-class DoubleBracket(Dissipation):
+class DoubleBracket(Damping):
     """Double bracket: keeps every Casimir and lowers the energy [Bloch, Krishnaprasad, Marsden, Ratiu 1996].
 
     ``x' = Pi dH + rate * Pi (Pi dH)^♯``, that is ``ad*_xi mu + rate * ad*_sigma mu`` with ``sigma = (ad*_xi mu)^♯``
@@ -47,17 +47,14 @@ class DoubleBracket(Dissipation):
 
     rate: jax.Array
     metric: Any
-    bath: Indices | None = eqx.field(static=True)
 
     def __init__(self, rate=1.0, metric=None, bath=None):
         self.rate = checked_rate(rate)
         self.bath = checked_bath_indices(bath)
         self.metric = None if metric is None else _checked_metric(metric)
 
-    energy_law = "nonincreasing"
     entropy_law = "conserved"
     preserves_casimirs = True
-    needs_entropy = False
 
     def bind_to(self, system):
         if self.metric is None:
@@ -65,10 +62,6 @@ class DoubleBracket(Dissipation):
         metric = repeat_over_sites(self.metric, system)
         check_form_shape(metric, system.dim, "the metric")
         return self if metric is self.metric else eqx.tree_at(lambda d: d.metric, self, metric)
-
-    @property
-    def heated_bath_index(self):
-        return self.bath
 
     def force(self, system, x, dH, dS, dL):
         return self.rate * system.poisson.sharp(x, self._bracket_velocity(system, x, dH))
@@ -85,12 +78,12 @@ class DoubleBracket(Dissipation):
         root = None if self.metric is None else form_root(self.metric)
 
         def velocity(w):
-            return system.lower_index(x, system.isotropic_vector(x, w)) if root is None else root @ w
+            return system.lower_index(x, isotropic_vector(system, x, w)) if root is None else root @ w
 
         def times(w):
             return system.poisson.sharp(x, velocity(w))
 
-        n_columns = system.isotropic_size if root is None else system.dim
+        n_columns = isotropic_size(system) if root is None else system.dim
         return Factor(n_columns, times, velocity=velocity).scale_by(self.rate)
 
 

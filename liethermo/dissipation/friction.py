@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,8 +11,7 @@ import numpy as np
 from manifolds._arrays import is_traced
 from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
 
-from ..functions.indices import Indices
-from .base import Dissipation
+from .base import Damping
 from .checks import (
     check_form_shape,
     checked_bath_indices,
@@ -23,9 +21,10 @@ from .checks import (
     reject_rate_as_form,
 )
 from .factor import Factor
+from .geometry import isotropic_size, isotropic_vector, project_tangent
 
 
-class Friction(Dissipation):
+class Friction(Damping):
     """Friction against the surroundings: ``x' = Pi dH - rate * D(x) dH``, with ``H' = -rate dH . D dH <= 0``.
 
     Without a D it is the gradient flow of the metric. With D = diag(0, gamma) on (q, p) it is the drag ``p' = -gamma
@@ -47,7 +46,6 @@ class Friction(Dissipation):
 
     D: Callable | jax.Array | None
     rate: jax.Array
-    bath: Indices | None = eqx.field(static=True)
 
     def __init__(self, D=None, rate=1.0, bath=None):
         reject_rate_as_form(D, self, "the friction D")
@@ -59,29 +57,21 @@ class Friction(Dissipation):
         self.rate = checked_rate(rate)
         self.bath = checked_bath_indices(bath)
 
-    energy_law = "nonincreasing"
-    entropy_law = None
-    needs_entropy = False
-
     def bind_to(self, system):
         if self.D is not None:
             check_form_shape(self.D, system.dim, "the friction D")
         return self
 
-    @property
-    def heated_bath_index(self):
-        return self.bath
-
     def force(self, system, x, dH, dS, dL):
         if self.D is None:
             return -self.rate * system.raise_index(x, dH)
-        return -self.rate * system.project_tangent(x, evaluate_form(self.D, x) @ system.project_tangent(x, dH))
+        return -self.rate * project_tangent(system, x, evaluate_form(self.D, x) @ project_tangent(system, x, dH))
 
     def factor(self, system, x, dH, dL):
         if self.D is None:
             return Factor(
-                system.isotropic_size, lambda w: system.isotropic_vector(x, w), system.space is None
+                isotropic_size(system), lambda w: isotropic_vector(system, x, w), system.space is None
             ).scale_by(self.rate)
         root = semidefinite_root(self.D(x)) if callable(self.D) else semidefinite_factor(self.D)
         constant = system.space is None and not callable(self.D)
-        return Factor(system.dim, lambda w: system.project_tangent(x, root @ w), constant).scale_by(self.rate)
+        return Factor(system.dim, lambda w: project_tangent(system, x, root @ w), constant).scale_by(self.rate)

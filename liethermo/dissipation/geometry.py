@@ -92,21 +92,6 @@ class Geometry(Module):
             return v
         return self.space.to_vector(self.space._metric_covector(self.points(x), self.points(v)).conj())
 
-    def project_tangent(self, x, w) -> jax.Array:
-        """Return the tangent vector nearest to an array, shape (n,); the array itself on R^n."""
-        if self.space is None:
-            return w
-        return self.space.to_vector(self.space._project_tangent(self.points(x), self.points(w)))
-
-    @property
-    def isotropic_size(self) -> int:
-        """Number of independent Gaussian numbers w in an isotropic random vector: see :meth:`isotropic_vector`."""
-        return self.dim if self.space is None else self.space.isotropic_size
-
-    def isotropic_vector(self, x, w) -> jax.Array:
-        """Return the tangent vector ``R w``, shape (n,), with ``R R^T`` the inverse of the metric; w itself on R^n."""
-        return w if self.space is None else self.space.to_vector(self.space._isotropic(self.points(x), w))
-
     def scale_at_sites(self, values, v) -> jax.Array:
         """Return a vector, shape (n,), times one number for each site, shape (sites,), or times a single number."""
         if jnp.ndim(values) == 0:
@@ -117,19 +102,37 @@ class Geometry(Module):
         """Return ``alpha . v`` at each site, shape (sites,)."""
         return jnp.sum((alpha * v).reshape(math.prod(self.sites), -1), axis=1)
 
-    def divergence_terms(self, x, contract_fields) -> jax.Array:
-        """Return the terms, shape (n, fields), whose sum over the first axis is the divergence of each vector field.
-
-        ``rows(y, alpha)`` is the product of a covector alpha at y with the field, or with each of several fields.
-        """
-        if self.space is None:
-            return jax.vmap(lambda e: jax.jvp(lambda y: contract_fields(y, e), (x,), (e,))[1])(jnp.eye(x.shape[0]))
-        vector = self.space.to_vector
-        return self.space._divergence_terms(
-            self.points(x), lambda y, alpha: contract_fields(vector(y), vector(alpha.conj()))
-        )
-
 
 @subprogram
 def _sharp(space: mf.Space, x, alpha) -> jax.Array:
     return space._sharp(x, alpha)
+
+
+def project_tangent(system: Geometry, x, w) -> jax.Array:
+    """Return the tangent vector nearest to an array, shape (n,); the array itself on R^n."""
+    if system.space is None:
+        return w
+    return system.space.to_vector(system.space._project_tangent(system.points(x), system.points(w)))
+
+
+def isotropic_size(system: Geometry) -> int:
+    """Return the number of independent Gaussian numbers in an isotropic random vector: see :func:`isotropic_vector`."""
+    return system.dim if system.space is None else system.space.isotropic_size
+
+
+def isotropic_vector(system: Geometry, x, w) -> jax.Array:
+    """Return the tangent vector ``R w``, shape (n,), with ``R R^T`` the inverse of the metric; w itself on R^n."""
+    return w if system.space is None else system.space.to_vector(system.space._isotropic(system.points(x), w))
+
+
+def divergence_terms_of_fields(system: Geometry, x, contract_fields) -> jax.Array:
+    """Return the terms, shape (n, fields), whose sum over the first axis is the divergence of each vector field.
+
+    ``contract_fields(y, alpha)`` is the product of a covector alpha at y with the field, or with each of several.
+    """
+    if system.space is None:
+        return jax.vmap(lambda e: jax.jvp(lambda y: contract_fields(y, e), (x,), (e,))[1])(jnp.eye(x.shape[0]))
+    vector = system.space.to_vector
+    return system.space._divergence_terms(
+        system.points(x), lambda y, alpha: contract_fields(vector(y), vector(alpha.conj()))
+    )

@@ -150,14 +150,7 @@ class HeatlessDissipation(LiftedDissipation):
 
 
 def _body_inner_geometry(system: Geometry, x) -> LiftedGeometry:
-    n = system.body_dim
-    return LiftedGeometry(
-        system.drop_baths(),
-        x[:n],
-        lambda alpha: alpha[:n],
-        lambda v: jnp.pad(v, (0, len(x) - n)),
-        preserves_solenoidal=True,
-    )
+    return LiftedGeometry.from_leading_components(system.drop_baths(), x, system.body_dim)
 
 
 def couple_to_baths(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
@@ -19,13 +18,12 @@ from manifolds.structures.spins import (
 from ..errors import InputError
 from ..functions.conditions import checked_numbers
 from ..functions.frames import sqrt_or_zero
-from ..functions.indices import Indices
-from .base import Dissipation
+from .base import Damping
 from .checks import checked_bath_indices, checked_rate, checked_rates
 from .factor import Factor
 
 
-class LandauLifshitz(Dissipation):
+class LandauLifshitz(Damping):
     """Landau-Lifshitz damping ``lambda_i s_i x (s_i x dH_i)`` at each site i: every |s_i| is constant, and H falls.
 
     It is the double bracket of so(3) at every site, with a rate of its own at each: the energy falls at the rate
@@ -49,7 +47,6 @@ class LandauLifshitz(Dissipation):
     """
 
     rate: jax.Array
-    bath: Indices | None = eqx.field(static=True)
 
     def __init__(self, rate=1.0, bath=None):
         array = checked_numbers(rate, "a rate")
@@ -62,10 +59,8 @@ class LandauLifshitz(Dissipation):
         alpha, ratio = checked_numbers(alpha, "alpha"), checked_numbers(ratio, "ratio")
         return ratio / (1.0 + alpha**2), alpha * ratio / (1.0 + alpha**2)
 
-    energy_law = "nonincreasing"
     entropy_law = "conserved"
     preserves_casimirs = True
-    needs_entropy = False
 
     def bind_to(self, system):
         spins = system.poisson
@@ -78,10 +73,6 @@ class LandauLifshitz(Dissipation):
                 f"rate must be one number, or have the shape {spins.sites} of the sites, got {self.rate.shape}"
             )
         return self
-
-    @property
-    def heated_bath_index(self):
-        return self.bath
 
     def force(self, system, x, dH, dS, dL):
         force, _ = self.damping_force_and_energy_loss(system.poisson, x, dH)

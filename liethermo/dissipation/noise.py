@@ -99,7 +99,7 @@ def _noisy_terms_with_values(
     dissipation: Dissipation, values: Sequence | None = None
 ) -> list[tuple[Dissipation, tuple]]:
     """Return the summands that can have noise, each with its portion of ``values``, by default its functions."""
-    terms = terms_with_preserved_values(dissipation, dissipation.preserve if values is None else values)
+    terms = terms_with_preserved_values(dissipation.terms, dissipation.preserve if values is None else values)
     return [(term, term_values) for term, term_values in terms if not term.is_noiseless]
 
 

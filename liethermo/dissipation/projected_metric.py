@@ -19,6 +19,7 @@ from ..functions.frames import gram_schmidt
 from .base import Dissipation
 from .checks import checked_rate, checked_semidefinite, evaluate_form, reject_rate_as_form
 from .factor import Factor
+from .geometry import isotropic_size, isotropic_vector, project_tangent
 
 
 class GlobalRateWarning(UserWarning):
@@ -117,7 +118,7 @@ class ProjectedMetric(Dissipation):
             if G is not None:
                 return None
             return self._projected_factor(
-                system, x, dH, dL, system.isotropic_size, lambda w: system.isotropic_vector(x, w)
+                system, x, dH, dL, isotropic_size(system), lambda w: isotropic_vector(system, x, w)
             )
         root = jnp.eye(n) if G is None else semidefinite_root(G) if callable(self.cometric) else semidefinite_factor(G)
         if not dL and not self.normalized:
@@ -138,5 +139,5 @@ class ProjectedMetric(Dissipation):
         return lambda alpha: (
             system.raise_index(x, alpha)
             if G is None
-            else system.project_tangent(x, G @ system.project_tangent(x, alpha))
+            else project_tangent(system, x, G @ project_tangent(system, x, alpha))
         )

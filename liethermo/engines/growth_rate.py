@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..dissipation.geometry import project_tangent
 from ..systems import System
 from ..tracing.programs import jit_cached
 
@@ -73,7 +74,7 @@ def arnoldi_hessenberg(system, method, x):
 
 def _jacobian_product(system: System, x) -> Callable:
     """Return the product of the Jacobian of the vector field at x with tangent vectors, as a function."""
-    return lambda v: system.project_tangent(x, jax.jvp(system.vector_field, (x,), (system.project_tangent(x, v),))[1])
+    return lambda v: project_tangent(system, x, jax.jvp(system.vector_field, (x,), (project_tangent(system, x, v),))[1])
 
 
 def _fixed_random_vector(n: int) -> np.ndarray:

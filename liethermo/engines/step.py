@@ -14,6 +14,7 @@ from ..integrators import OneStepMethod
 from ..integrators.base import is_permutation_equivariant, pullback_method
 from ..integrators.explicit import StepRow
 from ..systems import System
+from ..systems.spins import reorder_spins
 from ..tracing.programs import jit_unoptimised
 from .solver_options import DEFAULT_OPTIONS, EPS, SolverOptions
 from .stage_solver import (
@@ -115,7 +116,7 @@ def reorder_components(
     Only systems of more than ``options.rms_norm_dim`` components are reordered.
     """
     can_reorder = is_permutation_equivariant(method) and state.x.size > options.rms_norm_dim
-    reordering = system.reorder_components() if can_reorder else None
+    reordering = reorder_spins(system) if can_reorder else None
     if reordering is None:
         return system, method, state, lambda state: state
 

@@ -176,7 +176,7 @@ class OneStepMethod(Module):
         ):  # every discrete gradient is that of a collocation polynomial
             return bool(self.preserves & {"casimirs", "quadratic_casimirs"})
         if "quadratic_casimirs" in self.preserves:
-            force_keeps_casimirs = system.dissipation is None or system.dissipation.preserves_casimirs
+            force_keeps_casimirs = system.dissipation_keeps_casimirs
             return casimir and quadratic and force_keeps_casimirs
         return casimir and "casimirs" in self.preserves
 

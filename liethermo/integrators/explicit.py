@@ -342,7 +342,7 @@ class ExplicitMethod(TransportingMethod):
             return system.field(x, dH, jnp.zeros_like(x)), jnp.zeros(len(laws))
         dS = jnp.zeros_like(x) if system.entropy is None else system.entropy.gradient(x)
         dL = tuple(L.gradient(x) for L in system.preserved)
-        terms = list(terms_with_preserved_values(system.dissipation, dL))
+        terms = list(terms_with_preserved_values(system.dissipations, dL))
 
         def rate_by_dissipation(law: Law) -> jax.Array:
             """Return the rate by dissipation alone: near rest the motion would add rounding noise."""
@@ -412,4 +412,4 @@ def constraint_residual(k) -> jax.Array:
 
 def _max_stored_levels(system: System) -> int:
     """Return the number of levels that a run stores: the number of components without angles."""
-    return system.attitude_system.body.dim if isinstance(system, TurningSystem) else system.dim
+    return system.inner.dim if isinstance(system, TurningSystem) else system.dim

@@ -234,9 +234,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         system = system.freeze_at(u)
         slope = self._conservative_slope(system, u, dH, gradients_by_name)
         keys_and_names = tuple(zip(preserved_by_name(system), preserved_names(system), strict=True))
-        for term, preserved_keys in (
-            () if system.dissipation is None else terms_with_preserved_values(system.dissipation, keys_and_names)
-        ):
+        for term, preserved_keys in terms_with_preserved_values(system.dissipations, keys_and_names):
             slope = slope + self._dissipative_slope(term, preserved_keys, system, u, dH, dS, gradients_by_name)
         return slope
 
@@ -308,7 +306,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
     def can_transport_attitude(self, system: System) -> bool:
         """Return True if an attitude can follow the steps exactly, as it can if nothing is projected off the slopes."""
         names = preserved_names(system)
-        terms = () if system.dissipation is None else terms_with_preserved_values(system.dissipation, names)
+        terms = terms_with_preserved_values(system.dissipations, names)
         has_only_quadratics = all(
             C.is_quadratic for C in (self._held_functions(system) | _entropy_arguments(system)).values()
         )

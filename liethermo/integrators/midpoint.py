@@ -75,7 +75,7 @@ class MetriplecticMidpoint(TransportingMethod):
         d = h * k[0]
         z = x + (compensation + 0.5 * d)
         dH = self.gradient(system.energy, x, d, compensation)
-        dS = None if system.entropy is None else system.entropy.gradient(z)
+        dS = system.entropy_gradient(z)
         dL = tuple(self.gradient(L, x, d, compensation) for L in system.preserved)
         return z, dH, dS, dL
 

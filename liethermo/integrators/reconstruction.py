@@ -15,6 +15,7 @@ from ..errors import InputError
 from ..functions.frames import vector_with_inner_products
 from ..functions.gradients import two_sum
 from ..systems import MOMENTUM_LESS_IMPULSE, SPATIAL_MOMENTUM, AttitudeSystem, DrivenSystem, TurningSystem
+from ..systems.transport import is_torque_free
 from .base import MethodWrapper, TransportingMethod, pullback_method
 from .explicit import StepRow
 from .tableaus import gauss_tableau
@@ -162,7 +163,7 @@ class WithAttitude(MethodWrapper):
         local, step = TurningSystem(system, self.order, g), self.increment(h, k)
         new_g = g @ group.exp_map(group.algebra, local.angles(step))
         keeps_orbit, p_compensation = (
-            system.body.is_torque_free and self._transporting_method.can_transport_attitude(system.body),
+            is_torque_free(system.body) and self._transporting_method.can_transport_attitude(system.body),
             None,
         )
         if system.has_impulse:

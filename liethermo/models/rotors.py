@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
 
-from ..dissipation.base import Dissipation
+from ..dissipation.base import Damping, Dissipation
 from ..dissipation.checks import checked_rate
 from ..dissipation.factor import Factor
 from ..errors import InputError
@@ -24,7 +23,7 @@ from .inertia import checked_inertia, inverse_inertia
 from .parameters import checked_positive
 
 
-class BearingFriction(Dissipation):
+class BearingFriction(Damping):
     """Viscous friction ``p_i' = -k_i dH/dp_i`` in the bearings of rotors of momenta p; the total angular momentum is
     conserved.
 
@@ -37,15 +36,6 @@ class BearingFriction(Dissipation):
     """
 
     friction: jax.Array
-    bath: Indices = eqx.field(static=True)
-
-    energy_law = "nonincreasing"
-    entropy_law = None
-    needs_entropy = False
-
-    @property
-    def heated_bath_index(self):
-        return self.bath
 
     @property
     def _n_rotors(self) -> int:
@@ -69,7 +59,7 @@ class BearingFriction(Dissipation):
         return Factor(n, momentum_rates, True, velocity=zero_velocity)
 
 
-class RotorFriction(Dissipation):
+class RotorFriction(Damping):
     """Friction inside the rotor: the double bracket in the axes of the rotor.
 
     ``L' = L × sigma, p' = a . (L × sigma)`` with ``sigma = rate L × (Omega + w a)`` damps the motion of L in the
@@ -85,15 +75,6 @@ class RotorFriction(Dissipation):
 
     rate: jax.Array
     axis: jax.Array
-    bath: Indices = eqx.field(static=True)
-
-    energy_law = "nonincreasing"
-    entropy_law = None
-    needs_entropy = False
-
-    @property
-    def heated_bath_index(self):
-        return self.bath
 
     def _momentum_rate(self, x, sigma) -> jax.Array:
         torque = jnp.cross(x[:3], sigma)
@@ -153,7 +134,7 @@ def damper_wheel(
         If the body without the wheel had an inertia that is not positive, or another parameter cannot be used.
     """
     k, baths = checked_rate(friction), HeatBaths(capacity, temperature)
-    return _rotor_system(inertia, axis, wheel, lambda a: BearingFriction(k, Indices(0)), baths, attitude, torque)
+    return _rotor_system(inertia, axis, wheel, lambda a: BearingFriction(k), baths, attitude, torque)
 
 
 def ring_damper(
@@ -193,7 +174,7 @@ def ring_damper(
     J = 2.0 * np.pi**2 * checked_positive(density, "density") * a**2 * R**3
     k = 16.0 * np.pi**2 * checked_positive(viscosity, "viscosity") * R**3
     baths = HeatBaths(capacity, temperature)
-    return _rotor_system(inertia, axis, J, lambda a: BearingFriction(k, Indices(0)), baths, attitude, torque)
+    return _rotor_system(inertia, axis, J, lambda a: BearingFriction(k), baths, attitude, torque)
 
 
 def dual_spin(
@@ -247,9 +228,9 @@ def dual_spin(
     def make_dissipations(a) -> list[Dissipation]:
         platform_axis = jnp.zeros(3)
         return [
-            BearingFriction(k, Indices(0)),
-            RotorFriction(rates[0], platform_axis, Indices(0)),
-            RotorFriction(rates[1], a, Indices(1)),
+            BearingFriction(k),
+            RotorFriction(rates[0], platform_axis),
+            RotorFriction(rates[1], a, bath=Indices(1)),
         ]
 
     baths = HeatBaths(capacity, temperature, number=2)
@@ -309,7 +290,7 @@ def reaction_wheels(
     k = jnp.broadcast_to(checked_numbers(friction, "friction", (), (n,)), (n,))
     require_condition(k, lambda v: (v >= 0.0) & (v < jnp.inf), "friction must be >= 0 and finite, got {value}")
     baths = HeatBaths(capacity, temperature)
-    return _rotor_system(inertia, axes, wheels, lambda a: BearingFriction(k, Indices(0)), baths, attitude, torque)
+    return _rotor_system(inertia, axes, wheels, lambda a: BearingFriction(k), baths, attitude, torque)
 
 
 def spin_temperature(momentum, energy, inertia, capacity=1.0, temperature=1.0) -> float:

@@ -11,6 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from ..dissipation.geometry import divergence_terms_of_fields
 from ..dissipation.noise import factor_residuals
 from ..errors import InputError
 from ..functions.energy import Energy, make_energy
@@ -231,7 +232,7 @@ def _noise_residuals(model: tuple[System, Energy | None], x):
     def motion(y):
         return system.poisson.sharp(y, system.energy.gradient(y))
 
-    terms = system.divergence_terms(x, lambda y, alpha: jnp.dot(alpha, motion(y)))
+    terms = divergence_terms_of_fields(system, x, lambda y, alpha: jnp.dot(alpha, motion(y)))
     if density is not None:
         terms = jnp.append(terms, jnp.dot(density.gradient(x), motion(x)))
     scale = jnp.max(jnp.abs(terms)) + jnp.max(jnp.abs(motion(x))) / (1.0 + jnp.max(jnp.abs(x)))

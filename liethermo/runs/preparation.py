@@ -27,6 +27,7 @@ from ..systems import (
     embed_in_arrays,
     make_autonomous,
 )
+from ..systems.attitude import driven_system_or_none
 from ..systems.invariants import recorded_invariants, resolve_invariants_near, undecided_functions
 from ..tracing.caching import LRUCache, memoize
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
@@ -191,7 +192,7 @@ def limit_family_to_span(family: Family, system: System, start: float, end: floa
 
 def is_driven_run(system: System) -> bool:
     """Return True if a prepared system has a clock, because its functions depend on time."""
-    return isinstance(system.body if isinstance(system, AttitudeSystem) else system, DrivenSystem)
+    return driven_system_or_none(system) is not None
 
 
 @memoize

@@ -30,7 +30,9 @@ from ..results.audit_evidence import (
 from ..results.ensemble import Ensemble
 from ..results.solution import Solution
 from ..results.step_sampling import MAX_SAMPLED_VALUES, REPLAY_COST_RATIO, StepSample
-from ..systems import AttitudeSystem, DrivenSystem, System
+from ..systems import AttitudeSystem, System
+from ..systems.attitude import driven_system_or_none
+from ..systems.states import reshape_to_sites
 from ..tracing.interpret import evaluate_at_points
 from .preparation import invariants_and_laws
 from .schedule import StepSchedule
@@ -239,7 +241,7 @@ class EnsembleRecord:
             **quantities,
             **fields,
         )
-        return self.member.reshape_to_sites(result)
+        return reshape_to_sites(self.member, result)
 
     def _angular_velocity_source(self) -> Callable[[], np.ndarray] | None:
         """Return the function that computes the angular velocities, trajectories first; None without a rigid body."""
@@ -383,12 +385,6 @@ class EnsembleEvidenceCollector:
 
     def _user_states(self, x: np.ndarray) -> np.ndarray:
         return np.asarray(self.member.points(x)).reshape(len(x), -1)
-
-
-def driven_system_or_none(system: System) -> DrivenSystem | None:
-    """Return the part of a prepared system that records external work, or None."""
-    body = system.body if isinstance(system, AttitudeSystem) else system
-    return body if isinstance(body, DrivenSystem) else None
 
 
 def _rounding_scales_at(model: tuple[ProgramStructure, int], row):

@@ -15,7 +15,6 @@ from manifolds._arrays import is_traced
 from manifolds._pytree_module import forward_to
 from manifolds.groups import maps
 
-from ..dissipation.base import LiftedDissipation, LiftedGeometry
 from ..errors import InputError
 from ..functions.energy import Energy, Linear
 from ..functions.time_span import replace_time_span
@@ -23,7 +22,9 @@ from ..tracing.interpret import evaluate_at_points
 from .base import System
 from .driven import DrivenSystem
 from .lie_poisson import LiePoissonSystem
+from .lifted import LiftedSystem
 from .rotations import attitude_array
+from .transport import is_torque_free
 
 SPATIAL_MOMENTUM = "momentum in space"
 """Name of the constant of the motion ``Ad_star(inverse(g), mu)``."""
@@ -35,7 +36,7 @@ IMPULSE_NAME = "impulse"
 """Name of the impulse of a torque on the spatial momentum; the number of the component follows."""
 
 
-class AttitudeSystem(System):
+class AttitudeSystem(LiftedSystem):
     """A Lie-Poisson system for mu together with ``g' = g hat(transport(mu))`` [:doc:`/explanation/exact_laws`].
 
     A state consists of the state of the body, mu first, and the entries of g row by row; imaginary parts follow for
@@ -64,8 +65,8 @@ class AttitudeSystem(System):
         self.body, self.reconstruction, self.group, self.space = body, reconstruction, group, None
         self.dim = body.dim + self._n_real_parts * group.matrix_size**2 + (group.dim if body.has_impulse else 0)
         self.poisson, self.dissipation, self.momentum_maps = body.poisson, body.dissipation, {}
-        self.energy = self._extend_from_momentum(body.energy)
-        self.entropy = None if body.entropy is None else self._extend_from_momentum(body.entropy)
+        self.energy = self.extend(body.energy)
+        self.entropy = None if body.entropy is None else self.extend(body.entropy)
         self.preserved_labels, self.invariant_verdicts = body.preserved_labels, body.invariant_verdicts
 
     @property
@@ -80,10 +81,6 @@ class AttitudeSystem(System):
     def momentum_system(self) -> LiePoissonSystem:
         """System of mu and the baths, without attitude and clock."""
         return momentum_system_of(self.body)
-
-    torque_name = forward_to("body")
-    has_impulse = forward_to("body")
-    torque_invariant_casimirs = forward_to("body")
 
     def split_state(self, x) -> tuple[jax.Array, jax.Array]:
         """Return the state of the body, shape (..., n), and the group element, shape (..., m, m), of a state."""
@@ -170,15 +167,6 @@ class AttitudeSystem(System):
     def user_state(self, x):
         return self.body.user_state(self.points(x))
 
-    def outside(self, x) -> str:
-        return self.body.outside(self.points(x))
-
-    def domain_margin(self, x):
-        return self.body.domain_margin(self.points(x))
-
-    def why_singular(self, x) -> str:
-        return self.body.why_singular(self.points(x))
-
     def component_scales(self, k):
         """Return scales of momenta, which have a unit, and of attitudes, which have none."""
         n, m = self.body.dim, self.dim - self.spatial_impulse(k).shape[-1]
@@ -186,14 +174,6 @@ class AttitudeSystem(System):
         if m < self.dim:
             scales.append(super().component_scales(k[..., m:]))
         return jnp.concatenate(scales, axis=-1)
-
-    def raise_index(self, x, alpha):
-        n = self.body.dim
-        return jnp.concatenate([self.body.raise_index(x[:n], alpha[:n]), alpha[n:]])
-
-    def lower_index(self, x, v):
-        n = self.body.dim
-        return jnp.concatenate([self.body.lower_index(x[:n], v[:n]), v[n:]])
 
     def to_user_solution(self, solution):
         states, g = self.split_state(solution.x)
@@ -226,15 +206,10 @@ class AttitudeSystem(System):
         return float(np.abs(momenta - momenta[0]).max()) / (scale if scale > 0.0 else 1.0)
 
     inertia = forward_to("momentum_system")
-    has_angular_velocity = forward_to("body")
-    joint_ranges = forward_to("body")
-
-    def angular_velocity_at(self, x):
-        return self.body.angular_velocity_at(self.points(x))
 
     @property
     def constant_names(self):
-        if not self.body.is_torque_free:
+        if not is_torque_free(self.body):
             return ()
         return (MOMENTUM_LESS_IMPULSE,) if self.has_impulse else (SPATIAL_MOMENTUM,)
 
@@ -245,12 +220,10 @@ class AttitudeSystem(System):
 
     @property
     def ledger(self):
-        body_ledger = {name: self._extend_from_momentum(f) for name, f in self.body.ledger.items()}
+        body_ledger = {name: self.extend(f) for name, f in self.body.ledger.items()}
         return body_ledger | {
             name: Linear(jnp.ones(1)).on([i - self.group.dim]) for i, name in enumerate(self.impulse_names)
         }
-
-    balance_entries = forward_to("body")
 
     @property
     def state_blocks(self):
@@ -263,13 +236,10 @@ class AttitudeSystem(System):
 
     def _vector_field(self, x):
         (mu, g), body = self.split_state(x), self.body_at_attitude(x)
-        dS = None if body.entropy is None else body.entropy.gradient(mu)
-        xi = body.transport(mu, body.energy.gradient(mu), dS, body._preserved_gradients(mu))
+        dS = body.entropy_gradient(mu)
+        xi = body.transport(mu, body.energy.gradient(mu), dS, tuple(L.gradient(mu) for L in body.preserved))
         p = body.external_torque(mu)[: self.group.dim] @ self.spatial_action(g) if self.has_impulse else None
         return self.join_state(body._vector_field(mu), g @ self.group.algebra.hat(xi[: self.group.dim]), p)
-
-    def _extend_from_momentum(self, energy: Energy) -> Energy:
-        return energy.on(range(self.body.dim))
 
     @property
     def _n_real_parts(self) -> int:
@@ -296,6 +266,12 @@ def momentum_system_of(body: System) -> LiePoissonSystem:
     return momentum_system
 
 
+def driven_system_or_none(system: System) -> DrivenSystem | None:
+    """Return the part of a prepared system that records external work, or None."""
+    body = system.body if isinstance(system, AttitudeSystem) else system
+    return body if isinstance(body, DrivenSystem) else None
+
+
 def _attitude_residual(system: AttitudeSystem, x) -> jax.Array:
     return system.group.defect(system.split_state(x)[1])
 
@@ -314,7 +290,7 @@ ANGLE_UNIT = 2.0**-300
 which the momentum alone determines, be it 1e20 or 1e-20. It is a power of two, so that scaling rounds nothing."""
 
 
-class TurningSystem(System):
+class TurningSystem(LiftedSystem):
     """A body in coordinates (mu, theta) around an attitude g, for the attitude ``g exp(hat(theta))``.
 
     ``theta' = dexp(theta)^-1 transport(mu)`` [Munthe-Kaas 1999]: a system on a vector space, for one step of a method
@@ -340,46 +316,36 @@ class TurningSystem(System):
         self.dim, self.space = body.dim + attitude_system.group.dim * (2 if attitude_system.has_impulse else 1), None
         self.poisson = mf.NoPoisson(self.dim)  # field() computes the motion
         self.energy, self.entropy = attitude_system.energy, attitude_system.entropy
-        self.momentum_maps = {name: self.pullback(J) for name, J in body.momentum_maps.items()}
-        self.dissipation = _MomentumDissipation.lift_terms(body.dissipation, self.pullback)
-        self.preserved_labels, self.invariant_verdicts = body.preserved_labels, body.invariant_verdicts
+        self._lift_laws()
+
+    @property
+    def inner(self) -> LiePoissonSystem | DrivenSystem:
+        return self.attitude_system.body
 
     @property
     def state_blocks(self):
-        n, m = self.attitude_system.body.dim, self.attitude_system.body.dim + self.attitude_system.group.dim
-        return *_body_blocks(self.attitude_system.body), slice(n, m), *([slice(m, None)] if self.has_impulse else [])
+        n, m = self.inner.dim, self.inner.dim + self.attitude_system.group.dim
+        return *_body_blocks(self.inner), slice(n, m), *([slice(m, None)] if self.has_impulse else [])
 
     def pullback(self, energy: Energy) -> Energy:
-        return self.attitude_system._extend_from_momentum(energy)
-
-    torque_name = forward_to("attitude_system")
-    has_impulse = forward_to("attitude_system")
-    torque_invariant_casimirs = forward_to("attitude_system")
-
-    def casimirs(self):
-        return {name: self.pullback(C) for name, C in self.attitude_system.body.casimirs().items()}
-
-    raise_index = forward_to("attitude_system")
-    lower_index = forward_to("attitude_system")
+        return self.extend(energy)
 
     def field(self, x, dH, dS, dL=()):
-        body, n = self.body_at_attitude(x), self.attitude_system.body.dim
-        body_arguments = x[:n], dH[:n], None if dS is None else dS[:n], tuple(L[:n] for L in dL)
+        body, arguments = self.inner_at(x), self.inner_arguments(x, dH, dS, dL)
         algebra = self.attitude_system.group.algebra
-        velocity = body.transport(*body_arguments)[: algebra.dim]
+        velocity = body.transport(*arguments)[: algebra.dim]
         angle_rates = maps.inverse_dexp(algebra, self.angles(x), velocity, self.order)
-        rates = [body.field(*body_arguments), ANGLE_UNIT * angle_rates]
+        rates = [body.field(*arguments), ANGLE_UNIT * angle_rates]
         if self.has_impulse:
-            torque = body.external_torque(x[:n])
+            torque = body.external_torque(arguments[0])
             assert torque is not None
             rates.append(
                 ANGLE_UNIT * (torque[: algebra.dim] @ self.attitude_system.spatial_action(self._attitude_at(x)))
             )
         return jnp.concatenate(rates)
 
-    def body_at_attitude(self, x) -> System:
-        """Return the body with its torque bound to the attitude of the coordinates."""
-        body = self.attitude_system.body
+    def inner_at(self, x) -> System:
+        body = self.inner
         if isinstance(body, DrivenSystem) and body.needs_attitude:
             return body.bind_attitude(self._attitude_at(x))
         return body
@@ -402,21 +368,9 @@ class TurningSystem(System):
 
     def angles(self, v) -> jax.Array:
         """Return theta of coordinates, shape (..., algebra.dim)."""
-        n = self.attitude_system.body.dim
+        n = self.inner.dim
         return v[..., n : n + self.attitude_system.group.dim] / ANGLE_UNIT
 
     def spatial_impulse(self, v) -> jax.Array:
         """Return the spatial impulse of coordinates, shape (..., algebra.dim)."""
-        return v[..., self.attitude_system.body.dim + self.attitude_system.group.dim :] / ANGLE_UNIT
-
-
-class _MomentumDissipation(LiftedDissipation):
-    """A dissipation of the momentum."""
-
-    is_noiseless = forward_to("inner")
-
-    def lifted_geometry(self, system, x) -> LiftedGeometry:
-        n = system.attitude_system.body.dim
-        return LiftedGeometry(
-            system.body_at_attitude(x), x[:n], lambda alpha: alpha[:n], lambda v: jnp.pad(v, (0, len(x) - n))
-        )
+        return v[..., self.inner.dim + self.attitude_system.group.dim :] / ANGLE_UNIT

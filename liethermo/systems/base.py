@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,36 +15,21 @@ from manifolds._arrays import is_traced, real_array
 from manifolds._precision import with_library_settings
 from manifolds.structures.poisson import ProductPoisson
 
-from ..dissipation.base import Dissipation, sum_dissipations, terms_with_preserved_values
+from ..dissipation.base import Dissipation, sum_dissipations
 from ..dissipation.heating import couple_to_baths
-from ..errors import AxiomError, CasimirError, InputError
+from ..errors import InputError
 from ..functions.checks import checked_energy, trace_energies, with_polynomial_degrees
 from ..functions.energy import Energy, make_energy
 from ..functions.on_spaces import energy_of_vectors, flatten_site_functions
 from ..functions.with_baths import BodyBathsEnergy
 from ..tracing.traced import trace_callables
 from .baths import BathEntropy, HeatBaths, poisson_with_baths
-from .check import AXIOM_TOLERANCE, CheckReport, check_system
+from .check import AXIOM_TOLERANCE, CheckReport, check_system, require_axioms
+from .conservation import project_covector
 from .interface import SystemInterface
 from .invariants import find_invariants, find_preserved_names, named_functions
-
-
-class ReorderedSystem(NamedTuple):
-    """A system with the components of its states in another order.
-
-    Attributes
-    ----------
-    system : System
-    reorder_state, restore_state : functions of states, shape (..., n)
-        Reorder the components, and restore their order.
-    pullback : function from an Energy to an Energy
-        Turns a function of states into a function of reordered states.
-    """
-
-    system: System
-    reorder_state: Callable
-    restore_state: Callable
-    pullback: Callable
+from .states import checked_state_array, evaluate_batch, reshape_to_sites
+from .transport import dissipation_velocities
 
 
 class System(SystemInterface):
@@ -115,39 +99,13 @@ class System(SystemInterface):
         self.dissipation = None
         if dissipation is not None:
             dissipation = flatten_site_functions(dissipation, self.shape)
-            self.dissipation = self._bind_dissipation(dissipation)
+            self.dissipation = _bind_dissipation(self, dissipation)
         if baths is not None:
-            self._attach_baths(baths, bath_terms)
+            _attach_baths(self, baths, bath_terms)
         if self.preserved and not is_traced(self):
             self.preserved_labels = find_preserved_names(self)
         if validate and not is_traced(self):
-            self._validate()
-
-    def _bind_dissipation(self, dissipation: Dissipation) -> Dissipation:
-        dissipation = trace_energies(dissipation, self.dim, "a preserved function")
-        return self._trace_dissipation(dissipation.bind_to(self))
-
-    def _attach_baths(self, baths: HeatBaths, bath_terms: tuple[Dissipation, ...] = ()) -> None:
-        """Append baths to this system, in place; the dissipations ``bath_terms`` act on the extended states."""
-        body, n, m = copy(self), self.dim, baths.number
-
-        def extend(energy: Energy) -> Energy:
-            return energy.on(range(n))
-
-        if self.dissipation is not None or not bath_terms:
-            self.dissipation = couple_to_baths(self.dissipation, body, m, baths.has_positive_temperatures, extend)
-        if body.space is not None and body.space.dtype.kind == "c":
-            raise InputError(f"baths are for real spaces, and {body.space.name} is complex")
-        self.baths, self.dim = baths, n + m
-        self.space = None if body.space is None else mf.Product(body.space, mf.Euclidean(m))
-        self.poisson = poisson_with_baths(body.poisson, m)
-        self.energy = BodyBathsEnergy(body.energy, baths.energy, n, self.dim)
-        heat = BathEntropy(m)
-        self.entropy = heat if body.entropy is None else extend(body.entropy) + heat
-        self.momentum_maps = {name: extend(J) for name, J in body.momentum_maps.items()}
-        if bath_terms:
-            bound_terms = tuple(self._bind_dissipation(term) for term in bath_terms)
-            self.dissipation = sum_dissipations([d for d in (self.dissipation, *bound_terms) if d is not None])
+            require_axioms(self, matrices=not self.has_poisson_by_construction)
 
     def drop_baths(self) -> System:
         if self.baths is None:
@@ -203,12 +161,14 @@ class System(SystemInterface):
 
     def vector_field(self, x, t=None) -> jax.Array:
         """Return ``x'`` at states x, shape (..., n), and at the time t if the energy depends on it."""
-        return self.evaluate_batch(lambda system, y: system._vector_field(y), x, t, "(n)")
+        return evaluate_batch(self, lambda system, y: system._vector_field(y), x, t, "(n)")
 
     def entropy_production(self, x, t=None) -> jax.Array:
         """Return the rate of growth of the entropy, ``grad S . x'``, shape (...), at states x and the time t."""
-        entropy = self._require_entropy()
-        return self.evaluate_batch(lambda system, y: jnp.dot(entropy.gradient(y), system._vector_field(y)), x, t, "()")
+        entropy = self.entropy
+        if entropy is None:
+            raise InputError("this system has no entropy")
+        return evaluate_batch(self, lambda system, y: jnp.dot(entropy.gradient(y), system._vector_field(y)), x, t, "()")
 
     def energy_fall(self, x, t=None) -> jax.Array:
         """Return the rate at which the dissipation lowers the energy, ``-grad H . force``, shape (...), at x and t."""
@@ -217,10 +177,12 @@ class System(SystemInterface):
             if system.dissipation is None:
                 return jnp.zeros(())
             dH = system.energy.gradient(y)
-            dS = None if system.entropy is None else system.entropy.gradient(y)
-            return -system.dissipation.rate_of_change(system, y, dH, dS, system._preserved_gradients(y), dH)
+            dS = system.entropy_gradient(y)
+            return -system.dissipation.rate_of_change(
+                system, y, dH, dS, tuple(L.gradient(y) for L in system.preserved), dH
+            )
 
-        return self.evaluate_batch(fall_rate, x, t, "()")
+        return evaluate_batch(self, fall_rate, x, t, "()")
 
     @with_library_settings
     def friction_matrix(self, x, t=None, dissipation: Dissipation | None = None) -> jax.Array:
@@ -243,51 +205,9 @@ class System(SystemInterface):
         ``g' = g hat(transport)``.
         """
         total = dH[: self.body_dim]
-        for sigma in self._dissipation_velocities(x, dH, dS, dL):
+        for sigma in dissipation_velocities(self, x, dH, dS, dL):
             total = total if sigma is None else total + sigma
         return total
-
-    @property
-    def is_torque_free(self) -> bool:
-        """True if ``x' = Pi(x) transport``, so that on a Lie algebra the momentum in space is constant."""
-        answers: list[bool] = []
-
-        def record_answer(x):
-            velocities = self._dissipation_velocities(x, x, x, (x,) * len(self.preserved))
-            answers.append(all(sigma is not None for sigma in velocities))
-
-        jax.eval_shape(record_answer, jax.ShapeDtypeStruct((self.dim,), jnp.float64))
-        return answers[0]
-
-    def _dissipation_velocities(self, x, dH, dS, dL) -> list[jax.Array | None]:
-        """Return the velocity of each dissipation; None for a dissipation that acts as a torque."""
-        terms = () if self.dissipation is None else terms_with_preserved_values(self.dissipation, dL)
-        return [term.velocity(self, x, dH, dS, term_dL) for term, term_dL in terms]
-
-    # -- time -------------------------------------------------------------------------------------------------------
-
-    @with_library_settings
-    def evaluate_batch(self, function: Callable, x, t, result_signature: str) -> jax.Array:
-        """Return ``function(system, x)`` for each state of a batch, with the system frozen at the time t of that state.
-
-        Parameters
-        ----------
-        result_signature : str
-            The shape of one result, as in ``"(n)"``.
-
-        Raises
-        ------
-        InputError
-            If a time is needed and none is given.
-        """
-        x = self.state(x, batch=True)
-        if not self.is_driven:
-            return jnp.vectorize(lambda y: function(self, y), signature=f"(n)->{result_signature}")(x)
-        if t is None:
-            what = "energy of this system depends on" if self.energy.depends_on_time else "torque is known at a"
-            raise InputError(f"the {what} time: give the time beside the state")
-        evaluate = jnp.vectorize(lambda y, t: function(self.at_time(t), y), signature=f"(n),()->{result_signature}")
-        return evaluate(x, jnp.asarray(t, dtype=jnp.float64))
 
     # -- other forms of the same system -------------------------------------------------------------------------------
 
@@ -304,10 +224,6 @@ class System(SystemInterface):
         Slopes and errors have its dimension. The other components follow from it, and have tolerances of their own.
         """
         return self, x
-
-    def reorder_components(self) -> ReorderedSystem | None:
-        """Return this system with its components in the order that is fastest for large states; None if it has none."""
-        return None
 
     def system_of_step(self, x) -> System:
         """Return the system for a step that starts at x, shape (n,).
@@ -361,15 +277,7 @@ class System(SystemInterface):
 
     def to_user_solution(self, solution: Any) -> Any:
         """Return a solution in the form that the user sees."""
-        return self.reshape_to_sites(solution)
-
-    def reshape_to_sites(self, result: Any) -> Any:
-        """Return ``result``, a solution or an ensemble, with its states, shape (..., n), as arrays (..., *sites, d)."""
-        if not self.sites:
-            return result
-        states = {name: value for name in result.state_fields if (value := getattr(result, name)) is not None}
-        reshaped = {name: value.reshape(*value.shape[:-1], *self.shape) for name, value in states.items()}
-        return dataclasses.replace(result, **reshaped)
+        return reshape_to_sites(self, solution)
 
     def freeze_at(self, x) -> System:
         """Return the system for use at one state, with the common parts of Pi and K computed once."""
@@ -409,51 +317,7 @@ class System(SystemInterface):
 
     def state_array(self, x, batch: bool = False) -> np.ndarray | jax.Array:
         """Return the state x as :meth:`state` does, as an array of NumPy unless JAX traces it."""
-        if not isinstance(x, jax.Array):
-            try:
-                x = np.asarray(x)
-            except (TypeError, ValueError) as error:
-                raise InputError(f"a state is a rectangular array of real numbers: {error}") from None
-            if x.dtype.kind not in "fiubc":
-                raise InputError(f"a state is an array of real numbers, not of {x.dtype}")
-        if self.space is not None and x.shape[-len(self.space.shape) :] == self.space.shape:
-            x = self.space.to_vector(x)
-        if self.sites and x.shape[-len(self.shape) :] == self.shape:
-            x = x.reshape(*x.shape[: -len(self.shape)], self.dim)
-        if self.baths is not None and x.shape[-1:] != (self.dim,):
-            x = self._append_bath_entropies(x)
-        if jnp.iscomplexobj(x):
-            raise InputError(f"a state is real, not {x.dtype}; take the real part if that is meant")
-        if x.shape[-1:] != (self.dim,) or (x.ndim > 1 and not batch):
-            expected = f"(..., {self.dim})" if batch else f"({self.dim},)"
-            if self.sites:
-                shown = ", ".join([*(["..."] if batch else []), *map(str, self.shape)])
-                expected = f"({shown}), or flat {expected}"
-            raise InputError(f"a state of this system has shape {expected}, not {x.shape}")
-        if isinstance(x, jax.core.Tracer):
-            return x
-        numbers = np.asarray(x, dtype=np.float64)
-        if not np.isfinite(numbers).all():
-            where = tuple(int(i) for i in np.argwhere(~np.isfinite(numbers))[0])
-            raise InputError(f"the state is not finite: component {where} is {numbers[where]}")
-        if self.space is not None:
-            self.space.point(self.points(numbers))
-        return numbers
-
-    def _append_bath_entropies(self, x) -> np.ndarray | jax.Array:
-        """Append zero entropies of the baths to a state of the body; return any other array unchanged."""
-        body = self.drop_baths()
-        shape = body.shape if body.space is None else body.space.shape
-        if shape == (1, 3) and x.shape == (3,):
-            x = x[None]
-        if x.shape[-len(shape) :] == shape:
-            vectors = x.reshape(*x.shape[: -len(shape)], -1) if body.space is None else body.space.to_vector(x)
-        elif x.shape[-1:] == (body.dim,):
-            vectors = x
-        else:
-            return x
-        zeros = np.zeros((*vectors.shape[:-1], self.dim - body.dim))
-        return (jnp if isinstance(x, jax.Array) else np).concatenate([vectors, zeros], axis=-1)
+        return checked_state_array(self, x, batch)
 
     @with_library_settings
     def check(self, points=None, samples: int = 16, seed: int = 0, scale: float = 1.0, times=None) -> CheckReport:
@@ -475,36 +339,42 @@ class System(SystemInterface):
         """
         return check_system(self, points, samples, seed, scale, times)
 
-    def _validate(self) -> None:
-        """Raise an error if an axiom fails at random states; the constructors call it."""
-        for row in check_system(self, None, 4, 0, 1.0, matrices=not self.has_poisson_by_construction).rows:
-            if row.passed is not False:
-                continue
-            kind = CasimirError if row.axiom == "Pi grad S = 0" else AxiomError
-            raise kind(
-                f"{row.axiom} fails: residual {row.residual:.3g}, tolerance {row.tolerance:.1g}. {row.note}".rstrip()
-                + " (validate=False builds the system all the same)",
-                residual=row.residual,
-                tolerance=row.tolerance,
-            )
-
     def _vector_field(self, x) -> jax.Array:
         if self.has_generator:
             return self.generator_field(x)
         dS = jnp.zeros_like(x) if self.entropy is None else self.entropy.gradient(x)
-        gradients = self.energy.gradient(x), dS, *self._preserved_gradients(x)
-        dH, dS, *dL = (
-            alpha if self.space is None else self.lower_index(x, self.raise_index(x, alpha)) for alpha in gradients
-        )
+        gradients = self.energy.gradient(x), dS, *(L.gradient(x) for L in self.preserved)
+        dH, dS, *dL = (project_covector(self, x, alpha) for alpha in gradients)
         return self.field(x, dH, dS, tuple(dL))
 
-    def _preserved_gradients(self, x) -> tuple[jax.Array, ...]:
-        return tuple(L.gradient(x) for L in self.preserved)
 
-    def _require_entropy(self) -> Energy:
-        if self.entropy is None:
-            raise InputError("this system has no entropy")
-        return self.entropy
+def _bind_dissipation(system: System, dissipation: Dissipation) -> Dissipation:
+    """Return the dissipation bound to the system, its functions traced."""
+    dissipation = trace_energies(dissipation, system.dim, "a preserved function")
+    return system._trace_dissipation(dissipation.bind_to(system))
+
+
+def _attach_baths(system: System, baths: HeatBaths, bath_terms: tuple[Dissipation, ...]) -> None:
+    """Append baths to the system, in place; the dissipations ``bath_terms`` act on the extended states."""
+    body, n, m = copy(system), system.dim, baths.number
+
+    def extend(energy: Energy) -> Energy:
+        return energy.on(range(n))
+
+    if system.dissipation is not None or not bath_terms:
+        system.dissipation = couple_to_baths(system.dissipation, body, m, baths.has_positive_temperatures, extend)
+    if body.space is not None and body.space.dtype.kind == "c":
+        raise InputError(f"baths are for real spaces, and {body.space.name} is complex")
+    system.baths, system.dim = baths, n + m
+    system.space = None if body.space is None else mf.Product(body.space, mf.Euclidean(m))
+    system.poisson = poisson_with_baths(body.poisson, m)
+    system.energy = BodyBathsEnergy(body.energy, baths.energy, n, system.dim)
+    heat = BathEntropy(m)
+    system.entropy = heat if body.entropy is None else extend(body.entropy) + heat
+    system.momentum_maps = {name: extend(J) for name, J in body.momentum_maps.items()}
+    if bath_terms:
+        bound_terms = tuple(_bind_dissipation(system, term) for term in bath_terms)
+        system.dissipation = sum_dissipations([d for d in (system.dissipation, *bound_terms) if d is not None])
 
 
 def _drop_last_factor(space: mf.Space) -> mf.Space:

@@ -21,8 +21,8 @@ from ..functions.arguments import LastArgumentIgnored, required_argument_count
 from ..functions.checks import traced_function_and_shape
 from ..tracing.interpret import evaluate_at_points
 from .herglotz import random_states
-from .ledger import ForcesAndHeat
-from .simple_closed import FlattenedFunction, SimpleClosedSystem, join_lagrangian_arguments
+from .ledger import FlattenedFunction, ForcesAndHeat
+from .simple_closed import SimpleClosedSystem, join_lagrangian_arguments
 
 N_NEWTON_ITERATIONS = 12
 """Number of iterations of Newton's method for S' if the form depends on it."""
@@ -84,29 +84,19 @@ class ChetaevSystem(SimpleClosedSystem):
         structure, dim, energy = self._build_contact_structure(lagrangian, dim, space)
         self.friction = self.external = self.heat_power = None
         self.form = SemibasicForm.from_function(eta, (dim // 2,) if space is None else space.shape)
-        forces = OneFormForce(None, None, None, _find_entropy_law(self.form, structure.contact))
-        self._assemble(structure, dim, energy, forces, momentum_maps, validate)
+        forces = ForcesAndHeat(law=_find_entropy_law(self.form, structure.contact))
+        self._assemble(structure, dim, energy, forces, momentum_maps, validate, self._state_space(space))
 
-    def friction_at(self, q, v, S, t, T) -> jax.Array:
-        del t
+    def friction_at(self, arguments, T) -> jax.Array:
+        q, v, S, _ = arguments
         return T * self.tangential_part(q, self.form.force_covector(q, v, S))
 
-    def friction_force(self, q, v, S, t) -> jax.Array:
-        """Return the force ``T eta_q / eta_S``, shape (n,)."""
-        return self.friction_at(q, v, S, t, -jax.grad(self.lagrangian_value, argnums=2)(q, v, S))
+    def friction_force(self, *arguments) -> jax.Array:
+        """Return the force ``T eta_q / eta_S``, shape (n,), at the arguments (q, v, S, t)."""
+        return self.friction_at(arguments, -jax.grad(self.lagrangian_value, argnums=2)(*arguments[:3]))
 
     def specific_residuals(self, x) -> dict[str, jax.Array]:
         return super().specific_residuals(x) if self.entropy_law == "nondecreasing" else {}
-
-
-class OneFormForce(ForcesAndHeat):
-    """The force of a one-form with its entropy law."""
-
-    law: LawName | None = eqx.field(static=True)
-
-    @property
-    def entropy_law(self) -> LawName | None:
-        return self.law
 
 
 class SemibasicForm(Module):

@@ -14,20 +14,21 @@ import manifolds as mf
 from manifolds._pytree_module import forward_to
 from manifolds.structures.poisson import PoissonBySharp, ProductPoisson
 
-from ..dissipation.base import LawName, LiftedDissipation, LiftedGeometry, SkewFriction
+from ..dissipation.base import SkewFriction
 from ..errors import InputError
 from ..functions.checks import with_polynomial_degrees
 from ..functions.coordinates import ComponentMap
 from ..functions.energy import ChartEnergy, Energy, Linear, Pullback, Quadratic, StateTimeEnergy, Sum
 from ..functions.time_span import TimeSpan, replace_time_span
 from .base import System
+from .lifted import LiftedSystem
 
 CLOCK_UNIT = 2.0**-100
 """Unit in which time and work are stored. It is so small that they do not count in norms of a state or of its velocity,
 which convergence and errors are measured against. It is a power of two, so that scaling rounds nothing."""
 
 
-class DrivenSystem(System):
+class DrivenSystem(LiftedSystem):
     """A system with ``H(x, t)``, made autonomous: ``x' = Pi dH + force``, ``t' = 1``, ``W' = dH/dt`` at fixed x.
 
     It has the energy ``H(x, t) - W`` and the Poisson tensor ``Pi + [[0, -1], [1, 0]]`` on (t, W); the dissipation acts
@@ -72,13 +73,10 @@ class DrivenSystem(System):
         self.poisson = ProductPoisson(body.poisson, _ClockPoisson(unit))
         energy = Sum((*map(self._extend_term, body.energy.terms), _NegativeWork(unit)))
         self.energy = energy if self.space is not None else with_polynomial_degrees(energy, self.dim)
-        self.entropy = None if body.entropy is None else self._extend(body.entropy)
-        self.momentum_maps = {name: self._extend(J) for name, J in body.momentum_maps.items()}
-        self.dissipation = _BodyDissipation.lift_terms(body.dissipation, self._extend)
+        self._lift_laws()
         if body.torque_name:
-            torque = _TorqueForce("conserved" if body.entropy_law is not None or body.entropy is None else None)
+            torque = _TorqueForce(law="conserved" if body.entropy_law is not None or body.entropy is None else None)
             self.dissipation = torque if self.dissipation is None else self.dissipation + torque
-        self.preserved_labels, self.invariant_verdicts = body.preserved_labels, body.invariant_verdicts
 
     @property
     def kind(self) -> str:
@@ -138,9 +136,6 @@ class DrivenSystem(System):
     def outside(self, x) -> str:
         return self._body_at_first_time(x).outside(x[..., :-2])
 
-    def domain_margin(self, x):
-        return self._body_at_state(x).domain_margin(x[..., :-2])
-
     def why_singular(self, x) -> str:
         return self._body_at_first_time(x).why_singular(x[..., :-2])
 
@@ -158,35 +153,23 @@ class DrivenSystem(System):
 
     # -- dynamics ---------------------------------------------------------------------------------------------------
 
-    can_unroll = forward_to("body")
-    has_matrix_functions = forward_to("body")
+    @property
+    def inner(self) -> System:
+        return self.body
+
+    def inner_at(self, x) -> System:
+        return self._body_at_time(self.time(x))
+
+    body_dim = forward_to("body")
+    needs_attitude = forward_to("body")
 
     def field(self, x, dH, dS, dL=()):
-        motion = self._body_at_state(x).drop_torque().field(*_restrict_to_body(x, dH, dS, dL))
+        motion = self.inner_at(x).drop_torque().field(*self.inner_arguments(x, dH, dS, dL))
         motion = jnp.concatenate([motion, _clock_velocity(dH, self.unit)])
         return motion + self.torque_velocity(x, dH) if self.torque_name else motion
 
-    def transport(self, x, dH, dS, dL=()):
-        return self._body_at_state(x).transport(*_restrict_to_body(x, dH, dS, dL))
-
-    has_angular_velocity = forward_to("body")
-    joint_ranges = forward_to("body")
-
-    def momentum_scale(self, x):
-        return self.body.momentum_scale(x[:-2])
-
-    def angular_velocity_at(self, x):
-        return self._body_at_state(x).angular_velocity_at(x[:-2])
-
-    is_torque_free = forward_to("body")
-    body_dim = forward_to("body")
-    torque_name = forward_to("body")
-    has_impulse = forward_to("body")
-    torque_invariant_casimirs = forward_to("body")
-    needs_attitude = forward_to("body")
-
     def external_torque(self, x):
-        return self._body_at_state(x).external_torque(x[:-2]) if self.torque is None else self.torque
+        return self.inner_at(x).external_torque(x[:-2]) if self.torque is None else self.torque
 
     def torque_velocity(self, x, dH) -> jax.Array:
         """Return the velocity that a torque gives to a state, power included, for a continuous or discrete gradient."""
@@ -207,43 +190,21 @@ class DrivenSystem(System):
         object.__setattr__(bound, "torque", torque)
         return bound
 
-    surface = forward_to("body")
-
     def raise_index(self, x, alpha):
         """Return the direction of a correction along alpha, without components along the clock and the work."""
         return jnp.concatenate([self.body.raise_index(x[:-2], alpha[:-2]), jnp.zeros(2)])
 
-    def lower_index(self, x, v):
-        return jnp.concatenate([self.body.lower_index(x[:-2], v[:-2]), v[-2:]])
-
-    def _body_at_state(self, x) -> System:
-        return self._body_at_time(self.time(x))
-
     def _body_at_time(self, t) -> System:
-        attitude = () if self.attitude is None else (self.attitude,)
-        return self.body.at_time(t, *attitude)
+        return self.body.at_time(t, self.attitude)
 
     # -- functions ----------------------------------------------------------------------------------------------------
 
-    @property
-    def inner(self) -> System:
-        return self.body
-
     def pullback(self, energy: Energy) -> Energy:
-        return self._extend(self.body.energy_of_vectors(energy))
-
-    def _extend(self, energy: Energy) -> Energy:
-        return energy.on(range(self.body.dim))
+        return self.extend(self.body.energy_of_vectors(energy))
 
     def _extend_term(self, term: Energy) -> Energy:
         clock = _ClockMap(self.body.dim, self.unit)
-        return _TimedEnergy(term.with_time(), clock) if term.depends_on_time else self._extend(term)
-
-    def casimirs(self):
-        return {name: self._extend(C) for name, C in self.body.casimirs().items()}
-
-    has_all_casimirs = forward_to("body")
-    orbit_levels = forward_to("body")
+        return _TimedEnergy(term.with_time(), clock) if term.depends_on_time else self.extend(term)
 
     @property
     def ledger(self):
@@ -262,8 +223,6 @@ class DrivenSystem(System):
         energy = solution.energy + solution.casimirs["work"]
         body_solution = dataclasses.replace(solution, x=x, energy=energy, dense=dense).with_provenance(**entries)
         return body.to_user_solution(body_solution)
-
-    reshape_to_sites = forward_to("body")
 
 
 class _ClockPoisson(PoissonBySharp):
@@ -289,38 +248,14 @@ def _clock_velocity(dH, unit: float) -> jax.Array:
     return unit**2 * jnp.stack([-dH[-1], dH[-2]])
 
 
-def _restrict_to_body(x, dH, dS, dL) -> tuple:
-    """Return the state of the body and the gradients with respect to it."""
-    return x[:-2], dH[:-2], None if dS is None else dS[:-2], tuple(L[:-2] for L in dL)
-
-
 class _TorqueForce(SkewFriction):
     """The torque on a body and the work that it does."""
-
-    law: LawName | None = eqx.field(static=True)
-
-    @property
-    def entropy_law(self):
-        return self.law
 
     is_noiseless = True
     preserves_casimirs = True  # of :attr:`System.torque_invariant_casimirs`; no other Casimir is claimed
 
     def force(self, system, x, dH, dS, dL):
         return system.torque_velocity(x, dH)
-
-
-class _BodyDissipation(LiftedDissipation):
-    """A dissipation of the body, evaluated at the time that the state contains."""
-
-    def lifted_geometry(self, system, x) -> LiftedGeometry:
-        return LiftedGeometry(
-            system._body_at_state(x),
-            x[:-2],
-            lambda alpha: alpha[:-2],
-            lambda v: jnp.pad(v, (0, 2)),
-            preserves_solenoidal=True,
-        )
 
 
 class _ClockMap(ComponentMap):

@@ -19,7 +19,9 @@ from ..errors import InputError
 from ..functions.checks import checked_energy
 from ..functions.energy import Energy, Quadratic, TimeDependent, make_energy
 from ..functions.inverse_gradient import inverse_gradient
+from ..tracing.interpret import evaluate_at_points
 from .lie_poisson import LiePoissonSystem
+from .states import evaluate_batch
 
 _SINGULAR_MESSAGE = (
     "the Lagrangian is singular: its Hessian has no inverse, so the momentum mu does not determine the velocity xi"
@@ -110,14 +112,14 @@ class EulerPoincareSystem(LiePoissonSystem):
 
     def velocity(self, mu, t=None) -> jax.Array:
         """xi = dH/dmu at a state or batch of states, shape (..., dim); at a time, where the Lagrangian needs one."""
-        return self.evaluate_batch(lambda system, mu: system.energy.gradient(mu), mu, t, "(n)")
+        return evaluate_batch(self.drop_torque(), lambda system, mu: system.energy.gradient(mu), mu, t, "(n)")
 
     def momentum_of_velocity(self, xi, t=None):
         return self.momentum(xi, t)
 
     def momentum(self, xi, t=None) -> jax.Array:
         """mu = dl/dxi, shape (..., dim); likewise."""
-        return self.evaluate_batch(lambda system, xi: system.lagrangian.gradient(xi), xi, t, "(n)")
+        return evaluate_batch(self.drop_torque(), lambda system, xi: system.lagrangian.gradient(xi), xi, t, "(n)")
 
 
 class _TimedLegendre(Module):
@@ -150,16 +152,24 @@ def _legendre_hamiltonian(lagrangian: Energy, dim: int) -> Energy:
 
 
 def _require_regular(lagrangian: Energy, dim: int) -> None:
-    if is_traced(lagrangian):
-        return
     points = np.random.default_rng(0).standard_normal((4, dim))
-    if are_all_singular(jax.vmap(jax.hessian(lagrangian.value))(points)):
-        raise InputError(_SINGULAR_MESSAGE)
+    require_regular(_lagrangian_hessian, lagrangian, points, _SINGULAR_MESSAGE)
 
 
-def are_all_singular(matrices) -> bool:
-    """Return whether matrices, shape (points, n, n), are all finite and all singular."""
+def _lagrangian_hessian(lagrangian: Energy, xi) -> jax.Array:
+    return jax.hessian(lagrangian.value)(xi)
+
+
+def require_regular(hessian: Callable, model, points: np.ndarray, message: str) -> None:
+    """Raise InputError if the matrices ``hessian(model, point)`` are all finite and all singular.
+
+    Nothing is tested while JAX traces the model.
+    """
+    if is_traced(model):
+        return
+    matrices = evaluate_at_points(hessian, model, points)
     if not np.isfinite(matrices).all():
-        return False
+        return
     singular = np.linalg.svd(matrices, compute_uv=False)
-    return bool((singular[:, -1] <= 1e-14 * singular[:, 0]).all())
+    if (singular[:, -1] <= 1e-14 * singular[:, 0]).all():
+        raise InputError(message)

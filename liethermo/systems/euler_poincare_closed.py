@@ -10,22 +10,19 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
-from manifolds._arrays import is_traced
 from manifolds._pytree_module import Module
 from manifolds.matrices.linear import solve
-from manifolds.structures.poisson import PoissonBySharp, ProductPoisson
+from manifolds.structures.poisson import PoissonBySharp
 
 from ..errors import InputError
 from ..functions.checks import checked_energy, with_polynomial_degrees
 from ..functions.conditions import require_condition
 from ..functions.energy import Energy, Function, make_energy
 from ..functions.inverse_gradient import inverse_gradient
-from ..tracing.interpret import evaluate_at_points
 from ..tracing.traced import trace_callables
 from .body_states import checked_velocity, is_given_by_velocity
-from .euler_poincare import are_all_singular
-from .evolution import entropy_component
-from .ledger import ForcesAndHeat, LedgerSystem, check_state_function, linear_friction
+from .euler_poincare import require_regular
+from .ledger import LedgerSystem
 from .torque import begins_with_rotations
 
 
@@ -69,10 +66,9 @@ class EulerPoincareClosedSystem(LedgerSystem):
 
     algebra: mf.LieAlgebra
     lagrangian: Callable
-    friction: Callable | None
     momentum_casimirs: dict[str, Energy]
 
-    domain: ClassVar[str] = "a positive temperature"
+    first_velocity_index: ClassVar[int] = 0
 
     def __init__(
         self,
@@ -86,37 +82,21 @@ class EulerPoincareClosedSystem(LedgerSystem):
     ):
         if not isinstance(algebra, mf.LieAlgebra):
             raise InputError(f"the algebra is a manifolds.LieAlgebra, such as mf.so(3), not {type(algebra).__name__}")
-        n, at = algebra.dim, "(xi, S)"
+        n = algebra.dim
         checked_energy(make_energy(lambda x: lagrangian(x[:n], x[n]), "the Lagrangian"), n + 1, "the Lagrangian")
         lagrangian = trace_callables(lagrangian, lambda lagrangian, *a: lagrangian(*a), (n,), ())
         self.algebra, self.lagrangian = algebra, lagrangian
-        if friction is None or callable(friction):
-            self.friction = (
-                None if friction is None else check_state_function(friction, ((n,), ()), (n,), "the friction", at)
-            )
-        else:
-            self.friction = linear_friction(friction, n, "a coefficient of friction")
-        self.external = (
-            None if external is None else check_state_function(external, ((n,), ()), (n,), "the external force", at)
-        )
-        self.heat_power = (
-            None if heat_power is None else check_state_function(heat_power, ((n,), ()), (), "the heat power", at)
-        )
+        forces = self._set_forces(friction, external, heat_power, ((n,), ()), "(xi, S)")
         casimirs = {
             name: with_polynomial_degrees(Function(MomentumFunction(make_energy(C, "a Casimir"), lagrangian)), n + 1)
             for name, C in algebra.leading_casimirs()
         }
         self.momentum_casimirs = {name: C.on(range(n + 1)) if self.has_ledger else C for name, C in casimirs.items()}
         structure = VelocityLiePoisson(algebra, lagrangian)
-        if not is_traced(lagrangian):
-            hessians = evaluate_at_points(_hessian, structure, np.random.default_rng(0).standard_normal((4, n + 1)))
-            if are_all_singular(hessians):
-                raise InputError("the Lagrangian is singular: its Hessian in xi has no inverse")
-        terms = (self.friction, self.external, self.heat_power)
-        forces = None if terms == (None, None, None) else ForcesAndHeat(*terms)
+        message = "the Lagrangian is singular: its Hessian in xi has no inverse"
+        require_regular(_hessian, structure, np.random.default_rng(0).standard_normal((4, n + 1)), message)
         energy = with_polynomial_degrees(ReducedEnergy(lagrangian), n + 1)
-        poisson, total_dim, energy = self._append_ledger(structure, n + 1, energy)
-        self._build(poisson, total_dim, energy, entropy_component(total_dim, n), forces, momentum_maps, validate)
+        self._assemble(structure, n + 1, energy, forces, momentum_maps, validate)
 
     def state(
         self, x=None, batch: bool = False, *, angular_velocity=None, rotor_rates=None, temperature=None
@@ -161,43 +141,12 @@ class EulerPoincareClosedSystem(LedgerSystem):
         energy = Function(lambda y: -self.lagrangian(xi, y[0]))
         return inverse_gradient(energy, jnp.reshape(temperature, 1))
 
-    def split_state(self, x) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return xi, S and t of one state; t = 0 if the state has no ledger."""
-        n = self.algebra.dim
-        return x[:n], x[n], self.state_time(x)
-
-    @property
-    def structure(self) -> VelocityLiePoisson:
-        """Poisson structure of (xi, S)."""
-        return cast(
-            VelocityLiePoisson, self.poisson.first if isinstance(self.poisson, ProductPoisson) else self.poisson
-        )
-
     def momentum(self, xi, S) -> jax.Array:
         """Return the momentum ``l_xi`` at one point, shape (dim,)."""
         return jax.grad(self.lagrangian)(xi, S)
 
-    def friction_force(self, xi, S, t=0.0) -> jax.Array:
-        """Return the friction f at one point, shape (dim,)."""
-        return jnp.zeros_like(xi) if self.friction is None else jnp.asarray(self.friction(xi, S, t))
-
-    def external_force(self, xi, S, t=0.0) -> jax.Array:
-        """Return the external force F at one point, shape (dim,)."""
-        return jnp.zeros_like(xi) if self.external is None else jnp.asarray(self.external(xi, S, t))
-
-    def heating(self, xi, S, t=0.0) -> jax.Array:
-        """Return the heat power P_H at one point."""
-        return jnp.zeros(()) if self.heat_power is None else jnp.asarray(self.heat_power(xi, S, t))
-
-    first_velocity_index: ClassVar[int] = 0
-
     def momentum_jacobians(self, x) -> tuple[jax.Array, jax.Array]:
-        return self.structure.momentum_derivatives(x[: self.dim_without_ledger])[1:]
-
-    def forces_and_power(self, x, v, T) -> tuple[jax.Array, jax.Array, jax.Array]:
-        del T
-        _, S, t = self.split_state(x)
-        return self.friction_force(v, S, t), self.external_force(v, S, t), self.heating(v, S, t)
+        return cast(VelocityLiePoisson, self.structure).momentum_derivatives(x[: self.dim_without_ledger])[1:]
 
     @property
     def has_angular_velocity(self) -> bool:
@@ -206,34 +155,16 @@ class EulerPoincareClosedSystem(LedgerSystem):
     def angular_velocity_at(self, x):
         return x[:3]
 
-    def temperature(self, x) -> jax.Array:
-        """Return the temperature ``T = -l_S`` at states, shape (...)."""
-        S_derivative = jax.grad(self.lagrangian, argnums=1)
-        return jnp.vectorize(lambda y: -S_derivative(*self.split_state(y)[:2]), signature="(n)->()")(
-            self.state(x, batch=True)
-        )
+    def temperature_at(self, y) -> jax.Array:
+        return -jax.grad(self.lagrangian, argnums=1)(y[:-1], y[-1])
 
     def momenta(self, x) -> jax.Array:
         """Return the momenta ``l_xi``, shape (..., dim), at states, shape (..., n)."""
-        return jnp.vectorize(lambda y: self.momentum(*self.split_state(y)[:2]), signature="(n)->(m)")(
-            self.state(x, batch=True)
-        )
+        momentum = jnp.vectorize(lambda y: self.momentum(y[:-1], y[-1]), signature="(n)->(m)")
+        return momentum(self.drop_ledger(x))
 
     def casimirs(self) -> dict[str, Energy]:
         return self.momentum_casimirs
-
-    def outside(self, x) -> str:
-        T = float(evaluate_at_points(_temperature, self, np.atleast_2d(x)).min())
-        return "" if T > 0.0 else f"the temperature -dl/dS is {T:.4g}: it has to be positive"
-
-    def domain_margin(self, x):
-        return self.temperature(x)
-
-    def specific_residuals(self, x) -> dict[str, jax.Array]:
-        xi, S, t = self.split_state(x)
-        force = self.friction_force(xi, S, t)
-        scale = jnp.linalg.norm(force) * jnp.linalg.norm(xi)
-        return {"f . xi <= 0": jnp.maximum(jnp.dot(force, xi), 0.0) / jnp.where(scale > 0.0, scale, 1.0)}
 
 
 class MomentumFunction(Module):
@@ -276,10 +207,6 @@ class VelocityLiePoisson(PoissonBySharp):
         mu, W, _ = self.momentum_derivatives(x)
         xi = solve(W, alpha[:-1, None])[:, 0]
         return jnp.append(solve(W, self.algebra.ad_star(xi, mu)[:, None])[:, 0], 0.0)
-
-
-def _temperature(system: EulerPoincareClosedSystem, x):
-    return system.temperature(x)
 
 
 def _hessian(structure: VelocityLiePoisson, x):

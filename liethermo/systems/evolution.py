@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import manifolds as mf
 from manifolds._pytree_module import Module
 
-from ..dissipation.base import LawName, SkewFriction
+from ..dissipation.base import SkewFriction, nondecreasing_if
 from ..errors import InputError
 from ..functions.arguments import required_argument_count
 from ..functions.checks import checked_energy, with_polynomial_degrees
@@ -20,6 +20,7 @@ from ..functions.energy import Energy, Quadratic, make_energy
 from ..functions.mechanics import is_mechanical
 from .base import System
 from .embedded import EmbeddedSystem
+from .states import evaluate_batch
 
 
 class LiouvilleFriction(SkewFriction):
@@ -29,12 +30,6 @@ class LiouvilleFriction(SkewFriction):
     It is a skew bracket with H, so H is conserved. The entropy cannot fall where ``Delta H >= 0`` [SML Prop. 4.3]; this
     is known of ``H = p . G(q) p / 2 + V(q, S)`` given in terms of that form, and then holds in a discretisation too.
     """
-
-    is_nondecreasing: bool = eqx.field(static=True, default=False)
-
-    @property
-    def entropy_law(self) -> LawName | None:
-        return "nondecreasing" if self.is_nondecreasing else None
 
     def force(self, system, x, dH, dS, dL):
         return system.contact.liouville_sharp(x, dH)
@@ -53,6 +48,28 @@ class ContactManifoldSystem(System):
     """Base class of evolution and contact systems on T*Q x R and on TQ x R."""
 
     poisson: mf.Cosymplectic
+
+    is_isolated: ClassVar[bool] = True
+    """True for the evolution field, which conserves the energy; False for the contact field."""
+
+    def _build_field(self, structure, dim, energy, function: Energy, momentum_maps, validate, space) -> None:
+        """Build the evolution or the contact field of an energy; ``function`` determines it, on a space Q or R^n."""
+        entropy: Energy | None = None
+        friction: LiouvilleFriction = ReebDrift()
+        if self.is_isolated:
+            law = nondecreasing_if(is_mechanical(function, dim, space))
+            entropy, friction = entropy_component(dim), LiouvilleFriction(law=law)
+        self._build(structure, dim, energy, entropy, friction, momentum_maps, validate, state_space(space))
+
+    def specific_residuals(self, x) -> dict[str, jax.Array]:
+        rate = self.vector_field(x)
+        if self.is_isolated:  # the first law: the field lies in the kernel of the contact form [SML Remark 4.2]
+            form = self.contact.form(x)
+            return {"eta(x') = 0": _relative_residual(jnp.dot(form, rate), jnp.abs(form) @ jnp.abs(rate))}
+        dH = self.energy.gradient(x)  # [SML Prop. 2.1]
+        loss = jnp.dot(dH, self.contact.reeb(x)) * self.energy.value(x)
+        size = jnp.abs(dH) @ jnp.abs(rate) + jnp.abs(loss)
+        return {"dH/dt = -R(H) H": _relative_residual(jnp.dot(dH, rate) + loss, size)}
 
     @property
     def contact(self) -> mf.SplitContact:
@@ -74,10 +91,28 @@ class ContactManifoldSystem(System):
 
     def _vector_field(self, x) -> jax.Array:
         """Return the field without projecting the gradients, whose normal components have no effect."""
-        return self.field(x, self.energy.gradient(x), None if self.entropy is None else self.entropy.gradient(x))
+        return self.field(x, self.energy.gradient(x), self.entropy_gradient(x))
 
 
-class EvolutionSystem(ContactManifoldSystem):
+class MomentumContactSystem(ContactManifoldSystem):
+    """Base class of contact systems of an energy, with states (q, p, S)."""
+
+    def __init__(
+        self,
+        energy,
+        dim: int | None = None,
+        momentum_maps=(),
+        validate: bool = True,
+        space: mf.Space | None = None,
+    ):
+        dim = state_dim(dim, space)
+        energy = make_energy(join_arguments(energy, space), "the energy")
+        energy = checked_energy(energy, dim, "the energy", allow_time=True)
+        mechanics = with_polynomial_degrees(energy, dim)
+        self._build_field(canonical_structure(dim, space), dim, energy, mechanics, momentum_maps, validate, space)
+
+
+class EvolutionSystem(MomentumContactSystem):
     """The evolution field of an energy on T*Q x R: an isolated system with friction [SML 7, §4].
 
     ``q' = H_p, p' = -H_q - p H_S, S' = p . H_p``, with the temperature ``T = H_S``. The energy is constant and the path
@@ -119,32 +154,16 @@ class EvolutionSystem(ContactManifoldSystem):
     configurations : manifolds.Space or None
     """
 
-    production_name: ClassVar[str] = "Delta_Q H"
+    __init__ = MomentumContactSystem.__init__  # said here for type checkers, which would make one of the fields
 
-    def __init__(
-        self,
-        energy,
-        dim: int | None = None,
-        momentum_maps=(),
-        validate: bool = True,
-        space: mf.Space | None = None,
-    ):
-        dim = state_dim(dim, space)
-        energy = make_energy(join_arguments(energy, space), "the energy")
-        energy = checked_energy(energy, dim, "the energy", allow_time=True)
-        friction = LiouvilleFriction(is_mechanical(with_polynomial_degrees(energy, dim), dim, space))
-        entropy, states = entropy_component(dim), state_space(space)
-        self._build(canonical_structure(dim, space), dim, energy, entropy, friction, momentum_maps, validate, states)
+    production_name: ClassVar[str] = "Delta_Q H"
 
     def temperature(self, x, t=None) -> jax.Array:
         """``T = H_S`` at a state or a batch of states, shape (...); at a time, where the energy depends on one."""
-        return self.evaluate_batch(lambda system, y: system.energy.gradient(y)[-1], x, t, "()")
-
-    def specific_residuals(self, x) -> dict[str, jax.Array]:
-        return tangency_residual(self, x)
+        return evaluate_batch(self, lambda system, y: system.energy.gradient(y)[-1], x, t, "()")
 
 
-class ContactSystem(ContactManifoldSystem):
+class ContactSystem(MomentumContactSystem):
     """The plain contact field X_H of an energy on T*Q x R, for comparison [SML §2.2].
 
     ``q' = H_p, p' = -H_q - p H_S, S' = p . H_p - H``. It describes no isolated system: ``H' = -H_S H``, and S is the
@@ -156,21 +175,9 @@ class ContactSystem(ContactManifoldSystem):
         As for :class:`EvolutionSystem`.
     """
 
-    def __init__(
-        self,
-        energy,
-        dim: int | None = None,
-        momentum_maps=(),
-        validate: bool = True,
-        space: mf.Space | None = None,
-    ):
-        dim, energy = state_dim(dim, space), join_arguments(energy, space)
-        self._build(
-            canonical_structure(dim, space), dim, energy, None, ReebDrift(), momentum_maps, validate, state_space(space)
-        )
+    __init__ = MomentumContactSystem.__init__
 
-    def specific_residuals(self, x) -> dict[str, jax.Array]:
-        return energy_decay_residual(self, x)
+    is_isolated: ClassVar[bool] = False
 
 
 # -- shared with the Lagrangian side ----------------------------------------------------------------------------------
@@ -249,21 +256,6 @@ def n_degrees_of_freedom(dim: int | None) -> int:
 def entropy_component(dim: int, indices=-1) -> Energy:
     """Return the entropy that is the last component of a state, or the sum of components with given indices."""
     return Quadratic(jnp.zeros(dim), jnp.zeros(dim).at[indices].set(1.0))
-
-
-def tangency_residual(system: ContactManifoldSystem, x) -> dict[str, jax.Array]:
-    """Return the residual of the first law: the field lies in the kernel of the contact form [SML Remark 4.2]."""
-    form, rate = system.contact.form(x), system.vector_field(x)
-    return {"eta(x') = 0": _relative_residual(jnp.dot(form, rate), jnp.abs(form) @ jnp.abs(rate))}
-
-
-def energy_decay_residual(system: ContactManifoldSystem, x) -> dict[str, jax.Array]:
-    """Return the residual of ``H' = -R(H) H`` along a contact field [SML Prop. 2.1]."""
-    dH, rate = system.energy.gradient(x), system.vector_field(x)
-    loss = jnp.dot(dH, system.contact.reeb(x)) * system.energy.value(x)
-    return {
-        "dH/dt = -R(H) H": _relative_residual(jnp.dot(dH, rate) + loss, jnp.abs(dH) @ jnp.abs(rate) + jnp.abs(loss))
-    }
 
 
 def _relative_residual(residual, size):

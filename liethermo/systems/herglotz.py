@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Callable
 from typing import ClassVar, cast
 
@@ -15,30 +14,28 @@ from manifolds._arrays import is_traced
 from manifolds._pytree_module import Module
 from manifolds.matrices.linear import inverse
 
-from ..dissipation.base import Dissipation
 from ..errors import InputError
 from ..functions.checks import checked_energy, with_polynomial_degrees
 from ..functions.energy import Energy, Quadratic, make_energy
 from ..functions.inverse_gradient import inverse_gradient
-from ..functions.mechanics import Kinetic, is_independent_of_momenta, is_mechanical
-from ..tracing.interpret import evaluate_at_points
+from ..functions.mechanics import Kinetic, is_independent_of_momenta
 from ..tracing.programs import jit_cached
-from .euler_poincare import are_all_singular
+from .euler_poincare import require_regular
 from .evolution import (
     ContactManifoldSystem,
     ContactSystem,
     EvolutionSystem,
-    LiouvilleFriction,
-    ReebDrift,
-    energy_decay_residual,
-    entropy_component,
     join_arguments,
     n_degrees_of_freedom,
     state_dim,
-    state_space,
-    tangency_residual,
     tangent_bundle_of,
 )
+
+SINGULAR_LAGRANGIAN_MESSAGE = (
+    "the Lagrangian is singular: its Hessian L_vv has no inverse, so eta_L is no contact form and the momentum "
+    "does not determine the velocity"
+)
+"""Error message for a Lagrangian whose momentum does not determine the velocity."""
 
 
 class VelocityContactSystem(ContactManifoldSystem):
@@ -64,7 +61,7 @@ class VelocityContactSystem(ContactManifoldSystem):
         n = n_degrees_of_freedom(dim)
         self.lagrangian = L = with_polynomial_degrees(checked_energy(L, dim, "the Lagrangian"), dim)
         contact = mf.LagrangianContact(_EnergyValue(L), n, tangent_bundle_of(space))
-        _require_regular(contact)
+        require_regular(_hessian, contact, random_states(contact, 4), SINGULAR_LAGRANGIAN_MESSAGE)
         return mf.Cosymplectic(contact), dim, _lagrangian_energy(L, dim)
 
     def _hamiltonian(self) -> Energy:
@@ -92,19 +89,7 @@ class LagrangianSystem(VelocityContactSystem):
         space: mf.Space | None = None,
     ):
         structure, dim, energy = self._build_contact_structure(join_arguments(lagrangian, space), dim, space)
-        self._build(
-            structure,
-            dim,
-            energy,
-            *self._entropy_and_dissipation(dim, space),
-            momentum_maps,
-            validate,
-            state_space(space),
-        )
-
-    @abstractmethod
-    def _entropy_and_dissipation(self, dim: int, space: mf.Space | None) -> tuple[Energy | None, Dissipation]:
-        """Return the entropy and the dissipation."""
+        self._build_field(structure, dim, energy, self.lagrangian, momentum_maps, validate, space)
 
 
 class ThermodynamicHerglotz(LagrangianSystem):
@@ -138,17 +123,13 @@ class ThermodynamicHerglotz(LagrangianSystem):
     lagrangian : Energy
     """
 
-    production_name: ClassVar[str] = "Delta(L)"
+    __init__ = LagrangianSystem.__init__  # said here for type checkers, which would make one of the fields
 
-    def _entropy_and_dissipation(self, dim, space):
-        return entropy_component(dim), LiouvilleFriction(is_mechanical(self.lagrangian, dim, space))
+    production_name: ClassVar[str] = "Delta(L)"
 
     def hamiltonian_system(self) -> EvolutionSystem:
         """Return the system on T*Q x R with states (q, p, S); positions must be in R^n."""
         return EvolutionSystem(self._hamiltonian(), self.dim, validate=False)
-
-    def specific_residuals(self, x) -> dict[str, jax.Array]:
-        return tangency_residual(self, x)
 
 
 class Herglotz(LagrangianSystem):
@@ -162,15 +143,13 @@ class Herglotz(LagrangianSystem):
         As for :class:`ThermodynamicHerglotz`.
     """
 
-    def _entropy_and_dissipation(self, dim, space):
-        return None, ReebDrift()
+    __init__ = LagrangianSystem.__init__
+
+    is_isolated: ClassVar[bool] = False
 
     def hamiltonian_system(self) -> ContactSystem:
         """Return the system on T*Q x R with states (q, p, S); positions must be in R^n."""
         return ContactSystem(self._hamiltonian(), self.dim, validate=False)
-
-    def specific_residuals(self, x) -> dict[str, jax.Array]:
-        return energy_decay_residual(self, x)
 
 
 # -- the energy E_L ---------------------------------------------------------------------------------------------------
@@ -291,16 +270,6 @@ class _VelocityLagrangian(Energy):
 
     def value(self, x) -> jax.Array:
         return self.lagrangian.value(jnp.concatenate([self.q, x, self.S]))
-
-
-def _require_regular(contact: mf.LagrangianContact) -> None:
-    if is_traced(contact):
-        return
-    if are_all_singular(evaluate_at_points(_hessian, contact, random_states(contact, 4))):
-        raise InputError(
-            "the Lagrangian is singular: its Hessian L_vv has no inverse, so eta_L is no contact form and the momentum "
-            "does not determine the velocity"
-        )
 
 
 def random_states(contact: mf.SplitContact, count: int) -> np.ndarray:

@@ -105,6 +105,10 @@ class SystemInterface(Geometry):
         motion = self.poisson.sharp(x, dH)
         return motion if self.dissipation is None else motion + self.dissipation.force(self, x, dH, dS, dL)
 
+    def entropy_gradient(self, x) -> jax.Array | None:
+        """Return the gradient of the entropy at x, shape (n,); None without an entropy."""
+        return None if self.entropy is None else self.entropy.gradient(x)
+
     @property
     def has_poisson_by_construction(self) -> bool:
         """True if Pi is a Poisson tensor by construction, so that an expensive check can be skipped."""
@@ -221,6 +225,16 @@ class SystemInterface(Geometry):
         return self
 
     # -- laws ---------------------------------------------------------------------------------------------------------
+
+    @property
+    def dissipations(self) -> tuple[Dissipation, ...]:
+        """The summands of the dissipation; () without one."""
+        return () if self.dissipation is None else self.dissipation.terms
+
+    @property
+    def dissipation_keeps_casimirs(self) -> bool:
+        """True if no summand of the dissipation changes a Casimir, by construction."""
+        return all(term.preserves_casimirs for term in self.dissipations)
 
     @property
     def preserved(self) -> tuple[Energy, ...]:

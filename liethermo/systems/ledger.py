@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable
+from typing import ClassVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,20 +24,73 @@ from ..functions.arguments import ConstantFunction, LastArgumentIgnored, require
 from ..functions.checks import traced_function_and_shape
 from ..functions.conditions import checked_numbers, require_condition
 from ..functions.energy import Energy, Quadratic
+from ..tracing.interpret import evaluate_at_points
 from .base import System
+from .evolution import entropy_component
 
 LEDGER_DIM = 3
 """Components of the ledger of a system that is not isolated: work and heat received, and the time."""
 
 
 class LedgerSystem(System):
-    """A system whose state has the work W and the heat Q received so far, and the time t, behind its own components.
+    """A closed system of a Lagrangian, in a state (q, v, S) or (xi, S), with friction, work and heat from outside.
 
-    Its energy is ``E - W - Q``, that of system and surroundings. The state of an isolated system has no ledger.
+    With work or heat from outside the state has the work W and the heat Q received so far, and the time t, behind its
+    own components. Its energy is then ``E - W - Q``, that of system and surroundings.
     """
 
+    friction: Callable | None
     external: Callable | None
     heat_power: Callable | None
+
+    domain: ClassVar[str] = "a positive temperature"
+
+    def _set_forces(
+        self, friction, external, heat_power, parts: tuple[tuple[int, ...], ...], at: str
+    ) -> ForcesAndHeat | None:
+        """Check and set friction, external force and heat power, and return their dissipation, or None without any.
+
+        Parameters
+        ----------
+        parts : tuple of shapes
+            Shapes of the arguments of the functions before the time: q and v, or xi, and S.
+        at : str
+            Name of these arguments, for messages.
+        """
+        shape = parts[0]
+
+        def check(function, result_shape, what):
+            if function is None:
+                return None
+            checked = check_state_function(function, parts, result_shape, what, at)
+            return checked if len(shape) == 1 else FlattenedFunction(checked, shape)
+
+        if friction is None or callable(friction):
+            self.friction = check(friction, shape, "friction")
+        else:
+            self.friction = linear_friction(friction, math.prod(shape), "a coefficient of friction")
+        self.external = check(external, shape, "the external force")
+        self.heat_power = check(heat_power, (), "the heat power")
+        if self.friction is None and not self.has_ledger:
+            return None
+        law: LawName = "conserved" if self.friction is None else "nondecreasing"
+        return ForcesAndHeat(law=law if self.heat_power is None else None)
+
+    def _assemble(self, structure, dim: int, energy: Energy, forces, momentum_maps, validate, space=None) -> None:
+        """Build the system of a Poisson structure, dimension and energy without the ledger, which is appended."""
+        total_dim = dim + (LEDGER_DIM if self.has_ledger else 0)
+        if self.has_ledger:
+            received = Quadratic(jnp.zeros(total_dim), jnp.zeros(total_dim).at[dim : dim + 2].set(-1.0))
+            structure, energy = ProductPoisson(structure, mf.NoPoisson(LEDGER_DIM)), energy.on(range(dim)) + received
+        entropy = entropy_component(total_dim, dim - 1)
+        self._build(structure, total_dim, energy, entropy, forces, momentum_maps, validate, space)
+
+    @property
+    def structure(self) -> mf.PoissonStructure:
+        """The Poisson structure without the ledger."""
+        return self.poisson.first if isinstance(self.poisson, ProductPoisson) else self.poisson
+
+    # -- the state ----------------------------------------------------------------------------------------------------
 
     @property
     def has_ledger(self) -> bool:
@@ -46,42 +102,25 @@ class LedgerSystem(System):
         """Components of the state without the ledger."""
         return self.dim - LEDGER_DIM if self.has_ledger else self.dim
 
-    def _append_ledger(self, poisson, dim: int, energy: Energy) -> tuple[mf.PoissonStructure, int, Energy]:
-        """Return the Poisson structure, dimension and energy of system and ledger, from those of the system."""
-        if not self.has_ledger:
-            return poisson, dim, energy
-        total_dim = dim + LEDGER_DIM
-        received = Quadratic(jnp.zeros(total_dim), jnp.zeros(total_dim).at[dim : dim + 2].set(-1.0))
-        return ProductPoisson(poisson, mf.NoPoisson(LEDGER_DIM)), total_dim, energy.on(range(dim)) + received
+    @property
+    @abstractmethod
+    def first_velocity_index(self) -> int:
+        """Index of the first velocity in the state."""
 
     def state_array(self, x, batch: bool = False):
         if self.has_ledger and np.ndim(x) > 0 and np.shape(x)[-1] == self.dim_without_ledger:
             x = jnp.concatenate([jnp.asarray(x), jnp.zeros((*np.shape(x)[:-1], LEDGER_DIM))], axis=-1)
         return super().state_array(x, batch)
 
-    def state_time(self, x) -> jax.Array:
-        """Return the time that is contained in a state; 0 if the state has no ledger."""
-        return x[-1] if len(x) > self.dim_without_ledger else jnp.zeros(())
+    def split_state(self, x) -> tuple[jax.Array, ...]:
+        """Return (q, v, S, t), or (xi, S, t), of one state; t = 0 if it has no ledger."""
+        first, S = self.first_velocity_index, self.dim_without_ledger - 1
+        positions = (x[:first],) if first else ()
+        return (*positions, x[first:S], x[S], x[-1] if len(x) > S + 1 else jnp.zeros(()))
 
-    # members that ForcesAndHeat needs
-
-    @property
-    @abstractmethod
-    def first_velocity_index(self) -> int:
-        """Index of the first velocity in the state."""
-
-    @abstractmethod
-    def momentum_jacobians(self, x) -> tuple[jax.Array, jax.Array]:
-        """Return the derivatives of the momentum with respect to v and S at a state, shapes (n, n) and (n,)."""
-
-    @abstractmethod
-    def forces_and_power(self, x, v, T) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return friction, external force, shape (n,) each, and heat power at a state x, velocity v, temperature T."""
-
-    def tangential_covector(self, x, covector) -> jax.Array:
-        """Return the part of a covector that acts on admissible velocities at a state x, shape (n,)."""
-        del x
-        return covector
+    def drop_ledger(self, x) -> jax.Array:
+        """Return states without the ledger, shape (..., n)."""
+        return self.state(x, batch=True)[..., : self.dim_without_ledger]
 
     def ledger_rates(self, work, heat) -> jax.Array:
         """Return the rates of the ledger, shape (3,), or an empty array for an isolated system."""
@@ -93,32 +132,92 @@ class LedgerSystem(System):
         rows = jnp.eye(self.dim)
         return {name: Quadratic(jnp.zeros(self.dim), rows[self.dim_without_ledger + i]) for i, name in enumerate(names)}
 
+    # -- the functions, at one point ----------------------------------------------------------------------------------
+
+    def friction_force(self, *arguments) -> jax.Array:
+        """Return the friction at (q, v, S, t), or at (xi, S, t), shape (n,); t is 0 by default."""
+        return self._force(self.friction, arguments)
+
+    def external_force(self, *arguments) -> jax.Array:
+        """Return the external force at the arguments of :meth:`friction_force`, shape (n,)."""
+        return self._force(self.external, arguments)
+
+    def heating(self, *arguments) -> jax.Array:
+        """Return the heat power P_H at the arguments of :meth:`friction_force`."""
+        return jnp.zeros(()) if self.heat_power is None else jnp.asarray(self.heat_power(*self._with_time(arguments)))
+
+    def _force(self, function: Callable | None, arguments: tuple) -> jax.Array:
+        if function is None:
+            return jnp.zeros_like(arguments[0])
+        return self.tangential_part(arguments[0], jnp.asarray(function(*self._with_time(arguments))))
+
+    def _with_time(self, arguments: tuple) -> tuple:
+        """Return the arguments of a force, with t = 0 if it is left out."""
+        names = "(q, v, S, t)" if self.first_velocity_index else "(xi, S, t)"
+        count = names.count(",") + 1
+        if len(arguments) not in (count - 1, count):
+            raise InputError(f"forces and heat are functions of {names}, and {len(arguments)} arguments were given")
+        return arguments if len(arguments) == count else (*arguments, 0.0)
+
+    def friction_at(self, arguments: tuple, T) -> jax.Array:
+        """Return the friction at ``arguments``, those of :meth:`friction_force`, and at a temperature T, shape (n,)."""
+        del T
+        return self.friction_force(*arguments)
+
+    def tangential_part(self, q, v) -> jax.Array:
+        """Return the part of a velocity or a force that is along the manifold of positions; itself without one."""
+        del q
+        return v
+
+    @abstractmethod
+    def momentum_jacobians(self, x) -> tuple[jax.Array, jax.Array]:
+        """Return the derivatives of the momentum with respect to v and S at a state, shapes (n, n) and (n,)."""
+
+    @abstractmethod
+    def temperature_at(self, y) -> jax.Array:
+        """Return the temperature at y, a state without ledger, shape ()."""
+
+    def temperature(self, x) -> jax.Array:
+        """Return the temperature, ``-dL/dS``, at states, shape (...)."""
+        return jnp.vectorize(self.temperature_at, signature="(n)->()")(self.drop_ledger(x))
+
+    # -- checks -------------------------------------------------------------------------------------------------------
+
+    def outside(self, x) -> str:
+        T = float(evaluate_at_points(_temperature, self, np.atleast_2d(x)).min())
+        return "" if T > 0.0 else f"the temperature -dL/dS is {T:.4g}: it has to be positive"
+
+    def domain_margin(self, x):
+        return self.temperature(x)
+
+    def specific_residuals(self, x) -> dict[str, jax.Array]:
+        arguments = self.split_state(x)
+        v, force = arguments[-3], self.friction_force(*arguments)
+        scale = jnp.linalg.norm(force) * jnp.linalg.norm(v)
+        return {"F_fr . v <= 0": jnp.maximum(jnp.dot(force, v), 0.0) / jnp.where(scale > 0.0, scale, 1.0)}
+
+
+def _temperature(system: LedgerSystem, x):
+    return system.temperature(x)
+
 
 class ForcesAndHeat(SkewFriction):
     """Friction and the heat that it makes, an external force and a heat power, on states (…, v, S) [GBY 2.4].
 
     ``d/dt l_v = … + F_fr + F_ext`` and ``T S' = P_H - F_fr . v``. With the ledger W' = F_ext . v, Q' = P_H the energy
-    ``v . l_v - l - W - Q`` of system and surroundings is constant, for discrete gradients too. The system
-    provides ``first_velocity_index``, ``momentum_jacobians`` and ``forces_and_power``.
+    ``v . l_v - l - W - Q`` of system and surroundings is constant, for discrete gradients too: v and T are those that
+    belong to the gradient.
     """
-
-    friction: Callable | None
-    external: Callable | None
-    heat_power: Callable | None
-
-    @property
-    def entropy_law(self) -> LawName | None:
-        if self.heat_power is not None:
-            return None
-        return "conserved" if self.friction is None else "nondecreasing"
 
     def force(self, system, x, dH, dS, dL):
         first, S = system.first_velocity_index, system.dim_without_ledger - 1
         W, S_derivative = system.momentum_jacobians(x)
-        # velocity and temperature that belong to the gradient
-        v = solve(W, system.tangential_covector(x, dH[first:S])[:, None])[:, 0]
+        v = solve(W, system.tangential_part(x[:first], dH[first:S])[:, None])[:, 0]
         T = dH[S] - jnp.dot(S_derivative, v)
-        friction, external, power = system.forces_and_power(x, v, T)
+        *positions, _, entropy, t = system.split_state(x)
+        arguments = (*positions, v, entropy, t)
+        friction, external = system.friction_at(arguments, T), system.external_force(*arguments)
+        power = system.heating(*arguments)
         S_dot = (power - jnp.dot(friction, v)) / jnp.where(T > 0.0, T, jnp.nan)
         v_dot = solve(W, (friction + external - S_derivative * S_dot)[:, None])[:, 0]
         return jnp.concatenate([jnp.zeros(first), v_dot, S_dot[None], system.ledger_rates(jnp.dot(external, v), power)])
@@ -153,6 +252,17 @@ def linear_friction(coefficient, n: int, what: str) -> LinearFriction:
         return LinearFriction(checked_semidefinite(R, what, symmetric=False))
     require_condition(R.min(), lambda r: r >= 0.0, f"{what} must be >= 0, not {{value:g}}: it would inject energy")
     return LinearFriction(R)
+
+
+class FlattenedFunction(Module):
+    """A function of flat q and v with flat values, from a function of arrays q and v."""
+
+    function: Callable
+    shape: tuple[int, ...] = eqx.field(static=True)
+
+    def __call__(self, q, v, S, t):
+        found = jnp.asarray(self.function(q.reshape(self.shape), v.reshape(self.shape), S, t))
+        return found.ravel() if found.ndim else found
 
 
 # -- functions of a state and the time --------------------------------------------------------------------------------

@@ -229,7 +229,7 @@ def _regular_kernel(system: System, x: np.ndarray, scale: float) -> np.ndarray |
 
     None if all Casimirs are known, if x lies on a leaf of lower dimension, or if the dissipation leaves the leaf.
     """
-    by_form = system.dissipation is None or system.dissipation.preserves_casimirs
+    by_form = system.dissipation_keeps_casimirs
     if not by_form or system.torque_name or system.space is not None or system.baths is not None:
         return None
     if system.has_all_casimirs or system.dim > MAX_TENSOR_DIM:

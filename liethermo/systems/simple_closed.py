@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
 from typing import ClassVar, cast
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 import manifolds as mf
-from manifolds._pytree_module import Module
-from manifolds.structures.poisson import ProductPoisson
 
 from ..errors import InputError
 from ..functions.arguments import required_argument_count
 from ..functions.energy import Energy
-from ..tracing.interpret import evaluate_at_points
-from .evolution import configuration_space, entropy_component, join_arguments, state_space
+from .evolution import join_arguments, state_space
 from .herglotz import VelocityContactSystem
-from .ledger import ForcesAndHeat, LedgerSystem, check_state_function, linear_friction
+from .ledger import LEDGER_DIM, LedgerSystem
 
 
 class SimpleClosedSystem(LedgerSystem, VelocityContactSystem):
@@ -77,11 +70,6 @@ class SimpleClosedSystem(LedgerSystem, VelocityContactSystem):
         Q, where it is not R^n.
     """
 
-    friction: Callable | None
-    external: Callable | None
-    heat_power: Callable | None
-
-    domain: ClassVar[str] = "a positive temperature"
     production_name: ClassVar[str] = "dS/dt"
 
     def __init__(
@@ -98,57 +86,42 @@ class SimpleClosedSystem(LedgerSystem, VelocityContactSystem):
         lagrangian = join_lagrangian_arguments(lagrangian, space)
         structure, dim, energy = self._build_contact_structure(lagrangian, dim, space)
         shape = (dim // 2,) if space is None else space.shape
-        self.friction = _make_friction(friction, shape, "friction")
-        self.external = None if external is None else _check_flat_function(external, shape, shape, "the external force")
-        self.heat_power = None if heat_power is None else _check_flat_function(heat_power, shape, (), "the heat power")
-        terms = (self.friction, self.external, self.heat_power)
-        forces = None if terms == (None, None, None) else ForcesAndHeat(*terms)
-        self._assemble(structure, dim, energy, forces, momentum_maps, validate)
+        at = f"(q, v, S), q and v of shape {shape}"
+        forces = self._set_forces(friction, external, heat_power, (shape, shape, ()), at)
+        self._assemble(structure, dim, energy, forces, momentum_maps, validate, self._state_space(space))
 
-    def _assemble(
-        self, structure, dim: int, energy: Energy, forces: ForcesAndHeat | None, momentum_maps, validate
-    ) -> None:
-        poisson, total_dim, energy = self._append_ledger(structure, dim, energy)
-        entropy = entropy_component(total_dim, dim - 1)
-        space = state_space(configuration_space(structure.contact), total_dim - dim)
-        self._build(poisson, total_dim, energy, entropy, forces, momentum_maps, validate, space)
+    def _state_space(self, space: mf.Space | None) -> mf.Space | None:
+        return state_space(space, LEDGER_DIM if self.has_ledger else 0)
 
     # -- the state --------------------------------------------------------------------------------------------------
 
     @property
     def contact(self) -> mf.LagrangianContact:
-        structure = self.poisson.first if isinstance(self.poisson, ProductPoisson) else self.poisson
-        return cast(mf.LagrangianContact, cast(mf.Cosymplectic, structure).contact)
+        return cast(mf.LagrangianContact, cast(mf.Cosymplectic, self.structure).contact)
 
     @property
     def degrees_of_freedom(self) -> int:
         return self.dim_without_ledger // 2
 
-    def tangential_part(self, q, v) -> jax.Array:
-        """The part of a velocity or a force at q that is along Q, shape (n,); itself on R^n."""
-        return self.contact.tangential_part(q, v)
+    @property
+    def first_velocity_index(self) -> int:
+        return self.degrees_of_freedom
 
-    def split_state(self, x) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-        """q, v, S and t of one state; t = 0 where it has none."""
-        n = self.degrees_of_freedom
-        return x[:n], x[n : 2 * n], x[2 * n], self.state_time(x)
+    def tangential_part(self, q, v) -> jax.Array:
+        return self.contact.tangential_part(q, v)
 
     def legendre(self, x) -> jax.Array:
         """``FL(q, v, S) = (q, L_v, S)`` at a state or a batch of states, shape (..., 2n + 1)."""
-        return jnp.vectorize(self.contact.legendre, signature="(n)->(n)")(self._drop_ledger(x))
+        return jnp.vectorize(self.contact.legendre, signature="(n)->(n)")(self.drop_ledger(x))
 
-    def temperature(self, x) -> jax.Array:
-        """``T = -L_S``, shape (...)."""
-        return jnp.vectorize(lambda y: -self.lagrangian.gradient(y)[-1], signature="(n)->()")(self._drop_ledger(x))
+    def temperature_at(self, y) -> jax.Array:
+        return -self.lagrangian.gradient(y)[-1]
 
     def mechanical_energy(self, x) -> jax.Array:
         """``E = v·L_v - L``, without the ledger, shape (...)."""
-        return jnp.vectorize(self.contact.energy, signature="(n)->()")(self._drop_ledger(x))
+        return jnp.vectorize(self.contact.energy, signature="(n)->()")(self.drop_ledger(x))
 
     own_energy = mechanical_energy  # its name in 0.2
-
-    def _drop_ledger(self, x) -> jax.Array:
-        return self.state(x, batch=True)[..., : self.dim_without_ledger]
 
     # -- the functions, at one point ----------------------------------------------------------------------------------
 
@@ -160,67 +133,9 @@ class SimpleClosedSystem(LedgerSystem, VelocityContactSystem):
         """``L_v``, shape (n,)."""
         return jax.grad(self.lagrangian_value, argnums=1)(q, v, S)
 
-    def friction_force(self, q, v, S, t) -> jax.Array:
-        """F_fr, shape (n,)."""
-        return (
-            jnp.zeros_like(v)
-            if self.friction is None
-            else self.tangential_part(q, jnp.asarray(self.friction(q, v, S, t)))
-        )
-
-    def friction_at(self, q, v, S, t, T) -> jax.Array:
-        """F_fr where a discretisation has the temperature T, shape (n,)."""
-        return self.friction_force(q, v, S, t)
-
-    def external_force(self, q, v, S, t) -> jax.Array:
-        """F_ext, shape (n,)."""
-        return (
-            jnp.zeros_like(v)
-            if self.external is None
-            else self.tangential_part(q, jnp.asarray(self.external(q, v, S, t)))
-        )
-
-    def heating(self, q, v, S, t) -> jax.Array:
-        """P_H."""
-        return jnp.zeros(()) if self.heat_power is None else jnp.asarray(self.heat_power(q, v, S, t))
-
-    # -- what ForcesAndHeat asks for ----------------------------------------------------------------------------------
-
-    @property
-    def first_velocity_index(self) -> int:
-        return self.degrees_of_freedom
-
-    def tangential_covector(self, x, covector) -> jax.Array:
-        return self.tangential_part(x[: self.degrees_of_freedom], covector)
-
     def momentum_jacobians(self, x) -> tuple[jax.Array, jax.Array]:
         _, W, S_derivative = self.contact.rates(x[: self.dim_without_ledger])
         return W, S_derivative[:, 0]
-
-    def forces_and_power(self, x, v, T) -> tuple[jax.Array, jax.Array, jax.Array]:
-        q, _, S, t = self.split_state(x)
-        arguments = q, v, S, t
-        return self.friction_at(*arguments, T), self.external_force(*arguments), self.heating(*arguments)
-
-    # -- checks -----------------------------------------------------------------------------------------------------
-
-    def outside(self, x) -> str:
-        T = float(evaluate_at_points(_temperature, self, np.atleast_2d(x)).min())
-        return "" if T > 0.0 else f"the temperature -dL/dS is {T:.4g}: it has to be positive"
-
-    def domain_margin(self, x):
-        return self.temperature(x)
-
-    def specific_residuals(self, x) -> dict[str, jax.Array]:
-        q, v, S, t = self.split_state(x)
-        force = self.friction_force(q, v, S, t)
-        scale = jnp.linalg.norm(force) * jnp.linalg.norm(v)
-        positive_power = jnp.maximum(jnp.dot(force, v), 0.0)
-        return {"F_fr . v <= 0": positive_power / jnp.where(scale > 0.0, scale, 1.0)}
-
-
-def _temperature(system: SimpleClosedSystem, x):
-    return system.temperature(x)
 
 
 # -- arguments --------------------------------------------------------------------------------------------------------
@@ -233,26 +148,3 @@ def join_lagrangian_arguments(lagrangian, space: mf.Space | None = None):
             "the Lagrangian of a simple closed system is one of (q, v, S); what depends on time is external"
         )
     return join_arguments(lagrangian, space)
-
-
-def _make_friction(friction, shape: tuple[int, ...], what: str) -> Callable | None:
-    if friction is None or callable(friction):
-        return None if friction is None else _check_flat_function(friction, shape, shape, what)
-    return linear_friction(friction, math.prod(shape), f"a coefficient of {what}")
-
-
-class FlattenedFunction(Module):
-    """A function of flat q and v with flat values, from a function of arrays q and v."""
-
-    function: Callable
-    shape: tuple[int, ...] = eqx.field(static=True)
-
-    def __call__(self, q, v, S, t):
-        found = jnp.asarray(self.function(q.reshape(self.shape), v.reshape(self.shape), S, t))
-        return found.ravel() if found.ndim else found
-
-
-def _check_flat_function(function, at: tuple[int, ...], shape: tuple[int, ...], what: str) -> Callable:
-    """Check a function of (q, v, S, t), q and v of shape ``at``, and return it for flat q and v, with flat values."""
-    checked = check_state_function(function, (at, at, ()), shape, what, f"(q, v, S), q and v of shape {at}")
-    return checked if len(at) == 1 else FlattenedFunction(checked, at)

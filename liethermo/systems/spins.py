@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -25,7 +26,7 @@ from ..functions.magnetism.spin_torques import check_spin_torque
 from ..functions.on_spaces import flatten_site_functions
 from ..functions.planes import energy_in_component_order, interaction_range, to_component_order, to_site_order
 from ..functions.spheres import HalfSumOfSquares, Spheres
-from .base import ReorderedSystem
+from .base import System
 from .baths import HeatBaths, poisson_with_baths
 from .torque import TorqueSystem
 
@@ -114,10 +115,6 @@ class SpinSystem(TorqueSystem):
         total = sum((term(t, s) for term in self.torque), jnp.zeros(3))
         return cross(s, jnp.broadcast_to(total, s.shape)).reshape(-1)
 
-    @property
-    def is_torque_free(self) -> bool:
-        return self.torque is None and super().is_torque_free
-
     def scale_at_sites(self, values, v) -> jax.Array:
         """Return a vector v multiplied by ``values``, one for each site or one for all."""
         spins = self._spin_structure
@@ -168,30 +165,50 @@ class SpinSystem(TorqueSystem):
         assert self._spin_structure is not None
         return Spheres(math.prod(self.lattice), SPIN_LENGTHS_NAME, self._spin_structure.is_component_major)
 
-    def reorder_components(self) -> ReorderedSystem | None:
-        """Return the system with its spins component by component; None for dissipations that may use the order."""
-        spins = self._spin_structure
-        is_reorderable = type(self) is SpinSystem and (
-            self.dissipation is None or _split_damping(self.dissipation)[0] is not None
-        )
-        if not is_reorderable or spins is None or spins.is_component_major or self.is_driven:
-            return None
-        count = spins.count
-        planar = mf.Spins(spins.sites, 0, spins.ratio, interaction_range(self.energy, spins.sites))
-        poisson = planar if self.baths is None else poisson_with_baths(planar, self.baths.number)
-        maps = (
-            functools.partial(f, count=count) for f in (to_component_order, to_site_order, energy_in_component_order)
-        )
-        reorder, restore, pullback = maps
-        functions = [pullback(f) for f in (self.energy, *self.momentum_maps.values())]
-        system = eqx.tree_at(lambda s: [s.poisson, s.energy, *s.momentum_maps.values()], self, [poisson, *functions])
-        return ReorderedSystem(system, reorder, restore, pullback)
-
     @property
     def _spin_structure(self) -> mf.Spins | None:
         """Poisson structure of the spins; None if the system runs in other coordinates."""
         poisson = self.poisson.first if isinstance(self.poisson, ProductPoisson) else self.poisson
         return poisson if isinstance(poisson, mf.Spins) else None
+
+
+class ReorderedSystem(NamedTuple):
+    """A system with the components of its states in another order.
+
+    Attributes
+    ----------
+    system : System
+    reorder_state, restore_state : functions of states, shape (..., n)
+        Reorder the components, and restore their order.
+    pullback : function from an Energy to an Energy
+        Turns a function of states into a function of reordered states.
+    """
+
+    system: System
+    reorder_state: Callable
+    restore_state: Callable
+    pullback: Callable
+
+
+def reorder_spins(system: System) -> ReorderedSystem | None:
+    """Return a system of spins with these component by component, the order that is fastest for large states.
+
+    None for other systems, and for dissipations that may use the order.
+    """
+    if type(system) is not SpinSystem:
+        return None
+    spins = system._spin_structure
+    is_reorderable = system.dissipation is None or _split_damping(system.dissipation)[0] is not None
+    if not is_reorderable or spins is None or spins.is_component_major or system.is_driven:
+        return None
+    count = spins.count
+    planar = mf.Spins(spins.sites, 0, spins.ratio, interaction_range(system.energy, spins.sites))
+    poisson = planar if system.baths is None else poisson_with_baths(planar, system.baths.number)
+    maps = (functools.partial(f, count=count) for f in (to_component_order, to_site_order, energy_in_component_order))
+    reorder, restore, pullback = maps
+    functions = [pullback(f) for f in (system.energy, *system.momentum_maps.values())]
+    reordered = eqx.tree_at(lambda s: [s.poisson, s.energy, *s.momentum_maps.values()], system, [poisson, *functions])
+    return ReorderedSystem(reordered, reorder, restore, pullback)
 
 
 def _split_damping(dissipation: Dissipation | None) -> tuple[LandauLifshitz | None, Heating | None]:

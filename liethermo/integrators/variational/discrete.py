@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import equinox as eqx
@@ -301,11 +301,13 @@ class DiscreteSystem(Module):
             pair = Pair(q1, y[:-1], S1, y[-1])
             return jnp.append(self.motion_residual(p1, pair), self.constraint_residual(pair))
 
-        def newton(_, y):
-            return y - solve(jax.jacfwd(residual)(y), residual(y)[:, None])[:, 0]
-
-        y = jax.lax.fori_loop(0, steps, newton, start)
+        y = jax.lax.fori_loop(0, steps, lambda _, y: newton_correction(residual, y), start)
         return q1, q1 + self.h * y[:-1], S1, S1 + self.h * y[-1]
+
+
+def newton_correction(residual: Callable, y) -> jax.Array:
+    """Return y after one step of Newton's method for ``residual(y) = 0``, shape (n,) each."""
+    return y - solve(jax.jacfwd(residual)(y), residual(y)[:, None])[:, 0]
 
 
 def _sum_arrays(arrays: list[jax.Array]) -> jax.Array:

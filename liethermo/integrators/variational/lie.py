@@ -27,6 +27,7 @@ from ..base import (
     kind_or_class_name,
     register,
 )
+from .discrete import newton_correction
 
 NEWTON_STEPS = 20
 """Newton steps for the velocities between the states of a finished run."""
@@ -115,8 +116,7 @@ class LieVariational(OneStepMethod):
         def residual(y):
             return jnp.append(mu0 - step.momenta(y)[0], step.constraint_residual(y))
 
-        y = jnp.append(k[1, :n], k[0, n])
-        y = y - solve(jax.jacfwd(residual)(y), residual(y)[:, None])[:, 0]
+        y = newton_correction(residual, jnp.append(k[1, :n], k[0, n]))
         S1, mu1 = S0 + h * y[n], step.momenta(y)[1]
         guess = xi0 + h * k[0, :n]
         W = jax.jacfwd(system.momentum)(guess, S1)
@@ -207,11 +207,10 @@ def _group_increments(method: LieVariational, system: EulerPoincareClosedSystem,
         (xi0, S0, t), (xi1, S1, _) = system.split_state(x0), system.split_state(x1)
         step, s, mu0 = _LieStep(system, method.tau, S0, h, t), (S1 - S0) / h, system.momentum(xi0, S0)
 
-        def newton(_, xi):
-            residual = lambda xi: mu0 - step.momenta(jnp.append(xi, s))[0]  # noqa: E731
-            return xi - solve(jax.jacfwd(residual)(xi), residual(xi)[:, None])[:, 0]
+        def residual(xi):
+            return mu0 - step.momenta(jnp.append(xi, s))[0]
 
-        xi = jax.lax.fori_loop(0, NEWTON_STEPS, newton, 0.5 * (xi0 + xi1))
+        xi = jax.lax.fori_loop(0, NEWTON_STEPS, lambda _, xi: newton_correction(residual, xi), 0.5 * (xi0 + xi1))
         return tau(system.algebra, h * xi)
 
     return jax.vmap(group_increment)(x[:-1], x[1:])

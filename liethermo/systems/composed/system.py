@@ -16,7 +16,7 @@ from manifolds._arrays import is_traced
 from manifolds._pytree_module import Module
 from manifolds.structures.extended import StateIndices
 
-from ...dissipation.base import Dissipation
+from ...dissipation.base import Dissipation, nondecreasing_if
 from ...dissipation.bodies import ContactFriction, Drag, HeatConduction, LinearFriction
 from ...dissipation.matter import MatterExchange, Process, conserved_number_combinations
 from ...errors import InputError
@@ -28,6 +28,7 @@ from ...functions.indices import pattern_of_matrix, sparsity_pattern, union_patt
 from ...functions.mechanics import is_independent_of, is_mechanical
 from ..base import System, name_momentum_maps
 from ..evolution import entropy_component
+from ..states import evaluate_batch
 from .bodies import Copies, Subsystem, name_subsystems
 from .matter import Membrane, Reaction
 
@@ -158,7 +159,9 @@ class ComposedSystem(System):
 
     def temperatures(self, x, t=None) -> jax.Array:
         """Return the temperatures ``T_a = H_{S_a}``, shape (..., N), at x and at t if the energy depends on it."""
-        return self.evaluate_batch(lambda system, y: system.energy.gradient(y), x, t, "(n)")[..., self._state_indices.S]
+        return evaluate_batch(self, lambda system, y: system.energy.gradient(y), x, t, "(n)")[
+            ..., self._state_indices.S
+        ]
 
     def numbers_of_particles(self, x) -> jax.Array:
         """Return the particle numbers of all bodies, shape (..., K)."""
@@ -166,9 +169,7 @@ class ComposedSystem(System):
 
     def chemical_potentials(self, x, t=None) -> jax.Array:
         """Return the chemical potentials ``mu = H_N``, shape (..., K), at x and at t if the energy depends on it."""
-        return self.evaluate_batch(lambda system, y: system.energy.gradient(y), x, t, "(n)")[
-            ..., self.poisson.particle_indices.N
-        ]
+        return evaluate_batch(self, _energy_gradient, x, t, "(n)")[..., self.poisson.particle_indices.N]
 
     def fourier_factors(self, x, t=None) -> jax.Array:
         """Return the skew matrix ``K_ab = k_ab (1/T_a - 1/T_b)``, shape (..., N, N), with ``S_a' = sum_b K_ab T_b``.
@@ -177,7 +178,7 @@ class ComposedSystem(System):
         """
         beta = 1.0 / self.temperatures(x, t)
         factors = jnp.zeros((*beta.shape, beta.shape[-1]))
-        for term in () if self.dissipation is None else self.dissipation.terms:
+        for term in self.dissipations:
             if isinstance(term, HeatConduction):
                 i, j = np.array(term.first_bodies, dtype=int), np.array(term.second_bodies, dtype=int)
                 k = jnp.vectorize(term.conductances, signature="(n),(e),(e)->(e)")(
@@ -251,7 +252,9 @@ class ComposedSystem(System):
             if isinstance(body.friction, str)
         )
         if bodies:
-            terms.append(ContactFriction(bodies, self._is_entropy_producing(energy, structure, bodies)))
+            terms.append(
+                ContactFriction(bodies, law=nondecreasing_if(self._is_entropy_producing(energy, structure, bodies)))
+            )
         rates = [_diagonal_friction(body) for body in self.subsystems]
         if any(R is not None for R in rates):  # one dissipation for all diagonal frictions
             zeros = [jnp.zeros(body.count * body.degrees_of_freedom) for body in self.subsystems]
@@ -285,6 +288,10 @@ class ComposedSystem(System):
             for body in self.subsystems
             if isinstance(body.friction, str)
         ) and all(is_independent_of(term, points, momenta) for term in energy.terms[n_body_terms:])
+
+
+def _energy_gradient(system: System, x) -> jax.Array:
+    return system.energy.gradient(x)
 
 
 MAX_NAMED_BODIES = 3

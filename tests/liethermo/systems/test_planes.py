@@ -16,6 +16,7 @@ from liethermo.functions.gradients import DISCRETE_GRADIENTS, stage_gradients
 from liethermo.functions.planes import to_component_order, to_site_order
 from liethermo.integrators.base import pullback_method
 from liethermo.integrators.tableaus import gauss_tableau, kronrod_rule
+from liethermo.systems.spins import reorder_spins
 from tests.cases import BuiltOnUse
 
 from .test_spins import ENERGIES, SITES, unit
@@ -100,7 +101,7 @@ def evaluate_functions(system, x, d, compensation, k):
 @pytest.mark.sampled(3)
 def test_functions_are_the_same(name):
     system = SYSTEMS[name]
-    found, x = system.reorder_components(), state(system)
+    found, x = reorder_spins(system), state(system)
     d, compensation, k = (scale * jnp.asarray(RANDOM.standard_normal(shape)) for scale, shape in shapes(x.size))
     one = evaluate_functions(system, x, d, compensation, k)
     other = evaluate_functions(found.system, *map(found.reorder_state, (x, d, compensation, k)))
@@ -120,7 +121,7 @@ def shapes(n):
 def test_steps_are_the_same(name, method):
     system, h = SYSTEMS[name], jnp.asarray(0.02)
     method = method.on(system)
-    found = system.reorder_components()
+    found = reorder_spins(system)
     one = initial_run_state_program(system, method, state(system))
     other = initial_run_state_program(found.system, pullback_method(method, found), found.reorder_state(state(system)))
     step = jax.jit(take_step)
@@ -151,7 +152,7 @@ def test_a_run_of_a_large_system_is_in_that_order_and_no_user_sees_it(method, mo
     found = lt.integrate(*run)
     assert found.audit().passed
     np.testing.assert_allclose(np.linalg.norm(system.spins(found.x), axis=-1), 1.0, atol=1e-14)
-    monkeypatch.setattr(lt.SpinSystem, "reorder_components", lambda self: None)
+    monkeypatch.setattr("liethermo.engines.step.reorder_spins", lambda system: None)
     jax.clear_caches()
     np.testing.assert_allclose(found.x, lt.integrate(*run).x, rtol=1e-11, atol=1e-13)
     jax.clear_caches()
@@ -175,7 +176,7 @@ def test_adaptive_steps_are_the_same(monkeypatch):
         return lt.integrate(system, system.state(unit(N_LARGE)), (0.0, 0.2), lt.Adaptive(1e-6), METHODS[-1]).x[-1]
 
     found = path()
-    monkeypatch.setattr(lt.SpinSystem, "reorder_components", lambda self: None)
+    monkeypatch.setattr("liethermo.engines.step.reorder_spins", lambda system: None)
     jax.clear_caches()
     np.testing.assert_allclose(found, path(), rtol=1e-10, atol=1e-12)
     jax.clear_caches()
@@ -189,7 +190,7 @@ def test_noise_is_that_of_sites_whatever_the_order(monkeypatch):
         return lt.integrate(system, system.state(unit(N_LARGE)), (0.0, 0.2), 0.05, noise=noise).x[-1]
 
     found = path()
-    monkeypatch.setattr(lt.SpinSystem, "reorder_components", lambda self: None)
+    monkeypatch.setattr("liethermo.engines.step.reorder_spins", lambda system: None)
     jax.clear_caches()
     np.testing.assert_allclose(found, path(), rtol=1e-11, atol=1e-13)
     jax.clear_caches()
@@ -220,13 +221,13 @@ def test_derivatives_go_through():
 
 def test_what_has_no_other_order():
     assert mf.Spins(3).is_component_major is False
-    assert ring(baths=False).reorder_components() is not None
+    assert reorder_spins(ring(baths=False)) is not None
     other = lt.SpinSystem(3, lt.magnetism.zeeman(3, (0.0, 0.0, 1.0)), lt.DoubleBracket())
-    assert other.reorder_components() is None  # what that does with components is not known
-    assert ring().reorder_components().system.reorder_components() is None
+    assert reorder_spins(other) is None  # what that does with components is not known
+    assert reorder_spins(reorder_spins(ring()).system) is None
     driven = lt.SpinSystem(3, lambda s, t: t * jnp.sum(s))
-    assert driven.reorder_components() is None
-    assert lt.models.rigid_body().reorder_components() is None
+    assert reorder_spins(driven) is None
+    assert reorder_spins(lt.models.rigid_body()) is None
 
     class DoubledFriction(lt.LandauLifshitz):
         def force(self, system, x, dH, dS, dL):
@@ -234,7 +235,7 @@ def test_what_has_no_other_order():
 
     mine = lt.SpinSystem(3, lt.magnetism.zeeman(3, (0.0, 0.0, 1.0)), DoubledFriction(0.1))
     assert type(mine.dissipation) is DoubledFriction  # which may say something else of components
-    assert mine.reorder_components() is None
+    assert reorder_spins(mine) is None
     once = lt.SpinSystem(3, lt.magnetism.zeeman(3, (0.0, 0.0, 1.0)), lt.LandauLifshitz(0.1))
     x, motion = state(mine), mine.poisson.sharp(state(mine), mine.energy.gradient(state(mine)))
     np.testing.assert_allclose(mine.vector_field(x) - motion, 2.0 * (once.vector_field(x) - motion), atol=1e-15)
@@ -249,7 +250,7 @@ def test_the_two_orders():
 def test_control_a_wrong_order_is_seen():
     """Steps from a state in the other order, taken for one that is not."""
     system = ring()
-    found = system.reorder_components()
+    found = reorder_spins(system)
     first = initial_run_state_program(system, lt.MetriplecticMidpoint(), jnp.asarray(system.state(unit(N_LARGE))))
     right = array_engine.advance(system, lt.MetriplecticMidpoint(), first, *map(jnp.asarray, (0.05, 1, 1)), 1)[0]
     wrong = first._replace(x=found.reorder_state(first.x))

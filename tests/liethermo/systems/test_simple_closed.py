@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import liethermo as lt
+import manifolds as mf
 from liethermo.tracing.interpret import evaluate_at_points
 from tests.cases import tolerance
 from tests.liethermo.closed_systems import ISOLATED_SYSTEMS, MECHANICAL, OPEN, X0, friction, swirl
@@ -179,3 +180,17 @@ def test_initial_states_may_leave_out_the_ledger():
     assert np.array_equal(system.state(X0), [*X0, 0.0, 0.0, 0.0])
     with pytest.raises(lt.InputError, match="shape"):
         system.state([*X0, 0.0])
+
+
+def test_forces_at_one_point():
+    """The time may be left out of the arguments of a force, and nothing else."""
+    ones, q, kinetic = jnp.ones(3), jnp.ones(2), lambda xi, S: 0.5 * xi @ xi - S
+    algebra = lt.EulerPoincareClosedSystem(mf.so(3), kinetic, friction=0.2, validate=False)
+    plane = lt.SimpleClosedSystem(MECHANICAL, 5, 0.2, heat_power=lambda q, v, S, t: 1.0 + t, validate=False)
+    np.testing.assert_array_equal(algebra.friction_force(ones, 0.1), -0.2 * ones)
+    np.testing.assert_array_equal(plane.friction_force(q, q, 0.1), -0.2 * q)
+    assert (float(plane.heating(q, q, 0.1)), float(plane.heating(q, q, 0.1, 2.0))) == (1.0, 3.0)
+    with pytest.raises(lt.InputError, match=r"functions of \(xi, S, t\), and 1 arguments"):
+        algebra.friction_force(ones)
+    with pytest.raises(lt.InputError, match=r"functions of \(q, v, S, t\), and 2 arguments"):
+        plane.friction_force(q, q)

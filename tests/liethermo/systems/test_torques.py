@@ -555,4 +555,6 @@ def test_euler_poincare_system_with_a_torque(amplitude):
     assert np.abs(run.x[-1] - exact[:3]).max() < 1e-8
     assert np.abs(run.attitude[-1].ravel() - exact[3:]).max() < 1e-8
     assert run.audit().passed
+    if not amplitude:  # the velocity needs no time, which the torque does
+        np.testing.assert_allclose(system.velocity(START), START / moments, rtol=1e-15)
     assert abs(np.linalg.norm(run.x[-1]) - np.linalg.norm(START)) > 0.01  # the torque changes |mu|, a Casimir

@@ -1,0 +1,97 @@
+"""``LiftedSystem``: a system on longer states that begin with those of another one, whose laws it has."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+
+import jax
+import jax.numpy as jnp
+
+from manifolds._pytree_module import forward_to
+
+from ..dissipation.base import LiftedDissipation, LiftedGeometry
+from ..functions.energy import Energy
+from .base import System
+
+
+class LiftedSystem(System):
+    """A system whose states begin with those of the system :attr:`inner`; energy, entropy and laws are functions of it.
+
+    A subclass sets its fields, calls :meth:`_lift_laws`, and defines the motion of the components that it adds.
+    """
+
+    @property
+    @abstractmethod
+    def inner(self) -> System:
+        """The system whose states begin those of this one."""
+
+    def inner_at(self, x) -> System:
+        """Return the inner system as it acts at a state, at its time and attitude."""
+        return self.inner
+
+    def _lift_laws(self) -> None:
+        """Set entropy, momentum maps and dissipation, those of the inner system."""
+        inner = self.inner
+        self.entropy = None if inner.entropy is None else self.extend(inner.entropy)
+        self.momentum_maps = {name: self.extend(J) for name, J in inner.momentum_maps.items()}
+        self.dissipation = InnerDissipation.lift_terms(inner.dissipation, self.extend)
+        self.preserved_labels, self.invariant_verdicts = inner.preserved_labels, inner.invariant_verdicts
+
+    def extend(self, energy: Energy) -> Energy:
+        """Return a function of states from a function of inner states."""
+        return energy.on(range(self.inner.dim))
+
+    def inner_arguments(self, x, dH, dS, dL) -> tuple:
+        """Return the inner state and the gradients with respect to it; dS may be None."""
+        n = self.inner.dim
+        return x[:n], dH[:n], None if dS is None else dS[:n], tuple(L[:n] for L in dL)
+
+    def transport(self, x, dH, dS, dL=()):
+        return self.inner_at(x).transport(*self.inner_arguments(x, dH, dS, dL))
+
+    def raise_index(self, x, alpha):
+        n = self.inner.dim
+        return jnp.concatenate([self.inner.raise_index(x[:n], alpha[:n]), alpha[n:]])
+
+    def lower_index(self, x, v):
+        n = self.inner.dim
+        return jnp.concatenate([self.inner.lower_index(x[:n], v[:n]), v[n:]])
+
+    def casimirs(self) -> dict[str, Energy]:
+        return {name: self.extend(C) for name, C in self.inner.casimirs().items()}
+
+    def outside(self, x) -> str:
+        return self.inner.outside(x[..., : self.inner.dim])
+
+    def why_singular(self, x) -> str:
+        return self.inner.why_singular(x[..., : self.inner.dim])
+
+    def domain_margin(self, x):
+        return self.inner_at(x).domain_margin(x[..., : self.inner.dim])
+
+    def angular_velocity_at(self, x):
+        return self.inner_at(x).angular_velocity_at(x[: self.inner.dim])
+
+    def momentum_scale(self, x) -> jax.Array:
+        return self.inner.momentum_scale(x[: self.inner.dim])
+
+    torque_name = forward_to("inner")
+    has_impulse = forward_to("inner")
+    torque_invariant_casimirs = forward_to("inner")
+    has_all_casimirs = forward_to("inner")
+    orbit_levels = forward_to("inner")
+    has_angular_velocity = forward_to("inner")
+    joint_ranges = forward_to("inner")
+    balance_entries = forward_to("inner")
+    surface = forward_to("inner")
+    can_unroll = forward_to("inner")
+    has_matrix_functions = forward_to("inner")
+
+
+class InnerDissipation(LiftedDissipation):
+    """A dissipation of the inner system, at the time and the attitude of the state."""
+
+    is_noiseless = forward_to("inner")
+
+    def lifted_geometry(self, system, x) -> LiftedGeometry:
+        return LiftedGeometry.from_leading_components(system.inner_at(x), x, system.inner.dim)

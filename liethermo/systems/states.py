@@ -1,0 +1,100 @@
+"""Convert states: check what users give, evaluate functions at batches of states, and give states their shape."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from manifolds._precision import with_library_settings
+
+from ..errors import InputError
+
+
+def checked_state_array(system: Any, x, batch: bool = False) -> np.ndarray | jax.Array:
+    """Return the state x of a system as an array, checked as by ``system.state``; of NumPy unless JAX traces it."""
+    if not isinstance(x, jax.Array):
+        try:
+            x = np.asarray(x)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"a state is a rectangular array of real numbers: {error}") from None
+        if x.dtype.kind not in "fiubc":
+            raise InputError(f"a state is an array of real numbers, not of {x.dtype}")
+    if system.space is not None and x.shape[-len(system.space.shape) :] == system.space.shape:
+        x = system.space.to_vector(x)
+    if system.sites and x.shape[-len(system.shape) :] == system.shape:
+        x = x.reshape(*x.shape[: -len(system.shape)], system.dim)
+    if system.baths is not None and x.shape[-1:] != (system.dim,):
+        x = _append_bath_entropies(system, x)
+    if jnp.iscomplexobj(x):
+        raise InputError(f"a state is real, not {x.dtype}; take the real part if that is meant")
+    if x.shape[-1:] != (system.dim,) or (x.ndim > 1 and not batch):
+        expected = f"(..., {system.dim})" if batch else f"({system.dim},)"
+        if system.sites:
+            shown = ", ".join([*(["..."] if batch else []), *map(str, system.shape)])
+            expected = f"({shown}), or flat {expected}"
+        raise InputError(f"a state of this system has shape {expected}, not {x.shape}")
+    if isinstance(x, jax.core.Tracer):
+        return x
+    numbers = np.asarray(x, dtype=np.float64)
+    if not np.isfinite(numbers).all():
+        where = tuple(int(i) for i in np.argwhere(~np.isfinite(numbers))[0])
+        raise InputError(f"the state is not finite: component {where} is {numbers[where]}")
+    if system.space is not None:
+        system.space.point(system.points(numbers))
+    return numbers
+
+
+def _append_bath_entropies(system: Any, x) -> np.ndarray | jax.Array:
+    """Append zero entropies of the baths to a state of the body; return any other array unchanged."""
+    body = system.drop_baths()
+    shape = body.shape if body.space is None else body.space.shape
+    if shape == (1, 3) and x.shape == (3,):
+        x = x[None]
+    if x.shape[-len(shape) :] == shape:
+        vectors = x.reshape(*x.shape[: -len(shape)], -1) if body.space is None else body.space.to_vector(x)
+    elif x.shape[-1:] == (body.dim,):
+        vectors = x
+    else:
+        return x
+    zeros = np.zeros((*vectors.shape[:-1], system.dim - body.dim))
+    return (jnp if isinstance(x, jax.Array) else np).concatenate([vectors, zeros], axis=-1)
+
+
+@with_library_settings
+def evaluate_batch(system: Any, function: Callable, x, t, result_signature: str) -> jax.Array:
+    """Return ``function(system, x)`` for each state of a batch, with the system frozen at the time t of that state.
+
+    Parameters
+    ----------
+    result_signature : str
+        The shape of one result, as in ``"(n)"``.
+
+    Raises
+    ------
+    InputError
+        If a time is needed and none is given.
+    """
+    x = system.state(x, batch=True)
+    if not system.is_driven:
+        return jnp.vectorize(lambda y: function(system, y), signature=f"(n)->{result_signature}")(x)
+    if t is None:
+        what = "energy of this system depends on" if system.energy.depends_on_time else "torque is known at a"
+        raise InputError(f"the {what} time: give the time beside the state")
+    evaluate = jnp.vectorize(lambda y, t: function(system.at_time(t), y), signature=f"(n),()->{result_signature}")
+    return evaluate(x, jnp.asarray(t, dtype=jnp.float64))
+
+
+def reshape_to_sites(system: Any, result: Any) -> Any:
+    """Return ``result``, a solution or an ensemble, with its states, shape (..., n), as arrays (..., *sites, d)."""
+    while system.inner is not None:
+        system = system.inner
+    if not system.sites:
+        return result
+    states = {name: value for name in result.state_fields if (value := getattr(result, name)) is not None}
+    reshaped = {name: value.reshape(*value.shape[:-1], *system.shape) for name, value in states.items()}
+    return dataclasses.replace(result, **reshaped)

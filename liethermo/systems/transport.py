@@ -1,0 +1,29 @@
+"""Transport covectors: the velocities with which dissipations carry a momentum along its orbit."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from ..dissipation.base import terms_with_preserved_values
+from .interface import SystemInterface
+
+
+def dissipation_velocities(system: SystemInterface, x, dH, dS, dL) -> list[jax.Array | None]:
+    """Return the velocity of each dissipation; None for a dissipation that acts as a torque."""
+    terms = terms_with_preserved_values(system.dissipations, dL)
+    return [term.velocity(system, x, dH, dS, term_dL) for term, term_dL in terms]
+
+
+def is_torque_free(system: SystemInterface) -> bool:
+    """Return whether ``x' = Pi(x) transport``, so that on a Lie algebra the momentum in space is constant."""
+    while system.inner is not None:
+        system = system.inner
+    answers: list[bool] = []
+
+    def record_answer(x):
+        velocities = dissipation_velocities(system, x, x, x, (x,) * len(system.preserved))
+        answers.append(all(sigma is not None for sigma in velocities))
+
+    jax.eval_shape(record_answer, jax.ShapeDtypeStruct((system.dim,), jnp.float64))
+    return answers[0]
