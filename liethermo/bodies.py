@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from manifolds._names import public_dir
 
+from .models.bodies_on_ground import BodiesOnGround
 from .models.free_motion import Periods, damping_time, periods, rate_of
 from .models.inertia import PrincipalAxes, principal_axes
 from .models.jointed_bodies import JointedBodies
@@ -20,6 +21,7 @@ from .systems.rotations import AttitudeWarning, attitude
 __all__ = [
     "AttitudeHistory",
     "AttitudeWarning",
+    "BodiesOnGround",
     "Hinge",
     "JointedBodies",
     "Periods",

@@ -1,9 +1,10 @@
 """Mechanics of a tree of rigid bodies with joints of one degree of freedom: mass matrix, kinetic energy, velocities.
 
-Everything is expressed in axes of the base. A spatial velocity is ``V = (omega, v)``, with v the velocity of the point
-of a body that coincides with the origin of the base; a spatial momentum is (angular momentum about that origin, linear
-momentum). With screws S_i of the joints and inertias I_j, shape (6, 6), the kinetic energy is ``sum_j V_j . I_j V_j /
-2`` with ``V_j = V_parent + S_j q_j'`` [Featherstone, *Rigid Body Dynamics Algorithms*, 2008, chapters 2, 6 and 7].
+Everything is expressed in axes of the base, which is free, or fixed to the ground. A spatial velocity is ``V = (omega,
+v)``, with v the velocity of the point of a body that coincides with the origin of the base; a spatial momentum is
+(angular momentum about that origin, linear momentum). With screws S_i of the joints and inertias I_j, shape (6, 6), the
+kinetic energy is ``sum_j V_j . I_j V_j / 2`` with ``V_j = V_parent + S_j q_j'`` [Featherstone, *Rigid Body Dynamics
+Algorithms*, 2008, chapters 2, 6 and 7].
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from manifolds._pytree_module import Module
 
@@ -54,12 +54,15 @@ class Motion(NamedTuple):
     joint_rates : array, shape (k,)
     joint_gradient : array, shape (k,)
         Derivative of the kinetic energy by the joint coordinates at constant momenta.
+    rounding_scale : array, shape ()
+        The kinetic energy is rounded to about eps times this scale.
     """
 
     energy: jax.Array
     angular_velocity: jax.Array
     joint_rates: jax.Array
     joint_gradient: jax.Array
+    rounding_scale: jax.Array
 
 
 class ArticulatedBodies(Module):
@@ -86,6 +89,8 @@ class ArticulatedBodies(Module):
         Parent of each moved link; it has a smaller index than the link.
     slides : tuple of bool
         True for a joint that moves its link along the axis, False for one that turns it about the axis.
+    is_fixed : bool
+        True if link 0 is the ground, which has no body and does not move.
     """
 
     masses: jax.Array
@@ -96,11 +101,17 @@ class ArticulatedBodies(Module):
     body_links: tuple[int, ...] = eqx.field(static=True)
     parents: tuple[int, ...] = eqx.field(static=True)
     slides: tuple[bool, ...] = eqx.field(static=True)
+    is_fixed: bool = eqx.field(static=True, default=False)
 
     @property
     def n_joints(self) -> int:
         """Number of joint coordinates, k."""
         return len(self.parents)
+
+    @property
+    def first_joint_index(self) -> int:
+        """Index of the first joint coordinate in a state: 3, behind the angular momentum, or 0 on the ground."""
+        return 0 if self.is_fixed else 3
 
     def poses(self, q) -> Poses:
         """Return rotations and positions of all links and the screws of the joints, for joint coordinates q."""
@@ -133,7 +144,7 @@ class ArticulatedBodies(Module):
         """Return M(q), shape (3 + k, 3 + k), for which the kinetic energy is ``(Omega, q') . M(q) (Omega, q') / 2``.
 
         The linear momentum is zero. M is the matrix of a free base by the composite-body recursion, with the linear
-        velocity eliminated by a Schur complement, whose pivot is the total mass.
+        velocity eliminated by a Schur complement, whose pivot is the total mass. On the ground M has the shape (k, k).
         """
         k, poses = self.n_joints, self.poses(q)
         composites = self.spatial_inertias(poses)
@@ -147,6 +158,8 @@ class ArticulatedBodies(Module):
                 ancestor = self.parents[ancestor] - 1
             base_columns[i] = momentum
             composites[self.parents[i]] += composites[i + 1]
+        if self.is_fixed:
+            return M
         columns = jnp.stack(base_columns, axis=1)
         locked = composites[0]
         angular = jnp.concatenate([locked[:3, :3], columns[:3]], axis=1)
@@ -176,14 +189,17 @@ class ArticulatedBodies(Module):
     def motion(self, Pi, q, p) -> Motion:
         """Return the velocities for an angular momentum Pi and joint momenta p, O(k); see :class:`Motion`.
 
+        On the ground Pi does not count.
+
         At constant momenta the kinetic energy has the derivative ``h_i . (S_i × V_i)`` by q_i, h_i the momentum of all
         bodies that joint i moves: minus its derivative at constant velocities, which is that of the screw S_i as seen
         from these bodies.
+
+        An error dI of the inertia that a link moves changes the energy by ``-V . dI V / 2``. The entries of an inertia
+        are rounded to eps of the square roots of its diagonal, before the free joints lower it.
         """
         poses, joints, base = self._eliminate(q, Pi, p)
-        V = jnp.zeros(6)
-        for step, unit in zip(reversed(base), reversed(_BASE_SCREWS), strict=True):
-            V = V + (step.impulse - jnp.dot(step.column, V)) / step.pivot * unit
+        V = _base_velocity(base) if base else jnp.zeros(6)
         velocities, rates = [V], []
         for joint, parent, screw in zip(joints, self.parents, poses.screws, strict=True):
             rate = (joint.impulse - jnp.dot(joint.column, velocities[parent])) / joint.pivot
@@ -195,8 +211,12 @@ class ArticulatedBodies(Module):
         for i in reversed(range(self.n_joints)):
             gradient[i] = jnp.dot(momenta[i + 1], _motion_cross(poses.screws[i], velocities[i + 1]))
             momenta[self.parents[i]] += momenta[i + 1]
-        energy = _sum_of_squares(joints, base)
-        return Motion(energy, V[:3], jnp.stack(rates), jnp.stack(gradient))
+        diagonals = [jnp.diagonal(inertia) for inertia in inertias]
+        for i in reversed(range(self.n_joints)):
+            diagonals[self.parents[i]] += diagonals[i + 1]
+        scales = [jnp.sum(jnp.abs(v) * jnp.sqrt(d)) ** 2 for v, d in zip(velocities, diagonals, strict=True)]
+        energy, rounding_scale = _sum_of_squares(joints, base), 0.5 * jnp.sum(jnp.stack(scales))
+        return Motion(energy, V[:3], jnp.stack(rates), jnp.stack(gradient), rounding_scale)
 
     def _eliminate(self, q, Pi, p) -> tuple[Poses, list[_Elimination], list[_Elimination]]:
         """Eliminate the joint rates from the leaves to the base, then the velocity of the base.
@@ -214,17 +234,60 @@ class ArticulatedBodies(Module):
             joints.append(joint)
             inertias[self.parents[i]] += joint.reduced_inertia(inertias[i + 1])
             biases[self.parents[i]] += joint.bias(biases[i + 1])
-        base: list[_Elimination] = []
-        inertia, bias = inertias[0], biases[0]
-        for unit, momentum in zip(_BASE_SCREWS, [0.0, 0.0, 0.0, *Pi], strict=True):
-            step = _Elimination.from_inertia(inertia, bias, unit, momentum)
-            base.append(step)
-            inertia, bias = step.reduced_inertia(inertia), step.bias(bias)
+        base = [] if self.is_fixed else _eliminate_base(inertias[0], biases[0], Pi)
         return poses, joints[::-1], base
 
+    # -- gravity ------------------------------------------------------------------------------------------------------
 
-_BASE_SCREWS = [*np.eye(6)[3:], *np.eye(6)[:3]]
-"""Screws of the free base: the translations first, whose momenta are zero."""
+    def body_centres(self, poses: Poses) -> list[jax.Array]:
+        """Return the centre of mass of each body, from the origin of the base, shape (3,) each."""
+        links = zip(self.body_links, self.centres, strict=True)
+        return [poses.positions[link] + poses.rotations[link] @ centre for link, centre in links]
+
+    def common_centre(self, poses: Poses) -> jax.Array:
+        """Return the centre of mass of the whole, from the origin of the base, shape (3,)."""
+        return self.masses @ jnp.stack(self.body_centres(poses)) / jnp.sum(self.masses)
+
+    def weight_potential(self, q, gravity) -> jax.Array:
+        """Return the potential energy ``-sum m_j g . r_j`` in a uniform field g, shape (3,), from the ground."""
+        return -jnp.dot(gravity, self.masses @ jnp.stack(self.body_centres(self.poses(q))))
+
+    def weight_forces(self, q, gravity) -> jax.Array:
+        """Return the forces of a uniform field on the joint coordinates, shape (k,)."""
+        poses = self.poses(q)
+        forces = [mass * gravity for mass in self.masses]
+        return self._collect_wrenches(poses, forces, [jnp.zeros(3)] * len(forces))[0]
+
+    def tidal_forces(self, q, direction) -> tuple[jax.Array, jax.Array]:
+        """Return the torque on the whole, shape (3,), and the joint forces, shape (k,), in a gradient of gravity.
+
+        A point at rho from the centre of mass has the acceleration ``3 n (n . rho) - rho`` for a unit vector n to the
+        centre of the orbit, in axes of the base, times ``G M / r**3``. The inertia of a body about its own centre of
+        mass adds the torque ``3 n × I n`` [Hughes, *Spacecraft Attitude Dynamics*, 1986, 8.1].
+        """
+        poses = self.poses(q)
+        origin, n = self.common_centre(poses), direction
+        forces, torques = [], []
+        for body, (link, centre) in enumerate(zip(self.body_links, self.body_centres(poses), strict=True)):
+            R, offset = poses.rotations[link], centre - origin
+            forces.append(self.masses[body] * (3.0 * jnp.dot(n, offset) * n - offset))
+            torques.append(3.0 * jnp.cross(n, R @ (self.inertias[body] @ (R.T @ n))))
+        joint_forces, total = self._collect_wrenches(poses, forces, torques)
+        return total[:3], joint_forces  # the total force is zero, so the torque is the same about every point
+
+    def _collect_wrenches(self, poses: Poses, forces: list, torques: list) -> tuple[jax.Array, jax.Array]:
+        """Return the joint forces, shape (k,), and the total wrench, shape (6,), of forces and torques on the bodies.
+
+        Each force acts in the centre of mass of its body. The wrench is (torque about the origin of the base, force).
+        """
+        wrenches = [jnp.zeros(6)] * (self.n_joints + 1)
+        for link, centre, force, torque in zip(self.body_links, self.body_centres(poses), forces, torques, strict=True):
+            wrenches[link] = jnp.concatenate([torque + jnp.cross(centre, force), force])
+        joint_forces = [jnp.zeros(())] * self.n_joints
+        for i in reversed(range(self.n_joints)):
+            joint_forces[i] = jnp.dot(poses.screws[i], wrenches[i + 1])
+            wrenches[self.parents[i]] += wrenches[i + 1]
+        return jnp.stack(joint_forces), wrenches[0]
 
 
 class _Elimination(NamedTuple):
@@ -259,6 +322,28 @@ class _Elimination(NamedTuple):
         return bias + self.column * (self.impulse / self.pivot)
 
 
+def _eliminate_base(inertia, bias, Pi) -> list[_Elimination]:
+    """Eliminate the velocity of a free base, without linear momentum: the translations first.
+
+    The column of each step has the entries of the velocities that are eliminated after it.
+    """
+    A, b = jnp.roll(inertia, 3, axis=(0, 1)), jnp.roll(bias, 3)
+    steps: list[_Elimination] = []
+    for momentum in [0.0, 0.0, 0.0, *Pi]:
+        step = _Elimination(A[1:, 0], A[0, 0], momentum - b[0])
+        steps.append(step)
+        A, b = step.reduced_inertia(A[1:, 1:]), step.bias(b[1:])
+    return steps
+
+
+def _base_velocity(steps: list[_Elimination]) -> jax.Array:
+    """Return the velocity of the base, shape (6,), from the steps of :func:`_eliminate_base`."""
+    V = jnp.zeros(0)
+    for step in reversed(steps):
+        V = jnp.concatenate([((step.impulse - jnp.dot(step.column, V)) / step.pivot)[None], V])
+    return jnp.roll(V, 3)
+
+
 def _sum_of_squares(joints: list[_Elimination], base: list[_Elimination]) -> jax.Array:
     """Return the kinetic energy, a sum of squares: one for each eliminated velocity."""
     return 0.5 * jnp.sum(jnp.stack([step.impulse**2 / step.pivot for step in [*joints, *base]]))
@@ -285,6 +370,8 @@ def _motion_cross(V, W) -> jax.Array:
 class KineticEnergy(Energy):
     """The kinetic energy ``(Pi, p) . M(q)^-1 (Pi, p) / 2`` of a tree with the state (Pi, q, p).
 
+    The state of a tree on the ground is (q, p), without the angular momentum.
+
     Attributes
     ----------
     mechanism : ArticulatedBodies
@@ -293,9 +380,13 @@ class KineticEnergy(Energy):
     mechanism: ArticulatedBodies
 
     def split_state(self, x) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return angular momentum, joint coordinates and joint momenta, shapes (3,), (k,) and (k,)."""
-        k = self.mechanism.n_joints
-        return x[:3], x[3 : 3 + k], x[3 + k : 3 + 2 * k]
+        """Return angular momentum, joint coordinates and joint momenta, shapes (3,), (k,) and (k,).
+
+        The angular momentum is zero if the base is the ground.
+        """
+        k, first = self.mechanism.n_joints, self.mechanism.first_joint_index
+        Pi = x[:3] if first else jnp.zeros(3)
+        return Pi, x[first : first + k], x[first + k : first + 2 * k]
 
     def momentum_scale(self, x) -> jax.Array:
         """Return :meth:`ArticulatedBodies.momentum_scale` of a state."""
@@ -307,6 +398,9 @@ class KineticEnergy(Energy):
     def gradient(self, x) -> jax.Array:
         return _kinetic_gradient(self, float64_array(x))
 
+    def rounding_scale(self, x) -> jax.Array:
+        return jax.lax.stop_gradient(_kinetic_rounding_scale(self, x))
+
 
 @subprogram
 def _kinetic_energy(kinetic: KineticEnergy, x) -> jax.Array:
@@ -316,7 +410,59 @@ def _kinetic_energy(kinetic: KineticEnergy, x) -> jax.Array:
 @subprogram
 def _kinetic_gradient(kinetic: KineticEnergy, x) -> jax.Array:
     motion = kinetic.mechanism.motion(*kinetic.split_state(x))
-    return jnp.concatenate([motion.angular_velocity, motion.joint_gradient, motion.joint_rates])
+    velocity = [] if kinetic.mechanism.is_fixed else [motion.angular_velocity]
+    return jnp.concatenate([*velocity, motion.joint_gradient, motion.joint_rates])
+
+
+@subprogram
+def _kinetic_rounding_scale(kinetic: KineticEnergy, x) -> jax.Array:
+    return kinetic.mechanism.motion(*kinetic.split_state(x)).rounding_scale
+
+
+class WeightPotential(Energy):
+    """The potential energy ``-sum m_j g . r_j(q)`` of a tree on the ground, with the state (q, p).
+
+    Attributes
+    ----------
+    mechanism : ArticulatedBodies
+    gravity : array, shape (3,)
+        g, in axes of the ground (length / time**2).
+    """
+
+    mechanism: ArticulatedBodies
+    gravity: jax.Array
+
+    def value(self, x) -> jax.Array:
+        return _weight_potential(self, x)
+
+    def gradient(self, x) -> jax.Array:
+        return _weight_gradient(self, float64_array(x))
+
+    def rounding_scale(self, x) -> jax.Array:
+        """Return the sum of the weights times the lengths of the chains that carry them."""
+        return jax.lax.stop_gradient(_weight_rounding_scale(self, x))
+
+
+@subprogram
+def _weight_potential(weight: WeightPotential, x) -> jax.Array:
+    return weight.mechanism.weight_potential(x[: weight.mechanism.n_joints], weight.gravity)
+
+
+@subprogram
+def _weight_rounding_scale(weight: WeightPotential, x) -> jax.Array:
+    mechanism, q = weight.mechanism, x[: weight.mechanism.n_joints]
+    lengths = [jnp.zeros(())]
+    for i, (parent, slides) in enumerate(zip(mechanism.parents, mechanism.slides, strict=True)):
+        stroke = jnp.abs(q[i]) if slides else jnp.zeros(())
+        lengths.append(lengths[parent] + jnp.linalg.norm(mechanism.places[i]) + stroke)
+    arms = jnp.stack([lengths[link] for link in mechanism.body_links]) + jnp.linalg.norm(mechanism.centres, axis=1)
+    return jnp.linalg.norm(weight.gravity) * jnp.dot(mechanism.masses, arms)
+
+
+@subprogram
+def _weight_gradient(weight: WeightPotential, x) -> jax.Array:
+    k = weight.mechanism.n_joints
+    return jnp.concatenate([-weight.mechanism.weight_forces(x[:k], weight.gravity), jnp.zeros(k)])
 
 
 class SquaredMomentum(Pullback):
@@ -346,21 +492,26 @@ class JointSprings(Energy):
         Torque per angle of hinges, force per length of sliders.
     rest : array, shape (k,)
         Joint coordinates r at which the springs are relaxed.
+    first_joint_index : int
+        Index of the first joint coordinate in a state.
     """
 
     stiffness: jax.Array
     rest: jax.Array
+    first_joint_index: int = eqx.field(static=True, default=3)
 
     is_quadratic = True
 
     def value(self, x) -> jax.Array:
-        k = self.stiffness.shape[0]
-        return 0.5 * jnp.sum(self.stiffness * (x[3 : 3 + k] - self.rest) ** 2)
+        return 0.5 * jnp.sum(self.stiffness * self._deflections(x) ** 2)
 
     def gradient(self, x) -> jax.Array:
-        k = self.stiffness.shape[0]
-        force = self.stiffness * (x[3 : 3 + k] - self.rest)
-        return jnp.concatenate([jnp.zeros(3), force, jnp.zeros(k)])
+        force = self.stiffness * self._deflections(x)
+        return jnp.concatenate([jnp.zeros(self.first_joint_index), force, jnp.zeros_like(force)])
+
+    def _deflections(self, x) -> jax.Array:
+        first = self.first_joint_index
+        return x[first : first + self.stiffness.shape[0]] - self.rest
 
 
 class JointDamping(Dissipation):
@@ -370,9 +521,12 @@ class JointDamping(Dissipation):
     ----------
     coefficients : array, shape (k,), >= 0
         c: torque per angular velocity of hinges, force per velocity of sliders.
+    first_joint_index : int
+        Index of the first joint coordinate in a state.
     """
 
     coefficients: jax.Array
+    first_joint_index: int = eqx.field(static=True, default=3)
 
     energy_law = "nonincreasing"
     entropy_law = None
@@ -383,18 +537,19 @@ class JointDamping(Dissipation):
     def heated_bath_index(self):
         return Indices(0)
 
-    def _append_to_zeros(self, rates) -> jax.Array:
-        return jnp.concatenate([jnp.zeros(3 + self.coefficients.shape[0]), rates])
+    @property
+    def _momenta(self) -> slice:
+        """Range of the joint momenta in a state."""
+        k = self.coefficients.shape[0]
+        return slice(self.first_joint_index + k, self.first_joint_index + 2 * k)
 
     def force(self, system, x, dH, dS, dL):
-        k = self.coefficients.shape[0]
-        return self._append_to_zeros(-self.coefficients * dH[3 + k : 3 + 2 * k])
+        return jnp.zeros_like(dH).at[self._momenta].set(-self.coefficients * dH[self._momenta])
 
     def velocity(self, system, x, dH, dS, dL):
         return jnp.zeros_like(dH)
 
     def factor(self, system, x, dH, dL):
-        root = jnp.sqrt(self.coefficients)
-        return Factor(
-            root.shape[0], lambda w: self._append_to_zeros(root * w), True, velocity=lambda w: jnp.zeros_like(x)
-        )
+        root, momenta = jnp.sqrt(self.coefficients), self._momenta
+        momentum_rates = lambda w: jnp.zeros_like(x).at[momenta].set(root * w)  # noqa: E731
+        return Factor(root.shape[0], momentum_rates, True, velocity=lambda w: jnp.zeros_like(x))

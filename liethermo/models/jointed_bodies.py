@@ -14,127 +14,140 @@ import numpy as np
 import manifolds as mf
 from manifolds._arrays import is_traced
 from manifolds._precision import with_library_settings
-from manifolds._pytree_module import Module
-from manifolds.structures.poisson import ProductPoisson
+from manifolds.structures.poisson import PoissonStructure, ProductPoisson
 
 from ..errors import InputError
-from ..functions.energy import Energy, Sum
+from ..functions.energy import Energy, Quadratic
 from ..systems import HeatBaths, LiePoissonSystem
 from ..tracing.programs import jit_unoptimised
-from .articulated_bodies import ArticulatedBodies, JointDamping, JointSprings, KineticEnergy, Motion, SquaredMomentum
-from .parameters import checked_finite
+from .articulated_bodies import ArticulatedBodies, JointDamping, JointSprings, KineticEnergy, SquaredMomentum
+from .joint_states import JointMotors, JointRange, TreeSystem, broadcast_batches, checked_vectors, sum_of_terms
+from .orbits import Orbit, direction_and_distance
 
 
-class JointMotors(Module):
-    """Torques of motors in the joints, as functions of the time.
-
-    Attributes
-    ----------
-    functions : tuple of arrays, shape (size,), or functions from t, shape (), to one
-    indices : tuple of tuple of int
-        Joint coordinates that each motor drives.
-    n_joints : int
-        Number of joint coordinates.
-    names : tuple of str
-        Names of the bodies that are driven.
-    """
-
-    functions: tuple[Any, ...]
-    indices: tuple[tuple[int, ...], ...] = eqx.field(static=True)
-    n_joints: int = eqx.field(static=True)
-    names: tuple[str, ...] = eqx.field(static=True)
-
-    def __call__(self, t) -> jax.Array:
-        torques = jnp.zeros(self.n_joints)
-        for function, indices in zip(self.functions, self.indices, strict=True):
-            values = jnp.asarray(function(t) if callable(function) else function)
-            torques = torques.at[np.array(indices)].add(values.reshape(len(indices)))
-        return torques
-
-
-class JointedBodies(LiePoissonSystem):
+class JointedBodies(TreeSystem, LiePoissonSystem):
     """A free tree of jointed rigid bodies on ``so(3)* x T*Q``; :meth:`Tree.system` builds it.
 
     ``Pi' = Pi × Omega + torque``, ``q' = dH/dp``, ``p' = -dH/dq - c q' + u``, ``T y' = sum c q'**2`` with ``H = (Pi, p)
     . M(q)^-1 (Pi, p) / 2 + V(q)`` [Marsden & Scheurle 1993]. Pi is the angular momentum about the common centre of
-    mass, in axes of the base, and p are the momenta of the joint coordinates q; the linear momentum is zero. Springs,
-    dampers and motors u in the joints change no angular momentum in space. The attitude is that of the base.
+    mass, in axes of the base, and p are the momenta of the joint coordinates q. Springs, dampers and motors u in the
+    joints change no angular momentum in space. The attitude is that of the base.
 
-    The state is (Pi, q, p), followed by the entropy y of the bath if there is one. Joint coordinates are in the order
-    of :attr:`joint_indices`.
+    The state is (Pi, q, p), followed by the entropy y of the bath if there is one. In a uniform field of gravity g it
+    is (Pi, q, p, X, P, y), with the position X and the momentum P of the common centre of mass in axes in space: ``X' =
+    P / m``, ``P' = m g``. Along an orbit the gradient of gravity acts on every body, a torque on Pi and forces on p.
+    Joint coordinates are in the order of :attr:`joint_ranges`.
 
     Attributes
     ----------
     motors : JointMotors or None
-    joint_indices : tuple of (str, int, int)
-        Name of each body that has a joint, and the first and the last but one index of its coordinates in a state.
+    orbit : Orbit or None
+        Orbit on which the gradient of gravity acts.
     """
 
     motors: JointMotors | None
-    joint_indices: tuple[tuple[str, int, int], ...] = eqx.field(static=True)
+    orbit: Orbit | None
+    _joint_ranges: tuple[JointRange, ...] = eqx.field(static=True)
 
     def __init__(
         self,
         mechanism: ArticulatedBodies,
         springs: JointSprings,
         damping,
-        joint_indices: tuple[tuple[str, int, int], ...],
+        joint_ranges: tuple[JointRange, ...],
         baths: HeatBaths | None = None,
         torque: Any = None,
         motors: JointMotors | None = None,
         attitude: bool = True,
+        gravity: jax.Array | Orbit | None = None,
     ):
         algebra, k = mf.so(3), mechanism.n_joints
         self.algebra, self.group, self.reconstruction = algebra, None, None
         if attitude:
             self.group, self.reconstruction = mf.SO(3), "coadjoint"
         self._set_torque(torque)
-        self.motors, self.joint_indices = motors, joint_indices
-        energy: Energy = KineticEnergy(mechanism)
+        self.orbit = gravity if isinstance(gravity, Orbit) else None
+        if self.orbit is not None and not attitude:
+            raise InputError("gravity along an orbit depends on the attitude: leave out attitude=False")
+        self.motors, self._joint_ranges = motors, joint_ranges
+        terms: list[Energy] = [KineticEnergy(mechanism)]
         if is_traced(springs.stiffness) or np.asarray(springs.stiffness).any():
-            energy = Sum((energy, springs))
+            terms.append(springs)
+        poisson: PoissonStructure = ProductPoisson(mf.LiePoisson(algebra), mf.Canonical(k))
+        dim = 3 + 2 * k
+        if gravity is not None and self.orbit is None:
+            mass, n = jnp.sum(mechanism.masses), dim
+            terms = [term.on(range(n)) for term in terms]
+            poisson, dim = ProductPoisson(poisson, mf.Canonical(3)), n + 6
+            falling = Quadratic(jnp.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]) / mass, jnp.pad(-mass * gravity, (0, 3)))
+            terms.append(falling.on(range(n, dim)))
         dissipation = JointDamping(damping) if is_traced(damping) or np.asarray(damping).any() else None
-        poisson = ProductPoisson(mf.LiePoisson(algebra), mf.Canonical(k))
         validate = False  # the axioms hold for every tree
-        self._build(poisson, 3 + 2 * k, energy, None, dissipation, (), validate, baths=baths)
+        self._build(poisson, dim, sum_of_terms(terms), None, dissipation, (), validate, baths=baths)
 
-    # -- the motor torques --------------------------------------------------------------------------------------------
+    @property
+    def joint_ranges(self) -> tuple[JointRange, ...]:
+        return self._joint_ranges
+
+    # -- torques of motors and of gravity -----------------------------------------------------------------------------
 
     @property
     def torque_name(self) -> str:
-        motors = "" if self.motors is None else f"motors of {', '.join(self.motors.names)}"
-        return " + ".join(filter(None, [super().torque_name, motors]))
+        motors = "" if self.motors is None else str(self.motors)
+        gradient = "" if self.orbit is None else "gradient of gravity"
+        return " + ".join(filter(None, [super().torque_name, gradient, motors]))
 
     @property
     def is_driven(self) -> bool:
-        return super().is_driven or (self.motors is not None and self.torque_arguments is None)
+        return super().is_driven or (bool(self.torque_name) and self.torque_arguments is None)
+
+    @property
+    def needs_attitude(self) -> bool:
+        return self.orbit is not None or super().needs_attitude
+
+    @property
+    def has_impulse(self) -> bool:
+        return self.orbit is not None or super().has_impulse
 
     def at_time(self, t, attitude=None):
         system = super().at_time(t, attitude)
-        if self.motors is None or system.torque_arguments is not None:
+        if not self.torque_name or system.torque_arguments is not None:
             return system
         system = copy(system)
-        object.__setattr__(system, "torque_arguments", (jnp.asarray(t, dtype=jnp.float64), None))
+        arguments = jnp.asarray(t, dtype=jnp.float64), None if attitude is None else jnp.asarray(attitude)
+        object.__setattr__(system, "torque_arguments", arguments)
         return system
 
     def external_torque(self, x):
-        torque = super().external_torque(x)
-        if self.motors is None:
-            return torque
-        if self.torque_arguments is None:
-            raise InputError(f"the torque {self.torque_name} is known at a time: take system.at_time(t)")
+        if not self.torque_name:
+            return None
+        if self.torque_arguments is None or (self.needs_attitude and self.torque_arguments[1] is None):
+            what, arguments = ("time and an attitude", "t, attitude") if self.needs_attitude else ("time", "t")
+            raise InputError(f"the torque {self.torque_name} is known at a {what}: take system.at_time({arguments})")
+        torque, (t, attitude) = super().external_torque(x), self.torque_arguments
         k = self.mechanism.n_joints
-        joint_torques = jnp.pad(self.motors(self.torque_arguments[0]), (3 + k, self.dim - 3 - 2 * k))
-        return joint_torques if torque is None else torque + joint_torques
+        on_body, on_joints = jnp.zeros(3), jnp.zeros(k)
+        if self.orbit is not None:
+            direction, distance = direction_and_distance(self.orbit, t)
+            # without the barrier XLA crashes on products of many such matrices with vectors
+            n = jax.lax.optimization_barrier(attitude).T @ direction
+            strength = self.orbit.mean_motion**2 / distance**3
+            on_body, on_joints = (strength * part for part in self.mechanism.tidal_forces(x[3 : 3 + k], n))
+        if self.motors is not None:
+            on_joints = on_joints + self.motors(t)
+        forces = jnp.concatenate([on_body, jnp.zeros(k), on_joints, jnp.zeros(self.dim - 3 - 2 * k)])
+        return forces if torque is None else torque + forces
 
     def drop_torque(self):
         system = copy(super().drop_torque())
-        object.__setattr__(system, "motors", None)
-        object.__setattr__(system, "torque_arguments", None)
+        for name in ("motors", "orbit", "torque_arguments"):
+            object.__setattr__(system, name, None)
         return system
 
     @property
     def torque_invariant_casimirs(self) -> frozenset[str]:
+        if self.orbit is not None:
+            return frozenset()
         return frozenset(self.casimirs()) if self.torque is None else super().torque_invariant_casimirs
 
     def casimirs(self) -> dict[str, Energy]:
@@ -145,55 +158,53 @@ class JointedBodies(LiePoissonSystem):
         return KineticEnergy(self.mechanism).momentum_scale(x)
 
     @property
-    def joint_ranges(self):
-        return self.joint_indices
-
-    @property
     def inertia(self) -> None:
         """None: the inertia depends on the joint coordinates; see :meth:`mass_matrix`."""
         return None
 
     # -- mechanics ----------------------------------------------------------------------------------------------------
 
-    @property
-    def mechanism(self) -> ArticulatedBodies:
-        """The bodies and joints, with their parameters."""
-        kinetic = self.drop_baths().energy.terms[0]
-        assert isinstance(kinetic, KineticEnergy)
-        return kinetic.mechanism
-
-    @with_library_settings
-    def mass_matrix(self, q) -> jax.Array:
-        """Return M(q), shape (..., 3 + k, 3 + k), for which the kinetic energy is ``(Omega, q') . M (Omega, q') / 2``.
-
-        Parameters
-        ----------
-        q : array, shape (..., k)
-            Joint coordinates (rad or m).
-        """
-        q = jnp.asarray(q, dtype=jnp.float64)
-        if q.shape[-1:] != (self.mechanism.n_joints,):
-            raise InputError(f"q must have shape (..., {self.mechanism.n_joints}), got {q.shape}")
-        matrices = _mass_matrices(self.mechanism, q.reshape(-1, q.shape[-1]))
-        return matrices.reshape(*q.shape[:-1], *matrices.shape[1:])
-
     def angular_velocity(self, x) -> jax.Array:
         """Return the angular velocity of the base in its axes, shape (..., 3) (rad/s), at states x, shape (..., n)."""
         return self._motion(x).angular_velocity
 
-    def joint_rates(self, x) -> dict[str, jax.Array]:
-        """Return the rates of the joint coordinates by the name of the body, at states x, shape (..., n).
+    @property
+    def _centre_start(self) -> int | None:
+        """Index of the position of the centre of mass in a state; None without one."""
+        n = 3 + 2 * self.mechanism.n_joints
+        return n if self.body_dim > n else None
 
-        Each has the shape (...), or (..., 2) for a universal joint.
+    def centre_of_mass(self, x) -> jax.Array:
+        """Return the common centre of mass in axes in space, shape (..., 3), at states x, shape (..., n).
+
+        Raises
+        ------
+        InputError
+            If the tree has no position, since it was built without ``gravity=(gx, gy, gz)``.
         """
-        rates = self._motion(x).joint_rates
-        return {name: _entries(rates, start - 3, end - 3) for name, start, end in self.joint_indices}
+        start = self._centre_start
+        if start is None:
+            raise InputError(
+                "the tree has no position: build it by tree.system(gravity=(0, 0, 0)), or in another field"
+            )
+        return self.state(x, batch=True)[..., start : start + 3]
 
     @with_library_settings
-    def _motion(self, x) -> Motion:
-        x = self.state(x, batch=True)
-        flat = _motions(self.mechanism, x.reshape(-1, self.dim))
-        return Motion(*(part.reshape(*x.shape[:-1], *part.shape[1:]) for part in flat))
+    def base_position(self, x, attitude) -> jax.Array:
+        """Return the origin of the base in axes in space, shape (..., 3).
+
+        Parameters
+        ----------
+        x : array, shape (..., n)
+            States. Without a position in the state, the common centre of mass is at zero.
+        attitude : array, shape (..., 3, 3)
+            Attitudes of the base, such as those of a solution.
+        """
+        x, k = self.state(x, batch=True), self.mechanism.n_joints
+        q = x[..., 3 : 3 + k]
+        offsets = _common_centres(self.mechanism, q.reshape(-1, k)).reshape(*x.shape[:-1], 3)
+        centre = jnp.zeros(3) if self._centre_start is None else self.centre_of_mass(x)
+        return centre - jnp.einsum("...ij,...j->...i", jnp.asarray(attitude), offsets)
 
     # -- states -------------------------------------------------------------------------------------------------------
 
@@ -207,13 +218,15 @@ class JointedBodies(LiePoissonSystem):
         momentum=None,
         joints: Mapping[str, Any] | None = None,
         joint_rates: Mapping[str, Any] | None = None,
+        centre_of_mass=None,
+        velocity=None,
     ) -> jax.Array:
         """Return a state, from velocities or from an array of its components.
 
         Parameters
         ----------
         x : array, shape (n,), optional
-            The state (Pi, q, p, y), or (Pi, q, p), instead of all other arguments.
+            The state, with or without the entropy of the bath, instead of all other arguments.
         batch : bool
             Allow x to be many states, shape (..., n).
         angular_velocity : array, shape (3,) or (B, 3), optional
@@ -226,6 +239,9 @@ class JointedBodies(LiePoissonSystem):
             left out are zero.
         joint_rates : dict, as ``joints``; optional
             Rates of the joint coordinates (rad/s, or m/s); those left out are zero.
+        centre_of_mass, velocity : array, shape (3,) or (B, 3), optional
+            Position (m) and velocity (m/s) of the common centre of mass in axes in space, of a tree in a uniform field
+            of gravity; zero by default.
 
         Returns
         -------
@@ -236,7 +252,7 @@ class JointedBodies(LiePoissonSystem):
         InputError
             If there is no joint of a name, or a shape does not fit.
         """
-        velocities = angular_velocity, momentum, joints, joint_rates
+        velocities = angular_velocity, momentum, joints, joint_rates, centre_of_mass, velocity
         if x is not None:
             if any(value is not None for value in velocities):
                 raise InputError("give a state x, or velocities and joints by name, not both")
@@ -246,15 +262,10 @@ class JointedBodies(LiePoissonSystem):
         q, rates = self._joint_vector(joints, "joints"), self._joint_vector(joint_rates, "joint_rates")
         name = "angular_velocity" if momentum is None else "momentum"
         given_vectors = [v for v in (angular_velocity, momentum) if v is not None]
-        vector = checked_finite(given_vectors[0] if given_vectors else np.zeros(3), name)
-        if vector.shape[-1:] != (3,) or vector.ndim > 2:
-            raise InputError(f"{name} must have shape (3,), or (B, 3) for many states, got {vector.shape}")
-        batch_shapes = [vector.shape[:-1], q.shape[:-1], rates.shape[:-1]]
-        try:
-            shape = jnp.broadcast_shapes(*batch_shapes)
-        except ValueError:
-            raise InputError(f"the arguments of a state have batches of different lengths: {batch_shapes}") from None
-        vector, q, rates = (jnp.broadcast_to(v, (*shape, v.shape[-1])) for v in (vector, q, rates))
+        vector = checked_vectors(given_vectors[0] if given_vectors else np.zeros(3), name)
+        vector, q, rates, *translation = broadcast_batches(
+            vector, q, rates, *self._translation(centre_of_mass, velocity)
+        )
         M = self.mass_matrix(q)
         if momentum is None:
             Omega = vector
@@ -263,42 +274,23 @@ class JointedBodies(LiePoissonSystem):
             Omega = jnp.linalg.solve(M[..., :3, :3], residual[..., None])[..., 0]
         momenta = jnp.einsum("...ij,...j->...i", M, jnp.concatenate([Omega, rates], axis=-1))
         Pi = momenta[..., :3] if momentum is None else vector
-        return super().state(jnp.concatenate([Pi, q, momenta[..., 3:]], axis=-1), bool(shape))
+        x = jnp.concatenate([Pi, q, momenta[..., 3:], *translation], axis=-1)
+        return super().state(x, x.ndim > 1)
 
-    def _joint_vector(self, values: Mapping[str, Any] | None, argument: str) -> jax.Array:
-        """Return coordinates or rates of all joints, shape (k,) or (B, k), from those that are given by name."""
-        if not isinstance(values, Mapping | None):
-            raise InputError(f"{argument} must be a dict by the names of bodies, got {type(values).__name__}")
-        values = dict(values or {})
-        names = [name for name, _, _ in self.joint_indices]
-        if unknown := [name for name in values if name not in names]:
-            raise InputError(f"no joint moves {', '.join(map(repr, unknown))}. The joints move {', '.join(names)}")
-        columns = []
-        for name, start, end in self.joint_indices:
-            size, what = end - start, f"{argument}[{name!r}]"
-            array = checked_finite(values.get(name, np.zeros(size)), what)
-            array = array[..., None] if size == 1 and array.shape[-1:] != (1,) else array
-            if array.shape[-1:] != (size,) or array.ndim > 2:
-                raise InputError(f"{what} must have shape ({size},), or (B, {size}), got {array.shape}")
-            columns.append(array)
-        try:
-            shape = jnp.broadcast_shapes(*(column.shape[:-1] for column in columns))
-        except ValueError:
-            raise InputError(f"the entries of {argument} have different lengths") from None
-        return jnp.concatenate([jnp.broadcast_to(c, (*shape, c.shape[-1])) for c in columns], axis=-1)
+    def _translation(self, centre_of_mass, velocity) -> tuple[jax.Array, ...]:
+        """Return position and momentum of the centre of mass for a state; nothing for a tree without a position."""
+        if self._centre_start is None:
+            if centre_of_mass is not None or velocity is not None:
+                raise InputError(
+                    "centre_of_mass= and velocity= are for a tree with a position: build it by "
+                    "tree.system(gravity=(0, 0, 0)), or in another uniform field"
+                )
+            return ()
+        values = {"centre_of_mass": centre_of_mass, "velocity": velocity}
+        X, v = (checked_vectors(np.zeros(3) if value is None else value, name) for name, value in values.items())
+        return X, jnp.sum(self.mechanism.masses) * v
 
 
 @jit_unoptimised
-def _mass_matrices(mechanism: ArticulatedBodies, q) -> jax.Array:
-    return jax.vmap(mechanism.mass_matrix)(q)
-
-
-@jit_unoptimised
-def _motions(mechanism: ArticulatedBodies, x) -> Motion:
-    kinetic = KineticEnergy(mechanism)
-    return jax.vmap(lambda y: mechanism.motion(*kinetic.split_state(y)))(x)
-
-
-def _entries(values, start: int, end: int):
-    """Return some components of values, shape (..., k): shape (...) for one, (..., end - start) for more."""
-    return values[..., start] if end - start == 1 else values[..., start:end]
+def _common_centres(mechanism: ArticulatedBodies, q) -> jax.Array:
+    return jax.vmap(lambda q: mechanism.common_centre(mechanism.poses(q)))(q)

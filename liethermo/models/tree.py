@@ -18,9 +18,12 @@ from ..functions.conditions import checked_numbers
 from ..systems import HeatBaths
 from ..tracing.programs import jit_unoptimised
 from .articulated_bodies import ArticulatedBodies, JointSprings
+from .bodies_on_ground import BodiesOnGround
 from .inertia import INEQUALITY_RTOL, is_symmetric, satisfies_triangle_inequalities
-from .jointed_bodies import JointedBodies, JointMotors
+from .joint_states import JointMotors, JointRange
+from .jointed_bodies import JointedBodies
 from .joints import Joint, JointCoordinate
+from .orbits import Orbit
 from .parameters import checked_finite, checked_positive
 from .tree_files import BodyRecord, read_mjcf, read_urdf
 
@@ -45,10 +48,15 @@ class _Body(NamedTuple):
 
 
 class Tree:
-    """A tree of rigid bodies that are joined by hinges, sliders and universal joints, free in space.
+    """A tree of rigid bodies that are joined by hinges, sliders and universal joints, free in space or on the ground.
 
     The axes of all bodies are parallel to those of the base if all joint coordinates are zero, and the origin of a body
     is at its joint. Units are SI or any other consistent ones.
+
+    Parameters
+    ----------
+    ground : str, optional
+        Name of the ground, which is then the base and does not move. Without it the first body is the base, and free.
 
     Examples
     --------
@@ -63,10 +71,24 @@ class Tree:
     >>> solution = lt.integrate(system, x0, (0.0, 10.0), 0.05, lt.MetriplecticGauss(2))
     >>> solution.audit().passed, solution.joints["panel"].shape
     (True, (201,))
+
+    A pendulum that hangs from the ground:
+
+    >>> tree = lt.bodies.Tree(ground="ceiling")
+    >>> hinge = lt.bodies.Hinge(at=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0))
+    >>> bob = tree.add("bob", mass=1.0, centre=(0.0, 0.0, -0.5), parent="ceiling", joint=hinge)
+    >>> pendulum = tree.system(gravity=(0.0, 0.0, -9.81))
+    >>> swing = lt.integrate(pendulum, pendulum.state(joints={"bob": 0.3}), (0.0, 5.0), 0.05, lt.MetriplecticGauss(2))
+    >>> swing.audit().passed
+    True
     """
 
-    def __init__(self) -> None:
+    def __init__(self, ground: str | None = None) -> None:
         self._bodies: dict[str, _Body] = {}
+        self._has_ground = ground is not None
+        if ground is not None:
+            name, zero = _checked_name(ground), jnp.zeros(())
+            self._bodies[name] = _Body(name, zero, jnp.zeros(3), jnp.zeros((3, 3)), None, None)
 
     def add(
         self,
@@ -105,8 +127,7 @@ class Tree:
         InputError
             If the name exists, the parent does not, or no rigid body has this mass and inertia.
         """
-        if not isinstance(name, str) or not name:
-            raise InputError(f"the name of a body must be a text that is not empty, got {name!r}")
+        _checked_name(name)
         if name in self._bodies:
             raise InputError(f"there is a body {name!r} already. Give each body another name")
         if not self._bodies and (parent is not None or joint is not None):
@@ -114,7 +135,7 @@ class Tree:
         if self._bodies:
             if parent is None or joint is None:
                 missing = "a parent" if parent is None else "a joint"
-                raise InputError(f"{name!r} needs {missing}: only the first body, {self.base!r}, is free")
+                raise InputError(f"{name!r} needs {missing}: only the base, {self.base!r}, has none")
             if parent not in self._bodies:
                 names = ", ".join(map(repr, self._bodies))
                 raise InputError(
@@ -154,7 +175,7 @@ class Tree:
         motors: Mapping[str, Any] | None = None,
         gravity: Any = None,
         attitude: bool = True,
-    ) -> JointedBodies:
+    ) -> JointedBodies | BodiesOnGround:
         """Return the equations of motion of the tree.
 
         Parameters
@@ -166,22 +187,22 @@ class Tree:
             :mod:`liethermo.torques`.
         motors : dict of float or of function from t, optional
             Torques of motors by the name of the body, as ``motor`` of a joint, which they replace.
-        gravity : optional
-            Must be None. In a uniform field the centre of mass of a free tree falls, and attitude and joints move as
-            without gravity; a gradient of gravity acts by ``torque``.
+        gravity : array, shape (3,), or lt.torques.Orbit; optional
+            A uniform field in axes in space (m/s^2). On the ground it acts on the joints. A free tree falls in it: the
+            state then has position and momentum of the common centre of mass, and attitude and joints move as without
+            gravity. Along an orbit the gradient of gravity acts on every body of a free tree, to second order in its
+            size over the distance from the centre.
         attitude : bool
-            If true, runs follow the attitude of the base, an element of SO(3).
+            If true, runs follow the attitude of a free base, an element of SO(3).
 
         Raises
         ------
         InputError
-            If the tree has no joint, a joint moves no inertia, or a motor belongs to no joint.
+            If the tree has no joint, a joint moves no inertia, or a motor belongs to no joint; or if a torque or an
+            orbit is given for a tree on the ground.
         """
-        if gravity is not None:
-            raise InputError(
-                "gravity= is not available, since a free tree has no position. In a uniform field attitude and joints "
-                "move as without it; for its gradient use torque=lt.torques.GravityGradient(...)"
-            )
+        if gravity is not None and not isinstance(gravity, Orbit):
+            gravity = checked_finite(gravity, "gravity", 3)
         base = self._bodies[self.base]
         moved = [body for body in self._bodies.values() if body.joint is not None]
         if not moved:
@@ -189,14 +210,26 @@ class Tree:
                 f"the tree has one body, {base.name!r}, and no joint. Add bodies, or use lt.LiePoissonSystem with "
                 "lt.Quadratic for one rigid body"
             )
-        layout = _layout(base, moved)
-        indices = tuple((name, 3 + start, 3 + end) for name, start, end in layout.joint_ranges)
+        layout = _layout(base, moved, self._has_ground)
+        first = layout.mechanism.first_joint_index
+        ranges = tuple((name, first + start, first + end) for name, start, end in layout.joint_ranges)
         if not is_traced(layout.mechanism):
             _check_pivots(layout.mechanism, layout.joint_ranges)
         joint_motors = _joint_motors(moved, motors, layout)
-        return JointedBodies(
-            layout.mechanism, layout.springs, layout.damping, indices, baths, torque, joint_motors, attitude
-        )
+        if not self._has_ground:
+            return JointedBodies(
+                *(layout.mechanism, layout.springs, layout.damping, ranges),
+                *(baths, torque, joint_motors, attitude, gravity),
+            )
+        if torque is not None:
+            raise InputError(
+                f"torque= acts on a free base, and {base.name!r} is the ground. Use motors= for the joints"
+            )
+        if isinstance(gravity, Orbit):
+            raise InputError(
+                "gravity along an orbit is for a free tree; on the ground give a field, such as (0, 0, -9.81)"
+            )
+        return BodiesOnGround(layout.mechanism, layout.springs, layout.damping, ranges, baths, joint_motors, gravity)
 
     @classmethod
     def from_urdf(cls, source: str | os.PathLike) -> Tree:
@@ -264,6 +297,12 @@ class Tree:
         return _tree_of(cls, read_mjcf(source))
 
 
+def _checked_name(name: str) -> str:
+    if not isinstance(name, str) or not name:
+        raise InputError(f"the name of a body must be a text that is not empty, got {name!r}")
+    return name
+
+
 def _tree_of(cls: type[Tree], records: Sequence[BodyRecord]) -> Tree:
     """Return a tree with the bodies of a file."""
     tree = cls()
@@ -314,15 +353,15 @@ class _Layout(NamedTuple):
     mechanism: ArticulatedBodies
     springs: JointSprings
     damping: jax.Array
-    joint_ranges: list[tuple[str, int, int]]
+    joint_ranges: list[JointRange]
 
 
-def _layout(base: _Body, moved: list[_Body]) -> _Layout:
+def _layout(base: _Body, moved: list[_Body], has_ground: bool) -> _Layout:
     """Return the arrays of a tree; each coordinate of a joint moves a link, the last one that of the body."""
     link_of = {base.name: 0}
     parents: list[int] = []
     places: list[jax.Array] = []
-    joint_ranges: list[tuple[str, int, int]] = []
+    joint_ranges: list[JointRange] = []
     coordinates: list[JointCoordinate] = []
     for body in moved:
         assert body.joint is not None
@@ -335,7 +374,7 @@ def _layout(base: _Body, moved: list[_Body]) -> _Layout:
             link, place = len(parents), jnp.zeros(3)
         link_of[body.name] = link
         joint_ranges.append((body.name, link - body.joint.size, link))
-    bodies = [base, *moved]
+    bodies = moved if has_ground else [base, *moved]
     mechanism = ArticulatedBodies(
         jnp.stack([body.mass for body in bodies]),
         jnp.stack([body.centre for body in bodies]),
@@ -345,10 +384,12 @@ def _layout(base: _Body, moved: list[_Body]) -> _Layout:
         tuple(link_of[body.name] for body in bodies),
         tuple(parents),
         tuple(coordinate.slides for coordinate in coordinates),
+        has_ground,
     )
     springs = JointSprings(
         jnp.stack([coordinate.stiffness for coordinate in coordinates]),
         jnp.stack([coordinate.rest for coordinate in coordinates]),
+        mechanism.first_joint_index,
     )
     return _Layout(mechanism, springs, jnp.stack([coordinate.damping for coordinate in coordinates]), joint_ranges)
 
@@ -358,13 +399,14 @@ def _pivots_and_mass_matrix(mechanism: ArticulatedBodies, q) -> tuple[jax.Array,
     return mechanism.pivots(q), mechanism.mass_matrix(q)
 
 
-def _check_pivots(mechanism: ArticulatedBodies, joint_ranges: list[tuple[str, int, int]]) -> None:
+def _check_pivots(mechanism: ArticulatedBodies, joint_ranges: list[JointRange]) -> None:
     """Raise InputError if a joint moves no inertia, or the whole has none about an axis, at a random configuration."""
     q = np.random.default_rng(TEST_ANGLES_SEED).uniform(0.5, 1.0, mechanism.n_joints)
     with jax.ensure_compile_time_eval():
         pivots, M = map(np.asarray, _pivots_and_mass_matrix(mechanism, jnp.asarray(q)))
-    scales = np.diagonal(M)[3:]
-    inertia_scale = np.diagonal(M)[:3].max()
+    first = mechanism.first_joint_index
+    scales = np.diagonal(M)[first:]
+    inertia_scale = np.diagonal(M)[:first].max(initial=scales.max())
     for name, start, end in joint_ranges:
         for i in range(start, end):
             scale = np.sum(mechanism.masses) if mechanism.slides[i] else max(scales[i], inertia_scale)
@@ -373,6 +415,8 @@ def _check_pivots(mechanism: ArticulatedBodies, joint_ranges: list[tuple[str, in
                     f"the joint of {name!r} moves no inertia, so its motion is undefined: give the body an inertia, or "
                     "a centre of mass off the axis"
                 )
+    if mechanism.is_fixed:
+        return
     moments = np.linalg.eigvalsh(M[:3, :3] - M[:3, 3:] @ np.linalg.solve(M[3:, 3:], M[3:, :3]))
     if not moments[0] > MIN_PIVOT_FRACTION * inertia_scale:
         raise InputError(

@@ -35,8 +35,11 @@ def rotation(axis, angle):
     return np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * K @ K
 
 
-def initial_state(bodies, angular_velocity, q, rates):
-    """Return positions of the centres, rotations, velocities and angular velocities at rest of the centre of mass."""
+def initial_state(bodies, angular_velocity, q, rates, is_fixed=False):
+    """Return positions of the centres, rotations, velocities and angular velocities.
+
+    The centre of mass is at rest at zero, unless the first body is fixed.
+    """
     n = len(bodies)
     R, origin, w, v_origin = [np.eye(3)], [np.zeros(3)], [np.asarray(angular_velocity, float)], [np.zeros(3)]
     for i, body in enumerate(bodies[1:], start=1):
@@ -56,7 +59,8 @@ def initial_state(bodies, angular_velocity, q, rates):
     x = np.array([origin[i] + R[i] @ bodies[i].centre for i in range(n)])
     v = np.array([v_origin[i] + np.cross(w[i], R[i] @ bodies[i].centre) for i in range(n)])
     masses = np.array([body.mass for body in bodies])
-    x, v = x - masses @ x / masses.sum(), v - masses @ v / masses.sum()
+    if not is_fixed:
+        x, v = x - masses @ x / masses.sum(), v - masses @ v / masses.sum()
     return np.concatenate([x.ravel(), np.array(R).ravel(), v.ravel(), np.array(w).ravel(), q, [0.0]])
 
 
@@ -68,10 +72,13 @@ def unpack(bodies, z):
     return x, R, v, w, z[: n - 1]
 
 
-def rate(bodies, z):
-    """Return the rate of positions, rotations, velocities, angular velocities, joint coordinates and heat."""
+def rate(bodies, z, t=0.0, loads=None, is_fixed=False):
+    """Return the rate of positions, rotations, velocities, angular velocities, joint coordinates and heat.
+
+    ``loads(t, x, R)`` returns forces in the centres and torques on the bodies, in axes in space, shapes (n, 3).
+    """
     n = len(bodies)
-    _, R, v, w, q = unpack(bodies, z)
+    x, R, v, w, q = unpack(bodies, z)
     M, f, heat = np.zeros((6 * n, 6 * n)), np.zeros(6 * n), 0.0
     rows, right, rates = [], [], np.zeros(n - 1)
     for i, body in enumerate(bodies):
@@ -80,6 +87,15 @@ def rate(bodies, z):
         k = 3 * (n + i)
         M[k : k + 3, k : k + 3] = J
         f[k : k + 3] -= np.cross(w[i], J @ w[i])
+    if loads is not None:
+        f += np.concatenate([np.ravel(load) for load in loads(t, x, R)])
+    if is_fixed:
+        for k in (0, 3 * n):
+            for e in np.eye(3):
+                row = np.zeros(6 * n)
+                row[k : k + 3] = e
+                rows.append(row)
+                right.append(0.0)
     for i, body in enumerate(bodies[1:], start=1):
         P, u = body.parent, R[body.parent] @ body.axis
         linear, angular = slice(3 * i, 3 * i + 3), slice(3 * (n + i), 3 * (n + i) + 3)
@@ -134,10 +150,12 @@ def rate(bodies, z):
     return np.concatenate([v.ravel(), turns.ravel(), acceleration, rates, [heat]])
 
 
-def final_state(bodies, angular_velocity, q, rates, end):
+def final_state(bodies, angular_velocity, q, rates, end, loads=None, is_fixed=False):
     """Return the rotation of the base, the joint coordinates and the heat of the dampers at the end."""
-    start = initial_state(bodies, angular_velocity, np.asarray(q, float), rates)
-    run = solve_ivp(lambda t, z: rate(bodies, z), (0.0, end), start, "DOP853", rtol=1e-11, atol=1e-12)
+    start = initial_state(bodies, angular_velocity, np.asarray(q, float), rates, is_fixed)
+    run = solve_ivp(
+        lambda t, z: rate(bodies, z, t, loads, is_fixed), (0.0, end), start, "DOP853", rtol=1e-11, atol=1e-12
+    )
     z = run.y[:, -1]
     _, R, _, _, q = unpack(bodies, z)
     return R[0], q, z[-1]

@@ -54,7 +54,7 @@ def assert_equal_motion(read, built, names):
     """The two trees have the same vector field at a random state."""
     rng = np.random.default_rng(0)
     a, b = (tree.system(attitude=False) for tree in (read, built))
-    assert [name for name, _, _ in a.joint_indices] == [name for name, _, _ in b.joint_indices] == names
+    assert [name for name, _, _ in a.joint_ranges] == [name for name, _, _ in b.joint_ranges] == names
     x = rng.standard_normal(a.dim)
     field = b.vector_field(x)
     assert np.allclose(a.vector_field(x), field, rtol=0, atol=1e-12 * np.abs(field).max())
@@ -144,6 +144,6 @@ def test_a_massless_link_between_two_hinges_is_a_universal_joint():
       <joint name="b" type="continuous"><parent link="cross"/><child link="dish"/><axis xyz="0 1 0"/></joint>
     </robot>""")  # fmt: skip
     system = lt.bodies.Tree.from_urdf(text).system()
-    assert {name: end - start for name, start, end in system.joint_indices} == {"panel": 1, "mass": 1, "dish": 2}
+    assert {name: end - start for name, start, end in system.joint_ranges} == {"panel": 1, "mass": 1, "dish": 2}
     with pytest.raises(lt.InputError, match="the body 'cross' has no mass"):
         lt.bodies.Tree.from_urdf(text.replace('<child link="dish"/>', '<child link="dish"/><origin xyz="0 0 0.1"/>'))

@@ -1,0 +1,166 @@
+"""Joint coordinates, rates and motors of trees of rigid bodies, by the names of the bodies."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from manifolds._precision import with_library_settings
+from manifolds._pytree_module import Module
+
+from ..errors import InputError
+from ..functions.energy import Energy, Pullback, Sum
+from ..systems.base import System
+from ..tracing.programs import jit_unoptimised
+from .articulated_bodies import ArticulatedBodies, KineticEnergy, Motion
+from .parameters import checked_finite
+
+JointRange = tuple[str, int, int]
+"""Name of a body that has a joint, and the first and the last but one index of its coordinates in a state."""
+
+
+class JointMotors(Module):
+    """Torques of motors in the joints, as functions of the time.
+
+    Attributes
+    ----------
+    functions : tuple of arrays, shape (size,), or functions from t, shape (), to one
+    indices : tuple of tuple of int
+        Joint coordinates that each motor drives.
+    n_joints : int
+        Number of joint coordinates.
+    names : tuple of str
+        Names of the bodies that are driven.
+    """
+
+    functions: tuple[Any, ...]
+    indices: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+    n_joints: int = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    def __call__(self, t) -> jax.Array:
+        torques = jnp.zeros(self.n_joints)
+        for function, indices in zip(self.functions, self.indices, strict=True):
+            values = jnp.asarray(function(t) if callable(function) else function)
+            torques = torques.at[np.array(indices)].add(values.reshape(len(indices)))
+        return torques
+
+    def __str__(self) -> str:
+        return f"motors of {', '.join(self.names)}"
+
+
+class TreeSystem(System):
+    """Base class of the equations of motion of a tree of rigid bodies, free or on the ground."""
+
+    @property
+    @abstractmethod
+    def joint_ranges(self) -> tuple[JointRange, ...]:
+        """Name of each body that has a joint, and the first and the last but one index of its coordinates."""
+
+    @property
+    def mechanism(self) -> ArticulatedBodies:
+        """The bodies and joints, with their parameters."""
+        term: Energy = self.drop_baths().energy.terms[0]
+        kinetic = term.term if isinstance(term, Pullback) else term
+        assert isinstance(kinetic, KineticEnergy)
+        return kinetic.mechanism
+
+    @with_library_settings
+    def mass_matrix(self, q) -> jax.Array:
+        """Return M(q), for which the kinetic energy is ``(Omega, q') . M (Omega, q') / 2``, or ``q' . M q' / 2``.
+
+        Parameters
+        ----------
+        q : array, shape (..., k)
+            Joint coordinates (rad or m).
+
+        Returns
+        -------
+        array, shape (..., 3 + k, 3 + k), or (..., k, k) of a tree on the ground
+        """
+        q = jnp.asarray(q, dtype=jnp.float64)
+        if q.shape[-1:] != (self.mechanism.n_joints,):
+            raise InputError(f"q must have shape (..., {self.mechanism.n_joints}), got {q.shape}")
+        matrices = _mass_matrices(self.mechanism, q.reshape(-1, q.shape[-1]))
+        return matrices.reshape(*q.shape[:-1], *matrices.shape[1:])
+
+    def joint_rates(self, x) -> dict[str, jax.Array]:
+        """Return the rates of the joint coordinates by the name of the body, at states x, shape (..., n).
+
+        Each has the shape (...), or (..., 2) for a universal joint (rad/s or m/s).
+        """
+        rates, first = self._motion(x).joint_rates, self.mechanism.first_joint_index
+        return {name: _entries(rates, start - first, end - first) for name, start, end in self.joint_ranges}
+
+    @with_library_settings
+    def _motion(self, x) -> Motion:
+        x = self.state(x, batch=True)
+        flat = _motions(self.mechanism, x.reshape(-1, self.dim))
+        return Motion(*(part.reshape(*x.shape[:-1], *part.shape[1:]) for part in flat))
+
+    def _joint_vector(self, values: Mapping[str, Any] | None, argument: str) -> jax.Array:
+        """Return coordinates or rates of all joints, shape (k,) or (B, k), from those that are given by name."""
+        if not isinstance(values, Mapping | None):
+            raise InputError(f"{argument} must be a dict by the names of bodies, got {type(values).__name__}")
+        values = dict(values or {})
+        names = [name for name, _, _ in self.joint_ranges]
+        if unknown := [name for name in values if name not in names]:
+            raise InputError(f"no joint moves {', '.join(map(repr, unknown))}. The joints move {', '.join(names)}")
+        columns = []
+        for name, start, end in self.joint_ranges:
+            size, what = end - start, f"{argument}[{name!r}]"
+            array = checked_finite(values.get(name, np.zeros(size)), what)
+            array = array[..., None] if size == 1 and array.shape[-1:] != (1,) else array
+            if array.shape[-1:] != (size,) or array.ndim > 2:
+                raise InputError(f"{what} must have shape ({size},), or (B, {size}), got {array.shape}")
+            columns.append(array)
+        try:
+            shape = jnp.broadcast_shapes(*(column.shape[:-1] for column in columns))
+        except ValueError:
+            raise InputError(f"the entries of {argument} have different lengths") from None
+        return jnp.concatenate([jnp.broadcast_to(c, (*shape, c.shape[-1])) for c in columns], axis=-1)
+
+
+def broadcast_batches(*arrays: jax.Array) -> tuple[jax.Array, ...]:
+    """Return arrays of shape (n_i,) or (B, n_i) with one shape of their leading axes, () or (B,)."""
+    batch_shapes = [array.shape[:-1] for array in arrays]
+    try:
+        shape = jnp.broadcast_shapes(*batch_shapes)
+    except ValueError:
+        raise InputError(f"the arguments of a state have batches of different lengths: {batch_shapes}") from None
+    return tuple(jnp.broadcast_to(array, (*shape, array.shape[-1])) for array in arrays)
+
+
+def checked_vectors(value, name: str) -> jax.Array:
+    """Return a finite vector of a state, shape (3,), or those of many states, shape (B, 3)."""
+    vector = checked_finite(value, name)
+    if vector.shape[-1:] != (3,) or vector.ndim > 2:
+        raise InputError(f"{name} must have shape (3,), or (B, 3) for many states, got {vector.shape}")
+    return vector
+
+
+def sum_of_terms(terms: list[Energy]) -> Energy:
+    """Return the sum of terms of an energy, or the only one."""
+    return terms[0] if len(terms) == 1 else Sum(tuple(terms))
+
+
+@jit_unoptimised
+def _mass_matrices(mechanism: ArticulatedBodies, q) -> jax.Array:
+    return jax.vmap(mechanism.mass_matrix)(q)
+
+
+@jit_unoptimised
+def _motions(mechanism: ArticulatedBodies, x) -> Motion:
+    kinetic = KineticEnergy(mechanism)
+    return jax.vmap(lambda y: mechanism.motion(*kinetic.split_state(y)))(x)
+
+
+def _entries(values, start: int, end: int):
+    """Return some components of values, shape (..., k): shape (...) for one, (..., end - start) for more."""
+    return values[..., start] if end - start == 1 else values[..., start:end]
