@@ -286,7 +286,7 @@ def noise_levels(data: list[Trajectory], scale: np.ndarray) -> NoiseLevels:
     levels = np.array([_difference_levels([_column_values(tr, k) for tr in data]) for k in range(len(scale))])
     is_noise = (levels[:, -1] > NOISE_PLATEAU_RATIO * levels[:, -3]) & (levels[:, -1] > MIN_RELATIVE_NOISE * scale)
     std = np.where(is_noise, levels[:, -3:].mean(axis=1), levels.min(axis=1))
-    return NoiseLevels(np.maximum(std, MIN_RELATIVE_NOISE * scale), is_noise, levels.any(axis=1))
+    return NoiseLevels(np.maximum(std, MIN_RELATIVE_NOISE * scale), is_noise, np.asarray(levels.any(axis=1)))
 
 
 def _difference_levels(column: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:

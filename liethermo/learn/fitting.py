@@ -170,13 +170,13 @@ def fit(
 
     Examples
     --------
-    The friction of a spinning body, from its momenta at five times:
+    The rate of the dissipation of a body, from its momenta:
 
     >>> body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
-    >>> run = lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 2.0), 0.1, save_every=4)
+    >>> run = lt.integrate(body, [0.3, 0.2, 1.0], (0.0, 2.0), 0.1, lt.MetriplecticGauss(3))
     >>> guess = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.3)
     >>> found = lt.learn.fit(guess, run, parameters=["dissipation.rate"], positive=True)
-    >>> float(found.dissipation.rate / body.dissipation.rate).__round__(5)
+    >>> round(float(found.dissipation.rate / body.dissipation.rate), 4)
     1.0
     """
     start_time = time.perf_counter()

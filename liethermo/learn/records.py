@@ -129,7 +129,7 @@ def read_data(
 
     Examples
     --------
-    >>> table = {"time [ms]": [0.0, 10.0, 25.0], "angle [deg]": [0.0, 90.0, np.nan]}
+    >>> table = {"time [ms]": [0.0, 10.0, 25.0], "angle [deg]": [0.0, 90.0, 180.0]}
     >>> data = lt.learn.read_data(table)
     >>> data.names, data[0].t
     (('angle',), array([0.   , 0.01 , 0.025]))

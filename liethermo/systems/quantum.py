@@ -39,6 +39,7 @@ from .equilibria import Equilibrium, steady_state
 from .hamiltonian import hamiltonian_energy
 from .interface import InvariantVerdicts
 from .invariants import systems_at_test_times
+from .states import evaluate_batch
 
 LINDBLAD_EIGENVALUE_LIMIT = 1e-6
 """Largest modulus of a negative eigenvalue under Lindblad's equation alone, whose steps have errors of their order. The
@@ -476,7 +477,7 @@ class QuantumSystem(System):
             The time, if the Hamiltonian depends on it.
         """
         if not self.is_driven or t is None:
-            return self.evaluate_batch(lambda system, y: jnp.zeros(()), x, t, "()")
+            return evaluate_batch(self, lambda system, y: jnp.zeros(()), x, t, "()")
 
         def power_at(y, time):
             return jax.jvp(lambda s: jnp.dot(self._hamiltonian_at(s), y[: self.body_dim]), (time,), (jnp.ones(()),))[1]
