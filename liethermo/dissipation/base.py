@@ -24,6 +24,7 @@ from manifolds._pytree_module import Module, forward_to
 from ..errors import InputError
 from ..functions.energy import Energy
 from ..functions.indices import Indices, union_pattern
+from ..tracing.short_form import short_form
 from .factor import Factor, concatenate_factors
 from .geometry import Geometry, divergence_terms_of_fields
 
@@ -40,6 +41,8 @@ class Dissipation(Module):
     preserve : tuple of Energy
         Functions besides the energy that it keeps constant; for a sum the functions of all summands, in order.
     """
+
+    __repr__ = short_form
 
     @property
     def energy_law(self) -> LawName | None:

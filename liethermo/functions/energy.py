@@ -24,6 +24,7 @@ from manifolds._pytree_module import Module, forward_to
 
 from ..errors import FunctionError, InputError
 from ..tracing.programs import subprogram
+from ..tracing.short_form import short_form
 from .arguments import (
     CoordinatesWithTime,
     FixedTimeFunction,
@@ -67,6 +68,8 @@ class Energy(Module):
     Calling an energy evaluates it, from shape (..., n) to shape (...); an energy that depends on time also takes a
     time, shape (...).
     """
+
+    __repr__ = short_form
 
     @abstractmethod
     def value(self, x) -> jax.Array:

@@ -199,6 +199,9 @@ class OneStepMethod(Module):
     def __str__(self) -> str:
         return type(self).__name__
 
+    def __repr__(self) -> str:
+        return str(self)
+
 
 class MethodWrapper(OneStepMethod):
     """A method made from another one, with nearly the same slopes; undefined members are those of the inner method.

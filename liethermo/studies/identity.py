@@ -10,6 +10,7 @@ from dataclasses import asdict, is_dataclass
 from importlib import metadata
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -47,7 +48,7 @@ def study_as_json(solver: PointSolver, example_results: PointResults, x0: np.nda
         "x0": _to_json_numbers(x0),
         "t_span": list(map(float, task.t_span)),
         "step": _step_as_json(task.step),
-        "method": repr(task.method),
+        "method": eqx.tree_pformat(task.method),
         "until": _event_as_json(task.until),
         "noise": None if task.noise is None else task.noise.to_provenance(),
         "measures": {name: measure.description() for name, measure in task.measures.items()},

@@ -22,6 +22,7 @@ from ..functions.checks import checked_energy, trace_energies, with_polynomial_d
 from ..functions.energy import Energy, make_energy
 from ..functions.on_spaces import energy_of_vectors, flatten_site_functions
 from ..functions.with_baths import BodyBathsEnergy
+from ..tracing.short_form import arguments_form
 from ..tracing.traced import trace_callables
 from .baths import BathEntropy, HeatBaths, poisson_with_baths
 from .check import AXIOM_TOLERANCE, CheckReport, check_system, require_axioms
@@ -55,6 +56,19 @@ class System(SystemInterface):
     space : manifolds.Space or None
         The state space, where it is not R^n.
     """
+
+    def __repr__(self) -> str:
+        body = self.drop_baths()
+        state_space = body.space if body.lie_algebra is None else body.lie_algebra
+        parts = {
+            "energy": body.energy,
+            "entropy": None if self.baths is not None and isinstance(body.entropy, BathEntropy) else body.entropy,
+            "dissipation": self.dissipation,
+            "baths": self.baths,
+            "torque": self.torque_name,
+        }
+        name = f"{self.dim} components" if state_space is None else state_space.name
+        return f"{type(self).__name__}({name}, {arguments_form(parts)})"
 
     @with_library_settings
     def _build(

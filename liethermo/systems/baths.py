@@ -26,6 +26,7 @@ from ..functions.bath_energy import (
 from ..functions.conditions import checked_numbers
 from ..functions.each import Each
 from ..functions.energy import Energy
+from ..tracing.short_form import short_form
 
 
 class HeatBaths(Module):
@@ -70,6 +71,8 @@ class HeatBaths(Module):
 
     energy: Energy
     number: int = eqx.field(static=True)
+
+    __repr__ = short_form
 
     def __init__(self, capacity=1.0, temperature=1.0, number: int = 1, energy: Callable | None = None):
         if isinstance(number, bool) or not isinstance(number, int) or number < 1:

@@ -1,0 +1,98 @@
+"""One line about an object for people: its class, and its parameters with their values."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+MAX_SHOWN_NUMBERS = 9
+"""Largest number of entries of an array that are shown."""
+
+MAX_SHOWN_ITEMS = 3
+"""Largest number of objects of a list that are shown."""
+
+MAX_DEPTH = 3
+"""Depth of nested objects beyond which only the class is shown."""
+
+
+SUM_FIELDS = frozenset({"summands", "parts"})
+"""Fields with the parts of a sum."""
+
+WRAPPED_FIELDS = frozenset({"part", "term"})
+"""Fields of objects that wrap another one."""
+
+
+def short_form(value: Any, depth: int = 0) -> str:
+    """Return one line about a value: numbers with four digits, functions by name, objects by class and fields.
+
+    Fields that are None, empty, zero or flags are left out, and of arrays of many numbers all but their shape. Of an
+    object that wraps another one the other is shown, and of a sum its parts.
+    """
+    if isinstance(value, jax.core.Tracer):
+        return f"{value.dtype}{list(value.shape)}"
+    if isinstance(value, jax.Array | np.ndarray | np.generic):
+        array = np.asarray(value)
+        if array.size > MAX_SHOWN_NUMBERS or array.dtype.kind not in "bifcu":
+            return f"array{array.shape}"
+        return _numbers_form(array.tolist())
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, eqx.Module) and not callable_with_name(value):
+        return _short_form_of_object(value, depth)
+    if callable_with_name(value):
+        return str(value.__name__)
+    if isinstance(value, Mapping):
+        return _joined((f"{key}: {short_form(entry, depth + 1)}" for key, entry in value.items()), "{}")
+    if isinstance(value, list | tuple):
+        return _joined((short_form(entry, depth + 1) for entry in value), "[]")
+    return str(value)
+
+
+def _numbers_form(values: Any) -> str:
+    if isinstance(values, list):
+        return f"[{', '.join(map(_numbers_form, values))}]"
+    return str(values) if isinstance(values, bool) else f"{values:.4g}"
+
+
+def arguments_form(arguments: Mapping[str, Any], depth: int = 1) -> str:
+    """Return ``name=value, …`` in short forms, without arguments that are None, empty, zero or flags."""
+    return ", ".join(f"{name}={short_form(value, depth)}" for name, value in arguments.items() if not _is_void(value))
+
+
+def callable_with_name(value: Any) -> bool:
+    """Return whether a value is a function, or an object that stands for one and has its name."""
+    return callable(value) and hasattr(value, "__name__")
+
+
+def _short_form_of_object(value: eqx.Module, depth: int) -> str:
+    if type(value).__repr__ not in (eqx.Module.__repr__, short_form):
+        return repr(value)
+    fields = {field.name: vars(value)[field.name] for field in dataclasses.fields(value) if field.name in vars(value)}
+    for name in SUM_FIELDS & fields.keys():
+        return _joined((short_form(part, depth + 1) for part in fields[name]), ("", ""), " + ")
+    for name in WRAPPED_FIELDS & fields.keys():
+        return short_form(fields[name], depth)
+    if depth >= MAX_DEPTH:
+        return f"{type(value).__name__}(…)"
+    return f"{type(value).__name__}({arguments_form(fields, depth + 1)})"
+
+
+def _is_void(value: Any) -> bool:
+    if value is None or isinstance(value, jax.core.Tracer):
+        return value is None
+    if isinstance(value, jax.Array | np.ndarray | np.generic):
+        return not np.size(value) or (not np.shape(value) and not np.asarray(value).any())
+    return isinstance(value, bool) or (isinstance(value, Mapping | list | tuple | frozenset | str) and not value)
+
+
+def _joined(texts: Iterable[str], brackets: Sequence[str], separator: str = ", ") -> str:
+    all_texts = list(texts)
+    shown = all_texts[:MAX_SHOWN_ITEMS]
+    if len(all_texts) > len(shown):
+        shown.append(f"… ({len(all_texts)} in all)")
+    return f"{brackets[0]}{separator.join(shown)}{brackets[1]}"
