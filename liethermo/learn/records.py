@@ -103,8 +103,8 @@ def read_data(
     Parameters
     ----------
     source : path, pandas.DataFrame, xarray.Dataset, xarray.DataArray, structured array, or dict of arrays
-        The table. In xarray the first dimension of a variable, after that of the trajectories, is the time. A further
-        dimension becomes columns ``x[0]``, ``x[1]`` and so on.
+        The table. In xarray the dimension of the time is called ``time``, or it is the first one of a variable after
+        that of the trajectories. A further dimension becomes columns ``x[0]``, ``x[1]`` and so on.
     columns : sequence of str, optional
         Names of the columns to read, in order; by default all except the times and the numbers of the trajectories.
     time : str, optional
@@ -134,7 +134,7 @@ def read_data(
     >>> data.names, data[0].t
     (('angle',), array([0.   , 0.01 , 0.025]))
     """
-    table = _columns_of_source(source, trajectory)
+    table = _columns_of_source(source, trajectory, time)
     labels = _Labels(list(table), units or {})
     time_label = labels.find_time(time)
     group_label = None if trajectory is None else labels.find(trajectory, "trajectory=")
@@ -321,16 +321,18 @@ def _checked_rows(owner: str, t: np.ndarray, x: np.ndarray, names: Sequence[str]
 # -- sources ----------------------------------------------------------------------------------------------------------
 
 
-def _columns_of_source(source: Any, trajectory: str | None) -> dict[str, np.ndarray]:
+def _columns_of_source(source: Any, trajectory: str | None, time: str | None) -> dict[str, np.ndarray]:
     """Return the columns of a table by label, all of one length."""
     if isinstance(source, str | os.PathLike):
         return _columns_of_frame(_read_csv(Path(source)))
     if _is_instance_of(source, "pandas", "DataFrame"):
         return _columns_of_frame(source)
     if _is_instance_of(source, "xarray", "DataArray"):
-        return _columns_of_dataset(source.to_dataset(name="x" if source.name is None else source.name), trajectory)
+        return _columns_of_dataset(
+            source.to_dataset(name="x" if source.name is None else source.name), trajectory, time
+        )
     if _is_instance_of(source, "xarray", "Dataset"):
-        return _columns_of_dataset(source, trajectory)
+        return _columns_of_dataset(source, trajectory, time)
     if isinstance(source, np.ndarray) and source.dtype.names is not None:
         source = {name: source[name] for name in source.dtype.names}
     if not isinstance(source, Mapping):
@@ -390,18 +392,19 @@ def _array_of_series(series) -> np.ndarray:
     return series.to_numpy(dtype=object)
 
 
-def _columns_of_dataset(dataset, trajectory: str | None) -> dict[str, np.ndarray]:
+def _columns_of_dataset(dataset, trajectory: str | None, time: str | None) -> dict[str, np.ndarray]:
     """Return the variables of a dataset as columns; rows of several trajectories follow one another."""
     variables = {str(name): variable for name, variable in dataset.data_vars.items() if variable.dims}
     if not variables:
         raise InputError("the dataset has no variables with dimensions")
-    dims = list(next(iter(variables.values())).dims)
-    time_dim = next((dim for dim in dims if dim != trajectory), None)
-    if time_dim is None:
-        raise InputError(f"the variables of the dataset have no dimension besides {trajectory!r}")
-    leading = ([trajectory] if trajectory in dims else []) + [time_dim]
-    columns: dict[str, np.ndarray] = {}
     template = next(iter(variables.values()))
+    dims = [dim for dim in template.dims if dim != trajectory]
+    named_dims = [dim for dim in dims if dim == time or (time is None and str(dim).lower() in TIME_NAMES)]
+    time_dim = next(iter([*named_dims, *dims]), None)
+    if time_dim not in dataset.coords:
+        raise InputError(f"the dataset has no coordinate of the times {time_dim!r}. Add it with assign_coords")
+    leading = ([trajectory] if trajectory in template.dims else []) + [time_dim]
+    columns: dict[str, np.ndarray] = {}
     coordinates = {str(dim): dataset[dim] for dim in leading}
     coordinates |= {
         str(name): c for name, c in dataset.coords.items() if set(c.dims) == {time_dim} and name != time_dim

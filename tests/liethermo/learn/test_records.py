@@ -120,7 +120,19 @@ def table(**changes):
     return {"t": T, "x": HEIGHTS} | changes
 
 
+def test_the_time_of_a_dataset_may_be_any_dimension():
+    x = np.column_stack([HEIGHTS, ANGLES])
+    array = xarray.DataArray(x.T, dims=("component", "time"), coords={"time": T}, name="q")
+    np.testing.assert_array_equal(lt.learn.read_data(array)[0].x, x)
+    array = array.rename(time="clock")
+    np.testing.assert_array_equal(lt.learn.read_data(array, time="clock")[0].x, x)
+
+
 BAD = {
+    "a dataset without times": (
+        lambda: lt.learn.read_data(xarray.DataArray(HEIGHTS, dims=("time",))),
+        "no coordinate of the times 'time'. Add it with assign_coords",
+    ),
     "unsorted": (lambda: lt.learn.read_data(table(t=T[[0, 2, 1, 3]])), "time 2 is 0.01 after 0.025. Sort the rows"),
     "repeated": (lambda: lt.learn.read_data(table(t=T[[0, 1, 1, 3]])), "time 0.01 occurs twice. Keep one of these"),
     "unknown column": (lambda: lt.learn.read_data(table(), ["y"]), "no column 'y'; their columns are t, x"),
