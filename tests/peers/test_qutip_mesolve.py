@@ -3,8 +3,9 @@
 QuTiP writes jumps with any rates. Here they have detailed balance, at the temperature of a bath or at an infinite one
 without it. A decay at zero temperature is that in a bath so cold that the jumps upwards are rounding, exp(-50).
 
-What has no counterpart here: rates that depend on time, pumps that are faster than the decay, jumps of a part of a
-coupled system that are none of the whole, Hamiltonians that are not Hermitian, and superoperators as initial states.
+Rates that depend on time, pumps that are faster than the decay, and jumps of a part of a coupled system are those of
+``LindbladJumps``: see its tests. What has no counterpart here: Hamiltonians that are not Hermitian, and superoperators
+as initial states.
 """
 
 import pickle
