@@ -106,7 +106,7 @@ class BodiesOnGround(TreeSystem):
     # -- states -------------------------------------------------------------------------------------------------------
 
     @with_library_settings
-    def state(  # type: ignore[override]  # joints have coordinates and rates of their own
+    def state(
         self,
         x=None,
         batch: bool = False,

@@ -75,7 +75,7 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
             terms.append(springs)
         poisson: PoissonStructure = ProductPoisson(mf.LiePoisson(algebra), mf.Canonical(k))
         dim = 3 + 2 * k
-        if gravity is not None and self.orbit is None:
+        if gravity is not None and not isinstance(gravity, Orbit):
             mass, n = jnp.sum(mechanism.masses), dim
             terms = [term.on(range(n)) for term in terms]
             poisson, dim = ProductPoisson(poisson, mf.Canonical(3)), n + 6

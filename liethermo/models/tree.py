@@ -217,10 +217,8 @@ class Tree:
             _check_pivots(layout.mechanism, layout.joint_ranges)
         joint_motors = _joint_motors(moved, motors, layout)
         if not self._has_ground:
-            return JointedBodies(
-                *(layout.mechanism, layout.springs, layout.damping, ranges),
-                *(baths, torque, joint_motors, attitude, gravity),
-            )
+            bodies = layout.mechanism, layout.springs, layout.damping, ranges
+            return JointedBodies(*bodies, baths, torque, joint_motors, attitude, gravity)
         if torque is not None:
             raise InputError(
                 f"torque= acts on a free base, and {base.name!r} is the ground. Use motors= for the joints"
@@ -232,8 +230,8 @@ class Tree:
         return BodiesOnGround(layout.mechanism, layout.springs, layout.damping, ranges, baths, joint_motors, gravity)
 
     @classmethod
-    def from_urdf(cls, source: str | os.PathLike) -> Tree:
-        """Return the tree of a URDF file: a free base, and revolute, continuous, prismatic and fixed joints.
+    def from_urdf(cls, source: str | os.PathLike, fixed_base: bool = False) -> Tree:
+        """Return the tree of a URDF file with revolute, continuous, prismatic and fixed joints.
 
         ``damping`` of a joint is taken over; limits of position, effort and velocity, shapes and materials do not act.
         Bodies at fixed joints are merged with their parents.
@@ -242,6 +240,8 @@ class Tree:
         ----------
         source : str or path
             A file, or the text of one.
+        fixed_base : bool
+            If true, the base is the ground, and its mass does not count. By default it is free.
 
         Raises
         ------
@@ -263,14 +263,15 @@ class Tree:
         >>> tree.names
         ('bus', 'panel')
         """
-        return _tree_of(cls, read_urdf(source))
+        return _tree_of(cls, read_urdf(source, fixed_base), fixed_base)
 
     @classmethod
     def from_mjcf(cls, source: str | os.PathLike) -> Tree:
-        """Return the tree of an MJCF file of MuJoCo: one free body with hinges and slides.
+        """Return the tree of an MJCF file of MuJoCo: one free body, or bodies in the world, with hinges and slides.
 
-        Masses and inertias are those of ``inertial`` elements. ``damping``, ``stiffness``, ``springref`` and
-        ``armature="0"`` of a joint are covered; gravity must be zero.
+        If no body of the ``worldbody`` has a free joint, the base is the ground, with the name ``world``. Masses and
+        inertias are those of ``inertial`` elements. ``damping``, ``stiffness``, ``springref`` and ``armature="0"`` of a
+        joint are covered. The gravity of the file is not taken over: give ``gravity=`` to :meth:`system`.
 
         Parameters
         ----------
@@ -294,7 +295,7 @@ class Tree:
         >>> tree.names
         ('bus', 'panel')
         """
-        return _tree_of(cls, read_mjcf(source))
+        return _tree_of(cls, *read_mjcf(source))
 
 
 def _checked_name(name: str) -> str:
@@ -303,10 +304,10 @@ def _checked_name(name: str) -> str:
     return name
 
 
-def _tree_of(cls: type[Tree], records: Sequence[BodyRecord]) -> Tree:
-    """Return a tree with the bodies of a file."""
-    tree = cls()
-    for record in records:
+def _tree_of(cls: type[Tree], records: Sequence[BodyRecord], has_ground: bool) -> Tree:
+    """Return a tree with the bodies of a file, of which the first one is the base."""
+    tree = cls(records[0].name if has_ground else None)
+    for record in records[1:] if has_ground else records:
         tree.add(*record)
     return tree
 

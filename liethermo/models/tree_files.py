@@ -88,8 +88,11 @@ class LinkRecord(NamedTuple):
     joints: tuple[JointRecord, ...]
 
 
-def read_urdf(source: str | os.PathLike) -> list[BodyRecord]:
-    """Return the bodies of a URDF file or text, from the base outwards; see :meth:`.Tree.from_urdf`."""
+def read_urdf(source: str | os.PathLike, fixed_base: bool = False) -> list[BodyRecord]:
+    """Return the bodies of a URDF file or text, from the base outwards; see :meth:`.Tree.from_urdf`.
+
+    If the base is fixed, its mass is zero.
+    """
     robot = _read_root(source, "robot", "URDF")
     _refuse_children(robot, "robot", {"link", "joint"}, URDF_SHAPES | {"transmission"})
     links = {_attribute(link, "name"): link for link in robot.findall("link")}
@@ -120,7 +123,7 @@ def read_urdf(source: str | os.PathLike) -> list[BodyRecord]:
     if len(records) < len(links):
         rest = sorted(set(links) - {record.name for record in records})
         raise InputError(f"the links {', '.join(rest)} are in a loop of joints, so they are not a tree")
-    return _assemble(records)
+    return _assemble(records, fixed_base)
 
 
 URDF_SHAPES = {"visual", "collision", "material"}
@@ -167,8 +170,15 @@ def _urdf_origin(element: Element) -> tuple[np.ndarray, np.ndarray]:
     return Rotation.from_euler("xyz", angles).as_matrix(), _numbers(origin, "xyz", 3, np.zeros(3))
 
 
-def read_mjcf(source: str | os.PathLike) -> list[BodyRecord]:
-    """Return the bodies of an MJCF file or text, from the base outwards; see :meth:`.Tree.from_mjcf`."""
+GROUND_NAME = "world"
+"""Name of the ground in MJCF files."""
+
+
+def read_mjcf(source: str | os.PathLike) -> tuple[list[BodyRecord], bool]:
+    """Return the bodies of an MJCF file or text, from the base outwards, and whether the base is the ground.
+
+    See :meth:`.Tree.from_mjcf`.
+    """
     root = _read_root(source, "mujoco", "MJCF")
     covered = {"compiler", "option", "default", "worldbody"}
     _refuse_children(root, "mujoco", covered, MJCF_SETTINGS)
@@ -179,10 +189,23 @@ def read_mjcf(source: str | os.PathLike) -> list[BodyRecord]:
     world = _child(root, "worldbody")
     _refuse_children(world, "worldbody", {"body"}, MJCF_SHAPES)
     bodies = world.findall("body")
-    if len(bodies) != 1:
-        raise InputError(f"worldbody must have one body, the base, got {len(bodies)}")
-    reader.add_body(bodies[0], None)
-    return _assemble(reader.records)
+    if not bodies:
+        raise InputError("worldbody must have a body, got none")
+    has_ground = not any(_is_free(body) for body in bodies)
+    if has_ground:
+        zero = np.zeros(3)
+        reader.records.append(LinkRecord(GROUND_NAME, None, np.eye(3), zero, 0.0, zero, np.zeros((3, 3)), ()))
+    elif len(bodies) != 1:
+        raise InputError(f"a free base must be the only body of worldbody, got {len(bodies)} bodies")
+    for body in bodies:
+        reader.add_body(body, GROUND_NAME if has_ground else None)
+    return _assemble(reader.records, has_ground), has_ground
+
+
+def _is_free(body: Element) -> bool:
+    """Return whether a body of an MJCF file has a free joint."""
+    has_free_joint = any(joint.get("type") == "free" for joint in body.findall("joint"))
+    return has_free_joint or body.find("freejoint") is not None
 
 
 MJCF_SETTINGS = {"asset", "visual", "statistic", "size", "sensor", "custom", "keyframe", "contact"}
@@ -236,7 +259,7 @@ class _MjcfReader:
             if body.get(attribute) not in (None, "false", "0"):
                 raise InputError(f"{attribute} of the body {name!r} is not covered")
         joints = body.findall("joint")
-        is_free = body.find("freejoint") is not None or any(joint.get("type") == "free" for joint in joints)
+        is_free = _is_free(body)
         if is_free != (parent is None) or (is_free and len(joints) + len(body.findall("freejoint")) != 1):
             raise InputError(
                 f"the body {name!r} must have no free joint, which belongs to the base" if is_free
@@ -332,8 +355,11 @@ class _Group:
         return BodyRecord(self.name, total, centre, inertia, self.parent, joint)
 
 
-def _assemble(links: list[LinkRecord]) -> list[BodyRecord]:
-    """Return the bodies of links that are listed from the base outwards; links without a joint merge with theirs."""
+def _assemble(links: list[LinkRecord], has_ground: bool) -> list[BodyRecord]:
+    """Return the bodies of links that are listed from the base outwards; links without a joint merge with theirs.
+
+    If the base is the ground, its mass and inertia are zero.
+    """
     groups: dict[str, _Group] = {}
     frames: dict[str, tuple[str, np.ndarray, np.ndarray]] = {}  # group, rotation and origin in it, of each link
     for link in links:
@@ -360,7 +386,7 @@ def _assemble(links: list[LinkRecord]) -> list[BodyRecord]:
             group.inertias.append(R @ link.inertia @ R.T)
         elif np.any(link.inertia):
             raise InputError(f"{link.name!r} has an inertia and no mass")
-    return _records(groups)
+    return _records(groups, has_ground)
 
 
 def _common_position(link: LinkRecord) -> np.ndarray:
@@ -372,11 +398,15 @@ def _common_position(link: LinkRecord) -> np.ndarray:
     return position
 
 
-def _records(groups: dict[str, _Group]) -> list[BodyRecord]:
+def _records(groups: dict[str, _Group], has_ground: bool) -> list[BodyRecord]:
     """Return the bodies; a massless one between two hinges whose axes meet makes them a universal joint."""
     records = []
     for group in groups.values():
-        if not group.masses:
+        is_ground = has_ground and group.parent is None
+        if is_ground:
+            zero = np.zeros(3)
+            records.append(BodyRecord(group.name, 0.0, zero, np.zeros((3, 3)), None, None))
+        elif not group.masses:
             children = [child for child in groups.values() if child.parent == group.name]
             if group.parent is None or len(children) != 1 or not _can_merge(group, children[0]):
                 raise InputError(
@@ -386,7 +416,7 @@ def _records(groups: dict[str, _Group]) -> list[BodyRecord]:
             child = children[0]
             child.parent, child.at, child.joints = group.parent, group.at, group.joints + child.joints
     for group in groups.values():
-        if group.masses:
+        if group.masses and not (has_ground and group.parent is None):
             records.append(group.record(None if group.parent is None else _joint_of(group)))
     return records
 

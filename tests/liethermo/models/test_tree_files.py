@@ -119,7 +119,7 @@ def test_urdf_that_is_not_covered_is_refused(text, message):
         (MJCF.replace("</mujoco>", "<equality/></mujoco>"), "the element 'equality' in mujoco"),
         (MJCF.replace('stiffness="4"', 'armature="4"'), "armature='4'"),
         (MJCF.replace('stiffness="4"', 'class="big"'), "the attribute 'class'"),
-        (MJCF.replace("<freejoint/>", ""), "needs a freejoint"),
+        (MJCF.replace("<worldbody>", '<worldbody><body name="other"/>'), "must be the only body"),
         (MJCF.replace('timestep="0.001"', 'viscosity="0.1"'), "viscosity='0.1'"),
         (MJCF.replace('pos="0.8 0 0" mass', 'pos="0.8 0" mass'), "must be 3 finite numbers"),
         (MJCF.replace('<joint axis="1 0 0" damping="0"/>', '<joint type="slide" axis="1 0 0"/>'), "slide and hinge"),
@@ -147,3 +147,39 @@ def test_a_massless_link_between_two_hinges_is_a_universal_joint():
     assert {name: end - start for name, start, end in system.joint_ranges} == {"panel": 1, "mass": 1, "dish": 2}
     with pytest.raises(lt.InputError, match="the body 'cross' has no mass"):
         lt.bodies.Tree.from_urdf(text.replace('<child link="dish"/>', '<child link="dish"/><origin xyz="0 0 0.1"/>'))
+
+
+GROUND_MJCF = """<mujoco><compiler angle="radian"/><worldbody>
+  <body name="upper" pos="0 0 1"><joint type="hinge" axis="0 1 0" damping="0.1"/>
+    <inertial pos="0 0 -0.5" mass="1" diaginertia="0.08 0.08 0.01"/>
+    <body name="lower" pos="0 0 -1"><joint type="hinge" axis="0 1 0"/>
+      <inertial pos="0 0 -0.4" mass="0.7" diaginertia="0.05 0.05 0.01"/></body></body>
+</worldbody></mujoco>"""
+"""A double pendulum in the world, without a free joint."""
+
+GROUND_URDF = """<robot name="arm"><link name="table"/>
+  <link name="upper"><inertial><origin xyz="0 0 -0.5"/><mass value="1"/>
+    <inertia ixx="0.08" iyy="0.08" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <link name="lower"><inertial><origin xyz="0 0 -0.4"/><mass value="0.7"/>
+    <inertia ixx="0.05" iyy="0.05" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="a" type="continuous"><parent link="table"/><child link="upper"/><origin xyz="0 0 1"/>
+    <axis xyz="0 1 0"/><dynamics damping="0.1"/></joint>
+  <joint name="b" type="continuous"><parent link="upper"/><child link="lower"/><origin xyz="0 0 -1"/>
+    <axis xyz="0 1 0"/></joint>
+</robot>"""
+
+
+def test_trees_on_the_ground():
+    tree = lt.bodies.Tree(ground="floor")
+    hinge = lt.bodies.Hinge((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), damping=0.1)
+    tree.add("upper", 1.0, (0.0, 0.0, -0.5), (0.08, 0.08, 0.01), parent="floor", joint=hinge)
+    elbow = lt.bodies.Hinge((0.0, 0.0, -1.0), (0.0, 1.0, 0.0))
+    tree.add("lower", 0.7, (0.0, 0.0, -0.4), (0.05, 0.05, 0.01), parent="upper", joint=elbow)
+    system, x = tree.system(gravity=(0.0, 0.0, -9.81)), np.array([0.3, -0.2, 0.1, 0.4])
+    from_files = lt.bodies.Tree.from_mjcf(GROUND_MJCF), lt.bodies.Tree.from_urdf(GROUND_URDF, fixed_base=True)
+    assert [other.base for other in from_files] == ["world", "table"]
+    for other in from_files:
+        field = other.system(gravity=(0.0, 0.0, -9.81)).vector_field(x)
+        np.testing.assert_allclose(np.asarray(field), np.asarray(system.vector_field(x)), atol=1e-13)
+    with pytest.raises(lt.InputError, match="no mass"):
+        lt.bodies.Tree.from_urdf(GROUND_URDF)
