@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +12,10 @@ import scipy
 
 from manifolds._arrays import is_traced
 
-from .energy import Energy, Linear
+from ..errors import InputError
+from .energy import Energy, Linear, SpanLimitedEnergy, StateTimeEnergy
 from .indices import sparsity_pattern
+from .time_span import TimeSpan
 
 MAX_SERIES_ARGUMENT = 1 / 32
 """Largest argument of the series of ``(exp(z) - 1) / z``: its truncation after eight terms is then below rounding."""
@@ -77,6 +80,59 @@ class ReservoirEnergy(Linear):
     @property
     def capacity(self) -> jax.Array:
         return jnp.full_like(self.b, jnp.inf)
+
+
+class DrivenReservoirEnergy(Energy):
+    """The energy ``T(t) y`` of a bath of infinite capacity, whose temperature is a function of the time.
+
+    A device changes the temperature. At a fixed entropy y it does the work ``y T'(t)``, as for a reservoir whose levels
+    are all multiplied by the same factor.
+
+    Attributes
+    ----------
+    temperature : function of the time to an array of shape ()
+    """
+
+    temperature: Callable
+
+    depends_on_time = True
+
+    def at_time(self, t) -> ReservoirEnergy:
+        return ReservoirEnergy(self.temperature(t)[None])
+
+    def with_time(self) -> Energy:
+        return _ReservoirEnergyOfTime(SpanLimitedEnergy(_TemperatureTimesEntropy(self.temperature), TimeSpan()))
+
+    def value(self, x) -> jax.Array:
+        raise InputError("this energy depends on time, so its value needs a time. Call energy(x, t)")
+
+
+class _TemperatureTimesEntropy(Energy):
+    """The energy ``T(t) y`` as a function of (y, t)."""
+
+    temperature: Callable
+
+    def value(self, x) -> jax.Array:
+        return self.temperature(x[1]) * x[0]
+
+
+class _ReservoirEnergyOfTime(StateTimeEnergy):
+    """The energy ``T(t) y`` as a function of (y, t), with its change over a step in closed form."""
+
+    def difference_rounding_scale(self, x) -> jax.Array:
+        return jnp.zeros(())
+
+    def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
+        """Return the mean temperature, and the difference quotient of the temperatures times the mean entropy."""
+        (y, start), (change, duration) = x + compensation, d
+        assert isinstance(self.energy, SpanLimitedEnergy)
+        assert isinstance(self.energy.energy, _TemperatureTimesEntropy)
+        temperature, clip = self.energy.energy.temperature, self.energy.span.clip
+        first, last = temperature(clip(start)), temperature(clip(start + duration))
+        _, slope = jax.jvp(temperature, (clip(start),), (jnp.ones(()),))
+        is_zero = duration == 0.0
+        rate = jnp.where(is_zero, slope, (last - first) / jnp.where(is_zero, 1.0, duration))
+        return jnp.stack([0.5 * (first + last), rate * (y + 0.5 * change)])
 
 
 def make_bath_energy(capacity: jax.Array, temperature: jax.Array) -> BathEnergy | ReservoirEnergy:

@@ -7,8 +7,6 @@ import jax
 import jax.numpy as jnp
 import scipy
 
-from manifolds._pytree_module import forward_to
-
 from .bath_energy import ReservoirEnergy
 from .coordinates import Components
 from .energy import Energy, Pullback
@@ -27,7 +25,7 @@ class BodyBathsEnergy(Energy):
     body : Energy
         Energy of the first ``body_dim`` components. It may depend on time.
     baths : Energy
-        Energy of the other components.
+        Energy of the other components. It may depend on time.
     body_dim, dim : int
         Number of components of the body, and of the state.
     """
@@ -48,10 +46,12 @@ class BodyBathsEnergy(Energy):
     def is_quadratic(self) -> bool:
         return self.body.is_quadratic and self.baths.is_quadratic
 
-    depends_on_time = forward_to("body")
+    @property
+    def depends_on_time(self) -> bool:
+        return self.body.depends_on_time or self.baths.depends_on_time
 
     def at_time(self, t) -> Energy:
-        return BodyBathsEnergy(self.body.at_time(t), self.baths, self.body_dim, self.dim)
+        return BodyBathsEnergy(self.body.at_time(t), self.baths.at_time(t), self.body_dim, self.dim)
 
     @property
     def _energies_and_components(self) -> tuple[tuple[Energy, Components], ...]:

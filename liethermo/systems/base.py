@@ -120,10 +120,16 @@ class System(SystemInterface):
             self.momentum_maps = {name: with_polynomial_degrees(J, dim) for name, J in self.momentum_maps.items()}
         dissipation = sum_dissipations(dissipation)
         bath_terms: tuple[Dissipation, ...] = ()
-        if dissipation is not None and self.entropy is None:
-            bath_terms = tuple(term for term in dissipation.terms if term.needs_entropy)
-            dissipation = sum_dissipations([term for term in dissipation.terms if not term.needs_entropy] or None)
+        if dissipation is not None:
+
+            def drives_baths(term: Dissipation) -> bool:
+                return term.acts_on_baths_alone or (self.entropy is None and term.needs_entropy)
+
+            bath_terms = tuple(term for term in dissipation.terms if drives_baths(term))
+            dissipation = sum_dissipations([term for term in dissipation.terms if not drives_baths(term)] or None)
         for term in bath_terms:
+            if baths is None and term.acts_on_baths_alone:
+                raise InputError(f"{type(term).__name__} acts on baths: give the system baths=lt.HeatBaths(...)")
             if baths is None:
                 raise InputError(f"{type(term).__name__} drives the entropy up, so the system needs an entropy")
             if not term.can_drive_baths:
@@ -187,12 +193,20 @@ class System(SystemInterface):
         return energy.on(range(self.body_dim))
 
     @with_library_settings
-    def temperatures(self, x) -> jax.Array:
-        """Return the temperatures of the baths, shape (..., number of baths), for states of shape (..., n)."""
+    def temperatures(self, x, t=None) -> jax.Array:
+        """Return the temperatures of the baths, shape (..., number of baths), for states of shape (..., n).
+
+        Temperatures that are functions of the time are those at the times t, shape (...).
+        """
         if self.baths is None:
             raise InputError("this system has no baths: give it baths=lt.HeatBaths(...)")
-        entropies = jnp.asarray(x)[..., self.body_dim :]
-        return jnp.vectorize(self.baths.energy.gradient, signature="(m)->(m)")(entropies)
+        entropies, energy = jnp.asarray(x)[..., self.body_dim :], self.baths.energy
+        if not energy.depends_on_time:
+            return jnp.vectorize(energy.gradient, signature="(m)->(m)")(entropies)
+        if t is None:
+            raise InputError("a temperature of these baths depends on the time: give the times beside the states")
+        evaluate = jnp.vectorize(lambda y, t: energy.at_time(t).gradient(y), signature="(m),()->(m)")
+        return evaluate(entropies, jnp.asarray(t, dtype=jnp.float64))
 
     def energy_of_vectors(self, energy: Energy) -> Energy:
         """Return a function of flat states from a function of states in the shape that users see."""

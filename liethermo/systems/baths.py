@@ -16,10 +16,11 @@ from manifolds._pytree_module import Module
 from manifolds.structures.poisson import ProductPoisson
 
 from ..errors import InputError
-from ..functions.bath_energy import BathEnergy, ReservoirEnergy, make_bath_energy
+from ..functions.bath_energy import BathEnergy, DrivenReservoirEnergy, ReservoirEnergy, make_bath_energy
+from ..functions.checks import traced_function_and_shape
 from ..functions.conditions import checked_numbers
 from ..functions.each import Each
-from ..functions.energy import Energy
+from ..functions.energy import Energy, Pullback, Sum
 
 
 class HeatBaths(Module):
@@ -32,14 +33,18 @@ class HeatBaths(Module):
 
     Parameters
     ----------
-    capacity, temperature : float > 0, or array, shape (number,)
-        C (energy / temperature) and T (temperature, at y = 0), in any consistent units. A bath of infinite capacity
-        keeps its temperature, ``U = T y``.
+    capacity : float > 0, or array, shape (number,)
+        C (energy / temperature), in any consistent units. A bath of infinite capacity keeps its temperature, ``U = T
+        y``.
+    temperature : float > 0, or array, shape (number,); or function of the time; or a sequence with an entry per bath
+        T (temperature, at y = 0). A bath of infinite capacity may have a temperature that is a function of the time t,
+        shape (), to a number > 0: ``U = T(t) y``. A device that changes the temperature does the work ``y T'(t)``,
+        which a run accounts for; the heat that the bath receives is ``T(t) y`` less this work.
     number : int
         The number of baths.
-    energy : function from y, a scalar, to a scalar, optional
+    energy : function from y, a scalar, to a scalar; or a sequence with a function or None per bath; optional
         The energy of each bath as a function of its entropy y (energy / temperature), instead of the two numbers. It
-        has to increase.
+        has to increase. Electrons with the capacity ``c T``, for example, have ``U = T y + y^2 / (2 c)``.
 
     Attributes
     ----------
@@ -63,22 +68,47 @@ class HeatBaths(Module):
     energy: Energy
     number: int = eqx.field(static=True)
 
-    def __init__(self, capacity=1.0, temperature=1.0, number: int = 1, energy: Callable | None = None):
+    def __init__(self, capacity=1.0, temperature=1.0, number: int = 1, energy=None):
         if isinstance(number, bool) or not isinstance(number, int) or number < 1:
             raise InputError(f"the number of baths is a positive integer, not {number!r}")
         self.number = number
-        if energy is None:
+        if callable(energy):
+            self.energy = Each(_BathEnergyFunction(energy), np.arange(number)[:, None])
+            return
+        functions = _entries_of_baths(energy, "energy", number) if energy is not None else [None] * number
+        temperatures = _entries_of_baths(temperature, "temperature", number)
+        driven = [i for i, T in enumerate(temperatures) if callable(T) and functions[i] is None]
+        if not driven and all(function is None for function in functions):
             parameters = {"capacity": capacity, "temperature": temperature}
             self.energy = make_bath_energy(
                 *(_check_positive(value, what, number, what == "capacity") for what, value in parameters.items())
             )
-        else:
-            self.energy = Each(_BathEnergyFunction(energy), np.arange(number)[:, None])
+            return
+        numbers = [1.0 if callable(T) else T for T in temperatures]
+        C, T = (
+            _check_positive(capacity, "capacity", number, True),
+            _check_positive(numbers, "temperature", number, False),
+        )
+        for i in driven:
+            if not is_traced(C) and np.isfinite(C[i]):
+                raise InputError(
+                    f"the temperature of bath {i} is a function of the time, so its capacity must be infinite, not "
+                    f"{float(C[i]):g}. Set capacity=np.inf"
+                )
+        terms: list[Energy] = [
+            DrivenReservoirEnergy(_checked_temperature_function(temperatures[i], i)).on([i]) for i in driven
+        ]
+        terms += [Each(_BathEnergyFunction(f), np.array([[i]])) for i, f in enumerate(functions) if f is not None]
+        constant = np.array([i for i, f in enumerate(functions) if f is None and i not in driven], dtype=int)
+        if constant.size:
+            terms.append(make_bath_energy(C[constant], T[constant]).on(constant))
+        self.energy = Sum.of(terms)
 
     @property
     def has_positive_temperatures(self) -> bool:
         """True if the temperatures are positive in every state by construction."""
-        return isinstance(self.energy, BathEnergy | ReservoirEnergy)
+        terms = (term.term if isinstance(term, Pullback) else term for term in self.energy.terms)
+        return all(isinstance(term, BathEnergy | ReservoirEnergy | DrivenReservoirEnergy) for term in terms)
 
     @property
     def scale(self) -> np.ndarray | float:
@@ -90,6 +120,31 @@ class HeatBaths(Module):
         if not isinstance(self.energy, BathEnergy):  # any scale suits a bath of constant temperature
             return jnp.ones(self.number)
         return jnp.where(jnp.isfinite(self.energy.capacity), self.energy.capacity, 1.0)
+
+
+def _entries_of_baths(value, what: str, number: int) -> list:
+    """Return an entry for each bath, from one for all or a sequence."""
+    if not isinstance(value, list | tuple):
+        return [value] * number if callable(value) or np.ndim(value) == 0 else list(value)
+    if len(value) != number:
+        raise InputError(f"the {what} of {number} baths has an entry for each, not {len(value)} entries")
+    return list(value)
+
+
+def _checked_temperature_function(function: Callable, index: int) -> Callable:
+    what = f"the temperature of bath {index}"
+    traced, _ = traced_function_and_shape(function, ((),), [()], what, "a time")
+    return _PositiveTemperature(traced)
+
+
+class _PositiveTemperature(Module):
+    """A temperature as a function of time; NaN where it is not positive, so that a step is rejected."""
+
+    function: Callable
+
+    def __call__(self, t):
+        T = jnp.asarray(self.function(t), dtype=jnp.float64)
+        return jnp.where(T > 0.0, T, jnp.nan)
 
 
 def _check_positive(value, what: str, number: int, infinite: bool) -> jax.Array:

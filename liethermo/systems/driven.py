@@ -76,7 +76,8 @@ class DrivenSystem(System):
         self.momentum_maps = {name: self._extend_from_body(J) for name, J in body.momentum_maps.items()}
         self.dissipation = _BodyDissipation.lift_terms(body.dissipation, self._extend_from_body)
         if body.torque_name:
-            torque = _TorqueForce("conserved" if body.entropy_law is not None or body.entropy is None else None)
+            has_law = body.entropy_law is not None or body.entropy is None
+            torque = _TorqueForce(body.torque_entropy_law if has_law else None)
             self.dissipation = torque if self.dissipation is None else self.dissipation + torque
         self.preserved_labels, self.invariant_verdicts = body.preserved_labels, body.invariant_verdicts
 
@@ -183,8 +184,9 @@ class DrivenSystem(System):
 
     def torque_velocity(self, x, dH) -> jax.Array:
         """Return the velocity that a torque gives to a state, power included, for a continuous or discrete gradient."""
-        torque = self.external_torque(x)
-        return jnp.concatenate([torque, jnp.stack([jnp.zeros(()), self.unit * jnp.dot(dH[:-2], torque)])])
+        velocity = self._body_at_state(x).external_velocity(x[:-2], dH[:-2]) if self.torque is None else self.torque
+        assert velocity is not None
+        return jnp.concatenate([velocity, jnp.stack([jnp.zeros(()), self.unit * jnp.dot(dH[:-2], velocity)])])
 
     def bind_attitude(self, attitude) -> DrivenSystem:
         """Return the system with its torque evaluated at an attitude, shape (m, m)."""
@@ -201,6 +203,10 @@ class DrivenSystem(System):
         return bound
 
     surface = forward_to("body")
+    can_solve_rotations = forward_to("body")
+
+    def solve_rotation(self, angles, v):
+        return jnp.concatenate([self.body.solve_rotation(angles, v[:-2]), v[-2:]])
 
     def raise_index(self, x, alpha):
         """Return the direction of a correction along alpha, without components along the clock and the work."""

@@ -6,6 +6,7 @@ import functools
 import math
 from collections.abc import Callable, Sequence
 from copy import copy
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,10 +17,12 @@ import manifolds as mf
 from manifolds.structures.poisson import ProductPoisson
 from manifolds.structures.spins import add_vectors, cross, cross_vectors, dot_vectors, scale_vectors, split_vectors
 
-from ..dissipation.base import Dissipation
+from ..dissipation.base import Dissipation, LawName
+from ..dissipation.bath_conduction import BathConduction
 from ..dissipation.heating import Heating
 from ..dissipation.landau_lifshitz import LandauLifshitz
 from ..errors import InputError
+from ..functions.checks import traced_function_and_shape
 from ..functions.energy import Energy
 from ..functions.magnetism.spin_energy import lattice_shape
 from ..functions.magnetism.spin_torques import check_spin_torque
@@ -56,6 +59,9 @@ class SpinSystem(System):
     torque : function w of t, shape (), and s, shape ``(*sites, 3)``; or a list of them; optional
         Torques ``s x w`` (w in 1 / time) from outside, such as ``lt.magnetism.Slonczewski``. Each |s_i| stays constant.
         The torque does the work W, ``W' = sum grad_i H . (s_i x w_i)``, and the energy less the work is constant.
+    power : function of the time to a number >= 0, for the first bath; or a sequence with one or None per bath; optional
+        Power P that a device such as ``lt.magnetism.LaserPulse`` gives to a bath: ``y' = P / T`` for its entropy y and
+        temperature T, and ``W' = P``. Light has no entropy, so P is work, all of which becomes heat.
 
     Raises
     ------
@@ -65,6 +71,8 @@ class SpinSystem(System):
     lattice: tuple[int, ...] = eqx.field(static=True)
     torque: tuple[Callable, ...] | None
     torque_time: jax.Array | None
+    power: tuple[Callable, ...]
+    powered_baths: tuple[int, ...] = eqx.field(static=True)
 
     def __init__(
         self,
@@ -76,10 +84,12 @@ class SpinSystem(System):
         momentum_maps=(),
         validate: bool = True,
         torque=None,
+        power=None,
     ):
         self.lattice = lattice_shape(sites)
         self.torque = None if torque is None else check_spin_torque(torque, self.lattice)
         self.torque_time = None
+        self.powered_baths, self.power = _checked_powers(power, baths)
         poisson = mf.Spins(self.lattice, ratio=ratio)
         self._build(poisson, poisson.dim, energy, None, dissipation, momentum_maps, validate, baths=baths)
 
@@ -92,66 +102,82 @@ class SpinSystem(System):
 
     def field(self, x, dH, dS, dL=()):
         """Return the vector field; precession and damping of the spins are added before they are stored in a state."""
-        torque = self.external_torque(x)
-        if torque is not None:
-            return self.drop_torque().field(x, dH, dS, dL) + torque
-        damping, heating = _split_damping(self.dissipation)
-        spins, n = self._spin_structure, self.body_dim
-        if damping is None or spins is None:
+        velocity = self.external_velocity(x, dH)
+        if velocity is not None:
+            return self.drop_torque().field(x, dH, dS, dL) + velocity
+        parts, spins, n = _split_damping(self.dissipation), self._spin_structure, self.body_dim
+        if parts is None or spins is None:
             return super().field(x, dH, dS, dL)
+        damping, heating, conduction = parts
         if heating is None:
             force, _ = damping.damping_force_and_energy_loss(spins, x, dH)
-            entropy_rates = jnp.zeros(0)
+            entropy_rates = jnp.zeros(self.dim - n)
         else:  # the entropy is that of the baths
             force, lost_power = damping.damping_force_and_energy_loss(
                 spins, x, dH, heating.temperature_signs(dH[n:]), heating.has_site_baths
             )
             entropy_rates = heating.entropy_rates(lost_power, dH[n:])
+        for term in conduction:
+            entropy_rates = entropy_rates + term.entropy_rates(dH[n:], dS[n:])
         return spins.join_state(add_vectors(spins.precession_rates(x, dH), force), entropy_rates)
 
     # -- the torque -----------------------------------------------------------------------------------------------
 
     @property
+    def _has_drive(self) -> bool:
+        return self.torque is not None or bool(self.power)
+
+    @property
     def torque_name(self) -> str:
-        return "" if self.torque is None else torque_name(self.torque)
+        return torque_name((*(self.torque or ()), *self.power))
 
     @property
     def torque_invariant_casimirs(self) -> frozenset[str]:
         return frozenset(self.casimirs())  # a torque s x w keeps every length
 
     @property
+    def torque_entropy_law(self) -> LawName:
+        return "nondecreasing" if self.power else "conserved"
+
+    @property
     def is_driven(self) -> bool:
-        return super().is_driven or (self.torque is not None and self.torque_time is None)
+        return super().is_driven or (self._has_drive and self.torque_time is None)
 
     def at_time(self, t):
         system = super().at_time(t)
-        if self.torque is None:
+        if not self._has_drive:
             return system
-        system = copy(system)
-        object.__setattr__(system, "torque_time", jnp.asarray(t, dtype=jnp.float64))
-        return system
+        return _copy_with(system, torque_time=jnp.asarray(t, dtype=jnp.float64))
 
     def external_torque(self, x):
-        if self.torque is None:
+        return self.external_velocity(x, self.energy.gradient(x)) if self._has_drive else None
+
+    def external_velocity(self, x, dH):
+        if not self._has_drive:
             return None
         if self.torque_time is None:
             raise InputError(f"the torque {self.torque_name} is known at a time: take system.at_time(t)")
-        s = x[: self.body_dim].reshape(*self.lattice, 3)
-        total = sum((term(self.torque_time, s) for term in self.torque), jnp.zeros(3))
-        torque = cross(s, jnp.broadcast_to(total, s.shape))
-        return jnp.pad(torque.reshape(-1), (0, self.dim - self.body_dim))
+        s, n = x[: self.body_dim].reshape(*self.lattice, 3), self.body_dim
+        total = sum((term(self.torque_time, s) for term in self.torque or ()), jnp.zeros(3))
+        rates = cross(s, jnp.broadcast_to(total, s.shape)).reshape(-1)
+        T, entropy_rates = dH[n:], jnp.zeros(self.dim - n)
+        for bath, power in zip(self.powered_baths, self.power, strict=True):
+            P = jnp.asarray(power(self.torque_time))
+            entropy_rates = entropy_rates.at[bath].add(jnp.where(P >= 0.0, P, jnp.nan) / T[bath])
+        return jnp.concatenate([rates, entropy_rates])
 
     def drop_torque(self):
-        if self.torque is None:
+        if not self._has_drive:
             return self
-        system = copy(self)
-        for name in ("torque", "torque_time"):
-            object.__setattr__(system, name, None)
-        return system
+        return _copy_with(self, torque=None, torque_time=None, power=(), powered_baths=())
+
+    def drop_baths(self):
+        body = super().drop_baths()
+        return _copy_with(body, power=(), powered_baths=()) if self.power else body
 
     @property
     def is_torque_free(self) -> bool:
-        return self.torque is None and super().is_torque_free
+        return not self._has_drive and super().is_torque_free
 
     def scale_at_sites(self, values, v) -> jax.Array:
         """Return a vector v multiplied by ``values``, one for each site or one for all."""
@@ -167,6 +193,10 @@ class SpinSystem(System):
         spins = self._spin_structure
         assert spins is not None
         return dot_vectors(spins.split_covectors(alpha), spins.split_covectors(v))
+
+    @property
+    def can_solve_rotations(self) -> bool:
+        return self._spin_structure is not None
 
     def solve_rotation(self, angles, v) -> jax.Array:
         """Return u with ``u_i - angles_i x u_i = v_i`` at each spin, angles of shape (sites, 3), and u = v elsewhere.
@@ -207,7 +237,7 @@ class SpinSystem(System):
         """Return the system with its spins component by component; None for dissipations that may use the order."""
         spins = self._spin_structure
         is_reorderable = type(self) is SpinSystem and (
-            self.dissipation is None or _split_damping(self.dissipation)[0] is not None
+            self.dissipation is None or _split_damping(self.dissipation) is not None
         )
         if not is_reorderable or spins is None or spins.is_component_major or self.is_driven:
             return None
@@ -229,8 +259,55 @@ class SpinSystem(System):
         return poisson if isinstance(poisson, mf.Spins) else None
 
 
-def _split_damping(dissipation: Dissipation | None) -> tuple[LandauLifshitz | None, Heating | None]:
-    """Return the damping of the spins and the heating of baths by it; None for subclasses, whose force may differ."""
-    heating = dissipation if type(dissipation) is Heating else None
-    damping = dissipation if heating is None else heating.inner
-    return (damping if type(damping) is LandauLifshitz else None), heating
+def _checked_powers(power, baths: HeatBaths | None) -> tuple[tuple[int, ...], tuple[Callable, ...]]:
+    """Return the indices of the baths that receive power, and their powers as traced functions of the time."""
+    if power is None:
+        return (), ()
+    if not isinstance(baths, HeatBaths):
+        raise InputError("power= heats baths, and there are none: give baths=lt.HeatBaths(...)")
+    entries = list(power) if isinstance(power, list | tuple) else [power, *[None] * (baths.number - 1)]
+    if len(entries) != baths.number:
+        raise InputError(f"the power of {baths.number} baths has an entry for each, not {len(entries)} entries")
+    for i, entry in enumerate(entries):
+        if not callable(entry) and entry is not None:
+            raise InputError(
+                f"the power of bath {i} must be a function of the time, such as lt.magnetism.LaserPulse, or None, got "
+                f"{entry!r:.60}"
+            )
+    functions = {
+        i: traced_function_and_shape(entry, ((),), [()], f"the power of bath {i}", "a time")[0]
+        for i, entry in enumerate(entries)
+        if entry is not None
+    }
+    return tuple(functions), tuple(functions.values())
+
+
+def _copy_with(system: System, **attributes):
+    """Return a copy of a system with other attributes."""
+    copied = copy(system)
+    for name, value in attributes.items():
+        object.__setattr__(copied, name, value)
+    return copied
+
+
+class _DampingParts(NamedTuple):
+    """The damping of the spins, the heating of baths by it, and the conduction between baths."""
+
+    damping: LandauLifshitz
+    heating: Heating | None
+    conduction: tuple[BathConduction, ...]
+
+
+def _split_damping(dissipation: Dissipation | None) -> _DampingParts | None:
+    """Return the parts of a dissipation; None unless it is one damping, with heat conduction between baths or without.
+
+    It is None for subclasses, whose force may differ.
+    """
+    terms = () if dissipation is None else dissipation.terms
+    conduction = tuple(term for term in terms if type(term) is BathConduction)
+    others = [term for term in terms if type(term) is not BathConduction]
+    if len(others) != 1:
+        return None
+    heating = others[0] if type(others[0]) is Heating else None
+    damping = others[0] if heating is None else heating.inner
+    return _DampingParts(damping, heating, conduction) if type(damping) is LandauLifshitz else None

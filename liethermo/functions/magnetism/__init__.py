@@ -6,6 +6,7 @@ from .bond_terms import biquadratic, exchange_tensor
 from .correlations import StructureFactor, dynamic_structure_factor, structure_factor, topological_charge
 from .dipoles import dipoles
 from .grid_terms import dzyaloshinskii_moriya, exchange
+from .laser import LaserPulse
 from .lattices import Bonds, Lattice, lattice
 from .micromagnetics import (
     continuum_antisymmetric_exchange,
@@ -31,6 +32,7 @@ from .units import SpinDynamics, Units, units
 __all__ = [
     "Bonds",
     "HysteresisLoop",
+    "LaserPulse",
     "Lattice",
     "Minimum",
     "Slonczewski",
