@@ -209,6 +209,44 @@ class SpinSystem(System):
         u = add_vectors(add_vectors(r, cross_vectors(a, r)), scale_vectors(dot_vectors(a, r), a))
         return spins.join_state(scale_vectors(1.0 / (1.0 + dot_vectors(a, a)), u), v[self.body_dim :])
 
+    def largest_step(self, x, angle: float = 0.3, boltzmann: float = 0.0, t: float = 0.0) -> float:
+        """Return the step (time) in which no spin turns by more than an ``angle``, in its field or by noise.
+
+        A spin turns at the rate ``sqrt(ratio^2 + (rate |s|)^2) |grad_i H|`` at most. Noise turns it by angles of the
+        variance ``2 k T rate h`` in each component, which is kept below the square of the angle.
+
+        Parameters
+        ----------
+        x : array, shape (n,) or ``(*sites, 3)``
+        angle : float > 0
+            In radian. Steps with noise have a bias of about a per cent with 0.3 [:doc:`/explanation/fluctuations`].
+        boltzmann : float >= 0
+            k, as of ``lt.Fluctuations``, for steps with noise; the temperatures are those of the baths.
+        t : float
+            The time, for an energy or a temperature that depends on it.
+
+        Raises
+        ------
+        InputError
+            If no spin turns.
+        """
+        state, spins, n = self.state(x), self._spin_structure, self.body_dim
+        assert spins is not None
+        system = self.at_time(t)
+        gradient, s = system.energy.gradient(state), np.asarray(state[:n]).reshape(-1, 3)
+        field = np.linalg.norm(np.asarray(gradient[:n]).reshape(-1, 3), axis=1)
+        parts = _split_damping(self.dissipation)
+        rate = np.zeros(()) if parts is None else np.abs(np.asarray(parts.damping.rate)).ravel()
+        damping_rate = rate * np.linalg.norm(s, axis=1)
+        turning_rate = float((np.hypot(np.ravel(spins.ratio), damping_rate) * field).max())
+        diffusion = 0.0
+        if boltzmann and parts is not None and parts.heating is not None:
+            temperature = np.asarray(parts.heating.values_at_sites(gradient[n:]))
+            diffusion = float((2.0 * boltzmann * np.abs(temperature) * rate).max())
+        if not (turning_rate > 0.0 or diffusion > 0.0):
+            raise InputError("no spin turns at this state, so any step will do: give a state away from rest")
+        return min(angle / turning_rate if turning_rate else np.inf, angle**2 / diffusion if diffusion else np.inf)
+
     def state_array(self, x, batch: bool = False):
         """Return the flat state x; x may be the spins alone, shape ``(*sites, 3)``."""
         shape, x_shape = (*self.lattice, 3), np.shape(x)

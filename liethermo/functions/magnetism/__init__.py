@@ -27,13 +27,16 @@ from .site_terms import (
 )
 from .spin_torques import Slonczewski, SpinOrbit, ZhangLi
 from .spin_waves import spin_temperature, spin_wave_frequencies
+from .transitions import Estimate, MagnetSamples, binder_cumulant, cumulant_crossing
 from .units import SpinDynamics, Units, units
 
 __all__ = [
     "Bonds",
+    "Estimate",
     "HysteresisLoop",
     "LaserPulse",
     "Lattice",
+    "MagnetSamples",
     "Minimum",
     "Slonczewski",
     "SpinDynamics",
@@ -43,10 +46,12 @@ __all__ = [
     "VectorField",
     "ZhangLi",
     "anisotropy",
+    "binder_cumulant",
     "biquadratic",
     "continuum_antisymmetric_exchange",
     "continuum_exchange",
     "cubic_anisotropy",
+    "cumulant_crossing",
     "demagnetisation",
     "demagnetising_factors",
     "dipoles",
