@@ -14,6 +14,7 @@ from manifolds._names import public_dir
 from . import bodies, models, testing
 from .dissipation.adiabatic import AdiabaticJumps
 from .dissipation.base import Dissipation
+from .dissipation.bath_conduction import BathConduction
 from .dissipation.double_bracket import DoubleBracket
 from .dissipation.factor import Factor
 from .dissipation.force import EulerPoincareForce
@@ -128,6 +129,7 @@ __all__ = [
     "AttitudeSystem",
     "Audit",
     "AxiomError",
+    "BathConduction",
     "CasimirError",
     "ChartSystem",
     "ChetaevSystem",

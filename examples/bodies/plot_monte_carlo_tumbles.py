@@ -22,10 +22,16 @@ import liethermo as lt
 n = 2_000
 rng = np.random.default_rng(1958)
 mass, length, radius = 14.0, 2.03, 0.08  # kg, m
-nominal = mass * np.array([length**2 / 12.0 + radius**2 / 4.0] * 2 + [radius**2 / 2.0])  # kg m^2, a cylinder
-moments = nominal * (1.0 + 0.03 * rng.standard_normal((n, 2))[:, [0, 0, 1]])  # 3 % each, round about the long axis
+nominal = mass * np.array(
+    [length**2 / 12.0 + radius**2 / 4.0] * 2 + [radius**2 / 2.0]
+)  # kg m^2, a cylinder
+moments = nominal * (
+    1.0 + 0.03 * rng.standard_normal((n, 2))[:, [0, 0, 1]]
+)  # 3 % each, round about the long axis
 spin = np.pi * (1.0 + 0.02 * rng.standard_normal(n))  # rad/s: a turn in two seconds
-cone = np.radians(np.abs(rng.normal(0.0, 1.0, n)) + 0.1)  # rad, between the long axis and the angular momentum
+cone = np.radians(
+    np.abs(rng.normal(0.0, 1.0, n)) + 0.1
+)  # rad, between the long axis and the angular momentum
 rate = 0.04  # s / (kg m^2)
 
 L = moments[:, 2] * spin / np.cos(cone)
@@ -33,7 +39,13 @@ momenta = L[:, None] * np.stack([np.sin(cone), np.zeros(n), np.cos(cone)], axis=
 
 
 def satellite(p):
-    return lt.models.tumbling_body(p["inertia"], rate=rate, capacity=mass * 500.0, temperature=300.0, attitude=False)
+    return lt.models.tumbling_body(
+        p["inertia"],
+        rate=rate,
+        capacity=mass * 500.0,
+        temperature=300.0,
+        attitude=False,
+    )
 
 
 def sideways_excess(x):
@@ -58,13 +70,19 @@ print(f"{n} flights in {time.perf_counter() - begin:.0f} s")
 # The angle from the long axis obeys :math:`\tan\theta(t) = \tan\theta_0 \exp(\lambda\, (1/I_3 - 1/I_1)\, L^2 t)`, with
 # the rate :math:`\lambda` of the friction. So each satellite is at 45 degrees at a known time.
 
-exact = -np.log(np.tan(cone)) / (rate * (1.0 / moments[:, 2] - 1.0 / moments[:, 0]) * L**2)
-print(f"largest relative error of the 2,000 times: {np.abs(flights.event_time / exact - 1.0).max():.0e}")
+exact = -np.log(np.tan(cone)) / (
+    rate * (1.0 / moments[:, 2] - 1.0 / moments[:, 0]) * L**2
+)
+print(
+    f"largest relative error of the 2,000 times: {np.abs(flights.event_time / exact - 1.0).max():.0e}"
+)
 assert np.abs(flights.event_time / exact - 1.0).max() < 1e-5
 
 minutes = flights.event_time / 60.0
 low, median, high = np.percentile(minutes, [5.0, 50.0, 95.0])
-print(f"turned over after {median:.1f} minutes, from {low:.1f} to {high:.1f} in 90 of 100 cases")
+print(
+    f"turned over after {median:.1f} minutes, from {low:.1f} to {high:.1f} in 90 of 100 cases"
+)
 
 # %%
 
@@ -72,6 +90,8 @@ figure, (left, right) = plt.subplots(1, 2, figsize=(9.0, 3.4), layout="constrain
 left.hist(minutes, bins=60, color="#0072B2")
 left.set(xlabel="time to 45 degrees (minutes)", ylabel="number of satellites")
 right.scatter(np.degrees(cone), minutes, s=3.0, color="#D55E00")
-right.set(xlabel="angle at the separation (degrees)", ylabel="time to 45 degrees (minutes)")
+right.set(
+    xlabel="angle at the separation (degrees)", ylabel="time to 45 degrees (minutes)"
+)
 for axes in (left, right):
     axes.spines[["top", "right"]].set_visible(False)

@@ -100,6 +100,12 @@ class Dissipation(Module):
         own."""
         return False
 
+    @property
+    def acts_on_baths_alone(self) -> bool:
+        """True if its force has components along the entropies of baths only, and depends on their temperatures
+        only."""
+        return False
+
     def bind_to(self, system: Geometry) -> Dissipation:
         """Return this dissipation, checked against its system and completed by properties of the system."""
         return self

@@ -60,6 +60,10 @@ class HeatConduction(Dissipation):
     def entropy_law(self) -> LawName | None:
         return "nondecreasing" if self.fourier_factors == "discrete" else None
 
+    def entropy_indices(self, system) -> np.ndarray:
+        """Return the index of each entropy in the state."""
+        return _state_indices(system).S
+
     def conductances(self, x, T_i, T_j) -> jax.Array:
         """Return the conductances of the edges at these temperatures, shape (edges,); NaN where one is negative."""
         if not self.laws:
@@ -68,15 +72,28 @@ class HeatConduction(Dissipation):
         return jnp.where(values >= 0.0, values, jnp.nan)
 
     def force(self, system, x, dH, dS, dL):
-        S, i, j = _state_indices(system).S, np.asarray(self.first_bodies), np.asarray(self.second_bodies)
-        T, dS_S = _nan_unless_positive(dH[S]), dS[S]
-        T_factors = T if self.fourier_factors == "discrete" else _nan_unless_positive(system.energy.gradient(x)[S])
-        heat = self.conductances(x, T_factors[i], T_factors[j]) * (dS_S[i] * T_factors[j] - dS_S[j] * T_factors[i])
+        S, i, j = self.entropy_indices(system), np.asarray(self.first_bodies), np.asarray(self.second_bodies)
+        T_factors = dH[S] if self.fourier_factors == "discrete" else system.energy.gradient(x)[S]
+        first, second = self.edge_entropy_rates(x, dH[S], dS[S], T_factors)
+        return jnp.zeros_like(x).at[S[i]].add(first).at[S[j]].add(second)
+
+    def edge_entropy_rates(self, x, T, dS, T_factors) -> tuple[jax.Array, jax.Array]:
+        """Return the entropy rates of the first and the second body of each edge, shape (edges,).
+
+        Parameters
+        ----------
+        x : array, shape (n,)
+        T, dS, T_factors : array, shape (bodies,)
+            Components of the gradients of energy and entropy, and the temperatures in the Fourier factors.
+        """
+        i, j = np.asarray(self.first_bodies), np.asarray(self.second_bodies)
+        T, T_factors = _nan_unless_positive(T), _nan_unless_positive(T_factors)
+        heat = self.conductances(x, T_factors[i], T_factors[j]) * (dS[i] * T_factors[j] - dS[j] * T_factors[i])
         ratio = heat / (T_factors[i] * T_factors[j])
-        return jnp.zeros_like(x).at[S[i]].add(ratio * T[j]).at[S[j]].add(-ratio * T[i])
+        return ratio * T[j], -ratio * T[i]
 
     def factor(self, system, x, dH, dL):
-        S, i, j = _state_indices(system).S, np.asarray(self.first_bodies), np.asarray(self.second_bodies)
+        S, i, j = self.entropy_indices(system), np.asarray(self.first_bodies), np.asarray(self.second_bodies)
         T = _nan_unless_positive(dH[S])
         root = jnp.sqrt(self.conductances(x, T[i], T[j]) * T[i] * T[j])
 
@@ -88,7 +105,7 @@ class HeatConduction(Dissipation):
     def couplings(self, system):
         if self.laws:
             return None  # the laws may depend on all components
-        S = _state_indices(system).S
+        S = self.entropy_indices(system)
         return clique_pattern(
             np.stack([S[np.asarray(self.first_bodies)], S[np.asarray(self.second_bodies)]], axis=1), system.dim
         )

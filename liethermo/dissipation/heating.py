@@ -66,7 +66,7 @@ class Heating(LiftedDissipation):
         B = self.inner.factor(body, x[:n], dH[:n], tuple(L[:n] for L in dL))
         if B is None:
             return None
-        T = self._bath_values_at_sites(dH[n:])
+        T = self.values_at_sites(dH[n:])
         scale = sqrt_or_zero(self.temperature_signs(dH[n:]) * T)
 
         def times(w):
@@ -85,12 +85,12 @@ class Heating(LiftedDissipation):
         assert B is not None
         if self.has_site_baths and not B.solenoidal:  # each site has a temperature of its own
             return super().divergence(system, x)
-        T = jnp.abs(self._bath_values_at_sites(dH[n:]))
+        T = jnp.abs(self.values_at_sites(dH[n:]))
         body_divergence = jnp.zeros(B.size) if B.solenoidal else jnp.sqrt(T) * self.inner.divergence(body, x[:n])
         slopes = temperature_slopes(system.energy, x, n)
         if slopes is None:
             return body_divergence
-        ratio = jnp.where(T > 0.0, 0.5 * self._bath_values_at_sites(slopes) / jnp.where(T > 0.0, T, 1.0) ** 1.5, 0.0)
+        ratio = jnp.where(T > 0.0, 0.5 * self.values_at_sites(slopes) / jnp.where(T > 0.0, T, 1.0) ** 1.5, 0.0)
         return body_divergence + B.transpose_times(body.scale_at_sites(ratio, dH[:n]))
 
     def lifted_geometry(self, system, x) -> LiftedGeometry:
@@ -109,7 +109,7 @@ class Heating(LiftedDissipation):
         """
         if self.has_positive_temperatures:
             return jnp.ones(np.shape(self.bath)).ravel() if self.has_site_baths else jnp.ones(())
-        return jnp.where(self._bath_values_at_sites(T) < 0.0, -1.0, 1.0)
+        return jnp.where(self.values_at_sites(T) < 0.0, -1.0, 1.0)
 
     def entropy_rates(self, energy_loss, T) -> jax.Array:
         """Return the growth rates of the bath entropies, shape (m,), from the energy lost, shape () or (sites,)."""
@@ -120,15 +120,15 @@ class Heating(LiftedDissipation):
     def _effective_energy_gradient(self, body: Geometry, dH, dS, body_dim: int) -> jax.Array:
         """Return the gradient that replaces dH in the force on the body, shape (n,): dH for the bath entropy."""
         T, dS_y, sign = (
-            self._bath_values_at_sites(dH[body_dim:]),
-            self._bath_values_at_sites(dS[body_dim:]),
+            self.values_at_sites(dH[body_dim:]),
+            self.values_at_sites(dS[body_dim:]),
             self.temperature_signs(dH[body_dim:]),
         )
         return body.scale_at_sites(
             sign, body.scale_at_sites(dS_y, dH[:body_dim]) - body.scale_at_sites(T, dS[:body_dim])
         )
 
-    def _bath_values_at_sites(self, values) -> jax.Array:
+    def values_at_sites(self, values) -> jax.Array:
         """Return values of baths, shape (m,), at the sites that heat them, shape () or (sites,)."""
         return values[np.asarray(self.bath).ravel()] if self.has_site_baths else values[int(np.asarray(self.bath))]
 

@@ -5,17 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
 
 from manifolds._arrays import is_traced
-from manifolds._pytree_module import Module
 
-from .energy import Energy, Linear, TimeDependent
+from ..errors import InputError
+from .energy import Energy, Linear, Pullback, SpanLimitedEnergy, StateTimeEnergy
 from .indices import sparsity_pattern
+from .time_span import TimeSpan
 
 MAX_SERIES_ARGUMENT = 1 / 32
 """Largest argument of the series of ``(exp(z) - 1) / z``: its truncation after eight terms is then below rounding."""
@@ -82,35 +82,63 @@ class ReservoirEnergy(Linear):
         return jnp.full_like(self.b, jnp.inf)
 
 
-class TimedReservoirEnergy(TimeDependent):
-    """The energy ``sum_b T_b(t) y_b`` of baths of infinite capacity, whose temperatures an agent outside changes.
+class DrivenReservoirEnergy(Energy):
+    """The energy ``T(t) y`` of a bath of infinite capacity, whose temperature is a function of the time.
 
-    The work ``sum_b dT_b/dt y_b`` is what the agent does on the baths because of the entropy that they have received.
-    """
-
-    def temperature_at(self, t) -> jax.Array:
-        """Return the temperatures at a time, shape (m,)."""
-        assert isinstance(self.function, ReservoirEnergyFunction)
-        return self.function.temperatures(t)
-
-
-class ReservoirEnergyFunction(Module):
-    """The function ``sum_b T_b(t) y_b`` of the entropies y and the time t.
+    A device changes the temperature. At a fixed entropy y it does the work ``y T'(t)``, as for a reservoir whose levels
+    are all multiplied by the same factor.
 
     Attributes
     ----------
-    temperature : function from t to a scalar, or to an array, shape (number,)
-    number : int
+    temperature : function of the time to an array of shape ()
     """
 
     temperature: Callable
-    number: int = eqx.field(static=True)
 
-    def temperatures(self, t) -> jax.Array:
-        return jnp.broadcast_to(jnp.asarray(self.temperature(t), dtype=jnp.float64), (self.number,))
+    depends_on_time = True
 
-    def __call__(self, y, t):
-        return jnp.dot(self.temperatures(t), y)
+    def at_time(self, t) -> ReservoirEnergy:
+        return ReservoirEnergy(self.temperature(t)[None])
+
+    def with_time(self) -> Energy:
+        return _ReservoirEnergyOfTime(SpanLimitedEnergy(_TemperatureTimesEntropy(self.temperature), TimeSpan()))
+
+    def value(self, x) -> jax.Array:
+        raise InputError("this energy depends on time, so its value needs a time. Call energy(x, t)")
+
+
+class _TemperatureTimesEntropy(Energy):
+    """The energy ``T(t) y`` as a function of (y, t)."""
+
+    temperature: Callable
+
+    def value(self, x) -> jax.Array:
+        return self.temperature(x[1]) * x[0]
+
+
+class _ReservoirEnergyOfTime(StateTimeEnergy):
+    """The energy ``T(t) y`` as a function of (y, t), with its change over a step in closed form."""
+
+    def difference_rounding_scale(self, x) -> jax.Array:
+        return jnp.zeros(())
+
+    def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
+        """Return the mean temperature, and the difference quotient of the temperatures times the mean entropy."""
+        (y, start), (change, duration) = x + compensation, d
+        assert isinstance(self.energy, SpanLimitedEnergy)
+        assert isinstance(self.energy.energy, _TemperatureTimesEntropy)
+        temperature, clip = self.energy.energy.temperature, self.energy.span.clip
+        first, last = temperature(clip(start)), temperature(clip(start + duration))
+        _, slope = jax.jvp(temperature, (clip(start),), (jnp.ones(()),))
+        is_zero = duration == 0.0
+        rate = jnp.where(is_zero, slope, (last - first) / jnp.where(is_zero, 1.0, duration))
+        return jnp.stack([0.5 * (first + last), rate * (y + 0.5 * change)])
+
+
+def keeps_temperatures(energy: Energy) -> bool:
+    """Return whether no temperature of some baths with this energy depends on their entropies."""
+    terms = (term.term if isinstance(term, Pullback) else term for term in energy.terms)
+    return all(isinstance(term, ReservoirEnergy | DrivenReservoirEnergy) for term in terms)
 
 
 def make_bath_energy(capacity: jax.Array, temperature: jax.Array) -> BathEnergy | ReservoirEnergy:

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import scipy
 
-from .bath_energy import ReservoirEnergy, TimedReservoirEnergy
+from .bath_energy import keeps_temperatures
 from .coordinates import Components
 from .energy import Energy, Pullback
 from .frames import sum_terms
@@ -117,7 +117,7 @@ def temperature_slopes(energy: Energy, x, body_dim: int) -> jax.Array | None:
     """
     if not isinstance(energy, BodyBathsEnergy):
         return jax.jvp(energy.gradient, (x,), (jnp.zeros_like(x).at[body_dim:].set(1.0),))[1][body_dim:]
-    if isinstance(energy.baths, ReservoirEnergy | TimedReservoirEnergy):
+    if keeps_temperatures(energy.baths):
         return None
     y = x[body_dim:]
     return jax.jvp(energy.baths.gradient, (y,), (jnp.ones_like(y),))[1]

@@ -22,7 +22,7 @@ from ..dissipation.noise import (
 )
 from ..errors import InputError
 from ..functions.energy import Energy
-from ..systems import SpinSystem, System
+from ..systems import System
 from ..tracing.caching import memoize
 from ..tracing.interpret import evaluate_at_points
 from .base import MethodWrapper, OneStepMethod, TransportingMethod, apply_increment
@@ -98,7 +98,7 @@ class StochasticMidpoint(MethodWrapper, TransportingMethod):
             for B, w in factors_and_inputs
             if B.spin_coefficients is not None
         ]
-        if not rotations or not isinstance(system, SpinSystem):
+        if not rotations or not system.can_solve_rotations:
             return slope[None]
         # Solve for the rotation by noise at once: among many spins some rotate far, and the iteration would be slow.
         return (k[0] + system.solve_rotation(0.5 * h * sum(rotations), slope - k[0]))[None]

@@ -77,7 +77,7 @@ class BodiesOnGround(TreeSystem):
     def is_driven(self) -> bool:
         return self.motors is not None and self.motor_time is None
 
-    def at_time(self, t):
+    def at_time(self, t, attitude=None):
         if self.motors is None:
             return self
         system = copy(self)

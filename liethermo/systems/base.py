@@ -99,10 +99,16 @@ class System(SystemInterface):
             self.momentum_maps = {name: with_polynomial_degrees(J, dim) for name, J in self.momentum_maps.items()}
         dissipation = sum_dissipations(dissipation)
         bath_terms: tuple[Dissipation, ...] = ()
-        if dissipation is not None and self.entropy is None:
-            bath_terms = tuple(term for term in dissipation.terms if term.needs_entropy)
-            dissipation = sum_dissipations([term for term in dissipation.terms if not term.needs_entropy] or None)
+        if dissipation is not None:
+
+            def drives_baths(term: Dissipation) -> bool:
+                return term.acts_on_baths_alone or (self.entropy is None and term.needs_entropy)
+
+            bath_terms = tuple(term for term in dissipation.terms if drives_baths(term))
+            dissipation = sum_dissipations([term for term in dissipation.terms if not drives_baths(term)] or None)
         for term in bath_terms:
+            if baths is None and term.acts_on_baths_alone:
+                raise InputError(f"{type(term).__name__} acts on baths: give the system baths=lt.HeatBaths(...)")
             if baths is None:
                 raise InputError(f"{type(term).__name__} drives the entropy up, so the system needs an entropy")
             if not term.can_drive_baths:

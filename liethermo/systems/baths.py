@@ -16,16 +16,11 @@ from manifolds._pytree_module import Module
 from manifolds.structures.poisson import ProductPoisson
 
 from ..errors import InputError
-from ..functions.bath_energy import (
-    BathEnergy,
-    ReservoirEnergy,
-    ReservoirEnergyFunction,
-    TimedReservoirEnergy,
-    make_bath_energy,
-)
+from ..functions.bath_energy import BathEnergy, DrivenReservoirEnergy, ReservoirEnergy, make_bath_energy
+from ..functions.checks import traced_function_and_shape
 from ..functions.conditions import checked_numbers
 from ..functions.each import Each
-from ..functions.energy import Energy
+from ..functions.energy import Energy, Pullback, Sum
 from ..tracing.short_form import short_form
 
 
@@ -39,16 +34,19 @@ class HeatBaths(Module):
 
     Parameters
     ----------
-    capacity, temperature : float > 0, or array, shape (number,)
-        C (energy / temperature) and T (temperature, at y = 0), in any consistent units. A bath of infinite capacity
-        keeps its temperature, ``U = T y``. If all capacities are infinite, the temperature may be a function of the
-        time t that returns one number, or an array, shape (number,). The ledger then contains the work ``dT/dt y`` of
-        the agent that changes it; without an exchange of heat it is zero.
+    capacity : float > 0, or array, shape (number,)
+        C (energy / temperature), in any consistent units. A bath of infinite capacity keeps its temperature, ``U = T
+        y``.
+    temperature : float > 0, or array, shape (number,); or function of the time; or a sequence with an entry per bath
+        T (temperature, at y = 0). Baths of infinite capacity may have temperatures that are functions of the time t:
+        one function to a number > 0 or to an array, shape (number,), or a function for some of the baths, ``U = T(t)
+        y``. A device that changes the temperature does the work ``y T'(t)``, which the ledger of a run has; the heat
+        that the bath receives is ``T(t) y`` less this work.
     number : int
         The number of baths.
-    energy : function from y, a scalar, to a scalar, optional
+    energy : function from y, a scalar, to a scalar; or a sequence with a function or None per bath; optional
         The energy of each bath as a function of its entropy y (energy / temperature), instead of the two numbers. It
-        has to increase.
+        has to increase. Electrons with the capacity ``c T``, for example, have ``U = T y + y^2 / (2 c)``.
 
     Attributes
     ----------
@@ -74,24 +72,47 @@ class HeatBaths(Module):
 
     __repr__ = short_form
 
-    def __init__(self, capacity=1.0, temperature=1.0, number: int = 1, energy: Callable | None = None):
+    def __init__(self, capacity=1.0, temperature=1.0, number: int = 1, energy=None):
         if isinstance(number, bool) or not isinstance(number, int) or number < 1:
             raise InputError(f"the number of baths is a positive integer, not {number!r}")
         self.number = number
-        if energy is None and callable(temperature):
-            self.energy = _timed_reservoirs(capacity, temperature, number)
-        elif energy is None:
+        if callable(energy):
+            self.energy = Each(_BathEnergyFunction(energy), np.arange(number)[:, None])
+            return
+        functions = _entries_of_baths(energy, "energy", number) if energy is not None else [None] * number
+        temperatures = _entries_of_baths(temperature, "temperature", number)
+        driven = [i for i, T in enumerate(temperatures) if callable(T) and functions[i] is None]
+        if not driven and all(function is None for function in functions):
             parameters = {"capacity": capacity, "temperature": temperature}
             self.energy = make_bath_energy(
                 *(_check_positive(value, what, number, what == "capacity") for what, value in parameters.items())
             )
-        else:
-            self.energy = Each(_BathEnergyFunction(energy), np.arange(number)[:, None])
+            return
+        numbers = [1.0 if callable(T) else T for T in temperatures]
+        C, T = (
+            _check_positive(capacity, "capacity", number, True),
+            _check_positive(numbers, "temperature", number, False),
+        )
+        for i in driven:
+            if not is_traced(C) and np.isfinite(C[i]):
+                raise InputError(
+                    f"the temperature of bath {i} is a function of the time, so its capacity must be infinite, not "
+                    f"{float(C[i]):g}. Set capacity=np.inf"
+                )
+        terms: list[Energy] = [
+            DrivenReservoirEnergy(_checked_temperature_function(temperatures[i], i)).on([i]) for i in driven
+        ]
+        terms += [Each(_BathEnergyFunction(f), np.array([[i]])) for i, f in enumerate(functions) if f is not None]
+        constant = np.array([i for i, f in enumerate(functions) if f is None and i not in driven], dtype=int)
+        if constant.size:
+            terms.append(make_bath_energy(C[constant], T[constant]).on(constant))
+        self.energy = Sum.of(terms)
 
     @property
     def has_positive_temperatures(self) -> bool:
         """True if the temperatures are positive in every state by construction."""
-        return isinstance(self.energy, BathEnergy | ReservoirEnergy | TimedReservoirEnergy)
+        terms = (term.term if isinstance(term, Pullback) else term for term in self.energy.terms)
+        return all(isinstance(term, BathEnergy | ReservoirEnergy | DrivenReservoirEnergy) for term in terms)
 
     @property
     def scale(self) -> np.ndarray | float:
@@ -105,25 +126,42 @@ class HeatBaths(Module):
         return jnp.where(jnp.isfinite(self.energy.capacity), self.energy.capacity, 1.0)
 
 
-def _timed_reservoirs(capacity, temperature: Callable, number: int) -> TimedReservoirEnergy:
-    """Return the energy of baths whose temperature is a function of time, after a test of the function at t = 0."""
-    if not np.isinf(np.asarray(capacity)).all():
-        raise InputError(
-            f"a temperature that is a function of time belongs to baths of infinite capacity, got {capacity!r}: the "
-            "temperature of a finite bath follows from the heat that it receives. Give capacity=np.inf"
-        )
-    function = ReservoirEnergyFunction(temperature, number)
-    try:
-        with jax.ensure_compile_time_eval():
-            values = np.asarray(function.temperatures(jnp.zeros(())))
-    except (TypeError, ValueError) as error:
-        raise InputError(
-            f"the temperature of {number} baths must be a function of the time t to one number, or to an array of "
-            f"shape ({number},): {error}"
-        ) from None
-    if not (np.isfinite(values).all() and (values > 0.0).all()):
-        raise InputError(f"the temperature of a bath must be positive and finite, got {values.tolist()} at t = 0")
-    return TimedReservoirEnergy(function)
+def _entries_of_baths(value, what: str, number: int) -> list:
+    """Return an entry for each bath, from one for all or a sequence; a function to an array has an entry for each."""
+    if callable(value):
+        shape = np.shape(value(0.0)) if number > 1 else ()
+        return [value] * number if shape != (number,) else [_EntryOfFunction(value, i) for i in range(number)]
+    if not isinstance(value, list | tuple):
+        return [value] * number if np.ndim(value) == 0 else list(value)
+    if len(value) != number:
+        raise InputError(f"the {what} of {number} baths has an entry for each, not {len(value)} entries")
+    return list(value)
+
+
+class _EntryOfFunction(Module):
+    """One entry of a function of the time to an array."""
+
+    function: Callable
+    index: int = eqx.field(static=True)
+
+    def __call__(self, t):
+        return self.function(t)[self.index]
+
+
+def _checked_temperature_function(function: Callable, index: int) -> Callable:
+    what = f"the temperature of bath {index}"
+    traced, _ = traced_function_and_shape(function, ((),), [()], what, "a time")
+    return _PositiveTemperature(traced)
+
+
+class _PositiveTemperature(Module):
+    """A temperature as a function of time; NaN where it is not positive, so that a step is rejected."""
+
+    function: Callable
+
+    def __call__(self, t):
+        T = jnp.asarray(self.function(t), dtype=jnp.float64)
+        return jnp.where(T > 0.0, T, jnp.nan)
 
 
 def _check_positive(value, what: str, number: int, infinite: bool) -> jax.Array:

@@ -75,7 +75,8 @@ class DrivenSystem(LiftedSystem):
         self.energy = energy if self.space is not None else with_polynomial_degrees(energy, self.dim)
         self._lift_laws()
         if body.torque_name:
-            torque = _TorqueForce(law="conserved" if body.entropy_law is not None or body.entropy is None else None)
+            has_law = body.entropy_law is not None or body.entropy is None
+            torque = _TorqueForce(law=body.torque_entropy_law if has_law else None)
             self.dissipation = torque if self.dissipation is None else self.dissipation + torque
 
     @property
@@ -173,8 +174,9 @@ class DrivenSystem(LiftedSystem):
 
     def torque_velocity(self, x, dH) -> jax.Array:
         """Return the velocity that a torque gives to a state, power included, for a continuous or discrete gradient."""
-        torque = self.external_torque(x)
-        return jnp.concatenate([torque, jnp.stack([jnp.zeros(()), self.unit * jnp.dot(dH[:-2], torque)])])
+        velocity = self.inner_at(x).external_velocity(x[:-2], dH[:-2]) if self.torque is None else self.torque
+        assert velocity is not None
+        return jnp.concatenate([velocity, jnp.stack([jnp.zeros(()), self.unit * jnp.dot(dH[:-2], velocity)])])
 
     def bind_attitude(self, attitude) -> DrivenSystem:
         """Return the system with its torque evaluated at an attitude, shape (m, m)."""
@@ -189,6 +191,11 @@ class DrivenSystem(LiftedSystem):
         bound = copy(self)
         object.__setattr__(bound, "torque", torque)
         return bound
+
+    can_solve_rotations = forward_to("body")
+
+    def solve_rotation(self, angles, v):
+        return jnp.concatenate([self.body.solve_rotation(angles, v[:-2]), v[-2:]])
 
     def raise_index(self, x, alpha):
         """Return the direction of a correction along alpha, without components along the clock and the work."""

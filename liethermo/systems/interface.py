@@ -220,9 +220,38 @@ class SystemInterface(Geometry):
         """Return the external torque at a state, shape (n,), at a fixed time and attitude; None if none acts."""
         return None
 
+    def external_velocity(self, x, dH) -> jax.Array | None:
+        """Return the velocity that acts from outside, shape (n,), with temperatures from the gradient dH, shape (n,).
+
+        It is :meth:`external_torque` for torques, which do not depend on the gradient.
+        """
+        return self.external_torque(x)
+
+    @property
+    def torque_entropy_law(self) -> LawName:
+        """Law of the entropy under what acts from outside alone: "conserved", or "nondecreasing" if it heats."""
+        return "conserved"
+
     def drop_torque(self) -> Self:
         """Return the system without its external torque."""
         return self
+
+    # -- spins ----------------------------------------------------------------------------------------------------
+
+    @property
+    def can_solve_rotations(self) -> bool:
+        """True for a system of spins, whose method ``solve_rotation`` solves for a rotation of every spin at once."""
+        return False
+
+    def solve_rotation(self, angles, v) -> jax.Array:
+        """Return u with ``u_i - angles_i x u_i = v_i`` at each spin, and ``u = v`` elsewhere.
+
+        Parameters
+        ----------
+        angles : array, shape (sites, 3)
+        v : array, shape (n,)
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no spins")
 
     # -- laws ---------------------------------------------------------------------------------------------------------
 

@@ -16,7 +16,7 @@ from manifolds._arrays import is_traced
 from manifolds._precision import with_library_settings
 
 from ..errors import InputError
-from ..functions.bath_energy import BathEnergy, ReservoirEnergy, TimedReservoirEnergy
+from ..functions.bath_energy import BathEnergy
 from ..functions.energy import Energy
 from ..functions.gradients import EPS
 from ..tracing.interpret import evaluate_at_points
@@ -108,11 +108,15 @@ def counter_components(system: System) -> np.ndarray:
 
     The motion of the other components does not depend on them, so they may grow in a steady state.
     """
-    if system.baths is not None and isinstance(system.baths.energy, TimedReservoirEnergy):
-        return np.arange(system.body_dim, system.dim)
-    if system.baths is None or not isinstance(system.baths.energy, BathEnergy | ReservoirEnergy):
+    if system.baths is None:
         return np.zeros(0, dtype=int)
-    return system.body_dim + np.flatnonzero(np.isinf(np.asarray(system.baths.energy.capacity)))
+    energy = system.baths.energy
+    if isinstance(energy, BathEnergy):
+        is_constant = np.isinf(np.asarray(energy.capacity))
+    else:
+        energy, y = energy.at_time(0.0), np.zeros(system.baths.number)
+        is_constant = np.asarray(energy.gradient(y) == energy.gradient(y + 1.0))
+    return system.body_dim + np.flatnonzero(is_constant)
 
 
 def frozen_system(system: System, t: float | None) -> System:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from copy import copy
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,10 +17,12 @@ import manifolds as mf
 from manifolds.structures.poisson import ProductPoisson
 from manifolds.structures.spins import add_vectors, cross, cross_vectors, dot_vectors, scale_vectors, split_vectors
 
-from ..dissipation.base import Dissipation
+from ..dissipation.base import Dissipation, LawName
+from ..dissipation.bath_conduction import BathConduction
 from ..dissipation.heating import Heating
 from ..dissipation.landau_lifshitz import LandauLifshitz
 from ..errors import InputError
+from ..functions.checks import traced_function_and_shape
 from ..functions.energy import Energy
 from ..functions.magnetism.spin_energy import lattice_shape
 from ..functions.magnetism.spin_torques import check_spin_torque
@@ -28,7 +31,7 @@ from ..functions.planes import energy_in_component_order, interaction_range, to_
 from ..functions.spheres import HalfSumOfSquares, Spheres
 from .base import System
 from .baths import HeatBaths, poisson_with_baths
-from .torque import TorqueSystem
+from .torque import TorqueSystem, torque_name
 
 SPIN_LENGTHS_NAME = "sum |s|^2 / 2"
 
@@ -56,6 +59,9 @@ class SpinSystem(TorqueSystem):
     torque : function w of t, shape (), and s, shape ``(*sites, 3)``; or a list of them; optional
         Torques ``s x w`` (w in 1 / time) from outside, such as ``lt.magnetism.Slonczewski``. Each |s_i| stays constant.
         The torque does the work W, ``W' = sum grad_i H . (s_i x w_i)``, and the energy less the work is constant.
+    power : function of the time to a number >= 0, for the first bath; or a sequence with one or None per bath; optional
+        Power P that a device such as ``lt.magnetism.LaserPulse`` gives to a bath: ``y' = P / T`` for its entropy y and
+        temperature T, and ``W' = P``. Light has no entropy, so P is work, all of which becomes heat.
 
     Raises
     ------
@@ -63,6 +69,8 @@ class SpinSystem(TorqueSystem):
     """
 
     lattice: tuple[int, ...] = eqx.field(static=True)
+    power: tuple[Callable, ...]
+    powered_baths: tuple[int, ...] = eqx.field(static=True)
 
     def __init__(
         self,
@@ -74,10 +82,12 @@ class SpinSystem(TorqueSystem):
         momentum_maps=(),
         validate: bool = True,
         torque=None,
+        power=None,
     ):
         self.lattice = lattice_shape(sites)
         self.torque = None if torque is None else check_spin_torque(torque, self.lattice)
         self.torque_arguments = None
+        self.powered_baths, self.power = _checked_powers(power, baths)
         poisson = mf.Spins(self.lattice, ratio=ratio)
         self._build(poisson, poisson.dim, energy, None, dissipation, momentum_maps, validate, baths=baths)
 
@@ -90,30 +100,60 @@ class SpinSystem(TorqueSystem):
 
     def _field_without_torque(self, x, dH, dS, dL):
         # precession and damping of the spins are added before they are stored in a state
-        damping, heating = _split_damping(self.dissipation)
-        spins, n = self._spin_structure, self.body_dim
-        if damping is None or spins is None:
+        parts, spins, n = _split_damping(self.dissipation), self._spin_structure, self.body_dim
+        if parts is None or spins is None:
             return super()._field_without_torque(x, dH, dS, dL)
+        damping, heating, conduction = parts
         if heating is None:
             force, _ = damping.damping_force_and_energy_loss(spins, x, dH)
-            entropy_rates = jnp.zeros(0)
+            entropy_rates = jnp.zeros(self.dim - n)
         else:  # the entropy is that of the baths
             force, lost_power = damping.damping_force_and_energy_loss(
                 spins, x, dH, heating.temperature_signs(dH[n:]), heating.has_site_baths
             )
             entropy_rates = heating.entropy_rates(lost_power, dH[n:])
+        for term in conduction:
+            entropy_rates = entropy_rates + term.entropy_rates(dH[n:], dS[n:])
         return spins.join_state(add_vectors(spins.precession_rates(x, dH), force), entropy_rates)
 
     # -- the torque -----------------------------------------------------------------------------------------------
 
     @property
+    def has_torque(self) -> bool:
+        return self.torque is not None or bool(self.power)
+
+    @property
+    def torque_name(self) -> str:
+        return torque_name((*(self.torque or ()), *self.power))
+
+    @property
     def torque_invariant_casimirs(self) -> frozenset[str]:
         return frozenset(self.casimirs())  # a torque s x w keeps every length
 
+    @property
+    def torque_entropy_law(self) -> LawName:
+        return "nondecreasing" if self.power else "conserved"
+
     def _torque_at(self, x, t, attitude):
         s = x[: self.body_dim].reshape(*self.lattice, 3)
-        total = sum((term(t, s) for term in self.torque), jnp.zeros(3))
+        total = sum((term(t, s) for term in self.torque or ()), jnp.zeros(3))
         return cross(s, jnp.broadcast_to(total, s.shape)).reshape(-1)
+
+    def external_velocity(self, x, dH):
+        velocity, n = super().external_velocity(x, dH), self.body_dim
+        if not self.power or velocity is None:
+            return velocity
+        assert self.torque_arguments is not None
+        for bath, power in zip(self.powered_baths, self.power, strict=True):
+            P = jnp.asarray(power(self.torque_arguments[0]))
+            velocity = velocity.at[n + bath].add(jnp.where(P >= 0.0, P, jnp.nan) / dH[n + bath])
+        return velocity
+
+    def drop_torque(self):
+        return _without_power(super().drop_torque())
+
+    def drop_baths(self):
+        return _without_power(super().drop_baths())
 
     def scale_at_sites(self, values, v) -> jax.Array:
         """Return a vector v multiplied by ``values``, one for each site or one for all."""
@@ -130,6 +170,10 @@ class SpinSystem(TorqueSystem):
         assert spins is not None
         return dot_vectors(spins.split_covectors(alpha), spins.split_covectors(v))
 
+    @property
+    def can_solve_rotations(self) -> bool:
+        return self._spin_structure is not None
+
     def solve_rotation(self, angles, v) -> jax.Array:
         """Return u with ``u_i - angles_i x u_i = v_i`` at each spin, angles of shape (sites, 3), and u = v elsewhere.
 
@@ -140,6 +184,44 @@ class SpinSystem(TorqueSystem):
         a, r = split_vectors(angles), spins.split_covectors(v)
         u = add_vectors(add_vectors(r, cross_vectors(a, r)), scale_vectors(dot_vectors(a, r), a))
         return spins.join_state(scale_vectors(1.0 / (1.0 + dot_vectors(a, a)), u), v[self.body_dim :])
+
+    def largest_step(self, x, angle: float = 0.3, boltzmann: float = 0.0, t: float = 0.0) -> float:
+        """Return the step (time) in which no spin turns by more than an ``angle``, in its field or by noise.
+
+        A spin turns at the rate ``sqrt(ratio^2 + (rate |s|)^2) |grad_i H|`` at most. Noise turns it by angles of the
+        variance ``2 k T rate h`` in each component, which is kept below the square of the angle.
+
+        Parameters
+        ----------
+        x : array, shape (n,) or ``(*sites, 3)``
+        angle : float > 0
+            In radian. Steps with noise have a bias of about a per cent with 0.3 [:doc:`/explanation/fluctuations`].
+        boltzmann : float >= 0
+            k, as of ``lt.Fluctuations``, for steps with noise; the temperatures are those of the baths.
+        t : float
+            The time, for an energy or a temperature that depends on it.
+
+        Raises
+        ------
+        InputError
+            If no spin turns.
+        """
+        state, spins, n = self.state(x), self._spin_structure, self.body_dim
+        assert spins is not None
+        system = self.at_time(t)
+        gradient, s = system.energy.gradient(state), np.asarray(state[:n]).reshape(-1, 3)
+        field = np.linalg.norm(np.asarray(gradient[:n]).reshape(-1, 3), axis=1)
+        parts = _split_damping(self.dissipation)
+        rate = np.zeros(()) if parts is None else np.abs(np.asarray(parts.damping.rate)).ravel()
+        damping_rate = rate * np.linalg.norm(s, axis=1)
+        turning_rate = float((np.hypot(np.ravel(spins.ratio), damping_rate) * field).max())
+        diffusion = 0.0
+        if boltzmann and parts is not None and parts.heating is not None:
+            temperature = np.asarray(parts.heating.values_at_sites(gradient[n:]))
+            diffusion = float((2.0 * boltzmann * np.abs(temperature) * rate).max())
+        if not (turning_rate > 0.0 or diffusion > 0.0):
+            raise InputError("no spin turns at this state, so any step will do: give a state away from rest")
+        return min(angle / turning_rate if turning_rate else np.inf, angle**2 / diffusion if diffusion else np.inf)
 
     def state_array(self, x, batch: bool = False):
         """Return the flat state x; x may be the spins alone, shape ``(*sites, 3)``."""
@@ -198,7 +280,7 @@ def reorder_spins(system: System) -> ReorderedSystem | None:
     if type(system) is not SpinSystem:
         return None
     spins = system._spin_structure
-    is_reorderable = system.dissipation is None or _split_damping(system.dissipation)[0] is not None
+    is_reorderable = system.dissipation is None or _split_damping(system.dissipation) is not None
     if not is_reorderable or spins is None or spins.is_component_major or system.is_driven:
         return None
     count = spins.count
@@ -211,8 +293,57 @@ def reorder_spins(system: System) -> ReorderedSystem | None:
     return ReorderedSystem(reordered, reorder, restore, pullback)
 
 
-def _split_damping(dissipation: Dissipation | None) -> tuple[LandauLifshitz | None, Heating | None]:
-    """Return the damping of the spins and the heating of baths by it; None for subclasses, whose force may differ."""
-    heating = dissipation if type(dissipation) is Heating else None
-    damping = dissipation if heating is None else heating.inner
-    return (damping if type(damping) is LandauLifshitz else None), heating
+def _checked_powers(power, baths: HeatBaths | None) -> tuple[tuple[int, ...], tuple[Callable, ...]]:
+    """Return the indices of the baths that receive power, and their powers as traced functions of the time."""
+    if power is None:
+        return (), ()
+    if not isinstance(baths, HeatBaths):
+        raise InputError("power= heats baths, and there are none: give baths=lt.HeatBaths(...)")
+    entries = list(power) if isinstance(power, list | tuple) else [power, *[None] * (baths.number - 1)]
+    if len(entries) != baths.number:
+        raise InputError(f"the power of {baths.number} baths has an entry for each, not {len(entries)} entries")
+    for i, entry in enumerate(entries):
+        if not callable(entry) and entry is not None:
+            raise InputError(
+                f"the power of bath {i} must be a function of the time, such as lt.magnetism.LaserPulse, or None, got "
+                f"{entry!r:.60}"
+            )
+    functions = {
+        i: traced_function_and_shape(entry, ((),), [()], f"the power of bath {i}", "a time")[0]
+        for i, entry in enumerate(entries)
+        if entry is not None
+    }
+    return tuple(functions), tuple(functions.values())
+
+
+def _without_power(system: Any) -> Any:
+    """Return a system of spins without power for its baths."""
+    if not system.power:
+        return system
+    system = copy(system)
+    for name in ("power", "powered_baths"):
+        object.__setattr__(system, name, ())
+    return system
+
+
+class _DampingParts(NamedTuple):
+    """The damping of the spins, the heating of baths by it, and the conduction between baths."""
+
+    damping: LandauLifshitz
+    heating: Heating | None
+    conduction: tuple[BathConduction, ...]
+
+
+def _split_damping(dissipation: Dissipation | None) -> _DampingParts | None:
+    """Return the parts of a dissipation; None unless it is one damping, with heat conduction between baths or without.
+
+    It is None for subclasses, whose force may differ.
+    """
+    terms = () if dissipation is None else dissipation.terms
+    conduction = tuple(term for term in terms if type(term) is BathConduction)
+    others = [term for term in terms if type(term) is not BathConduction]
+    if len(others) != 1:
+        return None
+    heating = others[0] if type(others[0]) is Heating else None
+    damping = others[0] if heating is None else heating.inner
+    return _DampingParts(damping, heating, conduction) if type(damping) is LandauLifshitz else None

@@ -37,16 +37,21 @@ class TorqueSystem(System):
     torque_arguments: tuple[jax.Array, jax.Array | None] | None
 
     @property
+    def has_torque(self) -> bool:
+        """Whether something acts on the system from outside."""
+        return self.torque is not None
+
+    @property
     def torque_name(self) -> str:
         return "" if self.torque is None else torque_name(self.torque)
 
     @property
     def is_driven(self) -> bool:
-        return super().is_driven or (self.torque is not None and self.torque_arguments is None)
+        return super().is_driven or (self.has_torque and self.torque_arguments is None)
 
     def at_time(self, t, attitude=None):
         system = super().at_time(t)
-        if self.torque is None:
+        if not self.has_torque:
             return system
         system = copy(system)
         arguments = jnp.asarray(t, dtype=jnp.float64), None if attitude is None else jnp.asarray(attitude)
@@ -54,7 +59,7 @@ class TorqueSystem(System):
         return system
 
     def drop_torque(self):
-        if self.torque is None:
+        if not self.has_torque:
             return self
         system = copy(self)
         for name in ("torque", "torque_arguments"):
@@ -62,7 +67,7 @@ class TorqueSystem(System):
         return system
 
     def external_torque(self, x):
-        if self.torque is None:
+        if not self.has_torque:
             return None
         t, attitude = (None, None) if self.torque_arguments is None else self.torque_arguments
         if t is None or (attitude is None and self.needs_attitude):
@@ -80,9 +85,9 @@ class TorqueSystem(System):
 
     def field(self, x, dH, dS, dL=()):
         """Return the vector field, the torque added to that of the system without it."""
-        torque = self.external_torque(x)
+        velocity = self.external_velocity(x, dH)
         field = self.drop_torque()._field_without_torque(x, dH, dS, dL)
-        return field if torque is None else field + torque
+        return field if velocity is None else field + velocity
 
     def _field_without_torque(self, x, dH, dS, dL) -> jax.Array:
         return super().field(x, dH, dS, dL)

@@ -6,6 +6,7 @@ from .bond_terms import biquadratic, exchange_tensor
 from .correlations import StructureFactor, dynamic_structure_factor, structure_factor, topological_charge
 from .dipoles import dipoles
 from .grid_terms import dzyaloshinskii_moriya, exchange
+from .laser import LaserPulse
 from .lattices import Bonds, Lattice, lattice
 from .micromagnetics import (
     continuum_antisymmetric_exchange,
@@ -26,12 +27,16 @@ from .site_terms import (
 )
 from .spin_torques import Slonczewski, SpinOrbit, ZhangLi
 from .spin_waves import spin_temperature, spin_wave_frequencies
+from .transitions import Estimate, MagnetSamples, binder_cumulant, cumulant_crossing
 from .units import SpinDynamics, Units, units
 
 __all__ = [
     "Bonds",
+    "Estimate",
     "HysteresisLoop",
+    "LaserPulse",
     "Lattice",
+    "MagnetSamples",
     "Minimum",
     "Slonczewski",
     "SpinDynamics",
@@ -41,10 +46,12 @@ __all__ = [
     "VectorField",
     "ZhangLi",
     "anisotropy",
+    "binder_cumulant",
     "biquadratic",
     "continuum_antisymmetric_exchange",
     "continuum_exchange",
     "cubic_anisotropy",
+    "cumulant_crossing",
     "demagnetisation",
     "demagnetising_factors",
     "dipoles",

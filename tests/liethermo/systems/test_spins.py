@@ -476,3 +476,25 @@ def test_free_spins_in_a_bath_have_langevins_magnetisation(damping):
     off = mean.mean(axis=0) - (1.0 / np.tanh(FIELDS / T) - T / FIELDS)
     off /= mean.std(axis=0) / np.sqrt(len(mean))
     assert (np.abs(off).max() < 3.0) == (damping is lt.LandauLifshitz), off
+
+
+def test_the_largest_step_turns_no_spin_by_more_than_its_angle():
+    """In its field, with ratios and rates at each site, and by noise of the temperature of the bath."""
+    sites = (3, 3)
+    ratio, rate = np.full(sites, 2.0), np.full(sites, 0.5)
+    ratio[1, 1], rate[2, 0] = 3.0, 4.0
+    field = RANDOM.standard_normal((*sites, 3))
+    energy = lt.magnetism.zeeman(sites, lambda t: t * field)
+    baths = lt.HeatBaths(np.inf, lambda t: 0.1 * t)
+    system = lt.SpinSystem(sites, energy, lt.LandauLifshitz(rate), baths, ratio=ratio)
+    start = unit(*sites)
+    fastest = (np.hypot(ratio, rate) * np.linalg.norm(2.0 * field, axis=-1)).max()
+    assert system.largest_step(start, 0.1, t=2.0) == pytest.approx(0.1 / fastest, rel=1e-13)
+    by_noise = 1e-4 / (2.0 * 50.0 * 0.2 * 4.0)
+    assert system.largest_step(start, 0.01, boltzmann=50.0, t=2.0) == pytest.approx(by_noise, rel=1e-13)
+    h = system.largest_step(start, 0.05, t=1.0)
+    x = np.asarray(system.state(start))
+    turned = np.linalg.norm(np.asarray(system.vector_field(x, 1.0))[:27].reshape(9, 3), axis=1) * h
+    assert 0.01 < turned.max() <= 0.05
+    with pytest.raises(lt.InputError, match="no spin turns"):
+        system.largest_step(start, t=0.0)

@@ -1,0 +1,127 @@
+"""Baths whose temperature is a function of time, baths of several kinds, and power from a laser."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import liethermo as lt
+
+FIELD = 1.2
+RATE = 0.3
+START = np.array([1.0, 0.0, 0.2]) / np.sqrt(1.04)
+
+
+def spin_in_a_bath(temperature, **arguments):
+    zeeman = lt.magnetism.zeeman(1, (0.0, 0.0, FIELD))
+    return lt.SpinSystem(1, zeeman, lt.LandauLifshitz(RATE), lt.HeatBaths(np.inf, temperature), **arguments)
+
+
+def motion(t, u):
+    """Rates of the spin, of the entropy, and of the work ``y T'``."""
+    s, dH = u[:3], np.array([0.0, 0.0, -FIELD])
+    torque = np.cross(s, dH)
+    heat = RATE * torque @ torque
+    return [*(torque + RATE * np.cross(s, torque)), heat / (1.0 + 0.5 * np.sin(t)), u[3] * 0.5 * np.cos(t)]
+
+
+@pytest.mark.parametrize("method", [lt.MetriplecticMidpoint(), lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(4)])
+def test_a_bath_with_a_given_temperature_does_its_work(method):
+    reference = solve_ivp(motion, (0.0, 6.0), [*START, 0.0, 0.0], rtol=1e-11, atol=1e-12).y[:, -1]
+    system = spin_in_a_bath(lambda t: 1.0 + 0.5 * jnp.sin(t))
+    run = lt.integrate(system, system.state(START), (0.0, 6.0), 0.025, method)
+    audit = run.audit()
+    assert audit.passed
+    assert audit.energy_drift < 1e-15
+    assert np.diff(run.entropy).min() > 0.0
+    tolerance = 2e-4 if method.order == 2 else 1e-6
+    assert np.abs(run.x[-1] - reference[:4]).max() < tolerance
+    assert abs(run.casimirs["work"][-1] - reference[4]) < tolerance
+    assert np.abs(system.temperatures(run.x, run.t)[:, 0] - 1.0 - 0.5 * np.sin(run.t)).max() < 1e-15
+
+
+def test_a_temperature_that_is_constant_as_a_function_changes_nothing():
+    noise, ends = lt.Fluctuations(seed=1), []
+    for temperature in (0.8, lambda t: 0.8 + 0.0 * t):
+        system = spin_in_a_bath(temperature)
+        starts = np.repeat(np.asarray(system.state([0.0, 0.0, 1.0]))[None], 3, axis=0)
+        ends.append(np.asarray(lt.ensemble(system, starts, (0.0, 1.0), 0.05, noise=noise).x))
+    assert np.abs(ends[0] - ends[1]).max() < 1e-13
+    assert np.ptp(ends[0][:, 2]) > 0.05
+
+
+def test_noise_follows_a_temperature_that_rises_slowly():
+    """The mean spin is Langevin's function of the temperature of the moment, within four standard errors."""
+    system = spin_in_a_bath(lambda t: 0.3 + 0.1 * t)
+    starts = np.repeat(np.asarray(system.state([0.0, 0.0, 1.0]))[None], 2000, axis=0)
+    run = lt.ensemble(system, starts, (0.0, 30.0), 0.1, lt.MetriplecticMidpoint(), noise=lt.Fluctuations(seed=2))
+    x = FIELD / 3.2  # the temperature of a time 1 / (rate * T) before the end, to which the spin has relaxed
+    mean, error = run.x[:, 2].mean(), run.x[:, 2].std() / np.sqrt(2000)
+    assert abs(mean - (1.0 / np.tanh(x) - 1.0 / x)) < 4.0 * error
+    cold = FIELD / 0.3
+    assert abs(mean - (1.0 / np.tanh(cold) - 1.0 / cold)) > 20.0 * error
+
+
+def test_a_cryostat_cools_electrons_through_phonons():
+    """Three baths: electrons of capacity ``c T``, phonons, and a cryostat whose temperature is a function of time."""
+    baths = lt.HeatBaths(
+        capacity=[1.0, 3.0, np.inf],
+        temperature=[1.0, 1.0, lambda t: 1.0 - 0.02 * t],
+        number=3,
+        energy=[lambda y: y + y**2 / 1.0, None, None],
+    )
+    zeeman = lt.magnetism.zeeman(1, (0.0, 0.0, FIELD))
+    damping = [lt.LandauLifshitz(RATE), lt.BathConduction([(0, 1, 2.0), (1, 2, 1.0)])]
+    system = lt.SpinSystem(1, zeeman, damping, baths)
+    run = lt.integrate(system, system.state(START), (0.0, 30.0), 0.1, lt.MetriplecticGauss(2))
+    assert run.audit().passed
+    T = np.asarray(system.temperatures(run.x, run.t))
+    assert T[-1, 0] > T[-1, 1] > T[-1, 2]
+    late = run.t > 20.0  # the spin has come to rest: what phonons and electrons lose flows to the cryostat
+    lost = -3.0 * np.ptp(T[late, 1]) - 0.25 * np.ptp(T[late, 0] ** 2)
+    assert abs(lost + np.trapezoid(T[late, 1] - T[late, 2], run.t[late])) < 1e-5
+
+
+def test_the_pulse_has_its_energy_and_its_width():
+    pulse = lt.magnetism.LaserPulse(energy=2.0, duration=0.1, centre=0.5)
+    t = np.linspace(0.0, 1.0, 2001)
+    assert abs(np.trapezoid(np.asarray(pulse(t)), t) - 2.0) < 1e-12
+    assert abs(float(pulse(0.55)) - 0.5 * float(pulse(0.5))) < 1e-12
+
+
+def test_a_temperature_below_zero_stops_the_run():
+    system = spin_in_a_bath(lambda t: 1.0 - t)
+    with pytest.raises(lt.IntegrationError):
+        lt.integrate(system, system.state(START), (0.0, 2.0), 0.05)
+
+
+def test_power_from_a_bath_stops_the_run():
+    """A device that takes heat would lower the entropy."""
+    system = spin_in_a_bath(1.0, power=lambda t: jnp.cos(t))
+    with pytest.raises(lt.IntegrationError):
+        lt.integrate(system, system.state(START), (0.0, 4.0), 0.05)
+
+
+BAD = {
+    "a finite capacity": (lambda: lt.HeatBaths(2.0, lambda t: 1.0 + t), "must be infinite"),
+    "a vector of temperatures": (lambda: lt.HeatBaths(np.inf, lambda t: jnp.ones(2)), "must have shape"),
+    "too few temperatures": (lambda: lt.HeatBaths(1.0, [1.0], number=2), "entry for each"),
+    "power without baths": (
+        lambda: lt.SpinSystem(1, lt.magnetism.zeeman(1, (0, 0, 1.0)), power=lambda t: t),
+        "give baths",
+    ),
+    "power as a number": (lambda: spin_in_a_bath(1.0, power=1.0), "function of the time"),
+    "power for two baths": (lambda: spin_in_a_bath(1.0, power=[None, lambda t: t]), "1 baths"),
+    "temperatures without times": (
+        lambda: (s := spin_in_a_bath(lambda t: 1.0 + t)).temperatures(s.state(START)),
+        "give the times",
+    ),
+    "a pulse of no duration": (lambda: lt.magnetism.LaserPulse(1.0, 0.0), "positive"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_baths_are_refused(name):
+    attempt, says = BAD[name]
+    with pytest.raises((lt.InputError, lt.FunctionError), match=says):
+        attempt()
