@@ -150,10 +150,10 @@ class SpinSystem(TorqueSystem):
         return velocity
 
     def drop_torque(self):
-        return _without_power(super().drop_torque())
+        return _drop_power(super().drop_torque())
 
     def drop_baths(self):
-        return _without_power(super().drop_baths())
+        return _drop_power(super().drop_baths())
 
     def scale_at_sites(self, values, v) -> jax.Array:
         """Return a vector v multiplied by ``values``, one for each site or one for all."""
@@ -316,7 +316,7 @@ def _checked_powers(power, baths: HeatBaths | None) -> tuple[tuple[int, ...], tu
     return tuple(functions), tuple(functions.values())
 
 
-def _without_power(system: Any) -> Any:
+def _drop_power(system: Any) -> Any:
     """Return a system of spins without power for its baths."""
     if not system.power:
         return system

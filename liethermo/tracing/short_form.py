@@ -30,8 +30,8 @@ WRAPPED_FIELDS = frozenset({"part", "term"})
 def short_form(value: Any, depth: int = 0) -> str:
     """Return one line about a value: numbers with four digits, functions by name, objects by class and fields.
 
-    Fields that are None, empty, zero or flags are left out, and of arrays of many numbers all but their shape. Of an
-    object that wraps another one the other is shown, and of a sum its parts.
+    Fields that are None, empty, zero or flags are left out. An array of many numbers is shown by its shape, a wrapper
+    by the object that it wraps, and a sum by its parts.
     """
     if isinstance(value, jax.core.Tracer):
         return f"{value.dtype}{list(value.shape)}"
@@ -47,9 +47,9 @@ def short_form(value: Any, depth: int = 0) -> str:
     if callable_with_name(value):
         return str(value.__name__)
     if isinstance(value, Mapping):
-        return _joined((f"{key}: {short_form(entry, depth + 1)}" for key, entry in value.items()), "{}")
+        return join_shown((f"{key}: {short_form(entry, depth + 1)}" for key, entry in value.items()), "{}")
     if isinstance(value, list | tuple):
-        return _joined((short_form(entry, depth + 1) for entry in value), "[]")
+        return join_shown((short_form(entry, depth + 1) for entry in value), "[]")
     return str(value)
 
 
@@ -74,7 +74,7 @@ def _short_form_of_object(value: eqx.Module, depth: int) -> str:
         return repr(value)
     fields = {field.name: vars(value)[field.name] for field in dataclasses.fields(value) if field.name in vars(value)}
     for name in SUM_FIELDS & fields.keys():
-        return _joined((short_form(part, depth + 1) for part in fields[name]), ("", ""), " + ")
+        return join_shown((short_form(part, depth + 1) for part in fields[name]), ("", ""), " + ")
     for name in WRAPPED_FIELDS & fields.keys():
         return short_form(fields[name], depth)
     if depth >= MAX_DEPTH:
@@ -90,7 +90,7 @@ def _is_void(value: Any) -> bool:
     return isinstance(value, bool) or (isinstance(value, Mapping | list | tuple | frozenset | str) and not value)
 
 
-def _joined(texts: Iterable[str], brackets: Sequence[str], separator: str = ", ") -> str:
+def join_shown(texts: Iterable[str], brackets: Sequence[str], separator: str = ", ") -> str:
     all_texts = list(texts)
     shown = all_texts[:MAX_SHOWN_ITEMS]
     if len(all_texts) > len(shown):
