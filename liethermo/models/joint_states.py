@@ -21,6 +21,11 @@ from ..tracing.programs import jit_unoptimised
 from .articulated_bodies import ArticulatedBodies, KineticEnergy, Motion
 from .parameters import checked_finite
 
+MAX_UNROLLED_JOINTS = 4
+"""Largest number of joint coordinates for which the compiled engine is chosen by itself.
+
+Steps of larger trees are compiled in seconds too, but Newton's method, which a step may need later, takes minutes."""
+
 JointRange = tuple[str, int, int]
 """Name of a body that has a joint, and the first and the last but one index of its coordinates in a state."""
 
@@ -70,6 +75,10 @@ class TreeSystem(System):
         kinetic = term.term if isinstance(term, Pullback) else term
         assert isinstance(kinetic, KineticEnergy)
         return kinetic.mechanism
+
+    @property
+    def can_unroll(self) -> bool:
+        return self.mechanism.n_joints <= MAX_UNROLLED_JOINTS
 
     @with_library_settings
     def mass_matrix(self, q) -> jax.Array:
