@@ -76,3 +76,35 @@ def test_bad_samples_are_refused(name):
     attempt, says = BAD[name]
     with pytest.raises(lt.InputError, match=says):
         attempt()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "literature", "step", "lengths"), [("bcc", 2.0542, 0.018, (4, 8)), ("fcc", 3.177, 0.012, (3, 6))]
+)
+def test_crystals_lose_their_order_at_the_temperature_of_the_literature(name, literature, step, lengths):
+    """``kT_c / J`` of unit vectors, J counted once a pair, within 1 %.
+
+    bcc is 1 / 0.486798 [Chen, Ferrenberg & Landau 1993], fcc 1 / 0.3147 [McKenzie, Domb & Hunter 1982]. The
+    lattices have 108 to 1,024 spins.
+    """
+    samples = []
+    for length in lengths:
+        crystal = mag.lattice(name, (length,) * 3)
+        baths = lt.HeatBaths(np.inf, literature)
+        system = lt.SpinSystem(crystal, mag.exchange(crystal, 1.0), lt.LandauLifshitz(2.0), baths)
+        state = system.state(np.tile([0.0, 0.0, 1.0], (*crystal.sites, 1)))
+        energies, means = [], []
+        for part in range(25):
+            noise = lt.Fluctuations(seed=1000 * length + part)
+            run = lt.integrate(system, state, (0.0, 2000 * step), step, noise=noise, save_every=20, engine="array")
+            spins = np.asarray(system.spins(run.x))
+            state = system.state(spins[-1])
+            if part > 1:
+                energies.append(run.energy[1:] - literature * run.x[1:, -1])
+                means.append(spins[1:].reshape(len(spins) - 1, -1, 3).mean(axis=1))
+        samples.append(mag.MagnetSamples(literature, np.concatenate(energies), np.concatenate(means)))
+        assert mag.binder_cumulant(samples[-1].magnetisation).value == pytest.approx(0.6217, abs=0.02)  # Holm & Janke
+    found = mag.cumulant_crossing(*samples)
+    assert found.error < 0.01 * literature  # the fcc run measures 0.84 %
+    assert abs(found.value - literature) < 0.01 * literature

@@ -102,3 +102,32 @@ def test_bad_units_are_refused():
         mag.units("SI").gilbert(-0.1)
     with pytest.raises(lt.LiethermoError, match="a moment must be positive"):
         mag.units("SI").gilbert(0.1, moment=0.0)
+
+
+def test_two_sublattices_have_one_temperature():
+    """A dimer of two unlike spins in one bath: ``<s_1 . s_2>`` is Langevin's function of J / kT, in meV and kelvin.
+
+    Moments, damping and so the rates of both spins differ by a factor of up to ten; the temperature does not. As a
+    control, the correlation at one and a half times the temperature is more than six standard errors away.
+    """
+    u = lt.magnetism.units("meV")
+    J, kT = -2.0, float(u.thermal_energy(15.0))  # antiferromagnetic
+    motion = u.gilbert(np.array([0.5, 0.1]), u.moment(np.array([2.2, 5.0])))
+    system = lt.SpinSystem(
+        (2,),
+        lt.magnetism.exchange((2,), [(0, 1, J)]),
+        lt.LandauLifshitz(motion.rate),
+        lt.HeatBaths(np.inf, kT),
+        ratio=motion.ratio,
+    )
+    starts = np.repeat(np.asarray(system.state([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]))[None], 3000, axis=0)
+    run = lt.ensemble(system, starts, (0.0, 20.0), 0.05, lt.MetriplecticMidpoint(), noise=lt.Fluctuations(seed=4))
+    s = np.asarray(system.spins(run.x))
+    product = (s[:, 0] * s[:, 1]).sum(axis=1)
+    error = product.std() / np.sqrt(len(product))
+
+    def langevin(temperature):
+        return 1.0 / np.tanh(J / temperature) - temperature / J
+
+    assert abs(product.mean() - langevin(kT)) < 4.0 * error
+    assert abs(product.mean() - langevin(1.5 * kT)) > 6.0 * error
