@@ -38,7 +38,7 @@ class TorqueSystem(System):
 
     @property
     def has_torque(self) -> bool:
-        """Whether something acts on the system from outside."""
+        """True if something acts on the system from outside."""
         return self.torque is not None
 
     @property

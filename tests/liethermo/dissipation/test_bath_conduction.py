@@ -6,6 +6,7 @@ from scipy.integrate import solve_ivp
 
 import liethermo as lt
 import manifolds as mf
+from liethermo.systems.spins import reorder_spins
 
 FIELD = 1.2
 RATE = 0.3
@@ -109,7 +110,7 @@ def test_many_spins_conduct_component_by_component():
     bath = np.arange(60).reshape(sites) % 2
     damping = [lt.LandauLifshitz(0.2, bath), lt.BathConduction([(0, 1, 0.3), (1, 2, 0.5)])]
     system = lt.SpinSystem(sites, lt.magnetism.exchange(sites, 1.0), damping, baths)
-    planar = system.reorder_components()
+    planar = reorder_spins(system)
     assert planar is not None
     x = np.asarray(system.samples(1)[0])
     field = np.asarray(planar.restore_state(planar.system.vector_field(planar.reorder_state(x))))

@@ -50,9 +50,9 @@ def model(name: str) -> lt.System:
 
 
 def test_names_do_not_depend_on_a_bath():
-    free = lt.LiePoissonSystem(mf.so(3), energy_of(MOMENTS), dissipation=lt.DoubleBracket(0.1))
-    assert set(named_parameters(free)) == {"energy.inertia", "energy.c", "dissipation.rate"}
-    assert set(named_parameters(body_with_bath())) - set(named_parameters(free)) == {
+    free_body = lt.LiePoissonSystem(mf.so(3), energy_of(MOMENTS), dissipation=lt.DoubleBracket(0.1))
+    assert set(named_parameters(free_body)) == {"energy.inertia", "energy.c", "dissipation.rate"}
+    assert set(named_parameters(body_with_bath())) - set(named_parameters(free_body)) == {
         "baths.capacity",
         "baths.temperature",
     }
@@ -60,10 +60,10 @@ def test_names_do_not_depend_on_a_bath():
 
 
 def test_names_do_not_depend_on_a_torque_or_an_attitude():
-    plain = lt.models.rigid_body()
-    turned = lt.models.rigid_body(attitude=True, torque=lambda t, m: -0.1 * m)
-    names = {name for name in named_parameters(turned) if not name.startswith("torque")}
-    assert names == set(named_parameters(plain))
+    body = lt.models.rigid_body()
+    turning_body = lt.models.rigid_body(attitude=True, torque=lambda t, m: -0.1 * m)
+    names = {name for name in named_parameters(turning_body) if not name.startswith("torque")}
+    assert names == set(named_parameters(body))
 
 
 @pytest.mark.slow
@@ -88,11 +88,11 @@ def test_every_parameter_of_a_model_keeps_the_laws_and_has_an_effect(name):
 
     for parameter, value in named_parameters(system).items():
         if parameter.startswith(("dissipation", "baths", "lagrangian")) or parameter.endswith("inertia"):
-            changed = replace_parameters(system, {parameter: 1.03 * value})
-            assert changed.check().passed, parameter
-            pairs = zip(functions_of(system), functions_of(changed), strict=True)
+            changed_system = replace_parameters(system, {parameter: 1.03 * value})
+            assert changed_system.check().passed, parameter
+            pairs = zip(functions_of(system), functions_of(changed_system), strict=True)
             has_no_size = parameter.endswith("axis") or not np.any(value)  # a direction, or zero
-            assert any(not np.array_equal(old, new) for old, new in pairs) or has_no_size, parameter
+            assert any(not np.array_equal(*pair) for pair in pairs) or has_no_size, parameter
 
 
 # -- values -------------------------------------------------------------------------------------------------------
@@ -124,16 +124,16 @@ def test_a_tensor_of_inertia_is_a_parameter():
     tensor = np.array([[3.0, 0.2, 0.0], [0.2, 2.0, 0.1], [0.0, 0.1, 1.5]])
     system = body_with_bath(moments=np.diag(MOMENTS) + 0.1)
     np.testing.assert_allclose(named_parameters(system)["energy.inertia"], np.diag(MOMENTS) + 0.1, rtol=1e-15)
-    changed = replace_parameters(system, {"energy.inertia": tensor})
-    np.testing.assert_allclose(last_state(changed), last_state(body_with_bath(moments=tensor)), rtol=1e-13)
+    changed_system = replace_parameters(system, {"energy.inertia": tensor})
+    np.testing.assert_allclose(last_state(changed_system), last_state(body_with_bath(moments=tensor)), rtol=1e-13)
 
 
 def test_paths_of_arrays_are_names_too():
     system = body_with_bath()
     for path in ("dissipation.part.rate", "dissipation.rate"):
         assert float(replace_parameters(system, {path: 0.3}).dissipation.part.rate) == 0.3
-    changed = replace_parameters(system, {"energy.body.A": 1.0 / np.array([3.0, 2.5, 1.5])})
-    np.testing.assert_array_equal(named_parameters(changed)["energy.inertia"], [3.0, 2.5, 1.5])
+    changed_system = replace_parameters(system, {"energy.body.A": 1.0 / np.array([3.0, 2.5, 1.5])})
+    np.testing.assert_array_equal(named_parameters(changed_system)["energy.inertia"], [3.0, 2.5, 1.5])
 
 
 def test_entries_of_a_parameter_are_axes_of_a_study(tmp_path):

@@ -114,7 +114,7 @@ BAD = {
     "power for two baths": (lambda: spin_in_a_bath(1.0, power=[None, lambda t: t]), "1 baths"),
     "temperatures without times": (
         lambda: (s := spin_in_a_bath(lambda t: 1.0 + t)).temperatures(s.state(START)),
-        "give the times",
+        "give the time beside the state",
     ),
     "a pulse of no duration": (lambda: lt.magnetism.LaserPulse(1.0, 0.0), "positive"),
 }
