@@ -30,6 +30,9 @@ from .system_family import Family
 ATTEMPTS_PER_CALL_RANGE = (16, 2048)
 """Smallest and largest number of attempted steps per engine call; paused trajectories wait until the call ends."""
 
+MAX_FIRST_ATTEMPTS = 20
+"""Largest number of attempts after which the size of a first step is recorded; more are hardly ever needed."""
+
 TARGET_ATTEMPTS_PER_CALL = 2**15
 """Target number of attempted steps per engine call, summed over trajectories and clipped to
 ``ATTEMPTS_PER_CALL_RANGE``."""
@@ -171,11 +174,26 @@ class _BatchRecorder:
 
     def attempt(self) -> None:
         if self._is_first_attempt:
-            schedule = self.record.schedule
-            first_steps = np.minimum(self.runs.read("next_step_size"), schedule.end - schedule.start)
-            self.record.quantities["first_step"][self.members] = first_steps
+            self._record_first_steps()
             self._is_first_attempt = False
         self.runs.advance(int(np.clip(TARGET_ATTEMPTS_PER_CALL // len(self.members), *ATTEMPTS_PER_CALL_RANGE)))
+
+    def _record_first_steps(self) -> None:
+        """Let the trajectories attempt their first step until it is accepted, and record its size for the audit.
+
+        A trajectory that pauses or ends before has the size that it would attempt.
+        """
+        start, runs = self.record.schedule.start, self.runs
+        sizes = np.minimum(runs.read("next_step_size"), self.record.schedule.end - start)
+        is_pending = np.ones(len(self.members), dtype=bool)
+        for _ in range(MAX_FIRST_ATTEMPTS):
+            runs.advance(1)
+            is_accepted = is_pending & (runs.read("step") > 0)
+            sizes[is_accepted] = runs.read("t")[is_accepted] - start
+            is_pending &= ~is_accepted
+            if not (is_pending & (runs.read("status") == StatusCode.COMPLETED)).any():
+                break
+        self.record.quantities["first_step"][self.members] = sizes
 
     def record_pauses(self) -> None:
         handler, runs = self.pause_handler, self.runs

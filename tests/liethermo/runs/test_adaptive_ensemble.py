@@ -260,3 +260,16 @@ def test_bad_input(arguments, message):
     default = {"system": BODY, "x0s": states(2), "t_span": SPAN, "step": lt.Adaptive(1e-6)}
     with pytest.raises(lt.LiethermoError, match=message):
         lt.ensemble(**(default | arguments))
+
+
+@pytest.mark.parametrize("engine", ["compiled", "array"])
+def test_the_accuracy_of_an_audit_is_that_of_an_accepted_step(engine):
+    """The first size that is tried is much too long, and is no step of the run."""
+    body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
+    starts = np.array([[0.1, 0.2, 1.0], [0.3, 0.1, 0.9]])
+    step = lt.Adaptive(1e-8, first=19.0)
+
+    audit = lt.ensemble(body, starts, (0.0, 20.0), step, lt.MetriplecticRungeKutta(8), engine=engine).audit()
+
+    accuracy = next(row.value for row in audit.rows if row.name == "accuracy")
+    assert 1e-12 < accuracy < 1e-7
