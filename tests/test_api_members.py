@@ -112,7 +112,13 @@ def test_the_page_for_authors_describes_members_that_no_class_page_shows():
 
 
 def test_no_summary_begins_with_a_formula():
-    summaries = {name: (inspect.getdoc(thing) or "").partition("\n")[0] for name, thing in _public_names().items()}
+    things = _public_names()
+    things |= {
+        f"{name}.{member}": getattr(owner, member)
+        for name, owner in CLASSES.items()
+        for member in api_members.public_members(owner)
+    }
+    summaries = {name: (inspect.getdoc(thing) or "").partition("\n")[0] for name, thing in things.items()}
     assert [f"{name}: {line}" for name, line in summaries.items() if FORMULA.match(line) or not line] == []
 
 
